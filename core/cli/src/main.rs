@@ -1,0 +1,2 @@
+//! The dragfree command.
+fn main() {}

@@ -1,0 +1,8 @@
+//! Frames, rigid bodies, noise shapes, linear systems and whitening for a drag-free spacecraft.
+//!
+//! Everything is SI. Names carry frame and unit; `dcm_a_from_b` takes components in B to components in A
+//! (the paper's `T_B^A`).
+
+pub mod frames;
+pub mod mission;
+pub mod noise;

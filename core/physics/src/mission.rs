@@ -1,0 +1,535 @@
+//! The mission file: constants, frames, noise, requirements. Units stand in the keys, unknown keys are errors.
+//!
+//! The engine hands every plugin the whole file as JSON; a plugin asks for the sections that it needs.
+
+use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+use crate::frames::dcm_turned_about_z;
+use crate::noise::{NoiseShape, NoiseTerm};
+
+/// Why a mission file was refused: what, where, and what to do next.
+#[derive(Debug, thiserror::Error)]
+pub enum MissionError {
+    /// The text is not a mission: unknown key, wrong type, missing key.
+    #[error("mission file: {0}; every key carries its unit, and fixtures/missions/taiji.toml shows them all")]
+    Shape(#[from] serde_json::Error),
+    /// A value has no physical sense.
+    #[error("mission file: {key} = {value} {reason}")]
+    Value {
+        /// Dotted key.
+        key: String,
+        /// The value as written.
+        value: String,
+        /// What a value must satisfy.
+        reason: &'static str,
+    },
+    /// A section that a plugin needs is not there.
+    #[error("mission file: section [{section}] is missing; {needed_by} needs it")]
+    Missing {
+        /// Dotted section.
+        section: String,
+        /// Who asked.
+        needed_by: &'static str,
+    },
+}
+
+/// A whole mission file.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Mission {
+    /// Name, spacecraft, sample rate.
+    pub mission: Identity,
+    /// Mass properties of the spacecraft.
+    pub spacecraft: Spacecraft,
+    /// Test masses by name, `tm1` and `tm2`.
+    #[serde(default)]
+    pub test_mass: BTreeMap<String, TestMass>,
+    /// Survey of the housings.
+    #[serde(default)]
+    pub housing: Option<Housing>,
+    /// Noise models.
+    #[serde(default)]
+    pub noise: Noise,
+    /// Mean forces and torques of sunlight.
+    #[serde(default)]
+    pub solar_pressure: Option<SolarPressure>,
+    /// Requirement table (tab:state_precision_requirements).
+    #[serde(default)]
+    pub requirements: Option<Requirements>,
+    /// Controllers of the fifteen channels.
+    #[serde(default)]
+    pub control: Option<Control>,
+    /// Actuator limits.
+    #[serde(default)]
+    pub actuators: Option<Actuators>,
+    /// Limits of the telemetry beyond which a sample is an outlier.
+    #[serde(default)]
+    pub limits: Option<Limits>,
+    /// Free tables for mission-specific plugins, not interpreted here.
+    #[serde(default)]
+    pub plugin: BTreeMap<String, serde_json::Value>,
+}
+
+/// `[mission]`
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Identity {
+    /// Name of the mission.
+    pub name: String,
+    /// Name of the spacecraft, as in file and product names.
+    pub spacecraft: String,
+    /// Rate of the common grid, Hz.
+    pub sample_rate_hz: f64,
+}
+
+/// `[spacecraft]`
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Spacecraft {
+    /// Mass, kg.
+    pub mass_kg: f64,
+    /// Inertia about the centre of mass, in SRF, kg m², rows.
+    pub inertia_srf_kg_m2: [[f64; 3]; 3],
+}
+
+/// `[test_mass.tmN]`
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TestMass {
+    /// Mass, kg.
+    pub mass_kg: f64,
+    /// Inertia in MRF, kg m², rows.
+    #[serde(default)]
+    pub inertia_mrf_kg_m2: Option<[[f64; 3]; 3]>,
+    /// ORF is SRF turned by this angle about `s_3`, rad.
+    pub orf_from_srf_angle_rad: f64,
+    /// Where the drawings put the housing's centre relative to the spacecraft's centre of mass, SRF, m.
+    pub offset_nominal_srf_m: [f64; 3],
+    /// Half width of the box around the nominal offset in which the truth must lie, SRF, m.
+    pub offset_box_srf_m: [f64; 3],
+    /// `S_TT`, force per displacement and mass, ORF, s⁻², rows.
+    #[serde(default)]
+    pub stiffness_tt_orf_s2: [[f64; 3]; 3],
+    /// `S_TR`, m s⁻² per rad, ORF, rows.
+    #[serde(default)]
+    pub stiffness_tr_orf_m_s2_rad: [[f64; 3]; 3],
+    /// `S_RR`, rad s⁻² per rad, ORF, rows.
+    #[serde(default)]
+    pub stiffness_rr_orf_s2: [[f64; 3]; 3],
+}
+
+/// `[housing]`
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Housing {
+    /// Surveyed vector from housing 2 to housing 1, `b_1 − b_2`, SRF, m.
+    pub baseline_srf_m: [f64; 3],
+    /// Tolerance of the survey per axis, m.
+    pub baseline_tolerance_m: f64,
+}
+
+/// `[noise]`: one table per process, `a·sqrt(1+(corner/f)^exponent)` plus optional further terms.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Noise {
+    /// Interferometer, along the sensitive axis.
+    pub ifo_x: Option<DisplacementNoise>,
+    /// Capacitive readout along x, used where there is no interferometer.
+    pub is_x: Option<DisplacementNoise>,
+    /// Capacitive readout along y.
+    pub is_y: Option<DisplacementNoise>,
+    /// Capacitive readout along z.
+    pub is_z: Option<DisplacementNoise>,
+    /// Capacitive readout of the test-mass angles.
+    pub is_angle: Option<AngleNoise>,
+    /// Local wavefront sensing of the test-mass angles.
+    pub dws_local: Option<AngleNoise>,
+    /// Long-arm wavefront sensing of the spacecraft's attitude.
+    pub dws_long_arm: Option<AngleNoise>,
+    /// Thrust, per axis of SRF.
+    pub thruster_force: Option<ForceNoise>,
+    /// Thrusters' torque, per axis of SRF.
+    pub thruster_torque: Option<TorqueNoise>,
+    /// Electrostatic force on a test mass, y and z.
+    pub electrostatic_force: Option<ForceNoise>,
+    /// Electrostatic torque on a test mass.
+    pub electrostatic_torque: Option<TorqueNoise>,
+    /// Stray acceleration of a test mass.
+    pub test_mass_acceleration: Option<AccelerationNoise>,
+    /// Fluctuation of the solar pressure force.
+    pub solar_pressure: Option<ForceNoise>,
+    /// Linear acceleration measured by an accelerometer, with the non-gravitational acceleration nobody models.
+    pub accelerometer_linear: Option<AccelerationNoise>,
+    /// Angular acceleration measured by an accelerometer.
+    pub accelerometer_angular: Option<AngularAccelerationNoise>,
+}
+
+macro_rules! noise_table {
+    ($(#[$doc:meta])* $name:ident, $term:ident, $key:ident, $unit:literal) => {
+        $(#[$doc])*
+        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields)]
+        pub struct $name {
+            #[doc = concat!("Amplitude spectral density above the corner, ", $unit, "/√Hz.")]
+            pub $key: f64,
+            /// Corner frequency, Hz; 0 for white noise.
+            #[serde(default)]
+            pub corner_hz: f64,
+            /// Even exponent of the PSD below the corner.
+            #[serde(default)]
+            pub exponent: u32,
+            /// Further terms that add to the PSD.
+            #[serde(default)]
+            pub terms: Vec<$term>,
+        }
+
+        /// A further term of the PSD, `asd² (corner/f)^exponent`.
+        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields)]
+        pub struct $term {
+            #[doc = concat!("Amplitude spectral density at the corner, ", $unit, "/√Hz.")]
+            pub $key: f64,
+            /// Corner frequency, Hz.
+            pub corner_hz: f64,
+            /// Even exponent of the PSD.
+            pub exponent: u32,
+        }
+
+        impl $name {
+            /// The shape without its unit.
+            #[must_use]
+            pub fn shape(&self) -> NoiseShape {
+                let mut shape = NoiseShape::with_corner(self.$key, self.corner_hz, self.exponent);
+                shape.terms.extend(self.terms.iter().map(|t| NoiseTerm {
+                    asd: t.$key,
+                    corner_hz: t.corner_hz,
+                    exponent: t.exponent,
+                }));
+                shape
+            }
+
+            fn check(&self, key: &str) -> Result<(), MissionError> {
+                let all = std::iter::once((self.$key, self.corner_hz, self.exponent))
+                    .chain(self.terms.iter().map(|t| (t.$key, t.corner_hz, t.exponent)));
+                for (asd, corner_hz, exponent) in all {
+                    positive_or_zero(&format!("{key}.{}", stringify!($key)), asd)?;
+                    positive_or_zero(&format!("{key}.corner_hz"), corner_hz)?;
+                    if exponent % 2 != 0 || exponent > 8 {
+                        return Err(MissionError::Value {
+                            key: format!("{key}.exponent"),
+                            value: exponent.to_string(),
+                            reason: "must be 0, 2, 4, 6 or 8: a state-space shaping filter has whole states",
+                        });
+                    }
+                }
+                Ok(())
+            }
+        }
+    };
+}
+
+noise_table!(
+    /// Noise of a displacement readout.
+    DisplacementNoise, DisplacementTerm, asd_m_rthz, "m"
+);
+noise_table!(
+    /// Noise of an angle readout.
+    AngleNoise, AngleTerm, asd_rad_rthz, "rad"
+);
+noise_table!(
+    /// Noise of a force.
+    ForceNoise, ForceTerm, asd_n_rthz, "N"
+);
+noise_table!(
+    /// Noise of a torque.
+    TorqueNoise, TorqueTerm, asd_nm_rthz, "N m"
+);
+noise_table!(
+    /// Noise of an acceleration.
+    AccelerationNoise, AccelerationTerm, asd_m_s2_rthz, "m s⁻²"
+);
+noise_table!(
+    /// Noise of an angular acceleration.
+    AngularAccelerationNoise, AngularAccelerationTerm, asd_rad_s2_rthz, "rad s⁻²"
+);
+
+/// `[solar_pressure]` (eqs SRP_transfer_function and SRP_torque).
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SolarPressure {
+    /// Mean force `k_dSC` away from the Sun, N.
+    pub force_n: f64,
+    /// Arm of the force about the centre of mass, SRF, m; the torque is `arm × force`.
+    pub arm_srf_m: [f64; 3],
+    /// Error of the orbit that the feed-forward uses, 1σ per axis, m.
+    #[serde(default)]
+    pub orbit_error_m: f64,
+}
+
+/// `[requirements]` (tab:state_precision_requirements), amplitude spectral densities; `f_s`, `f_r` are
+/// `sqrt(1+(corner/f)^4)`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Requirements {
+    /// Test mass along x, m/√Hz.
+    pub tm_x_m_rthz: f64,
+    /// Test mass along y and z, m/√Hz.
+    pub tm_yz_m_rthz: f64,
+    /// Spacecraft attitude, rad/√Hz, times `f_s`.
+    pub sc_attitude_rad_rthz: f64,
+    /// Test-mass roll `φ`, rad/√Hz, times `f_r`.
+    pub tm_phi_rad_rthz: f64,
+    /// Test-mass `θ` and `ψ`, rad/√Hz, times `f_s`.
+    pub tm_theta_psi_rad_rthz: f64,
+    /// Corner of `f_s` and `f_r`, Hz; the paper does not give it.
+    pub corner_hz: f64,
+}
+
+/// `[control]`: one discrete controller per channel. Channel names: `sc.phi`, `sc.theta`, `sc.psi`, and for each
+/// test mass `tmN.x`, `tmN.y`, `tmN.z`, `tmN.phi`, `tmN.theta`, `tmN.psi`.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Control {
+    /// Samples between a readout and the start of the interval in which its command acts.
+    pub delay_samples: u32,
+    /// Controllers by channel.
+    pub channel: BTreeMap<String, ChannelController>,
+}
+
+/// A controller: from a channel's readout (m or rad) to its desired acceleration `u_d` (m s⁻² or rad s⁻²).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ChannelController {
+    /// `u_d = −gain · H(z) y`, gain in s⁻².
+    pub gain_s2: f64,
+    /// Second-order sections of `H(z)`, each `[b0, b1, b2, a1, a2]` of
+    /// `(b0 + b1 z⁻¹ + b2 z⁻²)/(1 + a1 z⁻¹ + a2 z⁻²)`, applied in order at the mission's sample rate.
+    pub sections: Vec<[f64; 5]>,
+}
+
+/// `[actuators]`: limits of what can be commanded.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Actuators {
+    /// Thrust per axis of SRF, N.
+    pub thrust_limit_n: f64,
+    /// Torque per axis of SRF, N m.
+    pub torque_limit_nm: f64,
+    /// Electrostatic force per axis, N.
+    pub electrostatic_force_limit_n: f64,
+    /// Electrostatic torque per axis, N m.
+    pub electrostatic_torque_limit_nm: f64,
+}
+
+/// `[limits]`: absolute bounds of telemetry, beyond which a sample is refused as unphysical.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Limits {
+    /// Test-mass displacement, m.
+    pub displacement_m: f64,
+    /// Attitude and test-mass angles, rad.
+    pub angle_rad: f64,
+}
+
+fn matrix(rows: &[[f64; 3]; 3]) -> Matrix3<f64> {
+    Matrix3::from_fn(|i, j| rows[i][j])
+}
+
+fn value_error(key: &str, value: impl ToString, reason: &'static str) -> MissionError {
+    MissionError::Value { key: key.to_owned(), value: value.to_string(), reason }
+}
+
+fn positive(key: &str, value: f64) -> Result<(), MissionError> {
+    if value.is_finite() && value > 0.0 {
+        Ok(())
+    } else {
+        Err(value_error(key, value, "must be finite and above zero"))
+    }
+}
+
+fn positive_or_zero(key: &str, value: f64) -> Result<(), MissionError> {
+    if value.is_finite() && value >= 0.0 {
+        Ok(())
+    } else {
+        Err(value_error(key, value, "must be finite and not negative"))
+    }
+}
+
+fn inertia(key: &str, rows: &[[f64; 3]; 3]) -> Result<(), MissionError> {
+    let m = matrix(rows);
+    if !m.iter().all(|x| x.is_finite()) || m != m.transpose() {
+        return Err(value_error(key, format!("{rows:?}"), "must be finite and symmetric"));
+    }
+    let e = m.symmetric_eigenvalues();
+    let (lo, sum) = (e.min(), e.sum());
+    if lo <= 0.0 || e.iter().any(|x| *x > sum - x) {
+        return Err(value_error(
+            key,
+            format!("{rows:?}"),
+            "must be positive definite and keep the triangle inequality of its principal moments",
+        ));
+    }
+    Ok(())
+}
+
+impl Mission {
+    /// Reads a mission from the JSON that the engine hands to plugins and checks every value.
+    ///
+    /// # Errors
+    /// [`MissionError`] names the key, its value and what it must be.
+    pub fn from_json(text: &str) -> Result<Self, MissionError> {
+        let mission: Self = serde_json::from_str(text)?;
+        mission.check()?;
+        Ok(mission)
+    }
+
+    fn check(&self) -> Result<(), MissionError> {
+        positive("mission.sample_rate_hz", self.mission.sample_rate_hz)?;
+        positive("spacecraft.mass_kg", self.spacecraft.mass_kg)?;
+        inertia("spacecraft.inertia_srf_kg_m2", &self.spacecraft.inertia_srf_kg_m2)?;
+        for (name, tm) in &self.test_mass {
+            let key = |k: &str| format!("test_mass.{name}.{k}");
+            if name != "tm1" && name != "tm2" {
+                return Err(value_error("test_mass", name, "must be tm1 or tm2"));
+            }
+            positive(&key("mass_kg"), tm.mass_kg)?;
+            if let Some(rows) = &tm.inertia_mrf_kg_m2 {
+                inertia(&key("inertia_mrf_kg_m2"), rows)?;
+            }
+            for (k, v) in [("offset_box_srf_m", tm.offset_box_srf_m)] {
+                for x in v {
+                    positive(&key(k), x)?;
+                }
+            }
+        }
+        if let Some(h) = &self.housing {
+            positive("housing.baseline_tolerance_m", h.baseline_tolerance_m)?;
+        }
+        self.noise.check()?;
+        if let Some(c) = &self.control {
+            for (name, channel) in &c.channel {
+                if !CHANNELS.contains(&name.as_str()) {
+                    return Err(value_error(
+                        "control.channel",
+                        name,
+                        "is no channel; the fifteen are sc.phi, sc.theta, sc.psi and tmN.x, y, z, phi, theta, psi",
+                    ));
+                }
+                let finite = channel.gain_s2.is_finite() && channel.sections.iter().flatten().all(|x| x.is_finite());
+                if !finite {
+                    return Err(value_error(&format!("control.channel.{name}"), "…", "must be finite"));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The section of a test mass.
+    ///
+    /// # Errors
+    /// [`MissionError::Missing`] when the mission has no such test mass.
+    pub fn test_mass(&self, name: &str, needed_by: &'static str) -> Result<&TestMass, MissionError> {
+        self.test_mass
+            .get(name)
+            .ok_or_else(|| MissionError::Missing { section: format!("test_mass.{name}"), needed_by })
+    }
+
+    /// A section or a noise table that must be there.
+    ///
+    /// # Errors
+    /// [`MissionError::Missing`] when it is not.
+    pub fn need<'a, T>(section: &'a Option<T>, name: &str, needed_by: &'static str) -> Result<&'a T, MissionError> {
+        section.as_ref().ok_or_else(|| MissionError::Missing { section: name.to_owned(), needed_by })
+    }
+
+    /// Seconds between epochs of the common grid.
+    #[must_use]
+    pub fn dt_s(&self) -> f64 {
+        1.0 / self.mission.sample_rate_hz
+    }
+}
+
+impl Spacecraft {
+    /// Inertia `J_S`, SRF, kg m².
+    #[must_use]
+    pub fn inertia(&self) -> Matrix3<f64> {
+        matrix(&self.inertia_srf_kg_m2)
+    }
+}
+
+impl TestMass {
+    /// `T_S^O`: components in ORF from components in SRF.
+    #[must_use]
+    pub fn dcm_orf_from_srf(&self) -> Matrix3<f64> {
+        dcm_turned_about_z(self.orf_from_srf_angle_rad)
+    }
+
+    /// Nominal offset in ORF, m.
+    #[must_use]
+    pub fn offset_nominal_orf_m(&self) -> Vector3<f64> {
+        self.dcm_orf_from_srf() * Vector3::from(self.offset_nominal_srf_m)
+    }
+
+    /// `S_TT`, s⁻².
+    #[must_use]
+    pub fn stiffness_tt(&self) -> Matrix3<f64> {
+        matrix(&self.stiffness_tt_orf_s2)
+    }
+
+    /// `S_TR`, m s⁻² rad⁻¹.
+    #[must_use]
+    pub fn stiffness_tr(&self) -> Matrix3<f64> {
+        matrix(&self.stiffness_tr_orf_m_s2_rad)
+    }
+
+    /// `S_RR`, s⁻².
+    #[must_use]
+    pub fn stiffness_rr(&self) -> Matrix3<f64> {
+        matrix(&self.stiffness_rr_orf_s2)
+    }
+}
+
+/// The fifteen channels in the order of eq:state_variables.
+pub const CHANNELS: [&str; 15] = [
+    "sc.phi",
+    "sc.theta",
+    "sc.psi",
+    "tm1.x",
+    "tm1.y",
+    "tm1.z",
+    "tm1.phi",
+    "tm1.theta",
+    "tm1.psi",
+    "tm2.x",
+    "tm2.y",
+    "tm2.z",
+    "tm2.phi",
+    "tm2.theta",
+    "tm2.psi",
+];
+
+impl Noise {
+    fn check(&self) -> Result<(), MissionError> {
+        macro_rules! check { ($($name:ident),*) => { $(if let Some(n) = &self.$name { n.check(concat!("noise.", stringify!($name)))?; })* } }
+        check!(
+            ifo_x,
+            is_x,
+            is_y,
+            is_z,
+            is_angle,
+            dws_local,
+            dws_long_arm,
+            thruster_force,
+            thruster_torque,
+            electrostatic_force,
+            electrostatic_torque,
+            test_mass_acceleration,
+            solar_pressure,
+            accelerometer_linear,
+            accelerometer_angular
+        );
+        Ok(())
+    }
+}
