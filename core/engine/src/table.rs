@@ -1,0 +1,65 @@
+//! Tables: what flows from a feed (files or a source plugin) through the stages. See ARCHITECTURE.md.
+
+use std::collections::BTreeMap;
+
+/// What a column is: its name, unit, frame, rate and free attributes.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Column {
+    /// Table that the column belongs to.
+    pub table: String,
+    /// Name, unique in its table.
+    pub name: String,
+    /// SI unit, `m s-2`; `1` for a number, empty for flags.
+    pub unit: String,
+    /// Frame, `ORF_1`; empty where there is none.
+    pub frame: String,
+    /// Rate of a uniform table, Hz; 0 for an irregular one.
+    pub rate_hz: f64,
+    /// Free attributes, `kind = channel` among them.
+    pub attributes: BTreeMap<String, String>,
+}
+
+/// A table as linked: its columns after the times.
+#[derive(Clone, Debug, PartialEq)]
+pub struct TableSpec {
+    /// Name, `is` or `grid`.
+    pub name: String,
+    /// Rate of a uniform table, Hz; 0 for an irregular one.
+    pub rate_hz: f64,
+    /// Columns after `time_ns`.
+    pub columns: Vec<Column>,
+    /// True where the table holds the truth of a simulation: written apart, never linked to a stage.
+    pub truth: bool,
+}
+
+/// Rows of one table.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Batch {
+    /// Unix nanoseconds of the telemetry's time scale, ascending.
+    pub time_ns: Vec<i64>,
+    /// One vector per column of the [`TableSpec`], each as long as `time_ns`; NaN where there is no value.
+    pub columns: Vec<Vec<f64>>,
+}
+
+impl Batch {
+    /// An empty batch with `columns` columns.
+    #[must_use]
+    pub fn empty(columns: usize) -> Self {
+        Self { time_ns: Vec::new(), columns: vec![Vec::new(); columns] }
+    }
+
+    /// Number of rows.
+    #[must_use]
+    pub fn rows(&self) -> usize {
+        self.time_ns.len()
+    }
+}
+
+/// A stretch of time from a feed: for each of its tables the rows of that stretch.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Chunk {
+    /// One batch per table of the feed, in its order.
+    pub batches: Vec<Batch>,
+    /// Every row before this time has been delivered, Unix ns.
+    pub complete_until_ns: i64,
+}
