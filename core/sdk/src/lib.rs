@@ -1,1 +1,77 @@
-//! See ARCHITECTURE.md.
+//! What the author of a `dragfree` plugin uses: the traits [`Source`], [`Stage`] and [`Effect`], and [`export_plugin!`].
+//!
+//! A plugin is a struct, a [`Manifest`], and one of the traits:
+//!
+//! ```
+//! use dragfree_sdk::prelude::*;
+//!
+//! /// Twice the measured displacement of test mass 1.
+//! struct Twice {
+//!     x: Option<(In, Table, Out)>,
+//! }
+//!
+//! impl Stage for Twice {
+//!     const MANIFEST: Manifest = Manifest {
+//!         id: "twice",
+//!         version: "1.0.0",
+//!         licence: "MIT",
+//!         description: "Doubles a column",
+//!         parameters: &[Parameter::f64("factor", "1", 2.0, 0.0..=10.0, "what to multiply by")],
+//!         instances: &[],
+//!     };
+//!     fn new(_setup: &Setup) -> Result<Self, PluginError> {
+//!         Ok(Self { x: None })
+//!     }
+//!     fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
+//!         let x = link.read(&Want::new("is.tm1.r_orf_m.x").unit("m").frame("ORF_1"))?;
+//!         let rate_hz = available.find("is.tm1.r_orf_m.x").map_or(0.0, |c| c.rate_hz);
+//!         let table = link.table("twice", rate_hz);
+//!         self.x = Some((x, table, link.write(table, "twice.x", "m", "ORF_1")?));
+//!         Ok(())
+//!     }
+//!     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
+//!         let Some((x, table, twice)) = self.x else { return Ok(()) };
+//!         output.time(table).extend_from_slice(input.time_ns());
+//!         output.f64(twice).extend(input.f64(x).iter().map(|x| 2.0 * x));
+//!         Ok(())
+//!     }
+//!     fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
+//!         Ok(Report::default())
+//!     }
+//!     fn save(&self) -> Result<Vec<u8>, PluginError> {
+//!         Ok(Vec::new())
+//!     }
+//!     fn load(&mut self, _state: &[u8]) -> Result<(), PluginError> {
+//!         Ok(())
+//!     }
+//! }
+//!
+//! export_plugin!(stages: [Twice]);
+//! # fn main() {}
+//! ```
+
+mod batch;
+pub mod border;
+mod error;
+mod link;
+mod manifest;
+mod node;
+mod report;
+mod setup;
+
+pub use batch::{Inputs, Outputs, Progress};
+pub use error::PluginError;
+pub use link::{Available, Coefficient, Column, Constraint, EffectLink, In, Link, Out, Table, Want};
+pub use manifest::{Manifest, Parameter};
+pub use node::{Effect, Source, Stage};
+pub use report::{Attachment, Covariance, Estimate, Report};
+pub use setup::{Level, Log, Setup};
+
+/// Everything a plugin needs.
+pub mod prelude {
+    pub use crate::{
+        Attachment, Available, Coefficient, Column, Constraint, Covariance, Effect, EffectLink, Estimate, In, Inputs,
+        Level, Link, Log, Manifest, Out, Outputs, Parameter, PluginError, Progress, Report, Setup, Source, Stage,
+        Table, Want, export_plugin,
+    };
+}
