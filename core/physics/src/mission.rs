@@ -294,7 +294,8 @@ pub struct Requirements {
 pub struct Control {
     /// Samples between a readout and the start of the interval in which its command acts.
     pub delay_samples: u32,
-    /// Controllers by channel.
+    /// Controllers by channel: all fifteen, or none for the default design.
+    #[serde(default)]
     pub channel: BTreeMap<String, ChannelController>,
 }
 
@@ -337,7 +338,12 @@ fn matrix(rows: &[[f64; 3]; 3]) -> Matrix3<f64> {
     Matrix3::from_fn(|i, j| rows[i][j])
 }
 
-fn value_error(key: &str, value: impl ToString, reason: &'static str) -> MissionError {
+/// Inverse of an inertia that [`Mission::check`] found positive definite.
+fn inverse(inertia: Matrix3<f64>) -> Matrix3<f64> {
+    inertia.cholesky().map_or_else(|| Matrix3::from_element(f64::NAN), |c| c.inverse())
+}
+
+fn value_error(key: &str, value: &dyn std::fmt::Display, reason: &'static str) -> MissionError {
     MissionError::Value { key: key.to_owned(), value: value.to_string(), reason }
 }
 
@@ -345,7 +351,7 @@ fn positive(key: &str, value: f64) -> Result<(), MissionError> {
     if value.is_finite() && value > 0.0 {
         Ok(())
     } else {
-        Err(value_error(key, value, "must be finite and above zero"))
+        Err(value_error(key, &value, "must be finite and above zero"))
     }
 }
 
@@ -353,21 +359,21 @@ fn positive_or_zero(key: &str, value: f64) -> Result<(), MissionError> {
     if value.is_finite() && value >= 0.0 {
         Ok(())
     } else {
-        Err(value_error(key, value, "must be finite and not negative"))
+        Err(value_error(key, &value, "must be finite and not negative"))
     }
 }
 
 fn inertia(key: &str, rows: &[[f64; 3]; 3]) -> Result<(), MissionError> {
     let m = matrix(rows);
     if !m.iter().all(|x| x.is_finite()) || m != m.transpose() {
-        return Err(value_error(key, format!("{rows:?}"), "must be finite and symmetric"));
+        return Err(value_error(key, &format!("{rows:?}"), "must be finite and symmetric"));
     }
     let e = m.symmetric_eigenvalues();
     let (lo, sum) = (e.min(), e.sum());
     if lo <= 0.0 || e.iter().any(|x| *x > sum - x) {
         return Err(value_error(
             key,
-            format!("{rows:?}"),
+            &format!("{rows:?}"),
             "must be positive definite and keep the triangle inequality of its principal moments",
         ));
     }
@@ -408,7 +414,16 @@ impl Mission {
             positive("housing.baseline_tolerance_m", h.baseline_tolerance_m)?;
         }
         self.noise.check()?;
+        if let Some(a) = &self.actuators {
+            positive("actuators.thrust_limit_n", a.thrust_limit_n)?;
+            positive("actuators.torque_limit_nm", a.torque_limit_nm)?;
+            positive("actuators.electrostatic_force_limit_n", a.electrostatic_force_limit_n)?;
+            positive("actuators.electrostatic_torque_limit_nm", a.electrostatic_torque_limit_nm)?;
+        }
         if let Some(c) = &self.control {
+            if c.delay_samples > MOST_DELAY_SAMPLES {
+                return Err(value_error("control.delay_samples", &c.delay_samples, "must be at most 100"));
+            }
             for (name, channel) in &c.channel {
                 if !CHANNELS.contains(&name.as_str()) {
                     return Err(value_error(
@@ -419,7 +434,7 @@ impl Mission {
                 }
                 let finite = channel.gain_s2.is_finite() && channel.sections.iter().flatten().all(|x| x.is_finite());
                 if !finite {
-                    return Err(value_error(&format!("control.channel.{name}"), "…", "must be finite"));
+                    return Err(value_error(&format!("control.channel.{name}"), &"…", "must be finite"));
                 }
             }
         }
@@ -457,6 +472,12 @@ impl Spacecraft {
     pub fn inertia(&self) -> Matrix3<f64> {
         matrix(&self.inertia_srf_kg_m2)
     }
+
+    /// `J_S⁻¹`, SRF, kg⁻¹ m⁻².
+    #[must_use]
+    pub fn inertia_inverse(&self) -> Matrix3<f64> {
+        inverse(self.inertia())
+    }
 }
 
 impl TestMass {
@@ -484,12 +505,32 @@ impl TestMass {
         matrix(&self.stiffness_tr_orf_m_s2_rad)
     }
 
+    /// `J_m⁻¹`, MRF, kg⁻¹ m⁻².
+    ///
+    /// # Errors
+    /// [`MissionError::Missing`] when the mission gives no inertia; `name` is the section's.
+    pub fn inertia_inverse(&self, name: &str, needed_by: &'static str) -> Result<Matrix3<f64>, MissionError> {
+        self.inertia_mrf_kg_m2
+            .as_ref()
+            .map(|rows| inverse(matrix(rows)))
+            .ok_or_else(|| MissionError::Missing { section: format!("test_mass.{name}.inertia_mrf_kg_m2"), needed_by })
+    }
+
+    /// `S_RT = m J_m⁻¹ S_TRᵀ`, rad s⁻² per m: force and torque come from one potential.
+    #[must_use]
+    pub fn stiffness_rt(&self, inertia_inverse: &Matrix3<f64>) -> Matrix3<f64> {
+        inertia_inverse * self.stiffness_tr().transpose() * self.mass_kg
+    }
+
     /// `S_RR`, s⁻².
     #[must_use]
     pub fn stiffness_rr(&self) -> Matrix3<f64> {
         matrix(&self.stiffness_rr_orf_s2)
     }
 }
+
+/// Longest delay of a loop, samples: beyond it a mission file is in error, not slow.
+const MOST_DELAY_SAMPLES: u32 = 100;
 
 /// The fifteen channels in the order of eq:state_variables.
 pub const CHANNELS: [&str; 15] = [
