@@ -126,12 +126,11 @@ pub fn align_quaternions(rows: &mut Rows, first: usize, last: &mut Option<[f64; 
         if q.iter().any(|x| !x.is_finite()) {
             continue;
         }
-        if let Some(p) = *last {
-            if p.iter().zip(&q).map(|(a, b)| a * b).sum::<f64>() < 0.0 {
-                q = q.map(|x| -x);
-                for i in 0..4 {
-                    rows.columns[first + i][k] = q[i];
-                }
+        let flipped = last.is_some_and(|p| p.iter().zip(&q).map(|(a, b)| a * b).sum::<f64>() < 0.0);
+        if flipped {
+            q = q.map(|x| -x);
+            for i in 0..4 {
+                rows.columns[first + i][k] = q[i];
             }
         }
         *last = Some(q);
