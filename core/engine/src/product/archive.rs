@@ -1,0 +1,384 @@
+//! The archive: a folder of products. Writing is a transaction, reading trusts nothing.
+//!
+//! Files are made in a hidden folder inside the archive and hard-linked to their names, which fails where a name is
+//! taken, so nothing is ever overwritten. The `.toml` comes last: a product exists when it is complete. A claim file
+//! keeps two writers from mixing their attachments under one revision.
+
+use super::ProductError;
+use super::draft::{self, Draft, Report};
+use super::file::{self, Attachment, Product, Supersedes};
+use chrono::NaiveDate;
+use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
+use std::fs::{self, File, OpenOptions};
+use std::io::{ErrorKind, Write as _};
+use std::path::{Path, PathBuf};
+
+/// Revisions have four digits.
+const LAST_REVISION: u32 = 9999;
+
+/// A product and where it lies.
+#[derive(Clone, Debug)]
+pub struct Written {
+    /// The product.
+    pub product: Product,
+    /// Its `.toml`.
+    pub path: PathBuf,
+}
+
+/// Writes one product: ask for [`ProductWriter::staged`] paths, write the files, [`ProductWriter::commit`].
+/// Dropped without a commit it leaves nothing behind.
+#[derive(Debug)]
+pub struct ProductWriter {
+    archive: PathBuf,
+    staging: tempfile::TempDir,
+    staged: BTreeMap<String, PathBuf>,
+}
+
+impl ProductWriter {
+    /// Opens a transaction in the folder `archive`, which is made where it does not exist.
+    ///
+    /// # Errors
+    /// [`ProductError::Io`]: the folder cannot be made or written.
+    pub fn begin(archive: &Path) -> Result<Self, ProductError> {
+        fs::create_dir_all(archive).map_err(ProductError::io("make the archive", archive))?;
+        let staging = tempfile::Builder::new().prefix(".staging-").tempdir_in(archive);
+        let staging = staging.map_err(ProductError::io("write in the archive", archive))?;
+        Ok(Self { archive: archive.to_owned(), staging, staged: BTreeMap::new() })
+    }
+
+    /// Path at which the caller writes the file that will lie beside the product as `ID.suffix`.
+    pub fn staged(&mut self, suffix: &str) -> PathBuf {
+        let path = self.staging.path().join(suffix);
+        self.staged.insert(suffix.to_owned(), path.clone());
+        path
+    }
+
+    /// Writes the product of `draft` as the next free revision of its day.
+    ///
+    /// # Errors
+    /// [`ProductError`]; nothing is left in the archive then.
+    pub fn commit(mut self, draft: &Draft) -> Result<Written, ProductError> {
+        let stem = draft::stem(draft)?;
+        let reports = draft::parse_reports(&draft.reports)?;
+        self.attach(&reports)?;
+        let attachments = self.staged.iter().map(|(suffix, path)| seal(suffix, path));
+        let attachments = attachments.collect::<Result<Vec<_>, _>>()?;
+        let mut revision = 1;
+        loop {
+            revision = next_free(&self.archive, &stem, revision)?;
+            let Some(claim) = Claim::take(&self.archive, &stem, revision)? else {
+                revision += 1;
+                continue;
+            };
+            // Another writer may have finished between the look and the claim.
+            if next_free(&self.archive, &stem, revision)? == revision {
+                let supersedes = superseded(&self.archive, &stem, draft, &reports, &attachments)?;
+                let product = draft::product(draft, &reports, revision, attachments, supersedes)?;
+                let path = self.place(&product)?;
+                drop(claim);
+                return Ok(Written { product, path });
+            }
+        }
+    }
+
+    /// Writes the attachments of the reports.
+    fn attach(&mut self, reports: &[(String, Report)]) -> Result<(), ProductError> {
+        for (stage, report) in reports {
+            for attachment in &report.attachments {
+                let suffix = &attachment.suffix;
+                let refuse = |reason| ProductError::Attachment { stage: stage.clone(), suffix: suffix.clone(), reason };
+                let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || matches!(c, '.' | '-' | '_');
+                if !suffix.starts_with(|c: char| c.is_ascii_lowercase()) || !suffix.chars().all(plain) {
+                    return Err(refuse("a suffix is lower-case letters, digits, '.', '-' and '_', a letter first"));
+                }
+                if suffix == "toml" || self.staged.contains_key(suffix) {
+                    return Err(refuse("that file exists already"));
+                }
+                let path = self.staged(suffix);
+                fs::write(&path, &attachment.text).map_err(ProductError::io("write", path))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Gives every staged file its name, the product last.
+    fn place(&self, product: &Product) -> Result<PathBuf, ProductError> {
+        let staged = self.staging.path().join("product.toml");
+        let text = product.emit()?;
+        let mut file = File::create_new(&staged).map_err(ProductError::io("write", &staged))?;
+        file.write_all(text.as_bytes()).map_err(ProductError::io("write", &staged))?;
+        file.sync_all().map_err(ProductError::io("write", &staged))?;
+        let back = fs::read_to_string(&staged).map_err(ProductError::io("read", &staged))?;
+        if file::parse(&back, &staged)?.canonical() != product.canonical() {
+            return Err(ProductError::Damaged { path: staged, reason: "it does not read as it was written".into() });
+        }
+        let mut placed = Placed::default();
+        for (suffix, from) in &self.staged {
+            placed.link(from, self.archive.join(format!("{}.{suffix}", product.id())))?;
+        }
+        sync_folder(&self.archive)?;
+        let path = self.archive.join(format!("{}.toml", product.id()));
+        placed.link(&staged, path.clone())?;
+        sync_folder(&self.archive)?;
+        placed.keep();
+        Ok(path)
+    }
+}
+
+/// Makes a staged file durable and takes its digest.
+fn seal(suffix: &str, path: &Path) -> Result<Attachment, ProductError> {
+    let mut file = File::open(path).map_err(ProductError::io("read", path))?;
+    file.sync_all().map_err(ProductError::io("write", path))?;
+    let mut digest = Sha256::new();
+    let size = std::io::copy(&mut file, &mut DigestWriter(&mut digest)).map_err(ProductError::io("read", path))?;
+    Ok(Attachment { suffix: suffix.to_owned(), size, sha256: file::hexadecimal(&digest.finalize()) })
+}
+
+/// Lets `io::copy` feed a digest.
+struct DigestWriter<'a>(&'a mut Sha256);
+
+impl std::io::Write for DigestWriter<'_> {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.update(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+/// The right to write one revision: a hidden file that only one writer can make.
+struct Claim(PathBuf);
+
+impl Claim {
+    /// `None` where another writer has it. A claim that a killed writer left costs one revision number, no more.
+    fn take(archive: &Path, stem: &str, revision: u32) -> Result<Option<Self>, ProductError> {
+        let path = archive.join(format!(".{stem}_{revision:04}.claim"));
+        match OpenOptions::new().write(true).create_new(true).open(&path) {
+            Ok(_) => Ok(Some(Self(path))),
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => Ok(None),
+            Err(source) => Err(ProductError::Io { action: "write", path, source }),
+        }
+    }
+}
+
+impl Drop for Claim {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.0); // a claim that stays costs a revision number
+    }
+}
+
+/// Files that have their names, taken away again unless the whole product has.
+#[derive(Default)]
+struct Placed(Vec<PathBuf>);
+
+impl Placed {
+    fn link(&mut self, from: &Path, to: PathBuf) -> Result<(), ProductError> {
+        fs::hard_link(from, &to)
+            .map_err(ProductError::io("place (the archive's file system must have hard links)", &to))?;
+        self.0.push(to);
+        Ok(())
+    }
+
+    fn keep(mut self) {
+        self.0.clear();
+    }
+}
+
+impl Drop for Placed {
+    fn drop(&mut self) {
+        for path in &self.0 {
+            let _ = fs::remove_file(path); // already failing; what stays is reported by `list`
+        }
+    }
+}
+
+#[cfg(unix)]
+fn sync_folder(folder: &Path) -> Result<(), ProductError> {
+    File::open(folder).and_then(|folder| folder.sync_all()).map_err(ProductError::io("write", folder))
+}
+
+/// Elsewhere a folder is no file that could be flushed.
+#[cfg(not(unix))]
+fn sync_folder(_: &Path) -> Result<(), ProductError> {
+    Ok(())
+}
+
+/// The first revision from `from` on after every one that has a file in the archive.
+fn next_free(archive: &Path, stem: &str, from: u32) -> Result<u32, ProductError> {
+    let taken = names(archive)?.into_iter().filter_map(|name| {
+        let revision = name.strip_prefix(stem)?.strip_prefix('_')?.get(..4)?;
+        revision.parse::<u32>().ok()
+    });
+    let next = taken.max().map_or(1, |last| last + 1).max(from);
+    if next > LAST_REVISION { Err(ProductError::Full(stem.to_owned())) } else { Ok(next) }
+}
+
+/// Names in the archive that are text and not hidden, in order.
+fn names(archive: &Path) -> Result<Vec<String>, ProductError> {
+    let mut names = Vec::new();
+    for entry in fs::read_dir(archive).map_err(ProductError::io("read the archive", archive))? {
+        let entry = entry.map_err(ProductError::io("read the archive", archive))?;
+        if let Ok(name) = entry.file_name().into_string()
+            && !name.starts_with('.')
+        {
+            names.push(name);
+        }
+    }
+    names.sort();
+    Ok(names)
+}
+
+/// What the new product takes the place of, and what changed since.
+fn superseded(
+    archive: &Path,
+    stem: &str,
+    draft: &Draft,
+    reports: &[(String, Report)],
+    attachments: &[Attachment],
+) -> Result<Option<Supersedes>, ProductError> {
+    let earlier = names(archive)?.into_iter().rev().filter(|name| name.starts_with(stem) && name.ends_with(".toml"));
+    let Some(old) = earlier.filter_map(|name| file::read(&archive.join(name)).ok()).next() else {
+        return Ok(None);
+    };
+    let new = draft::product(draft, reports, 1, attachments.to_vec(), None)?;
+    let sha256 = old.header.non_standard_attributes.sha256.clone();
+    let changed = [
+        ("inputs", old.inputs != new.inputs),
+        ("plugins or their parameters", old.history != new.history),
+        ("program", software(&old) != software(&new)),
+        ("window", window(&old) != window(&new)),
+    ];
+    let changed: Vec<&str> = changed.into_iter().filter_map(|(what, differs)| differs.then_some(what)).collect();
+    let reason = match changed.as_slice() {
+        [] if sha256 == new.digest() => "run again, same result".to_owned(),
+        [] => "run again with the same inputs, plugins and parameters".to_owned(),
+        changed => format!("changed: {}", changed.join(", ")),
+    };
+    Ok(Some(Supersedes { id: old.id().to_owned(), sha256, reason }))
+}
+
+fn software(product: &Product) -> &str {
+    &product.header.non_standard_attributes.software_version
+}
+
+fn window(product: &Product) -> (i64, i64) {
+    let attributes = &product.header.non_standard_attributes;
+    (attributes.start_time_epoch_ns, attributes.stop_time_epoch_ns)
+}
+
+/// What an archive holds.
+#[derive(Clone, Debug, Default)]
+pub struct Listing {
+    /// Products by day, spacecraft, name, release and revision.
+    pub entries: Vec<Entry>,
+    /// Files that are no sound product; nothing is done to them.
+    pub problems: Vec<Problem>,
+}
+
+/// A product in an archive.
+#[derive(Clone, Debug)]
+pub struct Entry {
+    /// The product.
+    pub product: Product,
+    /// Its `.toml`.
+    pub path: PathBuf,
+    /// True for the highest revision of the highest release of its day and spacecraft.
+    pub latest: bool,
+}
+
+impl Entry {
+    /// The id without the revision.
+    fn stem(&self) -> &str {
+        self.product.id().rsplit_once('_').map_or("", |(stem, _)| stem)
+    }
+
+    /// Product, day and spacecraft: what the releases and revisions have in common.
+    fn series(&self) -> (String, String, String) {
+        let attributes = &self.product.header.non_standard_attributes;
+        let platform = &self.product.header.global_attributes.platform;
+        (attributes.day.clone(), platform.clone(), attributes.product.clone())
+    }
+}
+
+/// A file in an archive that is no sound product.
+#[derive(Clone, Debug)]
+pub struct Problem {
+    /// File.
+    pub path: PathBuf,
+    /// What is wrong, one sentence.
+    pub reason: String,
+}
+
+/// Lists an archive. What is damaged or foreign is reported beside the products.
+///
+/// # Errors
+/// [`ProductError::Io`]: the folder itself cannot be read.
+pub fn list(archive: &Path) -> Result<Listing, ProductError> {
+    let mut listing = Listing::default();
+    let names = names(archive)?;
+    for name in names.iter().filter(|name| name.ends_with(".toml")) {
+        let path = archive.join(name);
+        match file::read(&path).and_then(|product| complete(product, &path)) {
+            Ok(product) => listing.entries.push(Entry { product, path, latest: false }),
+            Err(error) => listing.problems.push(Problem { path, reason: error.to_string() }),
+        }
+    }
+    for name in names.iter().filter(|name| !name.ends_with(".toml")) {
+        let owned = |entry: &Entry| {
+            let suffix = name.strip_prefix(entry.product.id()).and_then(|rest| rest.strip_prefix('.'));
+            suffix.is_some_and(|suffix| entry.product.attachments.iter().any(|file| file.suffix == suffix))
+        };
+        if !listing.entries.iter().any(owned) {
+            let reason = "belongs to no sound product; a run that was stopped may have left it".to_owned();
+            listing.problems.push(Problem { path: archive.join(name), reason });
+        }
+    }
+    let order = |entry: &Entry| {
+        let attributes = &entry.product.header.non_standard_attributes;
+        (entry.series(), attributes.release, attributes.revision)
+    };
+    listing.entries.sort_by_key(order);
+    for index in 0..listing.entries.len() {
+        let next = listing.entries.get(index + 1).map(Entry::series);
+        listing.entries[index].latest = next != Some(listing.entries[index].series());
+    }
+    Ok(listing)
+}
+
+/// Checks that the files beside the product are there in full length.
+fn complete(product: Product, path: &Path) -> Result<Product, ProductError> {
+    for attachment in &product.attachments {
+        let beside = path.with_extension(&attachment.suffix);
+        let size = fs::metadata(&beside).map_err(ProductError::io("read", &beside))?.len();
+        if size != attachment.size {
+            let reason = format!("it has {size} bytes, the product says {}", attachment.size);
+            return Err(ProductError::Damaged { path: beside, reason });
+        }
+    }
+    Ok(product)
+}
+
+/// Finds a product by its id, by its id without the revision (the latest one then) or by its day.
+///
+/// # Errors
+/// [`ProductError`]: there is none, or it is damaged.
+pub fn find(archive: &Path, id: &str) -> Result<Entry, ProductError> {
+    let missing = || ProductError::NotFound { id: id.to_owned(), folder: archive.to_owned() };
+    let id = id.strip_suffix(".toml").unwrap_or(id);
+    let path = archive.join(format!("{id}.toml"));
+    let day = id.parse::<NaiveDate>().is_ok();
+    let listing = list(archive)?;
+    let found = listing.entries.into_iter().rev().find(|entry| {
+        entry.path == path || entry.stem() == id || (day && entry.product.header.non_standard_attributes.day == id)
+    });
+    match found {
+        Some(entry) => Ok(entry),
+        None if path.is_file() => {
+            Err(file::read(&path).and_then(|product| complete(product, &path)).err().unwrap_or_else(missing))
+        }
+        None => Err(missing()),
+    }
+}

@@ -1,0 +1,352 @@
+//! What a run knows at its end, and how it becomes a product.
+
+use super::ProductError;
+use super::file::{
+    Attachment, Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Loss, Model,
+    NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Supersedes, Variable,
+};
+use chrono::{DateTime, NaiveDate, SecondsFormat, Utc};
+use serde::Deserialize;
+use std::collections::{BTreeMap, BTreeSet};
+
+/// All that a product is made from.
+#[derive(Clone, Debug)]
+pub struct Draft {
+    /// Pipeline, `science-mode`.
+    pub pipeline: String,
+    /// Product name, `COM1B`: letters and digits.
+    pub product: String,
+    /// Release of the product; changes with model, estimator, frame or unit.
+    pub release: u32,
+    /// Mission, `Taiji`.
+    pub mission: String,
+    /// Spacecraft, `SC1`: letters, digits and `-`.
+    pub spacecraft: String,
+    /// UTC day in the product's name, that of the first epoch.
+    pub day: NaiveDate,
+    /// First epoch, Unix ns of `time_scale`.
+    pub first_ns: i64,
+    /// Last epoch, Unix ns of `time_scale`.
+    pub last_ns: i64,
+    /// `UTC`, `TAI` or `GPS`.
+    pub time_scale: String,
+    /// Operations, reprocessing or a test.
+    pub stream: Stream,
+    /// How final the product is.
+    pub status: Status,
+    /// Every file that was read.
+    pub inputs: Vec<Input>,
+    /// Every plugin that ran, in order.
+    pub history: Vec<Stage>,
+    /// Model that the estimators used.
+    pub model: Model,
+    /// Version of the program, with its commit where it is known.
+    pub software: String,
+    /// Data that were lost.
+    pub losses: Vec<Loss>,
+    /// Counts of the replay; those of the stages stand in their reports.
+    pub counts: BTreeMap<String, u64>,
+    /// Reports in pipeline order.
+    pub reports: Vec<StageReport>,
+    /// When the product is made; the engine has no clock.
+    pub created: DateTime<Utc>,
+}
+
+/// A stage's report as it came across the border.
+#[derive(Clone, Debug)]
+pub struct StageReport {
+    /// Stage, `qp-check`.
+    pub stage: String,
+    /// Its report, keys of [`Report`].
+    pub report: serde_json::Value,
+}
+
+/// What a stage says at the end of a run. Everything is optional; a key that is not listed here is noted in the
+/// product and left out.
+#[derive(Clone, Debug, Default, Deserialize)]
+#[serde(default)]
+pub struct Report {
+    /// Estimates.
+    pub coefficients: Vec<Estimate>,
+    /// Covariances by solution.
+    pub covariance: BTreeMap<String, ReportedCovariance>,
+    /// `agree`, `disagree` or `weak`.
+    pub verdict: Option<String>,
+    /// Directions that the data do not determine, one sentence each.
+    pub weak_directions: Vec<String>,
+    /// χ² per degree of freedom of the residuals.
+    pub chi2_per_dof: Option<f64>,
+    /// Mean normalised innovation squared per channel.
+    pub nis: Option<f64>,
+    /// `telemetered` or `reconstructed`.
+    pub commands: Option<String>,
+    /// Epochs that entered the result.
+    pub epochs_used: Option<u64>,
+    /// Epochs that did not.
+    pub epochs_rejected: Option<u64>,
+    /// True where data were lost.
+    pub data_loss: bool,
+    /// True where the model contradicts the data.
+    pub inconsistent: bool,
+    /// Counts, `gaps`, `spikes`.
+    pub counts: BTreeMap<String, u64>,
+    /// Sentences for the reader.
+    pub notes: Vec<String>,
+    /// Free figures of quality.
+    pub quality: serde_json::Map<String, serde_json::Value>,
+    /// Files to lie beside the product.
+    pub attachments: Vec<ReportedAttachment>,
+    /// Keys that this engine does not know.
+    #[serde(flatten)]
+    pub unknown: BTreeMap<String, serde_json::Value>,
+}
+
+/// One coefficient in a report.
+#[derive(Clone, Debug, Deserialize)]
+pub struct Estimate {
+    /// `com-offset.tm1.x`.
+    pub name: String,
+    /// `es-akf`, `qp` or `adopted`.
+    pub solution: String,
+    /// Value in `unit`.
+    pub value: Option<f64>,
+    /// Standard deviation in `unit`.
+    pub sigma: Option<f64>,
+    /// SI unit.
+    #[serde(default)]
+    pub unit: String,
+    /// Frame, empty where there is none.
+    #[serde(default)]
+    pub frame: String,
+}
+
+/// A covariance in a report.
+#[derive(Clone, Debug, Deserialize)]
+pub struct ReportedCovariance {
+    /// Coefficients of the rows, n.
+    pub names: Vec<String>,
+    /// n × n, by rows.
+    pub matrix: Vec<Vec<Option<f64>>>,
+}
+
+/// A text that is to lie beside the product.
+#[derive(Clone, Debug, Deserialize)]
+pub struct ReportedAttachment {
+    /// What follows the product's name, `neq.json`.
+    pub suffix: String,
+    /// Contents.
+    pub text: String,
+}
+
+/// A product's name without its revision, `COM1B_2035-01-01_SC1_01`.
+pub(super) fn stem(draft: &Draft) -> Result<String, ProductError> {
+    let named = |what, value: &str, place, extra: &[char]| {
+        let fits = !value.is_empty() && value.chars().all(|c| c.is_ascii_alphanumeric() || extra.contains(&c));
+        if fits { Ok(()) } else { Err(ProductError::Name { what, value: value.to_owned(), place }) }
+    };
+    named("the product name", &draft.product, "pipeline", &[])?;
+    named("the spacecraft", &draft.spacecraft, "mission", &['-'])?;
+    Ok(format!("{}_{}_{}_{:02}", draft.product, draft.day.format("%Y-%m-%d"), draft.spacecraft, draft.release))
+}
+
+/// Reads the reports; keys that no one knows come back as notes.
+pub(super) fn parse_reports(reports: &[StageReport]) -> Result<Vec<(String, Report)>, ProductError> {
+    let parse = |StageReport { stage, report }: &StageReport| {
+        let parsed = Report::deserialize(report)
+            .map_err(|source| ProductError::Report { stage: stage.clone(), source })
+            .map(|mut parsed| {
+                parsed.notes.extend(
+                    std::mem::take(&mut parsed.unknown).into_keys().map(|key| format!("unknown key {key:?} left out")),
+                );
+                parsed
+            })?;
+        Ok((stage.clone(), parsed))
+    };
+    reports.iter().map(parse).collect()
+}
+
+/// Builds the product with `revision`; its digest is filled in.
+pub(super) fn product(
+    draft: &Draft,
+    reports: &[(String, Report)],
+    revision: u32,
+    attachments: Vec<Attachment>,
+    supersedes: Option<Supersedes>,
+) -> Result<Product, ProductError> {
+    let id = format!("{}_{revision:04}", stem(draft)?);
+    let result = outcome(draft, reports);
+    let quality = quality(draft, reports);
+    let header = Header {
+        dimensions: Dimensions {
+            epoch: quality.epochs_used.saturating_add(quality.epochs_rejected),
+            coefficient: distinct(&result.coefficients).len(),
+            stage: draft.history.len(),
+            input: draft.inputs.len(),
+        },
+        global_attributes: GlobalAttributes {
+            id,
+            title: format!("{} calibration of {} {}", draft.product, draft.mission, draft.spacecraft),
+            summary: format!(
+                "Coefficients of the model's effects from {} files by the pipeline {}",
+                draft.inputs.len(),
+                draft.pipeline
+            ),
+            conventions: "CF-1.6, ACDD-1.3, ISO 8601".to_owned(),
+            project: draft.mission.clone(),
+            platform: draft.spacecraft.clone(),
+            processing_level: "1B".to_owned(),
+            product_version: format!("{:02}", draft.release),
+            source: draft.pipeline.clone(),
+            date_created: draft.created.to_rfc3339_opts(SecondsFormat::Secs, true),
+            time_coverage_start: calendar(draft.first_ns),
+            time_coverage_stop: calendar(draft.last_ns),
+        },
+        non_standard_attributes: NonStandardAttributes {
+            product: draft.product.clone(),
+            release: draft.release,
+            revision,
+            day: draft.day.format("%Y-%m-%d").to_string(),
+            stream: draft.stream,
+            status: draft.status,
+            time_scale: draft.time_scale.clone(),
+            start_time_epoch_ns: draft.first_ns,
+            stop_time_epoch_ns: draft.last_ns,
+            frames: frames(&result.coefficients),
+            software_version: draft.software.clone(),
+            sha256: String::new(),
+        },
+        variables: variables(&result.coefficients),
+    };
+    let mut product = Product {
+        format_version: FORMAT_VERSION.to_owned(),
+        header,
+        model: draft.model.clone(),
+        result,
+        quality,
+        supersedes,
+        inputs: draft.inputs.clone(),
+        history: draft.history.clone(),
+        losses: draft.losses.clone(),
+        attachments,
+    };
+    product.header.non_standard_attributes.sha256 = product.digest();
+    Ok(product)
+}
+
+/// The last stage that says something has the word: qp-check stands after the filter and has seen its report.
+fn last<T>(reports: &[(String, Report)], get: impl Fn(&Report) -> Option<T>) -> Option<T> {
+    reports.iter().rev().find_map(|(_, report)| get(report))
+}
+
+fn outcome(draft: &Draft, reports: &[(String, Report)]) -> Outcome {
+    let coefficients = reports.iter().flat_map(|(_, report)| &report.coefficients).map(|estimate| Coefficient {
+        name: estimate.name.clone(),
+        solution: estimate.solution.clone(),
+        value: estimate.value.unwrap_or(f64::NAN),
+        sigma: estimate.sigma.unwrap_or(f64::NAN),
+        unit: estimate.unit.clone(),
+        frame: estimate.frame.clone(),
+    });
+    let covariance = reports.iter().flat_map(|(_, report)| &report.covariance).map(|(solution, reported)| {
+        let row = |row: &Vec<Option<f64>>| row.iter().map(|entry| entry.unwrap_or(f64::NAN)).collect();
+        let matrix = reported.matrix.iter().map(row).collect();
+        (solution.clone(), Covariance { names: reported.names.clone(), matrix })
+    });
+    Outcome {
+        epoch_ns: draft.last_ns,
+        verdict: last(reports, |report| report.verdict.clone()),
+        coefficients: coefficients.collect(),
+        covariance: covariance.collect(),
+    }
+}
+
+fn quality(draft: &Draft, reports: &[(String, Report)]) -> Quality {
+    let mut weak_directions: Vec<String> = Vec::new();
+    for direction in reports.iter().flat_map(|(_, report)| &report.weak_directions) {
+        if !weak_directions.contains(direction) {
+            weak_directions.push(direction.clone());
+        }
+    }
+    let replayed = Some(("replay".to_owned(), draft.counts.clone())).filter(|(_, counts)| !counts.is_empty());
+    let reported = |(stage, report): &(String, Report)| {
+        (!report.counts.is_empty()).then(|| (stage.clone(), report.counts.clone()))
+    };
+    let note = |(stage, report): &(String, Report)| -> Vec<String> {
+        report.notes.iter().map(|note| format!("{stage}: {note}")).collect()
+    };
+    let figures = |(stage, report): &(String, Report)| {
+        (!report.quality.is_empty()).then(|| (stage.clone(), table(&report.quality)))
+    };
+    Quality {
+        epochs_used: last(reports, |report| report.epochs_used).unwrap_or(0),
+        epochs_rejected: last(reports, |report| report.epochs_rejected).unwrap_or(0),
+        commands: last(reports, |report| report.commands.clone()),
+        chi2_per_dof: last(reports, |report| report.chi2_per_dof).unwrap_or(f64::NAN),
+        nis: last(reports, |report| report.nis).unwrap_or(f64::NAN),
+        data_loss: !draft.losses.is_empty() || reports.iter().any(|(_, report)| report.data_loss),
+        inconsistent: reports.iter().any(|(_, report)| report.inconsistent),
+        weak_directions,
+        notes: reports.iter().flat_map(note).collect(),
+        counts: replayed.into_iter().chain(reports.iter().filter_map(reported)).collect(),
+        stages: reports.iter().filter_map(figures).collect(),
+    }
+}
+
+/// JSON as TOML: TOML has no null, so a missing value becomes `nan`.
+fn value(json: &serde_json::Value) -> toml::Value {
+    use serde_json::Value as Json;
+    match json {
+        Json::Null => toml::Value::Float(f64::NAN),
+        Json::Bool(flag) => toml::Value::Boolean(*flag),
+        Json::Number(number) => match number.as_i64() {
+            Some(integer) => toml::Value::Integer(integer),
+            None => toml::Value::Float(number.as_f64().unwrap_or(f64::NAN)),
+        },
+        Json::String(text) => toml::Value::String(text.clone()),
+        Json::Array(items) => toml::Value::Array(items.iter().map(value).collect()),
+        Json::Object(map) => toml::Value::Table(table(map)),
+    }
+}
+
+fn table(map: &serde_json::Map<String, serde_json::Value>) -> toml::Table {
+    map.iter().map(|(key, item)| (key.clone(), value(item))).collect()
+}
+
+/// One entry per coefficient, whatever the number of its solutions, in the order of the reports.
+fn distinct(coefficients: &[Coefficient]) -> Vec<&Coefficient> {
+    let mut seen = BTreeSet::new();
+    coefficients.iter().filter(|coefficient| seen.insert(&coefficient.name)).collect()
+}
+
+fn frames(coefficients: &[Coefficient]) -> Vec<String> {
+    let named = coefficients.iter().map(|c| &c.frame).filter(|frame| !frame.is_empty());
+    named.collect::<BTreeSet<_>>().into_iter().cloned().collect()
+}
+
+fn variables(coefficients: &[Coefficient]) -> Vec<Variable> {
+    let estimated = distinct(coefficients).into_iter().map(|coefficient| Variable {
+        name: coefficient.name.clone(),
+        long_name: format!("coefficient {}", coefficient.name),
+        units: coefficient.unit.clone(),
+        frame: coefficient.frame.clone(),
+        coverage_content_type: "modelResult".to_owned(),
+    });
+    let figure = |name: &str, long_name: &str, units: &str| Variable {
+        name: name.to_owned(),
+        long_name: long_name.to_owned(),
+        units: units.to_owned(),
+        frame: String::new(),
+        coverage_content_type: "qualityInformation".to_owned(),
+    };
+    let figures = [
+        figure("covariance", "covariance of the coefficients; the product of the units of row and column", ""),
+        figure("chi2_per_dof", "chi-squared of the residuals per degree of freedom", "1"),
+        figure("nis", "mean normalised innovation squared per channel", "1"),
+    ];
+    estimated.chain(figures).collect()
+}
+
+/// ISO 8601 in the product's own time scale, hence without a zone.
+fn calendar(time_ns: i64) -> String {
+    DateTime::from_timestamp_nanos(time_ns).format("%Y-%m-%dT%H:%M:%S%.9f").to_string()
+}

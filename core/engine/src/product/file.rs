@@ -1,0 +1,423 @@
+//! The product file: its layout, its digest, reading and emitting.
+
+use super::ProductError;
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::LazyLock;
+
+/// Version of the layout.
+pub const FORMAT_VERSION: &str = "1.0.0";
+
+static SCHEMA: LazyLock<jsonschema::Validator> = LazyLock::new(|| {
+    let schema = serde_json::from_str(include_str!("../../../../fixtures/schema/product.schema.json"))
+        .expect("the committed schema is JSON");
+    jsonschema::validator_for(&schema).expect("the committed schema is a JSON Schema")
+});
+
+/// A product: header blocks after GRACE-FO's Level-1B, then what the run found and how.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Product {
+    /// Version of the layout, [`FORMAT_VERSION`].
+    pub format_version: String,
+    /// What the file is.
+    pub header: Header,
+    /// Model that the estimators used.
+    pub model: Model,
+    /// What they found.
+    pub result: Outcome,
+    /// How far to trust it.
+    pub quality: Quality,
+    /// The revision that this one takes the place of.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub supersedes: Option<Supersedes>,
+    /// Every file that was read.
+    pub inputs: Vec<Input>,
+    /// Every plugin that ran, in order.
+    pub history: Vec<Stage>,
+    /// Data that were lost.
+    pub losses: Vec<Loss>,
+    /// Files beside the product.
+    pub attachments: Vec<Attachment>,
+}
+
+/// Header blocks with the names of GRACE-FO's Level-1B files.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Header {
+    /// How many of each.
+    pub dimensions: Dimensions,
+    /// Attributes of CF and ACDD.
+    pub global_attributes: GlobalAttributes,
+    /// Attributes that those conventions do not know.
+    pub non_standard_attributes: NonStandardAttributes,
+    /// Quantities with their units.
+    pub variables: Vec<Variable>,
+}
+
+/// How many of each.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Dimensions {
+    /// Epochs, used and rejected.
+    pub epoch: u64,
+    /// Coefficients, whatever the number of solutions.
+    pub coefficient: usize,
+    /// Plugins that ran.
+    pub stage: usize,
+    /// Files read.
+    pub input: usize,
+}
+
+/// Attributes of CF and ACDD.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct GlobalAttributes {
+    /// `COM1B_2035-01-01_SC1_01_0001`, also the file's name.
+    pub id: String,
+    /// One line.
+    pub title: String,
+    /// One sentence.
+    pub summary: String,
+    /// Conventions that the names follow.
+    pub conventions: String,
+    /// Mission.
+    pub project: String,
+    /// Spacecraft.
+    pub platform: String,
+    /// `1B`.
+    pub processing_level: String,
+    /// Release, two digits.
+    pub product_version: String,
+    /// Pipeline.
+    pub source: String,
+    /// When the file was made, UTC; not part of the digest.
+    pub date_created: String,
+    /// First epoch in the product's time scale.
+    pub time_coverage_start: String,
+    /// Last epoch in the product's time scale.
+    pub time_coverage_stop: String,
+}
+
+/// Attributes that CF and ACDD do not know.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NonStandardAttributes {
+    /// Product name, `COM1B`.
+    pub product: String,
+    /// Changes with model, estimator, frame or unit.
+    pub release: u32,
+    /// Changes with late data or another run of the same day.
+    pub revision: u32,
+    /// UTC day of the first epoch.
+    pub day: String,
+    /// Operations, reprocessing or a test.
+    pub stream: Stream,
+    /// How final the product is.
+    pub status: Status,
+    /// `UTC`, `TAI` or `GPS`.
+    pub time_scale: String,
+    /// First epoch, Unix ns of `time_scale`.
+    pub start_time_epoch_ns: i64,
+    /// Last epoch, Unix ns of `time_scale`.
+    pub stop_time_epoch_ns: i64,
+    /// Frames that the coefficients stand in.
+    pub frames: Vec<String>,
+    /// Version of the program.
+    pub software_version: String,
+    /// [`Product::digest`].
+    pub sha256: String,
+}
+
+/// Why a product was made.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "UPPERCASE")]
+pub enum Stream {
+    /// Daily operations.
+    Oper,
+    /// Reprocessing.
+    Rpro,
+    /// A test or a simulation.
+    Test,
+}
+
+/// How final a product is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Status {
+    /// First look, data may still come.
+    Quicklook,
+    /// All data are in.
+    Final,
+    /// Not to be used.
+    Withdrawn,
+}
+
+/// A quantity of the product.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Variable {
+    /// Name, as in the result.
+    pub name: String,
+    /// In words.
+    pub long_name: String,
+    /// SI unit.
+    pub units: String,
+    /// Frame, empty where there is none.
+    pub frame: String,
+    /// ISO 19115-1 code, `modelResult`.
+    pub coverage_content_type: String,
+}
+
+/// Model that the estimators used.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Model {
+    /// Its revision.
+    pub revision: String,
+    /// The revision that it came from.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub parent: Option<String>,
+    /// Its effects, each once, `com-offset`.
+    pub effects: Vec<String>,
+}
+
+/// What the estimators found.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Outcome {
+    /// Epoch of the coefficients, Unix ns of the product's time scale: the end of the window.
+    pub epoch_ns: i64,
+    /// `agree`, `disagree` or `weak`; absent where no stage compared solutions.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub verdict: Option<String>,
+    /// Every coefficient of every solution.
+    pub coefficients: Vec<Coefficient>,
+    /// Covariances by solution.
+    pub covariance: BTreeMap<String, Covariance>,
+}
+
+/// One coefficient of one solution.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Coefficient {
+    /// `com-offset.tm1.x`.
+    pub name: String,
+    /// `es-akf`, `qp` or `adopted`.
+    pub solution: String,
+    /// Value in `unit`.
+    pub value: f64,
+    /// Standard deviation in `unit`.
+    pub sigma: f64,
+    /// SI unit.
+    pub unit: String,
+    /// Frame, empty where there is none.
+    pub frame: String,
+}
+
+/// A covariance; its units are the products of those of the coefficients.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Covariance {
+    /// Coefficients of the rows, n.
+    pub names: Vec<String>,
+    /// n × n, by rows.
+    pub matrix: Vec<Vec<f64>>,
+}
+
+/// How far to trust the result.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Quality {
+    /// Epochs that entered the result.
+    pub epochs_used: u64,
+    /// Epochs that did not.
+    pub epochs_rejected: u64,
+    /// `telemetered` or `reconstructed`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub commands: Option<String>,
+    /// χ² of the residuals per degree of freedom.
+    pub chi2_per_dof: f64,
+    /// Mean normalised innovation squared per channel.
+    pub nis: f64,
+    /// True where data were lost.
+    pub data_loss: bool,
+    /// True where the model contradicts the data.
+    pub inconsistent: bool,
+    /// Directions that the data do not determine.
+    pub weak_directions: Vec<String>,
+    /// Sentences of the stages.
+    pub notes: Vec<String>,
+    /// Counts by stage; `replay` is the engine's own.
+    pub counts: BTreeMap<String, BTreeMap<String, u64>>,
+    /// Free figures by stage.
+    pub stages: BTreeMap<String, toml::Table>,
+}
+
+/// The revision that a product takes the place of.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Supersedes {
+    /// Its id.
+    pub id: String,
+    /// Its digest.
+    pub sha256: String,
+    /// What changed since.
+    pub reason: String,
+}
+
+/// A file that was read.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Input {
+    /// What it is: `telemetry`, `mission`, `model`, `pipeline` or `state`.
+    pub role: String,
+    /// File name without folders, so that a product does not depend on where it was made.
+    pub name: String,
+    /// Bytes.
+    pub size: u64,
+    /// Digest, lower-case hexadecimal.
+    pub sha256: String,
+}
+
+/// A plugin that ran.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Stage {
+    /// Plugin, `qp-check`.
+    pub plugin: String,
+    /// Instance of an effect, `tm1`; empty for sources and stages.
+    pub instance: String,
+    /// `source`, `stage` or `effect`.
+    pub kind: String,
+    /// Version of the plugin.
+    pub version: String,
+    /// ABI that it was built for.
+    pub abi: String,
+    /// Digest of its library.
+    pub library_sha256: String,
+    /// Digest of its parameters, defaults filled in.
+    pub parameters_sha256: String,
+}
+
+/// Data that were lost.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Loss {
+    /// What was lost, `corrupt chunk`.
+    pub kind: String,
+    /// How often.
+    pub count: u64,
+    /// Where and why, one sentence.
+    pub detail: String,
+}
+
+/// A file beside the product.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Attachment {
+    /// What follows the product's id, `neq.json`.
+    pub suffix: String,
+    /// Bytes.
+    pub size: u64,
+    /// Digest, lower-case hexadecimal.
+    pub sha256: String,
+}
+
+impl Product {
+    /// `COM1B_2035-01-01_SC1_01_0001`.
+    #[must_use]
+    pub fn id(&self) -> &str {
+        &self.header.global_attributes.id
+    }
+
+    /// SHA-256 of what the run found and from what, lower-case hexadecimal.
+    ///
+    /// Its bytes are the document as JSON without white space, keys sorted, missing numbers `null`; left out are the
+    /// creation date, the id and revision, what it supersedes and the digest itself. The same inputs, plugins,
+    /// parameters and model therefore give the same digest, whenever and how often they are run.
+    #[must_use]
+    pub fn digest(&self) -> String {
+        let mut computed = self.clone();
+        computed.supersedes = None;
+        computed.header.global_attributes.id.clear();
+        computed.header.global_attributes.date_created.clear();
+        computed.header.non_standard_attributes.revision = 0;
+        computed.header.non_standard_attributes.sha256.clear();
+        hexadecimal(&Sha256::digest(computed.canonical()))
+    }
+
+    /// The whole document as JSON without white space, keys sorted.
+    pub(super) fn canonical(&self) -> Vec<u8> {
+        let mut document = self.document();
+        document.sort_all_objects();
+        document.to_string().into_bytes()
+    }
+
+    fn document(&self) -> serde_json::Value {
+        serde_json::to_value(self).expect("every key of a product is a string")
+    }
+
+    /// The text of the file, checked against the schema.
+    pub(super) fn emit(&self) -> Result<String, ProductError> {
+        check(self.id(), &self.document())?;
+        toml::to_string(self).map_err(|source| ProductError::Emit { id: self.id().to_owned(), source })
+    }
+}
+
+/// Reads a product and checks its format version, schema, name and digest.
+///
+/// # Errors
+/// [`ProductError`]: the file cannot be read, is no product, is from a later version or was changed.
+pub fn read(path: &Path) -> Result<Product, ProductError> {
+    let text = std::fs::read_to_string(path).map_err(ProductError::io("read", path))?;
+    let product = parse(&text, path)?;
+    if path.file_stem().is_none_or(|stem| stem != product.id()) {
+        return Err(ProductError::Damaged {
+            path: path.to_owned(),
+            reason: format!("the file says that it is {}", product.id()),
+        });
+    }
+    Ok(product)
+}
+
+/// Reads a product's text; `path` is for messages.
+pub(super) fn parse(text: &str, path: &Path) -> Result<Product, ProductError> {
+    let table = |source| ProductError::Parse { path: path.to_owned(), source: Box::new(source) };
+    let document: toml::Table = toml::from_str(text).map_err(table)?;
+    let major = |version: &str| version.split('.').next().map(str::to_owned);
+    if let Some(found) = document.get("format_version").and_then(toml::Value::as_str)
+        && major(found) != major(FORMAT_VERSION)
+    {
+        return Err(ProductError::Format { path: path.to_owned(), found: found.to_owned() });
+    }
+    let name = path.file_stem().unwrap_or_default().to_string_lossy();
+    check(&name, &serde_json::to_value(&document).expect("every key of TOML is a string"))?;
+    let product: Product = document.try_into().map_err(table)?;
+    let written = &product.header.non_standard_attributes.sha256;
+    let found = product.digest();
+    if found != *written {
+        let reason = format!("its digest is {found}, the file says {written}");
+        return Err(ProductError::Damaged { path: path.to_owned(), reason });
+    }
+    Ok(product)
+}
+
+fn check(id: &str, document: &serde_json::Value) -> Result<(), ProductError> {
+    SCHEMA.validate(document).map_err(|error| ProductError::Schema {
+        id: id.to_owned(),
+        at: error.instance_path().to_string(),
+        reason: error.to_string(),
+    })
+}
+
+/// Lower-case hexadecimal.
+pub(super) fn hexadecimal(bytes: &[u8]) -> String {
+    use std::fmt::Write as _;
+    bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
+        let _ = write!(text, "{byte:02x}"); // writing to a String cannot fail
+        text
+    })
+}

@@ -1,0 +1,133 @@
+//! Products: what a run leaves behind, `COM1B_2035-01-01_SC1_01_0001.toml` and the files beside it.
+//!
+//! The engine fills a [`Draft`] when the last stage has reported; [`ProductWriter`] turns it into a [`Product`] and
+//! archives it. A product is immutable: a second run of the same day is the next revision. The layout is fixed by
+//! `fixtures/schema/product.schema.json`, which every product is checked against when written and when read.
+//!
+//! A missing number is `nan` in a product, as in the tables, and `null` in JSON, which has no `nan`.
+
+mod archive;
+mod draft;
+mod file;
+mod json;
+
+pub use archive::{Entry, Listing, Problem, ProductWriter, Written, find, list};
+pub use draft::{Draft, Estimate, Report, ReportedAttachment, ReportedCovariance, StageReport};
+pub use file::{
+    Attachment, Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Loss, Model,
+    NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Supersedes, Variable, read,
+};
+pub use json::to_json;
+
+use std::path::PathBuf;
+
+/// Why a product could not be made, written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum ProductError {
+    /// The operating system refused something.
+    #[error("cannot {action} {}: {source}", path.display())]
+    Io {
+        /// What was tried, "write".
+        action: &'static str,
+        /// File or folder.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// A stage's report does not have the form of `Report`.
+    #[error("the report of stage {stage} cannot be read: {source}; the plugin's author has to mend it")]
+    Report {
+        /// Stage.
+        stage: String,
+        /// What is wrong.
+        source: serde_json::Error,
+    },
+    /// Two stages, or one stage twice, want to write the same file beside the product.
+    #[error("stage {stage} attaches {suffix:?}, but {reason}; rename the attachment in the plugin")]
+    Attachment {
+        /// Stage.
+        stage: String,
+        /// Suffix asked for.
+        suffix: String,
+        /// Why not.
+        reason: &'static str,
+    },
+    /// A part of the product's name holds a character that would break the name apart.
+    #[error(
+        "{what} {value:?} cannot stand in a file name: only letters, digits and '-' may; change it in the {place} file"
+    )]
+    Name {
+        /// Which part.
+        what: &'static str,
+        /// Its value.
+        value: String,
+        /// Where it is set.
+        place: &'static str,
+    },
+    /// A time outside what dates can hold.
+    #[error("time {0} ns is beyond the calendar")]
+    Time(i64),
+    /// The document breaks the schema.
+    #[error("product {id} breaks its schema at {at}: {reason}")]
+    Schema {
+        /// Product.
+        id: String,
+        /// JSON pointer of the offending value, `/result/coefficients/0/sigma`.
+        at: String,
+        /// What is wrong there.
+        reason: String,
+    },
+    /// The file is no TOML.
+    #[error("{} is no product: {source}", path.display())]
+    Parse {
+        /// File.
+        path: PathBuf,
+        /// Where the text goes wrong.
+        source: Box<toml::de::Error>,
+    },
+    /// The product cannot be expressed in TOML.
+    #[error("product {id} cannot be written as TOML: {source}")]
+    Emit {
+        /// Product.
+        id: String,
+        /// Why.
+        source: toml::ser::Error,
+    },
+    /// The file was changed after it was archived, or did not survive being written.
+    #[error("{} is damaged: {reason}; restore it from a copy, or run the day again", path.display())]
+    Damaged {
+        /// File.
+        path: PathBuf,
+        /// What does not fit.
+        reason: String,
+    },
+    /// The file was written by a later program.
+    #[error("{} has format version {found}, this program reads {FORMAT_VERSION}; use a newer dragfree", path.display())]
+    Format {
+        /// File.
+        path: PathBuf,
+        /// Version found.
+        found: String,
+    },
+    /// No such product.
+    #[error("no product {id} in {}; `dragfree products list` shows what there is", folder.display())]
+    NotFound {
+        /// Name asked for.
+        id: String,
+        /// Archive.
+        folder: PathBuf,
+    },
+    /// All revisions of that day are used up.
+    #[error("all 9999 revisions of {0} are taken; raise the release in the pipeline file")]
+    Full(String),
+}
+
+impl ProductError {
+    fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.into();
+        move |source| Self::Io { action, path, source }
+    }
+}
+
+#[cfg(test)]
+mod tests;
