@@ -1,0 +1,128 @@
+//! Rows as Arrow C Data: borrowed on the way in, owned and checked on the way out.
+
+use arrow_array::{StructArray, cast::AsArray, types::Float64Type, types::Int64Type};
+use arrow_data::ffi::FFI_ArrowArray;
+use arrow_schema::{DataType, Field, Fields, ffi::FFI_ArrowSchema};
+use dragfree_abi as abi;
+use std::collections::HashMap;
+use std::ffi::c_void;
+use std::ptr;
+
+use crate::table::{Batch, Column};
+
+const _: () = assert!(size_of::<FFI_ArrowArray>() == size_of::<abi::ArrowArray>());
+const _: () = assert!(size_of::<FFI_ArrowSchema>() == size_of::<abi::ArrowSchema>());
+
+/// The struct type of a table: `time_ns`, then its columns with unit, frame and rate as field metadata.
+pub(super) fn fields_of(columns: &[Column]) -> Fields {
+    std::iter::once(Field::new("time_ns", DataType::Int64, false))
+        .chain(columns.iter().map(|c| {
+            let mut metadata: HashMap<String, String> =
+                c.attributes.iter().map(|(k, v)| (k.clone(), v.clone())).collect();
+            metadata.insert("unit".to_owned(), c.unit.clone());
+            metadata.insert("frame".to_owned(), c.frame.clone());
+            metadata.insert("rate_hz".to_owned(), c.rate_hz.to_string());
+            Field::new(&c.name, DataType::Float64, false).with_metadata(metadata)
+        }))
+        .collect()
+}
+
+/// A struct array over rows that stay the host's: no release, nothing to free but the pointers held here.
+pub(super) struct Borrowed {
+    pub(super) array: abi::ArrowArray,
+    _children: Vec<abi::ArrowArray>,
+    _child_pointers: Vec<*mut abi::ArrowArray>,
+    _buffers: Vec<[*const c_void; 2]>,
+    _own_buffers: Box<[*const c_void; 1]>,
+}
+
+impl Borrowed {
+    /// The caller keeps `time_ns` and `columns` alive and unchanged as long as the result is used.
+    pub(super) fn new(time_ns: &[i64], columns: &[&[f64]]) -> Self {
+        let rows = time_ns.len().cast_signed() as i64;
+        let mut buffers: Vec<[*const c_void; 2]> = std::iter::once(time_ns.as_ptr().cast())
+            .chain(columns.iter().map(|c| c.as_ptr().cast()))
+            .map(|values| [ptr::null(), values])
+            .collect();
+        let mut children: Vec<abi::ArrowArray> = buffers
+            .iter_mut()
+            .map(|b| abi::ArrowArray {
+                length: rows,
+                n_buffers: 2,
+                buffers: b.as_mut_ptr(),
+                ..abi::ArrowArray::empty()
+            })
+            .collect();
+        let mut child_pointers: Vec<*mut abi::ArrowArray> = children.iter_mut().map(|c| &raw mut *c).collect();
+        let mut own_buffers = Box::new([ptr::null()]);
+        let array = abi::ArrowArray {
+            length: rows,
+            n_buffers: 1,
+            buffers: own_buffers.as_mut_ptr(),
+            n_children: child_pointers.len().cast_signed() as i64,
+            children: child_pointers.as_mut_ptr(),
+            ..abi::ArrowArray::empty()
+        };
+        Self {
+            array,
+            _children: children,
+            _child_pointers: child_pointers,
+            _buffers: buffers,
+            _own_buffers: own_buffers,
+        }
+    }
+}
+
+/// Takes a plugin's array: checks its shape, copies the rows, releases it.
+///
+/// # Safety
+/// `array` was written by a plugin as a struct array of the C Data Interface, or is untouched.
+pub(super) unsafe fn take(array: abi::ArrowArray, fields: &Fields) -> Result<Batch, String> {
+    let columns = fields.len() - 1;
+    if array.release.is_none() {
+        return if array.length == 0 && array.children.is_null() {
+            Ok(Batch::empty(columns))
+        } else {
+            Err("an output array without a release function".to_owned())
+        };
+    }
+    // SAFETY: by the caller; the array has not been released.
+    let shape = unsafe { check_shape(&array, fields.len()) };
+    // SAFETY: the two structs have one layout; from here on `owned` releases the array when it is dropped.
+    let owned: FFI_ArrowArray = unsafe { std::mem::transmute(array) };
+    shape?;
+    let schema = FFI_ArrowSchema::try_from(DataType::Struct(fields.clone())).map_err(|e| e.to_string())?;
+    // SAFETY: the shape was checked against the declared fields; buffer lengths cannot be checked across a C border.
+    let data = unsafe { arrow_array::ffi::from_ffi(owned, &schema) }.map_err(|e| e.to_string())?;
+    let rows = StructArray::from(data);
+    Ok(Batch {
+        time_ns: rows.column(0).as_primitive::<Int64Type>().values().to_vec(),
+        columns: (1..=columns).map(|i| rows.column(i).as_primitive::<Float64Type>().values().to_vec()).collect(),
+    })
+}
+
+/// # Safety
+/// `array` is a released-able Arrow array.
+unsafe fn check_shape(array: &abi::ArrowArray, children: usize) -> Result<(), String> {
+    if array.n_children != children.cast_signed() as i64 || array.children.is_null() {
+        return Err(format!("an output table of {} children where {children} were declared", array.n_children));
+    }
+    if array.length < 0 || array.offset < 0 || array.n_buffers != 1 || array.null_count > 0 {
+        return Err("an output table that is no struct array without nulls".to_owned());
+    }
+    for i in 0..children {
+        // SAFETY: there are `n_children` pointers.
+        let child = unsafe { (*array.children.add(i)).as_ref() }.ok_or("an output column without an array")?;
+        if child.n_buffers != 2 || child.buffers.is_null() || child.offset < 0 || child.null_count > 0 {
+            return Err(format!("output column {i} is no primitive array without nulls"));
+        }
+        if child.length < array.length.saturating_add(array.offset) {
+            return Err(format!("output column {i} has {} rows where the table has {}", child.length, array.length));
+        }
+        // SAFETY: there are two buffers.
+        if child.length > 0 && unsafe { (*child.buffers.add(1)).is_null() } {
+            return Err(format!("output column {i} has no values"));
+        }
+    }
+    Ok(())
+}

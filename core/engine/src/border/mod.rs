@@ -1,0 +1,57 @@
+//! The host's side of `plugin.h`: libraries, instances, calls. All unsafe code of the engine is in this folder.
+//!
+//! A library is opened once and never closed: unloading code with thread-locals is unsound (rust-lang/rust#59629).
+#![allow(unsafe_code, reason = "this module calls through the C border")]
+
+mod arrow;
+mod floats;
+mod instance;
+mod library;
+
+pub use instance::{Config, Instance, LinkRequest, Linked, ReadColumn, Rows, SourceStep};
+pub use library::{Kind, Library, Manifest, Parameter, PluginInfo};
+
+use std::path::PathBuf;
+
+/// What can go wrong at the border.
+#[derive(Debug, thiserror::Error)]
+pub enum BorderError {
+    /// A library was refused.
+    #[error("{}: refused: {reason}", path.display())]
+    Refused {
+        /// The file.
+        path: PathBuf,
+        /// Why, and what to do next.
+        reason: String,
+    },
+    /// A plugin refused its configuration or its columns, or failed.
+    #[error("plugin {plugin}: {call}: {message}")]
+    Plugin {
+        /// Id of the plugin.
+        plugin: String,
+        /// The call that failed.
+        call: &'static str,
+        /// The plugin's own words.
+        message: String,
+        /// The instance must never be called again.
+        fatal: bool,
+    },
+    /// A plugin broke the rules of the border.
+    #[error("plugin {plugin}: {call}: broke the rules of plugin.h: {what}; report it to its author")]
+    Rule {
+        /// Id of the plugin.
+        plugin: String,
+        /// The call.
+        call: &'static str,
+        /// The rule.
+        what: String,
+    },
+    /// Columns do not fit.
+    #[error("plugin {plugin}: {sentence}")]
+    Link {
+        /// Id of the plugin.
+        plugin: String,
+        /// What is wanted, what is there, what to do.
+        sentence: String,
+    },
+}

@@ -1,0 +1,310 @@
+//! Linking: every plugin of a pipeline made, asked for its columns, and routed, before a byte of data is read.
+
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
+
+use super::{Carry, Chain, ChainError, ChainNode, Queue, Reader, Route};
+use crate::border::{Config, Instance, Kind, LinkRequest, Linked};
+use crate::config::{EffectEntry, Mission, Model, Node, Pipeline, resolve_parameters};
+use crate::registry::{Found, Registry};
+use crate::table::{Column, TableSpec};
+
+/// A coefficient of the model, as it crosses the border; an open end of a range is null.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Coefficient {
+    /// `com-offset.tm1.x`
+    pub name: String,
+    /// Id of the effect.
+    #[serde(default)]
+    pub effect: String,
+    /// Instance of the effect.
+    #[serde(default)]
+    pub instance: String,
+    /// SI unit.
+    pub unit: String,
+    /// Frame.
+    #[serde(default)]
+    pub frame: String,
+    /// Lower end of the range.
+    #[serde(default)]
+    pub lower: Option<f64>,
+    /// Upper end of the range.
+    #[serde(default)]
+    pub upper: Option<f64>,
+    /// Value before any data.
+    #[serde(default)]
+    pub initial: f64,
+    /// Standard deviation before any data.
+    #[serde(default)]
+    pub prior_sigma: Option<f64>,
+    /// False where the model fixes it.
+    #[serde(default = "yes")]
+    pub estimate: bool,
+}
+
+fn yes() -> bool {
+    true
+}
+
+/// A linear constraint on coefficients.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Constraint {
+    /// Name.
+    pub name: String,
+    /// `survey` or `range`.
+    pub kind: String,
+    /// Coefficients with weights.
+    pub terms: Vec<(String, f64)>,
+    /// Lower bound.
+    #[serde(default)]
+    pub lower: Option<f64>,
+    /// Upper bound.
+    #[serde(default)]
+    pub upper: Option<f64>,
+    /// SI unit.
+    #[serde(default)]
+    pub unit: String,
+    /// Number of instances that must contribute.
+    #[serde(default = "one")]
+    pub parts: u32,
+}
+
+fn one() -> u32 {
+    1
+}
+
+/// Links a pipeline over the tables of a feed.
+///
+/// # Errors
+/// A plugin is missing, refuses its parameters, wants a column that nobody makes or with another unit, frame or rate;
+/// the model names an effect or a coefficient that does not exist.
+pub fn build(
+    registry: &Registry,
+    pipeline: &Pipeline,
+    mission: &Mission,
+    model: &Model,
+    feed_tables: &[TableSpec],
+    carry: Carry,
+) -> Result<Chain, ChainError> {
+    let mut builder = Builder {
+        registry,
+        mission,
+        model,
+        available: feed_tables.iter().filter(|t| !t.truth).flat_map(|t| t.columns.clone()).collect(),
+        chain: Chain {
+            nodes: Vec::new(),
+            coefficients: Vec::new(),
+            constraints: Vec::new(),
+            feed_tables: feed_tables.to_vec(),
+            feed_routes: vec![Route::default(); feed_tables.len()],
+            carry: Carry { batch_rows: carry.batch_rows.max(1), ..carry },
+            complete_until_ns: i64::MIN,
+        },
+    };
+    for node in &pipeline.nodes {
+        match node {
+            Node::Stage { plugin, parameters } => builder.stage(plugin, parameters, pipeline)?,
+            Node::Effects => builder.effects()?,
+        }
+    }
+    if !model.effects.is_empty() && !pipeline.nodes.contains(&Node::Effects) {
+        return Err(builder.model_error(format!(
+            "has effects, but {} has no `[[stage]] effects = true` to say where they stand",
+            pipeline.path.display()
+        )));
+    }
+    Ok(builder.chain)
+}
+
+struct Builder<'a> {
+    registry: &'a Registry,
+    mission: &'a Mission,
+    model: &'a Model,
+    available: Vec<Column>,
+    chain: Chain,
+}
+
+impl Builder<'_> {
+    fn model_error(&self, what: String) -> ChainError {
+        ChainError::Model { path: self.model.path.display().to_string(), what }
+    }
+
+    fn model_json(&self) -> String {
+        json!({ "coefficients": self.chain.coefficients, "constraints": self.chain.constraints }).to_string()
+    }
+
+    fn stage(&mut self, id: &str, parameters: &toml::Table, pipeline: &Pipeline) -> Result<(), ChainError> {
+        let found = self.registry.find(Kind::Stage, id)?;
+        let file = pipeline.path.display().to_string();
+        let parameters = resolve_parameters(&file, &found.info.manifest, parameters)?;
+        self.add(&found, parameters, "")?;
+        Ok(())
+    }
+
+    fn effects(&mut self) -> Result<(), ChainError> {
+        let mut constraints: Vec<(Constraint, u32)> = Vec::new();
+        for entry in &self.model.effects {
+            let found = self.registry.find(Kind::Effect, &entry.id)?;
+            let instances = &found.info.manifest.instances;
+            if !instances.is_empty() && !instances.contains(&entry.instance) {
+                return Err(self.model_error(format!(
+                    "effect {} has no instance `{}`; it has {}",
+                    entry.id,
+                    entry.instance,
+                    instances.join(", ")
+                )));
+            }
+            let file = self.model.path.display().to_string();
+            let parameters = resolve_parameters(&file, &found.info.manifest, &entry.parameters)?;
+            let linked = self.add(&found, parameters, &entry.instance)?;
+            self.take_coefficients(entry, linked.coefficients)?;
+            for value in linked.constraints {
+                let constraint: Constraint = serde_json::from_value(value)
+                    .map_err(|e| self.model_error(format!("effect {}: a constraint: {e}", entry.id)))?;
+                self.merge(&mut constraints, constraint)?;
+            }
+        }
+        self.chain.constraints =
+            constraints.into_iter().filter(|(c, contributed)| *contributed >= c.parts).map(|(c, _)| c).collect();
+        Ok(())
+    }
+
+    fn merge(&self, all: &mut Vec<(Constraint, u32)>, constraint: Constraint) -> Result<(), ChainError> {
+        match all.iter_mut().find(|(c, _)| c.name == constraint.name) {
+            Some((there, contributed)) => {
+                if (there.lower, there.upper, &there.kind, there.parts)
+                    != (constraint.lower, constraint.upper, &constraint.kind, constraint.parts)
+                {
+                    return Err(self
+                        .model_error(format!("constraint {} has different bounds in different effects", there.name)));
+                }
+                there.terms.extend(constraint.terms);
+                *contributed += 1;
+            }
+            None => all.push((constraint, 1)),
+        }
+        Ok(())
+    }
+
+    fn take_coefficients(&mut self, entry: &EffectEntry, announced: Vec<Value>) -> Result<(), ChainError> {
+        let mut unused: Vec<&String> = entry.prior.keys().collect();
+        for value in announced {
+            let mut c: Coefficient = serde_json::from_value(value)
+                .map_err(|e| self.model_error(format!("effect {}: a coefficient: {e}", entry.id)))?;
+            if self.chain.coefficients.iter().any(|other| other.name == c.name) {
+                return Err(self.model_error(format!("coefficient {} exists twice", c.name)));
+            }
+            c.effect.clone_from(&entry.id);
+            c.instance.clone_from(&entry.instance);
+            c.estimate = entry.estimate;
+            let short = c.name.rsplit('.').next().unwrap_or_default();
+            if let Some(prior) = entry.prior.get(short) {
+                unused.retain(|key| *key != short);
+                c.initial = prior.value.unwrap_or(c.initial);
+                c.prior_sigma = prior.sigma.or(c.prior_sigma);
+                c.lower = prior.lower.or(c.lower);
+                c.upper = prior.upper.or(c.upper);
+            }
+            self.chain.coefficients.push(c);
+        }
+        match unused.first() {
+            Some(key) => {
+                let names: Vec<_> = self
+                    .chain
+                    .coefficients
+                    .iter()
+                    .filter(|c| c.effect == entry.id && c.instance == entry.instance)
+                    .map(|c| c.name.as_str())
+                    .collect();
+                Err(self.model_error(format!(
+                    "effect {}:{}: prior.{key} is no coefficient; it has {}",
+                    entry.id,
+                    entry.instance,
+                    names.join(", ")
+                )))
+            }
+            None => Ok(()),
+        }
+    }
+
+    fn add(&mut self, found: &Found, parameters: Map<String, Value>, instance: &str) -> Result<Linked, ChainError> {
+        let config =
+            Config { value: json!({ "parameters": parameters, "mission": self.mission.value, "instance": instance }) };
+        let mut node = found.create(&config)?;
+        let linked = node.link(LinkRequest { available: &self.available, model_json: &self.model_json() })?;
+        node.activate(u32::try_from(self.chain.carry.batch_rows).unwrap_or(u32::MAX))?;
+        let index = self.chain.nodes.len();
+        let (inputs, wave) = self.route(index, &linked);
+        let reads = linked
+            .reads
+            .iter()
+            .flatten()
+            .map(|r| format!("{}:{}", self.available[r.available].table, self.available[r.available].name))
+            .collect();
+        self.available.extend(linked.writes.iter().flat_map(|t| t.columns.clone()));
+        self.chain.nodes.push(ChainNode {
+            info: found.info.clone(),
+            library_sha256: found.library.sha256.clone(),
+            parameters,
+            reads,
+            inputs,
+            routes: linked.writes.iter().map(|t| Route { readers: Vec::new(), archive: is_archived(t) }).collect(),
+            writes: linked.writes.clone(),
+            wave,
+            is_effect: node.kind == Kind::Effect,
+            discarded_rows: 0,
+            instance: node,
+        });
+        Ok(linked)
+    }
+
+    /// The queues of a new node, its routes entered where its tables are made.
+    fn route(&mut self, index: usize, linked: &Linked) -> (Vec<Queue>, usize) {
+        let mut wave = 0;
+        let mut inputs = Vec::new();
+        for (input, columns) in linked.reads.iter().enumerate() {
+            let Some(first) = columns.first().map(|c| &self.available[c.available]) else { continue };
+            let names: Vec<&str> = columns.iter().map(|c| self.available[c.available].name.as_str()).collect();
+            let reader = |table: &TableSpec| Reader {
+                node: index,
+                input,
+                columns: names.iter().filter_map(|n| table.columns.iter().position(|c| c.name == *n)).collect(),
+            };
+            inputs.push(Queue::new(first.table.clone(), first.rate_hz > 0.0, columns.len()));
+            for (table, route) in self.chain.feed_tables.iter().zip(&mut self.chain.feed_routes) {
+                if table.name == first.table {
+                    route.readers.push(reader(table));
+                }
+            }
+            for maker in &mut self.chain.nodes {
+                for (table, route) in maker.writes.iter().zip(&mut maker.routes) {
+                    if table.name == first.table {
+                        route.readers.push(reader(table));
+                        wave = wave.max(maker.wave + 1);
+                    }
+                }
+            }
+        }
+        (inputs, wave)
+    }
+}
+
+fn is_archived(table: &TableSpec) -> bool {
+    table.columns.iter().any(|c| c.attributes.get("archive").is_some_and(|a| a == "true"))
+}
+
+/// Makes and links a source over nothing.
+///
+/// # Errors
+/// The plugin is missing or refuses its configuration.
+pub(crate) fn source(
+    registry: &Registry,
+    id: &str,
+    config: &Config,
+) -> Result<(Found, Instance, Vec<TableSpec>), ChainError> {
+    let found = registry.find(Kind::Source, id)?;
+    let mut instance = found.create(config)?;
+    let linked = instance.link(LinkRequest { available: &[], model_json: "{}" })?;
+    instance.activate(u32::MAX)?;
+    Ok((found, instance, linked.writes))
+}

@@ -1,0 +1,427 @@
+//! The chain: plugins linked by their columns, rows flowing from the feed through stages and effects.
+//!
+//! Uniform tables are joined row by row, so a stage that is late by a fixed lag delays those behind it and nothing
+//! else; nobody keeps books on lags. Results do not depend on where batches end nor on the number of threads: an
+//! instance sees its rows in one order, whoever carries them.
+
+mod link;
+mod queue;
+mod state;
+
+pub use link::{Coefficient, Constraint, build};
+
+use std::collections::BTreeSet;
+
+use crate::border::{BorderError, Instance, PluginInfo, Rows};
+use crate::table::{Batch, Chunk, TableSpec};
+use queue::Queue;
+
+/// What can go wrong between plugins.
+#[derive(Debug, thiserror::Error)]
+pub enum ChainError {
+    /// At the border.
+    #[error(transparent)]
+    Border(#[from] BorderError),
+    /// There is no such plugin.
+    #[error(transparent)]
+    Registry(#[from] crate::registry::RegistryError),
+    /// Parameters are wrong.
+    #[error(transparent)]
+    Config(#[from] crate::config::ConfigError),
+    /// The model and the chain do not fit.
+    #[error("model {path}: {what}")]
+    Model {
+        /// The model file.
+        path: String,
+        /// What, why and what to do next.
+        what: String,
+    },
+    /// Tables that should have the same rows do not.
+    #[error(
+        "plugin {plugin}: its input tables have different rows: {what}; the stage that makes one of them is at fault"
+    )]
+    Join {
+        /// The reader.
+        plugin: String,
+        /// Which table, which time.
+        what: String,
+    },
+    /// A state does not belong to this chain.
+    #[error("state: {what}")]
+    State {
+        /// What, why and what to do next.
+        what: String,
+    },
+    /// Rows could not be archived.
+    #[error("time series: {0}")]
+    Sink(String),
+}
+
+/// Takes the rows of tables that belong beside the product.
+pub trait Sink {
+    /// Rows of one table, ordered by time.
+    ///
+    /// # Errors
+    /// A sentence for the operator.
+    fn rows(&mut self, table: &TableSpec, batch: &Batch) -> Result<(), String>;
+}
+
+/// A sink that keeps nothing.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Forget;
+
+impl Sink for Forget {
+    fn rows(&mut self, _table: &TableSpec, _batch: &Batch) -> Result<(), String> {
+        Ok(())
+    }
+}
+
+/// A plugin at its place in the chain.
+#[derive(Debug)]
+pub struct ChainNode {
+    /// The living plugin.
+    instance: Instance,
+    /// What it says of itself.
+    pub info: PluginInfo,
+    /// Digest of its library.
+    pub library_sha256: String,
+    /// Its parameters, complete.
+    pub parameters: serde_json::Map<String, serde_json::Value>,
+    /// Columns that it reads, `table:column`.
+    pub reads: Vec<String>,
+    inputs: Vec<Queue>,
+    /// Tables that it writes.
+    pub writes: Vec<TableSpec>,
+    routes: Vec<Route>,
+    /// Nodes of one wave do not read each other's tables.
+    wave: usize,
+    is_effect: bool,
+    /// Rows of batches that the plugin discarded.
+    pub discarded_rows: u64,
+}
+
+impl ChainNode {
+    /// Id, with the instance of an effect.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.instance.name
+    }
+}
+
+/// Where the rows of a table go.
+#[derive(Clone, Debug, Default)]
+struct Route {
+    readers: Vec<Reader>,
+    archive: bool,
+}
+
+#[derive(Clone, Debug)]
+struct Reader {
+    node: usize,
+    input: usize,
+    /// Columns of the table, in the reader's order.
+    columns: Vec<usize>,
+}
+
+/// How rows are carried.
+#[derive(Clone, Copy, Debug)]
+pub struct Carry {
+    /// Most rows of a uniform table in one call.
+    pub batch_rows: usize,
+    /// Threads for nodes that do not read each other.
+    pub threads: usize,
+}
+
+impl Default for Carry {
+    fn default() -> Self {
+        Self { batch_rows: 4096, threads: 1 }
+    }
+}
+
+/// A linked chain.
+#[derive(Debug)]
+pub struct Chain {
+    /// Its plugins in order.
+    pub nodes: Vec<ChainNode>,
+    /// Coefficients of the model.
+    pub coefficients: Vec<Coefficient>,
+    /// Constraints on them.
+    pub constraints: Vec<Constraint>,
+    feed_tables: Vec<TableSpec>,
+    feed_routes: Vec<Route>,
+    carry: Carry,
+    complete_until_ns: i64,
+}
+
+impl Chain {
+    /// Every row before this time has gone into the chain, Unix ns.
+    #[must_use]
+    pub fn complete_until_ns(&self) -> i64 {
+        self.complete_until_ns
+    }
+
+    /// Carries a stretch of the feed as far as it goes.
+    ///
+    /// # Errors
+    /// A plugin failed, or broke a rule.
+    pub fn feed(&mut self, chunk: &Chunk, sink: &mut dyn Sink) -> Result<(), ChainError> {
+        for piece in pieces(chunk, self.carry.batch_rows) {
+            for (i, batch) in piece.batches.iter().enumerate() {
+                publish(&mut self.nodes, &self.feed_tables[i], &self.feed_routes[i], batch, sink)?;
+            }
+            self.complete_until_ns = piece.complete_until_ns;
+            self.advance(sink)?;
+        }
+        Ok(())
+    }
+
+    /// The feed is at its end: carries what is left and flushes every lag.
+    ///
+    /// # Errors
+    /// A plugin failed, or broke a rule.
+    pub fn finish(&mut self, sink: &mut dyn Sink) -> Result<(), ChainError> {
+        for i in 0..self.nodes.len() {
+            let mut made = step(&mut self.nodes[i], i64::MAX, self.carry.batch_rows)?;
+            made.push(self.nodes[i].instance.flush()?);
+            self.distribute(i, &made, sink)?;
+        }
+        for node in &self.nodes {
+            if let Some(left) = node.inputs.iter().find(|q| q.uniform && q.rows() > 0) {
+                return Err(ChainError::Join {
+                    plugin: node.name().to_owned(),
+                    what: format!("table {} has {} rows more than the others at the end", left.table, left.rows()),
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// The reports of all stages, in order; `None` for effects, which have none.
+    ///
+    /// # Errors
+    /// A plugin failed.
+    pub fn reports(&mut self) -> Result<Vec<(String, serde_json::Value)>, ChainError> {
+        let mut reports: Vec<(String, serde_json::Value)> = Vec::new();
+        for node in self.nodes.iter_mut().filter(|n| !n.is_effect) {
+            let earlier: Vec<&serde_json::Value> = reports.iter().map(|(_, r)| r).collect();
+            let earlier = serde_json::Value::from(earlier.into_iter().cloned().collect::<Vec<_>>()).to_string();
+            let mut report = node.instance.report(&earlier)?;
+            if let Some(object) = report.as_object_mut() {
+                object.insert("plugin".to_owned(), node.info.manifest.id.clone().into());
+            }
+            reports.push((node.info.manifest.id.clone(), report));
+        }
+        Ok(reports)
+    }
+
+    fn advance(&mut self, sink: &mut dyn Sink) -> Result<(), ChainError> {
+        let waves = self.nodes.iter().map(|n| n.wave + 1).max().unwrap_or(0);
+        for wave in 0..waves {
+            let (until, rows, threads) = (self.complete_until_ns, self.carry.batch_rows, self.carry.threads);
+            let due: BTreeSet<usize> = (0..self.nodes.len()).filter(|i| self.nodes[*i].wave == wave).collect();
+            let busy = due.iter().filter(|i| self.nodes[**i].ready() > SPAWN_WORTH_ROWS).count();
+            let mut made: Vec<(usize, Made)> = Vec::new();
+            let nodes = self.nodes.iter_mut().enumerate().filter(|(i, _)| due.contains(i));
+            if threads > 1 && busy > 1 {
+                std::thread::scope(|scope| {
+                    let running: Vec<_> =
+                        nodes.map(|(i, node)| (i, scope.spawn(move || step(node, until, rows)))).collect();
+                    for (i, thread) in running {
+                        let result = thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+                        made.push((i, result));
+                    }
+                });
+            } else {
+                made.extend(nodes.map(|(i, node)| (i, step(node, until, rows))));
+            }
+            for (i, batches) in made {
+                self.distribute(i, &batches?, sink)?;
+            }
+        }
+        Ok(())
+    }
+
+    fn distribute(&mut self, node: usize, made: &[Vec<Batch>], sink: &mut dyn Sink) -> Result<(), ChainError> {
+        let routes = std::mem::take(&mut self.nodes[node].routes);
+        let writes = std::mem::take(&mut self.nodes[node].writes);
+        let mut result = Ok(());
+        for batches in made {
+            for ((table, route), batch) in writes.iter().zip(&routes).zip(batches) {
+                result = result.and_then(|()| publish(&mut self.nodes, table, route, batch, sink));
+            }
+        }
+        self.nodes[node].routes = routes;
+        self.nodes[node].writes = writes;
+        result
+    }
+}
+
+/// What a node made: for each call, one batch per written table.
+type Made = Result<Vec<Vec<Batch>>, ChainError>;
+
+/// Starting a thread costs about what a few hundred rows of a stage do.
+const SPAWN_WORTH_ROWS: usize = 512;
+
+impl ChainNode {
+    /// Rows that one call could take now.
+    fn ready(&self) -> usize {
+        self.inputs.iter().filter(|q| q.uniform).map(Queue::rows).min().unwrap_or(0)
+    }
+}
+
+fn publish(
+    nodes: &mut [ChainNode],
+    table: &TableSpec,
+    route: &Route,
+    batch: &Batch,
+    sink: &mut dyn Sink,
+) -> Result<(), ChainError> {
+    if batch.rows() == 0 {
+        return Ok(());
+    }
+    for reader in &route.readers {
+        nodes[reader.node].inputs[reader.input].push(batch, &reader.columns);
+    }
+    if route.archive {
+        sink.rows(table, batch).map_err(ChainError::Sink)?;
+    }
+    Ok(())
+}
+
+/// Lets a node work on everything that is ready for it.
+fn step(node: &mut ChainNode, complete_until_ns: i64, batch_rows: usize) -> Made {
+    let has_uniform = node.inputs.iter().any(|q| q.uniform);
+    let mut made = Vec::new();
+    loop {
+        let rows = node.ready().min(batch_rows);
+        if has_uniform && rows == 0 {
+            return Ok(made);
+        }
+        check_join(node, rows)?;
+        let given: Vec<usize> = node.inputs.iter().map(|q| if q.uniform { rows } else { q.rows() }).collect();
+        let tables: Vec<Rows<'_>> = node.inputs.iter().zip(&given).map(|(q, n)| q.front(*n)).collect();
+        let batches = node.instance.process(&tables, complete_until_ns)?;
+        let batches = match batches {
+            Some(batches) => {
+                check_rows(node, &batches, rows)?;
+                batches
+            }
+            None => discarded(node, rows),
+        };
+        for (queue, n) in node.inputs.iter_mut().zip(&given) {
+            queue.consume(*n);
+        }
+        made.push(batches);
+        if !has_uniform {
+            return Ok(made);
+        }
+    }
+}
+
+/// A discarded batch leaves rows without values in the node's uniform tables, so that the chain stays in step.
+fn discarded(node: &mut ChainNode, rows: usize) -> Vec<Batch> {
+    node.discarded_rows += rows as u64;
+    let times = node.inputs.iter().find(|q| q.uniform).map(|q| q.front(rows).time_ns.to_vec()).unwrap_or_default();
+    node.writes
+        .iter()
+        .map(|t| {
+            if t.rate_hz > 0.0 {
+                Batch { time_ns: times.clone(), columns: vec![vec![f64::NAN; times.len()]; t.columns.len()] }
+            } else {
+                Batch::empty(t.columns.len())
+            }
+        })
+        .collect()
+}
+
+fn check_join(node: &ChainNode, rows: usize) -> Result<(), ChainError> {
+    let mut uniform = node.inputs.iter().filter(|q| q.uniform);
+    let Some(first) = uniform.next() else { return Ok(()) };
+    let times = first.front(rows).time_ns;
+    for queue in uniform {
+        let other = queue.front(rows).time_ns;
+        if let Some(i) = (0..rows).find(|i| times[*i] != other[*i]) {
+            return Err(ChainError::Join {
+                plugin: node.name().to_owned(),
+                what: format!(
+                    "at the same row, {} has {} ns and {} has {} ns",
+                    first.table, times[i], queue.table, other[i]
+                ),
+            });
+        }
+    }
+    Ok(())
+}
+
+fn check_rows(node: &ChainNode, batches: &[Batch], rows: usize) -> Result<(), ChainError> {
+    let rule =
+        |what: String| ChainError::Border(BorderError::Rule { plugin: node.name().to_owned(), call: "process", what });
+    for (table, batch) in node.writes.iter().zip(batches) {
+        if batch.time_ns.windows(2).any(|w| w[0] > w[1] || (table.rate_hz > 0.0 && w[0] == w[1])) {
+            return Err(rule(format!("table {}: its times run backwards", table.name)));
+        }
+        if node.is_effect && batch.rows() != rows {
+            return Err(rule(format!("an effect that gives {} rows for {rows}", batch.rows())));
+        }
+    }
+    Ok(())
+}
+
+/// Cuts a chunk by time so that no table has many more than `rows` rows in one piece.
+fn pieces(chunk: &Chunk, rows: usize) -> Vec<Chunk> {
+    let Some(densest) = chunk.batches.iter().max_by_key(|b| b.rows()).filter(|b| b.rows() > rows) else {
+        return vec![chunk.clone()];
+    };
+    let mut cuts: Vec<i64> = (rows..densest.rows()).step_by(rows.max(1)).map(|i| densest.time_ns[i]).collect();
+    cuts.dedup();
+    cuts.retain(|t| *t <= chunk.complete_until_ns);
+    cuts.push(chunk.complete_until_ns);
+    let mut starts = vec![0usize; chunk.batches.len()];
+    let last = cuts.len() - 1;
+    cuts.iter()
+        .enumerate()
+        .map(|(k, until)| {
+            let batches = chunk
+                .batches
+                .iter()
+                .zip(&mut starts)
+                .map(|(batch, start)| {
+                    let end =
+                        if k == last { batch.rows() } else { batch.time_ns.partition_point(|t| t < until).max(*start) };
+                    let cut = Batch {
+                        time_ns: batch.time_ns[*start..end].to_vec(),
+                        columns: batch.columns.iter().map(|c| c[*start..end].to_vec()).collect(),
+                    };
+                    *start = end;
+                    cut
+                })
+                .collect();
+            Chunk { batches, complete_until_ns: *until }
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pieces_cover_a_chunk_once_and_in_order() {
+        let fast: Vec<i64> = (0..100).map(|k| k * 10).collect();
+        let slow: Vec<i64> = (0..10).map(|k| k * 100).collect();
+        let batch = |t: &[i64]| Batch { time_ns: t.to_vec(), columns: vec![t.iter().map(|t| *t as f64).collect()] };
+        let chunk = Chunk { batches: vec![batch(&fast), batch(&slow)], complete_until_ns: 1000 };
+        for rows in [1, 7, 99, 100, 1000] {
+            let pieces = pieces(&chunk, rows);
+            for (table, times) in [(0, &fast), (1, &slow)] {
+                let joined: Vec<i64> = pieces.iter().flat_map(|p| p.batches[table].time_ns.clone()).collect();
+                assert_eq!(joined, *times, "{rows} rows");
+            }
+            for p in &pieces {
+                assert!(p.batches.iter().all(|b| b.rows() <= rows.max(1)));
+                assert!(p.batches.iter().flat_map(|b| &b.time_ns).all(|t| *t < p.complete_until_ns));
+            }
+            assert_eq!(pieces.last().map(|p| p.complete_until_ns), Some(1000));
+        }
+    }
+}

@@ -1,0 +1,60 @@
+//! Pipeline, mission and model files, and the parameters in them: read, checked, handed on.
+//!
+//! The engine knows no physics: of a mission file it reads the name and the spacecraft, the rest is the plugins'.
+
+mod model;
+mod parameters;
+mod pipeline;
+
+pub use model::{EffectEntry, Model, Prior};
+pub use parameters::resolve as resolve_parameters;
+pub use pipeline::{Mission, Node, Pipeline};
+
+use std::path::{Path, PathBuf};
+
+/// A file that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// It cannot be read.
+    #[error("{}: cannot be read: {source}; check the path", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// It is not TOML of the shape wanted: unknown keys, wrong types.
+    #[error("{}: {source}", path.display())]
+    Shape {
+        /// The file.
+        path: PathBuf,
+        /// What and where.
+        source: Box<toml::de::Error>,
+    },
+    /// It is TOML, but has no sense.
+    #[error("{}: {what}", path.display())]
+    Sense {
+        /// The file.
+        path: PathBuf,
+        /// What, why and what to do next.
+        what: String,
+    },
+    /// A plugin's parameters are not those that it declares.
+    #[error("{file}: parameters of {plugin}: {what}")]
+    Parameter {
+        /// The file that gives them.
+        file: String,
+        /// The plugin.
+        plugin: String,
+        /// What, why and what to do next.
+        what: String,
+    },
+}
+
+fn read(path: &Path) -> Result<String, ConfigError> {
+    std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })
+}
+
+fn parse<T: serde::de::DeserializeOwned>(path: &Path, text: &str) -> Result<T, ConfigError> {
+    toml::from_str(text).map_err(|source| ConfigError::Shape { path: path.to_owned(), source: Box::new(source) })
+}

@@ -1,0 +1,175 @@
+//! Pipeline and mission files.
+
+use serde::Deserialize;
+use std::path::{Path, PathBuf};
+
+use super::{ConfigError, parse, read};
+
+/// A pipeline: where data come from and which stages they go through.
+#[derive(Clone, Debug)]
+pub struct Pipeline {
+    /// The file.
+    pub path: PathBuf,
+    /// Name.
+    pub name: String,
+    /// Name of the product, `COM1B`.
+    pub product: String,
+    /// Release of the product: model, estimator, frames and units.
+    pub release: u32,
+    /// Mission file, unless the command line names another.
+    pub mission: Option<PathBuf>,
+    /// Model file, unless the command line names another.
+    pub model: Option<PathBuf>,
+    /// Source plugin with its parameters; without one, telemetry comes from MCAP files.
+    pub source: Option<(String, toml::Table)>,
+    /// Stages in order.
+    pub nodes: Vec<Node>,
+}
+
+/// An entry of the chain.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Node {
+    /// A stage with its parameters.
+    Stage {
+        /// Id of the plugin.
+        plugin: String,
+        /// Parameters as written.
+        parameters: toml::Table,
+    },
+    /// The model's effects.
+    Effects,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    pipeline: Header,
+    source: Option<SourceEntry>,
+    #[serde(default)]
+    stage: Vec<StageEntry>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Header {
+    name: String,
+    #[serde(default = "com1b")]
+    product: String,
+    #[serde(default = "one")]
+    release: u32,
+    mission: Option<PathBuf>,
+    model: Option<PathBuf>,
+}
+
+fn com1b() -> String {
+    "COM1B".to_owned()
+}
+
+fn one() -> u32 {
+    1
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct SourceEntry {
+    plugin: String,
+    #[serde(default)]
+    parameters: toml::Table,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct StageEntry {
+    plugin: Option<String>,
+    #[serde(default)]
+    effects: bool,
+    #[serde(default)]
+    parameters: toml::Table,
+}
+
+impl Pipeline {
+    /// Reads a pipeline; paths in it are relative to its folder.
+    ///
+    /// # Errors
+    /// [`ConfigError`] says what, where and why.
+    pub fn load(path: &Path) -> Result<Self, ConfigError> {
+        let file: File = parse(path, &read(path)?)?;
+        let folder = path.parent().unwrap_or(Path::new("."));
+        let sense = |what: String| ConfigError::Sense { path: path.to_owned(), what };
+        let mut nodes = Vec::new();
+        for (i, stage) in file.stage.into_iter().enumerate() {
+            nodes.push(match (stage.plugin, stage.effects) {
+                (Some(plugin), false) => Node::Stage { plugin, parameters: stage.parameters },
+                (None, true) if stage.parameters.is_empty() => Node::Effects,
+                (None, true) => {
+                    return Err(sense(
+                        "`effects = true` takes no parameters; they belong into the model file".to_owned(),
+                    ));
+                }
+                (Some(_), true) => {
+                    return Err(sense(format!("stage {} has both `plugin` and `effects`; make two of it", i + 1)));
+                }
+                (None, false) => {
+                    return Err(sense(format!("stage {} has neither `plugin = \"…\"` nor `effects = true`", i + 1)));
+                }
+            });
+        }
+        if nodes.is_empty() {
+            return Err(sense("has no [[stage]]; fixtures/pipelines/science-mode.toml shows one".to_owned()));
+        }
+        if nodes.iter().filter(|n| **n == Node::Effects).count() > 1 {
+            return Err(sense("has `effects = true` twice; the model's effects stand at one place".to_owned()));
+        }
+        let product_ok =
+            !file.pipeline.product.is_empty() && file.pipeline.product.bytes().all(|b| b.is_ascii_alphanumeric());
+        if !product_ok {
+            return Err(sense(format!(
+                "product = \"{}\" must be letters and digits: it begins file names",
+                file.pipeline.product
+            )));
+        }
+        Ok(Self {
+            path: path.to_owned(),
+            name: file.pipeline.name,
+            product: file.pipeline.product,
+            release: file.pipeline.release,
+            mission: file.pipeline.mission.map(|p| folder.join(p)),
+            model: file.pipeline.model.map(|p| folder.join(p)),
+            source: file.source.map(|s| (s.plugin, s.parameters)),
+            nodes,
+        })
+    }
+}
+
+/// A mission file as the engine sees it.
+#[derive(Clone, Debug)]
+pub struct Mission {
+    /// The file.
+    pub path: PathBuf,
+    /// `mission.name`
+    pub name: String,
+    /// `mission.spacecraft`
+    pub spacecraft: String,
+    /// The whole file, for the plugins.
+    pub value: serde_json::Value,
+}
+
+impl Mission {
+    /// Reads a mission file.
+    ///
+    /// # Errors
+    /// [`ConfigError`] says what, where and why. Keys and values are checked by the plugins that use them.
+    pub fn load(path: &Path) -> Result<Self, ConfigError> {
+        let table: toml::Table = parse(path, &read(path)?)?;
+        let sense = |what: String| ConfigError::Sense { path: path.to_owned(), what };
+        let value = serde_json::to_value(&table).map_err(|e| sense(e.to_string()))?;
+        let text = |key: &str| {
+            value["mission"][key]
+                .as_str()
+                .filter(|t| !t.is_empty())
+                .map(str::to_owned)
+                .ok_or_else(|| sense(format!("[mission] has no `{key}`; fixtures/missions/taiji.toml shows one")))
+        };
+        Ok(Self { path: path.to_owned(), name: text("name")?, spacecraft: text("spacecraft")?, value })
+    }
+}

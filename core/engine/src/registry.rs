@@ -1,0 +1,148 @@
+//! Every plugin that the plugin folders hold, and why a file was refused.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use crate::border::{BorderError, Config, Instance, Kind, Library, PluginInfo};
+
+/// The plugins that were found.
+#[derive(Debug, Default)]
+pub struct Registry {
+    libraries: Vec<Arc<Library>>,
+    refused: Vec<Refused>,
+    folders: Vec<PathBuf>,
+}
+
+/// A file in a plugin folder that is not used.
+#[derive(Clone, Debug)]
+pub struct Refused {
+    /// The file.
+    pub path: PathBuf,
+    /// Why.
+    pub reason: String,
+}
+
+/// A plugin of the registry.
+#[derive(Clone, Debug)]
+pub struct Found {
+    /// Its library.
+    pub library: Arc<Library>,
+    /// Its place and manifest.
+    pub info: PluginInfo,
+}
+
+/// Why there is no plugin.
+#[derive(Debug, thiserror::Error)]
+pub enum RegistryError {
+    /// No folder holds it.
+    #[error(
+        "no {kind} `{id}` in the plugin folders {folders}{near}; `dragfree plugins list` shows what is there, --plugin-dir adds a folder"
+    )]
+    Unknown {
+        /// What was wanted.
+        kind: Kind,
+        /// Its id.
+        id: String,
+        /// Where we looked.
+        folders: String,
+        /// What comes near, or which files were refused.
+        near: String,
+    },
+    /// Two libraries have it.
+    #[error("{kind} `{id}` is in both {} and {}; remove one", first.display(), second.display())]
+    Twice {
+        /// What was wanted.
+        kind: Kind,
+        /// Its id.
+        id: String,
+        /// One file.
+        first: PathBuf,
+        /// The other.
+        second: PathBuf,
+    },
+}
+
+impl Registry {
+    /// Opens every shared library in the folders. A file that is refused is kept with its reason, and is no error.
+    #[must_use]
+    pub fn discover(folders: &[PathBuf]) -> Self {
+        let mut this = Self { folders: folders.to_vec(), ..Self::default() };
+        let mut seen = std::collections::BTreeSet::new();
+        for folder in folders {
+            for path in shared_libraries(folder) {
+                let canonical = path.canonicalize().unwrap_or_else(|_| path.clone());
+                if !seen.insert(canonical) {
+                    continue;
+                }
+                match Library::open(&path) {
+                    Ok(library) => this.libraries.push(Arc::new(library)),
+                    Err(BorderError::Refused { path, reason }) => this.refused.push(Refused { path, reason }),
+                    Err(other) => this.refused.push(Refused { path, reason: other.to_string() }),
+                }
+            }
+        }
+        this
+    }
+
+    /// Every plugin, by file and then kind.
+    pub fn plugins(&self) -> impl Iterator<Item = Found> {
+        self.libraries.iter().flat_map(|library| {
+            library.plugins.iter().map(|info| Found { library: Arc::clone(library), info: info.clone() })
+        })
+    }
+
+    /// Every file that was refused.
+    #[must_use]
+    pub fn refused(&self) -> &[Refused] {
+        &self.refused
+    }
+
+    /// A plugin by kind and id.
+    ///
+    /// # Errors
+    /// There is none, or there are two.
+    pub fn find(&self, kind: Kind, id: &str) -> Result<Found, RegistryError> {
+        let mut found = self.plugins().filter(|p| p.info.kind == kind && p.info.manifest.id == id);
+        match (found.next(), found.next()) {
+            (Some(plugin), None) => Ok(plugin),
+            (Some(a), Some(b)) => Err(RegistryError::Twice {
+                kind,
+                id: id.to_owned(),
+                first: a.library.path.clone(),
+                second: b.library.path.clone(),
+            }),
+            (None, _) => {
+                let folders: Vec<_> = self.folders.iter().map(|f| f.display().to_string()).collect();
+                let near = match self.refused.iter().find(|r| r.path.to_string_lossy().contains(&id.replace('-', "_")))
+                {
+                    Some(refused) => format!(" ({} was refused: {})", refused.path.display(), refused.reason),
+                    None => String::new(),
+                };
+                Err(RegistryError::Unknown { kind, id: id.to_owned(), folders: folders.join(", "), near })
+            }
+        }
+    }
+}
+
+impl Found {
+    /// Makes an instance.
+    ///
+    /// # Errors
+    /// The plugin refused its configuration.
+    pub fn create(&self, config: &Config) -> Result<Instance, BorderError> {
+        Instance::create(&self.library, &self.info, config)
+    }
+}
+
+/// The shared libraries of a folder in the order of their names; none where the folder cannot be read.
+fn shared_libraries(folder: &Path) -> Vec<PathBuf> {
+    let mut paths: Vec<PathBuf> = std::fs::read_dir(folder)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .map(|entry| entry.path())
+        .filter(|path| path.extension().is_some_and(|e| e == std::env::consts::DLL_EXTENSION) && path.is_file())
+        .collect();
+    paths.sort();
+    paths
+}
