@@ -1,1 +1,75 @@
-//! See ARCHITECTURE.md.
+//! What the whole-program tests share: the built program, its plugins, the repository's fixtures.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+use std::sync::OnceLock;
+
+/// The repository.
+#[must_use]
+pub fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new("."))
+}
+
+/// A file under `fixtures/`.
+#[must_use]
+pub fn fixture(path: &str) -> PathBuf {
+    root().join("fixtures").join(path)
+}
+
+/// The folder of the program and its plugins, built once per test program so that no test meets a stale one.
+///
+/// # Panics
+/// The workspace does not build.
+pub fn built() -> &'static Path {
+    static FOLDER: OnceLock<PathBuf> = OnceLock::new();
+    FOLDER.get_or_init(|| {
+        let exe = std::env::current_exe().expect("a test program has a path");
+        let folder = exe.parent().and_then(Path::parent).expect("target/PROFILE/deps/test").to_owned();
+        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+        let mut build = Command::new(cargo);
+        build.current_dir(root()).args(["build", "--quiet", "--workspace"]);
+        if folder.file_name().is_some_and(|name| name == "release") {
+            build.arg("--release");
+        }
+        if let Some(target) = folder.parent() {
+            build.arg("--target-dir").arg(target);
+        }
+        let status = build.status().expect("cargo runs");
+        assert!(status.success(), "the workspace does not build");
+        folder
+    })
+}
+
+/// The program with the built plugins alone, in `folder`.
+#[must_use]
+pub fn dragfree(folder: &Path) -> Command {
+    let mut command = Command::new(built().join(format!("dragfree{}", std::env::consts::EXE_SUFFIX)));
+    command.current_dir(folder).env_remove("DRAGFREE_PLUGIN_PATH").env("NO_COLOR", "1");
+    command
+}
+
+/// Runs a command and gives its standard output; its exit code must be `code`.
+///
+/// # Panics
+/// The exit code is another.
+pub fn expect(command: &mut Command, code: i32) -> Output {
+    let output = command.output().unwrap_or_else(|e| panic!("{command:?}: {e}"));
+    assert_eq!(
+        output.status.code(),
+        Some(code),
+        "{command:?}\n--- stdout\n{}\n--- stderr\n{}",
+        String::from_utf8_lossy(&output.stdout),
+        String::from_utf8_lossy(&output.stderr)
+    );
+    output
+}
+
+/// The JSON that a command prints; its exit code must be `code`.
+///
+/// # Panics
+/// The exit code is another, or the output is no JSON.
+pub fn json(command: &mut Command, code: i32) -> serde_json::Value {
+    let output = expect(command, code);
+    serde_json::from_slice(&output.stdout)
+        .unwrap_or_else(|e| panic!("{command:?}: {e}\n{}", String::from_utf8_lossy(&output.stdout)))
+}

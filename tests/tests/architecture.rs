@@ -1,0 +1,81 @@
+//! The arrows of ARCHITECTURE.md, read from `cargo metadata`.
+
+use serde_json::Value;
+use std::collections::{BTreeMap, BTreeSet};
+use std::process::Command;
+
+fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let output = dragfree_tests::expect(
+        Command::new(cargo).current_dir(dragfree_tests::root()).args(["metadata", "--no-deps", "--format-version", "1", "--offline"]),
+        0,
+    );
+    let metadata: Value = serde_json::from_slice(&output.stdout).expect("cargo prints JSON");
+    let packages = metadata["packages"].as_array().expect("packages");
+    packages
+        .iter()
+        .map(|p| {
+            let normal = p["dependencies"].as_array().expect("dependencies").iter().filter(|d| d["kind"].is_null());
+            let names = normal.filter_map(|d| d["name"].as_str()).map(str::to_owned).collect();
+            (p["name"].as_str().expect("a name").to_owned(), names)
+        })
+        .collect()
+}
+
+/// What a crate of ours may depend on among our crates.
+fn allowed(crate_name: &str) -> &'static [&'static str] {
+    match crate_name {
+        "dragfree-abi" | "dragfree-physics" => &[],
+        "dragfree-sdk" | "dragfree-engine" => &["dragfree-abi"],
+        "dragfree" | "dragfree-tests" => &["dragfree-engine"],
+        _ => &["dragfree-sdk", "dragfree-physics"],
+    }
+}
+
+fn arrows_up(dependencies: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
+    let ours = |name: &&String| dependencies.contains_key(*name);
+    dependencies
+        .iter()
+        .flat_map(|(from, to)| to.iter().filter(ours).filter(|to| !allowed(from).contains(&to.as_str())).map(move |to| format!("{from} -> {to}")))
+        .collect()
+}
+
+#[test]
+fn every_arrow_points_down() {
+    let found = dependencies();
+    assert!(found.len() >= 13, "the workspace has its crates: {:?}", found.keys());
+    assert_eq!(arrows_up(&found), Vec::<String>::new());
+    assert!(found["dragfree-abi"].is_empty(), "the border depends on nothing");
+}
+
+#[test]
+fn an_arrow_that_points_up_is_seen() {
+    let mut broken = dependencies();
+    broken.get_mut("dragfree-engine").expect("the engine").insert("dragfree-physics".to_owned());
+    broken.get_mut("dragfree-es-akf").expect("a plugin").insert("dragfree-engine".to_owned());
+    assert_eq!(arrows_up(&broken), ["dragfree-engine -> dragfree-physics", "dragfree-es-akf -> dragfree-engine"]);
+}
+
+/// The engine never knows a plugin or an effect by name.
+#[test]
+fn the_engine_names_no_plugin() {
+    let names = ["com-offset", "es-akf", "qp-check", "hinf-dfacs", "preprocess", "gracefo"];
+    let mut folders = vec![dragfree_tests::root().join("core/engine/src")];
+    let mut seen = 0;
+    while let Some(folder) = folders.pop() {
+        for entry in std::fs::read_dir(&folder).expect("a folder").flatten() {
+            let path = entry.path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|e| e == "rs") && path.file_name().is_some_and(|n| n != "tests.rs") {
+                seen += 1;
+                let text = std::fs::read_to_string(&path).expect("text");
+                let code = text.split("#[cfg(test)]").next().unwrap_or_default();
+                for (i, line) in code.lines().enumerate().filter(|(_, l)| !l.trim_start().starts_with("//")) {
+                    assert!(!names.iter().any(|n| line.contains(&format!("\"{n}"))), "{}:{}: {line}", path.display(), i + 1);
+                }
+            }
+        }
+    }
+    assert!(seen > 10, "the engine's files were read");
+}
