@@ -1,1 +1,13 @@
-//! See ARCHITECTURE.md.
+//! Stage `hinf-dfacs`: the known specific force `û_i`, the unbiased angular acceleration `α̂`, the rate `ω̂` and the
+//! nine channels (Section IV; ARCHITECTURE.md, table `reconstruction`).
+
+pub mod known;
+mod plugin;
+pub mod reconstruction;
+pub mod replay;
+pub mod smoother;
+pub mod state;
+
+pub use plugin::HinfDfacs;
+
+dragfree_sdk::export_plugin!(stages: [HinfDfacs]);

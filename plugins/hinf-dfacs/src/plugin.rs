@@ -1,0 +1,414 @@
+//! The stage at the border: columns in, rows out, a report.
+
+use dragfree_physics::mission::Mission;
+use dragfree_sdk::prelude::*;
+use nalgebra::Vector3;
+use serde_json::json;
+
+use crate::reconstruction::{AngularAcceleration, Epoch, ROW, Reconstruction, Row, Settings};
+use crate::replay::{COMMAND_VECTORS, Comparison};
+
+/// The innovations' variance may differ from the prediction by this much before it is worth a sentence; a day's
+/// sampling error is 0.2 %.
+const INNOVATION_TOLERANCE: f64 = 0.1;
+const AXES: [&str; 3] = ["x", "y", "z"];
+const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
+
+/// The stage.
+pub struct HinfDfacs {
+    mission: Mission,
+    angular_acceleration: AngularAcceleration,
+    compare_commands: bool,
+    warm_up_s: f64,
+    linked: Option<Linked>,
+    notes: Vec<String>,
+}
+
+struct Linked {
+    reconstruction: Reconstruction,
+    rate_hz: f64,
+    readout: [Option<In>; 15],
+    command: Option<[In; 18]>,
+    sun: Option<[In; 3]>,
+    omega_crf: Option<[In; 3]>,
+    alpha_crf: Option<[In; 3]>,
+    table: Table,
+    out: Vec<Out>,
+    /// Rows on their way out; empty between calls.
+    rows: Vec<Row>,
+}
+
+/// Asks for three columns of the grid, if the first is there.
+fn read_vector(
+    available: &Available,
+    link: &mut Link<'_>,
+    name: &str,
+    unit: &str,
+    frame: &str,
+) -> Result<Option<[In; 3]>, PluginError> {
+    if available.column("grid", &format!("{name}.x")).is_none() {
+        return Ok(None);
+    }
+    let mut read = |axis: &str| link.read(&grid(&format!("{name}.{axis}"), unit, frame));
+    Ok(Some([read("x")?, read("y")?, read("z")?]))
+}
+
+fn grid(name: &str, unit: &str, frame: &str) -> Want {
+    Want::new(name).table("grid").unit(unit).frame(frame)
+}
+
+impl HinfDfacs {
+    /// The best readout of each of the fifteen degrees of freedom: the interferometer along x where there is one at
+    /// all, local wavefront sensing for `θ` and `ψ`, else the inertial sensor. The angles of the test masses serve only
+    /// the stiffness and the replay and may be missing.
+    fn link_readouts(
+        &mut self,
+        available: &Available,
+        link: &mut Link<'_>,
+    ) -> Result<([Option<In>; 15], [&'static str; 2]), PluginError> {
+        let mut readout = [None; 15];
+        let mut noise_x = ["ifo_x"; 2];
+        for (i, angle) in ANGLES.iter().enumerate() {
+            let want = grid(&format!("dws.sc_crf_rad.{angle}"), "rad", "CRF");
+            readout[i] = if self.angular_acceleration == AngularAcceleration::Commanded {
+                link.read_if_available(available, &want)?
+            } else {
+                Some(link.read(&want)?)
+            };
+        }
+        for (tm, name) in ["tm1", "tm2"].iter().enumerate() {
+            let frame = format!("ORF_{}", tm + 1);
+            let first = 3 + 6 * tm;
+            let ifo = link.read_if_available(available, &grid(&format!("ifo.{name}.x_orf_m"), "m", &frame))?;
+            if ifo.is_none() {
+                noise_x[tm] = "is_x";
+                self.notes.push(format!("no interferometer for {name}: the inertial sensor reads its x"));
+            }
+            readout[first] = ifo;
+            for (axis, letter) in AXES.iter().enumerate() {
+                if readout[first + axis].is_none() {
+                    let want = grid(&format!("is.{name}.r_orf_m.{letter}"), "m", &frame);
+                    readout[first + axis] = Some(link.read(&want)?);
+                }
+            }
+            for (axis, angle) in ANGLES.iter().enumerate() {
+                let dws = grid(&format!("dws.{name}.{angle}_orf_rad"), "rad", &frame);
+                let is = grid(&format!("is.{name}.att_orf_rad.{angle}"), "rad", &frame);
+                readout[first + 3 + axis] = match link.read_if_available(available, &dws)? {
+                    None => link.read_if_available(available, &is)?,
+                    some => some,
+                };
+            }
+        }
+        Ok((readout, noise_x))
+    }
+
+    fn link_commands(available: &Available, link: &mut Link<'_>) -> Result<Option<[In; 18]>, PluginError> {
+        if !available.columns.iter().any(|c| c.table == "grid" && c.name.starts_with("command.")) {
+            return Ok(None);
+        }
+        let mut columns = Vec::with_capacity(18);
+        for (vector, unit, frame) in COMMAND_VECTORS {
+            for axis in AXES {
+                columns.push(link.read(&grid(&format!("command.{vector}.{axis}"), unit, frame))?);
+            }
+        }
+        Ok(columns.try_into().ok())
+    }
+
+    /// Builds the reconstruction, with the control law beside it where that can be had.
+    fn reconstruction(&mut self, settings: &Settings, all_readouts: bool) -> Result<Reconstruction, PluginError> {
+        let without = Settings { replay: false, ..*settings };
+        if !settings.commands {
+            if !all_readouts {
+                return Err(PluginError::error(
+                    "hinf-dfacs: there is no topic /command, and without every readout of /is and /dws the control law \
+                     cannot be replayed in its stead; give telemetry with /command, or with all readouts",
+                ));
+            }
+            return Ok(Reconstruction::new(&self.mission, &Settings { replay: true, ..*settings })?);
+        }
+        if !(self.compare_commands && all_readouts) {
+            return Ok(Reconstruction::new(&self.mission, &without)?);
+        }
+        match Reconstruction::new(&self.mission, &Settings { replay: true, ..*settings }) {
+            Ok(reconstruction) => Ok(reconstruction),
+            Err(reason) => {
+                let reconstruction = Reconstruction::new(&self.mission, &without)?;
+                self.notes.push(format!("telemetered commands were not compared with the control law: {reason}"));
+                Ok(reconstruction)
+            }
+        }
+    }
+}
+
+fn write_columns(link: &mut Link<'_>, table: Table, noise_x: [&'static str; 2]) -> Result<Vec<Out>, PluginError> {
+    let mut out = Vec::with_capacity(ROW);
+    for (vector, unit) in [("sc.alpha_srf_rad_s2", "rad s-2"), ("sc.omega_srf_rad_s", "rad s-1")] {
+        for axis in AXES {
+            out.push(link.write(table, &format!("{vector}.{axis}"), unit, "SRF")?);
+        }
+    }
+    let noise = |tm: usize| [noise_x[tm], "is_y", "is_z"];
+    for (tm, name) in ["tm1", "tm2"].iter().enumerate() {
+        let frame = format!("ORF_{}", tm + 1);
+        for (axis, noise) in AXES.iter().zip(noise(tm)) {
+            out.push(link.write_with(table, &format!("{name}.r_orf_m.{axis}"), "m", &frame, &[("noise", noise)])?);
+        }
+        for axis in AXES {
+            out.push(link.write(table, &format!("{name}.u_orf_m_s2.{axis}"), "m s-2", &frame)?);
+        }
+    }
+    let mut channel = |name: &str, unit: &str, frame: &str, noise: &str| {
+        let attributes = [("kind", "channel"), ("channel", name), ("average", "2"), ("noise", noise)];
+        link.write_with(table, name, unit, frame, &attributes)
+    };
+    for (tm, name) in ["tm1", "tm2"].iter().enumerate() {
+        for (axis, noise) in AXES.iter().zip(noise(tm)) {
+            out.push(channel(&format!("{name}.accel.{axis}"), "m s-2", &format!("ORF_{}", tm + 1), noise)?);
+        }
+    }
+    for axis in AXES {
+        out.push(channel(&format!("sc.alpha.{axis}"), "rad s-2", "SRF", "dws_long_arm")?);
+    }
+    Ok(out)
+}
+
+impl Linked {
+    fn epoch(&self, input: &Columns<'_>, k: usize) -> Epoch {
+        let vector = |columns: &Option<[&[f64]; 3]>| match columns {
+            Some([x, y, z]) => Vector3::new(x[k], y[k], z[k]),
+            None => Vector3::from_element(f64::NAN),
+        };
+        Epoch {
+            time_ns: input.time_ns[k],
+            readout: std::array::from_fn(|i| input.readout[i].map_or(f64::NAN, |column| column[k])),
+            command: std::array::from_fn(|i| input.command.map_or(f64::NAN, |columns| columns[i][k])),
+            sun_srf: vector(&input.sun),
+            omega_crf_rad_s: vector(&input.omega_crf),
+            alpha_crf_rad_s2: vector(&input.alpha_crf),
+        }
+    }
+
+    fn give(&mut self, output: &mut Outputs) {
+        output.time(self.table).extend(self.rows.iter().map(|row| row.time_ns));
+        for (i, column) in self.out.iter().enumerate() {
+            output.f64(*column).extend(self.rows.iter().map(|row| row.values[i]));
+        }
+        self.rows.clear();
+    }
+}
+
+/// A batch's columns, looked up once.
+struct Columns<'a> {
+    time_ns: &'a [i64],
+    readout: [Option<&'a [f64]>; 15],
+    command: Option<[&'a [f64]; 18]>,
+    sun: Option<[&'a [f64]; 3]>,
+    omega_crf: Option<[&'a [f64]; 3]>,
+    alpha_crf: Option<[&'a [f64]; 3]>,
+}
+
+impl<'a> Columns<'a> {
+    fn of(linked: &Linked, input: &'a Inputs<'_>) -> Self {
+        let vector = |columns: &Option<[In; 3]>| columns.map(|c| c.map(|c| input.f64(c)));
+        Self {
+            time_ns: input.time_ns(),
+            readout: linked.readout.map(|c| c.map(|c| input.f64(c))),
+            command: linked.command.map(|c| c.map(|c| input.f64(c))),
+            sun: vector(&linked.sun),
+            omega_crf: vector(&linked.omega_crf),
+            alpha_crf: vector(&linked.alpha_crf),
+        }
+    }
+}
+
+fn not_linked() -> PluginError {
+    PluginError::fatal("hinf-dfacs was called before `link`; the host must link first")
+}
+
+impl Stage for HinfDfacs {
+    const MANIFEST: Manifest = Manifest {
+        id: "hinf-dfacs",
+        version: env!("CARGO_PKG_VERSION"),
+        licence: "MIT OR Apache-2.0",
+        description: "Known specific force, unbiased angular acceleration and angular velocity from commands and sensing",
+        parameters: &[
+            Parameter::text(
+                "angular_acceleration",
+                "smoother",
+                &["smoother", "commanded", "second-difference"],
+                "where the angular acceleration comes from; all but the smoother bias the calibration",
+            ),
+            Parameter::bool(
+                "compare_commands",
+                true,
+                "replay the control law beside telemetered commands: report the distance, and fill gaps if it is small",
+            ),
+            Parameter::f64(
+                "warm_up_s",
+                "s",
+                600.0,
+                0.0..=86_400.0,
+                "time after which a replayed control law counts as settled",
+            ),
+        ],
+        instances: &[],
+    };
+
+    fn new(setup: &Setup) -> Result<Self, PluginError> {
+        let angular_acceleration = match setup.text("angular_acceleration")?.as_str() {
+            "commanded" => AngularAcceleration::Commanded,
+            "second-difference" => AngularAcceleration::SecondDifference,
+            _ => AngularAcceleration::Smoother,
+        };
+        Ok(Self {
+            mission: Mission::from_json(setup.mission_json())?,
+            angular_acceleration,
+            compare_commands: setup.bool("compare_commands")?,
+            warm_up_s: setup.f64("warm_up_s")?,
+            linked: None,
+            notes: Vec::new(),
+        })
+    }
+
+    fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
+        let (readout, noise_x) = self.link_readouts(available, link)?;
+        let command = Self::link_commands(available, link)?;
+        let sun = read_vector(available, link, "ephemeris.sun_srf", "1", "SRF")?;
+        let omega_crf = read_vector(available, link, "ephemeris.omega_crf_rad_s", "rad s-1", "CRF")?;
+        let alpha_crf = read_vector(available, link, "ephemeris.alpha_crf_rad_s2", "rad s-2", "CRF")?;
+        if sun.is_none() && self.mission.solar_pressure.is_some() {
+            self.notes.push(
+                "no direction of the Sun in /ephemeris: sunlight is not modelled, and the known forces lack it"
+                    .to_owned(),
+            );
+        }
+        if omega_crf.is_none() || alpha_crf.is_none() {
+            self.notes.push(
+                "no rotation of CRF in /ephemeris: angular velocity is relative to CRF, not to inertial space"
+                    .to_owned(),
+            );
+        }
+        let rate_hz = available.column("grid", "is.tm1.r_orf_m.y").map_or(0.0, |c| c.rate_hz);
+        let settings = Settings {
+            rate_hz,
+            angular_acceleration: self.angular_acceleration,
+            commands: command.is_some(),
+            sun: sun.is_some(),
+            replay: false,
+            warm_up_s: self.warm_up_s,
+        };
+        let reconstruction = self.reconstruction(&settings, readout.iter().all(Option::is_some))?;
+        let table = link.table("reconstruction", rate_hz);
+        let out = write_columns(link, table, noise_x)?;
+        self.linked = Some(Linked {
+            reconstruction,
+            rate_hz,
+            readout,
+            command,
+            sun,
+            omega_crf,
+            alpha_crf,
+            table,
+            out,
+            rows: Vec::new(),
+        });
+        Ok(())
+    }
+
+    fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
+        let linked = self.linked.as_mut().ok_or_else(not_linked)?;
+        let columns = Columns::of(linked, input);
+        for k in 0..columns.time_ns.len() {
+            let epoch = linked.epoch(&columns, k);
+            linked.reconstruction.push(&epoch, &mut linked.rows)?;
+        }
+        linked.give(output);
+        Ok(())
+    }
+
+    fn flush(&mut self, output: &mut Outputs) -> Result<(), PluginError> {
+        let linked = self.linked.as_mut().ok_or_else(not_linked)?;
+        linked.reconstruction.finish(&mut linked.rows);
+        linked.give(output);
+        Ok(())
+    }
+
+    fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
+        let linked = self.linked.as_ref().ok_or_else(not_linked)?;
+        let counts = linked.reconstruction.counts();
+        let mut report = Report { notes: self.notes.clone(), ..Report::default() };
+        let reconstructed = counts.commands_replayed > counts.commands_telemetered;
+        report.commands = Some(if reconstructed { "reconstructed" } else { "telemetered" }.to_owned());
+        for (name, count) in [
+            ("commands_telemetered", counts.commands_telemetered),
+            ("commands_replayed", counts.commands_replayed),
+            ("commands_missing", counts.commands_missing),
+            ("sun_direction_missing", counts.sun_missing),
+            ("attitude_missing", counts.attitude_missing),
+        ] {
+            report.counts.insert(name.to_owned(), count);
+        }
+        if counts.commands_replayed > 0 {
+            report.notes.push(format!(
+                "commands of {} of {} epochs were not telemetered and come from the replayed control law",
+                counts.commands_replayed, counts.epochs
+            ));
+        }
+        let q = &mut report.quality;
+        let method = match self.angular_acceleration {
+            AngularAcceleration::Smoother => "smoother",
+            AngularAcceleration::Commanded => "commanded",
+            AngularAcceleration::SecondDifference => "second-difference",
+        };
+        q.insert("angular_acceleration".to_owned(), json!(method));
+        q.insert("smoother_lag_s".to_owned(), json!(linked.reconstruction.lag() as f64 / linked.rate_hz));
+        if self.angular_acceleration != AngularAcceleration::Smoother {
+            report
+                .notes
+                .push(format!("angular_acceleration = \"{method}\" biases the calibration; it is for comparison"));
+        }
+        if let Some(ratio) = linked.reconstruction.innovation_ratio() {
+            q.insert("attitude_innovation_ratio".to_owned(), json!(ratio));
+            if ratio.iter().any(|r| (r - 1.0).abs() > INNOVATION_TOLERANCE) {
+                report.notes.push(format!(
+                    "attitude innovations have {ratio:.2?} of their predicted variance about the principal axes: the noise \
+                     of thrusters' torque or long-arm wavefront sensing is not what the mission file says"
+                ));
+            }
+        }
+        if let Some(comparison) = linked.reconstruction.comparison() {
+            q.insert("command_replay".to_owned(), comparison_json(comparison));
+            if !comparison.same_law() {
+                report.notes.push(
+                    "flown commands differ from the replayed control law by more than readout noise explains: another \
+                     controller flew; the flown commands were used"
+                        .to_owned(),
+                );
+            }
+        }
+        Ok(report)
+    }
+
+    fn save(&self) -> Result<Vec<u8>, PluginError> {
+        Ok(self.linked.as_ref().ok_or_else(not_linked)?.reconstruction.save())
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
+        Ok(self.linked.as_mut().ok_or_else(not_linked)?.reconstruction.load(state)?)
+    }
+}
+
+/// `{"samples", "rms_distance": {vector: value}, "rms_change_of_flown": {…}}`, N and N m.
+fn comparison_json(comparison: &Comparison) -> serde_json::Value {
+    let by_vector = |values: [f64; 6]| {
+        let pairs = COMMAND_VECTORS.iter().zip(values).map(|((name, _, _), value)| ((*name).to_owned(), json!(value)));
+        pairs.collect::<serde_json::Map<_, _>>()
+    };
+    json!({
+        "samples": comparison.samples(),
+        "rms_distance": by_vector(comparison.rms_distance()),
+        "rms_change_of_flown": by_vector(comparison.rms_change()),
+    })
+}

@@ -1,0 +1,410 @@
+//! From telemetry on the grid to the `reconstruction` table, epoch by epoch.
+
+use dragfree_physics::control::ControlLaw;
+use dragfree_physics::mission::{Mission, MissionError};
+use nalgebra::Vector3;
+
+use crate::known::{KnownModel, KnownMotion};
+use crate::replay::{CommandNumbers, Comparison, Held, ReadoutNumbers, Replay, command_from};
+use crate::smoother::{Model, Smoothed, Smoother};
+use crate::state::{Reader, StateError, Writer};
+
+const NEEDED_BY: &str = "hinf-dfacs";
+const STATE: &[u8; 8] = b"dfacs/1\n";
+
+/// Where the angular acceleration comes from. Only the smoother gives an unbiased calibration (physics.md §4).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum AngularAcceleration {
+    /// `E[α | all wavefront sensing, all commands]`.
+    Smoother,
+    /// The commanded torque alone: the loop makes the thrusters' noise a part of the command, which biases `b_x`.
+    Commanded,
+    /// Second difference of the attitude alone: errors in variables pull the offset to zero.
+    SecondDifference,
+}
+
+/// How to reconstruct.
+#[derive(Clone, Copy, Debug)]
+pub struct Settings {
+    /// Rate of the grid, Hz.
+    pub rate_hz: f64,
+    /// Source of `α̂`.
+    pub angular_acceleration: AngularAcceleration,
+    /// Commands are telemetered.
+    pub commands: bool,
+    /// The Sun's direction is telemetered.
+    pub sun: bool,
+    /// Replay the control law: where commands are missing, and beside those that are there.
+    pub replay: bool,
+    /// Time after which a replayed control law counts as settled, s.
+    pub warm_up_s: f64,
+}
+
+/// Telemetry at `t_k`; NaN where there is none.
+#[derive(Clone, Copy, Debug)]
+pub struct Epoch {
+    /// Unix ns.
+    pub time_ns: i64,
+    /// Best readouts, in the order of [`dragfree_physics::mission::CHANNELS`], m and rad.
+    pub readout: ReadoutNumbers,
+    /// What acts over `[t_k, t_{k+1})`, in the order of [`crate::replay::COMMAND_VECTORS`], N and N m.
+    pub command: CommandNumbers,
+    /// Unit vector from the Sun to the spacecraft, SRF.
+    pub sun_srf: Vector3<f64>,
+    /// `ω_CI`, CRF, rad s⁻¹.
+    pub omega_crf_rad_s: Vector3<f64>,
+    /// `ω̇_CI`, CRF, rad s⁻².
+    pub alpha_crf_rad_s2: Vector3<f64>,
+}
+
+/// Values in a row of the `reconstruction` table.
+pub const ROW: usize = 27;
+/// First value of the nine channels in a row.
+pub const CHANNELS_AT: usize = 18;
+
+/// A row: `α̂` (3), `ω̂` (3), `r_1` (3), `û_1` (3), `r_2` (3), `û_2` (3), then the channels `tm1.accel` (3),
+/// `tm2.accel` (3) and `sc.alpha` (3).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Row {
+    /// Unix ns.
+    pub time_ns: i64,
+    /// Values, NaN where there is none.
+    pub values: [f64; ROW],
+}
+
+/// What happened to how many epochs.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// All.
+    pub epochs: u64,
+    /// With a telemetered command.
+    pub commands_telemetered: u64,
+    /// With a replayed one.
+    pub commands_replayed: u64,
+    /// Without any.
+    pub commands_missing: u64,
+    /// Without a direction of the Sun, though sunlight is modelled and telemetered.
+    pub sun_missing: u64,
+    /// Without the spacecraft's attitude.
+    pub attitude_missing: u64,
+}
+
+/// An epoch that waits for the smoother.
+#[derive(Clone, Copy, Debug)]
+struct Pending {
+    time_ns: i64,
+    attitude_rad: Vector3<f64>,
+    r_orf_m: [Vector3<f64>; 2],
+    u_orf_m_s2: [Vector3<f64>; 2],
+    /// Commanded, relative to IRF.
+    alpha_known_rad_s2: Vector3<f64>,
+    /// `ω̇_SI − ω̇_SC = T ω̇_CI − ω_SC×(T ω_CI)`.
+    frame_rad_s2: Vector3<f64>,
+    omega_ci_rad_s: Vector3<f64>,
+}
+
+impl Pending {
+    fn numbers(&self) -> [f64; 24] {
+        let [r1, r2] = self.r_orf_m;
+        let [u1, u2] = self.u_orf_m_s2;
+        let v = [self.attitude_rad, r1, r2, u1, u2, self.alpha_known_rad_s2, self.frame_rad_s2, self.omega_ci_rad_s];
+        std::array::from_fn(|i| v[i / 3][i % 3])
+    }
+
+    fn load(state: &mut Reader<'_>) -> Result<Self, StateError> {
+        let time_ns = state.time()?;
+        let mut numbers = [0.0; 24];
+        state.numbers(&mut numbers)?;
+        let v = |i: usize| Vector3::from_column_slice(&numbers[3 * i..3 * i + 3]);
+        Ok(Self {
+            time_ns,
+            attitude_rad: v(0),
+            r_orf_m: [v(1), v(2)],
+            u_orf_m_s2: [v(3), v(4)],
+            alpha_known_rad_s2: v(5),
+            frame_rad_s2: v(6),
+            omega_ci_rad_s: v(7),
+        })
+    }
+}
+
+/// The running reconstruction.
+pub struct Reconstruction {
+    rate_hz: f64,
+    angular_acceleration: AngularAcceleration,
+    needs_sun: bool,
+    known: KnownModel,
+    smoother: Smoother,
+    lag: usize,
+    replay: Option<Replay>,
+    held: Held,
+    sun_srf: Option<Vector3<f64>>,
+    omega_ci_rad_s: Vector3<f64>,
+    alpha_ci_rad_s2: Vector3<f64>,
+    pending: Vec<Pending>,
+    /// The epoch before the first pending one.
+    previous: Option<Pending>,
+    counts: Counts,
+}
+
+fn finite(v: &Vector3<f64>) -> Option<Vector3<f64>> {
+    v.iter().all(|x| x.is_finite()).then_some(*v)
+}
+
+/// White level of a noise table, above zero.
+fn white(psd: f64, key: &str) -> Result<f64, MissionError> {
+    if psd > 0.0 {
+        return Ok(psd);
+    }
+    let reason = "must be above zero: it is what weighs wavefront sensing against commands";
+    Err(MissionError::Value { key: key.to_owned(), value: psd.sqrt().to_string(), reason })
+}
+
+impl Reconstruction {
+    /// Builds the stage for a mission.
+    ///
+    /// # Errors
+    /// [`MissionError`] when the mission lacks test masses, the noise of the thrusters' torque or of the long-arm
+    /// wavefront sensing, or, with `settings.replay`, a control law.
+    pub fn new(mission: &Mission, settings: &Settings) -> Result<Self, MissionError> {
+        let n = &mission.noise;
+        let torque = Mission::need(&n.thruster_torque, "noise.thruster_torque", NEEDED_BY)?.shape().white_psd();
+        let sensing = Mission::need(&n.dws_long_arm, "noise.dws_long_arm", NEEDED_BY)?.shape().white_psd();
+        let model = Model::new(
+            &mission.spacecraft.inertia(),
+            white(torque, "noise.thruster_torque.asd_nm_rthz")?,
+            white(sensing, "noise.dws_long_arm.asd_rad_rthz")?,
+            1.0 / settings.rate_hz,
+        );
+        let replay = if settings.replay {
+            Some(Replay::new(ControlLaw::new(mission)?, !settings.commands, settings.warm_up_s, settings.rate_hz))
+        } else {
+            None
+        };
+        Ok(Self {
+            rate_hz: settings.rate_hz,
+            angular_acceleration: settings.angular_acceleration,
+            needs_sun: settings.sun && mission.solar_pressure.is_some(),
+            known: KnownModel::new(mission)?,
+            lag: model.lag(),
+            smoother: Smoother::new(model),
+            replay,
+            held: Held::new(),
+            sun_srf: None,
+            omega_ci_rad_s: Vector3::zeros(),
+            alpha_ci_rad_s2: Vector3::zeros(),
+            pending: Vec::new(),
+            previous: None,
+            counts: Counts::default(),
+        })
+    }
+
+    /// Takes one epoch; `rows` gains those whose lag has passed.
+    ///
+    /// Small angles: SRF and CRF differ by the attitude error, 1e-8 rad, so `T_C^S = 1` and the three angles are a
+    /// vector whose second derivative is the angular acceleration relative to CRF.
+    ///
+    /// # Errors
+    /// [`StateError`] when the control law does not take back its own state.
+    pub fn push(&mut self, epoch: &Epoch, rows: &mut Vec<Row>) -> Result<(), StateError> {
+        self.counts.epochs += 1;
+        self.held.take(&epoch.readout);
+        // The ephemeris comes once a minute; what it tells moves by 1e-5 in that time.
+        self.sun_srf = finite(&epoch.sun_srf).or(self.sun_srf);
+        self.omega_ci_rad_s = finite(&epoch.omega_crf_rad_s).unwrap_or(self.omega_ci_rad_s);
+        self.alpha_ci_rad_s2 = finite(&epoch.alpha_crf_rad_s2).unwrap_or(self.alpha_ci_rad_s2);
+
+        let attitude_rad = Vector3::from_column_slice(&epoch.readout[..3]);
+        let attitude = finite(&attitude_rad);
+        self.counts.attitude_missing += u64::from(attitude.is_none());
+        let omega_sc = self.smoother.update(attitude.as_ref());
+        let frame_rad_s2 = self.alpha_ci_rad_s2 - omega_sc.cross(&self.omega_ci_rad_s);
+
+        let motion = self.known_motion(epoch, &(omega_sc + self.omega_ci_rad_s))?;
+        self.smoother.advance(motion.map(|m| m.alpha_srf_rad_s2 - frame_rad_s2).as_ref());
+        let missing = Vector3::from_element(f64::NAN);
+        self.pending.push(Pending {
+            time_ns: epoch.time_ns,
+            attitude_rad,
+            r_orf_m: [3, 9].map(|i| Vector3::from_column_slice(&epoch.readout[i..i + 3])),
+            u_orf_m_s2: motion.map_or([missing; 2], |m| m.u_orf_m_s2),
+            alpha_known_rad_s2: motion.map_or(missing, |m| m.alpha_srf_rad_s2),
+            frame_rad_s2,
+            omega_ci_rad_s: self.omega_ci_rad_s,
+        });
+        if self.smoother.waiting() == 2 * self.lag {
+            self.emit(self.lag, rows);
+        }
+        Ok(())
+    }
+
+    /// There are no more epochs: gives what waits.
+    pub fn finish(&mut self, rows: &mut Vec<Row>) {
+        self.emit(self.pending.len(), rows);
+    }
+
+    fn known_motion(
+        &mut self,
+        epoch: &Epoch,
+        omega_srf_rad_s: &Vector3<f64>,
+    ) -> Result<Option<KnownMotion>, StateError> {
+        let flown = epoch.command.iter().all(|x| x.is_finite()).then_some(&epoch.command);
+        let replayed = match &mut self.replay {
+            Some(replay) => replay.step(&self.held, self.sun_srf, flown)?,
+            None => None,
+        };
+        let counter = match (flown, &replayed) {
+            (Some(_), _) => &mut self.counts.commands_telemetered,
+            (None, Some(_)) => &mut self.counts.commands_replayed,
+            (None, None) => &mut self.counts.commands_missing,
+        };
+        *counter += 1;
+        if self.needs_sun && self.sun_srf.is_none() {
+            self.counts.sun_missing += 1;
+            return Ok(None);
+        }
+        let command = flown.copied().or(replayed).map(|numbers| command_from(&numbers));
+        let readout = self.held.test_masses();
+        Ok(command.map(|c| self.known.motion(&c, self.sun_srf.as_ref(), &readout, omega_srf_rad_s)))
+    }
+
+    fn emit(&mut self, count: usize, rows: &mut Vec<Row>) {
+        let smoothed = self.smoother.smooth(count);
+        rows.reserve(smoothed.len());
+        for (k, smoothed) in smoothed.iter().enumerate() {
+            rows.push(self.row(k, smoothed));
+        }
+        if let Some(last) = smoothed.len().checked_sub(1) {
+            self.previous = Some(self.pending[last]);
+        }
+        self.pending.drain(..smoothed.len());
+    }
+
+    fn row(&self, k: usize, smoothed: &Smoothed) -> Row {
+        let now = &self.pending[k];
+        let before = if k == 0 { self.previous.as_ref() } else { Some(&self.pending[k - 1]) };
+        let after = self.pending.get(k + 1);
+        let missing = Vector3::from_element(f64::NAN);
+        let alpha = match self.angular_acceleration {
+            AngularAcceleration::Smoother => now.alpha_known_rad_s2 + smoothed.disturbance_rad_s2,
+            AngularAcceleration::Commanded => now.alpha_known_rad_s2,
+            AngularAcceleration::SecondDifference => match (before, after, self.pending.get(k + 2)) {
+                // The mean of the second differences at both ends of the interval.
+                (Some(a), Some(c), Some(d)) => {
+                    let sum = d.attitude_rad - c.attitude_rad - now.attitude_rad + a.attitude_rad;
+                    sum * (0.5 * self.rate_hz * self.rate_hz) + now.frame_rad_s2
+                }
+                _ => missing,
+            },
+        };
+        let [tm1, tm2, sc] = match (before, after) {
+            (Some(a), Some(c)) => {
+                let difference = |read: fn(&Pending) -> Vector3<f64>, known: fn(&Pending) -> Vector3<f64>| {
+                    (read(a) - 2.0 * read(now) + read(c)) * (self.rate_hz * self.rate_hz)
+                        - 0.5 * (known(a) + known(now))
+                };
+                [
+                    difference(|p| p.r_orf_m[0], |p| p.u_orf_m_s2[0]),
+                    difference(|p| p.r_orf_m[1], |p| p.u_orf_m_s2[1]),
+                    difference(|p| p.attitude_rad, |p| p.alpha_known_rad_s2 - p.frame_rad_s2),
+                ]
+            }
+            _ => [missing; 3],
+        };
+        let omega = smoothed.omega_crf_rad_s + now.omega_ci_rad_s;
+        let vectors =
+            [alpha, omega, now.r_orf_m[0], now.u_orf_m_s2[0], now.r_orf_m[1], now.u_orf_m_s2[1], tm1, tm2, sc];
+        Row { time_ns: now.time_ns, values: std::array::from_fn(|i| vectors[i / 3][i % 3]) }
+    }
+
+    /// What happened to how many epochs.
+    #[must_use]
+    pub fn counts(&self) -> Counts {
+        self.counts
+    }
+
+    /// See [`Smoother::innovation_ratio`].
+    #[must_use]
+    pub fn innovation_ratio(&self) -> Option<[f64; 3]> {
+        self.smoother.innovation_ratio()
+    }
+
+    /// Replayed against flown commands; `None` where nothing was compared.
+    #[must_use]
+    pub fn comparison(&self) -> Option<&Comparison> {
+        self.replay.as_ref().map(Replay::comparison).filter(|c| c.samples() > 0)
+    }
+
+    /// Samples by which a row is late at least; at most twice as many.
+    #[must_use]
+    pub fn lag(&self) -> usize {
+        self.lag
+    }
+
+    /// The whole state.
+    #[must_use]
+    pub fn save(&self) -> Vec<u8> {
+        let mut out = Writer(STATE.to_vec());
+        self.smoother.save(&mut out);
+        self.held.save(&mut out);
+        out.optional(self.sun_srf.as_ref().map(Vector3::as_slice));
+        out.numbers(self.omega_ci_rad_s.as_slice());
+        out.numbers(self.alpha_ci_rad_s2.as_slice());
+        if let Some(replay) = &self.replay {
+            replay.save(&mut out);
+        }
+        let c = self.counts;
+        for count in [
+            c.epochs,
+            c.commands_telemetered,
+            c.commands_replayed,
+            c.commands_missing,
+            c.sun_missing,
+            c.attitude_missing,
+        ] {
+            out.count(count);
+        }
+        out.flag(self.previous.is_some());
+        for pending in self.previous.iter().chain(&self.pending) {
+            out.time(pending.time_ns);
+            out.numbers(&pending.numbers());
+        }
+        out.0
+    }
+
+    /// Takes a state back, bit for bit.
+    ///
+    /// # Errors
+    /// [`StateError`] when the bytes are not a state of this stage with this mission; do not use the stage after that.
+    pub fn load(&mut self, bytes: &[u8]) -> Result<(), StateError> {
+        let mut state = Reader::new(bytes);
+        if state.bytes().ok().as_ref() != Some(STATE) {
+            return Err(StateError::Foreign { expected: "version 1" });
+        }
+        self.smoother.load(&mut state)?;
+        self.held.load(&mut state)?;
+        self.sun_srf = state.optional()?.map(Vector3::from);
+        state.numbers(self.omega_ci_rad_s.as_mut_slice())?;
+        state.numbers(self.alpha_ci_rad_s2.as_mut_slice())?;
+        if let Some(replay) = &mut self.replay {
+            replay.load(&mut state)?;
+        }
+        let c = &mut self.counts;
+        for count in [
+            &mut c.epochs,
+            &mut c.commands_telemetered,
+            &mut c.commands_replayed,
+            &mut c.commands_missing,
+            &mut c.sun_missing,
+            &mut c.attitude_missing,
+        ] {
+            *count = state.count()?;
+        }
+        self.previous = if state.flag()? { Some(Pending::load(&mut state)?) } else { None };
+        self.pending.clear();
+        for _ in 0..self.smoother.waiting() {
+            self.pending.push(Pending::load(&mut state)?);
+        }
+        state.end()
+    }
+}

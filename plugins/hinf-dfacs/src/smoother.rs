@@ -1,0 +1,295 @@
+//! The spacecraft's angular acceleration given all wavefront sensing and all commands: a fixed-lag disturbance smoother.
+//!
+//! The attitude obeys `θ̈ = α_known + β + w` with `w` white (thrusters), constant over a sample, and `β` a slowly
+//! wandering torque (sunlight or a controller's integrator that nobody modelled). A Kalman filter runs on
+//! `x = [θ, ω, β]` for each principal axis, and the adjoint recursion of Koopman's disturbance smoother (Biometrika 80,
+//! 1993; Durbin & Koopman, sections 4.4 and 4.5) runs backward over a fixed lag. It gives `E[β + w | data]`, so that the truth regressed on the result
+//! has slope one. Commands are no extra information: they are known functions of past readouts.
+//!
+//! The torque noise has one level on all axes and so has the sensing: `J⁻¹ S_M J⁻ᵀ` and `S_n 1` are diagonal
+//! together in the principal axes of `J`, and the three axes decouple exactly.
+//!
+//! The sensing's rise below 2 mHz is not in the model. There the smoother has `1 − W < 1e-6` with it or without it:
+//! the disturbance is 10³ times above the sensing, and `w` is measured as well as it can be.
+
+use nalgebra::{Matrix3, Vector3};
+use std::f64::consts::TAU;
+
+use crate::state::{Reader, StateError, Writer};
+
+/// Where the wandering torque's spectrum crosses the thrusters' white one. Far below the crossover at which the
+/// smoother gives up sensing for commands (about 0.08 Hz), so `β` only saves the ends of a record from a constant torque.
+const DRIFT_CORNER_HZ: f64 = 1e-4;
+/// Standard deviations before any data: attitude (rad), rate (rad/s) and wandering part (rad/s²), all far wider than
+/// a spacecraft in science mode; a torque at the limit of micro-thrusters turns it by 1e-6 rad/s².
+const PRIOR: [f64; 3] = [1e-2, 1e-4, 1e-6];
+/// The lag in time constants of the filter. What lies beyond it would add `e⁻²⁰` of `w`, to be compared with the
+/// loop's own suppression of `α` against `w`, 1e-4 at 1 mHz.
+const LAG_TIME_CONSTANTS: f64 = 20.0;
+
+/// Three numbers, one for each principal axis.
+type Axes = [f64; 3];
+
+/// The model of one spacecraft, in its principal axes.
+#[derive(Clone, Debug)]
+pub struct Model {
+    dt_s: f64,
+    /// Columns are the principal axes in SRF.
+    srf_from_principal: Matrix3<f64>,
+    /// Variance of a sample's mean disturbance, rad² s⁻⁴.
+    disturbance_variance: Axes,
+    /// Variance of the step of `β` from one sample to the next, rad² s⁻⁴.
+    drift_variance: Axes,
+    /// Variance of a readout, rad².
+    readout_variance: f64,
+    lag: usize,
+}
+
+impl Model {
+    /// Builds the model from the inertia (SRF, kg m²), the one-sided PSD of the torque noise per axis (N² m²/Hz) and
+    /// of the attitude readout per axis (rad²/Hz), and the sample interval.
+    #[must_use]
+    pub fn new(inertia_kg_m2: &Matrix3<f64>, torque_psd: f64, readout_psd: f64, dt_s: f64) -> Self {
+        let eigen = inertia_kg_m2.symmetric_eigen();
+        // A one-sided PSD S, sampled at f_s, has the variance S f_s/2.
+        let per_sample = 0.5 / dt_s;
+        let disturbance_psd: Axes = std::array::from_fn(|i| torque_psd / eigen.eigenvalues[i].powi(2));
+        let drift_step = TAU * DRIFT_CORNER_HZ * dt_s;
+        // Poles at (S_w/S_n)^(1/4) rad/s, damped by 1/√2.
+        let slowest = disturbance_psd.iter().copied().fold(f64::INFINITY, f64::min);
+        let decay_per_sample = (slowest / readout_psd).powf(0.25) * std::f64::consts::FRAC_1_SQRT_2 * dt_s;
+        Self {
+            dt_s,
+            srf_from_principal: eigen.eigenvectors,
+            disturbance_variance: disturbance_psd.map(|s| s * per_sample),
+            drift_variance: disturbance_psd.map(|s| s * per_sample * drift_step * drift_step),
+            readout_variance: readout_psd * per_sample,
+            // Where sensing follows every sample the filter forgets at once; it still needs a few samples around.
+            lag: ((LAG_TIME_CONSTANTS / decay_per_sample).ceil() as usize).max(16),
+        }
+    }
+
+    /// Samples by which the result is late.
+    #[must_use]
+    pub fn lag(&self) -> usize {
+        self.lag
+    }
+}
+
+/// One-sided PSD at `frequency_hz` of `(e_{k−1} + e_k)/2`, where `e` is the error of the smoothed angular acceleration
+/// about one principal axis and the mean over two samples is what a second difference sees, rad² s⁻⁴/Hz.
+///
+/// `R = S_w − W S_w`, `W = S_w/(S_w + g S_n)`, with `S_w = cos²(πfΔt) disturbance_psd`, `g = (2 sin(πfΔt)/Δt)⁴`. In
+/// SRF the same holds with matrices, `S_w = cos² J⁻¹ S_M J⁻ᵀ` and `W = S_w (S_w + g S_n 1)⁻¹`.
+#[must_use]
+pub fn residual_psd(frequency_hz: f64, disturbance_psd: f64, readout_psd: f64, dt_s: f64) -> f64 {
+    let (s, c) = (0.5 * TAU * frequency_hz * dt_s).sin_cos();
+    let disturbance = c * c * disturbance_psd;
+    let readout = (2.0 * s / dt_s).powi(4) * readout_psd;
+    disturbance * readout / (disturbance + readout)
+}
+
+/// What the smoother knows about one epoch, SRF.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Smoothed {
+    /// `E[β + w]`, mean over `[t_k, t_{k+1})`, rad s⁻².
+    pub disturbance_rad_s2: Vector3<f64>,
+    /// `E[ω]` relative to CRF at `t_k`, rad s⁻¹.
+    pub omega_crf_rad_s: Vector3<f64>,
+}
+
+/// What the backward recursion needs of one epoch; every number for three axes.
+#[derive(Clone, Copy, Debug, Default)]
+struct Step {
+    /// Predicted ω and β.
+    predicted: [Axes; 2],
+    /// Rows ω and β of the predicted covariance: ωθ, ωω, ωβ, βθ, ββ.
+    covariance: [Axes; 5],
+    /// Gain `K` of the update.
+    gain: [Axes; 3],
+    /// Innovation over its variance; zero, as the gain, without a readout.
+    weighted_innovation: Axes,
+    /// The command of the interval that follows is unknown: attitude and rate are forgotten across it.
+    cut: bool,
+}
+
+/// The running smoother. Call [`Self::update`] and then [`Self::advance`] for each epoch.
+#[derive(Clone, Debug)]
+pub struct Smoother {
+    model: Model,
+    /// θ, ω, β.
+    mean: [Axes; 3],
+    /// θθ, θω, θβ, ωω, ωβ, ββ.
+    covariance: [Axes; 6],
+    steps: Vec<Step>,
+    innovation_squares: Axes,
+    innovations: u64,
+}
+
+impl Smoother {
+    /// Starts before any data.
+    #[must_use]
+    pub fn new(model: Model) -> Self {
+        let [theta, omega, beta] = PRIOR.map(|sigma| [sigma * sigma; 3]);
+        let zero = [0.0; 3];
+        Self {
+            model,
+            mean: [zero; 3],
+            covariance: [theta, zero, zero, omega, zero, beta],
+            steps: Vec::new(),
+            innovation_squares: zero,
+            innovations: 0,
+        }
+    }
+
+    /// Takes the attitude relative to CRF at `t_k` (SRF, rad), `None` where there is none, and returns the filtered ω
+    /// relative to CRF (SRF, rad s⁻¹).
+    pub fn update(&mut self, attitude_rad: Option<&Vector3<f64>>) -> Vector3<f64> {
+        let [p00, p01, p02, p11, p12, p22] = self.covariance;
+        let mut step =
+            Step { predicted: [self.mean[1], self.mean[2]], covariance: [p01, p11, p12, p02, p22], ..Step::default() };
+        if let Some(attitude) = attitude_rad {
+            let y = self.model.srf_from_principal.tr_mul(attitude);
+            let noise = self.model.readout_variance;
+            for i in 0..3 {
+                let variance = p00[i] + noise;
+                let innovation = y[i] - self.mean[0][i];
+                let gain = [p00[i] / variance, p01[i] / variance, p02[i] / variance];
+                for (state, k) in gain.into_iter().enumerate() {
+                    self.mean[state][i] += k * innovation;
+                    step.gain[state][i] = k;
+                }
+                step.weighted_innovation[i] = innovation / variance;
+                // The first row as noise times gain: no difference of nearly equal numbers after a wide prior.
+                self.covariance[0][i] = noise * gain[0];
+                self.covariance[1][i] = noise * gain[1];
+                self.covariance[2][i] = noise * gain[2];
+                self.covariance[3][i] = p11[i] - gain[1] * p01[i];
+                self.covariance[4][i] = p12[i] - gain[1] * p02[i];
+                self.covariance[5][i] = p22[i] - gain[2] * p02[i];
+                self.innovation_squares[i] += innovation * step.weighted_innovation[i];
+            }
+            self.innovations += 1;
+        }
+        self.steps.push(step);
+        self.model.srf_from_principal * Vector3::from(self.mean[1])
+    }
+
+    /// Moves on to `t_{k+1}` under the known part of `θ̈` over `[t_k, t_{k+1})` (SRF, rad s⁻²); `None` when the
+    /// command is unknown.
+    pub fn advance(&mut self, known_rad_s2: Option<&Vector3<f64>>) {
+        let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
+        let [p00, p01, p02, p11, p12, p22] = self.covariance;
+        let Some(known) = known_rad_s2 else {
+            if let Some(step) = self.steps.last_mut() {
+                step.cut = true;
+            }
+            let zero = [0.0; 3];
+            let drifted = std::array::from_fn(|i| p22[i] + self.model.drift_variance[i]);
+            self.mean = [zero, zero, self.mean[2]];
+            self.covariance = [[PRIOR[0].powi(2); 3], zero, zero, [PRIOR[1].powi(2); 3], zero, drifted];
+            return;
+        };
+        let known = self.model.srf_from_principal.tr_mul(known);
+        for i in 0..3 {
+            let push = self.mean[2][i] + known[i];
+            self.mean[0][i] += dt * self.mean[1][i] + half * push;
+            self.mean[1][i] += dt * push;
+            let q = self.model.disturbance_variance[i];
+            let theta_theta = p00[i] + dt * p01[i] + half * p02[i];
+            let theta_omega = p01[i] + dt * p11[i] + half * p12[i];
+            let theta_beta = p02[i] + dt * p12[i] + half * p22[i];
+            let omega_omega = p11[i] + dt * p12[i];
+            let omega_beta = p12[i] + dt * p22[i];
+            self.covariance[0][i] = theta_theta + dt * theta_omega + half * theta_beta + q * half * half;
+            self.covariance[1][i] = theta_omega + dt * theta_beta + q * half * dt;
+            self.covariance[2][i] = theta_beta;
+            self.covariance[3][i] = omega_omega + dt * omega_beta + q * dt * dt;
+            self.covariance[4][i] = omega_beta;
+            self.covariance[5][i] = p22[i] + self.model.drift_variance[i];
+        }
+    }
+
+    /// Epochs that wait for their future. At twice the lag, [`Self::smooth`] the first half: blocks are counted from
+    /// the first epoch, so that the result knows nothing of how the data came in.
+    #[must_use]
+    pub fn waiting(&self) -> usize {
+        self.steps.len()
+    }
+
+    /// Smooths the `count` oldest waiting epochs with all the data so far, and lets them go.
+    pub fn smooth(&mut self, count: usize) -> Vec<Smoothed> {
+        let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
+        let count = count.min(self.steps.len());
+        let mut out = vec![Smoothed { disturbance_rad_s2: Vector3::zeros(), omega_crf_rad_s: Vector3::zeros() }; count];
+        let mut adjoint = [[0.0; 3]; 3];
+        for (k, step) in self.steps.iter().enumerate().rev() {
+            let mut disturbance = [0.0; 3];
+            let mut omega = [0.0; 3];
+            for i in 0..3 {
+                let [r0, r1, r2] = [adjoint[0][i], adjoint[1][i], adjoint[2][i]];
+                let pushed = half * r0 + dt * r1;
+                // s = Aᵀ r, then r ← s − Hᵀ K·s + Hᵀ v/F.
+                let [s0, s1, s2] = if step.cut { [0.0, 0.0, r2] } else { [r0, dt * r0 + r1, pushed + r2] };
+                let corrected = step.gain[0][i] * s0 + step.gain[1][i] * s1 + step.gain[2][i] * s2;
+                let s0 = s0 - corrected + step.weighted_innovation[i];
+                for (state, s) in [s0, s1, s2].into_iter().enumerate() {
+                    adjoint[state][i] = s;
+                }
+                let [wt, ww, wb, bt, bb] = step.covariance;
+                let beta = step.predicted[1][i] + bt[i] * s0 + wb[i] * s1 + bb[i] * s2;
+                disturbance[i] = beta + self.model.disturbance_variance[i] * pushed;
+                omega[i] = step.predicted[0][i] + wt[i] * s0 + ww[i] * s1 + wb[i] * s2;
+            }
+            if k < count {
+                out[k] = Smoothed {
+                    disturbance_rad_s2: self.model.srf_from_principal * Vector3::from(disturbance),
+                    omega_crf_rad_s: self.model.srf_from_principal * Vector3::from(omega),
+                };
+            }
+        }
+        self.steps.drain(..count);
+        out
+    }
+
+    /// Mean squared innovation over its predicted variance per principal axis: 1 when torque noise and sensing noise
+    /// are as the mission file says. `None` before any readout.
+    #[must_use]
+    pub fn innovation_ratio(&self) -> Option<[f64; 3]> {
+        (self.innovations > 0).then(|| self.innovation_squares.map(|s| s / self.innovations as f64))
+    }
+
+    pub(crate) fn save(&self, out: &mut Writer) {
+        out.numbers(self.mean.as_flattened());
+        out.numbers(self.covariance.as_flattened());
+        out.numbers(&self.innovation_squares);
+        out.count(self.innovations);
+        out.count(self.steps.len() as u64);
+        for step in &self.steps {
+            out.numbers(step.predicted.as_flattened());
+            out.numbers(step.covariance.as_flattened());
+            out.numbers(step.gain.as_flattened());
+            out.numbers(&step.weighted_innovation);
+            out.flag(step.cut);
+        }
+    }
+
+    pub(crate) fn load(&mut self, state: &mut Reader<'_>) -> Result<(), StateError> {
+        state.numbers(self.mean.as_flattened_mut())?;
+        state.numbers(self.covariance.as_flattened_mut())?;
+        state.numbers(&mut self.innovation_squares)?;
+        self.innovations = state.count()?;
+        let steps = state.length(2 * self.model.lag)?;
+        self.steps.clear();
+        for _ in 0..steps {
+            let mut step = Step::default();
+            state.numbers(step.predicted.as_flattened_mut())?;
+            state.numbers(step.covariance.as_flattened_mut())?;
+            state.numbers(step.gain.as_flattened_mut())?;
+            state.numbers(&mut step.weighted_innovation)?;
+            step.cut = state.flag()?;
+            self.steps.push(step);
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,98 @@
+//! The attitude loop of the paper's spacecraft, with the mission's own control law and the test masses at rest.
+
+use dragfree_hinf_dfacs::known::KnownModel;
+use dragfree_hinf_dfacs::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Row, Settings};
+use dragfree_physics::control::{Command, ControlLaw, Readout, TestMassReadout};
+use dragfree_physics::mission::Mission;
+use nalgebra::{Matrix3, Vector3};
+
+pub(crate) const RATE_HZ: f64 = 10.0;
+pub(crate) const DT_S: f64 = 1.0 / RATE_HZ;
+
+/// The default mission without sunlight, so that nothing but the loop moves the spacecraft.
+pub(crate) fn mission() -> Mission {
+    let text = include_str!("../../../../fixtures/missions/taiji.toml");
+    let value: serde_json::Value = toml::from_str(text).expect("the fixture is TOML");
+    let mut mission = Mission::from_json(&value.to_string()).expect("the fixture is a mission");
+    mission.solar_pressure = None;
+    mission
+}
+
+pub(crate) fn settings(angular_acceleration: AngularAcceleration) -> Settings {
+    Settings { rate_hz: RATE_HZ, angular_acceleration, commands: true, sun: false, replay: false, warm_up_s: 60.0 }
+}
+
+pub(crate) fn stage(mission: &Mission, settings: &Settings) -> Reconstruction {
+    Reconstruction::new(mission, settings).expect("the fixture is complete")
+}
+
+/// One-sided PSDs of the torque (per axis, N² m²/Hz) and of the attitude readout (rad²/Hz).
+pub(crate) fn levels(mission: &Mission) -> [f64; 2] {
+    let n = &mission.noise;
+    let torque = n.thruster_torque.as_ref().expect("the fixture has it").asd_nm_rthz;
+    let sensing = n.dws_long_arm.as_ref().expect("the fixture has it").asd_rad_rthz;
+    [torque * torque, sensing * sensing]
+}
+
+pub(crate) struct AttitudeLoop {
+    law: ControlLaw,
+    known: KnownModel,
+    inertia_inverse: Matrix3<f64>,
+    theta: Vector3<f64>,
+    omega: Vector3<f64>,
+    time_ns: i64,
+}
+
+impl AttitudeLoop {
+    pub(crate) fn new(mission: &Mission) -> Self {
+        Self {
+            law: ControlLaw::new(mission).expect("the fixture is complete"),
+            known: KnownModel::new(mission).expect("the fixture is complete"),
+            inertia_inverse: mission.spacecraft.inertia_inverse(),
+            theta: Vector3::zeros(),
+            omega: Vector3::zeros(),
+            time_ns: 0,
+        }
+    }
+
+    /// One sample under a disturbing torque, with an error of the readout: telemetry and the true mean `α`.
+    pub(crate) fn step(&mut self, torque_nm: &Vector3<f64>, error_rad: &Vector3<f64>) -> (Epoch, Vector3<f64>) {
+        let y = self.theta + error_rad;
+        let command = self.law.step(&Readout { sc_crf_rad: y, ..Readout::default() });
+        let rest = [TestMassReadout::default(); 2];
+        let known = self.known.motion(&command, None, &rest, &Vector3::zeros());
+        let alpha = known.alpha_srf_rad_s2 + self.inertia_inverse * torque_nm;
+        self.theta += self.omega * DT_S + alpha * (0.5 * DT_S * DT_S);
+        self.omega += alpha * DT_S;
+        let time_ns = self.time_ns;
+        self.time_ns += 100_000_000;
+        let mut readout = [0.0; 15];
+        readout[..3].copy_from_slice(y.as_slice());
+        let missing = Vector3::from_element(f64::NAN);
+        let epoch = Epoch {
+            time_ns,
+            readout,
+            command: numbers(&command),
+            sun_srf: missing,
+            omega_crf_rad_s: missing,
+            alpha_crf_rad_s2: missing,
+        };
+        (epoch, alpha)
+    }
+}
+
+pub(crate) fn numbers(c: &Command) -> [f64; 18] {
+    let [a, b] = &c.tm;
+    let v = [c.mps_force_srf_n, c.mps_torque_srf_nm, a.force_orf_n, a.torque_orf_nm, b.force_orf_n, b.torque_orf_nm];
+    std::array::from_fn(|i| v[i / 3][i % 3])
+}
+
+/// A whole record at once.
+pub(crate) fn run(stage: &mut Reconstruction, epochs: &[Epoch]) -> Vec<Row> {
+    let mut rows = Vec::new();
+    for epoch in epochs {
+        stage.push(epoch, &mut rows).expect("the law takes its own state");
+    }
+    stage.finish(&mut rows);
+    rows
+}
