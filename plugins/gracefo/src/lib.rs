@@ -17,10 +17,17 @@
 //! | time tags of Level 1A are the on-board receiver's | column attribute `clock`, noted |
 //! | archives hold stray `._*` members | ignored |
 
+pub mod accelerometer;
 pub mod archive;
 pub mod header;
 pub mod product;
 pub mod rows;
+pub mod source;
+pub mod telemetry;
+
+use dragfree_sdk::export_plugin;
+
+export_plugin!(stages: [accelerometer::Accelerometer], effects: [], sources: [source::GraceFo]);
 
 /// Why a file was refused.
 #[derive(Debug, thiserror::Error)]

@@ -80,6 +80,12 @@ pub struct Product {
 }
 
 impl Product {
+    /// Level 1A keeps the time tags of the on-board receiver; Level 1B is on GPS time.
+    #[must_use]
+    pub fn on_receiver_time(&self) -> bool {
+        self.code.ends_with("1A")
+    }
+
     /// Names of the product's tables, one per instrument: `acc1a`, or `sca1a_1`, `sca1a_2`, `sca1a_3`.
     #[must_use]
     pub fn tables(&self) -> Vec<String> {

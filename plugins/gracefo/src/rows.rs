@@ -119,6 +119,22 @@ pub fn parse(
     Ok(Parsed { tables, counts })
 }
 
+impl Counts {
+    /// What goes into a report, each under its name. Rows outside the window are no loss.
+    pub(crate) fn each(&self) -> [(&'static str, u64); 8] {
+        [
+            ("header_count_wrong", u64::from(self.promised.is_some())),
+            ("garbage_lines", self.garbage),
+            ("files_truncated", self.truncated),
+            ("fill_values", self.fill_values),
+            ("rows_out_of_order", self.out_of_order),
+            ("rows_duplicate", self.duplicates),
+            ("rows_foreign", self.foreign),
+            ("rows_untimed", self.untimed),
+        ]
+    }
+}
+
 /// Gives neighbouring quaternions of one rotation one sign. `last` carries the sign over from an earlier file.
 pub fn align_quaternions(rows: &mut Rows, first: usize, last: &mut Option<[f64; 4]>) {
     for k in 0..rows.time_ns.len() {
@@ -138,7 +154,7 @@ pub fn align_quaternions(rows: &mut Rows, first: usize, last: &mut Option<[f64; 
 }
 
 /// Sorts by time where needed and drops all but the first row of a time.
-fn order(rows: &mut Rows, counts: &mut Counts) {
+pub(crate) fn order(rows: &mut Rows, counts: &mut Counts) {
     let mut latest = i64::MIN;
     let mut late = 0;
     for t in &rows.time_ns {

@@ -1,0 +1,222 @@
+//! The stage `accelerometer`: what an accelerometer measures takes the place of the displacements of a test mass.
+//!
+//! A proof mass is held at the centre of its cage, `b` from the spacecraft's centre of mass, and the force that holds
+//! it is measured. Per unit mass it is the cage's own acceleration against free fall,
+//! `a = a_ng + α×b + ω×(ω×b) − Γ b`. The channels of the chain are those of a **free** mass seen from its housing
+//! (eq:TM_SC_relative_acceleration), `r̈ = −a_ng − α×b − ω×(ω×b) + Γ b`: the same with the sign turned. So
+//! `channel = −a`, and every effect and estimator behind it works unchanged.
+//!
+//! `α` is measured by the same instrument. `ω` comes from differences of the attitude SCA1B and not from the gyros
+//! IMU1A: the attitude is in SRF, is without the gyros' drift and holds their data already, while the axes of the gyros
+//! are in no header. `ω` matters little: what changes in `ω×(ω×b)` is 1e-9 s⁻²·b, against 1e-7 s⁻²·b from α.
+//!
+//! The gradient's `Γ b` is 4e-6 s⁻²·b in low orbit, but constant in a spacecraft that points at the Earth, as are the
+//! instrument's biases (1e-5 m s⁻², 1e-3 rad s⁻²): `qp-check` takes constants and slopes out of every segment.
+
+use dragfree_physics::mission::Mission;
+use dragfree_sdk::prelude::*;
+use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
+
+const AXES: [&str; 3] = ["x", "y", "z"];
+
+/// Acceleration of a free mass relative to its housing (ORF), from what an accelerometer there measures (SRF).
+#[must_use]
+pub fn channel_orf_m_s2(orf_from_srf: &Matrix3<f64>, measured_srf_m_s2: &Vector3<f64>) -> Vector3<f64> {
+    -(orf_from_srf * measured_srf_m_s2)
+}
+
+/// Angular rate from the attitude: `q` turns components in SRF into components in IRF.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AttitudeRate {
+    last: Option<(i64, [f64; 4])>,
+}
+
+impl AttitudeRate {
+    /// Takes the attitude `[w, x, y, z]` of an epoch and gives the mean rate in SRF, rad s⁻¹, since the epoch `step_ns`
+    /// before; NaN when there was none. The half step between mean and end is 1e-8 rad s⁻¹ of a rate of 1e-3.
+    pub fn next(&mut self, time_ns: i64, q: [f64; 4], step_ns: i64) -> Vector3<f64> {
+        let unit = |q: [f64; 4]| UnitQuaternion::from_quaternion(Quaternion::new(q[0], q[1], q[2], q[3]));
+        let valid = q.iter().all(|x| x.is_finite()) && q.iter().any(|x| *x != 0.0);
+        let now = valid.then_some((time_ns, q));
+        match (std::mem::replace(&mut self.last, now), now) {
+            // The grid's epochs are rounded to whole nanoseconds.
+            (Some((before_ns, p)), Some(_)) if (time_ns - before_ns - step_ns).abs() <= 1 => {
+                (unit(p).inverse() * unit(q)).scaled_axis() / (step_ns as f64 * 1e-9)
+            }
+            _ => Vector3::repeat(f64::NAN),
+        }
+    }
+}
+
+/// What must survive a checkpoint.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct State {
+    attitude: AttitudeRate,
+    rows: u64,
+    without_acceleration: u64,
+    without_attitude: u64,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Handles {
+    linear: [In; 3],
+    angular: [In; 3],
+    attitude: Option<[In; 4]>,
+    channels: Table,
+    channel: [Out; 3],
+    motion: Table,
+    alpha: [Out; 3],
+    omega: [Out; 3],
+}
+
+/// The stage.
+#[derive(Debug)]
+pub struct Accelerometer {
+    test_mass: String,
+    linear: String,
+    angular: String,
+    attitude: String,
+    orf_from_srf: Matrix3<f64>,
+    step_ns: i64,
+    handles: Option<Handles>,
+    state: State,
+}
+
+impl Stage for Accelerometer {
+    const MANIFEST: Manifest = Manifest {
+        id: "accelerometer",
+        version: env!("CARGO_PKG_VERSION"),
+        licence: "MIT OR Apache-2.0",
+        description: "Lets measured linear and angular accelerations take the place of a test mass's displacements",
+        parameters: &[
+            Parameter::text(
+                "test_mass",
+                "tm1",
+                &["tm1", "tm2"],
+                "test mass of the mission that stands for the proof mass",
+            ),
+            Parameter::text(
+                "linear",
+                "acc1a.lin_accl_srf_m_s2",
+                &[],
+                "grid columns of the linear acceleration, without .x",
+            ),
+            Parameter::text("angular", "acc1a.ang_accl_srf_rad_s2", &[], "grid columns of the angular acceleration"),
+            Parameter::text(
+                "attitude",
+                "sca1b.quaternion_irf",
+                &[],
+                "grid columns of the attitude, without .w; may be absent",
+            ),
+        ],
+        instances: &[],
+    };
+
+    fn new(setup: &Setup) -> Result<Self, PluginError> {
+        let mission = Mission::from_json(setup.mission_json())?;
+        let test_mass = setup.text("test_mass")?;
+        Ok(Self {
+            orf_from_srf: mission.test_mass(&test_mass, "the stage accelerometer")?.dcm_orf_from_srf(),
+            step_ns: (mission.dt_s() * 1e9).round() as i64,
+            linear: setup.text("linear")?,
+            angular: setup.text("angular")?,
+            attitude: setup.text("attitude")?,
+            test_mass,
+            handles: None,
+            state: State::default(),
+        })
+    }
+
+    fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
+        let grid = |stem: &str, part: &str| Want::new(format!("{stem}.{part}")).table("grid");
+        let mut vector = |stem: &str, unit: &str| -> Result<[In; 3], PluginError> {
+            let [x, y, z] = AXES.map(|a| link.read(&grid(stem, a).unit(unit).frame("SRF")));
+            Ok([x?, y?, z?])
+        };
+        let linear = vector(&self.linear, "m s-2")?;
+        let angular = vector(&self.angular, "rad s-2")?;
+        let attitude = if available.column("grid", &format!("{}.w", self.attitude)).is_some() {
+            let [w, x, y, z] = ["w", "x", "y", "z"].map(|a| link.read(&grid(&self.attitude, a).unit("1").frame("SRF")));
+            Some([w?, x?, y?, z?])
+        } else {
+            None
+        };
+        let rate_hz = available.column("grid", &format!("{}.x", self.linear)).map_or(0.0, |c| c.rate_hz);
+        let frame = if self.test_mass == "tm1" { "ORF_1" } else { "ORF_2" };
+        let channels = link.table("channel", rate_hz);
+        let [x, y, z] = AXES.map(|a| {
+            let name = format!("{}.accel.{a}", self.test_mass);
+            let attributes = [("kind", "channel"), ("channel", name.as_str()), ("average", "1")];
+            link.write_with(channels, &name, "m s-2", frame, &attributes)
+        });
+        let channel = [x?, y?, z?];
+        let motion = link.table("reconstruction", rate_hz);
+        let mut write = |stem: &str, unit: &str| -> Result<[Out; 3], PluginError> {
+            let [x, y, z] = AXES.map(|a| link.write(motion, &format!("{stem}.{a}"), unit, "SRF"));
+            Ok([x?, y?, z?])
+        };
+        let alpha = write("sc.alpha_srf_rad_s2", "rad s-2")?;
+        let omega = write("sc.omega_srf_rad_s", "rad s-1")?;
+        self.handles = Some(Handles { linear, angular, attitude, channels, channel, motion, alpha, omega });
+        Ok(())
+    }
+
+    fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
+        let h = self.handles.ok_or_else(|| PluginError::fatal("accelerometer: process before link"))?;
+        output.time(h.channels).extend_from_slice(input.time_ns());
+        output.time(h.motion).extend_from_slice(input.time_ns());
+        for (k, time_ns) in input.time_ns().iter().enumerate() {
+            let measured = Vector3::from(h.linear.map(|c| input.f64(c)[k]));
+            let channel = channel_orf_m_s2(&self.orf_from_srf, &measured);
+            let alpha = Vector3::from(h.angular.map(|c| input.f64(c)[k]));
+            let omega = match h.attitude {
+                Some(q) => self.state.attitude.next(*time_ns, q.map(|c| input.f64(c)[k]), self.step_ns),
+                None => Vector3::zeros(),
+            };
+            self.state.rows += 1;
+            let complete = |v: &Vector3<f64>| v.iter().all(|x| x.is_finite());
+            self.state.without_acceleration += u64::from(!complete(&channel) || !complete(&alpha));
+            self.state.without_attitude += u64::from(!complete(&omega));
+            for i in 0..3 {
+                output.f64(h.channel[i]).push(channel[i]);
+                output.f64(h.alpha[i]).push(alpha[i]);
+                output.f64(h.omega[i]).push(omega[i]);
+            }
+        }
+        Ok(())
+    }
+
+    fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
+        let mut notes = vec![format!(
+            "{}.accel is the measured linear acceleration with its sign turned; nobody models the non-gravitational \
+             acceleration in it, which is noise here",
+            self.test_mass
+        )];
+        if self.handles.is_some_and(|h| h.attitude.is_none()) {
+            notes.push(format!(
+                "there is no attitude {}: the angular rate is taken as zero and the centrifugal part of the offset, about \
+                 1e-6 s⁻² in low orbit, is left out",
+                self.attitude
+            ));
+        }
+        let s = &self.state;
+        let counts = [
+            ("accelerometer.rows", s.rows),
+            ("accelerometer.rows_without_acceleration", s.without_acceleration),
+            ("accelerometer.rows_without_attitude", s.without_attitude),
+        ];
+        Ok(Report { counts: counts.map(|(k, v)| (k.to_owned(), v)).into(), notes, ..Report::default() })
+    }
+
+    fn save(&self) -> Result<Vec<u8>, PluginError> {
+        Ok(serde_json::to_vec(&self.state)?)
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
+        self.state = serde_json::from_slice(state)?;
+        Ok(())
+    }
+}

@@ -1,0 +1,357 @@
+//! All files of one spacecraft as one stream of rows, ordered in time. One day is in memory at a time.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use serde::{Deserialize, Serialize};
+
+use crate::archive::{Container, Member};
+use crate::product::{PRODUCTS, Product};
+use crate::rows::{Counts, Parsed, Rows, align_quaternions, order, parse};
+use crate::{Level1Error, Window};
+
+/// Why files cannot be a telemetry stream.
+#[derive(Debug, thiserror::Error)]
+pub enum TelemetryError {
+    /// A file cannot be read.
+    #[error("{}: {source}; check the path and its permissions", path.display())]
+    Read {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// No file holds anything of the spacecraft.
+    #[error(
+        "none of the {files} files given holds a product of spacecraft {spacecraft}: {seen}; give .tgz archives or .txt \
+         files named PRODUCT_DATE_SPACECRAFT_RELEASE.txt, and check mission.spacecraft and the parameter products"
+    )]
+    Nothing {
+        /// How many files.
+        files: usize,
+        /// Letter of the spacecraft.
+        spacecraft: char,
+        /// What was found instead.
+        seen: String,
+    },
+    /// A product that does not exist.
+    #[error("parameter products names `{0}`, which this source does not read; it reads {1}")]
+    UnknownProduct(String, String),
+    /// A saved state that is not this stream's.
+    #[error("the state is not one of these files: {0}; start the run anew")]
+    ForeignState(String),
+}
+
+/// A table of the stream.
+#[derive(Clone, Debug)]
+pub struct TableId {
+    /// Product that it comes from.
+    pub product: &'static Product,
+    /// Which of the product's tables.
+    pub part: usize,
+    /// Name.
+    pub name: String,
+}
+
+/// What is known after the last row given.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct State {
+    dates: Vec<String>,
+    tables: Vec<String>,
+    /// Index of the day in memory.
+    day: usize,
+    /// Rows of that day already given, per table.
+    given: Vec<usize>,
+    /// Last quaternion before that day, per table.
+    quaternions: Vec<Option<[f64; 4]>>,
+    /// Rows of that day before this time come too late.
+    not_before_ns: Option<i64>,
+    last_ns: Option<i64>,
+    log: Log,
+}
+
+/// What was counted and lost.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Log {
+    /// `acc1a.rows` and the like; nothing is zero.
+    pub counts: BTreeMap<String, u64>,
+    /// The first of each kind of oddity, by kind and product.
+    pub notes: BTreeMap<String, String>,
+    /// Something that should have been there is lost.
+    pub data_loss: bool,
+}
+
+impl Log {
+    fn count(&mut self, product: &Product, what: &str, n: u64) {
+        if n > 0 {
+            *self.counts.entry(format!("{}.{what}", product.code.to_lowercase())).or_default() += n;
+        }
+    }
+
+    fn note(&mut self, kind: &str, product: &Product, text: String) {
+        self.notes.entry(format!("{kind}.{}", product.code)).or_insert(text);
+    }
+
+    fn file(&mut self, member: &Member, counts: &Counts) {
+        let (product, name) = (member.product, &member.name);
+        for (what, n) in counts.each() {
+            self.count(product, what, n);
+        }
+        if let Some(promised) = counts.promised {
+            let text = format!("{name}: the header promises {promised} rows, the file holds another number");
+            self.note("promised", product, text);
+        }
+        if let Some(line) = counts.first_garbage_line {
+            let text = format!(
+                "{name}: lines that are no rows were left out, {} in all, the first is line {line}",
+                counts.garbage
+            );
+            self.note("garbage", product, text);
+        }
+        if counts.truncated > 0 {
+            self.note("truncated", product, format!("{name}: ends inside a line or cannot be read to its end"));
+        }
+        self.data_loss |= counts.garbage > 0 || counts.truncated > 0;
+    }
+
+    fn refused(&mut self, member: &Member, error: &Level1Error) {
+        self.count(member.product, "files_refused", 1);
+        self.note("refused", member.product, format!("{}: left out, {error}", member.name));
+        self.data_loss = true;
+    }
+}
+
+/// The stream.
+#[derive(Debug)]
+pub struct Telemetry {
+    containers: Vec<Container>,
+    spacecraft: char,
+    window: Window,
+    /// Tables, in the order of the products.
+    pub tables: Vec<TableId>,
+    /// Rows of the day in memory, per table; `None` before the first row is wanted.
+    day: Option<Vec<Rows>>,
+    quaternions_after: Vec<Option<[f64; 4]>>,
+    state: State,
+}
+
+impl Telemetry {
+    /// Looks into the files. `wanted` names products; none means all that are there.
+    ///
+    /// # Errors
+    /// See [`TelemetryError`].
+    pub fn open(
+        files: &[PathBuf],
+        spacecraft: char,
+        window: Window,
+        wanted: &[String],
+    ) -> Result<Self, TelemetryError> {
+        for name in wanted {
+            if !PRODUCTS.iter().any(|p| p.code.eq_ignore_ascii_case(name)) {
+                let all: Vec<&str> = PRODUCTS.iter().map(|p| p.code).collect();
+                return Err(TelemetryError::UnknownProduct(name.clone(), all.join(", ")));
+            }
+        }
+        let is_wanted = |m: &Member| {
+            m.spacecraft == spacecraft
+                && (wanted.is_empty() || wanted.iter().any(|w| m.product.code.eq_ignore_ascii_case(w)))
+        };
+        let mut log = Log::default();
+        let (mut containers, mut dates, mut seen) = (Vec::new(), Vec::new(), Vec::new());
+        for path in files {
+            let mut container =
+                Container::open(path).map_err(|source| TelemetryError::Read { path: path.clone(), source })?;
+            if let Some(damage) = &container.damage {
+                *log.counts.entry("archives_damaged".to_owned()).or_default() += 1;
+                log.notes.insert(
+                    format!("archive.{}", path.display()),
+                    format!("{}: the archive breaks off, what is behind is lost: {damage}", path.display()),
+                );
+                log.data_loss = true;
+            }
+            seen.extend(container.members.iter().map(|m| m.name.clone()));
+            container.members.retain(is_wanted);
+            dates.extend(container.members.iter().map(|m| m.date.clone()));
+            containers.push(container);
+        }
+        if dates.is_empty() {
+            seen.truncate(4);
+            let seen = if seen.is_empty() { "no product at all".to_owned() } else { seen.join(", ") };
+            return Err(TelemetryError::Nothing { files: files.len(), spacecraft, seen });
+        }
+        dates.sort_unstable();
+        dates.dedup();
+        let there = |p: &Product| containers.iter().flat_map(|c| &c.members).any(|m| m.product.code == p.code);
+        let tables: Vec<TableId> = PRODUCTS
+            .iter()
+            .filter(|p| there(p))
+            .flat_map(|product| {
+                product.tables().into_iter().enumerate().map(move |(part, name)| TableId { product, part, name })
+            })
+            .collect();
+        let state = State {
+            dates,
+            tables: tables.iter().map(|t| t.name.clone()).collect(),
+            given: vec![0; tables.len()],
+            quaternions: vec![None; tables.len()],
+            log,
+            ..State::default()
+        };
+        let quaternions_after = vec![None; tables.len()];
+        Ok(Self { containers, spacecraft, window, tables, day: None, quaternions_after, state })
+    }
+
+    /// Gives up to `rows` more rows, in order of time, as (table, row of the table, table's rows of the day). Comes back
+    /// with the time before which every row was given, and whether there is nothing more.
+    ///
+    /// # Errors
+    /// A file that was there cannot be read any more.
+    pub fn next(
+        &mut self,
+        rows: usize,
+        mut give: impl FnMut(usize, usize, &Rows),
+    ) -> Result<(i64, bool), TelemetryError> {
+        if self.day.is_none() {
+            let log = self.load()?;
+            self.state.log = log;
+        }
+        for _ in 0..rows.max(1) {
+            let Some((time_ns, table)) = self.head() else { break };
+            if let Some(day) = &self.day {
+                give(table, self.state.given[table], &day[table]);
+            }
+            self.state.given[table] += 1;
+            self.state.last_ns = Some(time_ns);
+        }
+        while self.head().is_none() && self.state.day + 1 < self.state.dates.len() {
+            self.state.day += 1;
+            self.state.given.fill(0);
+            self.state.quaternions = std::mem::take(&mut self.quaternions_after);
+            self.state.not_before_ns = self.state.last_ns.map(|t| t + 1);
+            let log = self.load()?;
+            self.state.log = log;
+        }
+        let after_last = self.state.last_ns.map_or(i64::MIN, |t| t + 1);
+        Ok(self.head().map_or((after_last, true), |(time_ns, _)| (time_ns, false)))
+    }
+
+    /// What was counted and lost so far.
+    #[must_use]
+    pub fn log(&self) -> &Log {
+        &self.state.log
+    }
+
+    /// The whole state.
+    ///
+    /// # Errors
+    /// Never in practice; the error is the serialiser's.
+    pub fn save(&self) -> Result<Vec<u8>, serde_json::Error> {
+        // Before the first row nothing was counted: the day is read when it is wanted.
+        serde_json::to_vec(&(self.day.is_some(), &self.state))
+    }
+
+    /// Takes a state back.
+    ///
+    /// # Errors
+    /// The bytes are no state of a stream of these files, or a file cannot be read any more.
+    pub fn load_state(&mut self, bytes: &[u8]) -> Result<(), TelemetryError> {
+        let (loaded, state): (bool, State) =
+            serde_json::from_slice(bytes).map_err(|e| TelemetryError::ForeignState(e.to_string()))?;
+        let foreign = |what: &str| Err(TelemetryError::ForeignState(what.to_owned()));
+        if state.dates != self.state.dates || state.tables != self.state.tables {
+            return foreign("it was saved with other days or products");
+        }
+        let n = self.tables.len();
+        if state.day >= state.dates.len() || state.given.len() != n || state.quaternions.len() != n {
+            return foreign("its parts do not fit together");
+        }
+        self.state = state;
+        self.day = None;
+        if loaded {
+            self.load()?;
+            let day = self.day.as_deref().unwrap_or_default();
+            if day.iter().zip(&self.state.given).any(|(rows, given)| *given > rows.time_ns.len()) {
+                return foreign("a file has fewer rows than were given already");
+            }
+        }
+        Ok(())
+    }
+
+    /// Time and table of the next row.
+    fn head(&self) -> Option<(i64, usize)> {
+        let day = self.day.as_ref()?;
+        let next = |(table, rows): (usize, &Rows)| rows.time_ns.get(self.state.given[table]).map(|t| (*t, table));
+        day.iter().enumerate().filter_map(next).min()
+    }
+
+    /// Reads the day of the state into memory; the log is what the state's becomes when the day is read for the first
+    /// time.
+    fn load(&mut self) -> Result<Log, TelemetryError> {
+        let date = &self.state.dates[self.state.day];
+        let mut log = self.state.log.clone();
+        let mut files: Vec<(Member, Parsed)> = Vec::new();
+        for container in self.containers.iter().filter(|c| c.members.iter().any(|m| m.date == *date)) {
+            let visited = container.visit(|member, text| {
+                let wanted = member.date == *date && container.members.iter().any(|m| m.name == member.name);
+                if wanted {
+                    match parse(text, member.product, self.spacecraft, self.window) {
+                        Ok(parsed) => files.push((member, parsed)),
+                        Err(error) => log.refused(&member, &error),
+                    }
+                }
+            });
+            // A broken archive was noted when it was opened.
+            if let (Err(source), None) = (visited, &container.damage) {
+                return Err(TelemetryError::Read { path: container.path().to_owned(), source });
+            }
+        }
+        // Of two releases the newer one's rows come first, and the first row of a time stays.
+        files.sort_by(|(a, _), (b, _)| b.release.cmp(&a.release));
+        for (member, parsed) in &files {
+            log.file(member, &parsed.counts);
+        }
+        let mut quaternions_after = self.state.quaternions.clone();
+        let mut day = Vec::with_capacity(self.tables.len());
+        for (k, id) in self.tables.iter().enumerate() {
+            let parts: Vec<Rows> = files
+                .iter_mut()
+                .filter(|(m, _)| m.product.code == id.product.code)
+                .map(|(_, parsed)| std::mem::take(&mut parsed.tables[id.part]))
+                .collect();
+            let mut rows = self.join(id, parts, &mut log);
+            if let Some(first) = id.product.quaternion {
+                align_quaternions(&mut rows, first, &mut quaternions_after[k]);
+            }
+            day.push(rows);
+        }
+        self.quaternions_after = quaternions_after;
+        self.day = Some(day);
+        Ok(log)
+    }
+
+    fn join(&self, id: &TableId, parts: Vec<Rows>, log: &mut Log) -> Rows {
+        let mut joined = Rows { time_ns: Vec::new(), columns: vec![Vec::new(); id.product.columns.len()] };
+        for part in parts {
+            if joined.time_ns.is_empty() {
+                joined = part;
+                continue;
+            }
+            joined.time_ns.extend(part.time_ns);
+            for (all, more) in joined.columns.iter_mut().zip(part.columns) {
+                all.extend(more);
+            }
+        }
+        let mut counts = Counts { rows: joined.time_ns.len() as u64, ..Counts::default() };
+        order(&mut joined, &mut counts);
+        let late = self.state.not_before_ns.map_or(0, |t| joined.time_ns.partition_point(|x| *x < t));
+        joined.time_ns.drain(..late);
+        for column in &mut joined.columns {
+            column.drain(..late);
+        }
+        log.count(id.product, "rows_duplicate", counts.duplicates);
+        log.count(id.product, "rows_late", late as u64);
+        log.count(id.product, "rows", joined.time_ns.len() as u64);
+        joined
+    }
+}

@@ -1,0 +1,116 @@
+//! The stage's mathematics: the sign of a channel and the angular rate, each against something else than itself.
+
+use std::path::PathBuf;
+
+use dragfree_gracefo::Window;
+use dragfree_gracefo::accelerometer::{AttitudeRate, channel_orf_m_s2};
+use dragfree_gracefo::archive::Container;
+use dragfree_gracefo::rows::{Rows, parse};
+use nalgebra::{Matrix3, Rotation3, Vector3};
+
+/// Acceleration that an accelerometer measures for its offset, by the matrix that GROOPS sets up in its program
+/// SimulateAccelerometerCoMOffset (centrifugal, Euler, gravity gradient), written out element by element.
+fn offset_acceleration(w: Vector3<f64>, wd: Vector3<f64>, gradient: Matrix3<f64>, d: Vector3<f64>) -> Vector3<f64> {
+    let mut m = -gradient;
+    m[(0, 0)] += -w.y * w.y - w.z * w.z;
+    m[(0, 1)] += w.x * w.y - wd.z;
+    m[(0, 2)] += w.x * w.z + wd.y;
+    m[(1, 0)] += w.x * w.y + wd.z;
+    m[(1, 1)] += -w.x * w.x - w.z * w.z;
+    m[(1, 2)] += w.y * w.z - wd.x;
+    m[(2, 0)] += w.x * w.z - wd.y;
+    m[(2, 1)] += w.y * w.z + wd.x;
+    m[(2, 2)] += -w.x * w.x - w.y * w.y;
+    m * d
+}
+
+/// A free mass in a turning spacecraft, in coordinates: the spacecraft's centre and the mass move in an inertial frame,
+/// the housing sits at `b` in the spacecraft, and the mass as seen from the housing is differenced twice. The
+/// accelerometer at the same place measures what GROOPS says plus the force on the spacecraft; the channel made of it
+/// must be the displacement's second derivative.
+#[test]
+fn the_channel_is_the_acceleration_of_a_free_mass_in_its_housing() {
+    let b = Vector3::new(0.3, -0.2, 0.4);
+    let push = Vector3::new(2e-3, -1e-3, 3e-3);
+    let (rate, growth) = (Vector3::new(0.03, 0.05, -0.02), Vector3::new(0.004, -0.006, 0.005));
+    // SRF as seen from IRF at time t, exact to second order in t, which is all that differences about t = 0 see.
+    let attitude = |t: f64| Rotation3::new(rate * t) * Rotation3::new(growth * (0.5 * t * t));
+    // The mass starts at the housing's centre and moves with it; nothing acts on it. The spacecraft is pushed.
+    let start = b;
+    let velocity = rate.cross(&b);
+    let seen = |t: f64| attitude(t).inverse() * (start + velocity * t - push * (0.5 * t * t)) - b;
+    let dt = 1e-3;
+    let second = (seen(dt) - 2.0 * seen(0.0) + seen(-dt)) / (dt * dt);
+
+    let measured = push + offset_acceleration(rate, growth, Matrix3::zeros(), b);
+    let channel = channel_orf_m_s2(&Matrix3::identity(), &measured);
+    assert!((channel - second).norm() < 1e-8, "{channel} against {second}");
+    assert!((-channel - second).norm() > 1e-3, "the other sign would not pass");
+    // And the regressors of the offset, −α×b − ω×(ω×b), explain all of it but the push.
+    let modelled = -growth.cross(&b) - rate.cross(&rate.cross(&b));
+    assert!((channel - modelled + push).norm() < 1e-12);
+}
+
+/// A gravity gradient pulls the free mass along: `+Γ b` in the channel.
+#[test]
+fn the_gradient_has_the_sign_of_the_free_mass() {
+    let gradient = Matrix3::from_diagonal(&Vector3::new(-1.0, -1.0, 2.0)) * 1.2e-6;
+    let b = Vector3::new(1e-3, 2e-3, 3e-3);
+    let measured = offset_acceleration(Vector3::zeros(), Vector3::zeros(), gradient, b);
+    assert!((channel_orf_m_s2(&Matrix3::identity(), &measured) - gradient * b).norm() < 1e-20);
+}
+
+fn table(code: &str) -> Rows {
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR"))
+        .join("../../fixtures/gracefo/gracefo_1B_2023-06-01_RL04.ascii.noLRI.tgz");
+    let mut found = None;
+    Container::open(&path)
+        .expect("fixture")
+        .visit(|member, text| {
+            if member.product.code == code && member.spacecraft == 'C' {
+                found = parse(text, member.product, 'C', Window::ALL).ok();
+            }
+        })
+        .expect("whole archive");
+    found.expect("the product").tables.remove(0)
+}
+
+/// The spacecraft points at its twin and at the Earth, so that it turns once per orbit about the orbit's normal. The
+/// orbit of GNI1B says about which axis, in which sense and how fast; the attitude of SCA1B must agree with it to the
+/// pointing errors, milliradians. The inverse quaternion would turn the other way.
+#[test]
+fn the_rate_from_the_attitude_is_that_of_the_orbit() {
+    let (attitude, orbit) = (table("SCA1B"), table("GNI1B"));
+    let mut rate = AttitudeRate::default();
+    let at = |rows: &Rows, first: usize, k: usize| Vector3::from([0, 1, 2].map(|i| rows.columns[first + i][k]));
+    for k in 0..100 {
+        assert_eq!(attitude.time_ns[k], orbit.time_ns[k]);
+        let q = [0, 1, 2, 3].map(|i| attitude.columns[i][k]);
+        let omega = rate.next(attitude.time_ns[k], q, 1_000_000_000);
+        if k == 0 {
+            assert!(omega.iter().all(|x| x.is_nan()), "no rate without a predecessor");
+            continue;
+        }
+        let (r, v) = (at(&orbit, 0, k), at(&orbit, 6, k));
+        let normal_irf = r.cross(&v) / r.norm_squared();
+        let turn = nalgebra::UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(q[0], q[1], q[2], q[3]));
+        let normal_srf = turn.inverse() * normal_irf;
+        assert!((omega - normal_srf).norm() < 0.01 * normal_srf.norm(), "{omega} against {normal_srf}");
+    }
+}
+
+#[test]
+fn a_gap_has_no_rate() {
+    let mut rate = AttitudeRate::default();
+    let q = |angle: f64| [(0.5 * angle).cos(), 0.0, (0.5 * angle).sin(), 0.0];
+    let step = 100_000_000;
+    assert!(rate.next(0, q(0.0), step).y.is_nan());
+    assert!((rate.next(step, q(1e-4), step).y - 1e-3).abs() < 1e-12);
+    // The other sign is the same attitude.
+    assert!((rate.next(2 * step, q(2e-4).map(|x| -x), step).y - 1e-3).abs() < 1e-12);
+    assert!(rate.next(4 * step, q(4e-4), step).y.is_nan(), "an epoch is missing");
+    assert!(rate.next(5 * step, [f64::NAN; 4], step).y.is_nan());
+    assert!(rate.next(6 * step, q(6e-4), step).y.is_nan(), "no attitude before");
+    assert!((rate.next(7 * step, q(7e-4), step).y - 1e-3).abs() < 1e-12);
+    assert!(rate.next(8 * step, [0.0; 4], step).y.is_nan(), "no quaternion at all");
+}
