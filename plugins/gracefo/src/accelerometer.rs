@@ -10,13 +10,21 @@
 //! IMU1A: the attitude is in SRF, is without the gyros' drift and holds their data already, while the axes of the gyros
 //! are in no header. `ω` matters little: what changes in `ω×(ω×b)` is 1e-9 s⁻²·b, against 1e-7 s⁻²·b from α.
 //!
+//! A measured α carries its instrument's noise into the regressors. Where the spacecraft hardly turns, that noise is all
+//! there is, and an offset fitted to it is pulled towards zero however small its σ (errors in variables). The stage
+//! compares the steps of α with those of its noise and says so.
+//!
 //! The gradient's `Γ b` is 4e-6 s⁻²·b in low orbit, but constant in a spacecraft that points at the Earth, as are the
 //! instrument's biases (1e-5 m s⁻², 1e-3 rad s⁻²): `qp-check` takes constants and slopes out of every segment.
 
 use dragfree_physics::mission::Mission;
+use dragfree_physics::noise::NoiseShape;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
+
+/// Below this ratio of mean squares a tenth or more of the regressors' power is noise.
+const QUIET: f64 = 10.0;
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 
@@ -50,11 +58,53 @@ impl AttitudeRate {
     }
 }
 
+/// Mean square of the steps of a signal from epoch to epoch, per axis.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Steps {
+    last: Option<[f64; 3]>,
+    sum: [f64; 3],
+    count: u64,
+}
+
+impl Steps {
+    /// Takes the value of the next epoch; a step into or out of a gap is none.
+    pub fn next(&mut self, value: &Vector3<f64>) {
+        let now = value.iter().all(|x| x.is_finite()).then_some([value.x, value.y, value.z]);
+        if let (Some(a), Some(b)) = (std::mem::replace(&mut self.last, now), now) {
+            for i in 0..3 {
+                self.sum[i] += (b[i] - a[i]).powi(2);
+            }
+            self.count += 1;
+        }
+    }
+
+    /// Mean squares; none without a step.
+    #[must_use]
+    pub fn mean_square(&self) -> Option<[f64; 3]> {
+        (self.count > 0).then(|| self.sum.map(|s| s / self.count as f64))
+    }
+}
+
+/// Mean square of the steps of noise alone, `∫ S(f) 4 sin²(π f dt) df` up to Nyquist.
+#[must_use]
+pub fn noise_steps(noise: &NoiseShape, dt_s: f64) -> f64 {
+    const N: u32 = 1000;
+    let width_hz = 0.5 / dt_s / f64::from(N);
+    (0..N)
+        .map(|k| {
+            let f = (f64::from(k) + 0.5) * width_hz;
+            noise.psd(f) * (2.0 * (std::f64::consts::PI * f * dt_s).sin()).powi(2) * width_hz
+        })
+        .sum()
+}
+
 /// What must survive a checkpoint.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct State {
     attitude: AttitudeRate,
+    alpha: Steps,
     rows: u64,
     without_acceleration: u64,
     without_attitude: u64,
@@ -81,6 +131,8 @@ pub struct Accelerometer {
     attitude: String,
     orf_from_srf: Matrix3<f64>,
     step_ns: i64,
+    /// Mean square of the steps of α's noise, (rad s⁻²)², if the mission says how noisy it is.
+    alpha_noise_steps: Option<f64>,
     handles: Option<Handles>,
     state: State,
 }
@@ -118,9 +170,11 @@ impl Stage for Accelerometer {
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         let mission = Mission::from_json(setup.mission_json())?;
         let test_mass = setup.text("test_mass")?;
+        let dt_s = mission.dt_s();
         Ok(Self {
             orf_from_srf: mission.test_mass(&test_mass, "the stage accelerometer")?.dcm_orf_from_srf(),
-            step_ns: (mission.dt_s() * 1e9).round() as i64,
+            step_ns: (dt_s * 1e9).round() as i64,
+            alpha_noise_steps: mission.noise.accelerometer_angular.map(|n| noise_steps(&n.shape(), dt_s)),
             linear: setup.text("linear")?,
             angular: setup.text("angular")?,
             attitude: setup.text("attitude")?,
@@ -176,6 +230,7 @@ impl Stage for Accelerometer {
                 Some(q) => self.state.attitude.next(*time_ns, q.map(|c| input.f64(c)[k]), self.step_ns),
                 None => Vector3::zeros(),
             };
+            self.state.alpha.next(&alpha);
             self.state.rows += 1;
             let complete = |v: &Vector3<f64>| v.iter().all(|x| x.is_finite());
             self.state.without_acceleration += u64::from(!complete(&channel) || !complete(&alpha));
@@ -203,12 +258,26 @@ impl Stage for Accelerometer {
             ));
         }
         let s = &self.state;
+        let mut quality = serde_json::Map::new();
+        if let (Some(noise), Some(measured)) = (self.alpha_noise_steps, s.alpha.mean_square()) {
+            let ratio = measured.map(|m| m / noise);
+            let quiet: Vec<String> =
+                (0..3).filter(|i| ratio[*i] < QUIET).map(|i| format!("{} ({:.2})", AXES[i], ratio[i])).collect();
+            if !quiet.is_empty() {
+                notes.push(format!(
+                    "the measured angular acceleration about {} is hardly more than its noise (ratio of the mean squares \
+                     of their steps): offsets that it should show are pulled towards zero",
+                    quiet.join(", ")
+                ));
+            }
+            quality.insert("alpha_steps_over_noise".to_owned(), ratio.to_vec().into());
+        }
         let counts = [
             ("accelerometer.rows", s.rows),
             ("accelerometer.rows_without_acceleration", s.without_acceleration),
             ("accelerometer.rows_without_attitude", s.without_attitude),
         ];
-        Ok(Report { counts: counts.map(|(k, v)| (k.to_owned(), v)).into(), notes, ..Report::default() })
+        Ok(Report { counts: counts.map(|(k, v)| (k.to_owned(), v)).into(), notes, quality, ..Report::default() })
     }
 
     fn save(&self) -> Result<Vec<u8>, PluginError> {

@@ -3,9 +3,10 @@
 use std::path::PathBuf;
 
 use dragfree_gracefo::Window;
-use dragfree_gracefo::accelerometer::{AttitudeRate, channel_orf_m_s2};
+use dragfree_gracefo::accelerometer::{AttitudeRate, Steps, channel_orf_m_s2, noise_steps};
 use dragfree_gracefo::archive::Container;
 use dragfree_gracefo::rows::{Rows, parse};
+use dragfree_physics::noise::NoiseShape;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
 /// Acceleration that an accelerometer measures for its offset, by the matrix that GROOPS sets up in its program
@@ -60,9 +61,9 @@ fn the_gradient_has_the_sign_of_the_free_mass() {
     assert!((channel_orf_m_s2(&Matrix3::identity(), &measured) - gradient * b).norm() < 1e-20);
 }
 
-fn table(code: &str) -> Rows {
+fn table(level: &str, code: &str) -> Rows {
     let path = PathBuf::from(env!("CARGO_MANIFEST_DIR"))
-        .join("../../fixtures/gracefo/gracefo_1B_2023-06-01_RL04.ascii.noLRI.tgz");
+        .join(format!("../../fixtures/gracefo/gracefo_{level}_2023-06-01_RL04.ascii.noLRI.tgz"));
     let mut found = None;
     Container::open(&path)
         .expect("fixture")
@@ -80,7 +81,7 @@ fn table(code: &str) -> Rows {
 /// pointing errors, milliradians. The inverse quaternion would turn the other way.
 #[test]
 fn the_rate_from_the_attitude_is_that_of_the_orbit() {
-    let (attitude, orbit) = (table("SCA1B"), table("GNI1B"));
+    let (attitude, orbit) = (table("1B", "SCA1B"), table("1B", "GNI1B"));
     let mut rate = AttitudeRate::default();
     let at = |rows: &Rows, first: usize, k: usize| Vector3::from([0, 1, 2].map(|i| rows.columns[first + i][k]));
     for k in 0..100 {
@@ -113,4 +114,43 @@ fn a_gap_has_no_rate() {
     assert!(rate.next(6 * step, q(6e-4), step).y.is_nan(), "no attitude before");
     assert!((rate.next(7 * step, q(7e-4), step).y - 1e-3).abs() < 1e-12);
     assert!(rate.next(8 * step, [0.0; 4], step).y.is_nan(), "no quaternion at all");
+}
+
+/// White noise of one-sided PSD `S` has variance `S/(2 dt)` and steps of twice that.
+#[test]
+fn steps_of_noise_follow_its_spectrum() {
+    let white = NoiseShape::white(3e-8);
+    assert!((noise_steps(&white, 0.1) / (9e-16 / 0.1) - 1.0).abs() < 1e-5);
+    // A term in f⁻²: asd² f_c² · 4π dt ∫₀^{π/2} sin²x/x² dx, and the integral is Si(π) − 2/π.
+    let corner = noise_steps(&NoiseShape::with_corner(3e-8, 5.0, 2), 0.1) - noise_steps(&white, 0.1);
+    let want = 9e-16 * 25.0 * 4.0 * std::f64::consts::PI * 0.1 * (1.851_937_051_982_466 - std::f64::consts::FRAC_2_PI);
+    assert!((corner / want - 1.0).abs() < 1e-5, "{corner:e} against {want:e}");
+}
+
+#[test]
+fn steps_do_not_cross_gaps() {
+    let mut steps = Steps::default();
+    assert_eq!(steps.mean_square(), None);
+    for x in [1.0, 2.0, f64::NAN, 9.0, 6.0] {
+        steps.next(&Vector3::new(x, 0.0, 1.0));
+    }
+    assert_eq!(steps.mean_square(), Some([5.0, 0.0, 0.0]));
+}
+
+/// Ten quiet seconds: what ACC1A calls angular acceleration is the noise that the mission file states, within what ten
+/// seconds can say. A thruster's pulse of 1e-5 rad s⁻² in one of a hundred samples would be twenty times that.
+#[test]
+fn the_real_spacecraft_hardly_turns_in_these_ten_seconds() {
+    let rows = table("1A", "ACC1A");
+    let steps = |pulse: f64| {
+        let mut steps = Steps::default();
+        for k in 0..rows.time_ns.len() {
+            let bump = if k == 50 { pulse } else { 0.0 };
+            steps.next(&Vector3::from([3, 4, 5].map(|i| rows.columns[i][k] + bump)));
+        }
+        steps.mean_square().expect("steps")
+    };
+    let noise = noise_steps(&NoiseShape::with_corner(7e-8, 0.01, 2), 0.1);
+    assert!(steps(0.0).iter().all(|m| *m < 2.0 * noise), "{:?} against {noise:e}", steps(0.0));
+    assert!(steps(1e-5).iter().all(|m| *m > 10.0 * noise));
 }
