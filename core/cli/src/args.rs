@@ -1,0 +1,280 @@
+//! Arguments. The names are a contract: scripts use them.
+
+use crate::utc;
+use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
+use std::path::PathBuf;
+
+/// Calibrates the offset between a drag-free spacecraft's centre of mass and its test masses.
+#[derive(Debug, Parser)]
+#[command(name = "dragfree", version, max_term_width = 100, arg_required_else_help = true)]
+#[command(after_help = "Exit codes: 0 done, 1 failed, 2 usage, 3 done with loss of data, \
+    4 done but the model is inconsistent with the data.")]
+pub(crate) struct Arguments {
+    /// What to do.
+    #[command(subcommand)]
+    pub(crate) command: Command,
+    /// Flags that every command knows.
+    #[command(flatten)]
+    pub(crate) global: Global,
+}
+
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Everywhere")]
+pub(crate) struct Global {
+    /// Folder with plugins, searched before the one beside the program; repeatable. Also DRAGFREE_PLUGIN_PATH
+    #[arg(long, global = true, value_name = "DIR")]
+    pub(crate) plugin_dir: Vec<PathBuf>,
+    /// Print the result as JSON
+    #[arg(long, global = true)]
+    pub(crate) json: bool,
+    /// No progress, errors only
+    #[arg(short, long, global = true, conflicts_with = "verbose")]
+    pub(crate) quiet: bool,
+    /// Progress and logs on stderr; twice for more
+    #[arg(short, long, global = true, action = ArgAction::Count)]
+    pub(crate) verbose: u8,
+    /// Colours
+    #[arg(long, global = true, value_enum, default_value_t = Colour::Auto, value_name = "WHEN")]
+    pub(crate) color: Colour,
+    /// Threads that a run may use
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    pub(crate) threads: Option<u16>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Colour {
+    /// Where stdout is a terminal and NO_COLOR is not set
+    Auto,
+    Always,
+    Never,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Command {
+    /// Simulate six hours, calibrate them and show the result
+    Demo {
+        /// Folder for everything that the demo writes
+        #[arg(long, value_name = "DIR", default_value = "dragfree-demo")]
+        dir: PathBuf,
+    },
+    /// Simulate telemetry: one file per day, the truth apart in DIR/truth/
+    Simulate(Simulate),
+    /// Replay telemetry through a pipeline and archive a product
+    Run(Run),
+    /// Check configuration without running
+    #[command(subcommand)]
+    Config(Config),
+    /// The plugins that can be found
+    #[command(subcommand)]
+    Plugins(Plugins),
+    /// The archive
+    #[command(subcommand)]
+    Products(Products),
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Simulate {
+    /// Mission file
+    #[arg(value_name = "MISSION.toml")]
+    pub(crate) mission: PathBuf,
+    /// Folder for the telemetry
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: PathBuf,
+    /// First epoch, `2035-01-01` or `2035-01-01T06:00:00Z`
+    #[arg(long = "start", value_name = "UTC", value_parser = utc::parse, default_value = "2035-01-01")]
+    pub(crate) start_ns: i64,
+    /// Length in hours [default: 6]
+    #[arg(long, value_name = "H", value_parser = positive, conflicts_with = "days")]
+    pub(crate) hours: Option<f64>,
+    /// Length in days
+    #[arg(long, value_name = "N", value_parser = positive)]
+    pub(crate) days: Option<f64>,
+    /// Seed of every noise
+    #[arg(long, value_name = "S", default_value_t = 1)]
+    pub(crate) seed: u32,
+    /// Add an effect to the truth, `es-gain:tm1.y=0.02`; repeatable
+    #[arg(long = "effect", value_name = "ID:INSTANCE=SIZE", value_parser = effect)]
+    pub(crate) effects: Vec<Effect>,
+    /// Hide an effect that this seed draws
+    #[arg(long, value_name = "SEED")]
+    pub(crate) hidden: Option<u64>,
+    /// Leave out the /command topic
+    #[arg(long)]
+    pub(crate) no_command: bool,
+}
+
+impl Simulate {
+    /// Length of the simulation, s.
+    pub(crate) fn duration_s(&self) -> f64 {
+        self.days.map_or(self.hours.unwrap_or(6.0) * 3600.0, |days| days * 86_400.0)
+    }
+}
+
+/// An effect in the truth of a simulation.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Effect {
+    pub(crate) id: String,
+    pub(crate) instance: String,
+    /// SI, unit of the coefficient.
+    pub(crate) size: f64,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Run {
+    #[command(flatten)]
+    pub(crate) chain: Chain,
+    /// First epoch
+    #[arg(long, value_name = "UTC", value_parser = utc::parse)]
+    pub(crate) from: Option<i64>,
+    /// End of the last epoch
+    #[arg(long, value_name = "UTC", value_parser = utc::parse)]
+    pub(crate) until: Option<i64>,
+    /// Resume from the state that an earlier run saved
+    #[arg(long, value_name = "FILE")]
+    pub(crate) load_state: Option<PathBuf>,
+    /// Save the state at the end, so that the next day can resume
+    #[arg(long, value_name = "FILE")]
+    pub(crate) save_state: Option<PathBuf>,
+    /// Epochs that plugins are handed at a time; results do not depend on it
+    #[arg(long, value_name = "N", default_value_t = 4096, value_parser = clap::value_parser!(u32).range(1..))]
+    pub(crate) batch_rows: u32,
+}
+
+/// What a run is linked from.
+#[derive(Debug, Args)]
+pub(crate) struct Chain {
+    /// Pipeline file
+    #[arg(value_name = "PIPELINE.toml")]
+    pub(crate) pipeline: PathBuf,
+    /// Telemetry, in any order
+    #[arg(value_name = "FILE")]
+    pub(crate) files: Vec<PathBuf>,
+    /// Mission file in place of the pipeline's
+    #[arg(long, value_name = "MISSION.toml")]
+    pub(crate) mission: Option<PathBuf>,
+    /// Model file in place of the pipeline's
+    #[arg(long, value_name = "MODEL.toml")]
+    pub(crate) model: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) archive: Archive,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Archive {
+    /// Folder with the products
+    #[arg(long = "archive", value_name = "DIR", default_value = "archive")]
+    pub(crate) folder: PathBuf,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Config {
+    /// Check pipeline, plugins, parameters and columns; telemetry is not read
+    Check(Chain),
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Plugins {
+    /// List what was found and what was refused, with the reason
+    List,
+    /// Show a plugin's parameters
+    Inspect {
+        /// Plugin, `es-akf`
+        #[arg(value_name = "ID")]
+        id: String,
+    },
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Products {
+    /// List the products of an archive
+    List(Archive),
+    /// Show a product
+    Show {
+        /// Its id, its id without the revision, its day or its file
+        #[arg(value_name = "PRODUCT")]
+        product: String,
+        #[command(flatten)]
+        archive: Archive,
+    },
+}
+
+fn positive(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(number) if number > 0.0 && number.is_finite() => Ok(number),
+        _ => Err("a number above zero is needed".to_owned()),
+    }
+}
+
+fn effect(text: &str) -> Result<Effect, String> {
+    let parts = || {
+        let (name, size) = text.split_once('=')?;
+        let (id, instance) = name.split_once(':')?;
+        let size: f64 = size.parse().ok().filter(|size: &f64| size.is_finite())?;
+        let complete = !id.is_empty() && !instance.is_empty();
+        complete.then(|| Effect { id: id.to_owned(), instance: instance.to_owned(), size })
+    };
+    parts().ok_or_else(|| "ID:INSTANCE=SIZE is needed, as in es-gain:tm1.y=0.02, the size in SI units".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::{CommandFactory, error::ErrorKind};
+
+    fn parse(line: &str) -> Result<Arguments, clap::Error> {
+        Arguments::try_parse_from(line.split(' '))
+    }
+
+    #[test]
+    fn the_declaration_is_sound() {
+        Arguments::command().debug_assert();
+    }
+
+    #[test]
+    fn every_line_of_the_contract_parses() {
+        for line in [
+            "dragfree demo",
+            "dragfree demo --dir d",
+            "dragfree simulate m.toml --out d --start 2035-01-01 --hours 6 --seed 3 --effect es-gain:tm1.y=0.02 --no-command",
+            "dragfree simulate m.toml --out d --start 2035-01-01T06:00:00Z --days 2 --hidden 7",
+            "dragfree run p.toml a.mcap b.mcap --mission m.toml --model c.toml --archive d --from 2035-01-01 --until 2035-01-02 --json",
+            "dragfree run p.toml",
+            "dragfree config check p.toml",
+            "dragfree plugins list --json --plugin-dir a --plugin-dir b",
+            "dragfree plugins inspect es-akf",
+            "dragfree products list --json",
+            "dragfree products show COM1B_2035-01-01_SC1_01_0001 --archive d --color never",
+            "dragfree --threads 2 -q run p.toml",
+            "dragfree -vv run p.toml",
+        ] {
+            parse(line).unwrap_or_else(|error| panic!("{line}: {error}"));
+        }
+    }
+
+    #[test]
+    fn wrong_usage_is_refused() {
+        for (line, kind) in [
+            ("dragfree simulate m.toml", ErrorKind::MissingRequiredArgument),
+            ("dragfree simulate m.toml --out d --hours 1 --days 1", ErrorKind::ArgumentConflict),
+            ("dragfree simulate m.toml --out d --hours -1", ErrorKind::UnknownArgument),
+            ("dragfree simulate m.toml --out d --hours nan", ErrorKind::ValueValidation),
+            ("dragfree simulate m.toml --out d --effect es-gain=1", ErrorKind::ValueValidation),
+            ("dragfree simulate m.toml --out d --start yesterday", ErrorKind::ValueValidation),
+            ("dragfree run p.toml --threads 0", ErrorKind::ValueValidation),
+            ("dragfree run p.toml --batch-rows 0", ErrorKind::ValueValidation),
+            ("dragfree -q -v run p.toml", ErrorKind::ArgumentConflict),
+            ("dragfree frobnicate", ErrorKind::InvalidSubcommand),
+        ] {
+            assert_eq!(parse(line).expect_err(line).kind(), kind, "{line}");
+        }
+    }
+
+    #[test]
+    fn effects_and_lengths_are_read() {
+        let arguments = parse("dragfree simulate m.toml --out d --effect a:b.c=-2e-3 --days 2").expect("parses");
+        let Command::Simulate(simulate) = arguments.command else { panic!("simulate was asked for") };
+        assert_eq!(simulate.effects, [Effect { id: "a".into(), instance: "b.c".into(), size: -2e-3 }]);
+        assert!((simulate.duration_s() - 172_800.0).abs() < 1e-9);
+        assert_eq!(simulate.start_ns, 2_051_222_400_000_000_000);
+    }
+}

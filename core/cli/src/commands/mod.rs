@@ -1,0 +1,62 @@
+//! One function per command; each gives back what belongs on stdout.
+
+mod plugins;
+mod products;
+
+use crate::args::{Arguments, Command, Config, Global};
+use crate::failure::Failure;
+use crate::text::Paint;
+use dragfree_engine::registry::Registry;
+use std::path::PathBuf;
+
+/// What a command leaves: text for stdout and the exit code.
+#[derive(Debug)]
+pub(crate) struct Done {
+    pub(crate) text: String,
+    pub(crate) code: u8,
+}
+
+impl Done {
+    fn new(text: String) -> Self {
+        Self { text, code: 0 }
+    }
+
+    fn json(value: &serde_json::Value) -> Self {
+        Self::new(format!("{value:#}\n"))
+    }
+}
+
+/// Does what the arguments say.
+pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failure> {
+    let global = &arguments.global;
+    match &arguments.command {
+        Command::Demo { dir } => unreachable!(),
+        Command::Simulate(simulate) => unreachable!(),
+        Command::Run(run) => unreachable!(),
+        Command::Config(Config::Check(chain)) => unreachable!(),
+        Command::Plugins(command) => plugins::execute(command, global, paint),
+        Command::Products(command) => products::execute(command, global.json, paint),
+    }
+}
+
+/// The plugins of the folders asked for and of the program's own.
+fn registry(global: &Global) -> Result<Registry, Failure> {
+    let listed = std::env::var_os("DRAGFREE_PLUGIN_PATH").unwrap_or_default();
+    let listed = std::env::split_paths(&listed).filter(|folder| !folder.as_os_str().is_empty());
+    let mut folders: Vec<PathBuf> = global.plugin_dir.iter().cloned().chain(listed).collect();
+    if let Some(missing) = folders.iter().find(|folder| !folder.is_dir()) {
+        return Err(Failure::PluginFolder(missing.clone()));
+    }
+    folders.extend(own_folders());
+    Ok(Registry::discover(&folders))
+}
+
+/// Beside the program, which is also where a build puts the plugins, and where an installation does.
+fn own_folders() -> Vec<PathBuf> {
+    let program = std::env::current_exe().and_then(|path| path.canonicalize());
+    let Some(beside) = program.ok().and_then(|path| path.parent().map(PathBuf::from)) else {
+        return Vec::new();
+    };
+    let installed = beside.join("../lib/dragfree");
+    [beside, installed].into_iter().filter(|folder| folder.is_dir()).collect()
+}

@@ -1,0 +1,37 @@
+//! `dragfree products`.
+
+use super::Done;
+use crate::args::Products;
+use crate::failure::Failure;
+use crate::screen;
+use crate::text::Paint;
+use dragfree_engine::product;
+use std::path::Path;
+
+pub(super) fn execute(command: &Products, json: bool, paint: Paint) -> Result<Done, Failure> {
+    match command {
+        Products::List(archive) => {
+            let listing = product::list(&archive.folder).map_err(Failure::engine)?;
+            if json {
+                return Ok(Done::json(&screen::listing_json(&listing)));
+            }
+            Ok(Done::new(screen::listing(&listing, &archive.folder, paint)))
+        }
+        Products::Show { product, archive } => show(product, &archive.folder, json, paint),
+    }
+}
+
+/// `name` is a product's file, or a name in the archive.
+fn show(name: &str, archive: &Path, json: bool, paint: Paint) -> Result<Done, Failure> {
+    let file = Path::new(name);
+    let (product, path) = if file.is_file() {
+        (product::read(file).map_err(Failure::engine)?, file.to_owned())
+    } else {
+        let entry = product::find(archive, name).map_err(Failure::engine)?;
+        (entry.product, entry.path)
+    };
+    if json {
+        return Ok(Done::json(&product::to_json(&product, &path)));
+    }
+    Ok(Done::new(screen::product(&product, &path, paint)))
+}
