@@ -305,6 +305,7 @@ mod tests {
             software: "0.1.0".into(),
             losses: Vec::new(),
             counts: BTreeMap::new(),
+            notes: Vec::new(),
             reports: vec![StageReport { stage: "qp-check".into(), report }],
             created: chrono::DateTime::UNIX_EPOCH,
         };

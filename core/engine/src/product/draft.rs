@@ -46,6 +46,8 @@ pub struct Draft {
     pub losses: Vec<Loss>,
     /// Counts of the replay; those of the stages stand in their reports.
     pub counts: BTreeMap<String, u64>,
+    /// Sentences of the replay; those of the stages stand in their reports.
+    pub notes: Vec<String>,
     /// Reports in pipeline order.
     pub reports: Vec<StageReport>,
     /// When the product is made; the engine has no clock.
@@ -286,7 +288,7 @@ fn quality(draft: &Draft, reports: &[(String, Report)]) -> Quality {
         data_loss: !draft.losses.is_empty() || reports.iter().any(|(_, report)| report.data_loss),
         inconsistent: reports.iter().any(|(_, report)| report.inconsistent),
         weak_directions,
-        notes: reports.iter().flat_map(note).collect(),
+        notes: draft.notes.iter().map(|note| format!("replay: {note}")).chain(reports.iter().flat_map(note)).collect(),
         counts: replayed.into_iter().chain(reports.iter().filter_map(reported)).collect(),
         stages: reports.iter().filter_map(figures).collect(),
     }

@@ -59,6 +59,7 @@ fn draft(value: f64) -> Draft {
         software: "0.1.0".into(),
         losses: Vec::new(),
         counts: BTreeMap::from([("gaps".into(), 2)]),
+        notes: vec!["a topic is not in the interface".into()],
         reports: vec![
             StageReport { stage: "es-akf".into(), report: json!({"nis": 0.99, "epochs_used": 100, "verdict": null}) },
             StageReport { stage: "qp-check".into(), report: qp_report(value) },
@@ -291,6 +292,6 @@ proptest! {
         prop_assert_eq!(product.result.coefficients[0].sigma.to_bits(), sigma.to_bits());
         prop_assert_eq!(product.result.covariance["qp"].matrix[0][0].to_bits(), value.to_bits());
         prop_assert!(product.result.covariance["qp"].matrix[0][1].is_nan());
-        prop_assert_eq!(&product.quality.notes[0], &format!("qp-check: {note}"));
+        prop_assert_eq!(&product.quality.notes[1], &format!("qp-check: {note}"));
     }
 }
