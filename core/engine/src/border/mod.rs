@@ -9,6 +9,7 @@ mod instance;
 mod library;
 
 pub use instance::{Config, Instance, LinkRequest, Linked, ReadColumn, Rows, SourceStep};
+pub(crate) use library::hex;
 pub use library::{Kind, Library, Manifest, Parameter, PluginInfo};
 
 use std::path::PathBuf;

@@ -293,18 +293,13 @@ fn is_archived(table: &TableSpec) -> bool {
     table.columns.iter().any(|c| c.attributes.get("archive").is_some_and(|a| a == "true"))
 }
 
-/// Makes and links a source over nothing.
+/// Makes and links a source: it reads nothing, and says which tables it makes.
 ///
 /// # Errors
-/// The plugin is missing or refuses its configuration.
-pub(crate) fn source(
-    registry: &Registry,
-    id: &str,
-    config: &Config,
-) -> Result<(Found, Instance, Vec<TableSpec>), ChainError> {
-    let found = registry.find(Kind::Source, id)?;
+/// The plugin refuses its configuration.
+pub(crate) fn open_source(found: &Found, config: &Config) -> Result<(Instance, Vec<TableSpec>), ChainError> {
     let mut instance = found.create(config)?;
     let linked = instance.link(LinkRequest { available: &[], model_json: "{}" })?;
     instance.activate(u32::MAX)?;
-    Ok((found, instance, linked.writes))
+    Ok((instance, linked.writes))
 }

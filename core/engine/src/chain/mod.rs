@@ -8,7 +8,9 @@ mod link;
 mod queue;
 mod state;
 
+pub(crate) use link::open_source;
 pub use link::{Coefficient, Constraint, build};
+pub use state::resumes_at_ns;
 
 use std::collections::BTreeSet;
 
@@ -160,11 +162,18 @@ impl Chain {
         self.complete_until_ns
     }
 
+    /// Tables that belong beside the product.
+    #[must_use]
+    pub fn archived_tables(&self) -> Vec<TableSpec> {
+        let all = self.nodes.iter().flat_map(|n| n.writes.iter().zip(&n.routes));
+        all.filter(|(_, route)| route.archive).map(|(table, _)| table.clone()).collect()
+    }
+
     /// Carries a stretch of the feed as far as it goes.
     ///
     /// # Errors
     /// A plugin failed, or broke a rule.
-    pub fn feed(&mut self, chunk: &Chunk, sink: &mut dyn Sink) -> Result<(), ChainError> {
+    pub fn feed(&mut self, chunk: Chunk, sink: &mut dyn Sink) -> Result<(), ChainError> {
         for piece in pieces(chunk, self.carry.batch_rows) {
             for (i, batch) in piece.batches.iter().enumerate() {
                 publish(&mut self.nodes, &self.feed_tables[i], &self.feed_routes[i], batch, sink)?;
@@ -368,10 +377,9 @@ fn check_rows(node: &ChainNode, batches: &[Batch], rows: usize) -> Result<(), Ch
 }
 
 /// Cuts a chunk by time so that no table has many more than `rows` rows in one piece.
-fn pieces(chunk: &Chunk, rows: usize) -> Vec<Chunk> {
-    let Some(densest) = chunk.batches.iter().max_by_key(|b| b.rows()).filter(|b| b.rows() > rows) else {
-        return vec![chunk.clone()];
-    };
+fn pieces(chunk: Chunk, rows: usize) -> Vec<Chunk> {
+    let densest = chunk.batches.iter().max_by_key(|b| b.rows()).filter(|b| b.rows() > rows);
+    let Some(densest) = densest else { return vec![chunk] };
     let mut cuts: Vec<i64> = (rows..densest.rows()).step_by(rows.max(1)).map(|i| densest.time_ns[i]).collect();
     cuts.dedup();
     cuts.retain(|t| *t <= chunk.complete_until_ns);
@@ -412,7 +420,7 @@ mod tests {
         let batch = |t: &[i64]| Batch { time_ns: t.to_vec(), columns: vec![t.iter().map(|t| *t as f64).collect()] };
         let chunk = Chunk { batches: vec![batch(&fast), batch(&slow)], complete_until_ns: 1000 };
         for rows in [1, 7, 99, 100, 1000] {
-            let pieces = pieces(&chunk, rows);
+            let pieces = pieces(chunk.clone(), rows);
             for (table, times) in [(0, &fast), (1, &slow)] {
                 let joined: Vec<i64> = pieces.iter().flat_map(|p| p.batches[table].time_ns.clone()).collect();
                 assert_eq!(joined, *times, "{rows} rows");

@@ -61,15 +61,7 @@ impl Chain {
     /// [`ChainError::State`] says in what the state differs from this chain.
     pub fn load(&mut self, bytes: &[u8]) -> Result<(), ChainError> {
         let refuse = |what: &str| ChainError::State { what: what.to_owned() };
-        let (body, digest) = bytes.split_last_chunk::<32>().ok_or_else(|| refuse("too short to be one"))?;
-        if !body.starts_with(MAGIC) {
-            return Err(refuse("this file is no state of a chain"));
-        }
-        if Sha256::digest(body).as_slice() != digest {
-            return Err(refuse("it is damaged: its digest does not match; use an earlier state"));
-        }
-        let mut rest = &body[MAGIC.len()..];
-        let header: Header = serde_json::from_slice(take(&mut rest)?).map_err(|e| refuse(&e.to_string()))?;
+        let (header, mut rest) = open(bytes)?;
         let mine = self.header();
         if let Some((theirs, mine)) = header.nodes.iter().zip(&mine.nodes).find(|(a, b)| a != b) {
             return Err(refuse(&format!(
@@ -93,6 +85,29 @@ impl Chain {
         self.complete_until_ns = header.complete_until_ns;
         Ok(())
     }
+}
+
+/// Where the run that saved a state stopped: every row before this time, Unix ns, is in the state.
+///
+/// # Errors
+/// The bytes are no state.
+pub fn resumes_at_ns(bytes: &[u8]) -> Result<i64, ChainError> {
+    Ok(open(bytes)?.0.complete_until_ns)
+}
+
+/// The header of a sound state, and what follows it.
+fn open(bytes: &[u8]) -> Result<(Header, &[u8]), ChainError> {
+    let refuse = |what: &str| ChainError::State { what: what.to_owned() };
+    let (body, digest) = bytes.split_last_chunk::<32>().ok_or_else(|| refuse("too short to be one"))?;
+    if !body.starts_with(MAGIC) {
+        return Err(refuse("this file is no state of a chain"));
+    }
+    if Sha256::digest(body).as_slice() != digest {
+        return Err(refuse("it is damaged: its digest does not match; use an earlier state"));
+    }
+    let mut rest = &body[MAGIC.len()..];
+    let header = serde_json::from_slice(take(&mut rest)?).map_err(|e| refuse(&e.to_string()))?;
+    Ok((header, rest))
 }
 
 fn put(bytes: &mut Vec<u8>, part: &[u8]) {

@@ -1,0 +1,202 @@
+//! Where rows come from: MCAP files, or a source plugin.
+
+use serde_json::json;
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::path::PathBuf;
+
+use crate::EngineError;
+use crate::border::{Config, Instance};
+use crate::chain;
+use crate::config::{Mission, resolve_parameters};
+use crate::product::Loss;
+use crate::registry::{Found, Registry};
+use crate::replay::Replay;
+use crate::table::{Chunk, TableSpec};
+
+/// Rows in stretches of time.
+pub trait Feed {
+    /// Its tables.
+    fn tables(&self) -> &[TableSpec];
+
+    /// The next stretch; `None` at the end.
+    ///
+    /// # Errors
+    /// The feed failed.
+    fn next(&mut self) -> Result<Option<Chunk>, EngineError>;
+
+    /// Times that the feed expects to cover, Unix ns; `None` where it cannot know.
+    fn span_ns(&self) -> Option<Range<i64>>;
+
+    /// What there is to say at the end.
+    ///
+    /// # Errors
+    /// The feed failed.
+    fn summary(&mut self) -> Result<Summary, EngineError>;
+}
+
+/// What a feed has to say at its end.
+#[derive(Clone, Debug, Default)]
+pub struct Summary {
+    /// `UTC`, `TAI` or `GPS`.
+    pub time_scale: String,
+    /// Spacecraft that the data are from; empty where they do not say.
+    pub spacecraft: String,
+    /// What was counted.
+    pub counts: BTreeMap<String, u64>,
+    /// What was lost.
+    pub losses: Vec<Loss>,
+    /// The report of a source plugin.
+    pub report: Option<(String, serde_json::Value)>,
+}
+
+/// Telemetry files.
+#[derive(Debug)]
+pub struct FileFeed {
+    replay: Replay,
+    window_ns: Option<Range<i64>>,
+}
+
+impl FileFeed {
+    /// Opens the files.
+    ///
+    /// # Errors
+    /// [`EngineError::Replay`]; or the telemetry is of another spacecraft than the mission.
+    pub fn open(
+        files: &[PathBuf],
+        window_ns: Option<Range<i64>>,
+        threads: usize,
+        mission: &Mission,
+    ) -> Result<Self, EngineError> {
+        let replay = Replay::open(files, window_ns.clone(), threads)?;
+        let spacecraft = &replay.info().spacecraft;
+        if !spacecraft.is_empty() && *spacecraft != mission.spacecraft {
+            return Err(EngineError::WrongSpacecraft {
+                telemetry: spacecraft.clone(),
+                mission: mission.spacecraft.clone(),
+                path: mission.path.clone(),
+            });
+        }
+        Ok(Self { replay, window_ns })
+    }
+}
+
+impl Feed for FileFeed {
+    fn tables(&self) -> &[TableSpec] {
+        self.replay.tables()
+    }
+
+    fn next(&mut self) -> Result<Option<Chunk>, EngineError> {
+        Ok(self.replay.next()?)
+    }
+
+    fn span_ns(&self) -> Option<Range<i64>> {
+        let info = self.replay.info();
+        let (mut first, mut end) = (info.first_ns?, info.last_ns?.saturating_add(1));
+        if let Some(window) = &self.window_ns {
+            first = first.max(window.start);
+            end = end.min(window.end);
+        }
+        Some(first..end)
+    }
+
+    fn summary(&mut self) -> Result<Summary, EngineError> {
+        let losses = self.replay.losses();
+        Ok(Summary {
+            time_scale: self.replay.info().time_scale.clone(),
+            spacecraft: self.replay.info().spacecraft.clone(),
+            counts: losses.counts(),
+            losses: losses.entries(),
+            report: None,
+        })
+    }
+}
+
+/// A source plugin.
+#[derive(Debug)]
+pub struct SourceFeed {
+    /// The plugin and its library.
+    pub found: Found,
+    /// Its parameters, complete.
+    pub parameters: serde_json::Map<String, serde_json::Value>,
+    instance: Instance,
+    tables: Vec<TableSpec>,
+    span_ns: Option<Range<i64>>,
+    rows: u32,
+    done: bool,
+}
+
+/// What a source is opened with.
+#[derive(Clone, Debug)]
+pub struct SourceOptions<'a> {
+    /// File that gives the parameters, for messages.
+    pub given_in: String,
+    /// Parameters as given.
+    pub parameters: &'a toml::Table,
+    /// Files to read.
+    pub files: &'a [PathBuf],
+    /// Times wanted, Unix ns.
+    pub window_ns: Option<Range<i64>>,
+    /// Epochs per stretch.
+    pub rows: usize,
+}
+
+impl SourceFeed {
+    /// Makes the source and asks for its tables.
+    ///
+    /// # Errors
+    /// The plugin is missing, or refuses its parameters, its files or the mission.
+    pub fn open(registry: &Registry, id: &str, mission: &Mission, options: &SourceOptions<'_>) -> Result<Self, EngineError> {
+        let found = registry.find(crate::border::Kind::Source, id)?;
+        let parameters = resolve_parameters(&options.given_in, &found.info.manifest, options.parameters)?;
+        let config = Config {
+            value: json!({
+                "parameters": parameters,
+                "mission": mission.value,
+                "files": options.files,
+                "start_ns": options.window_ns.as_ref().map(|w| w.start),
+                "end_ns": options.window_ns.as_ref().map(|w| w.end),
+            }),
+        };
+        let (instance, tables) = chain::open_source(&found, &config)?;
+        Ok(Self {
+            found,
+            parameters,
+            instance,
+            tables,
+            span_ns: options.window_ns.clone(),
+            rows: u32::try_from(options.rows.max(1)).unwrap_or(u32::MAX),
+            done: false,
+        })
+    }
+}
+
+impl Feed for SourceFeed {
+    fn tables(&self) -> &[TableSpec] {
+        &self.tables
+    }
+
+    fn next(&mut self) -> Result<Option<Chunk>, EngineError> {
+        if self.done {
+            return Ok(None);
+        }
+        let step = self.instance.next(self.rows).map_err(chain::ChainError::from)?;
+        self.done = step.done;
+        Ok(Some(Chunk { batches: step.batches, complete_until_ns: step.complete_until_ns }))
+    }
+
+    fn span_ns(&self) -> Option<Range<i64>> {
+        self.span_ns.clone()
+    }
+
+    fn summary(&mut self) -> Result<Summary, EngineError> {
+        let report = self.instance.report("[]").map_err(chain::ChainError::from)?;
+        let text = |key: &str| report["quality"][key].as_str().unwrap_or_default().to_owned();
+        Ok(Summary {
+            time_scale: Some(text("time_scale")).filter(|t| !t.is_empty()).unwrap_or_else(|| "UTC".to_owned()),
+            spacecraft: text("spacecraft"),
+            report: Some((self.found.info.manifest.id.clone(), report)),
+            ..Summary::default()
+        })
+    }
+}

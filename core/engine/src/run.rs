@@ -1,0 +1,412 @@
+//! One run: a pipeline over a feed, into a product.
+
+use chrono::{DateTime, Utc};
+use serde_json::Value;
+use sha2::{Digest, Sha256};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use crate::EngineError;
+use crate::border::hex;
+use crate::chain::{self, Carry, Chain, Sink};
+use crate::config::{Mission, Model, Pipeline};
+use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions, Summary};
+use crate::product::{self, Draft, Loss, Product, ProductWriter, Stage, StageReport, Status, Stream};
+use crate::registry::Registry;
+use crate::replay;
+use crate::table::{Batch, Chunk, TableSpec};
+use crate::telemetry::{FileHeader, TelemetryWriter};
+
+/// What to run.
+#[derive(Clone, Debug)]
+pub struct RunOptions {
+    /// Pipeline file.
+    pub pipeline: PathBuf,
+    /// Telemetry files, or the files of the pipeline's source.
+    pub files: Vec<PathBuf>,
+    /// Mission file in place of the pipeline's.
+    pub mission: Option<PathBuf>,
+    /// Model file in place of the pipeline's.
+    pub model: Option<PathBuf>,
+    /// Folder of the products.
+    pub archive: PathBuf,
+    /// First time wanted, Unix ns.
+    pub from_ns: Option<i64>,
+    /// End of the time wanted, exclusive, Unix ns.
+    pub until_ns: Option<i64>,
+    /// Threads; results do not depend on them.
+    pub threads: usize,
+    /// Most rows in one call of a plugin; results do not depend on it.
+    pub batch_rows: usize,
+    /// State of an earlier run to go on from.
+    pub state_in: Option<PathBuf>,
+    /// Where to keep the state for the next run.
+    pub state_out: Option<PathBuf>,
+    /// When the product is made; the engine has no clock.
+    pub created: DateTime<Utc>,
+    /// Version of the program.
+    pub software: String,
+}
+
+/// How far a run has come.
+#[derive(Clone, Copy, Debug)]
+pub struct Progress {
+    /// Everything before this time is done, Unix ns.
+    pub until_ns: i64,
+    /// First time, Unix ns.
+    pub first_ns: i64,
+    /// End, Unix ns, where it is known.
+    pub end_ns: Option<i64>,
+    /// Rows of the densest table so far.
+    pub epochs: u64,
+}
+
+/// What came of a run.
+#[derive(Clone, Debug)]
+pub struct Outcome {
+    /// The product.
+    pub product: Product,
+    /// Its file.
+    pub path: PathBuf,
+}
+
+/// What a check found.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct CheckReport {
+    /// Pipeline.
+    pub pipeline: String,
+    /// Mission.
+    pub mission: String,
+    /// Model revision.
+    pub model: String,
+    /// Plugins in order, with what each reads and writes.
+    pub nodes: Vec<CheckedNode>,
+    /// Coefficients that will be estimated.
+    pub coefficients: Vec<String>,
+    /// Free space where the product will go, bytes; none where it cannot be told.
+    pub free_bytes: Option<u64>,
+}
+
+/// A plugin as linked.
+#[derive(Clone, Debug, serde::Serialize)]
+pub struct CheckedNode {
+    /// Id, with the instance of an effect.
+    pub name: String,
+    /// Version.
+    pub version: String,
+    /// Columns that it reads, `table:column`.
+    pub reads: Vec<String>,
+    /// Columns that it writes, `table:column`.
+    pub writes: Vec<String>,
+}
+
+/// The files of a run, read.
+struct Setup {
+    pipeline: Pipeline,
+    mission: Mission,
+    model: Model,
+}
+
+impl Setup {
+    fn load(options: &RunOptions) -> Result<Self, EngineError> {
+        let pipeline = Pipeline::load(&options.pipeline)?;
+        let choose = |given: &Option<PathBuf>, own: &Option<PathBuf>, what: &'static str| {
+            given.clone().or_else(|| own.clone()).ok_or(EngineError::NotNamed { what, pipeline: options.pipeline.clone() })
+        };
+        let mission = Mission::load(&choose(&options.mission, &pipeline.mission, "mission")?)?;
+        let model = Model::load(&choose(&options.model, &pipeline.model, "model")?)?;
+        Ok(Self { pipeline, mission, model })
+    }
+
+    fn feed(&self, registry: &Registry, options: &RunOptions, window: Option<Range<i64>>) -> Result<FeedKind, EngineError> {
+        match &self.pipeline.source {
+            Some((id, parameters)) => {
+                let source = SourceOptions {
+                    given_in: options.pipeline.display().to_string(),
+                    parameters,
+                    files: &options.files,
+                    window_ns: window,
+                    rows: options.batch_rows,
+                };
+                Ok(FeedKind::Source(Box::new(SourceFeed::open(registry, id, &self.mission, &source)?)))
+            }
+            None if options.files.is_empty() => Err(EngineError::NoFiles { pipeline: options.pipeline.clone() }),
+            None => Ok(FeedKind::Files(Box::new(FileFeed::open(&options.files, window, options.threads, &self.mission)?))),
+        }
+    }
+}
+
+enum FeedKind {
+    Files(Box<FileFeed>),
+    Source(Box<SourceFeed>),
+}
+
+impl FeedKind {
+    fn get(&mut self) -> &mut dyn Feed {
+        match self {
+            Self::Files(feed) => feed.as_mut(),
+            Self::Source(feed) => feed.as_mut(),
+        }
+    }
+}
+
+fn window(options: &RunOptions, resume_ns: Option<i64>) -> Option<Range<i64>> {
+    let start = options.from_ns.max(resume_ns);
+    (start.is_some() || options.until_ns.is_some())
+        .then(|| start.unwrap_or(i64::MIN)..options.until_ns.unwrap_or(i64::MAX))
+}
+
+/// Links a pipeline over its feed without reading a row.
+///
+/// # Errors
+/// Whatever would keep the run from starting.
+pub fn check(registry: &Registry, options: &RunOptions) -> Result<CheckReport, EngineError> {
+    let setup = Setup::load(options)?;
+    let mut feed = match (&setup.pipeline.source, options.files.is_empty()) {
+        (None, true) => None,
+        _ => Some(setup.feed(registry, options, window(options, None))?),
+    };
+    let tables = feed.as_mut().map_or_else(crate::telemetry::interface_tables, |f| f.get().tables().to_vec());
+    let chain = chain::build(registry, &setup.pipeline, &setup.mission, &setup.model, &tables, carry(options))?;
+    Ok(CheckReport {
+        pipeline: setup.pipeline.name,
+        mission: setup.mission.name,
+        model: setup.model.revision,
+        nodes: chain
+            .nodes
+            .iter()
+            .map(|n| CheckedNode {
+                name: n.name().to_owned(),
+                version: n.info.manifest.version.clone(),
+                reads: n.reads.clone(),
+                writes: n.writes.iter().flat_map(|t| t.columns.iter().map(|c| format!("{}:{}", t.name, c.name))).collect(),
+            })
+            .collect(),
+        coefficients: chain.coefficients.iter().filter(|c| c.estimate).map(|c| c.name.clone()).collect(),
+        free_bytes: None,
+    })
+}
+
+fn carry(options: &RunOptions) -> Carry {
+    Carry { batch_rows: options.batch_rows, threads: options.threads }
+}
+
+/// Runs a pipeline and archives its product.
+///
+/// # Errors
+/// [`EngineError`] says what, where and why; nothing is left in the archive then.
+pub fn run(registry: &Registry, options: &RunOptions, progress: &mut dyn FnMut(Progress)) -> Result<Outcome, EngineError> {
+    let setup = Setup::load(options)?;
+    let state = options.state_in.as_ref().map(|path| read_state(path)).transpose()?;
+    let resume_ns = state.as_ref().map(|s| chain::resumes_at_ns(s)).transpose()?;
+    let mut feed = setup.feed(registry, options, window(options, resume_ns))?;
+    let tables = feed.get().tables().to_vec();
+    let mut chain = chain::build(registry, &setup.pipeline, &setup.mission, &setup.model, &tables, carry(options))?;
+    if let Some(state) = &state {
+        chain.load(state)?;
+    }
+    let mut writer = ProductWriter::begin(&options.archive)?;
+    let mut series = Series::create(&chain, &mut writer, &setup, options)?;
+    let covered = carry_all(feed.get(), &mut chain, &mut series, progress)?;
+    let Some(covered) = covered else { return Err(EngineError::NoRows { files: options.files.clone() }) };
+    if let Some(path) = &options.state_out {
+        write_state(path, &chain.save()?)?;
+    }
+    chain.finish(&mut series)?;
+    let reports = chain.reports()?;
+    series.finish()?;
+    let summary = feed.get().summary()?;
+    let draft = draft(&setup, options, &chain, &feed, summary, reports, &covered)?;
+    let written = writer.commit(&draft)?;
+    Ok(Outcome { product: written.product, path: written.path })
+}
+
+/// Rows that went into the chain.
+struct Covered {
+    first_ns: i64,
+    last_ns: i64,
+}
+
+fn carry_all(
+    feed: &mut dyn Feed,
+    chain: &mut Chain,
+    sink: &mut dyn Sink,
+    progress: &mut dyn FnMut(Progress),
+) -> Result<Option<Covered>, EngineError> {
+    let span = feed.span_ns();
+    let mut covered: Option<Covered> = None;
+    let mut epochs = 0u64;
+    while let Some(chunk) = feed.next()? {
+        if let Some((first, last)) = extent(&chunk) {
+            let covered = covered.get_or_insert(Covered { first_ns: first, last_ns: last });
+            covered.last_ns = covered.last_ns.max(last);
+            epochs += chunk.batches.iter().map(Batch::rows).max().unwrap_or(0) as u64;
+            progress(Progress {
+                until_ns: last,
+                first_ns: covered.first_ns,
+                end_ns: span.as_ref().map(|s| s.end).filter(|e| *e != i64::MAX),
+                epochs,
+            });
+        }
+        chain.feed(chunk, sink)?;
+    }
+    Ok(covered)
+}
+
+/// First and last time of the densest table of a chunk: slow tables may begin long before.
+fn extent(chunk: &Chunk) -> Option<(i64, i64)> {
+    let densest = chunk.batches.iter().max_by_key(|b| b.rows())?;
+    Some((*densest.time_ns.first()?, *densest.time_ns.last()?))
+}
+
+fn read_state(path: &Path) -> Result<Vec<u8>, EngineError> {
+    std::fs::read(path).map_err(|source| EngineError::Io { action: "read the state", path: path.to_owned(), source })
+}
+
+/// Writes the state beside itself and renames it: a kill leaves the old state or the new one.
+fn write_state(path: &Path, bytes: &[u8]) -> Result<(), EngineError> {
+    let io = |source| EngineError::Io { action: "write the state", path: path.to_owned(), source };
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    std::fs::create_dir_all(folder).map_err(io)?;
+    let mut file = tempfile::NamedTempFile::new_in(folder).map_err(io)?;
+    std::io::Write::write_all(&mut file, bytes).map_err(io)?;
+    file.as_file().sync_all().map_err(io)?;
+    file.persist(path).map_err(|e| io(e.error))?;
+    std::fs::File::open(folder).and_then(|f| f.sync_all()).map_err(io)
+}
+
+/// The time series beside the product; written only when a stage has any.
+struct Series {
+    tables: Vec<TableSpec>,
+    last_ns: Vec<Option<i64>>,
+    writer: Option<TelemetryWriter>,
+}
+
+impl Series {
+    fn create(chain: &Chain, product: &mut ProductWriter, setup: &Setup, options: &RunOptions) -> Result<Self, EngineError> {
+        let tables = chain.archived_tables();
+        let header = FileHeader {
+            time_scale: "UTC".to_owned(),
+            mission: setup.mission.name.clone(),
+            spacecraft: setup.mission.spacecraft.clone(),
+            producer: "dragfree".to_owned(),
+            version: options.software.clone(),
+            ..FileHeader::default()
+        };
+        let writer = if tables.is_empty() {
+            None
+        } else {
+            Some(TelemetryWriter::create(&product.staged("mcap"), &tables, &header)?)
+        };
+        Ok(Self { last_ns: vec![None; tables.len()], tables, writer })
+    }
+
+    fn finish(self) -> Result<(), EngineError> {
+        if let Some(writer) = self.writer {
+            writer.finish()?;
+        }
+        Ok(())
+    }
+}
+
+impl Sink for Series {
+    fn rows(&mut self, table: &TableSpec, batch: &Batch) -> Result<(), String> {
+        let Some(writer) = &mut self.writer else { return Ok(()) };
+        let mut chunk = Chunk::default();
+        for (i, t) in self.tables.iter().enumerate() {
+            let mine = t.name == table.name;
+            if mine {
+                self.last_ns[i] = batch.time_ns.last().copied();
+            }
+            chunk.batches.push(if mine { batch.clone() } else { Batch::empty(t.columns.len()) });
+        }
+        // A table that has not spoken yet may still come with earlier rows.
+        chunk.complete_until_ns = self.last_ns.iter().map(|t| t.unwrap_or(i64::MIN)).min().unwrap_or(i64::MIN);
+        writer.write(&chunk).map_err(|e| e.to_string())
+    }
+}
+
+fn draft(
+    setup: &Setup,
+    options: &RunOptions,
+    chain: &Chain,
+    feed: &FeedKind,
+    summary: Summary,
+    reports: Vec<(String, Value)>,
+    covered: &Covered,
+) -> Result<Draft, EngineError> {
+    let day = DateTime::from_timestamp_nanos(covered.first_ns).date_naive();
+    let mut history = Vec::new();
+    if let FeedKind::Source(source) = feed {
+        history.push(Stage {
+            plugin: source.found.info.manifest.id.clone(),
+            instance: String::new(),
+            kind: source.found.info.kind.to_string(),
+            version: source.found.info.manifest.version.clone(),
+            abi: dragfree_abi::ABI_VERSION.to_string(),
+            library_sha256: source.found.library.sha256.clone(),
+            parameters_sha256: digest(&source.parameters),
+        });
+    }
+    history.extend(chain.nodes.iter().map(|n| Stage {
+        plugin: n.info.manifest.id.clone(),
+        instance: n.name().split_once(':').map(|(_, i)| i.to_owned()).unwrap_or_default(),
+        kind: n.info.kind.to_string(),
+        version: n.info.manifest.version.clone(),
+        abi: dragfree_abi::ABI_VERSION.to_string(),
+        library_sha256: n.library_sha256.clone(),
+        parameters_sha256: digest(&n.parameters),
+    }));
+    let mut losses = summary.losses;
+    losses.extend(chain.nodes.iter().filter(|n| n.discarded_rows > 0).map(|n| Loss {
+        kind: "discarded_rows".to_owned(),
+        count: n.discarded_rows,
+        detail: format!("plugin {} discarded batches; its log says why", n.name()),
+    }));
+    let mut effects: Vec<String> = setup.model.effects.iter().map(|e| e.id.clone()).collect();
+    effects.dedup();
+    Ok(Draft {
+        pipeline: setup.pipeline.name.clone(),
+        product: setup.pipeline.product.clone(),
+        release: setup.pipeline.release,
+        mission: setup.mission.name.clone(),
+        spacecraft: setup.mission.spacecraft.clone(),
+        day,
+        first_ns: covered.first_ns,
+        last_ns: covered.last_ns,
+        time_scale: summary.time_scale,
+        stream: Stream::Test,
+        status: Status::Quicklook,
+        inputs: inputs(setup, options)?,
+        history,
+        model: product::Model { revision: setup.model.revision.clone(), parent: setup.model.parent.clone(), effects },
+        software: options.software.clone(),
+        losses,
+        counts: summary.counts,
+        reports: summary.report.into_iter().chain(reports).map(|(stage, report)| StageReport { stage, report }).collect(),
+        created: options.created,
+    })
+}
+
+fn digest(parameters: &serde_json::Map<String, Value>) -> String {
+    hex(&Sha256::digest(Value::Object(parameters.clone()).to_string()))
+}
+
+fn inputs(setup: &Setup, options: &RunOptions) -> Result<Vec<product::Input>, EngineError> {
+    let telemetry = options.files.iter().map(|f| ("telemetry", f.as_path()));
+    let own = [("pipeline", &setup.pipeline.path), ("mission", &setup.mission.path), ("model", &setup.model.path)];
+    let state = options.state_in.iter().map(|f| ("state", f.as_path()));
+    telemetry
+        .chain(own.iter().map(|(role, path)| (*role, path.as_path())))
+        .chain(state)
+        .map(|(role, path)| {
+            let io = |source| EngineError::Io { action: "read", path: path.to_owned(), source };
+            Ok(product::Input {
+                role: role.to_owned(),
+                name: path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
+                size: std::fs::metadata(path).map_err(io)?.len(),
+                sha256: replay::sha256(path).map_err(io)?,
+            })
+        })
+        .collect()
+}
