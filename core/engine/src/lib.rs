@@ -6,3 +6,4 @@ pub mod config;
 pub mod product;
 pub mod registry;
 pub mod table;
+pub mod telemetry;

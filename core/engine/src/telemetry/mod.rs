@@ -1,0 +1,19 @@
+//! The telemetry interface: messages of `telemetry.proto` as columns, and columns as messages.
+//!
+//! A reader trusts the schema *in the file*, never its own: [`Layout`] compiles a message descriptor into a walk from
+//! wire bytes to flat columns with dotted paths. Only then is the layout compared with the committed interface
+//! ([`interface`]), so that a producer may add fields or renumber them but not drop, retype or rename one.
+
+mod decode;
+mod encode;
+mod interface;
+mod layout;
+mod names;
+mod write;
+
+pub use decode::{Cells, Decoder, WireError};
+pub use encode::{EncodeError, Encoder, MessageType};
+pub use interface::{Drift, Topic, check, descriptor, expected, topic_kind};
+pub use layout::{Kind, Layout, LayoutError, Leaf};
+pub use names::unit_and_frame;
+pub use write::{FileHeader, TelemetryWriter, WriteError, Written};

@@ -1,0 +1,310 @@
+//! Tables as an MCAP file that every common viewer plots.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use mcap::records::{MessageHeader, Metadata};
+use mcap::{Compression, McapError, WriteOptions};
+use tempfile::NamedTempFile;
+
+use super::encode::{EncodeError, Encoder, MessageType};
+use crate::table::{Batch, Chunk, TableSpec};
+
+/// Uncompressed size at which a chunk is closed: small enough to seek, large enough to compress.
+const CHUNK_BYTES: u64 = 1 << 20;
+/// Noise hardly compresses; the fastest level keeps the writer ahead of the simulator.
+const ZSTD_LEVEL: u32 = 1;
+
+/// Why a file cannot be written.
+#[derive(Debug, thiserror::Error)]
+pub enum WriteError {
+    /// The file system refuses.
+    #[error("cannot write {path}: {source}; check the folder, its permissions and its free space", path = path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The MCAP writer refuses.
+    #[error("cannot write {path}: {source}", path = path.display())]
+    Mcap {
+        /// The file.
+        path: PathBuf,
+        /// What the writer said.
+        source: McapError,
+    },
+    /// A table does not fit its message.
+    #[error(transparent)]
+    Encode(#[from] EncodeError),
+    /// Rows that are not in order of time, or come after later ones were written.
+    #[error("table {table}: a row at {time_ns} ns after one at {after_ns} ns; rows must come in order of time")]
+    OutOfOrder {
+        /// Name of the table.
+        table: String,
+        /// Time of the row, Unix ns.
+        time_ns: i64,
+        /// Time that was already written, Unix ns.
+        after_ns: i64,
+    },
+    /// A time before 1970, which a file cannot hold.
+    #[error("table {table}: a row at {time_ns} ns lies before 1970; MCAP times are unsigned")]
+    NegativeTime {
+        /// Name of the table.
+        table: String,
+        /// Time of the row, Unix ns.
+        time_ns: i64,
+    },
+    /// A batch that has not the columns of its table.
+    #[error("table {table}: {found} columns of {rows} rows each were due, the batch has something else", found = columns)]
+    Shape {
+        /// Name of the table.
+        table: String,
+        /// Columns of the table.
+        columns: usize,
+        /// Rows of the batch.
+        rows: usize,
+    },
+}
+
+/// What the Metadata record `dragfree` says.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct FileHeader {
+    /// `UTC`, `TAI` or `GPS`: what the Unix nanoseconds count.
+    pub time_scale: String,
+    /// Name of the mission.
+    pub mission: String,
+    /// Name of the spacecraft, `SC1`.
+    pub spacecraft: String,
+    /// Program that made the data.
+    pub producer: String,
+    /// Its version.
+    pub version: String,
+    /// Anything else worth keeping.
+    pub extra: BTreeMap<String, String>,
+}
+
+/// What was written.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Written {
+    /// The file, under its final name.
+    pub path: PathBuf,
+    /// Its size, bytes.
+    pub bytes: u64,
+    /// Messages in it.
+    pub messages: u64,
+}
+
+/// One table on its way into the file.
+struct Topic {
+    name: String,
+    channel: u16,
+    sequence: u32,
+    encoder: Encoder,
+    /// Rows that wait until every table has come as far.
+    pending: Batch,
+    /// Rows of `pending` already written.
+    done: usize,
+}
+
+impl Topic {
+    fn head(&self) -> Option<i64> {
+        self.pending.time_ns.get(self.done).copied()
+    }
+}
+
+/// Writes tables into one MCAP file: protobuf, chunks of about 1 MiB, zstd, CRCs, indexes, statistics; messages in order of
+/// time across topics. The file appears under its name when it is complete; until then, and after any error, there is
+/// no such file.
+pub struct TelemetryWriter {
+    path: PathBuf,
+    writer: mcap::Writer<BufWriter<NamedTempFile>>,
+    topics: Vec<Topic>,
+    message: Vec<u8>,
+    messages: u64,
+    written_until_ns: i64,
+}
+
+impl TelemetryWriter {
+    /// Starts a file with one topic per table, `/` and the table's name.
+    ///
+    /// # Errors
+    /// [`WriteError`] when the file cannot be created or a table fits no message.
+    pub fn create(path: &Path, tables: &[TableSpec], header: &FileHeader) -> Result<Self, WriteError> {
+        let file = temporary(path).map_err(|source| WriteError::Io { path: path.to_owned(), source })?;
+        let refuse = |source| WriteError::Mcap { path: path.to_owned(), source };
+        let mut writer = WriteOptions::new()
+            .profile("")
+            .library(format!("{} {}", header.producer, header.version))
+            .compression(Some(Compression::Zstd))
+            .compression_level(ZSTD_LEVEL)
+            .compression_threads(0)
+            .chunk_size(Some(CHUNK_BYTES))
+            .create(BufWriter::with_capacity(1 << 18, file))
+            .map_err(refuse)?;
+        let mut metadata = header.extra.clone();
+        for (key, value) in [
+            ("time_scale", &header.time_scale),
+            ("mission", &header.mission),
+            ("spacecraft", &header.spacecraft),
+            ("producer", &header.producer),
+            ("version", &header.version),
+        ] {
+            metadata.insert(key.to_owned(), value.clone());
+        }
+        writer.write_metadata(&Metadata { name: "dragfree".to_owned(), metadata }).map_err(refuse)?;
+        let mut topics = Vec::with_capacity(tables.len());
+        for table in tables {
+            let message = MessageType::of(table)?;
+            let schema = writer.add_schema(&message.name, "protobuf", &message.descriptor_set).map_err(refuse)?;
+            let channel = writer
+                .add_channel(schema, &format!("/{}", table.name), "protobuf", &channel_metadata(table, &message))
+                .map_err(refuse)?;
+            topics.push(Topic {
+                name: table.name.clone(),
+                channel,
+                sequence: 0,
+                encoder: Encoder::new(message),
+                pending: Batch::empty(table.columns.len()),
+                done: 0,
+            });
+        }
+        Ok(Self { path: path.to_owned(), writer, topics, message: Vec::new(), messages: 0, written_until_ns: i64::MIN })
+    }
+
+    /// Takes the rows of a chunk, one batch per table in the order of [`TelemetryWriter::create`], and writes
+    /// everything before its `complete_until_ns`.
+    ///
+    /// # Errors
+    /// [`WriteError`]; nothing can be written after one.
+    pub fn write(&mut self, chunk: &Chunk) -> Result<(), WriteError> {
+        for (topic, batch) in self.topics.iter_mut().zip(&chunk.batches) {
+            accept(topic, batch, self.written_until_ns)?;
+        }
+        self.write_before(chunk.complete_until_ns)
+    }
+
+    /// Writes what is left, closes the file, makes it durable and gives it its name.
+    ///
+    /// # Errors
+    /// [`WriteError`]; there is no file then.
+    pub fn finish(mut self) -> Result<Written, WriteError> {
+        self.write_before(i64::MAX)?;
+        let Self { path, mut writer, messages, .. } = self;
+        writer.finish().map_err(|source| WriteError::Mcap { path: path.clone(), source })?;
+        let io = |source| WriteError::Io { path: path.clone(), source };
+        let mut file = writer.into_inner();
+        file.flush().map_err(io)?;
+        let file = file.into_inner().map_err(|e| io(e.into_error()))?;
+        file.as_file().sync_all().map_err(io)?;
+        let bytes = file.as_file().metadata().map_err(io)?.len();
+        file.persist(&path).map_err(|e| io(e.error))?;
+        // A rename is durable when its folder is.
+        File::open(folder(&path)).and_then(|f| f.sync_all()).map_err(io)?;
+        Ok(Written { path, bytes, messages })
+    }
+
+    fn write_before(&mut self, until_ns: i64) -> Result<(), WriteError> {
+        loop {
+            // Equal times go in the order of the tables.
+            let next = self.topics.iter().enumerate().filter_map(|(i, t)| Some((t.head()?, i))).min();
+            let Some((time_ns, i)) = next.filter(|&(time_ns, _)| time_ns < until_ns) else { break };
+            let topic = &mut self.topics[i];
+            self.message.clear();
+            topic.encoder.encode(&topic.pending, topic.done, &mut self.message)?;
+            let log_time = u64::try_from(time_ns)
+                .map_err(|_| WriteError::NegativeTime { table: topic.name.clone(), time_ns })?;
+            let header = MessageHeader {
+                channel_id: topic.channel,
+                sequence: topic.sequence,
+                log_time,
+                publish_time: log_time,
+            };
+            self.writer
+                .write_to_known_channel(&header, &self.message)
+                .map_err(|source| WriteError::Mcap { path: self.path.clone(), source })?;
+            topic.sequence = topic.sequence.wrapping_add(1);
+            topic.done += 1;
+            self.messages += 1;
+        }
+        for topic in &mut self.topics {
+            topic.pending.time_ns.drain(..topic.done);
+            for column in &mut topic.pending.columns {
+                column.drain(..topic.done);
+            }
+            topic.done = 0;
+        }
+        self.written_until_ns = self.written_until_ns.max(until_ns);
+        Ok(())
+    }
+}
+
+fn accept(topic: &mut Topic, batch: &Batch, written_until_ns: i64) -> Result<(), WriteError> {
+    let (columns, rows) = (topic.pending.columns.len(), batch.rows());
+    if batch.columns.len() != columns || batch.columns.iter().any(|c| c.len() != rows) {
+        return Err(WriteError::Shape { table: topic.name.clone(), columns, rows });
+    }
+    let mut after_ns = topic.pending.time_ns.last().copied().unwrap_or(written_until_ns);
+    for &time_ns in &batch.time_ns {
+        if time_ns < after_ns {
+            return Err(WriteError::OutOfOrder { table: topic.name.clone(), time_ns, after_ns });
+        }
+        after_ns = time_ns;
+    }
+    topic.pending.time_ns.extend_from_slice(&batch.time_ns);
+    for (pending, column) in topic.pending.columns.iter_mut().zip(&batch.columns) {
+        pending.extend_from_slice(column);
+    }
+    Ok(())
+}
+
+/// What the schema cannot say: unit, place and rate of a housekeeping scalar; units and original names of the columns
+/// of a generated message.
+fn channel_metadata(table: &TableSpec, message: &MessageType) -> BTreeMap<String, String> {
+    let mut metadata = BTreeMap::new();
+    if table.name.starts_with("hk/") {
+        if let Some(column) = table.columns.first() {
+            metadata.insert("unit".to_owned(), column.unit.clone());
+            for key in ["place", "rate_hz"] {
+                if let Some(value) = column.attributes.get(key) {
+                    metadata.insert(key.to_owned(), value.clone());
+                }
+            }
+        }
+        if table.rate_hz > 0.0 {
+            metadata.entry("rate_hz".to_owned()).or_insert_with(|| table.rate_hz.to_string());
+        }
+    }
+    for (path, column) in message.paths.iter().zip(&table.columns) {
+        for (key, value) in [("unit", &column.unit), ("frame", &column.frame)] {
+            if !value.is_empty() {
+                metadata.insert(format!("{key}:{path}"), value.clone());
+            }
+        }
+        if *path != column.name {
+            metadata.insert(format!("name:{path}"), column.name.clone());
+        }
+    }
+    metadata
+}
+
+fn folder(path: &Path) -> &Path {
+    match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    }
+}
+
+/// A file beside `path`, removed unless it is renamed.
+fn temporary(path: &Path) -> io::Result<NamedTempFile> {
+    let mut builder = tempfile::Builder::new();
+    builder.prefix(".writing-").suffix(".mcap");
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt as _;
+        builder.permissions(std::fs::Permissions::from_mode(0o666)); // less the umask, as of any new file
+    }
+    builder.tempfile_in(folder(path))
+}
