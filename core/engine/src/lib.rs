@@ -5,5 +5,6 @@ pub mod chain;
 pub mod config;
 pub mod product;
 pub mod registry;
+pub mod replay;
 pub mod table;
 pub mod telemetry;

@@ -14,7 +14,9 @@ use crate::table::{Batch, TableSpec};
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum EncodeError {
     /// A table of the interface has a column that its message has not.
-    #[error("table {table} has a column {column} that its message {message} in telemetry.proto does not have; rename the column or the table")]
+    #[error(
+        "table {table} has a column {column} that its message {message} in telemetry.proto does not have; rename the column or the table"
+    )]
     UnknownColumn {
         /// Name of the table.
         table: String,
@@ -248,9 +250,7 @@ fn free_path(name: &str, taken: &mut BTreeSet<String>) -> String {
     let components: Vec<String> = name.split('.').map(|c| identifier(c, "_")).collect();
     let mut path = components.join(".");
     let collides = |path: &str, taken: &BTreeSet<String>| {
-        taken.iter().any(|t| {
-            t == path || t.starts_with(&format!("{path}.")) || path.starts_with(&format!("{t}."))
-        })
+        taken.iter().any(|t| t == path || t.starts_with(&format!("{path}.")) || path.starts_with(&format!("{t}.")))
     };
     if collides(&path, taken) {
         // One flat name cannot be the parent or the child of another.

@@ -180,7 +180,8 @@ mod tests {
         );
         let retyped = drifted(|t| t.replace("double theta_orf_rad", "float theta_orf_rad"), "/dws", dws);
         assert!(matches!(retyped, Err(Drift::Type { path, .. }) if path == "tm1.theta_orf_rad"));
-        let grown = drifted(|t| t.replace("message Dws {", "message Dws { double t_k = 9; string s = 10;"), "/dws", dws);
+        let grown =
+            drifted(|t| t.replace("message Dws {", "message Dws { double t_k = 9; string s = 10;"), "/dws", dws);
         assert_eq!(grown, Ok(()));
         let renumbered = drifted(|t| t.replace("psi_orf_rad = 2", "psi_orf_rad = 77"), "/dws", dws);
         assert_eq!(renumbered, Ok(()));

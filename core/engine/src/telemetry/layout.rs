@@ -138,7 +138,8 @@ impl Layout {
     /// # Errors
     /// [`LayoutError`] when the bytes are no descriptor set or do not define the type completely.
     pub fn parse(descriptor_set: &[u8], name: &str) -> Result<Self, LayoutError> {
-        let set = FileDescriptorSet::decode(descriptor_set).map_err(|e| LayoutError::NotADescriptorSet(e.to_string()))?;
+        let set =
+            FileDescriptorSet::decode(descriptor_set).map_err(|e| LayoutError::NotADescriptorSet(e.to_string()))?;
         Self::compile(&set, name)
     }
 
@@ -312,7 +313,12 @@ mod tests {
         repeated.label = Some(Label::Repeated.into());
         let set = set(vec![(
             "M",
-            vec![field("v", 1, Type::Double, ""), repeated, field("t", 3, Type::Int64, ""), field("s", 4, Type::String, "")],
+            vec![
+                field("v", 1, Type::Double, ""),
+                repeated,
+                field("t", 3, Type::Int64, ""),
+                field("s", 4, Type::String, ""),
+            ],
         )]);
         let layout = Layout::compile(&set, "p.M").unwrap();
         assert_eq!(layout.leaves(), [Leaf { path: "v".into(), kind: Kind::Double }]);
@@ -326,7 +332,11 @@ mod tests {
         assert_eq!(layout.leaves().len(), MAX_DEPTH);
         let tree = set(vec![(
             "M",
-            vec![field("a", 1, Type::Message, ".p.M"), field("b", 2, Type::Message, ".p.M"), field("v", 3, Type::Bool, "")],
+            vec![
+                field("a", 1, Type::Message, ".p.M"),
+                field("b", 2, Type::Message, ".p.M"),
+                field("v", 3, Type::Bool, ""),
+            ],
         )]);
         assert_eq!(Layout::compile(&tree, "p.M"), Err(LayoutError::TooLarge("p.M".into())));
     }

@@ -214,14 +214,10 @@ impl TelemetryWriter {
             let topic = &mut self.topics[i];
             self.message.clear();
             topic.encoder.encode(&topic.pending, topic.done, &mut self.message)?;
-            let log_time = u64::try_from(time_ns)
-                .map_err(|_| WriteError::NegativeTime { table: topic.name.clone(), time_ns })?;
-            let header = MessageHeader {
-                channel_id: topic.channel,
-                sequence: topic.sequence,
-                log_time,
-                publish_time: log_time,
-            };
+            let log_time =
+                u64::try_from(time_ns).map_err(|_| WriteError::NegativeTime { table: topic.name.clone(), time_ns })?;
+            let header =
+                MessageHeader { channel_id: topic.channel, sequence: topic.sequence, log_time, publish_time: log_time };
             self.writer
                 .write_to_known_channel(&header, &self.message)
                 .map_err(|source| WriteError::Mcap { path: self.path.clone(), source })?;

@@ -1,0 +1,79 @@
+//! The records of a piece of a file, uncompressed and vouched for by their CRC.
+
+use std::io::{self, Read, Seek, SeekFrom};
+
+use super::scan::{Piece, Stored};
+
+/// Largest piece that is read, bytes, compressed or not. A length beyond it is damage or an attack.
+pub(super) const MAX_PIECE: u64 = 1 << 29;
+
+/// Why the records of a piece are not there.
+#[derive(Debug)]
+pub(super) enum InflateError {
+    /// The file cannot be read.
+    Io(io::Error),
+    /// What stands there is not what was written.
+    Corrupt(String),
+}
+
+/// Reads and decompresses, in buffers that stay.
+pub(super) struct Inflater {
+    zstd: zstd::bulk::Decompressor<'static>,
+    stored: Vec<u8>,
+    records: Vec<u8>,
+}
+
+impl Inflater {
+    pub(super) fn new() -> io::Result<Self> {
+        Ok(Self { zstd: zstd::bulk::Decompressor::new()?, stored: Vec::new(), records: Vec::new() })
+    }
+
+    /// The records of `piece`.
+    pub(super) fn read(&mut self, file: &mut (impl Read + Seek), piece: &Piece) -> Result<&[u8], InflateError> {
+        let corrupt = |what: String| Err(InflateError::Corrupt(what));
+        if piece.length > MAX_PIECE {
+            return corrupt(format!("{} bytes are more than a chunk can sensibly have", piece.length));
+        }
+        file.seek(SeekFrom::Start(piece.offset)).map_err(InflateError::Io)?;
+        self.stored.clear();
+        let got = file.take(piece.length).read_to_end(&mut self.stored).map_err(InflateError::Io)?;
+        if got as u64 != piece.length {
+            return corrupt(format!("the file ends {} bytes early", piece.length - got as u64));
+        }
+        let Stored::Chunk { compression, uncompressed_size, crc } = &piece.stored else {
+            return Ok(&self.stored);
+        };
+        if *uncompressed_size > MAX_PIECE {
+            return corrupt(format!("{uncompressed_size} bytes are more than a chunk can sensibly have"));
+        }
+        let size = usize::try_from(*uncompressed_size)
+            .map_err(|_| InflateError::Corrupt(format!("{uncompressed_size} bytes do not fit the memory")))?;
+        let records = match compression.as_str() {
+            "" => &self.stored,
+            "zstd" => {
+                self.records.clear();
+                self.records.reserve(size);
+                // Writers may cut the stream into frames; the bulk decoder takes them all.
+                self.zstd
+                    .decompress_to_buffer(&self.stored, &mut self.records)
+                    .map_err(|e| InflateError::Corrupt(format!("zstd: {e}")))?;
+                &self.records
+            }
+            "lz4" => {
+                self.records.clear();
+                lz4::Decoder::new(self.stored.as_slice())
+                    .and_then(|d| d.take(uncompressed_size + 1).read_to_end(&mut self.records))
+                    .map_err(|e| InflateError::Corrupt(format!("lz4: {e}")))?;
+                &self.records
+            }
+            other => return corrupt(format!("compression {other:?} is neither zstd nor lz4")),
+        };
+        if records.len() != size {
+            return corrupt(format!("{} bytes where {size} were written", records.len()));
+        }
+        if *crc != 0 && crc32fast::hash(records) != *crc {
+            return corrupt("its CRC is wrong".to_owned());
+        }
+        Ok(records)
+    }
+}

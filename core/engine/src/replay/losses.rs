@@ -1,0 +1,134 @@
+//! What a replay met that is not sound data: counted by kind, told in words, never skipped silently.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+/// Sentences kept of each kind; the counts go on.
+const MESSAGES_PER_KIND: usize = 8;
+
+/// One kind of finding.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Finding {
+    /// A file that ends before its end: cut, or still being written.
+    TruncatedFile,
+    /// A file without a byte.
+    EmptyFile,
+    /// A chunk whose CRC, compression or size is wrong; all its messages are lost.
+    CorruptChunk,
+    /// A record that makes no sense where it stands; what it held is lost.
+    DamagedRecord,
+    /// A message that is not what its schema says; lost.
+    MalformedMessage,
+    /// A message on a channel that the file does not define; lost.
+    UnknownChannel,
+    /// A message before 1980 or after 2200; dropped.
+    TimeOutOfRange,
+    /// A message earlier than its file's index says, found too late to be put in order; lost.
+    LateMessage,
+    /// A message of a time at which its topic already has other values; the first in the order of the files counts.
+    Conflict,
+    /// A message that repeats one of the same topic, time and values; dropped.
+    Duplicate,
+    /// A message with an earlier time than the one before it on its channel; put in order.
+    Backwards,
+    /// A transmitted value that is NaN or infinite; passed on.
+    NonFinite,
+    /// A message of a topic that is not in the interface; not read.
+    UnknownTopic,
+    /// A message of `/truth`, which a calibration must not see; not read.
+    Truth,
+    /// A field that cannot be a column (repeated, text, 64-bit integers), per channel; not read.
+    IgnoredField,
+    /// A housekeeping channel that does not state its unit.
+    MissingUnit,
+    /// A file without a `dragfree` metadata record, so nobody knows whose it is.
+    MissingMetadata,
+    /// A chunk written without a CRC.
+    UncheckedChunk,
+    /// A file without a usable summary; its channels were found by reading all of it.
+    NoSummary,
+    /// A file without a message.
+    NoMessages,
+}
+
+impl Finding {
+    /// Key of the count in a product.
+    #[must_use]
+    pub fn key(self) -> &'static str {
+        match self {
+            Self::TruncatedFile => "truncated_files",
+            Self::EmptyFile => "empty_files",
+            Self::CorruptChunk => "corrupt_chunks",
+            Self::DamagedRecord => "damaged_records",
+            Self::MalformedMessage => "malformed_messages",
+            Self::UnknownChannel => "messages_of_unknown_channels",
+            Self::TimeOutOfRange => "times_out_of_range",
+            Self::LateMessage => "late_messages",
+            Self::Conflict => "conflicting_messages",
+            Self::Duplicate => "duplicate_messages",
+            Self::Backwards => "backward_times",
+            Self::NonFinite => "non_finite_values",
+            Self::UnknownTopic => "messages_of_unknown_topics",
+            Self::Truth => "truth_messages",
+            Self::IgnoredField => "ignored_fields",
+            Self::MissingUnit => "missing_units",
+            Self::MissingMetadata => "files_without_metadata",
+            Self::UncheckedChunk => "chunks_without_crc",
+            Self::NoSummary => "files_without_summary",
+            Self::NoMessages => "files_without_messages",
+        }
+    }
+
+    /// True where data were there and are not in the tables.
+    #[must_use]
+    pub fn is_loss(self) -> bool {
+        self <= Self::LateMessage
+    }
+}
+
+/// Counts of findings, and the first sentences of each kind.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Losses {
+    counts: BTreeMap<Finding, u64>,
+    messages: Vec<String>,
+    /// What was told already: a kind, and the file or topic it concerns.
+    told: BTreeSet<(Finding, String)>,
+}
+
+impl Losses {
+    /// How often `finding` was met.
+    #[must_use]
+    pub fn count(&self, finding: Finding) -> u64 {
+        self.counts.get(&finding).copied().unwrap_or(0)
+    }
+
+    /// Everything met, by the key of its kind.
+    #[must_use]
+    pub fn counts(&self) -> BTreeMap<String, u64> {
+        self.counts.iter().map(|(finding, &count)| (finding.key().to_owned(), count)).collect()
+    }
+
+    /// The first sentences of each kind, in the order of their finding.
+    #[must_use]
+    pub fn messages(&self) -> &[String] {
+        &self.messages
+    }
+
+    /// True when data were lost.
+    #[must_use]
+    pub fn data_loss(&self) -> bool {
+        self.counts.keys().any(|f| f.is_loss())
+    }
+
+    /// Counts `times` of `finding`, nothing when that is 0. The sentence is kept once for each `subject`, a file or a
+    /// topic, and while there are few of the kind.
+    pub(super) fn add(&mut self, finding: Finding, times: u64, subject: &str, sentence: impl FnOnce() -> String) {
+        if times == 0 {
+            return;
+        }
+        *self.counts.entry(finding).or_default() += times;
+        let of_kind = self.told.range((finding, String::new())..).take_while(|(f, _)| *f == finding).count();
+        if of_kind < MESSAGES_PER_KIND && self.told.insert((finding, subject.to_owned())) {
+            self.messages.push(sentence());
+        }
+    }
+}

@@ -1,0 +1,295 @@
+//! Replay of telemetry files: any number, overlapping, in any order, damaged, as one sequence of stretches of time.
+//!
+//! What is right is delivered, what is wrong is counted ([`Losses`]) or, where going on would mix what must not be
+//! mixed, an error ([`ReplayError`]). Borders of stretches are multiples of a fixed length since 1970, and rows are in
+//! order of time, then of the files, so nothing depends on the number of threads or the order of the arguments. Memory
+//! holds the pieces of files that overlap the present stretch, never a file.
+
+mod block;
+pub mod fuzz;
+mod inflate;
+mod losses;
+mod reader;
+mod records;
+mod scan;
+mod tables;
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{self, Read};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::thread::{self, JoinHandle};
+
+use sha2::{Digest as _, Sha256};
+
+pub use losses::{Finding, Losses};
+
+use crate::table::{Chunk, TableSpec};
+use crate::telemetry::{Drift, LayoutError};
+use reader::{OpenFile, Reader, SANE_NS, clamp_ns};
+use scan::{Scan, ScanError, Source, scan};
+
+/// Stretches decoded ahead on the second thread.
+const AHEAD: usize = 2;
+
+/// Why files cannot be replayed.
+#[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
+pub enum ReplayError {
+    /// No files were given.
+    #[error("no telemetry files were given; name at least one .mcap file")]
+    NoFiles,
+    /// The file system refuses.
+    #[error("cannot read {path}: {source}", path = path.display())]
+    Io { path: PathBuf, source: io::Error },
+    /// Another kind of file.
+    #[error("{path} is not an MCAP file: it does not begin with the MCAP magic bytes; remove it from the list or convert it", path = path.display())]
+    NotMcap { path: PathBuf },
+    /// No file has a topic of the interface.
+    #[error(
+        "none of the files has a topic of telemetry.proto (found: {found}); these are no telemetry of a drag-free spacecraft"
+    )]
+    NoTelemetry { found: String },
+    /// Files that do not belong together.
+    #[error("{path} says {key} = {found:?} where the files before it say {before:?}; replay them apart", path = path.display())]
+    Mixed { path: PathBuf, key: &'static str, found: String, before: String },
+    /// A time scale that nobody knows.
+    #[error("{path} says time_scale = {found:?}; it must be UTC, TAI or GPS", path = path.display())]
+    TimeScale { path: PathBuf, found: String },
+    /// A topic of the interface in another encoding.
+    #[error("{path}: topic {topic} carries {encoding}; telemetry must be protobuf with a protobuf schema", path = path.display())]
+    Encoding { path: PathBuf, topic: String, encoding: String },
+    /// A schema that cannot be used.
+    #[error("{path}: topic {topic}: {source}; have the file written again by its producer", path = path.display())]
+    Schema { path: PathBuf, topic: String, source: LayoutError },
+    /// A schema that is not what the interface says.
+    #[error("{path}: schema drift in topic {topic}: {source}; convert the file or agree on a new telemetry.proto", path = path.display())]
+    Drift { path: PathBuf, topic: String, source: Drift },
+    /// One housekeeping topic in two units.
+    #[error("{path}: topic {topic} is in {found:?} where the files before it have {before:?}; convert one of them", path = path.display())]
+    MixedUnits { path: PathBuf, topic: String, found: String, before: String },
+    /// The thread that reads ahead ended without a word.
+    #[error("the reading thread died; this is a defect of dragfree, please report it with the files")]
+    Worker,
+}
+
+/// One input, as a product cites it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct InputFile {
+    /// Path as given.
+    pub path: PathBuf,
+    /// Size, bytes.
+    pub bytes: u64,
+    /// First log time that its chunks state, Unix ns; `None` without messages.
+    pub first_ns: Option<i64>,
+    /// Last log time that its chunks state, Unix ns.
+    pub last_ns: Option<i64>,
+}
+
+/// Whose data these are and from when.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ReplayInfo {
+    /// `UTC`, `TAI` or `GPS`; empty when no file says.
+    pub time_scale: String,
+    /// Mission; empty when no file says.
+    pub mission: String,
+    /// Spacecraft; empty when no file says.
+    pub spacecraft: String,
+    /// First log time of all files that the chunks state, Unix ns, before any window.
+    pub first_ns: Option<i64>,
+    /// Last log time of all files that the chunks state, Unix ns.
+    pub last_ns: Option<i64>,
+    /// The files, in order of time.
+    pub files: Vec<InputFile>,
+    /// Every topic that a file defines, read or not.
+    pub topics: Vec<String>,
+}
+
+/// A replay under way.
+pub struct Replay {
+    tables: Vec<TableSpec>,
+    info: ReplayInfo,
+    losses: Losses,
+    engine: Engine,
+}
+
+/// Who reads.
+enum Engine {
+    Here(Box<Reader>),
+    Ahead { stretches: Receiver<Stretch>, thread: Option<JoinHandle<()>> },
+}
+
+/// A stretch, or the end, and what was met until then.
+type Stretch = Result<(Option<Chunk>, Losses), ReplayError>;
+
+impl Replay {
+    /// Opens `files` for the log times within `window_ns` (Unix ns, all when `None`); with two or more `threads` the
+    /// reading goes ahead on a thread of its own. Files are put in order of their first time, then of their path.
+    ///
+    /// # Errors
+    /// [`ReplayError`] when a file cannot be read at all or does not fit the others or the interface.
+    pub fn open(files: &[PathBuf], window_ns: Option<Range<i64>>, threads: usize) -> Result<Self, ReplayError> {
+        Self::from_sources(files.iter().cloned().map(Source::Path).collect(), window_ns, threads)
+    }
+
+    fn from_sources(sources: Vec<Source>, window_ns: Option<Range<i64>>, threads: usize) -> Result<Self, ReplayError> {
+        if sources.is_empty() {
+            return Err(ReplayError::NoFiles);
+        }
+        let mut losses = Losses::default();
+        let mut files = Vec::with_capacity(sources.len());
+        for source in sources {
+            let path = source.path().to_owned();
+            let scan = scan(&source, &mut losses).map_err(|error| match error {
+                ScanError::Io(source) => ReplayError::Io { path, source },
+                ScanError::NotMcap => ReplayError::NotMcap { path },
+            })?;
+            files.push((source, scan));
+        }
+        files.sort_by_cached_key(|(source, scan)| (times(scan).map(|t| t.0), source.path().to_owned()));
+        let info = info(&files, &mut losses)?;
+        let views: Vec<(&Path, &Scan)> = files.iter().map(|(source, scan)| (source.path(), scan)).collect();
+        let (tables, routes) = tables::link(&views, &mut losses)?;
+        // Files that ended before their first channel are a loss, not the wrong files.
+        if tables.is_empty() && !losses.data_loss() {
+            return Err(ReplayError::NoTelemetry { found: info.topics.join(", ") });
+        }
+        let files = (files.into_iter().zip(routes))
+            .map(|((source, scan), routes)| OpenFile { source, pieces: scan.pieces, routes })
+            .collect();
+        let reader = Reader::new(files, tables.clone(), window_ns.unwrap_or(SANE_NS), losses.clone())?;
+        let engine = if threads < 2 { Engine::Here(Box::new(reader)) } else { ahead(reader) };
+        Ok(Self { tables, info, losses, engine })
+    }
+
+    /// The tables, in the order of the interface, housekeeping last by name. A table that is not here is a topic that
+    /// no file has.
+    #[must_use]
+    pub fn tables(&self) -> &[TableSpec] {
+        &self.tables
+    }
+
+    /// Whose data these are and from when.
+    #[must_use]
+    pub fn info(&self) -> &ReplayInfo {
+        &self.info
+    }
+
+    /// The next stretch of time that has a row, one batch per table; `None` at the end.
+    ///
+    /// # Errors
+    /// [`ReplayError::Io`] when a file can no longer be read.
+    #[allow(clippy::should_implement_trait, reason = "an iterator cannot be asked for its losses between two items")]
+    pub fn next(&mut self) -> Result<Option<Chunk>, ReplayError> {
+        let (chunk, losses) = match &mut self.engine {
+            Engine::Here(reader) => (reader.next()?, reader.losses().clone()),
+            Engine::Ahead { stretches, .. } => match stretches.recv() {
+                Ok(stretch) => stretch?,
+                Err(_) if self.ended() => (None, self.losses.clone()),
+                Err(_) => return Err(ReplayError::Worker),
+            },
+        };
+        self.losses = losses;
+        Ok(chunk)
+    }
+
+    /// What was met until the last stretch delivered; complete when [`Replay::next`] has said `None`.
+    #[must_use]
+    pub fn losses(&self) -> &Losses {
+        &self.losses
+    }
+
+    /// True when the reading thread came to its end in order.
+    fn ended(&mut self) -> bool {
+        match &mut self.engine {
+            Engine::Here(_) => true,
+            Engine::Ahead { thread, .. } => thread.take().is_none_or(|t| t.join().is_ok()),
+        }
+    }
+}
+
+fn ahead(mut reader: Reader) -> Engine {
+    let (send, stretches) = sync_channel(AHEAD);
+    let thread = thread::spawn(move || {
+        loop {
+            let stretch = reader.next().map(|chunk| (chunk, reader.losses().clone()));
+            let more = matches!(&stretch, Ok((Some(_), _)));
+            // The other side is gone when the replay was dropped: nobody wants the rest.
+            if send.send(stretch).is_err() || !more {
+                break;
+            }
+        }
+    });
+    Engine::Ahead { stretches, thread: Some(thread) }
+}
+
+/// First and last sane time that the pieces of a file state, Unix ns.
+fn times(scan: &Scan) -> Option<(i64, i64)> {
+    let sane = scan.pieces.iter().map(|p| (clamp_ns(p.start), clamp_ns(p.end)));
+    let sane = sane.filter(|(start, end)| *end > SANE_NS.start && *start < SANE_NS.end);
+    sane.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
+}
+
+fn info(files: &[(Source, Scan)], losses: &mut Losses) -> Result<ReplayInfo, ReplayError> {
+    let mut info = ReplayInfo::default();
+    let mut said: BTreeMap<&'static str, String> = BTreeMap::new();
+    for (source, scan) in files {
+        let path = source.path().to_owned();
+        let name = path.display().to_string();
+        for channel in scan.definitions.channels.values() {
+            if !info.topics.contains(&channel.topic) {
+                info.topics.push(channel.topic.clone());
+            }
+        }
+        let times = times(scan);
+        info.first_ns = info.first_ns.into_iter().chain(times.map(|t| t.0)).min();
+        info.last_ns = info.last_ns.into_iter().chain(times.map(|t| t.1)).max();
+        info.files.push(InputFile {
+            path: path.clone(),
+            bytes: scan.bytes,
+            first_ns: times.map(|t| t.0),
+            last_ns: times.map(|t| t.1),
+        });
+        let Some(metadata) = &scan.metadata else {
+            losses.add(Finding::MissingMetadata, u64::from(scan.bytes > 0), &name, || {
+                format!("{name} has no metadata record \"dragfree\": its spacecraft and time scale are taken on trust")
+            });
+            continue;
+        };
+        for key in ["time_scale", "mission", "spacecraft"] {
+            let Some(found) = metadata.get(key).filter(|v| !v.is_empty()).cloned() else { continue };
+            if key == "time_scale" && !matches!(found.as_str(), "UTC" | "TAI" | "GPS") {
+                return Err(ReplayError::TimeScale { path, found });
+            }
+            let before = said.entry(key).or_insert_with(|| found.clone());
+            if *before != found {
+                return Err(ReplayError::Mixed { path, key, found, before: before.clone() });
+            }
+        }
+    }
+    info.topics.sort();
+    let mut take = |key| said.remove(key).unwrap_or_default();
+    (info.time_scale, info.mission, info.spacecraft) = (take("time_scale"), take("mission"), take("spacecraft"));
+    Ok(info)
+}
+
+/// SHA-256 of a file, in hexadecimal: a pass of its own over all bytes.
+///
+/// # Errors
+/// What the system says when the file cannot be read.
+pub fn sha256(path: &Path) -> io::Result<String> {
+    let mut file = File::open(path)?;
+    let mut hasher = Sha256::new();
+    let mut buffer = vec![0; 1 << 18];
+    loop {
+        match file.read(&mut buffer)? {
+            0 => break,
+            count => hasher.update(&buffer[..count]),
+        }
+    }
+    Ok(hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
+}

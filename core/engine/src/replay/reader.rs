@@ -1,0 +1,290 @@
+//! From pieces of files to stretches of time.
+
+use std::collections::BTreeMap;
+use std::ops::Range;
+use std::path::PathBuf;
+
+use super::ReplayError;
+use super::block::{Block, drain};
+use super::inflate::{InflateError, Inflater};
+use super::losses::{Finding, Losses};
+use super::records::{Cursor, Message, op};
+use super::scan::{Piece, Source};
+use super::tables::{Route, Routes};
+use crate::table::{Batch, Chunk, TableSpec};
+use crate::telemetry::Cells;
+
+/// Length of a stretch, ns: 4096 epochs at 10 Hz. The borders are its multiples since 1970, whatever the files are.
+const STRETCH_NS: i64 = 409_600_000_000;
+/// Rows later than this many stretches ahead are not kept but read again, so that a file in no order at all costs
+/// time and not memory.
+const HORIZON: i64 = 16 * STRETCH_NS;
+/// 1980-01-01 and 2200-01-01: a clock outside has failed.
+pub(super) const SANE_NS: Range<i64> = 315_532_800_000_000_000..7_258_118_400_000_000_000;
+
+/// A log time as signed nanoseconds within the sane range, or the border of it that is nearest.
+pub(super) fn clamp_ns(log_time: u64) -> i64 {
+    i64::try_from(log_time).unwrap_or(i64::MAX).clamp(SANE_NS.start, SANE_NS.end)
+}
+
+/// A piece that has yet to be read.
+#[derive(Debug)]
+struct Pending {
+    piece: Piece,
+    /// Rows before this time were delivered by an earlier reading, Unix ns; `i64::MIN` before the first.
+    from_ns: i64,
+}
+
+/// Earliest time, file, offset: pieces are read in this order.
+type Key = (i64, usize, u64);
+
+/// A file ready to be read.
+#[derive(Debug)]
+pub(super) struct OpenFile {
+    pub(super) source: Source,
+    pub(super) pieces: Vec<Piece>,
+    pub(super) routes: Routes,
+}
+
+/// Where a message of a piece lies.
+struct Entry {
+    channel: u16,
+    time_ns: i64,
+    data: Range<usize>,
+}
+
+/// Reads the pieces of all files in order of time.
+pub(super) struct Reader {
+    files: Vec<(Source, Routes)>,
+    tables: Vec<TableSpec>,
+    queue: BTreeMap<Key, Pending>,
+    /// Rows read and not yet delivered, by table.
+    blocks: Vec<Vec<Block>>,
+    window_ns: Range<i64>,
+    /// Every row before this time has been delivered.
+    done_ns: i64,
+    inflater: Inflater,
+    entries: Vec<Entry>,
+    losses: Losses,
+}
+
+impl Reader {
+    pub(super) fn new(
+        files: Vec<OpenFile>,
+        tables: Vec<TableSpec>,
+        window_ns: Range<i64>,
+        losses: Losses,
+    ) -> Result<Self, ReplayError> {
+        let inflater = Inflater::new().map_err(|source| ReplayError::Io { path: PathBuf::from("zstd"), source })?;
+        let mut queue = BTreeMap::new();
+        let mut sources = Vec::with_capacity(files.len());
+        for (at, file) in files.into_iter().enumerate() {
+            for piece in file.pieces {
+                let (start, end) = (clamp_ns(piece.start), clamp_ns(piece.end));
+                if end >= window_ns.start && start < window_ns.end {
+                    queue.insert((start, at, piece.offset), Pending { piece, from_ns: i64::MIN });
+                }
+            }
+            sources.push((file.source, file.routes));
+        }
+        let blocks = tables.iter().map(|_| vec![]).collect();
+        let done_ns = i64::MIN;
+        Ok(Self { files: sources, tables, queue, blocks, window_ns, done_ns, inflater, entries: vec![], losses })
+    }
+
+    pub(super) fn losses(&self) -> &Losses {
+        &self.losses
+    }
+
+    /// The next stretch that has a row; `None` at the end.
+    pub(super) fn next(&mut self) -> Result<Option<Chunk>, ReplayError> {
+        loop {
+            let queued = self.queue.first_key_value().map(|(key, _)| key.0);
+            let held = self.blocks.iter().flatten().filter_map(Block::head).min();
+            let Some(first) = queued.into_iter().chain(held).min() else { return Ok(None) };
+            let until_ns = ((first.max(self.done_ns).div_euclid(STRETCH_NS)) + 1) * STRETCH_NS;
+            while let Some(entry) = self.queue.first_entry().filter(|e| e.key().0 < until_ns) {
+                let ((_, file, _), pending) = entry.remove_entry();
+                self.read(file, pending, until_ns)?;
+            }
+            let batches: Vec<Batch> = (self.blocks.iter_mut().zip(&self.tables))
+                .map(|(blocks, table)| drain(blocks, until_ns, table.columns.len(), &table.name, &mut self.losses))
+                .collect();
+            self.done_ns = until_ns;
+            if batches.iter().any(|b| b.rows() > 0) {
+                return Ok(Some(Chunk { batches, complete_until_ns: until_ns.min(self.window_ns.end) }));
+            }
+        }
+    }
+
+    /// Reads the rows of a piece that lie between what was delivered and the horizon.
+    fn read(&mut self, file: usize, pending: Pending, until_ns: i64) -> Result<(), ReplayError> {
+        let horizon_ns = until_ns.saturating_add(HORIZON);
+        let (source, routes) = &mut self.files[file];
+        let name = source.path().display().to_string();
+        let piece = &pending.piece;
+        let io = |error| ReplayError::Io { path: source.path().to_owned(), source: error };
+        let mut opened = source.open().map_err(io)?;
+        let records = match self.inflater.read(&mut opened, piece) {
+            Ok(records) => records,
+            Err(InflateError::Io(error)) => return Err(io(error)),
+            Err(InflateError::Corrupt(why)) => {
+                self.losses.add(Finding::CorruptChunk, 1, &format!("{name}@{}", piece.offset), || {
+                    format!(
+                        "{name}: the chunk at byte {} is corrupt ({why}); its messages from {} to {} ns are lost; fetch the file again",
+                        piece.offset, piece.start, piece.end
+                    )
+                });
+                return Ok(());
+            }
+        };
+        let first_time = pending.from_ns == i64::MIN;
+        if first_time && matches!(&piece.stored, super::scan::Stored::Chunk { crc: 0, .. }) {
+            self.losses.add(Finding::UncheckedChunk, 1, &name, || {
+                format!("{name} has chunks without a CRC; damage goes unseen")
+            });
+        }
+        let wanted = Wanted {
+            from_ns: pending.from_ns,
+            done_ns: self.done_ns,
+            horizon_ns,
+            window_ns: self.window_ns.clone(),
+            first_time,
+        };
+        let later = index(records, &wanted, &mut self.entries, &name, &mut self.losses);
+        let mut by_channel: BTreeMap<u16, usize> = BTreeMap::new();
+        let mut last: Option<(u16, usize)> = None;
+        for entry in &self.entries {
+            // Messages of one channel mostly come in turn with others; still the map is small.
+            match &mut last {
+                Some((channel, count)) if *channel == entry.channel => *count += 1,
+                other => {
+                    if let Some((channel, count)) = other.take() {
+                        *by_channel.entry(channel).or_default() += count;
+                    }
+                    *other = Some((entry.channel, 1));
+                }
+            }
+        }
+        if let Some((channel, count)) = last {
+            *by_channel.entry(channel).or_default() += count;
+        }
+        for (&channel, &count) in &by_channel {
+            let rank = (file, piece.offset, channel);
+            let entries = self.entries.iter().filter(|e| e.channel == channel);
+            match routes.get_mut(&channel) {
+                None => self.losses.add(Finding::UnknownChannel, count as u64, &format!("{name}#{channel}"), || {
+                    format!("{name}: {count} messages are of channel {channel}, which the file does not define; they are lost")
+                }),
+                Some(Route::Nowhere { finding, topic }) => {
+                    let why = match finding {
+                        Finding::Truth => "it is the truth of a simulation and no calibration may read it",
+                        _ => "it is not in telemetry.proto; housekeeping belongs under /hk/",
+                    };
+                    self.losses.add(*finding, count as u64, topic, || format!("{name}: topic {topic} is not read: {why}"));
+                }
+                Some(Route::Table { table, decoder }) => {
+                    let columns = self.tables[*table].columns.len();
+                    let mut times = Vec::with_capacity(count);
+                    let mut values = vec![f64::NAN; columns * count];
+                    let (mut non_finite, mut malformed, mut error) = (0, 0, None);
+                    for entry in entries {
+                        let mut cells = Cells { values: &mut values, rows: count, row: times.len() };
+                        match decoder.decode(&records[entry.data.clone()], &mut cells) {
+                            Ok(found) => {
+                                non_finite += found;
+                                times.push(entry.time_ns);
+                            }
+                            Err(why) => {
+                                malformed += 1;
+                                error = Some(why);
+                                (0..columns).for_each(|c| values[c * count + times.len()] = f64::NAN);
+                            }
+                        }
+                    }
+                    let topic = &self.tables[*table].name;
+                    self.losses.add(Finding::NonFinite, non_finite, topic, || {
+                        format!("{name}: topic /{topic} has values that are NaN or infinite; they are passed on")
+                    });
+                    if let Some(error) = error {
+                        self.losses.add(Finding::MalformedMessage, malformed, topic, || {
+                            format!("{name}: messages of topic /{topic} contradict their schema ({error}) and are lost")
+                        });
+                    }
+                    if !times.is_empty() {
+                        self.blocks[*table].push(Block::new(rank, times, &values, count));
+                    }
+                }
+            }
+        }
+        if let Some(later) = later {
+            let key = (later, file, piece.offset);
+            self.queue.insert(key, Pending { piece: pending.piece, from_ns: horizon_ns });
+        }
+        Ok(())
+    }
+}
+
+/// Which rows of a piece a reading takes.
+struct Wanted {
+    from_ns: i64,
+    done_ns: i64,
+    horizon_ns: i64,
+    window_ns: Range<i64>,
+    first_time: bool,
+}
+
+/// Lists the messages of a piece that are wanted; returns the earliest time of those that are for later.
+fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, losses: &mut Losses) -> Option<i64> {
+    entries.clear();
+    let mut cursor = Cursor(records);
+    let mut later: Option<i64> = None;
+    let (mut insane, mut backwards, mut late) = (0, 0, 0);
+    let mut before: BTreeMap<u16, u64> = BTreeMap::new();
+    loop {
+        let (code, body) = match cursor.record() {
+            Ok(Some(record)) => record,
+            Ok(None) => break,
+            Err(_) => {
+                losses
+                    .add(Finding::DamagedRecord, 1, name, || format!("{name}: a chunk ends in the middle of a record"));
+                break;
+            }
+        };
+        if code != op::MESSAGE {
+            continue;
+        }
+        let end = records.len() - cursor.0.len();
+        let Ok(message) = Message::parse(body) else {
+            losses.add(Finding::DamagedRecord, 1, name, || format!("{name}: a message is shorter than its header"));
+            continue;
+        };
+        let time_ns = i64::try_from(message.log_time).unwrap_or(i64::MAX);
+        if wanted.first_time {
+            let last = before.entry(message.channel).or_insert(0);
+            backwards += u64::from(message.log_time < *last);
+            *last = message.log_time;
+            insane += u64::from(!SANE_NS.contains(&time_ns));
+        }
+        if !SANE_NS.contains(&time_ns) || !wanted.window_ns.contains(&time_ns) || time_ns < wanted.from_ns {
+            continue;
+        }
+        if time_ns < wanted.done_ns {
+            late += 1;
+        } else if time_ns >= wanted.horizon_ns {
+            later = Some(later.map_or(time_ns, |l| l.min(time_ns)));
+        } else {
+            entries.push(Entry { channel: message.channel, time_ns, data: end - message.data.len()..end });
+        }
+    }
+    losses.add(Finding::TimeOutOfRange, insane, name, || {
+        format!("{name}: messages are dated before 1980 or after 2200 and were dropped")
+    });
+    losses.add(Finding::Backwards, backwards, name, || {
+        format!("{name}: log times run backwards; they were put in order")
+    });
+    losses.add(Finding::LateMessage, late, name, || {
+        format!("{name}: messages lie outside the times that their chunk states and came too late to be put in order; they are lost")
+    });
+    later
+}
