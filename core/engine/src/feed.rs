@@ -46,12 +46,13 @@ pub struct Summary {
     pub counts: BTreeMap<String, u64>,
     /// What was lost.
     pub losses: Vec<Loss>,
+    /// Sentences for the operator.
+    pub notes: Vec<String>,
     /// The report of a source plugin.
     pub report: Option<(String, serde_json::Value)>,
 }
 
 /// Telemetry files.
-#[derive(Debug)]
 pub struct FileFeed {
     replay: Replay,
     window_ns: Option<Range<i64>>,
@@ -106,7 +107,17 @@ impl Feed for FileFeed {
             time_scale: self.replay.info().time_scale.clone(),
             spacecraft: self.replay.info().spacecraft.clone(),
             counts: losses.counts(),
-            losses: losses.entries(),
+            losses: losses
+                .lost()
+                .map(|(kind, count)| Loss {
+                    kind: kind.to_owned(),
+                    count,
+                    detail: format!(
+                        "counted by the replay; the notes that begin with `replay:` say where, {count} in all"
+                    ),
+                })
+                .collect(),
+            notes: losses.messages().to_vec(),
             report: None,
         })
     }
@@ -146,7 +157,12 @@ impl SourceFeed {
     ///
     /// # Errors
     /// The plugin is missing, or refuses its parameters, its files or the mission.
-    pub fn open(registry: &Registry, id: &str, mission: &Mission, options: &SourceOptions<'_>) -> Result<Self, EngineError> {
+    pub fn open(
+        registry: &Registry,
+        id: &str,
+        mission: &Mission,
+        options: &SourceOptions<'_>,
+    ) -> Result<Self, EngineError> {
         let found = registry.find(crate::border::Kind::Source, id)?;
         let parameters = resolve_parameters(&options.given_in, &found.info.manifest, options.parameters)?;
         let config = Config {

@@ -1,10 +1,90 @@
 //! Replay, links between plugins, checkpoints, model files and products; no terminal, no clock.
+//!
+//! [`run::run`] is the main job: a [`feed`] of rows from telemetry files ([`mod@replay`]) or a source plugin, carried
+//! through a linked [`chain`] of plugins found in a [`registry`], into a [`product`].
 
 pub mod border;
 pub mod chain;
 pub mod config;
+pub mod feed;
 pub mod product;
 pub mod registry;
 pub mod replay;
+pub mod run;
+pub mod simulate;
 pub mod table;
 pub mod telemetry;
+
+use std::path::PathBuf;
+
+/// Why a run or a simulation failed.
+#[derive(Debug, thiserror::Error)]
+pub enum EngineError {
+    /// A file of the configuration.
+    #[error(transparent)]
+    Config(#[from] config::ConfigError),
+    /// A plugin is missing.
+    #[error(transparent)]
+    Registry(#[from] registry::RegistryError),
+    /// A plugin, or the links between plugins.
+    #[error(transparent)]
+    Chain(#[from] chain::ChainError),
+    /// Reading telemetry.
+    #[error(transparent)]
+    Replay(#[from] replay::ReplayError),
+    /// Writing telemetry or time series.
+    #[error(transparent)]
+    Write(#[from] telemetry::WriteError),
+    /// Writing the product.
+    #[error(transparent)]
+    Product(#[from] product::ProductError),
+    /// The operating system refused something.
+    #[error("cannot {action} {}: {source}", path.display())]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// Neither the command line nor the pipeline names a file.
+    #[error("{}: names no {what}, and the command line gives none; add `{what} = \"…\"` or pass --{what}", pipeline.display())]
+    NotNamed {
+        /// `mission` or `model`.
+        what: &'static str,
+        /// The pipeline.
+        pipeline: PathBuf,
+    },
+    /// No telemetry was given.
+    #[error("{}: has no [source], so it reads telemetry files, and none was given; pass MCAP files", pipeline.display())]
+    NoFiles {
+        /// The pipeline.
+        pipeline: PathBuf,
+    },
+    /// There is not one row in the window.
+    #[error("there is no telemetry in the time that was asked for ({} files); check --from and --until", files.len())]
+    NoRows {
+        /// The files.
+        files: Vec<PathBuf>,
+    },
+    /// The telemetry is not of the mission's spacecraft.
+    #[error("the telemetry is of spacecraft {telemetry}, the mission file {} is for {mission}; use that spacecraft's mission file", path.display())]
+    WrongSpacecraft {
+        /// What the files say.
+        telemetry: String,
+        /// What the mission says.
+        mission: String,
+        /// The mission file.
+        path: PathBuf,
+    },
+    /// A simulation of no time.
+    #[error("there is nothing to simulate: the end is not after the start")]
+    EmptyWindow,
+    /// A file would be overwritten.
+    #[error("{} exists already and is not overwritten; choose another folder with --out, or remove it", path.display())]
+    Exists {
+        /// The file.
+        path: PathBuf,
+    },
+}

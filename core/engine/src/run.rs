@@ -3,6 +3,7 @@
 use chrono::{DateTime, Utc};
 use serde_json::Value;
 use sha2::{Digest, Sha256};
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -14,8 +15,8 @@ use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions, Summary};
 use crate::product::{self, Draft, Loss, Product, ProductWriter, Stage, StageReport, Status, Stream};
 use crate::registry::Registry;
 use crate::replay;
-use crate::table::{Batch, Chunk, TableSpec};
-use crate::telemetry::{FileHeader, TelemetryWriter};
+use crate::table::{Batch, Chunk, Column, TableSpec};
+use crate::telemetry::{self, FileHeader, TelemetryWriter};
 
 /// What to run.
 #[derive(Clone, Debug)]
@@ -111,14 +112,22 @@ impl Setup {
     fn load(options: &RunOptions) -> Result<Self, EngineError> {
         let pipeline = Pipeline::load(&options.pipeline)?;
         let choose = |given: &Option<PathBuf>, own: &Option<PathBuf>, what: &'static str| {
-            given.clone().or_else(|| own.clone()).ok_or(EngineError::NotNamed { what, pipeline: options.pipeline.clone() })
+            given
+                .clone()
+                .or_else(|| own.clone())
+                .ok_or(EngineError::NotNamed { what, pipeline: options.pipeline.clone() })
         };
         let mission = Mission::load(&choose(&options.mission, &pipeline.mission, "mission")?)?;
         let model = Model::load(&choose(&options.model, &pipeline.model, "model")?)?;
         Ok(Self { pipeline, mission, model })
     }
 
-    fn feed(&self, registry: &Registry, options: &RunOptions, window: Option<Range<i64>>) -> Result<FeedKind, EngineError> {
+    fn feed(
+        &self,
+        registry: &Registry,
+        options: &RunOptions,
+        window: Option<Range<i64>>,
+    ) -> Result<FeedKind, EngineError> {
         match &self.pipeline.source {
             Some((id, parameters)) => {
                 let source = SourceOptions {
@@ -131,7 +140,9 @@ impl Setup {
                 Ok(FeedKind::Source(Box::new(SourceFeed::open(registry, id, &self.mission, &source)?)))
             }
             None if options.files.is_empty() => Err(EngineError::NoFiles { pipeline: options.pipeline.clone() }),
-            None => Ok(FeedKind::Files(Box::new(FileFeed::open(&options.files, window, options.threads, &self.mission)?))),
+            None => {
+                Ok(FeedKind::Files(Box::new(FileFeed::open(&options.files, window, options.threads, &self.mission)?)))
+            }
         }
     }
 }
@@ -166,7 +177,7 @@ pub fn check(registry: &Registry, options: &RunOptions) -> Result<CheckReport, E
         (None, true) => None,
         _ => Some(setup.feed(registry, options, window(options, None))?),
     };
-    let tables = feed.as_mut().map_or_else(crate::telemetry::interface_tables, |f| f.get().tables().to_vec());
+    let tables = feed.as_mut().map_or_else(interface_tables, |f| f.get().tables().to_vec());
     let chain = chain::build(registry, &setup.pipeline, &setup.mission, &setup.model, &tables, carry(options))?;
     Ok(CheckReport {
         pipeline: setup.pipeline.name,
@@ -179,12 +190,32 @@ pub fn check(registry: &Registry, options: &RunOptions) -> Result<CheckReport, E
                 name: n.name().to_owned(),
                 version: n.info.manifest.version.clone(),
                 reads: n.reads.clone(),
-                writes: n.writes.iter().flat_map(|t| t.columns.iter().map(|c| format!("{}:{}", t.name, c.name))).collect(),
+                writes: n
+                    .writes
+                    .iter()
+                    .flat_map(|t| t.columns.iter().map(|c| format!("{}:{}", t.name, c.name)))
+                    .collect(),
             })
             .collect(),
         coefficients: chain.coefficients.iter().filter(|c| c.estimate).map(|c| c.name.clone()).collect(),
         free_bytes: None,
     })
+}
+
+/// The tables of telemetry that has every topic of the interface, for a check without files.
+fn interface_tables() -> Vec<TableSpec> {
+    ["is", "ifo", "dws", "command", "ephemeris"]
+        .iter()
+        .filter_map(|name| {
+            let layout = telemetry::expected(&format!("/{name}"))?;
+            let columns = layout.leaves().iter().map(|leaf| {
+                let (unit, frame) = telemetry::unit_and_frame(&leaf.path);
+                let (table, name) = ((*name).to_owned(), leaf.path.clone());
+                Column { table, name, unit, frame, rate_hz: 0.0, attributes: BTreeMap::new() }
+            });
+            Some(TableSpec { name: (*name).to_owned(), rate_hz: 0.0, columns: columns.collect(), truth: false })
+        })
+        .collect()
 }
 
 fn carry(options: &RunOptions) -> Carry {
@@ -195,7 +226,11 @@ fn carry(options: &RunOptions) -> Carry {
 ///
 /// # Errors
 /// [`EngineError`] says what, where and why; nothing is left in the archive then.
-pub fn run(registry: &Registry, options: &RunOptions, progress: &mut dyn FnMut(Progress)) -> Result<Outcome, EngineError> {
+pub fn run(
+    registry: &Registry,
+    options: &RunOptions,
+    progress: &mut dyn FnMut(Progress),
+) -> Result<Outcome, EngineError> {
     let setup = Setup::load(options)?;
     let state = options.state_in.as_ref().map(|path| read_state(path)).transpose()?;
     let resume_ns = state.as_ref().map(|s| chain::resumes_at_ns(s)).transpose()?;
@@ -283,7 +318,12 @@ struct Series {
 }
 
 impl Series {
-    fn create(chain: &Chain, product: &mut ProductWriter, setup: &Setup, options: &RunOptions) -> Result<Self, EngineError> {
+    fn create(
+        chain: &Chain,
+        product: &mut ProductWriter,
+        setup: &Setup,
+        options: &RunOptions,
+    ) -> Result<Self, EngineError> {
         let tables = chain.archived_tables();
         let header = FileHeader {
             time_scale: "UTC".to_owned(),
@@ -383,7 +423,13 @@ fn draft(
         software: options.software.clone(),
         losses,
         counts: summary.counts,
-        reports: summary.report.into_iter().chain(reports).map(|(stage, report)| StageReport { stage, report }).collect(),
+        notes: summary.notes,
+        reports: summary
+            .report
+            .into_iter()
+            .chain(reports)
+            .map(|(stage, report)| StageReport { stage, report })
+            .collect(),
         created: options.created,
     })
 }

@@ -75,11 +75,22 @@ pub fn simulate(
             rows: 8192,
         },
     )?;
-    let mut days = DayFiles { options, mission: &mission, tables: feed.tables().to_vec(), open: None, done: SimulateOutcome::default() };
+    let mut days = DayFiles {
+        options,
+        mission: &mission,
+        tables: feed.tables().to_vec(),
+        open: None,
+        done: SimulateOutcome::default(),
+    };
     let mut epochs = 0;
     while let Some(chunk) = feed.next()? {
         epochs += chunk.batches.iter().map(Batch::rows).max().unwrap_or(0) as u64;
-        progress(Progress { until_ns: chunk.complete_until_ns, first_ns: window.start, end_ns: Some(window.end), epochs });
+        progress(Progress {
+            until_ns: chunk.complete_until_ns,
+            first_ns: window.start,
+            end_ns: Some(window.end),
+            epochs,
+        });
         days.write(&chunk)?;
     }
     days.close()?;
@@ -127,8 +138,10 @@ impl DayFiles<'_> {
                 None => self.create(first)?,
             };
             let until = chunk.complete_until_ns.min(open.end_ns);
-            let (mut telemetry, mut truth) =
-                (Chunk { batches: Vec::new(), complete_until_ns: until }, Chunk { batches: Vec::new(), complete_until_ns: until });
+            let (mut telemetry, mut truth) = (
+                Chunk { batches: Vec::new(), complete_until_ns: until },
+                Chunk { batches: Vec::new(), complete_until_ns: until },
+            );
             for ((batch, start), table) in chunk.batches.iter().zip(&mut starts).zip(&self.tables) {
                 let end = batch.time_ns.partition_point(|t| *t < open.end_ns);
                 let cut = Batch {
@@ -158,7 +171,11 @@ impl DayFiles<'_> {
         let writer = |truth: bool, tables: &[TableSpec]| {
             let path = self.options.path(self.mission, day, truth);
             if let Some(folder) = path.parent() {
-                std::fs::create_dir_all(folder).map_err(|source| EngineError::Io { action: "make the folder", path: folder.to_owned(), source })?;
+                std::fs::create_dir_all(folder).map_err(|source| EngineError::Io {
+                    action: "make the folder",
+                    path: folder.to_owned(),
+                    source,
+                })?;
             }
             let tables: Vec<TableSpec> = tables.iter().filter(|t| t.truth == truth).cloned().collect();
             Ok::<_, EngineError>(TelemetryWriter::create(&path, &tables, &header)?)

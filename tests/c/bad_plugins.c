@@ -1,0 +1,98 @@
+/* Plugins that misbehave, each in one way chosen at compile time with -DBAD=…; the host must say what and stay alive.
+ *   1 another ABI version            2 an error in mid-stream          3 discards every second batch
+ *   4 asks for a column nobody makes 5 wants another unit              6 changes the rounding mode
+ *   7 gives one row too few          8 fails in create                 9 a manifest that is no JSON
+ *  10 a fatal error in mid-stream
+ */
+#include "rows.h"
+#include <fenv.h>
+#include <stdio.h>
+
+typedef struct {
+  dragfree_slot_v1 x;
+  double rate_hz;
+  uint64_t calls;
+} bad;
+
+static const char *manifest(uint32_t index) {
+  (void)index;
+#if BAD == 9
+  return "{";
+#else
+  return "{\"id\":\"bad\",\"version\":\"1.0.0\",\"licence\":\"MIT\",\"description\":\"misbehaves\"}";
+#endif
+}
+
+static dragfree_status bad_link(void *self, const dragfree_link_v1 *link, dragfree_error_v1 *error) {
+  bad *s = self;
+  dragfree_column_v1 want = {"grid", "is.tm1.r_orf_m.y", "m", "ORF_1", 0.0, NULL};
+#if BAD == 4
+  want.name = "is.tm1.r_orf_m.w";
+#elif BAD == 5
+  want.unit = "mm";
+#endif
+  for (uint32_t i = 0; i < link->available_count; i++)
+    if (!strcmp(link->available[i].table, "grid")) s->rate_hz = link->available[i].rate_hz;
+  if (link->read(link->context, &want, &s->x)) return say(error, DRAGFREE_ERROR, "no column");
+  dragfree_column_v1 copy = {"bad", "bad.y", "m", "ORF_1", s->rate_hz, "{\"archive\":\"true\"}"};
+  return link->write(link->context, &copy);
+}
+
+static dragfree_status bad_process(void *self, const dragfree_inputs_v1 *inputs, struct ArrowArray *outputs,
+                                   dragfree_error_v1 *error) {
+  bad *s = self;
+  const struct ArrowArray *table = &inputs->tables[s->x.table];
+  s->calls++;
+#if BAD == 2
+  if (s->calls == 3) return say(error, DRAGFREE_ERROR, "the third batch is too much");
+#elif BAD == 10
+  if (s->calls == 3) return say(error, DRAGFREE_FATAL, "the third batch is fatal");
+#elif BAD == 3
+  if (s->calls % 2 == 0) return say(error, DRAGFREE_DISCARD, "not this one");
+#elif BAD == 6
+  fesetround(FE_UPWARD);
+#endif
+  int64_t rows = table->length;
+#if BAD == 7
+  rows -= 1;
+#endif
+  if (!make_table(&outputs[0], input(table, -1), rows, 1)) return say(error, DRAGFREE_FATAL, "no memory");
+  memcpy(column(&outputs[0], 0), input(table, s->x.column), (size_t)rows * 8);
+#if BAD == 7
+  /* The table claims the rows that its columns do not have. */
+  outputs[0].length = table->length;
+#endif
+  return DRAGFREE_OK;
+}
+
+static dragfree_status bad_create(uint32_t index, const dragfree_host_v1 *host, const dragfree_config_v1 *config,
+                                  dragfree_node_v1 *node, dragfree_error_v1 *error) {
+  (void)index;
+  (void)host;
+  (void)config;
+#if BAD == 8
+  return say(error, DRAGFREE_ERROR, "this plugin never comes to life");
+#endif
+  dragfree_node_v1 made = {0};
+  made.self = calloc(1, sizeof(bad));
+  made.link = bad_link;
+  made.process = bad_process;
+  made.destroy = free;
+  if (!made.self) return say(error, DRAGFREE_ERROR, "no memory");
+  *node = made;
+  return DRAGFREE_OK;
+}
+
+static const dragfree_factory_v1 stages = {1, manifest, bad_create};
+
+static const dragfree_factory_v1 *get_factory(const char *id) {
+  return strcmp(id, DRAGFREE_STAGE_V1) ? NULL : &stages;
+}
+
+#if BAD == 1
+#define VERSION (DRAGFREE_ABI_VERSION + 1u)
+#else
+#define VERSION DRAGFREE_ABI_VERSION
+#endif
+
+DRAGFREE_EXPORT const dragfree_entry_v1 dragfree_entry = {VERSION, 0, get_factory};
