@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use dragfree_engine::replay::Replay;
-use dragfree_engine::table::{Batch, Chunk, Column, TableSpec};
+use dragfree_engine::table::{Batch, Chunk, TableSpec};
 use dragfree_engine::telemetry::{
-    Cells, Decoder, Encoder, FileHeader, MessageType, TelemetryWriter, expected, unit_and_frame,
+    Cells, Decoder, Encoder, FileHeader, MessageType, TelemetryWriter, expected, interface_tables,
 };
 
 const TOPICS: [&str; 4] = ["is", "ifo", "dws", "command"];
@@ -17,11 +17,7 @@ const EPOCHS: usize = 6000;
 const START_NS: i64 = 2_051_222_400_000_000_000;
 
 fn table(name: &str) -> TableSpec {
-    let columns = expected(&format!("/{name}")).expect("a topic of the interface").leaves().iter().map(|leaf| {
-        let (unit, frame) = unit_and_frame(&leaf.path);
-        Column { table: name.to_owned(), name: leaf.path.clone(), unit, frame, rate_hz: 0.0, attributes: [].into() }
-    });
-    TableSpec { name: name.to_owned(), rate_hz: 0.0, columns: columns.collect(), truth: false }
+    interface_tables().into_iter().find(|t| t.name == name).expect("a topic of the interface")
 }
 
 /// Values with all their bits in use, like noise, from a multiplicative generator; statuses are 0.

@@ -1,5 +1,6 @@
 //! The records of a piece of a file, uncompressed and vouched for by their CRC.
 
+use std::fmt;
 use std::io::{self, Read, Seek, SeekFrom};
 
 use super::scan::{Piece, Stored};
@@ -75,5 +76,11 @@ impl Inflater {
             return corrupt("its CRC is wrong".to_owned());
         }
         Ok(records)
+    }
+}
+
+impl fmt::Debug for Inflater {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Inflater").field("stored", &self.stored.len()).field("records", &self.records.len()).finish()
     }
 }

@@ -2,6 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use crate::product::Loss;
+
 /// Sentences kept of each kind; the counts go on.
 const MESSAGES_PER_KIND: usize = 8;
 
@@ -89,7 +91,7 @@ impl Finding {
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Losses {
     counts: BTreeMap<Finding, u64>,
-    messages: Vec<String>,
+    messages: Vec<(Finding, String)>,
     /// What was told already: a kind, and the file or topic it concerns.
     told: BTreeSet<(Finding, String)>,
 }
@@ -107,10 +109,23 @@ impl Losses {
         self.counts.iter().map(|(finding, &count)| (finding.key().to_owned(), count)).collect()
     }
 
-    /// The first sentences of each kind, in the order of their finding.
+    /// What was lost, as a product states it.
     #[must_use]
-    pub fn messages(&self) -> &[String] {
-        &self.messages
+    pub fn entries(&self) -> Vec<Loss> {
+        let of = |finding| self.messages.iter().filter(move |(f, _)| *f == finding).map(|(_, text)| text.as_str());
+        let lost = self.counts.iter().filter(|(finding, _)| finding.is_loss());
+        lost.map(|(&finding, &count)| Loss {
+            kind: finding.key().to_owned(),
+            count,
+            detail: of(finding).collect::<Vec<_>>().join("; "),
+        })
+        .collect()
+    }
+
+    /// What was odd and cost no data, in the order of its finding: the first sentences of each kind.
+    #[must_use]
+    pub fn notes(&self) -> Vec<String> {
+        self.messages.iter().filter(|(finding, _)| !finding.is_loss()).map(|(_, text)| text.clone()).collect()
     }
 
     /// What was lost, by the key of its kind.
@@ -133,7 +148,7 @@ impl Losses {
         *self.counts.entry(finding).or_default() += times;
         let of_kind = self.told.range((finding, String::new())..).take_while(|(f, _)| *f == finding).count();
         if of_kind < MESSAGES_PER_KIND && self.told.insert((finding, subject.to_owned())) {
-            self.messages.push(sentence());
+            self.messages.push((finding, sentence()));
         }
     }
 }

@@ -110,6 +110,7 @@ pub struct ReplayInfo {
 }
 
 /// A replay under way.
+#[derive(Debug)]
 pub struct Replay {
     tables: Vec<TableSpec>,
     info: ReplayInfo,
@@ -118,6 +119,7 @@ pub struct Replay {
 }
 
 /// Who reads.
+#[derive(Debug)]
 enum Engine {
     Here(Box<Reader>),
     Ahead { stretches: Receiver<Stretch>, thread: Option<JoinHandle<()>> },

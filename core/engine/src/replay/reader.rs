@@ -47,6 +47,7 @@ pub(super) struct OpenFile {
 }
 
 /// Where a message of a piece lies.
+#[derive(Debug)]
 struct Entry {
     channel: u16,
     time_ns: i64,
@@ -54,6 +55,7 @@ struct Entry {
 }
 
 /// Reads the pieces of all files in order of time.
+#[derive(Debug)]
 pub(super) struct Reader {
     files: Vec<(Source, Routes)>,
     tables: Vec<TableSpec>,

@@ -6,7 +6,7 @@ use std::path::Path;
 use super::ReplayError;
 use super::losses::{Finding, Losses};
 use super::scan::Scan;
-use crate::table::{Column, TableSpec};
+use crate::table::TableSpec;
 use crate::telemetry::{self, Decoder, Layout, Topic};
 
 /// Where the messages of a channel go.
@@ -120,15 +120,7 @@ fn extend(
     let first = table.columns.is_empty();
     for leaf in due.chain(layout.leaves()) {
         if have.insert(leaf.path.clone()) {
-            let (unit, frame) = telemetry::unit_and_frame(&leaf.path);
-            table.columns.push(Column {
-                table: table.name.clone(),
-                name: leaf.path.clone(),
-                unit,
-                frame,
-                rate_hz: 0.0,
-                attributes: BTreeMap::new(),
-            });
+            table.columns.push(telemetry::column(&table.name, &leaf.path));
         }
     }
     let (Some(metadata), Some(value)) = (housekeeping, table.columns.first_mut()) else { return Ok(()) };

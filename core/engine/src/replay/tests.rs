@@ -12,8 +12,8 @@ use proptest::prelude::*;
 use super::fuzz::{fuzz_file, fuzz_message, fuzz_schema};
 use super::losses::Finding;
 use super::*;
-use crate::table::{Batch, Column};
-use crate::telemetry::{FileHeader, TelemetryWriter, descriptor, expected, unit_and_frame};
+use crate::table::Batch;
+use crate::telemetry::{FileHeader, TelemetryWriter, column, descriptor};
 
 /// 2035-01-01T00:00:00Z, Unix ns.
 const DAY: i64 = 2_051_222_400_000_000_000;
@@ -416,27 +416,12 @@ fn a_schema_that_drifted_stops_the_replay() {
 
 /// The tables of the interface with a housekeeping scalar, as a source would give them.
 fn interface_tables() -> Vec<TableSpec> {
-    ["is", "ifo", "dws", "command", "ephemeris", "hk/battery_current_a"]
-        .map(|name| {
-            let columns = expected(&format!("/{name}")).unwrap().leaves().iter().map(|leaf| {
-                let (unit, frame) = unit_and_frame(&leaf.path);
-                let housekeeping = leaf.path == "value";
-                Column {
-                    table: name.into(),
-                    name: leaf.path.clone(),
-                    unit: if housekeeping { "A".into() } else { unit },
-                    frame,
-                    rate_hz: 0.0,
-                    attributes: if housekeeping {
-                        BTreeMap::from([("place".into(), "bus".into()), ("rate_hz".into(), "0.1".into())])
-                    } else {
-                        BTreeMap::new()
-                    },
-                }
-            });
-            TableSpec { name: name.into(), rate_hz: 0.0, columns: columns.collect(), truth: false }
-        })
-        .to_vec()
+    let mut value = column("hk/battery_current_a", "value");
+    value.unit = "A".into();
+    value.attributes = BTreeMap::from([("place".into(), "bus".into()), ("rate_hz".into(), "0.1".into())]);
+    let mut tables = crate::telemetry::interface_tables();
+    tables.push(TableSpec { name: value.table.clone(), rate_hz: 0.0, columns: vec![value], truth: false });
+    tables
 }
 
 fn header() -> FileHeader {

@@ -1,9 +1,11 @@
 //! The committed interface, `fixtures/proto/telemetry.proto`, and the comparison of a file's schema with it.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::LazyLock;
 
 use super::layout::{Layout, Leaf};
+use super::names::unit_and_frame;
+use crate::table::{Column, TableSpec};
 
 /// `telemetry.proto` as a serialised FileDescriptorSet; a test compiles the text again and compares the bytes.
 const DESCRIPTOR: &[u8] = include_bytes!("telemetry.binpb");
@@ -62,6 +64,25 @@ pub fn descriptor(topic: &str) -> Option<(&'static str, &'static [u8])> {
     expected(topic)?;
     let key = if topic.starts_with("/hk/") { "/hk/" } else { topic };
     MESSAGES.iter().find(|(name, _)| *name == key).map(|&(_, message)| (message, DESCRIPTOR))
+}
+
+/// The tables of a spacecraft that sends everything in the interface, without its housekeeping.
+#[must_use]
+pub fn interface_tables() -> Vec<TableSpec> {
+    let sent = LAYOUTS.iter().filter(|(topic, _)| topic_kind(topic) == Topic::Telemetry);
+    sent.map(|(topic, layout)| table(topic.trim_start_matches('/'), layout)).collect()
+}
+
+/// A table with the columns of `layout`.
+fn table(name: &str, layout: &Layout) -> TableSpec {
+    let columns = layout.leaves().iter().map(|leaf| column(name, &leaf.path)).collect();
+    TableSpec { name: name.to_owned(), rate_hz: 0.0, columns, truth: false }
+}
+
+/// A column of an irregular table, its unit and frame from its name.
+pub(crate) fn column(table: &str, path: &str) -> Column {
+    let (unit, frame) = unit_and_frame(path);
+    Column { table: table.to_owned(), name: path.to_owned(), unit, frame, rate_hz: 0.0, attributes: BTreeMap::new() }
 }
 
 /// A schema that is not what the interface says.

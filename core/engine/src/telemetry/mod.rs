@@ -13,7 +13,8 @@ mod write;
 
 pub use decode::{Cells, Decoder, WireError};
 pub use encode::{EncodeError, Encoder, MessageType};
-pub use interface::{Drift, Topic, check, descriptor, expected, topic_kind};
+pub(crate) use interface::column;
+pub use interface::{Drift, Topic, check, descriptor, expected, interface_tables, topic_kind};
 pub use layout::{Kind, Layout, LayoutError, Leaf};
 pub use names::unit_and_frame;
 pub use write::{FileHeader, TelemetryWriter, WriteError, Written};
