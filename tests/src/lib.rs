@@ -27,7 +27,7 @@ pub fn built() -> &'static Path {
         let folder = exe.parent().and_then(Path::parent).expect("target/PROFILE/deps/test").to_owned();
         let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
         let mut build = Command::new(cargo);
-        build.current_dir(root()).args(["build", "--quiet", "--workspace"]);
+        build.current_dir(root()).args(["build", "--quiet", "--workspace", "--lib", "--bins", "--example", "clumsy"]);
         if folder.file_name().is_some_and(|name| name == "release") {
             build.arg("--release");
         }
@@ -72,4 +72,51 @@ pub fn json(command: &mut Command, code: i32) -> serde_json::Value {
     let output = expect(command, code);
     serde_json::from_slice(&output.stdout)
         .unwrap_or_else(|e| panic!("{command:?}: {e}\n{}", String::from_utf8_lossy(&output.stdout)))
+}
+
+/// Compiles a plugin written in C into `folder` and gives its path.
+///
+/// # Panics
+/// There is no C compiler, or the source does not compile without a warning.
+pub fn compile_plugin(folder: &Path, source: &str, name: &str, defines: &[&str]) -> PathBuf {
+    let library = folder.join(format!("{}{name}{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX));
+    let compiler = std::env::var_os("CC").unwrap_or_else(|| "cc".into());
+    let mut command = Command::new(compiler);
+    command.args(["-std=c11", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "-fvisibility=hidden"]);
+    command.args(defines).arg("-I").arg(root().join("core/abi/include"));
+    command.arg(root().join("tests/c").join(source)).arg("-o").arg(&library).arg("-lm");
+    expect(&mut command, 0);
+    library
+}
+
+/// Simulated telemetry of the bundled mission: the files in `folder`, oldest first.
+///
+/// # Panics
+/// The simulation fails.
+#[must_use]
+pub fn simulate(folder: &Path, arguments: &[&str]) -> Vec<PathBuf> {
+    let mut command = dragfree(folder);
+    command.arg("simulate").arg(fixture("missions/taiji.toml")).arg("--out").arg(folder).args(arguments);
+    expect(&mut command, 0);
+    let mut files: Vec<PathBuf> = std::fs::read_dir(folder)
+        .expect("the folder was made")
+        .flatten()
+        .map(|entry| entry.path())
+        .filter(|path| path.extension().is_some_and(|e| e == "mcap"))
+        .collect();
+    files.sort();
+    assert!(!files.is_empty(), "a simulation writes telemetry");
+    files
+}
+
+/// A coefficient of a product's JSON: value and σ.
+///
+/// # Panics
+/// The product has no such coefficient.
+#[must_use]
+pub fn coefficient(product: &serde_json::Value, name: &str, solution: &str) -> (f64, f64) {
+    let all = product["coefficients"].as_array().expect("coefficients");
+    let one = all.iter().find(|c| c["name"] == name && c["solution"] == solution);
+    let one = one.unwrap_or_else(|| panic!("no {name} by {solution} in {all:?}"));
+    (one["value"].as_f64().unwrap_or(f64::NAN), one["sigma"].as_f64().unwrap_or(f64::NAN))
 }

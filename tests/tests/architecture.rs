@@ -7,7 +7,13 @@ use std::process::Command;
 fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let output = dragfree_tests::expect(
-        Command::new(cargo).current_dir(dragfree_tests::root()).args(["metadata", "--no-deps", "--format-version", "1", "--offline"]),
+        Command::new(cargo).current_dir(dragfree_tests::root()).args([
+            "metadata",
+            "--no-deps",
+            "--format-version",
+            "1",
+            "--offline",
+        ]),
         0,
     );
     let metadata: Value = serde_json::from_slice(&output.stdout).expect("cargo prints JSON");
@@ -36,7 +42,12 @@ fn arrows_up(dependencies: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
     let ours = |name: &&String| dependencies.contains_key(*name);
     dependencies
         .iter()
-        .flat_map(|(from, to)| to.iter().filter(ours).filter(|to| !allowed(from).contains(&to.as_str())).map(move |to| format!("{from} -> {to}")))
+        .flat_map(|(from, to)| {
+            to.iter()
+                .filter(ours)
+                .filter(|to| !allowed(from).contains(&to.as_str()))
+                .map(move |to| format!("{from} -> {to}"))
+        })
         .collect()
 }
 
@@ -72,7 +83,12 @@ fn the_engine_names_no_plugin() {
                 let text = std::fs::read_to_string(&path).expect("text");
                 let code = text.split("#[cfg(test)]").next().unwrap_or_default();
                 for (i, line) in code.lines().enumerate().filter(|(_, l)| !l.trim_start().starts_with("//")) {
-                    assert!(!names.iter().any(|n| line.contains(&format!("\"{n}"))), "{}:{}: {line}", path.display(), i + 1);
+                    assert!(
+                        !names.iter().any(|n| line.contains(&format!("\"{n}"))),
+                        "{}:{}: {line}",
+                        path.display(),
+                        i + 1
+                    );
                 }
             }
         }

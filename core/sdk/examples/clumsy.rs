@@ -1,0 +1,73 @@
+//! A stage that counts rows, and panics where it is told to: what the host must survive. Also the shortest whole plugin.
+
+use dragfree_sdk::prelude::*;
+
+struct Clumsy {
+    panic_in: String,
+    x: Option<In>,
+    rows: u64,
+}
+
+impl Clumsy {
+    fn stumble(&self, place: &str) {
+        assert!(self.panic_in != place, "clumsy in {place}");
+    }
+}
+
+impl Stage for Clumsy {
+    const MANIFEST: Manifest = Manifest {
+        id: "clumsy",
+        version: "1.0.0",
+        licence: "MIT OR Apache-2.0",
+        description: "Counts rows and panics where it is told to",
+        parameters: &[Parameter::text(
+            "panic_in",
+            "nowhere",
+            &["nowhere", "new", "link", "process", "flush", "report"],
+            "function that panics",
+        )],
+        instances: &[],
+    };
+
+    fn new(setup: &Setup) -> Result<Self, PluginError> {
+        let this = Self { panic_in: setup.text("panic_in")?, x: None, rows: 0 };
+        this.stumble("new");
+        Ok(this)
+    }
+
+    fn link(&mut self, _available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
+        self.stumble("link");
+        self.x = Some(link.read(&Want::new("is.tm1.r_orf_m.y").table("grid").unit("m").frame("ORF_1"))?);
+        Ok(())
+    }
+
+    fn process(&mut self, input: &Inputs<'_>, _output: &mut Outputs) -> Result<(), PluginError> {
+        self.stumble("process");
+        self.rows += self.x.map_or(0, |x| input.f64(x).len() as u64);
+        Ok(())
+    }
+
+    fn flush(&mut self, _output: &mut Outputs) -> Result<(), PluginError> {
+        self.stumble("flush");
+        Ok(())
+    }
+
+    fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
+        self.stumble("report");
+        Ok(Report { counts: [("rows".to_owned(), self.rows)].into(), ..Report::default() })
+    }
+
+    fn save(&self) -> Result<Vec<u8>, PluginError> {
+        Ok(self.rows.to_le_bytes().to_vec())
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
+        let rows = state
+            .try_into()
+            .map_err(|_| PluginError::error(format!("{} bytes are no state of clumsy", state.len())))?;
+        self.rows = u64::from_le_bytes(rows);
+        Ok(())
+    }
+}
+
+export_plugin!(stages: [Clumsy]);

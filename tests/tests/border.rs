@@ -1,0 +1,163 @@
+//! Plugins that the workspace did not build: a stage and an effect in C that work, and all that misbehave.
+
+use dragfree_tests::{coefficient, compile_plugin, dragfree, expect, fixture, json, simulate};
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+use tempfile::TempDir;
+
+/// Half an hour of telemetry, made once.
+fn telemetry() -> &'static Path {
+    static FILE: OnceLock<(TempDir, PathBuf)> = OnceLock::new();
+    let (_, file) = FILE.get_or_init(|| {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        let file = simulate(dir.path(), &["--hours", "0.5", "--seed", "11"]).remove(0);
+        (dir, file)
+    });
+    file
+}
+
+/// A pipeline of `preprocess` and one more stage.
+fn pipeline(folder: &Path, stage: &str) -> PathBuf {
+    let path = folder.join("pipeline.toml");
+    let text = format!(
+        "[pipeline]\nname = \"test\"\nmission = '{}'\nmodel = 'model.toml'\n[[stage]]\nplugin = \"preprocess\"\n[[stage]]\n{stage}\n",
+        fixture("missions/taiji.toml").display()
+    );
+    std::fs::write(&path, text).expect("writable");
+    std::fs::write(folder.join("model.toml"), "[model]\nrevision = \"0\"\n").expect("writable");
+    path
+}
+
+fn run(folder: &Path, pipeline: &Path) -> std::process::Command {
+    let mut command = dragfree(folder);
+    command
+        .arg("run")
+        .arg(pipeline)
+        .arg(telemetry())
+        .args(["--archive", "archive", "--json", "--plugin-dir"])
+        .arg(folder);
+    command.arg("--plugin-dir").arg(dragfree_tests::built());
+    command
+}
+
+#[test]
+fn a_stage_in_c_runs_in_a_pipeline() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    compile_plugin(dir.path(), "c_plugins.c", "c_plugins", &[]);
+    let pipeline = pipeline(dir.path(), "plugin = \"c-scale\"\nparameters = { factor = 3.0 }");
+    let product = json(&mut run(dir.path(), &pipeline), 0);
+    assert_eq!(product["quality"]["counts"]["c-scale"]["rows"], 18_000, "{product}");
+}
+
+/// The model's effect is one in C; the QP estimates its coefficient beside the offsets. The flown gain is right, so
+/// the estimate lies within 5σ of zero (false-alarm rate 6e-7), and it is an estimate: σ is finite and below the prior.
+#[test]
+fn an_effect_in_c_is_estimated_like_every_other() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    compile_plugin(dir.path(), "c_plugins.c", "c_plugins", &[]);
+    let model = dir.path().join("gain.toml");
+    let effects = [("com-offset", "tm1"), ("com-offset", "tm2"), ("c-es-gain", "tm1")];
+    let entries: String =
+        effects.iter().map(|(id, i)| format!("[[effect]]\nid = \"{id}\"\ninstance = \"{i}\"\n")).collect();
+    std::fs::write(&model, format!("[model]\nrevision = \"2\"\nparent = \"1\"\n{entries}")).expect("writable");
+    let mut command = run(dir.path(), &fixture("pipelines/science-mode.toml"));
+    let output = command.arg("--model").arg(&model).output().expect("the program runs");
+    assert!(matches!(output.status.code(), Some(0 | 4)), "{}", String::from_utf8_lossy(&output.stderr));
+    let product: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let (value, sigma) = coefficient(&product, "c-es-gain.tm1.y", "qp");
+    assert!(sigma > 0.0 && sigma.is_finite() && value.abs() < 5.0 * sigma, "{value} ± {sigma}");
+    assert_eq!(product["model"]["effects"], serde_json::json!(["com-offset", "c-es-gain"]));
+}
+
+/// A plugin that misbehaves in one way, compiled and run; gives the exit code and what was said.
+fn misbehaving(way: u32) -> (Option<i32>, String) {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    compile_plugin(dir.path(), "bad_plugins.c", "bad", &[&format!("-DBAD={way}")]);
+    let pipeline = pipeline(dir.path(), "plugin = \"bad\"");
+    let output = run(dir.path(), &pipeline).output().expect("the program runs");
+    let left: Vec<_> =
+        std::fs::read_dir(dir.path().join("archive")).into_iter().flatten().flatten().map(|e| e.file_name()).collect();
+    assert!(output.status.code() != Some(1) || left.is_empty(), "a failed run leaves nothing: {left:?}");
+    (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+#[test]
+fn every_misbehaviour_is_told_and_none_is_a_crash() {
+    for (way, said) in [
+        (1, "ABI version 2"),
+        (2, "the third batch is too much"),
+        (4, "is.tm1.r_orf_m.w"),
+        (5, "`mm`"),
+        (6, "floating-point control word"),
+        (7, "rows where the table has"),
+        (8, "never comes to life"),
+        (9, "manifest 0"),
+        (10, "the third batch is fatal"),
+    ] {
+        let (code, stderr) = misbehaving(way);
+        assert_eq!(code, Some(1), "way {way}: {stderr}");
+        assert!(stderr.contains(said), "way {way} should say {said}: {stderr}");
+    }
+}
+
+/// A plugin in Rust that panics at each point of its life: the host says so, ends, and leaves nothing in the archive.
+#[test]
+fn a_panic_stops_at_the_border() {
+    let examples = dragfree_tests::built().join("examples");
+    for place in ["new", "link", "process", "flush", "report"] {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        let pipeline = pipeline(dir.path(), &format!("plugin = \"clumsy\"\nparameters = {{ panic_in = \"{place}\" }}"));
+        let output = expect(run(dir.path(), &pipeline).arg("--plugin-dir").arg(&examples), 1);
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert!(stderr.contains(&format!("clumsy in {place}")) && stderr.contains("panicked"), "{stderr}");
+        assert!(!stderr.contains("RUST_BACKTRACE"), "the panic is told by the host alone: {stderr}");
+    }
+}
+
+#[test]
+fn a_plugin_without_a_panic_goes_through() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let pipeline = pipeline(dir.path(), "plugin = \"clumsy\"");
+    let product = json(run(dir.path(), &pipeline).arg("--plugin-dir").arg(dragfree_tests::built().join("examples")), 0);
+    assert_eq!(product["quality"]["counts"]["clumsy"]["rows"], 18_000, "{product}");
+}
+
+#[test]
+fn a_discarded_batch_is_counted_as_lost() {
+    let (code, stderr) = misbehaving(3);
+    assert_eq!(code, Some(3), "{stderr}");
+}
+
+#[test]
+fn a_file_that_is_no_plugin_is_listed_with_its_reason() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let library = dir.path().join(format!("libnothing{}", std::env::consts::DLL_SUFFIX));
+    std::fs::write(&library, "this is no library").expect("writable");
+    let mut command = dragfree(dir.path());
+    let list = json(command.args(["plugins", "list", "--json", "--plugin-dir"]).arg(dir.path()), 0);
+    assert!(list.to_string().contains("libnothing"), "{list}");
+    assert!(list.to_string().contains("no shared library"), "{list}");
+}
+
+#[cfg(unix)]
+#[test]
+fn a_plugin_that_everybody_can_change_is_refused() {
+    use std::os::unix::fs::PermissionsExt;
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let library = compile_plugin(dir.path(), "c_plugins.c", "c_plugins", &[]);
+    std::fs::set_permissions(&library, std::fs::Permissions::from_mode(0o777)).expect("chmod");
+    let pipeline = pipeline(dir.path(), "plugin = \"c-scale\"");
+    let output = expect(&mut run(dir.path(), &pipeline), 1);
+    assert!(String::from_utf8_lossy(&output.stderr).contains("c-scale"));
+    let list = json(dragfree(dir.path()).args(["plugins", "list", "--json", "--plugin-dir"]).arg(dir.path()), 0);
+    assert!(list.to_string().contains("chmod o-w"), "{list}");
+}
+
+#[test]
+fn a_locked_folder_loads_only_what_is_locked() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    compile_plugin(dir.path(), "c_plugins.c", "c_plugins", &[]);
+    std::fs::write(dir.path().join("plugins.lock"), "[sha256]\n\"libother.so\" = \"00\"\n").expect("writable");
+    let list = json(dragfree(dir.path()).args(["plugins", "list", "--json", "--plugin-dir"]).arg(dir.path()), 0);
+    assert!(list.to_string().contains("not listed in"), "{list}");
+}
