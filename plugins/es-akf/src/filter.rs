@@ -1,0 +1,665 @@
+//! The extended-state adaptive Kalman filter of one test mass, equations Final_AKF_X_k to Final_AKF_p_k1.
+//!
+//! # Two readings of the printed equations
+//! * eq:Final_AKF_p_k1 carries `P_k`, the covariance of `X̂⁻_{k+1}`, to that of `X̂⁻_{k+2}`, so its `A_d` (and that of
+//!   eq:Final_AKF_Q_ITER) belongs to the *next* interval. For a constant `A` that is no difference; here `A` holds the
+//!   regressors of each interval, and with those of the last one `K` would follow an `α̂` one sample old. So the last
+//!   three lines of an epoch run as the first of the next, when its regressors are known.
+//! * eq:Final_AKF_Q_ITER needs `P̂_{k+1}` before eq:Final_AKF_p_k1 makes it: it is taken with `Q̂_{k−1}`.
+//!
+//! # Uncertainty
+//! `P` is only a covariance if `Q̂` and `R̂` are those of the data, and the adaptation moves both for reasons of
+//! stability. So a second covariance `P̃` follows the gains that were really used, under the noise of the mission
+//! file: the error covariance of this estimator, adapted or not, as far as that noise model holds. The innovations
+//! measure how far it does (`Statistics::design_nis`).
+
+use crate::definite::{Finding, repair};
+use crate::kernel::{
+    Columns, Mat3, Matrix, Transition, advance, advance_adapting, advance_with_foreign_gain, inverse, mix,
+};
+use crate::model::{BIAS, Model, R, THETA, V};
+use crate::state::{Bytes, StateError, Words};
+
+/// How `Q̂` and `R̂` follow the innovations.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Adaptation {
+    /// The paper's proposal: eqs Final_AKF_Q_K and Final_AKF_R_k.
+    Monotone,
+    /// eqs sage_husa_Q_update and sage_husa_R_update; diverges on quiet data within days.
+    Innovation,
+    /// eqs residual_Q_update and residual_R_update.
+    Residual,
+    /// `Q` and `R` stay those of the mission.
+    Off,
+}
+
+/// What does not follow from the model.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Settings {
+    /// How `Q̂` and `R̂` follow the innovations.
+    pub adaptation: Adaptation,
+    /// The paper's `α`, in (0, 1).
+    pub forgetting: f64,
+    /// Epochs after each (re-)acquisition before innovations are gated, and at first before anything is adapted.
+    pub warm_up_epochs: u64,
+    /// An innovation beyond so many σ is not used; 0 uses all.
+    pub gate_sigma: f64,
+    /// After so many rejections of a readout in a row the track is acquired anew.
+    pub gate_patience: u32,
+    /// Epochs between two tests of `P` and `Q̂` for definiteness; 0 tests never.
+    pub check_epochs: u64,
+}
+
+/// What acts between an epoch and the next.
+#[derive(Clone, Copy, Debug)]
+pub struct Drive<'a> {
+    /// `û`, mean over `[t_k, t_{k+1})`, ORF, m/s²; NaN where unknown.
+    pub acceleration_m_s2: [f64; 3],
+    /// Regressor of each coefficient on x, y, z, mean over `[t_k, t_{k+1})`, ORF, m s⁻² per unit; NaN where unknown.
+    pub regressors: &'a [[f64; 3]],
+}
+
+/// What the filter counted and measured since its start.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Statistics {
+    /// Epochs seen.
+    pub epochs: u64,
+    /// Epochs at which at least one readout was used.
+    pub updates: u64,
+    /// Epochs without any usable readout, or without a track.
+    pub predictions: u64,
+    /// Readouts (axes) that the gate refused.
+    pub rejected: u64,
+    /// Tracks begun after the first: gaps of `û` or the regressors, lock-outs of the gate.
+    pub reacquisitions: u64,
+    /// Times `Q̂` was indefinite and repaired.
+    pub repairs_q: u64,
+    /// Times `P` was indefinite and repaired.
+    pub repairs_p: u64,
+    /// Times the recursion broke down and `P`, `Q̂`, `R̂` began anew at their first values.
+    pub resets: u64,
+    /// Sum of `dᵀ S⁻¹ d` over the epochs after warm-up, `S` of the recursion.
+    pub nis_sum: f64,
+    /// Sum of `d_i² / S̃_ii` per readout, `S̃` from the mission's noise.
+    pub design_sum: [f64; 3],
+    /// Readouts in `nis_sum`, per axis.
+    pub readouts: [u64; 3],
+}
+
+impl Statistics {
+    /// Mean NIS per degree of freedom, gated samples excluded; `None` before the end of the warm-up.
+    #[must_use]
+    pub fn nis(&self) -> Option<f64> {
+        let dof: u64 = self.readouts.iter().sum();
+        (dof > 0).then(|| self.nis_sum / dof as f64)
+    }
+
+    /// Mean square of each readout's innovation against what the mission's noise predicts for the gains in use.
+    #[must_use]
+    pub fn design_nis(&self) -> [Option<f64>; 3] {
+        std::array::from_fn(|i| (self.readouts[i] > 0).then(|| self.design_sum[i] / self.readouts[i] as f64))
+    }
+}
+
+/// The filter of one test mass. The capacity `N ≥ model.states()` is a multiple of eight; see [`crate::Akf`] for the
+/// one that chooses it.
+#[derive(Clone, Debug)]
+pub struct Filter<const N: usize> {
+    model: Model,
+    settings: Settings,
+    transition: Transition<N>,
+    design_q: Matrix<N>,
+    /// `X̂⁺`.
+    x: [f64; N],
+    /// `P_k`: covariance of the last epoch's `X̂⁻`.
+    p: Matrix<N>,
+    /// `Q̂_k`, lower triangle.
+    q: Matrix<N>,
+    /// `R̂_k`.
+    r: Mat3,
+    /// `Ŝ_k = E{d dᵀ}`.
+    s_hat: Mat3,
+    /// `E{ε εᵀ}`, used by [`Adaptation::Residual`].
+    e_hat: Mat3,
+    /// `K_k`, zero where no readout was used.
+    gain: Columns<N>,
+    /// `S⁻¹ = (H P_k Hᵀ + R̂_k)⁻¹`, zero where no readout was used.
+    weight: Mat3,
+    /// Whether the last epoch may change `Q̂`.
+    adapt: bool,
+    /// `P̃`: like `P_k`, for the gains in use and the mission's noise.
+    p_design: Matrix<N>,
+    /// `S̃ = H P̃ Hᵀ + R`.
+    s_design: Mat3,
+    /// `û` of the interval that begins at the last epoch.
+    u: [f64; 3],
+    /// Whether that interval's `û` and regressors are known.
+    driven: bool,
+    /// Whether `r` and `v` are tracked.
+    tracking: bool,
+    /// Epochs since the track began.
+    age: u64,
+    /// Epochs used to start `Ŝ`.
+    s_samples: u64,
+    /// Rejections in a row, per readout.
+    refused: [u32; 3],
+    statistics: Statistics,
+    half: Matrix<N>,
+    turned: Matrix<N>,
+    product: Matrix<N>,
+}
+
+impl<const N: usize> Filter<N> {
+    /// A filter before its first epoch.
+    ///
+    /// # Panics
+    /// When `N` is no multiple of eight or smaller than `model.states()`.
+    #[must_use]
+    pub fn new(model: Model, settings: Settings) -> Self {
+        assert!(N.is_multiple_of(8) && model.states() <= N, "{} states do not fit into {N}", model.states());
+        let mut filter = Self {
+            transition: Transition::new(&model),
+            design_q: Matrix::zero(),
+            x: [0.0; N],
+            p: Matrix::zero(),
+            q: Matrix::zero(),
+            r: [[0.0; 3]; 3],
+            s_hat: [[0.0; 3]; 3],
+            e_hat: [[0.0; 3]; 3],
+            gain: [[0.0; N]; 3],
+            weight: [[0.0; 3]; 3],
+            adapt: false,
+            p_design: Matrix::zero(),
+            s_design: [[0.0; 3]; 3],
+            u: [0.0; 3],
+            driven: false,
+            tracking: false,
+            age: 0,
+            s_samples: 0,
+            refused: [0; 3],
+            statistics: Statistics::default(),
+            half: Matrix::zero(),
+            turned: Matrix::zero(),
+            product: Matrix::zero(),
+            model,
+            settings,
+        };
+        let design_q = &mut filter.design_q;
+        filter.model.process_noise(|i, j, value| design_q.0[i][j] = value);
+        filter.begin_covariances();
+        for (j, c) in filter.model.coefficients.iter().enumerate() {
+            filter.x[THETA + j] = c.initial;
+        }
+        filter
+    }
+
+    /// `P`, `P̃`, `Q̂`, `R̂` at their first values.
+    fn begin_covariances(&mut self) {
+        self.p = Matrix::zero();
+        let p = &mut self.p;
+        self.model.prior_covariance(|i, j, value| p.0[i][j] = value);
+        self.p_design = self.p.clone();
+        self.q = self.design_q.clone();
+        self.r = diagonal(&self.model.readout_m2);
+        self.s_hat = [[0.0; 3]; 3];
+        self.e_hat = self.r;
+        self.s_samples = 0;
+        self.forget_measurement();
+    }
+
+    /// One epoch: from `X̂⁺_k` and the drive of `[t_k, t_{k+1})` to the readout at `t_{k+1}`, and on with the drive
+    /// that begins there. `readout_m` is the measured displacement, NaN where missing.
+    pub fn step(&mut self, readout_m: [f64; 3], next: Drive<'_>) {
+        if self.statistics.epochs > 0 {
+            if self.tracking && self.driven {
+                self.time_update();
+                self.transition.state(&mut self.x, &self.u);
+            } else {
+                self.drift();
+            }
+        }
+        self.statistics.epochs += 1;
+        if self.tracking {
+            self.age += 1;
+            self.measure(readout_m);
+        } else {
+            self.acquire(readout_m);
+        }
+        self.keep(next);
+        let every = self.settings.check_epochs;
+        if every > 0 && self.statistics.epochs.is_multiple_of(every) {
+            self.check();
+        }
+    }
+
+    /// `epochs` without any data, as between two days with one missing: `a_b` and `n` walk on, `r` and `v` are lost.
+    pub fn skip(&mut self, epochs: u64) {
+        if epochs == 0 {
+            return;
+        }
+        self.driven = false;
+        self.drift();
+        for i in BIAS..THETA {
+            let walked = self.model.bias_step_m2_s4 * (epochs - 1) as f64;
+            self.p.0[i][i] += walked;
+            self.p_design.0[i][i] += walked;
+        }
+        // Noise of minutes to days has no memory of the other side of such a gap.
+        for i in THETA + self.model.coefficients.len()..self.model.states() {
+            self.x[i] = 0.0;
+            clear(&mut self.p, i);
+            clear(&mut self.p_design, i);
+        }
+        for (_, first, chain) in self.model.placed_chains() {
+            let n = chain.states();
+            for i in 0..n {
+                for j in 0..n {
+                    self.p.0[first + i][first + j] = chain.stationary[i * n + j];
+                    self.p_design.0[first + i][first + j] = chain.stationary[i * n + j];
+                }
+            }
+        }
+    }
+
+    /// Stores what acts until the next epoch.
+    fn keep(&mut self, next: Drive<'_>) {
+        self.u = next.acceleration_m_s2;
+        self.driven = self.u.iter().chain(next.regressors.iter().flatten()).all(|x| x.is_finite());
+        if self.driven {
+            self.transition.phi[..next.regressors.len()].copy_from_slice(next.regressors);
+        }
+    }
+
+    /// eqs Final_AKF_Q_ITER, Final_AKF_Q_K and Final_AKF_p_k1 of the last epoch, with the `A` of the interval now known.
+    fn time_update(&mut self) {
+        let m = self.transition.conjugate(&self.p, &mut self.half, &mut self.product, &mut self.turned);
+        let w = mix(&self.weight, &m);
+        let alpha = self.settings.forgetting;
+        if self.adapt {
+            let y = mix(&self.s_hat, &self.gain);
+            let (p, q, apa, k) = (&mut self.p, &mut self.q, &self.product, &self.gain);
+            match self.settings.adaptation {
+                Adaptation::Monotone => advance_adapting(p, q, apa, &w, &m, &y, k, |q, q_iter, _| {
+                    let size = q_iter.abs();
+                    alpha * q + (1.0 - alpha) * if size < q { size } else { q }
+                }),
+                Adaptation::Innovation => advance_adapting(p, q, apa, &w, &m, &y, k, |q, q_iter, _| {
+                    alpha * q + (1.0 - alpha) * q_iter
+                }),
+                Adaptation::Residual => {
+                    advance_adapting(p, q, apa, &w, &m, &y, k, |q, _, ksk| alpha * q + (1.0 - alpha) * ksk);
+                }
+                Adaptation::Off => advance(p, apa, &w, &m, q),
+            }
+        } else {
+            advance(&mut self.p, &self.product, &w, &m, &self.q);
+        }
+        if self.settings.adaptation == Adaptation::Off {
+            return;
+        }
+        let m = self.transition.conjugate(&self.p_design, &mut self.half, &mut self.product, &mut self.turned);
+        // W = A K, whatever covariance K came from.
+        let w: Columns<N> = std::array::from_fn(|c| {
+            let mut column = self.gain[c];
+            self.transition.state(&mut column, &[0.0; 3]);
+            column
+        });
+        advance_with_foreign_gain(&mut self.p_design, &self.product, &w, &m, &self.s_design, &self.design_q);
+    }
+
+    /// The covariance `P̃` of the gains in use under the mission's noise; `P` itself when nothing adapts.
+    fn design_covariance(&self) -> &Matrix<N> {
+        if self.settings.adaptation == Adaptation::Off { &self.p } else { &self.p_design }
+    }
+
+    /// Without `û` or regressors: `a_b`, `θ` and `n` go on, `r` and `v` fall back to their prior.
+    fn drift(&mut self) {
+        *self.transition.phi = [[0.0; 3]; N];
+        self.adapt = false;
+        self.time_update();
+        self.transition.state(&mut self.x, &[0.0; 3]);
+        self.forget_measurement();
+        self.lose_track();
+    }
+
+    /// Nothing of the last epoch is left to be carried to the next.
+    fn forget_measurement(&mut self) {
+        self.gain = [[0.0; N]; 3];
+        self.weight = [[0.0; 3]; 3];
+        self.adapt = false;
+    }
+
+    fn lose_track(&mut self) {
+        self.tracking = false;
+        for i in 0..3 {
+            for (s, sigma) in [(R + i, self.model.prior.displacement_m), (V + i, self.model.prior.velocity_m_s)] {
+                self.x[s] = 0.0;
+                for p in [&mut self.p, &mut self.p_design] {
+                    clear(p, s);
+                    p.0[s][s] = sigma * sigma;
+                }
+            }
+        }
+    }
+
+    /// Begins a track at a complete readout.
+    fn acquire(&mut self, readout_m: [f64; 3]) {
+        self.forget_measurement();
+        self.statistics.predictions += 1;
+        if !readout_m.iter().all(|z| z.is_finite()) {
+            return;
+        }
+        self.lose_track();
+        let coloured = self.transition.observe(&self.x);
+        for i in 0..3 {
+            self.x[R + i] = readout_m[i] - coloured[i];
+        }
+        self.tracking = true;
+        self.age = 0;
+        self.refused = [0; 3];
+        if self.statistics.updates > 0 {
+            self.statistics.reacquisitions += 1;
+        }
+    }
+
+    /// eqs Final_AKF_D_k to Final_AKF_x_k1.
+    fn measure(&mut self, readout_m: [f64; 3]) {
+        let settled = self.age > self.settings.warm_up_epochs;
+        let predicted = self.transition.observe(&self.x);
+        let c = self.transition.observed(&self.p);
+        let hph = self.transition.observed_twice(&c);
+        let mut d = [0.0; 3];
+        let mut used = [false; 3];
+        let mut complete = true;
+        for i in 0..3 {
+            d[i] = readout_m[i] - predicted[i];
+            let present = d[i].is_finite();
+            let refused = present && settled && self.beyond_gate(d[i], hph[i][i] + self.r[i][i], self.s_hat[i][i]);
+            used[i] = present && !refused;
+            complete &= used[i];
+            if !used[i] {
+                d[i] = 0.0;
+            }
+            if present {
+                self.refused[i] = if refused { self.refused[i] + 1 } else { 0 };
+                self.statistics.rejected += u64::from(refused);
+            }
+        }
+        if self.refused.iter().any(|&n| n >= self.settings.gate_patience) {
+            self.acquire(readout_m);
+            return;
+        }
+        if used == [false; 3] {
+            self.forget_measurement();
+            self.statistics.predictions += 1;
+            return;
+        }
+        self.adapt = complete && self.learn_innovation(&d);
+        if self.adapt {
+            self.adapt_readout_noise(&hph);
+        }
+        let s = sum(&hph, &self.r);
+        let Some(weight) = inverse(&s, used) else {
+            self.recover();
+            return;
+        };
+        self.weight = weight;
+        self.gain = mix(&self.weight, &c);
+        for i in 0..3 {
+            for l in 0..N {
+                self.x[l] += self.gain[i][l] * d[i];
+            }
+        }
+        if self.adapt && self.settings.adaptation == Adaptation::Residual {
+            self.adapt_by_residual(&readout_m, &hph);
+        }
+        self.statistics.updates += 1;
+        self.measure_consistency(&d, &s, used, settled);
+    }
+
+    /// Whether an innovation is beyond the gate, against the larger of the model's and the observed variance.
+    fn beyond_gate(&self, d: f64, model: f64, observed: f64) -> bool {
+        let n = self.settings.gate_sigma;
+        n > 0.0 && d * d > n * n * model.max(observed)
+    }
+
+    /// `Ŝ_k = α Ŝ_{k−1} + (1 − α) d dᵀ`, begun at the mean over the second half of the warm-up. False until then,
+    /// and in the first half of each later warm-up, when the innovations are those of an unknown velocity.
+    fn learn_innovation(&mut self, d: &[f64; 3]) -> bool {
+        let warm_up = self.settings.warm_up_epochs;
+        if self.age <= warm_up / 2 || self.settings.adaptation == Adaptation::Off {
+            return false;
+        }
+        let first = self.s_samples < (warm_up - warm_up / 2).max(1);
+        let fresh = if first { 1.0 / (self.s_samples + 1) as f64 } else { 1.0 - self.settings.forgetting };
+        for i in 0..3 {
+            for j in 0..3 {
+                self.s_hat[i][j] += fresh * (d[i] * d[j] - self.s_hat[i][j]);
+            }
+        }
+        if first {
+            self.s_samples += 1;
+        }
+        !first
+    }
+
+    /// eqs Final_AKF_R_ITER and Final_AKF_R_k, or eq:sage_husa_R_update.
+    fn adapt_readout_noise(&mut self, hph: &Mat3) {
+        let alpha = self.settings.forgetting;
+        for i in 0..3 {
+            for j in 0..3 {
+                let r = self.r[i][j];
+                let r_iter = (1.0 - alpha) * (self.s_hat[i][j] - hph[i][j]);
+                match self.settings.adaptation {
+                    Adaptation::Monotone => self.r[i][j] = alpha * r + r_iter.abs().min(r),
+                    Adaptation::Innovation => self.r[i][j] = alpha * r + r_iter,
+                    Adaptation::Residual | Adaptation::Off => {}
+                }
+            }
+        }
+    }
+
+    /// eqs residual_def and residual_R_update: `ε` needs `K`, so this `R̂` serves from the next epoch on.
+    fn adapt_by_residual(&mut self, readout_m: &[f64; 3], hph: &Mat3) {
+        let alpha = self.settings.forgetting;
+        let after = self.transition.observe(&self.x);
+        let e: [f64; 3] = std::array::from_fn(|i| readout_m[i] - after[i]);
+        for i in 0..3 {
+            for j in 0..3 {
+                self.e_hat[i][j] = alpha * self.e_hat[i][j] + (1.0 - alpha) * e[i] * e[j];
+                self.r[i][j] = alpha * self.r[i][j] + (1.0 - alpha) * (self.e_hat[i][j] + hph[i][j]);
+            }
+        }
+    }
+
+    fn measure_consistency(&mut self, d: &[f64; 3], s: &Mat3, used: [bool; 3], settled: bool) {
+        if self.settings.adaptation == Adaptation::Off {
+            self.s_design = *s;
+        } else {
+            let c = self.transition.observed(&self.p_design);
+            self.s_design = sum(&self.transition.observed_twice(&c), &diagonal(&self.model.readout_m2));
+        }
+        if !settled {
+            return;
+        }
+        for i in 0..3 {
+            for j in 0..3 {
+                self.statistics.nis_sum += d[i] * self.weight[i][j] * d[j];
+            }
+            if used[i] {
+                self.statistics.design_sum[i] += d[i] * d[i] / self.s_design[i][i];
+                self.statistics.readouts[i] += 1;
+            }
+        }
+    }
+
+    /// Tests `P` and `Q̂`, and repairs them.
+    fn check(&mut self) {
+        let n = self.model.states();
+        let (q, p) = (repair(&mut self.q, n), repair(&mut self.p, n));
+        self.statistics.repairs_q += u64::from(q == Finding::Repaired);
+        self.statistics.repairs_p += u64::from(p == Finding::Repaired);
+        if q == Finding::NotFinite || p == Finding::NotFinite || !self.x.iter().all(|x| x.is_finite()) {
+            self.reset();
+        }
+    }
+
+    /// `S` is not positive definite: repairs what can be repaired, else begins anew. The epoch is not used.
+    fn recover(&mut self) {
+        self.forget_measurement();
+        self.statistics.predictions += 1;
+        let before = self.statistics.repairs_p;
+        self.check();
+        if self.tracking && self.statistics.repairs_p == before {
+            self.reset();
+        }
+    }
+
+    /// All covariances at their first values, the track lost; the coefficients keep what is finite of their estimate.
+    fn reset(&mut self) {
+        self.begin_covariances();
+        for i in 0..N {
+            let initial = if i < THETA { 0.0 } else { self.model.coefficients.get(i - THETA).map_or(0.0, |c| c.initial) };
+            if !self.x[i].is_finite() {
+                self.x[i] = initial;
+            }
+        }
+        self.lose_track();
+        self.statistics.resets += 1;
+    }
+
+    /// The model.
+    #[must_use]
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
+    /// Counts and consistency.
+    #[must_use]
+    pub fn statistics(&self) -> &Statistics {
+        &self.statistics
+    }
+
+    /// `X̂⁺`, its first `model.states()` entries.
+    #[must_use]
+    pub fn state(&self) -> &[f64] {
+        &self.x[..self.model.states()]
+    }
+
+    /// `P_k[i][j]`, of `X̂⁻` at the last epoch.
+    #[must_use]
+    pub fn covariance(&self, i: usize, j: usize) -> f64 {
+        self.p.0[i][j]
+    }
+
+    /// `Q̂[i][j]`.
+    #[must_use]
+    pub fn process_noise(&self, i: usize, j: usize) -> f64 {
+        self.q.0[i.max(j)][i.min(j)]
+    }
+
+    /// `R̂`.
+    #[must_use]
+    pub fn readout_noise(&self) -> &Mat3 {
+        &self.r
+    }
+
+    /// Covariance of coefficients `i` and `j` as the recursion has it, before the last epoch's readout.
+    #[must_use]
+    pub fn recursion_covariance(&self, i: usize, j: usize) -> f64 {
+        self.p.0[THETA + i][THETA + j]
+    }
+
+    /// Covariance of coefficients `i` and `j` for the gains in use and the mission's noise, before the last epoch's
+    /// readout.
+    #[must_use]
+    pub fn coefficient_covariance(&self, i: usize, j: usize) -> f64 {
+        self.design_covariance().0[THETA + i][THETA + j]
+    }
+
+    /// Whether a track has been found.
+    #[must_use]
+    pub fn is_tracking(&self) -> bool {
+        self.tracking
+    }
+
+    /// Appends everything that the next step depends on.
+    pub fn save(&self, out: &mut Bytes) {
+        self.clone().visit(&mut Words::Write(out)).unwrap_or_else(|_| unreachable!("writing to memory"));
+    }
+
+    /// Restores what [`Filter::save`] wrote for the same model.
+    ///
+    /// # Errors
+    /// [`StateError`] when the bytes end early.
+    pub fn load(&mut self, words: &mut Words<'_>) -> Result<(), StateError> {
+        self.visit(words)
+    }
+
+    /// One list of the state for both directions.
+    fn visit(&mut self, w: &mut Words<'_>) -> Result<(), StateError> {
+        w.all(&mut self.x)?;
+        for m in [&mut self.p, &mut self.q, &mut self.p_design] {
+            for row in m.0.iter_mut() {
+                w.all(row)?;
+            }
+        }
+        for m in [&mut self.r, &mut self.s_hat, &mut self.e_hat, &mut self.weight, &mut self.s_design] {
+            for row in m {
+                w.all(row)?;
+            }
+        }
+        for row in &mut self.gain {
+            w.all(row)?;
+        }
+        for row in self.transition.phi.iter_mut() {
+            w.all(row)?;
+        }
+        w.all(&mut self.u)?;
+        for flag in [&mut self.adapt, &mut self.driven, &mut self.tracking] {
+            w.flag(flag)?;
+        }
+        for n in [&mut self.age, &mut self.s_samples] {
+            w.count(n)?;
+        }
+        for n in &mut self.refused {
+            let mut wide = u64::from(*n);
+            w.count(&mut wide)?;
+            *n = u32::try_from(wide).map_err(|_| StateError::Content("a count of rejections"))?;
+        }
+        let s = &mut self.statistics;
+        for n in [
+            &mut s.epochs,
+            &mut s.updates,
+            &mut s.predictions,
+            &mut s.rejected,
+            &mut s.reacquisitions,
+            &mut s.repairs_q,
+            &mut s.repairs_p,
+            &mut s.resets,
+        ] {
+            w.count(n)?;
+        }
+        for n in &mut s.readouts {
+            w.count(n)?;
+        }
+        w.all(std::slice::from_mut(&mut s.nis_sum))?;
+        w.all(&mut s.design_sum)
+    }
+}
+
+fn diagonal(d: &[f64; 3]) -> Mat3 {
+    [[d[0], 0.0, 0.0], [0.0, d[1], 0.0], [0.0, 0.0, d[2]]]
+}
+
+fn sum(a: &Mat3, b: &Mat3) -> Mat3 {
+    std::array::from_fn(|i| std::array::from_fn(|j| a[i][j] + b[i][j]))
+}
+
+/// Zeroes row and column `i`.
+fn clear<const N: usize>(p: &mut Matrix<N>, i: usize) {
+    p.0[i] = [0.0; N];
+    for row in p.0.iter_mut() {
+        row[i] = 0.0;
+    }
+}

@@ -1,0 +1,121 @@
+//! Noise-shaping states `n` of eq:readout_model: a readout's coloured noise as the output of driven chains.
+//!
+//! A term `asd² (f_c/f)^p` of a one-sided PSD is a chain of `p/2` integrators driven by white noise. Pure integrators
+//! beside the double integrator of `r` would let the variance of the unobservable difference grow without bound, so
+//! each integrator leaks at `ω_l`: `asd² f_c^p / (f² + f_l²)^{p/2}`, stationary, and equal to the term far above `f_l`.
+
+use dragfree_physics::noise::NoiseTerm;
+
+/// Chain of leaky integrators `ṅ_i = −ω_l n_i + n_{i+1}`, the last one driven by white noise; `n_0` is the output.
+///
+/// Everything here is exact for the continuous process sampled every `dt`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Chain {
+    /// First row of the transition over one step, `e^{−ω_l dt} dt^l / l!`; the matrix is upper triangular and Toeplitz.
+    pub transition: Vec<f64>,
+    /// Covariance of what the drive adds in one step, row-major, unit².
+    pub noise: Vec<f64>,
+    /// Stationary covariance, row-major, unit².
+    pub stationary: Vec<f64>,
+}
+
+impl Chain {
+    /// The chain of one coloured term, leaking below `leak_hz`, sampled every `dt_s`.
+    #[must_use]
+    pub fn new(term: &NoiseTerm, leak_hz: f64, dt_s: f64) -> Self {
+        let states = (term.exponent / 2) as usize;
+        let tau = std::f64::consts::TAU;
+        let leak = tau * leak_hz;
+        // Two-sided intensity of the drive: half of the one-sided PSD asd² (2π f_c)^p.
+        let drive = 0.5 * term.asd.powi(2) * (tau * term.corner_hz).powi(term.exponent.cast_signed());
+        let decay = (-leak * dt_s).exp();
+        let transition = (0..states).map(|l| decay * power_over_factorial(dt_s, l)).collect();
+        let mut noise = vec![0.0; states * states];
+        let mut stationary = vec![0.0; states * states];
+        for i in 0..states {
+            for j in 0..states {
+                // An impulse of the drive reaches state i as e^{−ω_l s} s^a / a!.
+                let (a, b) = (states - 1 - i, states - 1 - j);
+                let scale = drive / (factorial(a) * factorial(b));
+                noise[i * states + j] = scale * moment(a + b, 2.0 * leak, dt_s);
+                stationary[i * states + j] = scale * factorial(a + b) / (2.0 * leak).powi(a as i32 + b as i32 + 1);
+            }
+        }
+        Self { transition, noise, stationary }
+    }
+
+    /// Number of states.
+    #[must_use]
+    pub fn states(&self) -> usize {
+        self.transition.len()
+    }
+}
+
+fn factorial(n: usize) -> f64 {
+    (1..=n).map(|i| i as f64).product()
+}
+
+fn power_over_factorial(x: f64, n: usize) -> f64 {
+    x.powi(n as i32) / factorial(n)
+}
+
+/// `∫_0^T s^n e^{−c s} ds` as its power series: no cancellation while `c T` is small, as a leak of microhertz is.
+fn moment(n: usize, c: f64, t: f64) -> f64 {
+    let x = -c * t;
+    let (mut power, mut sum, mut k) = (1.0, 0.0_f64, 0_usize);
+    loop {
+        let term = power / (n + k + 1) as f64;
+        sum += term;
+        k += 1;
+        power *= x / k as f64;
+        if power.abs() <= f64::EPSILON * sum.abs() || k > 200 {
+            return t.powi(n as i32 + 1) * sum;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Complex, DMatrix};
+
+    fn matrices(chain: &Chain) -> (DMatrix<f64>, DMatrix<f64>, DMatrix<f64>) {
+        let n = chain.states();
+        let a = DMatrix::from_fn(n, n, |i, j| if j >= i { chain.transition[j - i] } else { 0.0 });
+        (a, DMatrix::from_row_slice(n, n, &chain.noise), DMatrix::from_row_slice(n, n, &chain.stationary))
+    }
+
+    /// The stationary covariance solves `Σ = A Σ Aᵀ + Q`. A leak of 0.1 Hz keeps the difference well conditioned.
+    #[test]
+    fn stationary_covariance_is_the_fixed_point() {
+        for exponent in [2, 4, 6, 8] {
+            let chain = Chain::new(&NoiseTerm { asd: 3.0, corner_hz: 0.2, exponent }, 0.1, 0.1);
+            let (a, q, sigma) = matrices(&chain);
+            let error = (&a * &sigma * a.transpose() + q - &sigma).norm() / sigma.norm();
+            assert!(error < 1e-13, "exponent {exponent}: {error}");
+        }
+    }
+
+    /// PSD of the sampled chain, `2 dt C (zI − A)⁻¹ Q (zI − A)⁻ᴴ Cᵀ`, against the shape it stands for.
+    /// Far from the leak and from Nyquist the two agree to the order of `(f_l/f)²` and of the aliases.
+    #[test]
+    fn sampled_psd_is_the_shape() {
+        let dt = 0.1;
+        for exponent in [2, 4] {
+            let term = NoiseTerm { asd: 1.8e-9, corner_hz: 1e-3, exponent };
+            let (a, q, _) = matrices(&Chain::new(&term, 1e-6, dt));
+            let n = a.nrows();
+            for f in [1e-4, 1e-3, 1e-2, 0.1] {
+                let z = Complex::from_polar(1.0, std::f64::consts::TAU * f * dt);
+                let zia = DMatrix::from_fn(n, n, |i, j| {
+                    Complex::new(-a[(i, j)], 0.0) + if i == j { z } else { Complex::new(0.0, 0.0) }
+                });
+                let inverse = zia.try_inverse().expect("no pole on the unit circle");
+                let psd = (&inverse * q.map(|x| Complex::new(x, 0.0)) * inverse.adjoint())[(0, 0)].re * 2.0 * dt;
+                let want = term.asd.powi(2) * (term.corner_hz / f).powi(exponent as i32);
+                let bound = 3e-4 + (std::f64::consts::PI * f * dt).powi(2);
+                assert!((psd / want - 1.0).abs() < bound, "exponent {exponent} at {f} Hz: {psd:e} against {want:e}");
+            }
+        }
+    }
+}

@@ -1,0 +1,163 @@
+//! The structured step against the paper's equations as printed, in dense matrices.
+
+mod common;
+
+use common::{Alpha, DT_S, Epoch, Simulation, model, settings};
+use dragfree_es_akf::filter::{Adaptation, Drive, Filter};
+use dragfree_es_akf::model::Model;
+use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+
+const N: usize = 22;
+type Mat = SMatrix<f64, N, N>;
+type State = SVector<f64, N>;
+
+/// eqs Final_AKF_X_k to Final_AKF_p_k1, line by line, with `A_d` and `B_d` by the power series of the matrix
+/// exponential of eq:extended_state_space.
+struct Printed {
+    a_n: Mat,
+    h: SMatrix<f64, 3, N>,
+    x: State,
+    p: Mat,
+    q: Mat,
+    r: Matrix3<f64>,
+    s: Matrix3<f64>,
+    alpha: f64,
+}
+
+impl Printed {
+    fn new(model: &Model, alpha: f64) -> Self {
+        let (mut q, mut p) = (Mat::zeros(), Mat::zeros());
+        model.process_noise(|i, j, value| q[(i, j)] = value);
+        model.prior_covariance(|i, j, value| p[(i, j)] = value);
+        let mut h = SMatrix::zeros();
+        let mut a_n = Mat::zeros();
+        for i in 0..3 {
+            h[(i, i)] = 1.0;
+        }
+        for (axis, first, chain) in model.placed_chains() {
+            h[(axis, first)] = 1.0;
+            for i in 0..chain.states() {
+                a_n[(first + i, first + i)] = -std::f64::consts::TAU * 1e-6;
+                if i > 0 {
+                    a_n[(first + i - 1, first + i)] = 1.0;
+                }
+            }
+        }
+        let r = Matrix3::from_diagonal(&Vector3::from(model.readout_m2));
+        Self { a_n, h, x: State::zeros(), p, q, r, s: Matrix3::zeros(), alpha }
+    }
+
+    /// `A_d` and `B_d û`.
+    fn discretised(&self, epoch: &Epoch) -> (Mat, State) {
+        let mut a = self.a_n;
+        for i in 0..3 {
+            a[(i, 3 + i)] = 1.0;
+            a[(3 + i, 6 + i)] = 1.0;
+            for j in 0..3 {
+                a[(3 + i, 9 + j)] = epoch.phi[j][i];
+            }
+        }
+        let mut b_u = State::zeros();
+        for i in 0..3 {
+            b_u[3 + i] = epoch.u_m_s2[i];
+        }
+        // e^{A dt} = Σ (A dt)^l / l!,  ∫ e^{A s} ds = dt Σ (A dt)^l / (l+1)!
+        let (mut power, mut a_d, mut integral) = (Mat::identity(), Mat::zeros(), Mat::zeros());
+        for l in 0..12 {
+            a_d += power;
+            integral += power * (DT_S / f64::from(l + 1));
+            power = power * a * (DT_S / f64::from(l + 1));
+        }
+        (a_d, integral * b_u)
+    }
+
+    /// The lines of one epoch, up to eq:Final_AKF_x_k1; the others need the next interval's `A_d`.
+    fn correct(&mut self, readout_m: [f64; 3], learn: f64, adapt: bool) -> SMatrix<f64, N, 3> {
+        let d = Vector3::from(readout_m) - self.h * self.x;
+        self.s += (d * d.transpose() - self.s) * learn;
+        let hph = self.h * self.p * self.h.transpose();
+        if adapt {
+            let r_iter = (self.s - hph) * (1.0 - self.alpha);
+            self.r = self.r * self.alpha + r_iter.abs().zip_map(&self.r, f64::min);
+        }
+        let k = self.p * self.h.transpose() * (hph + self.r).try_inverse().expect("S is positive definite");
+        self.x += k * d;
+        k
+    }
+
+    fn predict(&mut self, epoch: &Epoch, k: &SMatrix<f64, N, 3>, adapt: bool) {
+        let (a, b_u) = self.discretised(epoch);
+        let carried = a * (Mat::identity() - k * self.h) * self.p * a.transpose();
+        if adapt {
+            let p_hat = carried + self.q;
+            let q_iter = p_hat - a * self.p * a.transpose() + k * self.s * k.transpose();
+            self.q = self.q * self.alpha + q_iter.abs().zip_map(&self.q, f64::min) * (1.0 - self.alpha);
+        }
+        self.p = carried + self.q;
+        self.x = a * self.x + b_u;
+    }
+}
+
+/// A million epochs of 22 states (4 + 3 + 3 for the readouts), adaptation on: the same estimates, to 1e-9 of their σ,
+/// and the same covariances, to 1e-9 of the product of the σ, finite and exactly symmetric.
+#[test]
+fn a_million_steps_agree_with_the_printed_equations() {
+    let model = model([&[4, 2, 2], &[4, 2], &[4, 2]]);
+    assert_eq!(model.states(), N);
+    let mut settings = settings(Adaptation::Monotone);
+    settings.check_epochs = 0; // the printed equations repair nothing
+    let mut fast = Filter::<24>::new(model.clone(), settings);
+    let mut printed = Printed::new(&model, settings.forgetting);
+    let mut data = Simulation::new(&model, Alpha::Coloured(1.0), 1);
+    let (mut gain, mut adapt, mut learned) = (SMatrix::zeros(), false, 0_u64);
+    let mut last: Option<Epoch> = None;
+    let (half, epochs) = (settings.warm_up_epochs / 2, 1_000_000_u64);
+    let mut worst = (0.0_f64, 0.0_f64);
+    for k in 0..=epochs {
+        let epoch = data.epoch();
+        fast.step(epoch.readout_m, Drive { acceleration_m_s2: epoch.u_m_s2, regressors: &epoch.phi });
+        if let Some(before) = &last {
+            printed.predict(before, &gain, adapt);
+            let first = learned < half;
+            let learn = match (k > half, first) {
+                (false, _) => 0.0,
+                (true, true) => 1.0 / (learned + 1) as f64,
+                (true, false) => 1.0 - settings.forgetting,
+            };
+            adapt = k > half && !first;
+            learned += u64::from(k > half && first);
+            gain = printed.correct(epoch.readout_m, learn, adapt);
+        } else {
+            for i in 0..3 {
+                printed.x[i] = epoch.readout_m[i];
+            }
+        }
+        last = Some(epoch);
+        if k % 100_000 == 0 && k > 0 {
+            let sigma = |i: usize| printed.p[(i, i)].sqrt();
+            for i in 0..N {
+                worst.0 = worst.0.max((fast.state()[i] - printed.x[i]).abs() / sigma(i));
+                for j in 0..N {
+                    assert_eq!(fast.covariance(i, j).to_bits(), fast.covariance(j, i).to_bits(), "epoch {k}: P[{i}][{j}]");
+                    let error = (fast.covariance(i, j) - printed.p[(i, j)]).abs() / (sigma(i) * sigma(j));
+                    worst.1 = worst.1.max(error);
+                }
+            }
+            println!("epoch {k}: worst so far {:.1e} σ in X, {:.1e} in P", worst.0, worst.1);
+            assert!(worst.0 < 1e-9 && worst.1 < 1e-9, "epoch {k}: {worst:?}");
+        }
+    }
+    for i in 0..N {
+        for j in 0..=i {
+            let q = printed.q[(i, j)];
+            let scale = (printed.q[(i, i)] * printed.q[(j, j)]).sqrt();
+            assert!((fast.process_noise(i, j) - q).abs() <= 1e-9 * scale, "Q[{i}][{j}]");
+        }
+        println!("Q[{i}][{i}] is {:.4} of the mission's", printed.q[(i, i)] / {
+            let mut q0 = 0.0;
+            model.process_noise(|r, c, value| if r == i && c == i { q0 = value });
+            q0
+        });
+    }
+    println!("{:?}", fast.statistics());
+}
