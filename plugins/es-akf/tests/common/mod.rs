@@ -1,6 +1,6 @@
 //! Synthetic data for the tests: a test mass on a double integrator under known and unknown forces.
 
-#![allow(dead_code)] // each test file uses its part
+#![allow(dead_code, unreachable_pub)] // each test file uses its part
 
 use dragfree_es_akf::filter::{Adaptation, Settings};
 use dragfree_es_akf::model::{Coefficient, Model, Prior};
@@ -21,8 +21,9 @@ pub enum Alpha {
     Coloured(f64),
 }
 
-/// The default mission's noise levels; `exponents` are those of the coloured readout noise per axis.
-pub fn model(exponents: [&[u32]; 3]) -> Model {
+/// The default mission's noise levels; `exponents` are those of the coloured readout noise per axis, white below
+/// `leak_hz`.
+pub fn model(exponents: [&[u32]; 3], leak_hz: f64) -> Model {
     let half_rate = 0.5 / DT_S;
     let asd = [1.42e-12, 1.8e-9, 1.8e-9];
     let corner = [2e-3, 1e-3, 1e-3];
@@ -35,7 +36,7 @@ pub fn model(exponents: [&[u32]; 3]) -> Model {
         chains: std::array::from_fn(|i| {
             exponents[i]
                 .iter()
-                .map(|&exponent| Chain::new(&NoiseTerm { asd: asd[i], corner_hz: corner[i], exponent }, 1e-6, DT_S))
+                .map(|&exponent| Chain::new(&NoiseTerm { asd: asd[i], corner_hz: corner[i], exponent }, leak_hz, DT_S))
                 .collect()
         }),
         coefficients: vec![Coefficient { initial: 0.0, prior_sigma: 0.1 }; 3],
