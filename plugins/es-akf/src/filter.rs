@@ -283,9 +283,9 @@ impl<const N: usize> Filter<N> {
                     let size = q_iter.abs();
                     alpha * q + (1.0 - alpha) * if size < q { size } else { q }
                 }),
-                Adaptation::Innovation => advance_adapting(p, q, apa, &w, &m, &y, k, |q, q_iter, _| {
-                    alpha * q + (1.0 - alpha) * q_iter
-                }),
+                Adaptation::Innovation => {
+                    advance_adapting(p, q, apa, &w, &m, &y, k, |q, q_iter, _| alpha * q + (1.0 - alpha) * q_iter)
+                }
                 Adaptation::Residual => {
                     advance_adapting(p, q, apa, &w, &m, &y, k, |q, _, ksk| alpha * q + (1.0 - alpha) * ksk);
                 }
@@ -519,7 +519,8 @@ impl<const N: usize> Filter<N> {
     fn reset(&mut self) {
         self.begin_covariances();
         for i in 0..N {
-            let initial = if i < THETA { 0.0 } else { self.model.coefficients.get(i - THETA).map_or(0.0, |c| c.initial) };
+            let initial =
+                if i < THETA { 0.0 } else { self.model.coefficients.get(i - THETA).map_or(0.0, |c| c.initial) };
             if !self.x[i].is_finite() {
                 self.x[i] = initial;
             }

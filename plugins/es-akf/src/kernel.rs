@@ -162,7 +162,13 @@ impl<const N: usize> Transition<N> {
     }
 
     /// Lower blocks of `A P Aᵀ` into `product`, and `M = A P Hᵀ`. `half` is scratch.
-    pub fn conjugate(&self, p: &Matrix<N>, half: &mut Matrix<N>, product: &mut Matrix<N>, turned: &mut Matrix<N>) -> Columns<N> {
+    pub fn conjugate(
+        &self,
+        p: &Matrix<N>,
+        half: &mut Matrix<N>,
+        product: &mut Matrix<N>,
+        turned: &mut Matrix<N>,
+    ) -> Columns<N> {
         self.rows::<false>(half, p);
         let m = std::array::from_fn(|axis| {
             let mut column = [0.0; N];

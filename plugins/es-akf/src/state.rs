@@ -7,13 +7,17 @@ pub enum StateError {
     #[error("saved state does not begin with the mark of es-akf: it belongs to another plugin or is damaged")]
     Magic,
     /// Written by another version.
-    #[error("saved state has layout version {found}, this es-akf reads {VERSION}: start anew from an older checkpoint or replay")]
+    #[error(
+        "saved state has layout version {found}, this es-akf reads {VERSION}: start anew from an older checkpoint or replay"
+    )]
     Version {
         /// Version in the header.
         found: u64,
     },
     /// Written for another model or mission.
-    #[error("saved state was written for \"{found}\", this run has \"{expected}\": start anew after a change of model or mission")]
+    #[error(
+        "saved state was written for \"{found}\", this run has \"{expected}\": start anew after a change of model or mission"
+    )]
     Layout {
         /// Layout in the header.
         found: String,
@@ -77,6 +81,17 @@ impl Words<'_> {
             *value = f64::from_bits(bits);
         }
         Ok(())
+    }
+
+    /// Nothing may be left.
+    ///
+    /// # Errors
+    /// [`StateError::Length`] when something is.
+    pub fn end(&self) -> Result<(), StateError> {
+        match self {
+            Self::Read(left) if !left.is_empty() => Err(StateError::Length { found: left.len(), expected: 0 }),
+            _ => Ok(()),
+        }
     }
 
     /// A count.

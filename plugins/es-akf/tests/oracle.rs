@@ -145,28 +145,26 @@ fn a_million_steps_agree_with_the_printed_equations() {
             let sigma = |i: usize| printed.p[(i, i)].sqrt();
             for i in 0..N {
                 worst.0 = worst.0.max((fast.state()[i] - printed.x[i]).abs() / sigma(i));
-                print!("{:.0e} ", (fast.state()[i] - printed.x[i]).abs() / sigma(i));
                 for j in 0..N {
-                    assert_eq!(fast.covariance(i, j).to_bits(), fast.covariance(j, i).to_bits(), "epoch {k}: P[{i}][{j}]");
+                    assert_eq!(
+                        fast.covariance(i, j).to_bits(),
+                        fast.covariance(j, i).to_bits(),
+                        "epoch {k}: P[{i}][{j}]"
+                    );
                     let error = (fast.covariance(i, j) - printed.p[(i, j)]).abs() / (sigma(i) * sigma(j));
                     worst.1 = worst.1.max(error);
                 }
             }
-            println!("epoch {k}: worst so far {:.1e} σ in X, {:.1e} in P", worst.0, worst.1);
-            assert!(worst.0 < 1e-6 && worst.1 < 1e-6, "epoch {k}: {worst:?}");
+            assert!(worst.0 < 1e-9 && worst.1 < 1e-9, "epoch {k}: {worst:?}");
         }
     }
     for i in 0..N {
         for j in 0..=i {
-            let q = printed.q[(i, j)];
-            let scale = (printed.q[(i, i)] * printed.q[(j, j)]).sqrt();
-            assert!((fast.process_noise(i, j) - q).abs() <= 1e-9 * scale, "Q[{i}][{j}]");
+            let scale = |m: &Mat| (m[(i, i)] * m[(j, j)]).sqrt();
+            let error = (fast.process_noise(i, j) - printed.q[(i, j)]).abs();
+            // Q of a long chain's output, of the order of dt⁷, lies below the grain of P from which it is made.
+            assert!(error <= 1e-9 * scale(&printed.q) + 1e-14 * scale(&printed.p), "Q[{i}][{j}] is {error:e} off");
         }
-        println!("Q[{i}][{i}] is {:.4} of the mission's", printed.q[(i, i)] / {
-            let mut q0 = 0.0;
-            model.process_noise(|r, c, value| if r == i && c == i { q0 = value });
-            q0
-        });
     }
-    println!("{:?}", fast.statistics());
+    assert_eq!(fast.statistics().updates, epochs);
 }

@@ -1,0 +1,448 @@
+//! The stage: columns in, filters, columns and a report out.
+
+use dragfree_physics::mission::Mission;
+use dragfree_sdk::prelude::*;
+use serde_json::json;
+
+use crate::akf::{Akf, MAX_STATES};
+use crate::design::{Choices, model};
+use crate::filter::{Adaptation, Settings};
+use crate::model::{Coefficient as Theta, Prior};
+use crate::state::{Words, seal, unseal};
+use crate::tracker::{Average, Factor, Rows, Snapshot, Tracker};
+
+const AXES: [&str; 3] = ["x", "y", "z"];
+const TEST_MASSES: [&str; 2] = ["tm1", "tm2"];
+/// Batches from here on are worth a second thread.
+const THREAD_ROWS: usize = 512;
+
+/// The stage `es-akf`.
+#[derive(Debug)]
+pub struct EsAkf {
+    mission: Mission,
+    settings: Settings,
+    choices: Choices,
+    snapshot_s: f64,
+    bodies: Vec<Body>,
+    table: Option<Table>,
+    last_ns: Option<i64>,
+}
+
+/// A test mass with its columns.
+#[derive(Debug)]
+struct Body {
+    name: &'static str,
+    tracker: Tracker,
+    readout_m: [In; 3],
+    u_m_s2: [In; 3],
+    regressors: Vec<(Factor, usize, In)>,
+    coefficients: Vec<Coefficient>,
+    value: Vec<Out>,
+    sigma: Vec<Out>,
+    nis: Out,
+}
+
+impl Stage for EsAkf {
+    const MANIFEST: Manifest = Manifest {
+        id: "es-akf",
+        version: env!("CARGO_PKG_VERSION"),
+        licence: "MIT OR Apache-2.0",
+        description: "Extended-state adaptive Kalman filter: one state per coefficient of the model's effects",
+        parameters: &[
+            Parameter::text(
+                "adaptation",
+                "monotone",
+                &["monotone", "innovation", "residual", "off"],
+                "how process and readout noise follow the innovations; monotone is the paper's",
+            ),
+            Parameter::f64("forgetting", "1", 0.999_999, 0.0..=1.0, "the paper's alpha: weight of the past per epoch"),
+            Parameter::f64("warm_up_s", "s", 600.0, 0.0..=1e6, "time before gating, and at first before adapting"),
+            Parameter::f64(
+                "gate_sigma",
+                "1",
+                6.0,
+                0.0..=1e6,
+                "innovations beyond so many sigma are not used; 0 uses all",
+            ),
+            Parameter::i64("gate_patience", "1", 30, 1..=1_000_000, "rejections in a row after which to begin anew"),
+            Parameter::f64("check_s", "s", 600.0, 0.0..=1e9, "time between tests of definiteness; 0 tests never"),
+            Parameter::f64("output_interval_s", "s", 60.0, 1e-3..=1e9, "time between rows for the archive"),
+            Parameter::f64("displacement_prior_m", "m", 1e-6, 1e-12..=1.0, "1 sigma of r about the first readout"),
+            Parameter::f64("velocity_prior_m_s", "m s-1", 1e-7, 1e-15..=1.0, "1 sigma of v about zero"),
+            Parameter::f64("bias_prior_m_s2", "m s-2", 1e-7, 1e-18..=1.0, "1 sigma of the bias acceleration"),
+            Parameter::f64(
+                "bias_walk_m_s2_rts",
+                "m s-2 s-1/2",
+                3e-15,
+                0.0..=1e-3,
+                "random walk of the bias acceleration",
+            ),
+            Parameter::f64("leak_hz", "Hz", 1e-6, 1e-9..=1.0, "below this, coloured readout noise is white"),
+            Parameter::f64(
+                "unknown_alpha",
+                "1",
+                1.0,
+                0.0..=100.0,
+                "part of the torque noise's variance that the reconstructed angular acceleration does not know",
+            ),
+        ],
+        instances: &[],
+    };
+
+    fn new(setup: &Setup) -> Result<Self, PluginError> {
+        let mission = Mission::from_json(setup.mission_json())?;
+        let rate_hz = mission.mission.sample_rate_hz;
+        let epochs = |name: &str| -> Result<u64, PluginError> { Ok((setup.f64(name)? * rate_hz).round() as u64) };
+        let adaptation = match setup.text("adaptation")?.as_str() {
+            "monotone" => Adaptation::Monotone,
+            "innovation" => Adaptation::Innovation,
+            "residual" => Adaptation::Residual,
+            _ => Adaptation::Off,
+        };
+        Ok(Self {
+            settings: Settings {
+                adaptation,
+                forgetting: setup.f64("forgetting")?,
+                warm_up_epochs: epochs("warm_up_s")?,
+                gate_sigma: setup.f64("gate_sigma")?,
+                gate_patience: u32::try_from(setup.i64("gate_patience")?).unwrap_or(u32::MAX),
+                check_epochs: epochs("check_s")?,
+            },
+            choices: Choices {
+                prior: Prior {
+                    displacement_m: setup.f64("displacement_prior_m")?,
+                    velocity_m_s: setup.f64("velocity_prior_m_s")?,
+                    bias_m_s2: setup.f64("bias_prior_m_s2")?,
+                },
+                bias_walk_m_s2_rts: setup.f64("bias_walk_m_s2_rts")?,
+                leak_hz: setup.f64("leak_hz")?,
+                unknown_alpha: setup.f64("unknown_alpha")?,
+            },
+            snapshot_s: setup.f64("output_interval_s")?,
+            mission,
+            bodies: Vec::new(),
+            table: None,
+            last_ns: None,
+        })
+    }
+
+    fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
+        let table = link.table("es-akf", 0.0);
+        for (name, frame) in TEST_MASSES.into_iter().zip(["ORF_1", "ORF_2"]) {
+            if available.find(&format!("{name}.u_orf_m_s2.x")).is_some() {
+                let body = self.link_body(name, frame, table, available, link)?;
+                self.bodies.push(body);
+            }
+        }
+        if self.bodies.is_empty() {
+            return Err(PluginError::new(
+                "es-akf: no column tm1.u_orf_m_s2.x or tm2.u_orf_m_s2.x is made before this stage, so there is no \
+                 test mass to follow; put hinf-dfacs before it, or leave es-akf out for an accelerometer mission",
+            ));
+        }
+        self.table = Some(table);
+        Ok(())
+    }
+
+    fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
+        let Some(table) = self.table else { return Ok(()) };
+        let times = input.time_ns();
+        let pieces = self.contiguous(times)?;
+        let [first, rest @ ..] = self.bodies.as_mut_slice() else { return Ok(()) };
+        // The test masses share nothing, so the result is the same with one thread or two.
+        let snapshots: Vec<Vec<Snapshot>> = if times.len() < THREAD_ROWS {
+            std::iter::once(first.run(input, &pieces)).chain(rest.iter_mut().map(|b| b.run(input, &pieces))).collect()
+        } else {
+            std::thread::scope(|scope| {
+                let others: Vec<_> = rest.iter_mut().map(|b| scope.spawn(|| b.run(input, &pieces))).collect();
+                let mine = first.run(input, &pieces);
+                let joined =
+                    others.into_iter().map(|t| t.join().map_err(|_| PluginError::fatal("es-akf: a filter panicked")));
+                std::iter::once(Ok(mine)).chain(joined).collect::<Result<_, _>>()
+            })?
+        };
+        self.last_ns = times.last().copied().or(self.last_ns);
+        output.time(table).extend(snapshots[0].iter().map(|s| times[s.row]));
+        for (body, snapshots) in self.bodies.iter().zip(&snapshots) {
+            for s in snapshots {
+                for j in 0..s.value.len() {
+                    output.f64(body.value[j]).push(s.value[j]);
+                    output.f64(body.sigma[j]).push(s.sigma[j]);
+                }
+                output.f64(body.nis).push(s.nis);
+            }
+        }
+        Ok(())
+    }
+
+    fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
+        let mut report = Report::default();
+        let (mut nis_sum, mut dof) = (0.0, 0);
+        let mut p_end = serde_json::Map::new();
+        for body in &self.bodies {
+            let s = body.tracker.filter().statistics();
+            nis_sum += s.nis_sum;
+            dof += s.readouts.iter().sum::<u64>();
+            report.epochs_used = Some(report.epochs_used.map_or(s.updates, |n| n.min(s.updates)));
+            report.epochs_rejected = Some(report.epochs_rejected.map_or(s.predictions, |n| n.max(s.predictions)));
+            for (key, n) in [
+                ("updates", s.updates),
+                ("predictions_only", s.predictions),
+                ("rejected_readouts", s.rejected),
+                ("reacquisitions", s.reacquisitions),
+                ("repairs_of_q", s.repairs_q),
+                ("repairs_of_p", s.repairs_p),
+                ("resets", s.resets),
+            ] {
+                *report.counts.entry(key.to_owned()).or_default() += n;
+            }
+            let stretch = body.tracker.stretch();
+            let average = body.tracker.result();
+            for (j, c) in body.coefficients.iter().enumerate() {
+                let key =
+                    if p_end.contains_key(&c.name) { format!("{}@{}", c.name, body.name) } else { c.name.clone() };
+                p_end.insert(key, json!(body.tracker.filter().recursion_covariance(j, j).sqrt()));
+            }
+            report.quality.insert(
+                body.name.to_owned(),
+                json!({
+                    "nis": s.nis(),
+                    "innovation_variance_over_mission_noise": s.design_nis(),
+                    "sigma_stretch": stretch,
+                    "averaged_s": average.as_ref().map(|a| a.span_s),
+                }),
+            );
+            if stretch > 1.1 {
+                report.notes.push(format!(
+                    "es-akf: the innovations of {} are up to {stretch:.2} times what the noise of the mission file \
+                     predicts; its sigmas were stretched by that. Compare the readout and thrust noise with [noise]",
+                    body.name
+                ));
+            }
+        }
+        report.nis = (dof > 0).then(|| nis_sum / dof as f64);
+        report.quality.insert("p_end_sigma".to_owned(), p_end.into());
+        self.estimates(&mut report);
+        Ok(report)
+    }
+
+    fn save(&self) -> Result<Vec<u8>, PluginError> {
+        let mut words = Vec::new();
+        let mut out = Words::Write(&mut words);
+        let (mut begun, mut last) = (self.last_ns.is_some(), self.last_ns.unwrap_or(0).cast_unsigned());
+        out.flag(&mut begun)?;
+        out.count(&mut last)?;
+        for body in &self.bodies {
+            body.tracker.save(&mut words);
+        }
+        Ok(seal(&self.layout(), &words))
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
+        let mut words = Words::Read(unseal(&self.layout(), state)?);
+        let (mut begun, mut last) = (false, 0);
+        words.flag(&mut begun)?;
+        words.count(&mut last)?;
+        let mut trackers: Vec<Tracker> = self.bodies.iter().map(|b| b.tracker.clone()).collect();
+        for tracker in &mut trackers {
+            tracker.load(&mut words)?;
+        }
+        words.end()?;
+        for (body, tracker) in self.bodies.iter_mut().zip(trackers) {
+            body.tracker = tracker;
+        }
+        self.last_ns = begun.then_some(last.cast_signed());
+        Ok(())
+    }
+}
+
+impl EsAkf {
+    fn link_body(
+        &self,
+        name: &'static str,
+        frame: &str,
+        table: Table,
+        available: &Available,
+        link: &mut Link<'_>,
+    ) -> Result<Body, PluginError> {
+        let mut three = |group: &str, unit: &str| -> Result<[In; 3], PluginError> {
+            let mut read = |axis: &str| link.read(&Want::new(format!("{name}.{group}.{axis}")).unit(unit).frame(frame));
+            Ok([read("x")?, read("y")?, read("z")?])
+        };
+        let (readout_m, u_m_s2) = (three("r_orf_m", "m")?, three("u_orf_m_s2", "m s-2")?);
+        let mut coefficients: Vec<Coefficient> = Vec::new();
+        let mut regressors = Vec::new();
+        for column in available.of_kind("regressor") {
+            let Some(axis) = AXES.iter().position(|a| column.attribute("channel") == format!("{name}.accel.{a}"))
+            else {
+                continue;
+            };
+            let called = column.attribute("coefficient");
+            let coefficient = available.coefficient(called).ok_or_else(|| {
+                PluginError::new(format!(
+                    "es-akf: column {} of table {} is a regressor of coefficient \"{called}\", which no effect \
+                     declares; the effect must announce it with `coefficient` in its link",
+                    column.name, column.table
+                ))
+            })?;
+            let factor = if coefficient.estimate {
+                let known = coefficients.iter().position(|c| c.name == coefficient.name);
+                Factor::Estimated(known.unwrap_or_else(|| {
+                    coefficients.push(coefficient.clone());
+                    coefficients.len() - 1
+                }))
+            } else {
+                Factor::Fixed(coefficient.initial)
+            };
+            regressors.push((factor, axis, link.read(&Want::of(column))?));
+        }
+        let thetas = coefficients.iter().map(prior_of).collect::<Result<Vec<_>, _>>()?;
+        let model = model(&self.mission, name, thetas, &self.choices)?;
+        let states = model.states();
+        let filter = Akf::new(model, self.settings).ok_or_else(|| {
+            PluginError::new(format!(
+                "es-akf: {name} would have {states} states, at most {MAX_STATES} are possible; leave effects out of \
+                 the model, or terms out of the readout noise"
+            ))
+        })?;
+        let (mut value, mut sigma) = (Vec::new(), Vec::new());
+        let shared = |c: &Coefficient| acts_on_several(available, &c.name);
+        let label = |c: &Coefficient| if shared(c) { format!("{}@{name}", c.name) } else { c.name.clone() };
+        let archive = [("archive", "true")];
+        for c in &coefficients {
+            value.push(link.write_with(table, &label(c), &c.unit, &c.frame, &archive)?);
+            sigma.push(link.write_with(table, &format!("{}.sigma", label(c)), &c.unit, &c.frame, &archive)?);
+        }
+        let nis = link.write_with(table, &format!("{name}.nis"), "1", "", &archive)?;
+        let tracker = Tracker::new(filter, self.snapshot_s);
+        Ok(Body { name, tracker, readout_m, u_m_s2, regressors, coefficients, value, sigma, nis })
+    }
+
+    /// Runs of rows one step apart, each with the number of steps missing before it.
+    fn contiguous(&self, times: &[i64]) -> Result<Vec<(u64, std::ops::Range<usize>)>, PluginError> {
+        let rate_hz = self.mission.mission.sample_rate_hz;
+        let mut pieces: Vec<(u64, std::ops::Range<usize>)> = Vec::new();
+        let mut last = self.last_ns;
+        for (row, &t) in times.iter().enumerate() {
+            let steps = last.map_or(1.0, |last| ((t - last) as f64 * 1e-9 * rate_hz).round());
+            if steps < 1.0 {
+                return Err(PluginError::error(format!(
+                    "es-akf: row {row} at {t} ns is not later than the one before it; the uniform tables must be in \
+                     order, see the stage that made them"
+                )));
+            }
+            match pieces.last_mut() {
+                Some((_, piece)) if steps < 1.5 => piece.end = row + 1,
+                _ => pieces.push((steps as u64 - 1, row..row + 1)),
+            }
+            last = Some(t);
+        }
+        Ok(pieces)
+    }
+
+    /// What a saved state belongs to.
+    fn layout(&self) -> String {
+        let bodies = self.bodies.iter().map(|b| {
+            let names: Vec<&str> = b.coefficients.iter().map(|c| c.name.as_str()).collect();
+            format!("{}: {} states, {}", b.name, b.tracker.filter().model().states(), names.join(" "))
+        });
+        format!("{} Hz; {}", self.mission.mission.sample_rate_hz, bodies.collect::<Vec<_>>().join("; "))
+    }
+
+    /// Coefficients with value, σ and covariance. One that acts on both test masses is taken from the filter that knows
+    /// it better: the two share the thrusters' noise, so their mean would promise too much.
+    fn estimates(&self, report: &mut Report) {
+        let results: Vec<(f64, Option<Average>)> =
+            self.bodies.iter().map(|b| (b.tracker.stretch(), b.tracker.result())).collect();
+        let sigma = |b: usize, j: usize| -> Option<f64> {
+            let (stretch, average) = &results[b];
+            let m = self.bodies[b].coefficients.len();
+            average.as_ref().map(|a| stretch * a.covariance[j * m + j].sqrt())
+        };
+        let mut chosen: Vec<(usize, usize)> = Vec::new();
+        for (b, body) in self.bodies.iter().enumerate() {
+            for (j, c) in body.coefficients.iter().enumerate() {
+                let rival = chosen.iter().position(|&(b, j)| self.bodies[b].coefficients[j].name == c.name);
+                match rival {
+                    None => chosen.push((b, j)),
+                    Some(r) if sigma(b, j) < sigma(chosen[r].0, chosen[r].1) => chosen[r] = (b, j),
+                    Some(_) => {}
+                }
+            }
+        }
+        for &(b, j) in &chosen {
+            let c = &self.bodies[b].coefficients[j];
+            let value = results[b].1.as_ref().map(|a| a.value[j]);
+            report.coefficients.push(Estimate {
+                name: c.name.clone(),
+                solution: "es-akf".to_owned(),
+                value,
+                sigma: sigma(b, j),
+                unit: c.unit.clone(),
+                frame: c.frame.clone(),
+            });
+            if value.is_some_and(|v| !(c.lower..=c.upper).contains(&v)) {
+                report.notes.push(format!(
+                    "es-akf: {} = {:.4e} {} is outside its physical range {:.4e} to {:.4e}: too little data, or the \
+                     model lacks an effect",
+                    c.name,
+                    value.unwrap_or(f64::NAN),
+                    c.unit,
+                    c.lower,
+                    c.upper
+                ));
+            }
+        }
+        if chosen.is_empty() || results.iter().any(|(_, average)| average.is_none()) {
+            return;
+        }
+        let entry = |&(b, i): &(usize, usize), &(d, j): &(usize, usize)| match &results[b] {
+            (stretch, Some(a)) if b == d => stretch * stretch * a.covariance[i * self.bodies[b].coefficients.len() + j],
+            _ => 0.0,
+        };
+        let matrix = chosen.iter().map(|row| chosen.iter().map(|column| entry(row, column)).collect()).collect();
+        let names = chosen.iter().map(|&(b, j)| self.bodies[b].coefficients[j].name.clone()).collect();
+        report.covariance.insert("es-akf".to_owned(), Covariance { names, matrix });
+    }
+}
+
+impl Body {
+    fn run(&mut self, input: &Inputs<'_>, pieces: &[(u64, std::ops::Range<usize>)]) -> Vec<Snapshot> {
+        let rows = Rows {
+            readout_m: self.readout_m.map(|c| input.f64(c)),
+            u_m_s2: self.u_m_s2.map(|c| input.f64(c)),
+            regressors: self.regressors.iter().map(|&(factor, axis, c)| (factor, axis, input.f64(c))).collect(),
+        };
+        let mut snapshots = Vec::new();
+        for (missing, piece) in pieces {
+            self.tracker.skip(*missing);
+            snapshots.extend(self.tracker.process(&rows, piece.clone()));
+        }
+        snapshots
+    }
+}
+
+/// Initial value and prior σ; without a prior, half of the physical range.
+fn prior_of(c: &Coefficient) -> Result<Theta, PluginError> {
+    let half_range = 0.5 * (c.upper - c.lower);
+    let prior_sigma = if c.prior_sigma.is_finite() { c.prior_sigma } else { half_range };
+    if c.initial.is_finite() && prior_sigma.is_finite() && prior_sigma > 0.0 {
+        Ok(Theta { initial: c.initial, prior_sigma })
+    } else {
+        Err(PluginError::new(format!(
+            "es-akf: coefficient {} has initial value {} and prior sigma {}, range {} to {}; a filter needs a finite \
+             start: give it a prior_sigma or a finite range in the model file",
+            c.name, c.initial, c.prior_sigma, c.lower, c.upper
+        )))
+    }
+}
+
+/// Whether a coefficient has regressors on both test masses.
+fn acts_on_several(available: &Available, coefficient: &str) -> bool {
+    let of_it = |name: &str| {
+        available.of_kind("regressor").any(|c| {
+            c.attribute("coefficient") == coefficient && c.attribute("channel").starts_with(&format!("{name}.accel."))
+        })
+    };
+    TEST_MASSES.into_iter().all(of_it)
+}

@@ -1,0 +1,226 @@
+//! One test mass over time: the filter, the mean over its last hour, the rows for the archive.
+
+use std::collections::VecDeque;
+
+use crate::akf::Akf;
+use crate::filter::Drive;
+use crate::state::{Bytes, StateError, Words};
+
+/// The paper's value is the mean of the estimate over the last hour, s.
+const AVERAGE_S: f64 = 3600.0;
+/// A run shorter than six hours averages this part of itself instead.
+const AVERAGE_PART: u64 = 6;
+/// Grain of that mean, s.
+const BIN_S: f64 = 10.0;
+
+/// What one test mass reads, column by column, all of one length.
+#[derive(Clone, Debug)]
+pub struct Rows<'a> {
+    /// Measured displacement at `t_k`, x, y, z, m.
+    pub readout_m: [&'a [f64]; 3],
+    /// `û`, mean over `[t_k, t_{k+1})`, x, y, z, m/s².
+    pub u_m_s2: [&'a [f64]; 3],
+    /// Regressors: what they are multiplied with, axis, column.
+    pub regressors: Vec<(Factor, usize, &'a [f64])>,
+}
+
+/// What a regressor is multiplied with.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Factor {
+    /// The estimate of the filter's coefficient of this index.
+    Estimated(usize),
+    /// A value that the model fixes.
+    Fixed(f64),
+}
+
+/// A row for the archive.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Snapshot {
+    /// Index of the row of the batch at which it was taken.
+    pub row: usize,
+    /// Estimates of the coefficients.
+    pub value: Vec<f64>,
+    /// Their σ for the gains in use and the mission's noise.
+    pub sigma: Vec<f64>,
+    /// Mean NIS per degree of freedom since the row before, NaN where nothing was measured.
+    pub nis: f64,
+}
+
+/// Estimates summed over `BIN_S`, and their covariance at its start.
+#[derive(Clone, Debug, Default, PartialEq)]
+struct Bin {
+    epochs: u64,
+    sum: Vec<f64>,
+    covariance: Vec<f64>,
+}
+
+/// The mean over the end of a run.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Average {
+    /// How much of the end was averaged, s.
+    pub span_s: f64,
+    /// Mean estimate per coefficient.
+    pub value: Vec<f64>,
+    /// Mean covariance over the span, row-major, for the gains in use and the mission's noise. The error of a mean is
+    /// no larger than the mean error: `Cov(mean) ≤ mean(Cov)`, with near equality as the errors of one hour are one.
+    pub covariance: Vec<f64>,
+}
+
+/// A test mass being followed.
+#[derive(Clone, Debug)]
+pub struct Tracker {
+    filter: Akf,
+    dt_s: f64,
+    snapshot_epochs: u64,
+    bins: VecDeque<Bin>,
+    /// Statistics at the last snapshot: sum and degrees of freedom.
+    reported: (f64, u64),
+}
+
+impl Tracker {
+    /// A test mass before its first epoch, with a row for the archive every `snapshot_s`.
+    #[must_use]
+    pub fn new(filter: Akf, snapshot_s: f64) -> Self {
+        let dt_s = filter.model().dt_s;
+        let snapshot_epochs = ((snapshot_s / dt_s).round() as u64).max(1);
+        Self { filter, dt_s, snapshot_epochs, bins: VecDeque::new(), reported: (0.0, 0) }
+    }
+
+    /// The filter.
+    #[must_use]
+    pub fn filter(&self) -> &Akf {
+        &self.filter
+    }
+
+    fn bin_epochs(&self) -> u64 {
+        ((BIN_S / self.dt_s).round() as u64).max(1)
+    }
+
+    /// Rows `range` of a batch.
+    pub fn process(&mut self, rows: &Rows<'_>, range: std::ops::Range<usize>) -> Vec<Snapshot> {
+        let mut snapshots = Vec::new();
+        let mut phi = vec![[0.0; 3]; self.filter.coefficients().len()];
+        for k in range {
+            let mut u = rows.u_m_s2.map(|column| column[k]);
+            for &(factor, axis, column) in &rows.regressors {
+                match factor {
+                    Factor::Estimated(j) => phi[j][axis] = column[k],
+                    Factor::Fixed(value) => u[axis] += value * column[k],
+                }
+            }
+            let readout = rows.readout_m.map(|column| column[k]);
+            self.filter.step(readout, Drive { acceleration_m_s2: u, regressors: &phi });
+            self.average();
+            if self.filter.statistics().epochs.is_multiple_of(self.snapshot_epochs) {
+                snapshots.push(self.snapshot(k));
+            }
+        }
+        snapshots
+    }
+
+    /// Epochs that no row stands for.
+    pub fn skip(&mut self, epochs: u64) {
+        self.filter.skip(epochs);
+    }
+
+    fn average(&mut self) {
+        let bin_epochs = self.bin_epochs();
+        if self.bins.back().is_none_or(|b| b.epochs == bin_epochs) {
+            let m = self.filter.coefficients().len();
+            let covariance = (0..m * m).map(|i| self.filter.coefficient_covariance(i / m, i % m)).collect();
+            self.bins.push_back(Bin { epochs: 0, sum: vec![0.0; m], covariance });
+            if self.bins.len() > self.whole_window() {
+                self.bins.pop_front();
+            }
+        }
+        if let Some(bin) = self.bins.back_mut() {
+            bin.epochs += 1;
+            for (sum, x) in bin.sum.iter_mut().zip(self.filter.coefficients()) {
+                *sum += x;
+            }
+        }
+    }
+
+    /// Bins in the window of a long run.
+    fn whole_window(&self) -> usize {
+        (AVERAGE_S / (self.bin_epochs() as f64 * self.dt_s)).round() as usize
+    }
+
+    fn snapshot(&mut self, row: usize) -> Snapshot {
+        let s = self.filter.statistics();
+        let (sum, dof) = (s.nis_sum, s.readouts.iter().sum::<u64>());
+        let nis =
+            if dof > self.reported.1 { (sum - self.reported.0) / (dof - self.reported.1) as f64 } else { f64::NAN };
+        self.reported = (sum, dof);
+        let value = self.filter.coefficients().to_vec();
+        let sigma = (0..value.len()).map(|i| self.filter.coefficient_covariance(i, i).sqrt()).collect();
+        Snapshot { row, value, sigma, nis }
+    }
+
+    /// The mean over the last hour, or over the last sixth of a run shorter than six hours; in bins of ten seconds, the
+    /// newest one perhaps not full. `None` before the first epoch.
+    #[must_use]
+    pub fn result(&self) -> Option<Average> {
+        let m = self.filter.coefficients().len();
+        let wanted = self.filter.statistics().epochs / AVERAGE_PART / self.bin_epochs();
+        let wanted = usize::try_from(wanted).unwrap_or(usize::MAX).clamp(1, self.whole_window());
+        let newest = self.bins.iter().rev().take(wanted);
+        let epochs: u64 = newest.clone().map(|b| b.epochs).sum();
+        if epochs == 0 {
+            return None;
+        }
+        let mut average =
+            Average { span_s: epochs as f64 * self.dt_s, value: vec![0.0; m], covariance: vec![0.0; m * m] };
+        for bin in newest {
+            for (mean, sum) in average.value.iter_mut().zip(&bin.sum) {
+                *mean += sum / epochs as f64;
+            }
+            for (mean, c) in average.covariance.iter_mut().zip(&bin.covariance) {
+                *mean += c * bin.epochs as f64 / epochs as f64;
+            }
+        }
+        Some(average)
+    }
+
+    /// By how much σ must be stretched: the worst readout's innovations, rms, over what the mission's noise predicts;
+    /// never less than one, as quiet data do not prove a quiet instrument.
+    #[must_use]
+    pub fn stretch(&self) -> f64 {
+        self.filter.statistics().design_nis().into_iter().flatten().fold(1.0, f64::max).sqrt()
+    }
+
+    /// Appends everything that the next row depends on.
+    pub fn save(&self, out: &mut Bytes) {
+        self.filter.save(out);
+        let mut copy = self.clone();
+        copy.visit(&mut Words::Write(out)).unwrap_or_else(|_| unreachable!("writing to memory"));
+    }
+
+    /// Restores what [`Tracker::save`] wrote for the same model.
+    ///
+    /// # Errors
+    /// [`StateError`] when the bytes end early or have no sense.
+    pub fn load(&mut self, words: &mut Words<'_>) -> Result<(), StateError> {
+        self.filter.load(words)?;
+        self.visit(words)
+    }
+
+    fn visit(&mut self, w: &mut Words<'_>) -> Result<(), StateError> {
+        let m = self.filter.coefficients().len();
+        let mut bins = self.bins.len() as u64;
+        w.count(&mut bins)?;
+        if bins > self.whole_window() as u64 {
+            return Err(StateError::Content("a count of averages"));
+        }
+        self.bins.resize(bins as usize, Bin::default());
+        for bin in &mut self.bins {
+            bin.sum.resize(m, 0.0);
+            bin.covariance.resize(m * m, 0.0);
+            w.count(&mut bin.epochs)?;
+            w.all(&mut bin.sum)?;
+            w.all(&mut bin.covariance)?;
+        }
+        w.all(std::slice::from_mut(&mut self.reported.0))?;
+        w.count(&mut self.reported.1)
+    }
+}
