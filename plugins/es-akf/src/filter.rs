@@ -284,7 +284,7 @@ impl<const N: usize> Filter<N> {
                     alpha * q + (1.0 - alpha) * if size < q { size } else { q }
                 }),
                 Adaptation::Innovation => {
-                    advance_adapting(p, q, apa, &w, &m, &y, k, |q, q_iter, _| alpha * q + (1.0 - alpha) * q_iter)
+                    advance_adapting(p, q, apa, &w, &m, &y, k, |q, q_iter, _| alpha * q + (1.0 - alpha) * q_iter);
                 }
                 Adaptation::Residual => {
                     advance_adapting(p, q, apa, &w, &m, &y, k, |q, _, ksk| alpha * q + (1.0 - alpha) * ksk);

@@ -1,0 +1,160 @@
+//! Is σ honest? Seeded runs on synthetic data whose statistics are those of the model, or deliberately not.
+//!
+//! Seeds are 1, 2, 3 …; none was chosen. Each run is 2000 s of 16 states with coloured α.
+
+mod common;
+
+use common::{Alpha, Simulation, model, settings};
+use dragfree_es_akf::Akf;
+use dragfree_es_akf::filter::{Adaptation, Drive};
+use dragfree_es_akf::model::Model;
+use dragfree_es_akf::tracker::{Factor, Rows, Tracker};
+use nalgebra::{Matrix3, Vector3};
+
+const RUNS: u64 = 40;
+const EPOCHS: usize = 20_000;
+
+#[derive(Default)]
+struct Outcome {
+    /// |error| > 3σ, of 3 × RUNS, with the reported σ.
+    beyond_3_sigma: usize,
+    /// The same without the stretch.
+    beyond_3_sigma_unstretched: usize,
+    /// Σ eᵀ P⁻¹ e, χ² with 3 × RUNS degrees of freedom.
+    nees: f64,
+    nis_sum: f64,
+    dof: u64,
+}
+
+/// Runs the filter for `belief` on data made from `truth`.
+fn campaign(truth: &Model, belief: &Model, adaptation: Adaptation) -> Outcome {
+    let mut outcome = Outcome::default();
+    for seed in 1..=RUNS {
+        let mut data = Simulation::new(truth, Alpha::Coloured(1.0), seed);
+        let (mut r, mut u, mut phi) = ([vec![], vec![], vec![]], [vec![], vec![], vec![]], vec![vec![]; 9]);
+        for _ in 0..EPOCHS {
+            let epoch = data.epoch();
+            for i in 0..3 {
+                r[i].push(epoch.readout_m[i]);
+                u[i].push(epoch.u_m_s2[i]);
+                for j in 0..3 {
+                    phi[3 * j + i].push(epoch.phi[j][i]);
+                }
+            }
+        }
+        let rows = Rows {
+            readout_m: [&r[0], &r[1], &r[2]],
+            u_m_s2: [&u[0], &u[1], &u[2]],
+            regressors: (0..9).map(|c| (Factor::Estimated(c / 3), c % 3, phi[c].as_slice())).collect(),
+        };
+        let filter = Akf::new(belief.clone(), settings(adaptation)).expect("16 states");
+        let mut tracker = Tracker::new(filter, 60.0);
+        tracker.process(&rows, 0..EPOCHS);
+        let average = tracker.result().expect("a long run");
+        let p = Matrix3::from_row_slice(&average.covariance);
+        let e = Vector3::from(data.b_m) - Vector3::from_row_slice(&average.value);
+        let stretch = tracker.stretch();
+        for i in 0..3 {
+            let z = e[i].abs() / p[(i, i)].sqrt();
+            outcome.beyond_3_sigma += usize::from(z > 3.0 * stretch);
+            outcome.beyond_3_sigma_unstretched += usize::from(z > 3.0);
+        }
+        outcome.nees += (e.transpose() * p.try_inverse().expect("positive definite") * e)[0] / stretch.powi(2);
+        let s = tracker.filter().statistics();
+        outcome.nis_sum += s.nis_sum;
+        outcome.dof += s.readouts.iter().sum::<u64>();
+        assert_eq!((s.rejected, s.reacquisitions, s.resets), (0, 0, 0));
+    }
+    outcome
+}
+
+fn default_model() -> Model {
+    model([&[4], &[2], &[2]], 1e-6)
+}
+
+/// All acceleration and readout noise `k` times larger in variance.
+fn louder(model: &Model, k: f64) -> Model {
+    let mut model = model.clone();
+    model.acceleration_m2_s4 = model.acceleration_m2_s4.map(|row| row.map(|q| q * k));
+    model.readout_m2 = model.readout_m2.map(|r| r * k);
+    for chain in model.chains.iter_mut().flatten() {
+        chain.noise.iter_mut().chain(&mut chain.stationary).for_each(|q| *q *= k);
+    }
+    model
+}
+
+/// With calibrated σ the number beyond 3σ of 120 is Poisson with mean 0.32: more than 3 has probability 4e-4.
+const MOST_BEYOND: usize = 3;
+/// χ² with 120 degrees of freedom is inside with probability 1 − 2e-4 (3.7σ in the Wilson–Hilferty variable).
+const NEES_BOUNDS: (f64, f64) = (71.0, 187.0);
+/// NIS per degree of freedom over `RUNS` runs has σ = sqrt(2/dof) = 0.00096; four of it: 6e-5.
+fn nis_agrees(o: &Outcome) -> bool {
+    (o.nis_sum / o.dof as f64 - 1.0).abs() < 4.0 * (2.0 / o.dof as f64).sqrt()
+}
+
+#[test]
+fn sigma_is_honest_and_the_innovations_are_white_noise_of_their_covariance() {
+    let o = campaign(&default_model(), &default_model(), Adaptation::Off);
+    println!("off: {} beyond 3σ, NEES {:.1}, NIS {:.5}", o.beyond_3_sigma, o.nees, o.nis_sum / o.dof as f64);
+    assert!(o.beyond_3_sigma <= MOST_BEYOND, "{} beyond 3σ", o.beyond_3_sigma);
+    assert!(NEES_BOUNDS.0 < o.nees && o.nees < NEES_BOUNDS.1, "NEES {}", o.nees);
+    assert!(nis_agrees(&o), "NIS {}", o.nis_sum / o.dof as f64);
+}
+
+#[test]
+fn sigma_stays_honest_under_the_papers_adaptation() {
+    let o = campaign(&default_model(), &default_model(), Adaptation::Monotone);
+    println!("monotone: {} beyond 3σ, NEES {:.1}, NIS {:.5}", o.beyond_3_sigma, o.nees, o.nis_sum / o.dof as f64);
+    assert!(o.beyond_3_sigma <= MOST_BEYOND, "{} beyond 3σ", o.beyond_3_sigma);
+    assert!(NEES_BOUNDS.0 < o.nees && o.nees < NEES_BOUNDS.1, "NEES {}", o.nees);
+}
+
+/// The twins of the NIS test.
+#[test]
+fn ten_times_too_much_or_too_little_noise_fails_the_nis_test() {
+    for factor in [10.0, 0.1] {
+        let mut belief = default_model();
+        belief.acceleration_m2_s4 = belief.acceleration_m2_s4.map(|row| row.map(|q| q * factor));
+        let q = campaign(&default_model(), &belief, Adaptation::Off);
+        let mut belief = default_model();
+        belief.readout_m2 = belief.readout_m2.map(|r| r * factor);
+        let r = campaign(&default_model(), &belief, Adaptation::Off);
+        let nis = |o: &Outcome| o.nis_sum / o.dof as f64;
+        println!("Q×{factor}: NIS {:.3}; R×{factor}: NIS {:.3}", nis(&q), nis(&r));
+        assert!(!nis_agrees(&q) && !nis_agrees(&r));
+    }
+}
+
+/// Nine times more variance than the mission file says: without the stretch a third of the values are beyond 3σ.
+#[test]
+fn noise_that_the_mission_file_understates_stretches_sigma() {
+    let o = campaign(&louder(&default_model(), 9.0), &default_model(), Adaptation::Monotone);
+    println!(
+        "understated: {} beyond 3σ, {} without the stretch, NEES {:.1}",
+        o.beyond_3_sigma, o.beyond_3_sigma_unstretched, o.nees
+    );
+    assert!(o.beyond_3_sigma <= MOST_BEYOND, "{} beyond 3σ", o.beyond_3_sigma);
+    assert!(o.beyond_3_sigma_unstretched > 10, "{} beyond 3σ", o.beyond_3_sigma_unstretched);
+}
+
+/// Regressors given one epoch late, as an error of alignment anywhere before this stage would, throw the estimate off.
+#[test]
+fn regressors_one_epoch_late_are_far_off() {
+    let model = default_model();
+    let worst_z = |late: bool| {
+        let mut data = Simulation::new(&model, Alpha::White, 1);
+        let mut filter = Akf::new(model.clone(), settings(Adaptation::Off)).expect("16 states");
+        let mut before = [[0.0; 3]; 3];
+        for _ in 0..EPOCHS {
+            let epoch = data.epoch();
+            let phi = if late { before } else { epoch.phi };
+            filter.step(epoch.readout_m, Drive { acceleration_m_s2: epoch.u_m_s2, regressors: &phi });
+            before = epoch.phi;
+        }
+        let z = |i: usize| (filter.coefficients()[i] - data.b_m[i]).abs() / filter.coefficient_covariance(i, i).sqrt();
+        (0..3).map(z).fold(0.0, f64::max)
+    };
+    let (right, late) = (worst_z(false), worst_z(true));
+    println!("worst error {right:.1} σ, one epoch late {late:.1} σ");
+    assert!(right < 4.5 && late > 10.0, "{right} and {late}");
+}

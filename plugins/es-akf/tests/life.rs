@@ -1,0 +1,211 @@
+//! Gaps, outliers, indefinite noise, saved states.
+
+mod common;
+
+use common::{Alpha, Epoch, Simulation, model, settings};
+use dragfree_es_akf::Akf;
+use dragfree_es_akf::filter::{Adaptation, Drive, Settings};
+use dragfree_es_akf::model::Model;
+use dragfree_es_akf::state::{StateError, Words};
+use dragfree_es_akf::tracker::{Factor, Rows, Tracker};
+
+const NAN3: [f64; 3] = [f64::NAN; 3];
+
+fn default_model() -> Model {
+    model([&[4], &[2], &[2]], 1e-6)
+}
+
+fn gated() -> Settings {
+    Settings { gate_sigma: 6.0, ..settings(Adaptation::Monotone) }
+}
+
+/// `epochs` of data through a filter, spoilt on the way by `spoil(k, &mut epoch)`.
+fn run(settings: Settings, epochs: usize, mut spoil: impl FnMut(usize, &mut Epoch)) -> (Akf, Simulation) {
+    let model = default_model();
+    let mut data = Simulation::new(&model, Alpha::Coloured(1.0), 5);
+    let mut filter = Akf::new(model, settings).expect("16 states");
+    for k in 0..epochs {
+        let mut epoch = data.epoch();
+        spoil(k, &mut epoch);
+        filter.step(epoch.readout_m, Drive { acceleration_m_s2: epoch.u_m_s2, regressors: &epoch.phi });
+    }
+    (filter, data)
+}
+
+fn worst_z(filter: &Akf, data: &Simulation) -> f64 {
+    let z = |i: usize| (filter.coefficients()[i] - data.b_m[i]).abs() / filter.coefficient_covariance(i, i).sqrt();
+    (0..3).map(z).fold(0.0, f64::max)
+}
+
+/// NIS per degree of freedom: within five σ of sampling, false alarm 6e-7.
+fn nis_is_one(filter: &Akf) -> bool {
+    let s = filter.statistics();
+    let dof = s.readouts.iter().sum::<u64>() as f64;
+    (s.nis().expect("after warm-up") - 1.0).abs() < 5.0 * (2.0 / dof).sqrt()
+}
+
+#[test]
+fn missing_readouts_are_bridged_and_nothing_is_invented() {
+    let gap = 8_000..8_600;
+    let mut variances = Vec::new();
+    let model = default_model();
+    let mut data = Simulation::new(&model, Alpha::Coloured(1.0), 5);
+    let mut filter = Akf::new(model, settings(Adaptation::Off)).expect("16 states");
+    for k in 0..20_000 {
+        let mut epoch = data.epoch();
+        if gap.contains(&k) {
+            epoch.readout_m = NAN3;
+        }
+        filter.step(epoch.readout_m, Drive { acceleration_m_s2: epoch.u_m_s2, regressors: &epoch.phi });
+        if gap.contains(&k) {
+            variances.push((filter.coefficient_covariance(1, 1), filter.coefficients()[1]));
+        }
+    }
+    // The first row of the gap still carries the update before it.
+    assert!(variances[1..].windows(2).all(|w| w[0].1.to_bits() == w[1].1.to_bits()), "the estimate moved without data");
+    assert!(variances[1..].windows(2).all(|w| w[1].0 >= w[0].0 * (1.0 - 1e-9)), "σ fell without data");
+    let s = filter.statistics();
+    assert_eq!((s.predictions, s.reacquisitions), (gap.len() as u64 + 1, 0));
+    assert!(nis_is_one(&filter) && worst_z(&filter, &data) < 4.5, "{s:?}");
+}
+
+#[test]
+fn one_missing_readout_leaves_the_others_at_work() {
+    let (filter, data) = run(settings(Adaptation::Off), 20_000, |k, e| {
+        if (5_000..15_000).contains(&k) {
+            e.readout_m[0] = f64::NAN;
+        }
+    });
+    let s = filter.statistics();
+    assert_eq!(s.readouts[1] - s.readouts[0], 10_000);
+    assert_eq!(s.updates, 19_999);
+    assert!(nis_is_one(&filter) && worst_z(&filter, &data) < 4.5, "{s:?}");
+}
+
+#[test]
+fn after_a_gap_of_the_drive_the_track_is_acquired_anew_and_the_coefficients_are_kept() {
+    let gap = 10_000..11_000;
+    for regressors in [false, true] {
+        let (filter, data) = run(settings(Adaptation::Off), 20_000, |k, e| {
+            if gap.contains(&k) {
+                if regressors {
+                    e.phi[1][0] = f64::NAN;
+                } else {
+                    e.u_m_s2 = NAN3;
+                }
+            }
+        });
+        let s = filter.statistics();
+        assert_eq!(s.reacquisitions, gap.len() as u64, "each readout within the gap begins a track of no length");
+        assert!(nis_is_one(&filter) && worst_z(&filter, &data) < 4.5, "{s:?}");
+        let (short, _) = run(settings(Adaptation::Off), 10_000, |_, _| {});
+        assert!(
+            filter.coefficient_covariance(1, 1) < 0.8 * short.coefficient_covariance(1, 1),
+            "it learned nothing after the gap"
+        );
+    }
+}
+
+#[test]
+fn a_missing_day_lets_sigma_grow_only_where_something_walks() {
+    let (mut filter, _) = run(settings(Adaptation::Off), 5_000, |_, _| {});
+    let (value, before) = (filter.coefficients().to_vec(), filter.coefficient_covariance(1, 1));
+    filter.skip(864_000);
+    assert_eq!(filter.coefficients(), value);
+    assert!(filter.coefficient_covariance(1, 1) <= before, "the last readout was lost");
+}
+
+#[test]
+fn outliers_are_refused_and_counted() {
+    let spoil = |k: usize, e: &mut Epoch| {
+        if k >= 10_000 && k % 500 == 0 {
+            e.readout_m[k % 3] += 1e-6;
+        }
+    };
+    let (filter, data) = run(gated(), 20_000, spoil);
+    let s = filter.statistics();
+    assert_eq!((s.rejected, s.reacquisitions), (20, 0));
+    assert!(worst_z(&filter, &data) < 4.5, "{s:?}");
+    // The twin: without the gate the same outliers ruin the estimate.
+    let (open, data) = run(Settings { gate_sigma: 0.0, ..gated() }, 20_000, spoil);
+    assert!(worst_z(&open, &data) > 10.0);
+}
+
+#[test]
+fn a_lasting_jump_does_not_lock_the_gate_for_ever() {
+    let (filter, data) = run(gated(), 20_000, |k, e| {
+        if k >= 12_000 {
+            e.readout_m[1] += 1e-5;
+        }
+    });
+    let s = filter.statistics();
+    assert_eq!((s.rejected, s.reacquisitions), (30, 1));
+    assert!(worst_z(&filter, &data) < 4.5, "{s:?}");
+}
+
+#[test]
+fn an_indefinite_noise_is_repaired_and_counted() {
+    // A thousand times faster than in service, so that weeks of adaptation pass in minutes.
+    let fast = |adaptation| Settings { forgetting: 0.999, check_epochs: 100, ..settings(adaptation) };
+    let (filter, _) = run(fast(Adaptation::Monotone), 30_000, |_, _| {});
+    let s = filter.statistics();
+    assert!(s.repairs_q > 0, "{s:?}");
+    assert!(filter.coefficients().iter().all(|x| x.is_finite()));
+    // The innovation variant breaks down, is begun anew, and never gives NaN.
+    let (filter, _) = run(fast(Adaptation::Innovation), 30_000, |_, _| {});
+    let s = filter.statistics();
+    assert!(s.repairs_q + s.repairs_p + s.resets > 0, "{s:?}");
+    assert!(filter.coefficients().iter().all(|x| x.is_finite()));
+}
+
+/// Two halves through a saved state give the bits of the whole, wherever it is cut, gaps included.
+#[test]
+fn a_saved_state_resumes_to_the_bit() {
+    let model = default_model();
+    let mut data = Simulation::new(&model, Alpha::White, 9);
+    let (mut r, mut u, mut phi) = ([vec![], vec![], vec![]], [vec![], vec![], vec![]], vec![vec![]; 9]);
+    for k in 0..6_000 {
+        let mut e = data.epoch();
+        if (3_000..3_050).contains(&k) {
+            e.u_m_s2 = NAN3;
+        }
+        if (4_000..4_020).contains(&k) {
+            e.readout_m[2] = f64::NAN;
+        }
+        for i in 0..3 {
+            r[i].push(e.readout_m[i]);
+            u[i].push(e.u_m_s2[i]);
+            for j in 0..3 {
+                phi[3 * j + i].push(e.phi[j][i]);
+            }
+        }
+    }
+    let rows = Rows {
+        readout_m: [&r[0], &r[1], &r[2]],
+        u_m_s2: [&u[0], &u[1], &u[2]],
+        regressors: (0..9).map(|c| (Factor::Estimated(c / 3), c % 3, phi[c].as_slice())).collect(),
+    };
+    let fresh = || Tracker::new(Akf::new(model.clone(), gated()).expect("16 states"), 60.0);
+    let bytes = |t: &Tracker| {
+        let mut out = Vec::new();
+        t.save(&mut out);
+        out
+    };
+    let mut whole = fresh();
+    let snapshots = whole.process(&rows, 0..6_000);
+    for cut in [0, 1, 777, 2_001, 3_000, 3_025, 4_010, 5_999] {
+        let mut first = fresh();
+        let mut both = first.process(&rows, 0..cut);
+        let state = bytes(&first);
+        let mut second = fresh();
+        let mut words = Words::Read(&state);
+        second.load(&mut words).expect("its own state");
+        words.end().expect("nothing left");
+        assert_eq!(bytes(&second), state, "cut at {cut}");
+        both.extend(second.process(&rows, cut..6_000));
+        assert_eq!(format!("{both:?}"), format!("{snapshots:?}"), "cut at {cut}");
+        assert_eq!(bytes(&second), bytes(&whole), "cut at {cut}");
+    }
+    let state = bytes(&whole);
+    assert!(matches!(fresh().load(&mut Words::Read(&state[..state.len() / 2])), Err(StateError::Length { .. })));
+}
