@@ -219,13 +219,15 @@ impl<const N: usize> Filter<N> {
             }
         }
         self.statistics.epochs += 1;
+        self.keep(next);
         if self.tracking {
             self.age += 1;
             self.measure(readout_m);
-        } else {
+        } else if self.driven {
             self.acquire(readout_m);
+        } else {
+            self.statistics.predictions += 1;
         }
-        self.keep(next);
         let every = self.settings.check_epochs;
         if every > 0 && self.statistics.epochs.is_multiple_of(every) {
             self.check();
