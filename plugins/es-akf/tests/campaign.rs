@@ -95,7 +95,6 @@ fn nis_agrees(o: &Outcome) -> bool {
 #[test]
 fn sigma_is_honest_and_the_innovations_are_white_noise_of_their_covariance() {
     let o = campaign(&default_model(), &default_model(), Adaptation::Off);
-    println!("off: {} beyond 3σ, NEES {:.1}, NIS {:.5}", o.beyond_3_sigma, o.nees, o.nis_sum / o.dof as f64);
     assert!(o.beyond_3_sigma <= MOST_BEYOND, "{} beyond 3σ", o.beyond_3_sigma);
     assert!(NEES_BOUNDS.0 < o.nees && o.nees < NEES_BOUNDS.1, "NEES {}", o.nees);
     assert!(nis_agrees(&o), "NIS {}", o.nis_sum / o.dof as f64);
@@ -104,7 +103,6 @@ fn sigma_is_honest_and_the_innovations_are_white_noise_of_their_covariance() {
 #[test]
 fn sigma_stays_honest_under_the_papers_adaptation() {
     let o = campaign(&default_model(), &default_model(), Adaptation::Monotone);
-    println!("monotone: {} beyond 3σ, NEES {:.1}, NIS {:.5}", o.beyond_3_sigma, o.nees, o.nis_sum / o.dof as f64);
     assert!(o.beyond_3_sigma <= MOST_BEYOND, "{} beyond 3σ", o.beyond_3_sigma);
     assert!(NEES_BOUNDS.0 < o.nees && o.nees < NEES_BOUNDS.1, "NEES {}", o.nees);
 }
@@ -119,7 +117,6 @@ fn ten_times_too_much_or_too_little_noise_fails_the_nis_test() {
         let mut belief = default_model();
         belief.readout_m2 = belief.readout_m2.map(|r| r * factor);
         let r = campaign(&default_model(), &belief, Adaptation::Off);
-        let nis = |o: &Outcome| o.nis_sum / o.dof as f64;
         println!("Q×{factor}: NIS {:.3}; R×{factor}: NIS {:.3}", nis(&q), nis(&r));
         assert!(!nis_agrees(&q) && !nis_agrees(&r));
     }
@@ -129,10 +126,6 @@ fn ten_times_too_much_or_too_little_noise_fails_the_nis_test() {
 #[test]
 fn noise_that_the_mission_file_understates_stretches_sigma() {
     let o = campaign(&louder(&default_model(), 9.0), &default_model(), Adaptation::Monotone);
-    println!(
-        "understated: {} beyond 3σ, {} without the stretch, NEES {:.1}",
-        o.beyond_3_sigma, o.beyond_3_sigma_unstretched, o.nees
-    );
     assert!(o.beyond_3_sigma <= MOST_BEYOND, "{} beyond 3σ", o.beyond_3_sigma);
     assert!(o.beyond_3_sigma_unstretched > 10, "{} beyond 3σ", o.beyond_3_sigma_unstretched);
 }
@@ -155,6 +148,5 @@ fn regressors_one_epoch_late_are_far_off() {
         (0..3).map(z).fold(0.0, f64::max)
     };
     let (right, late) = (worst_z(false), worst_z(true));
-    println!("worst error {right:.1} σ, one epoch late {late:.1} σ");
     assert!(right < 4.5 && late > 10.0, "{right} and {late}");
 }

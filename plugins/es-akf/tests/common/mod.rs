@@ -63,6 +63,14 @@ pub struct Epoch {
     pub phi: [[f64; 3]; 3],
 }
 
+/// One chain of coloured readout noise.
+struct Coloured {
+    axis: usize,
+    transition: Vec<f64>,
+    state: Vec<f64>,
+    drive: DMatrix<f64>,
+}
+
 /// A seeded stretch of data whose statistics are those of `model`, with the offset `b_m`.
 pub struct Simulation {
     rng: Xoshiro256PlusPlus,
@@ -75,7 +83,7 @@ pub struct Simulation {
     last_alpha: [f64; 3],
     r: [f64; 3],
     v: [f64; 3],
-    chains: Vec<(usize, Vec<f64>, Vec<f64>, DMatrix<f64>)>,
+    chains: Vec<Coloured>,
 }
 
 impl Simulation {
@@ -91,7 +99,12 @@ impl Simulation {
             .map(|(axis, _, c)| {
                 let n = c.states();
                 let first = factor(n, &c.stationary) * DVector::from_fn(n, |_, _| normal());
-                (axis, c.transition.clone(), first.as_slice().to_vec(), factor(n, &c.noise))
+                Coloured {
+                    axis,
+                    transition: c.transition.clone(),
+                    state: first.as_slice().to_vec(),
+                    drive: factor(n, &c.noise),
+                }
             })
             .collect();
         Self {
@@ -119,8 +132,8 @@ impl Simulation {
         for i in 0..3 {
             readout_m[i] = self.r[i] + self.model.readout_m2[i].sqrt() * self.normal();
         }
-        for (axis, _, n, _) in &self.chains {
-            readout_m[*axis] += n[0];
+        for chain in &self.chains {
+            readout_m[chain.axis] += chain.state[0];
         }
         let (keep, add) = match self.alpha {
             Alpha::White => (0.0, 1.0),
@@ -142,12 +155,11 @@ impl Simulation {
             self.v[i] += dt * a;
             self.bias_m_s2[i] += bias_step * self.normal();
         }
-        for c in 0..self.chains.len() {
-            let n = self.chains[c].1.len();
-            let fresh = &self.chains[c].3 * DVector::from_fn(n, |_, _| StandardNormal.sample(&mut self.rng));
-            let (_, taps, state, _) = &mut self.chains[c];
+        for Coloured { transition, state, drive, .. } in &mut self.chains {
+            let n = state.len();
+            let fresh = &*drive * DVector::from_fn(n, |_, _| StandardNormal.sample(&mut self.rng));
             for i in 0..n {
-                state[i] = (i..n).map(|j| taps[j - i] * state[j]).sum::<f64>() + fresh[i];
+                state[i] = (i..n).map(|j| transition[j - i] * state[j]).sum::<f64>() + fresh[i];
             }
         }
         Epoch { readout_m, u_m_s2, phi }
