@@ -45,7 +45,8 @@ fn structured(adaptation: Adaptation) -> impl FnMut() {
     };
     let mut filter = Filter::<24>::new(model(), settings);
     move || {
-        filter.step(black_box(READOUT_M), Drive { acceleration_m_s2: black_box(U_M_S2), regressors: black_box(&PHI) })
+        let next = Drive { acceleration_m_s2: black_box(U_M_S2), regressors: black_box(&PHI) };
+        filter.step(black_box(READOUT_M), next);
     }
 }
 

@@ -297,7 +297,13 @@ impl EsAkf {
             regressors.push((factor, axis, link.read(&Want::of(column))?));
         }
         let thetas = coefficients.iter().map(prior_of).collect::<Result<Vec<_>, _>>()?;
-        let model = model(&self.mission, name, thetas, &self.choices)?;
+        let has_ifo = self.mission.noise.ifo_x.is_some();
+        let usual = [if has_ifo { "ifo_x" } else { "is_x" }, "is_y", "is_z"];
+        let noise: [&str; 3] = std::array::from_fn(|i| {
+            let column = available.find(&format!("{name}.r_orf_m.{}", AXES[i]));
+            column.map(|c| c.attribute("noise")).filter(|n| !n.is_empty()).unwrap_or(usual[i])
+        });
+        let model = model(&self.mission, name, noise, thetas, &self.choices)?;
         let states = model.states();
         let filter = Akf::new(model, self.settings).ok_or_else(|| {
             PluginError::new(format!(

@@ -1,12 +1,14 @@
 //! From the mission file to the noise of the filter's model.
 
 use dragfree_physics::frames::skew;
-use dragfree_physics::mission::{Mission, MissionError};
+use dragfree_physics::mission::{DisplacementNoise, Mission, MissionError, Noise};
 use dragfree_physics::noise::NoiseShape;
 use nalgebra::Matrix3;
 
 use crate::model::{Coefficient, Model, Prior};
 use crate::shaping::Chain;
+
+const STAGE: &str = "es-akf";
 
 /// What the mission file does not say.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -27,23 +29,21 @@ pub struct Choices {
 /// stray forces, and what α̂ does not know: above the band of the wavefront sensors that is the whole torque noise,
 /// through the nominal offset. The red (`1/f²`) parts of the forces on the test mass walk with `a_b`.
 ///
+/// `readouts` names the tables under `[noise]` that belong to the readouts x, y, z.
+///
 /// # Errors
 /// [`MissionError::Missing`] when the mission has no such test mass, no readout noise or no thrust noise.
 pub fn model(
     mission: &Mission,
     test_mass: &str,
+    readouts: [&str; 3],
     coefficients: Vec<Coefficient>,
     choices: &Choices,
 ) -> Result<Model, MissionError> {
-    const STAGE: &str = "es-akf";
     let tm = mission.test_mass(test_mass, STAGE)?;
     let (noise, dt_s) = (&mission.noise, mission.dt_s());
-    let x = noise.ifo_x.as_ref().or(noise.is_x.as_ref());
-    let readouts = [
-        x.ok_or_else(|| MissionError::Missing { section: "noise.ifo_x".to_owned(), needed_by: STAGE })?.shape(),
-        Mission::need(&noise.is_y, "noise.is_y", STAGE)?.shape(),
-        Mission::need(&noise.is_z, "noise.is_z", STAGE)?.shape(),
-    ];
+    let [x, y, z] = readouts.map(|name| readout_noise(&mission.noise, name));
+    let readouts = [x?, y?, z?];
     let thrust = Mission::need(&noise.thruster_force, "noise.thruster_force", STAGE)?.shape();
     let white = |shape: Option<NoiseShape>| shape.map_or(0.0, |s| s.white_psd());
     let electrostatic = noise.electrostatic_force.as_ref().map(|n| n.shape());
@@ -73,8 +73,81 @@ pub fn model(
     })
 }
 
+fn readout_noise(noise: &Noise, name: &str) -> Result<NoiseShape, MissionError> {
+    let table = match name {
+        "ifo_x" => &noise.ifo_x,
+        "is_x" => &noise.is_x,
+        "is_y" => &noise.is_y,
+        "is_z" => &noise.is_z,
+        _ => &None,
+    };
+    Mission::need(table, &format!("noise.{name}"), STAGE).map(DisplacementNoise::shape)
+}
+
 /// Variance per second of the random walk whose one-sided PSD is the `1/f²` part of a shape, unit² s⁻¹.
 fn red_walk(shape: Option<&NoiseShape>) -> f64 {
     let terms = shape.into_iter().flat_map(NoiseShape::coloured).filter(|t| t.exponent == 2);
     terms.map(|t| 0.5 * (t.asd * std::f64::consts::TAU * t.corner_hz).powi(2)).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The paper's spacecraft with the default noise.
+    fn taiji() -> Mission {
+        let mission = serde_json::json!({
+            "mission": { "name": "Taiji", "spacecraft": "SC1", "sample_rate_hz": 10.0 },
+            "spacecraft": {
+                "mass_kg": 1500.0,
+                "inertia_srf_kg_m2": [[800.0, 13.0, 10.0], [13.0, 800.0, 12.0], [10.0, 12.0, 1000.0]],
+            },
+            "test_mass": { "tm1": {
+                "mass_kg": 1.96,
+                "orf_from_srf_angle_rad": std::f64::consts::FRAC_PI_6,
+                "offset_nominal_srf_m": [0.0, 0.18, 0.0],
+                "offset_box_srf_m": [0.02, 0.02, 0.02],
+            } },
+            "noise": {
+                "ifo_x": { "asd_m_rthz": 1.42e-12, "corner_hz": 2e-3, "exponent": 4 },
+                "is_y": { "asd_m_rthz": 1.8e-9, "corner_hz": 1e-3, "exponent": 2 },
+                "is_z": { "asd_m_rthz": 1.8e-9, "corner_hz": 1e-3, "exponent": 2 },
+                "thruster_force": { "asd_n_rthz": 1e-7 },
+                "thruster_torque": { "asd_nm_rthz": 1e-7 },
+            },
+        });
+        Mission::from_json(&mission.to_string()).expect("a mission")
+    }
+
+    fn choices(unknown_alpha: f64) -> Choices {
+        let prior = Prior { displacement_m: 1e-6, velocity_m_s: 1e-7, bias_m_s2: 1e-7 };
+        Choices { prior, bias_walk_m_s2_rts: 0.0, leak_hz: 1e-6, unknown_alpha }
+    }
+
+    /// Numbers by hand: 1e-7 N/√Hz over 1500 kg at 10 Hz, 1e-7 N m/√Hz over about 800 kg m² through 0.18 m.
+    #[test]
+    fn the_default_mission_in_numbers() {
+        let names = ["ifo_x", "is_y", "is_z"];
+        let model = |unknown| model(&taiji(), "tm1", names, vec![], &choices(unknown)).expect("complete");
+        let still = model(0.0);
+        let thrust = (1e-7_f64 / 1500.0).powi(2) * 5.0;
+        assert!((still.acceleration_m2_s4[0][0] / thrust - 1.0).abs() < 1e-5);
+        assert!((still.readout_m2[0] / ((1.42e-12_f64).powi(2) * 5.0) - 1.0).abs() < 1e-12);
+        assert_eq!(still.chains.each_ref().map(|c| c.iter().map(Chain::states).sum::<usize>()), [2, 1, 1]);
+        // −α × b with b = (0.09, 0.156, 0): along z both horizontal components act, over 800 kg m²; x and y see α_z alone.
+        let moved = model(1.0);
+        let along_z = moved.acceleration_m2_s4[2][2] - still.acceleration_m2_s4[2][2];
+        let by_hand = (1e-7_f64 / 800.0 * 0.18).powi(2) * 5.0;
+        assert!((along_z / by_hand - 1.0).abs() < 0.05, "{along_z:e} against {by_hand:e}");
+        assert!(moved.acceleration_m2_s4[0][0] - still.acceleration_m2_s4[0][0] < by_hand);
+    }
+
+    #[test]
+    fn what_is_missing_is_named() {
+        let mut mission = taiji();
+        mission.noise.is_y = None;
+        let error =
+            model(&mission, "tm1", ["ifo_x", "is_y", "is_z"], vec![], &choices(1.0)).expect_err("no noise.is_y");
+        assert!(error.to_string().contains("noise.is_y"), "{error}");
+    }
 }

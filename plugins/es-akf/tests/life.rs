@@ -118,7 +118,7 @@ fn a_missing_day_lets_sigma_grow_only_where_something_walks() {
 #[test]
 fn outliers_are_refused_and_counted() {
     let spoil = |k: usize, e: &mut Epoch| {
-        if k >= 10_000 && k % 500 == 0 {
+        if k >= 10_000 && k.is_multiple_of(500) {
             e.readout_m[k % 3] += 1e-6;
         }
     };
