@@ -1,1 +1,328 @@
-//! See ARCHITECTURE.md.
+//! Source `sim`: a day in the closed loop of a drag-free spacecraft, as telemetry and, apart from it, the truth.
+//!
+//! Truth-side physics stands here and is written from states; it shares no code with the effects that a calibration
+//! fits.
+
+pub mod housekeeping;
+pub mod imperfection;
+pub mod orbit;
+pub mod plant;
+pub mod sensors;
+pub mod simulator;
+
+use dragfree_physics::mission::Mission;
+use dragfree_sdk::prelude::*;
+use nalgebra::Vector3;
+use rand::SeedableRng;
+use rand_xoshiro::Xoshiro256PlusPlus;
+use serde::{Deserialize, Serialize};
+
+use housekeeping::{CHANNELS, Housekeeping};
+use imperfection::Imperfections;
+use simulator::{Epoch, Settings, SimulationError, Simulator};
+
+/// 2035-01-01T00:00:00, where the paper's simulation starts, Unix ns.
+const DEFAULT_START_NS: i64 = 2_051_222_400_000_000_000;
+
+/// A table and its columns in the order in which rows are pushed.
+struct Topic {
+    table: Table,
+    columns: Vec<Out>,
+}
+
+impl Topic {
+    /// Columns are given as groups: field path, names below it, unit, frame.
+    fn new(link: &mut Link<'_>, name: &str, groups: &[(&str, &[&str], &str, &str)]) -> Result<Self, PluginError> {
+        let table = link.table(name, 0.0);
+        let mut columns = Vec::new();
+        for (path, parts, unit, frame) in groups {
+            if parts.is_empty() {
+                columns.push(link.write(table, path, unit, frame)?);
+            }
+            for part in *parts {
+                columns.push(link.write(table, &format!("{path}.{part}"), unit, frame)?);
+            }
+        }
+        Ok(Self { table, columns })
+    }
+
+    fn push<'a>(&self, output: &mut Outputs, time_ns: i64, values: impl IntoIterator<Item = &'a f64>) {
+        output.time(self.table).push(time_ns);
+        for (column, value) in self.columns.iter().zip(values) {
+            output.f64(*column).push(*value);
+        }
+    }
+}
+
+struct Topics {
+    is: Topic,
+    ifo: Topic,
+    dws: Topic,
+    command: Option<Topic>,
+    ephemeris: Topic,
+    housekeeping: Vec<Topic>,
+    truth: Topic,
+}
+
+/// Status of a valid sample.
+const VALID: f64 = 0.0;
+const XYZ: &[&str] = &["x", "y", "z"];
+const ANGLES: &[&str] = &["phi", "theta", "psi"];
+
+impl Topics {
+    fn new(link: &mut Link<'_>, command: bool) -> Result<Self, PluginError> {
+        let is = Topic::new(
+            link,
+            "is",
+            &[
+                ("tm1.r_orf_m", XYZ, "m", "ORF_1"),
+                ("tm1.att_orf_rad", ANGLES, "rad", "ORF_1"),
+                ("tm1.status", &[], "", ""),
+                ("tm2.r_orf_m", XYZ, "m", "ORF_2"),
+                ("tm2.att_orf_rad", ANGLES, "rad", "ORF_2"),
+                ("tm2.status", &[], "", ""),
+            ],
+        )?;
+        let ifo = Topic::new(
+            link,
+            "ifo",
+            &[
+                ("tm1.x_orf_m", &[], "m", "ORF_1"),
+                ("tm1.status", &[], "", ""),
+                ("tm2.x_orf_m", &[], "m", "ORF_2"),
+                ("tm2.status", &[], "", ""),
+            ],
+        )?;
+        let dws = Topic::new(
+            link,
+            "dws",
+            &[
+                ("tm1.theta_orf_rad", &[], "rad", "ORF_1"),
+                ("tm1.psi_orf_rad", &[], "rad", "ORF_1"),
+                ("tm2.theta_orf_rad", &[], "rad", "ORF_2"),
+                ("tm2.psi_orf_rad", &[], "rad", "ORF_2"),
+                ("sc_crf_rad", ANGLES, "rad", "CRF"),
+                ("status", &[], "", ""),
+            ],
+        )?;
+        let command = command
+            .then(|| {
+                Topic::new(
+                    link,
+                    "command",
+                    &[
+                        ("mps_force_srf_n", XYZ, "N", "SRF"),
+                        ("mps_torque_srf_nm", XYZ, "N m", "SRF"),
+                        ("tm1.force_orf_n", XYZ, "N", "ORF_1"),
+                        ("tm1.torque_orf_nm", XYZ, "N m", "ORF_1"),
+                        ("tm2.force_orf_n", XYZ, "N", "ORF_2"),
+                        ("tm2.torque_orf_nm", XYZ, "N m", "ORF_2"),
+                    ],
+                )
+            })
+            .transpose()?;
+        let ephemeris = Topic::new(
+            link,
+            "ephemeris",
+            &[
+                ("r_sc_irf_m", XYZ, "m", "IRF"),
+                ("v_sc_irf_m_s", XYZ, "m s-1", "IRF"),
+                ("omega_crf_rad_s", XYZ, "rad s-1", "CRF"),
+                ("alpha_crf_rad_s2", XYZ, "rad s-2", "CRF"),
+                ("sun_srf", XYZ, "1", "SRF"),
+            ],
+        )?;
+        let housekeeping = CHANNELS
+            .iter()
+            .map(|c| {
+                let table = link.table(format!("hk/{}", c.name), 0.0);
+                let rate = c.rate_hz.to_string();
+                let attributes = [("place", c.place), ("rate_hz", rate.as_str())];
+                Ok(Topic { table, columns: vec![link.write_with(table, "value", c.unit, "", &attributes)?] })
+            })
+            .collect::<Result<_, PluginError>>()?;
+        let truth = Topic::new(
+            link,
+            "truth",
+            &[
+                ("r1_orf_m", XYZ, "m", "ORF_1"),
+                ("r2_orf_m", XYZ, "m", "ORF_2"),
+                ("sc_crf_rad", ANGLES, "rad", "CRF"),
+                ("omega_srf_rad_s", XYZ, "rad s-1", "SRF"),
+                ("alpha_srf_rad_s2", XYZ, "rad s-2", "SRF"),
+                ("b1_orf_m", XYZ, "m", "ORF_1"),
+                ("b2_orf_m", XYZ, "m", "ORF_2"),
+                ("nongrav_accel_srf_m_s2", XYZ, "m s-2", "SRF"),
+            ],
+        )?;
+        Ok(Self { is, ifo, dws, command, ephemeris, housekeeping, truth })
+    }
+
+    fn push(&self, e: &Epoch, offsets_orf_m: &[Vector3<f64>; 2], output: &mut Outputs) {
+        let (t, m, c) = (e.time_ns, &e.measured, &e.command);
+        let is = (0..2).flat_map(|i| m.is_r_orf_m[i].iter().chain(m.is_att_orf_rad[i].iter()).chain([&VALID]));
+        self.is.push(output, t, is);
+        self.ifo.push(output, t, m.ifo_x_orf_m.iter().flat_map(|x| [x, &VALID]));
+        self.dws.push(output, t, m.dws_orf_rad.iter().flatten().chain(m.dws_sc_crf_rad.iter()).chain([&VALID]));
+        if let Some(topic) = &self.command {
+            let tm = c.tm.iter().flat_map(|tm| tm.force_orf_n.iter().chain(tm.torque_orf_nm.iter()));
+            topic.push(output, t, c.mps_force_srf_n.iter().chain(c.mps_torque_srf_nm.iter()).chain(tm));
+        }
+        if let Some(p) = &e.ephemeris {
+            let vectors = [&p.r_sc_irf_m, &p.v_sc_irf_m_s, &p.omega_crf_rad_s, &p.alpha_crf_rad_s2, &p.sun_srf];
+            self.ephemeris.push(output, t, vectors.into_iter().flat_map(|v| v.iter()));
+        }
+        let truth = &e.truth;
+        let vectors = [
+            &truth.r_orf_m[0],
+            &truth.r_orf_m[1],
+            &truth.sc_crf_rad,
+            &truth.omega_srf_rad_s,
+            &truth.alpha_srf_rad_s2,
+            &offsets_orf_m[0],
+            &offsets_orf_m[1],
+            &truth.nongrav_srf_m_s2,
+        ];
+        self.truth.push(output, t, vectors.into_iter().flat_map(|v| v.iter()));
+    }
+}
+
+/// The source.
+pub struct Sim {
+    simulator: Simulator,
+    housekeeping: Housekeeping,
+    telemeter_command: bool,
+    end_ns: i64,
+    topics: Option<Topics>,
+    identity: [(&'static str, String); 3],
+    epochs: u64,
+}
+
+#[derive(Serialize, Deserialize)]
+struct Saved {
+    simulator: Vec<u8>,
+    housekeeping: (Xoshiro256PlusPlus, Vec<f64>, f64),
+    epochs: u64,
+}
+
+fn refuse(error: SimulationError) -> PluginError {
+    match error {
+        // A lost loop stays lost.
+        SimulationError::Diverged { .. } => PluginError::fatal(error.to_string()),
+        other => PluginError::from(other),
+    }
+}
+
+impl Source for Sim {
+    const MANIFEST: Manifest = Manifest {
+        id: "sim",
+        version: env!("CARGO_PKG_VERSION"),
+        licence: "MIT OR Apache-2.0",
+        description: "Simulates the closed loop of a drag-free spacecraft with two test masses",
+        parameters: &[
+            Parameter::i64("seed", "", 1, 0..=i64::MAX, "seed of everything random"),
+            Parameter::f64_list(
+                "com_offset_srf_m",
+                "m",
+                &[0.001, 0.0, 0.0],
+                "both housings against the drawings, seen from the centre of mass, SRF",
+            ),
+            Parameter::bool("command", true, "telemeter /command"),
+            Parameter::f64("stiffness_error", "1", 0.2, 0.0..=0.9, "largest relative error of the mission's stiffness"),
+            Parameter::f64("settle_s", "s", 600.0, 0.0..=86_400.0, "how long the loop runs before the first sample"),
+            Parameter::text_list(
+                "effects",
+                &[],
+                "ID:INSTANCE=SIZE of es-gain, es-crosstalk, mps-gain, mps-tilt, torque-gain",
+            ),
+        ],
+        instances: &[],
+    };
+
+    fn new(setup: &Setup) -> Result<Self, PluginError> {
+        let mission = Mission::from_json(setup.mission_json())?;
+        let end_ns = setup.end_ns().ok_or_else(|| {
+            PluginError::new("the simulator has no end; give the run a time window, as --hours 6 does")
+        })?;
+        let start_ns = setup.start_ns().unwrap_or(DEFAULT_START_NS);
+        let offset: [f64; 3] = setup.f64_list("com_offset_srf_m")?.try_into().map_err(|given: Vec<f64>| {
+            PluginError::new(format!(
+                "parameter com_offset_srf_m = {given:?} must have three components, x, y, z of SRF"
+            ))
+        })?;
+        let settings = Settings {
+            seed: setup.i64("seed")?.cast_unsigned(),
+            start_ns,
+            settle_s: setup.f64("settle_s")?,
+            com_offset_srf_m: Vector3::from(offset),
+            stiffness_error: setup.f64("stiffness_error")?,
+            imperfections: Imperfections::parse(&setup.text_list("effects")?)?,
+        };
+        // The third stream of the seed; the loop takes the first two.
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(settings.seed);
+        rng.long_jump();
+        Ok(Self {
+            housekeeping: Housekeeping::new(mission.dt_s(), rng),
+            simulator: Simulator::new(&mission, settings).map_err(refuse)?,
+            telemeter_command: setup.bool("command")?,
+            end_ns,
+            topics: None,
+            identity: [
+                ("time_scale", "UTC".to_owned()),
+                ("mission", mission.mission.name),
+                ("spacecraft", mission.mission.spacecraft),
+            ],
+            epochs: 0,
+        })
+    }
+
+    fn link(&mut self, link: &mut Link<'_>) -> Result<(), PluginError> {
+        self.topics = Some(Topics::new(link, self.telemeter_command)?);
+        Ok(())
+    }
+
+    fn next(&mut self, rows: usize, output: &mut Outputs) -> Result<Progress, PluginError> {
+        let Some(topics) = &self.topics else { return Err(PluginError::error("next before link")) };
+        let bodies = &self.simulator.plant().tm;
+        let offsets = std::array::from_fn(|i| bodies[i].dcm_orf_from_srf * bodies[i].offset_srf_m);
+        for _ in 0..rows {
+            if self.simulator.time_ns() >= self.end_ns {
+                break;
+            }
+            let epoch = self.simulator.step().map_err(refuse)?;
+            topics.push(&epoch, &offsets, output);
+            for (i, value) in self.housekeeping.step(epoch.index, &epoch.command) {
+                topics.housekeeping[i].push(output, epoch.time_ns, [&value]);
+            }
+            self.epochs += 1;
+        }
+        let next_ns = self.simulator.time_ns();
+        Ok(Progress { complete_until_ns: next_ns, done: next_ns >= self.end_ns })
+    }
+
+    fn report(&mut self) -> Result<Report, PluginError> {
+        let quality = self.identity.iter().map(|(k, v)| ((*k).to_owned(), v.clone().into())).collect();
+        Ok(Report { counts: [("epochs".to_owned(), self.epochs)].into(), quality, ..Report::default() })
+    }
+
+    fn save(&self) -> Result<Vec<u8>, PluginError> {
+        let saved = Saved {
+            simulator: self.simulator.save().map_err(refuse)?,
+            housekeeping: self.housekeeping.state(),
+            epochs: self.epochs,
+        };
+        Ok(serde_json::to_vec(&saved)?)
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
+        let saved: Saved = serde_json::from_slice(state)?;
+        self.simulator.load(&saved.simulator).map_err(refuse)?;
+        if !self.housekeeping.set_state(saved.housekeeping) {
+            return Err(PluginError::error("state of the simulator: its housekeeping is another version's"));
+        }
+        self.epochs = saved.epochs;
+        Ok(())
+    }
+}
+
+export_plugin!(sources: [Sim]);

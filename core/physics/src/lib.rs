@@ -3,8 +3,10 @@
 //! Everything is SI. Names carry frame and unit; `dcm_a_from_b` takes components in B to components in A
 //! (the paper's `T_B^A`).
 
+pub mod attitude;
 pub mod control;
 pub mod control_design;
 pub mod frames;
 pub mod mission;
 pub mod noise;
+pub mod process;

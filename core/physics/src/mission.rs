@@ -505,15 +505,23 @@ impl TestMass {
         matrix(&self.stiffness_tr_orf_m_s2_rad)
     }
 
-    /// `J_m⁻¹`, MRF, kg⁻¹ m⁻².
+    /// `J_m`, MRF, kg m².
     ///
     /// # Errors
     /// [`MissionError::Missing`] when the mission gives no inertia; `name` is the section's.
-    pub fn inertia_inverse(&self, name: &str, needed_by: &'static str) -> Result<Matrix3<f64>, MissionError> {
+    pub fn inertia(&self, name: &str, needed_by: &'static str) -> Result<Matrix3<f64>, MissionError> {
         self.inertia_mrf_kg_m2
             .as_ref()
-            .map(|rows| inverse(matrix(rows)))
+            .map(matrix)
             .ok_or_else(|| MissionError::Missing { section: format!("test_mass.{name}.inertia_mrf_kg_m2"), needed_by })
+    }
+
+    /// `J_m⁻¹`, MRF, kg⁻¹ m⁻².
+    ///
+    /// # Errors
+    /// As [`Self::inertia`].
+    pub fn inertia_inverse(&self, name: &str, needed_by: &'static str) -> Result<Matrix3<f64>, MissionError> {
+        self.inertia(name, needed_by).map(inverse)
     }
 
     /// `S_RT = m J_m⁻¹ S_TRᵀ`, rad s⁻² per m: force and torque come from one potential.

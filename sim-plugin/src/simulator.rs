@@ -1,0 +1,385 @@
+//! The closed loop, epoch by epoch: measure, command, act.
+
+use dragfree_physics::attitude::{dcm, rotation_vector};
+use dragfree_physics::control::{Command, ControlLaw};
+use dragfree_physics::mission::{Mission, MissionError};
+use dragfree_physics::process::normal;
+use nalgebra::{Matrix3, Vector3};
+use rand::{RngExt, SeedableRng};
+use rand_xoshiro::Xoshiro256PlusPlus;
+use serde::{Deserialize, Serialize};
+
+use crate::imperfection::Imperfections;
+use crate::orbit::Environment;
+use crate::plant::{Loads, Outside, Plant, STATE_NUMBERS, State};
+use crate::sensors::{Measured, Noises};
+
+/// Spread of the first displacements and angles, as the instruments show them, m and rad (the paper).
+const INITIAL_SIGMA: f64 = 5e-8;
+/// Largest self-gravity left over along x, then y and z, m/s² (LISA Pathfinder).
+const SELF_GRAVITY_M_S2: [f64; 3] = [3e-10, 1e-9, 1e-9];
+/// Largest angular acceleration by self-gravity, rad/s².
+const SELF_GRAVITY_RAD_S2: f64 = 5e-9;
+/// Seconds between packets of `/ephemeris`.
+const EPHEMERIS_S: f64 = 60.0;
+/// Beyond these the loop is lost, m and rad.
+const LOST_M: f64 = 1e-3;
+const LOST_RAD: f64 = 0.1;
+
+/// Why a simulation cannot go on.
+#[derive(Debug, thiserror::Error)]
+pub enum SimulationError {
+    /// The mission file does not do.
+    #[error(transparent)]
+    Mission(#[from] MissionError),
+    /// A parameter has no sense.
+    #[error("{0}")]
+    Parameter(String),
+    /// The loop diverged.
+    #[error(
+        "the loop diverged {elapsed_s} s after the start of the simulation: {what} = {value:e} {unit}; \
+         check [control], [actuators] and the sizes of the effects"
+    )]
+    Diverged {
+        /// Seconds since the loop was closed.
+        elapsed_s: f64,
+        /// Body and axis.
+        what: String,
+        /// The value.
+        value: f64,
+        /// Its unit.
+        unit: &'static str,
+    },
+    /// A saved state is another simulation's.
+    #[error("state of the simulator: {0}; it was saved with another mission or parameters")]
+    State(String),
+}
+
+/// What a simulation is asked for, besides the mission.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// Seed of everything random.
+    pub seed: u64,
+    /// First epoch, Unix ns.
+    pub start_ns: i64,
+    /// Seconds that the loop runs before the first epoch.
+    pub settle_s: f64,
+    /// Where the housings truly are, against the drawings, relative to the centre of mass, SRF, m.
+    pub com_offset_srf_m: Vector3<f64>,
+    /// Largest relative error of a stiffness element.
+    pub stiffness_error: f64,
+    /// What the actuators make of a command.
+    pub imperfections: Imperfections,
+}
+
+/// One epoch of the loop.
+#[derive(Clone, Debug)]
+pub struct Epoch {
+    /// Number of the epoch.
+    pub index: i64,
+    /// Its time `t_k`, Unix ns.
+    pub time_ns: i64,
+    /// Readouts at `t_k`.
+    pub measured: Measured,
+    /// What was commanded over `[t_k, t_{k+1})`.
+    pub command: Command,
+    /// The truth at `t_k`; α and `a_ng` as means over `[t_k, t_{k+1})`.
+    pub truth: Truth,
+    /// The `/ephemeris` packet of this epoch, when it has one.
+    pub ephemeris: Option<Ephemeris>,
+}
+
+/// True states.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Truth {
+    /// Displacements, ORF, m.
+    pub r_orf_m: [Vector3<f64>; 2],
+    /// Attitude relative to CRF, rad.
+    pub sc_crf_rad: Vector3<f64>,
+    /// `ω_SI`, SRF, rad/s.
+    pub omega_srf_rad_s: Vector3<f64>,
+    /// Mean `α`, SRF, rad/s².
+    pub alpha_srf_rad_s2: Vector3<f64>,
+    /// Mean non-gravitational acceleration, SRF, m/s².
+    pub nongrav_srf_m_s2: Vector3<f64>,
+}
+
+/// What the ground tells about orbit and pointing.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ephemeris {
+    /// Determined position, IRF, m.
+    pub r_sc_irf_m: Vector3<f64>,
+    /// Velocity, IRF, m/s.
+    pub v_sc_irf_m_s: Vector3<f64>,
+    /// `ω_CI`, CRF, rad/s.
+    pub omega_crf_rad_s: Vector3<f64>,
+    /// `ω̇_CI`, CRF, rad/s².
+    pub alpha_crf_rad_s2: Vector3<f64>,
+    /// Unit vector from the Sun to the spacecraft, SRF taken as CRF.
+    pub sun_srf: Vector3<f64>,
+}
+
+/// The running loop.
+pub struct Simulator {
+    settings: Settings,
+    dt_s: f64,
+    ephemeris_every: i64,
+    /// Epoch of the first sample, before zero by the settling time.
+    first: i64,
+    plant: Plant,
+    law: ControlLaw,
+    noises: Noises,
+    rng: Xoshiro256PlusPlus,
+    /// `k_dSC` and its arm.
+    sunlight: Option<(f64, Vector3<f64>)>,
+    /// Constant acceleration and angular acceleration of each test mass by self-gravity.
+    self_gravity: [(Vector3<f64>, Vector3<f64>); 2],
+    /// Error of the determined orbit in Hill's sense of fixed axes: its effect on the Sun's direction, CRF.
+    orbit_error_irf_m: Vector3<f64>,
+    sun_error_crf: Vector3<f64>,
+    state: State,
+    index: i64,
+    /// Surroundings at the last packet, and the epoch of it.
+    environment: Environment,
+    environment_index: i64,
+}
+
+/// Everything that changes while the loop runs.
+#[derive(Serialize, Deserialize)]
+struct Snapshot {
+    index: i64,
+    environment_index: i64,
+    rng: Xoshiro256PlusPlus,
+    state: Vec<f64>,
+    noises: Vec<f64>,
+    law: Vec<f64>,
+}
+
+impl Simulator {
+    /// Closes the loop and lets it settle.
+    ///
+    /// # Errors
+    /// [`SimulationError`]: a section is missing, or the loop diverges while it settles.
+    pub fn new(mission: &Mission, settings: Settings) -> Result<Self, SimulationError> {
+        // One stream for what is drawn once and one for the noise: a parameter changes no noise.
+        let mut once = Xoshiro256PlusPlus::seed_from_u64(settings.seed);
+        let mut rng = once.clone();
+        rng.jump();
+
+        let range = settings.stiffness_error;
+        let stiffness = std::array::from_fn(|_| {
+            std::array::from_fn(|_| Matrix3::from_fn(|_, _| 1.0 + range * (2.0 * once.random::<f64>() - 1.0)))
+        });
+        let plant = Plant::new(mission, &settings.com_offset_srf_m, &stiffness)?;
+        let mut uniform = |limit: f64| limit * (2.0 * once.random::<f64>() - 1.0);
+        let self_gravity = std::array::from_fn(|_| {
+            let a = Vector3::from_fn(|i, _| uniform(SELF_GRAVITY_M_S2[i]));
+            (a, Vector3::from_fn(|_, _| uniform(SELF_GRAVITY_RAD_S2)))
+        });
+        let orbit_sigma = mission.solar_pressure.as_ref().map_or(0.0, |s| s.orbit_error_m);
+        let mut gauss = |sigma: f64| Vector3::from_fn(|_, _| sigma * normal(&mut once));
+        let orbit_error_irf_m = gauss(orbit_sigma);
+        // The orbit's error is as large along every axis, so its components in CRF are as good a draw.
+        let sun_error_crf = gauss(orbit_sigma);
+        let [sc, r1, a1, r2, a2] = std::array::from_fn(|_| gauss(INITIAL_SIGMA));
+
+        let mut noises = Noises::new(mission)?;
+        noises.start(&mut rng);
+        let shown = noises.slow_readout();
+
+        let dt_s = mission.dt_s();
+        let first = -(settings.settle_s / dt_s).round() as i64;
+        let environment = Environment::at(epoch_ns(settings.start_ns, first, dt_s));
+        let outside = Outside {
+            omega_crf_rad_s: environment.omega_crf_rad_s,
+            alpha_crf_rad_s2: environment.alpha_crf_rad_s2,
+            gradient_srf_s2: environment.gradient_crf_s2,
+        };
+        let tm = [(r1, a1), (r2, a2)];
+        let at = std::array::from_fn(|i| (tm[i].0 - shown.tm[i].r_orf_m, tm[i].1 - shown.tm[i].att_orf_rad));
+        let state = State::at_rest(&(sc - shown.sc_crf_rad), &at, &plant, &outside);
+        let mut simulator = Self {
+            dt_s,
+            ephemeris_every: (EPHEMERIS_S / dt_s).round().max(1.0) as i64,
+            first,
+            plant,
+            law: ControlLaw::new(mission)?,
+            noises,
+            rng,
+            sunlight: mission.solar_pressure.as_ref().map(|s| (s.force_n, Vector3::from(s.arm_srf_m))),
+            self_gravity,
+            orbit_error_irf_m,
+            sun_error_crf,
+            state,
+            index: first,
+            environment,
+            environment_index: first,
+            settings,
+        };
+        while simulator.index < 0 {
+            simulator.step()?;
+        }
+        Ok(simulator)
+    }
+
+    /// Time of the coming epoch, Unix ns.
+    #[must_use]
+    pub fn time_ns(&self) -> i64 {
+        epoch_ns(self.settings.start_ns, self.index, self.dt_s)
+    }
+
+    /// The true plant, for the constants of the truth and for tests.
+    #[must_use]
+    pub fn plant(&self) -> &Plant {
+        &self.plant
+    }
+
+    /// Runs one epoch.
+    ///
+    /// # Errors
+    /// [`SimulationError::Diverged`].
+    pub fn step(&mut self) -> Result<Epoch, SimulationError> {
+        let (index, time_ns) = (self.index, self.time_ns());
+        let packet = index.rem_euclid(self.ephemeris_every) == 0;
+        if packet {
+            self.environment = Environment::at(time_ns);
+            self.environment_index = index;
+        }
+        let ephemeris = self.ephemeris();
+        let measured = self.noises.measure(&self.state, &mut self.rng);
+        let command = self.law.step(&measured.readout(Some(ephemeris.sun_srf)));
+        let (loads, outside) = (self.loads(&command), self.outside());
+        let before = self.state;
+        let means = self.plant.step(&mut self.state, &loads, &outside, self.dt_s);
+        self.index += 1;
+        self.check()?;
+        Ok(Epoch {
+            index,
+            time_ns,
+            measured,
+            command,
+            truth: Truth {
+                r_orf_m: [before.tm[0].r_orf_m, before.tm[1].r_orf_m],
+                sc_crf_rad: before.sc_crf_rad(),
+                omega_srf_rad_s: before.omega_srf_rad_s,
+                alpha_srf_rad_s2: means.alpha_srf_rad_s2,
+                nongrav_srf_m_s2: means.nongrav_srf_m_s2,
+            },
+            ephemeris: packet.then_some(ephemeris),
+        })
+    }
+
+    /// The last packet.
+    fn ephemeris(&self) -> Ephemeris {
+        let e = &self.environment;
+        let distance_m = e.r_sc_irf_m.norm();
+        Ephemeris {
+            r_sc_irf_m: e.r_sc_irf_m + self.orbit_error_irf_m,
+            v_sc_irf_m_s: e.v_sc_irf_m_s,
+            omega_crf_rad_s: e.omega_crf_rad_s,
+            alpha_crf_rad_s2: e.alpha_crf_rad_s2,
+            sun_srf: (e.sun_crf + self.sun_error_crf / distance_m).normalize(),
+        }
+    }
+
+    /// The surroundings now. `ω_CI` moves on linearly from the last packet, wrong by 1e-17 rad/s after a minute; `Γ`
+    /// is held, wrong by 1e-19 m/s² at a test mass.
+    fn outside(&self) -> Outside {
+        let e = &self.environment;
+        let since_s = (self.index - self.environment_index) as f64 * self.dt_s;
+        let srf_from_crf = dcm(&self.state.q_srf_from_crf);
+        Outside {
+            omega_crf_rad_s: e.omega_crf_rad_s + e.alpha_crf_rad_s2 * since_s,
+            alpha_crf_rad_s2: e.alpha_crf_rad_s2,
+            gradient_srf_s2: srf_from_crf * e.gradient_crf_s2 * srf_from_crf.transpose(),
+        }
+    }
+
+    /// What truly acts over the coming sample.
+    fn loads(&mut self, command: &Command) -> Loads {
+        let acting = self.settings.imperfections.act(command);
+        let mut loads =
+            Loads { force_srf_n: acting.mps_force_srf_n, torque_srf_nm: acting.mps_torque_srf_nm, ..Loads::default() };
+        for (i, load) in loads.tm.iter_mut().enumerate() {
+            load.force_orf_n = acting.tm[i].force_orf_n;
+            load.torque_orf_nm = acting.tm[i].torque_orf_nm;
+            (load.acceleration_orf_m_s2, load.angular_acceleration_orf_rad_s2) = self.self_gravity[i];
+        }
+        let flicker_n = self.noises.disturb(&mut loads, &mut self.rng);
+        if let Some((force_n, arm)) = &self.sunlight {
+            // eq:SRP_transfer_function and eq:SRP_torque; the printed matrix is the arm's cross product.
+            let force = dcm(&self.state.q_srf_from_crf) * self.environment.sun_crf * (force_n + flicker_n);
+            loads.force_srf_n += force;
+            loads.torque_srf_nm += arm.cross(&force);
+        }
+        loads
+    }
+
+    fn check(&self) -> Result<(), SimulationError> {
+        // A NaN fails every comparison, so ask for what is well.
+        let worst = |v: &Vector3<f64>, limit: f64| (0..3).find(|i| !(v[*i].abs() <= limit)).map(|i| (i, v[i]));
+        let lost = |what: String, value: f64, unit: &'static str| SimulationError::Diverged {
+            elapsed_s: (self.index - self.first) as f64 * self.dt_s,
+            what,
+            value,
+            unit,
+        };
+        const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
+        for (i, tm) in self.state.tm.iter().enumerate() {
+            if let Some((axis, value)) = worst(&tm.r_orf_m, LOST_M) {
+                return Err(lost(format!("tm{}.{}", i + 1, ["x", "y", "z"][axis]), value, "m"));
+            }
+            if let Some((axis, value)) = worst(&rotation_vector(&tm.q_mrf_from_orf), LOST_RAD) {
+                return Err(lost(format!("tm{}.{}", i + 1, ANGLES[axis]), value, "rad"));
+            }
+        }
+        match worst(&self.state.sc_crf_rad(), LOST_RAD) {
+            Some((axis, value)) => Err(lost(format!("sc.{}", ANGLES[axis]), value, "rad")),
+            None => Ok(()),
+        }
+    }
+
+    /// The state as JSON, which keeps every bit of a float.
+    ///
+    /// # Errors
+    /// Never in practice: no number of a running loop is infinite.
+    pub fn save(&self) -> Result<Vec<u8>, SimulationError> {
+        let snapshot = Snapshot {
+            index: self.index,
+            environment_index: self.environment_index,
+            rng: self.rng.clone(),
+            state: self.state.to_numbers(),
+            noises: self.noises.states(),
+            law: self.law.state(),
+        };
+        serde_json::to_vec(&snapshot).map_err(|e| SimulationError::State(e.to_string()))
+    }
+
+    /// Takes a state back.
+    ///
+    /// # Errors
+    /// [`SimulationError::State`] when the bytes are not a state of this simulation.
+    pub fn load(&mut self, bytes: &[u8]) -> Result<(), SimulationError> {
+        let refuse = |what: &str| SimulationError::State(what.to_owned());
+        let snapshot: Snapshot = serde_json::from_slice(bytes).map_err(|e| refuse(&e.to_string()))?;
+        let numbers: &[f64; STATE_NUMBERS] =
+            snapshot.state.as_slice().try_into().map_err(|_| refuse("the plant has other states"))?;
+        if !self.noises.set_states(&snapshot.noises) {
+            return Err(refuse("the noise has other states"));
+        }
+        self.law.set_state(&snapshot.law).map_err(|e| refuse(&e.to_string()))?;
+        self.state = State::from_numbers(numbers);
+        (self.index, self.environment_index, self.rng) = (snapshot.index, snapshot.environment_index, snapshot.rng);
+        self.environment = Environment::at(epoch_ns(self.settings.start_ns, self.environment_index, self.dt_s));
+        Ok(())
+    }
+}
+
+/// Time of an epoch, Unix ns, to the nearest nanosecond whatever the rate.
+fn epoch_ns(start_ns: i64, index: i64, dt_s: f64) -> i64 {
+    // Whole seconds apart from the rest: 25 days in ns leave no fraction to a float.
+    let rate_hz = 1.0 / dt_s;
+    let seconds = (index as f64 / rate_hz).floor();
+    let rest_s = (index as f64 - seconds * rate_hz) / rate_hz;
+    start_ns + seconds as i64 * 1_000_000_000 + (rest_s * 1e9).round() as i64
+}
