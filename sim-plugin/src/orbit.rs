@@ -11,7 +11,7 @@ const AU_M: f64 = 149_597_870_700.0;
 /// Gravitational parameter of the Sun, m³ s⁻² (DE440).
 const MU_SUN_M3_S2: f64 = 1.327_124_400_412_794_2e20;
 /// Gravitational parameter of the Earth, m³ s⁻² (DE440).
-const MU_EARTH_M3_S2: f64 = 3.986_004_355_070_226_6e14;
+const MU_EARTH_M3_S2: f64 = 3.986_004_355_070_226e14;
 /// J2000, 2000-01-01T12:00, Unix s.
 const J2000_UNIX_S: i64 = 946_728_000;
 /// Mean longitude of the Earth at J2000, rad.

@@ -316,8 +316,8 @@ impl Simulator {
     }
 
     fn check(&self) -> Result<(), SimulationError> {
-        // A NaN fails every comparison, so ask for what is well.
-        let worst = |v: &Vector3<f64>, limit: f64| (0..3).find(|i| !(v[*i].abs() <= limit)).map(|i| (i, v[i]));
+        let worst =
+            |v: &Vector3<f64>, limit: f64| (0..3).find(|i| v[*i].is_nan() || v[*i].abs() > limit).map(|i| (i, v[i]));
         let lost = |what: String, value: f64, unit: &'static str| SimulationError::Diverged {
             elapsed_s: (self.index - self.first) as f64 * self.dt_s,
             what,

@@ -11,20 +11,20 @@ use crate::mission::{CHANNELS, ChannelController, Mission, MissionError};
 const NEEDED_BY: &str = "the default control design";
 
 /// Factor between `ω_c²` and disturbance over requirement. A double integrator under the controller below answers a
-/// white acceleration with at most about `5/ω_c²`, so 15 keeps the disturbance's part at a third of the requirement.
-const BANDWIDTH_MARGIN: f64 = 15.0;
+/// white acceleration with at most about `5/ω_c²`, so 12 keeps the disturbance's part at two fifths of the requirement.
+const BANDWIDTH_MARGIN: f64 = 12.0;
 /// Corners of the controller in units of `ω_c`: integral action, derivative action, roll-off (twice).
-const INTEGRAL: f64 = 1.0 / 20.0;
+const INTEGRAL: f64 = 1.0 / 30.0;
 const DERIVATIVE: f64 = 1.0 / 5.0;
-const ROLL_OFF: f64 = 8.0;
+const ROLL_OFF: f64 = 6.0;
 
 /// Loop-shaping design: one PID with a doubly filtered derivative per channel, for the plant `1/s²` that the static
 /// decoupling leaves (eq:decoupled_dynamics).
 ///
-/// `K(s) = k (s + ω_c/20)(s + ω_c/5)/s · (8ω_c)²/(s + 8ω_c)²`, `|K(iω_c)| = ω_c²`, Tustin at the mission's sample rate.
-/// The crossover follows from the requirement table and the thrusters' noise, `ω_c² = 15 d/requirement` with `d` the
+/// `K(s) = k (s + ω_c/30)(s + ω_c/5)/s · (6ω_c)²/(s + 6ω_c)²`, `|K(iω_c)| = ω_c²`, Tustin at the mission's sample rate.
+/// The crossover follows from the requirement table and the thrusters' noise, `ω_c² = 12 d/requirement` with `d` the
 /// ASD of the acceleration that disturbs the channel, and stays below a sixtieth of the sample rate, where the hold
-/// and one sample of delay cost nine degrees. Phase margins are 55° to 61°.
+/// and one sample of delay cost nine degrees. Phase margins are 53° to 57°.
 ///
 /// # Errors
 /// [`MissionError::Missing`] without `[requirements]` or the noise of the thrusters and electrodes.

@@ -1,0 +1,188 @@
+//! The source across the border, as the engine drives it.
+
+use dragfree_engine::border::{Config, Instance, Kind, Library, LinkRequest};
+use dragfree_engine::config::Mission;
+use dragfree_engine::table::{Batch, TableSpec};
+use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
+
+const START_NS: i64 = 2_051_222_400_000_000_000;
+
+fn root() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
+}
+
+/// The shared library lies beside the folder of the test's own program.
+fn library() -> Library {
+    let folder = std::env::current_exe().unwrap().parent().unwrap().parent().unwrap().to_owned();
+    let name = format!("{}dragfree_sim{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
+    Library::open(&folder.join(name)).unwrap()
+}
+
+fn config(seconds: i64, change: impl Fn(&mut Value, &mut Value)) -> Config {
+    let text = std::fs::read_to_string(root().join("fixtures/missions/taiji.toml")).unwrap();
+    let mut mission: Value = toml::from_str(&text).unwrap();
+    let mut parameters = json!({
+        "seed": 5, "com_offset_srf_m": [0.001, 0.0, 0.0], "command": true, "stiffness_error": 0.2, "settle_s": 60.0,
+        "effects": []
+    });
+    change(&mut mission, &mut parameters);
+    let value = json!({
+        "parameters": parameters, "mission": mission, "instance": "", "files": [],
+        "start_ns": START_NS, "end_ns": START_NS + seconds * 1_000_000_000
+    });
+    Config { value }
+}
+
+fn create(library: &Library, config: &Config) -> Result<Instance, String> {
+    let plugin = library.plugins.iter().find(|p| p.kind == Kind::Source && p.manifest.id == "sim").unwrap();
+    Instance::create(library, plugin, config).map_err(|e| e.to_string())
+}
+
+fn linked(library: &Library, config: &Config) -> (Instance, Vec<TableSpec>) {
+    let mut sim = create(library, config).unwrap();
+    let linked = sim.link(LinkRequest { available: &[], model_json: "{}" }).unwrap();
+    sim.activate(65_536).unwrap();
+    (sim, linked.writes)
+}
+
+fn append(all: &mut [Batch], batches: Vec<Batch>) {
+    for (whole, part) in all.iter_mut().zip(batches) {
+        whole.time_ns.extend(part.time_ns);
+        for (w, p) in whole.columns.iter_mut().zip(part.columns) {
+            w.extend(p);
+        }
+    }
+}
+
+/// Everything a source gives, in batches of `rows`.
+fn run(library: &Library, config: &Config, rows: u32) -> (Vec<TableSpec>, Vec<Batch>) {
+    let (mut sim, tables) = linked(library, config);
+    let mut all: Vec<Batch> = tables.iter().map(|t| Batch::empty(t.columns.len())).collect();
+    loop {
+        let step = sim.next(rows).unwrap();
+        assert!(step.batches.iter().flat_map(|b| b.time_ns.last()).all(|t| *t < step.complete_until_ns));
+        append(&mut all, step.batches);
+        if step.done {
+            return (tables, all);
+        }
+    }
+}
+
+#[test]
+fn rows_do_not_depend_on_the_batch_size() {
+    let library = library();
+    let config = config(300, |_, _| {});
+    let (tables, whole) = run(&library, &config, 65_536);
+    assert!(run(&library, &config, 1).1 == whole && run(&library, &config, 777).1 == whole);
+    let other = self::config(300, |_, p| p["seed"] = json!(6));
+    assert!(run(&library, &other, 777).1 != whole, "the seed matters");
+
+    let rows = |name: &str| {
+        let i = tables.iter().position(|t| t.name == name).unwrap();
+        (whole[i].time_ns.len(), whole[i].time_ns[0])
+    };
+    for (name, count) in [("is", 3000), ("ifo", 3000), ("dws", 3000), ("command", 3000), ("ephemeris", 5)] {
+        assert_eq!(rows(name), (count, START_NS), "{name}");
+    }
+    assert_eq!(rows("hk/battery_current_a"), (300, START_NS));
+    assert_eq!(rows("truth"), (3000, START_NS));
+    assert!(whole.iter().flat_map(|b| b.columns.iter().flatten()).all(|x| x.is_finite()));
+    assert!(tables.iter().all(|t| t.truth == (t.name == "truth")));
+}
+
+#[test]
+fn a_saved_state_goes_on_bit_for_bit() {
+    let library = library();
+    let config = config(200, |_, _| {});
+    let (_, whole) = run(&library, &config, 777);
+    let (mut first, tables) = linked(&library, &config);
+    let mut all: Vec<Batch> = tables.iter().map(|t| Batch::empty(t.columns.len())).collect();
+    append(&mut all, first.next(1234).unwrap().batches);
+    let state = first.save().unwrap();
+    let (mut second, _) = linked(&library, &config);
+    second.load(&state).unwrap();
+    append(&mut all, second.next(65_536).unwrap().batches);
+    assert!(all == whole);
+    assert!(second.load(&state[..state.len() / 2]).is_err() && second.load(b"{}").is_err());
+}
+
+#[test]
+fn the_command_can_be_kept_on_board() {
+    let library = library();
+    let (_, tables) = linked(&library, &config(10, |_, p| p["command"] = json!(false)));
+    assert!(!tables.iter().any(|t| t.name == "command"));
+}
+
+/// Every column is a field of telemetry.proto and every field a column.
+#[test]
+fn columns_are_the_fields_of_the_interface() {
+    let library = library();
+    let (_, tables) = linked(&library, &config(10, |_, _| {}));
+    let proto = std::fs::read_to_string(root().join("fixtures/proto/telemetry.proto")).unwrap();
+    for (table, message) in [
+        ("is", "InertialSensors"),
+        ("ifo", "Interferometers"),
+        ("dws", "Dws"),
+        ("command", "Command"),
+        ("ephemeris", "Ephemeris"),
+        ("hk/tank_mass_kg", "Scalar"),
+        ("truth", "Truth"),
+    ] {
+        let table = tables.iter().find(|t| t.name == table).unwrap();
+        let names: Vec<&str> = table.columns.iter().map(|c| c.name.as_str()).collect();
+        assert_eq!(names, fields(&proto, message), "{message}");
+    }
+}
+
+/// Leaves of a message, depth first in the order of the text; reads the simple proto3 of the interface alone.
+fn fields(proto: &str, message: &str) -> Vec<String> {
+    let body = proto.split(&format!("message {message} {{")).nth(1).unwrap().split("\n}").next().unwrap();
+    let mut out = Vec::new();
+    for line in body.lines() {
+        let mut words = line.split_whitespace();
+        let (Some(kind), Some(name), Some("=")) = (words.next(), words.next(), words.next()) else { continue };
+        if kind == "double" || kind == "uint32" {
+            out.push(name.to_owned());
+        } else {
+            out.extend(fields(proto, kind).into_iter().map(|leaf| format!("{name}.{leaf}")));
+        }
+    }
+    out
+}
+
+#[test]
+fn what_has_no_sense_is_refused_by_name() {
+    let library = library();
+    let refusal = |change: &dyn Fn(&mut Value, &mut Value)| create(&library, &config(10, change)).err().unwrap();
+    for (what, found) in [
+        ("spacecraft.mass_kg", refusal(&|m, _| m["spacecraft"]["mass_kg"] = json!(0.0))),
+        ("symmetric", refusal(&|m, _| m["spacecraft"]["inertia_srf_kg_m2"][0][1] = json!(99.0))),
+        ("test_mass.tm1.mass_kg", refusal(&|m, _| m["test_mass"]["tm1"]["mass_kg"] = json!(0.0))),
+        ("[test_mass.tm2]", refusal(&|m, _| drop(m["test_mass"].as_object_mut().unwrap().remove("tm2")))),
+        ("[noise.dws_local]", refusal(&|m, _| drop(m["noise"].as_object_mut().unwrap().remove("dws_local")))),
+        ("[requirements]", refusal(&|m, _| drop(m.as_object_mut().unwrap().remove("requirements")))),
+        ("com_offset_srf_m", refusal(&|_, p| p["com_offset_srf_m"] = json!([0.0, 1.0]))),
+        ("slosh:sc.x=0.1", refusal(&|_, p| p["effects"] = json!(["slosh:sc.x=0.1"]))),
+        ("es-gain:tm3.y=0.1", refusal(&|_, p| p["effects"] = json!(["es-gain:tm3.y=0.1"]))),
+        ("es-gain:tm1.y=much", refusal(&|_, p| p["effects"] = json!(["es-gain:tm1.y=much"]))),
+    ] {
+        assert!(found.contains(what), "{what}: {found}");
+    }
+}
+
+/// A thrust gain of −2 turns the drag-free loop into a push; the message says when and where.
+#[test]
+fn a_loop_that_diverges_says_when_and_where() {
+    let library = library();
+    let found = create(
+        &library,
+        &config(10, |_, p| {
+            p["effects"] = json!(["mps-gain:sc.x=-2"]);
+            p["settle_s"] = json!(86_400.0);
+        }),
+    )
+    .err()
+    .unwrap();
+    assert!(found.contains("diverged") && found.contains(" s after") && found.contains("tm"), "{found}");
+}
