@@ -1,0 +1,294 @@
+//! The stage as a stream: rows, gaps, states, replayed commands, the turning of CRF.
+
+mod common;
+
+use common::{AttitudeLoop, RATE_HZ, levels, mission, run, settings, stage};
+use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::Smoother;
+use dragfree_hinf_dfacs::reconstruction::{CHANNELS_AT, Epoch, Reconstruction, Row, Settings};
+use dragfree_physics::mission::Mission;
+use nalgebra::Vector3;
+use proptest::prelude::*;
+use rand::SeedableRng;
+use rand_distr::{Distribution, StandardNormal};
+use rand_xoshiro::Xoshiro256PlusPlus;
+
+/// Telemetry of the loop under the mission's noise, and the true `α`.
+fn telemetry(mission: &Mission, epochs: usize) -> (Vec<Epoch>, Vec<Vector3<f64>>) {
+    let [torque, sensing] = levels(mission).map(|psd| (0.5 * psd * RATE_HZ).sqrt());
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(22);
+    let mut gauss =
+        |sigma: f64| Vector3::from_fn(|_, _| sigma * Distribution::<f64>::sample(&StandardNormal, &mut random));
+    let mut body = AttitudeLoop::new(mission);
+    (0..epochs).map(|_| body.step(&gauss(torque), &gauss(sensing))).unzip()
+}
+
+fn bits(rows: &[Row]) -> Vec<(i64, Vec<u64>)> {
+    rows.iter().map(|r| (r.time_ns, r.values.iter().map(|v| v.to_bits()).collect())).collect()
+}
+
+fn alpha(row: &Row) -> Vector3<f64> {
+    Vector3::from_column_slice(&row.values[..3])
+}
+
+fn u1(row: &Row) -> Vector3<f64> {
+    Vector3::from_column_slice(&row.values[9..12])
+}
+
+fn rms(values: impl Iterator<Item = Vector3<f64>>) -> f64 {
+    let (sum, n) = values.fold((0.0, 0.0), |(s, n), v| (s + v.norm_squared(), n + 1.0));
+    (sum / n).sqrt()
+}
+
+fn with_replay() -> Settings {
+    Settings { replay: true, ..settings(Smoother) }
+}
+
+/// Some of everything goes missing.
+fn holes(mut epochs: Vec<Epoch>) -> Vec<Epoch> {
+    for (k, epoch) in epochs.iter_mut().enumerate() {
+        if k % 13 == 5 || (700..760).contains(&k) {
+            epoch.readout[1] = f64::NAN;
+        }
+        if k % 17 == 3 {
+            epoch.readout[9] = f64::NAN;
+        }
+        if k % 211 == 100 || (1200..1300).contains(&k) {
+            epoch.command[4] = f64::NAN;
+        }
+    }
+    epochs
+}
+
+#[test]
+fn one_row_per_epoch_in_order() {
+    let mission = mission();
+    let lag = stage(&mission, &settings(Smoother)).lag();
+    let (epochs, _) = telemetry(&mission, 4 * lag + 7);
+    for n in [0, 1, 2, 3, lag, 2 * lag - 1, 2 * lag, 2 * lag + 1, 4 * lag + 7] {
+        let rows = run(&mut stage(&mission, &settings(Smoother)), &epochs[..n]);
+        let times: Vec<_> = rows.iter().map(|r| r.time_ns).collect();
+        let want: Vec<_> = epochs[..n].iter().map(|e| e.time_ns).collect();
+        assert_eq!(times, want);
+    }
+}
+
+/// A new stage after every batch, with the state of the old one: neither the batches nor the states can be seen.
+#[test]
+fn saved_and_loaded_it_goes_on_bit_by_bit() {
+    let mission = mission();
+    let epochs = holes(telemetry(&mission, 2600).0);
+    let whole = bits(&run(&mut stage(&mission, &with_replay()), &epochs));
+    for batch in [1, 777, 2600] {
+        let mut rows = Vec::new();
+        let mut current = stage(&mission, &with_replay());
+        for epochs in epochs.chunks(batch) {
+            let mut next = stage(&mission, &with_replay());
+            next.load(&current.save()).expect("its own state");
+            assert_eq!(next.save(), current.save());
+            for epoch in epochs {
+                next.push(epoch, &mut rows).expect("the law takes its own state");
+            }
+            current = next;
+        }
+        current.finish(&mut rows);
+        assert!(bits(&rows) == whole, "batches of {batch} give other rows");
+    }
+}
+
+#[test]
+fn damaged_states_are_refused() {
+    let mission = mission();
+    let mut full = stage(&mission, &with_replay());
+    for epoch in telemetry(&mission, 50).0 {
+        full.push(&epoch, &mut Vec::new()).expect("the law takes its own state");
+    }
+    let state = full.save();
+    for length in (0..state.len()).step_by(101) {
+        assert!(stage(&mission, &with_replay()).load(&state[..length]).is_err(), "{length} of {} bytes", state.len());
+    }
+    let longer = [&state[..], &[0]].concat();
+    let refused = stage(&mission, &with_replay()).load(&longer).expect_err("it is too long");
+    assert!(refused.to_string().contains("more than belongs"), "{refused}");
+    // A stage that replays has a longer state than one that does not.
+    assert!(stage(&mission, &settings(Smoother)).load(&state).is_err());
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+    #[test]
+    fn garbage_is_refused(mut bytes in proptest::collection::vec(any::<u8>(), 0..4000), ours: bool) {
+        if ours {
+            bytes.splice(0..0, *b"dfacs/1\n");
+        }
+        prop_assert!(stage(&mission(), &settings(Smoother)).load(&bytes).is_err());
+    }
+}
+
+/// Without sensing the commands still tell the acceleration; a channel needs its three samples.
+#[test]
+fn missing_sensing_leaves_the_acceleration() {
+    let mission = mission();
+    let (mut epochs, truth) = telemetry(&mission, 3000);
+    let lost = 1500..1510;
+    for epoch in &mut epochs[lost.clone()] {
+        epoch.readout[0] = f64::NAN;
+    }
+    let mut stage = stage(&mission, &settings(Smoother));
+    let rows = run(&mut stage, &epochs);
+    for (k, row) in rows.iter().enumerate().take(2999).skip(1) {
+        assert!(row.values[..CHANNELS_AT].iter().all(|v| v.is_finite()), "epoch {k}");
+        let channel = row.values[CHANNELS_AT + 6].is_finite();
+        assert_eq!(channel, !(lost.start - 1..lost.end + 1).contains(&k), "epoch {k}");
+    }
+    assert_eq!(stage.counts().attitude_missing, 10);
+    // The error is the thrusters' noise, sensed or not, for such a short time.
+    let noise = (0.5 * levels(&mission)[0] * RATE_HZ * 3.0).sqrt() / 800.0;
+    let error = (1490..1520).map(|k| (alpha(&rows[k]) - truth[k]).norm()).fold(0.0, f64::max);
+    assert!(error < 4.0 * noise, "{error} against {noise}");
+}
+
+#[test]
+fn a_missing_command_costs_its_interval() {
+    let mission = mission();
+    let (mut epochs, truth) = telemetry(&mission, 3000);
+    epochs[1500].command[7] = f64::NAN;
+    let mut stage = stage(&mission, &settings(Smoother));
+    let rows = run(&mut stage, &epochs);
+    for (k, row) in rows.iter().enumerate().take(2999).skip(1) {
+        assert_eq!(alpha(row).x.is_finite(), k != 1500, "epoch {k}");
+        assert_eq!(u1(row).x.is_finite(), k != 1500, "epoch {k}");
+        let channels = row.values[CHANNELS_AT..].iter().filter(|v| v.is_finite()).count();
+        assert_eq!(channels, if k == 1500 || k == 1501 { 0 } else { 9 }, "epoch {k}");
+    }
+    assert_eq!(stage.counts().commands_missing, 1);
+    let noise = (0.5 * levels(&mission)[0] * RATE_HZ * 3.0).sqrt() / 800.0;
+    let near = (1400..1600).filter(|k| *k != 1500);
+    let error = near.map(|k| (alpha(&rows[k]) - truth[k]).norm()).fold(0.0, f64::max);
+    assert!(error < 5.0 * noise, "{error} against {noise}");
+}
+
+/// An hour of nothing: rows of nothing, and then as good as new.
+#[test]
+fn after_an_hour_of_nothing_it_starts_afresh() {
+    let mission = mission();
+    let (mut epochs, truth) = telemetry(&mission, 40_000);
+    for epoch in &mut epochs[2000..38_000] {
+        epoch.readout = [f64::NAN; 15];
+        epoch.command = [f64::NAN; 18];
+    }
+    let rows = run(&mut stage(&mission, &with_replay()), &epochs);
+    assert_eq!(rows.len(), epochs.len());
+    // The proven law holds lost readouts for a second, then stops.
+    assert!(rows[2000..2010].iter().all(|row| alpha(row).x.is_finite() && u1(row).x.is_finite()));
+    assert!(rows[2010..38_000].iter().all(|row| alpha(row).x.is_nan() && u1(row).x.is_nan()));
+    let error = |range: std::ops::Range<usize>| rms(range.map(|k| alpha(&rows[k]) - truth[k]));
+    // 1500 samples of three axes: 1.5 % each, so 10 % is nearly five standard deviations of the ratio.
+    let ratio = error(38_000..39_500) / error(300..1800);
+    assert!((ratio - 1.0).abs() < 0.1, "{ratio}");
+}
+
+/// Without `/command` the law stands in, and from the same start it repeats what flew.
+#[test]
+fn replayed_commands_are_the_flown_ones() {
+    let mission = mission();
+    let (mut epochs, _) = telemetry(&mission, 4000);
+    let flown = run(&mut stage(&mission, &settings(Smoother)), &epochs);
+    for epoch in &mut epochs {
+        epoch.command = [f64::NAN; 18];
+    }
+    let alone = Settings { commands: false, ..with_replay() };
+    let mut replaying = stage(&mission, &alone);
+    let rows = run(&mut replaying, &epochs);
+    assert!(rows[..600].iter().all(|row| u1(row).x.is_nan()), "the law settles for 60 s");
+    for k in 600..4000 {
+        assert_eq!(u1(&rows[k]), u1(&flown[k]), "epoch {k}");
+    }
+    assert_eq!((replaying.counts().commands_replayed, replaying.counts().commands_missing), (3400, 600));
+    assert!(replaying.comparison().is_none());
+
+    // From the middle of a flight the integrators' states are unknown: a constant torque that the wandering part takes
+    // up, here 1e-4 of what the loop commands from sample to sample.
+    let late = run(&mut stage(&mission, &alone), &epochs[1000..]);
+    let difference = rms((2000..3900).map(|k| alpha(&late[k - 1000]) - alpha(&flown[k])));
+    let size = rms((2000..3900).map(|k| alpha(&flown[k])));
+    assert!(difference < 1e-2 * size, "{difference} against {size}");
+}
+
+#[test]
+fn a_lost_command_is_filled_only_by_the_law_that_flew() {
+    let ours = mission();
+    let mut other = ours.clone();
+    if let Some(requirements) = &mut other.requirements {
+        requirements.sc_attitude_rad_rthz *= 3.0;
+    }
+    for (flying, same) in [(&ours, true), (&other, false)] {
+        let (mut epochs, _) = telemetry(flying, 4000);
+        let complete = run(&mut stage(&ours, &settings(Smoother)), &epochs);
+        for k in [500, 3000, 3001] {
+            epochs[k].command[0] = f64::NAN;
+        }
+        let mut stage = stage(&ours, &with_replay());
+        let rows = run(&mut stage, &epochs);
+        let comparison = stage.comparison().expect("both were there");
+        assert_eq!(comparison.same_law(), same, "{:?}", comparison.rms_distance());
+        assert_eq!(comparison.samples(), 4000 - 600 - 2);
+        if same {
+            assert!(comparison.rms_distance().iter().all(|d| *d < 1e-20), "{:?}", comparison.rms_distance());
+            assert!((alpha(&rows[3000]) - alpha(&complete[3000])).norm() < 1e-18);
+        }
+        let filled = stage.counts().commands_replayed;
+        assert_eq!(filled, if same { 2 } else { 0 });
+        assert_eq!(stage.counts().commands_missing, 3 - filled);
+    }
+}
+
+/// A spacecraft that follows CRF as it turns: sensing sees nothing, and the inertial motion is CRF's own.
+#[test]
+fn the_turning_of_the_constellation_is_added() {
+    let mission = mission();
+    let (omega_crf, alpha_crf) = (Vector3::new(0.0, 1e-7, 2e-7), Vector3::new(3e-13, 0.0, -2e-13));
+    let rate = Vector3::new(1e-7, 0.0, 0.0);
+    let epochs: Vec<_> = (0..3000)
+        .map(|k| {
+            let mut readout = [0.0; 15];
+            readout[0] = rate.x * f64::from(k) / RATE_HZ;
+            Epoch {
+                time_ns: i64::from(k) * 100_000_000,
+                readout,
+                command: [0.0; 18],
+                sun_srf: Vector3::from_element(f64::NAN),
+                // Once a minute; held in between.
+                omega_crf_rad_s: if k % 600 == 0 { omega_crf } else { Vector3::from_element(f64::NAN) },
+                alpha_crf_rad_s2: if k % 600 == 0 { alpha_crf } else { Vector3::from_element(f64::NAN) },
+            }
+        })
+        .collect();
+    let rows = run(&mut stage(&mission, &settings(Smoother)), &epochs);
+    // ω̇_SI = ω̇_CI − ω_SC×ω_CI = ω̇_CI − 1e-7·(0, −2e-7, 1e-7).
+    let want = alpha_crf + Vector3::new(0.0, 2e-14, -1e-14);
+    for row in &rows[1000..2000] {
+        assert!((alpha(row) - want).norm() < 1e-16, "{} against {want}", alpha(row));
+        let omega = Vector3::from_column_slice(&row.values[3..6]);
+        assert!((omega - omega_crf - rate).norm() < 1e-12, "{omega}");
+    }
+}
+
+#[test]
+fn sunlight_that_nobody_has_seen_yet_is_not_guessed() {
+    let mut mission = mission();
+    let (mut epochs, _) = telemetry(&mission, 1000);
+    mission.solar_pressure = Mission::from_json(
+        &toml::from_str::<serde_json::Value>(include_str!("../../../fixtures/missions/taiji.toml"))
+            .expect("the fixture is TOML")
+            .to_string(),
+    )
+    .expect("the fixture is a mission")
+    .solar_pressure;
+    epochs[100].sun_srf = Vector3::x();
+    let mut stage: Reconstruction = stage(&mission, &Settings { sun: true, ..settings(Smoother) });
+    let rows = run(&mut stage, &epochs);
+    assert_eq!(stage.counts().sun_missing, 100);
+    for (k, row) in rows.iter().enumerate() {
+        assert_eq!(u1(row).x.is_finite(), k >= 100, "epoch {k}");
+    }
+}
