@@ -206,8 +206,8 @@ fn replayed_commands_are_the_flown_ones() {
     assert_eq!((replaying.counts().commands_replayed, replaying.counts().commands_missing), (3400, 600));
     assert!(replaying.comparison().is_none());
 
-    // From the middle of a flight the integrators' states are unknown: a constant torque that the wandering part takes
-    // up, here 1e-4 of what the loop commands from sample to sample.
+    // From the middle of a flight the integrators' states are unknown: a constant torque, which the wandering part of
+    // the smoother's model takes up.
     let late = run(&mut stage(&mission, &alone), &epochs[1000..]);
     let difference = rms((2000..3900).map(|k| alpha(&late[k - 1000]) - alpha(&flown[k])));
     let size = rms((2000..3900).map(|k| alpha(&flown[k])));
