@@ -1,0 +1,970 @@
+//! Many irregular tables in, one uniform table out.
+//!
+//! Every decision depends on the telemetry alone, never on where a batch ends: a row is taken up when all that could
+//! bear on it has come. In order:
+//! 1. [`Series`] guards and cleans the rows of each table;
+//! 2. the opening ten minutes say which table is the reference and which tables are slow;
+//! 3. the reference lays the epochs ([`Epochs`]), the other fast tables take their places on them;
+//! 4. stuck and outlying samples are blanked in blocks of [`BLOCK`] rows;
+//! 5. slow tables are interpolated at the epochs, and the rows go out.
+
+use crate::bytes::{Reader, StateError, Writer};
+use crate::clock::{Epochs, Place, Rate};
+use crate::layout::{Mandatory, TableSpec};
+use crate::outliers::{self, BLOCK, MARGIN};
+use crate::series::{Reason, Series, Tally, Window};
+
+/// Telemetry from which rates are learnt, on both sides of the first mandatory row.
+const OPENING_NS: i64 = 600_000_000_000;
+
+/// Samples that must agree before a table's clock is said to have jumped.
+const AGREEING: usize = 20;
+
+/// Rows kept after they went out, for the outlier test of the rows that follow.
+const HISTORY: i64 = MARGIN as i64;
+
+/// Most rows that wait, and most that one call gives: an hour's gap becomes 36,000 rows at once, and a day's must not
+/// fill the memory. What is over waits for the next call.
+pub(crate) const MOST_ROWS: i64 = 65_536;
+
+/// What can be set.
+#[derive(Clone, Debug)]
+pub(crate) struct Config {
+    /// Rate of the grid, Hz.
+    pub(crate) rate_hz: f64,
+    /// Threshold of the outlier test in standard deviations of the second difference; 0 for none.
+    pub(crate) outlier_sigma: f64,
+    /// So many equal samples in a row are stuck; 0 for no such test.
+    pub(crate) stuck_samples: u32,
+    /// A slow table is interpolated across, and held beyond its last row for, so many of its intervals.
+    pub(crate) hold_intervals: f64,
+    /// Longest gap that is filled with blank rows, s.
+    pub(crate) max_gap_s: f64,
+}
+
+/// Where the rows go.
+pub(crate) trait Sink {
+    /// Epochs, Unix ns.
+    fn times(&mut self) -> &mut Vec<i64>;
+    /// Values of a column of a table.
+    fn column(&mut self, table: usize, column: usize) -> &mut Vec<f64>;
+}
+
+/// A run of equal samples of one column.
+#[derive(Clone, Copy, Debug, Default)]
+struct Run {
+    bits: u64,
+    length: u32,
+    /// The column has been something else than zero: one that is zero from the start is not there at all.
+    moved: bool,
+}
+
+/// A table whose samples are placed on epochs.
+#[derive(Clone, Debug)]
+struct Fast {
+    /// Samples lie so much after the epochs, ns; none before the first sample.
+    phase_ns: Option<i64>,
+    /// Row of the last sample placed.
+    last_row: i64,
+    /// A second sample came for `last_row`.
+    crowded: bool,
+    /// Rows with a sample.
+    filled: u64,
+    /// Cells of the waiting rows, a window per column.
+    cells: Vec<Window<f64>>,
+    runs: Vec<Run>,
+}
+
+/// How a table is treated.
+#[derive(Clone, Debug)]
+enum Class {
+    Fast(Fast),
+    /// Interpolated; interval in ns.
+    Slow(i64),
+}
+
+/// The longest stretch of epochs that could not be used.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Stretch {
+    pub(crate) rows: u64,
+    pub(crate) from_ns: i64,
+}
+
+/// What the report needs to know of the grid.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Summary {
+    pub(crate) used: u64,
+    pub(crate) rejected: u64,
+    pub(crate) longest: Stretch,
+    current: Stretch,
+    /// Gaps too long to fill: how many, and the longest, ns and from when.
+    pub(crate) cut_gaps: u64,
+    pub(crate) longest_cut_ns: i64,
+    pub(crate) longest_cut_from_ns: i64,
+    /// Times when the reference's clock jumped and the grid with it, and the first.
+    pub(crate) rephased: u64,
+    pub(crate) first_rephased_ns: i64,
+}
+
+/// What was learnt of a table, for the report.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Learnt<'a> {
+    pub(crate) name: &'a str,
+    pub(crate) interval_s: Option<f64>,
+    pub(crate) interpolated: bool,
+    pub(crate) phase_s: Option<f64>,
+    pub(crate) missing: Option<u64>,
+    pub(crate) absent: Vec<String>,
+}
+
+/// The grid in the making.
+#[derive(Clone, Debug)]
+pub(crate) struct Gridder {
+    config: Config,
+    pub(crate) tables: Vec<Series>,
+    classes: Vec<Class>,
+    /// Median interval in the opening, ns; 0 where unknown.
+    intervals: Vec<i64>,
+    /// Index of the table that lays the epochs, once the opening is over.
+    reference: Option<usize>,
+    epochs: Epochs,
+    /// Every telemetry row before this has come, Unix ns.
+    complete_ns: i64,
+    /// Time of the first row of a mandatory table.
+    first_ns: Option<i64>,
+    /// Time of the reference's last row taken up.
+    last_reference_ns: i64,
+    /// First row of `cells`; rows from 0 on.
+    base: i64,
+    /// Rows made so far, rows whose runs were counted, rows cleaned, rows given.
+    rows: i64,
+    counted: i64,
+    cleaned: i64,
+    given: i64,
+    pub(crate) summary: Summary,
+    scratch: Vec<f64>,
+    mask: Vec<u64>,
+}
+
+impl Gridder {
+    pub(crate) fn new(config: Config, specs: Vec<TableSpec>) -> Self {
+        let rate = Rate::new(config.rate_hz);
+        let count = specs.len();
+        Self {
+            config,
+            tables: specs.into_iter().map(Series::new).collect(),
+            classes: Vec::new(),
+            intervals: vec![0; count],
+            reference: None,
+            epochs: Epochs::new(rate),
+            complete_ns: i64::MIN,
+            first_ns: None,
+            last_reference_ns: 0,
+            base: 0,
+            rows: 0,
+            counted: 0,
+            cleaned: 0,
+            given: 0,
+            summary: Summary::default(),
+            scratch: Vec::new(),
+            mask: Vec::new(),
+        }
+    }
+
+    /// Takes rows of a table as they came.
+    pub(crate) fn take(&mut self, table: usize, times: &[i64], columns: &[&[f64]]) {
+        self.tables[table].take(times, columns);
+    }
+
+    /// Gives every row that is ready, or [`MOST_ROWS`]. Every row before `complete_ns` has been taken.
+    pub(crate) fn advance(&mut self, complete_ns: i64, sink: &mut impl Sink) {
+        self.complete_ns = self.complete_ns.max(complete_ns);
+        let first = self.given;
+        while self.step(false, first + MOST_ROWS, sink) {}
+    }
+
+    /// There is no more: gives the rest.
+    pub(crate) fn flush(&mut self, sink: &mut impl Sink) {
+        self.complete_ns = self.tables.iter().filter_map(|t| t.times.as_slice().last()).copied().max().map_or(
+            self.complete_ns,
+            // The next file's rows come after this one's.
+            |last| self.complete_ns.max(last + 1),
+        );
+        while self.step(true, i64::MAX, sink) {}
+        // What has no place now will have none: the grid ends with the reference.
+        for (series, class) in self.tables.iter_mut().zip(&self.classes) {
+            if matches!(class, Class::Fast(_)) {
+                let rest = series.times.len();
+                series.tally.add(Reason::Outside, rest as u64);
+                series.drop_front(rest);
+            }
+        }
+    }
+
+    /// One round; true when another may give more.
+    fn step(&mut self, flush: bool, most: i64, sink: &mut impl Sink) -> bool {
+        if !self.learnt(flush) {
+            return false;
+        }
+        let rows = self.rows;
+        let mut settled_ns = self.lay_epochs(flush);
+        for table in 0..self.tables.len() {
+            if Some(table) != self.reference {
+                settled_ns = settled_ns.min(self.fill(table, flush));
+            }
+        }
+        self.clean(settled_ns, flush);
+        let given = self.given;
+        self.give(most, flush, sink);
+        self.given < most && (self.given > given || self.rows > rows)
+    }
+
+    // ---- 2. the opening ----
+
+    /// Learns rates and the reference from the opening; false until it is over.
+    fn learnt(&mut self, flush: bool) -> bool {
+        if self.reference.is_some() {
+            return true;
+        }
+        let mandatory = |t: &&Series| t.spec.mandatory;
+        let first = self.tables.iter().filter(mandatory).filter_map(|t| t.times.as_slice().first()).min();
+        self.first_ns = self.first_ns.or(first.copied());
+        let Some(first_ns) = self.first_ns else {
+            self.forget_early_rows(self.complete_ns);
+            return false;
+        };
+        if !flush && self.complete_ns < first_ns.saturating_add(OPENING_NS) {
+            return false;
+        }
+        self.forget_early_rows(first_ns);
+        let end_ns = first_ns.saturating_add(OPENING_NS);
+        let period_ns = self.epochs.rate.part_ns(1.0);
+        self.intervals = self.tables.iter().map(|t| median_interval(t.times.as_slice(), end_ns)).collect();
+        self.classes = (0..self.tables.len()).map(|t| self.class_of(t, period_ns)).collect();
+        // The densest mandatory table; the first of those within a tenth of one another.
+        let mut best: Option<(usize, i64)> = None;
+        for (t, series) in self.tables.iter().enumerate().filter(|(_, t)| t.spec.mandatory) {
+            let interval = if self.intervals[t] > 0 { self.intervals[t] } else { i64::MAX / 10 };
+            let begun = series.times.as_slice().first().is_some_and(|time| *time < end_ns);
+            if begun && best.is_none_or(|(_, b)| interval < b / 10 * 9) {
+                best = Some((t, interval));
+            }
+        }
+        self.reference = best.map(|(t, _)| t);
+        self.reference.is_some()
+    }
+
+    fn class_of(&self, table: usize, period_ns: i64) -> Class {
+        let spec = &self.tables[table].spec;
+        let stated_ns = spec.stated_rate_hz.map(|rate| (1e9 / rate) as i64);
+        let usual_ns = if spec.name == "ephemeris" { 60_000_000_000 } else { period_ns };
+        let interval_ns = match self.intervals[table] {
+            0 => stated_ns.unwrap_or(usual_ns),
+            learnt => learnt,
+        };
+        // A twentieth more than two periods: half the grid's rate, with jitter.
+        if spec.never_interpolated || interval_ns <= period_ns / 20 * 41 {
+            let count = spec.columns.len();
+            Class::Fast(Fast {
+                phase_ns: None,
+                last_row: -1,
+                crowded: false,
+                filled: 0,
+                cells: vec![Window::default(); count],
+                runs: vec![Run::default(); count],
+            })
+        } else {
+            Class::Slow(interval_ns)
+        }
+    }
+
+    /// Rows long before the first epoch have no use.
+    fn forget_early_rows(&mut self, first_ns: i64) {
+        for series in &mut self.tables {
+            let early = series.times.as_slice().partition_point(|t| *t < first_ns.saturating_sub(OPENING_NS));
+            series.tally.add(Reason::Outside, early as u64);
+            series.drop_front(early);
+        }
+    }
+
+    // ---- 3. epochs and places ----
+
+    /// Places the reference's rows and makes rows for them. Gives the time up to which that is settled.
+    fn lay_epochs(&mut self, flush: bool) -> i64 {
+        let Some(reference) = self.reference else { return i64::MIN };
+        let rate = self.epochs.rate;
+        let agree_ns = rate.offset_ns(AGREEING as i64);
+        let mut placed: Vec<i64> = Vec::new();
+        let mut used = 0;
+        let mut blocked = false;
+        while let Some(&time) = self.tables[reference].times.as_slice().get(used) {
+            if time >= self.complete_ns {
+                break;
+            }
+            let ready = flush || self.complete_ns >= time.saturating_add(agree_ns);
+            if !self.epochs.begun() || (time - self.last_reference_ns) as f64 > self.config.max_gap_s * 1e9 {
+                if !ready {
+                    break;
+                }
+                self.begin_segment(reference, used, time);
+            }
+            let (mut row, off_ns) = self.epochs.newest(time);
+            if off_ns.abs() > rate.part_ns(0.25) {
+                if !ready {
+                    break;
+                }
+                if let Some(phase) = self.agreed_phase(reference, used, time) {
+                    // The last row of the old phase ends before the new one begins, and is blank.
+                    let (last, _) = self.epochs.newest(time - rate.part_ns(0.5) - 1);
+                    let last = last.max(self.rows - 1);
+                    if !self.make_rows(last + 1) {
+                        blocked = true;
+                        break;
+                    }
+                    self.put(reference, &placed, used - placed.len());
+                    placed.clear();
+                    self.blank_row(last);
+                    self.epochs.begin(last + 1, time + phase);
+                    self.tables[reference].tally.add(Reason::ClockJump, 1);
+                    if self.summary.rephased == 0 {
+                        self.summary.first_rephased_ns = time;
+                    }
+                    self.summary.rephased += 1;
+                    row = last + 1;
+                } else {
+                    self.tables[reference].tally.add(Reason::OffPhase, 1);
+                }
+            }
+            if !self.make_rows(row + 1) {
+                blocked = true;
+                break;
+            }
+            self.last_reference_ns = time;
+            placed.push(row);
+            used += 1;
+        }
+        self.put(reference, &placed, used - placed.len());
+        let waiting = self.tables[reference].times.as_slice().get(used).copied();
+        self.tables[reference].drop_front(used);
+        if blocked { waiting.unwrap_or(self.complete_ns) } else { waiting.unwrap_or(i64::MAX).min(self.complete_ns) }
+    }
+
+    /// The first segment, or one after a gap too long to fill.
+    fn begin_segment(&mut self, reference: usize, at: usize, time: i64) {
+        let rate = self.epochs.rate;
+        let phase = rate.phase(time, self.following(reference, at, time));
+        if self.epochs.begun() {
+            let gap_ns = time - self.last_reference_ns;
+            self.summary.cut_gaps += 1;
+            if gap_ns > self.summary.longest_cut_ns {
+                self.summary.longest_cut_ns = gap_ns;
+                self.summary.longest_cut_from_ns = self.last_reference_ns;
+            }
+            // One blank row says that the epochs before and after are no neighbours.
+            self.rows += 1;
+            self.grow_cells();
+        }
+        self.epochs.begin(self.rows, time + phase);
+    }
+
+    /// The table's next times within the span in which a clock must agree with itself.
+    fn following(&self, table: usize, at: usize, time: i64) -> &[i64] {
+        let times = &self.tables[table].times.as_slice()[at..];
+        let end_ns = time.saturating_add(self.epochs.rate.offset_ns(AGREEING as i64));
+        &times[..times.partition_point(|t| *t < end_ns)]
+    }
+
+    /// Median phase of the samples from `time` on against `time`, if they agree within an eighth of a period.
+    fn agreed_phase(&self, table: usize, at: usize, time: i64) -> Option<i64> {
+        let rate = self.epochs.rate;
+        let times = self.following(table, at, time);
+        let limit = rate.part_ns(0.125);
+        let agree = times.len() >= AGREEING / 2 && times.iter().all(|t| rate.wrap(t - time).abs() <= limit);
+        agree.then(|| rate.phase(time, times))
+    }
+
+    /// Makes blank rows up to `rows`; false when not all of them may wait.
+    fn make_rows(&mut self, rows: i64) -> bool {
+        let most = self.given + MOST_ROWS;
+        if self.rows < rows {
+            self.rows = rows.min(most).max(self.rows);
+            self.grow_cells();
+        }
+        self.rows >= rows
+    }
+
+    fn grow_cells(&mut self) {
+        let length = (self.rows - self.base) as usize;
+        for class in &mut self.classes {
+            if let Class::Fast(fast) = class {
+                for cells in &mut fast.cells {
+                    cells.grow(length - cells.len(), f64::NAN);
+                }
+            }
+        }
+    }
+
+    /// Blanks a row of every fast table before a jump of the reference's clock.
+    fn blank_row(&mut self, row: i64) {
+        for table in 0..self.tables.len() {
+            self.blank(table, row);
+        }
+    }
+
+    fn blank(&mut self, table: usize, row: i64) {
+        let at = row - self.base;
+        if let (Class::Fast(fast), true) = (&mut self.classes[table], at >= 0)
+            && fast.last_row == row
+            && !fast.crowded
+        {
+            for cells in &mut fast.cells {
+                cells.as_mut_slice()[at as usize] = f64::NAN;
+            }
+            fast.crowded = true;
+            fast.filled -= 1;
+            self.tables[table].tally.rows_placed -= 1;
+            self.tables[table].tally.add(Reason::BeforeJump, 1);
+        }
+    }
+
+    /// Places a table's rows on the rows there are. Gives the time up to which that is settled.
+    fn fill(&mut self, table: usize, flush: bool) -> i64 {
+        let Class::Fast(fast) = &self.classes[table] else { return i64::MAX };
+        let mut phase_ns = fast.phase_ns;
+        let rate = self.epochs.rate;
+        let agree_ns = rate.offset_ns(AGREEING as i64);
+        // Epochs before this are laid for good.
+        let reference_next = self.reference.and_then(|r| self.tables[r].times.as_slice().first().copied());
+        let laid_ns = reference_next.unwrap_or(self.complete_ns).min(self.complete_ns) - rate.part_ns(1.0);
+        let cut = (laid_ns - self.last_reference_ns) as f64 > self.config.max_gap_s * 1e9;
+        let mut placed: Vec<i64> = Vec::new();
+        let mut used = 0;
+        while let Some(&time) = self.tables[table].times.as_slice().get(used) {
+            if !flush && time >= laid_ns || time >= self.complete_ns {
+                break;
+            }
+            let ready = flush || self.complete_ns >= time.saturating_add(agree_ns);
+            let phase = match phase_ns {
+                Some(phase) => phase,
+                None if !ready => break,
+                None => {
+                    let origin = self.epochs.time_ns(self.rows - 1);
+                    let phase = rate.phase(origin, self.following(table, used, time));
+                    phase_ns = Some(phase);
+                    phase
+                }
+            };
+            let mut place = self.epochs.place(time - phase);
+            if let Place::Row(row) = place {
+                if row >= self.rows {
+                    if !cut {
+                        break;
+                    }
+                    place = Place::Nowhere;
+                } else {
+                    let off_ns = time - phase - self.epochs.time_ns(row);
+                    if off_ns.abs() > rate.part_ns(0.25) {
+                        if !ready {
+                            break;
+                        }
+                        if let Some(change) = self.agreed_phase(table, used, time) {
+                            self.put(table, &placed, used - placed.len());
+                            placed.clear();
+                            let new = rate.wrap(time + change - self.epochs.time_ns(row));
+                            phase_ns = Some(new);
+                            place = self.epochs.place(time - new);
+                            if let Place::Row(row) = place {
+                                self.blank(table, row - 1);
+                            }
+                            self.tables[table].tally.add(Reason::ClockJump, 1);
+                        } else {
+                            self.tables[table].tally.add(Reason::OffPhase, 1);
+                        }
+                    }
+                }
+            }
+            placed.push(if let Place::Row(row) = place { row } else { -1 });
+            used += 1;
+        }
+        self.put(table, &placed, used - placed.len());
+        if let Class::Fast(fast) = &mut self.classes[table] {
+            fast.phase_ns = phase_ns;
+        }
+        let series = &mut self.tables[table];
+        let waiting = series.times.as_slice().get(used).copied();
+        series.drop_front(used);
+        waiting.unwrap_or(laid_ns).min(laid_ns)
+    }
+
+    /// Copies samples, from the `from`-th waiting on, into the cells of their rows.
+    fn put(&mut self, table: usize, rows: &[i64], from: usize) {
+        let Class::Fast(fast) = &mut self.classes[table] else { return };
+        let series = &mut self.tables[table];
+        let mut lonely = rows.first().is_none_or(|r| *r > fast.last_row && *r >= self.given);
+        lonely &= rows.windows(2).all(|w| w[0] < w[1]);
+        let base = self.base;
+        if lonely {
+            for (cells, source) in fast.cells.iter_mut().zip(&series.columns) {
+                let cells = cells.as_mut_slice();
+                let source = &source.as_slice()[from..from + rows.len()];
+                for (row, v) in rows.iter().zip(source) {
+                    cells[(row - base) as usize] = *v;
+                }
+            }
+            if let Some(last) = rows.last() {
+                (fast.last_row, fast.crowded) = (*last, false);
+            }
+            fast.filled += rows.len() as u64;
+            series.tally.rows_placed += rows.len() as u64;
+            return;
+        }
+        for (k, row) in rows.iter().enumerate() {
+            if *row < self.given || *row < fast.last_row {
+                series.tally.add(Reason::Outside, 1);
+            } else if *row == fast.last_row {
+                // Two samples for one epoch: a slip of the clock. Neither is used.
+                series.tally.add(Reason::Crowded, if fast.crowded { 1 } else { 2 });
+                if !fast.crowded {
+                    fast.crowded = true;
+                    fast.filled -= 1;
+                    series.tally.rows_placed -= 1;
+                }
+                fast.cells.iter_mut().for_each(|c| c.as_mut_slice()[(row - base) as usize] = f64::NAN);
+            } else {
+                for (cells, source) in fast.cells.iter_mut().zip(&series.columns) {
+                    cells.as_mut_slice()[(row - base) as usize] = source.as_slice()[from + k];
+                }
+                (fast.last_row, fast.crowded) = (*row, false);
+                fast.filled += 1;
+                series.tally.rows_placed += 1;
+            }
+        }
+    }
+
+    // ---- 4. stuck and outlying samples ----
+
+    /// Cleans whole blocks of rows that no sample can reach any more.
+    fn clean(&mut self, settled_ns: i64, flush: bool) {
+        let mut settled = self.rows;
+        if !flush {
+            let limit = settled_ns.saturating_sub(self.epochs.rate.part_ns(3.0));
+            let earlier = self.counted;
+            while settled > earlier && self.epochs.time_ns(settled - 1) >= limit {
+                settled = match self.epochs.place(limit) {
+                    // Straight there when the last segment reaches back so far.
+                    Place::Row(row) if row < settled - 1 && self.epochs.time_ns(row) < limit => row + 1,
+                    _ => settled - 1,
+                };
+            }
+        }
+        self.count_runs(settled);
+        let margin = MARGIN as i64 + i64::from(self.config.stuck_samples);
+        while self.cleaned < self.counted {
+            let end = (self.cleaned + BLOCK as i64).min(self.counted);
+            if !flush && self.cleaned + BLOCK as i64 + margin > self.counted {
+                break;
+            }
+            self.remove_outliers(self.cleaned, end);
+            self.cleaned = end;
+        }
+    }
+
+    /// Blanks samples that repeat themselves, up to row `end`.
+    fn count_runs(&mut self, end: i64) {
+        let stuck = self.config.stuck_samples;
+        let (from, to) = ((self.counted - self.base) as usize, (end.max(self.counted) - self.base) as usize);
+        for (class, series) in self.classes.iter_mut().zip(&mut self.tables) {
+            let Class::Fast(fast) = class else { continue };
+            for (c, spec) in series.spec.columns.iter().enumerate() {
+                if !spec.instrument || stuck == 0 {
+                    continue;
+                }
+                let mut run = fast.runs[c];
+                let cells = fast.cells[c].as_mut_slice();
+                let mut blanked = 0;
+                for k in from..to {
+                    let v = cells[k];
+                    if v.to_bits() != run.bits || v.is_nan() {
+                        run.bits = v.to_bits();
+                        run.length = u32::from(!v.is_nan());
+                        run.moved |= v.abs() > 0.0;
+                        continue;
+                    }
+                    run.length = (run.length + 1).min(stuck + 1);
+                    if run.length < stuck || !run.moved {
+                        continue;
+                    }
+                    let start = if run.length == stuck { (k + 1).saturating_sub(stuck as usize) } else { k };
+                    cells[start..=k].fill(f64::NAN);
+                    blanked += k + 1 - start;
+                }
+                fast.runs[c] = run;
+                series.tally.add(Reason::Stuck, blanked as u64);
+            }
+        }
+        self.counted = self.counted.max(end);
+    }
+
+    fn remove_outliers(&mut self, from: i64, to: i64) {
+        let sigma = self.config.outlier_sigma;
+        if sigma <= 0.0 {
+            return;
+        }
+        let low = (from - HISTORY).max(self.base);
+        let high = (to + HISTORY).min(self.counted);
+        let window = (low - self.base) as usize..(high - self.base) as usize;
+        let (from, to) = ((from - low) as usize, (to - low) as usize);
+        for (class, series) in self.classes.iter_mut().zip(&mut self.tables) {
+            let Class::Fast(fast) = class else { continue };
+            for (c, _) in series.spec.columns.iter().enumerate().filter(|(_, spec)| spec.readout) {
+                let x = &mut fast.cells[c].as_mut_slice()[window.clone()];
+                let removed = outliers::remove(x, from, to, sigma, &mut self.scratch);
+                series.tally.add(Reason::Outlier, removed);
+            }
+        }
+    }
+
+    // ---- 5. rows out ----
+
+    /// How far beyond an epoch slow tables must be complete, ns.
+    fn look_ahead_ns(&self) -> i64 {
+        let slow = self.classes.iter().filter_map(|c| if let Class::Slow(interval) = c { Some(*interval) } else { None });
+        slow.map(|interval| across_ns(interval, self.config.hold_intervals)).max().unwrap_or(0)
+    }
+
+    fn give(&mut self, most: i64, flush: bool, sink: &mut impl Sink) {
+        let mut end = self.cleaned.min(most);
+        if !flush {
+            let limit = self.complete_ns.saturating_sub(self.look_ahead_ns());
+            while end > self.given && self.epochs.time_ns(end - 1) >= limit {
+                end = match self.epochs.place(limit) {
+                    Place::Row(row) if row < end - 1 && self.epochs.time_ns(row) < limit => row + 1,
+                    _ => end - 1,
+                };
+            }
+        }
+        if end <= self.given {
+            return;
+        }
+        let first = sink.times().len();
+        sink.times().extend((self.given..end).map(|row| self.epochs.time_ns(row)));
+        let times: Vec<i64> = sink.times()[first..].to_vec();
+        let window = (self.given - self.base) as usize..(end - self.base) as usize;
+        self.summarise(&times, window.clone());
+        for table in 0..self.tables.len() {
+            match &self.classes[table] {
+                Class::Fast(fast) => {
+                    for (c, cells) in fast.cells.iter().enumerate() {
+                        sink.column(table, c).extend_from_slice(&cells.as_slice()[window.clone()]);
+                    }
+                }
+                Class::Slow(interval) => {
+                    let interval = *interval;
+                    self.interpolate(table, interval, &times, sink);
+                }
+            }
+        }
+        self.given = end;
+        let keep = (end - HISTORY).max(self.base);
+        let drop = (keep - self.base) as usize;
+        for class in &mut self.classes {
+            if let Class::Fast(fast) = class {
+                fast.cells.iter_mut().for_each(|c| c.drop_front(drop));
+            }
+        }
+        self.base = keep;
+        self.epochs.forget_before(keep);
+    }
+
+    /// Linear between two rows of a slow table no more than the hold apart; the last row's value for as long as the
+    /// hold, NaN beyond. Flags are held. The error of a linear step of interval T is at most `max|x¨| T²/8`: 3 m for
+    /// an orbit at 60 s, 2e-11 for the components of a unit vector that turns with the Earth around the Sun, and a
+    /// unit vector is shortened by as much.
+    fn interpolate(&mut self, table: usize, interval_ns: i64, epochs: &[i64], sink: &mut impl Sink) {
+        let series = &mut self.tables[table];
+        let times = series.times.as_slice();
+        let across = across_ns(interval_ns, self.config.hold_intervals);
+        let hold = (interval_ns as f64 * self.config.hold_intervals) as i64;
+        // Row of the table before each epoch with the weight of the next one; none where nothing is near.
+        let mut at = 0;
+        let mut weights: Vec<Option<(usize, f64)>> = Vec::with_capacity(epochs.len());
+        for &epoch in epochs {
+            while times.get(at + 1).is_some_and(|t| *t <= epoch) {
+                at += 1;
+            }
+            weights.push(match (times.get(at), times.get(at + 1)) {
+                (Some(&t0), Some(&t1)) if t0 <= epoch && t1 - t0 <= across => {
+                    Some((at, (epoch - t0) as f64 / (t1 - t0) as f64))
+                }
+                (Some(&t0), _) if t0 <= epoch && epoch - t0 <= hold => Some((at, 0.0)),
+                _ => None,
+            });
+        }
+        for (c, spec) in series.spec.columns.iter().enumerate() {
+            let values = series.columns[c].as_slice();
+            sink.column(table, c).extend(weights.iter().map(|w| match *w {
+                None => f64::NAN,
+                Some((at, weight)) if weight > 0.0 && !spec.flag => {
+                    values[at] + (values[at + 1] - values[at]) * weight
+                }
+                Some((at, _)) => values[at],
+            }));
+        }
+        series.tally.rows_placed += at as u64;
+        series.drop_front(at);
+    }
+
+    /// Counts the epochs that can be used.
+    fn summarise(&mut self, times: &[i64], window: std::ops::Range<usize>) {
+        // A bit per alternative: 0 and 1 for x of the two test masses, 2 for all the rest.
+        const REST: u64 = 1 << 8;
+        self.mask.clear();
+        self.mask.resize(times.len(), REST);
+        let mut wanted = REST;
+        for (t, series) in self.tables.iter().enumerate() {
+            let slow = Window::default();
+            for (c, spec) in series.spec.columns.iter().enumerate() {
+                if spec.mandatory == Mandatory::No {
+                    continue;
+                }
+                let cells = if let Class::Fast(fast) = &self.classes[t] { &fast.cells[c] } else { &slow };
+                let Some(cells) = cells.as_slice().get(window.clone()) else { continue };
+                for (mask, v) in self.mask.iter_mut().zip(cells) {
+                    let there = u64::from(!v.is_nan());
+                    *mask = match spec.mandatory {
+                        Mandatory::OneOf(group) => *mask | there << group,
+                        _ => *mask & !(REST * (1 - there)),
+                    };
+                }
+                if let Mandatory::OneOf(group) = spec.mandatory {
+                    wanted |= 1 << group;
+                }
+            }
+        }
+        let summary = &mut self.summary;
+        for (mask, time) in self.mask.iter().zip(times) {
+            if *mask == wanted {
+                summary.used += 1;
+                summary.current.rows = 0;
+                continue;
+            }
+            summary.rejected += 1;
+            if summary.current.rows == 0 {
+                summary.current.from_ns = *time;
+            }
+            summary.current.rows += 1;
+            if summary.current.rows > summary.longest.rows {
+                summary.longest = summary.current;
+            }
+        }
+    }
+
+    // ---- report and state ----
+
+    /// What was learnt of each table.
+    pub(crate) fn learnt_tables(&self) -> Vec<Learnt<'_>> {
+        let given = self.summary.used + self.summary.rejected;
+        let describe = |(t, series): (usize, &Series)| {
+            let fast = if let Some(Class::Fast(fast)) = self.classes.get(t) { Some(fast) } else { None };
+            let absent = fast.map_or_else(Vec::new, |fast| {
+                let still = |c: &usize| series.spec.columns[*c].instrument && !fast.runs[*c].moved && fast.filled > 0;
+                let name = |c: usize| series.spec.columns[c].name.clone();
+                (0..fast.runs.len()).filter(still).map(name).collect()
+            });
+            Learnt {
+                name: &series.spec.name,
+                interval_s: (self.intervals[t] > 0).then(|| self.intervals[t] as f64 * 1e-9),
+                interpolated: matches!(self.classes.get(t), Some(Class::Slow(_))),
+                phase_s: fast.and_then(|f| f.phase_ns).map(|p| p as f64 * 1e-9),
+                missing: fast.map(|f| given.saturating_sub(f.filled)),
+                absent,
+            }
+        };
+        self.tables.iter().enumerate().map(describe).collect()
+    }
+
+    /// Name of the reference.
+    pub(crate) fn reference_name(&self) -> Option<&str> {
+        self.reference.map(|r| self.tables[r].spec.name.as_str())
+    }
+
+    /// Begins a new count: what was counted so far has been reported.
+    pub(crate) fn reset_counts(&mut self) {
+        self.summary = Summary::default();
+        for (t, series) in self.tables.iter_mut().enumerate() {
+            series.tally = Tally::default();
+            if let Some(Class::Fast(fast)) = self.classes.get_mut(t) {
+                fast.filled = 0;
+            }
+        }
+    }
+
+    /// The whole state.
+    pub(crate) fn save(&self) -> Vec<u8> {
+        let mut w = Writer::default();
+        w.text(MAGIC);
+        w.text(&self.fingerprint());
+        self.tables.iter().for_each(|t| t.save(&mut w));
+        w.i64s(&self.intervals);
+        w.u64(self.classes.len() as u64);
+        for class in &self.classes {
+            match class {
+                Class::Slow(interval) => w.option(Some(*interval)),
+                Class::Fast(fast) => {
+                    w.option(None);
+                    fast.save(&mut w);
+                }
+            }
+        }
+        w.option(self.reference.map(|r| r as i64));
+        self.epochs.save(&mut w);
+        w.option(self.first_ns);
+        w.i64s(&[self.complete_ns, self.last_reference_ns, self.base, self.rows, self.counted, self.cleaned, self.given]);
+        self.summary.save(&mut w);
+        w.0
+    }
+
+    /// Takes a state back; on an error nothing has changed.
+    pub(crate) fn load(&mut self, state: &[u8]) -> Result<(), StateError> {
+        let specs = self.tables.iter().map(|t| t.spec.clone()).collect();
+        let mut new = Self::new(self.config.clone(), specs);
+        let mut r = Reader::new(state);
+        r.text_is(MAGIC, "format")?;
+        r.text_is(&new.fingerprint(), "set of tables or parameters")?;
+        for table in &mut new.tables {
+            table.load(&mut r)?;
+        }
+        let layout = StateError::Foreign("layout");
+        new.intervals = r.i64s()?;
+        let classes = r.count(16)?;
+        if new.intervals.len() != new.tables.len() || (classes != 0 && classes != new.tables.len()) {
+            return Err(layout);
+        }
+        for table in 0..classes {
+            new.classes.push(match r.option()? {
+                Some(interval) if interval > 0 => Class::Slow(interval),
+                Some(_) => return Err(layout),
+                None => Class::Fast(Fast::load(&mut r, new.tables[table].spec.columns.len())?),
+            });
+        }
+        new.reference = match r.option()? {
+            None => None,
+            Some(r) => Some(usize::try_from(r).ok().filter(|r| *r < classes).ok_or(StateError::Foreign("layout"))?),
+        };
+        new.epochs.load(&mut r)?;
+        new.first_ns = r.option()?;
+        let counters: [i64; 7] = r.i64s()?.try_into().map_err(|_| StateError::Foreign("layout"))?;
+        [new.complete_ns, new.last_reference_ns, new.base, new.rows, new.counted, new.cleaned, new.given] = counters;
+        new.summary = Summary::load(&mut r)?;
+        r.end()?;
+        let ordered = [0, new.base, new.given, new.cleaned, new.counted, new.rows].is_sorted();
+        let waiting = (new.rows - new.base) as usize;
+        let whole = |class: &Class| match class {
+            Class::Fast(fast) => fast.cells.iter().all(|c| c.len() == waiting),
+            Class::Slow(_) => true,
+        };
+        if !ordered || !new.classes.iter().all(whole) || (new.reference.is_none() && new.rows > 0) {
+            return Err(layout);
+        }
+        *self = new;
+        Ok(())
+    }
+
+    /// Everything that must be equal for a state to fit.
+    fn fingerprint(&self) -> String {
+        let c = &self.config;
+        let mut text =
+            format!("{} {} {} {} {}", c.rate_hz, c.outlier_sigma, c.stuck_samples, c.hold_intervals, c.max_gap_s);
+        for t in &self.tables {
+            text.push_str(&format!("\n{}:", t.spec.name));
+            t.spec.columns.iter().for_each(|c| text.push_str(&format!(" {}", c.name)));
+        }
+        text
+    }
+}
+
+/// First words of a state.
+const MAGIC: &str = "dragfree preprocess state 1";
+
+/// Rows of a slow table no more than this apart are neighbours: the hold, with a tenth for jitter.
+fn across_ns(interval_ns: i64, hold_intervals: f64) -> i64 {
+    (interval_ns as f64 * hold_intervals * 1.1) as i64
+}
+
+/// Median interval of the times before `end_ns`; 0 where there are fewer than three.
+fn median_interval(times: &[i64], end_ns: i64) -> i64 {
+    let times = &times[..times.partition_point(|t| *t < end_ns)];
+    let mut intervals: Vec<i64> = times.windows(2).map(|w| w[1] - w[0]).collect();
+    if intervals.len() < 2 {
+        return 0;
+    }
+    let middle = (intervals.len() - 1) / 2;
+    *intervals.select_nth_unstable(middle).1
+}
+
+impl Fast {
+    fn save(&self, w: &mut Writer) {
+        w.option(self.phase_ns);
+        w.i64(self.last_row);
+        w.flag(self.crowded);
+        w.u64(self.filled);
+        for (cells, run) in self.cells.iter().zip(&self.runs) {
+            w.f64s(cells.as_slice());
+            w.u64(run.bits);
+            w.u64(u64::from(run.length));
+            w.flag(run.moved);
+        }
+    }
+
+    fn load(r: &mut Reader<'_>, columns: usize) -> Result<Self, StateError> {
+        let mut fast = Self {
+            phase_ns: r.option()?,
+            last_row: r.i64()?,
+            crowded: r.flag()?,
+            filled: r.u64()?,
+            cells: Vec::with_capacity(columns),
+            runs: Vec::with_capacity(columns),
+        };
+        for _ in 0..columns {
+            fast.cells.push(Window::from_vec(r.f64s()?));
+            let bits = r.u64()?;
+            let length = u32::try_from(r.u64()?).map_err(|_| StateError::Foreign("layout"))?;
+            fast.runs.push(Run { bits, length, moved: r.flag()? });
+        }
+        Ok(fast)
+    }
+}
+
+impl Summary {
+    fn words(&self) -> [u64; 11] {
+        let times = [self.longest.from_ns, self.current.from_ns, self.longest_cut_ns, self.longest_cut_from_ns];
+        let [a, b, c, d] = times.map(i64::cast_unsigned);
+        let jump = self.first_rephased_ns.cast_unsigned();
+        let counts = [self.used, self.rejected, self.longest.rows, self.current.rows, self.cut_gaps, self.rephased];
+        let [e, f, g, h, i, j] = counts;
+        [a, b, c, d, e, f, g, h, i, j, jump]
+    }
+
+    fn save(&self, w: &mut Writer) {
+        self.words().iter().for_each(|word| w.u64(*word));
+    }
+
+    fn load(r: &mut Reader<'_>) -> Result<Self, StateError> {
+        let mut words = [0; 11];
+        for word in &mut words {
+            *word = r.u64()?;
+        }
+        let [a, b, c, d, used, rejected, g, h, cut_gaps, rephased, jump] = words;
+        Ok(Self {
+            used,
+            rejected,
+            longest: Stretch { rows: g, from_ns: a.cast_signed() },
+            current: Stretch { rows: h, from_ns: b.cast_signed() },
+            cut_gaps,
+            longest_cut_ns: c.cast_signed(),
+            longest_cut_from_ns: d.cast_signed(),
+            rephased,
+            first_rephased_ns: jump.cast_signed(),
+        })
+    }
+}

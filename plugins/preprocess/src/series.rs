@@ -1,0 +1,298 @@
+//! The rows of one telemetry table on their way to the grid: guarded, cleaned, counted.
+
+use crate::bytes::{Reader, StateError, Writer};
+use crate::layout::TableSpec;
+
+/// A vector that is drained at the front in amortised constant time.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Window<T> {
+    data: Vec<T>,
+    head: usize,
+}
+
+impl<T: Copy> Window<T> {
+    pub(crate) fn from_vec(data: Vec<T>) -> Self {
+        Self { data, head: 0 }
+    }
+    pub(crate) fn as_slice(&self) -> &[T] {
+        &self.data[self.head..]
+    }
+    pub(crate) fn as_mut_slice(&mut self) -> &mut [T] {
+        &mut self.data[self.head..]
+    }
+    pub(crate) fn len(&self) -> usize {
+        self.data.len() - self.head
+    }
+    pub(crate) fn push(&mut self, value: T) {
+        self.data.push(value);
+    }
+    pub(crate) fn extend(&mut self, values: impl Iterator<Item = T>) {
+        self.data.extend(values);
+    }
+    pub(crate) fn grow(&mut self, count: usize, value: T) {
+        self.data.resize(self.data.len() + count, value);
+    }
+    pub(crate) fn pop(&mut self) {
+        if self.len() > 0 {
+            self.data.pop();
+        }
+    }
+    pub(crate) fn drop_front(&mut self, count: usize) {
+        self.head += count;
+        if self.head >= 4096 && 2 * self.head >= self.data.len() {
+            self.data.drain(..self.head);
+            self.head = 0;
+        }
+    }
+}
+
+/// Why a row or a value did not reach the grid, or what else was noticed about it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Reason {
+    /// Row: same time and values as the one before.
+    Duplicate,
+    /// Row: same time, other values; neither of the two can be trusted.
+    Conflicting,
+    /// Row: earlier than one already taken.
+    Late,
+    /// Row: a time before 1970 or after 2116.
+    BadTime,
+    /// Row: two rows of one table belong to the same epoch; neither is used, so that the slip is visible as a gap.
+    Crowded,
+    /// Row: before the grid's first epoch, after its last, or within a gap that the grid leaves out.
+    Outside,
+    /// Row: at the last epoch before the table's clock jumped; left out, so that no difference spans the jump.
+    BeforeJump,
+    /// Row: placed, but more than a quarter of an interval from its epoch.
+    OffPhase,
+    /// Value: covered by a status flag.
+    Status,
+    /// Value: NaN.
+    NotANumber,
+    /// Value: infinite.
+    Infinite,
+    /// Value: beyond the mission's limits.
+    Limit,
+    /// Value: repeated exactly.
+    Stuck,
+    /// Value: left its neighbours' line and came back.
+    Outlier,
+    /// The table's clock jumped.
+    ClockJump,
+}
+
+/// Number of reasons.
+const REASONS: usize = 15;
+
+impl Reason {
+    pub(crate) const ALL: [(Self, &'static str); REASONS] = [
+        (Self::Duplicate, "duplicate_rows"),
+        (Self::Conflicting, "conflicting_rows"),
+        (Self::Late, "late_rows"),
+        (Self::BadTime, "bad_time_rows"),
+        (Self::Crowded, "crowded_rows"),
+        (Self::Outside, "outside_rows"),
+        (Self::BeforeJump, "before_jump_rows"),
+        (Self::OffPhase, "off_phase_rows"),
+        (Self::Status, "status_values"),
+        (Self::NotANumber, "nan_values"),
+        (Self::Infinite, "infinite_values"),
+        (Self::Limit, "limit_values"),
+        (Self::Stuck, "stuck_values"),
+        (Self::Outlier, "outlier_values"),
+        (Self::ClockJump, "clock_jumps"),
+    ];
+
+    /// Corruption rather than operation: data that were sent and cannot be used.
+    pub(crate) const LOSSES: [Self; 5] = [Self::Conflicting, Self::Late, Self::BadTime, Self::Crowded, Self::Infinite];
+}
+
+/// Counts by [`Reason`], and rows in and on the grid.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Tally {
+    counts: [u64; REASONS],
+    /// Rows given.
+    pub(crate) rows_in: u64,
+    /// Rows on the grid, or held for interpolation.
+    pub(crate) rows_placed: u64,
+}
+
+impl Tally {
+    pub(crate) fn add(&mut self, reason: Reason, count: u64) {
+        self.counts[reason as usize] += count;
+    }
+    pub(crate) fn get(&self, reason: Reason) -> u64 {
+        self.counts[reason as usize]
+    }
+    pub(crate) fn save(&self, w: &mut Writer) {
+        self.counts.iter().for_each(|c| w.u64(*c));
+        w.u64(self.rows_in);
+        w.u64(self.rows_placed);
+    }
+    pub(crate) fn load(r: &mut Reader<'_>) -> Result<Self, StateError> {
+        let mut tally = Self::default();
+        for count in &mut tally.counts {
+            *count = r.u64()?;
+        }
+        tally.rows_in = r.u64()?;
+        tally.rows_placed = r.u64()?;
+        Ok(tally)
+    }
+}
+
+/// Times outside this are garbage; the bound keeps every difference within an i64.
+const LATEST_NS: i64 = 1 << 62;
+
+/// One table's rows that wait for their place.
+#[derive(Clone, Debug)]
+pub(crate) struct Series {
+    pub(crate) spec: TableSpec,
+    pub(crate) times: Window<i64>,
+    pub(crate) columns: Vec<Window<f64>>,
+    pub(crate) tally: Tally,
+    /// Time of the last row taken or refused as conflicting.
+    last_time: Option<i64>,
+    /// The row of `last_time` was refused as conflicting.
+    conflicting: bool,
+}
+
+impl Series {
+    pub(crate) fn new(spec: TableSpec) -> Self {
+        let columns = vec![Window::default(); spec.columns.len()];
+        Self { spec, times: Window::default(), columns, tally: Tally::default(), last_time: None, conflicting: false }
+    }
+
+    /// Takes rows as they came: `times` and one slice per column.
+    pub(crate) fn take(&mut self, times: &[i64], columns: &[&[f64]]) {
+        self.tally.rows_in += times.len() as u64;
+        let mut last = self.last_time.unwrap_or(-1);
+        let ordered = times.iter().all(|&t| std::mem::replace(&mut last, t) < t) && last < LATEST_NS;
+        let flagged = self.spec.status.iter().any(|rule| columns[rule.status].iter().any(|s| *s != 0.0));
+        if ordered && !flagged {
+            self.times.extend(times.iter().copied());
+            for (c, source) in columns.iter().enumerate() {
+                self.take_column(c, source);
+            }
+            if let Some(t) = times.last() {
+                self.last_time = Some(*t);
+                self.conflicting = false;
+            }
+        } else {
+            for (i, t) in times.iter().enumerate() {
+                let row: Vec<f64> = columns.iter().map(|c| c[i]).collect();
+                self.take_row(*t, &row);
+            }
+        }
+    }
+
+    fn take_column(&mut self, c: usize, source: &[f64]) {
+        let limit = self.spec.columns[c].limit;
+        let tally = &mut self.tally;
+        self.columns[c].extend(source.iter().map(|&v| if v.abs() <= limit { v } else { refuse(v, tally) }));
+    }
+
+    fn take_row(&mut self, t: i64, row: &[f64]) {
+        if !(0..LATEST_NS).contains(&t) {
+            return self.tally.add(Reason::BadTime, 1);
+        }
+        match self.last_time {
+            Some(last) if t < last => return self.tally.add(Reason::Late, 1),
+            Some(last) if t == last => return self.take_twin(t, row),
+            _ => {}
+        }
+        let mut tally = std::mem::take(&mut self.tally);
+        let clean = self.clean(row, &mut tally);
+        self.tally = tally;
+        self.times.push(t);
+        for (column, v) in self.columns.iter_mut().zip(clean) {
+            column.push(v);
+        }
+        self.last_time = Some(t);
+        self.conflicting = false;
+    }
+
+    /// A second row of the same time.
+    fn take_twin(&mut self, t: i64, row: &[f64]) {
+        if self.conflicting {
+            return self.tally.add(Reason::Conflicting, 1);
+        }
+        if self.times.as_slice().last() != Some(&t) {
+            // Its twin is on the grid already, which the host's promise of complete times rules out.
+            return self.tally.add(Reason::Late, 1);
+        }
+        let clean = self.clean(row, &mut Tally::default());
+        let same = |c: &Window<f64>, v: f64| c.as_slice().last().is_some_and(|x| x.to_bits() == v.to_bits());
+        if self.columns.iter().zip(clean).all(|(c, v)| same(c, v)) {
+            self.tally.add(Reason::Duplicate, 1);
+        } else {
+            self.times.pop();
+            self.columns.iter_mut().for_each(Window::pop);
+            self.conflicting = true;
+            self.tally.add(Reason::Conflicting, 2);
+        }
+    }
+
+    /// A row with every refused value NaN.
+    fn clean(&self, row: &[f64], tally: &mut Tally) -> Vec<f64> {
+        let mut flagged = vec![false; row.len()];
+        for rule in &self.spec.status {
+            if rule.raised(row[rule.status]) {
+                rule.covers.iter().for_each(|c| flagged[*c] = true);
+            }
+        }
+        row.iter()
+            .enumerate()
+            .map(|(c, &v)| {
+                if flagged[c] {
+                    tally.add(Reason::Status, 1);
+                    f64::NAN
+                } else if v.abs() <= self.spec.columns[c].limit {
+                    v
+                } else {
+                    refuse(v, tally)
+                }
+            })
+            .collect()
+    }
+
+    /// Forgets the first `count` rows.
+    pub(crate) fn drop_front(&mut self, count: usize) {
+        self.times.drop_front(count);
+        self.columns.iter_mut().for_each(|c| c.drop_front(count));
+    }
+
+    pub(crate) fn save(&self, w: &mut Writer) {
+        w.i64s(self.times.as_slice());
+        self.columns.iter().for_each(|c| w.f64s(c.as_slice()));
+        self.tally.save(w);
+        w.option(self.last_time);
+        w.flag(self.conflicting);
+    }
+
+    pub(crate) fn load(&mut self, r: &mut Reader<'_>) -> Result<(), StateError> {
+        self.times = Window::from_vec(r.i64s()?);
+        for column in &mut self.columns {
+            *column = Window::from_vec(r.f64s()?);
+        }
+        if self.columns.iter().any(|c| c.len() != self.times.len()) {
+            return Err(StateError::Foreign("layout"));
+        }
+        self.tally = Tally::load(r)?;
+        self.last_time = r.option()?;
+        self.conflicting = r.flag()?;
+        Ok(())
+    }
+}
+
+#[cold]
+fn refuse(v: f64, tally: &mut Tally) -> f64 {
+    let reason = if v.is_nan() {
+        Reason::NotANumber
+    } else if v.is_infinite() {
+        Reason::Infinite
+    } else {
+        Reason::Limit
+    };
+    tally.add(reason, 1);
+    f64::NAN
+}
