@@ -87,6 +87,9 @@ impl<'a> Reader<'a> {
     pub(crate) fn option(&mut self) -> Result<Option<i64>, StateError> {
         let there = self.flag()?;
         let value = self.i64()?;
+        if !there && value != 0 {
+            return Err(StateError::Foreign("layout"));
+        }
         Ok(there.then_some(value))
     }
     /// A count of things of `size` bytes each, no more than the rest of the state can hold.

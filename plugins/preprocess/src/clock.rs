@@ -71,7 +71,7 @@ struct Segment {
 pub(crate) enum Place {
     /// On this row, which may be one past the last so far or later.
     Row(i64),
-    /// On no row: before the grid, or between two segments.
+    /// On no row: before the grid, between two segments, or on the blank row before a segment.
     Nowhere,
 }
 
@@ -111,7 +111,8 @@ impl Epochs {
                 let row = segment.first_row + self.rate.nearest(time_ns - segment.origin_ns).max(0);
                 return if row < end { Place::Row(row) } else { Place::Nowhere };
             }
-            end = segment.first_row;
+            // The last row before a segment is blank.
+            end = segment.first_row - 1;
         }
         Place::Nowhere
     }
@@ -179,6 +180,8 @@ mod tests {
         epochs.begin(5, 1_540_000_000);
         assert_eq!(epochs.place(900_000_000), Place::Nowhere);
         assert_eq!(epochs.place(1_040_000_000), Place::Row(0));
+        assert_eq!(epochs.place(1_300_000_000), Place::Row(3));
+        assert_eq!(epochs.place(1_400_000_000), Place::Nowhere);
         assert_eq!(epochs.place(1_470_000_000), Place::Nowhere);
         assert_eq!(epochs.place(1_500_000_000), Place::Row(5));
         assert_eq!(epochs.time_ns(4), 1_400_000_000);

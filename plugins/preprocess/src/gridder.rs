@@ -12,7 +12,7 @@ use crate::bytes::{Reader, StateError, Writer};
 use crate::clock::{Epochs, Place, Rate};
 use crate::layout::{Mandatory, TableSpec};
 use crate::outliers::{self, BLOCK, MARGIN};
-use crate::series::{Reason, Series, Tally, Window};
+use crate::series::{LATEST_NS, Reason, Series, Tally, Window};
 
 /// Telemetry from which rates are learnt, on both sides of the first mandatory row.
 const OPENING_NS: i64 = 600_000_000_000;
@@ -108,8 +108,8 @@ pub(crate) struct Summary {
 
 /// What was learnt of a table, for the report.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Learnt<'a> {
-    pub(crate) name: &'a str,
+pub(crate) struct Learnt {
+    pub(crate) name: String,
     pub(crate) interval_s: Option<f64>,
     pub(crate) interpolated: bool,
     pub(crate) phase_s: Option<f64>,
@@ -157,7 +157,7 @@ impl Gridder {
             intervals: vec![0; count],
             reference: None,
             epochs: Epochs::new(rate),
-            complete_ns: i64::MIN,
+            complete_ns: 0,
             first_ns: None,
             last_reference_ns: 0,
             base: 0,
@@ -178,18 +178,20 @@ impl Gridder {
 
     /// Gives every row that is ready, or [`MOST_ROWS`]. Every row before `complete_ns` has been taken.
     pub(crate) fn advance(&mut self, complete_ns: i64, sink: &mut impl Sink) {
+        // At the end of the data hosts say "for ever"; tomorrow's rows are still to come, so that is no promise to keep.
+        let complete_ns = if complete_ns < LATEST_NS { complete_ns } else { self.after_last_row() };
         self.complete_ns = self.complete_ns.max(complete_ns);
         let first = self.given;
         while self.step(false, first + MOST_ROWS, sink) {}
     }
 
+    fn after_last_row(&self) -> i64 {
+        self.tables.iter().filter_map(|t| t.times.as_slice().last()).max().map_or(0, |last| last + 1)
+    }
+
     /// There is no more: gives the rest.
     pub(crate) fn flush(&mut self, sink: &mut impl Sink) {
-        self.complete_ns = self.tables.iter().filter_map(|t| t.times.as_slice().last()).copied().max().map_or(
-            self.complete_ns,
-            // The next file's rows come after this one's.
-            |last| self.complete_ns.max(last + 1),
-        );
+        self.complete_ns = self.complete_ns.max(self.after_last_row());
         while self.step(true, i64::MAX, sink) {}
         // What has no place now will have none: the grid ends with the reference.
         for (series, class) in self.tables.iter_mut().zip(&self.classes) {
@@ -207,13 +209,14 @@ impl Gridder {
             return false;
         }
         let rows = self.rows;
-        let mut settled_ns = self.lay_epochs(flush);
+        let (mut settled_ns, blocked) = self.lay_epochs(flush);
         for table in 0..self.tables.len() {
             if Some(table) != self.reference {
                 settled_ns = settled_ns.min(self.fill(table, flush));
             }
         }
-        self.clean(settled_ns, flush);
+        // Blocks of rows must not depend on how many rows may wait.
+        self.clean(settled_ns, flush && !blocked);
         let given = self.given;
         self.give(most, flush, sink);
         self.given < most && (self.given > given || self.rows > rows)
@@ -289,9 +292,10 @@ impl Gridder {
 
     // ---- 3. epochs and places ----
 
-    /// Places the reference's rows and makes rows for them. Gives the time up to which that is settled.
-    fn lay_epochs(&mut self, flush: bool) -> i64 {
-        let Some(reference) = self.reference else { return i64::MIN };
+    /// Places the reference's rows and makes rows for them. Gives the time up to which that is settled, and whether
+    /// more rows were needed than may wait.
+    fn lay_epochs(&mut self, flush: bool) -> (i64, bool) {
+        let Some(reference) = self.reference else { return (0, false) };
         let rate = self.epochs.rate;
         let agree_ns = rate.offset_ns(AGREEING as i64);
         let mut placed: Vec<i64> = Vec::new();
@@ -309,13 +313,14 @@ impl Gridder {
                 self.begin_segment(reference, used, time);
             }
             let (mut row, off_ns) = self.epochs.newest(time);
+            let mut off_phase = false;
             if off_ns.abs() > rate.part_ns(0.25) {
                 if !ready {
                     break;
                 }
                 if let Some(phase) = self.agreed_phase(reference, used, time) {
-                    // The last row of the old phase ends before the new one begins, and is blank.
-                    let (last, _) = self.epochs.newest(time - rate.part_ns(0.5) - 1);
+                    // The last row of the old phase lies half to one and a half intervals back, and is blank.
+                    let (last, _) = self.epochs.newest(time - rate.part_ns(1.0));
                     let last = last.max(self.rows - 1);
                     if !self.make_rows(last + 1) {
                         blocked = true;
@@ -332,13 +337,14 @@ impl Gridder {
                     self.summary.rephased += 1;
                     row = last + 1;
                 } else {
-                    self.tables[reference].tally.add(Reason::OffPhase, 1);
+                    off_phase = true;
                 }
             }
             if !self.make_rows(row + 1) {
                 blocked = true;
                 break;
             }
+            self.tables[reference].tally.add(Reason::OffPhase, u64::from(off_phase));
             self.last_reference_ns = time;
             placed.push(row);
             used += 1;
@@ -346,7 +352,7 @@ impl Gridder {
         self.put(reference, &placed, used - placed.len());
         let waiting = self.tables[reference].times.as_slice().get(used).copied();
         self.tables[reference].drop_front(used);
-        if blocked { waiting.unwrap_or(self.complete_ns) } else { waiting.unwrap_or(i64::MAX).min(self.complete_ns) }
+        (waiting.unwrap_or(self.complete_ns).min(self.complete_ns), blocked)
     }
 
     /// The first segment, or one after a gap too long to fill.
@@ -365,6 +371,7 @@ impl Gridder {
             self.grow_cells();
         }
         self.epochs.begin(self.rows, time + phase);
+        self.last_reference_ns = time;
     }
 
     /// The table's next times within the span in which a clock must agree with itself.
@@ -444,16 +451,15 @@ impl Gridder {
                 break;
             }
             let ready = flush || self.complete_ns >= time.saturating_add(agree_ns);
-            let phase = match phase_ns {
-                Some(phase) => phase,
-                None if !ready => break,
-                None => {
-                    let origin = self.epochs.time_ns(self.rows - 1);
-                    let phase = rate.phase(origin, self.following(table, used, time));
-                    phase_ns = Some(phase);
-                    phase
+            if phase_ns.is_none()
+                && let Place::Row(row) = self.epochs.place(time)
+            {
+                if !ready {
+                    break;
                 }
-            };
+                phase_ns = Some(rate.phase(self.epochs.time_ns(row), self.following(table, used, time)));
+            }
+            let phase = phase_ns.unwrap_or(0);
             let mut place = self.epochs.place(time - phase);
             if let Place::Row(row) = place {
                 if row >= self.rows {
@@ -470,13 +476,16 @@ impl Gridder {
                         if let Some(change) = self.agreed_phase(table, used, time) {
                             self.put(table, &placed, used - placed.len());
                             placed.clear();
+                            self.tables[table].tally.add(Reason::ClockJump, 1);
                             let new = rate.wrap(time + change - self.epochs.time_ns(row));
                             phase_ns = Some(new);
                             place = self.epochs.place(time - new);
                             if let Place::Row(row) = place {
                                 self.blank(table, row - 1);
+                                if row >= self.rows {
+                                    break;
+                                }
                             }
-                            self.tables[table].tally.add(Reason::ClockJump, 1);
                         } else {
                             self.tables[table].tally.add(Reason::OffPhase, 1);
                         }
@@ -628,7 +637,8 @@ impl Gridder {
 
     /// How far beyond an epoch slow tables must be complete, ns.
     fn look_ahead_ns(&self) -> i64 {
-        let slow = self.classes.iter().filter_map(|c| if let Class::Slow(interval) = c { Some(*interval) } else { None });
+        let slow =
+            self.classes.iter().filter_map(|c| if let Class::Slow(interval) = c { Some(*interval) } else { None });
         slow.map(|interval| across_ns(interval, self.config.hold_intervals)).max().unwrap_or(0)
     }
 
@@ -704,9 +714,7 @@ impl Gridder {
             let values = series.columns[c].as_slice();
             sink.column(table, c).extend(weights.iter().map(|w| match *w {
                 None => f64::NAN,
-                Some((at, weight)) if weight > 0.0 && !spec.flag => {
-                    values[at] + (values[at + 1] - values[at]) * weight
-                }
+                Some((at, weight)) if weight > 0.0 && !spec.flag => values[at] + (values[at + 1] - values[at]) * weight,
                 Some((at, _)) => values[at],
             }));
         }
@@ -762,7 +770,7 @@ impl Gridder {
     // ---- report and state ----
 
     /// What was learnt of each table.
-    pub(crate) fn learnt_tables(&self) -> Vec<Learnt<'_>> {
+    pub(crate) fn learnt_tables(&self) -> Vec<Learnt> {
         let given = self.summary.used + self.summary.rejected;
         let describe = |(t, series): (usize, &Series)| {
             let fast = if let Some(Class::Fast(fast)) = self.classes.get(t) { Some(fast) } else { None };
@@ -772,7 +780,7 @@ impl Gridder {
                 (0..fast.runs.len()).filter(still).map(name).collect()
             });
             Learnt {
-                name: &series.spec.name,
+                name: series.spec.name.clone(),
                 interval_s: (self.intervals[t] > 0).then(|| self.intervals[t] as f64 * 1e-9),
                 interpolated: matches!(self.classes.get(t), Some(Class::Slow(_))),
                 phase_s: fast.and_then(|f| f.phase_ns).map(|p| p as f64 * 1e-9),
@@ -819,7 +827,15 @@ impl Gridder {
         w.option(self.reference.map(|r| r as i64));
         self.epochs.save(&mut w);
         w.option(self.first_ns);
-        w.i64s(&[self.complete_ns, self.last_reference_ns, self.base, self.rows, self.counted, self.cleaned, self.given]);
+        w.i64s(&[
+            self.complete_ns,
+            self.last_reference_ns,
+            self.base,
+            self.rows,
+            self.counted,
+            self.cleaned,
+            self.given,
+        ]);
         self.summary.save(&mut w);
         w.0
     }

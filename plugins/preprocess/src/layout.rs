@@ -194,10 +194,8 @@ mod tests {
 
     #[test]
     fn a_status_covers_what_lies_below_it() {
-        let owned = columns(
-            "dws",
-            &["tm1.theta_orf_rad", "tm2.theta_orf_rad", "sc_crf_rad.phi", "sc_crf_rad.psi", "status"],
-        );
+        let owned =
+            columns("dws", &["tm1.theta_orf_rad", "tm2.theta_orf_rad", "sc_crf_rad.phi", "sc_crf_rad.psi", "status"]);
         let all: Vec<&Column> = owned.iter().collect();
         let spec = table_spec("dws", &all, true, &["tm1", "tm2"], None);
         let covered = |status: f64| -> Vec<usize> {

@@ -141,7 +141,7 @@ impl Tally {
 }
 
 /// Times outside this are garbage; the bound keeps every difference within an i64.
-const LATEST_NS: i64 = 1 << 62;
+pub(crate) const LATEST_NS: i64 = 1 << 62;
 
 /// One table's rows that wait for their place.
 #[derive(Clone, Debug)]

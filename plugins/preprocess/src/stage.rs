@@ -1,0 +1,312 @@
+//! The stage: columns in, columns out, and what the product says about them.
+
+use chrono::DateTime;
+use dragfree_physics::mission::Mission;
+use dragfree_sdk::prelude::*;
+use serde_json::json;
+use std::collections::BTreeMap;
+
+use crate::gridder::{Config, Gridder, Learnt, Sink};
+use crate::layout::{expected, grid_name, stated_rate_hz, table_spec};
+use crate::series::Reason;
+
+/// Irregular tables of telemetry in, the uniform table `grid` out.
+#[derive(Debug)]
+pub struct Preprocess {
+    mission: Mission,
+    mandatory: Vec<String>,
+    config: Config,
+    /// Per table the columns read and the columns written.
+    tables: Vec<(Vec<In>, Vec<Out>)>,
+    grid: Option<Table>,
+    gridder: Option<Gridder>,
+}
+
+/// Rows go straight into the host's columns.
+struct Host<'a> {
+    output: &'a mut Outputs,
+    grid: Table,
+    tables: &'a [(Vec<In>, Vec<Out>)],
+}
+
+impl Sink for Host<'_> {
+    fn times(&mut self) -> &mut Vec<i64> {
+        self.output.time(self.grid)
+    }
+    fn column(&mut self, table: usize, column: usize) -> &mut Vec<f64> {
+        self.output.f64(self.tables[table].1[column])
+    }
+}
+
+fn not_linked() -> PluginError {
+    PluginError::fatal("preprocess: called before it was linked; the host must link a stage before it gives it data")
+}
+
+impl Stage for Preprocess {
+    const MANIFEST: Manifest = Manifest {
+        id: "preprocess",
+        version: env!("CARGO_PKG_VERSION"),
+        licence: "MIT OR Apache-2.0",
+        description: "Brings all telemetry onto one grid of epochs; gaps, duplicates, status flags and outliers become NaN",
+        parameters: &[
+            Parameter::text_list(
+                "mandatory",
+                &["is", "dws"],
+                "topics without which nothing can be calibrated; the densest lays the epochs",
+            ),
+            Parameter::f64(
+                "outlier_sigma",
+                "1",
+                20.0,
+                0.0..=1e9,
+                "a displacement or angle that leaves its line by more than this and comes back is refused, in standard \
+                 deviations of its second difference; below 7.3 Gaussian noise raises false alarms; 0 = off",
+            ),
+            Parameter::i64(
+                "stuck_samples",
+                "1",
+                10,
+                0..=10_000,
+                "so many equal samples of an instrument in a row are refused; 0 = off",
+            ),
+            Parameter::f64(
+                "hold_intervals",
+                "1",
+                2.0,
+                1.0..=100.0,
+                "slow telemetry is interpolated across, and held for, so many of its own intervals",
+            ),
+            Parameter::f64(
+                "max_gap_s",
+                "s",
+                21_600.0,
+                1.0..=1e6,
+                "longer gaps are left out of the grid instead of filled with rows of NaN",
+            ),
+        ],
+        instances: &[],
+    };
+
+    fn new(setup: &Setup) -> Result<Self, PluginError> {
+        let mission = Mission::from_json(setup.mission_json())?;
+        let mandatory = setup.text_list("mandatory")?;
+        if mandatory.is_empty() {
+            return Err(PluginError::error(
+                "parameter mandatory = []: one table must lay the epochs; name the instrument, such as [\"is\", \"dws\"]",
+            ));
+        }
+        let config = Config {
+            rate_hz: mission.mission.sample_rate_hz,
+            outlier_sigma: setup.f64("outlier_sigma")?,
+            stuck_samples: u32::try_from(setup.i64("stuck_samples")?)?,
+            hold_intervals: setup.f64("hold_intervals")?,
+            max_gap_s: setup.f64("max_gap_s")?,
+        };
+        Ok(Self { mission, mandatory, config, tables: Vec::new(), grid: None, gridder: None })
+    }
+
+    fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
+        let mut found: Vec<(&str, Vec<&Column>)> = Vec::new();
+        for column in available.columns.iter().filter(|c| c.rate_hz == 0.0) {
+            match found.iter_mut().find(|(name, _)| *name == column.table) {
+                Some((_, columns)) => columns.push(column),
+                None => found.push((&column.table, vec![column])),
+            }
+        }
+        let names: Vec<&str> = found.iter().map(|(name, _)| *name).collect();
+        if let Some(missing) = self.mandatory.iter().find(|m| !names.contains(&m.as_str())) {
+            let found = if names.is_empty() { "no topic at all".to_owned() } else { names.join(", ") };
+            return Err(PluginError::error(format!(
+                "topic {missing} is missing from the telemetry, which has {found}; without it nothing can be calibrated: \
+                 give files that hold it, or name other topics in preprocess' parameter `mandatory`"
+            )));
+        }
+        let test_masses: Vec<&str> = self.mission.test_mass.keys().map(String::as_str).collect();
+        self.ask_for_readouts(link, &test_masses)?;
+        let grid = link.table("grid", self.config.rate_hz);
+        let mut specs = Vec::with_capacity(found.len());
+        for (name, columns) in &found {
+            let mandatory = self.mandatory.iter().any(|m| m == name);
+            let measured = columns.iter().filter(|c| !c.name.ends_with("status")).count();
+            let stated = stated_rate_hz(columns).map(|rate| rate.to_string());
+            let (mut ins, mut outs) = (Vec::new(), Vec::new());
+            for column in columns {
+                let mut want = Want::of(column);
+                if let Some((unit, frame)) = expected(name, &column.name) {
+                    want = want.unit(unit).frame(frame);
+                }
+                ins.push(link.read(&want)?);
+                let mut attributes: Vec<(&str, &str)> =
+                    column.attributes.iter().map(|(k, v)| (k.as_str(), v.as_str())).collect();
+                attributes.extend(stated.as_deref().map(|rate| ("source_rate_hz", rate)));
+                let name = grid_name(name, &column.name, measured == 1);
+                outs.push(link.write_with(grid, &name, &column.unit, &column.frame, &attributes)?);
+            }
+            specs.push(table_spec(name, columns, mandatory, &test_masses, self.mission.limits.as_ref()));
+            self.tables.push((ins, outs));
+        }
+        self.grid = Some(grid);
+        self.gridder = Some(Gridder::new(self.config.clone(), specs));
+        Ok(())
+    }
+
+    fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
+        let (Some(gridder), Some(grid)) = (&mut self.gridder, self.grid) else { return Err(not_linked()) };
+        let mut columns: Vec<&[f64]> = Vec::new();
+        for (table, (ins, _)) in self.tables.iter().enumerate() {
+            let Some(first) = ins.first() else { continue };
+            columns.clear();
+            columns.extend(ins.iter().map(|i| input.f64(*i)));
+            gridder.take(table, input.times_of(*first), &columns);
+        }
+        gridder.advance(input.complete_until_ns(), &mut Host { output, grid, tables: &self.tables });
+        Ok(())
+    }
+
+    fn flush(&mut self, output: &mut Outputs) -> Result<(), PluginError> {
+        let (Some(gridder), Some(grid)) = (&mut self.gridder, self.grid) else { return Err(not_linked()) };
+        gridder.flush(&mut Host { output, grid, tables: &self.tables });
+        Ok(())
+    }
+
+    fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
+        let gridder = self.gridder.as_mut().ok_or_else(not_linked)?;
+        let report = report_of(gridder, &self.config);
+        gridder.reset_counts();
+        Ok(report)
+    }
+
+    fn save(&self) -> Result<Vec<u8>, PluginError> {
+        Ok(self.gridder.as_ref().ok_or_else(not_linked)?.save())
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
+        Ok(self.gridder.as_mut().ok_or_else(not_linked)?.load(state)?)
+    }
+}
+
+impl Preprocess {
+    /// Asks for what the calibration of a drag-free mission cannot do without, so that a topic without it is refused
+    /// in the host's words.
+    fn ask_for_readouts(&self, link: &mut Link<'_>, test_masses: &[&str]) -> Result<(), PluginError> {
+        let mut wanted: Vec<(&str, String)> = Vec::new();
+        if self.mandatory.iter().any(|m| m == "is") {
+            wanted.extend(
+                test_masses.iter().flat_map(|tm| ["y", "z"].map(|axis| ("is", format!("{tm}.r_orf_m.{axis}")))),
+            );
+        }
+        if self.mandatory.iter().any(|m| m == "dws") {
+            wanted.extend(["phi", "theta", "psi"].map(|angle| ("dws", format!("sc_crf_rad.{angle}"))));
+        }
+        for (table, name) in wanted {
+            let (unit, frame) = expected(table, &name).unwrap_or_default();
+            link.read(&Want::new(name).table(table).unit(unit).frame(frame))?;
+        }
+        Ok(())
+    }
+}
+
+/// Unix nanoseconds as a date, in the time scale of the telemetry.
+fn date(time_ns: i64) -> String {
+    DateTime::from_timestamp_nanos(time_ns).format("%Y-%m-%dT%H:%M:%S%.3f").to_string()
+}
+
+fn report_of(gridder: &Gridder, config: &Config) -> Report {
+    let learnt = gridder.learnt_tables();
+    let summary = &gridder.summary;
+    let mut counts: BTreeMap<String, u64> = BTreeMap::new();
+    let mut data_loss = false;
+    for (series, learnt) in gridder.tables.iter().zip(&learnt) {
+        for (reason, name) in Reason::ALL {
+            let count = series.tally.get(reason);
+            if count > 0 {
+                counts.insert(format!("{}.{name}", learnt.name), count);
+                data_loss |= Reason::LOSSES.contains(&reason);
+            }
+        }
+        if let Some(missing) = learnt.missing.filter(|m| *m > 0) {
+            counts.insert(format!("{}.missing_epochs", learnt.name), missing);
+        }
+    }
+    for (name, count) in [("grid.rephased", summary.rephased), ("grid.cut_gaps", summary.cut_gaps)] {
+        if count > 0 {
+            counts.insert(name.to_owned(), count);
+        }
+    }
+    let mut quality = serde_json::Map::new();
+    quality.insert("telemetry".to_owned(), learnt.iter().map(|l| (l.name.clone(), describe(l))).collect());
+    Report {
+        epochs_used: Some(summary.used),
+        epochs_rejected: Some(summary.rejected),
+        data_loss,
+        counts,
+        notes: notes(gridder, &learnt, config),
+        quality,
+        ..Report::default()
+    }
+}
+
+fn describe(learnt: &Learnt) -> serde_json::Value {
+    json!({
+        "rate_hz": learnt.interval_s.map(|s| 1.0 / s),
+        "interpolated": learnt.interpolated,
+        "after_epoch_s": learnt.phase_s,
+    })
+}
+
+/// What an operator should know, in sentences.
+fn notes(gridder: &Gridder, learnt: &[Learnt], config: &Config) -> Vec<String> {
+    let summary = &gridder.summary;
+    let period_s = 1.0 / config.rate_hz;
+    let mut notes = Vec::new();
+    let Some(reference) = gridder.reference_name() else {
+        return vec!["no row of any mandatory topic came, so there is no epoch".to_owned()];
+    };
+    if summary.longest.rows > 0 {
+        notes.push(format!(
+            "longest stretch of epochs without all mandatory channels: {:.1} s from {}",
+            summary.longest.rows as f64 * period_s,
+            date(summary.longest.from_ns)
+        ));
+    }
+    if summary.cut_gaps > 0 {
+        notes.push(format!(
+            "{} gap(s) of {reference} longer than max_gap_s = {} s are left out of the grid, the longest {:.1} s from {}",
+            summary.cut_gaps,
+            config.max_gap_s,
+            summary.longest_cut_ns as f64 * 1e-9,
+            date(summary.longest_cut_from_ns)
+        ));
+    }
+    if summary.rephased > 0 {
+        notes.push(format!(
+            "the clock of {reference} jumped {} time(s), first at {}; the epochs follow it and the one before each jump is \
+             blank",
+            summary.rephased,
+            date(summary.first_rephased_ns)
+        ));
+    }
+    for (series, l) in gridder.tables.iter().zip(learnt) {
+        let table = &l.name;
+        if series.tally.rows_in == 0 {
+            notes.push(format!("{table}: not one row came"));
+        }
+        if let (true, Some(interval)) = (series.spec.mandatory, l.interval_s)
+            && (interval / period_s - 1.0).abs() > 1e-3
+        {
+            notes.push(format!(
+                "{table} comes at {:.4} Hz where the mission says {} Hz; epochs without a sample are blank and slips are \
+                 counted: correct mission.sample_rate_hz",
+                1.0 / interval,
+                config.rate_hz
+            ));
+        }
+        if let Some(phase) = l.phase_s.filter(|p| p.abs() > period_s * 0.01 && series.tally.rows_placed > 0) {
+            notes.push(format!("{table} is sampled {:+.1} ms from the epochs of {reference}", phase * 1e3));
+        }
+        if !l.absent.is_empty() {
+            notes.push(format!("{table}: {} never left zero and are taken as not measured", l.absent.join(", ")));
+        }
+    }
+    notes
+}
