@@ -3,7 +3,6 @@
 use chrono::{DateTime, Utc};
 use serde_json::Value;
 use sha2::{Digest, Sha256};
-use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -15,8 +14,8 @@ use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions, Summary};
 use crate::product::{self, Draft, Loss, Product, ProductWriter, Stage, StageReport, Status, Stream};
 use crate::registry::Registry;
 use crate::replay;
-use crate::table::{Batch, Chunk, Column, TableSpec};
-use crate::telemetry::{self, FileHeader, TelemetryWriter};
+use crate::table::{Batch, Chunk, TableSpec};
+use crate::telemetry::{FileHeader, TelemetryWriter, interface_tables};
 
 /// What to run.
 #[derive(Clone, Debug)]
@@ -200,22 +199,6 @@ pub fn check(registry: &Registry, options: &RunOptions) -> Result<CheckReport, E
         coefficients: chain.coefficients.iter().filter(|c| c.estimate).map(|c| c.name.clone()).collect(),
         free_bytes: None,
     })
-}
-
-/// The tables of telemetry that has every topic of the interface, for a check without files.
-fn interface_tables() -> Vec<TableSpec> {
-    ["is", "ifo", "dws", "command", "ephemeris"]
-        .iter()
-        .filter_map(|name| {
-            let layout = telemetry::expected(&format!("/{name}"))?;
-            let columns = layout.leaves().iter().map(|leaf| {
-                let (unit, frame) = telemetry::unit_and_frame(&leaf.path);
-                let (table, name) = ((*name).to_owned(), leaf.path.clone());
-                Column { table, name, unit, frame, rate_hz: 0.0, attributes: BTreeMap::new() }
-            });
-            Some(TableSpec { name: (*name).to_owned(), rate_hz: 0.0, columns: columns.collect(), truth: false })
-        })
-        .collect()
 }
 
 fn carry(options: &RunOptions) -> Carry {
