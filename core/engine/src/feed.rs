@@ -107,17 +107,8 @@ impl Feed for FileFeed {
             time_scale: self.replay.info().time_scale.clone(),
             spacecraft: self.replay.info().spacecraft.clone(),
             counts: losses.counts(),
-            losses: losses
-                .lost()
-                .map(|(kind, count)| Loss {
-                    kind: kind.to_owned(),
-                    count,
-                    detail: format!(
-                        "counted by the replay; the notes that begin with `replay:` say where, {count} in all"
-                    ),
-                })
-                .collect(),
-            notes: losses.messages().to_vec(),
+            losses: losses.entries(),
+            notes: losses.notes(),
             report: None,
         })
     }

@@ -128,11 +128,6 @@ impl Losses {
         self.messages.iter().filter(|(finding, _)| !finding.is_loss()).map(|(_, text)| text.clone()).collect()
     }
 
-    /// What was lost, by the key of its kind.
-    pub fn lost(&self) -> impl Iterator<Item = (&'static str, u64)> {
-        self.counts.iter().filter(|(finding, _)| finding.is_loss()).map(|(finding, &count)| (finding.key(), count))
-    }
-
     /// True when data were lost.
     #[must_use]
     pub fn data_loss(&self) -> bool {
