@@ -4,6 +4,9 @@ use crate::utc;
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
+/// Epochs that plugins are handed at a time unless the command line says otherwise.
+pub(crate) const BATCH_ROWS: u32 = 4096;
+
 /// Calibrates the offset between a drag-free spacecraft's centre of mass and its test masses.
 #[derive(Debug, Parser)]
 #[command(name = "dragfree", version, max_term_width = 100, arg_required_else_help = true)]
@@ -104,9 +107,10 @@ pub(crate) struct Simulate {
 }
 
 impl Simulate {
-    /// Length of the simulation, s.
-    pub(crate) fn duration_s(&self) -> f64 {
-        self.days.map_or(self.hours.unwrap_or(6.0) * 3600.0, |days| days * 86_400.0)
+    /// End of the simulation, exclusive, Unix ns.
+    pub(crate) fn end_ns(&self) -> i64 {
+        let hours = self.days.map_or(self.hours.unwrap_or(6.0), |days| 24.0 * days);
+        self.start_ns.saturating_add((hours * 3600e9).round() as i64) // a cast of a float saturates
     }
 }
 
@@ -136,7 +140,7 @@ pub(crate) struct Run {
     #[arg(long, value_name = "FILE")]
     pub(crate) save_state: Option<PathBuf>,
     /// Epochs that plugins are handed at a time; results do not depend on it
-    #[arg(long, value_name = "N", default_value_t = 4096, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, value_name = "N", default_value_t = BATCH_ROWS, value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) batch_rows: u32,
 }
 
@@ -274,7 +278,7 @@ mod tests {
         let arguments = parse("dragfree simulate m.toml --out d --effect a:b.c=-2e-3 --days 2").expect("parses");
         let Command::Simulate(simulate) = arguments.command else { panic!("simulate was asked for") };
         assert_eq!(simulate.effects, [Effect { id: "a".into(), instance: "b.c".into(), size: -2e-3 }]);
-        assert!((simulate.duration_s() - 172_800.0).abs() < 1e-9);
         assert_eq!(simulate.start_ns, 2_051_222_400_000_000_000);
+        assert_eq!(simulate.end_ns() - simulate.start_ns, 172_800_000_000_000);
     }
 }

@@ -15,6 +15,9 @@ pub(crate) enum Failure {
     /// No plugin of that name.
     #[error("no plugin {0}; `dragfree plugins list` shows what was found and what was refused")]
     Plugin(String),
+    /// The demo would have to share a folder.
+    #[error("{} is neither empty nor made by an earlier demo; name a folder of its own with --dir", .0.display())]
+    NoDemoFolder(PathBuf),
     /// `--hidden` was asked for.
     #[error(
         "--hidden is not built yet: no bundled effect can be hidden besides the offset; use --effect ID:INSTANCE=SIZE"

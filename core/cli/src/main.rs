@@ -8,6 +8,7 @@ mod logs;
 mod progress;
 mod screen;
 mod text;
+mod truth;
 mod utc;
 
 use args::{Arguments, Colour};

@@ -1,6 +1,8 @@
 //! Progress on stderr: one line that is rewritten on a terminal, a plain line now and then where it is asked for.
 
+use crate::args::Global;
 use crate::utc;
+use dragfree_engine::run::Progress;
 use std::io::{IsTerminal as _, Write as _};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -22,24 +24,22 @@ pub(crate) struct Meter {
     job: &'static str,
     started: Instant,
     shown: Option<Instant>,
-    first_ns: Option<i64>,
 }
 
 impl Meter {
-    /// `verbose` shows progress also where stderr is no terminal.
-    pub(crate) fn new(job: &'static str, quiet: bool, verbose: bool) -> Self {
-        let style = match (quiet, std::io::stderr().is_terminal()) {
+    /// `-v` shows progress also where stderr is no terminal.
+    pub(crate) fn new(job: &'static str, global: &Global) -> Self {
+        let style = match (global.quiet, std::io::stderr().is_terminal()) {
             (true, _) => Style::Silent,
             (false, true) => Style::Line,
-            (false, false) if verbose => Style::Plain,
+            (false, false) if global.verbose > 0 => Style::Plain,
             (false, false) => Style::Silent,
         };
-        Self { style, job, started: Instant::now(), shown: None, first_ns: None }
+        Self { style, job, started: Instant::now(), shown: None }
     }
 
-    /// `epoch_ns` is reached; the job ends at `end_ns` where that is known.
-    pub(crate) fn reached(&mut self, epoch_ns: i64, end_ns: Option<i64>) {
-        let first_ns = *self.first_ns.get_or_insert(epoch_ns);
+    /// Shows how far the job is, now and then.
+    pub(crate) fn show(&mut self, progress: &Progress) {
         let interval = match self.style {
             Style::Silent => return,
             Style::Line => Duration::from_millis(200),
@@ -50,7 +50,7 @@ impl Meter {
             return;
         }
         self.shown = Some(now);
-        let line = line(self.job, now.duration_since(self.started), first_ns, epoch_ns, end_ns);
+        let line = line(self.job, now.duration_since(self.started), progress);
         let mut stderr = std::io::stderr().lock();
         // Progress that cannot be shown is no reason to stop.
         let _ = match self.style {
@@ -76,12 +76,13 @@ pub(crate) fn clear_line() {
     }
 }
 
-/// `run  2035-01-01 03:00:00  50 %  21600 × real time  1 s left`.
-fn line(job: &str, elapsed: Duration, first_ns: i64, epoch_ns: i64, end_ns: Option<i64>) -> String {
+/// `run  2035-01-01 03:00:00  21600 × real time  50 %  1 s left`.
+fn line(job: &str, elapsed: Duration, progress: &Progress) -> String {
+    let Progress { first_ns, until_ns, end_ns, .. } = *progress;
     let seconds = |from: i64, to: i64| to.saturating_sub(from).max(0) as f64 * 1e-9;
-    let done_s = seconds(first_ns, epoch_ns);
+    let done_s = seconds(first_ns, until_ns);
     let rate = done_s / elapsed.as_secs_f64().max(1e-9);
-    let second_ns = epoch_ns.div_euclid(1_000_000_000) * 1_000_000_000;
+    let second_ns = until_ns.div_euclid(1_000_000_000) * 1_000_000_000;
     let mut line = format!("{job}  {}  {rate:.0} × real time", utc::format(second_ns));
     if let Some(end_ns) = end_ns {
         let whole_s = seconds(first_ns, end_ns);
@@ -102,11 +103,13 @@ mod tests {
 
     #[test]
     fn rate_and_time_left_follow_from_the_epochs() {
-        let second = Duration::from_secs(1);
-        let half = line("run", second, START_NS, START_NS + 3 * HOUR_NS, Some(START_NS + 6 * HOUR_NS));
-        assert_eq!(half, "run  2035-01-01 03:00:00  10800 × real time  50 %  1 s left");
-        assert_eq!(line("run", second, START_NS, START_NS, None), "run  2035-01-01 00:00:00  0 × real time");
-        let past = line("run", second, START_NS, START_NS + 7 * HOUR_NS, Some(START_NS + 6 * HOUR_NS));
-        assert!(past.ends_with("100 %  0 s left"), "{past}");
+        let said = |hours: i64, end_ns: Option<i64>| {
+            let progress = Progress { until_ns: START_NS + hours * HOUR_NS, first_ns: START_NS, end_ns, epochs: 0 };
+            line("run", Duration::from_secs(1), &progress)
+        };
+        let end_ns = Some(START_NS + 6 * HOUR_NS);
+        assert_eq!(said(3, end_ns), "run  2035-01-01 03:00:00  10800 × real time  50 %  1 s left");
+        assert_eq!(said(0, None), "run  2035-01-01 00:00:00  0 × real time");
+        assert!(said(7, end_ns).ends_with("100 %  0 s left"));
     }
 }

@@ -5,6 +5,7 @@ use crate::utc;
 use dragfree_engine::border::{Manifest, Parameter};
 use dragfree_engine::product::{Coefficient, Listing, Product};
 use dragfree_engine::registry::Registry;
+use dragfree_engine::run::{CheckReport, CheckedNode};
 use serde_json::Value;
 use std::fmt::Write as _;
 use std::path::Path;
@@ -188,6 +189,23 @@ pub(crate) fn plugins(registry: &Registry, paint: Paint) -> String {
         let _ = writeln!(screen, "{} {}", paint.doubtful("refused:"), refused.path.display());
         screen += &text::labelled("", &refused.reason);
     }
+    screen
+}
+
+/// A pipeline as it would run.
+pub(crate) fn check(report: &CheckReport) -> String {
+    let mut screen = text::labelled("pipeline", &report.pipeline);
+    screen += &text::labelled("mission", &report.mission);
+    screen += &text::labelled("model", &format!("revision {}: {}", report.model, report.coefficients.join(" ")));
+    screen.push('\n');
+    let heading = ["plugin", "version", "reads", "writes"].map(str::to_owned).to_vec();
+    let row = |node: &CheckedNode| {
+        let count = |columns: &[String]| format!("{} columns", columns.len());
+        vec![node.name.clone(), node.version.clone(), count(&node.reads), count(&node.writes)]
+    };
+    let rows: Vec<_> = [heading].into_iter().chain(report.nodes.iter().map(row)).collect();
+    screen += &text::columns(&rows);
+    screen += "\nevery column fits; the names of all columns with --json\n";
     screen
 }
 

@@ -1,7 +1,10 @@
 //! One function per command; each gives back what belongs on stdout.
 
+mod demo;
 mod plugins;
 mod products;
+mod run;
+mod simulate;
 
 use crate::args::{Arguments, Command, Config, Global};
 use crate::failure::Failure;
@@ -30,10 +33,10 @@ impl Done {
 pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failure> {
     let global = &arguments.global;
     match &arguments.command {
-        Command::Demo { dir } => unreachable!(),
-        Command::Simulate(simulate) => unreachable!(),
-        Command::Run(run) => unreachable!(),
-        Command::Config(Config::Check(chain)) => unreachable!(),
+        Command::Demo { dir } => demo::execute(dir, global, paint),
+        Command::Simulate(command) => simulate::execute(command, global),
+        Command::Run(command) => run::execute(command, global, paint),
+        Command::Config(Config::Check(chain)) => run::config_check(chain, global),
         Command::Plugins(command) => plugins::execute(command, global, paint),
         Command::Products(command) => products::execute(command, global.json, paint),
     }
@@ -59,4 +62,9 @@ fn own_folders() -> Vec<PathBuf> {
     };
     let installed = beside.join("../lib/dragfree");
     [beside, installed].into_iter().filter(|folder| folder.is_dir()).collect()
+}
+
+/// Version of the program, as products tell it.
+fn software() -> String {
+    concat!("dragfree ", env!("CARGO_PKG_VERSION")).to_owned()
 }

@@ -28,7 +28,7 @@ pub struct Draft {
     pub first_ns: i64,
     /// Last epoch, Unix ns of `time_scale`.
     pub last_ns: i64,
-    /// `UTC`, `TAI` or `GPS`.
+    /// `UTC`, `TAI` or `GPS`; empty where the data do not say.
     pub time_scale: String,
     /// Operations, reprocessing or a test.
     pub stream: Stream,
@@ -210,7 +210,7 @@ pub(super) fn product(
             day: draft.day.format("%Y-%m-%d").to_string(),
             stream: draft.stream,
             status: draft.status,
-            time_scale: draft.time_scale.clone(),
+            time_scale: if draft.time_scale.is_empty() { "unknown" } else { &draft.time_scale }.to_owned(),
             start_time_epoch_ns: draft.first_ns,
             stop_time_epoch_ns: draft.last_ns,
             frames: frames(&result.coefficients),

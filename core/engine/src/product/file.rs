@@ -117,7 +117,7 @@ pub struct NonStandardAttributes {
     pub stream: Stream,
     /// How final the product is.
     pub status: Status,
-    /// `UTC`, `TAI` or `GPS`.
+    /// `UTC`, `TAI`, `GPS` or `unknown`.
     pub time_scale: String,
     /// First epoch, Unix ns of `time_scale`.
     pub start_time_epoch_ns: i64,

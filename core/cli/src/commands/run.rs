@@ -1,0 +1,87 @@
+//! `dragfree run` and `dragfree config check`.
+
+use super::Done;
+use crate::args::{BATCH_ROWS, Chain, Global, Run};
+use crate::failure::Failure;
+use crate::progress::Meter;
+use crate::screen;
+use crate::text::Paint;
+use dragfree_engine::product::{self, Product};
+use dragfree_engine::run::{Outcome, RunOptions, check, run};
+use std::fmt::Write as _;
+use std::num::NonZero;
+use std::path::Path;
+use std::time::SystemTime;
+
+/// Done, but data were lost.
+const DATA_LOSS: u8 = 3;
+/// Done, but the model is inconsistent with the data.
+const INCONSISTENT: u8 = 4;
+
+pub(super) fn execute(command: &Run, global: &Global, paint: Paint) -> Result<Done, Failure> {
+    let outcome = archive(command, global)?;
+    let code = code(&outcome.product);
+    if global.json {
+        return Ok(Done { code, ..Done::json(&product::to_json(&outcome.product, &outcome.path)) });
+    }
+    let mut text = screen::product(&outcome.product, &outcome.path, paint);
+    let _ = writeln!(text, "next      {}", next(&outcome.product, &command.chain.archive.folder));
+    Ok(Done { text, code })
+}
+
+/// Runs the pipeline and archives the product.
+pub(super) fn archive(command: &Run, global: &Global) -> Result<Outcome, Failure> {
+    let registry = super::registry(global)?;
+    let options = RunOptions {
+        from_ns: command.from,
+        until_ns: command.until,
+        batch_rows: command.batch_rows as usize,
+        state_in: command.load_state.clone(),
+        state_out: command.save_state.clone(),
+        ..options(&command.chain, global)
+    };
+    let mut meter = Meter::new("run", global);
+    run(&registry, &options, &mut |progress| meter.show(&progress)).map_err(Failure::engine)
+}
+
+/// `dragfree config check`: links as a run would.
+pub(super) fn config_check(chain: &Chain, global: &Global) -> Result<Done, Failure> {
+    let report = check(&super::registry(global)?, &options(chain, global)).map_err(Failure::engine)?;
+    if global.json {
+        return Ok(Done::json(&serde_json::to_value(&report).map_err(Failure::engine)?));
+    }
+    Ok(Done::new(screen::check(&report)))
+}
+
+fn options(chain: &Chain, global: &Global) -> RunOptions {
+    let all = || std::thread::available_parallelism().map_or(1, NonZero::get);
+    RunOptions {
+        pipeline: chain.pipeline.clone(),
+        files: chain.files.clone(),
+        mission: chain.mission.clone(),
+        model: chain.model.clone(),
+        archive: chain.archive.folder.clone(),
+        from_ns: None,
+        until_ns: None,
+        threads: global.threads.map_or_else(all, usize::from),
+        batch_rows: BATCH_ROWS as usize,
+        state_in: None,
+        state_out: None,
+        created: SystemTime::now().into(),
+        software: super::software(),
+    }
+}
+
+/// An inconsistent model weighs more than lost data: the values themselves are in doubt.
+pub(super) fn code(product: &Product) -> u8 {
+    match (product.quality.inconsistent, product.quality.data_loss) {
+        (true, _) => INCONSISTENT,
+        (false, true) => DATA_LOSS,
+        (false, false) => 0,
+    }
+}
+
+/// The command that shows the product again.
+pub(super) fn next(product: &Product, archive: &Path) -> String {
+    format!("dragfree products show {} --archive {}", product.id(), archive.display())
+}
