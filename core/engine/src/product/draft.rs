@@ -157,6 +157,7 @@ pub(super) fn parse_reports(reports: &[StageReport]) -> Result<Vec<(String, Repo
         let parsed = Report::deserialize(report)
             .map_err(|source| ProductError::Report { stage: stage.clone(), source })
             .map(|mut parsed| {
+                parsed.unknown.remove("plugin"); // the engine's own mark, by which later stages tell reports apart
                 parsed.notes.extend(
                     std::mem::take(&mut parsed.unknown).into_keys().map(|key| format!("unknown key {key:?} left out")),
                 );

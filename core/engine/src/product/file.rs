@@ -1,6 +1,7 @@
 //! The product file: its layout, its digest, reading and emitting.
 
 use super::ProductError;
+use super::emit::emit;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -363,7 +364,8 @@ impl Product {
     /// The text of the file, checked against the schema.
     pub(super) fn emit(&self) -> Result<String, ProductError> {
         check(self.id(), &self.document())?;
-        toml::to_string(self).map_err(|source| ProductError::Emit { id: self.id().to_owned(), source })
+        let table = toml::Table::try_from(self);
+        Ok(emit(&table.map_err(|source| ProductError::Emit { id: self.id().to_owned(), source })?))
     }
 }
 

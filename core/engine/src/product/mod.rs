@@ -8,6 +8,7 @@
 
 mod archive;
 mod draft;
+mod emit;
 mod file;
 mod json;
 
