@@ -15,6 +15,9 @@ pub(crate) enum Failure {
     /// No plugin of that name.
     #[error("no plugin {0}; `dragfree plugins list` shows what was found and what was refused")]
     Plugin(String),
+    /// No archive there.
+    #[error("there is no archive {}; --archive names one, `dragfree run` makes one", .0.display())]
+    NoArchive(PathBuf),
     /// The demo would have to share a folder.
     #[error("{} is neither empty nor made by an earlier demo; name a folder of its own with --dir", .0.display())]
     NoDemoFolder(PathBuf),

@@ -236,7 +236,9 @@ pub(crate) fn manifest(kind: &str, manifest: &Manifest, library: &Path, paint: P
 }
 
 fn range(parameter: &Parameter) -> Option<String> {
-    match (parameter.minimum, parameter.maximum) {
+    // The largest whole number is no bound that anybody chose.
+    let maximum = parameter.maximum.filter(|maximum| parameter.kind != "i64" || *maximum < i64::MAX as f64);
+    match (parameter.minimum, maximum) {
         _ if !parameter.choices.is_empty() => Some(parameter.choices.join(" | ")),
         (Some(minimum), Some(maximum)) => Some(format!("{minimum} to {maximum}")),
         (Some(minimum), None) => Some(format!("{minimum} and more")),
@@ -429,7 +431,7 @@ mod tests {
             "parameters": [
                 {"name": "rate", "type": "f64", "unit": "Hz", "default": 10.0, "minimum": 0.1, "maximum": 100.0, "help": "Rate."},
                 {"name": "mode", "type": "text", "default": "a", "choices": ["a", "b"], "help": "Way."},
-                {"name": "depth", "type": "i64", "default": 3, "minimum": 1.0},
+                {"name": "depth", "type": "i64", "default": 3, "minimum": 1, "maximum": i64::MAX},
             ],
         }))
         .expect("a manifest");

@@ -11,6 +11,7 @@ use std::path::Path;
 pub(super) fn execute(command: &Products, json: bool, paint: Paint) -> Result<Done, Failure> {
     match command {
         Products::List(archive) => {
+            exists(&archive.folder)?;
             let listing = product::list(&archive.folder).map_err(Failure::engine)?;
             if json {
                 return Ok(Done::json(&screen::listing_json(&listing)));
@@ -27,6 +28,7 @@ fn show(name: &str, archive: &Path, json: bool, paint: Paint) -> Result<Done, Fa
     let (product, path) = if file.is_file() {
         (product::read(file).map_err(Failure::engine)?, file.to_owned())
     } else {
+        exists(archive)?;
         let entry = product::find(archive, name).map_err(Failure::engine)?;
         (entry.product, entry.path)
     };
@@ -34,4 +36,8 @@ fn show(name: &str, archive: &Path, json: bool, paint: Paint) -> Result<Done, Fa
         return Ok(Done::json(&product::to_json(&product, &path)));
     }
     Ok(Done::new(screen::product(&product, &path, paint)))
+}
+
+fn exists(archive: &Path) -> Result<(), Failure> {
+    if archive.is_dir() { Ok(()) } else { Err(Failure::NoArchive(archive.to_owned())) }
 }
