@@ -273,9 +273,9 @@ impl Stage for Accelerometer {
             quality.insert("alpha_steps_over_noise".to_owned(), ratio.to_vec().into());
         }
         let counts = [
-            ("accelerometer.rows", s.rows),
-            ("accelerometer.rows_without_acceleration", s.without_acceleration),
-            ("accelerometer.rows_without_attitude", s.without_attitude),
+            ("rows", s.rows),
+            ("rows_without_acceleration", s.without_acceleration),
+            ("rows_without_attitude", s.without_attitude),
         ];
         Ok(Report { counts: counts.map(|(k, v)| (k.to_owned(), v)).into(), notes, quality, ..Report::default() })
     }

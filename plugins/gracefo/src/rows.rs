@@ -25,7 +25,9 @@ const NO_VALUE: f64 = 1e33;
 pub struct Counts {
     /// Rows kept.
     pub rows: u64,
-    /// Rows that the header promised, where that is not what the file holds.
+    /// Lines below the header.
+    pub lines: u64,
+    /// Rows that the header promised, where that is not the number of lines.
     pub promised: Option<u64>,
     /// Lines that are no row of this product, and the number of the first of them.
     pub garbage: u64,
@@ -85,7 +87,6 @@ pub fn parse(
     let mut tables =
         vec![Rows { time_ns: Vec::new(), columns: vec![Vec::new(); product.columns.len()] }; product.tables().len()];
     let mut values = vec![f64::NAN; product.columns.len()];
-    let mut lines_of_data = 0;
     loop {
         match lines.next() {
             Line::End => break,
@@ -93,7 +94,7 @@ pub fn parse(
                 counts.truncated = 1;
                 break;
             }
-            Line::Whole => lines_of_data += 1,
+            Line::Whole => counts.lines += 1,
         }
         match layout.row(&lines.bytes, &mut values, &mut counts.fill_values) {
             Row::Garbage => {
@@ -112,7 +113,7 @@ pub fn parse(
             }
         }
     }
-    counts.promised = header.num_records.filter(|n| *n != lines_of_data);
+    counts.promised = header.num_records.filter(|n| *n != counts.lines);
     for rows in &mut tables {
         order(rows, &mut counts);
     }

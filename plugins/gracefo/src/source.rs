@@ -15,7 +15,7 @@ pub struct GraceFo {
     tables: Vec<(Table, Vec<Out>)>,
 }
 
-/// `GRACE-FO C` → `C`.
+/// `GRACE-FO-C` → `C`.
 ///
 /// # Errors
 /// The name ends with neither `C` nor `D`.
@@ -23,7 +23,7 @@ pub fn letter_of(spacecraft: &str) -> Result<char, PluginError> {
     spacecraft.chars().next_back().filter(|c| matches!(c, 'C' | 'D')).ok_or_else(|| {
         PluginError::error(format!(
             "mission.spacecraft = `{spacecraft}` ends with neither C nor D, which is how the source gracefo tells the two \
-             spacecraft apart; write `GRACE-FO C` or `GRACE-FO D`"
+             spacecraft apart; write `GRACE-FO-C` or `GRACE-FO-D`"
         ))
     })
 }

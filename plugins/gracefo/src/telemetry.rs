@@ -99,7 +99,7 @@ impl Log {
             self.count(product, what, n);
         }
         if let Some(promised) = counts.promised {
-            let text = format!("{name}: the header promises {promised} rows, the file holds another number");
+            let text = format!("{name}: the header promises {promised} rows, the file holds {}", counts.lines);
             self.note("promised", product, text);
         }
         if let Some(line) = counts.first_garbage_line {

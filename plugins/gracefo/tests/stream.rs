@@ -194,6 +194,6 @@ fn what_cannot_be_a_stream_says_why() {
     let missing = Telemetry::open(&[PathBuf::from("/nowhere.tgz")], 'C', Window::ALL, &[]).expect_err("no file");
     assert!(missing.to_string().contains("/nowhere.tgz"), "{missing}");
     assert!(Telemetry::open(&[], 'C', Window::ALL, &[]).is_err());
-    assert_eq!(letter_of("GRACE-FO D").ok(), Some('D'));
+    assert_eq!(letter_of("GRACE-FO-D").ok(), Some('D'));
     assert!(letter_of("SC1").expect_err("no letter").message().contains("mission.spacecraft"));
 }
