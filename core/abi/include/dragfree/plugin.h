@@ -115,7 +115,7 @@ typedef struct dragfree_config_v1 {
 
 /* A column: what it is called and what it means. */
 typedef struct dragfree_column_v1 {
-  const char *table;      /* "grid"; NULL in `read`: whichever table has the name */
+  const char *table;      /* "grid"; NULL in `read`: the uniform table that has the name, or else the irregular one */
   const char *name;       /* "is.tm1.r_orf_m.x" */
   const char *unit;       /* "m"; NULL in `read`: any */
   const char *frame;      /* "ORF_1", "" for none; NULL in `read`: any */

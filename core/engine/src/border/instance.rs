@@ -218,7 +218,13 @@ impl LinkContext<'_> {
 
     fn find(&self, want: &WantedColumn) -> Result<usize, String> {
         let fits = |c: &Column| c.name == want.name && want.table.as_ref().is_none_or(|t| *t == c.table);
-        let mut found = self.available.iter().enumerate().filter(|(_, c)| fits(c));
+        // Raw telemetry has the names that preprocessed columns keep: without a table, the grid is meant.
+        let uniform = self.available.iter().any(|c| fits(c) && c.rate_hz > 0.0);
+        let mut found = self
+            .available
+            .iter()
+            .enumerate()
+            .filter(|(_, c)| fits(c) && (!uniform || c.rate_hz > 0.0 || want.table.is_some()));
         let shown = want.table.as_ref().map_or_else(|| want.name.clone(), |t| format!("{t}:{}", want.name));
         match (found.next(), found.next()) {
             (Some((index, _)), None) => Ok(index),
