@@ -61,9 +61,6 @@ pub enum EstimateError {
     Qp(#[from] QpError),
 }
 
-/// How often Σ is measured from the residuals and the coefficients are solved again.
-const REFINEMENTS: usize = 3;
-
 /// The solution and how it came about.
 #[derive(Clone, Debug)]
 pub struct Estimate {
@@ -119,7 +116,7 @@ pub struct ChannelQuality {
     pub by_decade: Vec<(f64, f64, f64)>,
 }
 
-/// Solves for the coefficients.
+/// Solves for the coefficients; Σ is measured from the residuals, and the coefficients solved again, `refinements` times.
 ///
 /// # Errors
 /// [`EstimateError`] when the modelled noise is singular or the constraints contradict each other.
@@ -130,6 +127,7 @@ pub fn estimate(
     model: &NoiseModel,
     unknowns: &[Unknown],
     bounds: &[Bound],
+    refinements: usize,
 ) -> Result<Estimate, EstimateError> {
     let whitening = Whitening::new(model, plan, layout, sums)?;
     let (sum_g, sum_g2) = sums.weights(plan);
@@ -144,7 +142,7 @@ pub fn estimate(
     let mut residual = residuals(sums, layout, plan.bands.len(), &solved.theta);
     let modelled = whitening.chi2(&residual, &inverses, false);
     let mut last_step = DVector::zeros(unknowns.len());
-    for _ in 0..REFINEMENTS {
+    for _ in 0..refinements {
         inverses = whitening.refined_inverses(&residual);
         equations = accumulate(sums, layout, &inverses);
         let next = Reduced::new(&equations, kept, unknowns, bounds, &free).solve()?;
@@ -152,7 +150,7 @@ pub fn estimate(
         solved = next;
         residual = residuals(sums, layout, plan.bands.len(), &solved.theta);
     }
-    let chi2 = whitening.chi2(&residual, &inverses, true);
+    let chi2 = whitening.chi2(&residual, &inverses, refinements > 0);
 
     let reduced = Reduced::new(&equations, kept, unknowns, bounds, &free);
     let weak = reduced.weak(unknowns, &unseen);
@@ -278,7 +276,10 @@ impl<'a> Reduced<'a> {
             normal: self.information.clone(),
             right: self.right.clone(),
             rows: self.rows.clone(),
-            scale: self.size.clone(),
+            // σ with the others held, or the natural size where there is no information: unit curvature, an objective in χ².
+            scale: DVector::from_fn(self.free.len(), |k, _| {
+                (self.information[(k, k)] + self.size[k].powi(-2)).sqrt().recip()
+            }),
             origin: self.gaussian_solution(),
         };
         let solution = problem.solve()?;

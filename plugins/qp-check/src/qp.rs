@@ -158,9 +158,9 @@ impl Problem {
         let settings = DefaultSettings::<f64> {
             verbose: false,
             max_threads: 1,
-            tol_gap_abs: 1e-10,
-            tol_gap_rel: 1e-10,
-            tol_feas: 1e-10,
+            tol_gap_abs: 1e-9,
+            tol_gap_rel: 1e-9,
+            tol_feas: 1e-9,
             ..DefaultSettings::default()
         };
         let cones = [NonnegativeConeT(b.len())];

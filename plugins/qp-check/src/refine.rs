@@ -4,17 +4,17 @@
 //! model says "white with unit variance" (`L⁻¹r`, `LLᵀ = Σ_model`), the residuals' measured covariance Ŵ of a band about 1/7
 //! wide would be 1 if the model were right. Σ becomes `L W̃ Lᵀ` with
 //!
-//! `W̃ = n/(n−p) · (n Ŵ + ν₀ diag Ŵ)/(n + ν₀)`
+//! `W̃ = (n+ν₀)/(n+ν₀−p) · (n Ŵ + ν₀ diag Ŵ)/(n + ν₀)`
 //!
 //! * levels are measured, correlations shrunk towards the model's, with `ν₀ = 2p` pseudo-observations against n measured ones:
 //!   positive definite always, however short the data;
 //! * the model's shape inside the band stays, so a steep spectrum is no trouble;
-//! * `n/(n−p)` makes the inverse unbiased (complex Wishart), or a Σ fitted to few data would look too well known. χ² loses the
-//!   same p degrees of freedom per band;
+//! * the first factor makes the inverse unbiased (complex Wishart with n + ν₀ observations), or a Σ fitted to few data would look
+//!   too well known; the expectation of χ² shrinks by the same factor;
 //! * channels that the model does not connect stay unconnected. Were the attitude channels allowed to correlate with the test
 //!   masses', their measured coherence would *be* the offset's signal, because α̂ is made of them, and Σ would eat it.
 
-use nalgebra::{Cholesky, DMatrix, Dyn};
+use nalgebra::{Cholesky, DMatrix};
 
 use crate::sigma::NoiseModel;
 use crate::spectra::{Layout, Plan, Sums};
@@ -116,7 +116,7 @@ impl Whitening {
             let measured = self.whitened(residuals, range);
             let shrunk = DMatrix::from_fn(measured.nrows(), measured.ncols(), |i, j| {
                 let p = self.group_size[i];
-                let correction = self.wishart(*n, p);
+                let correction = Self::wishart(*n, p);
                 match (i == j, self.group[i] == self.group[j]) {
                     (true, _) => correction * measured[(i, j)],
                     (_, true) => correction * measured[(i, j)] * n / (n + SHRINKAGE * p),
@@ -133,9 +133,10 @@ impl Whitening {
         out
     }
 
-    /// Factor by which a level fitted to n observations of p channels is widened, never more than 2.
-    fn wishart(&self, n: f64, p: f64) -> f64 {
-        if n > 2.0 * p { n / (n - p) } else { 2.0 }
+    /// Factor by which a level fitted to n observations of p channels is widened.
+    fn wishart(n: f64, p: f64) -> f64 {
+        let total = n + SHRINKAGE * p;
+        total / (total - p)
     }
 
     /// Measured covariance of the model-whitened residuals over a range of bands; 1 when the model is right.
@@ -160,7 +161,7 @@ impl Whitening {
                 chi2.sum += residuals[b].dot(&inverses[b]);
                 let sigma = inverses[b].clone().try_inverse();
                 for c in 0..n {
-                    let kept = if refined { 1.0 / self.wishart(*observations, self.group_size[c]) } else { 1.0 };
+                    let kept = if refined { 1.0 / Self::wishart(*observations, self.group_size[c]) } else { 1.0 };
                     let expected = self.expected[b] * kept;
                     chi2.expected += expected;
                     let variance = sigma.as_ref().map_or(f64::NAN, |s| s[(c, c)]);

@@ -68,7 +68,8 @@ impl Segmenter {
         for (k, t) in time_ns.iter().enumerate() {
             // After a jump of the clock the row before is not the predecessor.
             let last = if k == 0 { self.state.last_ns } else { Some(time_ns[k - 1]) };
-            usable[k] = last.is_none_or(|last| t - last == self.step_ns);
+            // Epochs of a rate that does not divide 1e9 are rounded to whole nanoseconds.
+            usable[k] = last.is_none_or(|last| (t - last - self.step_ns).abs() <= 1);
         }
         let mut values = Vec::with_capacity(columns.len());
         for (j, column) in columns.iter().enumerate() {
@@ -145,20 +146,29 @@ impl Segmenter {
     }
 }
 
-/// The longest length with small prime factors (a fast transform) of which `samples` hold three half-overlapping segments;
-/// none when even 16 samples are too many.
+/// The longest length up to `samples` that is divisible by 4 and has small prime factors, for a fast transform; at least
+/// [`SHORTEST`].
 #[must_use]
-pub fn shorter_length(samples: usize) -> Option<usize> {
+pub fn longest_length(samples: usize) -> usize {
     let smooth = |n: &usize| {
         let mut m = *n;
         for p in [2, 3, 5] {
-            while m % p == 0 {
+            while m.is_multiple_of(p) {
                 m /= p;
             }
         }
-        m == 1 && n % 4 == 0
+        m == 1 && n.is_multiple_of(4)
     };
-    (16..=samples / 2).rev().find(smooth)
+    (SHORTEST..=samples).rev().find(smooth).unwrap_or(SHORTEST)
+}
+
+/// Below this a segment has hardly a bin above the window's main lobe.
+pub const SHORTEST: usize = 16;
+
+/// The longest length of which `samples` hold three half-overlapping segments; none when there is none.
+#[must_use]
+pub fn shorter_length(samples: usize) -> Option<usize> {
+    (samples >= 2 * SHORTEST).then(|| longest_length(samples / 2))
 }
 
 /// Cuts one run into segments of the analyser's length.
@@ -190,7 +200,7 @@ mod tests {
     }
 
     fn run(length: usize, batch: usize, columns: &[Vec<f64>], times: &[i64]) -> (Sums, State) {
-        let mut analyser = Analyser::new(Plan::new(length, 10.0), &layout(), |_, _| 1.0);
+        let mut analyser = Analyser::new(Plan::new(length, 10.0), &layout(), |_| vec![1.0; 2]);
         let mut sums = Sums::new(analyser.plan(), &layout());
         let mut segmenter = Segmenter::new(length, 100, vec![false, false, true]);
         for first in (0..times.len()).step_by(batch) {

@@ -207,7 +207,8 @@ impl NoiseModel {
     pub fn psd(&self, frequency_hz: f64) -> DMatrix<f64> {
         let mut sigma = DMatrix::zeros(self.channels, self.channels);
         for p in &self.processes {
-            sigma += &p.enters * (p.shape.psd(frequency_hz) * self.response(p.response, frequency_hz));
+            let power = p.shape.psd(frequency_hz) * self.response(p.response, frequency_hz);
+            sigma.iter_mut().zip(&p.enters).for_each(|(s, e)| *s += e * power);
         }
         if let Some(e) = &self.angular_error {
             let remaining = e.remaining(
@@ -219,6 +220,12 @@ impl NoiseModel {
             sigma += &e.lever * m * e.lever.transpose();
         }
         sigma
+    }
+
+    /// The diagonal of [`NoiseModel::psd`].
+    #[must_use]
+    pub fn variances(&self, frequency_hz: f64) -> Vec<f64> {
+        self.psd(frequency_hz).diagonal().iter().copied().collect()
     }
 
     fn response(&self, response: Response, frequency_hz: f64) -> f64 {

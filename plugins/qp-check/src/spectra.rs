@@ -81,6 +81,8 @@ pub struct Plan {
     fft: Arc<dyn RealToComplex<f64>>,
     /// `Σ w²`, `Σ w⁴` and `Σ w²(t) w²(t + L/2)`.
     window_sums: [f64; 3],
+    /// `Σ w² (t − L/2)²`.
+    window_moment: f64,
 }
 
 impl Plan {
@@ -95,6 +97,7 @@ impl Plan {
             squared.iter().map(|w| w * w).sum(),
             squared.iter().zip(&squared[length / 2..]).map(|(a, b)| a * b).sum(),
         ];
+        let window_moment = squared.iter().enumerate().map(|(t, w)| w * (t as f64 - length as f64 / 2.0).powi(2)).sum();
         let nyquist = length / 2;
         let mut bands = Vec::new();
         let mut first = FIRST_BIN;
@@ -105,7 +108,7 @@ impl Plan {
             first = end;
         }
         let fft = RealFftPlanner::new().plan_fft_forward(length);
-        Self { length, rate_hz, bands, window, fft, window_sums }
+        Self { length, rate_hz, bands, window, fft, window_sums, window_moment }
     }
 
     /// Frequency of the middle of a band, Hz.
@@ -190,14 +193,17 @@ pub struct Analyser {
 }
 
 impl Analyser {
-    /// `psd(channel, f)` is the modelled one-sided PSD of a channel, its unit squared per Hz.
+    /// `psd(f)` is the modelled one-sided PSD of every channel, its unit squared per Hz.
     #[must_use]
-    pub fn new(plan: Plan, layout: &Layout, psd: impl Fn(usize, f64) -> f64) -> Self {
+    pub fn new(plan: Plan, layout: &Layout, psd: impl Fn(f64) -> Vec<f64>) -> Self {
         let bins = FIRST_BIN..plan.length / 2;
         let norm = 4.0 / (plan.rate_hz * plan.length as f64);
-        let weight = (0..layout.channels.len())
-            .map(|c| bins.clone().map(|k| (norm / psd(c, plan.bin_hz(k as f64))).sqrt()).collect())
-            .collect();
+        let mut weight = vec![Vec::with_capacity(bins.len()); layout.channels.len()];
+        for k in bins.clone() {
+            for (weight, psd) in weight.iter_mut().zip(psd(plan.bin_hz(k as f64))) {
+                weight.push((norm / psd).sqrt());
+            }
+        }
         let columns = layout.columns();
         Self {
             weight,
@@ -237,15 +243,15 @@ impl Analyser {
     }
 
     fn transform(&mut self, column: usize, samples: &[f64]) {
-        let n = samples.len() as f64;
-        // Least-squares straight line, about the segment's middle.
-        let middle = 0.5 * (n - 1.0);
+        // The straight line that fits the *windowed* samples best. A fit to the bare samples would take its slope from the ends,
+        // where a second difference of readout noise is a hundred times louder than the lowest bins.
+        let middle = (samples.len() / 2) as f64;
         let (mut sum, mut moment) = (0.0, 0.0);
-        for (t, x) in samples.iter().enumerate() {
-            sum += x;
-            moment += (t as f64 - middle) * x;
+        for (t, (x, w)) in samples.iter().zip(&self.plan.window).enumerate() {
+            sum += w * w * x;
+            moment += w * w * (t as f64 - middle) * x;
         }
-        let (mean, slope) = (sum / n, moment / (n * (n * n - 1.0) / 12.0));
+        let (mean, slope) = (sum / self.plan.window_sums[0], moment / self.plan.window_moment);
         for (t, ((out, x), w)) in self.time.iter_mut().zip(samples).zip(&self.plan.window).enumerate() {
             *out = (x - mean - slope * (t as f64 - middle)) * w;
         }
@@ -309,7 +315,7 @@ mod tests {
     fn sums_are_the_weighted_power_over_the_noise() {
         let (rate, length, psd) = (10.0, 1000, 0.3);
         let layout = Layout { channels: vec!["c".into()], regressors: vec![], coefficients: 0 };
-        let mut analyser = Analyser::new(Plan::new(length, rate), &layout, |_, _| psd);
+        let mut analyser = Analyser::new(Plan::new(length, rate), &layout, |_| vec![psd]);
         let mut sums = Sums::new(analyser.plan(), &layout);
         let x: Vec<f64> = (0..length).map(|t| 2.0 * (0.7 * t as f64).sin() + 5.0 + 0.01 * t as f64).collect();
         analyser.add(&[&x], false, &mut sums);
