@@ -1,0 +1,392 @@
+//! From the sums to coefficients: normal equations, constrained solution, Σ from the residuals, honest covariance.
+//!
+//! **Covariance.** `C = (N Σg/Σg² + Σ_rows a aᵀ/σ_row²)⁻¹`, times χ²/dof where that is above one. A constraint says that a
+//! quantity lies in an interval of half width h and nothing else: a uniform density, whose Gaussian equivalent has σ = h/√3.
+//! Surveys and ranges are treated alike. Where a row is *active*, the value stands at its bound and the truth anywhere in the
+//! interval: the mean square about that bound is (2h/√3)². Projecting active rows out would claim that a quantity is known
+//! exactly because the data wanted it outside its range.
+
+use nalgebra::{Cholesky, DMatrix, DVector};
+use serde::Serialize;
+
+use crate::normal::{NormalEquations, accumulate, residuals};
+use crate::qp::{Active, Kkt, Problem, QpError, Row};
+use crate::refine::{Chi2, SigmaError, Whitening};
+use crate::sigma::NoiseModel;
+use crate::spectra::{Layout, Plan, Sums};
+use crate::verdict::{self, Direction};
+
+/// A coefficient of the model.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Unknown {
+    /// Its name.
+    pub name: String,
+    /// Its unit.
+    pub unit: String,
+    /// Lower end of its physical range, −∞ for none.
+    pub lower: f64,
+    /// Upper end of its physical range, +∞ for none.
+    pub upper: f64,
+    /// Value where it is not estimated.
+    pub initial: f64,
+    /// Prior σ; sets its natural size where it has no range.
+    pub prior_sigma: f64,
+    /// Whether it is estimated.
+    pub estimate: bool,
+}
+
+/// A linear constraint among coefficients.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Bound {
+    /// Its name.
+    pub name: String,
+    /// Knowledge from a survey counts as information; a range does not, when the data's own power is judged.
+    pub survey: bool,
+    /// Index of a coefficient, weight.
+    pub terms: Vec<(usize, f64)>,
+    /// Lower bound.
+    pub lower: f64,
+    /// Upper bound.
+    pub upper: f64,
+}
+
+/// Why there is no estimate.
+#[derive(Debug, thiserror::Error)]
+pub enum EstimateError {
+    /// Σ cannot be used.
+    #[error(transparent)]
+    Sigma(#[from] SigmaError),
+    /// The constrained problem has no solution.
+    #[error(transparent)]
+    Qp(#[from] QpError),
+}
+
+/// The solution and how it came about.
+#[derive(Clone, Debug)]
+pub struct Estimate {
+    /// Coefficients that were solved for.
+    pub free: Vec<usize>,
+    /// All coefficients, the fixed ones at their initial value.
+    pub theta: DVector<f64>,
+    /// Covariance of the free coefficients; none when there is neither data nor range in some direction.
+    pub covariance: Option<DMatrix<f64>>,
+    /// Directions that data and survey do not see.
+    pub weak: Vec<Direction>,
+    /// Rows at which the solution stands.
+    pub active: Vec<Active>,
+    /// Conditions of optimality of the last solution.
+    pub kkt: Kkt,
+    /// The normal equations, with the refined Σ.
+    pub normal: NormalEquations,
+    /// How well the noise is understood.
+    pub quality: Quality,
+}
+
+/// χ² and how far Σ moved.
+#[derive(Clone, Debug, Serialize)]
+pub struct Quality {
+    /// χ²/dof with Σ from the residuals.
+    pub chi2_per_dof: f64,
+    /// Degrees of freedom of it.
+    pub dof: f64,
+    /// χ²/dof with Σ as the mission file has it.
+    pub chi2_per_dof_modelled_sigma: f64,
+    /// Each channel alone, with Σ from the residuals.
+    pub channels: Vec<ChannelQuality>,
+    /// Largest change of a coefficient in the last refinement, in its σ.
+    pub last_step_sigma: f64,
+    /// Frequency and χ²/dof of the narrow band that fits the refined Σ least.
+    pub worst_band: (f64, f64),
+    /// Degrees of freedom of the worst band.
+    pub worst_band_dof: f64,
+}
+
+/// One channel's noise.
+#[derive(Clone, Debug, Serialize)]
+pub struct ChannelQuality {
+    /// Name.
+    pub channel: String,
+    /// χ²/dof with Σ from the residuals.
+    pub chi2_per_dof: f64,
+    /// Degrees of freedom.
+    pub dof: f64,
+    /// Measured over modelled amplitude, whole band.
+    pub measured_over_modelled: f64,
+    /// The same by decade: from Hz, to Hz, ratio.
+    pub by_decade: Vec<(f64, f64, f64)>,
+}
+
+/// Solves for the coefficients; Σ is measured from the residuals, and the coefficients solved again, `refinements` times.
+///
+/// # Errors
+/// [`EstimateError`] when the modelled noise is singular or the constraints contradict each other.
+pub fn estimate(
+    sums: &Sums,
+    plan: &Plan,
+    layout: &Layout,
+    model: &NoiseModel,
+    unknowns: &[Unknown],
+    bounds: &[Bound],
+    refinements: usize,
+) -> Result<Estimate, EstimateError> {
+    let whitening = Whitening::new(model, plan, layout, sums)?;
+    let (sum_g, sum_g2) = sums.weights(plan);
+    let kept = sum_g / sum_g2;
+    let mut inverses = whitening.model_inverses();
+    let mut equations = accumulate(sums, layout, &inverses);
+    let seen = |i: usize| equations.0[(i, i)] > 0.0;
+    let free: Vec<usize> = (0..unknowns.len()).filter(|i| unknowns[*i].estimate && seen(*i)).collect();
+    let unseen: Vec<usize> = (0..unknowns.len()).filter(|i| unknowns[*i].estimate && !seen(*i)).collect();
+
+    let mut solved = Reduced::new(&equations, kept, unknowns, bounds, &free).solve()?;
+    let mut residual = residuals(sums, layout, plan.bands.len(), &solved.theta);
+    let modelled = whitening.chi2(&residual, &inverses, false);
+    let mut last_step = DVector::zeros(unknowns.len());
+    for _ in 0..refinements {
+        inverses = whitening.refined_inverses(&residual);
+        equations = accumulate(sums, layout, &inverses);
+        let next = Reduced::new(&equations, kept, unknowns, bounds, &free).solve()?;
+        last_step = &next.theta - &solved.theta;
+        solved = next;
+        residual = residuals(sums, layout, plan.bands.len(), &solved.theta);
+    }
+    let chi2 = whitening.chi2(&residual, &inverses, refinements > 0);
+
+    let reduced = Reduced::new(&equations, kept, unknowns, bounds, &free);
+    let weak = reduced.weak(unknowns, &unseen);
+    let dof = (chi2.expected * kept - free.len() as f64).max(1.0);
+    let chi2_per_dof = chi2.sum * kept / dof;
+    let covariance = reduced.covariance(&solved.active).map(|c| c * chi2_per_dof.max(1.0));
+    let last_step_sigma = covariance.as_ref().map_or(f64::NAN, |c| {
+        free.iter().enumerate().map(|(k, i)| last_step[*i].abs() / c[(k, k)].sqrt()).fold(0.0, f64::max)
+    });
+    let (worst, worst_band_dof) = worst_band(&residual, &inverses, plan, &whitening, kept);
+    let quality = Quality {
+        chi2_per_dof,
+        dof,
+        chi2_per_dof_modelled_sigma: modelled.sum / modelled.expected,
+        channels: channel_quality(&chi2, &residual, plan, layout, &whitening, kept),
+        last_step_sigma,
+        worst_band: worst,
+        worst_band_dof,
+    };
+    let names = unknowns.iter().map(|u| u.name.clone()).collect();
+    Ok(Estimate {
+        free,
+        theta: solved.theta,
+        covariance,
+        weak,
+        active: solved.active,
+        kkt: solved.kkt,
+        normal: NormalEquations::new(names, &equations, sums, plan),
+        quality,
+    })
+}
+
+/// The problem in the free coefficients alone.
+struct Reduced<'a> {
+    free: &'a [usize],
+    unknowns: &'a [Unknown],
+    /// `N Σg/Σg²`, whose inverse is a covariance.
+    information: DMatrix<f64>,
+    right: DVector<f64>,
+    rows: Vec<Row>,
+    /// Which rows count as information when the data's power is judged.
+    survey: Vec<bool>,
+    /// Natural size of each free coefficient: half of its range, or its prior σ, or what the data say.
+    size: DVector<f64>,
+}
+
+struct Solved {
+    theta: DVector<f64>,
+    active: Vec<Active>,
+    kkt: Kkt,
+}
+
+/// A coefficient with neither range nor prior is called weak only when double precision cannot tell it from nothing.
+const SIZE_WITHOUT_RANGE: f64 = 1e6;
+
+impl<'a> Reduced<'a> {
+    fn new(
+        (normal, right, _): &(DMatrix<f64>, DVector<f64>, f64),
+        kept: f64,
+        unknowns: &'a [Unknown],
+        bounds: &[Bound],
+        free: &'a [usize],
+    ) -> Self {
+        let n = free.len();
+        let fixed: Vec<usize> = (0..unknowns.len()).filter(|i| !free.contains(i)).collect();
+        let information = DMatrix::from_fn(n, n, |i, j| kept * normal[(free[i], free[j])]);
+        let right = DVector::from_fn(n, |i, _| {
+            let known: f64 = fixed.iter().map(|f| normal[(free[i], *f)] * unknowns[*f].initial).sum();
+            kept * (right[free[i]] - known)
+        });
+        let (mut rows, mut survey) = (Vec::new(), Vec::new());
+        for (k, i) in free.iter().enumerate() {
+            let u = &unknowns[*i];
+            let mut terms = vec![0.0; n];
+            terms[k] = 1.0;
+            rows.push(Row { name: format!("range of {}", u.name), terms, lower: u.lower, upper: u.upper });
+            survey.push(false);
+        }
+        for b in bounds {
+            let known: f64 =
+                b.terms.iter().filter(|(i, _)| fixed.contains(i)).map(|(i, w)| w * unknowns[*i].initial).sum();
+            let mut terms = vec![0.0; n];
+            for (i, weight) in &b.terms {
+                if let Some(k) = free.iter().position(|f| f == i) {
+                    terms[k] += weight;
+                }
+            }
+            if terms.iter().any(|t| *t != 0.0) {
+                rows.push(Row { name: b.name.clone(), terms, lower: b.lower - known, upper: b.upper - known });
+                survey.push(b.survey);
+            }
+        }
+        let size = DVector::from_fn(n, |k, _| {
+            let u = &unknowns[free[k]];
+            let candidates = [0.5 * (u.upper - u.lower), u.prior_sigma];
+            let usable = candidates.into_iter().find(|s| s.is_finite() && *s > 0.0);
+            usable.unwrap_or_else(|| SIZE_WITHOUT_RANGE / information[(k, k)].sqrt())
+        });
+        Self { free, unknowns, information, right, rows, survey, size }
+    }
+
+    /// Information of data and rows, with the σ of each row as `sigma(index, row)` has it.
+    fn with_rows(&self, sigma: impl Fn(usize, &Row) -> f64) -> DMatrix<f64> {
+        let mut m = self.information.clone();
+        for (i, row) in self.rows.iter().enumerate() {
+            let a = DVector::from_column_slice(&row.terms);
+            // An interval of no width is an equality; in double precision 1e-9 of the unknowns' sizes is one.
+            let least = 1e-9 * a.component_mul(&self.size).norm();
+            let weight = sigma(i, row).max(least).powi(-2);
+            if weight > 0.0 {
+                m += &a * a.transpose() * weight;
+            }
+        }
+        m
+    }
+
+    fn solve(&self) -> Result<Solved, EstimateError> {
+        let mut theta = DVector::from_fn(self.unknowns.len(), |i, _| self.unknowns[i].initial);
+        if self.free.is_empty() {
+            return Ok(Solved { theta, active: Vec::new(), kkt: Kkt::default() });
+        }
+        let problem = Problem {
+            normal: self.information.clone(),
+            right: self.right.clone(),
+            rows: self.rows.clone(),
+            // σ with the others held, or the natural size where there is no information: unit curvature, an objective in χ².
+            scale: DVector::from_fn(self.free.len(), |k, _| {
+                (self.information[(k, k)] + self.size[k].powi(-2)).sqrt().recip()
+            }),
+            origin: self.gaussian_solution(),
+        };
+        let solution = problem.solve()?;
+        for (k, i) in self.free.iter().enumerate() {
+            theta[*i] = solution.theta[k];
+        }
+        Ok(Solved { theta, active: solution.active, kkt: solution.kkt })
+    }
+
+    /// Where the solution would be if every row were an observation of its interval's middle: a start for the solver.
+    fn gaussian_solution(&self) -> DVector<f64> {
+        let mut right = self.right.clone();
+        for row in self.rows.iter().filter(|r| r.half_width().is_finite() && r.half_width() > 0.0) {
+            let weight = 3.0 / row.half_width().powi(2);
+            right += DVector::from_column_slice(&row.terms) * (weight * 0.5 * (row.lower + row.upper));
+        }
+        let matrix = self.with_rows(|_, r| if r.half_width() > 0.0 { uniform_sigma(r) } else { f64::INFINITY });
+        self.inverse(&matrix).map_or_else(|| DVector::zeros(self.free.len()), |inverse| inverse * right)
+    }
+
+    /// Inverse in natural sizes, none when not positive definite.
+    fn inverse(&self, matrix: &DMatrix<f64>) -> Option<DMatrix<f64>> {
+        let d = DMatrix::from_diagonal(&self.size);
+        Cholesky::new(&d * matrix * &d).map(|c| &d * c.inverse() * &d)
+    }
+
+    fn covariance(&self, active: &[Active]) -> Option<DMatrix<f64>> {
+        let information = self.with_rows(|i, row| {
+            let at_a_bound = active.iter().any(|a| a.row == i);
+            uniform_sigma(row) * if at_a_bound { 2.0 } else { 1.0 }
+        });
+        self.inverse(&information)
+    }
+
+    fn weak(&self, unknowns: &[Unknown], unseen: &[usize]) -> Vec<Direction> {
+        let information = self.with_rows(|i, row| if self.survey[i] { uniform_sigma(row) } else { f64::INFINITY });
+        let names: Vec<(&str, &str)> =
+            self.free.iter().map(|i| (unknowns[*i].name.as_str(), unknowns[*i].unit.as_str())).collect();
+        let mut weak = verdict::weak_directions(&information, &self.size, &names);
+        weak.extend(unseen.iter().map(|i| Direction::unseen(&unknowns[*i].name)));
+        weak
+    }
+}
+
+/// σ of a uniform density over a row's interval; infinite where one side is open.
+fn uniform_sigma(row: &Row) -> f64 {
+    row.half_width() / 3f64.sqrt()
+}
+
+fn channel_quality(
+    chi2: &Chi2,
+    residual: &[DMatrix<f64>],
+    plan: &Plan,
+    layout: &Layout,
+    whitening: &Whitening,
+    kept: f64,
+) -> Vec<ChannelQuality> {
+    let overall = whitening.power_ratio(residual, 0..plan.bands.len());
+    let mut decades: Vec<(i32, std::ops::Range<usize>)> = Vec::new();
+    for (b, band) in plan.bands.iter().enumerate() {
+        let decade = plan.frequency_hz(*band).log10().floor() as i32;
+        match decades.last_mut() {
+            Some((last, range)) if *last == decade => range.end = b + 1,
+            _ => decades.push((decade, b..b + 1)),
+        }
+    }
+    let by_decade: Vec<(f64, f64, Vec<f64>)> = decades
+        .into_iter()
+        .map(|(_, range)| {
+            let from = plan.bin_hz(plan.bands[range.start].first as f64);
+            let to = plan.bin_hz(plan.bands[range.end - 1].end as f64);
+            (from, to, whitening.power_ratio(residual, range))
+        })
+        .collect();
+    layout
+        .channels
+        .iter()
+        .enumerate()
+        .map(|(c, name)| {
+            let (sum, expected) = chi2.channel[c];
+            ChannelQuality {
+                channel: name.clone(),
+                chi2_per_dof: sum / expected,
+                dof: expected * kept,
+                measured_over_modelled: overall[c].sqrt(),
+                by_decade: by_decade.iter().map(|(from, to, ratio)| (*from, *to, ratio[c].sqrt())).collect(),
+            }
+        })
+        .collect()
+}
+
+/// Frequency, χ²/dof and degrees of freedom of the narrow band that stands out most: a line shows here, because Σ is refined
+/// in bands too wide to follow it.
+fn worst_band(
+    residual: &[DMatrix<f64>],
+    inverses: &[DMatrix<f64>],
+    plan: &Plan,
+    whitening: &Whitening,
+    kept: f64,
+) -> ((f64, f64), f64) {
+    let mut worst = ((0.0, 0.0), 1.0);
+    for (b, band) in plan.bands.iter().enumerate() {
+        let expected = whitening.expected_chi2(b);
+        let ratio = residual[b].dot(&inverses[b]) / expected;
+        if ratio > worst.0.1 {
+            worst = ((plan.frequency_hz(*band), ratio), expected * kept);
+        }
+    }
+    worst
+}

@@ -1,0 +1,219 @@
+//! Σ from the residuals: telemetry whose noise is not that of the mission file must not be weighed by the mission file.
+//!
+//! After Vitale et al. (arXiv:1404.4792): solve, measure the residuals' spectrum, solve again. In the coordinates in which the
+//! model says "white with unit variance" (`L⁻¹r`, `LLᵀ = Σ_model`), the residuals' measured covariance Ŵ of a band about 1/7
+//! wide would be 1 if the model were right. Σ becomes `L W̃ Lᵀ` with
+//!
+//! `W̃ = (n+ν₀)/(n+ν₀−p) · (n Ŵ + ν₀ diag Ŵ)/(n + ν₀)`
+//!
+//! * levels are measured, correlations shrunk towards the model's, with `ν₀ = 2p` pseudo-observations against n measured ones:
+//!   positive definite always, however short the data;
+//! * the model's shape inside the band stays, so a steep spectrum is no trouble;
+//! * the first factor makes the inverse unbiased (complex Wishart with n + ν₀ observations), or a Σ fitted to few data would look
+//!   too well known; the expectation of χ² shrinks by the same factor;
+//! * channels that the model does not connect stay unconnected. Were the attitude channels allowed to correlate with the test
+//!   masses', their measured coherence would *be* the offset's signal, because α̂ is made of them, and Σ would eat it.
+
+use nalgebra::{Cholesky, DMatrix};
+
+use crate::sigma::NoiseModel;
+use crate::spectra::{Layout, Plan, Sums};
+
+/// A band in which Σ is refined is at least this wide, last frequency over first.
+const RATIO: f64 = 1.15;
+
+/// … and holds at least this many complex observations per channel of the largest group.
+const OBSERVATIONS_PER_CHANNEL: f64 = 4.0;
+
+/// Pseudo-observations per channel with which measured correlations are shrunk.
+const SHRINKAGE: f64 = 2.0;
+
+/// Σ as the model has it, in units of the modelled amplitudes, and the bands in which it may move.
+pub(crate) struct Whitening {
+    /// Cholesky factor of the model's correlation matrix, per band of the sums.
+    factors: Vec<DMatrix<f64>>,
+    /// Group of each channel: channels that the model connects.
+    group: Vec<usize>,
+    /// Channels in the group of each channel.
+    group_size: Vec<f64>,
+    /// Ranges of bands of the sums.
+    coarse: Vec<std::ops::Range<usize>>,
+    /// Expected diagonal of the residuals' sums, per band.
+    expected: Vec<f64>,
+    /// Complex observations, per coarse band.
+    observations: Vec<f64>,
+}
+
+/// Why Σ cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum SigmaError {
+    /// Two channels measure the same without noise of their own.
+    #[error(
+        "the modelled noise of the channels is not positive definite at {frequency_hz:.3e} Hz: some combination of channels has no \
+         noise at all; give every readout and every test mass a noise in the mission file"
+    )]
+    Singular {
+        /// Frequency.
+        frequency_hz: f64,
+    },
+}
+
+impl Whitening {
+    pub(crate) fn new(model: &NoiseModel, plan: &Plan, layout: &Layout, sums: &Sums) -> Result<Self, SigmaError> {
+        let n = layout.channels.len();
+        let mut factors = Vec::with_capacity(plan.bands.len());
+        let mut connected = DMatrix::from_element(n, n, false);
+        for band in &plan.bands {
+            let frequency_hz = plan.frequency_hz(*band);
+            let sigma = model.psd(frequency_hz);
+            let correlation = DMatrix::from_fn(n, n, |i, j| sigma[(i, j)] / (sigma[(i, i)] * sigma[(j, j)]).sqrt());
+            for (c, x) in connected.iter_mut().zip(&correlation) {
+                *c |= *x != 0.0;
+            }
+            factors.push(Cholesky::new(correlation).ok_or(SigmaError::Singular { frequency_hz })?.unpack());
+        }
+        let group = groups(&connected);
+        let group_size: Vec<f64> = group.iter().map(|g| group.iter().filter(|h| *h == g).count() as f64).collect();
+        let per_bin = plan.expected_per_bin() * sums.segments as f64;
+        let (g, g2) = sums.weights(plan);
+        // Real degrees of freedom of a channel are (Σg)²/Σg², shared by L/2 bins; two of them make a complex observation.
+        let observations_per_bin = if g2 > 0.0 { g * g / g2 / plan.length as f64 } else { 0.0 };
+        let needed = OBSERVATIONS_PER_CHANNEL * group_size.iter().fold(0.0, |a: f64, b| a.max(*b));
+        let bins =
+            |range: &std::ops::Range<usize>| plan.bands[range.clone()].iter().map(|b| b.bins()).sum::<usize>() as f64;
+        let mut coarse = Vec::new();
+        let mut start = 0;
+        for end in 1..=plan.bands.len() {
+            let wide = plan.bands[end - 1].end as f64 >= RATIO * plan.bands[start].first as f64;
+            if wide && observations_per_bin * bins(&(start..end)) >= needed {
+                coarse.push(start..end);
+                start = end;
+            }
+        }
+        if start < plan.bands.len() {
+            let first = coarse.pop().map_or(0, |last| last.start);
+            coarse.push(first..plan.bands.len());
+        }
+        Ok(Self {
+            factors,
+            group,
+            group_size,
+            observations: coarse.iter().map(|r| observations_per_bin * bins(r)).collect(),
+            coarse,
+            expected: plan.bands.iter().map(|b| per_bin * b.bins() as f64).collect(),
+        })
+    }
+
+    /// `Σ⁻¹` of the model, per band, in units of the modelled amplitudes.
+    pub(crate) fn model_inverses(&self) -> Vec<DMatrix<f64>> {
+        self.factors.iter().map(inverse_of_square).collect()
+    }
+
+    /// `(L W̃ Lᵀ)⁻¹` per band.
+    pub(crate) fn refined_inverses(&self, residuals: &[DMatrix<f64>]) -> Vec<DMatrix<f64>> {
+        let mut out = Vec::with_capacity(self.factors.len());
+        for (range, n) in self.coarse.iter().zip(&self.observations) {
+            let measured = self.whitened(residuals, range);
+            let shrunk = DMatrix::from_fn(measured.nrows(), measured.ncols(), |i, j| {
+                let p = self.group_size[i];
+                let correction = Self::wishart(*n, p);
+                match (i == j, self.group[i] == self.group[j]) {
+                    (true, _) => correction * measured[(i, j)],
+                    (_, true) => correction * measured[(i, j)] * n / (n + SHRINKAGE * p),
+                    _ => 0.0,
+                }
+            });
+            // Positive definite but for channels without a trace of signal, which keep the model.
+            let inner = Cholesky::new(shrunk).map(|c| c.unpack());
+            out.extend(self.factors[range.clone()].iter().map(|l| match &inner {
+                Some(w) => inverse_of_square(&(l * w)),
+                None => inverse_of_square(l),
+            }));
+        }
+        out
+    }
+
+    /// Factor by which a level fitted to n observations of p channels is widened.
+    fn wishart(n: f64, p: f64) -> f64 {
+        let total = n + SHRINKAGE * p;
+        total / (total - p)
+    }
+
+    /// Measured covariance of the model-whitened residuals over a range of bands; 1 when the model is right.
+    fn whitened(&self, residuals: &[DMatrix<f64>], range: &std::ops::Range<usize>) -> DMatrix<f64> {
+        let n = self.group.len();
+        let mut sum = DMatrix::zeros(n, n);
+        for b in range.clone() {
+            // L is lower triangular with a positive diagonal: the solves cannot fail.
+            let half = self.factors[b].solve_lower_triangular(&residuals[b]).unwrap_or_else(|| residuals[b].clone());
+            let whole = self.factors[b].solve_lower_triangular(&half.transpose()).unwrap_or(half);
+            sum += 0.5 * (&whole + whole.transpose());
+        }
+        sum / self.expected[range.clone()].iter().sum::<f64>()
+    }
+
+    /// `Σ rᴴ Σ⁻¹ r` and its expectation, overall and for each channel alone; `refined` when Σ was fitted to the residuals.
+    pub(crate) fn chi2(&self, residuals: &[DMatrix<f64>], inverses: &[DMatrix<f64>], refined: bool) -> Chi2 {
+        let n = self.group.len();
+        let mut chi2 = Chi2 { sum: 0.0, expected: 0.0, channel: vec![(0.0, 0.0); n] };
+        for (range, observations) in self.coarse.iter().zip(&self.observations) {
+            for b in range.clone() {
+                chi2.sum += residuals[b].dot(&inverses[b]);
+                let sigma = inverses[b].clone().try_inverse();
+                for c in 0..n {
+                    let kept = if refined { 1.0 / Self::wishart(*observations, self.group_size[c]) } else { 1.0 };
+                    let expected = self.expected[b] * kept;
+                    chi2.expected += expected;
+                    let variance = sigma.as_ref().map_or(f64::NAN, |s| s[(c, c)]);
+                    chi2.channel[c].0 += residuals[b][(c, c)] / variance;
+                    chi2.channel[c].1 += expected;
+                }
+            }
+        }
+        chi2
+    }
+
+    /// Expectation of `Σ rᴴ Σ⁻¹ r` in one band when Σ is right.
+    pub(crate) fn expected_chi2(&self, band: usize) -> f64 {
+        self.expected[band] * self.group.len() as f64
+    }
+
+    /// Measured over modelled power of each channel in a range of bands.
+    pub(crate) fn power_ratio(&self, residuals: &[DMatrix<f64>], range: std::ops::Range<usize>) -> Vec<f64> {
+        let expected: f64 = self.expected[range.clone()].iter().sum();
+        (0..self.group.len())
+            .map(|c| residuals[range.clone()].iter().map(|r| r[(c, c)]).sum::<f64>() / expected)
+            .collect()
+    }
+}
+
+/// `χ²` as summed, with its expectation.
+#[derive(Clone, Debug)]
+pub(crate) struct Chi2 {
+    pub(crate) sum: f64,
+    pub(crate) expected: f64,
+    /// The same per channel alone.
+    pub(crate) channel: Vec<(f64, f64)>,
+}
+
+/// `(A Aᵀ)⁻¹` for a lower triangular A with a positive diagonal.
+fn inverse_of_square(a: &DMatrix<f64>) -> DMatrix<f64> {
+    let identity = DMatrix::identity(a.nrows(), a.nrows());
+    let inverse = a.solve_lower_triangular(&identity).unwrap_or(identity);
+    inverse.transpose() * inverse
+}
+
+/// Labels of the connected components of a symmetric relation.
+fn groups(connected: &DMatrix<bool>) -> Vec<usize> {
+    let n = connected.nrows();
+    let mut label: Vec<usize> = (0..n).collect();
+    for i in 0..n {
+        for j in 0..i {
+            if connected[(i, j)] && label[i] != label[j] {
+                let (keep, drop) = (label[j], label[i]);
+                label.iter_mut().filter(|l| **l == drop).for_each(|l| *l = keep);
+            }
+        }
+    }
+    label
+}

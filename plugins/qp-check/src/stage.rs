@@ -1,0 +1,447 @@
+//! The stage: columns in, report out.
+
+use dragfree_physics::mission::Mission;
+use dragfree_sdk::prelude::*;
+use nalgebra::DMatrix;
+use serde_json::json;
+use std::collections::BTreeMap;
+
+use crate::estimate::{Bound, Estimate as Solution, Unknown, estimate};
+use crate::segments::{Segmenter, cut, longest_length, shorter_length};
+use crate::sigma::{Measured, NoiseModel};
+use crate::spectra::{Analyser, Layout, Plan, Regressor, Sums};
+use crate::state;
+use crate::verdict::{AGREEMENT_SIGMAS, Difference, Value, chi2_bounds, differences};
+
+/// Normal equations over segments, a constrained solution, and a verdict.
+pub struct QpCheck {
+    mission: Mission,
+    segment_s: f64,
+    refinements: usize,
+    log: Log,
+    linked: Option<Linked>,
+}
+
+/// What exists once the columns are known.
+struct Linked {
+    columns: Vec<In>,
+    names: Vec<String>,
+    layout: Layout,
+    model: NoiseModel,
+    coefficients: Vec<Coefficient>,
+    bounds: Vec<Bound>,
+    refinements: usize,
+    analyser: Analyser,
+    segmenter: Segmenter,
+    sums: Sums,
+    /// What a saved state must have been made for.
+    signature: String,
+}
+
+impl Stage for QpCheck {
+    const MANIFEST: Manifest = Manifest {
+        id: "qp-check",
+        version: env!("CARGO_PKG_VERSION"),
+        licence: "MIT OR Apache-2.0",
+        description: "Normal equations over segments, a constrained quadratic programme for the coefficients, and a verdict",
+        parameters: &[
+            Parameter::f64(
+                "segment_s",
+                "s",
+                1638.4,
+                10.0..=100_000.0,
+                "length of a segment; data with frequent gaps need shorter ones",
+            ),
+            Parameter::i64(
+                "refinements",
+                "1",
+                3,
+                0..=10,
+                "how often the noise is measured from the residuals; 0 trusts the mission file",
+            ),
+        ],
+        instances: &[],
+    };
+
+    fn new(setup: &Setup) -> Result<Self, PluginError> {
+        Ok(Self {
+            mission: Mission::from_json(setup.mission_json())?,
+            segment_s: setup.f64("segment_s")?,
+            refinements: usize::try_from(setup.i64("refinements")?)?,
+            log: setup.log(),
+            linked: None,
+        })
+    }
+
+    fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
+        let linked = Linked::new(self, available, link)?;
+        for c in &linked.model.unknown {
+            let name = &linked.layout.channels[*c];
+            self.log.message(Level::Warn, &format!("{} {name}: {UNKNOWN_NOISE}", Self::MANIFEST.id));
+        }
+        self.linked = Some(linked);
+        Ok(())
+    }
+
+    fn process(&mut self, input: &Inputs<'_>, _output: &mut Outputs) -> Result<(), PluginError> {
+        let linked = self.linked.as_mut().ok_or_else(before_link)?;
+        let columns: Vec<&[f64]> = linked.columns.iter().map(|c| input.f64(*c)).collect();
+        linked.segmenter.push(input.time_ns(), &columns, &mut linked.analyser, &mut linked.sums);
+        Ok(())
+    }
+
+    fn report(&mut self, earlier: &[Report]) -> Result<Report, PluginError> {
+        self.linked.as_mut().ok_or_else(before_link)?.report(earlier)
+    }
+
+    fn save(&self) -> Result<Vec<u8>, PluginError> {
+        let linked = self.linked.as_ref().ok_or_else(before_link)?;
+        Ok(state::save(&linked.signature, &linked.segmenter.state, &linked.sums))
+    }
+
+    fn load(&mut self, bytes: &[u8]) -> Result<(), PluginError> {
+        let linked = self.linked.as_mut().ok_or_else(before_link)?;
+        (linked.segmenter.state, linked.sums) =
+            state::load(bytes, &linked.signature, &linked.segmenter.state, &linked.sums)?;
+        Ok(())
+    }
+}
+
+const UNKNOWN_NOISE: &str =
+    "the mission file says nothing of its noise, so it is weighed by its residuals alone; a [noise] table would help";
+
+fn before_link() -> PluginError {
+    PluginError::fatal("qp-check was called before it was linked; the host must link first")
+}
+
+impl Linked {
+    fn new(stage: &QpCheck, available: &Available, link: &mut Link<'_>) -> Result<Self, PluginError> {
+        let channels: Vec<&Column> = available.of_kind("channel").collect();
+        let Some(rate_hz) = channels.first().map(|c| c.rate_hz) else {
+            return Err(PluginError::error(
+                "qp-check finds no channel to explain: put a stage before it that makes some, such as hinf-dfacs or accelerometer",
+            ));
+        };
+        let measured: Vec<Measured> = channels.iter().map(|c| measured(c)).collect::<Result<_, _>>()?;
+        let regressors: Vec<&Column> = available.of_kind("regressor").collect();
+        let position = |column: &Column, key: &str, found: Option<usize>| {
+            found.ok_or_else(|| {
+                let wanted = column.attribute(key);
+                PluginError::error(format!(
+                    "column {} is a regressor of {key} `{wanted}`, which nobody declares; the effect that makes it must",
+                    column.name
+                ))
+            })
+        };
+        let map: Vec<Regressor> = regressors
+            .iter()
+            .map(|r| {
+                let channel = channels.iter().position(|c| name_of(c) == r.attribute("channel"));
+                let coefficient = available.coefficients.iter().position(|c| c.name == r.attribute("coefficient"));
+                Ok(Regressor {
+                    coefficient: position(r, "coefficient", coefficient)?,
+                    channel: position(r, "channel", channel)?,
+                })
+            })
+            .collect::<Result<_, PluginError>>()?;
+        let columns = channels
+            .iter()
+            .chain(&regressors)
+            .map(|c| link.read(&Want::of(c).rate_hz(rate_hz)))
+            .collect::<Result<_, _>>()?;
+        let layout = Layout {
+            channels: channels.iter().map(|c| name_of(c).to_owned()).collect(),
+            regressors: map,
+            coefficients: available.coefficients.len(),
+        };
+        let noise: Vec<(&str, Measured)> =
+            layout.channels.iter().map(String::as_str).zip(measured.iter().copied()).collect();
+        let model = NoiseModel::new(&stage.mission, &noise, 1.0 / rate_hz)?;
+        let length = longest_length((stage.segment_s * rate_hz).round() as usize);
+        let analyser = Analyser::new(Plan::new(length, rate_hz), &layout, |f| model.variances(f));
+        let averaged = (0..layout.columns())
+            .map(|j| j >= layout.channels.len() && measured[layout.channel_of(j)] == Measured::Differenced)
+            .collect();
+        let names: Vec<String> = channels.iter().chain(&regressors).map(|c| c.name.clone()).collect();
+        Ok(Self {
+            signature: format!("{} in segments of {length} samples at {rate_hz} Hz", names.join(", ")),
+            columns,
+            names,
+            model,
+            bounds: bounds(available),
+            coefficients: available.coefficients.clone(),
+            refinements: stage.refinements,
+            sums: Sums::new(analyser.plan(), &layout),
+            segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged),
+            analyser,
+            layout,
+        })
+    }
+
+    fn report(&mut self, earlier: &[Report]) -> Result<Report, PluginError> {
+        let mut report = Report {
+            epochs_used: Some(self.segmenter.state.covered),
+            epochs_rejected: Some(self.segmenter.state.rows - self.segmenter.state.covered),
+            ..Report::default()
+        };
+        for c in &self.model.unknown {
+            report.notes.push(format!("{}: {UNKNOWN_NOISE}", self.layout.channels[*c]));
+        }
+        let unknowns: Vec<Unknown> = self.coefficients.iter().map(unknown).collect();
+        let solution = match self.shortened(&mut report) {
+            None if self.sums.segments == 0 => {
+                self.no_solution(&mut report);
+                return Ok(report);
+            }
+            None => estimate(
+                &self.sums,
+                self.analyser.plan(),
+                &self.layout,
+                &self.model,
+                &unknowns,
+                &self.bounds,
+                self.refinements,
+            )?,
+            Some((analyser, sums)) => {
+                let plan = analyser.plan();
+                report.epochs_used = Some(plan.hop() as u64 * (sums.segments + 1));
+                report.epochs_rejected =
+                    Some(self.segmenter.state.rows).zip(report.epochs_used).map(|(rows, used)| rows - used);
+                estimate(&sums, plan, &self.layout, &self.model, &unknowns, &self.bounds, self.refinements)?
+            }
+        };
+        self.describe(&solution, earlier, &mut report);
+        Ok(report)
+    }
+
+    /// Sums over shorter segments when no run was as long as one.
+    fn shortened(&mut self, report: &mut Report) -> Option<(Analyser, Sums)> {
+        if self.sums.segments > 0 {
+            return None;
+        }
+        let (wanted, rate_hz) = (self.analyser.plan().length, self.analyser.plan().rate_hz);
+        let run = self.segmenter.longest_run(&self.sums);
+        let samples = run.first().map_or(0, Vec::len);
+        let length = shorter_length(samples)?;
+        let mut analyser = Analyser::new(Plan::new(length, rate_hz), &self.layout, |f| self.model.variances(f));
+        let sums = cut(run, &self.layout, &mut analyser);
+        report.notes.push(format!(
+            "no stretch without a gap holds a segment of {wanted} samples; the longest, {samples} samples, was cut into {} segments \
+             of {length}",
+            sums.segments
+        ));
+        Some((analyser, sums))
+    }
+
+    /// Too short for any spectrum: a sentence, not a number.
+    fn no_solution(&self, report: &mut Report) {
+        let state = &self.segmenter.state;
+        let samples = state.longest.first().map_or(0, Vec::len);
+        let mut sentence = format!(
+            "the longest stretch in which every channel and regressor has a value is {samples} of {} epochs: too short for a spectrum",
+            state.rows
+        );
+        if let Some((j, missing)) = state.missing.iter().enumerate().max_by_key(|(j, n)| (**n, std::cmp::Reverse(*j)))
+            && *missing > 0
+        {
+            sentence += &format!("; {} is missing in {missing} epochs", self.names[j]);
+        }
+        report.notes.push(sentence);
+        report.verdict = Some("weak".into());
+        for c in self.coefficients.iter().filter(|c| c.estimate) {
+            report.weak_directions.push(format!("{} is not seen: there is no segment of data", c.name));
+            for solution in ["qp", "adopted"] {
+                report.coefficients.push(estimate_of(c, solution, None, None));
+            }
+        }
+    }
+
+    fn describe(&self, solution: &Solution, earlier: &[Report], report: &mut Report) {
+        let quality = &solution.quality;
+        let sigma = |k: usize| solution.covariance.as_ref().map(|c| c[(k, k)].sqrt());
+        let qp: Vec<Value> = solution
+            .free
+            .iter()
+            .enumerate()
+            .filter_map(|(k, i)| {
+                Some(Value { name: self.coefficients[*i].name.clone(), value: solution.theta[*i], sigma: sigma(k)? })
+            })
+            .collect();
+        let other: Vec<Value> = earlier
+            .iter()
+            .flat_map(|r| &r.coefficients)
+            .filter(|e| e.solution == "es-akf")
+            .filter_map(|e| Some(Value { name: e.name.clone(), value: e.value?, sigma: e.sigma? }))
+            .collect();
+        let compared = differences(&qp, &other);
+        let disagreeing: Vec<&Difference> = compared.iter().filter(|d| d.sigmas() > AGREEMENT_SIGMAS).collect();
+        let insane = self.insane(solution);
+
+        report.chi2_per_dof = Some(quality.chi2_per_dof);
+        report.weak_directions = solution.weak.iter().map(|d| d.sentence.clone()).collect();
+        let weak = !solution.weak.is_empty();
+        let verdict = match (weak, disagreeing.is_empty() && insane.is_empty()) {
+            (true, _) => "weak",
+            (false, true) => "agree",
+            (false, false) => "disagree",
+        };
+        report.verdict = Some(verdict.into());
+        report.inconsistent = !insane.is_empty() || verdict == "disagree";
+        report.notes.extend(insane);
+        if compared.is_empty() {
+            report.notes.push("no solution of es-akf to compare with: the verdict rests on the QP alone".into());
+        }
+        for d in &disagreeing {
+            report.notes.push(format!(
+                "{}: qp − es-akf = {:.3e}, {:.1}σ; likely causes: an effect missing from the model (torque gain and inertia act \
+                 through α̂), noise levels of the filter that are not those of the data, or a stretch that one of the two did not use",
+                d.name,
+                d.difference,
+                d.sigmas()
+            ));
+        }
+        let (frequency_hz, ratio) = quality.worst_band;
+        let (_, high) = chi2_bounds(quality.worst_band_dof);
+        if ratio > high.max(1.5) {
+            report.notes.push(format!(
+                "residuals near {frequency_hz:.3e} Hz have {ratio:.1} times the power of their neighbourhood: a line that nobody models?"
+            ));
+        }
+        self.put_coefficients(solution, &disagreeing, report);
+        self.put_quality(solution, &compared, report);
+    }
+
+    /// Sentences about χ²/dof outside its bounds although Σ was fitted.
+    fn insane(&self, solution: &Solution) -> Vec<String> {
+        let quality = &solution.quality;
+        let whole = ("all channels", quality.chi2_per_dof, quality.dof);
+        let single = quality.channels.iter().map(|c| (c.channel.as_str(), c.chi2_per_dof, c.dof));
+        std::iter::once(whole)
+            .chain(single)
+            .filter_map(|(name, ratio, dof)| {
+                let (low, high) = chi2_bounds(dof);
+                (!(low..=high).contains(&ratio)).then(|| {
+                    format!(
+                        "χ²/dof of {name} is {ratio:.4}, outside [{low:.4}, {high:.4}] even with Σ from the residuals"
+                    )
+                })
+            })
+            .collect()
+    }
+
+    /// Values of the QP and what is adopted: the QP's values, because it alone has the survey, the whole band and a measured Σ;
+    /// where it disagrees with the ES-AKF, its σ grows to span both.
+    fn put_coefficients(&self, solution: &Solution, disagreeing: &[&Difference], report: &mut Report) {
+        let names: Vec<String> = solution.free.iter().map(|i| self.coefficients[*i].name.clone()).collect();
+        let adopted = solution.covariance.as_ref().map(|c| {
+            let widen: Vec<f64> = names
+                .iter()
+                .enumerate()
+                .map(|(k, name)| {
+                    let apart = disagreeing.iter().find(|d| d.name == *name).map_or(0.0, |d| d.difference);
+                    (1.0 + apart * apart / c[(k, k)]).sqrt()
+                })
+                .collect();
+            DMatrix::from_fn(c.nrows(), c.ncols(), |i, j| c[(i, j)] * widen[i] * widen[j])
+        });
+        for (label, covariance) in [("qp", &solution.covariance), ("adopted", &adopted)] {
+            for (i, c) in self.coefficients.iter().enumerate().filter(|(_, c)| c.estimate) {
+                let free = solution.free.iter().position(|f| *f == i);
+                let sigma = free.zip(covariance.as_ref()).map(|(k, c)| c[(k, k)].sqrt());
+                report.coefficients.push(estimate_of(c, label, free.map(|_| solution.theta[i]), sigma));
+            }
+            if let Some(c) = covariance {
+                let matrix = c.row_iter().map(|r| r.iter().copied().collect()).collect();
+                report.covariance.insert(label.to_owned(), Covariance { names: names.clone(), matrix });
+            }
+        }
+    }
+
+    fn put_quality(&self, solution: &Solution, compared: &[Difference], report: &mut Report) {
+        let quality = &solution.quality;
+        let active: Vec<_> = solution
+            .active
+            .iter()
+            .map(|a| json!({ "constraint": a.name, "side": a.side, "multiplier": a.multiplier }))
+            .collect();
+        let differences: Vec<_> = compared
+            .iter()
+            .map(|d| json!({ "name": d.name, "qp_minus_es_akf": d.difference, "sigmas": d.sigmas() }))
+            .collect();
+        let entries = [
+            ("active_constraints", json!(active)),
+            ("kkt", json!(solution.kkt)),
+            ("differences", json!(differences)),
+            ("dof", json!(quality.dof)),
+            ("chi2_per_dof_modelled_sigma", json!(quality.chi2_per_dof_modelled_sigma)),
+            ("last_step_sigma", json!(quality.last_step_sigma)),
+            ("channels", json!(quality.channels)),
+        ];
+        report.quality.extend(entries.into_iter().map(|(k, v)| (k.to_owned(), v)));
+        let state = &self.segmenter.state;
+        report.counts = BTreeMap::from([
+            ("segments".to_owned(), solution.normal.segments),
+            ("epochs".to_owned(), state.rows),
+            ("epochs_without_every_value".to_owned(), state.rows - state.valid),
+        ]);
+        let mut equations = json!(solution.normal);
+        equations["channels"] = json!(self.layout.channels);
+        equations["theta"] = json!(solution.theta.as_slice());
+        report.attachments.push(Attachment { suffix: "neq.json".into(), text: equations.to_string() });
+    }
+}
+
+fn name_of(channel: &Column) -> &str {
+    match channel.attribute("channel") {
+        "" => &channel.name,
+        name => name,
+    }
+}
+
+fn measured(channel: &Column) -> Result<Measured, PluginError> {
+    match channel.attribute("average") {
+        "2" => Ok(Measured::Differenced),
+        "1" => Ok(Measured::Directly),
+        other => Err(PluginError::error(format!(
+            "channel {} has the attribute average = `{other}`; the stage that makes it must say 2 (second differences) or 1 (measured \
+             directly)",
+            channel.name
+        ))),
+    }
+}
+
+fn unknown(c: &Coefficient) -> Unknown {
+    Unknown {
+        name: c.name.clone(),
+        unit: c.unit.clone(),
+        lower: c.lower,
+        upper: c.upper,
+        initial: c.initial,
+        prior_sigma: c.prior_sigma,
+        estimate: c.estimate,
+    }
+}
+
+fn bounds(available: &Available) -> Vec<Bound> {
+    let index = |name: &str| available.coefficients.iter().position(|c| c.name == name);
+    available
+        .constraints
+        .iter()
+        .filter_map(|c| {
+            // A constraint on a coefficient that is not in the model constrains nothing here.
+            let terms = c.terms.iter().map(|(name, weight)| Some((index(name)?, *weight))).collect::<Option<_>>()?;
+            Some(Bound { name: c.name.clone(), survey: c.kind == "survey", terms, lower: c.lower, upper: c.upper })
+        })
+        .collect()
+}
+
+fn estimate_of(c: &Coefficient, solution: &str, value: Option<f64>, sigma: Option<f64>) -> Estimate {
+    Estimate {
+        name: c.name.clone(),
+        solution: solution.to_owned(),
+        value,
+        sigma,
+        unit: c.unit.clone(),
+        frame: c.frame.clone(),
+    }
+}

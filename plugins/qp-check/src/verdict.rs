@@ -1,0 +1,171 @@
+//! What the solution is worth: directions that the data do not see, and whether two methods agree.
+
+use nalgebra::{DMatrix, DVector, SymmetricEigen};
+
+/// A combination of coefficients that data and survey leave open, in words.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Direction {
+    /// The sentence for the report.
+    pub sentence: String,
+    /// σ along it, in natural sizes of the coefficients (half ranges); infinite when nothing depends on it.
+    pub sigma_in_sizes: f64,
+}
+
+impl Direction {
+    /// A coefficient on which nothing measured depends.
+    #[must_use]
+    pub fn unseen(name: &str) -> Self {
+        Self { sentence: format!("{name} is not seen: nothing measured depends on it"), sigma_in_sizes: f64::INFINITY }
+    }
+}
+
+/// A direction is weak when its σ exceeds this part of the half range: the range then says as much as the data.
+pub const WEAK: f64 = 1.0 / 3.0;
+
+/// Coefficients that share less than this part of the leading one's motion are not named.
+const NAMED: f64 = 0.05;
+
+/// Eigen-directions of the information, scaled by `size`, whose σ exceeds [`WEAK`]; `names` with units.
+#[must_use]
+pub fn weak_directions(information: &DMatrix<f64>, size: &DVector<f64>, names: &[(&str, &str)]) -> Vec<Direction> {
+    let d = DMatrix::from_diagonal(size);
+    let eigen = SymmetricEigen::new(&d * information * &d);
+    let mut found: Vec<(f64, usize)> = eigen
+        .eigenvalues
+        .iter()
+        .enumerate()
+        .map(|(k, e)| (e.max(0.0).sqrt().recip(), k))
+        .filter(|(s, _)| *s > WEAK)
+        .collect();
+    found.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+    found
+        .into_iter()
+        .map(|(sigma, k)| describe(sigma, &eigen.eigenvectors.column(k).clone_owned(), size, names))
+        .collect()
+}
+
+fn describe(sigma: f64, vector: &DVector<f64>, size: &DVector<f64>, names: &[(&str, &str)]) -> Direction {
+    let lead = vector.icamax();
+    let motion = |i: usize| vector[i] * size[i] / (vector[lead] * size[lead]);
+    let (name, unit) = names[lead];
+    let mut combination = name.to_owned();
+    for i in (0..vector.len()).filter(|i| *i != lead && (vector[*i] / vector[lead]).abs() >= NAMED) {
+        let m = motion(i);
+        combination += &format!(" {} {:.2} {}", if m < 0.0 { '−' } else { '+' }, m.abs(), names[i].0);
+    }
+    // σ of the leading coefficient's motion along the direction.
+    let spread = sigma * (vector[lead] * size[lead]).abs();
+    let spread = if spread.is_finite() { format!("σ {spread:.2e} {unit}") } else { "σ unbounded".to_owned() };
+    Direction {
+        sentence: format!("{combination} is not seen: {spread} against a range of ±{:.2e} {unit}", size[lead]),
+        sigma_in_sizes: sigma,
+    }
+}
+
+/// A value with its σ.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Value {
+    /// Coefficient.
+    pub name: String,
+    /// Value.
+    pub value: f64,
+    /// σ.
+    pub sigma: f64,
+}
+
+/// Two solutions of one coefficient.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Difference {
+    /// Coefficient.
+    pub name: String,
+    /// First minus second.
+    pub difference: f64,
+    /// `sqrt(σ₁² + σ₂²)`.
+    pub sigma: f64,
+}
+
+/// Differences above this many σ are a disagreement: at most 0.27 % of false alarms per coefficient.
+pub const AGREEMENT_SIGMAS: f64 = 3.0;
+
+impl Difference {
+    /// Size in σ.
+    #[must_use]
+    pub fn sigmas(&self) -> f64 {
+        self.difference.abs() / self.sigma
+    }
+}
+
+/// Coefficient by coefficient, `qp − other`.
+///
+/// Both come from the same data. If the QP were efficient and the other not, the variance of the difference would be
+/// `σ_other² − σ_qp²` (Hausman), but that is zero or negative as soon as one σ is a little off. The sum of the variances holds
+/// whatever their correlation, as long as it is not negative, and errs on the quiet side.
+#[must_use]
+pub fn differences(qp: &[Value], other: &[Value]) -> Vec<Difference> {
+    qp.iter()
+        .filter_map(|q| {
+            let o = other.iter().find(|o| o.name == q.name)?;
+            Some(Difference { name: q.name.clone(), difference: q.value - o.value, sigma: q.sigma.hypot(o.sigma) })
+        })
+        .collect()
+}
+
+/// Two-sided false-alarm rate of [`chi2_bounds`]: with nine channels and their sum, below 1e-4 in all.
+pub const CHI2_FALSE_ALARM: f64 = 1e-5;
+
+/// Normal quantile of [`CHI2_FALSE_ALARM`].
+const CHI2_QUANTILE: f64 = 4.417;
+
+/// Σ is constant in its bands but for the model's shape, so χ²/dof is only ever 1 to about this.
+const CHI2_TOLERANCE: f64 = 0.01;
+
+/// Bounds of χ²/dof at [`CHI2_FALSE_ALARM`], by Wilson and Hilferty, widened by what a Σ in bands cannot follow.
+#[must_use]
+pub fn chi2_bounds(dof: f64) -> (f64, f64) {
+    let v = 2.0 / (9.0 * dof);
+    let bound = |z: f64| (1.0 - v + z * v.sqrt()).max(0.0).powi(3);
+    (bound(-CHI2_QUANTILE) - CHI2_TOLERANCE, bound(CHI2_QUANTILE) + CHI2_TOLERANCE)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Two coefficients of which only the sum is measured, to 1 mm, in ranges of ±2 cm.
+    #[test]
+    fn an_unseen_difference_is_named() {
+        let a = DVector::from_vec(vec![1.0, 1.0]);
+        let information = &a * a.transpose() * 1e6 + DMatrix::identity(2, 2) * (0.5f64 / 9.0);
+        let weak = weak_directions(&information, &DVector::repeat(2, 0.02), &[("b.x", "m"), ("b.y", "m")]);
+        assert_eq!(weak.len(), 1);
+        // Along (1, −1)/√2 the information is 0.5/9: σ is 3√2 m along the unit vector, 3 m in each coefficient.
+        let sentence = &weak[0].sentence;
+        assert!(sentence.contains("σ 3.00e0 m against a range of ±2.00e-2 m"), "{sentence}");
+        assert!(sentence.starts_with("b.x − 1.00 b.y") || sentence.starts_with("b.y − 1.00 b.x"), "{sentence}");
+    }
+
+    #[test]
+    fn a_well_measured_coefficient_is_not_weak() {
+        let information = DMatrix::repeat(1, 1, 1e6);
+        assert!(weak_directions(&information, &DVector::repeat(1, 0.02), &[("b", "m")]).is_empty());
+        // 1 mm of σ in a range of ±2 mm is.
+        assert_eq!(weak_directions(&information, &DVector::repeat(1, 0.002), &[("b", "m")]).len(), 1);
+    }
+
+    #[test]
+    fn differences_are_in_combined_sigmas() {
+        let value = |name: &str, value, sigma| Value { name: name.into(), value, sigma };
+        let d = differences(&[value("a", 1.0, 3.0), value("b", 0.0, 1.0)], &[value("a", 21.0, 4.0)]);
+        assert_eq!((d.len(), d[0].sigmas()), (1, 4.0));
+    }
+
+    /// Table values of χ²: for 10 degrees of freedom P(χ² > 41.3) = 1e-5, P(χ² < 0.889) = 1e-4.
+    #[test]
+    fn bounds_of_chi2_are_those_of_the_tables() {
+        let (low, high) = chi2_bounds(10.0);
+        assert!((high - CHI2_TOLERANCE - 4.3).abs() < 0.1, "{high}");
+        assert!(low < 0.0889);
+        let (low, high) = chi2_bounds(1e6);
+        assert!((low - 0.983_75).abs() < 2e-5 && (high - 1.016_25).abs() < 2e-5, "{low} {high}");
+    }
+}
