@@ -20,6 +20,9 @@ const OPENING_NS: i64 = 600_000_000_000;
 /// Samples that must agree before a table's clock is said to have jumped.
 const AGREEING: usize = 20;
 
+/// After the last row before a gap too long to fill so much is filled nevertheless, for what follows to forget.
+const FORGET_S: f64 = 600.0;
+
 /// Rows kept after they went out, for the outlier test of the rows that follow.
 const HISTORY: i64 = MARGIN as i64;
 
@@ -329,13 +332,16 @@ impl Gridder {
                     self.put(reference, &placed, used - placed.len());
                     placed.clear();
                     self.blank_row(last);
-                    self.epochs.begin(last + 1, time + phase);
+                    // Time goes on by half an interval at least: a clock that jumped back loses its first sample.
+                    let lost = time + phase - self.epochs.time_ns(last) < rate.part_ns(0.55);
+                    let origin = time + phase + if lost { rate.offset_ns(1) } else { 0 };
+                    self.epochs.begin(last + 1, origin);
                     self.tables[reference].tally.add(Reason::ClockJump, 1);
                     if self.summary.rephased == 0 {
                         self.summary.first_rephased_ns = time;
                     }
                     self.summary.rephased += 1;
-                    row = last + 1;
+                    row = if lost { -1 } else { last + 1 };
                 } else {
                     off_phase = true;
                 }
@@ -366,12 +372,16 @@ impl Gridder {
                 self.summary.longest_cut_ns = gap_ns;
                 self.summary.longest_cut_from_ns = self.last_reference_ns;
             }
-            // One blank row says that the epochs before and after are no neighbours.
-            self.rows += 1;
+            self.rows += self.forget_rows();
             self.grow_cells();
         }
         self.epochs.begin(self.rows, time + phase);
         self.last_reference_ns = time;
+    }
+
+    /// Blank rows before a gap too long to fill.
+    fn forget_rows(&self) -> i64 {
+        ((FORGET_S.min(self.config.max_gap_s) * self.config.rate_hz) as i64).max(1)
     }
 
     /// The table's next times within the span in which a clock must agree with itself.
@@ -463,7 +473,7 @@ impl Gridder {
             let mut place = self.epochs.place(time - phase);
             if let Place::Row(row) = place {
                 if row >= self.rows {
-                    if !cut {
+                    if !cut || row < self.rows + self.forget_rows() {
                         break;
                     }
                     place = Place::Nowhere;

@@ -122,7 +122,7 @@ impl Stage for Preprocess {
             )));
         }
         let test_masses: Vec<&str> = self.mission.test_mass.keys().map(String::as_str).collect();
-        self.ask_for_readouts(link, &test_masses)?;
+        self.ask_for_missing_readouts(available, link, &test_masses)?;
         let grid = link.table("grid", self.config.rate_hz);
         let mut specs = Vec::with_capacity(found.len());
         for (name, columns) in &found {
@@ -188,7 +188,12 @@ impl Stage for Preprocess {
 impl Preprocess {
     /// Asks for what the calibration of a drag-free mission cannot do without, so that a topic without it is refused
     /// in the host's words.
-    fn ask_for_readouts(&self, link: &mut Link<'_>, test_masses: &[&str]) -> Result<(), PluginError> {
+    fn ask_for_missing_readouts(
+        &self,
+        available: &Available,
+        link: &mut Link<'_>,
+        test_masses: &[&str],
+    ) -> Result<(), PluginError> {
         let mut wanted: Vec<(&str, String)> = Vec::new();
         if self.mandatory.iter().any(|m| m == "is") {
             wanted.extend(
@@ -198,6 +203,7 @@ impl Preprocess {
         if self.mandatory.iter().any(|m| m == "dws") {
             wanted.extend(["phi", "theta", "psi"].map(|angle| ("dws", format!("sc_crf_rad.{angle}"))));
         }
+        wanted.retain(|(table, name)| available.column(table, name).is_none());
         for (table, name) in wanted {
             let (unit, frame) = expected(table, &name).unwrap_or_default();
             link.read(&Want::new(name).table(table).unit(unit).frame(frame))?;
