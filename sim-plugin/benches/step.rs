@@ -31,7 +31,7 @@ fn bench(c: &mut Criterion) {
     let outside = Outside {
         omega_crf_rad_s: environment.omega_crf_rad_s,
         alpha_crf_rad_s2: environment.alpha_crf_rad_s2,
-        gradient_srf_s2: environment.gradient_crf_s2,
+        gradient_orf_s2: [environment.gradient_crf_s2; 2],
     };
     let loads = Loads { torque_srf_nm: Vector3::new(1e-9, -1e-9, 2e-9), ..Loads::default() };
     let mut state = State::at_rest(&Vector3::zeros(), &Default::default(), &plant, &outside);
