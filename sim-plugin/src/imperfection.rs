@@ -84,3 +84,49 @@ impl Imperfections {
         out
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn command() -> Command {
+        let mut c = Command { mps_force_srf_n: Vector3::new(1.0, 2.0, 3.0), ..Command::default() };
+        c.mps_torque_srf_nm = Vector3::new(4.0, 5.0, 6.0);
+        c.tm[1].force_orf_n = Vector3::new(0.0, 7.0, 8.0);
+        c
+    }
+
+    fn acting(text: &str) -> Command {
+        Imperfections::parse(&[text.to_owned()]).unwrap().act(&command())
+    }
+
+    #[test]
+    fn each_effect_changes_what_it_names() {
+        assert_eq!(Imperfections::default().act(&command()), command());
+        assert_eq!(acting("es-gain:tm2.y=0.5").tm[1].force_orf_n, Vector3::new(0.0, 10.5, 8.0));
+        assert_eq!(acting("es-crosstalk:tm2.y-x=0.5").tm[1].force_orf_n, Vector3::new(3.5, 7.0, 8.0));
+        assert_eq!(acting("mps-gain:sc.z=0.5").mps_force_srf_n, Vector3::new(1.0, 2.0, 4.5));
+        // 0.1 e_x × (1, 2, 3) = (0, −0.3, 0.2)
+        let tilted = acting("mps-tilt:sc.x=0.1").mps_force_srf_n;
+        assert!((tilted - Vector3::new(1.0, 1.7, 3.2)).norm() < 1e-15);
+        assert_eq!(acting("torque-gain:sc.y=-0.5").mps_torque_srf_nm, Vector3::new(4.0, 2.5, 6.0));
+        let two = ["es-gain:tm2.y=0.25".to_owned(), "es-gain:tm2.y=0.25".to_owned()];
+        assert_eq!(Imperfections::parse(&two).unwrap().act(&command()), acting("es-gain:tm2.y=0.5"));
+    }
+
+    #[test]
+    fn what_is_not_there_is_refused() {
+        for text in [
+            "",
+            "es-gain",
+            "es-gain:tm1.y",
+            "es-gain:tm1.w=1",
+            "es-gain:tm1.y=inf",
+            "es-crosstalk:tm1.y-y=1",
+            "mps-gain:tm1.x=1",
+            "thermal:tm1.x=1",
+        ] {
+            assert!(Imperfections::parse(&[text.to_owned()]).is_err(), "{text}");
+        }
+    }
+}

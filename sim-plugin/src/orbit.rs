@@ -84,3 +84,45 @@ impl Environment {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const T_NS: i64 = 2_051_222_400_000_000_000;
+
+    #[test]
+    fn the_gradient_stretches_along_the_sun() {
+        let e = Environment::at(T_NS);
+        let along = e.sun_crf.dot(&(e.gradient_crf_s2 * e.sun_crf));
+        // 2 μ/R³ = 7.9e-14 s⁻²; the Earth adds 7e-5 of it.
+        assert!((along / 7.928e-14 - 1.0).abs() < 1e-3, "{along}");
+        assert!(e.gradient_crf_s2.trace().abs() < 1e-27, "no mass where the spacecraft is");
+    }
+
+    #[test]
+    fn the_constellation_turns_once_a_year() {
+        let e = Environment::at(T_NS);
+        assert!((e.omega_crf_rad_s.norm() / 1.991e-7 - 1.0).abs() < 1e-3);
+        assert!((e.sun_crf.norm() - 1.0).abs() < 1e-15 && (e.sun_crf.z + 30_f64.to_radians().cos()).abs() < 1e-12);
+        assert!((e.r_sc_irf_m.norm() / AU_M - 1.0).abs() < 1e-12);
+        assert!(e.r_sc_irf_m.dot(&e.v_sc_irf_m_s).abs() < 1e-3 * AU_M);
+    }
+
+    /// `ω̇` against a difference, and the Sun's apparent motion in CRF against `ω`: `ṡ_CRF = n×s − ω×s` with the orbit's
+    /// own motion n about ecliptic north.
+    #[test]
+    fn rates_are_derivatives() {
+        let h_s = 1000.0;
+        let at = |s: f64| Environment::at(T_NS + (s * 1e9) as i64);
+        let e = at(0.0);
+        let alpha = (at(h_s).omega_crf_rad_s - at(-h_s).omega_crf_rad_s) / (2.0 * h_s);
+        assert!((alpha - e.alpha_crf_rad_s2).norm() < 1e-6 * alpha.norm(), "{alpha}");
+        let sun = (at(h_s).sun_crf - at(-h_s).sun_crf) / (2.0 * h_s);
+        let motion_rad_s = (MU_SUN_M3_S2 / AU_M.powi(3)).sqrt();
+        // n sits at 60° from the plane's normal in the Sun's meridian: n = ω + n p_z, p_z = c_3.
+        let orbit = e.omega_crf_rad_s + Vector3::z() * motion_rad_s;
+        let want = (orbit - e.omega_crf_rad_s).cross(&e.sun_crf);
+        assert!((sun - want).norm() < 1e-6 * want.norm(), "{sun} {want}");
+    }
+}

@@ -1,6 +1,6 @@
 //! The closed loop, epoch by epoch: measure, command, act.
 
-use dragfree_physics::attitude::{dcm, rotation_vector};
+use dragfree_physics::attitude::{rotation_vector, turn};
 use dragfree_physics::control::{Command, ControlLaw};
 use dragfree_physics::mission::{Mission, MissionError};
 use dragfree_physics::process::normal;
@@ -142,6 +142,7 @@ pub struct Simulator {
     /// Surroundings at the last packet, and the epoch of it.
     environment: Environment,
     environment_index: i64,
+    gradient_orf_s2: [Matrix3<f64>; 2],
 }
 
 /// Everything that changes while the loop runs.
@@ -193,7 +194,7 @@ impl Simulator {
         let outside = Outside {
             omega_crf_rad_s: environment.omega_crf_rad_s,
             alpha_crf_rad_s2: environment.alpha_crf_rad_s2,
-            gradient_srf_s2: environment.gradient_crf_s2,
+            gradient_orf_s2: gradient_orf(&plant, &environment),
         };
         let tm = [(r1, a1), (r2, a2)];
         let at = std::array::from_fn(|i| (tm[i].0 - shown.tm[i].r_orf_m, tm[i].1 - shown.tm[i].att_orf_rad));
@@ -214,6 +215,7 @@ impl Simulator {
             index: first,
             environment,
             environment_index: first,
+            gradient_orf_s2: outside.gradient_orf_s2,
             settings,
         };
         while simulator.index < 0 {
@@ -226,6 +228,12 @@ impl Simulator {
     #[must_use]
     pub fn time_ns(&self) -> i64 {
         epoch_ns(self.settings.start_ns, self.index, self.dt_s)
+    }
+
+    /// The true state at the coming epoch.
+    #[must_use]
+    pub fn state(&self) -> &State {
+        &self.state
     }
 
     /// The true plant, for the constants of the truth and for tests.
@@ -242,8 +250,7 @@ impl Simulator {
         let (index, time_ns) = (self.index, self.time_ns());
         let packet = index.rem_euclid(self.ephemeris_every) == 0;
         if packet {
-            self.environment = Environment::at(time_ns);
-            self.environment_index = index;
+            self.surroundings(index);
         }
         let ephemeris = self.ephemeris();
         let measured = self.noises.measure(&self.state, &mut self.rng);
@@ -269,6 +276,13 @@ impl Simulator {
         })
     }
 
+    /// Looks around at an epoch.
+    fn surroundings(&mut self, index: i64) {
+        self.environment = Environment::at(epoch_ns(self.settings.start_ns, index, self.dt_s));
+        self.environment_index = index;
+        self.gradient_orf_s2 = gradient_orf(&self.plant, &self.environment);
+    }
+
     /// The last packet.
     fn ephemeris(&self) -> Ephemeris {
         let e = &self.environment;
@@ -283,15 +297,14 @@ impl Simulator {
     }
 
     /// The surroundings now. `ω_CI` moves on linearly from the last packet, wrong by 1e-17 rad/s after a minute; `Γ`
-    /// is held, wrong by 1e-19 m/s² at a test mass.
+    /// is held and taken with SRF on CRF, wrong by 1e-19 m/s² at a test mass.
     fn outside(&self) -> Outside {
         let e = &self.environment;
         let since_s = (self.index - self.environment_index) as f64 * self.dt_s;
-        let srf_from_crf = dcm(&self.state.q_srf_from_crf);
         Outside {
             omega_crf_rad_s: e.omega_crf_rad_s + e.alpha_crf_rad_s2 * since_s,
             alpha_crf_rad_s2: e.alpha_crf_rad_s2,
-            gradient_srf_s2: srf_from_crf * e.gradient_crf_s2 * srf_from_crf.transpose(),
+            gradient_orf_s2: self.gradient_orf_s2,
         }
     }
 
@@ -308,7 +321,7 @@ impl Simulator {
         let flicker_n = self.noises.disturb(&mut loads, &mut self.rng);
         if let Some((force_n, arm)) = &self.sunlight {
             // eq:SRP_transfer_function and eq:SRP_torque; the printed matrix is the arm's cross product.
-            let force = dcm(&self.state.q_srf_from_crf) * self.environment.sun_crf * (force_n + flicker_n);
+            let force = turn(&self.state.q_srf_from_crf, &self.environment.sun_crf) * (force_n + flicker_n);
             loads.force_srf_n += force;
             loads.torque_srf_nm += arm.cross(&force);
         }
@@ -369,10 +382,15 @@ impl Simulator {
         }
         self.law.set_state(&snapshot.law).map_err(|e| refuse(&e.to_string()))?;
         self.state = State::from_numbers(numbers);
-        (self.index, self.environment_index, self.rng) = (snapshot.index, snapshot.environment_index, snapshot.rng);
-        self.environment = Environment::at(epoch_ns(self.settings.start_ns, self.environment_index, self.dt_s));
+        (self.index, self.rng) = (snapshot.index, snapshot.rng);
+        self.surroundings(snapshot.environment_index);
         Ok(())
     }
+}
+
+/// `Γ` in both ORF, for SRF on CRF.
+fn gradient_orf(plant: &Plant, environment: &Environment) -> [Matrix3<f64>; 2] {
+    plant.tm.each_ref().map(|tm| tm.dcm_orf_from_srf * environment.gradient_crf_s2 * tm.dcm_orf_from_srf.transpose())
 }
 
 /// Time of an epoch, Unix ns, to the nearest nanosecond whatever the rate.

@@ -10,3 +10,4 @@ pub mod frames;
 pub mod mission;
 pub mod noise;
 pub mod process;
+pub mod spectrum;
