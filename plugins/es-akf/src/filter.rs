@@ -14,9 +14,7 @@
 //! measure how far it does (`Statistics::design_nis`).
 
 use crate::definite::{Finding, repair};
-use crate::kernel::{
-    Columns, Mat3, Matrix, Transition, advance, advance_adapting, advance_with_foreign_gain, inverse, mix,
-};
+use crate::kernel::{Columns, Mat3, Matrix, Transition, adapt, advance, advance_with_foreign_gain, inverse, mix};
 use crate::model::{BIAS, Model, R, THETA, V};
 use crate::state::{Bytes, StateError, Words};
 
@@ -109,11 +107,13 @@ pub struct Filter<const N: usize> {
     settings: Settings,
     transition: Transition<N>,
     design_q: Matrix<N>,
+    /// Entries of the lower triangle of `Q` that are not zero.
+    noisy: Vec<(usize, usize)>,
     /// `X̂⁺`.
     x: [f64; N],
     /// `P_k`: covariance of the last epoch's `X̂⁻`.
     p: Matrix<N>,
-    /// `Q̂_k`, lower triangle.
+    /// `Q̂_k`, lower triangle; what stands above it is not used.
     q: Matrix<N>,
     /// `R̂_k`.
     r: Mat3,
@@ -121,6 +121,8 @@ pub struct Filter<const N: usize> {
     s_hat: Mat3,
     /// `E{ε εᵀ}`, used by [`Adaptation::Residual`].
     e_hat: Mat3,
+    /// `P_k Hᵀ` at the last update.
+    seen: Columns<N>,
     /// `K_k`, zero where no readout was used.
     gain: Columns<N>,
     /// `S⁻¹ = (H P_k Hᵀ + R̂_k)⁻¹`, zero where no readout was used.
@@ -129,6 +131,8 @@ pub struct Filter<const N: usize> {
     adapt: bool,
     /// `P̃`: like `P_k`, for the gains in use and the mission's noise.
     p_design: Matrix<N>,
+    /// `P̃ Hᵀ` at the last update.
+    seen_design: Columns<N>,
     /// `S̃ = H P̃ Hᵀ + R`.
     s_design: Mat3,
     /// `û` of the interval that begins at the last epoch.
@@ -144,8 +148,7 @@ pub struct Filter<const N: usize> {
     /// Rejections in a row, per readout.
     refused: [u32; 3],
     statistics: Statistics,
-    half: Matrix<N>,
-    turned: Matrix<N>,
+    /// Scratch: `A P Aᵀ`.
     product: Matrix<N>,
 }
 
@@ -160,16 +163,19 @@ impl<const N: usize> Filter<N> {
         let mut filter = Self {
             transition: Transition::new(&model),
             design_q: Matrix::zero(),
+            noisy: Vec::new(),
             x: [0.0; N],
             p: Matrix::zero(),
             q: Matrix::zero(),
             r: [[0.0; 3]; 3],
             s_hat: [[0.0; 3]; 3],
             e_hat: [[0.0; 3]; 3],
+            seen: [[0.0; N]; 3],
             gain: [[0.0; N]; 3],
             weight: [[0.0; 3]; 3],
             adapt: false,
             p_design: Matrix::zero(),
+            seen_design: [[0.0; N]; 3],
             s_design: [[0.0; 3]; 3],
             u: [0.0; 3],
             driven: false,
@@ -178,14 +184,14 @@ impl<const N: usize> Filter<N> {
             s_samples: 0,
             refused: [0; 3],
             statistics: Statistics::default(),
-            half: Matrix::zero(),
-            turned: Matrix::zero(),
             product: Matrix::zero(),
             model,
             settings,
         };
         let design_q = &mut filter.design_q;
         filter.model.process_noise(|i, j, value| design_q.0[i][j] = value);
+        let lower = (0..N).flat_map(|i| (0..=i).map(move |j| (i, j)));
+        filter.noisy = lower.filter(|&(i, j)| design_q.0[i][j] != 0.0).collect();
         filter.begin_covariances();
         for (j, c) in filter.model.coefficients.iter().enumerate() {
             filter.x[THETA + j] = c.initial;
@@ -274,39 +280,35 @@ impl<const N: usize> Filter<N> {
 
     /// eqs Final_AKF_Q_ITER, Final_AKF_Q_K and Final_AKF_p_k1 of the last epoch, with the `A` of the interval now known.
     fn time_update(&mut self) {
-        let m = self.transition.conjugate(&self.p, &mut self.half, &mut self.product, &mut self.turned);
+        let product = &mut self.product;
+        self.transition.conjugate(&self.p, product);
+        let m = self.transition.columns(&self.seen);
         let w = mix(&self.weight, &m);
-        let alpha = self.settings.forgetting;
         if self.adapt {
             let y = mix(&self.s_hat, &self.gain);
-            let (p, q, apa, k) = (&mut self.p, &mut self.q, &self.product, &self.gain);
+            let (alpha, q, n) = (self.settings.forgetting, &mut self.q, self.model.states());
+            let (by_w, by_k) = ([&w, &m], [&y, &self.gain]);
+            let all = (0..n).flat_map(|i| (0..=i).map(move |j| (i, j)));
             match self.settings.adaptation {
-                Adaptation::Monotone => advance_adapting(p, q, apa, &w, &m, &y, k, |q, q_iter, _| {
+                // min{|·|, 0} = 0: what is no noise in the model never becomes one.
+                Adaptation::Monotone => adapt(q, self.noisy.iter().copied(), by_w, by_k, |q, q_iter, _| {
                     let size = q_iter.abs();
                     alpha * q + (1.0 - alpha) * if size < q { size } else { q }
                 }),
                 Adaptation::Innovation => {
-                    advance_adapting(p, q, apa, &w, &m, &y, k, |q, q_iter, _| alpha * q + (1.0 - alpha) * q_iter);
+                    adapt(q, all, by_w, by_k, |q, q_iter, _| alpha * q + (1.0 - alpha) * q_iter);
                 }
-                Adaptation::Residual => {
-                    advance_adapting(p, q, apa, &w, &m, &y, k, |q, _, ksk| alpha * q + (1.0 - alpha) * ksk);
-                }
-                Adaptation::Off => advance(p, apa, &w, &m, q),
+                Adaptation::Residual => adapt(q, all, by_w, by_k, |q, _, ksk| alpha * q + (1.0 - alpha) * ksk),
+                Adaptation::Off => {}
             }
-        } else {
-            advance(&mut self.p, &self.product, &w, &m, &self.q);
         }
+        advance(&mut self.p, product, &w, &m, &self.q);
         if self.settings.adaptation == Adaptation::Off {
             return;
         }
-        let m = self.transition.conjugate(&self.p_design, &mut self.half, &mut self.product, &mut self.turned);
-        // W = A K, whatever covariance K came from.
-        let w: Columns<N> = std::array::from_fn(|c| {
-            let mut column = self.gain[c];
-            self.transition.state(&mut column, &[0.0; 3]);
-            column
-        });
-        advance_with_foreign_gain(&mut self.p_design, &self.product, &w, &m, &self.s_design, &self.design_q);
+        self.transition.conjugate(&self.p_design, product);
+        let m = self.transition.columns(&self.seen_design);
+        advance_with_foreign_gain(&mut self.p_design, product, &w, &m, &self.s_design, &self.design_q);
     }
 
     /// The covariance `P̃` of the gains in use under the mission's noise; `P` itself when nothing adapts.
@@ -407,6 +409,7 @@ impl<const N: usize> Filter<N> {
         };
         self.weight = weight;
         self.gain = mix(&self.weight, &c);
+        self.seen = c;
         for i in 0..3 {
             for l in 0..N {
                 self.x[l] += self.gain[i][l] * d[i];
@@ -478,8 +481,9 @@ impl<const N: usize> Filter<N> {
         if self.settings.adaptation == Adaptation::Off {
             self.s_design = *s;
         } else {
-            let c = self.transition.observed(&self.p_design);
-            self.s_design = sum(&self.transition.observed_twice(&c), &diagonal(&self.model.readout_m2));
+            self.seen_design = self.transition.observed(&self.p_design);
+            let hph = self.transition.observed_twice(&self.seen_design);
+            self.s_design = sum(&hph, &diagonal(&self.model.readout_m2));
         }
         if !settled {
             return;
@@ -500,6 +504,14 @@ impl<const N: usize> Filter<N> {
         let n = self.model.states();
         let (q, p) = (repair(&mut self.q, n), repair(&mut self.p, n));
         self.statistics.repairs_q += u64::from(q == Finding::Repaired);
+        if q == Finding::Repaired && self.settings.adaptation == Adaptation::Monotone {
+            // The nearest definite matrix has the blocks of the indefinite one; what stands outside is rounding.
+            let mut kept = Matrix::zero();
+            for &(i, j) in &self.noisy {
+                kept.0[i][j] = self.q.0[i][j];
+            }
+            self.q = kept;
+        }
         self.statistics.repairs_p += u64::from(p == Finding::Repaired);
         if q == Finding::NotFinite || p == Finding::NotFinite || !self.x.iter().all(|x| x.is_finite()) {
             self.reset();
@@ -612,8 +624,10 @@ impl<const N: usize> Filter<N> {
                 w.all(row)?;
             }
         }
-        for row in &mut self.gain {
-            w.all(row)?;
+        for columns in [&mut self.seen, &mut self.seen_design, &mut self.gain] {
+            for column in columns {
+                w.all(column)?;
+            }
         }
         for row in self.transition.phi.iter_mut() {
             w.all(row)?;

@@ -8,6 +8,8 @@
 //! **Invariant: `P` is exactly symmetric.** Every pass computes the lower triangle in blocks eight wide and mirrors it;
 //! the same recursion without the mirror turns non-finite within 10⁵ steps.
 
+use std::ops::Range;
+
 use crate::model::{BIAS, Model, R, THETA, V};
 
 /// A 3×3 matrix over the readouts x, y, z.
@@ -39,9 +41,34 @@ impl<const N: usize> Matrix<N> {
     }
 }
 
-/// Columns of row `i` that hold its lower triangle, rounded up to whole blocks.
-const fn lower_width(i: usize) -> usize {
-    (i / LANES + 1) * LANES
+/// Blocks of row `i` that hold its lower triangle.
+const fn lower_blocks(i: usize) -> usize {
+    i / LANES + 1
+}
+
+/// A row, or a column of [`Columns`], in blocks.
+#[inline(always)]
+fn blocks<const N: usize>(row: &[f64; N]) -> &[[f64; LANES]] {
+    row.as_chunks().0
+}
+
+#[inline(always)]
+fn blocks_mut<const N: usize>(row: &mut [f64; N]) -> &mut [[f64; LANES]] {
+    row.as_chunks_mut().0
+}
+
+/// `sum += factor · row`.
+#[inline(always)]
+fn add<const N: usize>(sum: &mut [f64; N], factor: f64, row: &[f64; N]) {
+    for l in 0..N {
+        sum[l] += factor * row[l];
+    }
+}
+
+/// `Σ_c weight[c] columns[c]` over one block.
+#[inline(always)]
+fn combine(weight: [f64; 3], columns: [&[f64; LANES]; 3]) -> [f64; LANES] {
+    std::array::from_fn(|l| weight[0] * columns[0][l] + weight[1] * columns[1][l] + weight[2] * columns[2][l])
 }
 
 /// `A` of one step and the selections of `H`, shared by every covariance of a test mass.
@@ -50,8 +77,12 @@ pub struct Transition<const N: usize> {
     dt: f64,
     half_dt2: f64,
     coefficients: usize,
-    /// First state of each chain, and the first row of its Toeplitz transition.
-    chains: Vec<(usize, Vec<f64>)>,
+    /// The noise-shaping states.
+    noise: Range<usize>,
+    /// Their decay over one step, by state; one for all others.
+    decay: Box<[f64; N]>,
+    /// `A_n` without the decay and the diagonal: row, column > row, entry, rows ascending.
+    links: Vec<(usize, usize, f64)>,
     /// States that add up in each readout: `r_i` and the outputs of its chains.
     outputs: [Vec<usize>; 3],
     /// Regressors of the current step by coefficient, m s⁻² per unit; rows beyond the coefficients stay zero.
@@ -63,16 +94,23 @@ impl<const N: usize> Transition<N> {
     #[must_use]
     pub fn new(model: &Model) -> Self {
         let mut outputs = [vec![R], vec![R + 1], vec![R + 2]];
-        let mut chains = Vec::new();
+        let mut decay = Box::new([1.0; N]);
+        let mut links = Vec::new();
         for (axis, first, chain) in model.placed_chains() {
             outputs[axis].push(first);
-            chains.push((first, chain.transition.clone()));
+            for i in 0..chain.states() {
+                decay[first + i] = chain.decay();
+                let link = |l: usize| (first + i, first + i + l, chain.transition[l] / chain.decay());
+                links.extend((1..chain.states() - i).map(link));
+            }
         }
         Self {
             dt: model.dt_s,
             half_dt2: 0.5 * model.dt_s * model.dt_s,
             coefficients: model.coefficients.len(),
-            chains,
+            noise: THETA + model.coefficients.len()..model.states(),
+            decay,
+            links,
             outputs,
             phi: Box::new([[0.0; 3]; N]),
         }
@@ -80,18 +118,33 @@ impl<const N: usize> Transition<N> {
 
     /// `X ← A X + B û` (eq:Final_AKF_X_k).
     pub fn state(&self, x: &mut [f64; N], u: &[f64; 3]) {
-        for i in 0..3 {
-            let mut a = x[BIAS + i] + u[i];
-            for j in 0..self.coefficients {
-                a += self.phi[j][i] * x[THETA + j];
+        self.move_noise(x);
+        self.move_mass(x, u);
+    }
+
+    /// The rows of `r` and `v`.
+    #[inline(always)]
+    fn move_mass(&self, x: &mut [f64; N], u: &[f64; 3]) {
+        let mut a: [f64; 3] = std::array::from_fn(|i| x[BIAS + i] + u[i]);
+        for (phi, theta) in self.phi[..self.coefficients].iter().zip(&x[THETA..]) {
+            for i in 0..3 {
+                a[i] += phi[i] * theta;
             }
-            x[R + i] += self.dt * x[V + i] + self.half_dt2 * a;
-            x[V + i] += self.dt * a;
         }
-        for (first, taps) in &self.chains {
-            for i in 0..taps.len() {
-                x[first + i] = (i..taps.len()).map(|j| taps[j - i] * x[first + j]).sum();
-            }
+        for i in 0..3 {
+            x[R + i] += self.dt * x[V + i] + self.half_dt2 * a[i];
+            x[V + i] += self.dt * a[i];
+        }
+    }
+
+    /// The rows of `n`.
+    #[inline(always)]
+    fn move_noise(&self, x: &mut [f64; N]) {
+        for l in 0..N {
+            x[l] *= self.decay[l];
+        }
+        for &(i, j, link) in &self.links {
+            x[i] += link * x[j];
         }
     }
 
@@ -104,15 +157,13 @@ impl<const N: usize> Transition<N> {
     /// `P Hᵀ` of a symmetric `P`.
     #[must_use]
     pub fn observed(&self, p: &Matrix<N>) -> Columns<N> {
-        std::array::from_fn(|axis| {
-            let mut column = [0.0; N];
-            for &i in &self.outputs[axis] {
-                for l in 0..N {
-                    column[l] += p.0[i][l];
-                }
+        let mut c = [[0.0; N]; 3];
+        for (column, outputs) in c.iter_mut().zip(&self.outputs) {
+            for &i in outputs {
+                add(column, 1.0, &p.0[i]);
             }
-            column
-        })
+        }
+        c
     }
 
     /// `H C` for three columns `C`.
@@ -121,128 +172,108 @@ impl<const N: usize> Transition<N> {
         std::array::from_fn(|i| std::array::from_fn(|j| self.outputs[i].iter().map(|&s| c[j][s]).sum()))
     }
 
-    /// `destination = A · source`; with `LOWER`, only the lower blocks.
-    fn rows<const LOWER: bool>(&self, destination: &mut Matrix<N>, source: &Matrix<N>) {
+    /// `destination = A · source`.
+    fn rows(&self, destination: &mut Matrix<N>, source: &Matrix<N>) {
         let (d, s) = (&mut *destination.0, &*source.0);
-        let width = |i: usize| if LOWER { lower_width(i) } else { N };
-        for axis in 0..3 {
-            for b in (0..width(V + axis)).step_by(LANES) {
-                let mut a = [0.0; LANES];
-                a.copy_from_slice(&s[BIAS + axis][b..b + LANES]);
-                for j in 0..self.coefficients {
-                    let f = self.phi[j][axis];
+        for b in 0..N / LANES {
+            for axis in 0..3 {
+                let mut a = blocks(&s[BIAS + axis])[b];
+                for (phi, theta) in self.phi[..self.coefficients].iter().zip(&s[THETA..]) {
+                    let theta = &blocks(theta)[b];
                     for l in 0..LANES {
-                        a[l] += f * s[THETA + j][b + l];
+                        a[l] += phi[axis] * theta[l];
                     }
                 }
-                for l in 0..LANES {
-                    let v = s[V + axis][b + l];
-                    d[R + axis][b + l] = s[R + axis][b + l] + (self.dt * v + self.half_dt2 * a[l]);
-                    d[V + axis][b + l] = v + self.dt * a[l];
-                }
+                let (r, v) = (&blocks(&s[R + axis])[b], &blocks(&s[V + axis])[b]);
+                blocks_mut(&mut d[R + axis])[b] =
+                    std::array::from_fn(|l| r[l] + (self.dt * v[l] + self.half_dt2 * a[l]));
+                blocks_mut(&mut d[V + axis])[b] = std::array::from_fn(|l| v[l] + self.dt * a[l]);
             }
         }
-        for i in BIAS..THETA + self.coefficients {
-            d[i][..width(i)].copy_from_slice(&s[i][..width(i)]);
-        }
-        for (first, taps) in &self.chains {
-            for i in 0..taps.len() {
-                for b in (0..width(first + i)).step_by(LANES) {
-                    let mut sum = [0.0; LANES];
-                    for j in i..taps.len() {
-                        let tap = taps[j - i];
-                        for l in 0..LANES {
-                            sum[l] += tap * s[first + j][b + l];
-                        }
-                    }
-                    d[first + i][b..b + LANES].copy_from_slice(&sum);
-                }
+        d[BIAS..self.noise.start].copy_from_slice(&s[BIAS..self.noise.start]);
+        for i in self.noise.clone() {
+            for (x, before) in d[i].iter_mut().zip(&s[i]) {
+                *x = self.decay[i] * before;
             }
+        }
+        for &(i, j, link) in &self.links {
+            let (upper, lower) = d.split_at_mut(j);
+            add(&mut upper[i], link, &lower[0]);
         }
     }
 
-    /// Lower blocks of `A P Aᵀ` into `product`, and `M = A P Hᵀ`. `half` is scratch.
-    pub fn conjugate(
-        &self,
-        p: &Matrix<N>,
-        half: &mut Matrix<N>,
-        product: &mut Matrix<N>,
-        turned: &mut Matrix<N>,
-    ) -> Columns<N> {
-        self.rows::<false>(half, p);
-        let m = std::array::from_fn(|axis| {
-            let mut column = [0.0; N];
-            for &i in &self.outputs[axis] {
-                for l in 0..N {
-                    column[l] += half.0[l][i];
-                }
-            }
-            column
-        });
-        for i in 0..N {
-            for j in 0..lower_width(i) {
-                turned.0[i][j] = half.0[j][i];
+    /// Lower triangle of `A P Aᵀ` into `product`; what stands above it means nothing.
+    pub fn conjugate(&self, p: &Matrix<N>, product: &mut Matrix<N>) {
+        self.rows(product, p);
+        // · Aᵀ, row by row: r, v and n move, a_b and θ stay. The columns of r and v in the rows of a_b and θ are, by
+        // symmetry of the result, the rows of r and v of `A P`.
+        let (moved, rest) = product.0.split_at_mut(BIAS);
+        let (fixed, noise) = rest.split_at_mut(THETA - BIAS + self.coefficients);
+        for (i, row) in fixed.iter_mut().enumerate() {
+            for (entry, above) in row.iter_mut().zip(moved.iter()) {
+                *entry = above[BIAS + i];
             }
         }
-        self.rows::<true>(product, turned);
-        m
+        for row in moved {
+            self.move_mass(row, &[0.0; 3]);
+        }
+        for row in &mut noise[..self.noise.len()] {
+            self.move_noise(row);
+            self.move_mass(row, &[0.0; 3]);
+        }
+    }
+
+    /// `A C` for three columns `C`.
+    #[must_use]
+    pub fn columns(&self, c: &Columns<N>) -> Columns<N> {
+        let mut moved = *c;
+        for column in &mut moved {
+            self.state(column, &[0.0; 3]);
+        }
+        moved
     }
 }
 
 /// `Σ_d weight[c][d] columns[d]`.
 #[must_use]
 pub fn mix<const N: usize>(weight: &Mat3, columns: &Columns<N>) -> Columns<N> {
-    std::array::from_fn(|c| {
-        let [a, b, e] = weight[c];
-        std::array::from_fn(|l| a * columns[0][l] + b * columns[1][l] + e * columns[2][l])
-    })
+    let mut mixed = [[0.0; N]; 3];
+    for (out, w) in mixed.iter_mut().zip(weight) {
+        for l in 0..N {
+            out[l] = w[0] * columns[0][l] + w[1] * columns[1][l] + w[2] * columns[2][l];
+        }
+    }
+    mixed
 }
 
-/// `P = APAᵀ − W Mᵀ + Q` on the lower blocks, mirrored.
+/// `P = APAᵀ − W Mᵀ + Q` on the lower blocks, mirrored (eq:Final_AKF_p_k1).
 pub fn advance<const N: usize>(p: &mut Matrix<N>, apa: &Matrix<N>, w: &Columns<N>, m: &Columns<N>, q: &Matrix<N>) {
     for i in 0..N {
         let wi = [w[0][i], w[1][i], w[2][i]];
-        for b in (0..lower_width(i)).step_by(LANES) {
-            for l in 0..LANES {
-                let j = b + l;
-                let wm = wi[0] * m[0][j] + wi[1] * m[1][j] + wi[2] * m[2][j];
-                p.0[i][j] = (apa.0[i][j] - wm) + q.0[i][j];
-            }
+        for b in 0..lower_blocks(i) {
+            let wm = combine(wi, [&blocks(&m[0])[b], &blocks(&m[1])[b], &blocks(&m[2])[b]]);
+            let (apa, q) = (&blocks(&apa.0[i])[b], &blocks(&q.0[i])[b]);
+            blocks_mut(&mut p.0[i])[b] = std::array::from_fn(|l| (apa[l] - wm[l]) + q[l]);
         }
     }
     p.mirror();
 }
 
-/// The last three lines of the recursion in one pass: `Q̂_iter = Q̂ − W Mᵀ + K Ŝ Kᵀ` (eq:Final_AKF_Q_ITER, with
-/// `P̂_{k+1}` of `Q̂_{k−1}`), `Q̂_k = update(Q̂_{k−1}, Q̂_iter, K Ŝ Kᵀ)`, and `P_{k+1} = A (I − K H) P Aᵀ + Q̂_k`
-/// (eq:Final_AKF_p_k1). `y = K Ŝ`.
-#[allow(clippy::too_many_arguments)] // one argument per matrix of the paper's equations
-pub fn advance_adapting<const N: usize>(
-    p: &mut Matrix<N>,
+/// `Q̂_k = update(Q̂_{k−1}, Q̂_iter, K Ŝ Kᵀ)` on the given entries of the lower triangle, with
+/// `Q̂_iter = Q̂ − W Mᵀ + K Ŝ Kᵀ` (eq:Final_AKF_Q_ITER with `P̂_{k+1}` of `Q̂_{k−1}`) and `y = K Ŝ`.
+pub fn adapt<const N: usize>(
     q: &mut Matrix<N>,
-    apa: &Matrix<N>,
-    w: &Columns<N>,
-    m: &Columns<N>,
-    y: &Columns<N>,
-    k: &Columns<N>,
+    entries: impl Iterator<Item = (usize, usize)>,
+    [w, m]: [&Columns<N>; 2],
+    [y, k]: [&Columns<N>; 2],
     update: impl Fn(f64, f64, f64) -> f64,
 ) {
-    for i in 0..N {
-        let wi = [w[0][i], w[1][i], w[2][i]];
-        let yi = [y[0][i], y[1][i], y[2][i]];
-        for b in (0..lower_width(i)).step_by(LANES) {
-            for l in 0..LANES {
-                let j = b + l;
-                let wm = wi[0] * m[0][j] + wi[1] * m[1][j] + wi[2] * m[2][j];
-                let ksk = yi[0] * k[0][j] + yi[1] * k[1][j] + yi[2] * k[2][j];
-                let before = q.0[i][j];
-                let after = update(before, (before - wm) + ksk, ksk);
-                q.0[i][j] = after;
-                p.0[i][j] = (apa.0[i][j] - wm) + after;
-            }
-        }
+    for (i, j) in entries {
+        let wm = w[0][i] * m[0][j] + w[1][i] * m[1][j] + w[2][i] * m[2][j];
+        let ksk = y[0][i] * k[0][j] + y[1][i] * k[1][j] + y[2][i] * k[2][j];
+        let before = q.0[i][j];
+        q.0[i][j] = update(before, (before - wm) + ksk, ksk);
     }
-    p.mirror();
 }
 
 /// Covariance of a filter whose gain `K` was not made for it (Joseph's form, by structure):
@@ -255,18 +286,18 @@ pub fn advance_with_foreign_gain<const N: usize>(
     s: &Mat3,
     q: &Matrix<N>,
 ) {
-    let half_ws = mix(s, w);
-    let l_: Columns<N> = std::array::from_fn(|c| std::array::from_fn(|i| m[c][i] - 0.5 * half_ws[c][i]));
+    let mut l = *m;
+    for (l, ws) in l.iter_mut().zip(&mix(s, w)) {
+        add(l, -0.5, ws);
+    }
     for i in 0..N {
         let wi = [w[0][i], w[1][i], w[2][i]];
-        let li = [l_[0][i], l_[1][i], l_[2][i]];
-        for b in (0..lower_width(i)).step_by(LANES) {
-            for l in 0..LANES {
-                let j = b + l;
-                let wl = wi[0] * l_[0][j] + wi[1] * l_[1][j] + wi[2] * l_[2][j];
-                let lw = li[0] * w[0][j] + li[1] * w[1][j] + li[2] * w[2][j];
-                p.0[i][j] = (apa.0[i][j] - (wl + lw)) + q.0[i][j];
-            }
+        let li = [l[0][i], l[1][i], l[2][i]];
+        for b in 0..lower_blocks(i) {
+            let wl = combine(wi, [&blocks(&l[0])[b], &blocks(&l[1])[b], &blocks(&l[2])[b]]);
+            let lw = combine(li, [&blocks(&w[0])[b], &blocks(&w[1])[b], &blocks(&w[2])[b]]);
+            let (apa, q) = (&blocks(&apa.0[i])[b], &blocks(&q.0[i])[b]);
+            blocks_mut(&mut p.0[i])[b] = std::array::from_fn(|c| (apa[c] - (wl[c] + lw[c])) + q[c]);
         }
     }
     p.mirror();

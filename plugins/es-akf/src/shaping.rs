@@ -44,6 +44,12 @@ impl Chain {
         Self { transition, noise, stationary }
     }
 
+    /// Decay of each state over one step.
+    #[must_use]
+    pub fn decay(&self) -> f64 {
+        self.transition.first().copied().unwrap_or(1.0)
+    }
+
     /// Number of states.
     #[must_use]
     pub fn states(&self) -> usize {
