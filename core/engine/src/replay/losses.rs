@@ -50,6 +50,8 @@ pub enum Finding {
     NoSummary,
     /// A file without a message.
     NoMessages,
+    /// A topic of the interface that is defined and has no message in any file; it makes no table.
+    EmptyTopic,
 }
 
 impl Finding {
@@ -77,6 +79,7 @@ impl Finding {
             Self::UncheckedChunk => "chunks_without_crc",
             Self::NoSummary => "files_without_summary",
             Self::NoMessages => "files_without_messages",
+            Self::EmptyTopic => "topics_without_messages",
         }
     }
 

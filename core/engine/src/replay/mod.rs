@@ -30,7 +30,7 @@ pub use losses::{Finding, Losses};
 
 use crate::table::{Chunk, TableSpec};
 use crate::telemetry::{Drift, LayoutError};
-use reader::{OpenFile, Reader, SANE_NS, clamp_ns};
+use reader::{OpenFile, Reader, SANE_NS, clamp_ns, is_sane};
 use scan::{Scan, ScanError, Source, scan};
 
 /// Stretches decoded ahead on the second thread.
@@ -51,7 +51,7 @@ pub enum ReplayError {
     NotMcap { path: PathBuf },
     /// No file has a topic of the interface.
     #[error(
-        "none of the files has a topic of telemetry.proto (found: {found}); these are no telemetry of a drag-free spacecraft"
+        "none of the files has messages of a topic of telemetry.proto (topics found: {found}); these are not the telemetry of a drag-free spacecraft, or an empty file"
     )]
     NoTelemetry { found: String },
     /// Files that do not belong together.
@@ -229,11 +229,10 @@ fn ahead(mut reader: Reader) -> Engine {
     Engine::Ahead { stretches, thread: Some(thread) }
 }
 
-/// First and last sane time that the pieces of a file state, Unix ns.
+/// First and last time that the pieces of a file state, as far as they are sane, Unix ns.
 fn times(scan: &Scan) -> Option<(i64, i64)> {
-    let sane = scan.pieces.iter().map(|p| (clamp_ns(p.start), clamp_ns(p.end)));
-    let sane = sane.filter(|(start, end)| *end > SANE_NS.start && *start < SANE_NS.end);
-    sane.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
+    let stated = scan.pieces.iter().flat_map(|p| [p.start, p.end]).filter(|&t| is_sane(t)).map(clamp_ns);
+    stated.map(|t| (t, t)).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
 }
 
 fn info(files: &[(Source, Scan)], losses: &mut Losses) -> Result<ReplayInfo, ReplayError> {

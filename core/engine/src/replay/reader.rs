@@ -27,6 +27,11 @@ pub(super) fn clamp_ns(log_time: u64) -> i64 {
     i64::try_from(log_time).unwrap_or(i64::MAX).clamp(SANE_NS.start, SANE_NS.end)
 }
 
+/// Whether a log time lies within the sane range.
+pub(super) fn is_sane(log_time: u64) -> bool {
+    i64::try_from(log_time).is_ok_and(|t| SANE_NS.contains(&t))
+}
+
 /// A piece that has yet to be read.
 #[derive(Debug)]
 struct Pending {
@@ -83,7 +88,9 @@ impl Reader {
         for (at, file) in files.into_iter().enumerate() {
             for piece in file.pieces {
                 let (start, end) = (clamp_ns(piece.start), clamp_ns(piece.end));
-                if end >= window_ns.start && start < window_ns.end {
+                // Pieces with times out of range are read for the count of them.
+                let sane = is_sane(piece.start) && is_sane(piece.end);
+                if !sane || end >= window_ns.start && start < window_ns.end {
                     queue.insert((start, at, piece.offset), Pending { piece, from_ns: i64::MIN });
                 }
             }

@@ -1,6 +1,6 @@
 //! Records of an MCAP file, parsed without trust: every length is checked against the bytes that are there.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// First and last bytes of a file.
 pub(super) const MAGIC: [u8; 8] = *b"\x89MCAP0\r\n";
@@ -191,21 +191,35 @@ impl ChunkIndex {
 }
 
 /// What the statistics count, as far as it tells whether a summary is complete.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Statistics {
     pub(super) schemas: u16,
     pub(super) channels: u32,
     pub(super) chunks: u32,
+    /// Channels with at least one message; `None` where the writer did not count by channel.
+    pub(super) used: Option<BTreeSet<u16>>,
 }
 
 impl Statistics {
     pub(super) fn parse(body: &[u8]) -> Parsed<Self> {
         let mut c = Cursor(body);
-        c.u64()?; // messages
+        let messages = c.u64()?;
         let (schemas, channels) = (c.u16()?, c.u32()?);
         c.u32()?; // attachments
         c.u32()?; // metadata
-        Ok(Self { schemas, channels, chunks: c.u32()? })
+        let chunks = c.u32()?;
+        c.u64()?; // first time
+        c.u64()?; // last time
+        let mut counts = Cursor(c.prefixed()?);
+        let mut used = BTreeSet::new();
+        while !counts.0.is_empty() {
+            let (channel, count) = (counts.u16()?, counts.u64()?);
+            if count > 0 {
+                used.insert(channel);
+            }
+        }
+        let used = Some(used).filter(|used| messages == 0 || !used.is_empty());
+        Ok(Self { schemas, channels, chunks, used })
     }
 }
 

@@ -5,7 +5,7 @@
 //! lists the channels, which otherwise only a pass through every chunk finds, and its chunk index is what the walk falls back
 //! on when a record's length is damaged.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{self, BufReader, Cursor as Bytes, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
@@ -103,6 +103,8 @@ pub(super) struct Scan {
     pub(super) bytes: u64,
     pub(super) pieces: Vec<Piece>,
     pub(super) definitions: Definitions,
+    /// Channels that have messages.
+    pub(super) used: BTreeSet<u16>,
     /// Entries of the Metadata record `dragfree`.
     pub(super) metadata: Option<BTreeMap<String, String>>,
 }
@@ -139,6 +141,7 @@ pub(super) fn scan(source: &Source, losses: &mut Losses) -> Result<Scan, ScanErr
     let summary = summary(&mut file, bytes)?;
     Walk { name: &name, bytes, index: &summary.chunks, scan: &mut scan, losses }.run(&mut file)?;
     let complete = summary.complete;
+    scan.used.extend(summary.used);
     let doubtful = doubtful(&scan.pieces, &summary.chunks, complete);
     for (id, schema) in summary.definitions.schemas {
         scan.definitions.schemas.entry(id).or_insert(schema);
@@ -202,6 +205,7 @@ fn inspect(
         while let Ok(Some((code, body))) = cursor.record() {
             if code == op::MESSAGE {
                 if let Ok(message) = Message::parse(body) {
+                    scan.used.insert(message.channel);
                     start = start.min(message.log_time);
                     end = end.max(message.log_time);
                 }
@@ -221,6 +225,8 @@ fn inspect(
 struct Summary {
     definitions: Definitions,
     chunks: Vec<ChunkIndex>,
+    /// Channels that have messages.
+    used: BTreeSet<u16>,
     /// It lists as many schemas, channels and chunks as it counts.
     complete: bool,
 }
@@ -263,11 +269,12 @@ fn parse_summary(section: &[u8]) -> Option<Summary> {
             _ => {}
         }
     }
-    summary.complete = statistics.is_some_and(|s| {
-        usize::from(s.schemas) == summary.definitions.schemas.len()
-            && s.channels as usize == summary.definitions.channels.len()
-            && s.chunks as usize == summary.chunks.len()
-    });
+    if let Some(statistics) = statistics {
+        summary.complete = usize::from(statistics.schemas) == summary.definitions.schemas.len()
+            && statistics.channels as usize == summary.definitions.channels.len()
+            && statistics.chunks as usize == summary.chunks.len();
+        summary.used = statistics.used.unwrap_or_else(|| summary.definitions.channels.keys().copied().collect());
+    }
     Some(summary)
 }
 
@@ -377,6 +384,7 @@ impl Walk<'_> {
     fn loose(&mut self, at: u64, end: u64, body: &[u8]) -> bool {
         let Ok(message) = Message::parse(body) else { return false };
         let time = message.log_time;
+        self.scan.used.insert(message.channel);
         match self.scan.pieces.last_mut() {
             Some(run) if run.stored == Stored::Loose && run.offset + run.length == at && run.length < LOOSE_BYTES => {
                 run.length = end - run.offset;

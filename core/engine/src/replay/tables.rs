@@ -71,6 +71,13 @@ pub(super) fn link(
     }
     let mut tables = Vec::with_capacity(feeds.len());
     for (feeds, table) in feeds.into_values() {
+        // A stage that finds a table relies on it: an empty one is as good as a missing topic, and better told as one.
+        if !feeds.iter().any(|f| files[f.file].1.used.contains(&f.channel)) {
+            losses.add(Finding::EmptyTopic, 1, &table.name, || {
+                format!("topic /{} has no messages; it counts as missing", table.name)
+            });
+            continue;
+        }
         for Feed { file, channel, mut layout } in feeds {
             let columns: Vec<usize> = layout
                 .leaves()

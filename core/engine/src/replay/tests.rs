@@ -398,6 +398,27 @@ fn findings_are_counted() {
 }
 
 #[test]
+fn a_whole_file_out_of_range_is_counted() {
+    for time in [7, i64::MAX, -1] {
+        let lost = vec![("/dws", time, dws(0.0, 0))];
+        let outcome = replay(&[Foreign::new(epochs(0, 5)).bytes(), Foreign::new(lost).bytes()]);
+        assert_eq!(outcome.numbers(), (0..5).collect::<Vec<_>>());
+        assert_eq!(outcome.count(Finding::TimeOutOfRange), 1, "{time}");
+    }
+}
+
+#[test]
+fn a_topic_without_messages_is_missing() {
+    let tables = interface_tables();
+    let mut batches: Vec<Batch> = tables.iter().map(|t| Batch::empty(t.columns.len())).collect();
+    batches[0].time_ns.push(DAY);
+    batches[0].columns.iter_mut().for_each(|c| c.push(1.0));
+    let outcome = replay(&[write(&tables, &[Chunk { batches, complete_until_ns: i64::MAX }])]);
+    assert_eq!(outcome.tables, tables[..1]);
+    assert_eq!(outcome.count(Finding::EmptyTopic), 5);
+}
+
+#[test]
 fn a_schema_that_drifted_stops_the_replay() {
     let mut file = Foreign::new(vec![]);
     file.options = WriteOptions::new().compression_threads(0);
@@ -456,7 +477,7 @@ prop_compose! {
 fn any_batch(table: TableSpec) -> impl Strategy<Value = Batch> {
     let columns = table.columns.len();
     let row = (0..30_000_000_000_000i64, cells(table));
-    prop::collection::vec(row, 0..40).prop_map(move |mut rows| {
+    prop::collection::vec(row, 1..40).prop_map(move |mut rows| {
         rows.sort_by_key(|r| r.0);
         rows.dedup_by_key(|r| r.0);
         let mut batch = Batch::empty(columns);

@@ -233,33 +233,32 @@ fn set_length(at: usize, out: &mut Vec<u8>) {
     }
 }
 
-/// `name` as an identifier of protobuf: letters, digits and underscores, not a digit first, never empty.
-fn identifier(name: &str, empty: &str) -> String {
+/// `name` as an identifier of protobuf: letters, digits and underscores; `prefix` goes before anything but a letter.
+fn identifier(name: &str, prefix: &str) -> String {
     let mut text: String = name.chars().map(|c| if c.is_ascii_alphanumeric() { c } else { '_' }).collect();
-    if text.is_empty() {
-        empty.clone_into(&mut text);
-    }
-    if text.starts_with(|c: char| c.is_ascii_digit()) {
-        text.insert(0, '_');
+    if !text.starts_with(|c: char| c.is_ascii_alphabetic()) {
+        text.insert_str(0, prefix);
     }
     text
 }
 
-/// The path of a column as identifiers: distinct from those taken, and no field is a message and a value at once.
+/// The path of a column as identifiers. proto3 wants siblings that differ by more than case and underscores, and no
+/// field can be a message and a value at once; a column that collides becomes a flat name with a number.
 fn free_path(name: &str, taken: &mut BTreeSet<String>) -> String {
-    let components: Vec<String> = name.split('.').map(|c| identifier(c, "_")).collect();
-    let mut path = components.join(".");
-    let collides = |path: &str, taken: &BTreeSet<String>| {
-        taken.iter().any(|t| t == path || t.starts_with(&format!("{path}.")) || path.starts_with(&format!("{t}.")))
+    let components: Vec<String> = name.split('.').map(|c| identifier(c, "column")).collect();
+    let plain = |path: &str| path.replace('_', "").to_ascii_lowercase();
+    let free = |path: &str, taken: &BTreeSet<String>| {
+        let path = plain(path);
+        let above = |a: &str, b: &str| b.strip_prefix(a).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
+        taken.iter().all(|t| !above(t, &path) && !above(&path, t))
     };
-    if collides(&path, taken) {
-        // One flat name cannot be the parent or the child of another.
-        path = components.join("_");
-        while collides(&path, taken) {
-            path.push('_');
-        }
+    let mut path = components.join(".");
+    let mut number = 1;
+    while !free(&path, taken) {
+        number += 1;
+        path = format!("{}_{number}", components.join("_"));
     }
-    taken.insert(path.clone());
+    taken.insert(plain(&path));
     path
 }
 
@@ -307,5 +306,140 @@ impl Tree {
             })
             .collect();
         DescriptorProto { name: Some(name.to_owned()), field, nested_type, ..DescriptorProto::default() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::table::Column;
+    use crate::telemetry::{Cells, Decoder, descriptor, expected, interface_tables};
+    use proptest::prelude::*;
+    use protox::prost_reflect::{DescriptorPool, DynamicMessage, ReflectMessage as _, Value};
+
+    fn table(name: &str, columns: &[&str]) -> TableSpec {
+        let column = |name: &&str| Column {
+            table: "t".into(),
+            name: (*name).into(),
+            unit: "m".into(),
+            frame: String::new(),
+            rate_hz: 0.0,
+            attributes: BTreeMap::new(),
+        };
+        TableSpec { name: name.into(), rate_hz: 0.0, columns: columns.iter().map(column).collect(), truth: false }
+    }
+
+    fn one_row(values: &[f64]) -> Batch {
+        Batch { time_ns: vec![0], columns: values.iter().map(|v| vec![*v]).collect() }
+    }
+
+    /// Another implementation of protobuf, on the descriptor that goes into the file.
+    fn pool(message: &MessageType) -> DescriptorPool {
+        DescriptorPool::decode(message.descriptor_set.as_slice()).expect("a valid descriptor set")
+    }
+
+    fn reflected(message: &DynamicMessage, path: &str) -> f64 {
+        let (name, rest) = path.split_once('.').map_or((path, None), |(n, r)| (n, Some(r)));
+        match (message.get_field_by_name(name).expect("the field is there").into_owned(), rest) {
+            (Value::Message(inner), Some(rest)) => reflected(&inner, rest),
+            (Value::F64(value), None) => value,
+            (Value::U32(value), None) => f64::from(value),
+            other => panic!("{path}: {other:?}"),
+        }
+    }
+
+    #[test]
+    fn a_generated_message_is_read_by_another_implementation() {
+        let odd = [
+            "com-offset.tm1.x@tm1.accel.y",
+            "a",
+            "a.b",
+            "a.b.c",
+            "a-b",
+            "a_b",
+            "1x",
+            "",
+            "é",
+            "tm1.x",
+            "tm1.y",
+            "..",
+            "x.",
+        ];
+        let table = table("es-akf", &odd);
+        let message = MessageType::of(&table).unwrap();
+        let distinct: BTreeSet<_> = message.paths.iter().collect();
+        assert_eq!(distinct.len(), odd.len(), "{distinct:?}");
+        assert_eq!(message.paths[9], "tm1.x", "a sound name stays");
+        let values: Vec<f64> = (0..odd.len()).map(|i| i as f64 - 3.0).collect();
+        let mut bytes = vec![];
+        Encoder::new(message.clone()).encode(&one_row(&values), 0, &mut bytes).unwrap();
+        let descriptor = pool(&message).get_message_by_name(&message.name).unwrap();
+        let decoded = DynamicMessage::decode(descriptor.clone(), bytes.as_slice()).unwrap();
+        for (path, value) in message.paths.iter().zip(&values) {
+            assert_eq!(reflected(&decoded, path), *value, "{path}");
+        }
+        assert!(descriptor.fields().all(|f| f.json_name() == f.name()));
+    }
+
+    #[test]
+    fn what_has_no_encoding_is_an_error() {
+        let foreign = table("hk/t", &["value", "error"]);
+        assert!(
+            matches!(MessageType::of(&foreign), Err(EncodeError::UnknownColumn { column, .. }) if column == "error")
+        );
+        let status = table("ifo", &["tm1.x_orf_m", "tm1.status"]);
+        let encoder = Encoder::new(MessageType::of(&status).unwrap());
+        for bad in [0.5, -1.0, 4_294_967_296.0, f64::INFINITY, f64::NAN] {
+            let refused = encoder.encode(&one_row(&[1.0, bad]), 0, &mut vec![]);
+            assert!(matches!(refused, Err(EncodeError::NotAnInteger { .. })), "{bad}");
+        }
+        let mut bytes = vec![];
+        encoder.encode(&one_row(&[f64::NAN, f64::NAN]), 0, &mut bytes).unwrap();
+        assert!(bytes.is_empty(), "a sub-message of NaN is absent");
+    }
+
+    #[test]
+    fn a_long_sub_message_gets_a_long_length() {
+        let names: Vec<String> = (0..40).map(|i| format!("m.c{i}")).collect();
+        let table = table("long", &names.iter().map(String::as_str).collect::<Vec<_>>());
+        let message = MessageType::of(&table).unwrap();
+        let values: Vec<f64> = (0..40).map(|i| f64::from(i) + 0.5).collect();
+        let mut bytes = vec![];
+        Encoder::new(message.clone()).encode(&one_row(&values), 0, &mut bytes).unwrap();
+        assert!(bytes.len() > 0x80);
+        let layout = Layout::parse(&message.descriptor_set, &message.name).unwrap();
+        let mut read = vec![f64::NAN; 40];
+        Decoder::new(&layout).decode(&bytes, &mut Cells { values: &mut read, rows: 1, row: 0 }).unwrap();
+        assert_eq!(read, values);
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig { failure_persistence: None, ..ProptestConfig::default() })]
+
+        /// Both ways against another implementation: its reading of our bytes, our reading of its bytes.
+        #[test]
+        fn the_interface_as_another_implementation_has_it(
+            which in 0usize..5,
+            values in prop::collection::vec(any::<f64>().prop_filter("a number", |v| !v.is_nan()), 18),
+            status in any::<u32>(),
+        ) {
+            let table = &interface_tables()[which];
+            let message = MessageType::of(table).unwrap();
+            let cells: Vec<f64> = (table.columns.iter().zip(values))
+                .map(|(c, v)| if c.name.ends_with("status") { f64::from(status) } else { v })
+                .collect();
+            let mut bytes = vec![];
+            Encoder::new(message.clone()).encode(&one_row(&cells), 0, &mut bytes).unwrap();
+            let topic = format!("/{}", table.name);
+            let theirs = pool(&message).get_message_by_name(descriptor(&topic).unwrap().0).unwrap();
+            let decoded = DynamicMessage::decode(theirs, bytes.as_slice()).unwrap();
+            for (column, cell) in table.columns.iter().zip(&cells) {
+                prop_assert_eq!(reflected(&decoded, &column.name).to_bits(), cell.to_bits());
+            }
+            let again = decoded.transcode_to_dynamic().encode_to_vec();
+            let mut read = vec![f64::NAN; cells.len()];
+            Decoder::new(expected(&topic).unwrap()).decode(&again, &mut Cells { values: &mut read, rows: 1, row: 0 }).unwrap();
+            prop_assert_eq!(read, cells);
+        }
     }
 }
