@@ -11,8 +11,9 @@
 //! are in no header. `ω` matters little: what changes in `ω×(ω×b)` is 1e-9 s⁻²·b, against 1e-7 s⁻²·b from α.
 //!
 //! A measured α carries its instrument's noise into the regressors. Where the spacecraft hardly turns, that noise is all
-//! there is, and an offset fitted to it is pulled towards zero however small its σ (errors in variables). The stage
-//! compares the steps of α with those of its noise and says so.
+//! there is: an offset fitted to it is pulled towards zero (errors in variables), or to whatever lever the common
+//! electrodes of linear and angular readout pretend (centimetres in the ten quiet seconds of the fixtures), however
+//! small its σ. The stage compares α with its noise on every time scale and says so.
 //!
 //! The gradient's `Γ b` is 4e-6 s⁻²·b in low orbit, but constant in a spacecraft that points at the Earth, as are the
 //! instrument's biases (1e-5 m s⁻², 1e-3 rad s⁻²): `qp-check` takes constants and slopes out of every segment.
@@ -23,7 +24,7 @@ use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
-/// Below this ratio of mean squares a tenth or more of the regressors' power is noise.
+/// Below this ratio of mean squares a tenth or more of the regressors' power is noise at every frequency.
 const QUIET: f64 = 10.0;
 
 const AXES: [&str; 3] = ["x", "y", "z"];
@@ -58,45 +59,94 @@ impl AttitudeRate {
     }
 }
 
-/// Mean square of the steps of a signal from epoch to epoch, per axis.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+/// Block lengths over which α is compared with its noise: 1, 2, 4 … 512 samples, 0.1 s to 51 s at 10 Hz.
+const LEVELS: usize = 10;
+
+/// Fewest steps from which a mean square is taken: its own standard deviation is then about a half.
+const FEWEST_STEPS: u64 = 8;
+
+/// Steps between neighbouring blocks of one length.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Steps {
+struct Level {
+    /// Mean of the block before.
     last: Option<[f64; 3]>,
+    /// Mean of the first half of the next level's block.
+    half: Option<[f64; 3]>,
     sum: [f64; 3],
     count: u64,
 }
 
-impl Steps {
-    /// Takes the value of the next epoch; a step into or out of a gap is none.
-    pub fn next(&mut self, value: &Vector3<f64>) {
-        let now = value.iter().all(|x| x.is_finite()).then_some([value.x, value.y, value.z]);
-        if let (Some(a), Some(b)) = (std::mem::replace(&mut self.last, now), now) {
-            for i in 0..3 {
-                self.sum[i] += (b[i] - a[i]).powi(2);
-            }
-            self.count += 1;
-        }
-    }
+/// Mean squares of the steps between means over neighbouring blocks (twice the Allan variance), per axis and block
+/// length: a turn to and fro shows at the length of half its period, however small it is from sample to sample.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Steps {
+    levels: [Level; LEVELS],
+}
 
-    /// Mean squares; none without a step.
-    #[must_use]
-    pub fn mean_square(&self) -> Option<[f64; 3]> {
-        (self.count > 0).then(|| self.sum.map(|s| s / self.count as f64))
+impl Default for Steps {
+    fn default() -> Self {
+        Self { levels: [Level::default(); LEVELS] }
     }
 }
 
-/// Mean square of the steps of noise alone, `∫ S(f) 4 sin²(π f dt) df` up to Nyquist.
+impl Steps {
+    /// Takes the value of the next epoch. No block and no step reaches across a gap.
+    pub fn next(&mut self, value: &Vector3<f64>) {
+        if value.iter().any(|x| !x.is_finite()) {
+            for level in &mut self.levels {
+                (level.last, level.half) = (None, None);
+            }
+            return;
+        }
+        let mut mean = [value.x, value.y, value.z];
+        for level in &mut self.levels {
+            if let Some(before) = level.last.replace(mean) {
+                for i in 0..3 {
+                    level.sum[i] += (mean[i] - before[i]).powi(2);
+                }
+                level.count += 1;
+            }
+            match level.half.take() {
+                None => {
+                    level.half = Some(mean);
+                    return;
+                }
+                Some(first) => mean = [0, 1, 2].map(|i| 0.5 * (first[i] + mean[i])),
+            }
+        }
+    }
+
+    /// Per axis, the largest mean square in units of what noise alone would have, over all block lengths with enough
+    /// steps; none without any.
+    #[must_use]
+    pub fn over_noise(&self, noise_steps: &[f64; LEVELS]) -> Option<[f64; 3]> {
+        let ratios = self.levels.iter().zip(noise_steps).filter(|(level, _)| level.count >= FEWEST_STEPS);
+        ratios
+            .map(|(level, noise)| level.sum.map(|s| s / (level.count as f64 * noise)))
+            .reduce(|a, b| [0, 1, 2].map(|i| f64::max(a[i], b[i])))
+    }
+}
+
+/// Mean square of the steps of noise alone per block length of m samples,
+/// `∫ S(f) 4 sin⁴(π f m dt) / (m² sin²(π f dt)) df` up to Nyquist.
 #[must_use]
-pub fn noise_steps(noise: &NoiseShape, dt_s: f64) -> f64 {
-    const N: u32 = 1000;
+pub fn noise_steps(noise: &NoiseShape, dt_s: f64) -> [f64; LEVELS] {
+    // A quarter of the finest oscillation of the longest block.
+    const N: u32 = 1 << (LEVELS + 1);
     let width_hz = 0.5 / dt_s / f64::from(N);
-    (0..N)
-        .map(|k| {
-            let f = (f64::from(k) + 0.5) * width_hz;
-            noise.psd(f) * (2.0 * (std::f64::consts::PI * f * dt_s).sin()).powi(2) * width_hz
-        })
-        .sum()
+    let mut all = [0.0; LEVELS];
+    for k in 0..N {
+        let f = (f64::from(k) + 0.5) * width_hz;
+        let x = std::f64::consts::PI * f * dt_s;
+        let power = noise.psd(f) * width_hz / x.sin().powi(2);
+        for (level, sum) in all.iter_mut().enumerate() {
+            let m = f64::from(1_u32 << level);
+            *sum += power * (2.0 * (m * x).sin().powi(2) / m).powi(2);
+        }
+    }
+    all
 }
 
 /// What must survive a checkpoint.
@@ -131,8 +181,8 @@ pub struct Accelerometer {
     attitude: String,
     orf_from_srf: Matrix3<f64>,
     step_ns: i64,
-    /// Mean square of the steps of α's noise, (rad s⁻²)², if the mission says how noisy it is.
-    alpha_noise_steps: Option<f64>,
+    /// Mean squares of the steps of α's noise per block length, (rad s⁻²)², if the mission says how noisy it is.
+    alpha_noise_steps: Option<[f64; LEVELS]>,
     handles: Option<Handles>,
     state: State,
 }
@@ -259,14 +309,14 @@ impl Stage for Accelerometer {
         }
         let s = &self.state;
         let mut quality = serde_json::Map::new();
-        if let (Some(noise), Some(measured)) = (self.alpha_noise_steps, s.alpha.mean_square()) {
-            let ratio = measured.map(|m| m / noise);
+        if let Some(ratio) = self.alpha_noise_steps.as_ref().and_then(|noise| s.alpha.over_noise(noise)) {
             let quiet: Vec<String> =
                 (0..3).filter(|i| ratio[*i] < QUIET).map(|i| format!("{} ({:.2})", AXES[i], ratio[i])).collect();
             if !quiet.is_empty() {
                 notes.push(format!(
                     "the measured angular acceleration about {} is hardly more than its noise (ratio of the mean squares \
-                     of their steps): offsets that it should show are pulled towards zero",
+                     of their steps, at the best of all block lengths): an offset fitted to it tells how the instrument's linear \
+                     and angular noise go together, not where the mass is",
                     quiet.join(", ")
                 ));
             }

@@ -116,41 +116,51 @@ fn a_gap_has_no_rate() {
     assert!(rate.next(8 * step, [0.0; 4], step).y.is_nan(), "no quaternion at all");
 }
 
-/// White noise of one-sided PSD `S` has variance `S/(2 dt)` and steps of twice that.
+/// White noise of one-sided PSD `S` has means over m samples of variance `S/(2 m dt)`, and steps of twice that.
 #[test]
 fn steps_of_noise_follow_its_spectrum() {
-    let white = NoiseShape::white(3e-8);
-    assert!((noise_steps(&white, 0.1) / (9e-16 / 0.1) - 1.0).abs() < 1e-5);
-    // A term in f⁻²: asd² f_c² · 4π dt ∫₀^{π/2} sin²x/x² dx, and the integral is Si(π) − 2/π.
-    let corner = noise_steps(&NoiseShape::with_corner(3e-8, 5.0, 2), 0.1) - noise_steps(&white, 0.1);
+    let white = noise_steps(&NoiseShape::white(3e-8), 0.1);
+    for (level, step) in white.iter().enumerate() {
+        let want = 9e-16 / (0.1 * f64::from(1_u32 << level));
+        assert!((step / want - 1.0).abs() < 1e-3, "{level}: {step:e} against {want:e}");
+    }
+    // A term in f⁻² at a block of one: asd² f_c² · 4π dt ∫₀^{π/2} sin²x/x² dx, and the integral is Si(π) − 2/π.
+    let corner = noise_steps(&NoiseShape::with_corner(3e-8, 5.0, 2), 0.1)[0] - white[0];
     let want = 9e-16 * 25.0 * 4.0 * std::f64::consts::PI * 0.1 * (1.851_937_051_982_466 - std::f64::consts::FRAC_2_PI);
     assert!((corner / want - 1.0).abs() < 1e-5, "{corner:e} against {want:e}");
 }
 
 #[test]
 fn steps_do_not_cross_gaps() {
-    let mut steps = Steps::default();
-    assert_eq!(steps.mean_square(), None);
-    for x in [1.0, 2.0, f64::NAN, 9.0, 6.0] {
-        steps.next(&Vector3::new(x, 0.0, 1.0));
-    }
-    assert_eq!(steps.mean_square(), Some([5.0, 0.0, 0.0]));
+    let run = |values: &[f64]| {
+        let mut steps = Steps::default();
+        for x in values {
+            steps.next(&Vector3::new(*x, 0.0, 1.0));
+        }
+        steps.over_noise(&[1.0; 10])
+    };
+    assert_eq!(run(&[1.0; 8]), None, "seven steps are too few");
+    // Nine steps of 2; the one of 90 lies across the gap. Blocks of two come to four steps and do not count.
+    let mut values = vec![0.0, 2.0, 0.0, 2.0, 0.0, f64::NAN];
+    values.extend([90.0, 92.0, 90.0, 92.0, 90.0, 92.0]);
+    assert_eq!(run(&values), Some([4.0, 0.0, 0.0]));
 }
 
 /// Ten quiet seconds: what ACC1A calls angular acceleration is the noise that the mission file states, within what ten
-/// seconds can say. A thruster's pulse of 1e-5 rad s⁻² in one of a hundred samples would be twenty times that.
+/// seconds can say. One pulse of a thruster would show, and so would a slow turn to and fro that is a tenth of
+/// the noise from sample to sample.
 #[test]
 fn the_real_spacecraft_hardly_turns_in_these_ten_seconds() {
     let rows = table("1A", "ACC1A");
-    let steps = |pulse: f64| {
+    let noise = noise_steps(&NoiseShape::with_corner(7e-8, 0.01, 2), 0.1);
+    let ratio = |extra: &dyn Fn(usize) -> f64| {
         let mut steps = Steps::default();
         for k in 0..rows.time_ns.len() {
-            let bump = if k == 50 { pulse } else { 0.0 };
-            steps.next(&Vector3::from([3, 4, 5].map(|i| rows.columns[i][k] + bump)));
+            steps.next(&Vector3::from([3, 4, 5].map(|i| rows.columns[i][k] + extra(k))));
         }
-        steps.mean_square().expect("steps")
+        steps.over_noise(&noise).expect("a hundred rows")
     };
-    let noise = noise_steps(&NoiseShape::with_corner(7e-8, 0.01, 2), 0.1);
-    assert!(steps(0.0).iter().all(|m| *m < 2.0 * noise), "{:?} against {noise:e}", steps(0.0));
-    assert!(steps(1e-5).iter().all(|m| *m > 10.0 * noise));
+    assert!(ratio(&|_| 0.0).iter().all(|r| *r < 3.0), "{:?}", ratio(&|_| 0.0));
+    assert!(ratio(&|k| if k == 50 { 1e-5 } else { 0.0 }).iter().all(|r| *r > 10.0));
+    assert!(ratio(&|k| 4e-7 * (std::f64::consts::TAU * k as f64 / 20.0).sin()).iter().all(|r| *r > 10.0));
 }
