@@ -65,6 +65,11 @@ impl Stage for EsAkf {
                 "innovations beyond so many sigma are not used; 0 uses all",
             ),
             Parameter::i64("gate_patience", "1", 30, 1..=1_000_000, "rejections in a row after which to begin anew"),
+            Parameter::bool(
+                "calibrated_sigma",
+                true,
+                "follow the covariance of the gains in use; false halves the time and gives the recursion's own sigma",
+            ),
             Parameter::f64("check_s", "s", 600.0, 0.0..=1e9, "time between tests of definiteness; 0 tests never"),
             Parameter::f64("output_interval_s", "s", 60.0, 1e-3..=1e9, "time between rows for the archive"),
             Parameter::f64("displacement_prior_m", "m", 1e-6, 1e-12..=1.0, "1 sigma of r about the first readout"),
@@ -107,6 +112,7 @@ impl Stage for EsAkf {
                 gate_sigma: setup.f64("gate_sigma")?,
                 gate_patience: u32::try_from(setup.i64("gate_patience")?).unwrap_or(u32::MAX),
                 check_epochs: epochs("check_s")?,
+                calibrated_sigma: setup.bool("calibrated_sigma")?,
             },
             choices: Choices {
                 prior: Prior {

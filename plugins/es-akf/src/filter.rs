@@ -44,6 +44,8 @@ pub struct Settings {
     pub gate_sigma: f64,
     /// After so many rejections of a readout in a row the track is acquired anew.
     pub gate_patience: u32,
+    /// Follow the covariance `P̃` of the gains in use beside `P`; without it a step costs half and σ is that of `P`.
+    pub calibrated_sigma: bool,
     /// Epochs between two tests of `P` and `Q̂` for definiteness; 0 tests never.
     pub check_epochs: u64,
 }
@@ -280,6 +282,7 @@ impl<const N: usize> Filter<N> {
 
     /// eqs Final_AKF_Q_ITER, Final_AKF_Q_K and Final_AKF_p_k1 of the last epoch, with the `A` of the interval now known.
     fn time_update(&mut self) {
+        let follows = self.has_own_covariance();
         let product = &mut self.product;
         self.transition.conjugate(&self.p, product);
         let m = self.transition.columns(&self.seen);
@@ -303,7 +306,7 @@ impl<const N: usize> Filter<N> {
             }
         }
         advance(&mut self.p, product, &w, &m, &self.q);
-        if self.settings.adaptation == Adaptation::Off {
+        if !follows {
             return;
         }
         self.transition.conjugate(&self.p_design, product);
@@ -313,7 +316,12 @@ impl<const N: usize> Filter<N> {
 
     /// The covariance `P̃` of the gains in use under the mission's noise; `P` itself when nothing adapts.
     fn design_covariance(&self) -> &Matrix<N> {
-        if self.settings.adaptation == Adaptation::Off { &self.p } else { &self.p_design }
+        if self.has_own_covariance() { &self.p_design } else { &self.p }
+    }
+
+    /// Whether `P̃` differs from `P` and is followed.
+    fn has_own_covariance(&self) -> bool {
+        self.settings.calibrated_sigma && self.settings.adaptation != Adaptation::Off
     }
 
     /// Without `û` or regressors: `a_b`, `θ` and `n` go on, `r` and `v` fall back to their prior.
@@ -478,12 +486,12 @@ impl<const N: usize> Filter<N> {
     }
 
     fn measure_consistency(&mut self, d: &[f64; 3], s: &Mat3, used: [bool; 3], settled: bool) {
-        if self.settings.adaptation == Adaptation::Off {
-            self.s_design = *s;
-        } else {
+        if self.has_own_covariance() {
             self.seen_design = self.transition.observed(&self.p_design);
             let hph = self.transition.observed_twice(&self.seen_design);
             self.s_design = sum(&hph, &diagonal(&self.model.readout_m2));
+        } else {
+            self.s_design = *s;
         }
         if !settled {
             return;

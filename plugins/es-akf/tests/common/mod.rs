@@ -51,6 +51,7 @@ pub fn settings(adaptation: Adaptation) -> Settings {
         warm_up_epochs: 2000,
         gate_sigma: 0.0,
         gate_patience: 30,
+        calibrated_sigma: true,
         check_epochs: 6000,
     }
 }
