@@ -30,7 +30,7 @@ const CHANNELS: [&str; 15] = dragfree_physics::mission::CHANNELS;
 /// True states of the fifteen channels, hours of them at 10 Hz.
 fn states(mission: &Mission, hours: usize) -> Vec<Vec<f64>> {
     let mut simulator = Simulator::new(mission, settings(1)).unwrap();
-    let mut out = vec![Vec::with_capacity(hours * 36_000); 15];
+    let mut out = vec![Vec::new(); 15];
     for _ in 0..hours * 36_000 {
         let y = simulator.state();
         let [a, b] = &y.tm;

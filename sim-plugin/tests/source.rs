@@ -1,7 +1,6 @@
 //! The source across the border, as the engine drives it.
 
 use dragfree_engine::border::{Config, Instance, Kind, Library, LinkRequest};
-use dragfree_engine::config::Mission;
 use dragfree_engine::table::{Batch, TableSpec};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};

@@ -90,7 +90,7 @@ pub fn welch(x: &[f64], rate_hz: f64, segment: usize) -> Result<Spectrum, Spectr
     let last = psd.len() - 1;
     for (i, p) in psd.iter_mut().enumerate() {
         // Zero and (for even lengths) Nyquist have no partner on the negative side.
-        let sides = if i == 0 || (i == last && segment % 2 == 0) { 1.0 } else { 2.0 };
+        let sides = if i == 0 || (i == last && segment.is_multiple_of(2)) { 1.0 } else { 2.0 };
         *p *= sides / (rate_hz * power * f64::from(segments));
     }
     let frequency_hz = (0..psd.len()).map(|i| i as f64 * rate_hz / segment as f64).collect();
