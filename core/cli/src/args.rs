@@ -24,7 +24,7 @@ pub(crate) struct Arguments {
 #[derive(Debug, Args)]
 #[command(next_help_heading = "Everywhere")]
 pub(crate) struct Global {
-    /// Folder with plugins, searched before the one beside the program; repeatable. Also DRAGFREE_PLUGIN_PATH
+    /// Folder with plugins, besides the one of the program; repeatable. Also DRAGFREE_PLUGIN_PATH
     #[arg(long, global = true, value_name = "DIR")]
     pub(crate) plugin_dir: Vec<PathBuf>,
     /// Print the result as JSON
