@@ -27,6 +27,10 @@ const PRIOR: [f64; 3] = [1e-2, 1e-4, 1e-6];
 /// loop's own suppression of `α` against `w`, 1e-4 at 1 mHz.
 const LAG_TIME_CONSTANTS: f64 = 20.0;
 
+/// An innovation says something about the noise when the attitude was predicted to within so many variances of a
+/// readout: not after a missing command, when the wide prior expects anything.
+const INFORMED: f64 = 1e3;
+
 /// Three numbers, one for each principal axis.
 type Axes = [f64; 3];
 
@@ -151,6 +155,7 @@ impl Smoother {
         if let Some(attitude) = attitude_rad {
             let y = self.model.srf_from_principal.tr_mul(attitude);
             let noise = self.model.readout_variance;
+            let informed = p00.iter().all(|p| *p < INFORMED * noise);
             for i in 0..3 {
                 let variance = p00[i] + noise;
                 let innovation = y[i] - self.mean[0][i];
@@ -167,9 +172,11 @@ impl Smoother {
                 self.covariance[3][i] = p11[i] - gain[1] * p01[i];
                 self.covariance[4][i] = p12[i] - gain[1] * p02[i];
                 self.covariance[5][i] = p22[i] - gain[2] * p02[i];
-                self.innovation_squares[i] += innovation * step.weighted_innovation[i];
+                if informed {
+                    self.innovation_squares[i] += innovation * step.weighted_innovation[i];
+                }
             }
-            self.innovations += 1;
+            self.innovations += u64::from(informed);
         }
         self.steps.push(step);
         self.model.srf_from_principal * Vector3::from(self.mean[1])

@@ -6,9 +6,7 @@
 //! six days long for 0.1 to 1 Hz, seven months for 10 to 100 mHz and fourteen for 1 to 10 mHz.
 //! Then with chance, on a record of 29 hours, at five standard deviations.
 
-mod common;
-
-use common::{AttitudeLoop, DT_S, RATE_HZ, levels, mission, run, settings, stage};
+use crate::common::{AttitudeLoop, DT_S, RATE_HZ, levels, mission, run, settings, stage};
 use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::{self, Commanded, SecondDifference, Smoother};
 use dragfree_hinf_dfacs::smoother::residual_psd;
 use dragfree_physics::mission::Mission;

@@ -1,8 +1,6 @@
 //! The stage as a stream: rows, gaps, states, replayed commands, the turning of CRF.
 
-mod common;
-
-use common::{AttitudeLoop, RATE_HZ, levels, mission, run, settings, stage};
+use crate::common::{AttitudeLoop, RATE_HZ, levels, mission, run, settings, stage};
 use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::Smoother;
 use dragfree_hinf_dfacs::reconstruction::{CHANNELS_AT, Epoch, Reconstruction, Row, Settings};
 use dragfree_physics::mission::Mission;
@@ -278,7 +276,7 @@ fn sunlight_that_nobody_has_seen_yet_is_not_guessed() {
     let mut mission = mission();
     let (mut epochs, _) = telemetry(&mission, 1000);
     mission.solar_pressure = Mission::from_json(
-        &toml::from_str::<serde_json::Value>(include_str!("../../../fixtures/missions/taiji.toml"))
+        &toml::from_str::<serde_json::Value>(include_str!("../../../../fixtures/missions/taiji.toml"))
             .expect("the fixture is TOML")
             .to_string(),
     )

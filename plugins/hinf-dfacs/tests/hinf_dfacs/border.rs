@@ -1,8 +1,6 @@
 //! The stage across the border, as the engine drives it.
 
-mod common;
-
-use common::{AttitudeLoop, levels, mission};
+use crate::common::{AttitudeLoop, levels, mission};
 use dragfree_engine::border::{Config, Instance, Kind, Library, LinkRequest, Rows};
 use dragfree_engine::table::{Batch, Column};
 use nalgebra::Vector3;
@@ -89,16 +87,17 @@ impl Grid {
     }
 }
 
-/// The shared library lies beside the folder of the test's own program.
+/// The shared library that cargo built for this test lies beside its program; the one a folder up is that of the last
+/// `cargo build` and may be stale.
 fn library() -> Library {
     let program = std::env::current_exe().expect("a test program has a path");
-    let folder = program.parent().and_then(|p| p.parent()).expect("target/PROFILE/deps/test");
+    let folder = program.parent().expect("target/PROFILE/deps/test");
     let name = format!("{}dragfree_hinf_dfacs{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
     Library::open(&folder.join(name)).expect("cargo builds the library before its tests")
 }
 
 fn create(library: &Library, parameters: &Value) -> Instance {
-    let mission: Value = toml::from_str(include_str!("../../../fixtures/missions/taiji.toml")).expect("TOML");
+    let mission: Value = toml::from_str(include_str!("../../../../fixtures/missions/taiji.toml")).expect("TOML");
     let mut all = json!({"angular_acceleration": "smoother", "compare_commands": true, "warm_up_s": 60.0});
     for (key, value) in parameters.as_object().expect("an object") {
         all[key] = value.clone();
@@ -189,7 +188,7 @@ fn the_table_is_the_contract_s() {
     assert_eq!(report["commands"], "telemetered");
     assert_eq!(report["counts"]["commands_telemetered"], 3000);
     let ratio = report["quality"]["attitude_innovation_ratio"][0].as_f64().expect("a number");
-    // 3000 squares: 2.6 % each.
+    // 3000 squares have a mean within 2.6 % of one at one standard deviation; five are allowed.
     assert!((ratio - 1.0).abs() < 0.13, "{ratio}");
 }
 
@@ -223,6 +222,9 @@ fn it_does_without_what_can_be_missing() {
     let replayed = run(&Grid::of_the_loop(3000).without("command"), &json!({}), 4096);
     assert_eq!(replayed.report["commands"], "reconstructed");
     assert_eq!(replayed.report["counts"]["commands_replayed"], 2400);
+    // While the law settles nothing is said about the noise: 2400 squares, five times 2.9 %.
+    let ratio = replayed.report["quality"]["attitude_innovation_ratio"][2].as_f64().expect("a number");
+    assert!((ratio - 1.0).abs() < 0.15, "{ratio}");
 
     let angles = Grid::of_the_loop(3000).without("is.tm1.att_orf_rad").without("dws.tm1");
     assert_eq!(run(&angles, &json!({}), 4096).report["commands"], "telemetered");
@@ -252,7 +254,7 @@ fn the_naive_ways_say_that_they_are() {
     }
 }
 
-/// The loop flew without feed-forward of sunlight; a law with it is another.
+/// A torque of twice the law's, about one axis.
 #[test]
 fn another_controller_is_noticed() {
     let mut grid = Grid::of_the_loop(3000);
