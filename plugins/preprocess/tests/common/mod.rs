@@ -6,17 +6,17 @@ use dragfree_engine::table::{Batch, Column};
 use serde_json::{Value, json};
 use std::path::Path;
 
-pub const START_NS: i64 = 2_051_222_400_000_000_000;
+pub(crate) const START_NS: i64 = 2_051_222_400_000_000_000;
 
 /// The shared library lies beside the folder of the test's own program.
-pub fn library() -> Library {
+pub(crate) fn library() -> Library {
     let folder = std::env::current_exe().unwrap().parent().unwrap().parent().unwrap().to_owned();
     let name = format!("{}dragfree_preprocess{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
     Library::open(&folder.join(name)).unwrap()
 }
 
 /// Mission of the paper, default parameters.
-pub fn config() -> Config {
+pub(crate) fn config() -> Config {
     let fixtures = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../fixtures/missions/taiji.toml");
     let mission: Value = toml::from_str(&std::fs::read_to_string(fixtures).unwrap()).unwrap();
     let parameters = json!({
@@ -25,20 +25,20 @@ pub fn config() -> Config {
     Config { value: json!({ "parameters": parameters, "mission": mission, "instance": "", "files": [] }) }
 }
 
-pub fn create(library: &Library, config: &Config) -> Result<Instance, String> {
+pub(crate) fn create(library: &Library, config: &Config) -> Result<Instance, String> {
     let plugin = library.plugins.iter().find(|p| p.kind == Kind::Stage && p.manifest.id == "preprocess").unwrap();
     Instance::create(library, plugin, config).map_err(|e| e.to_string())
 }
 
 /// A topic: name, interval in ns, columns with unit and frame.
-pub struct Topic {
-    pub name: &'static str,
-    pub interval_ns: i64,
-    pub columns: Vec<(String, &'static str, &'static str)>,
+pub(crate) struct Topic {
+    pub(crate) name: &'static str,
+    pub(crate) interval_ns: i64,
+    pub(crate) columns: Vec<(String, &'static str, &'static str)>,
 }
 
 /// The topics of telemetry.proto with two of housekeeping, 61 columns.
-pub fn topics() -> Vec<Topic> {
+pub(crate) fn topics() -> Vec<Topic> {
     let topic = |name, interval_ns| Topic { name, interval_ns, columns: Vec::new() };
     let vector = |topic: &mut Topic, stem: &str, parts: [&str; 3], unit: &'static str, frame: &'static str| {
         topic.columns.extend(parts.map(|part| (format!("{stem}.{part}"), unit, frame)));
@@ -71,7 +71,7 @@ pub fn topics() -> Vec<Topic> {
     vec![is, ifo, dws, command, ephemeris, current, field]
 }
 
-pub fn columns(topics: &[Topic]) -> Vec<Column> {
+pub(crate) fn columns(topics: &[Topic]) -> Vec<Column> {
     let of = |t: &Topic| -> Vec<Column> {
         let column = |(name, unit, frame): &(String, &str, &str)| Column {
             table: t.name.to_owned(),
@@ -90,7 +90,7 @@ pub fn columns(topics: &[Topic]) -> Vec<Column> {
 }
 
 /// `seconds` of telemetry: values of 1e-9 that never repeat, status columns zero.
-pub fn telemetry(topics: &[Topic], seconds: i64) -> Vec<Batch> {
+pub(crate) fn telemetry(topics: &[Topic], seconds: i64) -> Vec<Batch> {
     let mut word = 7_u64;
     let mut value = move || {
         word = word.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -108,7 +108,7 @@ pub fn telemetry(topics: &[Topic], seconds: i64) -> Vec<Batch> {
     topics.iter().map(batch).collect()
 }
 
-pub fn link(library: &Library, available: &[Column]) -> Result<(Instance, Linked), String> {
+pub(crate) fn link(library: &Library, available: &[Column]) -> Result<(Instance, Linked), String> {
     let mut stage = create(library, &config())?;
     let linked = stage.link(LinkRequest { available, model_json: "{}" }).map_err(|e| e.to_string())?;
     stage.activate(65_536).map_err(|e| e.to_string())?;
@@ -116,7 +116,7 @@ pub fn link(library: &Library, available: &[Column]) -> Result<(Instance, Linked
 }
 
 /// Gives the stage its rows from `from_ns` to `to_ns` and returns its one table.
-pub fn process(
+pub(crate) fn process(
     stage: &mut Instance,
     linked: &Linked,
     topics: &[Topic],
@@ -142,7 +142,7 @@ pub fn process(
     stage.process(&rows, to_ns).unwrap().unwrap().remove(0)
 }
 
-pub fn append(all: &mut Batch, part: Batch) {
+pub(crate) fn append(all: &mut Batch, part: Batch) {
     all.time_ns.extend(part.time_ns);
     for (whole, part) in all.columns.iter_mut().zip(part.columns) {
         whole.extend(part);
