@@ -75,6 +75,8 @@ impl Registry {
                     continue;
                 }
                 match Library::open(&path) {
+                    // The same bytes under another name are the same plugin, not a second one.
+                    Ok(library) if this.libraries.iter().any(|l| l.sha256 == library.sha256) => {}
                     Ok(library) => this.libraries.push(Arc::new(library)),
                     Err(BorderError::Refused { path, reason }) => this.refused.push(Refused { path, reason }),
                     Err(other) => this.refused.push(Refused { path, reason: other.to_string() }),

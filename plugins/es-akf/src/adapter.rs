@@ -189,8 +189,6 @@ impl Stage for EsAkf {
             let s = body.tracker.filter().statistics();
             nis_sum += s.nis_sum;
             dof += s.readouts.iter().sum::<u64>();
-            report.epochs_used = Some(report.epochs_used.map_or(s.updates, |n| n.min(s.updates)));
-            report.epochs_rejected = Some(report.epochs_rejected.map_or(s.predictions, |n| n.max(s.predictions)));
             for (key, n) in [
                 ("updates", s.updates),
                 ("predictions_only", s.predictions),

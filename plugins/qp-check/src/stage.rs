@@ -179,11 +179,8 @@ impl Linked {
     }
 
     fn report(&mut self, earlier: &[Report]) -> Result<Report, PluginError> {
-        let mut report = Report {
-            epochs_used: Some(self.segmenter.state.covered),
-            epochs_rejected: Some(self.segmenter.state.rows - self.segmenter.state.covered),
-            ..Report::default()
-        };
+        let mut report = Report::default();
+        report.counts.insert("epochs_in_segments".to_owned(), self.segmenter.state.covered);
         for c in &self.model.unknown {
             report.notes.push(format!("{}: {UNKNOWN_NOISE}", self.layout.channels[*c]));
         }
@@ -204,9 +201,7 @@ impl Linked {
             )?,
             Some((analyser, sums)) => {
                 let plan = analyser.plan();
-                report.epochs_used = Some(plan.hop() as u64 * (sums.segments + 1));
-                report.epochs_rejected =
-                    Some(self.segmenter.state.rows).zip(report.epochs_used).map(|(rows, used)| rows - used);
+                report.counts.insert("epochs_in_segments".to_owned(), plan.hop() as u64 * (sums.segments + 1));
                 estimate(&sums, plan, &self.layout, &self.model, &unknowns, &self.bounds, self.refinements)?
             }
         };
