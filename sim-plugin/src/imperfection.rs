@@ -1,12 +1,11 @@
-//! What the actuators truly do with a command: gains, cross-talk and tilt that the controller does not know.
+//! What the spacecraft truly is: gains, cross-talk, tilt and offsets that the controller does not know.
 
 use dragfree_physics::control::Command;
 use dragfree_sdk::PluginError;
 use nalgebra::{Matrix3, Vector3};
 
 /// Effects that [`Imperfections::parse`] knows.
-const KNOWN: &str =
-    "es-gain:tmN.AXIS, es-crosstalk:tmN.FROM-TO, mps-gain:sc.AXIS, mps-tilt:sc.AXIS, torque-gain:sc.AXIS";
+const KNOWN: &str = "com-offset:sc.AXIS, es-gain:tmN.AXIS, es-crosstalk:tmN.FROM-TO, mps-gain:sc.AXIS, mps-tilt:sc.AXIS, torque-gain:sc.AXIS";
 
 /// Matrices between command and true load, without the unit matrix.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -14,6 +13,8 @@ pub struct Imperfections {
     mps_force: Matrix3<f64>,
     mps_torque: Matrix3<f64>,
     es_force: [Matrix3<f64>; 2],
+    /// How much farther both housings sit from the centre of mass, SRF, m.
+    pub com_offset_srf_m: Vector3<f64>,
 }
 
 fn axis(name: &str) -> Option<usize> {
@@ -47,6 +48,7 @@ impl Imperfections {
         let (id, instance) = name.trim().split_once(':')?;
         let (body, place) = instance.split_once('.')?;
         match (id, body) {
+            ("com-offset", "sc") => self.com_offset_srf_m[axis(place)?] += size,
             ("es-gain", _) => {
                 let a = axis(place)?;
                 self.es_force[test_mass(body)?][(a, a)] += size;

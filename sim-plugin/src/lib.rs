@@ -233,7 +233,7 @@ impl Source for Sim {
             Parameter::text_list(
                 "effects",
                 &[],
-                "ID:INSTANCE=SIZE of es-gain, es-crosstalk, mps-gain, mps-tilt, torque-gain",
+                "ID:INSTANCE=SIZE of com-offset, es-gain, es-crosstalk, mps-gain, mps-tilt, torque-gain",
             ),
         ],
         instances: &[],
@@ -250,13 +250,14 @@ impl Source for Sim {
                 "parameter com_offset_srf_m = {given:?} must have three components, x, y, z of SRF"
             ))
         })?;
+        let imperfections = Imperfections::parse(&setup.text_list("effects")?)?;
         let settings = Settings {
             seed: setup.i64("seed")?.cast_unsigned(),
             start_ns,
             settle_s: setup.f64("settle_s")?,
-            com_offset_srf_m: Vector3::from(offset),
+            com_offset_srf_m: Vector3::from(offset) + imperfections.com_offset_srf_m,
             stiffness_error: setup.f64("stiffness_error")?,
-            imperfections: Imperfections::parse(&setup.text_list("effects")?)?,
+            imperfections,
         };
         // The third stream of the seed; the loop takes the first two.
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(settings.seed);

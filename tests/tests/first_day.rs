@@ -28,7 +28,8 @@ fn telemetry() -> &'static Telemetry {
     static FILES: OnceLock<Telemetry> = OnceLock::new();
     FILES.get_or_init(|| {
         let dir = tempfile::tempdir().expect("a temporary folder");
-        let make = |name: &str, hours: &str| simulate(&dir.path().join(name), &["--hours", hours, "--seed", "1"]).remove(0);
+        let make =
+            |name: &str, hours: &str| simulate(&dir.path().join(name), &["--hours", hours, "--seed", "1"]).remove(0);
         for name in ["six", "short"] {
             std::fs::create_dir(dir.path().join(name)).expect("writable");
         }
@@ -157,7 +158,8 @@ fn a_state_that_is_damaged_or_of_another_chain_is_refused() {
     let output = expect(&mut run(dir.path(), file, &["--load-state", "damaged"]), 1);
     assert!(String::from_utf8_lossy(&output.stderr).contains("digest"));
     let model = dir.path().join("tm1.toml");
-    std::fs::write(&model, "[model]\nrevision = \"x\"\n[[effect]]\nid = \"com-offset\"\ninstance = \"tm1\"\n").expect("writable");
+    std::fs::write(&model, "[model]\nrevision = \"x\"\n[[effect]]\nid = \"com-offset\"\ninstance = \"tm1\"\n")
+        .expect("writable");
     let mut other = run(dir.path(), file, &["--load-state", "state"]);
     let output = expect(other.arg("--model").arg(&model), 1);
     assert!(String::from_utf8_lossy(&output.stderr).contains("saved by"));

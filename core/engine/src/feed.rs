@@ -70,6 +70,12 @@ impl FileFeed {
         mission: &Mission,
     ) -> Result<Self, EngineError> {
         let replay = Replay::open(files, window_ns.clone(), threads)?;
+        if replay.tables().is_empty() {
+            let losses = replay.losses();
+            let said =
+                losses.entries().into_iter().map(|l| l.detail).chain(losses.notes()).collect::<Vec<_>>().join("; ");
+            return Err(EngineError::NoTelemetry { files: files.to_vec(), said });
+        }
         let spacecraft = &replay.info().spacecraft;
         if !spacecraft.is_empty() && *spacecraft != mission.spacecraft {
             return Err(EngineError::WrongSpacecraft {

@@ -62,6 +62,14 @@ pub enum EngineError {
         /// The pipeline.
         pipeline: PathBuf,
     },
+    /// The files hold no topic of the interface.
+    #[error("there is no telemetry in {}: {said}", files.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join(", "))]
+    NoTelemetry {
+        /// The files.
+        files: Vec<PathBuf>,
+        /// What the replay found in them.
+        said: String,
+    },
     /// There is not one row in the window.
     #[error("there is no telemetry in the time that was asked for ({} files); check --from and --until", files.len())]
     NoRows {
