@@ -68,7 +68,7 @@ impl KnownModel {
     ///
     /// `sun_srf` is the unit vector from the Sun, `None` where sunlight is not modelled; `omega_srf_rad_s` is relative
     /// to IRF. The stiffness acts on the measured displacement with its noise `n`: `û` gains `S n` where the second
-    /// difference of the same readout has `n̈`, so the ratio is `S/(2πf)²`, 2 % at 1 mHz for 1e-6 s⁻² and less above.
+    /// difference of the same readout has `n̈`, so the ratio is `S/(2πf)²`, 2.5 % at 1 mHz for 1e-6 s⁻² and less above.
     #[must_use]
     pub fn motion(
         &self,

@@ -3,8 +3,9 @@
 //! The attitude obeys `θ̈ = α_known + β + w` with `w` white (thrusters), constant over a sample, and `β` a slowly
 //! wandering torque (sunlight or a controller's integrator that nobody modelled). A Kalman filter runs on
 //! `x = [θ, ω, β]` for each principal axis, and the adjoint recursion of Koopman's disturbance smoother (Biometrika 80,
-//! 1993; Durbin & Koopman, sections 4.4 and 4.5) runs backward over a fixed lag. It gives `E[β + w | data]`, so that the truth regressed on the result
-//! has slope one. Commands are no extra information: they are known functions of past readouts.
+//! 1993; Durbin & Koopman, sections 4.4 and 4.5) runs backward over a fixed lag. It gives `E[β + w | data]`, so that
+//! the truth regressed on the result has slope one. Commands are no extra information: they are known functions of past
+//! readouts.
 //!
 //! The torque noise has one level on all axes and so has the sensing: `J⁻¹ S_M J⁻ᵀ` and `S_n 1` are diagonal
 //! together in the principal axes of `J`, and the three axes decouple exactly.
