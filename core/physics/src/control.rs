@@ -386,6 +386,27 @@ pub(crate) mod tests {
         assert!(error.amax() < 1e-12, "{error}");
     }
 
+    proptest::proptest! {
+        /// A right inverse for other spacecraft too: masses, offsets, opening angles.
+        #[test]
+        fn allocation_is_a_right_inverse_for_any_geometry(
+            mass_kg in 100.0..5000.0_f64,
+            half_angle_rad in 0.1..0.7_f64,
+            offsets in proptest::array::uniform6(-0.5..0.5_f64),
+        ) {
+            let mut mission = taiji();
+            mission.spacecraft.mass_kg = mass_kg;
+            for (i, (name, sign)) in [("tm1", 1.0), ("tm2", -1.0)].into_iter().enumerate() {
+                let tm = mission.test_mass.get_mut(name).unwrap();
+                tm.orf_from_srf_angle_rad = sign * half_angle_rad;
+                tm.offset_nominal_srf_m = [offsets[3 * i], offsets[3 * i + 1], offsets[3 * i + 2]];
+            }
+            let plant = LinearPlant::new(&mission).unwrap();
+            let error = plant.input_matrix() * plant.allocation().unwrap() - SMatrix::<f64, 15, 15>::identity();
+            proptest::prop_assert!(error.amax() < 1e-11, "{}", error.amax());
+        }
+    }
+
     /// eqs x_axis_thrust to z_axis_thrust, with the paper's channels 4, 10 (x) and 6, 12 (z).
     #[test]
     fn thrust_follows_the_rules_of_the_paper() {

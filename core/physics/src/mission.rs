@@ -414,6 +414,18 @@ impl Mission {
             positive("housing.baseline_tolerance_m", h.baseline_tolerance_m)?;
         }
         self.noise.check()?;
+        if let Some(s) = &self.solar_pressure {
+            positive_or_zero("solar_pressure.force_n", s.force_n)?;
+            positive_or_zero("solar_pressure.orbit_error_m", s.orbit_error_m)?;
+        }
+        if let Some(r) = &self.requirements {
+            positive("requirements.tm_x_m_rthz", r.tm_x_m_rthz)?;
+            positive("requirements.tm_yz_m_rthz", r.tm_yz_m_rthz)?;
+            positive("requirements.sc_attitude_rad_rthz", r.sc_attitude_rad_rthz)?;
+            positive("requirements.tm_phi_rad_rthz", r.tm_phi_rad_rthz)?;
+            positive("requirements.tm_theta_psi_rad_rthz", r.tm_theta_psi_rad_rthz)?;
+            positive_or_zero("requirements.corner_hz", r.corner_hz)?;
+        }
         if let Some(a) = &self.actuators {
             positive("actuators.thrust_limit_n", a.thrust_limit_n)?;
             positive("actuators.torque_limit_nm", a.torque_limit_nm)?;
