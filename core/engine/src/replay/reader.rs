@@ -4,11 +4,13 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::PathBuf;
 
+use mcap::records::op;
+
 use super::ReplayError;
 use super::block::{Block, drain};
 use super::inflate::{InflateError, Inflater};
 use super::losses::{Finding, Losses};
-use super::records::{Cursor, Message, op};
+use super::records::{Cursor, Message};
 use super::scan::{Piece, Source};
 use super::tables::{Route, Routes};
 use crate::table::{Batch, Chunk, TableSpec};

@@ -2,27 +2,12 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-/// First and last bytes of a file.
-pub(super) const MAGIC: [u8; 8] = *b"\x89MCAP0\r\n";
 /// Operation code and length of a record.
 pub(super) const RECORD_HEADER: usize = 9;
 /// Channel, sequence, log time and publish time of a message.
 pub(super) const MESSAGE_HEADER: usize = 22;
 /// Length of the body of a footer.
 pub(super) const FOOTER: usize = 20;
-
-/// Operation codes.
-pub(super) mod op {
-    pub(in super::super) const FOOTER: u8 = 0x02;
-    pub(in super::super) const SCHEMA: u8 = 0x03;
-    pub(in super::super) const CHANNEL: u8 = 0x04;
-    pub(in super::super) const MESSAGE: u8 = 0x05;
-    pub(in super::super) const CHUNK: u8 = 0x06;
-    pub(in super::super) const CHUNK_INDEX: u8 = 0x08;
-    pub(in super::super) const STATISTICS: u8 = 0x0b;
-    pub(in super::super) const METADATA: u8 = 0x0c;
-    pub(in super::super) const DATA_END: u8 = 0x0f;
-}
 
 /// A record that is shorter than what it says, or holds text that is none.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -11,11 +11,14 @@ use std::io::{self, BufReader, Cursor as Bytes, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use mcap::MAGIC;
+use mcap::records::op;
+
 use super::inflate::{InflateError, Inflater, MAX_PIECE};
 use super::losses::{Finding, Losses};
 use super::records::{
-    Channel, ChunkHeader, ChunkIndex, Cursor, FOOTER, MAGIC, MESSAGE_HEADER, Message, RECORD_HEADER, Schema,
-    Statistics, footer, metadata, op,
+    Channel, ChunkHeader, ChunkIndex, Cursor, FOOTER, MESSAGE_HEADER, Message, RECORD_HEADER, Schema, Statistics,
+    footer, metadata,
 };
 
 /// Size at which a run of loose messages is closed.

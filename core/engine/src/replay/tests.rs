@@ -552,8 +552,9 @@ proptest! {
 /// The 416 conformance files of the format, by other writers, against their expected contents.
 mod conformance {
     use super::super::inflate::Inflater;
-    use super::super::records::{Cursor, Message, op};
+    use super::super::records::{Cursor, Message};
     use super::*;
+    use mcap::records::op;
     use serde_json::Value;
     use std::io::Read as _;
 

@@ -8,6 +8,7 @@ mod decode;
 mod encode;
 mod interface;
 mod layout;
+mod mcap_file;
 mod names;
 mod write;
 

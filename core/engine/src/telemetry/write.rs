@@ -2,20 +2,14 @@
 
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{self, BufWriter, Write};
+use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
 
-use mcap::records::{MessageHeader, Metadata};
-use mcap::{Compression, McapError, WriteOptions};
 use tempfile::NamedTempFile;
 
 use super::encode::{EncodeError, Encoder, MessageType};
+use super::mcap_file::McapFile;
 use crate::table::{Batch, Chunk, TableSpec};
-
-/// Uncompressed size at which a chunk is closed: small enough to seek, large enough to compress.
-const CHUNK_BYTES: u64 = 1 << 20;
-/// Noise hardly compresses; the fastest level keeps the writer ahead of the simulator.
-const ZSTD_LEVEL: u32 = 1;
 
 /// Why a file cannot be written.
 #[derive(Debug, thiserror::Error)]
@@ -27,14 +21,6 @@ pub enum WriteError {
         path: PathBuf,
         /// What the system said.
         source: io::Error,
-    },
-    /// The MCAP writer refuses.
-    #[error("cannot write {path}: {source}", path = path.display())]
-    Mcap {
-        /// The file.
-        path: PathBuf,
-        /// What the writer said.
-        source: McapError,
     },
     /// A table does not fit its message.
     #[error(transparent)]
@@ -101,7 +87,6 @@ pub struct Written {
 struct Topic {
     name: String,
     channel: u16,
-    sequence: u32,
     encoder: Encoder,
     /// Rows that wait until every table has come as far.
     pending: Batch,
@@ -120,7 +105,7 @@ impl Topic {
 /// no such file.
 pub struct TelemetryWriter {
     path: PathBuf,
-    writer: mcap::Writer<BufWriter<NamedTempFile>>,
+    file: McapFile<BufWriter<NamedTempFile>>,
     topics: Vec<Topic>,
     message: Vec<u8>,
     messages: u64,
@@ -133,17 +118,9 @@ impl TelemetryWriter {
     /// # Errors
     /// [`WriteError`] when the file cannot be created or a table fits no message.
     pub fn create(path: &Path, tables: &[TableSpec], header: &FileHeader) -> Result<Self, WriteError> {
-        let file = temporary(path).map_err(|source| WriteError::Io { path: path.to_owned(), source })?;
-        let refuse = |source| WriteError::Mcap { path: path.to_owned(), source };
-        let mut writer = WriteOptions::new()
-            .profile("")
-            .library(format!("{} {}", header.producer, header.version))
-            .compression(Some(Compression::Zstd))
-            .compression_level(ZSTD_LEVEL)
-            .compression_threads(0)
-            .chunk_size(Some(CHUNK_BYTES))
-            .create(BufWriter::with_capacity(1 << 18, file))
-            .map_err(refuse)?;
+        let io = |source| WriteError::Io { path: path.to_owned(), source };
+        let file = BufWriter::with_capacity(1 << 18, temporary(path).map_err(io)?);
+        let mut file = McapFile::new(file, &format!("{} {}", header.producer, header.version)).map_err(io)?;
         let mut metadata = header.extra.clone();
         for (key, value) in [
             ("time_scale", &header.time_scale),
@@ -154,24 +131,22 @@ impl TelemetryWriter {
         ] {
             metadata.insert(key.to_owned(), value.clone());
         }
-        writer.write_metadata(&Metadata { name: "dragfree".to_owned(), metadata }).map_err(refuse)?;
+        file.metadata("dragfree", &metadata).map_err(io)?;
         let mut topics = Vec::with_capacity(tables.len());
         for table in tables {
             let message = MessageType::of(table)?;
-            let schema = writer.add_schema(&message.name, "protobuf", &message.descriptor_set).map_err(refuse)?;
-            let channel = writer
-                .add_channel(schema, &format!("/{}", table.name), "protobuf", &channel_metadata(table, &message))
-                .map_err(refuse)?;
+            let topic = format!("/{}", table.name);
+            let metadata = channel_metadata(table, &message);
+            let channel = file.channel(&topic, &message.name, &message.descriptor_set, &metadata).map_err(io)?;
             topics.push(Topic {
                 name: table.name.clone(),
                 channel,
-                sequence: 0,
                 encoder: Encoder::new(message),
                 pending: Batch::empty(table.columns.len()),
                 done: 0,
             });
         }
-        Ok(Self { path: path.to_owned(), writer, topics, message: Vec::new(), messages: 0, written_until_ns: i64::MIN })
+        Ok(Self { path: path.to_owned(), file, topics, message: Vec::new(), messages: 0, written_until_ns: i64::MIN })
     }
 
     /// Takes the rows of a chunk, one batch per table in the order of [`TelemetryWriter::create`], and writes
@@ -192,11 +167,9 @@ impl TelemetryWriter {
     /// [`WriteError`]; there is no file then.
     pub fn finish(mut self) -> Result<Written, WriteError> {
         self.write_before(i64::MAX)?;
-        let Self { path, mut writer, messages, .. } = self;
-        writer.finish().map_err(|source| WriteError::Mcap { path: path.clone(), source })?;
+        let Self { path, file, messages, .. } = self;
         let io = |source| WriteError::Io { path: path.clone(), source };
-        let mut file = writer.into_inner();
-        file.flush().map_err(io)?;
+        let file = file.finish().map_err(io)?;
         let file = file.into_inner().map_err(|e| io(e.into_error()))?;
         file.as_file().sync_all().map_err(io)?;
         let bytes = file.as_file().metadata().map_err(io)?.len();
@@ -216,12 +189,9 @@ impl TelemetryWriter {
             topic.encoder.encode(&topic.pending, topic.done, &mut self.message)?;
             let log_time =
                 u64::try_from(time_ns).map_err(|_| WriteError::NegativeTime { table: topic.name.clone(), time_ns })?;
-            let header =
-                MessageHeader { channel_id: topic.channel, sequence: topic.sequence, log_time, publish_time: log_time };
-            self.writer
-                .write_to_known_channel(&header, &self.message)
-                .map_err(|source| WriteError::Mcap { path: self.path.clone(), source })?;
-            topic.sequence = topic.sequence.wrapping_add(1);
+            self.file
+                .message(topic.channel, log_time, &self.message)
+                .map_err(|source| WriteError::Io { path: self.path.clone(), source })?;
             topic.done += 1;
             self.messages += 1;
         }
