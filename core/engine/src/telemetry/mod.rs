@@ -2,7 +2,7 @@
 //!
 //! A reader trusts the schema *in the file*, never its own: [`Layout`] compiles a message descriptor into a walk from
 //! wire bytes to flat columns with dotted paths. Only then is the layout compared with the committed interface
-//! ([`interface`]), so that a producer may add fields or renumber them but not drop, retype or rename one.
+//! ([`check`]), so that a producer may add fields or renumber them but not drop, retype or rename one.
 
 mod decode;
 mod encode;
