@@ -13,6 +13,7 @@ use crate::bytes::{Reader, StateError, Writer};
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Rate {
     period_ns: f64,
+    half_ns: i64,
     /// The period where it is a whole number of nanoseconds.
     whole_ns: Option<i64>,
 }
@@ -23,7 +24,7 @@ impl Rate {
         let whole = period_ns.round();
         // 1e9/rate is within one unit of rounding of the whole number when the rate is one such as 10 or 0.3.
         let whole_ns = ((period_ns - whole).abs() <= whole * f64::EPSILON && whole >= 1.0).then_some(whole as i64);
-        Self { period_ns, whole_ns }
+        Self { period_ns, half_ns: (period_ns / 2.0).round() as i64, whole_ns }
     }
 
     /// `round(k · 1e9 / rate)`, ns.
@@ -104,10 +105,9 @@ impl Epochs {
 
     /// Row whose epoch is nearest to `time_ns`.
     pub(crate) fn place(&self, time_ns: i64) -> Place {
-        let half = self.rate.part_ns(0.5);
         let mut end = i64::MAX;
         for segment in self.segments.iter().rev() {
-            if time_ns >= segment.origin_ns - half {
+            if time_ns >= segment.origin_ns - self.rate.half_ns {
                 let row = segment.first_row + self.rate.nearest(time_ns - segment.origin_ns).max(0);
                 return if row < end { Place::Row(row) } else { Place::Nowhere };
             }

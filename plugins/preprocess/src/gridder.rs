@@ -301,6 +301,7 @@ impl Gridder {
         let Some(reference) = self.reference else { return (0, false) };
         let rate = self.epochs.rate;
         let agree_ns = rate.offset_ns(AGREEING as i64);
+        let off_limit_ns = rate.part_ns(0.25);
         let mut placed: Vec<i64> = Vec::new();
         let mut used = 0;
         let mut blocked = false;
@@ -317,7 +318,7 @@ impl Gridder {
             }
             let (mut row, off_ns) = self.epochs.newest(time);
             let mut off_phase = false;
-            if off_ns.abs() > rate.part_ns(0.25) {
+            if off_ns.abs() > off_limit_ns {
                 if !ready {
                     break;
                 }
@@ -329,6 +330,7 @@ impl Gridder {
                         blocked = true;
                         break;
                     }
+                    self.grow_cells();
                     self.put(reference, &placed, used - placed.len());
                     placed.clear();
                     self.blank_row(last);
@@ -355,6 +357,7 @@ impl Gridder {
             placed.push(row);
             used += 1;
         }
+        self.grow_cells();
         self.put(reference, &placed, used - placed.len());
         let waiting = self.tables[reference].times.as_slice().get(used).copied();
         self.tables[reference].drop_front(used);
@@ -373,7 +376,6 @@ impl Gridder {
                 self.summary.longest_cut_from_ns = self.last_reference_ns;
             }
             self.rows += self.forget_rows();
-            self.grow_cells();
         }
         self.epochs.begin(self.rows, time + phase);
         self.last_reference_ns = time;
@@ -400,16 +402,16 @@ impl Gridder {
         agree.then(|| rate.phase(time, times))
     }
 
-    /// Makes blank rows up to `rows`; false when not all of them may wait.
+    /// Makes rows up to `rows`, whose cells [`Self::grow_cells`] makes later; false when not all of them may wait.
     fn make_rows(&mut self, rows: i64) -> bool {
         let most = self.given + MOST_ROWS;
         if self.rows < rows {
             self.rows = rows.min(most).max(self.rows);
-            self.grow_cells();
         }
         self.rows >= rows
     }
 
+    /// Blank cells for the rows that have none yet.
     fn grow_cells(&mut self) {
         let length = (self.rows - self.base) as usize;
         for class in &mut self.classes {
@@ -450,6 +452,7 @@ impl Gridder {
         let mut phase_ns = fast.phase_ns;
         let rate = self.epochs.rate;
         let agree_ns = rate.offset_ns(AGREEING as i64);
+        let off_limit_ns = rate.part_ns(0.25);
         // Epochs before this are laid for good.
         let reference_next = self.reference.and_then(|r| self.tables[r].times.as_slice().first().copied());
         let laid_ns = reference_next.unwrap_or(self.complete_ns).min(self.complete_ns) - rate.part_ns(1.0);
@@ -479,7 +482,7 @@ impl Gridder {
                     place = Place::Nowhere;
                 } else {
                     let off_ns = time - phase - self.epochs.time_ns(row);
-                    if off_ns.abs() > rate.part_ns(0.25) {
+                    if off_ns.abs() > off_limit_ns {
                         if !ready {
                             break;
                         }
