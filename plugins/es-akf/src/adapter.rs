@@ -456,3 +456,63 @@ fn acts_on_several(available: &Available, coefficient: &str) -> bool {
     };
     TEST_MASSES.into_iter().all(of_it)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn stage() -> EsAkf {
+        let setup = serde_json::json!({
+            "parameters": {
+                "adaptation": "monotone", "forgetting": 0.999_999, "warm_up_s": 600.0, "gate_sigma": 6.0,
+                "gate_patience": 30, "calibrated_sigma": true, "check_s": 600.0, "output_interval_s": 60.0,
+                "displacement_prior_m": 1e-6, "velocity_prior_m_s": 1e-7, "bias_prior_m_s2": 1e-7,
+                "bias_walk_m_s2_rts": 3e-15, "leak_hz": 1e-6, "unknown_alpha": 1.0,
+            },
+            "mission": {
+                "mission": { "name": "M", "spacecraft": "S", "sample_rate_hz": 10.0 },
+                "spacecraft": { "mass_kg": 1.0, "inertia_srf_kg_m2": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]] },
+            },
+        });
+        EsAkf::new(&Setup::for_tests(&setup.to_string()).expect("a setup")).expect("a stage")
+    }
+
+    const STEP_NS: i64 = 100_000_000;
+
+    #[test]
+    fn rows_are_split_where_steps_are_missing_within_a_batch_and_between_two() {
+        let mut stage = stage();
+        let first = stage.contiguous(&[0, STEP_NS, 5 * STEP_NS]).expect("in order");
+        assert_eq!(first, [(0, 0..2), (3, 2..3)]);
+        stage.last_ns = Some(5 * STEP_NS);
+        // A clock that is 10 µs off is on time.
+        assert_eq!(stage.contiguous(&[6 * STEP_NS + 10_000, 7 * STEP_NS]).expect("in order"), [(0, 0..2)]);
+        assert_eq!(stage.contiguous(&[8 * STEP_NS]).expect("in order"), [(2, 0..1)]);
+    }
+
+    #[test]
+    fn time_that_goes_back_is_an_error() {
+        let mut stage = stage();
+        stage.last_ns = Some(STEP_NS);
+        assert!(stage.contiguous(&[STEP_NS]).expect_err("the same epoch again").message().contains("not later"));
+    }
+
+    #[test]
+    fn a_coefficient_without_a_finite_start_is_refused_by_name() {
+        let endless = Coefficient { name: "formula.k".to_owned(), ..Coefficient::default() };
+        assert!(prior_of(&endless).expect_err("no prior").message().contains("formula.k"));
+        let ranged = Coefficient { lower: -1.0, upper: 3.0, ..Coefficient::default() };
+        assert_eq!(prior_of(&ranged).expect("half of the range"), Theta { initial: 0.0, prior_sigma: 2.0 });
+    }
+
+    #[test]
+    fn a_state_of_something_else_is_refused() {
+        let mut stage = stage();
+        let saved = stage.save().expect("a state");
+        assert!(stage.load(&saved).is_ok());
+        assert!(stage.load(b"garbage").is_err());
+        assert!(stage.load(&saved[..saved.len() - 1]).is_err());
+        stage.mission.mission.sample_rate_hz = 1.0;
+        assert!(stage.load(&saved).expect_err("another rate").message().contains("start anew"));
+    }
+}

@@ -11,7 +11,14 @@
 //! `P` is only a covariance if `Q̂` and `R̂` are those of the data, and the adaptation moves both for reasons of
 //! stability. So a second covariance `P̃` follows the gains that were really used, under the noise of the mission
 //! file: the error covariance of this estimator, adapted or not, as far as that noise model holds. The innovations
-//! measure how far it does (`Statistics::design_nis`).
+//! measure how far it does ([`Statistics::design_nis`]). Ten synthetic days at the default pace ended with `P_end` at
+//! 1.00 of that σ under the monotone adaptation, at 0.35 (b_y, b_z) to 1.8 (b_x) under the residual one and at 1.6 to
+//! 1.8 under the innovation one, while the errors stayed within 2σ of `P̃` in all three.
+//!
+//! # Definiteness
+//! `Q` and `P` are tested every `check_epochs`, not every epoch: adaptation moves `Q̂` by `1 − α` a step, so that nothing
+//! happens in between that matters, and a test costs as much as a hundred steps. `Q̂` is singular by construction (one
+//! force drives `r` and `v`), so a `Q̂` that adapts by elements is found slightly indefinite nearly every time.
 
 use crate::definite::{Finding, repair};
 use crate::kernel::{Columns, Mat3, Matrix, Transition, adapt, advance, advance_with_foreign_gain, inverse, mix};

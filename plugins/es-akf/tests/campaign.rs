@@ -6,7 +6,7 @@ mod common;
 
 use common::{Alpha, Simulation, model, settings};
 use dragfree_es_akf::Akf;
-use dragfree_es_akf::filter::{Adaptation, Drive};
+use dragfree_es_akf::filter::{Adaptation, Drive, Settings};
 use dragfree_es_akf::model::Model;
 use dragfree_es_akf::tracker::{Factor, Rows, Tracker};
 use nalgebra::{Matrix3, Vector3};
@@ -20,6 +20,8 @@ struct Outcome {
     beyond_3_sigma: usize,
     /// The same without the stretch.
     beyond_3_sigma_unstretched: usize,
+    /// Σ e²/P over the coefficients with the P of the recursion's end, as the paper reports it.
+    z2_of_p_end: f64,
     /// Σ eᵀ P⁻¹ e, χ² with 3 × RUNS degrees of freedom.
     nees: f64,
     nis_sum: f64,
@@ -27,7 +29,7 @@ struct Outcome {
 }
 
 /// Runs the filter for `belief` on data made from `truth`.
-fn campaign(truth: &Model, belief: &Model, adaptation: Adaptation) -> Outcome {
+fn campaign(truth: &Model, belief: &Model, settings: Settings) -> Outcome {
     let mut outcome = Outcome::default();
     for seed in 1..=RUNS {
         let mut data = Simulation::new(truth, Alpha::Coloured(1.0), seed);
@@ -47,7 +49,7 @@ fn campaign(truth: &Model, belief: &Model, adaptation: Adaptation) -> Outcome {
             u_m_s2: [&u[0], &u[1], &u[2]],
             regressors: (0..9).map(|c| (Factor::Estimated(c / 3), c % 3, phi[c].as_slice())).collect(),
         };
-        let filter = Akf::new(belief.clone(), settings(adaptation)).expect("16 states");
+        let filter = Akf::new(belief.clone(), settings).expect("16 states");
         let mut tracker = Tracker::new(filter, 60.0);
         tracker.process(&rows, 0..EPOCHS);
         let average = tracker.result().expect("a long run");
@@ -56,6 +58,7 @@ fn campaign(truth: &Model, belief: &Model, adaptation: Adaptation) -> Outcome {
         let stretch = tracker.stretch();
         for i in 0..3 {
             let z = e[i].abs() / p[(i, i)].sqrt();
+            outcome.z2_of_p_end += e[i].powi(2) / tracker.filter().recursion_covariance(i, i);
             outcome.beyond_3_sigma += usize::from(z > 3.0 * stretch);
             outcome.beyond_3_sigma_unstretched += usize::from(z > 3.0);
         }
@@ -94,7 +97,7 @@ fn nis_agrees(o: &Outcome) -> bool {
 
 #[test]
 fn sigma_is_honest_and_the_innovations_are_white_noise_of_their_covariance() {
-    let o = campaign(&default_model(), &default_model(), Adaptation::Off);
+    let o = campaign(&default_model(), &default_model(), settings(Adaptation::Off));
     assert!(o.beyond_3_sigma <= MOST_BEYOND, "{} beyond 3σ", o.beyond_3_sigma);
     assert!(NEES_BOUNDS.0 < o.nees && o.nees < NEES_BOUNDS.1, "NEES {}", o.nees);
     assert!(nis_agrees(&o), "NIS {}", o.nis_sum / o.dof as f64);
@@ -102,9 +105,21 @@ fn sigma_is_honest_and_the_innovations_are_white_noise_of_their_covariance() {
 
 #[test]
 fn sigma_stays_honest_under_the_papers_adaptation() {
-    let o = campaign(&default_model(), &default_model(), Adaptation::Monotone);
+    let o = campaign(&default_model(), &default_model(), settings(Adaptation::Monotone));
     assert!(o.beyond_3_sigma <= MOST_BEYOND, "{} beyond 3σ", o.beyond_3_sigma);
     assert!(NEES_BOUNDS.0 < o.nees && o.nees < NEES_BOUNDS.1, "NEES {}", o.nees);
+}
+
+/// Twenty memories of adaptation by residuals, as weeks at the default pace, leave a `P_end` that has nothing to do with
+/// the error; σ still has.
+#[test]
+fn sigma_stays_honest_where_p_end_does_not() {
+    let fast = Settings { forgetting: 0.999, ..settings(Adaptation::Residual) };
+    let o = campaign(&default_model(), &default_model(), fast);
+    assert!(o.beyond_3_sigma <= MOST_BEYOND, "{} beyond 3σ", o.beyond_3_sigma);
+    assert!(NEES_BOUNDS.0 < o.nees && o.nees < NEES_BOUNDS.1, "NEES {}", o.nees);
+    let (low, high) = NEES_BOUNDS;
+    assert!(!(low..high).contains(&o.z2_of_p_end), "Σ z² of P_end is {}", o.z2_of_p_end);
 }
 
 /// The twins of the NIS test.
@@ -113,10 +128,10 @@ fn ten_times_too_much_or_too_little_noise_fails_the_nis_test() {
     for factor in [10.0, 0.1] {
         let mut belief = default_model();
         belief.acceleration_m2_s4 = belief.acceleration_m2_s4.map(|row| row.map(|q| q * factor));
-        let q = campaign(&default_model(), &belief, Adaptation::Off);
+        let q = campaign(&default_model(), &belief, settings(Adaptation::Off));
         let mut belief = default_model();
         belief.readout_m2 = belief.readout_m2.map(|r| r * factor);
-        let r = campaign(&default_model(), &belief, Adaptation::Off);
+        let r = campaign(&default_model(), &belief, settings(Adaptation::Off));
         assert!(!nis_agrees(&q) && !nis_agrees(&r), "factor {factor}");
     }
 }
@@ -124,7 +139,7 @@ fn ten_times_too_much_or_too_little_noise_fails_the_nis_test() {
 /// Nine times more variance than the mission file says: without the stretch a third of the values are beyond 3σ.
 #[test]
 fn noise_that_the_mission_file_understates_stretches_sigma() {
-    let o = campaign(&louder(&default_model(), 9.0), &default_model(), Adaptation::Monotone);
+    let o = campaign(&louder(&default_model(), 9.0), &default_model(), settings(Adaptation::Monotone));
     assert!(o.beyond_3_sigma <= MOST_BEYOND, "{} beyond 3σ", o.beyond_3_sigma);
     assert!(o.beyond_3_sigma_unstretched > 10, "{} beyond 3σ", o.beyond_3_sigma_unstretched);
 }
