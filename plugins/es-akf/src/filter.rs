@@ -17,7 +17,7 @@
 //!
 //! # Definiteness
 //! `Q` and `P` are tested every `check_epochs`, not every epoch: adaptation moves `Q̂` by `1 − α` a step, so that nothing
-//! happens in between that matters, and a test costs as much as a hundred steps. `Q̂` is singular by construction (one
+//! happens in between that matters, and an eigenvalue decomposition costs far more than a step. `Q̂` is singular by construction (one
 //! force drives `r` and `v`), so a `Q̂` that adapts by elements is found slightly indefinite nearly every time.
 
 use crate::definite::{Finding, repair};
