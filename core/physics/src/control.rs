@@ -121,6 +121,7 @@ struct LinearTestMass {
 
 impl LinearPlant {
     fn new(mission: &Mission) -> Result<Self, MissionError> {
+        let lever = mission.control.as_ref().is_none_or(|c| c.lever_feed_forward);
         let tm = |name: &str| -> Result<LinearTestMass, MissionError> {
             let section = mission.test_mass(name, NEEDED_BY)?;
             let inertia_inverse = section.inertia_inverse(name, NEEDED_BY)?;
@@ -128,7 +129,7 @@ impl LinearPlant {
                 mass_kg: section.mass_kg,
                 inertia_inverse,
                 dcm_orf_from_srf: section.dcm_orf_from_srf(),
-                offset_srf_m: Vector3::from(section.offset_nominal_srf_m),
+                offset_srf_m: if lever { Vector3::from(section.offset_nominal_srf_m) } else { Vector3::zeros() },
                 stiffness_tt: section.stiffness_tt(),
                 stiffness_tr: section.stiffness_tr(),
                 stiffness_rt: section.stiffness_rt(&inertia_inverse),
@@ -273,7 +274,8 @@ impl ControlLaw {
             Some(c) if !c.channel.is_empty() => c.clone(),
             given => {
                 let delay_samples = given.as_ref().map_or(1, |c| c.delay_samples);
-                Control { delay_samples, channel: loop_shaping(mission)? }
+                let lever_feed_forward = given.as_ref().is_none_or(|c| c.lever_feed_forward);
+                Control { delay_samples, lever_feed_forward, channel: loop_shaping(mission)? }
             }
         };
         let channels = CHANNELS
@@ -487,7 +489,7 @@ pub(crate) mod tests {
     fn delay_is_configured() {
         let mut mission = taiji();
         for delay_samples in [0, 1, 3] {
-            mission.control = Some(Control { delay_samples, channel: Default::default() });
+            mission.control = Some(Control { delay_samples, lever_feed_forward: true, channel: Default::default() });
             let mut law = ControlLaw::new(&mission).unwrap();
             let silent = (0..10).take_while(|_| law.step(&readout(1)) == Command::default()).count();
             assert_eq!(silent, delay_samples as usize);
@@ -502,7 +504,7 @@ pub(crate) mod tests {
         assert!(error.contains("[requirements]"), "{error}");
         let mut mission = taiji();
         let channel = [("tm1.x".to_owned(), ChannelController { gain_s2: 0.1, sections: vec![] })];
-        mission.control = Some(Control { delay_samples: 1, channel: channel.into() });
+        mission.control = Some(Control { delay_samples: 1, lever_feed_forward: true, channel: channel.into() });
         let error = ControlLaw::new(&mission).err().unwrap().to_string();
         assert!(error.contains("control.channel.\"sc.phi\""), "{error}");
         let mut mission = taiji();

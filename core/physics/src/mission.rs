@@ -294,9 +294,17 @@ pub struct Requirements {
 pub struct Control {
     /// Samples between a readout and the start of the interval in which its command acts.
     pub delay_samples: u32,
+    /// Whether the allocation cancels what turning the spacecraft does to the test masses, `−α × b` at the nominal
+    /// offsets. Controllers that treat rotation and translation apart do not.
+    #[serde(default = "yes")]
+    pub lever_feed_forward: bool,
     /// Controllers by channel: all fifteen, or none for the default design.
     #[serde(default)]
     pub channel: BTreeMap<String, ChannelController>,
+}
+
+fn yes() -> bool {
+    true
 }
 
 /// A controller: from a channel's readout (m or rad) to its desired acceleration `u_d` (m s⁻² or rad s⁻²).
