@@ -8,9 +8,10 @@ use std::path::Path;
 
 pub(crate) const START_NS: i64 = 2_051_222_400_000_000_000;
 
-/// The shared library lies beside the folder of the test's own program.
+/// The shared library lies beside the test's own program: the one that this test run built, where the one in the folder
+/// above may be older.
 pub(crate) fn library() -> Library {
-    let folder = std::env::current_exe().unwrap().parent().unwrap().parent().unwrap().to_owned();
+    let folder = std::env::current_exe().unwrap().parent().unwrap().to_owned();
     let name = format!("{}dragfree_preprocess{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
     Library::open(&folder.join(name)).unwrap()
 }
