@@ -11,10 +11,10 @@ use super::block::{Block, drain};
 use super::inflate::{InflateError, Inflater};
 use super::losses::{Finding, Losses};
 use super::records::{Cursor, Message};
-use super::scan::{Piece, Source};
+use super::scan::{Piece, Source, Stored};
 use super::tables::{Route, Routes};
 use crate::table::{Batch, Chunk, TableSpec};
-use crate::telemetry::Cells;
+use crate::telemetry::{Cells, Decoder, WireError};
 
 /// Length of a stretch, ns: 4096 epochs at 10 Hz. The borders are its multiples since 1970, whatever the files are.
 const STRETCH_NS: i64 = 409_600_000_000;
@@ -150,7 +150,7 @@ impl Reader {
             }
         };
         let first_time = pending.from_ns == i64::MIN;
-        if first_time && matches!(&piece.stored, super::scan::Stored::Chunk { crc: 0, .. }) {
+        if first_time && matches!(&piece.stored, Stored::Chunk { crc: 0, .. }) {
             self.losses.add(Finding::UncheckedChunk, 1, &name, || {
                 format!("{name} has chunks without a CRC; damage goes unseen")
             });
@@ -163,26 +163,9 @@ impl Reader {
             first_time,
         };
         let later = index(records, &wanted, &mut self.entries, &name, &mut self.losses);
-        let mut by_channel: BTreeMap<u16, usize> = BTreeMap::new();
-        let mut last: Option<(u16, usize)> = None;
-        for entry in &self.entries {
-            // Messages of one channel mostly come in turn with others; still the map is small.
-            match &mut last {
-                Some((channel, count)) if *channel == entry.channel => *count += 1,
-                other => {
-                    if let Some((channel, count)) = other.take() {
-                        *by_channel.entry(channel).or_default() += count;
-                    }
-                    *other = Some((entry.channel, 1));
-                }
-            }
-        }
-        if let Some((channel, count)) = last {
-            *by_channel.entry(channel).or_default() += count;
-        }
-        for (&channel, &count) in &by_channel {
-            let rank = (file, piece.offset, channel);
-            let entries = self.entries.iter().filter(|e| e.channel == channel);
+        self.entries.sort_by_key(|e| e.channel); // stable: within a channel the order of the file stays
+        for entries in self.entries.chunk_by(|a, b| a.channel == b.channel) {
+            let (channel, count) = (entries[0].channel, entries.len());
             match routes.get_mut(&channel) {
                 None => self.losses.add(Finding::UnknownChannel, count as u64, &format!("{name}#{channel}"), || {
                     format!("{name}: {count} messages are of channel {channel}, which the file does not define; they are lost")
@@ -195,35 +178,20 @@ impl Reader {
                     self.losses.add(*finding, count as u64, topic, || format!("{name}: topic {topic} is not read: {why}"));
                 }
                 Some(Route::Table { table, decoder }) => {
-                    let columns = self.tables[*table].columns.len();
-                    let mut times = Vec::with_capacity(count);
-                    let mut values = vec![f64::NAN; columns * count];
-                    let (mut non_finite, mut malformed, mut error) = (0, 0, None);
-                    for entry in entries {
-                        let mut cells = Cells { values: &mut values, rows: count, row: times.len() };
-                        match decoder.decode(&records[entry.data.clone()], &mut cells) {
-                            Ok(found) => {
-                                non_finite += found;
-                                times.push(entry.time_ns);
-                            }
-                            Err(why) => {
-                                malformed += 1;
-                                error = Some(why);
-                                (0..columns).for_each(|c| values[c * count + times.len()] = f64::NAN);
-                            }
-                        }
-                    }
-                    let topic = &self.tables[*table].name;
-                    self.losses.add(Finding::NonFinite, non_finite, topic, || {
+                    let spec = &self.tables[*table];
+                    let rows = decode(entries, records, decoder, spec.columns.len());
+                    let topic = &spec.name;
+                    self.losses.add(Finding::NonFinite, rows.non_finite, topic, || {
                         format!("{name}: topic /{topic} has values that are NaN or infinite; they are passed on")
                     });
-                    if let Some(error) = error {
-                        self.losses.add(Finding::MalformedMessage, malformed, topic, || {
+                    if let Some(error) = rows.error {
+                        self.losses.add(Finding::MalformedMessage, (count - rows.times.len()) as u64, topic, || {
                             format!("{name}: messages of topic /{topic} contradict their schema ({error}) and are lost")
                         });
                     }
-                    if !times.is_empty() {
-                        self.blocks[*table].push(Block::new(rank, times, &values, count));
+                    if !rows.times.is_empty() {
+                        let rank = (file, piece.offset, channel);
+                        self.blocks[*table].push(Block::new(rank, rows.times, &rows.values, count));
                     }
                 }
             }
@@ -234,6 +202,37 @@ impl Reader {
         }
         Ok(())
     }
+}
+
+/// The messages of one channel, decoded.
+struct Rows {
+    times: Vec<i64>,
+    /// The columns one after the other, each as long as there were messages.
+    values: Vec<f64>,
+    non_finite: u64,
+    /// Why the last of the messages that are not here could not be decoded.
+    error: Option<WireError>,
+}
+
+fn decode(entries: &[Entry], records: &[u8], decoder: &mut Decoder, columns: usize) -> Rows {
+    let count = entries.len();
+    let mut rows =
+        Rows { times: Vec::with_capacity(count), values: vec![f64::NAN; columns * count], non_finite: 0, error: None };
+    for entry in entries {
+        let row = rows.times.len();
+        let mut cells = Cells { values: &mut rows.values, rows: count, row };
+        match decoder.decode(&records[entry.data.clone()], &mut cells) {
+            Ok(non_finite) => {
+                rows.non_finite += non_finite;
+                rows.times.push(entry.time_ns);
+            }
+            Err(error) => {
+                rows.error = Some(error);
+                (0..columns).for_each(|c| rows.values[c * count + row] = f64::NAN);
+            }
+        }
+    }
+    rows
 }
 
 /// Which rows of a piece a reading takes.

@@ -274,3 +274,75 @@ fn temporary(path: &Path) -> io::Result<NamedTempFile> {
     }
     builder.tempfile_in(folder(path))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::replay::Replay;
+    use crate::telemetry::interface_tables;
+
+    const START: i64 = 2_051_222_400_000_000_000;
+
+    /// `ifo` and `dws` alone.
+    fn tables() -> Vec<TableSpec> {
+        interface_tables().into_iter().filter(|t| t.name == "ifo" || t.name == "dws").collect()
+    }
+
+    fn rows(table: &TableSpec, times: &[i64]) -> Batch {
+        Batch {
+            time_ns: times.iter().map(|t| START + t).collect(),
+            columns: table.columns.iter().map(|_| vec![1.0; times.len()]).collect(),
+        }
+    }
+
+    fn chunk(ifo: &[i64], dws: &[i64], until: i64) -> Chunk {
+        let tables = tables();
+        Chunk { batches: vec![rows(&tables[0], ifo), rows(&tables[1], dws)], complete_until_ns: START + until }
+    }
+
+    /// A table that comes late by a lag is still written in order with the others.
+    #[test]
+    fn topics_are_merged_in_time_across_chunks() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.mcap");
+        let mut writer = TelemetryWriter::create(&path, &tables(), &FileHeader::default()).unwrap();
+        writer.write(&chunk(&[0, 1, 2, 3], &[0], 1)).unwrap();
+        writer.write(&chunk(&[], &[1, 2, 3], 3)).unwrap();
+        assert_eq!(writer.finish().unwrap().messages, 8);
+        let file = std::fs::read(&path).unwrap();
+        let order: Vec<(i64, String)> = mcap::MessageStream::new(&file)
+            .unwrap()
+            .map(|m| m.map(|m| (m.log_time as i64 - START, m.channel.topic.clone())).unwrap())
+            .collect();
+        let expected: Vec<_> = (0..4).flat_map(|t| [(t, "/ifo".to_owned()), (t, "/dws".to_owned())]).collect();
+        assert_eq!(order, expected);
+        let replay = Replay::open(&[path], None, 1).unwrap();
+        assert_eq!(replay.tables(), tables());
+    }
+
+    #[test]
+    fn what_cannot_be_written_leaves_no_file() {
+        let cases: [(&[i64], bool, &str); 3] =
+            [(&[5, 4], false, "order of time"), (&[-1], true, "order of time"), (&[-START - 1], false, "before 1970")];
+        for (times, after_others, why) in cases {
+            let folder = tempfile::tempdir().unwrap();
+            let mut writer =
+                TelemetryWriter::create(&folder.path().join("a.mcap"), &tables(), &FileHeader::default()).unwrap();
+            if after_others {
+                writer.write(&chunk(&[0], &[0], 1)).unwrap();
+            }
+            let error = writer.write(&chunk(times, &[], 9)).unwrap_err();
+            assert!(error.to_string().contains(why), "{error}");
+            drop(writer);
+            assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+        }
+        let missing = TelemetryWriter::create(Path::new("/nowhere/at/all.mcap"), &tables(), &FileHeader::default());
+        assert!(matches!(missing.err(), Some(WriteError::Io { .. })));
+        let mut short = chunk(&[0], &[0], 1);
+        short.batches[0].columns.pop();
+        let folder = tempfile::tempdir().unwrap();
+        let mut writer =
+            TelemetryWriter::create(&folder.path().join("a.mcap"), &tables(), &FileHeader::default()).unwrap();
+        assert!(matches!(writer.write(&short), Err(WriteError::Shape { .. })));
+    }
+}
