@@ -23,9 +23,21 @@ use crate::setup::Setup;
 // The Arrow crates' array and the header's are the same C struct.
 const _: () = assert!(size_of::<FFI_ArrowArray>() == size_of::<abi::ArrowArray>());
 
+/// What a plugin is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// `dragfree.stage/1`
+    Stage,
+    /// `dragfree.effect/1`
+    Effect,
+    /// `dragfree.source/1`
+    Source,
+}
+
 /// A plugin as the export macro lists it.
 #[derive(Clone, Copy)]
 pub struct Registration {
+    kind: Kind,
     manifest: Manifest,
     create: fn(&Setup) -> Result<Box<dyn Node>, PluginError>,
 }
@@ -40,13 +52,14 @@ impl Registration {
     /// A stage.
     #[must_use]
     pub const fn stage<T: Stage>() -> Self {
-        Self { manifest: T::MANIFEST, create: |setup| Ok(Box::new(StageNode(T::new(setup)?))) }
+        Self { kind: Kind::Stage, manifest: T::MANIFEST, create: |setup| Ok(Box::new(StageNode(T::new(setup)?))) }
     }
 
     /// An effect.
     #[must_use]
     pub const fn effect<T: Effect>() -> Self {
         Self {
+            kind: Kind::Effect,
             manifest: T::MANIFEST,
             create: |setup| Ok(Box::new(EffectNode { effect: T::new(setup)?, instance: setup.instance().to_owned() })),
         }
@@ -55,29 +68,47 @@ impl Registration {
     /// A source.
     #[must_use]
     pub const fn source<T: Source>() -> Self {
-        Self { manifest: T::MANIFEST, create: |setup| Ok(Box::new(SourceNode(T::new(setup)?))) }
+        Self { kind: Kind::Source, manifest: T::MANIFEST, create: |setup| Ok(Box::new(SourceNode(T::new(setup)?))) }
     }
 }
 
 /// The plugins of one kind in a library, with their manifests as C strings.
 #[derive(Debug)]
 pub struct Shelf {
-    registrations: &'static [Registration],
+    kind: Kind,
+    all: &'static [Registration],
     manifests: OnceLock<Vec<CString>>,
 }
 
 impl Shelf {
-    /// The shelf of these registrations.
+    /// Those of `all` that are of one kind.
     #[must_use]
-    pub const fn new(registrations: &'static [Registration]) -> Self {
-        Self { registrations, manifests: OnceLock::new() }
+    pub const fn new(kind: Kind, all: &'static [Registration]) -> Self {
+        Self { kind, all, manifests: OnceLock::new() }
+    }
+
+    /// How many there are.
+    #[must_use]
+    pub const fn count(kind: Kind, all: &[Registration]) -> u32 {
+        let (mut i, mut count) = (0, 0);
+        while i < all.len() {
+            if all[i].kind as u8 == kind as u8 {
+                count += 1;
+            }
+            i += 1;
+        }
+        count
+    }
+
+    fn registrations(&self) -> impl Iterator<Item = &'static Registration> {
+        self.all.iter().filter(|r| r.kind == self.kind)
     }
 
     /// `dragfree_factory_v1.manifest`
     pub fn manifest(&'static self, index: u32) -> *const c_char {
         let manifests = self.manifests.get_or_init(|| {
             // JSON has no NUL: the serializer escapes it.
-            self.registrations.iter().map(|r| CString::new(r.manifest.to_json()).unwrap_or_default()).collect()
+            self.registrations().map(|r| CString::new(r.manifest.to_json()).unwrap_or_default()).collect()
         });
         manifests.get(index as usize).map_or(ptr::null(), |m| m.as_ptr())
     }
@@ -97,8 +128,8 @@ impl Shelf {
         quiet_panics();
         let made = guarded(|| {
             let registration = self
-                .registrations
-                .get(index as usize)
+                .registrations()
+                .nth(index as usize)
                 .ok_or_else(|| PluginError::error(format!("no plugin {index} in this library")))?;
             // SAFETY: the header promises a valid configuration and host during `create`.
             let (config, host) = unsafe { (config.as_ref(), host.as_ref()) };
@@ -528,30 +559,29 @@ unsafe extern "C" fn destroy(this: *mut c_void) {
 
 /// Defines `dragfree_entry`, the one exported symbol of a plugin library.
 ///
-/// `export_plugin!(stages: [A, B], effects: [C], sources: [D]);` with any subset of the three lists, in this order.
+/// `export_plugin!(stages: [A, B], effects: [C], sources: [D]);` with any of the three lists, in any order.
 #[macro_export]
 macro_rules! export_plugin {
-    ($(stages: [$($stage:ty),* $(,)?])? $(,)? $(effects: [$($effect:ty),* $(,)?])? $(,)? $(sources: [$($source:ty),* $(,)?])? $(,)?) => {
+    ($($kind:ident: [$($plugin:ty),* $(,)?]),+ $(,)?) => {
         #[allow(unsafe_code, reason = "the exported symbol of the C border")]
         const _: () = {
-            use $crate::border::{Registration, Shelf, abi};
+            use $crate::border::{Kind, Registration, Shelf, abi};
 
-            static STAGES: &[Registration] = &[$($(Registration::stage::<$stage>()),*)?];
-            static EFFECTS: &[Registration] = &[$($(Registration::effect::<$effect>()),*)?];
-            static SOURCES: &[Registration] = &[$($(Registration::source::<$source>()),*)?];
-            $crate::export_plugin!(@factory STAGES stage_shelf stage_manifest stage_create STAGE_FACTORY);
-            $crate::export_plugin!(@factory EFFECTS effect_shelf effect_manifest effect_create EFFECT_FACTORY);
-            $crate::export_plugin!(@factory SOURCES source_shelf source_manifest source_create SOURCE_FACTORY);
+            static ALL: &[Registration] = &[$($($crate::export_plugin!(@one $kind $plugin)),*),+];
+            $crate::export_plugin!(@factory Stage stage_manifest stage_create STAGES STAGE_FACTORY);
+            $crate::export_plugin!(@factory Effect effect_manifest effect_create EFFECTS EFFECT_FACTORY);
+            $crate::export_plugin!(@factory Source source_manifest source_create SOURCES SOURCE_FACTORY);
 
             unsafe extern "C" fn get_factory(id: *const core::ffi::c_char) -> *const abi::FactoryV1 {
                 // SAFETY: the host gives a NUL-terminated string.
                 let id = unsafe { core::ffi::CStr::from_ptr(id) };
-                match id.to_str() {
-                    Ok(abi::STAGE_V1) if !STAGES.is_empty() => &raw const STAGE_FACTORY,
-                    Ok(abi::EFFECT_V1) if !EFFECTS.is_empty() => &raw const EFFECT_FACTORY,
-                    Ok(abi::SOURCE_V1) if !SOURCES.is_empty() => &raw const SOURCE_FACTORY,
-                    _ => core::ptr::null(),
-                }
+                let factory = match id.to_str() {
+                    Ok(abi::STAGE_V1) => &STAGE_FACTORY,
+                    Ok(abi::EFFECT_V1) => &EFFECT_FACTORY,
+                    Ok(abi::SOURCE_V1) => &SOURCE_FACTORY,
+                    _ => return core::ptr::null(),
+                };
+                if factory.count == 0 { core::ptr::null() } else { factory }
             }
 
             // The name is exported from shared libraries alone: in an rlib linked into a test program several plugins
@@ -562,13 +592,13 @@ macro_rules! export_plugin {
                 abi::EntryV1 { abi_version: abi::ABI_VERSION, reserved: 0, get_factory: Some(get_factory) };
         };
     };
-    (@factory $list:ident $shelf:ident $manifest:ident $create:ident $factory:ident) => {
-        fn $shelf() -> &'static Shelf {
-            static SHELF: Shelf = Shelf::new($list);
-            &SHELF
-        }
+    (@one stages $plugin:ty) => { Registration::stage::<$plugin>() };
+    (@one effects $plugin:ty) => { Registration::effect::<$plugin>() };
+    (@one sources $plugin:ty) => { Registration::source::<$plugin>() };
+    (@factory $kind:ident $manifest:ident $create:ident $shelf:ident $factory:ident) => {
+        static $shelf: Shelf = Shelf::new(Kind::$kind, ALL);
         unsafe extern "C" fn $manifest(index: u32) -> *const core::ffi::c_char {
-            $shelf().manifest(index)
+            $shelf.manifest(index)
         }
         unsafe extern "C" fn $create(
             index: u32,
@@ -578,10 +608,13 @@ macro_rules! export_plugin {
             error: *mut abi::ErrorV1,
         ) -> abi::Status {
             // SAFETY: the host calls with what the header promises.
-            unsafe { $shelf().create(index, host, config, node, error) }
+            unsafe { $shelf.create(index, host, config, node, error) }
         }
-        static $factory: abi::FactoryV1 =
-            abi::FactoryV1 { count: $list.len() as u32, manifest: Some($manifest), create: Some($create) };
+        static $factory: abi::FactoryV1 = abi::FactoryV1 {
+            count: Shelf::count(Kind::$kind, ALL),
+            manifest: Some($manifest),
+            create: Some($create),
+        };
     };
 }
 

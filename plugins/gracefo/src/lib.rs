@@ -27,7 +27,7 @@ pub mod telemetry;
 
 use dragfree_sdk::export_plugin;
 
-export_plugin!(stages: [accelerometer::Accelerometer], effects: [], sources: [source::GraceFo]);
+export_plugin!(stages: [accelerometer::Accelerometer], sources: [source::GraceFo]);
 
 /// Why a file was refused.
 #[derive(Debug, thiserror::Error)]
