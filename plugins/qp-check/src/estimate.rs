@@ -191,10 +191,21 @@ struct Reduced<'a> {
     information: DMatrix<f64>,
     right: DVector<f64>,
     rows: Vec<Row>,
-    /// Which rows count as information when the data's power is judged.
-    survey: Vec<bool>,
+    /// What each row knows.
+    knowledge: Vec<Knowledge>,
     /// Natural size of each free coefficient: half of its range, or its prior σ, or what the data say.
     size: DVector<f64>,
+}
+
+/// What a row knows beyond excluding values.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Knowledge {
+    /// A measurement that is not ours.
+    Survey,
+    /// A physical range.
+    Range,
+    /// Nothing that another row does not say: the range of a coefficient that a range constraint bounds as well.
+    Repeated,
 }
 
 struct Solved {
@@ -221,13 +232,14 @@ impl<'a> Reduced<'a> {
             let known: f64 = fixed.iter().map(|f| normal[(free[i], *f)] * unknowns[*f].initial).sum();
             kept * (right[free[i]] - known)
         });
-        let (mut rows, mut survey) = (Vec::new(), Vec::new());
+        let (mut rows, mut knowledge) = (Vec::new(), Vec::new());
         for (k, i) in free.iter().enumerate() {
             let u = &unknowns[*i];
             let mut terms = vec![0.0; n];
             terms[k] = 1.0;
             rows.push(Row { name: format!("range of {}", u.name), terms, lower: u.lower, upper: u.upper });
-            survey.push(false);
+            let bounded_again = bounds.iter().any(|b| !b.survey && b.terms.iter().any(|(j, w)| j == i && *w != 0.0));
+            knowledge.push(if bounded_again { Knowledge::Repeated } else { Knowledge::Range });
         }
         for b in bounds {
             let known: f64 =
@@ -240,7 +252,7 @@ impl<'a> Reduced<'a> {
             }
             if terms.iter().any(|t| *t != 0.0) {
                 rows.push(Row { name: b.name.clone(), terms, lower: b.lower - known, upper: b.upper - known });
-                survey.push(b.survey);
+                knowledge.push(if b.survey { Knowledge::Survey } else { Knowledge::Range });
             }
         }
         let size = DVector::from_fn(n, |k, _| {
@@ -249,7 +261,7 @@ impl<'a> Reduced<'a> {
             let usable = candidates.into_iter().find(|s| s.is_finite() && *s > 0.0);
             usable.unwrap_or_else(|| SIZE_WITHOUT_RANGE / information[(k, k)].sqrt())
         });
-        Self { free, unknowns, information, right, rows, survey, size }
+        Self { free, unknowns, information, right, rows, knowledge, size }
     }
 
     /// Information of data and rows, with the σ of each row as `sigma(index, row)` has it.
@@ -309,13 +321,19 @@ impl<'a> Reduced<'a> {
     fn covariance(&self, active: &[Active]) -> Option<DMatrix<f64>> {
         let information = self.with_rows(|i, row| {
             let at_a_bound = active.iter().any(|a| a.row == i);
-            uniform_sigma(row) * if at_a_bound { 2.0 } else { 1.0 }
+            match self.knowledge[i] {
+                Knowledge::Repeated => f64::INFINITY,
+                _ => uniform_sigma(row) * if at_a_bound { 2.0 } else { 1.0 },
+            }
         });
         self.inverse(&information)
     }
 
     fn weak(&self, unknowns: &[Unknown], unseen: &[usize]) -> Vec<Direction> {
-        let information = self.with_rows(|i, row| if self.survey[i] { uniform_sigma(row) } else { f64::INFINITY });
+        let information = self.with_rows(|i, row| match self.knowledge[i] {
+            Knowledge::Survey => uniform_sigma(row),
+            _ => f64::INFINITY,
+        });
         let names: Vec<(&str, &str)> =
             self.free.iter().map(|i| (unknowns[*i].name.as_str(), unknowns[*i].unit.as_str())).collect();
         let mut weak = verdict::weak_directions(&information, &self.size, &names);
