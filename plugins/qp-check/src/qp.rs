@@ -349,13 +349,13 @@ mod tests {
             problem.scale = DVector::from_vec(scale);
             problem.origin = DVector::from_vec(vec![0.3, -0.2, 0.1]);
             match (problem.solve(), enumerate(&problem)) {
-                // In the metric of N, which is distance in σ. The solver's gap of 1e-9 of the objective allows
-                // ½ δᵀNδ of that size, since the gradient at the optimum points inward.
+                // In the metric of N, which is distance in σ: a gap of 1e-9 of the objective and violations of 1e-9 under
+                // multipliers of a hundred allow ½ δᵀNδ of 1e-7, since the gradient at the optimum points inward.
                 (Ok(got), Some(want)) => {
                     let apart = &got.theta - &want;
                     let objective = 0.5 * want.dot(&(&problem.normal * &want)) - problem.right.dot(&want);
                     prop_assert!(
-                        apart.dot(&(&problem.normal * &apart)) < 1e-7 * (1.0 + objective.abs()), "{} against {want}", got.theta
+                        apart.dot(&(&problem.normal * &apart)) < 1e-6 * (1.0 + objective.abs()), "{} against {want}", got.theta
                     );
                 }
                 (Err(QpError::Unsolved { .. }), None) => {}
