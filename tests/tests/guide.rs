@@ -1,0 +1,86 @@
+//! The commands of the README and of the operators' book run as they stand there.
+
+use dragfree_tests::{built, root, simulate};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Lines of the `sh` blocks of a page that call `dragfree`, in order.
+fn commands(page: &Path) -> Vec<String> {
+    let text = std::fs::read_to_string(page).unwrap_or_else(|e| panic!("{}: {e}", page.display()));
+    let mut inside = false;
+    let mut found = Vec::new();
+    for line in text.lines() {
+        match line.trim() {
+            "```sh" => inside = true,
+            "```" => inside = false,
+            command if inside && (command.starts_with("dragfree ") || command.contains("/dragfree demo")) => {
+                // The reader has just built the program; here it is on the path.
+                let command = command.rsplit("&& ").next().unwrap_or(command);
+                found.push(command.replace("./target/release/dragfree", "dragfree"));
+            }
+            _ => {}
+        }
+    }
+    found
+}
+
+fn pages() -> Vec<PathBuf> {
+    let book = root().join("ops-guide/src");
+    let summary = std::fs::read_to_string(book.join("SUMMARY.md")).expect("a summary");
+    let chapters = summary.split("](").skip(1).filter_map(|rest| rest.split(')').next()).map(|name| book.join(name));
+    std::iter::once(root().join("README.md")).chain(chapters).collect()
+}
+
+/// A folder as the reader has it: the repository's fixtures, two files of telemetry, a mission file.
+fn readers_folder() -> tempfile::TempDir {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let at = |name: &str| dir.path().join(name);
+    for (day, start) in [("day1", "2035-01-01T00:00:00Z"), ("day2", "2035-01-01T00:45:00Z")] {
+        std::fs::create_dir(at(day)).expect("writable");
+        let file = simulate(&at(day), &["--hours", "0.75", "--seed", "1", "--start", start]).remove(0);
+        std::fs::rename(file, at(&format!("{day}.mcap"))).expect("writable");
+    }
+    let mut folders = vec![PathBuf::from("fixtures")];
+    while let Some(folder) = folders.pop() {
+        std::fs::create_dir_all(at("").join(&folder)).expect("writable");
+        for entry in std::fs::read_dir(root().join(&folder)).expect("a folder").flatten() {
+            let name = folder.join(entry.file_name());
+            if entry.path().is_dir() {
+                folders.push(name);
+            } else {
+                std::fs::copy(entry.path(), dir.path().join(name)).expect("copied");
+            }
+        }
+    }
+    std::fs::copy(at("fixtures/missions/taiji.toml"), at("my-mission.toml")).expect("copied");
+    let science = std::fs::read_to_string(at("fixtures/pipelines/science-mode.toml")).expect("readable");
+    std::fs::write(at("science-mode.toml"), science.replace("../", "fixtures/")).expect("writable");
+    dir
+}
+
+#[test]
+fn every_command_of_the_guide_runs() {
+    let dir = readers_folder();
+    let path = std::env::join_paths(
+        std::iter::once(built().to_owned()).chain(std::env::split_paths(&std::env::var_os("PATH").unwrap_or_default())),
+    )
+    .expect("a path");
+    let mut run = 0;
+    for page in pages() {
+        for command in commands(&page) {
+            let mut shell = Command::new("sh");
+            shell.current_dir(dir.path()).args(["-c", &command]).env("PATH", &path).env("NO_COLOR", "1");
+            let output = shell.output().expect("sh runs");
+            // Three quarters of an hour are short: a weak or inconsistent result is a result.
+            assert!(
+                matches!(output.status.code(), Some(0 | 4)),
+                "{}: {command}\n{}{}",
+                page.display(),
+                String::from_utf8_lossy(&output.stdout),
+                String::from_utf8_lossy(&output.stderr)
+            );
+            run += 1;
+        }
+    }
+    assert!(run >= 8, "the pages were read: {run} commands");
+}
