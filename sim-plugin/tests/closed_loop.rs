@@ -93,7 +93,7 @@ fn four_hours_meet_the_requirement_table() {
 fn noisy_thrusters_break_the_table() {
     let mut mission = taiji();
     let designed = dragfree_physics::control_design::loop_shaping(&mission).unwrap();
-    mission.control = Some(Control { delay_samples: 1, channel: designed });
+    mission.control = Some(Control { delay_samples: 1, lever_feed_forward: true, channel: designed });
     mission.noise.thruster_force.as_mut().unwrap().asd_n_rthz *= 10.0;
     let series = states(&mission, 1);
     assert!(worst(&mission, "tm1.x", &series[3]).0 > 1.5);
@@ -104,7 +104,7 @@ fn noisy_thrusters_break_the_table() {
 #[test]
 fn channels_are_decoupled_in_the_exact_plant() {
     let mut mission = taiji();
-    mission.control = Some(Control { delay_samples: 0, channel: Default::default() });
+    mission.control = Some(Control { delay_samples: 0, lever_feed_forward: true, channel: Default::default() });
     mission.actuators = None;
     let ones = [[Matrix3::from_element(1.0); 3]; 2];
     let plant = Plant::new(&mission, &Vector3::zeros(), &ones).unwrap();

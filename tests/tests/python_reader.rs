@@ -1,6 +1,8 @@
 //! Another implementation reads what we write: the Python packages `mcap` and `mcap-protobuf-support`, from the schema
 //! in the file alone. Skipped with a message where there is no Python, or no package index to install them from.
 
+#![allow(clippy::print_stdout, reason = "a skipped test says so")]
+
 use dragfree_tests::foreign::{Container, Flight, Loops, fly, write};
 use dragfree_tests::{dragfree, fixture, root, simulate};
 use serde_json::Value;
