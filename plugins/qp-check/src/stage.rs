@@ -272,7 +272,8 @@ impl Linked {
         let disagreeing: Vec<&Difference> = compared.iter().filter(|d| d.sigmas() > AGREEMENT_SIGMAS).collect();
         let insane = self.insane(solution);
 
-        report.chi2_per_dof = Some(quality.chi2_per_dof);
+        // With Σ from the residuals the ratio is 1 by construction; only the mission's Σ can be contradicted.
+        report.chi2_per_dof = Some(quality.chi2_per_dof_modelled_sigma);
         report.weak_directions = solution.weak.iter().map(|d| d.sentence.clone()).collect();
         let weak = !solution.weak.is_empty();
         let verdict = match (weak, disagreeing.is_empty() && insane.is_empty()) {
@@ -368,7 +369,7 @@ impl Linked {
             ("kkt", json!(solution.kkt)),
             ("differences", json!(differences)),
             ("dof", json!(quality.dof)),
-            ("chi2_per_dof_modelled_sigma", json!(quality.chi2_per_dof_modelled_sigma)),
+            ("chi2_per_dof_refined_sigma", json!(quality.chi2_per_dof)),
             ("last_step_sigma", json!(quality.last_step_sigma)),
             ("channels", json!(quality.channels)),
         ];
