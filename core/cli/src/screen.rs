@@ -175,7 +175,7 @@ pub(crate) fn plugins(registry: &Registry, paint: Paint) -> String {
     let mut rows: Vec<_> = registry
         .plugins()
         .map(|found| {
-            let file = found.library.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let file = found.opened.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             vec![found.info.manifest.id.clone(), found.info.kind.to_string(), found.info.manifest.version.clone(), file]
         })
         .collect();
@@ -283,8 +283,8 @@ pub(crate) fn plugins_json(registry: &Registry) -> Value {
             "kind": found.info.kind,
             "version": found.info.manifest.version,
             "description": found.info.manifest.description,
-            "path": found.library.path.to_string_lossy(),
-            "sha256": found.library.sha256,
+            "path": found.opened.path.to_string_lossy(),
+            "sha256": found.opened.sha256,
         })
     });
     let refused = registry

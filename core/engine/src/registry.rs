@@ -26,7 +26,7 @@ pub struct Refused {
 #[derive(Clone, Debug)]
 pub struct Found {
     /// Its library.
-    pub library: Arc<Library>,
+    pub opened: Arc<Library>,
     /// Its place and manifest.
     pub info: PluginInfo,
 }
@@ -89,7 +89,7 @@ impl Registry {
     /// Every plugin, by file and then kind.
     pub fn plugins(&self) -> impl Iterator<Item = Found> {
         self.libraries.iter().flat_map(|library| {
-            library.plugins.iter().map(|info| Found { library: Arc::clone(library), info: info.clone() })
+            library.plugins.iter().map(|info| Found { opened: Arc::clone(library), info: info.clone() })
         })
     }
 
@@ -110,8 +110,8 @@ impl Registry {
             (Some(a), Some(b)) => Err(RegistryError::Twice {
                 kind,
                 id: id.to_owned(),
-                first: a.library.path.clone(),
-                second: b.library.path.clone(),
+                first: a.opened.path.clone(),
+                second: b.opened.path.clone(),
             }),
             (None, _) => {
                 let folders: Vec<_> = self.folders.iter().map(|f| f.display().to_string()).collect();
@@ -132,7 +132,7 @@ impl Found {
     /// # Errors
     /// The plugin refused its configuration.
     pub fn create(&self, config: &Config) -> Result<Instance, BorderError> {
-        Instance::create(&self.library, &self.info, config)
+        Instance::create(&self.opened, &self.info, config)
     }
 }
 

@@ -367,7 +367,7 @@ fn draft(
             kind: source.found.info.kind.to_string(),
             version: source.found.info.manifest.version.clone(),
             abi: dragfree_abi::ABI_VERSION.to_string(),
-            library_sha256: source.found.library.sha256.clone(),
+            library_sha256: source.found.opened.sha256.clone(),
             parameters_sha256: digest(&source.parameters),
         });
     }

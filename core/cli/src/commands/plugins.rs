@@ -19,7 +19,7 @@ pub(super) fn execute(command: &Plugins, global: &Global, paint: Paint) -> Resul
 fn inspect(registry: &Registry, id: &str, json: bool, paint: Paint) -> Result<Done, Failure> {
     let found = registry.plugins().find(|found| found.info.manifest.id == id);
     let found = found.ok_or_else(|| Failure::Plugin(id.to_owned()))?;
-    let (info, library) = (&found.info, &found.library);
+    let (info, library) = (&found.info, &found.opened);
     if json {
         return Ok(Done::json(&serde_json::json!({
             "kind": info.kind,
