@@ -122,3 +122,13 @@ pub fn coefficient(product: &serde_json::Value, name: &str, solution: &str) -> (
     let one = one.unwrap_or_else(|| panic!("no {name} by {solution} in {all:?}"));
     (one["value"].as_f64().unwrap_or(f64::NAN), one["sigma"].as_f64().unwrap_or(f64::NAN))
 }
+
+/// Copies the SDK's example plugin `clumsy` into `folder`: cargo leaves earlier builds beside the newest one, so its own
+/// folder is no plugin folder.
+///
+/// # Panics
+/// It was not built.
+pub fn example_plugin(folder: &Path) {
+    let library = format!("{}clumsy{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
+    std::fs::copy(built().join("examples").join(&library), folder.join(&library)).expect("the example is built");
+}

@@ -1,6 +1,6 @@
 //! Plugins that the workspace did not build: a stage and an effect in C that work, and all that misbehave.
 
-use dragfree_tests::{coefficient, compile_plugin, dragfree, expect, fixture, json, simulate};
+use dragfree_tests::{coefficient, compile_plugin, dragfree, example_plugin, expect, fixture, json, simulate};
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use tempfile::TempDir;
@@ -103,11 +103,11 @@ fn every_misbehaviour_is_told_and_none_is_a_crash() {
 /// A plugin in Rust that panics at each point of its life: the host says so, ends, and leaves nothing in the archive.
 #[test]
 fn a_panic_stops_at_the_border() {
-    let examples = dragfree_tests::built().join("examples");
     for place in ["new", "link", "process", "flush", "report"] {
         let dir = tempfile::tempdir().expect("a temporary folder");
         let pipeline = pipeline(dir.path(), &format!("plugin = \"clumsy\"\nparameters = {{ panic_in = \"{place}\" }}"));
-        let output = expect(run(dir.path(), &pipeline).arg("--plugin-dir").arg(&examples), 1);
+        example_plugin(dir.path());
+        let output = expect(&mut run(dir.path(), &pipeline), 1);
         let stderr = String::from_utf8_lossy(&output.stderr);
         assert!(stderr.contains(&format!("clumsy in {place}")) && stderr.contains("panicked"), "{stderr}");
         assert!(!stderr.contains("RUST_BACKTRACE"), "the panic is told by the host alone: {stderr}");
@@ -118,7 +118,8 @@ fn a_panic_stops_at_the_border() {
 fn a_plugin_without_a_panic_goes_through() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let pipeline = pipeline(dir.path(), "plugin = \"clumsy\"");
-    let product = json(run(dir.path(), &pipeline).arg("--plugin-dir").arg(dragfree_tests::built().join("examples")), 0);
+    example_plugin(dir.path());
+    let product = json(&mut run(dir.path(), &pipeline), 0);
     assert_eq!(product["quality"]["counts"]["clumsy"]["rows"], 18_000, "{product}");
 }
 

@@ -12,8 +12,13 @@ use std::collections::BTreeMap;
 fn counting_stage() -> Instance {
     let exe = std::env::current_exe().expect("a path");
     let examples = exe.parent().and_then(|p| p.parent()).expect("target/release/deps").join("examples");
-    let registry = Registry::discover(&[examples]);
-    let found = registry.find(Kind::Stage, "clumsy").expect("cargo build --release -p dragfree-sdk --example clumsy");
+    // A folder of its own: cargo leaves earlier builds beside the newest one.
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let library = format!("{}clumsy{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
+    std::fs::copy(examples.join(&library), folder.path().join(&library))
+        .expect("cargo build --release -p dragfree-sdk --example clumsy");
+    let registry = Registry::discover(&[folder.path().to_owned()]);
+    let found = registry.find(Kind::Stage, "clumsy").expect("the example plugin");
     let config = Config { value: serde_json::json!({ "parameters": { "panic_in": "nowhere" }, "mission": {} }) };
     let mut instance = found.create(&config).expect("an instance");
     let y = Column {
