@@ -377,7 +377,7 @@ fn draft(
         kind: n.info.kind.to_string(),
         version: n.info.manifest.version.clone(),
         abi: dragfree_abi::ABI_VERSION.to_string(),
-        library_sha256: n.library_sha256.clone(),
+        library_sha256: n.sha256.clone(),
         parameters_sha256: digest(&n.parameters),
     }));
     let mut losses = summary.losses;

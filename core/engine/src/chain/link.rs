@@ -244,7 +244,7 @@ impl Builder<'_> {
         self.available.extend(linked.writes.iter().flat_map(|t| t.columns.clone()));
         self.chain.nodes.push(ChainNode {
             info: found.info.clone(),
-            library_sha256: found.opened.sha256.clone(),
+            sha256: found.opened.sha256.clone(),
             parameters,
             reads,
             inputs,

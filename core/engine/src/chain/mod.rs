@@ -86,7 +86,7 @@ pub struct ChainNode {
     /// What it says of itself.
     pub info: PluginInfo,
     /// Digest of its library.
-    pub library_sha256: String,
+    pub sha256: String,
     /// Its parameters, complete.
     pub parameters: serde_json::Map<String, serde_json::Value>,
     /// Columns that it reads, `table:column`.
