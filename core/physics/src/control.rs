@@ -4,10 +4,11 @@
 //! One [`ControlLaw::step`] per sample turns the readout at `t_k` into the command that acts over `[t_k, t_{k+1})`.
 //! With the default delay of one sample that command was computed from the readout at `t_{k−1}`.
 
-use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+use nalgebra::Vector3;
 use std::collections::VecDeque;
 
 use crate::control_design::loop_shaping;
+use crate::decoupling::{AllocationMatrix, InputVector, LinearPlant};
 use crate::mission::{Actuators, CHANNELS, ChannelController, Control, Mission, MissionError};
 
 const NEEDED_BY: &str = "the control law";
@@ -53,18 +54,8 @@ pub struct Command {
     pub tm: [TestMassCommand; 2],
 }
 
-/// Inputs of eq:input_variables_reduced: `F_T` (3), `M_T` (3), then for each test mass `F_E` (y, z) and `M_E` (3).
-const INPUTS: usize = 16;
-/// Row of the input vector that holds the thrust along `s_3`.
-const THRUST_Z: usize = 2;
-/// Rows of eq:state_variables that hold `z_1` and `z_2`.
-const Z: [usize; 2] = [5, 11];
-
-type Accelerations = SVector<f64, 15>;
-type InputVector = SVector<f64, INPUTS>;
-
 impl Command {
-    fn from_vector(u: &InputVector) -> Self {
+    pub(crate) fn from_vector(u: &InputVector) -> Self {
         let at = |i: usize| Vector3::new(u[i], u[i + 1], u[i + 2]);
         let tm =
             |i: usize| TestMassCommand { force_orf_n: Vector3::new(0.0, u[i], u[i + 1]), torque_orf_nm: at(i + 2) };
@@ -98,122 +89,6 @@ impl Command {
         let at = |i: usize| Vector3::new(v[3 * i], v[3 * i + 1], v[3 * i + 2]);
         let tm = |i: usize| TestMassCommand { force_orf_n: at(i), torque_orf_nm: at(i + 1) };
         Self { mps_force_srf_n: at(0), mps_torque_srf_nm: at(1), tm: [tm(2), tm(4)] }
-    }
-}
-
-/// The plant of eq:state_space_model that the decoupling assumes: nominal masses, offsets and stiffness.
-struct LinearPlant {
-    sc_mass_kg: f64,
-    sc_inertia_inverse: Matrix3<f64>,
-    tm: [LinearTestMass; 2],
-}
-
-struct LinearTestMass {
-    mass_kg: f64,
-    inertia_inverse: Matrix3<f64>,
-    dcm_orf_from_srf: Matrix3<f64>,
-    offset_srf_m: Vector3<f64>,
-    stiffness_tt: Matrix3<f64>,
-    stiffness_tr: Matrix3<f64>,
-    stiffness_rt: Matrix3<f64>,
-    stiffness_rr: Matrix3<f64>,
-}
-
-impl LinearPlant {
-    fn new(mission: &Mission) -> Result<Self, MissionError> {
-        let lever = mission.control.as_ref().is_none_or(|c| c.lever_feed_forward);
-        let tm = |name: &str| -> Result<LinearTestMass, MissionError> {
-            let section = mission.test_mass(name, NEEDED_BY)?;
-            let inertia_inverse = section.inertia_inverse(name, NEEDED_BY)?;
-            Ok(LinearTestMass {
-                mass_kg: section.mass_kg,
-                inertia_inverse,
-                dcm_orf_from_srf: section.dcm_orf_from_srf(),
-                offset_srf_m: if lever { Vector3::from(section.offset_nominal_srf_m) } else { Vector3::zeros() },
-                stiffness_tt: section.stiffness_tt(),
-                stiffness_tr: section.stiffness_tr(),
-                stiffness_rt: section.stiffness_rt(&inertia_inverse),
-                stiffness_rr: section.stiffness_rr(),
-            })
-        };
-        Ok(Self {
-            sc_mass_kg: mission.spacecraft.mass_kg,
-            sc_inertia_inverse: mission.spacecraft.inertia_inverse(),
-            tm: [tm("tm1")?, tm("tm2")?],
-        })
-    }
-
-    /// `B_v u`: accelerations of the fifteen channels, in the order of [`CHANNELS`].
-    ///
-    /// `α = J_S⁻¹(M_T − Σ T M_Ej − Σ b_j×(T F_Ej))`, `r̈_i = −T((F_T − Σ T F_Ej)/m_S + α×b_i) + F_Ei/m_i`, and a test
-    /// mass turns against its housing by `J_m⁻¹ M_Ei − T α`.
-    fn accelerations(&self, u: &Command) -> Accelerations {
-        let (mut force, mut torque) = (u.mps_force_srf_n, u.mps_torque_srf_nm);
-        for (tm, e) in self.tm.iter().zip(&u.tm) {
-            let f = tm.dcm_orf_from_srf.tr_mul(&e.force_orf_n);
-            force -= f;
-            torque -= tm.dcm_orf_from_srf.tr_mul(&e.torque_orf_nm) + tm.offset_srf_m.cross(&f);
-        }
-        let alpha = self.sc_inertia_inverse * torque;
-        let mut out = Accelerations::zeros();
-        out.fixed_rows_mut::<3>(0).copy_from(&alpha);
-        for (i, (tm, e)) in self.tm.iter().zip(&u.tm).enumerate() {
-            let inertial = force / self.sc_mass_kg + alpha.cross(&tm.offset_srf_m);
-            let r = e.force_orf_n / tm.mass_kg - tm.dcm_orf_from_srf * inertial;
-            let turn = tm.inertia_inverse * e.torque_orf_nm - tm.dcm_orf_from_srf * alpha;
-            out.fixed_rows_mut::<3>(3 + 6 * i).copy_from(&r);
-            out.fixed_rows_mut::<3>(6 + 6 * i).copy_from(&turn);
-        }
-        out
-    }
-
-    /// `B_v`, column by column.
-    fn input_matrix(&self) -> SMatrix<f64, 15, INPUTS> {
-        let mut b = SMatrix::<f64, 15, INPUTS>::zeros();
-        for j in 0..INPUTS {
-            let mut unit = InputVector::zeros();
-            unit[j] = 1.0;
-            b.set_column(j, &self.accelerations(&Command::from_vector(&unit)));
-        }
-        b
-    }
-
-    /// `A_v p̂`.
-    fn stiffness(&self, y: &Readout) -> Accelerations {
-        let mut out = Accelerations::zeros();
-        for (i, (s, tm)) in self.tm.iter().zip(&y.tm).enumerate() {
-            let r = s.stiffness_tt * tm.r_orf_m + s.stiffness_tr * tm.att_orf_rad;
-            let turn = s.stiffness_rt * tm.r_orf_m + s.stiffness_rr * tm.att_orf_rad;
-            out.fixed_rows_mut::<3>(3 + 6 * i).copy_from(&r);
-            out.fixed_rows_mut::<3>(6 + 6 * i).copy_from(&turn);
-        }
-        out
-    }
-
-    /// `B_v†` under the rules of eqs x_axis_thrust to z_axis_thrust.
-    ///
-    /// `B_v` has one input more than channels, and the rules settle it: thrust along `s_3` serves the common motion
-    /// of `z_1` and `z_2` alone, `F_Tz = −m_S (u_d6 + u_d12)/2`. The other fifteen inputs then follow from the
-    /// fifteen channels without freedom, so that `B_v B_v† = 1` exactly; by the symmetry of the two optical frames
-    /// `F_Tx` weighs `x_1` and `x_2` alike, and `F_Ty` weighs them opposed.
-    ///
-    /// `None` when the two sensitive axes are parallel to within 3°: the reaction of the electrodes, `m_m/m_S`, would
-    /// still make `B_v` regular, with thrust beyond all use.
-    fn allocation(&self) -> Option<SMatrix<f64, INPUTS, 15>> {
-        let sensitive = |i: usize| self.tm[i].dcm_orf_from_srf.row(0).transpose();
-        if sensitive(0).cross(&sensitive(1)).norm() < 0.05 {
-            return None;
-        }
-        let b = self.input_matrix();
-        let mut thrust_z = SMatrix::<f64, 1, 15>::zeros();
-        for z in Z {
-            thrust_z[z] = -0.5 * self.sc_mass_kg;
-        }
-        let wanted = SMatrix::<f64, 15, 15>::identity() - b.column(THRUST_Z) * thrust_z;
-        let others: SMatrix<f64, 15, 15> = b.remove_column(THRUST_Z);
-        let mut out: SMatrix<f64, INPUTS, 15> = others.lu().solve(&wanted)?.insert_row(THRUST_Z, 0.0);
-        out.set_row(THRUST_Z, &thrust_z);
-        Some(out)
     }
 }
 
@@ -255,7 +130,7 @@ pub struct StateError {
 /// The running control law.
 pub struct ControlLaw {
     plant: LinearPlant,
-    allocation: SMatrix<f64, INPUTS, 15>,
+    allocation: AllocationMatrix,
     channels: Vec<Channel>,
     limits: Option<Actuators>,
     /// `k_dSC`, N, and the arm of the force, SRF, m.
@@ -288,11 +163,7 @@ impl ControlLaw {
             })
             .collect::<Result<Vec<_>, _>>()?;
         let plant = LinearPlant::new(mission)?;
-        let allocation = plant.allocation().ok_or_else(|| MissionError::Value {
-            key: "test_mass.tm2.orf_from_srf_angle_rad".to_owned(),
-            value: mission.test_mass("tm2", NEEDED_BY).map_or(f64::NAN, |tm| tm.orf_from_srf_angle_rad).to_string(),
-            reason: "leaves the thrusters no way to serve both sensitive axes, which must differ from tm1's by 3° or more",
-        })?;
+        let allocation = plant.allocation()?.matrix;
         Ok(Self {
             plant,
             allocation,
@@ -369,6 +240,7 @@ impl ControlLaw {
 pub(crate) mod tests {
     use super::*;
     use crate::control_design::tests::taiji;
+    use nalgebra::Matrix3;
 
     fn law() -> ControlLaw {
         ControlLaw::new(&taiji()).unwrap()
@@ -379,53 +251,6 @@ pub(crate) mod tests {
         let v = |i: usize| Vector3::from_fn(|j, _| 1e-8 * ((k * 7 + i * 3 + j) as f64).sin());
         let tm = |i: usize| TestMassReadout { r_orf_m: v(i), att_orf_rad: v(i + 1) };
         Readout { sc_crf_rad: v(0), tm: [tm(1), tm(3)], sun_srf: Some(Vector3::new(0.866, 0.1, -0.5)) }
-    }
-
-    #[test]
-    fn allocation_is_a_right_inverse() {
-        let plant = LinearPlant::new(&taiji()).unwrap();
-        let error = plant.input_matrix() * plant.allocation().unwrap() - SMatrix::<f64, 15, 15>::identity();
-        assert!(error.amax() < 1e-12, "{error}");
-    }
-
-    proptest::proptest! {
-        /// A right inverse for other spacecraft too: masses, offsets, opening angles.
-        #[test]
-        fn allocation_is_a_right_inverse_for_any_geometry(
-            mass_kg in 100.0..5000.0_f64,
-            half_angle_rad in 0.1..0.7_f64,
-            offsets in proptest::array::uniform6(-0.5..0.5_f64),
-        ) {
-            let mut mission = taiji();
-            mission.spacecraft.mass_kg = mass_kg;
-            for (i, (name, sign)) in [("tm1", 1.0), ("tm2", -1.0)].into_iter().enumerate() {
-                let tm = mission.test_mass.get_mut(name).unwrap();
-                tm.orf_from_srf_angle_rad = sign * half_angle_rad;
-                tm.offset_nominal_srf_m = [offsets[3 * i], offsets[3 * i + 1], offsets[3 * i + 2]];
-            }
-            let plant = LinearPlant::new(&mission).unwrap();
-            let error = plant.input_matrix() * plant.allocation().unwrap() - SMatrix::<f64, 15, 15>::identity();
-            proptest::prop_assert!(error.amax() < 1e-11, "{}", error.amax());
-        }
-    }
-
-    /// eqs x_axis_thrust to z_axis_thrust, with the paper's channels 4, 10 (x) and 6, 12 (z).
-    #[test]
-    fn thrust_follows_the_rules_of_the_paper() {
-        let b = LinearPlant::new(&taiji()).unwrap().allocation().unwrap();
-        let (x1, z1, x2, z2) = (3, 5, 9, 11);
-        // −(c F_x + s F_y)/m_S = u_d4 and −(c F_x − s F_y)/m_S = u_d10.
-        let (c, s) = (std::f64::consts::FRAC_PI_6.cos(), 0.5);
-        // The electrodes' reaction, m_m/m_S, is the only other way to x.
-        let near = |got: f64, want: f64| (got / want - 1.0).abs() < 4.0 * 1.96 / 1500.0;
-        assert!(near(b[(0, x1)], -1500.0 / (2.0 * c)) && (b[(0, x1)] / b[(0, x2)] - 1.0).abs() < 1e-12);
-        assert!(near(b[(1, x1)], -1500.0 / (2.0 * s)) && (b[(1, x1)] / b[(1, x2)] + 1.0).abs() < 1e-12);
-        for j in 0..15 {
-            let want = if j == z1 || j == z2 { -750.0 } else { 0.0 };
-            assert_eq!(b[(2, j)], want, "F_Tz from channel {j}");
-        }
-        // Pushing the spacecraft for x_1 moves it along y of both housings; the electrodes carry the masses along.
-        assert!(b[(6, x1)].abs() > 0.1, "F_E1y takes no part: {}", b[(6, x1)]);
     }
 
     /// A displaced test mass pulls the spacecraft after it, a lateral one is pushed back: the signs of r̈ = −T F_T/m_S + F_E/m_m.
@@ -507,9 +332,5 @@ pub(crate) mod tests {
         mission.control = Some(Control { delay_samples: 1, lever_feed_forward: true, channel: channel.into() });
         let error = ControlLaw::new(&mission).err().unwrap().to_string();
         assert!(error.contains("control.channel.\"sc.phi\""), "{error}");
-        let mut mission = taiji();
-        mission.test_mass.get_mut("tm2").unwrap().orf_from_srf_angle_rad = std::f64::consts::FRAC_PI_6;
-        let error = ControlLaw::new(&mission).err().unwrap().to_string();
-        assert!(error.contains("both sensitive axes"), "{error}");
     }
 }

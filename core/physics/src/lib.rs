@@ -6,6 +6,7 @@
 pub mod attitude;
 pub mod control;
 pub mod control_design;
+pub mod decoupling;
 pub mod frames;
 pub mod mission;
 pub mod noise;

@@ -25,6 +25,12 @@ pub enum MissionError {
         /// What a value must satisfy.
         reason: &'static str,
     },
+    /// The actuators cannot move every channel on its own.
+    #[error("mission file: no allocation of the fifteen channels to the actuators: {reason}")]
+    Decoupling {
+        /// What is wrong and what to check.
+        reason: String,
+    },
     /// A section that a plugin needs is not there.
     #[error("mission file: section [{section}] is missing; {needed_by} needs it")]
     Missing {
