@@ -11,6 +11,9 @@ use crate::replay::{COMMAND_VECTORS, Comparison};
 /// The innovations' variance may differ from the prediction by this much before it is worth a sentence; a day's
 /// sampling error is 0.2 %.
 const INNOVATION_TOLERANCE: f64 = 0.1;
+/// Standard deviations of the innovations' correlation with rebuilt commands above which the commands are not those that
+/// acted; a false alarm in 2e-6 of all runs.
+const DISOBEDIENCE: f64 = 5.0;
 const AXES: [&str; 3] = ["x", "y", "z"];
 const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
 
@@ -375,6 +378,16 @@ impl Stage for HinfDfacs {
                 report.notes.push(format!(
                     "attitude innovations have {ratio:.2?} of their predicted variance about the principal axes: the noise \
                      of thrusters' torque or long-arm wavefront sensing is not what the mission file says"
+                ));
+            }
+        }
+        if let Some(sigma) = linked.reconstruction.disobedience_sigma() {
+            q.insert("command_innovation_correlation_sigma".to_owned(), json!(sigma));
+            if reconstructed && sigma.iter().any(|z| z.abs() > DISOBEDIENCE) {
+                report.notes.push(format!(
+                    "the spacecraft does not turn as the rebuilt commands say: its attitude's innovations correlate with them \
+                     at {sigma:.1?} standard deviations about the principal axes. Another controller flew than [control] of the \
+                     mission file designs or lists, or thrusters and inertia are not what the mission file says"
                 ));
             }
         }

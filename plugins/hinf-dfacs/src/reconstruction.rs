@@ -10,7 +10,7 @@ use crate::smoother::{Model, Smoothed, Smoother};
 use crate::state::{Reader, StateError, Writer};
 
 const NEEDED_BY: &str = "hinf-dfacs";
-const STATE: &[u8; 8] = b"dfacs/1\n";
+const STATE: &[u8; 8] = b"dfacs/2\n";
 
 /// Where the angular acceleration comes from. Only the smoother gives an unbiased calibration (physics.md §4).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -329,6 +329,12 @@ impl Reconstruction {
         self.smoother.innovation_ratio()
     }
 
+    /// See [`Smoother::disobedience_sigma`].
+    #[must_use]
+    pub fn disobedience_sigma(&self) -> Option<[f64; 3]> {
+        self.smoother.disobedience_sigma()
+    }
+
     /// Replayed against flown commands; `None` where nothing was compared.
     #[must_use]
     pub fn comparison(&self) -> Option<&Comparison> {
@@ -379,7 +385,7 @@ impl Reconstruction {
     pub fn load(&mut self, bytes: &[u8]) -> Result<(), StateError> {
         let mut state = Reader::new(bytes);
         if state.bytes().ok().as_ref() != Some(STATE) {
-            return Err(StateError::Foreign { expected: "version 1" });
+            return Err(StateError::Foreign { expected: "version 2" });
         }
         self.smoother.load(&mut state)?;
         self.held.load(&mut state)?;

@@ -118,6 +118,40 @@ struct Step {
     cut: bool,
 }
 
+/// Whether the attitude does what the known accelerations say: a score test for their gain.
+///
+/// An innovation knows all that was known before it, so it is uncorrelated with every earlier command, whatever the loop
+/// did with its readouts; a part of the commands that did not act, or acted without being commanded, shows in the
+/// innovations as the filter's own answer to it. The products of the two are martingale differences, and their sum over the
+/// root of the sum of their squares is a standard normal deviate.
+#[derive(Clone, Debug, Default)]
+struct Obedience {
+    /// By how much the predicted θ, ω, β would miss if the known acceleration had acted once more.
+    answer: [Axes; 3],
+    products: Axes,
+    squares: Axes,
+}
+
+impl Obedience {
+    fn update(&mut self, axis: usize, innovation: f64, gain: [f64; 3], informed: bool) {
+        let miss = self.answer[0][axis];
+        for (state, k) in gain.into_iter().enumerate() {
+            self.answer[state][axis] -= k * miss;
+        }
+        if informed {
+            let product = innovation * miss;
+            self.products[axis] += product;
+            self.squares[axis] += product * product;
+        }
+    }
+
+    fn advance(&mut self, axis: usize, known: f64, dt: f64) {
+        let push = self.answer[2][axis] + known;
+        self.answer[0][axis] += dt * self.answer[1][axis] + 0.5 * dt * dt * push;
+        self.answer[1][axis] += dt * push;
+    }
+}
+
 /// The running smoother. Call [`Self::update`] and then [`Self::advance`] for each epoch.
 #[derive(Clone, Debug)]
 pub struct Smoother {
@@ -129,6 +163,7 @@ pub struct Smoother {
     steps: Vec<Step>,
     innovation_squares: Axes,
     innovations: u64,
+    obedience: Obedience,
 }
 
 impl Smoother {
@@ -144,6 +179,7 @@ impl Smoother {
             steps: Vec::new(),
             innovation_squares: zero,
             innovations: 0,
+            obedience: Obedience::default(),
         }
     }
 
@@ -173,6 +209,7 @@ impl Smoother {
                 self.covariance[3][i] = p11[i] - gain[1] * p01[i];
                 self.covariance[4][i] = p12[i] - gain[1] * p02[i];
                 self.covariance[5][i] = p22[i] - gain[2] * p02[i];
+                self.obedience.update(i, innovation, gain, informed);
                 if informed {
                     self.innovation_squares[i] += innovation * step.weighted_innovation[i];
                 }
@@ -192,6 +229,7 @@ impl Smoother {
             if let Some(step) = self.steps.last_mut() {
                 step.cut = true;
             }
+            self.obedience.answer = Default::default();
             let zero = [0.0; 3];
             let drifted = std::array::from_fn(|i| p22[i] + self.model.drift_variance[i]);
             self.mean = [zero, zero, self.mean[2]];
@@ -200,6 +238,7 @@ impl Smoother {
         };
         let known = self.model.srf_from_principal.tr_mul(known);
         for i in 0..3 {
+            self.obedience.advance(i, known[i], dt);
             let push = self.mean[2][i] + known[i];
             self.mean[0][i] += dt * self.mean[1][i] + half * push;
             self.mean[1][i] += dt * push;
@@ -267,7 +306,20 @@ impl Smoother {
         (self.innovations > 0).then(|| self.innovation_squares.map(|s| s / self.innovations as f64))
     }
 
+    /// Correlation of the innovations with the known accelerations before them, in standard deviations per principal
+    /// axis: a standard normal deviate when what is known is what acted. `None` before enough readouts.
+    #[must_use]
+    pub fn disobedience_sigma(&self) -> Option<[f64; 3]> {
+        let o = &self.obedience;
+        let z = std::array::from_fn(|i| o.products[i] / o.squares[i].sqrt());
+        z.iter().all(|z: &f64| z.is_finite()).then_some(z)
+    }
+
     pub(crate) fn save(&self, out: &mut Writer) {
+        let o = &self.obedience;
+        out.numbers(o.answer.as_flattened());
+        out.numbers(&o.products);
+        out.numbers(&o.squares);
         out.numbers(self.mean.as_flattened());
         out.numbers(self.covariance.as_flattened());
         out.numbers(&self.innovation_squares);
@@ -283,6 +335,10 @@ impl Smoother {
     }
 
     pub(crate) fn load(&mut self, state: &mut Reader<'_>) -> Result<(), StateError> {
+        let o = &mut self.obedience;
+        state.numbers(o.answer.as_flattened_mut())?;
+        state.numbers(&mut o.products)?;
+        state.numbers(&mut o.squares)?;
         state.numbers(self.mean.as_flattened_mut())?;
         state.numbers(self.covariance.as_flattened_mut())?;
         state.numbers(&mut self.innovation_squares)?;

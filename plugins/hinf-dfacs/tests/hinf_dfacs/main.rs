@@ -2,6 +2,7 @@
 
 mod border;
 mod common;
+mod obedience;
 mod posterior;
 mod slope;
 mod stream;
