@@ -4,11 +4,11 @@ use dragfree_physics::attitude::rotation_vector;
 use dragfree_physics::control::{Readout, TestMassReadout};
 use dragfree_physics::mission::{Mission, MissionError};
 use dragfree_physics::noise::NoiseShape;
-use dragfree_physics::process::NoiseProcess;
+use dragfree_physics::process::{NoiseBank, NoiseProcess};
 use nalgebra::Vector3;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
-use crate::plant::{Loads, State, TestMassLoads};
+use crate::plant::{Loads, State};
 
 const NEEDED_BY: &str = "the simulator";
 
@@ -39,23 +39,39 @@ impl Measured {
     }
 }
 
-type Axes = [NoiseProcess; 3];
+/// Random processes of the loop.
+const PROCESSES: usize = 44;
 
 /// The random processes, each independent of the others.
 #[derive(Clone, Debug)]
 pub struct Noises {
-    is_r: [Axes; 2],
-    is_att: [Axes; 2],
-    ifo_x: [NoiseProcess; 2],
-    dws_tm: [[NoiseProcess; 2]; 2],
-    dws_sc: Axes,
-    mps_force: Axes,
-    mps_torque: Axes,
-    sunlight: NoiseProcess,
+    bank: NoiseBank<PROCESSES>,
+    /// Of the epoch that was measured last.
+    samples: [f64; PROCESSES],
+    places: Places,
+}
+
+/// Where the processes stand in the bank; the further axes follow the first.
+#[derive(Clone, Debug)]
+struct Places {
+    tm: [TestMassPlaces; 2],
+    dws_sc: usize,
+    mps_force: usize,
+    mps_torque: usize,
+    sunlight: usize,
+}
+
+#[derive(Clone, Debug)]
+struct TestMassPlaces {
+    is_r: usize,
+    is_att: usize,
+    ifo_x: usize,
+    /// θ and ψ.
+    dws: usize,
     /// y and z: nothing drives the electrodes along the sensitive axis.
-    es_force: [[NoiseProcess; 2]; 2],
-    es_torque: [Axes; 2],
-    acceleration: [Axes; 2],
+    es_force: usize,
+    es_torque: usize,
+    acceleration: usize,
 }
 
 impl Noises {
@@ -64,146 +80,106 @@ impl Noises {
     /// # Errors
     /// [`MissionError::Missing`] names the table that is not there.
     pub fn new(mission: &Mission) -> Result<Self, MissionError> {
-        let n = &mission.noise;
+        let (n, dt_s) = (&mission.noise, mission.dt_s());
         macro_rules! process {
             ($name:ident) => {{
                 let table = Mission::need(&n.$name, concat!("noise.", stringify!($name)), NEEDED_BY)?;
-                NoiseProcess::new(&table.shape(), mission.dt_s())
+                NoiseProcess::with_lines(&table.shape(), &table.lines(), dt_s)
             }};
         }
-        let is_r = [process!(is_x), process!(is_y), process!(is_z)];
-        let (is_angle, ifo_x, dws) = (process!(is_angle), process!(ifo_x), process!(dws_local));
-        let (force, torque) = (process!(electrostatic_force), process!(electrostatic_torque));
-        let sunlight = n.solar_pressure.as_ref().map_or_else(NoiseShape::default, |t| t.shape());
-        let axes = |p: &NoiseProcess| [p.clone(), p.clone(), p.clone()];
-        let pair = |p: &NoiseProcess| [p.clone(), p.clone()];
-        let both = |p: &NoiseProcess| [axes(p), axes(p)];
-        Ok(Self {
-            is_r: [is_r.clone(), is_r],
-            is_att: both(&is_angle),
-            ifo_x: pair(&ifo_x),
-            dws_tm: [pair(&dws), pair(&dws)],
-            dws_sc: axes(&process!(dws_long_arm)),
-            mps_force: axes(&process!(thruster_force)),
-            mps_torque: axes(&process!(thruster_torque)),
-            sunlight: NoiseProcess::new(&sunlight, mission.dt_s()),
-            es_force: [pair(&force), pair(&force)],
-            es_torque: both(&torque),
-            acceleration: both(&process!(test_mass_acceleration)),
-        })
-    }
+        let (is_x, is_y, is_z, is_angle) = (process!(is_x), process!(is_y), process!(is_z), process!(is_angle));
+        let (ifo_x, dws_tm, dws_sc) = (process!(ifo_x), process!(dws_local), process!(dws_long_arm));
+        let (es_force, es_torque) = (process!(electrostatic_force), process!(electrostatic_torque));
+        let acceleration = process!(test_mass_acceleration);
+        let (mps_force, mps_torque) = (process!(thruster_force), process!(thruster_torque));
+        let sunlight = n.solar_pressure.as_ref().map_or_else(
+            || NoiseProcess::new(&NoiseShape::default(), dt_s),
+            |table| NoiseProcess::with_lines(&table.shape(), &table.lines(), dt_s),
+        );
 
-    fn all(&self) -> impl Iterator<Item = &NoiseProcess> {
-        let tm = (0..2).flat_map(|i| {
-            self.is_r[i]
-                .iter()
-                .chain(&self.is_att[i])
-                .chain(std::iter::once(&self.ifo_x[i]))
-                .chain(&self.dws_tm[i])
-                .chain(&self.es_force[i])
-                .chain(&self.es_torque[i])
-                .chain(&self.acceleration[i])
-        });
-        tm.chain(&self.dws_sc).chain(&self.mps_force).chain(&self.mps_torque).chain(std::iter::once(&self.sunlight))
-    }
-
-    /// In the order of [`Self::all`].
-    fn all_mut(&mut self) -> Vec<&mut NoiseProcess> {
-        let mut out: Vec<&mut NoiseProcess> = Vec::new();
-        let tm = self
-            .is_r
-            .iter_mut()
-            .zip(&mut self.is_att)
-            .zip(&mut self.ifo_x)
-            .zip(&mut self.dws_tm)
-            .zip(&mut self.es_force)
-            .zip(&mut self.es_torque)
-            .zip(&mut self.acceleration);
-        for ((((((is_r, is_att), ifo_x), dws), force), torque), acceleration) in tm {
-            out.extend(
-                is_r.iter_mut()
-                    .chain(is_att)
-                    .chain(std::iter::once(ifo_x))
-                    .chain(dws)
-                    .chain(force)
-                    .chain(torque)
-                    .chain(acceleration),
-            );
-        }
-        out.extend(self.dws_sc.iter_mut().chain(&mut self.mps_force).chain(&mut self.mps_torque));
-        out.push(&mut self.sunlight);
-        out
+        let mut processes: Vec<NoiseProcess> = Vec::with_capacity(PROCESSES);
+        let mut add = |axes: &[&NoiseProcess]| {
+            let place = processes.len();
+            processes.extend(axes.iter().map(|p| (*p).clone()));
+            place
+        };
+        let places = Places {
+            tm: std::array::from_fn(|_| TestMassPlaces {
+                is_r: add(&[&is_x, &is_y, &is_z]),
+                is_att: add(&[&is_angle; 3]),
+                ifo_x: add(&[&ifo_x]),
+                dws: add(&[&dws_tm; 2]),
+                es_force: add(&[&es_force; 2]),
+                es_torque: add(&[&es_torque; 3]),
+                acceleration: add(&[&acceleration; 3]),
+            }),
+            dws_sc: add(&[&dws_sc; 3]),
+            mps_force: add(&[&mps_force; 3]),
+            mps_torque: add(&[&mps_torque; 3]),
+            sunlight: add(&[&sunlight]),
+        };
+        let processes: [NoiseProcess; PROCESSES] =
+            processes.try_into().unwrap_or_else(|p: Vec<_>| unreachable!("{} processes", p.len()));
+        Ok(Self { bank: NoiseBank::new(processes), samples: [0.0; PROCESSES], places })
     }
 
     /// Draws every slow part from its stationary distribution.
     pub fn start(&mut self, rng: &mut Xoshiro256PlusPlus) {
-        for process in self.all_mut() {
-            process.start(rng);
-        }
+        self.bank.start(rng);
     }
 
     /// What the drifts alone make the instruments show: acquisition brought these readouts to zero, not the masses.
     #[must_use]
     pub fn slow_readout(&self) -> Readout {
-        let slow3 = |a: &Axes| Vector3::from_fn(|i, _| a[i].slow());
-        let tm = std::array::from_fn(|i| TestMassReadout {
-            r_orf_m: Vector3::new(self.ifo_x[i].slow(), self.is_r[i][1].slow(), self.is_r[i][2].slow()),
-            att_orf_rad: Vector3::new(self.is_att[i][0].slow(), self.dws_tm[i][0].slow(), self.dws_tm[i][1].slow()),
+        let slow = |place: usize| self.bank.slow(place);
+        let tm = self.places.tm.each_ref().map(|at| TestMassReadout {
+            r_orf_m: Vector3::new(slow(at.ifo_x), slow(at.is_r + 1), slow(at.is_r + 2)),
+            att_orf_rad: Vector3::new(slow(at.is_att), slow(at.dws), slow(at.dws + 1)),
         });
-        Readout { sc_crf_rad: slow3(&self.dws_sc), tm, sun_srf: None }
+        Readout { sc_crf_rad: Vector3::from_fn(|i, _| slow(self.places.dws_sc + i)), tm, sun_srf: None }
     }
 
-    /// Samples every instrument.
+    /// Goes on to the next epoch and samples every instrument.
     pub fn measure(&mut self, y: &State, rng: &mut Xoshiro256PlusPlus) -> Measured {
+        self.samples = self.bank.next(rng);
         let mut out = Measured::default();
-        for (i, tm) in y.tm.iter().enumerate() {
+        for (i, (tm, at)) in y.tm.iter().zip(&self.places.tm).enumerate() {
             let angle = rotation_vector(&tm.q_mrf_from_orf);
-            out.is_r_orf_m[i] = tm.r_orf_m + draw(&mut self.is_r[i], rng);
-            out.is_att_orf_rad[i] = angle + draw(&mut self.is_att[i], rng);
-            out.ifo_x_orf_m[i] = tm.r_orf_m.x + self.ifo_x[i].next(rng);
-            for (j, process) in self.dws_tm[i].iter_mut().enumerate() {
-                out.dws_orf_rad[i][j] = angle[j + 1] + process.next(rng);
-            }
+            out.is_r_orf_m[i] = tm.r_orf_m + self.three(at.is_r);
+            out.is_att_orf_rad[i] = angle + self.three(at.is_att);
+            out.ifo_x_orf_m[i] = tm.r_orf_m.x + self.samples[at.ifo_x];
+            out.dws_orf_rad[i] = std::array::from_fn(|j| angle[j + 1] + self.samples[at.dws + j]);
         }
-        out.dws_sc_crf_rad = y.sc_crf_rad() + draw(&mut self.dws_sc, rng);
+        out.dws_sc_crf_rad = y.sc_crf_rad() + self.three(self.places.dws_sc);
         out
     }
 
-    /// Adds a sample of every force noise to the loads; gives the fluctuation of the sunlight, N.
-    pub fn disturb(&mut self, loads: &mut Loads, rng: &mut Xoshiro256PlusPlus) -> f64 {
-        loads.force_srf_n += draw(&mut self.mps_force, rng);
-        loads.torque_srf_nm += draw(&mut self.mps_torque, rng);
-        for (i, tm) in loads.tm.iter_mut().enumerate() {
-            let TestMassLoads { force_orf_n, torque_orf_nm, acceleration_orf_m_s2, .. } = tm;
-            let [y, z] = &mut self.es_force[i];
-            *force_orf_n += Vector3::new(0.0, y.next(rng), z.next(rng));
-            *torque_orf_nm += draw(&mut self.es_torque[i], rng);
-            *acceleration_orf_m_s2 += draw(&mut self.acceleration[i], rng);
+    /// Adds the epoch's sample of every force noise to the loads; gives the fluctuation of the sunlight, N.
+    #[must_use]
+    pub fn disturb(&self, loads: &mut Loads) -> f64 {
+        loads.force_srf_n += self.three(self.places.mps_force);
+        loads.torque_srf_nm += self.three(self.places.mps_torque);
+        for (tm, at) in loads.tm.iter_mut().zip(&self.places.tm) {
+            tm.force_orf_n += Vector3::new(0.0, self.samples[at.es_force], self.samples[at.es_force + 1]);
+            tm.torque_orf_nm += self.three(at.es_torque);
+            tm.acceleration_orf_m_s2 += self.three(at.acceleration);
         }
-        self.sunlight.next(rng)
+        self.samples[self.places.sunlight]
     }
 
-    /// The states of all processes, for a checkpoint.
+    fn three(&self, place: usize) -> Vector3<f64> {
+        Vector3::from_fn(|i, _| self.samples[place + i])
+    }
+
+    /// The states of all processes, for a checkpoint between epochs.
     #[must_use]
     pub fn states(&self) -> Vec<f64> {
-        self.all().flat_map(NoiseProcess::states).collect()
+        self.bank.states()
     }
 
     /// Takes back what [`Self::states`] gave; false when the length is another mission's.
     #[must_use]
     pub fn set_states(&mut self, states: &[f64]) -> bool {
-        if states.len() != self.all().map(|p| p.states().count()).sum::<usize>() {
-            return false;
-        }
-        let slots = self.all_mut().into_iter().flat_map(|p| p.states_mut());
-        for (slot, value) in slots.zip(states) {
-            *slot = *value;
-        }
-        true
+        self.bank.set_states(states)
     }
-}
-
-fn draw(axes: &mut Axes, rng: &mut Xoshiro256PlusPlus) -> Vector3<f64> {
-    let [x, y, z] = axes;
-    Vector3::new(x.next(rng), y.next(rng), z.next(rng))
 }

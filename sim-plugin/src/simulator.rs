@@ -309,7 +309,7 @@ impl Simulator {
     }
 
     /// What truly acts over the coming sample.
-    fn loads(&mut self, command: &Command) -> Loads {
+    fn loads(&self, command: &Command) -> Loads {
         let acting = self.settings.imperfections.act(command);
         let mut loads =
             Loads { force_srf_n: acting.mps_force_srf_n, torque_srf_nm: acting.mps_torque_srf_nm, ..Loads::default() };
@@ -318,7 +318,7 @@ impl Simulator {
             load.torque_orf_nm = acting.tm[i].torque_orf_nm;
             (load.acceleration_orf_m_s2, load.angular_acceleration_orf_rad_s2) = self.self_gravity[i];
         }
-        let flicker_n = self.noises.disturb(&mut loads, &mut self.rng);
+        let flicker_n = self.noises.disturb(&mut loads);
         if let Some((force_n, arm)) = &self.sunlight {
             // eq:SRP_transfer_function and eq:SRP_torque; the printed matrix is the arm's cross product.
             let force = turn(&self.state.q_srf_from_crf, &self.environment.sun_crf) * (force_n + flicker_n);

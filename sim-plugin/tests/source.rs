@@ -158,6 +158,19 @@ fn what_has_no_sense_is_refused_by_name() {
         ("spacecraft.mass_kg", refusal(&|m, _| m["spacecraft"]["mass_kg"] = json!(0.0))),
         ("symmetric", refusal(&|m, _| m["spacecraft"]["inertia_srf_kg_m2"][0][1] = json!(99.0))),
         ("test_mass.tm1.mass_kg", refusal(&|m, _| m["test_mass"]["tm1"]["mass_kg"] = json!(0.0))),
+        ("noise.is_y.asd_m_rthz = -1", refusal(&|m, _| m["noise"]["is_y"]["asd_m_rthz"] = json!(-1.0))),
+        (
+            "noise.is_y.lines.amplitude_m",
+            refusal(&|m, _| {
+                m["noise"]["is_y"]["lines"] = json!([{ "amplitude_m": -1e-9, "frequency_hz": 0.1 }]);
+            }),
+        ),
+        (
+            "noise.is_y.lines.frequency_hz = 5",
+            refusal(&|m, _| {
+                m["noise"]["is_y"]["lines"] = json!([{ "amplitude_m": 1e-9, "frequency_hz": 5.0 }]);
+            }),
+        ),
         ("[test_mass.tm2]", refusal(&|m, _| drop(m["test_mass"].as_object_mut().unwrap().remove("tm2")))),
         ("[noise.dws_local]", refusal(&|m, _| drop(m["noise"].as_object_mut().unwrap().remove("dws_local")))),
         ("[requirements]", refusal(&|m, _| drop(m.as_object_mut().unwrap().remove("requirements")))),

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 use crate::frames::dcm_turned_about_z;
-use crate::noise::{NoiseShape, NoiseTerm};
+use crate::noise::{NoiseLine, NoiseShape, NoiseTerm};
 
 /// Why a mission file was refused: what, where, and what to do next.
 #[derive(Debug, thiserror::Error)]
@@ -136,7 +136,7 @@ pub struct Housing {
     pub baseline_tolerance_m: f64,
 }
 
-/// `[noise]`: one table per process, `a·sqrt(1+(corner/f)^exponent)` plus optional further terms.
+/// `[noise]`: one table per process, `a·sqrt(1+(corner/f)^exponent)` plus optional further terms and lines.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Noise {
@@ -173,7 +173,7 @@ pub struct Noise {
 }
 
 macro_rules! noise_table {
-    ($(#[$doc:meta])* $name:ident, $term:ident, $key:ident, $unit:literal) => {
+    ($(#[$doc:meta])* $name:ident, $term:ident, $key:ident, $line:ident, $amplitude:ident, $unit:literal) => {
         $(#[$doc])*
         #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
         #[serde(deny_unknown_fields)]
@@ -189,6 +189,9 @@ macro_rules! noise_table {
             /// Further terms that add to the PSD.
             #[serde(default)]
             pub terms: Vec<$term>,
+            /// Sines of random phase on top of it.
+            #[serde(default, skip_serializing_if = "Vec::is_empty")]
+            pub lines: Vec<$line>,
         }
 
         /// A further term of the PSD, `asd² (corner/f)^exponent`.
@@ -203,7 +206,24 @@ macro_rules! noise_table {
             pub exponent: u32,
         }
 
+        /// A sine of random phase.
+        #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+        #[serde(deny_unknown_fields)]
+        pub struct $line {
+            #[doc = concat!("Amplitude, ", $unit, ".")]
+            pub $amplitude: f64,
+            /// Frequency, Hz.
+            pub frequency_hz: f64,
+        }
+
         impl $name {
+            /// The lines without their unit.
+            #[must_use]
+            pub fn lines(&self) -> Vec<NoiseLine> {
+                let line = |l: &$line| NoiseLine { amplitude: l.$amplitude, frequency_hz: l.frequency_hz };
+                self.lines.iter().map(line).collect()
+            }
+
             /// The shape without its unit.
             #[must_use]
             pub fn shape(&self) -> NoiseShape {
@@ -216,7 +236,15 @@ macro_rules! noise_table {
                 shape
             }
 
-            fn check(&self, key: &str) -> Result<(), MissionError> {
+            fn check(&self, key: &str, sample_rate_hz: f64) -> Result<(), MissionError> {
+                for line in &self.lines {
+                    positive_or_zero(&format!("{key}.lines.{}", stringify!($amplitude)), line.$amplitude)?;
+                    let frequency = format!("{key}.lines.frequency_hz");
+                    positive(&frequency, line.frequency_hz)?;
+                    if line.frequency_hz >= 0.5 * sample_rate_hz {
+                        return Err(value_error(&frequency, &line.frequency_hz, "must lie below half the sample rate"));
+                    }
+                }
                 let all = std::iter::once((self.$key, self.corner_hz, self.exponent))
                     .chain(self.terms.iter().map(|t| (t.$key, t.corner_hz, t.exponent)));
                 for (asd, corner_hz, exponent) in all {
@@ -238,27 +266,27 @@ macro_rules! noise_table {
 
 noise_table!(
     /// Noise of a displacement readout.
-    DisplacementNoise, DisplacementTerm, asd_m_rthz, "m"
+    DisplacementNoise, DisplacementTerm, asd_m_rthz, DisplacementLine, amplitude_m, "m"
 );
 noise_table!(
     /// Noise of an angle readout.
-    AngleNoise, AngleTerm, asd_rad_rthz, "rad"
+    AngleNoise, AngleTerm, asd_rad_rthz, AngleLine, amplitude_rad, "rad"
 );
 noise_table!(
     /// Noise of a force.
-    ForceNoise, ForceTerm, asd_n_rthz, "N"
+    ForceNoise, ForceTerm, asd_n_rthz, ForceLine, amplitude_n, "N"
 );
 noise_table!(
     /// Noise of a torque.
-    TorqueNoise, TorqueTerm, asd_nm_rthz, "N m"
+    TorqueNoise, TorqueTerm, asd_nm_rthz, TorqueLine, amplitude_nm, "N m"
 );
 noise_table!(
     /// Noise of an acceleration.
-    AccelerationNoise, AccelerationTerm, asd_m_s2_rthz, "m s⁻²"
+    AccelerationNoise, AccelerationTerm, asd_m_s2_rthz, AccelerationLine, amplitude_m_s2, "m s⁻²"
 );
 noise_table!(
     /// Noise of an angular acceleration.
-    AngularAccelerationNoise, AngularAccelerationTerm, asd_rad_s2_rthz, "rad s⁻²"
+    AngularAccelerationNoise, AngularAccelerationTerm, asd_rad_s2_rthz, AngularAccelerationLine, amplitude_rad_s2, "rad s⁻²"
 );
 
 /// `[solar_pressure]` (eqs SRP_transfer_function and SRP_torque).
@@ -427,7 +455,7 @@ impl Mission {
         if let Some(h) = &self.housing {
             positive("housing.baseline_tolerance_m", h.baseline_tolerance_m)?;
         }
-        self.noise.check()?;
+        self.noise.check(self.mission.sample_rate_hz)?;
         if let Some(s) = &self.solar_pressure {
             positive_or_zero("solar_pressure.force_n", s.force_n)?;
             positive_or_zero("solar_pressure.orbit_error_m", s.orbit_error_m)?;
@@ -586,8 +614,8 @@ pub const CHANNELS: [&str; 15] = [
 ];
 
 impl Noise {
-    fn check(&self) -> Result<(), MissionError> {
-        macro_rules! check { ($($name:ident),*) => { $(if let Some(n) = &self.$name { n.check(concat!("noise.", stringify!($name)))?; })* } }
+    fn check(&self, sample_rate_hz: f64) -> Result<(), MissionError> {
+        macro_rules! check { ($($name:ident),*) => { $(if let Some(n) = &self.$name { n.check(concat!("noise.", stringify!($name)), sample_rate_hz)?; })* } }
         check!(
             ifo_x,
             is_x,

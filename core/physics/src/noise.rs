@@ -13,6 +13,23 @@ pub struct NoiseTerm {
     pub exponent: u32,
 }
 
+impl NoiseTerm {
+    /// States of a shaping filter of this term.
+    #[must_use]
+    pub fn states(&self) -> usize {
+        self.exponent as usize / 2
+    }
+}
+
+/// A line of a spectrum: a sine of random phase.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NoiseLine {
+    /// Amplitude, unit.
+    pub amplitude: f64,
+    /// Frequency, Hz.
+    pub frequency_hz: f64,
+}
+
 /// A one-sided power spectral density as a sum of independent terms, unit²/Hz.
 ///
 /// `a·sqrt(1+(f0/f)^p)` is the sum of white noise of ASD `a` and a term of exponent `p`, exactly: the two are
