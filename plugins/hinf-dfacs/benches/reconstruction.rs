@@ -34,6 +34,7 @@ fn stage(criterion: &mut Criterion) {
                         readout: [wiggle; 15],
                         command: [wiggle; 18],
                         sun_srf: Vector3::x(),
+                        ephemeris_age_s: f64::NAN,
                         omega_crf_rad_s: Vector3::z() * 2e-7,
                         alpha_crf_rad_s2: Vector3::zeros(),
                     };

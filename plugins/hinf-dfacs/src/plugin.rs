@@ -33,6 +33,7 @@ struct Linked {
     readout: [Option<In>; 15],
     command: Option<[In; 18]>,
     sun: Option<[In; 3]>,
+    ephemeris_age: Option<In>,
     omega_crf: Option<[In; 3]>,
     alpha_crf: Option<[In; 3]>,
     table: Table,
@@ -188,6 +189,7 @@ impl Linked {
             readout: std::array::from_fn(|i| input.readout[i].map_or(f64::NAN, |column| column[k])),
             command: std::array::from_fn(|i| input.command.map_or(f64::NAN, |columns| columns[i][k])),
             sun_srf: vector(&input.sun),
+            ephemeris_age_s: input.ephemeris_age.map_or(f64::NAN, |column| column[k]),
             omega_crf_rad_s: vector(&input.omega_crf),
             alpha_crf_rad_s2: vector(&input.alpha_crf),
         }
@@ -208,6 +210,7 @@ struct Columns<'a> {
     readout: [Option<&'a [f64]>; 15],
     command: Option<[&'a [f64]; 18]>,
     sun: Option<[&'a [f64]; 3]>,
+    ephemeris_age: Option<&'a [f64]>,
     omega_crf: Option<[&'a [f64]; 3]>,
     alpha_crf: Option<[&'a [f64]; 3]>,
 }
@@ -220,6 +223,7 @@ impl<'a> Columns<'a> {
             readout: linked.readout.map(|c| c.map(|c| input.f64(c))),
             command: linked.command.map(|c| c.map(|c| input.f64(c))),
             sun: vector(&linked.sun),
+            ephemeris_age: linked.ephemeris_age.map(|c| input.f64(c)),
             omega_crf: vector(&linked.omega_crf),
             alpha_crf: vector(&linked.alpha_crf),
         }
@@ -279,6 +283,7 @@ impl Stage for HinfDfacs {
         let (readout, noise_x) = self.link_readouts(available, link)?;
         let command = Self::link_commands(available, link)?;
         let sun = read_vector(available, link, "ephemeris.sun_srf", "1", "SRF")?;
+        let ephemeris_age = link.read_if_available(available, &grid("ephemeris.age_s", "s", ""))?;
         let omega_crf = read_vector(available, link, "ephemeris.omega_crf_rad_s", "rad s-1", "CRF")?;
         let alpha_crf = read_vector(available, link, "ephemeris.alpha_crf_rad_s2", "rad s-2", "CRF")?;
         if sun.is_none() && self.mission.solar_pressure.is_some() {
@@ -311,6 +316,7 @@ impl Stage for HinfDfacs {
             readout,
             command,
             sun,
+            ephemeris_age,
             omega_crf,
             alpha_crf,
             table,
@@ -413,7 +419,8 @@ impl Stage for HinfDfacs {
     }
 }
 
-/// `{"samples", "rms_distance": {vector: value}, "rms_change_of_flown": {…}}`, N and N m.
+/// `{"samples", "rms_distance": {vector: value}, "mean_distance": {…}, "rms_flown": {…}, "rms_change_of_flown": {…}}`, N and
+/// N m.
 fn comparison_json(comparison: &Comparison) -> serde_json::Value {
     let by_vector = |values: [f64; 6]| {
         let pairs = COMMAND_VECTORS.iter().zip(values).map(|((name, _, _), value)| ((*name).to_owned(), json!(value)));
@@ -422,6 +429,8 @@ fn comparison_json(comparison: &Comparison) -> serde_json::Value {
     json!({
         "samples": comparison.samples(),
         "rms_distance": by_vector(comparison.rms_distance()),
+        "mean_distance": by_vector(comparison.mean_distance()),
+        "rms_flown": by_vector(comparison.rms_flown()),
         "rms_change_of_flown": by_vector(comparison.rms_change()),
     })
 }

@@ -51,6 +51,8 @@ pub struct Epoch {
     pub command: CommandNumbers,
     /// Unit vector from the Sun to the spacecraft, SRF.
     pub sun_srf: Vector3<f64>,
+    /// How old the latest packet of the ephemeris is, s; NaN where nobody tells.
+    pub ephemeris_age_s: f64,
     /// `ω_CI`, CRF, rad s⁻¹.
     pub omega_crf_rad_s: Vector3<f64>,
     /// `ω̇_CI`, CRF, rad s⁻².
@@ -138,7 +140,9 @@ pub struct Reconstruction {
     lag: usize,
     replay: Option<Replay>,
     held: Held,
+    /// At the epoch, and as the last packet told it: on board the feed-forward holds the packet.
     sun_srf: Option<Vector3<f64>>,
+    packet_sun_srf: Option<Vector3<f64>>,
     omega_ci_rad_s: Vector3<f64>,
     alpha_ci_rad_s2: Vector3<f64>,
     pending: Vec<Pending>,
@@ -191,6 +195,7 @@ impl Reconstruction {
             replay,
             held: Held::new(),
             sun_srf: None,
+            packet_sun_srf: None,
             omega_ci_rad_s: Vector3::zeros(),
             alpha_ci_rad_s2: Vector3::zeros(),
             pending: Vec::new(),
@@ -211,6 +216,10 @@ impl Reconstruction {
         self.held.take(&epoch.readout);
         // The ephemeris comes once a minute; what it tells moves by 1e-5 in that time.
         self.sun_srf = finite(&epoch.sun_srf).or(self.sun_srf);
+        let held = epoch.ephemeris_age_s >= 1.0 / self.rate_hz && self.packet_sun_srf.is_some();
+        if !held {
+            self.packet_sun_srf = self.sun_srf;
+        }
         self.omega_ci_rad_s = finite(&epoch.omega_crf_rad_s).unwrap_or(self.omega_ci_rad_s);
         self.alpha_ci_rad_s2 = finite(&epoch.alpha_crf_rad_s2).unwrap_or(self.alpha_ci_rad_s2);
 
@@ -250,7 +259,7 @@ impl Reconstruction {
     ) -> Result<Option<KnownMotion>, StateError> {
         let flown = epoch.command.iter().all(|x| x.is_finite()).then_some(&epoch.command);
         let replayed = match &mut self.replay {
-            Some(replay) => replay.step(&self.held, self.sun_srf, flown)?,
+            Some(replay) => replay.step(&self.held, self.packet_sun_srf, flown)?,
             None => None,
         };
         let counter = match (flown, &replayed) {
@@ -354,6 +363,7 @@ impl Reconstruction {
         self.smoother.save(&mut out);
         self.held.save(&mut out);
         out.optional(self.sun_srf.as_ref().map(Vector3::as_slice));
+        out.optional(self.packet_sun_srf.as_ref().map(Vector3::as_slice));
         out.numbers(self.omega_ci_rad_s.as_slice());
         out.numbers(self.alpha_ci_rad_s2.as_slice());
         if let Some(replay) = &self.replay {
@@ -390,6 +400,7 @@ impl Reconstruction {
         self.smoother.load(&mut state)?;
         self.held.load(&mut state)?;
         self.sun_srf = state.optional()?.map(Vector3::from);
+        self.packet_sun_srf = state.optional()?.map(Vector3::from);
         state.numbers(self.omega_ci_rad_s.as_mut_slice())?;
         state.numbers(self.alpha_ci_rad_s2.as_mut_slice())?;
         if let Some(replay) = &mut self.replay {

@@ -110,6 +110,7 @@ pub struct Comparison {
     samples_of_mean: u64,
     mean: CommandNumbers,
     squares: CommandNumbers,
+    flown_squares: CommandNumbers,
     changes: u64,
     change_squares: CommandNumbers,
     previous: Option<CommandNumbers>,
@@ -124,6 +125,7 @@ impl Comparison {
             let step = difference - self.mean[i];
             self.mean[i] += step / self.samples_of_mean as f64;
             self.squares[i] += step * (difference - self.mean[i]);
+            self.flown_squares[i] += flown[i] * flown[i];
         }
         if let Some(previous) = self.previous.replace(*flown) {
             self.changes += 1;
@@ -151,6 +153,19 @@ impl Comparison {
         rms(&self.squares, self.samples)
     }
 
+    /// Length of the mean difference of each of [`COMMAND_VECTORS`] since the last restart, N or N m: what a constant in the
+    /// flown controllers' integrators amounts to.
+    #[must_use]
+    pub fn mean_distance(&self) -> [f64; 6] {
+        std::array::from_fn(|i| self.mean[3 * i..3 * i + 3].iter().map(|m| m * m).sum::<f64>().sqrt())
+    }
+
+    /// Root mean square length of the flown command, N or N m.
+    #[must_use]
+    pub fn rms_flown(&self) -> [f64; 6] {
+        rms(&self.flown_squares, self.samples)
+    }
+
     /// Root mean square length of the flown command's change from one sample to the next, N or N m.
     #[must_use]
     pub fn rms_change(&self) -> [f64; 6] {
@@ -168,6 +183,7 @@ impl Comparison {
         out.count(self.samples_of_mean);
         out.numbers(&self.mean);
         out.numbers(&self.squares);
+        out.numbers(&self.flown_squares);
         out.count(self.changes);
         out.numbers(&self.change_squares);
         out.optional(self.previous.as_ref().map(<[f64; 18]>::as_slice));
@@ -178,6 +194,7 @@ impl Comparison {
         self.samples_of_mean = state.count()?;
         state.numbers(&mut self.mean)?;
         state.numbers(&mut self.squares)?;
+        state.numbers(&mut self.flown_squares)?;
         self.changes = state.count()?;
         state.numbers(&mut self.change_squares)?;
         self.previous = state.optional()?;

@@ -51,6 +51,8 @@ pub(crate) trait Sink {
     fn times(&mut self) -> &mut Vec<i64>;
     /// Values of a column of a table.
     fn column(&mut self, table: usize, column: usize) -> &mut Vec<f64>;
+    /// How old the latest row of a table is at each epoch, s, where somebody wants to know.
+    fn age(&mut self, table: usize) -> Option<&mut Vec<f64>>;
 }
 
 /// A run of equal samples of one column.
@@ -680,6 +682,10 @@ impl Gridder {
                     for (c, cells) in fast.cells.iter().enumerate() {
                         sink.column(table, c).extend_from_slice(&cells.as_slice()[window.clone()]);
                     }
+                    if let (Some(age), Some(cells)) = (sink.age(table), fast.cells.first()) {
+                        let there = |v: &f64| if v.is_nan() { f64::NAN } else { 0.0 };
+                        age.extend(cells.as_slice()[window.clone()].iter().map(there));
+                    }
                 }
                 Class::Slow(interval) => {
                     let interval = *interval;
@@ -730,6 +736,12 @@ impl Gridder {
                 Some((at, weight)) if weight > 0.0 && !spec.flag => values[at] + (values[at + 1] - values[at]) * weight,
                 Some((at, _)) => values[at],
             }));
+        }
+        if let Some(age) = sink.age(table) {
+            let since = |(epoch, w): (&i64, &Option<(usize, f64)>)| {
+                w.map_or(f64::NAN, |(at, _)| (epoch - times[at]) as f64 * 1e-9)
+            };
+            age.extend(epochs.iter().zip(&weights).map(since));
         }
         series.tally.rows_placed += at as u64;
         series.drop_front(at);

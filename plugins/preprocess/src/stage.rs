@@ -18,6 +18,8 @@ pub struct Preprocess {
     config: Config,
     /// Per table the columns read and the columns written.
     tables: Vec<(Vec<In>, Vec<Out>)>,
+    /// The table of `/ephemeris` and the column of its age: on board, the last packet is held.
+    age: Option<(usize, Out)>,
     grid: Option<Table>,
     gridder: Option<Gridder>,
 }
@@ -27,6 +29,7 @@ struct Host<'a> {
     output: &'a mut Outputs,
     grid: Table,
     tables: &'a [(Vec<In>, Vec<Out>)],
+    age: Option<(usize, Out)>,
 }
 
 impl Sink for Host<'_> {
@@ -35,6 +38,10 @@ impl Sink for Host<'_> {
     }
     fn column(&mut self, table: usize, column: usize) -> &mut Vec<f64> {
         self.output.f64(self.tables[table].1[column])
+    }
+    fn age(&mut self, table: usize) -> Option<&mut Vec<f64>> {
+        let (_, out) = self.age.filter(|(of, _)| *of == table)?;
+        Some(self.output.f64(out))
     }
 }
 
@@ -102,7 +109,7 @@ impl Stage for Preprocess {
             hold_intervals: setup.f64("hold_intervals")?,
             max_gap_s: setup.f64("max_gap_s")?,
         };
-        Ok(Self { mission, mandatory, config, tables: Vec::new(), grid: None, gridder: None })
+        Ok(Self { mission, mandatory, config, tables: Vec::new(), age: None, grid: None, gridder: None })
     }
 
     fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
@@ -142,6 +149,9 @@ impl Stage for Preprocess {
                 let name = grid_name(name, &column.name, measured == 1);
                 outs.push(link.write_with(grid, &name, &column.unit, &column.frame, &attributes)?);
             }
+            if *name == "ephemeris" {
+                self.age = Some((specs.len(), link.write(grid, "ephemeris.age_s", "s", "")?));
+            }
             specs.push(table_spec(name, columns, mandatory, &test_masses, self.mission.limits.as_ref()));
             self.tables.push((ins, outs));
         }
@@ -159,13 +169,13 @@ impl Stage for Preprocess {
             columns.extend(ins.iter().map(|i| input.f64(*i)));
             gridder.take(table, input.times_of(*first), &columns);
         }
-        gridder.advance(input.complete_until_ns(), &mut Host { output, grid, tables: &self.tables });
+        gridder.advance(input.complete_until_ns(), &mut Host { output, grid, tables: &self.tables, age: self.age });
         Ok(())
     }
 
     fn flush(&mut self, output: &mut Outputs) -> Result<(), PluginError> {
         let (Some(gridder), Some(grid)) = (&mut self.gridder, self.grid) else { return Err(not_linked()) };
-        gridder.flush(&mut Host { output, grid, tables: &self.tables });
+        gridder.flush(&mut Host { output, grid, tables: &self.tables, age: self.age });
         Ok(())
     }
 

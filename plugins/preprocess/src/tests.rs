@@ -56,6 +56,7 @@ fn spec(t: &Telemetry) -> TableSpec {
 struct Grid {
     times: Vec<i64>,
     tables: Vec<Vec<Vec<f64>>>,
+    ages: Vec<Vec<f64>>,
     largest_call: usize,
 }
 
@@ -65,6 +66,9 @@ impl Sink for Grid {
     }
     fn column(&mut self, table: usize, column: usize) -> &mut Vec<f64> {
         &mut self.tables[table][column]
+    }
+    fn age(&mut self, table: usize) -> Option<&mut Vec<f64>> {
+        self.ages.get_mut(table)
     }
 }
 
@@ -80,8 +84,11 @@ impl Grid {
 /// latest time so far falls.
 fn run_with(tables: &[Telemetry], config: &Config, piece: usize, restore: impl Fn(usize) -> bool) -> (Grid, Gridder) {
     let mut gridder = Gridder::new(config.clone(), tables.iter().map(spec).collect());
-    let mut grid =
-        Grid { tables: tables.iter().map(|t| vec![Vec::new(); t.columns.len()]).collect(), ..Grid::default() };
+    let mut grid = Grid {
+        tables: tables.iter().map(|t| vec![Vec::new(); t.columns.len()]).collect(),
+        ages: vec![Vec::new(); tables.len()],
+        ..Grid::default()
+    };
     let mut cuts: Vec<i64> = tables[0].rows.iter().skip(piece).step_by(piece).map(|r| r.0).collect();
     let mut latest = i64::MIN;
     cuts.retain(|t| {
@@ -116,7 +123,7 @@ fn run_with(tables: &[Telemetry], config: &Config, piece: usize, restore: impl F
         }
     }
     gridder.flush(&mut grid);
-    for column in grid.tables.iter().flatten() {
+    for column in grid.tables.iter().flatten().chain(&grid.ages) {
         assert_eq!(column.len(), grid.times.len());
     }
     assert!(grid.times.windows(2).all(|w| w[0] < w[1]));
@@ -328,6 +335,12 @@ fn slow_telemetry_is_interpolated_held_and_given_up() {
             _ => assert_eq!(*v, 890.0),
         }
     }
+    // The age of the row that is the latest: 0 at a row, growing across a missing one.
+    let age = &grid.ages[2];
+    for (second, want) in [(0.0, 0.0), (9.9, 9.9), (10.0, 0.0), (305.0, 15.0), (615.0, 15.0), (700.0, 0.0)] {
+        assert!((age[(second * 10.0) as usize] - want).abs() < 1e-6, "{second} s: {}", age[(second * 10.0) as usize]);
+    }
+    assert!(age[6_500].is_nan() && grid.ages[0].iter().all(|a| *a == 0.0));
     // A flag is never between two values; a raised one blanks what it covers.
     assert!(grid.tables[3][1].iter().all(|v| v.is_nan() || v.fract() == 0.0));
     assert!(grid.tables[3][0][..900].iter().all(|v| !v.is_nan()) && grid.tables[3][0][1_000].is_nan());

@@ -10,8 +10,10 @@ fn the_grid_names_every_column_and_keeps_unit_frame_and_attributes() {
     let columns = columns(&topics());
     let (_stage, linked) = link(&library(), &columns).unwrap();
     let grid = &linked.writes[0];
-    assert_eq!((grid.name.as_str(), grid.rate_hz, grid.columns.len()), ("grid", 10.0, columns.len()));
-    for (read, written) in columns.iter().zip(&grid.columns) {
+    // One column is our own: how old the packet is that the spacecraft holds.
+    assert_eq!((grid.name.as_str(), grid.rate_hz, grid.columns.len()), ("grid", 10.0, columns.len() + 1));
+    assert!(grid.columns.iter().any(|c| c.name == "ephemeris.age_s" && c.unit == "s"));
+    for (read, written) in columns.iter().zip(grid.columns.iter().filter(|c| c.name != "ephemeris.age_s")) {
         assert_eq!((&read.unit, &read.frame), (&written.unit, &written.frame));
     }
     let names: Vec<&str> = grid.columns.iter().map(|c| c.name.as_str()).collect();

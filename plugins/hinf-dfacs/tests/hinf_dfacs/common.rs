@@ -74,6 +74,7 @@ impl AttitudeLoop {
             readout,
             command: numbers(&command),
             sun_srf: missing,
+            ephemeris_age_s: f64::NAN,
             omega_crf_rad_s: missing,
             alpha_crf_rad_s2: missing,
         };

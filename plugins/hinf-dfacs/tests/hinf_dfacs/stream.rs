@@ -255,6 +255,7 @@ fn the_turning_of_the_constellation_is_added() {
                 readout,
                 command: [0.0; 18],
                 sun_srf: Vector3::from_element(f64::NAN),
+                ephemeris_age_s: f64::NAN,
                 // Once a minute; held in between.
                 omega_crf_rad_s: if k % 600 == 0 { omega_crf } else { Vector3::from_element(f64::NAN) },
                 alpha_crf_rad_s2: if k % 600 == 0 { alpha_crf } else { Vector3::from_element(f64::NAN) },
