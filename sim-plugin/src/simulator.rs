@@ -329,6 +329,9 @@ impl Simulator {
     }
 
     fn check(&self) -> Result<(), SimulationError> {
+        if self.state.is_within(LOST_M, LOST_RAD) {
+            return Ok(());
+        }
         let worst =
             |v: &Vector3<f64>, limit: f64| (0..3).find(|i| v[*i].is_nan() || v[*i].abs() > limit).map(|i| (i, v[i]));
         let lost = |what: String, value: f64, unit: &'static str| SimulationError::Diverged {

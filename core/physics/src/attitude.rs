@@ -7,6 +7,7 @@ use crate::frames::skew;
 
 /// Components in the body frame from components in the parent frame, `T_A^B`:
 /// `1 − 2w[v×] + 2[v×]²`, which keeps the full precision of small angles.
+#[inline]
 #[must_use]
 pub fn dcm(q: &Quaternion<f64>) -> Matrix3<f64> {
     let v = skew(&q.imag());
@@ -14,6 +15,7 @@ pub fn dcm(q: &Quaternion<f64>) -> Matrix3<f64> {
 }
 
 /// `dcm(q) v`, without the matrix: `v − 2w u×v + 2 u×(u×v)`.
+#[inline]
 #[must_use]
 pub fn turn(q: &Quaternion<f64>, v: &Vector3<f64>) -> Vector3<f64> {
     let u = q.imag();
@@ -22,6 +24,7 @@ pub fn turn(q: &Quaternion<f64>, v: &Vector3<f64>) -> Vector3<f64> {
 }
 
 /// Quaternion of a rotation vector, rad.
+#[inline]
 #[must_use]
 pub fn from_rotation_vector(angle_rad: &Vector3<f64>) -> Quaternion<f64> {
     let half = 0.5 * angle_rad.norm();
@@ -31,6 +34,7 @@ pub fn from_rotation_vector(angle_rad: &Vector3<f64>) -> Quaternion<f64> {
 }
 
 /// Rotation vector of a unit quaternion, rad: for small angles the rotations about axes 1, 2, 3 of the body frame.
+#[inline]
 #[must_use]
 pub fn rotation_vector(q: &Quaternion<f64>) -> Vector3<f64> {
     let (v, w) = if q.w < 0.0 { (-q.imag(), -q.w) } else { (q.imag(), q.w) };
@@ -39,10 +43,21 @@ pub fn rotation_vector(q: &Quaternion<f64>) -> Vector3<f64> {
     v * factor
 }
 
-/// `q̇ = ½ q ⊗ (0, ω)` with `ω` of the body frame relative to the parent frame, in the body frame, rad/s.
+/// `q̇ = ½(q ⊗ ω_body − ω_parent ⊗ q)` with both rates against the same third frame, rad/s: `body` in the body frame,
+/// `parent` in the parent frame.
+#[inline]
 #[must_use]
-pub fn derivative(q: &Quaternion<f64>, omega_rad_s: &Vector3<f64>) -> Quaternion<f64> {
-    q * Quaternion::from_imag(omega_rad_s * 0.5)
+pub fn derivative(q: &Quaternion<f64>, body: &Vector3<f64>, parent: &Vector3<f64>) -> Quaternion<f64> {
+    let (u, difference) = (q.imag(), body - parent);
+    let imag = difference * q.w + u.cross(&(body + parent));
+    Quaternion::from_parts(-0.5 * u.dot(&difference), imag * 0.5)
+}
+
+/// A quaternion whose length is one to within `ε`, made one to within `ε²`.
+#[inline]
+#[must_use]
+pub fn unit(q: &Quaternion<f64>) -> Quaternion<f64> {
+    q * (1.5 - 0.5 * q.norm_squared())
 }
 
 #[cfg(test)]
@@ -68,14 +83,22 @@ mod tests {
         }
     }
 
-    /// The derivative against a difference of two turns about the body's axes.
+    /// The derivative against a difference of turns, of the body about its axes and of the parent about its own.
     #[test]
-    fn derivative_turns_about_the_body_axes() {
+    fn derivative_turns_body_and_parent() {
         let q = from_rotation_vector(&Vector3::new(0.4, 0.2, -0.9));
-        let omega = Vector3::new(0.3, -0.2, 0.5);
+        let (body, parent) = (Vector3::new(0.3, -0.2, 0.5), Vector3::new(-0.1, 0.4, 0.2));
         let h = 1e-6;
-        let turned = |h: f64| q * from_rotation_vector(&(omega * h));
+        let turned = |h: f64| from_rotation_vector(&(parent * h)).conjugate() * q * from_rotation_vector(&(body * h));
         let numeric = (turned(h) - turned(-h)) / (2.0 * h);
-        assert!((numeric - derivative(&q, &omega)).norm() < 1e-9);
+        assert!((numeric - derivative(&q, &body, &parent)).norm() < 1e-9);
+    }
+
+    #[test]
+    fn a_length_near_one_is_made_one() {
+        let q = from_rotation_vector(&Vector3::new(0.4, 0.2, -0.9));
+        let error = unit(&(q * (1.0 + 1e-4))).norm() - 1.0;
+        // (1+ε)(1.5 − 0.5(1+ε)²) = 1 − 1.5 ε² + …
+        assert!((error / -1.5e-8 - 1.0).abs() < 1e-3, "{error}");
     }
 }

@@ -8,7 +8,7 @@ use nalgebra::Vector3;
 use std::collections::VecDeque;
 
 use crate::control_design::loop_shaping;
-use crate::decoupling::{AllocationMatrix, InputVector, LinearPlant};
+use crate::decoupling::{Accelerations, AllocationMatrix, InputVector, LinearPlant};
 use crate::mission::{Actuators, CHANNELS, ChannelController, Control, Mission, MissionError};
 
 const NEEDED_BY: &str = "the control law";
@@ -92,28 +92,64 @@ impl Command {
     }
 }
 
-/// One channel's controller with the states of its sections (direct form II transposed).
-struct Channel {
-    controller: ChannelController,
-    states: Vec<[f64; 2]>,
+const WIDTH: usize = CHANNELS.len();
+
+/// The `n`-th second-order section of every channel (direct form II transposed), arrays over the channels.
+struct Sections {
+    b: [[f64; WIDTH]; 3],
+    a: [[f64; WIDTH]; 2],
+    states: [[f64; WIDTH]; 2],
 }
 
-impl Channel {
-    fn new(controller: ChannelController) -> Self {
-        let states = vec![[0.0; 2]; controller.sections.len()];
-        Self { controller, states }
+impl Sections {
+    /// A channel that has no such section hands its input on.
+    fn new(controllers: &[&ChannelController; WIDTH], n: usize) -> Self {
+        const UNIT: [f64; 5] = [1.0, 0.0, 0.0, 0.0, 0.0];
+        let of =
+            |coefficient: usize| std::array::from_fn(|c| controllers[c].sections.get(n).unwrap_or(&UNIT)[coefficient]);
+        Self { b: [of(0), of(1), of(2)], a: [of(3), of(4)], states: [[0.0; WIDTH]; 2] }
     }
 
-    /// `u_d = −gain · H(z) y`.
-    fn step(&mut self, y: f64) -> f64 {
-        let mut x = y;
-        for ([b0, b1, b2, a1, a2], s) in self.controller.sections.iter().zip(&mut self.states) {
-            let out = b0 * x + s[0];
-            s[0] = b1 * x - a1 * out + s[1];
-            s[1] = b2 * x - a2 * out;
-            x = out;
+    fn step(&mut self, x: &mut [f64; WIDTH]) {
+        let ([b0, b1, b2], [a1, a2], [s0, s1]) = (&self.b, &self.a, &mut self.states);
+        for c in 0..WIDTH {
+            let out = b0[c] * x[c] + s0[c];
+            s0[c] = b1[c] * x[c] - a1[c] * out + s1[c];
+            s1[c] = b2[c] * x[c] - a2[c] * out;
+            x[c] = out;
         }
-        -self.controller.gain_s2 * x
+    }
+}
+
+/// The controllers of all channels.
+struct Controllers {
+    gain_s2: [f64; WIDTH],
+    sections: Vec<Sections>,
+}
+
+impl Controllers {
+    fn new(controllers: &[&ChannelController; WIDTH]) -> Self {
+        let longest = controllers.iter().map(|c| c.sections.len()).max().unwrap_or(0);
+        Self {
+            gain_s2: controllers.map(|c| c.gain_s2),
+            sections: (0..longest).map(|n| Sections::new(controllers, n)).collect(),
+        }
+    }
+
+    /// `u_d = −gain · H(z) y`, channel by channel.
+    fn step(&mut self, mut y: [f64; WIDTH]) -> Accelerations {
+        for sections in &mut self.sections {
+            sections.step(&mut y);
+        }
+        Accelerations::from_fn(|c, _| -self.gain_s2[c] * y[c])
+    }
+
+    fn states(&self) -> impl Iterator<Item = &f64> {
+        self.sections.iter().flat_map(|s| s.states.iter().flatten())
+    }
+
+    fn states_mut(&mut self) -> impl Iterator<Item = &mut f64> {
+        self.sections.iter_mut().flat_map(|s| s.states.iter_mut().flatten())
     }
 }
 
@@ -131,7 +167,7 @@ pub struct StateError {
 pub struct ControlLaw {
     plant: LinearPlant,
     allocation: AllocationMatrix,
-    channels: Vec<Channel>,
+    controllers: Controllers,
     limits: Option<Actuators>,
     /// `k_dSC`, N, and the arm of the force, SRF, m.
     sunlight: Option<(f64, Vector3<f64>)>,
@@ -153,21 +189,20 @@ impl ControlLaw {
                 Control { delay_samples, lever_feed_forward, channel: loop_shaping(mission)? }
             }
         };
-        let channels = CHANNELS
-            .iter()
-            .map(|name| {
-                control.channel.get(*name).map(|c| Channel::new(c.clone())).ok_or_else(|| MissionError::Missing {
-                    section: format!("control.channel.\"{name}\""),
-                    needed_by: NEEDED_BY,
-                })
+        let channel = |name: &&str| {
+            control.channel.get(*name).ok_or_else(|| MissionError::Missing {
+                section: format!("control.channel.\"{name}\""),
+                needed_by: NEEDED_BY,
             })
-            .collect::<Result<Vec<_>, _>>()?;
+        };
+        let channels = CHANNELS.iter().map(channel).collect::<Result<Vec<_>, _>>()?;
+        let controllers = Controllers::new(&std::array::from_fn(|c| channels[c]));
         let plant = LinearPlant::new(mission)?;
         let allocation = plant.allocation()?.matrix;
         Ok(Self {
             plant,
             allocation,
-            channels,
+            controllers,
             limits: mission.actuators.clone(),
             sunlight: mission.solar_pressure.as_ref().map(|s| (s.force_n, Vector3::from(s.arm_srf_m))),
             waiting: (0..control.delay_samples).map(|_| Command::default()).collect(),
@@ -190,10 +225,7 @@ impl ControlLaw {
     /// where a test mass sees the spacecraft turn.)
     fn respond(&mut self, y: &Readout) -> Command {
         let p = [&y.sc_crf_rad, &y.tm[0].r_orf_m, &y.tm[0].att_orf_rad, &y.tm[1].r_orf_m, &y.tm[1].att_orf_rad];
-        let mut wanted = -self.plant.stiffness(y);
-        for (i, channel) in self.channels.iter_mut().enumerate() {
-            wanted[i] += channel.step(p[i / 3][i % 3]);
-        }
+        let wanted = self.controllers.step(std::array::from_fn(|c| p[c / 3][c % 3])) - self.plant.stiffness(y);
         let mut command = Command::from_vector(&(self.allocation * wanted));
         if let (Some((force_n, arm)), Some(sun)) = (&self.sunlight, &y.sun_srf) {
             let force = sun * *force_n;
@@ -209,9 +241,8 @@ impl ControlLaw {
     /// Everything that the next steps depend on: controllers' states, then the waiting commands.
     #[must_use]
     pub fn state(&self) -> Vec<f64> {
-        let sections = self.channels.iter().flat_map(|c| c.states.iter().flatten());
         let commands = self.waiting.iter().flat_map(|c| c.vectors().into_iter().flat_map(|v| v.iter().copied()));
-        sections.copied().chain(commands).collect()
+        self.controllers.states().copied().chain(commands).collect()
     }
 
     /// Takes back what [`Self::state`] gave, bit for bit.
@@ -219,14 +250,13 @@ impl ControlLaw {
     /// # Errors
     /// [`StateError`] when the length is another law's; the law is then unchanged.
     pub fn set_state(&mut self, state: &[f64]) -> Result<(), StateError> {
-        let sections: usize = self.channels.iter().map(|c| 2 * c.states.len()).sum();
+        let sections = self.controllers.states().count();
         let expected = sections + 18 * self.waiting.len();
         if state.len() != expected {
             return Err(StateError { expected, found: state.len() });
         }
         let (controllers, commands) = state.split_at(sections);
-        let slots = self.channels.iter_mut().flat_map(|c| c.states.iter_mut().flatten());
-        for (slot, value) in slots.zip(controllers) {
+        for (slot, value) in self.controllers.states_mut().zip(controllers) {
             *slot = *value;
         }
         for (slot, values) in self.waiting.iter_mut().zip(commands.chunks_exact(18)) {

@@ -288,19 +288,25 @@ impl<const N: usize> NoiseBank<N> {
 
     /// The next sample of every process.
     pub fn next<R: Rng + ?Sized>(&mut self, rng: &mut R) -> [f64; N] {
-        let w: [f64; N] = std::array::from_fn(|_| normal(rng));
-        let mut out: [f64; N] = std::array::from_fn(|p| self.sigma[p] * w[p]);
+        let mut w = [0.0; N];
+        for x in &mut w {
+            *x = normal(rng);
+        }
+        let mut out = [0.0; N];
+        for p in 0..N {
+            out[p] = self.sigma[p] * w[p];
+        }
         if let Some(row) = self.state.first() {
             for p in 0..N {
                 out[p] += row[p];
             }
         }
         // Row i needs the old rows from i on, so going down overwrites nothing still needed.
-        for i in 0..self.state.len() {
-            let (kick, (row, deeper)) = (&self.kick[i], self.state[i..].split_at_mut(1));
-            let row = &mut row[0];
+        for (i, kick) in self.kick.iter().enumerate() {
+            let [row, deeper @ ..] = &mut self.state[i..] else { break };
+            let leak = self.transition[0];
             for p in 0..N {
-                row[p] = self.transition[0] * row[p] + kick[p] * w[p];
+                row[p] = leak * row[p] + kick[p] * w[p];
             }
             for (other, c) in deeper.iter().zip(&self.transition[1..]) {
                 for p in 0..N {
