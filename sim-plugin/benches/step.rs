@@ -5,7 +5,7 @@ use criterion::{Criterion, criterion_group, criterion_main};
 use dragfree_physics::control::ControlLaw;
 use dragfree_physics::mission::Mission;
 use dragfree_sim::imperfection::Imperfections;
-use dragfree_sim::orbit::Environment;
+use dragfree_sim::orbit::Constellation;
 use dragfree_sim::plant::{Loads, Outside, State};
 use dragfree_sim::sensors::Noises;
 use dragfree_sim::simulator::{Settings, Simulator};
@@ -16,6 +16,8 @@ use std::hint::black_box;
 use std::io::Write as _;
 use std::time::{Duration, Instant};
 
+const START_NS: i64 = 2_051_222_400_000_000_000;
+
 fn mission() -> Mission {
     let text = include_str!("../../fixtures/missions/taiji.toml");
     let value: serde_json::Value = toml::from_str(text).expect("the fixture is TOML");
@@ -25,7 +27,7 @@ fn mission() -> Mission {
 fn simulator() -> Simulator {
     let settings = Settings {
         seed: 1,
-        start_ns: 2_051_222_400_000_000_000,
+        start_ns: START_NS,
         settle_s: 60.0,
         com_offset_srf_m: Vector3::new(0.001, 0.0, 0.0),
         stiffness_error: 0.2,
@@ -46,7 +48,7 @@ impl Shares {
         let mission = mission();
         let mut whole = simulator();
         let plant = whole.plant().clone();
-        let environment = Environment::at(2_051_222_400_000_000_000);
+        let environment = whole.constellation().at(START_NS).expect("the start lies in the ephemeris");
         let outside = Outside {
             omega_crf_rad_s: environment.omega_crf_rad_s,
             alpha_crf_rad_s2: environment.alpha_crf_rad_s2,
@@ -118,6 +120,12 @@ fn bench(c: &mut Criterion) {
     for (name, part) in &mut shares.parts {
         c.bench_function(name, |b| b.iter(&mut *part));
     }
+    let mission = mission();
+    c.bench_function("orbits, once a run", |b| b.iter(|| Constellation::new(black_box(&mission))));
+    let constellation = Constellation::new(&mission).expect("the epoch lies in the ephemeris");
+    // A day and a half after a node.
+    let time_ns = START_NS + 129_600_000_000_000;
+    c.bench_function("surroundings, once a minute", |b| b.iter(|| constellation.at(black_box(time_ns))));
 }
 
 criterion_group!(benches, bench);

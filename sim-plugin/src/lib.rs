@@ -251,20 +251,23 @@ impl Source for Sim {
             ))
         })?;
         let imperfections = Imperfections::parse(&setup.text_list("effects")?)?;
+        let seed = setup.i64("seed")?.cast_unsigned();
         let settings = Settings {
-            seed: setup.i64("seed")?.cast_unsigned(),
+            seed,
             start_ns,
             settle_s: setup.f64("settle_s")?,
             com_offset_srf_m: Vector3::from(offset) + imperfections.com_offset_srf_m,
             stiffness_error: setup.f64("stiffness_error")?,
             imperfections,
         };
+        let simulator = Simulator::new(&mission, settings).map_err(refuse)?;
+        simulator.constellation().check("the end of the simulation,", end_ns).map_err(|e| refuse(e.into()))?;
         // The third stream of the seed; the loop takes the first two.
-        let mut rng = Xoshiro256PlusPlus::seed_from_u64(settings.seed);
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         rng.long_jump();
         Ok(Self {
             housekeeping: Housekeeping::new(mission.dt_s(), rng),
-            simulator: Simulator::new(&mission, settings).map_err(refuse)?,
+            simulator,
             telemeter_command: setup.bool("command")?,
             end_ns,
             topics: None,

@@ -10,7 +10,7 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 
 use crate::imperfection::Imperfections;
-use crate::orbit::Environment;
+use crate::orbit::{Constellation, Environment, OrbitError};
 use crate::plant::{Loads, Outside, Plant, STATE_NUMBERS, State};
 use crate::sensors::{Measured, Noises};
 
@@ -32,6 +32,9 @@ pub enum SimulationError {
     /// The mission file does not do.
     #[error(transparent)]
     Mission(#[from] MissionError),
+    /// There is no orbit, or none at that time.
+    #[error(transparent)]
+    Orbit(#[from] OrbitError),
     /// A parameter has no sense.
     #[error("{0}")]
     Parameter(String),
@@ -139,6 +142,7 @@ pub struct Simulator {
     sun_error_crf: Vector3<f64>,
     state: State,
     index: i64,
+    constellation: Constellation,
     /// Surroundings at the last packet, and the epoch of it.
     environment: Environment,
     environment_index: i64,
@@ -190,7 +194,10 @@ impl Simulator {
 
         let dt_s = mission.dt_s();
         let first = -(settings.settle_s / dt_s).round() as i64;
-        let environment = Environment::at(epoch_ns(settings.start_ns, first, dt_s));
+        let constellation = Constellation::new(mission)?;
+        let first_ns = epoch_ns(settings.start_ns, first, dt_s);
+        constellation.check("the start of the simulation (settling included),", first_ns)?;
+        let environment = constellation.at(first_ns)?;
         let outside = Outside {
             omega_crf_rad_s: environment.omega_crf_rad_s,
             alpha_crf_rad_s2: environment.alpha_crf_rad_s2,
@@ -213,6 +220,7 @@ impl Simulator {
             sun_error_crf,
             state,
             index: first,
+            constellation,
             environment,
             environment_index: first,
             gradient_orf_s2: outside.gradient_orf_s2,
@@ -242,15 +250,21 @@ impl Simulator {
         &self.plant
     }
 
+    /// The orbits.
+    #[must_use]
+    pub fn constellation(&self) -> &Constellation {
+        &self.constellation
+    }
+
     /// Runs one epoch.
     ///
     /// # Errors
-    /// [`SimulationError::Diverged`].
+    /// [`SimulationError::Diverged`], and [`SimulationError::Orbit`] beyond the ephemeris.
     pub fn step(&mut self) -> Result<Epoch, SimulationError> {
         let (index, time_ns) = (self.index, self.time_ns());
         let packet = index.rem_euclid(self.ephemeris_every) == 0;
         if packet {
-            self.surroundings(index);
+            self.surroundings(index)?;
         }
         let ephemeris = self.ephemeris();
         let measured = self.noises.measure(&self.state, &mut self.rng);
@@ -277,10 +291,11 @@ impl Simulator {
     }
 
     /// Looks around at an epoch.
-    fn surroundings(&mut self, index: i64) {
-        self.environment = Environment::at(epoch_ns(self.settings.start_ns, index, self.dt_s));
+    fn surroundings(&mut self, index: i64) -> Result<(), OrbitError> {
+        self.environment = self.constellation.at(epoch_ns(self.settings.start_ns, index, self.dt_s))?;
         self.environment_index = index;
         self.gradient_orf_s2 = gradient_orf(&self.plant, &self.environment);
+        Ok(())
     }
 
     /// The last packet.
@@ -386,8 +401,7 @@ impl Simulator {
         self.law.set_state(&snapshot.law).map_err(|e| refuse(&e.to_string()))?;
         self.state = State::from_numbers(numbers);
         (self.index, self.rng) = (snapshot.index, snapshot.rng);
-        self.surroundings(snapshot.environment_index);
-        Ok(())
+        Ok(self.surroundings(snapshot.environment_index)?)
     }
 }
 

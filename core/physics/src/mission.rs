@@ -2,6 +2,7 @@
 //!
 //! The engine hands every plugin the whole file as JSON; a plugin asks for the sections that it needs.
 
+use chrono::{DateTime, NaiveDate, NaiveDateTime, Utc};
 use nalgebra::{Matrix3, Vector3};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -73,6 +74,9 @@ pub struct Mission {
     /// Limits of the telemetry beyond which a sample is an outlier.
     #[serde(default)]
     pub limits: Option<Limits>,
+    /// Where the constellation flies.
+    #[serde(default)]
+    pub orbit: Orbit,
     /// Free tables for mission-specific plugins, not interpreted here.
     #[serde(default)]
     pub plugin: BTreeMap<String, serde_json::Value>,
@@ -376,6 +380,65 @@ pub struct Limits {
     pub angle_rad: f64,
 }
 
+/// `[orbit]`: three spacecraft on a heliocentric triangle. `mission.spacecraft` says which of them is ours, `SC1`, `SC2` or
+/// `SC3`; any other name is the first.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Orbit {
+    /// When the triangle is as designed and SC1 at its aphelion: `YYYY-MM-DD` or `YYYY-MM-DDThh:mm:ss`, UTC.
+    pub epoch_utc: String,
+    /// How far the triangle's centre trails the Earth then, in ecliptic longitude, rad; negative when it leads.
+    pub trailing_angle_rad: f64,
+    /// Length of the arms, m.
+    pub arm_length_m: f64,
+}
+
+impl Default for Orbit {
+    /// The paper's.
+    fn default() -> Self {
+        Self {
+            epoch_utc: "2035-01-01T00:00:00".to_owned(),
+            trailing_angle_rad: 20_f64.to_radians(),
+            arm_length_m: 3.0e9,
+        }
+    }
+}
+
+impl Orbit {
+    /// The epoch.
+    ///
+    /// # Errors
+    /// [`MissionError::Value`] when the text is no instant.
+    pub fn epoch(&self) -> Result<DateTime<Utc>, MissionError> {
+        let text = self.epoch_utc.strip_suffix('Z').unwrap_or(&self.epoch_utc);
+        let date = || text.parse::<NaiveDate>().map(|day| day.and_time(chrono::NaiveTime::MIN));
+        let instant = text.parse::<NaiveDateTime>().or_else(|_| date());
+        instant
+            .map(|i| i.and_utc())
+            .map_err(|_| value_error("orbit.epoch_utc", &self.epoch_utc, "must be an instant as 2035-01-01T00:00:00"))
+    }
+
+    fn check(&self) -> Result<(), MissionError> {
+        self.epoch()?;
+        if !(LEAST_TRAILING_RAD..=std::f64::consts::PI).contains(&self.trailing_angle_rad.abs()) {
+            return Err(value_error(
+                "orbit.trailing_angle_rad",
+                &self.trailing_angle_rad,
+                "must be 0.1 to π in size: nearer, the Earth tears the triangle apart",
+            ));
+        }
+        if !(self.arm_length_m > 0.0 && self.arm_length_m <= MOST_ARM_LENGTH_M) {
+            return Err(value_error("orbit.arm_length_m", &self.arm_length_m, "must be above zero and at most 1e10"));
+        }
+        Ok(())
+    }
+}
+
+/// Nearest to the Earth that a triangle can fly.
+const LEAST_TRAILING_RAD: f64 = 0.1;
+/// Longest arms: the orbits are an expansion in arm length over one astronomical unit.
+const MOST_ARM_LENGTH_M: f64 = 1e10;
+
 fn matrix(rows: &[[f64; 3]; 3]) -> Matrix3<f64> {
     Matrix3::from_fn(|i, j| rows[i][j])
 }
@@ -456,6 +519,7 @@ impl Mission {
             positive("housing.baseline_tolerance_m", h.baseline_tolerance_m)?;
         }
         self.noise.check(self.mission.sample_rate_hz)?;
+        self.orbit.check()?;
         if let Some(s) = &self.solar_pressure {
             positive_or_zero("solar_pressure.force_n", s.force_n)?;
             positive_or_zero("solar_pressure.orbit_error_m", s.orbit_error_m)?;
