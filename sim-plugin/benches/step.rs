@@ -4,7 +4,6 @@
 use criterion::{Criterion, criterion_group, criterion_main};
 use dragfree_physics::control::ControlLaw;
 use dragfree_physics::mission::Mission;
-use dragfree_sim::imperfection::Imperfections;
 use dragfree_sim::orbit::Constellation;
 use dragfree_sim::plant::{Loads, Outside, State};
 use dragfree_sim::sensors::Noises;
@@ -31,7 +30,7 @@ fn simulator() -> Simulator {
         settle_s: 60.0,
         com_offset_srf_m: Vector3::new(0.001, 0.0, 0.0),
         stiffness_error: 0.2,
-        imperfections: Imperfections::default(),
+        effects: Vec::new(),
     };
     Simulator::new(&mission(), settings).expect("the fixture flies")
 }

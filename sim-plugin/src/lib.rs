@@ -3,12 +3,15 @@
 //! Truth-side physics stands here and is written from states; it shares no code with the effects that a calibration
 //! fits.
 
+pub mod effects;
 pub mod housekeeping;
-pub mod imperfection;
+pub mod interior;
 pub mod orbit;
 pub mod plant;
 pub mod sensors;
 pub mod simulator;
+#[cfg(test)]
+mod testing;
 
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
@@ -17,8 +20,8 @@ use rand::SeedableRng;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 
+use effects::Asked;
 use housekeeping::{CHANNELS, Housekeeping};
-use imperfection::Imperfections;
 use simulator::{Epoch, Settings, SimulationError, Simulator};
 
 /// 2035-01-01T00:00:00, where the paper's simulation starts, Unix ns.
@@ -158,7 +161,7 @@ impl Topics {
         Ok(Self { is, ifo, dws, command, ephemeris, housekeeping, truth })
     }
 
-    fn push(&self, e: &Epoch, offsets_orf_m: &[Vector3<f64>; 2], output: &mut Outputs) {
+    fn push(&self, e: &Epoch, output: &mut Outputs) {
         let (t, m, c) = (e.time_ns, &e.measured, &e.command);
         let is = (0..2).flat_map(|i| m.is_r_orf_m[i].iter().chain(m.is_att_orf_rad[i].iter()).chain([&VALID]));
         self.is.push(output, t, is);
@@ -179,8 +182,8 @@ impl Topics {
             &truth.sc_crf_rad,
             &truth.omega_srf_rad_s,
             &truth.alpha_srf_rad_s2,
-            &offsets_orf_m[0],
-            &offsets_orf_m[1],
+            &truth.offset_orf_m[0],
+            &truth.offset_orf_m[1],
             &truth.nongrav_srf_m_s2,
         ];
         self.truth.push(output, t, vectors.into_iter().flat_map(|v| v.iter()));
@@ -201,7 +204,7 @@ pub struct Sim {
 #[derive(Serialize, Deserialize)]
 struct Saved {
     simulator: Vec<u8>,
-    housekeeping: (Xoshiro256PlusPlus, Vec<f64>, f64),
+    housekeeping: (Xoshiro256PlusPlus, Vec<f64>),
     epochs: u64,
 }
 
@@ -233,7 +236,7 @@ impl Source for Sim {
             Parameter::text_list(
                 "effects",
                 &[],
-                "ID:INSTANCE=SIZE of com-offset, es-gain, es-crosstalk, mps-gain, mps-tilt, torque-gain",
+                "ID:INSTANCE=SIZE[,NAME=VALUE]..., as es-gain:tm1.y=0.02; what is not there is answered with the list",
             ),
         ],
         instances: &[],
@@ -250,15 +253,15 @@ impl Source for Sim {
                 "parameter com_offset_srf_m = {given:?} must have three components, x, y, z of SRF"
             ))
         })?;
-        let imperfections = Imperfections::parse(&setup.text_list("effects")?)?;
+        let effects = setup.text_list("effects")?.iter().map(|text| Asked::parse(text)).collect::<Result<_, _>>()?;
         let seed = setup.i64("seed")?.cast_unsigned();
         let settings = Settings {
             seed,
             start_ns,
             settle_s: setup.f64("settle_s")?,
-            com_offset_srf_m: Vector3::from(offset) + imperfections.com_offset_srf_m,
+            com_offset_srf_m: Vector3::from(offset),
             stiffness_error: setup.f64("stiffness_error")?,
-            imperfections,
+            effects,
         };
         let simulator = Simulator::new(&mission, settings).map_err(refuse)?;
         simulator.constellation().check("the end of the simulation,", end_ns).map_err(|e| refuse(e.into()))?;
@@ -287,17 +290,15 @@ impl Source for Sim {
 
     fn next(&mut self, rows: usize, output: &mut Outputs) -> Result<Progress, PluginError> {
         let Some(topics) = &self.topics else { return Err(PluginError::error("next before link")) };
-        let bodies = &self.simulator.plant().tm;
-        let offsets = std::array::from_fn(|i| bodies[i].dcm_orf_from_srf * bodies[i].offset_srf_m);
         for _ in 0..rows {
             if self.simulator.time_ns() >= self.end_ns {
                 break;
             }
-            let epoch = self.simulator.step().map_err(refuse)?;
-            topics.push(&epoch, &offsets, output);
-            for (i, value) in self.housekeeping.step(epoch.index, &epoch.command) {
-                topics.housekeeping[i].push(output, epoch.time_ns, [&value]);
-            }
+            let (index, time_ns) = (self.simulator.index(), self.simulator.time_ns());
+            self.housekeeping.read(index, self.simulator.inside(), |i, value| {
+                topics.housekeeping[i].push(output, time_ns, [&value]);
+            });
+            topics.push(&self.simulator.step().map_err(refuse)?, output);
             self.epochs += 1;
         }
         let next_ns = self.simulator.time_ns();

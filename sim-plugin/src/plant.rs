@@ -94,6 +94,15 @@ pub struct Loads {
     pub tm: [TestMassLoads; 2],
 }
 
+impl Loads {
+    /// What pushes the spacecraft, the electrodes' reaction with it, SRF, N.
+    #[must_use]
+    pub fn net_force_srf_n(&self, plant: &Plant) -> Vector3<f64> {
+        let pairs = plant.tm.iter().zip(&self.tm);
+        pairs.fold(self.force_srf_n, |net, (body, load)| net - body.dcm_orf_from_srf.tr_mul(&load.force_orf_n))
+    }
+}
+
 /// What turns and pulls from outside, over a sample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outside {

@@ -9,7 +9,8 @@ use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 
-use crate::imperfection::Imperfections;
+use crate::effects::{Asked, Basis, EffectError, Effects, Moment, Saved};
+use crate::interior::{Influences, Interior, Running, SavedInterior};
 use crate::orbit::{Constellation, Environment, OrbitError};
 use crate::plant::{Loads, Outside, Plant, STATE_NUMBERS, State};
 use crate::sensors::{Measured, Noises};
@@ -35,6 +36,9 @@ pub enum SimulationError {
     /// There is no orbit, or none at that time.
     #[error(transparent)]
     Orbit(#[from] OrbitError),
+    /// An effect cannot be had.
+    #[error(transparent)]
+    Effect(#[from] EffectError),
     /// A parameter has no sense.
     #[error("{0}")]
     Parameter(String),
@@ -71,8 +75,8 @@ pub struct Settings {
     pub com_offset_srf_m: Vector3<f64>,
     /// Largest relative error of a stiffness element.
     pub stiffness_error: f64,
-    /// What the actuators make of a command.
-    pub imperfections: Imperfections,
+    /// What the controller does not know.
+    pub effects: Vec<Asked>,
 }
 
 /// One epoch of the loop.
@@ -105,6 +109,8 @@ pub struct Truth {
     pub alpha_srf_rad_s2: Vector3<f64>,
     /// Mean non-gravitational acceleration, SRF, m/s².
     pub nongrav_srf_m_s2: Vector3<f64>,
+    /// Housings relative to the centre of mass, ORF, m.
+    pub offset_orf_m: [Vector3<f64>; 2],
 }
 
 /// What the ground tells about orbit and pointing.
@@ -133,6 +139,11 @@ pub struct Simulator {
     law: ControlLaw,
     noises: Noises,
     rng: Xoshiro256PlusPlus,
+    effects: Effects,
+    inside: Running,
+    /// The plant as the effects began it, before its geometry moves.
+    begun: Plant,
+    offset_orf_m: [Vector3<f64>; 2],
     /// `k_dSC` and its arm.
     sunlight: Option<(f64, Vector3<f64>)>,
     /// Constant acceleration and angular acceleration of each test mass by self-gravity.
@@ -158,6 +169,23 @@ struct Snapshot {
     state: Vec<f64>,
     noises: Vec<f64>,
     law: Vec<f64>,
+    effects: Vec<Saved>,
+    inside: SavedInterior,
+}
+
+/// What is true at the coming epoch, borrowed from the simulator field by field: its effects change meanwhile.
+macro_rules! now {
+    ($simulator:expr, $sunlight:expr) => {
+        Moment {
+            elapsed_s: $simulator.index as f64 * $simulator.dt_s,
+            dt_s: $simulator.dt_s,
+            state: &$simulator.state,
+            plant: &$simulator.plant,
+            inside: &$simulator.inside.now,
+            omega_crf_rad_s: $simulator.environment.omega_crf_rad_s,
+            sunlight_srf_n: $sunlight,
+        }
+    };
 }
 
 impl Simulator {
@@ -175,7 +203,9 @@ impl Simulator {
         let stiffness = std::array::from_fn(|_| {
             std::array::from_fn(|_| Matrix3::from_fn(|_, _| 1.0 + range * (2.0 * once.random::<f64>() - 1.0)))
         });
-        let plant = Plant::new(mission, &settings.com_offset_srf_m, &stiffness)?;
+        let mut plant = Plant::new(mission, &settings.com_offset_srf_m, &stiffness)?;
+        let mut effects = Effects::new(&settings.effects, &Basis { mission }, settings.seed)?;
+        effects.begin(&mut plant);
         let mut uniform = |limit: f64| limit * (2.0 * once.random::<f64>() - 1.0);
         let self_gravity = std::array::from_fn(|_| {
             let a = Vector3::from_fn(|i, _| uniform(SELF_GRAVITY_M_S2[i]));
@@ -206,6 +236,12 @@ impl Simulator {
         let tm = [(r1, a1), (r2, a2)];
         let at = std::array::from_fn(|i| (tm[i].0 - shown.tm[i].r_orf_m, tm[i].1 - shown.tm[i].att_orf_rad));
         let state = State::at_rest(&(sc - shown.sc_crf_rad), &at, &plant, &outside);
+        let influences = Influences {
+            sun_distance_m: environment.r_sc_irf_m.norm(),
+            sun_srf: environment.sun_crf,
+            opening_rad: opening(&plant),
+        };
+        let (begun, offset_orf_m) = (plant.clone(), offsets(&plant));
         let mut simulator = Self {
             dt_s,
             ephemeris_every: (EPHEMERIS_S / dt_s).round().max(1.0) as i64,
@@ -214,6 +250,10 @@ impl Simulator {
             law: ControlLaw::new(mission)?,
             noises,
             rng,
+            effects,
+            inside: Running::new(settings.seed, dt_s, &influences),
+            begun,
+            offset_orf_m,
             sunlight: mission.solar_pressure.as_ref().map(|s| (s.force_n, Vector3::from(s.arm_srf_m))),
             self_gravity,
             orbit_error_irf_m,
@@ -226,6 +266,11 @@ impl Simulator {
             gradient_orf_s2: outside.gradient_orf_s2,
             settings,
         };
+        if simulator.effects.moves() {
+            simulator.reshape();
+            // The first shape is where the test masses were caught, no move.
+            simulator.state = state;
+        }
         while simulator.index < 0 {
             simulator.step()?;
         }
@@ -236,6 +281,12 @@ impl Simulator {
     #[must_use]
     pub fn time_ns(&self) -> i64 {
         epoch_ns(self.settings.start_ns, self.index, self.dt_s)
+    }
+
+    /// Number of the coming epoch.
+    #[must_use]
+    pub fn index(&self) -> i64 {
+        self.index
     }
 
     /// The true state at the coming epoch.
@@ -267,13 +318,22 @@ impl Simulator {
             self.surroundings(index)?;
         }
         let ephemeris = self.ephemeris();
-        let measured = self.noises.measure(&self.state, &mut self.rng);
+        let mut measured = self.noises.measure(&self.state, &mut self.rng);
+        self.effects.read(&now!(self, Vector3::zeros()), &mut measured);
         let command = self.law.step(&measured.readout(Some(ephemeris.sun_srf)));
         let (loads, outside) = (self.loads(&command), self.outside());
         let before = self.state;
         let means = self.plant.step(&mut self.state, &loads, &outside, self.dt_s);
+        let offset_orf_m = self.offset_orf_m;
         self.index += 1;
         self.check()?;
+        if self.inside.due(self.index) {
+            let influences = self.influences();
+            self.inside.step(self.index, &influences);
+        }
+        if self.effects.moves() {
+            self.reshape();
+        }
         Ok(Epoch {
             index,
             time_ns,
@@ -285,6 +345,7 @@ impl Simulator {
                 omega_srf_rad_s: before.omega_srf_rad_s,
                 alpha_srf_rad_s2: means.alpha_srf_rad_s2,
                 nongrav_srf_m_s2: means.nongrav_srf_m_s2,
+                offset_orf_m,
             },
             ephemeris: packet.then_some(ephemeris),
         })
@@ -323,9 +384,38 @@ impl Simulator {
         }
     }
 
+    /// The inside of the spacecraft at the coming epoch.
+    #[must_use]
+    pub fn inside(&self) -> &Interior {
+        &self.inside.now
+    }
+
+    /// What the outside does to the inside.
+    fn influences(&self) -> Influences {
+        let e = &self.environment;
+        Influences {
+            sun_distance_m: e.r_sc_irf_m.norm(),
+            sun_srf: turn(&self.state.q_srf_from_crf, &e.sun_crf),
+            opening_rad: opening(&self.plant),
+        }
+    }
+
+    /// Brings the geometry up to the coming epoch. Where the centre of mass wanders, the housings move against the test
+    /// masses.
+    fn reshape(&mut self) {
+        let elapsed_s = self.index as f64 * self.dt_s;
+        let mut plant = self.begun.clone();
+        self.effects.reshape(elapsed_s, &self.inside.now, &mut plant);
+        for ((tm, new), old) in self.state.tm.iter_mut().zip(&plant.tm).zip(&self.plant.tm) {
+            tm.r_orf_m -= new.dcm_orf_from_srf * (new.offset_srf_m - old.offset_srf_m);
+        }
+        self.plant = plant;
+        self.offset_orf_m = offsets(&self.plant);
+    }
+
     /// What truly acts over the coming sample.
-    fn loads(&self, command: &Command) -> Loads {
-        let acting = self.settings.imperfections.act(command);
+    fn loads(&mut self, command: &Command) -> Loads {
+        let acting = self.effects.act(command);
         let mut loads =
             Loads { force_srf_n: acting.mps_force_srf_n, torque_srf_nm: acting.mps_torque_srf_nm, ..Loads::default() };
         for (i, load) in loads.tm.iter_mut().enumerate() {
@@ -334,12 +424,15 @@ impl Simulator {
             (load.acceleration_orf_m_s2, load.angular_acceleration_orf_rad_s2) = self.self_gravity[i];
         }
         let flicker_n = self.noises.disturb(&mut loads);
+        let mut sunlight_srf_n = Vector3::zeros();
         if let Some((force_n, arm)) = &self.sunlight {
             // eq:SRP_transfer_function and eq:SRP_torque; the printed matrix is the arm's cross product.
-            let force = turn(&self.state.q_srf_from_crf, &self.environment.sun_crf) * (force_n + flicker_n);
-            loads.force_srf_n += force;
-            loads.torque_srf_nm += arm.cross(&force);
+            sunlight_srf_n = turn(&self.state.q_srf_from_crf, &self.environment.sun_crf) * (force_n + flicker_n);
+            loads.force_srf_n += sunlight_srf_n;
+            loads.torque_srf_nm += arm.cross(&sunlight_srf_n);
         }
+        self.effects.push(&now!(self, sunlight_srf_n), &mut loads);
+        self.inside.thrust(&acting.mps_force_srf_n);
         loads
     }
 
@@ -382,6 +475,8 @@ impl Simulator {
             state: self.state.to_numbers(),
             noises: self.noises.states(),
             law: self.law.state(),
+            effects: self.effects.save(),
+            inside: self.inside.save(),
         };
         serde_json::to_vec(&snapshot).map_err(|e| SimulationError::State(e.to_string()))
     }
@@ -398,11 +493,27 @@ impl Simulator {
         if !self.noises.set_states(&snapshot.noises) {
             return Err(refuse("the noise has other states"));
         }
+        if !self.effects.load(&snapshot.effects) || !self.inside.load(&snapshot.inside) {
+            return Err(refuse("the effects or the inside of the spacecraft have other states"));
+        }
         self.law.set_state(&snapshot.law).map_err(|e| refuse(&e.to_string()))?;
-        self.state = State::from_numbers(numbers);
         (self.index, self.rng) = (snapshot.index, snapshot.rng);
+        // The geometry first: it moves the test masses of the state that goes.
+        self.reshape();
+        self.state = State::from_numbers(numbers);
         Ok(self.surroundings(snapshot.environment_index)?)
     }
+}
+
+/// `b_i` in ORF.
+fn offsets(plant: &Plant) -> [Vector3<f64>; 2] {
+    plant.tm.each_ref().map(|tm| tm.dcm_orf_from_srf * tm.offset_srf_m)
+}
+
+/// Angle between the sensitive axes, rad.
+fn opening(plant: &Plant) -> f64 {
+    let [a, b] = plant.tm.each_ref().map(|tm| tm.dcm_orf_from_srf.row(0).transpose());
+    a.cross(&b).norm().atan2(a.dot(&b))
 }
 
 /// `Γ` in both ORF, for SRF on CRF.

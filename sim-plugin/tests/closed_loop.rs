@@ -4,7 +4,6 @@ use dragfree_physics::attitude::rotation_vector;
 use dragfree_physics::control::{ControlLaw, Readout};
 use dragfree_physics::mission::{Control, Mission};
 use dragfree_physics::spectrum::welch;
-use dragfree_sim::imperfection::Imperfections;
 use dragfree_sim::plant::{Loads, Outside, Plant, State};
 use dragfree_sim::simulator::{Settings, Simulator};
 use nalgebra::{Matrix3, Vector3};
@@ -21,7 +20,7 @@ fn settings(seed: u64) -> Settings {
         settle_s: 600.0,
         com_offset_srf_m: Vector3::new(0.001, 0.0, 0.0),
         stiffness_error: 0.2,
-        imperfections: Imperfections::default(),
+        effects: Vec::new(),
     }
 }
 

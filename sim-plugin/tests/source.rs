@@ -175,7 +175,7 @@ fn what_has_no_sense_is_refused_by_name() {
         ("[noise.dws_local]", refusal(&|m, _| drop(m["noise"].as_object_mut().unwrap().remove("dws_local")))),
         ("[requirements]", refusal(&|m, _| drop(m.as_object_mut().unwrap().remove("requirements")))),
         ("com_offset_srf_m", refusal(&|_, p| p["com_offset_srf_m"] = json!([0.0, 1.0]))),
-        ("slosh:sc.x=0.1", refusal(&|_, p| p["effects"] = json!(["slosh:sc.x=0.1"]))),
+        ("sloshing:sc.x=0.1", refusal(&|_, p| p["effects"] = json!(["sloshing:sc.x=0.1"]))),
         ("es-gain:tm3.y=0.1", refusal(&|_, p| p["effects"] = json!(["es-gain:tm3.y=0.1"]))),
         ("es-gain:tm1.y=much", refusal(&|_, p| p["effects"] = json!(["es-gain:tm1.y=much"]))),
     ] {

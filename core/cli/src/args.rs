@@ -95,9 +95,9 @@ pub(crate) struct Simulate {
     /// Seed of every noise
     #[arg(long, value_name = "S", default_value_t = 1)]
     pub(crate) seed: u32,
-    /// Add an effect to the truth, `es-gain:tm1.y=0.02`; repeatable
-    #[arg(long = "effect", value_name = "ID:INSTANCE=SIZE", value_parser = effect)]
-    pub(crate) effects: Vec<Effect>,
+    /// Add an effect to the truth, `es-gain:tm1.y=0.02`, SI units; repeatable. The list is below
+    #[arg(long = "effect", value_name = "ID:INSTANCE=SIZE[,NAME=VALUE]...", value_parser = effect)]
+    pub(crate) effects: Vec<String>,
     /// Hide an effect that this seed draws
     #[arg(long, value_name = "SEED")]
     pub(crate) hidden: Option<u64>,
@@ -112,15 +112,6 @@ impl Simulate {
         let hours = self.days.map_or(self.hours.unwrap_or(6.0), |days| 24.0 * days);
         self.start_ns.saturating_add((hours * 3600e9).round() as i64) // a cast of a float saturates
     }
-}
-
-/// An effect in the truth of a simulation.
-#[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Effect {
-    pub(crate) id: String,
-    pub(crate) instance: String,
-    /// SI, unit of the coefficient.
-    pub(crate) size: f64,
 }
 
 #[derive(Debug, Args)]
@@ -209,15 +200,18 @@ fn positive(text: &str) -> Result<f64, String> {
     }
 }
 
-fn effect(text: &str) -> Result<Effect, String> {
-    let parts = || {
-        let (name, size) = text.split_once('=')?;
-        let (id, instance) = name.split_once(':')?;
-        let size: f64 = size.parse().ok().filter(|size: &f64| size.is_finite())?;
-        let complete = !id.is_empty() && !instance.is_empty();
-        complete.then(|| Effect { id: id.to_owned(), instance: instance.to_owned(), size })
-    };
-    parts().ok_or_else(|| "ID:INSTANCE=SIZE is needed, as in es-gain:tm1.y=0.02, the size in SI units".to_owned())
+/// The form alone: which effects there are is the simulator's to say.
+fn effect(text: &str) -> Result<String, String> {
+    let number = |value: &str| value.trim().parse().is_ok_and(|x: f64| x.is_finite());
+    let mut parts = text.split(',').map(|part| part.split_once('='));
+    let whole = parts.next().flatten().is_some_and(|(name, size)| {
+        name.split_once(':').is_some_and(|(id, instance)| !id.is_empty() && !instance.is_empty()) && number(size)
+    });
+    if whole && parts.all(|part| part.is_some_and(|(name, value)| !name.is_empty() && number(value))) {
+        Ok(text.to_owned())
+    } else {
+        Err("ID:INSTANCE=SIZE[,NAME=VALUE]... is needed, as in es-gain:tm1.y=0.02, numbers in SI units".to_owned())
+    }
 }
 
 #[cfg(test)]
@@ -263,6 +257,9 @@ mod tests {
             ("dragfree simulate m.toml --out d --hours -1", ErrorKind::UnknownArgument),
             ("dragfree simulate m.toml --out d --hours nan", ErrorKind::ValueValidation),
             ("dragfree simulate m.toml --out d --effect es-gain=1", ErrorKind::ValueValidation),
+            ("dragfree simulate m.toml --out d --effect es-gain:tm1.y=much", ErrorKind::ValueValidation),
+            ("dragfree simulate m.toml --out d --effect es-gain:tm1.y=1,f", ErrorKind::ValueValidation),
+            ("dragfree simulate m.toml --out d --effect es-gain:tm1.y=1,f=nan", ErrorKind::ValueValidation),
             ("dragfree simulate m.toml --out d --start yesterday", ErrorKind::ValueValidation),
             ("dragfree run p.toml --threads 0", ErrorKind::ValueValidation),
             ("dragfree run p.toml --batch-rows 0", ErrorKind::ValueValidation),
@@ -275,9 +272,11 @@ mod tests {
 
     #[test]
     fn effects_and_lengths_are_read() {
-        let arguments = parse("dragfree simulate m.toml --out d --effect a:b.c=-2e-3 --days 2").expect("parses");
-        let Command::Simulate(simulate) = arguments.command else { panic!("simulate was asked for") };
-        assert_eq!(simulate.effects, [Effect { id: "a".into(), instance: "b.c".into(), size: -2e-3 }]);
+        let line = "dragfree simulate m.toml --out d --effect a:b.c=-2e-3 --effect d:e=1,f_hz=0.03,g=2 --days 2";
+        let Command::Simulate(simulate) = parse(line).expect("parses").command else {
+            panic!("simulate was asked for")
+        };
+        assert_eq!(simulate.effects, ["a:b.c=-2e-3", "d:e=1,f_hz=0.03,g=2"]);
         assert_eq!(simulate.start_ns, 2_051_222_400_000_000_000);
         assert_eq!(simulate.end_ns() - simulate.start_ns, 172_800_000_000_000);
     }

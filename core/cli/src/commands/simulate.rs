@@ -35,11 +35,10 @@ pub(super) fn execute(command: &Simulate, global: &Global) -> Result<Done, Failu
 /// Runs the simulator and writes its files.
 pub(super) fn run(command: &Simulate, global: &Global) -> Result<SimulateOutcome, Failure> {
     let registry = super::registry(global)?;
-    let effects = command.effects.iter().map(|e| toml::Value::from(format!("{}:{}={:e}", e.id, e.instance, e.size)));
     let mut parameters = toml::Table::new();
     parameters.insert("seed".into(), i64::from(command.seed).into());
     parameters.insert("command".into(), (!command.no_command).into());
-    parameters.insert("effects".into(), effects.collect::<Vec<_>>().into());
+    parameters.insert("effects".into(), command.effects.clone().into());
     let options = SimulateOptions {
         mission: command.mission.clone(),
         out: command.out.clone(),

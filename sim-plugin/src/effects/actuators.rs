@@ -1,0 +1,121 @@
+//! Actuators that do something else than they are told.
+
+use dragfree_physics::control::Command;
+use nalgebra::Matrix3;
+
+use super::asked::{Asked, Built, Kind, Number, Place, sc_axes, tm_axes, tm_pairs};
+use super::{Basis, Cause, along};
+
+const GAIN: Number = Number::new("1", -3.0, 3.0);
+
+pub(super) const KINDS: &[Kind] = &[
+    Kind {
+        id: "es-gain",
+        places: || tm_axes().into_iter().filter(|place| !matches!(place, Place::TmAxis(_, 0))).collect(),
+        size: GAIN,
+        help: "electrodes: a commanded force F acts as (1 + SIZE) F along the axis",
+        shape: &[],
+        build,
+    },
+    Kind {
+        id: "es-crosstalk",
+        places: || tm_pairs(&[1, 2]),
+        size: GAIN,
+        help: "electrodes: tm2.y-x lets SIZE times the force commanded along y act along x too",
+        shape: &[],
+        build,
+    },
+    Kind {
+        id: "mps-gain",
+        places: sc_axes,
+        size: GAIN,
+        help: "thrusters: a commanded force F acts as (1 + SIZE) F along the axis",
+        shape: &[],
+        build,
+    },
+    Kind {
+        id: "mps-tilt",
+        places: sc_axes,
+        size: Number::new("rad", -1.0, 1.0),
+        help: "thrusters: their frame is turned by SIZE about the axis, F acts as F + θ × F",
+        shape: &[],
+        build,
+    },
+    Kind {
+        id: "torque-gain",
+        places: sc_axes,
+        size: GAIN,
+        help: "thrusters: a commanded torque M acts as (1 + SIZE) M about the axis; an error of the inertia looks the same",
+        shape: &[],
+        build,
+    },
+];
+
+fn build(asked: &Asked, _: &Basis<'_>) -> Built {
+    let size = asked.size;
+    let part = |to: usize, from: usize| along(to) * along(from).transpose() * size;
+    let (output, matrix) = match (asked.kind.id, asked.place) {
+        ("mps-tilt", Place::ScAxis(axis)) => (Output::Thrust, along(axis).cross_matrix() * size),
+        ("torque-gain", Place::ScAxis(axis)) => (Output::Torque, part(axis, axis)),
+        (_, Place::ScAxis(axis)) => (Output::Thrust, part(axis, axis)),
+        (_, Place::TmAxis(tm, axis)) => (Output::Electrodes(tm), part(axis, axis)),
+        (_, Place::TmPair { tm, from, to }) => (Output::Electrodes(tm), part(to, from)),
+        _ => unreachable!("instances are axes and pairs of them"),
+    };
+    Ok(Box::new(Actuator { output, matrix }))
+}
+
+enum Output {
+    Thrust,
+    Torque,
+    Electrodes(usize),
+}
+
+/// Adds `matrix · command` to what acts.
+struct Actuator {
+    output: Output,
+    matrix: Matrix3<f64>,
+}
+
+impl Cause for Actuator {
+    fn act(&mut self, command: &Command, acting: &mut Command) {
+        match self.output {
+            Output::Thrust => acting.mps_force_srf_n += self.matrix * command.mps_force_srf_n,
+            Output::Torque => acting.mps_torque_srf_nm += self.matrix * command.mps_torque_srf_nm,
+            Output::Electrodes(i) => acting.tm[i].force_orf_n += self.matrix * command.tm[i].force_orf_n,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::Effects;
+    use super::*;
+    use nalgebra::Vector3;
+
+    fn command() -> Command {
+        let mut c = Command { mps_force_srf_n: Vector3::new(1.0, 2.0, 3.0), ..Command::default() };
+        c.mps_torque_srf_nm = Vector3::new(4.0, 5.0, 6.0);
+        c.tm[1].force_orf_n = Vector3::new(0.0, 7.0, 8.0);
+        c
+    }
+
+    fn acting(effects: &[&str]) -> Command {
+        let asked: Vec<Asked> = effects.iter().map(|text| Asked::parse(text).unwrap()).collect();
+        Effects::new(&asked, &Basis { mission: &crate::testing::taiji() }, 1).unwrap().act(&command())
+    }
+
+    #[test]
+    fn each_changes_what_it_names() {
+        assert_eq!(acting(&[]), command());
+        assert_eq!(acting(&["es-gain:tm2.y=0.5"]).tm[1].force_orf_n, Vector3::new(0.0, 10.5, 8.0));
+        assert_eq!(acting(&["es-crosstalk:tm2.y-x=0.5"]).tm[1].force_orf_n, Vector3::new(3.5, 7.0, 8.0));
+        assert_eq!(acting(&["mps-gain:sc.z=0.5"]).mps_force_srf_n, Vector3::new(1.0, 2.0, 4.5));
+        // 0.1 e_x × (1, 2, 3) = (0, −0.3, 0.2)
+        let tilted = acting(&["mps-tilt:sc.x=0.1"]).mps_force_srf_n;
+        assert!((tilted - Vector3::new(1.0, 1.7, 3.2)).norm() < 1e-15);
+        assert_eq!(acting(&["torque-gain:sc.y=-0.5"]).mps_torque_srf_nm, Vector3::new(4.0, 2.5, 6.0));
+        // Two of them act on the command, not on one another.
+        assert_eq!(acting(&["es-gain:tm2.y=0.25", "es-gain:tm2.y=0.25"]), acting(&["es-gain:tm2.y=0.5"]));
+    }
+}

@@ -1,0 +1,317 @@
+//! How an effect is asked for: `ID:INSTANCE=SIZE[,NAME=VALUE]...`.
+
+use dragfree_physics::mission::MissionError;
+use std::fmt::{self, Display};
+
+use super::{Basis, Cause, catalogue};
+
+/// Why an effect cannot be had.
+#[derive(Debug, thiserror::Error)]
+pub enum EffectError {
+    /// The text is of another form.
+    #[error("effect {0}: not of the form ID:INSTANCE=SIZE[,NAME=VALUE]..., as es-gain:tm1.y=0.02; there are {list}", list = list())]
+    Form(String),
+    /// No effect of that name.
+    #[error("effect {text}: there is no effect {id}; there are {list}", list = list())]
+    Unknown {
+        /// What was asked.
+        text: String,
+        /// Its id.
+        id: String,
+    },
+    /// The effect has no such instance.
+    #[error("effect {text}: {id} has no instance {instance}; it has {has}")]
+    Instance {
+        /// What was asked.
+        text: String,
+        /// Id of the effect.
+        id: &'static str,
+        /// The instance.
+        instance: String,
+        /// The instances there are.
+        has: String,
+    },
+    /// The effect has no such shape parameter.
+    #[error("effect {text}: {id} has no parameter {name}; it has {has}")]
+    Parameter {
+        /// What was asked.
+        text: String,
+        /// Id of the effect.
+        id: &'static str,
+        /// The name.
+        name: String,
+        /// The parameters there are.
+        has: String,
+    },
+    /// A number that is none, or has no physical sense.
+    #[error("effect {text}: {what} = {value} must be a number from {minimum:e} to {maximum:e} {unit}")]
+    Value {
+        /// What was asked.
+        text: String,
+        /// Size or parameter.
+        what: String,
+        /// As written.
+        value: String,
+        /// Smallest.
+        minimum: f64,
+        /// Largest.
+        maximum: f64,
+        /// SI unit.
+        unit: &'static str,
+    },
+    /// The mission lacks what the effect needs.
+    #[error("effect {text}: {source}")]
+    Mission {
+        /// What was asked.
+        text: String,
+        /// What is missing.
+        source: MissionError,
+    },
+}
+
+/// Where an effect sits. Axes and angles count from 0: x, y, z and φ, θ, ψ.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// `sc`, the spacecraft as a whole.
+    Spacecraft,
+    /// `tm1`, a test mass as a whole.
+    Tm(usize),
+    /// An instrument.
+    Instrument(Instrument),
+    /// `sc.phi`, about an axis of SRF.
+    ScAngle(usize),
+    /// `sc.x`, an axis of SRF.
+    ScAxis(usize),
+    /// `tm1.x`: test mass and axis of its ORF.
+    TmAxis(usize, usize),
+    /// `tm2.y-x` reads from y into x.
+    TmPair {
+        /// Test mass.
+        tm: usize,
+        /// Axis that drives.
+        from: usize,
+        /// Axis that answers.
+        to: usize,
+    },
+}
+
+/// Instruments with a clock of their own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Instrument {
+    /// Capacitive readout.
+    Is,
+    /// Interferometers.
+    Ifo,
+    /// Wavefront sensing, local and of the long arm.
+    Dws,
+}
+
+const AXES: [&str; 3] = ["x", "y", "z"];
+const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
+
+impl Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::Spacecraft => f.write_str("sc"),
+            Self::Tm(tm) => write!(f, "tm{}", tm + 1),
+            Self::Instrument(Instrument::Is) => f.write_str("is"),
+            Self::Instrument(Instrument::Ifo) => f.write_str("ifo"),
+            Self::Instrument(Instrument::Dws) => f.write_str("dws"),
+            Self::ScAngle(axis) => write!(f, "sc.{}", ANGLES[axis]),
+            Self::ScAxis(axis) => write!(f, "sc.{}", AXES[axis]),
+            Self::TmAxis(tm, axis) => write!(f, "tm{}.{}", tm + 1, AXES[axis]),
+            Self::TmPair { tm, from, to } => write!(f, "tm{}.{}-{}", tm + 1, AXES[from], AXES[to]),
+        }
+    }
+}
+
+/// The axes of SRF.
+pub(super) fn sc_axes() -> Vec<Place> {
+    (0..3).map(Place::ScAxis).collect()
+}
+
+/// About the axes of SRF.
+pub(super) fn sc_angles() -> Vec<Place> {
+    (0..3).map(Place::ScAngle).collect()
+}
+
+/// Both test masses.
+pub(super) fn test_masses() -> Vec<Place> {
+    (0..2).map(Place::Tm).collect()
+}
+
+/// Every axis of both test masses.
+pub(super) fn tm_axes() -> Vec<Place> {
+    (0..2).flat_map(|tm| (0..3).map(move |axis| Place::TmAxis(tm, axis))).collect()
+}
+
+/// Every ordered pair of axes of both test masses whose first is among `from`.
+pub(super) fn tm_pairs(from: &[usize]) -> Vec<Place> {
+    let pairs = |tm: usize| {
+        let to = move |from: usize| (0..3).filter(move |to| *to != from).map(move |to| Place::TmPair { tm, from, to });
+        from.iter().copied().flat_map(to)
+    };
+    (0..2).flat_map(pairs).collect()
+}
+
+/// A number with its unit and the interval in which it has physical sense.
+#[derive(Clone, Copy, Debug)]
+pub struct Number {
+    /// SI unit; `1` for a ratio.
+    pub unit: &'static str,
+    /// Smallest value with sense.
+    pub minimum: f64,
+    /// Largest.
+    pub maximum: f64,
+}
+
+/// A shape parameter.
+#[derive(Clone, Copy, Debug)]
+pub struct Shape {
+    /// Name, with its unit.
+    pub name: &'static str,
+    /// Unit and interval.
+    pub number: Number,
+    /// Value unless given.
+    pub default: f64,
+    /// What it is.
+    pub help: &'static str,
+}
+
+/// A new effect, or what the mission lacks for it.
+pub type Built = Result<Box<dyn Cause>, MissionError>;
+
+/// A kind of effect.
+pub struct Kind {
+    /// Id.
+    pub id: &'static str,
+    /// The instances.
+    pub places: fn() -> Vec<Place>,
+    /// Unit and interval of SIZE.
+    pub size: Number,
+    /// What SIZE is and what a positive one does.
+    pub help: &'static str,
+    /// Shape parameters.
+    pub shape: &'static [Shape],
+    /// Makes it.
+    pub build: fn(&Asked, &Basis<'_>) -> Built,
+}
+
+impl fmt::Debug for Kind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.id)
+    }
+}
+
+/// An effect with its place, size and shape.
+#[derive(Clone, Debug)]
+pub struct Asked {
+    /// What kind.
+    pub kind: &'static Kind,
+    /// Where.
+    pub place: Place,
+    /// SIZE, in the kind's unit.
+    pub size: f64,
+    /// Shape parameters in the order of the kind's.
+    pub shape: Vec<f64>,
+}
+
+impl Display for Asked {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}:{}={:e}", self.kind.id, self.place, self.size)?;
+        self.kind.shape.iter().zip(&self.shape).try_for_each(|(shape, value)| write!(f, ",{}={value:e}", shape.name))
+    }
+}
+
+impl Asked {
+    /// Reads one effect, as in `es-crosstalk:tm2.y-x=0.03`: 3 % of what is commanded along y acts along x.
+    ///
+    /// # Errors
+    /// [`EffectError`] names what is wrong and what there is.
+    pub fn parse(text: &str) -> Result<Self, EffectError> {
+        let form = || EffectError::Form(text.to_owned());
+        let mut parts = text.split(',').map(|part| part.split_once('='));
+        let (name, size) = parts.next().flatten().ok_or_else(form)?;
+        let (id, instance) = name.trim().split_once(':').ok_or_else(form)?;
+        let kind = catalogue()
+            .find(|kind| kind.id == id)
+            .ok_or_else(|| EffectError::Unknown { text: text.to_owned(), id: id.to_owned() })?;
+        let places = (kind.places)();
+        let place = places.iter().find(|place| place.to_string() == instance).ok_or_else(|| EffectError::Instance {
+            text: text.to_owned(),
+            id: kind.id,
+            instance: instance.to_owned(),
+            has: joined(&places),
+        })?;
+        let size = kind.size.read(text, "SIZE", size)?;
+        let mut shape: Vec<f64> = kind.shape.iter().map(|s| s.default).collect();
+        for part in parts {
+            let (name, value) = part.ok_or_else(form)?;
+            let i = kind.shape.iter().position(|s| s.name == name.trim()).ok_or_else(|| EffectError::Parameter {
+                text: text.to_owned(),
+                id: kind.id,
+                name: name.trim().to_owned(),
+                has: kind.parameters(),
+            })?;
+            shape[i] = kind.shape[i].number.read(text, kind.shape[i].name, value)?;
+        }
+        Ok(Self { kind, place: *place, size, shape })
+    }
+
+    /// Value of a shape parameter of the kind.
+    pub(super) fn shape(&self, name: &str) -> f64 {
+        let i = self.kind.shape.iter().position(|s| s.name == name);
+        i.map_or(f64::NAN, |i| self.shape[i])
+    }
+
+    pub(super) fn cause(&self, basis: &Basis<'_>) -> Result<Box<dyn Cause>, EffectError> {
+        (self.kind.build)(self, basis).map_err(|source| EffectError::Mission { text: self.to_string(), source })
+    }
+}
+
+impl Number {
+    pub(super) const fn new(unit: &'static str, minimum: f64, maximum: f64) -> Self {
+        Self { unit, minimum, maximum }
+    }
+
+    fn read(&self, text: &str, what: &str, value: &str) -> Result<f64, EffectError> {
+        let number = value.trim().parse().ok().filter(|x| (self.minimum..=self.maximum).contains(x));
+        number.ok_or_else(|| EffectError::Value {
+            text: text.to_owned(),
+            what: what.to_owned(),
+            value: value.trim().to_owned(),
+            minimum: self.minimum,
+            maximum: self.maximum,
+            unit: self.unit,
+        })
+    }
+}
+
+impl Kind {
+    fn parameters(&self) -> String {
+        let one = |s: &Shape| format!("{} ({}; {} unless given)", s.name, s.help, s.default);
+        match self.shape {
+            [] => "none".to_owned(),
+            shape => shape.iter().map(one).collect::<Vec<_>>().join(", "),
+        }
+    }
+}
+
+fn joined(all: &[impl Display]) -> String {
+    all.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+}
+
+/// Ids, instances, sizes and parameters of everything there is, a line each.
+fn list() -> String {
+    let line = |kind: &Kind| {
+        let places = joined(&(kind.places)());
+        format!(
+            "\n  {}: {} [{}]; instances {places}; parameters {}",
+            kind.id,
+            kind.help,
+            kind.size.unit,
+            kind.parameters()
+        )
+    };
+    catalogue().map(line).collect()
+}

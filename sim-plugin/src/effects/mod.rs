@@ -1,0 +1,217 @@
+//! Physical effects that the controller and a calibration's model do not know, written from states.
+//!
+//! An effect is asked for as `ID:INSTANCE=SIZE[,NAME=VALUE]...` ([`Asked::parse`]); [`catalogue`] lists all of them. Each
+//! becomes a [`Cause`] that acts inside the loop, so the controller sees it and answers. A family of effects is a file.
+
+mod actuators;
+mod asked;
+mod constants;
+mod geometry;
+mod noise;
+mod pushes;
+mod readout;
+mod slosh;
+mod stray;
+
+use dragfree_physics::control::Command;
+use dragfree_physics::mission::Mission;
+use nalgebra::Vector3;
+use rand::SeedableRng;
+use rand_xoshiro::Xoshiro256PlusPlus;
+use serde::{Deserialize, Serialize};
+
+use crate::interior::Interior;
+use crate::plant::{Loads, Plant, State};
+use crate::sensors::Measured;
+pub use asked::{Asked, Built, EffectError, Kind, Number, Place, Shape};
+
+/// Every kind of effect.
+pub fn catalogue() -> impl Iterator<Item = &'static Kind> {
+    [
+        constants::KINDS,
+        geometry::KINDS,
+        actuators::KINDS,
+        noise::KINDS,
+        readout::KINDS,
+        stray::KINDS,
+        slosh::KINDS,
+        pushes::KINDS,
+    ]
+    .into_iter()
+    .flatten()
+}
+
+/// What is true at `t_k`.
+pub struct Moment<'a> {
+    /// Since the first sample of the telemetry; negative while the loop settles, s.
+    pub elapsed_s: f64,
+    /// Sample interval, s.
+    pub dt_s: f64,
+    /// True state.
+    pub state: &'a State,
+    /// True plant.
+    pub plant: &'a Plant,
+    /// What goes on inside the spacecraft.
+    pub inside: &'a Interior,
+    /// `ω_CI`, CRF, rad/s.
+    pub omega_crf_rad_s: Vector3<f64>,
+    /// Force of sunlight over the coming sample, SRF, N; zero before it is known.
+    pub sunlight_srf_n: Vector3<f64>,
+}
+
+/// One effect at work. A method is one place of the loop; most effects need one of them.
+///
+/// Each effect has a random stream of its own: switching one on changes no other noise.
+pub trait Cause: Send {
+    /// Changes constants of the plant before the loop is closed.
+    fn begin(&mut self, _plant: &mut Plant, _rng: &mut Xoshiro256PlusPlus) {}
+
+    /// Whether [`Self::reshape`] does anything.
+    fn moves(&self) -> bool {
+        false
+    }
+
+    /// Changes the geometry of the plant, given as it was begun, to that of an instant.
+    fn reshape(&self, _elapsed_s: f64, _inside: &Interior, _plant: &mut Plant) {}
+
+    /// Changes what the instruments say at `t_k`.
+    fn read(&mut self, _now: &Moment<'_>, _rng: &mut Xoshiro256PlusPlus, _measured: &mut Measured) {}
+
+    /// Changes what the actuators make of the command over `[t_k, t_{k+1})`.
+    fn act(&mut self, _command: &Command, _acting: &mut Command) {}
+
+    /// Adds loads over `[t_k, t_{k+1})`.
+    fn push(&mut self, _now: &Moment<'_>, _rng: &mut Xoshiro256PlusPlus, _loads: &mut Loads) {}
+
+    /// Adds what answers to all other loads.
+    fn react(&mut self, _now: &Moment<'_>, _loads: &mut Loads) {}
+
+    /// Everything that the next samples depend on.
+    fn states(&self) -> Vec<f64> {
+        Vec::new()
+    }
+
+    /// Takes back what [`Self::states`] gave; false when it is another effect's.
+    fn set_states(&mut self, states: &[f64]) -> bool {
+        states.is_empty()
+    }
+}
+
+/// What effects are built from, besides what was asked.
+pub struct Basis<'a> {
+    /// The mission.
+    pub mission: &'a Mission,
+}
+
+struct Active {
+    cause: Box<dyn Cause>,
+    rng: Xoshiro256PlusPlus,
+}
+
+/// The effects of a simulation; often none.
+#[derive(Default)]
+pub struct Effects(Vec<Active>);
+
+/// State of one effect.
+#[derive(Serialize, Deserialize)]
+pub struct Saved {
+    rng: Xoshiro256PlusPlus,
+    states: Vec<f64>,
+}
+
+impl Effects {
+    /// The effects that were asked for.
+    ///
+    /// # Errors
+    /// [`EffectError::Mission`] when the mission lacks what one needs.
+    pub fn new(asked: &[Asked], basis: &Basis<'_>, seed: u64) -> Result<Self, EffectError> {
+        let name = |a: &Asked| format!("{}:{}", a.kind.id, a.place);
+        let active = asked.iter().enumerate().map(|(i, one)| {
+            // Its size does not enter: the same noise, larger or smaller.
+            let before = asked[..i].iter().filter(|other| name(other) == name(one)).count();
+            Ok(Active { cause: one.cause(basis)?, rng: stream(seed, &format!("{} {before}", name(one))) })
+        });
+        Ok(Self(active.collect::<Result<_, EffectError>>()?))
+    }
+
+    /// Changes the plant before the loop is closed.
+    pub fn begin(&mut self, plant: &mut Plant) {
+        for Active { cause, rng } in &mut self.0 {
+            cause.begin(plant, rng);
+        }
+    }
+
+    /// Whether the geometry changes with time.
+    #[must_use]
+    pub fn moves(&self) -> bool {
+        self.0.iter().any(|active| active.cause.moves())
+    }
+
+    /// Changes the geometry of the plant, given as it was begun, to that of an instant.
+    pub fn reshape(&self, elapsed_s: f64, inside: &Interior, plant: &mut Plant) {
+        for active in &self.0 {
+            active.cause.reshape(elapsed_s, inside, plant);
+        }
+    }
+
+    /// What the instruments say at `t_k`.
+    pub fn read(&mut self, now: &Moment<'_>, measured: &mut Measured) {
+        for Active { cause, rng } in &mut self.0 {
+            cause.read(now, rng, measured);
+        }
+    }
+
+    /// What acts when `command` is given.
+    pub fn act(&mut self, command: &Command) -> Command {
+        let mut acting = *command;
+        for active in &mut self.0 {
+            active.cause.act(command, &mut acting);
+        }
+        acting
+    }
+
+    /// Adds loads over the coming sample.
+    pub fn push(&mut self, now: &Moment<'_>, loads: &mut Loads) {
+        for Active { cause, rng } in &mut self.0 {
+            cause.push(now, rng, loads);
+        }
+        for active in &mut self.0 {
+            active.cause.react(now, loads);
+        }
+    }
+
+    /// The states, for a checkpoint.
+    #[must_use]
+    pub fn save(&self) -> Vec<Saved> {
+        self.0.iter().map(|a| Saved { rng: a.rng.clone(), states: a.cause.states() }).collect()
+    }
+
+    /// Takes back what [`Self::save`] gave; false when it is of other effects.
+    #[must_use]
+    pub fn load(&mut self, saved: &[Saved]) -> bool {
+        saved.len() == self.0.len()
+            && self.0.iter_mut().zip(saved).all(|(active, saved)| {
+                active.rng = saved.rng.clone();
+                active.cause.set_states(&saved.states)
+            })
+    }
+}
+
+/// A random stream of its own for everything that has a name: FNV-1a of the name on top of the seed.
+#[must_use]
+pub fn stream(seed: u64, name: &str) -> Xoshiro256PlusPlus {
+    let hash = name.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));
+    Xoshiro256PlusPlus::seed_from_u64(hash.wrapping_add(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
+}
+
+/// Fills slots with saved numbers; false when there are more or fewer.
+fn fill<'a>(slots: impl IntoIterator<Item = &'a mut f64>, states: &[f64]) -> bool {
+    let mut states = states.iter();
+    let filled = slots.into_iter().all(|slot| states.next().map(|value| *slot = *value).is_some());
+    filled && states.next().is_none()
+}
+
+/// The unit vector along an axis.
+fn along(axis: usize) -> Vector3<f64> {
+    Vector3::from_fn(|i, _| f64::from(i == axis))
+}

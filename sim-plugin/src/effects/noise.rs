@@ -1,0 +1,140 @@
+//! Noise that is larger than the mission file says, or has a line.
+//!
+//! The excess is a process of its own, `sqrt(k² − 1)` times the mission's shape: the powers of independent processes add
+//! to `k²`.
+
+use dragfree_physics::mission::Mission;
+use dragfree_physics::noise::NoiseShape;
+use dragfree_physics::process::NoiseProcess;
+use rand::RngExt;
+use rand_xoshiro::Xoshiro256PlusPlus;
+use std::f64::consts::TAU;
+
+use super::asked::{Asked, Built, Kind, Number, Place, Shape, sc_axes, tm_axes};
+use super::{Basis, Cause, Moment, along};
+use crate::plant::{Loads, Plant};
+use crate::sensors::Measured;
+
+const FACTOR: Number = Number::new("1", 1.0, 100.0);
+const LINE: &[Shape] = &[
+    Shape {
+        name: "line_hz",
+        number: Number::new("Hz", 0.0, 5.0),
+        default: 0.0,
+        help: "frequency of a line, 0 for none",
+    },
+    Shape {
+        name: "line_rthz",
+        number: Number::new("Hz^0.5", 0.0, 1e3),
+        default: 0.1,
+        help: "amplitude of the line, in units of the mission's ASD above the corner",
+    },
+];
+
+pub(super) const KINDS: &[Kind] = &[
+    Kind {
+        id: "mps-noise",
+        places: sc_axes,
+        size: FACTOR,
+        help: "thrusters: the force noise along the axis has SIZE times the mission's ASD",
+        shape: LINE,
+        build: |asked, basis| {
+            let table = &basis.mission.noise.thruster_force;
+            let shape = Mission::need(table, "noise.thruster_force", "mps-noise")?.shape();
+            Excess::boxed(asked, basis, &shape)
+        },
+    },
+    Kind {
+        id: "torque-noise",
+        places: sc_axes,
+        size: FACTOR,
+        help: "thrusters: the torque noise about the axis has SIZE times the mission's ASD",
+        shape: LINE,
+        build: |asked, basis| {
+            let table = &basis.mission.noise.thruster_torque;
+            let shape = Mission::need(table, "noise.thruster_torque", "torque-noise")?.shape();
+            Excess::boxed(asked, basis, &shape)
+        },
+    },
+    Kind {
+        id: "is-noise",
+        places: tm_axes,
+        size: FACTOR,
+        help: "capacitive readout: the noise along the axis has SIZE times the mission's ASD",
+        shape: LINE,
+        build: |asked, basis| {
+            let noise = &basis.mission.noise;
+            let (table, section) = match asked.place {
+                Place::TmAxis(_, 0) => (&noise.is_x, "noise.is_x"),
+                Place::TmAxis(_, 1) => (&noise.is_y, "noise.is_y"),
+                _ => (&noise.is_z, "noise.is_z"),
+            };
+            let shape = Mission::need(table, section, "is-noise")?.shape();
+            Excess::boxed(asked, basis, &shape)
+        },
+    },
+];
+
+struct Excess {
+    id: &'static str,
+    place: Place,
+    process: NoiseProcess,
+    line_hz: f64,
+    line_amplitude: f64,
+    line_phase_rad: f64,
+}
+
+impl Excess {
+    fn boxed(asked: &Asked, basis: &Basis<'_>, shape: &NoiseShape) -> Built {
+        let line_amplitude = asked.shape("line_rthz") * shape.white_psd().sqrt();
+        let factor = (asked.size * asked.size - 1.0).sqrt();
+        let mut excess = shape.clone();
+        excess.terms.iter_mut().for_each(|term| term.asd *= factor);
+        Ok(Box::new(Self {
+            id: asked.kind.id,
+            place: asked.place,
+            process: NoiseProcess::new(&excess, basis.mission.dt_s()),
+            line_hz: asked.shape("line_hz"),
+            line_amplitude,
+            line_phase_rad: 0.0,
+        }))
+    }
+
+    fn next(&mut self, at_s: f64, rng: &mut Xoshiro256PlusPlus) -> f64 {
+        let noise = self.process.next(rng);
+        if self.line_hz > 0.0 {
+            noise + self.line_amplitude * (TAU * (self.line_hz * at_s).fract() + self.line_phase_rad).sin()
+        } else {
+            noise
+        }
+    }
+}
+
+impl Cause for Excess {
+    fn begin(&mut self, _plant: &mut Plant, rng: &mut Xoshiro256PlusPlus) {
+        self.process.start(rng);
+        self.line_phase_rad = TAU * rng.random::<f64>();
+    }
+
+    fn read(&mut self, now: &Moment<'_>, rng: &mut Xoshiro256PlusPlus, measured: &mut Measured) {
+        if let Place::TmAxis(tm, axis) = self.place {
+            measured.is_r_orf_m[tm][axis] += self.next(now.elapsed_s, rng);
+        }
+    }
+
+    fn push(&mut self, now: &Moment<'_>, rng: &mut Xoshiro256PlusPlus, loads: &mut Loads) {
+        if let Place::ScAxis(axis) = self.place {
+            let noise = along(axis) * self.next(now.elapsed_s + 0.5 * now.dt_s, rng);
+            *(if self.id == "mps-noise" { &mut loads.force_srf_n } else { &mut loads.torque_srf_nm }) += noise;
+        }
+    }
+
+    fn states(&self) -> Vec<f64> {
+        std::iter::once(self.line_phase_rad).chain(self.process.states()).collect()
+    }
+
+    fn set_states(&mut self, states: &[f64]) -> bool {
+        let slots: Vec<&mut f64> = std::iter::once(&mut self.line_phase_rad).chain(self.process.states_mut()).collect();
+        super::fill(slots, states)
+    }
+}
