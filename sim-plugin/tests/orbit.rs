@@ -94,8 +94,9 @@ fn spacecraft_fly_as_another_program_says() {
     assert_eq!(compared, 45);
 }
 
-/// One year. B. Wu et al., Phys. Rev. D 100 (2019) 122001, find that the tilt π/3 + 5α/8 keeps arms of 3e9 m within half a
-/// per cent; Taiji's interferometers are designed for 1 %, 60° ± 1° and 10 m/s.
+/// One year under Sun and Earth. Published: 5.5 m/s at most in three years for arms of 5e9 m under the same forces (S. V. Dhurandhar,
+/// K. R. Nayak, J.-Y. Vinet, arXiv:0809.1935). Without the Earth our arms breathe by 0.6 % and 0.5° from end to end
+/// (`elements.rs` compares the tilt's flexing with Nayak et al.); the Earth adds less than that again.
 #[test]
 fn the_triangle_breathes_within_published_ranges() {
     let constellation = constellation();
@@ -121,7 +122,7 @@ fn the_triangle_breathes_within_published_ranges() {
     }
     assert!(arm_m.0 > 0.99 * 3e9 && arm_m.1 < 1.01 * 3e9, "{arm_m:?}");
     assert!(angle_deg.0 > 59.0 && angle_deg.1 < 61.0, "{angle_deg:?}");
-    assert!(doppler_m_s < 6.0, "{doppler_m_s}");
+    assert!(doppler_m_s < 5.5, "{doppler_m_s}");
     // ±0.4° once and twice a year.
     assert!((5e-10..5e-9).contains(&opening_rad_s), "{opening_rad_s}");
 }
@@ -217,6 +218,34 @@ fn each_spacecraft_sees_the_others_in_cyclic_order() {
     assert_eq!(named("SC2"), [b, c, a]);
     assert_eq!(named("SC3"), [c, a, b]);
     assert_eq!(named("Taiji-1"), [a, b, c]);
+}
+
+#[test]
+fn orbits_without_sense_are_refused_by_name() {
+    let refusal = |key: &str, value: toml::Value| {
+        let mut table: toml::Table = toml::from_str(include_str!("../../fixtures/missions/taiji.toml")).unwrap();
+        table["orbit"].as_table_mut().unwrap().insert(key.to_owned(), value);
+        Mission::from_json(&serde_json::to_string(&table).unwrap()).unwrap_err().to_string()
+    };
+    for (key, value) in [
+        ("trailing_angle_rad", toml::Value::from(0.01)),
+        ("arm_length_m", 0.0.into()),
+        ("arm_length_m", 1e11.into()),
+        ("epoch_utc", "New Year".into()),
+        ("epoch_utc", "2035-02-29".into()),
+        ("phase_rad", 0.0.into()),
+    ] {
+        let told = refusal(key, value);
+        assert!(told.contains(key), "{key}: {told}");
+    }
+}
+
+/// A mission without `[orbit]` flies what the fixture's section says.
+#[test]
+fn the_section_may_be_left_out() {
+    let without = mission(|table| drop(table.remove("orbit")));
+    let states = Constellation::new(&without).unwrap().states(EPOCH_NS).unwrap();
+    assert_eq!(states, constellation().states(EPOCH_NS).unwrap());
 }
 
 #[test]

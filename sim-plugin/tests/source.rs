@@ -174,6 +174,12 @@ fn what_has_no_sense_is_refused_by_name() {
         ("[test_mass.tm2]", refusal(&|m, _| drop(m["test_mass"].as_object_mut().unwrap().remove("tm2")))),
         ("[noise.dws_local]", refusal(&|m, _| drop(m["noise"].as_object_mut().unwrap().remove("dws_local")))),
         ("[requirements]", refusal(&|m, _| drop(m.as_object_mut().unwrap().remove("requirements")))),
+        (
+            "missing ephemeris span: the epoch of [orbit], 2050",
+            refusal(&|m, _| {
+                m["orbit"]["epoch_utc"] = json!("2050-01-01");
+            }),
+        ),
         ("com_offset_srf_m", refusal(&|_, p| p["com_offset_srf_m"] = json!([0.0, 1.0]))),
         ("sloshing:sc.x=0.1", refusal(&|_, p| p["effects"] = json!(["sloshing:sc.x=0.1"]))),
         ("es-gain:tm3.y=0.1", refusal(&|_, p| p["effects"] = json!(["es-gain:tm3.y=0.1"]))),

@@ -394,7 +394,7 @@ pub struct Orbit {
 }
 
 impl Default for Orbit {
-    /// The paper's.
+    /// The paper's epoch, Taiji's arms and place.
     fn default() -> Self {
         Self {
             epoch_utc: "2035-01-01T00:00:00".to_owned(),

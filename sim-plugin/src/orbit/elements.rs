@@ -22,12 +22,17 @@ pub(super) fn dcm_irf_from_ecliptic() -> Matrix3<f64> {
 /// SC1, SC2 and SC3 around a centre at the given ecliptic longitude, SC1 at its aphelion and highest above the ecliptic.
 pub(super) fn triangle(longitude_rad: f64, arm_m: f64) -> [State; 3] {
     let alpha = arm_m / (2.0 * AU_M);
-    let (sin_tilt, cos_tilt) = (std::f64::consts::FRAC_PI_3 + 0.625 * alpha).sin_cos();
-    let side = 2.0 / 3_f64.sqrt() * alpha;
-    let e = (1.0 + 2.0 * side * cos_tilt + side * side).sqrt() - 1.0;
-    let inclination = (side * sin_tilt).atan2(1.0 + side * cos_tilt);
+    let (e, inclination) = shape(alpha, std::f64::consts::FRAC_PI_3 + 0.625 * alpha);
     let third = std::f64::consts::TAU / 3.0;
     [0.0, third, 2.0 * third].map(|turn| on_orbit(e, inclination, longitude_rad + turn, -turn))
+}
+
+/// Eccentricity and inclination, rad, that put an aphelion where the vertex of a triangle tilted by `tilt_rad` is.
+fn shape(alpha: f64, tilt_rad: f64) -> (f64, f64) {
+    // From the triangle's centre to a vertex, in semi-major axes.
+    let side = 2.0 / 3_f64.sqrt() * alpha;
+    let (out, up) = (1.0 + side * tilt_rad.cos(), side * tilt_rad.sin());
+    (out.hypot(up) - 1.0, up.atan2(out))
 }
 
 /// A spacecraft whose aphelion, the highest point of its orbit, has the longitude `apse_rad`, at `anomaly_rad` from there.
@@ -72,5 +77,30 @@ mod tests {
         }
         let ecliptic = dcm_irf_from_ecliptic().tr_mul(&states[0].r_irf_m);
         assert!((ecliptic.y.atan2(ecliptic.x) - 1.2).abs() < 1e-12 && ecliptic.z > 0.0);
+    }
+
+    /// Arms of 5e9 m, the Sun alone, one year. K. R. Nayak et al. (IUCAA preprint 31/05, "Reducing the flexing of the arms of
+    /// LISA") tell a flexing of about 48,000 km where the untilted triangle has 115,000 km.
+    #[test]
+    fn the_tilt_leaves_the_published_flexing() {
+        let alpha = 5e9 / (2.0 * AU_M);
+        let flexing_m = |tilt_rad: f64| {
+            let (e, inclination) = shape(alpha, tilt_rad);
+            let third = std::f64::consts::TAU / 3.0;
+            let arms = (0..360).map(|degree| {
+                let anomaly = f64::from(degree).to_radians();
+                let [a, b] = [0.0, third].map(|turn| on_orbit(e, inclination, turn, anomaly - turn).r_irf_m);
+                (b - a).norm()
+            });
+            let (least, most) = arms.fold((f64::INFINITY, 0.0_f64), |(lo, hi), arm| (lo.min(arm), hi.max(arm)));
+            most - least
+        };
+        let third_of_pi = std::f64::consts::FRAC_PI_3;
+        // Two digits and three are what the abstract gives.
+        let (tilted_m, untilted_m) = (flexing_m(third_of_pi + 0.625 * alpha), flexing_m(third_of_pi));
+        assert!(
+            (tilted_m / 48e6 - 1.0).abs() < 0.01 && (untilted_m / 115e6 - 1.0).abs() < 0.01,
+            "{tilted_m} {untilted_m}"
+        );
     }
 }

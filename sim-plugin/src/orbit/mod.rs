@@ -2,7 +2,7 @@
 //!
 //! Absolute positions serve nothing else: at one astronomical unit a float has 3e-5 m of grain. Of the arms that is 1e-14, so
 //! the frame's axes have 1e-14 rad of grain, `ω_CI` some 1e-21 rad/s and `ω̇_CI` some 1e-27 rad/s²: next to 2e-7 rad/s
-//! and 1e-15 rad/s², nothing.
+//! and 3e-14 rad/s², nothing.
 
 mod crf;
 mod elements;
