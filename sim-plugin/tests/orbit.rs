@@ -195,6 +195,20 @@ fn the_frame_turns_once_a_year() {
     }
 }
 
+/// Between packets the simulator moves `ω_CI` on linearly and holds `Γ`: `ω̈` is n²ω = 8e-21 rad/s³, and `Γ` turns by n, as
+/// its largest difference of 1.2e-13 s⁻² does, 1.4e-18 s⁻² a minute.
+#[test]
+fn a_minute_between_packets_is_short_enough() {
+    let constellation = constellation();
+    for day in (0..365).step_by(10) {
+        let [now, later] = [0, 60].map(|s| constellation.at(EPOCH_NS + day * DAY_NS + s * 1_000_000_000).unwrap());
+        let missed = later.omega_crf_rad_s - now.omega_crf_rad_s - now.alpha_crf_rad_s2 * 60.0;
+        assert!(missed.norm() < 2e-17, "{day}: {missed} rad/s");
+        let turned = (later.gradient_crf_s2 - now.gradient_crf_s2).norm();
+        assert!(turned < 3e-18, "{day}: {turned} s⁻²");
+    }
+}
+
 #[test]
 fn answers_do_not_depend_on_what_was_asked_before() {
     let times: Vec<i64> = (0..40).map(|k| EPOCH_NS + (k * 37 - 190) * DAY_NS + k * 1_234_567_891_011).collect();
