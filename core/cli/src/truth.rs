@@ -74,7 +74,7 @@ mod tests {
         let path = folder.path().join("truth.mcap");
         let header = FileHeader { time_scale: "UTC".into(), ..FileHeader::default() };
         let mut writer = TelemetryWriter::create(&path, &[table], &header).expect("create");
-        writer.write(&Chunk { batches: vec![rows], complete_until_ns: 3 }).expect("write");
+        writer.write(Chunk { batches: vec![rows], complete_until_ns: 3 }).expect("write");
         writer.finish().expect("finish");
         let truth = first(&path).expect("read");
         assert_eq!(offset(&truth, "com-offset.tm1.y"), Some(0.15));

@@ -62,7 +62,7 @@ fn write(path: &Path) {
     let batches = tables.iter().map(batch).collect();
     let header = FileHeader { time_scale: "TAI".to_owned(), ..FileHeader::default() };
     let mut writer = TelemetryWriter::create(path, &tables, &header).expect("a file");
-    writer.write(&Chunk { batches, complete_until_ns: i64::MAX }).expect("sound rows");
+    writer.write(Chunk { batches, complete_until_ns: i64::MAX }).expect("sound rows");
     writer.finish().expect("a file");
 }
 

@@ -345,7 +345,7 @@ impl Sink for Series {
         }
         // A table that has not spoken yet may still come with earlier rows.
         chunk.complete_until_ns = self.last_ns.iter().map(|t| t.unwrap_or(i64::MIN)).min().unwrap_or(i64::MIN);
-        writer.write(&chunk).map_err(|e| e.to_string())
+        writer.write(chunk).map_err(|e| e.to_string())
     }
 }
 

@@ -3,6 +3,8 @@
 use chrono::{DateTime, NaiveDate};
 use std::ops::Range;
 use std::path::PathBuf;
+use std::sync::mpsc::{SyncSender, sync_channel};
+use std::thread::{Scope, ScopedJoinHandle};
 
 use crate::EngineError;
 use crate::config::Mission;
@@ -10,7 +12,7 @@ use crate::feed::{Feed, SourceFeed, SourceOptions};
 use crate::registry::Registry;
 use crate::run::Progress;
 use crate::table::{Batch, Chunk, TableSpec};
-use crate::telemetry::{FileHeader, TelemetryWriter};
+use crate::telemetry::{FileHeader, TelemetryWriter, WriteError, Written};
 
 /// What to simulate.
 #[derive(Clone, Debug)]
@@ -29,6 +31,8 @@ pub struct SimulateOptions {
     pub parameters: toml::Table,
     /// Version of the program.
     pub software: String,
+    /// Threads that may work: with two, the telemetry is written on the second; with three, the truth on the third.
+    pub threads: usize,
 }
 
 /// What was simulated.
@@ -72,29 +76,39 @@ pub fn simulate(
             parameters: &options.parameters,
             files: &[],
             window_ns: Some(window.clone()),
-            rows: 8192,
+            // What fits a second-level cache goes through the writer while it is there.
+            rows: 1024,
         },
     )?;
-    let mut days = DayFiles {
-        options,
-        mission: &mission,
-        tables: feed.tables().to_vec(),
-        open: None,
-        done: SimulateOutcome::default(),
-    };
-    let mut epochs = 0;
-    while let Some(chunk) = feed.next()? {
-        epochs += chunk.batches.iter().map(Batch::rows).max().unwrap_or(0) as u64;
-        progress(Progress {
-            until_ns: chunk.complete_until_ns,
-            first_ns: window.start,
-            end_ns: Some(window.end),
-            epochs,
-        });
-        days.write(&chunk)?;
-    }
-    days.close()?;
-    Ok(days.done)
+    std::thread::scope(|scope| {
+        let mut days = DayFiles {
+            scope,
+            options,
+            mission: &mission,
+            tables: feed.tables().to_vec(),
+            open: None,
+            done: SimulateOutcome::default(),
+        };
+        let mut epochs = 0;
+        loop {
+            let chunk = match feed.next() {
+                Ok(Some(chunk)) => chunk,
+                Ok(None) => break,
+                // A writer that failed has failed at earlier rows.
+                Err(failure) => return Err(days.abandon().err().unwrap_or(failure)),
+            };
+            epochs += chunk.batches.iter().map(Batch::rows).max().unwrap_or(0) as u64;
+            progress(Progress {
+                until_ns: chunk.complete_until_ns,
+                first_ns: window.start,
+                end_ns: Some(window.end),
+                epochs,
+            });
+            days.write(chunk)?;
+        }
+        days.close()?;
+        Ok(days.done)
+    })
 }
 
 fn days(window: &Range<i64>) -> impl Iterator<Item = NaiveDate> {
@@ -109,55 +123,112 @@ impl SimulateOptions {
     }
 }
 
-/// The files of the day that is being written.
-struct Open {
-    end_ns: i64,
-    telemetry: TelemetryWriter,
-    truth: TelemetryWriter,
+/// Chunks that wait for a writer: enough to keep it busy, and memory stays flat.
+const QUEUE: usize = 4;
+
+/// A file that is written on this thread or on one of its own.
+enum Pen<'scope> {
+    Here(Box<TelemetryWriter>),
+    There { queue: SyncSender<Option<Chunk>>, thread: ScopedJoinHandle<'scope, Result<Option<Written>, WriteError>> },
 }
 
-struct DayFiles<'a> {
-    options: &'a SimulateOptions,
-    mission: &'a Mission,
-    tables: Vec<TableSpec>,
-    open: Option<Open>,
-    done: SimulateOutcome,
-}
+impl<'scope> Pen<'scope> {
+    fn there(scope: &'scope Scope<'scope, '_>, mut writer: TelemetryWriter) -> Self {
+        let (queue, chunks) = sync_channel::<Option<Chunk>>(QUEUE);
+        let thread = scope.spawn(move || {
+            // Without the word that all is said, there is no file.
+            while let Ok(said) = chunks.recv() {
+                match said {
+                    Some(chunk) => writer.write(chunk)?,
+                    None => return writer.finish().map(Some),
+                }
+            }
+            Ok(None)
+        });
+        Self::There { queue, thread }
+    }
 
-impl DayFiles<'_> {
-    fn write(&mut self, chunk: &Chunk) -> Result<(), EngineError> {
-        let mut starts = vec![0; chunk.batches.len()];
-        loop {
-            let first = chunk.batches.iter().zip(&starts).filter_map(|(b, s)| b.time_ns.get(*s)).min().copied();
-            let Some(first) = first else { return Ok(()) };
-            if self.open.as_ref().is_some_and(|open| first >= open.end_ns) {
-                self.close()?;
+    /// Writes, or asks to; gives the pen back.
+    fn write(self, chunk: Chunk) -> Result<Self, WriteError> {
+        match self {
+            Self::Here(mut writer) => {
+                writer.write(chunk)?;
+                Ok(Self::Here(writer))
             }
-            let open = match self.open.take() {
-                Some(open) => open,
-                None => self.create(first)?,
-            };
-            let until = chunk.complete_until_ns.min(open.end_ns);
-            let (mut telemetry, mut truth) = (
-                Chunk { batches: Vec::new(), complete_until_ns: until },
-                Chunk { batches: Vec::new(), complete_until_ns: until },
-            );
-            for ((batch, start), table) in chunk.batches.iter().zip(&mut starts).zip(&self.tables) {
-                let end = batch.time_ns.partition_point(|t| *t < open.end_ns);
-                let cut = Batch {
-                    time_ns: batch.time_ns[*start..end].to_vec(),
-                    columns: batch.columns.iter().map(|c| c[*start..end].to_vec()).collect(),
-                };
-                *start = end;
-                if table.truth { &mut truth } else { &mut telemetry }.batches.push(cut);
-            }
-            let open = self.open.insert(open);
-            open.telemetry.write(&telemetry)?;
-            open.truth.write(&truth)?;
+            Self::There { queue, thread } => match queue.send(Some(chunk)) {
+                Ok(()) => Ok(Self::There { queue, thread }),
+                // The other side is gone: it failed at an earlier chunk.
+                Err(_) => Err(join(thread).expect_err("a writer stops early only with an error")),
+            },
         }
     }
 
-    fn create(&mut self, time_ns: i64) -> Result<Open, EngineError> {
+    /// Leaves no file.
+    fn abandon(self) -> Result<(), WriteError> {
+        match self {
+            Self::Here(_) => Ok(()),
+            Self::There { queue, thread } => {
+                drop(queue);
+                join(thread).map(drop)
+            }
+        }
+    }
+
+    fn finish(self) -> Result<PathBuf, WriteError> {
+        match self {
+            Self::Here(writer) => writer.finish().map(|w| w.path),
+            Self::There { queue, thread } => {
+                // A writer that is gone says why when it is joined.
+                let _ = queue.send(None);
+                join(thread).map(|w| w.expect("a writer that is told to finish does").path)
+            }
+        }
+    }
+}
+
+fn join(thread: ScopedJoinHandle<'_, Result<Option<Written>, WriteError>>) -> Result<Option<Written>, WriteError> {
+    thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+}
+
+/// The files of the day that is being written.
+struct Open<'scope> {
+    end_ns: i64,
+    telemetry: Pen<'scope>,
+    truth: Pen<'scope>,
+}
+
+struct DayFiles<'scope, 'env> {
+    scope: &'scope Scope<'scope, 'env>,
+    options: &'env SimulateOptions,
+    mission: &'env Mission,
+    tables: Vec<TableSpec>,
+    open: Option<Open<'scope>>,
+    done: SimulateOutcome,
+}
+
+impl<'scope> DayFiles<'scope, '_> {
+    fn write(&mut self, mut chunk: Chunk) -> Result<(), EngineError> {
+        while let Some(first) = chunk.batches.iter().filter_map(|b| b.time_ns.first()).min().copied() {
+            if self.open.as_ref().is_some_and(|open| first >= open.end_ns) {
+                self.close()?;
+            }
+            let Open { end_ns, telemetry, truth } = match self.open.take() {
+                Some(open) => open,
+                None => self.create(first)?,
+            };
+            let later = chunk.split_off(end_ns);
+            let [mut mine, mut apart] =
+                [(); 2].map(|()| Chunk { complete_until_ns: chunk.complete_until_ns, ..Chunk::default() });
+            for (batch, table) in chunk.batches.into_iter().zip(&self.tables) {
+                if table.truth { &mut apart } else { &mut mine }.batches.push(batch);
+            }
+            self.open = Some(Open { end_ns, telemetry: telemetry.write(mine)?, truth: truth.write(apart)? });
+            chunk = later;
+        }
+        Ok(())
+    }
+
+    fn create(&mut self, time_ns: i64) -> Result<Open<'scope>, EngineError> {
         let start = time_ns.div_euclid(DAY_NS) * DAY_NS;
         let day = DateTime::from_timestamp_nanos(start).date_naive();
         let header = FileHeader {
@@ -168,7 +239,7 @@ impl DayFiles<'_> {
             version: self.options.software.clone(),
             ..FileHeader::default()
         };
-        let writer = |truth: bool, tables: &[TableSpec]| {
+        let pen = |truth: bool, tables: &[TableSpec]| {
             let path = self.options.path(self.mission, day, truth);
             if let Some(folder) = path.parent() {
                 std::fs::create_dir_all(folder).map_err(|source| EngineError::Io {
@@ -178,16 +249,70 @@ impl DayFiles<'_> {
                 })?;
             }
             let tables: Vec<TableSpec> = tables.iter().filter(|t| t.truth == truth).cloned().collect();
-            Ok::<_, EngineError>(TelemetryWriter::create(&path, &tables, &header)?)
+            let writer = TelemetryWriter::create(&path, &tables, &header)?;
+            let own = self.options.threads > if truth { 2 } else { 1 };
+            Ok::<_, EngineError>(if own { Pen::there(self.scope, writer) } else { Pen::Here(Box::new(writer)) })
         };
-        Ok(Open { end_ns: start + DAY_NS, telemetry: writer(false, &self.tables)?, truth: writer(true, &self.tables)? })
+        Ok(Open { end_ns: start + DAY_NS, telemetry: pen(false, &self.tables)?, truth: pen(true, &self.tables)? })
+    }
+
+    fn abandon(&mut self) -> Result<(), EngineError> {
+        if let Some(open) = self.open.take() {
+            open.telemetry.abandon()?;
+            open.truth.abandon()?;
+        }
+        Ok(())
     }
 
     fn close(&mut self) -> Result<(), EngineError> {
         if let Some(open) = self.open.take() {
-            self.done.truth_files.push(open.truth.finish()?.path);
-            self.done.files.push(open.telemetry.finish()?.path);
+            self.done.truth_files.push(open.truth.finish()?);
+            self.done.files.push(open.telemetry.finish()?);
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::telemetry::interface_tables;
+
+    /// Times and one number for every column of `ifo`.
+    fn chunk(table: &TableSpec, times: &[i64]) -> Chunk {
+        let batch =
+            Batch { time_ns: times.to_vec(), columns: table.columns.iter().map(|_| vec![0.0; times.len()]).collect() };
+        Chunk { batches: vec![batch], complete_until_ns: times.last().map_or(0, |t| t + 1) }
+    }
+
+    /// Writes `chunks` on another thread, `end`s, and tells how many files there are.
+    fn write(chunks: &[&[i64]], end: fn(Pen<'_>) -> Result<(), WriteError>) -> (Result<(), WriteError>, usize) {
+        let folder = tempfile::tempdir().unwrap();
+        let table: Vec<TableSpec> = interface_tables().into_iter().filter(|t| t.name == "ifo").collect();
+        let writer = TelemetryWriter::create(&folder.path().join("a.mcap"), &table, &FileHeader::default()).unwrap();
+        let result = std::thread::scope(|scope| {
+            let pen =
+                chunks.iter().try_fold(Pen::there(scope, writer), |pen, times| pen.write(chunk(&table[0], times)));
+            end(pen?)
+        });
+        (result, std::fs::read_dir(folder.path()).unwrap().count())
+    }
+
+    #[test]
+    fn another_thread_says_why_it_cannot_write() {
+        let finish = |pen: Pen<'_>| pen.finish().map(drop);
+        let (done, files) = write(&[&[0, 1], &[2], &[3]], finish);
+        assert!(done.is_ok() && files == 1);
+        let abandon = |pen: Pen<'_>| pen.abandon();
+        let (done, files) = write(&[&[0, 1], &[2]], abandon);
+        assert!(done.is_ok() && files == 0);
+        // More chunks after the bad one than the queue holds, and none: both ways of noticing.
+        for later in [0, 10] {
+            let mut chunks: Vec<&[i64]> = vec![&[5, 6], &[4]];
+            chunks.extend(std::iter::repeat_n(&[9_i64] as &[i64], later));
+            let (failed, files) = write(&chunks, finish);
+            assert!(matches!(failed, Err(WriteError::OutOfOrder { time_ns: 4, .. })) && files == 0, "{failed:?}");
+            assert!(write(&chunks, abandon).0.is_err());
+        }
     }
 }

@@ -48,6 +48,16 @@ impl Batch {
         Self { time_ns: Vec::new(), columns: vec![Vec::new(); columns] }
     }
 
+    /// Takes the rows at and after `time_ns` out.
+    #[must_use]
+    pub fn split_off(&mut self, time_ns: i64) -> Self {
+        let at = self.time_ns.partition_point(|t| *t < time_ns);
+        Self {
+            time_ns: self.time_ns.split_off(at),
+            columns: self.columns.iter_mut().map(|c| c.split_off(at)).collect(),
+        }
+    }
+
     /// Number of rows.
     #[must_use]
     pub fn rows(&self) -> usize {
@@ -62,4 +72,15 @@ pub struct Chunk {
     pub batches: Vec<Batch>,
     /// Every row before this time has been delivered, Unix ns.
     pub complete_until_ns: i64,
+}
+
+impl Chunk {
+    /// Takes the rows at and after `time_ns` out; this chunk is complete until then at most.
+    #[must_use]
+    pub fn split_off(&mut self, time_ns: i64) -> Self {
+        let later = self.batches.iter_mut().map(|b| b.split_off(time_ns)).collect();
+        let complete_until_ns = self.complete_until_ns;
+        self.complete_until_ns = complete_until_ns.min(time_ns);
+        Self { batches: later, complete_until_ns }
+    }
 }

@@ -64,6 +64,12 @@ fn own_folders() -> Vec<PathBuf> {
     [beside, installed].into_iter().filter(|folder| folder.is_dir()).collect()
 }
 
+/// Threads that may work: as asked for, or as many as the machine has.
+fn threads(global: &Global) -> usize {
+    let all = || std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
+    global.threads.map_or_else(all, usize::from)
+}
+
 /// Version of the program, as products tell it.
 fn software() -> String {
     concat!("dragfree ", env!("CARGO_PKG_VERSION")).to_owned()

@@ -9,7 +9,6 @@ use crate::text::Paint;
 use dragfree_engine::product::{self, Product};
 use dragfree_engine::run::{Outcome, RunOptions, check, run};
 use std::fmt::Write as _;
-use std::num::NonZero;
 use std::path::Path;
 use std::time::SystemTime;
 
@@ -54,7 +53,6 @@ pub(super) fn config_check(chain: &Chain, global: &Global) -> Result<Done, Failu
 }
 
 fn options(chain: &Chain, global: &Global) -> RunOptions {
-    let all = || std::thread::available_parallelism().map_or(1, NonZero::get);
     RunOptions {
         pipeline: chain.pipeline.clone(),
         files: chain.files.clone(),
@@ -63,7 +61,7 @@ fn options(chain: &Chain, global: &Global) -> RunOptions {
         archive: chain.archive.folder.clone(),
         from_ns: None,
         until_ns: None,
-        threads: global.threads.map_or_else(all, usize::from),
+        threads: super::threads(global),
         batch_rows: BATCH_ROWS as usize,
         state_in: None,
         state_out: None,

@@ -47,6 +47,7 @@ pub(super) fn run(command: &Simulate, global: &Global) -> Result<SimulateOutcome
         source: SOURCE.to_owned(),
         parameters,
         software: super::software(),
+        threads: super::threads(global),
     };
     let mut meter = Meter::new("simulate", global);
     simulate(&registry, &options, &mut |progress| meter.show(&progress)).map_err(Failure::engine)

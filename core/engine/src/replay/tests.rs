@@ -494,7 +494,7 @@ fn write(tables: &[TableSpec], chunks: &[Chunk]) -> Vec<u8> {
     let path = folder.path().join("written.mcap");
     let mut writer = TelemetryWriter::create(&path, tables, &header()).unwrap();
     assert!(!path.exists(), "no file before it is whole");
-    chunks.iter().for_each(|c| writer.write(c).unwrap());
+    chunks.iter().for_each(|c| writer.write(c.clone()).unwrap());
     let written = writer.finish().unwrap();
     let bytes = std::fs::read(&path).unwrap();
     assert_eq!(written.bytes, bytes.len() as u64);

@@ -125,13 +125,24 @@ impl MessageType {
 #[derive(Clone, Debug)]
 pub struct Encoder {
     message: MessageType,
+    last: Option<Pattern>,
+}
+
+/// A row's message but for its numbers: the next row mostly has its zeros, which are left out, in the same places.
+#[derive(Clone, Debug, Default)]
+struct Pattern {
+    bytes: Vec<u8>,
+    /// Column and place of each number.
+    numbers: Vec<(usize, usize)>,
+    /// Columns that are zero.
+    zeros: Vec<usize>,
 }
 
 impl Encoder {
     /// An encoder of the table from which `message` was made.
     #[must_use]
     pub fn new(message: MessageType) -> Self {
-        Self { message }
+        Self { message, last: None }
     }
 
     /// Appends one row to `out` as a message. A sub-message whose values are all NaN is left out, which is how it is
@@ -142,8 +153,53 @@ impl Encoder {
     ///
     /// # Panics
     /// When `batch` has not the columns of the table or not the row.
-    pub fn encode(&self, batch: &Batch, row: usize, out: &mut Vec<u8>) -> Result<(), EncodeError> {
-        self.node(0, batch, row, out).map(drop)
+    pub fn encode(&mut self, batch: &Batch, row: usize, out: &mut Vec<u8>) -> Result<(), EncodeError> {
+        if self.last.as_ref().is_some_and(|pattern| pattern.encode(batch, row, out)) {
+            return Ok(());
+        }
+        self.node(0, batch, row, out)?;
+        let mut pattern = Pattern::default();
+        self.last = self.lay_out(0, batch, row, &mut pattern).map(|_| pattern);
+        Ok(())
+    }
+
+    /// Adds a row's pattern; returns whether a sub-message has a column. `None` for a row with NaN or with an integer
+    /// other than 0.
+    fn lay_out(&self, node: usize, batch: &Batch, row: usize, pattern: &mut Pattern) -> Option<bool> {
+        let mut any = false;
+        for field in &self.message.layout.nodes[node].fields {
+            match field.slot {
+                Slot::Scalar { kind, column: leaf } => {
+                    let column = self.message.columns[leaf];
+                    any |= column.is_some();
+                    let value = column.map(|c| batch.columns[c][row]);
+                    match (kind, column) {
+                        _ if value.is_some_and(f64::is_nan) => return None,
+                        (_, Some(c)) if batch.columns[c][row].to_bits() == 0 => pattern.zeros.push(c),
+                        (Kind::Double, _) => {
+                            put_double(field.number, f64::NAN, &mut pattern.bytes);
+                            pattern.numbers.extend(column.map(|c| (c, pattern.bytes.len() - 8)));
+                        }
+                        (_, Some(_)) => return None,
+                        (_, None) => {}
+                    }
+                }
+                Slot::Message { node: child } => {
+                    let (start, numbers) = (pattern.bytes.len(), pattern.numbers.len());
+                    put_tag(field.number, 2, &mut pattern.bytes);
+                    let body = pattern.bytes.len();
+                    pattern.bytes.push(0);
+                    if self.lay_out(child, batch, row, pattern)? {
+                        any = true;
+                        let shift = set_length(body, &mut pattern.bytes);
+                        pattern.numbers[numbers..].iter_mut().for_each(|(_, place)| *place += shift);
+                    } else {
+                        pattern.bytes.truncate(start);
+                    }
+                }
+            }
+        }
+        Some(any)
     }
 
     /// Returns whether there was anything but NaN.
@@ -189,6 +245,28 @@ impl Encoder {
     }
 }
 
+impl Pattern {
+    /// Appends a row of this pattern; false, and nothing done, when the row is another.
+    fn encode(&self, batch: &Batch, row: usize, out: &mut Vec<u8>) -> bool {
+        if self.zeros.iter().any(|c| batch.columns[*c][row].to_bits() != 0) {
+            return false;
+        }
+        let start = out.len();
+        out.extend_from_slice(&self.bytes);
+        let message = &mut out[start..];
+        let mut same = true;
+        for (column, place) in &self.numbers {
+            let value = batch.columns[*column][row];
+            same &= value.to_bits() != 0 && !value.is_nan();
+            message[*place..place + 8].copy_from_slice(&value.to_le_bytes());
+        }
+        if !same {
+            out.truncate(start);
+        }
+        same
+    }
+}
+
 fn put_double(number: u32, value: f64, out: &mut Vec<u8>) {
     // proto3 leaves out what is all bits zero; −0 is not.
     if value.to_bits() != 0 {
@@ -221,16 +299,19 @@ fn put_tag(number: u32, wire_type: u8, out: &mut Vec<u8>) {
     put_varint(u64::from(number) << 3 | u64::from(wire_type), out);
 }
 
-/// Sets the length of the sub-message whose one-byte placeholder stands at `at`; longer lengths shift the body.
-fn set_length(at: usize, out: &mut Vec<u8>) {
+/// Sets the length of the sub-message whose one-byte placeholder stands at `at`; longer lengths shift the body, by as
+/// many bytes as this returns.
+fn set_length(at: usize, out: &mut Vec<u8>) -> usize {
     let length = out.len() - at - 1;
     if length < 0x80 {
         out[at] = length as u8;
-    } else {
-        let mut varint = Vec::new();
-        put_varint(length as u64, &mut varint);
-        out.splice(at..=at, varint);
+        return 0;
     }
+    let mut varint = Vec::new();
+    put_varint(length as u64, &mut varint);
+    let shift = varint.len() - 1;
+    out.splice(at..=at, varint);
+    shift
 }
 
 /// `name` as an identifier of protobuf: letters, digits and underscores; `prefix` goes before anything but a letter.
@@ -388,7 +469,7 @@ mod tests {
             matches!(MessageType::of(&foreign), Err(EncodeError::UnknownColumn { column, .. }) if column == "error")
         );
         let status = table("ifo", &["tm1.x_orf_m", "tm1.status"]);
-        let encoder = Encoder::new(MessageType::of(&status).unwrap());
+        let mut encoder = Encoder::new(MessageType::of(&status).unwrap());
         for bad in [0.5, -1.0, 4_294_967_296.0, f64::INFINITY, f64::NAN] {
             let refused = encoder.encode(&one_row(&[1.0, bad]), 0, &mut vec![]);
             assert!(matches!(refused, Err(EncodeError::NotAnInteger { .. })), "{bad}");
@@ -396,6 +477,39 @@ mod tests {
         let mut bytes = vec![];
         encoder.encode(&one_row(&[f64::NAN, f64::NAN]), 0, &mut bytes).unwrap();
         assert!(bytes.is_empty(), "a sub-message of NaN is absent");
+    }
+
+    /// A pattern gives the bytes of the general way, and leaves every row that differs to it.
+    #[test]
+    fn a_pattern_is_the_general_way() {
+        let long: Vec<String> = (0..40).map(|i| format!("m.n.c{i}")).chain(["m.z".into(), "a".into()]).collect();
+        let generated = table("long", &long.iter().map(String::as_str).collect::<Vec<_>>());
+        let partial = table("is", &["tm1.r_orf_m.x", "tm2.status"]);
+        for table in interface_tables().into_iter().chain([generated, partial]) {
+            let mut encoder = Encoder::new(MessageType::of(&table).unwrap());
+            let integer = |i: usize| table.columns[i].name.ends_with("status");
+            let n = table.columns.len();
+            let row = |k: usize| move |i: usize| if i % 7 == 3 { 0.0 } else { (i * n + k) as f64 + 0.5 };
+            let values = |k: usize| (0..n).map(|i| if integer(i) { 0.0 } else { row(k)(i) }).collect::<Vec<f64>>();
+            let general = |encoder: &Encoder, values: &[f64]| {
+                let mut bytes = vec![7];
+                encoder.node(0, &one_row(values), 0, &mut bytes).unwrap();
+                bytes
+            };
+            encoder.encode(&one_row(&values(0)), 0, &mut vec![]).unwrap();
+            let pattern = encoder.last.clone().unwrap();
+            let mut bytes = vec![7];
+            assert!(pattern.encode(&one_row(&values(1)), 0, &mut bytes), "{}", table.name);
+            assert_eq!(bytes, general(&encoder, &values(1)), "{}", table.name);
+            for i in 0..n {
+                let mut other = values(2);
+                other[i] = if other[i] == 0.0 { 3.0 } else { 0.0 };
+                let mut bytes = vec![7];
+                assert!(!pattern.encode(&one_row(&other), 0, &mut bytes) && bytes == [7], "{} {i}", table.name);
+                encoder.encode(&one_row(&other), 0, &mut bytes).unwrap();
+                assert_eq!(bytes, general(&encoder, &other), "{} {i}", table.name);
+            }
+        }
     }
 
     #[test]

@@ -94,12 +94,6 @@ struct Topic {
     done: usize,
 }
 
-impl Topic {
-    fn head(&self) -> Option<i64> {
-        self.pending.time_ns.get(self.done).copied()
-    }
-}
-
 /// Writes tables into one MCAP file: protobuf, chunks of about 1 MiB, zstd, CRCs, indexes, statistics; messages in order of
 /// time across topics. The file appears under its name when it is complete; until then, and after any error, there is
 /// no such file.
@@ -154,9 +148,9 @@ impl TelemetryWriter {
     ///
     /// # Errors
     /// [`WriteError`]; nothing can be written after one.
-    pub fn write(&mut self, chunk: &Chunk) -> Result<(), WriteError> {
-        for (topic, batch) in self.topics.iter_mut().zip(&chunk.batches) {
-            accept(topic, batch, self.written_until_ns)?;
+    pub fn write(&mut self, chunk: Chunk) -> Result<(), WriteError> {
+        for (topic, batch) in self.topics.iter_mut().zip(chunk.batches) {
+            topic.accept(batch, self.written_until_ns)?;
         }
         self.write_before(chunk.complete_until_ns)
     }
@@ -180,50 +174,66 @@ impl TelemetryWriter {
     }
 
     fn write_before(&mut self, until_ns: i64) -> Result<(), WriteError> {
-        loop {
-            // Equal times go in the order of the tables.
-            let next = self.topics.iter().enumerate().filter_map(|(i, t)| Some((t.head()?, i))).min();
-            let Some((time_ns, i)) = next.filter(|&(time_ns, _)| time_ns < until_ns) else { break };
-            let topic = &mut self.topics[i];
-            self.message.clear();
-            topic.encoder.encode(&topic.pending, topic.done, &mut self.message)?;
-            let log_time =
-                u64::try_from(time_ns).map_err(|_| WriteError::NegativeTime { table: topic.name.clone(), time_ns })?;
-            self.file
-                .message(topic.channel, log_time, &self.message)
-                .map_err(|source| WriteError::Io { path: self.path.clone(), source })?;
-            topic.done += 1;
-            self.messages += 1;
-        }
-        for topic in &mut self.topics {
-            topic.pending.time_ns.drain(..topic.done);
-            for column in &mut topic.pending.columns {
-                column.drain(..topic.done);
+        // Equal times go in the order of the tables.
+        while let Some(time_ns) = self.topics.iter().filter_map(Topic::head).min().filter(|t| *t < until_ns) {
+            for topic in &mut self.topics {
+                while topic.head() == Some(time_ns) {
+                    self.message.clear();
+                    topic.encoder.encode(&topic.pending, topic.done, &mut self.message)?;
+                    let log_time = u64::try_from(time_ns)
+                        .map_err(|_| WriteError::NegativeTime { table: topic.name.clone(), time_ns })?;
+                    self.file
+                        .message(topic.channel, log_time, &self.message)
+                        .map_err(|source| WriteError::Io { path: self.path.clone(), source })?;
+                    topic.done += 1;
+                    self.messages += 1;
+                }
             }
-            topic.done = 0;
         }
+        self.topics.iter_mut().for_each(Topic::forget);
         self.written_until_ns = self.written_until_ns.max(until_ns);
         Ok(())
     }
 }
 
-fn accept(topic: &mut Topic, batch: &Batch, written_until_ns: i64) -> Result<(), WriteError> {
-    let (columns, rows) = (topic.pending.columns.len(), batch.rows());
-    if batch.columns.len() != columns || batch.columns.iter().any(|c| c.len() != rows) {
-        return Err(WriteError::Shape { table: topic.name.clone(), columns, rows });
+impl Topic {
+    /// Time of the first row that is not yet written.
+    fn head(&self) -> Option<i64> {
+        self.pending.time_ns.get(self.done).copied()
     }
-    let mut after_ns = topic.pending.time_ns.last().copied().unwrap_or(written_until_ns);
-    for &time_ns in &batch.time_ns {
-        if time_ns < after_ns {
-            return Err(WriteError::OutOfOrder { table: topic.name.clone(), time_ns, after_ns });
+
+    /// Takes rows in order of time, none before `written_until_ns`.
+    fn accept(&mut self, batch: Batch, written_until_ns: i64) -> Result<(), WriteError> {
+        let (columns, rows) = (self.pending.columns.len(), batch.rows());
+        if batch.columns.len() != columns || batch.columns.iter().any(|c| c.len() != rows) {
+            return Err(WriteError::Shape { table: self.name.clone(), columns, rows });
         }
-        after_ns = time_ns;
+        let mut after_ns = self.pending.time_ns.last().copied().unwrap_or(written_until_ns);
+        for &time_ns in &batch.time_ns {
+            if time_ns < after_ns {
+                return Err(WriteError::OutOfOrder { table: self.name.clone(), time_ns, after_ns });
+            }
+            after_ns = time_ns;
+        }
+        if self.pending.rows() == 0 {
+            self.pending = batch;
+            return Ok(());
+        }
+        self.pending.time_ns.extend_from_slice(&batch.time_ns);
+        for (pending, column) in self.pending.columns.iter_mut().zip(&batch.columns) {
+            pending.extend_from_slice(column);
+        }
+        Ok(())
     }
-    topic.pending.time_ns.extend_from_slice(&batch.time_ns);
-    for (pending, column) in topic.pending.columns.iter_mut().zip(&batch.columns) {
-        pending.extend_from_slice(column);
+
+    /// Drops the rows that are written.
+    fn forget(&mut self) {
+        self.pending.time_ns.drain(..self.done);
+        for column in &mut self.pending.columns {
+            column.drain(..self.done);
+        }
+        self.done = 0;
     }
-    Ok(())
 }
 
 /// What the schema cannot say: unit, place and rate of a housekeeping scalar; units and original names of the columns
@@ -306,8 +316,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.mcap");
         let mut writer = TelemetryWriter::create(&path, &tables(), &FileHeader::default()).unwrap();
-        writer.write(&chunk(&[0, 1, 2, 3], &[0], 1)).unwrap();
-        writer.write(&chunk(&[], &[1, 2, 3], 3)).unwrap();
+        writer.write(chunk(&[0, 1, 2, 3], &[0], 1)).unwrap();
+        writer.write(chunk(&[], &[1, 2, 3], 3)).unwrap();
         assert_eq!(writer.finish().unwrap().messages, 8);
         let file = std::fs::read(&path).unwrap();
         let order: Vec<(i64, String)> = mcap::MessageStream::new(&file)
@@ -329,9 +339,9 @@ mod tests {
             let mut writer =
                 TelemetryWriter::create(&folder.path().join("a.mcap"), &tables(), &FileHeader::default()).unwrap();
             if after_others {
-                writer.write(&chunk(&[0], &[0], 1)).unwrap();
+                writer.write(chunk(&[0], &[0], 1)).unwrap();
             }
-            let error = writer.write(&chunk(times, &[], 9)).unwrap_err();
+            let error = writer.write(chunk(times, &[], 9)).unwrap_err();
             assert!(error.to_string().contains(why), "{error}");
             drop(writer);
             assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
@@ -343,6 +353,6 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut writer =
             TelemetryWriter::create(&folder.path().join("a.mcap"), &tables(), &FileHeader::default()).unwrap();
-        assert!(matches!(writer.write(&short), Err(WriteError::Shape { .. })));
+        assert!(matches!(writer.write(short), Err(WriteError::Shape { .. })));
     }
 }
