@@ -12,6 +12,7 @@ pub mod sensors;
 pub mod simulator;
 #[cfg(test)]
 mod testing;
+pub mod thrusters;
 
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
@@ -64,11 +65,14 @@ struct Topics {
     command: Option<Topic>,
     ephemeris: Topic,
     housekeeping: Vec<Topic>,
+    at_limit: Topic,
     truth: Topic,
 }
 
 /// Status of a valid sample.
 const VALID: f64 = 0.0;
+/// Status of a capacitive readout at the end of its range, bit 0.
+const SATURATED: f64 = 1.0;
 const XYZ: &[&str] = &["x", "y", "z"];
 const ANGLES: &[&str] = &["phi", "theta", "psi"];
 
@@ -135,15 +139,15 @@ impl Topics {
                 ("sun_srf", XYZ, "1", "SRF"),
             ],
         )?;
-        let housekeeping = CHANNELS
-            .iter()
-            .map(|c| {
-                let table = link.table(format!("hk/{}", c.name), 0.0);
-                let rate = c.rate_hz.to_string();
-                let attributes = [("place", c.place), ("rate_hz", rate.as_str())];
-                Ok(Topic { table, columns: vec![link.write_with(table, "value", c.unit, "", &attributes)?] })
-            })
-            .collect::<Result<_, PluginError>>()?;
+        let mut scalar = |name: &str, unit: &str, place: &str, rate_hz: f64| -> Result<Topic, PluginError> {
+            let table = link.table(format!("hk/{name}"), 0.0);
+            let rate = rate_hz.to_string();
+            let attributes = [("place", place), ("rate_hz", rate.as_str())];
+            Ok(Topic { table, columns: vec![link.write_with(table, "value", unit, "", &attributes)?] })
+        };
+        let housekeeping =
+            CHANNELS.iter().map(|c| scalar(c.name, c.unit, c.place, c.rate_hz)).collect::<Result<_, _>>()?;
+        let at_limit = scalar("actuators_at_limit", "1", "control computer", 1.0)?;
         let truth = Topic::new(
             link,
             "truth",
@@ -158,12 +162,13 @@ impl Topics {
                 ("nongrav_accel_srf_m_s2", XYZ, "m s-2", "SRF"),
             ],
         )?;
-        Ok(Self { is, ifo, dws, command, ephemeris, housekeeping, truth })
+        Ok(Self { is, ifo, dws, command, ephemeris, housekeeping, at_limit, truth })
     }
 
     fn push(&self, e: &Epoch, output: &mut Outputs) {
         let (t, m, c) = (e.time_ns, &e.measured, &e.command);
-        let is = (0..2).flat_map(|i| m.is_r_orf_m[i].iter().chain(m.is_att_orf_rad[i].iter()).chain([&VALID]));
+        let status = |i: usize| if m.is_saturated[i] { &SATURATED } else { &VALID };
+        let is = (0..2).flat_map(|i| m.is_r_orf_m[i].iter().chain(m.is_att_orf_rad[i].iter()).chain([status(i)]));
         self.is.push(output, t, is);
         self.ifo.push(output, t, m.ifo_x_orf_m.iter().flat_map(|x| [x, &VALID]));
         self.dws.push(output, t, m.dws_orf_rad.iter().flatten().chain(m.dws_sc_crf_rad.iter()).chain([&VALID]));
@@ -195,17 +200,40 @@ pub struct Sim {
     simulator: Simulator,
     housekeeping: Housekeeping,
     telemeter_command: bool,
+    /// Samples in a second.
+    every_second: i64,
     end_ns: i64,
     topics: Option<Topics>,
     identity: [(&'static str, String); 3],
-    epochs: u64,
+    counts: Counts,
+}
+
+/// What the report counts, epochs.
+#[derive(Clone, Default, Serialize, Deserialize)]
+struct Counts {
+    all: u64,
+    /// With a command at its limit or beyond the thrusters.
+    at_limit: u64,
+    /// Of those, how many no packet of `/hk/actuators_at_limit` has told yet.
+    untold: u64,
+    /// With a capacitive readout at the end of its range.
+    saturated: u64,
+}
+
+impl Counts {
+    fn add(&mut self, epoch: &Epoch) {
+        self.all += 1;
+        self.at_limit += u64::from(epoch.at_limit);
+        self.untold += u64::from(epoch.at_limit);
+        self.saturated += u64::from(epoch.measured.is_saturated.contains(&true));
+    }
 }
 
 #[derive(Serialize, Deserialize)]
 struct Saved {
     simulator: Vec<u8>,
     housekeeping: (Xoshiro256PlusPlus, Vec<f64>),
-    epochs: u64,
+    counts: Counts,
 }
 
 fn refuse(error: SimulationError) -> PluginError {
@@ -272,6 +300,7 @@ impl Source for Sim {
             housekeeping: Housekeeping::new(mission.dt_s(), rng),
             simulator,
             telemeter_command: setup.bool("command")?,
+            every_second: mission.mission.sample_rate_hz.round().max(1.0) as i64,
             end_ns,
             topics: None,
             identity: [
@@ -279,7 +308,7 @@ impl Source for Sim {
                 ("mission", mission.mission.name),
                 ("spacecraft", mission.mission.spacecraft),
             ],
-            epochs: 0,
+            counts: Counts::default(),
         })
     }
 
@@ -298,8 +327,12 @@ impl Source for Sim {
             self.housekeeping.read(index, self.simulator.inside(), |i, value| {
                 topics.housekeeping[i].push(output, time_ns, [&value]);
             });
-            topics.push(&self.simulator.step().map_err(refuse)?, output);
-            self.epochs += 1;
+            let epoch = self.simulator.step().map_err(refuse)?;
+            topics.push(&epoch, output);
+            self.counts.add(&epoch);
+            if index.rem_euclid(self.every_second) == 0 {
+                topics.at_limit.push(output, time_ns, [&(std::mem::take(&mut self.counts.untold) as f64)]);
+            }
         }
         let next_ns = self.simulator.time_ns();
         Ok(Progress { complete_until_ns: next_ns, done: next_ns >= self.end_ns })
@@ -307,14 +340,18 @@ impl Source for Sim {
 
     fn report(&mut self) -> Result<Report, PluginError> {
         let quality = self.identity.iter().map(|(k, v)| ((*k).to_owned(), v.clone().into())).collect();
-        Ok(Report { counts: [("epochs".to_owned(), self.epochs)].into(), quality, ..Report::default() })
+        let Counts { all, at_limit, saturated, .. } = self.counts;
+        let counts =
+            [("epochs", all), ("epochs_at_actuator_limit", at_limit), ("epochs_with_saturated_readout", saturated)];
+        let counts = counts.map(|(name, count)| (name.to_owned(), count));
+        Ok(Report { counts: counts.into(), quality, ..Report::default() })
     }
 
     fn save(&self) -> Result<Vec<u8>, PluginError> {
         let saved = Saved {
             simulator: self.simulator.save().map_err(refuse)?,
             housekeeping: self.housekeeping.state(),
-            epochs: self.epochs,
+            counts: self.counts.clone(),
         };
         Ok(serde_json::to_vec(&saved)?)
     }
@@ -325,7 +362,7 @@ impl Source for Sim {
         if !self.housekeeping.set_state(saved.housekeeping) {
             return Err(PluginError::error("state of the simulator: its housekeeping is another version's"));
         }
-        self.epochs = saved.epochs;
+        self.counts = saved.counts;
         Ok(())
     }
 }

@@ -2,7 +2,7 @@
 
 use dragfree_physics::attitude::rotation_vector;
 use dragfree_physics::control::{Readout, TestMassReadout};
-use dragfree_physics::mission::{Mission, MissionError};
+use dragfree_physics::mission::{Limits, Mission, MissionError};
 use dragfree_physics::noise::NoiseShape;
 use dragfree_physics::process::{NoiseBank, NoiseProcess};
 use nalgebra::Vector3;
@@ -19,6 +19,8 @@ pub struct Measured {
     pub is_r_orf_m: [Vector3<f64>; 2],
     /// Capacitive attitude `φ, θ, ψ`, ORF, rad.
     pub is_att_orf_rad: [Vector3<f64>; 2],
+    /// Whether a capacitive readout is at the end of its range.
+    pub is_saturated: [bool; 2],
     /// Interferometers, ORF x, m.
     pub ifo_x_orf_m: [f64; 2],
     /// Local wavefront sensing `θ, ψ`, ORF, rad.
@@ -28,6 +30,20 @@ pub struct Measured {
 }
 
 impl Measured {
+    /// Holds the capacitive readouts within their range.
+    pub fn saturate(&mut self, limits: &Limits) {
+        let hold = |v: &mut Vector3<f64>, limit: f64| {
+            let beyond = v.iter().fold(false, |any, x| any | (x.abs() > limit));
+            v.apply(|x| *x = x.clamp(-limit, limit));
+            beyond
+        };
+        for i in 0..2 {
+            let r = hold(&mut self.is_r_orf_m[i], limits.displacement_m);
+            let att = hold(&mut self.is_att_orf_rad[i], limits.angle_rad);
+            self.is_saturated[i] = r | att;
+        }
+    }
+
     /// What the controller uses of it.
     #[must_use]
     pub fn readout(&self, sun_srf: Option<Vector3<f64>>) -> Readout {
@@ -91,7 +107,12 @@ impl Noises {
         let (ifo_x, dws_tm, dws_sc) = (process!(ifo_x), process!(dws_local), process!(dws_long_arm));
         let (es_force, es_torque) = (process!(electrostatic_force), process!(electrostatic_torque));
         let acceleration = process!(test_mass_acceleration);
-        let (mps_force, mps_torque) = (process!(thruster_force), process!(thruster_torque));
+        let (mut mps_force, mut mps_torque) = (process!(thruster_force), process!(thruster_torque));
+        if mission.thrusters.as_ref().is_some_and(|t| !t.unit.is_empty()) {
+            // The units have noise of their own.
+            let silence = NoiseProcess::new(&NoiseShape::default(), dt_s);
+            (mps_force, mps_torque) = (silence.clone(), silence);
+        }
         let sunlight = n.solar_pressure.as_ref().map_or_else(
             || NoiseProcess::new(&NoiseShape::default(), dt_s),
             |table| NoiseProcess::with_lines(&table.shape(), &table.lines(), dt_s),
@@ -121,6 +142,13 @@ impl Noises {
         let processes: [NoiseProcess; PROCESSES] =
             processes.try_into().unwrap_or_else(|p: Vec<_>| unreachable!("{} processes", p.len()));
         Ok(Self { bank: NoiseBank::new(processes), samples: [0.0; PROCESSES], places })
+    }
+
+    /// Takes the thrusters' noise along the axes away, for one that comes from a layout.
+    pub fn silence_thrusters(&mut self) {
+        for process in self.places.mps_force..self.places.mps_torque + 3 {
+            self.bank.silence(process);
+        }
     }
 
     /// Draws every slow part from its stationary distribution.

@@ -2,7 +2,7 @@
 
 use dragfree_physics::attitude::{rotation_vector, turn};
 use dragfree_physics::control::{Command, ControlLaw};
-use dragfree_physics::mission::{Mission, MissionError};
+use dragfree_physics::mission::{Actuators, Limits, Mission, MissionError};
 use dragfree_physics::process::normal;
 use nalgebra::{Matrix3, Vector3};
 use rand::{RngExt, SeedableRng};
@@ -14,13 +14,12 @@ use crate::interior::{Influences, Interior, Running, SavedInterior};
 use crate::orbit::{Constellation, Environment, OrbitError};
 use crate::plant::{Loads, Outside, Plant, STATE_NUMBERS, State};
 use crate::sensors::{Measured, Noises};
+use crate::thrusters::{SavedThrusters, Thrusters};
 
 /// Spread of the first displacements and angles, as the instruments show them, m and rad (the paper).
 const INITIAL_SIGMA: f64 = 5e-8;
-/// Largest self-gravity left over along x, then y and z, m/s² (LISA Pathfinder).
-const SELF_GRAVITY_M_S2: [f64; 3] = [3e-10, 1e-9, 1e-9];
-/// Largest angular acceleration by self-gravity, rad/s².
-const SELF_GRAVITY_RAD_S2: f64 = 5e-9;
+/// Seconds of a day.
+const DAY_S: f64 = 86_400.0;
 /// Seconds between packets of `/ephemeris`.
 const EPHEMERIS_S: f64 = 60.0;
 /// Beyond these the loop is lost, m and rad.
@@ -90,6 +89,8 @@ pub struct Epoch {
     pub measured: Measured,
     /// What was commanded over `[t_k, t_{k+1})`.
     pub command: Command,
+    /// Whether the command is at its limit, or beyond the thrusters.
+    pub at_limit: bool,
     /// The truth at `t_k`; α and `a_ng` as means over `[t_k, t_{k+1})`.
     pub truth: Truth,
     /// The `/ephemeris` packet of this epoch, when it has one.
@@ -146,8 +147,11 @@ pub struct Simulator {
     offset_orf_m: [Vector3<f64>; 2],
     /// `k_dSC` and its arm.
     sunlight: Option<(f64, Vector3<f64>)>,
-    /// Constant acceleration and angular acceleration of each test mass by self-gravity.
-    self_gravity: [(Vector3<f64>, Vector3<f64>); 2],
+    /// `None` where the thrusters do what is commanded.
+    thrusters: Option<Thrusters>,
+    actuators: Option<Actuators>,
+    limits: Option<Limits>,
+    self_gravity: [SelfGravity; 2],
     /// Error of the determined orbit in Hill's sense of fixed axes: its effect on the Sun's direction, CRF.
     orbit_error_irf_m: Vector3<f64>,
     sun_error_crf: Vector3<f64>,
@@ -158,6 +162,13 @@ pub struct Simulator {
     environment: Environment,
     environment_index: i64,
     gradient_orf_s2: [Matrix3<f64>; 2],
+}
+
+/// What the spacecraft's own mass does to a test mass.
+struct SelfGravity {
+    acceleration_orf_m_s2: Vector3<f64>,
+    drift_orf_m_s3: Vector3<f64>,
+    angular_acceleration_orf_rad_s2: Vector3<f64>,
 }
 
 /// Everything that changes while the loop runs.
@@ -171,6 +182,7 @@ struct Snapshot {
     law: Vec<f64>,
     effects: Vec<Saved>,
     inside: SavedInterior,
+    thrusters: Option<SavedThrusters>,
 }
 
 /// What is true at the coming epoch, borrowed from the simulator field by field: its effects change meanwhile.
@@ -207,9 +219,11 @@ impl Simulator {
         let mut effects = Effects::new(&settings.effects, &Basis { mission }, settings.seed)?;
         effects.begin(&mut plant);
         let mut uniform = |limit: f64| limit * (2.0 * once.random::<f64>() - 1.0);
-        let self_gravity = std::array::from_fn(|_| {
-            let a = Vector3::from_fn(|i, _| uniform(SELF_GRAVITY_M_S2[i]));
-            (a, Vector3::from_fn(|_, _| uniform(SELF_GRAVITY_RAD_S2)))
+        let bounds = &mission.self_gravity;
+        let self_gravity = std::array::from_fn(|_| SelfGravity {
+            acceleration_orf_m_s2: Vector3::from_fn(|i, _| uniform(bounds.acceleration_orf_m_s2[i])),
+            drift_orf_m_s3: Vector3::from_fn(|_, _| uniform(bounds.drift_m_s2_day / DAY_S)),
+            angular_acceleration_orf_rad_s2: Vector3::from_fn(|_, _| uniform(bounds.angular_acceleration_rad_s2)),
         });
         let orbit_sigma = mission.solar_pressure.as_ref().map_or(0.0, |s| s.orbit_error_m);
         let mut gauss = |sigma: f64| Vector3::from_fn(|_, _| sigma * normal(&mut once));
@@ -255,6 +269,9 @@ impl Simulator {
             begun,
             offset_orf_m,
             sunlight: mission.solar_pressure.as_ref().map(|s| (s.force_n, Vector3::from(s.arm_srf_m))),
+            thrusters: mission.thrusters.as_ref().map(|t| Thrusters::new(t, dt_s, settings.seed)).transpose()?,
+            actuators: mission.actuators.clone(),
+            limits: mission.limits.clone(),
             self_gravity,
             orbit_error_irf_m,
             sun_error_crf,
@@ -320,6 +337,9 @@ impl Simulator {
         let ephemeris = self.ephemeris();
         let mut measured = self.noises.measure(&self.state, &mut self.rng);
         self.effects.read(&now!(self, Vector3::zeros()), &mut measured);
+        if let Some(limits) = &self.limits {
+            measured.saturate(limits);
+        }
         let command = self.law.step(&measured.readout(Some(ephemeris.sun_srf)));
         let (loads, outside) = (self.loads(&command), self.outside());
         let before = self.state;
@@ -339,6 +359,7 @@ impl Simulator {
             time_ns,
             measured,
             command,
+            at_limit: self.at_limit(&command),
             truth: Truth {
                 r_orf_m: [before.tm[0].r_orf_m, before.tm[1].r_orf_m],
                 sc_crf_rad: before.sc_crf_rad(),
@@ -415,13 +436,19 @@ impl Simulator {
 
     /// What truly acts over the coming sample.
     fn loads(&mut self, command: &Command) -> Loads {
-        let acting = self.effects.act(command);
+        let mut acting = self.effects.act(command);
+        if let Some(thrusters) = &mut self.thrusters {
+            (acting.mps_force_srf_n, acting.mps_torque_srf_nm) =
+                thrusters.act(&acting.mps_force_srf_n, &acting.mps_torque_srf_nm);
+        }
         let mut loads =
             Loads { force_srf_n: acting.mps_force_srf_n, torque_srf_nm: acting.mps_torque_srf_nm, ..Loads::default() };
-        for (i, load) in loads.tm.iter_mut().enumerate() {
-            load.force_orf_n = acting.tm[i].force_orf_n;
-            load.torque_orf_nm = acting.tm[i].torque_orf_nm;
-            (load.acceleration_orf_m_s2, load.angular_acceleration_orf_rad_s2) = self.self_gravity[i];
+        let elapsed_s = self.index as f64 * self.dt_s;
+        for ((load, acting), own) in loads.tm.iter_mut().zip(&acting.tm).zip(&self.self_gravity) {
+            load.force_orf_n = acting.force_orf_n;
+            load.torque_orf_nm = acting.torque_orf_nm;
+            load.acceleration_orf_m_s2 = own.acceleration_orf_m_s2 + own.drift_orf_m_s3 * elapsed_s;
+            load.angular_acceleration_orf_rad_s2 = own.angular_acceleration_orf_rad_s2;
         }
         let flicker_n = self.noises.disturb(&mut loads);
         let mut sunlight_srf_n = Vector3::zeros();
@@ -434,6 +461,11 @@ impl Simulator {
         self.effects.push(&now!(self, sunlight_srf_n), &mut loads);
         self.inside.thrust(&acting.mps_force_srf_n);
         loads
+    }
+
+    fn at_limit(&self, command: &Command) -> bool {
+        self.actuators.as_ref().is_some_and(|limits| command.reaches(limits))
+            || self.thrusters.as_ref().is_some_and(Thrusters::saturated)
     }
 
     fn check(&self) -> Result<(), SimulationError> {
@@ -477,6 +509,7 @@ impl Simulator {
             law: self.law.state(),
             effects: self.effects.save(),
             inside: self.inside.save(),
+            thrusters: self.thrusters.as_ref().map(Thrusters::save),
         };
         serde_json::to_vec(&snapshot).map_err(|e| SimulationError::State(e.to_string()))
     }
@@ -495,6 +528,13 @@ impl Simulator {
         }
         if !self.effects.load(&snapshot.effects) || !self.inside.load(&snapshot.inside) {
             return Err(refuse("the effects or the inside of the spacecraft have other states"));
+        }
+        let fits = match (&mut self.thrusters, snapshot.thrusters) {
+            (Some(thrusters), Some(saved)) => thrusters.load(saved),
+            (thrusters, saved) => thrusters.is_none() && saved.is_none(),
+        };
+        if !fits {
+            return Err(refuse("the thrusters have other states"));
         }
         self.law.set_state(&snapshot.law).map_err(|e| refuse(&e.to_string()))?;
         (self.index, self.rng) = (snapshot.index, snapshot.rng);

@@ -90,10 +90,30 @@ fn rows_do_not_depend_on_the_batch_size() {
     assert!(tables.iter().all(|t| t.truth == (t.name == "truth")));
 }
 
+/// The mission whose thrusters are told one by one.
+fn with_thrusters(mission: &mut Value) {
+    let text = std::fs::read_to_string(root().join("fixtures/missions/taiji-thrusters.toml")).unwrap();
+    let other: Value = toml::from_str(&text).unwrap();
+    mission["thrusters"] = other["thrusters"].clone();
+    assert_eq!(*mission, other, "the two missions differ in their thrusters alone");
+}
+
 #[test]
 fn a_saved_state_goes_on_bit_for_bit() {
+    goes_on(|_| {});
+}
+
+#[test]
+fn a_saved_state_goes_on_bit_for_bit_with_thrusters_and_lines() {
+    goes_on(|mission| {
+        with_thrusters(mission);
+        mission["noise"]["dws_long_arm"]["lines"] = json!([{ "amplitude_rad": 1e-9, "frequency_hz": 0.055 }]);
+    });
+}
+
+fn goes_on(change: impl Fn(&mut Value)) {
     let library = library();
-    let config = config(200, |_, _| {});
+    let config = config(200, |m, _| change(m));
     let (_, whole) = run(&library, &config, 777);
     let (mut first, tables) = linked(&library, &config);
     let mut all: Vec<Batch> = tables.iter().map(|t| Batch::empty(t.columns.len())).collect();
@@ -104,6 +124,41 @@ fn a_saved_state_goes_on_bit_for_bit() {
     append(&mut all, second.next(65_536).unwrap().batches);
     assert!(all == whole);
     assert!(second.load(&state[..state.len() / 2]).is_err() && second.load(b"{}").is_err());
+}
+
+/// Telemetry and report tell when an actuator or a readout is at its end; a day that is well has none of it.
+#[test]
+fn saturation_is_seen() {
+    let library = library();
+    let told = |config: &Config| {
+        let (mut sim, tables) = linked(&library, config);
+        let batches = sim.next(65_536).unwrap().batches;
+        let at = |table: &str, column: &str| {
+            let t = tables.iter().position(|t| t.name == table).unwrap();
+            batches[t].columns[tables[t].columns.iter().position(|c| c.name == column).unwrap()].clone()
+        };
+        let counts = sim.report("[]").unwrap()["counts"].clone();
+        (at("hk/actuators_at_limit", "value"), at("is", "tm1.status"), at("command", "tm1.force_orf_n.y"), counts)
+    };
+    let (flags, status, _, counts) = told(&config(100, |_, _| {}));
+    assert_eq!(flags.len(), 100);
+    assert!(flags.iter().chain(&status).all(|x| *x == 0.0) && counts["epochs"] == 1000);
+    assert!(counts["epochs_at_actuator_limit"] == 0 && counts["epochs_with_saturated_readout"] == 0);
+
+    // Self-gravity of 1e-9 m/s² takes 2e-9 N to hold, the noise of the readouts several nm.
+    let (flags, status, force, counts) = told(&config(100, |m, p| {
+        m["actuators"]["electrostatic_force_limit_n"] = json!(1e-12);
+        m["limits"]["displacement_m"] = json!(1e-9);
+        p["settle_s"] = json!(0.0);
+    }));
+    let clipped = force.iter().filter(|f| f.abs() == 1e-12).count();
+    assert!(clipped > 500, "{clipped}");
+    let at_limit = counts["epochs_at_actuator_limit"].as_u64().unwrap() as f64;
+    // The last packet tells the samples up to its own; what follows waits for the next one.
+    let told = flags.iter().sum::<f64>();
+    assert!(told >= clipped as f64 - 9.0 && told <= at_limit && at_limit - told <= 9.0, "{told} {at_limit}");
+    let saturated = status.iter().filter(|s| **s == 1.0).count() as u64;
+    assert!(saturated > 0 && counts["epochs_with_saturated_readout"].as_u64().unwrap() >= saturated, "{counts}");
 }
 
 #[test]
@@ -169,6 +224,30 @@ fn what_has_no_sense_is_refused_by_name() {
             "noise.is_y.lines.frequency_hz = 5",
             refusal(&|m, _| {
                 m["noise"]["is_y"]["lines"] = json!([{ "amplitude_m": 1e-9, "frequency_hz": 5.0 }]);
+            }),
+        ),
+        ("self_gravity.drift_m_s2_day = -1", refusal(&|m, _| m["self_gravity"]["drift_m_s2_day"] = json!(-1.0))),
+        ("thrusters.min_n", refusal(&|m, _| m["thrusters"] = json!({ "min_n": 1e-6 }))),
+        ("thrusters.delay_s = 11", refusal(&|m, _| m["thrusters"] = json!({ "delay_s": 11.0 }))),
+        (
+            "thrusters.max_n = missing",
+            refusal(&|m, _| {
+                with_thrusters(m);
+                drop(m["thrusters"].as_object_mut().unwrap().remove("max_n"));
+            }),
+        ),
+        (
+            "thrusters.unit[2].direction_srf",
+            refusal(&|m, _| {
+                with_thrusters(m);
+                m["thrusters"]["unit"][2]["direction_srf"] = json!([0.0, 0.0, 0.0]);
+            }),
+        ),
+        (
+            "six independent",
+            refusal(&|m, _| {
+                with_thrusters(m);
+                m["thrusters"]["unit"].as_array_mut().unwrap().truncate(5);
             }),
         ),
         ("[test_mass.tm2]", refusal(&|m, _| drop(m["test_mass"].as_object_mut().unwrap().remove("tm2")))),

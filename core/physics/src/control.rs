@@ -62,6 +62,18 @@ impl Command {
         Self { mps_force_srf_n: at(0), mps_torque_srf_nm: at(3), tm: [tm(6), tm(11)] }
     }
 
+    /// Whether any component is at its limit or beyond it.
+    #[must_use]
+    pub fn reaches(&self, limits: &Actuators) -> bool {
+        let reaches = |v: &Vector3<f64>, limit: f64| v.iter().fold(false, |any, x| any | (x.abs() >= limit));
+        let tm = self.tm.iter().fold(false, |any, tm| {
+            any | reaches(&tm.force_orf_n, limits.electrostatic_force_limit_n)
+                | reaches(&tm.torque_orf_nm, limits.electrostatic_torque_limit_nm)
+        });
+        tm | reaches(&self.mps_force_srf_n, limits.thrust_limit_n)
+            | reaches(&self.mps_torque_srf_nm, limits.torque_limit_nm)
+    }
+
     fn limited(mut self, limits: &Actuators) -> Self {
         let clamp = |v: &mut Vector3<f64>, limit: f64| v.apply(|x| *x = x.clamp(-limit, limit));
         clamp(&mut self.mps_force_srf_n, limits.thrust_limit_n);
@@ -320,6 +332,8 @@ pub(crate) mod tests {
         let mut law = law();
         law.step(&y);
         let c = law.step(&y);
+        let limits = taiji().actuators.unwrap();
+        assert!(c.reaches(&limits) && !Command::default().reaches(&limits));
         assert_eq!(c.mps_force_srf_n.amax(), 1e-3);
         assert_eq!(c.mps_torque_srf_nm.amax(), 1e-3);
         assert_eq!(c.tm[0].force_orf_n.amax(), 5e-9);

@@ -71,6 +71,12 @@ pub struct Mission {
     /// Actuator limits.
     #[serde(default)]
     pub actuators: Option<Actuators>,
+    /// What the thrusters make of a command; without it, what is commanded.
+    #[serde(default)]
+    pub thrusters: Option<Thrusters>,
+    /// Self-gravity left over at the test masses.
+    #[serde(default)]
+    pub self_gravity: SelfGravity,
     /// Limits of the telemetry beyond which a sample is an outlier.
     #[serde(default)]
     pub limits: Option<Limits>,
@@ -370,6 +376,61 @@ pub struct Actuators {
     pub electrostatic_torque_limit_nm: f64,
 }
 
+/// `[thrusters]`: what the thrusters make of a command. Without units, delay and lag act on force and torque along each
+/// axis of SRF, limit and step on the force, and the noise is that of `[noise]` per axis. With units, each has all of it.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Thrusters {
+    /// Time constant of the first-order lag, s.
+    #[serde(default)]
+    pub lag_s: f64,
+    /// Delay of the thrusters themselves, s, on top of the loop's `delay_samples`.
+    #[serde(default)]
+    pub delay_s: f64,
+    /// Least thrust of a unit, N.
+    #[serde(default)]
+    pub min_n: f64,
+    /// Largest thrust of a unit, or along an axis, N; none without it.
+    pub max_n: Option<f64>,
+    /// Step of the thrust, N; 0 for none.
+    #[serde(default)]
+    pub step_n: f64,
+    /// The thrusters; none to act along the axes.
+    #[serde(default)]
+    pub unit: Vec<ThrusterUnit>,
+}
+
+/// `[[thrusters.unit]]`: one thruster, with white noise of its own in place of the noise per axis.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ThrusterUnit {
+    /// Where it pushes, relative to the centre of mass, SRF, m.
+    pub position_srf_m: [f64; 3],
+    /// Direction of its force on the spacecraft, SRF, of any length.
+    pub direction_srf: [f64; 3],
+    /// Amplitude spectral density of its thrust, N/√Hz.
+    pub asd_n_rthz: f64,
+}
+
+/// `[self_gravity]`: bounds of what the masses of the spacecraft do to a test mass; the truth is drawn within them.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct SelfGravity {
+    /// Largest acceleration along x, y, z, ORF, m/s².
+    pub acceleration_orf_m_s2: [f64; 3],
+    /// Largest angular acceleration about any axis, rad/s².
+    pub angular_acceleration_rad_s2: f64,
+    /// Largest drift of the acceleration along any axis, m/s² per day.
+    pub drift_m_s2_day: f64,
+}
+
+impl Default for SelfGravity {
+    /// LISA Pathfinder's, without a drift.
+    fn default() -> Self {
+        Self { acceleration_orf_m_s2: [3e-10, 1e-9, 1e-9], angular_acceleration_rad_s2: 5e-9, drift_m_s2_day: 0.0 }
+    }
+}
+
 /// `[limits]`: absolute bounds of telemetry, beyond which a sample is refused as unphysical.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -538,6 +599,14 @@ impl Mission {
             positive("actuators.electrostatic_force_limit_n", a.electrostatic_force_limit_n)?;
             positive("actuators.electrostatic_torque_limit_nm", a.electrostatic_torque_limit_nm)?;
         }
+        if let Some(t) = &self.thrusters {
+            t.check()?;
+        }
+        for limit in self.self_gravity.acceleration_orf_m_s2 {
+            positive_or_zero("self_gravity.acceleration_orf_m_s2", limit)?;
+        }
+        positive_or_zero("self_gravity.angular_acceleration_rad_s2", self.self_gravity.angular_acceleration_rad_s2)?;
+        positive_or_zero("self_gravity.drift_m_s2_day", self.self_gravity.drift_m_s2_day)?;
         if let Some(c) = &self.control {
             if c.delay_samples > MOST_DELAY_SAMPLES {
                 return Err(value_error("control.delay_samples", &c.delay_samples, "must be at most 100"));
@@ -581,6 +650,49 @@ impl Mission {
     #[must_use]
     pub fn dt_s(&self) -> f64 {
         1.0 / self.mission.sample_rate_hz
+    }
+}
+
+impl Thrusters {
+    fn check(&self) -> Result<(), MissionError> {
+        positive_or_zero("thrusters.lag_s", self.lag_s)?;
+        positive_or_zero("thrusters.delay_s", self.delay_s)?;
+        positive_or_zero("thrusters.min_n", self.min_n)?;
+        positive_or_zero("thrusters.step_n", self.step_n)?;
+        if self.delay_s > MOST_THRUSTER_DELAY_S {
+            return Err(value_error("thrusters.delay_s", &self.delay_s, "must be at most 10 s"));
+        }
+        if let Some(max_n) = self.max_n {
+            positive("thrusters.max_n", max_n)?;
+        }
+        if self.unit.is_empty() && self.min_n > 0.0 {
+            return Err(value_error(
+                "thrusters.min_n",
+                &self.min_n,
+                "must be 0 without [[thrusters.unit]]: an axis pushes both ways",
+            ));
+        }
+        if !self.unit.is_empty() && self.max_n.is_none_or(|max_n| max_n <= self.min_n) {
+            let found = self.max_n.map_or_else(|| "missing".to_owned(), |x| x.to_string());
+            return Err(value_error("thrusters.max_n", &found, "must be above min_n where there are units"));
+        }
+        for (i, unit) in self.unit.iter().enumerate() {
+            let key = |k: &str| format!("thrusters.unit[{i}].{k}");
+            positive_or_zero(&key("asd_n_rthz"), unit.asd_n_rthz)?;
+            if !unit.position_srf_m.iter().all(|x| x.is_finite()) {
+                return Err(value_error(
+                    &key("position_srf_m"),
+                    &format!("{:?}", unit.position_srf_m),
+                    "must be finite",
+                ));
+            }
+            let length = Vector3::from(unit.direction_srf).norm();
+            if !(length.is_finite() && length > 0.0) {
+                let found = format!("{:?}", unit.direction_srf);
+                return Err(value_error(&key("direction_srf"), &found, "must be finite and not zero"));
+            }
+        }
+        Ok(())
     }
 }
 
@@ -657,6 +769,9 @@ impl TestMass {
 
 /// Longest delay of a loop, samples: beyond it a mission file is in error, not slow.
 const MOST_DELAY_SAMPLES: u32 = 100;
+
+/// Longest delay of thrusters, s, for the same reason.
+const MOST_THRUSTER_DELAY_S: f64 = 10.0;
 
 /// The fifteen channels in the order of eq:state_variables.
 pub const CHANNELS: [&str; 15] = [

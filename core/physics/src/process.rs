@@ -280,6 +280,15 @@ impl<const N: usize> NoiseBank<N> {
         self.gather();
     }
 
+    /// Silences one process; the others go on as if it sounded.
+    pub fn silence(&mut self, process: usize) {
+        self.sigma[process] = 0.0;
+        for row in self.kick.iter_mut().chain(&mut self.state) {
+            row[process] = 0.0;
+        }
+        self.lines.retain(|(p, _)| *p != process);
+    }
+
     /// As [`NoiseProcess::slow`] of one process.
     #[must_use]
     pub fn slow(&self, process: usize) -> f64 {
