@@ -91,7 +91,7 @@ fn four_hours_meet_the_requirement_table() {
 #[test]
 fn noisy_thrusters_break_the_table() {
     let mut mission = taiji();
-    let designed = dragfree_physics::control_design::loop_shaping(&mission).unwrap();
+    let designed = dragfree_physics::control_design::design(&mission).unwrap().controllers();
     mission.control = Some(Control { delay_samples: 1, lever_feed_forward: true, channel: designed });
     mission.noise.thruster_force.as_mut().unwrap().asd_n_rthz *= 10.0;
     let series = states(&mission, 1);

@@ -7,7 +7,7 @@
 use nalgebra::Vector3;
 use std::collections::VecDeque;
 
-use crate::control_design::loop_shaping;
+use crate::control_design::design;
 use crate::decoupling::{Accelerations, AllocationMatrix, InputVector, LinearPlant};
 use crate::mission::{Actuators, CHANNELS, ChannelController, Control, Mission, MissionError};
 
@@ -188,7 +188,7 @@ pub struct ControlLaw {
 }
 
 impl ControlLaw {
-    /// Builds the law of a mission: its own controllers, or [`loop_shaping`] when `[control.channel]` lists none.
+    /// Builds the law of a mission: its own controllers, or those of [`design`] when `[control.channel]` lists none.
     ///
     /// # Errors
     /// [`MissionError`] when a section is missing or the geometry leaves a channel without an actuator.
@@ -198,7 +198,7 @@ impl ControlLaw {
             given => {
                 let delay_samples = given.as_ref().map_or(1, |c| c.delay_samples);
                 let lever_feed_forward = given.as_ref().is_none_or(|c| c.lever_feed_forward);
-                Control { delay_samples, lever_feed_forward, channel: loop_shaping(mission)? }
+                Control { delay_samples, lever_feed_forward, channel: design(mission)?.controllers() }
             }
         };
         let channel = |name: &&str| {

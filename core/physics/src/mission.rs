@@ -40,6 +40,9 @@ pub enum MissionError {
         /// Who asked.
         needed_by: &'static str,
     },
+    /// The mission brings no controllers, and none can be designed for it.
+    #[error("mission file: {0}")]
+    Design(#[source] Box<crate::control_design::DesignError>),
 }
 
 /// A whole mission file.
