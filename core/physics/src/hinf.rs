@@ -12,15 +12,17 @@ use nalgebra::{Complex, DMatrix};
 
 use crate::lti::{LtiError, StateSpace};
 use crate::riccati::{RiccatiError, stabilising_solution};
-use crate::schur::{complex, eigenvalues, lyapunov};
+use crate::schur::{complex, eigenvalues, lyapunov, singular_value_range};
 
 type C64 = Complex<f64>;
 type Matrix = DMatrix<f64>;
 
 /// Relative size below which a singular value counts as zero.
-const RANK_TOLERANCE: f64 = 1e-10;
+const RANK_TOLERANCE: f64 = 1e-7;
 /// Relative size of a negative eigenvalue of `X∞` or `Y∞` that is put down to rounding.
 const DEFINITE_TOLERANCE: f64 = 1e-9;
+/// A difference this small against its terms is zero.
+const CANCELLED: f64 = 1e-13;
 /// γ is searched for up to here, on the scale of the plant.
 const LARGEST_GAMMA: f64 = 1e9;
 /// Covariance added to every state of a certificate, relative to the largest.
@@ -175,7 +177,7 @@ struct Solved {
 }
 
 fn largest_singular_value(m: &Matrix) -> f64 {
-    if m.is_empty() { 0.0 } else { m.singular_values().max() }
+    singular_value_range(&complex(m)).1
 }
 
 fn horizontal(left: &Matrix, right: &Matrix) -> Matrix {
@@ -197,8 +199,8 @@ fn gamma_block(gamma: f64, count: usize, size: usize) -> Matrix {
 /// Orthogonal `Q` (rows) and invertible `R` with `Q D = [0; R]` for `D` of full column rank, or `None`.
 fn bottom_triangular(d: &Matrix) -> Option<(Matrix, Matrix)> {
     let (rows, columns) = d.shape();
-    let singular = d.singular_values();
-    if columns > rows || singular.min() <= RANK_TOLERANCE * singular.max() {
+    let (smallest, largest) = singular_value_range(&complex(d));
+    if columns > rows || smallest <= RANK_TOLERANCE * largest {
         return None;
     }
     let qr = d.clone().qr();
@@ -425,7 +427,13 @@ fn hamiltonian(a: &Matrix, b: &Matrix, q: &Matrix, s: &Matrix, r_inverse: &Matri
     h.view_mut((0, 0), (n, n)).copy_from(a);
     h.view_mut((n, 0), (n, n)).copy_from(&-q);
     h.view_mut((n, n), (n, n)).copy_from(&-a.transpose());
-    h - vertical(b, &-s) * r_inverse * horizontal(&s.transpose(), &b.transpose())
+    h -= vertical(b, &-s) * r_inverse * horizontal(&s.transpose(), &b.transpose());
+    // In mixed sensitivity the measurement tells the disturbance, and this block cancels but for rounding.
+    let mut constant = h.view_mut((n, 0), (n, n));
+    if constant.amax() <= CANCELLED * q.amax() {
+        constant.fill(0.0);
+    }
+    h
 }
 
 /// Whether every mode of `A` in the closed right half plane is reached through `B` (Popov, Belevitch and Hautus).
@@ -444,7 +452,7 @@ fn reachable(a: &Matrix, b: &Matrix) -> Result<(), C64> {
                 row.unscale_mut(length);
             }
         }
-        if pencil.singular_values().min() < RANK_TOLERANCE {
+        if singular_value_range(&pencil).0 < RANK_TOLERANCE {
             return Err(mode);
         }
     }
@@ -469,7 +477,7 @@ fn with_balanced_states(system: &StateSpace) -> StateSpace {
 }
 
 fn gain_at(system: &StateSpace, omega: f64) -> f64 {
-    system.response(C64::new(0.0, omega)).singular_values().max()
+    singular_value_range(&system.response(C64::new(0.0, omega))).1
 }
 
 /// Hamiltonian of `‖G‖∞ < γ`: no imaginary eigenvalue if and only if the bound holds. `None` when `γ ≤ σ̄(D)`.
@@ -643,4 +651,170 @@ pub fn bounded_real(system: &StateSpace, gamma: f64) -> Result<BoundedReal, Hinf
         }
     }
     Err(not_bounded())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use serde_json::Value;
+
+    fn matrix(value: &Value) -> Matrix {
+        let rows: Vec<Vec<f64>> = serde_json::from_value(value.clone()).unwrap();
+        Matrix::from_row_iterator(rows.len(), rows[0].len(), rows.iter().flatten().copied())
+    }
+
+    /// The published problems with SLICOT's γ (`tests/oracles`).
+    fn benchmarks() -> Vec<(String, GeneralizedPlant, f64, Option<f64>)> {
+        let text = include_str!("../../../tests/oracles/hinf_benchmarks.json");
+        let problem = |p: &Value| {
+            let [a, b, c, d] = ["a", "b", "c", "d"].map(|key| matrix(&p[key]));
+            let count = |key: &str| p[key].as_u64().unwrap() as usize;
+            let system = StateSpace::new(a, b, c, d).unwrap();
+            let plant = GeneralizedPlant { system, measurements: count("measurements"), controls: count("controls") };
+            let name = p["name"].as_str().unwrap().to_owned();
+            (name, plant, p["slicot_gamma"].as_f64().unwrap(), p["published_gamma"].as_f64())
+        };
+        serde_json::from_str::<Vec<Value>>(text).unwrap().iter().map(problem).collect()
+    }
+
+    #[test]
+    fn gamma_is_that_of_slicot_and_of_the_books() {
+        let problems = benchmarks();
+        assert!(problems.len() >= 9);
+        for (name, plant, slicot, published) in problems {
+            let optimum = Synthesis::new(&plant).unwrap().optimum(1e-6).unwrap();
+            assert!((optimum.gamma / slicot - 1.0).abs() < 1e-3, "{name}: {} for {slicot}", optimum.gamma);
+            assert!(optimum.obstacle.is_some() && optimum.refused < optimum.gamma, "{name}");
+            if let Some(published) = published {
+                // Books print two decimals; closed forms are exact.
+                let tolerance = if published == (published * 100.0).round() / 100.0 { 0.005 } else { 2e-6 };
+                assert!((optimum.gamma - published).abs() < tolerance, "{name}: {} in print", published);
+            }
+        }
+    }
+
+    /// Both certificates hold just above γ, and fail with a γ 1 % lower, and with a controller that breaks the bound.
+    #[test]
+    fn certificates_hold_and_their_twins_fail() {
+        for (name, plant, gamma, _) in benchmarks() {
+            let synthesis = Synthesis::new(&plant).unwrap();
+            assert!(synthesis.check(0.99 * gamma).is_err(), "{name}: 1 % below is feasible");
+            let bound = 1.01 * gamma;
+            let controller = synthesis.controller(bound).unwrap();
+            let closed = plant.closed(&controller).unwrap();
+            assert!(norm_is_below(&closed, bound).unwrap(), "{name}");
+            let value = norm(&closed, 1e-6).unwrap().value;
+            assert!(value >= 0.999 * gamma && value < bound, "{name}: norm {value}");
+            let lemma = bounded_real(&closed, bound).unwrap();
+            assert!(lemma.largest_eigenvalue < 0.0 && lemma.x_smallest_eigenvalue > 0.0, "{name}");
+            assert!(bounded_real(&closed, 0.99 * value).is_err(), "{name}: a bound below the norm is proved");
+            let broken = [0.5, 2.0, 4.0].into_iter().filter(|gain| {
+                let other = StateSpace { c: &controller.c * *gain, d: &controller.d * *gain, ..controller.clone() };
+                let closed = plant.closed(&other).unwrap();
+                let breaks = !norm_is_below(&closed, bound).unwrap();
+                assert!(
+                    !breaks || lemma.largest_eigenvalue_for(&closed) > 0.0,
+                    "{name}: the inequality holds at {gain}"
+                );
+                breaks
+            });
+            assert!(broken.count() > 0, "{name}: no gain breaks the bound");
+        }
+    }
+
+    /// Resonance `1/(s² + 2ζs + 1)`, all-pass, and a direct term that is the largest gain.
+    #[test]
+    fn norms_in_closed_form() {
+        let zeta: f64 = 0.01;
+        let resonance = StateSpace::quotient(&[0.0, 0.0, 1.0], &[1.0, 2.0 * zeta, 1.0]);
+        let found = norm(&resonance, 1e-9).unwrap();
+        let exact = 1.0 / (2.0 * zeta * (1.0 - zeta * zeta).sqrt());
+        assert!((found.value / exact - 1.0).abs() < 1e-8, "{} for {exact}", found.value);
+        assert!((found.frequency_rad_s - (1.0 - 2.0 * zeta * zeta).sqrt()).abs() < 1e-4);
+        let all_pass = StateSpace::quotient(&[-1.0, 3.0], &[1.0, 3.0]);
+        assert!((norm(&all_pass, 1e-6).unwrap().value - 1.0).abs() < 1e-6);
+        let lead = StateSpace::quotient(&[2.0, 1.0], &[1.0, 1.0]);
+        assert!((norm(&lead, 1e-6).unwrap().value - 2.0).abs() < 2e-6);
+        assert!(
+            norm_is_below(&resonance, 1.0001 * exact).unwrap() && !norm_is_below(&resonance, 0.9999 * exact).unwrap()
+        );
+        let unstable = StateSpace::quotient(&[0.0, 1.0], &[1.0, -2.0]);
+        assert!(matches!(norm(&unstable, 1e-3), Err(HinfError::Unstable { re }) if (re - 2.0).abs() < 1e-12));
+    }
+
+    /// A plant of one state: `ẋ = a x + w_1 + b u`, `z = (x, u)`, `y = c x + w_2`.
+    fn scalar(a: f64, b: f64, c: f64) -> GeneralizedPlant {
+        let system = StateSpace::new(
+            Matrix::from_element(1, 1, a),
+            Matrix::from_row_slice(1, 3, &[1.0, 0.0, b]),
+            Matrix::from_row_slice(3, 1, &[1.0, 0.0, c]),
+            Matrix::from_row_slice(3, 3, &[0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0]),
+        );
+        GeneralizedPlant { system: system.unwrap(), measurements: 1, controls: 1 }
+    }
+
+    /// Closed form for `a = b = c = 1`: `X = Y` with `2X + X²(γ⁻² − 1) + 1 = 0`, and `X² = γ²` at the optimum.
+    #[test]
+    fn scalar_problem_has_its_closed_form() {
+        // X = γ: γ² − 2γ − 2 = 0.
+        let exact = 1.0 + 3.0_f64.sqrt();
+        let optimum = Synthesis::new(&scalar(1.0, 1.0, 1.0)).unwrap().optimum(1e-9).unwrap();
+        assert!((optimum.gamma - exact).abs() < 1e-7, "{}", optimum.gamma);
+        assert!(matches!(optimum.obstacle, Some(Obstacle::Coupling { .. })), "{:?}", optimum.obstacle);
+    }
+
+    #[test]
+    fn broken_assumptions_are_named() {
+        assert!(matches!(Synthesis::new(&scalar(1.0, 0.0, 1.0)), Err(HinfError::NotStabilisable { .. })));
+        assert!(matches!(Synthesis::new(&scalar(1.0, 1.0, 0.0)), Err(HinfError::NotDetectable { .. })));
+        assert!(Synthesis::new(&scalar(-1.0, 0.0, 0.0)).is_ok(), "a stable mode may be out of reach");
+        let mut plant = scalar(1.0, 1.0, 1.0);
+        plant.system.d[(1, 2)] = 0.0;
+        assert!(matches!(Synthesis::new(&plant), Err(HinfError::FreeControl)));
+        let mut plant = scalar(1.0, 1.0, 1.0);
+        plant.system.d[(2, 1)] = 0.0;
+        assert!(matches!(Synthesis::new(&plant), Err(HinfError::PerfectMeasurement)));
+        let plant = GeneralizedPlant { controls: 3, ..scalar(1.0, 1.0, 1.0) };
+        assert!(matches!(Synthesis::new(&plant), Err(HinfError::Partition { .. })));
+        // A direct term from w_1 to x that no control reaches.
+        let mut plant = scalar(1.0, 1.0, 1.0);
+        plant.system.d[(0, 0)] = 5.0;
+        let synthesis = Synthesis::new(&plant).unwrap();
+        assert!(matches!(synthesis.check(4.9), Err(Obstacle::Direct { at_least }) if (at_least - 5.0).abs() < 1e-12));
+        let error = synthesis.controller(4.9).unwrap_err().to_string();
+        assert!(error.contains("4.9") && error.contains("direct term"), "{error}");
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(64))]
+        /// Random plants of all sizes, every direct term present: the controller at 1.05 γ keeps its bound.
+        #[test]
+        fn controllers_keep_their_gamma(
+            n in 1..6_usize,
+            sizes in prop::array::uniform4(1..3_usize),
+            values in prop::collection::vec(-1.0..1.0_f64, 400),
+        ) {
+            let [extra_z, extra_w, measurements, controls] = sizes;
+            let (outputs, inputs) = (extra_z + controls + measurements, extra_w + measurements + controls);
+            let mut next = values.iter().copied().cycle();
+            let mut fill = |rows, columns| Matrix::from_fn(rows, columns, |_, _| next.next().unwrap_or(0.0));
+            let (a, b, c) = (fill(n, n) * 2.0, fill(n, inputs), fill(outputs, n));
+            let mut d = fill(outputs, inputs) * 0.5;
+            // Well away from a loss of rank in D_12 and D_21.
+            for k in 0..controls {
+                d[(extra_z + k, extra_w + measurements + k)] += 2.0;
+            }
+            for k in 0..measurements {
+                d[(extra_z + controls + k, extra_w + k)] += 2.0;
+            }
+            let plant = GeneralizedPlant { system: StateSpace::new(a, b, c, d).unwrap(), measurements, controls };
+            let Ok(synthesis) = Synthesis::new(&plant) else { return Ok(()) };
+            // Zeros on the axis are not excluded, and have no optimum.
+            let Ok(optimum) = synthesis.optimum(1e-4) else { return Ok(()) };
+            let gamma = 1.05 * optimum.gamma;
+            let closed = plant.closed(&synthesis.controller(gamma).unwrap()).unwrap();
+            prop_assert!(norm_is_below(&closed, gamma).unwrap(), "{:?} against {}", norm(&closed, 1e-4), gamma);
+        }
+    }
 }

@@ -3,7 +3,7 @@
 use nalgebra::linalg::balancing::balance_parlett_reinsch;
 use nalgebra::{Complex, DMatrix};
 
-use crate::schur::{Schur, complex, lyapunov};
+use crate::schur::{Schur, complex, eigenvalues, lyapunov};
 
 type Matrix = DMatrix<f64>;
 
@@ -38,6 +38,11 @@ pub enum RiccatiError {
 /// [`RiccatiError`] says why there is none.
 pub fn stabilising_solution(hamiltonian: &Matrix) -> Result<Matrix, RiccatiError> {
     let n = hamiltonian.nrows() / 2;
+    let stable = |m: Matrix| eigenvalues(&m).is_some_and(|values| values.iter().all(|z| z.re < 0.0));
+    if hamiltonian.view((n, 0), (n, n)).amax() == 0.0 && stable(hamiltonian.view((0, 0), (n, n)).into_owned()) {
+        // Zero, and not what rounding makes of it: its sign matters to who asks.
+        return Ok(Matrix::zeros(n, n));
+    }
     let mut balanced = hamiltonian.clone();
     let scaling = balance_parlett_reinsch(&mut balanced);
     let size = balanced.norm();
@@ -92,7 +97,6 @@ fn refined(hamiltonian: &Matrix, mut x: Matrix) -> Matrix {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::schur::eigenvalues;
     use proptest::prelude::*;
 
     fn hamiltonian(a: &Matrix, r: &Matrix, q: &Matrix) -> Matrix {

@@ -30,7 +30,8 @@ fn disobedience(flying: &Mission, file: &Mission, seed: u64) -> [f64; 3] {
 /// The controllers of the default design with other gains.
 fn with_gains(scale: f64) -> Mission {
     let mut mission = mission();
-    let mut channel = dragfree_physics::control_design::loop_shaping(&mission).expect("the fixture is complete");
+    let design = dragfree_physics::control_design::design(&mission).expect("the fixture is complete");
+    let mut channel = design.controllers();
     for controller in channel.values_mut() {
         controller.gain_s2 *= scale;
     }
