@@ -124,7 +124,7 @@ impl Panel {
             .x_label_formatter(&decade)
             .y_label_formatter(&decade)
             .bold_line_style(RGBColor(200, 200, 200))
-            .light_line_style(RGBColor(238, 238, 238))
+            .max_light_lines(0)
             .draw()
             .map_err(refused)?;
         for line in &self.lines {

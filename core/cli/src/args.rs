@@ -62,6 +62,8 @@ pub(crate) enum Command {
     },
     /// Simulate telemetry: one file per day, the truth apart in DIR/truth/
     Simulate(Simulate),
+    /// H-infinity synthesis and allocation of a mission: gamma, bounds and margins per channel
+    Design(Design),
     /// Replay telemetry through a pipeline and archive a product
     Run(Run),
     /// Check configuration without running
@@ -112,6 +114,28 @@ impl Simulate {
         let hours = self.days.map_or(self.hours.unwrap_or(6.0), |days| 24.0 * days);
         self.start_ns.saturating_add((hours * 3600e9).round() as i64) // a cast of a float saturates
     }
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Design {
+    /// Mission file
+    #[arg(value_name = "MISSION.toml")]
+    pub(crate) mission: PathBuf,
+    /// Draw sensitivities and predicted spectra as SVG into this folder
+    #[arg(long, value_name = "DIR")]
+    pub(crate) pictures: Option<PathBuf>,
+    /// Write the controllers as the [control] of a mission file
+    #[arg(long, value_name = "FILE")]
+    pub(crate) freeze: Option<PathBuf>,
+}
+
+/// An effect in the truth of a simulation.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Effect {
+    pub(crate) id: String,
+    pub(crate) instance: String,
+    /// SI, unit of the coefficient.
+    pub(crate) size: f64,
 }
 
 #[derive(Debug, Args)]
@@ -237,6 +261,8 @@ mod tests {
             "dragfree simulate m.toml --out d --start 2035-01-01T06:00:00Z --days 2 --hidden 7",
             "dragfree run p.toml a.mcap b.mcap --mission m.toml --model c.toml --archive d --from 2035-01-01 --until 2035-01-02 --json",
             "dragfree run p.toml",
+            "dragfree design m.toml --json",
+            "dragfree design m.toml --pictures d --freeze c.toml",
             "dragfree config check p.toml",
             "dragfree plugins list --json --plugin-dir a --plugin-dir b",
             "dragfree plugins inspect es-akf",

@@ -1,6 +1,7 @@
 //! One function per command; each gives back what belongs on stdout.
 
 mod demo;
+mod design;
 mod plugins;
 mod products;
 mod run;
@@ -35,6 +36,7 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
     match &arguments.command {
         Command::Demo { dir } => demo::execute(dir, global, paint),
         Command::Simulate(command) => simulate::execute(command, global),
+        Command::Design(command) => design::execute(command, global, paint),
         Command::Run(command) => run::execute(command, global, paint),
         Command::Config(Config::Check(chain)) => run::config_check(chain, global),
         Command::Plugins(command) => plugins::execute(command, global, paint),
