@@ -129,15 +129,6 @@ pub(crate) struct Design {
     pub(crate) freeze: Option<PathBuf>,
 }
 
-/// An effect in the truth of a simulation.
-#[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Effect {
-    pub(crate) id: String,
-    pub(crate) instance: String,
-    /// SI, unit of the coefficient.
-    pub(crate) size: f64,
-}
-
 #[derive(Debug, Args)]
 pub(crate) struct Run {
     #[command(flatten)]
