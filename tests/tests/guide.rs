@@ -58,6 +58,21 @@ fn readers_folder() -> tempfile::TempDir {
     dir
 }
 
+/// Every picture that a page shows is there.
+#[test]
+fn every_picture_of_the_guide_is_there() {
+    let mut shown = 0;
+    for page in pages() {
+        let text = std::fs::read_to_string(&page).expect("readable");
+        for name in text.split("](pictures/").skip(1).filter_map(|rest| rest.split(')').next()) {
+            let picture = page.with_file_name("pictures").join(name);
+            assert!(picture.is_file(), "{}: {}", page.display(), picture.display());
+            shown += 1;
+        }
+    }
+    assert!(shown >= 3, "the closed loop has its pictures");
+}
+
 #[test]
 fn every_command_of_the_guide_runs() {
     let dir = readers_folder();
