@@ -5,16 +5,25 @@ use dragfree_hinf_dfacs::reconstruction::{AngularAcceleration, Epoch, Reconstruc
 use dragfree_physics::control::{Command, ControlLaw, Readout, TestMassReadout};
 use dragfree_physics::mission::Mission;
 use nalgebra::{Matrix3, Vector3};
+use std::sync::OnceLock;
 
 pub(crate) const RATE_HZ: f64 = 10.0;
 pub(crate) const DT_S: f64 = 1.0 / RATE_HZ;
 
-/// The default mission without sunlight, so that nothing but the loop moves the spacecraft.
+/// The default mission without sunlight, so that nothing but the loop moves the spacecraft, with its controllers designed
+/// once for all tests.
 pub(crate) fn mission() -> Mission {
+    static MISSION: OnceLock<Mission> = OnceLock::new();
+    MISSION.get_or_init(designed).clone()
+}
+
+fn designed() -> Mission {
     let text = include_str!("../../../../fixtures/missions/taiji.toml");
     let value: serde_json::Value = toml::from_str(text).expect("the fixture is TOML");
     let mut mission = Mission::from_json(&value.to_string()).expect("the fixture is a mission");
     mission.solar_pressure = None;
+    let design = dragfree_physics::control_design::design(&mission).expect("the fixture is complete");
+    mission.control.as_mut().expect("the fixture has a loop").channel = design.controllers();
     mission
 }
 

@@ -219,6 +219,8 @@ fn a_lost_command_is_filled_only_by_the_law_that_flew() {
     if let Some(requirements) = &mut other.requirements {
         requirements.sc_attitude_rad_rthz *= 3.0;
     }
+    // Designed anew for the other requirement.
+    other.control.as_mut().expect("the fixture has a loop").channel.clear();
     for (flying, same) in [(&ours, true), (&other, false)] {
         let (mut epochs, _) = telemetry(flying, 4000);
         let complete = run(&mut stage(&ours, &settings(Smoother)), &epochs);
