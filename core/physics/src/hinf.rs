@@ -689,7 +689,7 @@ mod tests {
             if let Some(published) = published {
                 // Books print two decimals; closed forms are exact.
                 let tolerance = if published == (published * 100.0).round() / 100.0 { 0.005 } else { 2e-6 };
-                assert!((optimum.gamma - published).abs() < tolerance, "{name}: {} in print", published);
+                assert!((optimum.gamma - published).abs() < tolerance, "{name}: {published} in print");
             }
         }
     }
