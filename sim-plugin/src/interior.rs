@@ -105,6 +105,10 @@ pub struct Interior {
     pub battery_a: f64,
     /// Propellant left, kg.
     pub tank_kg: f64,
+    /// The same a step before, kg and, of the structure, K: what lies between two steps is a line.
+    pub tank_before_kg: f64,
+    /// See [`Self::tank_before_kg`].
+    pub structure_before_k: f64,
     /// Propellant at the first sample, kg.
     pub tank_first_kg: f64,
     /// Temperature of the structure at the first sample, K.
@@ -129,6 +133,17 @@ pub struct Interior {
     pub antenna_wait_s: f64,
     /// Opening angle between the two optical axes, rad.
     pub opening_rad: f64,
+}
+
+impl Interior {
+    /// Propellant (kg) and temperature of the structure (K) without steps, one second late.
+    #[must_use]
+    pub fn smooth(&self, elapsed_s: f64) -> (f64, f64) {
+        // Epochs are multiples of the interval to rounding.
+        let part = (elapsed_s / STEP_S - (elapsed_s / STEP_S + 1e-6).floor()).max(0.0);
+        let between = |before: f64, now: f64| before + (now - before) * part;
+        (between(self.tank_before_kg, self.tank_kg), between(self.structure_before_k, self.structure_k))
+    }
 }
 
 /// The random parts.
@@ -236,6 +251,8 @@ impl Running {
             warmth: [0.6, 0.4],
             battery_a: BUS_A,
             tank_kg: 85.0,
+            tank_before_kg: 85.0,
+            structure_before_k: 296.5,
             tank_first_kg: 85.0,
             structure_first_k: 296.5,
             thrust_n: [BIAS_N; 6],
@@ -257,6 +274,7 @@ impl Running {
         }
         out.electricity();
         out.now.structure_first_k = out.now.structure_k;
+        out.now.structure_before_k = out.now.structure_k;
         out
     }
 
@@ -274,6 +292,7 @@ impl Running {
 
     /// Moves on by a step, to an epoch.
     pub fn step(&mut self, index: i64, influences: &Influences) {
+        (self.now.tank_before_kg, self.now.structure_before_k) = (self.now.tank_kg, self.now.structure_k);
         self.propulsion();
         self.heat(influences, false);
         self.electricity();
@@ -282,8 +301,8 @@ impl Running {
         self.now.opening_rad = influences.opening_rad;
         self.now.pressure_pa *= (-STEP_S / OUTGASSING_S).exp();
         if index == 0 {
-            self.now.tank_first_kg = self.now.tank_kg;
-            self.now.structure_first_k = self.now.structure_k;
+            self.now.tank_first_kg = self.now.tank_before_kg;
+            self.now.structure_first_k = self.now.structure_before_k;
         }
     }
 

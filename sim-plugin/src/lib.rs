@@ -4,6 +4,7 @@
 //! fits.
 
 pub mod effects;
+pub mod hidden;
 pub mod housekeeping;
 pub mod interior;
 pub mod orbit;
@@ -22,6 +23,7 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 
 use effects::Asked;
+use hidden::Hidden;
 use housekeeping::{CHANNELS, Housekeeping};
 use simulator::{Epoch, Settings, SimulationError, Simulator};
 
@@ -203,6 +205,8 @@ pub struct Sim {
     /// Samples in a second.
     every_second: i64,
     end_ns: i64,
+    /// What is hidden, for the host to seal.
+    sealed: Option<String>,
     topics: Option<Topics>,
     identity: [(&'static str, String); 3],
     counts: Counts,
@@ -261,6 +265,7 @@ impl Source for Sim {
             Parameter::bool("command", true, "telemeter /command"),
             Parameter::f64("stiffness_error", "1", 0.2, 0.0..=0.9, "largest relative error of the mission's stiffness"),
             Parameter::f64("settle_s", "s", 600.0, 0.0..=86_400.0, "how long the loop runs before the first sample"),
+            Parameter::i64("hidden", "", -1, -1..=i64::MAX, "seed of the effects to hide; -1 hides none"),
             Parameter::text_list(
                 "effects",
                 &[],
@@ -281,7 +286,11 @@ impl Source for Sim {
                 "parameter com_offset_srf_m = {given:?} must have three components, x, y, z of SRF"
             ))
         })?;
-        let effects = setup.text_list("effects")?.iter().map(|text| Asked::parse(text)).collect::<Result<_, _>>()?;
+        let given = setup.text_list("effects")?;
+        let mut effects = given.iter().map(|text| Asked::parse(text)).collect::<Result<Vec<_>, _>>()?;
+        let days = (end_ns - start_ns) as f64 / 86_400e9;
+        let hidden = u64::try_from(setup.i64("hidden")?).ok().map(|seed| Hidden::draw(seed, days));
+        effects.extend(hidden.iter().flat_map(|h| &h.drawn).map(|d| d.asked.clone()));
         let seed = setup.i64("seed")?.cast_unsigned();
         let settings = Settings {
             seed,
@@ -292,6 +301,20 @@ impl Source for Sim {
             effects,
         };
         let simulator = Simulator::new(&mission, settings).map_err(refuse)?;
+        let sealed = hidden.map(|hidden| {
+            let offset_m: serde_json::Map<_, _> = (0..2)
+                .flat_map(|i| (0..3).map(move |j| (i, j)))
+                .map(|(i, j)| {
+                    let name = format!("com-offset.tm{}.{}", i + 1, ["x", "y", "z"][j]);
+                    (name, simulator.offset_orf_m()[i][j].into())
+                })
+                .collect();
+            let about = serde_json::json!({
+                "mission": mission.mission.name, "spacecraft": mission.mission.spacecraft, "noise_seed": seed,
+                "start_ns": start_ns, "end_ns": end_ns, "given": given, "offset_m": offset_m,
+            });
+            hidden.content(&about).to_string()
+        });
         simulator.constellation().check("the end of the simulation,", end_ns).map_err(|e| refuse(e.into()))?;
         // The third stream of the seed; the loop takes the first two.
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
@@ -302,6 +325,7 @@ impl Source for Sim {
             telemeter_command: setup.bool("command")?,
             every_second: mission.mission.sample_rate_hz.round().max(1.0) as i64,
             end_ns,
+            sealed,
             topics: None,
             identity: [
                 ("time_scale", "UTC".to_owned()),
@@ -344,7 +368,8 @@ impl Source for Sim {
         let counts =
             [("epochs", all), ("epochs_at_actuator_limit", at_limit), ("epochs_with_saturated_readout", saturated)];
         let counts = counts.map(|(name, count)| (name.to_owned(), count));
-        Ok(Report { counts: counts.into(), quality, ..Report::default() })
+        let sealed = self.sealed.iter().map(|text| Attachment { suffix: "sealed.json".to_owned(), text: text.clone() });
+        Ok(Report { counts: counts.into(), quality, attachments: sealed.collect(), ..Report::default() })
     }
 
     fn save(&self) -> Result<Vec<u8>, PluginError> {

@@ -411,6 +411,12 @@ impl Simulator {
         &self.inside.now
     }
 
+    /// The housings relative to the centre of mass at the coming epoch, ORF, m.
+    #[must_use]
+    pub fn offset_orf_m(&self) -> &[Vector3<f64>; 2] {
+        &self.offset_orf_m
+    }
+
     /// What the outside does to the inside.
     fn influences(&self) -> Influences {
         let e = &self.environment;

@@ -363,7 +363,11 @@ fn the_centre_of_mass_wanders() {
     let (first_k, first_kg) = (inside.structure_k, inside.tank_kg);
     twins.run(60_000);
     for row in twins.rows(5) {
-        let (warmer, spent) = (row.inside.structure_k - first_k, first_kg - row.inside.tank_kg);
+        // Between the last two seconds, a line.
+        let part = row.elapsed_s - (row.elapsed_s + 1e-6).floor();
+        let between = |a: f64, b: f64| a + part * (b - a);
+        let warmer = between(row.inside.structure_before_k, row.inside.structure_k) - first_k;
+        let spent = first_kg - between(row.inside.tank_before_kg, row.inside.tank_kg);
         assert!(warmer.abs() > 1e-4 && spent > 1e-4, "{warmer} K, {spent} kg");
         let drift = axis(0) * (5e-6 * row.elapsed_s + 1e-3 * warmer + spent);
         let alpha = row.epoch.truth.alpha_srf_rad_s2;

@@ -2,6 +2,7 @@
 
 use dragfree_engine::border::{Config, Instance, Kind, Library, LinkRequest};
 use dragfree_engine::table::{Batch, TableSpec};
+use dragfree_sim::hidden::Hidden;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -23,7 +24,7 @@ fn config(seconds: i64, change: impl Fn(&mut Value, &mut Value)) -> Config {
     let mut mission: Value = toml::from_str(&text).unwrap();
     let mut parameters = json!({
         "seed": 5, "com_offset_srf_m": [0.001, 0.0, 0.0], "command": true, "stiffness_error": 0.2, "settle_s": 60.0,
-        "effects": []
+        "effects": [], "hidden": -1
     });
     change(&mut mission, &mut parameters);
     let value = json!({
@@ -113,7 +114,17 @@ fn a_saved_state_goes_on_bit_for_bit_with_thrusters_and_lines() {
 
 fn goes_on(change: impl Fn(&mut Value)) {
     let library = library();
-    let config = config(200, |m, _| change(m));
+    let effects = [
+        "slosh:sc.x=0.01",
+        "thermal:tm1.x=1e-12",
+        "time-offset:dws=0.13",
+        "offset-drift:sc.x=1e-8,kappa_m_k=1e-5",
+        "is-noise:tm1.y=1.5",
+    ];
+    let config = config(200, |m, p| {
+        change(m);
+        p["effects"] = json!(effects);
+    });
     let (_, whole) = run(&library, &config, 777);
     let (mut first, tables) = linked(&library, &config);
     let mut all: Vec<Batch> = tables.iter().map(|t| Batch::empty(t.columns.len())).collect();
@@ -265,6 +276,39 @@ fn what_has_no_sense_is_refused_by_name() {
         ("es-gain:tm1.y=much", refusal(&|_, p| p["effects"] = json!(["es-gain:tm1.y=much"]))),
     ] {
         assert!(found.contains(what), "{what}: {found}");
+    }
+}
+
+/// What is hidden shows in the attachment that the host seals and nowhere else: tables, columns and their attributes are
+/// the same, and so are rows where the seed draws nothing. The seed is the first that draws something, and nothing.
+#[test]
+fn hidden_effects_leave_no_trace_but_their_own() {
+    let library = library();
+    let drawn = |seed: i64| Hidden::draw(seed.cast_unsigned(), 120.0 / 86_400.0).drawn.len();
+    let something = (0..).find(|seed| drawn(*seed) > 0).unwrap();
+    let nothing = (0..).find(|seed| drawn(*seed) == 0).unwrap();
+    let hide = |seed: i64| config(120, move |_, p| p["hidden"] = json!(seed));
+    let (plain, rows) = run(&library, &hide(-1), 4096);
+    let (hidden, changed) = run(&library, &hide(something), 4096);
+    assert_eq!(plain, hidden);
+    assert!(rows != changed, "seed {something} changes the rows");
+    assert!(rows == run(&library, &hide(nothing), 4096).1, "seed {nothing} changes nothing");
+
+    let sealed = |seed: i64| {
+        let report = linked(&library, &hide(seed)).0.report("[]").unwrap();
+        assert!(report["quality"].as_object().unwrap().keys().all(|k| k != "hidden"), "{report}");
+        report["attachments"].clone()
+    };
+    assert!(sealed(-1).is_null());
+    for seed in [something, nothing] {
+        let attachments = sealed(seed);
+        assert_eq!(attachments[0]["suffix"], "sealed.json");
+        let content: Value = serde_json::from_str(attachments[0]["text"].as_str().unwrap()).unwrap();
+        assert_eq!(content["effects"].as_array().unwrap().len(), drawn(seed));
+        assert_eq!((&content["hidden_seed"], &content["noise_seed"]), (&json!(seed), &json!(5)));
+        let b_m = content["offset_m"]["com-offset.tm1.x"].as_f64().unwrap();
+        assert!((b_m - 0.090_866_025).abs() < 2e-3, "{b_m}");
+        assert_eq!(sealed(seed), attachments, "the same again");
     }
 }
 

@@ -68,10 +68,19 @@ fn an_arrow_that_points_up_is_seen() {
     assert_eq!(arrows_up(&broken), ["dragfree-engine -> dragfree-physics", "dragfree-es-akf -> dragfree-engine"]);
 }
 
+/// The truth of a simulation and the effects that a calibration fits share no code: what one does wrong the other would
+/// not see.
+#[test]
+fn the_simulator_shares_no_code_with_the_effects() {
+    let found = dependencies();
+    assert!(found.contains_key("dragfree-sim") && found.contains_key("dragfree-effects"), "{:?}", found.keys());
+    assert!(!found["dragfree-sim"].contains("dragfree-effects") && !found["dragfree-effects"].contains("dragfree-sim"));
+}
+
 /// The engine never knows a plugin or an effect by name.
 #[test]
 fn the_engine_names_no_plugin() {
-    let names = ["com-offset", "es-akf", "qp-check", "hinf-dfacs", "preprocess", "gracefo"];
+    let names = ["com-offset", "es-gain", "thermal", "es-akf", "qp-check", "hinf-dfacs", "preprocess", "gracefo"];
     let mut folders = vec![dragfree_tests::root().join("core/engine/src")];
     let mut seen = 0;
     while let Some(folder) = folders.pop() {

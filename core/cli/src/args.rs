@@ -62,6 +62,15 @@ pub(crate) enum Command {
     },
     /// Simulate telemetry: one file per day, the truth apart in DIR/truth/
     Simulate(Simulate),
+    /// Open what `simulate --hidden` hid, and check that it was not changed since
+    Reveal {
+        /// Sealed file, DIR/truth/*.sealed.json
+        #[arg(value_name = "SEALED")]
+        sealed: PathBuf,
+        /// Telemetry that names its digest; repeatable [default: what lies in DIR]
+        #[arg(long, value_name = "FILE")]
+        telemetry: Vec<PathBuf>,
+    },
     /// H-infinity synthesis and allocation of a mission: gamma, bounds and margins per channel
     Design(Design),
     /// Replay telemetry through a pipeline and archive a product
@@ -77,7 +86,23 @@ pub(crate) enum Command {
     Products(Products),
 }
 
+/// What `simulate --help` ends with; the simulator has the last word, and a test compares.
+const EFFECTS: &str = "\
+Effects, and where (TM: tm1, tm2; AXIS: x, y, z; size in SI units):
+  com-offset:sc.AXIS           stiffness:TM.AXIS       cross-stiffness:TM.AXIS
+  offset-drift:sc.AXIS         opening-angle:TM        es-gain:TM.y|z
+  es-crosstalk:TM.FROM-TO      mps-gain:sc.AXIS        mps-tilt:sc.AXIS
+  torque-gain:sc.AXIS          mps-noise:sc.AXIS       torque-noise:sc.AXIS
+  is-noise:TM.AXIS             is-scale:TM.AXIS        is-crosstalk:TM.FROM-TO
+  tilt-to-length:TM            time-offset:is|ifo|dws  thermal:TM.AXIS
+  magnetic:TM                  charge:TM               current-force:TM.AXIS
+  product-force:TM.AXIS        slosh:sc.x|y            solar-pressure:sc
+  impulse:sc.AXIS|TM.AXIS|sc.phi|theta|psi
+Some have named shapes, as thermal:tm1.x=2e-12,lag_s=480. A wrong one, as
+--effect help:me=0, is answered with the sizes, shapes and what they do.";
+
 #[derive(Debug, Args)]
+#[command(after_help = EFFECTS)]
 pub(crate) struct Simulate {
     /// Mission file
     #[arg(value_name = "MISSION.toml")]
@@ -100,9 +125,9 @@ pub(crate) struct Simulate {
     /// Add an effect to the truth, `es-gain:tm1.y=0.02`, SI units; repeatable. The list is below
     #[arg(long = "effect", value_name = "ID:INSTANCE=SIZE[,NAME=VALUE]...", value_parser = effect)]
     pub(crate) effects: Vec<String>,
-    /// Hide an effect that this seed draws
+    /// Hide what this seed draws: mostly one effect; sealed in DIR/truth/, opened by `reveal`
     #[arg(long, value_name = "SEED")]
-    pub(crate) hidden: Option<u64>,
+    pub(crate) hidden: Option<u32>,
     /// Leave out the /command topic
     #[arg(long)]
     pub(crate) no_command: bool,
@@ -250,6 +275,7 @@ mod tests {
             "dragfree demo --dir d",
             "dragfree simulate m.toml --out d --start 2035-01-01 --hours 6 --seed 3 --effect es-gain:tm1.y=0.02 --no-command",
             "dragfree simulate m.toml --out d --start 2035-01-01T06:00:00Z --days 2 --hidden 7",
+            "dragfree reveal d/truth/a.sealed.json --telemetry a.mcap --telemetry b.mcap --json",
             "dragfree run p.toml a.mcap b.mcap --mission m.toml --model c.toml --archive d --from 2035-01-01 --until 2035-01-02 --json",
             "dragfree run p.toml",
             "dragfree design m.toml --json",

@@ -21,11 +21,6 @@ pub(crate) enum Failure {
     /// The demo would have to share a folder.
     #[error("{} is neither empty nor made by an earlier demo; name a folder of its own with --dir", .0.display())]
     NoDemoFolder(PathBuf),
-    /// `--hidden` was asked for.
-    #[error(
-        "--hidden is not built yet: no bundled effect can be hidden besides the offset; use --effect ID:INSTANCE=SIZE"
-    )]
-    Hidden,
     /// The engine failed.
     #[error(transparent)]
     Engine(#[from] Box<dyn Error>),

@@ -12,6 +12,7 @@ use crate::config::{Mission, resolve_parameters};
 use crate::product::Loss;
 use crate::registry::{Found, Registry};
 use crate::replay::Replay;
+use crate::sealed::Sealed;
 use crate::table::{Chunk, TableSpec};
 
 /// Rows in stretches of time.
@@ -184,6 +185,22 @@ impl SourceFeed {
     }
 }
 
+/// End of the name of an attachment that is sealed: the source's secret until it is revealed.
+const SEALED: &str = "sealed.json";
+
+impl SourceFeed {
+    /// What the source wants sealed, the attachment `sealed.json` of its report; it is never part of a product.
+    ///
+    /// # Errors
+    /// The source failed.
+    pub fn sealed(&mut self) -> Result<Option<Sealed>, EngineError> {
+        let report = self.instance.report("[]").map_err(chain::ChainError::from)?;
+        let attachments = report["attachments"].as_array().map_or(&[][..], Vec::as_slice);
+        let sealed = attachments.iter().find(|a| a["suffix"] == SEALED).and_then(|a| a["text"].as_str());
+        Ok(sealed.map(Sealed::new))
+    }
+}
+
 impl Feed for SourceFeed {
     fn tables(&self) -> &[TableSpec] {
         &self.tables
@@ -203,7 +220,10 @@ impl Feed for SourceFeed {
     }
 
     fn summary(&mut self) -> Result<Summary, EngineError> {
-        let report = self.instance.report("[]").map_err(chain::ChainError::from)?;
+        let mut report = self.instance.report("[]").map_err(chain::ChainError::from)?;
+        if let Some(attachments) = report["attachments"].as_array_mut() {
+            attachments.retain(|a| a["suffix"] != SEALED);
+        }
         let text = |key: &str| report["quality"][key].as_str().unwrap_or_default().to_owned();
         Ok(Summary {
             time_scale: Some(text("time_scale")).filter(|t| !t.is_empty()).unwrap_or_else(|| "UTC".to_owned()),

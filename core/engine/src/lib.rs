@@ -11,6 +11,7 @@ pub mod product;
 pub mod registry;
 pub mod replay;
 pub mod run;
+pub mod sealed;
 pub mod simulate;
 pub mod table;
 pub mod telemetry;
@@ -35,6 +36,9 @@ pub enum EngineError {
     /// Writing telemetry or time series.
     #[error(transparent)]
     Write(#[from] telemetry::WriteError),
+    /// What a simulation hides.
+    #[error(transparent)]
+    Sealed(#[from] sealed::SealedError),
     /// Writing the product.
     #[error(transparent)]
     Product(#[from] product::ProductError),

@@ -11,6 +11,7 @@ use crate::config::Mission;
 use crate::feed::{Feed, SourceFeed, SourceOptions};
 use crate::registry::Registry;
 use crate::run::Progress;
+use crate::sealed::{DIGEST_KEY, Sealed};
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{FileHeader, TelemetryWriter, WriteError, Written};
 
@@ -42,6 +43,8 @@ pub struct SimulateOutcome {
     pub files: Vec<PathBuf>,
     /// The truth of the same days.
     pub truth_files: Vec<PathBuf>,
+    /// What the source hides, when it hides something.
+    pub sealed_file: Option<PathBuf>,
 }
 
 const DAY_NS: i64 = 86_400_000_000_000;
@@ -80,6 +83,11 @@ pub fn simulate(
             rows: 1024,
         },
     )?;
+    let sealed = feed.sealed()?;
+    let sealed_file = sealed.as_ref().map(|_| options.sealed_path(&mission, &window));
+    if let (Some(sealed), Some(path)) = (&sealed, &sealed_file) {
+        sealed.write(path)?;
+    }
     std::thread::scope(|scope| {
         let mut days = DayFiles {
             scope,
@@ -87,7 +95,8 @@ pub fn simulate(
             mission: &mission,
             tables: feed.tables().to_vec(),
             open: None,
-            done: SimulateOutcome::default(),
+            done: SimulateOutcome { sealed_file, ..SimulateOutcome::default() },
+            sealed,
         };
         let mut epochs = 0;
         loop {
@@ -120,6 +129,13 @@ impl SimulateOptions {
     fn path(&self, mission: &Mission, day: NaiveDate, truth: bool) -> PathBuf {
         let folder = if truth { self.out.join("truth") } else { self.out.clone() };
         folder.join(format!("{}_{day}.mcap", mission.spacecraft))
+    }
+}
+
+impl SimulateOptions {
+    fn sealed_path(&self, mission: &Mission, window: &Range<i64>) -> PathBuf {
+        let day = DateTime::from_timestamp_nanos(window.start).date_naive();
+        self.out.join("truth").join(format!("{}_{day}.sealed.json", mission.spacecraft))
     }
 }
 
@@ -204,6 +220,7 @@ struct DayFiles<'scope, 'env> {
     tables: Vec<TableSpec>,
     open: Option<Open<'scope>>,
     done: SimulateOutcome,
+    sealed: Option<Sealed>,
 }
 
 impl<'scope> DayFiles<'scope, '_> {
@@ -237,7 +254,8 @@ impl<'scope> DayFiles<'scope, '_> {
             spacecraft: self.mission.spacecraft.clone(),
             producer: self.options.source.clone(),
             version: self.options.software.clone(),
-            ..FileHeader::default()
+            // The digest and nothing else: the telemetry must not tell what is hidden.
+            extra: self.sealed.iter().map(|s| (DIGEST_KEY.to_owned(), s.sha256.clone())).collect(),
         };
         let pen = |truth: bool, tables: &[TableSpec]| {
             let path = self.options.path(self.mission, day, truth);

@@ -71,8 +71,8 @@ impl Cause for OffsetDrift {
     }
 
     fn reshape(&self, elapsed_s: f64, inside: &Interior, plant: &mut Plant) {
-        let warmer_k = inside.structure_k - inside.structure_first_k;
-        let spent_kg = inside.tank_first_kg - inside.tank_kg;
+        let (tank_kg, structure_k) = inside.smooth(elapsed_s);
+        let (warmer_k, spent_kg) = (structure_k - inside.structure_first_k, inside.tank_first_kg - tank_kg);
         let drift_m = self.rate_m_s * elapsed_s + self.kappa_m_k * warmer_k + self.beta_m_kg * spent_kg;
         plant.tm.iter_mut().for_each(|tm| tm.offset_srf_m += along(self.axis) * drift_m);
     }

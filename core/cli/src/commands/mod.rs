@@ -4,6 +4,7 @@ mod demo;
 mod design;
 mod plugins;
 mod products;
+mod reveal;
 mod run;
 mod simulate;
 
@@ -36,6 +37,7 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
     match &arguments.command {
         Command::Demo { dir } => demo::execute(dir, global, paint),
         Command::Simulate(command) => simulate::execute(command, global),
+        Command::Reveal { sealed, telemetry } => reveal::execute(sealed, telemetry, global.json, paint),
         Command::Design(command) => design::execute(command, global, paint),
         Command::Run(command) => run::execute(command, global, paint),
         Command::Config(Config::Check(chain)) => run::config_check(chain, global),

@@ -11,16 +11,13 @@ use std::fmt::Write as _;
 const SOURCE: &str = "sim";
 
 pub(super) fn execute(command: &Simulate, global: &Global) -> Result<Done, Failure> {
-    if command.hidden.is_some() {
-        return Err(Failure::Hidden);
-    }
     let made = run(command, global)?;
     if global.json {
         let paths =
             |files: &[std::path::PathBuf]| files.iter().map(|f| f.to_string_lossy().into_owned()).collect::<Vec<_>>();
-        return Ok(Done::json(
-            &serde_json::json!({"files": paths(&made.files), "truth_files": paths(&made.truth_files)}),
-        ));
+        return Ok(Done::json(&serde_json::json!({
+            "files": paths(&made.files), "truth_files": paths(&made.truth_files), "sealed_file": made.sealed_file,
+        })));
     }
     let mut text = String::new();
     for file in &made.files {
@@ -28,6 +25,9 @@ pub(super) fn execute(command: &Simulate, global: &Global) -> Result<Done, Failu
     }
     for file in &made.truth_files {
         let _ = writeln!(text, "truth     {}", file.display());
+    }
+    if let Some(file) = &made.sealed_file {
+        let _ = writeln!(text, "sealed    {}", file.display());
     }
     Ok(Done::new(text))
 }
@@ -37,6 +37,9 @@ pub(super) fn run(command: &Simulate, global: &Global) -> Result<SimulateOutcome
     let registry = super::registry(global)?;
     let mut parameters = toml::Table::new();
     parameters.insert("seed".into(), i64::from(command.seed).into());
+    if let Some(seed) = command.hidden {
+        parameters.insert("hidden".into(), i64::from(seed).into());
+    }
     parameters.insert("command".into(), (!command.no_command).into());
     parameters.insert("effects".into(), command.effects.clone().into());
     let options = SimulateOptions {
