@@ -5,6 +5,8 @@
 //! information of it under the mission's noise, after the six offsets (with the surveyed baseline) and a constant and a
 //! slope per channel are fitted, gives σ. For an excess of noise it is that of the spectra.
 
+#![allow(clippy::print_stdout, reason = "it prints a table")]
+
 use dragfree_physics::mission::Mission;
 use dragfree_sim::effects::{Asked, catalogue};
 use dragfree_sim::simulator::{Epoch, Settings, Simulator};
@@ -59,6 +61,14 @@ impl Known {
     }
 }
 
+/// Readouts, known accelerations and `α` of an epoch.
+#[derive(Clone, Copy)]
+struct Sample {
+    shown: [Vector3<f64>; 3],
+    known: [Vector3<f64>; 3],
+    alpha: Vector3<f64>,
+}
+
 /// Nine residual channels, and with them `α` as the offsets' regressors need it.
 fn residuals(mission: &Mission, effect: Option<&str>) -> (Vec<Vec<f64>>, Vec<Vector3<f64>>) {
     let settings = Settings {
@@ -71,22 +81,23 @@ fn residuals(mission: &Mission, effect: Option<&str>) -> (Vec<Vec<f64>>, Vec<Vec
     };
     let known = Known::new(mission);
     let mut simulator = Simulator::new(mission, settings).expect("the fixture flies");
-    let mut out = vec![Vec::with_capacity(DAY); CHANNELS];
+    let mut out = vec![Vec::new(); CHANNELS];
     let mut alphas = Vec::with_capacity(DAY);
-    let mut past: Option<[([Vector3<f64>; 3], [Vector3<f64>; 3], Vector3<f64>); 2]> = None;
-    let mut last = None;
+    let mut past: Option<[Sample; 2]> = None;
+    let mut last: Option<Sample> = None;
     for _ in 0..DAY + 2 {
         let e = simulator.step().expect("the loop holds");
         let m = &e.measured;
         let r = |i: usize| Vector3::new(m.ifo_x_orf_m[i], m.is_r_orf_m[i].y, m.is_r_orf_m[i].z);
-        let now = ([r(0), r(1), m.dws_sc_crf_rad], known.known(&e), e.truth.alpha_srf_rad_s2);
+        let now =
+            Sample { shown: [r(0), r(1), m.dws_sc_crf_rad], known: known.known(&e), alpha: e.truth.alpha_srf_rad_s2 };
         if let Some([a, b]) = &past {
             for c in 0..3 {
-                let second = (now.0[c] - b.0[c] * 2.0 + a.0[c]) / (DT_S * DT_S);
-                let z = second - (a.1[c] + b.1[c]) * 0.5;
+                let second = (now.shown[c] - b.shown[c] * 2.0 + a.shown[c]) / (DT_S * DT_S);
+                let z = second - (a.known[c] + b.known[c]) * 0.5;
                 (0..3).for_each(|i| out[3 * c + i].push(z[i]));
             }
-            alphas.push((a.2 + b.2) * 0.5);
+            alphas.push((a.alpha + b.alpha) * 0.5);
         }
         past = last.map(|l| [l, now]);
         last = Some(now);
@@ -140,10 +151,10 @@ impl Model {
         let stray = |i: usize| {
             let acceleration = 9e-30 * (1.0 + (4e-4 / f).powi(2));
             let electric = (2e-14 / TM_KG).powi(2) * (1.0 + (1e-3 / f).powi(2));
-            acceleration + if i % 3 == 0 { 0.0 } else { electric }
+            acceleration + if i.is_multiple_of(3) { 0.0 } else { electric }
         };
-        for i in 0..6 {
-            let readout = if i % 3 == 0 {
+        for i in 0..6_usize {
+            let readout = if i.is_multiple_of(3) {
                 1.42e-12_f64.powi(2) * (1.0 + (2e-3 / f).powi(4))
             } else {
                 1.8e-9_f64.powi(2) * (1.0 + (1e-3 / f).powi(2))
@@ -249,7 +260,7 @@ fn main() {
         }
     };
     let only = std::env::args().nth(1);
-    for kind in catalogue().filter(|kind| only.as_ref().is_none_or(|id| id == kind.id)) {
+    for kind in catalogue().filter(|kind| only.as_ref().map_or(kind.id != "com-offset", |id| id == kind.id)) {
         for place in (kind.places)() {
             for (effect, size) in shapes(kind.id, &place.to_string()) {
                 let (z, _) = residuals(&mission, Some(&effect));

@@ -131,8 +131,10 @@ pub struct Interior {
     pub antenna_moves: bool,
     /// Seconds until the antenna starts or stops.
     pub antenna_wait_s: f64,
-    /// Opening angle between the two optical axes, rad.
+    /// Opening angle of the constellation, which the telescopes follow, and the same at the first sample, rad.
     pub opening_rad: f64,
+    /// See [`Self::opening_rad`].
+    pub opening_first_rad: f64,
 }
 
 impl Interior {
@@ -188,7 +190,7 @@ pub struct Influences {
     pub sun_distance_m: f64,
     /// Unit vector from the Sun to the spacecraft, SRF.
     pub sun_srf: Vector3<f64>,
-    /// Opening angle between the two optical axes, rad.
+    /// Opening angle of the constellation, rad.
     pub opening_rad: f64,
 }
 
@@ -265,6 +267,7 @@ impl Running {
             antenna_moves: false,
             antenna_wait_s: ANTENNA_S.1 * rng.random::<f64>(),
             opening_rad: influences.opening_rad,
+            opening_first_rad: influences.opening_rad,
         };
         let every = (STEP_S / dt_s).round().max(1.0) as i64;
         let mut out = Self { now, drifts, rng, every, thrust_sum_srf_n: Vector3::zeros(), epochs: 0 };
@@ -303,6 +306,7 @@ impl Running {
         if index == 0 {
             self.now.tank_first_kg = self.now.tank_before_kg;
             self.now.structure_first_k = self.now.structure_before_k;
+            self.now.opening_first_rad = self.now.opening_rad;
         }
     }
 

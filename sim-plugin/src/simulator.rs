@@ -253,7 +253,7 @@ impl Simulator {
         let influences = Influences {
             sun_distance_m: environment.r_sc_irf_m.norm(),
             sun_srf: environment.sun_crf,
-            opening_rad: opening(&plant),
+            opening_rad: environment.opening_angle_rad,
         };
         let (begun, offset_orf_m) = (plant.clone(), offsets(&plant));
         let mut simulator = Self {
@@ -397,7 +397,7 @@ impl Simulator {
     /// is held and taken with SRF on CRF, wrong by 1e-19 m/s² at a test mass.
     fn outside(&self) -> Outside {
         let e = &self.environment;
-        let since_s = (self.index - self.environment_index) as f64 * self.dt_s;
+        let since_s = self.since_packet_s();
         Outside {
             omega_crf_rad_s: e.omega_crf_rad_s + e.alpha_crf_rad_s2 * since_s,
             alpha_crf_rad_s2: e.alpha_crf_rad_s2,
@@ -417,13 +417,18 @@ impl Simulator {
         &self.offset_orf_m
     }
 
+    /// Seconds since the surroundings were looked at.
+    fn since_packet_s(&self) -> f64 {
+        (self.index - self.environment_index) as f64 * self.dt_s
+    }
+
     /// What the outside does to the inside.
     fn influences(&self) -> Influences {
         let e = &self.environment;
         Influences {
             sun_distance_m: e.r_sc_irf_m.norm(),
             sun_srf: turn(&self.state.q_srf_from_crf, &e.sun_crf),
-            opening_rad: opening(&self.plant),
+            opening_rad: e.opening_angle_rad + e.opening_rate_rad_s * self.since_packet_s(),
         }
     }
 
@@ -554,12 +559,6 @@ impl Simulator {
 /// `b_i` in ORF.
 fn offsets(plant: &Plant) -> [Vector3<f64>; 2] {
     plant.tm.each_ref().map(|tm| tm.dcm_orf_from_srf * tm.offset_srf_m)
-}
-
-/// Angle between the sensitive axes, rad.
-fn opening(plant: &Plant) -> f64 {
-    let [a, b] = plant.tm.each_ref().map(|tm| tm.dcm_orf_from_srf.row(0).transpose());
-    a.cross(&b).norm().atan2(a.dot(&b))
 }
 
 /// `Γ` in both ORF, for SRF on CRF.

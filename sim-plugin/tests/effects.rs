@@ -395,8 +395,20 @@ fn the_optical_frame_opens() {
     let turned = Matrix3::new(c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0);
     near(&row.epoch.truth.offset_orf_m[0], &(turned * offset_srf_m(0)), 1e-12, "offset in ORF_1");
     near(&row.epoch.truth.offset_orf_m[1], &(dcm(1) * offset_srf_m(1)), 1e-12, "offset in ORF_2");
-    let opening = twins.with.inside().opening_rad - std::f64::consts::FRAC_PI_3;
-    assert!((opening - 0.011).abs() < 2e-6, "{opening}");
+
+    // With the telescopes: half of what the constellation opens, to either side.
+    for (tm, sign) in [(0, 0.5), (1, -0.5)] {
+        let mut twins = Twins::new(&[&format!("opening-angle:tm{}=0,follow=1", tm + 1)], 0.0);
+        let first_rad = twins.with.inside().opening_rad;
+        twins.run(20_000);
+        let row = twins.row();
+        let opened_rad = row.inside.opening_rad - first_rad;
+        assert!(opened_rad.abs() > 1e-7, "{opened_rad}");
+        let (s, c) = (sign * opened_rad).sin_cos();
+        let turned = Matrix3::new(c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0) * dcm(tm) * offset_srf_m(tm);
+        let (found, own) = (row.epoch.truth.offset_orf_m[tm], dcm(tm) * offset_srf_m(tm));
+        near(&(found - own), &(turned - own), 1e-6, "follows");
+    }
 }
 
 #[test]

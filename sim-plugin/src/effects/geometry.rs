@@ -34,12 +34,20 @@ pub(super) const KINDS: &[Kind] = &[
         places: test_masses,
         size: Number::new("rad", -0.5, 0.5),
         help: "the optical frame is turned by SIZE about s_3 beyond the mission's angle",
-        shape: &[Shape {
-            name: "rate_rad_s",
-            number: Number::new("rad s-1", -1e-6, 1e-6),
-            default: 0.0,
-            help: "and by this per second, rad/s",
-        }],
+        shape: &[
+            Shape {
+                name: "rate_rad_s",
+                number: Number::new("rad s-1", -1e-6, 1e-6),
+                default: 0.0,
+                help: "and by this per second, rad/s",
+            },
+            Shape {
+                name: "follow",
+                number: Number::new("1", -2.0, 2.0),
+                default: 0.0,
+                help: "and by this part of what half the opening angle grows",
+            },
+        ],
         build,
     },
 ];
@@ -52,7 +60,12 @@ fn build(asked: &Asked, _: &Basis<'_>) -> Built {
             kappa_m_k: asked.shape("kappa_m_k"),
             beta_m_kg: asked.shape("beta_m_kg"),
         }),
-        Place::Tm(tm) => Box::new(Opening { tm, angle_rad: asked.size, rate_rad_s: asked.shape("rate_rad_s") }),
+        Place::Tm(tm) => Box::new(Opening {
+            tm,
+            angle_rad: asked.size,
+            rate_rad_s: asked.shape("rate_rad_s"),
+            follow: asked.shape("follow"),
+        }),
         _ => unreachable!("instances are axes and test masses"),
     })
 }
@@ -83,6 +96,7 @@ struct Opening {
     tm: usize,
     angle_rad: f64,
     rate_rad_s: f64,
+    follow: f64,
 }
 
 impl Cause for Opening {
@@ -90,9 +104,12 @@ impl Cause for Opening {
         true
     }
 
-    fn reshape(&self, elapsed_s: f64, _inside: &Interior, plant: &mut Plant) {
+    fn reshape(&self, elapsed_s: f64, inside: &Interior, plant: &mut Plant) {
+        let half_rad = 0.5 * self.follow * (inside.opening_rad - inside.opening_first_rad);
+        // ORF_1 is turned by +30°, ORF_2 by −30°.
+        let followed_rad = if self.tm == 0 { half_rad } else { -half_rad };
         let body = &mut plant.tm[self.tm];
-        body.dcm_orf_from_srf =
-            dcm_turned_about_z(self.angle_rad + self.rate_rad_s * elapsed_s) * body.dcm_orf_from_srf;
+        let turn = dcm_turned_about_z(self.angle_rad + self.rate_rad_s * elapsed_s + followed_rad);
+        body.dcm_orf_from_srf = turn * body.dcm_orf_from_srf;
     }
 }
