@@ -98,8 +98,8 @@ Effects, and where (TM: tm1, tm2; AXIS: x, y, z; size in SI units):
   magnetic:TM                  charge:TM               current-force:TM.AXIS
   product-force:TM.AXIS        slosh:sc.x|y            solar-pressure:sc
   impulse:sc.AXIS|TM.AXIS|sc.phi|theta|psi
-Some have named shapes, as thermal:tm1.x=2e-12,lag_s=480. A wrong one, as
---effect help:me=0, is answered with the sizes, shapes and what they do.";
+Some have named shapes, as thermal:tm1.x=2e-12,lag_s=480. A question, as
+--effect thermal:?=0, is answered with unit, shapes and what it does.";
 
 #[derive(Debug, Args)]
 #[command(after_help = EFFECTS)]

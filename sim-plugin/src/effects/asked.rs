@@ -20,7 +20,7 @@ pub enum EffectError {
         id: String,
     },
     /// The effect has no such instance.
-    #[error("effect {text}: {id} has no instance {instance}; it has {has}")]
+    #[error("effect {text}: {id} has no instance {instance}; it has {has}.\n{id}: {about}")]
     Instance {
         /// What was asked.
         text: String,
@@ -30,6 +30,8 @@ pub enum EffectError {
         instance: String,
         /// The instances there are.
         has: String,
+        /// What it is.
+        about: String,
     },
     /// The effect has no such shape parameter.
     #[error("effect {text}: {id} has no parameter {name}; it has {has}")]
@@ -242,6 +244,7 @@ impl Asked {
             id: kind.id,
             instance: instance.to_owned(),
             has: joined(&places),
+            about: format!("{} [{}]; parameters: {}", kind.help, kind.size.unit, kind.parameters()),
         })?;
         let size = kind.size.read(text, "SIZE", size)?;
         let mut shape: Vec<f64> = kind.shape.iter().map(|s| s.default).collect();
@@ -301,17 +304,8 @@ fn joined(all: &[impl Display]) -> String {
     all.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
 }
 
-/// Ids, instances, sizes and parameters of everything there is, a line each.
+/// Ids of everything there is; a message has no room for more.
 fn list() -> String {
-    let line = |kind: &Kind| {
-        let places = joined(&(kind.places)());
-        format!(
-            "\n  {}: {} [{}]; instances {places}; parameters {}",
-            kind.id,
-            kind.help,
-            kind.size.unit,
-            kind.parameters()
-        )
-    };
-    catalogue().map(line).collect()
+    let ids: Vec<&str> = catalogue().map(|kind| kind.id).collect();
+    format!("{}; ask one for what it is, as --effect {}:?=0", ids.join(", "), ids[0])
 }
