@@ -52,6 +52,7 @@ const PLAIN: Row = Row {
 // σ: printed by the example `one_day_sigma` for the bundled mission, after the offsets, a constant and a slope are fitted.
 // Not here, as three σ lie beyond their range whatever the days: stiffness and cross-stiffness, solar-pressure (a constant
 // but for the Sun's slow motion), an offset that follows the propellant, capacitive readout into x, which no residual uses.
+// Nor mps-correlation: at no size is the noise the mission's own, and its correlation has no size, so no significance.
 const ROWS: &[Row] = &[
     Row {
         id: "offset-drift",

@@ -21,7 +21,7 @@ pub struct Channel {
     /// White noise of the sensor, unit/√Hz.
     noise: f64,
     /// Step of the converter, unit.
-    step: f64,
+    pub step: f64,
     source: Source,
 }
 

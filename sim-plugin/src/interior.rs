@@ -422,3 +422,124 @@ impl Running {
         true
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SUN: Influences = Influences {
+        sun_distance_m: AU_M,
+        sun_srf: Vector3::new(0.5, 0.0, -0.866_025_403_784_438_6),
+        opening_rad: 1.0,
+    };
+
+    fn running() -> Running {
+        Running::new(7, 0.1, &SUN)
+    }
+
+    /// Two insides with the same random numbers, of which the second differs by `change`; their differences over time.
+    fn difference<const N: usize>(
+        change: impl Fn(&mut Running, &mut Influences),
+        of: impl Fn(&Interior) -> [f64; N],
+        steps: i64,
+    ) -> Vec<[f64; N]> {
+        let (mut plain, mut changed, mut sun) = (running(), running(), SUN);
+        change(&mut changed, &mut sun);
+        let mut one = |index| {
+            plain.step(index, &SUN);
+            changed.step(index, &sun);
+            let (a, b) = (of(&plain.now), of(&changed.now));
+            std::array::from_fn(|i| b[i] - a[i])
+        };
+        (1..=steps).map(&mut one).collect()
+    }
+
+    /// What is left after `t` of a unit step through two lags in a row.
+    fn second_order(t: f64, first_s: f64, second_s: f64) -> f64 {
+        1.0 - (second_s * (-t / second_s).exp() - first_s * (-t / first_s).exp()) / (second_s - first_s)
+    }
+
+    /// More sunlight from one step to the next: by Stefan's law the panel goes up by `338 K (s^{1/4} − 1)` as
+    /// `1 − e^{−t/600 s}`, exactly; the structure follows by 5 % of it behind 14,400 s, to the change within one step,
+    /// which is how much the panel may be ahead of it.
+    #[test]
+    fn a_step_of_sunlight_comes_behind_the_lags() {
+        let distance = 0.99;
+        let more =
+            difference(|_, sun| sun.sun_distance_m = distance * AU_M, |now| [now.panel_k, now.structure_k], 3000);
+        let up_k = 338.0 * (distance.powf(-0.5) - 1.0);
+        assert!(up_k > 1.0);
+        for (t, [panel_k, structure_k]) in (1..).map(f64::from).zip(more) {
+            let want_k = up_k * -(-t / 600.0).exp_m1();
+            assert!((panel_k - want_k).abs() < 1e-9, "{t} s: {panel_k} K, not {want_k} K");
+            let want_k = 0.05 * up_k * second_order(t, 600.0, 14_400.0);
+            assert!((structure_k - want_k).abs() < 0.05 * up_k * STEP_S / 14_400.0, "{t} s: {structure_k} K");
+        }
+    }
+
+    /// A warmer bench cools as `e^{−t/7200 s}`, exactly, and its housing follows behind 1800 s, to a step of that lag.
+    #[test]
+    fn a_housing_follows_its_bench() {
+        let warm = difference(|run, _| run.now.bench_k[1] += 1.0, |now| [now.bench_k[1], now.housing_k[1]], 5000);
+        for (t, [bench_k, housing_k]) in (1..).map(f64::from).zip(warm) {
+            assert!((bench_k - (-t / 7200.0).exp()).abs() < 1e-9, "{t} s: {bench_k} K");
+            let want_k = 7200.0 / (7200.0 - 1800.0) * ((-t / 7200.0).exp() - (-t / 1800.0).exp());
+            assert!((housing_k - want_k).abs() < STEP_S / 1800.0, "{t} s: {housing_k} K, not {want_k} K");
+        }
+    }
+
+    /// By hand: six thrusters at 15 µN take 90 µN whatever balanced force they make; 100 µN along x is more than three of
+    /// them can give way to: 72.7 + 2 × 43.9 µN, and three at their 2 µN. Forces that change within a step count by their
+    /// mean. Each of six thrusters takes its own from 85 kg, rounded to half the float's step.
+    #[test]
+    fn the_tank_empties_by_what_is_thrust() {
+        for (amplitude_n, swing_n, total_n) in [(0.0, 0.0, 90e-6), (5e-6, 4e-6, 90e-6), (100e-6, 30e-6, 166.5e-6)] {
+            let mut inside = running();
+            for index in 1..=1000 {
+                for epoch in 0..10 {
+                    let swing_n = if epoch % 2 == 0 { swing_n } else { -swing_n };
+                    inside.thrust(&Vector3::new(amplitude_n + swing_n, 0.0, 0.0));
+                }
+                inside.step(index, &SUN);
+            }
+            let (used_kg, want_kg) = (85.0 - inside.now.tank_kg, total_n * 1000.0 / 600.0);
+            let rounding_kg = 6.0 * 1000.0 * 0.5 * (85.0_f64.next_up() - 85.0);
+            assert!((used_kg - want_kg).abs() < rounding_kg, "{used_kg} kg, not {want_kg} kg");
+            let thrust_n: f64 = inside.now.thrust_n.iter().map(|t| t.abs()).sum();
+            assert!((thrust_n - total_n).abs() < 1e-15, "{thrust_n} N");
+        }
+    }
+
+    /// Cosmic rays charge the test mass at 23 e/s with the scatter of 400 e a second; above 6e5 e the lamp takes that off
+    /// behind 400 s, below 2e4 e it goes out and the charge climbs again. Each within 4.5σ, false alarm 7e-6.
+    #[test]
+    fn a_discharge_resets_the_charge() {
+        let mut inside = running();
+        let charge_e = |inside: &Running| inside.now.charge_c[0] / ELEMENTARY_C;
+        inside.now.charge_c[0] = 6.1e5 * ELEMENTARY_C;
+        inside.now.lamp[0] = false;
+        inside.charging();
+        assert!(inside.now.lamp[0], "too much charge lights the lamp");
+
+        let (start_e, n) = (charge_e(&inside), 800);
+        (0..n).for_each(|_| inside.charging());
+        // qₙ = a (qₙ₋₁ + 23 + 400 gauss): what is left of the start, of what came, and of its scatter.
+        let left = (-1.0 / 400.0_f64).exp();
+        let (whole, power) = (left.powi(n), left.powi(2 * n));
+        let want_e = start_e * whole + 23.0 * left * (1.0 - whole) / (1.0 - left);
+        let sigma_e = 400.0 * left * ((1.0 - power) / (1.0 - left * left)).sqrt();
+        assert!((charge_e(&inside) - want_e).abs() < 4.5 * sigma_e, "{} e, not {want_e} e", charge_e(&inside));
+        assert!(inside.now.lamp[0] && start_e - want_e > 40.0 * sigma_e, "a lamp without light would be seen");
+
+        while inside.now.lamp[0] {
+            inside.charging();
+        }
+        let reset_e = charge_e(&inside);
+        assert!(reset_e <= 2e4, "{reset_e} e");
+        let n = 20_000;
+        (0..n).for_each(|_| inside.charging());
+        let (grown_e, want_e) = (charge_e(&inside) - reset_e, 23.0 * f64::from(n));
+        assert!((grown_e - want_e).abs() < 4.5 * 400.0 * f64::from(n).sqrt(), "{grown_e} e, not {want_e} e");
+        assert!(!inside.now.lamp[0], "the lamp stays off below 6e5 e");
+    }
+}

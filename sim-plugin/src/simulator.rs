@@ -234,6 +234,9 @@ impl Simulator {
 
         let mut noises = Noises::new(mission)?;
         noises.start(&mut rng);
+        if effects.replace_thruster_noise() {
+            noises.silence_thrusters();
+        }
         let shown = noises.slow_readout();
 
         let dt_s = mission.dt_s();

@@ -50,8 +50,8 @@ impl Layout {
     }
 
     /// Six units in three pairs 1.5 m from the axis `s_3` and 0.35 m above the centre of mass, thrusting along the rim to
-    /// both sides and 35° up, towards the Sun: as on LISA Pathfinder, sunlight is their seventh. Chosen so that they
-    /// hold the default mission's sunlight within 2 to 30 µN.
+    /// both sides and 35° up, towards the Sun: as on LISA Pathfinder, sunlight is their seventh. They hold the default
+    /// mission's sunlight from every azimuth within 0.5 to 31 µN, and nothing that pulls them along `s_3`.
     #[must_use]
     pub fn six(asd_n_rthz: f64) -> Self {
         let unit = |k: usize| {
@@ -97,39 +97,23 @@ fn force_and_torque(wrench: &Wrench) -> (Vector3<f64>, Vector3<f64>) {
 pub struct ThrusterNoise {
     layout: Layout,
     units: Vec<NoiseProcess>,
-    rng: Xoshiro256PlusPlus,
 }
 
 impl ThrusterNoise {
-    /// White noise of every unit, sampled every `dt_s`; the stream is the seed's own for thrusters.
+    /// White noise of every unit, sampled every `dt_s`: its random stream is all its state.
     #[must_use]
-    pub fn new(layout: Layout, dt_s: f64, seed: u64) -> Self {
+    pub fn new(layout: Layout, dt_s: f64) -> Self {
         let units = layout.asd_n_rthz.iter().map(|asd| NoiseProcess::new(&NoiseShape::white(*asd), dt_s)).collect();
-        // The fourth stream of the seed: loop and housekeeping have the first three.
-        let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
-        rng.long_jump();
-        rng.jump();
-        Self { layout, units, rng }
+        Self { layout, units }
     }
 
     /// The next sample of force, N, and torque, N m, SRF.
-    pub fn sample(&mut self) -> (Vector3<f64>, Vector3<f64>) {
+    pub fn sample(&mut self, rng: &mut Xoshiro256PlusPlus) -> (Vector3<f64>, Vector3<f64>) {
         let mut sum = Wrench::zeros();
         for (unit, column) in self.units.iter_mut().zip(self.layout.wrenches.column_iter()) {
-            sum += column.fixed_rows::<6>(0) * unit.next(&mut self.rng);
+            sum += column.fixed_rows::<6>(0) * unit.next(rng);
         }
         force_and_torque(&sum)
-    }
-
-    /// The state: the random stream.
-    #[must_use]
-    pub fn state(&self) -> Xoshiro256PlusPlus {
-        self.rng.clone()
-    }
-
-    /// Takes back what [`Self::state`] gave.
-    pub fn set_state(&mut self, rng: Xoshiro256PlusPlus) {
-        self.rng = rng;
     }
 }
 
@@ -224,10 +208,18 @@ impl Lag {
     }
 }
 
+/// The units of a layout at work.
+#[derive(Clone, Debug)]
+struct Units {
+    distribution: Distribution,
+    noise: ThrusterNoise,
+    rng: Xoshiro256PlusPlus,
+}
+
 /// The thrusters of a mission.
 #[derive(Clone, Debug)]
 pub struct Thrusters {
-    units: Option<(Distribution, ThrusterNoise)>,
+    units: Option<Units>,
     limit_n: [f64; 2],
     step_n: f64,
     lag: Lag,
@@ -257,7 +249,12 @@ impl Thrusters {
             None
         } else {
             let layout = Layout::new(&section.unit)?;
-            Some((Distribution::new(&layout.wrenches, limit_n), ThrusterNoise::new(layout, dt_s, seed)))
+            let distribution = Distribution::new(&layout.wrenches, limit_n);
+            // The fourth stream of the seed: loop and housekeeping have the first three.
+            let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
+            rng.long_jump();
+            rng.jump();
+            Some(Units { distribution, noise: ThrusterNoise::new(layout, dt_s), rng })
         };
         Ok(Self {
             y: Channels::zeros(if units.is_some() { section.unit.len() } else { 6 }),
@@ -284,10 +281,10 @@ impl Thrusters {
         self.waiting.pop_front();
         match &mut self.units {
             None => force_and_torque(&Wrench::from_fn(|i, _| thrusts[i])),
-            Some((distribution, noise)) => {
+            Some(Units { distribution, noise, rng }) => {
                 let whole = &distribution.wrenches * thrusts;
                 let (force, torque) = force_and_torque(&whole.fixed_rows::<6>(0).into_owned());
-                let (more_force, more_torque) = noise.sample();
+                let (more_force, more_torque) = noise.sample(rng);
                 (force + more_force, torque + more_torque)
             }
         }
@@ -305,7 +302,7 @@ impl Thrusters {
         let step_n = self.step_n;
         let stepped = |x: f64| if step_n > 0.0 { ((x / step_n).round() * step_n).clamp(low, high) } else { x };
         match &self.units {
-            Some((distribution, _)) => {
+            Some(Units { distribution, .. }) => {
                 let (thrusts, reached) = distribution.thrusts(wanted);
                 self.saturated = !reached;
                 thrusts.map(stepped)
@@ -323,7 +320,7 @@ impl Thrusters {
         SavedThrusters {
             y: self.y.as_slice().to_vec(),
             waiting: self.waiting.iter().map(|w| w.as_slice().to_vec()).collect(),
-            rng: self.units.as_ref().map(|(_, noise)| noise.state()),
+            rng: self.units.as_ref().map(|units| units.rng.clone()),
         }
     }
 
@@ -336,7 +333,7 @@ impl Thrusters {
             return false;
         }
         match (&mut self.units, saved.rng) {
-            (Some((_, noise)), Some(rng)) => noise.set_state(rng),
+            (Some(units), Some(rng)) => units.rng = rng,
             (None, None) => {}
             _ => return false,
         }
@@ -391,11 +388,12 @@ mod tests {
 
         for layout in [Layout::six(1e-7), Layout::new(&nine().unit).unwrap()] {
             let wanted = layout.noise_psd() * (0.5 / DT_S);
-            let mut noise = ThrusterNoise::new(layout, DT_S, 3);
+            let mut noise = ThrusterNoise::new(layout, DT_S);
+            let mut rng = Xoshiro256PlusPlus::seed_from_u64(3);
             let n = 40_000;
             let mut sum = Matrix6::<f64>::zeros();
             for _ in 0..n {
-                let (force, torque) = noise.sample();
+                let (force, torque) = noise.sample(&mut rng);
                 let w = wrench(&force, &torque);
                 sum += w * w.transpose();
             }
@@ -447,12 +445,15 @@ mod tests {
             assert!(reached && thrusts.iter().all(|t| (range[0]..=range[1]).contains(t)), "{azimuth}: {thrusts}");
             assert!((&lisa.wrenches * thrusts - wanted).amax() < 1e-18);
         }
-        // As on LISA Pathfinder, the Sun stands where the six can lean on it.
-        let (force, torque) = sunlight(0.0);
-        let pathfinder = Distribution::new(&Layout::six(1e-7).wrenches, [0.0, 4e-5]);
-        assert!(pathfinder.thrusts(&wrench(&force, &torque)).1);
-        let (thrusts, reached) = pathfinder.thrusts(&wrench(&-force, &torque));
-        assert!(!reached && thrusts.iter().all(|t| (0.0..=4e-5).contains(t)));
+        // As on LISA Pathfinder, the Sun stands where the six can lean on it; from the other side they cannot pull.
+        let range = [5e-7, 3.1e-5];
+        let pathfinder = Distribution::new(&Layout::six(1e-7).wrenches, range);
+        for azimuth in (0..360).step_by(15) {
+            let (force, torque) = sunlight(f64::from(azimuth));
+            assert!(pathfinder.thrusts(&wrench(&force, &torque)).1, "{azimuth}");
+            let (thrusts, reached) = pathfinder.thrusts(&wrench(&-force, &torque));
+            assert!(!reached && thrusts.iter().all(|t| (range[0]..=range[1]).contains(t)), "{azimuth}");
+        }
     }
 
     #[test]

@@ -5,10 +5,13 @@ use dragfree_physics::attitude::rotation_vector;
 use dragfree_physics::mission::Mission;
 use dragfree_physics::spectrum::welch;
 use dragfree_sim::effects::{Asked, catalogue};
+use dragfree_sim::housekeeping::{CHANNELS, Housekeeping};
 use dragfree_sim::interior::Interior;
 use dragfree_sim::plant::State;
 use dragfree_sim::simulator::{Epoch, Settings, Simulator};
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Matrix3, Matrix6, Vector3, Vector6};
+use rand::SeedableRng;
+use rand_xoshiro::Xoshiro256PlusPlus;
 use std::f64::consts::TAU;
 
 const DT_S: f64 = 0.1;
@@ -528,6 +531,97 @@ fn a_line_has_its_frequency_and_amplitude() {
     assert!((power / (0.5e-16) - 1.0).abs() < 1e-6, "nothing but the line: {power}");
 }
 
+/// Covariance of force and torque against `Σ S (d, r×d)(d, r×d)ᵀ` of six units, worked out here from where they sit; the
+/// other simulation's noise along the axes, 1e-7 each, differs with it and so adds to the diagonal. Each number within
+/// 4.5σ (false alarm 7e-6), and the twins whose force and torque do not belong together, or whose noise along the axes
+/// goes on in both, are caught.
+#[test]
+fn noise_of_a_thruster_pushes_and_turns_at_once() {
+    let asd_n_rthz = 1e-7_f64;
+    let rows = Twins::new(&["mps-correlation:layout=1e-7"], 0.0).rows(20_000);
+    let mut units = Matrix6::<f64>::zeros();
+    for (azimuth_deg, side) in [60.0, 180.0, 300.0_f64].into_iter().flat_map(|a| [(a, 1.0), (a, -1.0)]) {
+        let (out, up) = (Vector3::new(azimuth_deg.to_radians().cos(), azimuth_deg.to_radians().sin(), 0.0), axis(2));
+        let tilt = 35.0_f64.to_radians();
+        let direction = up.cross(&out) * (side * tilt.cos()) + up * tilt.sin();
+        let torque = (out * 1.5 + up * 0.35).cross(&direction);
+        let wrench = Vector6::from_fn(|i, _| if i < 3 { direction[i] } else { torque[i - 3] });
+        units += wrench * wrench.transpose();
+    }
+    let per_sample = 0.5 / DT_S;
+    let units = units * (asd_n_rthz.powi(2) * per_sample);
+    let axes = Matrix6::identity() * (1e-14 * per_sample);
+
+    let n = rows.len() as f64;
+    let mut found = Matrix6::<f64>::zeros();
+    for row in &rows {
+        let (force, torque) = (row.sc_accel_srf_m_s2 * SC_KG, sc_inertia() * row.alpha_srf_rad_s2);
+        let wrench = Vector6::from_fn(|i, _| if i < 3 { force[i] } else { torque[i - 3] });
+        found += wrench * wrench.transpose() / n;
+    }
+    let worst = |wanted: &Matrix6<f64>| {
+        let z = |i: usize, j: usize| {
+            let sigma = ((wanted[(i, i)] * wanted[(j, j)] + wanted[(i, j)].powi(2)) / n).sqrt();
+            ((found[(i, j)] - wanted[(i, j)]) / sigma).abs()
+        };
+        (0..6).flat_map(|i| (0..=i).map(move |j| (i, j))).map(|(i, j)| z(i, j)).fold(0.0, f64::max)
+    };
+    assert!(worst(&(units + axes)) < 4.5, "{found} {}", units + axes);
+    let apart = Matrix6::from_diagonal(&(units + axes).diagonal());
+    assert!(worst(&apart) > 4.5, "force and torque drawn apart would pass");
+    assert!(worst(&units) > 4.5, "noise along the axes beside that of the units would pass");
+}
+
+/// Where the mission's own units have their noise, there is nothing to replace.
+#[test]
+fn units_of_the_mission_keep_their_noise() {
+    let value: serde_json::Value =
+        toml::from_str(include_str!("../../fixtures/missions/taiji-thrusters.toml")).unwrap();
+    let mission = Mission::from_json(&value.to_string()).unwrap();
+    let refused = Simulator::new(&mission, settings(&["mps-correlation:layout=7e-8"], 0.0)).err().unwrap().to_string();
+    assert!(refused.contains("mps-correlation") && refused.contains("thrusters.unit = 9 units"), "{refused}");
+}
+
+/// Housekeeping, 300 s of it, by channel.
+fn housekeeping(effects: &[&str]) -> Vec<Vec<f64>> {
+    let mut simulator = Simulator::new(&taiji(), settings(effects, 0.0)).unwrap();
+    let mut sensors = Housekeeping::new(DT_S, Xoshiro256PlusPlus::seed_from_u64(5));
+    let mut channels = vec![Vec::new(); CHANNELS.len()];
+    for _ in 0..3000 {
+        let index = simulator.index();
+        sensors.read(index, simulator.inside(), |i, value| channels[i].push(value));
+        simulator.step().unwrap();
+    }
+    channels
+}
+
+/// An effect shows in housekeeping only where the loop acts on what is measured: the thrusters' commands (valves, tank)
+/// and the attitude (Sun sensor and, through the panel, temperatures, by less than a step of their converter). Every other
+/// channel is the same to the last bit, so no channel tells which effect is hidden.
+#[test]
+fn housekeeping_does_not_tell_what_is_hidden() {
+    let plain = housekeeping(&[]);
+    for kind in catalogue() {
+        let effect = example(kind.id, &(kind.places)()[0].to_string());
+        let hidden = housekeeping(&[&effect]);
+        for ((channel, a), b) in CHANNELS.iter().zip(&plain).zip(&hidden) {
+            let commanded = channel.place.starts_with("thruster ");
+            let left = ["tank_mass_kg", "tank_pressure_pa"].contains(&channel.name);
+            if commanded || left || channel.name == "sun_angle_rad" {
+                continue;
+            }
+            assert!(a.len() >= 30 && a.len() == b.len(), "{}", channel.name);
+            let most = a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+            let allowed = if channel.unit == "K" { 1.001 * channel.step } else { 0.0 };
+            assert!(most <= allowed, "{effect}: {} changes by {most} {}", channel.name, channel.unit);
+        }
+    }
+    // What is compared would show a change: sunlight that pushes twice as hard opens the valves.
+    let pushed = housekeeping(&["solar-pressure:sc=1"]);
+    let valve = CHANNELS.iter().position(|c| c.place == "thruster 1" && c.unit == "A").unwrap();
+    assert_ne!(plain[valve], pushed[valve]);
+}
+
 /// A size for each kind that keeps the loop.
 fn example(id: &str, place: &str) -> String {
     let size = match id {
@@ -537,6 +631,7 @@ fn example(id: &str, place: &str) -> String {
         "mps-noise" | "torque-noise" | "is-noise" => "1.5",
         "thermal" | "current-force" | "product-force" => "1e-13",
         "magnetic" => "-2e-5",
+        "mps-correlation" => "7e-8",
         "impulse" => "1e-8,at_s=3",
         _ => "0.02",
     };
@@ -590,6 +685,7 @@ fn what_is_not_there_is_answered_with_what_is() {
         ("thermal:tm1.x=1e-12,tau=3", "thermal has no parameter tau; it has lag_s (lag, s; 480 unless given)"),
         ("es-gain:tm1.y=0.1,lag_s=3", "es-gain has no parameter lag_s; it has none"),
         ("time-offset:is=-0.1", "SIZE = -0.1"),
+        ("mps-correlation:sc=1e-7", "mps-correlation has no instance sc; it has layout"),
     ] {
         let error = Asked::parse(text).unwrap_err().to_string();
         assert!(error.contains(told), "{text}: {error}");

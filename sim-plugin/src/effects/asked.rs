@@ -76,6 +76,8 @@ pub enum EffectError {
 pub enum Place {
     /// `sc`, the spacecraft as a whole.
     Spacecraft,
+    /// `layout`, the thrusters where they sit.
+    Layout,
     /// `tm1`, a test mass as a whole.
     Tm(usize),
     /// An instrument.
@@ -115,6 +117,7 @@ impl Display for Place {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match *self {
             Self::Spacecraft => f.write_str("sc"),
+            Self::Layout => f.write_str("layout"),
             Self::Tm(tm) => write!(f, "tm{}", tm + 1),
             Self::Instrument(Instrument::Is) => f.write_str("is"),
             Self::Instrument(Instrument::Ifo) => f.write_str("ifo"),

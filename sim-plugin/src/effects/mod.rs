@@ -6,6 +6,7 @@
 mod actuators;
 mod asked;
 mod constants;
+mod correlation;
 mod geometry;
 mod noise;
 mod pushes;
@@ -32,6 +33,7 @@ pub fn catalogue() -> impl Iterator<Item = &'static Kind> {
         geometry::KINDS,
         actuators::KINDS,
         noise::KINDS,
+        correlation::KINDS,
         readout::KINDS,
         stray::KINDS,
         slosh::KINDS,
@@ -65,6 +67,11 @@ pub struct Moment<'a> {
 pub trait Cause: Send {
     /// Changes constants of the plant before the loop is closed.
     fn begin(&mut self, _plant: &mut Plant, _rng: &mut Xoshiro256PlusPlus) {}
+
+    /// Whether it stands in place of the mission's thruster noise along the axes.
+    fn replaces_thruster_noise(&self) -> bool {
+        false
+    }
 
     /// Whether [`Self::reshape`] does anything.
     fn moves(&self) -> bool {
@@ -139,6 +146,12 @@ impl Effects {
         for Active { cause, rng } in &mut self.0 {
             cause.begin(plant, rng);
         }
+    }
+
+    /// Whether the mission's thruster noise along the axes is replaced.
+    #[must_use]
+    pub fn replace_thruster_noise(&self) -> bool {
+        self.0.iter().any(|active| active.cause.replaces_thruster_noise())
     }
 
     /// Whether the geometry changes with time.

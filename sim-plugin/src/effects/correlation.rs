@@ -1,0 +1,46 @@
+//! Thruster noise that comes from single thrusters: what pushes the spacecraft turns it, too.
+
+use dragfree_physics::mission::MissionError;
+use rand_xoshiro::Xoshiro256PlusPlus;
+
+use super::asked::{Asked, Built, Kind, Number, Place};
+use super::{Basis, Cause, Moment};
+use crate::plant::Loads;
+use crate::thrusters::{Layout, ThrusterNoise};
+
+pub(super) const KINDS: &[Kind] = &[Kind {
+    id: "mps-correlation",
+    places: || vec![Place::Layout],
+    size: Number::new("N Hz^-0.5", 0.0, 1e-5),
+    help: "thrusters: noise of this ASD in each of six thrusters, white, in place of the noise along and about the axes; \
+           7e-8 is as much force along each axis as 1e-7 there",
+    shape: &[],
+    build,
+}];
+
+/// Adds `Σ n_i (d_i, r_i × d_i)` of [`Layout::six`]: the cross-spectrum of force and torque is `Σ S d_i (r_i × d_i)ᵀ`.
+struct Correlation(ThrusterNoise);
+
+fn build(asked: &Asked, basis: &Basis<'_>) -> Built {
+    let units = basis.mission.thrusters.as_ref().map_or(0, |thrusters| thrusters.unit.len());
+    if units > 0 {
+        return Err(MissionError::Value {
+            key: "thrusters.unit".to_owned(),
+            value: format!("{units} units"),
+            reason: "have noise of their own already, which pushes and turns at once: change their asd_n_rthz instead",
+        });
+    }
+    Ok(Box::new(Correlation(ThrusterNoise::new(Layout::six(asked.size), basis.mission.dt_s()))))
+}
+
+impl Cause for Correlation {
+    fn replaces_thruster_noise(&self) -> bool {
+        true
+    }
+
+    fn push(&mut self, _now: &Moment<'_>, rng: &mut Xoshiro256PlusPlus, loads: &mut Loads) {
+        let (force_srf_n, torque_srf_nm) = self.0.sample(rng);
+        loads.force_srf_n += force_srf_n;
+        loads.torque_srf_nm += torque_srf_nm;
+    }
+}
