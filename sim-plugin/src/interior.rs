@@ -510,6 +510,20 @@ mod tests {
         }
     }
 
+    /// Of two charges under the lamp, met by the same cosmic rays, the difference falls as `e^{−t/400 s}`, exactly.
+    #[test]
+    fn the_lamp_discharges_behind_its_lag() {
+        let [high_e, low_e] = [5e5, 3e5].map(|charge_e| {
+            let mut inside = running();
+            (inside.now.charge_c[1], inside.now.lamp[1]) = (charge_e * ELEMENTARY_C, true);
+            (0..600).for_each(|_| inside.charging());
+            assert!(inside.now.lamp[1], "still above where the lamp goes out");
+            inside.now.charge_c[1] / ELEMENTARY_C
+        });
+        let left = (high_e - low_e) / 2e5;
+        assert!((left / (-1.5_f64).exp() - 1.0).abs() < 1e-9, "{left}");
+    }
+
     /// Cosmic rays charge the test mass at 23 e/s with the scatter of 400 e a second; above 6e5 e the lamp takes that off
     /// behind 400 s, below 2e4 e it goes out and the charge climbs again. Each within 4.5σ, false alarm 7e-6.
     #[test]
