@@ -96,7 +96,7 @@ def benchmarks():
         ("himat-coprime", "HiMAT aircraft, normalised coprime factors", None, normalised_coprime(aircraft)),
         ("scherer", "Scherer, Gahinet and Chilali, IEEE Trans. Autom. Control 42, 896 (1997), example 7", None,
          scherer_example()),
-        ("slicot", "SLICOT's example of SB10FD and SB10AD (D11 and D22 not zero)", None, slicot_example()),
+        ("slicot", "after SLICOT's example of SB10FD, D11 and D22 not zero; the matrices that count are those listed here", None, slicot_example()),
         ("integrator", "normalised coprime factors of 1/s: sqrt(2)", 2**0.5,
          normalised_coprime(control.ss([[0]], [[1]], [[1]], [[0]]))),
         ("double-integrator", "normalised coprime factors of 1/s^2: sqrt(4 + 2 sqrt(2))", (4 + 8**0.5) ** 0.5,
