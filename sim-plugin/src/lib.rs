@@ -30,10 +30,13 @@ use simulator::{Epoch, Settings, SimulationError, Simulator};
 /// 2035-01-01T00:00:00, where the paper's simulation starts, Unix ns.
 const DEFAULT_START_NS: i64 = 2_051_222_400_000_000_000;
 
-/// A table and its columns in the order in which rows are pushed.
+/// A table, its columns in the order of a row's values, and the rows of the batch at hand: a row is one copy, and a column is
+/// taken out of all of them at once.
 struct Topic {
     table: Table,
     columns: Vec<Out>,
+    times_ns: Vec<i64>,
+    rows: Vec<f64>,
 }
 
 impl Topic {
@@ -49,14 +52,28 @@ impl Topic {
                 columns.push(link.write(table, &format!("{path}.{part}"), unit, frame)?);
             }
         }
-        Ok(Self { table, columns })
+        Ok(Self::of(table, columns))
     }
 
-    fn push<'a>(&self, output: &mut Outputs, time_ns: i64, values: impl IntoIterator<Item = &'a f64>) {
-        output.time(self.table).push(time_ns);
-        for (column, value) in self.columns.iter().zip(values) {
-            output.f64(*column).push(*value);
+    fn of(table: Table, columns: Vec<Out>) -> Self {
+        Self { table, columns, times_ns: Vec::new(), rows: Vec::new() }
+    }
+
+    /// Takes a row: one value for each column.
+    fn push<const N: usize>(&mut self, time_ns: i64, values: [f64; N]) {
+        debug_assert_eq!(N, self.columns.len());
+        self.times_ns.push(time_ns);
+        self.rows.extend_from_slice(&values);
+    }
+
+    /// Hands the rows to the host.
+    fn give(&mut self, output: &mut Outputs) {
+        output.time(self.table).append(&mut self.times_ns);
+        let width = self.columns.len();
+        for (i, column) in self.columns.iter().enumerate() {
+            output.f64(*column).extend(self.rows.chunks_exact(width).map(|row| row[i]));
         }
+        self.rows.clear();
     }
 }
 
@@ -145,7 +162,7 @@ impl Topics {
             let table = link.table(format!("hk/{name}"), 0.0);
             let rate = rate_hz.to_string();
             let attributes = [("place", place), ("rate_hz", rate.as_str())];
-            Ok(Topic { table, columns: vec![link.write_with(table, "value", unit, "", &attributes)?] })
+            Ok(Topic::of(table, vec![link.write_with(table, "value", unit, "", &attributes)?]))
         };
         let housekeeping =
             CHANNELS.iter().map(|c| scalar(c.name, c.unit, c.place, c.rate_hz)).collect::<Result<_, _>>()?;
@@ -167,20 +184,33 @@ impl Topics {
         Ok(Self { is, ifo, dws, command, ephemeris, housekeeping, at_limit, truth })
     }
 
-    fn push(&self, e: &Epoch, output: &mut Outputs) {
+    fn push(&mut self, e: &Epoch) {
         let (t, m, c) = (e.time_ns, &e.measured, &e.command);
-        let status = |i: usize| if m.is_saturated[i] { &SATURATED } else { &VALID };
-        let is = (0..2).flat_map(|i| m.is_r_orf_m[i].iter().chain(m.is_att_orf_rad[i].iter()).chain([status(i)]));
-        self.is.push(output, t, is);
-        self.ifo.push(output, t, m.ifo_x_orf_m.iter().flat_map(|x| [x, &VALID]));
-        self.dws.push(output, t, m.dws_orf_rad.iter().flatten().chain(m.dws_sc_crf_rad.iter()).chain([&VALID]));
-        if let Some(topic) = &self.command {
-            let tm = c.tm.iter().flat_map(|tm| tm.force_orf_n.iter().chain(tm.torque_orf_nm.iter()));
-            topic.push(output, t, c.mps_force_srf_n.iter().chain(c.mps_torque_srf_nm.iter()).chain(tm));
+        let [a, b] = &m.is_r_orf_m;
+        let [p, q] = &m.is_att_orf_rad;
+        let [s1, s2] = m.is_saturated.map(|saturated| if saturated { SATURATED } else { VALID });
+        self.is.push(t, [a.x, a.y, a.z, p.x, p.y, p.z, s1, b.x, b.y, b.z, q.x, q.y, q.z, s2]);
+        let [x1, x2] = m.ifo_x_orf_m;
+        self.ifo.push(t, [x1, VALID, x2, VALID]);
+        let ([[t1, p1], [t2, p2]], sc) = (m.dws_orf_rad, &m.dws_sc_crf_rad);
+        self.dws.push(t, [t1, p1, t2, p2, sc.x, sc.y, sc.z, VALID]);
+        if let Some(topic) = &mut self.command {
+            let [a, b] = &c.tm;
+            topic.push::<18>(
+                t,
+                flat([
+                    &c.mps_force_srf_n,
+                    &c.mps_torque_srf_nm,
+                    &a.force_orf_n,
+                    &a.torque_orf_nm,
+                    &b.force_orf_n,
+                    &b.torque_orf_nm,
+                ]),
+            );
         }
         if let Some(p) = &e.ephemeris {
             let vectors = [&p.r_sc_irf_m, &p.v_sc_irf_m_s, &p.omega_crf_rad_s, &p.alpha_crf_rad_s2, &p.sun_srf];
-            self.ephemeris.push(output, t, vectors.into_iter().flat_map(|v| v.iter()));
+            self.ephemeris.push::<15>(t, flat(vectors));
         }
         let truth = &e.truth;
         let vectors = [
@@ -193,8 +223,20 @@ impl Topics {
             &truth.offset_orf_m[1],
             &truth.nongrav_srf_m_s2,
         ];
-        self.truth.push(output, t, vectors.into_iter().flat_map(|v| v.iter()));
+        self.truth.push::<24>(t, flat(vectors));
     }
+
+    fn give(&mut self, output: &mut Outputs) {
+        let Self { is, ifo, dws, command, ephemeris, housekeeping, at_limit, truth } = self;
+        let slow = housekeeping.iter_mut().chain([is, ifo, dws, ephemeris, at_limit, truth]).chain(command);
+        slow.for_each(|topic| topic.give(output));
+    }
+}
+
+/// Vectors one after the other.
+fn flat<const VECTORS: usize, const NUMBERS: usize>(vectors: [&Vector3<f64>; VECTORS]) -> [f64; NUMBERS] {
+    const { assert!(NUMBERS == 3 * VECTORS) };
+    std::array::from_fn(|i| vectors[i / 3][i % 3])
 }
 
 /// The source.
@@ -342,22 +384,23 @@ impl Source for Sim {
     }
 
     fn next(&mut self, rows: usize, output: &mut Outputs) -> Result<Progress, PluginError> {
-        let Some(topics) = &self.topics else { return Err(PluginError::error("next before link")) };
+        let Some(topics) = &mut self.topics else { return Err(PluginError::error("next before link")) };
         for _ in 0..rows {
             if self.simulator.time_ns() >= self.end_ns {
                 break;
             }
             let (index, time_ns) = (self.simulator.index(), self.simulator.time_ns());
             self.housekeeping.read(index, self.simulator.inside(), |i, value| {
-                topics.housekeeping[i].push(output, time_ns, [&value]);
+                topics.housekeeping[i].push(time_ns, [value]);
             });
             let epoch = self.simulator.step().map_err(refuse)?;
-            topics.push(&epoch, output);
+            topics.push(&epoch);
             self.counts.add(&epoch);
             if index.rem_euclid(self.every_second) == 0 {
-                topics.at_limit.push(output, time_ns, [&(std::mem::take(&mut self.counts.untold) as f64)]);
+                topics.at_limit.push(time_ns, [std::mem::take(&mut self.counts.untold) as f64]);
             }
         }
+        topics.give(output);
         let next_ns = self.simulator.time_ns();
         Ok(Progress { complete_until_ns: next_ns, done: next_ns >= self.end_ns })
     }

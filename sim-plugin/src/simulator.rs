@@ -2,6 +2,7 @@
 
 use dragfree_physics::attitude::{rotation_vector, turn};
 use dragfree_physics::control::{Command, ControlLaw};
+use dragfree_physics::control_design::growth_per_sample;
 use dragfree_physics::mission::{Actuators, Limits, Mission, MissionError};
 use dragfree_physics::process::normal;
 use nalgebra::{Matrix3, Vector3};
@@ -41,6 +42,20 @@ pub enum SimulationError {
     /// A parameter has no sense.
     #[error("{0}")]
     Parameter(String),
+    /// The mission's own controllers do not hold a channel.
+    #[error(
+        "mission file: control.channel.\"{channel}\" makes an unstable loop, growing by {growth:.4} a sample with \
+         {delay_samples} sample(s) of delay; correct its gain, its sections or control.delay_samples, or leave \
+         [control.channel] out for the H-infinity design"
+    )]
+    Unstable {
+        /// Channel.
+        channel: String,
+        /// Factor per sample; NaN when its coefficients overflow.
+        growth: f64,
+        /// Delay of the loop.
+        delay_samples: u32,
+    },
     /// The loop diverged.
     #[error(
         "the loop diverged {elapsed_s} s after the start of the simulation: {what} = {value:e} {unit}; \
@@ -206,6 +221,7 @@ impl Simulator {
     /// # Errors
     /// [`SimulationError`]: a section is missing, or the loop diverges while it settles.
     pub fn new(mission: &Mission, settings: Settings) -> Result<Self, SimulationError> {
+        refuse_unstable(mission)?;
         // One stream for what is drawn once and one for the noise: a parameter changes no noise.
         let mut once = Xoshiro256PlusPlus::seed_from_u64(settings.seed);
         let mut rng = once.clone();
@@ -562,6 +578,22 @@ impl Simulator {
 /// `b_i` in ORF.
 fn offsets(plant: &Plant) -> [Vector3<f64>; 2] {
     plant.tm.each_ref().map(|tm| tm.dcm_orf_from_srf * tm.offset_srf_m)
+}
+
+/// A channel whose growth is within this of one drifts and does not diverge: nobody controls it.
+const DRIFTING: f64 = 1e-6;
+
+/// Refuses controllers of the mission's own that cannot hold their channel.
+fn refuse_unstable(mission: &Mission) -> Result<(), SimulationError> {
+    let Some(control) = &mission.control else { return Ok(()) };
+    let delay_samples = control.delay_samples;
+    for (channel, controller) in &control.channel {
+        let growth = growth_per_sample(controller, delay_samples, mission.dt_s()).unwrap_or(f64::NAN);
+        if growth.is_nan() || growth > 1.0 + DRIFTING {
+            return Err(SimulationError::Unstable { channel: channel.clone(), growth, delay_samples });
+        }
+    }
+    Ok(())
 }
 
 /// `Γ` in both ORF, for SRF on CRF.

@@ -1,8 +1,10 @@
 //! The control law's linear plant against the exact equations of motion.
 
 use dragfree_physics::control::{ControlLaw, Readout};
+use dragfree_physics::control_design::design;
 use dragfree_physics::mission::{CHANNELS, Control, Mission};
 use dragfree_sim::plant::{Loads, Outside, Plant, State};
+use dragfree_sim::simulator::{Settings, Simulator};
 use nalgebra::{Matrix3, Vector3};
 
 fn taiji() -> Mission {
@@ -15,7 +17,7 @@ fn taiji() -> Mission {
 #[test]
 fn channels_are_decoupled_in_the_exact_plant() {
     let mut mission = taiji();
-    mission.control = Some(Control { delay_samples: 0, lever_feed_forward: true, channel: Default::default() });
+    mission.control = Some(Control { delay_samples: 0, ..Control::default() });
     mission.actuators = None;
     let ones = [[Matrix3::from_element(1.0); 3]; 2];
     let plant = Plant::new(&mission, &Vector3::zeros(), &ones).unwrap();
@@ -55,6 +57,33 @@ fn channels_are_decoupled_in_the_exact_plant() {
         assert!(found[j] < -1e-13, "{}: {} answers the wrong way", CHANNELS[j], found[j]);
         for (i, other) in found.iter().enumerate().filter(|(i, _)| *i != j) {
             assert!(other.abs() < 1e-6 * found[j].abs(), "{} moves {}: {other}", CHANNELS[j], CHANNELS[i]);
+        }
+    }
+}
+
+/// Controllers that cannot hold their channel are refused by name before the first step; those that nobody moves may drift.
+#[test]
+fn controllers_that_cannot_hold_their_channel_are_refused() {
+    let mut mission = taiji();
+    let settings = Settings {
+        seed: 1,
+        start_ns: 2_051_222_400_000_000_000,
+        settle_s: 0.0,
+        com_offset_srf_m: Vector3::zeros(),
+        stiffness_error: 0.2,
+        effects: Vec::new(),
+    };
+    let channel = design(&mission).unwrap().controllers();
+    for (factor, refused) in [(1.0, false), (-1.0, true), (8.0, true), (0.0, false)] {
+        let mut channel = channel.clone();
+        channel.get_mut("tm1.x").unwrap().gain_s2 *= factor;
+        mission.control = Some(Control { channel, ..Control::default() });
+        match Simulator::new(&mission, settings.clone()) {
+            Ok(_) => assert!(!refused, "tm1.x with {factor} times its gain"),
+            Err(error) => {
+                let told = error.to_string();
+                assert!(refused && told.contains("control.channel.\"tm1.x\" makes an unstable loop"), "{told}");
+            }
         }
     }
 }

@@ -69,7 +69,7 @@ fn one_day_meets_the_requirement_table() {
 fn noisy_thrusters_break_the_table() {
     let mut mission = taiji();
     let channel = design(&mission).unwrap().controllers();
-    mission.control = Some(Control { delay_samples: 1, lever_feed_forward: true, channel });
+    mission.control = Some(Control { channel, ..Control::default() });
     mission.noise.thruster_force.as_mut().unwrap().asd_n_rthz *= 10.0;
     assert!(worst_of(&mission, "tm1.x") > 1.5);
 }

@@ -32,7 +32,7 @@ pub struct SimulateOptions {
     pub parameters: toml::Table,
     /// Version of the program.
     pub software: String,
-    /// Threads that may work: with two, the telemetry is written on the second; with three, the truth on the third.
+    /// Threads that may work: with more than one, telemetry and truth are each written on a thread of their own.
     pub threads: usize,
 }
 
@@ -268,8 +268,11 @@ impl<'scope> DayFiles<'scope, '_> {
             }
             let tables: Vec<TableSpec> = tables.iter().filter(|t| t.truth == truth).cloned().collect();
             let writer = TelemetryWriter::create(&path, &tables, &header)?;
-            let own = self.options.threads > if truth { 2 } else { 1 };
-            Ok::<_, EngineError>(if own { Pen::there(self.scope, writer) } else { Pen::Here(Box::new(writer)) })
+            Ok::<_, EngineError>(if self.options.threads > 1 {
+                Pen::there(self.scope, writer)
+            } else {
+                Pen::Here(Box::new(writer))
+            })
         };
         Ok(Open { end_ns: start + DAY_NS, telemetry: pen(false, &self.tables)?, truth: pen(true, &self.tables)? })
     }

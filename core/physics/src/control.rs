@@ -9,7 +9,7 @@ use std::collections::VecDeque;
 
 use crate::control_design::design;
 use crate::decoupling::{Accelerations, AllocationMatrix, InputVector, LinearPlant};
-use crate::mission::{Actuators, CHANNELS, ChannelController, Control, Mission, MissionError};
+use crate::mission::{Actuators, CHANNELS, ChannelController, Mission, MissionError};
 
 const NEEDED_BY: &str = "the control law";
 
@@ -193,14 +193,10 @@ impl ControlLaw {
     /// # Errors
     /// [`MissionError`] when a section is missing or the geometry leaves a channel without an actuator.
     pub fn new(mission: &Mission) -> Result<Self, MissionError> {
-        let control = match &mission.control {
-            Some(c) if !c.channel.is_empty() => c.clone(),
-            given => {
-                let delay_samples = given.as_ref().map_or(1, |c| c.delay_samples);
-                let lever_feed_forward = given.as_ref().is_none_or(|c| c.lever_feed_forward);
-                Control { delay_samples, lever_feed_forward, channel: design(mission)?.controllers() }
-            }
-        };
+        let mut control = mission.control.clone().unwrap_or_default();
+        if control.channel.is_empty() {
+            control.channel = design(mission)?.controllers();
+        }
         let channel = |name: &&str| {
             control.channel.get(*name).ok_or_else(|| MissionError::Missing {
                 section: format!("control.channel.\"{name}\""),
@@ -282,6 +278,7 @@ impl ControlLaw {
 pub(crate) mod tests {
     use super::*;
     use crate::control_design::tests::taiji;
+    use crate::mission::Control;
     use nalgebra::Matrix3;
 
     fn law() -> ControlLaw {
@@ -358,7 +355,7 @@ pub(crate) mod tests {
     fn delay_is_configured() {
         let mut mission = taiji();
         for delay_samples in [0, 1, 3] {
-            mission.control = Some(Control { delay_samples, lever_feed_forward: true, channel: Default::default() });
+            mission.control = Some(Control { delay_samples, ..Control::default() });
             let mut law = ControlLaw::new(&mission).unwrap();
             let silent = (0..10).take_while(|_| law.step(&readout(1)) == Command::default()).count();
             assert_eq!(silent, delay_samples as usize);
@@ -373,7 +370,7 @@ pub(crate) mod tests {
         assert!(error.contains("[requirements]"), "{error}");
         let mut mission = taiji();
         let channel = [("tm1.x".to_owned(), ChannelController { gain_s2: 0.1, sections: vec![] })];
-        mission.control = Some(Control { delay_samples: 1, lever_feed_forward: true, channel: channel.into() });
+        mission.control = Some(Control { channel: channel.into(), ..Control::default() });
         let error = ControlLaw::new(&mission).err().unwrap().to_string();
         assert!(error.contains("control.channel.\"sc.phi\""), "{error}");
     }

@@ -31,6 +31,7 @@ use crate::hinf::{GeneralizedPlant, HinfError, Synthesis, bounded_real, norm};
 use crate::lti::{LtiError, StateSpace, sections_response};
 use crate::mission::{CHANNELS, ChannelController, Mission, MissionError};
 use crate::noise::{NoiseShape, NoiseTerm};
+use crate::schur::eigenvalues;
 
 type C64 = Complex<f64>;
 
@@ -60,9 +61,12 @@ const SLOWEST_RAD_S: f64 = 2e-2;
 const LARGEST_DELAY_ANGLE: f64 = 0.5;
 /// Samples of delay that the synthesis models one by one; a longer delay is an all-pass of this order.
 const MOST_DELAY_STATES: u32 = 3;
-/// The controller is the central one at `min(1.1 γ, √γ)` of the optimal γ, not at the optimum itself, where it would
-/// trade everything else for the last per cent.
-const BACK_OFF: f64 = 1.1;
+/// The controller is the central one at `min(BACK_OFF γ, √γ)` of the optimal γ, not at the optimum itself, where it would
+/// trade everything else for the last per cent. Where the roots of that controller are too close to be sampled to full
+/// precision, and the norm of what would fly shows it, the next one is taken.
+const BACK_OFF: [f64; 4] = [1.1, 1.2, 1.5, 2.0];
+/// The norm of the sampled controller may lie above that of the synthesis by this factor: rounding of its roots.
+const SAMPLED_AS_PROVED: f64 = 1.01;
 /// Relative tolerance of γ.
 const GAMMA_TOLERANCE: f64 = 1e-5;
 /// Certificates are taken this much above the norm.
@@ -240,6 +244,8 @@ pub struct ChannelModel {
     pub disturbance: NoiseShape,
     /// `F_y`: noise of the readout, m or rad.
     pub readout: NoiseShape,
+    /// Bandwidth over the one that the requirement needs.
+    pub bandwidth_factor: f64,
 }
 
 impl ChannelModel {
@@ -518,7 +524,9 @@ fn channel_model(mission: &Mission, name: &'static str) -> Result<ChannelModel, 
         terms.extend(scaled(&noise.shape(), force.norm() + torque.norm() * arm.norm()));
     }
     terms.retain(|t| t.asd > 0.0);
-    Ok(ChannelModel { name, requirement, disturbance: NoiseShape { terms }, readout })
+    let control = mission.control.as_ref().filter(|_| body == "sc");
+    let bandwidth_factor = control.map_or(1.0, |c| c.attitude_bandwidth_factor);
+    Ok(ChannelModel { name, requirement, disturbance: NoiseShape { terms }, readout, bandwidth_factor })
 }
 
 /// `a n/√(a² + n²)`: the smallest ASD over requirement that `S + T = 1` allows, for `a = |W_1|` and `n = |W_3|`.
@@ -569,6 +577,7 @@ impl Problem {
             sampling.grid(BAND_HZ.0, BAND_HZ.1).map(|f| (sampling.warped(f), ratio(f).min(cap))).collect()
         };
         let mut disturbance = Lag::above(&points(&|f| model.disturbance_ratio(f), f64::INFINITY), |_| 0.0);
+        let headroom = headroom / model.bandwidth_factor.powi(2);
         let fastest = LARGEST_DELAY_ANGLE / sampling.delay_s();
         let headroom = headroom.max(disturbance.high / fastest.powi(2));
         let bandwidth = (disturbance.high / headroom).sqrt();
@@ -651,15 +660,11 @@ fn design_channel(model: ChannelModel, sampling: Sampling) -> Result<ChannelDesi
     must_be_in_reach(&model, sampling)?;
     let failed = |source| DesignError::Synthesis { channel: model.name, source };
     let (problem, synthesis, gamma) = best_problem(&model, sampling).map_err(failed)?;
-    let back_off = if gamma < 1.0 { (BACK_OFF * gamma).min(gamma.sqrt()) } else { BACK_OFF * gamma };
-    let central = synthesis.controller(back_off).map_err(failed)?;
-    let controller = problem.sampled(&central).map_err(|e| failed(e.into()))?;
+    let Flown { central, controller, closed, gamma_flown } = sample(&problem, &synthesis, gamma).map_err(failed)?;
     let flown = Loop { model: &model, sampling, controller: &controller };
     if gamma >= 1.0 {
         return Err(flown.too_greedy(&problem.weights, gamma));
     }
-    let closed = problem.flown(&controller).map_err(failed)?;
-    let gamma_flown = norm(&closed, GAMMA_TOLERANCE).map_err(failed)?.value;
     let lemma = bounded_real(&closed, CERTIFICATE_MARGIN * gamma_flown).map_err(failed)?;
     let bounds = flown.bounds(&problem.weights)?;
     let (max_asd_ratio, unattainable) = flown.table()?;
@@ -688,6 +693,37 @@ fn design_channel(model: ChannelModel, sampling: Sampling) -> Result<ChannelDesi
         sampling,
         model,
     })
+}
+
+/// A controller as it flies.
+struct Flown {
+    central: StateSpace,
+    controller: ChannelController,
+    closed: StateSpace,
+    gamma_flown: f64,
+}
+
+/// The central controller nearest to the optimum whose samples keep what was proved, or else the best.
+fn sample(problem: &Problem, synthesis: &Synthesis, gamma: f64) -> Result<Flown, HinfError> {
+    let attempt = |factor: f64| {
+        let bound = if gamma < 1.0 { (factor * gamma).min(gamma.sqrt()) } else { factor * gamma };
+        let central = synthesis.controller(bound)?;
+        let controller = problem.sampled(&central)?;
+        let closed = problem.flown(&controller)?;
+        let gamma_flown = norm(&closed, GAMMA_TOLERANCE).map_or(f64::INFINITY, |n| n.value);
+        Ok::<_, HinfError>((gamma_flown / bound, Flown { central, controller, closed, gamma_flown }))
+    };
+    let mut best = attempt(BACK_OFF[0])?;
+    for factor in &BACK_OFF[1..] {
+        if best.0 <= SAMPLED_AS_PROVED {
+            break;
+        }
+        let next = attempt(*factor)?;
+        if next.0 < best.0 {
+            best = next;
+        }
+    }
+    Ok(best.1)
 }
 
 /// The first headroom whose γ is good, or the best of all.
@@ -719,6 +755,37 @@ fn forget_time(controller: &ChannelController, dt_s: f64) -> f64 {
     };
     let slowest = controller.sections.iter().map(radius).fold(0.0, f64::max);
     FORGOTTEN.ln() / slowest.ln() * dt_s
+}
+
+/// Factor by which the slowest-dying motion of a channel's sampled loop grows from sample to sample, hold and delay included:
+/// below one when the loop is stable, one for the double integrator without a controller. `None` for coefficients whose
+/// eigenvalues cannot be found.
+#[must_use]
+pub fn growth_per_sample(controller: &ChannelController, delay_samples: u32, dt_s: f64) -> Option<f64> {
+    let delay = delay_samples as usize;
+    let order = 2 + delay + 2 * controller.sections.len();
+    // States: position, velocity, commands on their way (the next to act first), sections. One column per unit state.
+    let columns = (0..order).map(|unit| {
+        let now: Vec<f64> = (0..order).map(|i| f64::from(u8::from(i == unit))).collect();
+        let mut next = vec![0.0; order];
+        let mut x = now[0];
+        for (i, [b0, b1, b2, a1, a2]) in controller.sections.iter().enumerate() {
+            let at = 2 + delay + 2 * i;
+            let out = b0 * x + now[at];
+            (next[at], next[at + 1]) = (b1 * x - a1 * out + now[at + 1], b2 * x - a2 * out);
+            x = out;
+        }
+        let command = -controller.gain_s2 * x;
+        let mut waiting: Vec<f64> = now[2..2 + delay].to_vec();
+        waiting.push(command);
+        next[2..2 + delay].copy_from_slice(&waiting[1..]);
+        next[0] = now[0] + dt_s * now[1] + 0.5 * dt_s * dt_s * waiting[0];
+        next[1] = now[1] + dt_s * waiting[0];
+        next
+    });
+    let matrix = DMatrix::from_vec(order, order, columns.flatten().collect());
+    let largest = eigenvalues(&matrix)?.iter().map(|z| z.norm()).fold(0.0, f64::max);
+    largest.is_finite().then_some(largest)
 }
 
 /// The sampled loop of one channel.
@@ -939,6 +1006,24 @@ pub(crate) mod tests {
         assert!(c.max_asd_ratio < 1.0, "{name}: {} of the requirement", c.max_asd_ratio);
         assert!(c.lmi_max_eigenvalue < 0.0, "{name}: {}", c.lmi_max_eigenvalue);
         assert!(c.forget_time_s < 3600.0, "{name}: {} s", c.forget_time_s);
+    }
+
+    /// The designed loops die out, as fast as their margins say they should; the same ones with the sign of feedback turned,
+    /// or with a gain beyond the margin, grow; without a controller a channel drifts.
+    #[test]
+    fn growth_tells_stable_loops_from_others() {
+        let mission = taiji();
+        let growth = |c: &ChannelController| growth_per_sample(c, 1, mission.dt_s()).unwrap();
+        for c in design(&mission).unwrap().channels {
+            assert!(growth(&c.controller) < 1.0, "{}", c.name);
+            let scaled = |by: f64| ChannelController { gain_s2: by * c.controller.gain_s2, ..c.controller.clone() };
+            assert!(growth(&scaled(-1.0)) > 1.0, "{}", c.name);
+            let margin = 10_f64.powf(c.gain_margin_db / 20.0);
+            let (inside, outside) = ([1.0 / margin * 1.02, margin / 1.02], [1.0 / margin / 1.02, margin * 1.02]);
+            assert!(inside.iter().all(|by| growth(&scaled(*by)) < 1.0), "{}: {margin}", c.name);
+            assert!(outside.iter().any(|by| growth(&scaled(*by)) > 1.0), "{}: {margin}", c.name);
+            assert!((growth(&scaled(0.0)) - 1.0).abs() < 1e-6);
+        }
     }
 
     /// Every bound of every channel of the default mission, on the controllers that fly.

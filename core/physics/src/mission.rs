@@ -345,6 +345,10 @@ pub struct Control {
     /// offsets. Controllers that treat rotation and translation apart do not.
     #[serde(default = "yes")]
     pub lever_feed_forward: bool,
+    /// Bandwidth of the designed attitude loop over the one that its requirement needs. A faster loop keeps the requirement
+    /// and shakes the spacecraft more where the interferometers are quiet, from which the offset is read.
+    #[serde(default = "one")]
+    pub attitude_bandwidth_factor: f64,
     /// Controllers by channel: all fifteen, or none for the default design.
     #[serde(default)]
     pub channel: BTreeMap<String, ChannelController>,
@@ -352,6 +356,17 @@ pub struct Control {
 
 fn yes() -> bool {
     true
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+impl Default for Control {
+    /// A sample of delay, and the default design.
+    fn default() -> Self {
+        Self { delay_samples: 1, lever_feed_forward: yes(), attitude_bandwidth_factor: one(), channel: BTreeMap::new() }
+    }
 }
 
 /// A controller: from a channel's readout (m or rad) to its desired acceleration `u_d` (m s⁻² or rad s⁻²).
@@ -613,6 +628,10 @@ impl Mission {
         if let Some(c) = &self.control {
             if c.delay_samples > MOST_DELAY_SAMPLES {
                 return Err(value_error("control.delay_samples", &c.delay_samples, "must be at most 100"));
+            }
+            if !(0.5..=4.0).contains(&c.attitude_bandwidth_factor) {
+                let value = c.attitude_bandwidth_factor;
+                return Err(value_error("control.attitude_bandwidth_factor", &value, "must be between 0.5 and 4"));
             }
             for (name, channel) in &c.channel {
                 if !CHANNELS.contains(&name.as_str()) {

@@ -48,12 +48,7 @@ fn write(path: &Path, text: &str) -> Result<String, Failure> {
 
 /// The controllers as a mission file holds them.
 fn frozen(mission: &Mission, design: &Design) -> Result<String, Failure> {
-    let given = mission.control.as_ref();
-    let control = Control {
-        delay_samples: given.map_or(1, |c| c.delay_samples),
-        lever_feed_forward: given.is_none_or(|c| c.lever_feed_forward),
-        channel: design.controllers(),
-    };
+    let control = Control { channel: design.controllers(), ..mission.control.clone().unwrap_or_default() };
     let table =
         toml::Table::from_iter([("control".to_owned(), toml::Value::try_from(&control).map_err(Failure::engine)?)]);
     let text = toml::to_string(&table).map_err(Failure::engine)?;

@@ -35,7 +35,7 @@ fn with_gains(scale: f64) -> Mission {
     for controller in channel.values_mut() {
         controller.gain_s2 *= scale;
     }
-    mission.control = Some(Control { delay_samples: 1, lever_feed_forward: true, channel });
+    mission.control = Some(Control { channel, ..Control::default() });
     mission
 }
 
