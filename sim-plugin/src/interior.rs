@@ -374,7 +374,7 @@ impl Running {
     fn charging(&mut self) {
         for i in 0..2 {
             let (charge_c, lamp) = (&mut self.now.charge_c[i], &mut self.now.lamp[i]);
-            // Each cosmic ray brings some tens of charges: 23 e/s with the scatter of 600 e/√Hz.
+            // Each cosmic ray brings some tens of charges: 23 e/s with the scatter of 570 e/√Hz, one-sided.
             let arrived = CHARGING_E_S[i] * STEP_S + 400.0 * normal(&mut self.rng);
             *charge_c += arrived * ELEMENTARY_C;
             if *lamp {
