@@ -149,7 +149,7 @@ pub(crate) struct Design {
     /// Draw sensitivities and predicted spectra as SVG into this folder
     #[arg(long, value_name = "DIR")]
     pub(crate) pictures: Option<PathBuf>,
-    /// Write the controllers as the [control] of a mission file
+    /// Write the controllers as the section `control` of a mission file
     #[arg(long, value_name = "FILE")]
     pub(crate) freeze: Option<PathBuf>,
 }
