@@ -221,7 +221,7 @@ impl Feed for SourceFeed {
 
     fn summary(&mut self) -> Result<Summary, EngineError> {
         let mut report = self.instance.report("[]").map_err(chain::ChainError::from)?;
-        if let Some(attachments) = report["attachments"].as_array_mut() {
+        if let Some(attachments) = report.get_mut("attachments").and_then(serde_json::Value::as_array_mut) {
             attachments.retain(|a| a["suffix"] != SEALED);
         }
         let text = |key: &str| report["quality"][key].as_str().unwrap_or_default().to_owned();
