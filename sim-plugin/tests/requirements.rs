@@ -31,7 +31,7 @@ fn attainable(c: &ChannelDesign, band: (f64, f64)) -> bool {
 
 /// In every band of every channel, the spectrum of the true states is the one that the design predicts, to what a day can
 /// tell, and the prediction keeps the table wherever physics lets any controller keep it. The measured spectrum itself
-/// stays below the table even if chance made it as high as one estimate in 150,000.
+/// does not exceed the table by more than chance would make one estimate in 150,000 do.
 #[test]
 fn one_day_meets_the_requirement_table() {
     let mission = taiji();
