@@ -16,3 +16,4 @@ pub mod process;
 pub mod riccati;
 pub mod schur;
 pub mod spectrum;
+pub mod thrust_noise;
