@@ -1,21 +1,8 @@
-//! Stage `qp-check`: the check of the filter by another method on the same data.
-//!
-//! Segments of the channels and regressors become cross-spectral sums ([`spectra`]); Σ(f) starts as the mission's noise
-//! ([`sigma`]) and is re-measured from the residuals (`refine`); the normal equations ([`normal`]) are solved under the survey and
-//! the physical ranges ([`qp`]); [`verdict`] says what the solution is worth. No module knows an effect by name.
+//! Stage `qp-check`: the check of the filter by another method on the same data; the mathematics are those of
+//! `dragfree-estimation`.
 
-pub mod estimate;
-pub mod normal;
-pub mod qp;
-mod refine;
-pub mod segments;
-pub mod sigma;
-pub mod spectra;
 mod stage;
-pub mod state;
-pub mod verdict;
 
-pub use refine::SigmaError;
 pub use stage::QpCheck;
 
 dragfree_sdk::export_plugin!(stages: [QpCheck]);

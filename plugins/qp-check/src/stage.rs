@@ -6,12 +6,12 @@ use nalgebra::DMatrix;
 use serde_json::json;
 use std::collections::BTreeMap;
 
-use crate::estimate::{Bound, Estimate as Solution, Unknown, estimate};
-use crate::segments::{Segmenter, cut, longest_length, shorter_length};
-use crate::sigma::{Measured, NoiseModel};
-use crate::spectra::{Analyser, Layout, Plan, Regressor, Sums};
-use crate::state;
-use crate::verdict::{AGREEMENT_SIGMAS, Difference, Value, chi2_bounds, differences};
+use dragfree_estimation::estimate::{Bound, Estimate as Solution, Unknown, estimate};
+use dragfree_estimation::segments::{Segmenter, cut, longest_length, shorter_length};
+use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, Sums};
+use dragfree_estimation::state;
+use dragfree_estimation::verdict::{AGREEMENT_SIGMAS, Difference, Value, chi2_bounds, differences};
 
 /// Normal equations over segments, a constrained solution, and a verdict.
 pub struct QpCheck {

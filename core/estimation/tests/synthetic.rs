@@ -5,10 +5,10 @@
 
 use dragfree_physics::frames::dcm_turned_about_z;
 use dragfree_physics::mission::Mission;
-use dragfree_qp_check::estimate::{Bound, Estimate, Unknown, estimate};
-use dragfree_qp_check::segments::{Segmenter, cut, shorter_length};
-use dragfree_qp_check::sigma::{Measured, NoiseModel};
-use dragfree_qp_check::spectra::{Analyser, Layout, Plan, Regressor, Sums};
+use dragfree_estimation::estimate::{Bound, Estimate, Unknown, estimate};
+use dragfree_estimation::segments::{Segmenter, cut, shorter_length};
+use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, Sums};
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};

@@ -2,10 +2,10 @@
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use dragfree_physics::mission::Mission;
-use dragfree_qp_check::estimate::{Unknown, estimate};
-use dragfree_qp_check::segments::Segmenter;
-use dragfree_qp_check::sigma::{Measured, NoiseModel};
-use dragfree_qp_check::spectra::{Analyser, Layout, Plan, Regressor, Sums};
+use dragfree_estimation::estimate::{Unknown, estimate};
+use dragfree_estimation::segments::Segmenter;
+use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, Sums};
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
 use rand_xoshiro::Xoshiro256PlusPlus;
