@@ -9,7 +9,7 @@
 use nalgebra::{Cholesky, DMatrix, DVector};
 use serde::Serialize;
 
-use crate::normal::{NormalEquations, accumulate, residuals};
+use crate::normal::{Equations, NormalEquations, accumulate, residuals};
 use crate::qp::{Active, Kkt, Problem, QpError, Row};
 use crate::refine::{Chi2, SigmaError, Whitening};
 use crate::sigma::NoiseModel;
@@ -78,8 +78,30 @@ pub struct Estimate {
     pub kkt: Kkt,
     /// The normal equations, with the refined Σ.
     pub normal: NormalEquations,
+    /// What the blocks of time say of σ, for each free coefficient; none with fewer than [`LEAST_BLOCKS`].
+    pub scatter: Option<Scatter>,
     /// How well the noise is understood.
     pub quality: Quality,
+}
+
+/// Blocks below which nothing is said about their scatter.
+pub const LEAST_BLOCKS: usize = 6;
+
+/// False-alarm rate at which the scatter of the blocks widens σ: one-sided, per coefficient.
+pub const SCATTER_FALSE_ALARM: f64 = 1e-4;
+
+/// Normal quantile of [`SCATTER_FALSE_ALARM`].
+const SCATTER_QUANTILE: f64 = 3.719;
+
+/// The information measured: pulls of single blocks of time against what the normal equations promise.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Scatter {
+    /// Blocks compared.
+    pub blocks: usize,
+    /// Scatter of the blocks' pulls on each free coefficient over what `N` promises, as a ratio of σ.
+    pub ratio: Vec<f64>,
+    /// Above this the ratio is no chance ([`SCATTER_FALSE_ALARM`]) and widens σ.
+    pub upper: f64,
 }
 
 /// χ² and how far Σ moved.
@@ -112,8 +134,8 @@ pub struct ChannelQuality {
     pub dof: f64,
     /// Measured over modelled amplitude, whole band.
     pub measured_over_modelled: f64,
-    /// The same by decade: from Hz, to Hz, ratio.
-    pub by_decade: Vec<(f64, f64, f64)>,
+    /// The same by decade: from Hz, to Hz, ratio, its standard deviation when the noise is stationary.
+    pub by_decade: Vec<(f64, f64, f64, f64)>,
 }
 
 /// Solves for the coefficients; Σ is measured from the residuals, and the coefficients solved again, `refinements` times.
@@ -129,26 +151,27 @@ pub fn estimate(
     bounds: &[Bound],
     refinements: usize,
 ) -> Result<Estimate, EstimateError> {
-    let whitening = Whitening::new(model, plan, layout, sums)?;
-    let (sum_g, sum_g2) = sums.weights(plan);
+    let spectra = &sums.total;
+    let whitening = Whitening::new(model, plan, layout, spectra)?;
+    let (sum_g, sum_g2) = spectra.weights(plan);
     let kept = sum_g / sum_g2;
     let mut inverses = whitening.model_inverses();
-    let mut equations = accumulate(sums, layout, &inverses);
-    let seen = |i: usize| equations.0[(i, i)] > 0.0;
+    let mut equations = accumulate(spectra, layout, &inverses);
+    let seen = |i: usize| equations.normal[(i, i)] > 0.0;
     let free: Vec<usize> = (0..unknowns.len()).filter(|i| unknowns[*i].estimate && seen(*i)).collect();
     let unseen: Vec<usize> = (0..unknowns.len()).filter(|i| unknowns[*i].estimate && !seen(*i)).collect();
 
     let mut solved = Reduced::new(&equations, kept, unknowns, bounds, &free).solve()?;
-    let mut residual = residuals(sums, layout, plan.bands.len(), &solved.theta);
+    let mut residual = residuals(spectra, layout, plan.bands.len(), &solved.theta);
     let modelled = whitening.chi2(&residual, &inverses, false);
     let mut last_step = DVector::zeros(unknowns.len());
     for _ in 0..refinements {
         inverses = whitening.refined_inverses(&residual);
-        equations = accumulate(sums, layout, &inverses);
+        equations = accumulate(spectra, layout, &inverses);
         let next = Reduced::new(&equations, kept, unknowns, bounds, &free).solve()?;
         last_step = &next.theta - &solved.theta;
         solved = next;
-        residual = residuals(sums, layout, plan.bands.len(), &solved.theta);
+        residual = residuals(spectra, layout, plan.bands.len(), &solved.theta);
     }
     let chi2 = whitening.chi2(&residual, &inverses, refinements > 0);
 
@@ -156,7 +179,16 @@ pub fn estimate(
     let weak = reduced.weak(unknowns, &unseen);
     let dof = (chi2.expected * kept - free.len() as f64).max(1.0);
     let chi2_per_dof = chi2.sum * kept / dof;
-    let covariance = reduced.covariance(&solved.active).map(|c| c * chi2_per_dof.max(1.0));
+    let covariance = reduced.covariance(&solved.active);
+    let scatter =
+        covariance.as_ref().and_then(|c| scatter(sums, plan, layout, &inverses, &solved.theta, (c, kept), &free));
+    let covariance = covariance.map(|c| {
+        let by_blocks =
+            |k: usize| scatter.as_ref().map_or(1.0, |s| if s.ratio[k] > s.upper { s.ratio[k] } else { 1.0 });
+        let by_noise = chi2_per_dof.max(1.0).sqrt();
+        let widen: Vec<f64> = (0..free.len()).map(|k| by_blocks(k).max(by_noise)).collect();
+        DMatrix::from_fn(c.nrows(), c.ncols(), |i, j| c[(i, j)] * widen[i] * widen[j])
+    });
     let last_step_sigma = covariance.as_ref().map_or(f64::NAN, |c| {
         free.iter().enumerate().map(|(k, i)| last_step[*i].abs() / c[(k, k)].sqrt()).fold(0.0, f64::max)
     });
@@ -178,7 +210,8 @@ pub fn estimate(
         weak,
         active: solved.active,
         kkt: solved.kkt,
-        normal: NormalEquations::new(names, &equations, sums, plan),
+        normal: NormalEquations::new(names, &equations, spectra, plan),
+        scatter,
         quality,
     })
 }
@@ -219,7 +252,7 @@ const SIZE_WITHOUT_RANGE: f64 = 1e6;
 
 impl<'a> Reduced<'a> {
     fn new(
-        (normal, right, _): &(DMatrix<f64>, DVector<f64>, f64),
+        Equations { normal, right, .. }: &Equations,
         kept: f64,
         unknowns: &'a [Unknown],
         bounds: &[Bound],
@@ -342,6 +375,43 @@ impl<'a> Reduced<'a> {
     }
 }
 
+/// Pulls of the blocks on the free coefficients, `kept C (c_b − N_b θ)`, squared and summed, over their expectation
+/// `kept² C N_b C Σg²/Σg` when Σ is right and the same at all times; B blocks share one θ, which takes a part 1/B.
+fn scatter(
+    sums: &Sums,
+    plan: &Plan,
+    layout: &Layout,
+    inverses: &[DMatrix<f64>],
+    theta: &DVector<f64>,
+    (covariance, kept): (&DMatrix<f64>, f64),
+    free: &[usize],
+) -> Option<Scatter> {
+    let blocks = sums.blocks.len();
+    if blocks < LEAST_BLOCKS || free.is_empty() {
+        return None;
+    }
+    let (mut measured, mut expected) = (DVector::zeros(free.len()), DVector::zeros(free.len()));
+    for block in &sums.blocks {
+        let equations = accumulate(&block.spectra, layout, inverses);
+        let pull = &equations.right - &equations.normal * theta;
+        let pull = covariance * DVector::from_fn(free.len(), |k, _| kept * pull[free[k]]);
+        let normal = DMatrix::from_fn(free.len(), free.len(), |i, j| equations.normal[(free[i], free[j])]);
+        let (g, g2) = block.spectra.weights(plan);
+        measured += pull.component_mul(&pull);
+        expected += (covariance * normal * covariance).diagonal() * (kept * kept * g2 / g);
+    }
+    let dof = blocks as f64 - 1.0;
+    let ratio = measured.component_div(&expected).map(|r| (r * blocks as f64 / dof).sqrt());
+    let upper = chi2_upper(dof, SCATTER_QUANTILE).sqrt();
+    Some(Scatter { blocks, ratio: ratio.iter().copied().collect(), upper })
+}
+
+/// Upper bound of χ²/dof at a normal quantile, by Wilson and Hilferty.
+fn chi2_upper(dof: f64, quantile: f64) -> f64 {
+    let v = 2.0 / (9.0 * dof);
+    (1.0 - v + quantile * v.sqrt()).powi(3)
+}
+
 /// σ of a uniform density over a row's interval; infinite where one side is open.
 fn uniform_sigma(row: &Row) -> f64 {
     row.half_width() / 3f64.sqrt()
@@ -364,12 +434,14 @@ fn channel_quality(
             _ => decades.push((decade, b..b + 1)),
         }
     }
-    let by_decade: Vec<(f64, f64, Vec<f64>)> = decades
+    let by_decade: Vec<(f64, f64, Vec<f64>, f64)> = decades
         .into_iter()
         .map(|(_, range)| {
             let from = plan.bin_hz(plan.bands[range.start].first as f64);
             let to = plan.bin_hz(plan.bands[range.end - 1].end as f64);
-            (from, to, whitening.power_ratio(residual, range))
+            // Half the relative standard deviation of a power that n complex observations give.
+            let sigma = 0.5 / whitening.observations(range.clone()).sqrt();
+            (from, to, whitening.power_ratio(residual, range), sigma)
         })
         .collect();
     layout
@@ -383,7 +455,10 @@ fn channel_quality(
                 chi2_per_dof: sum / expected,
                 dof: expected * kept,
                 measured_over_modelled: overall[c].sqrt(),
-                by_decade: by_decade.iter().map(|(from, to, ratio)| (*from, *to, ratio[c].sqrt())).collect(),
+                by_decade: by_decade
+                    .iter()
+                    .map(|(from, to, ratio, sigma)| (*from, *to, ratio[c].sqrt(), ratio[c].sqrt() * sigma))
+                    .collect(),
             }
         })
         .collect()

@@ -12,6 +12,7 @@ pub mod segments;
 pub mod sigma;
 pub mod spectra;
 pub mod state;
+pub mod stored;
 pub mod verdict;
 
 pub use refine::SigmaError;

@@ -3,7 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 use serde::Serialize;
 
-use crate::spectra::{Layout, Plan, Sums, triangle};
+use crate::spectra::{Layout, Plan, Spectra, triangle};
 
 /// What any model's solution needs of the data. They add up over segments and days of the same Σ.
 #[derive(Clone, Debug, Serialize)]
@@ -34,46 +34,55 @@ impl Packed<'_> {
     }
 }
 
-/// `N`, `c` and `zᴴΣ⁻¹z` from the sums, with one inverse per band of Σ in units of the modelled amplitudes.
-pub(crate) fn accumulate(sums: &Sums, layout: &Layout, inverses: &[DMatrix<f64>]) -> (DMatrix<f64>, DVector<f64>, f64) {
-    let (channels, columns) = (layout.channels.len(), layout.columns());
-    let mut normal = DMatrix::zeros(layout.coefficients, layout.coefficients);
-    let mut right = DVector::zeros(layout.coefficients);
+/// `N`, `c` and `zᴴΣ⁻¹z`.
+#[derive(Clone, Debug)]
+pub(crate) struct Equations {
+    pub(crate) normal: DMatrix<f64>,
+    pub(crate) right: DVector<f64>,
+    pub(crate) zz: f64,
+}
+
+/// The equations of some segments, with one `Σ⁻¹` per band.
+pub(crate) fn accumulate(spectra: &Spectra, layout: &Layout, inverses: &[DMatrix<f64>]) -> Equations {
+    let (channels, columns, coefficients) = (layout.channels.len(), layout.columns(), layout.coefficients.len());
+    let mut normal = DMatrix::zeros(coefficients, coefficients);
+    let mut right = DVector::zeros(coefficients);
     let mut zz = 0.0;
     for (b, inverse) in inverses.iter().enumerate() {
-        let g = Packed(sums.band(b, columns));
+        let g = Packed(spectra.band(b, columns));
         for i in 0..channels {
             for j in 0..channels {
                 zz += inverse[(i, j)] * g.at(i, j);
             }
         }
-        for (i, r) in layout.regressors.iter().enumerate() {
+        for r in &layout.regressors {
             for j in 0..channels {
-                right[r.coefficient] += inverse[(r.channel, j)] * g.at(channels + i, j);
+                right[r.coefficient] += r.factor * inverse[(r.channel, j)] * g.at(channels + r.series, j);
             }
-            for (j, s) in layout.regressors.iter().enumerate() {
-                normal[(r.coefficient, s.coefficient)] +=
-                    inverse[(r.channel, s.channel)] * g.at(channels + i, channels + j);
+            for s in &layout.regressors {
+                normal[(r.coefficient, s.coefficient)] += r.factor
+                    * s.factor
+                    * inverse[(r.channel, s.channel)]
+                    * g.at(channels + r.series, channels + s.series);
             }
         }
     }
-    let symmetric = 0.5 * (&normal + normal.transpose());
-    (symmetric, right, zz)
+    Equations { normal: 0.5 * (&normal + normal.transpose()), right, zz }
 }
 
-/// Cross-spectra of the residuals `z − Φθ` in every band, in units of the modelled amplitudes.
-pub(crate) fn residuals(sums: &Sums, layout: &Layout, bands: usize, theta: &DVector<f64>) -> Vec<DMatrix<f64>> {
+/// Cross-spectra of the residuals `z − Φθ` in every band.
+pub(crate) fn residuals(spectra: &Spectra, layout: &Layout, bands: usize, theta: &DVector<f64>) -> Vec<DMatrix<f64>> {
     let (channels, columns) = (layout.channels.len(), layout.columns());
-    let weight: Vec<f64> = (0..columns)
-        .map(|j| j.checked_sub(channels).map_or(1.0, |r| -theta[layout.regressors[r].coefficient]))
-        .collect();
+    // Residuals as combinations of columns: channel, column, weight.
+    let mut terms: Vec<(usize, usize, f64)> = (0..channels).map(|c| (c, c, 1.0)).collect();
+    terms.extend(layout.regressors.iter().map(|r| (r.channel, channels + r.series, -r.factor * theta[r.coefficient])));
     (0..bands)
         .map(|b| {
-            let g = Packed(sums.band(b, columns));
+            let g = Packed(spectra.band(b, columns));
             let mut out = DMatrix::zeros(channels, channels);
-            for i in 0..columns {
-                for j in 0..columns {
-                    out[(layout.channel_of(i), layout.channel_of(j))] += weight[i] * weight[j] * g.at(i, j);
+            for (c, i, a) in &terms {
+                for (d, j, b) in &terms {
+                    out[(*c, *d)] += a * b * g.at(*i, *j);
                 }
             }
             0.5 * (&out + out.transpose())
@@ -84,11 +93,11 @@ pub(crate) fn residuals(sums: &Sums, layout: &Layout, bands: usize, theta: &DVec
 impl NormalEquations {
     pub(crate) fn new(
         names: Vec<String>,
-        (normal, right, zz): &(DMatrix<f64>, DVector<f64>, f64),
-        sums: &Sums,
+        Equations { normal, right, zz }: &Equations,
+        spectra: &Spectra,
         plan: &Plan,
     ) -> Self {
-        let (sum_g, sum_g2) = sums.weights(plan);
+        let (sum_g, sum_g2) = spectra.weights(plan);
         Self {
             names,
             normal: normal.row_iter().map(|r| r.iter().copied().collect()).collect(),
@@ -96,7 +105,7 @@ impl NormalEquations {
             zz: *zz,
             sum_g,
             sum_g2,
-            segments: sums.segments,
+            segments: spectra.segments,
         }
     }
 }

@@ -14,10 +14,10 @@
 //! * channels that the model does not connect stay unconnected. Were the attitude channels allowed to correlate with the test
 //!   masses', their measured coherence would *be* the offset's signal, because α̂ is made of them, and Σ would eat it.
 
-use nalgebra::{Cholesky, DMatrix};
+use nalgebra::{Cholesky, DMatrix, DVector};
 
 use crate::sigma::NoiseModel;
-use crate::spectra::{Layout, Plan, Sums};
+use crate::spectra::{Layout, Plan, Spectra};
 
 /// A band in which Σ is refined is at least this wide, last frequency over first.
 const RATIO: f64 = 1.15;
@@ -28,10 +28,12 @@ const OBSERVATIONS_PER_CHANNEL: f64 = 4.0;
 /// Pseudo-observations per channel with which measured correlations are shrunk.
 const SHRINKAGE: f64 = 2.0;
 
-/// Σ as the model has it, in units of the modelled amplitudes, and the bands in which it may move.
+/// Σ as the model has it, and the bands in which it may move.
 pub(crate) struct Whitening {
-    /// Cholesky factor of the model's correlation matrix, per band of the sums.
+    /// Cholesky factor of the model's Σ, its mean over the band, per band of the sums.
     factors: Vec<DMatrix<f64>>,
+    /// Diagonal of that Σ, per band of the sums.
+    variances: Vec<DVector<f64>>,
     /// Group of each channel: channels that the model connects.
     group: Vec<usize>,
     /// Channels in the group of each channel.
@@ -42,6 +44,8 @@ pub(crate) struct Whitening {
     expected: Vec<f64>,
     /// Complex observations, per coarse band.
     observations: Vec<f64>,
+    /// Complex observations, per band.
+    observations_per_band: Vec<f64>,
 }
 
 /// Why Σ cannot be used.
@@ -59,23 +63,25 @@ pub enum SigmaError {
 }
 
 impl Whitening {
-    pub(crate) fn new(model: &NoiseModel, plan: &Plan, layout: &Layout, sums: &Sums) -> Result<Self, SigmaError> {
+    pub(crate) fn new(model: &NoiseModel, plan: &Plan, layout: &Layout, spectra: &Spectra) -> Result<Self, SigmaError> {
         let n = layout.channels.len();
         let mut factors = Vec::with_capacity(plan.bands.len());
+        let mut variances = Vec::with_capacity(plan.bands.len());
         let mut connected = DMatrix::from_element(n, n, false);
         for band in &plan.bands {
-            let frequency_hz = plan.frequency_hz(*band);
-            let sigma = model.psd(frequency_hz);
-            let correlation = DMatrix::from_fn(n, n, |i, j| sigma[(i, j)] / (sigma[(i, i)] * sigma[(j, j)]).sqrt());
-            for (c, x) in connected.iter_mut().zip(&correlation) {
+            let bins = (band.first..band.end).map(|k| model.psd(plan.bin_hz(k as f64)));
+            let sigma = bins.fold(DMatrix::zeros(n, n), |sum, s| sum + s) / band.bins() as f64;
+            for (c, x) in connected.iter_mut().zip(&sigma) {
                 *c |= *x != 0.0;
             }
-            factors.push(Cholesky::new(correlation).ok_or(SigmaError::Singular { frequency_hz })?.unpack());
+            variances.push(sigma.diagonal());
+            let frequency_hz = plan.frequency_hz(*band);
+            factors.push(Cholesky::new(sigma).ok_or(SigmaError::Singular { frequency_hz })?.unpack());
         }
         let group = groups(&connected);
         let group_size: Vec<f64> = group.iter().map(|g| group.iter().filter(|h| *h == g).count() as f64).collect();
-        let per_bin = plan.expected_per_bin() * sums.segments as f64;
-        let (g, g2) = sums.weights(plan);
+        let per_bin = plan.expected_per_bin() * spectra.segments as f64;
+        let (g, g2) = spectra.weights(plan);
         // Real degrees of freedom of a channel are (Σg)²/Σg², shared by L/2 bins; two of them make a complex observation.
         let observations_per_bin = if g2 > 0.0 { g * g / g2 / plan.length as f64 } else { 0.0 };
         let needed = OBSERVATIONS_PER_CHANNEL * group_size.iter().fold(0.0, |a: f64, b| a.max(*b));
@@ -96,15 +102,17 @@ impl Whitening {
         }
         Ok(Self {
             factors,
+            variances,
             group,
             group_size,
             observations: coarse.iter().map(|r| observations_per_bin * bins(r)).collect(),
             coarse,
+            observations_per_band: plan.bands.iter().map(|b| observations_per_bin * b.bins() as f64).collect(),
             expected: plan.bands.iter().map(|b| per_bin * b.bins() as f64).collect(),
         })
     }
 
-    /// `Σ⁻¹` of the model, per band, in units of the modelled amplitudes.
+    /// `Σ⁻¹` of the model, per band.
     pub(crate) fn model_inverses(&self) -> Vec<DMatrix<f64>> {
         self.factors.iter().map(inverse_of_square).collect()
     }
@@ -178,11 +186,16 @@ impl Whitening {
         self.expected[band] * self.group.len() as f64
     }
 
+    /// Complex observations in a range of bands.
+    pub(crate) fn observations(&self, range: std::ops::Range<usize>) -> f64 {
+        self.observations_per_band[range].iter().sum()
+    }
+
     /// Measured over modelled power of each channel in a range of bands.
     pub(crate) fn power_ratio(&self, residuals: &[DMatrix<f64>], range: std::ops::Range<usize>) -> Vec<f64> {
         let expected: f64 = self.expected[range.clone()].iter().sum();
         (0..self.group.len())
-            .map(|c| residuals[range.clone()].iter().map(|r| r[(c, c)]).sum::<f64>() / expected)
+            .map(|c| range.clone().map(|b| residuals[b][(c, c)] / self.variances[b][c]).sum::<f64>() / expected)
             .collect()
     }
 }

@@ -85,7 +85,7 @@ impl Segmenter {
             let ok = usable[k];
             let end = k + usable[k..].iter().take_while(|u| **u == ok).count();
             if ok {
-                self.extend(&values, k, end, analyser, sums);
+                self.extend(time_ns, &values, k, end, analyser, sums);
                 self.state.valid += (end - k) as u64;
             } else {
                 self.end_run(sums);
@@ -105,7 +105,15 @@ impl Segmenter {
         column.iter().map(|x| 0.5 * (std::mem::replace(&mut previous, *x) + x)).collect()
     }
 
-    fn extend(&mut self, values: &[Vec<f64>], first: usize, end: usize, analyser: &mut Analyser, sums: &mut Sums) {
+    fn extend(
+        &mut self,
+        time_ns: &[i64],
+        values: &[Vec<f64>],
+        first: usize,
+        end: usize,
+        analyser: &mut Analyser,
+        sums: &mut Sums,
+    ) {
         let mut k = first;
         while k < end {
             let take = (self.length - self.state.run.first().map_or(0, Vec::len)).min(end - k);
@@ -115,7 +123,8 @@ impl Segmenter {
             k += take;
             if self.state.run.first().is_some_and(|r| r.len() == self.length) {
                 let segment: Vec<&[f64]> = self.state.run.iter().map(Vec::as_slice).collect();
-                analyser.add(&segment, self.state.run_has_segment, sums);
+                let first_ns = time_ns[k - 1] - self.step_ns * (self.length as i64 - 1);
+                analyser.add(first_ns, &segment, self.state.run_has_segment, sums);
                 let hop = self.length / 2;
                 self.state.covered += if self.state.run_has_segment { hop } else { self.length } as u64;
                 self.state.run_has_segment = true;
@@ -129,11 +138,11 @@ impl Segmenter {
     fn end_run(&mut self, sums: &Sums) {
         let state = &mut self.state;
         let len = |run: &[Vec<f64>]| run.first().map_or(0, Vec::len);
-        if sums.segments == 0 && len(&state.run) > len(&state.longest) {
+        if sums.total.segments == 0 && len(&state.run) > len(&state.longest) {
             std::mem::swap(&mut state.run, &mut state.longest);
         }
         state.run.iter_mut().for_each(Vec::clear);
-        if sums.segments > 0 {
+        if sums.total.segments > 0 {
             state.longest.iter_mut().for_each(Vec::clear);
         }
         state.run_has_segment = false;
@@ -171,7 +180,7 @@ pub fn shorter_length(samples: usize) -> Option<usize> {
     (samples >= 2 * SHORTEST).then(|| longest_length(samples / 2))
 }
 
-/// Cuts one run into segments of the analyser's length.
+/// Cuts one run into segments of the analyser's length; times count from its start.
 #[must_use]
 pub fn cut(run: &[Vec<f64>], layout: &Layout, analyser: &mut Analyser) -> Sums {
     let mut sums = Sums::new(analyser.plan(), layout);
@@ -180,7 +189,8 @@ pub fn cut(run: &[Vec<f64>], layout: &Layout, analyser: &mut Analyser) -> Sums {
     let mut first = 0;
     while first + length <= samples {
         let segment: Vec<&[f64]> = run.iter().map(|c| &c[first..first + length]).collect();
-        analyser.add(&segment, first > 0, &mut sums);
+        let first_ns = (1e9 * first as f64 / analyser.plan().rate_hz) as i64;
+        analyser.add(first_ns, &segment, first > 0, &mut sums);
         first += hop;
     }
     sums
@@ -194,13 +204,14 @@ mod tests {
     fn layout() -> Layout {
         Layout {
             channels: vec!["a".into(), "b".into()],
-            regressors: vec![crate::spectra::Regressor { coefficient: 0, channel: 1 }],
-            coefficients: 1,
+            series: vec!["s".into()],
+            regressors: vec![],
+            coefficients: vec![],
         }
     }
 
     fn run(length: usize, batch: usize, columns: &[Vec<f64>], times: &[i64]) -> (Sums, State) {
-        let mut analyser = Analyser::new(Plan::new(length, 10.0), &layout(), |_| vec![1.0; 2]);
+        let mut analyser = Analyser::new(Plan::new(length, 10.0), &layout());
         let mut sums = Sums::new(analyser.plan(), &layout());
         let mut segmenter = Segmenter::new(length, 100, vec![false, false, true]);
         for first in (0..times.len()).step_by(batch) {
@@ -247,8 +258,8 @@ mod tests {
         let (sums, state) = run(64, 100, &columns, &times);
         let segments = |samples: u64| (samples - 64) / 32 + 1;
         let want = [332, 267, 398].map(segments);
-        assert_eq!(sums.segments, want.iter().sum::<u64>());
-        assert_eq!(sums.overlaps, want.iter().map(|n| n - 1).sum::<u64>());
+        assert_eq!(sums.total.segments, want.iter().sum::<u64>());
+        assert_eq!(sums.total.overlaps, want.iter().map(|n| n - 1).sum::<u64>());
         assert_eq!(state.covered, want.iter().map(|n| 32 * (n + 1)).sum::<u64>());
     }
 

@@ -1,7 +1,7 @@
 //! The stage's state as bytes: a mark, what it was made for, little-endian words, a checksum. Exact to the bit, NaN included.
 
 use crate::segments::State;
-use crate::spectra::Sums;
+use crate::spectra::{Block, MAX_BLOCKS, Spectra, Sums};
 
 /// Why a saved state was refused.
 #[derive(Debug, thiserror::Error)]
@@ -28,7 +28,7 @@ pub enum StateError {
 
 const MARK: &[u8; 8] = b"QPCHECK\n";
 /// Version of the layout of saved states.
-pub const VERSION: u64 = 1;
+pub const VERSION: u64 = 2;
 
 /// The state as bytes; `layout` says what it is for.
 #[must_use]
@@ -43,11 +43,18 @@ pub fn save(layout: &str, state: &State, sums: &Sums) -> Vec<u8> {
     w.columns(&state.run);
     w.word(u64::from(state.run_has_segment));
     w.columns(&state.longest);
-    for count in [state.rows, state.valid, state.covered, sums.segments, sums.overlaps] {
+    for count in [state.rows, state.valid, state.covered] {
         w.word(count);
     }
     state.missing.iter().for_each(|n| w.word(*n));
-    w.numbers(&sums.packed);
+    w.spectra(&sums.total);
+    w.word(sums.block_ns.cast_unsigned());
+    w.word(sums.blocks.len() as u64);
+    for block in &sums.blocks {
+        w.word(block.number.cast_unsigned());
+        w.word(u64::from(block.overlaps_before));
+        w.spectra(&block.spectra);
+    }
     let sum = checksum(&w.0);
     w.word(sum);
     w.0
@@ -80,15 +87,26 @@ pub fn load(bytes: &[u8], layout: &str, state: &State, sums: &Sums) -> Result<(S
     let run_has_segment = r.flag()?;
     let longest = r.columns(columns)?;
     let (rows, valid, covered) = (r.word()?, r.word()?, r.word()?);
-    let (segments, overlaps) = (r.word()?, r.word()?);
     let missing = (0..columns).map(|_| r.word()).collect::<Result<_, _>>()?;
-    let packed = r.numbers(sums.packed.len())?;
+    let size = sums.total.packed.len();
+    let total = r.spectra(size)?;
+    let block_ns = r.word()?.cast_signed();
+    let blocks = r.size()?;
+    if block_ns <= 0 || blocks > MAX_BLOCKS {
+        return Err(StateError::Damaged("blocks of time"));
+    }
+    let blocks = (0..blocks)
+        .map(|_| {
+            let number = r.word()?.cast_signed();
+            Ok(Block { number, overlaps_before: r.flag()?, spectra: r.spectra(size)? })
+        })
+        .collect::<Result<_, StateError>>()?;
     if !r.0.is_empty() {
         return Err(StateError::Damaged("too long"));
     }
     let last_ns = some.then_some(last);
     let state = State { last_ns, previous, run, run_has_segment, longest, rows, valid, covered, missing };
-    Ok((state, Sums { packed, segments, overlaps }))
+    Ok((state, Sums { total, block_ns, blocks }))
 }
 
 struct Writer(Vec<u8>);
@@ -100,6 +118,12 @@ impl Writer {
 
     fn numbers(&mut self, numbers: &[f64]) {
         numbers.iter().for_each(|x| self.word(x.to_bits()));
+    }
+
+    fn spectra(&mut self, spectra: &Spectra) {
+        self.word(spectra.segments);
+        self.word(spectra.overlaps);
+        self.numbers(&spectra.packed);
     }
 
     /// Columns of equal length.
@@ -142,6 +166,10 @@ impl<'a> Reader<'a> {
         Ok(bytes.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b)).collect())
     }
 
+    fn spectra(&mut self, size: usize) -> Result<Spectra, StateError> {
+        Ok(Spectra { segments: self.word()?, overlaps: self.word()?, packed: self.numbers(size)? })
+    }
+
     fn columns(&mut self, columns: usize) -> Result<Vec<Vec<f64>>, StateError> {
         let length = self.size()?;
         (0..columns).map(|_| self.numbers(length)).collect()
@@ -171,7 +199,12 @@ mod tests {
             covered: 8,
             missing: vec![0, 1],
         };
-        (state, Sums { packed: vec![1.5, 2.5], segments: 3, overlaps: 2 })
+        let spectra = |segments, overlaps| Spectra { packed: vec![1.5, 2.5], segments, overlaps };
+        let blocks = vec![
+            Block { number: -1, spectra: spectra(1, 0), overlaps_before: false },
+            Block { number: 4, spectra: spectra(2, 1), overlaps_before: true },
+        ];
+        (state, Sums { total: spectra(3, 2), block_ns: 3_600_000_000_000, blocks })
     }
 
     #[test]

@@ -3,12 +3,12 @@
 //! The data are made here from white processes sample by sample, with no code of the crate but the mission file: torque and thrust
 //! noise, readouts differenced twice, and α̂ as the Wiener estimate from the attitude channel, in the frequency domain.
 
-use dragfree_physics::frames::dcm_turned_about_z;
-use dragfree_physics::mission::Mission;
 use dragfree_estimation::estimate::{Bound, Estimate, Unknown, estimate};
 use dragfree_estimation::segments::{Segmenter, cut, shorter_length};
 use dragfree_estimation::sigma::{Measured, NoiseModel};
 use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, Sums};
+use dragfree_physics::frames::dcm_turned_about_z;
+use dragfree_physics::mission::Mission;
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
@@ -183,12 +183,14 @@ const CHANNELS: [&str; 9] = [
 ];
 
 fn layout() -> Layout {
-    let regressors = (0..6)
-        .flat_map(|coefficient| {
-            (0..3).map(move |axis| Regressor { coefficient, channel: 3 * (coefficient / 3) + axis })
+    let regressors = (0..18)
+        .map(|series| {
+            let coefficient = series / 3;
+            Regressor { coefficient, channel: 3 * (coefficient / 3) + series % 3, series, factor: 1.0 }
         })
         .collect();
-    Layout { channels: CHANNELS.map(str::to_owned).to_vec(), regressors, coefficients: 6 }
+    let names = |n: usize| (0..n).map(|i| i.to_string()).collect();
+    Layout { channels: CHANNELS.map(str::to_owned).to_vec(), series: names(18), regressors, coefficients: names(6) }
 }
 
 fn unknowns(half_range: f64) -> Vec<Unknown> {
@@ -219,7 +221,7 @@ fn baseline() -> Vec<Bound> {
 
 fn sums(columns: &[Vec<f64>], mission: &Mission) -> (Sums, Plan, NoiseModel) {
     let model = NoiseModel::new(mission, &CHANNELS.map(|c| (c, Measured::Differenced)), DT_S).expect("a noise model");
-    let mut analyser = Analyser::new(Plan::new(LENGTH, RATE_HZ), &layout(), |f| model.variances(f));
+    let mut analyser = Analyser::new(Plan::new(LENGTH, RATE_HZ), &layout());
     let mut sums = Sums::new(analyser.plan(), &layout());
     let averaged = (0..27).map(|j| j >= 9).collect();
     let mut segmenter = Segmenter::new(LENGTH, 100_000_000, averaged);
@@ -396,14 +398,14 @@ fn weak_directions_are_named_until_the_survey_lifts_them() {
 #[test]
 fn gaps_cost_segments_and_nothing_else() {
     let mut columns = data(9, LOOP);
-    let whole = sums(&columns, &mission()).0.segments;
+    let whole = sums(&columns, &mission()).0.total.segments;
     columns[4][9000..11_000].fill(f64::NAN);
     columns[20][20_000] = f64::NAN;
     let (holed, plan, model) = sums(&columns, &mission());
     let segments = |samples: usize| (samples - LENGTH) / (LENGTH / 2) + 1;
     // The first row has no predecessor to average with; the one after a missing regressor has none either.
     assert_eq!(whole, segments(ROWS - 1) as u64);
-    assert_eq!(holed.segments, (segments(8999) + segments(9000) + segments(ROWS - 20_002)) as u64);
+    assert_eq!(holed.total.segments, (segments(8999) + segments(9000) + segments(ROWS - 20_002)) as u64);
     let e = estimate(&holed, &plan, &layout(), &model, &unknowns(50.0), &[], 3).expect("a solution");
     let error = &e.theta - truth();
     let nees = error.dot(&(e.covariance.expect("a covariance").try_inverse().expect("definite") * &error));
@@ -418,9 +420,9 @@ fn ten_seconds_give_no_confident_number() {
     let model =
         NoiseModel::new(&mission(), &CHANNELS.map(|c| (c, Measured::Differenced)), DT_S).expect("a noise model");
     let length = shorter_length(100).expect("long enough");
-    let mut analyser = Analyser::new(Plan::new(length, RATE_HZ), &layout(), |f| model.variances(f));
+    let mut analyser = Analyser::new(Plan::new(length, RATE_HZ), &layout());
     let sums = cut(&columns, &layout(), &mut analyser);
-    assert_eq!((length, sums.segments), (48, 3));
+    assert_eq!((length, sums.total.segments), (48, 3));
     let solve = |bounds: &[Bound]| {
         estimate(&sums, analyser.plan(), &layout(), &model, &unknowns(0.02), bounds, 3).expect("a solution")
     };

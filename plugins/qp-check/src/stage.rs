@@ -11,6 +11,7 @@ use dragfree_estimation::segments::{Segmenter, cut, longest_length, shorter_leng
 use dragfree_estimation::sigma::{Measured, NoiseModel};
 use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, Sums};
 use dragfree_estimation::state;
+use dragfree_estimation::stored::Stored;
 use dragfree_estimation::verdict::{AGREEMENT_SIGMAS, Difference, Value, chi2_bounds, differences};
 
 /// Normal equations over segments, a constrained solution, and a verdict.
@@ -33,7 +34,10 @@ struct Linked {
     refinements: usize,
     analyser: Analyser,
     segmenter: Segmenter,
+    /// Sums of this run.
     sums: Sums,
+    /// Sums of the runs before, whose state this one took over.
+    earlier: Sums,
     /// What a saved state must have been made for.
     signature: String,
 }
@@ -96,13 +100,14 @@ impl Stage for QpCheck {
 
     fn save(&self) -> Result<Vec<u8>, PluginError> {
         let linked = self.linked.as_ref().ok_or_else(before_link)?;
-        Ok(state::save(&linked.signature, &linked.segmenter.state, &linked.sums))
+        Ok(state::save(&linked.signature, &linked.segmenter.state, &linked.all_sums()))
     }
 
     fn load(&mut self, bytes: &[u8]) -> Result<(), PluginError> {
         let linked = self.linked.as_mut().ok_or_else(before_link)?;
-        (linked.segmenter.state, linked.sums) =
+        (linked.segmenter.state, linked.earlier) =
             state::load(bytes, &linked.signature, &linked.segmenter.state, &linked.sums)?;
+        linked.sums = Sums::new(linked.analyser.plan(), &linked.layout);
         Ok(())
     }
 }
@@ -135,12 +140,15 @@ impl Linked {
         };
         let map: Vec<Regressor> = regressors
             .iter()
-            .map(|r| {
+            .enumerate()
+            .map(|(series, r)| {
                 let channel = channels.iter().position(|c| name_of(c) == r.attribute("channel"));
                 let coefficient = available.coefficients.iter().position(|c| c.name == r.attribute("coefficient"));
                 Ok(Regressor {
                     coefficient: position(r, "coefficient", coefficient)?,
                     channel: position(r, "channel", channel)?,
+                    series,
+                    factor: 1.0,
                 })
             })
             .collect::<Result<_, PluginError>>()?;
@@ -151,16 +159,17 @@ impl Linked {
             .collect::<Result<_, _>>()?;
         let layout = Layout {
             channels: channels.iter().map(|c| name_of(c).to_owned()).collect(),
+            series: regressors.iter().map(|r| r.name.clone()).collect(),
             regressors: map,
-            coefficients: available.coefficients.len(),
+            coefficients: available.coefficients.iter().map(|c| c.name.clone()).collect(),
         };
         let noise: Vec<(&str, Measured)> =
             layout.channels.iter().map(String::as_str).zip(measured.iter().copied()).collect();
         let model = NoiseModel::new(&stage.mission, &noise, 1.0 / rate_hz)?;
         let length = longest_length((stage.segment_s * rate_hz).round() as usize);
-        let analyser = Analyser::new(Plan::new(length, rate_hz), &layout, |f| model.variances(f));
-        let averaged = (0..layout.columns())
-            .map(|j| j >= layout.channels.len() && measured[layout.channel_of(j)] == Measured::Differenced)
+        let analyser = Analyser::new(Plan::new(length, rate_hz), &layout);
+        let averaged = std::iter::repeat_n(false, layout.channels.len())
+            .chain(layout.regressors.iter().map(|r| measured[r.channel] == Measured::Differenced))
             .collect();
         let names: Vec<String> = channels.iter().chain(&regressors).map(|c| c.name.clone()).collect();
         Ok(Self {
@@ -172,6 +181,7 @@ impl Linked {
             coefficients: available.coefficients.clone(),
             refinements: stage.refinements,
             sums: Sums::new(analyser.plan(), &layout),
+            earlier: Sums::new(analyser.plan(), &layout),
             segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged),
             analyser,
             layout,
@@ -185,13 +195,14 @@ impl Linked {
             report.notes.push(format!("{}: {UNKNOWN_NOISE}", self.layout.channels[*c]));
         }
         let unknowns: Vec<Unknown> = self.coefficients.iter().map(unknown).collect();
-        let solution = match self.shortened(&mut report) {
-            None if self.sums.segments == 0 => {
+        let sums = self.all_sums();
+        let solution = match self.shortened(&sums, &mut report) {
+            None if sums.total.segments == 0 => {
                 self.no_solution(&mut report);
                 return Ok(report);
             }
             None => estimate(
-                &self.sums,
+                &sums,
                 self.analyser.plan(),
                 &self.layout,
                 &self.model,
@@ -201,7 +212,8 @@ impl Linked {
             )?,
             Some((analyser, sums)) => {
                 let plan = analyser.plan();
-                report.counts.insert("epochs_in_segments".to_owned(), plan.hop() as u64 * (sums.segments + 1));
+                let covered = plan.hop() as u64 * (sums.total.segments + 1);
+                report.counts.insert("epochs_in_segments".to_owned(), covered);
                 estimate(&sums, plan, &self.layout, &self.model, &unknowns, &self.bounds, self.refinements)?
             }
         };
@@ -209,21 +221,28 @@ impl Linked {
         Ok(report)
     }
 
+    /// Sums of this run and of those whose state it took over.
+    fn all_sums(&self) -> Sums {
+        let mut sums = self.earlier.clone();
+        sums.add(&self.sums);
+        sums
+    }
+
     /// Sums over shorter segments when no run was as long as one.
-    fn shortened(&mut self, report: &mut Report) -> Option<(Analyser, Sums)> {
-        if self.sums.segments > 0 {
+    fn shortened(&mut self, sums: &Sums, report: &mut Report) -> Option<(Analyser, Sums)> {
+        if sums.total.segments > 0 {
             return None;
         }
         let (wanted, rate_hz) = (self.analyser.plan().length, self.analyser.plan().rate_hz);
-        let run = self.segmenter.longest_run(&self.sums);
+        let run = self.segmenter.longest_run(sums);
         let samples = run.first().map_or(0, Vec::len);
         let length = shorter_length(samples)?;
-        let mut analyser = Analyser::new(Plan::new(length, rate_hz), &self.layout, |f| self.model.variances(f));
+        let mut analyser = Analyser::new(Plan::new(length, rate_hz), &self.layout);
         let sums = cut(run, &self.layout, &mut analyser);
         report.notes.push(format!(
             "no stretch without a gap holds a segment of {wanted} samples; the longest, {samples} samples, was cut into {} segments \
              of {length}",
-            sums.segments
+            sums.total.segments
         ));
         Some((analyser, sums))
     }
@@ -371,6 +390,7 @@ impl Linked {
             ("dof", json!(quality.dof)),
             ("chi2_per_dof_refined_sigma", json!(quality.chi2_per_dof)),
             ("last_step_sigma", json!(quality.last_step_sigma)),
+            ("scatter_of_blocks", json!(solution.scatter)),
             ("channels", json!(quality.channels)),
         ];
         report.quality.extend(entries.into_iter().map(|(k, v)| (k.to_owned(), v)));
@@ -383,6 +403,8 @@ impl Linked {
         let mut equations = json!(solution.normal);
         equations["channels"] = json!(self.layout.channels);
         equations["theta"] = json!(solution.theta.as_slice());
+        // What this run adds, and not what an earlier one has stored already: so days add up.
+        equations["sums"] = json!(Stored::new(&self.layout, self.analyser.plan(), &self.sums.total));
         report.attachments.push(Attachment { suffix: "neq.json".into(), text: equations.to_string() });
     }
 }

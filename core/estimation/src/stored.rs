@@ -1,0 +1,170 @@
+//! Sums as they lie beside a product: what a day leaves behind, to be added to other days and solved again for any Σ.
+
+use serde::{Deserialize, Serialize};
+
+use crate::spectra::{Block, Layout, Plan, Spectra, Sums, triangle};
+
+/// Version of the layout of stored sums.
+pub const FORMAT: u32 = 1;
+
+/// Sums in a form for JSON, in which every float is exact.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Stored {
+    /// [`FORMAT`].
+    pub format: u32,
+    /// Channels, series, regressors and coefficients.
+    pub layout: Layout,
+    /// Samples of a segment.
+    pub length: usize,
+    /// Samples per second.
+    pub rate_hz: f64,
+    /// Segments added.
+    pub segments: u64,
+    /// Pairs of them that overlap.
+    pub overlaps: u64,
+    /// First and last frequency of each band, Hz.
+    pub bands_hz: Vec<[f64; 2]>,
+    /// Per band, the lower triangle of the columns' summed cross-spectra: channels, then series.
+    pub spectra: Vec<f64>,
+}
+
+/// Why stored sums cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum StoredError {
+    /// Another version.
+    #[error("stored sums have format {found}, this program reads {FORMAT}: run the day again")]
+    Format {
+        /// In the file.
+        found: u32,
+    },
+    /// Sizes that contradict each other, or numbers that are none.
+    #[error("stored sums contradict themselves ({0}): the file is damaged, run the day again")]
+    Damaged(&'static str),
+    /// Two days of different make.
+    #[error(
+        "the sums of two days differ in {0}, so they cannot be added: run the days again with one model, mission and pipeline"
+    )]
+    Unlike(&'static str),
+}
+
+impl Stored {
+    /// What is to be stored.
+    #[must_use]
+    pub fn new(layout: &Layout, plan: &Plan, spectra: &Spectra) -> Self {
+        Self {
+            format: FORMAT,
+            layout: layout.clone(),
+            length: plan.length,
+            rate_hz: plan.rate_hz,
+            segments: spectra.segments,
+            overlaps: spectra.overlaps,
+            bands_hz: plan.bands.iter().map(|b| [b.first, b.end - 1].map(|k| plan.bin_hz(k as f64))).collect(),
+            spectra: spectra.packed.clone(),
+        }
+    }
+
+    /// The days' sums as one, each day a block.
+    ///
+    /// # Errors
+    /// [`StoredError`] when a file is damaged or the days are not of one make.
+    pub fn stack(days: &[Self]) -> Result<(Layout, Plan, Sums), StoredError> {
+        let first = days.first().ok_or(StoredError::Damaged("no day at all"))?;
+        for day in days {
+            day.check()?;
+            let same = [
+                (day.layout == first.layout, "channels or effects"),
+                (day.length == first.length, "the length of segments"),
+                (day.rate_hz == first.rate_hz, "the sample rate"),
+            ];
+            if let Some((_, what)) = same.into_iter().find(|(same, _)| !same) {
+                return Err(StoredError::Unlike(what));
+            }
+        }
+        let plan = Plan::new(first.length, first.rate_hz);
+        let mut sums = Sums::new(&plan, &first.layout);
+        for (number, day) in (0..).zip(days) {
+            let spectra = Spectra { packed: day.spectra.clone(), segments: day.segments, overlaps: day.overlaps };
+            let block = Block { number, spectra: spectra.clone(), overlaps_before: false };
+            sums.add(&Sums { total: spectra, block_ns: sums.block_ns, blocks: vec![block] });
+        }
+        Ok((first.layout.clone(), plan, sums))
+    }
+
+    fn check(&self) -> Result<(), StoredError> {
+        if self.format != FORMAT {
+            return Err(StoredError::Format { found: self.format });
+        }
+        let Layout { channels, series, regressors, coefficients } = &self.layout;
+        let inside = |r: &crate::spectra::Regressor| {
+            r.channel < channels.len() && r.series < series.len() && r.coefficient < coefficients.len()
+        };
+        let damaged = |what| Err(StoredError::Damaged(what));
+        if !(16..=1 << 24).contains(&self.length) || !self.length.is_multiple_of(4) {
+            return damaged("length of a segment");
+        }
+        if !(self.rate_hz.is_finite() && self.rate_hz > 0.0) {
+            return damaged("sample rate");
+        }
+        if !regressors.iter().all(|r| inside(r) && r.factor.is_finite()) {
+            return damaged("regressors");
+        }
+        if self.spectra.len() != self.bands_hz.len() * triangle(self.layout.columns())
+            || self.bands_hz.len() != Plan::new(self.length, self.rate_hz).bands.len()
+        {
+            return damaged("number of spectra");
+        }
+        if !self.spectra.iter().all(|x| x.is_finite()) || self.overlaps > self.segments {
+            return damaged("spectra");
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::spectra::{Analyser, Regressor};
+
+    fn day(seed: u64) -> Stored {
+        let layout = Layout {
+            channels: vec!["c".into()],
+            series: vec!["s".into()],
+            regressors: vec![Regressor { coefficient: 0, channel: 0, series: 0, factor: -0.5 }],
+            coefficients: vec!["b".into()],
+        };
+        let mut analyser = Analyser::new(Plan::new(64, 10.0), &layout);
+        let mut sums = Sums::new(analyser.plan(), &layout);
+        let column =
+            |k: u64| -> Vec<f64> { (0..64).map(|t| (1e-9 * (t * t + 7 * k) as f64 * seed as f64).sin()).collect() };
+        analyser.add(0, &[&column(1), &column(2)], false, &mut sums);
+        Stored::new(&layout, analyser.plan(), &sums.total)
+    }
+
+    #[test]
+    fn json_and_back_changes_no_bit_and_days_add_up() {
+        let text = serde_json::to_string(&day(1)).expect("JSON");
+        let back: Stored = serde_json::from_str(&text).expect("our own");
+        assert_eq!(back, day(1));
+        let (_, _, sums) = Stored::stack(&[day(1), day(2)]).expect("two days");
+        assert_eq!((sums.total.segments, sums.blocks.len()), (2, 2));
+        let both = day(1).spectra.iter().zip(&day(2).spectra).map(|(a, b)| a + b).collect::<Vec<_>>();
+        assert_eq!(sums.total.packed, both);
+    }
+
+    #[test]
+    fn what_does_not_fit_is_refused_by_name() {
+        let change = |f: fn(&mut Stored)| {
+            let mut other = day(2);
+            f(&mut other);
+            Stored::stack(&[day(1), other]).map(|_| ()).expect_err("refused").to_string()
+        };
+        assert!(change(|d| d.format = 7).contains("format 7"));
+        assert!(change(|d| d.spectra.truncate(3)).contains("number of spectra"));
+        assert!(change(|d| d.spectra[0] = f64::NAN).contains("damaged"));
+        assert!(change(|d| d.length = 10).contains("length"));
+        assert!(change(|d| d.rate_hz = 5.0).contains("sample rate"));
+        assert!(change(|d| d.layout.regressors[0].series = 9).contains("regressors"));
+        assert!(change(|d| d.layout.coefficients[0] = "g".into()).contains("effects"));
+        assert!(Stored::stack(&[]).is_err());
+    }
+}
