@@ -14,7 +14,7 @@ use crate::qp::{Active, Kkt, Problem, QpError, Row};
 use crate::refine::{Chi2, SigmaError, Whitening};
 use crate::sigma::NoiseModel;
 use crate::spectra::{Layout, Plan, Sums};
-use crate::verdict::{self, Direction};
+use crate::verdict::{self, Direction, Pull, chi2_per_dof_at};
 
 /// A coefficient of the model.
 #[derive(Clone, Debug, PartialEq)]
@@ -80,6 +80,10 @@ pub struct Estimate {
     pub normal: NormalEquations,
     /// What the blocks of time say of σ, for each free coefficient; none with fewer than [`LEAST_BLOCKS`].
     pub scatter: Option<Scatter>,
+    /// Surveys and ranges against the data.
+    pub pulls: Vec<Pull>,
+    /// χ² of the surveys against the data, and its degrees of freedom.
+    pub survey_chi2: (f64, f64),
     /// How well the noise is understood.
     pub quality: Quality,
 }
@@ -115,6 +119,8 @@ pub struct Quality {
     pub chi2_per_dof_modelled_sigma: f64,
     /// Each channel alone, with Σ from the residuals.
     pub channels: Vec<ChannelQuality>,
+    /// χ²/dof of the coherence between channels that the model does not connect, and its degrees of freedom.
+    pub between_groups: (f64, f64),
     /// Largest change of a coefficient in the last refinement, in its σ.
     pub last_step_sigma: f64,
     /// Frequency and χ²/dof of the narrow band that fits the refined Σ least.
@@ -192,12 +198,17 @@ pub fn estimate(
     let last_step_sigma = covariance.as_ref().map_or(f64::NAN, |c| {
         free.iter().enumerate().map(|(k, i)| last_step[*i].abs() / c[(k, k)].sqrt()).fold(0.0, f64::max)
     });
+    let (pulls, survey_chi2) = reduced.pulls(&solved.active, chi2_per_dof.max(1.0));
     let (worst, worst_band_dof) = worst_band(&residual, &inverses, plan, &whitening, kept);
     let quality = Quality {
         chi2_per_dof,
         dof,
         chi2_per_dof_modelled_sigma: modelled.sum / modelled.expected,
         channels: channel_quality(&chi2, &residual, plan, layout, &whitening, kept),
+        between_groups: {
+            let (sum, dof) = whitening.between_groups(&residual);
+            (sum / dof.max(1.0), dof)
+        },
         last_step_sigma,
         worst_band: worst,
         worst_band_dof,
@@ -212,6 +223,8 @@ pub fn estimate(
         kkt: solved.kkt,
         normal: NormalEquations::new(names, &equations, spectra, plan),
         scatter,
+        pulls,
+        survey_chi2,
         quality,
     })
 }
@@ -362,6 +375,68 @@ impl<'a> Reduced<'a> {
         self.inverse(&information)
     }
 
+    /// What the data say of each row without it: surveys against data and ranges, ranges against data and surveys. `noise` is the
+    /// χ²/dof by which covariances grow.
+    fn pulls(&self, active: &[Active], noise: f64) -> (Vec<Pull>, (f64, f64)) {
+        let is_survey = |i: usize| self.knowledge[i] == Knowledge::Survey;
+        let with = |survey: bool| {
+            // Nothing but a finite size in directions without data.
+            let prior = DMatrix::from_diagonal(&self.size.map(|s| s.powi(-2)));
+            let use_row = |i: usize| survey && is_survey(i);
+            let matrix = self.with_rows(|i, r| if use_row(i) { uniform_sigma(r) } else { f64::INFINITY }) + prior;
+            let mut right = self.right.clone() + self.middle().component_div(&self.size.map(|s| s * s));
+            for (_, row) in self.rows.iter().enumerate().filter(|(i, r)| use_row(*i) && r.half_width().is_finite()) {
+                let least = 1e-9 * DVector::from_column_slice(&row.terms).component_mul(&self.size).norm();
+                let weight = uniform_sigma(row).max(least).powi(-2);
+                right += DVector::from_column_slice(&row.terms) * (weight * 0.5 * (row.lower + row.upper));
+            }
+            self.inverse(&matrix).map(|c| (&c * right, c * noise))
+        };
+        let (Some((free, c_free)), Some((held, c_held))) = (with(false), with(true)) else {
+            return (Vec::new(), (0.0, 0.0));
+        };
+        let mut pulls = Vec::new();
+        let mut surveys: Vec<(DVector<f64>, f64, f64)> = Vec::new();
+        for (i, row) in self.rows.iter().enumerate() {
+            let a = DVector::from_column_slice(&row.terms);
+            let multiplier = active.iter().filter(|m| m.row == i).map(|m| m.multiplier).sum();
+            let (distance, sigma) = if is_survey(i) {
+                let distance = a.dot(&free) - 0.5 * (row.lower + row.upper);
+                surveys.push((a.clone(), distance, uniform_sigma(row)));
+                (distance, (a.dot(&(&c_free * &a)) + uniform_sigma(row).powi(2)).sqrt())
+            } else {
+                let value = a.dot(&held);
+                let beyond = (value - row.upper).max(0.0) - (row.lower - value).max(0.0);
+                (beyond, a.dot(&(&c_held * &a)).sqrt())
+            };
+            let unit = self.unit(row);
+            pulls.push(Pull { constraint: row.name.clone(), unit, distance, sigma, multiplier, survey: is_survey(i) });
+        }
+        let n = surveys.len();
+        let spread = DMatrix::from_fn(n, n, |i, j| {
+            let own = if i == j { surveys[i].2.powi(2) } else { 0.0 };
+            surveys[i].0.dot(&(&c_free * &surveys[j].0)) + own
+        });
+        let distance = DVector::from_fn(n, |i, _| surveys[i].1);
+        let chi2 = Cholesky::new(spread).map_or((0.0, 0.0), |c| (distance.dot(&c.solve(&distance)), n as f64));
+        (pulls, chi2)
+    }
+
+    /// Middles of the coefficients' ranges, or where they start.
+    fn middle(&self) -> DVector<f64> {
+        DVector::from_fn(self.free.len(), |k, _| {
+            let u = &self.unknowns[self.free[k]];
+            let middle = 0.5 * (u.lower + u.upper);
+            if middle.is_finite() { middle } else { u.initial }
+        })
+    }
+
+    /// Unit of a row: that of its first coefficient.
+    fn unit(&self, row: &Row) -> String {
+        let first = row.terms.iter().position(|t| *t != 0.0);
+        first.map_or_else(String::new, |k| self.unknowns[self.free[k]].unit.clone())
+    }
+
     fn weak(&self, unknowns: &[Unknown], unseen: &[usize]) -> Vec<Direction> {
         let information = self.with_rows(|i, row| match self.knowledge[i] {
             Knowledge::Survey => uniform_sigma(row),
@@ -402,14 +477,8 @@ fn scatter(
     }
     let dof = blocks as f64 - 1.0;
     let ratio = measured.component_div(&expected).map(|r| (r * blocks as f64 / dof).sqrt());
-    let upper = chi2_upper(dof, SCATTER_QUANTILE).sqrt();
+    let upper = chi2_per_dof_at(dof, SCATTER_QUANTILE).sqrt();
     Some(Scatter { blocks, ratio: ratio.iter().copied().collect(), upper })
-}
-
-/// Upper bound of χ²/dof at a normal quantile, by Wilson and Hilferty.
-fn chi2_upper(dof: f64, quantile: f64) -> f64 {
-    let v = 2.0 / (9.0 * dof);
-    (1.0 - v + quantile * v.sqrt()).powi(3)
 }
 
 /// σ of a uniform density over a row's interval; infinite where one side is open.

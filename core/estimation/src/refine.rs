@@ -186,6 +186,25 @@ impl Whitening {
         self.expected[band] * self.group.len() as f64
     }
 
+    /// Whether channels that the model does not connect are as unrelated as it says: for each pair of groups the sum of `2n ρ²`
+    /// over pairs of channels and refined bands, ρ the real coherence of the residuals, χ² of as many degrees of freedom when it
+    /// is so.
+    pub(crate) fn between_groups(&self, residuals: &[DMatrix<f64>]) -> (f64, f64) {
+        let (mut sum, mut dof) = (0.0, 0.0);
+        for (range, n) in self.coarse.iter().zip(&self.observations) {
+            let w = self.whitened(residuals, range);
+            for i in 0..self.group.len() {
+                for j in (0..i).filter(|j| self.group[i] != self.group[*j]) {
+                    let rho2 = w[(i, j)].powi(2) / (w[(i, i)] * w[(j, j)]);
+                    // Of n complex observations the square of the real coherence has the mean 1/(2n+1) … 1/(2n).
+                    sum += 2.0 * n * rho2;
+                    dof += 1.0;
+                }
+            }
+        }
+        (sum, dof)
+    }
+
     /// Complex observations in a range of bands.
     pub(crate) fn observations(&self, range: std::ops::Range<usize>) -> f64 {
         self.observations_per_band[range].iter().sum()

@@ -13,6 +13,7 @@ use nalgebra::{DMatrix, Matrix3, Vector3};
 use dragfree_physics::frames::skew;
 use dragfree_physics::mission::{Mission, MissionError};
 use dragfree_physics::noise::NoiseShape;
+use dragfree_physics::thrust_noise::ThrustNoise;
 
 /// How a channel's samples come about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -65,10 +66,11 @@ struct Process {
 
 /// What remains unknown of the angular acceleration once everything measured has been used, and how it enters the channels.
 struct AngularError {
-    /// `B`, rows of channels, columns of α in SRF: `[b×] T_S^O` in the rows of a test mass.
+    /// `B`, rows of channels, columns of α in SRF: `[b×] T_S^O` in the rows of a test mass, and `−T_S^O C J/m` where the torque
+    /// tells of a force.
     lever: DMatrix<f64>,
-    /// `J⁻¹ J⁻ᵀ`.
-    inverse_inertia_squared: Matrix3<f64>,
+    /// `J⁻¹ S_M J⁻ᵀ` over the PSD of the torque's shape.
+    disturbance: Matrix3<f64>,
     torque: NoiseShape,
     attitude: Option<NoiseShape>,
 }
@@ -120,7 +122,14 @@ impl NoiseModel {
             }
             lever.row_mut(i).copy_from(&(skew(&tm.offset_nominal_orf_m()) * dcm).row(axis));
         }
-        for shape in [noise.thruster_force.as_ref(), noise.solar_pressure.as_ref()].into_iter().flatten() {
+        // The known acceleration holds what the torque tells of the thrusters' force; the rest is noise.
+        let thrusters = ThrustNoise::of(mission);
+        if let Some(thrusters) = &thrusters {
+            let left = &thrust * dynamic(&thrusters.force_given_torque) * thrust.transpose();
+            model.add(thrusters.force_shape.clone(), Response::Held, left);
+            lever += &thrust * dynamic(&(thrusters.force_per_torque * mission.spacecraft.inertia()));
+        }
+        if let Some(shape) = &noise.solar_pressure {
             model.add(shape.shape(), Response::Held, &thrust * thrust.transpose());
         }
 
@@ -165,20 +174,21 @@ impl NoiseModel {
         // The attitude channels measure torque noise itself. The error of α̂ = E[α | everything measured] is orthogonal to
         // everything measured, these channels included: no cross term.
         let inverse_inertia = mission.spacecraft.inertia().try_inverse().unwrap_or_else(Matrix3::zeros);
-        if let Some(torque) = &noise.thruster_torque {
+        if let Some(thrusters) = thrusters.filter(|t| t.torque_shape.psd(0.1 / dt_s) > 0.0) {
             let mut enters = DMatrix::zeros(n, 3);
             for (i, place) in places.iter().enumerate() {
                 if let (Place::Spacecraft { axis }, Measured::Differenced) = (*place, measured(i)) {
                     enters.row_mut(i).copy_from(&inverse_inertia.row(axis));
                 }
             }
-            model.add(torque.shape(), Response::Held, &enters * enters.transpose());
+            let seen = &enters * dynamic(&thrusters.torque) * enters.transpose();
+            model.add(thrusters.torque_shape.clone(), Response::Held, seen);
             let from_displacements = (0..n).any(|i| measured(i) == Measured::Differenced);
             if from_displacements && lever.iter().any(|x| *x != 0.0) {
                 model.angular_error = Some(AngularError {
                     lever: lever.clone(),
-                    inverse_inertia_squared: inverse_inertia * inverse_inertia.transpose(),
-                    torque: torque.shape(),
+                    disturbance: inverse_inertia * thrusters.torque * inverse_inertia.transpose(),
+                    torque: thrusters.torque_shape,
                     attitude: noise.dws_long_arm.as_ref().map(|s| s.shape()),
                 });
             }
@@ -241,7 +251,7 @@ impl NoiseModel {
 impl AngularError {
     /// `R_α = S_w − S_w (S_w + S_n)⁻¹ S_w`: torque noise S_w as the channels see it, given an attitude readout of noise S_n.
     fn remaining(&self, held: f64, differenced: f64, frequency_hz: f64) -> Matrix3<f64> {
-        let sw = self.inverse_inertia_squared * (held * self.torque.psd(frequency_hz));
+        let sw = self.disturbance * (held * self.torque.psd(frequency_hz));
         let Some(attitude) = &self.attitude else { return sw };
         let sn = Matrix3::from_diagonal(&Vector3::repeat(differenced * attitude.psd(frequency_hz)));
         // S_w (S_w+S_n)⁻¹ S_n, the same without the difference of near-equal matrices where the readout is good.
@@ -250,6 +260,10 @@ impl AngularError {
             0.5 * (r + r.transpose())
         })
     }
+}
+
+fn dynamic(m: &Matrix3<f64>) -> DMatrix<f64> {
+    DMatrix::from_column_slice(3, 3, m.as_slice())
 }
 
 #[cfg(test)]

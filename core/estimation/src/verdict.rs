@@ -1,6 +1,7 @@
 //! What the solution is worth: directions that the data do not see, and whether two methods agree.
 
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
+use serde::Serialize;
 
 /// A combination of coefficients that data and survey leave open, in words.
 #[derive(Clone, Debug, PartialEq)]
@@ -110,6 +111,31 @@ pub fn differences(qp: &[Value], other: &[Value]) -> Vec<Difference> {
         .collect()
 }
 
+/// A survey or a physical range against the data.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Pull {
+    /// Name of the row.
+    pub constraint: String,
+    /// Unit of the row.
+    pub unit: String,
+    /// By how much the data alone lie beyond the interval, or from its middle for a survey; signed, the row's unit.
+    pub distance: f64,
+    /// Its standard deviation, the survey's tolerance included.
+    pub sigma: f64,
+    /// Half a χ² per unit by which the bound is moved, zero where the row does not hold the solution.
+    pub multiplier: f64,
+    /// Whether it is a survey.
+    pub survey: bool,
+}
+
+impl Pull {
+    /// Size in σ.
+    #[must_use]
+    pub fn sigmas(&self) -> f64 {
+        self.distance.abs() / self.sigma
+    }
+}
+
 /// Two-sided false-alarm rate of [`chi2_bounds`]: with nine channels and their sum, below 1e-4 in all.
 pub const CHI2_FALSE_ALARM: f64 = 1e-5;
 
@@ -119,12 +145,24 @@ const CHI2_QUANTILE: f64 = 4.417;
 /// Σ is constant in its bands but for the model's shape, so χ²/dof is only ever 1 to about this.
 const CHI2_TOLERANCE: f64 = 0.01;
 
-/// Bounds of χ²/dof at [`CHI2_FALSE_ALARM`], by Wilson and Hilferty, widened by what a Σ in bands cannot follow.
+/// Bounds of χ²/dof at [`CHI2_FALSE_ALARM`], widened by what a Σ in bands cannot follow.
 #[must_use]
 pub fn chi2_bounds(dof: f64) -> (f64, f64) {
+    (chi2_per_dof_at(dof, -CHI2_QUANTILE) - CHI2_TOLERANCE, chi2_per_dof_at(dof, CHI2_QUANTILE) + CHI2_TOLERANCE)
+}
+
+/// The χ²/dof that corresponds to a normal quantile, by Wilson and Hilferty.
+#[must_use]
+pub fn chi2_per_dof_at(dof: f64, quantile: f64) -> f64 {
     let v = 2.0 / (9.0 * dof);
-    let bound = |z: f64| (1.0 - v + z * v.sqrt()).max(0.0).powi(3);
-    (bound(-CHI2_QUANTILE) - CHI2_TOLERANCE, bound(CHI2_QUANTILE) + CHI2_TOLERANCE)
+    (1.0 - v + quantile * v.sqrt()).max(0.0).powi(3)
+}
+
+/// The normal quantile that corresponds to a χ²/dof, the inverse of [`chi2_per_dof_at`].
+#[must_use]
+pub fn chi2_quantile(chi2_per_dof: f64, dof: f64) -> f64 {
+    let v = 2.0 / (9.0 * dof);
+    (chi2_per_dof.cbrt() - 1.0 + v) / v.sqrt()
 }
 
 #[cfg(test)]

@@ -12,7 +12,9 @@ use dragfree_estimation::sigma::{Measured, NoiseModel};
 use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, Sums};
 use dragfree_estimation::state;
 use dragfree_estimation::stored::Stored;
-use dragfree_estimation::verdict::{AGREEMENT_SIGMAS, Difference, Value, chi2_bounds, differences};
+use dragfree_estimation::verdict::{
+    AGREEMENT_SIGMAS, Difference, Pull, Value, chi2_bounds, chi2_quantile, differences,
+};
 
 /// Normal equations over segments, a constrained solution, and a verdict.
 pub struct QpCheck {
@@ -289,7 +291,8 @@ impl Linked {
             .collect();
         let compared = differences(&qp, &other);
         let disagreeing: Vec<&Difference> = compared.iter().filter(|d| d.sigmas() > AGREEMENT_SIGMAS).collect();
-        let insane = self.insane(solution);
+        let mut insane = self.insane(solution);
+        insane.extend(contradictions(solution));
 
         // With Σ from the residuals the ratio is 1 by construction; only the mission's Σ can be contradicted.
         report.chi2_per_dof = Some(quality.chi2_per_dof_modelled_sigma);
@@ -321,6 +324,9 @@ impl Linked {
             report.notes.push(format!(
                 "residuals near {frequency_hz:.3e} Hz have {ratio:.1} times the power of their neighbourhood: a line that nobody models?"
             ));
+        }
+        for p in solution.pulls.iter().filter(|p| p.sigmas() > AGREEMENT_SIGMAS) {
+            report.notes.push(pull_sentence(p));
         }
         self.put_coefficients(solution, &disagreeing, report);
         self.put_quality(solution, &compared, report);
@@ -391,6 +397,9 @@ impl Linked {
             ("chi2_per_dof_refined_sigma", json!(quality.chi2_per_dof)),
             ("last_step_sigma", json!(quality.last_step_sigma)),
             ("scatter_of_blocks", json!(solution.scatter)),
+            ("constraints", json!(solution.pulls)),
+            ("survey_chi2", json!(solution.survey_chi2)),
+            ("coherence_between_groups", json!(quality.between_groups)),
             ("channels", json!(quality.channels)),
         ];
         report.quality.extend(entries.into_iter().map(|(k, v)| (k.to_owned(), v)));
@@ -407,6 +416,58 @@ impl Linked {
         equations["sums"] = json!(Stored::new(&self.layout, self.analyser.plan(), &self.sums.total));
         report.attachments.push(Attachment { suffix: "neq.json".into(), text: equations.to_string() });
     }
+}
+
+/// Normal quantile of a false alarm in a thousand, for what data and survey say of each other.
+const SURVEY_QUANTILE: f64 = 3.090;
+
+/// Normal quantile of a false alarm in 1e4, for a physical range that the data leave.
+const RANGE_QUANTILE: f64 = 3.719;
+
+/// Normal quantile of a false alarm in 1e5, for coherence where there should be none; and the least that matters.
+const COHERENCE: (f64, f64) = (4.265, 1.02);
+
+/// Sentences about a survey, a range or independent noises that the data contradict.
+fn contradictions(solution: &Solution) -> Vec<String> {
+    let mut out = Vec::new();
+    let (chi2, dof) = solution.survey_chi2;
+    if dof > 0.0 && chi2_quantile(chi2 / dof, dof) > SURVEY_QUANTILE {
+        out.push(format!(
+            "the survey contradicts the data: χ² {chi2:.1} on {dof} rows. Either the survey in the mission file is wrong, or the \
+             data are read through a wrong model (angular acceleration, gains, frames); see the rows"
+        ));
+    }
+    for p in solution.pulls.iter().filter(|p| !p.survey && p.sigmas() > RANGE_QUANTILE) {
+        out.push(format!(
+            "{} contradicts the data by {:.1}σ: an effect is missing from the model, or the range is wrong",
+            p.constraint,
+            p.sigmas()
+        ));
+    }
+    let (ratio, dof) = solution.quality.between_groups;
+    if dof > 0.0 && ratio > COHERENCE.1 && chi2_quantile(ratio, dof) > COHERENCE.0 {
+        out.push(format!(
+            "residuals of the attitude and of the test masses are coherent (χ²/dof {ratio:.3} on {dof}): noise that pushes and \
+             turns at once, such as thrusters one by one, or an angular acceleration that is not E[α | data]; the offset takes \
+             such noise for its own. State the layout in [[thrusters.unit]], or look at the reconstruction"
+        ));
+    }
+    out
+}
+
+/// A row of the survey or a range, and by how much the data are off it.
+fn pull_sentence(p: &Pull) -> String {
+    let what = if p.survey { "from the survey" } else { "beyond the range" };
+    format!(
+        "{}: the data alone put it {:.3e} ± {:.1e} {} {what}, {:.1}σ; multiplier {:.3e} per {}",
+        p.constraint,
+        p.distance,
+        p.sigma,
+        p.unit,
+        p.sigmas(),
+        p.multiplier,
+        p.unit
+    )
 }
 
 fn name_of(channel: &Column) -> &str {
