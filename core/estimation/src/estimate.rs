@@ -1,8 +1,9 @@
 //! From the sums to coefficients: normal equations, constrained solution, Σ from the residuals, honest covariance.
 //!
-//! **Covariance.** `C = (N Σg/Σg² + Σ_rows a aᵀ/σ_row²)⁻¹`, times χ²/dof where that is above one. A constraint says that a
-//! quantity lies in an interval of half width h and nothing else: a uniform density, whose Gaussian equivalent has σ = h/√3.
-//! Surveys and ranges are treated alike. Where a row is *active*, the value stands at its bound and the truth anywhere in the
+//! **Covariance.** `C = (N + Σ_rows a aᵀ/σ_row²)⁻¹`, times χ²/dof where that is above one. A constraint says that a
+//! quantity lies in an interval of half width h and nothing else: a uniform density, whose Gaussian equivalent has σ = h/√3. A
+//! survey holds the value near its middle. A range does not: it cuts off, the value stands anywhere in it where the data do not
+//! see, and the rms distance of two points of an interval is √2 h/√3; σ = h. Where a row is *active*, the value stands at its bound and the truth anywhere in the
 //! interval: the mean square about that bound is (2h/√3)². Projecting active rows out would claim that a quantity is known
 //! exactly because the data wanted it outside its range.
 
@@ -159,35 +160,33 @@ pub fn estimate(
 ) -> Result<Estimate, EstimateError> {
     let spectra = &sums.total;
     let whitening = Whitening::new(model, plan, layout, spectra)?;
-    let (sum_g, sum_g2) = spectra.weights(plan);
-    let kept = sum_g / sum_g2;
+    let kept = spectra.kept();
     let mut inverses = whitening.model_inverses();
-    let mut equations = accumulate(spectra, layout, &inverses);
+    let mut equations = accumulate(spectra, layout, &inverses, &kept);
     let seen = |i: usize| equations.normal[(i, i)] > 0.0;
     let free: Vec<usize> = (0..unknowns.len()).filter(|i| unknowns[*i].estimate && seen(*i)).collect();
     let unseen: Vec<usize> = (0..unknowns.len()).filter(|i| unknowns[*i].estimate && !seen(*i)).collect();
 
-    let mut solved = Reduced::new(&equations, kept, unknowns, bounds, &free).solve()?;
+    let mut solved = Reduced::new(&equations, unknowns, bounds, &free).solve()?;
     let mut residual = residuals(spectra, layout, plan.bands.len(), &solved.theta);
     let modelled = whitening.chi2(&residual, &inverses, false);
     let mut last_step = DVector::zeros(unknowns.len());
     for _ in 0..refinements {
         inverses = whitening.refined_inverses(&residual);
-        equations = accumulate(spectra, layout, &inverses);
-        let next = Reduced::new(&equations, kept, unknowns, bounds, &free).solve()?;
+        equations = accumulate(spectra, layout, &inverses, &kept);
+        let next = Reduced::new(&equations, unknowns, bounds, &free).solve()?;
         last_step = &next.theta - &solved.theta;
         solved = next;
         residual = residuals(spectra, layout, plan.bands.len(), &solved.theta);
     }
     let chi2 = whitening.chi2(&residual, &inverses, refinements > 0);
 
-    let reduced = Reduced::new(&equations, kept, unknowns, bounds, &free);
+    let reduced = Reduced::new(&equations, unknowns, bounds, &free);
     let weak = reduced.weak(unknowns, &unseen);
-    let dof = (chi2.expected * kept - free.len() as f64).max(1.0);
-    let chi2_per_dof = chi2.sum * kept / dof;
+    let dof = (chi2.expected - free.len() as f64).max(1.0);
+    let chi2_per_dof = chi2.sum / dof;
     let covariance = reduced.covariance(&solved.active);
-    let scatter =
-        covariance.as_ref().and_then(|c| scatter(sums, plan, layout, &inverses, &solved.theta, (c, kept), &free));
+    let scatter = covariance.as_ref().and_then(|c| scatter(sums, layout, &inverses, &solved.theta, c, &free));
     let covariance = covariance.map(|c| {
         let by_blocks =
             |k: usize| scatter.as_ref().map_or(1.0, |s| if s.ratio[k] > s.upper { s.ratio[k] } else { 1.0 });
@@ -199,12 +198,12 @@ pub fn estimate(
         free.iter().enumerate().map(|(k, i)| last_step[*i].abs() / c[(k, k)].sqrt()).fold(0.0, f64::max)
     });
     let (pulls, survey_chi2) = reduced.pulls(&solved.active, chi2_per_dof.max(1.0));
-    let (worst, worst_band_dof) = worst_band(&residual, &inverses, plan, &whitening, kept);
+    let (worst, worst_band_dof) = worst_band(&residual, &inverses, plan, &whitening);
     let quality = Quality {
         chi2_per_dof,
         dof,
         chi2_per_dof_modelled_sigma: modelled.sum / modelled.expected,
-        channels: channel_quality(&chi2, &residual, plan, layout, &whitening, kept),
+        channels: channel_quality(&chi2, &residual, plan, layout, &whitening),
         between_groups: {
             let (sum, dof) = whitening.between_groups(&residual);
             (sum / dof.max(1.0), dof)
@@ -221,7 +220,7 @@ pub fn estimate(
         weak,
         active: solved.active,
         kkt: solved.kkt,
-        normal: NormalEquations::new(names, &equations, spectra, plan),
+        normal: NormalEquations::new(names, &equations, spectra.segments),
         scatter,
         pulls,
         survey_chi2,
@@ -233,7 +232,7 @@ pub fn estimate(
 struct Reduced<'a> {
     free: &'a [usize],
     unknowns: &'a [Unknown],
-    /// `N Σg/Σg²`, whose inverse is a covariance.
+    /// `N`, whose inverse is a covariance.
     information: DMatrix<f64>,
     right: DVector<f64>,
     rows: Vec<Row>,
@@ -266,17 +265,16 @@ const SIZE_WITHOUT_RANGE: f64 = 1e6;
 impl<'a> Reduced<'a> {
     fn new(
         Equations { normal, right, .. }: &Equations,
-        kept: f64,
         unknowns: &'a [Unknown],
         bounds: &[Bound],
         free: &'a [usize],
     ) -> Self {
         let n = free.len();
         let fixed: Vec<usize> = (0..unknowns.len()).filter(|i| !free.contains(i)).collect();
-        let information = DMatrix::from_fn(n, n, |i, j| kept * normal[(free[i], free[j])]);
+        let information = DMatrix::from_fn(n, n, |i, j| normal[(free[i], free[j])]);
         let right = DVector::from_fn(n, |i, _| {
             let known: f64 = fixed.iter().map(|f| normal[(free[i], *f)] * unknowns[*f].initial).sum();
-            kept * (right[free[i]] - known)
+            right[free[i]] - known
         });
         let (mut rows, mut knowledge) = (Vec::new(), Vec::new());
         for (k, i) in free.iter().enumerate() {
@@ -369,7 +367,9 @@ impl<'a> Reduced<'a> {
             let at_a_bound = active.iter().any(|a| a.row == i);
             match self.knowledge[i] {
                 Knowledge::Repeated => f64::INFINITY,
-                _ => uniform_sigma(row) * if at_a_bound { 2.0 } else { 1.0 },
+                _ if at_a_bound => 2.0 * uniform_sigma(row),
+                Knowledge::Survey => uniform_sigma(row),
+                Knowledge::Range => row.half_width(),
             }
         });
         self.inverse(&information)
@@ -450,30 +450,34 @@ impl<'a> Reduced<'a> {
     }
 }
 
-/// Pulls of the blocks on the free coefficients, `kept C (c_b − N_b θ)`, squared and summed, over their expectation
-/// `kept² C N_b C Σg²/Σg` when Σ is right and the same at all times; B blocks share one θ, which takes a part 1/B.
+/// Pulls of the blocks on the free coefficients, `C (c_b − N_b θ)`, squared and summed, over their expectation when Σ is right
+/// and the same at all times; B blocks share one θ, which takes a part 1/B.
 fn scatter(
     sums: &Sums,
-    plan: &Plan,
     layout: &Layout,
     inverses: &[DMatrix<f64>],
     theta: &DVector<f64>,
-    (covariance, kept): (&DMatrix<f64>, f64),
+    covariance: &DMatrix<f64>,
     free: &[usize],
 ) -> Option<Scatter> {
     let blocks = sums.blocks.len();
     if blocks < LEAST_BLOCKS || free.is_empty() {
         return None;
     }
+    let kept = sums.total.kept();
     let (mut measured, mut expected) = (DVector::zeros(free.len()), DVector::zeros(free.len()));
     for block in &sums.blocks {
-        let equations = accumulate(&block.spectra, layout, inverses);
+        let equations = accumulate(&block.spectra, layout, inverses, &kept);
         let pull = &equations.right - &equations.normal * theta;
-        let pull = covariance * DVector::from_fn(free.len(), |k, _| kept * pull[free[k]]);
-        let normal = DMatrix::from_fn(free.len(), free.len(), |i, j| equations.normal[(free[i], free[j])]);
-        let (g, g2) = block.spectra.weights(plan);
+        let pull = covariance * DVector::from_fn(free.len(), |k, _| pull[free[k]]);
+        // `kept² Σg²/Σg` with the block's own weights: what the pull's variance is when the block's segments are taken as they lie.
+        let own = block.spectra.kept();
+        let weights: Vec<f64> =
+            kept.iter().zip(&own).map(|(k, own)| if *own > 0.0 { k * k / own } else { 0.0 }).collect();
+        let variance = accumulate(&block.spectra, layout, inverses, &weights).normal;
+        let variance = DMatrix::from_fn(free.len(), free.len(), |i, j| variance[(free[i], free[j])]);
         measured += pull.component_mul(&pull);
-        expected += (covariance * normal * covariance).diagonal() * (kept * kept * g2 / g);
+        expected += (covariance * variance * covariance).diagonal();
     }
     let dof = blocks as f64 - 1.0;
     let ratio = measured.component_div(&expected).map(|r| (r * blocks as f64 / dof).sqrt());
@@ -492,7 +496,6 @@ fn channel_quality(
     plan: &Plan,
     layout: &Layout,
     whitening: &Whitening,
-    kept: f64,
 ) -> Vec<ChannelQuality> {
     let overall = whitening.power_ratio(residual, 0..plan.bands.len());
     let mut decades: Vec<(i32, std::ops::Range<usize>)> = Vec::new();
@@ -522,7 +525,7 @@ fn channel_quality(
             ChannelQuality {
                 channel: name.clone(),
                 chi2_per_dof: sum / expected,
-                dof: expected * kept,
+                dof: expected,
                 measured_over_modelled: overall[c].sqrt(),
                 by_decade: by_decade
                     .iter()
@@ -540,14 +543,13 @@ fn worst_band(
     inverses: &[DMatrix<f64>],
     plan: &Plan,
     whitening: &Whitening,
-    kept: f64,
 ) -> ((f64, f64), f64) {
     let mut worst = ((0.0, 0.0), 1.0);
     for (b, band) in plan.bands.iter().enumerate() {
-        let expected = whitening.expected_chi2(b);
+        let (expected, dof) = whitening.expected_chi2(b);
         let ratio = residual[b].dot(&inverses[b]) / expected;
         if ratio > worst.0.1 {
-            worst = ((plan.frequency_hz(*band), ratio), expected * kept);
+            worst = ((plan.frequency_hz(*band), ratio), dof);
         }
     }
     worst

@@ -3,23 +3,19 @@
 use nalgebra::{DMatrix, DVector};
 use serde::Serialize;
 
-use crate::spectra::{Layout, Plan, Spectra, triangle};
+use crate::spectra::{Layout, Spectra, triangle};
 
 /// What any model's solution needs of the data. They add up over segments and days of the same Σ.
 #[derive(Clone, Debug, Serialize)]
 pub struct NormalEquations {
     /// Coefficients, in the order of rows and columns.
     pub names: Vec<String>,
-    /// `N`, rows; the information if every sample had weight one, times its weight `g`.
+    /// `N`, rows: the information, so that the covariance of `N⁻¹c` is `N⁻¹`.
     pub normal: Vec<Vec<f64>>,
     /// `c`.
     pub right: Vec<f64>,
     /// `Σ zᴴ Σ⁻¹ z`.
     pub zz: f64,
-    /// `Σ_t g`, `g` the summed squared windows.
-    pub sum_g: f64,
-    /// `Σ_t g²`: the covariance of `N⁻¹c` is `N⁻¹ Σg²/Σg`.
-    pub sum_g2: f64,
     /// Segments.
     pub segments: u64,
 }
@@ -42,14 +38,15 @@ pub(crate) struct Equations {
     pub(crate) zz: f64,
 }
 
-/// The equations of some segments, with one `Σ⁻¹` per band.
-pub(crate) fn accumulate(spectra: &Spectra, layout: &Layout, inverses: &[DMatrix<f64>]) -> Equations {
+/// The equations of some segments, with one `Σ⁻¹` and one weight per band.
+pub(crate) fn accumulate(spectra: &Spectra, layout: &Layout, inverses: &[DMatrix<f64>], weights: &[f64]) -> Equations {
     let (channels, columns, coefficients) = (layout.channels.len(), layout.columns(), layout.coefficients.len());
     let mut normal = DMatrix::zeros(coefficients, coefficients);
     let mut right = DVector::zeros(coefficients);
     let mut zz = 0.0;
-    for (b, inverse) in inverses.iter().enumerate() {
+    for (b, (inverse, weight)) in inverses.iter().zip(weights).enumerate() {
         let g = Packed(spectra.band(b, columns));
+        let inverse = inverse * *weight;
         for i in 0..channels {
             for j in 0..channels {
                 zz += inverse[(i, j)] * g.at(i, j);
@@ -91,21 +88,13 @@ pub(crate) fn residuals(spectra: &Spectra, layout: &Layout, bands: usize, theta:
 }
 
 impl NormalEquations {
-    pub(crate) fn new(
-        names: Vec<String>,
-        Equations { normal, right, zz }: &Equations,
-        spectra: &Spectra,
-        plan: &Plan,
-    ) -> Self {
-        let (sum_g, sum_g2) = spectra.weights(plan);
+    pub(crate) fn new(names: Vec<String>, Equations { normal, right, zz }: &Equations, segments: u64) -> Self {
         Self {
             names,
             normal: normal.row_iter().map(|r| r.iter().copied().collect()).collect(),
             right: right.iter().copied().collect(),
             zz: *zz,
-            sum_g,
-            sum_g2,
-            segments: spectra.segments,
+            segments,
         }
     }
 }

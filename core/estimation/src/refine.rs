@@ -15,6 +15,7 @@
 //!   masses', their measured coherence would *be* the offset's signal, because α̂ is made of them, and Σ would eat it.
 
 use nalgebra::{Cholesky, DMatrix, DVector};
+use std::ops::Range;
 
 use crate::sigma::NoiseModel;
 use crate::spectra::{Layout, Plan, Spectra};
@@ -39,9 +40,11 @@ pub(crate) struct Whitening {
     /// Channels in the group of each channel.
     group_size: Vec<f64>,
     /// Ranges of bands of the sums.
-    coarse: Vec<std::ops::Range<usize>>,
-    /// Expected diagonal of the residuals' sums, per band.
+    coarse: Vec<Range<usize>>,
+    /// Expected diagonal of the residuals' sums over Σ, per band.
     expected: Vec<f64>,
+    /// What makes information of the sums, per band.
+    kept: Vec<f64>,
     /// Complex observations, per coarse band.
     observations: Vec<f64>,
     /// Complex observations, per band.
@@ -67,31 +70,23 @@ impl Whitening {
         let n = layout.channels.len();
         let mut factors = Vec::with_capacity(plan.bands.len());
         let mut variances = Vec::with_capacity(plan.bands.len());
-        let mut connected = DMatrix::from_element(n, n, false);
         for band in &plan.bands {
             let bins = (band.first..band.end).map(|k| model.psd(plan.bin_hz(k as f64)));
             let sigma = bins.fold(DMatrix::zeros(n, n), |sum, s| sum + s) / band.bins() as f64;
-            for (c, x) in connected.iter_mut().zip(&sigma) {
-                *c |= *x != 0.0;
-            }
             variances.push(sigma.diagonal());
             let frequency_hz = plan.frequency_hz(*band);
             factors.push(Cholesky::new(sigma).ok_or(SigmaError::Singular { frequency_hz })?.unpack());
         }
-        let group = groups(&connected);
+        let group = model.groups();
         let group_size: Vec<f64> = group.iter().map(|g| group.iter().filter(|h| *h == g).count() as f64).collect();
-        let per_bin = plan.expected_per_bin() * spectra.segments as f64;
-        let (g, g2) = spectra.weights(plan);
-        // Real degrees of freedom of a channel are (Σg)²/Σg², shared by L/2 bins; two of them make a complex observation.
-        let observations_per_bin = if g2 > 0.0 { g * g / g2 / plan.length as f64 } else { 0.0 };
+        let per_band = spectra.observations(plan);
         let needed = OBSERVATIONS_PER_CHANNEL * group_size.iter().fold(0.0, |a: f64, b| a.max(*b));
-        let bins =
-            |range: &std::ops::Range<usize>| plan.bands[range.clone()].iter().map(|b| b.bins()).sum::<usize>() as f64;
+        let observed = |range: &Range<usize>| per_band[range.clone()].iter().sum::<f64>();
         let mut coarse = Vec::new();
         let mut start = 0;
         for end in 1..=plan.bands.len() {
             let wide = plan.bands[end - 1].end as f64 >= RATIO * plan.bands[start].first as f64;
-            if wide && observations_per_bin * bins(&(start..end)) >= needed {
+            if wide && observed(&(start..end)) >= needed {
                 coarse.push(start..end);
                 start = end;
             }
@@ -105,10 +100,11 @@ impl Whitening {
             variances,
             group,
             group_size,
-            observations: coarse.iter().map(|r| observations_per_bin * bins(r)).collect(),
+            observations: coarse.iter().map(observed).collect(),
             coarse,
-            observations_per_band: plan.bands.iter().map(|b| observations_per_bin * b.bins() as f64).collect(),
-            expected: plan.bands.iter().map(|b| per_bin * b.bins() as f64).collect(),
+            observations_per_band: per_band,
+            expected: spectra.expected.clone(),
+            kept: spectra.kept(),
         })
     }
 
@@ -148,7 +144,7 @@ impl Whitening {
     }
 
     /// Measured covariance of the model-whitened residuals over a range of bands; 1 when the model is right.
-    fn whitened(&self, residuals: &[DMatrix<f64>], range: &std::ops::Range<usize>) -> DMatrix<f64> {
+    fn whitened(&self, residuals: &[DMatrix<f64>], range: &Range<usize>) -> DMatrix<f64> {
         let n = self.group.len();
         let mut sum = DMatrix::zeros(n, n);
         for b in range.clone() {
@@ -166,14 +162,14 @@ impl Whitening {
         let mut chi2 = Chi2 { sum: 0.0, expected: 0.0, channel: vec![(0.0, 0.0); n] };
         for (range, observations) in self.coarse.iter().zip(&self.observations) {
             for b in range.clone() {
-                chi2.sum += residuals[b].dot(&inverses[b]);
+                chi2.sum += self.kept[b] * residuals[b].dot(&inverses[b]);
                 let sigma = inverses[b].clone().try_inverse();
                 for c in 0..n {
                     let kept = if refined { 1.0 / Self::wishart(*observations, self.group_size[c]) } else { 1.0 };
-                    let expected = self.expected[b] * kept;
+                    let expected = self.kept[b] * self.expected[b] * kept;
                     chi2.expected += expected;
                     let variance = sigma.as_ref().map_or(f64::NAN, |s| s[(c, c)]);
-                    chi2.channel[c].0 += residuals[b][(c, c)] / variance;
+                    chi2.channel[c].0 += self.kept[b] * residuals[b][(c, c)] / variance;
                     chi2.channel[c].1 += expected;
                 }
             }
@@ -181,9 +177,10 @@ impl Whitening {
         chi2
     }
 
-    /// Expectation of `Σ rᴴ Σ⁻¹ r` in one band when Σ is right.
-    pub(crate) fn expected_chi2(&self, band: usize) -> f64 {
-        self.expected[band] * self.group.len() as f64
+    /// Expectation of `Σ rᴴ Σ⁻¹ r` in one band when Σ is right, and its degrees of freedom.
+    pub(crate) fn expected_chi2(&self, band: usize) -> (f64, f64) {
+        let expected = self.expected[band] * self.group.len() as f64;
+        (expected, expected * self.kept[band])
     }
 
     /// Whether channels that the model does not connect are as unrelated as it says: for each pair of groups the sum of `2n ρ²`
@@ -206,12 +203,12 @@ impl Whitening {
     }
 
     /// Complex observations in a range of bands.
-    pub(crate) fn observations(&self, range: std::ops::Range<usize>) -> f64 {
+    pub(crate) fn observations(&self, range: Range<usize>) -> f64 {
         self.observations_per_band[range].iter().sum()
     }
 
     /// Measured over modelled power of each channel in a range of bands.
-    pub(crate) fn power_ratio(&self, residuals: &[DMatrix<f64>], range: std::ops::Range<usize>) -> Vec<f64> {
+    pub(crate) fn power_ratio(&self, residuals: &[DMatrix<f64>], range: Range<usize>) -> Vec<f64> {
         let expected: f64 = self.expected[range.clone()].iter().sum();
         (0..self.group.len())
             .map(|c| range.clone().map(|b| residuals[b][(c, c)] / self.variances[b][c]).sum::<f64>() / expected)
@@ -233,19 +230,4 @@ fn inverse_of_square(a: &DMatrix<f64>) -> DMatrix<f64> {
     let identity = DMatrix::identity(a.nrows(), a.nrows());
     let inverse = a.solve_lower_triangular(&identity).unwrap_or(identity);
     inverse.transpose() * inverse
-}
-
-/// Labels of the connected components of a symmetric relation.
-fn groups(connected: &DMatrix<bool>) -> Vec<usize> {
-    let n = connected.nrows();
-    let mut label: Vec<usize> = (0..n).collect();
-    for i in 0..n {
-        for j in 0..i {
-            if connected[(i, j)] && label[i] != label[j] {
-                let (keep, drop) = (label[j], label[i]);
-                label.iter_mut().filter(|l| **l == drop).for_each(|l| *l = keep);
-            }
-        }
-    }
-    label
 }

@@ -1,6 +1,6 @@
 //! From rows to segments: gaps respected, memory bounded, nothing depending on where a batch ends.
 
-use crate::spectra::{Analyser, Layout, Sums};
+use crate::spectra::{Analyser, SHORTEST, Sums};
 
 /// Collects rows into runs without a gap and hands whole segments on.
 #[derive(Clone, Debug, PartialEq)]
@@ -26,8 +26,8 @@ pub struct State {
     pub run: Vec<Vec<f64>>,
     /// Whether the current run has given a segment.
     pub run_has_segment: bool,
-    /// The longest run so far, kept while there is no segment at all.
-    pub longest: Vec<Vec<f64>>,
+    /// Time of its last sample, ns.
+    pub run_end_ns: i64,
     /// Rows seen.
     pub rows: u64,
     /// Rows in which every column had a value.
@@ -52,7 +52,7 @@ impl Segmenter {
                 previous: vec![f64::NAN; n],
                 run: vec![Vec::new(); n],
                 run_has_segment: false,
-                longest: vec![Vec::new(); n],
+                run_end_ns: 0,
                 rows: 0,
                 valid: 0,
                 covered: 0,
@@ -88,7 +88,7 @@ impl Segmenter {
                 self.extend(time_ns, &values, k, end, analyser, sums);
                 self.state.valid += (end - k) as u64;
             } else {
-                self.end_run(sums);
+                self.end_run(analyser, sums);
             }
             k = end;
         }
@@ -116,15 +116,15 @@ impl Segmenter {
     ) {
         let mut k = first;
         while k < end {
-            let take = (self.length - self.state.run.first().map_or(0, Vec::len)).min(end - k);
+            let take = (self.length - self.state.samples()).min(end - k);
             for (run, column) in self.state.run.iter_mut().zip(values) {
                 run.extend_from_slice(&column[k..k + take]);
             }
             k += take;
-            if self.state.run.first().is_some_and(|r| r.len() == self.length) {
+            self.state.run_end_ns = time_ns[k - 1];
+            if self.state.samples() == self.length {
                 let segment: Vec<&[f64]> = self.state.run.iter().map(Vec::as_slice).collect();
-                let first_ns = time_ns[k - 1] - self.step_ns * (self.length as i64 - 1);
-                analyser.add(first_ns, &segment, self.state.run_has_segment, sums);
+                analyser.add(0, self.time_of(0), &segment, self.state.run_has_segment, sums);
                 let hop = self.length / 2;
                 self.state.covered += if self.state.run_has_segment { hop } else { self.length } as u64;
                 self.state.run_has_segment = true;
@@ -135,23 +135,42 @@ impl Segmenter {
         }
     }
 
-    fn end_run(&mut self, sums: &Sums) {
-        let state = &mut self.state;
-        let len = |run: &[Vec<f64>]| run.first().map_or(0, Vec::len);
-        if sums.total.segments == 0 && len(&state.run) > len(&state.longest) {
-            std::mem::swap(&mut state.run, &mut state.longest);
-        }
-        state.run.iter_mut().for_each(Vec::clear);
-        if sums.total.segments > 0 {
-            state.longest.iter_mut().for_each(Vec::clear);
-        }
-        state.run_has_segment = false;
+    /// Time of a sample of the run, ns.
+    fn time_of(&self, sample: usize) -> i64 {
+        self.state.run_end_ns - self.step_ns * (self.state.samples() as i64 - 1 - sample as i64)
     }
 
-    /// When no run was as long as a segment: the longest of them, to be cut into shorter segments.
-    pub fn longest_run(&mut self, sums: &Sums) -> &[Vec<f64>] {
-        self.end_run(sums);
-        &self.state.longest
+    /// Ends the run: what no segment of full length covers is cut into shorter ones, as long as they fit.
+    pub fn end_run(&mut self, analyser: &mut Analyser, sums: &mut Sums) {
+        let samples = self.state.samples();
+        let lengths: Vec<usize> = analyser.plan().lengths().collect();
+        // The first half of what is kept belongs to the last segment.
+        let mut at = if self.state.run_has_segment { self.length / 2 } else { 0 };
+        let shortest = lengths.last().copied();
+        for (taper, length) in lengths.into_iter().enumerate() {
+            let mut overlaps = false;
+            // One segment alone keeps half of its information, two that overlap two thirds, and shorter ones do as well.
+            if at + length + length / 2 > samples && Some(length) != shortest {
+                continue;
+            }
+            while at + length <= samples {
+                let segment: Vec<&[f64]> = self.state.run.iter().map(|c| &c[at..at + length]).collect();
+                analyser.add(taper, self.time_of(at), &segment, overlaps, sums);
+                self.state.covered += if overlaps { length / 2 } else { length } as u64;
+                overlaps = true;
+                at += length / 2;
+            }
+            at += if overlaps { length / 2 } else { 0 };
+        }
+        self.state.run.iter_mut().for_each(Vec::clear);
+        self.state.run_has_segment = false;
+    }
+}
+
+impl State {
+    /// Samples of the run.
+    fn samples(&self) -> usize {
+        self.run.first().map_or(0, Vec::len)
     }
 }
 
@@ -171,35 +190,10 @@ pub fn longest_length(samples: usize) -> usize {
     (SHORTEST..=samples).rev().find(smooth).unwrap_or(SHORTEST)
 }
 
-/// Below this a segment has hardly a bin above the window's main lobe.
-pub const SHORTEST: usize = 16;
-
-/// The longest length of which `samples` hold three half-overlapping segments; none when there is none.
-#[must_use]
-pub fn shorter_length(samples: usize) -> Option<usize> {
-    (samples >= 2 * SHORTEST).then(|| longest_length(samples / 2))
-}
-
-/// Cuts one run into segments of the analyser's length; times count from its start.
-#[must_use]
-pub fn cut(run: &[Vec<f64>], layout: &Layout, analyser: &mut Analyser) -> Sums {
-    let mut sums = Sums::new(analyser.plan(), layout);
-    let (length, hop) = (analyser.plan().length, analyser.plan().hop());
-    let samples = run.first().map_or(0, Vec::len);
-    let mut first = 0;
-    while first + length <= samples {
-        let segment: Vec<&[f64]> = run.iter().map(|c| &c[first..first + length]).collect();
-        let first_ns = (1e9 * first as f64 / analyser.plan().rate_hz) as i64;
-        analyser.add(first_ns, &segment, first > 0, &mut sums);
-        first += hop;
-    }
-    sums
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::spectra::Plan;
+    use crate::spectra::{Layout, Plan};
 
     fn layout() -> Layout {
         Layout {
@@ -210,7 +204,7 @@ mod tests {
         }
     }
 
-    fn run(length: usize, batch: usize, columns: &[Vec<f64>], times: &[i64]) -> (Sums, State) {
+    fn run(length: usize, batch: usize, columns: &[Vec<f64>], times: &[i64]) -> (Sums, Segmenter) {
         let mut analyser = Analyser::new(Plan::new(length, 10.0), &layout());
         let mut sums = Sums::new(analyser.plan(), &layout());
         let mut segmenter = Segmenter::new(length, 100, vec![false, false, true]);
@@ -219,8 +213,7 @@ mod tests {
             let part: Vec<&[f64]> = columns.iter().map(|c| &c[first..end]).collect();
             segmenter.push(&times[first..end], &part, &mut analyser, &mut sums);
         }
-        segmenter.end_run(&sums);
-        (sums, segmenter.state)
+        (sums, segmenter)
     }
 
     fn noise(n: usize, seed: u64) -> Vec<f64> {
@@ -242,42 +235,48 @@ mod tests {
         for batch in [1, 7, 64, 777] {
             let parts = run(64, batch, &columns, &times);
             assert_eq!(parts.0, whole.0);
-            assert_eq!(
-                (parts.1.valid, parts.1.covered, parts.1.missing.clone()),
-                (997, whole.1.covered, vec![0, 1, 0])
-            );
+            let state = &parts.1.state;
+            assert_eq!((state.valid, state.covered, &state.missing), (997, whole.1.state.covered, &vec![0, 1, 0]));
         }
     }
 
-    /// Runs 1..333, 334..601 and 602..1000 (the average needs a predecessor): each starts its own segments.
+    /// Runs 1..333, 334..601 and 602..1000 (the average needs a predecessor): each starts its own segments, and what they leave over
+    /// is cut into shorter ones, all but the last, which goes on.
     #[test]
-    fn a_segment_never_spans_a_gap() {
+    fn a_segment_never_spans_a_gap_and_little_is_left_over() {
         let mut columns: Vec<Vec<f64>> = (1..4).map(|s| noise(1000, s)).collect();
         columns[1][333] = f64::NAN;
         let times: Vec<i64> = (0..1000).map(|k| 100 * (k + i64::from(k > 600))).collect();
-        let (sums, state) = run(64, 100, &columns, &times);
-        let segments = |samples: u64| (samples - 64) / 32 + 1;
-        let want = [332, 267, 398].map(segments);
-        assert_eq!(sums.total.segments, want.iter().sum::<u64>());
-        assert_eq!(sums.total.overlaps, want.iter().map(|n| n - 1).sum::<u64>());
-        assert_eq!(state.covered, want.iter().map(|n| 32 * (n + 1)).sum::<u64>());
+        let (mut sums, mut segmenter) = run(64, 100, &columns, &times);
+        // 332 = 32 · 10 + 12, 267 = 32 · 8 + 11, 398 = 32 · 12 + 14: nothing shorter than 16 is left over.
+        assert_eq!((sums.total.segments, segmenter.state.covered), (9 + 7 + 11, 320 + 256 + 384));
+        let mut analyser = Analyser::new(Plan::new(64, 10.0), &layout());
+        let before = sums.total.segments;
+        segmenter.end_run(&mut analyser, &mut sums);
+        assert_eq!((sums.total.segments, segmenter.state.run[0].len()), (before, 0));
+    }
+
+    /// 100 samples: two segments of 64 that overlap, as three halves fit; the four left over are lost. 63: of 32, three; 31: of 16, two.
+    #[test]
+    fn short_runs_have_short_segments() {
+        for (samples, segments, covered) in [(100, 2, 96), (63, 2, 48), (31, 2, 24), (15, 0, 0)] {
+            let columns: Vec<Vec<f64>> = (1..4).map(|s| noise(samples + 1, s)).collect();
+            let times: Vec<i64> = (0..=samples as i64).map(|k| 100 * k).collect();
+            let mut analyser = Analyser::new(Plan::new(128, 10.0), &layout());
+            let mut sums = Sums::new(analyser.plan(), &layout());
+            let mut segmenter = Segmenter::new(128, 100, vec![false, false, true]);
+            let slices: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
+            segmenter.push(&times, &slices, &mut analyser, &mut sums);
+            segmenter.end_run(&mut analyser, &mut sums);
+            assert_eq!((sums.total.segments, segmenter.state.covered), (segments, covered), "{samples}");
+        }
     }
 
     #[test]
     fn a_regressor_is_averaged_with_its_predecessor() {
         let columns = [vec![0.0; 8], vec![0.0; 8], (0..8).map(f64::from).collect()];
         let times: Vec<i64> = (0..8).map(|k| 100 * k).collect();
-        let (_, state) = run(64, 3, &columns, &times);
-        assert_eq!(state.longest[2], [0.5, 1.5, 2.5, 3.5, 4.5, 5.5, 6.5]);
-    }
-
-    #[test]
-    fn shorter_lengths_hold_three_segments() {
-        assert_eq!(shorter_length(100), Some(48));
-        assert_eq!(shorter_length(16383), Some(8100));
-        assert_eq!(shorter_length(31), None);
-        for n in 32..2000 {
-            assert!(shorter_length(n).is_some_and(|l| 2 * l <= n && l % 4 == 0));
-        }
+        let (_, segmenter) = run(64, 3, &columns, &times);
+        assert_eq!(segmenter.state.run[2], [0.5, 1.5, 2.5, 3.5, 4.5, 5.5, 6.5]);
     }
 }

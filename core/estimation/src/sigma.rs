@@ -232,10 +232,21 @@ impl NoiseModel {
         sigma
     }
 
-    /// The diagonal of [`NoiseModel::psd`].
+    /// A label per channel, the same for channels that a chain of common noises connects.
     #[must_use]
-    pub fn variances(&self, frequency_hz: f64) -> Vec<f64> {
-        self.psd(frequency_hz).diagonal().iter().copied().collect()
+    pub fn groups(&self) -> Vec<usize> {
+        let mut label: Vec<usize> = (0..self.channels).collect();
+        let entries = self.processes.iter().map(|p| p.enters.clone());
+        let entries = entries.chain(self.angular_error.iter().map(|e| &e.lever * e.lever.transpose()));
+        for m in entries {
+            for i in 0..self.channels {
+                for j in (0..i).filter(|j| m[(i, *j)] != 0.0) {
+                    let (keep, drop) = (label[j], label[i]);
+                    label.iter_mut().filter(|l| **l == drop).for_each(|l| *l = keep);
+                }
+            }
+        }
+        label
     }
 
     fn response(&self, response: Response, frequency_hz: f64) -> f64 {

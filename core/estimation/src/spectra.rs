@@ -7,6 +7,7 @@
 //! segments, days and files. The same sums are kept for blocks of time, at most [`MAX_BLOCKS`] of them, so that what the data
 //! scatter can be compared with what Σ promises, and memory does not grow with the length of a run.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use realfft::num_complex::Complex64;
@@ -78,35 +79,71 @@ pub const MAX_BLOCKS: usize = 25;
 /// Length of a block at first, ns: an hour, or two segments where these are longer than half an hour.
 const FIRST_BLOCK_NS: i64 = 3_600_000_000_000;
 
-/// Everything that depends on the length of a segment: window, transform, bands.
+/// Shortest segment: below this there is hardly a bin above the window's main lobe.
+pub const SHORTEST: usize = 16;
+
+/// Bands, and the segments whose bins fall into them: of the full length, and of its halves down to [`SHORTEST`] for what gaps
+/// leave over. A short segment has no bins in the lowest bands and counts in the others.
 pub struct Plan {
-    /// Samples of a segment; even.
+    /// Samples of the longest segment, divisible by four.
     pub length: usize,
     /// Samples per second.
     pub rate_hz: f64,
-    /// Bands from [`FIRST_BIN`] to the last bin below Nyquist.
+    /// Bands from [`FIRST_BIN`] to the last bin below Nyquist, in bins of the longest segment.
     pub bands: Vec<Band>,
+    /// The longest segment first.
+    tapers: Vec<Taper>,
+}
+
+/// A length of segment.
+struct Taper {
+    length: usize,
     window: Vec<f64>,
     fft: Arc<dyn RealToComplex<f64>>,
     /// `Σ w²`, `Σ w⁴` and `Σ w²(t) w²(t + L/2)`.
     window_sums: [f64; 3],
     /// `Σ w² (t − L/2)²`.
     window_moment: f64,
+    /// Its bins in each band of the plan.
+    bins: Vec<Range<usize>>,
+    /// The part of each band's time and bandwidth that its bins stand for.
+    part: Vec<f64>,
 }
 
-impl Plan {
-    /// Periodic Hann window and bands for segments of `length` samples.
-    #[must_use]
-    pub fn new(length: usize, rate_hz: f64) -> Self {
+impl Taper {
+    /// Periodic Hann window.
+    fn new(length: usize, longest: usize, bands: &[Band]) -> Self {
         let window: Vec<f64> =
             (0..length).map(|t| 0.5 - 0.5 * (std::f64::consts::TAU * t as f64 / length as f64).cos()).collect();
         let squared: Vec<f64> = window.iter().map(|w| w * w).collect();
-        let window_sums = [
-            squared.iter().sum(),
-            squared.iter().map(|w| w * w).sum(),
-            squared.iter().zip(&squared[length / 2..]).map(|(a, b)| a * b).sum(),
-        ];
-        let window_moment = squared.iter().enumerate().map(|(t, w)| w * (t as f64 - length as f64 / 2.0).powi(2)).sum();
+        let ratio = longest / length;
+        let bins: Vec<Range<usize>> = bands
+            .iter()
+            .map(|b| {
+                let first = b.first.div_ceil(ratio).max(FIRST_BIN);
+                first..b.end.div_ceil(ratio).max(first)
+            })
+            .collect();
+        Self {
+            part: bands.iter().zip(&bins).map(|(b, own)| (own.len() * ratio) as f64 / b.bins() as f64).collect(),
+            bins,
+            window_sums: [
+                squared.iter().sum(),
+                squared.iter().map(|w| w * w).sum(),
+                squared.iter().zip(&squared[length / 2..]).map(|(a, b)| a * b).sum(),
+            ],
+            window_moment: squared.iter().enumerate().map(|(t, w)| w * (t as f64 - length as f64 / 2.0).powi(2)).sum(),
+            fft: RealFftPlanner::new().plan_fft_forward(length),
+            window,
+            length,
+        }
+    }
+}
+
+impl Plan {
+    /// Segments of `length` samples, divisible by four, and of its halves.
+    #[must_use]
+    pub fn new(length: usize, rate_hz: f64) -> Self {
         let nyquist = length / 2;
         let mut bands = Vec::new();
         let mut first = FIRST_BIN;
@@ -116,8 +153,14 @@ impl Plan {
             bands.push(Band { first, end });
             first = end;
         }
-        let fft = RealFftPlanner::new().plan_fft_forward(length);
-        Self { length, rate_hz, bands, window, fft, window_sums, window_moment }
+        let halves = std::iter::successors(Some(length), |l| l.is_multiple_of(8).then_some(l / 2));
+        let lengths = halves.take_while(|l| *l == length || *l >= SHORTEST);
+        Self { tapers: lengths.map(|l| Taper::new(l, length, &bands)).collect(), length, rate_hz, bands }
+    }
+
+    /// Lengths of segments, the longest first.
+    pub fn lengths(&self) -> impl Iterator<Item = usize> {
+        self.tapers.iter().map(|t| t.length)
     }
 
     /// Frequency of the middle of a band, Hz.
@@ -126,22 +169,10 @@ impl Plan {
         self.bin_hz(0.5 * (band.first + band.end - 1) as f64)
     }
 
-    /// Frequency of a bin, Hz.
+    /// Frequency of a bin of the longest segment, Hz.
     #[must_use]
     pub fn bin_hz(&self, bin: f64) -> f64 {
         bin * self.rate_hz / self.length as f64
-    }
-
-    /// Samples between the starts of two segments: half a segment.
-    #[must_use]
-    pub fn hop(&self) -> usize {
-        self.length / 2
-    }
-
-    /// Expectation of a channel's diagonal of `G` over its one-sided PSD, per bin and segment.
-    #[must_use]
-    pub fn expected_per_bin(&self) -> f64 {
-        2.0 * self.window_sums[0] / self.length as f64
     }
 
     fn first_block_ns(&self) -> i64 {
@@ -150,35 +181,79 @@ impl Plan {
 }
 
 /// Cross-spectra added over segments.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Spectra {
     /// `G_b`, packed lower triangles, band after band.
     pub packed: Vec<f64>,
-    /// Segments added.
+    /// Per band, the expectation of a channel's diagonal of `G` over its one-sided PSD.
+    pub expected: Vec<f64>,
+    /// Per band, `Σ_t g(t)` with `g(t) = Σ_segments w²(t)`: the weight with which a sample entered.
+    pub weight: Vec<f64>,
+    /// Per band, `Σ_t g²(t)`.
+    pub weight_squared: Vec<f64>,
+    /// Segments added, of all lengths.
     pub segments: u64,
-    /// Pairs of them that overlap.
-    pub overlaps: u64,
 }
 
 impl Spectra {
-    fn zero(plan: &Plan, layout: &Layout) -> Self {
-        Self { packed: vec![0.0; plan.bands.len() * triangle(layout.columns())], segments: 0, overlaps: 0 }
+    fn zero(bands: usize, columns: usize) -> Self {
+        Self {
+            packed: vec![0.0; bands * triangle(columns)],
+            expected: vec![0.0; bands],
+            weight: vec![0.0; bands],
+            weight_squared: vec![0.0; bands],
+            segments: 0,
+        }
     }
 
     fn add(&mut self, other: &Self) {
-        self.packed.iter_mut().zip(&other.packed).for_each(|(a, b)| *a += b);
+        for (a, b) in [
+            (&mut self.packed, &other.packed),
+            (&mut self.expected, &other.expected),
+            (&mut self.weight, &other.weight),
+            (&mut self.weight_squared, &other.weight_squared),
+        ] {
+            a.iter_mut().zip(b).for_each(|(a, b)| *a += b);
+        }
         self.segments += other.segments;
-        self.overlaps += other.overlaps;
     }
 
-    /// `Σ_t g(t)` and `Σ_t g²(t)` with `g(t) = Σ_segments w²(t)`: the weight with which a sample entered.
-    ///
-    /// Estimates from weighted sums have covariance `N⁻¹ Σg²/Σg`; one Hann segment keeps 0.514 of the information, segments
-    /// that overlap by half 0.947.
+    /// Counts a segment, and its overlap with the one before it.
+    fn count(&mut self, taper: &Taper, overlaps: bool) {
+        let [w2, w4, _] = taper.window_sums;
+        for (b, part) in taper.part.iter().enumerate() {
+            self.expected[b] += taper.bins[b].len() as f64 * 2.0 * w2 / taper.length as f64;
+            self.weight[b] += w2 * part;
+            self.weight_squared[b] += w4 * part;
+        }
+        self.segments += 1;
+        if overlaps {
+            self.count_overlap(taper);
+        }
+    }
+
+    fn count_overlap(&mut self, taper: &Taper) {
+        let [_, _, cross] = taper.window_sums;
+        self.weight_squared.iter_mut().zip(&taper.part).for_each(|(w, part)| *w += 2.0 * cross * part);
+    }
+
+    /// Per band `Σg/Σg²`: sums times this are information, their inverse a covariance. One Hann segment keeps 0.514 of the
+    /// information of its samples, segments that overlap by half 0.947. Zero where no segment reaches.
     #[must_use]
-    pub fn weights(&self, plan: &Plan) -> (f64, f64) {
-        let [w2, w4, cross] = plan.window_sums;
-        (self.segments as f64 * w2, self.segments as f64 * w4 + 2.0 * self.overlaps as f64 * cross)
+    pub fn kept(&self) -> Vec<f64> {
+        let pairs = self.weight.iter().zip(&self.weight_squared);
+        pairs.map(|(g, g2)| if *g2 > 0.0 { g / g2 } else { 0.0 }).collect()
+    }
+
+    /// Per band, complex observations: half the samples that would know as much, times the band's part of all frequencies.
+    #[must_use]
+    pub fn observations(&self, plan: &Plan) -> Vec<f64> {
+        let kept = self.kept();
+        plan.bands
+            .iter()
+            .enumerate()
+            .map(|(b, band)| self.weight[b] * kept[b] * band.bins() as f64 / plan.length as f64)
+            .collect()
     }
 
     /// The lower triangle of band `b`, row after row.
@@ -194,13 +269,13 @@ impl Spectra {
 pub struct Block {
     /// Number of the block: its start over its length.
     pub number: i64,
-    /// Spectra of its segments; pairs that overlap across its ends are not counted.
+    /// Spectra of its segments; an overlap across its start is not counted.
     pub spectra: Spectra,
-    /// Whether its first segment overlaps the one before it, in the block before.
-    pub overlaps_before: bool,
+    /// The index of the length of its first segment, where that overlaps the last of the block before.
+    pub overlaps_before: Option<usize>,
 }
 
-/// The sums of one segment length: over all time, and block by block.
+/// The sums over all time, and block by block.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Sums {
     /// All segments.
@@ -215,56 +290,57 @@ impl Sums {
     /// Nothing added yet.
     #[must_use]
     pub fn new(plan: &Plan, layout: &Layout) -> Self {
-        Self { total: Spectra::zero(plan, layout), block_ns: plan.first_block_ns(), blocks: Vec::new() }
+        let total = Spectra::zero(plan.bands.len(), layout.columns());
+        Self { total, block_ns: plan.first_block_ns(), blocks: Vec::new() }
     }
 
     /// Adds the sums of other segments, of the same plan and layout, none of them twice.
-    pub fn add(&mut self, other: &Self) {
+    pub fn add(&mut self, plan: &Plan, other: &Self) {
         self.total.add(&other.total);
         let mut other = other.clone();
         while self.block_ns != other.block_ns {
-            if self.block_ns < other.block_ns { self.coarsen() } else { other.coarsen() }
+            if self.block_ns < other.block_ns { self.coarsen(plan) } else { other.coarsen(plan) }
         }
         self.blocks.append(&mut other.blocks);
         self.blocks.sort_by_key(|b| b.number);
-        self.merge_equal();
+        self.merge_equal(plan);
         while self.blocks.len() > MAX_BLOCKS {
-            self.coarsen();
+            self.coarsen(plan);
         }
     }
 
-    /// The block that a segment belongs to whose middle lies at `middle_ns`.
-    fn block(&mut self, plan: &Plan, columns: usize, middle_ns: i64, overlaps: bool) -> &mut Block {
+    /// The block of a segment whose middle lies at `middle_ns`, and whether it was there before.
+    fn block(&mut self, plan: &Plan, columns: usize, middle_ns: i64) -> (&mut Block, bool) {
         let known = |s: &Self| s.blocks.last().is_some_and(|b| b.number == middle_ns.div_euclid(s.block_ns));
         while !known(self) && self.blocks.len() >= MAX_BLOCKS {
-            self.coarsen();
+            self.coarsen(plan);
         }
-        if !known(self) {
-            let packed = vec![0.0; plan.bands.len() * triangle(columns)];
-            self.blocks.push(Block {
-                number: middle_ns.div_euclid(self.block_ns),
-                spectra: Spectra { packed, segments: 0, overlaps: 0 },
-                overlaps_before: overlaps,
-            });
+        let was_there = known(self);
+        if !was_there {
+            let spectra = Spectra::zero(plan.bands.len(), columns);
+            let number = middle_ns.div_euclid(self.block_ns);
+            self.blocks.push(Block { number, spectra, overlaps_before: None });
         }
         let last = self.blocks.len() - 1;
-        &mut self.blocks[last]
+        (&mut self.blocks[last], was_there)
     }
 
     /// Blocks of twice the length.
-    fn coarsen(&mut self) {
+    fn coarsen(&mut self, plan: &Plan) {
         self.block_ns *= 2;
         self.blocks.iter_mut().for_each(|b| b.number = b.number.div_euclid(2));
-        self.merge_equal();
+        self.merge_equal(plan);
     }
 
-    fn merge_equal(&mut self) {
+    fn merge_equal(&mut self, plan: &Plan) {
         let mut merged: Vec<Block> = Vec::with_capacity(self.blocks.len());
         for block in self.blocks.drain(..) {
             match merged.last_mut() {
                 Some(last) if last.number == block.number => {
                     last.spectra.add(&block.spectra);
-                    last.spectra.overlaps += u64::from(block.overlaps_before);
+                    if let Some(taper) = block.overlaps_before {
+                        last.spectra.count_overlap(&plan.tapers[taper]);
+                    }
                 }
                 _ => merged.push(block),
             }
@@ -283,12 +359,10 @@ pub fn triangle(n: usize) -> usize {
 pub struct Analyser {
     plan: Plan,
     columns: usize,
-    /// `sqrt(4/(f_s L))`.
-    scale: f64,
     time: Vec<f64>,
     spectrum: Vec<Complex64>,
     scratch: Vec<Complex64>,
-    /// Per column: real and imaginary part of each used bin, scaled.
+    /// Per column: real and imaginary part of each bin from [`FIRST_BIN`], scaled.
     scaled: Vec<Vec<f64>>,
 }
 
@@ -296,42 +370,42 @@ impl Analyser {
     /// An analyser of segments with the columns of `layout`.
     #[must_use]
     pub fn new(plan: Plan, layout: &Layout) -> Self {
-        let bins = plan.length / 2 - FIRST_BIN;
         let columns = layout.columns();
+        let scratch = plan.tapers.iter().map(|t| t.fft.get_scratch_len()).max().unwrap_or(0);
         Self {
-            scale: (4.0 / (plan.rate_hz * plan.length as f64)).sqrt(),
-            time: plan.fft.make_input_vec(),
-            spectrum: plan.fft.make_output_vec(),
-            scratch: plan.fft.make_scratch_vec(),
-            scaled: vec![vec![0.0; 2 * bins]; columns],
+            time: vec![0.0; plan.length],
+            spectrum: vec![Complex64::default(); plan.length / 2 + 1],
+            scratch: vec![Complex64::default(); scratch],
+            scaled: vec![vec![0.0; plan.length]; columns],
             columns,
             plan,
         }
     }
 
-    /// What depends on the length.
+    /// Bands and lengths.
     #[must_use]
     pub fn plan(&self) -> &Plan {
         &self.plan
     }
 
-    /// Adds one segment, a slice of `length` samples per column, the first at `first_ns`; `overlaps` when the segment before it
-    /// shares its first half.
-    pub fn add(&mut self, first_ns: i64, columns: &[&[f64]], overlaps: bool, sums: &mut Sums) {
+    /// Adds one segment, one slice per column, of the `taper`-th length, the first sample at `first_ns`; `overlaps` when the
+    /// segment before it has the same length and shares its first half.
+    pub fn add(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool, sums: &mut Sums) {
         for (j, samples) in columns.iter().enumerate() {
-            self.transform(j, samples);
+            self.transform(taper, j, samples);
         }
-        let middle_ns = first_ns + (0.5e9 * self.plan.length as f64 / self.plan.rate_hz) as i64;
-        let total = &mut sums.total;
-        total.segments += 1;
-        total.overlaps += u64::from(overlaps);
-        let mut total = std::mem::take(&mut total.packed);
-        let block = sums.block(&self.plan, self.columns, middle_ns, overlaps);
-        block.spectra.overlaps += u64::from(overlaps && block.spectra.segments > 0);
-        block.spectra.segments += 1;
+        let segment = &self.plan.tapers[taper];
+        let middle_ns = first_ns + (0.5e9 * segment.length as f64 / self.plan.rate_hz) as i64;
+        sums.total.count(segment, overlaps);
+        let mut total = std::mem::take(&mut sums.total.packed);
+        let (block, was_there) = sums.block(&self.plan, self.columns, middle_ns);
+        block.spectra.count(segment, overlaps && was_there);
+        if overlaps && !was_there {
+            block.overlaps_before = Some(taper);
+        }
         let mut entry = total.iter_mut().zip(&mut block.spectra.packed);
-        for band in &self.plan.bands {
-            let range = 2 * (band.first - FIRST_BIN)..2 * (band.end - FIRST_BIN);
+        for bins in &segment.bins {
+            let range = 2 * (bins.start - FIRST_BIN)..2 * (bins.end - FIRST_BIN);
             for i in 0..self.columns {
                 let a = &self.scaled[i][range.clone()];
                 for (b, (g, h)) in self.scaled[..=i].iter().zip(&mut entry) {
@@ -344,26 +418,30 @@ impl Analyser {
         sums.total.packed = total;
     }
 
-    fn transform(&mut self, column: usize, samples: &[f64]) {
+    fn transform(&mut self, taper: usize, column: usize, samples: &[f64]) {
+        let segment = &self.plan.tapers[taper];
+        let (time, spectrum) = (&mut self.time[..segment.length], &mut self.spectrum[..=segment.length / 2]);
         // The straight line that fits the *windowed* samples best. A fit to the bare samples would take its slope from the ends,
         // where a second difference of readout noise is a hundred times louder than the lowest bins.
         let middle = (samples.len() / 2) as f64;
         let (mut sum, mut moment) = (0.0, 0.0);
-        for (t, (x, w)) in samples.iter().zip(&self.plan.window).enumerate() {
+        for (t, (x, w)) in samples.iter().zip(&segment.window).enumerate() {
             sum += w * w * x;
             moment += w * w * (t as f64 - middle) * x;
         }
-        let (mean, slope) = (sum / self.plan.window_sums[0], moment / self.plan.window_moment);
-        for (t, ((out, x), w)) in self.time.iter_mut().zip(samples).zip(&self.plan.window).enumerate() {
+        let (mean, slope) = (sum / segment.window_sums[0], moment / segment.window_moment);
+        for (t, ((out, x), w)) in time.iter_mut().zip(samples).zip(&segment.window).enumerate() {
             *out = (x - mean - slope * (t as f64 - middle)) * w;
         }
         // The lengths are those that the plan was made for, the only thing that it refuses.
-        let done = self.plan.fft.process_with_scratch(&mut self.time, &mut self.spectrum, &mut self.scratch);
+        let scratch = &mut self.scratch[..segment.fft.get_scratch_len()];
+        let done = segment.fft.process_with_scratch(time, spectrum, scratch);
         debug_assert!(done.is_ok());
-        let used = &self.spectrum[FIRST_BIN..self.plan.length / 2];
+        let scale = (4.0 / (self.plan.rate_hz * segment.length as f64)).sqrt();
+        let used = spectrum.get(FIRST_BIN..segment.length / 2).unwrap_or_default();
         for (pair, x) in self.scaled[column].chunks_exact_mut(2).zip(used) {
-            pair[0] = x.re * self.scale;
-            pair[1] = x.im * self.scale;
+            pair[0] = x.re * scale;
+            pair[1] = x.im * scale;
         }
     }
 }
@@ -412,12 +490,33 @@ mod tests {
     #[test]
     fn information_kept_by_the_taper() {
         let plan = Plan::new(4096, 10.0);
-        let efficiency = |segments: u64, overlaps: u64| {
-            let (g, g2) = Spectra { packed: vec![], segments, overlaps }.weights(&plan);
-            g * g / g2 / (plan.hop() as f64 * (segments + 1) as f64)
+        let efficiency = |segments: usize| {
+            let mut spectra = Spectra::zero(plan.bands.len(), 0);
+            (0..segments).for_each(|k| spectra.count(&plan.tapers[0], k > 0));
+            let samples = (plan.length / 2 * (segments + 1)) as f64;
+            spectra.weight[0] * spectra.kept()[0] / samples
         };
-        assert!((efficiency(1, 0) - 18.0 / 35.0).abs() < 1e-9);
-        assert!((efficiency(1_000_000, 999_999) - 0.947).abs() < 1e-3);
+        assert!((efficiency(1) - 18.0 / 35.0).abs() < 1e-9);
+        assert!((efficiency(10_000) - 0.947).abs() < 1e-3);
+    }
+
+    /// Each length puts every bin of its own into one band, that of its frequency.
+    #[test]
+    fn short_segments_share_the_bands() {
+        let plan = Plan::new(16_384, 10.0);
+        assert_eq!(plan.lengths().last(), Some(SHORTEST));
+        for taper in &plan.tapers {
+            let mut next = FIRST_BIN;
+            let ratio = plan.length / taper.length;
+            for (band, bins) in plan.bands.iter().zip(&taper.bins) {
+                for k in bins.clone() {
+                    assert!((band.first..band.end).contains(&(k * ratio)));
+                    assert_eq!(k, next);
+                    next += 1;
+                }
+            }
+            assert_eq!(next, taper.length / 2);
+        }
     }
 
     /// A sinusoid's power, by Parseval: `Σ_t w² x²` over the variance of white noise of unit PSD.
@@ -427,57 +526,58 @@ mod tests {
         let mut analyser = Analyser::new(Plan::new(length, rate), &layout(1));
         let mut sums = Sums::new(analyser.plan(), &layout(1));
         let x: Vec<f64> = (0..length).map(|t| 2.0 * (0.7 * t as f64).sin() + 5.0 + 0.01 * t as f64).collect();
-        analyser.add(0, &[&x], false, &mut sums);
+        analyser.add(0, 0, &[&x], false, &mut sums);
         let total: f64 = sums.total.packed.iter().sum();
         // Variance of white noise of one-sided PSD 1 at rate f_s is f_s/2; Σ w² sin² = (3/8) L / 2.
         let want = 0.375 * length as f64 * 0.5 * 4.0 / (rate / 2.0);
         assert!((total / want - 1.0).abs() < 1e-3, "{total} against {want}");
     }
 
-    /// Blocks add up to the total, pairs across their ends apart, however often they were joined; and never become many.
+    /// Blocks add up to the total, overlaps across their ends apart, however often they were joined; and never become many.
     #[test]
     fn blocks_are_the_total_in_parts() {
         let mut analyser = Analyser::new(Plan::new(16, 1.0), &layout(1));
         let mut sums = Sums::new(analyser.plan(), &layout(1));
         let x: Vec<f64> = (0..16).map(|t| f64::from(t * t % 7)).collect();
         for k in 0..30_000i64 {
-            analyser.add(k * 8_000_000_000, &[&x], k > 0, &mut sums);
+            analyser.add(0, k * 8_000_000_000, &[&x], k > 0, &mut sums);
             assert!(sums.blocks.len() <= MAX_BLOCKS);
         }
         assert!(sums.blocks.len() > MAX_BLOCKS / 2 - 1, "{}", sums.blocks.len());
-        let of = |f: fn(&Block) -> u64| sums.blocks.iter().map(f).sum::<u64>();
-        assert_eq!(of(|b| b.spectra.segments), 30_000);
-        assert_eq!(of(|b| b.spectra.overlaps + u64::from(b.overlaps_before)), sums.total.overlaps);
-        let power: f64 = sums.blocks.iter().flat_map(|b| &b.spectra.packed).sum();
+        assert_eq!(sums.blocks.iter().map(|b| b.spectra.segments).sum::<u64>(), 30_000);
+        let of = |f: fn(&Block) -> f64| sums.blocks.iter().map(f).sum::<f64>();
+        let power = of(|b| b.spectra.packed.iter().sum());
         let total: f64 = sums.total.packed.iter().sum();
         assert!((power / total - 1.0).abs() < 1e-12);
+        let across = 2.0 * analyser.plan.tapers[0].window_sums[2] * (sums.blocks.len() - 1) as f64;
+        let squares = of(|b| b.spectra.weight_squared[0]) + across;
+        assert!((squares / sums.total.weight_squared[0] - 1.0).abs() < 1e-12);
     }
 
     /// Two halves of a record, with the tail carried from one to the other, add up to the whole, whichever comes first and
     /// whatever the length of their blocks.
     #[test]
     fn sums_of_parts_add_up() {
-        let plan = || Plan::new(16, 1.0);
-        let mut analyser = Analyser::new(plan(), &layout(1));
+        let mut analyser = Analyser::new(Plan::new(16, 1.0), &layout(1));
         let segment = |k: i64| -> Vec<f64> { (0..16).map(|t| ((8 * k + t) as f64).sin()).collect() };
         let mut whole = Sums::new(analyser.plan(), &layout(1));
         let (mut first, mut second) = (whole.clone(), whole.clone());
         for k in 0..15_000i64 {
-            analyser.add(k * 8_000_000_000, &[&segment(k)], k > 0, &mut whole);
+            analyser.add(0, k * 8_000_000_000, &[&segment(k)], k > 0, &mut whole);
             let part = if k < 14_000 { &mut first } else { &mut second };
-            analyser.add(k * 8_000_000_000, &[&segment(k)], k > 0, part);
+            analyser.add(0, k * 8_000_000_000, &[&segment(k)], k > 0, part);
         }
         assert!(first.block_ns > second.block_ns);
         for (a, b) in [(&first, &second), (&second, &first)] {
             let mut sum = a.clone();
-            sum.add(b);
-            assert_eq!((sum.total.segments, sum.total.overlaps), (15_000, 14_999));
-            assert_eq!((sum.block_ns, sum.blocks.len()), (whole.block_ns, whole.blocks.len()));
+            sum.add(analyser.plan(), b);
+            assert_eq!(
+                (sum.total.segments, sum.block_ns, sum.blocks.len()),
+                (15_000, whole.block_ns, whole.blocks.len())
+            );
             for (a, b) in sum.blocks.iter().zip(&whole.blocks) {
-                assert_eq!(
-                    (a.number, a.spectra.segments, a.spectra.overlaps),
-                    (b.number, b.spectra.segments, b.spectra.overlaps)
-                );
+                assert_eq!((a.number, a.spectra.segments), (b.number, b.spectra.segments));
+                assert!((a.spectra.kept()[0] / b.spectra.kept()[0] - 1.0).abs() < 1e-12);
             }
             let apart = sum.total.packed.iter().zip(&whole.total.packed).map(|(a, b)| (a / b - 1.0).abs());
             assert!(apart.fold(0.0, f64::max) < 1e-12);

@@ -42,7 +42,7 @@ pub fn save(layout: &str, state: &State, sums: &Sums) -> Vec<u8> {
     w.numbers(&state.previous);
     w.columns(&state.run);
     w.word(u64::from(state.run_has_segment));
-    w.columns(&state.longest);
+    w.word(state.run_end_ns.cast_unsigned());
     for count in [state.rows, state.valid, state.covered] {
         w.word(count);
     }
@@ -52,7 +52,7 @@ pub fn save(layout: &str, state: &State, sums: &Sums) -> Vec<u8> {
     w.word(sums.blocks.len() as u64);
     for block in &sums.blocks {
         w.word(block.number.cast_unsigned());
-        w.word(u64::from(block.overlaps_before));
+        w.word(block.overlaps_before.map_or(0, |taper| taper as u64 + 1));
         w.spectra(&block.spectra);
     }
     let sum = checksum(&w.0);
@@ -85,11 +85,11 @@ pub fn load(bytes: &[u8], layout: &str, state: &State, sums: &Sums) -> Result<(S
     let previous = r.numbers(columns)?;
     let run = r.columns(columns)?;
     let run_has_segment = r.flag()?;
-    let longest = r.columns(columns)?;
+    let run_end_ns = r.word()?.cast_signed();
     let (rows, valid, covered) = (r.word()?, r.word()?, r.word()?);
     let missing = (0..columns).map(|_| r.word()).collect::<Result<_, _>>()?;
-    let size = sums.total.packed.len();
-    let total = r.spectra(size)?;
+    let sizes = (sums.total.packed.len(), sums.total.expected.len());
+    let total = r.spectra(sizes)?;
     let block_ns = r.word()?.cast_signed();
     let blocks = r.size()?;
     if block_ns <= 0 || blocks > MAX_BLOCKS {
@@ -98,14 +98,18 @@ pub fn load(bytes: &[u8], layout: &str, state: &State, sums: &Sums) -> Result<(S
     let blocks = (0..blocks)
         .map(|_| {
             let number = r.word()?.cast_signed();
-            Ok(Block { number, overlaps_before: r.flag()?, spectra: r.spectra(size)? })
+            let overlaps_before = (r.word()? as usize).checked_sub(1);
+            if overlaps_before.is_some_and(|taper| taper >= 64) {
+                return Err(StateError::Damaged("an overlap"));
+            }
+            Ok(Block { number, overlaps_before, spectra: r.spectra(sizes)? })
         })
         .collect::<Result<_, StateError>>()?;
     if !r.0.is_empty() {
         return Err(StateError::Damaged("too long"));
     }
     let last_ns = some.then_some(last);
-    let state = State { last_ns, previous, run, run_has_segment, longest, rows, valid, covered, missing };
+    let state = State { last_ns, previous, run, run_has_segment, run_end_ns, rows, valid, covered, missing };
     Ok((state, Sums { total, block_ns, blocks }))
 }
 
@@ -122,8 +126,9 @@ impl Writer {
 
     fn spectra(&mut self, spectra: &Spectra) {
         self.word(spectra.segments);
-        self.word(spectra.overlaps);
-        self.numbers(&spectra.packed);
+        for numbers in [&spectra.packed, &spectra.expected, &spectra.weight, &spectra.weight_squared] {
+            self.numbers(numbers);
+        }
     }
 
     /// Columns of equal length.
@@ -166,8 +171,14 @@ impl<'a> Reader<'a> {
         Ok(bytes.as_chunks::<8>().0.iter().map(|b| f64::from_le_bytes(*b)).collect())
     }
 
-    fn spectra(&mut self, size: usize) -> Result<Spectra, StateError> {
-        Ok(Spectra { segments: self.word()?, overlaps: self.word()?, packed: self.numbers(size)? })
+    fn spectra(&mut self, (packed, bands): (usize, usize)) -> Result<Spectra, StateError> {
+        Ok(Spectra {
+            segments: self.word()?,
+            packed: self.numbers(packed)?,
+            expected: self.numbers(bands)?,
+            weight: self.numbers(bands)?,
+            weight_squared: self.numbers(bands)?,
+        })
     }
 
     fn columns(&mut self, columns: usize) -> Result<Vec<Vec<f64>>, StateError> {
@@ -193,18 +204,24 @@ mod tests {
             previous: vec![f64::NAN, 1.0],
             run: vec![vec![1.0, 2.0, -0.0], vec![0.1, f64::MIN_POSITIVE, 3.0]],
             run_has_segment: true,
-            longest: vec![vec![], vec![]],
+            run_end_ns: 77,
             rows: 10,
             valid: 9,
             covered: 8,
             missing: vec![0, 1],
         };
-        let spectra = |segments, overlaps| Spectra { packed: vec![1.5, 2.5], segments, overlaps };
+        let spectra = |segments| Spectra {
+            packed: vec![1.5, 2.5],
+            expected: vec![0.75],
+            weight: vec![3.0],
+            weight_squared: vec![2.0],
+            segments,
+        };
         let blocks = vec![
-            Block { number: -1, spectra: spectra(1, 0), overlaps_before: false },
-            Block { number: 4, spectra: spectra(2, 1), overlaps_before: true },
+            Block { number: -1, spectra: spectra(1), overlaps_before: None },
+            Block { number: 4, spectra: spectra(2), overlaps_before: Some(0) },
         ];
-        (state, Sums { total: spectra(3, 2), block_ns: 3_600_000_000_000, blocks })
+        (state, Sums { total: spectra(3), block_ns: 3_600_000_000_000, blocks })
     }
 
     #[test]

@@ -18,14 +18,10 @@ pub struct Stored {
     pub length: usize,
     /// Samples per second.
     pub rate_hz: f64,
-    /// Segments added.
-    pub segments: u64,
-    /// Pairs of them that overlap.
-    pub overlaps: u64,
     /// First and last frequency of each band, Hz.
     pub bands_hz: Vec<[f64; 2]>,
-    /// Per band, the lower triangle of the columns' summed cross-spectra: channels, then series.
-    pub spectra: Vec<f64>,
+    /// Per band, the lower triangle of the columns' summed cross-spectra, channels, then series; and their weights.
+    pub spectra: Spectra,
 }
 
 /// Why stored sums cannot be used.
@@ -56,10 +52,8 @@ impl Stored {
             layout: layout.clone(),
             length: plan.length,
             rate_hz: plan.rate_hz,
-            segments: spectra.segments,
-            overlaps: spectra.overlaps,
             bands_hz: plan.bands.iter().map(|b| [b.first, b.end - 1].map(|k| plan.bin_hz(k as f64))).collect(),
-            spectra: spectra.packed.clone(),
+            spectra: spectra.clone(),
         }
     }
 
@@ -83,9 +77,9 @@ impl Stored {
         let plan = Plan::new(first.length, first.rate_hz);
         let mut sums = Sums::new(&plan, &first.layout);
         for (number, day) in (0..).zip(days) {
-            let spectra = Spectra { packed: day.spectra.clone(), segments: day.segments, overlaps: day.overlaps };
-            let block = Block { number, spectra: spectra.clone(), overlaps_before: false };
-            sums.add(&Sums { total: spectra, block_ns: sums.block_ns, blocks: vec![block] });
+            let block = Block { number, spectra: day.spectra.clone(), overlaps_before: None };
+            let day = Sums { total: day.spectra.clone(), block_ns: sums.block_ns, blocks: vec![block] };
+            sums.add(&plan, &day);
         }
         Ok((first.layout.clone(), plan, sums))
     }
@@ -108,12 +102,14 @@ impl Stored {
         if !regressors.iter().all(|r| inside(r) && r.factor.is_finite()) {
             return damaged("regressors");
         }
-        if self.spectra.len() != self.bands_hz.len() * triangle(self.layout.columns())
-            || self.bands_hz.len() != Plan::new(self.length, self.rate_hz).bands.len()
-        {
+        let bands = Plan::new(self.length, self.rate_hz).bands.len();
+        let Spectra { packed, expected, weight, weight_squared, .. } = &self.spectra;
+        let sizes = [self.bands_hz.len(), expected.len(), weight.len(), weight_squared.len()];
+        if sizes != [bands; 4] || packed.len() != bands * triangle(self.layout.columns()) {
             return damaged("number of spectra");
         }
-        if !self.spectra.iter().all(|x| x.is_finite()) || self.overlaps > self.segments {
+        let weights = expected.iter().chain(weight).chain(weight_squared);
+        if !packed.iter().all(|x| x.is_finite()) || !weights.clone().all(|x| x.is_finite() && *x >= 0.0) {
             return damaged("spectra");
         }
         Ok(())
@@ -136,7 +132,7 @@ mod tests {
         let mut sums = Sums::new(analyser.plan(), &layout);
         let column =
             |k: u64| -> Vec<f64> { (0..64).map(|t| (1e-9 * (t * t + 7 * k) as f64 * seed as f64).sin()).collect() };
-        analyser.add(0, &[&column(1), &column(2)], false, &mut sums);
+        analyser.add(0, 0, &[&column(1), &column(2)], false, &mut sums);
         Stored::new(&layout, analyser.plan(), &sums.total)
     }
 
@@ -147,7 +143,7 @@ mod tests {
         assert_eq!(back, day(1));
         let (_, _, sums) = Stored::stack(&[day(1), day(2)]).expect("two days");
         assert_eq!((sums.total.segments, sums.blocks.len()), (2, 2));
-        let both = day(1).spectra.iter().zip(&day(2).spectra).map(|(a, b)| a + b).collect::<Vec<_>>();
+        let both = day(1).spectra.packed.iter().zip(&day(2).spectra.packed).map(|(a, b)| a + b).collect::<Vec<_>>();
         assert_eq!(sums.total.packed, both);
     }
 
@@ -159,8 +155,8 @@ mod tests {
             Stored::stack(&[day(1), other]).map(|_| ()).expect_err("refused").to_string()
         };
         assert!(change(|d| d.format = 7).contains("format 7"));
-        assert!(change(|d| d.spectra.truncate(3)).contains("number of spectra"));
-        assert!(change(|d| d.spectra[0] = f64::NAN).contains("damaged"));
+        assert!(change(|d| d.spectra.packed.truncate(3)).contains("number of spectra"));
+        assert!(change(|d| d.spectra.packed[0] = f64::NAN).contains("damaged"));
         assert!(change(|d| d.length = 10).contains("length"));
         assert!(change(|d| d.rate_hz = 5.0).contains("sample rate"));
         assert!(change(|d| d.layout.regressors[0].series = 9).contains("regressors"));

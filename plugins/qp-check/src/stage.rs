@@ -4,12 +4,11 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::DMatrix;
 use serde_json::json;
-use std::collections::BTreeMap;
 
 use dragfree_estimation::estimate::{Bound, Estimate as Solution, Unknown, estimate};
-use dragfree_estimation::segments::{Segmenter, cut, longest_length, shorter_length};
+use dragfree_estimation::segments::{Segmenter, longest_length};
 use dragfree_estimation::sigma::{Measured, NoiseModel};
-use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, Sums};
+use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, SHORTEST, Sums};
 use dragfree_estimation::state;
 use dragfree_estimation::stored::Stored;
 use dragfree_estimation::verdict::{
@@ -29,6 +28,8 @@ pub struct QpCheck {
 struct Linked {
     columns: Vec<In>,
     names: Vec<String>,
+    /// Channels that share noise with those of the model, and on which nothing of the model acts.
+    left_out: Vec<String>,
     layout: Layout,
     model: NoiseModel,
     coefficients: Vec<Coefficient>,
@@ -123,14 +124,15 @@ fn before_link() -> PluginError {
 
 impl Linked {
     fn new(stage: &QpCheck, available: &Available, link: &mut Link<'_>) -> Result<Self, PluginError> {
-        let channels: Vec<&Column> = available.of_kind("channel").collect();
-        let Some(rate_hz) = channels.first().map(|c| c.rate_hz) else {
+        let all: Vec<&Column> = available.of_kind("channel").collect();
+        let Some(rate_hz) = all.first().map(|c| c.rate_hz) else {
             return Err(PluginError::error(
                 "qp-check finds no channel to explain: put a stage before it that makes some, such as hinf-dfacs or accelerometer",
             ));
         };
-        let measured: Vec<Measured> = channels.iter().map(|c| measured(c)).collect::<Result<_, _>>()?;
         let regressors: Vec<&Column> = available.of_kind("regressor").collect();
+        let (channels, left_out) = modelled(&stage.mission, &all, &regressors, rate_hz)?;
+        let measured: Vec<Measured> = channels.iter().map(|c| measured(c)).collect::<Result<_, _>>()?;
         let position = |column: &Column, key: &str, found: Option<usize>| {
             found.ok_or_else(|| {
                 let wanted = column.attribute(key);
@@ -165,9 +167,7 @@ impl Linked {
             regressors: map,
             coefficients: available.coefficients.iter().map(|c| c.name.clone()).collect(),
         };
-        let noise: Vec<(&str, Measured)> =
-            layout.channels.iter().map(String::as_str).zip(measured.iter().copied()).collect();
-        let model = NoiseModel::new(&stage.mission, &noise, 1.0 / rate_hz)?;
+        let model = noise_model(&stage.mission, &channels, rate_hz)?;
         let length = longest_length((stage.segment_s * rate_hz).round() as usize);
         let analyser = Analyser::new(Plan::new(length, rate_hz), &layout);
         let averaged = std::iter::repeat_n(false, layout.channels.len())
@@ -178,6 +178,7 @@ impl Linked {
             signature: format!("{} in segments of {length} samples at {rate_hz} Hz", names.join(", ")),
             columns,
             names,
+            left_out,
             model,
             bounds: bounds(available),
             coefficients: available.coefficients.clone(),
@@ -192,33 +193,38 @@ impl Linked {
 
     fn report(&mut self, earlier: &[Report]) -> Result<Report, PluginError> {
         let mut report = Report::default();
-        report.counts.insert("epochs_in_segments".to_owned(), self.segmenter.state.covered);
         for c in &self.model.unknown {
             report.notes.push(format!("{}: {UNKNOWN_NOISE}", self.layout.channels[*c]));
         }
         let unknowns: Vec<Unknown> = self.coefficients.iter().map(unknown).collect();
-        let sums = self.all_sums();
-        let solution = match self.shortened(&sums, &mut report) {
-            None if sums.total.segments == 0 => {
-                self.no_solution(&mut report);
-                return Ok(report);
-            }
-            None => estimate(
-                &sums,
-                self.analyser.plan(),
-                &self.layout,
-                &self.model,
-                &unknowns,
-                &self.bounds,
-                self.refinements,
-            )?,
-            Some((analyser, sums)) => {
-                let plan = analyser.plan();
-                let covered = plan.hop() as u64 * (sums.total.segments + 1);
-                report.counts.insert("epochs_in_segments".to_owned(), covered);
-                estimate(&sums, plan, &self.layout, &self.model, &unknowns, &self.bounds, self.refinements)?
-            }
-        };
+        if !self.left_out.is_empty() {
+            report.notes.push(format!(
+                "{}: nothing in the model acts on them, so they are left out; as witnesses of the thrusters' noise they would lend \
+                 others what the model does not say of them",
+                self.left_out.join(", ")
+            ));
+        }
+        // The open run ends here for this answer alone: a later run goes on with it.
+        let mut sums = self.all_sums();
+        let mut segmenter = self.segmenter.clone();
+        segmenter.end_run(&mut self.analyser, &mut sums);
+        if self.sums.total.segments == 0 {
+            self.sums = sums.clone();
+        }
+        report.counts.insert("epochs_in_segments".to_owned(), segmenter.state.covered);
+        if sums.total.segments == 0 {
+            self.no_solution(&mut report);
+            return Ok(report);
+        }
+        let solution = estimate(
+            &sums,
+            self.analyser.plan(),
+            &self.layout,
+            &self.model,
+            &unknowns,
+            &self.bounds,
+            self.refinements,
+        )?;
         self.describe(&solution, earlier, &mut report);
         Ok(report)
     }
@@ -226,36 +232,16 @@ impl Linked {
     /// Sums of this run and of those whose state it took over.
     fn all_sums(&self) -> Sums {
         let mut sums = self.earlier.clone();
-        sums.add(&self.sums);
+        sums.add(self.analyser.plan(), &self.sums);
         sums
-    }
-
-    /// Sums over shorter segments when no run was as long as one.
-    fn shortened(&mut self, sums: &Sums, report: &mut Report) -> Option<(Analyser, Sums)> {
-        if sums.total.segments > 0 {
-            return None;
-        }
-        let (wanted, rate_hz) = (self.analyser.plan().length, self.analyser.plan().rate_hz);
-        let run = self.segmenter.longest_run(sums);
-        let samples = run.first().map_or(0, Vec::len);
-        let length = shorter_length(samples)?;
-        let mut analyser = Analyser::new(Plan::new(length, rate_hz), &self.layout);
-        let sums = cut(run, &self.layout, &mut analyser);
-        report.notes.push(format!(
-            "no stretch without a gap holds a segment of {wanted} samples; the longest, {samples} samples, was cut into {} segments \
-             of {length}",
-            sums.total.segments
-        ));
-        Some((analyser, sums))
     }
 
     /// Too short for any spectrum: a sentence, not a number.
     fn no_solution(&self, report: &mut Report) {
         let state = &self.segmenter.state;
-        let samples = state.longest.first().map_or(0, Vec::len);
         let mut sentence = format!(
-            "the longest stretch in which every channel and regressor has a value is {samples} of {} epochs: too short for a spectrum",
-            state.rows
+            "every channel and regressor has a value in {} of {} epochs, and nowhere in {} of them in a row: too few for a spectrum",
+            state.valid, state.rows, SHORTEST
         );
         if let Some((j, missing)) = state.missing.iter().enumerate().max_by_key(|(j, n)| (**n, std::cmp::Reverse(*j)))
             && *missing > 0
@@ -297,14 +283,15 @@ impl Linked {
         // With Σ from the residuals the ratio is 1 by construction; only the mission's Σ can be contradicted.
         report.chi2_per_dof = Some(quality.chi2_per_dof_modelled_sigma);
         report.weak_directions = solution.weak.iter().map(|d| d.sentence.clone()).collect();
-        let weak = !solution.weak.is_empty();
-        let verdict = match (weak, disagreeing.is_empty() && insane.is_empty()) {
-            (true, _) => "weak",
-            (false, true) => "agree",
-            (false, false) => "disagree",
+        // What is wrong must not hide behind what is not known.
+        let consistent = disagreeing.is_empty() && insane.is_empty();
+        let verdict = match (consistent, solution.weak.is_empty()) {
+            (false, _) => "disagree",
+            (true, false) => "weak",
+            (true, true) => "agree",
         };
         report.verdict = Some(verdict.into());
-        report.inconsistent = !insane.is_empty() || verdict == "disagree";
+        report.inconsistent = !consistent;
         report.notes.extend(insane);
         if compared.is_empty() {
             report.notes.push("no solution of es-akf to compare with: the verdict rests on the QP alone".into());
@@ -404,7 +391,7 @@ impl Linked {
         ];
         report.quality.extend(entries.into_iter().map(|(k, v)| (k.to_owned(), v)));
         let state = &self.segmenter.state;
-        report.counts = BTreeMap::from([
+        report.counts.extend([
             ("segments".to_owned(), solution.normal.segments),
             ("epochs".to_owned(), state.rows),
             ("epochs_without_every_value".to_owned(), state.rows - state.valid),
@@ -468,6 +455,27 @@ fn pull_sentence(p: &Pull) -> String {
         p.multiplier,
         p.unit
     )
+}
+
+/// The channels to weigh, and the names of those left out: where noise is shared, a channel on which no regressor acts is a
+/// witness whose own model is empty.
+fn modelled<'a>(
+    mission: &Mission,
+    channels: &[&'a Column],
+    regressors: &[&Column],
+    rate_hz: f64,
+) -> Result<(Vec<&'a Column>, Vec<String>), PluginError> {
+    let group = noise_model(mission, channels, rate_hz)?.groups();
+    let acted_on = |c: &Column| regressors.iter().any(|r| r.attribute("channel") == name_of(c));
+    let with_effects: Vec<usize> = channels.iter().zip(&group).filter(|(c, _)| acted_on(c)).map(|(_, g)| *g).collect();
+    let (kept, left): (Vec<_>, Vec<_>) =
+        channels.iter().copied().zip(&group).partition(|(c, g)| acted_on(c) || !with_effects.contains(g));
+    Ok((kept.into_iter().map(|(c, _)| c).collect(), left.into_iter().map(|(c, _)| name_of(c).to_owned()).collect()))
+}
+
+fn noise_model(mission: &Mission, channels: &[&Column], rate_hz: f64) -> Result<NoiseModel, PluginError> {
+    let noise = channels.iter().map(|c| Ok((name_of(c), measured(c)?))).collect::<Result<Vec<_>, PluginError>>()?;
+    Ok(NoiseModel::new(mission, &noise, 1.0 / rate_hz)?)
 }
 
 fn name_of(channel: &Column) -> &str {
