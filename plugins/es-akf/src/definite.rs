@@ -19,19 +19,19 @@ pub enum Finding {
     NotFinite,
 }
 
-/// Tests the lower triangle of the leading `n×n` block and, when it is indefinite, replaces it by the nearest positive
+/// Tests the upper triangle of the leading `n×n` block and, when it is indefinite, replaces it by the nearest positive
 /// semidefinite matrix in the metric of its own diagonal, mirrored.
 ///
 /// The test is one Cholesky factorisation of the matrix scaled to a unit diagonal plus 1e-9 of the identity; the
 /// eigenvalues are computed only when that fails.
 pub fn repair<const N: usize>(matrix: &mut Matrix<N>, n: usize) -> Finding {
     let m = &mut *matrix.0;
-    if (0..n).any(|i| m[i][..=i].iter().any(|x| !x.is_finite())) {
+    if (0..n).any(|i| m[i][i..n].iter().any(|x| !x.is_finite())) {
         return Finding::NotFinite;
     }
     let scale: Vec<f64> = (0..n).map(|i| m[i][i].abs().sqrt()).collect();
     let scaled = DMatrix::from_fn(n, n, |i, j| {
-        let (i, j) = (i.max(j), i.min(j));
+        let (i, j) = (i.min(j), i.max(j));
         let by = scale[i] * scale[j];
         if by > 0.0 { m[i][j] / by } else { 0.0 }
     });

@@ -21,7 +21,9 @@
 //! force drives `r` and `v`), so a `Q̂` that adapts by elements is found slightly indefinite nearly every time.
 
 use crate::definite::{Finding, repair};
-use crate::kernel::{Columns, Mat3, Matrix, Transition, adapt, advance, advance_with_foreign_gain, inverse, mix};
+use crate::kernel::{
+    Columns, Mat3, Matrix, Transition, adapt, add_noise, advance, advance_with_foreign_gain, inverse, mix,
+};
 use crate::model::{BIAS, Model, R, THETA, V};
 use crate::state::{Bytes, StateError, Words};
 
@@ -116,13 +118,15 @@ pub struct Filter<const N: usize> {
     settings: Settings,
     transition: Transition<N>,
     design_q: Matrix<N>,
-    /// Entries of the lower triangle of `Q` that are not zero.
+    /// Entries of the upper triangle of `Q` that are not zero.
     noisy: Vec<(usize, usize)>,
+    /// Entries of the upper triangle of `Q̂` that can be other than zero.
+    moving: Vec<(usize, usize)>,
     /// `X̂⁺`.
     x: [f64; N],
     /// `P_k`: covariance of the last epoch's `X̂⁻`.
     p: Matrix<N>,
-    /// `Q̂_k`, lower triangle; what stands above it is not used.
+    /// `Q̂_k`, upper triangle; what stands below it is not used.
     q: Matrix<N>,
     /// `R̂_k`.
     r: Mat3,
@@ -173,6 +177,7 @@ impl<const N: usize> Filter<N> {
             transition: Transition::new(&model),
             design_q: Matrix::zero(),
             noisy: Vec::new(),
+            moving: Vec::new(),
             x: [0.0; N],
             p: Matrix::zero(),
             q: Matrix::zero(),
@@ -199,8 +204,13 @@ impl<const N: usize> Filter<N> {
         };
         let design_q = &mut filter.design_q;
         filter.model.process_noise(|i, j, value| design_q.0[i][j] = value);
-        let lower = (0..N).flat_map(|i| (0..=i).map(move |j| (i, j)));
-        filter.noisy = lower.filter(|&(i, j)| design_q.0[i][j] != 0.0).collect();
+        let n = filter.model.states();
+        let upper = || (0..n).flat_map(|i| (i..n).map(move |j| (i, j)));
+        filter.noisy = upper().filter(|&(i, j)| design_q.0[i][j] != 0.0).collect();
+        filter.moving = match settings.adaptation {
+            Adaptation::Monotone | Adaptation::Off => filter.noisy.clone(),
+            Adaptation::Innovation | Adaptation::Residual => upper().collect(),
+        };
         filter.begin_covariances();
         for (j, c) in filter.model.coefficients.iter().enumerate() {
             filter.x[THETA + j] = c.initial;
@@ -296,29 +306,30 @@ impl<const N: usize> Filter<N> {
         let w = mix(&self.weight, &m);
         if self.adapt {
             let y = mix(&self.s_hat, &self.gain);
-            let (alpha, q, n) = (self.settings.forgetting, &mut self.q, self.model.states());
+            let (alpha, q, entries) = (self.settings.forgetting, &mut self.q, &self.moving);
             let (by_w, by_k) = ([&w, &m], [&y, &self.gain]);
-            let all = (0..n).flat_map(|i| (0..=i).map(move |j| (i, j)));
             match self.settings.adaptation {
                 // min{|·|, 0} = 0: what is no noise in the model never becomes one.
-                Adaptation::Monotone => adapt(q, self.noisy.iter().copied(), by_w, by_k, |q, q_iter, _| {
+                Adaptation::Monotone => adapt(q, entries, by_w, by_k, |q, q_iter, _| {
                     let size = q_iter.abs();
                     alpha * q + (1.0 - alpha) * if size < q { size } else { q }
                 }),
                 Adaptation::Innovation => {
-                    adapt(q, all, by_w, by_k, |q, q_iter, _| alpha * q + (1.0 - alpha) * q_iter);
+                    adapt(q, entries, by_w, by_k, |q, q_iter, _| alpha * q + (1.0 - alpha) * q_iter);
                 }
-                Adaptation::Residual => adapt(q, all, by_w, by_k, |q, _, ksk| alpha * q + (1.0 - alpha) * ksk),
+                Adaptation::Residual => adapt(q, entries, by_w, by_k, |q, _, ksk| alpha * q + (1.0 - alpha) * ksk),
                 Adaptation::Off => {}
             }
         }
-        advance(&mut self.p, product, &w, &m, &self.q);
+        add_noise(product, &self.q, &self.moving);
+        advance(&mut self.p, product, &w, &m);
         if !follows {
             return;
         }
         self.transition.conjugate(&self.p_design, product);
+        add_noise(product, &self.design_q, &self.noisy);
         let m = self.transition.columns(&self.seen_design);
-        advance_with_foreign_gain(&mut self.p_design, product, &w, &m, &self.s_design, &self.design_q);
+        advance_with_foreign_gain(&mut self.p_design, product, &w, &m, &self.s_design);
     }
 
     /// The covariance `P̃` of the gains in use under the mission's noise; `P` itself when nothing adapts.
@@ -585,7 +596,7 @@ impl<const N: usize> Filter<N> {
     /// `Q̂[i][j]`.
     #[must_use]
     pub fn process_noise(&self, i: usize, j: usize) -> f64 {
-        self.q.0[i.max(j)][i.min(j)]
+        self.q.0[i.min(j)][i.max(j)]
     }
 
     /// `R̂`.
