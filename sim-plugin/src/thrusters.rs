@@ -1,6 +1,7 @@
 //! What the thrusters make of a command: range, step, delay and lag, along each axis or in each unit of a layout; in a
 //! layout each unit's noise pushes and turns the spacecraft at once.
 
+use dragfree_physics::lag::Lag;
 use dragfree_physics::mission::{self, MissionError};
 use dragfree_physics::noise::NoiseShape;
 use dragfree_physics::process::NoiseProcess;
@@ -168,46 +169,6 @@ fn least_norm(wrenches: &DMatrix<f64>) -> DMatrix<f64> {
     wrenches.clone().pseudo_inverse(1e-9).unwrap_or_else(|_| DMatrix::zeros(wrenches.ncols(), 6))
 }
 
-/// Delay and first-order lag of a command that holds from sample to sample, exactly: `τ ẏ = u(t − delay) − y`.
-#[derive(Clone, Debug)]
-struct Lag {
-    /// Whole samples of the delay, and the rest as a part of one.
-    samples: usize,
-    part: f64,
-    /// Until a part of the sample is over the older command holds, then the newer one: for both stretches how much of
-    /// `y − u` is left at its end, and in its mean.
-    left: [f64; 2],
-    mean: [f64; 2],
-}
-
-impl Lag {
-    fn new(lag_s: f64, delay_s: f64, dt_s: f64) -> Self {
-        let delay = delay_s / dt_s;
-        // A delay of whole samples must not become one less and a rest.
-        let samples = (delay + 1e-9).floor();
-        let part = (delay - samples).max(0.0);
-        let left = |stretch: f64| if lag_s > 0.0 { (-stretch * dt_s / lag_s).exp() } else { 0.0 };
-        let mean = |stretch: f64| {
-            let x = stretch * dt_s / lag_s;
-            if lag_s > 0.0 && x > 0.0 { -(-x).exp_m1() / x } else { 0.0 }
-        };
-        let stretches = [part, 1.0 - part];
-        Self { samples: samples as usize, part, left: stretches.map(left), mean: stretches.map(mean) }
-    }
-
-    /// The mean over a sample, and `y` moved on to its end.
-    fn step(&self, y: &mut f64, older: f64, newer: f64) -> f64 {
-        let mut mean = 0.0;
-        for (i, (u, stretch)) in [(older, self.part), (newer, 1.0 - self.part)].into_iter().enumerate() {
-            if stretch > 0.0 {
-                mean += stretch * (u + (*y - u) * self.mean[i]);
-                *y = u + (*y - u) * self.left[i];
-            }
-        }
-        mean
-    }
-}
-
 /// The units of a layout at work.
 #[derive(Clone, Debug)]
 struct Units {
@@ -273,7 +234,7 @@ impl Thrusters {
         if self.waiting.is_empty() {
             // Before the first command, it has been there for ever.
             self.y = command.clone();
-            self.waiting.extend(std::iter::repeat_n(command.clone(), self.lag.samples + 1));
+            self.waiting.extend(std::iter::repeat_n(command.clone(), self.lag.samples() + 1));
         }
         self.waiting.push_back(command);
         let (older, newer) = (&self.waiting[0], &self.waiting[1]);
@@ -328,7 +289,7 @@ impl Thrusters {
     #[must_use]
     pub fn load(&mut self, saved: SavedThrusters) -> bool {
         let n = self.y.len();
-        let queue = [0, self.lag.samples + 1].contains(&saved.waiting.len());
+        let queue = [0, self.lag.samples() + 1].contains(&saved.waiting.len());
         if saved.y.len() != n || !queue || saved.waiting.iter().any(|w| w.len() != n) {
             return false;
         }

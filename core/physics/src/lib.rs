@@ -9,6 +9,7 @@ pub mod control_design;
 pub mod decoupling;
 pub mod frames;
 pub mod hinf;
+pub mod lag;
 pub mod lti;
 pub mod mission;
 pub mod noise;
