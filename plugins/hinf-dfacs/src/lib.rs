@@ -1,6 +1,7 @@
 //! Stage `hinf-dfacs`: the known specific force `û_i`, the unbiased angular acceleration `α̂`, the rate `ω̂` and the
 //! nine channels (Section IV; ARCHITECTURE.md, table `reconstruction`).
 
+mod acting;
 pub mod known;
 mod plugin;
 pub mod reconstruction;

@@ -286,6 +286,13 @@ impl Stage for HinfDfacs {
         let ephemeris_age = link.read_if_available(available, &grid("ephemeris.age_s", "s", ""))?;
         let omega_crf = read_vector(available, link, "ephemeris.omega_crf_rad_s", "rad s-1", "CRF")?;
         let alpha_crf = read_vector(available, link, "ephemeris.alpha_crf_rad_s2", "rad s-2", "CRF")?;
+        let sensing = self.mission.noise.dws_long_arm.as_ref().map(|n| n.shape());
+        if sensing.is_some_and(|shape| shape.coloured().any(|term| term.exponent > 4)) {
+            self.notes.push(
+                "noise.dws_long_arm rises with an exponent above 4, which the estimate of the angular acceleration leaves out"
+                    .to_owned(),
+            );
+        }
         if sun.is_none() && self.mission.solar_pressure.is_some() {
             self.notes.push(
                 "no direction of the Sun in /ephemeris: sunlight is not modelled, and the known forces lack it"
@@ -356,6 +363,7 @@ impl Stage for HinfDfacs {
             ("commands_missing", counts.commands_missing),
             ("sun_direction_missing", counts.sun_missing),
             ("attitude_missing", counts.attitude_missing),
+            ("angular_acceleration_unknown", counts.blind),
         ] {
             report.counts.insert(name.to_owned(), count);
         }

@@ -2,15 +2,17 @@
 
 use dragfree_physics::control::ControlLaw;
 use dragfree_physics::mission::{Mission, MissionError};
-use nalgebra::Vector3;
+use dragfree_physics::thrust_noise::ThrustNoise;
+use nalgebra::{Matrix3, Vector3};
 
+use crate::acting::Acting;
 use crate::known::{KnownModel, KnownMotion};
 use crate::replay::{CommandNumbers, Comparison, Held, ReadoutNumbers, Replay, command_from};
 use crate::smoother::{Model, Smoothed, Smoother};
 use crate::state::{Reader, StateError, Writer};
 
 const NEEDED_BY: &str = "hinf-dfacs";
-const STATE: &[u8; 8] = b"dfacs/2\n";
+const STATE: &[u8; 8] = b"dfacs/3\n";
 
 /// Where the angular acceleration comes from. Only the smoother gives an unbiased calibration (physics.md §4).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -89,6 +91,8 @@ pub struct Counts {
     pub sun_missing: u64,
     /// Without the spacecraft's attitude.
     pub attitude_missing: u64,
+    /// So far from any attitude that nothing but the command is known of the angular acceleration.
+    pub blind: u64,
 }
 
 /// An epoch that waits for the smoother.
@@ -136,16 +140,21 @@ pub struct Reconstruction {
     angular_acceleration: AngularAcceleration,
     needs_sun: bool,
     known: KnownModel,
+    /// `−T_S^{O_i} C J/m_S`: the acceleration of each test mass, ORF, by the force that comes with the thrusters' torque, from
+    /// what that torque does to the spacecraft, SRF; m s⁻² per rad s⁻².
+    push_per_turn: [Matrix3<f64>; 2],
     smoother: Smoother,
-    lag: usize,
     replay: Option<Replay>,
     held: Held,
+    acting: Acting,
     /// At the epoch, and as the last packet told it: on board the feed-forward holds the packet.
     sun_srf: Option<Vector3<f64>>,
     packet_sun_srf: Option<Vector3<f64>>,
     omega_ci_rad_s: Vector3<f64>,
     alpha_ci_rad_s2: Vector3<f64>,
     pending: Vec<Pending>,
+    /// Samples from the last attitude to the last epoch that left; infinite before the first.
+    since_attitude: f64,
     /// The epoch before the first pending one.
     previous: Option<Pending>,
     counts: Counts,
@@ -155,13 +164,25 @@ fn finite(v: &Vector3<f64>) -> Option<Vector3<f64>> {
     v.iter().all(|x| x.is_finite()).then_some(*v)
 }
 
-/// White level of a noise table, above zero.
-fn white(psd: f64, key: &str) -> Result<f64, MissionError> {
-    if psd > 0.0 {
-        return Ok(psd);
+/// The smoother's model: what the thrusters' noise does to the angular acceleration, and what the sensors see of it.
+fn model(mission: &Mission, noise: &ThrustNoise, rate_hz: f64) -> Result<Model, MissionError> {
+    let inverse = mission.spacecraft.inertia_inverse();
+    let torque = noise.torque * noise.torque_shape.white_psd();
+    let sensing = Mission::need(&mission.noise.dws_long_arm, "noise.dws_long_arm", NEEDED_BY)?.shape();
+    let refuse = |key: &str, psd: f64| {
+        let reason = "must be above zero: it is what weighs wavefront sensing against commands";
+        Err(MissionError::Value { key: key.to_owned(), value: psd.sqrt().to_string(), reason })
+    };
+    let levels = torque.symmetric_eigenvalues();
+    if levels.min() <= 1e-9 * levels.max() {
+        let units = mission.thrusters.as_ref().is_some_and(|t| !t.unit.is_empty());
+        let key = if units { "thrusters.unit.asd_n_rthz" } else { "noise.thruster_torque.asd_nm_rthz" };
+        return refuse(key, levels.min().max(0.0));
     }
-    let reason = "must be above zero: it is what weighs wavefront sensing against commands";
-    Err(MissionError::Value { key: key.to_owned(), value: psd.sqrt().to_string(), reason })
+    if sensing.white_psd() <= 0.0 {
+        return refuse("noise.dws_long_arm.asd_rad_rthz", 0.0);
+    }
+    Ok(Model::new(&(inverse * torque * inverse.transpose()), &sensing, 1.0 / rate_hz))
 }
 
 impl Reconstruction {
@@ -171,15 +192,14 @@ impl Reconstruction {
     /// [`MissionError`] when the mission lacks test masses, the noise of the thrusters' torque or of the long-arm
     /// wavefront sensing, or, with `settings.replay`, a control law.
     pub fn new(mission: &Mission, settings: &Settings) -> Result<Self, MissionError> {
-        let n = &mission.noise;
-        let torque = Mission::need(&n.thruster_torque, "noise.thruster_torque", NEEDED_BY)?.shape().white_psd();
-        let sensing = Mission::need(&n.dws_long_arm, "noise.dws_long_arm", NEEDED_BY)?.shape().white_psd();
-        let model = Model::new(
-            &mission.spacecraft.inertia(),
-            white(torque, "noise.thruster_torque.asd_nm_rthz")?,
-            white(sensing, "noise.dws_long_arm.asd_rad_rthz")?,
-            1.0 / settings.rate_hz,
-        );
+        let missing = || MissionError::Missing { section: "noise.thruster_torque".to_owned(), needed_by: NEEDED_BY };
+        let noise = ThrustNoise::of(mission).filter(|n| !n.torque_shape.terms.is_empty()).ok_or_else(missing)?;
+        let model = model(mission, &noise, settings.rate_hz)?;
+        let push_per_turn = |name: &str| -> Result<Matrix3<f64>, MissionError> {
+            let dcm_orf_from_srf = mission.test_mass(name, NEEDED_BY)?.dcm_orf_from_srf();
+            let force_per_turn = noise.force_per_torque * mission.spacecraft.inertia();
+            Ok(dcm_orf_from_srf * force_per_turn / -mission.spacecraft.mass_kg)
+        };
         let replay = if settings.replay {
             Some(Replay::new(ControlLaw::new(mission)?, !settings.commands, settings.warm_up_s, settings.rate_hz))
         } else {
@@ -189,16 +209,18 @@ impl Reconstruction {
             rate_hz: settings.rate_hz,
             angular_acceleration: settings.angular_acceleration,
             needs_sun: settings.sun && mission.solar_pressure.is_some(),
+            push_per_turn: [push_per_turn("tm1")?, push_per_turn("tm2")?],
             known: KnownModel::new(mission)?,
-            lag: model.lag(),
             smoother: Smoother::new(model),
             replay,
             held: Held::new(),
+            acting: Acting::new(mission, 1.0 / settings.rate_hz),
             sun_srf: None,
             packet_sun_srf: None,
             omega_ci_rad_s: Vector3::zeros(),
             alpha_ci_rad_s2: Vector3::zeros(),
             pending: Vec::new(),
+            since_attitude: f64::INFINITY,
             previous: None,
             counts: Counts::default(),
         })
@@ -241,8 +263,8 @@ impl Reconstruction {
             frame_rad_s2,
             omega_ci_rad_s: self.omega_ci_rad_s,
         });
-        if self.smoother.waiting() == 2 * self.lag {
-            self.emit(self.lag, rows);
+        if self.smoother.waiting() == 2 * self.lag() {
+            self.emit(self.lag(), rows);
         }
         Ok(())
     }
@@ -268,20 +290,31 @@ impl Reconstruction {
             (None, None) => &mut self.counts.commands_missing,
         };
         *counter += 1;
+        let told = flown.copied().or(replayed);
+        let thrust = self.acting.act(told.as_ref().and_then(|numbers| numbers.first_chunk().copied()));
+        let command = told.zip(thrust).map(|(mut numbers, thrust)| {
+            numbers[..6].copy_from_slice(&thrust);
+            command_from(&numbers)
+        });
         if self.needs_sun && self.sun_srf.is_none() {
             self.counts.sun_missing += 1;
             return Ok(None);
         }
-        let command = flown.copied().or(replayed).map(|numbers| command_from(&numbers));
         let readout = self.held.test_masses();
         Ok(command.map(|c| self.known.motion(&c, self.sun_srf.as_ref(), &readout, omega_srf_rad_s)))
     }
 
     fn emit(&mut self, count: usize, rows: &mut Vec<Row>) {
         let smoothed = self.smoother.smooth(count);
+        for (pending, smoothed) in self.pending.iter_mut().zip(&smoothed) {
+            for (u, push) in pending.u_orf_m_s2.iter_mut().zip(&self.push_per_turn) {
+                *u += push * smoothed.noise_rad_s2;
+            }
+        }
+        let blind = self.blind(smoothed.len());
         rows.reserve(smoothed.len());
-        for (k, smoothed) in smoothed.iter().enumerate() {
-            rows.push(self.row(k, smoothed));
+        for (k, (smoothed, blind)) in smoothed.iter().zip(blind).enumerate() {
+            rows.push(self.row(k, smoothed, blind));
         }
         if let Some(last) = smoothed.len().checked_sub(1) {
             self.previous = Some(self.pending[last]);
@@ -289,12 +322,34 @@ impl Reconstruction {
         self.pending.drain(..smoothed.len());
     }
 
-    fn row(&self, k: usize, smoothed: &Smoothed) -> Row {
+    /// Whether each of the `count` oldest pending epochs is further from every attitude than the smoother remembers. What is
+    /// left of `α̂` there is the command, which answers the very disturbance that it lacks: it would bias the calibration.
+    fn blind(&mut self, count: usize) -> Vec<bool> {
+        let sensed = |pending: &Pending| pending.attitude_rad.iter().all(|x| x.is_finite());
+        let memory = self.smoother.model().memory();
+        let mut blind = vec![false; count];
+        let mut ahead = f64::INFINITY;
+        for (k, pending) in self.pending.iter().enumerate().rev() {
+            ahead = if sensed(pending) { 0.0 } else { ahead + 1.0 };
+            if let Some(blind) = blind.get_mut(k) {
+                *blind = ahead > memory;
+            }
+        }
+        for (pending, blind) in self.pending.iter().zip(&mut blind) {
+            self.since_attitude = if sensed(pending) { 0.0 } else { self.since_attitude + 1.0 };
+            *blind &= self.since_attitude > memory;
+            self.counts.blind += u64::from(*blind);
+        }
+        blind
+    }
+
+    fn row(&self, k: usize, smoothed: &Smoothed, blind: bool) -> Row {
         let now = &self.pending[k];
         let before = if k == 0 { self.previous.as_ref() } else { Some(&self.pending[k - 1]) };
         let after = self.pending.get(k + 1);
         let missing = Vector3::from_element(f64::NAN);
         let alpha = match self.angular_acceleration {
+            AngularAcceleration::Smoother if blind => missing,
             AngularAcceleration::Smoother => now.alpha_known_rad_s2 + smoothed.disturbance_rad_s2,
             AngularAcceleration::Commanded => now.alpha_known_rad_s2,
             AngularAcceleration::SecondDifference => match (before, after, self.pending.get(k + 2)) {
@@ -353,7 +408,7 @@ impl Reconstruction {
     /// Samples by which a row is late at least; at most twice as many.
     #[must_use]
     pub fn lag(&self) -> usize {
-        self.lag
+        self.smoother.model().lag()
     }
 
     /// The whole state.
@@ -362,6 +417,7 @@ impl Reconstruction {
         let mut out = Writer(STATE.to_vec());
         self.smoother.save(&mut out);
         self.held.save(&mut out);
+        self.acting.save(&mut out);
         out.optional(self.sun_srf.as_ref().map(Vector3::as_slice));
         out.optional(self.packet_sun_srf.as_ref().map(Vector3::as_slice));
         out.numbers(self.omega_ci_rad_s.as_slice());
@@ -377,9 +433,11 @@ impl Reconstruction {
             c.commands_missing,
             c.sun_missing,
             c.attitude_missing,
+            c.blind,
         ] {
             out.count(count);
         }
+        out.numbers(&[self.since_attitude]);
         out.flag(self.previous.is_some());
         for pending in self.previous.iter().chain(&self.pending) {
             out.time(pending.time_ns);
@@ -395,10 +453,11 @@ impl Reconstruction {
     pub fn load(&mut self, bytes: &[u8]) -> Result<(), StateError> {
         let mut state = Reader::new(bytes);
         if state.bytes().ok().as_ref() != Some(STATE) {
-            return Err(StateError::Foreign { expected: "version 2" });
+            return Err(StateError::Foreign { expected: "version 3" });
         }
         self.smoother.load(&mut state)?;
         self.held.load(&mut state)?;
+        self.acting.load(&mut state)?;
         self.sun_srf = state.optional()?.map(Vector3::from);
         self.packet_sun_srf = state.optional()?.map(Vector3::from);
         state.numbers(self.omega_ci_rad_s.as_mut_slice())?;
@@ -414,9 +473,13 @@ impl Reconstruction {
             &mut c.commands_missing,
             &mut c.sun_missing,
             &mut c.attitude_missing,
+            &mut c.blind,
         ] {
             *count = state.count()?;
         }
+        let mut since = [0.0];
+        state.numbers(&mut since)?;
+        [self.since_attitude] = since;
         self.previous = if state.flag()? { Some(Pending::load(&mut state)?) } else { None };
         self.pending.clear();
         for _ in 0..self.smoother.waiting() {

@@ -7,12 +7,15 @@
 //! the truth regressed on the result has slope one. Commands are no extra information: they are known functions of past
 //! readouts.
 //!
-//! The torque noise has one level on all axes and so has the sensing: `J⁻¹ S_M J⁻ᵀ` and `S_n 1` are diagonal
-//! together in the principal axes of `J`, and the three axes decouple exactly.
+//! `J⁻¹ S_M J⁻ᵀ` is symmetric and the sensing is alike about all axes, so that in the eigenvectors of the former, here
+//! called principal axes, the three axes decouple exactly. With one level of torque noise they are those of `J`.
 //!
-//! The sensing's rise below 2 mHz is not in the model. There the smoother has `1 − W < 1e-6` with it or without it:
-//! the disturbance is 10³ times above the sensing, and `w` is measured as well as it can be.
+//! The sensing's coloured noise needs no states. A term of exponent 4 is white noise twice integrated, as `θ` is, one of
+//! exponent 2 once: what the sensors see, `z = θ + n`, is again a double integrator, with more noise on it. The filter runs
+//! on `z` and its rate; the adjoint recursion tells `w` from `n` by what each adds in a step. Without a leak that is the
+//! exact posterior; a leak moves it by about its decay over the filter's memory.
 
+use dragfree_physics::noise::NoiseShape;
 use nalgebra::{Matrix3, Vector3};
 use std::f64::consts::TAU;
 
@@ -27,6 +30,8 @@ const PRIOR: [f64; 3] = [1e-2, 1e-4, 1e-6];
 /// The lag in time constants of the filter. What lies beyond it would add `e⁻²⁰` of `w`, to be compared with the
 /// loop's own suppression of `α` against `w`, 1e-4 at 1 mHz.
 const LAG_TIME_CONSTANTS: f64 = 20.0;
+/// Longest lag, s, so that sensing that tells next to nothing does not hold back a day: 40 MB at 10 Hz.
+const MOST_LAG_S: f64 = 3600.0;
 
 /// An innovation says something about the noise when the attitude was predicted to within so many variances of a
 /// readout: not after a missing command, when the wide prior expects anything.
@@ -45,33 +50,53 @@ pub struct Model {
     disturbance_variance: Axes,
     /// Variance of the step of `β` from one sample to the next, rad² s⁻⁴.
     drift_variance: Axes,
-    /// Variance of a readout, rad².
+    /// Variance of the white part of a readout, rad².
     readout_variance: f64,
+    /// What the coloured part of the readouts adds in a step to `z` and its rate, `zz`, `zω`, `ωω`; rad², rad² s⁻¹,
+    /// rad² s⁻².
+    wander: [f64; 3],
+    /// Samples after which the filter has forgotten all but `1/e`.
+    memory: f64,
     lag: usize,
 }
 
 impl Model {
-    /// Builds the model from the inertia (SRF, kg m²), the one-sided PSD of the torque noise per axis (N² m²/Hz) and
-    /// of the attitude readout per axis (rad²/Hz), and the sample interval.
+    /// Builds the model from the one-sided PSD of the angular acceleration by the torque noise, `J⁻¹ S_M J⁻ᵀ` (SRF,
+    /// rad² s⁻⁴/Hz), the noise of the attitude readout per axis (rad), and the sample interval. Of the readout's terms
+    /// those of exponent 0, 2 and 4 are in the model.
     #[must_use]
-    pub fn new(inertia_kg_m2: &Matrix3<f64>, torque_psd: f64, readout_psd: f64, dt_s: f64) -> Self {
-        let eigen = inertia_kg_m2.symmetric_eigen();
+    pub fn new(disturbance_psd: &Matrix3<f64>, readout: &NoiseShape, dt_s: f64) -> Self {
+        let eigen = disturbance_psd.symmetric_eigen();
         // A one-sided PSD S, sampled at f_s, has the variance S f_s/2.
         let per_sample = 0.5 / dt_s;
-        let disturbance_psd: Axes = std::array::from_fn(|i| torque_psd / eigen.eigenvalues[i].powi(2));
+        let disturbance_psd: Axes = std::array::from_fn(|i| eigen.eigenvalues[i]);
         let drift_step = TAU * DRIFT_CORNER_HZ * dt_s;
-        // Poles at (S_w/S_n)^(1/4) rad/s, damped by 1/√2.
+        // S_2 and S_4 of the coloured part's one-sided PSD, S_2/ω² + S_4/ω⁴; half of them are the intensities of its drives.
+        let drive = |exponent: u32| -> f64 {
+            let terms = readout.coloured().filter(|t| t.exponent == exponent);
+            terms.map(|t| t.asd.powi(2) * (TAU * t.corner_hz).powi(exponent.cast_signed())).sum()
+        };
+        let (once, twice) = (drive(2), drive(4));
         let slowest = disturbance_psd.iter().copied().fold(f64::INFINITY, f64::min);
-        let decay_per_sample = (slowest / readout_psd).powf(0.25) * std::f64::consts::FRAC_1_SQRT_2 * dt_s;
+        let decay = decay_rad_s(once / readout.white_psd(), (slowest + twice) / readout.white_psd());
+        // Where sensing follows every sample the filter forgets at once; it still needs a few samples around.
+        let lag = (LAG_TIME_CONSTANTS / (decay * dt_s)).max(16.0).min((MOST_LAG_S / dt_s).max(16.0));
         Self {
             dt_s,
             srf_from_principal: eigen.eigenvectors,
             disturbance_variance: disturbance_psd.map(|s| s * per_sample),
             drift_variance: disturbance_psd.map(|s| s * per_sample * drift_step * drift_step),
-            readout_variance: readout_psd * per_sample,
-            // Where sensing follows every sample the filter forgets at once; it still needs a few samples around.
-            lag: ((LAG_TIME_CONSTANTS / decay_per_sample).ceil() as usize).max(16),
+            readout_variance: readout.white_psd() * per_sample,
+            wander: [0.5 * (once * dt_s + twice * dt_s.powi(3) / 3.0), 0.25 * twice * dt_s.powi(2), 0.5 * twice * dt_s],
+            memory: 1.0 / (decay * dt_s),
+            lag: lag.ceil() as usize,
         }
+    }
+
+    /// Samples after which the filter has forgotten all but `1/e`: what it knows of `w` it knows from readouts about as near.
+    #[must_use]
+    pub fn memory(&self) -> f64 {
+        self.memory
     }
 
     /// Samples by which the result is late.
@@ -79,6 +104,12 @@ impl Model {
     pub fn lag(&self) -> usize {
         self.lag
     }
+}
+
+/// Decay of the slowest pole of the filter, rad/s: the roots of `1 + a/ω² + b/ω⁴`, `s⁴ − a s² + b`, in the left half plane.
+fn decay_rad_s(a: f64, b: f64) -> f64 {
+    let discriminant = 0.25 * a * a - b;
+    if discriminant < 0.0 { (0.5 * b.sqrt() + 0.25 * a).sqrt() } else { (b / (0.5 * a + discriminant.sqrt())).sqrt() }
 }
 
 /// One-sided PSD at `frequency_hz` of `(e_{k−1} + e_k)/2`, where `e` is the error of the smoothed angular acceleration
@@ -99,7 +130,9 @@ pub fn residual_psd(frequency_hz: f64, disturbance_psd: f64, readout_psd: f64, d
 pub struct Smoothed {
     /// `E[β + w]`, mean over `[t_k, t_{k+1})`, rad s⁻².
     pub disturbance_rad_s2: Vector3<f64>,
-    /// `E[ω]` relative to CRF at `t_k`, rad s⁻¹.
+    /// `E[w]` of it: the part by the thrusters' noise.
+    pub noise_rad_s2: Vector3<f64>,
+    /// `E[ω]` relative to CRF at `t_k`, rad s⁻¹, as the sensors see it: with the rate of their coloured noise.
     pub omega_crf_rad_s: Vector3<f64>,
 }
 
@@ -183,6 +216,12 @@ impl Smoother {
         }
     }
 
+    /// The model.
+    #[must_use]
+    pub fn model(&self) -> &Model {
+        &self.model
+    }
+
     /// Takes the attitude relative to CRF at `t_k` (SRF, rad), `None` where there is none, and returns the filtered ω
     /// relative to CRF (SRF, rad s⁻¹).
     pub fn update(&mut self, attitude_rad: Option<&Vector3<f64>>) -> Vector3<f64> {
@@ -224,6 +263,7 @@ impl Smoother {
     /// command is unknown.
     pub fn advance(&mut self, known_rad_s2: Option<&Vector3<f64>>) {
         let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
+        let [zz, zw, ww] = self.model.wander;
         let [p00, p01, p02, p11, p12, p22] = self.covariance;
         let Some(known) = known_rad_s2 else {
             if let Some(step) = self.steps.last_mut() {
@@ -248,10 +288,10 @@ impl Smoother {
             let theta_beta = p02[i] + dt * p12[i] + half * p22[i];
             let omega_omega = p11[i] + dt * p12[i];
             let omega_beta = p12[i] + dt * p22[i];
-            self.covariance[0][i] = theta_theta + dt * theta_omega + half * theta_beta + q * half * half;
-            self.covariance[1][i] = theta_omega + dt * theta_beta + q * half * dt;
+            self.covariance[0][i] = theta_theta + dt * theta_omega + half * theta_beta + (q * half * half + zz);
+            self.covariance[1][i] = theta_omega + dt * theta_beta + (q * half * dt + zw);
             self.covariance[2][i] = theta_beta;
-            self.covariance[3][i] = omega_omega + dt * omega_beta + q * dt * dt;
+            self.covariance[3][i] = omega_omega + dt * omega_beta + (q * dt * dt + ww);
             self.covariance[4][i] = omega_beta;
             self.covariance[5][i] = p22[i] + self.model.drift_variance[i];
         }
@@ -268,30 +308,32 @@ impl Smoother {
     pub fn smooth(&mut self, count: usize) -> Vec<Smoothed> {
         let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
         let count = count.min(self.steps.len());
-        let mut out = vec![Smoothed { disturbance_rad_s2: Vector3::zeros(), omega_crf_rad_s: Vector3::zeros() }; count];
+        let srf = |v: Axes| self.model.srf_from_principal * Vector3::from(v);
+        let zero = Vector3::zeros();
+        let mut out = vec![Smoothed { disturbance_rad_s2: zero, noise_rad_s2: zero, omega_crf_rad_s: zero }; count];
         let mut adjoint = [[0.0; 3]; 3];
         for (k, step) in self.steps.iter().enumerate().rev() {
-            let mut disturbance = [0.0; 3];
-            let mut omega = [0.0; 3];
+            let mut noise = [0.0; 3];
             for i in 0..3 {
                 let [r0, r1, r2] = [adjoint[0][i], adjoint[1][i], adjoint[2][i]];
                 let pushed = half * r0 + dt * r1;
+                noise[i] = self.model.disturbance_variance[i] * pushed;
                 // s = Aᵀ r, then r ← s − Hᵀ K·s + Hᵀ v/F.
                 let [s0, s1, s2] = if step.cut { [0.0, 0.0, r2] } else { [r0, dt * r0 + r1, pushed + r2] };
                 let corrected = step.gain[0][i] * s0 + step.gain[1][i] * s1 + step.gain[2][i] * s2;
-                let s0 = s0 - corrected + step.weighted_innovation[i];
-                for (state, s) in [s0, s1, s2].into_iter().enumerate() {
-                    adjoint[state][i] = s;
-                }
-                let [wt, ww, wb, bt, bb] = step.covariance;
-                let beta = step.predicted[1][i] + bt[i] * s0 + wb[i] * s1 + bb[i] * s2;
-                disturbance[i] = beta + self.model.disturbance_variance[i] * pushed;
-                omega[i] = step.predicted[0][i] + wt[i] * s0 + ww[i] * s1 + wb[i] * s2;
+                adjoint[0][i] = s0 - corrected + step.weighted_innovation[i];
+                adjoint[1][i] = s1;
+                adjoint[2][i] = s2;
             }
             if k < count {
+                let [wt, ww, wb, bt, bb] = step.covariance;
+                let [s0, s1, s2] = adjoint;
+                let beta = |i: usize| step.predicted[1][i] + bt[i] * s0[i] + wb[i] * s1[i] + bb[i] * s2[i];
+                let omega = |i: usize| step.predicted[0][i] + wt[i] * s0[i] + ww[i] * s1[i] + wb[i] * s2[i];
                 out[k] = Smoothed {
-                    disturbance_rad_s2: self.model.srf_from_principal * Vector3::from(disturbance),
-                    omega_crf_rad_s: self.model.srf_from_principal * Vector3::from(omega),
+                    disturbance_rad_s2: srf(std::array::from_fn(|i| beta(i) + noise[i])),
+                    noise_rad_s2: srf(noise),
+                    omega_crf_rad_s: srf(std::array::from_fn(omega)),
                 };
             }
         }

@@ -27,6 +27,13 @@ fn designed() -> Mission {
     mission
 }
 
+/// The mission with thrusters that act 0.2 s late, behind a lag of 0.2 s.
+pub(crate) fn late(mut mission: Mission) -> Mission {
+    let thrusters = serde_json::json!({"lag_s": 0.2, "delay_s": 0.2});
+    mission.thrusters = Some(serde_json::from_value(thrusters).expect("lag and delay"));
+    mission
+}
+
 pub(crate) fn settings(angular_acceleration: AngularAcceleration) -> Settings {
     Settings { rate_hz: RATE_HZ, angular_acceleration, commands: true, sun: false, replay: false, warm_up_s: 60.0 }
 }
@@ -49,6 +56,10 @@ pub(crate) struct AttitudeLoop {
     inertia_inverse: Matrix3<f64>,
     theta: Vector3<f64>,
     omega: Vector3<f64>,
+    /// Whether the thrusters act as [`late`] says; what they make, and the commands of the two samples before.
+    late: bool,
+    made_nm: Vector3<f64>,
+    before_nm: [Vector3<f64>; 2],
     time_ns: i64,
 }
 
@@ -60,6 +71,9 @@ impl AttitudeLoop {
             inertia_inverse: mission.spacecraft.inertia_inverse(),
             theta: Vector3::zeros(),
             omega: Vector3::zeros(),
+            late: mission.thrusters.is_some(),
+            made_nm: Vector3::zeros(),
+            before_nm: [Vector3::zeros(); 2],
             time_ns: 0,
         }
     }
@@ -69,7 +83,16 @@ impl AttitudeLoop {
         let y = self.theta + error_rad;
         let command = self.law.step(&Readout { sc_crf_rad: y, ..Readout::default() });
         let rest = [TestMassReadout::default(); 2];
-        let known = self.known.motion(&command, None, &rest, &Vector3::zeros());
+        let mut acting = command;
+        if self.late {
+            // y → u with e^{−t/0.2 s} over 0.1 s.
+            let [oldest, older] = self.before_nm;
+            let left = (-0.5_f64).exp();
+            acting.mps_torque_srf_nm = oldest + (self.made_nm - oldest) * ((1.0 - left) / 0.5);
+            self.made_nm = oldest + (self.made_nm - oldest) * left;
+            self.before_nm = [older, command.mps_torque_srf_nm];
+        }
+        let known = self.known.motion(&acting, None, &rest, &Vector3::zeros());
         let alpha = known.alpha_srf_rad_s2 + self.inertia_inverse * torque_nm;
         self.theta += self.omega * DT_S + alpha * (0.5 * DT_S * DT_S);
         self.omega += alpha * DT_S;

@@ -2,6 +2,7 @@
 
 mod border;
 mod common;
+mod correlation;
 mod obedience;
 mod posterior;
 mod slope;

@@ -1,7 +1,7 @@
 //! The stage as a stream: rows, gaps, states, replayed commands, the turning of CRF.
 
-use crate::common::{AttitudeLoop, RATE_HZ, levels, mission, run, settings, stage};
-use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::Smoother;
+use crate::common::{AttitudeLoop, RATE_HZ, late, levels, mission, run, settings, stage};
+use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::{Commanded, Smoother};
 use dragfree_hinf_dfacs::reconstruction::{CHANNELS_AT, Epoch, Reconstruction, Row, Settings};
 use dragfree_physics::mission::Mission;
 use nalgebra::Vector3;
@@ -73,7 +73,7 @@ fn one_row_per_epoch_in_order() {
 /// A new stage after every batch, with the state of the old one: neither the batches nor the states can be seen.
 #[test]
 fn saved_and_loaded_it_goes_on_bit_by_bit() {
-    let mission = mission();
+    let mission = late(mission());
     let epochs = holes(telemetry(&mission, 2600).0);
     let whole = bits(&run(&mut stage(&mission, &with_replay()), &epochs));
     for batch in [1, 777, 2600] {
@@ -116,7 +116,7 @@ proptest! {
     #[test]
     fn garbage_is_refused(mut bytes in proptest::collection::vec(any::<u8>(), 0..4000), ours: bool) {
         if ours {
-            bytes.splice(0..0, *b"dfacs/1\n");
+            bytes.splice(0..0, *b"dfacs/3\n");
         }
         prop_assert!(stage(&mission(), &settings(Smoother)).load(&bytes).is_err());
     }
@@ -143,6 +143,37 @@ fn missing_sensing_leaves_the_acceleration() {
     let noise = (0.5 * levels(&mission)[0] * RATE_HZ * 3.0).sqrt() / 800.0;
     let error = (1490..1520).map(|k| (alpha(&rows[k]) - truth[k]).norm()).fold(0.0, f64::max);
     assert!(error < 4.0 * noise, "{error} against {noise}");
+}
+
+/// Hours without sensing leave commands alone: from the smoother's memory of 2.8 s into the gap to as long before its end
+/// nothing is given for the acceleration, whatever the blocks. The truth there regressed on the command has a slope far below one.
+#[test]
+fn without_sensing_for_hours_no_acceleration_is_invented() {
+    let mission = mission();
+    let (mut epochs, truth) = telemetry(&mission, 80_000);
+    let commanded = run(&mut stage(&mission, &settings(Commanded)), &epochs);
+    let lost = 2_000..76_000;
+    for epoch in &mut epochs[lost.clone()] {
+        epoch.readout[..3].fill(f64::NAN);
+    }
+    let mut stage = stage(&mission, &settings(Smoother));
+    let rows = run(&mut stage, &epochs);
+    let unknown: Vec<usize> = (0..80_000).filter(|k| alpha(&rows[*k]).x.is_nan()).collect();
+    let first = unknown.first().expect("the gap is long") - lost.start;
+    assert!((20..40).contains(&first), "{first}");
+    assert_eq!(unknown, (lost.start + first..lost.end - first).collect::<Vec<_>>());
+    assert_eq!(stage.counts().blind, unknown.len() as u64);
+    assert!(rows.iter().all(|row| u1(row).x.is_finite()));
+
+    // Means over 5 s: what is below 0.1 Hz.
+    let (mut cross, mut auto) = (0.0, 0.0);
+    for k in (lost.start..lost.end - 50).step_by(50) {
+        let mean = |of: &dyn Fn(usize) -> f64| (k..k + 50).map(of).sum::<f64>();
+        let (a, c) = (mean(&|k| truth[k].y), mean(&|k| alpha(&commanded[k]).y));
+        cross += a * c;
+        auto += c * c;
+    }
+    assert!(cross / auto < 0.9, "slope {}", cross / auto);
 }
 
 #[test]
