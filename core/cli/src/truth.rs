@@ -3,24 +3,13 @@
 use crate::failure::Failure;
 use crate::text;
 use dragfree_engine::product::Coefficient;
-use dragfree_engine::telemetry::{Cells, Decoder, Layout};
+use dragfree_engine::telemetry::first_message;
 use std::collections::BTreeMap;
 use std::path::Path;
 
 /// The first message of `/truth` in a file, by field path, `b1_orf_m.x`.
 pub(crate) fn first(path: &Path) -> Result<BTreeMap<String, f64>, Failure> {
-    let bytes = std::fs::read(path).map_err(Failure::io("read", path))?;
-    for message in mcap::MessageStream::new(&bytes).map_err(Failure::engine)? {
-        let message = message.map_err(Failure::engine)?;
-        if let Some(schema) = message.channel.schema.as_ref().filter(|_| message.channel.topic == "/truth") {
-            let layout = Layout::parse(&schema.data, &schema.name).map_err(Failure::engine)?;
-            let mut values = vec![f64::NAN; layout.leaves().len()];
-            let mut cells = Cells { values: &mut values, rows: 1, row: 0 };
-            Decoder::new(&layout).decode(&message.data, &mut cells).map_err(Failure::engine)?;
-            return Ok(layout.leaves().iter().map(|leaf| leaf.path.clone()).zip(values).collect());
-        }
-    }
-    Ok(BTreeMap::new())
+    first_message(path, "/truth").map_err(Failure::engine)
 }
 
 /// True offset of a coefficient `com-offset.tmN.AXIS`, m.

@@ -6,6 +6,7 @@
 
 mod decode;
 mod encode;
+mod first;
 mod interface;
 mod layout;
 mod mcap_file;
@@ -14,6 +15,7 @@ mod write;
 
 pub use decode::{Cells, Decoder, WireError};
 pub use encode::{EncodeError, Encoder, MessageType};
+pub use first::{FirstError, first_message};
 pub(crate) use interface::column;
 pub use interface::{Drift, Topic, check, descriptor, expected, interface_tables, topic_kind};
 pub use layout::{Kind, Layout, LayoutError, Leaf};
