@@ -33,7 +33,7 @@ fn allowed(crate_name: &str) -> &'static [&'static str] {
     match crate_name {
         "dragfree-abi" | "dragfree-physics" | "dragfree-chart" => &[],
         "dragfree-sdk" | "dragfree-engine" => &["dragfree-abi"],
-        "dragfree" => &["dragfree-engine", "dragfree-physics", "dragfree-chart"],
+        "dragfree" | "dragfree-validation" => &["dragfree-engine", "dragfree-physics", "dragfree-chart"],
         "dragfree-estimation" => &["dragfree-physics"],
         "dragfree-tests" => &["dragfree-engine"],
         "dragfree-qp-check" => &["dragfree-sdk", "dragfree-physics", "dragfree-estimation"],

@@ -1,0 +1,403 @@
+//! What any estimator could know at best of the offsets, from the mission's noise alone: no data, no sums, no segment.
+//!
+//! Relative to a test mass the housing at `b` shows `−α×b` through the mean of two samples, so with `α̂` the regressors of
+//! the channels are `Φ = −cos(πf dt) [α̂×]`. Over a span `T` real, stationary data carry the information
+//!
+//! ```text
+//! N = 2T ∫ Re E[Φᴴ Σ⁻¹ Φ] df,   f from 0 to Nyquist, one-sided spectra
+//! ```
+//!
+//! which takes two spectra. **Σ**, the noise of the channels: readouts through the second difference, stray and
+//! electrostatic accelerations, and what is not known of the thrusters' noise: its force in every channel, its torque
+//! through the levers. Commands are known; of force and torque together the attitude readout tells what it can, and the
+//! rest is their conditional covariance. **S_α̂**, the excitation: `α = S w − K S n` in the closed loop with torque noise
+//! `w` and attitude readout `n`, minus what nobody sees of it, as the error of the best `α̂` is orthogonal to it.
+
+use dragfree_physics::control_design::{DesignError, design};
+use dragfree_physics::frames::skew;
+use dragfree_physics::mission::{Mission, MissionError};
+use dragfree_physics::noise::NoiseShape;
+use nalgebra::{Complex, DMatrix, Matrix3, Matrix6, SMatrix, Vector3};
+use std::f64::consts::{PI, TAU};
+
+type C64 = Complex<f64>;
+
+/// Points of the integral, evenly in ln f.
+const POINTS: usize = 6000;
+/// Where the integral begins, Hz: below it lies less than a millionth of the information.
+const LOWEST_HZ: f64 = 1e-5;
+
+/// Why there is no bound.
+#[derive(Debug, thiserror::Error)]
+pub enum BoundError {
+    /// The mission lacks something.
+    #[error(transparent)]
+    Mission(#[from] MissionError),
+    /// The mission has no controllers.
+    #[error(transparent)]
+    Design(#[from] DesignError),
+    /// Some combination of channels has no noise, or some offset is not seen.
+    #[error("{0} is singular: give every readout and every test mass a noise in the mission file")]
+    Singular(&'static str),
+}
+
+/// One-sided PSD of the thrusters' force above their torque at a frequency in Hz, SRF, N² and N² m² per Hz.
+type WrenchPsd = Box<dyn Fn(f64) -> Matrix6<f64>>;
+/// Open loop of the three attitude channels at a frequency in Hz.
+type OpenLoop = Box<dyn Fn(f64) -> [C64; 3]>;
+
+/// Everything that the two spectra are made of.
+pub struct Case {
+    /// Sampling interval, s.
+    pub dt_s: f64,
+    /// Mass of the spacecraft, kg.
+    pub mass_kg: f64,
+    /// Inverse inertia, SRF, kg⁻¹ m⁻².
+    pub inertia_inverse: Matrix3<f64>,
+    /// `T_S^O` of both test masses.
+    pub dcm_orf_from_srf: [Matrix3<f64>; 2],
+    /// Their offsets, ORF, m: the levers of torque that nobody knows.
+    pub offset_orf_m: [Vector3<f64>; 2],
+    /// Noise of the thrusters.
+    pub wrench_psd: WrenchPsd,
+    /// Noise of the attitude readout, rad.
+    pub attitude: NoiseShape,
+    /// Noise of the displacement readouts, m.
+    pub readout: [[NoiseShape; 3]; 2],
+    /// Accelerations of the test masses themselves, m s⁻².
+    pub stray: [[NoiseShape; 3]; 2],
+    /// Attitude control.
+    pub open_loop: OpenLoop,
+}
+
+/// σ of the six coefficients, m, in the order of [`crate::records::COEFFICIENTS`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct InformationBound {
+    /// Each test mass from its own three channels.
+    pub single_m: [f64; 6],
+    /// Both test masses together, without the survey.
+    pub joint_m: [f64; 6],
+    /// Both, tied by the surveyed baseline.
+    pub surveyed_m: [f64; 6],
+}
+
+impl Case {
+    /// The case of a mission file.
+    ///
+    /// # Errors
+    /// [`BoundError`] when the mission lacks a noise or a design.
+    pub fn of(mission: &Mission) -> Result<Self, BoundError> {
+        const NEEDED_BY: &str = "the information bound";
+        let n = &mission.noise;
+        macro_rules! shape {
+            ($key:ident) => {
+                Mission::need(&n.$key, concat!("noise.", stringify!($key)), NEEDED_BY)?.shape()
+            };
+        }
+        let (mut dcm, mut offset) = ([Matrix3::zeros(); 2], [Vector3::zeros(); 2]);
+        let (mut readout, mut stray) = (<[[NoiseShape; 3]; 2]>::default(), <[[NoiseShape; 3]; 2]>::default());
+        for (i, name) in ["tm1", "tm2"].into_iter().enumerate() {
+            let tm = mission.test_mass(name, NEEDED_BY)?;
+            (dcm[i], offset[i]) = (tm.dcm_orf_from_srf(), tm.offset_nominal_orf_m());
+            readout[i] = [shape!(ifo_x), shape!(is_y), shape!(is_z)];
+            for axis in 0..3 {
+                stray[i][axis] = n.test_mass_acceleration.as_ref().map(|s| s.shape()).unwrap_or_default();
+                let force = n.electrostatic_force.as_ref().filter(|_| axis > 0).map(|s| s.shape()).unwrap_or_default();
+                let terms = force
+                    .terms
+                    .into_iter()
+                    .map(|t| dragfree_physics::noise::NoiseTerm { asd: t.asd / tm.mass_kg, ..t });
+                stray[i][axis].terms.extend(terms);
+            }
+        }
+        let units = mission.thrusters.as_ref().map(|t| t.unit.clone()).unwrap_or_default();
+        let wrench_psd: WrenchPsd = if units.is_empty() {
+            let (force, torque) = (shape!(thruster_force), shape!(thruster_torque));
+            Box::new(move |f| {
+                let diagonal = SMatrix::<f64, 6, 1>::from_fn(|i, _| if i < 3 { force.psd(f) } else { torque.psd(f) });
+                Matrix6::from_diagonal(&diagonal)
+            })
+        } else {
+            let whole = units.iter().fold(Matrix6::zeros(), |sum, unit| {
+                let d = Vector3::from(unit.direction_srf).normalize();
+                let turn = Vector3::from(unit.position_srf_m).cross(&d);
+                let wrench = SMatrix::<f64, 6, 1>::from_fn(|i, _| if i < 3 { d[i] } else { turn[i - 3] });
+                sum + wrench * wrench.transpose() * unit.asd_n_rthz.powi(2)
+            });
+            Box::new(move |_| whole)
+        };
+        let channels = design(mission)?.channels;
+        let (lag_s, delay_s) = mission.thrusters.as_ref().map_or((0.0, 0.0), |t| (t.lag_s, t.delay_s));
+        let open_loop: OpenLoop = Box::new(move |f| {
+            let omega = TAU * f;
+            let thrusters = C64::from_polar(1.0, -omega * delay_s) / C64::new(1.0, omega * lag_s);
+            [0, 1, 2].map(|axis| channels[axis].open_loop(f) * thrusters)
+        });
+        Ok(Self {
+            dt_s: mission.dt_s(),
+            mass_kg: mission.spacecraft.mass_kg,
+            inertia_inverse: mission.spacecraft.inertia_inverse(),
+            dcm_orf_from_srf: dcm,
+            offset_orf_m: offset,
+            wrench_psd,
+            attitude: shape!(dws_long_arm),
+            readout,
+            stray,
+            open_loop,
+        })
+    }
+
+    /// Spectrum of `α̂`, SRF, rad² s⁻⁴/Hz, real part, and noise of the six channels tm1.x … tm2.z, ORF, m² s⁻⁴/Hz.
+    fn spectra(&self, f_hz: f64) -> Option<(Matrix3<f64>, Matrix6<f64>)> {
+        let (sin, cos) = (PI * f_hz * self.dt_s).sin_cos();
+        let differenced = (4.0 * sin * sin / self.dt_s.powi(2)).powi(2);
+        let s = (self.wrench_psd)(f_hz);
+        let j = &self.inertia_inverse;
+
+        // What the attitude readout leaves open of force and torque; it sees the mean of two samples of torque.
+        let mut sees = SMatrix::<f64, 3, 6>::zeros();
+        sees.fixed_view_mut::<3, 3>(0, 3).copy_from(&(j * cos));
+        let attitude = Matrix3::identity() * (differenced * self.attitude.psd(f_hz));
+        let gain = s * sees.transpose() * (sees * s * sees.transpose() + attitude).try_inverse()?;
+        let left = s - gain * sees * s;
+
+        let torque = s.fixed_view::<3, 3>(3, 3).into_owned();
+        let disturbance = j * torque * j.transpose();
+        let unseen = j * left.fixed_view::<3, 3>(3, 3) * j.transpose();
+        // Acceleration over a sample to attitude at its end, s²: dt²/2 (z + 1)/(z − 1)².
+        let z = C64::from_polar(1.0, TAU * f_hz * self.dt_s);
+        let integrators = (z + 1.0) / ((z - 1.0) * (z - 1.0)) * (0.5 * self.dt_s.powi(2));
+        let sensitivity = (self.open_loop)(f_hz).map(|l| (l + 1.0).inv());
+        let of_readout = sensitivity.map(|s| (C64::from(1.0) - s) / integrators);
+        let excitation = Matrix3::from_fn(|a, b| {
+            let own = if a == b { of_readout[a].norm_sqr() * self.attitude.psd(f_hz) } else { 0.0 };
+            (sensitivity[a] * sensitivity[b].conj()).re * disturbance[(a, b)] + own - unseen[(a, b)]
+        });
+
+        let mut enters = Matrix6::zeros();
+        for i in 0..2 {
+            let dcm = self.dcm_orf_from_srf[i];
+            enters.fixed_view_mut::<3, 3>(3 * i, 0).copy_from(&(-dcm / self.mass_kg));
+            enters.fixed_view_mut::<3, 3>(3 * i, 3).copy_from(&(skew(&self.offset_orf_m[i]) * dcm * j));
+        }
+        let mut noise = enters * left * enters.transpose() * (cos * cos);
+        for (i, axis) in (0..2).flat_map(|i| (0..3).map(move |axis| (i, axis))) {
+            noise[(3 * i + axis, 3 * i + axis)] +=
+                differenced * self.readout[i][axis].psd(f_hz) + cos * cos * self.stray[i][axis].psd(f_hz);
+        }
+        Some((excitation, noise))
+    }
+
+    /// The bounds for a span of data in seconds, within a band in Hz.
+    ///
+    /// # Errors
+    /// [`BoundError::Singular`].
+    pub fn bound_in(&self, span_s: f64, band_hz: std::ops::Range<f64>) -> Result<InformationBound, BoundError> {
+        const NOISE: BoundError = BoundError::Singular("the noise of the channels");
+        const SEEN: BoundError = BoundError::Singular("the information");
+        // The channels of −[α×] b for α along each axis of SRF.
+        let regressors = [0, 1, 2].map(|axis| {
+            let mut g = Matrix6::zeros();
+            for i in 0..2 {
+                let alpha = self.dcm_orf_from_srf[i].column(axis).into_owned();
+                g.fixed_view_mut::<3, 3>(3 * i, 3 * i).copy_from(&-skew(&alpha));
+            }
+            g
+        });
+        let step = (band_hz.end / band_hz.start).ln() / POINTS as f64;
+        let (mut joint, mut single) = (Matrix6::<f64>::zeros(), Matrix6::<f64>::zeros());
+        for k in 0..POINTS {
+            let f = band_hz.start * (step * (k as f64 + 0.5)).exp();
+            let (excitation, noise) = self.spectra(f).ok_or(NOISE)?;
+            let mut apart = Matrix6::zeros();
+            for i in 0..2 {
+                let own = noise.fixed_view::<3, 3>(3 * i, 3 * i).try_inverse().ok_or(NOISE)?;
+                apart.fixed_view_mut::<3, 3>(3 * i, 3 * i).copy_from(&own);
+            }
+            let together = noise.try_inverse().ok_or(NOISE)?;
+            let weight = 2.0 * span_s * (PI * f * self.dt_s).cos().powi(2) * f * step;
+            for (a, b) in (0..3).flat_map(|a| (0..3).map(move |b| (a, b))) {
+                let power = weight * excitation[(a, b)];
+                joint += regressors[a].transpose() * together * regressors[b] * power;
+                single += regressors[a].transpose() * apart * regressors[b] * power;
+            }
+        }
+        let sigmas = |information: &Matrix6<f64>| -> Result<[f64; 6], BoundError> {
+            let covariance = information.try_inverse().ok_or(SEEN)?;
+            Ok(std::array::from_fn(|i| covariance[(i, i)].sqrt()))
+        };
+        // Under the survey both housings move together: b_i = T_S^O c + what the survey says.
+        let mut tied = SMatrix::<f64, 6, 3>::zeros();
+        for i in 0..2 {
+            tied.fixed_view_mut::<3, 3>(3 * i, 0).copy_from(&self.dcm_orf_from_srf[i]);
+        }
+        let centre = (tied.transpose() * joint * tied).try_inverse().ok_or(SEEN)?;
+        let surveyed = tied * centre * tied.transpose();
+        Ok(InformationBound {
+            single_m: sigmas(&single)?,
+            joint_m: sigmas(&joint)?,
+            surveyed_m: std::array::from_fn(|i| surveyed[(i, i)].sqrt()),
+        })
+    }
+
+    /// The bounds for a span of data in seconds, up to Nyquist.
+    ///
+    /// # Errors
+    /// [`BoundError::Singular`].
+    pub fn bound(&self, span_s: f64) -> Result<InformationBound, BoundError> {
+        self.bound_in(span_s, LOWEST_HZ..0.5 / self.dt_s * (1.0 - 1e-9))
+    }
+}
+
+/// The basis of what the survey leaves open: both housings along an axis of SRF together, one column each, orthonormal.
+#[must_use]
+pub fn free_space(dcm_orf_from_srf: &[Matrix3<f64>; 2]) -> DMatrix<f64> {
+    DMatrix::from_fn(6, 3, |row, axis| dcm_orf_from_srf[row / 3][(row % 3, axis)] * 0.5_f64.sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn mission(text: &str) -> Mission {
+        let value: toml::Value = toml::from_str(text).unwrap();
+        Mission::from_json(&serde_json::to_string(&value).unwrap()).unwrap()
+    }
+
+    fn taiji() -> Mission {
+        mission(include_str!("../../fixtures/missions/taiji.toml"))
+    }
+
+    fn turned(angle_deg: f64) -> Matrix3<f64> {
+        let (s, c) = f64::to_radians(angle_deg).sin_cos();
+        Matrix3::new(c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0)
+    }
+
+    fn near(found: &[f64], wanted: &[f64], tolerance: f64, what: &str) {
+        for (f, w) in found.iter().zip(wanted) {
+            assert!((f / w - 1.0).abs() < tolerance, "{what}: {found:?} for {wanted:?}");
+        }
+    }
+
+    /// A study in Python, another program with PID loops of its own, summed the normal equations of 25 simulated days, a Hann
+    /// window each, and logged σ of two digits: 3.2, 0.064 and 0.061 mm for both test masses, 3.6, 0.064 and 0.064 mm apart,
+    /// 0.072, 0.064 and 0.047 mm with the survey. It counted one observation every 1.5 bins for the window's bandwidth; the
+    /// untapered data have one in each.
+    #[test]
+    fn sums_over_simulated_days_of_another_program_agree() {
+        let dt_s = 0.1;
+        let inertia = Matrix3::new(800.0, 13.0, 10.0, 13.0, 800.0, 12.0, 10.0, 12.0, 1000.0);
+        let white = NoiseShape::white;
+        let dcm_orf_from_srf = [turned(30.0), turned(-30.0)];
+        let case = Case {
+            dt_s,
+            mass_kg: 1500.0,
+            inertia_inverse: inertia.try_inverse().unwrap(),
+            dcm_orf_from_srf,
+            offset_orf_m: [
+                dcm_orf_from_srf[0] * Vector3::new(0.001, 0.18, 0.0),
+                dcm_orf_from_srf[1] * Vector3::new(0.001, -0.18, 0.0),
+            ],
+            wrench_psd: Box::new(|_| Matrix6::identity() * 1e-14),
+            attitude: white(5e-10),
+            readout: std::array::from_fn(|_| [white(1.5e-12), white(1.8e-9), white(3e-9)]),
+            stray: std::array::from_fn(|_| [NoiseShape::default(), white(6e-15 / 1.96), white(6e-15 / 1.96)]),
+            open_loop: Box::new(move |f| {
+                // A low pass, then proportional, derivative and integral gains, no delay.
+                let (w, z) = (0.35_f64, C64::from_polar(1.0, TAU * f * dt_s));
+                let a = 1.0 - (-6.0 * w * dt_s).exp();
+                let filter = C64::from(a) / (C64::from(1.0) - z.inv() * (1.0 - a));
+                let step = C64::from(1.0) - z.inv();
+                let gains = step * (1.8 * w / dt_s) + w * w + step.inv() * (0.1 * w.powi(3) * dt_s);
+                [filter * gains * (z + 1.0) / ((z - 1.0) * (z - 1.0)) * (0.5 * dt_s * dt_s); 3]
+            }),
+        };
+        let bound = case.bound_in(25.0 * 86_400.0, 2e-4..4.9).unwrap();
+        let mm = |values: [f64; 3]| values.map(|v| v * 1e-3 / 1.5_f64.sqrt());
+        near(&bound.joint_m[..3], &mm([3.2, 0.064, 0.061]), 0.03, "joint");
+        near(&bound.single_m[..3], &mm([3.6, 0.064, 0.064]), 0.03, "single");
+        near(&bound.surveyed_m[..3], &mm([0.072, 0.064, 0.047]), 0.03, "surveyed");
+    }
+
+    /// One second in closed form: nothing but white noise s_n of acceleration on every channel, and α̂ white with the torque
+    /// noise, as nothing controls it and the readout is perfect: N = 2T f_N ½ s_α/s_n (|e_a × e_j|² summed), σ = 1/√N.
+    #[test]
+    fn white_noise_has_a_closed_form() {
+        let (dt_s, torque, noise) = (0.1, 1e-10_f64, 1e-12_f64);
+        let case = Case {
+            dt_s,
+            mass_kg: f64::INFINITY,
+            inertia_inverse: Matrix3::identity(),
+            dcm_orf_from_srf: [turned(30.0), turned(-30.0)],
+            offset_orf_m: [Vector3::zeros(); 2],
+            wrench_psd: Box::new(move |_| Matrix6::identity() * torque.powi(2)),
+            attitude: NoiseShape::white(1e-30),
+            readout: std::array::from_fn(|_| std::array::from_fn(|_| NoiseShape::default())),
+            stray: std::array::from_fn(|_| std::array::from_fn(|_| NoiseShape::white(noise))),
+            open_loop: Box::new(|_| [C64::from(0.0); 3]),
+        };
+        // cos² of the regressors and of the noise cancel; two of the three axes of α move each coefficient.
+        let information = 2.0 * 5.0 * (torque / noise).powi(2) * 2.0;
+        let bound = case.bound_in(1.0, 1e-5..5.0 * (1.0 - 1e-9)).unwrap();
+        near(&bound.single_m, &[information.powf(-0.5); 6], 1e-3, "single");
+        near(&bound.joint_m, &[information.powf(-0.5); 6], 1e-3, "joint");
+        near(&bound.surveyed_m, &[(2.0 * information).powf(-0.5) * 1.0; 6], 1e-3, "surveyed");
+    }
+
+    /// More knowledge never hurts, and σ falls with the root of the span.
+    #[test]
+    fn bounds_are_in_their_order() {
+        let case = Case::of(&taiji()).unwrap();
+        let (day, month) = (case.bound(86_400.0).unwrap(), case.bound(25.0 * 86_400.0).unwrap());
+        for i in 0..6 {
+            assert!(day.surveyed_m[i] <= day.joint_m[i] && day.joint_m[i] <= day.single_m[i], "{day:?}");
+            assert!((day.surveyed_m[i] / month.surveyed_m[i] - 5.0).abs() < 1e-9);
+        }
+        // Twins: a quieter attitude readout shakes the spacecraft less, a noisier interferometer tells less.
+        let with = |change: &dyn Fn(&mut Mission)| {
+            let mut m = taiji();
+            // The controllers are those of the mission as it is.
+            change(&mut m);
+            Case { open_loop: Case::of(&taiji()).unwrap().open_loop, ..Case::of(&m).unwrap() }.bound(86_400.0).unwrap()
+        };
+        let quiet = with(&|m| m.noise.dws_long_arm.as_mut().unwrap().asd_rad_rthz /= 2.0);
+        let loud = with(&|m| m.noise.ifo_x.as_mut().unwrap().asd_m_rthz *= 2.0);
+        assert!(quiet.surveyed_m[1] > 1.05 * day.surveyed_m[1], "{quiet:?} {day:?}");
+        assert!(loud.surveyed_m[0] > 1.05 * day.surveyed_m[0], "{loud:?} {day:?}");
+    }
+
+    /// Single thrusters push and turn at once: whoever knows the torque knows part of the force, so that ignoring the
+    /// correlation would give less.
+    #[test]
+    fn correlated_thrusters_tell_of_their_force() {
+        let thrusters = mission(include_str!("../../fixtures/missions/taiji-thrusters.toml"));
+        let case = Case::of(&thrusters).unwrap();
+        let known = case.bound(86_400.0).unwrap();
+        let whole = (case.wrench_psd)(1e-2);
+        let blind = Case {
+            wrench_psd: Box::new(move |_| {
+                Matrix6::from_fn(|i, j| if (i < 3) == (j < 3) { whole[(i, j)] } else { 0.0 })
+            }),
+            ..case
+        };
+        let blind = blind.bound(86_400.0).unwrap();
+        for i in 0..6 {
+            assert!(known.single_m[i] < blind.single_m[i], "{known:?} {blind:?}");
+        }
+    }
+
+    /// Two housings that move together: free; apart: not.
+    #[test]
+    fn the_survey_leaves_three_directions() {
+        let dcm = [turned(30.0), turned(-30.0)];
+        let free = free_space(&dcm);
+        assert!((free.transpose() * &free - DMatrix::identity(3, 3)).norm() < 1e-14);
+        let moved = |sign: f64| {
+            let v = Vector3::new(0.1, -0.2, 0.3);
+            let (a, b) = (dcm[0] * v, dcm[1] * v * sign);
+            nalgebra::DVector::from_fn(6, |i, _| if i < 3 { a[i] } else { b[i - 3] })
+        };
+        assert!(((free.transpose() * moved(1.0)).norm() - moved(1.0).norm()).abs() < 1e-14);
+        assert!((free.transpose() * moved(-1.0)).norm() < 1e-14);
+    }
+}

@@ -1,0 +1,321 @@
+//! The program under test, run as a user runs it: `dragfree simulate`, then `dragfree run`.
+
+use serde_json::Value;
+use sha2::{Digest as _, Sha256};
+use std::collections::BTreeMap;
+use std::ffi::OsStr;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use dragfree_engine::telemetry::first_message;
+
+use crate::records::{COEFFICIENTS, Line, Solution, rounded};
+
+/// A run that gave no result.
+#[derive(Debug, thiserror::Error)]
+pub enum ProgramError {
+    /// It did not start.
+    #[error("{command}: {source}")]
+    Start {
+        /// What was called.
+        command: String,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// It ended with an error.
+    #[error("{command}: {status}\n{message}")]
+    Failed {
+        /// What was called.
+        command: String,
+        /// Exit status.
+        status: std::process::ExitStatus,
+        /// What it said.
+        message: String,
+    },
+    /// It said something else than expected.
+    #[error("{command}: {what} is missing in what it printed")]
+    Answer {
+        /// What was called.
+        command: String,
+        /// Name of the part.
+        what: String,
+    },
+    /// A file of its own making cannot be read or removed.
+    #[error("{path}: {reason}", path = path.display())]
+    File {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        reason: String,
+    },
+}
+
+/// The repository.
+#[must_use]
+pub fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new("."))
+}
+
+/// The built program.
+#[derive(Clone, Debug)]
+pub struct Program {
+    exe: PathBuf,
+    /// Threads of one run.
+    pub threads: usize,
+}
+
+/// Telemetry of one simulation. The truth was read and removed before anything could calibrate it.
+#[derive(Clone, Debug)]
+pub struct Simulated {
+    /// The files, oldest first.
+    pub files: Vec<PathBuf>,
+    /// True offsets, m.
+    pub truth_m: [f64; 6],
+}
+
+/// What `run` is given besides the telemetry.
+#[derive(Clone, Debug, Default)]
+pub struct Chain {
+    /// Pipeline file.
+    pub pipeline: PathBuf,
+    /// Mission file in place of the pipeline's.
+    pub mission: Option<PathBuf>,
+    /// Model file in place of the pipeline's.
+    pub model: Option<PathBuf>,
+}
+
+impl Program {
+    /// Builds program and plugins, so that nothing stale is measured, and finds them beside this program.
+    ///
+    /// # Errors
+    /// [`ProgramError`] when the workspace does not build.
+    pub fn build() -> Result<Self, ProgramError> {
+        let folder = std::env::current_exe()
+            .map_err(|source| ProgramError::Start { command: "this program".to_owned(), source })?
+            .parent()
+            .map(Path::to_owned)
+            .unwrap_or_default();
+        let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+        let mut build = Command::new(cargo);
+        build.current_dir(root()).args(["build", "--quiet", "--release", "--workspace", "--lib", "--bins"]);
+        if let Some(target) = folder.parent() {
+            build.arg("--target-dir").arg(target);
+        }
+        output(&mut build, &[0])?;
+        Ok(Self { exe: folder.join(format!("dragfree{}", std::env::consts::EXE_SUFFIX)), threads: 1 })
+    }
+
+    fn command(&self) -> Command {
+        let mut command = Command::new(&self.exe);
+        command.current_dir(root()).env_remove("DRAGFREE_PLUGIN_PATH").env("NO_COLOR", "1").arg("--quiet");
+        command.arg("--threads").arg(self.threads.to_string());
+        command
+    }
+
+    /// Digest of the plugins' libraries: results of two digests are not of one program.
+    ///
+    /// # Errors
+    /// [`ProgramError`].
+    pub fn digest(&self) -> Result<String, ProgramError> {
+        let mut command = self.command();
+        let answer = json(command.args(["plugins", "list", "--json"]), &[0])?;
+        let plugins = answer["plugins"].as_array().ok_or_else(|| missing(&command, "plugins"))?;
+        let mut digests: Vec<&str> = plugins.iter().filter_map(|p| p["sha256"].as_str()).collect();
+        digests.sort_unstable();
+        let digest = Sha256::digest(digests.concat());
+        Ok(digest.iter().take(6).map(|byte| format!("{byte:02x}")).collect())
+    }
+
+    /// Freezes the controllers that a mission designs into a file with the section `control`.
+    ///
+    /// # Errors
+    /// [`ProgramError`].
+    pub fn freeze(&self, mission: &Path, to: &Path) -> Result<(), ProgramError> {
+        output(self.command().arg("design").arg(mission).arg("--freeze").arg(to), &[0]).map(|_| ())
+    }
+
+    /// Simulates into a new folder and takes the truth away.
+    ///
+    /// # Errors
+    /// [`ProgramError`].
+    pub fn simulate(
+        &self,
+        mission: &Path,
+        folder: &Path,
+        arguments: &[impl AsRef<OsStr>],
+    ) -> Result<Simulated, ProgramError> {
+        let mut command = self.command();
+        command.arg("simulate").arg(mission).arg("--out").arg(folder).args(arguments).arg("--json");
+        let made = json(&mut command, &[0])?;
+        let paths = |key: &str| -> Vec<PathBuf> {
+            made[key].as_array().into_iter().flatten().filter_map(Value::as_str).map(PathBuf::from).collect()
+        };
+        let truth_files = paths("truth_files");
+        let first = truth_files.first().ok_or_else(|| missing(&command, "truth_files"))?;
+        let file = |path: &Path, reason: &dyn std::fmt::Display| ProgramError::File {
+            path: path.to_owned(),
+            reason: reason.to_string(),
+        };
+        let truth = first_message(first, "/truth").map_err(|e| file(first, &e))?;
+        for path in &truth_files {
+            std::fs::remove_file(path).map_err(|e| file(path, &e))?;
+        }
+        let mut truth_m = [0.0; 6];
+        for (i, value) in truth_m.iter_mut().enumerate() {
+            let key = format!("b{}_orf_m.{}", i / 3 + 1, ["x", "y", "z"][i % 3]);
+            *value = *truth.get(&key).ok_or_else(|| missing(&command, &key))?;
+        }
+        Ok(Simulated { files: paths("files"), truth_m })
+    }
+
+    /// Runs a chain over telemetry and gives the product as JSON. Loss of data and an inconsistent model are results.
+    ///
+    /// # Errors
+    /// [`ProgramError`].
+    pub fn run(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Result<Value, ProgramError> {
+        let mut command = self.command();
+        command.arg("run").arg(&chain.pipeline).args(files).arg("--archive").arg(archive).arg("--json");
+        for (option, path) in [("--mission", &chain.mission), ("--model", &chain.model)] {
+            if let Some(path) = path {
+                command.arg(option).arg(path);
+            }
+        }
+        json(&mut command, &[0, 3, 4])
+    }
+}
+
+fn output(command: &mut Command, codes: &[i32]) -> Result<Vec<u8>, ProgramError> {
+    let name = format!("{command:?}");
+    let output = command.output().map_err(|source| ProgramError::Start { command: name.clone(), source })?;
+    match output.status.code() {
+        Some(code) if codes.contains(&code) => Ok(output.stdout),
+        _ => Err(ProgramError::Failed {
+            command: name,
+            status: output.status,
+            message: String::from_utf8_lossy(&output.stderr).into_owned(),
+        }),
+    }
+}
+
+fn json(command: &mut Command, codes: &[i32]) -> Result<Value, ProgramError> {
+    let text = output(command, codes)?;
+    serde_json::from_slice(&text).map_err(|_| missing(command, "a JSON document"))
+}
+
+fn missing(command: &Command, what: &str) -> ProgramError {
+    ProgramError::Answer { command: format!("{command:?}"), what: what.to_owned() }
+}
+
+/// The result of a product.
+///
+/// # Errors
+/// The name of what the product lacks.
+pub fn line(configuration: &str, seed: u32, build: &str, truth_m: &[f64; 6], product: &Value) -> Result<Line, String> {
+    let number = |value: &Value, what: &str| value.as_f64().ok_or_else(|| what.to_owned());
+    let text = |key: &str| product[key].as_str().map(str::to_owned).ok_or_else(|| key.to_owned());
+    let stage = &product["quality"]["stages"]["es-akf"];
+    let sigma_stretch = [
+        number(&stage["tm1"]["sigma_stretch"], "sigma_stretch of tm1")?,
+        number(&stage["tm2"]["sigma_stretch"], "sigma_stretch of tm2")?,
+    ];
+    let mut p_end_sigma_m = [0.0; 6];
+    for (sigma, name) in p_end_sigma_m.iter_mut().zip(COEFFICIENTS) {
+        *sigma = rounded(number(&stage["p_end_sigma"][name], "p_end_sigma")?);
+    }
+    let solution = |label: &str| solution(product, label, truth_m);
+    let qp = solution("qp")?;
+    let adopted = Some(solution("adopted")?).filter(|adopted| *adopted != qp);
+    let span_ns =
+        number(&product["stop_time_epoch_ns"], "stop time")? - number(&product["start_time_epoch_ns"], "start time")?;
+    Ok(Line {
+        configuration: configuration.to_owned(),
+        seed,
+        hours: (span_ns / 3.6e12 * 1000.0).round() / 1000.0,
+        date: text("date_created")?.chars().take(10).collect(),
+        software: text("software_version")?,
+        build: build.to_owned(),
+        verdict: text("verdict")?,
+        nis: rounded(number(&product["nis"], "nis")?),
+        nis_dof: 3.0 * number(&product["quality"]["counts"]["es-akf"]["updates"], "updates")?,
+        chi2_per_dof: rounded(number(&product["chi2_per_dof"], "chi2_per_dof")?),
+        sigma_stretch: sigma_stretch.map(rounded),
+        p_end_sigma_m,
+        es_akf: solution("es-akf")?,
+        qp,
+        adopted,
+    })
+}
+
+fn solution(product: &Value, label: &str, truth_m: &[f64; 6]) -> Result<Solution, String> {
+    let lacks = || format!("solution {label}");
+    let all = product["coefficients"].as_array().ok_or_else(lacks)?;
+    let names = product["covariance_names"][label].as_array().ok_or_else(lacks)?;
+    let values: BTreeMap<&str, f64> = all
+        .iter()
+        .filter(|c| c["solution"] == label)
+        .filter_map(|c| Some((c["name"].as_str()?, c["value"].as_f64()?)))
+        .collect();
+    let place = |name: &str| names.iter().position(|n| n == name).ok_or_else(lacks);
+    let mut value_m = [0.0; 6];
+    let mut covariance_m2 = Vec::with_capacity(21);
+    for (i, a) in COEFFICIENTS.into_iter().enumerate() {
+        value_m[i] = *values.get(a).ok_or_else(lacks)?;
+        for b in &COEFFICIENTS[i..] {
+            let entry = &product["covariance"][label][place(a)?][place(b)?];
+            covariance_m2.push(rounded(entry.as_f64().ok_or_else(lacks)?));
+        }
+    }
+    let error_m = std::array::from_fn(|i| rounded(value_m[i] - truth_m[i]));
+    Ok(Solution { value_m: value_m.map(rounded), error_m, covariance_m2 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn product() -> Value {
+        let coefficient = |name: &str, solution: &str, value: f64| json!({ "name": name, "solution": solution, "value": value, "sigma": 0.0 });
+        let mut coefficients = Vec::new();
+        let mut covariance = serde_json::Map::new();
+        let mut names = serde_json::Map::new();
+        // Names in another order than ours.
+        let order: Vec<&str> = COEFFICIENTS.iter().rev().copied().collect();
+        for (label, scale) in [("es-akf", 2.0), ("qp", 1.0), ("adopted", 1.0)] {
+            for (i, name) in order.iter().enumerate() {
+                coefficients.push(coefficient(name, label, scale * i as f64));
+            }
+            let matrix: Vec<Vec<f64>> =
+                (0..6).map(|i| (0..6).map(|j| scale * f64::from(i.min(j) + 10 * i.max(j) + 1)).collect()).collect();
+            covariance.insert(label.to_owned(), json!(matrix));
+            names.insert(label.to_owned(), json!(order));
+        }
+        let p_end: serde_json::Map<_, _> = COEFFICIENTS.iter().map(|n| ((*n).to_owned(), json!(1e-3))).collect();
+        json!({
+            "coefficients": coefficients, "covariance": covariance, "covariance_names": names,
+            "verdict": "agree", "nis": 1.0, "chi2_per_dof": 1.0, "software_version": "dragfree 0.1.0",
+            "date_created": "2026-11-21T04:14:45Z",
+            "start_time_epoch_ns": 0_i64, "stop_time_epoch_ns": 86_399_900_000_000_i64,
+            "quality": { "counts": { "es-akf": { "updates": 100 } }, "stages": { "es-akf": {
+                "tm1": { "sigma_stretch": 1.0 }, "tm2": { "sigma_stretch": 2.0 }, "p_end_sigma": p_end } } },
+        })
+    }
+
+    #[test]
+    fn a_product_becomes_a_line() {
+        let found = line("nominal", 7, "abc", &[1.0; 6], &product()).unwrap();
+        assert_eq!((found.seed, found.date.as_str(), found.hours, found.nis_dof), (7, "2026-11-21", 24.0, 300.0));
+        // tm1.x stands last in the product.
+        assert_eq!((found.es_akf.value_m[0], found.es_akf.error_m[0], found.qp.error_m[5]), (10.0, 9.0, -1.0));
+        let c = found.qp.covariance();
+        assert_eq!((c[(0, 0)], c[(5, 5)], c[(0, 5)]), (56.0, 1.0, 51.0));
+        assert_eq!((found.sigma_stretch, found.adopted), ([1.0, 2.0], None));
+    }
+
+    #[test]
+    fn what_a_product_lacks_is_named() {
+        let mut lame = product();
+        lame["covariance"]["qp"] = Value::Null;
+        assert_eq!(line("nominal", 7, "abc", &[1.0; 6], &lame).unwrap_err(), "solution qp");
+    }
+}

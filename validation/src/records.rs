@@ -1,0 +1,332 @@
+//! Results on disk: one JSON line for each configuration and seed, appended as soon as it is known.
+
+use nalgebra::DMatrix;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use std::fs::{File, OpenOptions};
+use std::io::{ErrorKind, Write as _};
+use std::path::{Path, PathBuf};
+
+/// The coefficients of the model, in the order of every array of six.
+pub const COEFFICIENTS: [&str; 6] = [
+    "com-offset.tm1.x",
+    "com-offset.tm1.y",
+    "com-offset.tm1.z",
+    "com-offset.tm2.x",
+    "com-offset.tm2.y",
+    "com-offset.tm2.z",
+];
+
+/// A file of results that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RecordError {
+    /// It cannot be read or written.
+    #[error("{path}: {source}", path = path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// A line that is complete is no result.
+    #[error("{path}, line {line}: {source}; results are written by `dragfree-validation` alone", path = path.display())]
+    Line {
+        /// The file.
+        path: PathBuf,
+        /// Counted from 1.
+        line: usize,
+        /// Why.
+        source: serde_json::Error,
+    },
+}
+
+/// One solution of one run.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Solution {
+    /// Estimates, m.
+    pub value_m: [f64; 6],
+    /// Estimate minus truth, m.
+    pub error_m: [f64; 6],
+    /// Upper triangle of the covariance by rows, m²; its diagonal is σ².
+    pub covariance_m2: Vec<f64>,
+}
+
+impl Solution {
+    /// The whole covariance, m².
+    #[must_use]
+    pub fn covariance(&self) -> DMatrix<f64> {
+        DMatrix::from_fn(6, 6, |i, j| {
+            let (i, j) = (i.min(j), i.max(j));
+            self.covariance_m2[i * 6 - i * (i + 1) / 2 + j]
+        })
+    }
+
+    /// σ, m.
+    #[must_use]
+    pub fn sigma_m(&self) -> [f64; 6] {
+        let c = self.covariance();
+        std::array::from_fn(|i| c[(i, i)].sqrt())
+    }
+
+    /// Error over σ.
+    #[must_use]
+    pub fn pulls(&self) -> [f64; 6] {
+        let sigma = self.sigma_m();
+        std::array::from_fn(|i| self.error_m[i] / sigma[i])
+    }
+}
+
+/// What one run of the program gave.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Line {
+    /// What was run.
+    pub configuration: String,
+    /// Seed of the simulation.
+    pub seed: u32,
+    /// Length of the data, h.
+    pub hours: f64,
+    /// Day of the run.
+    pub date: String,
+    /// The program and its version.
+    pub software: String,
+    /// Digest of the plugins' libraries, twelve hexadecimal digits.
+    pub build: String,
+    /// Verdict of the product.
+    pub verdict: String,
+    /// Normalised innovation squared over its degrees of freedom.
+    pub nis: f64,
+    /// Its degrees of freedom.
+    pub nis_dof: f64,
+    /// χ²/dof of the batch solution against the noise of the mission file.
+    pub chi2_per_dof: f64,
+    /// By how much the ES-AKF widened its σ for what it saw, per test mass.
+    pub sigma_stretch: [f64; 2],
+    /// σ of the recursion's end, as the paper reports it, m.
+    pub p_end_sigma_m: [f64; 6],
+    /// Recursive solution.
+    pub es_akf: Solution,
+    /// Batch solution.
+    pub qp: Solution,
+    /// What the product adopts; none where it is the batch solution as it stands.
+    pub adopted: Option<Solution>,
+}
+
+impl Line {
+    /// What the product adopts.
+    #[must_use]
+    pub fn adopted(&self) -> &Solution {
+        self.adopted.as_ref().unwrap_or(&self.qp)
+    }
+}
+
+/// A result that is there once for each key and build.
+pub trait Keyed {
+    /// Configuration and seed.
+    fn key(&self) -> (String, u32);
+    /// Digest of what made it.
+    fn build(&self) -> &str;
+}
+
+impl Keyed for Line {
+    fn key(&self) -> (String, u32) {
+        (self.configuration.clone(), self.seed)
+    }
+
+    fn build(&self) -> &str {
+        &self.build
+    }
+}
+
+/// A file of results that grows.
+#[derive(Debug)]
+pub struct Results<T> {
+    path: PathBuf,
+    file: File,
+    /// What is there.
+    pub lines: Vec<T>,
+}
+
+/// The results of a file, none where there is no file. A last line without its end was cut off by a kill and does not
+/// count.
+///
+/// # Errors
+/// [`RecordError`] when a complete line is no result.
+pub fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, RecordError> {
+    let text = match std::fs::read_to_string(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
+        other => other.map_err(|source| RecordError::Io { path: path.to_owned(), source })?,
+    };
+    let complete = text.rfind('\n').map_or("", |end| &text[..end]);
+    let parse = |(i, line): (usize, &str)| {
+        serde_json::from_str(line).map_err(|source| RecordError::Line { path: path.to_owned(), line: i + 1, source })
+    };
+    complete.lines().enumerate().map(parse).collect()
+}
+
+impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
+    /// Opens a file to go on with, or a new one. Results of another build are dropped from it: a table of two builds says
+    /// nothing of either. Gives how many.
+    ///
+    /// # Errors
+    /// [`RecordError`] when the file holds something else or cannot be written.
+    pub fn open(path: &Path, build: &str) -> Result<(Self, usize), RecordError> {
+        let io = |source| RecordError::Io { path: path.to_owned(), source };
+        let mut lines: Vec<T> = read(path)?;
+        let before = lines.len();
+        lines.retain(|line| line.build() == build);
+        let dropped = before - lines.len();
+        let mut text = Vec::new();
+        for line in &lines {
+            write_line(&mut text, line, path)?;
+        }
+        // Whatever was cut off is gone with the old file; a kill leaves one or the other whole.
+        let fresh = path.with_extension("tmp");
+        std::fs::create_dir_all(path.parent().unwrap_or(Path::new("."))).map_err(io)?;
+        std::fs::write(&fresh, text).map_err(io)?;
+        std::fs::rename(&fresh, path).map_err(io)?;
+        let file = OpenOptions::new().append(true).open(path).map_err(io)?;
+        Ok((Self { path: path.to_owned(), file, lines }, dropped))
+    }
+
+    /// Whether a result is there.
+    #[must_use]
+    pub fn has(&self, configuration: &str, seed: u32) -> bool {
+        self.lines.iter().any(|line| line.key() == (configuration.to_owned(), seed))
+    }
+
+    /// Appends a result in one write.
+    ///
+    /// # Errors
+    /// [`RecordError::Io`].
+    pub fn append(&mut self, line: T) -> Result<(), RecordError> {
+        let mut text = Vec::new();
+        write_line(&mut text, &line, &self.path)?;
+        self.file.write_all(&text).map_err(|source| RecordError::Io { path: self.path.clone(), source })?;
+        self.lines.push(line);
+        Ok(())
+    }
+
+    /// Writes the file again in the order of configurations and seeds, so that it does not depend on who finished first.
+    ///
+    /// # Errors
+    /// [`RecordError::Io`].
+    pub fn sort(mut self, configurations: &[&str]) -> Result<(), RecordError> {
+        let place = |name: &str| configurations.iter().position(|c| *c == name);
+        self.lines.sort_by_key(|line| {
+            let (configuration, seed) = line.key();
+            (place(&configuration), configuration, seed)
+        });
+        let io = |source| RecordError::Io { path: self.path.clone(), source };
+        let mut text = Vec::new();
+        for line in &self.lines {
+            write_line(&mut text, line, &self.path)?;
+        }
+        let fresh = self.path.with_extension("tmp");
+        std::fs::write(&fresh, text).map_err(io)?;
+        std::fs::rename(&fresh, &self.path).map_err(io)
+    }
+}
+
+fn write_line<T: Serialize>(text: &mut Vec<u8>, line: &T, path: &Path) -> Result<(), RecordError> {
+    serde_json::to_writer(&mut *text, line)
+        .map_err(|source| RecordError::Io { path: path.to_owned(), source: source.into() })?;
+    text.push(b'\n');
+    Ok(())
+}
+
+/// Seven significant digits: more than any statistic needs, and files that a person can read.
+#[must_use]
+pub fn rounded(value: f64) -> f64 {
+    format!("{value:.6e}").parse().unwrap_or(value)
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    pub(crate) fn solution(error_m: [f64; 6], sigma_m: f64) -> Solution {
+        let mut covariance_m2 = Vec::new();
+        for i in 0..6 {
+            for j in i..6 {
+                covariance_m2.push(if i == j { sigma_m * sigma_m } else { 0.0 });
+            }
+        }
+        Solution { value_m: error_m, error_m, covariance_m2 }
+    }
+
+    pub(crate) fn line(configuration: &str, seed: u32) -> Line {
+        Line {
+            configuration: configuration.to_owned(),
+            seed,
+            hours: 24.0,
+            date: "2035-01-01".to_owned(),
+            software: "dragfree 0.1.0".to_owned(),
+            build: "abc".to_owned(),
+            verdict: "agree".to_owned(),
+            nis: 1.0,
+            nis_dof: 5e6,
+            chi2_per_dof: 1.0,
+            sigma_stretch: [1.0; 2],
+            p_end_sigma_m: [1e-3; 6],
+            es_akf: solution([1e-3; 6], 1e-3),
+            qp: solution([1e-4; 6], 2e-4),
+            adopted: None,
+        }
+    }
+
+    #[test]
+    fn a_triangle_becomes_its_matrix() {
+        let mut s = solution([0.0; 6], 1.0);
+        s.covariance_m2 = (0..21).map(f64::from).collect();
+        let c = s.covariance();
+        assert_eq!((c[(0, 5)], c[(1, 1)], c[(5, 1)], c[(5, 5)]), (5.0, 6.0, 10.0, 20.0));
+        assert_eq!(c, c.transpose());
+    }
+
+    /// A kill at any byte of the last write: what was complete stays, once, and the rest is done again.
+    #[test]
+    fn a_kill_in_the_middle_loses_and_doubles_nothing() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("results.jsonl");
+        let (mut results, dropped) = Results::open(&path, "abc").unwrap();
+        assert_eq!(dropped, 0);
+        for seed in [2, 1] {
+            results.append(line("nominal", seed)).unwrap();
+        }
+        drop(results);
+        let whole = std::fs::read(&path).unwrap();
+        let first = whole.iter().position(|b| *b == b'\n').unwrap() + 1;
+        for cut in (first..whole.len()).step_by(7).chain([whole.len() - 1]) {
+            std::fs::write(&path, &whole[..cut]).unwrap();
+            let (mut results, _) = Results::<Line>::open(&path, "abc").unwrap();
+            assert!(results.has("nominal", 2) && !results.has("nominal", 1), "cut at {cut}");
+            results.append(line("nominal", 1)).unwrap();
+            drop(results);
+            assert_eq!(std::fs::read(&path).unwrap(), whole, "cut at {cut}");
+        }
+        let (results, _) = Results::<Line>::open(&path, "abc").unwrap();
+        results.sort(&["nominal"]).unwrap();
+        let seeds: Vec<u32> = read::<Line>(&path).unwrap().iter().map(|l| l.seed).collect();
+        assert_eq!(seeds, [1, 2]);
+    }
+
+    #[test]
+    fn results_of_another_build_are_dropped_and_nonsense_is_refused() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("results.jsonl");
+        let (mut results, _) = Results::open(&path, "abc").unwrap();
+        results.append(line("nominal", 1)).unwrap();
+        let (results, dropped) = Results::<Line>::open(&path, "def").unwrap();
+        assert_eq!((results.lines.len(), dropped), (0, 1));
+        std::fs::write(&path, "{}\n").unwrap();
+        let error = Results::<Line>::open(&path, "abc").unwrap_err().to_string();
+        assert!(error.contains("line 1"), "{error}");
+    }
+
+    #[test]
+    fn seven_digits_are_kept() {
+        assert_eq!((rounded(1.234_567_89e-8), rounded(0.0), rounded(-2.0)), (1.234_568e-8, 0.0, -2.0));
+    }
+}
