@@ -1,5 +1,7 @@
-//! Line charts on logarithmic axes, as SVG: amplitude spectra, sensitivities and their bounds.
+//! Line charts as SVG: spectra and their bounds on logarithmic axes, series and counts on linear ones.
 
+use plotters::coord::Shift;
+use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
 use plotters::prelude::*;
 use std::ops::Range;
 
@@ -12,16 +14,47 @@ pub enum Stroke {
     Dashed,
 }
 
+/// How an axis is divided.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scale {
+    /// By decades; only what is positive has a place.
+    Logarithmic,
+    /// Evenly.
+    Linear,
+}
+
+impl Scale {
+    fn shows(self, value: f64) -> bool {
+        value.is_finite() && (self == Self::Linear || value > 0.0)
+    }
+
+    /// Place of a value in a range, 0 to 1.
+    fn place(self, value: f64, range: &Range<f64>) -> f64 {
+        match self {
+            Self::Logarithmic => (value / range.start).ln() / (range.end / range.start).ln(),
+            Self::Linear => (value - range.start) / (range.end - range.start),
+        }
+    }
+
+    fn text(self, value: f64) -> String {
+        match self {
+            Self::Logarithmic => format!("{value:.0e}"),
+            // Rounded, so that a sum of tenths does not show its last bit.
+            Self::Linear => format!("{}", format!("{value:.6e}").parse().unwrap_or(value)),
+        }
+    }
+}
+
 /// One line of a panel.
 #[derive(Clone, Debug)]
 pub struct Line {
-    /// Text of the legend.
+    /// Text of the legend; empty for none.
     pub label: String,
     /// Place in [`PALETTE`]; a bound shares the colour of what it bounds.
     pub colour: usize,
     /// How it is drawn.
     pub stroke: Stroke,
-    /// Points in the order of x; those that are not positive and finite have no place on the axes and are left out.
+    /// Points in the order of x; those that have no place on the axes are left out.
     pub points: Vec<(f64, f64)>,
 }
 
@@ -34,9 +67,13 @@ pub struct Panel {
     pub x_label: String,
     /// Left, with the unit.
     pub y_label: String,
+    /// How x is divided.
+    pub x_scale: Scale,
+    /// How y is divided.
+    pub y_scale: Scale,
     /// Limits of x.
     pub x: Range<f64>,
-    /// Limits of y; `None` for whole decades around the points.
+    /// Limits of y; `None` for whole decades around the points, or a little more than the points.
     pub y: Option<Range<f64>>,
     /// The lines, the first at the bottom.
     pub lines: Vec<Line>,
@@ -50,9 +87,7 @@ pub const PALETTE: [(u8, u8, u8); 7] =
 #[derive(Debug, thiserror::Error)]
 pub enum ChartError {
     /// No point can be shown.
-    #[error(
-        "panel \"{panel}\" has no point with x in {x:?} and y above zero; nothing can be drawn on logarithmic axes"
-    )]
+    #[error("panel \"{panel}\" has no point with x in {x:?} that its axes can show (logarithmic ones: above zero)")]
     Empty {
         /// Title of the panel.
         panel: String,
@@ -68,18 +103,27 @@ pub enum ChartError {
 const PANEL: (u32, u32) = (560, 380);
 
 impl Panel {
-    fn shown(&self) -> impl Iterator<Item = &(f64, f64)> {
-        self.lines.iter().flat_map(|l| &l.points).filter(|(x, y)| self.x.contains(x) && y.is_finite() && *y > 0.0)
+    fn shows(&self, (x, y): &(f64, f64)) -> bool {
+        self.x.contains(x) && self.x_scale.shows(*x) && self.y_scale.shows(*y)
     }
 
-    /// Limits of y: as asked, or whole decades around what is shown.
+    fn shown(&self) -> impl Iterator<Item = &(f64, f64)> {
+        self.lines.iter().flat_map(|l| &l.points).filter(|point| self.shows(point))
+    }
+
+    /// Limits of y: as asked, or around what is shown.
     fn limits(&self) -> Result<Range<f64>, ChartError> {
         if let Some(y) = &self.y {
             return Ok(y.clone());
         }
-        let (lo, hi) = self.shown().fold((f64::INFINITY, 0.0_f64), |(lo, hi), (_, y)| (lo.min(*y), hi.max(*y)));
-        if hi == 0.0 {
+        let around = |(lo, hi): (f64, f64), (_, y): &(f64, f64)| (lo.min(*y), hi.max(*y));
+        let (lo, hi) = self.shown().fold((f64::INFINITY, f64::NEG_INFINITY), around);
+        if lo > hi {
             return Err(ChartError::Empty { panel: self.title.clone(), x: self.x.clone() });
+        }
+        if self.y_scale == Scale::Linear {
+            let margin = if hi > lo { 0.05 * (hi - lo) } else { 0.5 * hi.abs().max(1.0) };
+            return Ok(lo - margin..hi + margin);
         }
         let (lo, hi) = (lo.log10().floor(), hi.log10().ceil());
         Ok(10_f64.powf(lo)..10_f64.powf(hi.max(lo + 1.0)))
@@ -87,11 +131,12 @@ impl Panel {
 
     /// Where the legend hides the fewest points.
     fn emptiest_corner(&self, y: &Range<f64>) -> SeriesLabelPosition {
-        let place = |v: f64, range: &Range<f64>| (v / range.start).log10() / (range.end / range.start).log10();
         let covered = |right: bool, upper: bool| {
             let near = |at: f64, end: bool, reach: f64| if end { at > 1.0 - reach } else { at < reach };
             self.shown()
-                .filter(|(px, py)| near(place(*px, &self.x), right, 0.35) && near(place(*py, y), upper, 0.3))
+                .filter(|(px, py)| {
+                    near(self.x_scale.place(*px, &self.x), right, 0.35) && near(self.y_scale.place(*py, y), upper, 0.3)
+                })
                 .count()
         };
         let corners = [
@@ -106,14 +151,36 @@ impl Panel {
             .map_or(SeriesLabelPosition::UpperRight, |(corner, _)| corner)
     }
 
-    fn draw(&self, area: &DrawingArea<SVGBackend<'_>, plotters::coord::Shift>) -> Result<(), ChartError> {
+    fn draw(&self, area: &DrawingArea<SVGBackend<'_>, Shift>) -> Result<(), ChartError> {
         let y = self.limits()?;
+        let x = self.x.clone();
+        match (self.x_scale, self.y_scale) {
+            (Scale::Logarithmic, Scale::Logarithmic) => self.draw_on(area, &y, x.log_scale(), y.clone().log_scale()),
+            (Scale::Logarithmic, Scale::Linear) => self.draw_on(area, &y, x.log_scale(), y.clone()),
+            (Scale::Linear, Scale::Logarithmic) => self.draw_on(area, &y, x, y.clone().log_scale()),
+            (Scale::Linear, Scale::Linear) => self.draw_on(area, &y, x, y.clone()),
+        }
+    }
+
+    fn draw_on<X, Y>(
+        &self,
+        area: &DrawingArea<SVGBackend<'_>, Shift>,
+        y: &Range<f64>,
+        x_axis: X,
+        y_axis: Y,
+    ) -> Result<(), ChartError>
+    where
+        X: AsRangedCoord<Value = f64>,
+        Y: AsRangedCoord<Value = f64>,
+        X::CoordDescType: Ranged<ValueType = f64> + ValueFormatter<f64>,
+        Y::CoordDescType: Ranged<ValueType = f64> + ValueFormatter<f64>,
+    {
         let mut chart = ChartBuilder::on(area)
             .caption(&self.title, ("sans-serif", 17))
             .margin(10)
             .x_label_area_size(42)
             .y_label_area_size(70)
-            .build_cartesian_2d(self.x.clone().log_scale(), y.clone().log_scale())
+            .build_cartesian_2d(x_axis, y_axis)
             .map_err(refused)?;
         chart
             .configure_mesh()
@@ -121,8 +188,8 @@ impl Panel {
             .y_desc(&self.y_label)
             .axis_desc_style(("sans-serif", 14))
             .label_style(("sans-serif", 12))
-            .x_label_formatter(&decade)
-            .y_label_formatter(&decade)
+            .x_label_formatter(&|value| self.x_scale.text(*value))
+            .y_label_formatter(&|value| self.y_scale.text(*value))
             .bold_line_style(RGBColor(200, 200, 200))
             .max_light_lines(0)
             .draw()
@@ -130,38 +197,38 @@ impl Panel {
         for line in &self.lines {
             let (r, g, b) = PALETTE[line.colour % PALETTE.len()];
             let style = RGBColor(r, g, b).stroke_width(2);
-            let visible = line.points.iter().copied().filter(|(x, v)| self.x.contains(x) && v.is_finite() && *v > 0.0);
-            let points: Vec<_> = visible.map(|(x, v)| (x, v.clamp(y.start, y.end))).collect();
+            let points: Vec<_> = line
+                .points
+                .iter()
+                .copied()
+                .filter(|point| self.shows(point))
+                .map(|(x, v)| (x, v.clamp(y.start, y.end)))
+                .collect();
             let solid = move |(x, y): (i32, i32)| PathElement::new([(x, y), (x + 18, y)], style);
             let dashes = move |(x, y): (i32, i32)| {
                 let dash = |from: i32| PathElement::new([(from, 0), (from + 5, 0)], style);
                 EmptyElement::at((x, y)) + dash(0) + dash(7) + dash(14)
             };
+            let series = match line.stroke {
+                Stroke::Solid => chart.draw_series(LineSeries::new(points, style)),
+                Stroke::Dashed => chart.draw_series(DashedLineSeries::new(points, 6, 4, style)),
+            }
+            .map_err(refused)?;
             match line.stroke {
-                Stroke::Solid => {
-                    chart.draw_series(LineSeries::new(points, style)).map_err(refused)?.label(&line.label).legend(solid)
-                }
-                Stroke::Dashed => chart
-                    .draw_series(DashedLineSeries::new(points, 6, 4, style))
-                    .map_err(refused)?
-                    .label(&line.label)
-                    .legend(dashes),
+                _ if line.label.is_empty() => series,
+                Stroke::Solid => series.label(&line.label).legend(solid),
+                Stroke::Dashed => series.label(&line.label).legend(dashes),
             };
         }
         chart
             .configure_series_labels()
-            .position(self.emptiest_corner(&y))
+            .position(self.emptiest_corner(y))
             .background_style(WHITE.mix(0.85))
             .border_style(RGBColor(200, 200, 200))
             .label_font(("sans-serif", 12))
             .draw()
             .map_err(refused)
     }
-}
-
-/// `1e-3`, as engineers write decades.
-fn decade(value: &f64) -> String {
-    format!("{value:.0e}")
 }
 
 fn refused<E: std::fmt::Display>(error: E) -> ChartError {
@@ -198,6 +265,8 @@ mod tests {
             title: "tm1.x".to_owned(),
             x_label: "frequency / Hz".to_owned(),
             y_label: "|S|".to_owned(),
+            x_scale: Scale::Logarithmic,
+            y_scale: Scale::Logarithmic,
             x: 1e-4..1.0,
             y: None,
             lines: vec![line],
@@ -218,6 +287,18 @@ mod tests {
     fn limits_are_whole_decades() {
         assert_eq!(panel(vec![(1e-3, 2e-9), (1e-2, 3e-8)]).limits().unwrap(), 1e-9..1e-7);
         assert_eq!(panel(vec![(1e-3, 1.0)]).limits().unwrap(), 1.0..10.0);
+    }
+
+    #[test]
+    fn linear_axes_show_zero_and_below() {
+        let mut linear = panel(vec![(0.0, -1.0), (0.5, 0.0), (0.9, 3.0), (0.95, f64::NAN)]);
+        (linear.x_scale, linear.y_scale, linear.x) = (Scale::Linear, Scale::Linear, 0.0..1.0);
+        assert_eq!(linear.limits().unwrap(), -1.2..3.2);
+        assert_eq!(linear.shown().count(), 3);
+        assert!(svg(&[linear.clone()], 1).unwrap().lines().any(|text| text.trim() == "0.5"));
+        linear.y_scale = Scale::Logarithmic;
+        assert_eq!(linear.shown().count(), 1);
+        svg(&[linear], 1).unwrap();
     }
 
     #[test]

@@ -4,7 +4,7 @@ use super::Done;
 use crate::args::{Design as Arguments, Global};
 use crate::failure::Failure;
 use crate::text::{Paint, columns, labelled};
-use dragfree_chart::{Line, Panel, Stroke, svg};
+use dragfree_chart::{Line, Panel, Scale, Stroke, svg};
 use dragfree_engine::config::Mission as MissionFile;
 use dragfree_physics::control_design::{ChannelDesign, Design, design};
 use dragfree_physics::decoupling::Allocation;
@@ -190,6 +190,8 @@ fn sensitivities(design: &Design, nyquist_hz: f64) -> Vec<Panel> {
             title,
             x_label: "frequency / Hz".to_owned(),
             y_label: "gain".to_owned(),
+            x_scale: Scale::Logarithmic,
+            y_scale: Scale::Logarithmic,
             x: LOW_HZ..nyquist_hz,
             y: Some(1e-8..1e4),
             lines: vec![
@@ -213,6 +215,8 @@ fn predictions(design: &Design, nyquist_hz: f64) -> Vec<Panel> {
                 title,
                 x_label: "frequency / Hz".to_owned(),
                 y_label: format!("ASD / {unit}/√Hz"),
+                x_scale: Scale::Logarithmic,
+                y_scale: Scale::Logarithmic,
                 x: range.0..range.1,
                 y: None,
                 lines: vec![
