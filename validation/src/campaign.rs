@@ -188,11 +188,11 @@ fn write(path: &Path, text: &str) -> Result<(), CampaignError> {
     std::fs::write(path, text).map_err(|e| file(path, &e))
 }
 
-fn file(path: &Path, reason: &dyn std::fmt::Display) -> CampaignError {
+pub(crate) fn file(path: &Path, reason: &dyn std::fmt::Display) -> CampaignError {
     CampaignError::File { path: path.to_owned(), reason: reason.to_string() }
 }
 
-fn parse(path: &Path) -> Result<toml::Table, CampaignError> {
+pub(crate) fn parse(path: &Path) -> Result<toml::Table, CampaignError> {
     std::fs::read_to_string(path).map_err(|e| file(path, &e))?.parse().map_err(|e| file(path, &e))
 }
 

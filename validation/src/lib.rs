@@ -5,4 +5,7 @@ pub mod bound;
 pub mod campaign;
 pub mod program;
 pub mod records;
+pub mod report;
+pub mod speed;
 pub mod stats;
+pub mod table;

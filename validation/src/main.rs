@@ -3,6 +3,7 @@
 use clap::{Args, Parser, Subcommand};
 use dragfree_validation::campaign::{self, CampaignError, note};
 use dragfree_validation::program::{Program, root};
+use dragfree_validation::{report, speed, table};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -22,6 +23,14 @@ struct Arguments {
 enum Command {
     /// Simulate and calibrate seeds, and their twins; goes on where it was stopped
     Coverage(Coverage),
+    /// The table to beat: 25 days in three regimes of noise; goes on where it was stopped
+    Table(Table),
+    /// Measure ratios of speed, on a machine that does nothing else
+    Speed,
+    /// Write the generated parts of VALIDATION.md and the picture from the results
+    Report,
+    /// Everything: coverage, table, speed, report
+    All,
 }
 
 #[derive(Debug, Args)]
@@ -34,6 +43,21 @@ struct Coverage {
     results: Option<PathBuf>,
 }
 
+#[derive(Debug, Args)]
+struct Table {
+    /// Seeds
+    #[arg(long, value_delimiter = ',', default_value = "1")]
+    seeds: Vec<u32>,
+    /// Length of the long runs
+    #[arg(long, default_value_t = report::TABLE_DAYS, value_parser = clap::value_parser!(u32).range(1..))]
+    days: u32,
+    /// File of results
+    #[arg(long, value_name = "FILE")]
+    results: Option<PathBuf>,
+}
+
+const SEEDS: RangeInclusive<u32> = 1..=100;
+
 fn seeds(text: &str) -> Result<RangeInclusive<u32>, String> {
     let (first, last) = text.split_once('-').unwrap_or((text, text));
     match (first.parse(), last.parse()) {
@@ -45,10 +69,26 @@ fn seeds(text: &str) -> Result<RangeInclusive<u32>, String> {
 fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
     let results = root().join("validation/results");
     let scratch = arguments.scratch.clone().unwrap_or_else(|| root().join("target/validation"));
+    let coverage_file = results.join("coverage.jsonl");
+    let table_file = results.join("table.jsonl");
+    let speed_file = results.join("speed.json");
     match &arguments.command {
         Command::Coverage(c) => {
-            let file = c.results.clone().unwrap_or_else(|| results.join("coverage.jsonl"));
-            campaign::coverage(&Program::build()?, c.seeds.clone(), &file, &scratch)
+            let file = c.results.as_ref().unwrap_or(&coverage_file);
+            campaign::coverage(&Program::build()?, c.seeds.clone(), file, &scratch)
+        }
+        Command::Table(t) => {
+            let file = t.results.as_ref().unwrap_or(&table_file);
+            table::table(&Program::build()?, &t.seeds, t.days, file, &scratch)
+        }
+        Command::Speed => speed::measure(&Program::build()?, &speed_file, &scratch),
+        Command::Report => report::write(&results),
+        Command::All => {
+            let program = Program::build()?;
+            campaign::coverage(&program, SEEDS, &coverage_file, &scratch)?;
+            table::table(&program, &[1], report::TABLE_DAYS, &table_file, &scratch)?;
+            speed::measure(&program, &speed_file, &scratch)?;
+            report::write(&results)
         }
     }
 }

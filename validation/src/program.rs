@@ -60,8 +60,7 @@ pub fn root() -> &'static Path {
 #[derive(Clone, Debug)]
 pub struct Program {
     exe: PathBuf,
-    /// Threads of one run.
-    pub threads: usize,
+    threads: usize,
 }
 
 /// Telemetry of one simulation. The truth was read and removed before anything could calibrate it.
@@ -103,6 +102,12 @@ impl Program {
         }
         output(&mut build, &[0])?;
         Ok(Self { exe: folder.join(format!("dragfree{}", std::env::consts::EXE_SUFFIX)), threads: 1 })
+    }
+
+    /// The same program with so many threads for one run; one unless asked for more.
+    #[must_use]
+    pub fn with_threads(&self, threads: usize) -> Self {
+        Self { exe: self.exe.clone(), threads }
     }
 
     fn command(&self) -> Command {
@@ -239,11 +244,27 @@ pub fn line(configuration: &str, seed: u32, build: &str, truth_m: &[f64; 6], pro
         nis_dof: 3.0 * number(&product["quality"]["counts"]["es-akf"]["updates"], "updates")?,
         chi2_per_dof: rounded(number(&product["chi2_per_dof"], "chi2_per_dof")?),
         sigma_stretch: sigma_stretch.map(rounded),
+        qp_widened: qp_widened(product)?.map(rounded),
         p_end_sigma_m,
         es_akf: solution("es-akf")?,
         qp,
         adopted,
     })
+}
+
+/// By how much `qp-check` widened each σ: for residuals beyond its Σ, or for blocks of time that scatter more than chance
+/// allows, whichever is more.
+fn qp_widened(product: &Value) -> Result<[f64; 6], String> {
+    let stage = &product["quality"]["stages"]["qp-check"];
+    let chi2 = stage["chi2_per_dof_refined_sigma"].as_f64().ok_or_else(|| "chi2_per_dof_refined_sigma".to_owned())?;
+    let names = product["covariance_names"]["qp"].as_array().ok_or_else(|| "names of qp".to_owned())?;
+    let scatter = &stage["scatter_of_blocks"];
+    let upper = scatter["upper"].as_f64().unwrap_or(f64::INFINITY);
+    Ok(COEFFICIENTS.map(|name| {
+        let place = names.iter().position(|n| n == name).unwrap_or(usize::MAX);
+        let ratio = scatter["ratio"][place].as_f64().filter(|ratio| *ratio > upper).unwrap_or(1.0);
+        ratio.max(chi2.max(1.0).sqrt())
+    }))
 }
 
 fn solution(product: &Value, label: &str, truth_m: &[f64; 6]) -> Result<Solution, String> {
@@ -296,7 +317,10 @@ mod tests {
             "verdict": "agree", "nis": 1.0, "chi2_per_dof": 1.0, "software_version": "dragfree 0.1.0",
             "date_created": "2026-11-21T04:14:45Z",
             "start_time_epoch_ns": 0_i64, "stop_time_epoch_ns": 86_399_900_000_000_i64,
-            "quality": { "counts": { "es-akf": { "updates": 100 } }, "stages": { "es-akf": {
+            "quality": { "counts": { "es-akf": { "updates": 100 } }, "stages": {
+                "qp-check": { "chi2_per_dof_refined_sigma": 1.21, "scatter_of_blocks": {
+                    "ratio": [1.6, 1.4, 1.0, 1.0, 1.0, 1.0], "upper": 1.5 } },
+                "es-akf": {
                 "tm1": { "sigma_stretch": 1.0 }, "tm2": { "sigma_stretch": 2.0 }, "p_end_sigma": p_end } } },
         })
     }
@@ -309,7 +333,8 @@ mod tests {
         assert_eq!((found.es_akf.value_m[0], found.es_akf.error_m[0], found.qp.error_m[5]), (10.0, 9.0, -1.0));
         let c = found.qp.covariance();
         assert_eq!((c[(0, 0)], c[(5, 5)], c[(0, 5)]), (56.0, 1.0, 51.0));
-        assert_eq!((found.sigma_stretch, found.adopted), ([1.0, 2.0], None));
+        assert_eq!((found.sigma_stretch, found.adopted.as_ref()), ([1.0, 2.0], None));
+        assert_eq!(found.qp_widened, [1.1, 1.1, 1.1, 1.1, 1.1, 1.6]);
     }
 
     #[test]

@@ -69,6 +69,13 @@ impl Solution {
         std::array::from_fn(|i| c[(i, i)].sqrt())
     }
 
+    /// The same with every σ divided by a factor.
+    fn divided(&self, factor: impl Fn(usize) -> f64) -> Self {
+        let rows = (0..6).flat_map(|i| (i..6).map(move |j| (i, j)));
+        let covariance_m2 = rows.zip(&self.covariance_m2).map(|((i, j), c)| c / factor(i) / factor(j)).collect();
+        Self { covariance_m2, ..self.clone() }
+    }
+
     /// Error over σ.
     #[must_use]
     pub fn pulls(&self) -> [f64; 6] {
@@ -103,6 +110,8 @@ pub struct Line {
     pub chi2_per_dof: f64,
     /// By how much the ES-AKF widened its σ for what it saw, per test mass.
     pub sigma_stretch: [f64; 2],
+    /// By how much the batch solution widened its σ for what it saw, per coefficient.
+    pub qp_widened: [f64; 6],
     /// σ of the recursion's end, as the paper reports it, m.
     pub p_end_sigma_m: [f64; 6],
     /// Recursive solution.
@@ -114,6 +123,12 @@ pub struct Line {
 }
 
 impl Line {
+    /// Recursive and batch solution with their σ as they were before anything widened them.
+    #[must_use]
+    pub fn bare(&self) -> (Solution, Solution) {
+        (self.es_akf.divided(|i| self.sigma_stretch[i / 3]), self.qp.divided(|i| self.qp_widened[i]))
+    }
+
     /// What the product adopts.
     #[must_use]
     pub fn adopted(&self) -> &Solution {
@@ -269,6 +284,7 @@ pub(crate) mod tests {
             nis_dof: 5e6,
             chi2_per_dof: 1.0,
             sigma_stretch: [1.0; 2],
+            qp_widened: [1.0; 6],
             p_end_sigma_m: [1e-3; 6],
             es_akf: solution([1e-3; 6], 1e-3),
             qp: solution([1e-4; 6], 2e-4),
@@ -323,6 +339,15 @@ pub(crate) mod tests {
         std::fs::write(&path, "{}\n").unwrap();
         let error = Results::<Line>::open(&path, "abc").unwrap_err().to_string();
         assert!(error.contains("line 1"), "{error}");
+    }
+
+    #[test]
+    fn what_widened_sigma_can_be_undone() {
+        let mut l = line("nominal", 1);
+        (l.sigma_stretch, l.qp_widened[5]) = ([1.0, 2.0], 4.0);
+        let (es_akf, qp) = l.bare();
+        assert_eq!(es_akf.sigma_m(), [1e-3, 1e-3, 1e-3, 5e-4, 5e-4, 5e-4]);
+        assert_eq!((qp.sigma_m()[0], qp.sigma_m()[5]), (2e-4, 5e-5));
     }
 
     #[test]

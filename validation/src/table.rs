@@ -1,0 +1,148 @@
+//! The table to beat: 25 days in three regimes of noise, the first day of them alone, and the information bounds.
+
+use dragfree_physics::mission::Mission;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+use crate::bound::Case;
+use crate::campaign::{CampaignError, Meter, Workshop, file, note, parse, science_mode, work};
+use crate::program::{Chain, Program, line, root};
+use crate::records::{Keyed, Line, Results, rounded};
+
+/// A regime of noise.
+#[derive(Clone, Copy, Debug)]
+pub struct Regime {
+    /// Name of its results.
+    pub name: &'static str,
+    /// In words, for the report.
+    pub words: &'static str,
+    mission: MissionFile,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum MissionFile {
+    Fixture(&'static str),
+    /// The default mission with an amplitude times a factor.
+    Scaled(&'static str, f64),
+}
+
+/// The regimes.
+pub const REGIMES: [Regime; 3] = [
+    Regime { name: "default", words: "default noise", mission: MissionFile::Fixture("taiji.toml") },
+    Regime {
+        name: "quiet-dws",
+        words: "quieter long-arm wavefront sensing, 2.09e-10 rad/√Hz",
+        mission: MissionFile::Scaled("dws_long_arm", 2.09e-10 / 5e-10),
+    },
+    Regime {
+        name: "thrusters",
+        words: "nine thrusters with lag and noise of their own, which pushes and turns at once",
+        mission: MissionFile::Fixture("taiji-thrusters.toml"),
+    },
+];
+
+/// A run beside what could be known.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Row {
+    /// The run.
+    pub run: Line,
+    /// True offsets, m.
+    pub truth_m: [f64; 6],
+    /// Bound of σ from one test mass alone, m.
+    pub single_m: [f64; 6],
+    /// Bound of σ from both and the survey, m.
+    pub surveyed_m: [f64; 6],
+}
+
+impl Keyed for Row {
+    fn key(&self) -> (String, u32) {
+        self.run.key()
+    }
+
+    fn build(&self) -> &str {
+        self.run.build()
+    }
+}
+
+/// Name of a configuration.
+#[must_use]
+pub fn configuration(regime: &str, days: u32) -> String {
+    format!("{regime}, {days} days")
+}
+
+fn mission(path: &Path) -> Result<Mission, CampaignError> {
+    let text = serde_json::to_string(&parse(path)?).map_err(|e| file(path, &e))?;
+    Mission::from_json(&text).map_err(|e| file(path, &e))
+}
+
+struct Task {
+    regime: Regime,
+    path: PathBuf,
+    seed: u32,
+    lengths: Vec<u32>,
+}
+
+/// Runs what is not in `results` yet.
+///
+/// # Errors
+/// [`CampaignError`]; what was done by then is on disk, and the next call goes on.
+pub fn table(program: &Program, seeds: &[u32], days: u32, results: &Path, scratch: &Path) -> Result<(), CampaignError> {
+    let build = program.digest()?;
+    // Two at once with two threads each: the last one alone still has both cores.
+    let program = program.with_threads(2);
+    let (results, dropped) = Results::<Row>::open(results, &build)?;
+    if dropped > 0 {
+        note(&format!("{dropped} rows of another build are dropped and measured again"));
+    }
+    let workshop = Workshop::new(scratch)?;
+    let mut tasks = Vec::new();
+    for (regime, seed) in REGIMES.iter().flat_map(|r| seeds.iter().map(move |s| (r, *s))) {
+        let mut lengths = vec![1, days];
+        lengths.dedup();
+        lengths.retain(|days| !results.has(&configuration(regime.name, *days), seed));
+        let path = match regime.mission {
+            MissionFile::Fixture(name) => root().join("fixtures/missions").join(name),
+            MissionFile::Scaled(noise, factor) => workshop.mission(regime.name, &[(noise, factor)], None)?,
+        };
+        if !lengths.is_empty() {
+            tasks.push(Task { regime: *regime, path, seed, lengths });
+        }
+    }
+    let meter = Meter::new(tasks.len() as f64);
+    let results = Mutex::new(results);
+    work(tasks, |task| {
+        let case = Case::of(&mission(&task.path)?)?;
+        let folder = workshop.path(&format!("{}-{}", task.regime.name, task.seed));
+        let longest = task.lengths.iter().copied().fold(1, u32::max);
+        let arguments = ["--days", &longest.to_string(), "--seed", &task.seed.to_string()].map(str::to_owned);
+        let simulated = program.simulate(&task.path, &folder, &arguments)?;
+        let chain = Chain { pipeline: science_mode(), mission: Some(task.path.clone()), model: None };
+        for days in &task.lengths {
+            let name = configuration(task.regime.name, *days);
+            let archive = folder.join(format!("archive-{days}"));
+            let product = program.run(&chain, &simulated.files[..*days as usize], &archive)?;
+            let run = line(&name, task.seed, &build, &simulated.truth_m, &product)
+                .map_err(|what| CampaignError::Product { configuration: name.clone(), seed: task.seed, what })?;
+            let bound = case.bound(86_400.0 * f64::from(*days))?;
+            let row = Row {
+                run,
+                truth_m: simulated.truth_m.map(rounded),
+                single_m: bound.single_m.map(rounded),
+                surveyed_m: bound.surveyed_m.map(rounded),
+            };
+            if let Ok(mut results) = results.lock() {
+                results.append(row)?;
+            }
+        }
+        std::fs::remove_dir_all(&folder).map_err(|e| file(&folder, &e))?;
+        meter.say(1.0, &format!("{}, seed {}", task.regime.name, task.seed));
+        Ok(())
+    })?;
+    let order: Vec<String> = REGIMES.iter().flat_map(|r| [days, 1].map(|days| configuration(r.name, days))).collect();
+    if let Ok(results) = results.into_inner() {
+        results.sort(&order.iter().map(String::as_str).collect::<Vec<_>>())?;
+    }
+    Ok(())
+}
