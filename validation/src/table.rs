@@ -84,13 +84,20 @@ struct Task {
     lengths: Vec<u32>,
 }
 
-/// Runs what is not in `results` yet.
+/// Runs what is not in `results` yet, `at_once` regimes at a time; 25 days of one take 14 GB of `scratch`.
 ///
 /// # Errors
 /// [`CampaignError`]; what was done by then is on disk, and the next call goes on.
-pub fn table(program: &Program, seeds: &[u32], days: u32, results: &Path, scratch: &Path) -> Result<(), CampaignError> {
+pub fn table(
+    program: &Program,
+    seeds: &[u32],
+    days: u32,
+    at_once: usize,
+    results: &Path,
+    scratch: &Path,
+) -> Result<(), CampaignError> {
     let build = program.digest()?;
-    // Two at once with two threads each: the last one alone still has both cores.
+    // Two threads each, so that the last one alone still has both cores.
     let program = program.with_threads(2);
     let (results, dropped) = Results::<Row>::open(results, &build)?;
     if dropped > 0 {
@@ -112,7 +119,7 @@ pub fn table(program: &Program, seeds: &[u32], days: u32, results: &Path, scratc
     }
     let meter = Meter::new(tasks.len() as f64);
     let results = Mutex::new(results);
-    work(tasks, |task| {
+    work(tasks, at_once, |task| {
         let case = Case::of(&mission(&task.path)?)?;
         let folder = workshop.path(&format!("{}-{}", task.regime.name, task.seed));
         let longest = task.lengths.iter().copied().fold(1, u32::max);
