@@ -3,6 +3,7 @@
 use dragfree_physics::frames::skew;
 use dragfree_physics::mission::{DisplacementNoise, Mission, MissionError, Noise};
 use dragfree_physics::noise::NoiseShape;
+use dragfree_physics::thrust_noise::ThrustNoise;
 use nalgebra::Matrix3;
 
 use crate::model::{Coefficient, Model, Prior};
@@ -27,7 +28,8 @@ pub struct Choices {
 ///
 /// Acceleration noise: thrust and sunlight over the spacecraft's mass, the white parts of electrostatic (y, z) and
 /// stray forces, and what α̂ does not know: above the band of the wavefront sensors that is the whole torque noise,
-/// through the nominal offset. The red (`1/f²`) parts of the forces on the test mass walk with `a_b`.
+/// through the nominal offset. Where thrusters push and turn at once, û holds the force that the known torque comes with,
+/// so that the force given the torque is left, and the unknown torque brings its force along. The red (`1/f²`) parts of the forces on the test mass walk with `a_b`.
 ///
 /// `readouts` names the tables under `[noise]` that belong to the readouts x, y, z.
 ///
@@ -44,21 +46,24 @@ pub fn model(
     let (noise, dt_s) = (&mission.noise, mission.dt_s());
     let [x, y, z] = readouts.map(|name| readout_noise(&mission.noise, name));
     let readouts = [x?, y?, z?];
-    let thrust = Mission::need(&noise.thruster_force, "noise.thruster_force", STAGE)?.shape();
+    let thrust = ThrustNoise::of(mission).filter(|t| !t.force_shape.terms.is_empty());
+    let thrust = Mission::need(&thrust, "noise.thruster_force", STAGE)?;
     let white = |shape: Option<NoiseShape>| shape.map_or(0.0, |s| s.white_psd());
     let electrostatic = noise.electrostatic_force.as_ref().map(|n| n.shape());
     let stray = noise.test_mass_acceleration.as_ref().map(|n| n.shape());
     let sunlight = noise.solar_pressure.as_ref().map(|n| n.shape());
-    let torque = noise.thruster_torque.as_ref().map(|n| n.shape());
 
     // One-sided PSDs in ORF; noise alike on all axes of SRF is so in ORF too.
-    let common = (thrust.white_psd() + white(sunlight)) / mission.spacecraft.mass_kg.powi(2) + white(stray.clone());
+    let (mass_kg, dcm) = (mission.spacecraft.mass_kg, tm.dcm_orf_from_srf());
+    let common = white(sunlight) / mass_kg.powi(2) + white(stray.clone());
     let lateral = white(electrostatic.clone()) / tm.mass_kg.powi(2);
     let mut psd = Matrix3::from_diagonal(&[common, common + lateral, common + lateral].into());
+    let left = thrust.force_given_torque * (thrust.force_shape.white_psd() / mass_kg.powi(2));
+    psd += dcm * left * dcm.transpose();
     if let Some(inverse) = mission.spacecraft.inertia().try_inverse() {
-        let dcm = tm.dcm_orf_from_srf();
-        let lever = skew(&tm.offset_nominal_orf_m()) * dcm * inverse;
-        psd += lever * lever.transpose() * (white(torque) * choices.unknown_alpha);
+        // −α × b − F/m of an unknown torque.
+        let lever = skew(&tm.offset_nominal_orf_m()) * dcm * inverse - dcm * thrust.force_per_torque / mass_kg;
+        psd += lever * thrust.torque * lever.transpose() * (thrust.torque_shape.white_psd() * choices.unknown_alpha);
     }
     let per_step = 0.5 / dt_s;
     let red = red_walk(electrostatic.as_ref()) / tm.mass_kg.powi(2) + red_walk(stray.as_ref());
@@ -93,6 +98,8 @@ fn red_walk(shape: Option<&NoiseShape>) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dragfree_physics::mission::DisplacementTerm;
+    use nalgebra::{Complex, DMatrix, Vector3};
 
     /// The paper's spacecraft with the default noise.
     fn taiji() -> Mission {
@@ -140,6 +147,73 @@ mod tests {
         let by_hand = (1e-7_f64 / 800.0 * 0.18).powi(2) * 5.0;
         assert!((along_z / by_hand - 1.0).abs() < 0.05, "{along_z:e} against {by_hand:e}");
         assert!(moved.acceleration_m2_s4[0][0] - still.acceleration_m2_s4[0][0] < by_hand);
+    }
+
+    /// Further `terms` of a readout are further chains: 4 + 3 + 3 states, whose spectra add up to what the file says. The
+    /// sampled spectrum of a chain of `p/2` integrators is `a² (f_c/f)^p` to the order of its aliases, `(π f dt)²`, and
+    /// of the leak.
+    #[test]
+    fn further_terms_of_a_readout_are_further_states() {
+        let mut mission = taiji();
+        let term = |corner_hz, exponent| DisplacementTerm { asd_m_rthz: 1.42e-12, corner_hz, exponent };
+        let noise = &mut mission.noise;
+        noise.ifo_x.as_mut().expect("there").terms = vec![term(3e-3, 2), term(1e-4, 2)];
+        for readout in [&mut noise.is_y, &mut noise.is_z] {
+            readout.as_mut().expect("there").terms = vec![term(5e-4, 4)];
+        }
+        let offset = vec![Coefficient { initial: 0.0, prior_sigma: 0.1 }; 3];
+        let model = model(&mission, "tm1", ["ifo_x", "is_y", "is_z"], offset, &choices(1.0)).expect("complete");
+        assert_eq!(model.chains.each_ref().map(|c| c.iter().map(Chain::states).sum::<usize>()), [4, 3, 3]);
+        assert_eq!(model.states(), 22);
+        let stated = |f: f64| 1.42e-12_f64.powi(2) * ((2e-3 / f).powi(4) + (3e-3 / f).powi(2) + (1e-4 / f).powi(2));
+        for f in [2e-4_f64, 2e-3, 2e-2] {
+            let psd: f64 = model.chains[0].iter().map(|c| sampled_psd(c, f)).sum();
+            assert!(
+                (psd / stated(f) - 1.0).abs() < 3e-4 + (std::f64::consts::PI * f * 0.1).powi(2),
+                "{psd:e} at {f} Hz"
+            );
+        }
+    }
+
+    /// One-sided PSD of a chain's output, `2 dt C (zI − A)⁻¹ Q (zI − A)⁻ᴴ Cᵀ`.
+    fn sampled_psd(chain: &Chain, f_hz: f64) -> f64 {
+        let n = chain.states();
+        let z = Complex::from_polar(1.0, std::f64::consts::TAU * f_hz * 0.1);
+        let zia = DMatrix::from_fn(n, n, |i, j| {
+            let a = if j >= i { chain.transition[j - i] } else { 0.0 };
+            Complex::new(-a, 0.0) + if i == j { z } else { Complex::new(0.0, 0.0) }
+        });
+        let inverse = zia.try_inverse().expect("no pole on the unit circle");
+        let q = DMatrix::from_row_slice(n, n, &chain.noise).map(|x| Complex::new(x, 0.0));
+        (&inverse * q * inverse.adjoint())[(0, 0)].re * 0.2
+    }
+
+    /// The nine thrusters by sums over them, each pushing and turning at once: with the whole torque unknown every unit
+    /// moves the test mass by `−f d/m − (J⁻¹ (r×d) f) × b`; with the torque known, no more than with it unknown.
+    #[test]
+    fn thrusters_that_push_and_turn_at_once() {
+        let text = include_str!("../../../fixtures/missions/taiji-thrusters.toml");
+        let value: toml::Value = toml::from_str(text).expect("the fixture is TOML");
+        let mission = Mission::from_json(&serde_json::to_string(&value).expect("JSON")).expect("a mission");
+        let names = ["ifo_x", "is_y", "is_z"];
+        let noise = |unknown| {
+            let model = model(&mission, "tm2", names, vec![], &choices(unknown)).expect("complete");
+            Matrix3::from_fn(|i, j| model.acceleration_m2_s4[i][j] / 5.0)
+        };
+        let (known, unknown) = (noise(0.0), noise(1.0));
+        let tm = mission.test_mass("tm2", "the test").expect("it is there");
+        let inverse = mission.spacecraft.inertia_inverse();
+        let mut by_hand = Matrix3::zeros();
+        for unit in &mission.thrusters.as_ref().expect("units").unit {
+            let d = Vector3::from(unit.direction_srf).normalize();
+            let alpha = tm.dcm_orf_from_srf() * (inverse * Vector3::from(unit.position_srf_m).cross(&d));
+            let a = -tm.dcm_orf_from_srf() * d / mission.spacecraft.mass_kg - alpha.cross(&tm.offset_nominal_orf_m());
+            by_hand += a * a.transpose() * unit.asd_n_rthz.powi(2);
+        }
+        // What is not thrust is white and on the diagonal: stray forces, sunlight, electrodes; 1e-3 of the thrust.
+        assert!((unknown - by_hand).amax() < 2e-3 * by_hand.amax(), "{unknown} against {by_hand}");
+        let gained = (unknown - known).symmetric_eigenvalues();
+        assert!(gained.min() > -1e-9 * gained.max() && gained.max() > 0.0, "{gained}");
     }
 
     #[test]
