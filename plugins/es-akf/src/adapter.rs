@@ -39,6 +39,7 @@ struct Body {
     coefficients: Vec<Coefficient>,
     value: Vec<Out>,
     sigma: Vec<Out>,
+    displacement_m: [Out; 3],
     nis: Out,
 }
 
@@ -175,6 +176,9 @@ impl Stage for EsAkf {
                     output.f64(body.value[j]).push(s.value[j]);
                     output.f64(body.sigma[j]).push(s.sigma[j]);
                 }
+                for (column, x) in body.displacement_m.iter().zip(s.displacement_m) {
+                    output.f64(*column).push(x);
+                }
                 output.f64(body.nis).push(s.nis);
             }
         }
@@ -210,6 +214,7 @@ impl Stage for EsAkf {
             report.quality.insert(
                 body.name.to_owned(),
                 json!({
+                    "states": body.tracker.filter().model().states(),
                     "nis": s.nis(),
                     "innovation_variance_over_mission_noise": s.design_nis(),
                     "sigma_stretch": stretch,
@@ -323,9 +328,12 @@ impl EsAkf {
             value.push(link.write_with(table, &label(c), &c.unit, &c.frame, &archive)?);
             sigma.push(link.write_with(table, &format!("{}.sigma", label(c)), &c.unit, &c.frame, &archive)?);
         }
+        let mut displacement =
+            |axis: &str| link.write_with(table, &format!("{name}.displacement.{axis}"), "m", frame, &archive);
+        let displacement_m = [displacement("x")?, displacement("y")?, displacement("z")?];
         let nis = link.write_with(table, &format!("{name}.nis"), "1", "", &archive)?;
         let tracker = Tracker::new(filter, self.snapshot_s);
-        Ok(Body { name, tracker, readout_m, u_m_s2, regressors, coefficients, value, sigma, nis })
+        Ok(Body { name, tracker, readout_m, u_m_s2, regressors, coefficients, value, sigma, displacement_m, nis })
     }
 
     /// Runs of rows one step apart, each with the number of steps missing before it.

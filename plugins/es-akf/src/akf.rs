@@ -1,7 +1,7 @@
 //! The filter at the capacity that a model needs.
 
 use crate::filter::{Drive, Filter, Settings, Statistics};
-use crate::model::{Model, THETA};
+use crate::model::{Model, R, THETA};
 use crate::state::{Bytes, StateError, Words};
 
 /// Most states that a filter can have.
@@ -62,6 +62,12 @@ impl Akf {
     #[must_use]
     pub fn coefficients(&self) -> &[f64] {
         each!(self, f => &f.state()[THETA..THETA + f.model().coefficients.len()])
+    }
+
+    /// Estimate of the displacement `r`, ORF, m.
+    #[must_use]
+    pub fn displacement_m(&self) -> [f64; 3] {
+        each!(self, f => std::array::from_fn(|i| f.state()[R + i]))
     }
 
     /// See [`Filter::coefficient_covariance`].

@@ -38,6 +38,8 @@ pub enum Factor {
 pub struct Snapshot {
     /// Index of the row of the batch at which it was taken.
     pub row: usize,
+    /// Estimate of the displacement, ORF, m.
+    pub displacement_m: [f64; 3],
     /// Estimates of the coefficients.
     pub value: Vec<f64>,
     /// Their σ for the gains in use and the mission's noise.
@@ -154,7 +156,7 @@ impl Tracker {
         self.reported = (sum, dof);
         let value = self.filter.coefficients().to_vec();
         let sigma = (0..value.len()).map(|i| self.filter.coefficient_covariance(i, i).sqrt()).collect();
-        Snapshot { row, value, sigma, nis }
+        Snapshot { row, displacement_m: self.filter.displacement_m(), value, sigma, nis }
     }
 
     /// The mean over the last hour, or over the last sixth of a run shorter than six hours; in bins of ten seconds, the

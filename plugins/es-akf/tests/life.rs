@@ -5,7 +5,7 @@ mod common;
 use common::{Alpha, Epoch, Simulation, model, settings};
 use dragfree_es_akf::Akf;
 use dragfree_es_akf::filter::{Adaptation, Drive, Settings};
-use dragfree_es_akf::model::Model;
+use dragfree_es_akf::model::{Coefficient, Model};
 use dragfree_es_akf::state::{StateError, Words};
 use dragfree_es_akf::tracker::{Factor, Rows, Tracker};
 
@@ -156,6 +156,90 @@ fn an_indefinite_noise_is_repaired_and_counted() {
     let s = filter.statistics();
     assert!(s.repairs_q + s.repairs_p + s.resets > 0, "{s:?}");
     assert!(filter.coefficients().iter().all(|x| x.is_finite()));
+}
+
+/// A prior that no covariance can be, as a wrong hand-over would leave one: repaired at the first check and counted.
+#[test]
+fn an_indefinite_prior_is_repaired_and_counted() {
+    let mut model = default_model();
+    // A chain of two states correlated by more than one.
+    let s = &mut model.chains[0][0].stationary;
+    let size = (s[0] * s[3]).sqrt();
+    (s[1], s[2]) = (1.5 * size, 1.5 * size);
+    let mut data = Simulation::new(&default_model(), Alpha::Coloured(1.0), 5);
+    let mut filter = Akf::new(model, Settings { check_epochs: 100, ..gated() }).expect("16 states");
+    for _ in 0..20_000 {
+        let e = data.epoch();
+        filter.step(e.readout_m, Drive { acceleration_m_s2: e.u_m_s2, regressors: &e.phi });
+    }
+    let s = filter.statistics();
+    assert!(s.repairs_p + s.resets > 0, "{s:?}");
+    assert!(filter.coefficients().iter().all(|x| x.is_finite()) && worst_z(&filter, &data) < 4.5, "{s:?}");
+}
+
+/// An offset half a metre from where a prior of 2 cm (1σ) puts it: theory leaves `P P₀⁻¹` of the difference, nothing else.
+#[test]
+fn an_offset_far_from_its_prior_is_found() {
+    let truth = default_model();
+    let mut data = Simulation::new(&truth, Alpha::Coloured(1.0), 5);
+    let mut believed = truth;
+    for (j, c) in believed.coefficients.iter_mut().enumerate() {
+        *c = Coefficient { initial: data.b_m[j] - 0.5, prior_sigma: 0.02 };
+    }
+    let mut filter = Akf::new(believed, Settings { gate_sigma: 6.0, ..settings(Adaptation::Off) }).expect("16 states");
+    for _ in 0..20_000 {
+        let e = data.epoch();
+        filter.step(e.readout_m, Drive { acceleration_m_s2: e.u_m_s2, regressors: &e.phi });
+    }
+    for i in 0..3 {
+        let pulled: f64 = (0..3).map(|j| filter.coefficient_covariance(i, j) / 0.02_f64.powi(2) * 0.5).sum();
+        let error = filter.coefficients()[i] - (data.b_m[i] - pulled);
+        let sigma = filter.coefficient_covariance(i, i).sqrt();
+        assert!(error.abs() < 4.5 * sigma, "{i}: {error} with σ {sigma}, of which the prior {pulled}");
+        assert!(pulled < 0.25, "{i}: the data say too little for the test");
+    }
+}
+
+/// An instrument that gives the same bits for ever: finite, and σ promises what it would with live data, not more.
+#[test]
+fn constant_readouts_promise_nothing() {
+    for adaptation in [Adaptation::Off, Adaptation::Monotone] {
+        let stuck = [1e-9, -2e-9, 3e-9];
+        let (dead, _) = run(settings(adaptation), 20_000, |_, e| e.readout_m = stuck);
+        let (live, _) = run(settings(adaptation), 20_000, |_, _| {});
+        assert!(dead.coefficients().iter().all(|x| x.is_finite()));
+        for i in 0..3 {
+            let (dead, live) = (dead.coefficient_covariance(i, i), live.coefficient_covariance(i, i));
+            assert!(dead > 0.99 * live, "{adaptation:?} {i}: {dead:e} against {live:e}");
+        }
+    }
+}
+
+/// Without a single readout nothing is known that was not before, to the bit.
+#[test]
+fn without_readouts_the_prior_stays() {
+    let (filter, _) = run(gated(), 5_000, |_, e| e.readout_m = NAN3);
+    let s = filter.statistics();
+    assert_eq!((s.updates, s.predictions, s.nis()), (0, 5_000, None));
+    for i in 0..3 {
+        assert_eq!(filter.coefficients()[i], 0.0);
+        assert_eq!(filter.coefficient_covariance(i, i), 0.1_f64.powi(2));
+        assert_eq!(filter.recursion_covariance(i, i), 0.1_f64.powi(2));
+    }
+}
+
+/// A spacecraft that does not turn tells nothing of the offset: value and σ stay at the prior, to the bit, under every
+/// adaptation.
+#[test]
+fn without_angular_acceleration_the_prior_stays() {
+    for adaptation in [Adaptation::Off, Adaptation::Monotone, Adaptation::Innovation, Adaptation::Residual] {
+        let (filter, _) = run(settings(adaptation), 20_000, |_, e| e.phi = [[0.0; 3]; 3]);
+        assert_eq!(filter.statistics().updates, 19_999);
+        for i in 0..3 {
+            assert_eq!(filter.coefficients()[i], 0.0, "{adaptation:?}");
+            assert_eq!(filter.coefficient_covariance(i, i), 0.1_f64.powi(2), "{adaptation:?}");
+        }
+    }
 }
 
 /// Two halves through a saved state give the bits of the whole, wherever it is cut, gaps included.

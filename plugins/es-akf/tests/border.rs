@@ -1,0 +1,132 @@
+//! The stage across the border, with noise-shaping orders that a mission file asks for.
+
+mod common;
+
+use common::{Alpha, Simulation, model};
+use dragfree_engine::border::{Config, Instance, Kind, Library, LinkRequest, Rows};
+use dragfree_engine::table::{Batch, Column};
+use serde_json::{Value, json};
+
+const AXES: [&str; 3] = ["x", "y", "z"];
+const START_NS: i64 = 2_051_222_400_000_000_000;
+const STEP_NS: i64 = 100_000_000;
+
+fn library() -> Library {
+    let program = std::env::current_exe().expect("a test program has a path");
+    let folder = program.parent().expect("target/PROFILE/deps/test");
+    let name = format!("{}dragfree_es_akf{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
+    Library::open(&folder.join(name)).expect("cargo builds the library before its tests")
+}
+
+/// The bundled mission with further `terms` of coloured noise: exponents per readout.
+fn mission(terms: [&[u32]; 3]) -> Value {
+    let mut mission: Value =
+        toml::from_str(include_str!("../../../fixtures/missions/taiji.toml")).expect("the fixture is TOML");
+    for (name, exponents) in ["ifo_x", "is_y", "is_z"].iter().zip(terms) {
+        let table = &mut mission["noise"][name];
+        let asd = table["asd_m_rthz"].clone();
+        let term = |p: &u32| json!({"asd_m_rthz": asd, "corner_hz": 1e-3, "exponent": p});
+        table["terms"] = exponents.iter().map(term).collect();
+    }
+    mission
+}
+
+fn create(mission: &Value) -> Instance {
+    let library = library();
+    let parameters = json!({
+        "adaptation": "monotone", "forgetting": 0.999_999, "warm_up_s": 60.0, "gate_sigma": 6.0, "gate_patience": 30,
+        "calibrated_sigma": true, "check_s": 60.0, "output_interval_s": 60.0, "displacement_prior_m": 1e-6,
+        "velocity_prior_m_s": 1e-7, "bias_prior_m_s2": 1e-7, "bias_walk_m_s2_rts": 3e-15, "leak_hz": 1e-6,
+        "unknown_alpha": 1.0,
+    });
+    let value = json!({"parameters": parameters, "mission": mission, "instance": "", "files": []});
+    let plugin = library.plugins.iter().find(|p| p.kind == Kind::Stage).expect("the library has a stage");
+    Instance::create(&library, plugin, &Config { value }).expect("the fixture is a mission")
+}
+
+/// What `hinf-dfacs` and the offset make of test mass 1: columns and `epochs` rows of synthetic data.
+fn columns_and_rows(epochs: usize) -> (Vec<Column>, Vec<i64>, Vec<Vec<f64>>) {
+    let column = |table: &str, name: String, unit: &str, attributes: &[(&str, String)]| Column {
+        table: table.to_owned(),
+        name,
+        unit: unit.to_owned(),
+        frame: "ORF_1".to_owned(),
+        rate_hz: 10.0,
+        attributes: attributes.iter().map(|(k, v)| ((*k).to_owned(), v.clone())).collect(),
+    };
+    let mut columns = Vec::new();
+    for (group, unit) in [("r_orf_m", "m"), ("u_orf_m_s2", "m s-2")] {
+        columns.extend(AXES.map(|a| column("reconstruction", format!("tm1.{group}.{a}"), unit, &[])));
+    }
+    for j in AXES {
+        for i in AXES {
+            let (coefficient, channel) = (format!("com-offset.tm1.{j}"), format!("tm1.accel.{i}"));
+            let name = format!("{coefficient}@{channel}");
+            let attributes = [("kind", "regressor".to_owned()), ("coefficient", coefficient), ("channel", channel)];
+            columns.push(column("effect/com-offset:tm1", name, "s-2", &attributes));
+        }
+    }
+    let synthetic = model([&[4], &[2], &[2]], 1e-6);
+    let mut data = Simulation::new(&synthetic, Alpha::Coloured(1.0), 1);
+    let (mut times, mut rows) = (Vec::new(), vec![Vec::new(); columns.len()]);
+    for k in 0..epochs {
+        let e = data.epoch();
+        times.push(START_NS + k as i64 * STEP_NS);
+        for i in 0..3 {
+            rows[i].push(e.readout_m[i]);
+            rows[3 + i].push(e.u_m_s2[i]);
+            for j in 0..3 {
+                rows[6 + 3 * j + i].push(e.phi[j][i]);
+            }
+        }
+    }
+    (columns, times, rows)
+}
+
+fn model_json() -> String {
+    let offset = AXES.map(|a| {
+        json!({"name": format!("com-offset.tm1.{a}"), "unit": "m", "frame": "ORF_1", "lower": -1.0, "upper": 1.0,
+               "initial": 0.0, "prior_sigma": 0.1, "estimate": true})
+    });
+    json!({"coefficients": offset, "constraints": []}).to_string()
+}
+
+/// Runs ten minutes and gives the report and the rows for the archive.
+fn run(mission: &Value) -> (Value, Vec<Batch>) {
+    let (columns, times, rows) = columns_and_rows(6_000);
+    let mut stage = create(mission);
+    let linked = stage.link(LinkRequest { available: &columns, model_json: &model_json() }).expect("linked");
+    stage.activate(65_536).expect("active");
+    let input: Vec<Rows<'_>> = linked
+        .reads
+        .iter()
+        .map(|table| Rows { time_ns: &times, columns: table.iter().map(|r| &*rows[r.available]).collect() })
+        .collect();
+    let made = stage.process(&input, i64::MAX).expect("processed").expect("nothing is discarded");
+    (stage.report("[]").expect("a report"), made)
+}
+
+/// Four states for x, three each for y and z: 9 + 3 + 10.
+#[test]
+fn a_mission_file_can_ask_for_the_papers_22_states() {
+    let (report, made) = run(&mission([&[2, 2], &[4], &[4]]));
+    assert_eq!(report["quality"]["tm1"]["states"], 22, "{report}");
+    assert_eq!(report["counts"]["updates"], 5_999, "{report}");
+    // Every repair of Q̂ and of P reaches the product.
+    assert!(report["counts"]["repairs_of_q"].is_u64() && report["counts"]["repairs_of_p"].is_u64(), "{report}");
+    assert_eq!(made[0].rows(), 10);
+    // The last column, the NIS, has no value before the end of the warm-up.
+    let (_, estimates) = made[0].columns.split_last().expect("columns");
+    assert!(estimates.iter().flatten().all(|x| x.is_finite()));
+    assert_eq!(run(&mission([&[], &[], &[]])).0["quality"]["tm1"]["states"], 16);
+}
+
+#[test]
+fn more_states_than_there_is_room_for_are_refused_with_their_number() {
+    let (columns, ..) = columns_and_rows(0);
+    let many: &[u32] = &[8; 5];
+    let mut stage = create(&mission([many, many, many]));
+    let request = LinkRequest { available: &columns, model_json: &model_json() };
+    let refusal = stage.link(request).expect_err("76 states").to_string();
+    assert!(refusal.contains("76 states, at most 64") && refusal.contains("readout noise"), "{refusal}");
+}
