@@ -1,10 +1,11 @@
 //! Cost of an epoch: nine channels, two offsets (eighteen regressors), segments of 16384 samples; and of one solution.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use dragfree_estimation::estimate::{Unknown, estimate};
-use dragfree_estimation::segments::Segmenter;
+use dragfree_estimation::estimate::{Observed, Unknown, estimate};
+use dragfree_estimation::prediction::Prediction;
+use dragfree_estimation::segments::{Collected, Segmenter};
 use dragfree_estimation::sigma::{Measured, NoiseModel};
-use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, Sums};
+use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor};
 use dragfree_physics::mission::Mission;
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
@@ -48,10 +49,11 @@ fn bench(criterion: &mut Criterion) {
     let times: Vec<i64> = (0..ROWS as i64).map(|k| 100_000_000 * k).collect();
     let mut analyser = Analyser::new(Plan::new(16_384, 10.0), &layout);
     let run = |analyser: &mut Analyser| {
-        let mut sums = Sums::new(analyser.plan(), &layout);
+        let prediction = Prediction::new(&model, &[Measured::Differenced; 9], &layout, analyser.plan());
+        let mut collected = Collected::new(analyser.plan(), &layout, prediction);
         let mut segmenter = Segmenter::new(16_384, 100_000_000, (0..27).map(|j| j >= 9).collect());
-        segmenter.push(&times, &slices, analyser, &mut sums);
-        sums
+        segmenter.push(&times, &slices, analyser, &mut collected);
+        collected
     };
 
     let mut group = criterion.benchmark_group("estimation");
@@ -59,7 +61,7 @@ fn bench(criterion: &mut Criterion) {
     group.bench_function("epochs", |b| b.iter(|| run(black_box(&mut analyser))));
     group.finish();
 
-    let sums = run(&mut analyser);
+    let collected = run(&mut analyser);
     let unknowns: Vec<Unknown> = (0..6)
         .map(|i| Unknown {
             name: format!("b{i}"),
@@ -71,8 +73,10 @@ fn bench(criterion: &mut Criterion) {
             estimate: true,
         })
         .collect();
-    criterion.bench_function("qp-check/solution", |b| {
-        b.iter(|| estimate(black_box(&sums), analyser.plan(), &layout, &model, &unknowns, &[], 3));
+    criterion.bench_function("estimation/solution", |b| {
+        let (plan, prediction) = (analyser.plan(), collected.prediction.as_ref());
+        let observed = Observed { layout: &layout, plan, sums: &collected.sums, prediction };
+        b.iter(|| estimate(black_box(&observed), &model, &unknowns, &[], 3));
     });
 }
 

@@ -11,6 +11,7 @@ use nalgebra::{Cholesky, DMatrix, DVector};
 use serde::Serialize;
 
 use crate::normal::{Equations, NormalEquations, accumulate, residuals};
+use crate::prediction::Prediction;
 use crate::qp::{Active, Kkt, Problem, QpError, Row};
 use crate::refine::{Chi2, SigmaError, Whitening};
 use crate::sigma::NoiseModel;
@@ -51,6 +52,19 @@ pub struct Bound {
     pub upper: f64,
 }
 
+/// What was made of the data.
+#[derive(Clone, Copy)]
+pub struct Observed<'a> {
+    /// Channels, series and regressors.
+    pub layout: &'a Layout,
+    /// Bands and segments.
+    pub plan: &'a Plan,
+    /// Cross-spectra.
+    pub sums: &'a Sums,
+    /// The fit in the time domain.
+    pub prediction: Option<&'a Prediction>,
+}
+
 /// Why there is no estimate.
 #[derive(Debug, thiserror::Error)]
 pub enum EstimateError {
@@ -81,6 +95,8 @@ pub struct Estimate {
     pub normal: NormalEquations,
     /// What the blocks of time say of σ, for each free coefficient; none with fewer than [`LEAST_BLOCKS`].
     pub scatter: Option<Scatter>,
+    /// The same coefficients by the fit in the time domain.
+    pub prediction: Option<Check>,
     /// Surveys and ranges against the data.
     pub pulls: Vec<Pull>,
     /// χ² of the surveys against the data, and its degrees of freedom.
@@ -107,6 +123,17 @@ pub struct Scatter {
     pub ratio: Vec<f64>,
     /// Above this the ratio is no chance ([`SCATTER_FALSE_ALARM`]) and widens σ.
     pub upper: f64,
+}
+
+/// A second solution.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Check {
+    /// Values of the free coefficients.
+    pub value: Vec<f64>,
+    /// Their σ, from the scatter of the blocks where there are enough.
+    pub sigma: Vec<f64>,
+    /// Blocks of time.
+    pub blocks: usize,
 }
 
 /// χ² and how far Σ moved.
@@ -145,19 +172,18 @@ pub struct ChannelQuality {
     pub by_decade: Vec<(f64, f64, f64, f64)>,
 }
 
-/// Solves for the coefficients; Σ is measured from the residuals, and the coefficients solved again, `refinements` times.
+/// Solves for the coefficients, and again in the time domain where there is a `prediction`; Σ is measured from the residuals, and the coefficients solved again, `refinements` times.
 ///
 /// # Errors
 /// [`EstimateError`] when the modelled noise is singular or the constraints contradict each other.
 pub fn estimate(
-    sums: &Sums,
-    plan: &Plan,
-    layout: &Layout,
+    observed: &Observed<'_>,
     model: &NoiseModel,
     unknowns: &[Unknown],
     bounds: &[Bound],
     refinements: usize,
 ) -> Result<Estimate, EstimateError> {
+    let Observed { sums, prediction, plan, layout } = *observed;
     let spectra = &sums.total;
     let whitening = Whitening::new(model, plan, layout, spectra)?;
     let kept = spectra.kept();
@@ -197,6 +223,10 @@ pub fn estimate(
     let last_step_sigma = covariance.as_ref().map_or(f64::NAN, |c| {
         free.iter().enumerate().map(|(k, i)| last_step[*i].abs() / c[(k, k)].sqrt()).fold(0.0, f64::max)
     });
+    let prediction = match prediction {
+        Some(p) => check(p, unknowns, bounds, &free)?,
+        None => None,
+    };
     let (pulls, survey_chi2) = reduced.pulls(&solved.active, chi2_per_dof.max(1.0));
     let (worst, worst_band_dof) = worst_band(&residual, &inverses, plan, &whitening);
     let quality = Quality {
@@ -222,6 +252,7 @@ pub fn estimate(
         kkt: solved.kkt,
         normal: NormalEquations::new(names, &equations, spectra.segments),
         scatter,
+        prediction,
         pulls,
         survey_chi2,
         quality,
@@ -363,7 +394,12 @@ impl<'a> Reduced<'a> {
     }
 
     fn covariance(&self, active: &[Active]) -> Option<DMatrix<f64>> {
-        let information = self.with_rows(|i, row| {
+        self.inverse(&self.with_knowledge(active))
+    }
+
+    /// Information of the data and of every row.
+    fn with_knowledge(&self, active: &[Active]) -> DMatrix<f64> {
+        self.with_rows(|i, row| {
             let at_a_bound = active.iter().any(|a| a.row == i);
             match self.knowledge[i] {
                 Knowledge::Repeated => f64::INFINITY,
@@ -371,8 +407,7 @@ impl<'a> Reduced<'a> {
                 Knowledge::Survey => uniform_sigma(row),
                 Knowledge::Range => row.half_width(),
             }
-        });
-        self.inverse(&information)
+        })
     }
 
     /// What the data say of each row without it: surveys against data and ranges, ranges against data and surveys. `noise` is the
@@ -448,6 +483,47 @@ impl<'a> Reduced<'a> {
         weak.extend(unseen.iter().map(|i| Direction::unseen(&unknowns[*i].name)));
         weak
     }
+}
+
+/// The prediction-error fit under the same rows; none before its filters have settled, or where it does not see a coefficient.
+fn check(
+    prediction: &Prediction,
+    unknowns: &[Unknown],
+    bounds: &[Bound],
+    free: &[usize],
+) -> Result<Option<Check>, EstimateError> {
+    let blocks = prediction.equations();
+    let n = unknowns.len();
+    let mut sum = Equations { normal: DMatrix::zeros(n, n), right: DVector::zeros(n), zz: 0.0 };
+    for (normal, right) in &blocks {
+        sum.normal += normal;
+        sum.right += right;
+    }
+    if free.is_empty() || free.iter().any(|i| sum.normal[(*i, *i)] <= 0.0) {
+        return Ok(None);
+    }
+    let reduced = Reduced::new(&sum, unknowns, bounds, free);
+    let solved = reduced.solve()?;
+    let known = reduced.with_knowledge(&solved.active);
+    let Some(bread) = reduced.inverse(&known) else { return Ok(None) };
+    let covariance = if blocks.len() < LEAST_BLOCKS {
+        bread
+    } else {
+        // The scatter of the blocks' pulls in place of N; what the rows know stays what it is.
+        let mut middle = known - &reduced.information;
+        let shared = blocks.len() as f64 / (blocks.len() as f64 - 1.0);
+        for (normal, right) in &blocks {
+            let pull = right - normal * &solved.theta;
+            let pull = DVector::from_fn(free.len(), |k, _| pull[free[k]]);
+            middle += &pull * pull.transpose() * shared;
+        }
+        &bread * middle * &bread
+    };
+    Ok(Some(Check {
+        value: free.iter().map(|i| solved.theta[*i]).collect(),
+        sigma: covariance.diagonal().iter().map(|v| v.max(0.0).sqrt()).collect(),
+        blocks: blocks.len(),
+    }))
 }
 
 /// Pulls of the blocks on the free coefficients, `C (c_b − N_b θ)`, squared and summed, over their expectation when Σ is right

@@ -6,6 +6,7 @@
 
 pub mod estimate;
 pub mod normal;
+pub mod prediction;
 pub mod qp;
 mod refine;
 pub mod segments;

@@ -1,6 +1,64 @@
 //! From rows to segments: gaps respected, memory bounded, nothing depending on where a batch ends.
 
-use crate::spectra::{Analyser, SHORTEST, Sums};
+use crate::prediction::Prediction;
+use crate::spectra::{Analyser, Layout, Plan, SHORTEST, Sums};
+
+/// What has been made of the segments.
+#[derive(Clone)]
+pub struct Collected {
+    /// Sums of this run.
+    pub sums: Sums,
+    /// Sums of runs before, whose state this one took over.
+    pub earlier: Sums,
+    /// The fit in the time domain, over all of these runs.
+    pub prediction: Option<Prediction>,
+}
+
+impl Collected {
+    /// Nothing yet.
+    #[must_use]
+    pub fn new(plan: &Plan, layout: &Layout, prediction: Option<Prediction>) -> Self {
+        let sums = Sums::new(plan, layout);
+        Self { earlier: sums.clone(), sums, prediction }
+    }
+
+    /// Sums of this run and of those before.
+    #[must_use]
+    pub fn all(&self, plan: &Plan) -> Sums {
+        let mut sums = self.earlier.clone();
+        sums.add(plan, &self.sums);
+        sums
+    }
+
+    /// Segments of this run and of those before.
+    #[must_use]
+    pub fn segments(&self) -> u64 {
+        self.earlier.total.segments + self.sums.total.segments
+    }
+
+    /// New samples in fixed portions, whatever the batches, so that sums do not depend on these.
+    fn samples(&mut self, first_ns: i64, columns: &[&[f64]]) {
+        if let Some(prediction) = &mut self.prediction {
+            prediction.push(first_ns, columns);
+        }
+    }
+
+    fn train(&mut self, plan: &Plan) {
+        let due = self.prediction.as_ref().is_some_and(|p| p.is_due(self.segments()));
+        if due {
+            let all = self.all(plan);
+            if let Some(prediction) = &mut self.prediction {
+                prediction.train(&all.total, plan);
+            }
+        }
+    }
+
+    fn gap(&mut self) {
+        if let Some(prediction) = &mut self.prediction {
+            prediction.gap();
+        }
+    }
+}
 
 /// Collects rows into runs without a gap and hands whole segments on.
 #[derive(Clone, Debug, PartialEq)]
@@ -62,7 +120,7 @@ impl Segmenter {
     }
 
     /// Adds rows: `columns[j][k]` is column j at `time_ns[k]`, NaN where there is no value.
-    pub fn push(&mut self, time_ns: &[i64], columns: &[&[f64]], analyser: &mut Analyser, sums: &mut Sums) {
+    pub fn push(&mut self, time_ns: &[i64], columns: &[&[f64]], analyser: &mut Analyser, collected: &mut Collected) {
         let rows = time_ns.len();
         let mut usable = vec![true; rows];
         for (k, t) in time_ns.iter().enumerate() {
@@ -85,10 +143,10 @@ impl Segmenter {
             let ok = usable[k];
             let end = k + usable[k..].iter().take_while(|u| **u == ok).count();
             if ok {
-                self.extend(time_ns, &values, k, end, analyser, sums);
+                self.extend(time_ns, &values, k, end, analyser, collected);
                 self.state.valid += (end - k) as u64;
             } else {
-                self.end_run(analyser, sums);
+                self.end_run(analyser, collected);
             }
             k = end;
         }
@@ -112,7 +170,7 @@ impl Segmenter {
         first: usize,
         end: usize,
         analyser: &mut Analyser,
-        sums: &mut Sums,
+        collected: &mut Collected,
     ) {
         let mut k = first;
         while k < end {
@@ -124,8 +182,12 @@ impl Segmenter {
             self.state.run_end_ns = time_ns[k - 1];
             if self.state.samples() == self.length {
                 let segment: Vec<&[f64]> = self.state.run.iter().map(Vec::as_slice).collect();
-                analyser.add(0, self.time_of(0), &segment, self.state.run_has_segment, sums);
+                analyser.add(0, self.time_of(0), &segment, self.state.run_has_segment, &mut collected.sums);
                 let hop = self.length / 2;
+                let new = if self.state.run_has_segment { hop } else { 0 };
+                let samples: Vec<&[f64]> = segment.iter().map(|c| &c[new..]).collect();
+                collected.samples(self.time_of(new), &samples);
+                collected.train(analyser.plan());
                 self.state.covered += if self.state.run_has_segment { hop } else { self.length } as u64;
                 self.state.run_has_segment = true;
                 for run in &mut self.state.run {
@@ -141,11 +203,16 @@ impl Segmenter {
     }
 
     /// Ends the run: what no segment of full length covers is cut into shorter ones, as long as they fit.
-    pub fn end_run(&mut self, analyser: &mut Analyser, sums: &mut Sums) {
+    pub fn end_run(&mut self, analyser: &mut Analyser, collected: &mut Collected) {
         let samples = self.state.samples();
         let lengths: Vec<usize> = analyser.plan().lengths().collect();
         // The first half of what is kept belongs to the last segment.
         let mut at = if self.state.run_has_segment { self.length / 2 } else { 0 };
+        if at < samples {
+            let rest: Vec<&[f64]> = self.state.run.iter().map(|c| &c[at..]).collect();
+            collected.samples(self.time_of(at), &rest);
+        }
+        collected.gap();
         let shortest = lengths.last().copied();
         for (taper, length) in lengths.into_iter().enumerate() {
             let mut overlaps = false;
@@ -155,7 +222,7 @@ impl Segmenter {
             }
             while at + length <= samples {
                 let segment: Vec<&[f64]> = self.state.run.iter().map(|c| &c[at..at + length]).collect();
-                analyser.add(taper, self.time_of(at), &segment, overlaps, sums);
+                analyser.add(taper, self.time_of(at), &segment, overlaps, &mut collected.sums);
                 self.state.covered += if overlaps { length / 2 } else { length } as u64;
                 overlaps = true;
                 at += length / 2;
@@ -193,7 +260,6 @@ pub fn longest_length(samples: usize) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::spectra::{Layout, Plan};
 
     fn layout() -> Layout {
         Layout {
@@ -204,16 +270,16 @@ mod tests {
         }
     }
 
-    fn run(length: usize, batch: usize, columns: &[Vec<f64>], times: &[i64]) -> (Sums, Segmenter) {
+    fn run(length: usize, batch: usize, columns: &[Vec<f64>], times: &[i64]) -> (Collected, Segmenter) {
         let mut analyser = Analyser::new(Plan::new(length, 10.0), &layout());
-        let mut sums = Sums::new(analyser.plan(), &layout());
+        let mut collected = Collected::new(analyser.plan(), &layout(), None);
         let mut segmenter = Segmenter::new(length, 100, vec![false, false, true]);
         for first in (0..times.len()).step_by(batch) {
             let end = (first + batch).min(times.len());
             let part: Vec<&[f64]> = columns.iter().map(|c| &c[first..end]).collect();
-            segmenter.push(&times[first..end], &part, &mut analyser, &mut sums);
+            segmenter.push(&times[first..end], &part, &mut analyser, &mut collected);
         }
-        (sums, segmenter)
+        (collected, segmenter)
     }
 
     fn noise(n: usize, seed: u64) -> Vec<f64> {
@@ -234,7 +300,7 @@ mod tests {
         let whole = run(64, 1000, &columns, &times);
         for batch in [1, 7, 64, 777] {
             let parts = run(64, batch, &columns, &times);
-            assert_eq!(parts.0, whole.0);
+            assert_eq!(parts.0.sums, whole.0.sums);
             let state = &parts.1.state;
             assert_eq!((state.valid, state.covered, &state.missing), (997, whole.1.state.covered, &vec![0, 1, 0]));
         }
@@ -247,13 +313,13 @@ mod tests {
         let mut columns: Vec<Vec<f64>> = (1..4).map(|s| noise(1000, s)).collect();
         columns[1][333] = f64::NAN;
         let times: Vec<i64> = (0..1000).map(|k| 100 * (k + i64::from(k > 600))).collect();
-        let (mut sums, mut segmenter) = run(64, 100, &columns, &times);
+        let (mut collected, mut segmenter) = run(64, 100, &columns, &times);
         // 332 = 32 · 10 + 12, 267 = 32 · 8 + 11, 398 = 32 · 12 + 14: nothing shorter than 16 is left over.
-        assert_eq!((sums.total.segments, segmenter.state.covered), (9 + 7 + 11, 320 + 256 + 384));
+        assert_eq!((collected.sums.total.segments, segmenter.state.covered), (9 + 7 + 11, 320 + 256 + 384));
         let mut analyser = Analyser::new(Plan::new(64, 10.0), &layout());
-        let before = sums.total.segments;
-        segmenter.end_run(&mut analyser, &mut sums);
-        assert_eq!((sums.total.segments, segmenter.state.run[0].len()), (before, 0));
+        let before = collected.sums.total.segments;
+        segmenter.end_run(&mut analyser, &mut collected);
+        assert_eq!((collected.sums.total.segments, segmenter.state.run[0].len()), (before, 0));
     }
 
     /// 100 samples: two segments of 64 that overlap, as three halves fit; the four left over are lost. 63: of 32, three; 31: of 16, two.
@@ -263,12 +329,12 @@ mod tests {
             let columns: Vec<Vec<f64>> = (1..4).map(|s| noise(samples + 1, s)).collect();
             let times: Vec<i64> = (0..=samples as i64).map(|k| 100 * k).collect();
             let mut analyser = Analyser::new(Plan::new(128, 10.0), &layout());
-            let mut sums = Sums::new(analyser.plan(), &layout());
+            let mut collected = Collected::new(analyser.plan(), &layout(), None);
             let mut segmenter = Segmenter::new(128, 100, vec![false, false, true]);
             let slices: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
-            segmenter.push(&times, &slices, &mut analyser, &mut sums);
-            segmenter.end_run(&mut analyser, &mut sums);
-            assert_eq!((sums.total.segments, segmenter.state.covered), (segments, covered), "{samples}");
+            segmenter.push(&times, &slices, &mut analyser, &mut collected);
+            segmenter.end_run(&mut analyser, &mut collected);
+            assert_eq!((collected.sums.total.segments, segmenter.state.covered), (segments, covered), "{samples}");
         }
     }
 

@@ -1,7 +1,8 @@
 //! The stage's state as bytes: a mark, what it was made for, little-endian words, a checksum. Exact to the bit, NaN included.
 
-use crate::segments::State;
-use crate::spectra::{Block, MAX_BLOCKS, Spectra, Sums};
+use crate::prediction::{self, Levels, Memory, Stretch};
+use crate::segments::{Collected, State};
+use crate::spectra::{Block, MAX_BLOCKS, Plan, Spectra, Sums};
 
 /// Why a saved state was refused.
 #[derive(Debug, thiserror::Error)]
@@ -28,11 +29,12 @@ pub enum StateError {
 
 const MARK: &[u8; 8] = b"QPCHECK\n";
 /// Version of the layout of saved states.
-pub const VERSION: u64 = 2;
+pub const VERSION: u64 = 3;
 
-/// The state as bytes; `layout` says what it is for.
+/// The state as bytes; `layout` says what it is for. Sums of this run and of those before are one in it.
 #[must_use]
-pub fn save(layout: &str, state: &State, sums: &Sums) -> Vec<u8> {
+pub fn save(layout: &str, state: &State, collected: &Collected, plan: &Plan) -> Vec<u8> {
+    let sums = collected.all(plan);
     let mut w = Writer(MARK.to_vec());
     w.word(VERSION);
     w.word(layout.len() as u64);
@@ -55,16 +57,33 @@ pub fn save(layout: &str, state: &State, sums: &Sums) -> Vec<u8> {
         w.word(block.overlaps_before.map_or(0, |taper| taper as u64 + 1));
         w.spectra(&block.spectra);
     }
+    if let Some(prediction) = &collected.prediction {
+        let p = &prediction.state;
+        p.levels.iter().for_each(|l| w.numbers(&[l.held, l.readout]));
+        p.memory.iter().for_each(|m| w.numbers(&m.values));
+        for word in [p.since_gap, p.block_ns.cast_unsigned(), p.trained_at, p.blocks.len() as u64] {
+            w.word(word);
+        }
+        for block in &p.blocks {
+            w.word(block.number.cast_unsigned());
+            w.numbers(&block.sums);
+        }
+    }
     let sum = checksum(&w.0);
     w.word(sum);
     w.0
 }
 
-/// Takes a state back; `sums` and `state` give the sizes that this run expects.
+/// Takes a state back; `state` and `collected`, of a run that has not begun, give the sizes that this run expects.
 ///
 /// # Errors
 /// [`StateError`]; nothing is changed then.
-pub fn load(bytes: &[u8], layout: &str, state: &State, sums: &Sums) -> Result<(State, Sums), StateError> {
+pub fn load(
+    bytes: &[u8],
+    layout: &str,
+    state: &State,
+    collected: &Collected,
+) -> Result<(State, Collected), StateError> {
     if bytes.get(..8) != Some(MARK) || bytes.get(8..16) != Some(&VERSION.to_le_bytes()) {
         return Err(StateError::Foreign);
     }
@@ -88,7 +107,8 @@ pub fn load(bytes: &[u8], layout: &str, state: &State, sums: &Sums) -> Result<(S
     let run_end_ns = r.word()?.cast_signed();
     let (rows, valid, covered) = (r.word()?, r.word()?, r.word()?);
     let missing = (0..columns).map(|_| r.word()).collect::<Result<_, _>>()?;
-    let sizes = (sums.total.packed.len(), sums.total.expected.len());
+    let empty = &collected.sums.total;
+    let sizes = (empty.packed.len(), empty.expected.len());
     let total = r.spectra(sizes)?;
     let block_ns = r.word()?.cast_signed();
     let blocks = r.size()?;
@@ -105,12 +125,18 @@ pub fn load(bytes: &[u8], layout: &str, state: &State, sums: &Sums) -> Result<(S
             Ok(Block { number, overlaps_before, spectra: r.spectra(sizes)? })
         })
         .collect::<Result<_, StateError>>()?;
+    let mut collected = collected.clone();
+    collected.earlier = Sums { total, block_ns, blocks };
+    if let Some(prediction) = &mut collected.prediction {
+        prediction.state = r.prediction(&prediction.state, prediction.block_size())?;
+        prediction.design();
+    }
     if !r.0.is_empty() {
         return Err(StateError::Damaged("too long"));
     }
     let last_ns = some.then_some(last);
     let state = State { last_ns, previous, run, run_has_segment, run_end_ns, rows, valid, covered, missing };
-    Ok((state, Sums { total, block_ns, blocks }))
+    Ok((state, collected))
 }
 
 struct Writer(Vec<u8>);
@@ -181,6 +207,34 @@ impl<'a> Reader<'a> {
         })
     }
 
+    fn prediction(&mut self, like: &prediction::State, block: usize) -> Result<prediction::State, StateError> {
+        let levels = (0..like.levels.len())
+            .map(|_| Ok(Levels { held: self.number()?, readout: self.number()? }))
+            .collect::<Result<_, StateError>>()?;
+        let memory = (0..like.memory.len())
+            .map(|_| {
+                let mut values = [0.0; 6];
+                for value in &mut values {
+                    *value = self.number()?;
+                }
+                Ok(Memory { values })
+            })
+            .collect::<Result<_, StateError>>()?;
+        let (since_gap, block_ns, trained_at) = (self.word()?, self.word()?.cast_signed(), self.word()?);
+        let blocks = self.size()?;
+        if block_ns <= 0 || blocks > MAX_BLOCKS {
+            return Err(StateError::Damaged("stretches of time"));
+        }
+        let blocks = (0..blocks)
+            .map(|_| Ok(Stretch { number: self.word()?.cast_signed(), sums: self.numbers(block)? }))
+            .collect::<Result<_, StateError>>()?;
+        Ok(prediction::State { levels, memory, since_gap, block_ns, blocks, trained_at })
+    }
+
+    fn number(&mut self) -> Result<f64, StateError> {
+        Ok(f64::from_bits(self.word()?))
+    }
+
     fn columns(&mut self, columns: usize) -> Result<Vec<Vec<f64>>, StateError> {
         let length = self.size()?;
         (0..columns).map(|_| self.numbers(length)).collect()
@@ -197,51 +251,81 @@ fn checksum(bytes: &[u8]) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::prediction::Prediction;
+    use crate::segments::Segmenter;
+    use crate::sigma::{Measured, NoiseModel};
+    use crate::spectra::{Analyser, Layout, Regressor};
+    use dragfree_physics::mission::Mission;
 
-    fn example() -> (State, Sums) {
-        let state = State {
-            last_ns: Some(-5),
-            previous: vec![f64::NAN, 1.0],
-            run: vec![vec![1.0, 2.0, -0.0], vec![0.1, f64::MIN_POSITIVE, 3.0]],
-            run_has_segment: true,
-            run_end_ns: 77,
-            rows: 10,
-            valid: 9,
-            covered: 8,
-            missing: vec![0, 1],
-        };
-        let spectra = |segments| Spectra {
-            packed: vec![1.5, 2.5],
-            expected: vec![0.75],
-            weight: vec![3.0],
-            weight_squared: vec![2.0],
-            segments,
-        };
-        let blocks = vec![
-            Block { number: -1, spectra: spectra(1), overlaps_before: None },
-            Block { number: 4, spectra: spectra(2), overlaps_before: Some(0) },
-        ];
-        (state, Sums { total: spectra(3), block_ns: 3_600_000_000_000, blocks })
+    const DAY: [Measured; 1] = [Measured::Directly];
+
+    fn layout() -> Layout {
+        Layout {
+            channels: vec!["c".into()],
+            series: vec!["s".into()],
+            regressors: vec![Regressor { coefficient: 0, channel: 0, series: 0, factor: 2.0 }],
+            coefficients: vec!["b".into()],
+        }
+    }
+
+    fn begin() -> (Segmenter, Collected, Analyser) {
+        let text = include_str!("../../../fixtures/missions/taiji.toml");
+        let value: serde_json::Value = toml::from_str(text).expect("the fixture is TOML");
+        let mission = Mission::from_json(&value.to_string()).expect("a mission");
+        let model = NoiseModel::new(&mission, &[("c", DAY[0])], 0.1).expect("a model");
+        let plan = Plan::new(64, 10.0);
+        let prediction = Prediction::new(&model, &DAY, &layout(), &plan);
+        assert!(prediction.is_some());
+        let collected = Collected::new(&plan, &layout(), prediction);
+        (Segmenter::new(64, 100_000_000, vec![false; 2]), collected, Analyser::new(plan, &layout()))
+    }
+
+    /// Rows of two columns with a gap, from `first` on.
+    fn feed(first: i64, end: i64, (segmenter, collected, analyser): &mut (Segmenter, Collected, Analyser)) {
+        let times: Vec<i64> = (first..end).map(|k| 100_000_000 * (k + i64::from(k > 5000) * 7)).collect();
+        let column = |p: i64| -> Vec<f64> { (first..end).map(|k| ((k * k % p) as f64).sin()).collect() };
+        segmenter.push(&times, &[&column(1009), &column(997)], analyser, collected);
+    }
+
+    fn saved() -> Vec<u8> {
+        let mut run = begin();
+        feed(0, 9000, &mut run);
+        save("one channel", &run.0.state, &run.1, run.2.plan())
     }
 
     #[test]
-    fn a_round_trip_changes_no_byte() {
-        let (state, sums) = example();
-        let bytes = save("two channels", &state, &sums);
-        let (s, g) = load(&bytes, "two channels", &state, &sums).expect("our own state");
-        assert_eq!(save("two channels", &s, &g), bytes);
+    fn a_round_trip_changes_no_byte_and_the_run_goes_on_as_one() {
+        let bytes = saved();
+        let mut second = begin();
+        let (state, collected) = load(&bytes, "one channel", &second.0.state, &second.1).expect("our own state");
+        (second.0.state, second.1) = (state, collected);
+        assert_eq!(save("one channel", &second.0.state, &second.1, second.2.plan()), bytes);
+        feed(9000, 20_000, &mut second);
+        let mut whole = begin();
+        feed(0, 20_000, &mut whole);
+        assert_eq!(second.0.state, whole.0.state);
+        let states = [&second, &whole].map(|r| r.1.prediction.as_ref().expect("a fit").state.clone());
+        let apart = states[0].blocks.iter().zip(&states[1].blocks).flat_map(|(a, b)| {
+            assert_eq!(a.number, b.number);
+            a.sums.iter().zip(&b.sums).map(|(a, b)| (a / b - 1.0).abs())
+        });
+        assert!(states[0].blocks.len() == states[1].blocks.len() && apart.fold(0.0, f64::max) < 1e-9);
+        let (a, b) = (second.1.all(second.2.plan()), whole.1.all(whole.2.plan()));
+        assert_eq!((a.total.segments, a.blocks.len()), (b.total.segments, b.blocks.len()));
+        let apart = a.total.packed.iter().zip(&b.total.packed).map(|(a, b)| (a / b - 1.0).abs());
+        assert!(apart.fold(0.0, f64::max) < 1e-9);
     }
 
     #[test]
     fn every_flipped_byte_and_every_cut_is_refused() {
-        let (state, sums) = example();
-        let bytes = save("two channels", &state, &sums);
-        for i in 0..bytes.len() {
+        let bytes = saved();
+        let (segmenter, collected, _) = begin();
+        for i in (0..bytes.len()).step_by(7) {
             let mut damaged = bytes.clone();
             damaged[i] ^= 0x40;
-            assert!(load(&damaged, "two channels", &state, &sums).is_err(), "byte {i}");
-            assert!(load(&bytes[..i], "two channels", &state, &sums).is_err(), "cut at {i}");
+            assert!(load(&damaged, "one channel", &segmenter.state, &collected).is_err(), "byte {i}");
+            assert!(load(&bytes[..i], "one channel", &segmenter.state, &collected).is_err(), "cut at {i}");
         }
-        assert!(matches!(load(&bytes, "three channels", &state, &sums), Err(StateError::Layout { .. })));
+        assert!(matches!(load(&bytes, "two channels", &segmenter.state, &collected), Err(StateError::Layout { .. })));
     }
 }

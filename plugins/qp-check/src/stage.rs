@@ -5,10 +5,11 @@ use dragfree_sdk::prelude::*;
 use nalgebra::DMatrix;
 use serde_json::json;
 
-use dragfree_estimation::estimate::{Bound, Estimate as Solution, Unknown, estimate};
-use dragfree_estimation::segments::{Segmenter, longest_length};
+use dragfree_estimation::estimate::{Bound, Estimate as Solution, Observed, Unknown, estimate};
+use dragfree_estimation::prediction::Prediction;
+use dragfree_estimation::segments::{Collected, Segmenter, longest_length};
 use dragfree_estimation::sigma::{Measured, NoiseModel};
-use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, SHORTEST, Sums};
+use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, SHORTEST};
 use dragfree_estimation::state;
 use dragfree_estimation::stored::Stored;
 use dragfree_estimation::verdict::{
@@ -32,15 +33,13 @@ struct Linked {
     left_out: Vec<String>,
     layout: Layout,
     model: NoiseModel,
+    measured: Vec<Measured>,
     coefficients: Vec<Coefficient>,
     bounds: Vec<Bound>,
     refinements: usize,
     analyser: Analyser,
     segmenter: Segmenter,
-    /// Sums of this run.
-    sums: Sums,
-    /// Sums of the runs before, whose state this one took over.
-    earlier: Sums,
+    collected: Collected,
     /// What a saved state must have been made for.
     signature: String,
 }
@@ -93,7 +92,7 @@ impl Stage for QpCheck {
     fn process(&mut self, input: &Inputs<'_>, _output: &mut Outputs) -> Result<(), PluginError> {
         let linked = self.linked.as_mut().ok_or_else(before_link)?;
         let columns: Vec<&[f64]> = linked.columns.iter().map(|c| input.f64(*c)).collect();
-        linked.segmenter.push(input.time_ns(), &columns, &mut linked.analyser, &mut linked.sums);
+        linked.segmenter.push(input.time_ns(), &columns, &mut linked.analyser, &mut linked.collected);
         Ok(())
     }
 
@@ -103,14 +102,14 @@ impl Stage for QpCheck {
 
     fn save(&self) -> Result<Vec<u8>, PluginError> {
         let linked = self.linked.as_ref().ok_or_else(before_link)?;
-        Ok(state::save(&linked.signature, &linked.segmenter.state, &linked.all_sums()))
+        Ok(state::save(&linked.signature, &linked.segmenter.state, &linked.collected, linked.analyser.plan()))
     }
 
     fn load(&mut self, bytes: &[u8]) -> Result<(), PluginError> {
         let linked = self.linked.as_mut().ok_or_else(before_link)?;
-        (linked.segmenter.state, linked.earlier) =
-            state::load(bytes, &linked.signature, &linked.segmenter.state, &linked.sums)?;
-        linked.sums = Sums::new(linked.analyser.plan(), &linked.layout);
+        let fresh = linked.nothing_collected();
+        (linked.segmenter.state, linked.collected) =
+            state::load(bytes, &linked.signature, &linked.segmenter.state, &fresh)?;
         Ok(())
     }
 }
@@ -179,14 +178,14 @@ impl Linked {
             columns,
             names,
             left_out,
-            model,
             bounds: bounds(available),
             coefficients: available.coefficients.clone(),
             refinements: stage.refinements,
-            sums: Sums::new(analyser.plan(), &layout),
-            earlier: Sums::new(analyser.plan(), &layout),
+            collected: nothing_collected(&model, &measured, &layout, analyser.plan()),
+            measured,
             segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged),
             analyser,
+            model,
             layout,
         })
     }
@@ -205,35 +204,30 @@ impl Linked {
             ));
         }
         // The open run ends here for this answer alone: a later run goes on with it.
-        let mut sums = self.all_sums();
-        let mut segmenter = self.segmenter.clone();
-        segmenter.end_run(&mut self.analyser, &mut sums);
-        if self.sums.total.segments == 0 {
-            self.sums = sums.clone();
+        let (mut segmenter, mut collected) = (self.segmenter.clone(), self.collected.clone());
+        segmenter.end_run(&mut self.analyser, &mut collected);
+        let sums = collected.all(self.analyser.plan());
+        if self.collected.sums.total.segments == 0 {
+            self.collected.sums = collected.sums.clone();
         }
         report.counts.insert("epochs_in_segments".to_owned(), segmenter.state.covered);
         if sums.total.segments == 0 {
             self.no_solution(&mut report);
             return Ok(report);
         }
-        let solution = estimate(
-            &sums,
-            self.analyser.plan(),
-            &self.layout,
-            &self.model,
-            &unknowns,
-            &self.bounds,
-            self.refinements,
-        )?;
+        let observed = Observed {
+            layout: &self.layout,
+            plan: self.analyser.plan(),
+            sums: &sums,
+            prediction: collected.prediction.as_ref(),
+        };
+        let solution = estimate(&observed, &self.model, &unknowns, &self.bounds, self.refinements)?;
         self.describe(&solution, earlier, &mut report);
         Ok(report)
     }
 
-    /// Sums of this run and of those whose state it took over.
-    fn all_sums(&self) -> Sums {
-        let mut sums = self.earlier.clone();
-        sums.add(self.analyser.plan(), &self.sums);
-        sums
+    fn nothing_collected(&self) -> Collected {
+        nothing_collected(&self.model, &self.measured, &self.layout, self.analyser.plan())
     }
 
     /// Too short for any spectrum: a sentence, not a number.
@@ -276,9 +270,19 @@ impl Linked {
             .filter_map(|e| Some(Value { name: e.name.clone(), value: e.value?, sigma: e.sigma? }))
             .collect();
         let compared = differences(&qp, &other);
+        let checked = checks(solution, &qp);
         let disagreeing: Vec<&Difference> = compared.iter().filter(|d| d.sigmas() > AGREEMENT_SIGMAS).collect();
         let mut insane = self.insane(solution);
         insane.extend(contradictions(solution));
+        for d in checked.iter().filter(|d| d.sigmas() > AGREEMENT_SIGMAS) {
+            insane.push(format!(
+                "{}: the fit by spectra and the prediction-error fit of the same data differ by {:.3e}, {:.1}σ: noise that is not \
+                 stationary, or a band that the model does not describe",
+                d.name,
+                d.difference,
+                d.sigmas()
+            ));
+        }
 
         // With Σ from the residuals the ratio is 1 by construction; only the mission's Σ can be contradicted.
         report.chi2_per_dof = Some(quality.chi2_per_dof_modelled_sigma);
@@ -316,7 +320,7 @@ impl Linked {
             report.notes.push(pull_sentence(p));
         }
         self.put_coefficients(solution, &disagreeing, report);
-        self.put_quality(solution, &compared, report);
+        self.put_quality(solution, &compared, &checked, report);
     }
 
     /// Sentences about χ²/dof outside its bounds although Σ was fitted.
@@ -365,7 +369,7 @@ impl Linked {
         }
     }
 
-    fn put_quality(&self, solution: &Solution, compared: &[Difference], report: &mut Report) {
+    fn put_quality(&self, solution: &Solution, compared: &[Difference], checked: &[Difference], report: &mut Report) {
         let quality = &solution.quality;
         let active: Vec<_> = solution
             .active
@@ -376,6 +380,11 @@ impl Linked {
             .iter()
             .map(|d| json!({ "name": d.name, "qp_minus_es_akf": d.difference, "sigmas": d.sigmas() }))
             .collect();
+        let predicted: Vec<_> = checked
+            .iter()
+            .zip(solution.prediction.iter().flat_map(|p| p.value.iter().zip(&p.sigma)))
+            .map(|(d, (value, sigma))| json!({ "name": d.name, "value": value, "sigma": sigma, "sigmas_from_qp": d.sigmas() }))
+            .collect();
         let entries = [
             ("active_constraints", json!(active)),
             ("kkt", json!(solution.kkt)),
@@ -384,6 +393,7 @@ impl Linked {
             ("chi2_per_dof_refined_sigma", json!(quality.chi2_per_dof)),
             ("last_step_sigma", json!(quality.last_step_sigma)),
             ("scatter_of_blocks", json!(solution.scatter)),
+            ("prediction_error", json!(predicted)),
             ("constraints", json!(solution.pulls)),
             ("survey_chi2", json!(solution.survey_chi2)),
             ("coherence_between_groups", json!(quality.between_groups)),
@@ -400,9 +410,24 @@ impl Linked {
         equations["channels"] = json!(self.layout.channels);
         equations["theta"] = json!(solution.theta.as_slice());
         // What this run adds, and not what an earlier one has stored already: so days add up.
-        equations["sums"] = json!(Stored::new(&self.layout, self.analyser.plan(), &self.sums.total));
+        equations["sums"] = json!(Stored::new(&self.layout, self.analyser.plan(), &self.collected.sums.total));
         report.attachments.push(Attachment { suffix: "neq.json".into(), text: equations.to_string() });
     }
+}
+
+fn nothing_collected(model: &NoiseModel, measured: &[Measured], layout: &Layout, plan: &Plan) -> Collected {
+    Collected::new(plan, layout, Prediction::new(model, measured, layout, plan))
+}
+
+/// The fit in the time domain beside the QP, coefficient by coefficient.
+fn checks(solution: &Solution, qp: &[Value]) -> Vec<Difference> {
+    let Some(check) = &solution.prediction else { return Vec::new() };
+    let other: Vec<Value> = qp
+        .iter()
+        .zip(check.value.iter().zip(&check.sigma))
+        .map(|(q, (value, sigma))| Value { name: q.name.clone(), value: *value, sigma: *sigma })
+        .collect();
+    differences(qp, &other)
 }
 
 /// Normal quantile of a false alarm in a thousand, for what data and survey say of each other.
