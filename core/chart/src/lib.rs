@@ -36,10 +36,12 @@ impl Scale {
         }
     }
 
-    fn text(self, value: f64) -> String {
+    /// A mark of an axis over a range.
+    fn text(self, value: f64, range: &Range<f64>) -> String {
         match self {
             Self::Logarithmic => format!("{value:.0e}"),
-            // Rounded, so that a sum of tenths does not show its last bit.
+            // Rounded, so that a sum of tenths does not show its last bit, and is zero where it should be.
+            Self::Linear if value.abs() < 1e-9 * (range.end - range.start) => "0".to_owned(),
             Self::Linear => format!("{}", format!("{value:.6e}").parse().unwrap_or(value)),
         }
     }
@@ -188,8 +190,8 @@ impl Panel {
             .y_desc(&self.y_label)
             .axis_desc_style(("sans-serif", 14))
             .label_style(("sans-serif", 12))
-            .x_label_formatter(&|value| self.x_scale.text(*value))
-            .y_label_formatter(&|value| self.y_scale.text(*value))
+            .x_label_formatter(&|value| self.x_scale.text(*value, &self.x))
+            .y_label_formatter(&|value| self.y_scale.text(*value, y))
             .bold_line_style(RGBColor(200, 200, 200))
             .max_light_lines(0)
             .draw()
@@ -291,6 +293,10 @@ mod tests {
 
     #[test]
     fn linear_axes_show_zero_and_below() {
+        assert_eq!(
+            [1e-16, -0.2, 0.6000000000000001].map(|v| Scale::Linear.text(v, &(-1.0..1.0))),
+            ["0", "-0.2", "0.6"]
+        );
         let mut linear = panel(vec![(0.0, -1.0), (0.5, 0.0), (0.9, 3.0), (0.95, f64::NAN)]);
         (linear.x_scale, linear.y_scale, linear.x) = (Scale::Linear, Scale::Linear, 0.0..1.0);
         assert_eq!(linear.limits().unwrap(), -1.2..3.2);
