@@ -2,6 +2,7 @@
 //! nine channels (Section IV; ARCHITECTURE.md, table `reconstruction`).
 
 mod acting;
+mod bridge;
 pub mod known;
 mod plugin;
 pub mod reconstruction;

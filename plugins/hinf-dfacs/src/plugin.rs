@@ -362,7 +362,9 @@ impl Stage for HinfDfacs {
             ("commands_replayed", counts.commands_replayed),
             ("commands_missing", counts.commands_missing),
             ("sun_direction_missing", counts.sun_missing),
+            ("commands_of_one_test_mass", counts.commands_of_one_test_mass),
             ("attitude_missing", counts.attitude_missing),
+            ("readouts_bridged", counts.readouts_bridged),
             ("angular_acceleration_unknown", counts.blind),
         ] {
             report.counts.insert(name.to_owned(), count);
@@ -371,6 +373,18 @@ impl Stage for HinfDfacs {
             report.notes.push(format!(
                 "commands of {} of {} epochs were not telemetered and come from the replayed control law",
                 counts.commands_replayed, counts.epochs
+            ));
+        }
+        if counts.commands_missing > 0 {
+            report.notes.push(format!(
+                "commands of {} of {} epochs are neither telemetered nor rebuilt: those epochs are not used",
+                counts.commands_missing, counts.epochs
+            ));
+        }
+        if counts.commands_of_one_test_mass > 0 {
+            report.notes.push(format!(
+                "commands of {} of {} epochs lack the electrodes of one test mass, which is left out there",
+                counts.commands_of_one_test_mass, counts.epochs
             ));
         }
         let q = &mut report.quality;

@@ -6,13 +6,14 @@ use dragfree_physics::thrust_noise::ThrustNoise;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::acting::Acting;
+use crate::bridge::{LONGEST, bridge};
 use crate::known::{KnownModel, KnownMotion};
 use crate::replay::{CommandNumbers, Comparison, Held, ReadoutNumbers, Replay, command_from};
 use crate::smoother::{Model, Smoothed, Smoother};
 use crate::state::{Reader, StateError, Writer};
 
 const NEEDED_BY: &str = "hinf-dfacs";
-const STATE: &[u8; 8] = b"dfacs/3\n";
+const STATE: &[u8; 8] = b"dfacs/4\n";
 
 /// Where the angular acceleration comes from. Only the smoother gives an unbiased calibration (physics.md §4).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -91,6 +92,10 @@ pub struct Counts {
     pub sun_missing: u64,
     /// Without the spacecraft's attitude.
     pub attitude_missing: u64,
+    /// With a command that lacks the electrodes of one test mass.
+    pub commands_of_one_test_mass: u64,
+    /// Readouts (axes) bridged in the channels.
+    pub readouts_bridged: u64,
     /// So far from any attitude that nothing but the command is known of the angular acceleration.
     pub blind: u64,
 }
@@ -101,6 +106,8 @@ struct Pending {
     time_ns: i64,
     attitude_rad: Vector3<f64>,
     r_orf_m: [Vector3<f64>; 2],
+    /// The same with short holes bridged: attitude, `r_1`, `r_2`.
+    bridged: [Vector3<f64>; 3],
     u_orf_m_s2: [Vector3<f64>; 2],
     /// Commanded, relative to IRF.
     alpha_known_rad_s2: Vector3<f64>,
@@ -110,16 +117,29 @@ struct Pending {
 }
 
 impl Pending {
-    fn numbers(&self) -> [f64; 24] {
+    fn numbers(&self) -> [f64; 33] {
         let [r1, r2] = self.r_orf_m;
         let [u1, u2] = self.u_orf_m_s2;
-        let v = [self.attitude_rad, r1, r2, u1, u2, self.alpha_known_rad_s2, self.frame_rad_s2, self.omega_ci_rad_s];
+        let [a, b, c] = self.bridged;
+        let v = [
+            self.attitude_rad,
+            r1,
+            r2,
+            u1,
+            u2,
+            self.alpha_known_rad_s2,
+            self.frame_rad_s2,
+            self.omega_ci_rad_s,
+            a,
+            b,
+            c,
+        ];
         std::array::from_fn(|i| v[i / 3][i % 3])
     }
 
     fn load(state: &mut Reader<'_>) -> Result<Self, StateError> {
         let time_ns = state.time()?;
-        let mut numbers = [0.0; 24];
+        let mut numbers = [0.0; 33];
         state.numbers(&mut numbers)?;
         let v = |i: usize| Vector3::from_column_slice(&numbers[3 * i..3 * i + 3]);
         Ok(Self {
@@ -130,6 +150,7 @@ impl Pending {
             alpha_known_rad_s2: v(5),
             frame_rad_s2: v(6),
             omega_ci_rad_s: v(7),
+            bridged: [v(8), v(9), v(10)],
         })
     }
 }
@@ -254,19 +275,44 @@ impl Reconstruction {
         let motion = self.known_motion(epoch, &(omega_sc + self.omega_ci_rad_s))?;
         self.smoother.advance(motion.map(|m| m.alpha_srf_rad_s2 - frame_rad_s2).as_ref());
         let missing = Vector3::from_element(f64::NAN);
+        let r_orf_m = [3, 9].map(|i| Vector3::from_column_slice(&epoch.readout[i..i + 3]));
         self.pending.push(Pending {
             time_ns: epoch.time_ns,
             attitude_rad,
-            r_orf_m: [3, 9].map(|i| Vector3::from_column_slice(&epoch.readout[i..i + 3])),
+            r_orf_m,
+            bridged: [attitude_rad, r_orf_m[0], r_orf_m[1]],
             u_orf_m_s2: motion.map_or([missing; 2], |m| m.u_orf_m_s2),
             alpha_known_rad_s2: motion.map_or(missing, |m| m.alpha_srf_rad_s2),
             frame_rad_s2,
             omega_ci_rad_s: self.omega_ci_rad_s,
         });
+        self.bridge();
         if self.smoother.waiting() == 2 * self.lag() {
             self.emit(self.lag(), rows);
         }
         Ok(())
+    }
+
+    /// Fills a hole that the two newest epochs end. At least a lag of epochs is always pending, longer than any bridge.
+    fn bridge(&mut self) {
+        let end = self.pending.len();
+        for component in 0..9 {
+            let (vector, axis) = (component / 3, component % 3);
+            let at = |back: usize| end.checked_sub(back).map_or(f64::NAN, |k| self.pending[k].bridged[vector][axis]);
+            if !(at(1).is_finite() && at(2).is_finite() && at(3).is_nan()) {
+                continue;
+            }
+            let missing = (3..).take_while(|back| end >= *back && at(*back).is_nan()).take(LONGEST + 1).count();
+            let before = [at(missing + 4), at(missing + 3)];
+            if missing > LONGEST || before.iter().any(|x| !x.is_finite()) {
+                continue;
+            }
+            let after = [at(2), at(1)];
+            for (k, value) in (end - 2 - missing..).zip(bridge(before, after, missing)) {
+                self.pending[k].bridged[vector][axis] = value;
+                self.counts.readouts_bridged += 1;
+            }
+        }
     }
 
     /// There are no more epochs: gives what waits.
@@ -290,7 +336,23 @@ impl Reconstruction {
             (None, None) => &mut self.counts.commands_missing,
         };
         *counter += 1;
-        let told = flown.copied().or(replayed);
+        // Electrodes of one test mass that nobody tells of: the other one and the spacecraft go on. Their recoil, 1e-9 N on the
+        // spacecraft, is a thousandth of the thrusters' noise.
+        let without = |tm: usize| -> Option<CommandNumbers> {
+            let theirs = 6 + 6 * tm..12 + 6 * tm;
+            let others = (0..18).filter(|i| !theirs.contains(i));
+            let known = others.clone().all(|i| epoch.command[i].is_finite());
+            known.then(|| std::array::from_fn(|i| if theirs.contains(&i) { 0.0 } else { epoch.command[i] }))
+        };
+        let mut silent = None;
+        let told = flown.copied().or(replayed).or_else(|| {
+            silent = (0..2).find(|tm| without(*tm).is_some());
+            silent.and_then(without)
+        });
+        if silent.is_some() {
+            self.counts.commands_missing -= 1;
+            self.counts.commands_of_one_test_mass += 1;
+        }
         let thrust = self.acting.act(told.as_ref().and_then(|numbers| numbers.first_chunk().copied()));
         let command = told.zip(thrust).map(|(mut numbers, thrust)| {
             numbers[..6].copy_from_slice(&thrust);
@@ -301,7 +363,13 @@ impl Reconstruction {
             return Ok(None);
         }
         let readout = self.held.test_masses();
-        Ok(command.map(|c| self.known.motion(&c, self.sun_srf.as_ref(), &readout, omega_srf_rad_s)))
+        Ok(command.map(|c| {
+            let mut motion = self.known.motion(&c, self.sun_srf.as_ref(), &readout, omega_srf_rad_s);
+            if let Some(tm) = silent {
+                motion.u_orf_m_s2[tm] = Vector3::from_element(f64::NAN);
+            }
+            motion
+        }))
     }
 
     fn emit(&mut self, count: usize, rows: &mut Vec<Row>) {
@@ -368,9 +436,9 @@ impl Reconstruction {
                         - 0.5 * (known(a) + known(now))
                 };
                 [
-                    difference(|p| p.r_orf_m[0], |p| p.u_orf_m_s2[0]),
-                    difference(|p| p.r_orf_m[1], |p| p.u_orf_m_s2[1]),
-                    difference(|p| p.attitude_rad, |p| p.alpha_known_rad_s2 - p.frame_rad_s2),
+                    difference(|p| p.bridged[1], |p| p.u_orf_m_s2[0]),
+                    difference(|p| p.bridged[2], |p| p.u_orf_m_s2[1]),
+                    difference(|p| p.bridged[0], |p| p.alpha_known_rad_s2 - p.frame_rad_s2),
                 ]
             }
             _ => [missing; 3],
@@ -433,6 +501,8 @@ impl Reconstruction {
             c.commands_missing,
             c.sun_missing,
             c.attitude_missing,
+            c.commands_of_one_test_mass,
+            c.readouts_bridged,
             c.blind,
         ] {
             out.count(count);
@@ -453,7 +523,7 @@ impl Reconstruction {
     pub fn load(&mut self, bytes: &[u8]) -> Result<(), StateError> {
         let mut state = Reader::new(bytes);
         if state.bytes().ok().as_ref() != Some(STATE) {
-            return Err(StateError::Foreign { expected: "version 3" });
+            return Err(StateError::Foreign { expected: "version 4" });
         }
         self.smoother.load(&mut state)?;
         self.held.load(&mut state)?;
@@ -473,6 +543,8 @@ impl Reconstruction {
             &mut c.commands_missing,
             &mut c.sun_missing,
             &mut c.attitude_missing,
+            &mut c.commands_of_one_test_mass,
+            &mut c.readouts_bridged,
             &mut c.blind,
         ] {
             *count = state.count()?;

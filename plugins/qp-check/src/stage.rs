@@ -240,7 +240,10 @@ impl Linked {
         if let Some((j, missing)) = state.missing.iter().enumerate().max_by_key(|(j, n)| (**n, std::cmp::Reverse(*j)))
             && *missing > 0
         {
-            sentence += &format!("; {} is missing in {missing} epochs", self.names[j]);
+            sentence += &format!(
+                "; {} is missing in {missing} epochs: where an instrument is silent all day, take what reads it out of the model",
+                self.names[j]
+            );
         }
         report.notes.push(sentence);
         report.verdict = Some("weak".into());

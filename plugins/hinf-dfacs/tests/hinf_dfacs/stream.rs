@@ -180,7 +180,7 @@ fn without_sensing_for_hours_no_acceleration_is_invented() {
 fn a_missing_command_costs_its_interval() {
     let mission = mission();
     let (mut epochs, truth) = telemetry(&mission, 3000);
-    epochs[1500].command[7] = f64::NAN;
+    epochs[1500].command[4] = f64::NAN;
     let mut stage = stage(&mission, &settings(Smoother));
     let rows = run(&mut stage, &epochs);
     for (k, row) in rows.iter().enumerate().take(2999).skip(1) {
@@ -323,4 +323,75 @@ fn sunlight_that_nobody_has_seen_yet_is_not_guessed() {
     for (k, row) in rows.iter().enumerate() {
         assert_eq!(u1(row).x.is_finite(), k >= 100, "epoch {k}");
     }
+}
+
+/// Holes of up to five readouts are bridged in the channels alone: these have a value everywhere, off by the readout's noise
+/// differenced twice, while the readouts stay missing; a hole of six is a hole.
+#[test]
+fn short_holes_are_bridged_in_the_channels_alone() {
+    let m = mission();
+    let (epochs, _) = telemetry(&m, 4000);
+    let sigma_m = 1e-9;
+    let mut random = Xoshiro256PlusPlus::seed_from_u64(3);
+    let noisy: Vec<Epoch> = epochs
+        .into_iter()
+        .map(|mut e| {
+            for i in 3..15 {
+                e.readout[i] = sigma_m * Distribution::<f64>::sample(&StandardNormal, &mut random);
+            }
+            e
+        })
+        .collect();
+    let mut holed = noisy.clone();
+    let holes: Vec<usize> = (200..3800).step_by(100).collect();
+    for (n, first) in holes.iter().enumerate() {
+        for k in 0..=n % 6 {
+            holed[first + k].readout[4] = f64::NAN;
+        }
+    }
+    let whole = run(&mut stage(&m, &settings(Smoother)), &noisy);
+    let mut tested = stage(&m, &settings(Smoother));
+    let rows = run(&mut tested, &holed);
+    let (mut squares, mut count) = (0.0, 0.0);
+    for (n, first) in holes.iter().enumerate() {
+        let size = n % 6 + 1;
+        for k in *first..first + size {
+            assert!(rows[k].values[7].is_nan(), "the readout stays missing");
+            let (got, want) = (rows[k].values[CHANNELS_AT + 1], whole[k].values[CHANNELS_AT + 1]);
+            assert_eq!(got.is_nan(), size == 6, "hole of {size}");
+            if size == 1 {
+                squares += ((got - want) / (2.0 * sigma_m * RATE_HZ * RATE_HZ)).powi(2);
+                count += 1.0;
+            }
+        }
+    }
+    // Weights −1/6, 2/3, 2/3, −1/6 and the missing noise itself: variance 1 + 0.944. χ² of six holes at 1e-4: 0.11 to 4.6.
+    let ratio: f64 = squares / count / 1.944;
+    assert!(count == 6.0 && (0.11..4.6).contains(&ratio), "{ratio}");
+    assert_eq!(tested.counts().readouts_bridged, 6 * (1 + 2 + 3 + 4 + 5));
+}
+
+/// Without a word of the second test mass's electrodes the first goes on, its û off by the recoil alone; the second has none.
+#[test]
+fn one_silent_test_mass_does_not_silence_the_other() {
+    let m = mission();
+    let (mut epochs, _) = telemetry(&m, 2000);
+    for e in &mut epochs {
+        e.command[12..].fill(0.0);
+        e.command[13] = 1e-9;
+    }
+    let whole = run(&mut stage(&m, &settings(Smoother)), &epochs);
+    for e in &mut epochs {
+        e.command[12..].fill(f64::NAN);
+        e.readout[9..].fill(f64::NAN);
+    }
+    let mut tested = stage(&m, &settings(Smoother));
+    let rows = run(&mut tested, &epochs);
+    for (a, b) in rows.iter().zip(&whole) {
+        assert!((u1(a) - u1(b)).norm() < 1e-9 / m.spacecraft.mass_kg * 1.001);
+        assert!((alpha(a) - alpha(b)).norm() < 1e-11 && alpha(a).iter().all(|x| x.is_finite()));
+        assert!(a.values[15..18].iter().all(|x| x.is_nan()), "û of the silent one");
+    }
+    let counts = tested.counts();
+    assert_eq!((counts.commands_of_one_test_mass, counts.commands_missing), (2000, 0));
 }
