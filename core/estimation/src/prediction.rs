@@ -13,6 +13,7 @@
 //!
 //! Channels are taken one by one. That costs efficiency, not truth, and the covariance is that of the blocks' scatter.
 
+use dragfree_physics::levels::{self, Bin, Levels};
 use nalgebra::{Cholesky, DMatrix, DVector};
 
 use crate::normal::{accumulate, residuals};
@@ -27,15 +28,6 @@ const SETTLING: f64 = 14.0;
 
 /// Length of a block at first, ns.
 const FIRST_BLOCK_NS: i64 = 3_600_000_000_000;
-
-/// Spectral densities of a channel's noise, one-sided: held acceleration, and readout before it is differenced.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Levels {
-    /// `a`, the channel's unit squared per Hz.
-    pub held: f64,
-    /// `b`, the same times s⁴.
-    pub readout: f64,
-}
 
 /// The filter that makes a channel's noise white: `e_k = x_k − c₁ e_{k−1} − c₂ e_{k−2}`, then the washout twice.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -332,55 +324,24 @@ impl Prediction {
     }
 }
 
-/// Levels that fit a spectrum: least squares of the relative misfit, which is as large in every band as its observations allow.
+/// Levels that fit a spectrum.
 fn fit(frequencies: &[f64], psd: &[f64], weights: &[f64], measured: Measured, dt_s: f64) -> Levels {
-    let shape = |f: f64| match measured {
-        Measured::Directly => (1.0, 0.0),
-        Measured::Differenced => {
-            let (sin, cos) = (std::f64::consts::PI * f * dt_s).sin_cos();
-            (cos * cos, (4.0 * sin * sin / (dt_s * dt_s)).powi(2))
-        }
-    };
-    let used: Vec<(f64, f64, f64, f64)> = frequencies
+    let bins: Vec<Bin> = frequencies
         .iter()
         .zip(psd)
         .zip(weights)
-        .filter(|((f, s), w)| **f > WASHOUT_HZ && s.is_finite() && **s > 0.0 && **w > 0.0)
-        .map(|((f, s), w)| (shape(*f).0, shape(*f).1, *s, *w))
+        .map(|((f, s), w)| Bin { frequency_hz: *f, psd: *s, weight: *w })
+        .filter(|b| b.frequency_hz > WASHOUT_HZ)
         .collect();
-    // Each level alone can be no larger than what is measured; the smallest such values are a start from above.
-    let least = |of: fn(&(f64, f64, f64, f64)) -> f64| {
-        used.iter().filter(|u| of(u) > 0.0).map(|u| u.2 / of(u)).fold(f64::INFINITY, f64::min)
-    };
-    let (mut a, mut b) = (least(|u| u.0), least(|u| u.1));
-    if !a.is_finite() {
-        return Levels { held: 1.0, readout: 0.0 };
-    }
-    if !b.is_finite() {
-        let (sum, weight) = used.iter().fold((0.0, 0.0), |(s, w), u| (s + u.3 * u.2, w + u.3));
-        return Levels { held: sum / weight, readout: 0.0 };
-    }
-    for _ in 0..20 {
-        let (mut aa, mut ab, mut bb, mut ay, mut by) = (0.0, 0.0, 0.0, 0.0, 0.0);
-        for (p, q, s, w) in &used {
-            let model = a * p + b * q;
-            // In units of the present levels, so that the two unknowns are near one.
-            let (p, q, s) = (a * p / model, b * q / model, s / model);
-            aa += w * p * p;
-            ab += w * p * q;
-            bb += w * q * q;
-            ay += w * p * s;
-            by += w * q * s;
+    let unknown = Levels { held: 1.0, readout: 0.0 };
+    match measured {
+        Measured::Differenced => levels::fit(&bins, dt_s).unwrap_or(unknown),
+        Measured::Directly => {
+            let used = bins.iter().filter(|b| b.psd.is_finite() && b.weight > 0.0);
+            let (sum, weight) = used.fold((0.0, 0.0), |(s, w), b| (s + b.weight * b.psd, w + b.weight));
+            if sum > 0.0 { Levels { held: sum / weight, readout: 0.0 } } else { unknown }
         }
-        let determinant = aa * bb - ab * ab;
-        if determinant <= 1e-12 * aa * bb {
-            break;
-        }
-        let (x, y) = ((ay * bb - by * ab) / determinant, (by * aa - ay * ab) / determinant);
-        // A level that the other explains away falls by a factor of four at most, and stays above zero.
-        (a, b) = (a * x.max(0.25), b * y.max(0.25));
     }
-    Levels { held: a, readout: b }
 }
 
 /// Scalar product in four lanes.
@@ -421,18 +382,9 @@ mod tests {
     }
 
     #[test]
-    fn levels_are_found_from_their_spectrum_and_half_forgotten_guesses() {
-        let f: Vec<f64> = (1..400).map(|k| 0.0125 * f64::from(k)).collect();
-        let psd: Vec<f64> = f
-            .iter()
-            .map(|f| {
-                let (s, c) = (std::f64::consts::PI * f * 0.1).sin_cos();
-                3e-21 * c * c + 5e-18 * (400.0 * s * s).powi(2)
-            })
-            .collect();
-        let l = fit(&f, &psd, &vec![1.0; f.len()], Measured::Differenced, 0.1);
-        assert!((l.held / 3e-21 - 1.0).abs() < 1e-9 && (l.readout / 5e-18 - 1.0).abs() < 1e-9, "{l:?}");
-        let l = fit(&f, &vec![2.0; f.len()], &vec![1.0; f.len()], Measured::Directly, 0.1);
+    fn the_level_of_a_direct_measurement_is_its_mean() {
+        let f = [0.1, 1.0, 2.0];
+        let l = fit(&f, &[2.0; 3], &[1.0; 3], Measured::Directly, 0.1);
         assert_eq!(l, Levels { held: 2.0, readout: 0.0 });
     }
 }

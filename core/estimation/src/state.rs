@@ -1,8 +1,9 @@
 //! The stage's state as bytes: a mark, what it was made for, little-endian words, a checksum. Exact to the bit, NaN included.
 
-use crate::prediction::{self, Levels, Memory, Stretch};
+use crate::prediction::{self, Memory, Stretch};
 use crate::segments::{Collected, State};
 use crate::spectra::{Block, MAX_BLOCKS, Plan, Spectra, Sums};
+use dragfree_physics::levels::Levels;
 
 /// Why a saved state was refused.
 #[derive(Debug, thiserror::Error)]

@@ -10,6 +10,7 @@ pub mod decoupling;
 pub mod frames;
 pub mod hinf;
 pub mod lag;
+pub mod levels;
 pub mod lti;
 pub mod mission;
 pub mod noise;

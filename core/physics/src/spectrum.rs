@@ -97,13 +97,20 @@ pub fn welch(x: &[f64], rate_hz: f64, segment: usize) -> Result<Spectrum, Spectr
     Ok(Spectrum { frequency_hz, psd, segments: segments as usize })
 }
 
-/// Takes the least-squares line off a segment and weighs it.
+/// Takes the line off a segment that fits the *weighed* samples best, and weighs it. A fit to the bare samples would take its
+/// slope from the ends, where a second difference of readout noise is far louder than the lowest bins.
 fn windowed(x: &[f64], window: &[f64], out: &mut [f64]) {
-    let n = x.len() as f64;
-    let middle = 0.5 * (n - 1.0);
-    let mean = x.iter().sum::<f64>() / n;
-    let slope =
-        x.iter().enumerate().map(|(i, v)| (i as f64 - middle) * (v - mean)).sum::<f64>() / (n * (n * n - 1.0) / 12.0);
+    let middle = 0.5 * x.len() as f64;
+    let (mut weight, mut sum, mut first, mut moment) = (0.0, 0.0, 0.0, 0.0);
+    for (i, (v, w)) in x.iter().zip(window).enumerate() {
+        let (t, w) = (i as f64 - middle, w * w);
+        weight += w;
+        sum += w * v;
+        first += w * t * v;
+        moment += w * t * t;
+    }
+    // The window is even about the middle, so that constant and slope do not mix.
+    let (mean, slope) = (sum / weight, first / moment);
     for (i, (o, (v, w))) in out.iter_mut().zip(x.iter().zip(window)).enumerate() {
         *o = (v - mean - slope * (i as f64 - middle)) * w;
     }

@@ -1,6 +1,7 @@
 //! Time per epoch of the whole stage behind the border, replay of the control law included.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use dragfree_hinf_dfacs::pilot::Scale;
 use dragfree_hinf_dfacs::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Settings};
 use dragfree_physics::mission::Mission;
 use nalgebra::Vector3;
@@ -21,6 +22,7 @@ fn stage(criterion: &mut Criterion) {
             sun: true,
             replay,
             warm_up_s: 600.0,
+            scale: Scale::nominal(),
         };
         let mut reconstruction = Reconstruction::new(&mission, &settings).expect("the fixture is complete");
         let mut rows = Vec::new();

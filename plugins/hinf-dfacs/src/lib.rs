@@ -4,6 +4,7 @@
 mod acting;
 mod bridge;
 pub mod known;
+pub mod pilot;
 mod plugin;
 pub mod reconstruction;
 pub mod replay;

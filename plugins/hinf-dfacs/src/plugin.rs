@@ -5,8 +5,10 @@ use dragfree_sdk::prelude::*;
 use nalgebra::Vector3;
 use serde_json::json;
 
-use crate::reconstruction::{AngularAcceleration, Epoch, ROW, Reconstruction, Row, Settings};
+use crate::pilot::{self, Scale};
+use crate::reconstruction::{AngularAcceleration, Epoch, ROW, Reconstruction, Row, Settings, levels_of};
 use crate::replay::{COMMAND_VECTORS, Comparison};
+use crate::state::{Reader, StateError, Writer};
 
 /// The innovations' variance may differ from the prediction by this much before it is worth a sentence; a day's
 /// sampling error is 0.2 %.
@@ -14,6 +16,7 @@ const INNOVATION_TOLERANCE: f64 = 0.1;
 /// Standard deviations of the innovations' correlation with rebuilt commands above which the commands are not those that
 /// acted; a false alarm in 2e-6 of all runs.
 const DISOBEDIENCE: f64 = 5.0;
+const STATE: &[u8; 8] = b"dfacs/5\n";
 const AXES: [&str; 3] = ["x", "y", "z"];
 const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
 
@@ -22,6 +25,7 @@ pub struct HinfDfacs {
     mission: Mission,
     angular_acceleration: AngularAcceleration,
     compare_commands: bool,
+    measure_noise: bool,
     warm_up_s: f64,
     linked: Option<Linked>,
     notes: Vec<String>,
@@ -29,6 +33,10 @@ pub struct HinfDfacs {
 
 struct Linked {
     reconstruction: Reconstruction,
+    settings: Settings,
+    all_readouts: bool,
+    /// Epochs held back until they have told the levels of the noise; none from then on.
+    pilot: Option<Vec<Epoch>>,
     rate_hz: f64,
     readout: [Option<In>; 15],
     command: Option<[In; 18]>,
@@ -118,6 +126,39 @@ impl HinfDfacs {
             }
         }
         Ok(columns.try_into().ok())
+    }
+
+    /// A reconstruction from the start, for other levels of the noise.
+    fn rebuild(&mut self, scale: Scale) -> Result<(), PluginError> {
+        let linked = self.linked.as_ref().ok_or_else(not_linked)?;
+        let (settings, all_readouts) = (Settings { scale, ..linked.settings }, linked.all_readouts);
+        // What there is to say of the control law has been said at the link.
+        let notes = self.notes.clone();
+        let reconstruction = self.reconstruction(&settings, all_readouts)?;
+        self.notes = notes;
+        let linked = self.linked.as_mut().ok_or_else(not_linked)?;
+        (linked.settings, linked.reconstruction) = (settings, reconstruction);
+        Ok(())
+    }
+
+    /// Measures the levels of the noise in the epochs that were held back, and lets these go.
+    fn end_pilot(&mut self) -> Result<(), PluginError> {
+        let linked = self.linked.as_mut().ok_or_else(not_linked)?;
+        let Some(epochs) = linked.pilot.take() else { return Ok(()) };
+        let mut rows = Vec::new();
+        for epoch in &epochs {
+            linked.reconstruction.push(epoch, &mut rows)?;
+        }
+        linked.reconstruction.finish(&mut rows);
+        let levels = levels_of(&self.mission);
+        let scale =
+            levels.map_or_else(Scale::nominal, |(held, sensing)| pilot::measure(&rows, linked.rate_hz, &held, sensing));
+        self.rebuild(scale)?;
+        let linked = self.linked.as_mut().ok_or_else(not_linked)?;
+        for epoch in &epochs {
+            linked.reconstruction.push(epoch, &mut linked.rows)?;
+        }
+        Ok(())
     }
 
     /// Builds the reconstruction, with the control law beside it where that can be had.
@@ -252,6 +293,11 @@ impl Stage for HinfDfacs {
                 true,
                 "replay the control law beside telemetered commands: report the distance, and fill gaps if it is small",
             ),
+            Parameter::bool(
+                "measure_noise",
+                true,
+                "measure the levels of torque noise and attitude sensing in the first 55 minutes; false trusts the mission file",
+            ),
             Parameter::f64(
                 "warm_up_s",
                 "s",
@@ -273,6 +319,7 @@ impl Stage for HinfDfacs {
             mission: Mission::from_json(setup.mission_json())?,
             angular_acceleration,
             compare_commands: setup.bool("compare_commands")?,
+            measure_noise: setup.bool("measure_noise")?,
             warm_up_s: setup.f64("warm_up_s")?,
             linked: None,
             notes: Vec::new(),
@@ -313,12 +360,18 @@ impl Stage for HinfDfacs {
             sun: sun.is_some(),
             replay: false,
             warm_up_s: self.warm_up_s,
+            scale: Scale::nominal(),
         };
-        let reconstruction = self.reconstruction(&settings, readout.iter().all(Option::is_some))?;
+        let all_readouts = readout.iter().all(Option::is_some);
+        let reconstruction = self.reconstruction(&settings, all_readouts)?;
+        let smoother = self.angular_acceleration == AngularAcceleration::Smoother;
         let table = link.table("reconstruction", rate_hz);
         let out = write_columns(link, table, noise_x)?;
         self.linked = Some(Linked {
             reconstruction,
+            settings,
+            all_readouts,
+            pilot: (smoother && self.measure_noise).then(Vec::new),
             rate_hz,
             readout,
             command,
@@ -336,7 +389,20 @@ impl Stage for HinfDfacs {
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
         let columns = Columns::of(linked, input);
-        for k in 0..columns.time_ns.len() {
+        let rows = columns.time_ns.len();
+        let mut k = 0;
+        if let Some(pilot) = &linked.pilot {
+            let end = rows.min(pilot::length(linked.rate_hz) - pilot.len());
+            let epochs: Vec<Epoch> = (0..end).map(|k| linked.epoch(&columns, k)).collect();
+            linked.pilot.get_or_insert_default().extend(epochs);
+            k = end;
+            if linked.pilot.as_ref().is_some_and(|p| p.len() < pilot::length(linked.rate_hz)) {
+                return Ok(());
+            }
+            self.end_pilot()?;
+        }
+        let linked = self.linked.as_mut().ok_or_else(not_linked)?;
+        for k in k..rows {
             let epoch = linked.epoch(&columns, k);
             linked.reconstruction.push(&epoch, &mut linked.rows)?;
         }
@@ -345,6 +411,7 @@ impl Stage for HinfDfacs {
     }
 
     fn flush(&mut self, output: &mut Outputs) -> Result<(), PluginError> {
+        self.end_pilot()?;
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
         linked.reconstruction.finish(&mut linked.rows);
         linked.give(output);
@@ -394,6 +461,19 @@ impl Stage for HinfDfacs {
             AngularAcceleration::SecondDifference => "second-difference",
         };
         q.insert("angular_acceleration".to_owned(), json!(method));
+        let scale = linked.settings.scale;
+        q.insert(
+            "measured_over_stated_noise_power".to_owned(),
+            json!({ "thruster_torque": scale.torque.as_slice(), "dws_long_arm": scale.sensing }),
+        );
+        if scale != Scale::nominal() {
+            report.notes.push(format!(
+                "the first 55 minutes have {:.2?} times the power of the mission file's torque noise about x, y, z and {:.2} times that \
+                 of its long-arm wavefront sensing; the measured levels were used for the angular acceleration",
+                scale.torque.as_slice(),
+                scale.sensing
+            ));
+        }
         q.insert("smoother_lag_s".to_owned(), json!(linked.reconstruction.lag() as f64 / linked.rate_hz));
         if self.angular_acceleration != AngularAcceleration::Smoother {
             report
@@ -433,11 +513,45 @@ impl Stage for HinfDfacs {
     }
 
     fn save(&self) -> Result<Vec<u8>, PluginError> {
-        Ok(self.linked.as_ref().ok_or_else(not_linked)?.reconstruction.save())
+        let linked = self.linked.as_ref().ok_or_else(not_linked)?;
+        let mut out = Writer(STATE.to_vec());
+        out.flag(linked.pilot.is_some());
+        let scale = linked.settings.scale;
+        out.numbers(scale.torque.as_slice());
+        out.numbers(&[scale.sensing]);
+        match &linked.pilot {
+            Some(pilot) => {
+                out.count(pilot.len() as u64);
+                pilot.iter().for_each(|epoch| epoch.save(&mut out));
+            }
+            None => out.0.extend_from_slice(&linked.reconstruction.save()),
+        }
+        Ok(out.0)
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        Ok(self.linked.as_mut().ok_or_else(not_linked)?.reconstruction.load(state)?)
+        let mut reader = Reader::new(state);
+        if reader.bytes().ok().as_ref() != Some(STATE) {
+            return Err(StateError::Foreign { expected: "version 5" }.into());
+        }
+        let waits = reader.flag()?;
+        let mut numbers = [0.0; 4];
+        reader.numbers(&mut numbers)?;
+        if !numbers.iter().all(|x| x.is_finite() && *x > 0.0) {
+            return Err(reader.damaged("a level of the noise").into());
+        }
+        let scale = Scale { torque: Vector3::new(numbers[0], numbers[1], numbers[2]), sensing: numbers[3] };
+        if waits {
+            let count = reader.length(pilot::length(self.linked.as_ref().ok_or_else(not_linked)?.rate_hz))?;
+            let pilot = (0..count).map(|_| Epoch::load(&mut reader)).collect::<Result<_, _>>()?;
+            reader.end()?;
+            self.linked.as_mut().ok_or_else(not_linked)?.pilot = Some(pilot);
+            return Ok(());
+        }
+        self.rebuild(scale)?;
+        let linked = self.linked.as_mut().ok_or_else(not_linked)?;
+        linked.pilot = None;
+        Ok(linked.reconstruction.load(reader.rest())?)
     }
 }
 

@@ -8,6 +8,7 @@ use nalgebra::{Matrix3, Vector3};
 use crate::acting::Acting;
 use crate::bridge::{LONGEST, bridge};
 use crate::known::{KnownModel, KnownMotion};
+use crate::pilot::Scale;
 use crate::replay::{CommandNumbers, Comparison, Held, ReadoutNumbers, Replay, command_from};
 use crate::smoother::{Model, Smoothed, Smoother};
 use crate::state::{Reader, StateError, Writer};
@@ -41,6 +42,8 @@ pub struct Settings {
     pub replay: bool,
     /// Time after which a replayed control law counts as settled, s.
     pub warm_up_s: f64,
+    /// Levels of the noise against the mission file.
+    pub scale: Scale,
 }
 
 /// Telemetry at `t_k`; NaN where there is none.
@@ -60,6 +63,37 @@ pub struct Epoch {
     pub omega_crf_rad_s: Vector3<f64>,
     /// `ω̇_CI`, CRF, rad s⁻².
     pub alpha_crf_rad_s2: Vector3<f64>,
+}
+
+impl Epoch {
+    pub(crate) fn save(&self, out: &mut Writer) {
+        out.time(self.time_ns);
+        out.numbers(&self.readout);
+        out.numbers(&self.command);
+        out.numbers(self.sun_srf.as_slice());
+        out.numbers(&[self.ephemeris_age_s]);
+        out.numbers(self.omega_crf_rad_s.as_slice());
+        out.numbers(self.alpha_crf_rad_s2.as_slice());
+    }
+
+    pub(crate) fn load(state: &mut Reader<'_>) -> Result<Self, StateError> {
+        let mut epoch = Self {
+            time_ns: state.time()?,
+            readout: [0.0; 15],
+            command: [0.0; 18],
+            sun_srf: Vector3::zeros(),
+            ephemeris_age_s: 0.0,
+            omega_crf_rad_s: Vector3::zeros(),
+            alpha_crf_rad_s2: Vector3::zeros(),
+        };
+        state.numbers(&mut epoch.readout)?;
+        state.numbers(&mut epoch.command)?;
+        state.numbers(epoch.sun_srf.as_mut_slice())?;
+        state.numbers(std::slice::from_mut(&mut epoch.ephemeris_age_s))?;
+        state.numbers(epoch.omega_crf_rad_s.as_mut_slice())?;
+        state.numbers(epoch.alpha_crf_rad_s2.as_mut_slice())?;
+        Ok(epoch)
+    }
 }
 
 /// Values in a row of the `reconstruction` table.
@@ -186,10 +220,11 @@ fn finite(v: &Vector3<f64>) -> Option<Vector3<f64>> {
 }
 
 /// The smoother's model: what the thrusters' noise does to the angular acceleration, and what the sensors see of it.
-fn model(mission: &Mission, noise: &ThrustNoise, rate_hz: f64) -> Result<Model, MissionError> {
+fn model(mission: &Mission, noise: &ThrustNoise, settings: &Settings) -> Result<Model, MissionError> {
     let inverse = mission.spacecraft.inertia_inverse();
     let torque = noise.torque * noise.torque_shape.white_psd();
-    let sensing = Mission::need(&mission.noise.dws_long_arm, "noise.dws_long_arm", NEEDED_BY)?.shape();
+    let mut sensing = Mission::need(&mission.noise.dws_long_arm, "noise.dws_long_arm", NEEDED_BY)?.shape();
+    sensing.terms.iter_mut().for_each(|term| term.asd *= settings.scale.sensing.sqrt());
     let refuse = |key: &str, psd: f64| {
         let reason = "must be above zero: it is what weighs wavefront sensing against commands";
         Err(MissionError::Value { key: key.to_owned(), value: psd.sqrt().to_string(), reason })
@@ -203,7 +238,19 @@ fn model(mission: &Mission, noise: &ThrustNoise, rate_hz: f64) -> Result<Model, 
     if sensing.white_psd() <= 0.0 {
         return refuse("noise.dws_long_arm.asd_rad_rthz", 0.0);
     }
-    Ok(Model::new(&(inverse * torque * inverse.transpose()), &sensing, 1.0 / rate_hz))
+    let loud = Matrix3::from_diagonal(&settings.scale.torque.map(f64::sqrt));
+    Ok(Model::new(&(loud * inverse * torque * inverse.transpose() * loud), &sensing, 1.0 / settings.rate_hz))
+}
+
+/// One-sided PSDs of the mission file: what the thrusters' torque does to the angular acceleration about each axis of SRF,
+/// rad² s⁻⁴/Hz, and the white part of the attitude's sensing, rad²/Hz; `None` where it tells neither.
+#[must_use]
+pub fn levels_of(mission: &Mission) -> Option<(Vector3<f64>, f64)> {
+    let noise = ThrustNoise::of(mission)?;
+    let inverse = mission.spacecraft.inertia_inverse();
+    let torque = noise.torque * noise.torque_shape.white_psd();
+    let sensing = mission.noise.dws_long_arm.as_ref()?.shape().white_psd();
+    Some(((inverse * torque * inverse.transpose()).diagonal(), sensing))
 }
 
 impl Reconstruction {
@@ -215,7 +262,7 @@ impl Reconstruction {
     pub fn new(mission: &Mission, settings: &Settings) -> Result<Self, MissionError> {
         let missing = || MissionError::Missing { section: "noise.thruster_torque".to_owned(), needed_by: NEEDED_BY };
         let noise = ThrustNoise::of(mission).filter(|n| !n.torque_shape.terms.is_empty()).ok_or_else(missing)?;
-        let model = model(mission, &noise, settings.rate_hz)?;
+        let model = model(mission, &noise, settings)?;
         let push_per_turn = |name: &str| -> Result<Matrix3<f64>, MissionError> {
             let dcm_orf_from_srf = mission.test_mass(name, NEEDED_BY)?.dcm_orf_from_srf();
             let force_per_turn = noise.force_per_torque * mission.spacecraft.inertia();

@@ -69,7 +69,7 @@ impl<'a> Reader<'a> {
         Self { bytes, at: 0 }
     }
 
-    fn damaged(&self, what: &'static str) -> StateError {
+    pub(crate) fn damaged(&self, what: &'static str) -> StateError {
         StateError::Damaged { what, at: self.at, length: self.bytes.len() }
     }
 
@@ -116,6 +116,11 @@ impl<'a> Reader<'a> {
         let mut values = [0.0; N];
         self.numbers(&mut values)?;
         Ok(Some(values))
+    }
+
+    /// What has not been read yet.
+    pub(crate) fn rest(&self) -> &'a [u8] {
+        &self.bytes[self.at..]
     }
 
     pub(crate) fn end(&self) -> Result<(), StateError> {

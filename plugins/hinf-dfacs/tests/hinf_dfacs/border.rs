@@ -98,7 +98,8 @@ fn library() -> Library {
 
 fn create(library: &Library, parameters: &Value) -> Instance {
     let mission: Value = toml::from_str(include_str!("../../../../fixtures/missions/taiji.toml")).expect("TOML");
-    let mut all = json!({"angular_acceleration": "smoother", "compare_commands": true, "warm_up_s": 60.0});
+    let mut all =
+        json!({"angular_acceleration": "smoother", "compare_commands": true, "measure_noise": true, "warm_up_s": 60.0});
     for (key, value) in parameters.as_object().expect("an object") {
         all[key] = value.clone();
     }

@@ -1,6 +1,7 @@
 //! The attitude loop of the paper's spacecraft, with the mission's own control law and the test masses at rest.
 
 use dragfree_hinf_dfacs::known::KnownModel;
+use dragfree_hinf_dfacs::pilot::Scale;
 use dragfree_hinf_dfacs::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Row, Settings};
 use dragfree_physics::control::{Command, ControlLaw, Readout, TestMassReadout};
 use dragfree_physics::mission::Mission;
@@ -35,7 +36,15 @@ pub(crate) fn late(mut mission: Mission) -> Mission {
 }
 
 pub(crate) fn settings(angular_acceleration: AngularAcceleration) -> Settings {
-    Settings { rate_hz: RATE_HZ, angular_acceleration, commands: true, sun: false, replay: false, warm_up_s: 60.0 }
+    Settings {
+        rate_hz: RATE_HZ,
+        angular_acceleration,
+        commands: true,
+        sun: false,
+        replay: false,
+        warm_up_s: 60.0,
+        scale: Scale::nominal(),
+    }
 }
 
 pub(crate) fn stage(mission: &Mission, settings: &Settings) -> Reconstruction {
