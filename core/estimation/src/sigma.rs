@@ -193,7 +193,8 @@ impl NoiseModel {
                 });
             }
         }
-        // A measured α has its instrument's whole noise.
+        // A measured α has its instrument's whole noise. Where the stage gives E[α | measured α], what remains is `W S_n`, less;
+        // but W comes from the telemetry, which is not known here. The whole is the safe side, until the residuals refine it.
         if let (Some(shape), false) = (&noise.accelerometer_angular, model.angular_error.is_some()) {
             model.add(shape.shape(), Response::Flat, &lever * lever.transpose());
         }

@@ -10,19 +10,26 @@
 //! IMU1A: the attitude is in SRF, is without the gyros' drift and holds their data already, while the axes of the gyros
 //! are in no header. `ω` matters little: what changes in `ω×(ω×b)` is 1e-9 s⁻²·b, against 1e-7 s⁻²·b from α.
 //!
-//! A measured α carries its instrument's noise into the regressors. Where the spacecraft hardly turns, that noise is all
-//! there is: an offset fitted to it is pulled towards zero (errors in variables), or to whatever lever the common
-//! electrodes of linear and angular readout pretend (centimetres in the ten quiet seconds of the fixtures), however
-//! small its σ. The stage compares α with its noise on every time scale and says so.
+//! A measured α carries its instrument's noise into the regressors, and an offset fitted to it is pulled towards zero
+//! (errors in variables). Where the mission tells of the noise, the stage gives `E[α | measured α]` instead (see
+//! [`crate::angular`]). That takes a spectrum: a stretch without gaps of less than 2,048 samples stays as measured, and
+//! 128 samples at either end of a longer one have no α; the rest is late by at most 18,435 samples.
+//!
+//! Where the spacecraft hardly turns, the noise is all there is, and an offset fitted to it tells of whatever lever the
+//! common electrodes of linear and angular readout pretend (centimetres in the ten quiet seconds of the fixtures),
+//! however small its σ. The stage compares α with its noise on every time scale and says so.
 //!
 //! The gradient's `Γ b` is 4e-6 s⁻²·b in low orbit, but constant in a spacecraft that points at the Earth, as are the
 //! instrument's biases (1e-5 m s⁻², 1e-3 rad s⁻²): `qp-check` takes constants and slopes out of every segment.
 
 use dragfree_physics::mission::Mission;
 use dragfree_physics::noise::NoiseShape;
+use dragfree_physics::spectrum::SpectrumError;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
+
+use crate::angular::{Row, Wiener};
 
 /// Below this ratio of mean squares a tenth or more of the regressors' power is noise at every frequency.
 const QUIET: f64 = 10.0;
@@ -158,6 +165,8 @@ struct State {
     rows: u64,
     without_acceleration: u64,
     without_attitude: u64,
+    /// The filter's state, if there is a filter.
+    angular: Option<serde_json::Value>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -183,8 +192,25 @@ pub struct Accelerometer {
     step_ns: i64,
     /// Mean squares of the steps of α's noise per block length, (rad s⁻²)², if the mission says how noisy it is.
     alpha_noise_steps: Option<[f64; LEVELS]>,
+    /// Makes `E[α | measured α]` of the measured α, if the mission says how noisy it is.
+    wiener: Option<Wiener>,
     handles: Option<Handles>,
     state: State,
+}
+
+impl Handles {
+    /// Writes a row of the reconstruction.
+    fn give(&self, row: &Row, output: &mut Outputs) {
+        output.time(self.motion).push(row.time_ns);
+        for i in 0..3 {
+            output.f64(self.alpha[i]).push(row.alpha_srf_rad_s2.map_or(f64::NAN, |a| a[i]));
+            output.f64(self.omega[i]).push(row.omega_srf_rad_s.map_or(f64::NAN, |w| w[i]));
+        }
+    }
+}
+
+fn transform(error: &SpectrumError) -> PluginError {
+    PluginError::error(format!("the spectrum of the measured angular acceleration: {error}"))
 }
 
 impl Stage for Accelerometer {
@@ -221,10 +247,13 @@ impl Stage for Accelerometer {
         let mission = Mission::from_json(setup.mission_json())?;
         let test_mass = setup.text("test_mass")?;
         let dt_s = mission.dt_s();
+        let step_ns = (dt_s * 1e9).round() as i64;
+        let noise = mission.noise.accelerometer_angular.as_ref().map(|n| n.shape());
         Ok(Self {
             orf_from_srf: mission.test_mass(&test_mass, "the stage accelerometer")?.dcm_orf_from_srf(),
-            step_ns: (dt_s * 1e9).round() as i64,
-            alpha_noise_steps: mission.noise.accelerometer_angular.map(|n| noise_steps(&n.shape(), dt_s)),
+            step_ns,
+            alpha_noise_steps: noise.as_ref().map(|n| noise_steps(n, dt_s)),
+            wiener: noise.map(|n| Wiener::new(n, step_ns)),
             linear: setup.text("linear")?,
             angular: setup.text("angular")?,
             attitude: setup.text("attitude")?,
@@ -271,7 +300,6 @@ impl Stage for Accelerometer {
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
         let h = self.handles.ok_or_else(|| PluginError::fatal("accelerometer: process before link"))?;
         output.time(h.channels).extend_from_slice(input.time_ns());
-        output.time(h.motion).extend_from_slice(input.time_ns());
         for (k, time_ns) in input.time_ns().iter().enumerate() {
             let measured = Vector3::from(h.linear.map(|c| input.f64(c)[k]));
             let channel = channel_orf_m_s2(&self.orf_from_srf, &measured);
@@ -287,11 +315,24 @@ impl Stage for Accelerometer {
             self.state.without_attitude += u64::from(!complete(&omega));
             for i in 0..3 {
                 output.f64(h.channel[i]).push(channel[i]);
-                output.f64(h.alpha[i]).push(alpha[i]);
-                output.f64(h.omega[i]).push(omega[i]);
+            }
+            let row = Row {
+                time_ns: *time_ns,
+                alpha_srf_rad_s2: complete(&alpha).then(|| alpha.into()),
+                omega_srf_rad_s: complete(&omega).then(|| omega.into()),
+            };
+            match &mut self.wiener {
+                Some(wiener) => wiener.next(row, &mut |row| h.give(&row, output)).map_err(|e| transform(&e))?,
+                None => h.give(&row, output),
             }
         }
         Ok(())
+    }
+
+    fn flush(&mut self, output: &mut Outputs) -> Result<(), PluginError> {
+        let h = self.handles.ok_or_else(|| PluginError::fatal("accelerometer: flush before link"))?;
+        let Some(wiener) = &mut self.wiener else { return Ok(()) };
+        wiener.finish(&mut |row| h.give(&row, output)).map_err(|e| transform(&e))
     }
 
     fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
@@ -322,20 +363,46 @@ impl Stage for Accelerometer {
             }
             quality.insert("alpha_steps_over_noise".to_owned(), ratio.to_vec().into());
         }
-        let counts = [
+        let mut counts = vec![
             ("rows", s.rows),
             ("rows_without_acceleration", s.without_acceleration),
             ("rows_without_attitude", s.without_attitude),
         ];
-        Ok(Report { counts: counts.map(|(k, v)| (k.to_owned(), v)).into(), notes, quality, ..Report::default() })
+        if let Some(wiener) = &self.wiener {
+            let c = wiener.counts();
+            if c.as_measured > 0 {
+                notes.push(format!(
+                    "{} rows lie in stretches too short to tell the angular acceleration from its noise and are used as \
+                     measured: where the noise is not small, they pull the offset towards zero",
+                    c.as_measured
+                ));
+            }
+            counts.extend([
+                ("rows_alpha_filtered", c.filtered),
+                ("rows_alpha_as_measured", c.as_measured),
+                ("rows_alpha_near_gap", c.near_gap),
+            ]);
+        } else {
+            notes.push(
+                "the mission does not say how noisy the measured angular acceleration is (noise.accelerometer_angular): it \
+                 is used as measured, and its noise pulls the offset towards zero, nobody can know how far"
+                    .to_owned(),
+            );
+        }
+        let counts = counts.into_iter().map(|(k, v)| (k.to_owned(), v)).collect();
+        Ok(Report { counts, notes, quality, ..Report::default() })
     }
 
     fn save(&self) -> Result<Vec<u8>, PluginError> {
-        Ok(serde_json::to_vec(&self.state)?)
+        let angular = self.wiener.as_ref().map(Wiener::save).transpose()?;
+        Ok(serde_json::to_vec(&State { angular, ..self.state.clone() })?)
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
         self.state = serde_json::from_slice(state)?;
+        if let (Some(wiener), Some(angular)) = (&mut self.wiener, self.state.angular.take()) {
+            wiener.load(angular)?;
+        }
         Ok(())
     }
 }

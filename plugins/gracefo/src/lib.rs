@@ -18,6 +18,7 @@
 //! | archives hold stray `._*` members | ignored |
 
 pub mod accelerometer;
+pub mod angular;
 pub mod archive;
 pub mod header;
 pub mod product;
