@@ -292,3 +292,18 @@ fn the_bias_stays_and_noise_goes() {
         assert!((a[0] - 1e-3).abs() < 1e-15 && a[1] == 0.0 && (a[2] + 2e-5).abs() < 1e-15, "{a:?}");
     }
 }
+
+/// The accelerometer's clock is fast: every 3,600 samples the grid blanks an epoch and moves by a quarter of a step. The
+/// samples around it are as even as before, and only the blank rows and the ends have no α.
+#[test]
+fn a_grid_that_follows_its_clock_has_no_gap() {
+    let mut s = with_gaps(&[(3_600, 1), (7_200, 1)]);
+    let (even, counts) = run(&s.rows, stated(1.0));
+    for (k, row) in s.rows.iter_mut().enumerate() {
+        row.time_ns -= [3_600, 7_200].into_iter().filter(|jump| k > *jump).count() as i64 * STEP_NS / 4;
+    }
+    let (moved, moved_counts) = run(&s.rows, stated(1.0));
+    assert_eq!(counts, Counts { filtered: 60_000 - 2 - 2 * REACH as u64, as_measured: 0, near_gap: 2 * REACH as u64 });
+    assert_eq!(counts, moved_counts);
+    assert!(even.iter().zip(&moved).all(|(a, b)| a.alpha_srf_rad_s2 == b.alpha_srf_rad_s2));
+}
