@@ -8,6 +8,8 @@ use dragfree_estimation::prediction::Prediction;
 use dragfree_estimation::segments::{Collected, Segmenter};
 use dragfree_estimation::sigma::{Measured, NoiseModel};
 use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, Sums};
+use dragfree_estimation::state;
+use dragfree_estimation::stored::Stored;
 use dragfree_physics::frames::dcm_turned_about_z;
 use dragfree_physics::mission::Mission;
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
@@ -607,5 +609,56 @@ fn the_prediction_error_fit_finds_the_same_offsets() {
         assert!(squares.iter().all(|s| *s < runs + 3.9 * (2.0 * runs).sqrt() + 10.0), "{squares:?}");
         assert!(sums.iter().all(|s| s.abs() < 4.3 * runs.sqrt()), "{sums:?}");
         assert!(apart < 3.0, "{apart}");
+    }
+}
+
+/// Two days, the second with the state of the first: what each has stored, stacked, gives the answer of one run over both, and so does
+/// the second run itself; to 1e-12 of the value, σ alike.
+#[test]
+fn daily_sums_stacked_are_one_long_run() {
+    let columns = data(11, LOOP);
+    let plan = || Plan::new(LENGTH, RATE_HZ);
+    let model =
+        NoiseModel::new(&mission(), &CHANNELS.map(|c| (c, Measured::Differenced)), DT_S).expect("a noise model");
+    let prediction = || Prediction::new(&model, &[Measured::Differenced; 9], &layout(), &plan());
+    let begin = || {
+        let segmenter = Segmenter::new(LENGTH, 100_000_000, (0..27).map(|j| j >= 9).collect());
+        (segmenter, Collected::new(&plan(), &layout(), prediction()), Analyser::new(plan(), &layout()))
+    };
+    let feed = |range: std::ops::Range<usize>, run: &mut (Segmenter, Collected, Analyser)| {
+        let times: Vec<i64> = range.clone().map(|k| 100_000_000 * k as i64).collect();
+        let slices: Vec<&[f64]> = columns.iter().map(|c| &c[range.clone()]).collect();
+        run.0.push(&times, &slices, &mut run.2, &mut run.1);
+    };
+    let solve = |sums: &Sums| {
+        let observed = Observed { layout: &layout(), plan: &plan(), sums, prediction: None };
+        estimate(&observed, &model, &unknowns(0.5), &baseline(), 3).expect("a solution")
+    };
+    let midnight = 17_777;
+    let mut long = begin();
+    feed(0..ROWS, &mut long);
+    let mut first = begin();
+    feed(0..midnight, &mut first);
+    let bytes = state::save("two days", &first.0.state, &first.1, &plan());
+    let mut second = begin();
+    (second.0.state, second.1) = state::load(&bytes, "two days", &second.0.state, &second.1).expect("our own state");
+    feed(midnight..ROWS, &mut second);
+
+    let want = solve(&long.1.all(&plan()));
+    let stored = [&first.1, &second.1].map(|c| Stored::new(&layout(), &plan(), &c.sums.total));
+    let text = stored.map(|s| serde_json::to_string(&s).expect("JSON"));
+    let days: Vec<Stored> = text.iter().map(|t| serde_json::from_str(t).expect("our own")).collect();
+    let (_, _, stacked) = Stored::stack(&days).expect("two days");
+    for got in [solve(&stacked), solve(&second.1.all(&plan()))] {
+        assert_eq!(got.normal.segments, want.normal.segments);
+        let (a, b) = (got.covariance.expect("a covariance"), want.covariance.as_ref().expect("a covariance"));
+        for i in 0..6 {
+            // The solver stops at 1e-9 of its objective, far below a millionth of σ.
+            assert!((got.theta[i] - want.theta[i]).abs() < 1e-6 * b[(i, i)].sqrt());
+            assert!((a[(i, i)] / b[(i, i)] - 1.0).abs() < 1e-9);
+        }
+        for (a, b) in got.normal.normal.iter().flatten().zip(want.normal.normal.iter().flatten()) {
+            assert!((a - b).abs() <= 1e-12 * (want.normal.normal[0][0] + b.abs()), "{a} against {b}");
+        }
     }
 }
