@@ -37,6 +37,8 @@ pub(crate) struct Whitening {
     variances: Vec<DVector<f64>>,
     /// Group of each channel: channels that the model connects.
     group: Vec<usize>,
+    /// Whether a channel is the residual of a known motion.
+    residual: Vec<bool>,
     /// Channels in the group of each channel.
     group_size: Vec<f64>,
     /// Ranges of bands of the sums.
@@ -99,6 +101,7 @@ impl Whitening {
             factors,
             variances,
             group,
+            residual: model.residual().to_vec(),
             group_size,
             observations: coarse.iter().map(observed).collect(),
             coarse,
@@ -183,7 +186,7 @@ impl Whitening {
         (expected, expected * self.kept[band])
     }
 
-    /// Whether channels that the model does not connect are as unrelated as it says: for each pair of groups the sum of `2n ρ²`
+    /// Whether residuals that the model does not connect are as unrelated as it says: for each pair of groups the sum of `2n ρ²`
     /// over pairs of channels and refined bands, ρ the real coherence of the residuals, χ² of as many degrees of freedom when it
     /// is so.
     pub(crate) fn between_groups(&self, residuals: &[DMatrix<f64>]) -> (f64, f64) {
@@ -191,7 +194,8 @@ impl Whitening {
         for (range, n) in self.coarse.iter().zip(&self.observations) {
             let w = self.whitened(residuals, range);
             for i in 0..self.group.len() {
-                for j in (0..i).filter(|j| self.group[i] != self.group[*j]) {
+                let apart = |j: &usize| self.group[i] != self.group[*j] && self.residual[i] && self.residual[*j];
+                for j in (0..i).filter(apart) {
                     let rho2 = w[(i, j)].powi(2) / (w[(i, i)] * w[(j, j)]);
                     // Of n complex observations the square of the real coherence has the mean 1/(2n+1) … 1/(2n).
                     sum += 2.0 * n * rho2;

@@ -78,6 +78,8 @@ struct AngularError {
 /// The noise model of a set of channels.
 pub struct NoiseModel {
     channels: usize,
+    /// Channels that are residuals of a known motion, so that nothing but noise is left in them.
+    residual: Vec<bool>,
     dt_s: f64,
     processes: Vec<Process>,
     angular_error: Option<AngularError>,
@@ -98,7 +100,9 @@ impl NoiseModel {
         let n = channels.len();
         let places: Vec<Place> = channels.iter().map(|(name, _)| place(name)).collect();
         let measured = |i: usize| channels[i].1;
-        let mut model = Self { channels: n, dt_s, processes: Vec::new(), angular_error: None, unknown: Vec::new() };
+        let residual = channels.iter().map(|(_, m)| *m == Measured::Differenced).collect();
+        let mut model =
+            Self { channels: n, residual, dt_s, processes: Vec::new(), angular_error: None, unknown: Vec::new() };
         let noise = &mission.noise;
         let single = |i: usize, weight: f64| {
             let mut m = DMatrix::zeros(n, n);
@@ -231,6 +235,12 @@ impl NoiseModel {
             sigma += &e.lever * m * e.lever.transpose();
         }
         sigma
+    }
+
+    /// Per channel, whether it is the residual of a known motion; one that is measured directly holds the motion itself.
+    #[must_use]
+    pub fn residual(&self) -> &[bool] {
+        &self.residual
     }
 
     /// A label per channel, the same for channels that a chain of common noises connects.

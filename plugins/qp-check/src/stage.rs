@@ -207,9 +207,9 @@ impl Linked {
         let (mut segmenter, mut collected) = (self.segmenter.clone(), self.collected.clone());
         segmenter.end_run(&mut self.analyser, &mut collected);
         let sums = collected.all(self.analyser.plan());
-        if self.collected.sums.total.segments == 0 {
-            self.collected.sums = collected.sums.clone();
-        }
+        // The open end is stored only where there is nothing else: a later run stores the segment that it becomes.
+        let own = if self.collected.sums.total.segments == 0 { &collected.sums } else { &self.collected.sums };
+        let stored = Stored::new(&self.layout, self.analyser.plan(), &own.total);
         report.counts.insert("epochs_in_segments".to_owned(), segmenter.state.covered);
         if sums.total.segments == 0 {
             self.no_solution(&mut report);
@@ -223,6 +223,7 @@ impl Linked {
         };
         let solution = estimate(&observed, &self.model, &unknowns, &self.bounds, self.refinements)?;
         self.describe(&solution, earlier, &mut report);
+        self.attach(&solution, &stored, &mut report);
         Ok(report)
     }
 
@@ -409,11 +410,14 @@ impl Linked {
             ("epochs".to_owned(), state.rows),
             ("epochs_without_every_value".to_owned(), state.rows - state.valid),
         ]);
+    }
+
+    /// The normal equations, and the sums that they are made of: what this run adds, and not what an earlier one has stored already.
+    fn attach(&self, solution: &Solution, stored: &Stored, report: &mut Report) {
         let mut equations = json!(solution.normal);
         equations["channels"] = json!(self.layout.channels);
         equations["theta"] = json!(solution.theta.as_slice());
-        // What this run adds, and not what an earlier one has stored already: so days add up.
-        equations["sums"] = json!(Stored::new(&self.layout, self.analyser.plan(), &self.collected.sums.total));
+        equations["sums"] = json!(stored);
         report.attachments.push(Attachment { suffix: "neq.json".into(), text: equations.to_string() });
     }
 }
