@@ -1,6 +1,7 @@
 //! What the whole-program tests share: the built program, its plugins, the repository's fixtures.
 
 pub mod foreign;
+pub mod recording;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

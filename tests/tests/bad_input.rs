@@ -1,8 +1,8 @@
 //! Bad input: a clear error or a warning, counted in the product, nothing lost, never a panic.
 
+use dragfree_tests::recording::{Message, Recording};
 use dragfree_tests::{dragfree, fixture, json, simulate};
 use serde_json::Value;
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::Output;
 use std::sync::OnceLock;
@@ -21,47 +21,14 @@ fn telemetry() -> &'static Path {
     file
 }
 
-/// A message of a file, free to be changed.
-#[derive(Clone)]
-struct Message {
-    topic: String,
-    log_time: u64,
-    data: Vec<u8>,
+fn recording() -> &'static Recording {
+    static RECORDING: OnceLock<Recording> = OnceLock::new();
+    RECORDING.get_or_init(|| Recording::read(telemetry()))
 }
 
-/// Copies a telemetry file through `change`, by the `mcap` crate alone.
+/// Copies the telemetry through `change`.
 fn rewrite(to: &Path, change: impl FnOnce(Vec<Message>) -> Vec<Message>) {
-    let bytes = std::fs::read(telemetry()).expect("readable");
-    let mut channels = BTreeMap::new();
-    let mut messages = Vec::new();
-    for message in mcap::MessageStream::new(&bytes).expect("an MCAP file") {
-        let message = message.expect("a sound message");
-        messages.push(Message {
-            topic: message.channel.topic.clone(),
-            log_time: message.log_time,
-            data: message.data.to_vec(),
-        });
-        channels.entry(message.channel.topic.clone()).or_insert_with(|| message.channel.clone());
-    }
-    let file = std::io::BufWriter::new(std::fs::File::create(to).expect("writable"));
-    let mut writer = mcap::WriteOptions::new().profile("").chunk_size(Some(1 << 20)).create(file).expect("a writer");
-    let metadata =
-        [("time_scale", "UTC"), ("mission", "Taiji"), ("spacecraft", "SC1"), ("producer", "tests"), ("version", "1")];
-    let metadata = metadata.map(|(k, v)| (k.to_owned(), v.to_owned())).into();
-    writer.write_metadata(&mcap::records::Metadata { name: "dragfree".to_owned(), metadata }).expect("written");
-    let mut ids = BTreeMap::new();
-    for (sequence, message) in change(messages).into_iter().enumerate() {
-        let channel = &channels[&message.topic];
-        let id = *ids.entry(message.topic.clone()).or_insert_with(|| {
-            let schema = channel.schema.as_ref().expect("a schema");
-            let schema = writer.add_schema(&schema.name, &schema.encoding, &schema.data).expect("a schema");
-            writer.add_channel(schema, &message.topic, &channel.message_encoding, &channel.metadata).expect("a channel")
-        });
-        let (log_time, sequence) = (message.log_time, u32::try_from(sequence).expect("few messages"));
-        let header = mcap::records::MessageHeader { channel_id: id, sequence, log_time, publish_time: log_time };
-        writer.write_to_known_channel(&header, &message.data).expect("written");
-    }
-    writer.finish().expect("a whole file");
+    recording().write_all(to, change(recording().messages().to_vec()));
 }
 
 struct Run {
@@ -170,7 +137,7 @@ fn flipped_bits_cost_one_chunk() {
 #[test]
 fn a_missing_topic_is_named() {
     for topic in ["is", "dws"] {
-        let run = run_changed(|m| m.into_iter().filter(|m| m.topic != format!("/{topic}")).collect());
+        let run = run_changed(|m| m.into_iter().filter(|m| *m.topic != *format!("/{topic}")).collect());
         assert_eq!(run.code(), Some(1), "{topic}");
         assert!(run.stderr().contains(topic), "{}", run.stderr());
         assert_eq!(run.archived(), 0);
@@ -194,7 +161,7 @@ fn poison(message: &mut Message) {
 #[test]
 fn nan_is_rejected_epoch_by_epoch_and_counted() {
     let run = run_changed(|mut messages| {
-        messages.iter_mut().filter(|m| m.topic == "/is").skip(5_000).step_by(1_000).take(20).for_each(poison);
+        messages.iter_mut().filter(|m| &*m.topic == "/is").skip(5_000).step_by(1_000).take(20).for_each(poison);
         messages
     });
     assert!(matches!(run.code(), Some(0 | 3)), "{}", run.stderr());
