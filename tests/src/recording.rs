@@ -33,7 +33,8 @@ impl Recording {
         let mut recording = Self { channels: BTreeMap::new(), messages: Vec::new() };
         for message in mcap::MessageStream::new(&bytes).expect("an MCAP file") {
             let message = message.expect("a sound message");
-            let known = recording.channels.get_key_value(message.channel.topic.as_str()).map(|(topic, _)| topic.clone());
+            let known =
+                recording.channels.get_key_value(message.channel.topic.as_str()).map(|(topic, _)| topic.clone());
             let topic = known.unwrap_or_else(|| {
                 let topic: Arc<str> = message.channel.topic.as_str().into();
                 recording.channels.insert(topic.clone(), message.channel.clone());

@@ -164,10 +164,10 @@ pub(crate) struct Run {
     /// End of the last epoch
     #[arg(long, value_name = "UTC", value_parser = utc::parse)]
     pub(crate) until: Option<i64>,
-    /// Resume from the state that an earlier run saved
+    /// Resume from the state that an earlier run saved; refused when mission, model or plugins have changed since
     #[arg(long, value_name = "FILE")]
     pub(crate) load_state: Option<PathBuf>,
-    /// Save the state at the end, so that the next day can resume
+    /// Save the state once the product is archived, so that the next day can resume; may be the file resumed from
     #[arg(long, value_name = "FILE")]
     pub(crate) save_state: Option<PathBuf>,
     /// Epochs that plugins are handed at a time; results do not depend on it

@@ -227,15 +227,18 @@ pub fn run(
     let mut series = Series::create(&chain, &mut writer, &setup, options)?;
     let covered = carry_all(feed.get(), &mut chain, &mut series, progress)?;
     let Some(covered) = covered else { return Err(EngineError::NoRows { files: options.files.clone() }) };
-    if let Some(path) = &options.state_out {
-        write_state(path, &chain.save()?)?;
-    }
+    // Before the ends are flushed, so that tomorrow goes on in the middle of the lags.
+    let state = options.state_out.as_ref().map(|path| Ok::<_, EngineError>((path, chain.save()?))).transpose()?;
     chain.finish(&mut series)?;
     let reports = chain.reports()?;
     series.finish()?;
     let summary = feed.get().summary()?;
     let draft = draft(&setup, options, &chain, &feed, summary, reports, &covered)?;
     let written = writer.commit(&draft)?;
+    // After the product: a kill in between costs a second run of the day, never the day.
+    if let Some((path, bytes)) = state {
+        write_state(path, &bytes)?;
+    }
     Ok(Outcome { product: written.product, path: written.path })
 }
 

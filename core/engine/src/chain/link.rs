@@ -2,9 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
+use sha2::{Digest, Sha256};
 
 use super::{Carry, Chain, ChainError, ChainNode, Queue, Reader, Route};
-use crate::border::{Config, Instance, Kind, LinkRequest, Linked};
+use crate::border::{Config, Instance, Kind, LinkRequest, Linked, hex};
 use crate::config::{EffectEntry, Mission, Model, Node, Pipeline, resolve_parameters};
 use crate::registry::{Found, Registry};
 use crate::table::{Column, TableSpec};
@@ -99,6 +100,8 @@ pub fn build(
             feed_routes: vec![Route::default(); feed_tables.len()],
             carry: Carry { batch_rows: carry.batch_rows.max(1), ..carry },
             complete_until_ns: i64::MIN,
+            mission_sha256: hex(&Sha256::digest(mission.value.to_string())),
+            model_sha256: String::new(),
         },
     };
     for node in &pipeline.nodes {
@@ -113,6 +116,7 @@ pub fn build(
             pipeline.path.display()
         )));
     }
+    builder.chain.model_sha256 = hex(&Sha256::digest(builder.model_json()));
     Ok(builder.chain)
 }
 
@@ -204,6 +208,14 @@ impl Builder<'_> {
                 c.prior_sigma = prior.sigma.or(c.prior_sigma);
                 c.lower = prior.lower.or(c.lower);
                 c.upper = prior.upper.or(c.upper);
+                if let (Some(lower), Some(upper)) = (c.lower, c.upper)
+                    && lower >= upper
+                {
+                    return Err(self.model_error(format!(
+                        "effect {}:{}: prior.{short}: the range from {lower} to {upper} {} is empty",
+                        entry.id, entry.instance, c.unit
+                    )));
+                }
             }
             self.chain.coefficients.push(c);
         }

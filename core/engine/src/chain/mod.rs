@@ -153,6 +153,9 @@ pub struct Chain {
     feed_routes: Vec<Route>,
     carry: Carry,
     complete_until_ns: i64,
+    /// Digests of what a state must have been saved with.
+    mission_sha256: String,
+    model_sha256: String,
 }
 
 impl Chain {

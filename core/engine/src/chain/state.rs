@@ -5,11 +5,14 @@ use sha2::{Digest, Sha256};
 
 use super::{Chain, ChainError, Queue};
 
-const MAGIC: &[u8; 8] = b"DFSTATE1";
+const MAGIC: &[u8; 8] = b"DFSTATE2";
 
 #[derive(Serialize, Deserialize)]
 struct Header {
     complete_until_ns: i64,
+    mission_sha256: String,
+    /// Coefficients and constraints, as the plugins were told.
+    model_sha256: String,
     nodes: Vec<NodeHeader>,
 }
 
@@ -17,6 +20,7 @@ struct Header {
 struct NodeHeader {
     name: String,
     version: String,
+    sha256: String,
     parameters: serde_json::Map<String, serde_json::Value>,
     reads: Vec<String>,
 }
@@ -29,11 +33,17 @@ impl Chain {
             .map(|n| NodeHeader {
                 name: n.name().to_owned(),
                 version: n.info.manifest.version.clone(),
+                sha256: n.sha256.clone(),
                 parameters: n.parameters.clone(),
                 reads: n.reads.clone(),
             })
             .collect();
-        Header { complete_until_ns: self.complete_until_ns, nodes }
+        Header {
+            complete_until_ns: self.complete_until_ns,
+            mission_sha256: self.mission_sha256.clone(),
+            model_sha256: self.model_sha256.clone(),
+            nodes,
+        }
     }
 
     /// The whole state: a chain that loads it goes on as this one would.
@@ -60,22 +70,8 @@ impl Chain {
     /// # Errors
     /// [`ChainError::State`] says in what the state differs from this chain.
     pub fn load(&mut self, bytes: &[u8]) -> Result<(), ChainError> {
-        let refuse = |what: &str| ChainError::State { what: what.to_owned() };
         let (header, mut rest) = open(bytes)?;
-        let mine = self.header();
-        if let Some((theirs, mine)) = header.nodes.iter().zip(&mine.nodes).find(|(a, b)| a != b) {
-            return Err(refuse(&format!(
-                "it was saved by plugin {} {}, this chain has {} {} there, with other parameters or columns; replay from the start, or use the pipeline, mission and model of that run",
-                theirs.name, theirs.version, mine.name, mine.version
-            )));
-        }
-        if header.nodes.len() != mine.nodes.len() {
-            return Err(refuse(&format!(
-                "it was saved by a chain of {} plugins, this one has {}",
-                header.nodes.len(),
-                mine.nodes.len()
-            )));
-        }
+        self.same_chain(&header)?;
         for node in &mut self.nodes {
             node.instance.load(take(&mut rest)?)?;
             for queue in &mut node.inputs {
@@ -84,6 +80,31 @@ impl Chain {
         }
         self.complete_until_ns = header.complete_until_ns;
         Ok(())
+    }
+
+    /// Whether a state was saved by a chain like this one; the sentence says in what it was not.
+    fn same_chain(&self, theirs: &Header) -> Result<(), ChainError> {
+        const WHAT_NEXT: &str = "replay from the start, or use the pipeline, mission, model and plugins of that run";
+        let mine = self.header();
+        let differs = if theirs.nodes.len() != mine.nodes.len() {
+            format!("it was saved by a chain of {} plugins, this one has {}", theirs.nodes.len(), mine.nodes.len())
+        } else if let Some((theirs, mine)) = theirs.nodes.iter().zip(&mine.nodes).find(|(a, b)| a != b) {
+            let (name, version) = (&theirs.name, &theirs.version);
+            if (name, version) != (&mine.name, &mine.version) {
+                format!("it was saved by plugin {name} {version}, this chain has {} {} there", mine.name, mine.version)
+            } else if theirs.parameters != mine.parameters || theirs.reads != mine.reads {
+                format!("it was saved by plugin {name} {version} with other parameters or columns than here")
+            } else {
+                format!("it was saved by another build of plugin {name} {version} than the one found here")
+            }
+        } else if theirs.mission_sha256 != mine.mission_sha256 {
+            "it was saved by a run with another mission file".to_owned()
+        } else if theirs.model_sha256 != mine.model_sha256 {
+            "it was saved by a run with another model".to_owned()
+        } else {
+            return Ok(());
+        };
+        Err(ChainError::State { what: format!("{differs}; {WHAT_NEXT}") })
     }
 }
 

@@ -70,6 +70,8 @@ pub(super) struct Reader {
     /// Rows read and not yet delivered, by table.
     blocks: Vec<Vec<Block>>,
     window_ns: Range<i64>,
+    /// After the last row that the pieces state: what comes later is another run's, and no promise can be made for it.
+    end_ns: i64,
     /// Every row before this time has been delivered.
     done_ns: i64,
     inflater: Inflater,
@@ -87,12 +89,16 @@ impl Reader {
         let inflater = Inflater::new().map_err(|source| ReplayError::Io { path: PathBuf::from("zstd"), source })?;
         let mut queue = BTreeMap::new();
         let mut sources = Vec::with_capacity(files.len());
+        let mut end_ns = i64::MIN;
         for (at, file) in files.into_iter().enumerate() {
             for piece in file.pieces {
                 let (start, end) = (clamp_ns(piece.start), clamp_ns(piece.end));
                 // Pieces with times out of range are read for the count of them.
                 let sane = is_sane(piece.start) && is_sane(piece.end);
                 if !sane || end >= window_ns.start && start < window_ns.end {
+                    if sane {
+                        end_ns = end_ns.max(end + 1);
+                    }
                     queue.insert((start, at, piece.offset), Pending { piece, from_ns: i64::MIN });
                 }
             }
@@ -100,7 +106,18 @@ impl Reader {
         }
         let blocks = tables.iter().map(|_| vec![]).collect();
         let done_ns = i64::MIN;
-        Ok(Self { files: sources, tables, queue, blocks, window_ns, done_ns, inflater, entries: vec![], losses })
+        Ok(Self {
+            files: sources,
+            tables,
+            queue,
+            blocks,
+            window_ns,
+            end_ns,
+            done_ns,
+            inflater,
+            entries: vec![],
+            losses,
+        })
     }
 
     pub(super) fn losses(&self) -> &Losses {
@@ -122,8 +139,10 @@ impl Reader {
                 .map(|(blocks, table)| drain(blocks, until_ns, table.columns.len(), &table.name, &mut self.losses))
                 .collect();
             self.done_ns = until_ns;
-            if batches.iter().any(|b| b.rows() > 0) {
-                return Ok(Some(Chunk { batches, complete_until_ns: until_ns.min(self.window_ns.end) }));
+            if let Some(last) = batches.iter().filter_map(|b| b.time_ns.last()).max() {
+                self.end_ns = self.end_ns.max(last + 1);
+                let complete_until_ns = until_ns.min(self.window_ns.end).min(self.end_ns);
+                return Ok(Some(Chunk { batches, complete_until_ns }));
             }
         }
     }
