@@ -254,7 +254,8 @@ fn report_of(gridder: &Gridder, config: &Config) -> Report {
     Report {
         epochs_used: Some(summary.used),
         epochs_rejected: Some(summary.rejected),
-        data_loss,
+        // A run without one usable epoch has lost all that it was given.
+        data_loss: data_loss || summary.used == 0,
         counts,
         notes: notes(gridder, &learnt, config),
         quality,
@@ -270,14 +271,28 @@ fn describe(learnt: &Learnt) -> serde_json::Value {
     })
 }
 
+/// Why values are left out, in words.
+const REFUSED: [(Reason, &str); 6] = [
+    (Reason::Status, "under a status flag"),
+    (Reason::NotANumber, "NaN"),
+    (Reason::Infinite, "infinite"),
+    (Reason::Limit, "beyond [limits] of the mission file"),
+    (Reason::Stuck, "repeated exactly"),
+    (Reason::Outlier, "outliers"),
+];
+
 /// What an operator should know, in sentences.
 fn notes(gridder: &Gridder, learnt: &[Learnt], config: &Config) -> Vec<String> {
     let summary = &gridder.summary;
     let period_s = 1.0 / config.rate_hz;
+    let epochs = summary.used + summary.rejected;
     let mut notes = Vec::new();
     let Some(reference) = gridder.reference_name() else {
         return vec!["no row of any mandatory topic came, so there is no epoch".to_owned()];
     };
+    if summary.used == 0 {
+        notes.push(format!("not one of {epochs} epochs has all mandatory channels, so there is nothing to calibrate"));
+    }
     if summary.longest.rows > 0 {
         notes.push(format!(
             "longest stretch of epochs without all mandatory channels: {:.1} s from {}",
@@ -306,6 +321,13 @@ fn notes(gridder: &Gridder, learnt: &[Learnt], config: &Config) -> Vec<String> {
         let table = &l.name;
         if series.tally.rows_in == 0 {
             notes.push(format!("{table}: not one row came"));
+        } else if let Some(missing) = l.missing.filter(|m| *m > 0) {
+            notes.push(format!("{table}: no sample at {missing} of {epochs} epochs"));
+        }
+        let refused = REFUSED.iter().map(|(reason, what)| (series.tally.get(*reason), what)).filter(|(n, _)| *n > 0);
+        let refused: Vec<String> = refused.map(|(n, what)| format!("{n} {what}")).collect();
+        if !refused.is_empty() {
+            notes.push(format!("{table}: values left out: {}", refused.join(", ")));
         }
         if let (true, Some(interval)) = (series.spec.mandatory, l.interval_s)
             && (interval / period_s - 1.0).abs() > 1e-3
@@ -321,7 +343,8 @@ fn notes(gridder: &Gridder, learnt: &[Learnt], config: &Config) -> Vec<String> {
             notes.push(format!("{table} is sampled {:+.1} ms from the epochs of {reference}", phase * 1e3));
         }
         if !l.absent.is_empty() {
-            notes.push(format!("{table}: {} never left zero and are taken as not measured", l.absent.join(", ")));
+            let columns = l.absent.join(", ");
+            notes.push(format!("{table}: {columns} have no value but zero and are taken as not measured"));
         }
     }
     notes
