@@ -164,6 +164,9 @@ impl Message {
     }
 
     /// Sets a small number, such as a status, whether it was sent or not: of two, the later counts, and messages merge.
+    ///
+    /// # Panics
+    /// A field number above 15.
     pub fn set_number(&mut self, path: &[u64], value: u8) {
         let Some((last, outer)) = path.split_last() else { return };
         let small = |number: u64, kind: u64| u8::try_from(number << 3 | kind).expect("a small field number");

@@ -47,6 +47,10 @@ impl Run {
         self.product["quality"]["counts"][stage][what].as_u64().unwrap_or(0)
     }
 
+    fn used(&self) -> u64 {
+        self.product["epochs_used"].as_u64().expect("a count")
+    }
+
     fn rejected(&self) -> u64 {
         self.product["epochs_rejected"].as_u64().expect("a count")
     }
@@ -123,162 +127,280 @@ fn reference() -> &'static Run {
     })
 }
 
-fn print(what: &str, run: &Run) {
-    println!(
-        "==== {what}: exit {:?} verdict {} used {} rejected {} commands {}\n{}",
-        run.code,
-        run.product["verdict"],
-        run.product["epochs_used"],
-        run.product["epochs_rejected"],
-        run.product["commands"],
-        run.stderr
-    );
-    println!("counts {}", run.product["quality"]["counts"]);
-    println!("weak {}", run.product["weak_directions"]);
-    if let Some(n) = run.product["quality"]["notes"].as_array() {
-        for n in n {
-            println!("   NOTE {n}");
-        }
+/// Runs without an intact third of the day are right and wider, never narrower.
+fn assert_wider(run: &Run, factor: std::ops::RangeInclusive<f64>) {
+    for name in ["com-offset.tm1.y", "com-offset.tm1.z", "com-offset.tm2.y", "com-offset.tm2.z"] {
+        let ratio = coefficient(&run.product, name, "qp").1 / coefficient(&reference().product, name, "qp").1;
+        assert!(factor.contains(&ratio), "{name}: σ grew by {ratio}, not within {factor:?}");
     }
-    if run.product.is_null() {
-        return;
+}
+
+#[test]
+fn sound_telemetry_is_the_measure() {
+    assert_eq!(reference().code, Some(0), "{}", reference().stderr);
+    assert_eq!((reference().used(), reference().rejected()), (EPOCHS, 0));
+    assert_right(reference());
+}
+
+#[test]
+fn gaps_of_seconds_minutes_and_hours_are_left_out() {
+    const GAPS_S: [(u64, u64); 5] = [(1_000, 1_003), (2_000, 2_001), (4_000, 4_060), (5_000, 5_300), (9_000, 16_200)];
+    let run = run_changed(|m| (!GAPS_S.iter().any(|(from, until)| within(&m, *from, *until))).then_some(m));
+    assert_eq!(run.code, Some(0), "{}", run.stderr);
+    let lost: u64 = GAPS_S.iter().map(|(from, until)| (until - from) * 10).sum();
+    assert_eq!((run.used(), run.rejected()), (EPOCHS - lost, lost));
+    assert!(run.notes().contains("7200.0 s from 2035-01-01T02:30:00"), "{}", run.notes());
+    assert_right(&run);
+    // 65 % of the epochs are left: σ grows by 1.24, and by more for what the edges of stretches cost.
+    assert_wider(&run, 1.15..=2.2);
+}
+
+/// Without one instrument for two of six hours the epochs of those hours are lost to whoever needs it; σ grows by √(6/4).
+#[test]
+fn an_instrument_that_is_silent_for_hours_costs_those_hours() {
+    for topic in ["/ifo", "/is"] {
+        let run = run_changed(|m| (!(is(&m, topic) && within(&m, 7_200, 14_400))).then_some(m));
+        assert_eq!(run.code, Some(0), "{topic}: {}", run.stderr);
+        let table = &topic[1..];
+        assert_eq!(run.count("preprocess", &format!("{table}.missing_epochs")), 72_000);
+        let said = format!("{table}: no sample at 72000 of 216000 epochs");
+        assert!(run.notes().contains(&said), "{}", run.notes());
+        assert_eq!(run.rejected(), if topic == "/is" { 72_000 } else { 0 }, "x has two instruments, y and z have one");
+        assert_right(&run);
+        assert_wider(&run, 1.15..=1.5);
     }
-    for (name, truth) in TRUTH_M {
-        for s in ["es-akf", "qp"] {
-            let all = run.product["coefficients"].as_array().unwrap();
-            let Some(c) = all.iter().find(|c| c["name"] == name && c["solution"] == s) else {
-                println!("  no {name} {s}");
-                continue;
-            };
-            let (v, g) = (c["value"].as_f64().unwrap_or(f64::NAN), c["sigma"].as_f64().unwrap_or(f64::NAN));
-            println!(
-                "  {name} {s:7} err {:9.4} mm σ {:8.4} mm pull {:6.2}",
-                (v - truth) * 1e3,
-                g * 1e3,
-                (v - truth) / g
-            );
+}
+
+/// Commands that were not sent down are rebuilt by the control law, to 1e-9: the offsets are those of the whole telemetry.
+#[test]
+fn commands_missing_for_hours_are_rebuilt_and_said_to_be() {
+    let run = run_changed(|m| (!(is(&m, "/command") && within(&m, 7_200, 14_400))).then_some(m));
+    assert_eq!(run.code, Some(0), "{}", run.stderr);
+    assert_eq!(run.count("hinf-dfacs", "commands_replayed"), 72_000);
+    assert_eq!(run.count("hinf-dfacs", "commands_telemetered"), EPOCHS - 72_000);
+    assert_eq!(run.product["commands"], "telemetered");
+    assert!(run.notes().contains("commands of 72000 of 216000 epochs were not telemetered"), "{}", run.notes());
+    assert!(run.notes().contains("command: no sample at 72000 of 216000 epochs"), "{}", run.notes());
+    assert_near(&run, 1e-3);
+}
+
+/// Before the replayed law has settled there is nothing to rebuild commands from: those epochs are not used.
+#[test]
+fn commands_missing_from_the_start_are_not_invented() {
+    let run = run_changed(|m| (!(is(&m, "/command") && within(&m, 0, 3_600))).then_some(m));
+    assert_eq!(run.code, Some(0), "{}", run.stderr);
+    assert_eq!(run.count("hinf-dfacs", "commands_missing"), 36_000);
+    assert_eq!(run.count("hinf-dfacs", "commands_replayed"), 0);
+    assert_right(&run);
+    // Five of six hours are left: √(6/5).
+    assert_wider(&run, 1.0..=1.3);
+}
+
+/// The coefficients are those of the sound telemetry to a part of σ.
+fn assert_near(run: &Run, part_of_sigma: f64) {
+    for (name, _) in TRUTH_M {
+        for solution in ["es-akf", "qp"] {
+            let (value, sigma) = coefficient(&run.product, name, solution);
+            let (sound, _) = coefficient(&reference().product, name, solution);
+            let moved = (value - sound).abs() / sigma;
+            assert!(moved <= part_of_sigma, "{name} by {solution} moved by {moved:.1e}σ\n{}", run.notes());
         }
     }
 }
 
 #[test]
-fn explore() {
-    print("reference", reference());
-    print(
-        "gaps",
-        &run_changed(|m| {
-            let t = (m.log_time - sound().2.start_ns()) / SECOND_NS;
-            let gap = [(1000, 1003), (2000, 2003), (3000, 3002), (4000, 4060), (5000, 5300), (9000, 16200)]
-                .iter()
-                .any(|(a, b)| (*a..*b).contains(&t));
-            (!gap).then_some(m)
-        }),
-    );
-    for topic in ["/dws", "/ifo", "/is", "/command", "/ephemeris"] {
-        print(
-            &format!("no {topic} for two hours"),
-            &run_changed(|m| (!(is(&m, topic) && within(&m, 7_200, 14_400))).then_some(m)),
-        );
-    }
-    print(
-        "no command in the first hour",
-        &run_changed(|m| (!(is(&m, "/command") && within(&m, 0, 3_600))).then_some(m)),
-    );
-    print("tm2 gone, model of both", &run_changed(without_tm2));
-    let dir = tempfile::tempdir().expect("a temporary folder");
-    let file = dir.path().join("changed.mcap");
-    sound().2.write(&file, without_tm2);
-    let model = dir.path().join("model.toml");
-    std::fs::write(
-        &model,
-        "[model]\nrevision = \"1\"\n[[effect]]\nid = \"com-offset\"\ninstance = \"tm1\"\nestimate = true\n",
-    )
-    .unwrap();
-    print("tm2 gone, model of tm1", &run(dir.path(), &[file.clone()], None, Some(&model)));
-    print("all there, model of tm1", &run(dir.path(), &[sound().1.clone()], None, Some(&model)));
-    print(
-        "status",
-        &run_changed(|mut m| {
-            if is(&m, "/is") && within(&m, 3000, 3600) {
-                m.set_number(&[1, 3], 1);
+fn status_flags_take_values_out_and_are_counted() {
+    let run = run_changed(|mut m| {
+        if is(&m, "/is") && within(&m, 3_000, 3_600) {
+            m.set_number(&[1, 3], 1);
+        }
+        if is(&m, "/ifo") && within(&m, 6_000, 6_300) {
+            m.set_number(&[2, 2], 2);
+        }
+        Some(m)
+    });
+    assert_eq!(run.code, Some(0), "{}", run.stderr);
+    // Three displacements and three angles of one test mass; one displacement.
+    assert_eq!(run.count("preprocess", "is.status_values"), 6 * 6_000);
+    assert_eq!(run.count("preprocess", "ifo.status_values"), 3_000);
+    assert_eq!((run.used(), run.rejected()), (EPOCHS - 6_000, 6_000));
+    assert!(run.notes().contains("is: values left out: 36000 under a status flag"), "{}", run.notes());
+    assert_right(&run);
+}
+
+/// A readout at its limit says the same number again and again, or one that no test mass can have.
+#[test]
+fn saturated_readouts_are_left_out_and_counted() {
+    let run = run_changed(|mut m| {
+        if is(&m, "/is") && within(&m, 3_000, 3_600) {
+            m.set_double(&[1, 1, 2], 5e-6);
+        }
+        if is(&m, "/ifo") && within(&m, 12_000, 12_030) {
+            m.set_double(&[2, 1], 1.0);
+        }
+        Some(m)
+    });
+    assert_eq!(run.code, Some(0), "{}", run.stderr);
+    assert_eq!(run.count("preprocess", "is.stuck_values"), 6_000);
+    assert_eq!(run.count("preprocess", "ifo.limit_values"), 300);
+    assert_eq!(run.rejected(), 6_000, "x has a second instrument, y has none");
+    assert!(run.notes().contains("6000 repeated exactly"), "{}", run.notes());
+    assert!(run.notes().contains("300 beyond [limits] of the mission file"), "{}", run.notes());
+    assert_right(&run);
+}
+
+/// Outliers of 20 standard deviations of a sample in one of a thousand samples of one channel.
+fn outliers(topic: &str, path: &[u64], sample_sigma: f64, sigmas: f64) -> (Run, u64) {
+    let (mut k, mut put) = (0u64, 0);
+    let run = run_changed(|mut m| {
+        if is(&m, topic) {
+            k += 1;
+            // Knuth's multiplier scatters them.
+            if k.wrapping_mul(6_364_136_223_846_793_005) >> 33 < (1 << 31) / 1000 {
+                let value = m.double(path).expect("sent");
+                m.set_double(path, value + sigmas * sample_sigma * if k % 2 == 0 { 1.0 } else { -1.0 });
+                put += 1;
             }
-            if is(&m, "/ifo") && within(&m, 6000, 6300) {
-                m.set_number(&[2, 2], 2);
-            }
-            if is(&m, "/dws") && within(&m, 9000, 9600) {
-                m.set_number(&[4], 4);
-            }
-            Some(m)
-        }),
-    );
-    print(
-        "stuck at a limit",
-        &run_changed(|mut m| {
-            if is(&m, "/is") && within(&m, 3000, 3600) {
-                m.set_double(&[1, 1, 2], 5e-6);
-            }
-            if is(&m, "/dws") && within(&m, 9000, 9030) {
-                m.set_double(&[3, 1], 1e-6);
-            }
-            if is(&m, "/ifo") && within(&m, 12000, 12030) {
-                m.set_double(&[2, 1], 1.0);
-            }
-            Some(m)
-        }),
-    );
-    for (topic, path, size) in [
-        ("/is", &[1u64, 1, 2][..], 20.0 * 1.8e-9 * 5f64.sqrt()),
-        ("/is", &[2, 1, 3], 20.0 * 1.8e-9 * 5f64.sqrt()),
-        ("/ifo", &[1, 1], 20.0 * 1.42e-12 * 5f64.sqrt()),
-        ("/dws", &[3, 3], 20.0 * 5e-10 * 5f64.sqrt()),
+        }
+        Some(m)
+    });
+    (run, put)
+}
+
+/// White readout noise of one-sided ASD `a` at 10 Hz has the standard deviation `a √5` per sample. Whatever becomes of the outliers,
+/// removed or gated, the offsets stay where they are.
+#[test]
+fn outliers_in_one_of_a_thousand_samples_do_no_harm() {
+    for (topic, path, asd) in [
+        ("/is", &[1, 1, 2][..], 1.8e-9),
+        ("/is", &[2, 1, 3], 1.8e-9),
+        ("/ifo", &[1, 1], 1.42e-12),
+        ("/dws", &[3, 3], 5e-10),
     ] {
-        let mut k = 0u64;
-        print(
-            &format!("outliers {topic} {path:?}"),
-            &run_changed(|mut m| {
-                if is(&m, topic) {
-                    k += 1;
-                    if k.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407) >> 33 < (1 << 31) / 1000 {
-                        let v = m.double(path).unwrap();
-                        m.set_double(path, v + if k % 2 == 0 { size } else { -size });
-                    }
-                }
-                Some(m)
-            }),
-        );
-    }
-    for (topic, paths) in [
-        ("/is", vec![vec![1u64, 1, 2]]),
-        ("/dws", vec![vec![3, 1], vec![3, 2], vec![3, 3]]),
-        ("/ifo", vec![vec![1, 1]]),
-    ] {
-        print(
-            &format!("constant {topic}"),
-            &run_changed(|mut m| {
-                if is(&m, topic) {
-                    for p in &paths {
-                        m.set_double(p, 1e-9);
-                    }
-                }
-                Some(m)
-            }),
-        );
-    }
-    for (from, to) in [
-        ("offset_nominal_srf_m = [0.0, 0.18, 0.0] ", "offset_nominal_srf_m = [0.0, 0.195, 0.0] "),
-        ("offset_nominal_srf_m = [0.0, 0.18, 0.0] ", "offset_nominal_srf_m = [0.0, 0.205, 0.0] "),
-    ] {
-        let dir = tempfile::tempdir().expect("a temporary folder");
-        let mission = mission(dir.path(), from, to);
-        print(to, &run(dir.path(), &[sound().1.clone()], Some(&mission), None));
+        let (run, put) = outliers(topic, path, asd * 5f64.sqrt(), 20.0);
+        assert!((150..300).contains(&put), "{put}");
+        assert!(matches!(run.code, Some(0)), "{topic}: {} {}", run.stderr, run.notes());
+        assert_right(&run);
+        assert_wider(&run, 0.95..=1.1);
+        if topic != "/dws" {
+            let counted = run.count("es-akf", "rejected_readouts")
+                + run.count("preprocess", &format!("{}.outlier_values", &topic[1..]));
+            assert!(counted >= put * 9 / 10, "{counted} of {put} were counted");
+        }
     }
 }
 
-fn without_tm2(mut m: Message) -> Option<Message> {
-    match &*m.topic {
-        "/is" | "/ifo" | "/dws" => m.remove(2),
-        "/command" => m.remove(4),
-        _ => {}
+#[test]
+fn constant_data_are_not_data() {
+    for (topic, paths) in [("/dws", &[[3, 1], [3, 2], [3, 3]][..]), ("/is", &[[1, 1], [2, 1]])] {
+        let run = run_changed(|mut m| {
+            if is(&m, topic) {
+                for path in paths {
+                    let deeper: Vec<Vec<u64>> = if topic == "/is" {
+                        (1..=3).map(|axis| [&path[..], &[axis]].concat()).collect()
+                    } else {
+                        vec![path.to_vec()]
+                    };
+                    deeper.iter().for_each(|path| m.set_double(path, 1e-9));
+                }
+            }
+            Some(m)
+        });
+        assert_eq!(run.code, Some(3), "{topic}: {} {}", run.stderr, run.notes());
+        assert_eq!((run.used(), run.rejected()), (0, EPOCHS));
+        assert!(run.notes().contains("not one of 216000 epochs has all mandatory channels"), "{}", run.notes());
+        assert_eq!(run.product["verdict"], "weak");
+        let unseen = run.product["weak_directions"].to_string();
+        for (name, _) in TRUTH_M {
+            assert!(unseen.contains(name), "{unseen}");
+        }
     }
-    Some(m)
+}
+
+/// A drawing that is off by 15 mm within the box costs nothing.
+#[test]
+fn a_nominal_offset_far_away_within_its_box_does_no_harm() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let mission = mission(dir.path(), NOMINAL_TM1, "offset_nominal_srf_m = [0.0, 0.195, 0.0] ");
+    let run = run(dir.path(), std::slice::from_ref(&sound().1), Some(&mission), None);
+    assert_eq!((run.code, &run.product["verdict"]), (Some(0), &Value::from("agree")), "{} {}", run.stderr, run.notes());
+    assert_right(&run);
+    // It stands in the noise model alone, where a few per cent of Σ move the QP by parts of σ.
+    for (name, _) in TRUTH_M {
+        let (value, sigma) = coefficient(&run.product, name, "qp");
+        let (sound, _) = coefficient(&reference().product, name, "qp");
+        assert!((value - sound).abs() < 0.2 * sigma, "{name}: {value} against {sound} ± {sigma}");
+    }
+}
+
+const NOMINAL_TM1: &str = "offset_nominal_srf_m = [0.0, 0.18, 0.0] ";
+
+/// A box that does not hold the truth is contradicted by name.
+#[test]
+fn a_box_beside_the_truth_is_contradicted() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let mission = mission(dir.path(), NOMINAL_TM1, "offset_nominal_srf_m = [0.0, 0.205, 0.0] ");
+    let run = run(dir.path(), std::slice::from_ref(&sound().1), Some(&mission), None);
+    assert_eq!(
+        (run.code, &run.product["verdict"]),
+        (Some(4), &Value::from("disagree")),
+        "{} {}",
+        run.stderr,
+        run.notes()
+    );
+    assert!(run.notes().contains("com-box.tm1.y contradicts the data"), "{}", run.notes());
+}
+
+/// Nonsense is refused by key before a byte of telemetry is read.
+#[test]
+fn nonsense_in_mission_and_model_is_refused_by_key() {
+    let prior = |line: &str| format!("estimate = true\n[effect.prior.x]\n{line}");
+    let model = |line: &str| ("models/com-offset.toml", "--model", "estimate = true".to_owned(), prior(line));
+    let mission = |from: &str, to: &str| ("missions/taiji.toml", "--mission", from.to_owned(), to.to_owned());
+    let tolerance = "baseline_tolerance_m = 2e-5";
+    for ((file, option, from, to), said) in [
+        (model("sigma = -1e-3"), "prior.x"),
+        (model("sigma = 0.0"), "prior.x"),
+        (model("sigma = nan"), "prior.x"),
+        (model("value = inf"), "prior.x"),
+        (model("lower = 0.1\nupper = 0.1"), "prior.x: the range from 0.1 to 0.1 m is empty"),
+        (model("lower = 0.2"), "prior.x: the range from 0.2"),
+        (model("mean = 0.1"), "mean"),
+        (mission("offset_box_srf_m = [0.02, 0.02, 0.02]", "offset_box_srf_m = [0.02, 0.0, 0.02]"), "offset_box_srf_m"),
+        (
+            mission("offset_box_srf_m = [0.02, 0.02, 0.02]", "offset_box_srf_m = [0.02, -0.02, 0.02]"),
+            "offset_box_srf_m",
+        ),
+        (mission(tolerance, "baseline_tolerance_m = 0.0"), "baseline_tolerance_m"),
+        (mission(tolerance, "baseline_tolerance_m = -2e-5"), "baseline_tolerance_m"),
+        // Not positive definite: a principal moment below zero.
+        (
+            mission("[800.0, 13.0, 10.0], [13.0, 800.0, 12.0]", "[800.0, 900.0, 10.0], [900.0, 800.0, 12.0]"),
+            "inertia_srf_kg_m2",
+        ),
+    ] {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        let text = std::fs::read_to_string(fixture(file)).expect("readable");
+        assert!(text.contains(&from), "{from}");
+        std::fs::write(dir.path().join("changed.toml"), text.replacen(&from, &to, 1)).expect("writable");
+        let mut command = dragfree(dir.path());
+        command.arg("run").arg(fixture("pipelines/science-mode.toml")).arg(&sound().1);
+        let output = command.args(["--archive", "archive", option, "changed.toml"]).output().expect("runs");
+        let stderr = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(1), "{to}: {stderr}");
+        assert!(stderr.contains(said) && !stderr.contains("panicked"), "{to} should say {said}: {stderr}");
+        assert!(!dir.path().join("archive").join("COM1B_2035-01-01_SC1_01_0001.toml").exists());
+    }
+}
+
+/// The twin of every test here: offsets 5 mm beside the truth are not within 3σ.
+#[test]
+fn offsets_beside_the_truth_are_seen() {
+    let far = TRUTH_M.iter().filter(|(name, _)| !name.ends_with('x'));
+    for (name, truth) in far {
+        for solution in ["es-akf", "qp"] {
+            let (value, sigma) = coefficient(&reference().product, name, solution);
+            assert!((value - truth - 5e-3).abs() > 3.0 * sigma, "{name} by {solution}: {value} ± {sigma}");
+        }
+    }
 }

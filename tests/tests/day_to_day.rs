@@ -65,8 +65,11 @@ fn assert_same(product: &Value, long: &Value) {
         assert_eq!((a.len(), b.len()), (36, 36), "{solution}");
         a.iter().zip(&b).for_each(|(a, b)| close(a, b, solution));
     }
-    for key in ["verdict", "epochs_used", "epochs_rejected", "chi2_per_dof", "nis"] {
+    for key in ["verdict", "epochs_used", "epochs_rejected"] {
         assert_eq!(product[key], long[key], "{key}");
+    }
+    for key in ["chi2_per_dof", "nis"] {
+        close(&product[key], &long[key], key);
     }
 }
 
