@@ -373,6 +373,10 @@ fn nonsense_in_mission_and_model_is_refused_by_key() {
         ),
         (mission(tolerance, "baseline_tolerance_m = 0.0"), "baseline_tolerance_m"),
         (mission(tolerance, "baseline_tolerance_m = -2e-5"), "baseline_tolerance_m"),
+        (mission("baseline_srf_m = [0.0, 0.36, 0.0]", "baseline_srf_m = [0.0, 0.36]"), "housing.baseline_srf_m"),
+        (mission("baseline_srf_m = [0.0, 0.36, 0.0]", "baseline_srf_m = [0.0, nan, 0.0]"), "housing.baseline_srf_m"),
+        (mission(tolerance, ""), "housing: missing field `baseline_tolerance_m`"),
+        (mission("baseline_tolerance_m", "baseline_tolerance_mm"), "housing.baseline_tolerance_mm: unknown field"),
         // Not positive definite: a principal moment below zero.
         (
             mission("[800.0, 13.0, 10.0], [13.0, 800.0, 12.0]", "[800.0, 900.0, 10.0], [900.0, 800.0, 12.0]"),

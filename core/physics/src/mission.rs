@@ -14,8 +14,15 @@ use crate::noise::{NoiseLine, NoiseShape, NoiseTerm};
 #[derive(Debug, thiserror::Error)]
 pub enum MissionError {
     /// The text is not a mission: unknown key, wrong type, missing key.
-    #[error("mission file: {0}; every key carries its unit, and fixtures/missions/taiji.toml shows them all")]
-    Shape(#[from] serde_json::Error),
+    #[error(
+        "mission file: {key}: {source}; every key carries its unit, and fixtures/missions/taiji.toml shows them all"
+    )]
+    Shape {
+        /// Dotted key at which reading stopped.
+        key: String,
+        /// What was found and expected.
+        source: serde_json::Error,
+    },
     /// A value has no physical sense.
     #[error("mission file: {key} = {value} {reason}")]
     Value {
@@ -527,6 +534,43 @@ fn inverse(inertia: Matrix3<f64>) -> Matrix3<f64> {
     inertia.cholesky().map_or_else(|| Matrix3::from_element(f64::NAN), |c| c.inverse())
 }
 
+/// The dotted key at which reading of a JSON text stopped: the error itself knows line and column alone.
+fn key_at(text: &str, error: &serde_json::Error) -> String {
+    let lines = text.split_inclusive('\n').take(error.line().saturating_sub(1));
+    let end = (lines.map(str::len).sum::<usize>() + error.column()).min(text.len());
+    let mut keys: Vec<&str> = Vec::new();
+    let mut last = "";
+    let mut from = None;
+    for (at, byte) in text.bytes().enumerate().take(end) {
+        match (byte, from) {
+            (b'"', None) => from = Some(at + 1),
+            (b'"', Some(start)) => {
+                last = &text[start..at];
+                from = None;
+            }
+            (b'{', None) => keys.push(""),
+            // Where an object ends without a key that it needs, the object is at fault.
+            (b'}', None) if at + 1 < end => drop(keys.pop()),
+            (b':', None) => {
+                if let Some(key) = keys.last_mut() {
+                    *key = last;
+                }
+            }
+            _ => {}
+        }
+    }
+    let (before, after) = text.as_bytes().split_at(end);
+    if after.trim_ascii_start().starts_with(b":") {
+        // The key itself is at fault.
+        keys.pop();
+        keys.push(last);
+    } else if error.is_data() && before.ends_with(b"}") {
+        keys.pop();
+    }
+    keys.retain(|key| !key.is_empty());
+    keys.join(".")
+}
+
 fn value_error(key: &str, value: &dyn std::fmt::Display, reason: &'static str) -> MissionError {
     MissionError::Value { key: key.to_owned(), value: value.to_string(), reason }
 }
@@ -570,7 +614,8 @@ impl Mission {
     /// # Errors
     /// [`MissionError`] names the key, its value and what it must be.
     pub fn from_json(text: &str) -> Result<Self, MissionError> {
-        let mission: Self = serde_json::from_str(text)?;
+        let shape = |source: serde_json::Error| MissionError::Shape { key: key_at(text, &source), source };
+        let mission: Self = serde_json::from_str(text).map_err(shape)?;
         mission.check()?;
         Ok(mission)
     }
