@@ -4,7 +4,7 @@
 #[path = "../tests/record/mod.rs"]
 mod record;
 
-use dragfree_chart::{Line, Panel, Stroke, svg};
+use dragfree_chart::{Line, Panel, Scale, Stroke, svg};
 use dragfree_physics::control_design::{ChannelDesign, design};
 use dragfree_physics::mission::CHANNELS;
 use dragfree_physics::spectrum::Spectrum;
@@ -38,6 +38,8 @@ fn panel(title: &str, unit: &str, lines: Vec<Line>) -> Panel {
         title: title.to_owned(),
         x_label: "frequency / Hz".to_owned(),
         y_label: format!("ASD / {unit}/√Hz"),
+        x_scale: Scale::Logarithmic,
+        y_scale: Scale::Logarithmic,
         x: 1e-4..1.0,
         y: None,
         lines,

@@ -382,7 +382,8 @@ fn twins(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
     let full = stats::chi2_per_dof(3.0 * f64::from(TWINS[0].seeds), alarm);
     let mut text = format!(
         "Something is wrong on purpose: what the mission file says of the noise, or the noise itself ({}). Each six hours long, seeds \
-         from 1, with a prior of 1 m, so that only the data speak. *Off*: no adaptation, no gate, no refinement of Σ, no widening of σ; \
+         from 1, with a prior of 1 m, so that only the data speak. *Off*: no adaptation, no gate, no refinement of Σ, no widening of σ \
+         (the weights of α̂ are measured in both); \
          there the statistics must fail, or they have no power. *Product*: as it is shipped. **Bold** is outside of bounds that honest \
          σ leave once in {:.0}: NEES/dof {:.2}–{:.2} for {} seeds. NIS is judged where nothing adapts.\n\n\
          | what is wrong | mode | seeds | NIS | NEES/dof ES-AKF | NEES/dof QP | within σ, ES-AKF | within σ, QP | largest error of the \
