@@ -747,13 +747,15 @@ impl Gridder {
         series.drop_front(at);
     }
 
-    /// Counts the epochs that can be used.
+    /// Counts the epochs that can be used: all that is mandatory for both is there, and one test mass is whole. The other may be
+    /// silent for a while, or for good.
     fn summarise(&mut self, times: &[i64], window: std::ops::Range<usize>) {
-        // A bit per alternative: 0 and 1 for x of the two test masses, 2 for all the rest.
+        // A bit for what every epoch needs, and two for each test mass: x by one way or the other, and all the rest of it.
         const REST: u64 = 1 << 8;
+        let (one, each) = (|tm: u8| 1u64 << tm, |tm: u8| 1u64 << (2 + tm));
         self.mask.clear();
-        self.mask.resize(times.len(), REST);
-        let mut wanted = REST;
+        self.mask.resize(times.len(), REST | each(0) | each(1));
+        let mut wanted = [0, 0];
         for (t, series) in self.tables.iter().enumerate() {
             let slow = Window::default();
             for (c, spec) in series.spec.columns.iter().enumerate() {
@@ -763,20 +765,27 @@ impl Gridder {
                 let cells = if let Class::Fast(fast) = &self.classes[t] { &fast.cells[c] } else { &slow };
                 let Some(cells) = cells.as_slice().get(window.clone()) else { continue };
                 for (mask, v) in self.mask.iter_mut().zip(cells) {
-                    let there = u64::from(!v.is_nan());
-                    *mask = match spec.mandatory {
-                        Mandatory::OneOf(group) => *mask | there << group,
-                        _ => *mask & !(REST * (1 - there)),
-                    };
+                    let there = !v.is_nan();
+                    match spec.mandatory {
+                        Mandatory::OneOf(tm) => *mask |= if there { one(tm) } else { 0 },
+                        Mandatory::EachOf(tm) => *mask &= if there { u64::MAX } else { !each(tm) },
+                        _ => *mask &= if there { u64::MAX } else { !REST },
+                    }
                 }
-                if let Mandatory::OneOf(group) = spec.mandatory {
-                    wanted |= 1 << group;
+                match spec.mandatory {
+                    Mandatory::OneOf(tm) => wanted[usize::from(tm)] |= one(tm),
+                    Mandatory::EachOf(tm) => wanted[usize::from(tm)] |= each(tm),
+                    _ => {}
                 }
             }
         }
+        let whole = |mask: u64| {
+            let mut masses = wanted.iter().filter(|w| **w != 0).peekable();
+            mask & REST != 0 && (masses.peek().is_none() || masses.any(|w| mask & w == *w))
+        };
         let summary = &mut self.summary;
         for (mask, time) in self.mask.iter().zip(times) {
-            if *mask == wanted {
+            if whole(*mask) {
                 summary.used += 1;
                 summary.current.rows = 0;
                 continue;

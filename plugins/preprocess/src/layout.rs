@@ -27,8 +27,10 @@ pub(crate) enum Mandatory {
     No,
     /// It does.
     Yes,
-    /// It needs one of the columns with this number: x of a test mass by interferometer or by capacitive readout.
+    /// Of this test mass it needs one such column: x by interferometer or by capacitive readout. An epoch needs one test mass.
     OneOf(u8),
+    /// Of this test mass it needs every such column.
+    EachOf(u8),
 }
 
 /// A status column and what it covers.
@@ -173,7 +175,7 @@ fn needed(table: &str, mandatory: bool, columns: &[&Column], test_masses: &[&str
     match (table, tm) {
         ("ifo", Some(tm)) if column.name.ends_with(".x_orf_m") => Mandatory::OneOf(tm as u8),
         ("is", Some(tm)) if mandatory && column.name.ends_with(".r_orf_m.x") => Mandatory::OneOf(tm as u8),
-        ("is", Some(_)) if mandatory && column.name.contains(".r_orf_m.") => Mandatory::Yes,
+        ("is", Some(tm)) if mandatory && column.name.contains(".r_orf_m.") => Mandatory::EachOf(tm as u8),
         ("dws", _) if mandatory && column.name.starts_with("sc_crf_rad.") => Mandatory::Yes,
         ("is" | "dws" | "ifo", _) => Mandatory::No,
         _ if mandatory => {

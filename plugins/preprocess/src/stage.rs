@@ -291,7 +291,9 @@ fn notes(gridder: &Gridder, learnt: &[Learnt], config: &Config) -> Vec<String> {
         return vec!["no row of any mandatory topic came, so there is no epoch".to_owned()];
     };
     if summary.used == 0 {
-        notes.push(format!("not one of {epochs} epochs has all mandatory channels, so there is nothing to calibrate"));
+        notes.push(format!(
+            "not one of {epochs} epochs has all mandatory channels of any test mass, so there is nothing to calibrate"
+        ));
     }
     if summary.longest.rows > 0 {
         notes.push(format!(
