@@ -64,7 +64,7 @@ impl Stage for Preprocess {
             Parameter::f64(
                 "outlier_sigma",
                 "1",
-                20.0,
+                10.0,
                 0.0..=1e9,
                 "a displacement or angle that leaves its line by more than this and comes back is refused, in standard \
                  deviations of its second difference; below 7.3 Gaussian noise raises false alarms; 0 = off",
