@@ -342,7 +342,9 @@ fn outliers_in_one_of_a_thousand_samples_do_no_harm() {
         assert_right(&run);
         assert_wider(&run, 0.95..=1.1);
         let counted = run.count("preprocess", &format!("{}.outlier_values", &topic[1..]));
-        assert!(counted >= put * 9 / 10 && counted <= put, "{topic}: {counted} of {put} were counted");
+        // The lines before and after must agree to five standard deviations of a sample, of which slopes from two samples take up to
+        // three by noise alone and the attitude's jitter some more: not every outlier is proved one.
+        assert!(counted >= put * 4 / 5 && counted <= put, "{topic}: {counted} of {put} were counted");
     }
 }
 
