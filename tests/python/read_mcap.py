@@ -38,12 +38,16 @@ def main(path):
         for schema, channel, message, decoded in reader.iter_decoded_messages(topics=protobuf):
             topic = topics.setdefault(
                 channel.topic,
-                {"schema": schema.name, "metadata": channel.metadata, "count": 0, "first_ns": message.log_time, "sums": {}},
+                {"schema": schema.name, "metadata": channel.metadata, "count": 0, "first_ns": message.log_time}
+                | {"sums": {}, "missing": {}},
             )
             topic["count"] += 1
             topic["last_ns"] = message.log_time
             for name, value in leaves(decoded):
-                topic["sums"][name] = topic["sums"].get(name, 0.0) + value
+                if value != value:  # NaN is no value
+                    topic["missing"][name] = topic["missing"].get(name, 0) + 1
+                else:
+                    topic["sums"][name] = topic["sums"].get(name, 0.0) + value
     json.dump({"metadata": metadata, "topics": topics}, sys.stdout)
 
 

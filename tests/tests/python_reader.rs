@@ -95,6 +95,10 @@ fn python_reads_what_we_write() {
     let filter = &series["topics"]["/es-akf"];
     assert!(filter["count"].as_u64().expect("a count") >= 29, "one row a minute: {filter}");
     assert!(filter["sums"].as_object().expect("columns").len() >= 12, "six offsets with their σ: {filter}");
+    let missing = filter["missing"].as_object().expect("columns");
+    // NIS is counted after the filter's warm-up of ten minutes.
+    let warming = |(name, n): (&String, &Value)| name.ends_with(".nis") && n.as_u64().is_some_and(|n| n <= 10);
+    assert!(missing.iter().all(warming), "{filter}");
 }
 
 /// The first double of `Interferometers`: tm1 { x_orf_m }, wire bytes `0a LEN 09 …`.
