@@ -8,7 +8,7 @@
 //! A channel's noise is taken as `a cos²(πf dt) + b (4 sin²(πf dt)/dt²)²`, an acceleration held over a sample and a white readout
 //! differenced twice; both levels follow the residuals' spectrum, at the first segment and whenever their number has doubled.
 //! With `y = z − 2 + z⁻¹` that is `b y²/dt⁴ + a (1 + y/4)` up to the sampling, so the filter is the inverse of a polynomial of
-//! second degree. What is slower than [`WASHOUT_HZ`], constant and drifting accelerations above all, is taken out of channels and
+//! second degree. What is slower than 3 mHz, constant and drifting accelerations above all, is taken out of channels and
 //! regressors by the same causal filter.
 //!
 //! Channels are taken one by one. That costs efficiency, not truth, and the covariance is that of the blocks' scatter.
