@@ -315,6 +315,7 @@ impl Source for Sim {
             ),
         ],
         instances: &[],
+        needs: &[],
     };
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {

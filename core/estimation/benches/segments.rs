@@ -33,7 +33,7 @@ fn bench(criterion: &mut Criterion) {
     let regressors = (0..18)
         .map(|series| {
             let coefficient = series / 3;
-            Regressor { coefficient, channel: 3 * (coefficient / 3) + series % 3, series, factor: 1.0 }
+            Regressor { coefficient, channel: 3 * (coefficient / 3) + series % 3, series, factor: 1.0, times: None }
         })
         .collect();
     let names = |n: usize| (0..n).map(|i| i.to_string()).collect();

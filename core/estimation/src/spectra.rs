@@ -38,9 +38,22 @@ pub struct Regressor {
     pub series: usize,
     /// Unit of the channel per unit of the series and of the coefficient.
     pub factor: f64,
+    /// Index of another coefficient whose value multiplies the response too.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub times: Option<usize>,
 }
 
 impl Layout {
+    /// The same with products of two coefficients made linear: the second one has its value in `theta`.
+    #[must_use]
+    pub fn linear_at(&self, theta: &[f64]) -> Self {
+        let mut linear = self.clone();
+        for r in &mut linear.regressors {
+            r.factor *= r.times.take().map_or(1.0, |other| theta[other]);
+        }
+        linear
+    }
+
     /// Channels and series together.
     #[must_use]
     pub fn columns(&self) -> usize {

@@ -264,7 +264,7 @@ mod tests {
         Layout {
             channels: vec!["c".into()],
             series: vec!["s".into()],
-            regressors: vec![Regressor { coefficient: 0, channel: 0, series: 0, factor: 2.0 }],
+            regressors: vec![Regressor { coefficient: 0, channel: 0, series: 0, factor: 2.0, times: None }],
             coefficients: vec!["b".into()],
         }
     }

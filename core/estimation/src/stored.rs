@@ -90,7 +90,10 @@ impl Stored {
         }
         let Layout { channels, series, regressors, coefficients } = &self.layout;
         let inside = |r: &crate::spectra::Regressor| {
-            r.channel < channels.len() && r.series < series.len() && r.coefficient < coefficients.len()
+            r.channel < channels.len()
+                && r.series < series.len()
+                && r.coefficient < coefficients.len()
+                && r.times.is_none_or(|other| other < coefficients.len())
         };
         let damaged = |what| Err(StoredError::Damaged(what));
         if !(16..=1 << 24).contains(&self.length) || !self.length.is_multiple_of(4) {
@@ -125,7 +128,7 @@ mod tests {
         let layout = Layout {
             channels: vec!["c".into()],
             series: vec!["s".into()],
-            regressors: vec![Regressor { coefficient: 0, channel: 0, series: 0, factor: -0.5 }],
+            regressors: vec![Regressor { coefficient: 0, channel: 0, series: 0, factor: -0.5, times: None }],
             coefficients: vec!["b".into()],
         };
         let mut analyser = Analyser::new(Plan::new(64, 10.0), &layout);

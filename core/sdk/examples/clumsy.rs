@@ -27,6 +27,7 @@ impl Stage for Clumsy {
             "function that panics",
         )],
         instances: &[],
+        needs: &[],
     };
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {

@@ -18,6 +18,7 @@
 //!         description: "Doubles a column",
 //!         parameters: &[Parameter::f64("factor", "1", 2.0, 0.0..=10.0, "what to multiply by")],
 //!         instances: &[],
+//!         needs: &[],
 //!     };
 //!     fn new(_setup: &Setup) -> Result<Self, PluginError> {
 //!         Ok(Self { x: None })
@@ -61,7 +62,9 @@ mod setup;
 
 pub use batch::{Inputs, Outputs, Progress};
 pub use error::PluginError;
-pub use link::{Available, Coefficient, Column, Constraint, EffectLink, In, Link, Out, Table, Want};
+pub use link::{
+    Available, Coefficient, Column, Constraint, EffectLink, In, Link, Out, Response, Shape, Table, Variant, Want,
+};
 pub use manifest::{Manifest, Parameter};
 pub use node::{Effect, Source, Stage};
 pub use report::{Attachment, Covariance, Estimate, Report};
@@ -71,7 +74,7 @@ pub use setup::{Level, Log, Setup};
 pub mod prelude {
     pub use crate::{
         Attachment, Available, Coefficient, Column, Constraint, Covariance, Effect, EffectLink, Estimate, In, Inputs,
-        Level, Link, Log, Manifest, Out, Outputs, Parameter, PluginError, Progress, Report, Setup, Source, Stage,
-        Table, Want, export_plugin,
+        Level, Link, Log, Manifest, Out, Outputs, Parameter, PluginError, Progress, Report, Response, Setup, Shape, Source,
+        Stage, Table, Variant, Want, export_plugin,
     };
 }

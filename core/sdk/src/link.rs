@@ -60,6 +60,49 @@ pub struct Coefficient {
     pub prior_sigma: f64,
     /// False where the model fixes the coefficient at `initial`; the host fills it in.
     pub estimate: bool,
+    /// True where the effect is no part of the model, and only asks to be; the host fills it in.
+    pub candidate: bool,
+    /// How it acts, besides by the columns of [`EffectLink::regressor`].
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub responses: Vec<Response>,
+    /// Values of the shape parameters behind the responses, a lag or a resonance.
+    #[serde(skip_serializing_if = "Shape::is_empty")]
+    pub shape: Shape,
+    /// What else it may be; declared in place of `responses` by a [`crate::Setup::candidate`].
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub variants: Vec<Variant>,
+    /// A process of the mission's noise whose amplitude the coefficient multiplies; such a coefficient has no responses.
+    #[serde(skip_serializing_if = "String::is_empty")]
+    pub noise: String,
+}
+
+/// Shape parameters by name: numbers, or names of columns.
+pub type Shape = BTreeMap<String, serde_json::Value>;
+
+/// How one channel answers to a coefficient: `factor` times a series, times the value of another coefficient where `times` names
+/// one.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Response {
+    /// The channel, `tm1.accel.x`.
+    pub channel: String,
+    /// Table of the series.
+    pub table: String,
+    /// Column of the series, a mean over `[t_k, t_{k+1})`.
+    pub series: String,
+    /// Unit of the channel per unit of the series and of the coefficients.
+    pub factor: f64,
+    /// The other coefficient of a product, `com-offset.tm1.x`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub times: Option<String>,
+}
+
+/// One of several forms that a cause may have.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Variant {
+    /// Values of the shape parameters; as parameters of the effect they give these responses.
+    pub shape: Shape,
+    /// How it acts.
+    pub responses: Vec<Response>,
 }
 
 impl Default for Coefficient {
@@ -75,6 +118,11 @@ impl Default for Coefficient {
             initial: 0.0,
             prior_sigma: f64::INFINITY,
             estimate: true,
+            candidate: false,
+            responses: Vec::new(),
+            shape: Shape::new(),
+            variants: Vec::new(),
+            noise: String::new(),
         }
     }
 }
@@ -153,6 +201,32 @@ impl Available {
     /// The columns whose attribute `kind` is `kind`.
     pub fn of_kind<'a>(&'a self, kind: &'a str) -> impl Iterator<Item = &'a Column> {
         self.columns.iter().filter(move |c| c.attribute("kind") == kind)
+    }
+
+    /// How the channels answer to each coefficient: those that the coefficients declare, and the columns of `kind` `regressor`,
+    /// which are a response with the factor one each.
+    ///
+    /// # Errors
+    /// A column is a regressor of a coefficient that nobody declares.
+    pub fn responses(&self) -> Result<Vec<(&Coefficient, Response)>, PluginError> {
+        let mut all = Vec::new();
+        for column in self.of_kind("regressor") {
+            let name = column.attribute("coefficient");
+            let coefficient = self.coefficient(name).ok_or_else(|| {
+                PluginError::error(format!(
+                    "column {} of table {} is a regressor of coefficient `{name}`, which nobody declares; the effect that makes it \
+                     must announce it in its link",
+                    column.name, column.table
+                ))
+            })?;
+            let channel = column.attribute("channel").to_owned();
+            let (table, series) = (column.table.clone(), column.name.clone());
+            all.push((coefficient, Response { channel, table, series, factor: 1.0, times: None }));
+        }
+        for c in &self.coefficients {
+            all.extend(c.responses.iter().map(|r| (c, r.clone())));
+        }
+        Ok(all)
     }
 
     /// A coefficient by name.
@@ -362,6 +436,38 @@ impl<'l, 'a> EffectLink<'l, 'a> {
     /// The host refuses it: the name is taken.
     pub fn coefficient(&mut self, coefficient: &Coefficient) -> Result<(), PluginError> {
         crate::border::announce_json(self.link.raw, crate::border::Announcement::Coefficient, coefficient)
+    }
+
+    /// A series that responses refer to by [`Self::table`] and this name: one value per row, a mean over `[t_k, t_{k+1})`.
+    ///
+    /// # Errors
+    /// The host refuses it: the name is taken.
+    pub fn series(&mut self, name: &str, unit: &str, frame: &str) -> Result<Out, PluginError> {
+        self.link.write_with(self.table, name, unit, frame, &[("kind", "series"), ("effect", self.effect)])
+    }
+
+    /// A series of this name of an effect before this one, by its table, or else a new one of this effect. The name must say all
+    /// that the values depend on: `lag(hk.eh1_xp_temperature_k, 480)`.
+    ///
+    /// # Errors
+    /// As [`Self::series`].
+    pub fn shared_series(
+        &mut self,
+        available: &Available,
+        name: &str,
+        unit: &str,
+        frame: &str,
+    ) -> Result<(String, Option<Out>), PluginError> {
+        match available.of_kind("series").find(|c| c.name == name) {
+            Some(column) => Ok((column.table.clone(), None)),
+            None => Ok((self.table(), Some(self.series(name, unit, frame)?))),
+        }
+    }
+
+    /// Name of the table that this effect writes.
+    #[must_use]
+    pub fn table(&self) -> String {
+        self.link.written[self.table.index].name.clone()
     }
 
     /// What one unit of `coefficient` adds to `channel`; `unit` is the channel's unit per the coefficient's.

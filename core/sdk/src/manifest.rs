@@ -18,6 +18,9 @@ pub struct Manifest {
     pub parameters: &'static [Parameter],
     /// Effects only: the instances that exist, `tm1`, `tm2`.
     pub instances: &'static [&'static str],
+    /// Effects only: columns beyond the usual ones that stages before it are asked to make, by the names that they give them;
+    /// see [`crate::Setup::needs`].
+    pub needs: &'static [&'static str],
 }
 
 /// A parameter: name, unit, default, range, help.
@@ -126,6 +129,7 @@ impl Manifest {
             "licence": self.licence,
             "description": self.description,
             "instances": self.instances,
+            "needs": self.needs,
             "parameters": self.parameters.iter().map(|p| p.to_json()).collect::<Vec<_>>(),
         })
         .to_string()

@@ -197,7 +197,10 @@ impl<T: Effect> Node for EffectNode<T> {
     fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
         // All uniform tables share one grid; its rate is the regressors' rate.
         let rate_hz = available.columns.iter().map(|c| c.rate_hz).fold(0.0, f64::max);
-        self.effect.link(available, &mut EffectLink::new(link, T::MANIFEST.id, &self.instance, rate_hz))
+        self.effect.link(available, &mut EffectLink::new(link, T::MANIFEST.id, &self.instance, rate_hz))?;
+        // One that acts through the series of others alone has no table.
+        link.written.retain(|table| !table.columns.is_empty());
+        Ok(())
     }
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
         if let Some(table) = output.tables.first_mut() {

@@ -22,6 +22,9 @@ struct Config {
     parameters: serde_json::Map<String, serde_json::Value>,
     mission: serde_json::Value,
     instance: String,
+    candidate: bool,
+    needs: Vec<String>,
+    threads: Option<usize>,
     files: Vec<PathBuf>,
     start_ns: Option<i64>,
     end_ns: Option<i64>,
@@ -159,6 +162,25 @@ impl Setup {
     #[must_use]
     pub fn instance(&self) -> &str {
         &self.config.instance
+    }
+
+    /// Effects: whether this instance is not in the model and only asks to be: it then declares [`crate::Variant`]s, one for each
+    /// value that its shape parameters may have, in place of the one that its parameters name.
+    #[must_use]
+    pub fn candidate(&self) -> bool {
+        self.config.candidate
+    }
+
+    /// Stages: whether an effect after this one needs what the stage calls `name`, and makes only on demand.
+    #[must_use]
+    pub fn needs(&self, name: &str) -> bool {
+        self.config.needs.iter().any(|n| n == name)
+    }
+
+    /// Threads that an instance may use, itself included; results must not depend on it.
+    #[must_use]
+    pub fn threads(&self) -> usize {
+        self.config.threads.unwrap_or(1).max(1)
     }
 
     /// Sources: the files of the run.

@@ -110,6 +110,7 @@ impl Effect for ComOffset {
         description: "Offset of a test mass's housing from the spacecraft's centre of mass",
         parameters: &[],
         instances: &["tm1", "tm2"],
+        needs: &[],
     };
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {

@@ -9,7 +9,7 @@ use crate::design::{Choices, model};
 use crate::filter::{Adaptation, Settings};
 use crate::model::{Coefficient as Theta, Prior};
 use crate::state::{Words, seal, unseal};
-use crate::tracker::{Average, Factor, Rows, Snapshot, Tracker};
+use crate::tracker::{Average, Factor, Regressor, Rows, Snapshot, Tracker};
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 const TEST_MASSES: [&str; 2] = ["tm1", "tm2"];
@@ -23,6 +23,7 @@ pub struct EsAkf {
     settings: Settings,
     choices: Choices,
     snapshot_s: f64,
+    threads: usize,
     bodies: Vec<Body>,
     table: Option<Table>,
     last_ns: Option<i64>,
@@ -35,7 +36,7 @@ struct Body {
     tracker: Tracker,
     readout_m: [In; 3],
     u_m_s2: [In; 3],
-    regressors: Vec<(Factor, usize, In)>,
+    regressors: Vec<Regressor<In>>,
     coefficients: Vec<Coefficient>,
     value: Vec<Out>,
     sigma: Vec<Out>,
@@ -93,6 +94,7 @@ impl Stage for EsAkf {
             ),
         ],
         instances: &[],
+        needs: &[],
     };
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
@@ -126,6 +128,7 @@ impl Stage for EsAkf {
                 unknown_alpha: setup.f64("unknown_alpha")?,
             },
             snapshot_s: setup.f64("output_interval_s")?,
+            threads: setup.threads(),
             mission,
             bodies: Vec::new(),
             table: None,
@@ -157,7 +160,7 @@ impl Stage for EsAkf {
         let pieces = self.contiguous(times)?;
         let [first, rest @ ..] = self.bodies.as_mut_slice() else { return Ok(()) };
         // The test masses share nothing, so the result is the same with one thread or two.
-        let snapshots: Vec<Vec<Snapshot>> = if times.len() < THREAD_ROWS {
+        let snapshots: Vec<Vec<Snapshot>> = if self.threads == 1 || times.len() < THREAD_ROWS {
             std::iter::once(first.run(input, &pieces)).chain(rest.iter_mut().map(|b| b.run(input, &pieces))).collect()
         } else {
             std::thread::scope(|scope| {
@@ -281,29 +284,33 @@ impl EsAkf {
         let (readout_m, u_m_s2) = (three("r_orf_m", "m")?, three("u_orf_m_s2", "m s-2")?);
         let mut coefficients: Vec<Coefficient> = Vec::new();
         let mut regressors = Vec::new();
-        for column in available.of_kind("regressor") {
-            let Some(axis) = AXES.iter().position(|a| column.attribute("channel") == format!("{name}.accel.{a}"))
-            else {
+        let responses = available.responses()?;
+        for (coefficient, response) in &responses {
+            let Some(axis) = AXES.iter().position(|a| response.channel == format!("{name}.accel.{a}")) else {
                 continue;
             };
-            let called = column.attribute("coefficient");
-            let coefficient = available.coefficient(called).ok_or_else(|| {
-                PluginError::new(format!(
-                    "es-akf: column {} of table {} is a regressor of coefficient \"{called}\", which no effect \
-                     declares; the effect must announce it with `coefficient` in its link",
-                    column.name, column.table
-                ))
-            })?;
-            let factor = if coefficient.estimate {
-                let known = coefficients.iter().position(|c| c.name == coefficient.name);
+            let column = link.read(&Want::new(&response.series).table(&response.table))?;
+            let mut value_of = |c: &Coefficient| {
+                if !c.estimate {
+                    return Factor::Fixed(c.initial);
+                }
+                let known = coefficients.iter().position(|k| k.name == c.name);
                 Factor::Estimated(known.unwrap_or_else(|| {
-                    coefficients.push(coefficient.clone());
+                    coefficients.push(c.clone());
                     coefficients.len() - 1
                 }))
-            } else {
-                Factor::Fixed(coefficient.initial)
             };
-            regressors.push((factor, axis, link.read(&Want::of(column))?));
+            let coefficient = value_of(coefficient);
+            let times = match &response.times {
+                None => Factor::Fixed(1.0),
+                Some(other) => value_of(available.coefficient(other).ok_or_else(|| {
+                    PluginError::error(format!(
+                        "es-akf: the effect of {} acts through {other}, which is not in the model; add it",
+                        response.channel
+                    ))
+                })?),
+            };
+            regressors.push(Regressor { coefficient, times, factor: response.factor, axis, column });
         }
         let thetas = coefficients.iter().map(prior_of).collect::<Result<Vec<_>, _>>()?;
         let has_ifo = self.mission.noise.ifo_x.is_some();
@@ -321,7 +328,7 @@ impl EsAkf {
             ))
         })?;
         let (mut value, mut sigma) = (Vec::new(), Vec::new());
-        let shared = |c: &Coefficient| acts_on_several(available, &c.name);
+        let shared = |c: &Coefficient| acts_on_several(&responses, &c.name);
         let label = |c: &Coefficient| if shared(c) { format!("{}@{name}", c.name) } else { c.name.clone() };
         let archive = [("archive", "true")];
         for c in &coefficients {
@@ -429,7 +436,7 @@ impl Body {
         let rows = Rows {
             readout_m: self.readout_m.map(|c| input.f64(c)),
             u_m_s2: self.u_m_s2.map(|c| input.f64(c)),
-            regressors: self.regressors.iter().map(|&(factor, axis, c)| (factor, axis, input.f64(c))).collect(),
+            regressors: self.regressors.iter().map(|r| r.map(|c| input.f64(c))).collect(),
         };
         let mut snapshots = Vec::new();
         for (missing, piece) in pieces {
@@ -456,11 +463,9 @@ fn prior_of(c: &Coefficient) -> Result<Theta, PluginError> {
 }
 
 /// Whether a coefficient has regressors on both test masses.
-fn acts_on_several(available: &Available, coefficient: &str) -> bool {
+fn acts_on_several(responses: &[(&Coefficient, Response)], coefficient: &str) -> bool {
     let of_it = |name: &str| {
-        available.of_kind("regressor").any(|c| {
-            c.attribute("coefficient") == coefficient && c.attribute("channel").starts_with(&format!("{name}.accel."))
-        })
+        responses.iter().any(|(c, r)| c.name == coefficient && r.channel.starts_with(&format!("{name}.accel.")))
     };
     TEST_MASSES.into_iter().all(of_it)
 }

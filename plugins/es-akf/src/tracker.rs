@@ -20,8 +20,31 @@ pub struct Rows<'a> {
     pub readout_m: [&'a [f64]; 3],
     /// `û`, mean over `[t_k, t_{k+1})`, x, y, z, m/s².
     pub u_m_s2: [&'a [f64]; 3],
-    /// Regressors: what they are multiplied with, axis, column.
-    pub regressors: Vec<(Factor, usize, &'a [f64])>,
+    /// What the coefficients add.
+    pub regressors: Vec<Regressor<&'a [f64]>>,
+}
+
+/// What a coefficient adds to the acceleration along an axis: `coefficient · times · factor · column`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Regressor<C> {
+    /// The coefficient.
+    pub coefficient: Factor,
+    /// The other coefficient of a product, or one.
+    pub times: Factor,
+    /// Constant factor.
+    pub factor: f64,
+    /// Axis of ORF.
+    pub axis: usize,
+    /// Column.
+    pub column: C,
+}
+
+impl<C: Copy> Regressor<C> {
+    /// The same with another way to the column.
+    pub fn map<D>(&self, to: impl FnOnce(C) -> D) -> Regressor<D> {
+        let Self { coefficient, times, factor, axis, column } = *self;
+        Regressor { coefficient, times, factor, axis, column: to(column) }
+    }
 }
 
 /// What a regressor is multiplied with.
@@ -104,10 +127,17 @@ impl Tracker {
         let mut phi = vec![[0.0; 3]; self.filter.coefficients().len()];
         for k in range {
             let mut u = rows.u_m_s2.map(|column| column[k]);
-            for &(factor, axis, column) in &rows.regressors {
-                match factor {
-                    Factor::Estimated(j) => phi[j][axis] = column[k],
-                    Factor::Fixed(value) => u[axis] += value * column[k],
+            phi.iter_mut().for_each(|p| *p = [0.0; 3]);
+            for r in &rows.regressors {
+                // A product is linear in its coefficient at the other's estimate of this epoch.
+                let times = match r.times {
+                    Factor::Estimated(j) => self.filter.coefficients()[j],
+                    Factor::Fixed(value) => value,
+                };
+                let added = times * r.factor * r.column[k];
+                match r.coefficient {
+                    Factor::Estimated(j) => phi[j][r.axis] += added,
+                    Factor::Fixed(value) => u[r.axis] += value * added,
                 }
             }
             let readout = rows.readout_m.map(|column| column[k]);

@@ -8,7 +8,7 @@ use common::{Alpha, Simulation, model, settings};
 use dragfree_es_akf::Akf;
 use dragfree_es_akf::filter::{Adaptation, Drive, Settings};
 use dragfree_es_akf::model::Model;
-use dragfree_es_akf::tracker::{Factor, Rows, Tracker};
+use dragfree_es_akf::tracker::{Factor, Regressor, Rows, Tracker};
 use nalgebra::{Matrix3, Vector3};
 
 const RUNS: u64 = 40;
@@ -47,7 +47,15 @@ fn campaign(truth: &Model, belief: &Model, settings: Settings) -> Outcome {
         let rows = Rows {
             readout_m: [&r[0], &r[1], &r[2]],
             u_m_s2: [&u[0], &u[1], &u[2]],
-            regressors: (0..9).map(|c| (Factor::Estimated(c / 3), c % 3, phi[c].as_slice())).collect(),
+            regressors: (0..9)
+                .map(|c| Regressor {
+                    coefficient: Factor::Estimated(c / 3),
+                    times: Factor::Fixed(1.0),
+                    factor: 1.0,
+                    axis: c % 3,
+                    column: phi[c].as_slice(),
+                })
+                .collect(),
         };
         let filter = Akf::new(belief.clone(), settings).expect("16 states");
         let mut tracker = Tracker::new(filter, 60.0);

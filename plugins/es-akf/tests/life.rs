@@ -7,7 +7,7 @@ use dragfree_es_akf::Akf;
 use dragfree_es_akf::filter::{Adaptation, Drive, Settings};
 use dragfree_es_akf::model::{Coefficient, Model};
 use dragfree_es_akf::state::{StateError, Words};
-use dragfree_es_akf::tracker::{Factor, Rows, Tracker};
+use dragfree_es_akf::tracker::{Factor, Regressor, Rows, Tracker};
 
 const NAN3: [f64; 3] = [f64::NAN; 3];
 
@@ -267,7 +267,15 @@ fn a_saved_state_resumes_to_the_bit() {
     let rows = Rows {
         readout_m: [&r[0], &r[1], &r[2]],
         u_m_s2: [&u[0], &u[1], &u[2]],
-        regressors: (0..9).map(|c| (Factor::Estimated(c / 3), c % 3, phi[c].as_slice())).collect(),
+        regressors: (0..9)
+                .map(|c| Regressor {
+                    coefficient: Factor::Estimated(c / 3),
+                    times: Factor::Fixed(1.0),
+                    factor: 1.0,
+                    axis: c % 3,
+                    column: phi[c].as_slice(),
+                })
+                .collect(),
     };
     let fresh = || Tracker::new(Akf::new(model.clone(), gated()).expect("16 states"), 60.0);
     let bytes = |t: &Tracker| {

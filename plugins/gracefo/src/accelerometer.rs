@@ -241,6 +241,7 @@ impl Stage for Accelerometer {
             ),
         ],
         instances: &[],
+        needs: &[],
     };
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {

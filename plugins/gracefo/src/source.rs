@@ -40,6 +40,7 @@ impl Source for GraceFo {
             "products to read, such as ACC1A and SCA1B; none means all that the files hold",
         )],
         instances: &[],
+        needs: &[],
     };
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {

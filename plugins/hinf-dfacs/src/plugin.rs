@@ -307,6 +307,7 @@ impl Stage for HinfDfacs {
             ),
         ],
         instances: &[],
+        needs: &[],
     };
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {

@@ -92,6 +92,7 @@ impl Stage for Preprocess {
             ),
         ],
         instances: &[],
+        needs: &[],
     };
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {

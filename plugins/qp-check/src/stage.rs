@@ -67,6 +67,7 @@ impl Stage for QpCheck {
             ),
         ],
         instances: &[],
+        needs: &[],
     };
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
@@ -129,50 +130,29 @@ impl Linked {
                 "qp-check finds no channel to explain: put a stage before it that makes some, such as hinf-dfacs or accelerometer",
             ));
         };
-        let regressors: Vec<&Column> = available.of_kind("regressor").collect();
-        let (channels, left_out) = modelled(&stage.mission, &all, &regressors, rate_hz)?;
+        let responses = available.responses()?;
+        let acted_on = |channel: &str| responses.iter().any(|(_, r)| r.channel == channel);
+        let (channels, left_out) = modelled(&stage.mission, &all, acted_on, rate_hz)?;
         let measured: Vec<Measured> = channels.iter().map(|c| measured(c)).collect::<Result<_, _>>()?;
-        let position = |column: &Column, key: &str, found: Option<usize>| {
-            found.ok_or_else(|| {
-                let wanted = column.attribute(key);
-                PluginError::error(format!(
-                    "column {} is a regressor of {key} `{wanted}`, which nobody declares; the effect that makes it must",
-                    column.name
-                ))
-            })
-        };
-        let map: Vec<Regressor> = regressors
-            .iter()
-            .enumerate()
-            .map(|(series, r)| {
-                let channel = channels.iter().position(|c| name_of(c) == r.attribute("channel"));
-                let coefficient = available.coefficients.iter().position(|c| c.name == r.attribute("coefficient"));
-                Ok(Regressor {
-                    coefficient: position(r, "coefficient", coefficient)?,
-                    channel: position(r, "channel", channel)?,
-                    series,
-                    factor: 1.0,
-                })
-            })
-            .collect::<Result<_, PluginError>>()?;
+        let (layout, series) = layout(available, &channels, &responses)?;
+        let series = series.iter().map(|(table, name)| Want::new(name).table(table).rate_hz(rate_hz));
         let columns = channels
             .iter()
-            .chain(&regressors)
-            .map(|c| link.read(&Want::of(c).rate_hz(rate_hz)))
+            .map(|c| Want::of(c).rate_hz(rate_hz))
+            .chain(series)
+            .map(|want| link.read(&want))
             .collect::<Result<_, _>>()?;
-        let layout = Layout {
-            channels: channels.iter().map(|c| name_of(c).to_owned()).collect(),
-            series: regressors.iter().map(|r| r.name.clone()).collect(),
-            regressors: map,
-            coefficients: available.coefficients.iter().map(|c| c.name.clone()).collect(),
-        };
         let model = noise_model(&stage.mission, &channels, rate_hz)?;
         let length = longest_length((stage.segment_s * rate_hz).round() as usize);
         let analyser = Analyser::new(Plan::new(length, rate_hz), &layout);
+        let seen_as_mean = |s: usize| {
+            layout.regressors.iter().any(|r| r.series == s && measured[r.channel] == Measured::Differenced)
+        };
         let averaged = std::iter::repeat_n(false, layout.channels.len())
-            .chain(layout.regressors.iter().map(|r| measured[r.channel] == Measured::Differenced))
+            .chain((0..layout.series.len()).map(seen_as_mean))
             .collect();
-        let names: Vec<String> = channels.iter().chain(&regressors).map(|c| c.name.clone()).collect();
+        let names: Vec<String> =
+            channels.iter().map(|c| c.name.clone()).chain(layout.series.iter().cloned()).collect();
         Ok(Self {
             signature: format!("{} in segments of {length} samples at {rate_hz} Hz", names.join(", ")),
             columns,
@@ -181,7 +161,7 @@ impl Linked {
             bounds: bounds(available),
             coefficients: available.coefficients.clone(),
             refinements: stage.refinements,
-            collected: nothing_collected(&model, &measured, &layout, analyser.plan()),
+            collected: nothing_collected(&model, &measured, &layout, &available.coefficients, analyser.plan()),
             measured,
             segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged),
             analyser,
@@ -228,7 +208,7 @@ impl Linked {
     }
 
     fn nothing_collected(&self) -> Collected {
-        nothing_collected(&self.model, &self.measured, &self.layout, self.analyser.plan())
+        nothing_collected(&self.model, &self.measured, &self.layout, &self.coefficients, self.analyser.plan())
     }
 
     /// Too short for any spectrum: a sentence, not a number.
@@ -422,8 +402,16 @@ impl Linked {
     }
 }
 
-fn nothing_collected(model: &NoiseModel, measured: &[Measured], layout: &Layout, plan: &Plan) -> Collected {
-    Collected::new(plan, layout, Prediction::new(model, measured, layout, plan))
+/// The fit in the time domain takes products of coefficients at their initial values.
+fn nothing_collected(
+    model: &NoiseModel,
+    measured: &[Measured],
+    layout: &Layout,
+    coefficients: &[Coefficient],
+    plan: &Plan,
+) -> Collected {
+    let initial: Vec<f64> = coefficients.iter().map(|c| c.initial).collect();
+    Collected::new(plan, layout, Prediction::new(model, measured, &layout.linear_at(&initial), plan))
 }
 
 /// The fit in the time domain beside the QP, coefficient by coefficient.
@@ -494,15 +482,58 @@ fn pull_sentence(p: &Pull) -> String {
 fn modelled<'a>(
     mission: &Mission,
     channels: &[&'a Column],
-    regressors: &[&Column],
+    acted_on: impl Fn(&str) -> bool,
     rate_hz: f64,
 ) -> Result<(Vec<&'a Column>, Vec<String>), PluginError> {
     let group = noise_model(mission, channels, rate_hz)?.groups();
-    let acted_on = |c: &Column| regressors.iter().any(|r| r.attribute("channel") == name_of(c));
-    let with_effects: Vec<usize> = channels.iter().zip(&group).filter(|(c, _)| acted_on(c)).map(|(_, g)| *g).collect();
+    let with_effects: Vec<usize> =
+        channels.iter().zip(&group).filter(|(c, _)| acted_on(name_of(c))).map(|(_, g)| *g).collect();
     let (kept, left): (Vec<_>, Vec<_>) =
-        channels.iter().copied().zip(&group).partition(|(c, g)| acted_on(c) || !with_effects.contains(g));
+        channels.iter().copied().zip(&group).partition(|(c, g)| acted_on(name_of(c)) || !with_effects.contains(g));
     Ok((kept.into_iter().map(|(c, _)| c).collect(), left.into_iter().map(|(c, _)| name_of(c).to_owned()).collect()))
+}
+
+/// What the columns of the sums are, and the series among them by table and name.
+fn layout(
+    available: &Available,
+    channels: &[&Column],
+    responses: &[(&Coefficient, Response)],
+) -> Result<(Layout, Vec<(String, String)>), PluginError> {
+    let nobody = |c: &Coefficient, what: &str, name: &str| {
+        PluginError::error(format!(
+            "coefficient {} acts on or through the {what} `{name}`, which nobody declares; the stage or effect that makes it must \
+             stand before",
+            c.name
+        ))
+    };
+    let coefficient = |name: &str| available.coefficients.iter().position(|c| c.name == name);
+    let mut series: Vec<(String, String)> = Vec::new();
+    let mut regressors = Vec::new();
+    for (c, r) in responses {
+        let channel = channels.iter().position(|channel| name_of(channel) == r.channel);
+        let times = match &r.times {
+            Some(other) => Some(coefficient(other).ok_or_else(|| nobody(c, "coefficient", other))?),
+            None => None,
+        };
+        let key = (r.table.clone(), r.series.clone());
+        regressors.push(Regressor {
+            coefficient: coefficient(&c.name).ok_or_else(|| nobody(c, "coefficient", &c.name))?,
+            channel: channel.ok_or_else(|| nobody(c, "channel", &r.channel))?,
+            series: series.iter().position(|s| *s == key).unwrap_or_else(|| {
+                series.push(key);
+                series.len() - 1
+            }),
+            factor: r.factor,
+            times,
+        });
+    }
+    let layout = Layout {
+        channels: channels.iter().map(|c| name_of(c).to_owned()).collect(),
+        series: series.iter().map(|(_, name)| name.clone()).collect(),
+        regressors,
+        coefficients: available.coefficients.iter().map(|c| c.name.clone()).collect(),
+    };
+    Ok((layout, series))
 }
 
 fn noise_model(mission: &Mission, channels: &[&Column], rate_hz: f64) -> Result<NoiseModel, PluginError> {

@@ -58,6 +58,9 @@ pub struct Manifest {
     /// Effects: where it can act.
     #[serde(default)]
     pub instances: Vec<String>,
+    /// Effects: columns that stages before it make on demand.
+    #[serde(default)]
+    pub needs: Vec<String>,
     /// Parameters.
     #[serde(default)]
     pub parameters: Vec<Parameter>,

@@ -41,6 +41,12 @@ pub struct Coefficient {
     /// False where the model fixes it.
     #[serde(default = "yes")]
     pub estimate: bool,
+    /// True where the effect is no part of the model, and only asks to be.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub candidate: bool,
+    /// How the channels answer to it, as the effect declared it: responses, shape, variants, noise.
+    #[serde(flatten)]
+    pub action: Map<String, Value>,
 }
 
 fn yes() -> bool {
@@ -92,10 +98,12 @@ pub fn build(
         mission,
         model,
         available: feed_tables.iter().filter(|t| !t.truth).flat_map(|t| t.columns.clone()).collect(),
+        needs: needs(registry, model),
         chain: Chain {
             nodes: Vec::new(),
             coefficients: Vec::new(),
             constraints: Vec::new(),
+            not_tried: Vec::new(),
             feed_tables: feed_tables.to_vec(),
             feed_routes: vec![Route::default(); feed_tables.len()],
             carry: Carry { batch_rows: carry.batch_rows.max(1), ..carry },
@@ -120,11 +128,22 @@ pub fn build(
     Ok(builder.chain)
 }
 
+/// What the effects of a model want of the stages before them. An effect that does not exist is met again when it is linked.
+fn needs(registry: &Registry, model: &Model) -> Vec<String> {
+    let effects = model.effects.iter().chain(&model.candidates);
+    let found = effects.filter_map(|e| registry.find(Kind::Effect, &e.id).ok());
+    let mut needs: Vec<String> = found.flat_map(|f| f.info.manifest.needs.clone()).collect();
+    needs.sort();
+    needs.dedup();
+    needs
+}
+
 struct Builder<'a> {
     registry: &'a Registry,
     mission: &'a Mission,
     model: &'a Model,
     available: Vec<Column>,
+    needs: Vec<String>,
     chain: Chain,
 }
 
@@ -141,7 +160,7 @@ impl Builder<'_> {
         let found = self.registry.find(Kind::Stage, id)?;
         let file = pipeline.path.display().to_string();
         let parameters = resolve_parameters(&file, &found.info.manifest, parameters)?;
-        self.add(&found, parameters, "")?;
+        self.add(&found, parameters, "", false)?;
         Ok(())
     }
 
@@ -160,8 +179,8 @@ impl Builder<'_> {
             }
             let file = self.model.path.display().to_string();
             let parameters = resolve_parameters(&file, &found.info.manifest, &entry.parameters)?;
-            let linked = self.add(&found, parameters, &entry.instance)?;
-            self.take_coefficients(entry, linked.coefficients)?;
+            let linked = self.add(&found, parameters, &entry.instance, false)?;
+            self.take_coefficients(entry, linked.coefficients, false)?;
             for value in linked.constraints {
                 let constraint: Constraint = serde_json::from_value(value)
                     .map_err(|e| self.model_error(format!("effect {}: a constraint: {e}", entry.id)))?;
@@ -170,7 +189,22 @@ impl Builder<'_> {
         }
         self.chain.constraints =
             constraints.into_iter().filter(|(c, contributed)| *contributed >= c.parts).map(|(c, _)| c).collect();
+        for entry in &self.model.candidates {
+            if let Err(reason) = self.candidate(entry) {
+                let name = format!("{}:{}", entry.id, entry.instance);
+                self.chain.not_tried.push((name, reason.to_string()));
+            }
+        }
         Ok(())
+    }
+
+    /// An effect that is not in the model: what keeps it from being tried is no error of the run.
+    fn candidate(&mut self, entry: &EffectEntry) -> Result<(), ChainError> {
+        let found = self.registry.find(Kind::Effect, &entry.id)?;
+        let file = self.model.path.display().to_string();
+        let parameters = resolve_parameters(&file, &found.info.manifest, &entry.parameters)?;
+        let linked = self.add(&found, parameters, &entry.instance, true)?;
+        self.take_coefficients(entry, linked.coefficients, true)
     }
 
     fn merge(&self, all: &mut Vec<(Constraint, u32)>, constraint: Constraint) -> Result<(), ChainError> {
@@ -190,7 +224,12 @@ impl Builder<'_> {
         Ok(())
     }
 
-    fn take_coefficients(&mut self, entry: &EffectEntry, announced: Vec<Value>) -> Result<(), ChainError> {
+    fn take_coefficients(
+        &mut self,
+        entry: &EffectEntry,
+        announced: Vec<Value>,
+        candidate: bool,
+    ) -> Result<(), ChainError> {
         let mut unused: Vec<&String> = entry.prior.keys().collect();
         for value in announced {
             let mut c: Coefficient = serde_json::from_value(value)
@@ -200,7 +239,8 @@ impl Builder<'_> {
             }
             c.effect.clone_from(&entry.id);
             c.instance.clone_from(&entry.instance);
-            c.estimate = entry.estimate;
+            c.estimate = entry.estimate && !candidate;
+            c.candidate = candidate;
             let short = c.name.rsplit('.').next().unwrap_or_default();
             if let Some(prior) = entry.prior.get(short) {
                 unused.retain(|key| *key != short);
@@ -239,9 +279,23 @@ impl Builder<'_> {
         }
     }
 
-    fn add(&mut self, found: &Found, parameters: Map<String, Value>, instance: &str) -> Result<Linked, ChainError> {
-        let config =
-            Config { value: json!({ "parameters": parameters, "mission": self.mission.value, "instance": instance }) };
+    fn add(
+        &mut self,
+        found: &Found,
+        parameters: Map<String, Value>,
+        instance: &str,
+        candidate: bool,
+    ) -> Result<Linked, ChainError> {
+        let config = Config {
+            value: json!({
+                "parameters": parameters,
+                "mission": self.mission.value,
+                "instance": instance,
+                "candidate": candidate,
+                "needs": self.needs,
+                "threads": self.chain.carry.threads,
+            }),
+        };
         let mut node = found.create(&config)?;
         let linked = node.link(LinkRequest { available: &self.available, model_json: &self.model_json() })?;
         node.activate(u32::try_from(self.chain.carry.batch_rows).unwrap_or(u32::MAX))?;

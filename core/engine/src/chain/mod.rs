@@ -149,6 +149,8 @@ pub struct Chain {
     pub coefficients: Vec<Coefficient>,
     /// Constraints on them.
     pub constraints: Vec<Constraint>,
+    /// Candidates that could not be linked, with the reason.
+    pub not_tried: Vec<(String, String)>,
     feed_tables: Vec<TableSpec>,
     feed_routes: Vec<Route>,
     carry: Carry,

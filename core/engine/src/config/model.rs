@@ -17,6 +17,8 @@ pub struct Model {
     pub parent: Option<String>,
     /// Effects in order.
     pub effects: Vec<EffectEntry>,
+    /// Effects that are not in the file but are to be tried beside it.
+    pub candidates: Vec<EffectEntry>,
 }
 
 /// One `[[effect]]`.
@@ -99,6 +101,7 @@ impl Model {
             revision: file.model.revision,
             parent: file.model.parent,
             effects: file.effect,
+            candidates: Vec::new(),
         })
     }
 }
