@@ -71,7 +71,11 @@ pub struct Coefficient {
     /// What else it may be; declared in place of `responses` by a [`crate::Setup::candidate`].
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub variants: Vec<Variant>,
-    /// A process of the mission's noise whose amplitude the coefficient multiplies; such a coefficient has no responses.
+    /// What it may do for a short while, at a time that is to be found; declared by a [`crate::Setup::candidate`].
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub transients: Vec<Transient>,
+    /// A process of the mission's noise whose amplitude the coefficient multiplies, 1 for as the mission has it; such a coefficient
+    /// has no responses.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub noise: String,
 }
@@ -103,6 +107,23 @@ pub struct Variant {
     pub shape: Shape,
     /// How it acts.
     pub responses: Vec<Response>,
+    /// Unit of the coefficient, where it is not that of the others.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unit: Option<String>,
+    /// Its physical range, lower and upper end, where it is not that of the others.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub range: Option<[f64; 2]>,
+}
+
+/// Something short that begins at an unknown time: a hit, a glitch.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Transient {
+    /// Values of the shape parameters, all but `at_ns`, which the host finds: Unix ns of the sample in which it begins.
+    pub shape: Shape,
+    /// Its course, one mean per sample from the one in which it begins.
+    pub kernel: Vec<f64>,
+    /// Channels with the factor with which the course acts on each: unit of the channel per unit of kernel and coefficient.
+    pub channels: Vec<(String, f64)>,
 }
 
 impl Default for Coefficient {
@@ -122,6 +143,7 @@ impl Default for Coefficient {
             responses: Vec::new(),
             shape: Shape::new(),
             variants: Vec::new(),
+            transients: Vec::new(),
             noise: String::new(),
         }
     }
