@@ -268,14 +268,14 @@ fn a_saved_state_resumes_to_the_bit() {
         readout_m: [&r[0], &r[1], &r[2]],
         u_m_s2: [&u[0], &u[1], &u[2]],
         regressors: (0..9)
-                .map(|c| Regressor {
-                    coefficient: Factor::Estimated(c / 3),
-                    times: Factor::Fixed(1.0),
-                    factor: 1.0,
-                    axis: c % 3,
-                    column: phi[c].as_slice(),
-                })
-                .collect(),
+            .map(|c| Regressor {
+                coefficient: Factor::Estimated(c / 3),
+                times: Factor::Fixed(1.0),
+                factor: 1.0,
+                axis: c % 3,
+                column: phi[c].as_slice(),
+            })
+            .collect(),
     };
     let fresh = || Tracker::new(Akf::new(model.clone(), gated()).expect("16 states"), 60.0);
     let bytes = |t: &Tracker| {

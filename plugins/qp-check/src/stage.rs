@@ -145,14 +145,12 @@ impl Linked {
         let model = noise_model(&stage.mission, &channels, rate_hz)?;
         let length = longest_length((stage.segment_s * rate_hz).round() as usize);
         let analyser = Analyser::new(Plan::new(length, rate_hz), &layout);
-        let seen_as_mean = |s: usize| {
-            layout.regressors.iter().any(|r| r.series == s && measured[r.channel] == Measured::Differenced)
-        };
+        let seen_as_mean =
+            |s: usize| layout.regressors.iter().any(|r| r.series == s && measured[r.channel] == Measured::Differenced);
         let averaged = std::iter::repeat_n(false, layout.channels.len())
             .chain((0..layout.series.len()).map(seen_as_mean))
             .collect();
-        let names: Vec<String> =
-            channels.iter().map(|c| c.name.clone()).chain(layout.series.iter().cloned()).collect();
+        let names: Vec<String> = channels.iter().map(|c| c.name.clone()).chain(layout.series.iter().cloned()).collect();
         Ok(Self {
             signature: format!("{} in segments of {length} samples at {rate_hz} Hz", names.join(", ")),
             columns,
