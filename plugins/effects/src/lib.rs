@@ -5,6 +5,37 @@
 
 pub mod com_offset;
 
+mod actuators;
+#[cfg(test)]
+mod bench;
+mod geometry;
+mod linear;
+mod readout;
+mod stiffness;
+mod sunlight;
+
 pub use com_offset::ComOffset;
 
-dragfree_sdk::export_plugin!(effects: [ComOffset]);
+use actuators::{EsCrosstalk, EsGain, MpsGain, MpsTilt, TorqueGain};
+use geometry::{OffsetDrift, OpeningAngle};
+use readout::{IsCrosstalk, IsScale, TiltToLength, TimeOffset};
+use stiffness::{CrossStiffness, Stiffness};
+use sunlight::SolarPressure;
+
+dragfree_sdk::export_plugin!(effects: [
+    ComOffset,
+    CrossStiffness,
+    EsCrosstalk,
+    EsGain,
+    IsCrosstalk,
+    IsScale,
+    MpsGain,
+    MpsTilt,
+    OffsetDrift,
+    OpeningAngle,
+    SolarPressure,
+    Stiffness,
+    TiltToLength,
+    TimeOffset,
+    TorqueGain,
+]);

@@ -1,0 +1,240 @@
+//! Geometry that is not the mission file's, or changes: `opening-angle`, `offset-drift`.
+
+use dragfree_physics::mission::Mission;
+use dragfree_sdk::prelude::*;
+use nalgebra::{Matrix3, Vector3};
+
+use crate::linear::{
+    Driver, Form, Linear, Part, Recipe, Series, Source, Term, accel, offset_terms, push, sc_axis, tm_axis, tm_name,
+};
+
+const OPENING_RAD: [f64; 2] = [-0.02, 0.02];
+const RATE_M_S: [f64; 2] = [-2e-7, 2e-7];
+const PER_KELVIN_M: [f64; 2] = [-2e-4, 2e-4];
+/// A kilogram a metre and a half from the centre of a spacecraft of 1500 kg moves it by a millimetre.
+const PER_KILOGRAM_M: [f64; 2] = [-2e-2, 2e-2];
+
+const fn manifest(
+    id: &'static str,
+    description: &'static str,
+    instances: &'static [&'static str],
+    needs: &'static [&'static str],
+    parameters: &'static [Parameter],
+) -> Manifest {
+    let (version, licence) = (env!("CARGO_PKG_VERSION"), "MIT OR Apache-2.0");
+    Manifest { id, version, licence, description, parameters, instances, needs }
+}
+
+/// `opening-angle`: ORF of a test mass is turned by `δ` about `s_3` beyond the mission file's angle, housing, electrodes and
+/// optical bench together.
+///
+/// All that comes to the test mass by `T_S^O` turns: `T → R_z(δ) T`, and with `a = −T (F_T + F_SRP)/m_S + Φ b` in the mission
+/// file's ORF the channels gain `δ (a_y, −a_x, 0)`. δ: rad, ±0.02.
+///
+/// **Held** is where the housing is in the spacecraft: the coefficients `b` of the model stay its components in the mission
+/// file's ORF, `T b^S`. Electrodes push along their own axes as commanded; their recoil, 1e-3 of it, is left out. Confounders:
+/// `mps-tilt:sc.z` turns the thrust for both test masses alike.
+#[derive(Debug)]
+pub(crate) struct OpeningAngleRecipe(usize);
+
+/// See [`OpeningAngleRecipe`].
+pub(crate) type OpeningAngle = Linear<OpeningAngleRecipe>;
+
+impl Recipe for OpeningAngleRecipe {
+    const MANIFEST: Manifest = manifest(
+        "opening-angle",
+        "The optical frame of a test mass is turned about s_3 beyond the mission file's angle",
+        &["tm1", "tm2"],
+        &["commands"],
+        &[],
+    );
+
+    fn new(setup: &Setup) -> Result<Self, PluginError> {
+        Ok(Self(tm_axis(setup.instance()).0))
+    }
+
+    fn parts(&self, mission: &Mission, available: &Available) -> Result<Vec<Part>, PluginError> {
+        let tm = self.0;
+        let t = mission.test_mass(&tm_name(tm), "the effect opening-angle")?.dcm_orf_from_srf();
+        // dR_z/dδ at 0.
+        let turning = Matrix3::new(0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0);
+        let per_newton = turning * t / -mission.spacecraft.mass_kg;
+        let mut terms = Vec::new();
+        for axis in 0..3 {
+            let column: Vector3<f64> = per_newton.column(axis).into();
+            terms.extend(push(tm, &Series::Column(Source::thrust(axis)), &column));
+            if let Some(sunlight) = &mission.solar_pressure {
+                terms.extend(push(tm, &Series::Column(Source::sun(axis)), &(column * sunlight.force_n)));
+            }
+        }
+        for (row, from, factor) in [(0, 1, 1.0), (1, 0, -1.0)] {
+            for (column, times) in offset_terms(available, tm, from) {
+                terms.push(Term {
+                    channel: accel(tm, row),
+                    series: Series::Column(column),
+                    factor,
+                    times: Some(times),
+                });
+            }
+        }
+        Ok(Part::only("rad", OPENING_RAD, terms))
+    }
+}
+
+/// `offset-drift`: both housings wander along an axis `e` of SRF as the centre of mass moves, `b_i^S(t) = b_i^S + k s(t) e`.
+///
+/// `z_i = −k s T_S^{O_i} (α̂ × e)`, eq:TM_SC_relative_acceleration; the terms in `ω²`, 1e-13 s⁻², and `b̈` and `2ω×ḃ`, below
+/// 1e-15 m s⁻², are left out. What `s` is, the parameter `with` says:
+/// * `time`: seconds from `since_ns`, by default from the first epoch of the run. k: m s⁻¹, ±2e-7. The offset of the model is then
+///   that at this time: runs of several days add up in one solution only if all of them state the same `since_ns`.
+/// * `hk.NAME`: a housekeeping column in K, what it has gained since its first value. k: m K⁻¹, ±2e-4. The offset is that at the
+///   first value.
+/// * a column in kg, what it has **lost** since its first value, as propellant spent. k: m kg⁻¹, ±2e-2.
+///
+/// The critic tries time and every such column. Confounders: each other, as all that is slow resembles a drift within a day.
+#[derive(Debug)]
+pub(crate) struct OffsetDriftRecipe {
+    axis: usize,
+    with: String,
+    since_ns: Option<i64>,
+    candidate: bool,
+}
+
+/// See [`OffsetDriftRecipe`].
+pub(crate) type OffsetDrift = Linear<OffsetDriftRecipe>;
+
+const TIME: &str = "time";
+
+impl Recipe for OffsetDriftRecipe {
+    const MANIFEST: Manifest = manifest(
+        "offset-drift",
+        "The centre of mass moves along an axis, with time, a temperature or the propellant spent",
+        &["sc.x", "sc.y", "sc.z"],
+        &[],
+        &[
+            Parameter::text(
+                "with",
+                TIME,
+                &[],
+                "what the offset follows: `time`, or a housekeeping column `hk.NAME` in K or kg",
+            ),
+            Parameter::i64(
+                "since_ns",
+                "ns",
+                0,
+                0..=i64::MAX,
+                "Unix time from which the drift counts; 0 is the first epoch of the run, other runs then cannot be added",
+            ),
+        ],
+    );
+
+    fn new(setup: &Setup) -> Result<Self, PluginError> {
+        Ok(Self {
+            axis: sc_axis(setup.instance()),
+            with: setup.text("with")?,
+            since_ns: Some(setup.i64("since_ns")?).filter(|ns| *ns != 0),
+            candidate: setup.candidate(),
+        })
+    }
+
+    fn parts(&self, mission: &Mission, available: &Available) -> Result<Vec<Part>, PluginError> {
+        let forms = if self.candidate {
+            let followed = available
+                .columns
+                .iter()
+                .filter(|c| c.table == "grid" && c.name.starts_with("hk.") && ["K", "kg"].contains(&c.unit.as_str()));
+            std::iter::once(TIME).chain(followed.map(|c| c.name.as_str())).collect()
+        } else {
+            vec![self.with.as_str()]
+        };
+        let forms = forms.into_iter().map(|with| self.form(with, mission, available)).collect::<Result<_, _>>()?;
+        Ok(vec![Part { name: "", forms }])
+    }
+}
+
+impl OffsetDriftRecipe {
+    fn form(&self, with: &str, mission: &Mission, available: &Available) -> Result<Form, PluginError> {
+        let (driver, product, unit, range) = if with == TIME {
+            (Driver::Time(self.since_ns), "rad s-1", "m s-1", RATE_M_S)
+        } else {
+            let column = available.column("grid", with).filter(|_| with.starts_with("hk."));
+            match column.map(|c| (c, c.unit.as_str())) {
+                Some((c, "K")) => {
+                    (Driver::Growth { column: Source::of(c, "K"), lost: false }, "rad K s-2", "m K-1", PER_KELVIN_M)
+                }
+                Some((c, "kg")) => {
+                    (Driver::Growth { column: Source::of(c, "kg"), lost: true }, "rad kg s-2", "m kg-1", PER_KILOGRAM_M)
+                }
+                found => {
+                    return Err(PluginError::error(format!(
+                        "effect offset-drift: with = \"{with}\" is {}; give \"time\", or a housekeeping column hk.NAME in K or kg",
+                        found.map_or("no column of the telemetry".to_owned(), |(_, unit)| format!("in {unit}"))
+                    )));
+                }
+            }
+        };
+        let mut terms = Vec::new();
+        for tm in 0..2 {
+            let Some(test_mass) = mission.test_mass.get(&tm_name(tm)) else { continue };
+            let t = test_mass.dcm_orf_from_srf();
+            for j in (0..3).filter(|j| *j != self.axis) {
+                // −e_j × e, for a unit of α̂ about j.
+                let unit = |axis: usize| Vector3::from_fn(|i, _| f64::from(i == axis));
+                let per_turn: Vector3<f64> = -t * unit(j).cross(&unit(self.axis));
+                terms.extend(push(tm, &Series::Times(Source::alpha(j), driver.clone(), product), &per_turn));
+            }
+        }
+        let shape = Shape::from([("with".to_owned(), with.into())]);
+        Ok(Form::new(shape, unit, range, terms))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::bench::{Bench, ELAPSED_S, Wrong};
+    use crate::linear::AXES;
+
+    /// The housing stays where it is in the spacecraft; its axes turn.
+    #[test]
+    fn a_turned_frame_turns_all_that_comes_through_it() {
+        for tm in 0..2 {
+            let bench = Bench { electrodes: false, ..Bench::new() };
+            let instance = format!("tm{}", tm + 1);
+            bench.check::<OpeningAngleRecipe>(&instance, "", &[&|w, angle| w.opening_rad[tm] += angle]);
+        }
+    }
+
+    #[test]
+    fn an_offset_that_wanders_acts_by_what_it_has_wandered() {
+        for axis in 0..3 {
+            let instance = format!("sc.{}", AXES[axis]);
+            let time = |w: &mut Wrong, rate: f64| w.offset_srf_m[axis] += rate * ELAPSED_S;
+            Bench::new().check::<OffsetDriftRecipe>(&instance, r#""with": "time", "since_ns": 0"#, &[&time]);
+            // Fuel that is spent counts positive.
+            let bench = Bench { gained_kg: -2.3, ..Bench::new() };
+            let spent = |w: &mut Wrong, beta: f64| w.offset_srf_m[axis] += beta * 2.3;
+            bench.check::<OffsetDriftRecipe>(&instance, r#""with": "hk.fuel_kg", "since_ns": 0"#, &[&spent]);
+        }
+    }
+
+    #[test]
+    fn a_candidate_tries_time_and_every_column_of_a_unit_that_moves_masses() {
+        let bench = Bench::new();
+        let recipe = OffsetDriftRecipe { axis: 0, with: TIME.to_owned(), since_ns: None, candidate: true };
+        let parts = recipe.parts(&bench.mission, &bench.available()).unwrap();
+        let forms: Vec<_> =
+            parts[0].forms.iter().map(|f| (f.shape["with"].as_str().unwrap(), f.unit.as_str())).collect();
+        assert_eq!(forms, [("time", "m s-1"), ("hk.fuel_kg", "m kg-1")]);
+    }
+
+    #[test]
+    fn a_column_that_moves_no_mass_is_refused_by_name() {
+        let bench = Bench::new();
+        for (with, why) in [("hk.bus_v", "in V"), ("hk.nothing", "no column"), ("tm1.r_orf_m.x", "no column")] {
+            let recipe = OffsetDriftRecipe { axis: 0, with: with.to_owned(), since_ns: None, candidate: false };
+            let error = recipe.parts(&bench.mission, &bench.available()).unwrap_err();
+            assert!(error.message().contains(with) && error.message().contains(why), "{}", error.message());
+        }
+    }
+}
