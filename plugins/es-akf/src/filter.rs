@@ -32,7 +32,8 @@ use crate::state::{Bytes, StateError, Words};
 pub enum Adaptation {
     /// The paper's proposal: eqs Final_AKF_Q_K and Final_AKF_R_k.
     Monotone,
-    /// eqs sage_husa_Q_update and sage_husa_R_update; diverges on quiet data within days.
+    /// eqs sage_husa_Q_update and sage_husa_R_update. The paper calls it unstable; in a trial of one seed over three days, without
+    /// repairs, it lost the z axis after 2.2 days.
     Innovation,
     /// eqs residual_Q_update and residual_R_update.
     Residual,

@@ -1,6 +1,7 @@
 //! Time per epoch of the whole stage behind the border, replay of the control law included.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use dragfree_hinf_dfacs::asked::Needs;
 use dragfree_hinf_dfacs::pilot::Scale;
 use dragfree_hinf_dfacs::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Settings};
 use dragfree_physics::mission::Mission;
@@ -14,7 +15,12 @@ fn stage(criterion: &mut Criterion) {
     const EPOCHS: u64 = 4096;
     let mut group = criterion.benchmark_group("hinf-dfacs");
     group.throughput(Throughput::Elements(EPOCHS));
-    for replay in [true, false] {
+    let everything = Needs { commands: true, torque_response: true, dws_delay_response: true };
+    for (name, replay, needs) in [
+        ("with replay", true, Needs::default()),
+        ("without replay", false, Needs::default()),
+        ("without replay, every column on demand", false, everything),
+    ] {
         let settings = Settings {
             rate_hz: 10.0,
             angular_acceleration: AngularAcceleration::Smoother,
@@ -23,11 +29,12 @@ fn stage(criterion: &mut Criterion) {
             replay,
             warm_up_s: 600.0,
             scale: Scale::nominal(),
+            needs,
         };
         let mut reconstruction = Reconstruction::new(&mission, &settings).expect("the fixture is complete");
         let mut rows = Vec::new();
         let mut k = 0_i64;
-        group.bench_function(if replay { "with replay" } else { "without replay" }, |b| {
+        group.bench_function(name, |b| {
             b.iter(|| {
                 for _ in 0..EPOCHS {
                     let wiggle = (k % 97) as f64 * 1e-11;

@@ -2,6 +2,7 @@
 //! nine channels (Section IV; ARCHITECTURE.md, table `reconstruction`).
 
 mod acting;
+pub mod asked;
 mod bridge;
 pub mod known;
 pub mod pilot;

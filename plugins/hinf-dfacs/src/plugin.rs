@@ -5,6 +5,7 @@ use dragfree_sdk::prelude::*;
 use nalgebra::Vector3;
 use serde_json::json;
 
+use crate::asked::Needs;
 use crate::pilot::{self, Scale};
 use crate::reconstruction::{AngularAcceleration, Epoch, ROW, Reconstruction, Row, Settings, levels_of};
 use crate::replay::{COMMAND_VECTORS, Comparison};
@@ -16,7 +17,7 @@ const INNOVATION_TOLERANCE: f64 = 0.1;
 /// Standard deviations of the innovations' correlation with rebuilt commands above which the commands are not those that
 /// acted; a false alarm in 2e-6 of all runs.
 const DISOBEDIENCE: f64 = 5.0;
-const STATE: &[u8; 8] = b"dfacs/5\n";
+const STATE: &[u8; 8] = b"dfacs/6\n";
 const AXES: [&str; 3] = ["x", "y", "z"];
 const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
 
@@ -27,6 +28,7 @@ pub struct HinfDfacs {
     compare_commands: bool,
     measure_noise: bool,
     warm_up_s: f64,
+    needs: Needs,
     linked: Option<Linked>,
     notes: Vec<String>,
 }
@@ -238,8 +240,12 @@ impl Linked {
 
     fn give(&mut self, output: &mut Outputs) {
         output.time(self.table).extend(self.rows.iter().map(|row| row.time_ns));
-        for (i, column) in self.out.iter().enumerate() {
+        let (always, asked) = self.out.split_at(ROW);
+        for (i, column) in always.iter().enumerate() {
             output.f64(*column).extend(self.rows.iter().map(|row| row.values[i]));
+        }
+        for (i, column) in asked.iter().enumerate() {
+            output.f64(*column).extend(self.rows.iter().map(|row| row.asked[i]));
         }
         self.rows.clear();
     }
@@ -322,6 +328,11 @@ impl Stage for HinfDfacs {
             compare_commands: setup.bool("compare_commands")?,
             measure_noise: setup.bool("measure_noise")?,
             warm_up_s: setup.f64("warm_up_s")?,
+            needs: Needs {
+                commands: setup.needs("commands"),
+                torque_response: setup.needs("torque-response"),
+                dws_delay_response: setup.needs("dws-delay-response"),
+            },
             linked: None,
             notes: Vec::new(),
         })
@@ -362,12 +373,23 @@ impl Stage for HinfDfacs {
             replay: false,
             warm_up_s: self.warm_up_s,
             scale: Scale::nominal(),
+            needs: self.needs,
         };
         let all_readouts = readout.iter().all(Option::is_some);
         let reconstruction = self.reconstruction(&settings, all_readouts)?;
         let smoother = self.angular_acceleration == AngularAcceleration::Smoother;
+        if self.needs.responses() && !smoother {
+            return Err(PluginError::error(
+                "hinf-dfacs: an effect of the model asks for derivatives of the smoothed angular acceleration, which is not made; \
+                 set angular_acceleration = \"smoother\", or take that effect (of a torque, or of a delay of the wavefront sensing) \
+                 out of the model",
+            ));
+        }
         let table = link.table("reconstruction", rate_hz);
-        let out = write_columns(link, table, noise_x)?;
+        let mut out = write_columns(link, table, noise_x)?;
+        for (name, unit, frame) in reconstruction.asked_columns() {
+            out.push(link.write_with(table, &name, unit, frame, &[("kind", "series")])?);
+        }
         self.linked = Some(Linked {
             reconstruction,
             settings,
@@ -533,7 +555,7 @@ impl Stage for HinfDfacs {
     fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
         let mut reader = Reader::new(state);
         if reader.bytes().ok().as_ref() != Some(STATE) {
-            return Err(StateError::Foreign { expected: "version 5" }.into());
+            return Err(StateError::Foreign { expected: "version 6" }.into());
         }
         let waits = reader.flag()?;
         let mut numbers = [0.0; 4];

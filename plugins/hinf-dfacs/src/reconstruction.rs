@@ -6,6 +6,7 @@ use dragfree_physics::thrust_noise::ThrustNoise;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::acting::Acting;
+use crate::asked::{Asked, Given, Needs};
 use crate::bridge::{LONGEST, bridge};
 use crate::known::{KnownModel, KnownMotion};
 use crate::pilot::Scale;
@@ -14,7 +15,7 @@ use crate::smoother::{Model, Smoothed, Smoother};
 use crate::state::{Reader, StateError, Writer};
 
 const NEEDED_BY: &str = "hinf-dfacs";
-const STATE: &[u8; 8] = b"dfacs/4\n";
+const STATE: &[u8; 8] = b"dfacs/5\n";
 
 /// Where the angular acceleration comes from. Only the smoother gives an unbiased calibration (physics.md §4).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -44,6 +45,8 @@ pub struct Settings {
     pub warm_up_s: f64,
     /// Levels of the noise against the mission file.
     pub scale: Scale,
+    /// Columns on demand.
+    pub needs: Needs,
 }
 
 /// Telemetry at `t_k`; NaN where there is none.
@@ -103,12 +106,14 @@ pub const CHANNELS_AT: usize = 18;
 
 /// A row: `α̂` (3), `ω̂` (3), `r_1` (3), `û_1` (3), `r_2` (3), `û_2` (3), then the channels `tm1.accel` (3),
 /// `tm2.accel` (3) and `sc.alpha` (3).
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Row {
     /// Unix ns.
     pub time_ns: i64,
     /// Values, NaN where there is none.
     pub values: [f64; ROW],
+    /// Values of the columns on demand, in the order of [`Reconstruction::asked_columns`].
+    pub asked: Vec<f64>,
 }
 
 /// What happened to how many epochs.
@@ -212,6 +217,8 @@ pub struct Reconstruction {
     since_attitude: f64,
     /// The epoch before the first pending one.
     previous: Option<Pending>,
+    /// `None` where nothing is asked for.
+    asked: Option<Asked>,
     counts: Counts,
 }
 
@@ -273,11 +280,14 @@ impl Reconstruction {
         } else {
             None
         };
+        let push_per_turn = [push_per_turn("tm1")?, push_per_turn("tm2")?];
+        let asked = || Asked::new(settings.needs, mission.spacecraft.inertia_inverse(), push_per_turn);
         Ok(Self {
             rate_hz: settings.rate_hz,
             angular_acceleration: settings.angular_acceleration,
             needs_sun: settings.sun && mission.solar_pressure.is_some(),
-            push_per_turn: [push_per_turn("tm1")?, push_per_turn("tm2")?],
+            push_per_turn,
+            asked: (settings.needs != Needs::default()).then(asked),
             known: KnownModel::new(mission)?,
             smoother: Smoother::new(model),
             replay,
@@ -367,6 +377,10 @@ impl Reconstruction {
         self.emit(self.pending.len(), rows);
     }
 
+    fn needs(&self) -> Needs {
+        self.asked.as_ref().map(Asked::needs).unwrap_or_default()
+    }
+
     fn known_motion(
         &mut self,
         epoch: &Epoch,
@@ -401,17 +415,21 @@ impl Reconstruction {
             self.counts.commands_of_one_test_mass += 1;
         }
         let thrust = self.acting.act(told.as_ref().and_then(|numbers| numbers.first_chunk().copied()));
-        let command = told.zip(thrust).map(|(mut numbers, thrust)| {
+        let acting = told.zip(thrust).map(|(mut numbers, thrust)| {
             numbers[..6].copy_from_slice(&thrust);
-            command_from(&numbers)
+            numbers
         });
+        if let Some(asked) = &mut self.asked {
+            asked.take(acting.as_ref(), silent, self.sun_srf);
+        }
         if self.needs_sun && self.sun_srf.is_none() {
             self.counts.sun_missing += 1;
             return Ok(None);
         }
         let readout = self.held.test_masses();
-        Ok(command.map(|c| {
-            let mut motion = self.known.motion(&c, self.sun_srf.as_ref(), &readout, omega_srf_rad_s);
+        Ok(acting.map(|numbers| {
+            let command = command_from(&numbers);
+            let mut motion = self.known.motion(&command, self.sun_srf.as_ref(), &readout, omega_srf_rad_s);
             if let Some(tm) = silent {
                 motion.u_orf_m_s2[tm] = Vector3::from_element(f64::NAN);
             }
@@ -420,16 +438,33 @@ impl Reconstruction {
     }
 
     fn emit(&mut self, count: usize, rows: &mut Vec<Row>) {
-        let smoothed = self.smoother.smooth(count);
+        let delay = self.asked.as_ref().is_some_and(|asked| asked.needs().dws_delay_response);
+        let mut smoothed = self.smoother.smoothed(if delay { self.pending.len() } else { count });
+        let alpha_crf = |(p, s): (&Pending, &Smoothed)| p.alpha_known_rad_s2 - p.frame_rad_s2 + s.disturbance_rad_s2;
+        let alpha_crf_rad_s2: Vec<_> = self.pending.iter().zip(&smoothed).filter(|_| delay).map(alpha_crf).collect();
+        smoothed.truncate(count);
         for (pending, smoothed) in self.pending.iter_mut().zip(&smoothed) {
             for (u, push) in pending.u_orf_m_s2.iter_mut().zip(&self.push_per_turn) {
                 *u += push * smoothed.noise_rad_s2;
             }
         }
         let blind = self.blind(smoothed.len());
+        let known = |v: &Vector3<f64>| v.iter().all(|x| x.is_finite());
+        let given = |(p, blind): (&Pending, &bool)| Given {
+            alpha: known(&p.alpha_known_rad_s2) && !blind,
+            u: p.u_orf_m_s2.each_ref().map(known),
+        };
+        let mut asked = Vec::new();
+        if let Some(columns) = &mut self.asked {
+            let leaving: Vec<Given> = self.pending.iter().zip(&blind).map(given).collect();
+            asked = columns.give(&self.smoother, &leaving, &alpha_crf_rad_s2);
+        }
+        self.smoother.release(count);
+        let mut asked = asked.into_iter();
         rows.reserve(smoothed.len());
         for (k, (smoothed, blind)) in smoothed.iter().zip(blind).enumerate() {
-            rows.push(self.row(k, smoothed, blind));
+            let row = self.row(k, smoothed, blind);
+            rows.push(Row { asked: asked.next().unwrap_or_default(), ..row });
         }
         if let Some(last) = smoothed.len().checked_sub(1) {
             self.previous = Some(self.pending[last]);
@@ -493,7 +528,13 @@ impl Reconstruction {
         let omega = smoothed.omega_crf_rad_s + now.omega_ci_rad_s;
         let vectors =
             [alpha, omega, now.r_orf_m[0], now.u_orf_m_s2[0], now.r_orf_m[1], now.u_orf_m_s2[1], tm1, tm2, sc];
-        Row { time_ns: now.time_ns, values: std::array::from_fn(|i| vectors[i / 3][i % 3]) }
+        Row { time_ns: now.time_ns, values: std::array::from_fn(|i| vectors[i / 3][i % 3]), asked: Vec::new() }
+    }
+
+    /// Name, unit and frame of the columns on demand.
+    #[must_use]
+    pub fn asked_columns(&self) -> Vec<(String, &'static str, &'static str)> {
+        self.asked.as_ref().map(Asked::columns).unwrap_or_default()
     }
 
     /// What happened to how many epochs.
@@ -560,6 +601,10 @@ impl Reconstruction {
             out.time(pending.time_ns);
             out.numbers(&pending.numbers());
         }
+        self.needs().flags().into_iter().for_each(|flag| out.flag(flag));
+        if let Some(asked) = &self.asked {
+            asked.save(&mut out);
+        }
         out.0
     }
 
@@ -570,7 +615,7 @@ impl Reconstruction {
     pub fn load(&mut self, bytes: &[u8]) -> Result<(), StateError> {
         let mut state = Reader::new(bytes);
         if state.bytes().ok().as_ref() != Some(STATE) {
-            return Err(StateError::Foreign { expected: "version 4" });
+            return Err(StateError::Foreign { expected: "version 5" });
         }
         self.smoother.load(&mut state)?;
         self.held.load(&mut state)?;
@@ -603,6 +648,15 @@ impl Reconstruction {
         self.pending.clear();
         for _ in 0..self.smoother.waiting() {
             self.pending.push(Pending::load(&mut state)?);
+        }
+        let needs = self.needs();
+        for flag in needs.flags() {
+            if state.flag()? != flag {
+                return Err(state.damaged("it is of a model whose effects ask for other columns"));
+            }
+        }
+        if let Some(asked) = &mut self.asked {
+            asked.load(self.smoother.waiting(), &mut state)?;
         }
         state.end()
     }

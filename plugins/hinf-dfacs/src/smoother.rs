@@ -151,6 +151,40 @@ struct Step {
     cut: bool,
 }
 
+/// What the filter made of the data up to one epoch.
+#[derive(Clone, Copy, Debug)]
+struct Seen {
+    /// Predicted ω and β.
+    predicted: [Axes; 2],
+    /// Innovation over its variance; zero without a readout.
+    weighted_innovation: Axes,
+}
+
+/// An angular acceleration, SRF.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Turn {
+    /// Held over `[t_k, t_{k+1})`, rad s⁻².
+    pub held_rad_s2: Vector3<f64>,
+    /// All at once at `t_k`, rad s⁻¹.
+    pub kick_rad_s: Vector3<f64>,
+}
+
+/// State of [`Smoother::answer`]: predicted θ, ω, β at the oldest waiting epoch.
+#[derive(Clone, Debug, Default)]
+pub struct Answer {
+    mean: [Axes; 3],
+}
+
+impl Answer {
+    pub(crate) fn save(&self, out: &mut Writer) {
+        out.numbers(self.mean.as_flattened());
+    }
+
+    pub(crate) fn load(&mut self, state: &mut Reader<'_>) -> Result<(), StateError> {
+        state.numbers(self.mean.as_flattened_mut())
+    }
+}
+
 /// Whether the attitude does what the known accelerations say: a score test for their gain.
 ///
 /// An innovation knows all that was known before it, so it is uncorrelated with every earlier command, whatever the loop
@@ -306,6 +340,70 @@ impl Smoother {
 
     /// Smooths the `count` oldest waiting epochs with all the data so far, and lets them go.
     pub fn smooth(&mut self, count: usize) -> Vec<Smoothed> {
+        let out = self.smoothed(count);
+        self.release(count);
+        out
+    }
+
+    /// What all the data so far say about the `count` oldest waiting epochs.
+    #[must_use]
+    pub fn smoothed(&self, count: usize) -> Vec<Smoothed> {
+        self.backward(count, |k| {
+            let step = &self.steps[k];
+            Seen { predicted: step.predicted, weighted_innovation: step.weighted_innovation }
+        })
+    }
+
+    /// Lets the `count` oldest waiting epochs go.
+    pub fn release(&mut self, count: usize) {
+        self.steps.drain(..count.min(self.steps.len()));
+    }
+
+    /// By how much [`Self::smoothed`] of the `count` oldest waiting epochs would differ if more were known of the acceleration:
+    /// `more(k)` for the epoch that `k` others wait before. `state` goes from the oldest waiting epoch to the one after `count`.
+    ///
+    /// The smoother is linear in attitude and known acceleration, and its gains depend only on which epochs have any; so the
+    /// difference is what it makes of that acceleration alone, with an attitude of zero where there is one.
+    pub fn answer(&self, state: &mut Answer, count: usize, more: impl Fn(usize) -> Turn) -> Vec<Smoothed> {
+        let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
+        let principal = |v: &Vector3<f64>| self.model.srf_from_principal.tr_mul(v);
+        let mut mean = state.mean;
+        let mut seen = Vec::with_capacity(self.steps.len());
+        for (k, step) in self.steps.iter().enumerate() {
+            if k == count {
+                state.mean = mean;
+            }
+            let mut now = Seen { predicted: [mean[1], mean[2]], weighted_innovation: [0.0; 3] };
+            let turn = more(k);
+            let (kick, held) = (principal(&turn.kick_rad_s), principal(&turn.held_rad_s2));
+            for i in 0..3 {
+                let (miss, gain) = (mean[0][i], step.gain.map(|k| k[i]));
+                // Over the innovation's variance F, from K_ω = P_ωθ/F. At the very start P_ωθ is zero, and so is what is missed.
+                let omega_theta = step.covariance[0][i];
+                if omega_theta != 0.0 {
+                    now.weighted_innovation[i] = -miss * (gain[1] / omega_theta);
+                }
+                for (state, k) in gain.into_iter().enumerate() {
+                    mean[state][i] -= k * miss;
+                }
+                let push = mean[2][i] + held[i];
+                let omega = mean[1][i] + kick[i];
+                mean[0][i] += dt * omega + half * push;
+                mean[1][i] = omega + dt * push;
+            }
+            if step.cut {
+                mean = [[0.0; 3], [0.0; 3], mean[2]];
+            }
+            seen.push(now);
+        }
+        if count >= self.steps.len() {
+            state.mean = mean;
+        }
+        self.backward(count, |k| seen[k])
+    }
+
+    /// The adjoint recursion over all waiting epochs, and what it gives for the `count` oldest.
+    fn backward(&self, count: usize, seen: impl Fn(usize) -> Seen) -> Vec<Smoothed> {
         let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
         let count = count.min(self.steps.len());
         let srf = |v: Axes| self.model.srf_from_principal * Vector3::from(v);
@@ -313,6 +411,7 @@ impl Smoother {
         let mut out = vec![Smoothed { disturbance_rad_s2: zero, noise_rad_s2: zero, omega_crf_rad_s: zero }; count];
         let mut adjoint = [[0.0; 3]; 3];
         for (k, step) in self.steps.iter().enumerate().rev() {
+            let Seen { predicted, weighted_innovation } = seen(k);
             let mut noise = [0.0; 3];
             for i in 0..3 {
                 let [r0, r1, r2] = [adjoint[0][i], adjoint[1][i], adjoint[2][i]];
@@ -321,15 +420,15 @@ impl Smoother {
                 // s = Aᵀ r, then r ← s − Hᵀ K·s + Hᵀ v/F.
                 let [s0, s1, s2] = if step.cut { [0.0, 0.0, r2] } else { [r0, dt * r0 + r1, pushed + r2] };
                 let corrected = step.gain[0][i] * s0 + step.gain[1][i] * s1 + step.gain[2][i] * s2;
-                adjoint[0][i] = s0 - corrected + step.weighted_innovation[i];
+                adjoint[0][i] = s0 - corrected + weighted_innovation[i];
                 adjoint[1][i] = s1;
                 adjoint[2][i] = s2;
             }
             if k < count {
                 let [wt, ww, wb, bt, bb] = step.covariance;
                 let [s0, s1, s2] = adjoint;
-                let beta = |i: usize| step.predicted[1][i] + bt[i] * s0[i] + wb[i] * s1[i] + bb[i] * s2[i];
-                let omega = |i: usize| step.predicted[0][i] + wt[i] * s0[i] + ww[i] * s1[i] + wb[i] * s2[i];
+                let beta = |i: usize| predicted[1][i] + bt[i] * s0[i] + wb[i] * s1[i] + bb[i] * s2[i];
+                let omega = |i: usize| predicted[0][i] + wt[i] * s0[i] + ww[i] * s1[i] + wb[i] * s2[i];
                 out[k] = Smoothed {
                     disturbance_rad_s2: srf(std::array::from_fn(|i| beta(i) + noise[i])),
                     noise_rad_s2: srf(noise),
@@ -337,7 +436,6 @@ impl Smoother {
                 };
             }
         }
-        self.steps.drain(..count);
         out
     }
 

@@ -13,7 +13,7 @@ pub enum StateError {
     },
     /// It ends early, or holds more than it should.
     #[error(
-        "state of hinf-dfacs: {what} at byte {at} of {length}; it is damaged, or was saved with another mission file"
+        "state of hinf-dfacs: {what} at byte {at} of {length}; it is damaged, or was saved with another mission or model file"
     )]
     Damaged {
         /// What is wrong.

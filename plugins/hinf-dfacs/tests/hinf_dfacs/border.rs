@@ -96,14 +96,14 @@ fn library() -> Library {
     Library::open(&folder.join(name)).expect("cargo builds the library before its tests")
 }
 
-fn create(library: &Library, parameters: &Value) -> Instance {
+fn create(library: &Library, parameters: &Value, needs: &[&str]) -> Instance {
     let mission: Value = toml::from_str(include_str!("../../../../fixtures/missions/taiji.toml")).expect("TOML");
     let mut all =
         json!({"angular_acceleration": "smoother", "compare_commands": true, "measure_noise": true, "warm_up_s": 60.0});
     for (key, value) in parameters.as_object().expect("an object") {
         all[key] = value.clone();
     }
-    let value = json!({"parameters": all, "mission": mission, "instance": "", "files": []});
+    let value = json!({"parameters": all, "mission": mission, "instance": "", "files": [], "needs": needs});
     let plugin = library.plugins.iter().find(|p| p.kind == Kind::Stage).expect("the library has a stage");
     Instance::create(library, plugin, &Config { value }).expect("the fixture is a mission")
 }
@@ -115,8 +115,12 @@ struct Output {
 }
 
 fn run(grid: &Grid, parameters: &Value, batch_rows: usize) -> Output {
+    run_asked(grid, parameters, batch_rows, &[])
+}
+
+fn run_asked(grid: &Grid, parameters: &Value, batch_rows: usize, needs: &[&str]) -> Output {
     let library = library();
-    let mut stage = create(&library, parameters);
+    let mut stage = create(&library, parameters, needs);
     let linked = stage.link(LinkRequest { available: &grid.columns, model_json: "{}" }).expect("linked");
     stage.activate(65_536).expect("active");
     let [reads] = &linked.reads[..] else { panic!("one table is read") };
@@ -145,9 +149,9 @@ fn run(grid: &Grid, parameters: &Value, batch_rows: usize) -> Output {
     Output { columns: table.columns.clone(), rows, report }
 }
 
-fn link_refusal(grid: &Grid, parameters: &Value) -> String {
+fn link_refusal(grid: &Grid, parameters: &Value, needs: &[&str]) -> String {
     let library = library();
-    let mut stage = create(&library, parameters);
+    let mut stage = create(&library, parameters, needs);
     stage.link(LinkRequest { available: &grid.columns, model_json: "{}" }).expect_err("it must refuse").to_string()
 }
 
@@ -229,19 +233,19 @@ fn it_does_without_what_can_be_missing() {
 
     let angles = Grid::of_the_loop(3000).without("is.tm1.att_orf_rad").without("dws.tm1");
     assert_eq!(run(&angles, &json!({}), 4096).report["commands"], "telemetered");
-    let refusal = link_refusal(&angles.without("command"), &json!({}));
+    let refusal = link_refusal(&angles.without("command"), &json!({}), &[]);
     assert!(refusal.contains("/command") && refusal.contains("replayed"), "{refusal}");
 }
 
 #[test]
 fn what_must_be_there_is_asked_for_by_name() {
-    let refusal = link_refusal(&Grid::of_the_loop(1).without("dws.sc_crf_rad"), &json!({}));
+    let refusal = link_refusal(&Grid::of_the_loop(1).without("dws.sc_crf_rad"), &json!({}), &[]);
     assert!(refusal.contains("dws.sc_crf_rad.phi"), "{refusal}");
-    let refusal = link_refusal(&Grid::of_the_loop(1).without("is.tm2.r_orf_m.z"), &json!({}));
+    let refusal = link_refusal(&Grid::of_the_loop(1).without("is.tm2.r_orf_m.z"), &json!({}), &[]);
     assert!(refusal.contains("is.tm2.r_orf_m.z"), "{refusal}");
     let mut wrong = Grid::of_the_loop(1);
     wrong.columns[0].unit = "deg".to_owned();
-    let refusal = link_refusal(&wrong, &json!({}));
+    let refusal = link_refusal(&wrong, &json!({}), &[]);
     assert!(refusal.contains("deg") && refusal.contains("rad"), "{refusal}");
 }
 
@@ -267,4 +271,45 @@ fn another_controller_is_noticed() {
     assert!(noted.contains("another controller flew"), "{noted}");
     let quiet = run(&grid, &json!({"compare_commands": false}), 4096).report;
     assert!(quiet["quality"].get("command_replay").is_none(), "{quiet}");
+}
+
+/// The columns on demand change nothing of the others, through the stretch that is held back for the levels of the noise and after.
+#[test]
+fn what_is_asked_for_comes_beside_the_rest() {
+    let grid = Grid::of_the_loop(34_000);
+    let usual = run(&grid, &json!({"compare_commands": false}), 4096);
+    for (needs, first, unit, frame, count) in [
+        ("commands", "used.mps_force_srf_n.x", "N", "SRF", 21),
+        ("torque-response", "response.alpha_srf_rad_s2.by_torque_gain.x.x", "rad s-2", "SRF", 9),
+        ("dws-delay-response", "response.alpha_srf_rad_s2.by_dws_delay.x", "rad s-3", "SRF", 3),
+    ] {
+        let asked = run_asked(&grid, &json!({"compare_commands": false}), 4096, &[needs]);
+        assert_eq!(asked.columns[..27], usual.columns);
+        assert_eq!(asked.rows.time_ns, usual.rows.time_ns);
+        let bits = |o: &Output| -> Vec<u64> { o.rows.columns[..27].iter().flatten().map(|v| v.to_bits()).collect() };
+        assert!(bits(&asked) == bits(&usual), "{needs}");
+        let column = &asked.columns[27];
+        assert_eq!((column.name.as_str(), column.unit.as_str(), column.frame.as_str()), (first, unit, frame));
+        assert_eq!((asked.columns.len(), column.attributes["kind"].as_str()), (27 + count, "series"));
+        assert!(
+            asked.rows.columns[27..].iter().all(|c| c.len() == 34_000 && c.iter().all(|x| x.is_finite())),
+            "{needs}"
+        );
+    }
+    let at = |rows: &Grid, name: &str| rows.columns.iter().position(|c| c.name == name).expect("a column");
+    let asked = run_asked(&grid, &json!({"compare_commands": false}), 4096, &["commands"]);
+    for (column, values) in asked.columns.iter().zip(&asked.rows.columns).skip(27) {
+        let told = column.name.replace("used.sun_srf", "ephemeris.sun_srf").replace("used.", "command.");
+        assert_eq!(*values, grid.rows.columns[at(&grid, &told)], "{told}");
+    }
+}
+
+#[test]
+fn a_response_of_what_is_not_made_is_refused() {
+    for needs in ["torque-response", "dws-delay-response"] {
+        let grid = Grid::of_the_loop(1);
+        let refusal = link_refusal(&grid, &json!({"angular_acceleration": "commanded"}), &[needs]);
+        assert!(refusal.contains("angular_acceleration = \"smoother\""), "{refusal}");
+    }
+    run_asked(&Grid::of_the_loop(10), &json!({"angular_acceleration": "commanded"}), 4096, &["commands"]);
 }

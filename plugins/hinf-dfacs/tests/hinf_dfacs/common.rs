@@ -1,5 +1,6 @@
 //! The attitude loop of the paper's spacecraft, with the mission's own control law and the test masses at rest.
 
+use dragfree_hinf_dfacs::asked::Needs;
 use dragfree_hinf_dfacs::known::KnownModel;
 use dragfree_hinf_dfacs::pilot::Scale;
 use dragfree_hinf_dfacs::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Row, Settings};
@@ -10,6 +11,9 @@ use std::sync::OnceLock;
 
 pub(crate) const RATE_HZ: f64 = 10.0;
 pub(crate) const DT_S: f64 = 1.0 / RATE_HZ;
+
+/// Every column on demand.
+pub(crate) const EVERYTHING: Needs = Needs { commands: true, torque_response: true, dws_delay_response: true };
 
 /// The default mission without sunlight, so that nothing but the loop moves the spacecraft, with its controllers designed
 /// once for all tests.
@@ -44,6 +48,7 @@ pub(crate) fn settings(angular_acceleration: AngularAcceleration) -> Settings {
         replay: false,
         warm_up_s: 60.0,
         scale: Scale::nominal(),
+        needs: Needs::default(),
     }
 }
 

@@ -15,7 +15,7 @@ use crate::common::{AttitudeLoop, DT_S, levels, mission, run, settings, stage};
 const QUIET: usize = 40_321;
 const AFTER: usize = 1 << 14;
 
-fn layout() -> Thrusters {
+pub(crate) fn layout() -> Thrusters {
     let text = include_str!("../../../../fixtures/missions/taiji-thrusters.toml");
     let value: serde_json::Value = toml::from_str(text).expect("the fixture is TOML");
     let mission = Mission::from_json(&value.to_string()).expect("the fixture is a mission");

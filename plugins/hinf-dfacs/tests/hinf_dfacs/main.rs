@@ -1,5 +1,6 @@
 //! Tests of the stage, in one program.
 
+mod asked;
 mod border;
 mod common;
 mod correlation;

@@ -17,12 +17,12 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 use realfft::num_complex::Complex64;
 use std::f64::consts::TAU;
 
-const DECADES: [[f64; 2]; 4] = [[1e-3, 1e-2], [1e-2, 1e-1], [1e-1, 1.0], [1.0, 4.9]];
+pub(crate) const DECADES: [[f64; 2]; 4] = [[1e-3, 1e-2], [1e-2, 1e-1], [1e-1, 1.0], [1.0, 4.9]];
 
 /// Truth and `α̂`, axis by axis, from an impulse of torque (inputs 0 to 2) or of readout error (3 to 5).
-struct Response {
-    truth: [Vec<f64>; 3],
-    estimate: [Vec<f64>; 3],
+pub(crate) struct Response {
+    pub(crate) truth: [Vec<f64>; 3],
+    pub(crate) estimate: [Vec<f64>; 3],
 }
 
 /// The covariances settle for over an hour on zeros; then the impulse, in the middle of nowhere of a block.
@@ -53,10 +53,10 @@ fn response(flown: &Mission, told: &Mission, method: AngularAcceleration, input:
 
 /// Truth against `α̂` in a decade, about an axis.
 #[derive(Clone, Copy, Debug)]
-struct Against {
-    slope: f64,
+pub(crate) struct Against {
+    pub(crate) slope: f64,
     /// Part of the truth's power that `α̂` explains: `|∫S_αα̂|² / (∫S_αα ∫S_α̂α̂)`.
-    coherence: f64,
+    pub(crate) coherence: f64,
 }
 
 /// `α̂` carries information where it explains at least a tenth of the truth's power.
@@ -69,7 +69,7 @@ fn against(flown: &Mission, told: &Mission, method: AngularAcceleration) -> [[Ag
     of_responses(flown, &responses)
 }
 
-fn of_responses(flown: &Mission, responses: &[Response]) -> [[Against; 3]; 4] {
+pub(crate) fn of_responses(flown: &Mission, responses: &[Response]) -> [[Against; 3]; 4] {
     let [torque, _] = levels(flown);
     let sensing = flown.noise.dws_long_arm.as_ref().expect("the fixture has it").shape();
     DECADES.map(|[low, high]| {

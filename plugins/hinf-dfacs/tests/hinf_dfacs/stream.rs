@@ -1,6 +1,6 @@
 //! The stage as a stream: rows, gaps, states, replayed commands, the turning of CRF.
 
-use crate::common::{AttitudeLoop, RATE_HZ, late, levels, mission, run, settings, stage};
+use crate::common::{AttitudeLoop, EVERYTHING, RATE_HZ, late, levels, mission, run, settings, stage};
 use dragfree_hinf_dfacs::pilot;
 use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::{Commanded, Smoother};
 use dragfree_hinf_dfacs::reconstruction::{CHANNELS_AT, Epoch, Reconstruction, Row, Settings, levels_of};
@@ -12,7 +12,7 @@ use rand_distr::{Distribution, StandardNormal};
 use rand_xoshiro::Xoshiro256PlusPlus;
 
 /// Telemetry of the loop under the mission's noise, and the true `α`.
-fn telemetry(mission: &Mission, epochs: usize) -> (Vec<Epoch>, Vec<Vector3<f64>>) {
+pub(crate) fn telemetry(mission: &Mission, epochs: usize) -> (Vec<Epoch>, Vec<Vector3<f64>>) {
     let [torque, sensing] = levels(mission).map(|psd| (0.5 * psd * RATE_HZ).sqrt());
     let mut random = Xoshiro256PlusPlus::seed_from_u64(22);
     let mut gauss =
@@ -22,10 +22,10 @@ fn telemetry(mission: &Mission, epochs: usize) -> (Vec<Epoch>, Vec<Vector3<f64>>
 }
 
 fn bits(rows: &[Row]) -> Vec<(i64, Vec<u64>)> {
-    rows.iter().map(|r| (r.time_ns, r.values.iter().map(|v| v.to_bits()).collect())).collect()
+    rows.iter().map(|r| (r.time_ns, r.values.iter().chain(&r.asked).map(|v| v.to_bits()).collect())).collect()
 }
 
-fn alpha(row: &Row) -> Vector3<f64> {
+pub(crate) fn alpha(row: &Row) -> Vector3<f64> {
     Vector3::from_column_slice(&row.values[..3])
 }
 
@@ -38,12 +38,12 @@ fn rms(values: impl Iterator<Item = Vector3<f64>>) -> f64 {
     (sum / n).sqrt()
 }
 
-fn with_replay() -> Settings {
+pub(crate) fn with_replay() -> Settings {
     Settings { replay: true, ..settings(Smoother) }
 }
 
 /// Some of everything goes missing.
-fn holes(mut epochs: Vec<Epoch>) -> Vec<Epoch> {
+pub(crate) fn holes(mut epochs: Vec<Epoch>) -> Vec<Epoch> {
     for (k, epoch) in epochs.iter_mut().enumerate() {
         if k % 13 == 5 || (700..760).contains(&k) {
             epoch.readout[1] = f64::NAN;
@@ -76,21 +76,23 @@ fn one_row_per_epoch_in_order() {
 fn saved_and_loaded_it_goes_on_bit_by_bit() {
     let mission = late(mission());
     let epochs = holes(telemetry(&mission, 2600).0);
-    let whole = bits(&run(&mut stage(&mission, &with_replay()), &epochs));
-    for batch in [1, 777, 2600] {
-        let mut rows = Vec::new();
-        let mut current = stage(&mission, &with_replay());
-        for epochs in epochs.chunks(batch) {
-            let mut next = stage(&mission, &with_replay());
-            next.load(&current.save()).expect("its own state");
-            assert_eq!(next.save(), current.save());
-            for epoch in epochs {
-                next.push(epoch, &mut rows).expect("the law takes its own state");
+    for settings in [with_replay(), Settings { needs: EVERYTHING, ..with_replay() }] {
+        let whole = bits(&run(&mut stage(&mission, &settings), &epochs));
+        for batch in [1, 777, 2600] {
+            let mut rows = Vec::new();
+            let mut current = stage(&mission, &settings);
+            for epochs in epochs.chunks(batch) {
+                let mut next = stage(&mission, &settings);
+                next.load(&current.save()).expect("its own state");
+                assert_eq!(next.save(), current.save());
+                for epoch in epochs {
+                    next.push(epoch, &mut rows).expect("the law takes its own state");
+                }
+                current = next;
             }
-            current = next;
+            current.finish(&mut rows);
+            assert!(bits(&rows) == whole, "batches of {batch} give other rows");
         }
-        current.finish(&mut rows);
-        assert!(bits(&rows) == whole, "batches of {batch} give other rows");
     }
 }
 
@@ -110,6 +112,9 @@ fn damaged_states_are_refused() {
     assert!(refused.to_string().contains("more than belongs"), "{refused}");
     // A stage that replays has a longer state than one that does not.
     assert!(stage(&mission, &settings(Smoother)).load(&state).is_err());
+    let asking = Settings { needs: EVERYTHING, ..with_replay() };
+    let refused = stage(&mission, &asking).load(&state).expect_err("it lacks what is asked for");
+    assert!(refused.to_string().contains("other columns"), "{refused}");
 }
 
 proptest! {
@@ -117,7 +122,7 @@ proptest! {
     #[test]
     fn garbage_is_refused(mut bytes in proptest::collection::vec(any::<u8>(), 0..4000), ours: bool) {
         if ours {
-            bytes.splice(0..0, *b"dfacs/3\n");
+            bytes.splice(0..0, *b"dfacs/5\n");
         }
         prop_assert!(stage(&mission(), &settings(Smoother)).load(&bytes).is_err());
     }

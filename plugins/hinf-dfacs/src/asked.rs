@@ -1,0 +1,243 @@
+//! Columns that are made only when an effect of the model asks for them.
+//!
+//! Two of them are derivatives of `α̂`. `α̂ = α_c + D[θ, α_c]`, where `α_c` is what the commands say and `D` the smoother, which
+//! is linear in both: with `α_c` alone, `α_c + D[0, α_c]`, it is what `α̂` makes of commands; `D[θ, 0]` is what it makes of attitude.
+//!
+//! **Torque.** Were the torque about axis `i` of SRF `(1 + g_i)` times the commanded one `M_i`, one who knew would have
+//! `α_c + g_i J⁻¹ e_i M_i`, with the same attitude. So `∂α̂/∂g_i = J⁻¹ e_i M_i + D[0, J⁻¹ e_i M_i]`: much above the crossover of
+//! 0.08 Hz, where the smoother believes commands, little below. The noise part of the second term pushes the test masses where the
+//! thrusters have a layout ([`crate::reconstruction`], `push_per_turn`).
+//!
+//! **Delay.** A sensor that shows at `t` what was true at `t − τ` reads `θ_k − τ ω_k` to first order: the attitude that is added for
+//! each second of delay is `−ω`, and `∂α̂/∂τ = D[−ω, 0]`. As `α` is held from sample to sample, `−ω` is a chain of straight lines
+//! that bends at `t_k` by `−(α_k − α_{k−1})`: exactly what a spacecraft does that gets these kicks. Attitude that does what is known
+//! leaves nothing to the smoother, `D[−ω, kicks −Δα] = 0`, so that `D[−ω, 0] = D[0, kicks +Δα]`, without any `ω` that might drift.
+//! Where sensing tells all it is `−dα/dt`, as it must be.
+//!
+//! Which `α`? The true one is not known. Of all functions of the data `D[0, kicks Δα̂]` is nearest, as `α̂ = E[α | all data]` and `D`
+//! is linear: what is missing is uncorrelated with everything in the data, so a regression on it is unbiased. Commands alone are not
+//! good enough, causal as they are: below the crossover they answer the thrusters' noise that they leave out (slope of the truth on
+//! them 0.02 at 1–10 mHz). `α̂` has attitude noise in it, which is no harm in the test masses' channels, where the column acts
+//! through the offset: they have their own readouts. For the attitude channels, which share that noise, the column is not made:
+//! they see `−τ dα/dt` without the smoother, and a smoothed command is no longer causal.
+
+use nalgebra::{Matrix3, Vector3};
+
+use crate::replay::{COMMAND_VECTORS, CommandNumbers};
+use crate::smoother::{Answer, Smoothed, Smoother, Turn};
+use crate::state::{Reader, StateError, Writer};
+
+const AXES: [&str; 3] = ["x", "y", "z"];
+
+/// Columns on demand, each off by default.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Needs {
+    /// `used.*`: commands and direction of the Sun as `û` has them, means over `[t_k, t_{k+1})`.
+    pub commands: bool,
+    /// `response.alpha_srf_rad_s2.by_torque_gain.I.J`, `∂α̂_J/∂g_I` for a torque about axis `I` of `(1 + g_I)` times the commanded one:
+    /// `α̂` of one who knows `g` minus that of one who does not. And `response.u_orf_m_s2.by_torque_gain.I.tmN.J`, the same of `û_N`,
+    /// where thrusters have a layout: their torque's noise, which is `E[w]`, says something of their force's.
+    pub torque_response: bool,
+    /// `response.alpha_srf_rad_s2.by_dws_delay.J`, `∂α̂_J/∂τ` where long-arm sensing shows what was true `τ` before: late minus on
+    /// time, so that one who knows `τ` subtracts `τ` times it. For the test masses' channels; see the module.
+    pub dws_delay_response: bool,
+}
+
+impl Needs {
+    /// Whether any column is a derivative of the smoothed `α̂`.
+    #[must_use]
+    pub fn responses(&self) -> bool {
+        self.torque_response || self.dws_delay_response
+    }
+
+    pub(crate) fn flags(self) -> [bool; 3] {
+        [self.commands, self.torque_response, self.dws_delay_response]
+    }
+}
+
+/// What acted over one interval as commanded; NaN where nobody knows.
+#[derive(Clone, Copy, Debug)]
+struct Used {
+    command: CommandNumbers,
+    sun_srf: Vector3<f64>,
+}
+
+/// What there is of an epoch that leaves: a derivative of what is not given is not given either.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Given {
+    pub(crate) alpha: bool,
+    pub(crate) u: [bool; 2],
+}
+
+/// The running columns.
+#[derive(Clone, Debug)]
+pub(crate) struct Asked {
+    needs: Needs,
+    inertia_inverse: Matrix3<f64>,
+    /// `−T_S^{O_i} C J/m_S`, m s⁻² per rad s⁻²; zero unless thrusters have a layout.
+    push_per_turn: [Matrix3<f64>; 2],
+    /// One for each epoch that waits for the smoother.
+    used: Vec<Used>,
+    torque: [Answer; 3],
+    delay: Answer,
+    /// By how much `α̂` changes where the oldest waiting epoch begins, of one estimate of both sides: from one block to the next the
+    /// estimate of the slow torque changes too.
+    kick_rad_s2: Vector3<f64>,
+}
+
+impl Asked {
+    pub(crate) fn new(needs: Needs, inertia_inverse: Matrix3<f64>, push_per_turn: [Matrix3<f64>; 2]) -> Self {
+        Self {
+            needs,
+            inertia_inverse,
+            push_per_turn,
+            used: Vec::new(),
+            torque: Default::default(),
+            delay: Answer::default(),
+            kick_rad_s2: Vector3::from_element(f64::NAN),
+        }
+    }
+
+    pub(crate) fn needs(&self) -> Needs {
+        self.needs
+    }
+
+    /// Name, unit and frame of the columns, in the order of [`crate::reconstruction::Row::asked`].
+    pub(crate) fn columns(&self) -> Vec<(String, &'static str, &'static str)> {
+        let mut columns = Vec::new();
+        if self.needs.commands {
+            for (vector, unit, frame) in COMMAND_VECTORS.into_iter().chain([("sun_srf", "1", "SRF")]) {
+                columns.extend(AXES.map(|axis| (format!("used.{vector}.{axis}"), unit, frame)));
+            }
+        }
+        if self.needs.torque_response {
+            for about in AXES {
+                let name = |axis| format!("response.alpha_srf_rad_s2.by_torque_gain.{about}.{axis}");
+                columns.extend(AXES.map(|axis| (name(axis), "rad s-2", "SRF")));
+            }
+            for about in AXES.iter().filter(|_| self.layout()) {
+                for (tm, frame) in [("tm1", "ORF_1"), ("tm2", "ORF_2")] {
+                    let name = |axis| format!("response.u_orf_m_s2.by_torque_gain.{about}.{tm}.{axis}");
+                    columns.extend(AXES.map(|axis| (name(axis), "m s-2", frame)));
+                }
+            }
+        }
+        if self.needs.dws_delay_response {
+            let name = |axis| format!("response.alpha_srf_rad_s2.by_dws_delay.{axis}");
+            columns.extend(AXES.map(|axis| (name(axis), "rad s-3", "SRF")));
+        }
+        columns
+    }
+
+    fn layout(&self) -> bool {
+        self.push_per_turn.iter().any(|push| *push != Matrix3::zeros())
+    }
+
+    /// Takes what acts over the newest interval. Of the test mass `silent` no command is known.
+    pub(crate) fn take(
+        &mut self,
+        acting: Option<&CommandNumbers>,
+        silent: Option<usize>,
+        sun_srf: Option<Vector3<f64>>,
+    ) {
+        let missing = f64::NAN;
+        let mut command = acting.copied().unwrap_or([missing; 18]);
+        if let Some(tm) = silent {
+            command[6 + 6 * tm..12 + 6 * tm].fill(missing);
+        }
+        self.used.push(Used { command, sun_srf: sun_srf.unwrap_or(Vector3::from_element(missing)) });
+    }
+
+    /// Values for the oldest waiting epochs, which leave. `alpha_crf_rad_s2` is the smoothed `α̂` relative to CRF of all that wait,
+    /// NaN where a command is missing; nothing unless a delay is asked for.
+    pub(crate) fn give(
+        &mut self,
+        smoother: &Smoother,
+        leaving: &[Given],
+        alpha_crf_rad_s2: &[Vector3<f64>],
+    ) -> Vec<Vec<f64>> {
+        let mut out = vec![Vec::new(); leaving.len()];
+        if self.needs.commands {
+            for (out, used) in out.iter_mut().zip(&self.used) {
+                out.extend_from_slice(&used.command);
+                out.extend_from_slice(used.sun_srf.as_slice());
+            }
+        }
+        if self.needs.torque_response {
+            self.give_torque(smoother, leaving, &mut out);
+        }
+        if self.needs.dws_delay_response {
+            let answers = self.give_delay(smoother, leaving.len(), alpha_crf_rad_s2);
+            for ((out, given), answer) in out.iter_mut().zip(leaving).zip(answers) {
+                put(out, &answer.disturbance_rad_s2, given.alpha);
+            }
+        }
+        self.used.drain(..leaving.len());
+        out
+    }
+
+    fn give_torque(&mut self, smoother: &Smoother, leaving: &[Given], out: &mut [Vec<f64>]) {
+        let (used, inverse) = (&self.used, &self.inertia_inverse);
+        let turn = |about: usize, k: usize| inverse.column(about) * used[k].command[3 + about];
+        let answers = [0, 1, 2].map(|about| {
+            let more = |k| Turn { held_rad_s2: turn(about, k), kick_rad_s: Vector3::zeros() };
+            smoother.answer(&mut self.torque[about], leaving.len(), more)
+        });
+        let layout = self.layout();
+        for (k, (out, given)) in out.iter_mut().zip(leaving).enumerate() {
+            for (about, answer) in answers.iter().enumerate() {
+                put(out, &(turn(about, k) + answer[k].disturbance_rad_s2), given.alpha);
+            }
+            for answer in answers.iter().filter(|_| layout) {
+                for (push, given) in self.push_per_turn.iter().zip(given.u) {
+                    put(out, &(push * answer[k].noise_rad_s2), given);
+                }
+            }
+        }
+    }
+
+    fn give_delay(&mut self, smoother: &Smoother, count: usize, alpha_crf_rad_s2: &[Vector3<f64>]) -> Vec<Smoothed> {
+        let change = |k: usize| alpha_crf_rad_s2[k] - alpha_crf_rad_s2[k - 1];
+        let first = self.kick_rad_s2;
+        let more = |k: usize| {
+            let kick = if k == 0 { first } else { change(k) };
+            // Next to an unknown command the attitude starts anew: what bends there is not known, and tells nothing.
+            let known = kick.iter().all(|x| x.is_finite());
+            Turn { held_rad_s2: Vector3::zeros(), kick_rad_s: if known { kick } else { Vector3::zeros() } }
+        };
+        let answer = smoother.answer(&mut self.delay, count, more);
+        if (1..alpha_crf_rad_s2.len()).contains(&count) {
+            self.kick_rad_s2 = change(count);
+        }
+        answer
+    }
+
+    pub(crate) fn save(&self, out: &mut Writer) {
+        out.numbers(self.kick_rad_s2.as_slice());
+        self.torque.iter().chain([&self.delay]).for_each(|answer| answer.save(out));
+        for used in &self.used {
+            out.numbers(&used.command);
+            out.numbers(used.sun_srf.as_slice());
+        }
+    }
+
+    /// Takes a state of `waiting` epochs back.
+    pub(crate) fn load(&mut self, waiting: usize, state: &mut Reader<'_>) -> Result<(), StateError> {
+        state.numbers(self.kick_rad_s2.as_mut_slice())?;
+        for answer in self.torque.iter_mut().chain([&mut self.delay]) {
+            answer.load(state)?;
+        }
+        self.used.clear();
+        for _ in 0..waiting {
+            let mut used = Used { command: [0.0; 18], sun_srf: Vector3::zeros() };
+            state.numbers(&mut used.command)?;
+            state.numbers(used.sun_srf.as_mut_slice())?;
+            self.used.push(used);
+        }
+        Ok(())
+    }
+}
+
+fn put(out: &mut Vec<f64>, value: &Vector3<f64>, given: bool) {
+    out.extend(value.iter().map(|x| if given { *x } else { f64::NAN }));
+}
