@@ -31,7 +31,7 @@ fn pages() -> Vec<PathBuf> {
     std::iter::once(root().join("README.md")).chain(chapters).collect()
 }
 
-/// A folder as the reader has it: the repository's fixtures, two files of telemetry, a mission file.
+/// A folder as the reader has it: the repository's fixtures, two files of telemetry, a mission and a model file.
 fn readers_folder() -> tempfile::TempDir {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let at = |name: &str| dir.path().join(name);
@@ -53,6 +53,7 @@ fn readers_folder() -> tempfile::TempDir {
         }
     }
     std::fs::copy(at("fixtures/missions/taiji.toml"), at("my-mission.toml")).expect("copied");
+    std::fs::copy(at("fixtures/models/com-offset.toml"), at("my-model.toml")).expect("copied");
     let science = std::fs::read_to_string(at("fixtures/pipelines/science-mode.toml")).expect("readable");
     std::fs::write(at("science-mode.toml"), science.replace("../", "fixtures/")).expect("writable");
     dir

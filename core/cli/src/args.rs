@@ -84,6 +84,11 @@ pub(crate) enum Command {
     /// The archive
     #[command(subcommand)]
     Products(Products),
+    /// Model files: what is in them, what changed, every revision kept
+    #[command(subcommand)]
+    Model(Model),
+    /// The error from model revision to revision, on days of the fit and on days kept out of it
+    Ladder(Ladder),
 }
 
 /// What `simulate --help` ends with; the simulator has the last word, and a test compares.
@@ -233,6 +238,131 @@ pub(crate) enum Products {
     },
 }
 
+/// What can be done with a model file.
+#[derive(Debug, Subcommand)]
+pub(crate) enum Model {
+    /// Show the effects of a model
+    Show {
+        /// Model file
+        #[arg(value_name = "MODEL.toml")]
+        model: PathBuf,
+        /// An earlier revision; the number in front is enough
+        #[arg(long, value_name = "REVISION")]
+        revision: Option<String>,
+    },
+    /// List the revisions, newest first, with what changed in each
+    Log {
+        /// Model file
+        #[arg(value_name = "MODEL.toml")]
+        model: PathBuf,
+    },
+    /// Add an effect: a new revision
+    Add(ModelAdd),
+    /// Remove an effect: a new revision
+    Remove {
+        /// Model file
+        #[arg(value_name = "MODEL.toml")]
+        model: PathBuf,
+        /// `es-gain:tm1.y`; the id alone where it is there once
+        #[arg(value_name = "EFFECT[:INSTANCE]")]
+        effect: String,
+    },
+    /// Make an earlier revision the newest again
+    Restore {
+        /// Model file
+        #[arg(value_name = "MODEL.toml")]
+        model: PathBuf,
+        /// Its name, or the number in front
+        #[arg(value_name = "REVISION")]
+        revision: String,
+    },
+    /// Make a revision of what was edited by hand
+    Commit {
+        /// Model file
+        #[arg(value_name = "MODEL.toml")]
+        model: PathBuf,
+    },
+    /// Fix every coefficient at a product's value, in a model file of its own: what a held-out day is run with
+    Fix(ModelFix),
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ModelAdd {
+    /// Model file
+    #[arg(value_name = "MODEL.toml")]
+    pub(crate) model: PathBuf,
+    /// Effect and where it acts, `es-gain:tm1.y`; may be left out with --from
+    #[arg(value_name = "EFFECT[:INSTANCE]", required_unless_present = "from")]
+    pub(crate) effect: Option<String>,
+    /// Set a parameter; repeatable. `dragfree plugins inspect EFFECT` lists them
+    #[arg(long, value_name = "NAME=VALUE", value_parser = setting)]
+    pub(crate) set: Vec<(String, String)>,
+    /// Do not estimate, but fix at a value in SI units; repeatable, NAME= where the effect has several coefficients
+    #[arg(long, value_name = "[NAME=]VALUE", value_parser = named_number, conflicts_with_all = ["value", "prior_sigma"])]
+    pub(crate) fixed: Vec<(Option<String>, f64)>,
+    /// Value before any data, SI; repeatable
+    #[arg(long, value_name = "[NAME=]VALUE", value_parser = named_number)]
+    pub(crate) value: Vec<(Option<String>, f64)>,
+    /// Standard deviation before any data, SI; repeatable
+    #[arg(long, value_name = "[NAME=]SIGMA", value_parser = named_number)]
+    pub(crate) prior_sigma: Vec<(Option<String>, f64)>,
+    /// Take effect and shape from the output of `dragfree diagnose --json`
+    #[arg(long, value_name = "DIAGNOSIS.json")]
+    pub(crate) from: Option<PathBuf>,
+    /// Which candidate of the diagnosis [default: 1, or that of the named effect]
+    #[arg(long, value_name = "N", requires = "from", conflicts_with = "effect", value_parser = clap::value_parser!(u16).range(1..))]
+    pub(crate) rank: Option<u16>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct ModelFix {
+    /// Model file that the product was made with
+    #[arg(value_name = "MODEL.toml")]
+    pub(crate) model: PathBuf,
+    /// Product with the coefficients: its file, its id or its day
+    #[arg(long = "from", value_name = "PRODUCT")]
+    pub(crate) product: String,
+    /// Effect that stays estimated, `com-offset`; repeatable
+    #[arg(long, value_name = "EFFECT[:INSTANCE]")]
+    pub(crate) keep: Vec<String>,
+    /// Model file to write [default: MODEL.fixed.toml]
+    #[arg(long, value_name = "FILE")]
+    pub(crate) out: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) archive: Archive,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Ladder {
+    /// Products of the fit, every revision over the same data: files, ids or days
+    #[arg(value_name = "PRODUCT", required = true)]
+    pub(crate) products: Vec<String>,
+    /// Products of other data, made with what `dragfree model fix` wrote; repeatable
+    #[arg(long, value_name = "PRODUCT", num_args = 1..)]
+    pub(crate) held_out: Vec<String>,
+    /// Truth of a simulation, DIR/truth/*.mcap: shows the true error
+    #[arg(long, value_name = "FILE")]
+    pub(crate) truth: Option<PathBuf>,
+    /// Draw the ladder as SVG
+    #[arg(long, value_name = "FILE.svg")]
+    pub(crate) picture: Option<PathBuf>,
+    #[command(flatten)]
+    pub(crate) archive: Archive,
+}
+
+fn setting(text: &str) -> Result<(String, String), String> {
+    let (name, value) = text.split_once('=').ok_or("NAME=VALUE is needed, as in lag_s=480")?;
+    Ok((name.trim().to_owned(), value.trim().to_owned()))
+}
+
+fn named_number(text: &str) -> Result<(Option<String>, f64), String> {
+    let (name, number) = text.rsplit_once('=').map_or((None, text), |(name, number)| (Some(name.trim()), number));
+    match number.trim().parse() {
+        Ok(number) if f64::is_finite(number) => Ok((name.map(str::to_owned), number)),
+        _ => Err("a finite number in SI units is needed, with NAME= in front where there are several".to_owned()),
+    }
+}
+
 fn positive(text: &str) -> Result<f64, String> {
     match text.parse::<f64>() {
         Ok(number) if number > 0.0 && number.is_finite() => Ok(number),
@@ -287,6 +417,17 @@ mod tests {
             "dragfree products show COM1B_2035-01-01_SC1_01_0001 --archive d --color never",
             "dragfree --threads 2 -q run p.toml",
             "dragfree -vv run p.toml",
+            "dragfree model show m.toml --revision 2",
+            "dragfree model log m.toml --json",
+            "dragfree model add m.toml es-gain:tm1.y --set lag_s=480 --value 0.01 --prior-sigma 0.05",
+            "dragfree model add m.toml com-offset:tm1 --fixed x=0.09 --fixed y=-0.1",
+            "dragfree model add m.toml --from d.json --rank 2",
+            "dragfree model add m.toml thermal:tm1.x --from d.json",
+            "dragfree model remove m.toml es-gain:tm1.y",
+            "dragfree model restore m.toml 1",
+            "dragfree model commit m.toml",
+            "dragfree model fix m.toml --from p.toml --keep com-offset --out h.toml",
+            "dragfree ladder a b --held-out c d --truth t.mcap --picture l.svg --json",
         ] {
             parse(line).unwrap_or_else(|error| panic!("{line}: {error}"));
         }
@@ -306,6 +447,13 @@ mod tests {
             ("dragfree simulate m.toml --out d --start yesterday", ErrorKind::ValueValidation),
             ("dragfree run p.toml --threads 0", ErrorKind::ValueValidation),
             ("dragfree run p.toml --batch-rows 0", ErrorKind::ValueValidation),
+            ("dragfree model add m.toml", ErrorKind::MissingRequiredArgument),
+            ("dragfree model add m.toml --rank 1", ErrorKind::MissingRequiredArgument),
+            ("dragfree model add m.toml a:b --from d.json --rank 1", ErrorKind::ArgumentConflict),
+            ("dragfree model add m.toml a:b --fixed 1 --prior-sigma 1", ErrorKind::ArgumentConflict),
+            ("dragfree model add m.toml a:b --value nan", ErrorKind::ValueValidation),
+            ("dragfree model add m.toml a:b --set lag", ErrorKind::ValueValidation),
+            ("dragfree ladder", ErrorKind::MissingRequiredArgument),
             ("dragfree -q -v run p.toml", ErrorKind::ArgumentConflict),
             ("dragfree frobnicate", ErrorKind::InvalidSubcommand),
         ] {

@@ -21,6 +21,12 @@ pub(crate) enum Failure {
     /// The demo would have to share a folder.
     #[error("{} is neither empty nor made by an earlier demo; name a folder of its own with --dir", .0.display())]
     NoDemoFolder(PathBuf),
+    /// A diagnosis that names no effect to add.
+    #[error("{}: {what}", path.display())]
+    Diagnosis { path: PathBuf, what: String },
+    /// Arguments that make no sense together.
+    #[error("{0}")]
+    Usage(String),
     /// The engine failed.
     #[error(transparent)]
     Engine(#[from] Box<dyn Error>),

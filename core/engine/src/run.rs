@@ -181,7 +181,7 @@ pub fn check(registry: &Registry, options: &RunOptions) -> Result<CheckReport, E
     Ok(CheckReport {
         pipeline: setup.pipeline.name,
         mission: setup.mission.name,
-        model: setup.model.revision,
+        model: setup.model.identity().0,
         nodes: chain
             .nodes
             .iter()
@@ -391,6 +391,14 @@ fn draft(
     }));
     let mut effects: Vec<String> = setup.model.effects.iter().map(|e| e.id.clone()).collect();
     effects.dedup();
+    let (revision, parent) = setup.model.identity();
+    let mut notes = summary.notes;
+    if setup.model.edited_by_hand() {
+        notes.push(format!(
+            "the model file was edited by hand since revision {} was made; `dragfree model commit` makes a revision of it",
+            setup.model.revision
+        ));
+    }
     Ok(Draft {
         pipeline: setup.pipeline.name.clone(),
         product: setup.pipeline.product.clone(),
@@ -405,11 +413,11 @@ fn draft(
         status: Status::Quicklook,
         inputs: inputs(setup, options)?,
         history,
-        model: product::Model { revision: setup.model.revision.clone(), parent: setup.model.parent.clone(), effects },
+        model: product::Model { revision, parent, effects },
         software: options.software.clone(),
         losses,
         counts: summary.counts,
-        notes: summary.notes,
+        notes,
         reports: summary
             .report
             .into_iter()

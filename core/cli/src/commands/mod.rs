@@ -2,6 +2,8 @@
 
 mod demo;
 mod design;
+mod ladder;
+mod model;
 mod plugins;
 mod products;
 mod reveal;
@@ -43,6 +45,8 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
         Command::Config(Config::Check(chain)) => run::config_check(chain, global),
         Command::Plugins(command) => plugins::execute(command, global, paint),
         Command::Products(command) => products::execute(command, global.json, paint),
+        Command::Model(command) => model::execute(command, global, paint),
+        Command::Ladder(command) => ladder::execute(command, global.json, paint),
     }
 }
 

@@ -5,8 +5,8 @@ use crate::args::Products;
 use crate::failure::Failure;
 use crate::screen;
 use crate::text::Paint;
-use dragfree_engine::product;
-use std::path::Path;
+use dragfree_engine::product::{self, Product};
+use std::path::{Path, PathBuf};
 
 pub(super) fn execute(command: &Products, json: bool, paint: Paint) -> Result<Done, Failure> {
     match command {
@@ -22,16 +22,19 @@ pub(super) fn execute(command: &Products, json: bool, paint: Paint) -> Result<Do
     }
 }
 
-/// `name` is a product's file, or a name in the archive.
-fn show(name: &str, archive: &Path, json: bool, paint: Paint) -> Result<Done, Failure> {
+/// A product by its file, or by a name in the archive, and its file.
+pub(super) fn open(name: &str, archive: &Path) -> Result<(Product, PathBuf), Failure> {
     let file = Path::new(name);
-    let (product, path) = if file.is_file() {
-        (product::read(file).map_err(Failure::engine)?, file.to_owned())
-    } else {
-        exists(archive)?;
-        let entry = product::find(archive, name).map_err(Failure::engine)?;
-        (entry.product, entry.path)
-    };
+    if file.is_file() {
+        return Ok((product::read(file).map_err(Failure::engine)?, file.to_owned()));
+    }
+    exists(archive)?;
+    let entry = product::find(archive, name).map_err(Failure::engine)?;
+    Ok((entry.product, entry.path))
+}
+
+fn show(name: &str, archive: &Path, json: bool, paint: Paint) -> Result<Done, Failure> {
+    let (product, path) = open(name, archive)?;
     if json {
         return Ok(Done::json(&product::to_json(&product, &path)));
     }

@@ -168,15 +168,7 @@ impl Builder<'_> {
         let mut constraints: Vec<(Constraint, u32)> = Vec::new();
         for entry in &self.model.effects {
             let found = self.registry.find(Kind::Effect, &entry.id)?;
-            let instances = &found.info.manifest.instances;
-            if !instances.is_empty() && !instances.contains(&entry.instance) {
-                return Err(self.model_error(format!(
-                    "effect {} has no instance `{}`; it has {}",
-                    entry.id,
-                    entry.instance,
-                    instances.join(", ")
-                )));
-            }
+            entry.check_instance(&found.info.manifest).map_err(|what| self.model_error(what))?;
             let file = self.model.path.display().to_string();
             let parameters = resolve_parameters(&file, &found.info.manifest, &entry.parameters)?;
             let linked = self.add(&found, parameters, &entry.instance, false)?;

@@ -1,0 +1,806 @@
+//! Model files with history: every change makes a revision with a parent, and no revision is ever lost.
+//!
+//! `MODEL.toml` is the newest revision. Every revision that a command made or left behind lies beside it, immutable, as
+//! `MODEL.history/REVISION.toml`. Text is edited in place, so comments and formatting stay. The history is written before the
+//! file, and the file by a rename: a kill at any instruction leaves the old file or the new one, and both revisions once they
+//! were current. `MODEL.toml.lock` holds the new text until it takes the file's name, and keeps a second writer out.
+
+use std::collections::BTreeSet;
+use std::fs::{self, File, OpenOptions};
+use std::io::{ErrorKind, Write as _};
+use std::path::{Path, PathBuf};
+
+use serde::Serialize;
+use toml_edit::{ArrayOfTables, DocumentMut, InlineTable, Item, Table, TableLike, Value, value};
+
+use crate::config::{ConfigError, EffectEntry, Model};
+
+/// Why a model file could not be changed or its history not be read.
+#[derive(Debug, thiserror::Error)]
+pub enum RevisionError {
+    /// The file is no model.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The operating system refused something.
+    #[error("cannot {action} {}: {source}", path.display())]
+    Io {
+        /// What was tried.
+        action: &'static str,
+        /// File or folder.
+        path: PathBuf,
+        /// The system's reason.
+        source: std::io::Error,
+    },
+    /// Another writer is at work, or was killed.
+    #[error(
+        "{} exists: another command is changing the model file; try again when it is done. If none is, it was killed: \
+         remove that file, the model file itself is whole", path.display()
+    )]
+    Locked {
+        /// The lock.
+        path: PathBuf,
+    },
+    /// The file was written between reading and replacing it.
+    #[error("{} was changed by someone else meanwhile; nothing was done, run the command again", path.display())]
+    Changed {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A revision cannot name a file.
+    #[error(
+        "{}: revision {revision:?} cannot name a file of the history: letters, digits, '.', '_', '+' and '-' may stand in it, no \
+         '.' first; change it in the file", path.display()
+    )]
+    Name {
+        /// The file.
+        path: PathBuf,
+        /// Its revision.
+        revision: String,
+    },
+    /// The effects are written in a way that cannot be edited.
+    #[error("{}: `effect` is not a list of [[effect]] tables; write them so", path.display())]
+    Shape {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The effect is in the model already.
+    #[error("{}: effect {effect} is in the model already; `dragfree model remove` takes it out", path.display())]
+    There {
+        /// The file.
+        path: PathBuf,
+        /// `ID:INSTANCE`.
+        effect: String,
+    },
+    /// The effect is not in the model, or not exactly once.
+    #[error("{}: {what}; the model has {known}", path.display())]
+    NoEffect {
+        /// The file.
+        path: PathBuf,
+        /// Which, and why not.
+        what: String,
+        /// What there is.
+        known: String,
+    },
+    /// No such revision.
+    #[error("no revision {revision} of {}; there are {known}", path.display())]
+    NoRevision {
+        /// The file.
+        path: PathBuf,
+        /// What was asked for.
+        revision: String,
+        /// What there is.
+        known: String,
+    },
+    /// A file of the history is not what it was.
+    #[error("{}: {reason}; a revision is never changed: take the file from a backup, or remove it", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A coefficient cannot be fixed.
+    #[error("{}: {what}", path.display())]
+    Fix {
+        /// The file.
+        path: PathBuf,
+        /// What, why and what to do next.
+        what: String,
+    },
+}
+
+impl RevisionError {
+    fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.into();
+        move |source| Self::Io { action, path, source }
+    }
+}
+
+/// What differs between two revisions of one effect.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum What {
+    /// It is new.
+    Added,
+    /// It is gone.
+    Removed,
+    /// These keys differ: `estimate`, `prior`, `parameters`, `order`.
+    Changed(Vec<&'static str>),
+}
+
+/// A difference between two revisions.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Change {
+    /// `ID:INSTANCE`.
+    pub effect: String,
+    /// What happened to it.
+    pub what: What,
+}
+
+/// What turned the effects `old` into `new`.
+#[must_use]
+pub fn changes(old: &[EffectEntry], new: &[EffectEntry]) -> Vec<Change> {
+    let same = |a: &EffectEntry, b: &EffectEntry| a.id == b.id && a.instance == b.instance;
+    let mut out = Vec::new();
+    let mut put = |entry: &EffectEntry, what| out.push(Change { effect: entry.to_string(), what });
+    for entry in old.iter().filter(|o| !new.iter().any(|n| same(o, n))) {
+        put(entry, What::Removed);
+    }
+    let kept_before: Vec<&EffectEntry> = old.iter().filter(|o| new.iter().any(|n| same(o, n))).collect();
+    let mut place = 0;
+    for entry in new {
+        let Some(before) = old.iter().find(|o| same(o, entry)) else {
+            put(entry, What::Added);
+            continue;
+        };
+        let moved = !same(kept_before[place], entry);
+        place += 1;
+        let keys = [
+            ("estimate", before.estimate != entry.estimate),
+            ("prior", before.prior != entry.prior),
+            ("parameters", before.parameters != entry.parameters),
+            ("order", moved),
+        ];
+        let keys: Vec<&str> = keys.into_iter().filter_map(|(key, differs)| differs.then_some(key)).collect();
+        if !keys.is_empty() {
+            put(entry, What::Changed(keys));
+        }
+    }
+    out
+}
+
+/// A change that was made.
+#[derive(Clone, Debug)]
+pub struct Committed {
+    /// The file.
+    pub path: PathBuf,
+    /// Revision that was found; `None` for a new file.
+    pub before: Option<String>,
+    /// Revision made of what somebody had edited by hand.
+    pub recorded: Option<String>,
+    /// Revision that the file is now.
+    pub revision: String,
+    /// Its parent.
+    pub parent: Option<String>,
+    /// What changed from the parent.
+    pub changes: Vec<Change>,
+    /// Folder of the history.
+    pub history: PathBuf,
+}
+
+/// A change in the making; dropped without a commit it leaves nothing behind.
+#[derive(Debug)]
+pub struct Edit {
+    path: PathBuf,
+    lock: Lock,
+    /// Text and model as found; `None` where there is no file yet.
+    found: Option<(String, Model)>,
+    document: DocumentMut,
+    /// Parent and its effects in place of the revision found.
+    parent: Option<(String, Vec<EffectEntry>)>,
+}
+
+impl Edit {
+    /// Locks and reads a model file.
+    ///
+    /// # Errors
+    /// [`RevisionError`]: it cannot be read, is no model, is read-only, or another writer has it.
+    pub fn begin(path: &Path) -> Result<Self, RevisionError> {
+        let path = fs::canonicalize(path).map_err(RevisionError::io("read the model file", path))?;
+        let lock = Lock::take(&path)?;
+        let text = fs::read_to_string(&path).map_err(RevisionError::io("read the model file", &path))?;
+        let model = Model::parse(&path, &text)?;
+        file_name(&model)?;
+        let document = document(&path, &text)?;
+        Ok(Self { path, lock, found: Some((text, model)), document, parent: None })
+    }
+
+    /// Locks a model file that need not exist, to be filled by [`Edit::fix`].
+    ///
+    /// # Errors
+    /// As [`Edit::begin`].
+    pub fn begin_or_new(path: &Path) -> Result<Self, RevisionError> {
+        if path.exists() {
+            return Self::begin(path);
+        }
+        let lock = Lock::take(path)?;
+        Ok(Self { path: path.to_owned(), lock, found: None, document: DocumentMut::new(), parent: None })
+    }
+
+    /// The model as it was found.
+    #[must_use]
+    pub fn model(&self) -> Option<&Model> {
+        self.found.as_ref().map(|(_, model)| model)
+    }
+
+    /// Adds an effect at the end, under `comment` where there is one.
+    ///
+    /// # Errors
+    /// It is there already.
+    pub fn add(&mut self, entry: &EffectEntry, comment: &str) -> Result<(), RevisionError> {
+        if self.effects()?.iter().any(|e| e.id == entry.id && e.instance == entry.instance) {
+            return Err(RevisionError::There { path: self.path.clone(), effect: entry.to_string() });
+        }
+        let mut table = Table::new();
+        table.insert("id", value(&entry.id));
+        if !entry.instance.is_empty() {
+            table.insert("instance", value(&entry.instance));
+        }
+        table.insert("estimate", value(entry.estimate));
+        if !entry.parameters.is_empty() {
+            let text = toml::Value::Table(entry.parameters.clone()).to_string();
+            let parameters: Value = text.parse().map_err(|_| RevisionError::Shape { path: self.path.clone() })?;
+            table.insert("parameters", Item::Value(parameters));
+        }
+        for (name, prior) in &entry.prior {
+            let numbers =
+                [("value", prior.value), ("sigma", prior.sigma), ("lower", prior.lower), ("upper", prior.upper)];
+            for (key, number) in numbers.into_iter().filter_map(|(key, number)| Some((key, number?))) {
+                set_prior(&mut table, name, key, number);
+            }
+        }
+        let comment = if comment.is_empty() { String::new() } else { format!("# {comment}\n") };
+        table.decor_mut().set_prefix(format!("\n{comment}"));
+        self.tables()?.push(table);
+        Ok(())
+    }
+
+    /// Removes an effect; without an instance the only one of that id.
+    ///
+    /// # Errors
+    /// It is not there, or not alone.
+    pub fn remove(&mut self, id: &str, instance: Option<&str>) -> Result<(), RevisionError> {
+        let effects = self.effects()?;
+        let wanted = |e: &EffectEntry| e.id == id && instance.is_none_or(|i| e.instance == i);
+        let at: Vec<usize> = (0..effects.len()).filter(|i| wanted(&effects[*i])).collect();
+        let [at] = at[..] else {
+            let name = instance.map_or_else(|| id.to_owned(), |i| format!("{id}:{i}"));
+            let what = if at.is_empty() {
+                format!("effect {name} is not in the model")
+            } else {
+                format!("effect {name} is in the model {} times: name the instance", at.len())
+            };
+            let known: Vec<String> = effects.iter().map(ToString::to_string).collect();
+            let known = if known.is_empty() { "no effect".to_owned() } else { known.join(", ") };
+            return Err(RevisionError::NoEffect { path: self.path.clone(), what, known });
+        };
+        let tables = self.tables()?;
+        let above = detached(tables.get(at));
+        tables.remove(at);
+        if !above.is_empty() {
+            if let Some(next) = tables.get_mut(at) {
+                let own = prefix(next);
+                next.decor_mut().set_prefix(format!("{above}{own}"));
+            } else {
+                let own = self.document.trailing().as_str().unwrap_or_default().to_owned();
+                self.document.set_trailing(format!("{above}{own}"));
+            }
+        }
+        Ok(())
+    }
+
+    /// Takes the text of an earlier revision.
+    ///
+    /// # Errors
+    /// There is none of that name, or it is damaged.
+    pub fn restore(&mut self, revision: &str) -> Result<(), RevisionError> {
+        let (_, text) = find(&self.path, revision)?;
+        self.document = document(&self.path, &text)?;
+        Ok(())
+    }
+
+    /// Becomes a child of the revision `base` of the model file `source` in which every estimated effect but those of `keep` (by
+    /// id, or `ID:INSTANCE`) is fixed at `values`, coefficients by name in SI units.
+    ///
+    /// # Errors
+    /// No such revision; an effect has no value, or two of its coefficients end alike.
+    pub fn fix(
+        &mut self,
+        source: &Path,
+        base: &str,
+        values: &[(String, f64)],
+        keep: &[String],
+    ) -> Result<(), RevisionError> {
+        let (model, text) = find(source, base)?;
+        let refuse = |what: String| RevisionError::Fix { path: source.to_owned(), what };
+        let named = |e: &EffectEntry, name: &String| *name == e.id || *name == e.to_string();
+        if let Some(unknown) = keep.iter().find(|k| !model.effects.iter().any(|e| named(e, k))) {
+            let known: Vec<String> = model.effects.iter().map(ToString::to_string).collect();
+            return Err(refuse(format!(
+                "effect {unknown} is not in the model, so it cannot be kept; it has {}",
+                known.join(", ")
+            )));
+        }
+        self.document = document(source, &text)?;
+        self.parent = Some((model.identity().0, model.effects.clone()));
+        let fixed: Vec<bool> =
+            model.effects.iter().map(|e| e.estimate && !keep.iter().any(|name| named(e, name))).collect();
+        let tables = self.tables()?;
+        for ((entry, table), _) in model.effects.iter().zip(tables.iter_mut()).zip(&fixed).filter(|(_, fixed)| **fixed)
+        {
+            table.insert("estimate", value(false));
+            let mut names = BTreeSet::new();
+            for (name, number) in values.iter().filter(|(name, _)| entry.owns(name)) {
+                let short = name.rsplit('.').next().unwrap_or_default();
+                if !names.insert(short) {
+                    return Err(refuse(format!(
+                        "effect {entry}: two coefficients end in .{short}, so a model file cannot tell them apart; keep it with --keep {entry}"
+                    )));
+                }
+                if !number.is_finite() {
+                    return Err(refuse(format!(
+                        "coefficient {name} has no value in the product; keep its effect with --keep {entry}"
+                    )));
+                }
+                set_prior(table, short, "value", *number);
+            }
+            if names.is_empty() {
+                return Err(refuse(format!(
+                    "the product has no coefficient of effect {entry}; is it a product of this model? Or keep it with --keep {entry}"
+                )));
+            }
+        }
+        Ok(())
+    }
+
+    /// Makes a revision of the change and of what was edited by hand before it. Without either it is refused by `None`.
+    ///
+    /// # Errors
+    /// [`RevisionError`]; the file is then what it was.
+    pub fn commit(self) -> Result<Option<Committed>, RevisionError> {
+        let Some((steps, committed)) = self.plan()? else { return Ok(None) };
+        let Self { lock, found, path, .. } = self;
+        let now = fs::read_to_string(&path).ok();
+        if now != found.map(|(text, _)| text) {
+            return Err(RevisionError::Changed { path });
+        }
+        let mut lock = Some(lock);
+        for step in steps {
+            step.take(&mut lock)?;
+        }
+        Ok(Some(committed))
+    }
+
+    /// What will be written, in order, and what will have come of it.
+    fn plan(&self) -> Result<Option<(Vec<Step>, Committed)>, RevisionError> {
+        let folder = history_folder(&self.path);
+        let kept = history(&folder)?;
+        let counter = |name: &str| Model::parts(name).map(|(counter, _)| counter).or_else(|| name.parse().ok());
+        let names = kept.models.iter().map(|(model, _)| model.revision.as_str());
+        let names = names
+            .chain(self.model().map(|m| m.revision.as_str()))
+            .chain(self.parent.as_ref().map(|(name, _)| name.as_str()));
+        let mut next = names.map(|name| counter(name).unwrap_or(1)).max().unwrap_or(0).saturating_add(1);
+
+        let mut steps = Vec::new();
+        let mut recorded = None;
+        let mut parent = None;
+        if let Some((text, found)) = &self.found {
+            let stored = kept.models.iter().find(|(model, _)| model.revision == found.revision).map(|(model, _)| model);
+            if found.edited_by_hand() || stored.is_some_and(|s| s.effects != found.effects) {
+                let name = found.name(next);
+                next = next.saturating_add(1);
+                let text = with_header(document(&self.path, text)?, &name, Some(&found.revision));
+                steps.push(Step::Keep { path: folder.join(format!("{name}.toml")), text });
+                recorded = Some(name.clone());
+                parent = Some(name);
+            } else {
+                if stored.is_none() {
+                    let path = folder.join(format!("{}.toml", found.revision));
+                    steps.push(Step::Keep { path, text: text.clone() });
+                }
+                parent = Some(found.revision.clone());
+            }
+        }
+        let effects = self.effects()?;
+        let before = self.model().map(|m| m.effects.clone()).unwrap_or_default();
+        let unchanged = self.parent.is_none() && self.found.is_some() && effects == before;
+        let revision = match (&recorded, unchanged) {
+            (None, true) => return Ok(None),
+            (Some(name), true) => name.clone(),
+            (_, false) => self.as_model()?.name(next),
+        };
+        if unchanged {
+            parent = self.model().map(|m| m.revision.clone());
+        } else if let Some((name, _)) = &self.parent {
+            parent = Some(name.clone());
+        }
+        let text = with_header(self.document.clone(), &revision, parent.as_deref());
+        let compared = match (&self.parent, unchanged) {
+            (_, true) => {
+                kept.models.iter().find(|(m, _)| Some(&m.revision) == parent.as_ref()).map(|(m, _)| m.effects.clone())
+            }
+            (Some((_, effects)), _) => Some(effects.clone()),
+            (None, _) => Some(before),
+        };
+        if !unchanged {
+            steps.push(Step::Keep { path: folder.join(format!("{revision}.toml")), text: text.clone() });
+        }
+        steps.push(Step::Replace { path: self.path.clone(), text });
+        let committed = Committed {
+            path: self.path.clone(),
+            before: self.model().map(|m| m.revision.clone()),
+            recorded,
+            revision,
+            parent,
+            changes: changes(&compared.unwrap_or_default(), &effects),
+            history: folder,
+        };
+        Ok(Some((steps, committed)))
+    }
+
+    fn as_model(&self) -> Result<Model, RevisionError> {
+        Ok(Model::parse(&self.path, &with_header(self.document.clone(), "0", None))?)
+    }
+
+    fn effects(&self) -> Result<Vec<EffectEntry>, RevisionError> {
+        Ok(self.as_model()?.effects)
+    }
+
+    fn tables(&mut self) -> Result<&mut ArrayOfTables, RevisionError> {
+        let path = &self.path;
+        self.document
+            .entry("effect")
+            .or_insert_with(|| Item::ArrayOfTables(ArrayOfTables::new()))
+            .as_array_of_tables_mut()
+            .ok_or_else(|| RevisionError::Shape { path: path.clone() })
+    }
+}
+
+/// One act of a commit; whatever comes after it may not happen.
+#[derive(Debug)]
+enum Step {
+    /// A revision goes into the history.
+    Keep { path: PathBuf, text: String },
+    /// The file becomes the new revision.
+    Replace { path: PathBuf, text: String },
+}
+
+impl Step {
+    fn take(self, lock: &mut Option<Lock>) -> Result<(), RevisionError> {
+        match self {
+            Self::Keep { path, text } => keep(&path, &text),
+            Self::Replace { path, text } => lock.take().map_or(Ok(()), |lock| lock.replace(&path, &text)),
+        }
+    }
+}
+
+/// Writes a file of the history: whole under its name, or not at all, and read-only.
+fn keep(path: &Path, text: &str) -> Result<(), RevisionError> {
+    let io = |source| RevisionError::Io { action: "write the history", path: path.to_owned(), source };
+    let folder = path.parent().unwrap_or(Path::new("."));
+    fs::create_dir_all(folder).map_err(io)?;
+    if path.exists() {
+        let reason = "a revision of that name exists already, and is another".to_owned();
+        return Err(RevisionError::Damaged { path: path.to_owned(), reason });
+    }
+    // The lock is ours, so nobody else has this file; one that a kill left is written anew.
+    let partial = folder.join(format!(".{}.partial", path.file_stem().unwrap_or_default().to_string_lossy()));
+    let mut file = File::create(&partial).map_err(io)?;
+    file.write_all(text.as_bytes()).map_err(io)?;
+    let mut permissions = file.metadata().map_err(io)?.permissions();
+    permissions.set_readonly(true);
+    file.set_permissions(permissions).map_err(io)?;
+    file.sync_all().map_err(io)?;
+    fs::rename(&partial, path).map_err(io)?;
+    sync_folder(folder).map_err(io)?;
+    // The entry of a folder that was just made.
+    sync_folder(folder.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))).map_err(io)
+}
+
+#[cfg(unix)]
+fn sync_folder(folder: &Path) -> std::io::Result<()> {
+    File::open(folder).and_then(|folder| folder.sync_all())
+}
+
+/// Elsewhere a folder is no file that could be flushed.
+#[cfg(not(unix))]
+fn sync_folder(_: &Path) -> std::io::Result<()> {
+    Ok(())
+}
+
+/// The right to change a model file: `MODEL.toml.lock`, which only one writer can make.
+#[derive(Debug)]
+struct Lock {
+    path: PathBuf,
+    file: File,
+    renamed: bool,
+}
+
+impl Lock {
+    fn take(model: &Path) -> Result<Self, RevisionError> {
+        let mut path = model.as_os_str().to_owned();
+        path.push(".lock");
+        let path = PathBuf::from(path);
+        if fs::metadata(model).is_ok_and(|m| m.permissions().readonly()) {
+            let source = std::io::Error::from(ErrorKind::PermissionDenied);
+            return Err(RevisionError::Io { action: "change the read-only", path: model.to_owned(), source });
+        }
+        match OpenOptions::new().write(true).create_new(true).open(&path) {
+            Ok(file) => Ok(Self { path, file, renamed: false }),
+            Err(error) if error.kind() == ErrorKind::AlreadyExists => Err(RevisionError::Locked { path }),
+            Err(source) => Err(RevisionError::Io { action: "lock the model file with", path, source }),
+        }
+    }
+
+    /// Fills the lock with the text and gives it the file's name, which also ends the lock.
+    fn replace(mut self, path: &Path, text: &str) -> Result<(), RevisionError> {
+        let io = |source| RevisionError::Io { action: "write the model file", path: path.to_owned(), source };
+        self.file.write_all(text.as_bytes()).map_err(io)?;
+        if let Ok(old) = fs::metadata(path) {
+            self.file.set_permissions(old.permissions()).map_err(io)?;
+        }
+        self.file.sync_all().map_err(io)?;
+        fs::rename(&self.path, path).map_err(io)?;
+        self.renamed = true;
+        sync_folder(path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))).map_err(io)
+    }
+}
+
+impl Drop for Lock {
+    fn drop(&mut self) {
+        if !self.renamed {
+            let _ = fs::remove_file(&self.path); // one that stays is told to the next writer
+        }
+    }
+}
+
+/// Where a revision stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Place {
+    /// The file is this revision.
+    Current,
+    /// The file came from it.
+    Ancestor,
+    /// The file did not come from it.
+    Aside,
+}
+
+/// A revision of a model file.
+#[derive(Clone, Debug)]
+pub struct Logged {
+    /// Its model.
+    pub model: Model,
+    /// Name; that of [`Model::identity`] where the file was edited by hand.
+    pub revision: String,
+    /// Parent.
+    pub parent: Option<String>,
+    /// Where it stands.
+    pub place: Place,
+    /// What changed from the parent; everything where there is none, nothing where it is not known.
+    pub changes: Vec<Change>,
+    /// The file was edited by hand after this revision was made, and is not recorded.
+    pub edited: bool,
+}
+
+/// The revisions of a model file.
+#[derive(Clone, Debug)]
+pub struct Log {
+    /// Newest first.
+    pub revisions: Vec<Logged>,
+    /// Files of the history that cannot be used, and why.
+    pub problems: Vec<(PathBuf, String)>,
+}
+
+/// Every revision of a model file.
+///
+/// # Errors
+/// The file itself or the folder of the history cannot be read.
+pub fn log(path: &Path) -> Result<Log, RevisionError> {
+    let current = Model::load(path)?;
+    let kept = history(&history_folder(path))?;
+    let stored = kept.models.iter().find(|(model, _)| model.revision == current.revision);
+    let edited = current.edited_by_hand() || stored.is_some_and(|(model, _)| model.effects != current.effects);
+    let (revision, parent) = match (edited, current.edited_by_hand()) {
+        (true, false) => (format!("{}+{}", current.revision, current.digest()), Some(current.revision.clone())),
+        _ => current.identity(),
+    };
+    let mut all: Vec<(Model, String, Option<String>, bool)> = kept
+        .models
+        .into_iter()
+        .filter(|(model, _)| edited || model.revision != current.revision)
+        .map(|(model, _)| (model.clone(), model.revision.clone(), model.parent, false))
+        .collect();
+    let number = |name: &str, edited: bool| {
+        let made = Model::parts(name).map(|(counter, _)| counter).or_else(|| name.parse().ok());
+        if edited { u32::MAX } else { made.unwrap_or(0) }
+    };
+    all.push((current, revision.clone(), parent, edited));
+    all.sort_by(|a, b| (number(&b.1, b.3), &b.1).cmp(&(number(&a.1, a.3), &a.1)));
+    let mut line = BTreeSet::new();
+    let mut at = Some(revision.clone());
+    while let Some(name) = at.filter(|name| !line.contains(name)) {
+        at = all.iter().find(|(_, revision, ..)| *revision == name).and_then(|(_, _, parent, _)| parent.clone());
+        line.insert(name);
+    }
+    let revisions = all.iter().map(|(model, name, parent, edited)| {
+        let from = match parent {
+            None => Some(&[][..]),
+            Some(parent) => all.iter().find(|(_, r, ..)| r == parent).map(|(m, ..)| m.effects.as_slice()),
+        };
+        Logged {
+            model: model.clone(),
+            revision: name.clone(),
+            parent: parent.clone(),
+            place: match (*name == revision, line.contains(name)) {
+                (true, _) => Place::Current,
+                (_, true) => Place::Ancestor,
+                _ => Place::Aside,
+            },
+            changes: from.map(|from| changes(from, &model.effects)).unwrap_or_default(),
+            edited: *edited,
+        }
+    });
+    Ok(Log { revisions: revisions.collect(), problems: kept.problems })
+}
+
+/// A revision of a model file and its text: by its name, or by the number in front where that is enough.
+///
+/// # Errors
+/// There is none, or the file cannot be read.
+pub fn find(path: &Path, revision: &str) -> Result<(Model, String), RevisionError> {
+    let current = Model::load(path)?;
+    if current.identity().0 == revision {
+        let text = fs::read_to_string(path).map_err(RevisionError::io("read the model file", path))?;
+        return Ok((Model::parse(path, &text)?, text));
+    }
+    let kept = history(&history_folder(path))?;
+    if let Some(found) = kept.models.iter().find(|(model, _)| model.revision == revision) {
+        return Ok(found.clone());
+    }
+    let numbered: Vec<_> =
+        kept.models.iter().filter(|(model, _)| model.revision.starts_with(&format!("{revision}-"))).collect();
+    if let [found] = numbered[..] {
+        return Ok(found.clone());
+    }
+    let mut known: Vec<String> = kept.models.into_iter().map(|(model, _)| model.revision).collect();
+    let current = current.identity().0;
+    if !known.contains(&current) {
+        known.push(current);
+    }
+    Err(RevisionError::NoRevision { path: path.to_owned(), revision: revision.to_owned(), known: known.join(", ") })
+}
+
+/// `MODEL.history` beside `MODEL.toml`.
+#[must_use]
+pub fn history_folder(path: &Path) -> PathBuf {
+    path.with_extension("history")
+}
+
+#[derive(Default)]
+struct History {
+    /// Sound revisions and their texts, by name.
+    models: Vec<(Model, String)>,
+    problems: Vec<(PathBuf, String)>,
+}
+
+fn history(folder: &Path) -> Result<History, RevisionError> {
+    let mut kept = History::default();
+    let entries = match fs::read_dir(folder) {
+        Ok(entries) => entries,
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(kept),
+        Err(source) => return Err(RevisionError::Io { action: "read the history", path: folder.to_owned(), source }),
+    };
+    let mut paths = Vec::new();
+    for entry in entries {
+        let path = entry.map_err(RevisionError::io("read the history", folder))?.path();
+        // What a kill left unfinished begins with a dot; it never was a revision.
+        if !path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.')) {
+            paths.push(path);
+        }
+    }
+    paths.sort();
+    for path in paths {
+        match sound(&path) {
+            Ok(found) => kept.models.push(found),
+            Err(error) => kept.problems.push((path, error.to_string())),
+        }
+    }
+    Ok(kept)
+}
+
+/// A file of the history, whose name and digest must be its content's.
+fn sound(path: &Path) -> Result<(Model, String), RevisionError> {
+    let text = fs::read_to_string(path).map_err(RevisionError::io("read the history", path))?;
+    let model = Model::parse(path, &text)?;
+    let damaged = |reason: String| Err(RevisionError::Damaged { path: path.to_owned(), reason });
+    if path.file_name().is_none_or(|name| *name != *format!("{}.toml", model.revision)) {
+        return damaged(format!("the file says that it is revision {}", model.revision));
+    }
+    if model.edited_by_hand() {
+        return damaged(format!("its effects have the digest {}, not that of its name", model.digest()));
+    }
+    Ok((model, text))
+}
+
+/// Refuses a revision that cannot name a file.
+fn file_name(model: &Model) -> Result<(), RevisionError> {
+    let revision = &model.revision;
+    let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '.' | '_' | '+' | '-');
+    if revision.is_empty() || revision.starts_with('.') || !revision.chars().all(plain) {
+        return Err(RevisionError::Name { path: model.path.clone(), revision: revision.clone() });
+    }
+    Ok(())
+}
+
+fn document(path: &Path, text: &str) -> Result<DocumentMut, RevisionError> {
+    text.parse().map_err(|_| RevisionError::Shape { path: path.to_owned() })
+}
+
+/// The text of a document under another revision and parent.
+fn with_header(mut document: DocumentMut, revision: &str, parent: Option<&str>) -> String {
+    let header = document.entry("model").or_insert_with(|| Item::Table(Table::new()));
+    if let Some(header) = header.as_table_like_mut() {
+        set(header, "revision", revision.into());
+        match parent {
+            Some(parent) => set(header, "parent", parent.into()),
+            None => drop(header.remove("parent")),
+        }
+    }
+    document.to_string()
+}
+
+/// Sets a value and keeps what stands around it.
+fn set(table: &mut dyn TableLike, key: &str, mut to: Value) {
+    match table.get_mut(key) {
+        Some(Item::Value(old)) => {
+            *to.decor_mut() = old.decor().clone();
+            *old = to;
+        }
+        _ => {
+            table.insert(key, Item::Value(to));
+        }
+    }
+}
+
+/// Sets `prior.NAME.KEY` in whatever form the file has its priors.
+fn set_prior(effect: &mut Table, name: &str, key: &str, number: f64) {
+    let dotted = |inline: bool| {
+        let mut table = Table::new();
+        table.set_dotted(true);
+        if inline { Item::Value(Value::InlineTable(InlineTable::new())) } else { Item::Table(table) }
+    };
+    let priors = effect.entry("prior").or_insert_with(|| dotted(false));
+    let inline = priors.is_inline_table();
+    let Some(priors) = priors.as_table_like_mut() else { return };
+    let prior = priors.entry(name).or_insert_with(|| dotted(inline));
+    if let Some(prior) = prior.as_table_like_mut() {
+        set(prior, key, number.into());
+    }
+}
+
+fn prefix(table: &Table) -> String {
+    table.decor().prefix().and_then(|p| p.as_str()).unwrap_or_default().to_owned()
+}
+
+/// Comments above a table that an empty line parts from it: they are the file's, not the table's.
+fn detached(table: Option<&Table>) -> String {
+    let above = table.map(prefix).unwrap_or_default();
+    let end = above.rfind("\n\n").map_or(0, |at| at + 1);
+    let own = &above[..end];
+    if own.contains('#') { own.to_owned() } else { String::new() }
+}
+
+#[cfg(test)]
+mod tests;
