@@ -1,0 +1,381 @@
+//! Effect `slosh`: propellant that swings in its tank, a damped mode that the spacecraft's acceleration drives.
+//!
+//! A slug `m_f = μ m_S` at `x` from its rest along an axis of SRF, the spacecraft without it `m_S − m_f`, known force `F` on the
+//! spacecraft: `(m_S − m_f) a = F + κ`, `m_f (a + ẍ) = −κ`, `κ = m_f(ω0² x + 2ζω0 ẋ)` (Dodge, The New Dynamic Behavior of
+//! Liquids in Moving Containers, ch. 3). The sum is `m_S a = F − m_f ẍ`. With `a` put into the second,
+//!
+//! `ẍ + 2ZΩ ẋ + Ω² x = −F/(m_S (1 − μ))`, `Ω = ω0/√(1 − μ)`, `Z = ζ/√(1 − μ)`:
+//!
+//! so `a = F/m_S + c s`, where `s` is `−ẍ` under `F/m_S` and **`c = μ/(1 − μ)`**, the slug's mass over that of all the rest. The
+//! parameters `f0_hz` = Ω/2π and `zeta` = Z are those of the resonance as it is seen, with the spacecraft free; with the
+//! spacecraft held it is lower by √(1 − μ), 1.5 % for μ = 0.03. The test masses stay behind: `z_i = −c T_S^{O_i} e s`.
+//!
+//! `F` is what is known: thrusters, sunlight, the electrodes' recoil. Noise of the thrusters drives the mode too and is not
+//! known: it colours the residuals, common to both test masses. **Range** of c: 0 to 0.3; a slug cannot have a negative mass.
+//! **Confounders.** Far above the resonance `s = F/m_S`, the response of `mps-gain`, below it nothing: only the resonance's own
+//! band tells them apart.
+
+use std::f64::consts::TAU;
+
+use dragfree_physics::mission::Mission;
+use dragfree_sdk::prelude::*;
+use serde_json::json;
+
+use crate::common::{
+    AXES, Place, axis_of, behind_spacecraft, loaded, manifest, mission, on_channels, rows_between, saved,
+};
+
+const STATE: &[u8; 8] = b"slosh/1\n";
+const MOST: f64 = 0.3;
+/// Between the epochs of a shorter gap the last force holds, and after a longer one the slug starts at rest, s.
+const HOLD_S: f64 = 60.0;
+/// Resonances that a candidate tries, Hz, and their damping ratios.
+const FIRST_HZ: f64 = 0.005;
+const LAST_HZ: f64 = 0.2;
+const ZETAS: [f64; 2] = [0.02, 0.08];
+/// Two resonances of half width `Zf`, `Δf` apart, share `1/(1 + (Δf/2Zf)²)²` of their power as far as a real factor can take it:
+/// 95 % within 0.32 `Zf` of a point of the grid. What they share far above the resonance only adds to that.
+const SPACING_PER_ZETA: f64 = 0.64;
+
+/// What a candidate tries: resonance, Hz, and damping ratio. A damping between two of the grid costs up to 11 % of Δχ² more.
+pub(crate) fn grid() -> impl Iterator<Item = (f64, f64)> {
+    ZETAS.into_iter().flat_map(|zeta| {
+        let steps = ((LAST_HZ / FIRST_HZ).ln() / (SPACING_PER_ZETA * zeta).ln_1p()).ceil();
+        let ratio = (LAST_HZ / FIRST_HZ).powf(1.0 / steps);
+        // A microhertz is a hundredth of the narrowest width.
+        let digits = |f: f64| (f * 1e6).round() / 1e6;
+        (0..=steps as i32).map(move |i| (digits(FIRST_HZ * ratio.powi(i)), zeta))
+    })
+}
+
+/// `s = −ẍ` of `ẍ + 2ZΩẋ + Ω²x = −a`, means over samples in which `a` holds, exactly.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Mode {
+    /// `(x, ẋ)` about the rest under a constant `a`, moved on by a sample: a matrix.
+    transition: [[f64; 2]; 2],
+    /// Rest under `a = 1`, s².
+    rest_s2: f64,
+    dt_s: f64,
+    state: [f64; 2],
+}
+
+impl Mode {
+    /// A resonance at `f0_hz` with damping ratio `zeta` below 1.
+    #[must_use]
+    pub(crate) fn new(f0_hz: f64, zeta: f64, dt_s: f64) -> Self {
+        let (omega, damped) = (TAU * f0_hz, TAU * f0_hz * (1.0 - zeta * zeta).sqrt());
+        let (decay, (sin, cos)) = ((-zeta * omega * dt_s).exp(), (damped * dt_s).sin_cos());
+        let (s, ratio) = (decay * sin / damped, zeta * omega);
+        let transition = [[decay * cos + ratio * s, s], [-omega * omega * s, decay * cos - ratio * s]];
+        Self { transition, rest_s2: -1.0 / (omega * omega), dt_s, state: [0.0; 2] }
+    }
+
+    /// At rest under `a`.
+    pub(crate) fn settle(&mut self, a: f64) {
+        self.state = [self.rest_s2 * a, 0.0];
+    }
+
+    /// Moves on by a sample in which `a` holds; gives the mean of `−ẍ` over it.
+    pub(crate) fn step(&mut self, a: f64) -> f64 {
+        let [x, v] = [self.state[0] - self.rest_s2 * a, self.state[1]];
+        let [to_x, to_v] = self.transition;
+        self.state = [self.rest_s2 * a + to_x[0] * x + to_x[1] * v, to_v[0] * x + to_v[1] * v];
+        (v - self.state[1]) / self.dt_s
+    }
+}
+
+/// The force on the spacecraft along an axis, N, from columns with factors.
+#[derive(Debug)]
+struct Force {
+    terms: Vec<(In, f64)>,
+}
+
+/// The effect.
+#[derive(Debug)]
+pub(crate) struct Slosh {
+    instance: String,
+    mission: Mission,
+    candidate: bool,
+    f0_hz: f64,
+    zeta: f64,
+    force: Force,
+    modes: Vec<(Mode, Out)>,
+    /// The last known force over the spacecraft's mass, m s⁻²; NaN before the first, or after a long gap.
+    held: f64,
+    /// Rows without a force since.
+    missing: u64,
+    last_ns: i64,
+}
+
+impl Slosh {
+    fn name(&self) -> String {
+        format!("slosh:{}", self.instance)
+    }
+
+    /// `F_T + F_SRP − Σ T_{O_j}^S F_Ej` along the axis (eq:TM_SC_relative_acceleration).
+    fn link_force(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
+        let axis = axis_of(&self.instance);
+        let thrust = Want::new(format!("used.mps_force_srf_n.{}", AXES[axis])).unit("N").frame("SRF");
+        self.force.terms = vec![(link.read(&thrust)?, 1.0)];
+        if let Some(pressure) = &self.mission.solar_pressure {
+            let sun = Want::new(format!("used.sun_srf.{}", AXES[axis])).unit("1").frame("SRF");
+            if let Some(sun) = link.read_if_available(available, &sun)? {
+                self.force.terms.push((sun, pressure.force_n));
+            }
+        }
+        for (name, tm) in &self.mission.test_mass {
+            let frame = if name == "tm1" { "ORF_1" } else { "ORF_2" };
+            let srf_from_orf = tm.dcm_orf_from_srf().transpose();
+            for (j, letter) in AXES.iter().enumerate() {
+                let push = Want::new(format!("used.{name}.force_orf_n.{letter}")).unit("N").frame(frame);
+                if srf_from_orf[(axis, j)] != 0.0
+                    && let Some(push) = link.read_if_available(available, &push)?
+                {
+                    self.force.terms.push((push, -srf_from_orf[(axis, j)]));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The series of one resonance, and what the test masses show of it.
+    fn responses(
+        &mut self,
+        (f0_hz, zeta): (f64, f64),
+        available: &Available,
+        link: &mut EffectLink<'_, '_>,
+    ) -> Result<Vec<Response>, PluginError> {
+        let name = format!("slosh({},{f0_hz},{zeta})", self.instance);
+        let (table, out) = link.shared_series(available, &name, "m s-2", "SRF")?;
+        if let Some(out) = out {
+            self.modes.push((Mode::new(f0_hz, zeta, self.mission.dt_s()), out));
+        }
+        let mut responses = behind_spacecraft(&self.mission, axis_of(&self.instance), &(table, name));
+        // The series is an acceleration of the spacecraft, not a force on it.
+        responses.iter_mut().for_each(|r| r.factor *= self.mission.spacecraft.mass_kg);
+        on_channels(available, &self.name(), responses)
+    }
+
+    /// Takes in a row's acceleration by the known force; false where the row has no value.
+    fn drive(&mut self, now_ns: i64, a: f64) -> bool {
+        let dt_s = self.mission.dt_s();
+        let patience = (HOLD_S / dt_s) as u64;
+        let left_out = rows_between(self.last_ns, now_ns, dt_s);
+        self.missing = self.missing.saturating_add(left_out);
+        self.last_ns = now_ns;
+        let known = a.is_finite();
+        if self.missing > patience {
+            self.held = f64::NAN;
+        }
+        if self.held.is_finite() {
+            for _ in 0..left_out {
+                for (mode, _) in &mut self.modes {
+                    mode.step(self.held);
+                }
+            }
+        } else if known {
+            self.modes.iter_mut().for_each(|(mode, _)| mode.settle(a));
+        }
+        if known {
+            (self.held, self.missing) = (a, 0);
+        } else {
+            self.missing = self.missing.saturating_add(1);
+        }
+        known
+    }
+}
+
+impl Effect for Slosh {
+    const MANIFEST: Manifest = manifest(
+        "slosh",
+        "Propellant that swings along an axis, driven by the spacecraft's acceleration",
+        &[
+            Parameter::f64("f0_hz", "Hz", 0.03, 1e-4..=2.0, "resonance as it is seen, with the spacecraft free"),
+            Parameter::f64("zeta", "1", 0.02, 1e-4..=0.9, "damping ratio of that resonance"),
+        ],
+        &["sc.x", "sc.y"],
+        &["commands"],
+    );
+
+    fn new(setup: &Setup) -> Result<Self, PluginError> {
+        Ok(Self {
+            instance: setup.instance().to_owned(),
+            mission: mission(setup)?,
+            candidate: setup.candidate(),
+            f0_hz: setup.f64("f0_hz")?,
+            zeta: setup.f64("zeta")?,
+            force: Force { terms: Vec::new() },
+            modes: Vec::new(),
+            held: f64::NAN,
+            missing: 0,
+            last_ns: 0,
+        })
+    }
+
+    fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
+        on_channels(available, &self.name(), behind_spacecraft(&self.mission, 0, &Place::default()))?;
+        self.link_force(available, link)?;
+        let mut coefficient = Coefficient {
+            name: format!("slosh.{}", self.instance),
+            lower: 0.0,
+            upper: MOST,
+            prior_sigma: MOST / 3.0,
+            ..Coefficient::default()
+        };
+        let shape = |(f0_hz, zeta): (f64, f64)| {
+            Shape::from([("f0_hz".to_owned(), json!(f0_hz)), ("zeta".to_owned(), json!(zeta))])
+        };
+        if self.candidate {
+            for point in grid() {
+                let responses = self.responses(point, available, link)?;
+                coefficient.variants.push(Variant { shape: shape(point), responses, unit: None, range: None });
+            }
+        } else {
+            let point = (self.f0_hz, self.zeta);
+            (coefficient.shape, coefficient.responses) = (shape(point), self.responses(point, available, link)?);
+        }
+        link.coefficient(&coefficient)
+    }
+
+    fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
+        let times = input.time_ns();
+        let mut acceleration = vec![0.0; times.len()];
+        for (column, factor) in &self.force.terms {
+            let factor = factor / self.mission.spacecraft.mass_kg;
+            acceleration.iter_mut().zip(input.f64(*column)).for_each(|(a, x)| *a += factor * x);
+        }
+        let mut start = 0;
+        while start < times.len() {
+            // A row without a force, or after a gap, alone; then all that follow without one, mode by mode.
+            let known = self.drive(times[start], acceleration[start]);
+            let mut end = start + 1;
+            let step_ns = (self.mission.dt_s() * 1.5e9) as i64;
+            if known {
+                while end < times.len() && acceleration[end].is_finite() && times[end] - times[end - 1] < step_ns {
+                    end += 1;
+                }
+                (self.held, self.last_ns) = (acceleration[end - 1], times[end - 1]);
+            }
+            let held = self.held;
+            for (mode, out) in &mut self.modes {
+                let column = output.f64(*out);
+                if known {
+                    column.extend(acceleration[start..end].iter().map(|a| mode.step(*a)));
+                } else {
+                    if held.is_finite() {
+                        mode.step(held);
+                    }
+                    column.push(f64::NAN);
+                }
+            }
+            start = end;
+        }
+        Ok(())
+    }
+
+    fn save(&self) -> Result<Vec<u8>, PluginError> {
+        let whole = [self.missing, self.last_ns.cast_unsigned()].map(f64::from_bits);
+        let modes = self.modes.iter().flat_map(|(mode, _)| mode.state);
+        Ok(saved(STATE, [self.held].into_iter().chain(whole).chain(modes)))
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
+        let numbers = loaded(STATE, &self.name(), 3 + 2 * self.modes.len(), state)?;
+        (self.held, self.missing) = (numbers[0], numbers[1].to_bits());
+        self.last_ns = numbers[2].to_bits().cast_signed();
+        for ((mode, _), state) in self.modes.iter_mut().zip(numbers[3..].chunks_exact(2)) {
+            mode.state = [state[0], state[1]];
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The two bodies themselves, each with its own equation, in small steps: what the spacecraft does more than `F/m_S` is the
+    /// mode's output times μ/(1 − μ). Nothing here knows of the resonance's shift or of exponentials.
+    #[test]
+    fn slug_and_spacecraft_move_as_the_mode_says() {
+        let (mass_kg, mu, f0_hz, zeta, dt_s) = (1500.0, 0.2_f64, 0.4, 0.1, 0.1);
+        let (slug_kg, rest_kg) = (mass_kg * mu, mass_kg * (1.0 - mu));
+        let omega = TAU * f0_hz;
+        let raised = (1.0 - mu).sqrt();
+        let mut mode = Mode::new(f0_hz / raised, zeta / raised, dt_s);
+        let coefficient = mu / (1.0 - mu);
+        let (mut x, mut v, steps) = (0.0, 0.0, 20_000);
+        let (h, mut worst, mut scale, mut first_order) = (dt_s / f64::from(steps), 0.0_f64, 0.0_f64, 0.0_f64);
+        for k in 0..60 {
+            let force_n = if k < 30 { 1e-4 } else { -2e-4 * (0.7 * f64::from(k)).sin() };
+            let mut gained = 0.0;
+            for _ in 0..steps {
+                // Midpoint rule.
+                let slug = |x: f64, v: f64| {
+                    let spring_n = slug_kg * (omega * omega * x + 2.0 * zeta * omega * v);
+                    let a = (force_n + spring_n) / rest_kg;
+                    (a, -spring_n / slug_kg - a)
+                };
+                let (_, w) = slug(x, v);
+                let (a, w) = slug(x + 0.5 * h * v, v + 0.5 * h * w);
+                x += h * (v + 0.5 * h * w);
+                v += h * w;
+                gained += h * a;
+            }
+            let more = gained / dt_s - force_n / mass_kg;
+            let s = mode.step(force_n / mass_kg);
+            worst = worst.max((more - coefficient * s).abs());
+            first_order = first_order.max((more - mu * s).abs());
+            scale = scale.max(more.abs());
+        }
+        assert!(worst < 1e-6 * scale, "{worst:e} of {scale:e}");
+        assert!(first_order > 0.1 * scale, "μ for μ/(1 − μ) would be seen");
+    }
+
+    #[test]
+    fn under_a_constant_force_a_settled_slug_does_nothing() {
+        let mut mode = Mode::new(0.03, 0.02, 0.1);
+        mode.settle(3e-7);
+        for _ in 0..1000 {
+            assert!(mode.step(3e-7).abs() < 1e-20);
+        }
+        // And far above its resonance the slug stays where it is while the rest is pushed: the rest is lighter by it.
+        let mut mode = Mode::new(1e-4, 0.02, 0.1);
+        assert!((mode.step(3e-7) - 3e-7).abs() < 1e-12);
+    }
+
+    /// What a flat drive leaves of Δχ² to a model whose resonance is off: the integral over frequency of both responses.
+    fn loss(a: (f64, f64), b: (f64, f64)) -> f64 {
+        let h = |f: f64, (f0, zeta): (f64, f64)| {
+            nalgebra::Complex::new(f * f, 0.0) / nalgebra::Complex::new(f * f - f0 * f0, -2.0 * zeta * f0 * f)
+        };
+        // Up to 0.3 Hz, as far as the loop answers the thrusters' noise.
+        let (mut aa, mut bb, mut ab) = (0.0, 0.0, 0.0);
+        let step = 1e-3 * a.0 * a.1;
+        let mut f = 0.5 * step;
+        while f < 0.3 {
+            let (x, y) = (h(f, a), h(f, b));
+            // Wide steps far from the resonance.
+            let df = step * (1.0 + 20.0 * ((f - a.0) / (a.0 * a.1)).abs().min(10.0));
+            (aa, bb, ab) = (aa + df * x.norm_sqr(), bb + df * y.norm_sqr(), ab + df * (x * y.conj()).re);
+            f += df;
+        }
+        1.0 - ab * ab / (aa * bb)
+    }
+
+    #[test]
+    fn between_two_points_of_the_grid_five_per_cent_are_lost() {
+        let all: Vec<(f64, f64)> = grid().collect();
+        assert!((all[0].0, all.last().unwrap().0) == (FIRST_HZ, LAST_HZ), "{all:?}");
+        for zeta in ZETAS {
+            let points: Vec<f64> = all.iter().filter(|p| p.1 == zeta).map(|p| p.0).collect();
+            for i in [0, points.len() / 2, points.len() - 2] {
+                let middle = (points[i] * points[i + 1]).sqrt();
+                let lost = loss((points[i], zeta), (middle, zeta));
+                assert!(lost < 0.05, "{zeta} {middle}: {lost}");
+                let next = loss((points[i], zeta), (points[i] * (1.0 + 4.0 * SPACING_PER_ZETA * zeta), zeta));
+                assert!(next > 0.05, "a grid four times as coarse would lose more: {next}");
+            }
+        }
+    }
+}

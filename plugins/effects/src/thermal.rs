@@ -1,0 +1,225 @@
+//! Effect `thermal`: a force on a test mass that follows the difference of two temperatures.
+//!
+//! Warm walls push: residual gas, radiation pressure and outgassing of opposite faces of the housing differ by their
+//! temperatures. `a = k (T₊ − T₋)` behind a first-order lag `τ`, by which heat comes from where it is measured to where it acts:
+//! `τ ẏ = T − y` (LISA Pathfinder's housings: arXiv:1905.09060, 2507.20846).
+//!
+//! **Units, sign.** k: m s⁻² K⁻¹; positive where the test mass is pushed along its axis of ORF while `plus` is the warmer one.
+//! **Range** ±1e-9: radiation pressure and the radiometric effect give some 1e-11 each; more is another cause.
+//! **Confounders.** The two columns and the lag are to be found: neighbouring lags differ little (the bank's ratio is 1.5, and
+//! the truth between two of them is a mixture), thermometers that see the same heater are alike, and the loop's commands mirror
+//! every slow force: gains of actuators near −1 "explain" it too, which their ranges forbid.
+
+use dragfree_physics::mission::Mission;
+use dragfree_sdk::prelude::*;
+use serde_json::json;
+
+use crate::common::{
+    Place, TM_AXES, channel_of, housekeeping, loaded, manifest, mission, named, on_channels, response, saved,
+};
+use crate::lag::Lags;
+
+const STATE: &[u8; 8] = b"thermal1";
+const K_MAX: f64 = 1e-9;
+
+/// The lags that a candidate tries, s: 30 s to 4,000 s in steps of 1.5, whole seconds.
+pub(crate) const LAGS_S: [f64; 13] =
+    [30.0, 45.0, 68.0, 101.0, 152.0, 228.0, 342.0, 513.0, 769.0, 1153.0, 1730.0, 2595.0, 3892.0];
+
+/// Name of a lagged column.
+pub(crate) fn lagged(column: &str, lag_s: f64) -> String {
+    format!("lag({column},{lag_s})")
+}
+
+/// One column behind lags, those of which nobody else made before.
+#[derive(Debug)]
+struct Bank<const N: usize> {
+    input: In,
+    lags: Lags<N>,
+    /// Per lag: where it is written, unless it stands elsewhere.
+    out: [Option<Out>; N],
+}
+
+impl<const N: usize> Bank<N> {
+    /// Announces what is missing; gives where each lag stands, and the bank if it has anything to do.
+    fn link(
+        column: &Column,
+        lag_s: [f64; N],
+        dt_s: f64,
+        available: &Available,
+        link: &mut EffectLink<'_, '_>,
+    ) -> Result<([Place; N], Option<Self>), PluginError> {
+        let mut places = [const { (String::new(), String::new()) }; N];
+        let mut out = [None; N];
+        for j in 0..N {
+            let name = lagged(&column.name, lag_s[j]);
+            let (table, written) = link.shared_series(available, &name, &column.unit, &column.frame)?;
+            (places[j], out[j]) = ((table, name), written);
+        }
+        if out.iter().all(Option::is_none) {
+            return Ok((places, None));
+        }
+        let input = link.read(&Want::of(column).unit(&column.unit))?;
+        Ok((places, Some(Self { input, lags: Lags::new(lag_s, dt_s), out })))
+    }
+
+    fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) {
+        let out = self.out;
+        self.lags.push(input.time_ns(), input.f64(self.input), |j, rows| {
+            if let Some(column) = out[j] {
+                output.f64(column).extend_from_slice(rows);
+            }
+        });
+    }
+}
+
+/// The effect.
+#[derive(Debug)]
+pub(crate) struct Thermal {
+    instance: String,
+    mission: Mission,
+    candidate: bool,
+    plus: String,
+    minus: String,
+    lag_s: f64,
+    single: Vec<Bank<1>>,
+    banks: Vec<Bank<13>>,
+}
+
+impl Thermal {
+    fn name(&self) -> String {
+        format!("thermal:{}", self.instance)
+    }
+
+    /// The response to one lagged temperature.
+    fn pushed(&self, temperature: &Place, factor: f64) -> Response {
+        response(channel_of(&self.instance), temperature, factor)
+    }
+
+    /// Every two temperatures, once, at every lag of the grid. The sign of k is free, so their order tells nothing.
+    fn variants(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<Vec<Variant>, PluginError> {
+        let columns: Vec<&Column> = housekeeping(available, "K").collect();
+        let mut places = Vec::new();
+        for column in &columns {
+            let (place, bank) = Bank::link(column, LAGS_S, self.mission.dt_s(), available, link)?;
+            places.push(place);
+            self.banks.extend(bank);
+        }
+        let mut variants = Vec::new();
+        for plus in 0..columns.len() {
+            for minus in plus + 1..columns.len() {
+                for (j, lag_s) in LAGS_S.into_iter().enumerate() {
+                    let shape = [
+                        ("plus".to_owned(), json!(columns[plus].name)),
+                        ("minus".to_owned(), json!(columns[minus].name)),
+                        ("lag_s".to_owned(), json!(lag_s)),
+                    ];
+                    let responses = vec![self.pushed(&places[plus][j], 1.0), self.pushed(&places[minus][j], -1.0)];
+                    variants.push(Variant { shape: shape.into(), responses, unit: None, range: None });
+                }
+            }
+        }
+        Ok(variants)
+    }
+
+    /// The two temperatures that the parameters name, or one alone.
+    fn responses(
+        &mut self,
+        available: &Available,
+        link: &mut EffectLink<'_, '_>,
+    ) -> Result<Vec<Response>, PluginError> {
+        if self.plus.is_empty() && self.minus.is_empty() {
+            // The sentence says which columns there are.
+            named(available, &self.name(), "plus", "", "K")?;
+        }
+        let mut responses = Vec::new();
+        for (parameter, name, factor) in [("plus", self.plus.clone(), 1.0), ("minus", self.minus.clone(), -1.0)] {
+            if name.is_empty() {
+                continue;
+            }
+            let column = named(available, &self.name(), parameter, &name, "K")?;
+            let ([lagged], bank) = Bank::link(column, [self.lag_s], self.mission.dt_s(), available, link)?;
+            responses.push(self.pushed(&lagged, factor));
+            self.single.extend(bank);
+        }
+        Ok(responses)
+    }
+}
+
+impl Effect for Thermal {
+    const MANIFEST: Manifest = manifest(
+        "thermal",
+        "Force on a test mass that follows the difference of two temperatures behind a lag",
+        &[
+            Parameter::text("plus", "", &[], "column of the temperature that pushes along the axis, hk.NAME in K"),
+            Parameter::text("minus", "", &[], "column of the temperature that pushes against it, hk.NAME in K"),
+            Parameter::f64("lag_s", "s", 480.0, 0.0..=1e5, "first-order lag between temperature and force"),
+        ],
+        &TM_AXES,
+        &[],
+    );
+
+    fn new(setup: &Setup) -> Result<Self, PluginError> {
+        Ok(Self {
+            instance: setup.instance().to_owned(),
+            mission: mission(setup)?,
+            candidate: setup.candidate(),
+            plus: setup.text("plus")?,
+            minus: setup.text("minus")?,
+            lag_s: setup.f64("lag_s")?,
+            single: Vec::new(),
+            banks: Vec::new(),
+        })
+    }
+
+    fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
+        let mut coefficient = Coefficient {
+            name: format!("thermal.{}", self.instance),
+            unit: "m s-2 K-1".to_owned(),
+            lower: -K_MAX,
+            upper: K_MAX,
+            prior_sigma: K_MAX / 3.0,
+            ..Coefficient::default()
+        };
+        // Without its channel there is nothing to say.
+        on_channels(available, &self.name(), vec![self.pushed(&Place::default(), 1.0)])?;
+        if self.candidate {
+            coefficient.variants = self.variants(available, link)?;
+            if coefficient.variants.is_empty() {
+                return Err(PluginError::error(format!(
+                    "effect {}: the telemetry has fewer than two temperatures, columns hk.* in K, so there is nothing to try",
+                    self.name()
+                )));
+            }
+        } else {
+            coefficient.responses = self.responses(available, link)?;
+            coefficient.shape = [
+                ("plus".to_owned(), json!(self.plus)),
+                ("minus".to_owned(), json!(self.minus)),
+                ("lag_s".to_owned(), json!(self.lag_s)),
+            ]
+            .into();
+        }
+        link.coefficient(&coefficient)
+    }
+
+    fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
+        self.single.iter_mut().for_each(|bank| bank.process(input, output));
+        self.banks.iter_mut().for_each(|bank| bank.process(input, output));
+        Ok(())
+    }
+
+    fn save(&self) -> Result<Vec<u8>, PluginError> {
+        let single = self.single.iter().flat_map(|bank| bank.lags.state());
+        Ok(saved(STATE, single.chain(self.banks.iter().flat_map(|bank| bank.lags.state()))))
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
+        let count = self.single.len() * Lags::<1>::STATE + self.banks.len() * Lags::<13>::STATE;
+        let numbers = loaded(STATE, &self.name(), count, state)?;
+        let (single, banks) = numbers.split_at(self.single.len() * Lags::<1>::STATE);
+        self.single.iter_mut().zip(single.chunks_exact(Lags::<1>::STATE)).for_each(|(b, s)| b.lags.set_state(s));
+        self.banks.iter_mut().zip(banks.chunks_exact(Lags::<13>::STATE)).for_each(|(b, s)| b.lags.set_state(s));
+        Ok(())
+    }
+}
