@@ -1,5 +1,6 @@
 //! What the whole-program tests share: the built program, its plugins, the repository's fixtures.
 
+pub mod calibration;
 pub mod foreign;
 pub mod recording;
 

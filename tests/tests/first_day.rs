@@ -1,21 +1,12 @@
 //! A first day, end to end: telemetry from the simulator in, a calibration product out.
 
-use dragfree_tests::{coefficient, dragfree, expect, fixture, json, simulate};
+use dragfree_tests::calibration::{TRUTH_M, science_mode};
+use dragfree_tests::{coefficient, dragfree, expect, json, simulate};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::sync::OnceLock;
 use tempfile::TempDir;
-
-/// The offsets of the paper's Table tab:com_calibration_results, m.
-const TRUTH_M: [(&str, f64); 6] = [
-    ("com-offset.tm1.x", 0.090_866_025_403_784_44),
-    ("com-offset.tm1.y", 0.155_384_572_681_198_96),
-    ("com-offset.tm1.z", 0.0),
-    ("com-offset.tm2.x", 0.090_866_025_403_784_44),
-    ("com-offset.tm2.y", -0.155_384_572_681_198_96),
-    ("com-offset.tm2.z", 0.0),
-];
 
 struct Telemetry {
     _dir: TempDir,
@@ -38,9 +29,8 @@ fn telemetry() -> &'static Telemetry {
 }
 
 fn run(folder: &Path, file: &Path, arguments: &[&str]) -> Command {
-    let mut command = dragfree(folder);
-    command.arg("run").arg(fixture("pipelines/science-mode.toml")).arg(file).args(["--archive", "archive", "--json"]);
-    command.args(arguments);
+    let mut command = science_mode(folder);
+    command.arg(file).args(arguments);
     command
 }
 

@@ -1,0 +1,101 @@
+//! Calibrations of simulated telemetry: the run, what came of it, the truth.
+
+use crate::{dragfree, fixture};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// The offsets of the paper's Table tab:com_calibration_results, m.
+pub const TRUTH_M: [(&str, f64); 6] = [
+    ("com-offset.tm1.x", 0.090_866_025_403_784_44),
+    ("com-offset.tm1.y", 0.155_384_572_681_198_96),
+    ("com-offset.tm1.z", 0.0),
+    ("com-offset.tm2.x", 0.090_866_025_403_784_44),
+    ("com-offset.tm2.y", -0.155_384_572_681_198_96),
+    ("com-offset.tm2.z", 0.0),
+];
+
+/// `dragfree run` of the science-mode pipeline in `folder`, into the archive `archive` there, answering in JSON.
+#[must_use]
+pub fn science_mode(folder: &Path) -> Command {
+    of_pipeline(folder, &fixture("pipelines/science-mode.toml"))
+}
+
+/// The same with another pipeline.
+#[must_use]
+pub fn of_pipeline(folder: &Path, pipeline: &Path) -> Command {
+    let mut command = dragfree(folder);
+    command.arg("run").arg(pipeline).args(["--archive", "archive", "--json"]);
+    command
+}
+
+/// The bundled mission with changed texts, in `folder`.
+///
+/// # Panics
+/// A text to be changed is not there.
+#[must_use]
+pub fn changed_mission(folder: &Path, name: &str, changes: &[(&str, &str)]) -> PathBuf {
+    let mut text = std::fs::read_to_string(fixture("missions/taiji.toml")).expect("readable");
+    for (from, to) in changes {
+        assert!(text.contains(from), "{from}");
+        text = text.replacen(from, to, 1);
+    }
+    let path = folder.join(name);
+    std::fs::write(&path, text).expect("writable");
+    path
+}
+
+/// What came of a run.
+pub struct Run {
+    /// Exit code.
+    pub code: Option<i32>,
+    /// What it said.
+    pub stderr: String,
+    /// The product, or null.
+    pub product: Value,
+}
+
+impl Run {
+    /// Runs `command`.
+    ///
+    /// # Panics
+    /// The program does not start, or panics.
+    pub fn of(command: &mut Command) -> Self {
+        let output = command.output().expect("the program runs");
+        let stderr = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.code().is_some() && !stderr.contains("panicked"), "{command:?}: {stderr}");
+        let product = serde_json::from_slice(&output.stdout).unwrap_or(Value::Null);
+        Self { code: output.status.code(), stderr, product }
+    }
+
+    /// Asserts exit code and verdict.
+    ///
+    /// # Panics
+    /// They are others.
+    pub fn assert_ended(&self, code: i32, verdict: &str) {
+        let found = (self.code, &self.product["verdict"]);
+        assert_eq!(found, (Some(code), &Value::from(verdict)), "{} {}", self.stderr, self.notes());
+    }
+
+    /// A count of a stage; 0 where there is none.
+    #[must_use]
+    pub fn count(&self, stage: &str, what: &str) -> u64 {
+        self.product["quality"]["counts"][stage][what].as_u64().unwrap_or(0)
+    }
+
+    /// Epochs used, and rejected.
+    ///
+    /// # Panics
+    /// There is no product.
+    #[must_use]
+    pub fn epochs(&self) -> (u64, u64) {
+        let count = |key: &str| self.product[key].as_u64().unwrap_or_else(|| panic!("no {key}: {}", self.stderr));
+        (count("epochs_used"), count("epochs_rejected"))
+    }
+
+    /// The sentences of the product.
+    #[must_use]
+    pub fn notes(&self) -> String {
+        self.product["quality"]["notes"].to_string()
+    }
+}
