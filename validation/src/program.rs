@@ -252,19 +252,14 @@ pub fn line(configuration: &str, seed: u32, build: &str, truth_m: &[f64; 6], pro
     })
 }
 
-/// By how much `qp-check` widened each σ: for residuals beyond its Σ, or for blocks of time that scatter more than chance
-/// allows, whichever is more.
+/// By how much `qp-check` says that it widened each σ.
 fn qp_widened(product: &Value) -> Result<[f64; 6], String> {
-    let stage = &product["quality"]["stages"]["qp-check"];
-    let chi2 = stage["chi2_per_dof_refined_sigma"].as_f64().ok_or_else(|| "chi2_per_dof_refined_sigma".to_owned())?;
-    let names = product["covariance_names"]["qp"].as_array().ok_or_else(|| "names of qp".to_owned())?;
-    let scatter = &stage["scatter_of_blocks"];
-    let upper = scatter["upper"].as_f64().unwrap_or(f64::INFINITY);
-    Ok(COEFFICIENTS.map(|name| {
-        let place = names.iter().position(|n| n == name).unwrap_or(usize::MAX);
-        let ratio = scatter["ratio"][place].as_f64().filter(|ratio| *ratio > upper).unwrap_or(1.0);
-        ratio.max(chi2.max(1.0).sqrt())
-    }))
+    let widened = &product["quality"]["stages"]["qp-check"]["widened"];
+    let mut all = [1.0; 6];
+    for (factor, name) in all.iter_mut().zip(COEFFICIENTS) {
+        *factor = widened[name].as_f64().ok_or_else(|| format!("widened {name}"))?;
+    }
+    Ok(all)
 }
 
 fn solution(product: &Value, label: &str, truth_m: &[f64; 6]) -> Result<Solution, String> {
@@ -311,6 +306,8 @@ mod tests {
             covariance.insert(label.to_owned(), json!(matrix));
             names.insert(label.to_owned(), json!(order));
         }
+        let widened: serde_json::Map<_, _> =
+            order.iter().enumerate().map(|(i, n)| ((*n).to_owned(), json!(if i == 0 { 1.6 } else { 1.1 }))).collect();
         let p_end: serde_json::Map<_, _> = COEFFICIENTS.iter().map(|n| ((*n).to_owned(), json!(1e-3))).collect();
         json!({
             "coefficients": coefficients, "covariance": covariance, "covariance_names": names,
@@ -318,8 +315,7 @@ mod tests {
             "date_created": "2026-11-21T04:14:45Z",
             "start_time_epoch_ns": 0_i64, "stop_time_epoch_ns": 86_399_900_000_000_i64,
             "quality": { "counts": { "es-akf": { "updates": 100 } }, "stages": {
-                "qp-check": { "chi2_per_dof_refined_sigma": 1.21, "scatter_of_blocks": {
-                    "ratio": [1.6, 1.4, 1.0, 1.0, 1.0, 1.0], "upper": 1.5 } },
+                "qp-check": { "widened": widened },
                 "es-akf": {
                 "tm1": { "sigma_stretch": 1.0 }, "tm2": { "sigma_stretch": 2.0 }, "p_end_sigma": p_end } } },
         })

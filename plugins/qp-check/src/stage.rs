@@ -1,5 +1,7 @@
 //! The stage: columns in, report out.
 
+use std::collections::BTreeMap;
+
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::DMatrix;
@@ -375,6 +377,7 @@ impl Linked {
             ("chi2_per_dof_refined_sigma", json!(quality.chi2_per_dof)),
             ("last_step_sigma", json!(quality.last_step_sigma)),
             ("scatter_of_blocks", json!(solution.scatter)),
+            ("widened", json!(widened(solution, &self.coefficients))),
             ("prediction_error", json!(predicted)),
             ("constraints", json!(solution.pulls)),
             ("survey_chi2", json!(solution.survey_chi2)),
@@ -581,6 +584,18 @@ fn bounds(available: &Available) -> Vec<Bound> {
             Some(Bound { name: c.name.clone(), survey: c.kind == "survey", terms, lower: c.lower, upper: c.upper })
         })
         .collect()
+}
+
+/// By how much each σ was widened: for residuals beyond the refined Σ, or for blocks of time that scatter more than chance allows,
+/// whichever is more.
+fn widened<'a>(solution: &Solution, coefficients: &'a [Coefficient]) -> BTreeMap<&'a str, f64> {
+    let by_noise = solution.quality.chi2_per_dof.max(1.0).sqrt();
+    let by_blocks = |k: usize| {
+        let ratio = solution.scatter.as_ref().and_then(|s| s.ratio.get(k).copied().filter(|ratio| *ratio > s.upper));
+        ratio.unwrap_or(1.0)
+    };
+    let of = |(k, i): (usize, &usize)| (coefficients[*i].name.as_str(), by_blocks(k).max(by_noise));
+    solution.free.iter().enumerate().map(of).collect()
 }
 
 fn estimate_of(c: &Coefficient, solution: &str, value: Option<f64>, sigma: Option<f64>) -> Estimate {
