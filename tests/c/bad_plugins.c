@@ -4,7 +4,7 @@
  *   7 gives one row too few          8 fails in create                 9 a manifest that is no JSON
  *  10 a fatal error in mid-stream
  */
-#include "rows.h"
+#include <dragfree/rows.h>
 #include <fenv.h>
 #include <stdio.h>
 

@@ -1,5 +1,5 @@
 /* A stage and an effect in plain C, compiled by the tests and run in a pipeline. */
-#include "rows.h"
+#include <dragfree/rows.h>
 #include <math.h>
 #include <stdio.h>
 

@@ -4,6 +4,11 @@ use dragfree_tests::{built, root, simulate};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+/// A line that a test can run: the reader's own builds of this repository are not.
+fn is_run(command: &str) -> bool {
+    command.starts_with("dragfree ") || command.starts_with("make ") || command.contains("/dragfree demo")
+}
+
 /// Lines of the `sh` blocks of a page that call `dragfree`, in order.
 fn commands(page: &Path) -> Vec<String> {
     let text = std::fs::read_to_string(page).unwrap_or_else(|e| panic!("{}: {e}", page.display()));
@@ -13,7 +18,7 @@ fn commands(page: &Path) -> Vec<String> {
         match line.trim() {
             "```sh" => inside = true,
             "```" => inside = false,
-            command if inside && (command.starts_with("dragfree ") || command.contains("/dragfree demo")) => {
+            command if inside && is_run(command) => {
                 // The reader has just built the program; here it is on the path.
                 let command = command.rsplit("&& ").next().unwrap_or(command);
                 found.push(command.replace("./target/release/dragfree", "dragfree"));

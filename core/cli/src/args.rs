@@ -222,6 +222,83 @@ pub(crate) enum Plugins {
         #[arg(value_name = "ID")]
         id: String,
     },
+    /// Check a plugin by itself, each check in a process of its own
+    Validate(Validate),
+    /// Write the skeleton of a plugin that builds and works as it is
+    New(NewPlugin),
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Validate {
+    /// Plugin file, or the id of one that `list` finds
+    #[arg(value_name = "FILE|ID")]
+    pub(crate) target: String,
+    /// Mission that it is given [default: the bundled one]
+    #[arg(long, value_name = "MISSION.toml")]
+    pub(crate) mission: Option<PathBuf>,
+    /// Parameter in place of its default; repeatable
+    #[arg(long, value_name = "NAME=VALUE")]
+    pub(crate) set: Vec<String>,
+    /// File for a source that reads some; repeatable
+    #[arg(long, value_name = "FILE")]
+    pub(crate) file: Vec<PathBuf>,
+    /// One check, in this very process: what this command asks of its children
+    #[arg(long, hide = true)]
+    pub(crate) check: Option<String>,
+    /// Kind of the plugin in a file of several
+    #[arg(long, hide = true)]
+    pub(crate) kind: Option<String>,
+    /// Id of the plugin in a file of several
+    #[arg(long, hide = true)]
+    pub(crate) id: Option<String>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct NewPlugin {
+    /// Id of the plugin: small letters, digits and hyphens
+    #[arg(value_name = "NAME", value_parser = plugin_name)]
+    pub(crate) name: String,
+    /// What it is
+    #[arg(long, value_enum)]
+    pub(crate) kind: PluginKind,
+    /// Language
+    #[arg(long, value_enum, default_value_t = Language::Rust)]
+    pub(crate) lang: Language,
+    /// Folder to write [default: NAME]
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: Option<PathBuf>,
+    /// Folder of the SDK, for Rust [default: the one that this program was built from]
+    #[arg(long, value_name = "DIR", conflicts_with = "sdk_git")]
+    pub(crate) sdk: Option<PathBuf>,
+    /// Repository of the SDK, for Rust
+    #[arg(long, value_name = "URL")]
+    pub(crate) sdk_git: Option<String>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum PluginKind {
+    /// A physical cause, whose coefficient is estimated
+    Effect,
+    /// A stage of the chain
+    Stage,
+    /// Telemetry that is no file of ours
+    Source,
+}
+
+impl std::fmt::Display for PluginKind {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Effect => "effect",
+            Self::Stage => "stage",
+            Self::Source => "source",
+        })
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Language {
+    Rust,
+    C,
 }
 
 #[derive(Debug, Subcommand)]
@@ -370,6 +447,16 @@ fn positive(text: &str) -> Result<f64, String> {
     }
 }
 
+/// A name that is an id, a crate and part of a file name.
+fn plugin_name(text: &str) -> Result<String, String> {
+    let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-';
+    if text.starts_with(|c: char| c.is_ascii_lowercase()) && text.len() <= 32 && text.chars().all(plain) {
+        Ok(text.to_owned())
+    } else {
+        Err("small letters, digits and hyphens are needed, a letter first, 32 at most, as in my-effect".to_owned())
+    }
+}
+
 /// The form alone: which effects there are is the simulator's to say.
 fn effect(text: &str) -> Result<String, String> {
     let number = |value: &str| value.trim().parse().is_ok_and(|x: f64| x.is_finite());
@@ -413,6 +500,9 @@ mod tests {
             "dragfree config check p.toml",
             "dragfree plugins list --json --plugin-dir a --plugin-dir b",
             "dragfree plugins inspect es-akf",
+            "dragfree plugins validate libmy_effect.so --mission m.toml --set channel=hk.a --file a.dat --json",
+            "dragfree plugins new my-effect --kind effect --lang c --out d",
+            "dragfree plugins new my-effect --kind stage --sdk ../core/sdk",
             "dragfree products list --json",
             "dragfree products show COM1B_2035-01-01_SC1_01_0001 --archive d --color never",
             "dragfree --threads 2 -q run p.toml",
@@ -445,6 +535,8 @@ mod tests {
             ("dragfree simulate m.toml --out d --effect es-gain:tm1.y=1,f", ErrorKind::ValueValidation),
             ("dragfree simulate m.toml --out d --effect es-gain:tm1.y=1,f=nan", ErrorKind::ValueValidation),
             ("dragfree simulate m.toml --out d --start yesterday", ErrorKind::ValueValidation),
+            ("dragfree plugins new My_Effect --kind effect", ErrorKind::ValueValidation),
+            ("dragfree plugins new my-effect", ErrorKind::MissingRequiredArgument),
             ("dragfree run p.toml --threads 0", ErrorKind::ValueValidation),
             ("dragfree run p.toml --batch-rows 0", ErrorKind::ValueValidation),
             ("dragfree model add m.toml", ErrorKind::MissingRequiredArgument),

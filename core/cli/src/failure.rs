@@ -27,6 +27,18 @@ pub(crate) enum Failure {
     /// Arguments that make no sense together.
     #[error("{0}")]
     Usage(String),
+    /// A skeleton would have to share a folder.
+    #[error("{} is not empty; name another folder with --out", .0.display())]
+    NoPluginFolder(PathBuf),
+    /// There is no SDK to depend on.
+    #[error("there is no SDK in {}; name its folder with --sdk, or its repository with --sdk-git", .0.display())]
+    NoSdk(PathBuf),
+    /// A check that does not exist.
+    #[error("there is no check {0}")]
+    NoCheck(String),
+    /// `--set` without a value.
+    #[error("--set {0}: NAME=VALUE is needed")]
+    NoParameter(String),
     /// The engine failed.
     #[error(transparent)]
     Engine(#[from] Box<dyn Error>),

@@ -17,6 +17,7 @@ pub mod sealed;
 pub mod simulate;
 pub mod table;
 pub mod telemetry;
+pub mod validate;
 
 use std::path::PathBuf;
 

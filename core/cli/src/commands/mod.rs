@@ -4,11 +4,13 @@ mod demo;
 mod design;
 mod ladder;
 mod model;
+mod new_plugin;
 mod plugins;
 mod products;
 mod reveal;
 mod run;
 mod simulate;
+mod validate;
 
 use crate::args::{Arguments, Command, Config, Global};
 use crate::failure::Failure;

@@ -8,11 +8,12 @@ use crate::text::Paint;
 use dragfree_engine::registry::Registry;
 
 pub(super) fn execute(command: &Plugins, global: &Global, paint: Paint) -> Result<Done, Failure> {
-    let registry = super::registry(global)?;
     match command {
-        Plugins::List if global.json => Ok(Done::json(&screen::plugins_json(&registry))),
-        Plugins::List => Ok(Done::new(screen::plugins(&registry, paint))),
-        Plugins::Inspect { id } => inspect(&registry, id, global.json, paint),
+        Plugins::List if global.json => Ok(Done::json(&screen::plugins_json(&super::registry(global)?))),
+        Plugins::List => Ok(Done::new(screen::plugins(&super::registry(global)?, paint))),
+        Plugins::Inspect { id } => inspect(&super::registry(global)?, id, global.json, paint),
+        Plugins::Validate(validate) => super::validate::execute(validate, global, paint),
+        Plugins::New(new) => super::new_plugin::execute(new, global.json),
     }
 }
 

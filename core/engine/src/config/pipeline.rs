@@ -160,7 +160,15 @@ impl Mission {
     /// # Errors
     /// [`ConfigError`] says what, where and why. Keys and values are checked by the plugins that use them.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
-        let table: toml::Table = parse(path, &read(path)?)?;
+        Self::parse(path, &read(path)?)
+    }
+
+    /// A mission from the text of a file; `path` is for messages.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn parse(path: &Path, text: &str) -> Result<Self, ConfigError> {
+        let table: toml::Table = parse(path, text)?;
         let sense = |what: String| ConfigError::Sense { path: path.to_owned(), what };
         let value = serde_json::to_value(&table).map_err(|e| sense(e.to_string()))?;
         let text = |key: &str| {

@@ -1,18 +1,20 @@
-/* Rows out of a plugin written in plain C: a struct array of times and float64 columns, as plugin.h wants it. */
-#ifndef ROWS_H
-#define ROWS_H
+/* dragfree/rows.h - helpers for a plugin written in plain C: rows out as a struct array of times and float64 columns, as plugin.h
+ * wants it, and columns in. No part of the border: copy it, change it, or do without. */
+#ifndef DRAGFREE_ROWS_H
+#define DRAGFREE_ROWS_H
 
 #include <dragfree/plugin.h>
+#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
-static void release_child(struct ArrowArray *array) {
+static inline void release_child(struct ArrowArray *array) {
   free((void *)array->buffers[1]);
   free(array->buffers);
   array->release = NULL;
 }
 
-static void release_table(struct ArrowArray *array) {
+static inline void release_table(struct ArrowArray *array) {
   for (int64_t i = 0; i < array->n_children; i++) {
     if (array->children[i]->release) array->children[i]->release(array->children[i]);
     free(array->children[i]);
@@ -23,7 +25,7 @@ static void release_table(struct ArrowArray *array) {
 }
 
 /* A table of `rows` rows with `columns` float64 columns, its times copied; give the values with `column`. */
-static int make_table(struct ArrowArray *out, const int64_t *time_ns, int64_t rows, int64_t columns) {
+static inline int make_table(struct ArrowArray *out, const int64_t *time_ns, int64_t rows, int64_t columns) {
   memset(out, 0, sizeof *out);
   out->length = rows;
   out->n_buffers = 1;
@@ -47,17 +49,17 @@ static int make_table(struct ArrowArray *out, const int64_t *time_ns, int64_t ro
   return 1;
 }
 
-static double *column(struct ArrowArray *table, int64_t index) {
+static inline double *column(struct ArrowArray *table, int64_t index) {
   return (double *)table->children[index + 1]->buffers[1];
 }
 
 /* Column `index` of an input table; index -1 are the times. */
-static const void *input(const struct ArrowArray *table, int64_t index) {
+static inline const void *input(const struct ArrowArray *table, int64_t index) {
   const struct ArrowArray *child = table->children[index + 1];
   return (const char *)child->buffers[1] + 8 * child->offset;
 }
 
-static dragfree_status say(dragfree_error_v1 *error, dragfree_status status, const char *text) {
+static inline dragfree_status say(dragfree_error_v1 *error, dragfree_status status, const char *text) {
   if (error && error->capacity) {
     strncpy(error->text, text, error->capacity - 1);
     error->text[error->capacity - 1] = 0;

@@ -1,0 +1,444 @@
+//! A plugin by itself: what `plugin.h` asks and what the chain relies on, checked over made-up inputs, without any other plugin.
+//!
+//! A [`Check`] is run in the process of the caller. A plugin that crashes takes that process with it, so a caller that wants to go
+//! on runs each check in a process of its own, as `dragfree plugins validate` does.
+
+mod session;
+mod stand;
+
+use serde_json::{Value, json};
+use std::path::PathBuf;
+
+use crate::border::{BorderError, Config, Kind, Library, LinkRequest, Linked, Manifest, PluginInfo};
+use crate::config::{ConfigError, Mission, resolve_parameters};
+use crate::table::Column;
+use session::{Session, is_same};
+
+/// Epochs that a check feeds: ten minutes at 10 Hz.
+const EPOCHS: usize = 6000;
+/// Epochs without any value in [`Check::Gaps`].
+const GAP: std::ops::Range<usize> = 2000..2050;
+/// Sizes of batches whose results must agree.
+const BATCHES: [usize; 4] = [EPOCHS, 1, 7, 512];
+
+/// Something that is checked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Check {
+    /// The manifest says who it is, and every default is one that the parameter's own declaration allows.
+    Manifest,
+    /// Every instance comes to life.
+    Create,
+    /// Every instance finds its columns, and what it announces is whole.
+    Link,
+    /// Times ascend, nothing is infinite; an effect gives a row for a row, and a finite one once it has run in.
+    Values,
+    /// Missing values are no failure.
+    Gaps,
+    /// Results do not depend on where batches end, bit by bit.
+    Batches,
+    /// Twice the same input gives the same, bit by bit.
+    Replay,
+    /// A state that is saved, loaded and saved again is the same bytes, and the instance that took it over goes on as the first.
+    State,
+    /// Bytes that are no state are refused.
+    Garbage,
+}
+
+impl Check {
+    /// In the order in which they make sense.
+    pub const ALL: [Self; 9] = [
+        Self::Manifest,
+        Self::Create,
+        Self::Link,
+        Self::Values,
+        Self::Gaps,
+        Self::Batches,
+        Self::Replay,
+        Self::State,
+        Self::Garbage,
+    ];
+
+    /// Its name.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Manifest => "manifest",
+            Self::Create => "create",
+            Self::Link => "link",
+            Self::Values => "values",
+            Self::Gaps => "gaps",
+            Self::Batches => "batches",
+            Self::Replay => "replay",
+            Self::State => "state",
+            Self::Garbage => "garbage",
+        }
+    }
+}
+
+/// What a check found.
+#[derive(Debug, thiserror::Error)]
+pub enum Finding {
+    /// The plugin failed or broke a rule of the border.
+    #[error(transparent)]
+    Border(#[from] BorderError),
+    /// The parameters given are not those that it declares.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The manifest is not whole.
+    #[error("manifest: {0}")]
+    Manifest(String),
+    /// What an instance announced or gave is not what the chain relies on.
+    #[error("{instance}: {what}")]
+    Broken {
+        /// Id and instance.
+        instance: String,
+        /// What is wrong, and what to do.
+        what: String,
+    },
+}
+
+/// The plugin and what it is given.
+#[derive(Debug)]
+pub struct Subject<'a> {
+    /// Its library.
+    pub library: &'a Library,
+    /// Which of the library's plugins.
+    pub plugin: &'a PluginInfo,
+    /// The mission.
+    pub mission: &'a Mission,
+    /// Parameters besides the defaults.
+    pub parameters: &'a toml::Table,
+    /// Files, for a source that reads some.
+    pub files: &'a [PathBuf],
+}
+
+impl Subject<'_> {
+    /// Runs a check and gives one sentence about what was looked at.
+    ///
+    /// # Errors
+    /// The first [`Finding`].
+    pub fn run(&self, check: Check) -> Result<String, Finding> {
+        match check {
+            Check::Manifest => manifest(&self.plugin.manifest, self.plugin.kind),
+            Check::Create => self.each(|s, name| s.create(name, false).map(|_| ()), "came to life"),
+            Check::Link => self.each(Self::link, "found their columns"),
+            Check::Values => self.each(|s, name| s.values(name, None), "gave rows that can be used"),
+            Check::Gaps if self.plugin.kind == Kind::Source => Ok("a source has no input".to_owned()),
+            Check::Gaps => self.each(|s, name| s.values(name, Some(GAP)), "went on over 50 epochs without values"),
+            Check::Batches => self.each(Self::batches, "gave the same in batches of 6000, 1, 7 and 512"),
+            Check::Replay => self.each(Self::replay, "gave the same twice"),
+            Check::State => self.each(Self::state, "went on from their states"),
+            Check::Garbage => self.each(Self::garbage, "refused what is no state"),
+        }
+    }
+
+    /// Runs `check` for each instance; a stage or a source has one.
+    fn each(&self, check: impl Fn(&Self, &str) -> Result<(), Finding>, what: &str) -> Result<String, Finding> {
+        let instances = &self.plugin.manifest.instances;
+        if instances.is_empty() {
+            check(self, "")?;
+            return Ok(format!("1 instance: {what}"));
+        }
+        instances.iter().try_for_each(|name| check(self, name))?;
+        Ok(format!("{} instances: {what}", instances.len()))
+    }
+
+    fn broken(&self, instance: &str, what: impl Into<String>) -> Finding {
+        let id = &self.plugin.manifest.id;
+        let instance = if instance.is_empty() { id.clone() } else { format!("{id}:{instance}") };
+        Finding::Broken { instance, what: what.into() }
+    }
+
+    fn create(&self, instance: &str, candidate: bool) -> Result<crate::border::Instance, Finding> {
+        let manifest = &self.plugin.manifest;
+        let value = json!({
+            "parameters": resolve_parameters("the command line", manifest, self.parameters)?,
+            "mission": self.mission.value,
+            "instance": instance,
+            "candidate": candidate,
+            "needs": [],
+            "threads": 1,
+            "files": self.files,
+            "start_ns": stand::START_NS,
+            "end_ns": stand::START_NS + EPOCHS as i64 * self.step_ns(),
+        });
+        Ok(crate::border::Instance::create(self.library, self.plugin, &Config { value })?)
+    }
+
+    /// Interval of the mission's epochs, ns.
+    fn step_ns(&self) -> i64 {
+        let rate_hz = self.mission.value["mission"]["sample_rate_hz"].as_f64().filter(|rate| *rate > 0.0);
+        (1e9 / rate_hz.unwrap_or(10.0)).round() as i64
+    }
+
+    /// A linked instance, the columns that it was offered and what it said.
+    fn linked(
+        &self,
+        instance: &str,
+        candidate: bool,
+    ) -> Result<(crate::border::Instance, Vec<Column>, Linked), Finding> {
+        let rate_hz = 1e9 / self.step_ns() as f64;
+        let parameters = resolve_parameters("the command line", &self.plugin.manifest, self.parameters)?;
+        let mut refused = None;
+        for available in stand::stands(self.plugin.kind, rate_hz, &parameters) {
+            let mut node = self.create(instance, candidate)?;
+            match node.link(LinkRequest { available: &available, model_json: stand::MODEL }) {
+                Ok(linked) => return Ok((node, available, linked)),
+                // A stage that makes the grid stands before it: the next stand has less.
+                Err(BorderError::Link { sentence, .. }) if sentence.contains("exists already") => {}
+                Err(other) => refused = refused.or(Some(other)),
+            }
+        }
+        Err(refused.map_or_else(|| self.broken(instance, "writes columns that the telemetry has"), Finding::from))
+    }
+
+    fn session(&self, instance: &str, gap: Option<std::ops::Range<usize>>) -> Result<Session, Finding> {
+        let (mut node, available, linked) = self.linked(instance, false)?;
+        node.activate(u32::try_from(EPOCHS).unwrap_or(u32::MAX))?;
+        Ok(Session::new(node, self.plugin.kind, &available, &linked, self.step_ns(), gap))
+    }
+
+    fn link(&self, instance: &str) -> Result<(), Finding> {
+        let (_, available, linked) = self.linked(instance, false)?;
+        if self.plugin.kind == Kind::Effect {
+            self.announced(instance, &available, &linked)?;
+            let (_, available, linked) = self.linked(instance, true)?;
+            self.announced(instance, &available, &linked)?;
+        }
+        for column in linked.writes.iter().flat_map(|t| &t.columns) {
+            if column.unit.is_empty() && !column.name.ends_with("status") && !column.name.ends_with("flag") {
+                let what = format!("column {}:{} has no unit; `1` is the unit of a number", column.table, column.name);
+                return Err(self.broken(instance, what));
+            }
+        }
+        Ok(())
+    }
+
+    /// Coefficients with name, unit, range, and columns that say which coefficient and which channel they belong to.
+    fn announced(&self, instance: &str, available: &[Column], linked: &Linked) -> Result<(), Finding> {
+        let fail = |what: String| Err(self.broken(instance, what));
+        let start = format!("{}.{instance}", self.plugin.manifest.id);
+        let mut names = Vec::new();
+        for value in &linked.coefficients {
+            let Some(name) = value["name"].as_str() else {
+                return fail(format!("a coefficient without a name: {value}"));
+            };
+            let rest = name.strip_prefix(&start);
+            if !rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.')) {
+                return fail(format!(
+                    "coefficient {name} must be called {start}, or {start}.NAME where there are several"
+                ));
+            }
+            if names.contains(&name) {
+                return fail(format!("coefficient {name} is announced twice"));
+            }
+            names.push(name);
+            if value["unit"].as_str().is_none_or(str::is_empty) {
+                return fail(format!("coefficient {name} has no unit; `1` is the unit of a number"));
+            }
+            let number = |key: &str| value[key].as_f64();
+            if let (Some(lower), Some(upper)) = (number("lower"), number("upper")) {
+                let initial = number("initial").unwrap_or(0.0);
+                if lower >= upper || !(lower..=upper).contains(&initial) {
+                    return fail(format!(
+                        "coefficient {name} is to begin at {initial} within a range from {lower} to {upper}; begin inside"
+                    ));
+                }
+            }
+            if number("prior_sigma").is_some_and(|sigma| sigma <= 0.0) {
+                return fail(format!("coefficient {name} has a prior standard deviation that is not above zero"));
+            }
+        }
+        if names.is_empty() {
+            return fail(
+                "announces no coefficient, so nothing can be estimated; call `coefficient` in `link`".to_owned(),
+            );
+        }
+        let channels: Vec<&str> =
+            available.iter().filter(|c| attribute(c, "kind") == "channel").map(|c| c.name.as_str()).collect();
+        for column in linked.writes.iter().flat_map(|t| &t.columns).filter(|c| attribute(c, "kind") == "regressor") {
+            if !names.contains(&attribute(column, "coefficient")) {
+                return fail(format!("column {} names no coefficient of this instance", column.name));
+            }
+            if !channels.contains(&attribute(column, "channel")) {
+                let known = channels.join(", ");
+                return fail(format!("column {} names no channel; there are {known}", column.name));
+            }
+        }
+        Ok(())
+    }
+
+    fn values(&self, instance: &str, gap: Option<std::ops::Range<usize>>) -> Result<(), Finding> {
+        let whole = gap.is_none();
+        let mut session = self.session(instance, gap)?;
+        session.advance(EPOCHS, 512)?;
+        let (batches, times_ns, _) = session.finish()?;
+        for (table, batch) in batches.iter().enumerate() {
+            if batch.time_ns.windows(2).any(|pair| pair[0] >= pair[1]) {
+                return Err(self.broken(instance, format!("the times of table {table} do not ascend")));
+            }
+            if batch.columns.iter().flatten().any(|x| x.is_infinite()) {
+                return Err(self.broken(instance, format!("table {table} has an infinite value; NaN is no value")));
+            }
+            if self.plugin.kind != Kind::Effect {
+                continue;
+            }
+            if batch.time_ns != times_ns {
+                let what = format!("table {table} has {} rows for {} given", batch.time_ns.len(), times_ns.len());
+                return Err(self.broken(instance, what + "; an effect gives one for each, at its time"));
+            }
+            // What has a memory may have to run in.
+            if whole && batch.columns.iter().any(|column| column[column.len() / 2..].iter().any(|x| !x.is_finite())) {
+                return Err(self.broken(instance, format!("table {table} has NaN where every input was finite")));
+            }
+        }
+        Ok(())
+    }
+
+    fn batches(&self, instance: &str) -> Result<(), Finding> {
+        let mut first = None;
+        for size in BATCHES {
+            let mut session = self.session(instance, None)?;
+            session.advance(EPOCHS, size)?;
+            let result = session.finish()?;
+            let (whole, _, report) = first.get_or_insert_with(|| result.clone());
+            if let Some(difference) = is_same(whole, &result.0) {
+                let what = format!(
+                    "in batches of {size} in place of {EPOCHS} epochs {difference}; keep what is left over for the next call"
+                );
+                return Err(self.broken(instance, what));
+            }
+            if *report != result.2 {
+                return Err(
+                    self.broken(instance, format!("in batches of {size} in place of {EPOCHS} the report is another"))
+                );
+            }
+        }
+        Ok(())
+    }
+
+    fn replay(&self, instance: &str) -> Result<(), Finding> {
+        let run = || -> Result<_, Finding> {
+            let mut session = self.session(instance, None)?;
+            session.advance(EPOCHS, 512)?;
+            session.finish()
+        };
+        let (first, second) = (run()?, run()?);
+        if let Some(difference) = is_same(&first.0, &second.0) {
+            let what = format!(
+                "the second time {difference}; clocks, addresses and random numbers without a seed are no input"
+            );
+            return Err(self.broken(instance, what));
+        }
+        if first.2 == second.2 { Ok(()) } else { Err(self.broken(instance, "the second time the report is another")) }
+    }
+
+    fn state(&self, instance: &str) -> Result<(), Finding> {
+        // A source's rows may be slow: few at a time, or there is nothing left after the first call.
+        let size = if self.plugin.kind == Kind::Source { 7 } else { 500 };
+        let mut first = self.session(instance, None)?;
+        first.advance(EPOCHS / 2, size)?;
+        let saved = first.save()?;
+        let mut second = first.heir(self.session(instance, None)?);
+        second.load(&saved)?;
+        let again = second.save()?;
+        if saved != again {
+            let what =
+                format!("a state of {} bytes, loaded and saved again, is {} other bytes", saved.len(), again.len());
+            return Err(self.broken(instance, what));
+        }
+        first.forget_rows();
+        first.advance(EPOCHS, size)?;
+        second.advance(EPOCHS, size)?;
+        let (first, second) = (first.finish()?, second.finish()?);
+        if let Some(difference) = is_same(&first.0, &second.0) {
+            return Err(self.broken(
+                instance,
+                format!("resumed from its state {difference}; the state must hold all that counts"),
+            ));
+        }
+        if first.2 == second.2 {
+            Ok(())
+        } else {
+            Err(self
+                .broken(instance, "resumed from its state the report is another; the state must hold all that counts"))
+        }
+    }
+
+    fn garbage(&self, instance: &str) -> Result<(), Finding> {
+        let mut session = self.session(instance, None)?;
+        session.advance(EPOCHS / 2, 500)?;
+        let saved = session.save()?;
+        let mut wrong = vec![vec![0xff], b"this is no state".to_vec(), stand::noise_bytes(4096)];
+        if let Some((_, shorter)) = saved.split_last() {
+            wrong.push(shorter.to_vec());
+            wrong.push([&saved[..], &[0]].concat());
+            wrong.push(Vec::new());
+        }
+        for bytes in wrong.into_iter().filter(|bytes| *bytes != saved) {
+            if self.session(instance, None)?.load(&bytes).is_ok() {
+                let what = format!(
+                    "took {} bytes for a state, where its own has {}; check length and content in `load`",
+                    bytes.len(),
+                    saved.len()
+                );
+                return Err(self.broken(instance, what));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn attribute<'a>(column: &'a Column, key: &str) -> &'a str {
+    column.attributes.get(key).map_or("", String::as_str)
+}
+
+/// Who it is, in a form that file names, model files and messages can carry; defaults that its own declaration allows.
+fn manifest(manifest: &Manifest, kind: Kind) -> Result<String, Finding> {
+    let fail = |what: String| Err(Finding::Manifest(what));
+    let plain = |text: &str| {
+        text.starts_with(|c: char| c.is_ascii_lowercase())
+            && text.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '-')
+    };
+    if !plain(&manifest.id) {
+        return fail(format!("id `{}` must be small letters, digits and hyphens, a letter first", manifest.id));
+    }
+    let numbers = manifest.version.split(['-', '+']).next().unwrap_or_default().split('.');
+    if numbers.clone().count() != 3 || numbers.clone().any(|n| n.parse::<u32>().is_err()) {
+        return fail(format!("version `{}` must be of the form 1.2.3", manifest.version));
+    }
+    for (what, text) in [("licence", &manifest.licence), ("description", &manifest.description)] {
+        if text.trim().is_empty() {
+            return fail(format!("the {what} is empty"));
+        }
+    }
+    if kind != Kind::Effect && !manifest.instances.is_empty() {
+        return fail(format!("a {kind} has no instances"));
+    }
+    for (k, parameter) in manifest.parameters.iter().enumerate() {
+        let name = &parameter.name;
+        if manifest.parameters[..k].iter().any(|other| other.name == *name) {
+            return fail(format!("parameter {name} is declared twice"));
+        }
+        if parameter.help.trim().is_empty() {
+            return fail(format!("parameter {name} has no help"));
+        }
+        if matches!(parameter.kind.as_str(), "f64" | "f64_list") && parameter.unit.is_empty() {
+            return fail(format!("parameter {name} has no unit; `1` is the unit of a number"));
+        }
+        let default = toml::Value::try_from(&parameter.default)
+            .map_err(|_| Finding::Manifest(format!("parameter {name} has the default {}", parameter.default)))?;
+        let given = toml::Table::from_iter([(name.clone(), default)]);
+        resolve_parameters("its own default", manifest, &given)?;
+    }
+    Ok(format!("{kind} {} {}, {} parameters", manifest.id, manifest.version, manifest.parameters.len()))
+}
+
+/// The result of a check as `dragfree plugins validate` hands it from process to process.
+#[must_use]
+pub fn to_json(result: &Result<String, Finding>) -> Value {
+    match result {
+        Ok(detail) => json!({ "passed": true, "detail": detail }),
+        Err(finding) => json!({ "passed": false, "detail": finding.to_string() }),
+    }
+}
