@@ -24,7 +24,6 @@ pub(crate) struct Wrong {
     pub(crate) shown: [Matrix3<f64>; 2],
     /// Shown in x of θ and ψ, m/rad.
     pub(crate) tilt_m_rad: [[f64; 2]; 2],
-    pub(crate) opening_rad: [f64; 2],
     pub(crate) sunlight: f64,
     pub(crate) arm_srf_m: Vector3<f64>,
     pub(crate) offset_srf_m: Vector3<f64>,
@@ -43,7 +42,6 @@ impl Default for Wrong {
             electrodes: [one; 2],
             shown: [one; 2],
             tilt_m_rad: [[0.0; 2]; 2],
-            opening_rad: [0.0; 2],
             sunlight: 1.0,
             arm_srf_m: Vector3::zeros(),
             offset_srf_m: Vector3::zeros(),
@@ -64,6 +62,7 @@ struct Loads {
     sun_srf: Vector3<f64>,
     /// Torque that nobody knows, and a force on the spacecraft that comes with it.
     noise_srf_nm: Vector3<f64>,
+    gust_srf_n: Vector3<f64>,
 }
 
 /// Brings a coefficient of a size into the world.
@@ -78,6 +77,8 @@ pub(crate) struct Bench {
     pub(crate) layout: bool,
     /// Whether the electrodes push, with a recoil that is a thousand times that of a real spacecraft.
     pub(crate) electrodes: bool,
+    /// Force on the spacecraft that nobody knows, and its rate, SRF, N and N s⁻¹.
+    pub(crate) gust_srf_n: [Vector3<f64>; 2],
     /// Whether the thrusters' torque alone varies with time.
     pub(crate) torque_alone_varies: bool,
     pub(crate) r_orf_m: [Vector3<f64>; 2],
@@ -118,6 +119,7 @@ impl Bench {
             sees: Matrix3::identity(),
             layout: false,
             electrodes: true,
+            gust_srf_n: zero,
             torque_alone_varies: false,
             r_orf_m: zero,
             angle_orf_rad: zero,
@@ -138,6 +140,7 @@ impl Bench {
             electrodes_orf_nm: [ramp(5), ramp(6)],
             sun_srf: ramp(7),
             noise_srf_nm: ramp(8),
+            gust_srf_n: self.gust_srf_n[0] + self.gust_srf_n[1] * t_s,
         }
     }
 
@@ -159,7 +162,8 @@ impl Bench {
         let pressure = loads.sun_srf * (sun.force_n * wrong.sunlight);
         let arm = Vector3::from(sun.arm_srf_m) + wrong.arm_srf_m;
         let hum = loads.noise_srf_nm * noise;
-        let mut force = wrong.thrust * loads.thrust_srf_n + pressure + self.noise_force() * hum;
+        let mut force =
+            wrong.thrust * loads.thrust_srf_n + pressure + self.noise_force() * hum + loads.gust_srf_n * noise;
         let mut torque = wrong.torque * loads.torque_srf_nm + arm.cross(&pressure) + hum;
         for tm in 0..2 {
             // The recoil of a correct push; that of the wrong part is 1/1000 of it in a real spacecraft, for the other test mass
@@ -176,7 +180,7 @@ impl Bench {
         let loads = self.loads(t_s);
         let body = &self.mission.test_mass[&format!("tm{}", tm + 1)];
         let (force, alpha) = self.spacecraft(&loads, wrong, 1.0);
-        let dcm = Rotation3::from_axis_angle(&Vector3::z_axis(), -wrong.opening_rad[tm]).matrix() * self.dcm(tm);
+        let dcm = self.dcm(tm);
         let acting = wrong.electrodes[tm] * loads.electrodes_orf_n[tm];
         // Its own recoil moves the housing against it.
         let recoil = dcm.transpose() * (acting - loads.electrodes_orf_n[tm]) / self.mission.spacecraft.mass_kg;
@@ -271,6 +275,8 @@ impl Bench {
         all.columns.push(Column { unit: "kg".to_owned(), ..column("grid", "hk.fuel_kg".to_owned(), &[]) });
         all.columns.push(Column { unit: "V".to_owned(), ..column("grid", "hk.bus_v".to_owned(), &[]) });
         for (tm, axis) in [1, 2].into_iter().flat_map(|tm| AXES.map(move |axis| (tm, axis))) {
+            // The raw topic has a column of the same name, as telemetry has.
+            all.columns.insert(0, column("is", format!("tm{tm}.r_orf_m.{axis}"), &[]));
             let noise = if axis == "x" { "ifo_x".to_owned() } else { format!("is_{axis}") };
             all.columns.push(column("reconstruction", format!("tm{tm}.r_orf_m.{axis}"), &[("noise", noise)]));
             let channel = format!("tm{tm}.accel.{axis}");
@@ -297,6 +303,9 @@ impl Bench {
             // All loads are straight lines in time.
             return self.value(inner, t_s + 1.0) - self.value(inner, t_s);
         }
+        if let Some(inner) = name.strip_prefix("newer(").and_then(|s| s.strip_suffix(')')) {
+            return self.value(inner, t_s);
+        }
         if let Some(inner) = name.strip_prefix("held(").and_then(|s| s.strip_suffix(')')) {
             return self.value(inner, t_s);
         }
@@ -322,6 +331,7 @@ impl Bench {
             ["used", _, "torque_orf_nm", a] => loads.electrodes_orf_nm[tm][index(a)],
             ["used", "sun_srf", a] => loads.sun_srf[index(a)],
             [_, "u_orf_m_s2", a] => self.known(tm, t_s, &right)[index(a)],
+            [_, "accel", a] => (self.shown(tm, t_s, &right) - self.known(tm, t_s, &right))[index(a)],
             [_, "r_orf_m", a] => self.r_orf_m[tm][index(a)],
             ["dws", _, "theta_orf_rad"] | ["is", _, "att_orf_rad", "theta"] => self.angle_orf_rad[tm].y,
             ["dws", _, "psi_orf_rad"] | ["is", _, "att_orf_rad", "psi"] => self.angle_orf_rad[tm].z,

@@ -1,85 +1,15 @@
-//! Geometry that is not the mission file's, or changes: `opening-angle`, `offset-drift`.
+//! Geometry that changes: `offset-drift`.
 
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Vector3;
 
-use crate::linear::{
-    Driver, Form, Linear, Part, Recipe, Series, Source, Term, accel, offset_terms, push, sc_axis, tm_axis, tm_name,
-};
+use crate::linear::{Driver, Form, Linear, Part, Recipe, Series, Source, push, sc_axis, tm_name};
 
-const OPENING_RAD: [f64; 2] = [-0.02, 0.02];
 const RATE_M_S: [f64; 2] = [-2e-7, 2e-7];
 const PER_KELVIN_M: [f64; 2] = [-2e-4, 2e-4];
 /// A kilogram a metre and a half from the centre of a spacecraft of 1500 kg moves it by a millimetre.
 const PER_KILOGRAM_M: [f64; 2] = [-2e-2, 2e-2];
-
-const fn manifest(
-    id: &'static str,
-    description: &'static str,
-    instances: &'static [&'static str],
-    needs: &'static [&'static str],
-    parameters: &'static [Parameter],
-) -> Manifest {
-    let (version, licence) = (env!("CARGO_PKG_VERSION"), "MIT OR Apache-2.0");
-    Manifest { id, version, licence, description, parameters, instances, needs }
-}
-
-/// `opening-angle`: ORF of a test mass is turned by `δ` about `s_3` beyond the mission file's angle, housing, electrodes and
-/// optical bench together.
-///
-/// All that comes to the test mass by `T_S^O` turns: `T → R_z(δ) T`, and with `a = −T (F_T + F_SRP)/m_S + Φ b` in the mission
-/// file's ORF the channels gain `δ (a_y, −a_x, 0)`. δ: rad, ±0.02.
-///
-/// **Held** is where the housing is in the spacecraft: the coefficients `b` of the model stay its components in the mission
-/// file's ORF, `T b^S`. Electrodes push along their own axes as commanded; their recoil, 1e-3 of it, is left out. Confounders:
-/// `mps-tilt:sc.z` turns the thrust for both test masses alike.
-#[derive(Debug)]
-pub(crate) struct OpeningAngleRecipe(usize);
-
-/// See [`OpeningAngleRecipe`].
-pub(crate) type OpeningAngle = Linear<OpeningAngleRecipe>;
-
-impl Recipe for OpeningAngleRecipe {
-    const MANIFEST: Manifest = manifest(
-        "opening-angle",
-        "The optical frame of a test mass is turned about s_3 beyond the mission file's angle",
-        &["tm1", "tm2"],
-        &["commands"],
-        &[],
-    );
-
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(tm_axis(setup.instance()).0))
-    }
-
-    fn parts(&self, mission: &Mission, available: &Available) -> Result<Vec<Part>, PluginError> {
-        let tm = self.0;
-        let t = mission.test_mass(&tm_name(tm), "the effect opening-angle")?.dcm_orf_from_srf();
-        // dR_z/dδ at 0.
-        let turning = Matrix3::new(0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0);
-        let per_newton = turning * t / -mission.spacecraft.mass_kg;
-        let mut terms = Vec::new();
-        for axis in 0..3 {
-            let column: Vector3<f64> = per_newton.column(axis).into();
-            terms.extend(push(tm, &Series::Column(Source::thrust(axis)), &column));
-            if let Some(sunlight) = &mission.solar_pressure {
-                terms.extend(push(tm, &Series::Column(Source::sun(axis)), &(column * sunlight.force_n)));
-            }
-        }
-        for (row, from, factor) in [(0, 1, 1.0), (1, 0, -1.0)] {
-            for (column, times) in offset_terms(available, tm, from) {
-                terms.push(Term {
-                    channel: accel(tm, row),
-                    series: Series::Column(column),
-                    factor,
-                    times: Some(times),
-                });
-            }
-        }
-        Ok(Part::only("rad", OPENING_RAD, terms))
-    }
-}
 
 /// `offset-drift`: both housings wander along an axis `e` of SRF as the centre of mass moves, `b_i^S(t) = b_i^S + k s(t) e`.
 ///
@@ -106,12 +36,12 @@ pub(crate) type OffsetDrift = Linear<OffsetDriftRecipe>;
 const TIME: &str = "time";
 
 impl Recipe for OffsetDriftRecipe {
-    const MANIFEST: Manifest = manifest(
-        "offset-drift",
-        "The centre of mass moves along an axis, with time, a temperature or the propellant spent",
-        &["sc.x", "sc.y", "sc.z"],
-        &[],
-        &[
+    const MANIFEST: Manifest = Manifest {
+        id: "offset-drift",
+        version: env!("CARGO_PKG_VERSION"),
+        licence: "MIT OR Apache-2.0",
+        description: "The centre of mass moves along an axis, with time, a temperature or the propellant spent",
+        parameters: &[
             Parameter::text(
                 "with",
                 TIME,
@@ -126,7 +56,9 @@ impl Recipe for OffsetDriftRecipe {
                 "Unix time from which the drift counts; 0 is the first epoch of the run, other runs then cannot be added",
             ),
         ],
-    );
+        instances: &["sc.x", "sc.y", "sc.z"],
+        needs: &[],
+    };
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         Ok(Self {
@@ -194,16 +126,6 @@ mod tests {
     use super::*;
     use crate::bench::{Bench, ELAPSED_S, Wrong};
     use crate::linear::AXES;
-
-    /// The housing stays where it is in the spacecraft; its axes turn.
-    #[test]
-    fn a_turned_frame_turns_all_that_comes_through_it() {
-        for tm in 0..2 {
-            let bench = Bench { electrodes: false, ..Bench::new() };
-            let instance = format!("tm{}", tm + 1);
-            bench.check::<OpeningAngleRecipe>(&instance, "", &[&|w, angle| w.opening_rad[tm] += angle]);
-        }
-    }
 
     #[test]
     fn an_offset_that_wanders_acts_by_what_it_has_wandered() {

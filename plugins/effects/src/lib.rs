@@ -28,7 +28,7 @@ pub use com_offset::ComOffset;
 use actuators::{EsCrosstalk, EsGain, MpsGain, MpsTilt, TorqueGain};
 use correlation::MpsCorrelation;
 use formula::Formula;
-use geometry::{OffsetDrift, OpeningAngle};
+use geometry::OffsetDrift;
 use impulse::Impulse;
 use noise::{IsNoise, MpsNoise, TorqueNoise};
 use readout::{IsCrosstalk, IsScale, TiltToLength, TimeOffset};
@@ -55,7 +55,6 @@ dragfree_sdk::export_plugin!(effects: [
     MpsNoise,
     MpsTilt,
     OffsetDrift,
-    OpeningAngle,
     Slosh,
     SolarPressure,
     Stiffness,

@@ -7,9 +7,9 @@
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 
-use dragfree_physics::mission::Mission;
+use dragfree_physics::mission::{Mission, TestMass};
 use dragfree_sdk::prelude::*;
-use nalgebra::Vector3;
+use nalgebra::{Matrix2, Vector3};
 
 /// Axes as the columns name them.
 pub(crate) const AXES: [&str; 3] = ["x", "y", "z"];
@@ -58,6 +58,11 @@ impl Source {
     /// `û`, ORF, m s⁻².
     pub(crate) fn known(tm: usize, axis: usize) -> Self {
         Self::new(format!("{}.u_orf_m_s2.{}", tm_name(tm), AXES[axis]), "m s-2", orf(tm))
+    }
+
+    /// Channel of a test mass, m s⁻².
+    pub(crate) fn channel(tm: usize, axis: usize) -> Self {
+        Self::new(accel(tm, axis), "m s-2", orf(tm))
     }
 
     /// Best readout of a displacement, ORF, m.
@@ -121,6 +126,9 @@ pub(crate) enum Series {
     Slope(Source, &'static str),
     /// A column, or its last value where it has none.
     Held(Source),
+    /// `(3 z_k − z_{k−1})/2` of a channel, which is an acceleration averaged over two samples already: what of it belongs to the
+    /// newer one, so that the estimators' average gives `z_k` again but for a second difference. No value where there is none before.
+    Newer(Source),
     /// A column times something slow, and the unit of the product.
     Times(Source, Driver, &'static str),
 }
@@ -132,6 +140,7 @@ impl Series {
             Self::Column(source) => source.name.clone(),
             Self::Slope(source, _) => format!("slope({})", source.name),
             Self::Held(source) => format!("held({})", source.name),
+            Self::Newer(source) => format!("newer({})", source.name),
             Self::Times(source, Driver::Time(None), _) => format!("{}*elapsed_s", source.name),
             Self::Times(source, Driver::Time(Some(ns)), _) => format!("{}*seconds_since_{ns}_ns", source.name),
             Self::Times(source, Driver::Growth { column, lost }, _) => {
@@ -142,13 +151,17 @@ impl Series {
 
     fn source(&self) -> &Source {
         match self {
-            Self::Column(source) | Self::Slope(source, _) | Self::Held(source) | Self::Times(source, _, _) => source,
+            Self::Column(source)
+            | Self::Slope(source, _)
+            | Self::Held(source)
+            | Self::Newer(source)
+            | Self::Times(source, _, _) => source,
         }
     }
 
     fn unit(&self) -> &'static str {
         match self {
-            Self::Column(source) | Self::Held(source) => source.unit,
+            Self::Column(source) | Self::Held(source) | Self::Newer(source) => source.unit,
             Self::Slope(_, unit) | Self::Times(_, _, unit) => unit,
         }
     }
@@ -206,6 +219,12 @@ impl Part {
     }
 }
 
+/// The column of this name that was made last: what a stage made of telemetry, `tm1.r_orf_m.y` of the reconstruction, rather than
+/// the raw topic's of the same name.
+pub(crate) fn latest<'a>(available: &'a Available, name: &str) -> Option<&'a Column> {
+    available.columns.iter().rev().find(|c| c.name == name)
+}
+
 /// `tm1.accel.x`, m s⁻².
 pub(crate) fn accel(tm: usize, axis: usize) -> String {
     format!("{}.accel.{}", tm_name(tm), AXES[axis])
@@ -241,6 +260,62 @@ pub(crate) fn offset_terms(available: &Available, tm: usize, row: usize) -> Vec<
     };
     let names = (0..3).filter(|j| *j != row).map(|j| offset(tm, j)).filter(|name| known(name));
     names.filter_map(|name| Some((Source::of(&column(&name)?, "s-2"), name))).collect()
+}
+
+/// The acceleration of a test mass along an axis, `û + Φ b + d`, with what interferometers say of the push `d` that nobody
+/// commanded: a part, its factor, and the coefficient that it is multiplied with.
+///
+/// Above all `d` is the thrusters' noise, `−T_S^{O_i} n/m_S`, which the loop works against: what is left of `û + d` is much less than
+/// either, so that `û` alone is no estimate of the motion. It is common to both test masses. In the plane of the two optical axes
+/// the two channels `z_x − Φ_x b` are what it does along them, and two equations give it, finer than any capacitive readout; the
+/// mission's nominal offsets are good enough there. Along s_3 no interferometer looks.
+///
+/// `None` along s_3 and without both interferometers: then nobody knows `d`.
+pub(crate) fn motion(
+    available: &Available,
+    mission: &Mission,
+    tm: usize,
+    axis: usize,
+) -> Option<Vec<(Piece, f64, Option<String>)>> {
+    let reads = |tm: usize| latest(available, &Source::displacement(tm, 0).name).map_or("", |c| c.attribute("noise"));
+    if axis == 2 || reads(0) != "ifo_x" || reads(1) != "ifo_x" {
+        return None;
+    }
+    let dcm = |tm: usize| mission.test_mass.get(&tm_name(tm)).map(TestMass::dcm_orf_from_srf);
+    let (both, own) = ([dcm(0)?, dcm(1)?], dcm(tm)?);
+    let weight = own.fixed_view::<1, 2>(axis, 0) * Matrix2::from_fn(|i, j| both[i][(0, j)]).try_inverse()?;
+    let mut parts = vec![(Piece::Column(Source::known(tm, axis)), 1.0, None)];
+    for (column, times) in offset_terms(available, tm, axis) {
+        parts.push((Piece::Column(column), 1.0, Some(times)));
+    }
+    for other in (0..2).filter(|other| weight[*other].abs() > 1e-12) {
+        parts.push((Piece::Channel(Source::channel(other, 0)), weight[other], None));
+        let b = mission.test_mass.get(&tm_name(other))?.offset_nominal_orf_m();
+        for j in 0..3 {
+            let explained = both[other][(2, j)] * b.y - both[other][(1, j)] * b.z;
+            parts.push((Piece::Column(Source::alpha(j)), -weight[other] * explained, None));
+        }
+    }
+    Some(parts)
+}
+
+/// What a [`motion`] is made of.
+#[derive(Clone, Debug)]
+pub(crate) enum Piece {
+    /// A mean over `[t_k, t_{k+1})`.
+    Column(Source),
+    /// A channel, averaged over two.
+    Channel(Source),
+}
+
+impl Piece {
+    /// The motion itself.
+    pub(crate) fn series(self) -> Series {
+        match self {
+            Self::Column(source) => Series::Column(source),
+            Self::Channel(source) => Series::Newer(source),
+        }
+    }
 }
 
 /// Where the right angular acceleration is `α̂ + factor · δα`, with `δα` as series of SRF components, the test masses' channels
@@ -356,6 +431,7 @@ struct Step {
 #[derive(Clone, Copy, Debug)]
 enum Rule {
     Slope,
+    Newer,
     Hold,
     /// Times the seconds since `time_ns`.
     Elapsed,
@@ -369,12 +445,12 @@ impl Step {
     /// The next sample, from the column's value `a` at `now` and the driver's, where there is one.
     fn next(&mut self, now: i64, a: f64, driver: f64, dt_s: f64) -> f64 {
         match self.rule {
-            Rule::Slope => {
+            Rule::Slope | Rule::Newer => {
                 // Across a gap there is no slope.
                 let follows = self.time_ns.is_some_and(|t| ((now - t) as f64 * 1e-9 - dt_s).abs() < 0.5 * dt_s);
                 let before = if follows { self.value } else { f64::NAN };
                 (self.time_ns, self.value) = (Some(now), a);
-                (a - before) / dt_s
+                if matches!(self.rule, Rule::Newer) { 1.5 * a - 0.5 * before } else { (a - before) / dt_s }
             }
             Rule::Hold => {
                 if a.is_finite() {
@@ -410,12 +486,13 @@ impl<R: Recipe> Linear<R> {
         link: &mut EffectLink<'_, '_>,
     ) -> Result<(String, String), PluginError> {
         let read = |source: &Source, link: &mut EffectLink<'_, '_>| {
-            link.read(&Want::new(&source.name).unit(source.unit).frame(&source.frame))
+            let want = latest(available, &source.name).map_or_else(|| Want::new(&source.name), Want::of);
+            link.read(&want.unit(source.unit).frame(&source.frame))
         };
         let name = series.name();
         let input = read(series.source(), link)?;
         if let Series::Column(source) = series {
-            let table = available.find(&source.name).map(|c| c.table.clone()).unwrap_or_default();
+            let table = latest(available, &source.name).map(|c| c.table.clone()).unwrap_or_default();
             return Ok((table, name));
         }
         let (table, out) = link.shared_series(available, &name, series.unit(), &series.source().frame)?;
@@ -423,6 +500,7 @@ impl<R: Recipe> Linear<R> {
         let (rule, time_ns, driver) = match series {
             Series::Column(_) | Series::Held(_) => (Rule::Hold, None, None),
             Series::Slope(..) => (Rule::Slope, None, None),
+            Series::Newer(_) => (Rule::Newer, None, None),
             Series::Times(_, Driver::Time(since), _) => (Rule::Elapsed, *since, None),
             Series::Times(_, Driver::Growth { column, lost }, _) => {
                 (Rule::Growth { sign: if *lost { -1.0 } else { 1.0 } }, None, Some(read(column, link)?))
@@ -452,7 +530,7 @@ impl<R: Recipe> Linear<R> {
         Err(PluginError::error(format!(
             "{} acts on {}, and no stage before it makes any of them; put hinf-dfacs before the effects, or take it out of the model",
             self.name(),
-            if names.is_empty() { "nothing that there is".to_owned() } else { names.join(", ") }
+            if names.is_empty() { "readouts of this instrument".to_owned() } else { names.join(", ") }
         )))
     }
 }
@@ -586,6 +664,15 @@ mod tests {
         let rows =
             [(0, 1.0, NAN), (1, 3.0, NAN), (2, 2.0, NAN), (4, 5.0, NAN), (5, 5.5, NAN), (6, NAN, NAN), (7, 1.0, NAN)];
         same(&stepped(Rule::Slope, None, &rows), &[NAN, 20.0, -10.0, NAN, 5.0, NAN, NAN]);
+    }
+
+    /// A straight line comes back unchanged when two samples are averaged.
+    #[test]
+    fn the_newer_half_of_an_average_is_extrapolated() {
+        let rows: Vec<(i64, f64, f64)> = (0..6).map(|k| (k + i64::from(k > 3), 2.0 * k as f64, NAN)).collect();
+        let newer = stepped(Rule::Newer, None, &rows);
+        same(&newer, &[NAN, 3.0, 5.0, 7.0, NAN, 11.0]);
+        assert_eq!(0.5 * (newer[2] + newer[3]), rows[3].1);
     }
 
     #[test]

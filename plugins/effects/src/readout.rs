@@ -3,13 +3,16 @@
 //! A readout error `δ(t)` adds its second difference to the channel. What is twice differenced here is **not** the readout: a
 //! regressor made from the readout that it must explain fits that readout's own noise (a scale error of +0.96 on clean data).
 //! It is the known motion: `û`, made of commands, which carry readout noise only into later samples, so that a fit over the whole
-//! band is unbiased, and `Φ b` of the model's offset, without which a scale error would not multiply the signal itself.
+//! band is unbiased; `Φ b` of the model's offset, without which a scale error would not multiply the signal itself; and for capacitive
+//! readouts the push `d` that nobody commanded, as the interferometers tell it: the loop works against it, so that what moves the
+//! test mass is the small rest of `û + d`. With `û` alone a scale error of 15 % came out of six hours as 0.3 ± 0.1 %.
 
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 
 use crate::linear::{
-    Linear, Part, Recipe, Series, Source, Term, accel, offset_terms, through_offset, tm_axis, tm_name, tm_pair, turn,
+    Linear, Part, Piece, Recipe, Series, Source, Term, accel, latest, motion, offset_terms, through_offset, tm_axis,
+    tm_name, tm_pair, turn,
 };
 
 const SCALE: [f64; 2] = [-0.2, 0.2];
@@ -27,28 +30,31 @@ const fn manifest(
 }
 
 /// The second difference of the displacement along `from`, as known, in the channel of `to`.
-fn shown(available: &Available, effect: &str, (tm, from, to): (usize, usize, usize)) -> Result<Vec<Term>, PluginError> {
-    let readout = Source::displacement(tm, to).name;
-    if to == 0 && available.find(&readout).is_some_and(|c| c.attribute("noise") == "ifo_x") {
+fn shown(
+    mission: &Mission,
+    available: &Available,
+    effect: &str,
+    (tm, from, to): (usize, usize, usize),
+) -> Result<Vec<Term>, PluginError> {
+    let Some(pieces) = motion(available, mission, tm, from) else {
         return Err(PluginError::error(format!(
-            "effect {effect}: x of {} is read by an interferometer, so no residual shows its capacitive readout; take it out of the \
-             model",
-            tm_name(tm)
+            "effect {effect}: without the interferometers of both test masses nobody knows the thrusters' noise, and without that not \
+             how a test mass moves; give telemetry with /ifo, or take the effect out of the model"
         )));
-    }
-    let mut terms = vec![Term::new(accel(tm, to), Series::Column(Source::known(tm, from)), 1.0)];
-    for (column, times) in offset_terms(available, tm, from) {
-        let series = Series::Column(column);
-        terms.push(Term { channel: accel(tm, to), series, factor: 1.0, times: Some(times) });
-    }
-    Ok(terms)
+    };
+    let term = |(piece, factor, times)| Term { channel: accel(tm, to), series: Piece::series(piece), factor, times };
+    Ok(pieces.into_iter().map(term).collect())
 }
 
 /// `is-scale`: the capacitive readout shows a displacement `r` as `(1 + s) r`.
 ///
-/// `z = s r̈ = s (û + Φ b)` along the axis; s: 1, ±0.2. `x` exists only where no interferometer reads it. Other effects of the model
-/// move the test mass too: their products with `s` are of second order. Confounders: gains of what pushes along the axis,
-/// `es-gain` above all; the offset's part of the axis scales with it.
+/// `z = s r̈ = s (û + Φ b + d)` along the axis; s: 1, ±0.2. Other effects of the model move the test mass too: their products with `s`
+/// are of second order. Confounders: gains of what pushes along the axis, `es-gain` above all.
+///
+/// **Limits.** `x` is read by the interferometer, so no residual shows its scale, and along `z` nothing tells `d`. The push `d` is in
+/// the regressor and in the channel: only a fit that knows how `d` is common to both test masses can tell them apart. `qp-check`
+/// does (six quiet hours gave 0.060 ± 0.011: it has an error of its own with effects that act back on their own channel);
+/// `es-akf` follows each test mass alone and does not (0.48 ± 0.02), and the verdict says that they disagree.
 #[derive(Debug)]
 pub(crate) struct IsScaleRecipe(usize, usize);
 
@@ -59,7 +65,7 @@ impl Recipe for IsScaleRecipe {
     const MANIFEST: Manifest = manifest(
         "is-scale",
         "The capacitive readout shows more or less of a displacement than there is",
-        &["tm1.x", "tm1.y", "tm1.z", "tm2.x", "tm2.y", "tm2.z"],
+        &["tm1.y", "tm2.y"],
         &[],
     );
 
@@ -68,14 +74,15 @@ impl Recipe for IsScaleRecipe {
         Ok(Self(tm, axis))
     }
 
-    fn parts(&self, _: &Mission, available: &Available) -> Result<Vec<Part>, PluginError> {
-        Ok(Part::only("1", SCALE, shown(available, "is-scale", (self.0, self.1, self.1))?))
+    fn parts(&self, mission: &Mission, available: &Available) -> Result<Vec<Part>, PluginError> {
+        Ok(Part::only("1", SCALE, shown(mission, available, "is-scale", (self.0, self.1, self.1))?))
     }
 }
 
 /// `is-crosstalk`: `tm1.y-z` shows `k` times the displacement along y in z too.
 ///
-/// `z_to = k r̈_from = k (û + Φ b)_from`; k: 1, ±0.2. Into x only where no interferometer reads it.
+/// `z_to = k r̈_from = k (û + Φ b + d)_from`; k: 1, ±0.2. Into x nothing shows it, as the interferometer reads that; from z nothing
+/// tells `d`.
 #[derive(Debug)]
 pub(crate) struct IsCrosstalkRecipe(usize, usize, usize);
 
@@ -86,10 +93,7 @@ impl Recipe for IsCrosstalkRecipe {
     const MANIFEST: Manifest = manifest(
         "is-crosstalk",
         "The capacitive readout of one axis shows a part of the displacement along another one",
-        &[
-            "tm1.x-y", "tm1.x-z", "tm1.y-x", "tm1.y-z", "tm1.z-x", "tm1.z-y", "tm2.x-y", "tm2.x-z", "tm2.y-x",
-            "tm2.y-z", "tm2.z-x", "tm2.z-y",
-        ],
+        &["tm1.x-y", "tm1.x-z", "tm1.y-z", "tm2.x-y", "tm2.x-z", "tm2.y-z"],
         &[],
     );
 
@@ -98,8 +102,8 @@ impl Recipe for IsCrosstalkRecipe {
         Ok(Self(tm, from, to))
     }
 
-    fn parts(&self, _: &Mission, available: &Available) -> Result<Vec<Part>, PluginError> {
-        Ok(Part::only("1", SCALE, shown(available, "is-crosstalk", (self.0, self.1, self.2))?))
+    fn parts(&self, mission: &Mission, available: &Available) -> Result<Vec<Part>, PluginError> {
+        Ok(Part::only("1", SCALE, shown(mission, available, "is-crosstalk", (self.0, self.1, self.2))?))
     }
 }
 
@@ -134,7 +138,7 @@ impl Recipe for TiltToLengthRecipe {
         const BY: &str = "the effect tilt-to-length";
         let (tm, name) = (self.0, tm_name(self.0));
         let readout = Source::displacement(tm, 0).name;
-        if available.find(&readout).is_some_and(|c| c.attribute("noise") != "ifo_x") {
+        if latest(available, &readout).is_some_and(|c| c.attribute("noise") != "ifo_x") {
             return Err(PluginError::error(format!(
                 "effect tilt-to-length: x of {name} is read by the inertial sensor, not by an interferometer; take it out of the model"
             )));
@@ -159,9 +163,15 @@ impl Recipe for TiltToLengthRecipe {
 /// the true difference: the error is orthogonal to the regressor at every frequency, and with it that of second order, so that
 /// `τ` is unbiased up to one sample interval; at two it is small by `(1 + cos 2πfΔt)/2` of what drives it. τ: s, 0 to 0.2.
 ///
-/// `is` acts on y and z of both test masses (and on x where no interferometer reads it), `ifo` on x of both. `dws` acts on the
+/// `ifo` acts on x of both test masses. `dws` acts on the
 /// attitude channels, with `a` the angular acceleration that was commanded, `J_S⁻¹ M_T`, and through `α̂`, which is too late by
-/// `τ ∂α̂/∂τ`: the test masses' channels, which have `Φ(α̂) b` explained, show `+τ [T ∂α̂/∂τ ×] b` more. Its local part, which reads the test masses' angles, is in no channel.
+/// `τ ∂α̂/∂τ`: the test masses' channels, which have `Φ(α̂) b` explained, show `+τ [T ∂α̂/∂τ ×] b` more. Its local part, which reads the
+/// test masses' angles, is in no channel.
+///
+/// **Limits.** What nobody commanded comes late too. In x alone its spectrum does not tell, but `qp-check` knows it to be common with y,
+/// which is on time: 0.05 s of `ifo` came out of six hours as 0.027 ± 0.004 s (three seeds), of `es-akf` as 0.044 ± 0.006 s. A late
+/// capacitive readout is not offered for that reason: it came out as nothing.
+///
 /// Confounders: a delay of the actuators, which `[thrusters]` of the mission file states, looks the same in all channels that the
 /// actuator drives; gains at high frequency.
 #[derive(Debug)]
@@ -174,7 +184,7 @@ impl Recipe for TimeOffsetRecipe {
     const MANIFEST: Manifest = manifest(
         "time-offset",
         "An instrument shows what was true some time before",
-        &["is", "ifo", "dws"],
+        &["ifo", "dws"],
         &["commands", "dws-delay-response"],
     );
 
@@ -196,9 +206,9 @@ impl Recipe for TimeOffsetRecipe {
             return Ok(Part::only("s", DELAY_S, terms));
         }
         for (tm, axis) in (0..2).flat_map(|tm| (0..3).map(move |axis| (tm, axis))) {
-            let column = available.find(&Source::displacement(tm, axis).name);
+            let column = latest(available, &Source::displacement(tm, axis).name);
             let reads = column.map_or("", |c| c.attribute("noise"));
-            if reads.starts_with("ifo") != (self.0 == "ifo") {
+            if !reads.starts_with("ifo") {
                 continue;
             }
             terms.push(Term::new(accel(tm, axis), Series::Slope(Source::known(tm, axis), "m s-3"), -1.0));
@@ -216,36 +226,42 @@ mod tests {
     use super::*;
     use crate::bench::Bench;
     use crate::linear::AXES;
-    use nalgebra::Matrix3;
+    use nalgebra::{Matrix3, Vector3};
+
+    /// In the plane that the interferometers see.
+    const GUST: [Vector3<f64>; 2] = [Vector3::new(0.4, -0.7, 0.0), Vector3::new(-0.5, 0.3, 0.0)];
 
     #[test]
     fn a_scale_multiplies_the_whole_motion_the_offsets_part_included() {
-        for (tm, axis) in [(0, 1), (0, 2), (1, 1), (1, 2)] {
+        for (tm, axis) in [(0, 1), (1, 1)] {
             let instance = format!("tm{}.{}", tm + 1, AXES[axis]);
-            Bench::new().check::<IsScaleRecipe>(&instance, "", &[&|w, s| w.shown[tm][(axis, axis)] += s]);
+            let bench = Bench { gust_srf_n: GUST, ..Bench::new() };
+            bench.check::<IsScaleRecipe>(&instance, "", &[&|w, s| w.shown[tm][(axis, axis)] += s]);
         }
     }
 
     #[test]
     fn crosstalk_shows_the_first_axis_named_in_the_second() {
-        for (tm, from, to) in [(0, 0, 1), (0, 1, 2), (1, 2, 1), (1, 0, 2)] {
+        for (tm, from, to) in [(0, 0, 1), (0, 1, 2), (1, 0, 1), (1, 0, 2)] {
             let instance = format!("tm{}.{}-{}", tm + 1, AXES[from], AXES[to]);
-            Bench::new().check::<IsCrosstalkRecipe>(&instance, "", &[&|w, k| w.shown[tm][(to, from)] += k]);
+            let bench = Bench { gust_srf_n: GUST, ..Bench::new() };
+            bench.check::<IsCrosstalkRecipe>(&instance, "", &[&|w, k| w.shown[tm][(to, from)] += k]);
         }
     }
 
     #[test]
-    fn x_of_an_interferometer_shows_nothing_of_the_capacitive_readout() {
+    fn without_interferometers_nobody_knows_how_a_test_mass_moves() {
         let bench = Bench::new();
         let mut available = bench.available();
-        let error = IsScaleRecipe(1, 0).parts(&bench.mission, &available).unwrap_err();
-        assert!(error.message().contains("is-scale: x of tm2 is read by an interferometer"), "{}", error.message());
-        let error = IsCrosstalkRecipe(0, 1, 0).parts(&bench.mission, &available).unwrap_err();
-        assert!(error.message().contains("is-crosstalk: x of tm1"), "{}", error.message());
         for column in available.columns.iter_mut().filter(|c| c.attribute("noise") == "ifo_x") {
             column.attributes.insert("noise".to_owned(), "is_x".to_owned());
         }
-        assert_eq!(IsScaleRecipe(1, 0).parts(&bench.mission, &available).unwrap()[0].forms[0].terms.len(), 3);
+        for error in [
+            IsScaleRecipe(1, 1).parts(&bench.mission, &available).unwrap_err(),
+            IsCrosstalkRecipe(0, 1, 2).parts(&bench.mission, &available).unwrap_err(),
+        ] {
+            assert!(error.message().contains("without the interferometers"), "{}", error.message());
+        }
         let error = TiltToLengthRecipe(0).parts(&bench.mission, &available).unwrap_err();
         assert!(error.message().contains("x of tm1 is read by the inertial sensor"), "{}", error.message());
     }
@@ -268,7 +284,6 @@ mod tests {
         let late = |channels: &'static [usize]| {
             move |w: &mut crate::bench::Wrong, tau: f64| channels.iter().for_each(|c| w.late_s[*c] += tau)
         };
-        Bench::new().check::<TimeOffsetRecipe>("is", "", &[&late(&[1, 2, 4, 5])]);
         Bench::new().check::<TimeOffsetRecipe>("ifo", "", &[&late(&[0, 3])]);
         let sees = Matrix3::new(0.7, 0.1, -0.2, 0.1, 0.4, 0.05, -0.1, 0.2, 0.9);
         let bench = Bench { sees, torque_alone_varies: true, ..Bench::new() };
