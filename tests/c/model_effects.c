@@ -1,5 +1,5 @@
 /* Effect `c-es-crosstalk` in plain C: electrostatic force along y that also pushes along x, F_y / m_m per unit. */
-#include "rows.h"
+#include <dragfree/rows.h>
 #include <math.h>
 #include <stdio.h>
 

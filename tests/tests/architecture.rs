@@ -33,8 +33,13 @@ fn allowed(crate_name: &str) -> &'static [&'static str] {
     match crate_name {
         "dragfree-abi" | "dragfree-physics" | "dragfree-chart" => &[],
         "dragfree-sdk" | "dragfree-engine" => &["dragfree-abi"],
-        "dragfree" | "dragfree-validation" => &["dragfree-engine", "dragfree-physics", "dragfree-chart"],
+        "dragfree" => {
+            &["dragfree-engine", "dragfree-physics", "dragfree-chart", "dragfree-critic", "dragfree-estimation"]
+        }
+        "dragfree-validation" => &["dragfree-engine", "dragfree-physics", "dragfree-chart"],
         "dragfree-estimation" => &["dragfree-physics"],
+        "dragfree-critic" => &["dragfree-physics", "dragfree-estimation"],
+        "dragfree-critic-stage" => &["dragfree-sdk", "dragfree-physics", "dragfree-estimation", "dragfree-critic"],
         "dragfree-tests" => &["dragfree-engine"],
         "dragfree-qp-check" => &["dragfree-sdk", "dragfree-physics", "dragfree-estimation"],
         _ => &["dragfree-sdk", "dragfree-physics"],

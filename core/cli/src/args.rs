@@ -75,6 +75,8 @@ pub(crate) enum Command {
     Design(Design),
     /// Replay telemetry through a pipeline and archive a product
     Run(Run),
+    /// Which effect is missing: a ranked list with evidence, size and what its absence does to the offset
+    Diagnose(Diagnose),
     /// Check configuration without running
     #[command(subcommand)]
     Config(Config),
@@ -204,6 +206,21 @@ pub(crate) struct Archive {
     /// Folder with the products
     #[arg(long = "archive", value_name = "DIR", default_value = "archive")]
     pub(crate) folder: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Diagnose {
+    /// Products of one model: id, id without the revision, day or file
+    #[arg(value_name = "PRODUCT", required = true)]
+    pub(crate) products: Vec<String>,
+    #[command(flatten)]
+    pub(crate) archive: Archive,
+    /// Write what was gathered, to be ranked again without the telemetry
+    #[arg(long, value_name = "FILE")]
+    pub(crate) save_sums: Option<PathBuf>,
+    /// Candidates and limits to print; --json has all
+    #[arg(long, value_name = "N", default_value_t = 8)]
+    pub(crate) top: usize,
 }
 
 #[derive(Debug, Subcommand)]
@@ -496,6 +513,7 @@ mod tests {
             "dragfree run p.toml a.mcap b.mcap --mission m.toml --model c.toml --archive d --from 2035-01-01 --until 2035-01-02 --json",
             "dragfree run p.toml",
             "dragfree design m.toml --json",
+            "dragfree diagnose COM1B_2035-01-01_SC1_01_0001 b.toml --archive d --json",
             "dragfree design m.toml --pictures d --freeze c.toml",
             "dragfree config check p.toml",
             "dragfree plugins list --json --plugin-dir a --plugin-dir b",

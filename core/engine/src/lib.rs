@@ -6,6 +6,7 @@
 pub mod border;
 pub mod chain;
 pub mod config;
+pub mod examine;
 pub mod feed;
 pub mod ladder;
 pub mod product;
@@ -96,6 +97,14 @@ pub enum EngineError {
     /// A simulation of no time.
     #[error("there is nothing to simulate: the end is not after the start")]
     EmptyWindow,
+    /// An input of a product is not what it was.
+    #[error("{} is not what it was when {product} was made from it; run the product again, or put the file back", path.display())]
+    Changed {
+        /// The file.
+        path: PathBuf,
+        /// The product.
+        product: String,
+    },
     /// A file would be overwritten.
     #[error("{} exists already and is not overwritten; choose another folder with --out, or remove it", path.display())]
     Exists {

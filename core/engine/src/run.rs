@@ -10,6 +10,7 @@ use crate::EngineError;
 use crate::border::hex;
 use crate::chain::{self, Carry, Chain, Sink};
 use crate::config::{Mission, Model, Pipeline};
+use crate::examine::Sources;
 use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions, Summary};
 use crate::product::{self, Draft, Loss, Product, ProductWriter, Stage, StageReport, Status, Stream};
 use crate::registry::Registry;
@@ -101,14 +102,14 @@ pub struct CheckedNode {
 }
 
 /// The files of a run, read.
-struct Setup {
-    pipeline: Pipeline,
-    mission: Mission,
-    model: Model,
+pub(crate) struct Setup {
+    pub(crate) pipeline: Pipeline,
+    pub(crate) mission: Mission,
+    pub(crate) model: Model,
 }
 
 impl Setup {
-    fn load(options: &RunOptions) -> Result<Self, EngineError> {
+    pub(crate) fn load(options: &RunOptions) -> Result<Self, EngineError> {
         let pipeline = Pipeline::load(&options.pipeline)?;
         let choose = |given: &Option<PathBuf>, own: &Option<PathBuf>, what: &'static str| {
             given
@@ -121,7 +122,7 @@ impl Setup {
         Ok(Self { pipeline, mission, model })
     }
 
-    fn feed(
+    pub(crate) fn feed(
         &self,
         registry: &Registry,
         options: &RunOptions,
@@ -146,13 +147,13 @@ impl Setup {
     }
 }
 
-enum FeedKind {
+pub(crate) enum FeedKind {
     Files(Box<FileFeed>),
     Source(Box<SourceFeed>),
 }
 
 impl FeedKind {
-    fn get(&mut self) -> &mut dyn Feed {
+    pub(crate) fn get(&mut self) -> &mut dyn Feed {
         match self {
             Self::Files(feed) => feed.as_mut(),
             Self::Source(feed) => feed.as_mut(),
@@ -160,7 +161,7 @@ impl FeedKind {
     }
 }
 
-fn window(options: &RunOptions, resume_ns: Option<i64>) -> Option<Range<i64>> {
+pub(crate) fn window(options: &RunOptions, resume_ns: Option<i64>) -> Option<Range<i64>> {
     let start = options.from_ns.max(resume_ns);
     (start.is_some() || options.until_ns.is_some())
         .then(|| start.unwrap_or(i64::MIN)..options.until_ns.unwrap_or(i64::MAX))
@@ -201,7 +202,7 @@ pub fn check(registry: &Registry, options: &RunOptions) -> Result<CheckReport, E
     })
 }
 
-fn carry(options: &RunOptions) -> Carry {
+pub(crate) fn carry(options: &RunOptions) -> Carry {
     Carry { batch_rows: options.batch_rows, threads: options.threads }
 }
 
@@ -235,6 +236,7 @@ pub fn run(
     let summary = feed.get().summary()?;
     let draft = draft(&setup, options, &chain, &feed, summary, reports, &covered)?;
     let written = writer.commit(&draft)?;
+    Sources::of(&setup, options).write(&written.path)?;
     // After the product: a kill in between costs a second run of the day, never the day.
     if let Some((path, bytes)) = state {
         write_state(path, &bytes)?;
@@ -243,12 +245,12 @@ pub fn run(
 }
 
 /// Rows that went into the chain.
-struct Covered {
+pub(crate) struct Covered {
     first_ns: i64,
     last_ns: i64,
 }
 
-fn carry_all(
+pub(crate) fn carry_all(
     feed: &mut dyn Feed,
     chain: &mut Chain,
     sink: &mut dyn Sink,

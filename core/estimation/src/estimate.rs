@@ -10,12 +10,13 @@
 use nalgebra::{Cholesky, DMatrix, DVector};
 use serde::Serialize;
 
+use crate::levels::Levels;
 use crate::normal::{Equations, NormalEquations, accumulate, residuals};
 use crate::prediction::Prediction;
 use crate::qp::{Active, Kkt, Problem, QpError, Row};
 use crate::refine::{Chi2, SigmaError, Whitening};
 use crate::sigma::NoiseModel;
-use crate::spectra::{Layout, Plan, Sums};
+use crate::spectra::{Layout, Plan, Spectra, Sums};
 use crate::verdict::{self, Direction, Pull, chi2_per_dof_at};
 
 /// A coefficient of the model.
@@ -93,6 +94,12 @@ pub struct Estimate {
     pub kkt: Kkt,
     /// The normal equations, with the refined Σ.
     pub normal: NormalEquations,
+    /// Information of data, surveys and ranges on the free coefficients.
+    pub known: DMatrix<f64>,
+    /// Refined `Σ⁻¹`, channels × channels, per band.
+    pub inverses: Vec<DMatrix<f64>>,
+    /// `−2 log` of the likelihood of the residuals under the Σ that fits them best, up to a constant of the data.
+    pub deviance: f64,
     /// What the blocks of time say of σ, for each free coefficient; none with fewer than [`LEAST_BLOCKS`].
     pub scatter: Option<Scatter>,
     /// The same coefficients by the fit in the time domain.
@@ -187,6 +194,30 @@ pub fn estimate(
     bounds: &[Bound],
     refinements: usize,
 ) -> Result<Estimate, EstimateError> {
+    estimate_with(observed, model, unknowns, bounds, refinements, Refinement::Bands)
+}
+
+/// What of Σ is measured from the residuals.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Refinement {
+    /// Every band, with its correlations.
+    Bands,
+    /// The levels of the mission's processes alone; see [`crate::levels`]. For models with regressors that the loop makes of the noise.
+    Levels,
+}
+
+/// As [`estimate`], with Σ refined in one way or the other.
+///
+/// # Errors
+/// As [`estimate`].
+pub fn estimate_with(
+    observed: &Observed<'_>,
+    model: &NoiseModel,
+    unknowns: &[Unknown],
+    bounds: &[Bound],
+    refinements: usize,
+    refinement: Refinement,
+) -> Result<Estimate, EstimateError> {
     let Observed { sums, prediction, plan, layout } = *observed;
     let spectra = &sums.total;
     let whitening = Whitening::new(model, plan, layout, spectra)?;
@@ -208,7 +239,10 @@ pub fn estimate(
     let steps = if products { refinements.max(PRODUCT_STEPS) } else { refinements };
     for step in 0..steps {
         if step < refinements {
-            inverses = whitening.refined_inverses(&residual);
+            inverses = match refinement {
+                Refinement::Bands => whitening.refined_inverses(&residual),
+                Refinement::Levels => by_levels(model, plan, spectra, &residual),
+            };
         }
         linear = layout.linear_at(solved.theta.as_slice());
         equations = accumulate(spectra, &linear, &inverses, &kept);
@@ -218,7 +252,8 @@ pub fn estimate(
         residual = residuals(spectra, &linear, plan.bands.len(), &solved.theta);
     }
     let layout = &linear;
-    let chi2 = whitening.chi2(&residual, &inverses, refinements > 0);
+    let fitted = refinements > 0 && refinement == Refinement::Bands;
+    let chi2 = whitening.chi2(&residual, &inverses, fitted);
 
     let reduced = Reduced::new(&equations, unknowns, bounds, &free);
     let weak = reduced.weak(unknowns, &unseen);
@@ -240,6 +275,7 @@ pub fn estimate(
         Some(p) => check(p, unknowns, bounds, &free)?,
         None => None,
     };
+    let known = reduced.with_knowledge(&solved.active);
     let (pulls, survey_chi2) = reduced.pulls(&solved.active, chi2_per_dof.max(1.0));
     let (worst, worst_band_dof) = worst_band(&residual, &inverses, plan, &whitening);
     let quality = Quality {
@@ -264,12 +300,23 @@ pub fn estimate(
         active: solved.active,
         kkt: solved.kkt,
         normal: NormalEquations::new(names, &equations, spectra.segments),
+        known,
+        deviance: whitening.deviance(&residual),
+        inverses,
         scatter,
         prediction,
         pulls,
         survey_chi2,
         quality,
     })
+}
+
+fn by_levels(model: &NoiseModel, plan: &Plan, spectra: &Spectra, residual: &[DMatrix<f64>]) -> Vec<DMatrix<f64>> {
+    let expected = spectra.expected.iter().map(|e| e.max(f64::MIN_POSITIVE));
+    let measured: Vec<DMatrix<f64>> = residual.iter().zip(expected).map(|(r, e)| r / e).collect();
+    let mut levels = Levels::new(model, plan, spectra, &measured);
+    levels.fit();
+    levels.inverses()
 }
 
 /// The problem in the free coefficients alone.

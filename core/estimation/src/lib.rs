@@ -5,6 +5,7 @@
 //! the physical ranges ([`qp`]); [`verdict`] says what the solution is worth. No module knows an effect by name.
 
 pub mod estimate;
+pub mod levels;
 pub mod normal;
 pub mod prediction;
 pub mod qp;

@@ -140,6 +140,25 @@ impl Whitening {
         out
     }
 
+    /// `Σ 2n log det Ŵ` over the refined bands, Ŵ within groups alone: of n complex Gaussian observations the likelihood at its best Σ is
+    /// `|Ŵ|^−n` but for constants.
+    pub(crate) fn deviance(&self, residuals: &[DMatrix<f64>]) -> f64 {
+        let mut sum = 0.0;
+        for (range, n) in self.coarse.iter().zip(&self.observations) {
+            let w = self.whitened(residuals, range);
+            let within =
+                DMatrix::from_fn(
+                    w.nrows(),
+                    w.ncols(),
+                    |i, j| {
+                        if self.group[i] == self.group[j] { w[(i, j)] } else { 0.0 }
+                    },
+                );
+            sum += 2.0 * n * Cholesky::new(within).map_or(0.0, |c| 2.0 * c.l().diagonal().map(f64::ln).sum());
+        }
+        sum
+    }
+
     /// Factor by which a level fitted to n observations of p channels is widened.
     fn wishart(n: f64, p: f64) -> f64 {
         let total = n + SHRINKAGE * p;

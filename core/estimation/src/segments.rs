@@ -3,6 +3,46 @@
 use crate::prediction::Prediction;
 use crate::spectra::{Analyser, Layout, Plan, SHORTEST, Sums};
 
+/// Takes what a [`Segmenter`] cuts.
+pub trait Cuts {
+    /// Lengths of segments.
+    fn plan(&self) -> &Plan;
+
+    /// A segment of the `taper`-th length, one slice per column, the first sample at `first_ns`; `overlaps` when the segment before it
+    /// has the same length and shares its first half.
+    fn segment(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool);
+
+    /// Every sample once, in fixed portions, whatever the batches.
+    fn samples(&mut self, _first_ns: i64, _columns: &[&[f64]]) {}
+
+    /// A segment of full length and its samples have been given.
+    fn between(&mut self) {}
+
+    /// The run of samples has ended.
+    fn gap(&mut self) {}
+}
+
+/// Segments into sums, samples into the fit in the time domain.
+struct IntoSums<'a>(&'a mut Analyser, &'a mut Collected);
+
+impl Cuts for IntoSums<'_> {
+    fn plan(&self) -> &Plan {
+        self.0.plan()
+    }
+    fn segment(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
+        self.0.add(taper, first_ns, columns, overlaps, &mut self.1.sums);
+    }
+    fn samples(&mut self, first_ns: i64, columns: &[&[f64]]) {
+        self.1.samples(first_ns, columns);
+    }
+    fn between(&mut self) {
+        self.1.train(self.0.plan());
+    }
+    fn gap(&mut self) {
+        self.1.gap();
+    }
+}
+
 /// What has been made of the segments.
 #[derive(Clone)]
 pub struct Collected {
@@ -121,6 +161,11 @@ impl Segmenter {
 
     /// Adds rows: `columns[j][k]` is column j at `time_ns[k]`, NaN where there is no value.
     pub fn push(&mut self, time_ns: &[i64], columns: &[&[f64]], analyser: &mut Analyser, collected: &mut Collected) {
+        self.cut(time_ns, columns, &mut IntoSums(analyser, collected));
+    }
+
+    /// As [`Self::push`], with somebody else to take the segments.
+    pub fn cut(&mut self, time_ns: &[i64], columns: &[&[f64]], to: &mut impl Cuts) {
         let rows = time_ns.len();
         let mut usable = vec![true; rows];
         for (k, t) in time_ns.iter().enumerate() {
@@ -143,10 +188,10 @@ impl Segmenter {
             let ok = usable[k];
             let end = k + usable[k..].iter().take_while(|u| **u == ok).count();
             if ok {
-                self.extend(time_ns, &values, k, end, analyser, collected);
+                self.extend(time_ns, &values, k, end, to);
                 self.state.valid += (end - k) as u64;
             } else {
-                self.end_run(analyser, collected);
+                self.cut_end(to);
             }
             k = end;
         }
@@ -163,15 +208,7 @@ impl Segmenter {
         column.iter().map(|x| 0.5 * (std::mem::replace(&mut previous, *x) + x)).collect()
     }
 
-    fn extend(
-        &mut self,
-        time_ns: &[i64],
-        values: &[Vec<f64>],
-        first: usize,
-        end: usize,
-        analyser: &mut Analyser,
-        collected: &mut Collected,
-    ) {
+    fn extend(&mut self, time_ns: &[i64], values: &[Vec<f64>], first: usize, end: usize, to: &mut impl Cuts) {
         let mut k = first;
         while k < end {
             let take = (self.length - self.state.samples()).min(end - k);
@@ -182,12 +219,12 @@ impl Segmenter {
             self.state.run_end_ns = time_ns[k - 1];
             if self.state.samples() == self.length {
                 let segment: Vec<&[f64]> = self.state.run.iter().map(Vec::as_slice).collect();
-                analyser.add(0, self.time_of(0), &segment, self.state.run_has_segment, &mut collected.sums);
+                to.segment(0, self.time_of(0), &segment, self.state.run_has_segment);
                 let hop = self.length / 2;
                 let new = if self.state.run_has_segment { hop } else { 0 };
                 let samples: Vec<&[f64]> = segment.iter().map(|c| &c[new..]).collect();
-                collected.samples(self.time_of(new), &samples);
-                collected.train(analyser.plan());
+                to.samples(self.time_of(new), &samples);
+                to.between();
                 self.state.covered += if self.state.run_has_segment { hop } else { self.length } as u64;
                 self.state.run_has_segment = true;
                 for run in &mut self.state.run {
@@ -204,15 +241,20 @@ impl Segmenter {
 
     /// Ends the run: what no segment of full length covers is cut into shorter ones, as long as they fit.
     pub fn end_run(&mut self, analyser: &mut Analyser, collected: &mut Collected) {
+        self.cut_end(&mut IntoSums(analyser, collected));
+    }
+
+    /// As [`Self::end_run`], with somebody else to take the segments.
+    pub fn cut_end(&mut self, to: &mut impl Cuts) {
         let samples = self.state.samples();
-        let lengths: Vec<usize> = analyser.plan().lengths().collect();
+        let lengths: Vec<usize> = to.plan().lengths().collect();
         // The first half of what is kept belongs to the last segment.
         let mut at = if self.state.run_has_segment { self.length / 2 } else { 0 };
         if at < samples {
             let rest: Vec<&[f64]> = self.state.run.iter().map(|c| &c[at..]).collect();
-            collected.samples(self.time_of(at), &rest);
+            to.samples(self.time_of(at), &rest);
         }
-        collected.gap();
+        to.gap();
         let shortest = lengths.last().copied();
         for (taper, length) in lengths.into_iter().enumerate() {
             let mut overlaps = false;
@@ -222,7 +264,7 @@ impl Segmenter {
             }
             while at + length <= samples {
                 let segment: Vec<&[f64]> = self.state.run.iter().map(|c| &c[at..at + length]).collect();
-                analyser.add(taper, self.time_of(at), &segment, overlaps, &mut collected.sums);
+                to.segment(taper, self.time_of(at), &segment, overlaps);
                 self.state.covered += if overlaps { length / 2 } else { length } as u64;
                 overlaps = true;
                 at += length / 2;

@@ -35,8 +35,10 @@ enum Place {
     Elsewhere,
 }
 
+const AXES: [&str; 3] = ["x", "y", "z"];
+
 fn place(channel: &str) -> Place {
-    let axis = |name: &str| ["x", "y", "z"].iter().position(|a| *a == name);
+    let axis = |name: &str| AXES.iter().position(|a| *a == name);
     let mut parts = channel.split('.');
     let words = (parts.next(), parts.next(), parts.next().and_then(axis), parts.next());
     match words {
@@ -82,6 +84,8 @@ pub struct NoiseModel {
     residual: Vec<bool>,
     dt_s: f64,
     processes: Vec<Process>,
+    /// Processes that an effect may name, `thruster_force:sc.x`, each alone.
+    named: Vec<(String, Process)>,
     angular_error: Option<AngularError>,
     /// Channels of whose noise the mission says nothing; they start as white with unit PSD and are measured.
     pub unknown: Vec<usize>,
@@ -101,8 +105,15 @@ impl NoiseModel {
         let places: Vec<Place> = channels.iter().map(|(name, _)| place(name)).collect();
         let measured = |i: usize| channels[i].1;
         let residual = channels.iter().map(|(_, m)| *m == Measured::Differenced).collect();
-        let mut model =
-            Self { channels: n, residual, dt_s, processes: Vec::new(), angular_error: None, unknown: Vec::new() };
+        let mut model = Self {
+            channels: n,
+            residual,
+            dt_s,
+            processes: Vec::new(),
+            named: Vec::new(),
+            angular_error: None,
+            unknown: Vec::new(),
+        };
         let noise = &mission.noise;
         let single = |i: usize, weight: f64| {
             let mut m = DMatrix::zeros(n, n);
@@ -129,6 +140,11 @@ impl NoiseModel {
         // The known acceleration holds what the torque tells of the thrusters' force; the rest is noise.
         let thrusters = ThrustNoise::of(mission);
         if let Some(thrusters) = &thrusters {
+            for (axis, name) in AXES.iter().enumerate() {
+                let (column, level) = (thrust.column(axis), thrusters.force_given_torque[(axis, axis)]);
+                let enters = column * column.transpose() * level;
+                model.name(format!("thruster_force:sc.{name}"), &thrusters.force_shape, Response::Held, enters);
+            }
             let left = &thrust * dynamic(&thrusters.force_given_torque) * thrust.transpose();
             model.add(thrusters.force_shape.clone(), Response::Held, left);
             lever += &thrust * dynamic(&(thrusters.force_per_torque * mission.spacecraft.inertia()));
@@ -146,6 +162,8 @@ impl NoiseModel {
                         _ => noise.is_z.as_ref(),
                     };
                     if let Some(readout) = readout {
+                        let name = format!("readout:{}.{}", ["tm1", "tm2"][mass], AXES[axis]);
+                        model.name(name, &readout.shape(), Response::Readout, single(i, 1.0));
                         model.add(readout.shape(), Response::Readout, single(i, 1.0));
                     }
                     if let (Some(force), 1 | 2) = (&noise.electrostatic_force, axis) {
@@ -185,6 +203,11 @@ impl NoiseModel {
                     enters.row_mut(i).copy_from(&inverse_inertia.row(axis));
                 }
             }
+            for (axis, name) in AXES.iter().enumerate() {
+                let (column, level) = (enters.column(axis), thrusters.torque[(axis, axis)]);
+                let own = column * column.transpose() * level;
+                model.name(format!("thruster_torque:sc.{name}"), &thrusters.torque_shape, Response::Held, own);
+            }
             let seen = &enters * dynamic(&thrusters.torque) * enters.transpose();
             model.add(thrusters.torque_shape.clone(), Response::Held, seen);
             let from_displacements = (0..n).any(|i| measured(i) == Measured::Differenced);
@@ -217,6 +240,20 @@ impl NoiseModel {
         }
     }
 
+    fn name(&mut self, name: String, shape: &NoiseShape, response: Response, enters: DMatrix<f64>) {
+        if enters.iter().any(|x| *x != 0.0) {
+            self.named.push((name, Process { shape: shape.clone(), response, enters }));
+        }
+    }
+
+    /// One-sided cross-spectral matrix of one process alone, by its name: `thruster_force:sc.x`, `thruster_torque:sc.z`,
+    /// `readout:tm1.y`; `None` where the mission or the channels have no such process.
+    #[must_use]
+    pub fn process_psd(&self, name: &str, frequency_hz: f64) -> Option<DMatrix<f64>> {
+        let (_, p) = self.named.iter().find(|(n, _)| n == name)?;
+        Some(&p.enters * (p.shape.psd(frequency_hz) * self.response(p.response, frequency_hz)))
+    }
+
     /// One-sided cross-spectral matrix at `frequency_hz`, channels × channels, units of the channels squared per Hz.
     #[must_use]
     pub fn psd(&self, frequency_hz: f64) -> DMatrix<f64> {
@@ -235,6 +272,11 @@ impl NoiseModel {
             sigma += &e.lever * m * e.lever.transpose();
         }
         sigma
+    }
+
+    /// Names of the processes that [`Self::process_psd`] knows.
+    pub fn process_names(&self) -> impl Iterator<Item = &str> {
+        self.named.iter().map(|(name, _)| name.as_str())
     }
 
     /// Per channel, whether it is the residual of a known motion; one that is measured directly holds the motion itself.

@@ -176,6 +176,12 @@ impl Plan {
         self.tapers.iter().map(|t| t.length)
     }
 
+    /// Bins of each band in segments of the `taper`-th length.
+    #[must_use]
+    pub fn bins(&self, taper: usize) -> &[Range<usize>] {
+        &self.tapers[taper].bins
+    }
+
     /// Frequency of the middle of a band, Hz.
     #[must_use]
     pub fn frequency_hz(&self, band: Band) -> f64 {
@@ -209,7 +215,9 @@ pub struct Spectra {
 }
 
 impl Spectra {
-    fn zero(bands: usize, columns: usize) -> Self {
+    /// Nothing added yet.
+    #[must_use]
+    pub fn zero(bands: usize, columns: usize) -> Self {
         Self {
             packed: vec![0.0; bands * triangle(columns)],
             expected: vec![0.0; bands],
@@ -219,7 +227,8 @@ impl Spectra {
         }
     }
 
-    fn add(&mut self, other: &Self) {
+    /// Adds the spectra of other segments.
+    pub fn add(&mut self, other: &Self) {
         for (a, b) in [
             (&mut self.packed, &other.packed),
             (&mut self.expected, &other.expected),
@@ -231,7 +240,11 @@ impl Spectra {
         self.segments += other.segments;
     }
 
-    /// Counts a segment, and its overlap with the one before it.
+    /// Counts a segment of the `taper`-th length, and its overlap with the one before it.
+    pub fn count_segment(&mut self, plan: &Plan, taper: usize, overlaps: bool) {
+        self.count(&plan.tapers[taper], overlaps);
+    }
+
     fn count(&mut self, taper: &Taper, overlaps: bool) {
         let [w2, w4, _] = taper.window_sums;
         for (b, part) in taper.part.iter().enumerate() {
@@ -368,13 +381,60 @@ pub fn triangle(n: usize) -> usize {
     n * (n + 1) / 2
 }
 
-/// Turns segments into cross-spectra; owns the scratch space.
-pub struct Analyser {
-    plan: Plan,
-    columns: usize,
+/// Turns samples into spectra; owns the scratch space.
+pub struct Transformer {
     time: Vec<f64>,
     spectrum: Vec<Complex64>,
     scratch: Vec<Complex64>,
+}
+
+impl Transformer {
+    /// For the segments of a plan.
+    #[must_use]
+    pub fn new(plan: &Plan) -> Self {
+        let scratch = plan.tapers.iter().map(|t| t.fft.get_scratch_len()).max().unwrap_or(0);
+        Self {
+            time: vec![0.0; plan.length],
+            spectrum: vec![Complex64::default(); plan.length / 2 + 1],
+            scratch: vec![Complex64::default(); scratch],
+        }
+    }
+
+    /// Spectrum of a segment of the `taper`-th length without its constant and slope, under its window: real and imaginary part of
+    /// each bin from [`FIRST_BIN`] to the last below Nyquist, so scaled that the sum of their squares is the one-sided PSD.
+    pub fn transform(&mut self, plan: &Plan, taper: usize, samples: &[f64], out: &mut [f64]) {
+        let segment = &plan.tapers[taper];
+        let (time, spectrum) = (&mut self.time[..segment.length], &mut self.spectrum[..=segment.length / 2]);
+        // The straight line that fits the *windowed* samples best. A fit to the bare samples would take its slope from the ends,
+        // where a second difference of readout noise is a hundred times louder than the lowest bins.
+        let middle = (samples.len() / 2) as f64;
+        let (mut sum, mut moment) = (0.0, 0.0);
+        for (t, (x, w)) in samples.iter().zip(&segment.window).enumerate() {
+            sum += w * w * x;
+            moment += w * w * (t as f64 - middle) * x;
+        }
+        let (mean, slope) = (sum / segment.window_sums[0], moment / segment.window_moment);
+        for (t, ((out, x), w)) in time.iter_mut().zip(samples).zip(&segment.window).enumerate() {
+            *out = (x - mean - slope * (t as f64 - middle)) * w;
+        }
+        // The lengths are those that the plan was made for, the only thing that it refuses.
+        let scratch = &mut self.scratch[..segment.fft.get_scratch_len()];
+        let done = segment.fft.process_with_scratch(time, spectrum, scratch);
+        debug_assert!(done.is_ok());
+        let scale = (4.0 / (plan.rate_hz * segment.length as f64)).sqrt();
+        let used = spectrum.get(FIRST_BIN..segment.length / 2).unwrap_or_default();
+        for (pair, x) in out.chunks_exact_mut(2).zip(used) {
+            pair[0] = x.re * scale;
+            pair[1] = x.im * scale;
+        }
+    }
+}
+
+/// Turns segments into cross-spectra.
+pub struct Analyser {
+    plan: Plan,
+    columns: usize,
+    transformer: Transformer,
     /// Per column: real and imaginary part of each bin from [`FIRST_BIN`], scaled.
     scaled: Vec<Vec<f64>>,
 }
@@ -384,15 +444,7 @@ impl Analyser {
     #[must_use]
     pub fn new(plan: Plan, layout: &Layout) -> Self {
         let columns = layout.columns();
-        let scratch = plan.tapers.iter().map(|t| t.fft.get_scratch_len()).max().unwrap_or(0);
-        Self {
-            time: vec![0.0; plan.length],
-            spectrum: vec![Complex64::default(); plan.length / 2 + 1],
-            scratch: vec![Complex64::default(); scratch],
-            scaled: vec![vec![0.0; plan.length]; columns],
-            columns,
-            plan,
-        }
+        Self { transformer: Transformer::new(&plan), scaled: vec![vec![0.0; plan.length]; columns], columns, plan }
     }
 
     /// Bands and lengths.
@@ -405,7 +457,7 @@ impl Analyser {
     /// segment before it has the same length and shares its first half.
     pub fn add(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool, sums: &mut Sums) {
         for (j, samples) in columns.iter().enumerate() {
-            self.transform(taper, j, samples);
+            self.transformer.transform(&self.plan, taper, samples, &mut self.scaled[j]);
         }
         let segment = &self.plan.tapers[taper];
         let middle_ns = first_ns + (0.5e9 * segment.length as f64 / self.plan.rate_hz) as i64;
@@ -429,33 +481,6 @@ impl Analyser {
             }
         }
         sums.total.packed = total;
-    }
-
-    fn transform(&mut self, taper: usize, column: usize, samples: &[f64]) {
-        let segment = &self.plan.tapers[taper];
-        let (time, spectrum) = (&mut self.time[..segment.length], &mut self.spectrum[..=segment.length / 2]);
-        // The straight line that fits the *windowed* samples best. A fit to the bare samples would take its slope from the ends,
-        // where a second difference of readout noise is a hundred times louder than the lowest bins.
-        let middle = (samples.len() / 2) as f64;
-        let (mut sum, mut moment) = (0.0, 0.0);
-        for (t, (x, w)) in samples.iter().zip(&segment.window).enumerate() {
-            sum += w * w * x;
-            moment += w * w * (t as f64 - middle) * x;
-        }
-        let (mean, slope) = (sum / segment.window_sums[0], moment / segment.window_moment);
-        for (t, ((out, x), w)) in time.iter_mut().zip(samples).zip(&segment.window).enumerate() {
-            *out = (x - mean - slope * (t as f64 - middle)) * w;
-        }
-        // The lengths are those that the plan was made for, the only thing that it refuses.
-        let scratch = &mut self.scratch[..segment.fft.get_scratch_len()];
-        let done = segment.fft.process_with_scratch(time, spectrum, scratch);
-        debug_assert!(done.is_ok());
-        let scale = (4.0 / (self.plan.rate_hz * segment.length as f64)).sqrt();
-        let used = spectrum.get(FIRST_BIN..segment.length / 2).unwrap_or_default();
-        for (pair, x) in self.scaled[column].chunks_exact_mut(2).zip(used) {
-            pair[0] = x.re * scale;
-            pair[1] = x.im * scale;
-        }
     }
 }
 

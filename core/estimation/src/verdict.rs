@@ -29,6 +29,9 @@ const NAMED: f64 = 0.05;
 /// Eigen-directions of the information, scaled by `size`, whose σ exceeds [`WEAK`]; `names` with units.
 #[must_use]
 pub fn weak_directions(information: &DMatrix<f64>, size: &DVector<f64>, names: &[(&str, &str)]) -> Vec<Direction> {
+    if names.is_empty() {
+        return Vec::new();
+    }
     let d = DMatrix::from_diagonal(size);
     let eigen = SymmetricEigen::new(&d * information * &d);
     let mut found: Vec<(f64, usize)> = eigen

@@ -358,11 +358,12 @@ impl<'a> Link<'a> {
     pub fn read(&mut self, want: &Want) -> Result<In, PluginError> {
         let mut slot = abi::SlotV1::default();
         crate::border::ask_for_column(self.raw, want.parts(), &mut slot)?;
+        // Of a name that raw telemetry shares with a uniform table the host gives the uniform one.
         let rate_hz = self
             .available
             .iter()
-            .find(|(table, name, _)| *name == want.name && (want.table.is_none() || *table == want.table))
-            .map_or(0.0, |(_, _, rate_hz)| *rate_hz);
+            .filter(|(table, name, _)| *name == want.name && (want.table.is_none() || *table == want.table))
+            .fold(0.0, |fastest: f64, (_, _, rate_hz)| fastest.max(*rate_hz));
         if rate_hz > 0.0 && self.uniform_input.is_none() {
             self.uniform_input = Some(slot.table);
         }
@@ -466,6 +467,28 @@ impl<'l, 'a> EffectLink<'l, 'a> {
     /// The host refuses it: the name is taken.
     pub fn series(&mut self, name: &str, unit: &str, frame: &str) -> Result<Out, PluginError> {
         self.link.write_with(self.table, name, unit, frame, &[("kind", "series"), ("effect", self.effect)])
+    }
+
+    /// As [`Self::shared_series`], of a series without content above `below_hz`, such as one made of housekeeping: nobody need look for
+    /// it there.
+    ///
+    /// # Errors
+    /// As [`Self::series`].
+    pub fn slow_series(
+        &mut self,
+        available: &Available,
+        name: &str,
+        unit: &str,
+        below_hz: f64,
+    ) -> Result<(String, Option<Out>), PluginError> {
+        match available.of_kind("series").find(|c| c.name == name) {
+            Some(column) => Ok((column.table.clone(), None)),
+            None => {
+                let below_hz = below_hz.to_string();
+                let attributes = [("kind", "series"), ("effect", self.effect), ("below_hz", &below_hz)];
+                Ok((self.table(), Some(self.link.write_with(self.table, name, unit, "", &attributes)?)))
+            }
+        }
     }
 
     /// A series of this name of an effect before this one, by its table, or else a new one of this effect. The name must say all

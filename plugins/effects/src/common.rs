@@ -6,6 +6,8 @@ use dragfree_sdk::prelude::*;
 
 /// Axes as the columns name them.
 pub(crate) const AXES: [&str; 3] = ["x", "y", "z"];
+/// What is made of housekeeping and has passed a lag or a slow sensor has nothing above this, Hz.
+pub(crate) const SLOW_HZ: f64 = 0.05;
 /// Every axis of both test masses.
 pub(crate) const TM_AXES: [&str; 6] = ["tm1.x", "tm1.y", "tm1.z", "tm2.x", "tm2.y", "tm2.z"];
 

@@ -70,6 +70,12 @@ impl Recipe for IsScaleRecipe {
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
+        if setup.candidate() {
+            return Err(PluginError::error(
+                "is-scale is not tried: on data without any effect it comes out as 0.06 ± 0.01, and it passes for a gain of the \
+                 electrodes; add it by hand where a readout is known to be wrong",
+            ));
+        }
         let (tm, axis) = tm_axis(setup.instance());
         Ok(Self(tm, axis))
     }

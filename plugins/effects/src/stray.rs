@@ -4,7 +4,7 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use serde_json::json;
 
-use crate::common::{AXES, Place, housekeeping, manifest, mission, named, on_channels, place, response};
+use crate::common::{AXES, Place, SLOW_HZ, housekeeping, manifest, mission, named, on_channels, place, response};
 
 /// `charge`: a charged test mass in the field of stray voltages.
 ///
@@ -167,7 +167,7 @@ impl Magnetic {
     ) -> Result<Place, PluginError> {
         let name = format!("{}*{}", gradient.name, field.name);
         let unit = if gradient.unit == FIELD_UNIT { "T2" } else { "T2 m-1" };
-        let (table, out) = link.shared_series(available, &name, unit, "")?;
+        let (table, out) = link.slow_series(available, &name, unit, SLOW_HZ)?;
         if let Some(out) = out {
             let columns = [link.read(&Want::of(gradient))?, link.read(&Want::of(field))?];
             self.products.push(Product { columns, out });

@@ -15,7 +15,7 @@ use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
-    Place, TM_AXES, channel_of, housekeeping, loaded, manifest, mission, named, on_channels, response, saved,
+    Place, SLOW_HZ, TM_AXES, channel_of, housekeeping, loaded, manifest, mission, named, on_channels, response, saved,
 };
 use crate::lag::Lags;
 
@@ -53,7 +53,7 @@ impl<const N: usize> Bank<N> {
         let mut out = [None; N];
         for j in 0..N {
             let name = lagged(&column.name, lag_s[j]);
-            let (table, written) = link.shared_series(available, &name, &column.unit, &column.frame)?;
+            let (table, written) = link.slow_series(available, &name, &column.unit, SLOW_HZ)?;
             (places[j], out[j]) = ((table, name), written);
         }
         if out.iter().all(Option::is_none) {

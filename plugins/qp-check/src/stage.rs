@@ -7,7 +7,7 @@ use dragfree_sdk::prelude::*;
 use nalgebra::DMatrix;
 use serde_json::json;
 
-use dragfree_estimation::estimate::{Bound, Estimate as Solution, Observed, Unknown, estimate};
+use dragfree_estimation::estimate::{Bound, Estimate as Solution, Observed, Refinement, Unknown, estimate_with};
 use dragfree_estimation::prediction::Prediction;
 use dragfree_estimation::segments::{Collected, Segmenter, longest_length};
 use dragfree_estimation::sigma::{Measured, NoiseModel};
@@ -23,6 +23,7 @@ pub struct QpCheck {
     mission: Mission,
     segment_s: f64,
     refinements: usize,
+    refinement: Refinement,
     log: Log,
     linked: Option<Linked>,
 }
@@ -39,6 +40,7 @@ struct Linked {
     coefficients: Vec<Coefficient>,
     bounds: Vec<Bound>,
     refinements: usize,
+    refinement: Refinement,
     analyser: Analyser,
     segmenter: Segmenter,
     collected: Collected,
@@ -77,6 +79,12 @@ impl Stage for QpCheck {
             mission: Mission::from_json(setup.mission_json())?,
             segment_s: setup.f64("segment_s")?,
             refinements: usize::try_from(setup.i64("refinements")?)?,
+            // Commands are made of the very noise whose spectrum would be measured.
+            refinement: if setup.needs("commands") || setup.needs("torque-response") {
+                Refinement::Levels
+            } else {
+                Refinement::Bands
+            },
             log: setup.log(),
             linked: None,
         })
@@ -161,6 +169,7 @@ impl Linked {
             bounds: bounds(available),
             coefficients: available.coefficients.clone(),
             refinements: stage.refinements,
+            refinement: stage.refinement,
             collected: nothing_collected(&model, &measured, &layout, &available.coefficients, analyser.plan()),
             measured,
             segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged),
@@ -201,7 +210,8 @@ impl Linked {
             sums: &sums,
             prediction: collected.prediction.as_ref(),
         };
-        let solution = estimate(&observed, &self.model, &unknowns, &self.bounds, self.refinements)?;
+        let solution =
+            estimate_with(&observed, &self.model, &unknowns, &self.bounds, self.refinements, self.refinement)?;
         self.describe(&solution, earlier, &mut report);
         self.attach(&solution, &stored, &mut report);
         Ok(report)

@@ -2,6 +2,7 @@
 
 mod demo;
 mod design;
+mod diagnose;
 mod ladder;
 mod model;
 mod new_plugin;
@@ -44,6 +45,7 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
         Command::Reveal { sealed, telemetry } => reveal::execute(sealed, telemetry, global.json, paint),
         Command::Design(command) => design::execute(command, global, paint),
         Command::Run(command) => run::execute(command, global, paint),
+        Command::Diagnose(command) => diagnose::execute(command, global, paint),
         Command::Config(Config::Check(chain)) => run::config_check(chain, global),
         Command::Plugins(command) => plugins::execute(command, global, paint),
         Command::Products(command) => products::execute(command, global.json, paint),

@@ -33,6 +33,7 @@ pub(super) fn open(name: &str, archive: &Path) -> Result<(Product, PathBuf), Fai
     Ok((entry.product, entry.path))
 }
 
+/// `name` is a product's file, or a name in the archive.
 fn show(name: &str, archive: &Path, json: bool, paint: Paint) -> Result<Done, Failure> {
     let (product, path) = open(name, archive)?;
     if json {

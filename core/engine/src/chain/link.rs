@@ -124,7 +124,7 @@ pub fn build(
             pipeline.path.display()
         )));
     }
-    builder.chain.model_sha256 = hex(&Sha256::digest(builder.model_json()));
+    builder.chain.model_sha256 = hex(&Sha256::digest(builder.model_json(false)));
     Ok(builder.chain)
 }
 
@@ -152,8 +152,10 @@ impl Builder<'_> {
         ChainError::Model { path: self.model.path.display().to_string(), what }
     }
 
-    fn model_json(&self) -> String {
-        json!({ "coefficients": self.chain.coefficients, "constraints": self.chain.constraints }).to_string()
+    fn model_json(&self, for_candidate: bool) -> String {
+        // A candidate need not know of others, whose forms may be ten thousands.
+        let told: Vec<_> = self.chain.coefficients.iter().filter(|c| !(for_candidate && c.candidate)).collect();
+        json!({ "coefficients": told, "constraints": self.chain.constraints }).to_string()
     }
 
     fn stage(&mut self, id: &str, parameters: &toml::Table, pipeline: &Pipeline) -> Result<(), ChainError> {
@@ -289,7 +291,7 @@ impl Builder<'_> {
             }),
         };
         let mut node = found.create(&config)?;
-        let linked = node.link(LinkRequest { available: &self.available, model_json: &self.model_json() })?;
+        let linked = node.link(LinkRequest { available: &self.available, model_json: &self.model_json(candidate) })?;
         node.activate(u32::try_from(self.chain.carry.batch_rows).unwrap_or(u32::MAX))?;
         let index = self.chain.nodes.len();
         let (inputs, wave) = self.route(index, &linked);

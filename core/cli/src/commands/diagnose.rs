@@ -1,0 +1,169 @@
+//! `dragfree diagnose`: the data of products once more, with every effect that is not in the model.
+
+use super::Done;
+use crate::args::{BATCH_ROWS, Diagnose, Global};
+use crate::failure::Failure;
+use crate::progress::Meter;
+use crate::text::Paint;
+use dragfree_critic::diagnosis::{Diagnosis, Found, diagnose};
+use dragfree_critic::rank::Court;
+use dragfree_critic::record::Record;
+use dragfree_engine::examine::{Examination, Sources, candidates, examine, model};
+use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_physics::mission::Mission;
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Result<Done, Failure> {
+    let (record, mission) = gather(&command.products, &command.archive.folder, global, true)?;
+    if let Some(path) = &command.save_sums {
+        std::fs::write(path, record.to_bytes()).map_err(Failure::io("write", path))?;
+    }
+    let diagnosis = judge(&record, &mission)?;
+    let mut value = serde_json::to_value(&diagnosis).map_err(Failure::engine)?;
+    value["not_tried"] = serde_json::json!(record.not_tried);
+    if global.json {
+        return Ok(Done::json(&value));
+    }
+    Ok(Done::new(screen(&diagnosis, &record, command.top, paint)))
+}
+
+/// The verdict on what was gathered.
+pub(super) fn judge(record: &Record, mission: &Mission) -> Result<Diagnosis, Failure> {
+    let noise = noise(record, mission)?;
+    diagnose(&Court::new(&record.question, &record.gathered, &noise)).map_err(Failure::engine)
+}
+
+pub(super) fn noise(record: &Record, mission: &Mission) -> Result<NoiseModel, Failure> {
+    let measured = |d: &bool| if *d { Measured::Differenced } else { Measured::Directly };
+    let channels: Vec<(&str, Measured)> =
+        record.question.channels.iter().map(String::as_str).zip(record.differenced.iter().map(measured)).collect();
+    NoiseModel::new(mission, &channels, 1.0 / record.gathered.rate_hz).map_err(Failure::engine)
+}
+
+/// Gathers the data of products of one model; with every candidate, or with the model alone.
+pub(super) fn gather(
+    names: &[String],
+    archive: &Path,
+    global: &Global,
+    with_candidates: bool,
+) -> Result<(Record, Mission), Failure> {
+    let registry = super::registry(global)?;
+    let mut whole: Option<(Record, Mission)> = None;
+    for name in names {
+        let (product, path) = super::products::open(name, archive)?;
+        let sources = Sources::read(&path).map_err(Failure::engine)?;
+        let folder = tempfile::tempdir().map_err(Failure::engine)?;
+        let out = folder.path().join("sums");
+        let mut parameters = toml::Table::new();
+        let text = |path: &Path| toml::Value::String(path.to_string_lossy().into_owned());
+        parameters.insert("out".to_owned(), text(&out));
+        let equations = path.with_extension("neq.json");
+        if equations.is_file() {
+            parameters.insert("reference".to_owned(), text(&equations));
+        }
+        let model = model(&sources).map_err(Failure::engine)?;
+        let what = Examination {
+            product: &product,
+            sources: &sources,
+            stage: ("critic", parameters),
+            candidates: if with_candidates { candidates(&registry, &model) } else { Vec::new() },
+            threads: super::threads(global),
+            batch_rows: BATCH_ROWS as usize,
+        };
+        let mut meter = Meter::new("diagnose", global);
+        let not_tried = examine(&registry, &what, &mut |p| meter.show(&p)).map_err(Failure::engine)?;
+        let bytes = std::fs::read(&out).map_err(Failure::engine)?;
+        let mut record = Record::from_bytes(&bytes).map_err(Failure::engine)?;
+        record.not_tried.extend(not_tried);
+        match &mut whole {
+            None => whole = Some((record, mission(&sources.mission)?)),
+            Some((sum, _)) => sum.add(&record).map_err(Failure::engine)?,
+        }
+    }
+    whole.ok_or_else(|| Failure::engine(std::io::Error::other("no product was named")))
+}
+
+fn mission(path: &PathBuf) -> Result<Mission, Failure> {
+    let text = std::fs::read_to_string(path).map_err(Failure::engine)?;
+    let value: toml::Value = toml::from_str(&text).map_err(Failure::engine)?;
+    let json = serde_json::to_string(&value).map_err(Failure::engine)?;
+    Mission::from_json(&json).map_err(Failure::engine)
+}
+
+fn screen(d: &Diagnosis, record: &Record, top: usize, paint: Paint) -> String {
+    let mut out = String::new();
+    let verdict = match d.verdict.as_str() {
+        "missing" => "an effect is missing from the model",
+        "unexplained" => "something is left that no installed effect explains",
+        _ => "the model is sufficient for these data",
+    };
+    let _ = writeln!(out, "verdict   {} ({verdict})", paint.bold(&d.verdict));
+    let _ = writeln!(
+        out,
+        "tried     {} forms of {} effects, false alarms at most {} in 100",
+        d.tried,
+        record.question.places().len(),
+        100.0 * d.false_alarm_rate
+    );
+    let accepted: Vec<&Found> = d.candidates.iter().filter(|f| f.accepted).collect();
+    if !accepted.is_empty() {
+        let _ = writeln!(out, "\nWhat is missing");
+        accepted.iter().for_each(|f| put(&mut out, f));
+    }
+    let others: Vec<&Found> =
+        d.candidates.iter().filter(|f| !f.accepted).take(top.saturating_sub(accepted.len())).collect();
+    if !others.is_empty() {
+        let _ = writeln!(out, "\nWhat was tried next, and is no explanation");
+        others.iter().for_each(|f| put(&mut out, f));
+    }
+    if let Some(u) = &d.unexplained {
+        let _ = writeln!(out, "\nWhat nobody explains");
+        let _ = writeln!(out, "  channels {}", u.channels.join(", "));
+        let _ = writeln!(
+            out,
+            "  {} between {:.2e} and {:.2e} Hz, {:.2} times the power",
+            u.kind, u.band_hz[0], u.band_hz[1], u.ratio
+        );
+        if !u.coherent_with.is_empty() {
+            let _ = writeln!(out, "  coherent with {}", u.coherent_with.join(", "));
+        }
+    }
+    if let Some(f) = accepted.first() {
+        let _ = writeln!(out, "\nnext      dragfree model add MODEL.toml {}:{}", f.effect, f.instance);
+    }
+    for (name, reason) in &record.not_tried {
+        let _ = writeln!(out, "not tried {name}: {reason}");
+    }
+    out
+}
+
+fn put(out: &mut String, f: &Found) {
+    let _ = writeln!(out, "  {}:{}", f.effect, f.instance);
+    let _ = writeln!(
+        out,
+        "    {} = {:.4e} ± {:.1e} {}, χ² falls by {:.0}, chance {:.1e}{}",
+        f.coefficient,
+        f.value,
+        f.sigma,
+        f.unit,
+        f.delta_chi2,
+        f.p_value,
+        if f.in_range { "" } else { ", at the end of its range" }
+    );
+    for (key, value) in &f.shape {
+        let _ = writeln!(out, "    {key} = {value}");
+    }
+    let moved: Vec<String> = f
+        .offset_shift_sigma
+        .iter()
+        .filter(|(_, s)| s.abs() > 1.0)
+        .map(|(name, s)| format!("{name} by {:.2} mm ({s:.1}σ)", 1e3 * f.offset_shift_m[name]))
+        .collect();
+    if !moved.is_empty() {
+        let _ = writeln!(out, "    without it {}", moved.join(", "));
+    }
+    if !f.confounders.is_empty() {
+        let _ = writeln!(out, "    cannot be told from {}", f.confounders.join(", "));
+    }
+}

@@ -1,0 +1,532 @@
+//! The verdict: is the model sufficient, what is missing, or is there something that nothing explains.
+
+use dragfree_estimation::estimate::EstimateError;
+use dragfree_estimation::levels::{Level, Levels};
+use dragfree_estimation::verdict::{chi2_per_dof_at, chi2_quantile};
+use serde::Serialize;
+use serde_json::{Map, Value, json};
+use std::collections::BTreeMap;
+
+use crate::rank::{Court, Fit, Scored};
+use crate::transient::Hit;
+use crate::witness::Coherence;
+
+/// Chance of naming an effect when none is hidden.
+pub const FALSE_ALARM: f64 = 0.01;
+
+/// A mission file knows its noise to this: a level within it is none that is missing.
+const LEVEL_TOLERANCE: f64 = 0.15;
+
+/// Rounds of adding the best effect.
+const MOST_ADDED: usize = 4;
+
+/// Candidates that are weighed in full in each round.
+const LISTED: usize = 12;
+
+/// Independent segments of full length below which nothing is said.
+const LEAST_SEGMENTS: f64 = 4.0;
+
+/// Standard normal quantile of a one-sided 95 % limit.
+const LIMIT_QUANTILE: f64 = 1.645;
+
+/// An excess is looked at when the power of a third of a decade is above the modelled by this.
+const EXCESS: f64 = 1.25;
+
+/// Why there is no diagnosis.
+#[derive(Debug, thiserror::Error)]
+pub enum DiagnosisError {
+    /// Nothing can be fitted.
+    #[error(transparent)]
+    Estimate(#[from] EstimateError),
+    /// Too little data.
+    #[error(
+        "a diagnosis needs at least {LEAST_SEGMENTS} segments of {segment_s:.0} s without a gap, and there are {segments:.1}: give more telemetry, \
+         or several products"
+    )]
+    TooShort {
+        /// Segments there are.
+        segments: f64,
+        /// Their length.
+        segment_s: f64,
+    },
+}
+
+/// An effect that explains something.
+#[derive(Clone, Debug, Serialize)]
+pub struct Found {
+    /// Effect.
+    pub effect: String,
+    /// Instance.
+    pub instance: String,
+    /// Coefficient that stands out most.
+    pub coefficient: String,
+    /// Its value, in `unit`.
+    pub value: f64,
+    /// σ of it.
+    pub sigma: f64,
+    /// Unit.
+    pub unit: String,
+    /// Values of the shape parameters.
+    pub shape: Map<String, Value>,
+    /// Every coefficient of the effect: name, value, σ, unit.
+    pub coefficients: Vec<Value>,
+    /// By how much χ² falls.
+    pub delta_chi2: f64,
+    /// Chance of as much when nothing is there, corrected for everything tried.
+    pub p_value: f64,
+    /// Change of the Bayesian information criterion, negative in favour of the effect.
+    pub delta_bic: f64,
+    /// Whether the value lies inside its physical range.
+    pub in_range: bool,
+    /// Whether it explains each half of the data with the value of the other; none where there is one half.
+    pub held_out_delta_chi2: Option<[f64; 2]>,
+    /// χ²/dof without it, under the noise that is left with it.
+    pub chi2_per_dof_before: f64,
+    /// χ²/dof with it.
+    pub chi2_per_dof_after: f64,
+    /// By how much the lack of it moves each coefficient of the model that is a length, m.
+    pub offset_shift_m: BTreeMap<String, f64>,
+    /// The same in σ of the coefficient.
+    pub offset_shift_sigma: BTreeMap<String, f64>,
+    /// Where it acts.
+    pub channels: Vec<String>,
+    /// What the data cannot tell from it.
+    pub confounders: Vec<String>,
+    /// Whether it is part of the answer, or only the next on the list.
+    pub accepted: bool,
+}
+
+/// What cannot be seen.
+#[derive(Clone, Debug, Serialize)]
+pub struct Limit {
+    /// Effect.
+    pub effect: String,
+    /// Instance.
+    pub instance: String,
+    /// Coefficient.
+    pub coefficient: String,
+    /// 95 % upper limit on its size.
+    pub limit_95: f64,
+    /// Unit.
+    pub unit: String,
+    /// Form for which it holds.
+    pub shape: Map<String, Value>,
+}
+
+/// What is left over.
+#[derive(Clone, Debug, Serialize)]
+pub struct Unexplained {
+    /// Channels with an excess.
+    pub channels: Vec<String>,
+    /// Lowest and highest frequency of it, Hz.
+    pub band_hz: [f64; 2],
+    /// `line`, `broadband`, `transient` or `drift`.
+    pub kind: String,
+    /// Measured over modelled power, at its worst.
+    pub ratio: f64,
+    /// Start of the hours in which it is loud, Unix ns.
+    pub hours_ns: Vec<i64>,
+    /// Housekeeping that is coherent with it, the most coherent first.
+    pub coherent_with: Vec<String>,
+    /// The same with numbers.
+    pub witnesses: Vec<Coherence>,
+}
+
+/// The answer.
+#[derive(Clone, Debug, Serialize)]
+pub struct Diagnosis {
+    /// `sufficient`, `missing` or `unexplained`.
+    pub verdict: String,
+    /// Chance of a false alarm.
+    pub false_alarm_rate: f64,
+    /// Forms of effects, levels and templates that were tried.
+    pub tried: usize,
+    /// What explains the data, the best first; those that are accepted stand before the rest.
+    pub candidates: Vec<Found>,
+    /// Limits of what is not seen.
+    pub upper_limits: Vec<Limit>,
+    /// What nobody explains.
+    pub unexplained: Option<Unexplained>,
+    /// What happened once.
+    pub transients: Vec<Value>,
+}
+
+/// Chance that χ² of `dof` is above `chi2`, by Wilson and Hilferty and the normal tail.
+fn tail(chi2: f64, dof: f64) -> f64 {
+    let z = chi2_quantile(chi2.max(0.0) / dof, dof);
+    if z < 0.0 {
+        return 1.0 - normal_tail(-z);
+    }
+    // The cube root is poor far out for few degrees of freedom, where the leading term of the incomplete gamma function is exact.
+    if chi2 > 4.0 * dof + 20.0 {
+        let half = 0.5 * dof;
+        let log = (half - 1.0) * (0.5 * chi2).ln() - 0.5 * chi2 - ln_gamma(half);
+        return (log.exp() * (1.0 / (1.0 - (dof - 2.0) / chi2).max(0.1))).min(1.0);
+    }
+    normal_tail(z)
+}
+
+/// Upper tail of the normal distribution (Abramowitz and Stegun 7.1.26, to 1.5e-7, and its asymptote beyond 4σ).
+fn normal_tail(z: f64) -> f64 {
+    if z > 4.0 {
+        return (-0.5 * z * z).exp() / (z * std::f64::consts::TAU.sqrt()) * (1.0 - 1.0 / (z * z));
+    }
+    let x = z / std::f64::consts::SQRT_2;
+    let t = 1.0 / (1.0 + 0.327_591_1 * x);
+    let poly =
+        t * (0.254_829_592 + t * (-0.284_496_736 + t * (1.421_413_741 + t * (-1.453_152_027 + t * 1.061_405_429))));
+    0.5 * poly * (-x * x).exp()
+}
+
+/// `ln Γ` at multiples of one half.
+fn ln_gamma(x: f64) -> f64 {
+    let (mut value, mut at) =
+        if (2.0 * x).rem_euclid(2.0) < 0.5 { (0.0, 1.0) } else { (0.5 * std::f64::consts::PI.ln(), 0.5) };
+    while at + 0.5 < x {
+        value += f64::ln(at);
+        at += 1.0;
+    }
+    value
+}
+
+fn corrected(p: f64, tried: usize) -> f64 {
+    // 1 − (1 − p)^n
+    (-(tried as f64 * (-p).ln_1p()).exp_m1()).clamp(0.0, 1.0)
+}
+
+/// Diagnoses the sums.
+///
+/// # Errors
+/// [`DiagnosisError`]: too little data, or a model that cannot be fitted.
+pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
+    // The lowest band is seen by segments of full length alone, one observation each.
+    let bins = court.plan().bands.first().map_or(1, |b| b.bins()) as f64;
+    let segments = court.total.weights.observations(court.plan()).first().map_or(0.0, |n| n / bins);
+    let segment_s = court.gathered.length as f64 / court.gathered.rate_hz;
+    if segments < LEAST_SEGMENTS {
+        return Err(DiagnosisError::TooShort { segments, segment_s });
+    }
+    let mut fit = court.fit(&[])?;
+    let mut found: Vec<Found> = Vec::new();
+    let mut tried = 0;
+    let rest: Vec<Scored>;
+    loop {
+        let (ranked, forms) = court.rank(&fit);
+        if tried == 0 {
+            tried = forms;
+        }
+        let weighed: Vec<Found> =
+            ranked.iter().take(LISTED).map(|scored| weigh(court, &fit, scored, &ranked, tried)).collect();
+        let helps = |f: &Found| f.held_out_delta_chi2.is_none_or(|h| h.iter().sum::<f64>() > 0.0);
+        let good = |f: &Found| f.p_value < FALSE_ALARM && f.in_range && helps(f);
+        let best = weighed.iter().position(good).filter(|_| found.len() < MOST_ADDED);
+        match best {
+            Some(i) => {
+                let mut added = fit.added.clone();
+                added.push(ranked[i].candidate.clone());
+                fit = court.fit(&added)?;
+                found.push(Found { accepted: true, ..weighed[i].clone() });
+                // What is found is measured again with Σ as it is without the excess.
+                refresh(court, &fit, &mut found);
+            }
+            None => {
+                rest = ranked;
+                found.extend(weighed);
+                break;
+            }
+        }
+    }
+
+    let measured = court.residual_psd(&fit);
+    let mut levels = Levels::new(court.noise, court.plan(), &court.total.weights, &measured);
+    let mut extra = noise_levels(court, &mut levels, &mut tried);
+    let hits = transients(court, &mut tried, &mut extra);
+    let accepted = found.iter().filter(|f| f.accepted).count();
+    // Noise and transients are weighed apart: they stand behind the effects that are accepted and before the rest.
+    extra.sort_by(|a, b| b.accepted.cmp(&a.accepted).then(b.delta_chi2.total_cmp(&a.delta_chi2)));
+    let louder: Vec<Found> = extra.iter().filter(|f| f.accepted).cloned().collect();
+    let mut candidates: Vec<Found> = found.drain(..accepted).chain(louder).collect();
+    candidates.sort_by(|a, b| b.delta_chi2.total_cmp(&a.delta_chi2));
+    let missing = !candidates.is_empty();
+    candidates.extend(found);
+    candidates.extend(extra.into_iter().filter(|f| !f.accepted));
+
+    let unexplained = unexplained(court, &levels, &measured);
+    let verdict = match (missing, &unexplained) {
+        (true, _) => "missing",
+        (false, Some(_)) => "unexplained",
+        (false, None) => "sufficient",
+    };
+    let upper_limits = limits(court, &rest, &candidates);
+    Ok(Diagnosis {
+        verdict: verdict.to_owned(),
+        false_alarm_rate: FALSE_ALARM,
+        tried,
+        candidates,
+        upper_limits,
+        unexplained,
+        transients: hits,
+    })
+}
+
+/// A candidate as it stands beside a fit.
+fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], tried: usize) -> Found {
+    let parts = &scored.candidate.parts;
+    let covariance = scored.information.clone().try_inverse();
+    let sigma = |j: usize| covariance.as_ref().map_or(f64::INFINITY, |c| c[(j, j)].max(0.0).sqrt());
+    let values: Vec<(f64, f64)> = (0..parts.len()).map(|j| (scored.value[j], sigma(j))).collect();
+    let name = |j: usize| court.question.coefficients[parts[j].0].name.clone();
+    let lead = leading(&values);
+    let dof = parts.len() as f64;
+    let quality = &fit.estimate.quality;
+    let (mut offset_shift_m, mut offset_shift_sigma) = (BTreeMap::new(), BTreeMap::new());
+    for (k, i) in fit.estimate.free.iter().enumerate() {
+        let Some(c) = court.question.coefficients[..court.question.model()].get(*i) else { continue };
+        if c.forms[0].unit == "m" {
+            let own = fit.estimate.covariance.as_ref().map_or(f64::INFINITY, |c| c[(k, k)].sqrt());
+            offset_shift_m.insert(c.name.clone(), scored.shift[k]);
+            offset_shift_sigma.insert(c.name.clone(), scored.shift[k] / own);
+        }
+    }
+    let mut channels: Vec<String> =
+        parts.iter().flat_map(|(_, f)| &f.terms).map(|t| court.question.channels[t.channel].clone()).collect();
+    channels.sort();
+    channels.dedup();
+    Found {
+        effect: scored.candidate.effect.clone(),
+        instance: scored.candidate.instance.clone(),
+        coefficient: name(lead),
+        value: values[lead].0,
+        sigma: values[lead].1,
+        unit: parts[lead].1.unit.clone(),
+        shape: parts[lead].1.shape.clone(),
+        coefficients: (0..parts.len())
+            .map(|j| json!({ "name": name(j), "value": values[j].0, "sigma": values[j].1, "unit": parts[j].1.unit }))
+            .collect(),
+        delta_chi2: scored.delta_chi2,
+        p_value: corrected(tail(scored.delta_chi2, dof), tried),
+        delta_bic: dof * quality.dof.ln() - scored.delta_chi2,
+        in_range: scored.in_range,
+        held_out_delta_chi2: court.held_out(fit, &scored.candidate),
+        chi2_per_dof_before: quality.chi2_per_dof,
+        chi2_per_dof_after: quality.chi2_per_dof - scored.delta_chi2 / quality.dof,
+        offset_shift_m,
+        offset_shift_sigma,
+        channels,
+        confounders: court.confounders(fit, scored, ranked),
+        accepted: false,
+    }
+}
+
+/// The coefficient that stands out most.
+fn leading(values: &[(f64, f64)]) -> usize {
+    let size = |i: &usize| (values[*i].0 / values[*i].1).abs();
+    (0..values.len()).max_by(|a, b| size(a).total_cmp(&size(b))).unwrap_or(0)
+}
+
+/// The accepted effects as the fit of all of them has them.
+fn refresh(court: &Court<'_>, fit: &Fit, found: &mut [Found]) {
+    let mut at = court.question.model();
+    let sigma = |i: usize| {
+        let k = fit.estimate.free.iter().position(|f| *f == i)?;
+        fit.estimate.covariance.as_ref().map(|c| c[(k, k)].sqrt())
+    };
+    for (f, added) in found.iter_mut().zip(&fit.added) {
+        let values: Vec<(f64, f64)> =
+            (at..at + added.parts.len()).map(|i| (fit.estimate.theta[i], sigma(i).unwrap_or(f64::INFINITY))).collect();
+        at += added.parts.len();
+        let lead = leading(&values);
+        let name = |j: usize| court.question.coefficients[added.parts[j].0].name.clone();
+        (f.value, f.sigma) = values[lead];
+        (f.coefficient, f.unit) = (name(lead), added.parts[lead].1.unit.clone());
+        f.coefficients = (0..values.len())
+            .map(|j| {
+                json!({ "name": name(j), "value": values[j].0, "sigma": values[j].1, "unit": added.parts[j].1.unit })
+            })
+            .collect();
+    }
+}
+
+/// Levels of noise one after the other, the best first; those that matter are accepted and taken over.
+fn noise_levels(court: &Court<'_>, levels: &mut Levels<'_>, tried: &mut usize) -> Vec<Found> {
+    let asked: Vec<usize> =
+        (0..court.question.coefficients.len()).filter(|i| !court.question.coefficients[*i].noise.is_empty()).collect();
+    *tried += asked.len();
+    let mut left = asked;
+    let mut out = Vec::new();
+    loop {
+        let measured: Vec<(usize, Level)> =
+            left.iter().filter_map(|i| Some((*i, levels.level(&court.question.coefficients[*i].noise)?))).collect();
+        let best = measured.into_iter().max_by(|a, b| a.1.delta_chi2.total_cmp(&b.1.delta_chi2));
+        let Some((i, level)) = best else { return out };
+        let p_value = corrected(tail(level.delta_chi2, 1.0), *tried);
+        let matters = p_value < FALSE_ALARM && (level.value.ln()).abs() > LEVEL_TOLERANCE.ln_1p();
+        if p_value < FALSE_ALARM {
+            levels.take(&level);
+        }
+        let c = &court.question.coefficients[i];
+        out.push(Found {
+            effect: c.effect.clone(),
+            instance: c.instance.clone(),
+            coefficient: c.name.clone(),
+            value: level.value,
+            sigma: level.sigma,
+            unit: "1".to_owned(),
+            shape: Map::new(),
+            coefficients: vec![json!({ "name": c.name, "value": level.value, "sigma": level.sigma, "unit": "1" })],
+            delta_chi2: level.delta_chi2,
+            p_value,
+            delta_bic: (court.total.weights.segments as f64).ln() - level.delta_chi2,
+            in_range: true,
+            held_out_delta_chi2: None,
+            chi2_per_dof_before: f64::NAN,
+            chi2_per_dof_after: f64::NAN,
+            offset_shift_m: BTreeMap::new(),
+            offset_shift_sigma: BTreeMap::new(),
+            channels: Vec::new(),
+            confounders: Vec::new(),
+            accepted: matters,
+        });
+        left.retain(|j| *j != i);
+        if p_value >= FALSE_ALARM {
+            return out;
+        }
+    }
+}
+
+/// Hits that no chance gives; the loudest of each effect and instance becomes a candidate.
+fn transients(court: &Court<'_>, tried: &mut usize, out: &mut Vec<Found>) -> Vec<Value> {
+    let search = &court.gathered.transients;
+    let chance = |h: &Hit| {
+        // Neighbouring samples are one trial at most; all are counted.
+        (2.0 * normal_tail(h.significance()) * search.tried).min(1.0)
+    };
+    *tried += usize::from(search.tried > 0.0);
+    let certain: Vec<&Hit> = search.hits.iter().filter(|h| chance(h) < FALSE_ALARM).collect();
+    let mut named: Vec<(&str, &str)> = Vec::new();
+    for h in &certain {
+        if named.contains(&(&h.effect, &h.instance)) {
+            continue;
+        }
+        named.push((&h.effect, &h.instance));
+        out.push(Found {
+            effect: h.effect.clone(),
+            instance: h.instance.clone(),
+            coefficient: h.coefficient.clone(),
+            value: h.value,
+            sigma: h.sigma,
+            unit: h.unit.clone(),
+            shape: h.shape.clone(),
+            coefficients: vec![json!({ "name": h.coefficient, "value": h.value, "sigma": h.sigma, "unit": h.unit })],
+            delta_chi2: h.significance().powi(2),
+            p_value: chance(h),
+            delta_bic: f64::NAN,
+            in_range: true,
+            held_out_delta_chi2: None,
+            chi2_per_dof_before: f64::NAN,
+            chi2_per_dof_after: f64::NAN,
+            offset_shift_m: BTreeMap::new(),
+            offset_shift_sigma: BTreeMap::new(),
+            channels: Vec::new(),
+            confounders: Vec::new(),
+            accepted: true,
+        });
+    }
+    certain.iter().map(|h| json!(h)).collect()
+}
+
+fn limits(court: &Court<'_>, rest: &[Scored], named: &[Found]) -> Vec<Limit> {
+    let mut out = Vec::new();
+    for s in rest {
+        let accepted =
+            |f: &Found| f.accepted && (&f.effect, &f.instance) == (&s.candidate.effect, &s.candidate.instance);
+        if named.iter().any(accepted) {
+            continue;
+        }
+        let Some(covariance) = s.information.clone().try_inverse() else { continue };
+        for (j, (i, form)) in s.candidate.parts.iter().enumerate() {
+            let sigma = covariance[(j, j)].max(0.0).sqrt();
+            out.push(Limit {
+                effect: s.candidate.effect.clone(),
+                instance: s.candidate.instance.clone(),
+                coefficient: court.question.coefficients[*i].name.clone(),
+                limit_95: s.value[j].abs() + LIMIT_QUANTILE * sigma,
+                unit: form.unit.clone(),
+                shape: form.shape.clone(),
+            });
+        }
+    }
+    out
+}
+
+/// Power beyond the modelled noise, channel by channel in thirds of a decade, and what is coherent with it.
+fn unexplained(court: &Court<'_>, levels: &Levels<'_>, measured: &[nalgebra::DMatrix<f64>]) -> Option<Unexplained> {
+    let plan = court.plan();
+    let observations = court.total.weights.observations(plan);
+    let channels = &court.question.channels;
+    let mut loud: Vec<(usize, [f64; 2], f64)> = Vec::new();
+    for c in 0..channels.len() {
+        let mut first = 0;
+        while first < plan.bands.len() {
+            let limit = plan.bands[first].first as f64 * 10.0f64.powf(1.0 / 3.0);
+            let end = first + plan.bands[first..].iter().take_while(|b| (b.first as f64) < limit).count();
+            let n: f64 = observations[first..end].iter().sum();
+            let weighed = |b: usize| observations[b] * measured[b][(c, c)] / levels.modelled()[b][(c, c)];
+            let ratio = (first..end).map(weighed).sum::<f64>() / n.max(f64::MIN_POSITIVE);
+            let certain = chi2_per_dof_at(2.0 * n, 5.0);
+            if n > 3.0 && ratio > certain.max(EXCESS) {
+                let hz = |b: usize| plan.frequency_hz(plan.bands[b]);
+                loud.push((c, [hz(first), hz(end - 1)], ratio));
+            }
+            first = end;
+        }
+    }
+    // Every driver with every channel is a trial.
+    let all = court.gathered.witnesses.coherences(channels);
+    let trials = all.len().max(1);
+    let significant: Vec<Coherence> =
+        all.into_iter().filter(|w| corrected(tail(w.statistic, w.dof), trials) < FALSE_ALARM).collect();
+    // Without an excess a coherence means nothing: currents of thrusters follow the commands, and these the noise.
+    let (_, band_hz, ratio) = *loud.iter().max_by(|a, b| a.2.total_cmp(&b.2))?;
+    let mut names: Vec<String> = loud.iter().map(|(c, _, _)| channels[*c].clone()).collect();
+    names.sort();
+    names.dedup();
+    let kind = if court.gathered.transients.hits.iter().any(|h| h.significance() > 10.0) {
+        "transient"
+    } else if band_hz[1] < 2.0 * plan.bin_hz(plan.bands[0].first as f64) {
+        "drift"
+    } else {
+        "broadband"
+    };
+    let mut coherent_with: Vec<String> = Vec::new();
+    for w in significant.iter().filter(|w| names.contains(&w.channel)) {
+        if !coherent_with.contains(&w.driver) && coherent_with.len() < 10 {
+            coherent_with.push(w.driver.clone());
+        }
+    }
+    Some(Unexplained {
+        channels: names,
+        band_hz,
+        kind: kind.to_owned(),
+        ratio,
+        hours_ns: Vec::new(),
+        coherent_with,
+        witnesses: significant.into_iter().take(20).collect(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Tables of χ²: P(χ²₁ > 3.841) = 0.05, P(χ²₂ > 9.210) = 0.01, P(χ²₁ > 30) = 4.3205e-8, P(χ²₉ > 60) = 1.34e-9.
+    #[test]
+    fn tails_are_those_of_the_tables() {
+        for (chi2, dof, p) in [(3.841, 1.0, 0.05), (9.210, 2.0, 0.01), (30.0, 1.0, 4.3205e-8), (60.0, 9.0, 1.338e-9)] {
+            let got = tail(chi2, dof);
+            assert!((got / p - 1.0).abs() < 0.1, "{chi2} {dof}: {got} against {p}");
+        }
+        assert!((normal_tail(0.0) - 0.5).abs() < 1e-6);
+        assert!((corrected(1e-6, 1000) - 1e-3).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,13 @@
+//! Criticism of a model: where it fails, which effect is missing, how sure that is (the design's `effects.md`).
+//!
+//! Data are read once: [`gather`] sums the cross-spectra of channels, of the model's series and of those of every candidate,
+//! [`transient`] looks for what happens once, [`witness`] asks every channel of housekeeping. From the sums alone [`rank`] tries the
+//! candidates, `dragfree_estimation::levels` the noise, and [`diagnosis`] says what is missing. No module knows an effect by name.
+
+pub mod diagnosis;
+pub mod gather;
+pub mod question;
+pub mod rank;
+pub mod record;
+pub mod transient;
+pub mod witness;

@@ -1,0 +1,218 @@
+//! What is asked: the model, and the forms of everything that is not in it.
+
+use dragfree_estimation::estimate::{Bound, Unknown};
+use dragfree_estimation::spectra::{Layout, Regressor};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+/// A channel's answer to a coefficient.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Term {
+    /// Index of the channel.
+    pub channel: usize,
+    /// Index of the column.
+    pub column: usize,
+    /// Unit of the channel per unit of column and coefficients.
+    pub factor: f64,
+    /// Index of another coefficient of the model that multiplies it.
+    pub times: Option<usize>,
+}
+
+/// One form that a coefficient may have.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Form {
+    /// Values of the shape parameters.
+    pub shape: Map<String, Value>,
+    /// Unit of the coefficient.
+    pub unit: String,
+    /// Lower end of its physical range, none for −∞.
+    pub lower: Option<f64>,
+    /// Upper end of its physical range, none for ∞.
+    pub upper: Option<f64>,
+    /// How it acts.
+    pub terms: Vec<Term>,
+}
+
+/// A coefficient of the model or of a candidate.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Coefficient {
+    /// Name.
+    pub name: String,
+    /// Effect.
+    pub effect: String,
+    /// Instance.
+    pub instance: String,
+    /// Value before any data, or the fixed value.
+    pub initial: f64,
+    /// Standard deviation before any data, none for ∞.
+    pub prior_sigma: Option<f64>,
+    /// Whether the model estimates it.
+    pub estimate: bool,
+    /// Whether it is no part of the model.
+    pub candidate: bool,
+    /// Its forms; one for a coefficient of the model.
+    pub forms: Vec<Form>,
+    /// A process of the mission's noise that it multiplies.
+    pub noise: String,
+}
+
+/// A linear constraint of the model.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Rule {
+    /// Name.
+    pub name: String,
+    /// Whether it is a survey.
+    pub survey: bool,
+    /// Index of a coefficient, weight.
+    pub terms: Vec<(usize, f64)>,
+    /// Bounds, none for none.
+    pub lower: Option<f64>,
+    /// Upper bound.
+    pub upper: Option<f64>,
+}
+
+/// Model and candidates.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Question {
+    /// Names of the channels.
+    pub channels: Vec<String>,
+    /// Coefficients, those of the model first.
+    pub coefficients: Vec<Coefficient>,
+    /// Constraints of the model.
+    pub rules: Vec<Rule>,
+}
+
+/// An effect at a place, in one form: what can be added to a model.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Candidate {
+    /// Effect.
+    pub effect: String,
+    /// Instance.
+    pub instance: String,
+    /// Indices of its coefficients, with the form of each.
+    pub parts: Vec<(usize, Form)>,
+}
+
+impl Question {
+    /// Coefficients of the model.
+    #[must_use]
+    pub fn model(&self) -> usize {
+        self.coefficients.iter().take_while(|c| !c.candidate).count()
+    }
+
+    /// Every instance of every effect that is not in the model, with the indices of its coefficients; noise apart.
+    #[must_use]
+    pub fn places(&self) -> Vec<Vec<usize>> {
+        let mut places: Vec<Vec<usize>> = Vec::new();
+        for (i, c) in self.coefficients.iter().enumerate().filter(|(_, c)| c.candidate && !c.forms.is_empty()) {
+            let same = |p: &&mut Vec<usize>| {
+                let other = &self.coefficients[p[0]];
+                (&other.effect, &other.instance, other.forms.len()) == (&c.effect, &c.instance, c.forms.len())
+            };
+            match places.iter_mut().find(same) {
+                Some(place) => place.push(i),
+                None => places.push(vec![i]),
+            }
+        }
+        places
+    }
+
+    /// The `form`-th form of the coefficients of a place.
+    #[must_use]
+    pub fn candidate(&self, place: &[usize], form: usize) -> Candidate {
+        let first = &self.coefficients[place[0]];
+        Candidate {
+            effect: first.effect.clone(),
+            instance: first.instance.clone(),
+            parts: place.iter().map(|i| (*i, self.coefficients[*i].forms[form].clone())).collect(),
+        }
+    }
+
+    /// Unknowns of the model and of what was added to it.
+    #[must_use]
+    pub fn unknowns(&self, added: &[Candidate]) -> Vec<Unknown> {
+        let unknown = |c: &Coefficient, form: &Form, estimate: bool| Unknown {
+            name: c.name.clone(),
+            unit: form.unit.clone(),
+            lower: form.lower.unwrap_or(f64::NEG_INFINITY),
+            upper: form.upper.unwrap_or(f64::INFINITY),
+            initial: if estimate && c.candidate { 0.0 } else { c.initial },
+            prior_sigma: c.prior_sigma.unwrap_or(f64::INFINITY),
+            estimate,
+        };
+        let model = self.coefficients[..self.model()].iter().map(|c| unknown(c, &c.forms[0], c.estimate));
+        let added = added.iter().flat_map(|a| &a.parts).map(|(i, form)| unknown(&self.coefficients[*i], form, true));
+        model.chain(added).collect()
+    }
+
+    /// Constraints as the estimator takes them.
+    #[must_use]
+    pub fn bounds(&self) -> Vec<Bound> {
+        let bound = |r: &Rule| Bound {
+            name: r.name.clone(),
+            survey: r.survey,
+            terms: r.terms.clone(),
+            lower: r.lower.unwrap_or(f64::NEG_INFINITY),
+            upper: r.upper.unwrap_or(f64::INFINITY),
+        };
+        self.rules.iter().map(bound).collect()
+    }
+
+    /// The layout of the model with what was added, and the columns that it is made of.
+    #[must_use]
+    pub fn layout(&self, names: &[String], added: &[Candidate]) -> (Layout, Vec<usize>) {
+        let model = self.model();
+        let mut columns: Vec<usize> = (0..self.channels.len()).collect();
+        let mut regressors = Vec::new();
+        let own = self.coefficients[..model].iter().enumerate().map(|(i, c)| (i, &c.forms[0]));
+        let more = added.iter().flat_map(|a| &a.parts).enumerate().map(|(k, (_, form))| (model + k, form));
+        for (coefficient, form) in own.chain(more) {
+            for t in &form.terms {
+                let at = columns.iter().position(|c| *c == t.column).unwrap_or_else(|| {
+                    columns.push(t.column);
+                    columns.len() - 1
+                });
+                let series = at - self.channels.len();
+                regressors.push(Regressor {
+                    coefficient,
+                    channel: t.channel,
+                    series,
+                    factor: t.factor,
+                    times: t.times,
+                });
+            }
+        }
+        let layout = Layout {
+            channels: self.channels.clone(),
+            series: columns[self.channels.len()..].iter().map(|c| names[*c].clone()).collect(),
+            regressors,
+            coefficients: self.unknowns(added).into_iter().map(|u| u.name).collect(),
+        };
+        (layout, columns)
+    }
+}
+
+impl Candidate {
+    /// Its name, `es-gain:tm1.y`.
+    #[must_use]
+    pub fn name(&self) -> String {
+        format!("{}:{}", self.effect, self.instance)
+    }
+
+    /// Between this form and another of the same place: `part` of the way, shapes in their logarithm.
+    #[must_use]
+    pub fn towards(&self, other: &Self, part: f64) -> Self {
+        let mut mixed = self.clone();
+        for ((_, form), (_, to)) in mixed.parts.iter_mut().zip(&other.parts) {
+            form.terms.iter_mut().for_each(|t| t.factor *= 1.0 - part);
+            form.terms.extend(to.terms.iter().map(|t| Term { factor: t.factor * part, ..t.clone() }));
+            for (key, value) in &mut form.shape {
+                let (Some(a), Some(b)) = (value.as_f64(), to.shape.get(key).and_then(Value::as_f64)) else { continue };
+                if a != b && a > 0.0 && b > 0.0 {
+                    *value = Value::from(a * (b / a).powf(part));
+                }
+            }
+        }
+        mixed
+    }
+}

@@ -1,0 +1,338 @@
+//! Which cause is missing: every candidate against what the model leaves, from the sums alone.
+//!
+//! With the model fitted and Σ measured from its residuals, adding coefficients p to the fitted ones q lowers χ² by `sᵀ S⁻¹ s`,
+//! `s = c_p − N_pq θ_q`, `S = N_pp − N_pq N_qq⁻¹ N_qp`; all of it is linear in the Gram matrices, and exact for that Σ. Σ is that of
+//! the mission with its levels measured (see `dragfree_estimation::levels`) and has taken up a plain excess that nobody explains.
+//! Values beyond a coefficient's hard range are no explanation: χ² is taken at the best point inside.
+//!
+//! Shapes are scanned on the grid of the forms, and between neighbours by mixing the two, which for a lag or a resonance on a fine
+//! grid is an interpolation.
+
+use dragfree_estimation::estimate::{Estimate, EstimateError, Observed, Refinement, estimate_with};
+use dragfree_estimation::sigma::NoiseModel;
+use dragfree_estimation::spectra::{Layout, Plan, Spectra, Sums};
+use nalgebra::{Cholesky, DMatrix, DVector};
+
+use crate::gather::{Gathered, Gram};
+use crate::question::{Candidate, Question};
+
+/// How often Σ is measured from the residuals.
+const REFINEMENTS: usize = 3;
+
+/// Projection above which two causes cannot be told apart.
+pub const CONFOUNDED: f64 = 0.95;
+
+/// What is left of a candidate's information beside the model when it is called degenerate with it.
+const DEGENERATE: f64 = 0.02;
+
+/// A model fitted to the sums.
+pub struct Fit {
+    /// What was added to the model.
+    pub added: Vec<Candidate>,
+    /// Coefficients of the model, then of what was added.
+    pub estimate: Estimate,
+    layout: Layout,
+    /// Columns of the layout among all.
+    columns: Vec<usize>,
+}
+
+/// A candidate beside a fit.
+#[derive(Clone, Debug)]
+pub struct Scored {
+    /// The candidate in its best form.
+    pub candidate: Candidate,
+    /// Best values inside the ranges.
+    pub value: DVector<f64>,
+    /// Whether the free fit lies inside them.
+    pub in_range: bool,
+    /// By how much χ² falls.
+    pub delta_chi2: f64,
+    /// Information of its coefficients beside the model.
+    pub information: DMatrix<f64>,
+    /// Part of the information that the model leaves it.
+    pub left: f64,
+    /// By how much its absence moves each free coefficient of the fit.
+    pub shift: DVector<f64>,
+}
+
+/// Everything that is asked of the sums.
+pub struct Court<'a> {
+    /// Model and candidates.
+    pub question: &'a Question,
+    /// Sums.
+    pub gathered: &'a Gathered,
+    /// Both sets together.
+    pub total: Gram,
+    /// Noise of the mission.
+    pub noise: &'a NoiseModel,
+    plan: Plan,
+}
+
+/// What a band needs: residual against columns, and the model's columns against columns, under `Σ⁻¹`.
+struct Scores {
+    /// Column, channel: `Σ_b (residual · Σ⁻¹)`.
+    residual: DMatrix<f64>,
+    /// The same of the model's regressors, per free coefficient.
+    model: Vec<DMatrix<f64>>,
+    /// `N_qq⁻¹` with what surveys and ranges know.
+    covariance: DMatrix<f64>,
+    /// `Σ⁻¹` times what makes information of sums, per band.
+    weights: Vec<DMatrix<f64>>,
+    theta: DVector<f64>,
+}
+
+impl<'a> Court<'a> {
+    /// Takes the sums.
+    #[must_use]
+    pub fn new(question: &'a Question, gathered: &'a Gathered, noise: &'a NoiseModel) -> Self {
+        Self { question, gathered, total: gathered.total(), noise, plan: gathered.plan() }
+    }
+
+    /// Bands.
+    #[must_use]
+    pub fn plan(&self) -> &Plan {
+        &self.plan
+    }
+
+    /// Fits the model with what was added.
+    ///
+    /// # Errors
+    /// As [`estimate_with`].
+    pub fn fit(&self, added: &[Candidate]) -> Result<Fit, EstimateError> {
+        let (layout, columns) = self.question.layout(&self.gathered.columns.names, added);
+        let spectra = self.total.select(&columns);
+        let sums = Sums { total: spectra, block_ns: 1, blocks: Vec::new() };
+        let observed = Observed { layout: &layout, plan: &self.plan, sums: &sums, prediction: None };
+        let unknowns = self.question.unknowns(added);
+        let estimate =
+            estimate_with(&observed, self.noise, &unknowns, &self.question.bounds(), REFINEMENTS, Refinement::Levels)?;
+        Ok(Fit { added: added.to_vec(), estimate, layout, columns })
+    }
+
+    fn scores(&self, gram: &Gram, fit: &Fit) -> Scores {
+        let n = self.gathered.columns.names.len();
+        let channels = self.question.channels.len();
+        let theta = &fit.estimate.theta;
+        let linear = fit.layout.linear_at(theta.as_slice());
+        let kept = self.total.weights.kept();
+        let weights: Vec<DMatrix<f64>> = fit.estimate.inverses.iter().zip(&kept).map(|(w, k)| w * *k).collect();
+        let mut residual = DMatrix::zeros(n, channels);
+        let free = &fit.estimate.free;
+        let mut model = vec![DMatrix::zeros(n, channels); free.len()];
+        for (g, w) in gram.bands.iter().zip(&weights) {
+            let m = g.nrows();
+            let mut left = g.columns(0, channels).into_owned();
+            for r in &linear.regressors {
+                let column = fit.columns[channels + r.series];
+                if column < m {
+                    left.column_mut(r.channel).axpy(-r.factor * theta[r.coefficient], &g.column(column), 1.0);
+                }
+            }
+            residual.rows_mut(0, m).gemm(1.0, &left, w, 1.0);
+            for r in &linear.regressors {
+                let column = fit.columns[channels + r.series];
+                let Some(k) = free.iter().position(|f| *f == r.coefficient).filter(|_| column < m) else { continue };
+                model[k].rows_mut(0, m).ger(r.factor, &g.column(column), &w.row(r.channel).transpose(), 1.0);
+            }
+        }
+        let covariance = fit
+            .estimate
+            .known
+            .clone()
+            .cholesky()
+            .map_or_else(|| DMatrix::zeros(free.len(), free.len()), |c| c.inverse());
+        Scores { residual, model, covariance, weights, theta: theta.clone() }
+    }
+
+    /// Terms of each coefficient: column, channel, factor, with products at the fit's values.
+    fn terms(candidate: &Candidate, theta: &DVector<f64>) -> Vec<Vec<(usize, usize, f64)>> {
+        let of = |form: &crate::question::Form| {
+            let at =
+                |t: &crate::question::Term| (t.column, t.channel, t.factor * t.times.map_or(1.0, |other| theta[other]));
+            form.terms.iter().map(at).collect()
+        };
+        candidate.parts.iter().map(|(_, form)| of(form)).collect()
+    }
+
+    /// `N` between two candidates' coefficients, before anything is projected out.
+    fn between(&self, gram: &Gram, scores: &Scores, a: &Candidate, b: &Candidate) -> DMatrix<f64> {
+        let (a, b) = (Self::terms(a, &scores.theta), Self::terms(b, &scores.theta));
+        DMatrix::from_fn(a.len(), b.len(), |i, j| {
+            let mut sum = 0.0;
+            for (g, w) in gram.bands.iter().zip(&scores.weights) {
+                let m = g.nrows();
+                for (s, c, f) in a[i].iter().filter(|t| t.0 < m) {
+                    for (t, d, h) in b[j].iter().filter(|t| t.0 < m) {
+                        sum += f * h * w[(*c, *d)] * g[(*s, *t)];
+                    }
+                }
+            }
+            sum
+        })
+    }
+
+    /// Score of a candidate's coefficients, and their information with the model's.
+    fn against(scores: &Scores, candidate: &Candidate) -> (DVector<f64>, DMatrix<f64>) {
+        let terms = Self::terms(candidate, &scores.theta);
+        let sum = |m: &DMatrix<f64>, i: usize| terms[i].iter().map(|(s, c, f)| f * m[(*s, *c)]).sum::<f64>();
+        let score = DVector::from_fn(terms.len(), |i, _| sum(&scores.residual, i));
+        (score, DMatrix::from_fn(terms.len(), scores.model.len(), |i, q| sum(&scores.model[q], i)))
+    }
+
+    fn score(&self, scores: &Scores, candidate: Candidate) -> Option<Scored> {
+        let own = self.between(&self.total, scores, &candidate, &candidate);
+        let (score, with_model) = Self::against(scores, &candidate);
+        let information = &own - &with_model * &scores.covariance * with_model.transpose();
+        let left = (0..own.nrows()).map(|i| information[(i, i)] / own[(i, i)]).fold(1.0, f64::min);
+        // A coefficient that nothing sees, or that the model has already.
+        if left.is_nan() || left <= 1e-9 {
+            return None;
+        }
+        let bounds: Vec<(f64, f64)> = candidate
+            .parts
+            .iter()
+            .map(|(_, f)| (f.lower.unwrap_or(f64::NEG_INFINITY), f.upper.unwrap_or(f64::INFINITY)))
+            .collect();
+        let free = Cholesky::new(information.clone())?.solve(&score);
+        let in_range = free.iter().zip(&bounds).all(|(x, (lower, upper))| lower <= x && x <= upper);
+        let value = if in_range { free } else { inside(&information, &score, &bounds) };
+        let delta_chi2 = 2.0 * score.dot(&value) - value.dot(&(&information * &value));
+        let shift = &scores.covariance * with_model.transpose() * &value;
+        Some(Scored { candidate, value, in_range, delta_chi2, information, left, shift })
+    }
+
+    /// Every place of every effect that is not in the fit, in its best form; the best first. Also how many forms were tried.
+    #[must_use]
+    pub fn rank(&self, fit: &Fit) -> (Vec<Scored>, usize) {
+        let scores = self.scores(&self.total, fit);
+        let mut tried = 0;
+        let mut ranked = Vec::new();
+        for place in self.question.places() {
+            let first = &self.question.coefficients[place[0]];
+            if fit.added.iter().any(|a| (&a.effect, &a.instance) == (&first.effect, &first.instance)) {
+                continue;
+            }
+            let forms = first.forms.len();
+            let scored: Vec<Option<Scored>> =
+                (0..forms).map(|f| self.score(&scores, self.question.candidate(&place, f))).collect();
+            tried += scored.iter().flatten().count();
+            let best = scored.iter().flatten().max_by(|a, b| a.delta_chi2.total_cmp(&b.delta_chi2));
+            let Some(best) = best else { continue };
+            ranked.push(self.between_neighbours(&scores, &scored, best));
+        }
+        ranked.sort_by(|a, b| b.delta_chi2.total_cmp(&a.delta_chi2));
+        (ranked, tried)
+    }
+
+    /// The best mixture of the best form with a neighbour on its grid of shapes.
+    fn between_neighbours(&self, scores: &Scores, all: &[Option<Scored>], best: &Scored) -> Scored {
+        let mut winner = best.clone();
+        for (_, other) in neighbours(&best.candidate, all.iter().flatten().map(|s| &s.candidate)) {
+            let mixed = |part: f64| self.score(scores, best.candidate.towards(other, part));
+            // Golden section over the part of the way.
+            let (mut a, mut b) = (0.0, 1.0);
+            for _ in 0..12 {
+                let (c, d) = (b - 0.618_034 * (b - a), a + 0.618_034 * (b - a));
+                let [fc, fd] = [c, d].map(|x| mixed(x).map_or(f64::NEG_INFINITY, |s| s.delta_chi2));
+                if fc > fd { b = d } else { a = c }
+            }
+            if let Some(s) = mixed(0.5 * (a + b)).filter(|s| s.delta_chi2 > winner.delta_chi2) {
+                winner = s;
+            }
+        }
+        winner
+    }
+
+    /// By how much χ² falls in each set of stretches with the values that the other set gives; `None` where one set is empty.
+    #[must_use]
+    pub fn held_out(&self, fit: &Fit, candidate: &Candidate) -> Option<[f64; 2]> {
+        if self.gathered.sets.iter().any(|s| s.weights.segments == 0) {
+            return None;
+        }
+        let judge = |set: &Gram| {
+            let scores = self.scores(set, fit);
+            let (score, _) = Self::against(&scores, candidate);
+            (score, self.between(set, &scores, candidate, candidate))
+        };
+        let [a, b] = [judge(&self.gathered.sets[0]), judge(&self.gathered.sets[1])];
+        let gain = |fitted: &(DVector<f64>, DMatrix<f64>), tested: &(DVector<f64>, DMatrix<f64>)| {
+            let value = Cholesky::new(fitted.1.clone())?.solve(&fitted.0);
+            Some(2.0 * tested.0.dot(&value) - value.dot(&(&tested.1 * &value)))
+        };
+        Some([gain(&b, &a)?, gain(&a, &b)?])
+    }
+
+    /// Causes that the data cannot tell from `scored`, and coefficients of the model that it is degenerate with.
+    #[must_use]
+    pub fn confounders(&self, fit: &Fit, scored: &Scored, ranked: &[Scored]) -> Vec<String> {
+        let scores = self.scores(&self.total, fit);
+        let direction = |s: &Scored| (Self::against(&scores, &s.candidate).1.transpose() * &s.value, s.value.clone());
+        let (model, value) = direction(scored);
+        let norm = |s: &Scored, v: &DVector<f64>| v.dot(&(&s.information * v));
+        let mut names = Vec::new();
+        for other in ranked.iter().filter(|o| o.candidate.name() != scored.candidate.name()) {
+            let (their_model, their_value) = direction(other);
+            let own = self.between(&self.total, &scores, &scored.candidate, &other.candidate);
+            let shared = value.dot(&(&own * &their_value)) - model.dot(&(&scores.covariance * &their_model));
+            let both = norm(scored, &value) * norm(other, &their_value);
+            if both > 0.0 && shared.abs() > CONFOUNDED * both.sqrt() {
+                names.push(other.candidate.name());
+            }
+        }
+        if scored.left < DEGENERATE {
+            let share = |q: usize| model[q].powi(2) * scores.covariance[(q, q)];
+            let free = &fit.estimate.free;
+            let lead = (0..free.len()).max_by(|a, b| share(*a).total_cmp(&share(*b)));
+            names.extend(lead.map(|q| fit.layout.coefficients[free[q]].clone()));
+        }
+        names
+    }
+
+    /// Cross-spectra of the residuals of a fit, per band, over those expected of a PSD of one: a measured Σ.
+    #[must_use]
+    pub fn residual_psd(&self, fit: &Fit) -> Vec<DMatrix<f64>> {
+        let spectra: Spectra = self.total.select(&fit.columns);
+        dragfree_estimation::normal::residual_spectra(&spectra, &fit.layout, &fit.estimate.theta)
+            .into_iter()
+            .zip(&self.total.weights.expected)
+            .map(|(r, e)| r / e.max(f64::MIN_POSITIVE))
+            .collect()
+    }
+}
+
+/// How far its one differing number is away, and the candidate.
+type Neighbour<'a> = (f64, &'a Candidate);
+
+/// Candidates of the same place that differ in one number of their shape, the next below and above.
+fn neighbours<'a>(of: &Candidate, all: impl Iterator<Item = &'a Candidate>) -> Vec<Neighbour<'a>> {
+    let shape = &of.parts[0].1.shape;
+    let (mut below, mut above): (Option<Neighbour<'_>>, Option<Neighbour<'_>>) = (None, None);
+    for other in all {
+        let theirs = &other.parts[0].1.shape;
+        let differing: Vec<_> = shape.iter().filter(|(k, v)| theirs.get(*k) != Some(v)).collect();
+        let [(key, value)] = differing[..] else { continue };
+        let (Some(mine), Some(other_value)) = (value.as_f64(), theirs.get(key).and_then(serde_json::Value::as_f64))
+        else {
+            continue;
+        };
+        let distance = other_value - mine;
+        if distance > 0.0 && above.is_none_or(|(d, _)| distance < d) {
+            above = Some((distance, other));
+        } else if distance < 0.0 && below.is_none_or(|(d, _)| distance > d) {
+            below = Some((distance, other));
+        }
+    }
+    below.into_iter().chain(above).collect()
+}
+
+/// The minimum of `½ xᵀSx − sᵀx` in a box, coordinate by coordinate: S is positive definite and small.
+fn inside(information: &DMatrix<f64>, score: &DVector<f64>, bounds: &[(f64, f64)]) -> DVector<f64> {
+    let mut x: DVector<f64> = DVector::from_iterator(bounds.len(), bounds.iter().map(|(l, u)| 0.0f64.clamp(*l, *u)));
+    for _ in 0..200 {
+        for i in 0..x.len() {
+            let rest = score[i] - information.row(i).dot(&x.transpose()) + information[(i, i)] * x[i];
+            x[i] = (rest / information[(i, i)]).clamp(bounds[i].0, bounds[i].1);
+        }
+    }
+    x
+}

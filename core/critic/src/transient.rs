@@ -1,0 +1,208 @@
+//! What happens once: every template at every time, by the filter that is matched to it and to the noise.
+//!
+//! With residuals r whose spectrum is Σ and a template `T(f)` that begins at `t`, the amplitude that fits best is
+//! `n(t)/D`, `n(t) = Σ_f Re T* Σ⁻¹ r e^{2πift}`, `D = Σ_f T* Σ⁻¹ T`, and its significance `n/√D`; one inverse transform gives all times.
+//! Under a window w that is long against the template both n and its noise are those without it times `w(t)`.
+
+use std::f64::consts::{PI, TAU};
+
+use dragfree_estimation::spectra::{FIRST_BIN, Plan};
+use nalgebra::{DMatrix, DMatrixView};
+use realfft::RealFftPlanner;
+use realfft::num_complex::Complex64;
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value};
+
+/// Significance below which a peak is not kept.
+const LEAST: f64 = 5.0;
+
+/// Median of the size of a standard normal number.
+const MEDIAN: f64 = 0.674_49;
+
+/// Peaks of one cause nearer than this are one, s.
+const NEAR_S: f64 = 120.0;
+
+/// Peaks that are kept.
+const MOST: usize = 50;
+
+/// A short course of something, and how the channels answer.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Template {
+    /// Effect.
+    pub effect: String,
+    /// Instance.
+    pub instance: String,
+    /// Coefficient.
+    pub coefficient: String,
+    /// Unit of the coefficient.
+    pub unit: String,
+    /// Values of the shape parameters.
+    pub shape: Map<String, Value>,
+    /// Course, one mean per sample.
+    pub kernel: Vec<f64>,
+    /// Channel, factor, and whether the channel sees the mean of two samples.
+    pub channels: Vec<(usize, f64, bool)>,
+}
+
+/// A template that was found.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Hit {
+    /// Effect.
+    pub effect: String,
+    /// Instance.
+    pub instance: String,
+    /// Coefficient.
+    pub coefficient: String,
+    /// Unit.
+    pub unit: String,
+    /// Shape, with `at_ns`.
+    pub shape: Map<String, Value>,
+    /// Unix ns of the sample in which it begins.
+    pub at_ns: i64,
+    /// Amplitude, unit of the coefficient.
+    pub value: f64,
+    /// Its σ.
+    pub sigma: f64,
+}
+
+impl Hit {
+    /// Amplitude over σ.
+    #[must_use]
+    pub fn significance(&self) -> f64 {
+        (self.value / self.sigma).abs()
+    }
+}
+
+/// The search.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Search {
+    templates: Vec<Template>,
+    /// Residual of each channel as a combination of the base columns.
+    residual: DMatrix<f64>,
+    /// `Σ⁻¹` per band.
+    inverses: Vec<DMatrix<f64>>,
+    /// Peaks, the loudest first.
+    pub hits: Vec<Hit>,
+    /// Templates times samples that were tried.
+    pub tried: f64,
+}
+
+impl Search {
+    /// Looks for `templates` in residuals made by `residual` (channels × base columns) of noise `inverses⁻¹`.
+    #[must_use]
+    pub fn new(templates: Vec<Template>, residual: DMatrix<f64>, inverses: Vec<DMatrix<f64>>) -> Self {
+        Self { templates, residual, inverses, hits: Vec::new(), tried: 0.0 }
+    }
+
+    /// What an earlier search found.
+    #[must_use]
+    pub fn found(hits: Vec<Hit>, tried: f64) -> Self {
+        Self { hits, tried, ..Self::default() }
+    }
+
+    /// A segment of full length: spectra of the base columns.
+    pub fn segment(&mut self, plan: &Plan, first_ns: i64, base: &DMatrixView<'_, f64>) {
+        if self.templates.is_empty() || self.inverses.len() != plan.bands.len() {
+            return;
+        }
+        let n = plan.length;
+        let mut white = base * self.residual.transpose();
+        for (band, inverse) in plan.bands.iter().zip(&self.inverses) {
+            let rows = 2 * (band.first - FIRST_BIN)..2 * (band.end - FIRST_BIN);
+            let product = white.rows(rows.start, rows.len()) * inverse;
+            white.rows_mut(rows.start, rows.len()).copy_from(&product);
+        }
+        let mut planner = RealFftPlanner::<f64>::new();
+        let (forward, inverse) = (planner.plan_fft_forward(n), planner.plan_fft_inverse(n));
+        let scale = (4.0 / (plan.rate_hz * n as f64)).sqrt();
+        let mut spectrum = vec![Complex64::default(); n / 2 + 1];
+        let mut time = vec![0.0; n];
+        for template in &self.templates {
+            time.fill(0.0);
+            let course = template.kernel.len().min(n / 4);
+            time[..course].copy_from_slice(&template.kernel[..course]);
+            if forward.process(&mut time, &mut spectrum).is_err() {
+                return;
+            }
+            let mut sum = 0.0;
+            let mut band = 0;
+            for (k, t) in spectrum.iter_mut().enumerate() {
+                if k < FIRST_BIN || k >= n / 2 {
+                    *t = Complex64::default();
+                    continue;
+                }
+                while plan.bands[band].end <= k {
+                    band += 1;
+                }
+                let mean = 0.5 * (1.0 + Complex64::from_polar(1.0, -TAU * k as f64 / n as f64));
+                let answers = |averaged: bool| *t * scale * if averaged { mean } else { Complex64::from(1.0) };
+                let row = 2 * (k - FIRST_BIN);
+                let mut product = Complex64::default();
+                for (c, factor, averaged) in &template.channels {
+                    let answer = answers(*averaged) * *factor;
+                    product += answer.conj() * Complex64::new(white[(row, *c)], white[(row + 1, *c)]);
+                    for (d, other, averaged) in &template.channels {
+                        sum += (answer.conj() * answers(*averaged) * *other).re * self.inverses[band][(*c, *d)];
+                    }
+                }
+                *t = product;
+            }
+            if sum <= 0.0 || inverse.process(&mut spectrum, &mut time).is_err() {
+                continue;
+            }
+            // The middle half: segments that overlap by half cover every time once.
+            let window = |k: usize| (PI * k as f64 / n as f64).sin().powi(2);
+            // The transform sums the bins of both signs.
+            let significance = |k: usize| 0.5 * time[k] / (window(k) * sum.sqrt());
+            // Noise may be louder than Σ says. Its median does not see what happens once.
+            let mut sizes: Vec<f64> = (n / 4..3 * n / 4).map(|k| significance(k).abs()).collect();
+            let middle = sizes.len() / 2;
+            let louder = (*sizes.select_nth_unstable_by(middle, f64::total_cmp).1 / MEDIAN).max(1.0);
+            for k in n / 4..3 * n / 4 {
+                let sigma = louder * sum.sqrt().recip();
+                let value = significance(k) * sum.sqrt().recip();
+                if (value / sigma).abs() > LEAST {
+                    let at_ns = first_ns + (k as f64 * 1e9 / plan.rate_hz).round() as i64;
+                    keep(&mut self.hits, template, at_ns, value, sigma);
+                }
+            }
+        }
+        self.tried += (self.templates.len() * n / 2) as f64;
+    }
+
+    /// Adds the peaks of other data.
+    pub fn add(&mut self, other: &Self) {
+        self.hits.extend(other.hits.iter().cloned());
+        self.hits.sort_by(|a, b| b.significance().total_cmp(&a.significance()));
+        self.hits.truncate(MOST);
+        self.tried += other.tried;
+    }
+}
+
+/// Keeps a peak if no louder one is near.
+fn keep(hits: &mut Vec<Hit>, template: &Template, at_ns: i64, value: f64, sigma: f64) {
+    let significance = (value / sigma).abs();
+    let near = |h: &Hit| (h.at_ns - at_ns).abs() < (NEAR_S * 1e9) as i64;
+    if hits.iter().any(|h| near(h) && h.significance() >= significance) {
+        return;
+    }
+    if hits.len() >= MOST && hits.last().is_some_and(|h| h.significance() >= significance) {
+        return;
+    }
+    hits.retain(|h| !near(h));
+    let mut shape = template.shape.clone();
+    shape.insert("at_ns".to_owned(), at_ns.into());
+    let hit = Hit {
+        effect: template.effect.clone(),
+        instance: template.instance.clone(),
+        coefficient: template.coefficient.clone(),
+        unit: template.unit.clone(),
+        shape,
+        at_ns,
+        value,
+        sigma,
+    };
+    let place = hits.partition_point(|h| h.significance() >= significance);
+    hits.insert(place, hit);
+    hits.truncate(MOST);
+}

@@ -1,0 +1,473 @@
+//! Columns in, a record out.
+
+use std::collections::BTreeMap;
+use std::io::Write as _;
+use std::path::Path;
+
+use dragfree_critic::gather::{Columns, Gatherer, SLOW_HZ};
+use dragfree_critic::question::{Coefficient as Asked, Form, Question, Rule, Term};
+use dragfree_critic::record::Record;
+use dragfree_critic::transient::{Search, Template};
+use dragfree_critic::witness::Witnesses;
+use dragfree_estimation::estimate::{Observed, Refinement, estimate_with};
+use dragfree_estimation::segments::{Segmenter, longest_length};
+use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_estimation::spectra::Plan;
+use dragfree_estimation::stored::Stored;
+use dragfree_physics::mission::Mission;
+use dragfree_sdk::prelude::*;
+use nalgebra::DMatrix;
+
+/// Rows at the start that wait for the first value of every candidate's series, s: housekeeping may come once a minute.
+const PATIENCE_S: f64 = 120.0;
+
+/// A candidate whose series lack more of their rows is not tried.
+const MISSING: f64 = 0.01;
+
+/// Gathers sums.
+pub struct Critic {
+    mission: Mission,
+    segment_s: f64,
+    out: String,
+    reference: String,
+    threads: usize,
+    linked: Option<Linked>,
+}
+
+struct Linked {
+    columns: Vec<In>,
+    names: Vec<String>,
+    question: Question,
+    differenced: Vec<bool>,
+    base: usize,
+    segmenter: Segmenter,
+    gatherer: Gatherer,
+    rate_hz: f64,
+    /// Last value of each column.
+    held: Vec<f64>,
+    /// Rows without a value, per column, after the first ones.
+    missing: Vec<u64>,
+    rows: u64,
+    waiting: bool,
+}
+
+impl Stage for Critic {
+    const MANIFEST: Manifest = Manifest {
+        id: "critic",
+        version: env!("CARGO_PKG_VERSION"),
+        licence: "MIT OR Apache-2.0",
+        description: "Sums over channels, model, candidates and housekeeping, from which the model is criticised",
+        parameters: &[
+            Parameter::f64("segment_s", "s", 1638.4, 10.0..=100_000.0, "length of a segment"),
+            Parameter::text("out", "", &[], "file for what is gathered"),
+            Parameter::text(
+                "reference",
+                "",
+                &[],
+                "normal equations of the product (.neq.json): residuals and noise for the search of transients",
+            ),
+        ],
+        instances: &[],
+        needs: &[],
+    };
+
+    fn new(setup: &Setup) -> Result<Self, PluginError> {
+        Ok(Self {
+            mission: Mission::from_json(setup.mission_json())?,
+            segment_s: setup.f64("segment_s")?,
+            out: setup.text("out")?,
+            reference: setup.text("reference")?,
+            threads: setup.threads(),
+            linked: None,
+        })
+    }
+
+    fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
+        self.linked = Some(self.linked(available, link)?);
+        Ok(())
+    }
+
+    fn process(&mut self, input: &Inputs<'_>, _output: &mut Outputs) -> Result<(), PluginError> {
+        let linked = self.linked.as_mut().ok_or_else(before_link)?;
+        let columns: Vec<&[f64]> = linked.columns.iter().map(|c| input.f64(*c)).collect();
+        linked.push(input.time_ns(), &columns);
+        Ok(())
+    }
+
+    fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
+        let out = self.out.clone();
+        let linked = self.linked.as_mut().ok_or_else(before_link)?;
+        linked.segmenter.cut_end(&mut linked.gatherer);
+        let record = linked.record();
+        if !out.is_empty() {
+            write(Path::new(&out), &record.to_bytes())
+                .map_err(|e| PluginError::error(format!("critic: {out} cannot be written: {e}")))?;
+        }
+        let mut report = Report::default();
+        report.counts.insert("epochs_in_segments".to_owned(), linked.segmenter.state.covered);
+        Ok(report)
+    }
+
+    fn save(&self) -> Result<Vec<u8>, PluginError> {
+        Err(PluginError::error("critic: has no state to resume from; run it over the whole stretch at once"))
+    }
+
+    fn load(&mut self, _state: &[u8]) -> Result<(), PluginError> {
+        Err(PluginError::error("critic: has no state to resume from; run it over the whole stretch at once"))
+    }
+}
+
+fn before_link() -> PluginError {
+    PluginError::fatal("critic was called before it was linked; the host must link first")
+}
+
+/// Beside the place, and renamed: a kill leaves nothing that looks whole.
+fn write(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let mut file = tempfile::NamedTempFile::new_in(folder)?;
+    file.write_all(bytes)?;
+    file.persist(path)?;
+    Ok(())
+}
+
+fn name_of(channel: &Column) -> &str {
+    match channel.attribute("channel") {
+        "" => &channel.name,
+        name => name,
+    }
+}
+
+fn finite(x: f64) -> Option<f64> {
+    x.is_finite().then_some(x)
+}
+
+impl Critic {
+    fn linked(&self, available: &Available, link: &mut Link<'_>) -> Result<Linked, PluginError> {
+        let channels: Vec<&Column> = available.of_kind("channel").collect();
+        let Some(rate_hz) = channels.first().map(|c| c.rate_hz) else {
+            return Err(PluginError::error(
+                "critic finds no channel to explain: put a stage before it that makes some, such as hinf-dfacs",
+            ));
+        };
+        let differenced: Vec<bool> = channels.iter().map(|c| c.attribute("average") == "2").collect();
+        let sorted = Series::sort(available, &channels)?;
+        let housekeeping: Vec<&Column> =
+            available.columns.iter().filter(|c| c.table == "grid" && c.name.starts_with("hk.")).collect();
+        let own = channels.iter().map(|c| Want::of(c));
+        let series = sorted.keys.iter().map(|(table, name)| Want::new(name).table(table));
+        let wants = own.chain(series).chain(housekeeping.iter().map(|c| Want::of(c)));
+        let columns: Vec<In> = wants.map(|want| link.read(&want.rate_hz(rate_hz))).collect::<Result<_, _>>()?;
+        let names: Vec<String> =
+            channels.iter().map(|c| name_of(c).to_owned()).chain(sorted.keys.iter().map(|(_, n)| n.clone())).collect();
+        let all = Columns {
+            names: names.clone(),
+            channels: channels.len(),
+            base: channels.len() + sorted.base,
+            fast: channels.len() + sorted.fast,
+        };
+        let question = question(available, &channels, &sorted);
+        let length = longest_length((self.segment_s * rate_hz).round() as usize);
+        let (residual, inverses) = self.reference(&question, &channels, &all, length, rate_hz)?;
+        // As they are called in telemetry: `hk/battery_current_a`.
+        let topics = housekeeping.iter().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
+        let witnesses = Witnesses::new(topics, length, rate_hz, residual.clone());
+        let search = Search::new(templates(available, &channels, &differenced), residual, inverses);
+        let averaged: Vec<bool> = (0..columns.len())
+            .map(|i| (all.channels..names.len()).contains(&i) && differenced.iter().any(|d| *d))
+            .collect();
+        Ok(Linked {
+            held: vec![f64::NAN; columns.len()],
+            missing: vec![0; columns.len()],
+            rows: 0,
+            waiting: true,
+            segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged),
+            base: all.base,
+            gatherer: Gatherer::new(all, length, rate_hz, self.threads, witnesses, search),
+            columns,
+            names,
+            question,
+            differenced,
+            rate_hz,
+        })
+    }
+
+    /// Residuals as combinations of the base columns, and `Σ⁻¹` of all channels: from the product's own sums where they are given.
+    fn reference(
+        &self,
+        question: &Question,
+        channels: &[&Column],
+        columns: &Columns,
+        length: usize,
+        rate_hz: f64,
+    ) -> Result<(DMatrix<f64>, Vec<DMatrix<f64>>), PluginError> {
+        let n = channels.len();
+        let mut theta: Vec<f64> = question.coefficients.iter().map(|c| c.initial).collect();
+        let mut inverses = Vec::new();
+        let plan = Plan::new(length, rate_hz);
+        if !self.reference.is_empty() {
+            let refuse = |what: String| PluginError::error(format!("critic: {}: {what}", self.reference));
+            let text = std::fs::read_to_string(&self.reference).map_err(|e| refuse(e.to_string()))?;
+            let mut value: serde_json::Value = serde_json::from_str(&text).map_err(|e| refuse(e.to_string()))?;
+            let stored: Stored = serde_json::from_value(value["sums"].take()).map_err(|e| refuse(e.to_string()))?;
+            let (layout, own_plan, sums) = Stored::stack(&[stored]).map_err(|e| refuse(e.to_string()))?;
+            let model = question.model();
+            let same = layout.coefficients.iter().eq(question.coefficients[..model].iter().map(|c| &c.name));
+            if !same || own_plan.length != length {
+                return Err(refuse("belongs to another model, or to segments of another length".to_owned()));
+            }
+            let of = |name: &String| channels.iter().position(|c| name_of(c) == name);
+            let places: Vec<usize> = layout.channels.iter().filter_map(of).collect();
+            let seen: Vec<(&str, Measured)> =
+                places.iter().map(|i| (name_of(channels[*i]), measured(channels[*i]))).collect();
+            let noise = NoiseModel::new(&self.mission, &seen, 1.0 / rate_hz)?;
+            let observed = Observed { layout: &layout, plan: &own_plan, sums: &sums, prediction: None };
+            if sums.total.segments > 0 {
+                let solved = estimate_with(
+                    &observed,
+                    &noise,
+                    &question.unknowns(&[]),
+                    &question.bounds(),
+                    3,
+                    Refinement::Levels,
+                )?;
+                theta.iter_mut().zip(solved.theta.iter()).for_each(|(t, s)| *t = *s);
+                let whole: Vec<(&str, Measured)> = channels.iter().map(|c| (name_of(c), measured(c))).collect();
+                let all = NoiseModel::new(&self.mission, &whole, 1.0 / rate_hz)?;
+                for (band, inner) in plan.bands.iter().zip(&solved.inverses) {
+                    // Channels on which nothing of the model acts are no part of the product's Σ: the mission's stands for them.
+                    let sigma = all.psd(plan.frequency_hz(*band));
+                    let rest: Vec<usize> = (0..n).filter(|i| !places.contains(i)).collect();
+                    let block = DMatrix::from_fn(rest.len(), rest.len(), |i, j| sigma[(rest[i], rest[j])]);
+                    let block = block.try_inverse().unwrap_or_else(|| DMatrix::zeros(rest.len(), rest.len()));
+                    let mut inverse = DMatrix::zeros(n, n);
+                    places.iter().enumerate().for_each(|(i, a)| {
+                        places.iter().enumerate().for_each(|(j, b)| inverse[(*a, *b)] = inner[(i, j)]);
+                    });
+                    rest.iter().enumerate().for_each(|(i, a)| {
+                        rest.iter().enumerate().for_each(|(j, b)| inverse[(*a, *b)] = block[(i, j)]);
+                    });
+                    inverses.push(inverse);
+                }
+            }
+        }
+        let mut residual = DMatrix::zeros(n, columns.base);
+        (0..n).for_each(|c| residual[(c, c)] = 1.0);
+        for (i, c) in question.coefficients[..question.model()].iter().enumerate() {
+            for t in &c.forms[0].terms {
+                residual[(t.channel, t.column)] -= theta[i] * t.factor * t.times.map_or(1.0, |other| theta[other]);
+            }
+        }
+        Ok((residual, inverses))
+    }
+}
+
+fn measured(channel: &Column) -> Measured {
+    if channel.attribute("average") == "1" { Measured::Directly } else { Measured::Differenced }
+}
+
+/// The series behind the channels, sorted as the sums want them.
+struct Series {
+    /// Table and name: of the model, of candidates, slow ones of candidates.
+    keys: Vec<(String, String)>,
+    base: usize,
+    fast: usize,
+    /// How each coefficient acts, by its name, where it is not by variants.
+    responses: BTreeMap<String, Vec<Response>>,
+}
+
+impl Series {
+    fn sort(available: &Available, channels: &[&Column]) -> Result<Self, PluginError> {
+        let mut responses: BTreeMap<String, Vec<Response>> = BTreeMap::new();
+        for (c, r) in available.responses()? {
+            responses.entry(c.name.clone()).or_default().push(r);
+        }
+        let exists = |r: &&Response| channels.iter().any(|c| name_of(c) == r.channel);
+        let slow = |r: &Response| {
+            let column = available.column(&r.table, &r.series);
+            column.is_some_and(|c| c.attribute("below_hz").parse::<f64>().is_ok_and(|hz| hz <= SLOW_HZ))
+        };
+        let mut keys: Vec<(String, String)> = Vec::new();
+        let mut seen = std::collections::HashSet::new();
+        let mut counts = [0; 2];
+        for part in 0..3 {
+            for c in &available.coefficients {
+                let own = responses.get(&c.name).into_iter().flatten();
+                for r in own.chain(c.variants.iter().flat_map(|v| &v.responses)).filter(exists) {
+                    let wanted = match part {
+                        0 => !c.candidate,
+                        1 => c.candidate && !slow(r),
+                        _ => c.candidate,
+                    };
+                    let key = (r.table.clone(), r.series.clone());
+                    if wanted && seen.insert(key.clone()) {
+                        keys.push(key);
+                    }
+                }
+            }
+            if part < 2 {
+                counts[part] = keys.len();
+            }
+        }
+        Ok(Self { keys, base: counts[0], fast: counts[1], responses })
+    }
+}
+
+fn question(available: &Available, channels: &[&Column], series: &Series) -> Question {
+    let column: BTreeMap<(&str, &str), usize> =
+        series.keys.iter().enumerate().map(|(i, (t, n))| ((t.as_str(), n.as_str()), channels.len() + i)).collect();
+    let coefficient = |name: &String| available.coefficients.iter().position(|c| !c.candidate && c.name == *name);
+    let terms = |responses: &[Response]| -> Vec<Term> {
+        let term = |r: &Response| {
+            let times = match &r.times {
+                Some(other) => Some(coefficient(other)?),
+                None => None,
+            };
+            Some(Term {
+                channel: channels.iter().position(|c| name_of(c) == r.channel)?,
+                column: *column.get(&(r.table.as_str(), r.series.as_str()))?,
+                factor: r.factor,
+                times,
+            })
+        };
+        // What acts through a coefficient that the model lacks does not act.
+        responses.iter().filter_map(term).collect()
+    };
+    let asked = |c: &Coefficient| {
+        let form = |shape: &Shape, responses: &[Response], unit: Option<&String>, range: Option<[f64; 2]>| Form {
+            shape: shape.iter().map(|(k, v)| (k.clone(), v.clone())).collect(),
+            unit: unit.unwrap_or(&c.unit).clone(),
+            lower: finite(range.map_or(c.lower, |r| r[0])),
+            upper: finite(range.map_or(c.upper, |r| r[1])),
+            terms: terms(responses),
+        };
+        let forms = if !c.variants.is_empty() {
+            c.variants.iter().map(|v| form(&v.shape, &v.responses, v.unit.as_ref(), v.range)).collect()
+        } else {
+            match series.responses.get(&c.name) {
+                Some(responses) => vec![form(&c.shape, responses, None, None)],
+                None if c.candidate => Vec::new(),
+                None => vec![form(&c.shape, &[], None, None)],
+            }
+        };
+        Asked {
+            name: c.name.clone(),
+            effect: c.effect.clone(),
+            instance: c.instance.clone(),
+            initial: c.initial,
+            prior_sigma: finite(c.prior_sigma),
+            estimate: c.estimate,
+            candidate: c.candidate,
+            forms,
+            noise: c.noise.clone(),
+        }
+    };
+    let rule = |r: &Constraint| Rule {
+        name: r.name.clone(),
+        survey: r.kind == "survey",
+        terms: r.terms.iter().filter_map(|(name, weight)| Some((coefficient(name)?, *weight))).collect(),
+        lower: finite(r.lower),
+        upper: finite(r.upper),
+    };
+    Question {
+        channels: channels.iter().map(|c| name_of(c).to_owned()).collect(),
+        coefficients: available.coefficients.iter().map(asked).collect(),
+        rules: available.constraints.iter().map(rule).collect(),
+    }
+}
+
+fn templates(available: &Available, channels: &[&Column], differenced: &[bool]) -> Vec<Template> {
+    let mut out = Vec::new();
+    for c in available.coefficients.iter().filter(|c| c.candidate) {
+        for t in &c.transients {
+            let at = |(name, factor): &(String, f64)| {
+                let channel = channels.iter().position(|c| name_of(c) == name)?;
+                Some((channel, *factor, differenced[channel]))
+            };
+            let channels: Vec<(usize, f64, bool)> = t.channels.iter().filter_map(at).collect();
+            if !channels.is_empty() && !t.kernel.is_empty() {
+                out.push(Template {
+                    effect: c.effect.clone(),
+                    instance: c.instance.clone(),
+                    coefficient: c.name.clone(),
+                    unit: c.unit.clone(),
+                    shape: t.shape.iter().map(|(k, v)| (k.clone(), v.clone())).collect(),
+                    kernel: t.kernel.clone(),
+                    channels,
+                });
+            }
+        }
+    }
+    out
+}
+
+impl Linked {
+    fn push(&mut self, time_ns: &[i64], columns: &[&[f64]]) {
+        let mut filled: Vec<Vec<f64>> = Vec::with_capacity(columns.len() - self.base);
+        for (j, column) in columns.iter().enumerate().skip(self.base) {
+            let mut held = self.held[j];
+            let mut missing = 0;
+            filled.push(
+                column
+                    .iter()
+                    .map(|x| {
+                        if x.is_finite() {
+                            held = *x;
+                        } else {
+                            missing += 1;
+                        }
+                        held
+                    })
+                    .collect(),
+            );
+            self.held[j] = held;
+            if !self.waiting {
+                self.missing[j] += missing;
+            }
+        }
+        let mut first = columns.first().map_or_else(Vec::new, |c| c.to_vec());
+        if self.waiting {
+            let patience = ((PATIENCE_S * self.rate_hz) as u64).saturating_sub(self.rows) as usize;
+            let lacks = |k: usize| filled.iter().any(|c| c[k].is_nan());
+            let wait = (0..time_ns.len()).take_while(|k| *k < patience && lacks(*k)).count();
+            first[..wait].fill(f64::NAN);
+            self.waiting = wait == time_ns.len();
+        }
+        // Whoever has no value by now has none at all, and stays at zero.
+        filled.iter_mut().flatten().filter(|x| x.is_nan()).for_each(|x| *x = 0.0);
+        self.rows += time_ns.len() as u64;
+        let all: Vec<&[f64]> = std::iter::once(first.as_slice())
+            .chain(columns[1..self.base].iter().copied())
+            .chain(filled.iter().map(Vec::as_slice))
+            .collect();
+        self.segmenter.cut(time_ns, &all, &mut self.gatherer);
+    }
+
+    /// What was gathered; candidates whose series have gaps are left out, with the reason.
+    fn record(&self) -> Record {
+        let mut question = self.question.clone();
+        let mut not_tried = Vec::new();
+        let gappy = |column: usize| {
+            self.missing[column] as f64 > MISSING * self.rows.max(1) as f64 || self.held[column].is_nan()
+        };
+        let model = question.model();
+        for c in &mut question.coefficients[model..] {
+            let before = c.forms.len();
+            let mut culprit = None;
+            c.forms.retain(|f| {
+                let bad = f.terms.iter().find(|t| t.column >= self.base && gappy(t.column));
+                culprit = bad.map(|t| t.column).or(culprit);
+                bad.is_none()
+            });
+            if let (true, Some(column)) = (before > 0 && c.forms.is_empty(), culprit) {
+                not_tried.push((
+                    format!("{}:{}", c.effect, c.instance),
+                    format!(
+                        "{} has no value in {} of {} epochs: what it is made of has gaps",
+                        self.names[column], self.missing[column], self.rows
+                    ),
+                ));
+            }
+        }
+        Record { question, differenced: self.differenced.clone(), gathered: self.gatherer.gathered.clone(), not_tried }
+    }
+}
