@@ -181,7 +181,7 @@ fn child(validate: &Validate, check: &str) -> Result<Done, Failure> {
     let mission = mission(validate.mission.as_deref())?;
     let parameters = validate.set.iter().map(|text| parameter(text)).collect::<Result<toml::Table, Failure>>()?;
     let subject =
-        Subject { library: &library, plugin, mission: &mission, parameters: &parameters, files: &validate.file };
+        Subject { opened: &library, plugin, mission: &mission, parameters: &parameters, files: &validate.file };
     Ok(told(&to_json(&subject.run(check))))
 }
 

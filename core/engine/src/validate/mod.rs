@@ -101,7 +101,7 @@ pub enum Finding {
 #[derive(Debug)]
 pub struct Subject<'a> {
     /// Its library.
-    pub library: &'a Library,
+    pub opened: &'a Library,
     /// Which of the library's plugins.
     pub plugin: &'a PluginInfo,
     /// The mission.
@@ -162,7 +162,7 @@ impl Subject<'_> {
             "start_ns": stand::START_NS,
             "end_ns": stand::START_NS + EPOCHS as i64 * self.step_ns(),
         });
-        Ok(crate::border::Instance::create(self.library, self.plugin, &Config { value })?)
+        Ok(crate::border::Instance::create(self.opened, self.plugin, &Config { value })?)
     }
 
     /// Interval of the mission's epochs, ns.
