@@ -120,12 +120,10 @@ pub struct Unexplained {
     pub channels: Vec<String>,
     /// Lowest and highest frequency of it, Hz.
     pub band_hz: [f64; 2],
-    /// `line`, `broadband`, `transient` or `drift`.
+    /// `broadband`, `transient` or `drift`.
     pub kind: String,
     /// Measured over modelled power, at its worst.
     pub ratio: f64,
-    /// Start of the hours in which it is loud, Unix ns.
-    pub hours_ns: Vec<i64>,
     /// Housekeeping that is coherent with it, the most coherent first.
     pub coherent_with: Vec<String>,
     /// The same with numbers.
@@ -509,7 +507,6 @@ fn unexplained(court: &Court<'_>, levels: &Levels<'_>, measured: &[nalgebra::DMa
         band_hz,
         kind: kind.to_owned(),
         ratio,
-        hours_ns: Vec::new(),
         coherent_with,
         witnesses: significant.into_iter().take(20).collect(),
     })
