@@ -61,10 +61,10 @@ const SLOWEST_RAD_S: f64 = 2e-2;
 const LARGEST_DELAY_ANGLE: f64 = 0.5;
 /// Samples of delay that the synthesis models one by one; a longer delay is an all-pass of this order.
 const MOST_DELAY_STATES: u32 = 3;
-/// The controller is the central one at `min(BACK_OFF γ, √γ)` of the optimal γ, not at the optimum itself, where it would
-/// trade everything else for the last per cent. Where the roots of that controller are too close to be sampled to full
-/// precision, and the norm of what would fly shows it, the next one is taken.
-const BACK_OFF: [f64; 4] = [1.1, 1.2, 1.5, 2.0];
+/// The controller is the central one at `min(factor γ, γ^exponent)` of the optimal γ, not at the optimum itself, where it
+/// would trade everything else for the last per cent. Where the roots of that controller are too close to be sampled to full
+/// precision, and the norm of what would fly shows it, the next one is taken; each stays below one where γ does.
+const BACK_OFF: [(f64, f64); 4] = [(1.1, 0.5), (1.2, 0.25), (1.5, 0.1), (2.0, 0.05)];
 /// The norm of the sampled controller may lie above that of the synthesis by this factor: rounding of its roots.
 const SAMPLED_AS_PROVED: f64 = 1.01;
 /// Relative tolerance of γ.
@@ -705,8 +705,8 @@ struct Flown {
 
 /// The central controller nearest to the optimum whose samples keep what was proved, or else the best.
 fn sample(problem: &Problem, synthesis: &Synthesis, gamma: f64) -> Result<Flown, HinfError> {
-    let attempt = |factor: f64| {
-        let bound = if gamma < 1.0 { (factor * gamma).min(gamma.sqrt()) } else { factor * gamma };
+    let attempt = |(factor, exponent): (f64, f64)| {
+        let bound = if gamma < 1.0 { (factor * gamma).min(gamma.powf(exponent)) } else { factor * gamma };
         let central = synthesis.controller(bound)?;
         let controller = problem.sampled(&central)?;
         let closed = problem.flown(&controller)?;
@@ -714,11 +714,11 @@ fn sample(problem: &Problem, synthesis: &Synthesis, gamma: f64) -> Result<Flown,
         Ok::<_, HinfError>((gamma_flown / bound, Flown { central, controller, closed, gamma_flown }))
     };
     let mut best = attempt(BACK_OFF[0])?;
-    for factor in &BACK_OFF[1..] {
+    for back_off in &BACK_OFF[1..] {
         if best.0 <= SAMPLED_AS_PROVED {
             break;
         }
-        let next = attempt(*factor)?;
+        let next = attempt(*back_off)?;
         if next.0 < best.0 {
             best = next;
         }
@@ -1230,7 +1230,10 @@ pub(crate) mod tests {
                     Ok(c) => {
                         assert_kept(&c, "random mission");
                         if let Some(band) = c.unattainable {
-                            proptest::prop_assert!(band.best_ratio > 0.5 * LARGEST_SHARE, "{}", band);
+                            // What W_1 and the capped W_3 promise there, and that nothing else than readout noise is the cause.
+                            let readout = c.model.readout_ratio(band.worst_hz);
+                            let promised = 1.0_f64.hypot(readout / LARGEST_SHARE);
+                            proptest::prop_assert!(readout > LARGEST_SHARE && band.predicted_ratio < promised, "{}", band);
                         }
                         proptest::prop_assert!(c.modulus_margin > 0.3, "{}: {}", name, c.modulus_margin);
                     }
