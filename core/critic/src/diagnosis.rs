@@ -2,11 +2,13 @@
 
 use dragfree_estimation::estimate::EstimateError;
 use dragfree_estimation::levels::{Level, Levels};
+use dragfree_estimation::spectra::FIRST_BIN;
 use dragfree_estimation::verdict::{chi2_per_dof_at, chi2_quantile};
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 
+use crate::gather::LONG;
 use crate::rank::{Court, Fit, Scored};
 use crate::transient::Hit;
 use crate::witness::Coherence;
@@ -16,6 +18,9 @@ pub const FALSE_ALARM: f64 = 0.01;
 
 /// A mission file knows its noise to this: a level within it is none that is missing.
 const LEVEL_TOLERANCE: f64 = 0.15;
+
+/// A cause whose halves differ so that chance gives it more rarely is none: what is true at one time is true at another.
+const HALVES_DIFFER: f64 = 1e-3;
 
 /// Rounds of adding the best effect.
 const MOST_ADDED: usize = 4;
@@ -78,8 +83,10 @@ pub struct Found {
     pub delta_bic: f64,
     /// Whether the value lies inside its physical range.
     pub in_range: bool,
-    /// Whether it explains each half of the data with the value of the other; none where there is one half.
+    /// By how much χ² of each half of the data falls with the value that the other gives; none where there is one half.
     pub held_out_delta_chi2: Option<[f64; 2]>,
+    /// Chance that the halves' values differ as much if both are right; none where there is one half.
+    pub held_out_p_value: Option<f64>,
     /// χ²/dof without it, under the noise that is left with it.
     pub chi2_per_dof_before: f64,
     /// χ²/dof with it.
@@ -197,10 +204,8 @@ fn corrected(p: f64, tried: usize) -> f64 {
 /// # Errors
 /// [`DiagnosisError`]: too little data, or a model that cannot be fitted.
 pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
-    // The lowest band is seen by segments of full length alone, one observation each.
-    let bins = court.plan().bands.first().map_or(1, |b| b.bins()) as f64;
-    let segments = court.total.weights.observations(court.plan()).first().map_or(0.0, |n| n / bins);
     let segment_s = court.gathered.length as f64 / court.gathered.rate_hz;
+    let segments = short_segments(court);
     if segments < LEAST_SEGMENTS {
         return Err(DiagnosisError::TooShort { segments, segment_s });
     }
@@ -215,7 +220,7 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
         }
         let weighed: Vec<Found> =
             ranked.iter().take(LISTED).map(|scored| weigh(court, &fit, scored, &ranked, tried)).collect();
-        let helps = |f: &Found| f.held_out_delta_chi2.is_none_or(|h| h.iter().sum::<f64>() > 0.0);
+        let helps = |f: &Found| f.held_out_p_value.is_none_or(|p| p > HALVES_DIFFER);
         let good = |f: &Found| f.p_value < FALSE_ALARM && f.in_range && helps(f);
         let best = weighed.iter().position(good).filter(|_| found.len() < MOST_ADDED);
         match best {
@@ -249,7 +254,7 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
     candidates.extend(found);
     candidates.extend(extra.into_iter().filter(|f| !f.accepted));
 
-    let unexplained = unexplained(court, &levels, &measured);
+    let unexplained = unexplained(court, &levels);
     let verdict = match (missing, &unexplained) {
         (true, _) => "missing",
         (false, Some(_)) => "unexplained",
@@ -267,6 +272,14 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
     })
 }
 
+/// Independent short segments that would know as much of the lowest band of short segments.
+fn short_segments(court: &Court<'_>) -> f64 {
+    let plan = court.plan();
+    let observations = court.total.weights.observations(plan);
+    let lowest = plan.bands.iter().position(|b| b.first >= LONG * FIRST_BIN);
+    lowest.map_or(0.0, |b| observations[b] * LONG as f64 / plan.bands[b].bins() as f64)
+}
+
 /// A candidate as it stands beside a fit.
 fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], tried: usize) -> Found {
     let parts = &scored.candidate.parts;
@@ -276,6 +289,7 @@ fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], tried
     let name = |j: usize| court.question.coefficients[parts[j].0].name.clone();
     let lead = leading(&values);
     let dof = parts.len() as f64;
+    let halves = court.held_out(fit, &scored.candidate);
     let quality = &fit.estimate.quality;
     let (mut offset_shift_m, mut offset_shift_sigma) = (BTreeMap::new(), BTreeMap::new());
     for (k, i) in fit.estimate.free.iter().enumerate() {
@@ -305,7 +319,8 @@ fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], tried
         p_value: corrected(tail(scored.delta_chi2, dof), tried),
         delta_bic: dof * quality.dof.ln() - scored.delta_chi2,
         in_range: scored.in_range,
-        held_out_delta_chi2: court.held_out(fit, &scored.candidate),
+        held_out_delta_chi2: halves.map(|h| h.gains),
+        held_out_p_value: halves.map(|h| tail(h.difference_chi2, dof)),
         chi2_per_dof_before: quality.chi2_per_dof,
         chi2_per_dof_after: quality.chi2_per_dof - scored.delta_chi2 / quality.dof,
         offset_shift_m,
@@ -377,6 +392,7 @@ fn noise_levels(court: &Court<'_>, levels: &mut Levels<'_>, tried: &mut usize) -
             delta_bic: (court.total.weights.segments as f64).ln() - level.delta_chi2,
             in_range: true,
             held_out_delta_chi2: None,
+            held_out_p_value: None,
             chi2_per_dof_before: f64::NAN,
             chi2_per_dof_after: f64::NAN,
             offset_shift_m: BTreeMap::new(),
@@ -421,6 +437,7 @@ fn transients(court: &Court<'_>, tried: &mut usize, out: &mut Vec<Found>) -> Vec
             delta_bic: f64::NAN,
             in_range: true,
             held_out_delta_chi2: None,
+            held_out_p_value: None,
             chi2_per_dof_before: f64::NAN,
             chi2_per_dof_after: f64::NAN,
             offset_shift_m: BTreeMap::new(),
@@ -458,26 +475,16 @@ fn limits(court: &Court<'_>, rest: &[Scored], named: &[Found]) -> Vec<Limit> {
 }
 
 /// Power beyond the modelled noise, channel by channel in thirds of a decade, and what is coherent with it.
-fn unexplained(court: &Court<'_>, levels: &Levels<'_>, measured: &[nalgebra::DMatrix<f64>]) -> Option<Unexplained> {
+fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
     let plan = court.plan();
-    let observations = court.total.weights.observations(plan);
     let channels = &court.question.channels;
     let mut loud: Vec<(usize, [f64; 2], f64)> = Vec::new();
-    for c in 0..channels.len() {
-        let mut first = 0;
-        while first < plan.bands.len() {
-            let limit = plan.bands[first].first as f64 * 10.0f64.powf(1.0 / 3.0);
-            let end = first + plan.bands[first..].iter().take_while(|b| (b.first as f64) < limit).count();
-            let n: f64 = observations[first..end].iter().sum();
-            let weighed = |b: usize| observations[b] * measured[b][(c, c)] / levels.modelled()[b][(c, c)];
-            let ratio = (first..end).map(weighed).sum::<f64>() / n.max(f64::MIN_POSITIVE);
-            let certain = chi2_per_dof_at(2.0 * n, 5.0);
-            if n > 3.0 && ratio > certain.max(EXCESS) {
-                let hz = |b: usize| plan.frequency_hz(plan.bands[b]);
-                loud.push((c, [hz(first), hz(end - 1)], ratio));
-            }
-            first = end;
-        }
+    for (bands, n, ratios) in levels.excesses() {
+        let hz = |b: usize| plan.frequency_hz(plan.bands[b]);
+        let certain = chi2_per_dof_at(2.0 * n, 5.0);
+        let above = |(_, ratio): &(usize, f64)| n > 3.0 && *ratio > certain.max(EXCESS);
+        let found = ratios.into_iter().enumerate().filter(above);
+        loud.extend(found.map(|(c, ratio)| (c, [hz(bands.start), hz(bands.end - 1)], ratio)));
     }
     // Every driver with every channel is a trial.
     let all = court.gathered.witnesses.coherences(channels);

@@ -1,22 +1,37 @@
 //! Sums over everything that might explain the data: channels, the model's series and those of every candidate, cut once.
 //!
 //! Per band the Gram matrix `Σ Re(x* xᵀ)` of all columns, by matrix products, so that any model made of them is solved and ranked
-//! without reading the data again. Series that are slow by their nature stand last and are left out above [`SLOW_HZ`]. What the
-//! data of every second stretch of an hour and a half say is kept apart from the rest: a cause must help in both.
+//! without reading the data again. What the data of every second stretch of time say is kept apart from the rest: a cause must help
+//! in both.
+//!
+//! Time is cut twice. Segments of one length serve the bands from [`SLOW_HZ`] on; segments [`LONG`] times as long, of samples that
+//! [`crate::decimate`] has thinned out, serve those below, where heat, charge and drifts act and where a short segment sees nothing
+//! under its window's main lobe. Series that are slow by their nature stand last and are in the long segments alone.
 
 use std::ops::Range;
 
-use dragfree_estimation::segments::Cuts;
+use dragfree_estimation::segments::{Cuts, Segmenter};
 use dragfree_estimation::spectra::{FIRST_BIN, Plan, Spectra, Transformer, triangle};
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DMatrixView};
 
-use crate::transient::Search;
+use crate::decimate::{Decimator, Response};
+use crate::transient::{Search, Transients};
 use crate::witness::Witnesses;
 
 /// Slow series have nothing above this.
 pub const SLOW_HZ: f64 = 0.05;
 
-/// Stretches of this length go to the first and the second set in turn, s.
+/// Long segments are so many times as long as the short ones.
+pub const LONG: usize = 16;
+
+/// Halvings of a long segment that make a short one.
+const HALVINGS: usize = LONG.ilog2() as usize;
+
+/// Thinned samples come at least this many times as often as [`SLOW_HZ`]: what folds there is then weaker by 1e7.
+const THIN: f64 = 6.0;
+
+/// Stretches of this length go to the first and the second set in turn, s: three hours, the least that a diagnosis is asked of,
+/// have one of each, and the middles of long segments that follow each other lie in different ones more often than not.
 const STRETCH_S: f64 = 1.5 * 3600.0;
 
 /// The map of where the model fails has one row for this time, ns.
@@ -92,18 +107,18 @@ pub struct Hour {
 pub struct Gathered {
     /// What the columns are.
     pub columns: Columns,
-    /// Samples of a segment, samples per second.
+    /// Samples of a short segment.
     pub length: usize,
     /// Samples per second.
     pub rate_hz: f64,
     /// Sums of the first and the second set of stretches.
     pub sets: [Gram; 2],
-    /// The base columns hour by hour.
+    /// The base columns hour by hour, in the bands of short segments ([`Self::hour_plan`]).
     pub hours: Vec<Hour>,
     /// Housekeeping against the residuals.
     pub witnesses: Witnesses,
     /// The loudest transients.
-    pub transients: Search,
+    pub transients: Transients,
 }
 
 impl Gathered {
@@ -115,58 +130,57 @@ impl Gathered {
         total
     }
 
-    /// The plan of its bands.
+    /// The plan of the bands of the sums.
     #[must_use]
     pub fn plan(&self) -> Plan {
+        Plan::new(LONG * self.length, self.rate_hz)
+    }
+
+    /// The plan of the bands of the hours.
+    #[must_use]
+    pub fn hour_plan(&self) -> Plan {
         Plan::new(self.length, self.rate_hz)
     }
 }
 
 /// Gathers segments.
 pub struct Gatherer {
+    /// Bands of the sums.
     plan: Plan,
-    threads: usize,
-    transformers: Vec<Transformer>,
-    /// Real and imaginary parts from the first bin, a column of the matrix per column of the data.
-    spectra: DMatrix<f64>,
+    /// Bands below [`SLOW_HZ`].
+    low_bands: usize,
+    short: Plan,
+    bench: Bench,
+    search: Search,
+    decimator: Decimator,
+    segmenter: Segmenter,
+    long: Plan,
+    long_bench: Bench,
     /// What has been gathered.
     pub gathered: Gathered,
 }
 
-impl Gatherer {
-    /// A gatherer of segments of `length` samples.
-    #[must_use]
-    pub fn new(
-        columns: Columns,
-        length: usize,
-        rate_hz: f64,
-        threads: usize,
-        witnesses: Witnesses,
-        transients: Search,
-    ) -> Self {
-        let plan = Plan::new(length, rate_hz);
-        let gram = Gram::zero(&columns, &plan);
+/// Samples into spectra into sums.
+struct Bench {
+    threads: usize,
+    transformers: Vec<Transformer>,
+    /// Real and imaginary parts from the first bin, a column of the matrix per column of the data.
+    spectra: DMatrix<f64>,
+}
+
+impl Bench {
+    fn new(plan: &Plan, columns: usize, threads: usize) -> Self {
         Self {
-            transformers: (0..threads.max(1)).map(|_| Transformer::new(&plan)).collect(),
-            spectra: DMatrix::zeros(2 * (length / 2 - FIRST_BIN), columns.names.len()),
-            gathered: Gathered {
-                length,
-                rate_hz,
-                sets: [gram.clone(), gram],
-                hours: Vec::new(),
-                witnesses,
-                transients,
-                columns,
-            },
-            threads: threads.max(1),
-            plan,
+            threads,
+            transformers: (0..threads).map(|_| Transformer::new(plan)).collect(),
+            spectra: DMatrix::zeros(2 * (plan.length / 2 - FIRST_BIN), columns),
         }
     }
 
-    fn transform(&mut self, taper: usize, columns: &[&[f64]]) {
+    fn transform(&mut self, plan: &Plan, taper: usize, columns: &[&[f64]]) {
         let rows = self.spectra.nrows();
         let each = columns.len().div_ceil(self.threads);
-        let (plan, spectra) = (&self.plan, self.spectra.as_mut_slice());
+        let spectra = self.spectra.as_mut_slice();
         std::thread::scope(|scope| {
             let parts = spectra.chunks_mut(each * rows).zip(columns.chunks(each)).zip(&mut self.transformers);
             for ((out, columns), transformer) in parts {
@@ -180,14 +194,12 @@ impl Gatherer {
     }
 
     /// `G_b += A_bᵀ A_b` in every band, the bands shared among the threads by the work in them.
-    fn multiply(&mut self, taper: usize, set: usize) {
-        let bins = self.plan.bins(taper);
+    fn multiply(&self, bins: &[Range<usize>], grams: &mut [DMatrix<f64>]) {
         let spectra = &self.spectra;
-        let grams = &mut self.gathered.sets[set].bands;
         let work = |g: &DMatrix<f64>, bins: &Range<usize>| g.len() * bins.len();
         let total: usize = grams.iter().zip(bins).map(|(g, b)| work(g, b)).sum();
         std::thread::scope(|scope| {
-            let mut rest = grams.as_mut_slice();
+            let mut rest = grams;
             let mut first = 0;
             for thread in 0..self.threads {
                 let mut taken = 0;
@@ -196,7 +208,7 @@ impl Gatherer {
                     taken += work(&rest[count], &bins[first + count]);
                     count += 1;
                 }
-                let (mine, others) = rest.split_at_mut(count);
+                let (mine, others) = std::mem::take(&mut rest).split_at_mut(count);
                 let bins = &bins[first..first + count];
                 (rest, first) = (others, first + count);
                 scope.spawn(move || {
@@ -209,20 +221,71 @@ impl Gatherer {
         });
     }
 
+    fn base(&self, columns: usize) -> DMatrixView<'_, f64> {
+        self.spectra.columns(0, columns)
+    }
+}
+
+impl Gatherer {
+    /// A gatherer of short segments of `length` samples. `residual` (channels × base columns) makes residuals, `inverse` is `Σ⁻¹` at a
+    /// frequency in Hz: with both the witnesses are heard.
+    #[must_use]
+    pub fn new(
+        columns: Columns,
+        length: usize,
+        rate_hz: f64,
+        threads: usize,
+        housekeeping: Vec<String>,
+        residual: DMatrix<f64>,
+        inverse: impl Fn(f64) -> DMatrix<f64>,
+        search: Search,
+    ) -> Self {
+        let threads = threads.max(1);
+        let (plan, short) = (Plan::new(LONG * length, rate_hz), Plan::new(length, rate_hz));
+        let (long, factor) = low_plan(length, rate_hz);
+        let slow = |b: usize| plan.bin_hz(plan.bands[b].end as f64) <= SLOW_HZ;
+        let low_bands = (0..plan.bands.len().min(long.bands.len())).take_while(|b| slow(*b)).count();
+        let decimator =
+            Decimator::new(factor, columns.names.len() + housekeeping.len(), (1e9 / rate_hz).round() as i64);
+        let whitening = long.bands.iter().map(|b| inverse(long.frequency_hz(*b))).collect();
+        let all = vec![false; columns.names.len() + housekeeping.len()];
+        let gram = Gram::zero(&columns, &plan);
+        Self {
+            low_bands,
+            bench: Bench::new(&short, columns.fast, threads),
+            search,
+            segmenter: Segmenter::new(long.length, decimator.step_ns(), all),
+            decimator,
+            long_bench: Bench::new(&long, columns.names.len(), threads),
+            gathered: Gathered {
+                length,
+                rate_hz,
+                sets: [gram.clone(), gram],
+                hours: Vec::new(),
+                witnesses: Witnesses::new(housekeeping, &long, residual, whitening),
+                transients: Transients::default(),
+                columns,
+            },
+            plan,
+            short,
+            long,
+        }
+    }
+
     fn hour(&mut self, taper: usize, middle_ns: i64) {
         let start_ns = middle_ns.div_euclid(HOUR_NS) * HOUR_NS;
         let base = self.gathered.columns.base;
         if self.gathered.hours.last().is_none_or(|h| h.start_ns != start_ns) {
-            self.gathered.hours.push(Hour { start_ns, spectra: Spectra::zero(self.plan.bands.len(), base) });
+            self.gathered.hours.push(Hour { start_ns, spectra: Spectra::zero(self.short.bands.len(), base) });
         }
         let Some(hour) = self.gathered.hours.last_mut() else { return };
-        hour.spectra.count_segment(&self.plan, taper, false);
+        hour.spectra.count_segment(&self.short, taper, false);
         let mut entries = hour.spectra.packed.iter_mut();
-        for bins in self.plan.bins(taper) {
+        for bins in self.short.bins(taper) {
             for i in 0..base {
                 for j in 0..=i {
                     let rows = (2 * (bins.start - FIRST_BIN), 2 * bins.len());
-                    let [a, b] = [i, j].map(|c| self.spectra.view((rows.0, c), (rows.1, 1)));
+                    let [a, b] = [i, j].map(|c| self.bench.spectra.view((rows.0, c), (rows.1, 1)));
                     if let Some(entry) = entries.next() {
                         *entry += a.dot(&b);
                     }
@@ -230,27 +293,108 @@ impl Gatherer {
             }
         }
     }
+
+    /// The thinned samples, and whoever takes their segments.
+    fn low(&mut self) -> (&mut Decimator, &mut Segmenter, Low<'_>) {
+        let low = Low {
+            response: self.decimator.response(),
+            rate_hz: self.short.rate_hz,
+            plan: &self.plan,
+            low_bands: self.low_bands,
+            long: &self.long,
+            bench: &mut self.long_bench,
+            gathered: &mut self.gathered,
+        };
+        (&mut self.decimator, &mut self.segmenter, low)
+    }
+}
+
+/// The plan of long segments of thinned samples, and how many samples one of them stands for.
+pub(crate) fn low_plan(length: usize, rate_hz: f64) -> (Plan, usize) {
+    let mut factor = 1;
+    while (LONG * length).is_multiple_of(8 * factor) && rate_hz / (2 * factor) as f64 >= THIN * SLOW_HZ {
+        factor *= 2;
+    }
+    (Plan::new(LONG * length / factor, rate_hz / factor as f64), factor)
+}
+
+/// Which set a segment belongs to.
+fn set_of(middle_ns: i64) -> usize {
+    middle_ns.div_euclid((STRETCH_S * 1e9) as i64).rem_euclid(2) as usize
+}
+
+fn middle_ns(first_ns: i64, columns: &[&[f64]], rate_hz: f64) -> i64 {
+    let samples = columns.first().map_or(0, |c| c.len());
+    first_ns + (0.5e9 * samples as f64 / rate_hz) as i64
 }
 
 impl Cuts for Gatherer {
     fn plan(&self) -> &Plan {
-        &self.plan
+        &self.short
+    }
+
+    fn segment(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
+        let columns = &columns[..self.gathered.columns.fast];
+        let middle_ns = middle_ns(first_ns, columns, self.short.rate_hz);
+        let set = &mut self.gathered.sets[set_of(middle_ns)];
+        let bands = self.low_bands..self.plan.bands.len();
+        self.bench.transform(&self.short, taper, columns);
+        self.bench.multiply(&self.plan.bins(taper + HALVINGS)[bands.clone()], &mut set.bands[bands.clone()]);
+        set.weights.count_bands(&self.plan, taper + HALVINGS, overlaps, bands);
+        set.weights.segments += 1;
+        self.hour(taper, middle_ns);
+        if taper == 0 {
+            let base = self.bench.base(self.gathered.columns.base);
+            self.search.segment(&self.short, first_ns, &base, &mut self.gathered.transients);
+        }
+    }
+
+    fn samples(&mut self, first_ns: i64, columns: &[&[f64]]) {
+        let (decimator, segmenter, mut low) = self.low();
+        let (times, thinned) = decimator.push(first_ns, columns);
+        let thinned: Vec<&[f64]> = thinned.iter().map(Vec::as_slice).collect();
+        segmenter.cut(&times, &thinned, &mut low);
+    }
+
+    fn gap(&mut self) {
+        let (decimator, segmenter, mut low) = self.low();
+        decimator.gap();
+        segmenter.cut_end(&mut low);
+    }
+}
+
+/// Takes the long segments.
+struct Low<'a> {
+    /// Of the decimator.
+    response: Response,
+    /// Samples per second before it.
+    rate_hz: f64,
+    plan: &'a Plan,
+    low_bands: usize,
+    long: &'a Plan,
+    bench: &'a mut Bench,
+    gathered: &'a mut Gathered,
+}
+
+impl Cuts for Low<'_> {
+    fn plan(&self) -> &Plan {
+        self.long
     }
 
     fn segment(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
         // What follows the columns are housekeeping values.
         let (columns, housekeeping) = columns.split_at(self.gathered.columns.names.len());
         let samples = columns.first().map_or(0, |c| c.len());
-        let middle_ns = first_ns + (0.5e9 * samples as f64 / self.plan.rate_hz) as i64;
-        let set = (middle_ns.div_euclid((STRETCH_S * 1e9) as i64)).rem_euclid(2) as usize;
-        self.transform(taper, columns);
-        self.multiply(taper, set);
-        self.gathered.sets[set].weights.count_segment(&self.plan, taper, overlaps);
-        self.hour(taper, middle_ns);
-        let base = self.gathered.columns.base;
-        if taper == 0 {
-            self.gathered.transients.segment(&self.plan, first_ns, &self.spectra.columns(0, base));
-            self.gathered.witnesses.segment(&self.plan, housekeeping, &self.spectra.columns(0, base));
+        self.bench.transform(self.long, taper, columns);
+        for k in FIRST_BIN..samples / 2 {
+            let gain = self.response.at(k as f64 * self.long.rate_hz / samples as f64 / self.rate_hz);
+            self.bench.spectra.rows_mut(2 * (k - FIRST_BIN), 2).scale_mut(gain.recip());
         }
+        let set = &mut self.gathered.sets[set_of(middle_ns(first_ns, columns, self.long.rate_hz))];
+        let bands = 0..self.low_bands;
+        self.bench.multiply(&self.long.bins(taper)[bands.clone()], &mut set.bands[bands.clone()]);
+        set.weights.count_bands(self.plan, taper, overlaps, bands);
+        let base = self.bench.base(self.gathered.columns.base);
+        self.gathered.witnesses.segment(self.long, taper, housekeeping, &base, overlaps);
     }
 }

@@ -4,6 +4,7 @@
 //! [`transient`] looks for what happens once, [`witness`] asks every channel of housekeeping. From the sums alone [`rank`] tries the
 //! candidates, `dragfree_estimation::levels` the noise, and [`diagnosis`] says what is missing. No module knows an effect by name.
 
+pub mod decimate;
 pub mod diagnosis;
 pub mod gather;
 pub mod question;

@@ -34,6 +34,9 @@ pub struct Fit {
     layout: Layout,
     /// Columns of the layout among all.
     columns: Vec<usize>,
+    /// What candidates are judged by: all data, and each set of stretches.
+    scores: Scores,
+    halves: [Scores; 2],
 }
 
 /// A candidate beside a fit.
@@ -53,6 +56,16 @@ pub struct Scored {
     pub left: f64,
     /// By how much its absence moves each free coefficient of the fit.
     pub shift: DVector<f64>,
+}
+
+/// A candidate fitted to each half of the data.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Halves {
+    /// By how much χ² of each half falls with the values that the other gives. A half that knows little of a slow cause gives values
+    /// that are no good, and that is no evidence against the cause.
+    pub gains: [f64; 2],
+    /// χ² of the difference of the two halves' values, one degree of freedom per coefficient: the evidence against it.
+    pub difference_chi2: f64,
 }
 
 /// Everything that is asked of the sums.
@@ -106,41 +119,40 @@ impl<'a> Court<'a> {
         let unknowns = self.question.unknowns(added);
         let estimate =
             estimate_with(&observed, self.noise, &unknowns, &self.question.bounds(), REFINEMENTS, Refinement::Levels)?;
-        Ok(Fit { added: added.to_vec(), estimate, layout, columns })
+        let [first, second] = &self.gathered.sets;
+        let of = |gram: &Gram| self.scores(gram, &estimate, &layout, &columns);
+        let (scores, halves) = (of(&self.total), [of(first), of(second)]);
+        Ok(Fit { added: added.to_vec(), estimate, layout, columns, scores, halves })
     }
 
-    fn scores(&self, gram: &Gram, fit: &Fit) -> Scores {
+    fn scores(&self, gram: &Gram, estimate: &Estimate, layout: &Layout, columns: &[usize]) -> Scores {
         let n = self.gathered.columns.names.len();
         let channels = self.question.channels.len();
-        let theta = &fit.estimate.theta;
-        let linear = fit.layout.linear_at(theta.as_slice());
-        let kept = self.total.weights.kept();
-        let weights: Vec<DMatrix<f64>> = fit.estimate.inverses.iter().zip(&kept).map(|(w, k)| w * *k).collect();
+        let theta = &estimate.theta;
+        let linear = layout.linear_at(theta.as_slice());
+        let kept = self.total.weights.evenly();
+        let weights: Vec<DMatrix<f64>> = estimate.inverses.iter().zip(&kept).map(|(w, k)| w * *k).collect();
         let mut residual = DMatrix::zeros(n, channels);
-        let free = &fit.estimate.free;
+        let free = &estimate.free;
         let mut model = vec![DMatrix::zeros(n, channels); free.len()];
         for (g, w) in gram.bands.iter().zip(&weights) {
             let m = g.nrows();
             let mut left = g.columns(0, channels).into_owned();
             for r in &linear.regressors {
-                let column = fit.columns[channels + r.series];
+                let column = columns[channels + r.series];
                 if column < m {
                     left.column_mut(r.channel).axpy(-r.factor * theta[r.coefficient], &g.column(column), 1.0);
                 }
             }
             residual.rows_mut(0, m).gemm(1.0, &left, w, 1.0);
             for r in &linear.regressors {
-                let column = fit.columns[channels + r.series];
+                let column = columns[channels + r.series];
                 let Some(k) = free.iter().position(|f| *f == r.coefficient).filter(|_| column < m) else { continue };
                 model[k].rows_mut(0, m).ger(r.factor, &g.column(column), &w.row(r.channel).transpose(), 1.0);
             }
         }
-        let covariance = fit
-            .estimate
-            .known
-            .clone()
-            .cholesky()
-            .map_or_else(|| DMatrix::zeros(free.len(), free.len()), |c| c.inverse());
+        let covariance =
+            estimate.known.clone().cholesky().map_or_else(|| DMatrix::zeros(free.len(), free.len()), |c| c.inverse());
         Scores { residual, model, covariance, weights, theta: theta.clone() }
     }
 
@@ -156,10 +168,20 @@ impl<'a> Court<'a> {
 
     /// `N` between two candidates' coefficients, before anything is projected out.
     fn between(&self, gram: &Gram, scores: &Scores, a: &Candidate, b: &Candidate) -> DMatrix<f64> {
-        let (a, b) = (Self::terms(a, &scores.theta), Self::terms(b, &scores.theta));
+        Self::weighed(gram, &scores.weights, &scores.theta, a, b)
+    }
+
+    fn weighed(
+        gram: &Gram,
+        weights: &[DMatrix<f64>],
+        theta: &DVector<f64>,
+        a: &Candidate,
+        b: &Candidate,
+    ) -> DMatrix<f64> {
+        let (a, b) = (Self::terms(a, theta), Self::terms(b, theta));
         DMatrix::from_fn(a.len(), b.len(), |i, j| {
             let mut sum = 0.0;
-            for (g, w) in gram.bands.iter().zip(&scores.weights) {
+            for (g, w) in gram.bands.iter().zip(weights) {
                 let m = g.nrows();
                 for (s, c, f) in a[i].iter().filter(|t| t.0 < m) {
                     for (t, d, h) in b[j].iter().filter(|t| t.0 < m) {
@@ -201,10 +223,28 @@ impl<'a> Court<'a> {
         Some(Scored { candidate, value, in_range, delta_chi2, information, left, shift })
     }
 
+    /// What a candidate is worth when bands that stand for little time count for what they are (see [`Spectra::evenly`]).
+    fn honest(&self, fit: &Fit, mut scored: Scored) -> Scored {
+        let weights = &self.total.weights;
+        let over = |(u, v): (f64, f64)| if v > 0.0 { u / v } else { 0.0 };
+        let over: Vec<f64> = weights.evenly().into_iter().zip(weights.kept()).map(over).collect();
+        let size = |w: &[DMatrix<f64>]| {
+            let own = Self::weighed(&self.total, w, &fit.scores.theta, &scored.candidate, &scored.candidate);
+            scored.value.dot(&(own * &scored.value))
+        };
+        let uneven: Vec<DMatrix<f64>> = fit.scores.weights.iter().zip(&over).map(|(w, r)| w * *r).collect();
+        let part = (size(&fit.scores.weights) / size(&uneven)).min(1.0);
+        if part.is_finite() {
+            scored.delta_chi2 *= part;
+            scored.information *= part;
+        }
+        scored
+    }
+
     /// Every place of every effect that is not in the fit, in its best form; the best first. Also how many forms were tried.
     #[must_use]
     pub fn rank(&self, fit: &Fit) -> (Vec<Scored>, usize) {
-        let scores = self.scores(&self.total, fit);
+        let scores = &fit.scores;
         let mut tried = 0;
         let mut ranked = Vec::new();
         for place in self.question.places() {
@@ -214,11 +254,11 @@ impl<'a> Court<'a> {
             }
             let forms = first.forms.len();
             let scored: Vec<Option<Scored>> =
-                (0..forms).map(|f| self.score(&scores, self.question.candidate(&place, f))).collect();
+                (0..forms).map(|f| self.score(scores, self.question.candidate(&place, f))).collect();
             tried += scored.iter().flatten().count();
             let best = scored.iter().flatten().max_by(|a, b| a.delta_chi2.total_cmp(&b.delta_chi2));
             let Some(best) = best else { continue };
-            ranked.push(self.between_neighbours(&scores, &scored, best));
+            ranked.push(self.honest(fit, self.between_neighbours(scores, &scored, best)));
         }
         ranked.sort_by(|a, b| b.delta_chi2.total_cmp(&a.delta_chi2));
         (ranked, tried)
@@ -243,36 +283,38 @@ impl<'a> Court<'a> {
         winner
     }
 
-    /// By how much χ² falls in each set of stretches with the values that the other set gives; `None` where one set is empty.
+    /// What the two sets of stretches say of a candidate; `None` where one of them says nothing.
     #[must_use]
-    pub fn held_out(&self, fit: &Fit, candidate: &Candidate) -> Option<[f64; 2]> {
-        if self.gathered.sets.iter().any(|s| s.weights.segments == 0) {
-            return None;
-        }
-        let judge = |set: &Gram| {
-            let scores = self.scores(set, fit);
-            let (score, _) = Self::against(&scores, candidate);
-            (score, self.between(set, &scores, candidate, candidate))
+    pub fn held_out(&self, fit: &Fit, candidate: &Candidate) -> Option<Halves> {
+        let judge = |set: usize| {
+            let scores = &fit.halves[set];
+            let (score, _) = Self::against(scores, candidate);
+            let information = self.between(&self.gathered.sets[set], scores, candidate, candidate);
+            let covariance = Cholesky::new(information.clone())?.inverse();
+            Some((&covariance * &score, score, information, covariance))
         };
-        let [a, b] = [judge(&self.gathered.sets[0]), judge(&self.gathered.sets[1])];
-        let gain = |fitted: &(DVector<f64>, DMatrix<f64>), tested: &(DVector<f64>, DMatrix<f64>)| {
-            let value = Cholesky::new(fitted.1.clone())?.solve(&fitted.0);
-            Some(2.0 * tested.0.dot(&value) - value.dot(&(&tested.1 * &value)))
+        let (a, b) = (judge(0)?, judge(1)?);
+        let gain = |value: &DVector<f64>, score: &DVector<f64>, information: &DMatrix<f64>| {
+            2.0 * score.dot(value) - value.dot(&(information * value))
         };
-        Some([gain(&b, &a)?, gain(&a, &b)?])
+        let difference = &a.0 - &b.0;
+        Some(Halves {
+            gains: [gain(&b.0, &a.1, &a.2), gain(&a.0, &b.1, &b.2)],
+            difference_chi2: difference.dot(&Cholesky::new(&a.3 + &b.3)?.solve(&difference)),
+        })
     }
 
     /// Causes that the data cannot tell from `scored`, and coefficients of the model that it is degenerate with.
     #[must_use]
     pub fn confounders(&self, fit: &Fit, scored: &Scored, ranked: &[Scored]) -> Vec<String> {
-        let scores = self.scores(&self.total, fit);
-        let direction = |s: &Scored| (Self::against(&scores, &s.candidate).1.transpose() * &s.value, s.value.clone());
+        let scores = &fit.scores;
+        let direction = |s: &Scored| (Self::against(scores, &s.candidate).1.transpose() * &s.value, s.value.clone());
         let (model, value) = direction(scored);
         let norm = |s: &Scored, v: &DVector<f64>| v.dot(&(&s.information * v));
         let mut names = Vec::new();
         for other in ranked.iter().filter(|o| o.candidate.name() != scored.candidate.name()) {
             let (their_model, their_value) = direction(other);
-            let own = self.between(&self.total, &scores, &scored.candidate, &other.candidate);
+            let own = self.between(&self.total, scores, &scored.candidate, &other.candidate);
             let shared = value.dot(&(&own * &their_value)) - model.dot(&(&scores.covariance * &their_model));
             let both = norm(scored, &value) * norm(other, &their_value);
             if both > 0.0 && shared.abs() > CONFOUNDED * both.sqrt() {

@@ -1,12 +1,14 @@
 //! What was gathered, as bytes: a header in JSON, then every number as it is in memory.
 
-use dragfree_estimation::spectra::Spectra;
+use std::io::{self, Read, Write};
+
+use dragfree_estimation::spectra::{Plan, Spectra};
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
 
-use crate::gather::{Columns, Gathered, Gram, Hour};
+use crate::gather::{Columns, Gathered, Gram, Hour, LONG, low_plan};
 use crate::question::Question;
-use crate::transient::{Hit, Search};
+use crate::transient::{Hit, Transients};
 use crate::witness::Witnesses;
 
 const MAGIC: &[u8; 8] = b"DFCRIT1\n";
@@ -51,20 +53,23 @@ struct Header {
     segments: [u64; 2],
     hours: Vec<(i64, u64)>,
     housekeeping: Vec<String>,
-    witness_segments: u64,
     hits: Vec<Hit>,
     tried: f64,
 }
 
-struct Numbers<'a>(&'a [u8]);
+/// Numbers that are read one after the other.
+struct Numbers<R>(R);
 
-impl Numbers<'_> {
+impl<R: Read> Numbers<R> {
     fn fill(&mut self, out: &mut [f64]) -> Result<(), RecordError> {
-        let (mine, rest) = self.0.split_at_checked(8 * out.len()).ok_or(RecordError::Damaged("it ends early"))?;
-        for (x, bytes) in out.iter_mut().zip(mine.as_chunks::<8>().0) {
-            *x = f64::from_le_bytes(*bytes);
+        let mut bytes = [0; 8 * 512];
+        for out in out.chunks_mut(512) {
+            let bytes = &mut bytes[..8 * out.len()];
+            self.0.read_exact(bytes).map_err(|_| RecordError::Damaged("it ends early"))?;
+            for (x, bytes) in out.iter_mut().zip(bytes.as_chunks::<8>().0) {
+                *x = f64::from_le_bytes(*bytes);
+            }
         }
-        self.0 = rest;
         Ok(())
     }
 
@@ -76,10 +81,19 @@ impl Numbers<'_> {
     }
 }
 
+/// Numbers as bytes.
+fn put(to: &mut impl Write, numbers: &[f64]) -> io::Result<()> {
+    let mut bytes = Vec::with_capacity(8 * numbers.len());
+    numbers.iter().for_each(|x| bytes.extend(x.to_le_bytes()));
+    to.write_all(&bytes)
+}
+
 impl Record {
-    /// The bytes.
-    #[must_use]
-    pub fn to_bytes(&self) -> Vec<u8> {
+    /// Writes it.
+    ///
+    /// # Errors
+    /// Those of the writer.
+    pub fn write(&self, to: &mut impl Write) -> io::Result<()> {
         let g = &self.gathered;
         let header = Header {
             question: self.question.clone(),
@@ -94,46 +108,55 @@ impl Record {
             segments: [g.sets[0].weights.segments, g.sets[1].weights.segments],
             hours: g.hours.iter().map(|h| (h.start_ns, h.spectra.segments)).collect(),
             housekeeping: g.witnesses.names.clone(),
-            witness_segments: g.witnesses.segments,
             hits: g.transients.hits.clone(),
             tried: g.transients.tried,
         };
         // A struct of plain data has no way to fail.
         let header = serde_json::to_vec(&header).unwrap_or_default();
-        let mut bytes = MAGIC.to_vec();
-        bytes.extend((header.len() as u64).to_le_bytes());
-        bytes.extend(header);
-        let mut put = |numbers: &[f64]| numbers.iter().for_each(|x| bytes.extend(x.to_le_bytes()));
-        let mut spectra = |s: &Spectra| {
-            [&s.packed, &s.expected, &s.weight, &s.weight_squared].into_iter().for_each(|v| put(v));
-        };
-        for set in &g.sets {
-            spectra(&set.weights);
+        to.write_all(MAGIC)?;
+        to.write_all(&(header.len() as u64).to_le_bytes())?;
+        to.write_all(&header)?;
+        for spectra in g.sets.iter().map(|s| &s.weights).chain(g.hours.iter().map(|h| &h.spectra)) {
+            for numbers in [&spectra.packed, &spectra.expected, &spectra.weight, &spectra.weight_squared] {
+                put(to, numbers)?;
+            }
         }
-        for hour in &g.hours {
-            spectra(&hour.spectra);
+        // The matrices are symmetric: the part from the diagonal down, column by column.
+        for m in g.sets.iter().flat_map(|s| &s.bands) {
+            for j in 0..m.ncols() {
+                put(to, &m.as_slice()[j * m.nrows() + j..(j + 1) * m.nrows()])?;
+            }
         }
-        g.sets.iter().flat_map(|s| &s.bands).for_each(|m| put(m.as_slice()));
         let w = &g.witnesses;
-        put(w.residual.as_slice());
-        put(&w.level);
-        [&w.residual_power, &w.power, &w.cross[0], &w.cross[1]].into_iter().for_each(|m| put(m.as_slice()));
-        bytes
+        put(to, w.residual.as_slice())?;
+        put(to, &w.level)?;
+        put(to, &w.observations)?;
+        [&w.residual_power, &w.power, &w.cross[0], &w.cross[1]].into_iter().try_for_each(|m| put(to, m.as_slice()))
     }
 
-    /// Reads what [`Self::to_bytes`] wrote.
+    /// Reads what [`Self::write`] wrote.
     ///
     /// # Errors
     /// [`RecordError::Damaged`].
-    pub fn from_bytes(bytes: &[u8]) -> Result<Self, RecordError> {
-        let rest = bytes.strip_prefix(MAGIC).ok_or(RecordError::Damaged("no record at all"))?;
-        let (length, rest) = rest.split_first_chunk::<8>().ok_or(RecordError::Damaged("it ends early"))?;
-        let length = usize::try_from(u64::from_le_bytes(*length)).map_err(|_| RecordError::Damaged("its header"))?;
-        let (header, rest) = rest.split_at_checked(length).ok_or(RecordError::Damaged("it ends early"))?;
-        let h: Header = serde_json::from_slice(header).map_err(|_| RecordError::Damaged("its header"))?;
+    pub fn read(from: &mut impl Read) -> Result<Self, RecordError> {
+        let early = |_| RecordError::Damaged("it ends early");
+        let mut start = [0; 16];
+        from.read_exact(&mut start).map_err(early)?;
+        let (magic, length) = start.split_at(8);
+        if magic != MAGIC {
+            return Err(RecordError::Damaged("no record at all"));
+        }
+        let length = u64::from_le_bytes(length.try_into().map_err(|_| RecordError::Damaged("its header"))?);
+        // As much as there is, whatever the length claims.
+        let mut header = Vec::new();
+        let read = from.take(length).read_to_end(&mut header);
+        if read.map_err(early)? as u64 != length {
+            return Err(RecordError::Damaged("it ends early"));
+        }
+        let h: Header = serde_json::from_slice(&header).map_err(|_| RecordError::Damaged("its header"))?;
         let sound = h.channels <= h.base && h.base <= h.fast && h.fast <= h.names.len();
         if !sound
-            || !(16..=1 << 24).contains(&h.length)
+            || !(16..=1 << 20).contains(&h.length)
             || !h.length.is_multiple_of(4)
             || !h.rate_hz.is_finite()
             || h.rate_hz <= 0.0
@@ -141,8 +164,8 @@ impl Record {
             return Err(RecordError::Damaged("its header"));
         }
         let columns = Columns { names: h.names, channels: h.channels, base: h.base, fast: h.fast };
-        let plan = dragfree_estimation::spectra::Plan::new(h.length, h.rate_hz);
-        let mut numbers = Numbers(rest);
+        let (plan, hour_plan) = (Plan::new(LONG * h.length, h.rate_hz), Plan::new(h.length, h.rate_hz));
+        let mut numbers = Numbers(from);
         let mut sets = [Gram::zero(&columns, &plan), Gram::zero(&columns, &plan)];
         for (set, segments) in sets.iter_mut().zip(h.segments) {
             numbers.spectra(&mut set.weights)?;
@@ -150,26 +173,28 @@ impl Record {
         }
         let mut hours = Vec::new();
         for (start_ns, segments) in h.hours {
-            let mut spectra = Spectra::zero(plan.bands.len(), columns.base);
+            let mut spectra = Spectra::zero(hour_plan.bands.len(), columns.base);
             numbers.spectra(&mut spectra)?;
             spectra.segments = segments;
             hours.push(Hour { start_ns, spectra });
         }
         for m in sets.iter_mut().flat_map(|s| &mut s.bands) {
-            numbers.fill(m.as_mut_slice())?;
+            let n = m.nrows();
+            (0..n).try_for_each(|j| numbers.fill(&mut m.as_mut_slice()[j * n + j..(j + 1) * n]))?;
+            m.fill_upper_triangle_with_lower_triangle();
         }
         let mut residual = DMatrix::zeros(columns.channels, columns.base);
         numbers.fill(residual.as_mut_slice())?;
-        let mut w = Witnesses::new(h.housekeeping, h.length, h.rate_hz, residual);
+        let mut w = Witnesses::new(h.housekeeping, &low_plan(h.length, h.rate_hz).0, residual, Vec::new());
         numbers.fill(&mut w.level)?;
+        numbers.fill(&mut w.observations)?;
         for m in [&mut w.residual_power, &mut w.power].into_iter().chain(&mut w.cross) {
             numbers.fill(m.as_mut_slice())?;
         }
-        w.segments = h.witness_segments;
-        if !numbers.0.is_empty() {
+        if numbers.0.read(&mut [0]).map_err(early)? > 0 {
             return Err(RecordError::Damaged("it goes on too long"));
         }
-        let transients = Search::found(h.hits, h.tried);
+        let transients = Transients { hits: h.hits, tried: h.tried };
         let gathered =
             Gathered { columns, length: h.length, rate_hz: h.rate_hz, sets, hours, witnesses: w, transients };
         Ok(Self { question: h.question, differenced: h.differenced, gathered, not_tried: h.not_tried })

@@ -5,11 +5,12 @@
 //! Under a window w that is long against the template both n and its noise are those without it times `w(t)`.
 
 use std::f64::consts::{PI, TAU};
+use std::sync::Arc;
 
 use dragfree_estimation::spectra::{FIRST_BIN, Plan};
 use nalgebra::{DMatrix, DMatrixView};
-use realfft::RealFftPlanner;
 use realfft::num_complex::Complex64;
+use realfft::{ComplexToReal, RealFftPlanner};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
@@ -73,35 +74,95 @@ impl Hit {
     }
 }
 
-/// The search.
+/// What was found.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub struct Search {
-    templates: Vec<Template>,
-    /// Residual of each channel as a combination of the base columns.
-    residual: DMatrix<f64>,
-    /// `Σ⁻¹` per band.
-    inverses: Vec<DMatrix<f64>>,
+pub struct Transients {
     /// Peaks, the loudest first.
     pub hits: Vec<Hit>,
     /// Templates times samples that were tried.
     pub tried: f64,
 }
 
+impl Transients {
+    /// Adds the peaks of other data.
+    pub fn add(&mut self, other: &Self) {
+        self.hits.extend(other.hits.iter().cloned());
+        self.hits.sort_by(|a, b| b.significance().total_cmp(&a.significance()));
+        self.hits.truncate(MOST);
+        self.tried += other.tried;
+    }
+}
+
+/// The search.
+pub struct Search {
+    templates: Vec<Template>,
+    /// Residual of each channel as a combination of the base columns.
+    residual: DMatrix<f64>,
+    /// `Σ⁻¹` per band.
+    inverses: Vec<DMatrix<f64>>,
+    /// What every segment needs, made for the first.
+    prepared: Option<Prepared>,
+}
+
+/// Templates as the filter wants them.
+struct Prepared {
+    inverse: Arc<dyn ComplexToReal<f64>>,
+    /// Per template its conjugate spectrum and `√D`.
+    filters: Vec<(Vec<Complex64>, f64)>,
+    /// Per bin, the conjugate response of a mean of two samples.
+    mean: Vec<Complex64>,
+}
+
 impl Search {
     /// Looks for `templates` in residuals made by `residual` (channels × base columns) of noise `inverses⁻¹`.
     #[must_use]
     pub fn new(templates: Vec<Template>, residual: DMatrix<f64>, inverses: Vec<DMatrix<f64>>) -> Self {
-        Self { templates, residual, inverses, hits: Vec::new(), tried: 0.0 }
+        Self { templates, residual, inverses, prepared: None }
     }
 
-    /// What an earlier search found.
-    #[must_use]
-    pub fn found(hits: Vec<Hit>, tried: f64) -> Self {
-        Self { hits, tried, ..Self::default() }
+    fn prepare(&self, plan: &Plan) -> Prepared {
+        let n = plan.length;
+        let mut planner = RealFftPlanner::<f64>::new();
+        let (forward, inverse) = (planner.plan_fft_forward(n), planner.plan_fft_inverse(n));
+        let scale = (4.0 / (plan.rate_hz * n as f64)).sqrt();
+        let mean: Vec<Complex64> =
+            (0..=n / 2).map(|k| 0.5 * (1.0 + Complex64::from_polar(1.0, TAU * k as f64 / n as f64))).collect();
+        let mut time = vec![0.0; n];
+        let filter = |template: &Template| {
+            let mut spectrum = vec![Complex64::default(); n / 2 + 1];
+            time.fill(0.0);
+            let course = template.kernel.len().min(n / 4);
+            time[..course].copy_from_slice(&template.kernel[..course]);
+            // The length is that of the plan of the transform, the only thing that it refuses.
+            let done = forward.process(&mut time, &mut spectrum);
+            debug_assert!(done.is_ok());
+            let mut sum = 0.0;
+            for (band, own) in plan.bands.iter().zip(&self.inverses) {
+                // Channels that see the mean of two samples answer with its response, the others alike.
+                let (mut plain, mut mixed, mut averaged) = (0.0, 0.0, 0.0);
+                for (c, factor, mean) in &template.channels {
+                    for (d, other, their_mean) in &template.channels {
+                        let part = factor * other * own[(*c, *d)];
+                        match (mean, their_mean) {
+                            (false, false) => plain += part,
+                            (true, true) => averaged += part,
+                            _ => mixed += part,
+                        }
+                    }
+                }
+                for k in band.first..band.end {
+                    let answer = plain + mixed * mean[k].re + averaged * mean[k].norm_sqr();
+                    sum += spectrum[k].norm_sqr() * scale * scale * answer;
+                }
+            }
+            spectrum.iter_mut().for_each(|t| *t = t.conj() * scale);
+            (spectrum, sum.max(0.0).sqrt())
+        };
+        Prepared { filters: self.templates.iter().map(filter).collect(), inverse, mean }
     }
 
     /// A segment of full length: spectra of the base columns.
-    pub fn segment(&mut self, plan: &Plan, first_ns: i64, base: &DMatrixView<'_, f64>) {
+    pub fn segment(&mut self, plan: &Plan, first_ns: i64, base: &DMatrixView<'_, f64>, found: &mut Transients) {
         if self.templates.is_empty() || self.inverses.len() != plan.bands.len() {
             return;
         }
@@ -112,70 +173,46 @@ impl Search {
             let product = white.rows(rows.start, rows.len()) * inverse;
             white.rows_mut(rows.start, rows.len()).copy_from(&product);
         }
-        let mut planner = RealFftPlanner::<f64>::new();
-        let (forward, inverse) = (planner.plan_fft_forward(n), planner.plan_fft_inverse(n));
-        let scale = (4.0 / (plan.rate_hz * n as f64)).sqrt();
+        let prepared = match self.prepared.take() {
+            Some(prepared) => prepared,
+            None => self.prepare(plan),
+        };
         let mut spectrum = vec![Complex64::default(); n / 2 + 1];
         let mut time = vec![0.0; n];
-        for template in &self.templates {
-            time.fill(0.0);
-            let course = template.kernel.len().min(n / 4);
-            time[..course].copy_from_slice(&template.kernel[..course]);
-            if forward.process(&mut time, &mut spectrum).is_err() {
-                return;
-            }
-            let mut sum = 0.0;
-            let mut band = 0;
-            for (k, t) in spectrum.iter_mut().enumerate() {
-                if k < FIRST_BIN || k >= n / 2 {
-                    *t = Complex64::default();
-                    continue;
-                }
-                while plan.bands[band].end <= k {
-                    band += 1;
-                }
-                let mean = 0.5 * (1.0 + Complex64::from_polar(1.0, -TAU * k as f64 / n as f64));
-                let answers = |averaged: bool| *t * scale * if averaged { mean } else { Complex64::from(1.0) };
-                let row = 2 * (k - FIRST_BIN);
-                let mut product = Complex64::default();
-                for (c, factor, averaged) in &template.channels {
-                    let answer = answers(*averaged) * *factor;
-                    product += answer.conj() * Complex64::new(white[(row, *c)], white[(row + 1, *c)]);
-                    for (d, other, averaged) in &template.channels {
-                        sum += (answer.conj() * answers(*averaged) * *other).re * self.inverses[band][(*c, *d)];
-                    }
-                }
-                *t = product;
-            }
-            if sum <= 0.0 || inverse.process(&mut spectrum, &mut time).is_err() {
+        // Under the window, over the middle half: segments that overlap by half cover every time once.
+        let middle = n / 4..3 * n / 4;
+        let window: Vec<f64> = middle.clone().map(|k| (PI * k as f64 / n as f64).sin().powi(2)).collect();
+        for (template, (filter, root)) in self.templates.iter().zip(&prepared.filters) {
+            if *root <= 0.0 {
                 continue;
             }
-            // The middle half: segments that overlap by half cover every time once.
-            let window = |k: usize| (PI * k as f64 / n as f64).sin().powi(2);
-            // The transform sums the bins of both signs.
-            let significance = |k: usize| 0.5 * time[k] / (window(k) * sum.sqrt());
-            // Noise may be louder than Σ says. Its median does not see what happens once.
-            let mut sizes: Vec<f64> = (n / 4..3 * n / 4).map(|k| significance(k).abs()).collect();
-            let middle = sizes.len() / 2;
-            let louder = (*sizes.select_nth_unstable_by(middle, f64::total_cmp).1 / MEDIAN).max(1.0);
-            for k in n / 4..3 * n / 4 {
-                let sigma = louder * sum.sqrt().recip();
-                let value = significance(k) * sum.sqrt().recip();
-                if (value / sigma).abs() > LEAST {
-                    let at_ns = first_ns + (k as f64 * 1e9 / plan.rate_hz).round() as i64;
-                    keep(&mut self.hits, template, at_ns, value, sigma);
+            spectrum.fill(Complex64::default());
+            for (c, factor, averaged) in &template.channels {
+                let rows = white.column(*c);
+                let pairs = rows.as_slice().chunks_exact(2).zip(&mut spectrum[FIRST_BIN..n / 2]);
+                for ((pair, out), mean) in pairs.zip(&prepared.mean[FIRST_BIN..]) {
+                    let x = Complex64::new(pair[0], pair[1]) * *factor;
+                    *out += if *averaged { x * mean } else { x };
                 }
             }
+            spectrum.iter_mut().zip(filter).for_each(|(x, filter)| *x *= filter);
+            if prepared.inverse.process(&mut spectrum, &mut time).is_err() {
+                continue;
+            }
+            // The transform sums the bins of both signs.
+            let significance: Vec<f64> =
+                time[middle.clone()].iter().zip(&window).map(|(x, w)| 0.5 * x / (w * root)).collect();
+            // Noise may be louder than Σ says. Its median does not see what happens once.
+            let mut sizes: Vec<f64> = significance.iter().map(|x| x.abs()).collect();
+            let half = sizes.len() / 2;
+            let louder = (*sizes.select_nth_unstable_by(half, f64::total_cmp).1 / MEDIAN).max(1.0);
+            for (k, x) in middle.clone().zip(&significance).filter(|(_, x)| x.abs() > LEAST * louder) {
+                let at_ns = first_ns + (k as f64 * 1e9 / plan.rate_hz).round() as i64;
+                keep(&mut found.hits, template, at_ns, x / root, louder / root);
+            }
         }
-        self.tried += (self.templates.len() * n / 2) as f64;
-    }
-
-    /// Adds the peaks of other data.
-    pub fn add(&mut self, other: &Self) {
-        self.hits.extend(other.hits.iter().cloned());
-        self.hits.sort_by(|a, b| b.significance().total_cmp(&a.significance()));
-        self.hits.truncate(MOST);
-        self.tried += other.tried;
+        self.prepared = Some(prepared);
+        found.tried += (self.templates.len() * n / 2) as f64;
     }
 }
 

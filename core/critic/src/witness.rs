@@ -1,8 +1,12 @@
 //! Housekeeping as witness: which channel of the telemetry is coherent with what nobody explains.
 //!
-//! For each housekeeping value, its derivative, its square and the products of two, the complex cross-spectrum with the residuals
-//! is summed over segments, in wide bands below [`crate::gather::SLOW_HZ`]. A lag between cause and force turns the phase and leaves
+//! For each housekeeping value, its derivative, its square and the products of two, the complex cross-spectrum with `Σ⁻¹ r` of the
+//! residuals r, which is what is left of each channel when all others are known (what acts on one test mass is seen there, far below
+//! the thrusters' noise, which moves all of them and which their own currents follow),
+//! is summed over long segments, in wide bands below [`crate::gather::SLOW_HZ`]. A lag between cause and force turns the phase and leaves
 //! the coherence. For n complex observations without relation `−2n log(1 − |γ|²)` is χ² with two degrees of freedom (Goodman 1957).
+
+use std::ops::Range;
 
 use dragfree_estimation::spectra::{FIRST_BIN, Plan, Transformer};
 use nalgebra::{DMatrix, DMatrixView};
@@ -16,7 +20,7 @@ const RATIO: f64 = 1.6;
 /// With more channels of housekeeping than this their products are too many to try.
 const MOST_FOR_PRODUCTS: usize = 100;
 
-/// Segments of Hann windows that overlap by half are worth this part of their number.
+/// What a segment of a Hann window adds to the observations of the one before it that it overlaps by half.
 const WORTH: f64 = 0.53;
 
 /// What may drive a force.
@@ -58,6 +62,8 @@ pub struct Witnesses {
     pub(crate) drivers: Vec<Driver>,
     /// Residual of each channel as a combination of the base columns.
     pub(crate) residual: DMatrix<f64>,
+    /// `Σ⁻¹` per band of the plan; none after reading, when no segment comes.
+    whitening: Vec<DMatrix<f64>>,
     /// Bands in bins of a segment.
     pub(crate) bands: Vec<[usize; 2]>,
     pub(crate) bin_hz: f64,
@@ -69,21 +75,23 @@ pub struct Witnesses {
     pub(crate) power: DMatrix<f64>,
     /// Per driver, a column per band and channel: real and imaginary parts of the cross-spectrum.
     pub(crate) cross: [DMatrix<f64>; 2],
-    pub(crate) segments: u64,
+    /// Per band: complex observations.
+    pub(crate) observations: Vec<f64>,
 }
 
 impl Witnesses {
-    /// For housekeeping of these names, segments of `length` samples and residuals made by `residual` (channels × base columns).
+    /// For housekeeping of these names, segments of a plan, residuals made by `residual` (channels × base columns) and `Σ⁻¹` per band of the
+    /// plan.
     #[must_use]
-    pub fn new(names: Vec<String>, length: usize, rate_hz: f64, residual: DMatrix<f64>) -> Self {
+    pub fn new(names: Vec<String>, plan: &Plan, residual: DMatrix<f64>, whitening: Vec<DMatrix<f64>>) -> Self {
         let n = names.len();
         let mut drivers: Vec<Driver> =
             (0..n).flat_map(|i| [Driver::Value(i), Driver::Derivative(i), Driver::Square(i)]).collect();
         if n <= MOST_FOR_PRODUCTS {
             drivers.extend((0..n).flat_map(|i| (0..i).map(move |j| Driver::Product(j, i))));
         }
-        let bin_hz = rate_hz / length as f64;
-        let last = ((SLOW_HZ / bin_hz) as usize).min(length / block(length, rate_hz) / 2);
+        let bin_hz = plan.bin_hz(1.0);
+        let last = ((SLOW_HZ / bin_hz) as usize).min(plan.length / 2);
         let mut bands = Vec::new();
         let mut first = FIRST_BIN;
         while first < last {
@@ -98,10 +106,11 @@ impl Witnesses {
             residual_power: DMatrix::zeros(bands.len(), channels),
             power: DMatrix::zeros(drivers.len(), bands.len()),
             cross: [DMatrix::zeros(drivers.len(), wide), DMatrix::zeros(drivers.len(), wide)],
-            segments: 0,
+            observations: vec![0.0; bands.len()],
             names,
             drivers,
             residual,
+            whitening,
             bands,
             bin_hz,
         }
@@ -115,43 +124,63 @@ impl Witnesses {
         self.residual_power += &other.residual_power;
         self.power += &other.power;
         self.cross.iter_mut().zip(&other.cross).for_each(|(a, b)| *a += b);
-        self.segments += other.segments;
+        self.observations.iter_mut().zip(&other.observations).for_each(|(a, b)| *a += b);
     }
 
-    /// A segment: housekeeping sample by sample, spectra of the base columns.
-    pub fn segment(&mut self, plan: &Plan, housekeeping: &[&[f64]], base: &DMatrixView<'_, f64>) {
-        let (Some(last), false) = (self.bands.last().copied(), self.names.is_empty()) else { return };
-        let block = block(plan.length, plan.rate_hz);
-        let coarse = Plan::new(plan.length / block, plan.rate_hz / block as f64);
-        let mut transformer = Transformer::new(&coarse);
-        let means =
-            |x: &[f64]| -> Vec<f64> { x.chunks_exact(block).map(|c| c.iter().sum::<f64>() / block as f64).collect() };
-        let values: Vec<Vec<f64>> = housekeeping.iter().map(|x| means(x)).collect();
-        for (level, x) in self.level.iter_mut().zip(&values).filter(|(level, _)| level.is_nan()) {
+    /// A segment of the plan's `taper`-th length: housekeeping sample by sample, spectra of the base columns.
+    pub fn segment(
+        &mut self,
+        plan: &Plan,
+        taper: usize,
+        housekeeping: &[&[f64]],
+        base: &DMatrixView<'_, f64>,
+        overlaps: bool,
+    ) {
+        let samples = housekeeping.first().map_or(0, |x| x.len());
+        if samples == 0 {
+            return;
+        }
+        let ratio = plan.length / samples;
+        let mut transformer = Transformer::new(plan);
+        for (level, x) in self.level.iter_mut().zip(housekeeping).filter(|(level, _)| level.is_nan()) {
             *level = x.iter().sum::<f64>() / x.len() as f64;
         }
-        let residual = base.rows(0, 2 * (last[1] - FIRST_BIN)) * self.residual.transpose();
-        let channels = self.residual.nrows();
-        for (b, [first, end]) in self.bands.iter().enumerate() {
-            for c in 0..channels {
-                let part = residual.view((2 * (first - FIRST_BIN), c), (2 * (end - first), 1));
-                self.residual_power[(b, c)] += part.norm_squared();
+        // Bins of this length, as rows of the spectra.
+        let rows: Vec<Range<usize>> = self
+            .bands
+            .iter()
+            .map(|[first, end]| {
+                let first = first.div_ceil(ratio).max(FIRST_BIN);
+                2 * (first - FIRST_BIN)..2 * (end.div_ceil(ratio).max(first) - FIRST_BIN)
+            })
+            .collect();
+        let mut residual = base.rows(0, rows.last().map_or(0, |r| r.end)) * self.residual.transpose();
+        for (band, inverse) in plan.bands.iter().zip(&self.whitening) {
+            let first = band.first.div_ceil(ratio).max(FIRST_BIN);
+            let (start, end) = (2 * (first - FIRST_BIN), 2 * (band.end.div_ceil(ratio).max(first) - FIRST_BIN));
+            let end = end.min(residual.nrows());
+            if start < end {
+                let white = residual.rows(start, end - start) * inverse;
+                residual.rows_mut(start, end - start).copy_from(&white);
             }
         }
-        let mut spectrum = vec![0.0; coarse.length];
+        let channels = self.residual.nrows();
+        for (b, rows) in rows.iter().enumerate() {
+            self.observations[b] += 0.5 * rows.len() as f64 * if overlaps { WORTH } else { 1.0 };
+            for c in 0..channels {
+                self.residual_power[(b, c)] += residual.view((rows.start, c), (rows.len(), 1)).norm_squared();
+            }
+        }
+        let mut spectrum = vec![0.0; 2 * (plan.length / 2 - FIRST_BIN)];
         for (d, driver) in self.drivers.iter().enumerate() {
-            let samples = driver.samples(&values, &self.level);
-            transformer.transform(&coarse, 0, &samples, &mut spectrum);
-            for (b, [first, end]) in self.bands.iter().enumerate() {
-                let range = 2 * (first - FIRST_BIN)..2 * (end - FIRST_BIN);
-                let own = &spectrum[range.clone()];
+            transformer.transform(plan, taper, &driver.samples(housekeeping, &self.level), &mut spectrum);
+            for (b, rows) in rows.iter().enumerate() {
+                let own = &spectrum[rows.clone()];
                 self.power[(d, b)] += own.iter().map(|x| x * x).sum::<f64>();
                 for c in 0..channels {
                     let (mut re, mut im) = (0.0, 0.0);
-                    for (s, r) in own
-                        .chunks_exact(2)
-                        .zip(residual.as_slice()[c * residual.nrows()..][range.clone()].chunks_exact(2))
-                    {
+                    let theirs = &residual.as_slice()[c * residual.nrows()..][rows.clone()];
+                    for (s, r) in own.chunks_exact(2).zip(theirs.chunks_exact(2)) {
                         re += s[0] * r[0] + s[1] * r[1];
                         im += s[0] * r[1] - s[1] * r[0];
                     }
@@ -161,7 +190,6 @@ impl Witnesses {
                 }
             }
         }
-        self.segments += 1;
     }
 
     /// How coherent each driver is with the residual of each channel, the most coherent first.
@@ -172,7 +200,7 @@ impl Witnesses {
             for (c, channel) in channels.iter().enumerate() {
                 let (mut statistic, mut dof, mut explained, mut band_hz) = (0.0, 0.0, 0.0, [0.0; 2]);
                 for (b, [first, end]) in self.bands.iter().enumerate() {
-                    let n = WORTH * (self.segments + 1) as f64 * (end - first) as f64;
+                    let n = self.observations[b];
                     let power = self.power[(d, b)] * self.residual_power[(b, c)];
                     if n < 2.0 || power <= 0.0 {
                         continue;
@@ -205,15 +233,6 @@ impl Witnesses {
     }
 }
 
-/// Samples that are averaged: a power of two, so that twice [`SLOW_HZ`] stays below Nyquist.
-fn block(length: usize, rate_hz: f64) -> usize {
-    let mut block = 1;
-    while length.is_multiple_of(8 * block) && rate_hz / (2.0 * (2 * block) as f64) > 1.5 * SLOW_HZ {
-        block *= 2;
-    }
-    block
-}
-
 impl Driver {
     fn of(self) -> Vec<usize> {
         match self {
@@ -231,16 +250,16 @@ impl Driver {
         }
     }
 
-    fn samples(self, values: &[Vec<f64>], level: &[f64]) -> Vec<f64> {
+    fn samples(self, values: &[&[f64]], level: &[f64]) -> Vec<f64> {
         match self {
-            Self::Value(i) => values[i].clone(),
+            Self::Value(i) => values[i].to_vec(),
             Self::Derivative(i) => {
-                let x = &values[i];
+                let x = values[i];
                 (0..x.len()).map(|k| x[(k + 1).min(x.len() - 1)] - x[k.saturating_sub(1)]).collect()
             }
             Self::Square(i) => values[i].iter().map(|x| x * x).collect(),
             Self::Product(i, j) => {
-                values[i].iter().zip(&values[j]).map(|(x, y)| (x - level[i]) * (y - level[j])).collect()
+                values[i].iter().zip(values[j]).map(|(x, y)| (x - level[i]) * (y - level[j])).collect()
             }
         }
     }

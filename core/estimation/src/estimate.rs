@@ -221,7 +221,8 @@ pub fn estimate_with(
     let Observed { sums, prediction, plan, layout } = *observed;
     let spectra = &sums.total;
     let whitening = Whitening::new(model, plan, layout, spectra)?;
-    let kept = spectra.kept();
+    let even = refinement == Refinement::Levels;
+    let kept = if even { spectra.evenly() } else { spectra.kept() };
     let mut inverses = whitening.model_inverses();
     let initial: Vec<f64> = unknowns.iter().map(|u| u.initial).collect();
     let mut linear = layout.linear_at(&initial);
@@ -265,7 +266,8 @@ pub fn estimate_with(
         let by_blocks =
             |k: usize| scatter.as_ref().map_or(1.0, |s| if s.ratio[k] > s.upper { s.ratio[k] } else { 1.0 });
         let by_noise = chi2_per_dof.max(1.0).sqrt();
-        let widen: Vec<f64> = (0..free.len()).map(|k| by_blocks(k).max(by_noise)).collect();
+        let by_time = if even { unevenness(spectra, layout, &inverses, &free, &c) } else { vec![1.0; free.len()] };
+        let widen: Vec<f64> = (0..free.len()).map(|k| by_blocks(k).max(by_noise) * by_time[k]).collect();
         DMatrix::from_fn(c.nrows(), c.ncols(), |i, j| c[(i, j)] * widen[i] * widen[j])
     });
     let last_step_sigma = covariance.as_ref().map_or(f64::NAN, |c| {
@@ -309,6 +311,23 @@ pub fn estimate_with(
         survey_chi2,
         quality,
     })
+}
+
+/// By how much σ of each free coefficient is larger than the equations with even weights say, as these count bands that stand for
+/// little time as if they stood for all: `C (N + Σ_b (u_b/v_b − 1) N_b) C` against `C`, u_b the even weights and v_b the true ones.
+fn unevenness(
+    spectra: &Spectra,
+    layout: &Layout,
+    inverses: &[DMatrix<f64>],
+    free: &[usize],
+    covariance: &DMatrix<f64>,
+) -> Vec<f64> {
+    let over = |(u, v): (&f64, &f64)| if *v > 0.0 { u * (u / v - 1.0) } else { 0.0 };
+    let excess: Vec<f64> = spectra.evenly().iter().zip(&spectra.kept()).map(over).collect();
+    let normal = accumulate(spectra, layout, inverses, &excess).normal;
+    let more = DMatrix::from_fn(free.len(), free.len(), |i, j| normal[(free[i], free[j])]);
+    let spread = covariance * more * covariance;
+    (0..free.len()).map(|k| (1.0 + spread[(k, k)] / covariance[(k, k)]).max(1.0).sqrt()).collect()
 }
 
 fn by_levels(model: &NoiseModel, plan: &Plan, spectra: &Spectra, residual: &[DMatrix<f64>]) -> Vec<DMatrix<f64>> {

@@ -1,5 +1,7 @@
 //! From rows to segments: gaps respected, memory bounded, nothing depending on where a batch ends.
 
+use std::borrow::Cow;
+
 use crate::prediction::Prediction;
 use crate::spectra::{Analyser, Layout, Plan, SHORTEST, Sums};
 
@@ -177,7 +179,7 @@ impl Segmenter {
         let mut values = Vec::with_capacity(columns.len());
         for (j, column) in columns.iter().enumerate() {
             let averaged = self.average(j, column);
-            for (ok, x) in usable.iter_mut().zip(&averaged) {
+            for (ok, x) in usable.iter_mut().zip(averaged.iter()) {
                 *ok &= x.is_finite();
             }
             self.state.missing[j] += column.iter().filter(|x| !x.is_finite()).count() as u64;
@@ -199,16 +201,16 @@ impl Segmenter {
         self.state.last_ns = time_ns.last().copied().or(self.state.last_ns);
     }
 
-    fn average(&mut self, j: usize, column: &[f64]) -> Vec<f64> {
+    fn average<'a>(&mut self, j: usize, column: &'a [f64]) -> Cow<'a, [f64]> {
         let mut previous = self.state.previous[j];
         self.state.previous[j] = column.last().copied().unwrap_or(previous);
         if !self.averaged[j] {
-            return column.to_vec();
+            return Cow::Borrowed(column);
         }
         column.iter().map(|x| 0.5 * (std::mem::replace(&mut previous, *x) + x)).collect()
     }
 
-    fn extend(&mut self, time_ns: &[i64], values: &[Vec<f64>], first: usize, end: usize, to: &mut impl Cuts) {
+    fn extend(&mut self, time_ns: &[i64], values: &[Cow<'_, [f64]>], first: usize, end: usize, to: &mut impl Cuts) {
         let mut k = first;
         while k < end {
             let take = (self.length - self.state.samples()).min(end - k);

@@ -242,25 +242,29 @@ impl Spectra {
 
     /// Counts a segment of the `taper`-th length, and its overlap with the one before it.
     pub fn count_segment(&mut self, plan: &Plan, taper: usize, overlaps: bool) {
-        self.count(&plan.tapers[taper], overlaps);
+        self.count_bands(plan, taper, overlaps, 0..plan.bands.len());
+        self.segments += 1;
     }
 
-    fn count(&mut self, taper: &Taper, overlaps: bool) {
+    /// As [`Self::count_segment`], for a segment that is one of several looks at the same time and serves these bands alone; it
+    /// does not count as a segment.
+    pub fn count_bands(&mut self, plan: &Plan, taper: usize, overlaps: bool, bands: Range<usize>) {
+        let taper = &plan.tapers[taper];
         let [w2, w4, _] = taper.window_sums;
-        for (b, part) in taper.part.iter().enumerate() {
+        for b in bands.clone() {
+            let part = taper.part[b];
             self.expected[b] += taper.bins[b].len() as f64 * 2.0 * w2 / taper.length as f64;
             self.weight[b] += w2 * part;
             self.weight_squared[b] += w4 * part;
         }
-        self.segments += 1;
         if overlaps {
-            self.count_overlap(taper);
+            self.count_overlap(taper, bands);
         }
     }
 
-    fn count_overlap(&mut self, taper: &Taper) {
+    fn count_overlap(&mut self, taper: &Taper, bands: Range<usize>) {
         let [_, _, cross] = taper.window_sums;
-        self.weight_squared.iter_mut().zip(&taper.part).for_each(|(w, part)| *w += 2.0 * cross * part);
+        bands.for_each(|b| self.weight_squared[b] += 2.0 * cross * taper.part[b]);
     }
 
     /// Per band `Σg/Σg²`: sums times this are information, their inverse a covariance. One Hann segment keeps 0.514 of the
@@ -269,6 +273,18 @@ impl Spectra {
     pub fn kept(&self) -> Vec<f64> {
         let pairs = self.weight.iter().zip(&self.weight_squared);
         pairs.map(|(g, g2)| if *g2 > 0.0 { g / g2 } else { 0.0 }).collect()
+    }
+
+    /// As [`Self::kept`], with every band worth the same time, that of the highest one: sums times this are the means of the spectra
+    /// times one time.
+    ///
+    /// Where commands are regressors, the score of a gain inside the loop has another expectation in every band and only their sum
+    /// over all bands is zero (see [`crate::levels`]). Bands that stand for less time than others, as the lowest ones do at the ends
+    /// of a run, would bias it.
+    #[must_use]
+    pub fn evenly(&self) -> Vec<f64> {
+        let time = self.kept().last().zip(self.weight.last()).map_or(0.0, |(kept, weight)| kept * weight);
+        self.weight.iter().map(|g| if *g > 0.0 { time / g } else { 0.0 }).collect()
     }
 
     /// Per band, complex observations: half the samples that would know as much, times the band's part of all frequencies.
@@ -365,7 +381,7 @@ impl Sums {
                 Some(last) if last.number == block.number => {
                     last.spectra.add(&block.spectra);
                     if let Some(taper) = block.overlaps_before {
-                        last.spectra.count_overlap(&plan.tapers[taper]);
+                        last.spectra.count_overlap(&plan.tapers[taper], 0..plan.bands.len());
                     }
                 }
                 _ => merged.push(block),
@@ -461,10 +477,10 @@ impl Analyser {
         }
         let segment = &self.plan.tapers[taper];
         let middle_ns = first_ns + (0.5e9 * segment.length as f64 / self.plan.rate_hz) as i64;
-        sums.total.count(segment, overlaps);
+        sums.total.count_segment(&self.plan, taper, overlaps);
         let mut total = std::mem::take(&mut sums.total.packed);
         let (block, was_there) = sums.block(&self.plan, self.columns, middle_ns);
-        block.spectra.count(segment, overlaps && was_there);
+        block.spectra.count_segment(&self.plan, taper, overlaps && was_there);
         if overlaps && !was_there {
             block.overlaps_before = Some(taper);
         }
@@ -530,7 +546,7 @@ mod tests {
         let plan = Plan::new(4096, 10.0);
         let efficiency = |segments: usize| {
             let mut spectra = Spectra::zero(plan.bands.len(), 0);
-            (0..segments).for_each(|k| spectra.count(&plan.tapers[0], k > 0));
+            (0..segments).for_each(|k| spectra.count_segment(&plan, 0, k > 0));
             let samples = (plan.length / 2 * (segments + 1)) as f64;
             spectra.weight[0] * spectra.kept()[0] / samples
         };

@@ -1,14 +1,14 @@
 //! Columns in, a record out.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
-use std::io::Write as _;
+use std::io::BufWriter;
 use std::path::Path;
 
 use dragfree_critic::gather::{Columns, Gatherer, SLOW_HZ};
 use dragfree_critic::question::{Coefficient as Asked, Form, Question, Rule, Term};
 use dragfree_critic::record::Record;
 use dragfree_critic::transient::{Search, Template};
-use dragfree_critic::witness::Witnesses;
 use dragfree_estimation::estimate::{Observed, Refinement, estimate_with};
 use dragfree_estimation::segments::{Segmenter, longest_length};
 use dragfree_estimation::sigma::{Measured, NoiseModel};
@@ -98,13 +98,13 @@ impl Stage for Critic {
         let out = self.out.clone();
         let linked = self.linked.as_mut().ok_or_else(before_link)?;
         linked.segmenter.cut_end(&mut linked.gatherer);
-        let record = linked.record();
-        if !out.is_empty() {
-            write(Path::new(&out), &record.to_bytes())
+        let covered = linked.segmenter.state.covered;
+        if let (false, Some(linked)) = (out.is_empty(), self.linked.take()) {
+            write(Path::new(&out), &linked.record())
                 .map_err(|e| PluginError::error(format!("critic: {out} cannot be written: {e}")))?;
         }
         let mut report = Report::default();
-        report.counts.insert("epochs_in_segments".to_owned(), linked.segmenter.state.covered);
+        report.counts.insert("epochs_in_segments".to_owned(), covered);
         Ok(report)
     }
 
@@ -122,11 +122,11 @@ fn before_link() -> PluginError {
 }
 
 /// Beside the place, and renamed: a kill leaves nothing that looks whole.
-fn write(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+fn write(path: &Path, record: &Record) -> std::io::Result<()> {
     let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let mut file = tempfile::NamedTempFile::new_in(folder)?;
-    file.write_all(bytes)?;
-    file.persist(path)?;
+    let mut file = BufWriter::with_capacity(1 << 20, tempfile::NamedTempFile::new_in(folder)?);
+    record.write(&mut file)?;
+    file.into_inner().map_err(std::io::IntoInnerError::into_error)?.persist(path)?;
     Ok(())
 }
 
@@ -169,9 +169,15 @@ impl Critic {
         let length = longest_length((self.segment_s * rate_hz).round() as usize);
         let (residual, inverses) = self.reference(&question, &channels, &all, length, rate_hz)?;
         // As they are called in telemetry: `hk/battery_current_a`.
-        let topics = housekeeping.iter().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
-        let witnesses = Witnesses::new(topics, length, rate_hz, residual.clone());
-        let search = Search::new(templates(available, &channels, &differenced), residual, inverses);
+        let topics: Vec<String> = housekeeping.iter().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
+        let search = Search::new(templates(available, &channels, &differenced), residual.clone(), inverses);
+        let whole: Vec<(&str, Measured)> = channels.iter().map(|c| (name_of(c), measured(c))).collect();
+        let noise = NoiseModel::new(&self.mission, &whole, 1.0 / rate_hz)?;
+        let inverse = |hz: f64| {
+            let sigma = noise.psd(hz);
+            let nothing = DMatrix::zeros(sigma.nrows(), sigma.ncols());
+            sigma.cholesky().map_or(nothing, |c| c.inverse())
+        };
         let averaged: Vec<bool> = (0..columns.len())
             .map(|i| (all.channels..names.len()).contains(&i) && differenced.iter().any(|d| *d))
             .collect();
@@ -182,7 +188,7 @@ impl Critic {
             waiting: true,
             segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged),
             base: all.base,
-            gatherer: Gatherer::new(all, length, rate_hz, self.threads, witnesses, search),
+            gatherer: Gatherer::new(all, length, rate_hz, self.threads, topics, residual, inverse, search),
             columns,
             names,
             question,
@@ -402,8 +408,13 @@ fn templates(available: &Available, channels: &[&Column], differenced: &[bool]) 
 
 impl Linked {
     fn push(&mut self, time_ns: &[i64], columns: &[&[f64]]) {
-        let mut filled: Vec<Vec<f64>> = Vec::with_capacity(columns.len() - self.base);
+        let mut filled: Vec<Cow<'_, [f64]>> = Vec::with_capacity(columns.len() - self.base);
         for (j, column) in columns.iter().enumerate().skip(self.base) {
+            if column.iter().all(|x| x.is_finite()) {
+                self.held[j] = column.last().copied().unwrap_or(self.held[j]);
+                filled.push(Cow::Borrowed(column));
+                continue;
+            }
             let mut held = self.held[j];
             let mut missing = 0;
             filled.push(
@@ -433,18 +444,20 @@ impl Linked {
             self.waiting = wait == time_ns.len();
         }
         // Whoever has no value by now has none at all, and stays at zero.
-        filled.iter_mut().flatten().filter(|x| x.is_nan()).for_each(|x| *x = 0.0);
+        for column in filled.iter_mut().filter(|c| c.iter().any(|x| x.is_nan())) {
+            column.to_mut().iter_mut().filter(|x| x.is_nan()).for_each(|x| *x = 0.0);
+        }
         self.rows += time_ns.len() as u64;
         let all: Vec<&[f64]> = std::iter::once(first.as_slice())
             .chain(columns[1..self.base].iter().copied())
-            .chain(filled.iter().map(Vec::as_slice))
+            .chain(filled.iter().map(AsRef::as_ref))
             .collect();
         self.segmenter.cut(time_ns, &all, &mut self.gatherer);
     }
 
     /// What was gathered; candidates whose series have gaps are left out, with the reason.
-    fn record(&self) -> Record {
-        let mut question = self.question.clone();
+    fn record(self) -> Record {
+        let mut question = self.question;
         let mut not_tried = Vec::new();
         let gappy = |column: usize| {
             self.missing[column] as f64 > MISSING * self.rows.max(1) as f64 || self.held[column].is_nan()
@@ -468,6 +481,6 @@ impl Linked {
                 ));
             }
         }
-        Record { question, differenced: self.differenced.clone(), gathered: self.gatherer.gathered.clone(), not_tried }
+        Record { question, differenced: self.differenced, gathered: self.gatherer.gathered, not_tried }
     }
 }

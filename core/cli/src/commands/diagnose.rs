@@ -12,12 +12,15 @@ use dragfree_engine::examine::{Examination, Sources, candidates, examine, model}
 use dragfree_estimation::sigma::{Measured, NoiseModel};
 use dragfree_physics::mission::Mission;
 use std::fmt::Write as _;
+use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let (record, mission) = gather(&command.products, &command.archive.folder, global, true)?;
     if let Some(path) = &command.save_sums {
-        std::fs::write(path, record.to_bytes()).map_err(Failure::io("write", path))?;
+        let file = std::fs::File::create(path).map_err(Failure::io("write", path))?;
+        let mut file = std::io::BufWriter::with_capacity(1 << 20, file);
+        record.write(&mut file).and_then(|()| file.flush()).map_err(Failure::io("write", path))?;
     }
     let diagnosis = judge(&record, &mission)?;
     let mut value = serde_json::to_value(&diagnosis).map_err(Failure::engine)?;
@@ -73,8 +76,9 @@ pub(super) fn gather(
         };
         let mut meter = Meter::new("diagnose", global);
         let not_tried = examine(&registry, &what, &mut |p| meter.show(&p)).map_err(Failure::engine)?;
-        let bytes = std::fs::read(&out).map_err(Failure::engine)?;
-        let mut record = Record::from_bytes(&bytes).map_err(Failure::engine)?;
+        let file = std::fs::File::open(&out).map_err(Failure::engine)?;
+        let mut record =
+            Record::read(&mut std::io::BufReader::with_capacity(1 << 20, file)).map_err(Failure::engine)?;
         record.not_tried.extend(not_tried);
         match &mut whole {
             None => whole = Some((record, mission(&sources.mission)?)),
