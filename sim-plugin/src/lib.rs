@@ -352,7 +352,9 @@ impl Source for Sim {
                     (name, simulator.offset_orf_m()[i][j].into())
                 })
                 .collect();
+            let mass_kg = |name: &str| mission.test_mass.get(name).map(|tm| tm.mass_kg);
             let about = serde_json::json!({
+                "test_mass_kg": [mass_kg("tm1"), mass_kg("tm2")],
                 "mission": mission.mission.name, "spacecraft": mission.mission.spacecraft, "noise_seed": seed,
                 "start_ns": start_ns, "end_ns": end_ns, "given": given, "offset_m": offset_m,
             });

@@ -21,7 +21,7 @@ pub(crate) struct Arguments {
     pub(crate) global: Global,
 }
 
-#[derive(Debug, Args)]
+#[derive(Clone, Debug, Args)]
 #[command(next_help_heading = "Everywhere")]
 pub(crate) struct Global {
     /// Folder with plugins, besides the one of the program; repeatable. Also DRAGFREE_PLUGIN_PATH
@@ -62,15 +62,8 @@ pub(crate) enum Command {
     },
     /// Simulate telemetry: one file per day, the truth apart in DIR/truth/
     Simulate(Simulate),
-    /// Open what `simulate --hidden` hid, and check that it was not changed since
-    Reveal {
-        /// Sealed file, DIR/truth/*.sealed.json
-        #[arg(value_name = "SEALED")]
-        sealed: PathBuf,
-        /// Telemetry that names its digest; repeatable [default: what lies in DIR]
-        #[arg(long, value_name = "FILE")]
-        telemetry: Vec<PathBuf>,
-    },
+    /// Open what `simulate --hidden` hid, check that it was not changed since, and score a diagnosis against it
+    Reveal(Reveal),
     /// H-infinity synthesis and allocation of a mission: gamma, bounds and margins per channel
     Design(Design),
     /// Replay telemetry through a pipeline and archive a product
@@ -146,6 +139,19 @@ impl Simulate {
         let hours = self.days.map_or(self.hours.unwrap_or(6.0), |days| 24.0 * days);
         self.start_ns.saturating_add((hours * 3600e9).round() as i64) // a cast of a float saturates
     }
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Reveal {
+    /// Sealed file, DIR/truth/*.sealed.json
+    #[arg(value_name = "SEALED")]
+    pub(crate) sealed: PathBuf,
+    /// Telemetry that names its digest; repeatable [default: what lies in DIR]
+    #[arg(long, value_name = "FILE")]
+    pub(crate) telemetry: Vec<PathBuf>,
+    /// Score the output of `dragfree diagnose --json`
+    #[arg(long, value_name = "FILE")]
+    pub(crate) diagnosis: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]
@@ -510,6 +516,7 @@ mod tests {
             "dragfree simulate m.toml --out d --start 2035-01-01 --hours 6 --seed 3 --effect es-gain:tm1.y=0.02 --no-command",
             "dragfree simulate m.toml --out d --start 2035-01-01T06:00:00Z --days 2 --hidden 7",
             "dragfree reveal d/truth/a.sealed.json --telemetry a.mcap --telemetry b.mcap --json",
+            "dragfree reveal d/truth/a.sealed.json --diagnosis d.json --json",
             "dragfree run p.toml a.mcap b.mcap --mission m.toml --model c.toml --archive d --from 2035-01-01 --until 2035-01-02 --json",
             "dragfree run p.toml",
             "dragfree design m.toml --json",

@@ -414,8 +414,13 @@ fn fit<'a>(days: impl Iterator<Item = &'a Product>) -> Fit {
     let mut channels: Vec<(String, f64, f64)> = Vec::new();
     for product in days {
         let figures = weighed(product);
-        // The stage has subtracted what it estimated; the sum over observations must not depend on that.
-        let observations = figures.map_or(f64::NAN, |f| float(f, "dof") + adopted(product).len() as f64);
+        // Degrees of freedom lack what the stage estimated, of coefficients and of noise, and the sum over observations must not
+        // depend on that. Products of before tell these alone.
+        let told = |f: &toml::Table| {
+            let observations = float(f, "observations");
+            if observations.is_nan() { float(f, "dof") + adopted(product).len() as f64 } else { observations }
+        };
+        let observations = figures.map_or(f64::NAN, told);
         chi2 += product.quality.chi2_per_dof * observations;
         dof += observations;
         nis += product.quality.nis * product.quality.epochs_used as f64;

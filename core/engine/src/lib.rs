@@ -14,6 +14,7 @@ pub mod registry;
 pub mod replay;
 pub mod revisions;
 pub mod run;
+pub mod score;
 pub mod sealed;
 pub mod simulate;
 pub mod table;

@@ -212,6 +212,10 @@ impl Linked {
         };
         let solution =
             estimate_with(&observed, &self.model, &unknowns, &self.bounds, self.refinements, self.refinement)?;
+        // What χ² with the mission file's Σ is a sum over: the same for every model of the same data, which `dof` is not.
+        let weights = sums.total.kept().into_iter().zip(&sums.total.expected).map(|(kept, expected)| kept * expected);
+        let observations = weights.sum::<f64>() * self.layout.channels.len() as f64;
+        report.quality.insert("observations".to_owned(), json!(observations));
         self.describe(&solution, earlier, &mut report);
         self.attach(&solution, &stored, &mut report);
         Ok(report)

@@ -42,7 +42,7 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
     match &arguments.command {
         Command::Demo { dir } => demo::execute(dir, global, paint),
         Command::Simulate(command) => simulate::execute(command, global),
-        Command::Reveal { sealed, telemetry } => reveal::execute(sealed, telemetry, global.json, paint),
+        Command::Reveal(command) => reveal::execute(command, global, paint),
         Command::Design(command) => design::execute(command, global, paint),
         Command::Run(command) => run::execute(command, global, paint),
         Command::Diagnose(command) => diagnose::execute(command, global, paint),

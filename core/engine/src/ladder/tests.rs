@@ -16,6 +16,8 @@ struct Made<'a> {
     offset: Option<(f64, f64)>,
     channels: &'a [&'a str],
     observations: f64,
+    /// Degrees of freedom that a measured noise takes, of a product that tells observations too.
+    noise: Option<f64>,
 }
 
 const OFFSET: &[&str] = &["com-offset:tm1"];
@@ -24,7 +26,17 @@ const ALL: &[&str] = &["com-offset:tm1", "es-gain:tm1.y", "thermal:tm1.x"];
 
 fn made<'a>(revision: &'a str, parent: Option<&'a str>, effects: &'a [&'a str], day: i64, ratio: f64) -> Made<'a> {
     let channels = &["tm1.accel.x", "sc.alpha.x"];
-    Made { revision, parent, effects, day, ratio, offset: Some((0.1, 1e-3)), channels, observations: 1000.0 }
+    Made {
+        revision,
+        parent,
+        effects,
+        day,
+        ratio,
+        offset: Some((0.1, 1e-3)),
+        channels,
+        observations: 1000.0,
+        noise: None,
+    }
 }
 
 impl Made<'_> {
@@ -62,16 +74,19 @@ impl Made<'_> {
             .collect();
         let channel = |name: &&str| json!({"channel": name, "dof": 500.0, "measured_over_modelled": self.ratio.sqrt()});
         let free = f64::from(u8::from(self.offset.is_some()));
-        let report = json!({
+        let mut report = json!({
             "coefficients": coefficients,
             "chi2_per_dof": self.ratio,
             "nis": 1.0,
             "epochs_used": 100,
             "quality": {
-                "dof": self.observations - free,
+                "dof": self.observations - free - self.noise.unwrap_or(0.0),
                 "channels": self.channels.iter().map(channel).collect::<Vec<_>>(),
             },
         });
+        if self.noise.is_some() {
+            report["quality"]["observations"] = self.observations.into();
+        }
         let first_ns = START_NS + self.day * DAY_NS;
         let draft = Draft {
             pipeline: "science-mode".into(),
@@ -212,6 +227,17 @@ fn other_channels_or_epochs_are_not_taken_for_a_better_model() {
     near(held.fall.expect("compared").uncertainty, 20.0);
     assert_eq!(held.verdict, Some(Verdict::Undecided));
     assert!(ladder.over_fitted.is_empty());
+}
+
+/// A stage that measures the noise band by band has fewer degrees of freedom than one that measures levels alone: of the same epochs.
+#[test]
+fn a_noise_measured_in_another_way_takes_no_epochs_away() {
+    let with = |made: Made<'static>, noise: f64| Made { noise: Some(noise), ..made };
+    let fitted = [with(made("1", None, OFFSET, 0, 1.3), 200.0), with(made("2-bbbbbb", Some("1"), BOTH, 0, 1.1), 3.0)];
+    let ladder = of(&fitted, &[]).expect("a ladder");
+    let fall = ladder.revisions[1].fall.expect("compared");
+    near(fall.delta_chi2, 200.0);
+    assert_eq!((fall.uncertainty, ladder.notes.len()), (0.0, 0), "{:?}", ladder.notes);
 }
 
 #[test]
