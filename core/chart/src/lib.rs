@@ -1,4 +1,6 @@
-//! Line charts as SVG: spectra and their bounds on logarithmic axes, series and counts on linear ones.
+//! Charts as SVG: spectra and their bounds on logarithmic axes, series and counts on linear ones, and maps of colours ([`heat`]).
+
+pub mod heat;
 
 use plotters::coord::Shift;
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
@@ -12,6 +14,8 @@ pub enum Stroke {
     Solid,
     /// What it is held against.
     Dashed,
+    /// An area in which something lies by chance: its points run round it.
+    Area,
 }
 
 /// How an axis is divided.
@@ -214,12 +218,16 @@ impl Panel {
             let series = match line.stroke {
                 Stroke::Solid => chart.draw_series(LineSeries::new(points, style)),
                 Stroke::Dashed => chart.draw_series(DashedLineSeries::new(points, 6, 4, style)),
+                Stroke::Area => chart.draw_series([Polygon::new(points, RGBColor(r, g, b).mix(0.25))]),
             }
             .map_err(refused)?;
             match line.stroke {
                 _ if line.label.is_empty() => series,
                 Stroke::Solid => series.label(&line.label).legend(solid),
                 Stroke::Dashed => series.label(&line.label).legend(dashes),
+                Stroke::Area => series.label(&line.label).legend(move |(x, y)| {
+                    Rectangle::new([(x, y - 5), (x + 18, y + 5)], RGBColor(r, g, b).mix(0.25).filled())
+                }),
             };
         }
         chart

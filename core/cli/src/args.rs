@@ -68,6 +68,8 @@ pub(crate) enum Command {
     Design(Design),
     /// Replay telemetry through a pipeline and archive a product
     Run(Run),
+    /// Where the model fails: every channel, band and hour against the noise of the mission
+    Compare(Compare),
     /// Which effect is missing: a ranked list with evidence, size and what its absence does to the offset
     Diagnose(Diagnose),
     /// Check configuration without running
@@ -212,6 +214,18 @@ pub(crate) struct Archive {
     /// Folder with the products
     #[arg(long = "archive", value_name = "DIR", default_value = "archive")]
     pub(crate) folder: PathBuf,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Compare {
+    /// Products of one model: id, id without the revision, day or file
+    #[arg(value_name = "PRODUCT", required = true)]
+    pub(crate) products: Vec<String>,
+    #[command(flatten)]
+    pub(crate) archive: Archive,
+    /// Write spectra, maps and tests as one page of HTML that needs nothing else
+    #[arg(long, value_name = "FILE.html")]
+    pub(crate) page: Option<PathBuf>,
 }
 
 #[derive(Debug, Args)]

@@ -2,8 +2,11 @@
 //!
 //! Data are read once: [`gather`] sums the cross-spectra of channels, of the model's series and of those of every candidate,
 //! [`transient`] looks for what happens once, [`witness`] asks every channel of housekeeping. From the sums alone [`rank`] tries the
-//! candidates, `dragfree_estimation::levels` the noise, and [`diagnosis`] says what is missing. No module knows an effect by name.
+//! candidates, `dragfree_estimation::levels` the noise, and [`diagnosis`] says what is missing; [`compare`] says where the
+//! model fails. No module knows an effect by name.
 
+pub mod chance;
+pub mod compare;
 pub mod decimate;
 pub mod diagnosis;
 pub mod gather;

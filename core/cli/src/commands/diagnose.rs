@@ -74,7 +74,7 @@ pub(super) fn gather(
             threads: super::threads(global),
             batch_rows: BATCH_ROWS as usize,
         };
-        let mut meter = Meter::new("diagnose", global);
+        let mut meter = Meter::new(if with_candidates { "diagnose" } else { "compare" }, global);
         let not_tried = examine(&registry, &what, &mut |p| meter.show(&p)).map_err(Failure::engine)?;
         let file = std::fs::File::open(&out).map_err(Failure::engine)?;
         let mut record =

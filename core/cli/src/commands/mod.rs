@@ -1,5 +1,6 @@
 //! One function per command; each gives back what belongs on stdout.
 
+mod compare;
 mod demo;
 mod design;
 mod diagnose;
@@ -45,6 +46,7 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
         Command::Reveal(command) => reveal::execute(command, global, paint),
         Command::Design(command) => design::execute(command, global, paint),
         Command::Run(command) => run::execute(command, global, paint),
+        Command::Compare(command) => compare::execute(command, global, paint),
         Command::Diagnose(command) => diagnose::execute(command, global, paint),
         Command::Config(Config::Check(chain)) => run::config_check(chain, global),
         Command::Plugins(command) => plugins::execute(command, global, paint),

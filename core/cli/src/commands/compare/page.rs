@@ -1,0 +1,228 @@
+//! The page of `dragfree compare`: one file of HTML with its pictures inside, for a reader who knows no filter.
+
+use crate::failure::Failure;
+use dragfree_chart::heat::{self, HeatMap};
+use dragfree_chart::{Line, Panel, Scale, Stroke, svg};
+use dragfree_critic::chance::{corrected, two_sided};
+use dragfree_critic::compare::{Cell, Channel, Comparison, Kind};
+use std::fmt::Write as _;
+
+/// Axes of one body stand side by side.
+const COLUMNS: usize = 3;
+
+/// Bars of housekeeping.
+const BARS: usize = 20;
+
+const STYLE: &str = "body{font:16px/1.5 sans-serif;max-width:1680px;margin:2em auto;padding:0 1em;color:#222}\
+p{max-width:60em}svg{width:100%;height:auto}table{border-collapse:collapse;margin:1em 0}\
+td,th{padding:.2em .8em;text-align:left;border-bottom:1px solid #ddd}\
+.fails{color:#b2182b;font-weight:bold}.passes{color:#2166ac;font-weight:bold}\
+.bar{background:#0072b2;height:.8em}.track{width:20em;background:#eee}";
+
+/// The page. `names` are the products, `meaning` what the screen says of the null combinations.
+pub(crate) fn page(c: &Comparison, names: &[String], meaning: Option<&str>) -> Result<String, Failure> {
+    let names = escape(&names.join(", "));
+    let word =
+        |passes: bool| if passes { "<span class=passes>passes</span>" } else { "<span class=fails>fails</span>" };
+    let mut out = format!(
+        "<!DOCTYPE html>\n<html lang=\"en\"><head><meta charset=\"utf-8\"><title>{names}: where the model fails</title>\n\
+         <style>{STYLE}</style></head><body>\n<h1>Where the model fails</h1>\n<p>{names}: the model {}. {}</p>\n",
+        word(c.passes),
+        meaning.map_or(String::new(), |m| escape(&format!("{m}.")))
+    );
+    let _ = writeln!(
+        out,
+        "<p>A model says how the spacecraft and its test masses move. What is left when its motion is taken from the measurements should \
+         be nothing but the noise of the instruments, which the mission file states. This page holds the one against the other. Of a \
+         hundred sound models {} would fail by chance.</p>",
+        100.0 * c.false_alarm_rate
+    );
+    if let Some(nis) = &c.nis {
+        let _ = writeln!(
+            out,
+            "<p>NIS, the recursive filter's own statistic: {:.4}, between {:.4} and {:.4} where all is well: it {}. The filter adapts its \
+             noise to what it sees, so a pass of NIS is no pass of the model.</p>",
+            nis.value,
+            nis.bounds[0],
+            nis.bounds[1],
+            word(nis.passes)
+        );
+    }
+    out += &table(c, word);
+    section(
+        &mut out,
+        "How strong, at which frequency",
+        "Amplitude of what is left, over frequency: measured, and what the noise of the mission predicts; 95 of 100 points lie in the shaded \
+         area where that is all.",
+        &lines(c, amplitude)?,
+    );
+    section(
+        &mut out,
+        "Measured over predicted",
+        "The same, power over predicted power. Where the model is right the line is 1, and 95 of 100 points lie in the shaded area. \
+         Above it there is something that nobody predicted; below it the model takes away more than there was.",
+        &lines(c, ratio)?,
+    );
+    let maps: Vec<HeatMap> = c.channels.iter().map(|channel| map(c, channel)).collect();
+    section(
+        &mut out,
+        "When",
+        "The same hour by hour. Red is louder than predicted, blue quieter. Single cells of low frequency scatter widely, as an hour holds \
+         few of their waves: a frame marks the cells for which chance is no excuse.",
+        &heat::svg(&maps, COLUMNS, "measured over predicted power; a frame where that is no chance")
+            .map_err(Failure::engine)?,
+    );
+    section(
+        &mut out,
+        "Is it white?",
+        "All power up to a frequency, less what it should be. For noise of the predicted shape, at whatever level, the line wanders \
+         between the dashed limits.",
+        &lines(c, cumulative)?,
+    );
+    out += "<h2>What goes with it</h2>\n<p>Housekeeping whose course goes with what is left over, below 50 mHz, by the part of the power that \
+            it shares in its best band. A place to look and no cause: currents of thrusters follow the commands, and these the noise.</p>\n";
+    out += &bars(c);
+    Ok(out + "</body></html>\n")
+}
+
+fn section(out: &mut String, title: &str, caption: &str, picture: &str) {
+    // The page is one document: what an SVG file begins with has no place inside.
+    let picture = picture.find("<svg").map_or(picture, |at| &picture[at..]);
+    let _ = writeln!(out, "<h2>{title}</h2>\n<p>{caption}</p>\n{picture}");
+}
+
+fn escape(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+}
+
+fn table(c: &Comparison, word: impl Fn(bool) -> &'static str) -> String {
+    let mut out =
+        "<table><tr><th>channel<th>verdict<th>χ²/dof<th>with fitted noise levels<th>excess<th>fails in</tr>\n"
+            .to_owned();
+    for channel in &c.channels {
+        let failed: Vec<&str> = channel.tests.iter().filter(|t| !t.passes).map(|t| t.name).collect();
+        let kind = match channel.kind {
+            Kind::Channel => "",
+            Kind::Common => " (what both test masses see)",
+            Kind::Null => " (no force on the spacecraft reaches it)",
+        };
+        let _ = writeln!(
+            out,
+            "<tr><td>{}{kind}<td>{}<td>{:.4} ± {:.4}<td>{:.4}<td>{:.0} %<td>{}</tr>",
+            escape(&channel.name),
+            if channel.tests.is_empty() { "not tested: its noise is not known" } else { word(channel.passes) },
+            channel.chi2_per_dof,
+            (2.0 / channel.dof).sqrt(),
+            channel.chi2_per_dof_fitted_levels,
+            100.0 * channel.unexplained,
+            failed.join(", ")
+        );
+    }
+    out + "</table>\n"
+}
+
+fn lines(c: &Comparison, of: fn(&Channel) -> Panel) -> Result<String, Failure> {
+    svg(&c.channels.iter().map(of).collect::<Vec<_>>(), COLUMNS).map_err(Failure::engine)
+}
+
+fn line(label: &str, colour: usize, stroke: Stroke, points: Vec<(f64, f64)>) -> Line {
+    Line { label: label.to_owned(), colour, stroke, points }
+}
+
+/// A panel over frequency.
+fn over_frequency(channel: &Channel, y_label: &str, lines: Vec<Line>) -> Panel {
+    let ends = [channel.frequency_hz.first(), channel.frequency_hz.last()].map(|f| f.copied().unwrap_or(1.0));
+    Panel {
+        title: channel.name.clone(),
+        x_label: "frequency / Hz".to_owned(),
+        y_label: y_label.to_owned(),
+        x_scale: Scale::Logarithmic,
+        y_scale: Scale::Logarithmic,
+        x: 0.9 * ends[0]..1.1 * ends[1],
+        y: None,
+        lines,
+    }
+}
+
+/// The interval around one, times what `of` makes of each frequency, round and back.
+fn area(channel: &Channel, of: impl Fn(usize, f64) -> f64) -> Line {
+    let n = channel.frequency_hz.len();
+    let end = |b: usize, k: usize| (channel.frequency_hz[b], of(b, channel.interval_95[b][k]));
+    line("95 of 100", 6, Stroke::Area, (0..n).map(|b| end(b, 0)).chain((0..n).rev().map(|b| end(b, 1))).collect())
+}
+
+fn amplitude(channel: &Channel) -> Panel {
+    let root = |psd: &[f64]| channel.frequency_hz.iter().zip(psd).map(|(f, p)| (*f, p.max(0.0).sqrt())).collect();
+    let unit = if channel.name.starts_with("sc.") { "rad s⁻² Hz^-1/2" } else { "m s⁻² Hz^-1/2" };
+    let around = area(channel, |b, ratio| (ratio * channel.predicted_psd[b]).sqrt());
+    let measured = line("measured", 0, Stroke::Solid, root(&channel.measured_psd));
+    let predicted = line("predicted", 1, Stroke::Dashed, root(&channel.predicted_psd));
+    over_frequency(channel, unit, vec![around, measured, predicted])
+}
+
+fn ratio(channel: &Channel) -> Panel {
+    let f = &channel.frequency_hz;
+    let measured = f.iter().zip(channel.measured_psd.iter().zip(&channel.predicted_psd)).map(|(f, (m, p))| (*f, m / p));
+    let lines = vec![area(channel, |_, ratio| ratio), line("measured", 0, Stroke::Solid, measured.collect())];
+    Panel { y: Some(0.1..10.0), ..over_frequency(channel, "measured / predicted power", lines) }
+}
+
+fn cumulative(channel: &Channel) -> Panel {
+    let limit = channel.cumulative_limit;
+    let apart = channel.cumulative.iter().map(|[expected, power]| (*expected, power - expected)).collect();
+    let flat = |y: f64| vec![(0.0, y), (0.999_999, y)];
+    let most = channel.cumulative.iter().map(|[e, p]| (p - e).abs()).fold(1.5 * limit, f64::max);
+    Panel {
+        title: channel.name.clone(),
+        x_label: "part of all frequencies".to_owned(),
+        y_label: "part of the power, less expected".to_owned(),
+        x_scale: Scale::Linear,
+        y_scale: Scale::Linear,
+        x: 0.0..1.0,
+        y: Some(-1.1 * most..1.1 * most),
+        lines: vec![
+            line("measured", 0, Stroke::Solid, apart),
+            line("limits", 1, Stroke::Dashed, flat(limit)),
+            line("", 1, Stroke::Dashed, flat(-limit)),
+        ],
+    }
+}
+
+/// Hours to the right, bands upwards.
+fn map(c: &Comparison, channel: &Channel) -> HeatMap {
+    let first = c.hours_ns.first().copied().unwrap_or(0);
+    let hour = |ns: i64| (ns - first) as f64 / 3600e9;
+    let count = channel.map.iter().flatten().filter(|cell| cell.chi2_per_dof.is_some()).count();
+    let mut cells = Vec::new();
+    for (row, start) in channel.map.iter().zip(&c.hours_ns) {
+        for (b, Cell { band_hz, chi2_per_dof, dof }) in row.iter().enumerate() {
+            let Some(ratio) = *chi2_per_dof else { continue };
+            cells.push(heat::Cell {
+                x: [hour(*start), hour(*start) + 1.0],
+                // Up to where the next band begins.
+                y: [band_hz[0], row.get(b + 1).map_or(band_hz[1], |next| next.band_hz[0])],
+                ratio,
+                framed: !channel.tests.is_empty()
+                    && corrected(two_sided(ratio, *dof), count) < c.false_alarm_rate_per_test,
+            });
+        }
+    }
+    HeatMap { title: channel.name.clone(), x_label: "hour".to_owned(), y_label: "frequency / Hz".to_owned(), cells }
+}
+
+fn bars(c: &Comparison) -> String {
+    if c.coherences.is_empty() {
+        return "<p>None.</p>\n".to_owned();
+    }
+    let mut out = "<table><tr><th>housekeeping<th>channel<th>part of the power<th></tr>\n".to_owned();
+    for w in c.coherences.iter().take(BARS) {
+        let percent = 100.0 * w.coherence.explained;
+        let _ = writeln!(
+            out,
+            "<tr><td>{}<td>{}<td><div class=track><div class=bar style=\"width:{percent:.1}%\"></div></div><td>{percent:.0} %</tr>",
+            escape(&w.coherence.driver),
+            escape(&w.coherence.channel)
+        );
+    }
+    out + "</table>\n"
+}

@@ -1,0 +1,124 @@
+//! Chances: tails of χ² and of Kolmogorov's distribution, exact where an approximation of a tail would decide.
+
+/// `ln Γ(x)` for `x > 0` (Lanczos, g = 7, to 1e-14).
+fn ln_gamma(x: f64) -> f64 {
+    const C: [f64; 8] = [
+        676.520_368_121_885_1,
+        -1_259.139_216_722_402_8,
+        771.323_428_777_653_1,
+        -176.615_029_162_140_6,
+        12.507_343_278_686_905,
+        -0.138_571_095_265_720_12,
+        9.984_369_578_019_572e-6,
+        1.505_632_735_149_311_6e-7,
+    ];
+    let x = x - 1.0;
+    let sum = C.iter().enumerate().fold(0.999_999_999_999_809_9, |sum, (i, c)| sum + c / (x + i as f64 + 1.0));
+    let t = x + 7.5;
+    0.5 * std::f64::consts::TAU.ln() + (x + 0.5) * t.ln() - t + sum.ln()
+}
+
+/// Chances that χ² of `dof` degrees of freedom lies below and above `dof * per_dof`: the incomplete gamma functions, by their series
+/// below the mean and their continued fraction above it (Abramowitz and Stegun 6.5.29 and 6.5.31).
+#[must_use]
+pub fn chi2_tails(per_dof: f64, dof: f64) -> (f64, f64) {
+    let (a, x) = (0.5 * dof, 0.5 * dof * per_dof);
+    if x.is_nan() || x <= 0.0 || a <= 0.0 {
+        return (0.0, 1.0);
+    }
+    let leading = (a * x.ln() - x - ln_gamma(a)).exp();
+    if x < a + 1.0 {
+        let (mut term, mut sum, mut n) = (1.0 / a, 1.0 / a, a);
+        while term > 1e-17 * sum {
+            n += 1.0;
+            term *= x / n;
+            sum += term;
+        }
+        let below = (leading * sum).min(1.0);
+        return (below, 1.0 - below);
+    }
+    let (mut b, mut c) = (x + 1.0 - a, f64::MAX);
+    let mut d = 1.0 / b;
+    let mut fraction = d;
+    // Some √a steps are enough.
+    for i in 1..100_000 {
+        let i = f64::from(i);
+        let an = -i * (i - a);
+        b += 2.0;
+        d = 1.0 / (an * d + b);
+        c = b + an / c;
+        fraction *= c * d;
+        if (c * d - 1.0).abs() < 1e-15 {
+            break;
+        }
+    }
+    let above = (leading * fraction).min(1.0);
+    (1.0 - above, above)
+}
+
+/// Chance of a χ²/dof at least as far out as this, on either side.
+#[must_use]
+pub fn two_sided(per_dof: f64, dof: f64) -> f64 {
+    let (below, above) = chi2_tails(per_dof, dof);
+    (2.0 * below.min(above)).min(1.0)
+}
+
+/// The χ²/dof below which a part `p` of all draws lies.
+#[must_use]
+pub fn chi2_per_dof_quantile(p: f64, dof: f64) -> f64 {
+    let (mut low, mut high) = (0.0, 1.0);
+    while chi2_tails(high, dof).0 < p && high < 1e9 {
+        high *= 2.0;
+    }
+    for _ in 0..60 {
+        let middle = 0.5 * (low + high);
+        if chi2_tails(middle, dof).0 < p { low = middle } else { high = middle }
+    }
+    0.5 * (low + high)
+}
+
+/// Chance that the largest distance of a Brownian bridge from zero exceeds `x` (Kolmogorov 1933).
+#[must_use]
+pub fn kolmogorov(x: f64) -> f64 {
+    // The alternating series needs many terms where the chance is one anyway.
+    if x < 0.2 {
+        return 1.0;
+    }
+    let term = |k: i32| f64::from(if k % 2 == 1 { 2 } else { -2 }) * (-2.0 * (f64::from(k) * x).powi(2)).exp();
+    (1..50).map(term).sum::<f64>().clamp(0.0, 1.0)
+}
+
+/// Chance of a p-value as small as `p` in the best of `tried`: `1 − (1 − p)^n`.
+#[must_use]
+pub fn corrected(p: f64, tried: usize) -> f64 {
+    (-(tried as f64 * (-p).ln_1p()).exp_m1()).clamp(0.0, 1.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Tables of χ²: P(χ²₁ > 3.841459) = 0.05, P(χ²₂ > 2 ln 100) = 0.01, P(χ²₂₀ < 10.85081) = 0.05, P(χ²₉ > 60) = 1.3378e-9, and
+    /// `P(χ²₂ > 2x) = e^{-x}` far out.
+    #[test]
+    fn tails_are_those_of_the_tables() {
+        let above = |chi2: f64, dof: f64| chi2_tails(chi2 / dof, dof).1;
+        assert!((above(3.841_459, 1.0) - 0.05).abs() < 1e-7);
+        assert!((above(2.0 * 100f64.ln(), 2.0) - 0.01).abs() < 1e-12);
+        assert!((chi2_tails(10.850_81 / 20.0, 20.0).0 - 0.05).abs() < 1e-6);
+        assert!((above(120.0, 2.0) / (-60f64).exp() - 1.0).abs() < 1e-10);
+        // A hundred thousand degrees of freedom, two deviations up: the normal 0.022750 and Edgeworth's √(8/dof)/6 (z²−1) φ(z).
+        let far = above(1e5 + 2.0 * (2e5f64).sqrt(), 1e5);
+        assert!((far / (0.022_750 + 0.000_241) - 1.0).abs() < 1e-3, "{far}");
+        for (p, dof) in [(0.025, 3.0), (0.975, 3.0), (0.5, 1e4)] {
+            assert!((chi2_tails(chi2_per_dof_quantile(p, dof), dof).0 - p).abs() < 1e-9);
+        }
+    }
+
+    /// The classical 5 % point 1.3581 and 1 % point 1.6276.
+    #[test]
+    fn kolmogorov_s_points_are_those_of_the_tables() {
+        assert!((kolmogorov(1.358_1) - 0.05).abs() < 1e-5 && (kolmogorov(1.627_6) - 0.01).abs() < 1e-5);
+        assert!(kolmogorov(0.1) == 1.0 && (kolmogorov(0.3) - 1.0).abs() < 1e-4);
+    }
+}
