@@ -54,7 +54,7 @@ pub(crate) enum Colour {
 
 #[derive(Debug, Subcommand)]
 pub(crate) enum Command {
-    /// Simulate six hours, calibrate them and show the result
+    /// A story: simulate hours with a hidden effect, calibrate, diagnose, mend the model, open the seal
     Demo {
         /// Folder for everything that the demo writes
         #[arg(long, value_name = "DIR", default_value = "dragfree-demo")]

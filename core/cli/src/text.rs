@@ -51,6 +51,24 @@ pub(crate) fn columns(rows: &[Vec<String>]) -> String {
     text
 }
 
+/// A sentence broken at [`WIDTH`].
+pub(crate) fn wrapped(sentence: &str) -> String {
+    let mut text = String::new();
+    let mut column = 0;
+    for word in sentence.split_whitespace() {
+        if column > 0 && column + 1 + width(word) > WIDTH {
+            text.push('\n');
+            column = 0;
+        } else if column > 0 {
+            text.push(' ');
+            column += 1;
+        }
+        text += word;
+        column += width(word);
+    }
+    text + "\n"
+}
+
 /// `label` and then `words`, broken at [`WIDTH`] and indented under the first word.
 pub(crate) fn labelled(label: &str, words: &str) -> String {
     const INDENT: usize = 10;
@@ -166,5 +184,7 @@ mod tests {
         assert!(text.lines().all(|line| width(line) <= WIDTH), "{text}");
         assert!(text.lines().skip(1).all(|line| line.starts_with("          word")), "{text}");
         assert_eq!(labelled("a", ""), "a\n");
+        let text = wrapped(&"word ".repeat(40));
+        assert!(text.lines().count() == 3 && text.lines().all(|line| width(line) <= WIDTH), "{text}");
     }
 }
