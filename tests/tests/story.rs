@@ -100,7 +100,7 @@ fn sizes_of_the_simulator_are_coefficients_of_the_models() {
     let at = |name: &str| dir.path().join(name);
     let mut simulate = dragfree(dir.path());
     simulate.arg("simulate").arg(fixture("missions/taiji.toml")).args(["--out", "out", "--hours", "0.05", "--json"]);
-    asked.iter().for_each(|effect| drop(simulate.args(["--effect", effect])));
+    simulate.args(asked.iter().flat_map(|effect| ["--effect", effect]));
     let made = json(simulate.args(["--hidden", "38"]), 0);
     let sealed = Path::new(made["sealed_file"].as_str().expect("a sealed file"));
     std::fs::write(at("d.json"), told()["story"]["diagnosis"].to_string()).expect("writable");

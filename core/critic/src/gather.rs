@@ -146,7 +146,7 @@ impl Gathered {
 /// Gathers segments.
 pub struct Gatherer {
     /// Bands of the sums.
-    plan: Plan,
+    whole: Plan,
     /// Bands below [`SLOW_HZ`].
     low_bands: usize,
     short: Plan,
@@ -227,34 +227,31 @@ impl Bench {
 }
 
 impl Gatherer {
-    /// A gatherer of short segments of `length` samples. `residual` (channels × base columns) makes residuals, `inverse` is `Σ⁻¹` at a
-    /// frequency in Hz: with both the witnesses are heard.
+    /// A gatherer of short segments of `length` samples. `witnesses` are made for the plan of long segments; their housekeeping follows
+    /// the columns.
     #[must_use]
     pub fn new(
         columns: Columns,
         length: usize,
         rate_hz: f64,
         threads: usize,
-        housekeeping: Vec<String>,
-        residual: DMatrix<f64>,
-        inverse: impl Fn(f64) -> DMatrix<f64>,
+        witnesses: impl FnOnce(&Plan) -> Witnesses,
         search: Search,
     ) -> Self {
         let threads = threads.max(1);
-        let (plan, short) = (Plan::new(LONG * length, rate_hz), Plan::new(length, rate_hz));
+        let (whole, short) = (Plan::new(LONG * length, rate_hz), Plan::new(length, rate_hz));
         let (long, factor) = low_plan(length, rate_hz);
-        let slow = |b: usize| plan.bin_hz(plan.bands[b].end as f64) <= SLOW_HZ;
-        let low_bands = (0..plan.bands.len().min(long.bands.len())).take_while(|b| slow(*b)).count();
-        let decimator =
-            Decimator::new(factor, columns.names.len() + housekeeping.len(), (1e9 / rate_hz).round() as i64);
-        let whitening = long.bands.iter().map(|b| inverse(long.frequency_hz(*b))).collect();
-        let all = vec![false; columns.names.len() + housekeeping.len()];
-        let gram = Gram::zero(&columns, &plan);
+        let slow = |b: usize| whole.bin_hz(whole.bands[b].end as f64) <= SLOW_HZ;
+        let low_bands = (0..whole.bands.len().min(long.bands.len())).take_while(|b| slow(*b)).count();
+        let witnesses = witnesses(&long);
+        let all = columns.names.len() + witnesses.names.len();
+        let decimator = Decimator::new(factor, all, (1e9 / rate_hz).round() as i64);
+        let gram = Gram::zero(&columns, &whole);
         Self {
             low_bands,
             bench: Bench::new(&short, columns.fast, threads),
             search,
-            segmenter: Segmenter::new(long.length, decimator.step_ns(), all),
+            segmenter: Segmenter::new(long.length, decimator.step_ns(), vec![false; all]),
             decimator,
             long_bench: Bench::new(&long, columns.names.len(), threads),
             gathered: Gathered {
@@ -262,11 +259,11 @@ impl Gatherer {
                 rate_hz,
                 sets: [gram.clone(), gram],
                 hours: Vec::new(),
-                witnesses: Witnesses::new(housekeeping, &long, residual, whitening),
+                witnesses,
                 transients: Transients::default(),
                 columns,
             },
-            plan,
+            whole,
             short,
             long,
         }
@@ -299,7 +296,7 @@ impl Gatherer {
         let low = Low {
             response: self.decimator.response(),
             rate_hz: self.short.rate_hz,
-            plan: &self.plan,
+            whole: &self.whole,
             low_bands: self.low_bands,
             long: &self.long,
             bench: &mut self.long_bench,
@@ -337,10 +334,10 @@ impl Cuts for Gatherer {
         let columns = &columns[..self.gathered.columns.fast];
         let middle_ns = middle_ns(first_ns, columns, self.short.rate_hz);
         let set = &mut self.gathered.sets[set_of(middle_ns)];
-        let bands = self.low_bands..self.plan.bands.len();
+        let bands = self.low_bands..self.whole.bands.len();
         self.bench.transform(&self.short, taper, columns);
-        self.bench.multiply(&self.plan.bins(taper + HALVINGS)[bands.clone()], &mut set.bands[bands.clone()]);
-        set.weights.count_bands(&self.plan, taper + HALVINGS, overlaps, bands);
+        self.bench.multiply(&self.whole.bins(taper + HALVINGS)[bands.clone()], &mut set.bands[bands.clone()]);
+        set.weights.count_bands(&self.whole, taper + HALVINGS, overlaps, bands);
         set.weights.segments += 1;
         self.hour(taper, middle_ns);
         if taper == 0 {
@@ -369,7 +366,7 @@ struct Low<'a> {
     response: Response,
     /// Samples per second before it.
     rate_hz: f64,
-    plan: &'a Plan,
+    whole: &'a Plan,
     low_bands: usize,
     long: &'a Plan,
     bench: &'a mut Bench,
@@ -393,7 +390,7 @@ impl Cuts for Low<'_> {
         let set = &mut self.gathered.sets[set_of(middle_ns(first_ns, columns, self.long.rate_hz))];
         let bands = 0..self.low_bands;
         self.bench.multiply(&self.long.bins(taper)[bands.clone()], &mut set.bands[bands.clone()]);
-        set.weights.count_bands(self.plan, taper, overlaps, bands);
+        set.weights.count_bands(self.whole, taper, overlaps, bands);
         let base = self.bench.base(self.gathered.columns.base);
         self.gathered.witnesses.segment(self.long, taper, housekeeping, &base, overlaps);
     }

@@ -9,6 +9,7 @@ use dragfree_critic::gather::{Columns, Gatherer, SLOW_HZ};
 use dragfree_critic::question::{Coefficient as Asked, Form, Question, Rule, Term};
 use dragfree_critic::record::Record;
 use dragfree_critic::transient::{Search, Template};
+use dragfree_critic::witness::Witnesses;
 use dragfree_estimation::estimate::{Observed, Refinement, estimate_with};
 use dragfree_estimation::segments::{Segmenter, longest_length};
 use dragfree_estimation::sigma::{Measured, NoiseModel};
@@ -178,6 +179,10 @@ impl Critic {
             let nothing = DMatrix::zeros(sigma.nrows(), sigma.ncols());
             sigma.cholesky().map_or(nothing, |c| c.inverse())
         };
+        let witnesses = |plan: &Plan| {
+            let whitening = plan.bands.iter().map(|b| inverse(plan.frequency_hz(*b))).collect();
+            Witnesses::new(topics, plan, residual, whitening)
+        };
         let averaged: Vec<bool> = (0..columns.len())
             .map(|i| (all.channels..names.len()).contains(&i) && differenced.iter().any(|d| *d))
             .collect();
@@ -188,7 +193,7 @@ impl Critic {
             waiting: true,
             segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged),
             base: all.base,
-            gatherer: Gatherer::new(all, length, rate_hz, self.threads, topics, residual, inverse, search),
+            gatherer: Gatherer::new(all, length, rate_hz, self.threads, witnesses, search),
             columns,
             names,
             question,
