@@ -31,11 +31,16 @@ fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
 /// What a crate of ours may depend on among our crates.
 fn allowed(crate_name: &str) -> &'static [&'static str] {
     match crate_name {
-        "dragfree-abi" | "dragfree-physics" | "dragfree-chart" => &[],
+        "dragfree-abi" | "dragfree-physics" | "dragfree-chart" | "dragfree-score" => &[],
         "dragfree-sdk" | "dragfree-engine" => &["dragfree-abi"],
-        "dragfree" => {
-            &["dragfree-engine", "dragfree-physics", "dragfree-chart", "dragfree-critic", "dragfree-estimation"]
-        }
+        "dragfree" => &[
+            "dragfree-engine",
+            "dragfree-physics",
+            "dragfree-chart",
+            "dragfree-critic",
+            "dragfree-estimation",
+            "dragfree-score",
+        ],
         "dragfree-validation" => &["dragfree-engine", "dragfree-physics", "dragfree-chart"],
         "dragfree-estimation" => &["dragfree-physics"],
         "dragfree-critic" => &["dragfree-physics", "dragfree-estimation"],

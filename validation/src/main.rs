@@ -3,7 +3,7 @@
 use clap::{Args, Parser, Subcommand};
 use dragfree_validation::campaign::{self, CampaignError, note};
 use dragfree_validation::program::{Program, root};
-use dragfree_validation::{report, speed, table};
+use dragfree_validation::{blind, report, speed, table};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -25,6 +25,8 @@ enum Command {
     Coverage(Coverage),
     /// The table to beat: 25 days in three regimes of noise; goes on where it was stopped
     Table(Table),
+    /// Hide effects, diagnose, and score when the seals are opened; goes on where it was stopped
+    Blind(Blind),
     /// Measure ratios of speed, on a machine that does nothing else
     Speed,
     /// Write the generated parts of VALIDATION.md and the picture from the results
@@ -59,6 +61,22 @@ struct Table {
     results: Option<PathBuf>,
 }
 
+#[derive(Debug, Args)]
+struct Blind {
+    /// Seeds, FIRST-LAST; those up to 100 served to develop the method
+    #[arg(long, value_parser = seeds, default_value = "101-300")]
+    seeds: RangeInclusive<u32>,
+    /// Length of the data, h
+    #[arg(long, default_value_t = 6.0)]
+    hours: f64,
+    /// Diagnoses at a time; each takes some 2 GB of memory
+    #[arg(long, default_value_t = AT_ONCE)]
+    at_once: usize,
+    /// File of results
+    #[arg(long, value_name = "FILE")]
+    results: Option<PathBuf>,
+}
+
 const AT_ONCE: usize = 2;
 const SEEDS: RangeInclusive<u32> = 1..=100;
 
@@ -84,6 +102,10 @@ fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
         Command::Table(t) => {
             let file = t.results.as_ref().unwrap_or(&table_file);
             table::table(&Program::build()?, &t.seeds, t.days, t.at_once, file, &scratch)
+        }
+        Command::Blind(b) => {
+            let file = b.results.clone().unwrap_or_else(|| results.join("blind.jsonl"));
+            blind::blind(&Program::build()?, b.seeds.clone(), b.hours, b.at_once, &file, &scratch)
         }
         Command::Speed => speed::measure(&Program::build()?, &speed_file, &scratch),
         Command::Report => report::write(&results),

@@ -72,6 +72,15 @@ pub struct Simulated {
     pub truth_m: [f64; 6],
 }
 
+/// Telemetry of one simulation with something hidden in it, and its sealed truth, which lies elsewhere.
+#[derive(Clone, Debug)]
+pub struct Hidden {
+    /// The files, oldest first.
+    pub files: Vec<PathBuf>,
+    /// The sealed file.
+    pub sealed: PathBuf,
+}
+
 /// What `run` is given besides the telemetry.
 #[derive(Clone, Debug, Default)]
 pub struct Chain {
@@ -171,6 +180,53 @@ impl Program {
             *value = *truth.get(&key).ok_or_else(|| missing(&command, &key))?;
         }
         Ok(Simulated { files: paths("files"), truth_m })
+    }
+
+    /// Simulates with what a seed hides, into `folder`, and moves the truth away from the telemetry.
+    ///
+    /// # Errors
+    /// [`ProgramError`].
+    pub fn hide(&self, mission: &Path, folder: &Path, seed: u32, hours: f64) -> Result<Hidden, ProgramError> {
+        let (telemetry, away) = (folder.join("telemetry"), folder.join("sealed"));
+        let mut command = self.command();
+        command.arg("simulate").arg(mission).arg("--out").arg(&telemetry).arg("--json");
+        for (option, value) in
+            [("--hidden", seed.to_string()), ("--seed", seed.to_string()), ("--hours", hours.to_string())]
+        {
+            command.args([option, &value]);
+        }
+        let made = json(&mut command, &[0])?;
+        let sealed = made["sealed_file"].as_str().map(Path::new).ok_or_else(|| missing(&command, "sealed_file"))?;
+        let file = |reason: String| ProgramError::File { path: sealed.to_owned(), reason };
+        let (Some(truth), Some(name)) = (sealed.parent(), sealed.file_name()) else {
+            return Err(file("it has no folder".to_owned()));
+        };
+        std::fs::rename(truth, &away).map_err(|e| file(e.to_string()))?;
+        let files =
+            made["files"].as_array().into_iter().flatten().filter_map(Value::as_str).map(PathBuf::from).collect();
+        Ok(Hidden { files, sealed: away.join(name) })
+    }
+
+    /// Which effect is missing from the model of a product.
+    ///
+    /// # Errors
+    /// [`ProgramError`].
+    pub fn diagnose(&self, product: &Value, archive: &Path) -> Result<Value, ProgramError> {
+        let mut command = self.command();
+        let id = product["id"].as_str().ok_or_else(|| missing(&command, "id"))?;
+        command.arg("diagnose").arg(id).arg("--archive").arg(archive).arg("--json");
+        json(&mut command, &[0])
+    }
+
+    /// Opens the seal and gives the score of a diagnosis.
+    ///
+    /// # Errors
+    /// [`ProgramError`].
+    pub fn reveal(&self, hidden: &Hidden, diagnosis: &Path) -> Result<Value, ProgramError> {
+        let mut command = self.command();
+        command.arg("reveal").arg(&hidden.sealed).arg("--diagnosis").arg(diagnosis);
+        command.args(hidden.files.iter().flat_map(|file| [OsStr::new("--telemetry"), file.as_os_str()]));
+        Ok(json(command.arg("--json"), &[0])?["score"].take())
     }
 
     /// Runs a chain over telemetry and gives the product as JSON. Loss of data and an inconsistent model are results.

@@ -272,12 +272,15 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
     })
 }
 
-/// Independent short segments that would know as much of the lowest band of short segments.
+/// Independent short segments that would know as much of the lowest octave of short segments. One band is too narrow to tell: a bin
+/// of a short segment serves many bands of the long ones, and counts in one of them.
 fn short_segments(court: &Court<'_>) -> f64 {
     let plan = court.plan();
-    let observations = court.total.weights.observations(plan);
-    let lowest = plan.bands.iter().position(|b| b.first >= LONG * FIRST_BIN);
-    lowest.map_or(0.0, |b| observations[b] * LONG as f64 / plan.bands[b].bins() as f64)
+    let octave = LONG * FIRST_BIN..2 * LONG * FIRST_BIN;
+    let bands =
+        plan.bands.iter().zip(court.total.weights.observations(plan)).filter(|(b, _)| octave.contains(&b.first));
+    let (bins, observations) = bands.fold((0, 0.0), |(bins, sum), (b, n)| (bins + b.bins(), sum + n));
+    observations * LONG as f64 / bins.max(1) as f64
 }
 
 /// A candidate as it stands beside a fit.

@@ -14,7 +14,6 @@ pub mod registry;
 pub mod replay;
 pub mod revisions;
 pub mod run;
-pub mod score;
 pub mod sealed;
 pub mod simulate;
 pub mod table;

@@ -5,8 +5,8 @@ use crate::args::{Global, Reveal};
 use crate::failure::Failure;
 use crate::text::{self, Paint, columns, labelled};
 use dragfree_engine::border::Kind;
-use dragfree_engine::score::{Compared, Outcome, Score, Scored, Verdict, score};
 use dragfree_engine::sealed::Sealed;
+use dragfree_score::{Compared, Outcome, Score, Scored, Verdict, score};
 use serde_json::Value;
 use std::path::Path;
 
