@@ -1,8 +1,8 @@
 //! Sums over everything that might explain the data: channels, the model's series and those of every candidate, cut once.
 //!
 //! Per band the Gram matrix `Σ Re(x* xᵀ)` of all columns, by matrix products, so that any model made of them is solved and ranked
-//! without reading the data again. What the data of every second stretch of time say is kept apart from the rest: a cause must help
-//! in both.
+//! without reading the data again. What the data of every second stretch of time say is kept apart from the rest: the
+//! two must not contradict each other about a cause.
 //!
 //! Time is cut twice. Segments of one length serve the bands from [`SLOW_HZ`] on; segments [`LONG`] times as long, of samples that
 //! [`crate::decimate`] has thinned out, serve those below, where heat, charge and drifts act and where a short segment sees nothing
@@ -30,8 +30,8 @@ const HALVINGS: usize = LONG.ilog2() as usize;
 /// Thinned samples come at least this many times as often as [`SLOW_HZ`]: what folds there is then weaker by 1e7.
 const THIN: f64 = 6.0;
 
-/// Stretches of this length go to the first and the second set in turn, s: three hours, the least that a diagnosis is asked of,
-/// have one of each, and the middles of long segments that follow each other lie in different ones more often than not.
+/// Stretches of this length go to the first and the second set in turn, s: a choice, so that three hours have one of each. A long
+/// segment spans several and belongs to that of its middle.
 const STRETCH_S: f64 = 1.5 * 3600.0;
 
 /// The map of where the model fails has one row for this time, ns.

@@ -225,12 +225,6 @@ impl Witnesses {
         all.sort_by(|a, b| b.statistic.total_cmp(&a.statistic));
         all
     }
-
-    /// Drivers that were tried.
-    #[must_use]
-    pub fn tried(&self) -> usize {
-        self.drivers.len()
-    }
 }
 
 impl Driver {
