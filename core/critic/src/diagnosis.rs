@@ -37,6 +37,12 @@ const LIMIT_QUANTILE: f64 = 1.645;
 /// An excess is looked at when the power of a third of a decade is above the modelled by this.
 const EXCESS: f64 = 1.25;
 
+/// Chance that any driver passes for a witness when none is: a part of [`FALSE_ALARM`], the most of which is left to effects.
+const WITNESS_ALARM: f64 = 1e-3;
+
+/// What lies wholly below this is a drift: slower than an hour.
+const DRIFT_HZ: f64 = 1.0 / 3600.0;
+
 /// Why there is no diagnosis.
 #[derive(Debug, thiserror::Error)]
 pub enum DiagnosisError {
@@ -477,7 +483,8 @@ fn limits(court: &Court<'_>, rest: &[Scored], named: &[Found]) -> Vec<Limit> {
     out
 }
 
-/// Power beyond the modelled noise, channel by channel in thirds of a decade, and what is coherent with it.
+/// Power beyond the modelled noise, channel by channel in thirds of a decade, and what of the telemetry is coherent with what is
+/// left over: either is a sign of something that no effect explains, and a slow force shows by the second long before the first.
 fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
     let plan = court.plan();
     let channels = &court.question.channels;
@@ -493,15 +500,20 @@ fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
     let all = court.gathered.witnesses.coherences(channels);
     let trials = all.len().max(1);
     let significant: Vec<Coherence> =
-        all.into_iter().filter(|w| corrected(tail(w.statistic, w.dof), trials) < FALSE_ALARM).collect();
-    // Without an excess a coherence means nothing: currents of thrusters follow the commands, and these the noise.
+        all.into_iter().filter(|w| corrected(tail(w.statistic, w.dof), trials) < WITNESS_ALARM).collect();
+    if loud.is_empty() {
+        // What explains a part of the power leaves the rest: so much more there is than without it.
+        let of = |w: &Coherence| channels.iter().position(|c| *c == w.channel);
+        let best = significant.first()?;
+        loud.push((of(best)?, best.band_hz, (1.0 - best.explained.clamp(0.0, 0.999)).recip()));
+    }
     let (_, band_hz, ratio) = *loud.iter().max_by(|a, b| a.2.total_cmp(&b.2))?;
     let mut names: Vec<String> = loud.iter().map(|(c, _, _)| channels[*c].clone()).collect();
     names.sort();
     names.dedup();
     let kind = if court.gathered.transients.hits.iter().any(|h| h.significance() > 10.0) {
         "transient"
-    } else if band_hz[1] < 2.0 * plan.bin_hz(plan.bands[0].first as f64) {
+    } else if band_hz[1] < DRIFT_HZ {
         "drift"
     } else {
         "broadband"

@@ -1,7 +1,7 @@
 //! Housekeeping as witness: which channel of the telemetry is coherent with what nobody explains.
 //!
 //! For each housekeeping value, its derivative, its square and the products of two, the complex cross-spectrum with `Σ⁻¹ r` of the
-//! residuals r, which is what is left of each channel when all others are known (what acts on one test mass is seen there, far below
+//! residuals r, each at unit power, which is what is left of each channel when all others are known (what acts on one test mass is seen there, far below
 //! the thrusters' noise, which moves all of them and which their own currents follow),
 //! is summed over long segments, in wide bands below [`crate::gather::SLOW_HZ`]. A lag between cause and force turns the phase and leaves
 //! the coherence. For n complex observations without relation `−2n log(1 − |γ|²)` is χ² with two degrees of freedom (Goodman 1957).
@@ -160,7 +160,9 @@ impl Witnesses {
             let (start, end) = (2 * (first - FIRST_BIN), 2 * (band.end.div_ceil(ratio).max(first) - FIRST_BIN));
             let end = end.min(residual.nrows());
             if start < end {
-                let white = residual.rows(start, end - start) * inverse;
+                // Each of unit power, so that a band is as loud at one end as at the other.
+                let unit = DMatrix::from_diagonal(&inverse.diagonal().map(|x| x.sqrt().recip()));
+                let white = residual.rows(start, end - start) * (inverse * unit);
                 residual.rows_mut(start, end - start).copy_from(&white);
             }
         }

@@ -1,6 +1,7 @@
-//! One standard deviation of every effect's SIZE after a day of the bundled mission, for the table in `src/hidden.rs`.
+//! One standard deviation of every effect's SIZE after so many hours of the bundled mission, for the table in `src/hidden.rs`:
+//! `expected_sigma HOURS [EFFECT]`.
 //!
-//! A day is simulated twice with the same random numbers, without an effect and with a small one. The difference of the
+//! The time is simulated twice with the same random numbers, without an effect and with a small one. The difference of the
 //! nine residual channels is the effect's regressor, the controller's answer taken out by the commands. The Fisher
 //! information of it under the mission's noise, after the six offsets (with the surveyed baseline) and a constant and a
 //! slope per channel are fitted, gives σ. For an excess of noise it is that of the spectra.
@@ -15,7 +16,6 @@ use realfft::RealFftPlanner;
 use std::f64::consts::TAU;
 
 const DT_S: f64 = 0.1;
-const DAY: usize = 864_000;
 const CHANNELS: usize = 9;
 type Channels = SMatrix<Complex<f64>, CHANNELS, CHANNELS>;
 
@@ -70,7 +70,7 @@ struct Sample {
 }
 
 /// Nine residual channels, and with them `α` as the offsets' regressors need it.
-fn residuals(mission: &Mission, effect: Option<&str>) -> (Vec<Vec<f64>>, Vec<Vector3<f64>>) {
+fn residuals(mission: &Mission, samples: usize, effect: Option<&str>) -> (Vec<Vec<f64>>, Vec<Vector3<f64>>) {
     let settings = Settings {
         seed: 1,
         start_ns: 2_051_222_400_000_000_000,
@@ -82,10 +82,10 @@ fn residuals(mission: &Mission, effect: Option<&str>) -> (Vec<Vec<f64>>, Vec<Vec
     let known = Known::new(mission);
     let mut simulator = Simulator::new(mission, settings).expect("the fixture flies");
     let mut out = vec![Vec::new(); CHANNELS];
-    let mut alphas = Vec::with_capacity(DAY);
+    let mut alphas = Vec::with_capacity(samples);
     let mut past: Option<[Sample; 2]> = None;
     let mut last: Option<Sample> = None;
-    for _ in 0..DAY + 2 {
+    for _ in 0..samples + 2 {
         let e = simulator.step().expect("the loop holds");
         let m = &e.measured;
         let r = |i: usize| Vector3::new(m.ifo_x_orf_m[i], m.is_r_orf_m[i].y, m.is_r_orf_m[i].z);
@@ -128,6 +128,7 @@ fn transform(x: &[f64], planner: &mut RealFftPlanner<f64>) -> Vec<Complex<f64>> 
 /// One-sided PSD of the nine channels, and the part of one source in it.
 struct Model {
     known: Known,
+    seconds: f64,
 }
 
 impl Model {
@@ -181,7 +182,7 @@ impl Model {
 
     /// σ of `k` of an excess whose PSD is `k²` times one source's, at `k = 1`.
     fn excess(&self, part: impl Fn(f64) -> SMatrix<f64, CHANNELS, CHANNELS>) -> f64 {
-        let step = 1.0 / (DAY as f64 * DT_S);
+        let step = 1.0 / self.seconds;
         // A thousand frequencies stand for all, evenly spread: white sources tell most at the top.
         let (count, mut information) = (1000, 0.0);
         for j in 0..count {
@@ -194,10 +195,14 @@ impl Model {
 }
 
 fn main() {
+    let mut arguments = std::env::args().skip(1);
+    let hours: f64 = arguments.next().and_then(|text| text.parse().ok()).unwrap_or(24.0);
+    let only = arguments.next();
+    let samples = (hours * 3600.0 / DT_S) as usize;
     let mission = mission();
-    let model = Model { known: Known::new(&mission) };
+    let model = Model { known: Known::new(&mission), seconds: hours * 3600.0 };
     let mut planner = RealFftPlanner::new();
-    let (plain, alphas) = residuals(&mission, None);
+    let (plain, alphas) = residuals(&mission, samples, None);
     let n = plain[0].len();
     let frequency = |k: usize| k as f64 / (n as f64 * DT_S);
     let inverse: Vec<Channels> = (1..n / 2)
@@ -253,17 +258,16 @@ fn main() {
             "charge" => vec![(text("1e-2"), 1e-2)],
             "current-force" | "product-force" => vec![(text("1e-14"), 1e-14)],
             "slosh" => [0.005, 0.012, 0.03, 0.08, 0.2].map(|f0| (text(&format!("0.01,f0_hz={f0}")), 0.01)).to_vec(),
-            "impulse" => vec![(text("1e-8,at_s=43200"), 1e-8)],
-            "mps-noise" | "torque-noise" | "is-noise" => vec![],
+            "impulse" => vec![(text(&format!("1e-8,at_s={}", 1800.0 * hours)), 1e-8)],
+            "mps-noise" | "torque-noise" | "is-noise" | "mps-correlation" => vec![],
             "time-offset" => vec![(text("0.01"), 0.01)],
             _ => vec![(text("0.01"), 0.01)],
         }
     };
-    let only = std::env::args().nth(1);
     for kind in catalogue().filter(|kind| only.as_ref().map_or(kind.id != "com-offset", |id| id == kind.id)) {
         for place in (kind.places)() {
             for (effect, size) in shapes(kind.id, &place.to_string()) {
-                let (z, _) = residuals(&mission, Some(&effect));
+                let (z, _) = residuals(&mission, samples, Some(&effect));
                 let change: Vec<Vec<Complex<f64>>> = z
                     .iter()
                     .zip(&plain)
