@@ -9,7 +9,8 @@ use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 
 use crate::gather::LONG;
-use crate::rank::{Court, Fit, Scored};
+use crate::question::Candidate;
+use crate::rank::{Court, Fit, Scored, WithoutExcess};
 use crate::transient::Hit;
 use crate::witness::Coherence;
 
@@ -27,6 +28,9 @@ const MOST_ADDED: usize = 4;
 
 /// Candidates that are weighed in full in each round.
 const LISTED: usize = 12;
+
+/// Candidates whose likelihood is tried where there is an excess.
+const EXPLAINING: usize = 6;
 
 /// Independent segments of full length below which nothing is said.
 const LEAST_SEGMENTS: f64 = 4.0;
@@ -224,23 +228,37 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
         if tried == 0 {
             tried = forms;
         }
-        let weighed: Vec<Found> =
-            ranked.iter().take(LISTED).map(|scored| weigh(court, &fit, scored, &ranked, tried)).collect();
+        let mut weighed: Vec<(Found, Candidate)> = ranked
+            .iter()
+            .take(LISTED)
+            .map(|scored| (weigh(court, &fit, scored, &ranked, tried), scored.candidate.clone()))
+            .collect();
+        if found.len() < MOST_ADDED {
+            for (f, candidate) in of_the_excess(court, &fit, tried)? {
+                let of = |w: &(Found, Candidate)| (&w.0.effect, &w.0.instance) == (&f.effect, &f.instance);
+                match weighed.iter().position(of) {
+                    Some(i) if weighed[i].0.delta_chi2 >= f.delta_chi2 => {}
+                    Some(i) => weighed[i] = (f, candidate),
+                    None => weighed.push((f, candidate)),
+                }
+            }
+            weighed.sort_by(|a, b| b.0.delta_chi2.total_cmp(&a.0.delta_chi2));
+        }
         let helps = |f: &Found| f.held_out_p_value.is_none_or(|p| p > HALVES_DIFFER);
-        let good = |f: &Found| f.p_value < FALSE_ALARM && f.in_range && helps(f);
+        let good = |(f, _): &(Found, Candidate)| f.p_value < FALSE_ALARM && f.in_range && helps(f);
         let best = weighed.iter().position(good).filter(|_| found.len() < MOST_ADDED);
         match best {
             Some(i) => {
                 let mut added = fit.added.clone();
-                added.push(ranked[i].candidate.clone());
+                added.push(weighed[i].1.clone());
                 fit = court.fit(&added)?;
-                found.push(Found { accepted: true, ..weighed[i].clone() });
+                found.push(Found { accepted: true, ..weighed[i].0.clone() });
                 // What is found is measured again with Σ as it is without the excess.
                 refresh(court, &fit, &mut found);
             }
             None => {
                 rest = ranked;
-                found.extend(weighed);
+                found.extend(weighed.into_iter().map(|(f, _)| f));
                 break;
             }
         }
@@ -287,6 +305,34 @@ fn short_segments(court: &Court<'_>) -> f64 {
         plan.bands.iter().zip(court.total.weights.observations(plan)).filter(|(b, _)| octave.contains(&b.first));
     let (bins, observations) = bands.fold((0, 0.0), |(bins, sum), (b, n)| (bins + b.bins(), sum + n));
     observations * LONG as f64 / bins.max(1) as f64
+}
+
+/// Where Σ had to take up an excess, the candidates that may explain it, weighed by the likelihood with a Σ of their own.
+///
+/// Under the Σ that has taken it up, nothing that acts in a few bins can be worth more than those bins, however exactly it explains
+/// them; under the Σ that has not, whatever follows the excess by chance is worth thousands. The ratio of the likelihoods, each at the
+/// Σ that its own residuals have, is neither: n observations whose power falls to a part x are worth n log 1/x, by Bartlett's correction
+/// n − (p + 2)/2 of them for p coefficients.
+fn of_the_excess(court: &Court<'_>, fit: &Fit, tried: usize) -> Result<Vec<(Found, Candidate)>, DiagnosisError> {
+    let Some(WithoutExcess { plain, bands, observations }) = court.without_excess(fit) else { return Ok(Vec::new()) };
+    let before = court.deviance(fit, &bands, &fit.added)?;
+    let (ranked, _) = court.rank(&plain);
+    let mut out = Vec::new();
+    for scored in ranked.iter().filter(|s| s.in_range).take(EXPLAINING) {
+        let mut added = fit.added.clone();
+        added.push(scored.candidate.clone());
+        let dof = scored.candidate.parts.len() as f64;
+        let kept = (1.0 - 0.5 * (dof + 2.0) / observations).max(0.0);
+        // n log 1/x is at most n (1/x − 1), the fall of χ² under the Σ without the excess; beyond that, something else has changed.
+        let ratio = (before - court.deviance(fit, &bands, &added)?).clamp(0.0, scored.delta_chi2.max(0.0));
+        let delta_chi2 = ratio * kept;
+        let p_value = corrected(tail(delta_chi2, dof), tried);
+        let f = weigh(court, &plain, scored, &ranked, tried);
+        let delta_bic = dof * fit.estimate.quality.dof.ln() - delta_chi2;
+        let chi2_per_dof_after = f.chi2_per_dof_before - delta_chi2 / fit.estimate.quality.dof;
+        out.push((Found { delta_chi2, p_value, delta_bic, chi2_per_dof_after, ..f }, scored.candidate.clone()));
+    }
+    Ok(out)
 }
 
 /// A candidate as it stands beside a fit.

@@ -9,6 +9,7 @@
 //! grid is an interpolation.
 
 use dragfree_estimation::estimate::{Estimate, EstimateError, Observed, Refinement, estimate_with};
+use dragfree_estimation::levels::Levels;
 use dragfree_estimation::sigma::NoiseModel;
 use dragfree_estimation::spectra::{Layout, Plan, Spectra, Sums};
 use nalgebra::{Cholesky, DMatrix, DVector};
@@ -37,6 +38,23 @@ pub struct Fit {
     /// What candidates are judged by: all data, and each set of stretches.
     scores: Scores,
     halves: [Scores; 2],
+}
+
+/// A model solved.
+struct Solved {
+    layout: Layout,
+    columns: Vec<usize>,
+    estimate: Estimate,
+}
+
+/// A fit with an excess of power that nothing explains, under the Σ that the mission's noise has.
+pub struct WithoutExcess {
+    /// The fit.
+    pub plain: Fit,
+    /// Bands of the excess.
+    pub bands: Vec<bool>,
+    /// Real observations in them.
+    pub observations: f64,
 }
 
 /// A candidate beside a fit.
@@ -112,17 +130,22 @@ impl<'a> Court<'a> {
     /// # Errors
     /// As [`estimate_with`].
     pub fn fit(&self, added: &[Candidate]) -> Result<Fit, EstimateError> {
+        let Solved { layout, columns, estimate } = self.solve(added, REFINEMENTS)?;
+        let [first, second] = &self.gathered.sets;
+        let of = |gram: &Gram| self.scores(gram, &estimate, &layout, &columns);
+        let (scores, halves) = (of(&self.total), [of(first), of(second)]);
+        Ok(Fit { added: added.to_vec(), estimate, layout, columns, scores, halves })
+    }
+
+    fn solve(&self, added: &[Candidate], refinements: usize) -> Result<Solved, EstimateError> {
         let (layout, columns) = self.question.layout(&self.gathered.columns.names, added);
         let spectra = self.total.select(&columns);
         let sums = Sums { total: spectra, block_ns: 1, blocks: Vec::new() };
         let observed = Observed { layout: &layout, plan: &self.plan, sums: &sums, prediction: None };
         let unknowns = self.question.unknowns(added);
-        let estimate =
-            estimate_with(&observed, self.noise, &unknowns, &self.question.bounds(), REFINEMENTS, Refinement::Levels)?;
-        let [first, second] = &self.gathered.sets;
-        let of = |gram: &Gram| self.scores(gram, &estimate, &layout, &columns);
-        let (scores, halves) = (of(&self.total), [of(first), of(second)]);
-        Ok(Fit { added: added.to_vec(), estimate, layout, columns, scores, halves })
+        let bounds = self.question.bounds();
+        let estimate = estimate_with(&observed, self.noise, &unknowns, &bounds, refinements, Refinement::Levels)?;
+        Ok(Solved { layout, columns, estimate })
     }
 
     fn scores(&self, gram: &Gram, estimate: &Estimate, layout: &Layout, columns: &[usize]) -> Scores {
@@ -154,6 +177,46 @@ impl<'a> Court<'a> {
         let covariance =
             estimate.known.clone().cholesky().map_or_else(|| DMatrix::zeros(free.len(), free.len()), |c| c.inverse());
         Scores { residual, model, covariance, weights, theta: theta.clone() }
+    }
+
+    /// Where Σ had to take up an excess: the fit as it stands without that. What explains the excess shows here, and so does what follows
+    /// it by chance.
+    #[must_use]
+    pub fn without_excess(&self, fit: &Fit) -> Option<WithoutExcess> {
+        let measured = self.residual_psd(fit);
+        let mut levels = Levels::new(self.noise, &self.plan, &self.total.weights, &measured);
+        levels.fit();
+        let (bands, observations) = levels.excess_bands();
+        if observations <= 0.0 {
+            return None;
+        }
+        let mut estimate = fit.estimate.clone();
+        estimate.inverses = levels.plain_inverses();
+        let [first, second] = &self.gathered.sets;
+        let of = |gram: &Gram| self.scores(gram, &estimate, &fit.layout, &fit.columns);
+        let (scores, halves) = (of(&self.total), [of(first), of(second)]);
+        let (added, layout, columns) = (fit.added.clone(), fit.layout.clone(), fit.columns.clone());
+        let plain = Fit { added, estimate, layout, columns, scores, halves };
+        Some(WithoutExcess { plain, bands, observations })
+    }
+
+    /// `−2 log` of the likelihood of the model with what was added, up to a constant of the data, where what it does not explain of an
+    /// excess in some bands is taken up; `fit` has the levels of the noise.
+    ///
+    /// It has a minimum where the excess is explained and one where it is taken up, and the lower one counts.
+    ///
+    /// # Errors
+    /// As [`Self::fit`].
+    pub fn deviance(&self, fit: &Fit, bands: &[bool], added: &[Candidate]) -> Result<f64, EstimateError> {
+        let measured = self.residual_psd(fit);
+        let mut levels = Levels::new(self.noise, &self.plan, &self.total.weights, &measured);
+        levels.fit();
+        let mut least = f64::INFINITY;
+        for refinements in [0, REFINEMENTS] {
+            let Solved { layout, columns, estimate } = self.solve(added, refinements)?;
+            least = least.min(levels.deviance(&self.residual(&layout, &columns, &estimate.theta), bands));
+        }
+        Ok(least)
     }
 
     /// Terms of each coefficient: column, channel, factor, with products at the fit's values.
@@ -333,8 +396,12 @@ impl<'a> Court<'a> {
     /// Cross-spectra of the residuals of a fit, per band, over those expected of a PSD of one: a measured Σ.
     #[must_use]
     pub fn residual_psd(&self, fit: &Fit) -> Vec<DMatrix<f64>> {
-        let spectra: Spectra = self.total.select(&fit.columns);
-        dragfree_estimation::normal::residual_spectra(&spectra, &fit.layout, &fit.estimate.theta)
+        self.residual(&fit.layout, &fit.columns, &fit.estimate.theta)
+    }
+
+    fn residual(&self, layout: &Layout, columns: &[usize], theta: &DVector<f64>) -> Vec<DMatrix<f64>> {
+        let spectra: Spectra = self.total.select(columns);
+        dragfree_estimation::normal::residual_spectra(&spectra, layout, theta)
             .into_iter()
             .zip(&self.total.weights.expected)
             .map(|(r, e)| r / e.max(f64::MIN_POSITIVE))

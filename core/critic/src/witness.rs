@@ -1,10 +1,10 @@
 //! Housekeeping as witness: which channel of the telemetry is coherent with what nobody explains.
 //!
 //! For each housekeeping value, its derivative, its square and the products of two, the complex cross-spectrum with `Σ⁻¹ r` of the
-//! residuals r, each at unit power, which is what is left of each channel when all others are known (what acts on one test mass is seen there, far below
-//! the thrusters' noise, which moves all of them and which their own currents follow),
-//! is summed over long segments, in wide bands below [`crate::gather::SLOW_HZ`]. A lag between cause and force turns the phase and leaves
-//! the coherence. For n complex observations without relation `−2n log(1 − |γ|²)` is χ² with two degrees of freedom (Goodman 1957).
+//! residuals r, each at unit power, which is what is left of each channel when all others are known (what acts on one test mass is
+//! seen there, far below the thrusters' noise, which moves all of them and which their own currents follow), is summed over long segments, in wide bands below [`crate::gather::SLOW_HZ`]. A lag between cause and force turns the phase and leaves
+//! the coherence. For n complex observations without relation `−2(n−1) log(1 − |γ|²)` is χ² with two degrees of freedom, whatever the driver (Goodman
+//! 1957).
 
 use std::ops::Range;
 
@@ -20,8 +20,9 @@ const RATIO: f64 = 1.6;
 /// With more channels of housekeeping than this their products are too many to try.
 const MOST_FOR_PRODUCTS: usize = 100;
 
-/// What a segment of a Hann window adds to the observations of the one before it that it overlaps by half.
-const WORTH: f64 = 0.53;
+/// Independent observations per bin of a segment under a Hann window, alone and beside the one before it that it overlaps by half:
+/// neighbouring bins tell much the same.
+const WORTH: [f64; 2] = [0.514, 0.48];
 
 /// What may drive a force.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
@@ -45,7 +46,7 @@ pub struct Coherence {
     pub of: Vec<String>,
     /// Channel.
     pub channel: String,
-    /// `−2n log(1 − |γ|²)` over all bands.
+    /// `−2(n−1) log(1 − |γ|²)` over all bands.
     pub statistic: f64,
     /// Its degrees of freedom.
     pub dof: f64,
@@ -168,7 +169,7 @@ impl Witnesses {
         }
         let channels = self.residual.nrows();
         for (b, rows) in rows.iter().enumerate() {
-            self.observations[b] += 0.5 * rows.len() as f64 * if overlaps { WORTH } else { 1.0 };
+            self.observations[b] += 0.5 * rows.len() as f64 * WORTH[usize::from(overlaps)];
             for c in 0..channels {
                 self.residual_power[(b, c)] += residual.view((rows.start, c), (rows.len(), 1)).norm_squared();
             }
@@ -209,8 +210,8 @@ impl Witnesses {
                     }
                     let column = b * channels.len() + c;
                     let squared = (self.cross[0][(d, column)].powi(2) + self.cross[1][(d, column)].powi(2)) / power;
-                    // Of n observations the squared coherence is 1/n without any relation.
-                    statistic -= 2.0 * n * (-squared.min(1.0 - 1e-12)).ln_1p();
+                    // Without any relation |γ|² is above x with a chance of (1 − x)^(n−1), and 1/n in the mean.
+                    statistic -= 2.0 * (n - 1.0) * (-squared.min(1.0 - 1e-12)).ln_1p();
                     dof += 2.0;
                     if squared - 1.0 / n > explained {
                         explained = squared - 1.0 / n;
