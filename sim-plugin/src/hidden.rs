@@ -505,8 +505,8 @@ mod tests {
             for (place, sigma) in row.sigma {
                 Asked::parse(&format!("{}:{place}={}", row.id, row.origin)).unwrap();
                 assert_eq!(sigma.len(), row.shape.map_or(1, |(_, grid)| grid.len()), "{} {place}", row.id);
-                // Four times the time tells at least as much, a drift up to 4^1.5 times and what moves once a day far more.
-                assert!(sigma.iter().all(|[six, day]| 0.0 < *day && day <= six && six.is_finite()));
+                // More time tells at least as much, to the three digits that are printed.
+                assert!(sigma.iter().all(|[six, day]| 0.0 < *day && *day <= 1.01 * six && six.is_finite()));
             }
             for name in row.carrier.into_iter().chain(row.shape.map(|(name, _)| name)) {
                 Asked::parse(&format!("{}:{}={},{name}=1e-12", row.id, row.sigma[0].0, row.origin))

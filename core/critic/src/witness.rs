@@ -261,3 +261,69 @@ impl Driver {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::chance::chi2_tails;
+    use rand::SeedableRng;
+    use rand_distr::{Distribution, StandardNormal};
+    use rand_xoshiro::Xoshiro256PlusPlus;
+
+    const CHANNELS: usize = 6;
+    /// More than have products tried.
+    const NAMES: usize = MOST_FOR_PRODUCTS + 1;
+
+    /// Three segments that overlap, of white channels and housekeeping, some of it added to a channel; housekeeping 0 is a flag that is up
+    /// in the last quarter alone.
+    fn coherences(seed: u64, of_second_in_first: f64) -> Vec<Coherence> {
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
+        let plan = Plan::new(1024, 1.0);
+        let samples = 2 * plan.length;
+        let mut white = |n: usize| -> Vec<f64> { (0..n).map(|_| StandardNormal.sample(&mut rng)).collect() };
+        let mut channels: Vec<Vec<f64>> = (0..CHANNELS).map(|_| white(samples)).collect();
+        let mut housekeeping: Vec<Vec<f64>> = (0..NAMES).map(|_| white(samples)).collect();
+        housekeeping[0] = (0..samples).map(|k| f64::from(u8::from(4 * k > 3 * samples))).collect();
+        let driver = housekeeping[1].clone();
+        channels[0].iter_mut().zip(driver).for_each(|(z, x)| *z += of_second_in_first * x);
+        let names = (0..NAMES).map(|i| format!("hk/{i}")).collect();
+        let whitening = vec![DMatrix::identity(CHANNELS, CHANNELS); plan.bands.len()];
+        let mut witnesses = Witnesses::new(names, &plan, DMatrix::identity(CHANNELS, CHANNELS), whitening);
+        let mut transformer = Transformer::new(&plan);
+        for first in (0..=samples - plan.length).step_by(plan.length / 2) {
+            let cut = |x: &Vec<f64>| x[first..first + plan.length].to_vec();
+            let mut base = DMatrix::zeros(2 * (plan.length / 2 - FIRST_BIN), CHANNELS);
+            for (mut column, x) in base.column_iter_mut().zip(&channels) {
+                transformer.transform(&plan, 0, &cut(x), column.as_mut_slice());
+            }
+            let cuts: Vec<Vec<f64>> = housekeeping.iter().map(cut).collect();
+            let slices: Vec<&[f64]> = cuts.iter().map(Vec::as_slice).collect();
+            witnesses.segment(&plan, 0, &slices, &base.columns(0, CHANNELS), first > 0);
+        }
+        let names: Vec<String> = (0..CHANNELS).map(|c| format!("channel {c}")).collect();
+        witnesses.coherences(&names)
+    }
+
+    /// Of housekeeping that has nothing to do with any channel, one coherence in a hundred is as large as chance makes one in a
+    /// hundred, and one in ten thousand so; values and derivatives of one channel are told apart poorly, so that the spread is that of a
+    /// third of them. False alarm 1e-5 each.
+    #[test]
+    fn nothing_is_coherent_more_often_than_by_chance() {
+        let chances: Vec<f64> = coherences(1, 0.0).iter().map(|w| chi2_tails(w.statistic / w.dof, w.dof).1).collect();
+        let n = chances.len() as f64;
+        for p in [1e-1, 1e-2, 1e-4] {
+            let found = chances.iter().filter(|chance| **chance < p).count() as f64;
+            let most = n * p + 4.3 * (3.0 * n * p).sqrt() + 3.0;
+            assert!(found <= most, "{found} of {n} below {p}");
+        }
+    }
+
+    /// The twin: a driver with half of a channel's power, |γ|² = 1/2, is worth 2n log 2 = 97 over some 70 observations.
+    #[test]
+    fn a_driver_is_the_first_witness() {
+        let all = coherences(2, 1.0);
+        assert_eq!((all[0].driver.as_str(), all[0].channel.as_str()), ("hk/1", "channel 0"));
+        assert!(chi2_tails(all[0].statistic / all[0].dof, all[0].dof).1 < 1e-8, "{:?}", all[0]);
+        assert!(all[0].explained > 0.3, "{:?}", all[0]);
+    }
+}
