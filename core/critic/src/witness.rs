@@ -2,9 +2,10 @@
 //!
 //! For each housekeeping value, its derivative, its square and the products of two, the complex cross-spectrum with `Σ⁻¹ r` of the
 //! residuals r, each at unit power, which is what is left of each channel when all others are known (what acts on one test mass is
-//! seen there, far below the thrusters' noise, which moves all of them and which their own currents follow), is summed over long segments, in wide bands below [`crate::gather::SLOW_HZ`]. A lag between cause and force turns the phase and leaves
-//! the coherence. For n complex observations without relation `−2(n−1) log(1 − |γ|²)` is χ² with two degrees of freedom, whatever the driver (Goodman
-//! 1957).
+//! seen there, far below the thrusters' noise, which moves all of them and which their own currents follow), is summed over long
+//! segments, in wide bands below [`crate::gather::SLOW_HZ`]. A lag between cause and force turns the phase and leaves the coherence.
+//! For n complex observations without relation `−2(n−1) log(1 − |γ|²)` is χ² with two degrees of freedom, whatever the driver
+//! (Goodman 1957).
 
 use std::ops::Range;
 
