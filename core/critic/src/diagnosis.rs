@@ -87,8 +87,10 @@ pub struct Found {
     pub coefficients: Vec<Value>,
     /// By how much χ² falls.
     pub delta_chi2: f64,
-    /// Chance of as much when nothing is there, corrected for everything tried.
+    /// Chance of as much when nothing is there, corrected for everything tried (see [`Trials`]).
     pub p_value: f64,
+    /// Its decimal logarithm, where the chance itself is too small for a number; what the list is sorted by.
+    pub log10_p_value: f64,
     /// Change of the Bayesian information criterion, negative in favour of the effect.
     pub delta_bic: f64,
     /// Whether the value lies inside its physical range.
@@ -141,7 +143,7 @@ pub struct Unexplained {
     pub kind: String,
     /// Measured over modelled power, at its worst.
     pub ratio: f64,
-    /// Housekeeping that is coherent with it, the most coherent first.
+    /// Housekeeping that is coherent with it, each in its best form: first what chance gives most rarely.
     pub coherent_with: Vec<String>,
     /// The same with numbers.
     pub witnesses: Vec<Coherence>,
@@ -166,19 +168,59 @@ pub struct Diagnosis {
     pub transients: Vec<Value>,
 }
 
-/// Chance that χ² of `dof` is above `chi2`, by Wilson and Hilferty and the normal tail.
+/// How often chance had its say. Every effect has the same part of [`FALSE_ALARM`], and so has the search of transients; an effect's
+/// part is shared by all forms in all places that were tried of it (Bonferroni, with weights that are fixed before the data are seen).
+///
+/// Were all forms alike, an effect of one form would pay for the ten thousand pairs of thermometers and lags of another.
+struct Trials {
+    /// Forms and levels per effect.
+    forms: BTreeMap<String, usize>,
+    /// Effects, and the search.
+    shares: f64,
+}
+
+impl Trials {
+    fn new(court: &Court<'_>, forms: BTreeMap<String, usize>) -> Self {
+        let mut forms = forms;
+        for c in court.question.coefficients.iter().filter(|c| !c.noise.is_empty()) {
+            *forms.entry(c.effect.clone()).or_default() += 1;
+        }
+        let shares = forms.len() + usize::from(court.gathered.transients.tried > 0.0);
+        Self { forms, shares: shares as f64 }
+    }
+
+    /// Forms, levels and searches together.
+    fn total(&self, court: &Court<'_>) -> usize {
+        self.forms.values().sum::<usize>() + usize::from(court.gathered.transients.tried > 0.0)
+    }
+
+    /// The chance, and its decimal logarithm, that an effect is worth so much without being there.
+    fn chance(&self, effect: &str, chi2: f64, dof: f64) -> (f64, f64) {
+        let trials = self.shares * self.forms.get(effect).copied().unwrap_or(1).max(1) as f64;
+        let ln_p = ln_tail(chi2, dof);
+        let p = corrected(ln_p.exp(), trials);
+        (p, if ln_p > -30.0 { p.log10() } else { (ln_p + trials.ln()) / std::f64::consts::LN_10 })
+    }
+}
+
+/// Chance that χ² of `dof` is above `chi2`.
 fn tail(chi2: f64, dof: f64) -> f64 {
+    ln_tail(chi2, dof).exp()
+}
+
+/// Logarithm of the chance that χ² of `dof` is above `chi2`, by Wilson and Hilferty and the normal tail.
+fn ln_tail(chi2: f64, dof: f64) -> f64 {
     let z = chi2_quantile(chi2.max(0.0) / dof, dof);
     if z < 0.0 {
-        return 1.0 - normal_tail(-z);
+        return (-normal_tail(-z)).ln_1p();
     }
     // The cube root is poor far out for few degrees of freedom, where the leading term of the incomplete gamma function is exact.
     if chi2 > 4.0 * dof + 20.0 {
         let half = 0.5 * dof;
         let log = (half - 1.0) * (0.5 * chi2).ln() - 0.5 * chi2 - ln_gamma(half);
-        return (log.exp() * (1.0 / (1.0 - (dof - 2.0) / chi2).max(0.1))).min(1.0);
+        return (log - (1.0 - (dof - 2.0) / chi2).max(0.1).ln()).min(0.0);
     }
-    normal_tail(z)
+    normal_tail(z).ln()
 }
 
 /// Upper tail of the normal distribution (Abramowitz and Stegun 7.1.26, to 1.5e-7, and its asymptote beyond 4σ).
@@ -204,9 +246,9 @@ fn ln_gamma(x: f64) -> f64 {
     value
 }
 
-fn corrected(p: f64, tried: usize) -> f64 {
+fn corrected(p: f64, trials: f64) -> f64 {
     // 1 − (1 − p)^n
-    (-(tried as f64 * (-p).ln_1p()).exp_m1()).clamp(0.0, 1.0)
+    (-(trials * (-p).ln_1p()).exp_m1()).clamp(0.0, 1.0)
 }
 
 /// Diagnoses the sums.
@@ -221,28 +263,26 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
     }
     let mut fit = court.fit(&[])?;
     let mut found: Vec<Found> = Vec::new();
-    let mut tried = 0;
+    let (mut ranked, forms) = court.rank(&fit);
+    let trials = Trials::new(court, forms);
     let rest: Vec<Scored>;
     loop {
-        let (ranked, forms) = court.rank(&fit);
-        if tried == 0 {
-            tried = forms;
-        }
+        likeliest_first(&trials, &mut ranked);
         let mut weighed: Vec<(Found, Candidate)> = ranked
             .iter()
             .take(LISTED)
-            .map(|scored| (weigh(court, &fit, scored, &ranked, tried), scored.candidate.clone()))
+            .map(|scored| (weigh(court, &fit, scored, &ranked, &trials), scored.candidate.clone()))
             .collect();
         if found.len() < MOST_ADDED {
-            for (f, candidate) in of_the_excess(court, &fit, tried)? {
+            for (f, candidate) in of_the_excess(court, &fit, &trials)? {
                 let of = |w: &(Found, Candidate)| (&w.0.effect, &w.0.instance) == (&f.effect, &f.instance);
                 match weighed.iter().position(of) {
-                    Some(i) if weighed[i].0.delta_chi2 >= f.delta_chi2 => {}
+                    Some(i) if weighed[i].0.log10_p_value <= f.log10_p_value => {}
                     Some(i) => weighed[i] = (f, candidate),
                     None => weighed.push((f, candidate)),
                 }
             }
-            weighed.sort_by(|a, b| b.0.delta_chi2.total_cmp(&a.0.delta_chi2));
+            weighed.sort_by(|a, b| a.0.log10_p_value.total_cmp(&b.0.log10_p_value));
         }
         let helps = |f: &Found| f.held_out_p_value.is_none_or(|p| p > HALVES_DIFFER);
         let good = |(f, _): &(Found, Candidate)| f.p_value < FALSE_ALARM && f.in_range && helps(f);
@@ -252,6 +292,7 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
                 let mut added = fit.added.clone();
                 added.push(weighed[i].1.clone());
                 fit = court.fit(&added)?;
+                (ranked, _) = court.rank(&fit);
                 found.push(Found { accepted: true, ..weighed[i].0.clone() });
                 // What is found is measured again with Σ as it is without the excess.
                 refresh(court, &fit, &mut found);
@@ -266,14 +307,14 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
 
     let measured = court.residual_psd(&fit);
     let mut levels = Levels::new(court.noise, court.plan(), &court.total.weights, &measured);
-    let mut extra = noise_levels(court, &mut levels, &mut tried);
-    let hits = transients(court, &mut tried, &mut extra);
+    let mut extra = noise_levels(court, &mut levels, &trials);
+    let hits = transients(court, &trials, &mut extra);
     let accepted = found.iter().filter(|f| f.accepted).count();
     // Noise and transients are weighed apart: they stand behind the effects that are accepted and before the rest.
-    extra.sort_by(|a, b| b.accepted.cmp(&a.accepted).then(b.delta_chi2.total_cmp(&a.delta_chi2)));
+    extra.sort_by(|a, b| b.accepted.cmp(&a.accepted).then(a.log10_p_value.total_cmp(&b.log10_p_value)));
     let louder: Vec<Found> = extra.iter().filter(|f| f.accepted).cloned().collect();
     let mut candidates: Vec<Found> = found.drain(..accepted).chain(louder).collect();
-    candidates.sort_by(|a, b| b.delta_chi2.total_cmp(&a.delta_chi2));
+    candidates.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
     let missing = !candidates.is_empty();
     candidates.extend(found);
     candidates.extend(extra.into_iter().filter(|f| !f.accepted));
@@ -288,7 +329,7 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
     Ok(Diagnosis {
         verdict: verdict.to_owned(),
         false_alarm_rate: FALSE_ALARM,
-        tried,
+        tried: trials.total(court),
         candidates,
         upper_limits,
         unexplained,
@@ -313,10 +354,11 @@ fn short_segments(court: &Court<'_>) -> f64 {
 /// them; under the Σ that has not, whatever follows the excess by chance is worth thousands. The ratio of the likelihoods, each at the
 /// Σ that its own residuals have, is neither: n observations whose power falls to a part x are worth n log 1/x, by Bartlett's correction
 /// n − (p + 2)/2 of them for p coefficients.
-fn of_the_excess(court: &Court<'_>, fit: &Fit, tried: usize) -> Result<Vec<(Found, Candidate)>, DiagnosisError> {
+fn of_the_excess(court: &Court<'_>, fit: &Fit, trials: &Trials) -> Result<Vec<(Found, Candidate)>, DiagnosisError> {
     let Some(WithoutExcess { plain, bands, observations }) = court.without_excess(fit) else { return Ok(Vec::new()) };
     let before = court.deviance(fit, &bands, &fit.added)?;
-    let (ranked, _) = court.rank(&plain);
+    let (mut ranked, _) = court.rank(&plain);
+    likeliest_first(trials, &mut ranked);
     let mut out = Vec::new();
     for scored in ranked.iter().filter(|s| s.in_range).take(EXPLAINING) {
         let mut added = fit.added.clone();
@@ -326,17 +368,24 @@ fn of_the_excess(court: &Court<'_>, fit: &Fit, tried: usize) -> Result<Vec<(Foun
         // n log 1/x is at most n (1/x − 1), the fall of χ² under the Σ without the excess; beyond that, something else has changed.
         let ratio = (before - court.deviance(fit, &bands, &added)?).clamp(0.0, scored.delta_chi2.max(0.0));
         let delta_chi2 = ratio * kept;
-        let p_value = corrected(tail(delta_chi2, dof), tried);
-        let f = weigh(court, &plain, scored, &ranked, tried);
+        let (p_value, log10_p_value) = trials.chance(&scored.candidate.effect, delta_chi2, dof);
+        let f = weigh(court, &plain, scored, &ranked, trials);
         let delta_bic = dof * fit.estimate.quality.dof.ln() - delta_chi2;
         let chi2_per_dof_after = f.chi2_per_dof_before - delta_chi2 / fit.estimate.quality.dof;
-        out.push((Found { delta_chi2, p_value, delta_bic, chi2_per_dof_after, ..f }, scored.candidate.clone()));
+        let f = Found { delta_chi2, p_value, log10_p_value, delta_bic, chi2_per_dof_after, ..f };
+        out.push((f, scored.candidate.clone()));
     }
     Ok(out)
 }
 
+/// Sorted by the chance of what each is worth, the smallest first.
+fn likeliest_first(trials: &Trials, ranked: &mut [Scored]) {
+    let chance = |s: &Scored| trials.chance(&s.candidate.effect, s.delta_chi2, s.candidate.parts.len() as f64).1;
+    ranked.sort_by(|a, b| chance(a).total_cmp(&chance(b)));
+}
+
 /// A candidate as it stands beside a fit.
-fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], tried: usize) -> Found {
+fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], trials: &Trials) -> Found {
     let parts = &scored.candidate.parts;
     let covariance = scored.information.clone().try_inverse();
     let sigma = |j: usize| covariance.as_ref().map_or(f64::INFINITY, |c| c[(j, j)].max(0.0).sqrt());
@@ -346,6 +395,7 @@ fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], tried
     let dof = parts.len() as f64;
     let halves = court.held_out(fit, &scored.candidate);
     let quality = &fit.estimate.quality;
+    let (p_value, log10_p_value) = trials.chance(&scored.candidate.effect, scored.delta_chi2, dof);
     let (mut offset_shift_m, mut offset_shift_sigma) = (BTreeMap::new(), BTreeMap::new());
     for (k, i) in fit.estimate.free.iter().enumerate() {
         let Some(c) = court.question.coefficients[..court.question.model()].get(*i) else { continue };
@@ -371,7 +421,8 @@ fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], tried
             .map(|j| json!({ "name": name(j), "value": values[j].0, "sigma": values[j].1, "unit": parts[j].1.unit }))
             .collect(),
         delta_chi2: scored.delta_chi2,
-        p_value: corrected(tail(scored.delta_chi2, dof), tried),
+        p_value,
+        log10_p_value,
         delta_bic: dof * quality.dof.ln() - scored.delta_chi2,
         in_range: scored.in_range,
         held_out_delta_chi2: halves.map(|h| h.gains),
@@ -416,10 +467,9 @@ fn refresh(court: &Court<'_>, fit: &Fit, found: &mut [Found]) {
 }
 
 /// Levels of noise one after the other, the best first; those that matter are accepted and taken over.
-fn noise_levels(court: &Court<'_>, levels: &mut Levels<'_>, tried: &mut usize) -> Vec<Found> {
+fn noise_levels(court: &Court<'_>, levels: &mut Levels<'_>, trials: &Trials) -> Vec<Found> {
     let asked: Vec<usize> =
         (0..court.question.coefficients.len()).filter(|i| !court.question.coefficients[*i].noise.is_empty()).collect();
-    *tried += asked.len();
     let mut left = asked;
     let mut out = Vec::new();
     loop {
@@ -427,12 +477,12 @@ fn noise_levels(court: &Court<'_>, levels: &mut Levels<'_>, tried: &mut usize) -
             left.iter().filter_map(|i| Some((*i, levels.level(&court.question.coefficients[*i].noise)?))).collect();
         let best = measured.into_iter().max_by(|a, b| a.1.delta_chi2.total_cmp(&b.1.delta_chi2));
         let Some((i, level)) = best else { return out };
-        let p_value = corrected(tail(level.delta_chi2, 1.0), *tried);
+        let c = &court.question.coefficients[i];
+        let (p_value, log10_p_value) = trials.chance(&c.effect, level.delta_chi2, 1.0);
         let matters = p_value < FALSE_ALARM && (level.value.ln()).abs() > LEVEL_TOLERANCE.ln_1p();
         if p_value < FALSE_ALARM {
             levels.take(&level);
         }
-        let c = &court.question.coefficients[i];
         out.push(Found {
             effect: c.effect.clone(),
             instance: c.instance.clone(),
@@ -444,6 +494,7 @@ fn noise_levels(court: &Court<'_>, levels: &mut Levels<'_>, tried: &mut usize) -
             coefficients: vec![json!({ "name": c.name, "value": level.value, "sigma": level.sigma, "unit": "1" })],
             delta_chi2: level.delta_chi2,
             p_value,
+            log10_p_value,
             delta_bic: (court.total.weights.segments as f64).ln() - level.delta_chi2,
             in_range: true,
             held_out_delta_chi2: None,
@@ -464,13 +515,12 @@ fn noise_levels(court: &Court<'_>, levels: &mut Levels<'_>, tried: &mut usize) -
 }
 
 /// Hits that no chance gives; the loudest of each effect and instance becomes a candidate.
-fn transients(court: &Court<'_>, tried: &mut usize, out: &mut Vec<Found>) -> Vec<Value> {
+fn transients(court: &Court<'_>, trials: &Trials, out: &mut Vec<Found>) -> Vec<Value> {
     let search = &court.gathered.transients;
     let chance = |h: &Hit| {
         // Neighbouring samples are one trial at most; all are counted.
-        (2.0 * normal_tail(h.significance()) * search.tried).min(1.0)
+        (2.0 * normal_tail(h.significance()) * search.tried * trials.shares).min(1.0)
     };
-    *tried += usize::from(search.tried > 0.0);
     let certain: Vec<&Hit> = search.hits.iter().filter(|h| chance(h) < FALSE_ALARM).collect();
     let mut named: Vec<(&str, &str)> = Vec::new();
     for h in &certain {
@@ -489,6 +539,7 @@ fn transients(court: &Court<'_>, tried: &mut usize, out: &mut Vec<Found>) -> Vec
             coefficients: vec![json!({ "name": h.coefficient, "value": h.value, "sigma": h.sigma, "unit": h.unit })],
             delta_chi2: h.significance().powi(2),
             p_value: chance(h),
+            log10_p_value: chance(h).max(f64::MIN_POSITIVE).log10(),
             delta_bic: f64::NAN,
             in_range: true,
             held_out_delta_chi2: None,
@@ -542,11 +593,9 @@ fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
         let found = ratios.into_iter().enumerate().filter(above);
         loud.extend(found.map(|(c, ratio)| (c, [hz(bands.start), hz(bands.end - 1)], ratio)));
     }
-    // Every driver with every channel is a trial.
     let all = court.gathered.witnesses.coherences(channels);
-    let trials = all.len().max(1);
     let significant: Vec<Coherence> =
-        all.into_iter().filter(|w| corrected(tail(w.statistic, w.dof), trials) < WITNESS_ALARM).collect();
+        all.into_iter().filter(|w| corrected(tail(w.statistic, w.dof), w.trials) < WITNESS_ALARM).collect();
     if loud.is_empty() {
         // What explains a part of the power leaves the rest: so much more there is than without it.
         let of = |w: &Coherence| channels.iter().position(|c| *c == w.channel);
@@ -564,12 +613,14 @@ fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
     } else {
         "broadband"
     };
-    let mut coherent_with: Vec<String> = Vec::new();
+    // The same housekeeping, its derivative and its square are one hint.
+    let mut hints: Vec<&Coherence> = Vec::new();
     for w in significant.iter().filter(|w| names.contains(&w.channel)) {
-        if !coherent_with.contains(&w.driver) && coherent_with.len() < 10 {
-            coherent_with.push(w.driver.clone());
+        if hints.len() < 10 && hints.iter().all(|hint| hint.of != w.of) {
+            hints.push(w);
         }
     }
+    let coherent_with = hints.into_iter().map(|w| w.driver.clone()).collect();
     Some(Unexplained {
         channels: names,
         band_hz,
@@ -592,6 +643,6 @@ mod tests {
             assert!((got / p - 1.0).abs() < 0.1, "{chi2} {dof}: {got} against {p}");
         }
         assert!((normal_tail(0.0) - 0.5).abs() < 1e-6);
-        assert!((corrected(1e-6, 1000) - 1e-3).abs() < 1e-6);
+        assert!((corrected(1e-6, 1000.0) - 1e-3).abs() < 1e-6);
     }
 }

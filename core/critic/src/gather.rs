@@ -6,12 +6,12 @@
 //!
 //! Time is cut twice. Segments of one length serve the bands from [`SLOW_HZ`] on; segments [`LONG`] times as long, of samples that
 //! [`crate::decimate`] has thinned out, serve those below, where heat, charge and drifts act and where a short segment sees nothing
-//! under its window's main lobe. Series that are slow by their nature stand last and are in the long segments alone.
+//! under its window's main lobe; a run shorter than one of them is one segment for the bins that its halves do not have. Series that are slow by their nature stand last and are in the long segments alone.
 
 use std::ops::Range;
 
 use dragfree_estimation::segments::{Cuts, Segmenter};
-use dragfree_estimation::spectra::{FIRST_BIN, Plan, Spectra, Transformer, triangle};
+use dragfree_estimation::spectra::{Plan, Spectra, Transformer, triangle};
 use nalgebra::{DMatrix, DMatrixView};
 
 use crate::decimate::{Decimator, Response};
@@ -133,7 +133,7 @@ impl Gathered {
     /// The plan of the bands of the sums.
     #[must_use]
     pub fn plan(&self) -> Plan {
-        Plan::new(LONG * self.length, self.rate_hz)
+        whole_plan(self.length, self.rate_hz)
     }
 
     /// The plan of the bands of the hours.
@@ -164,6 +164,7 @@ pub struct Gatherer {
 struct Bench {
     threads: usize,
     transformers: Vec<Transformer>,
+    first_bin: usize,
     /// Real and imaginary parts from the first bin, a column of the matrix per column of the data.
     spectra: DMatrix<f64>,
 }
@@ -173,7 +174,8 @@ impl Bench {
         Self {
             threads,
             transformers: (0..threads).map(|_| Transformer::new(plan)).collect(),
-            spectra: DMatrix::zeros(2 * (plan.length / 2 - FIRST_BIN), columns),
+            first_bin: plan.first_bin,
+            spectra: DMatrix::zeros(2 * (plan.length / 2 - plan.first_bin), columns),
         }
     }
 
@@ -196,6 +198,8 @@ impl Bench {
     /// `G_b += A_bᵀ A_b` in every band, the bands shared among the threads by the work in them.
     fn multiply(&self, bins: &[Range<usize>], grams: &mut [DMatrix<f64>]) {
         let spectra = &self.spectra;
+        let earliest = bins.iter().filter(|b| !b.is_empty()).map(|b| b.start).min();
+        assert!(earliest.is_none_or(|first| first >= self.first_bin), "the spectra have no bin {earliest:?}");
         let work = |g: &DMatrix<f64>, bins: &Range<usize>| g.len() * bins.len();
         let total: usize = grams.iter().zip(bins).map(|(g, b)| work(g, b)).sum();
         std::thread::scope(|scope| {
@@ -213,7 +217,7 @@ impl Bench {
                 (rest, first) = (others, first + count);
                 scope.spawn(move || {
                     for (g, bins) in mine.iter_mut().zip(bins).filter(|(_, b)| !b.is_empty()) {
-                        let part = spectra.view((2 * (bins.start - FIRST_BIN), 0), (2 * bins.len(), g.ncols()));
+                        let part = spectra.view((2 * (bins.start - self.first_bin), 0), (2 * bins.len(), g.ncols()));
                         g.gemm(1.0, &part.transpose(), &part, 1.0);
                     }
                 });
@@ -239,7 +243,7 @@ impl Gatherer {
         search: Search,
     ) -> Self {
         let threads = threads.max(1);
-        let (whole, short) = (Plan::new(LONG * length, rate_hz), Plan::new(length, rate_hz));
+        let (whole, short) = (whole_plan(length, rate_hz), Plan::new(length, rate_hz));
         let (long, factor) = low_plan(length, rate_hz);
         let slow = |b: usize| whole.bin_hz(whole.bands[b].end as f64) <= SLOW_HZ;
         let low_bands = (0..whole.bands.len().min(long.bands.len())).take_while(|b| slow(*b)).count();
@@ -281,7 +285,7 @@ impl Gatherer {
         for bins in self.short.bins(taper) {
             for i in 0..base {
                 for j in 0..=i {
-                    let rows = (2 * (bins.start - FIRST_BIN), 2 * bins.len());
+                    let rows = (2 * (bins.start - self.short.first_bin), 2 * bins.len());
                     let [a, b] = [i, j].map(|c| self.bench.spectra.view((rows.0, c), (rows.1, 1)));
                     if let Some(entry) = entries.next() {
                         *entry += a.dot(&b);
@@ -306,13 +310,18 @@ impl Gatherer {
     }
 }
 
+/// The plan of the bands of the sums.
+pub(crate) fn whole_plan(length: usize, rate_hz: f64) -> Plan {
+    Plan::slow(LONG * length, length, rate_hz)
+}
+
 /// The plan of long segments of thinned samples, and how many samples one of them stands for.
 pub(crate) fn low_plan(length: usize, rate_hz: f64) -> (Plan, usize) {
     let mut factor = 1;
     while (LONG * length).is_multiple_of(8 * factor) && rate_hz / (2 * factor) as f64 >= THIN * SLOW_HZ {
         factor *= 2;
     }
-    (Plan::new(LONG * length / factor, rate_hz / factor as f64), factor)
+    (Plan::slow(LONG * length / factor, length / factor, rate_hz / factor as f64), factor)
 }
 
 /// Which set a segment belongs to.
@@ -379,19 +388,39 @@ impl Cuts for Low<'_> {
     }
 
     fn segment(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
+        self.take([self.long, self.whole], taper, first_ns, columns, overlaps);
+    }
+
+    fn short_run(&mut self, first_ns: i64, columns: &[&[f64]]) {
+        let samples = columns.first().map_or(0, |c| c.len());
+        let even = samples - samples % 4;
+        if even > self.long.length / 2 {
+            let columns: Vec<&[f64]> = columns.iter().map(|c| &c[..even]).collect();
+            let thinned = self.whole.length / self.long.length;
+            let plans = [self.long.between_halves(even), self.whole.between_halves(even * thinned)];
+            self.take([&plans[0], &plans[1]], 0, first_ns, &columns, false);
+        }
+    }
+}
+
+impl Low<'_> {
+    /// A segment of the `taper`-th length of a plan whose bands begin as those of the sums; with the same for all samples, by which it
+    /// counts.
+    fn take(&mut self, plans: [&Plan; 2], taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
+        let [plan, counted] = plans;
         // What follows the columns are housekeeping values.
         let (columns, housekeeping) = columns.split_at(self.gathered.columns.names.len());
         let samples = columns.first().map_or(0, |c| c.len());
-        self.bench.transform(self.long, taper, columns);
-        for k in FIRST_BIN..samples / 2 {
-            let gain = self.response.at(k as f64 * self.long.rate_hz / samples as f64 / self.rate_hz);
-            self.bench.spectra.rows_mut(2 * (k - FIRST_BIN), 2).scale_mut(gain.recip());
+        self.bench.transform(plan, taper, columns);
+        for k in plan.first_bin..samples / 2 {
+            let gain = self.response.at(k as f64 * plan.rate_hz / samples as f64 / self.rate_hz);
+            self.bench.spectra.rows_mut(2 * (k - plan.first_bin), 2).scale_mut(gain.recip());
         }
-        let set = &mut self.gathered.sets[set_of(middle_ns(first_ns, columns, self.long.rate_hz))];
-        let bands = 0..self.low_bands;
-        self.bench.multiply(&self.long.bins(taper)[bands.clone()], &mut set.bands[bands.clone()]);
-        set.weights.count_bands(self.whole, taper, overlaps, bands);
+        let set = &mut self.gathered.sets[set_of(middle_ns(first_ns, columns, plan.rate_hz))];
+        let bands = 0..self.low_bands.min(plan.bands.len());
+        self.bench.multiply(&plan.bins(taper)[bands.clone()], &mut set.bands[bands.clone()]);
+        set.weights.count_bands(counted, taper, overlaps, bands);
         let base = self.bench.base(self.gathered.columns.base);
-        self.gathered.witnesses.segment(self.long, taper, housekeeping, &base, overlaps);
+        self.gathered.witnesses.segment(plan, taper, housekeeping, &base, overlaps);
     }
 }

@@ -8,6 +8,8 @@
 //! Shapes are scanned on the grid of the forms, and between neighbours by mixing the two, which for a lag or a resonance on a fine
 //! grid is an interpolation.
 
+use std::collections::BTreeMap;
+
 use dragfree_estimation::estimate::{Estimate, EstimateError, Observed, Refinement, estimate_with};
 use dragfree_estimation::levels::Levels;
 use dragfree_estimation::sigma::NoiseModel;
@@ -304,11 +306,12 @@ impl<'a> Court<'a> {
         scored
     }
 
-    /// Every place of every effect that is not in the fit, in its best form; the best first. Also how many forms were tried.
+    /// Every place of every effect that is not in the fit, in its best form; the best first. Also how many forms of each effect were
+    /// tried.
     #[must_use]
-    pub fn rank(&self, fit: &Fit) -> (Vec<Scored>, usize) {
+    pub fn rank(&self, fit: &Fit) -> (Vec<Scored>, BTreeMap<String, usize>) {
         let scores = &fit.scores;
-        let mut tried = 0;
+        let mut tried = BTreeMap::new();
         let mut ranked = Vec::new();
         for place in self.question.places() {
             let first = &self.question.coefficients[place[0]];
@@ -318,7 +321,7 @@ impl<'a> Court<'a> {
             let forms = first.forms.len();
             let scored: Vec<Option<Scored>> =
                 (0..forms).map(|f| self.score(scores, self.question.candidate(&place, f))).collect();
-            tried += scored.iter().flatten().count();
+            *tried.entry(first.effect.clone()).or_default() += scored.iter().flatten().count();
             let best = scored.iter().flatten().max_by(|a, b| a.delta_chi2.total_cmp(&b.delta_chi2));
             let Some(best) = best else { continue };
             ranked.push(self.honest(fit, self.between_neighbours(scores, &scored, best)));

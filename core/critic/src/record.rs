@@ -6,12 +6,12 @@ use dragfree_estimation::spectra::{Plan, Spectra};
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
 
-use crate::gather::{Columns, Gathered, Gram, Hour, LONG, low_plan};
+use crate::gather::{Columns, Gathered, Gram, Hour, low_plan, whole_plan};
 use crate::question::Question;
 use crate::transient::{Hit, Transients};
 use crate::witness::Witnesses;
 
-const MAGIC: &[u8; 8] = b"DFCRIT1\n";
+const MAGIC: &[u8; 8] = b"DFCRIT2\n";
 
 /// Question and sums of some telemetry.
 #[derive(Clone, Debug, PartialEq)]
@@ -164,7 +164,7 @@ impl Record {
             return Err(RecordError::Damaged("its header"));
         }
         let columns = Columns { names: h.names, channels: h.channels, base: h.base, fast: h.fast };
-        let (plan, hour_plan) = (Plan::new(LONG * h.length, h.rate_hz), Plan::new(h.length, h.rate_hz));
+        let (plan, hour_plan) = (whole_plan(h.length, h.rate_hz), Plan::new(h.length, h.rate_hz));
         let mut numbers = Numbers(from);
         let mut sets = [Gram::zero(&columns, &plan), Gram::zero(&columns, &plan)];
         for (set, segments) in sets.iter_mut().zip(h.segments) {

@@ -7,7 +7,7 @@
 use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
 
-use dragfree_estimation::spectra::{FIRST_BIN, Plan};
+use dragfree_estimation::spectra::Plan;
 use nalgebra::{DMatrix, DMatrixView};
 use realfft::num_complex::Complex64;
 use realfft::{ComplexToReal, RealFftPlanner};
@@ -169,7 +169,7 @@ impl Search {
         let n = plan.length;
         let mut white = base * self.residual.transpose();
         for (band, inverse) in plan.bands.iter().zip(&self.inverses) {
-            let rows = 2 * (band.first - FIRST_BIN)..2 * (band.end - FIRST_BIN);
+            let rows = 2 * (band.first - plan.first_bin)..2 * (band.end - plan.first_bin);
             let product = white.rows(rows.start, rows.len()) * inverse;
             white.rows_mut(rows.start, rows.len()).copy_from(&product);
         }
@@ -189,8 +189,8 @@ impl Search {
             spectrum.fill(Complex64::default());
             for (c, factor, averaged) in &template.channels {
                 let rows = white.column(*c);
-                let pairs = rows.as_slice().chunks_exact(2).zip(&mut spectrum[FIRST_BIN..n / 2]);
-                for ((pair, out), mean) in pairs.zip(&prepared.mean[FIRST_BIN..]) {
+                let pairs = rows.as_slice().chunks_exact(2).zip(&mut spectrum[plan.first_bin..n / 2]);
+                for ((pair, out), mean) in pairs.zip(&prepared.mean[plan.first_bin..]) {
                     let x = Complex64::new(pair[0], pair[1]) * *factor;
                     *out += if *averaged { x * mean } else { x };
                 }

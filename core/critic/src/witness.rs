@@ -9,7 +9,7 @@
 
 use std::ops::Range;
 
-use dragfree_estimation::spectra::{FIRST_BIN, Plan, Transformer};
+use dragfree_estimation::spectra::{Plan, Transformer};
 use nalgebra::{DMatrix, DMatrixView};
 use serde::{Deserialize, Serialize};
 
@@ -51,6 +51,9 @@ pub struct Coherence {
     pub statistic: f64,
     /// Its degrees of freedom.
     pub dof: f64,
+    /// How often chance had its say: drivers of one channel of housekeeping and products of two have half each, however many there are
+    /// of them.
+    pub trials: f64,
     /// Part of the residual's power that is coherent, in the band where that is largest.
     pub explained: f64,
     /// That band, Hz.
@@ -95,7 +98,7 @@ impl Witnesses {
         let bin_hz = plan.bin_hz(1.0);
         let last = ((SLOW_HZ / bin_hz) as usize).min(plan.length / 2);
         let mut bands = Vec::new();
-        let mut first = FIRST_BIN;
+        let mut first = plan.first_bin;
         while first < last {
             let end = ((first as f64 * RATIO).ceil() as usize).max(first + 1).min(last);
             bands.push([first, end]);
@@ -142,25 +145,20 @@ impl Witnesses {
         if samples == 0 {
             return;
         }
-        let ratio = plan.length / samples;
         let mut transformer = Transformer::new(plan);
         for (level, x) in self.level.iter_mut().zip(housekeeping).filter(|(level, _)| level.is_nan()) {
             *level = x.iter().sum::<f64>() / x.len() as f64;
         }
         // Bins of this length, as rows of the spectra.
-        let rows: Vec<Range<usize>> = self
-            .bands
-            .iter()
-            .map(|[first, end]| {
-                let first = first.div_ceil(ratio).max(FIRST_BIN);
-                2 * (first - FIRST_BIN)..2 * (end.div_ceil(ratio).max(first) - FIRST_BIN)
-            })
-            .collect();
+        let rows_between = |first: usize, end: usize| {
+            let bins = plan.bins_between(taper, first..end);
+            2 * (bins.start - plan.first_bin)..2 * (bins.end - plan.first_bin)
+        };
+        let rows: Vec<Range<usize>> = self.bands.iter().map(|[first, end]| rows_between(*first, *end)).collect();
         let mut residual = base.rows(0, rows.last().map_or(0, |r| r.end)) * self.residual.transpose();
         for (band, inverse) in plan.bands.iter().zip(&self.whitening) {
-            let first = band.first.div_ceil(ratio).max(FIRST_BIN);
-            let (start, end) = (2 * (first - FIRST_BIN), 2 * (band.end.div_ceil(ratio).max(first) - FIRST_BIN));
-            let end = end.min(residual.nrows());
+            let rows = rows_between(band.first, band.end);
+            let (start, end) = (rows.start, rows.end.min(residual.nrows()));
             if start < end {
                 // Each of unit power, so that a band is as loud at one end as at the other.
                 let unit = DMatrix::from_diagonal(&inverse.diagonal().map(|x| x.sqrt().recip()));
@@ -175,7 +173,7 @@ impl Witnesses {
                 self.residual_power[(b, c)] += residual.view((rows.start, c), (rows.len(), 1)).norm_squared();
             }
         }
-        let mut spectrum = vec![0.0; 2 * (plan.length / 2 - FIRST_BIN)];
+        let mut spectrum = vec![0.0; 2 * (samples / 2 - plan.first_bin)];
         for (d, driver) in self.drivers.iter().enumerate() {
             transformer.transform(plan, taper, &driver.samples(housekeeping, &self.level), &mut spectrum);
             for (b, rows) in rows.iter().enumerate() {
@@ -196,10 +194,12 @@ impl Witnesses {
         }
     }
 
-    /// How coherent each driver is with the residual of each channel, the most coherent first.
+    /// How coherent each driver is with the residual of each channel, the first what chance gives most rarely.
     #[must_use]
     pub fn coherences(&self, channels: &[String]) -> Vec<Coherence> {
         let mut all = Vec::new();
+        let singles = self.drivers.iter().filter(|d| d.of().len() == 1).count();
+        let kinds = if singles == self.drivers.len() { 1.0 } else { 2.0 };
         for (d, driver) in self.drivers.iter().enumerate() {
             for (c, channel) in channels.iter().enumerate() {
                 let (mut statistic, mut dof, mut explained, mut band_hz) = (0.0, 0.0, 0.0, [0.0; 2]);
@@ -220,13 +220,17 @@ impl Witnesses {
                     }
                 }
                 if dof > 0.0 {
-                    let of = driver.of().iter().map(|i| self.names[*i].clone()).collect();
-                    let driver = driver.label(&self.names);
-                    all.push(Coherence { driver, of, channel: channel.clone(), statistic, dof, explained, band_hz });
+                    let of: Vec<String> = driver.of().iter().map(|i| self.names[*i].clone()).collect();
+                    let alike = if of.len() == 1 { singles } else { self.drivers.len() - singles };
+                    let trials = kinds * (alike * channels.len()) as f64;
+                    let (driver, channel) = (driver.label(&self.names), channel.clone());
+                    all.push(Coherence { driver, of, channel, statistic, dof, trials, explained, band_hz });
                 }
             }
         }
-        all.sort_by(|a, b| b.statistic.total_cmp(&a.statistic));
+        // Among many products with a channel that hardly moves, one follows what its factor explains a little better by chance.
+        let worth = |c: &Coherence| c.statistic - 2.0 * c.trials.ln();
+        all.sort_by(|a, b| worth(b).total_cmp(&worth(a)));
         all
     }
 }
@@ -293,7 +297,7 @@ mod tests {
         let mut transformer = Transformer::new(&plan);
         for first in (0..=samples - plan.length).step_by(plan.length / 2) {
             let cut = |x: &Vec<f64>| x[first..first + plan.length].to_vec();
-            let mut base = DMatrix::zeros(2 * (plan.length / 2 - FIRST_BIN), CHANNELS);
+            let mut base = DMatrix::zeros(2 * (plan.length / 2 - plan.first_bin), CHANNELS);
             for (mut column, x) in base.column_iter_mut().zip(&channels) {
                 transformer.transform(&plan, 0, &cut(x), column.as_mut_slice());
             }

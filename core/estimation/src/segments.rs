@@ -20,6 +20,9 @@ pub trait Cuts {
     /// A segment of full length and its samples have been given.
     fn between(&mut self) {}
 
+    /// A run that has ended before it gave a segment of full length, all of its samples.
+    fn short_run(&mut self, _first_ns: i64, _columns: &[&[f64]]) {}
+
     /// The run of samples has ended.
     fn gap(&mut self) {}
 }
@@ -255,6 +258,10 @@ impl Segmenter {
         if at < samples {
             let rest: Vec<&[f64]> = self.state.run.iter().map(|c| &c[at..]).collect();
             to.samples(self.time_of(at), &rest);
+        }
+        if at == 0 && samples > 0 {
+            let whole: Vec<&[f64]> = self.state.run.iter().map(Vec::as_slice).collect();
+            to.short_run(self.time_of(0), &whole);
         }
         to.gap();
         let shortest = lengths.last().copied();

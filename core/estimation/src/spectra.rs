@@ -82,6 +82,14 @@ impl Band {
 /// is left of a slower drift stay below this bin.
 pub const FIRST_BIN: usize = 3;
 
+/// The first bin of a plan for what is slow ([`Plan::slow`]). A periodic Hann window has a constant in bins −1 to 1 alone, so the
+/// second is free of what a constant leaves; the removed slope takes 0.155 of the power of white noise there, most of its odd part,
+/// and less than 0.016 in any bin above.
+pub const FIRST_SLOW_BIN: usize = 2;
+
+/// What the removed straight line leaves of white noise in [`FIRST_SLOW_BIN`].
+const LEFT_IN_SLOW_BIN: f64 = 0.845;
+
 /// Bins up to this fraction of their frequency are weighed alike, by the mean of Σ over them. A PSD in f⁴ changes by ±12 % across,
 /// and a wrong weight costs information only in second order: half a per cent.
 const RELATIVE_WIDTH: f64 = 1.0 / 16.0;
@@ -102,8 +110,12 @@ pub struct Plan {
     pub length: usize,
     /// Samples per second.
     pub rate_hz: f64,
-    /// Bands from [`FIRST_BIN`] to the last bin below Nyquist, in bins of the longest segment.
+    /// Bands from the first bin to the last below Nyquist, in bins of the longest segment.
     pub bands: Vec<Band>,
+    /// The first bin that counts of any segment, with which spectra begin.
+    pub first_bin: usize,
+    /// Samples of the segments whose bins the bands are told in.
+    bins_of: usize,
     /// The longest segment first.
     tapers: Vec<Taper>,
 }
@@ -111,6 +123,8 @@ pub struct Plan {
 /// A length of segment.
 struct Taper {
     length: usize,
+    /// The first of its bins that counts.
+    first_bin: usize,
     window: Vec<f64>,
     fft: Arc<dyn RealToComplex<f64>>,
     /// `Σ w²`, `Σ w⁴` and `Σ w²(t) w²(t + L/2)`.
@@ -124,21 +138,16 @@ struct Taper {
 }
 
 impl Taper {
-    /// Periodic Hann window.
-    fn new(length: usize, longest: usize, bands: &[Band]) -> Self {
+    /// Periodic Hann window of a segment, its bins from the first in the bands of a plan of segments of another length.
+    fn new(length: usize, longest: usize, first_bin: usize, bands: &[Band]) -> Self {
         let window: Vec<f64> =
             (0..length).map(|t| 0.5 - 0.5 * (std::f64::consts::TAU * t as f64 / length as f64).cos()).collect();
         let squared: Vec<f64> = window.iter().map(|w| w * w).collect();
-        let ratio = longest / length;
-        let bins: Vec<Range<usize>> = bands
-            .iter()
-            .map(|b| {
-                let first = b.first.div_ceil(ratio).max(FIRST_BIN);
-                first..b.end.div_ceil(ratio).max(first)
-            })
-            .collect();
+        let bins: Vec<Range<usize>> =
+            bands.iter().map(|b| bins_between(b.first..b.end, longest, length, first_bin)).collect();
+        let ratio = longest as f64 / length as f64;
         Self {
-            part: bands.iter().zip(&bins).map(|(b, own)| (own.len() * ratio) as f64 / b.bins() as f64).collect(),
+            part: bands.iter().zip(&bins).map(|(b, own)| own.len() as f64 * ratio / b.bins() as f64).collect(),
             bins,
             window_sums: [
                 squared.iter().sum(),
@@ -149,17 +158,35 @@ impl Taper {
             fft: RealFftPlanner::new().plan_fft_forward(length),
             window,
             length,
+            first_bin,
         }
     }
+}
+
+/// Bins of segments of `length` samples whose frequencies lie between bins of segments of another length, from `first_bin` on.
+fn bins_between(bins: Range<usize>, of: usize, length: usize, first_bin: usize) -> Range<usize> {
+    let own = |bin: usize| (bin * length).div_ceil(of);
+    let first = own(bins.start).max(first_bin);
+    first..own(bins.end).max(first)
 }
 
 impl Plan {
     /// Segments of `length` samples, divisible by four, and of its halves.
     #[must_use]
     pub fn new(length: usize, rate_hz: f64) -> Self {
+        Self::from_bin(FIRST_BIN, length, length, rate_hz)
+    }
+
+    /// As [`Self::new`]; segments longer than `ordinary` samples, which are there for what is slow, count from [`FIRST_SLOW_BIN`] on.
+    #[must_use]
+    pub fn slow(length: usize, ordinary: usize, rate_hz: f64) -> Self {
+        Self::from_bin(FIRST_SLOW_BIN, length, ordinary, rate_hz)
+    }
+
+    fn from_bin(first_bin: usize, length: usize, ordinary: usize, rate_hz: f64) -> Self {
         let nyquist = length / 2;
         let mut bands = Vec::new();
-        let mut first = FIRST_BIN;
+        let mut first = first_bin;
         while first < nyquist {
             let width = ((first as f64 * RELATIVE_WIDTH) as usize).max(1);
             let end = (first + width).min(nyquist);
@@ -168,7 +195,27 @@ impl Plan {
         }
         let halves = std::iter::successors(Some(length), |l| l.is_multiple_of(8).then_some(l / 2));
         let lengths = halves.take_while(|l| *l == length || *l >= SHORTEST);
-        Self { tapers: lengths.map(|l| Taper::new(l, length, &bands)).collect(), length, rate_hz, bands }
+        let first = |l: usize| if l > ordinary { first_bin } else { FIRST_BIN };
+        let tapers = lengths.map(|l| Taper::new(l, length, first(l), &bands)).collect();
+        Self { tapers, length, rate_hz, bands, first_bin, bins_of: length }
+    }
+
+    /// For one segment of another length, between half the longest and the longest: the bands of this plan that half the longest has
+    /// no bins in.
+    #[must_use]
+    pub fn between_halves(&self, length: usize) -> Self {
+        let out_of_reach = |b: &&Band| b.first < 2 * self.first_bin;
+        let bands: Vec<Band> = self.bands.iter().take_while(out_of_reach).copied().collect();
+        let tapers = vec![Taper::new(length, self.bins_of, self.first_bin, &bands)];
+        Self { tapers, length, rate_hz: self.rate_hz, bands, first_bin: self.first_bin, bins_of: self.bins_of }
+    }
+
+    /// Bins of segments of the `taper`-th length that lie between bins of the longest, in the bands of this plan alone.
+    #[must_use]
+    pub fn bins_between(&self, taper: usize, bins: Range<usize>) -> Range<usize> {
+        let end = self.bands.last().map_or(0, |b| b.end);
+        let taper = &self.tapers[taper];
+        bins_between(bins.start.min(end)..bins.end.min(end), self.bins_of, taper.length, taper.first_bin)
     }
 
     /// Lengths of segments, the longest first.
@@ -191,7 +238,7 @@ impl Plan {
     /// Frequency of a bin of the longest segment, Hz.
     #[must_use]
     pub fn bin_hz(&self, bin: f64) -> f64 {
-        bin * self.rate_hz / self.length as f64
+        bin * self.rate_hz / self.bins_of as f64
     }
 
     fn first_block_ns(&self) -> i64 {
@@ -253,7 +300,8 @@ impl Spectra {
         let [w2, w4, _] = taper.window_sums;
         for b in bands.clone() {
             let part = taper.part[b];
-            self.expected[b] += taper.bins[b].len() as f64 * 2.0 * w2 / taper.length as f64;
+            let slow = if taper.bins[b].contains(&FIRST_SLOW_BIN) { 1.0 - LEFT_IN_SLOW_BIN } else { 0.0 };
+            self.expected[b] += (taper.bins[b].len() as f64 - slow) * 2.0 * w2 / taper.length as f64;
             self.weight[b] += w2 * part;
             self.weight_squared[b] += w4 * part;
         }
@@ -294,7 +342,7 @@ impl Spectra {
         plan.bands
             .iter()
             .enumerate()
-            .map(|(b, band)| self.weight[b] * kept[b] * band.bins() as f64 / plan.length as f64)
+            .map(|(b, band)| self.weight[b] * kept[b] * band.bins() as f64 / plan.bins_of as f64)
             .collect()
     }
 
@@ -417,7 +465,7 @@ impl Transformer {
     }
 
     /// Spectrum of a segment of the `taper`-th length without its constant and slope, under its window: real and imaginary part of
-    /// each bin from [`FIRST_BIN`] to the last below Nyquist, so scaled that the sum of their squares is the one-sided PSD.
+    /// each bin from the plan's first to the last below Nyquist, so scaled that the sum of their squares is the one-sided PSD.
     pub fn transform(&mut self, plan: &Plan, taper: usize, samples: &[f64], out: &mut [f64]) {
         let segment = &plan.tapers[taper];
         let (time, spectrum) = (&mut self.time[..segment.length], &mut self.spectrum[..=segment.length / 2]);
@@ -434,11 +482,13 @@ impl Transformer {
             *out = (x - mean - slope * (t as f64 - middle)) * w;
         }
         // The lengths are those that the plan was made for, the only thing that it refuses.
-        let scratch = &mut self.scratch[..segment.fft.get_scratch_len()];
+        let needed = segment.fft.get_scratch_len();
+        self.scratch.resize(self.scratch.len().max(needed), Complex64::default());
+        let scratch = &mut self.scratch[..needed];
         let done = segment.fft.process_with_scratch(time, spectrum, scratch);
         debug_assert!(done.is_ok());
         let scale = (4.0 / (plan.rate_hz * segment.length as f64)).sqrt();
-        let used = spectrum.get(FIRST_BIN..segment.length / 2).unwrap_or_default();
+        let used = spectrum.get(plan.first_bin..segment.length / 2).unwrap_or_default();
         for (pair, x) in out.chunks_exact_mut(2).zip(used) {
             pair[0] = x.re * scale;
             pair[1] = x.im * scale;
@@ -451,7 +501,7 @@ pub struct Analyser {
     plan: Plan,
     columns: usize,
     transformer: Transformer,
-    /// Per column: real and imaginary part of each bin from [`FIRST_BIN`], scaled.
+    /// Per column: real and imaginary part of each bin from the plan's first, scaled.
     scaled: Vec<Vec<f64>>,
 }
 
@@ -486,7 +536,8 @@ impl Analyser {
         }
         let mut entry = total.iter_mut().zip(&mut block.spectra.packed);
         for bins in &segment.bins {
-            let range = 2 * (bins.start - FIRST_BIN)..2 * (bins.end - FIRST_BIN);
+            let first = self.plan.first_bin;
+            let range = 2 * (bins.start - first)..2 * (bins.end - first);
             for i in 0..self.columns {
                 let a = &self.scaled[i][range.clone()];
                 for (b, (g, h)) in self.scaled[..=i].iter().zip(&mut entry) {

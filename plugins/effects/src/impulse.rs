@@ -1,10 +1,15 @@
-//! Effect `impulse`: something short at a known time, or, for a candidate, at a time that the host finds.
+//! Effect `impulse`: something short at a known time, or, for a candidate, at a time that the host finds; or at every step of a
+//! flag of the telemetry.
 //!
 //! | instance | cause | coefficients | course |
 //! |---|---|---|---|
 //! | `sc.x\|y\|z` | micrometeoroid (Thorpe et al., ApJ 883, 53) | momentum, N s, and angular momentum x, y, z, N m s | within one sample |
 //! | `tmN.x\|y\|z` | glitch on a test mass (arXiv:2205.11938) | momentum, N s | `(e^{−t/τ1} − e^{−t/τ2})/(τ1 − τ2)`, `decay_s` = τ1, `rise_s` = τ2 |
 //! | `sc.phi\|theta\|psi` | antenna that starts or stops | angular momentum, N m s | even over `pulse_s` |
+//!
+//! What moves aboard takes angular momentum when it starts and gives it back when it stops, and telemetry has a flag of it: with
+//! `flag`, the course comes at every step of that column, as much of it as the step is high, against the axis where it falls. Each
+//! single one may be too faint to find; all together are one coefficient.
 //!
 //! The regressor is the mean over each sample, s⁻¹, of a course whose integral is one. A momentum p on the spacecraft leaves the
 //! test masses behind, `−T_S^{O_i} p/m_S` (eq:TM_SC_relative_acceleration); the arm of a hit is not known, so its angular
@@ -21,8 +26,10 @@ use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
-    AXES, Place, axis_of, behind_spacecraft, channel_of, manifest, mission, on_channels, response, tm_of, turning,
+    AXES, Place, SLOW_HZ, axis_of, behind_spacecraft, channel_of, housekeeping, loaded, manifest, mission, named,
+    on_channels, response, saved, tm_of, turning,
 };
+use crate::steps::Steps;
 
 const SPACECRAFT_MAX: f64 = 1e-3;
 const TEST_MASS_MAX: f64 = 1e-7;
@@ -35,6 +42,12 @@ const RISES: [f64; 2] = [0.0, 0.25];
 const KEPT: f64 = 0.99;
 /// Lengths that a candidate tries for a turn of the spacecraft, s; 0 is one sample.
 const PULSES_S: [f64; 2] = [0.0, 10.0];
+/// Lengths that it tries for the steps of a flag, s. What two of them share lies below the shorter one's inverse, where most of
+/// what tells them lies, and the truth between two is a mixture.
+const FLAG_PULSES_S: [f64; 5] = [1.0, 3.0, 10.0, 30.0, 100.0];
+/// From this length on nothing above [`SLOW_HZ`] is worth looking at: the first zero of the course is at a fifth of it.
+const SLOW_PULSE_S: f64 = 100.0;
+const STATE: &[u8; 8] = b"impulse1";
 
 /// How a momentum is given over time.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -107,7 +120,18 @@ pub(crate) struct Impulse {
     decay_s: f64,
     rise_s: f64,
     pulse_s: f64,
+    flag: String,
     out: Option<Out>,
+    steps: Vec<FlagSteps>,
+}
+
+/// The courses at the steps of one flag.
+#[derive(Debug)]
+struct FlagSteps {
+    flag: In,
+    steps: Steps,
+    /// Length of each, rows, and where it is written.
+    out: Vec<(usize, Out)>,
 }
 
 impl Impulse {
@@ -163,6 +187,64 @@ impl Impulse {
         })
     }
 
+    /// Where the courses at the steps of a flag stand, for pulses of these lengths, s.
+    fn at_steps(
+        &mut self,
+        flag: &Column,
+        pulses_s: &[f64],
+        available: &Available,
+        link: &mut EffectLink<'_, '_>,
+    ) -> Result<Vec<Place>, PluginError> {
+        let (mut places, mut out) = (Vec::new(), Vec::new());
+        for pulse_s in pulses_s {
+            let name = format!("steps({},{pulse_s})", flag.name);
+            let (table, written) = if *pulse_s >= SLOW_PULSE_S {
+                link.slow_series(available, &name, "s-1", SLOW_HZ)?
+            } else {
+                link.shared_series(available, &name, "s-1", "")?
+            };
+            let rows = (pulse_s / self.mission.dt_s()).round().max(1.0) as usize;
+            out.extend(written.map(|written| (rows, written)));
+            places.push((table, name));
+        }
+        if let Some(longest) = out.iter().map(|(rows, _)| *rows).max() {
+            let flag = link.read(&Want::of(flag))?;
+            self.steps.push(FlagSteps { flag, steps: Steps::new(longest, self.mission.dt_s()), out });
+        }
+        Ok(places)
+    }
+
+    fn link_to_flag(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
+        if self.kind != Kind::Turn {
+            return Err(PluginError::error(format!(
+                "effect {}: its parameter `flag` is for what turns the spacecraft, sc.phi, sc.theta or sc.psi; give `at_ns`",
+                self.name()
+            )));
+        }
+        let flag = named(available, &self.name(), "flag", &self.flag, FLAG_UNIT)?;
+        let pulse_s = self.pulse_s;
+        let places = self.at_steps(flag, &[pulse_s], available, link)?;
+        for (mut coefficient, responses) in self.parts(available, &places[0])? {
+            (coefficient.responses, coefficient.shape) = (responses, at_flag(flag, pulse_s));
+            link.coefficient(&coefficient)?;
+        }
+        Ok(())
+    }
+
+    /// The forms of a turn at the steps of every column without a unit.
+    fn flags(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<Vec<Variant>, PluginError> {
+        let mut variants = Vec::new();
+        for flag in housekeeping(available, FLAG_UNIT) {
+            let places = self.at_steps(flag, &FLAG_PULSES_S, available, link)?;
+            for (place, pulse_s) in places.iter().zip(FLAG_PULSES_S) {
+                for (_, responses) in self.parts(available, place)? {
+                    variants.push(Variant { shape: at_flag(flag, pulse_s), responses, unit: None, range: None });
+                }
+            }
+        }
+        Ok(variants)
+    }
+
     /// The courses that a candidate tries, with the parameters that name them.
     fn courses(&self) -> Vec<(Course, Shape)> {
         match self.kind {
@@ -183,6 +265,13 @@ impl Impulse {
     }
 }
 
+/// A flag has no unit.
+const FLAG_UNIT: &str = "1";
+
+fn at_flag(flag: &Column, pulse_s: f64) -> Shape {
+    [("flag".to_owned(), json!(flag.name)), ("pulse_s".to_owned(), json!(pulse_s))].into()
+}
+
 fn even(pulse_s: f64) -> Course {
     if pulse_s > 0.0 { Course::Even(pulse_s) } else { Course::AtOnce }
 }
@@ -201,6 +290,12 @@ impl Effect for Impulse {
                 0.0,
                 0.0..=1e4,
                 "sc.phi, theta, psi: how long the torque acts; 0 for one sample",
+            ),
+            Parameter::text(
+                "flag",
+                "",
+                &[],
+                "sc.phi, theta, psi: column at each step of which it acts, hk.NAME in 1, in place of one time",
             ),
         ],
         &["sc.x", "sc.y", "sc.z", "sc.phi", "sc.theta", "sc.psi", "tm1.x", "tm1.y", "tm1.z", "tm2.x", "tm2.y", "tm2.z"],
@@ -223,7 +318,9 @@ impl Effect for Impulse {
             decay_s: setup.f64("decay_s")?,
             rise_s: setup.f64("rise_s")?,
             pulse_s: setup.f64("pulse_s")?,
+            flag: setup.text("flag")?,
             out: None,
+            steps: Vec::new(),
             instance,
         })
     }
@@ -231,6 +328,7 @@ impl Effect for Impulse {
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
         if self.candidate {
             let dt_s = self.mission.dt_s();
+            let variants = if self.kind == Kind::Turn { self.flags(available, link)? } else { Vec::new() };
             for (mut coefficient, responses) in self.parts(available, &Place::default())? {
                 let channels: Vec<(String, f64)> = responses.into_iter().map(|r| (r.channel, r.factor)).collect();
                 let transient = |(course, shape): (Course, Shape)| Transient {
@@ -239,13 +337,18 @@ impl Effect for Impulse {
                     channels: channels.clone(),
                 };
                 coefficient.transients = self.courses().into_iter().map(transient).collect();
+                coefficient.variants.clone_from(&variants);
                 link.coefficient(&coefficient)?;
             }
             return Ok(());
         }
+        if !self.flag.is_empty() {
+            return self.link_to_flag(available, link);
+        }
         if self.at_ns == 0 {
             return Err(PluginError::error(format!(
-                "effect {}: its parameter `at_ns`, the Unix time at which it begins, is not given; `dragfree diagnose` finds it",
+                "effect {}: neither its parameter `at_ns`, the Unix time at which it begins, nor `flag`, a column at the steps of which it \
+                 acts, is given; `dragfree diagnose` finds them",
                 self.name()
             )));
         }
@@ -273,10 +376,32 @@ impl Effect for Impulse {
     }
 
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
+        for FlagSteps { flag, steps, out } in &mut self.steps {
+            for (now_ns, value) in input.time_ns().iter().zip(input.f64(*flag)) {
+                steps.push(*now_ns, *value);
+                out.iter().for_each(|(rows, out)| output.f64(*out).push(steps.mean(*rows)));
+            }
+        }
         let Some(out) = self.out else { return Ok(()) };
         let (course, dt_s) = (self.course(), self.mission.dt_s());
         let means = input.time_ns().iter().map(|now_ns| course.mean((now_ns - self.at_ns) as f64 * 1e-9, dt_s));
         output.f64(out).extend(means);
+        Ok(())
+    }
+
+    fn save(&self) -> Result<Vec<u8>, PluginError> {
+        Ok(saved(STATE, self.steps.iter().flat_map(|s| s.steps.state())))
+    }
+
+    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
+        let counts: Vec<usize> = self.steps.iter().map(|s| s.steps.state_len()).collect();
+        let numbers = loaded(STATE, &self.name(), counts.iter().sum(), state)?;
+        let mut rest = numbers.as_slice();
+        for (FlagSteps { steps, .. }, count) in self.steps.iter_mut().zip(counts) {
+            let (own, others) = rest.split_at(count);
+            steps.set_state(own);
+            rest = others;
+        }
         Ok(())
     }
 }

@@ -18,6 +18,7 @@ mod linear;
 mod noise;
 mod readout;
 mod slosh;
+mod steps;
 mod stiffness;
 mod stray;
 mod sunlight;
