@@ -288,6 +288,18 @@ impl<'a> Court<'a> {
         Some(Scored { candidate, value, in_range, delta_chi2, information, left, shift })
     }
 
+    /// The part of what would be known of a candidate under some `Σ⁻¹` that comes from some of the bands.
+    #[must_use]
+    pub fn part_in(&self, fit: &Fit, inverses: &[DMatrix<f64>], candidate: &Candidate, bands: &[bool]) -> f64 {
+        let kept = self.total.weights.evenly();
+        let weights: Vec<DMatrix<f64>> = inverses.iter().zip(&kept).map(|(w, k)| w * *k).collect();
+        let here: Vec<DMatrix<f64>> = weights.iter().zip(bands).map(|(w, b)| w * f64::from(u8::from(*b))).collect();
+        let theta = &fit.scores.theta;
+        let of = |w: &[DMatrix<f64>]| Self::weighed(&self.total, w, theta, candidate, candidate).diagonal();
+        // Of several coefficients, each in its own unit.
+        of(&here).component_div(&of(&weights)).mean()
+    }
+
     /// What a candidate is worth when bands that stand for little time count for what they are (see [`Spectra::evenly`]).
     fn honest(&self, fit: &Fit, mut scored: Scored) -> Scored {
         let weights = &self.total.weights;

@@ -15,6 +15,7 @@ use nalgebra::{Cholesky, DMatrix};
 
 use crate::sigma::NoiseModel;
 use crate::spectra::{Plan, Spectra};
+use crate::verdict::chi2_per_dof_at;
 
 /// Amplitudes that are tried lie between its inverse and this.
 const MOST: f64 = 20.0;
@@ -64,9 +65,10 @@ fn deviance(modes: &[Mode], excess: f64) -> f64 {
 /// Ratio of the ends of a group of bands.
 const GROUP: f64 = 2.154_434_690_031_884;
 
-/// Ratio of power from which an excess over `n` complex observations is taken up: five σ, and no less than [`EXCESS`].
+/// Ratio of power from which an excess over `n` complex observations is taken up: four σ by the distribution of χ², a chance of
+/// 3e-5, and no less than [`EXCESS`].
 fn least_excess(n: f64) -> f64 {
-    EXCESS.max(1.0 + 5.0 / n.max(1.0).sqrt())
+    EXCESS.max(chi2_per_dof_at(2.0 * n.max(0.5), 4.0))
 }
 
 /// The inverse, or nothing known where there is none.
@@ -279,6 +281,14 @@ impl<'a> Levels<'a> {
         // Single channels made louder as a whole, which scales what they share, would bury what little is left when it cancels.
         let inverses = own.less_in_channels(self.plain_inverses(), |b| bands[b], |_| 1.0);
         inverses.into_iter().zip(measured).zip(&self.observations).filter(|(_, n)| **n > 0.0).map(of).sum()
+    }
+
+    /// Channels in which a process has power.
+    #[must_use]
+    pub fn channels_of(&self, process: &str) -> Vec<usize> {
+        let bands = self.processes.get(process).map_or(&[][..], Vec::as_slice);
+        let channels = self.modelled.first().map_or(0, DMatrix::nrows);
+        (0..channels).filter(|c| bands.iter().any(|p| p[(*c, *c)] > 0.0)).collect()
     }
 
     /// Takes a level over into what is modelled.

@@ -109,6 +109,8 @@ pub struct Limited {
     pub truth: Option<f64>,
     /// 95 % upper limit on the size.
     pub limit_95: f64,
+    /// σ that the data have for it.
+    pub sigma: Option<f64>,
 }
 
 /// A cause that acted, beside what the diagnosis says of it.
@@ -139,6 +141,9 @@ pub struct Scored {
     pub not_compared_because: Option<String>,
     /// |value|/σ of the candidate's leading coefficient, for a level of noise counted from 1.
     pub significance: Option<f64>,
+    /// |truth|/σ with the σ that the diagnosis has for it, found or not; none where it has none. What was drawn for the σ that such
+    /// data have as a rule may be worth less in these: a charge that drifts evenly tells little.
+    pub significance_at_hand: Option<f64>,
     /// Fall of χ² by the candidate.
     pub delta_chi2: Option<f64>,
     /// Corrected chance.
@@ -510,15 +515,20 @@ impl Judged<'_> {
         };
 
         let (mut values, mut not_compared_because, mut significance) = (Vec::new(), None, None);
+        let origin = if truth.effect.ends_with("-noise") { 1.0 } else { 0.0 };
         if let Some(c) = candidate {
             match self.compared(c, &truth) {
                 Ok(compared) => values = compared,
                 Err(why) => not_compared_because = Some(why),
             }
-            let origin = if truth.effect.ends_with("-noise") { 1.0 } else { 0.0 };
             let number = |key: &str| c[key].as_f64();
             significance = number("value").zip(number("sigma")).map(|(value, sigma)| (value - origin).abs() / sigma);
         }
+        let limits = self.limits(&truth);
+        let found = values.iter().map(|c| (c.truth, c.sigma));
+        let limited = limits.iter().filter_map(|l| Some((l.truth?, l.sigma?)));
+        let significances = found.chain(limited).map(|(truth, sigma)| (truth - origin).abs() / sigma);
+        let significance_at_hand = significances.max_by(f64::total_cmp);
         let drivers: Vec<String> = drivers(&truth.effect).iter().map(|d| (*d).to_owned()).collect();
         let witnesses = unexplained["coherent_with"].as_array().map(|all| texts(all)).unwrap_or_default();
         let driver_rank =
@@ -536,13 +546,14 @@ impl Judged<'_> {
             values,
             not_compared_because,
             significance,
+            significance_at_hand,
             delta_chi2: field("delta_chi2").as_f64(),
             p_value: field("p_value").as_f64(),
             in_range: field("in_range").as_bool(),
             expected_shape: expected_shape(&truth),
             found_shape: field("shape").as_object().cloned().unwrap_or_default(),
             time_error_s: candidate.and_then(|c| self.time_error_s(c, &truth)),
-            limits: self.limits(&truth),
+            limits,
             drivers,
             driver_rank,
             truth,
@@ -591,6 +602,7 @@ impl Judged<'_> {
                 unit: unit.to_owned(),
                 truth: value,
                 limit_95: l["limit_95"].as_f64()?,
+                sigma: l["sigma"].as_f64(),
             })
         })
         .collect()
