@@ -1,10 +1,11 @@
 //! The blind campaign: telemetry with effects that a seed alone has drawn, diagnosed, and scored when the seal is opened.
 //!
 //! Each seed goes the way of a user: `simulate --hidden`, `run`, `diagnose`, then `reveal`. The folder with the sealed truth is moved
-//! away before anything reads the telemetry.
+//! away before anything reads the telemetry. Where every cause that was accepted is true and can be added to a model, that is done:
+//! the same telemetry is calibrated again, and other telemetry with the same hidden causes, which no fit has seen, is predicted by the
+//! model before, by the model after and by one that has the true values.
 
-use std::collections::BTreeMap;
-use std::fmt::Write as _;
+use std::ffi::OsStr;
 use std::ops::RangeInclusive;
 use std::path::Path;
 use std::sync::Mutex;
@@ -13,15 +14,13 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
+use crate::blind_report::numbers;
 use crate::campaign::{CampaignError, Meter, note, work};
-use crate::program::{Chain, Program, root};
-use crate::records::{Keyed, Results};
+use crate::program::{Chain, Hidden, Program, root, solution};
+use crate::records::{Keyed, Results, Solution};
 
 /// Hidden seeds up to this one served to develop the method, and count in no campaign.
 pub const DEVELOPED_ON: u32 = 100;
-
-/// Significance from which an effect should be found.
-const PLAIN: f64 = 8.0;
 
 /// One seed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -37,6 +36,23 @@ pub struct Blind {
     pub diagnosis_s: f64,
     /// What `reveal` says of it.
     pub score: Value,
+    /// What the model says of the offset with nothing added.
+    pub before: Solution,
+    /// What became of it when what was found was added; none where nothing could be, or something false was accepted.
+    pub after: Option<After>,
+}
+
+/// A model with what was found.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct After {
+    /// What was added.
+    pub added: Vec<String>,
+    /// The offset from the same telemetry.
+    pub offset: Solution,
+    /// χ²/dof of telemetry that no fit has seen: the model before, with what was found, and with the true values of that; none where
+    /// the truth has no value that a model can take.
+    pub held_out_chi2_per_dof: [Option<f64>; 3],
 }
 
 impl Keyed for Blind {
@@ -70,7 +86,7 @@ pub fn blind(
     let left: Vec<u32> = seeds.filter(|seed| !results.has(&configuration, *seed)).collect();
     let meter = Meter::new(left.len() as f64);
     let results = Mutex::new(results);
-    let chain = Chain { pipeline: root().join("fixtures/pipelines/science-mode.toml"), ..Chain::default() };
+    let pipeline = root().join("fixtures/pipelines/science-mode.toml");
     work(left, at_once, |seed| {
         let folder = scratch.join(format!("blind-{seed}"));
         let io = |e: std::io::Error| CampaignError::File { path: folder.clone(), reason: e.to_string() };
@@ -78,8 +94,12 @@ pub fn blind(
             std::fs::remove_dir_all(&folder).map_err(io)?;
         }
         std::fs::create_dir_all(&folder).map_err(io)?;
-        let hidden = program.hide(&root().join("fixtures/missions/taiji.toml"), &folder, seed, hours)?;
+        let mission = root().join("fixtures/missions/taiji.toml");
+        let hidden = program.hide(&mission, &folder, [seed, seed], hours)?;
         let archive = folder.join("archive");
+        let bare = folder.join("bare.toml");
+        std::fs::copy(root().join("fixtures/models/com-offset.toml"), &bare).map_err(io)?;
+        let chain = Chain { pipeline: pipeline.clone(), model: Some(bare), ..Chain::default() };
         let product = program.run(&chain, &hidden.files, &archive)?;
         let start = Instant::now();
         let diagnosis = program.diagnose(&product, &archive)?;
@@ -87,11 +107,21 @@ pub fn blind(
         let answer = folder.join("diagnosis.json");
         std::fs::write(&answer, diagnosis.to_string()).map_err(io)?;
         let score = program.reveal(&hidden, &answer)?;
+        let lacks = |what: String| CampaignError::Product { configuration: configuration.clone(), seed, what };
+        let set = Set { program, folder: &folder, archive: &archive, chain: &chain, hidden: &hidden };
         let line = Blind {
             configuration: configuration.clone(),
             seed,
             build: build.clone(),
             diagnosis_s,
+            before: solution(&product, "adopted", &hidden.truth_m).map_err(lacks)?,
+            after: match to_add(&diagnosis, &score) {
+                names if names.is_empty() => None,
+                names => {
+                    let unseen = program.hide(&mission, &folder.join("unseen"), [seed, OTHER_NOISE + seed], hours)?;
+                    Some(set.after(&product, &answer, &score, names, &unseen, &lacks)?)
+                }
+            },
             score: score.clone(),
         };
         if let Ok(mut results) = results.lock() {
@@ -103,72 +133,110 @@ pub fn blind(
     })?;
     match results.into_inner() {
         Ok(results) => {
-            note(&summary(&results.lines));
+            note(&numbers(&results.lines).0);
             Ok(results.sort(&[&configuration])?)
         }
         Err(_) => Ok(()),
     }
 }
 
-/// The numbers of a campaign, as text.
-#[must_use]
-pub fn summary(lines: &[Blind]) -> String {
-    let mut verdicts: BTreeMap<&str, usize> = BTreeMap::new();
-    let mut kinds: BTreeMap<String, (usize, usize, BTreeMap<String, usize>)> = BTreeMap::new();
-    let (mut clean, mut alarms) = (0, 0);
-    for line in lines {
-        let score = &line.score;
-        *verdicts.entry(score["verdict"].as_str().unwrap_or("?")).or_default() += 1;
-        let effects = score["effects"].as_array().map_or(&[][..], Vec::as_slice);
-        if effects.is_empty() {
-            clean += 1;
-            alarms += usize::from(score["correct"] != true);
-        }
-        let [effect] = effects else { continue };
-        let significance = effect["expected_significance"].as_f64().unwrap_or(0.0);
-        let kind = kinds.entry(effect["effect"].as_str().unwrap_or("?").to_owned()).or_default();
-        if significance >= PLAIN {
-            kind.0 += 1;
-            kind.1 += usize::from(score["correct"] == true || score["verdict"] == "confounded");
-        }
-        let said = match score["accepted"].get(0).and_then(Value::as_str) {
-            Some(name) => name.split(':').next().unwrap_or(name),
-            None => score["diagnosis_verdict"].as_str().unwrap_or("?"),
-        };
-        *kind.2.entry(said.to_owned()).or_default() += 1;
+/// Telemetry that is kept out has the noise of a seed so many above.
+const OTHER_NOISE: u32 = 1_000_000;
+
+/// What of a diagnosis can be added to a model: everything that was accepted, where all of it is true and none of it is a level or
+/// happened once.
+fn to_add(diagnosis: &Value, score: &Value) -> Vec<String> {
+    let accepted: Vec<&Value> =
+        diagnosis["candidates"].as_array().into_iter().flatten().filter(|c| c["accepted"] == true).collect();
+    let none_false = score["false_causes"].as_array().is_some_and(Vec::is_empty);
+    let lasting = |c: &&&Value| c["chi2_per_dof_before"].is_f64();
+    if !none_false || !accepted.iter().all(|c| lasting(&c)) {
+        return Vec::new();
     }
-    let mut text = format!("{} sets; {clean} with nothing hidden, {alarms} false alarms among them\n", lines.len());
-    for (verdict, n) in verdicts {
-        let _ = writeln!(text, "  {verdict:<12} {n}");
-    }
-    let _ = writeln!(text, "one effect: kind, right or confounded of those above {PLAIN}σ, and what was said");
-    for (kind, (plain, right, said)) in kinds {
-        let said: Vec<String> = said.into_iter().map(|(name, n)| format!("{name} {n}")).collect();
-        let _ = writeln!(text, "  {kind:<16} {right}/{plain}  {}", said.join(", "));
-    }
-    text
+    let name = |c: &Value| format!("{}:{}", c["effect"].as_str().unwrap_or("?"), c["instance"].as_str().unwrap_or("?"));
+    accepted.into_iter().map(name).collect()
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use serde_json::json;
+/// One seed's files.
+struct Set<'a> {
+    program: &'a Program,
+    folder: &'a Path,
+    archive: &'a Path,
+    chain: &'a Chain,
+    hidden: &'a Hidden,
+}
 
-    fn line(seed: u32, score: Value) -> Blind {
-        Blind { configuration: "hidden-6h".to_owned(), seed, build: "b".to_owned(), diagnosis_s: 1.0, score }
+impl Set<'_> {
+    fn after(
+        &self,
+        before: &Value,
+        diagnosis: &Path,
+        score: &Value,
+        added: Vec<String>,
+        unseen: &Hidden,
+        lacks: &impl Fn(String) -> CampaignError,
+    ) -> Result<After, CampaignError> {
+        let io = |e: std::io::Error| CampaignError::File { path: self.folder.to_owned(), reason: e.to_string() };
+        let [bare, found, knowing] = ["bare", "found", "knowing"].map(|name| self.folder.join(format!("{name}.toml")));
+        for model in [&found, &knowing] {
+            std::fs::copy(&bare, model).map_err(io)?;
+        }
+        let mut known = true;
+        for name in &added {
+            let words = |model: &Path, more: &[String]| {
+                let mut all = vec!["add".into(), model.as_os_str().to_owned(), name.into()];
+                all.extend(["--from".into(), diagnosis.as_os_str().to_owned()]);
+                all.extend(more.iter().map(|word| OsStr::new(word).to_owned()));
+                self.program.model(&all.iter().map(AsRef::as_ref).collect::<Vec<_>>())
+            };
+            words(&found, &[])?;
+            match truth_as_words(score, name) {
+                Some(fixed) if known => words(&knowing, &fixed)?,
+                _ => known = false,
+            }
+        }
+        let run = |model: &Path, files: &[_]| {
+            let chain = Chain { model: Some(model.to_owned()), ..self.chain.clone() };
+            self.program.run(&chain, files, self.archive)
+        };
+        let after = run(&found, &self.hidden.files)?;
+        let id = |product: &Value| product["id"].as_str().map(str::to_owned).ok_or_else(|| lacks("id".to_owned()));
+        let fixed = |model: &Path, product: &Value| {
+            let (out, id) = (model.with_extension("fixed.toml"), id(product)?);
+            let words = [OsStr::new("fix"), model.as_os_str(), "--from".as_ref(), id.as_ref(), "--keep".as_ref()];
+            let more = ["com-offset".as_ref(), "--out".as_ref(), out.as_os_str(), "--archive".as_ref()];
+            self.program.model(&[&words[..], &more[..], &[self.archive.as_os_str()]].concat())?;
+            Ok::<_, CampaignError>(out)
+        };
+        let chi2 = |model: &Path| Ok::<_, CampaignError>(run(model, &unseen.files)?["chi2_per_dof"].as_f64());
+        Ok(After {
+            offset: solution(&after, "adopted", &self.hidden.truth_m).map_err(lacks)?,
+            held_out_chi2_per_dof: [
+                chi2(&fixed(&bare, before)?)?,
+                chi2(&fixed(&found, &after)?)?,
+                if known { chi2(&knowing)? } else { None },
+            ],
+            added,
+        })
     }
+}
 
-    #[test]
-    fn a_summary_counts_what_was_right() {
-        let one = |significance: f64| json!([{ "effect": "es-gain", "expected_significance": significance }]);
-        let right = json!({ "verdict": "right", "correct": true, "effects": one(9.0), "accepted": ["es-gain:tm1.y"] });
-        let missed = json!({ "verdict": "missed", "correct": false, "effects": one(8.5), "accepted": [],
-            "diagnosis_verdict": "sufficient" });
-        let faint = json!({ "verdict": "missed", "correct": false, "effects": one(3.0), "accepted": [],
-            "diagnosis_verdict": "sufficient" });
-        let alarm = json!({ "verdict": "false alarm", "correct": false, "effects": [], "accepted": ["slosh:sc.x"] });
-        let text = summary(&[line(101, right), line(102, missed), line(103, faint), line(104, alarm)]);
-        assert!(text.contains("4 sets; 1 with nothing hidden, 1 false alarms"), "{text}");
-        assert!(text.contains("es-gain          1/2  es-gain 1, sufficient 2"), "{text}");
+/// The true values and shape of an effect as `model add` takes them; none where not all are known.
+fn truth_as_words(score: &Value, name: &str) -> Option<Vec<String>> {
+    let effects = score["effects"].as_array()?;
+    let named = |e: &&Value| {
+        e["effect"].as_str().zip(e["instance"].as_str()).is_some_and(|(a, b)| format!("{a}:{b}") == name)
+    };
+    let effect = effects.iter().find(named)?;
+    let mut words = Vec::new();
+    let values = effect["values"].as_array().filter(|values| !values.is_empty())?;
+    for value in values {
+        let number = value["truth"].as_f64()?;
+        let of = if values.len() > 1 { format!("{}=", value["coefficient"].as_str()?) } else { String::new() };
+        words.extend(["--fixed".to_owned(), format!("{of}{number:e}")]);
     }
+    for (parameter, value) in effect["expected_shape"].as_object()? {
+        words.extend(["--set".to_owned(), format!("{parameter}={value}")]);
+    }
+    Some(words)
 }

@@ -2,6 +2,7 @@
 //! bounds from the mission's noise alone, and the report that is made of committed results.
 
 pub mod blind;
+pub mod blind_report;
 pub mod bound;
 pub mod campaign;
 pub mod program;

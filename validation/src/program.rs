@@ -79,6 +79,8 @@ pub struct Hidden {
     pub files: Vec<PathBuf>,
     /// The sealed file.
     pub sealed: PathBuf,
+    /// True offsets, m.
+    pub truth_m: [f64; 6],
 }
 
 /// What `run` is given besides the telemetry.
@@ -166,32 +168,29 @@ impl Program {
         };
         let truth_files = paths("truth_files");
         let first = truth_files.first().ok_or_else(|| missing(&command, "truth_files"))?;
-        let file = |path: &Path, reason: &dyn std::fmt::Display| ProgramError::File {
-            path: path.to_owned(),
-            reason: reason.to_string(),
-        };
-        let truth = first_message(first, "/truth").map_err(|e| file(first, &e))?;
+        let truth_m = offsets_m(first)?;
         for path in &truth_files {
-            std::fs::remove_file(path).map_err(|e| file(path, &e))?;
-        }
-        let mut truth_m = [0.0; 6];
-        for (i, value) in truth_m.iter_mut().enumerate() {
-            let key = format!("b{}_orf_m.{}", i / 3 + 1, ["x", "y", "z"][i % 3]);
-            *value = *truth.get(&key).ok_or_else(|| missing(&command, &key))?;
+            std::fs::remove_file(path).map_err(|e| ProgramError::File { path: path.clone(), reason: e.to_string() })?;
         }
         Ok(Simulated { files: paths("files"), truth_m })
     }
 
-    /// Simulates with what a seed hides, into `folder`, and moves the truth away from the telemetry.
+    /// Simulates with what a seed hides, into `folder`, and moves the truth away from the telemetry; `noise` is the seed of all else.
     ///
     /// # Errors
     /// [`ProgramError`].
-    pub fn hide(&self, mission: &Path, folder: &Path, seed: u32, hours: f64) -> Result<Hidden, ProgramError> {
+    pub fn hide(
+        &self,
+        mission: &Path,
+        folder: &Path,
+        [hidden, noise]: [u32; 2],
+        hours: f64,
+    ) -> Result<Hidden, ProgramError> {
         let (telemetry, away) = (folder.join("telemetry"), folder.join("sealed"));
         let mut command = self.command();
         command.arg("simulate").arg(mission).arg("--out").arg(&telemetry).arg("--json");
         for (option, value) in
-            [("--hidden", seed.to_string()), ("--seed", seed.to_string()), ("--hours", hours.to_string())]
+            [("--hidden", hidden.to_string()), ("--seed", noise.to_string()), ("--hours", hours.to_string())]
         {
             command.args([option, &value]);
         }
@@ -202,9 +201,18 @@ impl Program {
             return Err(file("it has no folder".to_owned()));
         };
         std::fs::rename(truth, &away).map_err(|e| file(e.to_string()))?;
-        let files =
-            made["files"].as_array().into_iter().flatten().filter_map(Value::as_str).map(PathBuf::from).collect();
-        Ok(Hidden { files, sealed: away.join(name) })
+        let all = |key: &str| made[key].as_array().into_iter().flatten().filter_map(Value::as_str).map(PathBuf::from);
+        let moved = all("truth_files").find_map(|path| Some(away.join(path.file_name()?)));
+        let truth_m = offsets_m(&moved.ok_or_else(|| missing(&command, "truth_files"))?)?;
+        Ok(Hidden { files: all("files").collect(), sealed: away.join(name), truth_m })
+    }
+
+    /// `dragfree model` with these words.
+    ///
+    /// # Errors
+    /// [`ProgramError`].
+    pub fn model(&self, words: &[&OsStr]) -> Result<(), ProgramError> {
+        output(self.command().arg("model").args(words), &[0]).map(|_| ())
     }
 
     /// Which effect is missing from the model of a product.
@@ -243,6 +251,18 @@ impl Program {
         }
         json(&mut command, &[0, 3, 4])
     }
+}
+
+/// True offsets, m, in a simulation's truth.
+fn offsets_m(truth: &Path) -> Result<[f64; 6], ProgramError> {
+    let file = |reason: String| ProgramError::File { path: truth.to_owned(), reason };
+    let first = first_message(truth, "/truth").map_err(|e| file(e.to_string()))?;
+    let mut truth_m = [0.0; 6];
+    for (i, value) in truth_m.iter_mut().enumerate() {
+        let key = format!("b{}_orf_m.{}", i / 3 + 1, ["x", "y", "z"][i % 3]);
+        *value = *first.get(&key).ok_or_else(|| file(format!("it has no {key}")))?;
+    }
+    Ok(truth_m)
 }
 
 fn output(command: &mut Command, codes: &[i32]) -> Result<Vec<u8>, ProgramError> {
@@ -318,7 +338,11 @@ fn qp_widened(product: &Value) -> Result<[f64; 6], String> {
     Ok(all)
 }
 
-fn solution(product: &Value, label: &str, truth_m: &[f64; 6]) -> Result<Solution, String> {
+/// One solution of a product.
+///
+/// # Errors
+/// The name of what the product lacks.
+pub fn solution(product: &Value, label: &str, truth_m: &[f64; 6]) -> Result<Solution, String> {
     let lacks = || format!("solution {label}");
     let all = product["coefficients"].as_array().ok_or_else(lacks)?;
     let names = product["covariance_names"][label].as_array().ok_or_else(lacks)?;

@@ -1,4 +1,4 @@
-//! The generated parts of VALIDATION.md and the picture of the coverage, made of committed results alone.
+//! The generated parts of VALIDATION.md and its pictures, made of committed results alone.
 
 use dragfree_chart::{ChartError, Line as Curve, Panel, Scale, Stroke, svg};
 use dragfree_physics::frames::dcm_turned_about_z;
@@ -8,6 +8,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
+use crate::blind::Blind;
+use crate::blind_report;
 use crate::bound::free_space;
 use crate::campaign::{CampaignError, NOMINAL, TWINS, Twin, file, note, parse, taiji};
 use crate::program::root;
@@ -36,6 +38,8 @@ pub struct Measured {
     pub table: Vec<Row>,
     /// Ratios of speed.
     pub speed: Option<Speed>,
+    /// Hidden effects.
+    pub blind: Vec<Blind>,
 }
 
 impl Measured {
@@ -48,6 +52,7 @@ impl Measured {
             coverage: read(&folder.join("coverage.jsonl"))?,
             table: read(&folder.join("table.jsonl"))?,
             speed: Speed::read(&folder.join("speed.json"))?,
+            blind: read(&folder.join("blind.jsonl"))?,
         })
     }
 }
@@ -543,8 +548,8 @@ fn picture(all: &[Line], free: &DMatrix<f64>) -> Result<Option<String>, ChartErr
 pub struct Report {
     /// Generated parts by the name of their markers.
     pub parts: BTreeMap<&'static str, String>,
-    /// The picture of the coverage; none without a campaign.
-    pub picture: Option<String>,
+    /// Pictures, each with its place; those without a campaign are left out.
+    pub pictures: Vec<(PathBuf, String)>,
     /// Everything that is outside of its bounds or misses its bar.
     pub failed: Vec<String>,
 }
@@ -564,9 +569,22 @@ pub fn report(measured: &Measured) -> Result<Report, CampaignError> {
     let (table, more) = table(&measured.table);
     failed.extend(more);
     let speed = measured.speed.as_ref().map_or("Not measured yet.\n".to_owned(), Speed::table);
-    let picture = picture(&measured.coverage, &free).map_err(|e| file(&picture_path(), &e))?;
-    let parts = BTreeMap::from([("coverage", coverage), ("twins", twins), ("table", table), ("speed", speed)]);
-    Ok(Report { parts, picture, failed })
+    let (blind, more) = blind_report::numbers(&measured.blind);
+    failed.extend(more);
+    let drawn = [("coverage", picture(&measured.coverage, &free)), ("confusion", blind_report::picture(&measured.blind))];
+    let mut pictures = Vec::new();
+    for (name, picture) in drawn {
+        let path = picture_path(name);
+        pictures.extend(picture.map_err(|e| file(&path, &e))?.map(|picture| (path, picture)));
+    }
+    let parts = BTreeMap::from([
+        ("coverage", coverage),
+        ("twins", twins),
+        ("table", table),
+        ("speed", speed),
+        ("blind", blind),
+    ]);
+    Ok(Report { parts, pictures, failed })
 }
 
 /// VALIDATION.md.
@@ -575,10 +593,10 @@ pub fn document_path() -> PathBuf {
     root().join("VALIDATION.md")
 }
 
-/// The picture of the coverage.
+/// A picture of the guide.
 #[must_use]
-pub fn picture_path() -> PathBuf {
-    root().join("ops-guide/src/pictures/coverage.svg")
+pub fn picture_path(name: &str) -> PathBuf {
+    root().join("ops-guide/src/pictures").join(name).with_extension("svg")
 }
 
 /// A document with its generated parts replaced; none when a part has no markers.
@@ -594,7 +612,7 @@ pub fn rewritten(document: &str, parts: &BTreeMap<&'static str, String>) -> Opti
     Some(text)
 }
 
-/// Writes the generated parts of VALIDATION.md and the picture.
+/// Writes the generated parts of VALIDATION.md and the pictures.
 ///
 /// # Errors
 /// [`CampaignError`] when a file cannot be read or written, or lacks a marker.
@@ -605,8 +623,8 @@ pub fn write(folder: &Path) -> Result<(), CampaignError> {
     let text =
         rewritten(&document, &report.parts).ok_or_else(|| file(&path, &"a marker of a generated part is missing"))?;
     std::fs::write(&path, text).map_err(|e| file(&path, &e))?;
-    if let Some(picture) = &report.picture {
-        std::fs::write(picture_path(), picture).map_err(|e| file(&picture_path(), &e))?;
+    for (path, picture) in &report.pictures {
+        std::fs::write(path, picture).map_err(|e| file(path, &e))?;
     }
     for failed in &report.failed {
         note(&format!("outside: {failed}"));
@@ -622,15 +640,15 @@ mod tests {
     use rand_distr::{Distribution, StandardNormal};
     use rand_xoshiro::Xoshiro256PlusPlus;
 
-    /// VALIDATION.md and the picture are what the committed results say.
+    /// VALIDATION.md and the pictures are what the committed results say.
     #[test]
     fn validation_is_what_the_results_say() {
         let found = report(&Measured::read(&root().join("validation/results")).unwrap()).unwrap();
         let document = std::fs::read_to_string(document_path()).unwrap();
         let wanted = rewritten(&document, &found.parts).expect("every part has its markers");
         assert!(document == wanted, "run `cargo run --release -p dragfree-validation -- report`");
-        if let Some(picture) = found.picture {
-            assert_eq!(std::fs::read_to_string(picture_path()).unwrap(), picture);
+        for (path, picture) in found.pictures {
+            assert_eq!(std::fs::read_to_string(path).unwrap(), picture);
         }
     }
 

@@ -1,6 +1,8 @@
-//! Charts as SVG: spectra and their bounds on logarithmic axes, series and counts on linear ones, and maps of colours ([`heat`]).
+//! Charts as SVG: spectra and their bounds on logarithmic axes, series and counts on linear ones, and maps of colours ([`heat`]), tables of
+//! counts ([`matrix`]).
 
 pub mod heat;
+pub mod matrix;
 
 use plotters::coord::Shift;
 use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};

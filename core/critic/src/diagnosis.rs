@@ -47,6 +47,9 @@ const EXCESS_SIGMA: f64 = 4.5;
 /// Chance that any driver passes for a witness when none is: a part of [`FALSE_ALARM`], the most of which is left to effects.
 const WITNESS_ALARM: f64 = 1e-3;
 
+/// Why a candidate has no number.
+const MUTE: &str = "these data say nothing of it: what it is made of does not change in them, or the model has the same already";
+
 /// What moves the offset by so many σ is no longer told from it.
 const MOVES_OFFSET: f64 = 3.0;
 
@@ -176,6 +179,8 @@ pub struct Diagnosis {
     pub unexplained: Option<Unexplained>,
     /// What happened once.
     pub transients: Vec<Value>,
+    /// What could not be tried, and why.
+    pub not_tried: Vec<(String, String)>,
 }
 
 /// How often chance had its say. Every effect has the same part of [`FALSE_ALARM`], and so has the search of transients; an effect's
@@ -273,8 +278,9 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
     }
     let mut fit = court.fit(&[])?;
     let mut accepted: Vec<Found> = Vec::new();
-    let (mut ranked, forms) = court.rank(&fit);
-    let trials = Trials::new(court, forms);
+    let first = court.rank(&fit);
+    let trials = Trials::new(court, first.tried);
+    let mut ranked = first.all;
     let mut others: Vec<Found> = loop {
         likeliest_first(&trials, &mut ranked);
         let mut weighed: Vec<(Found, Candidate)> = ranked
@@ -301,7 +307,7 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
         let mut added = fit.added.clone();
         added.push(weighed[best].1.clone());
         fit = court.fit(&added)?;
-        (ranked, _) = court.rank(&fit);
+        ranked = court.rank(&fit).all;
         accepted.push(Found { accepted: true, ..weighed[best].0.clone() });
         // What is found is measured again with Σ as it is without the excess.
         refresh(court, &fit, &mut accepted);
@@ -310,7 +316,7 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
     let (mut extra, hits, unexplained) = loop {
         let measured = court.residual_psd(&fit);
         let mut levels = Levels::new(court.noise, court.plan(), &court.total.weights, &measured);
-        let mut extra = noise_levels(court, &mut levels, &trials);
+        let mut extra = noise_levels(court, &fit, &mut levels, &trials);
         let hits = transients(court, &trials, &accepted, &mut extra);
         let unexplained = unexplained(court, &levels);
         let ((excess, _), plain) = (levels.excess_bands(), levels.plain_inverses());
@@ -323,7 +329,7 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
         let mut added = fit.added.clone();
         added.remove(doubtful);
         fit = court.fit(&added)?;
-        (ranked, _) = court.rank(&fit);
+        ranked = court.rank(&fit).all;
         refresh(court, &fit, &mut accepted);
     };
     // Noise and transients are weighed apart: they stand behind the effects that are accepted and before the rest.
@@ -349,6 +355,7 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
         upper_limits,
         unexplained,
         transients: hits,
+        not_tried: first.mute.into_iter().map(|name| (name, MUTE.to_owned())).collect(),
     })
 }
 
@@ -372,7 +379,7 @@ fn short_segments(court: &Court<'_>) -> f64 {
 fn of_the_excess(court: &Court<'_>, fit: &Fit, trials: &Trials) -> Result<Vec<(Found, Candidate)>, DiagnosisError> {
     let Some(WithoutExcess { plain, bands, observations }) = court.without_excess(fit) else { return Ok(Vec::new()) };
     let before = court.deviance(fit, &bands, &fit.added)?;
-    let (mut ranked, _) = court.rank(&plain);
+    let mut ranked = court.rank(&plain).all;
     likeliest_first(trials, &mut ranked);
     let mut out = Vec::new();
     for scored in ranked.iter().filter(|s| s.in_range).take(EXPLAINING) {
@@ -496,7 +503,11 @@ fn refresh(court: &Court<'_>, fit: &Fit, found: &mut [Found]) {
 }
 
 /// Levels of noise one after the other, the best first; those that matter are accepted and taken over.
-fn noise_levels(court: &Court<'_>, levels: &mut Levels<'_>, trials: &Trials) -> Vec<Found> {
+fn noise_levels(court: &Court<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &Trials) -> Vec<Found> {
+    let residuals = court.residual_psd_of_sets(fit);
+    let halves = [0, 1].map(|set| {
+        Levels::new(court.noise, court.plan(), &court.gathered.sets[set].weights, &residuals[set])
+    });
     let asked: Vec<usize> =
         (0..court.question.coefficients.len()).filter(|i| !court.question.coefficients[*i].noise.is_empty()).collect();
     let mut left = asked;
@@ -508,7 +519,16 @@ fn noise_levels(court: &Court<'_>, levels: &mut Levels<'_>, trials: &Trials) -> 
         let Some((i, level)) = best else { return out };
         let c = &court.question.coefficients[i];
         let (p_value, log10_p_value) = trials.chance(&c.effect, level.delta_chi2, 1.0);
-        let matters = p_value < FALSE_ALARM && (level.value.ln()).abs() > LEVEL_TOLERANCE.ln_1p();
+        // What happens once makes one half of the data louder, noise both.
+        let differ = match halves.each_ref().map(|half| half.level(&c.noise)) {
+            [Some(a), Some(b)] => {
+                let difference = (a.value - b.value).abs() / a.sigma.hypot(b.sigma);
+                Some(2.0 * normal_tail(difference)).filter(|p| p.is_finite())
+            }
+            _ => None,
+        };
+        let steady = differ.is_none_or(|p| p > HALVES_DIFFER);
+        let matters = p_value < FALSE_ALARM && steady && (level.value.ln()).abs() > LEVEL_TOLERANCE.ln_1p();
         if p_value < FALSE_ALARM {
             levels.take(&level);
         }
@@ -527,7 +547,7 @@ fn noise_levels(court: &Court<'_>, levels: &mut Levels<'_>, trials: &Trials) -> 
             delta_bic: (court.total.weights.segments as f64).ln() - level.delta_chi2,
             in_range: true,
             held_out_delta_chi2: None,
-            held_out_p_value: None,
+            held_out_p_value: differ,
             chi2_per_dof_before: f64::NAN,
             chi2_per_dof_after: f64::NAN,
             offset_shift_m: BTreeMap::new(),

@@ -15,7 +15,7 @@ use dragfree_estimation::spectra::{Plan, Spectra, Transformer, triangle};
 use nalgebra::{DMatrix, DMatrixView};
 
 use crate::decimate::{Decimator, Response};
-use crate::transient::{Search, Transients};
+use crate::transient::{Part, Search, Transients};
 use crate::witness::Witnesses;
 
 /// Slow series have nothing above this.
@@ -152,6 +152,7 @@ pub struct Gatherer {
     short: Plan,
     bench: Bench,
     search: Search,
+    long_search: Search,
     decimator: Decimator,
     segmenter: Segmenter,
     long: Plan,
@@ -254,6 +255,7 @@ impl Gatherer {
         Self {
             low_bands,
             bench: Bench::new(&short, columns.fast, threads),
+            long_search: search.thinned(factor, SLOW_HZ),
             search,
             segmenter: Segmenter::new(long.length, decimator.step_ns(), vec![false; all]),
             decimator,
@@ -304,6 +306,7 @@ impl Gatherer {
             low_bands: self.low_bands,
             long: &self.long,
             bench: &mut self.long_bench,
+            search: &mut self.long_search,
             gathered: &mut self.gathered,
         };
         (&mut self.decimator, &mut self.segmenter, low)
@@ -351,7 +354,8 @@ impl Cuts for Gatherer {
         self.hour(taper, middle_ns);
         if taper == 0 {
             let base = self.bench.base(self.gathered.columns.base);
-            self.search.segment(&self.short, first_ns, &base, &mut self.gathered.transients);
+            let found = &mut self.gathered.transients;
+            self.search.segment(&self.short, self.short.length, Part::MiddleHalf, first_ns, &base, found);
         }
     }
 
@@ -379,6 +383,7 @@ struct Low<'a> {
     low_bands: usize,
     long: &'a Plan,
     bench: &'a mut Bench,
+    search: &'a mut Search,
     gathered: &'a mut Gathered,
 }
 
@@ -389,33 +394,55 @@ impl Cuts for Low<'_> {
 
     fn segment(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
         self.take([self.long, self.whole], taper, first_ns, columns, overlaps);
+        if taper == 0 {
+            self.look(self.long.length, Part::MiddleHalf, first_ns);
+        }
     }
 
     fn short_run(&mut self, first_ns: i64, columns: &[&[f64]]) {
         let samples = columns.first().map_or(0, |c| c.len());
         let even = samples - samples % 4;
-        if even > self.long.length / 2 {
-            let columns: Vec<&[f64]> = columns.iter().map(|c| &c[..even]).collect();
-            let thinned = self.whole.length / self.long.length;
-            let plans = [self.long.between_halves(even), self.whole.between_halves(even * thinned)];
-            self.take([&plans[0], &plans[1]], 0, first_ns, &columns, false);
+        if even < self.long.length / LONG {
+            return;
         }
+        let columns: Vec<&[f64]> = columns.iter().map(|c| &c[..even]).collect();
+        let thinned = self.whole.length / self.long.length;
+        let plans = [self.long.between_halves(even), self.whole.between_halves(even * thinned)];
+        if even > self.long.length / 2 {
+            self.take([&plans[0], &plans[1]], 0, first_ns, &columns, false);
+        } else {
+            self.transform(&plans[0], 0, &columns[..self.gathered.columns.names.len()]);
+        }
+        self.look(even, Part::All, first_ns);
     }
 }
 
 impl Low<'_> {
-    /// A segment of the `taper`-th length of a plan whose bands begin as those of the sums; with the same for all samples, by which it
-    /// counts.
-    fn take(&mut self, plans: [&Plan; 2], taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
-        let [plan, counted] = plans;
-        // What follows the columns are housekeeping values.
-        let (columns, housekeeping) = columns.split_at(self.gathered.columns.names.len());
+    /// Spectra of the samples before they were thinned.
+    fn transform(&mut self, plan: &Plan, taper: usize, columns: &[&[f64]]) {
         let samples = columns.first().map_or(0, |c| c.len());
         self.bench.transform(plan, taper, columns);
         for k in plan.first_bin..samples / 2 {
             let gain = self.response.at(k as f64 * plan.rate_hz / samples as f64 / self.rate_hz);
             self.bench.spectra.rows_mut(2 * (k - plan.first_bin), 2).scale_mut(gain.recip());
         }
+    }
+
+    /// For what happens once, in the segment that was taken last.
+    fn look(&mut self, samples: usize, part: Part, first_ns: i64) {
+        let base = self.bench.base(self.gathered.columns.base);
+        // A template begins with the first half of its first sample.
+        let first_ns = first_ns - (0.5e9 / self.long.rate_hz) as i64;
+        self.search.segment(self.long, samples, part, first_ns, &base, &mut self.gathered.transients);
+    }
+
+    /// A segment of the `taper`-th length of a plan whose bands begin as those of the sums; with the same for all samples, by which it
+    /// counts.
+    fn take(&mut self, plans: [&Plan; 2], taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
+        let [plan, counted] = plans;
+        // What follows the columns are housekeeping values.
+        let (columns, housekeeping) = columns.split_at(self.gathered.columns.names.len());
+        self.transform(plan, taper, columns);
         let set = &mut self.gathered.sets[set_of(middle_ns(first_ns, columns, plan.rate_hz))];
         let bands = 0..self.low_bands.min(plan.bands.len());
         self.bench.multiply(&plan.bins(taper)[bands.clone()], &mut set.bands[bands.clone()]);

@@ -78,6 +78,17 @@ pub struct Scored {
     pub shift: DVector<f64>,
 }
 
+/// All candidates beside a fit.
+#[derive(Clone, Debug)]
+pub struct Ranked {
+    /// Each place of each effect in its best form, the best first.
+    pub all: Vec<Scored>,
+    /// Forms that were tried, per effect.
+    pub tried: BTreeMap<String, usize>,
+    /// Places of effects of which these data say nothing: what they are made of does not change, or the model has it already.
+    pub mute: Vec<String>,
+}
+
 /// A candidate fitted to each half of the data.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Halves {
@@ -216,7 +227,7 @@ impl<'a> Court<'a> {
         let mut least = f64::INFINITY;
         for refinements in [0, REFINEMENTS] {
             let Solved { layout, columns, estimate } = self.solve(added, refinements)?;
-            least = least.min(levels.deviance(&self.residual(&layout, &columns, &estimate.theta), bands));
+            least = least.min(levels.deviance(&Self::residual(&self.total, &layout, &columns, &estimate.theta), bands));
         }
         Ok(least)
     }
@@ -319,11 +330,11 @@ impl<'a> Court<'a> {
     }
 
     /// Every place of every effect that is not in the fit, in its best form; the best first. Also how many forms of each effect were
-    /// tried.
+    /// tried, and the names of those of which these data say nothing.
     #[must_use]
-    pub fn rank(&self, fit: &Fit) -> (Vec<Scored>, BTreeMap<String, usize>) {
+    pub fn rank(&self, fit: &Fit) -> Ranked {
         let scores = &fit.scores;
-        let mut tried = BTreeMap::new();
+        let (mut tried, mut mute) = (BTreeMap::new(), Vec::new());
         let mut ranked = Vec::new();
         for place in self.question.places() {
             let first = &self.question.coefficients[place[0]];
@@ -335,11 +346,14 @@ impl<'a> Court<'a> {
                 (0..forms).map(|f| self.score(scores, self.question.candidate(&place, f))).collect();
             *tried.entry(first.effect.clone()).or_default() += scored.iter().flatten().count();
             let best = scored.iter().flatten().max_by(|a, b| a.delta_chi2.total_cmp(&b.delta_chi2));
-            let Some(best) = best else { continue };
+            let Some(best) = best else {
+                mute.push(format!("{}:{}", first.effect, first.instance));
+                continue;
+            };
             ranked.push(self.honest(fit, self.between_neighbours(scores, &scored, best)));
         }
         ranked.sort_by(|a, b| b.delta_chi2.total_cmp(&a.delta_chi2));
-        (ranked, tried)
+        Ranked { all: ranked, tried, mute }
     }
 
     /// The best mixture of the best form with a neighbour on its grid of shapes.
@@ -411,14 +425,21 @@ impl<'a> Court<'a> {
     /// Cross-spectra of the residuals of a fit, per band, over those expected of a PSD of one: a measured Σ.
     #[must_use]
     pub fn residual_psd(&self, fit: &Fit) -> Vec<DMatrix<f64>> {
-        self.residual(&fit.layout, &fit.columns, &fit.estimate.theta)
+        Self::residual(&self.total, &fit.layout, &fit.columns, &fit.estimate.theta)
     }
 
-    fn residual(&self, layout: &Layout, columns: &[usize], theta: &DVector<f64>) -> Vec<DMatrix<f64>> {
-        let spectra: Spectra = self.total.select(columns);
+    /// The same of each set of stretches.
+    #[must_use]
+    pub fn residual_psd_of_sets(&self, fit: &Fit) -> [Vec<DMatrix<f64>>; 2] {
+        let of = |gram: &Gram| Self::residual(gram, &fit.layout, &fit.columns, &fit.estimate.theta);
+        self.gathered.sets.each_ref().map(of)
+    }
+
+    fn residual(gram: &Gram, layout: &Layout, columns: &[usize], theta: &DVector<f64>) -> Vec<DMatrix<f64>> {
+        let spectra: Spectra = gram.select(columns);
         dragfree_estimation::normal::residual_spectra(&spectra, layout, theta)
             .into_iter()
-            .zip(&self.total.weights.expected)
+            .zip(&gram.weights.expected)
             .map(|(r, e)| r / e.max(f64::MIN_POSITIVE))
             .collect()
     }

@@ -3,8 +3,12 @@
 //! With residuals r whose spectrum is Σ and a template `T(f)` that begins at `t`, the amplitude that fits best is
 //! `n(t)/D`, `n(t) = Σ_f Re T* Σ⁻¹ r e^{2πift}`, `D = Σ_f T* Σ⁻¹ T`, and its significance `n/√D`; one inverse transform gives all times.
 //! Under a window w that is long against the template both n and its noise are those without it times `w(t)`.
+//!
+//! A hit of the spacecraft stands out of broad noise and is looked for in short segments. What pushes a test mass for a minute is
+//! known by the velocity that is left, below 2 mHz, where a short segment sees nothing: it is looked for in long ones.
 
 use std::f64::consts::{PI, TAU};
+use std::ops::Range;
 use std::sync::Arc;
 
 use dragfree_estimation::spectra::Plan;
@@ -20,8 +24,9 @@ const LEAST: f64 = 5.0;
 /// Median of the size of a standard normal number.
 const MEDIAN: f64 = 0.674_49;
 
-/// Peaks of one cause nearer than this are one, s.
-const NEAR_S: f64 = 120.0;
+/// Peaks of one cause nearer than this are one, s: in short segments, and in long ones, where the filter of what is known below 2 mHz
+/// rings for half an hour on either side. A second, smaller event within it is not told.
+const NEAR_S: [f64; 2] = [120.0, 1800.0];
 
 /// Peaks that are kept.
 const MOST: usize = 50;
@@ -93,15 +98,26 @@ impl Transients {
     }
 }
 
-/// The search.
+/// The search in segments of one rate.
 pub struct Search {
     templates: Vec<Template>,
     /// Residual of each channel as a combination of the base columns.
     residual: DMatrix<f64>,
-    /// `Σ⁻¹` per band.
-    inverses: Vec<DMatrix<f64>>,
-    /// What every segment needs, made for the first.
-    prepared: Option<Prepared>,
+    /// Upper end of each band, Hz, and `Σ⁻¹` in it; nothing is looked at above.
+    inverses: Vec<(f64, DMatrix<f64>)>,
+    /// One of [`NEAR_S`].
+    near_s: f64,
+    /// What every segment of a length needs, made for the first.
+    prepared: Option<(usize, Prepared)>,
+}
+
+/// Where a segment is looked at: at the times at which no other segment is looked at.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Part {
+    /// Its middle half, where segments overlap by half.
+    MiddleHalf,
+    /// All but a tenth at either end, where the window leaves little.
+    All,
 }
 
 /// Templates as the filter wants them.
@@ -114,14 +130,38 @@ struct Prepared {
 }
 
 impl Search {
-    /// Looks for `templates` in residuals made by `residual` (channels × base columns) of noise `inverses⁻¹`.
+    /// Looks for `templates` in residuals made by `residual` (channels × base columns); `inverses` are the upper end of each band,
+    /// Hz, and `Σ⁻¹` in it.
     #[must_use]
-    pub fn new(templates: Vec<Template>, residual: DMatrix<f64>, inverses: Vec<DMatrix<f64>>) -> Self {
-        Self { templates, residual, inverses, prepared: None }
+    pub fn new(templates: Vec<Template>, residual: DMatrix<f64>, inverses: Vec<(f64, DMatrix<f64>)>) -> Self {
+        Self { templates, residual, inverses, near_s: NEAR_S[0], prepared: None }
     }
 
-    fn prepare(&self, plan: &Plan) -> Prepared {
-        let n = plan.length;
+    /// The same for samples of which `factor` have become one, up to a frequency.
+    #[must_use]
+    pub fn thinned(&self, factor: usize, below_hz: f64) -> Self {
+        let template = |t: &Template| Template {
+            kernel: t.kernel.chunks(factor).map(|c| c.iter().sum::<f64>() / factor as f64).collect(),
+            // The mean of two samples is that of one here.
+            channels: t.channels.iter().map(|(c, factor, _)| (*c, *factor, false)).collect(),
+            ..t.clone()
+        };
+        let inverses = self.inverses.iter().take_while(|(end_hz, _)| *end_hz <= below_hz).cloned().collect();
+        let templates = self.templates.iter().map(template).collect();
+        Self { near_s: NEAR_S[1], ..Self::new(templates, self.residual.clone(), inverses) }
+    }
+
+    /// Bins of a segment of `n` samples in each band.
+    fn bins(&self, plan: &Plan, n: usize) -> Vec<Range<usize>> {
+        let mut first = plan.first_bin;
+        let of = |(end_hz, _): &(f64, DMatrix<f64>)| {
+            let end = ((end_hz * n as f64 / plan.rate_hz).round() as usize).clamp(first, (n / 2).max(first));
+            std::mem::replace(&mut first, end)..end
+        };
+        self.inverses.iter().map(of).collect()
+    }
+
+    fn prepare(&self, plan: &Plan, n: usize) -> Prepared {
         let mut planner = RealFftPlanner::<f64>::new();
         let (forward, inverse) = (planner.plan_fft_forward(n), planner.plan_fft_inverse(n));
         let scale = (4.0 / (plan.rate_hz * n as f64)).sqrt();
@@ -137,7 +177,7 @@ impl Search {
             let done = forward.process(&mut time, &mut spectrum);
             debug_assert!(done.is_ok());
             let mut sum = 0.0;
-            for (band, own) in plan.bands.iter().zip(&self.inverses) {
+            for (bins, (_, own)) in self.bins(plan, n).into_iter().zip(&self.inverses) {
                 // Channels that see the mean of two samples answer with its response, the others alike.
                 let (mut plain, mut mixed, mut averaged) = (0.0, 0.0, 0.0);
                 for (c, factor, mean) in &template.channels {
@@ -150,7 +190,7 @@ impl Search {
                         }
                     }
                 }
-                for k in band.first..band.end {
+                for k in bins {
                     let answer = plain + mixed * mean[k].re + averaged * mean[k].norm_sqr();
                     sum += spectrum[k].norm_sqr() * scale * scale * answer;
                 }
@@ -161,26 +201,36 @@ impl Search {
         Prepared { filters: self.templates.iter().map(filter).collect(), inverse, mean }
     }
 
-    /// A segment of full length: spectra of the base columns.
-    pub fn segment(&mut self, plan: &Plan, first_ns: i64, base: &DMatrixView<'_, f64>, found: &mut Transients) {
-        if self.templates.is_empty() || self.inverses.len() != plan.bands.len() {
+    /// A segment of `n` samples at the rate of a plan: spectra of the base columns from the plan's first bin.
+    pub fn segment(
+        &mut self,
+        plan: &Plan,
+        n: usize,
+        part: Part,
+        first_ns: i64,
+        base: &DMatrixView<'_, f64>,
+        found: &mut Transients,
+    ) {
+        if self.templates.is_empty() {
             return;
         }
-        let n = plan.length;
-        let mut white = base * self.residual.transpose();
-        for (band, inverse) in plan.bands.iter().zip(&self.inverses) {
-            let rows = 2 * (band.first - plan.first_bin)..2 * (band.end - plan.first_bin);
-            let product = white.rows(rows.start, rows.len()) * inverse;
-            white.rows_mut(rows.start, rows.len()).copy_from(&product);
+        let whole = base.rows(0, 2 * (n / 2 - plan.first_bin)) * self.residual.transpose();
+        let mut white = DMatrix::zeros(whole.nrows(), whole.ncols());
+        for (bins, (_, inverse)) in self.bins(plan, n).into_iter().zip(&self.inverses) {
+            let (start, rows) = (2 * (bins.start - plan.first_bin), 2 * bins.len());
+            white.rows_mut(start, rows).copy_from(&(whole.rows(start, rows) * inverse));
         }
         let prepared = match self.prepared.take() {
-            Some(prepared) => prepared,
-            None => self.prepare(plan),
+            Some((length, prepared)) if length == n => prepared,
+            _ => self.prepare(plan, n),
         };
         let mut spectrum = vec![Complex64::default(); n / 2 + 1];
         let mut time = vec![0.0; n];
-        // Under the window, over the middle half: segments that overlap by half cover every time once.
-        let middle = n / 4..3 * n / 4;
+        // Segments that overlap by half cover every time once with their middle halves.
+        let middle = match part {
+            Part::MiddleHalf => n / 4..3 * n / 4,
+            Part::All => n / 10..n - n / 10,
+        };
         let window: Vec<f64> = middle.clone().map(|k| (PI * k as f64 / n as f64).sin().powi(2)).collect();
         for (template, (filter, root)) in self.templates.iter().zip(&prepared.filters) {
             if *root <= 0.0 {
@@ -208,18 +258,18 @@ impl Search {
             let louder = (*sizes.select_nth_unstable_by(half, f64::total_cmp).1 / MEDIAN).max(1.0);
             for (k, x) in middle.clone().zip(&significance).filter(|(_, x)| x.abs() > LEAST * louder) {
                 let at_ns = first_ns + (k as f64 * 1e9 / plan.rate_hz).round() as i64;
-                keep(&mut found.hits, template, at_ns, x / root, louder / root);
+                keep(&mut found.hits, template, self.near_s, at_ns, [x / root, louder / root]);
             }
         }
-        self.prepared = Some(prepared);
-        found.tried += (self.templates.len() * n / 2) as f64;
+        self.prepared = Some((n, prepared));
+        found.tried += (self.templates.len() * middle.len()) as f64;
     }
 }
 
 /// Keeps a peak if no louder one is near.
-fn keep(hits: &mut Vec<Hit>, template: &Template, at_ns: i64, value: f64, sigma: f64) {
+fn keep(hits: &mut Vec<Hit>, template: &Template, near_s: f64, at_ns: i64, [value, sigma]: [f64; 2]) {
     let significance = (value / sigma).abs();
-    let near = |h: &Hit| (h.at_ns - at_ns).abs() < (NEAR_S * 1e9) as i64;
+    let near = |h: &Hit| (h.at_ns - at_ns).abs() < (near_s * 1e9) as i64;
     if hits.iter().any(|h| near(h) && h.significance() >= significance) {
         return;
     }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::io::BufWriter;
 use std::path::Path;
 
-use dragfree_critic::gather::{Columns, Gatherer, SLOW_HZ};
+use dragfree_critic::gather::{Columns, Gatherer, LONG, SLOW_HZ};
 use dragfree_critic::question::{Coefficient as Asked, Form, Question, Rule, Term};
 use dragfree_critic::record::Record;
 use dragfree_critic::transient::{Search, Template};
@@ -65,7 +65,7 @@ impl Stage for Critic {
                 "reference",
                 "",
                 &[],
-                "normal equations of the product (.neq.json): residuals and noise for the search of transients",
+                "normal equations of the product (.neq.json): residuals for the search of transients and witnesses",
             ),
         ],
         instances: &[],
@@ -168,10 +168,9 @@ impl Critic {
         };
         let question = question(available, &channels, &sorted);
         let length = longest_length((self.segment_s * rate_hz).round() as usize);
-        let (residual, inverses) = self.reference(&question, &channels, &all, length, rate_hz)?;
+        let residual = self.residual(&question, &channels, &all, length)?;
         // As they are called in telemetry: `hk/battery_current_a`.
         let topics: Vec<String> = housekeeping.iter().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
-        let search = Search::new(templates(available, &channels, &differenced), residual.clone(), inverses);
         let whole: Vec<(&str, Measured)> = channels.iter().map(|c| (name_of(c), measured(c))).collect();
         let noise = NoiseModel::new(&self.mission, &whole, 1.0 / rate_hz)?;
         let inverse = |hz: f64| {
@@ -179,6 +178,12 @@ impl Critic {
             let nothing = DMatrix::zeros(sigma.nrows(), sigma.ncols());
             sigma.cholesky().map_or(nothing, |c| c.inverse())
         };
+        // The mission's Σ: what these data promise has taken up the power of what is looked for.
+        // From the lowest bin of a long segment on.
+        let slow = Plan::slow(LONG * length, length, rate_hz);
+        let lower = slow.bands.iter().map(|b| (slow.bin_hz(b.end as f64 - 0.5), inverse(slow.frequency_hz(*b))));
+        let inverses = lower.collect();
+        let search = Search::new(templates(available, &channels, &differenced), residual.clone(), inverses);
         let witnesses = |plan: &Plan| {
             let whitening = plan.bands.iter().map(|b| inverse(plan.frequency_hz(*b))).collect();
             Witnesses::new(topics, plan, residual, whitening)
@@ -202,63 +207,36 @@ impl Critic {
         })
     }
 
-    /// Residuals as combinations of the base columns, and `Σ⁻¹` of all channels: from the product's own sums where they are given.
-    fn reference(
+    /// Residuals as combinations of the base columns, at the coefficients of the product's own sums where they are given.
+    fn residual(
         &self,
         question: &Question,
         channels: &[&Column],
         columns: &Columns,
         length: usize,
-        rate_hz: f64,
-    ) -> Result<(DMatrix<f64>, Vec<DMatrix<f64>>), PluginError> {
+    ) -> Result<DMatrix<f64>, PluginError> {
         let n = channels.len();
         let mut theta: Vec<f64> = question.coefficients.iter().map(|c| c.initial).collect();
-        let mut inverses = Vec::new();
-        let plan = Plan::new(length, rate_hz);
         if !self.reference.is_empty() {
             let refuse = |what: String| PluginError::error(format!("critic: {}: {what}", self.reference));
             let text = std::fs::read_to_string(&self.reference).map_err(|e| refuse(e.to_string()))?;
             let mut value: serde_json::Value = serde_json::from_str(&text).map_err(|e| refuse(e.to_string()))?;
             let stored: Stored = serde_json::from_value(value["sums"].take()).map_err(|e| refuse(e.to_string()))?;
-            let (layout, own_plan, sums) = Stored::stack(&[stored]).map_err(|e| refuse(e.to_string()))?;
+            let (layout, plan, sums) = Stored::stack(&[stored]).map_err(|e| refuse(e.to_string()))?;
             let model = question.model();
             let same = layout.coefficients.iter().eq(question.coefficients[..model].iter().map(|c| &c.name));
-            if !same || own_plan.length != length {
+            if !same || plan.length != length {
                 return Err(refuse("belongs to another model, or to segments of another length".to_owned()));
             }
-            let of = |name: &String| channels.iter().position(|c| name_of(c) == name);
-            let places: Vec<usize> = layout.channels.iter().filter_map(of).collect();
-            let seen: Vec<(&str, Measured)> =
-                places.iter().map(|i| (name_of(channels[*i]), measured(channels[*i]))).collect();
-            let noise = NoiseModel::new(&self.mission, &seen, 1.0 / rate_hz)?;
-            let observed = Observed { layout: &layout, plan: &own_plan, sums: &sums, prediction: None };
             if sums.total.segments > 0 {
-                let solved = estimate_with(
-                    &observed,
-                    &noise,
-                    &question.unknowns(&[]),
-                    &question.bounds(),
-                    3,
-                    Refinement::Levels,
-                )?;
+                let of = |name: &String| channels.iter().find(|c| name_of(c) == name);
+                let seen: Vec<(&str, Measured)> =
+                    layout.channels.iter().filter_map(of).map(|c| (name_of(c), measured(c))).collect();
+                let noise = NoiseModel::new(&self.mission, &seen, 1.0 / plan.rate_hz)?;
+                let observed = Observed { layout: &layout, plan: &plan, sums: &sums, prediction: None };
+                let (unknowns, bounds) = (question.unknowns(&[]), question.bounds());
+                let solved = estimate_with(&observed, &noise, &unknowns, &bounds, 3, Refinement::Levels)?;
                 theta.iter_mut().zip(solved.theta.iter()).for_each(|(t, s)| *t = *s);
-                let whole: Vec<(&str, Measured)> = channels.iter().map(|c| (name_of(c), measured(c))).collect();
-                let all = NoiseModel::new(&self.mission, &whole, 1.0 / rate_hz)?;
-                for (band, inner) in plan.bands.iter().zip(&solved.inverses) {
-                    // Channels on which nothing of the model acts are no part of the product's Σ: the mission's stands for them.
-                    let sigma = all.psd(plan.frequency_hz(*band));
-                    let rest: Vec<usize> = (0..n).filter(|i| !places.contains(i)).collect();
-                    let block = DMatrix::from_fn(rest.len(), rest.len(), |i, j| sigma[(rest[i], rest[j])]);
-                    let block = block.try_inverse().unwrap_or_else(|| DMatrix::zeros(rest.len(), rest.len()));
-                    let mut inverse = DMatrix::zeros(n, n);
-                    places.iter().enumerate().for_each(|(i, a)| {
-                        places.iter().enumerate().for_each(|(j, b)| inverse[(*a, *b)] = inner[(i, j)]);
-                    });
-                    rest.iter().enumerate().for_each(|(i, a)| {
-                        rest.iter().enumerate().for_each(|(j, b)| inverse[(*a, *b)] = block[(i, j)]);
-                    });
-                    inverses.push(inverse);
-                }
             }
         }
         let mut residual = DMatrix::zeros(n, columns.base);
@@ -268,7 +246,7 @@ impl Critic {
                 residual[(t.channel, t.column)] -= theta[i] * t.factor * t.times.map_or(1.0, |other| theta[other]);
             }
         }
-        Ok((residual, inverses))
+        Ok(residual)
     }
 }
 
@@ -468,6 +446,7 @@ impl Linked {
             self.missing[column] as f64 > MISSING * self.rows.max(1) as f64 || self.held[column].is_nan()
         };
         let model = question.model();
+        let mut fewer: BTreeMap<usize, usize> = BTreeMap::new();
         for c in &mut question.coefficients[model..] {
             let before = c.forms.len();
             let mut culprit = None;
@@ -476,6 +455,9 @@ impl Linked {
                 culprit = bad.map(|t| t.column).or(culprit);
                 bad.is_none()
             });
+            if let (false, Some(column)) = (c.forms.is_empty(), culprit) {
+                *fewer.entry(column).or_default() += before - c.forms.len();
+            }
             if let (true, Some(column)) = (before > 0 && c.forms.is_empty(), culprit) {
                 not_tried.push((
                     format!("{}:{}", c.effect, c.instance),
@@ -486,6 +468,11 @@ impl Linked {
                 ));
             }
         }
+        not_tried.extend(fewer.into_iter().map(|(column, forms)| {
+            let (missing, rows) = (self.missing[column], self.rows);
+            let reason = format!("it has no value in {missing} of {rows} epochs, so {forms} forms of effects are left out");
+            (self.names[column].clone(), reason)
+        }));
         Record { question, differenced: self.differenced, gathered: self.gatherer.gathered, not_tried }
     }
 }

@@ -22,11 +22,10 @@ pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Resu
         let mut file = std::io::BufWriter::with_capacity(1 << 20, file);
         record.write(&mut file).and_then(|()| file.flush()).map_err(Failure::io("write", path))?;
     }
-    let diagnosis = judge(&record, &mission)?;
-    let mut value = serde_json::to_value(&diagnosis).map_err(Failure::engine)?;
-    value["not_tried"] = serde_json::json!(record.not_tried);
+    let mut diagnosis = judge(&record, &mission)?;
+    diagnosis.not_tried.extend(record.not_tried.iter().cloned());
     if global.json {
-        return Ok(Done::json(&value));
+        return Ok(Done::json(&serde_json::to_value(&diagnosis).map_err(Failure::engine)?));
     }
     Ok(Done::new(screen(&diagnosis, &record, command.top, paint)))
 }
@@ -136,7 +135,7 @@ fn screen(d: &Diagnosis, record: &Record, top: usize, paint: Paint) -> String {
     if let Some(f) = accepted.first() {
         let _ = writeln!(out, "\nnext      dragfree model add MODEL.toml {}:{}", f.effect, f.instance);
     }
-    for (name, reason) in &record.not_tried {
+    for (name, reason) in &d.not_tried {
         let _ = writeln!(out, "not tried {name}: {reason}");
     }
     out

@@ -1,0 +1,96 @@
+//! Housekeeping that is no good, and candidates that are not: a sentence each, and the rest of the diagnosis as ever.
+
+use dragfree_tests::calibration::science_mode;
+use dragfree_tests::recording::Recording;
+use dragfree_tests::{dragfree, json, simulate};
+use serde_json::Value;
+use std::path::Path;
+
+/// Length of the telemetry, h.
+const HOURS: f64 = 3.0;
+
+/// Calibrates a file with a model, the pipeline's where there is none, and diagnoses the product.
+fn diagnosed(folder: &Path, telemetry: &Path, model: Option<&Path>) -> Value {
+    let mut run = science_mode(folder);
+    run.arg(telemetry);
+    if let Some(model) = model {
+        run.arg("--model").arg(model);
+    }
+    let product: Value = serde_json::from_slice(&run.output().expect("runs").stdout).expect("a product as JSON");
+    let id = product["id"].as_str().expect("an id");
+    json(dragfree(folder).args(["diagnose", id, "--archive", "archive", "--json", "-q"]), 0)
+}
+
+/// The reason why a name was not tried.
+fn reason<'a>(diagnosis: &'a Value, name: &str) -> Option<&'a str> {
+    let all = diagnosis["not_tried"].as_array().expect("a list");
+    all.iter().find(|pair| pair[0] == name).and_then(|pair| pair[1].as_str())
+}
+
+/// One channel has nothing for an hour, another hangs at one value, a third comes with every sixth packet alone. The gap and the hanging value are told, the slow one is used, nothing is accepted
+/// (nothing is hidden; false alarms 1 %), and no number is anything but a number.
+#[test]
+fn housekeeping_with_gaps_that_hangs_or_is_slow() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let hours = HOURS.to_string();
+    let file = simulate(folder.path(), &["--hours", &hours, "--seed", "21"]).remove(0);
+    std::fs::remove_dir_all(folder.path().join("truth")).expect("removable");
+    let recording = Recording::read(&file);
+    let start_ns = recording.start_ns();
+    let mut packets = 0_u32;
+    let mut hanging = None;
+    recording.write(&file, |mut message| match &*message.topic {
+        "/hk/eh1_xp_temperature_k" => {
+            let hour = message.log_time.saturating_sub(start_ns) / 3_600_000_000_000;
+            (hour != 1).then_some(message)
+        }
+        "/hk/antenna_move_flag" => {
+            let data = hanging.get_or_insert_with(|| message.data.clone());
+            message.data.clone_from(data);
+            Some(message)
+        }
+        "/hk/tm1_charge_c" => {
+            packets += 1;
+            (packets % 6 == 1).then_some(message)
+        }
+        _ => Some(message),
+    });
+    let d = diagnosed(folder.path(), &file, None);
+    assert_eq!(d["verdict"], "sufficient", "{:#}", d["candidates"][0]);
+    let gap = d["not_tried"].as_array().expect("a list").iter().find(|pair| {
+        pair[0].as_str().is_some_and(|name| name.contains("eh1_xp_temperature_k"))
+    });
+    let gap = gap.expect("the gap is told")[1].as_str().expect("a sentence");
+    assert!(gap.contains("no value in") && gap.contains("left out"), "{gap}");
+    // Every other temperature serves, and so does the slow charge.
+    let limits = d["upper_limits"].as_array().expect("limits");
+    let of = |effect: &str| limits.iter().filter(|l| l["effect"] == effect).collect::<Vec<_>>();
+    let uses = |l: &Value, column: &str| l["shape"].as_object().is_some_and(|s| s.values().any(|v| v == column));
+    assert!(!of("thermal").is_empty() && of("thermal").iter().all(|l| !uses(l, "hk.eh1_xp_temperature_k")));
+    assert_eq!(of("charge").len(), 2);
+    // A flag that hangs has no steps.
+    assert!(of("impulse").iter().all(|l| !uses(l, "hk.antenna_move_flag")), "{:?}", of("impulse"));
+    for l in limits {
+        assert!(l["limit_95"].is_f64() && l["sigma"].is_f64(), "{l}");
+    }
+}
+
+/// A model that has a candidate's very series under another name: the candidate is told to say nothing, and is given no number.
+#[test]
+fn a_candidate_that_the_model_has_under_another_name() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let hours = HOURS.to_string();
+    let file = simulate(folder.path(), &["--hours", &hours, "--seed", "22"]).remove(0);
+    std::fs::remove_dir_all(folder.path().join("truth")).expect("removable");
+    let model = folder.path().join("model.toml");
+    let offsets = ["tm1", "tm2"].map(|tm| format!("[[effect]]\nid = \"com-offset\"\ninstance = \"{tm}\"\n")).concat();
+    let formula = "acts_on = \"tm2.force.y\"\nexpression = \"command.tm2.force.y\"\nunit = \"1\"\nrange = [-0.5, 0.5]\n";
+    let mine = format!("[[effect]]\nid = \"formula\"\ninstance = \"mine\"\n[effect.parameters]\n{formula}");
+    std::fs::write(&model, format!("[model]\nrevision = \"1\"\n{offsets}{mine}")).expect("writable");
+    let d = diagnosed(folder.path(), &file, Some(&model));
+    let said = reason(&d, "es-gain:tm2.y").expect("it is told");
+    assert!(said.contains("the model has the same already"), "{said}");
+    let limits = d["upper_limits"].as_array().expect("limits");
+    let gains = |at: &str| limits.iter().filter(|l| l["effect"] == "es-gain" && l["instance"] == at).count();
+    assert_eq!((gains("tm2.y"), gains("tm1.y")), (0, 1));
+}
