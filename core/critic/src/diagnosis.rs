@@ -568,7 +568,7 @@ fn transients(court: &Court<'_>, trials: &Trials, accepted: &[Found], out: &mut 
     let search = &court.gathered.transients;
     let chance = |h: &Hit| {
         // Neighbouring samples are one trial at most; all are counted.
-        (2.0 * normal_tail(h.significance()) * search.tried * trials.shares).min(1.0)
+        (2.0 * normal_tail(h.significance) * search.tried * trials.shares).min(1.0)
     };
     let certain: Vec<&Hit> = search.hits.iter().filter(|h| chance(h) < FALSE_ALARM).collect();
     // What comes again and again has been found as one.
@@ -578,16 +578,18 @@ fn transients(court: &Court<'_>, trials: &Trials, accepted: &[Found], out: &mut 
             continue;
         }
         named.push((&h.effect, &h.instance));
+        let values: Vec<(f64, f64)> = h.coefficients.iter().map(|c| (c.value, c.sigma)).collect();
+        let Some(lead) = h.coefficients.get(leading(&values)) else { continue };
         out.push(Found {
             effect: h.effect.clone(),
             instance: h.instance.clone(),
-            coefficient: h.coefficient.clone(),
-            value: h.value,
-            sigma: h.sigma,
-            unit: h.unit.clone(),
+            coefficient: lead.name.clone(),
+            value: lead.value,
+            sigma: lead.sigma,
+            unit: lead.unit.clone(),
             shape: h.shape.clone(),
-            coefficients: vec![json!({ "name": h.coefficient, "value": h.value, "sigma": h.sigma, "unit": h.unit })],
-            delta_chi2: h.significance().powi(2),
+            coefficients: h.coefficients.iter().map(|c| json!(c)).collect(),
+            delta_chi2: h.significance.powi(2),
             p_value: chance(h),
             log10_p_value: chance(h).max(f64::MIN_POSITIVE).log10(),
             delta_bic: f64::NAN,
@@ -658,7 +660,7 @@ fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
     let mut names: Vec<String> = loud.iter().map(|(c, _, _)| channels[*c].clone()).collect();
     names.sort();
     names.dedup();
-    let kind = if court.gathered.transients.hits.iter().any(|h| h.significance() > 10.0) {
+    let kind = if court.gathered.transients.hits.iter().any(|h| h.significance > 10.0) {
         "transient"
     } else if band_hz[1] < DRIFT_HZ {
         "drift"

@@ -12,7 +12,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use dragfree_estimation::spectra::Plan;
-use nalgebra::{DMatrix, DMatrixView};
+use nalgebra::{DMatrix, DMatrixView, DVector};
 use realfft::num_complex::Complex64;
 use realfft::{ComplexToReal, RealFftPlanner};
 use serde::{Deserialize, Serialize};
@@ -65,18 +65,24 @@ pub struct Hit {
     pub shape: Map<String, Value>,
     /// Unix ns of the sample in which it begins.
     pub at_ns: i64,
-    /// Amplitude, unit of the coefficient.
+    /// Amplitude over σ of this template alone, by which it was found.
+    pub significance: f64,
+    /// Every coefficient of the effect with this course at this time, fitted together: a hit pushes and turns, and what
+    /// turns is seen in the test masses too.
+    pub coefficients: Vec<Amplitude>,
+}
+
+/// A coefficient of what was found.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Amplitude {
+    /// Name.
+    pub name: String,
+    /// Value, in `unit`.
     pub value: f64,
     /// Its σ.
     pub sigma: f64,
-}
-
-impl Hit {
-    /// Amplitude over σ.
-    #[must_use]
-    pub fn significance(&self) -> f64 {
-        (self.value / self.sigma).abs()
-    }
+    /// Unit.
+    pub unit: String,
 }
 
 /// What was found.
@@ -92,7 +98,7 @@ impl Transients {
     /// Adds the peaks of other data.
     pub fn add(&mut self, other: &Self) {
         self.hits.extend(other.hits.iter().cloned());
-        self.hits.sort_by(|a, b| b.significance().total_cmp(&a.significance()));
+        self.hits.sort_by(|a, b| b.significance.total_cmp(&a.significance));
         self.hits.truncate(MOST);
         self.tried += other.tried;
     }
@@ -120,11 +126,22 @@ pub enum Part {
     All,
 }
 
+/// A template as the filter wants it.
+struct Filter {
+    conjugate: Vec<Complex64>,
+    /// `√D`, `D = Σ_f t`, `t = T* Σ⁻¹ T`.
+    root: f64,
+    /// `Σ_f t²`.
+    squares: f64,
+}
+
+/// Mean of a squared Hann window times two: the power of a segment's noise over that where the window is one.
+const WINDOW_POWER: f64 = 0.75;
+
 /// Templates as the filter wants them.
 struct Prepared {
     inverse: Arc<dyn ComplexToReal<f64>>,
-    /// Per template its conjugate spectrum and `√D`.
-    filters: Vec<(Vec<Complex64>, f64)>,
+    filters: Vec<Filter>,
     /// Per bin, the conjugate response of a mean of two samples.
     mean: Vec<Complex64>,
 }
@@ -176,29 +193,77 @@ impl Search {
             // The length is that of the plan of the transform, the only thing that it refuses.
             let done = forward.process(&mut time, &mut spectrum);
             debug_assert!(done.is_ok());
-            let mut sum = 0.0;
+            let (mut sum, mut squares) = (0.0, 0.0);
             for (bins, (_, own)) in self.bins(plan, n).into_iter().zip(&self.inverses) {
-                // Channels that see the mean of two samples answer with its response, the others alike.
-                let (mut plain, mut mixed, mut averaged) = (0.0, 0.0, 0.0);
-                for (c, factor, mean) in &template.channels {
-                    for (d, other, their_mean) in &template.channels {
-                        let part = factor * other * own[(*c, *d)];
-                        match (mean, their_mean) {
-                            (false, false) => plain += part,
-                            (true, true) => averaged += part,
-                            _ => mixed += part,
-                        }
-                    }
-                }
+                let answer = Answer::new(template, template, own);
                 for k in bins {
-                    let answer = plain + mixed * mean[k].re + averaged * mean[k].norm_sqr();
-                    sum += spectrum[k].norm_sqr() * scale * scale * answer;
+                    let t = spectrum[k].norm_sqr() * scale * scale * answer.at(mean[k]);
+                    sum += t;
+                    squares += t * t;
                 }
             }
             spectrum.iter_mut().for_each(|t| *t = t.conj() * scale);
-            (spectrum, sum.max(0.0).sqrt())
+            Filter { conjugate: spectrum, root: sum.max(0.0).sqrt(), squares }
         };
         Prepared { filters: self.templates.iter().map(filter).collect(), inverse, mean }
+    }
+
+    /// What a template's matched filter makes of whitened residuals, bin by bin.
+    fn filtered(&self, plan: &Plan, n: usize, of: usize, white: &DMatrix<f64>, prepared: &Prepared) -> Vec<Complex64> {
+        let mut spectrum = vec![Complex64::default(); n / 2 + 1];
+        for (c, factor, averaged) in &self.templates[of].channels {
+            let rows = white.column(*c);
+            let pairs = rows.as_slice().chunks_exact(2).zip(&mut spectrum[plan.first_bin..n / 2]);
+            for ((pair, out), mean) in pairs.zip(&prepared.mean[plan.first_bin..]) {
+                let x = Complex64::new(pair[0], pair[1]) * *factor;
+                *out += if *averaged { x * mean } else { x };
+            }
+        }
+        spectrum.iter_mut().zip(&prepared.filters[of].conjugate).for_each(|(x, filter)| *x *= filter);
+        spectrum
+    }
+
+    /// All templates of the effect and course of one, fitted together where that one has its peak, at sample `k`; `louder` than Σ says
+    /// is the noise.
+    fn amplitudes(
+        &self,
+        plan: &Plan,
+        n: usize,
+        (of, k, louder): (usize, usize, f64),
+        white: &DMatrix<f64>,
+        prepared: &Prepared,
+    ) -> Vec<Amplitude> {
+        let own = &self.templates[of];
+        let alike = |t: &Template| (&t.effect, &t.instance, &t.shape) == (&own.effect, &own.instance, &own.shape);
+        let group: Vec<usize> = (0..self.templates.len())
+            .filter(|i| alike(&self.templates[*i]) && prepared.filters[*i].root > 0.0)
+            .collect();
+        let window = (PI * k as f64 / n as f64).sin().powi(2);
+        let turn = |bin: usize| Complex64::from_polar(1.0, TAU * (bin * k % n) as f64 / n as f64);
+        let score = DVector::from_iterator(
+            group.len(),
+            group.iter().map(|i| {
+                let filtered = self.filtered(plan, n, *i, white, prepared);
+                filtered.iter().enumerate().map(|(bin, x)| (x * turn(bin)).re).sum::<f64>() / window
+            }),
+        );
+        let course = &prepared.filters[of].conjugate;
+        let information = DMatrix::from_fn(group.len(), group.len(), |i, j| {
+            let of = |(bins, (_, own)): (Range<usize>, &(f64, DMatrix<f64>))| {
+                let answer = Answer::new(&self.templates[group[i]], &self.templates[group[j]], own);
+                bins.map(|k| course[k].norm_sqr() * answer.at(prepared.mean[k])).sum::<f64>()
+            };
+            self.bins(plan, n).into_iter().zip(&self.inverses).map(of).sum::<f64>()
+        });
+        let Some(covariance) = information.cholesky().map(|c| c.inverse()) else { return Vec::new() };
+        let values: DVector<f64> = &covariance * score;
+        let amplitude = |(i, t): (usize, &usize)| Amplitude {
+            name: self.templates[*t].coefficient.clone(),
+            value: values[i],
+            sigma: louder * covariance[(i, i)].sqrt(),
+            unit: self.templates[*t].unit.clone(),
+        };
+        group.iter().enumerate().map(amplitude).collect()
     }
 
     /// A segment of `n` samples at the rate of a plan: spectra of the base columns from the plan's first bin.
@@ -224,7 +289,6 @@ impl Search {
             Some((length, prepared)) if length == n => prepared,
             _ => self.prepare(plan, n),
         };
-        let mut spectrum = vec![Complex64::default(); n / 2 + 1];
         let mut time = vec![0.0; n];
         // Segments that overlap by half cover every time once with their middle halves.
         let middle = match part {
@@ -232,33 +296,46 @@ impl Search {
             Part::All => n / 10..n - n / 10,
         };
         let window: Vec<f64> = middle.clone().map(|k| (PI * k as f64 / n as f64).sin().powi(2)).collect();
-        for (template, (filter, root)) in self.templates.iter().zip(&prepared.filters) {
+        let mut peaks: Vec<(usize, usize, f64)> = Vec::new();
+        for (of, Filter { root, squares, .. }) in prepared.filters.iter().enumerate() {
             if *root <= 0.0 {
                 continue;
             }
-            spectrum.fill(Complex64::default());
-            for (c, factor, averaged) in &template.channels {
-                let rows = white.column(*c);
-                let pairs = rows.as_slice().chunks_exact(2).zip(&mut spectrum[plan.first_bin..n / 2]);
-                for ((pair, out), mean) in pairs.zip(&prepared.mean[plan.first_bin..]) {
-                    let x = Complex64::new(pair[0], pair[1]) * *factor;
-                    *out += if *averaged { x * mean } else { x };
-                }
-            }
-            spectrum.iter_mut().zip(filter).for_each(|(x, filter)| *x *= filter);
+            let mut spectrum = self.filtered(plan, n, of, &white, &prepared);
+            let power: f64 = spectrum.iter().map(Complex64::norm_sqr).sum();
             if prepared.inverse.process(&mut spectrum, &mut time).is_err() {
                 continue;
             }
             // The transform sums the bins of both signs.
             let significance: Vec<f64> =
                 time[middle.clone()].iter().zip(&window).map(|(x, w)| 0.5 * x / (w * root)).collect();
-            // Noise may be louder than Σ says. Its median does not see what happens once.
+            // Noise may be louder than Σ says. Its median does not see what happens a few times and is soon over; and what a peak
+            // leaves of the filtered power does not see what happens once, however long it rings.
             let mut sizes: Vec<f64> = significance.iter().map(|x| x.abs()).collect();
             let half = sizes.len() / 2;
-            let louder = (*sizes.select_nth_unstable_by(half, f64::total_cmp).1 / MEDIAN).max(1.0);
+            let median = *sizes.select_nth_unstable_by(half, f64::total_cmp).1 / MEDIAN;
+            let sizes = significance.iter().zip(&window).map(|(x, w)| (x * w / root).powi(2));
+            let left = power - sizes.fold(0.0, f64::max) * squares;
+            let left = (left / (WINDOW_POWER * root * root)).max(0.0).sqrt();
+            let louder = median.min(left).max(1.0);
             for (k, x) in middle.clone().zip(&significance).filter(|(_, x)| x.abs() > LEAST * louder) {
                 let at_ns = first_ns + (k as f64 * 1e9 / plan.rate_hz).round() as i64;
-                keep(&mut found.hits, template, self.near_s, at_ns, [x / root, louder / root]);
+                if keep(&mut found.hits, &self.templates[of], self.near_s, at_ns, x.abs() / louder) {
+                    peaks.push((of, k, louder));
+                }
+            }
+        }
+        // Only what was kept is worth the time.
+        for (of, k, louder) in peaks {
+            let at_ns = first_ns + (k as f64 * 1e9 / plan.rate_hz).round() as i64;
+            let t = &self.templates[of];
+            let same_course = |h: &Hit| t.shape.iter().all(|(key, value)| h.shape.get(key) == Some(value));
+            let is = |h: &&mut Hit| {
+                let same = (&h.effect, &h.instance, &h.coefficient) == (&t.effect, &t.instance, &t.coefficient);
+                h.at_ns == at_ns && same && same_course(h) && h.coefficients.is_empty()
+            };
+            if let Some(hit) = found.hits.iter_mut().find(is) {
+                hit.coefficients = self.amplitudes(plan, n, (of, k, louder), &white, &prepared);
             }
         }
         self.prepared = Some((n, prepared));
@@ -266,15 +343,42 @@ impl Search {
     }
 }
 
-/// Keeps a peak if no louder one is near.
-fn keep(hits: &mut Vec<Hit>, template: &Template, near_s: f64, at_ns: i64, [value, sigma]: [f64; 2]) {
-    let significance = (value / sigma).abs();
-    let near = |h: &Hit| (h.at_ns - at_ns).abs() < (near_s * 1e9) as i64;
-    if hits.iter().any(|h| near(h) && h.significance() >= significance) {
-        return;
+/// How two templates of one course share information in a band: the sum over their channels, of which those that see the mean of two
+/// samples answer with its response.
+struct Answer {
+    plain: f64,
+    mixed: f64,
+    averaged: f64,
+}
+
+impl Answer {
+    fn new(a: &Template, b: &Template, inverse: &DMatrix<f64>) -> Self {
+        let mut answer = Self { plain: 0.0, mixed: 0.0, averaged: 0.0 };
+        for (c, factor, mean) in &a.channels {
+            for (d, other, their_mean) in &b.channels {
+                let part = factor * other * inverse[(*c, *d)];
+                match (mean, their_mean) {
+                    (false, false) => answer.plain += part,
+                    (true, true) => answer.averaged += part,
+                    _ => answer.mixed += part,
+                }
+            }
+        }
+        answer
     }
-    if hits.len() >= MOST && hits.last().is_some_and(|h| h.significance() >= significance) {
-        return;
+
+    fn at(&self, mean: Complex64) -> f64 {
+        self.plain + self.mixed * mean.re + self.averaged * mean.norm_sqr()
+    }
+}
+
+/// Keeps a peak if no louder one is near; whether it did.
+fn keep(hits: &mut Vec<Hit>, template: &Template, near_s: f64, at_ns: i64, significance: f64) -> bool {
+    let near = |h: &Hit| (h.at_ns - at_ns).abs() < (near_s * 1e9) as i64;
+    if hits.iter().any(|h| near(h) && h.significance >= significance)
+        || hits.len() >= MOST && hits.last().is_some_and(|h| h.significance >= significance)
+    {
+        return false;
     }
     hits.retain(|h| !near(h));
     let mut shape = template.shape.clone();
@@ -286,10 +390,11 @@ fn keep(hits: &mut Vec<Hit>, template: &Template, near_s: f64, at_ns: i64, [valu
         unit: template.unit.clone(),
         shape,
         at_ns,
-        value,
-        sigma,
+        significance,
+        coefficients: Vec::new(),
     };
-    let place = hits.partition_point(|h| h.significance() >= significance);
+    let place = hits.partition_point(|h| h.significance >= significance);
     hits.insert(place, hit);
     hits.truncate(MOST);
+    true
 }
