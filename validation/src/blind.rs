@@ -232,7 +232,8 @@ fn truth_as_words(score: &Value, name: &str) -> Option<Vec<String>> {
     let values = effect["values"].as_array().filter(|values| !values.is_empty())?;
     for value in values {
         let number = value["truth"].as_f64()?;
-        let of = if values.len() > 1 { format!("{}=", value["coefficient"].as_str()?) } else { String::new() };
+        let part = value["coefficient"].as_str()?.strip_prefix(&name.replacen(':', ".", 1))?.trim_start_matches('.');
+        let of = if part.is_empty() { String::new() } else { format!("{part}=") };
         words.extend(["--fixed".to_owned(), format!("{of}{number:e}")]);
     }
     for (parameter, value) in effect["expected_shape"].as_object()? {

@@ -412,10 +412,11 @@ pub(crate) struct ModelAdd {
     #[arg(long, value_name = "NAME=VALUE", value_parser = setting)]
     pub(crate) set: Vec<(String, String)>,
     /// Do not estimate, but fix at a value in SI units; repeatable, NAME= where the effect has several coefficients
-    #[arg(long, value_name = "[NAME=]VALUE", value_parser = named_number, conflicts_with_all = ["value", "prior_sigma"])]
+    #[arg(long, value_name = "[NAME=]VALUE", value_parser = named_number, allow_hyphen_values = true,
+        conflicts_with_all = ["value", "prior_sigma"])]
     pub(crate) fixed: Vec<(Option<String>, f64)>,
     /// Value before any data, SI; repeatable
-    #[arg(long, value_name = "[NAME=]VALUE", value_parser = named_number)]
+    #[arg(long, value_name = "[NAME=]VALUE", value_parser = named_number, allow_hyphen_values = true)]
     pub(crate) value: Vec<(Option<String>, f64)>,
     /// Standard deviation before any data, SI; repeatable
     #[arg(long, value_name = "[NAME=]SIGMA", value_parser = named_number)]
@@ -550,6 +551,8 @@ mod tests {
             "dragfree model log m.toml --json",
             "dragfree model add m.toml es-gain:tm1.y --set lag_s=480 --value 0.01 --prior-sigma 0.05",
             "dragfree model add m.toml com-offset:tm1 --fixed x=0.09 --fixed y=-0.1",
+            "dragfree model add m.toml es-gain:tm1.y --fixed -6.1e-2",
+            "dragfree model add m.toml es-gain:tm1.y --value -0.01",
             "dragfree model add m.toml --from d.json --rank 2",
             "dragfree model add m.toml thermal:tm1.x --from d.json",
             "dragfree model remove m.toml es-gain:tm1.y",
