@@ -57,9 +57,11 @@ fn housekeeping_with_gaps_that_hangs_or_is_slow() {
     });
     let d = diagnosed(folder.path(), &file, None);
     assert_eq!(d["verdict"], "sufficient", "{:#}", d["candidates"][0]);
-    let gap = d["not_tried"].as_array().expect("a list").iter().find(|pair| {
-        pair[0].as_str().is_some_and(|name| name.contains("eh1_xp_temperature_k"))
-    });
+    let gap = d["not_tried"]
+        .as_array()
+        .expect("a list")
+        .iter()
+        .find(|pair| pair[0].as_str().is_some_and(|name| name.contains("eh1_xp_temperature_k")));
     let gap = gap.expect("the gap is told")[1].as_str().expect("a sentence");
     assert!(gap.contains("no value in") && gap.contains("left out"), "{gap}");
     // Every other temperature serves, and so does the slow charge.
@@ -84,7 +86,8 @@ fn a_candidate_that_the_model_has_under_another_name() {
     std::fs::remove_dir_all(folder.path().join("truth")).expect("removable");
     let model = folder.path().join("model.toml");
     let offsets = ["tm1", "tm2"].map(|tm| format!("[[effect]]\nid = \"com-offset\"\ninstance = \"{tm}\"\n")).concat();
-    let formula = "acts_on = \"tm2.force.y\"\nexpression = \"command.tm2.force.y\"\nunit = \"1\"\nrange = [-0.5, 0.5]\n";
+    let formula =
+        "acts_on = \"tm2.force.y\"\nexpression = \"command.tm2.force.y\"\nunit = \"1\"\nrange = [-0.5, 0.5]\n";
     let mine = format!("[[effect]]\nid = \"formula\"\ninstance = \"mine\"\n[effect.parameters]\n{formula}");
     std::fs::write(&model, format!("[model]\nrevision = \"1\"\n{offsets}{mine}")).expect("writable");
     let d = diagnosed(folder.path(), &file, Some(&model));

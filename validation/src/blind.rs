@@ -224,9 +224,8 @@ impl Set<'_> {
 /// The true values and shape of an effect as `model add` takes them; none where not all are known.
 fn truth_as_words(score: &Value, name: &str) -> Option<Vec<String>> {
     let effects = score["effects"].as_array()?;
-    let named = |e: &&Value| {
-        e["effect"].as_str().zip(e["instance"].as_str()).is_some_and(|(a, b)| format!("{a}:{b}") == name)
-    };
+    let named =
+        |e: &&Value| e["effect"].as_str().zip(e["instance"].as_str()).is_some_and(|(a, b)| format!("{a}:{b}") == name);
     let effect = effects.iter().find(named)?;
     let mut words = Vec::new();
     let values = effect["values"].as_array().filter(|values| !values.is_empty())?;

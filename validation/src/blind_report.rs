@@ -113,7 +113,12 @@ pub fn numbers(lines: &[Blind]) -> (String, Vec<String>) {
     let few = share(nothing.len() - alarms, nothing.len(), 0.99);
     row("false alarms where nothing is hidden", part(alarms, nothing.len()), "≤ 1 %", few);
     let wrong = lines.iter().filter(|l| false_causes(l) > 0).count();
-    row("a false cause named, all sets", part(wrong, lines.len()), "≤ 1 %", share(lines.len() - wrong, lines.len(), 0.99));
+    row(
+        "a false cause named, all sets",
+        part(wrong, lines.len()),
+        "≤ 1 %",
+        share(lines.len() - wrong, lines.len(), 0.99),
+    );
 
     let singles: Vec<Acted<'_>> = lines.iter().map(effects).filter(|e| e.len() == 1).flatten().collect();
     let right = |a: &&&Acted<'_>| a.is_found() && false_causes(a.line) == 0;
@@ -124,7 +129,12 @@ pub fn numbers(lines: &[Blind]) -> (String, Vec<String>) {
     };
     let at_hand = |a: &Acted<'_>| a.at_hand().unwrap_or(0.0);
     let (k, n) = above(&at_hand, PLAIN, f64::INFINITY);
-    row("one effect, above 8σ in the data at hand: right first, or a confounder", part(k, n), "≥ 95 %", share(k, n, 0.95));
+    row(
+        "one effect, above 8σ in the data at hand: right first, or a confounder",
+        part(k, n),
+        "≥ 95 %",
+        share(k, n, 0.95),
+    );
     let (k, n) = above(&|a| a.drawn(), PLAIN, f64::INFINITY);
     row("one effect, drawn for more than 8σ: the same", part(k, n), "≥ 95 %", share(k, n, 0.95));
     let (k, n) = above(&at_hand, 3.0, PLAIN);
@@ -136,7 +146,12 @@ pub fn numbers(lines: &[Blind]) -> (String, Vec<String>) {
         .filter_map(|v| v["difference_sigma"].as_f64())
         .collect();
     let within = values.iter().filter(|d| d.abs() <= 2.0).count();
-    row("coefficients of true causes within 2σ", part(within, values.len()), "≥ 93 %", share(within, values.len(), 0.93));
+    row(
+        "coefficients of true causes within 2σ",
+        part(within, values.len()),
+        "≥ 93 %",
+        share(within, values.len(), 0.93),
+    );
 
     let after: Vec<_> = lines.iter().filter_map(|l| Some((l, l.after.as_ref()?))).collect();
     let apart: Vec<f64> = after
@@ -167,7 +182,8 @@ pub fn numbers(lines: &[Blind]) -> (String, Vec<String>) {
     let both = |p: &&Vec<Acted<'_>>| p.iter().all(|a| a.is_found() || a.is_pointed_at());
     let k = pairs.iter().filter(both).count();
     row("pairs: both found", part(k, pairs.len()), "≥ 85 %", share(k, pairs.len(), 0.85));
-    let plain = |p: &&Vec<Acted<'_>>| p.iter().all(|a| at_hand(a).max(if a.is_covered() { 0.0 } else { a.drawn() }) >= PLAIN);
+    let plain =
+        |p: &&Vec<Acted<'_>>| p.iter().all(|a| at_hand(a).max(if a.is_covered() { 0.0 } else { a.drawn() }) >= PLAIN);
     let loud: Vec<&Vec<Acted<'_>>> = pairs.iter().filter(plain).collect();
     let k = loud.iter().filter(|p| both(p)).count();
     row("pairs of two above 8σ: both found", part(k, loud.len()), "≥ 85 %", share(k, loud.len(), 0.85));
@@ -178,7 +194,8 @@ pub fn numbers(lines: &[Blind]) -> (String, Vec<String>) {
         let k = these.iter().filter(|a| a.is_pointed_at()).count();
         let bar = if floor > 0.0 { "all" } else { "" };
         let holds = if floor > 0.0 { share(k, these.len(), 1.0) } else { None };
-        let what = format!("a kind that no effect covers, drawn {what}: `unexplained`, the true driver among the first three");
+        let what =
+            format!("a kind that no effect covers, drawn {what}: `unexplained`, the true driver among the first three");
         row(&what, part(k, these.len()), bar, holds);
     }
     text += &kinds(&singles);
@@ -188,7 +205,8 @@ pub fn numbers(lines: &[Blind]) -> (String, Vec<String>) {
 fn provenance(lines: &[Blind]) -> String {
     let seeds: BTreeSet<u32> = lines.iter().map(|l| l.seed).collect();
     let (first, last) = (seeds.first().copied().unwrap_or(0), seeds.last().copied().unwrap_or(0));
-    let join = |of: &dyn Fn(&Blind) -> String| lines.iter().map(of).collect::<BTreeSet<_>>().into_iter().collect::<Vec<_>>();
+    let join =
+        |of: &dyn Fn(&Blind) -> String| lines.iter().map(of).collect::<BTreeSet<_>>().into_iter().collect::<Vec<_>>();
     let mut seconds: Vec<f64> = lines.iter().map(|l| l.diagnosis_s).collect();
     seconds.sort_by(f64::total_cmp);
     format!(
@@ -213,7 +231,9 @@ fn kinds(singles: &[Acted<'_>]) -> String {
             (row[2].0, row[2].1) = (row[2].0 + found, row[2].1 + 1);
         }
     }
-    let mut text = "\n| one effect | drawn above 8σ | drawn 3 to 8σ | above 8σ in the data at hand |\n|---|---|---|---|\n".to_owned();
+    let mut text =
+        "\n| one effect | drawn above 8σ | drawn 3 to 8σ | above 8σ in the data at hand |\n|---|---|---|---|\n"
+            .to_owned();
     for (kind, row) in rows {
         let [a, b, c] = row.map(|(k, n)| if n == 0 { "–".to_owned() } else { format!("{k} of {n}") });
         let _ = writeln!(text, "| `{kind}` | {a} | {b} | {c} |");
@@ -228,7 +248,9 @@ fn kinds(singles: &[Acted<'_>]) -> String {
 pub fn picture(lines: &[Blind]) -> Result<Option<String>, ChartError> {
     let plain = |a: &Acted<'_>| a.drawn().max(a.at_hand().unwrap_or(0.0)) >= PLAIN;
     let mut tables = Vec::new();
-    for (title, wanted) in [("Hidden above 8σ (rows), said first (columns)", true), ("Hidden below 8σ, or nothing", false)] {
+    for (title, wanted) in
+        [("Hidden above 8σ (rows), said first (columns)", true), ("Hidden below 8σ, or nothing", false)]
+    {
         let mut counts: BTreeMap<(&str, &str), usize> = BTreeMap::new();
         let mut covered: BTreeMap<&str, bool> = BTreeMap::new();
         for line in lines {
@@ -245,7 +267,8 @@ pub fn picture(lines: &[Blind]) -> Result<Option<String>, ChartError> {
             continue;
         }
         // Nothing and the kinds that nobody covers stand last, as do the answers that belong to them.
-        let order = |name: &str| (matches!(name, NOTHING | "sufficient" | "unexplained"), covered.get(name) == Some(&false));
+        let order =
+            |name: &str| (matches!(name, NOTHING | "sufficient" | "unexplained"), covered.get(name) == Some(&false));
         let sorted = |names: BTreeSet<&str>| {
             let mut names: Vec<String> = names.into_iter().map(str::to_owned).collect();
             names.sort_by_key(|name| order(name));
@@ -275,7 +298,12 @@ mod tests {
     use serde_json::json;
 
     fn set(seed: u32, verdict: &str, accepted: &[&str], effects: Value) -> Blind {
-        let names: Vec<String> = effects.as_array().into_iter().flatten().map(|e| format!("{}:tm1.y", e["effect"].as_str().unwrap_or("?"))).collect();
+        let names: Vec<String> = effects
+            .as_array()
+            .into_iter()
+            .flatten()
+            .map(|e| format!("{}:tm1.y", e["effect"].as_str().unwrap_or("?")))
+            .collect();
         let false_causes: Vec<&&str> = accepted.iter().filter(|a| !names.iter().any(|n| n == **a)).collect();
         Blind {
             configuration: "hidden-6h".to_owned(),
@@ -305,7 +333,10 @@ mod tests {
         let both = json!([effect("es-gain", 9.0, 9.0, "accepted"), effect("charge", 9.0, 9.0, "accepted")]);
         let pair = set(104, "right", &["es-gain:tm1.y", "charge:tm1.y"], both);
         let (text, missed) = numbers(&[right.clone(), lost.clone(), alarm, pair]);
-        assert!(text.contains("one effect, above 8σ in the data at hand: right first, or a confounder | 1 of 1, 100 %"), "{text}");
+        assert!(
+            text.contains("one effect, above 8σ in the data at hand: right first, or a confounder | 1 of 1, 100 %"),
+            "{text}"
+        );
         assert!(text.contains("drawn for more than 8σ: the same | 1 of 2, 50 %"), "{text}");
         assert!(text.contains("pairs: both found | 1 of 1"), "{text}");
         assert!(text.contains("| `charge` | 0 of 1 | – | – |"), "{text}");
@@ -322,7 +353,8 @@ mod tests {
         let offset = line.before.clone();
         for (found, failed) in [(1.005, 0), (1.02, 1)] {
             let held_out_chi2_per_dof = [Some(1.1), Some(found), Some(1.0)];
-            line.after = Some(After { added: vec!["es-gain:tm1.y".to_owned()], offset: offset.clone(), held_out_chi2_per_dof });
+            line.after =
+                Some(After { added: vec!["es-gain:tm1.y".to_owned()], offset: offset.clone(), held_out_chi2_per_dof });
             assert_eq!(numbers(std::slice::from_ref(&line)).1.len(), failed, "{found}");
         }
     }

@@ -571,7 +571,8 @@ pub fn report(measured: &Measured) -> Result<Report, CampaignError> {
     let speed = measured.speed.as_ref().map_or("Not measured yet.\n".to_owned(), Speed::table);
     let (blind, more) = blind_report::numbers(&measured.blind);
     failed.extend(more);
-    let drawn = [("coverage", picture(&measured.coverage, &free)), ("confusion", blind_report::picture(&measured.blind))];
+    let drawn =
+        [("coverage", picture(&measured.coverage, &free)), ("confusion", blind_report::picture(&measured.blind))];
     let mut pictures = Vec::new();
     for (name, picture) in drawn {
         let path = picture_path(name);

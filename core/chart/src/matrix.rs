@@ -84,7 +84,8 @@ fn draw(m: &Matrix, area: &DrawingArea<SVGBackend<'_>, plotters::coord::Shift>, 
                 let fill = colour(if is_right { RIGHT } else { WRONG }, *count as f64 / all as f64);
                 area.draw(&Rectangle::new([(x, y), (x + CELL, y + CELL)], fill.filled())).map_err(refused)?;
                 let dark = *count * 2 > all;
-                let style = font(12).color(if dark { &WHITE } else { &BLACK }).pos(Pos::new(HPos::Center, VPos::Center));
+                let style =
+                    font(12).color(if dark { &WHITE } else { &BLACK }).pos(Pos::new(HPos::Center, VPos::Center));
                 text(&count.to_string(), (x + CELL / 2, y + CELL / 2), style)?;
             }
             let frame = if is_right { BLACK.stroke_width(2) } else { RGBColor(215, 215, 215).stroke_width(1) };

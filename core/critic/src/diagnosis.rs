@@ -48,7 +48,8 @@ const EXCESS_SIGMA: f64 = 4.5;
 const WITNESS_ALARM: f64 = 1e-3;
 
 /// Why a candidate has no number.
-const MUTE: &str = "these data say nothing of it: what it is made of does not change in them, or the model has the same already";
+const MUTE: &str =
+    "these data say nothing of it: what it is made of does not change in them, or the model has the same already";
 
 /// What moves the offset by so many σ is no longer told from it.
 const MOVES_OFFSET: f64 = 3.0;
@@ -505,9 +506,8 @@ fn refresh(court: &Court<'_>, fit: &Fit, found: &mut [Found]) {
 /// Levels of noise one after the other, the best first; those that matter are accepted and taken over.
 fn noise_levels(court: &Court<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &Trials) -> Vec<Found> {
     let residuals = court.residual_psd_of_sets(fit);
-    let halves = [0, 1].map(|set| {
-        Levels::new(court.noise, court.plan(), &court.gathered.sets[set].weights, &residuals[set])
-    });
+    let halves =
+        [0, 1].map(|set| Levels::new(court.noise, court.plan(), &court.gathered.sets[set].weights, &residuals[set]));
     let asked: Vec<usize> =
         (0..court.question.coefficients.len()).filter(|i| !court.question.coefficients[*i].noise.is_empty()).collect();
     let mut left = asked;
@@ -699,5 +699,82 @@ mod tests {
         }
         assert!((normal_tail(0.0) - 0.5).abs() < 1e-6);
         assert!((corrected(1e-6, 1000.0) - 1e-3).abs() < 1e-6);
+        // Where the chance itself is no number any more its logarithm is: the leading term for one degree of freedom.
+        let (chi2, log10) = (4000.0, ln_tail(4000.0, 1.0) / std::f64::consts::LN_10);
+        let leading = (-0.5 * chi2 - 0.5 * (0.5 * std::f64::consts::PI * chi2).ln()) / std::f64::consts::LN_10;
+        assert!((log10 - leading).abs() < 1e-3, "{log10} against {leading}");
+    }
+
+    /// Chances of normal deviates: over all forms of all effects together a false alarm is as likely as is said, and the one effect
+    /// with ten thousand forms takes no more of it than the one with a single form.
+    #[test]
+    fn every_effect_has_the_same_part_of_the_false_alarms() {
+        let forms = BTreeMap::from([("many".to_owned(), 10_000), ("one".to_owned(), 1)]);
+        let trials = Trials { forms, shares: 2.0 };
+        for (effect, n) in [("many", 10_000.0), ("one", 1.0)] {
+            // The χ² at which this effect alone is falsely named with a chance of half a per cent.
+            let mut chi2 = 0.0;
+            while trials.chance(effect, chi2, 1.0).0 > FALSE_ALARM {
+                chi2 += 0.01;
+            }
+            let alone = 1.0 - (1.0 - tail(chi2, 1.0)).powf(n);
+            assert!((alone / (0.5 * FALSE_ALARM) - 1.0).abs() < 0.02, "{effect}: {alone}");
+        }
+        assert!(trials.chance("one", 20.0, 1.0).1 < trials.chance("many", 25.0, 1.0).1);
+    }
+
+    fn found(channels: &[&str], shift: f64, accepted: bool) -> Found {
+        Found {
+            effect: "e".to_owned(),
+            instance: "i".to_owned(),
+            coefficient: "e.i".to_owned(),
+            value: 1.0,
+            sigma: 0.1,
+            unit: "1".to_owned(),
+            shape: Map::new(),
+            coefficients: Vec::new(),
+            delta_chi2: 100.0,
+            p_value: 1e-9,
+            log10_p_value: -9.0,
+            delta_bic: -90.0,
+            in_range: true,
+            held_out_delta_chi2: None,
+            held_out_p_value: None,
+            chi2_per_dof_before: 1.0,
+            chi2_per_dof_after: 1.0,
+            offset_shift_m: BTreeMap::new(),
+            offset_shift_sigma: BTreeMap::from([("com-offset.tm1.y".to_owned(), shift)]),
+            channels: channels.iter().map(|c| (*c).to_owned()).collect(),
+            confounders: Vec::new(),
+            accepted,
+        }
+    }
+
+    #[test]
+    fn what_leaves_the_excess_or_follows_a_wrong_noise_is_doubtful() {
+        let excess = |channel: &str, power| Unexplained {
+            channels: vec![channel.to_owned()],
+            band_hz: [1e-4, 2e-4],
+            kind: "drift".to_owned(),
+            ratio: 9.0,
+            power,
+            coherent_with: Vec::new(),
+            witnesses: Vec::new(),
+        };
+        let slow = found(&["tm1.accel.x"], 0.0, true);
+        for (part, left, doubtful) in [
+            (0.9, Some(excess("tm1.accel.x", true)), true),
+            (0.1, Some(excess("tm1.accel.x", true)), false),
+            (0.9, Some(excess("tm2.accel.z", true)), false),
+            (0.9, Some(excess("tm1.accel.x", false)), false),
+            (0.9, None, false),
+        ] {
+            assert_eq!(is_doubtful(&slow, part, &[], left.as_ref()), doubtful, "{part} {left:?}");
+        }
+        let (gain, still) = (found(&["tm1.accel.y"], 12.0, true), found(&["tm1.accel.y"], 1.0, true));
+        let torque = [found(&["sc.alpha.z"], 0.0, true)];
+        assert!(is_doubtful(&gain, 0.0, &torque, None) && !is_doubtful(&still, 0.0, &torque, None));
+        assert!(!is_doubtful(&gain, 0.0, &[found(&["sc.alpha.z"], 0.0, false)], None));
+        assert!(!is_doubtful(&gain, 0.0, &[found(&["tm1.accel.y"], 0.0, true)], None));
     }
 }

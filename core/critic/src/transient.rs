@@ -398,3 +398,95 @@ fn keep(hits: &mut Vec<Hit>, template: &Template, near_s: f64, at_ns: i64, signi
     hits.truncate(MOST);
     true
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use dragfree_estimation::spectra::Transformer;
+    use rand::SeedableRng;
+    use rand_distr::{Distribution, StandardNormal};
+    use rand_xoshiro::Xoshiro256PlusPlus;
+
+    const N: usize = 4096;
+    const COURSE: usize = 8;
+    const AT: usize = 1500;
+
+    fn template(coefficient: &str, channels: &[(usize, f64)]) -> Template {
+        Template {
+            effect: "event".to_owned(),
+            instance: "here".to_owned(),
+            coefficient: coefficient.to_owned(),
+            unit: "1".to_owned(),
+            shape: Map::new(),
+            kernel: vec![1.0; COURSE],
+            channels: channels.iter().map(|(c, factor)| (*c, *factor, false)).collect(),
+        }
+    }
+
+    /// Two channels of white noise of unit variance at 1 Hz, whose one-sided PSD is 2; `a` pushes the first, `b` half of it and the second.
+    fn hits(seed: u64, below_hz: f64, part: Part, [a, b]: [f64; 2], wave: f64) -> Vec<Hit> {
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
+        let plan = Plan::new(N, 1.0);
+        let inverse = DMatrix::from_diagonal_element(2, 2, 0.5);
+        let templates = vec![template("a", &[(0, 1.0)]), template("b", &[(0, 0.5), (1, 1.0)])];
+        let mut search = Search::new(templates, DMatrix::identity(2, 2), vec![(below_hz, inverse)]);
+        let mut base = DMatrix::zeros(2 * (N / 2 - plan.first_bin), 2);
+        for (c, mut column) in base.column_iter_mut().enumerate() {
+            let pushed = [a + 0.5 * b, b][c];
+            let sample = |k: usize| {
+                let noise: f64 = StandardNormal.sample(&mut rng);
+                let event = if (AT..AT + COURSE).contains(&k) { pushed } else { 0.0 };
+                noise + event + wave * (TAU * 0.02 * k as f64).sin()
+            };
+            let samples: Vec<f64> = (0..N).map(sample).collect();
+            Transformer::new(&plan).transform(&plan, 0, &samples, column.as_mut_slice());
+        }
+        let mut found = Transients::default();
+        search.segment(&plan, N, part, 0, &base.columns(0, 2), &mut found);
+        found.hits
+    }
+
+    /// What pushes two channels, one of them by two coefficients at once, comes out with both values, each within 4σ (false alarm
+    /// 1.3e-4); σ is that of least squares over the eight samples, `(8 (1, ½; ½, 1¼))⁻¹`. Taken alone, the first would be `a + ½ b`.
+    #[test]
+    fn an_event_has_its_time_its_values_and_the_errors_of_least_squares() {
+        let truth = [4.0, -6.0];
+        let found = hits(1, 0.5, Part::MiddleHalf, truth, 0.0);
+        let hit = &found[0];
+        assert!((hit.at_ns - 1_000_000_000 * AT as i64).abs() <= 1_000_000_000, "{hit:?}");
+        let sigma = [(10.0_f64 / 64.0).sqrt(), (8.0_f64 / 64.0).sqrt()];
+        for ((found, truth), sigma) in hit.coefficients.iter().zip(truth).zip(sigma) {
+            assert!((found.value - truth).abs() < 4.0 * sigma, "{found:?}");
+            assert!((found.sigma / sigma - 1.0).abs() < 0.02, "{found:?} against {sigma}");
+        }
+        assert!(hits(2, 0.5, Part::MiddleHalf, [0.0; 2], 0.0).is_empty());
+    }
+
+    /// Through a filter that rings for a quarter of the segment an event is found all the same, however loud.
+    #[test]
+    fn an_event_that_rings_is_found_however_loud_it_is() {
+        for size in [15.0, 500.0] {
+            let found = hits(3, 0.003, Part::MiddleHalf, [size, 0.0], 0.0);
+            let hit = found.first().unwrap_or_else(|| panic!("{size} is not found"));
+            assert!((hit.at_ns - 1_000_000_000 * AT as i64).abs() < 100_000_000_000, "{hit:?}");
+            let a = hit.coefficients.iter().find(|c| c.name == "a").expect("fitted");
+            assert!((a.value - size).abs() < 4.0 * a.sigma.max(0.02 * size), "{size}: {a:?}");
+        }
+    }
+
+    /// What goes on and on is no event.
+    #[test]
+    fn a_wave_is_no_event() {
+        for part in [Part::MiddleHalf, Part::All] {
+            assert!(hits(4, 0.5, part, [0.0; 2], 10.0).is_empty());
+        }
+    }
+
+    #[test]
+    fn a_thinned_template_gives_as_much() {
+        let search = Search::new(vec![template("a", &[(0, 1.0)])], DMatrix::identity(1, 1), Vec::new());
+        let kernel = &search.thinned(3, 1.0).templates[0].kernel;
+        assert_eq!(kernel.len(), 3);
+        assert!((3.0 * kernel.iter().sum::<f64>() - COURSE as f64).abs() < 1e-12);
+    }
+}

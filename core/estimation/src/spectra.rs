@@ -605,6 +605,53 @@ mod tests {
         assert!((efficiency(10_000) - 0.947).abs() < 1e-3);
     }
 
+    /// White noise of unit PSD, by the response to each of its samples: every bin of a segment has what `count_bands` promises of it,
+    /// the lowest one of a slow plan too.
+    #[test]
+    fn every_bin_has_the_power_that_is_promised() {
+        let (length, rate_hz) = (256, 2.0);
+        let plan = Plan::slow(length, length / 16, rate_hz);
+        let mut weights = Spectra::zero(plan.bands.len(), 0);
+        weights.count_segment(&plan, 0, false);
+        let mut transformer = Transformer::new(&plan);
+        let mut power = vec![0.0; plan.bands.len()];
+        let mut spectrum = vec![0.0; 2 * (length / 2 - FIRST_SLOW_BIN)];
+        for t in 0..length {
+            let impulse: Vec<f64> = (0..length).map(|k| f64::from(u8::from(k == t))).collect();
+            transformer.transform(&plan, 0, &impulse, &mut spectrum);
+            for (power, bins) in power.iter_mut().zip(plan.bins(0)) {
+                let rows = 2 * (bins.start - FIRST_SLOW_BIN)..2 * (bins.end - FIRST_SLOW_BIN);
+                // The variance of white noise of unit one-sided PSD is half its rate.
+                *power += 0.5 * rate_hz * spectrum[rows].iter().map(|x| x * x).sum::<f64>();
+            }
+        }
+        assert_eq!(plan.bands[0], Band { first: 2, end: 3 });
+        for (b, (power, expected)) in power.iter().zip(&weights.expected).enumerate() {
+            // A straight line leaves 1.016 in bin 3.
+            let tolerance = if plan.bands[b].first == 3 { 0.017 } else { 1e-3 };
+            assert!((power / expected - 1.0).abs() < tolerance, "band {b}: {power} against {expected}");
+        }
+    }
+
+    /// A segment of another length has the bins that half the longest lacks, each in the band of its frequency, and no other.
+    #[test]
+    fn a_run_between_two_lengths_reaches_below_the_shorter() {
+        let plan = Plan::slow(16_384, 1024, 10.0);
+        for length in [8196, 10_000, 13_500, 16_380] {
+            let between = plan.between_halves(length);
+            let reach = plan.bins(1).iter().position(|bins| !bins.is_empty()).unwrap();
+            assert!(between.bands.len() <= reach + 1);
+            for (bins, band) in between.bins(0).iter().zip(&between.bands) {
+                for k in bins.clone() {
+                    let at = (k * 16_384) as f64 / length as f64;
+                    assert!(band.first as f64 <= at && at < band.end as f64, "{length}: bin {k} in {band:?}");
+                }
+            }
+            assert_eq!(between.bins(0)[0].start, FIRST_SLOW_BIN);
+            assert!((between.bin_hz(3.0) - plan.bin_hz(3.0)).abs() < 1e-15);
+        }
+    }
+
     /// Each length puts every bin of its own into one band, that of its frequency.
     #[test]
     fn short_segments_share_the_bands() {

@@ -470,7 +470,8 @@ impl Linked {
         }
         not_tried.extend(fewer.into_iter().map(|(column, forms)| {
             let (missing, rows) = (self.missing[column], self.rows);
-            let reason = format!("it has no value in {missing} of {rows} epochs, so {forms} forms of effects are left out");
+            let reason =
+                format!("it has no value in {missing} of {rows} epochs, so {forms} forms of effects are left out");
             (self.names[column].clone(), reason)
         }));
         Record { question, differenced: self.differenced, gathered: self.gatherer.gathered, not_tried }

@@ -95,7 +95,13 @@ mod tests {
         let values: Vec<f64> = (0..100).map(|k| f64::from(u8::from((20..60).contains(&k)))).collect();
         let given = run(&mut Steps::new(30, DT_S), 0, &values, 10);
         for (k, got) in given.iter().enumerate() {
-            let want = if (20..30).contains(&k) { 1.0 } else if (60..70).contains(&k) { -1.0 } else { 0.0 };
+            let want = if (20..30).contains(&k) {
+                1.0
+            } else if (60..70).contains(&k) {
+                -1.0
+            } else {
+                0.0
+            };
             assert!((got - want).abs() < 1e-12, "row {k}: {got}");
         }
     }
