@@ -106,7 +106,7 @@ pub fn numbers(lines: &[Blind]) -> (String, Vec<String>) {
             missed.push(format!("{what}: {measured}, bar {bar}"));
         }
     };
-    let share = |k: usize, n: usize, least: f64| (n > 0).then(|| k as f64 >= least * n as f64);
+    let share = |k: usize, n: usize, least: f64| (n > 0).then_some(k as f64 >= least * n as f64);
 
     let nothing: Vec<&Blind> = lines.iter().filter(|l| effects(l).is_empty()).collect();
     let alarms = nothing.iter().filter(|l| l.score["correct"] != true).count();
@@ -297,7 +297,7 @@ mod tests {
     use crate::records::tests::line as product;
     use serde_json::json;
 
-    fn set(seed: u32, verdict: &str, accepted: &[&str], effects: Value) -> Blind {
+    fn set(seed: u32, verdict: &str, accepted: &[&str], effects: &Value) -> Blind {
         let names: Vec<String> = effects
             .as_array()
             .into_iter()
@@ -327,11 +327,11 @@ mod tests {
 
     #[test]
     fn bars_that_are_missed_are_told() {
-        let right = set(101, "right", &["es-gain:tm1.y"], json!([effect("es-gain", 9.0, 8.5, "accepted")]));
-        let lost = set(102, "missed", &[], json!([effect("charge", 9.0, 2.0, "missed")]));
-        let alarm = set(103, "false alarm", &["slosh:sc.x"], json!([]));
+        let right = set(101, "right", &["es-gain:tm1.y"], &json!([effect("es-gain", 9.0, 8.5, "accepted")]));
+        let lost = set(102, "missed", &[], &json!([effect("charge", 9.0, 2.0, "missed")]));
+        let alarm = set(103, "false alarm", &["slosh:sc.x"], &json!([]));
         let both = json!([effect("es-gain", 9.0, 9.0, "accepted"), effect("charge", 9.0, 9.0, "accepted")]);
-        let pair = set(104, "right", &["es-gain:tm1.y", "charge:tm1.y"], both);
+        let pair = set(104, "right", &["es-gain:tm1.y", "charge:tm1.y"], &both);
         let (text, missed) = numbers(&[right.clone(), lost.clone(), alarm, pair]);
         assert!(
             text.contains("one effect, above 8σ in the data at hand: right first, or a confounder | 1 of 1, 100 %"),
@@ -349,7 +349,7 @@ mod tests {
 
     #[test]
     fn what_is_kept_out_tells_a_wrong_size() {
-        let mut line = set(101, "right", &["es-gain:tm1.y"], json!([effect("es-gain", 9.0, 8.5, "accepted")]));
+        let mut line = set(101, "right", &["es-gain:tm1.y"], &json!([effect("es-gain", 9.0, 8.5, "accepted")]));
         let offset = line.before.clone();
         for (found, failed) in [(1.005, 0), (1.02, 1)] {
             let held_out_chi2_per_dof = [Some(1.1), Some(found), Some(1.0)];
@@ -361,8 +361,8 @@ mod tests {
 
     #[test]
     fn the_picture_has_what_was_hidden_and_what_was_said() {
-        let right = set(101, "right", &["es-gain:tm1.y"], json!([effect("es-gain", 9.0, 8.5, "accepted")]));
-        let nothing = set(102, "right", &[], json!([]));
+        let right = set(101, "right", &["es-gain:tm1.y"], &json!([effect("es-gain", 9.0, 8.5, "accepted")]));
+        let nothing = set(102, "right", &[], &json!([]));
         let picture = picture(&[right, nothing]).expect("a picture").expect("with cells");
         for word in ["es-gain", "nothing", "sufficient"] {
             assert!(picture.contains(word), "{word}");
