@@ -21,7 +21,8 @@ fn diagnosed(folder: &Path, telemetry: &Path, model: Option<&Path>) -> Value {
     json(dragfree(folder).args(["diagnose", id, "--archive", "archive", "--json", "-q"]), 0)
 }
 
-/// One channel has nothing for an hour, another hangs at one value, a third comes with every sixth packet alone. The gap and the hanging value are told, the slow one is used, nothing is accepted
+/// One channel has nothing for an hour, another hangs at one value, a third comes with every sixth packet alone. The gap is told, the
+/// channel that hangs gives no form, the slow one is used, nothing is accepted
 /// (nothing is hidden; false alarms 1 %), and no number is anything but a number.
 #[test]
 fn housekeeping_with_gaps_that_hangs_or_is_slow() {

@@ -97,7 +97,8 @@ pub struct Found {
     pub coefficients: Vec<Value>,
     /// By how much χ² falls.
     pub delta_chi2: f64,
-    /// Chance of as much when nothing is there, corrected for everything tried: every effect has the same part of the false alarms, whatever its forms.
+    /// Chance of as much when nothing is there, corrected for everything tried: every effect has the same part of the false alarms,
+    /// whatever its forms.
     pub p_value: f64,
     /// Its decimal logarithm, where the chance itself is too small for a number; what the list is sorted by.
     pub log10_p_value: f64,

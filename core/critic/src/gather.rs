@@ -6,7 +6,8 @@
 //!
 //! Time is cut twice. Segments of one length serve the bands from [`SLOW_HZ`] on; segments [`LONG`] times as long, of samples that
 //! [`crate::decimate`] has thinned out, serve those below, where heat, charge and drifts act and where a short segment sees nothing
-//! under its window's main lobe; a run shorter than one of them is one segment for the bins that its halves do not have. Series that are slow by their nature stand last and are in the long segments alone.
+//! under its window's main lobe; a run shorter than one of them is one segment for the bins that its halves do not have. Series that
+//! are slow by their nature stand last and are in the long segments alone.
 
 use std::ops::Range;
 
