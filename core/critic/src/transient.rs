@@ -470,7 +470,7 @@ mod tests {
             let hit = found.first().unwrap_or_else(|| panic!("{size} is not found"));
             assert!((hit.at_ns - 1_000_000_000 * AT as i64).abs() < 100_000_000_000, "{hit:?}");
             let a = hit.coefficients.iter().find(|c| c.name == "a").expect("fitted");
-            assert!((a.value - size).abs() < 4.0 * a.sigma.max(0.02 * size), "{size}: {a:?}");
+            assert!((a.value - size).abs() < 4.0 * a.sigma, "{size}: {a:?}");
         }
     }
 
