@@ -474,6 +474,13 @@ mod tests {
         }
     }
 
+    /// Through two bins alone it rings over the whole segment: the median of the filter's output is the event itself, and only what
+    /// its peak leaves tells that there is nothing else.
+    #[test]
+    fn an_event_that_rings_over_the_whole_segment_is_found() {
+        assert!(!hits(3, 0.0012, Part::MiddleHalf, [500.0, 0.0], 0.0).is_empty());
+    }
+
     /// What goes on and on is no event.
     #[test]
     fn a_wave_is_no_event() {
