@@ -18,25 +18,24 @@ fn ln_gamma(x: f64) -> f64 {
     0.5 * std::f64::consts::TAU.ln() + (x + 0.5) * t.ln() - t + sum.ln()
 }
 
-/// Chances that χ² of `dof` degrees of freedom lies below and above `dof * per_dof`: the incomplete gamma functions, by their series
-/// below the mean and their continued fraction above it (Abramowitz and Stegun 6.5.29 and 6.5.31).
-#[must_use]
-pub fn chi2_tails(per_dof: f64, dof: f64) -> (f64, f64) {
-    let (a, x) = (0.5 * dof, 0.5 * dof * per_dof);
-    if x.is_nan() || x <= 0.0 || a <= 0.0 {
-        return (0.0, 1.0);
+/// `ln (x^a e^{−x}/Γ(a))`.
+fn ln_leading(a: f64, x: f64) -> f64 {
+    a * x.ln() - x - ln_gamma(a)
+}
+
+/// The lower incomplete gamma function `P(a, x)` by its series (Abramowitz and Stegun 6.5.29), for x below the mean.
+fn series_below(a: f64, x: f64) -> f64 {
+    let (mut term, mut sum, mut n) = (1.0 / a, 1.0 / a, a);
+    while term > 1e-17 * sum {
+        n += 1.0;
+        term *= x / n;
+        sum += term;
     }
-    let leading = (a * x.ln() - x - ln_gamma(a)).exp();
-    if x < a + 1.0 {
-        let (mut term, mut sum, mut n) = (1.0 / a, 1.0 / a, a);
-        while term > 1e-17 * sum {
-            n += 1.0;
-            term *= x / n;
-            sum += term;
-        }
-        let below = (leading * sum).min(1.0);
-        return (below, 1.0 - below);
-    }
+    (ln_leading(a, x).exp() * sum).min(1.0)
+}
+
+/// `ln Q(a, x)` of the upper one by its continued fraction (6.5.31), for x above the mean.
+fn ln_fraction_above(a: f64, x: f64) -> f64 {
     let (mut b, mut c) = (x + 1.0 - a, f64::MAX);
     let mut d = 1.0 / b;
     let mut fraction = d;
@@ -52,8 +51,38 @@ pub fn chi2_tails(per_dof: f64, dof: f64) -> (f64, f64) {
             break;
         }
     }
-    let above = (leading * fraction).min(1.0);
+    (ln_leading(a, x) + fraction.ln()).min(0.0)
+}
+
+/// Chances that χ² of `dof` degrees of freedom lies below and above `dof * per_dof`.
+#[must_use]
+pub fn chi2_tails(per_dof: f64, dof: f64) -> (f64, f64) {
+    let (a, x) = (0.5 * dof, 0.5 * dof * per_dof);
+    if x.is_nan() || x <= 0.0 || a <= 0.0 {
+        return (0.0, 1.0);
+    }
+    if x < a + 1.0 {
+        let below = series_below(a, x);
+        return (below, 1.0 - below);
+    }
+    let above = ln_fraction_above(a, x).exp();
     (1.0 - above, above)
+}
+
+/// Logarithm of the chance that χ² of `dof` degrees of freedom is above `chi2`; a number where the chance itself is none any more.
+#[must_use]
+pub fn ln_chi2_above(chi2: f64, dof: f64) -> f64 {
+    let (a, x) = (0.5 * dof, 0.5 * chi2);
+    if x.is_nan() || x <= 0.0 || a <= 0.0 {
+        return 0.0;
+    }
+    if x < a + 1.0 { (-series_below(a, x)).ln_1p() } else { ln_fraction_above(a, x) }
+}
+
+/// Chance that a normal number is so many σ from its mean or more, on either side.
+#[must_use]
+pub fn normal_tails(sigmas: f64) -> f64 {
+    ln_chi2_above(sigmas * sigmas, 1.0).exp()
 }
 
 /// Chance of a χ²/dof at least as far out as this, on either side.
@@ -90,8 +119,8 @@ pub fn kolmogorov(x: f64) -> f64 {
 
 /// Chance of a p-value as small as `p` in the best of `tried`: `1 − (1 − p)^n`.
 #[must_use]
-pub fn corrected(p: f64, tried: usize) -> f64 {
-    (-(tried as f64 * (-p).ln_1p()).exp_m1()).clamp(0.0, 1.0)
+pub fn corrected(p: f64, tried: f64) -> f64 {
+    (-(tried * (-p).ln_1p()).exp_m1()).clamp(0.0, 1.0)
 }
 
 #[cfg(test)]
@@ -113,6 +142,24 @@ mod tests {
         for (p, dof) in [(0.025, 3.0), (0.975, 3.0), (0.5, 1e4)] {
             assert!((chi2_tails(chi2_per_dof_quantile(p, dof), dof).0 - p).abs() < 1e-9);
         }
+    }
+
+    /// Where the chance itself is no number any more its logarithm is: for two degrees of freedom `−χ²/2`, for one that of the
+    /// leading terms `e^{−χ²/2} √(2/(π χ²)) (1 − 1/χ²)`.
+    #[test]
+    fn a_chance_has_a_logarithm_however_small() {
+        let chi2: f64 = 4000.0;
+        assert!((ln_chi2_above(chi2, 2.0) + 0.5 * chi2).abs() < 1e-9);
+        let leading = -0.5 * chi2 - 0.5 * (std::f64::consts::FRAC_PI_2 * chi2).ln() + (-chi2.recip()).ln_1p();
+        assert!((ln_chi2_above(chi2, 1.0) - leading).abs() < 1e-6);
+        assert!((ln_chi2_above(0.1, 1.0) - 0.751_829_634_f64.ln()).abs() < 1e-8);
+        assert!((normal_tails(1.0) - 0.317_310_508).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_chance_is_corrected_for_all_trials() {
+        assert!((corrected(1e-6, 1000.0) - 1e-3).abs() < 1e-6);
+        assert_eq!(corrected(0.5, 1e6), 1.0);
     }
 
     /// The classical 5 % point 1.3581 and 1 % point 1.6276.

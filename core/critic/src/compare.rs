@@ -19,6 +19,7 @@ use std::f64::consts::PI;
 use std::ops::Range;
 
 use dragfree_estimation::estimate::EstimateError;
+use dragfree_estimation::estimate::colours;
 use dragfree_estimation::levels::Levels;
 use dragfree_estimation::sigma::NoiseModel;
 use dragfree_estimation::spectra::{Band, Plan, Spectra};
@@ -269,7 +270,9 @@ pub fn compare(court: &Court<'_>, nis: Option<Nis>) -> Result<Comparison, Compar
     let hours: Vec<Vec<DMatrix<f64>>> = gathered.hours.iter().map(|h| psd(&h.spectra)).collect();
     let hour_observations: Vec<Vec<f64>> = gathered.hours.iter().map(|h| observations(&h.spectra, plan)).collect();
     let predicted = predicted(court.noise, plan);
-    let mut levels = Levels::new(court.noise, plan, &whole, &measured);
+    let unknowns = court.question.unknowns(&[]);
+    let mut levels =
+        Levels::new(court.noise, plan, &whole, &measured).coloured(plan, &colours(&unknowns, &fit.estimate.theta));
     levels.fit();
 
     let known = |i: usize| court.noise.residual()[i] && !court.noise.unknown.contains(&i);
@@ -311,7 +314,7 @@ pub fn compare(court: &Court<'_>, nis: Option<Nis>) -> Result<Comparison, Compar
         })
         .collect();
     let all = gathered.witnesses.coherences(names);
-    let trials = all.len();
+    let trials = all.len() as f64;
     let chance = |w: &Coherence| corrected(chi2_tails(w.statistic / w.dof, w.dof).1, trials);
     let passes = channels.iter().all(|c| c.passes);
     let coherences = all.into_iter().map(|c| Witness { p_value: chance(&c), coherence: c });
@@ -459,7 +462,7 @@ fn judge(plan: &Plan, total: &Ratios, hours: &[Ratios], hours_ns: &[i64], allowe
         let worst = cells.iter().map(|(c, hour)| (chance(c), c, hour)).min_by(|a, b| a.0.total_cmp(&b.0));
         let (p, place) = worst.map_or((1.0, None), |(p, c, hour)| (p, Some((c, hour))));
         let at = place.map(|(c, hour)| Place { band_hz: c.band_hz, hour_ns: *hour });
-        test(name, place.and_then(|(c, _)| c.chi2_per_dof).unwrap_or(f64::NAN), corrected(p, tried), at)
+        test(name, place.and_then(|(c, _)| c.chi2_per_dof).unwrap_or(f64::NAN), corrected(p, tried as f64), at)
     };
     let whole: Vec<Cell> = thirds.iter().map(|r| cell(total, r)).collect();
     let map: Vec<Vec<Cell>> = hours.iter().map(|h| thirds.iter().map(|r| cell(h, r)).collect()).collect();
@@ -486,7 +489,8 @@ fn judge(plan: &Plan, total: &Ratios, hours: &[Ratios], hours_ns: &[i64], allowe
         test("ljung-box", portmanteau, chi2_tails(portmanteau / LAGS as f64, LAGS as f64).1, None),
     ];
     let beyond = |c: &Cell| {
-        let certain = c.chi2_per_dof.filter(|r| *r > 1.0 && corrected(two_sided(*r, c.dof), whole.len()) < allowed);
+        let certain =
+            c.chi2_per_dof.filter(|r| *r > 1.0 && corrected(two_sided(*r, c.dof), whole.len() as f64) < allowed);
         certain.map_or(0.0, |r| r - 1.0)
     };
     let beyond: f64 = whole.iter().map(beyond).sum();

@@ -3,15 +3,15 @@
 use dragfree_estimation::estimate::EstimateError;
 use dragfree_estimation::levels::{Level, Levels};
 use dragfree_estimation::spectra::FIRST_BIN;
-use dragfree_estimation::verdict::{chi2_per_dof_at, chi2_quantile};
+use dragfree_estimation::verdict::chi2_per_dof_at;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 
+use crate::chance::{corrected, ln_chi2_above, normal_tails};
 use crate::gather::LONG;
 use crate::question::Candidate;
 use crate::rank::{Court, Fit, Scored, WithoutExcess};
-use crate::transient::Hit;
 use crate::witness::Coherence;
 
 /// Chance of naming an effect when none is hidden.
@@ -124,6 +124,9 @@ pub struct Found {
     pub confounders: Vec<String>,
     /// Whether it is part of the answer, or only the next on the list.
     pub accepted: bool,
+    /// Whether it was weighed by what it explains of an excess of power.
+    #[serde(skip)]
+    of_excess: bool,
 }
 
 /// What cannot be seen.
@@ -171,7 +174,7 @@ pub struct Diagnosis {
     pub verdict: String,
     /// Chance of a false alarm.
     pub false_alarm_rate: f64,
-    /// Forms of effects, levels and templates that were tried.
+    /// Forms and levels of effects that were tried; what happens once was tried at every time besides.
     pub tried: usize,
     /// What explains the data, the best first; those that are accepted stand before the rest.
     pub candidates: Vec<Found>,
@@ -183,96 +186,74 @@ pub struct Diagnosis {
     pub transients: Vec<Value>,
     /// What could not be tried, and why.
     pub not_tried: Vec<(String, String)>,
+    /// Places that stand out beside the model alone, in their best forms: worth a finer look.
+    #[serde(skip)]
+    pub leads: Vec<Lead>,
+    /// Forms that were tried, per effect, this time and before.
+    #[serde(skip)]
+    pub forms: BTreeMap<String, usize>,
 }
 
-/// How often chance had its say. Every effect has the same part of [`FALSE_ALARM`], and so has the search of transients; an effect's
-/// part is shared by all forms in all places that were tried of it (Bonferroni, with weights that are fixed before the data are seen).
+/// An effect at a place, in a form.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Lead {
+    /// Effect.
+    pub effect: String,
+    /// Instance.
+    pub instance: String,
+    /// Values of the shape parameters.
+    pub shape: Map<String, Value>,
+}
+
+/// How often chance had its say. Every effect has the same part of [`FALSE_ALARM`], and so has the search of what happens once; an
+/// effect's part is shared by all forms in all places that were tried of it (Bonferroni, with weights that are fixed before the data are seen).
 ///
 /// Were all forms alike, an effect of one form would pay for the ten thousand pairs of thermometers and lags of another.
 struct Trials {
-    /// Forms and levels per effect.
-    forms: BTreeMap<String, usize>,
-    /// Effects, and the search.
-    shares: f64,
+    /// Forms and levels per effect, and trials of the search.
+    forms: BTreeMap<String, f64>,
+}
+
+/// The search of what happens once, among the effects.
+const ONCE: &str = "what happens once";
+
+/// Whose part of the false alarms it is.
+fn family(c: &Candidate) -> &str {
+    if c.once { ONCE } else { &c.effect }
 }
 
 impl Trials {
-    fn new(court: &Court<'_>, forms: BTreeMap<String, usize>) -> Self {
-        let mut forms = forms;
+    fn new(court: &Court<'_>, forms: &BTreeMap<String, usize>) -> Self {
+        let mut forms: BTreeMap<String, f64> = forms.iter().map(|(e, n)| (e.clone(), *n as f64)).collect();
         for c in court.question.coefficients.iter().filter(|c| !c.noise.is_empty()) {
-            *forms.entry(c.effect.clone()).or_default() += 1;
+            *forms.entry(c.effect.clone()).or_default() += 1.0;
         }
-        let shares = forms.len() + usize::from(court.gathered.transients.tried > 0.0);
-        Self { forms, shares: shares as f64 }
+        let search = court.gathered.transients.tried;
+        if search > 0.0 {
+            forms.insert(ONCE.to_owned(), search);
+        }
+        Self { forms }
     }
 
-    /// Forms, levels and searches together.
-    fn total(&self, court: &Court<'_>) -> usize {
-        self.forms.values().sum::<usize>() + usize::from(court.gathered.transients.tried > 0.0)
+    /// Forms and levels of all effects.
+    fn total(&self) -> usize {
+        self.forms.iter().filter(|(family, _)| *family != ONCE).map(|(_, n)| n).sum::<f64>() as usize
     }
 
     /// The chance, and its decimal logarithm, that an effect is worth so much without being there.
-    fn chance(&self, effect: &str, chi2: f64, dof: f64) -> (f64, f64) {
-        let trials = self.shares * self.forms.get(effect).copied().unwrap_or(1).max(1) as f64;
-        let ln_p = ln_tail(chi2, dof);
+    fn chance(&self, family: &str, chi2: f64, dof: f64) -> (f64, f64) {
+        let trials = self.forms.len() as f64 * self.forms.get(family).copied().unwrap_or(1.0).max(1.0);
+        let ln_p = ln_chi2_above(chi2, dof);
         let p = corrected(ln_p.exp(), trials);
         (p, if ln_p > -30.0 { p.log10() } else { (ln_p + trials.ln()) / std::f64::consts::LN_10 })
     }
 }
 
-/// Chance that χ² of `dof` is above `chi2`.
-fn tail(chi2: f64, dof: f64) -> f64 {
-    ln_tail(chi2, dof).exp()
-}
-
-/// Logarithm of the chance that χ² of `dof` is above `chi2`, by Wilson and Hilferty and the normal tail.
-fn ln_tail(chi2: f64, dof: f64) -> f64 {
-    let z = chi2_quantile(chi2.max(0.0) / dof, dof);
-    if z < 0.0 {
-        return (-normal_tail(-z)).ln_1p();
-    }
-    // The cube root is poor far out for few degrees of freedom, where the leading term of the incomplete gamma function is exact.
-    if chi2 > 4.0 * dof + 20.0 {
-        let half = 0.5 * dof;
-        let log = (half - 1.0) * (0.5 * chi2).ln() - 0.5 * chi2 - ln_gamma(half);
-        return (log - (1.0 - (dof - 2.0) / chi2).max(0.1).ln()).min(0.0);
-    }
-    normal_tail(z).ln()
-}
-
-/// Upper tail of the normal distribution (Abramowitz and Stegun 7.1.26, to 1.5e-7, and its asymptote beyond 4σ).
-fn normal_tail(z: f64) -> f64 {
-    if z > 4.0 {
-        return (-0.5 * z * z).exp() / (z * std::f64::consts::TAU.sqrt()) * (1.0 - 1.0 / (z * z));
-    }
-    let x = z / std::f64::consts::SQRT_2;
-    let t = 1.0 / (1.0 + 0.327_591_1 * x);
-    let poly =
-        t * (0.254_829_592 + t * (-0.284_496_736 + t * (1.421_413_741 + t * (-1.453_152_027 + t * 1.061_405_429))));
-    0.5 * poly * (-x * x).exp()
-}
-
-/// `ln Γ` at multiples of one half.
-fn ln_gamma(x: f64) -> f64 {
-    let (mut value, mut at) =
-        if (2.0 * x).rem_euclid(2.0) < 0.5 { (0.0, 1.0) } else { (0.5 * std::f64::consts::PI.ln(), 0.5) };
-    while at + 0.5 < x {
-        value += f64::ln(at);
-        at += 1.0;
-    }
-    value
-}
-
-fn corrected(p: f64, trials: f64) -> f64 {
-    // 1 − (1 − p)^n
-    (-(trials * (-p).ln_1p()).exp_m1()).clamp(0.0, 1.0)
-}
-
-/// Diagnoses the sums.
+/// Diagnoses the sums; `tried_before` are forms of effects, by which some of those that are tried now were chosen.
 ///
 /// # Errors
 /// [`DiagnosisError`]: too little data, or a model that cannot be fitted.
-pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
+pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Result<Diagnosis, DiagnosisError> {
     let segment_s = court.gathered.length as f64 / court.gathered.rate_hz;
     let segments = short_segments(court);
     if segments < LEAST_SEGMENTS {
@@ -281,8 +262,11 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
     let mut fit = court.fit(&[])?;
     let mut accepted: Vec<Found> = Vec::new();
     let first = court.rank(&fit);
-    let trials = Trials::new(court, first.tried);
+    let mut forms = first.tried;
+    tried_before.iter().for_each(|(effect, n)| *forms.entry(effect.clone()).or_default() += n);
+    let trials = Trials::new(court, &forms);
     let mut ranked = first.all;
+    let mut first_leads = leads(&trials, &ranked);
     let mut others: Vec<Found> = loop {
         likeliest_first(&trials, &mut ranked);
         let mut weighed: Vec<(Found, Candidate)> = ranked
@@ -290,6 +274,15 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
             .take(LISTED)
             .map(|scored| (weigh(court, &fit, scored, &ranked, &trials), scored.candidate.clone()))
             .collect();
+        for (f, candidate) in &mut weighed {
+            // On a coarse grid of shapes the peak of a wrong colour costs more than all that it explains.
+            let finely = tried_before.contains_key(&candidate.effect);
+            let stands_out = finely && f.p_value < FALSE_ALARM && f.in_range && accepted.len() < MOST_ADDED;
+            if let (true, Some((form, fall))) = (stands_out, court.coloured(&fit, candidate)?) {
+                by_likelihood(f, &form, fall, &fit, &trials);
+                *candidate = form;
+            }
+        }
         if accepted.len() < MOST_ADDED {
             for (f, candidate) in of_the_excess(court, &fit, &trials)? {
                 let of = |w: &(Found, Candidate)| (&w.0.effect, &w.0.instance) == (&f.effect, &f.instance);
@@ -315,17 +308,16 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
         refresh(court, &fit, &mut accepted);
     };
 
-    let (mut extra, hits, unexplained) = loop {
+    let (mut extra, unexplained) = loop {
         let measured = court.residual_psd(&fit);
-        let mut levels = Levels::new(court.noise, court.plan(), &court.total.weights, &measured);
-        let mut extra = noise_levels(court, &fit, &mut levels, &trials);
-        let hits = transients(court, &trials, &accepted, &mut extra);
+        let mut levels = court.levels(&fit, &court.total, &measured);
+        let extra = noise_levels(court, &fit, &mut levels, &trials);
         let unexplained = unexplained(court, &levels);
         let ((excess, _), plain) = (levels.excess_bands(), levels.plain_inverses());
         let mut both = accepted.iter().zip(&fit.added);
         let part = |candidate: &Candidate| court.part_in(&fit, &plain, candidate, &excess);
         let Some(doubtful) = both.position(|(f, c)| is_doubtful(f, part(c), &extra, unexplained.as_ref())) else {
-            break (extra, hits, unexplained);
+            break (extra, unexplained);
         };
         others.insert(0, Found { accepted: false, ..accepted.remove(doubtful) });
         let mut added = fit.added.clone();
@@ -334,7 +326,7 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
         ranked = court.rank(&fit).all;
         refresh(court, &fit, &mut accepted);
     };
-    // Noise and transients are weighed apart: they stand behind the effects that are accepted and before the rest.
+    // Noise is weighed apart: levels stand behind the effects that are accepted and before the rest.
     extra.sort_by(|a, b| b.accepted.cmp(&a.accepted).then(a.log10_p_value.total_cmp(&b.log10_p_value)));
     let louder: Vec<Found> = extra.iter().filter(|f| f.accepted).cloned().collect();
     let mut candidates: Vec<Found> = accepted.into_iter().chain(louder).collect();
@@ -348,15 +340,22 @@ pub fn diagnose(court: &Court<'_>) -> Result<Diagnosis, DiagnosisError> {
         (false, Some(_)) => "unexplained",
         (false, None) => "sufficient",
     };
+    // A shape is told best beside what else was found, or else came next.
+    for lead in &mut first_leads {
+        let found = candidates.iter().find(|f| (&f.effect, &f.instance) == (&lead.effect, &lead.instance));
+        lead.shape = found.map_or_else(|| lead.shape.clone(), |f| f.shape.clone());
+    }
     let upper_limits = limits(court, &ranked, &candidates);
     Ok(Diagnosis {
         verdict: verdict.to_owned(),
         false_alarm_rate: FALSE_ALARM,
-        tried: trials.total(court),
+        tried: trials.total(),
         candidates,
         upper_limits,
         unexplained,
-        transients: hits,
+        transients: transients(court),
+        leads: first_leads,
+        forms,
         not_tried: first.mute.into_iter().map(|name| (name, MUTE.to_owned())).collect(),
     })
 }
@@ -392,11 +391,11 @@ fn of_the_excess(court: &Court<'_>, fit: &Fit, trials: &Trials) -> Result<Vec<(F
         // n log 1/x is at most n (1/x − 1), the fall of χ² under the Σ without the excess; beyond that, something else has changed.
         let ratio = (before - court.deviance(fit, &bands, &added)?).clamp(0.0, scored.delta_chi2.max(0.0));
         let delta_chi2 = ratio * kept;
-        let (p_value, log10_p_value) = trials.chance(&scored.candidate.effect, delta_chi2, dof);
+        let (p_value, log10_p_value) = trials.chance(family(&scored.candidate), delta_chi2, dof);
         let f = weigh(court, &plain, scored, &ranked, trials);
         let delta_bic = dof * fit.estimate.quality.dof.ln() - delta_chi2;
         let chi2_per_dof_after = f.chi2_per_dof_before - delta_chi2 / fit.estimate.quality.dof;
-        let f = Found { delta_chi2, p_value, log10_p_value, delta_bic, chi2_per_dof_after, ..f };
+        let f = Found { delta_chi2, p_value, log10_p_value, delta_bic, chi2_per_dof_after, of_excess: true, ..f };
         out.push((f, scored.candidate.clone()));
     }
     Ok(out)
@@ -404,22 +403,45 @@ fn of_the_excess(court: &Court<'_>, fit: &Fit, trials: &Trials) -> Result<Vec<(F
 
 /// Whether what was accepted does not stand beside the rest of the answer.
 ///
-/// - What would be known by what it does where there is an excess, `part` of its information, while an excess remains in the channels
-///   where it acts: it follows what is there, as much else does that is slow, and does not explain it.
+/// - What was weighed by what it explains of an excess, or would be known by what it does where there is one, `part` of its
+///   information, while an excess, or something that housekeeping is coherent with, remains in the channels where it acts: it follows
+///   what is there, as much else does that is slow, and does not explain it. A magnetometer sees the current whose square heats a test mass's housing.
 /// - What moves the offset, while the noise that turns the spacecraft is not the mission's: `α̂` is smoothed for that noise, and
 ///   with another one all that follows the offset is biased, a gain by 5 % where torques are 40 % louder. It is to be asked
 ///   again when the model has the level.
 fn is_doubtful(f: &Found, part: f64, extra: &[Found], unexplained: Option<&Unexplained>) -> bool {
-    let remains = |u: &Unexplained| u.power && f.channels.iter().any(|c| u.channels.contains(c));
+    // Housekeeping that is coherent with what is left says as much of what was chosen for an excess.
+    let remains = |u: &Unexplained| (u.power || f.of_excess) && f.channels.iter().any(|c| u.channels.contains(c));
     let turned = |e: &Found| e.accepted && e.channels.iter().any(|c| c.starts_with("sc.alpha."));
     let moves = f.offset_shift_sigma.values().any(|sigmas| sigmas.abs() > MOVES_OFFSET);
-    part > 0.5 && unexplained.is_some_and(remains) || moves && extra.iter().any(turned)
+    (f.of_excess || part > 0.5) && unexplained.is_some_and(remains) || moves && extra.iter().any(turned)
 }
 
 /// Sorted by the chance of what each is worth, the smallest first.
 fn likeliest_first(trials: &Trials, ranked: &mut [Scored]) {
-    let chance = |s: &Scored| trials.chance(&s.candidate.effect, s.delta_chi2, s.candidate.parts.len() as f64).1;
+    let chance = |s: &Scored| trials.chance(family(&s.candidate), s.delta_chi2, s.candidate.parts.len() as f64).1;
     ranked.sort_by(|a, b| chance(a).total_cmp(&chance(b)));
+}
+
+/// Places that stand out by themselves.
+fn leads(trials: &Trials, ranked: &[Scored]) -> Vec<Lead> {
+    let chance = |s: &Scored| trials.chance(family(&s.candidate), s.delta_chi2, s.candidate.parts.len() as f64).0;
+    let lead = |s: &Scored| Lead {
+        effect: s.candidate.effect.clone(),
+        instance: s.candidate.instance.clone(),
+        shape: s.candidate.parts[0].1.shape.clone(),
+    };
+    ranked.iter().filter(|s| !s.candidate.once && chance(s) < FALSE_ALARM).map(lead).collect()
+}
+
+/// A candidate in the form that its likelihood prefers, worth what `−2 log` of that falls.
+fn by_likelihood(f: &mut Found, form: &Candidate, fall: f64, fit: &Fit, trials: &Trials) {
+    let dof = form.parts.len() as f64;
+    let quality = &fit.estimate.quality;
+    f.shape.clone_from(&form.parts[0].1.shape);
+    (f.p_value, f.log10_p_value) = trials.chance(family(form), fall, dof);
+    (f.delta_chi2, f.delta_bic) = (fall, dof * quality.dof.ln() - fall);
+    f.chi2_per_dof_after = f.chi2_per_dof_before - fall / quality.dof;
 }
 
 /// A candidate as it stands beside a fit.
@@ -433,7 +455,7 @@ fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], trial
     let dof = parts.len() as f64;
     let halves = court.held_out(fit, &scored.candidate);
     let quality = &fit.estimate.quality;
-    let (p_value, log10_p_value) = trials.chance(&scored.candidate.effect, scored.delta_chi2, dof);
+    let (p_value, log10_p_value) = trials.chance(family(&scored.candidate), scored.delta_chi2, dof);
     let (mut offset_shift_m, mut offset_shift_sigma) = (BTreeMap::new(), BTreeMap::new());
     for (k, i) in fit.estimate.free.iter().enumerate() {
         let Some(c) = court.question.coefficients[..court.question.model()].get(*i) else { continue };
@@ -464,7 +486,7 @@ fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], trial
         delta_bic: dof * quality.dof.ln() - scored.delta_chi2,
         in_range: scored.in_range,
         held_out_delta_chi2: halves.map(|h| h.gains),
-        held_out_p_value: halves.map(|h| tail(h.difference_chi2, dof)),
+        held_out_p_value: halves.map(|h| ln_chi2_above(h.difference_chi2, dof).exp()),
         chi2_per_dof_before: quality.chi2_per_dof,
         chi2_per_dof_after: quality.chi2_per_dof - scored.delta_chi2 / quality.dof,
         offset_shift_m,
@@ -472,6 +494,7 @@ fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], trial
         channels,
         confounders: court.confounders(fit, scored, ranked),
         accepted: false,
+        of_excess: false,
     }
 }
 
@@ -489,9 +512,13 @@ fn refresh(court: &Court<'_>, fit: &Fit, found: &mut [Found]) {
         fit.estimate.covariance.as_ref().map(|c| c[(k, k)].sqrt())
     };
     for (f, added) in found.iter_mut().zip(&fit.added) {
-        let values: Vec<(f64, f64)> =
-            (at..at + added.parts.len()).map(|i| (fit.estimate.theta[i], sigma(i).unwrap_or(f64::INFINITY))).collect();
-        at += added.parts.len();
+        let own = at..at + added.parts.len();
+        at = own.end;
+        // Of what is over soon the fit does not know how much a window has left.
+        if added.once {
+            continue;
+        }
+        let values: Vec<(f64, f64)> = own.map(|i| (fit.estimate.theta[i], sigma(i).unwrap_or(f64::INFINITY))).collect();
         let lead = leading(&values);
         let name = |j: usize| court.question.coefficients[added.parts[j].0].name.clone();
         (f.value, f.sigma) = values[lead];
@@ -507,8 +534,7 @@ fn refresh(court: &Court<'_>, fit: &Fit, found: &mut [Found]) {
 /// Levels of noise one after the other, the best first; those that matter are accepted and taken over.
 fn noise_levels(court: &Court<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &Trials) -> Vec<Found> {
     let residuals = court.residual_psd_of_sets(fit);
-    let halves =
-        [0, 1].map(|set| Levels::new(court.noise, court.plan(), &court.gathered.sets[set].weights, &residuals[set]));
+    let halves = [0, 1].map(|set| court.levels(fit, &court.gathered.sets[set], &residuals[set]));
     let asked: Vec<usize> =
         (0..court.question.coefficients.len()).filter(|i| !court.question.coefficients[*i].noise.is_empty()).collect();
     let mut left = asked;
@@ -524,7 +550,7 @@ fn noise_levels(court: &Court<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &
         let differ = match halves.each_ref().map(|half| half.level(&c.noise)) {
             [Some(a), Some(b)] => {
                 let difference = (a.value - b.value).abs() / a.sigma.hypot(b.sigma);
-                Some(2.0 * normal_tail(difference)).filter(|p| p.is_finite())
+                Some(normal_tails(difference)).filter(|_| difference.is_finite())
             }
             _ => None,
         };
@@ -556,6 +582,7 @@ fn noise_levels(court: &Court<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &
             channels: levels.channels_of(&c.noise).into_iter().map(|i| court.question.channels[i].clone()).collect(),
             confounders: Vec::new(),
             accepted: matters,
+            of_excess: false,
         });
         left.retain(|j| *j != i);
         if p_value >= FALSE_ALARM {
@@ -564,49 +591,9 @@ fn noise_levels(court: &Court<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &
     }
 }
 
-/// Hits that no chance gives; the loudest of each effect and instance becomes a candidate.
-fn transients(court: &Court<'_>, trials: &Trials, accepted: &[Found], out: &mut Vec<Found>) -> Vec<Value> {
-    let search = &court.gathered.transients;
-    let chance = |h: &Hit| {
-        // Neighbouring samples are one trial at most; all are counted.
-        (2.0 * normal_tail(h.significance) * search.tried * trials.shares).min(1.0)
-    };
-    let certain: Vec<&Hit> = search.hits.iter().filter(|h| chance(h) < FALSE_ALARM).collect();
-    // What comes again and again has been found as one.
-    let mut named: Vec<(&str, &str)> = accepted.iter().map(|f| (f.effect.as_str(), f.instance.as_str())).collect();
-    for h in &certain {
-        if named.contains(&(&h.effect, &h.instance)) {
-            continue;
-        }
-        named.push((&h.effect, &h.instance));
-        let values: Vec<(f64, f64)> = h.coefficients.iter().map(|c| (c.value, c.sigma)).collect();
-        let Some(lead) = h.coefficients.get(leading(&values)) else { continue };
-        out.push(Found {
-            effect: h.effect.clone(),
-            instance: h.instance.clone(),
-            coefficient: lead.name.clone(),
-            value: lead.value,
-            sigma: lead.sigma,
-            unit: lead.unit.clone(),
-            shape: h.shape.clone(),
-            coefficients: h.coefficients.iter().map(|c| json!(c)).collect(),
-            delta_chi2: h.significance.powi(2),
-            p_value: chance(h),
-            log10_p_value: chance(h).max(f64::MIN_POSITIVE).log10(),
-            delta_bic: f64::NAN,
-            in_range: true,
-            held_out_delta_chi2: None,
-            held_out_p_value: None,
-            chi2_per_dof_before: f64::NAN,
-            chi2_per_dof_after: f64::NAN,
-            offset_shift_m: BTreeMap::new(),
-            offset_shift_sigma: BTreeMap::new(),
-            channels: Vec::new(),
-            confounders: Vec::new(),
-            accepted: true,
-        });
-    }
-    certain.iter().map(|h| json!(h)).collect()
+/// Times at which something happened that no chance gives; what it was is for the candidates to say.
+fn transients(court: &Court<'_>) -> Vec<Value> {
+    court.gathered.transients.certain(FALSE_ALARM).map(|h| json!(h)).collect()
 }
 
 fn limits(court: &Court<'_>, rest: &[Scored], named: &[Found]) -> Vec<Limit> {
@@ -614,7 +601,7 @@ fn limits(court: &Court<'_>, rest: &[Scored], named: &[Found]) -> Vec<Limit> {
     for s in rest {
         let accepted =
             |f: &Found| f.accepted && (&f.effect, &f.instance) == (&s.candidate.effect, &s.candidate.instance);
-        if named.iter().any(accepted) {
+        if s.candidate.once || named.iter().any(accepted) {
             continue;
         }
         let Some(covariance) = s.information.clone().try_inverse() else { continue };
@@ -648,8 +635,10 @@ fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
         loud.extend(found.map(|(c, ratio)| (c, [hz(bands.start), hz(bands.end - 1)], ratio)));
     }
     let all = court.gathered.witnesses.coherences(channels);
-    let significant: Vec<Coherence> =
-        all.into_iter().filter(|w| corrected(tail(w.statistic, w.dof), w.trials) < WITNESS_ALARM).collect();
+    let significant: Vec<Coherence> = all
+        .into_iter()
+        .filter(|w| corrected(ln_chi2_above(w.statistic, w.dof).exp(), w.trials) < WITNESS_ALARM)
+        .collect();
     let power = !loud.is_empty();
     if !power {
         // What explains a part of the power leaves the rest: so much more there is than without it.
@@ -691,34 +680,19 @@ fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
 mod tests {
     use super::*;
 
-    /// Tables of χ²: P(χ²₁ > 3.841) = 0.05, P(χ²₂ > 9.210) = 0.01, P(χ²₁ > 30) = 4.3205e-8, P(χ²₉ > 60) = 1.34e-9.
-    #[test]
-    fn tails_are_those_of_the_tables() {
-        for (chi2, dof, p) in [(3.841, 1.0, 0.05), (9.210, 2.0, 0.01), (30.0, 1.0, 4.3205e-8), (60.0, 9.0, 1.338e-9)] {
-            let got = tail(chi2, dof);
-            assert!((got / p - 1.0).abs() < 0.1, "{chi2} {dof}: {got} against {p}");
-        }
-        assert!((normal_tail(0.0) - 0.5).abs() < 1e-6);
-        assert!((corrected(1e-6, 1000.0) - 1e-3).abs() < 1e-6);
-        // Where the chance itself is no number any more its logarithm is: the leading term for one degree of freedom.
-        let (chi2, log10) = (4000.0, ln_tail(4000.0, 1.0) / std::f64::consts::LN_10);
-        let leading = (-0.5 * chi2 - 0.5 * (0.5 * std::f64::consts::PI * chi2).ln()) / std::f64::consts::LN_10;
-        assert!((log10 - leading).abs() < 1e-3, "{log10} against {leading}");
-    }
-
     /// Chances of normal deviates: over all forms of all effects together a false alarm is as likely as is said, and the one effect
     /// with ten thousand forms takes no more of it than the one with a single form.
     #[test]
     fn every_effect_has_the_same_part_of_the_false_alarms() {
-        let forms = BTreeMap::from([("many".to_owned(), 10_000), ("one".to_owned(), 1)]);
-        let trials = Trials { forms, shares: 2.0 };
+        let forms = BTreeMap::from([("many".to_owned(), 10_000.0), ("one".to_owned(), 1.0)]);
+        let trials = Trials { forms };
         for (effect, n) in [("many", 10_000.0), ("one", 1.0)] {
             // The χ² at which this effect alone is falsely named with a chance of half a per cent.
             let mut chi2 = 0.0;
             while trials.chance(effect, chi2, 1.0).0 > FALSE_ALARM {
                 chi2 += 0.01;
             }
-            let alone = 1.0 - (1.0 - tail(chi2, 1.0)).powf(n);
+            let alone = 1.0 - (1.0 - ln_chi2_above(chi2, 1.0).exp()).powf(n);
             assert!((alone / (0.5 * FALSE_ALARM) - 1.0).abs() < 0.02, "{effect}: {alone}");
         }
         assert!(trials.chance("one", 20.0, 1.0).1 < trials.chance("many", 25.0, 1.0).1);
@@ -748,6 +722,7 @@ mod tests {
             channels: channels.iter().map(|c| (*c).to_owned()).collect(),
             confounders: Vec::new(),
             accepted,
+            of_excess: false,
         }
     }
 
@@ -772,6 +747,11 @@ mod tests {
         ] {
             assert_eq!(is_doubtful(&slow, part, &[], left.as_ref()), doubtful, "{part} {left:?}");
         }
+        let of_excess = Found { of_excess: true, ..found(&["tm1.accel.x"], 0.0, true) };
+        assert!(is_doubtful(&of_excess, 0.1, &[], Some(&excess("tm1.accel.x", true))));
+        assert!(is_doubtful(&of_excess, 0.1, &[], Some(&excess("tm1.accel.x", false))));
+        assert!(!is_doubtful(&of_excess, 0.1, &[], Some(&excess("tm2.accel.z", true))));
+        assert!(!is_doubtful(&of_excess, 0.1, &[], None));
         let (gain, still) = (found(&["tm1.accel.y"], 12.0, true), found(&["tm1.accel.y"], 1.0, true));
         let torque = [found(&["sc.alpha.z"], 0.0, true)];
         assert!(is_doubtful(&gain, 0.0, &torque, None) && !is_doubtful(&still, 0.0, &torque, None));

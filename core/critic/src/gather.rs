@@ -28,6 +28,9 @@ pub const LONG: usize = 16;
 /// Halvings of a long segment that make a short one.
 const HALVINGS: usize = LONG.ilog2() as usize;
 
+/// What happens once is looked for in long segments, halves and quarters.
+const SHORTEST_LOOKED_AT: usize = 2;
+
 /// Thinned samples come at least this many times as often as [`SLOW_HZ`]: what folds there is then weaker by 1e7.
 const THIN: f64 = 6.0;
 
@@ -49,9 +52,19 @@ pub struct Columns {
     pub base: usize,
     /// All but the slow ones.
     pub fast: usize,
+    /// Of columns that stand last among those, and are not zero for a short time alone: what all of it would add to the diagonal of the
+    /// Gram matrix, per band. A window leaves a part of it, by the time at which it happens.
+    pub energy: Vec<Vec<f64>>,
 }
 
 impl Columns {
+    /// Energy per band of one that is not zero for a short time alone.
+    #[must_use]
+    pub fn energy_of(&self, column: usize) -> Option<&[f64]> {
+        let first = self.fast.checked_sub(self.energy.len())?;
+        self.energy.get(column.checked_sub(first)?).map(Vec::as_slice)
+    }
+
     /// Columns that take part in a band.
     fn active(&self, plan: &Plan, band: usize) -> usize {
         if plan.bin_hz(plan.bands[band].end as f64) <= SLOW_HZ { self.names.len() } else { self.fast }
@@ -395,8 +408,10 @@ impl Cuts for Low<'_> {
 
     fn segment(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
         self.take([self.long, self.whole], taper, first_ns, columns, overlaps);
-        if taper == 0 {
-            self.look(self.long.length, Part::MiddleHalf, first_ns);
+        // Shorter ones cover the ends of a run.
+        if taper <= SHORTEST_LOOKED_AT {
+            let part = if taper == 0 { Part::MiddleHalf } else { Part::All };
+            self.look(columns.first().map_or(0, |c| c.len()), part, first_ns);
         }
     }
 

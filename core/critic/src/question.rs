@@ -1,5 +1,6 @@
 //! What is asked: the model, and the forms of everything that is not in it.
 
+use dragfree_estimation::colour::Colour;
 use dragfree_estimation::estimate::{Bound, Unknown};
 use dragfree_estimation::spectra::{Layout, Regressor};
 use serde::{Deserialize, Serialize};
@@ -31,6 +32,9 @@ pub struct Form {
     pub upper: Option<f64>,
     /// How it acts.
     pub terms: Vec<Term>,
+    /// A noise that it colours.
+    #[serde(default)]
+    pub colours: Option<Colour>,
 }
 
 /// A coefficient of the model or of a candidate.
@@ -50,6 +54,9 @@ pub struct Coefficient {
     pub estimate: bool,
     /// Whether it is no part of the model.
     pub candidate: bool,
+    /// Whether its forms are courses at times at which something was found to happen.
+    #[serde(default)]
+    pub once: bool,
     /// Its forms; one for a coefficient of the model.
     pub forms: Vec<Form>,
     /// A process of the mission's noise that it multiplies.
@@ -89,6 +96,8 @@ pub struct Candidate {
     pub effect: String,
     /// Instance.
     pub instance: String,
+    /// Whether it is a course at a time at which something was found to happen.
+    pub once: bool,
     /// Indices of its coefficients, with the form of each.
     pub parts: Vec<(usize, Form)>,
 }
@@ -100,14 +109,16 @@ impl Question {
         self.coefficients.iter().take_while(|c| !c.candidate).count()
     }
 
-    /// Every instance of every effect that is not in the model, with the indices of its coefficients; noise apart.
+    /// Every instance of every effect that is not in the model, with the indices of its coefficients; noise apart, and what happens
+    /// once apart from what lasts.
     #[must_use]
     pub fn places(&self) -> Vec<Vec<usize>> {
         let mut places: Vec<Vec<usize>> = Vec::new();
         for (i, c) in self.coefficients.iter().enumerate().filter(|(_, c)| c.candidate && !c.forms.is_empty()) {
             let same = |p: &&mut Vec<usize>| {
                 let other = &self.coefficients[p[0]];
-                (&other.effect, &other.instance, other.forms.len()) == (&c.effect, &c.instance, c.forms.len())
+                let key = |c: &Coefficient| (c.once, c.forms.len());
+                (&other.effect, &other.instance, key(other)) == (&c.effect, &c.instance, key(c))
             };
             match places.iter_mut().find(same) {
                 Some(place) => place.push(i),
@@ -124,6 +135,7 @@ impl Question {
         Candidate {
             effect: first.effect.clone(),
             instance: first.instance.clone(),
+            once: first.once,
             parts: place.iter().map(|i| (*i, self.coefficients[*i].forms[form].clone())).collect(),
         }
     }
@@ -139,6 +151,7 @@ impl Question {
             initial: if estimate && c.candidate { 0.0 } else { c.initial },
             prior_sigma: c.prior_sigma.unwrap_or(f64::INFINITY),
             estimate,
+            colours: form.colours.clone(),
         };
         let model = self.coefficients[..self.model()].iter().map(|c| unknown(c, &c.forms[0], c.estimate));
         let added = added.iter().flat_map(|a| &a.parts).map(|(i, form)| unknown(&self.coefficients[*i], form, true));

@@ -11,7 +11,7 @@ use crate::question::Question;
 use crate::transient::{Hit, Transients};
 use crate::witness::Witnesses;
 
-const MAGIC: &[u8; 8] = b"DFCRIT2\n";
+const MAGIC: &[u8; 8] = b"DFCRIT3\n";
 
 /// Question and sums of some telemetry.
 #[derive(Clone, Debug, PartialEq)]
@@ -48,6 +48,7 @@ struct Header {
     channels: usize,
     base: usize,
     fast: usize,
+    energy: Vec<Vec<f64>>,
     length: usize,
     rate_hz: f64,
     segments: [u64; 2],
@@ -103,6 +104,7 @@ impl Record {
             channels: g.columns.channels,
             base: g.columns.base,
             fast: g.columns.fast,
+            energy: g.columns.energy.clone(),
             length: g.length,
             rate_hz: g.rate_hz,
             segments: [g.sets[0].weights.segments, g.sets[1].weights.segments],
@@ -163,8 +165,11 @@ impl Record {
         {
             return Err(RecordError::Damaged("its header"));
         }
-        let columns = Columns { names: h.names, channels: h.channels, base: h.base, fast: h.fast };
         let (plan, hour_plan) = (whole_plan(h.length, h.rate_hz), Plan::new(h.length, h.rate_hz));
+        if h.energy.len() > h.fast - h.base || h.energy.iter().any(|e| e.len() != plan.bands.len()) {
+            return Err(RecordError::Damaged("its header"));
+        }
+        let columns = Columns { names: h.names, channels: h.channels, base: h.base, fast: h.fast, energy: h.energy };
         let mut numbers = Numbers(from);
         let mut sets = [Gram::zero(&columns, &plan), Gram::zero(&columns, &plan)];
         for (set, segments) in sets.iter_mut().zip(h.segments) {

@@ -105,6 +105,14 @@ pub fn candidates(registry: &Registry, model: &Model) -> Vec<EffectEntry> {
     all
 }
 
+/// Whether an effect has a parameter: with `at_ns` what it does happens once, at a time that the host finds; with `fine` its candidate
+/// can be tried about one shape in fine steps.
+#[must_use]
+pub fn has_parameter(registry: &Registry, effect: &str, name: &str) -> bool {
+    let found = registry.find(Kind::Effect, effect);
+    found.is_ok_and(|f| f.info.manifest.parameters.iter().any(|p| p.name == name))
+}
+
 /// The model of a product, as its file is now.
 ///
 /// # Errors

@@ -71,6 +71,7 @@ fn bench(criterion: &mut Criterion) {
             initial: 0.0,
             prior_sigma: 0.02,
             estimate: true,
+            colours: None,
         })
         .collect();
     criterion.bench_function("estimation/solution", |b| {

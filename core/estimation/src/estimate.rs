@@ -10,6 +10,7 @@
 use nalgebra::{Cholesky, DMatrix, DVector};
 use serde::Serialize;
 
+use crate::colour::Colour;
 use crate::levels::Levels;
 use crate::normal::{Equations, NormalEquations, accumulate, residuals};
 use crate::prediction::Prediction;
@@ -36,6 +37,13 @@ pub struct Unknown {
     pub prior_sigma: f64,
     /// Whether it is estimated.
     pub estimate: bool,
+    /// A noise that it colours; where levels of the noise are measured, not its bands.
+    pub colours: Option<Colour>,
+}
+
+/// The noises that unknowns colour, with their values.
+pub fn colours<'a>(unknowns: &'a [Unknown], theta: &'a DVector<f64>) -> Vec<(&'a Colour, f64)> {
+    unknowns.iter().zip(theta.iter()).filter_map(|(u, value)| Some((u.colours.as_ref()?, *value))).collect()
 }
 
 /// A linear constraint among coefficients.
@@ -242,7 +250,7 @@ pub fn estimate_with(
         if step < refinements {
             inverses = match refinement {
                 Refinement::Bands => whitening.refined_inverses(&residual),
-                Refinement::Levels => by_levels(model, plan, spectra, &residual),
+                Refinement::Levels => by_levels(model, plan, spectra, &residual, &colours(unknowns, &solved.theta)),
             };
         }
         linear = layout.linear_at(solved.theta.as_slice());
@@ -330,10 +338,16 @@ fn unevenness(
     (0..free.len()).map(|k| (1.0 + spread[(k, k)] / covariance[(k, k)]).max(1.0).sqrt()).collect()
 }
 
-fn by_levels(model: &NoiseModel, plan: &Plan, spectra: &Spectra, residual: &[DMatrix<f64>]) -> Vec<DMatrix<f64>> {
+fn by_levels(
+    model: &NoiseModel,
+    plan: &Plan,
+    spectra: &Spectra,
+    residual: &[DMatrix<f64>],
+    colours: &[(&Colour, f64)],
+) -> Vec<DMatrix<f64>> {
     let expected = spectra.expected.iter().map(|e| e.max(f64::MIN_POSITIVE));
     let measured: Vec<DMatrix<f64>> = residual.iter().zip(expected).map(|(r, e)| r / e).collect();
-    let mut levels = Levels::new(model, plan, spectra, &measured);
+    let mut levels = Levels::new(model, plan, spectra, &measured).coloured(plan, colours);
     levels.fit();
     levels.inverses()
 }

@@ -13,6 +13,7 @@ use std::ops::Range;
 
 use nalgebra::{Cholesky, DMatrix};
 
+use crate::colour::Colour;
 use crate::sigma::NoiseModel;
 use crate::spectra::{Plan, Spectra};
 use crate::verdict::chi2_per_dof_at;
@@ -102,6 +103,20 @@ impl<'a> Levels<'a> {
             measured,
             hz,
         }
+    }
+
+    /// The same where coefficients colour processes.
+    #[must_use]
+    pub fn coloured(mut self, plan: &Plan, colours: &[(&Colour, f64)]) -> Self {
+        for (colour, coefficient) in colours {
+            let Some(process) = self.processes.get_mut(colour.process.as_str()) else { continue };
+            for ((p, sigma), band) in process.iter_mut().zip(&mut self.modelled).zip(&plan.bands) {
+                let power = colour.power(*coefficient, plan, *band);
+                *sigma += &*p * (power - 1.0);
+                *p *= power;
+            }
+        }
+        self
     }
 
     /// The modelled spectra, per band, with the levels that were taken over.
@@ -355,6 +370,33 @@ mod tests {
         );
         levels.fit();
         assert!(levels.modelled().iter().zip(&truth).all(|(a, b)| (a - b).norm() < 1e-6 * b.norm()));
+    }
+
+    /// A process that a coefficient colours is what is measured, at its own level; without the colour its level would be another.
+    #[test]
+    fn a_coloured_process_has_its_own_level() {
+        let mission = mission();
+        let noise = NoiseModel::new(&mission, &CHANNELS, 0.1).unwrap();
+        let plan = Plan::new(16_384, 10.0);
+        let weights = weights(&plan, 20);
+        let name = "thruster_force:sc.y";
+        let omega = std::f64::consts::TAU * 0.06;
+        let colour = Colour {
+            process: name.to_owned(),
+            numerator: vec![0.0, 0.0, 1.0],
+            denominator: vec![omega * omega, 0.04 * omega, 1.0],
+        };
+        let measured: Vec<DMatrix<f64>> = (plan.bands.iter())
+            .map(|b| {
+                let hz = plan.frequency_hz(*b);
+                noise.psd(hz) + noise.process_psd(name, hz).unwrap() * (colour.power(0.05, &plan, *b) - 1.0)
+            })
+            .collect();
+        let levels = Levels::new(&noise, &plan, &weights, &measured).coloured(&plan, &[(&colour, 0.05)]);
+        assert!(levels.modelled().iter().zip(&measured).all(|(a, b)| (a - b).norm() < 1e-9 * b.norm()));
+        assert!((levels.level(name).unwrap().value - 1.0).abs() < 1e-6);
+        let plain = Levels::new(&noise, &plan, &weights, &measured).level(name).unwrap();
+        assert!(plain.value > 1.02 && plain.delta_chi2 > LEAST, "{plain:?}");
     }
 
     /// A force on one test mass far below the thrusters' noise, invisible in its channel's power, is taken up where the others cancel

@@ -4,6 +4,7 @@
 //! ([`sigma`]) and is re-measured from the residuals (`refine`); the normal equations ([`normal`]) are solved under the survey and
 //! the physical ranges ([`qp`]); [`verdict`] says what the solution is worth. No module knows an effect by name.
 
+pub mod colour;
 pub mod estimate;
 pub mod levels;
 pub mod normal;

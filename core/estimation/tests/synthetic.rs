@@ -206,6 +206,7 @@ fn unknowns(half_range: f64) -> Vec<Unknown> {
             initial: 0.0,
             prior_sigma: f64::INFINITY,
             estimate: true,
+            colours: None,
         })
         .collect()
 }

@@ -63,8 +63,8 @@ mod setup;
 pub use batch::{Inputs, Outputs, Progress};
 pub use error::PluginError;
 pub use link::{
-    Available, Coefficient, Column, Constraint, EffectLink, In, Link, Out, Response, Shape, Table, Transient, Variant,
-    Want,
+    Available, Coefficient, Colour, Column, Constraint, EffectLink, In, Link, Out, Response, Shape, Table, Transient,
+    Variant, Want,
 };
 pub use manifest::{Manifest, Parameter};
 pub use node::{Effect, Source, Stage};
@@ -74,8 +74,8 @@ pub use setup::{Level, Log, Setup};
 /// Everything a plugin needs.
 pub mod prelude {
     pub use crate::{
-        Attachment, Available, Coefficient, Column, Constraint, Covariance, Effect, EffectLink, Estimate, In, Inputs,
-        Level, Link, Log, Manifest, Out, Outputs, Parameter, PluginError, Progress, Report, Response, Setup, Shape,
-        Source, Stage, Table, Transient, Variant, Want, export_plugin,
+        Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Effect, EffectLink, Estimate, In,
+        Inputs, Level, Link, Log, Manifest, Out, Outputs, Parameter, PluginError, Progress, Report, Response, Setup,
+        Shape, Source, Stage, Table, Transient, Variant, Want, export_plugin,
     };
 }

@@ -78,6 +78,21 @@ pub struct Coefficient {
     /// has no responses.
     #[serde(skip_serializing_if = "String::is_empty")]
     pub noise: String,
+    /// A process of the mission's noise that it colours.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub colours: Option<Colour>,
+}
+
+/// What a coefficient c does to a process of the mission's noise that drives what it stands for as commands do: `|1 + cH|²` times its
+/// power.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Colour {
+    /// The process, `thruster_force:sc.x`.
+    pub process: String,
+    /// `H(s)`, s in s⁻¹: coefficients of the numerator's polynomial, the constant first.
+    pub numerator: Vec<f64>,
+    /// The same of its denominator.
+    pub denominator: Vec<f64>,
 }
 
 /// Shape parameters by name: numbers, or names of columns.
@@ -101,7 +116,7 @@ pub struct Response {
 }
 
 /// One of several forms that a cause may have.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Variant {
     /// Values of the shape parameters; as parameters of the effect they give these responses.
     pub shape: Shape,
@@ -113,6 +128,9 @@ pub struct Variant {
     /// Its physical range, lower and upper end, where it is not that of the others.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub range: Option<[f64; 2]>,
+    /// A process of the mission's noise that it colours.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub colours: Option<Colour>,
 }
 
 /// Something short that begins at an unknown time: a hit, a glitch.
@@ -145,6 +163,7 @@ impl Default for Coefficient {
             variants: Vec::new(),
             transients: Vec::new(),
             noise: String::new(),
+            colours: None,
         }
     }
 }

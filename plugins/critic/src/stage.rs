@@ -5,11 +5,13 @@ use std::collections::BTreeMap;
 use std::io::BufWriter;
 use std::path::Path;
 
+use dragfree_critic::course::Course;
 use dragfree_critic::gather::{Columns, Gatherer, LONG, SLOW_HZ};
 use dragfree_critic::question::{Coefficient as Asked, Form, Question, Rule, Term};
 use dragfree_critic::record::Record;
-use dragfree_critic::transient::{Search, Template};
+use dragfree_critic::transient::{Hit, Search, Template};
 use dragfree_critic::witness::Witnesses;
+use dragfree_estimation::colour;
 use dragfree_estimation::estimate::{Observed, Refinement, estimate_with};
 use dragfree_estimation::segments::{Segmenter, longest_length};
 use dragfree_estimation::sigma::{Measured, NoiseModel};
@@ -31,6 +33,8 @@ pub struct Critic {
     segment_s: f64,
     out: String,
     reference: String,
+    only_events: bool,
+    events: String,
     threads: usize,
     linked: Option<Linked>,
 }
@@ -41,6 +45,9 @@ struct Linked {
     question: Question,
     differenced: Vec<bool>,
     base: usize,
+    /// Courses that begin at known times, and where they stand among the columns.
+    courses: Vec<Course>,
+    courses_at: usize,
     segmenter: Segmenter,
     gatherer: Gatherer,
     rate_hz: f64,
@@ -65,7 +72,19 @@ impl Stage for Critic {
                 "reference",
                 "",
                 &[],
-                "normal equations of the product (.neq.json): residuals for the search of transients and witnesses",
+                "normal equations of the product (.neq.json): residuals for the search of what happens once, and for witnesses",
+            ),
+            Parameter::text(
+                "gather",
+                "everything",
+                &["everything", "events"],
+                "events: only look for what happens once, and gather nothing of any candidate",
+            ),
+            Parameter::text(
+                "events",
+                "",
+                &[],
+                "file with the times at which something was found to happen (JSON): courses of candidates that begin then are gathered",
             ),
         ],
         instances: &[],
@@ -78,6 +97,8 @@ impl Stage for Critic {
             segment_s: setup.f64("segment_s")?,
             out: setup.text("out")?,
             reference: setup.text("reference")?,
+            only_events: setup.text("gather")? == "events",
+            events: setup.text("events")?,
             threads: setup.threads(),
             linked: None,
         })
@@ -90,7 +111,9 @@ impl Stage for Critic {
 
     fn process(&mut self, input: &Inputs<'_>, _output: &mut Outputs) -> Result<(), PluginError> {
         let linked = self.linked.as_mut().ok_or_else(before_link)?;
-        let columns: Vec<&[f64]> = linked.columns.iter().map(|c| input.f64(*c)).collect();
+        let begun: Vec<Vec<f64>> = linked.courses.iter().map(|c| c.over(input.time_ns())).collect();
+        let mut columns: Vec<&[f64]> = linked.columns.iter().map(|c| input.f64(*c)).collect();
+        columns.splice(linked.courses_at..linked.courses_at, begun.iter().map(Vec::as_slice));
         linked.push(input.time_ns(), &columns);
         Ok(())
     }
@@ -151,23 +174,28 @@ impl Critic {
             ));
         };
         let differenced: Vec<bool> = channels.iter().map(|c| c.attribute("average") == "2").collect();
-        let sorted = Series::sort(available, &channels)?;
+        let templates = templates(available, &channels, &differenced);
+        let courses = self.courses(&templates, rate_hz)?;
+        let sorted = Series::sort(available, &channels, self.only_events, &courses)?;
         let housekeeping: Vec<&Column> =
             available.columns.iter().filter(|c| c.table == "grid" && c.name.starts_with("hk.")).collect();
         let own = channels.iter().map(|c| Want::of(c));
-        let series = sorted.keys.iter().map(|(table, name)| Want::new(name).table(table));
+        let made = |(table, _): &&(String, String)| table != COURSES;
+        let series = sorted.keys.iter().filter(made).map(|(table, name)| Want::new(name).table(table));
         let wants = own.chain(series).chain(housekeeping.iter().map(|c| Want::of(c)));
         let columns: Vec<In> = wants.map(|want| link.read(&want.rate_hz(rate_hz))).collect::<Result<_, _>>()?;
         let names: Vec<String> =
             channels.iter().map(|c| name_of(c).to_owned()).chain(sorted.keys.iter().map(|(_, n)| n.clone())).collect();
+        let length = longest_length((self.segment_s * rate_hz).round() as usize);
+        let plan = Plan::slow(LONG * length, length, rate_hz);
         let all = Columns {
             names: names.clone(),
             channels: channels.len(),
             base: channels.len() + sorted.base,
             fast: channels.len() + sorted.fast,
+            energy: courses.iter().map(|c| c.energy(&plan, differenced.contains(&true))).collect(),
         };
-        let question = question(available, &channels, &sorted);
-        let length = longest_length((self.segment_s * rate_hz).round() as usize);
+        let question = question(available, &channels, &sorted, &courses);
         let residual = self.residual(&question, &channels, &all, length)?;
         // As they are called in telemetry: `hk/battery_current_a`.
         let topics: Vec<String> = housekeeping.iter().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
@@ -180,24 +208,27 @@ impl Critic {
         };
         // The mission's Σ: what these data promise has taken up the power of what is looked for.
         // From the lowest bin of a long segment on.
-        let slow = Plan::slow(LONG * length, length, rate_hz);
-        let lower = slow.bands.iter().map(|b| (slow.bin_hz(b.end as f64 - 0.5), inverse(slow.frequency_hz(*b))));
+        let lower = plan.bands.iter().map(|b| (plan.bin_hz(b.end as f64 - 0.5), inverse(plan.frequency_hz(*b))));
         let inverses = lower.collect();
-        let search = Search::new(templates(available, &channels, &differenced), residual.clone(), inverses);
+        // What was looked for before is not looked for again.
+        let templates = if self.events.is_empty() { templates } else { Vec::new() };
+        let search = Search::new(templates, residual.clone(), inverses);
         let witnesses = |plan: &Plan| {
             let whitening = plan.bands.iter().map(|b| inverse(plan.frequency_hz(*b))).collect();
             Witnesses::new(topics, plan, residual, whitening)
         };
-        let averaged: Vec<bool> = (0..columns.len())
-            .map(|i| (all.channels..names.len()).contains(&i) && differenced.iter().any(|d| *d))
-            .collect();
+        let width = columns.len() + courses.len();
+        let averaged: Vec<bool> =
+            (0..width).map(|i| (all.channels..names.len()).contains(&i) && differenced.iter().any(|d| *d)).collect();
         Ok(Linked {
-            held: vec![f64::NAN; columns.len()],
-            missing: vec![0; columns.len()],
+            held: vec![f64::NAN; width],
+            missing: vec![0; width],
             rows: 0,
             waiting: true,
             segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged),
             base: all.base,
+            courses_at: all.fast - courses.len(),
+            courses,
             gatherer: Gatherer::new(all, length, rate_hz, self.threads, witnesses, search),
             columns,
             names,
@@ -205,6 +236,30 @@ impl Critic {
             differenced,
             rate_hz,
         })
+    }
+
+    /// The courses that begin where something was found to happen.
+    fn courses(&self, templates: &[Template], rate_hz: f64) -> Result<Vec<Course>, PluginError> {
+        if self.events.is_empty() {
+            return Ok(Vec::new());
+        }
+        let refuse = |what: String| PluginError::error(format!("critic: {}: {what}", self.events));
+        let text = std::fs::read_to_string(&self.events).map_err(|e| refuse(e.to_string()))?;
+        let hits: Vec<Hit> = serde_json::from_str(&text).map_err(|e| refuse(e.to_string()))?;
+        let course = |hit: &Hit| {
+            let of = |t: &&Template| {
+                (&t.effect, &t.instance, &t.coefficient) == (&hit.effect, &hit.instance, &hit.coefficient)
+            };
+            let own = |t: &&Template| t.shape.iter().all(|(key, value)| hit.shape.get(key) == Some(value));
+            let template = templates.iter().find(|t| of(t) && own(t)).ok_or_else(|| {
+                refuse(format!(
+                    "no effect has the course of {}:{} at {} ns any more",
+                    hit.effect, hit.instance, hit.at_ns
+                ))
+            })?;
+            Ok(Course { at_ns: hit.at_ns, step_ns: (1e9 / rate_hz).round() as i64, kernel: template.kernel.clone() })
+        };
+        hits.iter().map(course).collect()
     }
 
     /// Residuals as combinations of the base columns, at the coefficients of the product's own sums where they are given.
@@ -254,6 +309,9 @@ fn measured(channel: &Column) -> Measured {
     if channel.attribute("average") == "1" { Measured::Directly } else { Measured::Differenced }
 }
 
+/// The table of columns that no plugin makes.
+const COURSES: &str = "events";
+
 /// The series behind the channels, sorted as the sums want them.
 struct Series {
     /// Table and name: of the model, of candidates, slow ones of candidates.
@@ -265,7 +323,12 @@ struct Series {
 }
 
 impl Series {
-    fn sort(available: &Available, channels: &[&Column]) -> Result<Self, PluginError> {
+    fn sort(
+        available: &Available,
+        channels: &[&Column],
+        model_alone: bool,
+        courses: &[Course],
+    ) -> Result<Self, PluginError> {
         let mut responses: BTreeMap<String, Vec<Response>> = BTreeMap::new();
         for (c, r) in available.responses()? {
             responses.entry(c.name.clone()).or_default().push(r);
@@ -279,7 +342,7 @@ impl Series {
         let mut seen = std::collections::HashSet::new();
         let mut counts = [0; 2];
         for part in 0..3 {
-            for c in &available.coefficients {
+            for c in available.coefficients.iter().filter(|c| !(c.candidate && model_alone)) {
                 let own = responses.get(&c.name).into_iter().flatten();
                 for r in own.chain(c.variants.iter().flat_map(|v| &v.responses)).filter(exists) {
                     let wanted = match part {
@@ -293,6 +356,9 @@ impl Series {
                     }
                 }
             }
+            if part == 1 {
+                keys.extend((0..courses.len()).map(|k| (COURSES.to_owned(), format!("event {k}"))));
+            }
             if part < 2 {
                 counts[part] = keys.len();
             }
@@ -301,7 +367,7 @@ impl Series {
     }
 }
 
-fn question(available: &Available, channels: &[&Column], series: &Series) -> Question {
+fn question(available: &Available, channels: &[&Column], series: &Series, courses: &[Course]) -> Question {
     let column: BTreeMap<(&str, &str), usize> =
         series.keys.iter().enumerate().map(|(i, (t, n))| ((t.as_str(), n.as_str()), channels.len() + i)).collect();
     let coefficient = |name: &String| available.coefficients.iter().position(|c| !c.candidate && c.name == *name);
@@ -322,7 +388,13 @@ fn question(available: &Available, channels: &[&Column], series: &Series) -> Que
         responses.iter().filter_map(term).collect()
     };
     let asked = |c: &Coefficient| {
+        let colour = |c: &Colour| colour::Colour {
+            process: c.process.clone(),
+            numerator: c.numerator.clone(),
+            denominator: c.denominator.clone(),
+        };
         let form = |shape: &Shape, responses: &[Response], unit: Option<&String>, range: Option<[f64; 2]>| Form {
+            colours: None,
             shape: shape.iter().map(|(k, v)| (k.clone(), v.clone())).collect(),
             unit: unit.unwrap_or(&c.unit).clone(),
             lower: finite(range.map_or(c.lower, |r| r[0])),
@@ -330,10 +402,17 @@ fn question(available: &Available, channels: &[&Column], series: &Series) -> Que
             terms: terms(responses),
         };
         let forms = if !c.variants.is_empty() {
-            c.variants.iter().map(|v| form(&v.shape, &v.responses, v.unit.as_ref(), v.range)).collect()
+            let form = |v: &Variant| Form {
+                colours: v.colours.as_ref().map(colour),
+                ..form(&v.shape, &v.responses, v.unit.as_ref(), v.range)
+            };
+            c.variants.iter().map(form).collect()
         } else {
             match series.responses.get(&c.name) {
-                Some(responses) => vec![form(&c.shape, responses, None, None)],
+                Some(responses) => {
+                    let colours = c.colours.as_ref().map(colour);
+                    vec![Form { colours, ..form(&c.shape, responses, None, None) }]
+                }
                 None if c.candidate => Vec::new(),
                 None => vec![form(&c.shape, &[], None, None)],
             }
@@ -346,9 +425,28 @@ fn question(available: &Available, channels: &[&Column], series: &Series) -> Que
             prior_sigma: finite(c.prior_sigma),
             estimate: c.estimate,
             candidate: c.candidate,
+            once: false,
             forms,
             noise: c.noise.clone(),
         }
+    };
+    // Whatever has the course of something that was found may have been the cause.
+    let once = |c: &Coefficient| {
+        let at = |(k, course): (usize, &Course)| {
+            let transient = c.transients.iter().find(|t| t.kernel == course.kernel)?;
+            let mut shape: serde_json::Map<_, _> = transient.shape.clone().into_iter().collect();
+            shape.insert("at_ns".to_owned(), course.at_ns.into());
+            let column = *column.get(&(COURSES, format!("event {k}").as_str()))?;
+            let term = |(name, factor): &(String, f64)| {
+                let channel = channels.iter().position(|c| name_of(c) == name)?;
+                Some(Term { channel, column, factor: *factor, times: None })
+            };
+            let terms = transient.channels.iter().filter_map(term).collect();
+            let (lower, upper) = (finite(c.lower), finite(c.upper));
+            Some(Form { shape, unit: c.unit.clone(), lower, upper, terms, colours: None })
+        };
+        let forms: Vec<Form> = courses.iter().enumerate().filter_map(at).collect();
+        (!forms.is_empty()).then(|| Asked { once: true, noise: String::new(), forms, ..asked(c) })
     };
     let rule = |r: &Constraint| Rule {
         name: r.name.clone(),
@@ -359,7 +457,12 @@ fn question(available: &Available, channels: &[&Column], series: &Series) -> Que
     };
     Question {
         channels: channels.iter().map(|c| name_of(c).to_owned()).collect(),
-        coefficients: available.coefficients.iter().map(asked).collect(),
+        coefficients: available
+            .coefficients
+            .iter()
+            .map(asked)
+            .chain(available.coefficients.iter().filter_map(once))
+            .collect(),
         rules: available.constraints.iter().map(rule).collect(),
     }
 }

@@ -238,7 +238,7 @@ impl Impulse {
             let places = self.at_steps(flag, &FLAG_PULSES_S, available, link)?;
             for (place, pulse_s) in places.iter().zip(FLAG_PULSES_S) {
                 for (_, responses) in self.parts(available, place)? {
-                    variants.push(Variant { shape: at_flag(flag, pulse_s), responses, unit: None, range: None });
+                    variants.push(Variant { shape: at_flag(flag, pulse_s), responses, ..Variant::default() });
                 }
             }
         }

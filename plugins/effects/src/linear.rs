@@ -587,6 +587,7 @@ impl<R: Recipe> Effect for Linear<R> {
                     responses: responses(form),
                     unit: Some(form.unit.clone()),
                     range: Some(form.range),
+                    colours: None,
                 };
                 coefficient.variants = part.forms.iter().map(variant).collect();
             } else {

@@ -82,7 +82,7 @@ impl Effect for Charge {
         if self.candidate {
             for column in housekeeping(available, "C") {
                 let responses = self.responses(available, column)?;
-                coefficient.variants.push(Variant { shape: shape(column), responses, unit: None, range: None });
+                coefficient.variants.push(Variant { shape: shape(column), responses, ..Variant::default() });
             }
             if coefficient.variants.is_empty() {
                 let name = self.name();
@@ -272,7 +272,7 @@ impl Effect for Magnetic {
                 if self.candidate {
                     let (max, unit) = scale(*of_product, squared);
                     let (unit, range) = (Some(unit.to_owned()), Some([-max, max]));
-                    coefficient.variants.push(Variant { shape: shape.clone(), responses, unit, range });
+                    coefficient.variants.push(Variant { shape: shape.clone(), responses, unit, range, colours: None });
                 } else {
                     (coefficient.shape, coefficient.responses) = (shape.clone(), responses);
                 }

@@ -115,7 +115,7 @@ impl Thermal {
                         ("lag_s".to_owned(), json!(lag_s)),
                     ];
                     let responses = vec![self.pushed(&places[plus][j], 1.0), self.pushed(&places[minus][j], -1.0)];
-                    variants.push(Variant { shape: shape.into(), responses, unit: None, range: None });
+                    variants.push(Variant { shape: shape.into(), responses, ..Variant::default() });
                 }
             }
         }

@@ -5,24 +5,34 @@ use crate::args::{BATCH_ROWS, Diagnose, Global};
 use crate::failure::Failure;
 use crate::progress::Meter;
 use crate::text::Paint;
-use dragfree_critic::diagnosis::{Diagnosis, Found, diagnose};
+use dragfree_critic::diagnosis::{Diagnosis, Found, Lead, diagnose};
 use dragfree_critic::rank::Court;
 use dragfree_critic::record::Record;
-use dragfree_engine::examine::{Examination, Sources, candidates, examine, model};
+use dragfree_critic::transient::Hit;
+use dragfree_engine::examine::{Examination, Sources, candidates, examine, has_parameter, model};
 use dragfree_estimation::sigma::{Measured, NoiseModel};
 use dragfree_physics::mission::Mission;
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
+/// Parameter of an effect whose candidate can be tried about one shape in fine steps.
+const FINE: &str = "fine";
+
+/// Of what happened once, as much is weighed against all else.
+const MOST_EVENTS: usize = 8;
+
+/// And no less than what chance gives in one of so many searches: which of it is certain, its full weight decides.
+const WORTH_TRYING: f64 = 0.5;
+
 pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Result<Done, Failure> {
-    let (record, mission) = gather(&command.products, &command.archive.folder, global, true)?;
+    let Gathering { record, mut diagnosis } = gather_candidates(&command.products, &command.archive.folder, global)?;
     if let Some(path) = &command.save_sums {
         let file = std::fs::File::create(path).map_err(Failure::io("write", path))?;
         let mut file = std::io::BufWriter::with_capacity(1 << 20, file);
         record.write(&mut file).and_then(|()| file.flush()).map_err(Failure::io("write", path))?;
     }
-    let mut diagnosis = judge(&record, &mission)?;
     diagnosis.not_tried.extend(record.not_tried.iter().cloned());
     if global.json {
         return Ok(Done::json(&serde_json::to_value(&diagnosis).map_err(Failure::engine)?));
@@ -30,10 +40,10 @@ pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Resu
     Ok(Done::new(screen(&diagnosis, &record, command.top, paint)))
 }
 
-/// The verdict on what was gathered.
-pub(super) fn judge(record: &Record, mission: &Mission) -> Result<Diagnosis, Failure> {
+/// The verdict on what was gathered; `tried_before` as [`diagnose`] takes it.
+fn judge(record: &Record, mission: &Mission, tried_before: &BTreeMap<String, usize>) -> Result<Diagnosis, Failure> {
     let noise = noise(record, mission)?;
-    diagnose(&Court::new(&record.question, &record.gathered, &noise)).map_err(Failure::engine)
+    diagnose(&Court::new(&record.question, &record.gathered, &noise), tried_before).map_err(Failure::engine)
 }
 
 pub(super) fn noise(record: &Record, mission: &Mission) -> Result<NoiseModel, Failure> {
@@ -43,13 +53,54 @@ pub(super) fn noise(record: &Record, mission: &Mission) -> Result<NoiseModel, Fa
     NoiseModel::new(mission, &channels, 1.0 / record.gathered.rate_hz).map_err(Failure::engine)
 }
 
-/// Gathers the data of products of one model; with every candidate, or with the model alone.
-pub(super) fn gather(
-    names: &[String],
-    archive: &Path,
-    global: &Global,
-    with_candidates: bool,
-) -> Result<(Record, Mission), Failure> {
+/// What is gathered.
+#[derive(Clone, Copy, PartialEq)]
+enum What<'a> {
+    /// The model alone.
+    Model,
+    /// What happens once.
+    Events,
+    /// Every candidate, at these times what happens once, and about these shapes in fine steps what can be tried so.
+    Everything(&'a [Hit], &'a [Lead]),
+}
+
+/// What is known of some products.
+pub(super) struct Gathering {
+    /// Sums.
+    pub(super) record: Record,
+    /// What they say.
+    pub(super) diagnosis: Diagnosis,
+}
+
+/// Gathers the data of products of one model, with the model alone.
+pub(super) fn gather_model(names: &[String], archive: &Path, global: &Global) -> Result<(Record, Mission), Failure> {
+    gather(names, archive, global, What::Model)
+}
+
+/// Gathers the data of products of one model, with every candidate, and diagnoses them. The data are read twice: what happens once has
+/// to be found before it can be weighed against what lasts; and once more where a shape stands out that can be tried in finer steps.
+pub(super) fn gather_candidates(names: &[String], archive: &Path, global: &Global) -> Result<Gathering, Failure> {
+    let found = gather(names, archive, global, What::Events)?.0.gathered.transients;
+    let events: Vec<Hit> = found.certain(WORTH_TRYING).take(MOST_EVENTS).cloned().collect();
+    let once = |leads: &[Lead], tried_before: &BTreeMap<String, usize>| {
+        let (mut record, mission) = gather(names, archive, global, What::Everything(&events, leads))?;
+        record.gathered.transients = found.clone();
+        let diagnosis = judge(&record, &mission, tried_before)?;
+        Ok::<_, Failure>(Gathering { record, diagnosis })
+    };
+    let first = once(&[], &BTreeMap::new())?;
+    let registry = super::registry(global)?;
+    let mut leads = first.diagnosis.leads.clone();
+    leads.retain(|lead| has_parameter(&registry, &lead.effect, FINE));
+    if leads.is_empty() {
+        return Ok(first);
+    }
+    let mut tried = first.diagnosis.forms;
+    tried.retain(|effect, _| leads.iter().any(|lead| lead.effect == *effect));
+    once(&leads, &tried)
+}
+
+fn gather(names: &[String], archive: &Path, global: &Global, what: What<'_>) -> Result<(Record, Mission), Failure> {
     let registry = super::registry(global)?;
     let mut whole: Option<(Record, Mission)> = None;
     for name in names {
@@ -64,16 +115,41 @@ pub(super) fn gather(
         if equations.is_file() {
             parameters.insert("reference".to_owned(), text(&equations));
         }
-        let model = model(&sources).map_err(Failure::engine)?;
+        let mut all = candidates(&registry, &model(&sources).map_err(Failure::engine)?);
+        let (said, candidates) = match what {
+            What::Model => ("compare", Vec::new()),
+            What::Events => {
+                all.retain(|e| has_parameter(&registry, &e.id, "at_ns"));
+                ("look", all)
+            }
+            What::Everything(events, leads) => {
+                for lead in leads {
+                    all.iter_mut().filter(|e| (&e.id, &e.instance) == (&lead.effect, &lead.instance)).for_each(|e| {
+                        let shape =
+                            lead.shape.iter().filter_map(|(k, v)| Some((k.clone(), toml::Value::try_from(v).ok()?)));
+                        e.parameters = shape.collect();
+                        e.parameters.insert(FINE.to_owned(), toml::Value::Integer(1));
+                    });
+                }
+                let file = folder.path().join("events.json");
+                let json = serde_json::to_vec(events).map_err(Failure::engine)?;
+                std::fs::write(&file, json).map_err(Failure::io("write", &file))?;
+                parameters.insert("events".to_owned(), text(&file));
+                ("diagnose", all)
+            }
+        };
+        if what == What::Events {
+            parameters.insert("gather".to_owned(), toml::Value::String("events".to_owned()));
+        }
         let what = Examination {
             product: &product,
             sources: &sources,
             stage: ("critic", parameters),
-            candidates: if with_candidates { candidates(&registry, &model) } else { Vec::new() },
+            candidates,
             threads: super::threads(global),
             batch_rows: BATCH_ROWS as usize,
         };
-        let mut meter = Meter::new(if with_candidates { "diagnose" } else { "compare" }, global);
+        let mut meter = Meter::new(said, global);
         let not_tried = examine(&registry, &what, &mut |p| meter.show(&p)).map_err(Failure::engine)?;
         let file = std::fs::File::open(&out).map_err(Failure::engine)?;
         let mut record =
@@ -106,7 +182,7 @@ fn screen(d: &Diagnosis, record: &Record, top: usize, paint: Paint) -> String {
         out,
         "tried     {} forms of {} effects, false alarms at most {} in 100",
         d.tried,
-        record.question.places().len(),
+        record.question.places().iter().filter(|p| !record.question.coefficients[p[0]].once).count(),
         100.0 * d.false_alarm_rate
     );
     let accepted: Vec<&Found> = d.candidates.iter().filter(|f| f.accepted).collect();

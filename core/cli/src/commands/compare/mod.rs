@@ -20,7 +20,7 @@ const NAMED: usize = 5;
 
 pub(super) fn execute(command: &Compare, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let (names, archive) = (&command.products, &command.archive.folder);
-    let (record, mission) = diagnose::gather(names, archive, global, false)?;
+    let (record, mission) = diagnose::gather_model(names, archive, global)?;
     let noise = diagnose::noise(&record, &mission)?;
     let opened = names.iter().map(|name| Ok(products::open(name, archive)?.0)).collect::<Result<Vec<_>, Failure>>()?;
     let court = Court::new(&record.question, &record.gathered, &noise);

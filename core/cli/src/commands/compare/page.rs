@@ -203,7 +203,7 @@ fn map(c: &Comparison, channel: &Channel) -> HeatMap {
                 y: [band_hz[0], row.get(b + 1).map_or(band_hz[1], |next| next.band_hz[0])],
                 ratio,
                 framed: !channel.tests.is_empty()
-                    && corrected(two_sided(ratio, *dof), count) < c.false_alarm_rate_per_test,
+                    && corrected(two_sided(ratio, *dof), count as f64) < c.false_alarm_rate_per_test,
             });
         }
     }
