@@ -1,6 +1,7 @@
 //! A small spacecraft to try the effects on: positions and rotations of rigid bodies in inertial space, from which second
 //! differences are taken. It knows neither `Ω` nor `û` nor any regressor. Numbers are of order one, so that nothing hides.
 
+use dragfree_physics::frames::dcm_turned_about_z;
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Rotation3, Vector3};
@@ -31,6 +32,8 @@ pub(crate) struct Wrong {
     pub(crate) cross_m_s2_rad: [Matrix3<f64>; 2],
     /// What each of the nine channels' readouts shows is so much too old, s.
     pub(crate) late_s: [f64; 9],
+    /// Turn of a test mass's frame about s_3, rad.
+    pub(crate) opening_rad: [f64; 2],
 }
 
 impl Default for Wrong {
@@ -48,6 +51,7 @@ impl Default for Wrong {
             stiffness_s2: [zero; 2],
             cross_m_s2_rad: [zero; 2],
             late_s: [0.0; 9],
+            opening_rad: [0.0; 2],
         }
     }
 }
@@ -180,7 +184,7 @@ impl Bench {
         let loads = self.loads(t_s);
         let body = &self.mission.test_mass[&format!("tm{}", tm + 1)];
         let (force, alpha) = self.spacecraft(&loads, wrong, 1.0);
-        let dcm = self.dcm(tm);
+        let dcm = dcm_turned_about_z(wrong.opening_rad[tm]) * self.dcm(tm);
         let acting = wrong.electrodes[tm] * loads.electrodes_orf_n[tm];
         // Its own recoil moves the housing against it.
         let recoil = dcm.transpose() * (acting - loads.electrodes_orf_n[tm]) / self.mission.spacecraft.mass_kg;
@@ -253,7 +257,7 @@ impl Bench {
     }
 
     /// Derivative of the residual to a coefficient that `set` brings into the world.
-    fn derivative(&self, set: Set<'_>) -> [f64; 9] {
+    pub(crate) fn derivative(&self, set: Set<'_>) -> [f64; 9] {
         let at = |size: f64| {
             let mut wrong = Wrong::default();
             set(&mut wrong, size);
@@ -365,7 +369,7 @@ impl Bench {
         (self.dcm(tm) * self.offset_srf_m(tm))[AXES.iter().position(|a| *a == parts[2]).unwrap()]
     }
 
-    fn predicted(&self, form: &Form) -> [f64; 9] {
+    pub(crate) fn predicted(&self, form: &Form) -> [f64; 9] {
         let mut out = [0.0; 9];
         for term in &form.terms {
             let names = ["tm1.accel", "tm2.accel", "sc.alpha"];

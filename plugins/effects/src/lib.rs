@@ -29,7 +29,7 @@ pub use com_offset::ComOffset;
 use actuators::{EsCrosstalk, EsGain, MpsGain, MpsTilt, TorqueGain};
 use correlation::MpsCorrelation;
 use formula::Formula;
-use geometry::OffsetDrift;
+use geometry::{OffsetDrift, OpeningAngle};
 use impulse::Impulse;
 use noise::{IsNoise, MpsNoise, TorqueNoise};
 use readout::{IsCrosstalk, IsScale, TiltToLength, TimeOffset};
@@ -56,6 +56,7 @@ dragfree_sdk::export_plugin!(effects: [
     MpsNoise,
     MpsTilt,
     OffsetDrift,
+    OpeningAngle,
     Slosh,
     SolarPressure,
     Stiffness,

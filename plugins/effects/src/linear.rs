@@ -282,8 +282,8 @@ pub(crate) fn motion(
         return None;
     }
     let dcm = |tm: usize| mission.test_mass.get(&tm_name(tm)).map(TestMass::dcm_orf_from_srf);
-    let (both, own) = ([dcm(0)?, dcm(1)?], dcm(tm)?);
-    let weight = own.fixed_view::<1, 2>(axis, 0) * Matrix2::from_fn(|i, j| both[i][(0, j)]).try_inverse()?;
+    let both = [dcm(0)?, dcm(1)?];
+    let weight = of_optical_axes(mission, tm, axis)?;
     let mut parts = vec![(Piece::Column(Source::known(tm, axis)), 1.0, None)];
     for (column, times) in offset_terms(available, tm, axis) {
         parts.push((Piece::Column(column), 1.0, Some(times)));
@@ -297,6 +297,14 @@ pub(crate) fn motion(
         }
     }
     Some(parts)
+}
+
+/// An axis of a test mass in the plane of the two optical axes, as their combination; `None` where they are parallel.
+pub(crate) fn of_optical_axes(mission: &Mission, tm: usize, axis: usize) -> Option<[f64; 2]> {
+    let dcm = |tm: usize| mission.test_mass.get(&tm_name(tm)).map(TestMass::dcm_orf_from_srf);
+    let both = [dcm(0)?, dcm(1)?];
+    let weight = both[tm].fixed_view::<1, 2>(axis, 0) * Matrix2::from_fn(|i, j| both[i][(0, j)]).try_inverse()?;
+    Some(weight.into())
 }
 
 /// What a [`motion`] is made of.
