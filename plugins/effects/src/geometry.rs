@@ -5,7 +5,8 @@ use dragfree_sdk::prelude::*;
 use nalgebra::Vector3;
 
 use crate::linear::{
-    Driver, Form, Linear, Part, Recipe, Series, Source, Term, accel, motion, of_optical_axes, push, sc_axis, tm_axis, tm_name,
+    Driver, Form, Linear, Part, Piece, Recipe, Series, Source, Term, accel, motion, of_optical_axes, push, sc_axis,
+    tm_axis, tm_name,
 };
 
 const RATE_M_S: [f64; 2] = [-2e-7, 2e-7];
@@ -130,11 +131,13 @@ const OPENING_RAD: [f64; 2] = [-0.1, 0.1];
 /// What the housing's own acceleration does to the test mass, `a = û − F_E/m + Φ b + d` with the push `d` that nobody commanded, comes
 /// from another direction: `z = −δ e_3 × a`, so `δ a_y` in x and `−δ a_x` in y. δ: rad, ±0.1.
 ///
-/// `a_y` is told by the very x that it would explain, and a regressor made from the readout that it must explain fits that
-/// readout's noise. But whatever x shows a push on the spacecraft may have done: the thrusters' noise is far above the interferometer's
-/// where any other readout sees anything at all. So `δ a_y` in x is put as what y of both test masses shows less for it:
-/// `−w_j δ a_y`, with the combination `y_j = Σ_i w_ji x_i` of the two optical axes. For one test mass alone, without knowing `d` from
-/// both, that is no equation: `qp-check` fits it, `es-akf`, which follows each alone, does not.
+/// `d_y` is told by the very x that it would explain, and a regressor made from the readout that it must explain fits that
+/// readout's noise. But `d_x + δ d_y` is a push on the spacecraft as good as `d_x`: read so, x shows nothing of it, and y of each test
+/// mass, which is `w_j` of the optical axis in question, shows `w_j δ d_y` less than that push would do. So x has the known part of
+/// `a_y` alone.
+///
+/// **Limits.** `d` is known where both optical axes are read. `es-akf` follows each test mass alone, in which `d` and what is left of it
+/// in y are one noise.
 ///
 /// Confounders: `mps-tilt:sc.z` turns both test masses' forces alike; `is-crosstalk` of x in y; the offset's own direction.
 #[derive(Debug)]
@@ -160,28 +163,33 @@ impl Recipe for OpeningAngleRecipe {
 
     fn parts(&self, mission: &Mission, available: &Available) -> Result<Vec<Part>, PluginError> {
         let tm = self.0;
-        // The housing's acceleration along an axis: the test mass's motion without what its electrodes do.
-        let housing = |axis: usize| {
-            let mut pieces: Vec<_> = motion(available, mission, tm, axis)?
-                .into_iter()
-                .map(|(piece, factor, times)| (piece.series(), factor, times))
-                .collect();
-            let mass_kg = mission.test_mass.get(&tm_name(tm))?.mass_kg;
-            pieces.push((Series::Column(Source::electrodes_force(tm, axis)), -1.0 / mass_kg, None));
-            Some(pieces)
-        };
-        let weights = |tm: usize| of_optical_axes(mission, tm, 1);
-        let (Some(x), Some(y), Some(own), Some(others)) = (housing(0), housing(1), weights(tm), weights(1 - tm)) else {
+        let (Some(x), Some(y)) = (motion(available, mission, tm, 0), motion(available, mission, tm, 1)) else {
             return Err(PluginError::error(
                 "effect opening-angle: without the interferometers of both test masses nobody knows the thrusters' noise, and without \
                  that not how a housing moves; give telemetry with /ifo, or take the effect out of the model",
             ));
         };
+        let mass_kg = mission.test_mass(&tm_name(tm), "the effect opening-angle")?.mass_kg;
+        let weight = |tm: usize| of_optical_axes(mission, tm, 1).map_or(0.0, |w| w[self.0]);
+        // The housing moves as the test mass without what the electrodes do to that.
+        let electrodes = |axis: usize| (Series::Column(Source::electrodes_force(tm, axis)), -1.0 / mass_kg, None);
+        let series = |part: Vec<(Piece, f64, Option<String>)>| {
+            part.into_iter().map(|(piece, factor, times)| (piece.series(), factor, times))
+        };
+        let x: Vec<_> = series([x.known, x.push].concat()).chain([electrodes(0)]).collect();
+        let known_y: Vec<_> = series(y.known).chain([electrodes(1)]).collect();
+        let push_y: Vec<_> = series(y.push).collect();
+        let rows = [
+            ((tm, 0), &known_y, 1.0),
+            ((tm, 1), &x, -1.0),
+            ((tm, 1), &push_y, -weight(tm)),
+            ((1 - tm, 1), &push_y, -weight(1 - tm)),
+        ];
         let mut terms: Vec<Term> = Vec::new();
-        for (to, pieces, weight) in [(tm, &x, -1.0), (tm, &y, -own[tm]), (1 - tm, &y, -others[tm])] {
+        for ((to, axis), pieces, weight) in rows {
             for (series, factor, times) in pieces {
                 let term = Term {
-                    channel: accel(to, 1),
+                    channel: accel(to, axis),
                     series: series.clone(),
                     factor: factor * weight,
                     times: times.clone(),
@@ -227,47 +235,42 @@ mod tests {
         assert_eq!(forms, [("time", "m s-1"), ("hk.fuel_kg", "m kg-1")]);
     }
 
-    /// What x shows is put as a push on the spacecraft, so what is compared is what no such push reaches: y of each test mass less what
-    /// its direction is of the two optical axes, by its angle to them.
+    const GUST: [Vector3<f64>; 2] = [Vector3::new(0.4, -0.7, 0.0), Vector3::new(-0.5, 0.3, 0.0)];
+
     #[test]
-    fn a_frame_that_is_turned_sees_the_housings_push_from_elsewhere() {
+    fn a_frame_that_is_turned_sees_the_housings_acceleration_from_elsewhere() {
         for tm in 0..2 {
-            // The electrodes' recoil on the spacecraft, 1/1000 in a real one, is not turned.
-            let gust_srf_n = [Vector3::new(0.4, -0.7, 0.0), Vector3::new(-0.5, 0.3, 0.0)];
-            let bench = Bench { electrodes: false, gust_srf_n, ..Bench::new() };
-            let instance = format!("tm{}", tm + 1);
-            let forms = bench.forms::<OpeningAngleRecipe>(&instance, "");
-            let (truth, form) = (bench.derivative(&|w, angle| w.opening_rad[tm] += angle), &forms[0].1);
-            assert!(form.terms.iter().all(|t| t.channel.ends_with("accel.y")), "{form:?}");
-            // x_1 stands 1 rad before x_2 in this mission; y_1 = (x_2 − cos x_1)/sin up to sign, y_2 = (cos x_2 − x_1)/sin.
+            Bench::new().check::<OpeningAngleRecipe>(
+                &format!("tm{}", tm + 1),
+                "",
+                &[&|w, angle| w.opening_rad[tm] += angle],
+            );
+        }
+    }
+
+    /// With a push that nobody commanded, what is compared is what no such push reaches: y of each test mass less what its direction is of
+    /// the two optical axes, by its angle to them.
+    #[test]
+    fn an_unknown_push_is_seen_from_elsewhere_too() {
+        for tm in 0..2 {
+            let bench = Bench { gust_srf_n: GUST, ..Bench::new() };
+            let form = bench.forms::<OpeningAngleRecipe>(&format!("tm{}", tm + 1), "").remove(0).1;
+            let truth = bench.derivative(&|w, angle| w.opening_rad[tm] += angle);
+            // x_1 stands 1 rad before x_2 in this mission: y_1 = (cos x_1 − x_2)/sin, y_2 = (x_1 − cos x_2)/sin.
             let free = |z: &[f64; 9]| {
                 let (sin, cos) = 1.0f64.sin_cos();
-                [z[1] + (z[3] - cos * z[0]) / sin, z[4] + (cos * z[3] - z[0]) / sin]
+                [z[1] - (cos * z[0] - z[3]) / sin, z[4] - (z[0] - cos * z[3]) / sin]
             };
             let close = |form: &Form| {
                 let (got, want) = (free(&bench.predicted(form)), free(&truth));
                 (0..2).all(|i| (got[i] - want[i]).abs() < 2e-5)
             };
-            assert!(close(form), "{:?} against {:?}", free(&bench.predicted(form)), free(&truth));
-            // The electrodes are silent here and stand in it with what they are.
-            for i in (0..form.terms.len()).filter(|i| !form.terms[*i].series.name().contains("force_orf_n")) {
-                for factor in [-1.0, 0.0] {
-                    let mut other = form.clone();
-                    other.terms[i].factor *= factor;
-                    assert!(!close(&other), "{:?} says nothing", form.terms[i]);
-                }
+            assert!(close(&form), "{:?} against {:?}", free(&bench.predicted(&form)), free(&truth));
+            for i in 0..form.terms.len() {
+                let mut other = form.clone();
+                other.terms[i].factor = 0.0;
+                assert!(!close(&other), "{:?} says nothing", form.terms[i]);
             }
-        }
-    }
-
-    #[test]
-    fn what_the_electrodes_do_turns_with_the_frame() {
-        let form = Bench::new().forms::<OpeningAngleRecipe>("tm1", "").remove(0).1;
-        let factor = |name: &str| form.terms.iter().find(|t| t.series.name() == name).expect(name).factor;
-        for axis in ["x", "y"] {
-            // û holds F/m of 0.7 kg.
-            let [force, known] = ["used.tm1.force_orf_n", "tm1.u_orf_m_s2"].map(|name| factor(&format!("{name}.{axis}")));
-            assert!((force + known / 0.7).abs() < 1e-12 && known != 0.0, "{axis}: {force} {known}");
         }
     }
 

@@ -262,8 +262,16 @@ pub(crate) fn offset_terms(available: &Available, tm: usize, row: usize) -> Vec<
     names.filter_map(|name| Some((Source::of(&column(&name)?, "s-2"), name))).collect()
 }
 
-/// The acceleration of a test mass along an axis, `û + Φ b + d`, with what interferometers say of the push `d` that nobody
-/// commanded: a part, its factor, and the coefficient that it is multiplied with.
+/// The acceleration of a test mass along an axis, `û + Φ b + d`: of each part a piece, its factor, and the coefficient that it is
+/// multiplied with.
+pub(crate) struct Motion {
+    /// `û + Φ b`.
+    pub(crate) known: Vec<(Piece, f64, Option<String>)>,
+    /// The push `d` that nobody commanded, as interferometers tell it.
+    pub(crate) push: Vec<(Piece, f64, Option<String>)>,
+}
+
+/// How a test mass moves along an axis.
 ///
 /// Above all `d` is the thrusters' noise, `−T_S^{O_i} n/m_S`, which the loop works against: what is left of `û + d` is much less than
 /// either, so that `û` alone is no estimate of the motion. It is common to both test masses. In the plane of the two optical axes
@@ -271,32 +279,27 @@ pub(crate) fn offset_terms(available: &Available, tm: usize, row: usize) -> Vec<
 /// mission's nominal offsets are good enough there. Along s_3 no interferometer looks.
 ///
 /// `None` along s_3 and without both interferometers: then nobody knows `d`.
-pub(crate) fn motion(
-    available: &Available,
-    mission: &Mission,
-    tm: usize,
-    axis: usize,
-) -> Option<Vec<(Piece, f64, Option<String>)>> {
+pub(crate) fn motion(available: &Available, mission: &Mission, tm: usize, axis: usize) -> Option<Motion> {
     let reads = |tm: usize| latest(available, &Source::displacement(tm, 0).name).map_or("", |c| c.attribute("noise"));
     if axis == 2 || reads(0) != "ifo_x" || reads(1) != "ifo_x" {
         return None;
     }
-    let dcm = |tm: usize| mission.test_mass.get(&tm_name(tm)).map(TestMass::dcm_orf_from_srf);
-    let both = [dcm(0)?, dcm(1)?];
     let weight = of_optical_axes(mission, tm, axis)?;
-    let mut parts = vec![(Piece::Column(Source::known(tm, axis)), 1.0, None)];
+    let mut known = vec![(Piece::Column(Source::known(tm, axis)), 1.0, None)];
     for (column, times) in offset_terms(available, tm, axis) {
-        parts.push((Piece::Column(column), 1.0, Some(times)));
+        known.push((Piece::Column(column), 1.0, Some(times)));
     }
+    let mut push = Vec::new();
     for other in (0..2).filter(|other| weight[*other].abs() > 1e-12) {
-        parts.push((Piece::Channel(Source::channel(other, 0)), weight[other], None));
-        let b = mission.test_mass.get(&tm_name(other))?.offset_nominal_orf_m();
+        let body = mission.test_mass.get(&tm_name(other))?;
+        let (t, b) = (body.dcm_orf_from_srf(), body.offset_nominal_orf_m());
+        push.push((Piece::Channel(Source::channel(other, 0)), weight[other], None));
         for j in 0..3 {
-            let explained = both[other][(2, j)] * b.y - both[other][(1, j)] * b.z;
-            parts.push((Piece::Column(Source::alpha(j)), -weight[other] * explained, None));
+            let explained = t[(2, j)] * b.y - t[(1, j)] * b.z;
+            push.push((Piece::Column(Source::alpha(j)), -weight[other] * explained, None));
         }
     }
-    Some(parts)
+    Some(Motion { known, push })
 }
 
 /// An axis of a test mass in the plane of the two optical axes, as their combination; `None` where they are parallel.

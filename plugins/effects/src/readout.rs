@@ -11,8 +11,8 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 
 use crate::linear::{
-    Linear, Part, Piece, Recipe, Series, Source, Term, accel, latest, motion, offset_terms, through_offset, tm_axis,
-    tm_name, tm_pair, turn,
+    Linear, Motion, Part, Piece, Recipe, Series, Source, Term, accel, latest, motion, offset_terms, through_offset,
+    tm_axis, tm_name, tm_pair, turn,
 };
 
 const SCALE: [f64; 2] = [-0.2, 0.2];
@@ -36,14 +36,14 @@ fn shown(
     effect: &str,
     (tm, from, to): (usize, usize, usize),
 ) -> Result<Vec<Term>, PluginError> {
-    let Some(pieces) = motion(available, mission, tm, from) else {
+    let Some(Motion { known, push }) = motion(available, mission, tm, from) else {
         return Err(PluginError::error(format!(
             "effect {effect}: without the interferometers of both test masses nobody knows the thrusters' noise, and without that not \
              how a test mass moves; give telemetry with /ifo, or take the effect out of the model"
         )));
     };
     let term = |(piece, factor, times)| Term { channel: accel(tm, to), series: Piece::series(piece), factor, times };
-    Ok(pieces.into_iter().map(term).collect())
+    Ok(known.into_iter().chain(push).map(term).collect())
 }
 
 /// `is-scale`: the capacitive readout shows a displacement `r` as `(1 + s) r`.
