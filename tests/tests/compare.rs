@@ -79,6 +79,10 @@ fn a_sound_model_passes_in_every_channel() {
     }
     assert_eq!(c["hours_ns"].as_array().expect("hours").len(), 3);
     assert_eq!(c["nis"]["passes"], true);
+    // One in a hundred fails by chance, as does one in a hundred with housekeeping beside it.
+    let innovations = c["innovations"].as_array().expect("innovations");
+    assert!(innovations.len() == 6 && innovations.iter().all(|i| i["passes"] == true), "{innovations:#?}");
+    assert_eq!(c["together"], Value::Array(Vec::new()));
     let screen = compare(dir.path(), &[], 0);
     assert!(screen.lines().all(|line| line.chars().count() <= 80), "{screen}");
 }
@@ -114,6 +118,8 @@ fn a_noisy_readout_fails_in_the_null_combinations() {
     let failing = failing(&c);
     assert!(failing.contains(&"tm2.accel.z") && failing.contains(&"null.sc.z"), "{failing:?}");
     assert!(!failing.iter().any(|name| name.starts_with("tm1") || name.ends_with('x')), "{failing:?}");
+    let coloured = c["innovations"].as_array().expect("innovations").iter().filter(|i| i["passes"] == false);
+    assert_eq!(coloured.map(|i| i["readout"].as_str()).collect::<Vec<_>>(), [Some("tm2.z")]);
     // The level is all that is wrong.
     let z = channels(&c).iter().find(|c| c["name"] == "tm2.accel.z").expect("there");
     let [ratio, fitted] = ["chi2_per_dof", "chi2_per_dof_fitted_levels"].map(|k| z[k].as_f64().expect("a ratio"));

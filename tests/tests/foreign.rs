@@ -1,7 +1,7 @@
 //! Telemetry of another producer runs with a mission file alone: other controllers, other noise, offsets a few
 //! millimetres off the nominal, housekeeping never seen before, with and without `/command`.
 
-use dragfree_tests::foreign::{Container, Flight, Loops, Record, fly, write};
+use dragfree_tests::foreign::{Container, Flight, HEAT_LAG_S, Hidden, Loops, Record, fly, write};
 use dragfree_tests::{coefficient, dragfree, fixture};
 use serde_json::Value;
 use std::fmt::Write;
@@ -20,6 +20,7 @@ const FLIGHT: Flight = Flight {
     dws_rad: 3e-10,
     sunlight_n: 6.3513e-5,
     loops: Loops { attitude: 0.4, x: 0.45, y: 0.2, z: 0.25 },
+    hidden: Hidden { aside_tm2_y_x: 0.0, thrust_y: 0.0, shown_tm1_y: 0.0, heat_tm1_x: 0.0, blow: None },
 };
 
 /// Not on a full second: 2035-03-07T03:20:00.034567890Z.
@@ -191,4 +192,86 @@ fn without_an_ephemeris_the_run_goes_on() {
     let run = run(Container { ephemeris: false, ..USUAL }, records(), |dir| mission(dir, false));
     assert_eq!(run.code, Some(0), "{} {}", run.stderr, run.product);
     assert_within_three_sigma(&run.product);
+}
+
+/// What is diagnosed of six hours with something hidden in them.
+fn diagnosed(hidden: Hidden) -> Value {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let file = dir.path().join("foreign.mcap");
+    write(&file, &fly(&Flight { hidden, seed: 2, ..FLIGHT }), START_NS, USUAL);
+    let mut command = dragfree(dir.path());
+    command.arg("run").arg(fixture("pipelines/science-mode.toml")).arg(&file);
+    let run =
+        command.arg("--mission").arg(mission(dir.path(), false)).args(["--archive", "archive", "--json"]).output();
+    let run = run.expect("the program runs");
+    let product: Value =
+        serde_json::from_slice(&run.stdout).unwrap_or_else(|_| panic!("{}", String::from_utf8_lossy(&run.stderr)));
+    let id = product["id"].as_str().expect("an id");
+    let output = dragfree(dir.path()).args(["diagnose", id, "--archive", "archive", "--json", "-q"]).output();
+    let output = output.expect("the program runs");
+    serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{}", String::from_utf8_lossy(&output.stderr)))
+}
+
+/// The one candidate that is accepted, by its name, and how far its only coefficient is from the truth, in σ.
+fn found(d: &Value, truth: f64) -> (String, Value, f64) {
+    let all: Vec<&Value> =
+        d["candidates"].as_array().expect("a list").iter().filter(|c| c["accepted"] == true).collect();
+    assert_eq!(all.len(), 1, "{} {all:#?}", d["verdict"]);
+    let [value, sigma] = ["value", "sigma"].map(|key| all[0][key].as_f64().expect("a number"));
+    let name = format!("{}:{}", all[0]["effect"].as_str().unwrap_or(""), all[0]["instance"].as_str().unwrap_or(""));
+    (name, all[0].clone(), (value - truth) / sigma)
+}
+
+/// Nothing hidden in telemetry of another producer, nothing named (false alarms: one in a hundred).
+#[test]
+fn another_producers_sound_model_is_sufficient() {
+    let d = diagnosed(Hidden::default());
+    assert_eq!(d["verdict"], "sufficient", "{:#}", d["candidates"][0]);
+}
+
+/// Effects that another producer has hidden, its own way: named alone, in their place, with their size within 4σ (6e-5 each).
+#[test]
+fn another_producers_hidden_gain_and_crosstalk_are_found() {
+    for (name, truth, hidden) in [
+        ("mps-gain:sc.y", 0.1, Hidden { thrust_y: 0.1, ..Hidden::default() }),
+        ("es-crosstalk:tm2.y-x", 0.03, Hidden { aside_tm2_y_x: 0.03, ..Hidden::default() }),
+    ] {
+        let (accepted, candidate, pull) = found(&diagnosed(hidden), truth);
+        assert!(accepted == name && pull.abs() < 4.0, "{pull} {candidate:#}");
+    }
+}
+
+/// A readout that shows a tenth too much: itself, or what it names as its confounder, the gain of the electrodes along the same axis.
+#[test]
+fn another_producers_wrong_readout_is_found_or_named_beside_its_confounder() {
+    let (accepted, candidate, pull) = found(&diagnosed(Hidden { shown_tm1_y: 0.1, ..Hidden::default() }), 0.1);
+    let beside = candidate["confounders"].as_array().is_some_and(|c| c.iter().any(|name| name == "is-scale:tm1.y"));
+    assert!(
+        accepted == "is-scale:tm1.y" && pull.abs() < 4.0 || accepted == "es-gain:tm1.y" && beside,
+        "{pull} {candidate:#}"
+    );
+}
+
+/// Heat through one housing, by thermometers that no plugin has heard of: the right pair, the lag within a third.
+#[test]
+fn another_producers_heat_is_found_by_its_own_thermometers() {
+    let truth = 2e-11;
+    let (accepted, candidate, pull) = found(&diagnosed(Hidden { heat_tm1_x: truth, ..Hidden::default() }), truth);
+    assert!(accepted == "thermal:tm1.x" && pull.abs() < 4.0, "{pull} {candidate:#}");
+    let shape = &candidate["shape"];
+    assert_eq!((&shape["plus"], &shape["minus"]), (&"hk.housing_a_left_k".into(), &"hk.housing_a_right_k".into()));
+    let lag_s = shape["lag_s"].as_f64().expect("a lag");
+    assert!((lag_s / HEAT_LAG_S - 1.0).abs() < 0.34, "{lag_s}");
+}
+
+/// A blow of the sky: within a second of its time, with its momentum.
+#[test]
+fn another_producers_blow_is_found_with_its_time_and_momentum() {
+    let (at_s, momentum) = (2.2 * 3600.0, 2e-6);
+    let (accepted, candidate, pull) =
+        found(&diagnosed(Hidden { blow: Some((at_s, momentum)), ..Hidden::default() }), momentum);
+    assert!(accepted == "impulse:sc.x" && pull.abs() < 4.0, "{pull} {candidate:#}");
+    let at_ns = candidate["shape"]["at_ns"].as_i64().expect("a time");
+    let late_s = (at_ns - START_NS as i64) as f64 * 1e-9 - at_s;
+    assert!(late_s.abs() < 1.0, "{late_s} s");
 }

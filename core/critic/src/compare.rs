@@ -15,6 +15,7 @@
 //! No thrust, commanded or not, no solar pressure and no wrong gain of a thruster reaches these. What does act on one mass alone, or on
 //! its readout. So a model that fails in the channels and not in the null combinations has its fault in the forces on the spacecraft.
 
+use std::collections::BTreeMap;
 use std::f64::consts::PI;
 use std::ops::Range;
 
@@ -28,7 +29,7 @@ use serde::Serialize;
 
 use crate::chance::{chi2_per_dof_quantile, chi2_tails, corrected, kolmogorov, two_sided};
 use crate::rank::Court;
-use crate::witness::Coherence;
+use crate::witness::{Coherence, Together};
 
 /// Chance that anything fails where the model and the mission's noise are right; all tests of all channels together.
 pub const FALSE_ALARM: f64 = 0.01;
@@ -163,6 +164,51 @@ impl Nis {
     }
 }
 
+/// Innovations of a readout in the recursive filter, octave by octave.
+///
+/// They are white where the filter's model and the mission's noise are right and its gains are the best ones; a filter that adapts its
+/// gains has others, and one for each test mass does not know what the other one's readouts would tell it. So this says where in frequency
+/// the filter is wrong, and is no part of the verdict.
+#[derive(Clone, Debug, Serialize)]
+pub struct Innovations {
+    /// `tm1.x`.
+    pub readout: String,
+    /// Octaves, the highest first: `chi2_per_dof` is the mean square over what the mission's noise predicts for the gains in use.
+    pub octaves: Vec<Cell>,
+    /// Chance of the octave that is farthest from one, corrected for all octaves of all readouts.
+    pub p_value: f64,
+    /// The number of that octave.
+    pub farthest: usize,
+    /// Whether the chance is above [`FALSE_ALARM`].
+    pub passes: bool,
+}
+
+impl Innovations {
+    /// Judges readouts sampled at `rate_hz` by mean squares and counts of each octave, as [Haar's wavelets][1] give them.
+    ///
+    /// [1]: https://en.wikipedia.org/wiki/Haar_wavelet
+    #[must_use]
+    pub fn judge(readouts: &BTreeMap<String, Vec<(f64, u64)>>, rate_hz: f64) -> Vec<Self> {
+        let told = |octaves: &Vec<(f64, u64)>| octaves.iter().filter(|(_, n)| *n > 0).count();
+        let trials: usize = readouts.values().map(told).sum();
+        let band = |k: usize| [2.0, 1.0].map(|of| rate_hz / (of * (2 << k) as f64));
+        let of = |(readout, octaves): (&String, &Vec<(f64, u64)>)| {
+            let cell = |(k, (power, n)): (usize, &(f64, u64))| Cell {
+                band_hz: band(k),
+                chi2_per_dof: (*n > 0).then_some(*power),
+                dof: *n as f64,
+            };
+            let octaves: Vec<Cell> = octaves.iter().enumerate().map(cell).collect();
+            let chance = |c: &Cell| c.chi2_per_dof.map_or(1.0, |power| two_sided(power, c.dof));
+            let far = octaves.iter().enumerate().min_by(|a, b| chance(a.1).total_cmp(&chance(b.1)))?;
+            let p_value = corrected(chance(far.1), trials as f64);
+            let farthest = far.0;
+            Some(Self { readout: readout.clone(), passes: p_value >= FALSE_ALARM, p_value, farthest, octaves })
+        };
+        readouts.iter().filter_map(of).collect()
+    }
+}
+
 /// Housekeeping that goes with a residual.
 #[derive(Clone, Debug, Serialize)]
 pub struct Witness {
@@ -194,9 +240,13 @@ pub struct Comparison {
     pub channels: Vec<Channel>,
     /// Innovations of the recursive filter; no part of the verdict.
     pub nis: Option<Nis>,
+    /// The same octave by octave; no part of the verdict either.
+    pub innovations: Vec<Innovations>,
     /// Housekeeping that is coherent with a residual, beyond chance; evidence and no test, since currents of thrusters follow
     /// commands, and these the noise.
     pub coherences: Vec<Witness>,
+    /// Per channel what goes with its residual beside what was named before, and the multiple coherence of all that is named.
+    pub together: Vec<Together>,
 }
 
 /// Why there is no comparison.
@@ -238,11 +288,11 @@ impl Ratios {
     }
 }
 
-/// Compares the sums with the mission's noise. `nis` is what the product says of the recursive filter.
+/// Compares the sums with the mission's noise. `nis` and `innovations` are what the products say of the recursive filter.
 ///
 /// # Errors
 /// [`CompareError`]: too little data, or a model that cannot be fitted.
-pub fn compare(court: &Court<'_>, nis: Option<Nis>) -> Result<Comparison, CompareError> {
+pub fn compare(court: &Court<'_>, nis: Option<Nis>, innovations: Vec<Innovations>) -> Result<Comparison, CompareError> {
     let (gathered, names) = (court.gathered, &court.question.channels);
     // The hours and their sum are of segments of one length, whatever else was gathered.
     let plan = &gathered.hour_plan();
@@ -328,7 +378,9 @@ pub fn compare(court: &Court<'_>, nis: Option<Nis>) -> Result<Comparison, Compar
         hours_ns,
         channels,
         nis,
+        innovations,
         coherences: coherences.filter(|w| w.p_value < FALSE_ALARM).take(MOST_COHERENCES).collect(),
+        together: gathered.witnesses.together(names, FALSE_ALARM),
     })
 }
 
@@ -561,6 +613,20 @@ mod tests {
     const LENGTH: usize = 256;
     const HOURS: usize = 8;
 
+    /// Of white innovations one readout in a hundred fails of all together; one octave a tenth too loud, of ten thousand, is 7σ.
+    #[test]
+    fn innovations_are_judged_octave_by_octave() {
+        let octaves = |wrong: f64| (0..10).map(|k| (if k == 3 { wrong } else { 1.0 }, 10_000 >> k)).collect::<Vec<_>>();
+        let readouts =
+            |wrong| BTreeMap::from([("tm1.x".to_owned(), octaves(wrong)), ("tm1.y".to_owned(), octaves(1.0))]);
+        assert!(Innovations::judge(&readouts(1.0), 10.0).iter().all(|i| i.passes && i.p_value > 0.99));
+        let judged = Innovations::judge(&readouts(1.3), 10.0);
+        assert!(!judged[0].passes && judged[1].passes, "{judged:?}");
+        // 1250 of variance 2/1250: 7.5σ; Haar's fourth octave of 10 Hz.
+        assert_eq!((judged[0].farthest, judged[0].octaves[3].band_hz), (3, [0.3125, 0.625]));
+        assert!(judged[0].p_value < 1e-9, "{judged:?}");
+    }
+
     /// White noise of unit variance at 1 Hz, eight hours, what `shape` makes of it, cut and judged as a channel whose prediction is white;
     /// `louder` multiplies the measured power of band and hour.
     fn judged(seed: u64, allowed: f64, shape: fn(&mut [f64]), louder: fn(f64, usize) -> f64) -> Channel {
@@ -607,7 +673,7 @@ mod tests {
     #[test]
     fn white_noise_fails_at_the_stated_rate() {
         const DRAWS: u64 = 1000;
-        let mut alarms = std::collections::BTreeMap::new();
+        let mut alarms = BTreeMap::new();
         for seed in 0..DRAWS {
             for name in failed(&judged(seed, 0.05, |_| (), |_, _| 1.0)) {
                 *alarms.entry(name).or_insert(0.0) += 1.0;

@@ -11,7 +11,7 @@ use crate::question::Question;
 use crate::transient::{Hit, Transients};
 use crate::witness::Witnesses;
 
-const MAGIC: &[u8; 8] = b"DFCRIT3\n";
+const MAGIC: &[u8; 8] = b"DFCRIT4\n";
 
 /// Question and sums of some telemetry.
 #[derive(Clone, Debug, PartialEq)]
@@ -133,7 +133,8 @@ impl Record {
         put(to, w.residual.as_slice())?;
         put(to, &w.level)?;
         put(to, &w.observations)?;
-        [&w.residual_power, &w.power, &w.cross[0], &w.cross[1]].into_iter().try_for_each(|m| put(to, m.as_slice()))
+        let sums = [&w.residual_power, &w.power, &w.cross[0], &w.cross[1]];
+        sums.into_iter().chain(w.among.iter().flatten()).try_for_each(|m| put(to, m.as_slice()))
     }
 
     /// Reads what [`Self::write`] wrote.
@@ -193,7 +194,8 @@ impl Record {
         let mut w = Witnesses::new(h.housekeeping, &low_plan(h.length, h.rate_hz).0, residual, Vec::new());
         numbers.fill(&mut w.level)?;
         numbers.fill(&mut w.observations)?;
-        for m in [&mut w.residual_power, &mut w.power].into_iter().chain(&mut w.cross) {
+        let sums = [&mut w.residual_power, &mut w.power].into_iter().chain(&mut w.cross);
+        for m in sums.chain(w.among.iter_mut().flatten()) {
             numbers.fill(m.as_mut_slice())?;
         }
         if numbers.0.read(&mut [0]).map_err(early)? > 0 {

@@ -6,13 +6,19 @@
 //! segments, in wide bands below [`crate::gather::SLOW_HZ`]. A lag between cause and force turns the phase and leaves the coherence.
 //! For n complex observations without relation `−2(n−1) log(1 − |γ|²)` is χ² with two degrees of freedom, whatever the driver
 //! (Goodman 1957).
+//!
+//! Channels of housekeeping go with one another, and one that drives a residual makes all of its kin light up. So
+//! [`Witnesses::together`] asks again, one after the other: what goes with the residual beside those that were named already, by the
+//! partial coherence (Bendat and Piersol, Random Data, 4th ed., §7.3), until chance says as much. What all of them explain is their
+//! multiple coherence.
 
 use std::ops::Range;
 
 use dragfree_estimation::spectra::{Plan, Transformer};
-use nalgebra::{DMatrix, DMatrixView};
+use nalgebra::{Complex, DMatrix, DMatrixView};
 use serde::{Deserialize, Serialize};
 
+use crate::chance::{corrected, ln_chi2_above};
 use crate::gather::SLOW_HZ;
 
 /// Ratio of the ends of a band.
@@ -60,6 +66,28 @@ pub struct Coherence {
     pub band_hz: [f64; 2],
 }
 
+/// Drivers that go with a channel's residual, each beside those before it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Together {
+    /// Channel.
+    pub channel: String,
+    /// The drivers in words.
+    pub drivers: Vec<String>,
+    /// Of each the chance of as much beside those before it, corrected for all drivers of all channels.
+    pub p_values: Vec<f64>,
+    /// Part of the residual's power that is coherent with all of them, in the band where that is largest: their multiple coherence, less
+    /// what chance gives.
+    pub explained: f64,
+    /// That band, Hz.
+    pub band_hz: [f64; 2],
+}
+
+/// More drivers than these are not named together.
+const MOST_TOGETHER: usize = 5;
+
+/// A driver of which the others leave less than this has nothing of its own.
+const OWN: f64 = 1e-6;
+
 /// The sums.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Witnesses {
@@ -80,6 +108,9 @@ pub struct Witnesses {
     pub(crate) power: DMatrix<f64>,
     /// Per driver, a column per band and channel: real and imaginary parts of the cross-spectrum.
     pub(crate) cross: [DMatrix<f64>; 2],
+    /// Per band the cross-spectra of the drivers that are no products, real and imaginary parts, lower triangles; none where there are too
+    /// many.
+    pub(crate) among: Vec<[DMatrix<f64>; 2]>,
     /// Per band: complex observations.
     pub(crate) observations: Vec<f64>,
 }
@@ -106,7 +137,9 @@ impl Witnesses {
         }
         let channels = residual.nrows();
         let wide = bands.len() * channels;
+        let singles = if n <= MOST_FOR_PRODUCTS { 3 * n } else { 0 };
         Self {
+            among: vec![[DMatrix::zeros(singles, singles), DMatrix::zeros(singles, singles)]; bands.len()],
             level: vec![f64::NAN; n],
             residual_power: DMatrix::zeros(bands.len(), channels),
             power: DMatrix::zeros(drivers.len(), bands.len()),
@@ -130,6 +163,7 @@ impl Witnesses {
         self.power += &other.power;
         self.cross.iter_mut().zip(&other.cross).for_each(|(a, b)| *a += b);
         self.observations.iter_mut().zip(&other.observations).for_each(|(a, b)| *a += b);
+        self.among.iter_mut().flatten().zip(other.among.iter().flatten()).for_each(|(a, b)| *a += b);
     }
 
     /// A segment of the plan's `taper`-th length: housekeeping sample by sample, spectra of the base columns.
@@ -174,8 +208,15 @@ impl Witnesses {
             }
         }
         let mut spectrum = vec![0.0; 2 * (samples / 2 - plan.first_bin)];
+        // Spectra of those that are no products, a column each.
+        let singles = self.among.first().map_or(0, |a| a[0].nrows());
+        let mut all = DMatrix::zeros(rows.last().map_or(0, |r| r.end), singles);
         for (d, driver) in self.drivers.iter().enumerate() {
             transformer.transform(plan, taper, &driver.samples(housekeeping, &self.level), &mut spectrum);
+            if d < singles {
+                let length = all.nrows();
+                all.column_mut(d).copy_from_slice(&spectrum[..length]);
+            }
             for (b, rows) in rows.iter().enumerate() {
                 let own = &spectrum[rows.clone()];
                 self.power[(d, b)] += own.iter().map(|x| x * x).sum::<f64>();
@@ -192,6 +233,92 @@ impl Witnesses {
                 }
             }
         }
+        for (rows, among) in rows.into_iter().zip(&mut self.among) {
+            // Times i, so that the imaginary part is a product of real matrices too.
+            let own = all.rows(rows.start, rows.len()).into_owned();
+            let turned =
+                DMatrix::from_fn(
+                    own.nrows(),
+                    own.ncols(),
+                    |r, d| {
+                        if r % 2 == 0 { own[(r + 1, d)] } else { -own[(r - 1, d)] }
+                    },
+                );
+            among[0].gemm_tr(1.0, &own, &own, 1.0);
+            among[1].gemm_tr(1.0, &own, &turned, 1.0);
+        }
+    }
+
+    /// What goes with each channel's residual, one driver beside the other; only channels with any, and no products. `alarm` is the chance
+    /// that any is named of all.
+    #[must_use]
+    pub fn together(&self, channels: &[String], alarm: f64) -> Vec<Together> {
+        (0..channels.len()).filter_map(|c| self.together_in(channels, c, alarm)).collect()
+    }
+
+    fn together_in(&self, channels: &[String], c: usize, alarm: f64) -> Option<Together> {
+        let singles = self.among.first().map_or(0, |a| a[0].nrows());
+        // Per band the Hermitian matrix of the drivers and, last, the residual, from which each driver named is swept.
+        let mut bands: Vec<DMatrix<Complex<f64>>> = (0..self.bands.len())
+            .map(|b| {
+                let column = b * channels.len() + c;
+                DMatrix::from_fn(singles + 1, singles + 1, |i, j| match (i == singles, j == singles) {
+                    (false, false) => Complex::new(self.among[b][0][(i, j)], self.among[b][1][(i, j)]),
+                    (false, true) => Complex::new(self.cross[0][(i, column)], self.cross[1][(i, column)]),
+                    (true, false) => Complex::new(self.cross[0][(j, column)], -self.cross[1][(j, column)]),
+                    (true, true) => Complex::new(self.residual_power[(b, c)], 0.0),
+                })
+            })
+            .collect();
+        let whole: Vec<Vec<f64>> = bands.iter().map(|m| m.diagonal().iter().map(|x| x.re).collect()).collect();
+        let trials = (singles * channels.len()) as f64;
+        let mut named: Vec<usize> = Vec::new();
+        let mut p_values = Vec::new();
+        while named.len() < MOST_TOGETHER {
+            let left = |b: usize, i: usize| bands[b][(i, i)].re > OWN * whole[b][i];
+            let chance = |d: usize| {
+                let (mut statistic, mut dof) = (0.0, 0.0);
+                for (b, m) in bands.iter().enumerate() {
+                    let n = self.observations[b] - named.len() as f64;
+                    if n < 2.0 || !left(b, d) || !left(b, singles) {
+                        continue;
+                    }
+                    let squared = m[(d, singles)].norm_sqr() / (m[(d, d)].re * m[(singles, singles)].re);
+                    statistic -= 2.0 * (n - 1.0) * (-squared.min(1.0 - 1e-12)).ln_1p();
+                    dof += 2.0;
+                }
+                (dof > 0.0).then(|| ln_chi2_above(statistic, dof))
+            };
+            let others = (0..singles).filter(|d| !named.contains(d)).filter_map(|d| Some((d, chance(d)?)));
+            let (best, ln_p) = others.min_by(|a, b| a.1.total_cmp(&b.1))?;
+            let p_value = corrected(ln_p.exp(), trials);
+            if p_value >= alarm {
+                break;
+            }
+            for (m, whole) in bands.iter_mut().zip(&whole) {
+                let pivot = m[(best, best)].re;
+                if pivot > OWN * whole[best] {
+                    let column = m.column(best).into_owned();
+                    m.gerc(Complex::new(-1.0 / pivot, 0.0), &column, &column, Complex::new(1.0, 0.0));
+                }
+            }
+            named.push(best);
+            p_values.push(p_value);
+        }
+        let explained = |b: &usize| {
+            let (q, n) = (named.len() as f64, self.observations[*b]);
+            let power = whole[*b][singles];
+            (n > q + 1.0 && power > 0.0).then(|| 1.0 - bands[*b][(singles, singles)].re / power - q / n)
+        };
+        let best = (0..bands.len()).filter_map(|b| Some((b, explained(&b)?))).max_by(|a, b| a.1.total_cmp(&b.1))?;
+        let [first, end] = self.bands[best.0];
+        (!named.is_empty()).then(|| Together {
+            channel: channels[c].clone(),
+            drivers: named.iter().map(|d| self.drivers[*d].label(&self.names)).collect(),
+            p_values,
+            explained: best.1,
+            band_hz: [first as f64 * self.bin_hz, (end - 1) as f64 * self.bin_hz],
+        })
     }
 
     /// How coherent each driver is with the residual of each channel, the first what chance gives most rarely.
@@ -276,12 +403,12 @@ mod tests {
     use rand_xoshiro::Xoshiro256PlusPlus;
 
     const CHANNELS: usize = 6;
-    /// More than have products tried.
-    const NAMES: usize = MOST_FOR_PRODUCTS + 1;
+    /// As many as are tried together.
+    const NAMES: usize = 50;
 
-    /// Three segments that overlap, of white channels and housekeeping, some of it added to a channel; housekeeping 0 is a flag that is up
-    /// in the last quarter alone.
-    fn coherences(seed: u64, of_second_in_first: f64) -> Vec<Coherence> {
+    /// Three segments that overlap, of white channels and housekeeping as `change` leaves them; housekeeping 0 is a flag that is up in the
+    /// last quarter alone.
+    fn witnesses(seed: u64, change: impl Fn(&mut [Vec<f64>], &mut [Vec<f64>])) -> (Witnesses, Vec<String>) {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         let plan = Plan::new(1024, 1.0);
         let samples = 2 * plan.length;
@@ -289,8 +416,7 @@ mod tests {
         let mut channels: Vec<Vec<f64>> = (0..CHANNELS).map(|_| white(samples)).collect();
         let mut housekeeping: Vec<Vec<f64>> = (0..NAMES).map(|_| white(samples)).collect();
         housekeeping[0] = (0..samples).map(|k| f64::from(u8::from(4 * k > 3 * samples))).collect();
-        let driver = housekeeping[1].clone();
-        channels[0].iter_mut().zip(driver).for_each(|(z, x)| *z += of_second_in_first * x);
+        change(&mut channels, &mut housekeeping);
         let names = (0..NAMES).map(|i| format!("hk/{i}")).collect();
         let whitening = vec![DMatrix::identity(CHANNELS, CHANNELS); plan.bands.len()];
         let mut witnesses = Witnesses::new(names, &plan, DMatrix::identity(CHANNELS, CHANNELS), whitening);
@@ -305,7 +431,14 @@ mod tests {
             let slices: Vec<&[f64]> = cuts.iter().map(Vec::as_slice).collect();
             witnesses.segment(&plan, 0, &slices, &base.columns(0, CHANNELS), first > 0);
         }
-        let names: Vec<String> = (0..CHANNELS).map(|c| format!("channel {c}")).collect();
+        (witnesses, (0..CHANNELS).map(|c| format!("channel {c}")).collect())
+    }
+
+    /// With some of the second housekeeping added to the first channel.
+    fn coherences(seed: u64, of_second_in_first: f64) -> Vec<Coherence> {
+        let (witnesses, names) = witnesses(seed, |channels, housekeeping| {
+            channels[0].iter_mut().zip(&housekeeping[1]).for_each(|(z, x)| *z += of_second_in_first * x);
+        });
         witnesses.coherences(&names)
     }
 
@@ -321,6 +454,35 @@ mod tests {
             let most = n * p + 4.3 * (3.0 * n * p).sqrt() + 3.0;
             assert!(found <= most, "{found} of {n} below {p}");
         }
+    }
+
+    /// Two drivers, each with twice the amplitude of the noise, and a noisy copy of the first: all three go with the channel, with 4/9, 4/9
+    /// and 2/9 of its power, and two of them explain 8/9 of it, to which the third adds nothing.
+    #[test]
+    fn a_copy_of_a_driver_is_not_named_beside_it() {
+        let together = |parts: &[(usize, f64)]| {
+            let (witnesses, names) = witnesses(7, |channels, housekeeping| {
+                for (driver, part) in parts {
+                    let driver = housekeeping[*driver].clone();
+                    channels[0].iter_mut().zip(driver).for_each(|(z, x)| *z += part * x);
+                }
+                let first = housekeeping[1].clone();
+                housekeeping[3].iter_mut().zip(first).for_each(|(copy, x)| *copy += x);
+            });
+            (witnesses.coherences(&names), witnesses.together(&names, 1e-3))
+        };
+        let (pairs, found) = together(&[(1, 2.0), (2, 2.0)]);
+        // In narrow bands a derivative is as coherent as what it is the derivative of.
+        let lights_up = |name: &str| pairs.iter().take(6).any(|w| w.of == [name] && w.channel == "channel 0");
+        assert!(["hk/1", "hk/2", "hk/3"].into_iter().all(lights_up), "{:?}", &pairs[..6]);
+        assert_eq!(found.len(), 1, "{found:?}");
+        let mut drivers: Vec<&str> = found[0].drivers.iter().map(|d| d.trim_start_matches("d/dt ")).collect();
+        drivers.sort_unstable();
+        assert_eq!((found[0].channel.as_str(), &drivers[..]), ("channel 0", &["hk/1", "hk/2"][..]));
+        // The largest of the bands, of 20 observations and more each: (1 − γ²)√(2/n)γ = 0.03, of which four σ.
+        assert!((found[0].explained - 8.0 / 9.0).abs() < 0.13, "{found:?}");
+        // Nothing goes with nothing; the chance of this test is 1e-3.
+        assert_eq!(together(&[]).1, []);
     }
 
     /// The twin: a driver with half of a channel's power, |γ|² = 1/2, is worth 2n log 2 = 97 over some 70 observations.

@@ -6,8 +6,9 @@ use serde_json::json;
 
 use crate::akf::{Akf, MAX_STATES};
 use crate::design::{Choices, model};
-use crate::filter::{Adaptation, Settings};
+use crate::filter::{Adaptation, Settings, Statistics};
 use crate::model::{Coefficient as Theta, Prior};
+use crate::octaves::Octaves;
 use crate::state::{Words, seal, unseal};
 use crate::tracker::{Average, Factor, Regressor, Rows, Snapshot, Tracker};
 
@@ -220,6 +221,7 @@ impl Stage for EsAkf {
                     "states": body.tracker.filter().model().states(),
                     "nis": s.nis(),
                     "innovation_variance_over_mission_noise": s.design_nis(),
+                    "innovation_octaves": innovation_octaves(s),
                     "sigma_stretch": stretch,
                     "averaged_s": average.as_ref().map(|a| a.span_s),
                 }),
@@ -460,6 +462,16 @@ fn prior_of(c: &Coefficient) -> Result<Theta, PluginError> {
             c.name, c.initial, c.prior_sigma, c.lower, c.upper
         )))
     }
+}
+
+/// Of each readout the innovations' mean square over what the mission's noise predicts, octave by octave from the highest, and how
+/// many there are.
+fn innovation_octaves(s: &Statistics) -> serde_json::Map<String, serde_json::Value> {
+    let of = |octaves: &Octaves| {
+        let (power, count): (Vec<f64>, Vec<u64>) = octaves.powers().unzip();
+        json!({"power": power, "count": count})
+    };
+    AXES.iter().zip(&s.octaves).map(|(axis, octaves)| ((*axis).to_owned(), of(octaves))).collect()
 }
 
 /// Whether a coefficient has regressors on both test masses.

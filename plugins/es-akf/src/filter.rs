@@ -25,6 +25,7 @@ use crate::kernel::{
     Columns, Mat3, Matrix, Transition, adapt, add_noise, advance, advance_with_foreign_gain, inverse, mix,
 };
 use crate::model::{BIAS, Model, R, THETA, V};
+use crate::octaves::Octaves;
 use crate::state::{Bytes, StateError, Words};
 
 /// How `Q̂` and `R̂` follow the innovations.
@@ -94,6 +95,8 @@ pub struct Statistics {
     pub design_sum: [f64; 3],
     /// Readouts in `nis_sum`, per axis.
     pub readouts: [u64; 3],
+    /// `d_i / √S̃_ii` per readout, octave by octave.
+    pub octaves: [Octaves; 3],
 }
 
 impl Statistics {
@@ -355,6 +358,7 @@ impl<const N: usize> Filter<N> {
 
     /// Nothing of the last epoch is left to be carried to the next.
     fn forget_measurement(&mut self) {
+        self.statistics.octaves.iter_mut().for_each(Octaves::interrupt);
         self.gain = [[0.0; N]; 3];
         self.weight = [[0.0; 3]; 3];
         self.adapt = false;
@@ -515,13 +519,17 @@ impl<const N: usize> Filter<N> {
         if !settled {
             return;
         }
+        let s = &mut self.statistics;
         for i in 0..3 {
             for j in 0..3 {
-                self.statistics.nis_sum += d[i] * self.weight[i][j] * d[j];
+                s.nis_sum += d[i] * self.weight[i][j] * d[j];
             }
             if used[i] {
-                self.statistics.design_sum[i] += d[i] * d[i] / self.s_design[i][i];
-                self.statistics.readouts[i] += 1;
+                s.design_sum[i] += d[i] * d[i] / self.s_design[i][i];
+                s.readouts[i] += 1;
+                s.octaves[i].push(d[i] / self.s_design[i][i].sqrt());
+            } else {
+                s.octaves[i].interrupt();
             }
         }
     }
@@ -688,7 +696,8 @@ impl<const N: usize> Filter<N> {
             w.count(n)?;
         }
         w.all(std::slice::from_mut(&mut s.nis_sum))?;
-        w.all(&mut s.design_sum)
+        w.all(&mut s.design_sum)?;
+        s.octaves.iter_mut().try_for_each(|o| o.visit(w))
     }
 }
 

@@ -18,6 +18,7 @@ pub mod design;
 pub mod filter;
 pub mod kernel;
 pub mod model;
+pub mod octaves;
 pub mod shaping;
 pub mod state;
 pub mod tracker;

@@ -42,7 +42,7 @@ pub enum StateError {
 
 const MAGIC: &[u8; 8] = b"ES-AKF\r\n";
 /// Version of the layout of saved states.
-const VERSION: u64 = 2;
+const VERSION: u64 = 3;
 
 /// Bytes of a state being written.
 pub type Bytes = Vec<u8>;

@@ -52,7 +52,7 @@ struct Topic {
     metadata: &'static [(&'static str, &'static str)],
 }
 
-const TOPICS: [Topic; 8] = [
+const TOPICS: [Topic; 11] = [
     Topic { name: "/is", message: "InertialSensors", encoding: "protobuf", metadata: &[] },
     Topic { name: "/ifo", message: "Interferometers", encoding: "protobuf", metadata: &[] },
     Topic { name: "/dws", message: "Dws", encoding: "protobuf", metadata: &[] },
@@ -71,7 +71,12 @@ const TOPICS: [Topic; 8] = [
         metadata: &[("unit", "Pa"), ("place", "tank"), ("rate_hz", "0.1")],
     },
     Topic { name: "/debug/text", message: "", encoding: "json", metadata: &[] },
+    Topic { name: "/hk/housing_a_left_k", message: "Scalar", encoding: "protobuf", metadata: THERMOMETER },
+    Topic { name: "/hk/housing_a_right_k", message: "Scalar", encoding: "protobuf", metadata: THERMOMETER },
+    Topic { name: "/hk/battery_case_k", message: "Scalar", encoding: "protobuf", metadata: THERMOMETER },
 ];
+
+const THERMOMETER: &[(&str, &str)] = &[("unit", "K"), ("place", "somewhere"), ("rate_hz", "0.1")];
 
 fn definitions() -> Vec<u8> {
     let mut out = Vec::new();
@@ -277,6 +282,9 @@ pub fn write(path: &Path, records: &[Record], start_ns: u64, container: Containe
         if k % 100 == 0 {
             writer.message(6, time, &wire::scalar(2e7 - k as f64));
             writer.message(7, time, br#"{"says": "all is well"}"#);
+            for (i, t) in r.temperature_k.into_iter().enumerate() {
+                writer.message(8 + i, time, &wire::scalar(t));
+            }
         }
     }
     writer.close_chunk();

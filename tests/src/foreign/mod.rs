@@ -8,4 +8,4 @@ mod spacecraft;
 mod wire;
 
 pub use file::{Container, write};
-pub use spacecraft::{Flight, Loops, Record, fly};
+pub use spacecraft::{Flight, HEAT_LAG_S, Hidden, Loops, Record, fly};

@@ -29,7 +29,30 @@ pub struct Flight {
     pub sunlight_n: f64,
     /// Bandwidths.
     pub loops: Loops,
+    /// What nobody is told.
+    pub hidden: Hidden,
 }
+
+/// What is not as the mission file says.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Hidden {
+    /// Part of the electrodes' push along y of test mass 2 that acts along x.
+    pub aside_tm2_y_x: f64,
+    /// The thrusters push so much more than commanded along y of SRF.
+    pub thrust_y: f64,
+    /// The capacitive readout of y of test mass 1 shows so much more than there is.
+    pub shown_tm1_y: f64,
+    /// Acceleration of test mass 1 along x per kelvin between the sides of its housing, behind a lag of [`HEAT_LAG_S`], m s⁻² K⁻¹.
+    pub heat_tm1_x: f64,
+    /// A blow along x of SRF at this time after the first sample, s, and its momentum, N s.
+    pub blow: Option<(f64, f64)>,
+}
+
+/// How long the heat takes from where it is measured to where it pushes, s.
+pub const HEAT_LAG_S: f64 = 700.0;
+/// Relaxation of the temperatures, s, and how far they wander, K.
+const HEAT_S: f64 = 1500.0;
+const HEAT_K: f64 = 0.03;
 
 /// Bandwidths of the loops, rad/s.
 #[derive(Clone, Copy, Debug)]
@@ -83,6 +106,8 @@ pub struct Record {
     pub torque_nm: [f64; 3],
     /// Electrostatic force, ORF, N.
     pub electrostatic_n: [[f64; 3]; 2],
+    /// Temperatures left and right of test mass 1, and of the battery, which pushes nothing, K.
+    pub temperature_k: [f64; 3],
 }
 
 /// xorshift64* and Box–Muller.
@@ -187,22 +212,38 @@ pub fn fly(flight: &Flight) -> Vec<Record> {
     let mut loops = [Loop::default(); 9];
     let sunlight = [flight.sunlight_n, 0.0, 0.0];
     let sunlight_torque = cross([0.1, 0.0, 0.6], sunlight);
+    let hidden = &flight.hidden;
+    // Dice of their own: what is hidden does not change the noise.
+    let mut weather = Dice::new(flight.seed + 1_000_000);
+    let (mut temperature_k, mut felt_k) = ([0.0; 3], 0.0);
     let (settle, keep) = ((SETTLE_S * RATE_HZ) as usize, (flight.seconds * RATE_HZ) as usize);
     let mut records = Vec::with_capacity(keep);
     for k in 0..settle + keep {
         let mut record = Record { dws_sc_rad: angle.map(|a| a + dice.white(flight.dws_rad)), ..Record::default() };
         for i in 0..2 {
             record.ifo_x_m[i] = r[i][0] + dice.white(flight.ifo_m);
-            record.is_r_m[i] = r[i].map(|x| x + dice.white(flight.is_m));
+            let shown = if i == 0 { 1.0 + hidden.shown_tm1_y } else { 1.0 };
+            record.is_r_m[i] = [r[i][0], shown * r[i][1], r[i][2]].map(|x| x + dice.white(flight.is_m));
             record.is_angle_rad[i] = [0.0; 3].map(|x: f64| x + dice.white(1.5e-7));
             record.dws_tm_rad[i] = [0.0; 2].map(|x: f64| x + dice.white(1e-9));
         }
+        for t in &mut temperature_k {
+            // A step of the process that forgets within HEAT_S and wanders HEAT_K, rms; unit deviates are white of √(2/rate).
+            *t += -*t * DT_S / HEAT_S + HEAT_K * (2.0 * DT_S / HEAT_S).sqrt() * weather.white((2.0 / RATE_HZ).sqrt());
+        }
+        felt_k += (temperature_k[0] - temperature_k[1] - felt_k) * DT_S / HEAT_LAG_S;
+        record.temperature_k = temperature_k.map(|t| 293.0 + t + weather.white(1e-5 * (2.0 / RATE_HZ).sqrt()));
         control(&mut loops, &flight.loops, &mut record);
         if k >= settle {
             records.push(record);
         }
         // From here to the next sample everything is constant.
-        let force: [f64; 3] = std::array::from_fn(|a| record.force_n[a] + sunlight[a] + dice.white(flight.thrust_n));
+        let mut force: [f64; 3] =
+            std::array::from_fn(|a| record.force_n[a] + sunlight[a] + dice.white(flight.thrust_n));
+        force[1] += hidden.thrust_y * record.force_n[1];
+        if let Some((_, momentum)) = hidden.blow.filter(|(at_s, _)| k == settle + (at_s * RATE_HZ) as usize) {
+            force[0] += momentum / DT_S;
+        }
         let torque: [f64; 3] =
             std::array::from_fn(|a| record.torque_nm[a] + sunlight_torque[a] + dice.white(flight.torque_nm));
         let mut on_spacecraft = force;
@@ -222,7 +263,13 @@ pub fn fly(flight: &Flight) -> Vec<Record> {
             let (carried, swing) = (to_orf(i, spacecraft), cross(to_orf(i, alpha), offset[i]));
             for a in 0..3 {
                 let electrostatic = record.electrostatic_n[i][a] + if a > 0 { dice.white(2e-14) } else { 0.0 };
-                let acceleration = electrostatic / TM_KG - carried[a] - swing[a] + STIFFNESS[a] * r[i][a] + PULL[i][a];
+                let stray = match (i, a) {
+                    (0, 0) => hidden.heat_tm1_x * felt_k,
+                    (1, 0) => hidden.aside_tm2_y_x * record.electrostatic_n[1][1] / TM_KG,
+                    _ => 0.0,
+                };
+                let acceleration =
+                    stray + electrostatic / TM_KG - carried[a] - swing[a] + STIFFNESS[a] * r[i][a] + PULL[i][a];
                 r[i][a] += v[i][a] * DT_S + 0.5 * acceleration * DT_S * DT_S;
                 v[i][a] += acceleration * DT_S;
             }

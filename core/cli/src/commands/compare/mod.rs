@@ -6,10 +6,11 @@ use super::{Done, diagnose, products};
 use crate::args::{Compare, Global};
 use crate::failure::Failure;
 use crate::text::{Paint, columns, labelled};
-use dragfree_critic::compare::{Channel, Comparison, Kind, Nis, Test, compare};
+use dragfree_critic::compare::{Channel, Comparison, Innovations, Kind, Nis, Test, compare};
 use dragfree_critic::rank::Court;
-use dragfree_critic::witness::Coherence;
+use dragfree_critic::witness::{Coherence, Together};
 use dragfree_engine::product::Product;
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Exit code where the model contradicts the data.
@@ -24,7 +25,8 @@ pub(super) fn execute(command: &Compare, global: &Global, paint: Paint) -> Resul
     let noise = diagnose::noise(&record, &mission)?;
     let opened = names.iter().map(|name| Ok(products::open(name, archive)?.0)).collect::<Result<Vec<_>, Failure>>()?;
     let court = Court::new(&record.question, &record.gathered, &noise);
-    let comparison = compare(&court, nis(&opened)).map_err(Failure::engine)?;
+    let innovations = Innovations::judge(&octaves(&opened), record.gathered.rate_hz);
+    let comparison = compare(&court, nis(&opened), innovations).map_err(Failure::engine)?;
     if let Some(path) = &command.page {
         let meaning = (!comparison.passes).then(|| meaning(&comparison));
         let page = page::page(&comparison, names, meaning)?;
@@ -47,6 +49,30 @@ fn nis(products: &[Product]) -> Option<Nis> {
     let all: Vec<(f64, f64)> = products.iter().filter_map(of).collect();
     let dof: f64 = all.iter().map(|(_, n)| n).sum();
     (!all.is_empty()).then(|| Nis::new(all.iter().map(|(nis, n)| nis * n).sum::<f64>() / dof, dof))
+}
+
+/// Mean square and count of each readout's innovations, octave by octave, of all products together.
+fn octaves(products: &[Product]) -> BTreeMap<String, Vec<(f64, u64)>> {
+    let mut all: BTreeMap<String, Vec<(f64, u64)>> = BTreeMap::new();
+    for stage in products.iter().filter_map(|p| p.quality.stages.get("es-akf")) {
+        for (body, figures) in stage {
+            let Some(axes) = figures.get("innovation_octaves").and_then(|o| o.as_table()) else { continue };
+            for (axis, octaves) in axes {
+                let numbers = |key: &str| octaves.get(key).and_then(|x| x.as_array()).into_iter().flatten();
+                let sum = all.entry(format!("{body}.{axis}")).or_default();
+                for (k, (power, n)) in numbers("power").zip(numbers("count")).enumerate() {
+                    let (power, n) = (power.as_float().unwrap_or(0.0), n.as_integer().unwrap_or(0).max(0) as u64);
+                    if sum.len() == k {
+                        sum.push((0.0, 0));
+                    }
+                    let (mean, count) = sum[k];
+                    let total = (count + n).max(1);
+                    sum[k] = ((mean * count as f64 + power * n as f64) / total as f64, count + n);
+                }
+            }
+        }
+    }
+    all
 }
 
 fn screen(c: &Comparison, names: &[String], page: Option<&Path>, paint: Paint) -> String {
@@ -81,8 +107,24 @@ fn screen(c: &Comparison, names: &[String], page: Option<&Path>, paint: Paint) -
         };
         out += &labelled("NIS", &words);
     }
+    if !c.innovations.is_empty() && c.innovations.iter().all(|i| i.passes) {
+        out += &labelled("filter", "es-akf's innovations are white in every octave, at the level that it expects");
+    }
+    let coloured: Vec<String> = c.innovations.iter().filter(|i| !i.passes).map(innovation).collect();
+    if !coloured.is_empty() {
+        out += &labelled(
+            "filter",
+            &format!(
+                "es-akf's innovations against what it expects at this noise, where farthest: {}; no part of the verdict",
+                coloured.join(", ")
+            ),
+        );
+    }
     let suspects = suspects(c);
-    if !suspects.is_empty() {
+    let together = c.together.iter().map(together).collect::<Vec<_>>();
+    if !together.is_empty() {
+        out += &labelled("coherent", &format!("{}; where to look, not a cause", together.join("; ")));
+    } else if !suspects.is_empty() {
         out += &labelled("coherent", &format!("{}: where to look, not a cause", suspects.join(", ")));
     }
     let names = names.join(" ");
@@ -96,6 +138,13 @@ fn screen(c: &Comparison, names: &[String], page: Option<&Path>, paint: Paint) -
         Some(path) => format!("page      {}\n", path.display()),
         None => labelled("page", "--page FILE.html draws spectra and maps"),
     }
+}
+
+/// `tm1.y ×1.80 at 0.3m–0.6mHz`.
+fn innovation(i: &Innovations) -> String {
+    let octave = &i.octaves[i.farthest];
+    let ratio = octave.chi2_per_dof.map_or("?".to_owned(), |r| format!("{r:.2}"));
+    format!("{} ×{ratio} at {}", i.readout, hertz(octave.band_hz))
 }
 
 /// One row a channel.
@@ -166,11 +215,20 @@ fn meaning(c: &Comparison) -> &'static str {
     }
 }
 
+fn fails(c: &Comparison, name: &str) -> bool {
+    c.channels.iter().any(|c| c.name == name && !c.passes)
+}
+
+/// `tm1.y with hk/a and beside it hk/b, 64 % of 0.2m–0.5mHz`.
+fn together(t: &Together) -> String {
+    let name = t.channel.replace(".accel", "").replace("alpha", "α");
+    format!("{name} with {}, {:.0} % of {}", t.drivers.join(" and beside it "), 100.0 * t.explained, hertz(t.band_hz))
+}
+
 /// Housekeeping that goes with the channels that fail, the strongest form of each.
 fn suspects(c: &Comparison) -> Vec<String> {
-    let fails = |name: &str| c.channels.iter().any(|c| c.name == name && !c.passes);
     let mut named: Vec<&Coherence> = Vec::new();
-    for w in c.coherences.iter().map(|w| &w.coherence).filter(|w| fails(&w.channel)) {
+    for w in c.coherences.iter().map(|w| &w.coherence).filter(|w| fails(c, &w.channel)) {
         let told = |other: &&Coherence| other.of.iter().any(|name| w.of.contains(name));
         if !named.iter().any(told) && named.len() < NAMED {
             named.push(w);

@@ -3,8 +3,8 @@
 use crate::failure::Failure;
 use dragfree_chart::heat::{self, HeatMap};
 use dragfree_chart::{Line, Panel, Scale, Stroke, svg};
-use dragfree_critic::chance::{corrected, two_sided};
-use dragfree_critic::compare::{Cell, Channel, Comparison, Kind};
+use dragfree_critic::chance::{chi2_per_dof_quantile, corrected, two_sided};
+use dragfree_critic::compare::{Cell, Channel, Comparison, Innovations, Kind};
 use std::fmt::Write as _;
 
 /// Axes of one body stand side by side.
@@ -49,6 +49,17 @@ pub(crate) fn page(c: &Comparison, names: &[String], meaning: Option<&str>) -> R
         );
     }
     out += &table(c, word);
+    if !c.innovations.is_empty() {
+        let panels: Vec<Panel> = c.innovations.iter().map(innovations).collect();
+        section(
+            &mut out,
+            "What the recursive filter did not foresee",
+            "Innovations of es-akf, each readout less what the filter expected of it, octave by octave: power over what the noise of the \
+             mission file lets expect for the gains in use. 95 of 100 points lie in the shaded area where filter and noise are right. Not a \
+             part of the verdict: each filter follows one test mass and does not know what the other one's readouts would tell it.",
+            &svg(&panels, COLUMNS).map_err(Failure::engine)?,
+        );
+    }
     section(
         &mut out,
         "How strong, at which frequency",
@@ -82,6 +93,16 @@ pub(crate) fn page(c: &Comparison, names: &[String], meaning: Option<&str>) -> R
     out += "<h2>What goes with it</h2>\n<p>Housekeeping whose course goes with what is left over, below 50 mHz, by the part of the power that \
             it shares in its best band. A place to look and no cause: currents of thrusters follow the commands, and these the noise.</p>\n";
     out += &bars(c);
+    if !c.together.is_empty() {
+        out += "<p>Housekeeping goes with housekeeping, and one cause lights up all of its kin. Here each is named only if it goes with what is \
+                left over beside those before it, and the last column is what all of them share with it, in their best band.</p>\n\
+                <table><tr><th>channel<th>housekeeping<th>part of the power</tr>\n";
+        for t in &c.together {
+            let (channel, drivers) = (escape(&t.channel), escape(&t.drivers.join(", ")));
+            let _ = writeln!(out, "<tr><td>{channel}<td>{drivers}<td>{:.0} %</tr>", 100.0 * t.explained);
+        }
+        out += "</table>\n";
+    }
     Ok(out + "</body></html>\n")
 }
 
@@ -165,6 +186,26 @@ fn ratio(channel: &Channel) -> Panel {
     let measured = f.iter().zip(channel.measured_psd.iter().zip(&channel.predicted_psd)).map(|(f, (m, p))| (*f, m / p));
     let lines = vec![area(channel, |_, ratio| ratio), line("measured", 0, Stroke::Solid, measured.collect())];
     Panel { y: Some(0.1..10.0), ..over_frequency(channel, "measured / predicted power", lines) }
+}
+
+fn innovations(readout: &Innovations) -> Panel {
+    let middle = |octave: &Cell| (octave.band_hz[0] * octave.band_hz[1]).sqrt();
+    // The lowest octave stands first, as frequencies grow to the right.
+    let octaves: Vec<&Cell> = readout.octaves.iter().rev().filter(|o| o.chi2_per_dof.is_some()).collect();
+    let end = |p: f64| octaves.iter().map(move |o| (middle(o), chi2_per_dof_quantile(p, o.dof).max(1e-3)));
+    let around = end(0.025).chain(end(0.975).rev()).collect();
+    let measured = octaves.iter().map(|o| (middle(o), o.chi2_per_dof.unwrap_or(1.0).max(1e-3))).collect();
+    let ends = [octaves.first(), octaves.last()].map(|o| o.map_or(1.0, |o| middle(o)));
+    Panel {
+        title: readout.readout.clone(),
+        x_label: "frequency / Hz".to_owned(),
+        y_label: "innovation / expected power".to_owned(),
+        x_scale: Scale::Logarithmic,
+        y_scale: Scale::Logarithmic,
+        x: 0.7 * ends[0]..1.4 * ends[1],
+        y: Some(0.1..10.0),
+        lines: vec![line("95 of 100", 6, Stroke::Area, around), line("measured", 0, Stroke::Solid, measured)],
+    }
 }
 
 fn cumulative(channel: &Channel) -> Panel {
