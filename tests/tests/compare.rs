@@ -40,7 +40,7 @@ fn self_contained(page: &str) {
     }
     let grammar = "xmlns=\"http://www.w3.org/2000/svg\"";
     assert_eq!(page.matches("http").count(), page.matches(grammar).count());
-    assert_eq!((page.matches("<svg").count(), page.matches("</svg>").count()), (4, 4));
+    assert_eq!((page.matches("<svg").count(), page.matches("</svg>").count()), (5, 5));
     for name in ["tm1.accel.y", "common.sc.y", "null.sc.y"] {
         // The table, and one panel a picture.
         assert!(page.matches(name).count() >= 5, "{name}");

@@ -216,7 +216,7 @@ fn diagnosed(hidden: Hidden) -> Value {
 fn found(d: &Value, truth: f64) -> (String, Value, f64) {
     let all: Vec<&Value> =
         d["candidates"].as_array().expect("a list").iter().filter(|c| c["accepted"] == true).collect();
-    assert_eq!(all.len(), 1, "{} {all:#?}", d["verdict"]);
+    assert_eq!(all.len(), 1, "{} {:#} {:#}", d["verdict"], d["candidates"], d["unexplained"]);
     let [value, sigma] = ["value", "sigma"].map(|key| all[0][key].as_f64().expect("a number"));
     let name = format!("{}:{}", all[0]["effect"].as_str().unwrap_or(""), all[0]["instance"].as_str().unwrap_or(""));
     (name, all[0].clone(), (value - truth) / sigma)

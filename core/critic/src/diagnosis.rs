@@ -54,6 +54,9 @@ const MUTE: &str =
 /// What moves the offset by so many σ is no longer told from it.
 const MOVES_OFFSET: f64 = 3.0;
 
+/// So many of what stands out beside something that colours the noise are weighed by their likelihood too.
+const RIVALS: usize = 4;
+
 /// What lies wholly below this is a drift: slower than an hour.
 const DRIFT_HZ: f64 = 1.0 / 3600.0;
 
@@ -274,14 +277,26 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
             .take(LISTED)
             .map(|scored| (weigh(court, &fit, scored, &ranked, &trials), scored.candidate.clone()))
             .collect();
+        let stands_out = |f: &Found| f.p_value < FALSE_ALARM && f.in_range && accepted.len() < MOST_ADDED;
+        let mut coloured = false;
         for (f, candidate) in &mut weighed {
             // On a coarse grid of shapes the peak of a wrong colour costs more than all that it explains.
             let finely = tried_before.contains_key(&candidate.effect);
-            let stands_out = finely && f.p_value < FALSE_ALARM && f.in_range && accepted.len() < MOST_ADDED;
-            if let (true, Some((form, fall))) = (stands_out, court.coloured(&fit, candidate)?) {
+            if let (true, Some((form, fall))) = (finely && stands_out(f), court.coloured(&fit, candidate)?) {
                 by_likelihood(f, &form, fall, &fit, &trials);
                 *candidate = form;
+                coloured = true;
             }
+        }
+        if coloured {
+            // What colours nothing changes the spectrum of what is left too: all that stand out are held against one another alike.
+            let without = court.likelihood(&fit.added)?;
+            let rivals = weighed.iter_mut().filter(|(f, c)| stands_out(f) && !colours(c));
+            for (f, candidate) in rivals.take(RIVALS) {
+                let with = court.likelihood(&[fit.added.as_slice(), std::slice::from_ref(candidate)].concat())?;
+                by_likelihood(f, candidate, without - with, &fit, &trials);
+            }
+            weighed.sort_by(|a, b| a.0.log10_p_value.total_cmp(&b.0.log10_p_value));
         }
         if accepted.len() < MOST_ADDED {
             for (f, candidate) in of_the_excess(court, &fit, &trials)? {
@@ -432,6 +447,10 @@ fn leads(trials: &Trials, ranked: &[Scored]) -> Vec<Lead> {
         shape: s.candidate.parts[0].1.shape.clone(),
     };
     ranked.iter().filter(|s| !s.candidate.once && chance(s) < FALSE_ALARM).map(lead).collect()
+}
+
+fn colours(c: &Candidate) -> bool {
+    c.parts.iter().any(|(_, form)| form.colours.is_some())
 }
 
 /// A candidate in the form that its likelihood prefers, worth what `−2 log` of that falls.

@@ -14,7 +14,7 @@ use crate::colour::Colour;
 use crate::levels::Levels;
 use crate::normal::{Equations, NormalEquations, accumulate, residuals};
 use crate::prediction::Prediction;
-use crate::qp::{Active, Kkt, Problem, QpError, Row};
+use crate::qp::{Active, Kkt, Problem, QpError, Row, Side};
 use crate::refine::{Chi2, SigmaError, Whitening};
 use crate::sigma::NoiseModel;
 use crate::spectra::{Layout, Plan, Spectra, Sums};
@@ -98,6 +98,8 @@ pub struct Estimate {
     pub weak: Vec<Direction>,
     /// Rows at which the solution stands.
     pub active: Vec<Active>,
+    /// The data's score of the free coefficients at the solution, `c − Nθ`, where ranges hold it back; what surveys hold stays where it is.
+    pub held: DVector<f64>,
     /// Conditions of optimality of the last solution.
     pub kkt: Kkt,
     /// The normal equations, with the refined Σ.
@@ -286,6 +288,7 @@ pub fn estimate_with(
         None => None,
     };
     let known = reduced.with_knowledge(&solved.active);
+    let held = reduced.held(&solved.active);
     let (pulls, survey_chi2) = reduced.pulls(&solved.active, chi2_per_dof.max(1.0));
     let (worst, worst_band_dof) = worst_band(&residual, &inverses, plan, &whitening);
     let quality = Quality {
@@ -308,6 +311,7 @@ pub fn estimate_with(
         covariance,
         weak,
         active: solved.active,
+        held,
         kkt: solved.kkt,
         normal: NormalEquations::new(names, &equations, spectra.segments),
         known,
@@ -488,6 +492,16 @@ impl<'a> Reduced<'a> {
 
     fn covariance(&self, active: &[Active]) -> Option<DMatrix<f64>> {
         self.inverse(&self.with_knowledge(active))
+    }
+
+    /// `Σ z a` over ranges at which the solution stands.
+    fn held(&self, active: &[Active]) -> DVector<f64> {
+        let mut sum = DVector::zeros(self.free.len());
+        for a in active.iter().filter(|a| self.knowledge[a.row] != Knowledge::Survey) {
+            let sign = if a.side == Side::Upper { 1.0 } else { -1.0 };
+            sum += DVector::from_column_slice(&self.rows[a.row].terms) * (sign * a.multiplier);
+        }
+        sum
     }
 
     /// Information of the data and of every row.
