@@ -57,6 +57,12 @@ const MOVES_OFFSET: f64 = 3.0;
 /// So many of what stands out beside something that colours the noise are weighed by their likelihood too.
 const RIVALS: usize = 4;
 
+/// Explanations whose `−2 log` likelihoods differ by less than this are not told apart: 1 % of χ² with one degree of freedom.
+const AS_LIKELY: f64 = 6.63;
+
+/// Part of an excess that an explanation may leave.
+const REMAINS: f64 = 1e-3;
+
 /// What lies wholly below this is a drift: slower than an hour.
 const DRIFT_HZ: f64 = 1.0 / 3600.0;
 
@@ -264,6 +270,10 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
     }
     let mut fit = court.fit(&[])?;
     let mut accepted: Vec<Found> = Vec::new();
+    let loudest = {
+        let measured = court.residual_psd(&fit);
+        unexplained(court, &court.levels(&fit, &court.total, &measured)).map_or(0.0, |u| u.ratio)
+    };
     let first = court.rank(&fit);
     let mut forms = first.tried;
     tried_before.iter().for_each(|(effect, n)| *forms.entry(effect.clone()).or_default() += n);
@@ -278,23 +288,24 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
             .map(|scored| (weigh(court, &fit, scored, &ranked, &trials), scored.candidate.clone()))
             .collect();
         let stands_out = |f: &Found| f.p_value < FALSE_ALARM && f.in_range && accepted.len() < MOST_ADDED;
-        let mut coloured = false;
+        let mut alike: Vec<(String, f64)> = Vec::new();
         for (f, candidate) in &mut weighed {
             // On a coarse grid of shapes the peak of a wrong colour costs more than all that it explains.
             let finely = tried_before.contains_key(&candidate.effect);
             if let (true, Some((form, fall))) = (finely && stands_out(f), court.coloured(&fit, candidate)?) {
                 by_likelihood(f, &form, fall, &fit, &trials);
+                alike.push((form.name(), fall));
                 *candidate = form;
-                coloured = true;
             }
         }
-        if coloured {
+        if !alike.is_empty() {
             // What colours nothing changes the spectrum of what is left too: all that stand out are held against one another alike.
             let without = court.likelihood(&fit.added)?;
             let rivals = weighed.iter_mut().filter(|(f, c)| stands_out(f) && !colours(c));
             for (f, candidate) in rivals.take(RIVALS) {
                 let with = court.likelihood(&[fit.added.as_slice(), std::slice::from_ref(candidate)].concat())?;
                 by_likelihood(f, candidate, without - with, &fit, &trials);
+                alike.push((candidate.name(), without - with));
             }
             weighed.sort_by(|a, b| a.0.log10_p_value.total_cmp(&b.0.log10_p_value));
         }
@@ -314,6 +325,13 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
         let Some(best) = weighed.iter().position(good).filter(|_| accepted.len() < MOST_ADDED) else {
             break weighed.into_iter().map(|(f, _)| f).collect();
         };
+        let (f, chosen) = &mut weighed[best];
+        if let Some((_, fall)) = alike.iter().find(|(name, _)| *name == chosen.name()) {
+            let others = alike.iter().filter(|(name, other)| *name != chosen.name() && fall - other < AS_LIKELY);
+            f.confounders.extend(others.map(|(name, _)| name.clone()));
+            f.confounders.sort();
+            f.confounders.dedup();
+        }
         let mut added = fit.added.clone();
         added.push(weighed[best].1.clone());
         fit = court.fit(&added)?;
@@ -331,7 +349,9 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
         let ((excess, _), plain) = (levels.excess_bands(), levels.plain_inverses());
         let mut both = accepted.iter().zip(&fit.added);
         let part = |candidate: &Candidate| court.part_in(&fit, &plain, candidate, &excess);
-        let Some(doubtful) = both.position(|(f, c)| is_doubtful(f, part(c), &extra, unexplained.as_ref())) else {
+        // What is left of an excess a thousand times as large is what the forms that were tried are beside the true one.
+        let loud = unexplained.as_ref().filter(|u| !u.power || u.ratio > REMAINS * loudest);
+        let Some(doubtful) = both.position(|(f, c)| is_doubtful(f, part(c), &extra, loud)) else {
             break (extra, unexplained);
         };
         others.insert(0, Found { accepted: false, ..accepted.remove(doubtful) });
