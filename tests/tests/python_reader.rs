@@ -3,7 +3,7 @@
 
 #![allow(clippy::print_stdout, reason = "a skipped test says so")]
 
-use dragfree_tests::foreign::{Container, Flight, Loops, fly, write};
+use dragfree_tests::foreign::{Container, Flight, Hidden, Loops, fly, write};
 use dragfree_tests::{dragfree, fixture, root, simulate};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -123,6 +123,7 @@ fn python_reads_the_other_producer() {
         dws_rad: 1e-9,
         sunlight_n: 0.0,
         loops: Loops { attitude: 0.4, x: 0.4, y: 0.2, z: 0.2 },
+        hidden: Hidden::default(),
     };
     let records = fly(&flight);
     for (chunks, zstd, summary) in [(true, true, true), (true, false, false), (false, false, true)] {

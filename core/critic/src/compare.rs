@@ -191,7 +191,7 @@ impl Innovations {
     pub fn judge(readouts: &BTreeMap<String, Vec<(f64, u64)>>, rate_hz: f64) -> Vec<Self> {
         let told = |octaves: &Vec<(f64, u64)>| octaves.iter().filter(|(_, n)| *n > 0).count();
         let trials: usize = readouts.values().map(told).sum();
-        let band = |k: usize| [2.0, 1.0].map(|of| rate_hz / (of * (2 << k) as f64));
+        let band = |k: usize| [2.0, 1.0].map(|of| rate_hz / (of * (2usize << k) as f64));
         let of = |(readout, octaves): (&String, &Vec<(f64, u64)>)| {
             let cell = |(k, (power, n)): (usize, &(f64, u64))| Cell {
                 band_hz: band(k),

@@ -87,7 +87,7 @@ pub struct Hit {
 pub struct Transients {
     /// Peaks, the loudest first.
     pub hits: Vec<Hit>,
-    /// Independent trials that would have a peak of [`LOUD`] σ as often as the search.
+    /// Independent trials that would have a peak of 6σ as often as the search.
     pub tried: f64,
 }
 
