@@ -54,12 +54,6 @@ const MUTE: &str =
 /// What moves the offset by so many σ is no longer told from it.
 const MOVES_OFFSET: f64 = 3.0;
 
-/// So many of what stands out beside something that colours the noise are weighed by their likelihood too.
-const RIVALS: usize = 4;
-
-/// Explanations whose `−2 log` likelihoods differ by less than this are not told apart: 1 % of χ² with one degree of freedom.
-const AS_LIKELY: f64 = 6.63;
-
 /// Part of an excess that an explanation may leave.
 const REMAINS: f64 = 1e-3;
 
@@ -287,27 +281,15 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
             .take(LISTED)
             .map(|scored| (weigh(court, &fit, scored, &ranked, &trials), scored.candidate.clone()))
             .collect();
-        let stands_out = |f: &Found| f.p_value < FALSE_ALARM && f.in_range && accepted.len() < MOST_ADDED;
-        let mut alike: Vec<(String, f64)> = Vec::new();
         for (f, candidate) in &mut weighed {
             // On a coarse grid of shapes the peak of a wrong colour costs more than all that it explains.
             let finely = tried_before.contains_key(&candidate.effect);
-            if let (true, Some((form, fall))) = (finely && stands_out(f), court.coloured(&fit, candidate)?) {
-                by_likelihood(f, &form, fall, &fit, &trials);
-                alike.push((form.name(), fall));
+            let stands_out = f.p_value < FALSE_ALARM && f.in_range && accepted.len() < MOST_ADDED;
+            // The likelihood chooses among its shapes alone: what it is worth beside what colours nothing is told by scores.
+            if let (true, Some(form)) = (finely && stands_out, court.coloured(&fit, candidate)?) {
+                f.shape.clone_from(&form.parts[0].1.shape);
                 *candidate = form;
             }
-        }
-        if !alike.is_empty() {
-            // What colours nothing changes the spectrum of what is left too: all that stand out are held against one another alike.
-            let without = court.likelihood(&fit.added)?;
-            let rivals = weighed.iter_mut().filter(|(f, c)| stands_out(f) && !colours(c));
-            for (f, candidate) in rivals.take(RIVALS) {
-                let with = court.likelihood(&[fit.added.as_slice(), std::slice::from_ref(candidate)].concat())?;
-                by_likelihood(f, candidate, without - with, &fit, &trials);
-                alike.push((candidate.name(), without - with));
-            }
-            weighed.sort_by(|a, b| a.0.log10_p_value.total_cmp(&b.0.log10_p_value));
         }
         if accepted.len() < MOST_ADDED {
             for (f, candidate) in of_the_excess(court, &fit, &trials)? {
@@ -325,13 +307,6 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
         let Some(best) = weighed.iter().position(good).filter(|_| accepted.len() < MOST_ADDED) else {
             break weighed.into_iter().map(|(f, _)| f).collect();
         };
-        let (f, chosen) = &mut weighed[best];
-        if let Some((_, fall)) = alike.iter().find(|(name, _)| *name == chosen.name()) {
-            let others = alike.iter().filter(|(name, other)| *name != chosen.name() && fall - other < AS_LIKELY);
-            f.confounders.extend(others.map(|(name, _)| name.clone()));
-            f.confounders.sort();
-            f.confounders.dedup();
-        }
         let mut added = fit.added.clone();
         added.push(weighed[best].1.clone());
         fit = court.fit(&added)?;
@@ -467,20 +442,6 @@ fn leads(trials: &Trials, ranked: &[Scored]) -> Vec<Lead> {
         shape: s.candidate.parts[0].1.shape.clone(),
     };
     ranked.iter().filter(|s| !s.candidate.once && chance(s) < FALSE_ALARM).map(lead).collect()
-}
-
-fn colours(c: &Candidate) -> bool {
-    c.parts.iter().any(|(_, form)| form.colours.is_some())
-}
-
-/// A candidate in the form that its likelihood prefers, worth what `−2 log` of that falls.
-fn by_likelihood(f: &mut Found, form: &Candidate, fall: f64, fit: &Fit, trials: &Trials) {
-    let dof = form.parts.len() as f64;
-    let quality = &fit.estimate.quality;
-    f.shape.clone_from(&form.parts[0].1.shape);
-    (f.p_value, f.log10_p_value) = trials.chance(family(form), fall, dof);
-    (f.delta_chi2, f.delta_bic) = (fall, dof * quality.dof.ln() - fall);
-    f.chi2_per_dof_after = f.chi2_per_dof_before - fall / quality.dof;
 }
 
 /// A candidate as it stands beside a fit.

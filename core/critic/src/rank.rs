@@ -266,13 +266,12 @@ impl<'a> Court<'a> {
         Ok(levels.deviance(&measured, &vec![false; self.plan.bands.len()]))
     }
 
-    /// Of a candidate that colours the noise, the form with the highest likelihood, and by how much `−2 log` of it falls: the scores know
-    /// nothing of the colour. From the forms with the best scores to a neighbour on the grid of shapes, as long as one is better. `None` for
+    /// Of a candidate that colours the noise, the form with the highest likelihood: the scores know nothing of the colour. From the forms with the best scores to a neighbour on the grid of shapes, as long as one is better. `None` for
     /// one that colours nothing.
     ///
     /// # Errors
     /// As [`Self::fit`].
-    pub fn coloured(&self, fit: &Fit, candidate: &Candidate) -> Result<Option<(Candidate, f64)>, EstimateError> {
+    pub fn coloured(&self, fit: &Fit, candidate: &Candidate) -> Result<Option<Candidate>, EstimateError> {
         if candidate.parts.iter().all(|(_, form)| form.colours.is_none()) {
             return Ok(None);
         }
@@ -316,8 +315,7 @@ impl<'a> Court<'a> {
                 best = Some(at);
             }
         }
-        let without = self.likelihood(&fit.added)?;
-        Ok(best.map(|(i, least)| (forms[i].clone(), without - least)))
+        Ok(best.map(|(i, _)| forms[i].clone()))
     }
 
     /// Terms of each coefficient: column, channel, factor, with products at the fit's values.
