@@ -54,6 +54,9 @@ const MUTE: &str =
 /// What moves the offset by so many σ is no longer told from it.
 const MOVES_OFFSET: f64 = 3.0;
 
+/// Explanations whose χ² differ by less than this are not told apart: 1 % of χ² with one degree of freedom.
+const AS_GOOD: f64 = 6.63;
+
 /// Part of an excess that an explanation may leave.
 const REMAINS: f64 = 1e-3;
 
@@ -310,8 +313,14 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
         let mut added = fit.added.clone();
         added.push(weighed[best].1.clone());
         fit = court.fit(&added)?;
-        ranked = court.rank(&fit).all;
-        accepted.push(Found { accepted: true, ..weighed[best].0.clone() });
+        let before = std::mem::replace(&mut ranked, court.rank(&fit).all);
+        let mut f = Found { accepted: true, ..weighed[best].0.clone() };
+        if !f.of_excess {
+            f.confounders.extend(as_good(&f, &before, &ranked));
+            f.confounders.sort();
+            f.confounders.dedup();
+        }
+        accepted.push(f);
         // What is found is measured again with Σ as it is without the excess.
         refresh(court, &fit, &mut accepted);
     };
@@ -442,6 +451,19 @@ fn leads(trials: &Trials, ranked: &[Scored]) -> Vec<Lead> {
         shape: s.candidate.parts[0].1.shape.clone(),
     };
     ranked.iter().filter(|s| !s.candidate.once && chance(s) < FALSE_ALARM).map(lead).collect()
+}
+
+/// What explained as much as a candidate before that was there, and nothing beside it: as good an explanation, whatever its shape.
+fn as_good(chosen: &Found, before: &[Scored], beside: &[Scored]) -> Vec<String> {
+    let worth = |all: &[Scored], name: &str| {
+        all.iter().find(|s| !s.candidate.once && s.candidate.name() == name).map_or(0.0, |s| s.delta_chi2)
+    };
+    let names = before.iter().filter(|s| s.in_range && !s.candidate.once).map(|s| s.candidate.name());
+    let own = format!("{}:{}", chosen.effect, chosen.instance);
+    names
+        .filter(|name| *name != own)
+        .filter(|name| worth(before, name) > chosen.delta_chi2 - AS_GOOD && worth(beside, name) < AS_GOOD)
+        .collect()
 }
 
 /// A candidate as it stands beside a fit.
