@@ -88,9 +88,14 @@ fn draw(m: &Matrix, area: &DrawingArea<SVGBackend<'_>, plotters::coord::Shift>, 
                     font(12).color(if dark { &WHITE } else { &BLACK }).pos(Pos::new(HPos::Center, VPos::Center));
                 text(&count.to_string(), (x + CELL / 2, y + CELL / 2), style)?;
             }
-            let frame = if is_right { BLACK.stroke_width(2) } else { RGBColor(215, 215, 215).stroke_width(1) };
-            area.draw(&Rectangle::new([(x, y), (x + CELL, y + CELL)], frame)).map_err(refused)?;
+            let grey = RGBColor(215, 215, 215).stroke_width(1);
+            area.draw(&Rectangle::new([(x, y), (x + CELL, y + CELL)], grey)).map_err(refused)?;
         }
+    }
+    // Above what their neighbours have drawn.
+    for (i, j) in m.right.iter().filter(|(i, j)| *i < m.rows.len() && *j < m.columns.len()) {
+        let (x, y) = (LEFT + CELL * *j as i32, below + CELL * *i as i32);
+        area.draw(&Rectangle::new([(x, y), (x + CELL, y + CELL)], BLACK.stroke_width(2))).map_err(refused)?;
     }
     Ok(())
 }
@@ -112,6 +117,9 @@ mod tests {
         for word in ["Said of what was hidden", "nothing", "sufficient", "17", "5"] {
             assert!(picture.contains(word), "{word}");
         }
+        // Frames stand above what the neighbours of their cells have drawn.
+        let last = |word: &str| picture.rfind(word).expect("drawn");
+        assert!(last("stroke=\"#000000\"") > last("stroke=\"#D7D7D7\""), "{picture}");
         assert!(svg(&[Matrix { rows: Vec::new(), ..table }]).is_err());
     }
 }
