@@ -289,7 +289,8 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
             let finely = tried_before.contains_key(&candidate.effect);
             let stands_out = f.p_value < FALSE_ALARM && f.in_range && accepted.len() < MOST_ADDED;
             // The likelihood chooses among its shapes alone: what it is worth beside what colours nothing is told by scores.
-            if let (true, Some(form)) = (finely && stands_out, court.coloured(&fit, candidate)?) {
+            let chosen = if finely && stands_out { court.coloured(&fit, candidate)? } else { None };
+            if let Some(form) = chosen {
                 f.shape.clone_from(&form.parts[0].1.shape);
                 *candidate = form;
             }
