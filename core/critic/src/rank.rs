@@ -255,7 +255,7 @@ impl<'a> Court<'a> {
     ///
     /// # Errors
     /// As [`Self::fit`].
-    pub fn likelihood(&self, added: &[Candidate]) -> Result<f64, EstimateError> {
+    fn likelihood(&self, added: &[Candidate]) -> Result<f64, EstimateError> {
         let Solved { layout, columns, estimate } = self.solve(added, REFINEMENTS)?;
         let measured = Self::residual(&self.total, &layout, &columns, &estimate.theta);
         let unknowns = self.question.unknowns(added);

@@ -163,14 +163,15 @@ impl Recipe for OpeningAngleRecipe {
 
     fn parts(&self, mission: &Mission, available: &Available) -> Result<Vec<Part>, PluginError> {
         let tm = self.0;
-        let (Some(x), Some(y)) = (motion(available, mission, tm, 0), motion(available, mission, tm, 1)) else {
+        let [x, y] = [0, 1].map(|axis| motion(available, mission, tm, axis));
+        let weights = |body: usize| of_optical_axes(mission, body, 1).map(|w| w[tm]);
+        let (Some(x), Some(y), Some(own), Some(others)) = (x, y, weights(tm), weights(1 - tm)) else {
             return Err(PluginError::error(
                 "effect opening-angle: without the interferometers of both test masses nobody knows the thrusters' noise, and without \
                  that not how a housing moves; give telemetry with /ifo, or take the effect out of the model",
             ));
         };
         let mass_kg = mission.test_mass(&tm_name(tm), "the effect opening-angle")?.mass_kg;
-        let weight = |tm: usize| of_optical_axes(mission, tm, 1).map_or(0.0, |w| w[self.0]);
         // The housing moves as the test mass without what the electrodes do to that.
         let electrodes = |axis: usize| (Series::Column(Source::electrodes_force(tm, axis)), -1.0 / mass_kg, None);
         let series = |part: Vec<(Piece, f64, Option<String>)>| {
@@ -179,12 +180,8 @@ impl Recipe for OpeningAngleRecipe {
         let x: Vec<_> = series([x.known, x.push].concat()).chain([electrodes(0)]).collect();
         let known_y: Vec<_> = series(y.known).chain([electrodes(1)]).collect();
         let push_y: Vec<_> = series(y.push).collect();
-        let rows = [
-            ((tm, 0), &known_y, 1.0),
-            ((tm, 1), &x, -1.0),
-            ((tm, 1), &push_y, -weight(tm)),
-            ((1 - tm, 1), &push_y, -weight(1 - tm)),
-        ];
+        let rows =
+            [((tm, 0), &known_y, 1.0), ((tm, 1), &x, -1.0), ((tm, 1), &push_y, -own), ((1 - tm, 1), &push_y, -others)];
         let mut terms: Vec<Term> = Vec::new();
         for ((to, axis), pieces, weight) in rows {
             for (series, factor, times) in pieces {

@@ -89,8 +89,8 @@ mod tests {
         }
     }
 
-    /// The twin: a sum of neighbours, `1 + cos 2πfΔt` of the power, has 3/2 of it above a whole octave less: Haar's own highest
-    /// octave takes `E[(d_0)²] = 1/2·E[(x_0 − x_2)²]/2 = 1/2`, all power passed on is 3/2 in the mean.
+    /// The twin: a sum of neighbours `(x_k + x_{k+1})/√2` has the spectrum `1 + cos 2πfΔt`. Of it the highest octave sees `(x_0 − x_2)/2`, of
+    /// variance 1/2, where 0.02 is 5σ; the octaves far below tend to 2.
     #[test]
     fn what_is_coloured_is_seen_at_its_octave() {
         let x = noise(1 << 16);
