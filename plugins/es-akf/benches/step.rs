@@ -26,6 +26,7 @@ fn model() -> Model {
     Model {
         dt_s: DT_S,
         acceleration_m2_s4: [[q, 0.0, 0.0], [0.0, q, 0.0], [0.0, 0.0, q]],
+        shakings: Vec::new(),
         bias_step_m2_s4: 1e-30,
         readout_m2: asd.map(|a: f64| a * a * 0.5 / DT_S),
         chains: std::array::from_fn(|i| exponents[i].iter().map(|&p| chain(asd[i], p)).collect()),

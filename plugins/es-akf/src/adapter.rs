@@ -6,10 +6,10 @@ use serde_json::json;
 
 use crate::akf::{Akf, MAX_STATES};
 use crate::design::{Choices, model};
-use crate::filter::{Adaptation, Settings, Statistics};
-use crate::model::{Coefficient as Theta, Prior};
+use crate::filter::{Adaptation, Settings};
+use crate::model::{Coefficient as Theta, Model, Prior};
 use crate::octaves::Octaves;
-use crate::state::{Words, seal, unseal};
+use crate::state::{Bytes, StateError, Words, seal, unseal};
 use crate::tracker::{Average, Factor, Regressor, Rows, Snapshot, Tracker};
 
 const AXES: [&str; 3] = ["x", "y", "z"];
@@ -25,24 +25,53 @@ pub struct EsAkf {
     choices: Choices,
     snapshot_s: f64,
     threads: usize,
+    /// Whether both test masses are to be in one filter.
+    both: bool,
     bodies: Vec<Body>,
+    notes: Vec<String>,
     table: Option<Table>,
     last_ns: Option<i64>,
 }
 
-/// A test mass with its columns.
+/// What one filter follows, a test mass or both, with its columns; three axes for each test mass.
 #[derive(Debug)]
 struct Body {
-    name: &'static str,
-    tracker: Tracker,
-    readout_m: [In; 3],
-    u_m_s2: [In; 3],
+    names: Vec<&'static str>,
+    tracker: Following,
+    readout_m: Vec<In>,
+    u_m_s2: Vec<In>,
     regressors: Vec<Regressor<In>>,
     coefficients: Vec<Coefficient>,
     value: Vec<Out>,
     sigma: Vec<Out>,
-    displacement_m: [Out; 3],
-    nis: Out,
+    displacement_m: Vec<Out>,
+    /// One for each test mass.
+    nis: Vec<Out>,
+}
+
+/// The columns of a body before its filter is made.
+struct Columns {
+    readout_m: Vec<In>,
+    u_m_s2: Vec<In>,
+    regressors: Vec<Regressor<In>>,
+    coefficients: Vec<Coefficient>,
+}
+
+/// A filter of one test mass, or of two.
+#[derive(Clone, Debug)]
+enum Following {
+    One(Box<Tracker<3>>),
+    Both(Box<Tracker<6>>),
+}
+
+/// The same for a filter of one test mass and of two.
+macro_rules! each {
+    ($following:expr, $tracker:ident => $body:expr) => {
+        match $following {
+            Following::One($tracker) => $body,
+            Following::Both($tracker) => $body,
+        }
+    };
 }
 
 impl Stage for EsAkf {
@@ -53,10 +82,16 @@ impl Stage for EsAkf {
         description: "Extended-state adaptive Kalman filter: one state per coefficient of the model's effects",
         parameters: &[
             Parameter::text(
+                "follow",
+                "auto",
+                &["auto", "each", "both"],
+                "a filter for each test mass, one for both, or one where an effect of the model is made of commands",
+            ),
+            Parameter::text(
                 "adaptation",
                 "monotone",
                 &["monotone", "innovation", "residual", "off"],
-                "how process and readout noise follow the innovations; monotone is the paper's",
+                "how process and readout noise follow the innovations, where a filter has one test mass; monotone is the paper's",
             ),
             Parameter::f64("forgetting", "1", 0.999_999, 0.0..=1.0, "the paper's alpha: weight of the past per epoch"),
             Parameter::f64("warm_up_s", "s", 600.0, 0.0..=1e6, "time before gating, and at first before adapting"),
@@ -83,7 +118,14 @@ impl Stage for EsAkf {
                 "m s-2 s-1/2",
                 3e-15,
                 0.0..=1e-3,
-                "random walk of the bias acceleration",
+                "random walk of the bias acceleration, where a filter has one test mass",
+            ),
+            Parameter::f64(
+                "bias_walk_both_m_s2_rts",
+                "m s-2 s-1/2",
+                3e-16,
+                0.0..=1e-3,
+                "the same where it has both: no thrust hides the bias there, and a walk too large takes the weight from what is slow",
             ),
             Parameter::f64("leak_hz", "Hz", 1e-6, 1e-9..=1.0, "below this, coloured readout noise is white"),
             Parameter::f64(
@@ -124,14 +166,21 @@ impl Stage for EsAkf {
                     velocity_m_s: setup.f64("velocity_prior_m_s")?,
                     bias_m_s2: setup.f64("bias_prior_m_s2")?,
                 },
-                bias_walk_m_s2_rts: setup.f64("bias_walk_m_s2_rts")?,
+                bias_walk_m_s2_rts: [setup.f64("bias_walk_m_s2_rts")?, setup.f64("bias_walk_both_m_s2_rts")?],
                 leak_hz: setup.f64("leak_hz")?,
                 unknown_alpha: setup.f64("unknown_alpha")?,
             },
             snapshot_s: setup.f64("output_interval_s")?,
             threads: setup.threads(),
+            both: match setup.text("follow")?.as_str() {
+                "each" => false,
+                "both" => true,
+                // A command knows what all readouts told it.
+                _ => setup.needs("commands"),
+            },
             mission,
             bodies: Vec::new(),
+            notes: Vec::new(),
             table: None,
             last_ns: None,
         })
@@ -139,17 +188,37 @@ impl Stage for EsAkf {
 
     fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
         let table = link.table("es-akf", 0.0);
-        for (name, frame) in TEST_MASSES.into_iter().zip(["ORF_1", "ORF_2"]) {
-            if available.find(&format!("{name}.u_orf_m_s2.x")).is_some() {
-                let body = self.link_body(name, frame, table, available, link)?;
-                self.bodies.push(body);
-            }
-        }
-        if self.bodies.is_empty() {
+        let there: Vec<&'static str> =
+            TEST_MASSES.into_iter().filter(|name| available.find(&format!("{name}.u_orf_m_s2.x")).is_some()).collect();
+        if there.is_empty() {
             return Err(PluginError::new(
                 "es-akf: no column tm1.u_orf_m_s2.x or tm2.u_orf_m_s2.x is made before this stage, so there is no \
                  test mass to follow; put hinf-dfacs before it, or leave es-akf out for an accelerometer mission",
             ));
+        }
+        let mut apart: Vec<Vec<&'static str>> = there.iter().map(|name| vec![*name]).collect();
+        if self.both && there.len() > 1 {
+            match self.link_body(&there, table, available, link)? {
+                Ok(body) => {
+                    self.bodies.push(body);
+                    apart.clear();
+                }
+                Err(TooMany(states)) => self.notes.push(format!(
+                    "es-akf: both test masses in one filter would have {states} states, at most {MAX_STATES} are possible, so each has \
+                     its own; their coefficients of effects made of commands are biased, as one does not know what the \
+                     other's readouts told the thrusters: trust qp, or leave effects out of the model"
+                )),
+            }
+        }
+        for names in apart {
+            let body = self.link_body(&names, table, available, link)?.map_err(|TooMany(states)| {
+                PluginError::new(format!(
+                    "es-akf: {} would have {states} states, at most {MAX_STATES} are possible; leave effects out of \
+                     the model, or terms out of the readout noise",
+                    names[0]
+                ))
+            })?;
+            self.bodies.push(body);
         }
         self.table = Some(table);
         Ok(())
@@ -161,7 +230,7 @@ impl Stage for EsAkf {
         let pieces = self.contiguous(times)?;
         let [first, rest @ ..] = self.bodies.as_mut_slice() else { return Ok(()) };
         // The test masses share nothing, so the result is the same with one thread or two.
-        let snapshots: Vec<Vec<Snapshot>> = if self.threads == 1 || times.len() < THREAD_ROWS {
+        let snapshots: Vec<Vec<Row>> = if self.threads == 1 || times.len() < THREAD_ROWS {
             std::iter::once(first.run(input, &pieces)).chain(rest.iter_mut().map(|b| b.run(input, &pieces))).collect()
         } else {
             std::thread::scope(|scope| {
@@ -180,57 +249,54 @@ impl Stage for EsAkf {
                     output.f64(body.value[j]).push(s.value[j]);
                     output.f64(body.sigma[j]).push(s.sigma[j]);
                 }
-                for (column, x) in body.displacement_m.iter().zip(s.displacement_m) {
-                    output.f64(*column).push(x);
+                for (column, x) in body.displacement_m.iter().zip(&s.displacement_m) {
+                    output.f64(*column).push(*x);
                 }
-                output.f64(body.nis).push(s.nis);
+                for column in &body.nis {
+                    output.f64(*column).push(s.nis);
+                }
             }
         }
         Ok(())
     }
 
     fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
-        let mut report = Report::default();
+        let mut report = Report { notes: self.notes.clone(), ..Report::default() };
         let (mut nis_sum, mut dof) = (0.0, 0);
         let mut p_end = serde_json::Map::new();
         for body in &self.bodies {
-            let s = body.tracker.filter().statistics();
+            let s = body.tracker.summary();
             nis_sum += s.nis_sum;
-            dof += s.readouts.iter().sum::<u64>();
-            for (key, n) in [
-                ("updates", s.updates),
-                ("predictions_only", s.predictions),
-                ("rejected_readouts", s.rejected),
-                ("reacquisitions", s.reacquisitions),
-                ("repairs_of_q", s.repairs_q),
-                ("repairs_of_p", s.repairs_p),
-                ("resets", s.resets),
-            ] {
+            dof += s.readouts.iter().map(|r| r.used).sum::<u64>();
+            for (key, n) in s.counts {
                 *report.counts.entry(key.to_owned()).or_default() += n;
             }
-            let stretch = body.tracker.stretch();
-            let average = body.tracker.result();
-            for (j, c) in body.coefficients.iter().enumerate() {
-                let key =
-                    if p_end.contains_key(&c.name) { format!("{}@{}", c.name, body.name) } else { c.name.clone() };
-                p_end.insert(key, json!(body.tracker.filter().recursion_covariance(j, j).sqrt()));
+            for (c, sigma) in body.coefficients.iter().zip(&s.recursion_sigma) {
+                let name = body.names[0];
+                let key = if p_end.contains_key(&c.name) { format!("{}@{name}", c.name) } else { c.name.clone() };
+                p_end.insert(key, json!(sigma));
             }
-            report.quality.insert(
-                body.name.to_owned(),
-                json!({
-                    "states": body.tracker.filter().model().states(),
-                    "nis": s.nis(),
-                    "innovation_variance_over_mission_noise": s.design_nis(),
-                    "innovation_octaves": innovation_octaves(s),
-                    "sigma_stretch": stretch,
-                    "averaged_s": average.as_ref().map(|a| a.span_s),
-                }),
-            );
-            if stretch > 1.1 {
+            for (name, readouts) in body.names.iter().zip(s.readouts.chunks(3)) {
+                let innovations: Vec<Option<f64>> = readouts.iter().map(|r| r.design_nis).collect();
+                report.quality.insert(
+                    (*name).to_owned(),
+                    json!({
+                        "followed": body.names,
+                        "states": s.states,
+                        "nis": s.nis,
+                        "innovation_variance_over_mission_noise": innovations,
+                        "innovation_octaves": innovation_octaves(readouts),
+                        "sigma_stretch": s.stretch,
+                        "averaged_s": s.averaged_s,
+                    }),
+                );
+            }
+            if s.stretch > 1.1 {
                 report.notes.push(format!(
-                    "es-akf: the innovations of {} are up to {stretch:.2} times what the noise of the mission file \
+                    "es-akf: the innovations of {} are up to {:.2} times what the noise of the mission file \
                      predicts; its sigmas were stretched by that. Compare the readout and thrust noise with [noise]",
-                    body.name
+                    body.names.join(" and "),
+                    s.stretch
                 ));
             }
         }
@@ -257,7 +323,7 @@ impl Stage for EsAkf {
         let (mut begun, mut last) = (false, 0);
         words.flag(&mut begun)?;
         words.count(&mut last)?;
-        let mut trackers: Vec<Tracker> = self.bodies.iter().map(|b| b.tracker.clone()).collect();
+        let mut trackers: Vec<Following> = self.bodies.iter().map(|b| b.tracker.clone()).collect();
         for tracker in &mut trackers {
             tracker.load(&mut words)?;
         }
@@ -271,78 +337,64 @@ impl Stage for EsAkf {
 }
 
 impl EsAkf {
+    /// The columns and the filter of these test masses.
     fn link_body(
         &self,
-        name: &'static str,
-        frame: &str,
+        names: &[&'static str],
         table: Table,
         available: &Available,
         link: &mut Link<'_>,
-    ) -> Result<Body, PluginError> {
-        let mut three = |group: &str, unit: &str| -> Result<[In; 3], PluginError> {
-            let mut read = |axis: &str| link.read(&Want::new(format!("{name}.{group}.{axis}")).unit(unit).frame(frame));
-            Ok([read("x")?, read("y")?, read("z")?])
-        };
-        let (readout_m, u_m_s2) = (three("r_orf_m", "m")?, three("u_orf_m_s2", "m s-2")?);
-        let mut coefficients: Vec<Coefficient> = Vec::new();
-        let mut regressors = Vec::new();
+    ) -> Result<Result<Body, TooMany>, PluginError> {
         let responses = available.responses()?;
-        for (coefficient, response) in &responses {
-            let Some(axis) = AXES.iter().position(|a| response.channel == format!("{name}.accel.{a}")) else {
-                continue;
-            };
-            let column = link.read(&Want::new(&response.series).table(&response.table))?;
-            let mut value_of = |c: &Coefficient| {
-                if !c.estimate {
-                    return Factor::Fixed(c.initial);
-                }
-                let known = coefficients.iter().position(|k| k.name == c.name);
-                Factor::Estimated(known.unwrap_or_else(|| {
-                    coefficients.push(c.clone());
-                    coefficients.len() - 1
-                }))
-            };
-            let coefficient = value_of(coefficient);
-            let times = match &response.times {
-                None => Factor::Fixed(1.0),
-                Some(other) => value_of(available.coefficient(other).ok_or_else(|| {
-                    PluginError::error(format!(
-                        "es-akf: the effect of {} acts through {other}, which is not in the model; add it",
-                        response.channel
-                    ))
-                })?),
-            };
-            regressors.push(Regressor { coefficient, times, factor: response.factor, axis, column });
-        }
-        let thetas = coefficients.iter().map(prior_of).collect::<Result<Vec<_>, _>>()?;
-        let has_ifo = self.mission.noise.ifo_x.is_some();
-        let usual = [if has_ifo { "ifo_x" } else { "is_x" }, "is_y", "is_z"];
-        let noise: [&str; 3] = std::array::from_fn(|i| {
-            let column = available.find(&format!("{name}.r_orf_m.{}", AXES[i]));
-            column.map(|c| c.attribute("noise")).filter(|n| !n.is_empty()).unwrap_or(usual[i])
-        });
-        let model = model(&self.mission, name, noise, thetas, &self.choices)?;
-        let states = model.states();
-        let filter = Akf::new(model, self.settings).ok_or_else(|| {
-            PluginError::new(format!(
-                "es-akf: {name} would have {states} states, at most {MAX_STATES} are possible; leave effects out of \
-                 the model, or terms out of the readout noise"
-            ))
-        })?;
+        let Columns { readout_m, u_m_s2, regressors, coefficients } = read_columns(names, &responses, available, link)?;
+        let tracker = match self.following(names, &coefficients, available)? {
+            Ok(tracker) => tracker,
+            Err(too_many) => return Ok(Err(too_many)),
+        };
         let (mut value, mut sigma) = (Vec::new(), Vec::new());
-        let shared = |c: &Coefficient| acts_on_several(&responses, &c.name);
-        let label = |c: &Coefficient| if shared(c) { format!("{}@{name}", c.name) } else { c.name.clone() };
+        // A coefficient that two filters estimate is told apart by its test mass.
+        let several = |c: &Coefficient| names.len() == 1 && acts_on_several(&responses, &c.name);
+        let label = |c: &Coefficient| if several(c) { format!("{}@{}", c.name, names[0]) } else { c.name.clone() };
         let archive = [("archive", "true")];
         for c in &coefficients {
             value.push(link.write_with(table, &label(c), &c.unit, &c.frame, &archive)?);
             sigma.push(link.write_with(table, &format!("{}.sigma", label(c)), &c.unit, &c.frame, &archive)?);
         }
-        let mut displacement =
-            |axis: &str| link.write_with(table, &format!("{name}.displacement.{axis}"), "m", frame, &archive);
-        let displacement_m = [displacement("x")?, displacement("y")?, displacement("z")?];
-        let nis = link.write_with(table, &format!("{name}.nis"), "1", "", &archive)?;
-        let tracker = Tracker::new(filter, self.snapshot_s);
-        Ok(Body { name, tracker, readout_m, u_m_s2, regressors, coefficients, value, sigma, displacement_m, nis })
+        let (mut displacement_m, mut nis) = (Vec::new(), Vec::new());
+        for name in names {
+            for axis in AXES {
+                let column = format!("{name}.displacement.{axis}");
+                displacement_m.push(link.write_with(table, &column, "m", frame_of(name), &archive)?);
+            }
+            nis.push(link.write_with(table, &format!("{name}.nis"), "1", "", &archive)?);
+        }
+        let names = names.to_vec();
+        Ok(Ok(Body { names, tracker, readout_m, u_m_s2, regressors, coefficients, value, sigma, displacement_m, nis }))
+    }
+
+    /// The filter of these test masses before its first epoch.
+    fn following(
+        &self,
+        names: &[&'static str],
+        coefficients: &[Coefficient],
+        available: &Available,
+    ) -> Result<Result<Following, TooMany>, PluginError> {
+        let thetas = coefficients.iter().map(prior_of).collect::<Result<Vec<_>, _>>()?;
+        let usual = [if self.mission.noise.ifo_x.is_some() { "ifo_x" } else { "is_x" }, "is_y", "is_z"];
+        let noise = |i: usize| {
+            let column = available.find(&format!("{}.r_orf_m.{}", names[i / 3], AXES[i % 3]));
+            column.map(|c| c.attribute("noise")).filter(|n| !n.is_empty()).unwrap_or(usual[i % 3])
+        };
+        Ok(if names.len() > 1 {
+            // Six axes shaken by three thrusts have combinations that hardly anything shakes, which is what makes this filter
+            // worth its price; an adaptation element by element would drown them.
+            let settings = Settings { adaptation: Adaptation::Off, ..self.settings };
+            let model = model::<6>(&self.mission, names, std::array::from_fn(noise), thetas, &self.choices)?;
+            tracker(model, settings, self.snapshot_s).map(Following::Both)
+        } else {
+            let model = model::<3>(&self.mission, names, std::array::from_fn(noise), thetas, &self.choices)?;
+            tracker(model, self.settings, self.snapshot_s).map(Following::One)
+        })
     }
 
     /// Runs of rows one step apart, each with the number of steps missing before it.
@@ -371,7 +423,7 @@ impl EsAkf {
     fn layout(&self) -> String {
         let bodies = self.bodies.iter().map(|b| {
             let names: Vec<&str> = b.coefficients.iter().map(|c| c.name.as_str()).collect();
-            format!("{}: {} states, {}", b.name, b.tracker.filter().model().states(), names.join(" "))
+            format!("{}: {} states, {}", b.names.join(" and "), b.tracker.summary().states, names.join(" "))
         });
         format!("{} Hz; {}", self.mission.mission.sample_rate_hz, bodies.collect::<Vec<_>>().join("; "))
     }
@@ -433,19 +485,162 @@ impl EsAkf {
     }
 }
 
-impl Body {
-    fn run(&mut self, input: &Inputs<'_>, pieces: &[(u64, std::ops::Range<usize>)]) -> Vec<Snapshot> {
-        let rows = Rows {
-            readout_m: self.readout_m.map(|c| input.f64(c)),
-            u_m_s2: self.u_m_s2.map(|c| input.f64(c)),
-            regressors: self.regressors.iter().map(|r| r.map(|c| input.f64(c))).collect(),
+/// So many states that no filter holds them.
+struct TooMany(usize);
+
+fn tracker<const D: usize>(model: Model<D>, settings: Settings, snapshot_s: f64) -> Result<Box<Tracker<D>>, TooMany> {
+    let states = model.states();
+    Akf::new(model, settings).map(|filter| Box::new(Tracker::new(filter, snapshot_s))).ok_or(TooMany(states))
+}
+
+/// Frame of a test mass's displacements.
+fn frame_of(test_mass: &str) -> &'static str {
+    if test_mass == TEST_MASSES[0] { "ORF_1" } else { "ORF_2" }
+}
+
+/// What the filter of these test masses reads.
+fn read_columns(
+    names: &[&'static str],
+    responses: &[(&Coefficient, Response)],
+    available: &Available,
+    link: &mut Link<'_>,
+) -> Result<Columns, PluginError> {
+    let mut three = |group: &str, unit: &str| -> Result<Vec<In>, PluginError> {
+        let wanted = names.iter().flat_map(|name| AXES.map(|axis| (frame_of(name), format!("{name}.{group}.{axis}"))));
+        wanted.map(|(frame, column)| link.read(&Want::new(column).unit(unit).frame(frame))).collect()
+    };
+    let (readout_m, u_m_s2) = (three("r_orf_m", "m")?, three("u_orf_m_s2", "m s-2")?);
+    let channels: Vec<String> = names.iter().flat_map(|name| AXES.map(|axis| format!("{name}.accel.{axis}"))).collect();
+    let mut coefficients: Vec<Coefficient> = Vec::new();
+    let mut regressors = Vec::new();
+    for (coefficient, response) in responses {
+        let Some(axis) = channels.iter().position(|channel| *channel == response.channel) else {
+            continue;
         };
-        let mut snapshots = Vec::new();
-        for (missing, piece) in pieces {
-            self.tracker.skip(*missing);
-            snapshots.extend(self.tracker.process(&rows, piece.clone()));
-        }
-        snapshots
+        let column = link.read(&Want::new(&response.series).table(&response.table))?;
+        let mut value_of = |c: &Coefficient| {
+            if !c.estimate {
+                return Factor::Fixed(c.initial);
+            }
+            let known = coefficients.iter().position(|k| k.name == c.name);
+            Factor::Estimated(known.unwrap_or_else(|| {
+                coefficients.push(c.clone());
+                coefficients.len() - 1
+            }))
+        };
+        let coefficient = value_of(coefficient);
+        let times = match &response.times {
+            None => Factor::Fixed(1.0),
+            Some(other) => value_of(available.coefficient(other).ok_or_else(|| {
+                PluginError::error(format!(
+                    "es-akf: the effect of {} acts through {other}, which is not in the model; add it",
+                    response.channel
+                ))
+            })?),
+        };
+        regressors.push(Regressor { coefficient, times, factor: response.factor, axis, column });
+    }
+    Ok(Columns { readout_m, u_m_s2, regressors, coefficients })
+}
+
+/// What a filter has to say at the end, whatever it follows.
+struct Summary {
+    states: usize,
+    counts: [(&'static str, u64); 7],
+    nis_sum: f64,
+    nis: Option<f64>,
+    readouts: Vec<Readout>,
+    /// σ of the coefficients as the recursion has it.
+    recursion_sigma: Vec<f64>,
+    stretch: f64,
+    averaged_s: Option<f64>,
+}
+
+/// One readout's innovations.
+struct Readout {
+    used: u64,
+    design_nis: Option<f64>,
+    octaves: Octaves,
+}
+
+/// A row for the archive, whatever is followed.
+struct Row {
+    row: usize,
+    displacement_m: Vec<f64>,
+    value: Vec<f64>,
+    sigma: Vec<f64>,
+    nis: f64,
+}
+
+impl<const D: usize> From<Snapshot<D>> for Row {
+    fn from(s: Snapshot<D>) -> Self {
+        let Snapshot { row, displacement_m, value, sigma, nis } = s;
+        Self { row, displacement_m: displacement_m.to_vec(), value, sigma, nis }
+    }
+}
+
+impl Following {
+    fn summary(&self) -> Summary {
+        each!(self, t => {
+            let (filter, s) = (t.filter(), t.filter().statistics());
+            let readouts = s.readouts.iter().zip(s.design_nis()).zip(s.octaves);
+            Summary {
+                states: filter.model().states(),
+                counts: [
+                    ("updates", s.updates),
+                    ("predictions_only", s.predictions),
+                    ("rejected_readouts", s.rejected),
+                    ("reacquisitions", s.reacquisitions),
+                    ("repairs_of_q", s.repairs_q),
+                    ("repairs_of_p", s.repairs_p),
+                    ("resets", s.resets),
+                ],
+                nis_sum: s.nis_sum,
+                nis: s.nis(),
+                readouts: readouts
+                    .map(|((used, design_nis), octaves)| Readout { used: *used, design_nis, octaves })
+                    .collect(),
+                recursion_sigma: (0..filter.coefficients().len())
+                    .map(|j| filter.recursion_covariance(j, j).sqrt())
+                    .collect(),
+                stretch: t.stretch(),
+                averaged_s: t.result().map(|a| a.span_s),
+            }
+        })
+    }
+
+    fn result(&self) -> Option<Average> {
+        each!(self, t => t.result())
+    }
+
+    fn stretch(&self) -> f64 {
+        each!(self, t => t.stretch())
+    }
+
+    fn save(&self, out: &mut Bytes) {
+        each!(self, t => t.save(out));
+    }
+
+    fn load(&mut self, words: &mut Words<'_>) -> Result<(), StateError> {
+        each!(self, t => t.load(words))
+    }
+}
+
+impl Body {
+    fn run(&mut self, input: &Inputs<'_>, pieces: &[(u64, std::ops::Range<usize>)]) -> Vec<Row> {
+        each!(&mut self.tracker, tracker => {
+            let rows = Rows {
+                readout_m: std::array::from_fn(|i| input.f64(self.readout_m[i])),
+                u_m_s2: std::array::from_fn(|i| input.f64(self.u_m_s2[i])),
+                regressors: self.regressors.iter().map(|r| r.map(|c| input.f64(c))).collect(),
+            };
+            let mut snapshots = Vec::new();
+            for (missing, piece) in pieces {
+                tracker.skip(*missing);
+                snapshots.extend(tracker.process(&rows, piece.clone()).into_iter().map(Row::from));
+            }
+            snapshots
+        })
     }
 }
 
@@ -464,14 +659,14 @@ fn prior_of(c: &Coefficient) -> Result<Theta, PluginError> {
     }
 }
 
-/// Of each readout the innovations' mean square over what the mission's noise predicts, octave by octave from the highest, and how
-/// many there are.
-fn innovation_octaves(s: &Statistics) -> serde_json::Map<String, serde_json::Value> {
+/// Of a test mass's readouts the innovations' mean square over what the mission's noise predicts, octave by octave from the highest, and
+/// how many there are.
+fn innovation_octaves(readouts: &[Readout]) -> serde_json::Map<String, serde_json::Value> {
     let of = |octaves: &Octaves| {
         let (power, count): (Vec<f64>, Vec<u64>) = octaves.powers().unzip();
         json!({"power": power, "count": count})
     };
-    AXES.iter().zip(&s.octaves).map(|(axis, octaves)| ((*axis).to_owned(), of(octaves))).collect()
+    AXES.iter().zip(readouts).map(|(axis, readout)| ((*axis).to_owned(), of(&readout.octaves))).collect()
 }
 
 /// Whether a coefficient has regressors on both test masses.
@@ -489,10 +684,10 @@ mod tests {
     fn stage() -> EsAkf {
         let setup = serde_json::json!({
             "parameters": {
-                "adaptation": "monotone", "forgetting": 0.999_999, "warm_up_s": 600.0, "gate_sigma": 6.0,
+                "follow": "auto", "adaptation": "monotone", "forgetting": 0.999_999, "warm_up_s": 600.0, "gate_sigma": 6.0,
                 "gate_patience": 30, "calibrated_sigma": true, "check_s": 600.0, "output_interval_s": 60.0,
                 "displacement_prior_m": 1e-6, "velocity_prior_m_s": 1e-7, "bias_prior_m_s2": 1e-7,
-                "bias_walk_m_s2_rts": 3e-15, "leak_hz": 1e-6, "unknown_alpha": 1.0,
+                "bias_walk_m_s2_rts": 3e-15, "bias_walk_both_m_s2_rts": 3e-16, "leak_hz": 1e-6, "unknown_alpha": 1.0,
             },
             "mission": {
                 "mission": { "name": "M", "spacecraft": "S", "sample_rate_hz": 10.0 },

@@ -1,7 +1,7 @@
 //! The filter at the capacity that a model needs.
 
 use crate::filter::{Drive, Filter, Settings, Statistics};
-use crate::model::{Model, R, THETA};
+use crate::model::Model;
 use crate::state::{Bytes, StateError, Words};
 
 /// Most states that a filter can have.
@@ -9,17 +9,17 @@ pub const MAX_STATES: usize = 64;
 
 /// A [`Filter`] whose capacity is the next one that holds the model's states.
 #[derive(Clone, Debug)]
-pub enum Akf {
+pub enum Akf<const D: usize = 3> {
     /// Up to 16 states: the offset with the default readout noise.
-    N16(Box<Filter<16>>),
+    N16(Box<Filter<16, D>>),
     /// Up to 24 states: the paper's 22.
-    N24(Box<Filter<24>>),
+    N24(Box<Filter<24, D>>),
     /// Up to 32 states.
-    N32(Box<Filter<32>>),
+    N32(Box<Filter<32, D>>),
     /// Up to 48 states.
-    N48(Box<Filter<48>>),
+    N48(Box<Filter<48, D>>),
     /// Up to 64 states.
-    N64(Box<Filter<64>>),
+    N64(Box<Filter<64, D>>),
 }
 
 macro_rules! each {
@@ -34,10 +34,10 @@ macro_rules! each {
     };
 }
 
-impl Akf {
+impl<const D: usize> Akf<D> {
     /// A filter before its first epoch, `None` when the model has more than [`MAX_STATES`] states.
     #[must_use]
-    pub fn new(model: Model, settings: Settings) -> Option<Self> {
+    pub fn new(model: Model<D>, settings: Settings) -> Option<Self> {
         Some(match model.states() {
             0..=16 => Self::N16(Box::new(Filter::new(model, settings))),
             17..=24 => Self::N24(Box::new(Filter::new(model, settings))),
@@ -49,7 +49,7 @@ impl Akf {
     }
 
     /// See [`Filter::step`].
-    pub fn step(&mut self, readout_m: [f64; 3], next: Drive<'_>) {
+    pub fn step(&mut self, readout_m: [f64; D], next: Drive<'_, D>) {
         each!(self, f => f.step(readout_m, next));
     }
 
@@ -61,13 +61,13 @@ impl Akf {
     /// Estimates of the coefficients.
     #[must_use]
     pub fn coefficients(&self) -> &[f64] {
-        each!(self, f => &f.state()[THETA..THETA + f.model().coefficients.len()])
+        each!(self, f => &f.state()[Model::<D>::THETA..][..f.model().coefficients.len()])
     }
 
     /// Estimate of the displacement `r`, ORF, m.
     #[must_use]
-    pub fn displacement_m(&self) -> [f64; 3] {
-        each!(self, f => std::array::from_fn(|i| f.state()[R + i]))
+    pub fn displacement_m(&self) -> [f64; D] {
+        each!(self, f => std::array::from_fn(|i| f.state()[Model::<D>::R + i]))
     }
 
     /// See [`Filter::coefficient_covariance`].
@@ -84,13 +84,13 @@ impl Akf {
 
     /// See [`Filter::statistics`].
     #[must_use]
-    pub fn statistics(&self) -> &Statistics {
+    pub fn statistics(&self) -> &Statistics<D> {
         each!(self, f => f.statistics())
     }
 
     /// See [`Filter::model`].
     #[must_use]
-    pub fn model(&self) -> &Model {
+    pub fn model(&self) -> &Model<D> {
         each!(self, f => f.model())
     }
 

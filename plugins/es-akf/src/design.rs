@@ -4,10 +4,10 @@ use dragfree_physics::frames::skew;
 use dragfree_physics::mission::{DisplacementNoise, Mission, MissionError, Noise};
 use dragfree_physics::noise::NoiseShape;
 use dragfree_physics::thrust_noise::ThrustNoise;
-use nalgebra::Matrix3;
+use nalgebra::{DMatrix, Matrix3};
 
 use crate::model::{Coefficient, Model, Prior};
-use crate::shaping::Chain;
+use crate::shaping::{Chain, Shaking};
 
 const STAGE: &str = "es-akf";
 
@@ -16,36 +16,44 @@ const STAGE: &str = "es-akf";
 pub struct Choices {
     /// Prior of the states that are no coefficients.
     pub prior: Prior,
-    /// Random walk of the bias acceleration, m s⁻² per √s, on top of the red part of the forces on the test mass.
-    pub bias_walk_m_s2_rts: f64,
+    /// Random walk of the bias acceleration, m s⁻² per √s, on top of the red part of the forces on the test mass: where a filter has one
+    /// test mass, and where it has both.
+    pub bias_walk_m_s2_rts: [f64; 2],
     /// Below this frequency coloured readout noise is white, Hz.
     pub leak_hz: f64,
     /// Part of the torque noise's variance that α̂ does not know, acting through the nominal offset.
     pub unknown_alpha: f64,
 }
 
-/// The model of a test mass.
+/// The model of one test mass, or of two in one filter; `D` is three times their number.
 ///
-/// Acceleration noise: thrust and sunlight over the spacecraft's mass, the white parts of electrostatic (y, z) and
-/// stray forces, and what α̂ does not know: above the band of the wavefront sensors that is the whole torque noise,
-/// through the nominal offset. Where thrusters push and turn at once, û holds the force that the known torque comes with,
-/// so that the force given the torque is left, and the unknown torque brings its force along. The red (`1/f²`) parts of the forces on the test mass walk with `a_b`.
+/// Acceleration noise: thrust and sunlight over the spacecraft's mass, alike for all test masses, the white parts of electrostatic (y, z)
+/// and stray forces, and what α̂ does not know of the torque noise, through the nominal offset. Where thrusters push and turn at once, û
+/// holds the force that the known torque comes with, so that the force given the torque is left, and the unknown torque brings its force
+/// along. The red (`1/f²`) parts of the forces on the test mass walk with `a_b`.
 ///
-/// `readouts` names the tables under `[noise]` that belong to the readouts x, y, z.
+/// What α̂ does not know is torque noise above the band of the wavefront sensors. One test mass feels it beside the thrusters' force,
+/// and it is white here, as it makes no difference. Between two test masses that force falls out, and it is what remains: there it is
+/// a [`Shaking`], known below the frequency at which the torque noise turns the spacecraft by as much as the sensors' noise.
+///
+/// `readouts` names the tables under `[noise]` that belong to the readouts x, y, z of each test mass.
 ///
 /// # Errors
 /// [`MissionError::Missing`] when the mission has no such test mass, no readout noise or no thrust noise.
-pub fn model(
+///
+/// # Panics
+/// When `D` is not three times the number of test masses.
+pub fn model<const D: usize>(
     mission: &Mission,
-    test_mass: &str,
-    readouts: [&str; 3],
+    test_masses: &[&str],
+    readouts: [&str; D],
     coefficients: Vec<Coefficient>,
     choices: &Choices,
-) -> Result<Model, MissionError> {
-    let tm = mission.test_mass(test_mass, STAGE)?;
+) -> Result<Model<D>, MissionError> {
+    assert_eq!(D, 3 * test_masses.len(), "{D} axes of {test_masses:?}");
     let (noise, dt_s) = (&mission.noise, mission.dt_s());
-    let [x, y, z] = readouts.map(|name| readout_noise(&mission.noise, name));
-    let readouts = [x?, y?, z?];
+    let tms = test_masses.iter().map(|name| mission.test_mass(name, STAGE)).collect::<Result<Vec<_>, _>>()?;
+    let shapes = readouts.iter().map(|name| readout_noise(noise, name)).collect::<Result<Vec<_>, _>>()?;
     let thrust = ThrustNoise::of(mission).filter(|t| !t.force_shape.terms.is_empty());
     let thrust = Mission::need(&thrust, "noise.thruster_force", STAGE)?;
     let white = |shape: Option<NoiseShape>| shape.map_or(0.0, |s| s.white_psd());
@@ -53,26 +61,58 @@ pub fn model(
     let stray = noise.test_mass_acceleration.as_ref().map(|n| n.shape());
     let sunlight = noise.solar_pressure.as_ref().map(|n| n.shape());
 
-    // One-sided PSDs in ORF; noise alike on all axes of SRF is so in ORF too.
-    let (mass_kg, dcm) = (mission.spacecraft.mass_kg, tm.dcm_orf_from_srf());
-    let common = white(sunlight) / mass_kg.powi(2) + white(stray.clone());
-    let lateral = white(electrostatic.clone()) / tm.mass_kg.powi(2);
-    let mut psd = Matrix3::from_diagonal(&[common, common + lateral, common + lateral].into());
-    let left = thrust.force_given_torque * (thrust.force_shape.white_psd() / mass_kg.powi(2));
-    psd += dcm * left * dcm.transpose();
-    if let Some(inverse) = mission.spacecraft.inertia().try_inverse() {
-        // −α × b − F/m of an unknown torque.
+    // One-sided PSDs in ORF, the test masses below each other: what a force on the spacecraft does to each, and a torque on it,
+    // −α × b − F/m.
+    let mass_kg = mission.spacecraft.mass_kg;
+    let inverse = mission.spacecraft.inertia().try_inverse().unwrap_or_else(Matrix3::zeros);
+    let mut pushed = DMatrix::zeros(D, 3);
+    let mut turned = DMatrix::zeros(D, 3);
+    let mut psd = DMatrix::zeros(D, D);
+    for (t, tm) in tms.iter().enumerate() {
+        let dcm = tm.dcm_orf_from_srf();
         let lever = skew(&tm.offset_nominal_orf_m()) * dcm * inverse - dcm * thrust.force_per_torque / mass_kg;
-        psd += lever * thrust.torque * lever.transpose() * (thrust.torque_shape.white_psd() * choices.unknown_alpha);
+        pushed.fixed_view_mut::<3, 3>(3 * t, 0).copy_from(&dcm);
+        turned.fixed_view_mut::<3, 3>(3 * t, 0).copy_from(&lever);
+        for axis in 0..3 {
+            let held = if axis == 0 { 0.0 } else { white(electrostatic.clone()) / tm.mass_kg.powi(2) };
+            psd[(3 * t + axis, 3 * t + axis)] = white(stray.clone()) + held;
+        }
     }
+    let left = thrust.force_given_torque * thrust.force_shape.white_psd() + Matrix3::identity() * white(sunlight);
+    psd += &pushed * (left / mass_kg.powi(2)) * pushed.transpose();
     let per_step = 0.5 / dt_s;
-    let red = red_walk(electrostatic.as_ref()) / tm.mass_kg.powi(2) + red_walk(stray.as_ref());
+    let unknown = thrust.torque_shape.white_psd() * choices.unknown_alpha;
+    let mut shakings = Vec::new();
+    let sensing = noise.dws_long_arm.as_ref().map(|n| n.shape().white_psd()).filter(|_| test_masses.len() > 1);
+    match sensing {
+        Some(sensing) => {
+            let axes = thrust.torque.symmetric_eigen();
+            for (axis, share) in
+                axes.eigenvectors.column_iter().zip(&axes.eigenvalues).filter(|(_, share)| **share > 0.0)
+            {
+                let torque = axis * share.sqrt();
+                let turn_rad_s2 = (inverse * torque).norm() * thrust.torque_shape.white_psd().sqrt();
+                if turn_rad_s2 == 0.0 {
+                    continue;
+                }
+                let lever = &turned * torque * (unknown * per_step).sqrt();
+                let corner_rad_s = (turn_rad_s2 / sensing.sqrt()).sqrt();
+                shakings.push(Shaking::new(std::array::from_fn(|i| lever[i]), corner_rad_s, dt_s));
+            }
+        }
+        None => psd += &turned * (thrust.torque * unknown) * turned.transpose(),
+    }
+    let [one, both] = choices.bias_walk_m_s2_rts;
+    let walk = if tms.len() > 1 { both } else { one };
+    let red = |mass_kg: f64| red_walk(electrostatic.as_ref()) / mass_kg.powi(2) + red_walk(stray.as_ref());
+    let red = tms.iter().map(|tm| red(tm.mass_kg)).fold(0.0, f64::max);
     Ok(Model {
         dt_s,
         acceleration_m2_s4: std::array::from_fn(|i| std::array::from_fn(|j| psd[(i, j)] * per_step)),
-        bias_step_m2_s4: (choices.bias_walk_m_s2_rts.powi(2) + red) * dt_s,
-        readout_m2: std::array::from_fn(|i| readouts[i].white_psd() * per_step),
-        chains: readouts.map(|shape| shape.coloured().map(|t| Chain::new(t, choices.leak_hz, dt_s)).collect()),
+        shakings,
+        bias_step_m2_s4: (walk.powi(2) + red) * dt_s,
+        readout_m2: std::array::from_fn(|i| shapes[i].white_psd() * per_step),
+        chains: std::array::from_fn(|i| shapes[i].coloured().map(|t| Chain::new(t, choices.leak_hz, dt_s)).collect()),
         coefficients,
         prior: choices.prior,
     })
@@ -128,14 +168,14 @@ mod tests {
 
     fn choices(unknown_alpha: f64) -> Choices {
         let prior = Prior { displacement_m: 1e-6, velocity_m_s: 1e-7, bias_m_s2: 1e-7 };
-        Choices { prior, bias_walk_m_s2_rts: 0.0, leak_hz: 1e-6, unknown_alpha }
+        Choices { prior, bias_walk_m_s2_rts: [0.0; 2], leak_hz: 1e-6, unknown_alpha }
     }
 
     /// Numbers by hand: 1e-7 N/√Hz over 1500 kg at 10 Hz, 1e-7 N m/√Hz over about 800 kg m² through 0.18 m.
     #[test]
     fn the_default_mission_in_numbers() {
         let names = ["ifo_x", "is_y", "is_z"];
-        let model = |unknown| model(&taiji(), "tm1", names, vec![], &choices(unknown)).expect("complete");
+        let model = |unknown| model(&taiji(), &["tm1"], names, vec![], &choices(unknown)).expect("complete");
         let still = model(0.0);
         let thrust = (1e-7_f64 / 1500.0).powi(2) * 5.0;
         assert!((still.acceleration_m2_s4[0][0] / thrust - 1.0).abs() < 1e-5);
@@ -162,7 +202,7 @@ mod tests {
             readout.as_mut().expect("there").terms = vec![term(5e-4, 4)];
         }
         let offset = vec![Coefficient { initial: 0.0, prior_sigma: 0.1 }; 3];
-        let model = model(&mission, "tm1", ["ifo_x", "is_y", "is_z"], offset, &choices(1.0)).expect("complete");
+        let model = model(&mission, &["tm1"], ["ifo_x", "is_y", "is_z"], offset, &choices(1.0)).expect("complete");
         assert_eq!(model.chains.each_ref().map(|c| c.iter().map(Chain::states).sum::<usize>()), [4, 3, 3]);
         assert_eq!(model.states(), 22);
         let stated = |f: f64| 1.42e-12_f64.powi(2) * ((2e-3 / f).powi(4) + (3e-3 / f).powi(2) + (1e-4 / f).powi(2));
@@ -197,7 +237,7 @@ mod tests {
         let mission = Mission::from_json(&serde_json::to_string(&value).expect("JSON")).expect("a mission");
         let names = ["ifo_x", "is_y", "is_z"];
         let noise = |unknown| {
-            let model = model(&mission, "tm2", names, vec![], &choices(unknown)).expect("complete");
+            let model = model(&mission, &["tm2"], names, vec![], &choices(unknown)).expect("complete");
             Matrix3::from_fn(|i, j| model.acceleration_m2_s4[i][j] / 5.0)
         };
         let (known, unknown) = (noise(0.0), noise(1.0));
@@ -216,12 +256,50 @@ mod tests {
         assert!(gained.min() > -1e-9 * gained.max() && gained.max() > 0.0, "{gained}");
     }
 
+    /// Two test masses, ±30° and ±0.18 m: no thrust moves `y_1 + y_2` against `x_1 − x_2`, as both show the spacecraft along s₂, so that
+    /// nothing is left there but the electrodes; and the torques shake what they shake of one test mass, at Nyquist.
+    #[test]
+    fn between_two_test_masses_the_thrust_falls_out() {
+        let text = include_str!("../../../fixtures/missions/taiji.toml");
+        let value: toml::Value = toml::from_str(text).expect("the fixture is TOML");
+        let mission = Mission::from_json(&serde_json::to_string(&value).expect("JSON")).expect("a mission");
+        let names = ["ifo_x", "is_y", "is_z", "ifo_x", "is_y", "is_z"];
+        let both: Model<6> = model(&mission, &["tm1", "tm2"], names, vec![], &choices(1.0)).expect("complete");
+        let q = DMatrix::from_fn(6, 6, |i, j| both.acceleration_m2_s4[i][j] / 5.0);
+        let quiet = |weights: [f64; 6]| {
+            let w = DMatrix::from_row_slice(1, 6, &weights);
+            (&w * &q * w.transpose())[(0, 0)]
+        };
+        // s₂ = sin 30° x₁ + cos 30° y₁ = −sin 30° x₂ + cos 30° y₂: the noise of four electrodes and test masses, by hand.
+        let (s, c) = (0.5, 0.75_f64.sqrt());
+        let own = 2.0 * (3e-15_f64).powi(2) * (s * s + c * c) + 2.0 * (2e-14_f64 / 1.96).powi(2) * c * c;
+        let between = quiet([s, c, 0.0, s, -c, 0.0]);
+        assert!((between / own - 1.0).abs() < 1e-3, "{between:e} against {own:e}");
+        assert!(quiet([s, c, 0.0, 0.0, 0.0, 0.0]) > 1e7 * between, "the thrust is there");
+
+        let white = model(&mission, &["tm1"], ["ifo_x", "is_y", "is_z"], vec![], &choices(1.0)).expect("complete");
+        let none = model(&mission, &["tm1"], ["ifo_x", "is_y", "is_z"], vec![], &choices(0.0)).expect("complete");
+        for i in 0..3 {
+            // The levers hold the gain that makes one at Nyquist, ((1 + a)/2)² each.
+            let shaken: f64 = both
+                .shakings
+                .iter()
+                .map(|shaking| (shaking.lever_m_s2[i] / (0.5 * (1.0 + shaking.decay())).powi(2)).powi(2))
+                .sum();
+            let torque = white.acceleration_m2_s4[i][i] - none.acceleration_m2_s4[i][i];
+            assert!((shaken / torque - 1.0).abs() < 1e-6, "axis {i}: {shaken:e} against {torque:e}");
+        }
+        // The torque about s₃ turns 1000 kg m² by as much as the sensors' noise at √(1e-10/5e-10)/2π Hz.
+        let slowest = both.shakings.iter().map(|s| -s.decay().ln() / 0.1).fold(f64::MAX, f64::min);
+        assert!((slowest / 0.2_f64.sqrt() - 1.0).abs() < 1e-2, "{slowest} rad/s");
+    }
+
     #[test]
     fn what_is_missing_is_named() {
         let mut mission = taiji();
         mission.noise.is_y = None;
         let error =
-            model(&mission, "tm1", ["ifo_x", "is_y", "is_z"], vec![], &choices(1.0)).expect_err("no noise.is_y");
+            model(&mission, &["tm1"], ["ifo_x", "is_y", "is_z"], vec![], &choices(1.0)).expect_err("no noise.is_y");
         assert!(error.to_string().contains("noise.is_y"), "{error}");
     }
 }

@@ -1,4 +1,5 @@
-//! The extended-state adaptive Kalman filter of one test mass, equations Final_AKF_X_k to Final_AKF_p_k1.
+//! The extended-state adaptive Kalman filter, equations Final_AKF_X_k to Final_AKF_p_k1, of `D` axes: those of one test mass, as in
+//! the paper, or of two.
 //!
 //! # Two readings of the printed equations
 //! * eq:Final_AKF_p_k1 carries `P_k`, the covariance of `X̂⁻_{k+1}`, to that of `X̂⁻_{k+2}`, so its `A_d` (and that of
@@ -22,9 +23,9 @@
 
 use crate::definite::{Finding, repair};
 use crate::kernel::{
-    Columns, Mat3, Matrix, Transition, adapt, add_noise, advance, advance_with_foreign_gain, inverse, mix,
+    Columns, Matrix, Square, Transition, adapt, add_noise, advance, advance_with_foreign_gain, inverse, mix,
 };
-use crate::model::{BIAS, Model, R, THETA, V};
+use crate::model::Model;
 use crate::octaves::Octaves;
 use crate::state::{Bytes, StateError, Words};
 
@@ -63,16 +64,16 @@ pub struct Settings {
 
 /// What acts between an epoch and the next.
 #[derive(Clone, Copy, Debug)]
-pub struct Drive<'a> {
+pub struct Drive<'a, const D: usize = 3> {
     /// `û`, mean over `[t_k, t_{k+1})`, ORF, m/s²; NaN where unknown.
-    pub acceleration_m_s2: [f64; 3],
-    /// Regressor of each coefficient on x, y, z, mean over `[t_k, t_{k+1})`, ORF, m s⁻² per unit; NaN where unknown.
-    pub regressors: &'a [[f64; 3]],
+    pub acceleration_m_s2: [f64; D],
+    /// Regressor of each coefficient on each axis, mean over `[t_k, t_{k+1})`, ORF, m s⁻² per unit; NaN where unknown.
+    pub regressors: &'a [[f64; D]],
 }
 
 /// What the filter counted and measured since its start.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Statistics {
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Statistics<const D: usize = 3> {
     /// Epochs seen.
     pub epochs: u64,
     /// Epochs at which at least one readout was used.
@@ -92,14 +93,33 @@ pub struct Statistics {
     /// Sum of `dᵀ S⁻¹ d` over the epochs after warm-up, `S` of the recursion.
     pub nis_sum: f64,
     /// Sum of `d_i² / S̃_ii` per readout, `S̃` from the mission's noise.
-    pub design_sum: [f64; 3],
+    pub design_sum: [f64; D],
     /// Readouts in `nis_sum`, per axis.
-    pub readouts: [u64; 3],
+    pub readouts: [u64; D],
     /// `d_i / √S̃_ii` per readout, octave by octave.
-    pub octaves: [Octaves; 3],
+    pub octaves: [Octaves; D],
 }
 
-impl Statistics {
+impl<const D: usize> Default for Statistics<D> {
+    fn default() -> Self {
+        Self {
+            epochs: 0,
+            updates: 0,
+            predictions: 0,
+            rejected: 0,
+            reacquisitions: 0,
+            repairs_q: 0,
+            repairs_p: 0,
+            resets: 0,
+            nis_sum: 0.0,
+            design_sum: [0.0; D],
+            readouts: [0; D],
+            octaves: [Octaves::default(); D],
+        }
+    }
+}
+
+impl<const D: usize> Statistics<D> {
     /// Mean NIS per degree of freedom, gated samples excluded; `None` before the end of the warm-up.
     #[must_use]
     pub fn nis(&self) -> Option<f64> {
@@ -109,18 +129,18 @@ impl Statistics {
 
     /// Mean square of each readout's innovation against what the mission's noise predicts for the gains in use.
     #[must_use]
-    pub fn design_nis(&self) -> [Option<f64>; 3] {
+    pub fn design_nis(&self) -> [Option<f64>; D] {
         std::array::from_fn(|i| (self.readouts[i] > 0).then(|| self.design_sum[i] / self.readouts[i] as f64))
     }
 }
 
-/// The filter of one test mass. The capacity `N ≥ model.states()` is a multiple of eight; see [`crate::Akf`] for the
+/// The filter. The capacity `N ≥ model.states()` is a multiple of eight; see [`crate::Akf`] for the
 /// one that chooses it.
 #[derive(Clone, Debug)]
-pub struct Filter<const N: usize> {
-    model: Model,
+pub struct Filter<const N: usize, const D: usize = 3> {
+    model: Model<D>,
     settings: Settings,
-    transition: Transition<N>,
+    transition: Transition<N, D>,
     design_q: Matrix<N>,
     /// Entries of the upper triangle of `Q` that are not zero.
     noisy: Vec<(usize, usize)>,
@@ -133,27 +153,27 @@ pub struct Filter<const N: usize> {
     /// `Q̂_k`, upper triangle; what stands below it is not used.
     q: Matrix<N>,
     /// `R̂_k`.
-    r: Mat3,
+    r: Square<D>,
     /// `Ŝ_k = E{d dᵀ}`.
-    s_hat: Mat3,
+    s_hat: Square<D>,
     /// `E{ε εᵀ}`, used by [`Adaptation::Residual`].
-    e_hat: Mat3,
+    e_hat: Square<D>,
     /// `P_k Hᵀ` at the last update.
-    seen: Columns<N>,
+    seen: Columns<N, D>,
     /// `K_k`, zero where no readout was used.
-    gain: Columns<N>,
+    gain: Columns<N, D>,
     /// `S⁻¹ = (H P_k Hᵀ + R̂_k)⁻¹`, zero where no readout was used.
-    weight: Mat3,
+    weight: Square<D>,
     /// Whether the last epoch may change `Q̂`.
     adapt: bool,
     /// `P̃`: like `P_k`, for the gains in use and the mission's noise.
     p_design: Matrix<N>,
     /// `P̃ Hᵀ` at the last update.
-    seen_design: Columns<N>,
+    seen_design: Columns<N, D>,
     /// `S̃ = H P̃ Hᵀ + R`.
-    s_design: Mat3,
+    s_design: Square<D>,
     /// `û` of the interval that begins at the last epoch.
-    u: [f64; 3],
+    u: [f64; D],
     /// Whether that interval's `û` and regressors are known.
     driven: bool,
     /// Whether `r` and `v` are tracked.
@@ -163,19 +183,24 @@ pub struct Filter<const N: usize> {
     /// Epochs used to start `Ŝ`.
     s_samples: u64,
     /// Rejections in a row, per readout.
-    refused: [u32; 3],
-    statistics: Statistics,
+    refused: [u32; D],
+    statistics: Statistics<D>,
     /// Scratch: `A P Aᵀ`.
     product: Matrix<N>,
 }
 
-impl<const N: usize> Filter<N> {
+impl<const N: usize, const D: usize> Filter<N, D> {
+    const R: usize = Model::<D>::R;
+    const V: usize = Model::<D>::V;
+    const BIAS: usize = Model::<D>::BIAS;
+    const THETA: usize = Model::<D>::THETA;
+
     /// A filter before its first epoch.
     ///
     /// # Panics
     /// When `N` is no multiple of eight or smaller than `model.states()`.
     #[must_use]
-    pub fn new(model: Model, settings: Settings) -> Self {
+    pub fn new(model: Model<D>, settings: Settings) -> Self {
         assert!(N.is_multiple_of(8) && model.states() <= N, "{} states do not fit into {N}", model.states());
         let mut filter = Self {
             transition: Transition::new(&model),
@@ -185,22 +210,22 @@ impl<const N: usize> Filter<N> {
             x: [0.0; N],
             p: Matrix::zero(),
             q: Matrix::zero(),
-            r: [[0.0; 3]; 3],
-            s_hat: [[0.0; 3]; 3],
-            e_hat: [[0.0; 3]; 3],
-            seen: [[0.0; N]; 3],
-            gain: [[0.0; N]; 3],
-            weight: [[0.0; 3]; 3],
+            r: [[0.0; D]; D],
+            s_hat: [[0.0; D]; D],
+            e_hat: [[0.0; D]; D],
+            seen: [[0.0; N]; D],
+            gain: [[0.0; N]; D],
+            weight: [[0.0; D]; D],
             adapt: false,
             p_design: Matrix::zero(),
-            seen_design: [[0.0; N]; 3],
-            s_design: [[0.0; 3]; 3],
-            u: [0.0; 3],
+            seen_design: [[0.0; N]; D],
+            s_design: [[0.0; D]; D],
+            u: [0.0; D],
             driven: false,
             tracking: false,
             age: 0,
             s_samples: 0,
-            refused: [0; 3],
+            refused: [0; D],
             statistics: Statistics::default(),
             product: Matrix::zero(),
             model,
@@ -217,7 +242,7 @@ impl<const N: usize> Filter<N> {
         };
         filter.begin_covariances();
         for (j, c) in filter.model.coefficients.iter().enumerate() {
-            filter.x[THETA + j] = c.initial;
+            filter.x[Self::THETA + j] = c.initial;
         }
         filter
     }
@@ -230,7 +255,7 @@ impl<const N: usize> Filter<N> {
         self.p_design = self.p.clone();
         self.q = self.design_q.clone();
         self.r = diagonal(&self.model.readout_m2);
-        self.s_hat = [[0.0; 3]; 3];
+        self.s_hat = [[0.0; D]; D];
         self.e_hat = self.r;
         self.s_samples = 0;
         self.forget_measurement();
@@ -238,7 +263,7 @@ impl<const N: usize> Filter<N> {
 
     /// One epoch: from `X̂⁺_k` and the drive of `[t_k, t_{k+1})` to the readout at `t_{k+1}`, and on with the drive
     /// that begins there. `readout_m` is the measured displacement, NaN where missing.
-    pub fn step(&mut self, readout_m: [f64; 3], next: Drive<'_>) {
+    pub fn step(&mut self, readout_m: [f64; D], next: Drive<'_, D>) {
         if self.statistics.epochs > 0 {
             if self.tracking && self.driven {
                 self.time_update();
@@ -270,30 +295,29 @@ impl<const N: usize> Filter<N> {
         }
         self.driven = false;
         self.drift();
-        for i in BIAS..THETA {
+        for i in Self::BIAS..Self::THETA {
             let walked = self.model.bias_step_m2_s4 * (epochs - 1) as f64;
             self.p.0[i][i] += walked;
             self.p_design.0[i][i] += walked;
         }
         // Noise of minutes to days has no memory of the other side of such a gap.
-        for i in THETA + self.model.coefficients.len()..self.model.states() {
+        for i in Self::THETA + self.model.coefficients.len()..self.model.states() {
             self.x[i] = 0.0;
             clear(&mut self.p, i);
             clear(&mut self.p_design, i);
         }
-        for (_, first, chain) in self.model.placed_chains() {
-            let n = chain.states();
-            for i in 0..n {
-                for j in 0..n {
-                    self.p.0[first + i][first + j] = chain.stationary[i * n + j];
-                    self.p_design.0[first + i][first + j] = chain.stationary[i * n + j];
-                }
+        let after = Self::THETA + self.model.coefficients.len();
+        let (p, p_design) = (&mut self.p, &mut self.p_design);
+        self.model.prior_covariance(|i, j, value| {
+            if i >= after {
+                p.0[i][j] = value;
+                p_design.0[i][j] = value;
             }
-        }
+        });
     }
 
     /// Stores what acts until the next epoch.
-    fn keep(&mut self, next: Drive<'_>) {
+    fn keep(&mut self, next: Drive<'_, D>) {
         self.u = next.acceleration_m_s2;
         self.driven = self.u.iter().chain(next.regressors.iter().flatten()).all(|x| x.is_finite());
         if self.driven {
@@ -348,10 +372,10 @@ impl<const N: usize> Filter<N> {
 
     /// Without `û` or regressors: `a_b`, `θ` and `n` go on, `r` and `v` fall back to their prior.
     fn drift(&mut self) {
-        *self.transition.phi = [[0.0; 3]; N];
+        self.transition.phi[..self.model.coefficients.len()].fill([0.0; D]);
         self.adapt = false;
         self.time_update();
-        self.transition.state(&mut self.x, &[0.0; 3]);
+        self.transition.state(&mut self.x, &[0.0; D]);
         self.forget_measurement();
         self.lose_track();
     }
@@ -359,15 +383,17 @@ impl<const N: usize> Filter<N> {
     /// Nothing of the last epoch is left to be carried to the next.
     fn forget_measurement(&mut self) {
         self.statistics.octaves.iter_mut().for_each(Octaves::interrupt);
-        self.gain = [[0.0; N]; 3];
-        self.weight = [[0.0; 3]; 3];
+        self.gain = [[0.0; N]; D];
+        self.weight = [[0.0; D]; D];
         self.adapt = false;
     }
 
     fn lose_track(&mut self) {
         self.tracking = false;
-        for i in 0..3 {
-            for (s, sigma) in [(R + i, self.model.prior.displacement_m), (V + i, self.model.prior.velocity_m_s)] {
+        for i in 0..D {
+            for (s, sigma) in
+                [(Self::R + i, self.model.prior.displacement_m), (Self::V + i, self.model.prior.velocity_m_s)]
+            {
                 self.x[s] = 0.0;
                 for p in [&mut self.p, &mut self.p_design] {
                     clear(p, s);
@@ -378,7 +404,7 @@ impl<const N: usize> Filter<N> {
     }
 
     /// Begins a track at a complete readout.
-    fn acquire(&mut self, readout_m: [f64; 3]) {
+    fn acquire(&mut self, readout_m: [f64; D]) {
         self.forget_measurement();
         self.statistics.predictions += 1;
         if !readout_m.iter().all(|z| z.is_finite()) {
@@ -386,27 +412,27 @@ impl<const N: usize> Filter<N> {
         }
         self.lose_track();
         let coloured = self.transition.observe(&self.x);
-        for i in 0..3 {
-            self.x[R + i] = readout_m[i] - coloured[i];
+        for i in 0..D {
+            self.x[Self::R + i] = readout_m[i] - coloured[i];
         }
         self.tracking = true;
         self.age = 0;
-        self.refused = [0; 3];
+        self.refused = [0; D];
         if self.statistics.updates > 0 {
             self.statistics.reacquisitions += 1;
         }
     }
 
     /// eqs Final_AKF_D_k to Final_AKF_x_k1.
-    fn measure(&mut self, readout_m: [f64; 3]) {
+    fn measure(&mut self, readout_m: [f64; D]) {
         let settled = self.age > self.settings.warm_up_epochs;
         let predicted = self.transition.observe(&self.x);
         let c = self.transition.observed(&self.p);
         let hph = self.transition.observed_twice(&c);
-        let mut d = [0.0; 3];
-        let mut used = [false; 3];
+        let mut d = [0.0; D];
+        let mut used = [false; D];
         let mut complete = true;
-        for i in 0..3 {
+        for i in 0..D {
             d[i] = readout_m[i] - predicted[i];
             let present = d[i].is_finite();
             let refused = present && settled && self.beyond_gate(d[i], hph[i][i] + self.r[i][i], self.s_hat[i][i]);
@@ -424,7 +450,7 @@ impl<const N: usize> Filter<N> {
             self.acquire(readout_m);
             return;
         }
-        if used == [false; 3] {
+        if used == [false; D] {
             self.forget_measurement();
             self.statistics.predictions += 1;
             return;
@@ -441,7 +467,7 @@ impl<const N: usize> Filter<N> {
         self.weight = weight;
         self.gain = mix(&self.weight, &c);
         self.seen = c;
-        for i in 0..3 {
+        for i in 0..D {
             for l in 0..N {
                 self.x[l] += self.gain[i][l] * d[i];
             }
@@ -461,15 +487,15 @@ impl<const N: usize> Filter<N> {
 
     /// `Ŝ_k = α Ŝ_{k−1} + (1 − α) d dᵀ`, begun at the mean over the second half of the warm-up. False until then,
     /// and in the first half of each later warm-up, when the innovations are those of an unknown velocity.
-    fn learn_innovation(&mut self, d: &[f64; 3]) -> bool {
+    fn learn_innovation(&mut self, d: &[f64; D]) -> bool {
         let warm_up = self.settings.warm_up_epochs;
         if self.age <= warm_up / 2 || self.settings.adaptation == Adaptation::Off {
             return false;
         }
         let first = self.s_samples < (warm_up - warm_up / 2).max(1);
         let fresh = if first { 1.0 / (self.s_samples + 1) as f64 } else { 1.0 - self.settings.forgetting };
-        for i in 0..3 {
-            for j in 0..3 {
+        for i in 0..D {
+            for j in 0..D {
                 self.s_hat[i][j] += fresh * (d[i] * d[j] - self.s_hat[i][j]);
             }
         }
@@ -480,10 +506,10 @@ impl<const N: usize> Filter<N> {
     }
 
     /// eqs Final_AKF_R_ITER and Final_AKF_R_k, or eq:sage_husa_R_update.
-    fn adapt_readout_noise(&mut self, hph: &Mat3) {
+    fn adapt_readout_noise(&mut self, hph: &Square<D>) {
         let alpha = self.settings.forgetting;
-        for i in 0..3 {
-            for j in 0..3 {
+        for i in 0..D {
+            for j in 0..D {
                 let r = self.r[i][j];
                 let r_iter = (1.0 - alpha) * (self.s_hat[i][j] - hph[i][j]);
                 match self.settings.adaptation {
@@ -496,19 +522,19 @@ impl<const N: usize> Filter<N> {
     }
 
     /// eqs residual_def and residual_R_update: `ε` needs `K`, so this `R̂` serves from the next epoch on.
-    fn adapt_by_residual(&mut self, readout_m: &[f64; 3], hph: &Mat3) {
+    fn adapt_by_residual(&mut self, readout_m: &[f64; D], hph: &Square<D>) {
         let alpha = self.settings.forgetting;
         let after = self.transition.observe(&self.x);
-        let e: [f64; 3] = std::array::from_fn(|i| readout_m[i] - after[i]);
-        for i in 0..3 {
-            for j in 0..3 {
+        let e: [f64; D] = std::array::from_fn(|i| readout_m[i] - after[i]);
+        for i in 0..D {
+            for j in 0..D {
                 self.e_hat[i][j] = alpha * self.e_hat[i][j] + (1.0 - alpha) * e[i] * e[j];
                 self.r[i][j] = alpha * self.r[i][j] + (1.0 - alpha) * (self.e_hat[i][j] + hph[i][j]);
             }
         }
     }
 
-    fn measure_consistency(&mut self, d: &[f64; 3], s: &Mat3, used: [bool; 3], settled: bool) {
+    fn measure_consistency(&mut self, d: &[f64; D], s: &Square<D>, used: [bool; D], settled: bool) {
         if self.has_own_covariance() {
             self.seen_design = self.transition.observed(&self.p_design);
             let hph = self.transition.observed_twice(&self.seen_design);
@@ -520,8 +546,8 @@ impl<const N: usize> Filter<N> {
             return;
         }
         let s = &mut self.statistics;
-        for i in 0..3 {
-            for j in 0..3 {
+        for i in 0..D {
+            for j in 0..D {
                 s.nis_sum += d[i] * self.weight[i][j] * d[j];
             }
             if used[i] {
@@ -568,8 +594,11 @@ impl<const N: usize> Filter<N> {
     fn reset(&mut self) {
         self.begin_covariances();
         for i in 0..N {
-            let initial =
-                if i < THETA { 0.0 } else { self.model.coefficients.get(i - THETA).map_or(0.0, |c| c.initial) };
+            let initial = if i < Self::THETA {
+                0.0
+            } else {
+                self.model.coefficients.get(i - Self::THETA).map_or(0.0, |c| c.initial)
+            };
             if !self.x[i].is_finite() {
                 self.x[i] = initial;
             }
@@ -580,13 +609,13 @@ impl<const N: usize> Filter<N> {
 
     /// The model.
     #[must_use]
-    pub fn model(&self) -> &Model {
+    pub fn model(&self) -> &Model<D> {
         &self.model
     }
 
     /// Counts and consistency.
     #[must_use]
-    pub fn statistics(&self) -> &Statistics {
+    pub fn statistics(&self) -> &Statistics<D> {
         &self.statistics
     }
 
@@ -610,21 +639,21 @@ impl<const N: usize> Filter<N> {
 
     /// `R̂`.
     #[must_use]
-    pub fn readout_noise(&self) -> &Mat3 {
+    pub fn readout_noise(&self) -> &Square<D> {
         &self.r
     }
 
     /// Covariance of coefficients `i` and `j` as the recursion has it, before the last epoch's readout.
     #[must_use]
     pub fn recursion_covariance(&self, i: usize, j: usize) -> f64 {
-        self.p.0[THETA + i][THETA + j]
+        self.p.0[Self::THETA + i][Self::THETA + j]
     }
 
     /// Covariance of coefficients `i` and `j` for the gains in use and the mission's noise, before the last epoch's
     /// readout.
     #[must_use]
     pub fn coefficient_covariance(&self, i: usize, j: usize) -> f64 {
-        self.design_covariance().0[THETA + i][THETA + j]
+        self.design_covariance().0[Self::THETA + i][Self::THETA + j]
     }
 
     /// Whether a track has been found.
@@ -701,11 +730,11 @@ impl<const N: usize> Filter<N> {
     }
 }
 
-fn diagonal(d: &[f64; 3]) -> Mat3 {
-    [[d[0], 0.0, 0.0], [0.0, d[1], 0.0], [0.0, 0.0, d[2]]]
+fn diagonal<const D: usize>(d: &[f64; D]) -> Square<D> {
+    std::array::from_fn(|i| std::array::from_fn(|j| if i == j { d[i] } else { 0.0 }))
 }
 
-fn sum(a: &Mat3, b: &Mat3) -> Mat3 {
+fn sum<const D: usize>(a: &Square<D>, b: &Square<D>) -> Square<D> {
     std::array::from_fn(|i| std::array::from_fn(|j| a[i][j] + b[i][j]))
 }
 

@@ -1,12 +1,8 @@
-//! The extended-state model of one test mass (eq:extended_state_space, eq:readout_model), discretised.
+//! The extended-state model (eq:extended_state_space, eq:readout_model), discretised.
+//!
+//! `D` is the number of axes that are followed: three of one test mass as in the paper, or six of both test masses.
 
-use crate::shaping::Chain;
-
-/// First index of each group of states: `X = [r(3), v(3), a_b(3), θ(m), n(s)]`.
-pub(crate) const R: usize = 0;
-pub(crate) const V: usize = 3;
-pub(crate) const BIAS: usize = 6;
-pub(crate) const THETA: usize = 9;
+use crate::shaping::{Chain, Shaking};
 
 /// What is believed before the first sample, 1σ, and what `r` and `v` fall back to after a loss of track.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -28,43 +24,67 @@ pub struct Coefficient {
     pub prior_sigma: f64,
 }
 
-/// The model of one test mass. All components are in its ORF.
+/// The model of one test mass, or of two, the second's axes after the first's. All components are in the ORF of their test mass.
+///
+/// The states are `X = [r(D), v(D), a_b(D), θ(m), w(2 per shaking), n(s)]`.
 ///
 /// `A` is not stored: with `φ` (3×m) the regressors, mean over `[t_k, t_{k+1})`, it is, exactly for accelerations
 /// constant over a step, `r ← r + dt v + dt²/2 (a_b + φθ + û)`, `v ← v + dt (a_b + φθ + û)`, `n ← A_n n`, and the
 /// identity for `a_b` and `θ`. The offset's regressors are `φ = −[α̂×] − [ω̂×][ω̂×]`; the printed A has `+[α×]`,
 /// against the paper's own eq:TM_SC_relative_acceleration.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Model {
+pub struct Model<const D: usize = 3> {
     /// Step, s.
     pub dt_s: f64,
-    /// Covariance of the mean acceleration noise of one step, 3×3, m² s⁻⁴: one-sided PSD × sample rate / 2.
+    /// Covariance of the mean acceleration noise of one step, D×D, m² s⁻⁴: one-sided PSD × sample rate / 2.
     ///
     /// The noise is taken constant over a step, as û and α̂ are means over it, so the blocks of `Q` are
     /// `(dt⁴/4, dt³/2, dt²)`; a continuous white force would have `dt³/3` in place of `dt³/4` in `rr`.
-    pub acceleration_m2_s4: [[f64; 3]; 3],
+    pub acceleration_m2_s4: [[f64; D]; D],
+    /// Acceleration noise that is not white.
+    pub shakings: Vec<Shaking<D>>,
     /// Variance that each component of `a_b` gains in one step, m² s⁻⁴.
     pub bias_step_m2_s4: f64,
-    /// Variance of the white part of the readouts x, y, z, m²: one-sided PSD × sample rate / 2.
-    pub readout_m2: [f64; 3],
-    /// Noise-shaping chains of the readouts x, y, z.
-    pub chains: [Vec<Chain>; 3],
-    /// Coefficients that act on this test mass.
+    /// Variance of the white part of the readouts, m²: one-sided PSD × sample rate / 2.
+    pub readout_m2: [f64; D],
+    /// Noise-shaping chains of the readouts.
+    pub chains: [Vec<Chain>; D],
+    /// Coefficients that act on these axes.
     pub coefficients: Vec<Coefficient>,
     /// Prior of the other states.
     pub prior: Prior,
 }
 
-impl Model {
-    /// Number of states, `9 + m + s`.
+impl<const D: usize> Model<D> {
+    /// First state of the displacements.
+    pub const R: usize = 0;
+    /// First state of the velocities.
+    pub const V: usize = D;
+    /// First state of the bias accelerations.
+    pub const BIAS: usize = 2 * D;
+    /// First state of the coefficients.
+    pub const THETA: usize = 3 * D;
+
+    /// Number of states, `3D + m + 2 per shaking + s`.
     #[must_use]
     pub fn states(&self) -> usize {
-        THETA + self.coefficients.len() + self.chains.iter().flatten().map(Chain::states).sum::<usize>()
+        self.first_chain() + self.chains.iter().flatten().map(Chain::states).sum::<usize>()
+    }
+
+    /// First state of the noise-shaping chains.
+    fn first_chain(&self) -> usize {
+        Self::THETA + self.coefficients.len() + Shaking::<D>::STATES * self.shakings.len()
+    }
+
+    /// What shakes the axes with a spectrum of its own, each with its first state.
+    pub fn placed_shakings(&self) -> impl Iterator<Item = (usize, &Shaking<D>)> {
+        let first = Self::THETA + self.coefficients.len();
+        self.shakings.iter().enumerate().map(move |(i, shaking)| (first + Shaking::<D>::STATES * i, shaking))
     }
 
     /// Chains with their axis and their first state.
     pub fn placed_chains(&self) -> impl Iterator<Item = (usize, usize, &Chain)> {
-        let mut at = THETA + self.coefficients.len();
+        let mut at = self.first_chain();
         self.chains.iter().enumerate().flat_map(|(axis, chains)| chains.iter().map(move |c| (axis, c))).map(
             move |(axis, chain)| {
                 let first = at;
@@ -77,15 +97,31 @@ impl Model {
     /// `Q` before any adaptation, n×n, by entries through `set(row, column, value)`; zero elsewhere.
     pub fn process_noise(&self, mut set: impl FnMut(usize, usize, f64)) {
         let dt = self.dt_s;
-        for i in 0..3 {
-            for j in 0..3 {
-                let q = self.acceleration_m2_s4[i][j];
-                set(R + i, R + j, q * dt.powi(4) / 4.0);
-                set(R + i, V + j, q * dt.powi(3) / 2.0);
-                set(V + i, R + j, q * dt.powi(3) / 2.0);
-                set(V + i, V + j, q * dt.powi(2));
+        for i in 0..D {
+            for j in 0..D {
+                // A shaking's white noise acts at once as well.
+                let shaken: f64 = self.shakings.iter().map(|s| s.lever_m_s2[i] * s.lever_m_s2[j]).sum();
+                let q = self.acceleration_m2_s4[i][j] + shaken;
+                set(Self::R + i, Self::R + j, q * dt.powi(4) / 4.0);
+                set(Self::R + i, Self::V + j, q * dt.powi(3) / 2.0);
+                set(Self::V + i, Self::R + j, q * dt.powi(3) / 2.0);
+                set(Self::V + i, Self::V + j, q * dt.powi(2));
             }
-            set(BIAS + i, BIAS + i, self.bias_step_m2_s4);
+            set(Self::BIAS + i, Self::BIAS + i, self.bias_step_m2_s4);
+        }
+        for (first, shaking) in self.placed_shakings() {
+            let gain = shaking.gain();
+            for state in first..first + Shaking::<D>::STATES {
+                for (i, lever) in shaking.lever_m_s2.iter().enumerate() {
+                    for (moved, by) in [(Self::R + i, dt.powi(2) / 2.0), (Self::V + i, dt)] {
+                        set(moved, state, by * lever * gain);
+                        set(state, moved, by * lever * gain);
+                    }
+                }
+                for other in first..first + Shaking::<D>::STATES {
+                    set(state, other, gain * gain);
+                }
+            }
         }
         for (_, first, chain) in self.placed_chains() {
             let n = chain.states();
@@ -99,13 +135,21 @@ impl Model {
 
     /// `P` before the first sample, n×n, by entries through `set(row, column, value)`; zero elsewhere.
     pub fn prior_covariance(&self, mut set: impl FnMut(usize, usize, f64)) {
-        for i in 0..3 {
-            set(R + i, R + i, self.prior.displacement_m.powi(2));
-            set(V + i, V + i, self.prior.velocity_m_s.powi(2));
-            set(BIAS + i, BIAS + i, self.prior.bias_m_s2.powi(2));
+        for i in 0..D {
+            set(Self::R + i, Self::R + i, self.prior.displacement_m.powi(2));
+            set(Self::V + i, Self::V + i, self.prior.velocity_m_s.powi(2));
+            set(Self::BIAS + i, Self::BIAS + i, self.prior.bias_m_s2.powi(2));
         }
         for (j, c) in self.coefficients.iter().enumerate() {
-            set(THETA + j, THETA + j, c.prior_sigma.powi(2));
+            set(Self::THETA + j, Self::THETA + j, c.prior_sigma.powi(2));
+        }
+        for (first, shaking) in self.placed_shakings() {
+            let stationary = shaking.stationary();
+            for (i, row) in stationary.iter().enumerate() {
+                for (j, covariance) in row.iter().enumerate() {
+                    set(first + i, first + j, *covariance);
+                }
+            }
         }
         for (_, first, chain) in self.placed_chains() {
             let n = chain.states();

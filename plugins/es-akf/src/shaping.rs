@@ -57,6 +57,55 @@ impl Chain {
     }
 }
 
+/// White noise that is known from somewhere else where it is slow: `(s/(s + ω))²` of it is left.
+///
+/// That is what an estimate of an angular acceleration leaves, made of angles with white noise: torques above ω, hardly anything below,
+/// where the error of the estimate falls with `(f/f_c)²`. The torque acts at once, its slow part is taken away by two states,
+/// `e = w − l₁ − l₂`, `l₁ ← a l₁ + g w`, `l₂ ← a l₂ + g (w − l₁)` with `a = e^{−ω dt}`, `g = 1 − a`, which is `((1 − z⁻¹)/(1 − a z⁻¹))²`.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Shaking<const D: usize = 3> {
+    /// What one σ of the white noise, held for a step, does to each axis, m/s².
+    pub lever_m_s2: [f64; D],
+    decay: f64,
+}
+
+impl<const D: usize> Shaking<D> {
+    /// Its states `l₂, l₁`.
+    pub const STATES: usize = 2;
+
+    /// Noise of which `lever_m_s2` is one σ at Nyquist, held for a step of `dt_s`, known below `corner_rad_s`.
+    #[must_use]
+    pub fn new(lever_m_s2: [f64; D], corner_rad_s: f64, dt_s: f64) -> Self {
+        let decay = (-corner_rad_s * dt_s).exp();
+        // At Nyquist each stage has the gain 2/(1 + a).
+        let whole = (0.5 * (1.0 + decay)).powi(2);
+        Self { lever_m_s2: lever_m_s2.map(|l| l * whole), decay }
+    }
+
+    /// `a`, of each state over one step.
+    #[must_use]
+    pub fn decay(&self) -> f64 {
+        self.decay
+    }
+
+    /// `g`: what the noise adds to each state in one step, and what `l₁` takes from `l₂`.
+    #[must_use]
+    pub fn gain(&self) -> f64 {
+        1.0 - self.decay
+    }
+
+    /// Stationary covariance of `l₂, l₁`: the fixed point of their recursion.
+    #[must_use]
+    pub fn stationary(&self) -> [[f64; 2]; 2] {
+        let (a, g) = (self.decay, self.gain());
+        let lost = 1.0 - a * a;
+        let first = g * g / lost;
+        let cross = (g * g - a * g * first) / lost;
+        let second = (g * g * first + g * g - 2.0 * a * g * cross) / lost;
+        [[second, cross], [cross, first]]
+    }
+}
+
 fn factorial(n: usize) -> f64 {
     (1..=n).map(|i| i as f64).product()
 }
@@ -122,6 +171,34 @@ mod tests {
                 let bound = 3e-4 + (std::f64::consts::PI * f * dt).powi(2);
                 assert!((psd / want - 1.0).abs() < bound, "exponent {exponent} at {f} Hz: {psd:e} against {want:e}");
             }
+        }
+    }
+
+    /// Spectrum and stationary covariance of what is left of white noise, from its own state space: `((1 − z⁻¹)/(1 − a z⁻¹))²`, one at
+    /// Nyquist, `(f/f_c)⁴` far below the corner.
+    #[test]
+    fn what_is_known_where_it_is_slow_is_gone_there() {
+        let (dt, corner) = (0.1, 0.5_f64);
+        let shaking = Shaking::new([2.0], corner, dt);
+        let (a, g) = (shaking.decay(), shaking.gain());
+        let transition = DMatrix::from_row_slice(2, 2, &[a, -g, 0.0, a]);
+        let drive = DMatrix::from_row_slice(2, 1, &[g, g]);
+        let stationary = DMatrix::from_fn(2, 2, |i, j| shaking.stationary()[i][j]);
+        let next = &transition * &stationary * transition.transpose() + &drive * drive.transpose();
+        assert!((&next - &stationary).norm() < 1e-14 * stationary.norm(), "{stationary} is not stationary: {next}");
+        let gain = |f: f64| {
+            let z = Complex::from_polar(1.0, std::f64::consts::TAU * f * dt);
+            let complex = |m: &DMatrix<f64>| m.map(|x| Complex::new(x, 0.0));
+            let zia = DMatrix::identity(2, 2) * z - complex(&transition);
+            let inverse = zia.try_inverse().expect("no pole on the unit circle");
+            let slow = DMatrix::from_element(1, 2, Complex::new(1.0, 0.0)) * inverse * complex(&drive);
+            (shaking.lever_m_s2[0] * (Complex::new(1.0, 0.0) - slow[(0, 0)])).norm()
+        };
+        assert!((gain(5.0) - 2.0).abs() < 1e-12, "{}", gain(5.0));
+        // To the order of ω dt, and of (f/f_c)².
+        for f in [1e-4, 1e-3] {
+            let want = 2.0 * (std::f64::consts::TAU * f / corner).powi(2);
+            assert!((gain(f) / want - 1.0).abs() < 1e-2, "{f} Hz: {} against {want}", gain(f));
         }
     }
 }

@@ -1,4 +1,4 @@
-//! One test mass over time: the filter, the mean over its last hour, the rows for the archive.
+//! One test mass, or two, over time: the filter, the mean over its last hour, the rows for the archive.
 
 use std::collections::VecDeque;
 
@@ -13,13 +13,13 @@ const AVERAGE_PART: u64 = 6;
 /// Grain of that mean, s.
 const BIN_S: f64 = 10.0;
 
-/// What one test mass reads, column by column, all of one length.
+/// What is read, column by column, all of one length.
 #[derive(Clone, Debug)]
-pub struct Rows<'a> {
-    /// Measured displacement at `t_k`, x, y, z, m.
-    pub readout_m: [&'a [f64]; 3],
-    /// `û`, mean over `[t_k, t_{k+1})`, x, y, z, m/s².
-    pub u_m_s2: [&'a [f64]; 3],
+pub struct Rows<'a, const D: usize = 3> {
+    /// Measured displacement at `t_k`, axis by axis, m.
+    pub readout_m: [&'a [f64]; D],
+    /// `û`, mean over `[t_k, t_{k+1})`, axis by axis, m/s².
+    pub u_m_s2: [&'a [f64]; D],
     /// What the coefficients add.
     pub regressors: Vec<Regressor<&'a [f64]>>,
 }
@@ -33,7 +33,7 @@ pub struct Regressor<C> {
     pub times: Factor,
     /// Constant factor.
     pub factor: f64,
-    /// Axis of ORF.
+    /// Which of the axes that are followed.
     pub axis: usize,
     /// Column.
     pub column: C,
@@ -58,11 +58,11 @@ pub enum Factor {
 
 /// A row for the archive.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Snapshot {
+pub struct Snapshot<const D: usize = 3> {
     /// Index of the row of the batch at which it was taken.
     pub row: usize,
     /// Estimate of the displacement, ORF, m.
-    pub displacement_m: [f64; 3],
+    pub displacement_m: [f64; D],
     /// Estimates of the coefficients.
     pub value: Vec<f64>,
     /// Their σ for the gains in use and the mission's noise.
@@ -91,10 +91,10 @@ pub struct Average {
     pub covariance: Vec<f64>,
 }
 
-/// A test mass being followed.
+/// A test mass being followed, or both.
 #[derive(Clone, Debug)]
-pub struct Tracker {
-    filter: Akf,
+pub struct Tracker<const D: usize = 3> {
+    filter: Akf<D>,
     dt_s: f64,
     snapshot_epochs: u64,
     bins: VecDeque<Bin>,
@@ -102,10 +102,10 @@ pub struct Tracker {
     reported: (f64, u64),
 }
 
-impl Tracker {
-    /// A test mass before its first epoch, with a row for the archive every `snapshot_s`.
+impl<const D: usize> Tracker<D> {
+    /// A filter before its first epoch, with a row for the archive every `snapshot_s`.
     #[must_use]
-    pub fn new(filter: Akf, snapshot_s: f64) -> Self {
+    pub fn new(filter: Akf<D>, snapshot_s: f64) -> Self {
         let dt_s = filter.model().dt_s;
         let snapshot_epochs = ((snapshot_s / dt_s).round() as u64).max(1);
         Self { filter, dt_s, snapshot_epochs, bins: VecDeque::new(), reported: (0.0, 0) }
@@ -113,7 +113,7 @@ impl Tracker {
 
     /// The filter.
     #[must_use]
-    pub fn filter(&self) -> &Akf {
+    pub fn filter(&self) -> &Akf<D> {
         &self.filter
     }
 
@@ -122,12 +122,12 @@ impl Tracker {
     }
 
     /// Rows `range` of a batch.
-    pub fn process(&mut self, rows: &Rows<'_>, range: std::ops::Range<usize>) -> Vec<Snapshot> {
+    pub fn process(&mut self, rows: &Rows<'_, D>, range: std::ops::Range<usize>) -> Vec<Snapshot<D>> {
         let mut snapshots = Vec::new();
-        let mut phi = vec![[0.0; 3]; self.filter.coefficients().len()];
+        let mut phi = vec![[0.0; D]; self.filter.coefficients().len()];
         for k in range {
             let mut u = rows.u_m_s2.map(|column| column[k]);
-            phi.iter_mut().for_each(|p| *p = [0.0; 3]);
+            phi.iter_mut().for_each(|p| *p = [0.0; D]);
             for r in &rows.regressors {
                 // A product is linear in its coefficient at the other's estimate of this epoch.
                 let times = match r.times {
@@ -178,7 +178,7 @@ impl Tracker {
         (AVERAGE_S / (self.bin_epochs() as f64 * self.dt_s)).round() as usize
     }
 
-    fn snapshot(&mut self, row: usize) -> Snapshot {
+    fn snapshot(&mut self, row: usize) -> Snapshot<D> {
         let s = self.filter.statistics();
         let (sum, dof) = (s.nis_sum, s.readouts.iter().sum::<u64>());
         let nis =

@@ -3,7 +3,7 @@
 mod common;
 
 use common::{Alpha, Simulation, model};
-use dragfree_engine::border::{Config, Instance, Kind, Library, LinkRequest, Rows};
+use dragfree_engine::border::{Config, Instance, Kind, Library, LinkRequest, ReadColumn, Rows};
 use dragfree_engine::table::{Batch, Column};
 use serde_json::{Value, json};
 
@@ -31,43 +31,44 @@ fn mission(terms: [&[u32]; 3]) -> Value {
     mission
 }
 
-fn create(mission: &Value) -> Instance {
+fn create(mission: &Value, needs: &[&str]) -> Instance {
     let library = library();
     let parameters = json!({
-        "adaptation": "monotone", "forgetting": 0.999_999, "warm_up_s": 60.0, "gate_sigma": 6.0, "gate_patience": 30,
+        "follow": "auto", "adaptation": "monotone", "forgetting": 0.999_999, "warm_up_s": 60.0, "gate_sigma": 6.0, "gate_patience": 30,
         "calibrated_sigma": true, "check_s": 60.0, "output_interval_s": 60.0, "displacement_prior_m": 1e-6,
-        "velocity_prior_m_s": 1e-7, "bias_prior_m_s2": 1e-7, "bias_walk_m_s2_rts": 3e-15, "leak_hz": 1e-6,
+        "velocity_prior_m_s": 1e-7, "bias_prior_m_s2": 1e-7, "bias_walk_m_s2_rts": 3e-15, "bias_walk_both_m_s2_rts": 3e-16,
+        "leak_hz": 1e-6,
         "unknown_alpha": 1.0,
     });
-    let value = json!({"parameters": parameters, "mission": mission, "instance": "", "files": []});
+    let value = json!({"parameters": parameters, "mission": mission, "instance": "", "files": [], "needs": needs});
     let plugin = library.plugins.iter().find(|p| p.kind == Kind::Stage).expect("the library has a stage");
     Instance::create(&library, plugin, &Config { value }).expect("the fixture is a mission")
 }
 
-/// What `hinf-dfacs` and the offset make of test mass 1: columns and `epochs` rows of synthetic data.
-fn columns_and_rows(epochs: usize) -> (Vec<Column>, Vec<i64>, Vec<Vec<f64>>) {
+/// What `hinf-dfacs` and the offset make of a test mass: columns and `epochs` rows of synthetic data.
+fn columns_and_rows(test_mass: u64, epochs: usize) -> (Vec<Column>, Vec<i64>, Vec<Vec<f64>>) {
     let column = |table: &str, name: String, unit: &str, attributes: &[(&str, String)]| Column {
         table: table.to_owned(),
         name,
         unit: unit.to_owned(),
-        frame: "ORF_1".to_owned(),
+        frame: format!("ORF_{test_mass}"),
         rate_hz: 10.0,
         attributes: attributes.iter().map(|(k, v)| ((*k).to_owned(), v.clone())).collect(),
     };
     let mut columns = Vec::new();
     for (group, unit) in [("r_orf_m", "m"), ("u_orf_m_s2", "m s-2")] {
-        columns.extend(AXES.map(|a| column("reconstruction", format!("tm1.{group}.{a}"), unit, &[])));
+        columns.extend(AXES.map(|a| column("reconstruction", format!("tm{test_mass}.{group}.{a}"), unit, &[])));
     }
     for j in AXES {
         for i in AXES {
-            let (coefficient, channel) = (format!("com-offset.tm1.{j}"), format!("tm1.accel.{i}"));
+            let (coefficient, channel) = (format!("com-offset.tm{test_mass}.{j}"), format!("tm{test_mass}.accel.{i}"));
             let name = format!("{coefficient}@{channel}");
             let attributes = [("kind", "regressor".to_owned()), ("coefficient", coefficient), ("channel", channel)];
-            columns.push(column("effect/com-offset:tm1", name, "s-2", &attributes));
+            columns.push(column(&format!("effect/com-offset:tm{test_mass}"), name, "s-2", &attributes));
         }
     }
     let synthetic = model([&[4], &[2], &[2]], 1e-6);
-    let mut data = Simulation::new(&synthetic, Alpha::Coloured(1.0), 1);
+    let mut data = Simulation::new(&synthetic, Alpha::Coloured(1.0), test_mass);
     let (mut times, mut rows) = (Vec::new(), vec![Vec::new(); columns.len()]);
     for k in 0..epochs {
         let e = data.epoch();
@@ -83,33 +84,55 @@ fn columns_and_rows(epochs: usize) -> (Vec<Column>, Vec<i64>, Vec<Vec<f64>>) {
     (columns, times, rows)
 }
 
-fn model_json() -> String {
-    let offset = AXES.map(|a| {
-        json!({"name": format!("com-offset.tm1.{a}"), "unit": "m", "frame": "ORF_1", "lower": -1.0, "upper": 1.0,
+fn model_json(test_masses: &[u64]) -> String {
+    let coefficient = |tm: &u64, a: &str| {
+        json!({"name": format!("com-offset.tm{tm}.{a}"), "unit": "m", "frame": format!("ORF_{tm}"), "lower": -1.0, "upper": 1.0,
                "initial": 0.0, "prior_sigma": 0.1, "estimate": true})
-    });
-    json!({"coefficients": offset, "constraints": []}).to_string()
+    };
+    let offsets: Vec<Value> = test_masses.iter().flat_map(|tm| AXES.map(|a| coefficient(tm, a))).collect();
+    json!({"coefficients": offsets, "constraints": []}).to_string()
 }
 
-/// Runs ten minutes and gives the report and the rows for the archive.
-fn run(mission: &Value) -> (Value, Vec<Batch>) {
-    let (columns, times, rows) = columns_and_rows(6_000);
-    let mut stage = create(mission);
-    let linked = stage.link(LinkRequest { available: &columns, model_json: &model_json() }).expect("linked");
-    stage.activate(65_536).expect("active");
-    let input: Vec<Rows<'_>> = linked
-        .reads
-        .iter()
-        .map(|table| Rows { time_ns: &times, columns: table.iter().map(|r| &*rows[r.available]).collect() })
-        .collect();
-    let made = stage.process(&input, i64::MAX).expect("processed").expect("nothing is discarded");
+/// Ten minutes, cut at `cut` and gone on with from its saved state: the report and the rows for the archive.
+fn run(mission: &Value, test_masses: &[u64], needs: &[&str], cut: usize) -> (Value, Vec<Batch>) {
+    let (mut columns, mut times, mut rows) = (Vec::new(), Vec::new(), Vec::new());
+    for tm in test_masses {
+        let (c, t, r) = columns_and_rows(*tm, 6_000);
+        columns.extend(c);
+        rows.extend(r);
+        times = t;
+    }
+    let begin = || {
+        let mut stage = create(mission, needs);
+        let request = LinkRequest { available: &columns, model_json: &model_json(test_masses) };
+        let linked = stage.link(request).expect("linked");
+        stage.activate(65_536).expect("active");
+        (stage, linked)
+    };
+    let (mut stage, linked) = begin();
+    let mut made = Vec::new();
+    for part in [0..cut, cut..times.len()] {
+        if part.start > 0 {
+            let saved = stage.save().expect("a state");
+            stage = begin().0;
+            stage.load(&saved).expect("its own state");
+        }
+        let table = |reads: &Vec<_>| -> Vec<&[f64]> { reads.iter().map(|r| column_of(r, &rows, &part)).collect() };
+        let input: Vec<Rows<'_>> =
+            linked.reads.iter().map(|reads| Rows { time_ns: &times[part.clone()], columns: table(reads) }).collect();
+        made.extend(stage.process(&input, i64::MAX).expect("processed").expect("nothing is discarded"));
+    }
     (stage.report("[]").expect("a report"), made)
+}
+
+fn column_of<'a>(read: &ReadColumn, rows: &'a [Vec<f64>], part: &std::ops::Range<usize>) -> &'a [f64] {
+    &rows[read.available][part.clone()]
 }
 
 /// Four states for x, three each for y and z: 9 + 3 + 10.
 #[test]
 fn a_mission_file_can_ask_for_the_papers_22_states() {
-    let (report, made) = run(&mission([&[2, 2], &[4], &[4]]));
+    let (report, made) = run(&mission([&[2, 2], &[4], &[4]]), &[1], &[], 6_000);
     assert_eq!(report["quality"]["tm1"]["states"], 22, "{report}");
     assert_eq!(report["counts"]["updates"], 5_999, "{report}");
     // Every repair of Q̂ and of P reaches the product.
@@ -118,15 +141,50 @@ fn a_mission_file_can_ask_for_the_papers_22_states() {
     // The last column, the NIS, has no value before the end of the warm-up.
     let (_, estimates) = made[0].columns.split_last().expect("columns");
     assert!(estimates.iter().flatten().all(|x| x.is_finite()));
-    assert_eq!(run(&mission([&[], &[], &[]])).0["quality"]["tm1"]["states"], 16);
+    assert_eq!(run(&mission([&[], &[], &[]]), &[1], &[], 6_000).0["quality"]["tm1"]["states"], 16);
+}
+
+/// 18 + 6 + two for each of three torques + 8 of the readouts. A run in two parts ends as one in one.
+#[test]
+fn an_effect_made_of_commands_puts_both_test_masses_into_one_filter() {
+    let bundled = mission([&[], &[], &[]]);
+    let (report, made) = run(&bundled, &[1, 2], &["commands"], 6_000);
+    for tm in ["tm1", "tm2"] {
+        assert_eq!(report["quality"][tm]["followed"], json!(["tm1", "tm2"]), "{report}");
+        assert_eq!(report["quality"][tm]["states"], 38, "{report}");
+    }
+    // Forces on these two have nothing in common, so that some innovations are refused: but epochs count once.
+    assert!(report["counts"]["updates"].as_u64().is_some_and(|n| (5_900..6_000).contains(&n)), "{report}");
+    let (in_two, parts) = run(&bundled, &[1, 2], &["commands"], 2_500);
+    assert_eq!(in_two, report);
+    let rows = |made: &[Batch]| -> usize { made.iter().map(Batch::rows).sum() };
+    assert_eq!(rows(&parts), rows(&made));
+    // Without such an effect, and with one test mass, each has its own.
+    for (report, test_masses) in [
+        (run(&bundled, &[1, 2], &[], 6_000).0, vec!["tm1", "tm2"]),
+        (run(&bundled, &[2], &["commands"], 6_000).0, vec!["tm2"]),
+    ] {
+        for tm in test_masses {
+            assert_eq!(report["quality"][tm]["followed"], json!([tm]), "{report}");
+        }
+    }
+}
+
+/// 18 + 6 + 6 + 2·(10 + 9 + 5) states.
+#[test]
+fn both_test_masses_that_do_not_fit_are_followed_apart_and_the_report_says_what_that_means() {
+    let (report, _) = run(&mission([&[8, 8], &[8, 8], &[8]]), &[1, 2], &["commands"], 6_000);
+    assert_eq!(report["quality"]["tm2"]["followed"], json!(["tm2"]), "{report}");
+    let notes = report["notes"].to_string();
+    assert!(notes.contains("would have 78 states, at most 64") && notes.contains("trust qp"), "{notes}");
 }
 
 #[test]
 fn more_states_than_there_is_room_for_are_refused_with_their_number() {
-    let (columns, ..) = columns_and_rows(0);
+    let (columns, ..) = columns_and_rows(1, 0);
     let many: &[u32] = &[8; 5];
-    let mut stage = create(&mission([many, many, many]));
-    let request = LinkRequest { available: &columns, model_json: &model_json() };
+    let mut stage = create(&mission([many, many, many]), &[]);
+    let request = LinkRequest { available: &columns, model_json: &model_json(&[1]) };
     let refusal = stage.link(request).expect_err("76 states").to_string();
     assert!(refusal.contains("76 states, at most 64") && refusal.contains("readout noise"), "{refusal}");
 }

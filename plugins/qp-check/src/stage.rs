@@ -170,7 +170,14 @@ impl Linked {
             coefficients: available.coefficients.clone(),
             refinements: stage.refinements,
             refinement: stage.refinement,
-            collected: nothing_collected(&model, &measured, &layout, &available.coefficients, analyser.plan()),
+            collected: nothing_collected(
+                stage.refinement,
+                &model,
+                &measured,
+                &layout,
+                &available.coefficients,
+                analyser.plan(),
+            ),
             measured,
             segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged),
             analyser,
@@ -222,7 +229,8 @@ impl Linked {
     }
 
     fn nothing_collected(&self) -> Collected {
-        nothing_collected(&self.model, &self.measured, &self.layout, &self.coefficients, self.analyser.plan())
+        let plan = self.analyser.plan();
+        nothing_collected(self.refinement, &self.model, &self.measured, &self.layout, &self.coefficients, plan)
     }
 
     /// Too short for any spectrum: a sentence, not a number.
@@ -417,8 +425,11 @@ impl Linked {
     }
 }
 
-/// The fit in the time domain takes products of coefficients at their initial values.
+/// The fit in the time domain takes products of coefficients at their initial values. It takes channels one by one, and a prediction of a
+/// channel from its own past misses what a command knows of the others: where the model has regressors made of commands there is none,
+/// and es-akf with both test masses in one filter is the check in the time domain.
 fn nothing_collected(
+    refinement: Refinement,
     model: &NoiseModel,
     measured: &[Measured],
     layout: &Layout,
@@ -426,7 +437,11 @@ fn nothing_collected(
     plan: &Plan,
 ) -> Collected {
     let initial: Vec<f64> = coefficients.iter().map(|c| c.initial).collect();
-    Collected::new(plan, layout, Prediction::new(model, measured, &layout.linear_at(&initial), plan))
+    let prediction = match refinement {
+        Refinement::Bands => Prediction::new(model, measured, &layout.linear_at(&initial), plan),
+        Refinement::Levels => None,
+    };
+    Collected::new(plan, layout, prediction)
 }
 
 /// The fit in the time domain beside the QP, coefficient by coefficient.

@@ -33,6 +33,7 @@ pub fn model(exponents: [&[u32]; 3], leak_hz: f64) -> Model {
         acceleration_m2_s4: [[force, 0.0, 0.0], [0.0, force, 0.0], [0.0, 0.0, force]],
         bias_step_m2_s4: (3e-15_f64).powi(2) * DT_S,
         readout_m2: asd.map(|a| a * a * half_rate),
+        shakings: Vec::new(),
         chains: std::array::from_fn(|i| {
             exponents[i]
                 .iter()
