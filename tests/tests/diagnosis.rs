@@ -53,6 +53,22 @@ fn a_hidden_gain_is_found_at_its_place_and_with_its_size() {
     assert_eq!(d["candidates"].as_array().expect("a list").iter().filter(|c| c["accepted"] == true).count(), 1);
 }
 
+/// Along y a readout that shows too much makes the loop push too much, so that its scale and the electrodes' gain cannot be told apart: one
+/// of them is named, alone, and the other as its confounder. It is told from every other electrode.
+#[test]
+fn a_gain_that_looks_like_a_scale_is_named_with_it() {
+    let (d, _) = diagnosis(&["--hours", "3", "--seed", "12", "--effect", "es-gain:tm2.y=0.2"], 0);
+    let found = accepted(&d);
+    let both = ["es-gain:tm2.y", "is-scale:tm2.y"];
+    let [one] = &found[..] else { panic!("{found:?}") };
+    let other = both.iter().find(|name| **name != one.as_str()).expect("two names");
+    assert!(both.contains(&one.as_str()), "{found:?}");
+    let confounders = d["candidates"][0]["confounders"].to_string();
+    let (effect, instance) = other.split_once(':').expect("an effect and its place");
+    assert!(confounders.contains(effect) && confounders.contains(instance), "{one} without {other}: {confounders}");
+    assert!(!confounders.contains("tm1.y"), "{confounders}");
+}
+
 /// What a diagnosis accepts.
 fn accepted(d: &Value) -> Vec<String> {
     let name = |c: &Value| format!("{}:{}", c["effect"].as_str().unwrap_or("?"), c["instance"].as_str().unwrap_or("?"));
