@@ -106,6 +106,18 @@ fn a_slosh_is_found_alone_with_its_shape_and_size() {
     assert!((f0_hz / (0.065 / 0.95_f64.sqrt()) - 1.0).abs() < 0.05, "{f0_hz}");
 }
 
+/// Torques twice as loud: that, with its size, and nothing else. α̂ knows less of louder torques, and the test masses feel what it does not
+/// know: while Σ of the test masses did not say so, louder thrusters (`mps-noise:sc.y` = 1.25) and a gain of theirs (0.08) were found beside it.
+#[test]
+fn louder_torques_are_found_alone() {
+    let (d, _) = diagnosis(&["--hours", "3", "--seed", "16", "--effect", "torque-noise:sc.z=2"], 0);
+    assert_eq!(accepted(&d), ["torque-noise:sc.z"], "{:#}", d["candidates"][1]);
+    let first = &d["candidates"][0];
+    let (value, sigma) = (first["value"].as_f64().expect("a value"), first["sigma"].as_f64().expect("a sigma"));
+    // To first order in the level: an error of half a per cent of it.
+    assert!((value - 2.0).abs() < 4.0 * sigma + 0.01 && sigma < 0.05, "{value} ± {sigma}");
+}
+
 /// An hour holds three segments: a sentence, not a number.
 #[test]
 fn a_diagnosis_on_too_little_data_is_refused() {

@@ -210,7 +210,7 @@ fn provenance(lines: &[Blind]) -> String {
     let mut seconds: Vec<f64> = lines.iter().map(|l| l.diagnosis_s).collect();
     seconds.sort_by(f64::total_cmp);
     format!(
-        "{} sets, {}, hidden seeds {first} to {last}, build {}; a diagnosis took {:.0} s in the median, {:.0} s at most, two at a time.\n",
+        "{} sets, {}, hidden seeds {first} to {last}, build {}; a diagnosis took {:.0} s in the median, {:.0} s at most.\n",
         lines.len(),
         join(&|l| l.configuration.clone()).join(", "),
         join(&|l| l.build.clone()).join(", "),

@@ -17,6 +17,9 @@ use crate::witness::Coherence;
 /// Chance of naming an effect when none is hidden.
 pub const FALSE_ALARM: f64 = 0.01;
 
+/// What moves the offset is doubtful below this part of what a level of torque noise is worth.
+const BESIDE_A_LEVEL: f64 = 0.02;
+
 /// A mission file knows its noise to this: a level within it is none that is missing.
 const LEVEL_TOLERANCE: f64 = 0.15;
 
@@ -426,13 +429,17 @@ fn of_the_excess(court: &Court<'_>, fit: &Fit, trials: &Trials) -> Result<Vec<(F
 /// - What was weighed by what it explains of an excess, or would be known by what it does where there is one, `part` of its
 ///   information, while an excess, or something that housekeeping is coherent with, remains in the channels where it acts: it follows
 ///   what is there, as much else does that is slow, and does not explain it. A magnetometer sees the current whose square heats a test mass's housing.
-/// - What moves the offset, while the noise that turns the spacecraft is not the mission's: `α̂` is smoothed for that noise, and
-///   with another one all that follows the offset is biased, a gain by 5 % where torques are 40 % louder. It is to be asked
-///   again when the model has the level.
+/// - What moves the offset and is little beside a level of noise that turns the spacecraft, worth less than [`BESIDE_A_LEVEL`] of it: what
+///   α̂ does not know of such a torque is known to first order, and a resonance of 2 % followed torques three times as loud (41 of χ² to
+///   27,000). It is to be asked again when the model has the level.
 fn is_doubtful(f: &Found, part: f64, extra: &[Found], unexplained: Option<&Unexplained>) -> bool {
     // Housekeeping that is coherent with what is left says as much of what was chosen for an excess.
     let remains = |u: &Unexplained| (u.power || f.of_excess) && f.channels.iter().any(|c| u.channels.contains(c));
-    let turned = |e: &Found| e.accepted && e.channels.iter().any(|c| c.starts_with("sc.alpha."));
+    let turned = |e: &Found| {
+        e.accepted
+            && e.channels.iter().any(|c| c.starts_with("sc.alpha."))
+            && f.delta_chi2 < BESIDE_A_LEVEL * e.delta_chi2
+    };
     let moves = f.offset_shift_sigma.values().any(|sigmas| sigmas.abs() > MOVES_OFFSET);
     (f.of_excess || part > 0.5) && unexplained.is_some_and(remains) || moves && extra.iter().any(turned)
 }
@@ -569,15 +576,16 @@ fn noise_levels(court: &Court<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &
         let Some((i, level)) = best else { return out };
         let c = &court.question.coefficients[i];
         let (p_value, log10_p_value) = trials.chance(&c.effect, level.delta_chi2, 1.0);
-        // What happens once makes one half of the data louder, noise both.
-        let differ = match halves.each_ref().map(|half| half.level(&c.noise)) {
+        // What happens once makes one half of the data louder, noise both: as much within chance, or each by half of it at least.
+        let (differ, steady) = match halves.each_ref().map(|half| half.level(&c.noise)) {
             [Some(a), Some(b)] => {
                 let difference = (a.value - b.value).abs() / a.sigma.hypot(b.sigma);
-                Some(normal_tails(difference)).filter(|_| difference.is_finite())
+                let chance = Some(normal_tails(difference)).filter(|_| difference.is_finite());
+                let shows = |half: &Level| (half.value - 1.0) / (level.value - 1.0) > 0.5;
+                (chance, chance.is_none_or(|p| p > HALVES_DIFFER) || shows(&a) && shows(&b))
             }
-            _ => None,
+            _ => (None, true),
         };
-        let steady = differ.is_none_or(|p| p > HALVES_DIFFER);
         let matters = p_value < FALSE_ALARM && steady && (level.value.ln()).abs() > LEVEL_TOLERANCE.ln_1p();
         if p_value < FALSE_ALARM {
             levels.take(&level);

@@ -66,6 +66,15 @@ struct Process {
     enters: DMatrix<f64>,
 }
 
+/// A process that an effect may name.
+struct Named {
+    name: String,
+    process: Process,
+    /// What it turns the spacecraft by, SRF, over its shape; nothing for what turns nothing. What α̂ does not know of it moves the test
+    /// masses.
+    turns: Option<Vector3<f64>>,
+}
+
 /// What remains unknown of the angular acceleration once everything measured has been used, and how it enters the channels.
 struct AngularError {
     /// `B`, rows of channels, columns of α in SRF: `[b×] T_S^O` in the rows of a test mass, and `−T_S^O C J/m` where the torque
@@ -85,7 +94,7 @@ pub struct NoiseModel {
     dt_s: f64,
     processes: Vec<Process>,
     /// Processes that an effect may name, `thruster_force:sc.x`, each alone.
-    named: Vec<(String, Process)>,
+    named: Vec<Named>,
     angular_error: Option<AngularError>,
     /// Channels of whose noise the mission says nothing; they start as white with unit PSD and are measured.
     pub unknown: Vec<usize>,
@@ -207,6 +216,9 @@ impl NoiseModel {
                 let (column, level) = (enters.column(axis), thrusters.torque[(axis, axis)]);
                 let own = column * column.transpose() * level;
                 model.name(format!("thruster_torque:sc.{name}"), &thrusters.torque_shape, Response::Held, own);
+                if let Some(named) = model.named.last_mut() {
+                    named.turns = Some(inverse_inertia.column(axis) * level.sqrt());
+                }
             }
             let seen = &enters * dynamic(&thrusters.torque) * enters.transpose();
             model.add(thrusters.torque_shape.clone(), Response::Held, seen);
@@ -242,16 +254,26 @@ impl NoiseModel {
 
     fn name(&mut self, name: String, shape: &NoiseShape, response: Response, enters: DMatrix<f64>) {
         if enters.iter().any(|x| *x != 0.0) {
-            self.named.push((name, Process { shape: shape.clone(), response, enters }));
+            self.named.push(Named { name, process: Process { shape: shape.clone(), response, enters }, turns: None });
         }
     }
 
     /// One-sided cross-spectral matrix of one process alone, by its name: `thruster_force:sc.x`, `thruster_torque:sc.z`,
     /// `readout:tm1.y`; `None` where the mission or the channels have no such process.
+    ///
+    /// Of a torque it is what Σ gains by a little more of it: in the attitude's channels the torque itself, in the test masses' what α̂ does
+    /// not know of it. α̂ follows the level (`hinf-dfacs` measures it), so that its error stays orthogonal to the attitude's residuals.
     #[must_use]
     pub fn process_psd(&self, name: &str, frequency_hz: f64) -> Option<DMatrix<f64>> {
-        let (_, p) = self.named.iter().find(|(n, _)| n == name)?;
-        Some(&p.enters * (p.shape.psd(frequency_hz) * self.response(p.response, frequency_hz)))
+        let Named { process: p, turns, .. } = self.named.iter().find(|n| n.name == name)?;
+        let power = p.shape.psd(frequency_hz) * self.response(p.response, frequency_hz);
+        let mut psd = &p.enters * power;
+        if let (Some(turns), Some(error)) = (turns, &self.angular_error) {
+            let [held, differenced] = [Response::Held, Response::Readout].map(|r| self.response(r, frequency_hz));
+            let moves = &error.lever * dynamic(&error.unknown_part(held, differenced, frequency_hz)) * turns;
+            psd += &moves * moves.transpose() * power;
+        }
+        Some(psd)
     }
 
     /// One-sided cross-spectral matrix at `frequency_hz`, channels × channels, units of the channels squared per Hz.
@@ -276,7 +298,7 @@ impl NoiseModel {
 
     /// Names of the processes that [`Self::process_psd`] knows.
     pub fn process_names(&self) -> impl Iterator<Item = &str> {
-        self.named.iter().map(|(name, _)| name.as_str())
+        self.named.iter().map(|n| n.name.as_str())
     }
 
     /// Per channel, whether it is the residual of a known motion; one that is measured directly holds the motion itself.
@@ -313,16 +335,21 @@ impl NoiseModel {
 }
 
 impl AngularError {
+    /// The part of an angular acceleration that is not known, `S_n (S_w + S_n)⁻¹`: `remaining` is this times `S_w`, and changes by this
+    /// times a change of `S_w` times its transpose.
+    fn unknown_part(&self, held: f64, differenced: f64, frequency_hz: f64) -> Matrix3<f64> {
+        let Some(attitude) = &self.attitude else { return Matrix3::identity() };
+        let sw = self.disturbance * (held * self.torque.psd(frequency_hz));
+        let sn = Matrix3::from_diagonal(&Vector3::repeat(differenced * attitude.psd(frequency_hz)));
+        (sw + sn).try_inverse().map_or_else(Matrix3::identity, |inverse| sn * inverse)
+    }
+
     /// `R_α = S_w − S_w (S_w + S_n)⁻¹ S_w`: torque noise S_w as the channels see it, given an attitude readout of noise S_n.
     fn remaining(&self, held: f64, differenced: f64, frequency_hz: f64) -> Matrix3<f64> {
         let sw = self.disturbance * (held * self.torque.psd(frequency_hz));
-        let Some(attitude) = &self.attitude else { return sw };
-        let sn = Matrix3::from_diagonal(&Vector3::repeat(differenced * attitude.psd(frequency_hz)));
-        // S_w (S_w+S_n)⁻¹ S_n, the same without the difference of near-equal matrices where the readout is good.
-        (sw + sn).try_inverse().map_or(sw, |inverse| {
-            let r = sw * inverse * sn;
-            0.5 * (r + r.transpose())
-        })
+        // S_n (S_w+S_n)⁻¹ S_w, the same as above without the difference of near-equal matrices where the readout is good.
+        let r = self.unknown_part(held, differenced, frequency_hz) * sw;
+        0.5 * (r + r.transpose())
     }
 }
 
@@ -377,6 +404,38 @@ mod tests {
         let readout = 1.8e-9 * (std::f64::consts::TAU * 0.01).powi(2);
         assert!(values[2] < 3.0 * readout.powi(2), "{values:?}");
         assert!(values[3] > 1e2 * values[2]);
+    }
+
+    /// What a process adds to Σ is what Σ gains when the mission file says a little more of it: for a torque in the attitude's channels and,
+    /// through what α̂ does not know, in the test masses'. By differences of two noise models, for every process.
+    #[test]
+    fn a_process_is_what_sigma_gains_by_a_little_more_of_it() {
+        let more = 1e-6_f64;
+        let louder = |table: &dyn Fn(&mut Mission)| {
+            let mut mission = taiji();
+            table(&mut mission);
+            NoiseModel::new(&mission, &NINE.map(|c| (c, Measured::Differenced)), 0.1).expect("a model")
+        };
+        let factor = (1.0 + more).sqrt();
+        let torque = louder(&|m| m.noise.thruster_torque.as_mut().expect("there").asd_nm_rthz *= factor);
+        let force = louder(&|m| m.noise.thruster_force.as_mut().expect("there").asd_n_rthz *= factor);
+        let base = nine();
+        for f in [1e-3, 0.03, 0.08, 0.3, 2.0] {
+            for (louder, process) in [(&torque, "thruster_torque"), (&force, "thruster_force")] {
+                let gained = (louder.psd(f) - base.psd(f)) / more;
+                let parts = ["x", "y", "z"].map(|a| base.process_psd(&format!("{process}:sc.{a}"), f).expect("there"));
+                let sum = &parts[0] + &parts[1] + &parts[2];
+                let scale = |i: usize, j: usize| (base.psd(f)[(i, i)] * base.psd(f)[(j, j)]).sqrt();
+                for i in 0..9 {
+                    for j in 0..9 {
+                        let error = (gained[(i, j)] - sum[(i, j)]).abs();
+                        assert!(error < 1e-5 * scale(i, j), "{process} at {f} Hz, {i} {j}: {error:e}");
+                    }
+                }
+                // At 0.3 Hz α̂ does not know the torque, and Σ of x shows it.
+                assert!(process == "thruster_force" || f != 0.3 || sum[(0, 0)] > 0.01 * base.psd(f)[(0, 0)], "{sum}");
+            }
+        }
     }
 
     /// A perfect readout leaves nothing unknown, a blind one the whole torque noise.

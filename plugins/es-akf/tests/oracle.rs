@@ -210,7 +210,7 @@ fn six_axes_with_coloured_shaking_agree_with_dense_matrices() {
     model.prior_covariance(|i, j, value| p[(i, j)] = value);
     // Q from what acts in a step: the forces, held, and each shaking's white noise on axes and states at once.
     model.process_noise(|i, j, value| {
-        if i >= 12 && i < 18 || i >= 26 {
+        if (12..18).contains(&i) || i >= 26 {
             q[(i, j)] = value;
         }
     });
