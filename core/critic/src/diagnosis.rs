@@ -784,9 +784,14 @@ mod tests {
         assert!(!is_doubtful(&of_excess, 0.1, &[], Some(&excess("tm2.accel.z", true))));
         assert!(!is_doubtful(&of_excess, 0.1, &[], None));
         let (gain, still) = (found(&["tm1.accel.y"], 12.0, true), found(&["tm1.accel.y"], 1.0, true));
-        let torque = [found(&["sc.alpha.z"], 0.0, true)];
+        let level = |channel: &str, accepted, times: f64| {
+            [Found { delta_chi2: times * gain.delta_chi2, ..found(&[channel], 0.0, accepted) }]
+        };
+        let torque = level("sc.alpha.z", true, 100.0);
         assert!(is_doubtful(&gain, 0.0, &torque, None) && !is_doubtful(&still, 0.0, &torque, None));
-        assert!(!is_doubtful(&gain, 0.0, &[found(&["sc.alpha.z"], 0.0, false)], None));
-        assert!(!is_doubtful(&gain, 0.0, &[found(&["tm1.accel.y"], 0.0, true)], None));
+        // A cause that is worth a tenth of the level is no trace of it.
+        assert!(!is_doubtful(&gain, 0.0, &level("sc.alpha.z", true, 10.0), None));
+        assert!(!is_doubtful(&gain, 0.0, &level("sc.alpha.z", false, 100.0), None));
+        assert!(!is_doubtful(&gain, 0.0, &level("tm1.accel.y", true, 100.0), None));
     }
 }
