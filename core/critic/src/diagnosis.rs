@@ -50,6 +50,11 @@ const EXCESS_SIGMA: f64 = 4.5;
 /// Chance that any driver passes for a witness when none is: a part of [`FALSE_ALARM`], the most of which is left to effects.
 const WITNESS_ALARM: f64 = 1e-3;
 
+/// Where there is no excess of power, a witness that explains no more than this part of a channel's power, in the band that says most, is
+/// no sign of something unexplained. In a day a few per cent are certain, and a thruster's current goes with the residuals by as much
+/// without driving them: it follows a command, which is made of the readouts that the residuals are made of.
+const LEAST_EXPLAINED: f64 = 0.1;
+
 /// Why a candidate has no number.
 const MUTE: &str =
     "these data say nothing of it: what it is made of does not change in them, or the model has the same already";
@@ -674,7 +679,7 @@ fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
     if !power {
         // What explains a part of the power leaves the rest: so much more there is than without it.
         let of = |w: &Coherence| channels.iter().position(|c| *c == w.channel);
-        let best = significant.first()?;
+        let best = significant.iter().find(|w| w.explained > LEAST_EXPLAINED)?;
         loud.push((of(best)?, best.band_hz, (1.0 - best.explained.clamp(0.0, 0.999)).recip()));
     }
     let (_, band_hz, ratio) = *loud.iter().max_by(|a, b| a.2.total_cmp(&b.2))?;

@@ -60,7 +60,7 @@ pub struct Coherence {
     /// How often chance had its say: drivers of one channel of housekeeping and products of two have half each, however many there are
     /// of them.
     pub trials: f64,
-    /// Part of the residual's power that is coherent, in the band where that is largest.
+    /// Part of the residual's power that is coherent, in the band that says most of it; among few observations a larger part is chance.
     pub explained: f64,
     /// That band, Hz.
     pub band_hz: [f64; 2],
@@ -330,6 +330,7 @@ impl Witnesses {
         for (d, driver) in self.drivers.iter().enumerate() {
             for (c, channel) in channels.iter().enumerate() {
                 let (mut statistic, mut dof, mut explained, mut band_hz) = (0.0, 0.0, 0.0, [0.0; 2]);
+                let mut most = 0.0;
                 for (b, [first, end]) in self.bands.iter().enumerate() {
                     let n = self.observations[b];
                     let power = self.power[(d, b)] * self.residual_power[(b, c)];
@@ -339,10 +340,12 @@ impl Witnesses {
                     let column = b * channels.len() + c;
                     let squared = (self.cross[0][(d, column)].powi(2) + self.cross[1][(d, column)].powi(2)) / power;
                     // Without any relation |γ|² is above x with a chance of (1 − x)^(n−1), and 1/n in the mean.
-                    statistic -= 2.0 * (n - 1.0) * (-squared.min(1.0 - 1e-12)).ln_1p();
+                    let said = -2.0 * (n - 1.0) * (-squared.min(1.0 - 1e-12)).ln_1p();
+                    statistic += said;
                     dof += 2.0;
-                    if squared - 1.0 / n > explained {
-                        explained = squared - 1.0 / n;
+                    if said > most {
+                        most = said;
+                        explained = (squared - 1.0 / n).max(0.0);
                         band_hz = [*first as f64 * self.bin_hz, (*end - 1) as f64 * self.bin_hz];
                     }
                 }
