@@ -3,37 +3,50 @@
 
 use dragfree_tests::calibration::{Run, of_pipeline};
 use dragfree_tests::{coefficient, dragfree, expect, fixture};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
+use std::sync::OnceLock;
+use tempfile::TempDir;
 
 const HIDDEN: [(&str, f64); 3] = [("es-gain:tm1.y", 0.1), ("mps-gain:sc.y", 0.06), ("es-gain:tm2.z", 0.0)];
 
-/// Six hours with the gains of [`HIDDEN`], and a model that estimates all of them.
-fn telemetry_and_model(folder: &Path) -> (PathBuf, PathBuf) {
-    let mut simulate = dragfree(folder);
-    simulate.arg("simulate").arg(fixture("missions/taiji.toml")).args(["--out", "sc", "--hours", "6", "--seed", "21"]);
-    let model = folder.join("model.toml");
-    std::fs::copy(fixture("models/com-offset.toml"), &model).expect("writable");
-    for (effect, value) in HIDDEN {
-        if value != 0.0 {
-            simulate.args(["--effect", &format!("{effect}={value}")]);
+/// Telemetry and a model in a folder of their own.
+type Prepared = (TempDir, PathBuf, PathBuf);
+
+/// Six hours with the gains of [`HIDDEN`], and a model that estimates all of them; simulated once for all tests.
+fn telemetry_and_model() -> &'static Prepared {
+    static PREPARED: OnceLock<Prepared> = OnceLock::new();
+    PREPARED.get_or_init(|| {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        let mut simulate = dragfree(dir.path());
+        simulate.arg("simulate").arg(fixture("missions/taiji.toml"));
+        simulate.args(["--out", "sc", "--hours", "6", "--seed", "21"]);
+        let model = dir.path().join("model.toml");
+        std::fs::copy(fixture("models/com-offset.toml"), &model).expect("writable");
+        for (effect, value) in HIDDEN {
+            if value != 0.0 {
+                simulate.args(["--effect", &format!("{effect}={value}")]);
+            }
+            expect(dragfree(dir.path()).args(["model", "add"]).arg(&model).arg(effect), 0);
         }
-        expect(dragfree(folder).args(["model", "add"]).arg(&model).arg(effect), 0);
-    }
-    expect(&mut simulate, 0);
-    (folder.join("sc/SC1_2035-01-01.mcap"), model)
+        expect(&mut simulate, 0);
+        let file = dir.path().join("sc/SC1_2035-01-01.mcap");
+        (dir, file, model)
+    })
 }
 
 /// Science mode with parameters of es-akf.
-fn run(folder: &Path, file: &Path, model: &Path, parameters: &str) -> Run {
+fn run(parameters: &str) -> Run {
+    let (_, file, model) = telemetry_and_model();
+    let dir = tempfile::tempdir().expect("a temporary folder");
     let text = std::fs::read_to_string(fixture("pipelines/science-mode.toml")).expect("readable");
     let stage = "plugin = \"es-akf\"";
     assert!(text.contains(stage));
     let text = text
         .replace("../", &format!("{}/", fixture("").display()))
         .replace(stage, &format!("{stage}\nparameters = {{ {parameters} }}"));
-    let pipeline = folder.join("pipeline.toml");
+    let pipeline = dir.path().join("pipeline.toml");
     std::fs::write(&pipeline, text).expect("writable");
-    Run::of(of_pipeline(folder, &pipeline).arg(file).arg("--model").arg(model))
+    Run::of(of_pipeline(dir.path(), &pipeline).arg(file).arg("--model").arg(model))
 }
 
 fn name(effect: &str) -> String {
@@ -44,9 +57,7 @@ fn name(effect: &str) -> String {
 /// as both solutions rest on the same data.
 #[test]
 fn gains_are_right_in_both_solutions_and_the_solutions_agree() {
-    let dir = tempfile::tempdir().expect("a temporary folder");
-    let (file, model) = telemetry_and_model(dir.path());
-    let together = run(dir.path(), &file, &model, "");
+    let together = run("");
     together.assert_ended(0, "agree");
     assert_eq!(together.product["quality"]["stages"]["es-akf"]["tm1"]["followed"], serde_json::json!(["tm1", "tm2"]));
     for (effect, truth) in HIDDEN {
@@ -62,9 +73,7 @@ fn gains_are_right_in_both_solutions_and_the_solutions_agree() {
 /// The twin: with a filter for each test mass the same gains are far off, and the verdict says so.
 #[test]
 fn filters_that_know_one_test_mass_each_find_gains_that_are_not_there() {
-    let dir = tempfile::tempdir().expect("a temporary folder");
-    let (file, model) = telemetry_and_model(dir.path());
-    let apart = run(dir.path(), &file, &model, "follow = \"each\"");
+    let apart = run("follow = \"each\"");
     apart.assert_ended(4, "disagree");
     for (effect, truth) in HIDDEN {
         let (value, sigma) = coefficient(&apart.product, &name(effect), "es-akf");
