@@ -122,8 +122,7 @@ fn louder_torques_are_found_alone() {
     assert_eq!(accepted(&d), ["torque-noise:sc.z"], "{:#}", d["candidates"][1]);
     let first = &d["candidates"][0];
     let (value, sigma) = (first["value"].as_f64().expect("a value"), first["sigma"].as_f64().expect("a sigma"));
-    // To first order in the level: an error of half a per cent of it.
-    assert!((value - 2.0).abs() < 4.0 * sigma + 0.01 && sigma < 0.05, "{value} ± {sigma}");
+    assert!((value - 2.0).abs() < 4.0 * sigma && sigma < 0.05, "{value} ± {sigma}");
 }
 
 /// An hour holds three segments: a sentence, not a number.

@@ -266,7 +266,8 @@ impl<'a> Court<'a> {
         Ok(levels.deviance(&measured, &vec![false; self.plan.bands.len()]))
     }
 
-    /// Of a candidate that colours the noise, the form with the highest likelihood: the scores know nothing of the colour. From the forms with the best scores to a neighbour on the grid of shapes, as long as one is better. `None` for
+    /// Of a candidate that colours the noise, the form with the highest likelihood: the scores know nothing of the colour. From the forms
+    /// with the best scores to a neighbour on the grid of shapes, as long as one is better. `None` for
     /// one that colours nothing.
     ///
     /// # Errors
