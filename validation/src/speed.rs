@@ -38,6 +38,8 @@ pub struct Ratio {
 /// How often a whole program is timed; the median counts.
 const REPEATS: usize = 3;
 const DAY_S: f64 = 86_400.0;
+/// What the benchmark of candidates adds up.
+const SIX_HOURS_S: f64 = 21_600.0;
 
 impl Speed {
     /// Reads a file; none where there is none.
@@ -78,10 +80,10 @@ fn criterion(name: &[&str]) -> Result<f64, CampaignError> {
     estimates["median"]["point_estimate"].as_f64().ok_or_else(|| file(&path, &"no median"))
 }
 
-fn bench(package: &str) -> Result<(), CampaignError> {
+fn bench(package: &str, name: &str) -> Result<(), CampaignError> {
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let mut command = Command::new(cargo);
-    command.current_dir(root()).args(["bench", "--quiet", "-p", package, "--bench", "step"]);
+    command.current_dir(root()).args(["bench", "--quiet", "-p", package, "--bench", name]);
     command.stdout(std::process::Stdio::null());
     match command.status() {
         Ok(status) if status.success() => Ok(()),
@@ -95,10 +97,14 @@ fn bench(package: &str) -> Result<(), CampaignError> {
 /// # Errors
 /// [`CampaignError`].
 pub fn measure(program: &Program, path: &Path, scratch: &Path) -> Result<(), CampaignError> {
-    bench("dragfree-es-akf")?;
+    bench("dragfree-es-akf", "step")?;
+    bench("dragfree-critic", "candidates")?;
     const STEP: &str = "es-akf step, 22 states";
     let dense = criterion(&[STEP, "dense nalgebra"])?;
     let step = |name: &str| Ok::<_, CampaignError>(dense / criterion(&[STEP, name])?);
+
+    const CANDIDATES: &str = "100 candidates";
+    let seconds = |name: &str| Ok::<_, CampaignError>(1e-9 * criterion(&[CANDIDATES, name])?);
 
     let workshop = Workshop::new(scratch)?;
     let program = program.with_threads(2);
@@ -123,6 +129,7 @@ pub fn measure(program: &Program, path: &Path, scratch: &Path) -> Result<(), Cam
         command: command.to_owned(),
     };
     let bench = "cargo bench -p dragfree-es-akf --bench step";
+    let candidates = "cargo bench -p dragfree-critic --bench candidates";
     let speed = Speed {
         date,
         ratios: vec![
@@ -139,6 +146,18 @@ pub fn measure(program: &Program, path: &Path, scratch: &Path) -> Result<(), Cam
                 DAY_S / median(simulating),
                 50_000.0,
                 "dragfree simulate fixtures/missions/taiji.toml --out DIR --days 1",
+            ),
+            ratio(
+                "normal equations of 100 candidates, two threads, than real time; the bar is ten seconds a day",
+                SIX_HOURS_S / seconds("sums of six hours")?,
+                DAY_S / 10.0,
+                candidates,
+            ),
+            ratio(
+                "model fitted and 100 candidates ranked from stacked sums, than a tenth of a second",
+                0.1 / seconds("fit and rank")?,
+                1.0,
+                candidates,
             ),
         ],
     };

@@ -4,6 +4,8 @@
 //! `(fM/r)⁵`, which matters, as a second difference of readout noise is 1e8 times louder there than where it would land. All columns
 //! pass the same filter, so what one explains of another stays what it was; spectra are divided by the response.
 
+use nalgebra::{DVector, DVectorView};
+
 /// Running means in a row.
 const ORDER: i32 = 5;
 
@@ -26,17 +28,21 @@ impl Response {
 #[derive(Clone, Debug)]
 pub struct Decimator {
     factor: usize,
-    kernel: Vec<f64>,
+    kernel: DVector<f64>,
     /// Samples that outputs to come still need, per column, and the time of the first, ns.
     pending: Vec<Vec<f64>>,
     first_ns: i64,
     step_ns: i64,
+    threads: usize,
 }
 
+/// Samples of all columns that are worth a thread.
+const WORTH_A_THREAD: usize = 1 << 16;
+
 impl Decimator {
-    /// For `columns` columns with a sample every `step_ns`.
+    /// For `columns` columns with a sample every `step_ns`, shared among `threads`.
     #[must_use]
-    pub fn new(factor: usize, columns: usize, step_ns: i64) -> Self {
+    pub fn new(factor: usize, columns: usize, step_ns: i64, threads: usize) -> Self {
         let mean = vec![1.0 / factor as f64; factor];
         let convolved = |kernel: Vec<f64>| {
             let mut out = vec![0.0; kernel.len() + factor - 1];
@@ -44,7 +50,7 @@ impl Decimator {
             out
         };
         let kernel = (0..ORDER).fold(vec![1.0], |kernel, _| convolved(kernel));
-        Self { factor, kernel, pending: vec![Vec::new(); columns], first_ns: 0, step_ns }
+        Self { factor, kernel: kernel.into(), pending: vec![Vec::new(); columns], first_ns: 0, step_ns, threads }
     }
 
     /// Nanoseconds between samples that are kept.
@@ -64,22 +70,39 @@ impl Decimator {
         if self.pending.first().is_none_or(Vec::is_empty) {
             self.first_ns = first_ns;
         }
-        self.pending.iter_mut().zip(columns).for_each(|(pending, x)| pending.extend_from_slice(x));
         let length = self.kernel.len();
-        let samples = self.pending.first().map_or(0, Vec::len);
+        let new = columns.first().map_or(0, |c| c.len());
+        let samples = self.pending.first().map_or(0, Vec::len) + new;
         let kept = if samples < length { 0 } else { (samples - length) / self.factor + 1 };
         let middle_ns = self.first_ns + (length as i64 - 1) * self.step_ns / 2;
         let times = (0..kept as i64).map(|m| middle_ns + m * self.step_ns()).collect();
         let (kernel, factor) = (&self.kernel, self.factor);
-        let filtered = |pending: &mut Vec<f64>| {
-            let at = |m: usize| pending[m * factor..].iter().zip(kernel).map(|(x, h)| x * h).sum();
+        let filter = |pending: &mut Vec<f64>, samples: &[f64]| {
+            pending.extend_from_slice(samples);
+            let at = |m: usize| kernel.dot(&DVectorView::from_slice(&pending[m * factor..], length));
             let out = (0..kept).map(at).collect();
             pending.drain(..kept * factor);
             out
         };
-        let columns = self.pending.iter_mut().map(filtered).collect();
+        let mut thinned = vec![Vec::new(); columns.len()];
+        let threads = if new * columns.len() < WORTH_A_THREAD { 1 } else { self.threads };
+        let each = columns.len().div_ceil(threads).max(1);
+        let shares = thinned.chunks_mut(each).zip(self.pending.chunks_mut(each)).zip(columns.chunks(each));
+        std::thread::scope(|scope| {
+            for (k, ((out, pending), columns)) in shares.enumerate() {
+                let work = move || {
+                    let columns = out.iter_mut().zip(pending).zip(columns);
+                    columns.for_each(|((out, pending), samples)| *out = filter(pending, samples));
+                };
+                if k + 1 < threads {
+                    scope.spawn(work);
+                } else {
+                    work();
+                }
+            }
+        });
         self.first_ns += kept as i64 * self.step_ns();
-        (times, columns)
+        (times, thinned)
     }
 
     /// The run has ended.
@@ -97,20 +120,20 @@ mod tests {
     #[test]
     fn slow_waves_pass_and_fast_ones_do_not_fold() {
         let wave = |cycles: f64| -> Vec<f64> {
-            (0..20_000).map(|k| (std::f64::consts::TAU * cycles * f64::from(k) + 0.3).cos()).collect()
+            (0..40_000).map(|k| (std::f64::consts::TAU * cycles * f64::from(k) + 0.3).cos()).collect()
         };
         let (slow, fast) = (wave(2e-4), wave(1.0 / 32.0 + 2e-4));
-        for portion in [20_000, 777, 8] {
-            let mut decimator = Decimator::new(32, 2, 100_000_000);
+        for portion in [40_000, 777, 8] {
+            let mut decimator = Decimator::new(32, 2, 100_000_000, 2);
             let (mut times, mut values) = (Vec::new(), [Vec::new(), Vec::new()]);
-            for at in (0..20_000).step_by(portion) {
-                let end = (at + portion).min(20_000);
+            for at in (0..40_000).step_by(portion) {
+                let end = (at + portion).min(40_000);
                 let (t, v) = decimator.push(1_000 + at as i64 * 100_000_000, &[&slow[at..end], &fast[at..end]]);
                 times.extend(t);
                 v.into_iter().zip(&mut values).for_each(|(v, all)| all.extend(v));
             }
             // Five means of 32 need 156 samples, and one in 32 is kept.
-            assert_eq!(times.len(), (20_000 - 156) / 32 + 1);
+            assert_eq!(times.len(), (40_000 - 156) / 32 + 1);
             assert_eq!((times[0], times[1] - times[0]), (1_000 + 7_750_000_000, 3_200_000_000));
             let gain = decimator.response().at(2e-4);
             for (m, (t, x)) in times.iter().zip(&values[0]).enumerate() {

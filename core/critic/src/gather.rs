@@ -171,8 +171,8 @@ pub struct Gatherer {
     segmenter: Segmenter,
     long: Plan,
     long_bench: Bench,
-    /// What has been gathered.
-    pub gathered: Gathered,
+    /// Grams from the diagonal down.
+    gathered: Gathered,
 }
 
 /// Samples into spectra into sums.
@@ -210,7 +210,7 @@ impl Bench {
         });
     }
 
-    /// `G_b += A_bᵀ A_b` in every band, the bands shared among the threads by the work in them.
+    /// `G_b += A_bᵀ A_b` in every band from the diagonal down, the bands shared among the threads by the work in them.
     fn multiply(&self, bins: &[Range<usize>], grams: &mut [DMatrix<f64>]) {
         let spectra = &self.spectra;
         let earliest = bins.iter().filter(|b| !b.is_empty()).map(|b| b.start).min();
@@ -232,8 +232,7 @@ impl Bench {
                 (rest, first) = (others, first + count);
                 scope.spawn(move || {
                     for (g, bins) in mine.iter_mut().zip(bins).filter(|(_, b)| !b.is_empty()) {
-                        let part = spectra.view((2 * (bins.start - self.first_bin), 0), (2 * bins.len(), g.ncols()));
-                        g.gemm(1.0, &part.transpose(), &part, 1.0);
+                        add_square(g, &spectra.rows(2 * (bins.start - self.first_bin), 2 * bins.len()));
                     }
                 });
             }
@@ -242,6 +241,21 @@ impl Bench {
 
     fn base(&self, columns: usize) -> DMatrixView<'_, f64> {
         self.spectra.columns(0, columns)
+    }
+}
+
+/// Columns of a block of [`add_square`].
+const BLOCK: usize = 64;
+
+/// `G += AᵀA` from the diagonal down, with the first columns of A: blocks of columns meet themselves and what follows.
+fn add_square(g: &mut DMatrix<f64>, a: &DMatrixView<'_, f64>) {
+    let n = g.ncols();
+    let a = a.columns(0, n);
+    let transposed = a.transpose();
+    for first in (0..n).step_by(BLOCK) {
+        let (block, rest) = (BLOCK.min(n - first), n - first);
+        let mut out = g.view_mut((first, first), (rest, block));
+        out.gemm(1.0, &transposed.rows(first, rest), &a.columns(first, block), 1.0);
     }
 }
 
@@ -264,7 +278,7 @@ impl Gatherer {
         let low_bands = (0..whole.bands.len().min(long.bands.len())).take_while(|b| slow(*b)).count();
         let witnesses = witnesses(&long);
         let all = columns.names.len() + witnesses.names.len();
-        let decimator = Decimator::new(factor, all, (1e9 / rate_hz).round() as i64);
+        let decimator = Decimator::new(factor, all, (1e9 / rate_hz).round() as i64, threads);
         let gram = Gram::zero(&columns, &whole);
         Self {
             low_bands,
@@ -287,6 +301,14 @@ impl Gatherer {
             short,
             long,
         }
+    }
+
+    /// What has been gathered.
+    #[must_use]
+    pub fn finish(mut self) -> Gathered {
+        let bands = self.gathered.sets.iter_mut().flat_map(|set| &mut set.bands);
+        bands.for_each(DMatrix::fill_upper_triangle_with_lower_triangle);
+        self.gathered
     }
 
     fn hour(&mut self, taper: usize, middle_ns: i64) {
@@ -357,7 +379,6 @@ impl Cuts for Gatherer {
     }
 
     fn segment(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
-        let columns = &columns[..self.gathered.columns.fast];
         let middle_ns = middle_ns(first_ns, columns, self.short.rate_hz);
         let set = &mut self.gathered.sets[set_of(middle_ns)];
         let bands = self.low_bands..self.whole.bands.len();
@@ -373,7 +394,7 @@ impl Cuts for Gatherer {
         }
     }
 
-    fn samples(&mut self, first_ns: i64, columns: &[&[f64]]) {
+    fn rows(&mut self, first_ns: i64, columns: &[&[f64]]) {
         let (decimator, segmenter, mut low) = self.low();
         let (times, thinned) = decimator.push(first_ns, columns);
         let thinned: Vec<&[f64]> = thinned.iter().map(Vec::as_slice).collect();

@@ -12,7 +12,7 @@ use std::collections::BTreeMap;
 
 use dragfree_estimation::estimate::{Estimate, EstimateError, Observed, Refinement, colours, estimate_with};
 use dragfree_estimation::levels::Levels;
-use dragfree_estimation::sigma::NoiseModel;
+use dragfree_estimation::sigma::{BandNoise, NoiseModel};
 use dragfree_estimation::spectra::{Layout, Plan, Spectra, Sums};
 use nalgebra::{Cholesky, DMatrix, DVector};
 
@@ -117,6 +117,7 @@ pub struct Court<'a> {
     pub total: Gram,
     /// Noise of the mission.
     pub noise: &'a NoiseModel,
+    noise_in_bands: BandNoise<'a>,
     plan: Plan,
 }
 
@@ -139,7 +140,9 @@ impl<'a> Court<'a> {
     /// Takes the sums.
     #[must_use]
     pub fn new(question: &'a Question, gathered: &'a Gathered, noise: &'a NoiseModel) -> Self {
-        Self { question, gathered, total: gathered.total(), noise, plan: gathered.plan() }
+        let plan = gathered.plan();
+        let noise_in_bands = BandNoise::new(noise, &plan);
+        Self { question, gathered, total: gathered.total(), noise, noise_in_bands, plan }
     }
 
     /// Bands.
@@ -167,7 +170,8 @@ impl<'a> Court<'a> {
         let observed = Observed { layout: &layout, plan: &self.plan, sums: &sums, prediction: None };
         let unknowns = self.question.unknowns(added);
         let bounds = self.question.bounds();
-        let estimate = estimate_with(&observed, self.noise, &unknowns, &bounds, refinements, Refinement::Levels)?;
+        let estimate =
+            estimate_with(&observed, &self.noise_in_bands, &unknowns, &bounds, refinements, Refinement::Levels)?;
         Ok(Solved { layout, columns, estimate })
     }
 
@@ -688,7 +692,7 @@ mod tests {
         let slices = [&first, &second, &model, &lasting, &event].map(Vec::as_slice);
         segmenter.cut(&time_ns, &slices, &mut gatherer);
         segmenter.cut_end(&mut gatherer);
-        gatherer.gathered
+        gatherer.finish()
     }
 
     fn noise() -> NoiseModel {

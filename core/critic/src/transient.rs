@@ -115,6 +115,7 @@ pub struct Search {
     inverses: Vec<(f64, DMatrix<f64>)>,
     /// One of [`NEAR_S`].
     near_s: f64,
+    threads: usize,
     /// What segments of a length need, made for the first of each.
     prepared: BTreeMap<usize, Prepared>,
 }
@@ -157,7 +158,13 @@ impl Search {
     /// Hz, and `Σ⁻¹` in it.
     #[must_use]
     pub fn new(templates: Vec<Template>, residual: DMatrix<f64>, inverses: Vec<(f64, DMatrix<f64>)>) -> Self {
-        Self { templates, residual, inverses, near_s: NEAR_S[0], prepared: BTreeMap::new() }
+        Self { templates, residual, inverses, near_s: NEAR_S[0], threads: 1, prepared: BTreeMap::new() }
+    }
+
+    /// The same with the templates shared among threads.
+    #[must_use]
+    pub fn on(self, threads: usize) -> Self {
+        Self { threads: threads.max(1), ..self }
     }
 
     /// The same for samples of which `factor` have become one, up to a frequency.
@@ -171,7 +178,8 @@ impl Search {
         };
         let inverses = self.inverses.iter().take_while(|(end_hz, _)| *end_hz <= below_hz).cloned().collect();
         let templates = self.templates.iter().map(template).collect();
-        Self { near_s: NEAR_S[1], ..Self::new(templates, self.residual.clone(), inverses) }
+        let thinned = Self::new(templates, self.residual.clone(), inverses).on(self.threads);
+        Self { near_s: NEAR_S[1], ..thinned }
     }
 
     /// Bins of a segment of `n` samples in each band.
@@ -279,45 +287,79 @@ impl Search {
             white.rows_mut(start, rows).copy_from(&(whole.rows(start, rows) * inverse));
         }
         let prepared = self.prepared.remove(&n).unwrap_or_else(|| self.prepare(plan, n));
-        let mut time = vec![0.0; n];
         // Segments that overlap by half cover every time once with their middle halves.
         let middle = match part {
             Part::MiddleHalf => n / 4..3 * n / 4,
             Part::All => 0..n,
         };
-        for (of, filter) in prepared.filters.iter().enumerate() {
-            let least = LEAST_VARIANCE.sqrt();
-            let looked: Vec<usize> = middle.clone().filter(|k| filter.deviation[*k] > least).collect();
-            if filter.root <= 0.0 || looked.is_empty() {
-                continue;
-            }
-            found.tried += TAU.sqrt() * LOUD * filter.spread_hz * looked.len() as f64 / plan.rate_hz;
-            let mut spectrum = self.filtered(plan, n, of, &white, &prepared);
-            let power: f64 = spectrum.iter().map(Complex64::norm_sqr).sum();
-            if prepared.inverse.process(&mut spectrum, &mut time).is_err() {
-                continue;
-            }
-            // The transform sums the bins of both signs.
-            let significance = |k: usize| 0.5 * time[k] / (filter.deviation[k] * filter.root);
-            // Noise may be louder than Σ says. Its median does not see what happens a few times and is soon over; and what a peak
-            // leaves of the filtered power does not see what happens once, however long it rings.
-            let mut sizes: Vec<f64> = looked.iter().map(|k| significance(*k).abs()).collect();
-            let half = sizes.len() / 2;
-            let median = *sizes.select_nth_unstable_by(half, f64::total_cmp).1 / MEDIAN;
-            let peak =
-                looked.iter().map(|k| (0.5 * time[*k] / (filter.root * filter.root)).powi(2)).fold(0.0, f64::max);
-            let left = (power - peak * filter.squares) / (WINDOW_POWER * filter.root * filter.root);
-            let louder = median.min(left.max(0.0).sqrt()).max(1.0);
-            for k in looked {
-                let sigmas = significance(k).abs() / louder;
-                if sigmas > LEAST {
-                    let at_ns = first_ns + (k as f64 * 1e9 / plan.rate_hz).round() as i64;
-                    keep(&mut found.hits, &self.templates[of], self.near_s, at_ns, sigmas);
-                }
+        let all: Vec<usize> = (0..self.templates.len()).collect();
+        let each = all.len().div_ceil(self.threads);
+        let look = |templates: &[usize]| -> Vec<Looked> {
+            let mut time = vec![0.0; n];
+            let seen = |of: &usize| self.look(plan, *of, &middle, &white, &prepared, &mut time);
+            templates.iter().filter_map(seen).collect()
+        };
+        let looked: Vec<Looked> = std::thread::scope(|scope| {
+            let running: Vec<_> = all.chunks(each).map(|own| scope.spawn(|| look(own))).collect();
+            let join = |thread: std::thread::ScopedJoinHandle<'_, Vec<Looked>>| {
+                thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+            };
+            running.into_iter().flat_map(join).collect()
+        });
+        for Looked { template, tried, peaks } in looked {
+            found.tried += tried;
+            for (k, sigmas) in peaks {
+                let at_ns = first_ns + (k as f64 * 1e9 / plan.rate_hz).round() as i64;
+                keep(&mut found.hits, &self.templates[template], self.near_s, at_ns, sigmas);
             }
         }
         self.prepared.insert(n, prepared);
     }
+
+    /// Looks for one template at some times of a segment of as many samples as `time` has; `None` where it cannot be seen.
+    fn look(
+        &self,
+        plan: &Plan,
+        template: usize,
+        times: &Range<usize>,
+        white: &DMatrix<f64>,
+        prepared: &Prepared,
+        time: &mut [f64],
+    ) -> Option<Looked> {
+        let filter = &prepared.filters[template];
+        let least = LEAST_VARIANCE.sqrt();
+        let looked: Vec<usize> = times.clone().filter(|k| filter.deviation[*k] > least).collect();
+        if filter.root <= 0.0 || looked.is_empty() {
+            return None;
+        }
+        let tried = TAU.sqrt() * LOUD * filter.spread_hz * looked.len() as f64 / plan.rate_hz;
+        let mut spectrum = self.filtered(plan, time.len(), template, white, prepared);
+        let power: f64 = spectrum.iter().map(Complex64::norm_sqr).sum();
+        if prepared.inverse.process(&mut spectrum, time).is_err() {
+            return Some(Looked { template, tried, peaks: Vec::new() });
+        }
+        // The transform sums the bins of both signs.
+        let significance = |k: usize| 0.5 * time[k] / (filter.deviation[k] * filter.root);
+        // Noise may be louder than Σ says. Its median does not see what happens a few times and is soon over; and what a peak
+        // leaves of the filtered power does not see what happens once, however long it rings.
+        let mut sizes: Vec<f64> = looked.iter().map(|k| significance(*k).abs()).collect();
+        let half = sizes.len() / 2;
+        let median = *sizes.select_nth_unstable_by(half, f64::total_cmp).1 / MEDIAN;
+        let peak = looked.iter().map(|k| (0.5 * time[*k] / (filter.root * filter.root)).powi(2)).fold(0.0, f64::max);
+        let left = (power - peak * filter.squares) / (WINDOW_POWER * filter.root * filter.root);
+        let louder = median.min(left.max(0.0).sqrt()).max(1.0);
+        let sigmas = looked.into_iter().map(|k| (k, significance(k).abs() / louder));
+        Some(Looked { template, tried, peaks: sigmas.filter(|(_, sigmas)| *sigmas > LEAST).collect() })
+    }
+}
+
+/// What the search for one template saw in a segment.
+struct Looked {
+    template: usize,
+    /// Independent trials.
+    tried: f64,
+    /// Samples, and how many σ stand there.
+    peaks: Vec<(usize, f64)>,
 }
 
 /// Transforms of one length.

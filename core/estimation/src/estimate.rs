@@ -16,7 +16,7 @@ use crate::normal::{Equations, NormalEquations, accumulate, residuals};
 use crate::prediction::Prediction;
 use crate::qp::{Active, Kkt, Problem, QpError, Row, Side};
 use crate::refine::{Chi2, SigmaError, Whitening};
-use crate::sigma::NoiseModel;
+use crate::sigma::{BandNoise, NoiseModel};
 use crate::spectra::{Layout, Plan, Spectra, Sums};
 use crate::verdict::{self, Direction, Pull, chi2_per_dof_at};
 
@@ -204,7 +204,7 @@ pub fn estimate(
     bounds: &[Bound],
     refinements: usize,
 ) -> Result<Estimate, EstimateError> {
-    estimate_with(observed, model, unknowns, bounds, refinements, Refinement::Bands)
+    estimate_with(observed, &BandNoise::new(model, observed.plan), unknowns, bounds, refinements, Refinement::Bands)
 }
 
 /// What of Σ is measured from the residuals.
@@ -216,13 +216,13 @@ pub enum Refinement {
     Levels,
 }
 
-/// As [`estimate`], with Σ refined in one way or the other.
+/// As [`estimate`], with Σ refined in one way or the other, and the mission's noise in the bands of the plan.
 ///
 /// # Errors
 /// As [`estimate`].
 pub fn estimate_with(
     observed: &Observed<'_>,
-    model: &NoiseModel,
+    noise: &BandNoise<'_>,
     unknowns: &[Unknown],
     bounds: &[Bound],
     refinements: usize,
@@ -230,7 +230,7 @@ pub fn estimate_with(
 ) -> Result<Estimate, EstimateError> {
     let Observed { sums, prediction, plan, layout } = *observed;
     let spectra = &sums.total;
-    let whitening = Whitening::new(model, plan, layout, spectra)?;
+    let whitening = Whitening::new(noise, plan, spectra)?;
     let even = refinement == Refinement::Levels;
     let kept = if even { spectra.evenly() } else { spectra.kept() };
     let mut inverses = whitening.model_inverses();
@@ -252,7 +252,9 @@ pub fn estimate_with(
         if step < refinements {
             inverses = match refinement {
                 Refinement::Bands => whitening.refined_inverses(&residual),
-                Refinement::Levels => by_levels(model, plan, spectra, &residual, &colours(unknowns, &solved.theta)),
+                Refinement::Levels => {
+                    by_levels(noise.model, plan, spectra, &residual, &colours(unknowns, &solved.theta))
+                }
             };
         }
         linear = layout.linear_at(solved.theta.as_slice());

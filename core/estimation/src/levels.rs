@@ -54,6 +54,17 @@ struct Mode {
     power: f64,
 }
 
+/// A band in coordinates in which the modelled noise is white, `Σ = L Lᵀ`.
+struct Whitened {
+    band: usize,
+    /// Twice the complex observations.
+    weight: f64,
+    /// `L⁻¹`.
+    inverse_factor: DMatrix<f64>,
+    /// `L⁻¹ Ŵ L⁻ᵀ`.
+    power: DMatrix<f64>,
+}
+
 /// `−2 log` of the likelihood up to a constant, with the process's power more by `excess`; infinite where no power is left.
 fn deviance(modes: &[Mode], excess: f64) -> f64 {
     let of = |m: &Mode| {
@@ -127,30 +138,39 @@ impl<'a> Levels<'a> {
 
     /// What the likelihood of a level needs: with `Σ = L Lᵀ` and `L⁻¹ P L⁻ᵀ = V Λ Vᵀ` it is `Σ_b 2n_b Σ_j log(1 + eλ_j) + w_j/(1 + eλ_j)`
     /// up to a constant, `e = k² − 1`, `w` the diagonal of `Vᵀ L⁻¹ Ŵ L⁻ᵀ V`: one decomposition for every amplitude.
-    fn modes(&self, process: &[DMatrix<f64>]) -> Option<Vec<Mode>> {
+    fn modes(whitened: &[Whitened], process: &[DMatrix<f64>]) -> Vec<Mode> {
         let mut modes = Vec::new();
-        let bands = self.modelled.iter().zip(process).zip(self.measured).zip(&self.observations);
-        for (((sigma, p), measured), n) in bands.filter(|(_, n)| **n > 0.0) {
-            let l = Cholesky::new(sigma.clone())?.unpack();
-            let whitened = |m: &DMatrix<f64>| {
-                let half = l.solve_lower_triangular(m)?;
-                l.solve_lower_triangular(&half.transpose())
-            };
-            let (p, measured) = (whitened(p)?, whitened(measured)?);
-            let eigen = p.symmetric_eigen();
+        for Whitened { band, weight, inverse_factor, power } in whitened {
+            let eigen = (inverse_factor * &process[*band] * inverse_factor.transpose()).symmetric_eigen();
             for (lambda, v) in eigen.eigenvalues.iter().zip(eigen.eigenvectors.column_iter()) {
                 if lambda.abs() > NEGLIGIBLE {
-                    modes.push(Mode { weight: 2.0 * n, lambda: *lambda, power: v.dot(&(&measured * v)) });
+                    modes.push(Mode { weight: *weight, lambda: *lambda, power: v.dot(&(power * v)) });
                 }
             }
         }
-        Some(modes)
+        modes
+    }
+
+    /// Bands in which something was observed; `None` where Σ is singular.
+    fn whitened(&self) -> Option<Vec<Whitened>> {
+        let bands = self.modelled.iter().zip(self.measured).zip(&self.observations).enumerate();
+        let whitened = |(band, ((sigma, measured), n)): (usize, ((&DMatrix<f64>, &DMatrix<f64>), &f64))| {
+            let identity = DMatrix::identity(sigma.nrows(), sigma.nrows());
+            let inverse_factor = Cholesky::new(sigma.clone())?.l().solve_lower_triangular(&identity)?;
+            let power = &inverse_factor * measured * inverse_factor.transpose();
+            Some(Whitened { band, weight: 2.0 * n, inverse_factor, power })
+        };
+        bands.filter(|(_, (_, n))| **n > 0.0).map(whitened).collect()
     }
 
     /// The amplitude of a process that fits best; `None` where the channels do not have it.
     #[must_use]
     pub fn level(&self, name: &str) -> Option<Level> {
-        let modes = self.modes(self.processes.get(name)?)?;
+        self.level_in(&self.whitened()?, name)
+    }
+
+    fn level_in(&self, whitened: &[Whitened], name: &str) -> Option<Level> {
+        let modes = Self::modes(whitened, self.processes.get(name)?);
         let at = |log: f64| deviance(&modes, (2.0 * log).exp() - 1.0);
         // The likelihood of one level has one minimum.
         let (mut a, mut b) = (-MOST.ln(), MOST.ln());
@@ -170,7 +190,8 @@ impl<'a> Levels<'a> {
     pub fn fit(&mut self) {
         let names: Vec<&str> = self.processes.keys().copied().collect();
         for _ in 0..2 * names.len() {
-            let levels = names.iter().filter_map(|name| self.level(name));
+            let Some(whitened) = self.whitened() else { return };
+            let levels = names.iter().filter_map(|name| self.level_in(&whitened, name));
             let Some(best) = levels.max_by(|a, b| a.delta_chi2.total_cmp(&b.delta_chi2)) else { return };
             if best.delta_chi2 < LEAST || (best.value - 1.0).abs() < 1e-3 {
                 return;

@@ -17,8 +17,8 @@
 use nalgebra::{Cholesky, DMatrix, DVector};
 use std::ops::Range;
 
-use crate::sigma::NoiseModel;
-use crate::spectra::{Layout, Plan, Spectra};
+use crate::sigma::BandNoise;
+use crate::spectra::{Plan, Spectra};
 
 /// A band in which Σ is refined is at least this wide, last frequency over first.
 const RATIO: f64 = 1.15;
@@ -68,18 +68,15 @@ pub enum SigmaError {
 }
 
 impl Whitening {
-    pub(crate) fn new(model: &NoiseModel, plan: &Plan, layout: &Layout, spectra: &Spectra) -> Result<Self, SigmaError> {
-        let n = layout.channels.len();
+    pub(crate) fn new(noise: &BandNoise<'_>, plan: &Plan, spectra: &Spectra) -> Result<Self, SigmaError> {
         let mut factors = Vec::with_capacity(plan.bands.len());
         let mut variances = Vec::with_capacity(plan.bands.len());
-        for band in &plan.bands {
-            let bins = (band.first..band.end).map(|k| model.psd(plan.bin_hz(k as f64)));
-            let sigma = bins.fold(DMatrix::zeros(n, n), |sum, s| sum + s) / band.bins() as f64;
+        for (band, sigma) in plan.bands.iter().zip(&noise.mean) {
             variances.push(sigma.diagonal());
             let frequency_hz = plan.frequency_hz(*band);
-            factors.push(Cholesky::new(sigma).ok_or(SigmaError::Singular { frequency_hz })?.unpack());
+            factors.push(Cholesky::new(sigma.clone()).ok_or(SigmaError::Singular { frequency_hz })?.unpack());
         }
-        let group = model.groups();
+        let group = noise.model.groups();
         let group_size: Vec<f64> = group.iter().map(|g| group.iter().filter(|h| *h == g).count() as f64).collect();
         let per_band = spectra.observations(plan);
         let needed = OBSERVATIONS_PER_CHANNEL * group_size.iter().fold(0.0, |a: f64, b| a.max(*b));
@@ -101,7 +98,7 @@ impl Whitening {
             factors,
             variances,
             group,
-            residual: model.residual().to_vec(),
+            residual: noise.model.residual().to_vec(),
             group_size,
             observations: coarse.iter().map(observed).collect(),
             coarse,

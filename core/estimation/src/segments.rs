@@ -14,6 +14,9 @@ pub trait Cuts {
     /// has the same length and shares its first half.
     fn segment(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool);
 
+    /// Every sample of a run once, as it comes, of all columns; before the segment that it completes.
+    fn rows(&mut self, _first_ns: i64, _columns: &[&[f64]]) {}
+
     /// Every sample once, in fixed portions, whatever the batches.
     fn samples(&mut self, _first_ns: i64, _columns: &[&[f64]]) {}
 
@@ -125,7 +128,7 @@ pub struct State {
     pub last_ns: Option<i64>,
     /// Last raw value of each column.
     pub previous: Vec<f64>,
-    /// The current run's samples that a future segment may still need, per column.
+    /// The current run's samples that a future segment may still need, per column that segments have.
     pub run: Vec<Vec<f64>>,
     /// Whether the current run has given a segment.
     pub run_has_segment: bool,
@@ -164,6 +167,13 @@ impl Segmenter {
         }
     }
 
+    /// The same with the first `columns` in its segments alone; the others are handed on as they come ([`Cuts::rows`]) and never kept.
+    #[must_use]
+    pub fn of_first(mut self, columns: usize) -> Self {
+        self.state.run.truncate(columns);
+        self
+    }
+
     /// Adds rows: `columns[j][k]` is column j at `time_ns[k]`, NaN where there is no value.
     pub fn push(&mut self, time_ns: &[i64], columns: &[&[f64]], analyser: &mut Analyser, collected: &mut Collected) {
         self.cut(time_ns, columns, &mut IntoSums(analyser, collected));
@@ -181,11 +191,12 @@ impl Segmenter {
         }
         let mut values = Vec::with_capacity(columns.len());
         for (j, column) in columns.iter().enumerate() {
+            let whole = all_finite(column) && (!self.averaged[j] || self.state.previous[j].is_finite());
             let averaged = self.average(j, column);
-            for (ok, x) in usable.iter_mut().zip(averaged.iter()) {
-                *ok &= x.is_finite();
+            if !whole {
+                usable.iter_mut().zip(averaged.iter()).for_each(|(ok, x)| *ok &= x.is_finite());
+                self.state.missing[j] += column.iter().filter(|x| !x.is_finite()).count() as u64;
             }
-            self.state.missing[j] += column.iter().filter(|x| !x.is_finite()).count() as u64;
             values.push(averaged);
         }
         let mut k = 0;
@@ -217,7 +228,10 @@ impl Segmenter {
         let mut k = first;
         while k < end {
             let take = (self.length - self.state.samples()).min(end - k);
+            let rows: Vec<&[f64]> = values.iter().map(|c| &c[k..k + take]).collect();
+            to.rows(time_ns[k], &rows);
             for (run, column) in self.state.run.iter_mut().zip(values) {
+                run.reserve_exact(self.length - run.len());
                 run.extend_from_slice(&column[k..k + take]);
             }
             k += take;
@@ -290,6 +304,12 @@ impl State {
     fn samples(&self) -> usize {
         self.run.first().map_or(0, Vec::len)
     }
+}
+
+/// Whether there is a value everywhere; without an early end, so that it is done several at a time.
+#[must_use]
+pub fn all_finite(column: &[f64]) -> bool {
+    column.iter().fold(true, |all, x| all & x.is_finite())
 }
 
 /// The longest length up to `samples` that is divisible by 4 and has small prime factors, for a fast transform; at least

@@ -15,6 +15,8 @@ use dragfree_physics::mission::{Mission, MissionError};
 use dragfree_physics::noise::NoiseShape;
 use dragfree_physics::thrust_noise::ThrustNoise;
 
+use crate::spectra::{Band, Plan};
+
 /// How a channel's samples come about.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Measured {
@@ -331,6 +333,27 @@ impl NoiseModel {
             Response::Readout => (4.0 * sin * sin / (self.dt_s * self.dt_s)).powi(2),
             Response::Flat => 1.0,
         }
+    }
+}
+
+/// The mission's noise in the bands of a plan: made once for as many estimates as there are, as a band has up to ten thousand bins.
+pub struct BandNoise<'a> {
+    /// At any frequency.
+    pub model: &'a NoiseModel,
+    /// Its mean over the bins of each band.
+    pub(crate) mean: Vec<DMatrix<f64>>,
+}
+
+impl<'a> BandNoise<'a> {
+    /// Of the bands of `plan`.
+    #[must_use]
+    pub fn new(model: &'a NoiseModel, plan: &Plan) -> Self {
+        let zero = || DMatrix::zeros(model.channels, model.channels);
+        let mean = |band: &Band| {
+            let bins = (band.first..band.end).map(|k| model.psd(plan.bin_hz(k as f64)));
+            bins.fold(zero(), |sum, psd| sum + psd) / band.bins() as f64
+        };
+        Self { model, mean: plan.bands.iter().map(mean).collect() }
     }
 }
 

@@ -13,8 +13,8 @@ use dragfree_critic::transient::{Hit, Search, Template};
 use dragfree_critic::witness::Witnesses;
 use dragfree_estimation::colour;
 use dragfree_estimation::estimate::{Observed, Refinement, estimate_with};
-use dragfree_estimation::segments::{Segmenter, longest_length};
-use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_estimation::segments::{Segmenter, all_finite, longest_length};
+use dragfree_estimation::sigma::{BandNoise, Measured, NoiseModel};
 use dragfree_estimation::spectra::Plan;
 use dragfree_estimation::stored::Stored;
 use dragfree_physics::mission::Mission;
@@ -212,7 +212,7 @@ impl Critic {
         let inverses = lower.collect();
         // What was looked for before is not looked for again.
         let templates = if self.events.is_empty() { templates } else { Vec::new() };
-        let search = Search::new(templates, residual.clone(), inverses);
+        let search = Search::new(templates, residual.clone(), inverses).on(self.threads);
         let witnesses = |plan: &Plan| {
             let whitening = plan.bands.iter().map(|b| inverse(plan.frequency_hz(*b))).collect();
             Witnesses::new(topics, plan, residual, whitening)
@@ -225,7 +225,7 @@ impl Critic {
             missing: vec![0; width],
             rows: 0,
             waiting: true,
-            segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged),
+            segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged).of_first(all.fast),
             base: all.base,
             courses_at: all.fast - courses.len(),
             courses,
@@ -290,7 +290,14 @@ impl Critic {
                 let noise = NoiseModel::new(&self.mission, &seen, 1.0 / plan.rate_hz)?;
                 let observed = Observed { layout: &layout, plan: &plan, sums: &sums, prediction: None };
                 let (unknowns, bounds) = (question.unknowns(&[]), question.bounds());
-                let solved = estimate_with(&observed, &noise, &unknowns, &bounds, 3, Refinement::Levels)?;
+                let solved = estimate_with(
+                    &observed,
+                    &BandNoise::new(&noise, &plan),
+                    &unknowns,
+                    &bounds,
+                    3,
+                    Refinement::Levels,
+                )?;
                 theta.iter_mut().zip(solved.theta.iter()).for_each(|(t, s)| *t = *s);
             }
         }
@@ -496,7 +503,7 @@ impl Linked {
     fn push(&mut self, time_ns: &[i64], columns: &[&[f64]]) {
         let mut filled: Vec<Cow<'_, [f64]>> = Vec::with_capacity(columns.len() - self.base);
         for (j, column) in columns.iter().enumerate().skip(self.base) {
-            if column.iter().all(|x| x.is_finite()) {
+            if all_finite(column) {
                 self.held[j] = column.last().copied().unwrap_or(self.held[j]);
                 filled.push(Cow::Borrowed(column));
                 continue;
@@ -577,6 +584,6 @@ impl Linked {
                 format!("it has no value in {missing} of {rows} epochs, so {forms} forms of effects are left out");
             (self.names[column].clone(), reason)
         }));
-        Record { question, differenced: self.differenced, gathered: self.gatherer.gathered, not_tried }
+        Record { question, differenced: self.differenced, gathered: self.gatherer.finish(), not_tried }
     }
 }

@@ -10,7 +10,7 @@ use serde_json::json;
 use dragfree_estimation::estimate::{Bound, Estimate as Solution, Observed, Refinement, Unknown, estimate_with};
 use dragfree_estimation::prediction::Prediction;
 use dragfree_estimation::segments::{Collected, Segmenter, longest_length};
-use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_estimation::sigma::{BandNoise, Measured, NoiseModel};
 use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, SHORTEST};
 use dragfree_estimation::state;
 use dragfree_estimation::stored::Stored;
@@ -217,8 +217,14 @@ impl Linked {
             sums: &sums,
             prediction: collected.prediction.as_ref(),
         };
-        let solution =
-            estimate_with(&observed, &self.model, &unknowns, &self.bounds, self.refinements, self.refinement)?;
+        let solution = estimate_with(
+            &observed,
+            &BandNoise::new(&self.model, observed.plan),
+            &unknowns,
+            &self.bounds,
+            self.refinements,
+            self.refinement,
+        )?;
         // What χ² with the mission file's Σ is a sum over: the same for every model of the same data, which `dof` is not.
         let weights = sums.total.kept().into_iter().zip(&sums.total.expected).map(|(kept, expected)| kept * expected);
         let observations = weights.sum::<f64>() * self.layout.channels.len() as f64;

@@ -97,6 +97,8 @@ pub(super) fn gather_candidates(names: &[String], archive: &Path, global: &Globa
     }
     let mut tried = first.diagnosis.forms;
     tried.retain(|effect, _| leads.iter().any(|lead| lead.effect == *effect));
+    // Sums are large, and these are made again.
+    drop(first.record);
     once(&leads, &tried)
 }
 

@@ -12,7 +12,7 @@ pub(crate) use link::open_source;
 pub use link::{Coefficient, Constraint, build};
 pub use state::resumes_at_ns;
 
-use std::collections::BTreeSet;
+use std::sync::{Mutex, PoisonError};
 
 use crate::border::{BorderError, Instance, PluginInfo, Rows};
 use crate::table::{Batch, Chunk, TableSpec};
@@ -195,9 +195,13 @@ impl Chain {
     /// A plugin failed, or broke a rule.
     pub fn finish(&mut self, sink: &mut dyn Sink) -> Result<(), ChainError> {
         for i in 0..self.nodes.len() {
-            let mut made = step(&mut self.nodes[i], i64::MAX, self.carry.batch_rows)?;
-            made.push(self.nodes[i].instance.flush()?);
+            if let Some(made) = step(&mut self.nodes[i], i64::MAX, self.carry.batch_rows, true)? {
+                self.distribute(i, &made, sink)?;
+            }
+            while self.round(false, sink)? {}
+            let made = self.nodes[i].instance.flush()?;
             self.distribute(i, &made, sink)?;
+            while self.round(false, sink)? {}
         }
         for node in &self.nodes {
             if let Some(left) = node.inputs.iter().find(|q| q.uniform && q.rows() > 0) {
@@ -228,41 +232,70 @@ impl Chain {
         Ok(reports)
     }
 
+    /// Carries what has come as far as it goes. A plugin may hold rows back for an hour and give them all at once: by one call of each in
+    /// turn, those behind it need not hold what they make of them all at once as well.
     fn advance(&mut self, sink: &mut dyn Sink) -> Result<(), ChainError> {
-        let waves = self.nodes.iter().map(|n| n.wave + 1).max().unwrap_or(0);
-        for wave in 0..waves {
-            let (until, rows, threads) = (self.complete_until_ns, self.carry.batch_rows, self.carry.threads);
-            let due: BTreeSet<usize> = (0..self.nodes.len()).filter(|i| self.nodes[*i].wave == wave).collect();
-            let busy = due.iter().filter(|i| self.nodes[**i].ready() > SPAWN_WORTH_ROWS).count();
-            let mut made: Vec<(usize, Made)> = Vec::new();
-            let nodes = self.nodes.iter_mut().enumerate().filter(|(i, _)| due.contains(i));
-            if threads > 1 && busy > 1 {
-                std::thread::scope(|scope| {
-                    let running: Vec<_> =
-                        nodes.map(|(i, node)| (i, scope.spawn(move || step(node, until, rows)))).collect();
-                    for (i, thread) in running {
-                        let result = thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
-                        made.push((i, result));
-                    }
-                });
-            } else {
-                made.extend(nodes.map(|(i, node)| (i, step(node, until, rows))));
-            }
-            for (i, batches) in made {
-                self.distribute(i, &batches?, sink)?;
-            }
+        let mut new_rows = true;
+        while self.round(new_rows, sink)? {
+            new_rows = false;
         }
         Ok(())
     }
 
-    fn distribute(&mut self, node: usize, made: &[Vec<Batch>], sink: &mut dyn Sink) -> Result<(), ChainError> {
+    /// One call of every node that has rows, and of those that wait for none where there is something new; false where there was nothing
+    /// to do. An effect waits while somebody has a whole batch of its rows that cannot be used yet: its inputs are few, and all candidates'
+    /// series are many.
+    fn round(&mut self, new_rows: bool, sink: &mut dyn Sink) -> Result<bool, ChainError> {
+        let waves = self.nodes.iter().map(|n| n.wave + 1).max().unwrap_or(0);
+        let (until, rows) = (self.complete_until_ns, self.carry.batch_rows);
+        let mut busy = false;
+        for wave in 0..waves {
+            let ahead: Vec<bool> = self.nodes.iter().map(|n| n.is_effect && self.unread(n) >= rows).collect();
+            let in_wave = self.nodes.iter_mut().zip(&ahead).enumerate().filter(|(_, (n, _))| n.wave == wave);
+            let due: Vec<(usize, &mut ChainNode)> = in_wave
+                .filter(|(_, (n, ahead))| n.ready() > 0 && !**ahead || new_rows && !n.has_uniform())
+                .map(|(i, (n, _))| (i, n))
+                .collect();
+            let worth = due.iter().filter(|(_, n)| n.ready() > SPAWN_WORTH_ROWS).count();
+            let call = |(i, node): (usize, &mut ChainNode)| (i, step(node, until, rows, new_rows));
+            let threads = self.carry.threads.min(worth);
+            let mut made: Vec<(usize, Made)> = if threads > 1 {
+                let waiting = Mutex::new(due.into_iter());
+                let next = || waiting.lock().unwrap_or_else(PoisonError::into_inner).next();
+                let work = || std::iter::from_fn(next).map(call).collect::<Vec<_>>();
+                std::thread::scope(|scope| {
+                    let running: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
+                    let join = |thread: std::thread::ScopedJoinHandle<'_, Vec<(usize, Made)>>| {
+                        thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+                    };
+                    running.into_iter().flat_map(join).collect()
+                })
+            } else {
+                due.into_iter().map(call).collect()
+            };
+            made.sort_by_key(|(i, _)| *i);
+            for (i, made) in made {
+                if let Some(batches) = made? {
+                    busy = true;
+                    self.distribute(i, &batches, sink)?;
+                }
+            }
+        }
+        Ok(busy)
+    }
+
+    /// Most rows that a reader of a node has not used yet.
+    fn unread(&self, node: &ChainNode) -> usize {
+        let readers = node.routes.iter().flat_map(|route| &route.readers);
+        readers.map(|r| self.nodes[r.node].inputs[r.input].rows()).max().unwrap_or(0)
+    }
+
+    fn distribute(&mut self, node: usize, made: &[Batch], sink: &mut dyn Sink) -> Result<(), ChainError> {
         let routes = std::mem::take(&mut self.nodes[node].routes);
         let writes = std::mem::take(&mut self.nodes[node].writes);
         let mut result = Ok(());
-        for batches in made {
-            for ((table, route), batch) in writes.iter().zip(&routes).zip(batches) {
-                result = result.and_then(|()| publish(&mut self.nodes, table, route, batch, sink));
-            }
+        for ((table, route), batch) in writes.iter().zip(&routes).zip(made) {
+            result = result.and_then(|()| publish(&mut self.nodes, table, route, batch, sink));
         }
         self.nodes[node].routes = routes;
         self.nodes[node].writes = writes;
@@ -270,8 +303,8 @@ impl Chain {
     }
 }
 
-/// What a node made: for each call, one batch per written table.
-type Made = Result<Vec<Vec<Batch>>, ChainError>;
+/// What a node made in one call: one batch per written table; none where there was nothing to call it for.
+type Made = Result<Option<Vec<Batch>>, ChainError>;
 
 /// Starting a thread costs about what a few hundred rows of a stage do.
 const SPAWN_WORTH_ROWS: usize = 512;
@@ -280,6 +313,11 @@ impl ChainNode {
     /// Rows that one call could take now.
     fn ready(&self) -> usize {
         self.inputs.iter().filter(|q| q.uniform).map(Queue::rows).min().unwrap_or(0)
+    }
+
+    /// Whether it goes row by row through some table; others take whatever there is.
+    fn has_uniform(&self) -> bool {
+        self.inputs.iter().any(|q| q.uniform)
     }
 }
 
@@ -302,34 +340,26 @@ fn publish(
     Ok(())
 }
 
-/// Lets a node work on everything that is ready for it.
-fn step(node: &mut ChainNode, complete_until_ns: i64, batch_rows: usize) -> Made {
-    let has_uniform = node.inputs.iter().any(|q| q.uniform);
-    let mut made = Vec::new();
-    loop {
-        let rows = node.ready().min(batch_rows);
-        if has_uniform && rows == 0 {
-            return Ok(made);
-        }
-        check_join(node, rows)?;
-        let given: Vec<usize> = node.inputs.iter().map(|q| if q.uniform { rows } else { q.rows() }).collect();
-        let tables: Vec<Rows<'_>> = node.inputs.iter().zip(&given).map(|(q, n)| q.front(*n)).collect();
-        let batches = node.instance.process(&tables, complete_until_ns)?;
-        let batches = match batches {
-            Some(batches) => {
-                check_rows(node, &batches, rows)?;
-                batches
-            }
-            None => discarded(node, rows),
-        };
-        for (queue, n) in node.inputs.iter_mut().zip(&given) {
-            queue.consume(*n);
-        }
-        made.push(batches);
-        if !has_uniform {
-            return Ok(made);
-        }
+/// One call of a node, with at most so many rows of a uniform table; one that has none is called where there is something new.
+fn step(node: &mut ChainNode, complete_until_ns: i64, batch_rows: usize, new_rows: bool) -> Made {
+    let rows = node.ready().min(batch_rows);
+    if rows == 0 && (node.has_uniform() || !new_rows) {
+        return Ok(None);
     }
+    check_join(node, rows)?;
+    let given: Vec<usize> = node.inputs.iter().map(|q| if q.uniform { rows } else { q.rows() }).collect();
+    let tables: Vec<Rows<'_>> = node.inputs.iter().zip(&given).map(|(q, n)| q.front(*n)).collect();
+    let batches = match node.instance.process(&tables, complete_until_ns)? {
+        Some(batches) => {
+            check_rows(node, &batches, rows)?;
+            batches
+        }
+        None => discarded(node, rows),
+    };
+    for (queue, n) in node.inputs.iter_mut().zip(&given) {
+        queue.consume(*n);
+    }
+    Ok(Some(batches))
 }
 
 /// A discarded batch leaves rows without values in the node's uniform tables, so that the chain stays in step.
