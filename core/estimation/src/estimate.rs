@@ -17,7 +17,7 @@ use crate::prediction::Prediction;
 use crate::qp::{Active, Kkt, Problem, QpError, Row, Side};
 use crate::refine::{Chi2, SigmaError, Whitening};
 use crate::sigma::{BandNoise, NoiseModel};
-use crate::spectra::{Layout, Plan, Spectra, Sums};
+use crate::spectra::{Band, FIRST_BIN, Layout, Plan, Spectra, Sums};
 use crate::verdict::{self, Direction, Pull, chi2_per_dof_at};
 
 /// A coefficient of the model.
@@ -232,7 +232,7 @@ pub fn estimate_with(
     let spectra = &sums.total;
     let whitening = Whitening::new(noise, plan, spectra)?;
     let even = refinement == Refinement::Levels;
-    let kept = if even { spectra.evenly() } else { spectra.kept() };
+    let kept = if even { balanced(spectra, plan) } else { spectra.kept() };
     let mut inverses = whitening.model_inverses();
     let initial: Vec<f64> = unknowns.iter().map(|u| u.initial).collect();
     let mut linear = layout.linear_at(&initial);
@@ -278,7 +278,8 @@ pub fn estimate_with(
         let by_blocks =
             |k: usize| scatter.as_ref().map_or(1.0, |s| if s.ratio[k] > s.upper { s.ratio[k] } else { 1.0 });
         let by_noise = chi2_per_dof.max(1.0).sqrt();
-        let by_time = if even { unevenness(spectra, layout, &inverses, &free, &c) } else { vec![1.0; free.len()] };
+        let by_time =
+            if even { unevenness(spectra, &kept, layout, &inverses, &free, &c) } else { vec![1.0; free.len()] };
         let widen: Vec<f64> = (0..free.len()).map(|k| by_blocks(k).max(by_noise) * by_time[k]).collect();
         DMatrix::from_fn(c.nrows(), c.ncols(), |i, j| c[(i, j)] * widen[i] * widen[j])
     });
@@ -327,17 +328,33 @@ pub fn estimate_with(
     })
 }
 
-/// By how much σ of each free coefficient is larger than the equations with even weights say, as these count bands that stand for
-/// little time as if they stood for all: `C (N + Σ_b (u_b/v_b − 1) N_b) C` against `C`, u_b the even weights and v_b the true ones.
+/// Weights with which the score of a gain inside the loop vanishes where the gain is right: each band as much as it is wide, and the
+/// octave above the lowest bin for what lies below it too.
+///
+/// A command follows the noise through a strictly causal filter U, and `∫ Re U df = 0` from zero on (see [`crate::levels`]). Below the
+/// lowest bin of an ordinary segment, 1.8 mHz, the loop is stiff, and U is much as it is in the octave above. Left out, that moved gains
+/// of the thrusters by 0.02, more than their σ, whatever the length of the data. Segments that are there for what is slow leave next to
+/// nothing out.
+fn balanced(spectra: &Spectra, plan: &Plan) -> Vec<f64> {
+    let octave = if plan.first_bin == FIRST_BIN { FIRST_BIN..2 * FIRST_BIN } else { 0..0 };
+    // Of frequencies from zero, half a bin belongs to the constant.
+    let both = 1.0 + (FIRST_BIN as f64 - 0.5) / FIRST_BIN as f64;
+    let weight = |(band, even): (&Band, f64)| if octave.contains(&band.first) { both * even } else { even };
+    plan.bands.iter().zip(spectra.evenly()).map(weight).collect()
+}
+
+/// By how much σ of each free coefficient is larger than the equations with other weights than the true ones say: bands that stand for
+/// little time count as if they stood for all. `C (N + Σ_b (u_b/v_b − 1) N_b) C` against `C`, `used` are the u_b, and v_b the true ones.
 fn unevenness(
     spectra: &Spectra,
+    used: &[f64],
     layout: &Layout,
     inverses: &[DMatrix<f64>],
     free: &[usize],
     covariance: &DMatrix<f64>,
 ) -> Vec<f64> {
     let over = |(u, v): (&f64, &f64)| if *v > 0.0 { u * (u / v - 1.0) } else { 0.0 };
-    let excess: Vec<f64> = spectra.evenly().iter().zip(&spectra.kept()).map(over).collect();
+    let excess: Vec<f64> = used.iter().zip(&spectra.kept()).map(over).collect();
     let normal = accumulate(spectra, layout, inverses, &excess).normal;
     let more = DMatrix::from_fn(free.len(), free.len(), |i, j| normal[(free[i], free[j])]);
     let spread = covariance * more * covariance;
@@ -738,4 +755,47 @@ fn worst_band(
         }
     }
     worst
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// `Σ_b w_b e_b Re U_b` over what one bin of all segments weighs, for a command that answers a step by `−(1 − e^{−2πf_c t})` from the
+    /// next sample on: strictly causal, and −1 far below the corner.
+    fn score(plan: &Plan, spectra: &Spectra, weights: &[f64], corner_hz: f64) -> f64 {
+        let response = |hz: f64| {
+            let turn = nalgebra::Complex::from_polar(1.0, -std::f64::consts::TAU * hz / plan.rate_hz);
+            let part = 1.0 - (-std::f64::consts::TAU * corner_hz / plan.rate_hz).exp();
+            -(turn * part / (1.0 - turn * (1.0 - part))).re
+        };
+        let mean = |band: &Band| {
+            (band.first..band.end).map(|k| response(plan.bin_hz(k as f64))).sum::<f64>() / band.bins() as f64
+        };
+        let bands = plan.bands.iter().zip(weights).zip(&spectra.expected);
+        let top = plan.bands.len() - 1;
+        let bin = weights[top] * spectra.expected[top] / plan.bands[top].bins() as f64;
+        bands.map(|((band, w), e)| w * e * mean(band)).sum::<f64>() / bin
+    }
+
+    /// Of a strictly causal filter the real part has no area. All bands alike leave out what lies below the lowest bin, two and a half
+    /// bins in which `U = −1`; balanced weights leave out by what U differs in the octave above, `(f/f_c)²` of these: 1 % for a corner of
+    /// ten times its frequency.
+    #[test]
+    fn what_lies_below_the_lowest_bin_counts_with_the_octave_above() {
+        let plan = Plan::new(16_384, 10.0);
+        let mut spectra = Spectra::zero(plan.bands.len(), 0);
+        (0..20).for_each(|k| spectra.count_segment(&plan, 0, k > 0));
+        for corner_hz in [0.03, 0.1] {
+            let alike = score(&plan, &spectra, &spectra.evenly(), corner_hz);
+            let balanced = score(&plan, &spectra, &balanced(&spectra, &plan), corner_hz);
+            assert!((alike - 2.5).abs() < 0.1, "{corner_hz} Hz: {alike}");
+            assert!(balanced.abs() < 0.1, "{corner_hz} Hz: {balanced}");
+        }
+        // Of longer segments for what is slow nothing is added.
+        let slow = Plan::slow(16 * 16_384, 16_384, 10.0);
+        let mut spectra = Spectra::zero(slow.bands.len(), 0);
+        spectra.count_segment(&slow, 0, false);
+        assert_eq!(balanced(&spectra, &slow), spectra.evenly());
+    }
 }

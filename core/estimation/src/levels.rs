@@ -153,14 +153,13 @@ impl<'a> Levels<'a> {
 
     /// Bands in which something was observed; `None` where Σ is singular.
     fn whitened(&self) -> Option<Vec<Whitened>> {
-        let bands = self.modelled.iter().zip(self.measured).zip(&self.observations).enumerate();
-        let whitened = |(band, ((sigma, measured), n)): (usize, ((&DMatrix<f64>, &DMatrix<f64>), &f64))| {
-            let identity = DMatrix::identity(sigma.nrows(), sigma.nrows());
-            let inverse_factor = Cholesky::new(sigma.clone())?.l().solve_lower_triangular(&identity)?;
-            let power = &inverse_factor * measured * inverse_factor.transpose();
-            Some(Whitened { band, weight: 2.0 * n, inverse_factor, power })
+        let whitened = |band: usize| {
+            let identity = DMatrix::identity(self.modelled[band].nrows(), self.modelled[band].nrows());
+            let inverse_factor = Cholesky::new(self.modelled[band].clone())?.l().solve_lower_triangular(&identity)?;
+            let power = &inverse_factor * &self.measured[band] * inverse_factor.transpose();
+            Some(Whitened { band, weight: 2.0 * self.observations[band], inverse_factor, power })
         };
-        bands.filter(|(_, (_, n))| **n > 0.0).map(whitened).collect()
+        (0..self.modelled.len()).filter(|band| self.observations[*band] > 0.0).map(whitened).collect()
     }
 
     /// The amplitude of a process that fits best; `None` where the channels do not have it.
