@@ -452,9 +452,27 @@ impl Cuts for Low<'_> {
         }
         self.look(even, Part::All, first_ns);
     }
+
+    /// What happens in the last hour of a run is under no other window but its edge.
+    fn tail(&mut self, first_ns: i64, columns: &[&[f64]]) {
+        let columns = &columns[..self.gathered.columns.base];
+        let samples = columns.first().map_or(0, |c| c.len());
+        let lengths: Vec<usize> = self.long.lengths().collect();
+        for taper in 1..=SHORTEST_LOOKED_AT {
+            let Some(first) = lengths.get(taper).and_then(|length| samples.checked_sub(*length)) else { continue };
+            let last: Vec<&[f64]> = columns.iter().map(|c| &c[first..]).collect();
+            self.transform(self.long, taper, &last);
+            self.look(lengths[taper], Part::All, first_ns + first as i64 * self.step_ns());
+        }
+    }
 }
 
 impl Low<'_> {
+    /// Step of the thinned samples, ns.
+    fn step_ns(&self) -> i64 {
+        (1e9 / self.long.rate_hz).round() as i64
+    }
+
     /// Spectra of the samples before they were thinned.
     fn transform(&mut self, plan: &Plan, taper: usize, columns: &[&[f64]]) {
         let samples = columns.first().map_or(0, |c| c.len());

@@ -26,6 +26,9 @@ pub trait Cuts {
     /// A run that has ended before it gave a segment of full length, all of its samples.
     fn short_run(&mut self, _first_ns: i64, _columns: &[&[f64]]) {}
 
+    /// The last samples of a run that has ended, as many as a segment may still have needed: others end where they please.
+    fn tail(&mut self, _first_ns: i64, _columns: &[&[f64]]) {}
+
     /// The run of samples has ended.
     fn gap(&mut self) {}
 }
@@ -273,9 +276,12 @@ impl Segmenter {
             let rest: Vec<&[f64]> = self.state.run.iter().map(|c| &c[at..]).collect();
             to.samples(self.time_of(at), &rest);
         }
-        if at == 0 && samples > 0 {
-            let whole: Vec<&[f64]> = self.state.run.iter().map(Vec::as_slice).collect();
-            to.short_run(self.time_of(0), &whole);
+        if samples > 0 {
+            let kept: Vec<&[f64]> = self.state.run.iter().map(Vec::as_slice).collect();
+            if at == 0 {
+                to.short_run(self.time_of(0), &kept);
+            }
+            to.tail(self.time_of(0), &kept);
         }
         to.gap();
         let shortest = lengths.last().copied();

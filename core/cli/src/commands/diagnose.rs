@@ -5,6 +5,7 @@ use crate::args::{BATCH_ROWS, Diagnose, Global};
 use crate::failure::Failure;
 use crate::progress::Meter;
 use crate::text::Paint;
+use chrono::DateTime;
 use dragfree_critic::diagnosis::{Diagnosis, Found, Lead, diagnose};
 use dragfree_critic::rank::Court;
 use dragfree_critic::record::Record;
@@ -25,6 +26,9 @@ const MOST_EVENTS: usize = 8;
 
 /// And no less than what chance gives in one of so many searches: which of it is certain, its full weight decides.
 const WORTH_TRYING: f64 = 0.5;
+
+/// What is seen within this of something louder is its ringing in another window, ns.
+const SAME_EVENT_NS: i64 = 3_600_000_000_000;
 
 pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let Gathering { record, mut diagnosis } = gather_candidates(&command.products, &command.archive.folder, global)?;
@@ -210,6 +214,16 @@ fn screen(d: &Diagnosis, record: &Record, top: usize, paint: Paint) -> String {
             let _ = writeln!(out, "  coherent with {}", u.coherent_with.join(", "));
         }
     }
+    let unnamed = unnamed(record.gathered.transients.certain(d.false_alarm_rate), &accepted);
+    if !unnamed.is_empty() {
+        let _ = writeln!(out, "\nWhat was seen to happen, and is no part of the answer");
+        for h in unnamed.iter().take(top) {
+            let at = DateTime::from_timestamp_nanos(h.at_ns).format("%Y-%m-%dT%H:%M:%SZ");
+            let _ = writeln!(out, "  {at}, as {}:{} would, {:.0}σ", h.effect, h.instance, h.significance);
+        }
+        let _ =
+            writeln!(out, "  Near a gap or the end there is too little to weigh it: run two days' files as one.");
+    }
     if let Some(f) = accepted.first() {
         let _ = writeln!(out, "\nnext      dragfree model add MODEL.toml {}:{}", f.effect, f.instance);
     }
@@ -217,6 +231,18 @@ fn screen(d: &Diagnosis, record: &Record, top: usize, paint: Paint) -> String {
         let _ = writeln!(out, "not tried {name}: {reason}");
     }
     out
+}
+
+/// What was seen, the loudest first, but for what is part of the answer and what rings beside something louder.
+fn unnamed<'a>(seen: impl Iterator<Item = &'a Hit>, accepted: &[&Found]) -> Vec<&'a Hit> {
+    let at_ns = |f: &&Found| f.shape.get("at_ns").and_then(serde_json::Value::as_i64);
+    let mut told: Vec<i64> = accepted.iter().filter_map(at_ns).collect();
+    let mut is_new = |hit: &&Hit| {
+        let new = told.iter().all(|at_ns| (at_ns - hit.at_ns).abs() > SAME_EVENT_NS);
+        told.push(hit.at_ns);
+        new
+    };
+    seen.filter(|hit| is_new(hit)).collect()
 }
 
 fn put(out: &mut String, f: &Found) {
@@ -246,5 +272,29 @@ fn put(out: &mut String, f: &Found) {
     }
     if !f.confounders.is_empty() {
         let _ = writeln!(out, "    cannot be told from {}", f.confounders.join(", "));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_rings_beside_something_louder_or_is_named_is_not_told_again() {
+        let hit = |at_s: i64| Hit {
+            effect: "impulse".to_owned(),
+            instance: "tm1.x".to_owned(),
+            coefficient: "impulse.tm1.x".to_owned(),
+            unit: "N s".to_owned(),
+            shape: serde_json::Map::new(),
+            at_ns: 1_000_000_000 * at_s,
+            significance: 10.0,
+        };
+        let seen = [hit(20_000), hit(21_800), hit(24_000), hit(5_000)];
+        let times = |accepted: &[&Found]| -> Vec<i64> {
+            unnamed(seen.iter(), accepted).iter().map(|h| h.at_ns / 1_000_000_000).collect()
+        };
+        // The third rings beside the second, which rings beside the first.
+        assert_eq!(times(&[]), [20_000, 5_000]);
     }
 }

@@ -71,7 +71,8 @@ impl ProductWriter {
                 revision += 1;
                 continue;
             };
-            // Another writer may have finished between the look and the claim.
+            // Another writer may have finished between the look and the claim, with this revision or a later one: revisions follow the order in
+            // which they were written, and one that is given up so stays free.
             if next_free(&self.archive, &stem, revision)? == revision {
                 let supersedes = superseded(&self.archive, &stem, draft, &reports, &attachments)?;
                 let product = draft::product(draft, &reports, revision, attachments, supersedes)?;

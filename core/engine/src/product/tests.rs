@@ -178,8 +178,11 @@ fn concurrent_writers_get_a_revision_each_with_their_own_attachments() {
     });
     let listing = list(folder.path()).expect("list");
     assert!(listing.problems.is_empty(), "{:?}", listing.problems);
-    let revisions = listing.entries.iter().map(|entry| entry.product.header.non_standard_attributes.revision);
-    assert!(revisions.eq(1..=WRITERS), "no revision lost, none twice");
+    let revision = |entry: &Entry| entry.product.header.non_standard_attributes.revision;
+    let revisions: Vec<u32> = listing.entries.iter().map(revision).collect();
+    // One who claimed a revision, and finds that another was quicker with the next, goes on behind it: a number may stay free.
+    assert_eq!(revisions.len(), WRITERS as usize, "none lost");
+    assert!(revisions.windows(2).all(|pair| pair[0] < pair[1]), "none twice: {revisions:?}");
     assert_eq!(listing.entries.iter().filter(|entry| entry.latest).count(), 1);
     for entry in &listing.entries {
         let beside = std::fs::read_to_string(entry.path.with_extension("mcap")).expect("series");
