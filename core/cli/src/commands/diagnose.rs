@@ -221,8 +221,7 @@ fn screen(d: &Diagnosis, record: &Record, top: usize, paint: Paint) -> String {
             let at = DateTime::from_timestamp_nanos(h.at_ns).format("%Y-%m-%dT%H:%M:%SZ");
             let _ = writeln!(out, "  {at}, as {}:{} would, {:.0}σ", h.effect, h.instance, h.significance);
         }
-        let _ =
-            writeln!(out, "  Near a gap or the end there is too little to weigh it: run two days' files as one.");
+        let _ = writeln!(out, "  Near a gap or the end there is too little to weigh it: run two days' files as one.");
     }
     if let Some(f) = accepted.first() {
         let _ = writeln!(out, "\nnext      dragfree model add MODEL.toml {}:{}", f.effect, f.instance);
