@@ -26,7 +26,7 @@ pub trait Cuts {
     /// A run that has ended before it gave a segment of full length, all of its samples.
     fn short_run(&mut self, _first_ns: i64, _columns: &[&[f64]]) {}
 
-    /// The last samples of a run that has ended, as many as a segment may still have needed: others end where they please.
+    /// A run has ended: its last samples, less than a segment of full length, whatever shorter ones there were or come.
     fn tail(&mut self, _first_ns: i64, _columns: &[&[f64]]) {}
 
     /// The run of samples has ended.
