@@ -13,6 +13,10 @@ use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions};
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// A claim that stays longer is one that a killed writer left.
+const PATIENCE: Duration = Duration::from_secs(5);
 
 /// Revisions have four digits.
 const LAST_REVISION: u32 = 9999;
@@ -65,14 +69,22 @@ impl ProductWriter {
         let attachments = self.staged.iter().map(|(suffix, path)| seal(suffix, path));
         let attachments = attachments.collect::<Result<Vec<_>, _>>()?;
         let mut revision = 1;
+        let mut waiting = (revision, Instant::now());
         loop {
             revision = next_free(&self.archive, &stem, revision)?;
+            if waiting.0 != revision {
+                waiting = (revision, Instant::now());
+            }
             let Some(claim) = Claim::take(&self.archive, &stem, revision)? else {
-                revision += 1;
+                // Whoever has it may still give it up, and the next would be written over a gap.
+                if waiting.1.elapsed() < PATIENCE {
+                    std::thread::sleep(PATIENCE / 500);
+                } else {
+                    revision += 1;
+                }
                 continue;
             };
-            // Another writer may have finished between the look and the claim, with this revision or a later one: revisions follow the order in
-            // which they were written, and one that is given up so stays free.
+            // Another writer may have finished between the look and the claim.
             if next_free(&self.archive, &stem, revision)? == revision {
                 let supersedes = superseded(&self.archive, &stem, draft, &reports, &attachments)?;
                 let product = draft::product(draft, &reports, revision, attachments, supersedes)?;
