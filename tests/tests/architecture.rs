@@ -37,14 +37,16 @@ fn allowed(crate_name: &str) -> &'static [&'static str] {
             "dragfree-engine",
             "dragfree-physics",
             "dragfree-chart",
-            "dragfree-critic",
+            "dragfree-identification",
             "dragfree-estimation",
             "dragfree-score",
         ],
         "dragfree-validation" => &["dragfree-engine", "dragfree-physics", "dragfree-chart"],
         "dragfree-estimation" => &["dragfree-physics"],
-        "dragfree-critic" => &["dragfree-physics", "dragfree-estimation"],
-        "dragfree-critic-stage" => &["dragfree-sdk", "dragfree-physics", "dragfree-estimation", "dragfree-critic"],
+        "dragfree-identification" => &["dragfree-physics", "dragfree-estimation"],
+        "dragfree-critic-stage" => {
+            &["dragfree-sdk", "dragfree-physics", "dragfree-estimation", "dragfree-identification"]
+        }
         "dragfree-tests" => &["dragfree-engine"],
         "dragfree-qp-check" => &["dragfree-sdk", "dragfree-physics", "dragfree-estimation"],
         _ => &["dragfree-sdk", "dragfree-physics"],

@@ -98,7 +98,7 @@ fn bench(package: &str, name: &str) -> Result<(), CampaignError> {
 /// [`CampaignError`].
 pub fn measure(program: &Program, path: &Path, scratch: &Path) -> Result<(), CampaignError> {
     bench("dragfree-es-akf", "step")?;
-    bench("dragfree-critic", "candidates")?;
+    bench("dragfree-identification", "candidates")?;
     const STEP: &str = "es-akf step, 22 states";
     let dense = criterion(&[STEP, "dense nalgebra"])?;
     let step = |name: &str| Ok::<_, CampaignError>(dense / criterion(&[STEP, name])?);
@@ -129,7 +129,7 @@ pub fn measure(program: &Program, path: &Path, scratch: &Path) -> Result<(), Cam
         command: command.to_owned(),
     };
     let bench = "cargo bench -p dragfree-es-akf --bench step";
-    let candidates = "cargo bench -p dragfree-critic --bench candidates";
+    let candidates = "cargo bench -p dragfree-identification --bench candidates";
     let speed = Speed {
         date,
         ratios: vec![

@@ -99,7 +99,7 @@ pub struct Estimate {
     /// Rows at which the solution stands.
     pub active: Vec<Active>,
     /// The data's score of the free coefficients at the solution, `c − Nθ`, where ranges hold it back; what surveys hold stays where it is.
-    pub held: DVector<f64>,
+    pub bound_score: DVector<f64>,
     /// Conditions of optimality of the last solution.
     pub kkt: Kkt,
     /// The normal equations, with the refined Σ.
@@ -232,7 +232,7 @@ pub fn estimate_with(
     let spectra = &sums.total;
     let whitening = Whitening::new(noise, plan, spectra)?;
     let even = refinement == Refinement::Levels;
-    let kept = if even { balanced(spectra, plan) } else { spectra.kept() };
+    let kept = if even { zero_area_weights(spectra, plan) } else { spectra.kept() };
     let mut inverses = whitening.model_inverses();
     let initial: Vec<f64> = unknowns.iter().map(|u| u.initial).collect();
     let mut linear = layout.linear_at(&initial);
@@ -291,7 +291,7 @@ pub fn estimate_with(
         None => None,
     };
     let known = reduced.with_knowledge(&solved.active);
-    let held = reduced.held(&solved.active);
+    let bound_score = reduced.bound_score(&solved.active);
     let (pulls, survey_chi2) = reduced.pulls(&solved.active, chi2_per_dof.max(1.0));
     let (worst, worst_band_dof) = worst_band(&residual, &inverses, plan, &whitening);
     let quality = Quality {
@@ -314,7 +314,7 @@ pub fn estimate_with(
         covariance,
         weak,
         active: solved.active,
-        held,
+        bound_score,
         kkt: solved.kkt,
         normal: NormalEquations::new(names, &equations, spectra.segments),
         known,
@@ -335,12 +335,12 @@ pub fn estimate_with(
 /// lowest bin of an ordinary segment, 1.8 mHz, the loop is stiff, and U is much as it is in the octave above. Left out, that moved gains
 /// of the thrusters by 0.02, more than their σ, whatever the length of the data. Segments that are there for what is slow leave next to
 /// nothing out.
-fn balanced(spectra: &Spectra, plan: &Plan) -> Vec<f64> {
+fn zero_area_weights(spectra: &Spectra, plan: &Plan) -> Vec<f64> {
     let octave = if plan.first_bin == FIRST_BIN { FIRST_BIN..2 * FIRST_BIN } else { 0..0 };
     // Of frequencies from zero, half a bin belongs to the constant.
     let both = 1.0 + (FIRST_BIN as f64 - 0.5) / FIRST_BIN as f64;
     let weight = |(band, even): (&Band, f64)| if octave.contains(&band.first) { both * even } else { even };
-    plan.bands.iter().zip(spectra.evenly()).map(weight).collect()
+    plan.bands.iter().zip(spectra.equal_time_weights()).map(weight).collect()
 }
 
 /// By how much σ of each free coefficient is larger than the equations with other weights than the true ones say: bands that stand for
@@ -514,7 +514,7 @@ impl<'a> Reduced<'a> {
     }
 
     /// `Σ z a` over ranges at which the solution stands.
-    fn held(&self, active: &[Active]) -> DVector<f64> {
+    fn bound_score(&self, active: &[Active]) -> DVector<f64> {
         let mut sum = DVector::zeros(self.free.len());
         for a in active.iter().filter(|a| self.knowledge[a.row] != Knowledge::Survey) {
             let sign = if a.side == Side::Upper { 1.0 } else { -1.0 };
@@ -779,7 +779,7 @@ mod tests {
     }
 
     /// Of a strictly causal filter the real part has no area. All bands alike leave out what lies below the lowest bin, two and a half
-    /// bins in which `U = −1`; balanced weights leave out by what U differs in the octave above, `(f/f_c)²` of these: 1 % for a corner of
+    /// bins in which `U = −1`; zero-area weights leave out by what U differs in the octave above, `(f/f_c)²` of these: 1 % for a corner of
     /// ten times its frequency.
     #[test]
     fn what_lies_below_the_lowest_bin_counts_with_the_octave_above() {
@@ -787,8 +787,8 @@ mod tests {
         let mut spectra = Spectra::zero(plan.bands.len(), 0);
         (0..20).for_each(|k| spectra.count_segment(&plan, 0, k > 0));
         for corner_hz in [0.03, 0.1] {
-            let alike = score(&plan, &spectra, &spectra.evenly(), corner_hz);
-            let balanced = score(&plan, &spectra, &balanced(&spectra, &plan), corner_hz);
+            let alike = score(&plan, &spectra, &spectra.equal_time_weights(), corner_hz);
+            let balanced = score(&plan, &spectra, &zero_area_weights(&spectra, &plan), corner_hz);
             assert!((alike - 2.5).abs() < 0.1, "{corner_hz} Hz: {alike}");
             assert!(balanced.abs() < 0.1, "{corner_hz} Hz: {balanced}");
         }
@@ -796,6 +796,6 @@ mod tests {
         let slow = Plan::slow(16 * 16_384, 16_384, 10.0);
         let mut spectra = Spectra::zero(slow.bands.len(), 0);
         spectra.count_segment(&slow, 0, false);
-        assert_eq!(balanced(&spectra, &slow), spectra.evenly());
+        assert_eq!(zero_area_weights(&spectra, &slow), spectra.equal_time_weights());
     }
 }

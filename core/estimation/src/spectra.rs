@@ -330,7 +330,7 @@ impl Spectra {
     /// over all bands is zero (see [`crate::levels`]). Bands that stand for less time than others, as the lowest ones do at the ends
     /// of a run, would bias it.
     #[must_use]
-    pub fn evenly(&self) -> Vec<f64> {
+    pub fn equal_time_weights(&self) -> Vec<f64> {
         let time = self.kept().last().zip(self.weight.last()).map_or(0.0, |(kept, weight)| kept * weight);
         self.weight.iter().map(|g| if *g > 0.0 { time / g } else { 0.0 }).collect()
     }

@@ -1,7 +1,7 @@
 //! Stage `critic`: gathers what a criticism of the model needs, and leaves it in a file.
 //!
 //! It stands in the place of the estimators, behind the effects of the model and every candidate. The mathematics is that of
-//! `core/critic`; here columns become its question.
+//! `core/identification`; here columns become its candidate_set.
 
 mod stage;
 

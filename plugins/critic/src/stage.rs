@@ -5,18 +5,18 @@ use std::collections::BTreeMap;
 use std::io::BufWriter;
 use std::path::Path;
 
-use dragfree_critic::course::Course;
-use dragfree_critic::gather::{Columns, Gatherer, LONG, SLOW_HZ};
-use dragfree_critic::question::{Coefficient as Asked, Form, Question, Rule, Term};
-use dragfree_critic::record::Record;
-use dragfree_critic::transient::{Hit, Search, Template};
-use dragfree_critic::witness::Witnesses;
 use dragfree_estimation::colour;
 use dragfree_estimation::estimate::{Observed, Refinement, estimate_with};
 use dragfree_estimation::segments::{Segmenter, all_finite, longest_length};
 use dragfree_estimation::sigma::{BandNoise, Measured, NoiseModel};
 use dragfree_estimation::spectra::Plan;
 use dragfree_estimation::stored::Stored;
+use dragfree_identification::candidates::{CandidateSet, Coefficient as Asked, Form, Rule, Term};
+use dragfree_identification::coherence::HousekeepingCoherence;
+use dragfree_identification::gram::{Columns, GramAccumulator, LONG, SLOW_HZ};
+use dragfree_identification::record::Record;
+use dragfree_identification::transient::{Detection, Search, Template};
+use dragfree_identification::waveform::Waveform;
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::DMatrix;
@@ -42,14 +42,14 @@ pub struct Critic {
 struct Linked {
     columns: Vec<In>,
     names: Vec<String>,
-    question: Question,
+    candidate_set: CandidateSet,
     differenced: Vec<bool>,
     base: usize,
     /// Courses that begin at known times, and where they stand among the columns.
-    courses: Vec<Course>,
+    waveforms: Vec<Waveform>,
     courses_at: usize,
     segmenter: Segmenter,
-    gatherer: Gatherer,
+    gatherer: GramAccumulator,
     rate_hz: f64,
     /// Last value of each column.
     held: Vec<f64>,
@@ -72,19 +72,19 @@ impl Stage for Critic {
                 "reference",
                 "",
                 &[],
-                "normal equations of the product (.neq.json): residuals for the search of what happens once, and for witnesses",
+                "normal equations of the product (.neq.json): residuals for the search of transients, and for coherences of housekeeping",
             ),
             Parameter::text(
                 "gather",
                 "everything",
                 &["everything", "events"],
-                "events: only look for what happens once, and gather nothing of any candidate",
+                "events: only look for what happens transient, and gather nothing of any candidate",
             ),
             Parameter::text(
                 "events",
                 "",
                 &[],
-                "file with the times at which something was found to happen (JSON): courses of candidates that begin then are gathered",
+                "file with the times at which something was found to happen (JSON): waveforms of candidates that begin then are gathered",
             ),
         ],
         instances: &[],
@@ -111,7 +111,7 @@ impl Stage for Critic {
 
     fn process(&mut self, input: &Inputs<'_>, _output: &mut Outputs) -> Result<(), PluginError> {
         let linked = self.linked.as_mut().ok_or_else(before_link)?;
-        let begun: Vec<Vec<f64>> = linked.courses.iter().map(|c| c.over(input.time_ns())).collect();
+        let begun: Vec<Vec<f64>> = linked.waveforms.iter().map(|c| c.over(input.time_ns())).collect();
         let mut columns: Vec<&[f64]> = linked.columns.iter().map(|c| input.f64(*c)).collect();
         columns.splice(linked.courses_at..linked.courses_at, begun.iter().map(Vec::as_slice));
         linked.push(input.time_ns(), &columns);
@@ -175,12 +175,12 @@ impl Critic {
         };
         let differenced: Vec<bool> = channels.iter().map(|c| c.attribute("average") == "2").collect();
         let templates = templates(available, &channels, &differenced);
-        let courses = self.courses(&templates, rate_hz)?;
-        let sorted = Series::sort(available, &channels, self.only_events, &courses)?;
+        let waveforms = self.waveforms(&templates, rate_hz)?;
+        let sorted = Series::sort(available, &channels, self.only_events, &waveforms)?;
         let housekeeping: Vec<&Column> =
             available.columns.iter().filter(|c| c.table == "grid" && c.name.starts_with("hk.")).collect();
         let own = channels.iter().map(|c| Want::of(c));
-        let made = |(table, _): &&(String, String)| table != COURSES;
+        let made = |(table, _): &&(String, String)| table != WAVEFORMS;
         let series = sorted.keys.iter().filter(made).map(|(table, name)| Want::new(name).table(table));
         let wants = own.chain(series).chain(housekeeping.iter().map(|c| Want::of(c)));
         let columns: Vec<In> = wants.map(|want| link.read(&want.rate_hz(rate_hz))).collect::<Result<_, _>>()?;
@@ -193,10 +193,10 @@ impl Critic {
             channels: channels.len(),
             base: channels.len() + sorted.base,
             fast: channels.len() + sorted.fast,
-            energy: courses.iter().map(|c| c.energy(&plan, differenced.contains(&true))).collect(),
+            energy: waveforms.iter().map(|c| c.energy(&plan, differenced.contains(&true))).collect(),
         };
-        let question = question(available, &channels, &sorted, &courses);
-        let residual = self.residual(&question, &channels, &all, length)?;
+        let candidate_set = candidate_set(available, &channels, &sorted, &waveforms);
+        let residual = self.residual(&candidate_set, &channels, &all, length)?;
         // As they are called in telemetry: `hk/battery_current_a`.
         let topics: Vec<String> = housekeeping.iter().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
         let whole: Vec<(&str, Measured)> = channels.iter().map(|c| (name_of(c), measured(c))).collect();
@@ -213,11 +213,11 @@ impl Critic {
         // What was looked for before is not looked for again.
         let templates = if self.events.is_empty() { templates } else { Vec::new() };
         let search = Search::new(templates, residual.clone(), inverses).on(self.threads);
-        let witnesses = |plan: &Plan| {
+        let coherence = |plan: &Plan| {
             let whitening = plan.bands.iter().map(|b| inverse(plan.frequency_hz(*b))).collect();
-            Witnesses::new(topics, plan, residual, whitening)
+            HousekeepingCoherence::new(topics, plan, residual, whitening)
         };
-        let width = columns.len() + courses.len();
+        let width = columns.len() + waveforms.len();
         let averaged: Vec<bool> =
             (0..width).map(|i| (all.channels..names.len()).contains(&i) && differenced.iter().any(|d| *d)).collect();
         Ok(Linked {
@@ -227,59 +227,64 @@ impl Critic {
             waiting: true,
             segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged).of_first(all.fast),
             base: all.base,
-            courses_at: all.fast - courses.len(),
-            courses,
-            gatherer: Gatherer::new(all, length, rate_hz, self.threads, witnesses, search),
+            courses_at: all.fast - waveforms.len(),
+            waveforms,
+            gatherer: GramAccumulator::new(all, length, rate_hz, self.threads, coherence, search),
             columns,
             names,
-            question,
+            candidate_set,
             differenced,
             rate_hz,
         })
     }
 
-    /// The courses that begin where something was found to happen.
-    fn courses(&self, templates: &[Template], rate_hz: f64) -> Result<Vec<Course>, PluginError> {
+    /// The waveforms that begin where something was found to happen.
+    fn waveforms(&self, templates: &[Template], rate_hz: f64) -> Result<Vec<Waveform>, PluginError> {
         if self.events.is_empty() {
             return Ok(Vec::new());
         }
         let refuse = |what: String| PluginError::error(format!("critic: {}: {what}", self.events));
         let text = std::fs::read_to_string(&self.events).map_err(|e| refuse(e.to_string()))?;
-        let hits: Vec<Hit> = serde_json::from_str(&text).map_err(|e| refuse(e.to_string()))?;
-        let course = |hit: &Hit| {
+        let detections: Vec<Detection> = serde_json::from_str(&text).map_err(|e| refuse(e.to_string()))?;
+        let waveform = |detection: &Detection| {
             let of = |t: &&Template| {
-                (&t.effect, &t.instance, &t.coefficient) == (&hit.effect, &hit.instance, &hit.coefficient)
+                (&t.effect, &t.instance, &t.coefficient)
+                    == (&detection.effect, &detection.instance, &detection.coefficient)
             };
-            let own = |t: &&Template| t.shape.iter().all(|(key, value)| hit.shape.get(key) == Some(value));
+            let own = |t: &&Template| t.shape.iter().all(|(key, value)| detection.shape.get(key) == Some(value));
             let template = templates.iter().find(|t| of(t) && own(t)).ok_or_else(|| {
                 refuse(format!(
-                    "no effect has the course of {}:{} at {} ns any more",
-                    hit.effect, hit.instance, hit.at_ns
+                    "no effect has the waveform of {}:{} at {} ns any more",
+                    detection.effect, detection.instance, detection.at_ns
                 ))
             })?;
-            Ok(Course { at_ns: hit.at_ns, step_ns: (1e9 / rate_hz).round() as i64, kernel: template.kernel.clone() })
+            Ok(Waveform {
+                at_ns: detection.at_ns,
+                step_ns: (1e9 / rate_hz).round() as i64,
+                kernel: template.kernel.clone(),
+            })
         };
-        hits.iter().map(course).collect()
+        detections.iter().map(waveform).collect()
     }
 
     /// Residuals as combinations of the base columns, at the coefficients of the product's own sums where they are given.
     fn residual(
         &self,
-        question: &Question,
+        candidate_set: &CandidateSet,
         channels: &[&Column],
         columns: &Columns,
         length: usize,
     ) -> Result<DMatrix<f64>, PluginError> {
         let n = channels.len();
-        let mut theta: Vec<f64> = question.coefficients.iter().map(|c| c.initial).collect();
+        let mut theta: Vec<f64> = candidate_set.coefficients.iter().map(|c| c.initial).collect();
         if !self.reference.is_empty() {
             let refuse = |what: String| PluginError::error(format!("critic: {}: {what}", self.reference));
             let text = std::fs::read_to_string(&self.reference).map_err(|e| refuse(e.to_string()))?;
             let mut value: serde_json::Value = serde_json::from_str(&text).map_err(|e| refuse(e.to_string()))?;
             let stored: Stored = serde_json::from_value(value["sums"].take()).map_err(|e| refuse(e.to_string()))?;
             let (layout, plan, sums) = Stored::stack(&[stored]).map_err(|e| refuse(e.to_string()))?;
-            let model = question.model();
-            let same = layout.coefficients.iter().eq(question.coefficients[..model].iter().map(|c| &c.name));
+            let model = candidate_set.model();
+            let same = layout.coefficients.iter().eq(candidate_set.coefficients[..model].iter().map(|c| &c.name));
             if !same || plan.length != length {
                 return Err(refuse("belongs to another model, or to segments of another length".to_owned()));
             }
@@ -289,7 +294,7 @@ impl Critic {
                     layout.channels.iter().filter_map(of).map(|c| (name_of(c), measured(c))).collect();
                 let noise = NoiseModel::new(&self.mission, &seen, 1.0 / plan.rate_hz)?;
                 let observed = Observed { layout: &layout, plan: &plan, sums: &sums, prediction: None };
-                let (unknowns, bounds) = (question.unknowns(&[]), question.bounds());
+                let (unknowns, bounds) = (candidate_set.unknowns(&[]), candidate_set.bounds());
                 let solved = estimate_with(
                     &observed,
                     &BandNoise::new(&noise, &plan),
@@ -303,7 +308,7 @@ impl Critic {
         }
         let mut residual = DMatrix::zeros(n, columns.base);
         (0..n).for_each(|c| residual[(c, c)] = 1.0);
-        for (i, c) in question.coefficients[..question.model()].iter().enumerate() {
+        for (i, c) in candidate_set.coefficients[..candidate_set.model()].iter().enumerate() {
             for t in &c.forms[0].terms {
                 residual[(t.channel, t.column)] -= theta[i] * t.factor * t.times.map_or(1.0, |other| theta[other]);
             }
@@ -317,7 +322,7 @@ fn measured(channel: &Column) -> Measured {
 }
 
 /// The table of columns that no plugin makes.
-const COURSES: &str = "events";
+const WAVEFORMS: &str = "events";
 
 /// The series behind the channels, sorted as the sums want them.
 struct Series {
@@ -334,7 +339,7 @@ impl Series {
         available: &Available,
         channels: &[&Column],
         model_alone: bool,
-        courses: &[Course],
+        waveforms: &[Waveform],
     ) -> Result<Self, PluginError> {
         let mut responses: BTreeMap<String, Vec<Response>> = BTreeMap::new();
         for (c, r) in available.responses()? {
@@ -364,7 +369,7 @@ impl Series {
                 }
             }
             if part == 1 {
-                keys.extend((0..courses.len()).map(|k| (COURSES.to_owned(), format!("event {k}"))));
+                keys.extend((0..waveforms.len()).map(|k| (WAVEFORMS.to_owned(), format!("event {k}"))));
             }
             if part < 2 {
                 counts[part] = keys.len();
@@ -374,7 +379,7 @@ impl Series {
     }
 }
 
-fn question(available: &Available, channels: &[&Column], series: &Series, courses: &[Course]) -> Question {
+fn candidate_set(available: &Available, channels: &[&Column], series: &Series, waveforms: &[Waveform]) -> CandidateSet {
     let column: BTreeMap<(&str, &str), usize> =
         series.keys.iter().enumerate().map(|(i, (t, n))| ((t.as_str(), n.as_str()), channels.len() + i)).collect();
     let coefficient = |name: &String| available.coefficients.iter().position(|c| !c.candidate && c.name == *name);
@@ -432,18 +437,18 @@ fn question(available: &Available, channels: &[&Column], series: &Series, course
             prior_sigma: finite(c.prior_sigma),
             estimate: c.estimate,
             candidate: c.candidate,
-            once: false,
+            transient: false,
             forms,
             noise: c.noise.clone(),
         }
     };
-    // Whatever has the course of something that was found may have been the cause.
-    let once = |c: &Coefficient| {
-        let at = |(k, course): (usize, &Course)| {
-            let transient = c.transients.iter().find(|t| t.kernel == course.kernel)?;
+    // Whatever has the waveform of something that was found may have been the cause.
+    let transient = |c: &Coefficient| {
+        let at = |(k, waveform): (usize, &Waveform)| {
+            let transient = c.transients.iter().find(|t| t.kernel == waveform.kernel)?;
             let mut shape: serde_json::Map<_, _> = transient.shape.clone().into_iter().collect();
-            shape.insert("at_ns".to_owned(), course.at_ns.into());
-            let column = *column.get(&(COURSES, format!("event {k}").as_str()))?;
+            shape.insert("at_ns".to_owned(), waveform.at_ns.into());
+            let column = *column.get(&(WAVEFORMS, format!("event {k}").as_str()))?;
             let term = |(name, factor): &(String, f64)| {
                 let channel = channels.iter().position(|c| name_of(c) == name)?;
                 Some(Term { channel, column, factor: *factor, times: None })
@@ -452,8 +457,8 @@ fn question(available: &Available, channels: &[&Column], series: &Series, course
             let (lower, upper) = (finite(c.lower), finite(c.upper));
             Some(Form { shape, unit: c.unit.clone(), lower, upper, terms, colours: None })
         };
-        let forms: Vec<Form> = courses.iter().enumerate().filter_map(at).collect();
-        (!forms.is_empty()).then(|| Asked { once: true, noise: String::new(), forms, ..asked(c) })
+        let forms: Vec<Form> = waveforms.iter().enumerate().filter_map(at).collect();
+        (!forms.is_empty()).then(|| Asked { transient: true, noise: String::new(), forms, ..asked(c) })
     };
     let rule = |r: &Constraint| Rule {
         name: r.name.clone(),
@@ -462,13 +467,13 @@ fn question(available: &Available, channels: &[&Column], series: &Series, course
         lower: finite(r.lower),
         upper: finite(r.upper),
     };
-    Question {
+    CandidateSet {
         channels: channels.iter().map(|c| name_of(c).to_owned()).collect(),
         coefficients: available
             .coefficients
             .iter()
             .map(asked)
-            .chain(available.coefficients.iter().filter_map(once))
+            .chain(available.coefficients.iter().filter_map(transient))
             .collect(),
         rules: available.constraints.iter().map(rule).collect(),
     }
@@ -550,14 +555,14 @@ impl Linked {
 
     /// What was gathered; candidates whose series have gaps are left out, with the reason.
     fn record(self) -> Record {
-        let mut question = self.question;
+        let mut candidate_set = self.candidate_set;
         let mut not_tried = Vec::new();
         let gappy = |column: usize| {
             self.missing[column] as f64 > MISSING * self.rows.max(1) as f64 || self.held[column].is_nan()
         };
-        let model = question.model();
+        let model = candidate_set.model();
         let mut fewer: BTreeMap<usize, usize> = BTreeMap::new();
-        for c in &mut question.coefficients[model..] {
+        for c in &mut candidate_set.coefficients[model..] {
             let before = c.forms.len();
             let mut culprit = None;
             c.forms.retain(|f| {
@@ -584,6 +589,6 @@ impl Linked {
                 format!("it has no value in {missing} of {rows} epochs, so {forms} forms of effects are left out");
             (self.names[column].clone(), reason)
         }));
-        Record { question, differenced: self.differenced, gathered: self.gatherer.finish(), not_tried }
+        Record { candidate_set, differenced: self.differenced, gathered: self.gatherer.finish(), not_tried }
     }
 }

@@ -6,12 +6,12 @@ use crate::failure::Failure;
 use crate::progress::Meter;
 use crate::text::Paint;
 use chrono::DateTime;
-use dragfree_critic::diagnosis::{Diagnosis, Found, Lead, diagnose};
-use dragfree_critic::rank::Court;
-use dragfree_critic::record::Record;
-use dragfree_critic::transient::Hit;
 use dragfree_engine::examine::{Examination, Sources, candidates, examine, has_parameter, model};
 use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_identification::diagnosis::{Diagnosis, Found, RefinementRequest, diagnose};
+use dragfree_identification::record::Record;
+use dragfree_identification::scores::CandidateScorer;
+use dragfree_identification::transient::Detection;
 use dragfree_physics::mission::Mission;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -21,7 +21,7 @@ use std::path::{Path, PathBuf};
 /// Parameter of an effect whose candidate can be tried about one shape in fine steps.
 const FINE: &str = "fine";
 
-/// Of what happened once, as much is weighed against all else.
+/// Of what happened transient, as much is weighed against all else.
 const MOST_EVENTS: usize = 8;
 
 /// And no less than what chance gives in one of so many searches: which of it is certain, its full weight decides.
@@ -47,13 +47,14 @@ pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Resu
 /// The verdict on what was gathered; `tried_before` as [`diagnose`] takes it.
 fn judge(record: &Record, mission: &Mission, tried_before: &BTreeMap<String, usize>) -> Result<Diagnosis, Failure> {
     let noise = noise(record, mission)?;
-    diagnose(&Court::new(&record.question, &record.gathered, &noise), tried_before).map_err(Failure::engine)
+    diagnose(&CandidateScorer::new(&record.candidate_set, &record.gathered, &noise), tried_before)
+        .map_err(Failure::engine)
 }
 
 pub(super) fn noise(record: &Record, mission: &Mission) -> Result<NoiseModel, Failure> {
     let measured = |d: &bool| if *d { Measured::Differenced } else { Measured::Directly };
     let channels: Vec<(&str, Measured)> =
-        record.question.channels.iter().map(String::as_str).zip(record.differenced.iter().map(measured)).collect();
+        record.candidate_set.channels.iter().map(String::as_str).zip(record.differenced.iter().map(measured)).collect();
     NoiseModel::new(mission, &channels, 1.0 / record.gathered.rate_hz).map_err(Failure::engine)
 }
 
@@ -62,10 +63,10 @@ pub(super) fn noise(record: &Record, mission: &Mission) -> Result<NoiseModel, Fa
 enum What<'a> {
     /// The model alone.
     Model,
-    /// What happens once.
+    /// Transients.
     Events,
-    /// Every candidate, at these times what happens once, and about these shapes in fine steps what can be tried so.
-    Everything(&'a [Hit], &'a [Lead]),
+    /// Every candidate, at these times what happens transient, and about these shapes in fine steps what can be tried so.
+    Everything(&'a [Detection], &'a [RefinementRequest]),
 }
 
 /// What is known of some products.
@@ -81,29 +82,29 @@ pub(super) fn gather_model(names: &[String], archive: &Path, global: &Global) ->
     gather(names, archive, global, What::Model)
 }
 
-/// Gathers the data of products of one model, with every candidate, and diagnoses them. The data are read twice: what happens once has
+/// Gathers the data of products of one model, with every candidate, and diagnoses them. The data are read twice: transients has
 /// to be found before it can be weighed against what lasts; and once more where a shape stands out that can be tried in finer steps.
 pub(super) fn gather_candidates(names: &[String], archive: &Path, global: &Global) -> Result<Gathering, Failure> {
     let found = gather(names, archive, global, What::Events)?.0.gathered.transients;
-    let events: Vec<Hit> = found.certain(WORTH_TRYING).take(MOST_EVENTS).cloned().collect();
-    let once = |leads: &[Lead], tried_before: &BTreeMap<String, usize>| {
-        let (mut record, mission) = gather(names, archive, global, What::Everything(&events, leads))?;
+    let events: Vec<Detection> = found.certain(WORTH_TRYING).take(MOST_EVENTS).cloned().collect();
+    let pass = |refinement_requests: &[RefinementRequest], tried_before: &BTreeMap<String, usize>| {
+        let (mut record, mission) = gather(names, archive, global, What::Everything(&events, refinement_requests))?;
         record.gathered.transients = found.clone();
         let diagnosis = judge(&record, &mission, tried_before)?;
         Ok::<_, Failure>(Gathering { record, diagnosis })
     };
-    let first = once(&[], &BTreeMap::new())?;
+    let first = pass(&[], &BTreeMap::new())?;
     let registry = super::registry(global)?;
-    let mut leads = first.diagnosis.leads.clone();
-    leads.retain(|lead| has_parameter(&registry, &lead.effect, FINE));
-    if leads.is_empty() {
+    let mut refinement_requests = first.diagnosis.refinement_requests.clone();
+    refinement_requests.retain(|request| has_parameter(&registry, &request.effect, FINE));
+    if refinement_requests.is_empty() {
         return Ok(first);
     }
     let mut tried = first.diagnosis.forms;
-    tried.retain(|effect, _| leads.iter().any(|lead| lead.effect == *effect));
+    tried.retain(|effect, _| refinement_requests.iter().any(|request| request.effect == *effect));
     // Sums are large, and these are made again.
     drop(first.record);
-    once(&leads, &tried)
+    pass(&refinement_requests, &tried)
 }
 
 fn gather(names: &[String], archive: &Path, global: &Global, what: What<'_>) -> Result<(Record, Mission), Failure> {
@@ -128,14 +129,18 @@ fn gather(names: &[String], archive: &Path, global: &Global, what: What<'_>) -> 
                 all.retain(|e| has_parameter(&registry, &e.id, "at_ns"));
                 ("look", all)
             }
-            What::Everything(events, leads) => {
-                for lead in leads {
-                    all.iter_mut().filter(|e| (&e.id, &e.instance) == (&lead.effect, &lead.instance)).for_each(|e| {
-                        let shape =
-                            lead.shape.iter().filter_map(|(k, v)| Some((k.clone(), toml::Value::try_from(v).ok()?)));
-                        e.parameters = shape.collect();
-                        e.parameters.insert(FINE.to_owned(), toml::Value::Integer(1));
-                    });
+            What::Everything(events, refinement_requests) => {
+                for request in refinement_requests {
+                    all.iter_mut().filter(|e| (&e.id, &e.instance) == (&request.effect, &request.instance)).for_each(
+                        |e| {
+                            let shape = request
+                                .shape
+                                .iter()
+                                .filter_map(|(k, v)| Some((k.clone(), toml::Value::try_from(v).ok()?)));
+                            e.parameters = shape.collect();
+                            e.parameters.insert(FINE.to_owned(), toml::Value::Integer(1));
+                        },
+                    );
                 }
                 let file = folder.path().join("events.json");
                 let json = serde_json::to_vec(events).map_err(Failure::engine)?;
@@ -188,7 +193,7 @@ fn screen(d: &Diagnosis, record: &Record, top: usize, paint: Paint) -> String {
         out,
         "tried     {} forms of {} effects, false alarms at most {} in 100",
         d.tried,
-        record.question.places().iter().filter(|p| !record.question.coefficients[p[0]].once).count(),
+        record.candidate_set.places().iter().filter(|p| !record.candidate_set.coefficients[p[0]].transient).count(),
         100.0 * d.false_alarm_rate
     );
     let accepted: Vec<&Found> = d.candidates.iter().filter(|f| f.accepted).collect();
@@ -233,15 +238,15 @@ fn screen(d: &Diagnosis, record: &Record, top: usize, paint: Paint) -> String {
 }
 
 /// What was seen, the loudest first, but for what is part of the answer and what rings beside something louder.
-fn unnamed<'a>(seen: impl Iterator<Item = &'a Hit>, accepted: &[&Found]) -> Vec<&'a Hit> {
+fn unnamed<'a>(seen: impl Iterator<Item = &'a Detection>, accepted: &[&Found]) -> Vec<&'a Detection> {
     let at_ns = |f: &&Found| f.shape.get("at_ns").and_then(serde_json::Value::as_i64);
     let mut told: Vec<i64> = accepted.iter().filter_map(at_ns).collect();
-    let mut is_new = |hit: &&Hit| {
-        let new = told.iter().all(|at_ns| (at_ns - hit.at_ns).abs() > SAME_EVENT_NS);
-        told.push(hit.at_ns);
+    let mut is_new = |detection: &&Detection| {
+        let new = told.iter().all(|at_ns| (at_ns - detection.at_ns).abs() > SAME_EVENT_NS);
+        told.push(detection.at_ns);
         new
     };
-    seen.filter(|hit| is_new(hit)).collect()
+    seen.filter(|detection| is_new(detection)).collect()
 }
 
 fn put(out: &mut String, f: &Found) {
@@ -280,7 +285,7 @@ mod tests {
 
     #[test]
     fn what_rings_beside_something_louder_or_is_named_is_not_told_again() {
-        let hit = |at_s: i64| Hit {
+        let detection = |at_s: i64| Detection {
             effect: "impulse".to_owned(),
             instance: "tm1.x".to_owned(),
             coefficient: "impulse.tm1.x".to_owned(),
@@ -289,7 +294,7 @@ mod tests {
             at_ns: 1_000_000_000 * at_s,
             significance: 10.0,
         };
-        let seen = [hit(20_000), hit(21_800), hit(24_000), hit(5_000)];
+        let seen = [detection(20_000), detection(21_800), detection(24_000), detection(5_000)];
         let times = |accepted: &[&Found]| -> Vec<i64> {
             unnamed(seen.iter(), accepted).iter().map(|h| h.at_ns / 1_000_000_000).collect()
         };

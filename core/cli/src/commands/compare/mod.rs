@@ -6,10 +6,10 @@ use super::{Done, diagnose, products};
 use crate::args::{Compare, Global};
 use crate::failure::Failure;
 use crate::text::{Paint, columns, labelled};
-use dragfree_critic::compare::{Channel, Comparison, Innovations, Kind, Nis, Test, compare};
-use dragfree_critic::rank::Court;
-use dragfree_critic::witness::{Coherence, Together};
 use dragfree_engine::product::Product;
+use dragfree_identification::coherence::{Coherence, StepwiseCoherence};
+use dragfree_identification::compare::{Channel, Comparison, Innovations, Kind, Nis, Test, compare};
+use dragfree_identification::scores::CandidateScorer;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -24,9 +24,9 @@ pub(super) fn execute(command: &Compare, global: &Global, paint: Paint) -> Resul
     let (record, mission) = diagnose::gather_model(names, archive, global)?;
     let noise = diagnose::noise(&record, &mission)?;
     let opened = names.iter().map(|name| Ok(products::open(name, archive)?.0)).collect::<Result<Vec<_>, Failure>>()?;
-    let court = Court::new(&record.question, &record.gathered, &noise);
+    let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise);
     let innovations = Innovations::judge(&octaves(&opened), record.gathered.rate_hz);
-    let comparison = compare(&court, nis(&opened), innovations).map_err(Failure::engine)?;
+    let comparison = compare(&scorer, nis(&opened), innovations).map_err(Failure::engine)?;
     if let Some(path) = &command.page {
         let meaning = (!comparison.passes).then(|| meaning(&comparison));
         let page = page::page(&comparison, names, meaning)?;
@@ -220,7 +220,7 @@ fn fails(c: &Comparison, name: &str) -> bool {
 }
 
 /// `tm1.y with hk/a and beside it hk/b, 64 % of 0.2m–0.5mHz`.
-fn together(t: &Together) -> String {
+fn together(t: &StepwiseCoherence) -> String {
     let name = t.channel.replace(".accel", "").replace("alpha", "α");
     format!("{name} with {}, {:.0} % of {}", t.drivers.join(" and beside it "), 100.0 * t.explained, hertz(t.band_hz))
 }

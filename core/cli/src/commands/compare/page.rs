@@ -3,8 +3,8 @@
 use crate::failure::Failure;
 use dragfree_chart::heat::{self, HeatMap};
 use dragfree_chart::{Line, Panel, Scale, Stroke, svg};
-use dragfree_critic::chance::{chi2_per_dof_quantile, corrected, two_sided};
-use dragfree_critic::compare::{Cell, Channel, Comparison, Innovations, Kind};
+use dragfree_identification::compare::{Cell, Channel, Comparison, Innovations, Kind};
+use dragfree_identification::distributions::{chi2_per_dof_quantile, corrected, two_sided};
 use std::fmt::Write as _;
 
 /// Axes of one body stand side by side.
@@ -90,7 +90,7 @@ pub(crate) fn page(c: &Comparison, names: &[String], meaning: Option<&str>) -> R
          between the dashed limits.",
         &lines(c, cumulative)?,
     );
-    out += "<h2>What goes with it</h2>\n<p>Housekeeping whose course goes with what is left over, below 50 mHz, by the part of the power that \
+    out += "<h2>What goes with it</h2>\n<p>Housekeeping whose waveform goes with what is left over, below 50 mHz, by the part of the power that \
             it shares in its best band. A place to look and no cause: currents of thrusters follow the commands, and these the noise.</p>\n";
     out += &bars(c);
     if !c.together.is_empty() {

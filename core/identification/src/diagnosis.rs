@@ -8,11 +8,11 @@ use serde::Serialize;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 
-use crate::chance::{corrected, ln_chi2_above, normal_tails};
-use crate::gather::LONG;
-use crate::question::Candidate;
-use crate::rank::{Court, Fit, Scored, WithoutExcess};
-use crate::witness::Coherence;
+use crate::candidates::Candidate;
+use crate::coherence::Coherence;
+use crate::distributions::{corrected, ln_chi2_above, normal_tails};
+use crate::gram::LONG;
+use crate::scores::{CandidateScorer, Fit, Scored, WithoutExcess};
 
 /// Chance of naming an effect when none is hidden.
 pub const FALSE_ALARM: f64 = 0.01;
@@ -48,7 +48,7 @@ const EXCESS: f64 = 1.25;
 const EXCESS_SIGMA: f64 = 4.5;
 
 /// Chance that any driver passes for a witness when none is: a part of [`FALSE_ALARM`], the most of which is left to effects.
-const WITNESS_ALARM: f64 = 1e-3;
+const COHERENCE_ALARM: f64 = 1e-3;
 
 /// Where there is no excess of power, a witness that explains no more than this part of a channel's power, in the band that says most, is
 /// no sign of something unexplained. In a day a few per cent are certain, and a thruster's current goes with the residuals by as much
@@ -56,7 +56,7 @@ const WITNESS_ALARM: f64 = 1e-3;
 const LEAST_EXPLAINED: f64 = 0.1;
 
 /// Why a candidate has no number.
-const MUTE: &str =
+const UNOBSERVABLE: &str =
     "these data say nothing of it: what it is made of does not change in them, or the model has the same already";
 
 /// What moves the offset by so many σ is no longer told from it.
@@ -178,7 +178,8 @@ pub struct Unexplained {
     /// Housekeeping that is coherent with it, each in its best form: first what chance gives most rarely.
     pub coherent_with: Vec<String>,
     /// The same with numbers.
-    pub witnesses: Vec<Coherence>,
+    #[serde(rename = "witnesses")]
+    pub coherences: Vec<Coherence>,
 }
 
 /// The answer.
@@ -188,7 +189,7 @@ pub struct Diagnosis {
     pub verdict: String,
     /// Chance of a false alarm.
     pub false_alarm_rate: f64,
-    /// Forms and levels of effects that were tried; what happens once was tried at every time besides.
+    /// Forms and levels of effects that were tried; transient templates were tried at every time besides.
     pub tried: usize,
     /// What explains the data, the best first; those that are accepted stand before the rest.
     pub candidates: Vec<Found>,
@@ -202,7 +203,7 @@ pub struct Diagnosis {
     pub not_tried: Vec<(String, String)>,
     /// Places that stand out beside the model alone, in their best forms: worth a finer look.
     #[serde(skip)]
-    pub leads: Vec<Lead>,
+    pub refinement_requests: Vec<RefinementRequest>,
     /// Forms that were tried, per effect, this time and before.
     #[serde(skip)]
     pub forms: BTreeMap<String, usize>,
@@ -210,7 +211,7 @@ pub struct Diagnosis {
 
 /// An effect at a place, in a form.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Lead {
+pub struct RefinementRequest {
     /// Effect.
     pub effect: String,
     /// Instance.
@@ -219,7 +220,7 @@ pub struct Lead {
     pub shape: Map<String, Value>,
 }
 
-/// How often chance had its say. Every effect has the same part of [`FALSE_ALARM`], and so has the search of what happens once; an
+/// How often chance had its say. Every effect has the same part of [`FALSE_ALARM`], and so has the search of transients; an
 /// effect's part is shared by all forms in all places that were tried of it (Bonferroni, with weights that are fixed before the data are seen).
 ///
 /// Were all forms alike, an effect of one form would pay for the ten thousand pairs of thermometers and lags of another.
@@ -228,30 +229,30 @@ struct Trials {
     forms: BTreeMap<String, f64>,
 }
 
-/// The search of what happens once, among the effects.
-const ONCE: &str = "what happens once";
+/// The search of what happens transient, among the effects.
+const TRANSIENT: &str = "transient search";
 
 /// Whose part of the false alarms it is.
 fn family(c: &Candidate) -> &str {
-    if c.once { ONCE } else { &c.effect }
+    if c.transient { TRANSIENT } else { &c.effect }
 }
 
 impl Trials {
-    fn new(court: &Court<'_>, forms: &BTreeMap<String, usize>) -> Self {
+    fn new(scorer: &CandidateScorer<'_>, forms: &BTreeMap<String, usize>) -> Self {
         let mut forms: BTreeMap<String, f64> = forms.iter().map(|(e, n)| (e.clone(), *n as f64)).collect();
-        for c in court.question.coefficients.iter().filter(|c| !c.noise.is_empty()) {
+        for c in scorer.candidate_set.coefficients.iter().filter(|c| !c.noise.is_empty()) {
             *forms.entry(c.effect.clone()).or_default() += 1.0;
         }
-        let search = court.gathered.transients.tried;
+        let search = scorer.gathered.transients.tried;
         if search > 0.0 {
-            forms.insert(ONCE.to_owned(), search);
+            forms.insert(TRANSIENT.to_owned(), search);
         }
         Self { forms }
     }
 
     /// Forms and levels of all effects.
     fn total(&self) -> usize {
-        self.forms.iter().filter(|(family, _)| *family != ONCE).map(|(_, n)| n).sum::<f64>() as usize
+        self.forms.iter().filter(|(family, _)| *family != TRANSIENT).map(|(_, n)| n).sum::<f64>() as usize
     }
 
     /// The chance, and its decimal logarithm, that an effect is worth so much without being there.
@@ -267,44 +268,47 @@ impl Trials {
 ///
 /// # Errors
 /// [`DiagnosisError`]: too little data, or a model that cannot be fitted.
-pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Result<Diagnosis, DiagnosisError> {
-    let segment_s = court.gathered.length as f64 / court.gathered.rate_hz;
-    let segments = short_segments(court);
+pub fn diagnose(
+    scorer: &CandidateScorer<'_>,
+    tried_before: &BTreeMap<String, usize>,
+) -> Result<Diagnosis, DiagnosisError> {
+    let segment_s = scorer.gathered.length as f64 / scorer.gathered.rate_hz;
+    let segments = short_segments(scorer);
     if segments < LEAST_SEGMENTS {
         return Err(DiagnosisError::TooShort { segments, segment_s });
     }
-    let mut fit = court.fit(&[])?;
+    let mut fit = scorer.fit(&[])?;
     let mut accepted: Vec<Found> = Vec::new();
     let loudest = {
-        let measured = court.residual_psd(&fit);
-        unexplained(court, &court.levels(&fit, &court.total, &measured)).map_or(0.0, |u| u.ratio)
+        let measured = scorer.residual_psd(&fit);
+        unexplained(scorer, &scorer.levels(&fit, &scorer.total, &measured)).map_or(0.0, |u| u.ratio)
     };
-    let first = court.rank(&fit);
+    let first = scorer.rank(&fit);
     let mut forms = first.tried;
     tried_before.iter().for_each(|(effect, n)| *forms.entry(effect.clone()).or_default() += n);
-    let trials = Trials::new(court, &forms);
+    let trials = Trials::new(scorer, &forms);
     let mut ranked = first.all;
-    let mut first_leads = leads(&trials, &ranked);
+    let mut requests = refinement_requests(&trials, &ranked);
     let mut others: Vec<Found> = loop {
         likeliest_first(&trials, &mut ranked);
         let mut weighed: Vec<(Found, Candidate)> = ranked
             .iter()
             .take(LISTED)
-            .map(|scored| (weigh(court, &fit, scored, &ranked, &trials), scored.candidate.clone()))
+            .map(|scored| (weigh(scorer, &fit, scored, &ranked, &trials), scored.candidate.clone()))
             .collect();
         for (f, candidate) in &mut weighed {
             // On a coarse grid of shapes the peak of a wrong colour costs more than all that it explains.
             let finely = tried_before.contains_key(&candidate.effect);
             let stands_out = f.p_value < FALSE_ALARM && f.in_range && accepted.len() < MOST_ADDED;
             // The likelihood chooses among its shapes alone: what it is worth beside what colours nothing is told by scores.
-            let chosen = if finely && stands_out { court.coloured(&fit, candidate)? } else { None };
+            let chosen = if finely && stands_out { scorer.coloured(&fit, candidate)? } else { None };
             if let Some(form) = chosen {
                 f.shape.clone_from(&form.parts[0].1.shape);
                 *candidate = form;
             }
         }
         if accepted.len() < MOST_ADDED {
-            for (f, candidate) in of_the_excess(court, &fit, &trials)? {
+            for (f, candidate) in of_the_excess(scorer, &fit, &trials)? {
                 let of = |w: &(Found, Candidate)| (&w.0.effect, &w.0.instance) == (&f.effect, &f.instance);
                 match weighed.iter().position(of) {
                     Some(i) if weighed[i].0.log10_p_value <= f.log10_p_value => {}
@@ -321,8 +325,8 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
         };
         let mut added = fit.added.clone();
         added.push(weighed[best].1.clone());
-        fit = court.fit(&added)?;
-        let before = std::mem::replace(&mut ranked, court.rank(&fit).all);
+        fit = scorer.fit(&added)?;
+        let before = std::mem::replace(&mut ranked, scorer.rank(&fit).all);
         let mut f = Found { accepted: true, ..weighed[best].0.clone() };
         if !f.of_excess {
             f.confounders.extend(as_good(&f, &before, &ranked));
@@ -331,17 +335,17 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
         }
         accepted.push(f);
         // What is found is measured again with Σ as it is without the excess.
-        refresh(court, &fit, &mut accepted);
+        refresh(scorer, &fit, &mut accepted);
     };
 
     let (mut extra, unexplained) = loop {
-        let measured = court.residual_psd(&fit);
-        let mut levels = court.levels(&fit, &court.total, &measured);
-        let extra = noise_levels(court, &fit, &mut levels, &trials);
-        let unexplained = unexplained(court, &levels);
+        let measured = scorer.residual_psd(&fit);
+        let mut levels = scorer.levels(&fit, &scorer.total, &measured);
+        let extra = noise_levels(scorer, &fit, &mut levels, &trials);
+        let unexplained = unexplained(scorer, &levels);
         let ((excess, _), plain) = (levels.excess_bands(), levels.plain_inverses());
         let mut both = accepted.iter().zip(&fit.added);
-        let part = |candidate: &Candidate| court.part_in(&fit, &plain, candidate, &excess);
+        let part = |candidate: &Candidate| scorer.part_in(&fit, &plain, candidate, &excess);
         // What is left of an excess a thousand times as large is what the forms that were tried are beside the true one.
         let loud = unexplained.as_ref().filter(|u| !u.power || u.ratio > REMAINS * loudest);
         let Some(doubtful) = both.position(|(f, c)| is_doubtful(f, part(c), &extra, loud)) else {
@@ -350,9 +354,9 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
         others.insert(0, Found { accepted: false, ..accepted.remove(doubtful) });
         let mut added = fit.added.clone();
         added.remove(doubtful);
-        fit = court.fit(&added)?;
-        ranked = court.rank(&fit).all;
-        refresh(court, &fit, &mut accepted);
+        fit = scorer.fit(&added)?;
+        ranked = scorer.rank(&fit).all;
+        refresh(scorer, &fit, &mut accepted);
     };
     // Noise is weighed apart: levels stand behind the effects that are accepted and before the rest.
     extra.sort_by(|a, b| b.accepted.cmp(&a.accepted).then(a.log10_p_value.total_cmp(&b.log10_p_value)));
@@ -369,11 +373,11 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
         (false, None) => "sufficient",
     };
     // A shape is told best beside what else was found, or else came next.
-    for lead in &mut first_leads {
-        let found = candidates.iter().find(|f| (&f.effect, &f.instance) == (&lead.effect, &lead.instance));
-        lead.shape = found.map_or_else(|| lead.shape.clone(), |f| f.shape.clone());
+    for request in &mut requests {
+        let found = candidates.iter().find(|f| (&f.effect, &f.instance) == (&request.effect, &request.instance));
+        request.shape = found.map_or_else(|| request.shape.clone(), |f| f.shape.clone());
     }
-    let upper_limits = limits(court, &ranked, &candidates);
+    let upper_limits = limits(scorer, &ranked, &candidates);
     Ok(Diagnosis {
         verdict: verdict.to_owned(),
         false_alarm_rate: FALSE_ALARM,
@@ -381,20 +385,20 @@ pub fn diagnose(court: &Court<'_>, tried_before: &BTreeMap<String, usize>) -> Re
         candidates,
         upper_limits,
         unexplained,
-        transients: transients(court),
-        leads: first_leads,
+        transients: transients(scorer),
+        refinement_requests: requests,
         forms,
-        not_tried: first.mute.into_iter().map(|name| (name, MUTE.to_owned())).collect(),
+        not_tried: first.unobservable.into_iter().map(|name| (name, UNOBSERVABLE.to_owned())).collect(),
     })
 }
 
 /// Independent short segments that would know as much of the lowest octave of short segments. One band is too narrow to tell: a bin
 /// of a short segment serves many bands of the long ones, and counts in one of them.
-fn short_segments(court: &Court<'_>) -> f64 {
-    let plan = court.plan();
+fn short_segments(scorer: &CandidateScorer<'_>) -> f64 {
+    let plan = scorer.plan();
     let octave = LONG * FIRST_BIN..2 * LONG * FIRST_BIN;
     let bands =
-        plan.bands.iter().zip(court.total.weights.observations(plan)).filter(|(b, _)| octave.contains(&b.first));
+        plan.bands.iter().zip(scorer.total.weights.observations(plan)).filter(|(b, _)| octave.contains(&b.first));
     let (bins, observations) = bands.fold((0, 0.0), |(bins, sum), (b, n)| (bins + b.bins(), sum + n));
     observations * LONG as f64 / bins.max(1) as f64
 }
@@ -405,10 +409,14 @@ fn short_segments(court: &Court<'_>) -> f64 {
 /// them; under the Σ that has not, whatever follows the excess by chance is worth thousands. The ratio of the likelihoods, each at the
 /// Σ that its own residuals have, is neither: n observations whose power falls to a part x are worth n log 1/x, by Bartlett's correction
 /// n − (p + 2)/2 of them for p coefficients.
-fn of_the_excess(court: &Court<'_>, fit: &Fit, trials: &Trials) -> Result<Vec<(Found, Candidate)>, DiagnosisError> {
-    let Some(WithoutExcess { plain, bands, observations }) = court.without_excess(fit) else { return Ok(Vec::new()) };
-    let before = court.deviance(fit, &bands, &fit.added)?;
-    let mut ranked = court.rank(&plain).all;
+fn of_the_excess(
+    scorer: &CandidateScorer<'_>,
+    fit: &Fit,
+    trials: &Trials,
+) -> Result<Vec<(Found, Candidate)>, DiagnosisError> {
+    let Some(WithoutExcess { plain, bands, observations }) = scorer.without_excess(fit) else { return Ok(Vec::new()) };
+    let before = scorer.deviance(fit, &bands, &fit.added)?;
+    let mut ranked = scorer.rank(&plain).all;
     likeliest_first(trials, &mut ranked);
     let mut out = Vec::new();
     for scored in ranked.iter().filter(|s| s.in_range).take(EXPLAINING) {
@@ -417,10 +425,10 @@ fn of_the_excess(court: &Court<'_>, fit: &Fit, trials: &Trials) -> Result<Vec<(F
         let dof = scored.candidate.parts.len() as f64;
         let kept = (1.0 - 0.5 * (dof + 2.0) / observations).max(0.0);
         // n log 1/x is at most n (1/x − 1), the fall of χ² under the Σ without the excess; beyond that, something else has changed.
-        let ratio = (before - court.deviance(fit, &bands, &added)?).clamp(0.0, scored.delta_chi2.max(0.0));
+        let ratio = (before - scorer.deviance(fit, &bands, &added)?).clamp(0.0, scored.delta_chi2.max(0.0));
         let delta_chi2 = ratio * kept;
         let (p_value, log10_p_value) = trials.chance(family(&scored.candidate), delta_chi2, dof);
-        let f = weigh(court, &plain, scored, &ranked, trials);
+        let f = weigh(scorer, &plain, scored, &ranked, trials);
         let delta_bic = dof * fit.estimate.quality.dof.ln() - delta_chi2;
         let chi2_per_dof_after = f.chi2_per_dof_before - delta_chi2 / fit.estimate.quality.dof;
         let f = Found { delta_chi2, p_value, log10_p_value, delta_bic, chi2_per_dof_after, of_excess: true, ..f };
@@ -456,22 +464,22 @@ fn likeliest_first(trials: &Trials, ranked: &mut [Scored]) {
 }
 
 /// Places that stand out by themselves.
-fn leads(trials: &Trials, ranked: &[Scored]) -> Vec<Lead> {
+fn refinement_requests(trials: &Trials, ranked: &[Scored]) -> Vec<RefinementRequest> {
     let chance = |s: &Scored| trials.chance(family(&s.candidate), s.delta_chi2, s.candidate.parts.len() as f64).0;
-    let lead = |s: &Scored| Lead {
+    let request = |s: &Scored| RefinementRequest {
         effect: s.candidate.effect.clone(),
         instance: s.candidate.instance.clone(),
         shape: s.candidate.parts[0].1.shape.clone(),
     };
-    ranked.iter().filter(|s| !s.candidate.once && chance(s) < FALSE_ALARM).map(lead).collect()
+    ranked.iter().filter(|s| !s.candidate.transient && chance(s) < FALSE_ALARM).map(request).collect()
 }
 
 /// What explained as much as a candidate before that was there, and nothing beside it: as good an explanation, whatever its shape.
 fn as_good(chosen: &Found, before: &[Scored], beside: &[Scored]) -> Vec<String> {
     let worth = |all: &[Scored], name: &str| {
-        all.iter().find(|s| !s.candidate.once && s.candidate.name() == name).map_or(0.0, |s| s.delta_chi2)
+        all.iter().find(|s| !s.candidate.transient && s.candidate.name() == name).map_or(0.0, |s| s.delta_chi2)
     };
-    let names = before.iter().filter(|s| s.in_range && !s.candidate.once).map(|s| s.candidate.name());
+    let names = before.iter().filter(|s| s.in_range && !s.candidate.transient).map(|s| s.candidate.name());
     let own = format!("{}:{}", chosen.effect, chosen.instance);
     names
         .filter(|name| *name != own)
@@ -480,20 +488,20 @@ fn as_good(chosen: &Found, before: &[Scored], beside: &[Scored]) -> Vec<String> 
 }
 
 /// A candidate as it stands beside a fit.
-fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], trials: &Trials) -> Found {
+fn weigh(scorer: &CandidateScorer<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], trials: &Trials) -> Found {
     let parts = &scored.candidate.parts;
     let covariance = scored.information.clone().try_inverse();
     let sigma = |j: usize| covariance.as_ref().map_or(f64::INFINITY, |c| c[(j, j)].max(0.0).sqrt());
     let values: Vec<(f64, f64)> = (0..parts.len()).map(|j| (scored.value[j], sigma(j))).collect();
-    let name = |j: usize| court.question.coefficients[parts[j].0].name.clone();
+    let name = |j: usize| scorer.candidate_set.coefficients[parts[j].0].name.clone();
     let lead = leading(&values);
     let dof = parts.len() as f64;
-    let halves = court.held_out(fit, &scored.candidate);
+    let halves = scorer.held_out(fit, &scored.candidate);
     let quality = &fit.estimate.quality;
     let (p_value, log10_p_value) = trials.chance(family(&scored.candidate), scored.delta_chi2, dof);
     let (mut offset_shift_m, mut offset_shift_sigma) = (BTreeMap::new(), BTreeMap::new());
     for (k, i) in fit.estimate.free.iter().enumerate() {
-        let Some(c) = court.question.coefficients[..court.question.model()].get(*i) else { continue };
+        let Some(c) = scorer.candidate_set.coefficients[..scorer.candidate_set.model()].get(*i) else { continue };
         if c.forms[0].unit == "m" {
             let own = fit.estimate.covariance.as_ref().map_or(f64::INFINITY, |c| c[(k, k)].sqrt());
             offset_shift_m.insert(c.name.clone(), scored.shift[k]);
@@ -501,7 +509,7 @@ fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], trial
         }
     }
     let mut channels: Vec<String> =
-        parts.iter().flat_map(|(_, f)| &f.terms).map(|t| court.question.channels[t.channel].clone()).collect();
+        parts.iter().flat_map(|(_, f)| &f.terms).map(|t| scorer.candidate_set.channels[t.channel].clone()).collect();
     channels.sort();
     channels.dedup();
     Found {
@@ -527,7 +535,7 @@ fn weigh(court: &Court<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], trial
         offset_shift_m,
         offset_shift_sigma,
         channels,
-        confounders: court.confounders(fit, scored, ranked),
+        confounders: scorer.confounders(fit, scored, ranked),
         accepted: false,
         of_excess: false,
     }
@@ -540,8 +548,8 @@ fn leading(values: &[(f64, f64)]) -> usize {
 }
 
 /// The accepted effects as the fit of all of them has them.
-fn refresh(court: &Court<'_>, fit: &Fit, found: &mut [Found]) {
-    let mut at = court.question.model();
+fn refresh(scorer: &CandidateScorer<'_>, fit: &Fit, found: &mut [Found]) {
+    let mut at = scorer.candidate_set.model();
     let sigma = |i: usize| {
         let k = fit.estimate.free.iter().position(|f| *f == i)?;
         fit.estimate.covariance.as_ref().map(|c| c[(k, k)].sqrt())
@@ -550,12 +558,12 @@ fn refresh(court: &Court<'_>, fit: &Fit, found: &mut [Found]) {
         let own = at..at + added.parts.len();
         at = own.end;
         // Of what is over soon the fit does not know how much a window has left.
-        if added.once {
+        if added.transient {
             continue;
         }
         let values: Vec<(f64, f64)> = own.map(|i| (fit.estimate.theta[i], sigma(i).unwrap_or(f64::INFINITY))).collect();
         let lead = leading(&values);
-        let name = |j: usize| court.question.coefficients[added.parts[j].0].name.clone();
+        let name = |j: usize| scorer.candidate_set.coefficients[added.parts[j].0].name.clone();
         (f.value, f.sigma) = values[lead];
         (f.coefficient, f.unit) = (name(lead), added.parts[lead].1.unit.clone());
         f.coefficients = (0..values.len())
@@ -567,21 +575,24 @@ fn refresh(court: &Court<'_>, fit: &Fit, found: &mut [Found]) {
 }
 
 /// Levels of noise one after the other, the best first; those that matter are accepted and taken over.
-fn noise_levels(court: &Court<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &Trials) -> Vec<Found> {
-    let residuals = court.residual_psd_of_sets(fit);
-    let halves = [0, 1].map(|set| court.levels(fit, &court.gathered.sets[set], &residuals[set]));
-    let asked: Vec<usize> =
-        (0..court.question.coefficients.len()).filter(|i| !court.question.coefficients[*i].noise.is_empty()).collect();
+fn noise_levels(scorer: &CandidateScorer<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &Trials) -> Vec<Found> {
+    let residuals = scorer.residual_psd_of_sets(fit);
+    let halves = [0, 1].map(|set| scorer.levels(fit, &scorer.gathered.sets[set], &residuals[set]));
+    let asked: Vec<usize> = (0..scorer.candidate_set.coefficients.len())
+        .filter(|i| !scorer.candidate_set.coefficients[*i].noise.is_empty())
+        .collect();
     let mut left = asked;
     let mut out = Vec::new();
     loop {
-        let measured: Vec<(usize, Level)> =
-            left.iter().filter_map(|i| Some((*i, levels.level(&court.question.coefficients[*i].noise)?))).collect();
+        let measured: Vec<(usize, Level)> = left
+            .iter()
+            .filter_map(|i| Some((*i, levels.level(&scorer.candidate_set.coefficients[*i].noise)?)))
+            .collect();
         let best = measured.into_iter().max_by(|a, b| a.1.delta_chi2.total_cmp(&b.1.delta_chi2));
         let Some((i, level)) = best else { return out };
-        let c = &court.question.coefficients[i];
+        let c = &scorer.candidate_set.coefficients[i];
         let (p_value, log10_p_value) = trials.chance(&c.effect, level.delta_chi2, 1.0);
-        // What happens once makes one half of the data louder, noise both: as much within chance, or each by half of it at least.
+        // A transient makes one half of the data louder, noise both: as much within chance, or each by half of it at least.
         let (differ, steady) = match halves.each_ref().map(|half| half.level(&c.noise)) {
             [Some(a), Some(b)] => {
                 let difference = (a.value - b.value).abs() / a.sigma.hypot(b.sigma);
@@ -607,7 +618,7 @@ fn noise_levels(court: &Court<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &
             delta_chi2: level.delta_chi2,
             p_value,
             log10_p_value,
-            delta_bic: (court.total.weights.segments as f64).ln() - level.delta_chi2,
+            delta_bic: (scorer.total.weights.segments as f64).ln() - level.delta_chi2,
             in_range: true,
             held_out_delta_chi2: None,
             held_out_p_value: differ,
@@ -615,7 +626,11 @@ fn noise_levels(court: &Court<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &
             chi2_per_dof_after: f64::NAN,
             offset_shift_m: BTreeMap::new(),
             offset_shift_sigma: BTreeMap::new(),
-            channels: levels.channels_of(&c.noise).into_iter().map(|i| court.question.channels[i].clone()).collect(),
+            channels: levels
+                .channels_of(&c.noise)
+                .into_iter()
+                .map(|i| scorer.candidate_set.channels[i].clone())
+                .collect(),
             confounders: Vec::new(),
             accepted: matters,
             of_excess: false,
@@ -628,16 +643,16 @@ fn noise_levels(court: &Court<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &
 }
 
 /// Times at which something happened that no chance gives; what it was is for the candidates to say.
-fn transients(court: &Court<'_>) -> Vec<Value> {
-    court.gathered.transients.certain(FALSE_ALARM).map(|h| json!(h)).collect()
+fn transients(scorer: &CandidateScorer<'_>) -> Vec<Value> {
+    scorer.gathered.transients.certain(FALSE_ALARM).map(|h| json!(h)).collect()
 }
 
-fn limits(court: &Court<'_>, rest: &[Scored], named: &[Found]) -> Vec<Limit> {
+fn limits(scorer: &CandidateScorer<'_>, rest: &[Scored], named: &[Found]) -> Vec<Limit> {
     let mut out = Vec::new();
     for s in rest {
         let accepted =
             |f: &Found| f.accepted && (&f.effect, &f.instance) == (&s.candidate.effect, &s.candidate.instance);
-        if s.candidate.once || named.iter().any(accepted) {
+        if s.candidate.transient || named.iter().any(accepted) {
             continue;
         }
         let Some(covariance) = s.information.clone().try_inverse() else { continue };
@@ -646,7 +661,7 @@ fn limits(court: &Court<'_>, rest: &[Scored], named: &[Found]) -> Vec<Limit> {
             out.push(Limit {
                 effect: s.candidate.effect.clone(),
                 instance: s.candidate.instance.clone(),
-                coefficient: court.question.coefficients[*i].name.clone(),
+                coefficient: scorer.candidate_set.coefficients[*i].name.clone(),
                 limit_95: s.value[j].abs() + LIMIT_QUANTILE * sigma,
                 sigma,
                 unit: form.unit.clone(),
@@ -659,9 +674,9 @@ fn limits(court: &Court<'_>, rest: &[Scored], named: &[Found]) -> Vec<Limit> {
 
 /// Power beyond the modelled noise, channel by channel in thirds of a decade, and what of the telemetry is coherent with what is
 /// left over: either is a sign of something that no effect explains, and a slow force shows by the second long before the first.
-fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
-    let plan = court.plan();
-    let channels = &court.question.channels;
+fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
+    let plan = scorer.plan();
+    let channels = &scorer.candidate_set.channels;
     let mut loud: Vec<(usize, [f64; 2], f64)> = Vec::new();
     for (bands, n, ratios) in levels.excesses() {
         let hz = |b: usize| plan.frequency_hz(plan.bands[b]);
@@ -670,10 +685,10 @@ fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
         let found = ratios.into_iter().enumerate().filter(above);
         loud.extend(found.map(|(c, ratio)| (c, [hz(bands.start), hz(bands.end - 1)], ratio)));
     }
-    let all = court.gathered.witnesses.coherences(channels);
+    let all = scorer.gathered.housekeeping.coherences(channels);
     let significant: Vec<Coherence> = all
         .into_iter()
-        .filter(|w| corrected(ln_chi2_above(w.statistic, w.dof).exp(), w.trials) < WITNESS_ALARM)
+        .filter(|w| corrected(ln_chi2_above(w.statistic, w.dof).exp(), w.trials) < COHERENCE_ALARM)
         .collect();
     let power = !loud.is_empty();
     if !power {
@@ -686,7 +701,7 @@ fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
     let mut names: Vec<String> = loud.iter().map(|(c, _, _)| channels[*c].clone()).collect();
     names.sort();
     names.dedup();
-    let kind = if court.gathered.transients.hits.iter().any(|h| h.significance > 10.0) {
+    let kind = if scorer.gathered.transients.detections.iter().any(|h| h.significance > 10.0) {
         "transient"
     } else if band_hz[1] < DRIFT_HZ {
         "drift"
@@ -708,7 +723,7 @@ fn unexplained(court: &Court<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
         ratio,
         power,
         coherent_with,
-        witnesses: significant.into_iter().take(20).collect(),
+        coherences: significant.into_iter().take(20).collect(),
     })
 }
 
@@ -771,7 +786,7 @@ mod tests {
             ratio: 9.0,
             power,
             coherent_with: Vec::new(),
-            witnesses: Vec::new(),
+            coherences: Vec::new(),
         };
         let slow = found(&["tm1.accel.x"], 0.0, true);
         for (part, left, doubtful) in [

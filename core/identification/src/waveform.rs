@@ -1,10 +1,10 @@
-//! The course of something that happens once, at a known time.
+//! The waveform of something that happens transient, at a known time.
 
 use dragfree_estimation::spectra::{Band, Plan};
 
-/// A course that begins at a known time.
+/// A waveform that begins at a known time.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Course {
+pub struct Waveform {
     /// Unix ns of the sample in which it begins.
     pub at_ns: i64,
     /// Time between samples, ns.
@@ -13,7 +13,7 @@ pub struct Course {
     pub kernel: Vec<f64>,
 }
 
-impl Course {
+impl Waveform {
     /// Its means over the samples of some rows.
     #[must_use]
     pub fn over(&self, time_ns: &[i64]) -> Vec<f64> {
@@ -39,7 +39,7 @@ impl Course {
             (re * re + im * im) * dt_s * dt_s * mean
         };
         let band = |b: &Band| {
-            // By the midpoint rule; where the bands are wide a course has little that changes within a quarter of one.
+            // By the midpoint rule; where the bands are wide a waveform has little that changes within a quarter of one.
             let parts = b.bins().min(4);
             let (first, width) = (b.first as f64 - 0.5, b.bins() as f64 / parts as f64);
             let at = |i: usize| power(plan.bin_hz(first + (i as f64 + 0.5) * width));
@@ -53,17 +53,17 @@ impl Course {
 mod tests {
     use super::*;
 
-    fn course(kernel: &[f64]) -> Course {
-        Course { at_ns: 5_000_000_000, step_ns: 100_000_000, kernel: kernel.to_vec() }
+    fn waveform(kernel: &[f64]) -> Waveform {
+        Waveform { at_ns: 5_000_000_000, step_ns: 100_000_000, kernel: kernel.to_vec() }
     }
 
     #[test]
     fn it_begins_in_its_sample_and_ends() {
         let times: Vec<i64> = (48..54).map(|k| 100_000_000 * k).collect();
-        assert_eq!(course(&[3.0, 2.0, 1.0]).over(&times), [0.0, 0.0, 3.0, 2.0, 1.0, 0.0]);
+        assert_eq!(waveform(&[3.0, 2.0, 1.0]).over(&times), [0.0, 0.0, 3.0, 2.0, 1.0, 0.0]);
         // A grid that lies a nanosecond beside is the same one.
         let beside: Vec<i64> = times.iter().map(|t| t - 1).collect();
-        assert_eq!(course(&[3.0, 2.0, 1.0]).over(&beside), [0.0, 0.0, 3.0, 2.0, 1.0, 0.0]);
+        assert_eq!(waveform(&[3.0, 2.0, 1.0]).over(&beside), [0.0, 0.0, 3.0, 2.0, 1.0, 0.0]);
     }
 
     /// Parseval: over all frequencies `2 Δt Σ k²`, of the mean of two samples that of the mean.
@@ -73,7 +73,7 @@ mod tests {
         let plan = Plan::slow(16_384, 1024, 10.0);
         let means = [2.0, 1.0, 2.5, 4.0, 0.5];
         for (averaged, samples) in [(false, &kernel[..]), (true, &means[..])] {
-            let whole: f64 = course(&kernel).energy(&plan, averaged).iter().sum();
+            let whole: f64 = waveform(&kernel).energy(&plan, averaged).iter().sum();
             let want = 2.0 * 0.1 * samples.iter().map(|x| x * x).sum::<f64>();
             // Below the first bin and in the last nothing is counted.
             assert!((whole / want - 1.0).abs() < 2e-3, "{whole} against {want}");

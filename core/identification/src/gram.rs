@@ -15,9 +15,9 @@ use dragfree_estimation::segments::{Cuts, Segmenter};
 use dragfree_estimation::spectra::{Plan, Spectra, Transformer, triangle};
 use nalgebra::{DMatrix, DMatrixView};
 
+use crate::coherence::HousekeepingCoherence;
 use crate::decimate::{Decimator, Response};
 use crate::transient::{Part, Search, Transients};
-use crate::witness::Witnesses;
 
 /// Slow series have nothing above this.
 pub const SLOW_HZ: f64 = 0.05;
@@ -28,7 +28,7 @@ pub const LONG: usize = 16;
 /// Halvings of a long segment that make a short one.
 const HALVINGS: usize = LONG.ilog2() as usize;
 
-/// What happens once is looked for in long segments, halves and quarters.
+/// Transients are looked for in long segments, halves and quarters.
 const SHORTEST_LOOKED_AT: usize = 2;
 
 /// Thinned samples come at least this many times as often as [`SLOW_HZ`]: what folds there is then weaker by 1e7.
@@ -118,7 +118,7 @@ pub struct Hour {
 
 /// Everything that was gathered.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Gathered {
+pub struct GramSums {
     /// What the columns are.
     pub columns: Columns,
     /// Samples of a short segment.
@@ -130,12 +130,12 @@ pub struct Gathered {
     /// The base columns hour by hour, in the bands of short segments ([`Self::hour_plan`]).
     pub hours: Vec<Hour>,
     /// Housekeeping against the residuals.
-    pub witnesses: Witnesses,
+    pub housekeeping: HousekeepingCoherence,
     /// The loudest transients.
     pub transients: Transients,
 }
 
-impl Gathered {
+impl GramSums {
     /// All segments together.
     #[must_use]
     pub fn total(&self) -> Gram {
@@ -158,25 +158,25 @@ impl Gathered {
 }
 
 /// Gathers segments.
-pub struct Gatherer {
+pub struct GramAccumulator {
     /// Bands of the sums.
     whole: Plan,
     /// Bands below [`SLOW_HZ`].
     low_bands: usize,
     short: Plan,
-    bench: Bench,
+    bench: SegmentTransform,
     search: Search,
     long_search: Search,
     decimator: Decimator,
     segmenter: Segmenter,
     long: Plan,
-    long_bench: Bench,
+    long_bench: SegmentTransform,
     /// Grams from the diagonal down.
-    gathered: Gathered,
+    gathered: GramSums,
 }
 
 /// Samples into spectra into sums.
-struct Bench {
+struct SegmentTransform {
     threads: usize,
     transformers: Vec<Transformer>,
     first_bin: usize,
@@ -184,7 +184,7 @@ struct Bench {
     spectra: DMatrix<f64>,
 }
 
-impl Bench {
+impl SegmentTransform {
     fn new(plan: &Plan, columns: usize, threads: usize) -> Self {
         Self {
             threads,
@@ -259,8 +259,8 @@ fn add_square(g: &mut DMatrix<f64>, a: &DMatrixView<'_, f64>) {
     }
 }
 
-impl Gatherer {
-    /// A gatherer of short segments of `length` samples. `witnesses` are made for the plan of long segments; their housekeeping follows
+impl GramAccumulator {
+    /// A gatherer of short segments of `length` samples. `coherence` is made for the plan of long segments; their housekeeping follows
     /// the columns.
     #[must_use]
     pub fn new(
@@ -268,7 +268,7 @@ impl Gatherer {
         length: usize,
         rate_hz: f64,
         threads: usize,
-        witnesses: impl FnOnce(&Plan) -> Witnesses,
+        coherence: impl FnOnce(&Plan) -> HousekeepingCoherence,
         search: Search,
     ) -> Self {
         let threads = threads.max(1);
@@ -276,24 +276,24 @@ impl Gatherer {
         let (long, factor) = low_plan(length, rate_hz);
         let slow = |b: usize| whole.bin_hz(whole.bands[b].end as f64) <= SLOW_HZ;
         let low_bands = (0..whole.bands.len().min(long.bands.len())).take_while(|b| slow(*b)).count();
-        let witnesses = witnesses(&long);
-        let all = columns.names.len() + witnesses.names.len();
+        let housekeeping = coherence(&long);
+        let all = columns.names.len() + housekeeping.names.len();
         let decimator = Decimator::new(factor, all, (1e9 / rate_hz).round() as i64, threads);
         let gram = Gram::zero(&columns, &whole);
         Self {
             low_bands,
-            bench: Bench::new(&short, columns.fast, threads),
+            bench: SegmentTransform::new(&short, columns.fast, threads),
             long_search: search.thinned(factor, SLOW_HZ),
             search,
             segmenter: Segmenter::new(long.length, decimator.step_ns(), vec![false; all]),
             decimator,
-            long_bench: Bench::new(&long, columns.names.len(), threads),
-            gathered: Gathered {
+            long_bench: SegmentTransform::new(&long, columns.names.len(), threads),
+            gathered: GramSums {
                 length,
                 rate_hz,
                 sets: [gram.clone(), gram],
                 hours: Vec::new(),
-                witnesses,
+                housekeeping,
                 transients: Transients::default(),
                 columns,
             },
@@ -305,7 +305,7 @@ impl Gatherer {
 
     /// What has been gathered.
     #[must_use]
-    pub fn finish(mut self) -> Gathered {
+    pub fn finish(mut self) -> GramSums {
         let bands = self.gathered.sets.iter_mut().flat_map(|set| &mut set.bands);
         bands.for_each(DMatrix::fill_upper_triangle_with_lower_triangle);
         self.gathered
@@ -373,7 +373,7 @@ fn middle_ns(first_ns: i64, columns: &[&[f64]], rate_hz: f64) -> i64 {
     first_ns + (0.5e9 * samples as f64 / rate_hz) as i64
 }
 
-impl Cuts for Gatherer {
+impl Cuts for GramAccumulator {
     fn plan(&self) -> &Plan {
         &self.short
     }
@@ -417,9 +417,9 @@ struct Low<'a> {
     whole: &'a Plan,
     low_bands: usize,
     long: &'a Plan,
-    bench: &'a mut Bench,
+    bench: &'a mut SegmentTransform,
     search: &'a mut Search,
-    gathered: &'a mut Gathered,
+    gathered: &'a mut GramSums,
 }
 
 impl Cuts for Low<'_> {
@@ -483,7 +483,7 @@ impl Low<'_> {
         }
     }
 
-    /// For what happens once, in the segment that was taken last.
+    /// For what happens transient, in the segment that was taken last.
     fn look(&mut self, samples: usize, part: Part, first_ns: i64) {
         let base = self.bench.base(self.gathered.columns.base);
         // A template begins with the first half of its first sample.
@@ -503,6 +503,6 @@ impl Low<'_> {
         self.bench.multiply(&plan.bins(taper)[bands.clone()], &mut set.bands[bands.clone()]);
         set.weights.count_bands(counted, taper, overlaps, bands);
         let base = self.bench.base(self.gathered.columns.base);
-        self.gathered.witnesses.segment(plan, taper, housekeeping, &base, overlaps);
+        self.gathered.housekeeping.segment(plan, taper, housekeeping, &base, overlaps);
     }
 }

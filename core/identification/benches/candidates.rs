@@ -1,13 +1,13 @@
 //! Cost of a hundred candidates: the sums of six hours at 10 Hz on two threads, and all of them ranked from these sums.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use dragfree_critic::gather::{Columns, Gathered, Gatherer};
-use dragfree_critic::question::{Coefficient, Form, Question, Term};
-use dragfree_critic::rank::Court;
-use dragfree_critic::transient::Search;
-use dragfree_critic::witness::Witnesses;
 use dragfree_estimation::segments::Segmenter;
 use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_identification::candidates::{CandidateSet, Coefficient, Form, Term};
+use dragfree_identification::coherence::HousekeepingCoherence;
+use dragfree_identification::gram::{Columns, GramAccumulator, GramSums};
+use dragfree_identification::scores::CandidateScorer;
+use dragfree_identification::transient::Search;
 use dragfree_physics::mission::Mission;
 use nalgebra::DMatrix;
 use rand::SeedableRng;
@@ -39,7 +39,7 @@ const BATCH: usize = 4096;
 const LENGTH: usize = 16_384;
 const RATE_HZ: f64 = 10.0;
 
-fn question() -> Question {
+fn candidate_set() -> CandidateSet {
     let coefficient = |name: String, candidate: bool, terms: Vec<Term>| Coefficient {
         effect: name.clone(),
         instance: String::new(),
@@ -48,7 +48,7 @@ fn question() -> Question {
         prior_sigma: None,
         estimate: !candidate,
         candidate,
-        once: false,
+        transient: false,
         forms: vec![Form {
             shape: serde_json::Map::new(),
             unit: "1".to_owned(),
@@ -68,7 +68,7 @@ fn question() -> Question {
         let column = CHANNELS.len() + MODEL + i;
         coefficient(format!("candidate {i}"), true, vec![term(i % CHANNELS.len(), column)])
     };
-    Question {
+    CandidateSet {
         channels: CHANNELS.map(str::to_owned).to_vec(),
         coefficients: (0..MODEL / 3).map(offset).chain((0..CANDIDATES).map(candidate)).collect(),
         rules: Vec::new(),
@@ -98,7 +98,7 @@ fn channels_of(noise: &NoiseModel, white: &mut impl FnMut() -> f64) -> Vec<Vec<f
     spectra.into_iter().map(&mut samples).collect()
 }
 
-fn gathered(columns: &[Vec<f64>], threads: usize) -> Gathered {
+fn gathered(columns: &[Vec<f64>], threads: usize) -> GramSums {
     let base = CHANNELS.len() + MODEL;
     let of = Columns {
         names: (0..columns.len()).map(|i| i.to_string()).collect(),
@@ -111,8 +111,8 @@ fn gathered(columns: &[Vec<f64>], threads: usize) -> Gathered {
     let search = Search::new(Vec::new(), residual.clone(), Vec::new());
     let averaged = (0..columns.len()).map(|j| j >= CHANNELS.len()).collect();
     let mut segmenter = Segmenter::new(LENGTH, (1e9 / RATE_HZ) as i64, averaged).of_first(of.fast);
-    let witnesses = |plan: &_| Witnesses::new(Vec::new(), plan, residual, Vec::new());
-    let mut gatherer = Gatherer::new(of, LENGTH, RATE_HZ, threads, witnesses, search);
+    let coherence = |plan: &_| HousekeepingCoherence::new(Vec::new(), plan, residual, Vec::new());
+    let mut gatherer = GramAccumulator::new(of, LENGTH, RATE_HZ, threads, coherence, search);
     for first in (0..ROWS).step_by(BATCH) {
         let rows = first..(first + BATCH).min(ROWS);
         let times: Vec<i64> = rows.clone().map(|k| (1e9 / RATE_HZ) as i64 * k as i64).collect();
@@ -139,15 +139,15 @@ fn bench(criterion: &mut Criterion) {
     group.bench_function("sums of six hours", |b| b.iter(|| gathered(black_box(&columns), 2)));
     group.finish();
 
-    let (question, sums) = (question(), gathered(&columns, 2));
-    let court = Court::new(&question, &sums, &noise);
-    let fit = court.fit(&[]).expect("a solution");
+    let (candidate_set, sums) = (candidate_set(), gathered(&columns, 2));
+    let scorer = CandidateScorer::new(&candidate_set, &sums, &noise);
+    let fit = scorer.fit(&[]).expect("a solution");
     let mut group = criterion.benchmark_group("100 candidates");
     group.sample_size(10);
     group.bench_function("fit and rank", |b| {
-        b.iter(|| court.rank(&court.fit(&[]).expect("a solution")).all.len());
+        b.iter(|| scorer.rank(&scorer.fit(&[]).expect("a solution")).all.len());
     });
-    group.bench_function("rank", |b| b.iter(|| black_box(court.rank(black_box(&fit))).all.len()));
+    group.bench_function("rank", |b| b.iter(|| black_box(scorer.rank(black_box(&fit))).all.len()));
     group.finish();
 }
 

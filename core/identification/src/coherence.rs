@@ -3,12 +3,12 @@
 //! For each housekeeping value, its derivative, its square and the products of two, the complex cross-spectrum with `Σ⁻¹ r` of the
 //! residuals r, each at unit power, which is what is left of each channel when all others are known (what acts on one test mass is
 //! seen there, far below the thrusters' noise, which moves all of them and which their own currents follow), is summed over long
-//! segments, in wide bands below [`crate::gather::SLOW_HZ`]. A lag between cause and force turns the phase and leaves the coherence.
+//! segments, in wide bands below [`crate::gram::SLOW_HZ`]. A lag between cause and force turns the phase and leaves the coherence.
 //! For n complex observations without relation `−2(n−1) log(1 − |γ|²)` is χ² with two degrees of freedom, whatever the driver
 //! (Goodman 1957).
 //!
 //! Channels of housekeeping go with one another, and one that drives a residual makes all of its kin light up. So
-//! [`Witnesses::together`] asks again, one after the other: what goes with the residual beside those that were named already, by the
+//! [`HousekeepingCoherence::together`] asks again, one after the other: what goes with the residual beside those that were named already, by the
 //! partial coherence (Bendat and Piersol, Random Data, 4th ed., §7.3), until chance says as much. What all of them explain is their
 //! multiple coherence.
 
@@ -18,8 +18,8 @@ use dragfree_estimation::spectra::{Plan, Transformer};
 use nalgebra::{Complex, DMatrix, DMatrixView};
 use serde::{Deserialize, Serialize};
 
-use crate::chance::{corrected, ln_chi2_above};
-use crate::gather::SLOW_HZ;
+use crate::distributions::{corrected, ln_chi2_above};
+use crate::gram::SLOW_HZ;
 
 /// Ratio of the ends of a band.
 const RATIO: f64 = 1.6;
@@ -68,7 +68,7 @@ pub struct Coherence {
 
 /// Drivers that go with a channel's residual, each beside those before it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
-pub struct Together {
+pub struct StepwiseCoherence {
     /// Channel.
     pub channel: String,
     /// The drivers in words.
@@ -83,14 +83,14 @@ pub struct Together {
 }
 
 /// More drivers than these are not named together.
-const MOST_TOGETHER: usize = 5;
+const MAX_STEPS: usize = 5;
 
 /// A driver of which the others leave less than this has nothing of its own.
 const OWN: f64 = 1e-6;
 
 /// The sums.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Witnesses {
+pub struct HousekeepingCoherence {
     pub(crate) names: Vec<String>,
     pub(crate) drivers: Vec<Driver>,
     /// Residual of each channel as a combination of the base columns.
@@ -115,7 +115,7 @@ pub struct Witnesses {
     pub(crate) observations: Vec<f64>,
 }
 
-impl Witnesses {
+impl HousekeepingCoherence {
     /// For housekeeping of these names, segments of a plan, residuals made by `residual` (channels × base columns) and `Σ⁻¹` per band of the
     /// plan.
     #[must_use]
@@ -252,11 +252,11 @@ impl Witnesses {
     /// What goes with each channel's residual, one driver beside the other; only channels with any, and no products. `alarm` is the chance
     /// that any is named of all.
     #[must_use]
-    pub fn together(&self, channels: &[String], alarm: f64) -> Vec<Together> {
-        (0..channels.len()).filter_map(|c| self.together_in(channels, c, alarm)).collect()
+    pub fn stepwise_coherence(&self, channels: &[String], alarm: f64) -> Vec<StepwiseCoherence> {
+        (0..channels.len()).filter_map(|c| self.stepwise_coherence_of(channels, c, alarm)).collect()
     }
 
-    fn together_in(&self, channels: &[String], c: usize, alarm: f64) -> Option<Together> {
+    fn stepwise_coherence_of(&self, channels: &[String], c: usize, alarm: f64) -> Option<StepwiseCoherence> {
         let singles = self.among.first().map_or(0, |a| a[0].nrows());
         // Per band the Hermitian matrix of the drivers and, last, the residual, from which each driver named is swept.
         let mut bands: Vec<DMatrix<Complex<f64>>> = (0..self.bands.len())
@@ -274,7 +274,7 @@ impl Witnesses {
         let trials = (singles * channels.len()) as f64;
         let mut named: Vec<usize> = Vec::new();
         let mut p_values = Vec::new();
-        while named.len() < MOST_TOGETHER {
+        while named.len() < MAX_STEPS {
             let left = |b: usize, i: usize| bands[b][(i, i)].re > OWN * whole[b][i];
             let chance = |d: usize| {
                 let (mut statistic, mut dof) = (0.0, 0.0);
@@ -312,7 +312,7 @@ impl Witnesses {
         };
         let best = (0..bands.len()).filter_map(|b| Some((b, explained(&b)?))).max_by(|a, b| a.1.total_cmp(&b.1))?;
         let [first, end] = self.bands[best.0];
-        (!named.is_empty()).then(|| Together {
+        (!named.is_empty()).then(|| StepwiseCoherence {
             channel: channels[c].clone(),
             drivers: named.iter().map(|d| self.drivers[*d].label(&self.names)).collect(),
             p_values,
@@ -400,7 +400,7 @@ impl Driver {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::chance::chi2_tails;
+    use crate::distributions::chi2_tails;
     use rand::SeedableRng;
     use rand_distr::{Distribution, StandardNormal};
     use rand_xoshiro::Xoshiro256PlusPlus;
@@ -411,7 +411,7 @@ mod tests {
 
     /// Three segments that overlap, of white channels and housekeeping as `change` leaves them; housekeeping 0 is a flag that is up in the
     /// last quarter alone.
-    fn witnesses(seed: u64, change: impl Fn(&mut [Vec<f64>], &mut [Vec<f64>])) -> (Witnesses, Vec<String>) {
+    fn segments(seed: u64, change: impl Fn(&mut [Vec<f64>], &mut [Vec<f64>])) -> (HousekeepingCoherence, Vec<String>) {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         let plan = Plan::new(1024, 1.0);
         let samples = 2 * plan.length;
@@ -422,7 +422,7 @@ mod tests {
         change(&mut channels, &mut housekeeping);
         let names = (0..NAMES).map(|i| format!("hk/{i}")).collect();
         let whitening = vec![DMatrix::identity(CHANNELS, CHANNELS); plan.bands.len()];
-        let mut witnesses = Witnesses::new(names, &plan, DMatrix::identity(CHANNELS, CHANNELS), whitening);
+        let mut coherence = HousekeepingCoherence::new(names, &plan, DMatrix::identity(CHANNELS, CHANNELS), whitening);
         let mut transformer = Transformer::new(&plan);
         for first in (0..=samples - plan.length).step_by(plan.length / 2) {
             let cut = |x: &Vec<f64>| x[first..first + plan.length].to_vec();
@@ -432,17 +432,17 @@ mod tests {
             }
             let cuts: Vec<Vec<f64>> = housekeeping.iter().map(cut).collect();
             let slices: Vec<&[f64]> = cuts.iter().map(Vec::as_slice).collect();
-            witnesses.segment(&plan, 0, &slices, &base.columns(0, CHANNELS), first > 0);
+            coherence.segment(&plan, 0, &slices, &base.columns(0, CHANNELS), first > 0);
         }
-        (witnesses, (0..CHANNELS).map(|c| format!("channel {c}")).collect())
+        (coherence, (0..CHANNELS).map(|c| format!("channel {c}")).collect())
     }
 
     /// With some of the second housekeeping added to the first channel.
     fn coherences(seed: u64, of_second_in_first: f64) -> Vec<Coherence> {
-        let (witnesses, names) = witnesses(seed, |channels, housekeeping| {
+        let (coherence, names) = segments(seed, |channels, housekeeping| {
             channels[0].iter_mut().zip(&housekeeping[1]).for_each(|(z, x)| *z += of_second_in_first * x);
         });
-        witnesses.coherences(&names)
+        coherence.coherences(&names)
     }
 
     /// Of housekeeping that has nothing to do with any channel, one coherence in a hundred is as large as chance makes one in a
@@ -464,7 +464,7 @@ mod tests {
     #[test]
     fn a_copy_of_a_driver_is_not_named_beside_it() {
         let together = |parts: &[(usize, f64)]| {
-            let (witnesses, names) = witnesses(7, |channels, housekeeping| {
+            let (coherence, names) = segments(7, |channels, housekeeping| {
                 for (driver, part) in parts {
                     let driver = housekeeping[*driver].clone();
                     channels[0].iter_mut().zip(driver).for_each(|(z, x)| *z += part * x);
@@ -472,7 +472,7 @@ mod tests {
                 let first = housekeeping[1].clone();
                 housekeeping[3].iter_mut().zip(first).for_each(|(copy, x)| *copy += x);
             });
-            (witnesses.coherences(&names), witnesses.together(&names, 1e-3))
+            (coherence.coherences(&names), coherence.stepwise_coherence(&names, 1e-3))
         };
         let (pairs, found) = together(&[(1, 2.0), (2, 2.0)]);
         // In narrow bands a derivative is as coherent as what it is the derivative of.
@@ -490,7 +490,7 @@ mod tests {
 
     /// The twin: a driver with half of a channel's power, |γ|² = 1/2, is worth 2n log 2 = 97 over some 70 observations.
     #[test]
-    fn a_driver_is_the_first_witness() {
+    fn a_driver_is_the_largest_coherence() {
         let all = coherences(2, 1.0);
         assert_eq!((all[0].driver.as_str(), all[0].channel.as_str()), ("hk/1", "channel 0"));
         assert!(chi2_tails(all[0].statistic / all[0].dof, all[0].dof).1 < 1e-8, "{:?}", all[0]);

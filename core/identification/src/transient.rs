@@ -1,11 +1,11 @@
-//! What happens once: every template at every time, by the filter that is matched to it and to the noise.
+//! What happens transient: every template at every time, by the filter that is matched to it and to the noise.
 //!
 //! With residuals r whose spectrum is Σ and a template `T(f)` that begins at `t`, `n(t) = Σ_f Re T* Σ⁻¹ r e^{2πift}` is largest where
 //! it fits best; one inverse transform gives all times. Under a window w the noise of n is not the same at all times: with
 //! `u = Σ^{-1/2} T` in the time domain, of unit energy, its variance is `D V(t)`, `D = Σ_f T* Σ⁻¹ T`, `V(t) = Σ_s u²(s − t) w²(s)`, whether
 //! the filter is short against the window or rings through all of it. The significance is `n/√(D V)`.
 //!
-//! A hit of the spacecraft stands out of broad noise and is looked for in short segments. What pushes a test mass for a minute is
+//! A detection of the spacecraft stands out of broad noise and is looked for in short segments. What pushes a test mass for a minute is
 //! known by the velocity that is left, below 2 mHz, where a short segment sees nothing: it is looked for in long ones. How large it is,
 //! and whether it is the cause, is not said here: what is found becomes a candidate among all others (`crate::diagnosis`).
 
@@ -21,7 +21,7 @@ use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::chance::normal_tails;
+use crate::distributions::normal_tails;
 
 /// Significance below which a peak is not kept.
 const LEAST: f64 = 5.0;
@@ -44,7 +44,7 @@ const NEAR_S: [f64; 2] = [120.0, 1800.0];
 /// Peaks that are kept.
 const MOST: usize = 50;
 
-/// A short course of something, and how the channels answer.
+/// A short waveform of something, and how the channels answer.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Template {
     /// Effect.
@@ -57,7 +57,7 @@ pub struct Template {
     pub unit: String,
     /// Values of the shape parameters.
     pub shape: Map<String, Value>,
-    /// Course, one mean per sample.
+    /// Waveform, one mean per sample.
     pub kernel: Vec<f64>,
     /// Channel, factor, and whether the channel sees the mean of two samples.
     pub channels: Vec<(usize, f64, bool)>,
@@ -65,7 +65,7 @@ pub struct Template {
 
 /// A template that was found.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Hit {
+pub struct Detection {
     /// Effect.
     pub effect: String,
     /// Instance.
@@ -86,22 +86,22 @@ pub struct Hit {
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Transients {
     /// Peaks, the loudest first.
-    pub hits: Vec<Hit>,
+    pub detections: Vec<Detection>,
     /// Independent trials that would have a peak of 6σ as often as the search.
     pub tried: f64,
 }
 
 impl Transients {
     /// Peaks that chance gives in fewer searches than this.
-    pub fn certain(&self, chance: f64) -> impl Iterator<Item = &Hit> {
-        self.hits.iter().filter(move |h| normal_tails(h.significance) * self.tried < chance)
+    pub fn certain(&self, chance: f64) -> impl Iterator<Item = &Detection> {
+        self.detections.iter().filter(move |h| normal_tails(h.significance) * self.tried < chance)
     }
 
     /// Adds the peaks of other data.
     pub fn add(&mut self, other: &Self) {
-        self.hits.extend(other.hits.iter().cloned());
-        self.hits.sort_by(|a, b| b.significance.total_cmp(&a.significance));
-        self.hits.truncate(MOST);
+        self.detections.extend(other.detections.iter().cloned());
+        self.detections.sort_by(|a, b| b.significance.total_cmp(&a.significance));
+        self.detections.truncate(MOST);
         self.tried += other.tried;
     }
 }
@@ -294,23 +294,23 @@ impl Search {
         };
         let all: Vec<usize> = (0..self.templates.len()).collect();
         let each = all.len().div_ceil(self.threads);
-        let look = |templates: &[usize]| -> Vec<Looked> {
+        let look = |templates: &[usize]| -> Vec<MatchedFilterOutput> {
             let mut time = vec![0.0; n];
             let seen = |of: &usize| self.look(plan, *of, &middle, &white, &prepared, &mut time);
             templates.iter().filter_map(seen).collect()
         };
-        let looked: Vec<Looked> = std::thread::scope(|scope| {
+        let looked: Vec<MatchedFilterOutput> = std::thread::scope(|scope| {
             let running: Vec<_> = all.chunks(each).map(|own| scope.spawn(|| look(own))).collect();
-            let join = |thread: std::thread::ScopedJoinHandle<'_, Vec<Looked>>| {
+            let join = |thread: std::thread::ScopedJoinHandle<'_, Vec<MatchedFilterOutput>>| {
                 thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
             };
             running.into_iter().flat_map(join).collect()
         });
-        for Looked { template, tried, peaks } in looked {
+        for MatchedFilterOutput { template, tried, peaks } in looked {
             found.tried += tried;
             for (k, sigmas) in peaks {
                 let at_ns = first_ns + (k as f64 * 1e9 / plan.rate_hz).round() as i64;
-                keep(&mut found.hits, &self.templates[template], self.near_s, at_ns, sigmas);
+                keep(&mut found.detections, &self.templates[template], self.near_s, at_ns, sigmas);
             }
         }
         self.prepared.insert(n, prepared);
@@ -325,7 +325,7 @@ impl Search {
         white: &DMatrix<f64>,
         prepared: &Prepared,
         time: &mut [f64],
-    ) -> Option<Looked> {
+    ) -> Option<MatchedFilterOutput> {
         let filter = &prepared.filters[template];
         let least = LEAST_VARIANCE.sqrt();
         let looked: Vec<usize> = times.clone().filter(|k| filter.deviation[*k] > least).collect();
@@ -336,12 +336,12 @@ impl Search {
         let mut spectrum = self.filtered(plan, time.len(), template, white, prepared);
         let power: f64 = spectrum.iter().map(Complex64::norm_sqr).sum();
         if prepared.inverse.process(&mut spectrum, time).is_err() {
-            return Some(Looked { template, tried, peaks: Vec::new() });
+            return Some(MatchedFilterOutput { template, tried, peaks: Vec::new() });
         }
         // The transform sums the bins of both signs.
         let significance = |k: usize| 0.5 * time[k] / (filter.deviation[k] * filter.root);
         // Noise may be louder than Σ says. Its median does not see what happens a few times and is soon over; and what a peak
-        // leaves of the filtered power does not see what happens once, however long it rings.
+        // leaves of the filtered power does not see what happens transient, however long it rings.
         let mut sizes: Vec<f64> = looked.iter().map(|k| significance(*k).abs()).collect();
         let half = sizes.len() / 2;
         let median = *sizes.select_nth_unstable_by(half, f64::total_cmp).1 / MEDIAN;
@@ -349,12 +349,12 @@ impl Search {
         let left = (power - peak * filter.squares) / (WINDOW_POWER * filter.root * filter.root);
         let louder = median.min(left.max(0.0).sqrt()).max(1.0);
         let sigmas = looked.into_iter().map(|k| (k, significance(k).abs() / louder));
-        Some(Looked { template, tried, peaks: sigmas.filter(|(_, sigmas)| *sigmas > LEAST).collect() })
+        Some(MatchedFilterOutput { template, tried, peaks: sigmas.filter(|(_, sigmas)| *sigmas > LEAST).collect() })
     }
 }
 
 /// What the search for one template saw in a segment.
-struct Looked {
+struct MatchedFilterOutput {
     template: usize,
     /// Independent trials.
     tried: f64,
@@ -391,17 +391,17 @@ impl Transforms {
 }
 
 /// Keeps a peak if no louder one is near.
-fn keep(hits: &mut Vec<Hit>, template: &Template, near_s: f64, at_ns: i64, significance: f64) {
-    let near = |h: &Hit| (h.at_ns - at_ns).abs() < (near_s * 1e9) as i64;
-    if hits.iter().any(|h| near(h) && h.significance >= significance)
-        || hits.len() >= MOST && hits.last().is_some_and(|h| h.significance >= significance)
+fn keep(detections: &mut Vec<Detection>, template: &Template, near_s: f64, at_ns: i64, significance: f64) {
+    let near = |h: &Detection| (h.at_ns - at_ns).abs() < (near_s * 1e9) as i64;
+    if detections.iter().any(|h| near(h) && h.significance >= significance)
+        || detections.len() >= MOST && detections.last().is_some_and(|h| h.significance >= significance)
     {
         return;
     }
-    hits.retain(|h| !near(h));
+    detections.retain(|h| !near(h));
     let mut shape = template.shape.clone();
     shape.insert("at_ns".to_owned(), at_ns.into());
-    let hit = Hit {
+    let detection = Detection {
         effect: template.effect.clone(),
         instance: template.instance.clone(),
         coefficient: template.coefficient.clone(),
@@ -410,9 +410,9 @@ fn keep(hits: &mut Vec<Hit>, template: &Template, near_s: f64, at_ns: i64, signi
         at_ns,
         significance,
     };
-    let place = hits.partition_point(|h| h.significance >= significance);
-    hits.insert(place, hit);
-    hits.truncate(MOST);
+    let place = detections.partition_point(|h| h.significance >= significance);
+    detections.insert(place, detection);
+    detections.truncate(MOST);
 }
 
 #[cfg(test)]
@@ -424,7 +424,7 @@ mod tests {
     use rand_xoshiro::Xoshiro256PlusPlus;
 
     const N: usize = 4096;
-    const COURSE: usize = 8;
+    const WAVEFORM: usize = 8;
     const AT: usize = 1500;
 
     fn template(coefficient: &str, channels: &[(usize, f64)]) -> Template {
@@ -434,7 +434,7 @@ mod tests {
             coefficient: coefficient.to_owned(),
             unit: "1".to_owned(),
             shape: Map::new(),
-            kernel: vec![1.0; COURSE],
+            kernel: vec![1.0; WAVEFORM],
             channels: channels.iter().map(|(c, factor)| (*c, *factor, false)).collect(),
         }
     }
@@ -459,23 +459,23 @@ mod tests {
     }
 
     /// Something of a size that pushes the first channel from a sample on.
-    fn hits(seed: u64, below_hz: f64, part: Part, (size, at): (f64, usize), wave: f64) -> Vec<Hit> {
-        let pushed = |c: usize, k: usize| if c == 0 && (at..at + COURSE).contains(&k) { size } else { 0.0 };
+    fn detections(seed: u64, below_hz: f64, part: Part, (size, at): (f64, usize), wave: f64) -> Vec<Detection> {
+        let pushed = |c: usize, k: usize| if c == 0 && (at..at + WAVEFORM).contains(&k) { size } else { 0.0 };
         let base = spectra(seed, |c, k| pushed(c, k) + wave * (TAU * 0.02 * k as f64).sin());
         let mut found = Transients::default();
         search(below_hz).segment(&Plan::new(N, 1.0), N, part, 0, &base.columns(0, 2), &mut found);
-        found.hits
+        found.detections
     }
 
     /// At its sample or the next, by the right template, with the significance `size √8` of least squares (within 4σ, false alarm
     /// 1e-4), in the middle of a segment; and nothing where there is nothing.
     #[test]
     fn an_event_has_its_time_and_the_significance_of_least_squares() {
-        let hit = &hits(1, 0.5, Part::MiddleHalf, (4.0, N / 2), 0.0)[0];
-        assert!((hit.at_ns - 1_000_000_000 * (N / 2) as i64).abs() <= 1_000_000_000, "{hit:?}");
-        assert_eq!(hit.coefficient, "a");
-        assert!((hit.significance - 4.0 * 8.0_f64.sqrt()).abs() < 4.0, "{hit:?}");
-        assert!(hits(2, 0.5, Part::MiddleHalf, (0.0, 0), 0.0).is_empty());
+        let detection = &detections(1, 0.5, Part::MiddleHalf, (4.0, N / 2), 0.0)[0];
+        assert!((detection.at_ns - 1_000_000_000 * (N / 2) as i64).abs() <= 1_000_000_000, "{detection:?}");
+        assert_eq!(detection.coefficient, "a");
+        assert!((detection.significance - 4.0 * 8.0_f64.sqrt()).abs() < 4.0, "{detection:?}");
+        assert!(detections(2, 0.5, Part::MiddleHalf, (0.0, 0), 0.0).is_empty());
     }
 
     /// Through a filter that rings for a quarter of the segment an event is found all the same, however loud, in all of it; to a
@@ -483,9 +483,9 @@ mod tests {
     #[test]
     fn an_event_that_rings_is_found_however_loud_it_is() {
         for (size, at) in [(15.0, 1500), (500.0, 1500), (30.0, 900), (500.0, 3200)] {
-            let found = hits(3, 0.003, Part::All, (size, at), 0.0);
-            let hit = found.first().unwrap_or_else(|| panic!("{size} is not found"));
-            assert!((hit.at_ns - 1_000_000_000 * at as i64).abs() < 333_000_000_000, "{hit:?} at {at}");
+            let found = detections(3, 0.003, Part::All, (size, at), 0.0);
+            let detection = found.first().unwrap_or_else(|| panic!("{size} is not found"));
+            assert!((detection.at_ns - 1_000_000_000 * at as i64).abs() < 333_000_000_000, "{detection:?} at {at}");
         }
     }
 
@@ -531,14 +531,14 @@ mod tests {
     /// its peak leaves tells that there is nothing else.
     #[test]
     fn an_event_that_rings_over_the_whole_segment_is_found() {
-        assert!(!hits(3, 0.0012, Part::MiddleHalf, (500.0, AT), 0.0).is_empty());
+        assert!(!detections(3, 0.0012, Part::MiddleHalf, (500.0, AT), 0.0).is_empty());
     }
 
     /// What goes on and on is no event.
     #[test]
     fn a_wave_is_no_event() {
         for part in [Part::MiddleHalf, Part::All] {
-            assert!(hits(4, 0.5, part, (0.0, 0), 10.0).is_empty());
+            assert!(detections(4, 0.5, part, (0.0, 0), 10.0).is_empty());
         }
     }
 
@@ -547,6 +547,6 @@ mod tests {
         let search = Search::new(vec![template("a", &[(0, 1.0)])], DMatrix::identity(1, 1), Vec::new());
         let kernel = &search.thinned(3, 1.0).templates[0].kernel;
         assert_eq!(kernel.len(), 3);
-        assert!((3.0 * kernel.iter().sum::<f64>() - COURSE as f64).abs() < 1e-12);
+        assert!((3.0 * kernel.iter().sum::<f64>() - WAVEFORM as f64).abs() < 1e-12);
     }
 }

@@ -6,22 +6,22 @@ use dragfree_estimation::spectra::{Plan, Spectra};
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
 
-use crate::gather::{Columns, Gathered, Gram, Hour, low_plan, whole_plan};
-use crate::question::Question;
-use crate::transient::{Hit, Transients};
-use crate::witness::Witnesses;
+use crate::candidates::CandidateSet;
+use crate::coherence::HousekeepingCoherence;
+use crate::gram::{Columns, Gram, GramSums, Hour, low_plan, whole_plan};
+use crate::transient::{Detection, Transients};
 
-const MAGIC: &[u8; 8] = b"DFCRIT4\n";
+const MAGIC: &[u8; 8] = b"DFSUMS1\n";
 
-/// Question and sums of some telemetry.
+/// CandidateSet and sums of some telemetry.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Record {
     /// Model and candidates.
-    pub question: Question,
+    pub candidate_set: CandidateSet,
     /// How each channel is measured, true for second differences.
     pub differenced: Vec<bool>,
     /// Sums.
-    pub gathered: Gathered,
+    pub gathered: GramSums,
     /// Candidates that could not be tried, with the reason.
     pub not_tried: Vec<(String, String)>,
 }
@@ -41,7 +41,7 @@ pub enum RecordError {
 
 #[derive(Serialize, Deserialize)]
 struct Header {
-    question: Question,
+    candidate_set: CandidateSet,
     differenced: Vec<bool>,
     not_tried: Vec<(String, String)>,
     names: Vec<String>,
@@ -54,7 +54,7 @@ struct Header {
     segments: [u64; 2],
     hours: Vec<(i64, u64)>,
     housekeeping: Vec<String>,
-    hits: Vec<Hit>,
+    detections: Vec<Detection>,
     tried: f64,
 }
 
@@ -97,7 +97,7 @@ impl Record {
     pub fn write(&self, to: &mut impl Write) -> io::Result<()> {
         let g = &self.gathered;
         let header = Header {
-            question: self.question.clone(),
+            candidate_set: self.candidate_set.clone(),
             differenced: self.differenced.clone(),
             not_tried: self.not_tried.clone(),
             names: g.columns.names.clone(),
@@ -109,8 +109,8 @@ impl Record {
             rate_hz: g.rate_hz,
             segments: [g.sets[0].weights.segments, g.sets[1].weights.segments],
             hours: g.hours.iter().map(|h| (h.start_ns, h.spectra.segments)).collect(),
-            housekeeping: g.witnesses.names.clone(),
-            hits: g.transients.hits.clone(),
+            housekeeping: g.housekeeping.names.clone(),
+            detections: g.transients.detections.clone(),
             tried: g.transients.tried,
         };
         // A struct of plain data has no way to fail.
@@ -129,7 +129,7 @@ impl Record {
                 put(to, &m.as_slice()[j * m.nrows() + j..(j + 1) * m.nrows()])?;
             }
         }
-        let w = &g.witnesses;
+        let w = &g.housekeeping;
         put(to, w.residual.as_slice())?;
         put(to, &w.level)?;
         put(to, &w.observations)?;
@@ -191,7 +191,7 @@ impl Record {
         }
         let mut residual = DMatrix::zeros(columns.channels, columns.base);
         numbers.fill(residual.as_mut_slice())?;
-        let mut w = Witnesses::new(h.housekeeping, &low_plan(h.length, h.rate_hz).0, residual, Vec::new());
+        let mut w = HousekeepingCoherence::new(h.housekeeping, &low_plan(h.length, h.rate_hz).0, residual, Vec::new());
         numbers.fill(&mut w.level)?;
         numbers.fill(&mut w.observations)?;
         let sums = [&mut w.residual_power, &mut w.power].into_iter().chain(&mut w.cross);
@@ -201,10 +201,10 @@ impl Record {
         if numbers.0.read(&mut [0]).map_err(early)? > 0 {
             return Err(RecordError::Damaged("it goes on too long"));
         }
-        let transients = Transients { hits: h.hits, tried: h.tried };
+        let transients = Transients { detections: h.detections, tried: h.tried };
         let gathered =
-            Gathered { columns, length: h.length, rate_hz: h.rate_hz, sets, hours, witnesses: w, transients };
-        Ok(Self { question: h.question, differenced: h.differenced, gathered, not_tried: h.not_tried })
+            GramSums { columns, length: h.length, rate_hz: h.rate_hz, sets, hours, housekeeping: w, transients };
+        Ok(Self { candidate_set: h.candidate_set, differenced: h.differenced, gathered, not_tried: h.not_tried })
     }
 
     /// Adds the sums of other telemetry.
@@ -214,7 +214,7 @@ impl Record {
     pub fn add(&mut self, other: &Self) -> Result<(), RecordError> {
         let (a, b) = (&self.gathered, &other.gathered);
         let same = [
-            (self.question == other.question, "models, candidates or housekeeping"),
+            (self.candidate_set == other.candidate_set, "models, candidates or housekeeping"),
             (a.columns == b.columns, "columns"),
             (a.length == b.length && a.rate_hz == b.rate_hz, "segments"),
         ];
@@ -225,7 +225,7 @@ impl Record {
         g.sets.iter_mut().zip(&other.gathered.sets).for_each(|(a, b)| a.add(b));
         g.hours.extend(other.gathered.hours.iter().cloned());
         g.hours.sort_by_key(|h| h.start_ns);
-        g.witnesses.add(&other.gathered.witnesses);
+        g.housekeeping.add(&other.gathered.housekeeping);
         g.transients.add(&other.gathered.transients);
         Ok(())
     }

@@ -54,9 +54,9 @@ pub struct Coefficient {
     pub estimate: bool,
     /// Whether it is no part of the model.
     pub candidate: bool,
-    /// Whether its forms are courses at times at which something was found to happen.
+    /// Whether its forms are waveforms at times at which something was found to happen.
     #[serde(default)]
-    pub once: bool,
+    pub transient: bool,
     /// Its forms; one for a coefficient of the model.
     pub forms: Vec<Form>,
     /// A process of the mission's noise that it multiplies.
@@ -80,7 +80,7 @@ pub struct Rule {
 
 /// Model and candidates.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Question {
+pub struct CandidateSet {
     /// Names of the channels.
     pub channels: Vec<String>,
     /// Coefficients, those of the model first.
@@ -96,13 +96,13 @@ pub struct Candidate {
     pub effect: String,
     /// Instance.
     pub instance: String,
-    /// Whether it is a course at a time at which something was found to happen.
-    pub once: bool,
+    /// Whether it is a waveform at a time at which something was found to happen.
+    pub transient: bool,
     /// Indices of its coefficients, with the form of each.
     pub parts: Vec<(usize, Form)>,
 }
 
-impl Question {
+impl CandidateSet {
     /// Coefficients of the model.
     #[must_use]
     pub fn model(&self) -> usize {
@@ -117,7 +117,7 @@ impl Question {
         for (i, c) in self.coefficients.iter().enumerate().filter(|(_, c)| c.candidate && !c.forms.is_empty()) {
             let same = |p: &&mut Vec<usize>| {
                 let other = &self.coefficients[p[0]];
-                let key = |c: &Coefficient| (c.once, c.forms.len());
+                let key = |c: &Coefficient| (c.transient, c.forms.len());
                 (&other.effect, &other.instance, key(other)) == (&c.effect, &c.instance, key(c))
             };
             match places.iter_mut().find(same) {
@@ -135,7 +135,7 @@ impl Question {
         Candidate {
             effect: first.effect.clone(),
             instance: first.instance.clone(),
-            once: first.once,
+            transient: first.transient,
             parts: place.iter().map(|i| (*i, self.coefficients[*i].forms[form].clone())).collect(),
         }
     }

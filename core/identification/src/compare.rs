@@ -27,9 +27,9 @@ use dragfree_estimation::spectra::{Band, Plan, Spectra};
 use nalgebra::{Cholesky, DMatrix, DVector};
 use serde::Serialize;
 
-use crate::chance::{chi2_per_dof_quantile, chi2_tails, corrected, kolmogorov, two_sided};
-use crate::rank::Court;
-use crate::witness::{Coherence, Together};
+use crate::coherence::{Coherence, StepwiseCoherence};
+use crate::distributions::{chi2_per_dof_quantile, chi2_tails, corrected, kolmogorov, two_sided};
+use crate::scores::CandidateScorer;
 
 /// Chance that anything fails where the model and the mission's noise are right; all tests of all channels together.
 pub const FALSE_ALARM: f64 = 0.01;
@@ -57,7 +57,7 @@ pub struct Cell {
     pub dof: f64,
 }
 
-/// A question to a channel.
+/// A candidate_set to a channel.
 #[derive(Clone, Debug, Serialize)]
 pub struct Test {
     /// * `level`: χ²/dof over all bands.
@@ -211,7 +211,7 @@ impl Innovations {
 
 /// Housekeeping that goes with a residual.
 #[derive(Clone, Debug, Serialize)]
-pub struct Witness {
+pub struct SignificantCoherence {
     /// The driver and its coherence.
     #[serde(flatten)]
     pub coherence: Coherence,
@@ -244,9 +244,9 @@ pub struct Comparison {
     pub innovations: Vec<Innovations>,
     /// Housekeeping that is coherent with a residual, beyond chance; evidence and no test, since currents of thrusters follow
     /// commands, and these the noise.
-    pub coherences: Vec<Witness>,
+    pub coherences: Vec<SignificantCoherence>,
     /// Per channel what goes with its residual beside what was named before, and the multiple coherence of all that is named.
-    pub together: Vec<Together>,
+    pub together: Vec<StepwiseCoherence>,
 }
 
 /// Why there is no comparison.
@@ -292,8 +292,12 @@ impl Ratios {
 ///
 /// # Errors
 /// [`CompareError`]: too little data, or a model that cannot be fitted.
-pub fn compare(court: &Court<'_>, nis: Option<Nis>, innovations: Vec<Innovations>) -> Result<Comparison, CompareError> {
-    let (gathered, names) = (court.gathered, &court.question.channels);
+pub fn compare(
+    scorer: &CandidateScorer<'_>,
+    nis: Option<Nis>,
+    innovations: Vec<Innovations>,
+) -> Result<Comparison, CompareError> {
+    let (gathered, names) = (scorer.gathered, &scorer.candidate_set.channels);
     // The hours and their sum are of segments of one length, whatever else was gathered.
     let plan = &gathered.hour_plan();
     let base = gathered.columns.base;
@@ -307,8 +311,8 @@ pub fn compare(court: &Court<'_>, nis: Option<Nis>, innovations: Vec<Innovations
     if segments < LEAST_SEGMENTS {
         return Err(CompareError::TooShort { segments, segment_s });
     }
-    let fit = court.fit(&[])?;
-    let residual = residual(court, fit.estimate.theta.as_slice());
+    let fit = scorer.fit(&[])?;
+    let residual = residual(scorer, fit.estimate.theta.as_slice());
     let psd = |spectra: &Spectra| -> Vec<DMatrix<f64>> {
         let band = |b: usize| {
             let sums = &residual * unpacked(spectra.band(b, base), base) * residual.transpose();
@@ -319,17 +323,17 @@ pub fn compare(court: &Court<'_>, nis: Option<Nis>, innovations: Vec<Innovations
     let measured = psd(&whole);
     let hours: Vec<Vec<DMatrix<f64>>> = gathered.hours.iter().map(|h| psd(&h.spectra)).collect();
     let hour_observations: Vec<Vec<f64>> = gathered.hours.iter().map(|h| observations(&h.spectra, plan)).collect();
-    let predicted = predicted(court.noise, plan);
-    let unknowns = court.question.unknowns(&[]);
+    let predicted = predicted(scorer.noise, plan);
+    let unknowns = scorer.candidate_set.unknowns(&[]);
     let mut levels =
-        Levels::new(court.noise, plan, &whole, &measured).coloured(plan, &colours(&unknowns, &fit.estimate.theta));
+        Levels::new(scorer.noise, plan, &whole, &measured).coloured(plan, &colours(&unknowns, &fit.estimate.theta));
     levels.fit();
 
-    let known = |i: usize| court.noise.residual()[i] && !court.noise.unknown.contains(&i);
+    let known = |i: usize| scorer.noise.residual()[i] && !scorer.noise.unknown.contains(&i);
     let single = |i: usize| DVector::from_fn(names.len(), |j, _| f64::from(u8::from(i == j)));
     let mut combinations: Vec<(String, DVector<f64>, Kind)> =
         (0..names.len()).map(|i| (names[i].clone(), single(i), Kind::Channel)).collect();
-    combinations.extend(pairs(court.noise, names, gathered.rate_hz));
+    combinations.extend(pairs(scorer.noise, names, gathered.rate_hz));
     let tested = |w: &DVector<f64>| (0..names.len()).all(|i| w[i] == 0.0 || known(i));
     let allowed = FALSE_ALARM / (TESTS * combinations.iter().filter(|(_, w, _)| tested(w)).count().max(1)) as f64;
     let hours_ns: Vec<i64> = gathered.hours.iter().map(|h| h.start_ns).collect();
@@ -348,7 +352,7 @@ pub fn compare(court: &Court<'_>, nis: Option<Nis>, innovations: Vec<Innovations
             channel.measured_psd = measured.iter().map(power).collect();
             channel.chi2_per_dof_fitted_levels = {
                 // The level's prediction lies on the middle of a band, as the plain one it is compared with.
-                let at = |b: usize| power(&court.noise.psd(plan.frequency_hz(plan.bands[b])));
+                let at = |b: usize| power(&scorer.noise.psd(plan.frequency_hz(plan.bands[b])));
                 let ratio = |b: usize| total.ratio[b] * at(b) / power(&levels.modelled()[b]);
                 let n = &total.observations;
                 (0..n.len()).map(|b| n[b] * ratio(b)).sum::<f64>() / n.iter().sum::<f64>()
@@ -363,11 +367,11 @@ pub fn compare(court: &Court<'_>, nis: Option<Nis>, innovations: Vec<Innovations
             channel
         })
         .collect();
-    let all = gathered.witnesses.coherences(names);
+    let all = gathered.housekeeping.coherences(names);
     let trials = all.len() as f64;
     let chance = |w: &Coherence| corrected(chi2_tails(w.statistic / w.dof, w.dof).1, trials);
     let passes = channels.iter().all(|c| c.passes);
-    let coherences = all.into_iter().map(|c| Witness { p_value: chance(&c), coherence: c });
+    let coherences = all.into_iter().map(|c| SignificantCoherence { p_value: chance(&c), coherence: c });
     Ok(Comparison {
         verdict: if passes { "passes" } else { "fails" },
         passes,
@@ -380,15 +384,15 @@ pub fn compare(court: &Court<'_>, nis: Option<Nis>, innovations: Vec<Innovations
         nis,
         innovations,
         coherences: coherences.filter(|w| w.p_value < FALSE_ALARM).take(MOST_COHERENCES).collect(),
-        together: gathered.witnesses.together(names, FALSE_ALARM),
+        together: gathered.housekeeping.stepwise_coherence(names, FALSE_ALARM),
     })
 }
 
 /// Residuals as combinations of the base columns: channels × columns.
-fn residual(court: &Court<'_>, theta: &[f64]) -> DMatrix<f64> {
-    let columns = &court.gathered.columns;
+fn residual(scorer: &CandidateScorer<'_>, theta: &[f64]) -> DMatrix<f64> {
+    let columns = &scorer.gathered.columns;
     let mut out = DMatrix::identity(columns.channels, columns.base);
-    for (c, value) in court.question.coefficients.iter().zip(theta) {
+    for (c, value) in scorer.candidate_set.coefficients.iter().zip(theta) {
         for t in &c.forms[0].terms {
             out[(t.channel, t.column)] -= value * t.factor * t.times.map_or(1.0, |other| theta[other]);
         }
@@ -602,7 +606,7 @@ fn autocorrelations(plan: &Plan, part: &[f64], ratio: &[f64], n: f64) -> (Vec<f6
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::gather::HOUR_NS;
+    use crate::gram::HOUR_NS;
     use dragfree_estimation::sigma::Measured;
     use dragfree_estimation::spectra::{Analyser, Layout, Sums};
     use dragfree_physics::mission::Mission;

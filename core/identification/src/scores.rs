@@ -16,8 +16,8 @@ use dragfree_estimation::sigma::{BandNoise, NoiseModel};
 use dragfree_estimation::spectra::{Layout, Plan, Spectra, Sums};
 use nalgebra::{Cholesky, DMatrix, DVector};
 
-use crate::gather::{Gathered, Gram};
-use crate::question::{Candidate, Question};
+use crate::candidates::{Candidate, CandidateSet};
+use crate::gram::{Gram, GramSums};
 
 /// How often Σ is measured from the residuals.
 const REFINEMENTS: usize = 3;
@@ -28,7 +28,7 @@ const SUMMITS: usize = 3;
 /// Projection above which two causes cannot be told apart.
 pub const CONFOUNDED: f64 = 0.95;
 
-/// A window that leaves less than the inverse of this of a course's energy leaves too little to judge it by.
+/// A window that leaves less than the inverse of this of a waveform's energy leaves too little to judge it by.
 const MOST_WINDOWED: f64 = 4.0;
 
 /// What is left of a candidate's information beside the model when it is called degenerate with it.
@@ -78,7 +78,7 @@ pub struct Scored {
     pub delta_chi2: f64,
     /// Information of its coefficients beside the model.
     pub information: DMatrix<f64>,
-    /// By what the weights of the sums over- or understate the information, see [`Court::honest`].
+    /// By what the weights of the sums over- or understate the information, see [`CandidateScorer::window_corrected`].
     understated: f64,
     /// Part of the information that the model leaves it.
     pub left: f64,
@@ -91,10 +91,10 @@ pub struct Scored {
 pub struct Ranked {
     /// Each place of each effect in its best form, the best first.
     pub all: Vec<Scored>,
-    /// Forms that were tried, per effect; but for what happens once.
+    /// Forms that were tried, per effect; but for transients.
     pub tried: BTreeMap<String, usize>,
     /// Places of effects of which these data say nothing: what they are made of does not change, or the model has it already.
-    pub mute: Vec<String>,
+    pub unobservable: Vec<String>,
 }
 
 /// A candidate fitted to each half of the data.
@@ -108,11 +108,11 @@ pub struct Halves {
 }
 
 /// Everything that is asked of the sums.
-pub struct Court<'a> {
+pub struct CandidateScorer<'a> {
     /// Model and candidates.
-    pub question: &'a Question,
+    pub candidate_set: &'a CandidateSet,
     /// Sums.
-    pub gathered: &'a Gathered,
+    pub gathered: &'a GramSums,
     /// Both sets together.
     pub total: Gram,
     /// Noise of the mission.
@@ -130,19 +130,19 @@ struct Scores {
     /// `N_qq⁻¹` with what surveys and ranges know.
     covariance: DMatrix<f64>,
     /// Score of the free coefficients that ranges hold back.
-    held: DVector<f64>,
+    bound_score: DVector<f64>,
     /// `Σ⁻¹` times what makes information of sums, per band.
     weights: Vec<DMatrix<f64>>,
     theta: DVector<f64>,
 }
 
-impl<'a> Court<'a> {
+impl<'a> CandidateScorer<'a> {
     /// Takes the sums.
     #[must_use]
-    pub fn new(question: &'a Question, gathered: &'a Gathered, noise: &'a NoiseModel) -> Self {
+    pub fn new(candidate_set: &'a CandidateSet, gathered: &'a GramSums, noise: &'a NoiseModel) -> Self {
         let plan = gathered.plan();
         let noise_in_bands = BandNoise::new(noise, &plan);
-        Self { question, gathered, total: gathered.total(), noise, noise_in_bands, plan }
+        Self { candidate_set, gathered, total: gathered.total(), noise, noise_in_bands, plan }
     }
 
     /// Bands.
@@ -164,12 +164,12 @@ impl<'a> Court<'a> {
     }
 
     fn solve(&self, added: &[Candidate], refinements: usize) -> Result<Solved, EstimateError> {
-        let (layout, columns) = self.question.layout(&self.gathered.columns.names, added);
+        let (layout, columns) = self.candidate_set.layout(&self.gathered.columns.names, added);
         let spectra = self.total.select(&columns);
         let sums = Sums { total: spectra, block_ns: 1, blocks: Vec::new() };
         let observed = Observed { layout: &layout, plan: &self.plan, sums: &sums, prediction: None };
-        let unknowns = self.question.unknowns(added);
-        let bounds = self.question.bounds();
+        let unknowns = self.candidate_set.unknowns(added);
+        let bounds = self.candidate_set.bounds();
         let estimate =
             estimate_with(&observed, &self.noise_in_bands, &unknowns, &bounds, refinements, Refinement::Levels)?;
         Ok(Solved { layout, columns, estimate })
@@ -177,10 +177,10 @@ impl<'a> Court<'a> {
 
     fn scores(&self, gram: &Gram, estimate: &Estimate, layout: &Layout, columns: &[usize]) -> Scores {
         let n = self.gathered.columns.names.len();
-        let channels = self.question.channels.len();
+        let channels = self.candidate_set.channels.len();
         let theta = &estimate.theta;
         let linear = layout.linear_at(theta.as_slice());
-        let kept = self.total.weights.evenly();
+        let kept = self.total.weights.equal_time_weights();
         let weights: Vec<DMatrix<f64>> = estimate.inverses.iter().zip(&kept).map(|(w, k)| w * *k).collect();
         let mut residual = DMatrix::zeros(n, channels);
         let free = &estimate.free;
@@ -203,13 +203,13 @@ impl<'a> Court<'a> {
         }
         let covariance =
             estimate.known.clone().cholesky().map_or_else(|| DMatrix::zeros(free.len(), free.len()), |c| c.inverse());
-        Scores { residual, model, covariance, held: estimate.held.clone(), weights, theta: theta.clone() }
+        Scores { residual, model, covariance, bound_score: estimate.bound_score.clone(), weights, theta: theta.clone() }
     }
 
     /// The mission's noise as a fit has it, beside residuals that some of the sums have.
     #[must_use]
     pub fn levels<'b>(&'b self, fit: &Fit, gram: &Gram, measured: &'b [DMatrix<f64>]) -> Levels<'b> {
-        let unknowns = self.question.unknowns(&fit.added);
+        let unknowns = self.candidate_set.unknowns(&fit.added);
         let colours = colours(&unknowns, &fit.estimate.theta);
         Levels::new(self.noise, &self.plan, &gram.weights, measured).coloured(&self.plan, &colours)
     }
@@ -262,7 +262,7 @@ impl<'a> Court<'a> {
     fn likelihood(&self, added: &[Candidate]) -> Result<f64, EstimateError> {
         let Solved { layout, columns, estimate } = self.solve(added, REFINEMENTS)?;
         let measured = Self::residual(&self.total, &layout, &columns, &estimate.theta);
-        let unknowns = self.question.unknowns(added);
+        let unknowns = self.candidate_set.unknowns(added);
         let colours = colours(&unknowns, &estimate.theta);
         let levels = Levels::new(self.noise, &self.plan, &self.total.weights, &measured);
         let mut levels = levels.coloured(&self.plan, &colours);
@@ -281,9 +281,9 @@ impl<'a> Court<'a> {
             return Ok(None);
         }
         let same = |p: &Vec<usize>| p.iter().eq(candidate.parts.iter().map(|(i, _)| i));
-        let Some(place) = self.question.places().into_iter().find(same) else { return Ok(None) };
-        let count = self.question.coefficients[place[0]].forms.len();
-        let forms: Vec<Candidate> = (0..count).map(|form| self.question.candidate(&place, form)).collect();
+        let Some(place) = self.candidate_set.places().into_iter().find(same) else { return Ok(None) };
+        let count = self.candidate_set.coefficients[place[0]].forms.len();
+        let forms: Vec<Candidate> = (0..count).map(|form| self.candidate_set.candidate(&place, form)).collect();
         let worth = |form: &Candidate| self.score(&fit.scores, form.clone()).map_or(0.0, |s| s.delta_chi2);
         let scores: Vec<f64> = forms.iter().map(worth).collect();
         let index = |of: &Candidate| forms.iter().position(|form| form == of);
@@ -325,9 +325,10 @@ impl<'a> Court<'a> {
 
     /// Terms of each coefficient: column, channel, factor, with products at the fit's values.
     fn terms(candidate: &Candidate, theta: &DVector<f64>) -> Vec<Vec<(usize, usize, f64)>> {
-        let of = |form: &crate::question::Form| {
-            let at =
-                |t: &crate::question::Term| (t.column, t.channel, t.factor * t.times.map_or(1.0, |other| theta[other]));
+        let of = |form: &crate::candidates::Form| {
+            let at = |t: &crate::candidates::Term| {
+                (t.column, t.channel, t.factor * t.times.map_or(1.0, |other| theta[other]))
+            };
             form.terms.iter().map(at).collect()
         };
         candidate.parts.iter().map(|(_, form)| of(form)).collect()
@@ -373,7 +374,7 @@ impl<'a> Court<'a> {
         let (score, with_model) = Self::against(scores, &candidate);
         // What the lack of the candidate pushed to the end of its range comes back when the candidate is there: the solution stands at no
         // optimum of the data, and a gain of 0.1 had looked like 0.3 beside an offset that it had moved by its whole box.
-        let score = score - &with_model * (&scores.covariance * &scores.held);
+        let score = score - &with_model * (&scores.covariance * &scores.bound_score);
         let information = &own - &with_model * &scores.covariance * with_model.transpose();
         let left = (0..own.nrows()).map(|i| information[(i, i)] / own[(i, i)]).fold(1.0, f64::min);
         // A coefficient that nothing sees, or that the model has already.
@@ -396,7 +397,7 @@ impl<'a> Court<'a> {
     /// The part of what would be known of a candidate under some `Σ⁻¹` that comes from some of the bands.
     #[must_use]
     pub fn part_in(&self, fit: &Fit, inverses: &[DMatrix<f64>], candidate: &Candidate, bands: &[bool]) -> f64 {
-        let kept = self.total.weights.evenly();
+        let kept = self.total.weights.equal_time_weights();
         let weights: Vec<DMatrix<f64>> = inverses.iter().zip(&kept).map(|(w, k)| w * *k).collect();
         let here: Vec<DMatrix<f64>> = weights.iter().zip(bands).map(|(w, b)| w * f64::from(u8::from(*b))).collect();
         let theta = &fit.scores.theta;
@@ -405,20 +406,20 @@ impl<'a> Court<'a> {
         of(&here).component_div(&of(&weights)).mean()
     }
 
-    /// What a candidate is worth: bands that stand for little time count for what they are (see [`Spectra::evenly`]); and a course that
+    /// What a candidate is worth: bands that stand for little time count for what they are (see [`Spectra::equal_time_weights`]); and a waveform that
     /// is over soon is as well known as if there were no window, wherever in a segment it lies. Its amplitude and the noise beside it
     /// are windowed alike, while the sums' weights are right for what lasts: they would make its σ too small by 1.6 in the middle of
     /// a segment that overlaps no other, and too large near its ends.
-    fn honest(&self, fit: &Fit, mut scored: Scored) -> Scored {
+    fn window_corrected(&self, fit: &Fit, mut scored: Scored) -> Scored {
         let (weights, candidate) = (&self.total.weights, &scored.candidate);
-        let evenly = weights.evenly();
+        let equal_time = weights.equal_time_weights();
         let ratio = |(u, v): (f64, f64)| if v > 0.0 { u / v } else { 0.0 };
         let energy = candidate.parts.iter().flat_map(|(_, form)| &form.terms).find_map(|t| {
             let energy = self.gathered.columns.energy_of(t.column)?;
-            let windowed = self.total.bands.iter().zip(&evenly).map(|(g, k)| g[(t.column, t.column)] * k);
+            let windowed = self.total.bands.iter().zip(&equal_time).map(|(g, k)| g[(t.column, t.column)] * k);
             Some(energy.iter().copied().zip(windowed).map(ratio).map(|r| r.min(MOST_WINDOWED)).collect())
         });
-        let lasts = || evenly.iter().copied().zip(weights.kept()).map(|(e, k)| ratio((k, e)).min(1.0)).collect();
+        let lasts = || equal_time.iter().copied().zip(weights.kept()).map(|(e, k)| ratio((k, e)).min(1.0)).collect();
         let factors: Vec<f64> = energy.unwrap_or_else(lasts);
         let size = |w: &[DMatrix<f64>]| {
             let own = Self::weighed(&self.total, w, &fit.scores.theta, candidate, candidate);
@@ -439,33 +440,33 @@ impl<'a> Court<'a> {
     #[must_use]
     pub fn rank(&self, fit: &Fit) -> Ranked {
         let scores = &fit.scores;
-        let (mut tried, mut mute) = (BTreeMap::new(), Vec::new());
+        let (mut tried, mut unobservable) = (BTreeMap::new(), Vec::new());
         let mut ranked = Vec::new();
-        for place in self.question.places() {
-            let first = &self.question.coefficients[place[0]];
+        for place in self.candidate_set.places() {
+            let first = &self.candidate_set.coefficients[place[0]];
             if fit.added.iter().any(|a| (&a.effect, &a.instance) == (&first.effect, &first.instance)) {
                 continue;
             }
             let forms = first.forms.len();
             let scored: Vec<Option<Scored>> =
-                (0..forms).map(|f| self.score(scores, self.question.candidate(&place, f))).collect();
-            // The search of what happens once counts its own trials.
-            if !first.once {
+                (0..forms).map(|f| self.score(scores, self.candidate_set.candidate(&place, f))).collect();
+            // The search of transients counts its own trials.
+            if !first.transient {
                 *tried.entry(first.effect.clone()).or_default() += scored.iter().flatten().count();
             }
             let best = scored.iter().flatten().max_by(|a, b| a.delta_chi2.total_cmp(&b.delta_chi2));
             let Some(best) = best else {
-                if !first.once {
-                    mute.push(format!("{}:{}", first.effect, first.instance));
+                if !first.transient {
+                    unobservable.push(format!("{}:{}", first.effect, first.instance));
                 }
                 continue;
             };
             // There is nothing between two times.
-            let best = if first.once { best.clone() } else { self.between_neighbours(scores, &scored, best) };
-            ranked.push(self.honest(fit, best));
+            let best = if first.transient { best.clone() } else { self.between_neighbours(scores, &scored, best) };
+            ranked.push(self.window_corrected(fit, best));
         }
         ranked.sort_by(|a, b| b.delta_chi2.total_cmp(&a.delta_chi2));
-        Ranked { all: ranked, tried, mute }
+        Ranked { all: ranked, tried, unobservable }
     }
 
     /// The best mixture of the best form with a neighbour on its grid of shapes.
@@ -598,11 +599,11 @@ fn inside(information: &DMatrix<f64>, score: &DVector<f64>, bounds: &[(f64, f64)
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::course::Course;
-    use crate::gather::{Columns, Gatherer, LONG};
-    use crate::question::{Coefficient, Form, Term};
+    use crate::candidates::{Coefficient, Form, Term};
+    use crate::coherence::HousekeepingCoherence;
+    use crate::gram::{Columns, GramAccumulator, LONG};
     use crate::transient::Search;
-    use crate::witness::Witnesses;
+    use crate::waveform::Waveform;
     use dragfree_estimation::segments::Segmenter;
     use dragfree_estimation::sigma::Measured;
     use dragfree_physics::mission::Mission;
@@ -613,11 +614,11 @@ mod tests {
 
     const LENGTH: usize = 1024;
     const SAMPLES: usize = 20_000;
-    const COURSE: [f64; 4] = [1.0; 4];
+    const WAVEFORM: [f64; 4] = [1.0; 4];
     /// Two channels of white noise of one-sided PSD 1 at 1 Hz.
     const VARIANCE: f64 = 0.5;
 
-    fn coefficient(instance: &str, candidate: bool, once: bool, forms: Vec<Form>) -> Coefficient {
+    fn coefficient(instance: &str, candidate: bool, transient: bool, forms: Vec<Form>) -> Coefficient {
         Coefficient {
             name: format!("e.{instance}"),
             effect: "e".to_owned(),
@@ -626,7 +627,7 @@ mod tests {
             prior_sigma: None,
             estimate: !candidate,
             candidate,
-            once,
+            transient,
             forms,
             noise: String::new(),
         }
@@ -646,9 +647,9 @@ mod tests {
 
     /// A model of one coefficient; pushes of either channel at one time as candidates, the second of both channels; and one that lasts
     /// at the first's place.
-    fn question() -> Question {
+    fn candidate_set() -> CandidateSet {
         let at = &[("at_ns", 1)];
-        Question {
+        CandidateSet {
             channels: vec!["first".to_owned(), "second".to_owned()],
             coefficients: vec![
                 coefficient("model", false, false, vec![form(&[], &[(0, 2, 1.0)])]),
@@ -661,15 +662,15 @@ mod tests {
         }
     }
 
-    /// `size` of the course, and `push` of what lasts, which is like the model's own series to nine tenths.
-    fn gathered(seed: u64, samples: usize, at: usize, size: f64, push: f64) -> Gathered {
+    /// `size` of the waveform, and `push` of what lasts, which is like the model's own series to nine tenths.
+    fn gathered(seed: u64, samples: usize, at: usize, size: f64, push: f64) -> GramSums {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         let mut white = || -> Vec<f64> { (0..samples).map(|_| StandardNormal.sample(&mut rng)).collect() };
         let (mut first, mut second, model, mut lasting) = (white(), white(), white(), white());
         lasting.iter_mut().zip(&model).for_each(|(x, m)| *x = 0.9 * m + 0.19f64.sqrt() * *x);
         let time_ns: Vec<i64> = (0..samples as i64).map(|k| 1_000_000_000 * k).collect();
-        let course = Course { at_ns: time_ns[at], step_ns: 1_000_000_000, kernel: COURSE.to_vec() };
-        let event = course.over(&time_ns);
+        let waveform = Waveform { at_ns: time_ns[at], step_ns: 1_000_000_000, kernel: WAVEFORM.to_vec() };
+        let event = waveform.over(&time_ns);
         first.iter_mut().zip(&event).for_each(|(x, e)| *x = *x * VARIANCE.sqrt() + size * e);
         first.iter_mut().zip(&lasting).for_each(|(x, l)| *x += push * l);
         second.iter_mut().for_each(|x| *x *= VARIANCE.sqrt());
@@ -679,15 +680,15 @@ mod tests {
             channels: 2,
             base: 3,
             fast: 5,
-            energy: vec![course.energy(&plan, false)],
+            energy: vec![waveform.energy(&plan, false)],
         };
         let residual = DMatrix::from_fn(2, 3, |i, j| f64::from(u8::from(i == j)));
-        let witnesses = |plan: &Plan| {
+        let coherence = |plan: &Plan| {
             let whitening = vec![DMatrix::identity(2, 2); plan.bands.len()];
-            Witnesses::new(Vec::new(), plan, residual.clone(), whitening)
+            HousekeepingCoherence::new(Vec::new(), plan, residual.clone(), whitening)
         };
         let search = Search::new(Vec::new(), residual.clone(), Vec::new());
-        let mut gatherer = Gatherer::new(columns, LENGTH, 1.0, 1, witnesses, search);
+        let mut gatherer = GramAccumulator::new(columns, LENGTH, 1.0, 1, coherence, search);
         let mut segmenter = Segmenter::new(LENGTH, 1_000_000_000, vec![false; 5]);
         let slices = [&first, &second, &model, &lasting, &event].map(Vec::as_slice);
         segmenter.cut(&time_ns, &slices, &mut gatherer);
@@ -703,8 +704,8 @@ mod tests {
         NoiseModel::new(&mission, &[("first", Measured::Directly), ("second", Measured::Directly)], 1.0).unwrap()
     }
 
-    fn once(ranked: &Ranked, instance: &str) -> Scored {
-        let of = |s: &&Scored| s.candidate.once && s.candidate.instance == instance;
+    fn transient(ranked: &Ranked, instance: &str) -> Scored {
+        let of = |s: &&Scored| s.candidate.transient && s.candidate.instance == instance;
         ranked.all.iter().find(of).unwrap_or_else(|| panic!("{instance} is not ranked")).clone()
     }
 
@@ -713,12 +714,12 @@ mod tests {
     /// of them).
     #[test]
     fn an_event_has_the_error_of_least_squares_wherever_it_is() {
-        let (question, noise) = (question(), noise());
+        let (candidate_set, noise) = (candidate_set(), noise());
         let mut natural: Vec<f64> = Vec::new();
         for (k, at) in (0..8).map(|k| (k, 9000 + 64 * k)) {
             let gathered = gathered(7 + k as u64, SAMPLES, at, 6.0, 0.0);
-            let court = Court::new(&question, &gathered, &noise);
-            let scored = once(&court.rank(&court.fit(&[]).unwrap()), "one");
+            let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise);
+            let scored = transient(&scorer.rank(&scorer.fit(&[]).unwrap()), "one");
             let sigma = scored.information[(0, 0)].sqrt().recip();
             let exact = (VARIANCE / 4.0).sqrt();
             assert!((sigma / exact - 1.0).abs() < 0.1, "at {at}: {sigma} against {exact}");
@@ -733,16 +734,16 @@ mod tests {
     /// twice (false alarm 1.4e-5).
     #[test]
     fn what_a_range_holds_back_comes_back_beside_a_candidate() {
-        let (mut question, noise) = (question(), noise());
+        let (mut candidate_set, noise) = (candidate_set(), noise());
         let gathered = gathered(5, SAMPLES, 9000, 0.0, 1.0);
         for limit in [None, Some(0.1)] {
-            let form = &mut question.coefficients[0].forms[0];
+            let form = &mut candidate_set.coefficients[0].forms[0];
             (form.lower, form.upper) = (limit.map(|x: f64| -x), limit);
-            let court = Court::new(&question, &gathered, &noise);
-            let fit = court.fit(&[]).unwrap();
+            let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise);
+            let fit = scorer.fit(&[]).unwrap();
             assert_eq!(fit.estimate.active.len(), usize::from(limit.is_some()));
-            let ranked = court.rank(&fit);
-            let lasting = ranked.all.iter().find(|s| !s.candidate.once && s.candidate.instance == "one").unwrap();
+            let ranked = scorer.rank(&fit);
+            let lasting = ranked.all.iter().find(|s| !s.candidate.transient && s.candidate.instance == "one").unwrap();
             let sigma = lasting.information[(0, 0)].sqrt().recip();
             assert!(
                 (lasting.value[0] - 1.0).abs() < 4.5 * sigma && sigma < 0.02,
@@ -752,26 +753,26 @@ mod tests {
         }
     }
 
-    /// What shares the course and nearly all channels is a confounder, whatever the windows leave of it; what acts on another channel
+    /// What shares the waveform and nearly all channels is a confounder, whatever the windows leave of it; what acts on another channel
     /// is none; and what lasts at the same place is ranked apart.
     #[test]
     fn an_event_is_told_from_what_it_can_be_told_from() {
-        let (question, noise) = (question(), noise());
-        assert_eq!(question.places().len(), 4);
+        let (candidate_set, noise) = (candidate_set(), noise());
+        assert_eq!(candidate_set.places().len(), 4);
         let gathered = gathered(3, SAMPLES, 9000, 6.0, 0.0);
-        let court = Court::new(&question, &gathered, &noise);
-        let fit = court.fit(&[]).unwrap();
-        let ranked = court.rank(&fit);
-        let [one, both] = ["one", "both"].map(|instance| once(&ranked, instance));
-        assert_eq!(court.confounders(&fit, &one, &ranked.all), ["e:both"]);
-        assert_eq!(court.confounders(&fit, &both, &ranked.all), ["e:one"]);
-        assert!(ranked.all.iter().any(|s| !s.candidate.once && s.candidate.instance == "one"));
-        // Forms of what happens once are counted by their search.
+        let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise);
+        let fit = scorer.fit(&[]).unwrap();
+        let ranked = scorer.rank(&fit);
+        let [one, both] = ["one", "both"].map(|instance| transient(&ranked, instance));
+        assert_eq!(scorer.confounders(&fit, &one, &ranked.all), ["e:both"]);
+        assert_eq!(scorer.confounders(&fit, &both, &ranked.all), ["e:one"]);
+        assert!(ranked.all.iter().any(|s| !s.candidate.transient && s.candidate.instance == "one"));
+        // Forms of transients are counted by their search.
         assert_eq!(ranked.tried, BTreeMap::from([("e".to_owned(), 1)]));
         // What was added is not ranked again, and leaves nothing of itself.
-        let fit = court.fit(&[one.candidate]).unwrap();
-        let left = court.rank(&fit);
+        let fit = scorer.fit(&[one.candidate]).unwrap();
+        let left = scorer.rank(&fit);
         assert!(left.all.iter().all(|s| s.candidate.instance != "one"));
-        assert!(once(&left, "other").delta_chi2 < 20.0);
+        assert!(transient(&left, "other").delta_chi2 < 20.0);
     }
 }
