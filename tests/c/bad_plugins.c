@@ -2,7 +2,8 @@
  *   1 another ABI version            2 an error in mid-stream          3 discards every second batch
  *   4 asks for a column nobody makes 5 wants another unit              6 changes the rounding mode
  *   7 gives one row too few          8 fails in create                 9 a manifest that is no JSON
- *  10 a fatal error in mid-stream
+ *  10 a fatal error in mid-stream   11 a report with NaN and unknown keys   12 a report with a text for a number
+ *  13 noise in a channel that nobody makes
  */
 #include <dragfree/rows.h>
 #include <fenv.h>
@@ -35,6 +36,10 @@ static dragfree_status bad_link(void *self, const dragfree_link_v1 *link, dragfr
     if (!strcmp(link->available[i].table, "grid")) s->rate_hz = link->available[i].rate_hz;
   if (link->read(link->context, &want, &s->x)) return say(error, DRAGFREE_ERROR, "no column");
   dragfree_column_v1 copy = {"bad", "bad.y", "m", "ORF_1", s->rate_hz, "{\"archive\":\"true\"}"};
+#if BAD == 13
+  copy.attributes = "{\"noise_processes\":[{\"name\":\"shot:bad\",\"unit\":\"m\",\"spectrum\":[{\"asd\":1e-12,"
+                    "\"corner_hz\":1.0,\"exponent\":0}],\"enters\":[[\"bad.y\",1.0]],\"response\":\"direct\"}]}";
+#endif
   return link->write(link->context, &copy);
 }
 
@@ -65,6 +70,24 @@ static dragfree_status bad_process(void *self, const dragfree_inputs_v1 *inputs,
   return DRAGFREE_OK;
 }
 
+/* As `printf` writes it: `nan` is no JSON. */
+static dragfree_status bad_report(void *self, const char *earlier, const dragfree_writer_v1 *writer,
+                                  dragfree_error_v1 *error) {
+  (void)self;
+  (void)earlier;
+  (void)error;
+  char text[256];
+#if BAD == 12
+  int n = snprintf(text, sizeof text, "{\"nis\":\"good\"}");
+#else
+  int n = snprintf(text, sizeof text,
+                   "{\"chi2_per_dof\":%g,\"shade\":\"blue\",\"covariance\":{\"mine\":{\"names\":[\"a\"],"
+                   "\"matrix\":[[null]]}}}",
+                   strtod("nan", NULL));
+#endif
+  return writer->write(writer->context, (const uint8_t *)text, (size_t)n);
+}
+
 static dragfree_status bad_create(uint32_t index, const dragfree_host_v1 *host, const dragfree_config_v1 *config,
                                   dragfree_node_v1 *node, dragfree_error_v1 *error) {
   (void)index;
@@ -77,6 +100,9 @@ static dragfree_status bad_create(uint32_t index, const dragfree_host_v1 *host, 
   made.self = calloc(1, sizeof(bad));
   made.link = bad_link;
   made.process = bad_process;
+#if BAD == 11 || BAD == 12
+  made.report = bad_report;
+#endif
   made.destroy = free;
   if (!made.self) return say(error, DRAGFREE_ERROR, "no memory");
   *node = made;

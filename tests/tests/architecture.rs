@@ -31,8 +31,9 @@ fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
 /// What a crate of ours may depend on among our crates.
 fn allowed(crate_name: &str) -> &'static [&'static str] {
     match crate_name {
-        "dragfree-abi" | "dragfree-physics" | "dragfree-chart" | "dragfree-score" => &[],
-        "dragfree-sdk" | "dragfree-engine" => &["dragfree-abi"],
+        "dragfree-abi" | "dragfree-schema" | "dragfree-chart" | "dragfree-score" => &[],
+        "dragfree-physics" => &["dragfree-schema"],
+        "dragfree-sdk" | "dragfree-engine" => &["dragfree-abi", "dragfree-schema"],
         "dragfree" => &[
             "dragfree-engine",
             "dragfree-physics",
@@ -42,7 +43,7 @@ fn allowed(crate_name: &str) -> &'static [&'static str] {
             "dragfree-score",
         ],
         "dragfree-validation" => &["dragfree-engine", "dragfree-physics", "dragfree-chart"],
-        "dragfree-estimation" => &["dragfree-physics"],
+        "dragfree-estimation" => &["dragfree-physics", "dragfree-schema"],
         "dragfree-identification" => &["dragfree-physics", "dragfree-estimation"],
         "dragfree-critic-stage" => {
             &["dragfree-sdk", "dragfree-physics", "dragfree-estimation", "dragfree-identification"]

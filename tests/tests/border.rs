@@ -93,6 +93,8 @@ fn every_misbehaviour_is_told_and_none_is_a_crash() {
         (8, "never comes to life"),
         (9, "manifest 0"),
         (10, "the third batch is fatal"),
+        (12, "plugin bad: report: broke the rules of plugin.h: key `nis`: invalid type: string \"good\""),
+        (13, "declares that the noise process `shot:bad` enters `bad.y`, which is no channel"),
     ] {
         let (code, stderr) = misbehaving(way);
         assert_eq!(code, Some(1), "way {way}: {stderr}");
@@ -121,6 +123,25 @@ fn a_plugin_without_a_panic_goes_through() {
     example_plugin(dir.path());
     let product = json(&mut run(dir.path(), &pipeline), 0);
     assert_eq!(product["quality"]["counts"]["clumsy"]["rows"], 18_000, "{product}");
+}
+
+/// An early stage that wrote an unknown key, or NaN, failed the next stage in Rust when the whole day had been read.
+#[test]
+fn an_odd_report_of_an_early_stage_fails_no_later_one() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    compile_plugin(dir.path(), "bad_plugins.c", "bad", &["-DBAD=11"]);
+    example_plugin(dir.path());
+    let pipeline = pipeline(dir.path(), "plugin = \"bad\"\n[[stage]]\nplugin = \"clumsy\"");
+    let product = json(&mut run(dir.path(), &pipeline), 0);
+    let notes = product["quality"]["notes"].as_array().expect("notes");
+    for note in [
+        "bad: wrote NaN or infinity, which JSON does not have; read as null",
+        "bad: unknown key \"shade\" left out",
+        "bad: 1 entries of the covariance of \"mine\" are no numbers",
+    ] {
+        assert!(notes.iter().any(|n| n == note), "{note} among {notes:?}");
+    }
+    assert_eq!(product["quality"]["counts"]["clumsy"]["reports"], 2, "preprocess and bad, {product}");
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use crate::text::{self, Paint};
 use crate::utc;
-use dragfree_engine::border::{Manifest, Parameter};
+use dragfree_engine::border::{Manifest, Parameter, ParameterType};
 use dragfree_engine::product::{Coefficient, Listing, Product};
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::{CheckReport, CheckedNode};
@@ -237,7 +237,8 @@ pub(crate) fn manifest(kind: &str, manifest: &Manifest, library: &Path, paint: P
 
 fn range(parameter: &Parameter) -> Option<String> {
     // The largest whole number is no bound that anybody chose.
-    let maximum = parameter.maximum.filter(|maximum| parameter.kind != "i64" || *maximum < i64::MAX as f64);
+    let maximum =
+        parameter.maximum.filter(|maximum| parameter.kind != ParameterType::I64 || *maximum < i64::MAX as f64);
     match (parameter.minimum, maximum) {
         _ if !parameter.choices.is_empty() => Some(parameter.choices.join(" | ")),
         (Some(minimum), Some(maximum)) => Some(format!("{minimum} to {maximum}")),
@@ -297,7 +298,8 @@ pub(crate) fn plugins_json(registry: &Registry) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dragfree_engine::product::{Draft, Model, ProductWriter, StageReport, Status, Stream, Written};
+    use dragfree_engine::product::{Draft, Model, ProductWriter, Status, Stream, Written};
+    use dragfree_engine::schema::Report;
     use std::collections::BTreeMap;
 
     const PLAIN: Paint = Paint(false);
@@ -307,6 +309,7 @@ mod tests {
     }
 
     fn written(folder: &Path, report: Value) -> Written {
+        let report: Report = serde_json::from_value(report).expect("a report");
         let draft = Draft {
             pipeline: "science-mode".into(),
             product: "COM1B".into(),
@@ -326,7 +329,7 @@ mod tests {
             losses: Vec::new(),
             counts: BTreeMap::new(),
             notes: Vec::new(),
-            reports: vec![StageReport { stage: "qp-check".into(), report }],
+            reports: vec![Report { plugin: "qp-check".into(), ..report }],
             created: chrono::DateTime::UNIX_EPOCH,
         };
         ProductWriter::begin(folder).expect("begin").commit(&draft).expect("commit")

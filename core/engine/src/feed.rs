@@ -5,6 +5,8 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::PathBuf;
 
+use dragfree_schema::Report;
+
 use crate::EngineError;
 use crate::border::{Config, Instance};
 use crate::chain;
@@ -50,7 +52,7 @@ pub struct Summary {
     /// Sentences for the operator.
     pub notes: Vec<String>,
     /// The report of a source plugin.
-    pub report: Option<(String, serde_json::Value)>,
+    pub report: Option<Report>,
 }
 
 /// Telemetry files.
@@ -195,9 +197,8 @@ impl SourceFeed {
     /// The source failed.
     pub fn sealed(&mut self) -> Result<Option<Sealed>, EngineError> {
         let report = self.instance.report("[]").map_err(chain::ChainError::from)?;
-        let attachments = report["attachments"].as_array().map_or(&[][..], Vec::as_slice);
-        let sealed = attachments.iter().find(|a| a["suffix"] == SEALED).and_then(|a| a["text"].as_str());
-        Ok(sealed.map(Sealed::new))
+        let sealed = report.attachments.iter().find(|a| a.suffix == SEALED);
+        Ok(sealed.map(|a| Sealed::new(&a.text)))
     }
 }
 
@@ -221,14 +222,12 @@ impl Feed for SourceFeed {
 
     fn summary(&mut self) -> Result<Summary, EngineError> {
         let mut report = self.instance.report("[]").map_err(chain::ChainError::from)?;
-        if let Some(attachments) = report.get_mut("attachments").and_then(serde_json::Value::as_array_mut) {
-            attachments.retain(|a| a["suffix"] != SEALED);
-        }
-        let text = |key: &str| report["quality"][key].as_str().unwrap_or_default().to_owned();
+        report.attachments.retain(|a| a.suffix != SEALED);
+        let text = |key: &str| report.quality.get(key).and_then(|v| v.as_str()).unwrap_or_default().to_owned();
         Ok(Summary {
             time_scale: Some(text("time_scale")).filter(|t| !t.is_empty()).unwrap_or_else(|| "UTC".to_owned()),
             spacecraft: text("spacecraft"),
-            report: Some((self.found.info.manifest.id.clone(), report)),
+            report: Some(report),
             ..Summary::default()
         })
     }

@@ -20,6 +20,8 @@ pub mod table;
 pub mod telemetry;
 pub mod validate;
 
+pub use dragfree_schema as schema;
+
 use std::path::PathBuf;
 
 /// Why a run or a simulation failed.

@@ -1,6 +1,7 @@
 //! One run: a pipeline over a feed, into a product.
 
 use chrono::{DateTime, Utc};
+use dragfree_schema::Report;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 use std::ops::Range;
@@ -12,7 +13,7 @@ use crate::chain::{self, Carry, Chain, Sink};
 use crate::config::{Mission, Model, Pipeline};
 use crate::examine::Sources;
 use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions, Summary};
-use crate::product::{self, Draft, Loss, Product, ProductWriter, Stage, StageReport, Status, Stream};
+use crate::product::{self, Draft, Loss, Product, ProductWriter, Stage, Status, Stream};
 use crate::registry::Registry;
 use crate::replay;
 use crate::table::{Batch, Chunk, TableSpec};
@@ -360,7 +361,7 @@ fn draft(
     chain: &Chain,
     feed: &FeedKind,
     summary: Summary,
-    reports: Vec<(String, Value)>,
+    reports: Vec<Report>,
     covered: &Covered,
 ) -> Result<Draft, EngineError> {
     let day = DateTime::from_timestamp_nanos(covered.first_ns).date_naive();
@@ -420,12 +421,7 @@ fn draft(
         losses,
         counts: summary.counts,
         notes,
-        reports: summary
-            .report
-            .into_iter()
-            .chain(reports)
-            .map(|(stage, report)| StageReport { stage, report })
-            .collect(),
+        reports: summary.report.into_iter().chain(reports).collect(),
         created: options.created,
     })
 }

@@ -1,23 +1,6 @@
 //! Tables: what flows from a feed (files or a source plugin) through the stages. See ARCHITECTURE.md.
 
-use std::collections::BTreeMap;
-
-/// What a column is: its name, unit, frame, rate and free attributes.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Column {
-    /// Table that the column belongs to.
-    pub table: String,
-    /// Name, unique in its table.
-    pub name: String,
-    /// SI unit, `m s-2`; `1` for a number, empty for flags.
-    pub unit: String,
-    /// Frame, `ORF_1`; empty where there is none.
-    pub frame: String,
-    /// Rate of a uniform table, Hz; 0 for an irregular one.
-    pub rate_hz: f64,
-    /// Free attributes, `kind = channel` among them.
-    pub attributes: BTreeMap<String, String>,
-}
+pub use dragfree_schema::Column;
 
 /// A table as linked: its columns after the times.
 #[derive(Clone, Debug, PartialEq)]

@@ -53,9 +53,10 @@ impl Stage for Clumsy {
         Ok(())
     }
 
-    fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
+    fn report(&mut self, earlier: &[Report]) -> Result<Report, PluginError> {
         self.stumble("report");
-        Ok(Report { counts: [("rows".to_owned(), self.rows)].into(), ..Report::default() })
+        let counts = [("rows".to_owned(), self.rows), ("reports".to_owned(), earlier.len() as u64)];
+        Ok(Report { counts: counts.into(), ..Report::default() })
     }
 
     fn save(&self) -> Result<Vec<u8>, PluginError> {

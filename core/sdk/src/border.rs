@@ -4,6 +4,7 @@
 use arrow_array::{Array, ArrayRef, Float64Array, Int64Array, StructArray};
 use arrow_data::ffi::FFI_ArrowArray;
 use arrow_schema::{DataType, Field, Fields};
+use dragfree_schema::{Column, NOISE_ATTRIBUTE, NoiseProcess, Report};
 use serde::Serialize;
 use std::any::Any;
 use std::cell::RefCell;
@@ -14,10 +15,9 @@ use std::sync::{Arc, Once, OnceLock};
 
 use crate::batch::{InputTable, Inputs, Outputs};
 use crate::error::PluginError;
-use crate::link::{Available, Column, Link, WantParts, Written, pointer};
+use crate::link::{Available, Link, WantParts, Written, pointer};
 use crate::manifest::Manifest;
 use crate::node::{Effect, EffectNode, Node, Source, SourceNode, Stage, StageNode};
-use crate::report::Report;
 use crate::setup::Setup;
 
 // The Arrow crates' array and the header's are the same C struct.
@@ -329,11 +329,16 @@ pub(crate) fn ask_for_column(
     status_to_result(status, &format!("column {} was refused", want.name.to_string_lossy()))
 }
 
-/// `dragfree_link_v1.write`
-pub(crate) fn announce_column(raw: &abi::LinkV1, column: &Column) -> Result<(), PluginError> {
+/// `dragfree_link_v1.write`, with the noise processes that are declared beside the column.
+pub(crate) fn announce_column(raw: &abi::LinkV1, column: &Column, noise: &[NoiseProcess]) -> Result<(), PluginError> {
     let (table, name) = (CString::new(column.table.as_str())?, CString::new(column.name.as_str())?);
     let (unit, frame) = (CString::new(column.unit.as_str())?, CString::new(column.frame.as_str())?);
-    let attributes = CString::new(serde_json::to_string(&column.attributes)?)?;
+    let texts = column.attributes.iter().map(|(key, text)| (key.clone(), text.clone().into()));
+    let mut attributes: serde_json::Map<String, serde_json::Value> = texts.collect();
+    if !noise.is_empty() {
+        attributes.insert(NOISE_ATTRIBUTE.to_owned(), serde_json::to_value(noise)?);
+    }
+    let attributes = CString::new(serde_json::to_string(&attributes)?)?;
     let c = abi::ColumnV1 {
         table: table.as_ptr(),
         name: name.as_ptr(),

@@ -57,25 +57,25 @@ mod error;
 mod link;
 mod manifest;
 mod node;
-mod report;
 mod setup;
 
 pub use batch::{Inputs, Outputs, Progress};
-pub use error::PluginError;
-pub use link::{
-    Available, Coefficient, Colour, Column, Constraint, EffectLink, In, Link, Out, Response, Shape, Table, Transient,
-    Variant, Want,
+pub use dragfree_schema::{
+    Attachment, Coefficient, Colour, Column, Constraint, Covariance, Estimate, NoiseProcess, NoiseResponse, NoiseShape,
+    NoiseTerm, Report, Response, Shape, Transient, Variant,
 };
+pub use error::PluginError;
+pub use link::{Available, EffectLink, In, Link, Out, Table, Want};
 pub use manifest::{Manifest, Parameter};
 pub use node::{Effect, Source, Stage};
-pub use report::{Attachment, Covariance, Estimate, Report};
 pub use setup::{Level, Log, Setup};
 
 /// Everything a plugin needs.
 pub mod prelude {
     pub use crate::{
         Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Effect, EffectLink, Estimate, In,
-        Inputs, Level, Link, Log, Manifest, Out, Outputs, Parameter, PluginError, Progress, Report, Response, Setup,
-        Shape, Source, Stage, Table, Transient, Variant, Want, export_plugin,
+        Inputs, Level, Link, Log, Manifest, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm, Out, Outputs,
+        Parameter, PluginError, Progress, Report, Response, Setup, Shape, Source, Stage, Table, Transient, Variant,
+        Want, export_plugin,
     };
 }

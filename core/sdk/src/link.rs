@@ -1,206 +1,11 @@
 //! Columns, coefficients and constraints: what a plugin sees, asks for and makes before a byte of data is read.
 
 use dragfree_abi as abi;
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
-use std::collections::BTreeMap;
+use dragfree_schema::{Coefficient, Column, Constraint, Model, NoiseProcess, Response};
 use std::ffi::CString;
 use std::ptr;
 
 use crate::error::PluginError;
-
-/// A column: what it is called and what it means.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub struct Column {
-    /// Table that it belongs to.
-    pub table: String,
-    /// Name, unique in its table.
-    pub name: String,
-    /// SI unit.
-    pub unit: String,
-    /// Frame, empty for none.
-    pub frame: String,
-    /// Rate of a uniform table, Hz; 0 for an irregular one.
-    pub rate_hz: f64,
-    /// Free attributes.
-    pub attributes: BTreeMap<String, String>,
-}
-
-impl Column {
-    /// An attribute, empty where there is none.
-    #[must_use]
-    pub fn attribute(&self, key: &str) -> &str {
-        self.attributes.get(key).map_or("", String::as_str)
-    }
-}
-
-/// A coefficient of an effect.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
-pub struct Coefficient {
-    /// `com-offset.tm1.x`
-    pub name: String,
-    /// Id of the effect; the host fills it in.
-    pub effect: String,
-    /// Instance of the effect; the host fills it in.
-    pub instance: String,
-    /// SI unit.
-    pub unit: String,
-    /// Frame.
-    pub frame: String,
-    /// Lower end of the physical range.
-    #[serde(serialize_with = "finite_or_null", deserialize_with = "number_or_minus_infinity")]
-    pub lower: f64,
-    /// Upper end of the physical range.
-    #[serde(serialize_with = "finite_or_null", deserialize_with = "number_or_infinity")]
-    pub upper: f64,
-    /// Value before any data.
-    pub initial: f64,
-    /// Standard deviation before any data; infinite for none.
-    #[serde(serialize_with = "finite_or_null", deserialize_with = "number_or_infinity")]
-    pub prior_sigma: f64,
-    /// False where the model fixes the coefficient at `initial`; the host fills it in.
-    pub estimate: bool,
-    /// True where the effect is no part of the model, and only asks to be; the host fills it in.
-    pub candidate: bool,
-    /// How it acts, besides by the columns of [`EffectLink::regressor`].
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub responses: Vec<Response>,
-    /// Values of the shape parameters behind the responses, a lag or a resonance.
-    #[serde(skip_serializing_if = "Shape::is_empty")]
-    pub shape: Shape,
-    /// What else it may be; declared in place of `responses` by a [`crate::Setup::candidate`].
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub variants: Vec<Variant>,
-    /// What it may do for a short while, at a time that is to be found; declared by a [`crate::Setup::candidate`].
-    #[serde(skip_serializing_if = "Vec::is_empty")]
-    pub transients: Vec<Transient>,
-    /// A process of the mission's noise whose amplitude the coefficient multiplies, 1 for as the mission has it; such a coefficient
-    /// has no responses.
-    #[serde(skip_serializing_if = "String::is_empty")]
-    pub noise: String,
-    /// A process of the mission's noise that it colours.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub colours: Option<Colour>,
-}
-
-/// What a coefficient c does to a process of the mission's noise that drives what it stands for as commands do: `|1 + cH|²` times its
-/// power.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Colour {
-    /// The process, `thruster_force:sc.x`.
-    pub process: String,
-    /// `H(s)`, s in s⁻¹: coefficients of the numerator's polynomial, the constant first.
-    pub numerator: Vec<f64>,
-    /// The same of its denominator.
-    pub denominator: Vec<f64>,
-}
-
-/// Shape parameters by name: numbers, or names of columns.
-pub type Shape = BTreeMap<String, serde_json::Value>;
-
-/// How one channel answers to a coefficient: `factor` times a series, times the value of another coefficient where `times` names
-/// one.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Response {
-    /// The channel, `tm1.accel.x`.
-    pub channel: String,
-    /// Table of the series.
-    pub table: String,
-    /// Column of the series, a mean over `[t_k, t_{k+1})`.
-    pub series: String,
-    /// Unit of the channel per unit of the series and of the coefficients.
-    pub factor: f64,
-    /// The other coefficient of a product, `com-offset.tm1.x`.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub times: Option<String>,
-}
-
-/// One of several forms that a cause may have.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Variant {
-    /// Values of the shape parameters; as parameters of the effect they give these responses.
-    pub shape: Shape,
-    /// How it acts.
-    pub responses: Vec<Response>,
-    /// Unit of the coefficient, where it is not that of the others.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub unit: Option<String>,
-    /// Its physical range, lower and upper end, where it is not that of the others.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub range: Option<[f64; 2]>,
-    /// A process of the mission's noise that it colours.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub colours: Option<Colour>,
-}
-
-/// Something short that begins at an unknown time: a hit, a glitch.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Transient {
-    /// Values of the shape parameters, all but `at_ns`, which the host finds: Unix ns of the sample in which it begins.
-    pub shape: Shape,
-    /// Its course, one mean per sample from the one in which it begins.
-    pub kernel: Vec<f64>,
-    /// Channels with the factor with which the course acts on each: unit of the channel per unit of kernel and coefficient.
-    pub channels: Vec<(String, f64)>,
-}
-
-impl Default for Coefficient {
-    fn default() -> Self {
-        Self {
-            name: String::new(),
-            effect: String::new(),
-            instance: String::new(),
-            unit: "1".to_owned(),
-            frame: String::new(),
-            lower: f64::NEG_INFINITY,
-            upper: f64::INFINITY,
-            initial: 0.0,
-            prior_sigma: f64::INFINITY,
-            estimate: true,
-            candidate: false,
-            responses: Vec::new(),
-            shape: Shape::new(),
-            variants: Vec::new(),
-            transients: Vec::new(),
-            noise: String::new(),
-            colours: None,
-        }
-    }
-}
-
-/// A linear constraint on coefficients, `lower ≤ Σ weight · coefficient ≤ upper`.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Constraint {
-    /// Name; constraints of one name from several instances add their terms.
-    pub name: String,
-    /// `survey`, a measurement with a tolerance, or `range`, a physical bound.
-    pub kind: String,
-    /// Coefficients with their weights.
-    pub terms: Vec<(String, f64)>,
-    /// Lower bound.
-    #[serde(serialize_with = "finite_or_null", deserialize_with = "number_or_minus_infinity")]
-    pub lower: f64,
-    /// Upper bound.
-    #[serde(serialize_with = "finite_or_null", deserialize_with = "number_or_infinity")]
-    pub upper: f64,
-    /// SI unit of the bounds.
-    pub unit: String,
-    /// Number of instances that must contribute; with fewer the host drops the constraint.
-    pub parts: u32,
-}
-
-// JSON has no infinity: an open end of a range crosses the border as null.
-fn finite_or_null<S: Serializer>(value: &f64, serializer: S) -> Result<S::Ok, S::Error> {
-    value.is_finite().then_some(*value).serialize(serializer)
-}
-
-fn number_or_infinity<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
-    Ok(Option::deserialize(deserializer)?.unwrap_or(f64::INFINITY))
-}
-
-fn number_or_minus_infinity<'de, D: Deserializer<'de>>(deserializer: D) -> Result<f64, D::Error> {
-    Ok(Option::deserialize(deserializer)?.unwrap_or(f64::NEG_INFINITY))
-}
 
 /// What exists at this point of the chain.
 #[derive(Clone, Debug, Default)]
@@ -211,20 +16,14 @@ pub struct Available {
     pub coefficients: Vec<Coefficient>,
     /// Every constraint on them.
     pub constraints: Vec<Constraint>,
-}
-
-#[derive(Deserialize)]
-struct ModelJson {
-    #[serde(default)]
-    coefficients: Vec<Coefficient>,
-    #[serde(default)]
-    constraints: Vec<Constraint>,
+    /// Every noise process that stages before this point declared.
+    pub noise: Vec<NoiseProcess>,
 }
 
 impl Available {
     pub(crate) fn parse(columns: Vec<Column>, model_json: &str) -> Result<Self, PluginError> {
-        let model: ModelJson = serde_json::from_str(model_json)?;
-        Ok(Self { columns, coefficients: model.coefficients, constraints: model.constraints })
+        let Model { coefficients, constraints, noise } = serde_json::from_str(model_json)?;
+        Ok(Self { columns, coefficients, constraints, noise })
     }
 
     /// A column by table and name.
@@ -427,6 +226,23 @@ impl<'a> Link<'a> {
         frame: &str,
         attributes: &[(&str, &str)],
     ) -> Result<Out, PluginError> {
+        self.write_noisy(table, name, unit, frame, attributes, &[])
+    }
+
+    /// A column with attributes, and noise processes that are declared with it. A process may enter any channel of this stage or
+    /// of one before it; which column it is declared with does not matter.
+    ///
+    /// # Errors
+    /// The host refuses it: the name is taken, a process of this name exists, or one of its numbers is not finite.
+    pub fn write_noisy(
+        &mut self,
+        table: Table,
+        name: &str,
+        unit: &str,
+        frame: &str,
+        attributes: &[(&str, &str)],
+        noise: &[NoiseProcess],
+    ) -> Result<Out, PluginError> {
         let written = &mut self.written[table.index];
         let column = Column {
             table: written.name.clone(),
@@ -436,7 +252,7 @@ impl<'a> Link<'a> {
             rate_hz: written.rate_hz,
             attributes: attributes.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect(),
         };
-        crate::border::announce_column(self.raw, &column)?;
+        crate::border::announce_column(self.raw, &column, noise)?;
         written.columns.push(column);
         Ok(Out { table: table.index, column: written.columns.len() - 1 })
     }

@@ -1,7 +1,8 @@
-//! What a plugin is and which parameters it takes, declared once; validation, `plugins inspect` and the guide's
-//! tables derive from it.
+//! What a plugin is and which parameters it takes, as a constant; [`dragfree_schema::Manifest`] is the form that crosses the
+//! border. Validation, `plugins inspect` and the guide's tables derive from it.
 
-use serde_json::{Value, json};
+use dragfree_schema::ParameterType;
+use serde_json::Value;
 
 /// What a plugin is.
 #[derive(Clone, Copy, Debug)]
@@ -98,40 +99,61 @@ impl Parameter {
         Self { name, unit: "", help, kind: Kind::TextList { default } }
     }
 
-    fn to_json(self) -> Value {
-        let mut object = json!({ "name": self.name, "unit": self.unit, "help": self.help });
-        let fields = match self.kind {
+    fn owned(self) -> dragfree_schema::Parameter {
+        let mut owned = dragfree_schema::Parameter {
+            name: self.name.to_owned(),
+            kind: ParameterType::F64,
+            unit: self.unit.to_owned(),
+            default: Value::Null,
+            minimum: None,
+            maximum: None,
+            choices: Vec::new(),
+            help: self.help.to_owned(),
+        };
+        (owned.kind, owned.default) = match self.kind {
             Kind::F64 { default, minimum, maximum } => {
-                json!({ "type": "f64", "default": default, "minimum": minimum, "maximum": maximum })
+                (owned.minimum, owned.maximum) = (Some(minimum), Some(maximum));
+                (ParameterType::F64, default.into())
             }
             Kind::I64 { default, minimum, maximum } => {
-                json!({ "type": "i64", "default": default, "minimum": minimum, "maximum": maximum })
+                (owned.minimum, owned.maximum) = (Some(minimum as f64), Some(maximum as f64));
+                (ParameterType::I64, default.into())
             }
-            Kind::Bool { default } => json!({ "type": "bool", "default": default }),
-            Kind::Text { default, choices } => json!({ "type": "text", "default": default, "choices": choices }),
-            Kind::F64List { default } => json!({ "type": "f64_list", "default": default }),
-            Kind::TextList { default } => json!({ "type": "text_list", "default": default }),
+            Kind::Bool { default } => (ParameterType::Bool, default.into()),
+            Kind::Text { default, choices } => {
+                owned.choices = texts(choices);
+                (ParameterType::Text, default.into())
+            }
+            Kind::F64List { default } => (ParameterType::F64List, default.into()),
+            Kind::TextList { default } => (ParameterType::TextList, default.into()),
         };
-        if let (Value::Object(object), Value::Object(fields)) = (&mut object, fields) {
-            object.extend(fields);
-        }
-        object
+        owned
     }
 }
 
+fn texts(list: &[&str]) -> Vec<String> {
+    list.iter().map(|text| (*text).to_owned()).collect()
+}
+
 impl Manifest {
-    /// The manifest as the border carries it.
+    /// The manifest as it crosses the border.
+    #[must_use]
+    pub fn owned(&self) -> dragfree_schema::Manifest {
+        dragfree_schema::Manifest {
+            id: self.id.to_owned(),
+            version: self.version.to_owned(),
+            licence: self.licence.to_owned(),
+            description: self.description.to_owned(),
+            instances: texts(self.instances),
+            needs: texts(self.needs),
+            parameters: self.parameters.iter().map(|p| p.owned()).collect(),
+        }
+    }
+
+    /// The same as JSON.
     #[must_use]
     pub fn to_json(&self) -> String {
-        json!({
-            "id": self.id,
-            "version": self.version,
-            "licence": self.licence,
-            "description": self.description,
-            "instances": self.instances,
-            "needs": self.needs,
-            "parameters": self.parameters.iter().map(|p| p.to_json()).collect::<Vec<_>>(),
-        })
-        .to_string()
+        // A constant of texts, finite numbers and lists of them is always JSON.
+        serde_json::to_string(&self.owned()).unwrap_or_default()
     }
 }

@@ -1,10 +1,11 @@
 //! The three traits a plugin implements, and the one shape in which they cross the border.
 
+use dragfree_schema::Report;
+
 use crate::batch::{Inputs, Outputs, Progress};
 use crate::error::PluginError;
 use crate::link::{Available, EffectLink, Link};
 use crate::manifest::Manifest;
-use crate::report::Report;
 use crate::setup::Setup;
 
 /// A stage of the chain: columns in, columns out, a report at the end.

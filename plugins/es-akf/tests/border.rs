@@ -122,7 +122,7 @@ fn run(mission: &Value, test_masses: &[u64], needs: &[&str], cut: usize) -> (Val
             linked.reads.iter().map(|reads| Rows { time_ns: &times[part.clone()], columns: table(reads) }).collect();
         made.extend(stage.process(&input, i64::MAX).expect("processed").expect("nothing is discarded"));
     }
-    (stage.report("[]").expect("a report"), made)
+    (serde_json::to_value(stage.report("[]").expect("a report")).expect("JSON"), made)
 }
 
 fn column_of<'a>(read: &ReadColumn, rows: &'a [Vec<f64>], part: &std::ops::Range<usize>) -> &'a [f64] {

@@ -82,7 +82,7 @@ fn rows_and_report_do_not_depend_on_batches_nor_on_a_restored_state() {
         }
         append(&mut all, stage.flush().unwrap().remove(0));
         let bits: Vec<Vec<u64>> = all.columns.iter().map(|c| c.iter().map(|v| v.to_bits()).collect()).collect();
-        (all.time_ns, bits, stage.report("[]").unwrap())
+        (all.time_ns, bits, serde_json::to_value(stage.report("[]").unwrap()).unwrap())
     };
     let whole = run(65_536, false);
     assert!(whole == run(1, false) && whole == run(777, true));

@@ -4,7 +4,7 @@ use super::{Done, products};
 use crate::args::{Global, Model as Command, ModelAdd, ModelFix};
 use crate::failure::Failure;
 use crate::text::{self, Paint, columns, labelled};
-use dragfree_engine::border::{Kind, Manifest};
+use dragfree_engine::border::{Kind, Manifest, ParameterType};
 use dragfree_engine::config::{EffectEntry, Model, Prior, resolve_parameters};
 use dragfree_engine::revisions::{self, Change, Committed, Edit, Log, Logged, Place, What};
 use serde_json::{Value, json};
@@ -120,16 +120,16 @@ fn add(command: &ModelAdd, global: &Global, paint: Paint) -> Result<Done, Failur
 
 /// A parameter's value as the plugin declares it: texts need no quotes, lists no brackets.
 fn parameter(manifest: &Manifest, name: &str, value: &str) -> Result<toml::Value, Failure> {
-    let declared = manifest.parameters.iter().find(|p| p.name == name).map_or("", |p| p.kind.as_str());
+    let declared = manifest.parameters.iter().find(|p| p.name == name).map(|p| p.kind);
     let literal = |text: &str| text.parse::<toml::Value>().ok();
     let bracketed = || literal(value).filter(toml::Value::is_array);
     let parsed = match declared {
-        "text" => literal(value).filter(toml::Value::is_str).or_else(|| Some(value.into())),
-        "text_list" => {
+        Some(ParameterType::Text) => literal(value).filter(toml::Value::is_str).or_else(|| Some(value.into())),
+        Some(ParameterType::TextList) => {
             let texts = value.split(',').map(|v| toml::Value::from(v.trim()));
             bracketed().or_else(|| Some(toml::Value::Array(texts.collect())))
         }
-        "f64_list" => bracketed().or_else(|| literal(&format!("[{value}]"))),
+        Some(ParameterType::F64List) => bracketed().or_else(|| literal(&format!("[{value}]"))),
         _ => literal(value),
     };
     parsed

@@ -2,10 +2,13 @@
 
 use arrow_schema::{DataType, Fields, ffi::FFI_ArrowSchema};
 use dragfree_abi as abi;
+use dragfree_schema::{Coefficient, Constraint, NOISE_ATTRIBUTE, NoiseProcess, Report};
+use serde::de::DeserializeOwned;
+use std::collections::BTreeMap;
 use std::ffi::{CStr, CString, c_char, c_void};
 
 use super::library::{Kind, Library, PluginInfo};
-use super::{BorderError, arrow, floats};
+use super::{BorderError, arrow, floats, read};
 use crate::table::{Batch, Column, TableSpec};
 
 /// What an instance is made from: the JSON object that `dragfree_config_v1` describes.
@@ -20,7 +23,7 @@ pub struct Config {
 pub struct LinkRequest<'a> {
     /// Every column made so far.
     pub available: &'a [Column],
-    /// `{"coefficients":[…],"constraints":[…]}`
+    /// What the plugins before it declared: a [`dragfree_schema::Model`].
     pub model_json: &'a str,
 }
 
@@ -38,10 +41,12 @@ pub struct Linked {
     pub reads: Vec<Vec<ReadColumn>>,
     /// Tables written, in order.
     pub writes: Vec<TableSpec>,
-    /// Coefficients as announced, JSON.
-    pub coefficients: Vec<serde_json::Value>,
-    /// Constraints as announced, JSON.
-    pub constraints: Vec<serde_json::Value>,
+    /// Coefficients that it announced.
+    pub coefficients: Vec<Coefficient>,
+    /// Constraints that it announced.
+    pub constraints: Vec<Constraint>,
+    /// Noise processes that it declared.
+    pub noise: Vec<NoiseProcess>,
 }
 
 /// Rows of one input table.
@@ -283,6 +288,24 @@ impl LinkContext<'_> {
     }
 }
 
+/// The declared noise makes sense, and enters channels that exist.
+fn check_noise(linked: &Linked, available: &[Column]) -> Result<(), String> {
+    for process in &linked.noise {
+        process.check().map_err(|what| format!("declares the noise process `{}`: {what}", process.name))?;
+        let known = |channel: &str| {
+            let written = linked.writes.iter().flat_map(|t| &t.columns);
+            available.iter().chain(written).any(|c| c.name == channel && c.attribute("kind") == "channel")
+        };
+        if let Some((channel, _)) = process.enters.iter().find(|(channel, _)| !known(channel)) {
+            return Err(format!(
+                "declares that the noise process `{}` enters `{channel}`, which is no channel; write it with the attribute kind = channel",
+                process.name
+            ));
+        }
+    }
+    Ok(())
+}
+
 /// A coarse measure of how far two names are apart: what is left outside the common start and end.
 fn distance(a: &str, b: &str) -> usize {
     let start = a.bytes().zip(b.bytes()).take_while(|(x, y)| x == y).count();
@@ -341,11 +364,10 @@ unsafe extern "C" fn link_write(context: *mut c_void, column: *const abi::Column
             return abi::ERROR;
         };
         let text = |t| optional(t).unwrap_or_default();
-        let attributes = optional(c.attributes)
-            .filter(|a| !a.is_empty())
-            .map_or(Ok(Default::default()), |a| serde_json::from_str(&a));
-        let result =
-            attributes.map_err(|e| format!("attributes of column {}: {e}", text(c.name))).and_then(|attributes| {
+        let result = attributes(&text(c.attributes))
+            .map_err(|what| format!("attributes of column {}: {what}", text(c.name)))
+            .and_then(|(attributes, noise)| {
+                context.linked.noise.extend(noise);
                 context.write(Column {
                     table: text(c.table),
                     name: text(c.name),
@@ -359,34 +381,50 @@ unsafe extern "C" fn link_write(context: *mut c_void, column: *const abi::Column
     }
 }
 
+/// The attributes of a written column, and the noise processes among them.
+fn attributes(json: &str) -> Result<(BTreeMap<String, String>, Vec<NoiseProcess>), String> {
+    if json.is_empty() {
+        return Ok((BTreeMap::new(), Vec::new()));
+    }
+    let mut all: serde_json::Map<String, serde_json::Value> = serde_json::from_str(json).map_err(|e| e.to_string())?;
+    let noise = all.remove(NOISE_ATTRIBUTE).map_or(Ok(Vec::new()), read::declaration);
+    let noise = noise.map_err(|what| format!("{NOISE_ATTRIBUTE}: {what}"))?;
+    Ok((read::declaration(all.into())?, noise))
+}
+
 /// # Safety
 /// As the header promises for `coefficient` and `constraint`.
-unsafe fn link_json(context: *mut c_void, json: *const c_char, coefficient: bool) -> abi::Status {
+unsafe fn link_json<T: DeserializeOwned>(
+    context: *mut c_void,
+    json: *const c_char,
+    what: &str,
+    list: impl FnOnce(&mut Linked) -> &mut Vec<T>,
+) -> abi::Status {
     // SAFETY: by the caller.
     unsafe {
         let Some(context) = context.cast::<LinkContext<'_>>().as_mut() else { return abi::ERROR };
         if context.kind != Kind::Effect {
-            return context.refuse("announces a coefficient or a constraint, but is no effect".to_owned());
+            return context.refuse(format!("announces a {what}, but is no effect"));
         }
-        match serde_json::from_str(&optional(json).unwrap_or_default()) {
-            Ok(value) => {
-                let list = if coefficient { &mut context.linked.coefficients } else { &mut context.linked.constraints };
-                list.push(value);
+        let document = serde_json::from_str(&optional(json).unwrap_or_default()).map_err(|e| e.to_string());
+        match document.and_then(read::declaration) {
+            Ok(declared) => {
+                list(&mut context.linked).push(declared);
                 abi::OK
             }
-            Err(e) => context.refuse(format!("a coefficient or constraint that is no JSON: {e}")),
+            Err(why) => context.refuse(format!("announces a {what} that cannot be read: {why}")),
         }
     }
 }
 
 unsafe extern "C" fn link_coefficient(context: *mut c_void, json: *const c_char) -> abi::Status {
     // SAFETY: as the header promises.
-    unsafe { link_json(context, json, true) }
+    unsafe { link_json(context, json, "coefficient", |linked| &mut linked.coefficients) }
 }
 
 unsafe extern "C" fn link_constraint(context: *mut c_void, json: *const c_char) -> abi::Status {
     // SAFETY: as the header promises.
-    unsafe { link_json(context, json, false) }
+    unsafe { link_json(context, json, "constraint", |linked| &mut linked.constraints) }
 }
 
 unsafe extern "C" fn collect(context: *mut c_void, bytes: *const u8, length: usize) -> abi::Status {
@@ -514,6 +552,8 @@ impl Instance {
         }
         result?;
         let linked = context.linked;
+        check_noise(&linked, request.available)
+            .map_err(|sentence| BorderError::Link { plugin: self.name.clone(), sentence })?;
         for columns in &linked.reads {
             let columns: Vec<Column> = columns.iter().map(|c| request.available[c.available].clone()).collect();
             let schema = FFI_ArrowSchema::try_from(DataType::Struct(arrow::fields_of(&columns)))
@@ -594,17 +634,18 @@ impl Instance {
         batches.ok_or_else(|| self.rule("flush", "nothing to discard here".to_owned()))
     }
 
-    /// The report as JSON.
+    /// The report; keys that it does not have are notes in it.
     ///
     /// # Errors
-    /// The plugin failed or gave no JSON object.
-    pub fn report(&mut self, earlier_json: &str) -> Result<serde_json::Value, BorderError> {
-        let Some(report) = self.node.report else { return Ok(serde_json::json!({})) };
+    /// The plugin failed, or gave what cannot be understood: the sentence names the key.
+    pub fn report(&mut self, earlier_json: &str) -> Result<Report, BorderError> {
+        let Some(report) = self.node.report else { return Ok(Report::default()) };
         let earlier = CString::new(earlier_json.replace('\0', "?")).unwrap_or_default();
         // SAFETY: the string and the writer live during the call.
         let bytes =
             self.bytes_from("report", |node, writer, error| unsafe { report(node, earlier.as_ptr(), writer, error) })?;
-        serde_json::from_slice(&bytes).map_err(|e| self.rule("report", format!("a report that is no JSON: {e}")))
+        let report = read::report(&String::from_utf8_lossy(&bytes)).map_err(|what| self.rule("report", what))?;
+        Ok(Report { plugin: self.name.clone(), ..report })
     }
 
     /// The whole state.

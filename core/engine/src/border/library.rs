@@ -1,6 +1,7 @@
 //! Plugin libraries: found, checked, opened, asked what they hold.
 
 use dragfree_abi as abi;
+use dragfree_schema::Manifest;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::ffi::{CStr, CString};
@@ -42,55 +43,6 @@ impl std::fmt::Display for Kind {
             Self::Effect => "effect",
         })
     }
-}
-
-/// A plugin's manifest.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Manifest {
-    /// Id by which pipelines and models name it.
-    pub id: String,
-    /// Version of the plugin.
-    pub version: String,
-    /// SPDX expression.
-    pub licence: String,
-    /// One sentence.
-    pub description: String,
-    /// Effects: where it can act.
-    #[serde(default)]
-    pub instances: Vec<String>,
-    /// Effects: columns that stages before it make on demand.
-    #[serde(default)]
-    pub needs: Vec<String>,
-    /// Parameters.
-    #[serde(default)]
-    pub parameters: Vec<Parameter>,
-}
-
-/// A parameter as declared.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Parameter {
-    /// Name.
-    pub name: String,
-    /// `f64`, `i64`, `bool`, `text`, `f64_list` or `text_list`.
-    #[serde(rename = "type")]
-    pub kind: String,
-    /// SI unit.
-    #[serde(default)]
-    pub unit: String,
-    /// Value when nothing is said.
-    pub default: serde_json::Value,
-    /// Smallest value.
-    #[serde(default)]
-    pub minimum: Option<f64>,
-    /// Largest value.
-    #[serde(default)]
-    pub maximum: Option<f64>,
-    /// Texts that are allowed; empty for any.
-    #[serde(default)]
-    pub choices: Vec<String>,
-    /// One sentence.
-    #[serde(default)]
-    pub help: String,
 }
 
 /// One plugin of a library.

@@ -7,10 +7,12 @@ mod arrow;
 mod floats;
 mod instance;
 mod library;
+mod read;
 
+pub use dragfree_schema::{Manifest, Parameter, ParameterType};
 pub use instance::{Config, Instance, LinkRequest, Linked, ReadColumn, Rows, SourceStep};
 pub(crate) use library::hex;
-pub use library::{Kind, Library, Manifest, Parameter, PluginInfo};
+pub use library::{Kind, Library, PluginInfo};
 
 use std::path::PathBuf;
 

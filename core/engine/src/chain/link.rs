@@ -1,84 +1,14 @@
 //! Linking: every plugin of a pipeline made, asked for its columns, and routed, before a byte of data is read.
 
-use serde::{Deserialize, Serialize};
+use dragfree_schema::{Coefficient, Constraint, NoiseProcess};
 use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 
 use super::{Carry, Chain, ChainError, ChainNode, Queue, Reader, Route};
-use crate::border::{Config, Instance, Kind, LinkRequest, Linked, hex};
+use crate::border::{BorderError, Config, Instance, Kind, LinkRequest, Linked, hex};
 use crate::config::{EffectEntry, Mission, Model, Node, Pipeline, resolve_parameters};
 use crate::registry::{Found, Registry};
 use crate::table::{Column, TableSpec};
-
-/// A coefficient of the model, as it crosses the border; an open end of a range is null.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Coefficient {
-    /// `com-offset.tm1.x`
-    pub name: String,
-    /// Id of the effect.
-    #[serde(default)]
-    pub effect: String,
-    /// Instance of the effect.
-    #[serde(default)]
-    pub instance: String,
-    /// SI unit.
-    pub unit: String,
-    /// Frame.
-    #[serde(default)]
-    pub frame: String,
-    /// Lower end of the range.
-    #[serde(default)]
-    pub lower: Option<f64>,
-    /// Upper end of the range.
-    #[serde(default)]
-    pub upper: Option<f64>,
-    /// Value before any data.
-    #[serde(default)]
-    pub initial: f64,
-    /// Standard deviation before any data.
-    #[serde(default)]
-    pub prior_sigma: Option<f64>,
-    /// False where the model fixes it.
-    #[serde(default = "yes")]
-    pub estimate: bool,
-    /// True where the effect is no part of the model, and only asks to be.
-    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub candidate: bool,
-    /// How the channels answer to it, as the effect declared it: responses, shape, variants, noise.
-    #[serde(flatten)]
-    pub action: Map<String, Value>,
-}
-
-fn yes() -> bool {
-    true
-}
-
-/// A linear constraint on coefficients.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Constraint {
-    /// Name.
-    pub name: String,
-    /// `survey` or `range`.
-    pub kind: String,
-    /// Coefficients with weights.
-    pub terms: Vec<(String, f64)>,
-    /// Lower bound.
-    #[serde(default)]
-    pub lower: Option<f64>,
-    /// Upper bound.
-    #[serde(default)]
-    pub upper: Option<f64>,
-    /// SI unit.
-    #[serde(default)]
-    pub unit: String,
-    /// Number of instances that must contribute.
-    #[serde(default = "one")]
-    pub parts: u32,
-}
-
-fn one() -> u32 {
-    1
-}
 
 /// Links a pipeline over the tables of a feed.
 ///
@@ -103,6 +33,7 @@ pub fn build(
             nodes: Vec::new(),
             coefficients: Vec::new(),
             constraints: Vec::new(),
+            noise: Vec::new(),
             not_tried: Vec::new(),
             feed_tables: feed_tables.to_vec(),
             feed_routes: vec![Route::default(); feed_tables.len()],
@@ -155,7 +86,7 @@ impl Builder<'_> {
     fn model_json(&self, for_candidate: bool) -> String {
         // A candidate need not know of others, whose forms may be ten thousands.
         let told: Vec<_> = self.chain.coefficients.iter().filter(|c| !(for_candidate && c.candidate)).collect();
-        json!({ "coefficients": told, "constraints": self.chain.constraints }).to_string()
+        json!({ "coefficients": told, "constraints": self.chain.constraints, "noise": self.chain.noise }).to_string()
     }
 
     fn stage(&mut self, id: &str, parameters: &toml::Table, pipeline: &Pipeline) -> Result<(), ChainError> {
@@ -175,9 +106,7 @@ impl Builder<'_> {
             let parameters = resolve_parameters(&file, &found.info.manifest, &entry.parameters)?;
             let linked = self.add(&found, parameters, &entry.instance, false)?;
             self.take_coefficients(entry, linked.coefficients, false)?;
-            for value in linked.constraints {
-                let constraint: Constraint = serde_json::from_value(value)
-                    .map_err(|e| self.model_error(format!("effect {}: a constraint: {e}", entry.id)))?;
+            for constraint in linked.constraints {
                 self.merge(&mut constraints, constraint)?;
             }
         }
@@ -221,13 +150,11 @@ impl Builder<'_> {
     fn take_coefficients(
         &mut self,
         entry: &EffectEntry,
-        announced: Vec<Value>,
+        announced: Vec<Coefficient>,
         candidate: bool,
     ) -> Result<(), ChainError> {
         let mut unused: Vec<&String> = entry.prior.keys().collect();
-        for value in announced {
-            let mut c: Coefficient = serde_json::from_value(value)
-                .map_err(|e| self.model_error(format!("effect {}: a coefficient: {e}", entry.id)))?;
+        for mut c in announced {
             if self.chain.coefficients.iter().any(|other| other.name == c.name) {
                 return Err(self.model_error(format!("coefficient {} exists twice", c.name)));
             }
@@ -239,15 +166,13 @@ impl Builder<'_> {
             if let Some(prior) = entry.prior.get(short) {
                 unused.retain(|key| *key != short);
                 c.initial = prior.value.unwrap_or(c.initial);
-                c.prior_sigma = prior.sigma.or(c.prior_sigma);
-                c.lower = prior.lower.or(c.lower);
-                c.upper = prior.upper.or(c.upper);
-                if let (Some(lower), Some(upper)) = (c.lower, c.upper)
-                    && lower >= upper
-                {
+                c.prior_sigma = prior.sigma.unwrap_or(c.prior_sigma);
+                c.lower = prior.lower.unwrap_or(c.lower);
+                c.upper = prior.upper.unwrap_or(c.upper);
+                if c.lower >= c.upper {
                     return Err(self.model_error(format!(
-                        "effect {}:{}: prior.{short}: the range from {lower} to {upper} {} is empty",
-                        entry.id, entry.instance, c.unit
+                        "effect {}:{}: prior.{short}: the range from {} to {} {} is empty",
+                        entry.id, entry.instance, c.lower, c.upper, c.unit
                     )));
                 }
             }
@@ -291,7 +216,9 @@ impl Builder<'_> {
             }),
         };
         let mut node = found.create(&config)?;
-        let linked = node.link(LinkRequest { available: &self.available, model_json: &self.model_json(candidate) })?;
+        let mut linked =
+            node.link(LinkRequest { available: &self.available, model_json: &self.model_json(candidate) })?;
+        self.take_noise(&node.name, std::mem::take(&mut linked.noise))?;
         node.activate(u32::try_from(self.chain.carry.batch_rows).unwrap_or(u32::MAX))?;
         let index = self.chain.nodes.len();
         let (inputs, wave) = self.route(index, &linked);
@@ -316,6 +243,17 @@ impl Builder<'_> {
             instance: node,
         });
         Ok(linked)
+    }
+
+    fn take_noise(&mut self, plugin: &str, declared: Vec<NoiseProcess>) -> Result<(), ChainError> {
+        for process in declared {
+            if self.chain.noise.iter().any(|other| other.name == process.name) {
+                let sentence = format!("declares the noise process `{}`, which exists already", process.name);
+                return Err(BorderError::Link { plugin: plugin.to_owned(), sentence }.into());
+            }
+            self.chain.noise.push(process);
+        }
+        Ok(())
     }
 
     /// The queues of a new node, its routes entered where its tables are made.

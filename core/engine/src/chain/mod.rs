@@ -8,11 +8,13 @@ mod link;
 mod queue;
 mod state;
 
+pub use link::build;
 pub(crate) use link::open_source;
-pub use link::{Coefficient, Constraint, build};
 pub use state::resumes_at_ns;
 
 use std::sync::{Mutex, PoisonError};
+
+use dragfree_schema::{Coefficient, Constraint, NoiseProcess, Report};
 
 use crate::border::{BorderError, Instance, PluginInfo, Rows};
 use crate::table::{Batch, Chunk, TableSpec};
@@ -54,6 +56,9 @@ pub enum ChainError {
         /// What, why and what to do next.
         what: String,
     },
+    /// Reports could not be handed on.
+    #[error("reports: {0}")]
+    Reports(String),
     /// Rows could not be archived.
     #[error("time series: {0}")]
     Sink(String),
@@ -149,6 +154,8 @@ pub struct Chain {
     pub coefficients: Vec<Coefficient>,
     /// Constraints on them.
     pub constraints: Vec<Constraint>,
+    /// Noise in the channels, as its stages declared it.
+    pub noise: Vec<NoiseProcess>,
     /// Candidates that could not be linked, with the reason.
     pub not_tried: Vec<(String, String)>,
     feed_tables: Vec<TableSpec>,
@@ -214,20 +221,15 @@ impl Chain {
         Ok(())
     }
 
-    /// The reports of all stages, in order; `None` for effects, which have none.
+    /// The reports of all stages, in order; effects have none.
     ///
     /// # Errors
-    /// A plugin failed.
-    pub fn reports(&mut self) -> Result<Vec<(String, serde_json::Value)>, ChainError> {
-        let mut reports: Vec<(String, serde_json::Value)> = Vec::new();
+    /// A plugin failed, or its report cannot be understood.
+    pub fn reports(&mut self) -> Result<Vec<Report>, ChainError> {
+        let mut reports: Vec<Report> = Vec::new();
         for node in self.nodes.iter_mut().filter(|n| !n.is_effect) {
-            let earlier: Vec<&serde_json::Value> = reports.iter().map(|(_, r)| r).collect();
-            let earlier = serde_json::Value::from(earlier.into_iter().cloned().collect::<Vec<_>>()).to_string();
-            let mut report = node.instance.report(&earlier)?;
-            if let Some(object) = report.as_object_mut() {
-                object.insert("plugin".to_owned(), node.info.manifest.id.clone().into());
-            }
-            reports.push((node.info.manifest.id.clone(), report));
+            let earlier = serde_json::to_string(&reports).map_err(|e| ChainError::Reports(e.to_string()))?;
+            reports.push(node.instance.report(&earlier)?);
         }
         Ok(reports)
     }

@@ -2,8 +2,9 @@
 
 use serde_json::{Map, Value};
 
+use dragfree_schema::{Manifest, Parameter, ParameterType};
+
 use super::ConfigError;
-use crate::border::{Manifest, Parameter};
 
 /// The full set of parameters of a plugin: those given, checked, and the defaults of the rest.
 ///
@@ -31,34 +32,33 @@ pub fn resolve(file: &str, manifest: &Manifest, given: &toml::Table) -> Result<M
 
 fn check(parameter: &Parameter, value: &toml::Value) -> Result<Value, String> {
     let unit = if parameter.unit.is_empty() { String::new() } else { format!(" in {}", parameter.unit) };
-    match parameter.kind.as_str() {
-        "f64" => number(parameter, value)
+    match parameter.kind {
+        ParameterType::F64 => number(parameter, value)
             .map(Value::from)
             .ok_or_else(|| format!("must be a finite number{unit}{}", range(parameter))),
-        "i64" => value
+        ParameterType::I64 => value
             .as_integer()
             .filter(|i| within(parameter, *i as f64))
             .map(Value::from)
             .ok_or_else(|| format!("must be a whole number{unit}{}", range(parameter))),
-        "bool" => value.as_bool().map(Value::from).ok_or_else(|| "must be true or false".to_owned()),
-        "text" => match value.as_str() {
+        ParameterType::Bool => value.as_bool().map(Value::from).ok_or_else(|| "must be true or false".to_owned()),
+        ParameterType::Text => match value.as_str() {
             Some(text) if parameter.choices.is_empty() || parameter.choices.iter().any(|c| c == text) => {
                 Ok(Value::from(text))
             }
             Some(_) => Err(format!("must be one of {}", parameter.choices.join(", "))),
             None => Err("must be a text".to_owned()),
         },
-        "f64_list" => value
+        ParameterType::F64List => value
             .as_array()
             .and_then(|items| items.iter().map(|v| number(parameter, v)).collect::<Option<Vec<f64>>>())
             .map(Value::from)
             .ok_or_else(|| format!("must be a list of finite numbers{unit}")),
-        "text_list" => value
+        ParameterType::TextList => value
             .as_array()
             .and_then(|items| items.iter().map(|v| v.as_str().map(str::to_owned)).collect::<Option<Vec<String>>>())
             .map(Value::from)
             .ok_or_else(|| "must be a list of texts".to_owned()),
-        other => Err(format!("is declared with the type `{other}`, which this host does not know; rebuild the plugin")),
     }
 }
 

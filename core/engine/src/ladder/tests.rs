@@ -1,5 +1,5 @@
 use super::*;
-use crate::product::{self, Draft, ProductWriter, Stage, StageReport, Status, Stream};
+use crate::product::{self, Draft, ProductWriter, Stage, Status, Stream};
 use serde_json::json;
 
 /// 2035-01-01.
@@ -75,6 +75,7 @@ impl Made<'_> {
         let channel = |name: &&str| json!({"channel": name, "dof": 500.0, "measured_over_modelled": self.ratio.sqrt()});
         let free = f64::from(u8::from(self.offset.is_some()));
         let mut report = json!({
+            "plugin": "weigher",
             "coefficients": coefficients,
             "chi2_per_dof": self.ratio,
             "nis": 1.0,
@@ -111,7 +112,7 @@ impl Made<'_> {
             losses: Vec::new(),
             counts: BTreeMap::new(),
             notes: Vec::new(),
-            reports: vec![StageReport { stage: "weigher".into(), report }],
+            reports: vec![serde_json::from_value(report).expect("a report")],
             created: chrono::DateTime::UNIX_EPOCH,
         };
         let folder = tempfile::tempdir().expect("folder");

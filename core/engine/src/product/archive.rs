@@ -5,9 +5,10 @@
 //! keeps two writers from mixing their attachments under one revision.
 
 use super::ProductError;
-use super::draft::{self, Draft, Report};
+use super::draft::{self, Draft};
 use super::file::{self, Attachment, Product, Supersedes};
 use chrono::NaiveDate;
+use dragfree_schema::Report;
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::fs::{self, File, OpenOptions};
@@ -64,8 +65,7 @@ impl ProductWriter {
     /// [`ProductError`]; nothing is left in the archive then.
     pub fn commit(mut self, draft: &Draft) -> Result<Written, ProductError> {
         let stem = draft::stem(draft)?;
-        let reports = draft::parse_reports(&draft.reports)?;
-        self.attach(&reports)?;
+        self.attach(&draft.reports)?;
         let attachments = self.staged.iter().map(|(suffix, path)| seal(suffix, path));
         let attachments = attachments.collect::<Result<Vec<_>, _>>()?;
         let mut revision = 1;
@@ -86,8 +86,8 @@ impl ProductWriter {
             };
             // Another writer may have finished between the look and the claim.
             if next_free(&self.archive, &stem, revision)? == revision {
-                let supersedes = superseded(&self.archive, &stem, draft, &reports, &attachments)?;
-                let product = draft::product(draft, &reports, revision, attachments, supersedes)?;
+                let supersedes = superseded(&self.archive, &stem, draft, &attachments)?;
+                let product = draft::product(draft, revision, attachments, supersedes)?;
                 let path = self.place(&product)?;
                 drop(claim);
                 return Ok(Written { product, path });
@@ -96,11 +96,12 @@ impl ProductWriter {
     }
 
     /// Writes the attachments of the reports.
-    fn attach(&mut self, reports: &[(String, Report)]) -> Result<(), ProductError> {
-        for (stage, report) in reports {
+    fn attach(&mut self, reports: &[Report]) -> Result<(), ProductError> {
+        for report in reports {
             for attachment in &report.attachments {
                 let suffix = &attachment.suffix;
-                let refuse = |reason| ProductError::Attachment { stage: stage.clone(), suffix: suffix.clone(), reason };
+                let refuse =
+                    |reason| ProductError::Attachment { stage: report.plugin.clone(), suffix: suffix.clone(), reason };
                 let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || matches!(c, '.' | '-' | '_');
                 if !suffix.starts_with(|c: char| c.is_ascii_lowercase()) || !suffix.chars().all(plain) {
                     return Err(refuse("a suffix is lower-case letters, digits, '.', '-' and '_', a letter first"));
@@ -249,14 +250,13 @@ fn superseded(
     archive: &Path,
     stem: &str,
     draft: &Draft,
-    reports: &[(String, Report)],
     attachments: &[Attachment],
 ) -> Result<Option<Supersedes>, ProductError> {
     let earlier = names(archive)?.into_iter().rev().filter(|name| name.starts_with(stem) && name.ends_with(".toml"));
     let Some(old) = earlier.filter_map(|name| file::read(&archive.join(name)).ok()).next() else {
         return Ok(None);
     };
-    let new = draft::product(draft, reports, 1, attachments.to_vec(), None)?;
+    let new = draft::product(draft, 1, attachments.to_vec(), None)?;
     let sha256 = old.header.non_standard_attributes.sha256.clone();
     let changed = [
         ("inputs", old.inputs != new.inputs),

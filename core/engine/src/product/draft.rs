@@ -6,7 +6,7 @@ use super::file::{
     NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Supersedes, Variable,
 };
 use chrono::{DateTime, NaiveDate, SecondsFormat, Utc};
-use serde::Deserialize;
+use dragfree_schema::Report;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// All that a product is made from.
@@ -48,96 +48,10 @@ pub struct Draft {
     pub counts: BTreeMap<String, u64>,
     /// Sentences of the replay; those of the stages stand in their reports.
     pub notes: Vec<String>,
-    /// Reports in pipeline order.
-    pub reports: Vec<StageReport>,
+    /// Reports in pipeline order, each with its plugin.
+    pub reports: Vec<Report>,
     /// When the product is made; the engine has no clock.
     pub created: DateTime<Utc>,
-}
-
-/// A stage's report as it came across the border.
-#[derive(Clone, Debug)]
-pub struct StageReport {
-    /// Stage, `qp-check`.
-    pub stage: String,
-    /// Its report, keys of [`Report`].
-    pub report: serde_json::Value,
-}
-
-/// What a stage says at the end of a run. Everything is optional; a key that is not listed here is noted in the
-/// product and left out.
-#[derive(Clone, Debug, Default, Deserialize)]
-#[serde(default)]
-pub struct Report {
-    /// Estimates.
-    pub coefficients: Vec<Estimate>,
-    /// Covariances by solution.
-    pub covariance: BTreeMap<String, ReportedCovariance>,
-    /// `agree`, `disagree` or `weak`.
-    pub verdict: Option<String>,
-    /// Directions that the data do not determine, one sentence each.
-    pub weak_directions: Vec<String>,
-    /// χ² per degree of freedom of the residuals.
-    pub chi2_per_dof: Option<f64>,
-    /// Mean normalised innovation squared per channel.
-    pub nis: Option<f64>,
-    /// `telemetered` or `reconstructed`.
-    pub commands: Option<String>,
-    /// Epochs that entered the result.
-    pub epochs_used: Option<u64>,
-    /// Epochs that did not.
-    pub epochs_rejected: Option<u64>,
-    /// True where data were lost.
-    pub data_loss: bool,
-    /// True where the model contradicts the data.
-    pub inconsistent: bool,
-    /// Counts, `gaps`, `spikes`.
-    pub counts: BTreeMap<String, u64>,
-    /// Sentences for the reader.
-    pub notes: Vec<String>,
-    /// Free figures of quality.
-    pub quality: serde_json::Map<String, serde_json::Value>,
-    /// Files to lie beside the product.
-    pub attachments: Vec<ReportedAttachment>,
-    /// Keys that this engine does not know.
-    #[serde(flatten)]
-    pub unknown: BTreeMap<String, serde_json::Value>,
-}
-
-/// One coefficient in a report.
-#[derive(Clone, Debug, Deserialize)]
-pub struct Estimate {
-    /// `com-offset.tm1.x`.
-    pub name: String,
-    /// `es-akf`, `qp` or `adopted`.
-    pub solution: String,
-    /// Value in `unit`.
-    pub value: Option<f64>,
-    /// Standard deviation in `unit`.
-    pub sigma: Option<f64>,
-    /// SI unit.
-    #[serde(default)]
-    pub unit: String,
-    /// Frame, empty where there is none.
-    #[serde(default)]
-    pub frame: String,
-}
-
-/// A covariance in a report.
-#[derive(Clone, Debug, Deserialize)]
-pub struct ReportedCovariance {
-    /// Coefficients of the rows, n.
-    pub names: Vec<String>,
-    /// n × n, by rows.
-    pub matrix: Vec<Vec<Option<f64>>>,
-}
-
-/// A text that is to lie beside the product.
-#[derive(Clone, Debug, Deserialize)]
-pub struct ReportedAttachment {
-    /// What follows the product's name, `neq.json`.
-    pub suffix: String,
-    /// Contents.
-    pub text: String,
 }
 
 /// A product's name without its revision, `COM1B_2035-01-01_SC1_01`.
@@ -151,34 +65,16 @@ pub(super) fn stem(draft: &Draft) -> Result<String, ProductError> {
     Ok(format!("{}_{}_{}_{:02}", draft.product, draft.day.format("%Y-%m-%d"), draft.spacecraft, draft.release))
 }
 
-/// Reads the reports; keys that no one knows come back as notes.
-pub(super) fn parse_reports(reports: &[StageReport]) -> Result<Vec<(String, Report)>, ProductError> {
-    let parse = |StageReport { stage, report }: &StageReport| {
-        let parsed = Report::deserialize(report)
-            .map_err(|source| ProductError::Report { stage: stage.clone(), source })
-            .map(|mut parsed| {
-                parsed.unknown.remove("plugin"); // the engine's own mark, by which later stages tell reports apart
-                parsed.notes.extend(
-                    std::mem::take(&mut parsed.unknown).into_keys().map(|key| format!("unknown key {key:?} left out")),
-                );
-                parsed
-            })?;
-        Ok((stage.clone(), parsed))
-    };
-    reports.iter().map(parse).collect()
-}
-
 /// Builds the product with `revision`; its digest is filled in.
 pub(super) fn product(
     draft: &Draft,
-    reports: &[(String, Report)],
     revision: u32,
     attachments: Vec<Attachment>,
     supersedes: Option<Supersedes>,
 ) -> Result<Product, ProductError> {
     let id = format!("{}_{revision:04}", stem(draft)?);
-    let result = outcome(draft, reports);
-    let quality = quality(draft, reports);
+    let result = outcome(draft);
+    let quality = quality(draft);
     let header = Header {
         dimensions: Dimensions {
             epoch: quality.epochs_used.saturating_add(quality.epochs_rejected),
@@ -237,12 +133,12 @@ pub(super) fn product(
 }
 
 /// The last stage that says something has the word: qp-check stands after the filter and has seen its report.
-fn last<T>(reports: &[(String, Report)], get: impl Fn(&Report) -> Option<T>) -> Option<T> {
-    reports.iter().rev().find_map(|(_, report)| get(report))
+fn last<T>(draft: &Draft, get: impl Fn(&Report) -> Option<T>) -> Option<T> {
+    draft.reports.iter().rev().find_map(get)
 }
 
-fn outcome(draft: &Draft, reports: &[(String, Report)]) -> Outcome {
-    let coefficients = reports.iter().flat_map(|(_, report)| &report.coefficients).map(|estimate| Coefficient {
+fn outcome(draft: &Draft) -> Outcome {
+    let coefficients = draft.reports.iter().flat_map(|report| &report.coefficients).map(|estimate| Coefficient {
         name: estimate.name.clone(),
         solution: estimate.solution.clone(),
         value: estimate.value.unwrap_or(f64::NAN),
@@ -250,48 +146,49 @@ fn outcome(draft: &Draft, reports: &[(String, Report)]) -> Outcome {
         unit: estimate.unit.clone(),
         frame: estimate.frame.clone(),
     });
-    let covariance = reports.iter().flat_map(|(_, report)| &report.covariance).map(|(solution, reported)| {
-        let row = |row: &Vec<Option<f64>>| row.iter().map(|entry| entry.unwrap_or(f64::NAN)).collect();
-        let matrix = reported.matrix.iter().map(row).collect();
-        (solution.clone(), Covariance { names: reported.names.clone(), matrix })
+    let covariance = draft.reports.iter().flat_map(|report| &report.covariance).map(|(solution, reported)| {
+        (solution.clone(), Covariance { names: reported.names.clone(), matrix: reported.matrix.clone() })
     });
     Outcome {
         epoch_ns: draft.last_ns,
-        verdict: last(reports, |report| report.verdict.clone()),
+        verdict: last(draft, |report| report.verdict.clone()),
         coefficients: coefficients.collect(),
         covariance: covariance.collect(),
     }
 }
 
-fn quality(draft: &Draft, reports: &[(String, Report)]) -> Quality {
+fn quality(draft: &Draft) -> Quality {
     let mut weak_directions: Vec<String> = Vec::new();
-    for direction in reports.iter().flat_map(|(_, report)| &report.weak_directions) {
+    for direction in draft.reports.iter().flat_map(|report| &report.weak_directions) {
         if !weak_directions.contains(direction) {
             weak_directions.push(direction.clone());
         }
     }
     let replayed = Some(("replay".to_owned(), draft.counts.clone())).filter(|(_, counts)| !counts.is_empty());
-    let reported = |(stage, report): &(String, Report)| {
-        (!report.counts.is_empty()).then(|| (stage.clone(), report.counts.clone()))
+    let reported =
+        |report: &Report| (!report.counts.is_empty()).then(|| (report.plugin.clone(), report.counts.clone()));
+    let note = |report: &Report| -> Vec<String> {
+        report.notes.iter().map(|note| format!("{}: {note}", report.plugin)).collect()
     };
-    let note = |(stage, report): &(String, Report)| -> Vec<String> {
-        report.notes.iter().map(|note| format!("{stage}: {note}")).collect()
-    };
-    let figures = |(stage, report): &(String, Report)| {
-        (!report.quality.is_empty()).then(|| (stage.clone(), table(&report.quality)))
-    };
+    let figures =
+        |report: &Report| (!report.quality.is_empty()).then(|| (report.plugin.clone(), table(&report.quality)));
     Quality {
-        epochs_used: last(reports, |report| report.epochs_used).unwrap_or(0),
-        epochs_rejected: last(reports, |report| report.epochs_rejected).unwrap_or(0),
-        commands: last(reports, |report| report.commands.clone()),
-        chi2_per_dof: last(reports, |report| report.chi2_per_dof).unwrap_or(f64::NAN),
-        nis: last(reports, |report| report.nis).unwrap_or(f64::NAN),
-        data_loss: !draft.losses.is_empty() || reports.iter().any(|(_, report)| report.data_loss),
-        inconsistent: reports.iter().any(|(_, report)| report.inconsistent),
+        epochs_used: last(draft, |report| report.epochs_used).unwrap_or(0),
+        epochs_rejected: last(draft, |report| report.epochs_rejected).unwrap_or(0),
+        commands: last(draft, |report| report.commands.clone()),
+        chi2_per_dof: last(draft, |report| report.chi2_per_dof).unwrap_or(f64::NAN),
+        nis: last(draft, |report| report.nis).unwrap_or(f64::NAN),
+        data_loss: !draft.losses.is_empty() || draft.reports.iter().any(|report| report.data_loss),
+        inconsistent: draft.reports.iter().any(|report| report.inconsistent),
         weak_directions,
-        notes: draft.notes.iter().map(|note| format!("replay: {note}")).chain(reports.iter().flat_map(note)).collect(),
-        counts: replayed.into_iter().chain(reports.iter().filter_map(reported)).collect(),
-        stages: reports.iter().filter_map(figures).collect(),
+        notes: draft
+            .notes
+            .iter()
+            .map(|note| format!("replay: {note}"))
+            .chain(draft.reports.iter().flat_map(note))
+            .collect(),
+        counts: replayed.into_iter().chain(draft.reports.iter().filter_map(reported)).collect(),
+        stages: draft.reports.iter().filter_map(figures).collect(),
     }
 }
 

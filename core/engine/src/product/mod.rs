@@ -13,7 +13,7 @@ mod file;
 mod json;
 
 pub use archive::{Entry, Listing, Problem, ProductWriter, Written, find, list};
-pub use draft::{Draft, Estimate, Report, ReportedAttachment, ReportedCovariance, StageReport};
+pub use draft::Draft;
 pub use file::{
     Attachment, Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Loss, Model,
     NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Supersedes, Variable, read,
@@ -34,14 +34,6 @@ pub enum ProductError {
         path: PathBuf,
         /// The system's reason.
         source: std::io::Error,
-    },
-    /// A stage's report does not have the form of `Report`.
-    #[error("the report of stage {stage} cannot be read: {source}; the plugin's author has to mend it")]
-    Report {
-        /// Stage.
-        stage: String,
-        /// What is wrong.
-        source: serde_json::Error,
     },
     /// Two stages, or one stage twice, want to write the same file beside the product.
     #[error("stage {stage} attaches {suffix:?}, but {reason}; rename the attachment in the plugin")]

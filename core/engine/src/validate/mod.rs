@@ -6,6 +6,7 @@
 mod session;
 mod stand;
 
+use dragfree_schema::{Coefficient, ParameterType};
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
@@ -219,10 +220,8 @@ impl Subject<'_> {
         let fail = |what: String| Err(self.broken(instance, what));
         let start = format!("{}.{instance}", self.plugin.manifest.id);
         let mut names = Vec::new();
-        for value in &linked.coefficients {
-            let Some(name) = value["name"].as_str() else {
-                return fail(format!("a coefficient without a name: {value}"));
-            };
+        for c in &linked.coefficients {
+            let name = c.name.as_str();
             let rest = name.strip_prefix(&start);
             if !rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('.')) {
                 return fail(format!(
@@ -233,19 +232,16 @@ impl Subject<'_> {
                 return fail(format!("coefficient {name} is announced twice"));
             }
             names.push(name);
-            if value["unit"].as_str().is_none_or(str::is_empty) {
+            if c.unit.is_empty() {
                 return fail(format!("coefficient {name} has no unit; `1` is the unit of a number"));
             }
-            let number = |key: &str| value[key].as_f64();
-            if let (Some(lower), Some(upper)) = (number("lower"), number("upper")) {
-                let initial = number("initial").unwrap_or(0.0);
-                if lower >= upper || !(lower..=upper).contains(&initial) {
-                    return fail(format!(
-                        "coefficient {name} is to begin at {initial} within a range from {lower} to {upper}; begin inside"
-                    ));
-                }
+            let Coefficient { lower, upper, initial, .. } = c;
+            if lower >= upper || !(lower..=upper).contains(&initial) {
+                return fail(format!(
+                    "coefficient {name} is to begin at {initial} within a range from {lower} to {upper}; begin inside"
+                ));
             }
-            if number("prior_sigma").is_some_and(|sigma| sigma <= 0.0) {
+            if c.prior_sigma <= 0.0 {
                 return fail(format!("coefficient {name} has a prior standard deviation that is not above zero"));
             }
         }
@@ -255,12 +251,12 @@ impl Subject<'_> {
             );
         }
         let channels: Vec<&str> =
-            available.iter().filter(|c| attribute(c, "kind") == "channel").map(|c| c.name.as_str()).collect();
-        for column in linked.writes.iter().flat_map(|t| &t.columns).filter(|c| attribute(c, "kind") == "regressor") {
-            if !names.contains(&attribute(column, "coefficient")) {
+            available.iter().filter(|c| c.attribute("kind") == "channel").map(|c| c.name.as_str()).collect();
+        for column in linked.writes.iter().flat_map(|t| &t.columns).filter(|c| c.attribute("kind") == "regressor") {
+            if !names.contains(&column.attribute("coefficient")) {
                 return fail(format!("column {} names no coefficient of this instance", column.name));
             }
-            if !channels.contains(&attribute(column, "channel")) {
+            if !channels.contains(&column.attribute("channel")) {
                 let known = channels.join(", ");
                 return fail(format!("column {} names no channel; there are {known}", column.name));
             }
@@ -389,10 +385,6 @@ impl Subject<'_> {
     }
 }
 
-fn attribute<'a>(column: &'a Column, key: &str) -> &'a str {
-    column.attributes.get(key).map_or("", String::as_str)
-}
-
 /// Who it is, in a form that file names, model files and messages can carry; defaults that its own declaration allows.
 fn manifest(manifest: &Manifest, kind: Kind) -> Result<String, Finding> {
     let fail = |what: String| Err(Finding::Manifest(what));
@@ -423,7 +415,7 @@ fn manifest(manifest: &Manifest, kind: Kind) -> Result<String, Finding> {
         if parameter.help.trim().is_empty() {
             return fail(format!("parameter {name} has no help"));
         }
-        if matches!(parameter.kind.as_str(), "f64" | "f64_list") && parameter.unit.is_empty() {
+        if matches!(parameter.kind, ParameterType::F64 | ParameterType::F64List) && parameter.unit.is_empty() {
             return fail(format!("parameter {name} has no unit; `1` is the unit of a number"));
         }
         let default = toml::Value::try_from(&parameter.default)

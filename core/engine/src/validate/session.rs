@@ -1,6 +1,5 @@
 //! An instance that is fed epoch by epoch, and what it gave.
 
-use serde_json::Value;
 use std::ops::Range;
 
 use super::Finding;
@@ -119,12 +118,13 @@ impl Session {
     }
 
     /// What it gave since the rows were forgotten last, the times that it was given, and its report.
-    pub(super) fn finish(mut self) -> Result<(Vec<Batch>, Vec<i64>, Value), Finding> {
+    pub(super) fn finish(mut self) -> Result<(Vec<Batch>, Vec<i64>, String), Finding> {
         if self.kind != Kind::Source {
             let rest = self.node.flush()?;
             self.take(rest);
         }
-        let report = self.node.report("[]")?;
+        // As text: NaN is not equal to itself.
+        let report = serde_json::to_string(&self.node.report("[]")?).unwrap_or_default();
         Ok((self.batches, self.times_ns, report))
     }
 

@@ -155,16 +155,14 @@ impl World {
         assert_eq!(linked.coefficients.len(), values.len(), "{:?}", linked.coefficients);
         for (last, value) in values {
             let name = format!("{id}.{instance}{}{last}", if last.is_empty() { "" } else { "." });
-            let coefficient = linked.coefficients.iter().find(|c| c["name"] == name.as_str());
+            let coefficient = linked.coefficients.iter().find(|c| c.name == name);
             let coefficient = coefficient.unwrap_or_else(|| panic!("no {name} in {:?}", linked.coefficients));
-            let (lower, upper) = (coefficient["lower"].as_f64().unwrap(), coefficient["upper"].as_f64().unwrap());
-            assert!((lower..=upper).contains(value), "{name} = {value} lies beyond its range");
-            for response in coefficient["responses"].as_array().expect("responses") {
-                let text = |key: &str| response[key].as_str().expect("a text");
-                let column = series(text("table"), text("series"));
-                let factor = response["factor"].as_f64().expect("a factor");
-                let sum = added.entry(text("channel").to_owned()).or_insert_with(|| vec![0.0; column.len()]);
-                sum.iter_mut().zip(column).for_each(|(s, x)| *s += value * factor * x);
+            let range = coefficient.lower..=coefficient.upper;
+            assert!(range.contains(value), "{name} = {value} lies beyond its range");
+            for response in &coefficient.responses {
+                let column = series(&response.table, &response.series);
+                let sum = added.entry(response.channel.clone()).or_insert_with(|| vec![0.0; column.len()]);
+                sum.iter_mut().zip(column).for_each(|(s, x)| *s += value * response.factor * x);
             }
         }
         added

@@ -75,7 +75,7 @@ fn a_lagged_difference_of_temperatures_pushes_along_the_axis() {
 fn a_thermal_candidate_tries_every_pair_at_every_lag() {
     let mut world = World::new(10, &[("hk.p", "K"), ("hk.q", "K"), ("hk.r", "K"), ("hk.volts", "V")]);
     let (_, first) = world.link("thermal", "tm1.x", json!({}), true).expect("linked");
-    assert_eq!(first.coefficients[0]["variants"].as_array().map(Vec::len), Some(3 * 13));
+    assert_eq!(first.coefficients[0].variants.len(), 3 * 13);
     let written: Vec<_> = first.writes.iter().flat_map(|t| t.columns.clone()).collect();
     assert_eq!(written.len(), 3 * 13);
     let rows = world.time_ns.len();
@@ -83,16 +83,16 @@ fn a_thermal_candidate_tries_every_pair_at_every_lag() {
     world.columns.extend(written);
     let (_, second) = world.link("thermal", "tm2.z", json!({}), true).expect("linked");
     assert!(second.writes.is_empty() && second.reads.is_empty());
-    let variant = &second.coefficients[0]["variants"][13 + 1];
-    assert_eq!(variant["shape"], json!({"plus": "hk.p", "minus": "hk.r", "lag_s": 45.0}));
-    let responses = variant["responses"].as_array().expect("responses");
-    assert_eq!(responses[0]["table"], "effect/thermal:tm1.x");
-    assert_eq!((&responses[0]["series"], &responses[0]["factor"]), (&json!("lag(hk.p,45)"), &json!(1.0)));
-    assert_eq!((&responses[1]["series"], &responses[1]["factor"]), (&json!("lag(hk.r,45)"), &json!(-1.0)));
-    assert!(responses.iter().all(|r| r["channel"] == "tm2.accel.z"));
+    let variant = &second.coefficients[0].variants[13 + 1];
+    assert_eq!(json!(variant.shape), json!({"plus": "hk.p", "minus": "hk.r", "lag_s": 45.0}));
+    let responses = &variant.responses;
+    assert_eq!(responses[0].table, "effect/thermal:tm1.x");
+    assert_eq!((responses[0].series.as_str(), responses[0].factor), ("lag(hk.p,45)", 1.0));
+    assert_eq!((responses[1].series.as_str(), responses[1].factor), ("lag(hk.r,45)", -1.0));
+    assert!(responses.iter().all(|r| r.channel == "tm2.accel.z"));
     // The shape of a variant, as parameters, gives the responses of the variant.
-    let (_, third) = world.link("thermal", "tm2.z", variant["shape"].clone(), false).expect("linked");
-    assert_eq!(third.coefficients[0]["responses"], variant["responses"]);
+    let (_, third) = world.link("thermal", "tm2.z", json!(variant.shape), false).expect("linked");
+    assert_eq!(third.coefficients[0].responses, variant.responses);
 }
 
 /// Forces by finite differences of the energy of two electrodes at `∓ΔV/2` and a charged test mass between them: with
@@ -115,7 +115,7 @@ fn a_charge_is_pushed_from_the_higher_voltage() {
         world.row("hk.q9").iter().map(|q| 0.5 * (force(*q) - force(-q)) / mission().test_mass["tm1"].mass_kg).collect();
     assert!(apart(&added["tm1.accel.x"], &want) < 1e-4, "{}", apart(&added["tm1.accel.x"], &want));
     let (_, tried) = world.link("charge", "tm2", json!({}), true).expect("linked");
-    assert_eq!(tried.coefficients[0]["variants"].as_array().map(Vec::len), Some(2));
+    assert_eq!(tried.coefficients[0].variants.len(), 2);
     let refused = world.link("charge", "tm1", json!({"charge": "hk.q8"}), false).map(drop).expect_err("no such column");
     assert!(refused.contains("hk.q9, hk.other"), "{refused}");
 }
@@ -158,12 +158,13 @@ fn a_magnet_is_drawn_up_the_gradient() {
     }
     // Two fields times one gradient, and two squares; all six coefficients in one order.
     let (_, tried) = world.link("magnetic", "tm1", json!({}), true).expect("linked");
-    let variants = |i: usize| tried.coefficients[i]["variants"].as_array().expect("variants").clone();
+    let variants = |i: usize| tried.coefficients[i].variants.clone();
     assert!((0..6).all(|i| variants(i).len() == 4));
-    assert!((0..4).all(|v| variants(0)[v]["shape"] == variants(5)[v]["shape"]));
-    assert_eq!((&variants(3)[3]["shape"]["gradient"], &variants(3)[3]["unit"]), (&json!("hk.c"), &json!("m s-2 T-2")));
-    let again = world.link("magnetic", "tm1", variants(3)[3]["shape"].clone(), false).expect("linked").1;
-    assert_eq!(again.coefficients[3]["responses"], variants(3)[3]["responses"]);
+    assert!((0..4).all(|v| variants(0)[v].shape == variants(5)[v].shape));
+    assert_eq!(variants(3)[3].shape["gradient"], "hk.c");
+    assert_eq!(variants(3)[3].unit.as_deref(), Some("m s-2 T-2"));
+    let again = world.link("magnetic", "tm1", json!(variants(3)[3].shape), false).expect("linked").1;
+    assert_eq!(again.coefficients[3].responses, variants(3)[3].responses);
 }
 
 /// Slug and spacecraft, each with its own equation of motion, in small steps.
@@ -259,26 +260,23 @@ fn the_transients_of_a_candidate_are_what_the_model_would_add() {
     for instance in ["sc.z", "sc.theta", "tm1.x"] {
         let (_, tried) = world.link("impulse", instance, json!({}), true).expect("linked");
         for coefficient in &tried.coefficients {
-            let name = coefficient["name"].as_str().expect("a name").to_owned();
-            for transient in coefficient["transients"].as_array().expect("transients").iter().take(4) {
-                let mut shape = transient["shape"].clone();
+            let name = &coefficient.name;
+            for transient in coefficient.transients.iter().take(4) {
+                let mut shape = json!(transient.shape);
                 shape["at_ns"] = json!(START_NS + 300_000_000);
                 let last = name.strip_prefix(&format!("impulse.{instance}")).expect("its name").trim_start_matches('.');
                 let values: Vec<(String, f64)> = tried
                     .coefficients
                     .iter()
-                    .map(|c| c["name"].as_str().expect("a name"))
-                    .map(|n| n.trim_start_matches(&format!("impulse.{instance}")).trim_start_matches('.').to_owned())
+                    .map(|c| {
+                        c.name.trim_start_matches(&format!("impulse.{instance}")).trim_start_matches('.').to_owned()
+                    })
                     .map(|n| (n.clone(), if n == last { 1e-8 } else { 0.0 }))
                     .collect();
                 let values: Vec<(&str, f64)> = values.iter().map(|(n, v)| (n.as_str(), *v)).collect();
                 let added = world.added("impulse", instance, shape, &values);
-                let kernel = transient["kernel"].as_array().expect("a kernel");
-                for pair in transient["channels"].as_array().expect("channels") {
-                    let (channel, factor) = (pair[0].as_str().expect("a name"), pair[1].as_f64().expect("a factor"));
-                    let want: Vec<f64> = (0..kernel.len().min(3997))
-                        .map(|k| 1e-8 * factor * kernel[k].as_f64().expect("a number"))
-                        .collect();
+                for (channel, factor) in &transient.channels {
+                    let want: Vec<f64> = transient.kernel.iter().take(3997).map(|k| 1e-8 * factor * k).collect();
                     let got = &added[channel][3..3 + want.len()];
                     assert!(added[channel][..3].iter().all(|x| *x == 0.0));
                     assert!(apart(got, &want) < 1e-5, "{instance} {name} {channel}: {}", apart(got, &want));
@@ -330,8 +328,8 @@ fn noise_names_its_process() {
     ] {
         let (_, linked) = world.link(id, instance, json!({}), false).expect("linked");
         let c = &linked.coefficients[0];
-        assert_eq!((&c["noise"], &c["initial"], &c["unit"]), (&json!(process), &json!(1.0), &json!("1")));
-        assert!(c.get("responses").is_none() && linked.writes.is_empty());
+        assert_eq!((c.noise.as_str(), c.initial, c.unit.as_str()), (process, 1.0, "1"));
+        assert!(c.responses.is_empty() && linked.writes.is_empty());
     }
 }
 

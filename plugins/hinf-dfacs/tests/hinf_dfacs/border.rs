@@ -145,7 +145,7 @@ fn run_asked(grid: &Grid, parameters: &Value, batch_rows: usize, needs: &[&str])
         append(stage.process(&[input], i64::MAX).expect("processed").expect("nothing is discarded"));
     }
     append(stage.flush().expect("flushed"));
-    let report = stage.report("[]").expect("a report");
+    let report = serde_json::to_value(stage.report("[]").expect("a report")).expect("JSON");
     Output { columns: table.columns.clone(), rows, report }
 }
 

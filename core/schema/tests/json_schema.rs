@@ -1,0 +1,28 @@
+//! The JSON Schema beside plugin.h is that of the types. `DRAGFREE_WRITE_SCHEMA=1 cargo test -p dragfree-schema` writes it anew.
+
+use dragfree_schema::{Coefficient, Constraint, Manifest, Model, NoiseProcess, Report};
+use schemars::{JsonSchema, schema_for};
+use std::path::Path;
+
+fn committed<T: JsonSchema>(name: &str) {
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../abi/include/dragfree/schema");
+    let path = folder.join(format!("{name}.schema.json"));
+    let made = serde_json::to_string_pretty(&schema_for!(T)).expect("JSON") + "\n";
+    if std::env::var_os("DRAGFREE_WRITE_SCHEMA").is_some() {
+        std::fs::create_dir_all(&folder).expect("the folder");
+        std::fs::write(&path, &made).expect("written");
+    }
+    let there = std::fs::read_to_string(&path).unwrap_or_default();
+    let again = "DRAGFREE_WRITE_SCHEMA=1 cargo test --release -p dragfree-schema";
+    assert!(there == made, "{} is not the schema of {name}; run `{again}`", path.display());
+}
+
+#[test]
+fn the_committed_schemas_are_those_of_the_types() {
+    committed::<Manifest>("manifest");
+    committed::<Coefficient>("coefficient");
+    committed::<Constraint>("constraint");
+    committed::<NoiseProcess>("noise_process");
+    committed::<Model>("model");
+    committed::<Report>("report");
+}
