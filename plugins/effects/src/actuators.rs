@@ -1,26 +1,22 @@
-//! Actuators that do something else than they are told: `es-gain`, `es-crosstalk`, `mps-gain`, `mps-tilt`, `torque-gain`.
+//! Actuators whose output differs from the command: `es-gain`, `es-crosstalk`, `mps-gain`, `mps-tilt`, `torque-gain`.
 //!
-//! All act through what was commanded (columns `used.*`, mean over the sample, with the mission's lag and delay). A command
-//! carries the noise of the readouts only into later samples, so a fit over the whole band up to Nyquist is unbiased; over a part
-//! of the band it is not.
+//! Regressors are the commands (columns `used.*`, mean over the sample, with the mission's lag and delay). Feedback
+//! makes the commands depend on past readout noise only, so a least-squares fit is unbiased over the whole band up to
+//! Nyquist but biased over part of it; Methods, "Regressors inside the control loop".
 //!
-//! **Limits.** What acts across (`es-crosstalk`, `mps-tilt`) comes out right. A gain acts back on the channel whose noise the loop
-//! works against, and there the fits are not yet what they should be: on six quiet hours `qp-check` gave `mps-gain:sc.z` 0.15 ± 0.02
-//! (0.05 without the refinement of Σ, 0.04 with that and segments of 6554 s) and `es-gain:tm2.z` 0.09 ± 0.03, `es-akf` −0.16 and 0.56;
-//! `torque-gain:sc.z` of 0.12 came out at its bound of 0.15. The prediction-error fit beside the spectra says −0.006 ± 0.006 for
-//! the first. The verdict is then that they disagree.
-//!
-//! **Confounders.** The loop's command mirrors every slow force that nobody models, so such a force is "explained" by a gain near
-//! −1: no actuator is so wrong, hence the hard ranges. `mps-gain` and `mps-tilt` of different axes share their series.
-//! `torque-gain` about an axis is an error of the inertia about it, and acts through the offset too: in part it is degenerate with
-//! the offset across the axis. Left out of the model it moves `b_y` by many σ with hardly a trace in the attitude channels.
+//! **Confounders.** Feedback mirrors every slow unmodelled force in the command, so a gain near −1 fits such a force;
+//! the hard ranges exclude this. `mps-gain` and `mps-tilt` of different axes share their series. `torque-gain` is
+//! equivalent to an error of the inertia; part of it, acting through the offset, is collinear with the offset across
+//! the axis.
 
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 
+use crate::common::{axis_of, manifest};
 use crate::linear::{
-    Linear, Part, Recipe, Series, Source, Term, accel, push, sc_axis, through_offset, tm_axis, tm_name, tm_pair, turn,
+    CoefficientForms, InputColumn, LinearEffect, Series, Term, accel_channel, attitude_channel, offset_coupling_terms,
+    tm_axis, tm_name, tm_pair, vector_terms,
 };
 
 const GAIN: [f64; 2] = [-0.3, 0.3];
@@ -28,49 +24,36 @@ const CROSSTALK: [f64; 2] = [-0.1, 0.1];
 const TILT_RAD: [f64; 2] = [-0.1, 0.1];
 const TORQUE_GAIN: [f64; 2] = [-0.15, 0.15];
 
-const fn manifest(
-    id: &'static str,
-    description: &'static str,
-    instances: &'static [&'static str],
-    needs: &'static [&'static str],
-) -> Manifest {
-    let (version, licence) = (env!("CARGO_PKG_VERSION"), "MIT OR Apache-2.0");
-    Manifest { id, version, licence, description, parameters: &[], instances, needs }
-}
-
-/// The unit vector along an axis.
-fn along(axis: usize) -> Vector3<f64> {
+/// Unit vector along an axis.
+fn unit_vector(axis: usize) -> Vector3<f64> {
     Vector3::from_fn(|i, _| f64::from(i == axis))
 }
 
-/// Acceleration of a test mass by a force `F_E` on it: `F_E/m_m`, and the spacecraft's recoil `F_E/m_S` against it (`û_i` of
-/// Section IV), per newton. The other test mass sees the recoil alone, 1.3e-3 of it, which the interferometers cannot tell from a
-/// thrust of 1 % of the thrusters' noise: left out.
-fn electrodes(
+/// Terms of an electrode force along axis `from` that acts along `to`: `F_E/m_m` on the test mass plus the spacecraft's
+/// recoil `F_E/m_S` (`û_i` of Section IV). The recoil in the other test mass's channels is far below thruster noise and
+/// omitted.
+fn electrode_terms(
     mission: &Mission,
     by: &'static str,
     (tm, from, to): (usize, usize, usize),
 ) -> Result<Vec<Term>, PluginError> {
     let test_mass = mission.test_mass(&tm_name(tm), by)?;
     let per_newton = 1.0 / test_mass.mass_kg + 1.0 / mission.spacecraft.mass_kg;
-    Ok(vec![Term::new(accel(tm, to), Series::Column(Source::electrodes_force(tm, from)), per_newton)])
+    Ok(vec![Term::new(accel_channel(tm, to), Series::Column(InputColumn::electrodes_force(tm, from)), per_newton)])
 }
 
-/// `es-gain`: electrodes push `(1 + g) F_E` where `F_E` is commanded along an axis of ORF.
+/// `es-gain`: electrodes apply `(1 + g) F_E` where `F_E` is commanded along an axis of ORF.
 ///
-/// `z = g F_E (1/m_m + 1/m_S)`; g: 1, ±0.3. A gain also changes the torque of the recoil, `b × g F_E`, below 1e-13 rad s⁻²
-/// against thruster noise of 1e-10 rad s⁻²/√Hz, which `α̂` follows anyway. Literature: voltages and gaps of LISA Pathfinder's
-/// electrodes gave per cents (Armano et al., Phys. Rev. D 97, 122002).
+/// `z = g F_E (1/m_m + 1/m_S)`; g: 1, ±0.3. The change of the recoil torque `b × g F_E` is negligible and followed by
+/// `α̂`. LISA Pathfinder calibrated such gains to per cents (Armano et al., Phys. Rev. D 97, 122002).
 #[derive(Debug)]
-pub(crate) struct EsGainRecipe(usize, usize);
+pub(crate) struct EsGain(usize, usize);
 
-/// See [`EsGainRecipe`].
-pub(crate) type EsGain = Linear<EsGainRecipe>;
-
-impl Recipe for EsGainRecipe {
+impl LinearEffect for EsGain {
     const MANIFEST: Manifest = manifest(
         "es-gain",
-        "Electrodes push more or less along an axis than they are told",
+        "Gain of the electrodes' force along an axis differs from one",
+        &[],
         &["tm1.y", "tm1.z", "tm2.y", "tm2.z"],
         &["commands"],
     );
@@ -80,25 +63,23 @@ impl Recipe for EsGainRecipe {
         Ok(Self(tm, axis))
     }
 
-    fn parts(&self, mission: &Mission, _: &Available) -> Result<Vec<Part>, PluginError> {
-        let terms = electrodes(mission, "the effect es-gain", (self.0, self.1, self.1))?;
-        Ok(Part::only("1", GAIN, terms))
+    fn coefficients(&self, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
+        let terms = electrode_terms(mission, "the effect es-gain", (self.0, self.1, self.1))?;
+        Ok(CoefficientForms::only("1", GAIN, terms))
     }
 }
 
-/// `es-crosstalk`: `tm2.y-x` lets `δ` times the force commanded along y act along x too.
+/// `es-crosstalk`: in instance `tm2.y-x`, `δ` times the force commanded along y also acts along x.
 ///
 /// `z_to = δ F_E,from (1/m_m + 1/m_S)`; δ: 1, ±0.1.
 #[derive(Debug)]
-pub(crate) struct EsCrosstalkRecipe(usize, usize, usize);
+pub(crate) struct EsCrosstalk(usize, usize, usize);
 
-/// See [`EsCrosstalkRecipe`].
-pub(crate) type EsCrosstalk = Linear<EsCrosstalkRecipe>;
-
-impl Recipe for EsCrosstalkRecipe {
+impl LinearEffect for EsCrosstalk {
     const MANIFEST: Manifest = manifest(
         "es-crosstalk",
-        "Electrodes told to push along one axis push along another one too",
+        "Part of the force commanded along one axis also acts along another",
+        &[],
         &["tm1.y-x", "tm1.y-z", "tm1.z-x", "tm1.z-y", "tm2.y-x", "tm2.y-z", "tm2.z-x", "tm2.z-y"],
         &["commands"],
     );
@@ -108,179 +89,194 @@ impl Recipe for EsCrosstalkRecipe {
         Ok(Self(tm, from, to))
     }
 
-    fn parts(&self, mission: &Mission, _: &Available) -> Result<Vec<Part>, PluginError> {
-        let terms = electrodes(mission, "the effect es-crosstalk", (self.0, self.1, self.2))?;
-        Ok(Part::only("1", CROSSTALK, terms))
+    fn coefficients(&self, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
+        let terms = electrode_terms(mission, "the effect es-crosstalk", (self.0, self.1, self.2))?;
+        Ok(CoefficientForms::only("1", CROSSTALK, terms))
     }
 }
 
-/// The thrusters do `matrix · F` more than `F`: `z_i = −T_S^{O_i} matrix F/m_S` on all test-mass channels.
-fn thrust(mission: &Mission, matrix: &Matrix3<f64>) -> Vec<Term> {
+/// Terms of an additional thruster force `matrix · F_T`: `z_i = −T_S^{O_i} matrix F_T/m_S` on all test masses.
+fn thrust_terms(mission: &Mission, matrix: &Matrix3<f64>) -> Vec<Term> {
     let mut terms = Vec::new();
     for tm in 0..2 {
         let Some(test_mass) = mission.test_mass.get(&tm_name(tm)) else { continue };
         let per_newton = test_mass.dcm_orf_from_srf() * matrix / -mission.spacecraft.mass_kg;
         for (from, column) in per_newton.column_iter().enumerate() {
-            terms.extend(push(tm, &Series::Column(Source::thrust(from)), &column.into()));
+            terms.extend(vector_terms(tm, &Series::Column(InputColumn::thrust(from)), &column.into()));
         }
     }
     terms.retain(|term| term.factor.abs() > 1e-12 / mission.spacecraft.mass_kg);
     terms
 }
 
-/// `mps-gain`: thrusters push `(1 + g) F_T` where `F_T` is commanded along an axis of SRF.
+/// `mps-gain`: thrusters apply `(1 + g) F_T` where `F_T` is commanded along an axis of SRF.
 ///
-/// `z_i = −g T_S^{O_i} e F_T,e/m_S`; g: 1, ±0.3. `α̂` knows nothing of forces, so nothing acts through it.
+/// `z_i = −g T_S^{O_i} e F_T,e/m_S`; g: 1, ±0.3. `α̂` does not depend on forces, so no term acts through it.
 #[derive(Debug)]
-pub(crate) struct MpsGainRecipe(usize);
+pub(crate) struct MpsGain(usize);
 
-/// See [`MpsGainRecipe`].
-pub(crate) type MpsGain = Linear<MpsGainRecipe>;
-
-impl Recipe for MpsGainRecipe {
+impl LinearEffect for MpsGain {
     const MANIFEST: Manifest = manifest(
         "mps-gain",
-        "Thrusters push more or less along an axis than they are told",
+        "Gain of the thrusters' force along an axis differs from one",
+        &[],
         &["sc.x", "sc.y", "sc.z"],
         &["commands"],
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(sc_axis(setup.instance())))
+        Ok(Self(axis_of(setup.instance())))
     }
 
-    fn parts(&self, mission: &Mission, _: &Available) -> Result<Vec<Part>, PluginError> {
-        let axis = along(self.0);
-        Ok(Part::only("1", GAIN, thrust(mission, &(axis * axis.transpose()))))
+    fn coefficients(&self, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
+        let axis = unit_vector(self.0);
+        Ok(CoefficientForms::only("1", GAIN, thrust_terms(mission, &(axis * axis.transpose()))))
     }
 }
 
-/// `mps-tilt`: the thrusters' frame is turned by `θ` about an axis `e` of SRF, so that `F_T` acts as `F_T + θ e × F_T`.
+/// `mps-tilt`: the thrusters' frame is rotated by `θ` about an axis `e` of SRF, so `F_T` acts as `F_T + θ e × F_T`.
 ///
 /// `z_i = −θ T_S^{O_i} (e × F_T)/m_S`; θ: rad, ±0.1.
 #[derive(Debug)]
-pub(crate) struct MpsTiltRecipe(usize);
+pub(crate) struct MpsTilt(usize);
 
-/// See [`MpsTiltRecipe`].
-pub(crate) type MpsTilt = Linear<MpsTiltRecipe>;
-
-impl Recipe for MpsTiltRecipe {
-    const MANIFEST: Manifest =
-        manifest("mps-tilt", "The thrusters' frame is turned about an axis", &["sc.x", "sc.y", "sc.z"], &["commands"]);
+impl LinearEffect for MpsTilt {
+    const MANIFEST: Manifest = manifest(
+        "mps-tilt",
+        "The thrusters' frame is rotated about an axis",
+        &[],
+        &["sc.x", "sc.y", "sc.z"],
+        &["commands"],
+    );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(sc_axis(setup.instance())))
+        Ok(Self(axis_of(setup.instance())))
     }
 
-    fn parts(&self, mission: &Mission, _: &Available) -> Result<Vec<Part>, PluginError> {
-        Ok(Part::only("rad", TILT_RAD, thrust(mission, &along(self.0).cross_matrix())))
+    fn coefficients(&self, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
+        Ok(CoefficientForms::only("rad", TILT_RAD, thrust_terms(mission, &unit_vector(self.0).cross_matrix())))
     }
 }
 
-/// `torque-gain`: thrusters turn with `(1 + g) M_T` where `M_T` is commanded about an axis of SRF; an error of the inertia about
-/// it looks the same.
+/// `torque-gain`: thrusters apply `(1 + g) M_T` where `M_T` is commanded about an axis of SRF; g: 1, ±0.15.
 ///
-/// The attitude channels see `g J_S⁻¹ e M_T,e` (eq:SC_attitude_dynamics). The test masses see it through `α̂`: the right one is
-/// `α̂ + g ∂α̂/∂g`, so that their channels, which have `Φ(α̂) b` explained, show `−g [T ∂α̂/∂g ×] b` more (eq:
-/// `TM_SC_relative_acceleration`), a product with the offset of the model. Where thrusters have a layout, the noise of their torque,
-/// of which the smoother's estimate depends on `g`, says something of the force that is in `û`: `g ∂û/∂g` more. g: 1, ±0.15.
+/// * Attitude: `g J_S⁻¹ e M_T,e` (eq:SC_attitude_dynamics).
+/// * Test masses, through the estimate of the angular acceleration: `−g [T ∂α̂/∂g ×] b`
+///   (eq:TM_SC_relative_acceleration), a product with the model's offset.
+/// * Test masses, for thrusters with a layout: `g ∂û/∂g`, because `û` contains the force correlated with the estimated
+///   torque noise, which depends on g.
 #[derive(Debug)]
-pub(crate) struct TorqueGainRecipe(usize);
+pub(crate) struct TorqueGain(usize);
 
-/// See [`TorqueGainRecipe`].
-pub(crate) type TorqueGain = Linear<TorqueGainRecipe>;
-
-impl Recipe for TorqueGainRecipe {
+impl LinearEffect for TorqueGain {
     const MANIFEST: Manifest = manifest(
         "torque-gain",
-        "Thrusters turn the spacecraft more or less about an axis than they are told, or its inertia is another",
+        "Gain of the thrusters' torque about an axis differs from one, or the inertia does",
+        &[],
         &["sc.x", "sc.y", "sc.z"],
         &["commands", "torque-response"],
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(sc_axis(setup.instance())))
+        Ok(Self(axis_of(setup.instance())))
     }
 
-    fn parts(&self, mission: &Mission, available: &Available) -> Result<Vec<Part>, PluginError> {
+    fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
         let axis = self.0;
         let inverse = mission.spacecraft.inertia_inverse();
-        let torque = Series::Column(Source::torque(axis));
-        let mut terms: Vec<Term> = (0..3).map(|j| Term::new(turn(j), torque.clone(), inverse[(j, axis)])).collect();
-        let response = |j| Series::Column(Source::alpha_by_torque_gain(axis, j));
-        terms.extend(through_offset(available, mission, "the effect torque-gain", response, 1.0)?);
+        let torque = Series::Column(InputColumn::torque(axis));
+        let mut terms: Vec<Term> =
+            (0..3).map(|j| Term::new(attitude_channel(j), torque.clone(), inverse[(j, axis)])).collect();
+        let response = |j| Series::Column(InputColumn::alpha_by_torque_gain(axis, j));
+        terms.extend(offset_coupling_terms(available, mission, "the effect torque-gain", response, 1.0)?);
         for (tm, row) in (0..2).flat_map(|tm| (0..3).map(move |row| (tm, row))) {
-            let source = Source::known_by_torque_gain(axis, tm, row);
+            let source = InputColumn::known_accel_by_torque_gain(axis, tm, row);
             if available.find(&source.name).is_some() {
-                terms.push(Term::new(accel(tm, row), Series::Column(source), 1.0));
+                terms.push(Term::new(accel_channel(tm, row), Series::Column(source), 1.0));
             }
         }
-        Ok(Part::only("1", TORQUE_GAIN, terms))
+        Ok(CoefficientForms::only("1", TORQUE_GAIN, terms))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bench::{Bench, Wrong};
-    use crate::linear::AXES;
+    use crate::common::AXES;
+    use crate::test_spacecraft::{Deviations, TestSpacecraft};
 
     #[test]
-    fn electrodes_of_another_gain_push_the_test_mass_and_the_spacecraft_back() {
+    fn es_gain_matches_the_derivative() {
         for (tm, axis) in [(0, 1), (0, 2), (1, 1), (1, 2)] {
             let instance = format!("tm{}.{}", tm + 1, AXES[axis]);
-            Bench::new().check::<EsGainRecipe>(&instance, "", &[&|w, g| w.electrodes[tm][(axis, axis)] += g]);
+            TestSpacecraft::new().assert_matches_derivative::<EsGain>(
+                &instance,
+                "",
+                &[&|w, g| w.electrode_gain[tm][(axis, axis)] += g],
+            );
         }
     }
 
     #[test]
-    fn electrodes_that_push_aside_push_along_the_second_axis_named() {
+    fn es_crosstalk_matches_the_derivative() {
         for (tm, from, to) in [(0, 1, 0), (0, 1, 2), (0, 2, 0), (1, 2, 1)] {
             let instance = format!("tm{}.{}-{}", tm + 1, AXES[from], AXES[to]);
-            Bench::new().check::<EsCrosstalkRecipe>(&instance, "", &[&|w, d| w.electrodes[tm][(to, from)] += d]);
+            TestSpacecraft::new().assert_matches_derivative::<EsCrosstalk>(
+                &instance,
+                "",
+                &[&|w, d| w.electrode_gain[tm][(to, from)] += d],
+            );
         }
     }
 
     #[test]
-    fn thrusters_of_another_gain_move_both_housings() {
+    fn mps_gain_matches_the_derivative() {
         for axis in 0..3 {
             let instance = format!("sc.{}", AXES[axis]);
-            Bench::new().check::<MpsGainRecipe>(&instance, "", &[&|w, g| w.thrust[(axis, axis)] += g]);
+            TestSpacecraft::new().assert_matches_derivative::<MpsGain>(
+                &instance,
+                "",
+                &[&|w, g| w.thrust_gain[(axis, axis)] += g],
+            );
         }
     }
 
     #[test]
-    fn tilted_thrusters_push_across() {
+    fn mps_tilt_matches_the_derivative() {
         for axis in 0..3 {
-            // A rotation, not its first order.
-            let tilt = move |w: &mut Wrong, angle: f64| {
-                w.thrust = *nalgebra::Rotation3::new(along(axis) * angle).matrix();
+            // Exact rotation, of which the effect declares the first order.
+            let tilt = move |w: &mut Deviations, angle: f64| {
+                w.thrust_gain = *nalgebra::Rotation3::new(unit_vector(axis) * angle).matrix();
             };
-            Bench::new().check::<MpsTiltRecipe>(&format!("sc.{}", AXES[axis]), "", &[&tilt]);
+            TestSpacecraft::new().assert_matches_derivative::<MpsTilt>(&format!("sc.{}", AXES[axis]), "", &[&tilt]);
         }
     }
 
-    /// The smoother sees a part of the unknown torque, another about each axis.
+    /// A smoother with a different gain about each axis.
     #[test]
-    fn a_torque_of_another_gain_acts_on_the_attitude_and_through_the_offset() {
-        for (axis, layout) in [(0, false), (1, false), (2, false), (0, true), (1, true), (2, true)] {
-            let sees = Matrix3::new(0.7, 0.1, -0.2, 0.1, 0.4, 0.05, -0.1, 0.2, 0.9);
-            let bench = Bench { sees, layout, ..Bench::new() };
+    fn torque_gain_matches_the_derivative() {
+        for (axis, thruster_layout) in [(0, false), (1, false), (2, false), (0, true), (1, true), (2, true)] {
+            let smoother_gain = Matrix3::new(0.7, 0.1, -0.2, 0.1, 0.4, 0.05, -0.1, 0.2, 0.9);
+            let test_spacecraft = TestSpacecraft { smoother_gain, thruster_layout, ..TestSpacecraft::new() };
             let instance = format!("sc.{}", AXES[axis]);
-            bench.check::<TorqueGainRecipe>(&instance, "", &[&|w, g| w.torque[(axis, axis)] += g]);
+            test_spacecraft.assert_matches_derivative::<TorqueGain>(
+                &instance,
+                "",
+                &[&|w, g| w.torque_gain[(axis, axis)] += g],
+            );
         }
     }
 
     #[test]
-    fn without_an_offset_in_the_model_a_torque_gain_acts_on_the_attitude_alone() {
-        let bench = Bench::new();
-        let mut available = bench.available();
-        let parts = TorqueGainRecipe(1).parts(&bench.mission, &available).unwrap();
-        assert!(parts[0].forms[0].terms.iter().any(|t| t.times.as_deref() == Some("com-offset.tm2.z")));
-        // One that only asks to be in the model has no value.
+    fn torque_gain_acts_on_the_attitude_alone_without_an_offset_in_the_model() {
+        let test_spacecraft = TestSpacecraft::new();
+        let mut available = test_spacecraft.available();
+        let coefficients = TorqueGain(1).coefficients(&test_spacecraft.mission, &available).unwrap();
+        assert!(coefficients[0].forms[0].terms.iter().any(|t| t.times.as_deref() == Some("com-offset.tm2.z")));
+        // The coefficient of a candidate has no value.
         available.coefficients.iter_mut().for_each(|c| c.candidate = true);
-        let parts = TorqueGainRecipe(1).parts(&bench.mission, &available).unwrap();
-        assert!(parts[0].forms[0].terms.iter().all(|t| t.channel.starts_with("sc.alpha") && t.times.is_none()));
-        assert_eq!(parts[0].forms[0].terms.len(), 3);
+        let coefficients = TorqueGain(1).coefficients(&test_spacecraft.mission, &available).unwrap();
+        assert!(coefficients[0].forms[0].terms.iter().all(|t| t.channel.starts_with("sc.alpha") && t.times.is_none()));
+        assert_eq!(coefficients[0].forms[0].terms.len(), 3);
     }
 }

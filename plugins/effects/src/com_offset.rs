@@ -1,22 +1,20 @@
 //! Effect `com-offset`: the offset `b_i` of a test mass's housing from the spacecraft's centre of mass.
 //!
-//! A point at `b` in a frame that turns with `ω` and `α` is accelerated by `Ω b`, `Ω = [α×] + [ω×][ω×]`; the free test
-//! mass stays behind, and its displacement from the housing shows `−Ω b`
-//! (eq:TM_SC_relative_acceleration; the matrix `A` of eq:extended_state_space is printed with the sign turned and
-//! without the second term).
+//! A point fixed in the spacecraft at `b` has the acceleration `Ω b`, `Ω = [α×] + [ω×][ω×]`. A free test mass does not
+//! follow, so its displacement from the housing shows `−Ω b` (eq:TM_SC_relative_acceleration). Matrix `A` of
+//! eq:extended_state_space is printed with the opposite sign and without the second term.
 
 use dragfree_physics::frames::omega_matrix;
 use dragfree_physics::mission::{Housing, Mission, TestMass};
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 
-const AXES: [&str; 3] = ["x", "y", "z"];
+use crate::common::{AXES, manifest, mission, read_srf_vector};
 
-/// `−Ω` in ORF, s⁻²: what one metre of offset along each axis of ORF (column) adds to the acceleration along each axis
-/// of ORF (row), m s⁻².
+/// Regressors `−Ω` in ORF, s⁻², 3 × 3: acceleration along axis `row`, m s⁻², per metre of offset along axis `column`.
 ///
-/// `alpha_srf_rad_s2` is the mean over an interval, `omega_srf_rad_s` the rate in its middle; then this is the mean over
-/// the interval but for `[α×]² Δt²/12`, 1e-22 s⁻² at 0.1 s and 1e-10 rad s⁻², a billionth of the signal.
+/// `alpha_srf_rad_s2` is the mean over an interval and `omega_srf_rad_s` the rate in its middle. The result is the mean
+/// over the interval up to `[α×]² Δt²/12`, which is negligible at the sample rates of drag-free control.
 #[must_use]
 pub fn regressors(
     dcm_orf_from_srf: &Matrix3<f64>,
@@ -26,7 +24,7 @@ pub fn regressors(
     -omega_matrix(&(dcm_orf_from_srf * omega_srf_rad_s), &(dcm_orf_from_srf * alpha_srf_rad_s2))
 }
 
-/// The three components of the offset in ORF, m: nominal values, and the intervals that hold the mission's box.
+/// Coefficients of the offset in ORF, m. The ranges are the smallest that contain the mission's box.
 fn coefficients(instance: &str, test_mass: &TestMass) -> [Coefficient; 3] {
     let nominal = test_mass.offset_nominal_orf_m();
     let half = test_mass.dcm_orf_from_srf().abs() * Vector3::from(test_mass.offset_box_srf_m);
@@ -37,13 +35,13 @@ fn coefficients(instance: &str, test_mass: &TestMass) -> [Coefficient; 3] {
         lower: nominal[j] - half[j],
         upper: nominal[j] + half[j],
         initial: nominal[j],
-        // The truth must lie in the box, so its half width as one standard deviation leaves the data the word.
+        // The half width of the box as one standard deviation is a weak prior: the data dominate.
         prior_sigma: half[j],
         ..Coefficient::default()
     })
 }
 
-/// The box of the mission, exact in SRF: `(T_O^S b)_i` within `offset_box` of the nominal offset.
+/// The mission's box in SRF: each component of `T_O^S b` within `offset_box` of the nominal offset.
 fn box_constraints(instance: &str, test_mass: &TestMass) -> [Constraint; 3] {
     let srf_from_orf = test_mass.dcm_orf_from_srf().transpose();
     [0, 1, 2].map(|i| Constraint {
@@ -57,8 +55,8 @@ fn box_constraints(instance: &str, test_mass: &TestMass) -> [Constraint; 3] {
     })
 }
 
-/// This test mass's part of `T_{O_1}^S b_1 − T_{O_2}^S b_2` = surveyed baseline within its tolerance. It takes both test
-/// masses, so it counts only when both are in the model.
+/// This test mass's terms of the baseline survey `T_{O_1}^S b_1 − T_{O_2}^S b_2`, within its tolerance. The engine adds
+/// the terms of both test masses and applies the constraint only if both are present (`parts`).
 fn baseline_constraints(instance: &str, test_mass: &TestMass, housing: &Housing) -> [Constraint; 3] {
     let srf_from_orf = test_mass.dcm_orf_from_srf().transpose();
     let sign = if instance == "tm1" { 1.0 } else { -1.0 };
@@ -73,7 +71,7 @@ fn baseline_constraints(instance: &str, test_mass: &TestMass, housing: &Housing)
     })
 }
 
-/// Row `i` of a matrix as weights of the three coefficients, without zeros.
+/// Row `i` of a matrix as nonzero weights of the three coefficients.
 fn terms(instance: &str, matrix: &Matrix3<f64>, i: usize, sign: f64) -> Vec<(String, f64)> {
     let weighted = (0..3).filter(|j| matrix[(i, *j)] != 0.0);
     weighted.map(|j| (format!("com-offset.{instance}.{}", AXES[j]), sign * matrix[(i, j)])).collect()
@@ -87,9 +85,9 @@ fn frame(instance: &str) -> &'static str {
 struct Handles {
     alpha: [In; 3],
     omega: [In; 3],
-    /// Per channel that exists: its row of the matrix, and a column per coefficient.
+    /// Existing channels: row of the matrix, and an output column per coefficient.
     channels: Vec<(usize, [Out; 3])>,
-    /// From `t_k` to the middle of what a channel's sample averages, s.
+    /// Time from `t_k` to the middle of the interval that a channel's sample averages, s.
     middle_s: f64,
 }
 
@@ -103,30 +101,24 @@ pub struct ComOffset {
 }
 
 impl Effect for ComOffset {
-    const MANIFEST: Manifest = Manifest {
-        id: "com-offset",
-        version: env!("CARGO_PKG_VERSION"),
-        licence: "MIT OR Apache-2.0",
-        description: "Offset of a test mass's housing from the spacecraft's centre of mass",
-        parameters: &[],
-        instances: &["tm1", "tm2"],
-        needs: &[],
-    };
+    const MANIFEST: Manifest = manifest(
+        "com-offset",
+        "Offset of a test mass's housing from the spacecraft's centre of mass",
+        &[],
+        &["tm1", "tm2"],
+        &[],
+    );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        let mission = Mission::from_json(setup.mission_json())?;
+        let mission = mission(setup)?;
         let instance = setup.instance().to_owned();
         let dcm_orf_from_srf = mission.test_mass(&instance, "the effect com-offset")?.dcm_orf_from_srf();
         Ok(Self { instance, mission, dcm_orf_from_srf, handles: None })
     }
 
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
-        let mut vector = |stem: &str, unit: &str| -> Result<[In; 3], PluginError> {
-            let [x, y, z] = AXES.map(|axis| link.read(&Want::new(format!("{stem}.{axis}")).unit(unit).frame("SRF")));
-            Ok([x?, y?, z?])
-        };
-        let alpha = vector("sc.alpha_srf_rad_s2", "rad s-2")?;
-        let omega = vector("sc.omega_srf_rad_s", "rad s-1")?;
+        let alpha = read_srf_vector(link, "sc.alpha_srf_rad_s2", "rad s-2")?;
+        let omega = read_srf_vector(link, "sc.omega_srf_rad_s", "rad s-1")?;
         let test_mass = self.mission.test_mass(&self.instance, "the effect com-offset")?;
         let coefficients = coefficients(&self.instance, test_mass);
         for coefficient in &coefficients {
@@ -143,8 +135,8 @@ impl Effect for ComOffset {
         }
         if channels.is_empty() {
             return Err(PluginError::error(format!(
-                "effect com-offset:{0} acts on the channels {0}.accel.x, y and z, and no stage before it makes any of \
-                 them; put hinf-dfacs, or another stage that does, before the effects, or take {0} out of the model",
+                "effect com-offset:{0} acts on the channels {0}.accel.x, y and z, but no earlier stage writes any of them; put \
+                 a stage that does (hinf-dfacs) before the effects in the pipeline, or remove {0} from the model",
                 self.instance
             )));
         }
@@ -163,7 +155,7 @@ impl Effect for ComOffset {
 
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
         let Some(handles) = &self.handles else {
-            return Err(PluginError::fatal("com-offset: called before it was linked"));
+            return Err(PluginError::fatal("com-offset: process called before link"));
         };
         let [alpha, omega] = [handles.alpha, handles.omega].map(|vector| vector.map(|axis| input.f64(axis)));
         for k in 0..input.rows() {
@@ -184,7 +176,7 @@ mod tests {
     use super::*;
     use dragfree_physics::frames::dcm_turned_about_z;
 
-    /// Attitude of a tumbling body, inertial from SRF, written out as products of plane rotations.
+    /// Attitude of a tumbling body, inertial from SRF, as a product of plane rotations.
     fn attitude(t: f64) -> Matrix3<f64> {
         let (a, b, c) = (0.3 * (1.1 * t).sin() + 0.2 * t, 0.4 * (0.7 * t).cos(), 0.5 * (0.9 * t).sin() - 0.1 * t * t);
         let x = Matrix3::new(1.0, 0.0, 0.0, 0.0, a.cos(), -a.sin(), 0.0, a.sin(), a.cos());
@@ -206,10 +198,9 @@ mod tests {
         Vector3::new(spin[(2, 1)], spin[(0, 2)], spin[(1, 0)])
     }
 
-    /// The housing is carried along the second derivative of its inertial position; a free mass beside it is not, so
-    /// relative to the housing it falls the other way. Position differences know nothing of `Ω`.
+    /// The expected value is the second derivative of inertial positions, computed without `Ω`.
     #[test]
-    fn the_free_mass_stays_behind_the_point_that_the_body_carries_along() {
+    fn regressors_match_differentiated_inertial_positions() {
         for (angle, b) in [(0.52, Vector3::new(0.09, 0.155, 0.0)), (-0.52, Vector3::new(0.091, -0.155, 0.02))] {
             let orf_from_srf = dcm_turned_about_z(angle);
             let b_srf = orf_from_srf.transpose() * b;
@@ -219,7 +210,7 @@ mod tests {
                 let (alpha, omega) = (derivative(rate, t), rate(t));
                 let seen = regressors(&orf_from_srf, &alpha, &omega) * b;
                 assert!((seen + carried).norm() < 1e-7 * carried.norm(), "{seen} against −{carried}");
-                // The test sees each sign and each term.
+                // A wrong sign or a missing term must fail.
                 for (alpha_sign, omega_factor) in [(-1.0, 1.0), (1.0, 0.0), (0.0, 1.0)] {
                     let wrong = regressors(&orf_from_srf, &(alpha * alpha_sign), &(omega * omega_factor)) * b;
                     assert!((wrong + carried).norm() > 0.05 * carried.norm());
@@ -228,9 +219,9 @@ mod tests {
         }
     }
 
-    /// Mean over an interval of constant α by Simpson's rule, which is exact for a square, against the rate in its middle.
+    /// Reference: Simpson's rule over the interval, exact for a quadratic.
     #[test]
-    fn the_rate_in_the_middle_gives_the_mean_over_the_interval() {
+    fn the_rate_at_mid_interval_gives_the_interval_mean() {
         let (alpha, omega, dt) = (Vector3::new(3e-3, -2e-3, 1e-3), Vector3::new(0.02, 0.5, -0.3), 0.1);
         let t = dcm_turned_about_z(0.5);
         let at = |tau: f64| regressors(&t, &alpha, &(omega + alpha * tau));
@@ -257,10 +248,9 @@ mod tests {
         constraint.terms.iter().map(|(name, weight)| weight * of(name)).sum()
     }
 
-    /// The corners of the box in SRF: each meets the exact constraints with equality and lies within the ranges of the
-    /// coefficients, some on their ends.
+    /// Each corner of the box meets the constraints with equality and lies within the ranges.
     #[test]
-    fn the_box_holds_its_corners_and_no_more() {
+    fn box_constraints_and_ranges_are_tight_at_the_corners() {
         let tm = test_mass(0.4, 0.18);
         let (constraints, ranges) = (box_constraints("tm1", &tm), coefficients("tm1", &tm));
         let mut reached = [false; 6];
@@ -283,9 +273,9 @@ mod tests {
         assert_eq!(ranges[0].name, "com-offset.tm1.x");
     }
 
-    /// The paper's offsets differ by exactly its baseline; the parts of the two test masses add up to it.
+    /// The paper's offsets differ by exactly its baseline.
     #[test]
-    fn the_two_parts_of_the_baseline_add_up() {
+    fn baseline_terms_of_both_test_masses_add_up() {
         let housing: Housing =
             serde_json::from_str(r#"{"baseline_srf_m": [0.0, 0.36, 0.0], "baseline_tolerance_m": 2e-5}"#).unwrap();
         let third = std::f64::consts::FRAC_PI_6;

@@ -1,17 +1,17 @@
-//! What the effects of this crate share: names of places, responses of the spacecraft's motion, saved numbers, telemetry
-//! columns by unit.
+//! Parts shared by several effects: parsing of instance names, responses of test masses and attitude, lookup of
+//! housekeeping columns, saved state.
 
 use dragfree_physics::mission::{Mission, MissionError};
 use dragfree_sdk::prelude::*;
 
 /// Axes as the columns name them.
 pub(crate) const AXES: [&str; 3] = ["x", "y", "z"];
-/// What is made of housekeeping and has passed a lag or a slow sensor has nothing above this, Hz.
+/// Upper band edge of series made from housekeeping, Hz: thermometers and first-order lags pass nothing above it.
 pub(crate) const SLOW_HZ: f64 = 0.05;
-/// Every axis of both test masses.
+/// Instances of an effect that acts on one axis of one test mass.
 pub(crate) const TM_AXES: [&str; 6] = ["tm1.x", "tm1.y", "tm1.z", "tm2.x", "tm2.y", "tm2.z"];
 
-/// The constant parts of a manifest filled in.
+/// A manifest with this crate's version and licence.
 pub(crate) const fn manifest(
     id: &'static str,
     description: &'static str,
@@ -23,53 +23,56 @@ pub(crate) const fn manifest(
     Manifest { id, version, licence, description, parameters, instances, needs }
 }
 
-/// Index of the axis at the end of `sc.x` or `tm1.x`.
+/// Index of the axis that ends an instance name: 0 for `sc.x` or `tm1.x`.
 pub(crate) fn axis_of(instance: &str) -> usize {
     let letter = instance.rsplit('.').next().unwrap_or_default();
     AXES.iter().position(|axis| *axis == letter).unwrap_or(0)
 }
 
-/// `tm1` of `tm1.x`.
+/// Test mass of an instance name: `tm1` for `tm1.x`.
 pub(crate) fn tm_of(instance: &str) -> &str {
     instance.split('.').next().unwrap_or_default()
 }
 
-/// `tm1.accel.x` of `tm1.x`.
-pub(crate) fn channel_of(instance: &str) -> String {
+/// Acceleration channel of an instance: `tm1.accel.x` for `tm1.x`.
+pub(crate) fn accel_channel_of(instance: &str) -> String {
     format!("{}.accel.{}", tm_of(instance), AXES[axis_of(instance)])
 }
 
-/// A series: its table and its name.
-pub(crate) type Place = (String, String);
+/// Table and name of a series.
+pub(crate) type SeriesRef = (String, String);
 
-/// `factor` times a series.
-pub(crate) fn response(channel: String, place: &Place, factor: f64) -> Response {
+/// The response `factor · series` of a channel.
+pub(crate) fn response(channel: String, place: &SeriesRef, factor: f64) -> Response {
     Response { channel, table: place.0.clone(), series: place.1.clone(), factor, times: None }
 }
 
-/// What a force on the spacecraft along an axis of SRF, a series in newton, does to the test masses that stay behind:
-/// `−T_S^{O_i} e/m_S` on `tmN.accel.x|y|z` (eq:TM_SC_relative_acceleration).
-pub(crate) fn behind_spacecraft(mission: &Mission, axis: usize, force: &Place) -> Vec<Response> {
+/// Responses of the test masses to a force on the spacecraft along an axis of SRF; `force` is a series in N.
+///
+/// Free test masses do not follow the spacecraft: `−T_S^{O_i} e/m_S` on `tmN.accel.AXIS`,
+/// eq:TM_SC_relative_acceleration.
+pub(crate) fn responses_to_spacecraft_force(mission: &Mission, axis: usize, force: &SeriesRef) -> Vec<Response> {
     let each = mission.test_mass.iter().flat_map(|(name, tm)| {
         let column = tm.dcm_orf_from_srf().column(axis) / -mission.spacecraft.mass_kg;
         (0..3).map(move |row| response(format!("{name}.accel.{}", AXES[row]), force, column[row]))
     });
-    // Zeros of a rotation about s_3 come out as rounding.
+    // Exact zeros of the rotation appear as rounding errors.
     each.filter(|r| r.factor.abs() * mission.spacecraft.mass_kg > 1e-12).collect()
 }
 
-/// What a torque on the spacecraft about an axis of SRF, a series in N m, does to its attitude: `J_S⁻¹ e` on
-/// `sc.alpha.x|y|z` (eq:SC_attitude_dynamics).
-pub(crate) fn turning(mission: &Mission, axis: usize, torque: &Place) -> Vec<Response> {
+/// Responses of the attitude to a torque on the spacecraft about an axis of SRF; `torque` is a series in N m.
+///
+/// `J_S⁻¹ e` on `sc.alpha.x|y|z` (eq:SC_attitude_dynamics).
+pub(crate) fn responses_to_spacecraft_torque(mission: &Mission, axis: usize, torque: &SeriesRef) -> Vec<Response> {
     let column = mission.spacecraft.inertia_inverse().column(axis).into_owned();
     (0..3).map(|row| response(format!("sc.alpha.{}", AXES[row]), torque, column[row])).collect()
 }
 
-/// The responses on channels that exist.
+/// Keeps the responses of channels that an earlier stage writes.
 ///
 /// # Errors
-/// None of the channels exists.
-pub(crate) fn on_channels(
+/// No channel of the responses exists.
+pub(crate) fn keep_available(
     available: &Available,
     by: &str,
     mut responses: Vec<Response>,
@@ -80,24 +83,24 @@ pub(crate) fn on_channels(
         wanted.sort();
         wanted.dedup();
         return Err(PluginError::error(format!(
-            "effect {by} acts on {}, and no stage before it makes any of them; put hinf-dfacs, or another stage that does, before \
-             the effects, or take {by} out of the model",
+            "effect {by} acts on the channels {}, but no earlier stage writes any of them; put a stage that does (hinf-dfacs) before \
+             the effects in the pipeline, or remove {by} from the model",
             wanted.join(", ")
         )));
     }
     Ok(responses)
 }
 
-/// Housekeeping columns of a unit, in the order of the telemetry. Their names say nothing to an effect.
-pub(crate) fn housekeeping<'a>(available: &'a Available, unit: &'a str) -> impl Iterator<Item = &'a Column> {
+/// Housekeeping columns with a unit, in telemetry order. Effects select by unit because missions differ in names.
+pub(crate) fn housekeeping_in<'a>(available: &'a Available, unit: &'a str) -> impl Iterator<Item = &'a Column> {
     available.columns.iter().filter(move |c| c.table == "grid" && c.name.starts_with("hk.") && c.unit == unit)
 }
 
-/// The housekeeping column that a parameter names.
+/// Finds the housekeeping column that a parameter names.
 ///
 /// # Errors
-/// There is none of that name and unit; the sentence lists those of the unit.
-pub(crate) fn named<'a>(
+/// No column has that name and unit; the message lists the columns with the unit.
+pub(crate) fn find_housekeeping<'a>(
     available: &'a Available,
     by: &str,
     parameter: &str,
@@ -105,48 +108,57 @@ pub(crate) fn named<'a>(
     unit: &str,
 ) -> Result<&'a Column, PluginError> {
     available.columns.iter().find(|c| c.table == "grid" && c.name == name && c.unit == unit).ok_or_else(|| {
-        let all: Vec<&str> = housekeeping(available, unit).map(|c| c.name.as_str()).collect();
-        let all = if all.is_empty() { "none in this telemetry".to_owned() } else { all.join(", ") };
-        let found = if name.is_empty() { "is not given".to_owned() } else { format!("= \"{name}\" is none of them") };
+        let all: Vec<&str> = housekeeping_in(available, unit).map(|c| c.name.as_str()).collect();
+        let all = if all.is_empty() { "none".to_owned() } else { all.join(", ") };
+        let found = if name.is_empty() { "is not set".to_owned() } else { format!("= \"{name}\" does not") };
         PluginError::error(format!(
-            "effect {by}: its parameter `{parameter}` must name a telemetry column in {unit}, and {found}; there are: {all}"
+            "effect {by}: parameter `{parameter}` must name a housekeeping column in {unit} but {found}; columns in {unit}: {all}"
         ))
     })
 }
 
-/// A column by table and name.
-pub(crate) fn place(column: &Column) -> Place {
+/// Reads the columns `STEM.x`, `STEM.y` and `STEM.z` of a vector in SRF.
+///
+/// # Errors
+/// A column is missing, or has another unit or frame.
+pub(crate) fn read_srf_vector(link: &mut EffectLink<'_, '_>, stem: &str, unit: &str) -> Result<[In; 3], PluginError> {
+    let [x, y, z] = AXES.map(|axis| link.read(&Want::new(format!("{stem}.{axis}")).unit(unit).frame("SRF")));
+    Ok([x?, y?, z?])
+}
+
+/// The series that a column is.
+pub(crate) fn series_of(column: &Column) -> SeriesRef {
     (column.table.clone(), column.name.clone())
 }
 
-/// The mission, with the sentence of an effect that cannot do without it.
+/// Parses the mission file.
 pub(crate) fn mission(setup: &Setup) -> Result<Mission, MissionError> {
     Mission::from_json(setup.mission_json())
 }
 
-/// The number of rows left out between two epochs; 0 between neighbours.
-pub(crate) fn rows_between(before_ns: i64, now_ns: i64, dt_s: f64) -> u64 {
+/// Number of rows missing between two epochs; 0 for consecutive epochs.
+pub(crate) fn skipped_rows(before_ns: i64, now_ns: i64, dt_s: f64) -> u64 {
     let rows = ((now_ns - before_ns) as f64 * 1e-9 / dt_s).round();
     if rows >= 2.0 { rows as u64 - 1 } else { 0 }
 }
 
-/// Numbers as bytes behind a mark that says whose they are.
+/// Encodes a state: a mark that identifies its owner and layout, then the numbers, little endian.
 pub(crate) fn saved(mark: &[u8; 8], numbers: impl IntoIterator<Item = f64>) -> Vec<u8> {
     let mut bytes = mark.to_vec();
     bytes.extend(numbers.into_iter().flat_map(f64::to_le_bytes));
     bytes
 }
 
-/// Takes back `count` numbers of [`saved`].
+/// Decodes `count` numbers written by [`saved`].
 ///
 /// # Errors
-/// The bytes are something else.
+/// The mark or the length differs.
 pub(crate) fn loaded(mark: &[u8; 8], by: &str, count: usize, bytes: &[u8]) -> Result<Vec<f64>, PluginError> {
     let (words, rest) = bytes.strip_prefix(mark).unwrap_or(&[0]).as_chunks::<8>();
     if !rest.is_empty() || words.len() != count {
         return Err(PluginError::error(format!(
-            "effect {by}: {} bytes are not its state of {count} numbers; it was saved by another version or for another model, so \
-             start from the telemetry",
+            "effect {by}: a saved state of {} bytes does not fit the {count} numbers expected: it comes from another version or \
+             model; rerun from the telemetry without it",
             bytes.len()
         )));
     }

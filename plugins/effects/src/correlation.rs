@@ -1,24 +1,20 @@
-//! Effect `mps-correlation`: thruster noise that comes from single thrusters pushes and turns at once.
+//! Effect `mps-correlation`: noise of single thrusters makes correlated force and torque.
 //!
-//! A thruster at `r` that pushes along `d` with noise n makes the force `d n` and the torque `(r × d) n`. Of the torque noise the
-//! smoother knows much: `M̂ = J_S α̂ − (M_T + M_SRP)`, what turned the spacecraft besides the known torques. The force that comes
-//! with it is `K M̂`, `K = E[F Mᵀ] E[M Mᵀ]⁻¹`, nine coefficients `force_X_by_torque_Y`, N per N m, SRF, and the test masses stay
-//! behind: `z_i = −T_S^{O_i} K M̂/m_S` (eq:TM_SC_relative_acceleration). Thrusters a metre from the centre of mass make K of
-//! order one per metre: **range** ±5.
+//! The smoother's residual torque is `M̂ = J_S α̂ − (M_T + M_SRP)`, SRF, N m. The force correlated with it is `K M̂`,
+//! `K = E[F Mᵀ] E[M Mᵀ]⁻¹`, with nine coefficients `force_X_by_torque_Y`, N per N m, SRF, range ±5. The test masses
+//! show `z_i = −T_S^{O_i} K M̂/m_S` (eq:TM_SC_relative_acceleration). Left out of a model, the correlation biases
+//! `b_z`.
 //!
-//! **Confounders.** `M̂` is nearly `J_S α̂` where the loop commands little, so K is the offset's twin: a column `K e_j` looks
-//! like an offset `−[J⁻¹ e_j ×] b` wherever commands are small against noise, above the attitude loop's bandwidth. This is
-//! how the correlation biases `b_z` by centimetres when it is left out; told apart only below that bandwidth, where
-//! commands cancel what K sees and the offset sees neither. Gyroscopic and electrode torques, 1e-10 N m, are left in `M̂`: they are
-//! nearly constant.
+//! Confounder: the centre-of-mass offset, see Methods, "Thruster correlation". Gyroscopic and electrode torques are
+//! nearly constant and stay in `M̂`.
 
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::common::{AXES, axis_of, behind_spacecraft, manifest, mission, on_channels};
+use crate::common::{AXES, axis_of, keep_available, manifest, mission, read_srf_vector, responses_to_spacecraft_force};
 
-const MOST: f64 = 5.0;
+const MAX_PER_METRE: f64 = 5.0;
 
 #[derive(Debug)]
 struct Handles {
@@ -35,15 +31,15 @@ pub(crate) struct MpsCorrelation {
     handles: Option<Handles>,
 }
 
-/// `M̂`, SRF, N m.
-fn unexplained(inertia: &Matrix3<f64>, alpha: &Vector3<f64>, known_nm: &Vector3<f64>) -> Vector3<f64> {
-    inertia * alpha - known_nm
+/// Residual torque `M̂`, SRF, N m.
+fn residual_torque(inertia: &Matrix3<f64>, alpha: &Vector3<f64>, modelled_nm: &Vector3<f64>) -> Vector3<f64> {
+    inertia * alpha - modelled_nm
 }
 
 impl Effect for MpsCorrelation {
     const MANIFEST: Manifest = manifest(
         "mps-correlation",
-        "Force and torque noise of the thrusters belong together",
+        "Force and torque noise of the thrusters are correlated",
         &[],
         &["layout"],
         &["commands"],
@@ -54,28 +50,24 @@ impl Effect for MpsCorrelation {
     }
 
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
-        let mut vector = |stem: &str, unit: &str| -> Result<[In; 3], PluginError> {
-            let [x, y, z] = AXES.map(|axis| link.read(&Want::new(format!("{stem}.{axis}")).unit(unit).frame("SRF")));
-            Ok([x?, y?, z?])
-        };
-        let alpha = vector("sc.alpha_srf_rad_s2", "rad s-2")?;
-        let torque = vector("used.mps_torque_srf_nm", "N m")?;
+        let alpha = read_srf_vector(link, "sc.alpha_srf_rad_s2", "rad s-2")?;
+        let torque = read_srf_vector(link, "used.mps_torque_srf_nm", "N m")?;
         let sunlit = self.mission.solar_pressure.is_some() && available.find("used.sun_srf.x").is_some();
-        let sun = if sunlit { Some(vector("used.sun_srf", "1")?) } else { None };
+        let sun = sunlit.then(|| read_srf_vector(link, "used.sun_srf", "1")).transpose()?;
         let [x, y, z] = AXES.map(|axis| link.series(&format!("torque_excess.{axis}"), "N m", "SRF"));
         self.handles = Some(Handles { alpha, torque, sun, out: [x?, y?, z?] });
         for force in AXES {
             for torque in AXES {
                 let series = (link.table(), format!("torque_excess.{torque}"));
-                let responses = behind_spacecraft(&self.mission, axis_of(force), &series);
+                let responses = responses_to_spacecraft_force(&self.mission, axis_of(force), &series);
                 link.coefficient(&Coefficient {
                     name: format!("mps-correlation.layout.force_{force}_by_torque_{torque}"),
                     unit: "m-1".to_owned(),
                     frame: "SRF".to_owned(),
-                    lower: -MOST,
-                    upper: MOST,
-                    prior_sigma: MOST / 3.0,
-                    responses: on_channels(available, "mps-correlation:layout", responses)?,
+                    lower: -MAX_PER_METRE,
+                    upper: MAX_PER_METRE,
+                    prior_sigma: MAX_PER_METRE / 3.0,
+                    responses: keep_available(available, "mps-correlation:layout", responses)?,
                     ..Coefficient::default()
                 })?;
             }
@@ -85,7 +77,7 @@ impl Effect for MpsCorrelation {
 
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
         let Some(handles) = &self.handles else {
-            return Err(PluginError::fatal("mps-correlation: called before it was linked"));
+            return Err(PluginError::fatal("mps-correlation: process called before link"));
         };
         let inertia = self.mission.spacecraft.inertia();
         let pressure = self.mission.solar_pressure.as_ref();
@@ -93,13 +85,13 @@ impl Effect for MpsCorrelation {
         let (alpha, torque, sun) = (columns(handles.alpha), columns(handles.torque), handles.sun.map(columns));
         for k in 0..input.rows() {
             let at = |columns: [&[f64]; 3]| Vector3::from(columns.map(|axis| axis[k]));
-            let mut known_nm = at(torque);
+            let mut modelled_nm = at(torque);
             if let (Some(pressure), Some(sun)) = (pressure, sun) {
-                known_nm += Vector3::from(pressure.arm_srf_m).cross(&(at(sun) * pressure.force_n));
+                modelled_nm += Vector3::from(pressure.arm_srf_m).cross(&(at(sun) * pressure.force_n));
             }
-            let excess = unexplained(&inertia, &at(alpha), &known_nm);
+            let residual = residual_torque(&inertia, &at(alpha), &modelled_nm);
             for (axis, out) in handles.out.iter().enumerate() {
-                output.f64(*out).push(excess[axis]);
+                output.f64(*out).push(residual[axis]);
             }
         }
         Ok(())

@@ -1,86 +1,84 @@
-//! First-order lags of one column, several at once.
+//! Banks of first-order lags of one column.
 
-use crate::common::rows_between;
+use crate::common::skipped_rows;
 
-/// A lag forgives a missing input for as long as itself, and for this long at least, s.
-const LEAST_PATIENCE_S: f64 = 60.0;
-/// Rows computed between two hand-overs.
-const PIECE: usize = 256;
+/// Time over which the last input is held where values are missing, at least, s.
+const MIN_HOLD_S: f64 = 60.0;
+/// Rows computed between two calls of `emit`.
+const CHUNK_ROWS: usize = 256;
 
-/// `N` first-order lags `τ_j ẏ_j = u − y_j` of one input, each exact for an input that holds from epoch to epoch:
+/// `N` first-order lags `τ_j ẏ_j = u − y_j` of one input, discretised exactly for an input held over each sample:
 ///
 /// `mean_k = u_k + (y_k − u_k)(1 − e^{−Δt/τ})τ/Δt`, `y_{k+1} = u_k + (y_k − u_k)e^{−Δt/τ}`.
 ///
-/// What is given is the mean over `[t_k, t_{k+1})`. A column that is interpolated between its packets is so read half a sample
-/// late, 0.05 s of lags of half a minute and more.
+/// The output is the mean over `[t_k, t_{k+1})`. An interpolated column is thus read half a sample late.
 ///
-/// **What is missing.** Before the first value, NaN. A lag starts settled at its first value. Where values are missing, the last
-/// one holds for as long as the lag (a minute at least): what such a stretch leaves out is still mostly in the lag. Beyond, NaN;
-/// when values come back, the lag starts anew, settled at the first of them.
+/// **Missing values.** NaN before the first value; a lag starts settled at it. Over missing values the last one is held
+/// for `max(τ, 60 s)`. Beyond that the output is NaN and the lag restarts, settled at the next value.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Lags<const N: usize> {
-    left: [f64; N],
-    mean: [f64; N],
-    /// Rows for which a missing input is forgiven.
-    patience: [u64; N],
+    decay: [f64; N],
+    mean_gain: [f64; N],
+    /// Rows over which a missing input is held.
+    max_missing: [u64; N],
     dt_s: f64,
-    /// `y`, the unit of the input.
+    /// State `y`, in the unit of the input.
     y: [f64; N],
-    /// The last value of the input; NaN before the first.
-    held: f64,
-    /// Rows since.
+    /// Last value of the input; NaN before the first.
+    last_input: f64,
+    /// Rows since the last value.
     missing: u64,
     /// Time of the last row, Unix ns; 0 before the first.
     last_ns: i64,
 }
 
 impl<const N: usize> Lags<N> {
-    /// Lags of the time constants `lag_s`, s; a lag of 0 is the input itself.
+    /// Lags with time constants `lag_s` and sample interval `dt_s`, s; a lag of 0 returns the input.
     #[must_use]
     pub fn new(lag_s: [f64; N], dt_s: f64) -> Self {
         let x = lag_s.map(|lag| if lag > 0.0 { dt_s / lag } else { f64::INFINITY });
         Self {
-            left: x.map(|x| (-x).exp()),
-            mean: x.map(|x| if x.is_finite() { -(-x).exp_m1() / x } else { 0.0 }),
-            patience: lag_s.map(|lag| (lag.max(LEAST_PATIENCE_S) / dt_s).ceil() as u64),
+            decay: x.map(|x| (-x).exp()),
+            mean_gain: x.map(|x| if x.is_finite() { -(-x).exp_m1() / x } else { 0.0 }),
+            max_missing: lag_s.map(|lag| (lag.max(MIN_HOLD_S) / dt_s).ceil() as u64),
             dt_s,
             y: [0.0; N],
-            held: f64::NAN,
+            last_input: f64::NAN,
             missing: 0,
             last_ns: 0,
         }
     }
 
-    /// Rows of the input; `give(j, means)` is called with lag `j`'s means, piece by piece.
-    pub fn push(&mut self, time_ns: &[i64], input: &[f64], mut give: impl FnMut(usize, &[f64])) {
-        let mut rows = [[0.0; N]; PIECE];
-        let mut column = [0.0; PIECE];
-        for (times, values) in time_ns.chunks(PIECE).zip(input.chunks(PIECE)) {
+    /// Processes rows of the input; calls `emit(j, means)` with the output of lag `j`, chunk by chunk.
+    pub fn push(&mut self, time_ns: &[i64], input: &[f64], mut emit: impl FnMut(usize, &[f64])) {
+        let mut rows = [[0.0; N]; CHUNK_ROWS];
+        let mut column = [0.0; CHUNK_ROWS];
+        for (times, values) in time_ns.chunks(CHUNK_ROWS).zip(input.chunks(CHUNK_ROWS)) {
             let n = values.len();
-            self.piece(times, values, &mut rows[..n]);
+            self.advance_chunk(times, values, &mut rows[..n]);
             for j in 0..N {
                 for (to, row) in column[..n].iter_mut().zip(&rows[..n]) {
                     *to = row[j];
                 }
-                give(j, &column[..n]);
+                emit(j, &column[..n]);
             }
         }
     }
 
-    fn piece(&mut self, time_ns: &[i64], input: &[f64], rows: &mut [[f64; N]]) {
+    fn advance_chunk(&mut self, time_ns: &[i64], input: &[f64], rows: &mut [[f64; N]]) {
         let step_ns = (self.dt_s * 1.5e9) as i64;
         let mut y = self.y;
         for ((&now_ns, &u), row) in time_ns.iter().zip(input).zip(rows) {
             if u.is_finite() && self.missing == 0 && now_ns - self.last_ns < step_ns {
                 for j in 0..N {
-                    let above = y[j] - u;
-                    row[j] = u + above * self.mean[j];
-                    y[j] = u + above * self.left[j];
+                    let difference = y[j] - u;
+                    row[j] = u + difference * self.mean_gain[j];
+                    y[j] = u + difference * self.decay[j];
                 }
-                self.held = u;
+                self.last_input = u;
             } else {
                 self.y = y;
-                self.uneven_row(now_ns, u, row);
+                self.advance_row(now_ns, u, row);
                 y = self.y;
             }
             self.last_ns = now_ns;
@@ -88,55 +86,55 @@ impl<const N: usize> Lags<N> {
         self.y = y;
     }
 
-    /// A row that does not follow a row with a value, or has none.
+    /// Processes a row that has no value, or follows a gap or a missing value.
     #[cold]
-    fn uneven_row(&mut self, now_ns: i64, u: f64, row: &mut [f64; N]) {
-        for _ in
-            0..rows_between(self.last_ns, now_ns, self.dt_s).min(self.patience.iter().copied().max().unwrap_or(0) + 1)
+    fn advance_row(&mut self, now_ns: i64, u: f64, row: &mut [f64; N]) {
+        for _ in 0..skipped_rows(self.last_ns, now_ns, self.dt_s)
+            .min(self.max_missing.iter().copied().max().unwrap_or(0) + 1)
         {
             self.missing += 1;
-            self.settle(self.held);
+            self.advance(self.last_input);
         }
         if u.is_finite() {
             for j in 0..N {
-                if self.held.is_nan() || self.missing > self.patience[j] {
+                if self.last_input.is_nan() || self.missing > self.max_missing[j] {
                     self.y[j] = u;
                 }
-                row[j] = u + (self.y[j] - u) * self.mean[j];
+                row[j] = u + (self.y[j] - u) * self.mean_gain[j];
             }
-            (self.held, self.missing) = (u, 0);
+            (self.last_input, self.missing) = (u, 0);
         } else {
             self.missing = self.missing.saturating_add(1);
             for j in 0..N {
-                let known = self.missing <= self.patience[j];
-                row[j] = if known { self.held + (self.y[j] - self.held) * self.mean[j] } else { f64::NAN };
+                let known = self.missing <= self.max_missing[j];
+                row[j] =
+                    if known { self.last_input + (self.y[j] - self.last_input) * self.mean_gain[j] } else { f64::NAN };
             }
         }
-        self.settle(self.held);
+        self.advance(self.last_input);
     }
 
-    /// The lags moved on over a sample in which `u` holds.
-    fn settle(&mut self, u: f64) {
+    /// Advances the lags by a sample with input `u`.
+    fn advance(&mut self, u: f64) {
         for j in 0..N {
-            self.y[j] = u + (self.y[j] - u) * self.left[j];
+            self.y[j] = u + (self.y[j] - u) * self.decay[j];
         }
     }
 
-    /// Number of [`Self::state`]'s numbers.
+    /// Length of [`Self::state`].
     pub const STATE: usize = N + 3;
 
-    /// All that the next rows depend on.
+    /// State on which later rows depend; integers are stored as the bits of a float.
     pub fn state(&self) -> impl Iterator<Item = f64> {
-        // Bits carry whole numbers through, whatever their size.
         let whole = [self.missing, self.last_ns.cast_unsigned()].map(f64::from_bits);
-        self.y.into_iter().chain([self.held]).chain(whole)
+        self.y.into_iter().chain([self.last_input]).chain(whole)
     }
 
-    /// Takes back what [`Self::state`] gave, [`Self::STATE`] numbers.
+    /// Restores [`Self::state`], [`Self::STATE`] numbers.
     pub fn set_state(&mut self, state: &[f64]) {
-        if let Some((y, [held, missing, last_ns])) = state.split_at_checked(N) {
+        if let Some((y, [last_input, missing, last_ns])) = state.split_at_checked(N) {
             self.y.copy_from_slice(y);
-            self.held = *held;
+            self.last_input = *last_input;
             (self.missing, self.last_ns) = (missing.to_bits(), last_ns.to_bits().cast_signed());
         }
     }
@@ -159,14 +157,14 @@ mod tests {
         out
     }
 
-    /// Bit by bit, so that NaN equals NaN.
+    /// Bits, so that NaN equals NaN.
     fn bits<const N: usize>(columns: &[Vec<f64>; N]) -> Vec<Vec<u64>> {
         columns.iter().map(|c| c.iter().map(|x| x.to_bits()).collect()).collect()
     }
 
-    /// The equation itself, by Heun's method in many steps a sample, knows nothing of exponentials.
+    /// Reference: Heun's method on the differential equation, without exponentials.
     #[test]
-    fn the_means_are_those_of_the_differential_equation() {
+    fn outputs_are_means_of_the_differential_equation() {
         let lag_s = [0.03, 0.4, 7.0];
         let input: Vec<f64> = (0..40).map(|k| if k < 5 { 2.0 } else { (0.3 * f64::from(k)).sin() }).collect();
         let got = run(&mut Lags::new(lag_s, DT_S), &times(40), &input);
@@ -188,7 +186,7 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_input_holds_for_a_lag_and_then_the_lag_starts_anew() {
+    fn a_missing_input_is_held_for_one_time_constant_then_the_lag_restarts() {
         let (short, long) = (60.0, 200.0);
         let mut input = vec![f64::NAN; 3];
         input.extend(vec![1.0; 10]);
@@ -197,7 +195,7 @@ mod tests {
         let [a, b] = run(&mut Lags::new([short, long], DT_S), &times(input.len()), &input);
         assert!(a[..3].iter().chain(&b[..3]).all(|x| x.is_nan()), "nothing is known before the first value");
         assert!(a[3..13].iter().all(|x| *x == 1.0), "it starts settled");
-        // 600 rows are forgiven to the short lag, and all 1000 to the long one.
+        // The short lag holds 600 rows, the long one all 1000.
         assert!(a[13..613].iter().all(|x| *x == 1.0) && a[613..1013].iter().all(|x| x.is_nan()));
         assert!(b[13..1013].iter().all(|x| *x == 1.0));
         assert_eq!(a[1013], 5.0, "anew, settled");
@@ -205,9 +203,9 @@ mod tests {
         assert!((b[1013] - expected).abs() < 1e-12, "it went on: {}", b[1013]);
     }
 
-    /// Rows that are left out altogether are rows without a value.
+    /// Absent rows are equivalent to rows without a value.
     #[test]
-    fn a_jump_of_time_is_a_gap() {
+    fn absent_rows_are_missing_values() {
         let all = times(3000);
         for left_out in [5, 700, 2500] {
             let mut input: Vec<f64> = (0..3000).map(|k| (0.01 * f64::from(k)).cos()).collect();
@@ -221,9 +219,9 @@ mod tests {
     }
 
     proptest! {
-        /// Pieces of any length, with the state saved and taken back between them, give the same bits.
+        /// Splitting the rows and saving the state in between leaves the output bit by bit the same.
         #[test]
-        fn neither_pieces_nor_saved_states_change_a_bit(
+        fn chunks_and_saved_states_do_not_change_the_output(
             input in prop::collection::vec(prop_oneof![4 => -3.0..3.0, 1 => Just(f64::NAN)], 1..900),
             cut in 0.0..1.0_f64,
         ) {

@@ -1,68 +1,69 @@
-//! The bundled effects, a module each.
+//! The bundled effects, one module per physical cause.
 //!
-//! An effect turns telemetry into regressors, the acceleration that a physical cause adds to a channel per unit of its
-//! coefficient; see ARCHITECTURE.md.
+//! An effect turns telemetry into regressors: the acceleration that a cause adds to a channel per unit of its
+//! coefficient. Derivations are in the guide, chapter "Methods"; labels `eq:...` are those of the reference paper.
 
 pub mod com_offset;
 pub mod formula;
 pub mod lag;
 
 mod actuators;
-#[cfg(test)]
-mod bench;
 mod common;
 mod correlation;
+mod electromagnetic;
 mod geometry;
 mod impulse;
 mod linear;
 mod noise;
 mod readout;
 mod slosh;
-mod steps;
+mod step_pulses;
 mod stiffness;
-mod stray;
 mod sunlight;
+#[cfg(test)]
+mod test_spacecraft;
 mod thermal;
 
 pub use com_offset::ComOffset;
 
 use actuators::{EsCrosstalk, EsGain, MpsGain, MpsTilt, TorqueGain};
 use correlation::MpsCorrelation;
+use electromagnetic::{Charge, Magnetic};
 use formula::Formula;
 use geometry::{OffsetDrift, OpeningAngle};
 use impulse::Impulse;
+use linear::Linear;
 use noise::{IsNoise, MpsNoise, TorqueNoise};
 use readout::{IsCrosstalk, IsScale, TiltToLength, TimeOffset};
 use slosh::Slosh;
 use stiffness::{CrossStiffness, Stiffness};
-use stray::{Charge, Magnetic};
 use sunlight::SolarPressure;
 use thermal::Thermal;
 
 dragfree_sdk::export_plugin!(effects: [
     Charge,
     ComOffset,
-    CrossStiffness,
-    EsCrosstalk,
-    EsGain,
+    Linear<CrossStiffness>,
+    Linear<EsCrosstalk>,
+    Linear<EsGain>,
     Formula,
     Impulse,
-    IsCrosstalk,
+    Linear<IsCrosstalk>,
     IsNoise,
-    IsScale,
+    Linear<IsScale>,
     Magnetic,
     MpsCorrelation,
-    MpsGain,
+    Linear<MpsGain>,
     MpsNoise,
-    MpsTilt,
-    OffsetDrift,
-    OpeningAngle,
+    Linear<MpsTilt>,
+    Linear<OffsetDrift>,
+    Linear<OpeningAngle>,
     Slosh,
-    SolarPressure,
-    Stiffness,
+    Linear<SolarPressure>,
+    Linear<Stiffness>,
     Thermal,
-    TiltToLength,
-    TimeOffset,
-    TorqueGain,
+    Linear<TiltToLength>,
+    Linear<TimeOffset>,
+    Linear<TorqueGain>,
     TorqueNoise,
 ]);

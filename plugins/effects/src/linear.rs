@@ -1,8 +1,8 @@
-//! What most effects have in common: coefficients that act on channels through series with constant factors.
+//! Base of effects whose coefficients act on channels through series with constant factors.
 //!
-//! An effect is a [`Recipe`]: from the mission it works out on which channels each of its coefficients acts, through which
-//! [`Series`], with which factor. [`Linear`] asks for the columns, computes the series that are not columns, and declares the
-//! responses. All of it describes what one unit of the coefficient adds to `measured − known`.
+//! A [`LinearEffect`] states, from the mission, on which channels each coefficient acts, through which [`Series`] and
+//! with which factor. [`Linear`] adapts it to the SDK: it requests the columns, computes series that no stage writes,
+//! and declares the responses. A response is what one unit of the coefficient adds to `measured − known`.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -11,21 +11,21 @@ use dragfree_physics::mission::{Mission, TestMass};
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix2, Vector3};
 
-/// Axes as the columns name them.
-pub(crate) const AXES: [&str; 3] = ["x", "y", "z"];
-/// Angles about them.
+use crate::common::{AXES, SeriesRef, axis_of, mission, tm_of};
+
+/// Names of the angles about x, y and z.
 pub(crate) const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
 const STATE: &[u8; 8] = b"linear/1";
 
-/// A column that somebody before the effect makes.
+/// A column that an earlier stage writes.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Source {
+pub(crate) struct InputColumn {
     pub(crate) name: String,
     pub(crate) unit: &'static str,
     pub(crate) frame: String,
 }
 
-impl Source {
+impl InputColumn {
     fn new(name: String, unit: &'static str, frame: impl Into<String>) -> Self {
         Self { name, unit, frame: frame.into() }
     }
@@ -35,17 +35,17 @@ impl Source {
         Self::new(format!("used.mps_force_srf_n.{}", AXES[axis]), "N", "SRF")
     }
 
-    /// Commanded torque of the thrusters, SRF, N m.
+    /// Commanded torque of the thrusters, mean over the sample, SRF, N m.
     pub(crate) fn torque(axis: usize) -> Self {
         Self::new(format!("used.mps_torque_srf_nm.{}", AXES[axis]), "N m", "SRF")
     }
 
-    /// Commanded force of the electrodes on a test mass, ORF, N.
+    /// Commanded force of the electrodes on a test mass, mean over the sample, ORF, N.
     pub(crate) fn electrodes_force(tm: usize, axis: usize) -> Self {
         Self::new(format!("used.{}.force_orf_n.{}", tm_name(tm), AXES[axis]), "N", orf(tm))
     }
 
-    /// Their torque, ORF, N m.
+    /// Commanded torque of the electrodes on a test mass, mean over the sample, ORF, N m.
     pub(crate) fn electrodes_torque(tm: usize, axis: usize) -> Self {
         Self::new(format!("used.{}.torque_orf_nm.{}", tm_name(tm), AXES[axis]), "N m", orf(tm))
     }
@@ -55,101 +55,101 @@ impl Source {
         Self::new(format!("used.sun_srf.{}", AXES[axis]), "1", "SRF")
     }
 
-    /// `û`, ORF, m s⁻².
-    pub(crate) fn known(tm: usize, axis: usize) -> Self {
+    /// Known acceleration `û` of a test mass, ORF, m s⁻².
+    pub(crate) fn known_accel(tm: usize, axis: usize) -> Self {
         Self::new(format!("{}.u_orf_m_s2.{}", tm_name(tm), AXES[axis]), "m s-2", orf(tm))
     }
 
-    /// Channel of a test mass, m s⁻².
+    /// Acceleration channel of a test mass, ORF, m s⁻².
     pub(crate) fn channel(tm: usize, axis: usize) -> Self {
-        Self::new(accel(tm, axis), "m s-2", orf(tm))
+        Self::new(accel_channel(tm, axis), "m s-2", orf(tm))
     }
 
-    /// Best readout of a displacement, ORF, m.
+    /// Best readout of a test mass's displacement, ORF, m.
     pub(crate) fn displacement(tm: usize, axis: usize) -> Self {
         Self::new(format!("{}.r_orf_m.{}", tm_name(tm), AXES[axis]), "m", orf(tm))
     }
 
-    /// Estimate of the spacecraft's angular acceleration `α̂`, SRF, rad s⁻².
+    /// Estimate `α̂` of the spacecraft's angular acceleration, SRF, rad s⁻².
     pub(crate) fn alpha(axis: usize) -> Self {
         Self::new(format!("sc.alpha_srf_rad_s2.{}", AXES[axis]), "rad s-2", "SRF")
     }
 
-    /// `∂α̂_j/∂g_i` for a torque about axis `i` that is `1 + g_i` times the commanded one, SRF, rad s⁻².
+    /// Derivative `∂α̂_j/∂g_i`, SRF, rad s⁻²; the torque about axis `i` is `1 + g_i` times the commanded one.
     pub(crate) fn alpha_by_torque_gain(i: usize, j: usize) -> Self {
         let name = format!("response.alpha_srf_rad_s2.by_torque_gain.{}.{}", AXES[i], AXES[j]);
         Self::new(name, "rad s-2", "SRF")
     }
 
-    /// `∂û_row/∂g_i` of a test mass, ORF, m s⁻²; only where thrusters have a layout.
-    pub(crate) fn known_by_torque_gain(i: usize, tm: usize, row: usize) -> Self {
+    /// Derivative `∂û_row/∂g_i` of a test mass, ORF, m s⁻²; written only for thrusters with a layout.
+    pub(crate) fn known_accel_by_torque_gain(i: usize, tm: usize, row: usize) -> Self {
         let name = format!("response.u_orf_m_s2.by_torque_gain.{}.{}.{}", AXES[i], tm_name(tm), AXES[row]);
         Self::new(name, "m s-2", orf(tm))
     }
 
-    /// `∂α̂_j/∂τ` for an attitude that is read `τ` late, late minus on time, SRF, rad s⁻³.
+    /// Derivative `∂α̂_j/∂τ`, SRF, rad s⁻³, for a delay `τ` of the attitude readout.
     pub(crate) fn alpha_by_dws_delay(j: usize) -> Self {
         Self::new(format!("response.alpha_srf_rad_s2.by_dws_delay.{}", AXES[j]), "rad s-3", "SRF")
     }
 
-    /// Local wavefront sensing of a test mass, ORF, rad.
+    /// Angle of a test mass by differential wavefront sensing, ORF, rad.
     pub(crate) fn angle_by_dws(tm: usize, angle: &str) -> Self {
         Self::new(format!("dws.{}.{angle}_orf_rad", tm_name(tm)), "rad", orf(tm))
     }
 
-    /// Capacitive readout of its attitude, ORF, rad.
+    /// Angle of a test mass by the capacitive readout, ORF, rad.
     pub(crate) fn angle_by_is(tm: usize, angle: &str) -> Self {
         Self::new(format!("is.{}.att_orf_rad.{angle}", tm_name(tm)), "rad", orf(tm))
     }
 
-    /// A column found among those that there are.
+    /// An available column, with the unit that the effect expects.
     pub(crate) fn of(column: &Column, unit: &'static str) -> Self {
         Self::new(column.name.clone(), unit, &column.frame)
     }
 }
 
-/// What varies with time by which a column is multiplied.
+/// A slowly varying factor of a column.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) enum Driver {
-    /// Seconds from this Unix time, ns, to the middle of the sample; from the first epoch of the run with `None`.
+pub(crate) enum Multiplier {
+    /// Seconds from this Unix time, ns, to the middle of the sample; from the run's first epoch for `None`.
     Time(Option<i64>),
-    /// What a column has grown since its first value, or shrunk where `lost`.
-    Growth { column: Source, lost: bool },
+    /// Change of a column since its first value, with the sign turned if `lost`.
+    Growth { column: InputColumn, lost: bool },
 }
 
-/// A series that channels answer to, mean over `[t_k, t_{k+1})`.
+/// A series of a response: mean over `[t_k, t_{k+1})`.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) enum Series {
-    /// A column as it is.
-    Column(Source),
-    /// `(a_k − a_{k−1})/Δt` of a column, and its unit. No value where there is none before.
-    Slope(Source, &'static str),
-    /// A column, or its last value where it has none.
-    Held(Source),
-    /// `(3 z_k − z_{k−1})/2` of a channel, which is an acceleration averaged over two samples already: what of it belongs to the
-    /// newer one, so that the estimators' average gives `z_k` again but for a second difference. No value where there is none before.
-    Newer(Source),
-    /// A column times something slow, and the unit of the product.
-    Times(Source, Driver, &'static str),
+    /// The column itself.
+    Column(InputColumn),
+    /// Backward difference `(a_k − a_{k−1})/Δt`, with its unit; NaN at the first sample after a gap.
+    Slope(InputColumn, &'static str),
+    /// The column, with missing values replaced by the last valid one.
+    Held(InputColumn),
+    /// `(3 z_k − z_{k−1})/2` of a channel, NaN at the first sample after a gap. A channel is a mean over two samples
+    /// already; this extrapolation undoes the estimators' second averaging up to a second difference.
+    Newer(InputColumn),
+    /// The column times a [`Multiplier`], with the unit of the product.
+    Times(InputColumn, Multiplier, &'static str),
 }
 
 impl Series {
-    /// Says all that the values depend on.
+    /// Name of the series; series of one name have equal values.
     pub(crate) fn name(&self) -> String {
         match self {
             Self::Column(source) => source.name.clone(),
             Self::Slope(source, _) => format!("slope({})", source.name),
             Self::Held(source) => format!("held({})", source.name),
             Self::Newer(source) => format!("newer({})", source.name),
-            Self::Times(source, Driver::Time(None), _) => format!("{}*elapsed_s", source.name),
-            Self::Times(source, Driver::Time(Some(ns)), _) => format!("{}*seconds_since_{ns}_ns", source.name),
-            Self::Times(source, Driver::Growth { column, lost }, _) => {
+            Self::Times(source, Multiplier::Time(None), _) => format!("{}*elapsed_s", source.name),
+            Self::Times(source, Multiplier::Time(Some(ns)), _) => format!("{}*seconds_since_{ns}_ns", source.name),
+            Self::Times(source, Multiplier::Growth { column, lost }, _) => {
                 format!("{}*{}({})", source.name, if *lost { "lost" } else { "gained" }, column.name)
             }
         }
     }
 
-    fn source(&self) -> &Source {
+    fn source(&self) -> &InputColumn {
         match self {
             Self::Column(source)
             | Self::Slope(source, _)
@@ -167,7 +167,7 @@ impl Series {
     }
 }
 
-/// What one unit of a coefficient adds to a channel: `factor` times the series, times another coefficient's value.
+/// What one unit of a coefficient adds to a channel: `factor · series`, times the coefficient `times` if there is one.
 #[derive(Clone, Debug)]
 pub(crate) struct Term {
     pub(crate) channel: String,
@@ -182,7 +182,7 @@ impl Term {
     }
 }
 
-/// One form of a coefficient: the shape parameters that give it, its unit, its range, and what it does.
+/// One form of a coefficient: shape parameters, unit, range and responses.
 #[derive(Clone, Debug)]
 pub(crate) struct Form {
     pub(crate) shape: Shape,
@@ -191,51 +191,51 @@ pub(crate) struct Form {
     pub(crate) terms: Vec<Term>,
 }
 
-/// A coefficient: the last part of its name, empty where the effect has only one, and its forms: one, or for a candidate one
-/// for each value of the shape parameters.
+/// A coefficient: last part of its name (empty for the only one of an effect) and its forms. A candidate has one form
+/// per value of the shape parameters; an effect in the model has one.
 #[derive(Clone, Debug)]
-pub(crate) struct Part {
+pub(crate) struct CoefficientForms {
     pub(crate) name: &'static str,
     pub(crate) forms: Vec<Form>,
 }
 
 impl Form {
-    /// Without the terms that do nothing.
+    /// Drops terms with a factor of zero.
     pub(crate) fn new(shape: Shape, unit: &str, range: [f64; 2], mut terms: Vec<Term>) -> Self {
         terms.retain(|term| term.factor != 0.0);
         Self { shape, unit: unit.to_owned(), range, terms }
     }
 }
 
-impl Part {
-    /// The only coefficient of an effect without shape parameters.
+impl CoefficientForms {
+    /// The single coefficient of an effect without shape parameters.
     pub(crate) fn only(unit: &str, range: [f64; 2], terms: Vec<Term>) -> Vec<Self> {
         vec![Self::named("", unit, range, terms)]
     }
 
-    /// One of several.
+    /// One of several coefficients of an effect without shape parameters.
     pub(crate) fn named(name: &'static str, unit: &str, range: [f64; 2], terms: Vec<Term>) -> Self {
         Self { name, forms: vec![Form::new(Shape::new(), unit, range, terms)] }
     }
 }
 
-/// The column of this name that was made last: what a stage made of telemetry, `tm1.r_orf_m.y` of the reconstruction, rather than
-/// the raw topic's of the same name.
-pub(crate) fn latest<'a>(available: &'a Available, name: &str) -> Option<&'a Column> {
+/// The column of this name that was written last, e.g. the reconstruction's `tm1.r_orf_m.y` rather than the raw
+/// topic's.
+pub(crate) fn latest_column<'a>(available: &'a Available, name: &str) -> Option<&'a Column> {
     available.columns.iter().rev().find(|c| c.name == name)
 }
 
-/// `tm1.accel.x`, m s⁻².
-pub(crate) fn accel(tm: usize, axis: usize) -> String {
+/// Name of an acceleration channel, `tm1.accel.x`, m s⁻².
+pub(crate) fn accel_channel(tm: usize, axis: usize) -> String {
     format!("{}.accel.{}", tm_name(tm), AXES[axis])
 }
 
-/// `sc.alpha.x`, rad s⁻².
-pub(crate) fn turn(axis: usize) -> String {
+/// Name of an attitude channel, `sc.alpha.x`, rad s⁻².
+pub(crate) fn attitude_channel(axis: usize) -> String {
     format!("sc.alpha.{}", AXES[axis])
 }
 
-/// `tm1` of 0.
+/// Name of a test mass by index: `tm1` for 0.
 pub(crate) fn tm_name(tm: usize) -> String {
     format!("tm{}", tm + 1)
 }
@@ -244,95 +244,82 @@ fn orf(tm: usize) -> String {
     format!("ORF_{}", tm + 1)
 }
 
-/// Name of an offset's component.
-pub(crate) fn offset(tm: usize, axis: usize) -> String {
+/// Name of a coefficient of the centre-of-mass offset.
+pub(crate) fn offset_name(tm: usize, axis: usize) -> String {
     format!("com-offset.{}.{}", tm_name(tm), AXES[axis])
 }
 
-/// The accelerations of one test mass by its offset, `Φ_row b`, as the model's `com-offset` has them; empty where that stands
-/// not before in the model, as then nobody says what `b` is. The diagonal of `Φ` is left out: it is `ω²`, a constant of 1e-13 s⁻².
-pub(crate) fn offset_terms(available: &Available, tm: usize, row: usize) -> Vec<(Source, String)> {
-    let channel = accel(tm, row);
-    let known = |name: &str| available.coefficient(name).is_some_and(|c| !c.candidate);
+/// Terms of `Φ_row b`, the acceleration of a test mass by its offset: columns and coefficients of `com-offset`. Empty
+/// if that effect is not earlier in the model. The diagonal of `Φ` is of order `ω²`, nearly constant and omitted.
+pub(crate) fn offset_terms(available: &Available, tm: usize, row: usize) -> Vec<(InputColumn, String)> {
+    let channel = accel_channel(tm, row);
+    let in_model = |name: &str| available.coefficient(name).is_some_and(|c| !c.candidate);
     let column = |name: &str| {
         let mut all = available.of_kind("regressor");
         all.find(|c| c.attribute("coefficient") == name && c.attribute("channel") == channel).cloned()
     };
-    let names = (0..3).filter(|j| *j != row).map(|j| offset(tm, j)).filter(|name| known(name));
-    names.filter_map(|name| Some((Source::of(&column(&name)?, "s-2"), name))).collect()
+    let names = (0..3).filter(|j| *j != row).map(|j| offset_name(tm, j)).filter(|name| in_model(name));
+    names.filter_map(|name| Some((InputColumn::of(&column(&name)?, "s-2"), name))).collect()
 }
 
-/// The acceleration of a test mass along an axis, `û + Φ b + d`: of each part a piece, its factor, and the coefficient that it is
-/// multiplied with.
-pub(crate) struct Motion {
+/// Acceleration of a test mass along an axis, `û + Φ b + d`: series, factor and multiplying coefficient per term.
+pub(crate) struct TmAcceleration {
     /// `û + Φ b`.
-    pub(crate) known: Vec<(Piece, f64, Option<String>)>,
-    /// The push `d` that nobody commanded, as interferometers tell it.
-    pub(crate) push: Vec<(Piece, f64, Option<String>)>,
+    pub(crate) modelled: Vec<(Series, f64, Option<String>)>,
+    /// Unmodelled acceleration `d`, estimated from the interferometers.
+    pub(crate) unmodelled: Vec<(Series, f64, Option<String>)>,
 }
 
-/// How a test mass moves along an axis.
+/// Acceleration of a test mass along an axis; Methods, "Acceleration of a test mass".
 ///
-/// Above all `d` is the thrusters' noise, `−T_S^{O_i} n/m_S`, which the loop works against: what is left of `û + d` is much less than
-/// either, so that `û` alone is no estimate of the motion. It is common to both test masses. In the plane of the two optical axes
-/// the two channels `z_x − Φ_x b` are what it does along them, and two equations give it, finer than any capacitive readout; the
-/// mission's nominal offsets are good enough there. Along s_3 no interferometer looks.
+/// The control loop cancels most of `d`, chiefly thruster noise, by `û`, so `û` alone does not estimate the
+/// acceleration.
 ///
-/// `None` along s_3 and without both interferometers: then nobody knows `d`.
-pub(crate) fn motion(available: &Available, mission: &Mission, tm: usize, axis: usize) -> Option<Motion> {
-    let reads = |tm: usize| latest(available, &Source::displacement(tm, 0).name).map_or("", |c| c.attribute("noise"));
+/// `None` along s_3 and without interferometers on both test masses, where `d` is unobservable.
+pub(crate) fn tm_acceleration(
+    available: &Available,
+    mission: &Mission,
+    tm: usize,
+    axis: usize,
+) -> Option<TmAcceleration> {
+    let reads = |tm: usize| {
+        latest_column(available, &InputColumn::displacement(tm, 0).name).map_or("", |c| c.attribute("noise"))
+    };
     if axis == 2 || reads(0) != "ifo_x" || reads(1) != "ifo_x" {
         return None;
     }
-    let weight = of_optical_axes(mission, tm, axis)?;
-    let mut known = vec![(Piece::Column(Source::known(tm, axis)), 1.0, None)];
+    let weight = optical_axis_weights(mission, tm, axis)?;
+    let mut modelled = vec![(Series::Column(InputColumn::known_accel(tm, axis)), 1.0, None)];
     for (column, times) in offset_terms(available, tm, axis) {
-        known.push((Piece::Column(column), 1.0, Some(times)));
+        modelled.push((Series::Column(column), 1.0, Some(times)));
     }
-    let mut push = Vec::new();
+    let mut unmodelled = Vec::new();
     for other in (0..2).filter(|other| weight[*other].abs() > 1e-12) {
         let body = mission.test_mass.get(&tm_name(other))?;
         let (t, b) = (body.dcm_orf_from_srf(), body.offset_nominal_orf_m());
-        push.push((Piece::Channel(Source::channel(other, 0)), weight[other], None));
+        unmodelled.push((Series::Newer(InputColumn::channel(other, 0)), weight[other], None));
         for j in 0..3 {
             let explained = t[(2, j)] * b.y - t[(1, j)] * b.z;
-            push.push((Piece::Column(Source::alpha(j)), -weight[other] * explained, None));
+            unmodelled.push((Series::Column(InputColumn::alpha(j)), -weight[other] * explained, None));
         }
     }
-    Some(Motion { known, push })
+    Some(TmAcceleration { modelled, unmodelled })
 }
 
-/// An axis of a test mass in the plane of the two optical axes, as their combination; `None` where they are parallel.
-pub(crate) fn of_optical_axes(mission: &Mission, tm: usize, axis: usize) -> Option<[f64; 2]> {
+/// Weights of the two optical axes that give an axis in their plane; `None` if the optical axes are parallel.
+pub(crate) fn optical_axis_weights(mission: &Mission, tm: usize, axis: usize) -> Option<[f64; 2]> {
     let dcm = |tm: usize| mission.test_mass.get(&tm_name(tm)).map(TestMass::dcm_orf_from_srf);
     let both = [dcm(0)?, dcm(1)?];
     let weight = both[tm].fixed_view::<1, 2>(axis, 0) * Matrix2::from_fn(|i, j| both[i][(0, j)]).try_inverse()?;
     Some(weight.into())
 }
 
-/// What a [`motion`] is made of.
-#[derive(Clone, Debug)]
-pub(crate) enum Piece {
-    /// A mean over `[t_k, t_{k+1})`.
-    Column(Source),
-    /// A channel, averaged over two.
-    Channel(Source),
-}
-
-impl Piece {
-    /// The motion itself.
-    pub(crate) fn series(self) -> Series {
-        match self {
-            Self::Column(source) => Series::Column(source),
-            Self::Channel(source) => Series::Newer(source),
-        }
-    }
-}
-
-/// Where the right angular acceleration is `α̂ + factor · δα`, with `δα` as series of SRF components, the test masses' channels
-/// show `−factor [T δα ×] b` more than the `Φ(α̂) b` of the model. Without `com-offset` before it in the model nobody says what
-/// `b` is, and there is no such term.
-pub(crate) fn through_offset(
+/// Terms of an error in `α̂`: if the angular acceleration is `α̂ + factor · δα`, the test masses show `−factor [T δα ×]
+/// b` beyond `Φ(α̂) b`. `series(j)` is component j of `δα` in SRF. Empty without `com-offset` earlier in the model.
+///
+/// # Errors
+/// The mission has no test mass.
+pub(crate) fn offset_coupling_terms(
     available: &Available,
     mission: &Mission,
     by: &'static str,
@@ -344,16 +331,16 @@ pub(crate) fn through_offset(
         let Some(test_mass) = mission.test_mass.get(&tm_name(tm)) else { continue };
         let t = test_mass.dcm_orf_from_srf();
         for (row, axis) in (0..3).flat_map(|row| (0..3).map(move |axis| (row, axis))).filter(|(r, a)| r != a) {
-            let times = offset(tm, axis);
+            let times = offset_name(tm, axis);
             if available.coefficient(&times).is_none_or(|c| c.candidate) {
                 continue;
             }
-            // (−a × b)_row = ε · a_other · b_axis with the third axis `other`.
+            // (−a × b)_row = ε a_other b_axis, where `other` is the third axis.
             let other = 3 - row - axis;
             let sign = if (row + 1) % 3 == axis { 1.0 } else { -1.0 };
             for j in 0..3 {
                 terms.push(Term {
-                    channel: accel(tm, row),
+                    channel: accel_channel(tm, row),
                     series: series(j),
                     factor: sign * factor * t[(other, j)],
                     times: Some(times.clone()),
@@ -362,162 +349,159 @@ pub(crate) fn through_offset(
         }
     }
     if mission.test_mass.is_empty() {
-        return Err(PluginError::error(format!("{by}: the mission file has no table [test_mass.tm1]; add it")));
+        return Err(PluginError::error(format!(
+            "{by}: the mission file has no test mass; add a table [test_mass.tm1]"
+        )));
     }
     Ok(terms)
 }
 
-/// A constant vector of accelerations of a test mass, ORF, per unit of a series.
-pub(crate) fn push(tm: usize, series: &Series, per_unit: &Vector3<f64>) -> Vec<Term> {
-    (0..3).map(|row| Term::new(accel(tm, row), series.clone(), per_unit[row])).collect()
+/// Terms of an acceleration vector of a test mass, ORF, per unit of a series.
+pub(crate) fn vector_terms(tm: usize, series: &Series, per_unit: &Vector3<f64>) -> Vec<Term> {
+    (0..3).map(|row| Term::new(accel_channel(tm, row), series.clone(), per_unit[row])).collect()
 }
 
-/// `tm1.y` is `(0, 1)`; the manifest lists what there is.
+/// Indices of an instance: `(0, 1)` for `tm1.y`.
 pub(crate) fn tm_axis(instance: &str) -> (usize, usize) {
-    let (tm, axis) = instance.split_once('.').unwrap_or((instance, "x"));
-    (usize::from(tm == "tm2"), axis_of(axis))
+    (usize::from(tm_of(instance) == "tm2"), axis_of(instance))
 }
 
-/// `tm1.y-x` is `(0, 1, 0)`: test mass, from, to.
+/// Indices of a pair instance, (test mass, from, to): `(0, 1, 0)` for `tm1.y-x`.
 pub(crate) fn tm_pair(instance: &str) -> (usize, usize, usize) {
     let (first, to) = instance.split_once('-').unwrap_or((instance, "x"));
     let (tm, from) = tm_axis(first);
     (tm, from, axis_of(to))
 }
 
-/// `sc.x` is 0.
-pub(crate) fn sc_axis(instance: &str) -> usize {
-    axis_of(instance.rsplit('.').next().unwrap_or_default())
-}
-
-fn axis_of(letter: &str) -> usize {
-    AXES.iter().position(|axis| *axis == letter).unwrap_or(0)
-}
-
-/// What is particular to an effect.
-pub(crate) trait Recipe: Send + Sized + 'static {
-    /// What it is.
+/// An effect that acts linearly through series with constant factors.
+pub(crate) trait LinearEffect: Send + Sized + 'static {
+    /// Identity, parameters and instances.
     const MANIFEST: Manifest;
-    /// Takes what it needs of the configuration.
+    /// Reads the configuration.
     ///
     /// # Errors
-    /// The configuration has no sense for this effect.
+    /// The configuration is invalid.
     fn new(setup: &Setup) -> Result<Self, PluginError>;
-    /// Its coefficients.
+    /// The coefficients and their terms.
     ///
     /// # Errors
-    /// The mission or the telemetry lacks what the effect needs.
-    fn parts(&self, mission: &Mission, available: &Available) -> Result<Vec<Part>, PluginError>;
+    /// The mission or the telemetry lacks an input of the effect.
+    fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError>;
 }
 
-/// An effect made from its recipe.
+/// SDK effect of a [`LinearEffect`].
 #[derive(Debug)]
-pub(crate) struct Linear<R> {
-    recipe: R,
+pub(crate) struct Linear<E> {
+    effect: E,
     mission: Mission,
     instance: String,
     candidate: bool,
-    made: Vec<Made>,
+    computed: Vec<ComputedSeries>,
 }
 
-/// A series that this effect computes.
+/// A series computed by this effect.
 #[derive(Debug)]
-struct Made {
-    step: Step,
+struct ComputedSeries {
+    state: SeriesState,
     input: In,
-    driver: Option<In>,
+    multiplier: Option<In>,
     out: Out,
 }
 
-/// From one sample to the next.
+/// State of a computed series between samples.
 #[derive(Debug)]
-struct Step {
-    rule: Rule,
-    /// The value before, or the first of a driver.
+struct SeriesState {
+    operation: Operation,
+    /// Previous value, or the first value of a multiplier.
     value: f64,
-    /// Time of the row before, or from which time counts, Unix ns.
+    /// Time of the previous row, or the origin of elapsed time, Unix ns.
     time_ns: Option<i64>,
 }
 
 #[derive(Clone, Copy, Debug)]
-enum Rule {
+enum Operation {
     Slope,
     Newer,
     Hold,
-    /// Times the seconds since `time_ns`.
+    /// Product with the seconds since `time_ns`.
     Elapsed,
-    /// Times `sign` of what a driver has grown since its first value.
+    /// Product with `sign` times the change of the multiplier since its first value.
     Growth {
         sign: f64,
     },
 }
 
-impl Step {
-    /// The next sample, from the column's value `a` at `now` and the driver's, where there is one.
-    fn next(&mut self, now: i64, a: f64, driver: f64, dt_s: f64) -> f64 {
-        match self.rule {
-            Rule::Slope | Rule::Newer => {
-                // Across a gap there is no slope.
+impl SeriesState {
+    /// Value of the next sample, from the column's value `a` at `now`, Unix ns, and the multiplier's.
+    fn next(&mut self, now: i64, a: f64, multiplier: f64, dt_s: f64) -> f64 {
+        match self.operation {
+            Operation::Slope | Operation::Newer => {
+                // Undefined across a gap.
                 let follows = self.time_ns.is_some_and(|t| ((now - t) as f64 * 1e-9 - dt_s).abs() < 0.5 * dt_s);
                 let before = if follows { self.value } else { f64::NAN };
                 (self.time_ns, self.value) = (Some(now), a);
-                if matches!(self.rule, Rule::Newer) { 1.5 * a - 0.5 * before } else { (a - before) / dt_s }
+                if matches!(self.operation, Operation::Newer) { 1.5 * a - 0.5 * before } else { (a - before) / dt_s }
             }
-            Rule::Hold => {
+            Operation::Hold => {
                 if a.is_finite() {
                     self.value = a;
                 }
                 self.value
             }
-            Rule::Elapsed => {
+            Operation::Elapsed => {
                 let since = *self.time_ns.get_or_insert(now);
                 a * ((now - since) as f64 * 1e-9 + 0.5 * dt_s)
             }
-            Rule::Growth { sign } => {
+            Operation::Growth { sign } => {
                 if self.value.is_nan() {
-                    self.value = driver;
+                    self.value = multiplier;
                 }
-                // Before its first packet nothing is known to have changed.
-                a * if driver.is_finite() { sign * (driver - self.value) } else { 0.0 }
+                // Before the first packet the change is taken as zero.
+                a * if multiplier.is_finite() { sign * (multiplier - self.value) } else { 0.0 }
             }
         }
     }
 }
 
-impl<R: Recipe> Linear<R> {
+impl<E: LinearEffect> Linear<E> {
     fn name(&self) -> String {
-        format!("effect {}:{}", R::MANIFEST.id, self.instance)
+        format!("effect {}:{}", E::MANIFEST.id, self.instance)
     }
 
-    /// What a series is called and where it stands; made here where nobody makes it yet.
-    fn place(
+    /// Table and name of a series; registers it for computation if no other effect writes it.
+    fn series_ref(
         &mut self,
         series: &Series,
         available: &Available,
         link: &mut EffectLink<'_, '_>,
-    ) -> Result<(String, String), PluginError> {
-        let read = |source: &Source, link: &mut EffectLink<'_, '_>| {
-            let want = latest(available, &source.name).map_or_else(|| Want::new(&source.name), Want::of);
+    ) -> Result<SeriesRef, PluginError> {
+        let read = |source: &InputColumn, link: &mut EffectLink<'_, '_>| {
+            let want = latest_column(available, &source.name).map_or_else(|| Want::new(&source.name), Want::of);
             link.read(&want.unit(source.unit).frame(&source.frame))
         };
         let name = series.name();
         let input = read(series.source(), link)?;
         if let Series::Column(source) = series {
-            let table = latest(available, &source.name).map(|c| c.table.clone()).unwrap_or_default();
+            let table = latest_column(available, &source.name).map(|c| c.table.clone()).unwrap_or_default();
             return Ok((table, name));
         }
         let (table, out) = link.shared_series(available, &name, series.unit(), &series.source().frame)?;
         let Some(out) = out else { return Ok((table, name)) };
-        let (rule, time_ns, driver) = match series {
-            Series::Column(_) | Series::Held(_) => (Rule::Hold, None, None),
-            Series::Slope(..) => (Rule::Slope, None, None),
-            Series::Newer(_) => (Rule::Newer, None, None),
-            Series::Times(_, Driver::Time(since), _) => (Rule::Elapsed, *since, None),
-            Series::Times(_, Driver::Growth { column, lost }, _) => {
-                (Rule::Growth { sign: if *lost { -1.0 } else { 1.0 } }, None, Some(read(column, link)?))
+        let (operation, time_ns, multiplier) = match series {
+            Series::Column(_) | Series::Held(_) => (Operation::Hold, None, None),
+            Series::Slope(..) => (Operation::Slope, None, None),
+            Series::Newer(_) => (Operation::Newer, None, None),
+            Series::Times(_, Multiplier::Time(since), _) => (Operation::Elapsed, *since, None),
+            Series::Times(_, Multiplier::Growth { column, lost }, _) => {
+                (Operation::Growth { sign: if *lost { -1.0 } else { 1.0 } }, None, Some(read(column, link)?))
             }
         };
-        self.made.push(Made { step: Step { rule, value: f64::NAN, time_ns }, input, driver, out });
+        self.computed.push(ComputedSeries {
+            state: SeriesState { operation, value: f64::NAN, time_ns },
+            input,
+            multiplier,
+            out,
+        });
         Ok((table, name))
     }
 
@@ -526,7 +510,7 @@ impl<R: Recipe> Linear<R> {
         let wanted = |c: &&Column| acted_on.iter().any(|term| term.channel == c.name);
         if let Some(c) = all.iter().copied().filter(wanted).find(|c| c.attribute("average") != "2") {
             return Err(PluginError::error(format!(
-                "{}: channel {} is measured directly, and this effect acts on second differences of readouts; take it out of the \
+                "{}: channel {} is measured directly, but this effect acts on second differences of readouts; remove it from the \
                  model",
                 self.name(),
                 c.name
@@ -539,34 +523,35 @@ impl<R: Recipe> Linear<R> {
         names.sort_unstable();
         names.dedup();
         Err(PluginError::error(format!(
-            "{} acts on {}, and no stage before it makes any of them; put hinf-dfacs before the effects, or take it out of the model",
+            "{} acts on {}, but no earlier stage writes any of them; put hinf-dfacs before the effects in the pipeline, or remove \
+             the effect from the model",
             self.name(),
-            if names.is_empty() { "readouts of this instrument".to_owned() } else { names.join(", ") }
+            if names.is_empty() { "the readouts of an interferometer".to_owned() } else { names.join(", ") }
         )))
     }
 }
 
-impl<R: Recipe> Effect for Linear<R> {
-    const MANIFEST: Manifest = R::MANIFEST;
+impl<E: LinearEffect> Effect for Linear<E> {
+    const MANIFEST: Manifest = E::MANIFEST;
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         Ok(Self {
-            recipe: R::new(setup)?,
-            mission: Mission::from_json(setup.mission_json())?,
+            effect: E::new(setup)?,
+            mission: mission(setup)?,
             instance: setup.instance().to_owned(),
             candidate: setup.candidate(),
-            made: Vec::new(),
+            computed: Vec::new(),
         })
     }
 
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
-        let parts = self.recipe.parts(&self.mission, available)?;
-        let terms: Vec<&Term> = parts.iter().flat_map(|p| &p.forms).flat_map(|f| &f.terms).collect();
+        let coefficients = self.effect.coefficients(&self.mission, available)?;
+        let terms: Vec<&Term> = coefficients.iter().flat_map(|p| &p.forms).flat_map(|f| &f.terms).collect();
         self.check_channels(available, &terms)?;
-        let mut places: BTreeMap<String, (String, String)> = BTreeMap::new();
+        let mut series_refs: BTreeMap<String, SeriesRef> = BTreeMap::new();
         for term in terms {
-            if let Entry::Vacant(place) = places.entry(term.series.name()) {
-                place.insert(self.place(&term.series, available, link)?);
+            if let Entry::Vacant(entry) = series_refs.entry(term.series.name()) {
+                entry.insert(self.series_ref(&term.series, available, link)?);
             }
         }
         let channels: Vec<&str> = available.of_kind("channel").map(|c| c.name.as_str()).collect();
@@ -574,17 +559,17 @@ impl<R: Recipe> Effect for Linear<R> {
             let terms = form.terms.iter().filter(|t| channels.contains(&t.channel.as_str()));
             terms
                 .map(|t| {
-                    let (table, series) = places.get(&t.series.name()).cloned().unwrap_or_default();
+                    let (table, series) = series_refs.get(&t.series.name()).cloned().unwrap_or_default();
                     Response { channel: t.channel.clone(), table, series, factor: t.factor, times: t.times.clone() }
                 })
                 .collect()
         };
-        for part in &parts {
-            let Some(first) = part.forms.first() else { continue };
+        for declared in &coefficients {
+            let Some(first) = declared.forms.first() else { continue };
             let [lower, upper] = first.range;
-            let stem = format!("{}.{}", R::MANIFEST.id, self.instance);
+            let stem = format!("{}.{}", E::MANIFEST.id, self.instance);
             let mut coefficient = Coefficient {
-                name: if part.name.is_empty() { stem } else { format!("{stem}.{}", part.name) },
+                name: if declared.name.is_empty() { stem } else { format!("{stem}.{}", declared.name) },
                 unit: first.unit.clone(),
                 lower,
                 upper,
@@ -600,7 +585,7 @@ impl<R: Recipe> Effect for Linear<R> {
                     range: Some(form.range),
                     colours: None,
                 };
-                coefficient.variants = part.forms.iter().map(variant).collect();
+                coefficient.variants = declared.forms.iter().map(variant).collect();
             } else {
                 (coefficient.shape, coefficient.responses) = (first.shape.clone(), responses(first));
             }
@@ -611,44 +596,44 @@ impl<R: Recipe> Effect for Linear<R> {
 
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
         let dt_s = self.mission.dt_s();
-        for made in &mut self.made {
-            let column = input.f64(made.input);
-            let driver = input.f64(made.driver.unwrap_or(made.input));
-            let out = output.f64(made.out);
-            for ((now, a), driver) in input.time_ns().iter().zip(column).zip(driver) {
-                out.push(made.step.next(*now, *a, *driver, dt_s));
+        for series in &mut self.computed {
+            let column = input.f64(series.input);
+            let multiplier = input.f64(series.multiplier.unwrap_or(series.input));
+            let out = output.f64(series.out);
+            for ((now, a), multiplier) in input.time_ns().iter().zip(column).zip(multiplier) {
+                out.push(series.state.next(*now, *a, *multiplier, dt_s));
             }
         }
         Ok(())
     }
 
     fn save(&self) -> Result<Vec<u8>, PluginError> {
-        if self.made.is_empty() {
+        if self.computed.is_empty() {
             return Ok(Vec::new());
         }
         let mut bytes = STATE.to_vec();
-        for made in &self.made {
-            bytes.extend_from_slice(&made.step.value.to_le_bytes());
-            bytes.extend_from_slice(&made.step.time_ns.unwrap_or(i64::MIN).to_le_bytes());
+        for series in &self.computed {
+            bytes.extend_from_slice(&series.state.value.to_le_bytes());
+            bytes.extend_from_slice(&series.state.time_ns.unwrap_or(i64::MIN).to_le_bytes());
         }
         Ok(bytes)
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let body = if self.made.is_empty() { Some(state) } else { state.strip_prefix(STATE) };
+        let body = if self.computed.is_empty() { Some(state) } else { state.strip_prefix(STATE) };
         let (words, rest) = body.unwrap_or(&[0]).as_chunks::<8>();
-        if !rest.is_empty() || words.len() != 2 * self.made.len() {
+        if !rest.is_empty() || words.len() != 2 * self.computed.len() {
             return Err(PluginError::error(format!(
-                "{}: {} bytes are not a state of its {} series; it was saved by another version or for another model, start from \
-                 the telemetry",
+                "{}: a saved state of {} bytes does not fit its {} series: it comes from another version or model; rerun from the \
+                 telemetry without it",
                 self.name(),
                 state.len(),
-                self.made.len()
+                self.computed.len()
             )));
         }
-        for (made, word) in self.made.iter_mut().zip(words.chunks_exact(2)) {
-            made.step.value = f64::from_le_bytes(word[0]);
-            made.step.time_ns = Some(i64::from_le_bytes(word[1])).filter(|t| *t != i64::MIN);
+        for (series, word) in self.computed.iter_mut().zip(words.chunks_exact(2)) {
+            series.state.value = f64::from_le_bytes(word[0]);
+            series.state.time_ns = Some(i64::from_le_bytes(word[1])).filter(|t| *t != i64::MIN);
         }
         Ok(())
     }
@@ -660,10 +645,10 @@ mod tests {
 
     const NAN: f64 = f64::NAN;
 
-    /// Values at samples of 0.1 s, counted from an arbitrary time, with the driver's.
-    fn stepped(rule: Rule, since_ns: Option<i64>, rows: &[(i64, f64, f64)]) -> Vec<f64> {
-        let mut step = Step { rule, value: NAN, time_ns: since_ns };
-        rows.iter().map(|(k, a, driver)| step.next(1_000 + k * 100_000_000, *a, *driver, 0.1)).collect()
+    /// Values at samples of 0.1 s from rows (index, value, multiplier).
+    fn computed_values(operation: Operation, since_ns: Option<i64>, rows: &[(i64, f64, f64)]) -> Vec<f64> {
+        let mut state = SeriesState { operation, value: NAN, time_ns: since_ns };
+        rows.iter().map(|(k, a, multiplier)| state.next(1_000 + k * 100_000_000, *a, *multiplier, 0.1)).collect()
     }
 
     fn same(got: &[f64], want: &[f64]) {
@@ -675,14 +660,14 @@ mod tests {
     fn a_slope_is_taken_from_the_sample_before_and_never_across_a_gap() {
         let rows =
             [(0, 1.0, NAN), (1, 3.0, NAN), (2, 2.0, NAN), (4, 5.0, NAN), (5, 5.5, NAN), (6, NAN, NAN), (7, 1.0, NAN)];
-        same(&stepped(Rule::Slope, None, &rows), &[NAN, 20.0, -10.0, NAN, 5.0, NAN, NAN]);
+        same(&computed_values(Operation::Slope, None, &rows), &[NAN, 20.0, -10.0, NAN, 5.0, NAN, NAN]);
     }
 
-    /// A straight line comes back unchanged when two samples are averaged.
+    /// For a straight line the mean of two samples returns the channel.
     #[test]
     fn the_newer_half_of_an_average_is_extrapolated() {
         let rows: Vec<(i64, f64, f64)> = (0..6).map(|k| (k + i64::from(k > 3), 2.0 * k as f64, NAN)).collect();
-        let newer = stepped(Rule::Newer, None, &rows);
+        let newer = computed_values(Operation::Newer, None, &rows);
         same(&newer, &[NAN, 3.0, 5.0, 7.0, NAN, 11.0]);
         assert_eq!(0.5 * (newer[2] + newer[3]), rows[3].1);
     }
@@ -690,35 +675,47 @@ mod tests {
     #[test]
     fn a_held_value_stays_until_the_next_one() {
         let rows = [(0, NAN, NAN), (1, 3.0, NAN), (2, NAN, NAN), (9, NAN, NAN), (10, 4.0, NAN)];
-        same(&stepped(Rule::Hold, None, &rows), &[NAN, 3.0, 3.0, 3.0, 4.0]);
+        same(&computed_values(Operation::Hold, None, &rows), &[NAN, 3.0, 3.0, 3.0, 4.0]);
     }
 
     #[test]
     fn time_counts_to_the_middle_of_the_sample() {
         let rows = [(0, 2.0, NAN), (1, 2.0, NAN), (20, 1.0, NAN)];
-        same(&stepped(Rule::Elapsed, None, &rows), &[0.1, 0.3, 2.05]);
-        same(&stepped(Rule::Elapsed, Some(1_000 - 1_000_000_000), &rows), &[2.1, 2.3, 3.05]);
+        same(&computed_values(Operation::Elapsed, None, &rows), &[0.1, 0.3, 2.05]);
+        same(&computed_values(Operation::Elapsed, Some(1_000 - 1_000_000_000), &rows), &[2.1, 2.3, 3.05]);
     }
 
     #[test]
     fn growth_counts_from_the_first_value_and_is_nothing_before() {
         let rows = [(0, 2.0, NAN), (1, 2.0, 7.0), (2, 2.0, 7.5), (3, 3.0, 6.0)];
-        same(&stepped(Rule::Growth { sign: 1.0 }, None, &rows), &[0.0, 0.0, 1.0, -3.0]);
-        same(&stepped(Rule::Growth { sign: -1.0 }, None, &rows), &[0.0, 0.0, -1.0, 3.0]);
+        same(&computed_values(Operation::Growth { sign: 1.0 }, None, &rows), &[0.0, 0.0, 1.0, -3.0]);
+        same(&computed_values(Operation::Growth { sign: -1.0 }, None, &rows), &[0.0, 0.0, -1.0, 3.0]);
     }
 
     #[test]
     fn series_of_one_name_are_one_series() {
         let series = [
-            Series::Column(Source::alpha(0)),
-            Series::Slope(Source::alpha(0), "rad s-3"),
-            Series::Held(Source::alpha(0)),
-            Series::Times(Source::alpha(0), Driver::Time(None), "rad s-1"),
-            Series::Times(Source::alpha(0), Driver::Time(Some(5)), "rad s-1"),
-            Series::Times(Source::alpha(0), Driver::Growth { column: Source::sun(0), lost: true }, "rad s-2"),
-            Series::Times(Source::alpha(0), Driver::Growth { column: Source::sun(0), lost: false }, "rad s-2"),
-            Series::Times(Source::alpha(0), Driver::Growth { column: Source::sun(1), lost: false }, "rad s-2"),
-            Series::Slope(Source::alpha(1), "rad s-3"),
+            Series::Column(InputColumn::alpha(0)),
+            Series::Slope(InputColumn::alpha(0), "rad s-3"),
+            Series::Held(InputColumn::alpha(0)),
+            Series::Times(InputColumn::alpha(0), Multiplier::Time(None), "rad s-1"),
+            Series::Times(InputColumn::alpha(0), Multiplier::Time(Some(5)), "rad s-1"),
+            Series::Times(
+                InputColumn::alpha(0),
+                Multiplier::Growth { column: InputColumn::sun(0), lost: true },
+                "rad s-2",
+            ),
+            Series::Times(
+                InputColumn::alpha(0),
+                Multiplier::Growth { column: InputColumn::sun(0), lost: false },
+                "rad s-2",
+            ),
+            Series::Times(
+                InputColumn::alpha(0),
+                Multiplier::Growth { column: InputColumn::sun(1), lost: false },
+                "rad s-2",
+            ),
+            Series::Slope(InputColumn::alpha(1), "rad s-3"),
         ];
         let names: std::collections::BTreeSet<String> = series.iter().map(Series::name).collect();
         assert_eq!(names.len(), series.len());

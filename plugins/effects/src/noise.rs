@@ -1,18 +1,17 @@
-//! Noise that is larger than the mission file says: `mps-noise`, `torque-noise`, `is-noise`.
+//! Noise levels that differ from the mission file: `mps-noise`, `torque-noise`, `is-noise`.
 //!
-//! The coefficient k multiplies the amplitude spectral density of one process of the mission's noise: 1 is as the mission file
-//! has it, and k² the power. It adds nothing to a channel's mean and has no response; it names its process, by which the
-//! critic's Σ(f; k) changes:
+//! The coefficient k scales the amplitude spectral density of one noise process; 1 is the mission file's level. It has
+//! no regressor: the identification varies Σ(f; k) of the named process.
 //!
-//! | effect | process | seen in |
+//! | effect | process | channels |
 //! |---|---|---|
-//! | `mps-noise:sc.AXIS` | `thruster_force:sc.AXIS`, N/√Hz, SRF | both test masses in common, `T_S^{O_i} e/m_S` |
-//! | `torque-noise:sc.AXIS` | `thruster_torque:sc.AXIS`, N m/√Hz, SRF | attitude, `J_S⁻¹ e` |
+//! | `mps-noise:sc.AXIS` | `thruster_force:sc.AXIS`, N/√Hz, SRF | test masses, in common: `T_S^{O_i} e/m_S` |
+//! | `torque-noise:sc.AXIS` | `thruster_torque:sc.AXIS`, N m/√Hz, SRF | attitude: `J_S⁻¹ e` |
 //! | `is-noise:tmN.AXIS` | `readout:tmN.AXIS`, m/√Hz, ORF | one axis of one test mass, rising as f² |
 //!
-//! In a model such an effect says what is known and changes nothing in es-akf or qp-check: these refine Σ from the residuals
-//! anyway. **Range** 0.2 to 20. **Confounders.** Any unexplained force of the same spectrum; force noise along two axes of the
-//! same test masses when only one of them is read; thrusters that sit on a layout make force and torque noise together.
+//! In a model such an effect documents a known level; es-akf and qp-check refine Σ from residuals in any case.
+//! **Range**: 0.2 to 20. **Confounders**: any unmodelled force of the same spectrum; thruster force along axes that
+//! share the channels that are read; thrusters in a layout, whose force and torque noise are correlated.
 
 use dragfree_sdk::prelude::*;
 
@@ -58,15 +57,15 @@ macro_rules! noise_effect {
 
 noise_effect! {
     /// Force noise of the thrusters along an axis of SRF.
-    MpsNoise, "mps-noise", "thruster_force", "The thrusters' force noise along an axis is larger or smaller",
+    MpsNoise, "mps-noise", "thruster_force", "Level of the thrusters' force noise along an axis",
     &["sc.x", "sc.y", "sc.z"]
 }
 noise_effect! {
     /// Torque noise of the thrusters about an axis of SRF.
-    TorqueNoise, "torque-noise", "thruster_torque", "The thrusters' torque noise about an axis is larger or smaller",
+    TorqueNoise, "torque-noise", "thruster_torque", "Level of the thrusters' torque noise about an axis",
     &["sc.x", "sc.y", "sc.z"]
 }
 noise_effect! {
     /// Noise of the capacitive readout along an axis of ORF.
-    IsNoise, "is-noise", "readout", "The readout noise along an axis is larger or smaller", &TM_AXES
+    IsNoise, "is-noise", "readout", "Level of the capacitive readout noise along an axis", &TM_AXES
 }

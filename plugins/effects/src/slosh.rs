@@ -1,19 +1,12 @@
-//! Effect `slosh`: propellant that swings in its tank, a damped mode that the spacecraft's acceleration drives.
+//! Effect `slosh`: propellant that oscillates in its tank, driven by the spacecraft's acceleration.
 //!
-//! A slug `m_f = μ m_S` at `x` from its rest along an axis of SRF, the spacecraft without it `m_S − m_f`, known force `F` on the
-//! spacecraft: `(m_S − m_f) a = F + κ`, `m_f (a + ẍ) = −κ`, `κ = m_f(ω0² x + 2ζω0 ẋ)` (Dodge, The New Dynamic Behavior of
-//! Liquids in Moving Containers, ch. 3). The sum is `m_S a = F − m_f ẍ`. With `a` put into the second,
+//! A slug of mass ratio μ adds to the spacecraft the acceleration `c s`, `c = μ/(1 − μ)`, where `s = −ẍ` is the output
+//! of `ẍ + 2ZΩ ẋ + Ω² x = −F/m_S` and F the known force; Methods, "Slosh". Test masses show `z_i = −c T_S^{O_i} e s`.
+//! The parameters `f0_hz` = Ω/2π and `zeta` = Z are those of the resonance with the spacecraft free.
 //!
-//! `ẍ + 2ZΩ ẋ + Ω² x = −F/(m_S (1 − μ))`, `Ω = ω0/√(1 − μ)`, `Z = ζ/√(1 − μ)`:
-//!
-//! so `a = F/m_S + c s`, where `s` is `−ẍ` under `F/m_S` and **`c = μ/(1 − μ)`**, the slug's mass over that of all the rest. The
-//! parameters `f0_hz` = Ω/2π and `zeta` = Z are those of the resonance as it is seen, with the spacecraft free; with the
-//! spacecraft held it is lower by √(1 − μ), 1.5 % for μ = 0.03. The test masses stay behind: `z_i = −c T_S^{O_i} e s`.
-//!
-//! `F` is what is known: thrusters, sunlight, the electrodes' recoil. Noise of the thrusters drives the mode too and is not
-//! known: it colours the residuals, common to both test masses, and Σ has it so ([`Colour`]). **Range** of c: 0 to 0.3; a slug cannot have a negative mass.
-//! **Confounders.** Far above the resonance `s = F/m_S`, the response of `mps-gain`, below it nothing: only the resonance's own
-//! band tells them apart.
+//! F contains thrusters, sunlight and the electrodes' recoil. Thruster noise drives the mode too, which changes the
+//! noise spectrum common to the test masses ([`Colour`]). **Range** of c: 0 to 0.3. **Confounders**: `mps-gain`, whose
+//! response is the same far above the resonance.
 
 use std::f64::consts::TAU;
 
@@ -22,52 +15,52 @@ use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
-    AXES, Place, axis_of, behind_spacecraft, loaded, manifest, mission, on_channels, rows_between, saved,
+    AXES, SeriesRef, axis_of, keep_available, loaded, manifest, mission, responses_to_spacecraft_force, saved,
+    skipped_rows,
 };
 
 const STATE: &[u8; 8] = b"slosh/1\n";
-const MOST: f64 = 0.3;
-/// Between the epochs of a shorter gap the last force holds, and after a longer one the slug starts at rest, s.
-const HOLD_S: f64 = 60.0;
-/// Resonances that a candidate tries, Hz, and their damping ratios.
+const MAX_RATIO: f64 = 0.3;
+/// Longest gap over which the last force is held, s; after a longer one the slug starts at rest.
+const MAX_HOLD_S: f64 = 60.0;
+/// Resonances of a candidate, Hz, and their damping ratios.
 const FIRST_HZ: f64 = 0.005;
 const LAST_HZ: f64 = 0.2;
 const ZETAS: [f64; 1] = [0.05];
-/// Every point of the grid is a series of its own at the full rate, so that a fine grid would cost more than all other effects together.
-/// The host mixes neighbours: of two that lie 2.5 half widths apart the best mixture keeps three quarters of the Δχ² of a resonance
-/// halfway, and 40 to 75 % of one that is as narrow as 2 %. Where that stands out the host asks again, with `fine` = 1.
+/// Spacing of the grid in half widths of a resonance. It trades the cost of a series at the full rate per point against
+/// sensitivity between points, where the host fits mixtures of neighbours. It refines a detection with `fine` = 1.
 const SPACING_PER_ZETA: f64 = 2.5;
-/// The fine grid: so far on either side of a resonance that was found, in steps of the narrowest width.
-const FINE_REACH: f64 = 0.15;
+/// Fine grid: relative half width about a detected resonance, and step.
+const FINE_HALF_WIDTH: f64 = 0.15;
 const FINE_STEP: f64 = 0.025;
 const FINE_ZETAS: [f64; 3] = [0.01, 0.02, 0.05];
 
-/// What a candidate tries: resonance, Hz, and damping ratio.
+/// Grid of a candidate: resonance, Hz, and damping ratio.
 pub(crate) fn grid() -> impl Iterator<Item = (f64, f64)> {
     ZETAS.into_iter().flat_map(|zeta| {
         let steps = ((LAST_HZ / FIRST_HZ).ln() / (SPACING_PER_ZETA * zeta).ln_1p()).ceil();
         let ratio = (LAST_HZ / FIRST_HZ).powf(1.0 / steps);
-        // A microhertz is a hundredth of the narrowest width.
+        // Rounding to 1 µHz, far below the narrowest width.
         let digits = |f: f64| (f * 1e6).round() / 1e6;
         (0..=steps as i32).map(move |i| (digits(FIRST_HZ * ratio.powi(i)), zeta))
     })
 }
 
-/// What it tries about a resonance that was found.
+/// Fine grid about a detected resonance.
 pub(crate) fn fine_grid(f0_hz: f64) -> impl Iterator<Item = (f64, f64)> {
-    let steps = (FINE_REACH / FINE_STEP).round() as i32;
+    let steps = (FINE_HALF_WIDTH / FINE_STEP).round() as i32;
     let digits = |f: f64| (f * 1e7).round() / 1e7;
     FINE_ZETAS
         .into_iter()
         .flat_map(move |zeta| (-steps..=steps).map(move |i| (digits(f0_hz * (1.0 + FINE_STEP).powi(i)), zeta)))
 }
 
-/// `s = −ẍ` of `ẍ + 2ZΩẋ + Ω²x = −a`, means over samples in which `a` holds, exactly.
+/// Output `s = −ẍ` of `ẍ + 2ZΩẋ + Ω²x = −a`, mean over samples, exact for `a` held over each sample.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Mode {
-    /// `(x, ẋ)` about the rest under a constant `a`, moved on by a sample: a matrix.
+    /// Transition matrix of `(x, ẋ)` about the rest over one sample.
     transition: [[f64; 2]; 2],
-    /// Rest under `a = 1`, s².
+    /// Rest position for `a = 1`, s².
     rest_s2: f64,
     dt_s: f64,
     state: [f64; 2],
@@ -84,12 +77,12 @@ impl Mode {
         Self { transition, rest_s2: -1.0 / (omega * omega), dt_s, state: [0.0; 2] }
     }
 
-    /// At rest under `a`.
+    /// Sets the rest state under `a`.
     pub(crate) fn settle(&mut self, a: f64) {
         self.state = [self.rest_s2 * a, 0.0];
     }
 
-    /// Moves on by a sample in which `a` holds; gives the mean of `−ẍ` over it.
+    /// Advances by a sample with input `a`; returns the mean of `−ẍ` over it.
     pub(crate) fn step(&mut self, a: f64) -> f64 {
         let [x, v] = [self.state[0] - self.rest_s2 * a, self.state[1]];
         let [to_x, to_v] = self.transition;
@@ -98,7 +91,7 @@ impl Mode {
     }
 }
 
-/// The thrusters' noise along an axis drives the mode as their commands do: the response of [`Mode`] is `s²/(s² + 2ZΩs + Ω²)`.
+/// Colouring of the thrusters' force noise by the response of [`Mode`], `s²/(s² + 2ZΩs + Ω²)`.
 fn colour(instance: &str, (f0_hz, zeta): (f64, f64)) -> Colour {
     let omega = TAU * f0_hz;
     Colour {
@@ -106,12 +99,6 @@ fn colour(instance: &str, (f0_hz, zeta): (f64, f64)) -> Colour {
         numerator: vec![0.0, 0.0, 1.0],
         denominator: vec![omega * omega, 2.0 * zeta * omega, 1.0],
     }
-}
-
-/// The force on the spacecraft along an axis, N, from columns with factors.
-#[derive(Debug)]
-struct Force {
-    terms: Vec<(In, f64)>,
 }
 
 /// The effect.
@@ -123,11 +110,12 @@ pub(crate) struct Slosh {
     fine: bool,
     f0_hz: f64,
     zeta: f64,
-    force: Force,
+    /// Columns and factors that add up to the force on the spacecraft along the axis, N.
+    force_terms: Vec<(In, f64)>,
     modes: Vec<(Mode, Out)>,
-    /// The last known force over the spacecraft's mass, m s⁻²; NaN before the first, or after a long gap.
-    held: f64,
-    /// Rows without a force since.
+    /// Last known force over the spacecraft's mass, m s⁻²; NaN before the first and after a long gap.
+    last_input: f64,
+    /// Rows since that force.
     missing: u64,
     last_ns: i64,
 }
@@ -137,15 +125,15 @@ impl Slosh {
         format!("slosh:{}", self.instance)
     }
 
-    /// `F_T + F_SRP − Σ T_{O_j}^S F_Ej` along the axis (eq:TM_SC_relative_acceleration).
+    /// Requests the terms of `F_T + F_SRP − Σ T_{O_j}^S F_Ej` along the axis (eq:TM_SC_relative_acceleration).
     fn link_force(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
         let axis = axis_of(&self.instance);
         let thrust = Want::new(format!("used.mps_force_srf_n.{}", AXES[axis])).unit("N").frame("SRF");
-        self.force.terms = vec![(link.read(&thrust)?, 1.0)];
+        self.force_terms = vec![(link.read(&thrust)?, 1.0)];
         if let Some(pressure) = &self.mission.solar_pressure {
             let sun = Want::new(format!("used.sun_srf.{}", AXES[axis])).unit("1").frame("SRF");
             if let Some(sun) = link.read_if_available(available, &sun)? {
-                self.force.terms.push((sun, pressure.force_n));
+                self.force_terms.push((sun, pressure.force_n));
             }
         }
         for (name, tm) in &self.mission.test_mass {
@@ -156,14 +144,14 @@ impl Slosh {
                 if srf_from_orf[(axis, j)] != 0.0
                     && let Some(push) = link.read_if_available(available, &push)?
                 {
-                    self.force.terms.push((push, -srf_from_orf[(axis, j)]));
+                    self.force_terms.push((push, -srf_from_orf[(axis, j)]));
                 }
             }
         }
         Ok(())
     }
 
-    /// The series of one resonance, and what the test masses show of it.
+    /// Responses to one resonance; registers its series.
     fn responses(
         &mut self,
         (f0_hz, zeta): (f64, f64),
@@ -175,34 +163,34 @@ impl Slosh {
         if let Some(out) = out {
             self.modes.push((Mode::new(f0_hz, zeta, self.mission.dt_s()), out));
         }
-        let mut responses = behind_spacecraft(&self.mission, axis_of(&self.instance), &(table, name));
-        // The series is an acceleration of the spacecraft, not a force on it.
+        let mut responses = responses_to_spacecraft_force(&self.mission, axis_of(&self.instance), &(table, name));
+        // The series is an acceleration of the spacecraft rather than a force.
         responses.iter_mut().for_each(|r| r.factor *= self.mission.spacecraft.mass_kg);
-        on_channels(available, &self.name(), responses)
+        keep_available(available, &self.name(), responses)
     }
 
-    /// Takes in a row's acceleration by the known force; false where the row has no value.
-    fn drive(&mut self, now_ns: i64, a: f64) -> bool {
+    /// Handles gaps before a row with the acceleration `a` by the known force; false if `a` is missing.
+    fn advance_gaps(&mut self, now_ns: i64, a: f64) -> bool {
         let dt_s = self.mission.dt_s();
-        let patience = (HOLD_S / dt_s) as u64;
-        let left_out = rows_between(self.last_ns, now_ns, dt_s);
-        self.missing = self.missing.saturating_add(left_out);
+        let max_missing = (MAX_HOLD_S / dt_s) as u64;
+        let skipped = skipped_rows(self.last_ns, now_ns, dt_s);
+        self.missing = self.missing.saturating_add(skipped);
         self.last_ns = now_ns;
         let known = a.is_finite();
-        if self.missing > patience {
-            self.held = f64::NAN;
+        if self.missing > max_missing {
+            self.last_input = f64::NAN;
         }
-        if self.held.is_finite() {
-            for _ in 0..left_out {
+        if self.last_input.is_finite() {
+            for _ in 0..skipped {
                 for (mode, _) in &mut self.modes {
-                    mode.step(self.held);
+                    mode.step(self.last_input);
                 }
             }
         } else if known {
             self.modes.iter_mut().for_each(|(mode, _)| mode.settle(a));
         }
         if known {
-            (self.held, self.missing) = (a, 0);
+            (self.last_input, self.missing) = (a, 0);
         } else {
             self.missing = self.missing.saturating_add(1);
         }
@@ -213,11 +201,11 @@ impl Slosh {
 impl Effect for Slosh {
     const MANIFEST: Manifest = manifest(
         "slosh",
-        "Propellant that swings along an axis, driven by the spacecraft's acceleration",
+        "Propellant slosh along an axis, driven by the spacecraft's acceleration",
         &[
-            Parameter::f64("f0_hz", "Hz", 0.03, 1e-4..=2.0, "resonance as it is seen, with the spacecraft free"),
+            Parameter::f64("f0_hz", "Hz", 0.03, 1e-4..=2.0, "resonance frequency with the spacecraft free"),
             Parameter::f64("zeta", "1", 0.02, 1e-4..=0.9, "damping ratio of that resonance"),
-            Parameter::i64("fine", "1", 0, 0..=1, "1 for a candidate that is tried about f0_hz alone, in fine steps"),
+            Parameter::i64("fine", "1", 0, 0..=1, "1 to search a fine grid about f0_hz only, for candidates"),
         ],
         &["sc.x", "sc.y"],
         &["commands"],
@@ -231,22 +219,26 @@ impl Effect for Slosh {
             fine: setup.i64("fine")? == 1,
             f0_hz: setup.f64("f0_hz")?,
             zeta: setup.f64("zeta")?,
-            force: Force { terms: Vec::new() },
+            force_terms: Vec::new(),
             modes: Vec::new(),
-            held: f64::NAN,
+            last_input: f64::NAN,
             missing: 0,
             last_ns: 0,
         })
     }
 
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
-        on_channels(available, &self.name(), behind_spacecraft(&self.mission, 0, &Place::default()))?;
+        keep_available(
+            available,
+            &self.name(),
+            responses_to_spacecraft_force(&self.mission, 0, &SeriesRef::default()),
+        )?;
         self.link_force(available, link)?;
         let mut coefficient = Coefficient {
             name: format!("slosh.{}", self.instance),
             lower: 0.0,
-            upper: MOST,
-            prior_sigma: MOST / 3.0,
+            upper: MAX_RATIO,
+            prior_sigma: MAX_RATIO / 3.0,
             ..Coefficient::default()
         };
         let shape = |(f0_hz, zeta): (f64, f64)| {
@@ -270,30 +262,30 @@ impl Effect for Slosh {
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
         let times = input.time_ns();
         let mut acceleration = vec![0.0; times.len()];
-        for (column, factor) in &self.force.terms {
+        for (column, factor) in &self.force_terms {
             let factor = factor / self.mission.spacecraft.mass_kg;
             acceleration.iter_mut().zip(input.f64(*column)).for_each(|(a, x)| *a += factor * x);
         }
         let mut start = 0;
         while start < times.len() {
-            // A row without a force, or after a gap, alone; then all that follow without one, mode by mode.
-            let known = self.drive(times[start], acceleration[start]);
+            // One row alone if it lacks a force or follows a gap, then all regular rows, mode by mode.
+            let known = self.advance_gaps(times[start], acceleration[start]);
             let mut end = start + 1;
             let step_ns = (self.mission.dt_s() * 1.5e9) as i64;
             if known {
                 while end < times.len() && acceleration[end].is_finite() && times[end] - times[end - 1] < step_ns {
                     end += 1;
                 }
-                (self.held, self.last_ns) = (acceleration[end - 1], times[end - 1]);
+                (self.last_input, self.last_ns) = (acceleration[end - 1], times[end - 1]);
             }
-            let held = self.held;
+            let last_input = self.last_input;
             for (mode, out) in &mut self.modes {
                 let column = output.f64(*out);
                 if known {
                     column.extend(acceleration[start..end].iter().map(|a| mode.step(*a)));
                 } else {
-                    if held.is_finite() {
-                        mode.step(held);
+                    if last_input.is_finite() {
+                        mode.step(last_input);
                     }
                     column.push(f64::NAN);
                 }
@@ -306,12 +298,12 @@ impl Effect for Slosh {
     fn save(&self) -> Result<Vec<u8>, PluginError> {
         let whole = [self.missing, self.last_ns.cast_unsigned()].map(f64::from_bits);
         let modes = self.modes.iter().flat_map(|(mode, _)| mode.state);
-        Ok(saved(STATE, [self.held].into_iter().chain(whole).chain(modes)))
+        Ok(saved(STATE, [self.last_input].into_iter().chain(whole).chain(modes)))
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
         let numbers = loaded(STATE, &self.name(), 3 + 2 * self.modes.len(), state)?;
-        (self.held, self.missing) = (numbers[0], numbers[1].to_bits());
+        (self.last_input, self.missing) = (numbers[0], numbers[1].to_bits());
         self.last_ns = numbers[2].to_bits().cast_signed();
         for ((mode, _), state) in self.modes.iter_mut().zip(numbers[3..].chunks_exact(2)) {
             mode.state = [state[0], state[1]];
@@ -324,10 +316,9 @@ impl Effect for Slosh {
 mod tests {
     use super::*;
 
-    /// The two bodies themselves, each with its own equation, in small steps: what the spacecraft does more than `F/m_S` is the
-    /// mode's output times μ/(1 − μ). Nothing here knows of the resonance's shift or of exponentials.
+    /// Reference: each body's own equation of motion in small steps, without the mode's resonance or exponentials.
     #[test]
-    fn slug_and_spacecraft_move_as_the_mode_says() {
+    fn mode_output_matches_two_body_dynamics() {
         let (mass_kg, mu, f0_hz, zeta, dt_s) = (1500.0, 0.2_f64, 0.4, 0.1, 0.1);
         let (slug_kg, rest_kg) = (mass_kg * mu, mass_kg * (1.0 - mu));
         let omega = TAU * f0_hz;
@@ -363,21 +354,20 @@ mod tests {
     }
 
     #[test]
-    fn under_a_constant_force_a_settled_slug_does_nothing() {
+    fn a_settled_slug_has_no_effect_under_constant_force() {
         let mut mode = Mode::new(0.03, 0.02, 0.1);
         mode.settle(3e-7);
         for _ in 0..1000 {
             assert!(mode.step(3e-7).abs() < 1e-20);
         }
-        // And far above its resonance the slug stays where it is while the rest is pushed: the rest is lighter by it.
+        // Far above its resonance the slug does not move and the spacecraft is lighter by it.
         let mut mode = Mode::new(1e-4, 0.02, 0.1);
         assert!((mode.step(3e-7) - 3e-7).abs() < 1e-12);
     }
 
-    /// What a mode makes of a wave after it has swung in is what its colour says, to a per cent: it works with means over samples, which
-    /// are 3e-4 smaller at a sixtieth of the rate.
+    /// Reference: the settled response to a sine wave. The mode works with means over samples, hence the tolerance.
     #[test]
-    fn a_colour_is_the_response_of_the_mode() {
+    fn the_colouring_is_the_response_of_the_mode() {
         let (f0_hz, zeta, dt_s) = (0.03, 0.05, 0.1);
         let colour = colour("sc.y", (f0_hz, zeta));
         assert_eq!(colour.process, "thruster_force:sc.y");
@@ -401,10 +391,9 @@ mod tests {
         }
     }
 
-    /// On the fine grid a resonance of two per cent between two points loses a tenth at most; and the grid reaches beyond the coarse
-    /// one's next points.
+    /// Between points of the fine grid a resonance of 2 % damping loses at most a tenth of its Δχ².
     #[test]
-    fn the_fine_grid_is_fine_and_reaches_far_enough() {
+    fn the_fine_grid_resolves_a_resonance_and_overlaps_the_coarse_neighbours() {
         let all: Vec<(f64, f64)> = fine_grid(0.05).filter(|(_, zeta)| *zeta == 0.02).collect();
         let middle = all.len() / 2;
         assert!((all[middle].0 - 0.05).abs() < 1e-9);
@@ -416,13 +405,13 @@ mod tests {
         assert!(all[0].0 < 0.05 / ratio && all.last().unwrap().0 > 0.05 * ratio, "{all:?} {ratio}");
     }
 
-    /// What a flat drive leaves of Δχ² to the best mixture of two resonances whose truth lies elsewhere: the responses' integrals over
-    /// frequency.
+    /// Fraction of Δχ² lost by the best mixture of two resonances when the truth lies elsewhere, for a flat force
+    /// spectrum.
     fn loss(truth: (f64, f64), tried: [(f64, f64); 2]) -> f64 {
         let h = |f: f64, (f0, zeta): (f64, f64)| {
             nalgebra::Complex::new(f * f, 0.0) / nalgebra::Complex::new(f * f - f0 * f0, -2.0 * zeta * f0 * f)
         };
-        // Up to 0.3 Hz, as far as the loop answers the thrusters' noise.
+        // Band in which the control loop counteracts thruster noise.
         let mut g = nalgebra::Matrix3::<f64>::zeros();
         let df = 1e-2 * truth.0 * truth.1;
         for i in 0..(0.3 / df) as usize {
@@ -436,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn between_two_points_of_the_grid_their_mixture_loses_at_most_a_quarter() {
+    fn a_mixture_of_grid_neighbours_loses_at_most_a_quarter() {
         let all: Vec<(f64, f64)> = grid().collect();
         assert!((all[0].0, all.last().unwrap().0) == (FIRST_HZ, LAST_HZ), "{all:?}");
         for i in [0, all.len() / 2, all.len() - 2] {
@@ -444,7 +433,8 @@ mod tests {
             let lost = loss(middle, [all[i], all[i + 1]]);
             assert!(lost < 0.25, "{middle:?}: {lost}");
         }
-        // A grid twice as coarse would lose four tenths and more, but for the slowest, which are seen by what they do above.
+        // A grid twice as coarse loses over 40 %, except at the slowest resonances, which are seen above their
+        // frequency.
         for i in [all.len() / 2, all.len() - 2] {
             let (middle, part) = ((all[i].0 * all[i + 1].0).sqrt(), (all[i + 1].0 / all[i].0).sqrt());
             let far = [(all[i].0 / part, all[i].1), (all[i + 1].0 * part, all[i].1)];

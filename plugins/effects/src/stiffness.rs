@@ -1,115 +1,111 @@
-//! Forces that depend on where a test mass is and how it is turned: `stiffness`, `cross-stiffness`.
+//! Forces that depend on displacement and angle of a test mass: `stiffness`, `cross-stiffness`.
 //!
-//! Both act through a readout, held where it has no value. A channel's sample at `t_k` holds the readouts up to `t_{k+1}`, of
-//! which the series knows those up to `t_k`: it is causal with respect to the channel, so that the readout's noise in it does not
-//! bias a fit over the whole band. Within a sample the displacement moves by some 1e-10 m, which is left out.
-//!
-//! Usually below detection: displacements of 1e-8 m change by the nominal stiffness of 1e-6 s⁻² what a nanometre of readout noise
-//! hides; the honest answer is an upper limit.
+//! The regressor is a readout, held over missing values. The channel's sample at `t_k` contains readouts up to
+//! `t_{k+1}` and the regressor only those up to `t_k`, so readout noise in the regressor does not bias a fit over the
+//! whole band. The displacement's change within a sample is neglected. Both are usually below detection; the result is
+//! an upper limit.
 
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 
-use crate::linear::{ANGLES, Linear, Part, Recipe, Series, Source, Term, accel, tm_axis};
+use crate::common::{TM_AXES, manifest};
+use crate::linear::{ANGLES, CoefficientForms, InputColumn, LinearEffect, Series, Term, accel_channel, tm_axis};
 
 const STIFFNESS_S2: [f64; 2] = [-1e-5, 1e-5];
 const CROSS_M_S2_RAD: [f64; 2] = [-1e-6, 1e-6];
 
-const INSTANCES: &[&str] = &["tm1.x", "tm1.y", "tm1.z", "tm2.x", "tm2.y", "tm2.z"];
-
-/// `stiffness`: the element of `S_TT` along an axis of ORF is not the mission file's.
+/// `stiffness`: an error of a diagonal element of `S_TT`, ORF.
 ///
-/// `z = ΔS r` with the measured displacement; ΔS: s⁻², ±1e-5, positive pushes away from the centre. The mission file's own
-/// stiffness is in `û` already (eq:TM_SC_relative_acceleration, `F_st`). Confounders: gains of what holds the test mass.
+/// `z = ΔS r` with the measured displacement; ΔS: s⁻², ±1e-5, positive if the force points away from the centre. The
+/// mission file's stiffness is part of `û` (eq:TM_SC_relative_acceleration, `F_st`). Confounders: gains of the
+/// actuators that hold the test mass.
 #[derive(Debug)]
-pub(crate) struct StiffnessRecipe(usize, usize);
+pub(crate) struct Stiffness(usize, usize);
 
-/// See [`StiffnessRecipe`].
-pub(crate) type Stiffness = Linear<StiffnessRecipe>;
-
-impl Recipe for StiffnessRecipe {
-    const MANIFEST: Manifest = Manifest {
-        id: "stiffness",
-        version: env!("CARGO_PKG_VERSION"),
-        licence: "MIT OR Apache-2.0",
-        description: "A test mass is pushed or pulled by its displacement more than the mission file says",
-        parameters: &[],
-        instances: INSTANCES,
-        needs: &[],
-    };
+impl LinearEffect for Stiffness {
+    const MANIFEST: Manifest = manifest(
+        "stiffness",
+        "Force gradient of a test mass along an axis beyond the mission file's",
+        &[],
+        &TM_AXES,
+        &[],
+    );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         let (tm, axis) = tm_axis(setup.instance());
         Ok(Self(tm, axis))
     }
 
-    fn parts(&self, _: &Mission, _: &Available) -> Result<Vec<Part>, PluginError> {
+    fn coefficients(&self, _: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
         let Self(tm, axis) = *self;
-        let terms = vec![Term::new(accel(tm, axis), Series::Held(Source::displacement(tm, axis)), 1.0)];
-        Ok(Part::only("s-2", STIFFNESS_S2, terms))
+        let terms = vec![Term::new(accel_channel(tm, axis), Series::Held(InputColumn::displacement(tm, axis)), 1.0)];
+        Ok(CoefficientForms::only("s-2", STIFFNESS_S2, terms))
     }
 }
 
-/// `cross-stiffness`: the element of `S_TR` along and about an axis of ORF is not the mission file's.
+/// `cross-stiffness`: an error of a diagonal element of `S_TR`, ORF.
 ///
-/// `z = ΔS θ` with the measured angle about the axis, local wavefront sensing for `θ` and `ψ`, the inertial sensor for `φ`;
-/// ΔS: m s⁻² rad⁻¹, ±1e-6. The torque that belongs to it, `J_m S_RT = m S_TRᵀ`, is in no channel.
+/// `z = ΔS θ` with the measured angle about the axis: local wavefront sensing for `θ` and `ψ`, the inertial sensor for
+/// `φ`. ΔS: m s⁻² rad⁻¹, ±1e-6. The corresponding torque, `J_m S_RT = m S_TRᵀ`, is in no channel.
 #[derive(Debug)]
-pub(crate) struct CrossStiffnessRecipe(usize, usize);
+pub(crate) struct CrossStiffness(usize, usize);
 
-/// See [`CrossStiffnessRecipe`].
-pub(crate) type CrossStiffness = Linear<CrossStiffnessRecipe>;
-
-impl Recipe for CrossStiffnessRecipe {
-    const MANIFEST: Manifest = Manifest {
-        id: "cross-stiffness",
-        version: env!("CARGO_PKG_VERSION"),
-        licence: "MIT OR Apache-2.0",
-        description: "A test mass is pushed by its angle more than the mission file says",
-        parameters: &[],
-        instances: INSTANCES,
-        needs: &[],
-    };
+impl LinearEffect for CrossStiffness {
+    const MANIFEST: Manifest =
+        manifest("cross-stiffness", "Force on a test mass per angle beyond the mission file's", &[], &TM_AXES, &[]);
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         let (tm, axis) = tm_axis(setup.instance());
         Ok(Self(tm, axis))
     }
 
-    fn parts(&self, _: &Mission, available: &Available) -> Result<Vec<Part>, PluginError> {
+    fn coefficients(&self, _: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
         let Self(tm, axis) = *self;
-        let local = Source::angle_by_dws(tm, ANGLES[axis]);
-        let angle = if available.find(&local.name).is_some() { local } else { Source::angle_by_is(tm, ANGLES[axis]) };
-        Ok(Part::only("m s-2 rad-1", CROSS_M_S2_RAD, vec![Term::new(accel(tm, axis), Series::Held(angle), 1.0)]))
+        let local = InputColumn::angle_by_dws(tm, ANGLES[axis]);
+        let angle =
+            if available.find(&local.name).is_some() { local } else { InputColumn::angle_by_is(tm, ANGLES[axis]) };
+        Ok(CoefficientForms::only(
+            "m s-2 rad-1",
+            CROSS_M_S2_RAD,
+            vec![Term::new(accel_channel(tm, axis), Series::Held(angle), 1.0)],
+        ))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bench::Bench;
-    use crate::linear::AXES;
+    use crate::common::AXES;
+    use crate::test_spacecraft::TestSpacecraft;
     use nalgebra::Vector3;
 
     #[test]
-    fn a_spring_pushes_by_its_own_axis_displacement_or_angle() {
+    fn stiffness_terms_match_the_derivative() {
         for (tm, axis) in [(0, 0), (0, 1), (1, 2)] {
             let r_orf_m = [Vector3::new(0.4, -0.3, 0.2), Vector3::new(-0.2, 0.5, 0.6)];
             let angle_orf_rad = [Vector3::new(0.3, 0.7, -0.2), Vector3::new(0.1, -0.4, 0.5)];
-            let bench = Bench { r_orf_m, angle_orf_rad, ..Bench::new() };
+            let test_spacecraft = TestSpacecraft { r_orf_m, angle_orf_rad, ..TestSpacecraft::new() };
             let instance = format!("tm{}.{}", tm + 1, AXES[axis]);
-            bench.check::<StiffnessRecipe>(&instance, "", &[&|w, s| w.stiffness_s2[tm][(axis, axis)] += s]);
-            bench.check::<CrossStiffnessRecipe>(&instance, "", &[&|w, s| w.cross_m_s2_rad[tm][(axis, axis)] += s]);
+            test_spacecraft.assert_matches_derivative::<Stiffness>(
+                &instance,
+                "",
+                &[&|w, s| w.stiffness_s2[tm][(axis, axis)] += s],
+            );
+            test_spacecraft.assert_matches_derivative::<CrossStiffness>(
+                &instance,
+                "",
+                &[&|w, s| w.cross_stiffness_m_s2_rad[tm][(axis, axis)] += s],
+            );
         }
     }
 
     #[test]
-    fn angles_come_from_the_finer_instrument_where_there_is_one() {
-        let bench = Bench::new();
-        let mut available = bench.available();
+    fn wavefront_sensing_is_preferred_for_angles() {
+        let test_spacecraft = TestSpacecraft::new();
+        let mut available = test_spacecraft.available();
         let name = |available: &Available| {
-            let parts = CrossStiffnessRecipe(1, 2).parts(&bench.mission, available).unwrap();
-            parts[0].forms[0].terms[0].series.name()
+            let coefficients = CrossStiffness(1, 2).coefficients(&test_spacecraft.mission, available).unwrap();
+            coefficients[0].forms[0].terms[0].series.name()
         };
         assert_eq!(name(&available), "held(is.tm2.att_orf_rad.psi)");
         available.columns.push(Column { name: "dws.tm2.psi_orf_rad".to_owned(), ..Column::default() });

@@ -1,58 +1,57 @@
-//! Effect `thermal`: a force on a test mass that follows the difference of two temperatures.
+//! Effect `thermal`: a force on a test mass proportional to the difference of two temperatures.
 //!
-//! Warm walls push: residual gas, radiation pressure and outgassing of opposite faces of the housing differ by their
-//! temperatures. `a = k (T₊ − T₋)` behind a first-order lag `τ`, by which heat comes from where it is measured to where it acts:
-//! `τ ẏ = T − y` (LISA Pathfinder's housings: arXiv:1905.09060, 2507.20846).
+//! Residual gas, radiation pressure and outgassing of opposite housing faces differ with their temperatures: `a = k (T₊
+//! − T₋)` behind a first-order lag `τ` between thermometer and face, `τ ẏ = T − y` (LISA Pathfinder: arXiv:1905.09060,
+//! 2507.20846).
 //!
-//! **Units, sign.** k: m s⁻² K⁻¹; positive where the test mass is pushed along its axis of ORF while `plus` is the warmer one.
-//! **Range** ±1e-9: radiation pressure and the radiometric effect give some 1e-11 each; more is another cause.
-//! **Confounders.** The two columns and the lag are to be found: neighbouring lags differ little (the bank's ratio is 1.5, and
-//! the truth between two of them is a mixture), thermometers that see the same heater are alike, and the loop's commands mirror
-//! every slow force: gains of actuators near −1 "explain" it too, which their ranges forbid.
+//! k: m s⁻² K⁻¹, positive if the test mass is pushed along its axis of ORF while `plus` is warmer. **Range** ±1e-9;
+//! radiation pressure and the radiometric effect give some 1e-11 each. **Confounders**: neighbouring lags, of which the
+//! truth may be a mixture; thermometers that see the same heater.
 
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
-    Place, SLOW_HZ, TM_AXES, channel_of, housekeeping, loaded, manifest, mission, named, on_channels, response, saved,
+    SLOW_HZ, SeriesRef, TM_AXES, accel_channel_of, find_housekeeping, housekeeping_in, keep_available, loaded,
+    manifest, mission, response, saved,
 };
 use crate::lag::Lags;
 
 const STATE: &[u8; 8] = b"thermal1";
-const K_MAX: f64 = 1e-9;
+const MAX_PER_KELVIN: f64 = 1e-9;
 
-/// The lags that a candidate tries, s: 30 s to 4,000 s in steps of 1.5, whole seconds.
+/// Lags of a candidate, s: 30 s to 4,000 s in steps of 1.5, whole seconds.
 pub(crate) const LAGS_S: [f64; 13] =
     [30.0, 45.0, 68.0, 101.0, 152.0, 228.0, 342.0, 513.0, 769.0, 1153.0, 1730.0, 2595.0, 3892.0];
 
-/// Name of a lagged column.
-pub(crate) fn lagged(column: &str, lag_s: f64) -> String {
+/// Name of the series of a lagged column.
+pub(crate) fn lagged_name(column: &str, lag_s: f64) -> String {
     format!("lag({column},{lag_s})")
 }
 
-/// One column behind lags, those of which nobody else made before.
+/// One column behind several lags.
 #[derive(Debug)]
-struct Bank<const N: usize> {
+struct LaggedColumn<const N: usize> {
     input: In,
     lags: Lags<N>,
-    /// Per lag: where it is written, unless it stands elsewhere.
+    /// Output column per lag; `None` if another effect writes the series.
     out: [Option<Out>; N],
 }
 
-impl<const N: usize> Bank<N> {
-    /// Announces what is missing; gives where each lag stands, and the bank if it has anything to do.
+impl<const N: usize> LaggedColumn<N> {
+    /// Requests the series; returns them, and the bank if this effect must compute any of them.
     fn link(
         column: &Column,
         lag_s: [f64; N],
         dt_s: f64,
         available: &Available,
         link: &mut EffectLink<'_, '_>,
-    ) -> Result<([Place; N], Option<Self>), PluginError> {
+    ) -> Result<([SeriesRef; N], Option<Self>), PluginError> {
         let mut places = [const { (String::new(), String::new()) }; N];
         let mut out = [None; N];
         for j in 0..N {
-            let name = lagged(&column.name, lag_s[j]);
+            let name = lagged_name(&column.name, lag_s[j]);
             let (table, written) = link.slow_series(available, &name, &column.unit, SLOW_HZ)?;
             (places[j], out[j]) = ((table, name), written);
         }
@@ -82,8 +81,8 @@ pub(crate) struct Thermal {
     plus: String,
     minus: String,
     lag_s: f64,
-    single: Vec<Bank<1>>,
-    banks: Vec<Bank<13>>,
+    lagged_pair: Vec<LaggedColumn<1>>,
+    banks: Vec<LaggedColumn<13>>,
 }
 
 impl Thermal {
@@ -91,17 +90,17 @@ impl Thermal {
         format!("thermal:{}", self.instance)
     }
 
-    /// The response to one lagged temperature.
-    fn pushed(&self, temperature: &Place, factor: f64) -> Response {
-        response(channel_of(&self.instance), temperature, factor)
+    /// Response to one lagged temperature.
+    fn force_response(&self, temperature: &SeriesRef, factor: f64) -> Response {
+        response(accel_channel_of(&self.instance), temperature, factor)
     }
 
-    /// Every two temperatures, once, at every lag of the grid. The sign of k is free, so their order tells nothing.
+    /// Every pair of temperatures at every lag. The sign of k is free, so each pair is listed in one order.
     fn variants(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<Vec<Variant>, PluginError> {
-        let columns: Vec<&Column> = housekeeping(available, "K").collect();
+        let columns: Vec<&Column> = housekeeping_in(available, "K").collect();
         let mut places = Vec::new();
         for column in &columns {
-            let (place, bank) = Bank::link(column, LAGS_S, self.mission.dt_s(), available, link)?;
+            let (place, bank) = LaggedColumn::link(column, LAGS_S, self.mission.dt_s(), available, link)?;
             places.push(place);
             self.banks.extend(bank);
         }
@@ -114,7 +113,8 @@ impl Thermal {
                         ("minus".to_owned(), json!(columns[minus].name)),
                         ("lag_s".to_owned(), json!(lag_s)),
                     ];
-                    let responses = vec![self.pushed(&places[plus][j], 1.0), self.pushed(&places[minus][j], -1.0)];
+                    let responses =
+                        vec![self.force_response(&places[plus][j], 1.0), self.force_response(&places[minus][j], -1.0)];
                     variants.push(Variant { shape: shape.into(), responses, ..Variant::default() });
                 }
             }
@@ -122,25 +122,25 @@ impl Thermal {
         Ok(variants)
     }
 
-    /// The two temperatures that the parameters name, or one alone.
+    /// Responses to the temperatures that the parameters name; either may be empty.
     fn responses(
         &mut self,
         available: &Available,
         link: &mut EffectLink<'_, '_>,
     ) -> Result<Vec<Response>, PluginError> {
         if self.plus.is_empty() && self.minus.is_empty() {
-            // The sentence says which columns there are.
-            named(available, &self.name(), "plus", "", "K")?;
+            // Refuses with the list of columns.
+            find_housekeeping(available, &self.name(), "plus", "", "K")?;
         }
         let mut responses = Vec::new();
         for (parameter, name, factor) in [("plus", self.plus.clone(), 1.0), ("minus", self.minus.clone(), -1.0)] {
             if name.is_empty() {
                 continue;
             }
-            let column = named(available, &self.name(), parameter, &name, "K")?;
-            let ([lagged], bank) = Bank::link(column, [self.lag_s], self.mission.dt_s(), available, link)?;
-            responses.push(self.pushed(&lagged, factor));
-            self.single.extend(bank);
+            let column = find_housekeeping(available, &self.name(), parameter, &name, "K")?;
+            let ([lagged_name], bank) = LaggedColumn::link(column, [self.lag_s], self.mission.dt_s(), available, link)?;
+            responses.push(self.force_response(&lagged_name, factor));
+            self.lagged_pair.extend(bank);
         }
         Ok(responses)
     }
@@ -149,7 +149,7 @@ impl Thermal {
 impl Effect for Thermal {
     const MANIFEST: Manifest = manifest(
         "thermal",
-        "Force on a test mass that follows the difference of two temperatures behind a lag",
+        "Force on a test mass proportional to a lagged temperature difference",
         &[
             Parameter::text("plus", "", &[], "column of the temperature that pushes along the axis, hk.NAME in K"),
             Parameter::text("minus", "", &[], "column of the temperature that pushes against it, hk.NAME in K"),
@@ -167,7 +167,7 @@ impl Effect for Thermal {
             plus: setup.text("plus")?,
             minus: setup.text("minus")?,
             lag_s: setup.f64("lag_s")?,
-            single: Vec::new(),
+            lagged_pair: Vec::new(),
             banks: Vec::new(),
         })
     }
@@ -176,18 +176,18 @@ impl Effect for Thermal {
         let mut coefficient = Coefficient {
             name: format!("thermal.{}", self.instance),
             unit: "m s-2 K-1".to_owned(),
-            lower: -K_MAX,
-            upper: K_MAX,
-            prior_sigma: K_MAX / 3.0,
+            lower: -MAX_PER_KELVIN,
+            upper: MAX_PER_KELVIN,
+            prior_sigma: MAX_PER_KELVIN / 3.0,
             ..Coefficient::default()
         };
-        // Without its channel there is nothing to say.
-        on_channels(available, &self.name(), vec![self.pushed(&Place::default(), 1.0)])?;
+        // Checks the channel first.
+        keep_available(available, &self.name(), vec![self.force_response(&SeriesRef::default(), 1.0)])?;
         if self.candidate {
             coefficient.variants = self.variants(available, link)?;
             if coefficient.variants.is_empty() {
                 return Err(PluginError::error(format!(
-                    "effect {}: the telemetry has fewer than two temperatures, columns hk.* in K, so there is nothing to try",
+                    "effect {}: the telemetry has fewer than two temperatures (columns hk.* in K), so this candidate has no form",
                     self.name()
                 )));
             }
@@ -204,21 +204,24 @@ impl Effect for Thermal {
     }
 
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
-        self.single.iter_mut().for_each(|bank| bank.process(input, output));
+        self.lagged_pair.iter_mut().for_each(|bank| bank.process(input, output));
         self.banks.iter_mut().for_each(|bank| bank.process(input, output));
         Ok(())
     }
 
     fn save(&self) -> Result<Vec<u8>, PluginError> {
-        let single = self.single.iter().flat_map(|bank| bank.lags.state());
-        Ok(saved(STATE, single.chain(self.banks.iter().flat_map(|bank| bank.lags.state()))))
+        let lagged_pair = self.lagged_pair.iter().flat_map(|bank| bank.lags.state());
+        Ok(saved(STATE, lagged_pair.chain(self.banks.iter().flat_map(|bank| bank.lags.state()))))
     }
 
     fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let count = self.single.len() * Lags::<1>::STATE + self.banks.len() * Lags::<13>::STATE;
+        let count = self.lagged_pair.len() * Lags::<1>::STATE + self.banks.len() * Lags::<13>::STATE;
         let numbers = loaded(STATE, &self.name(), count, state)?;
-        let (single, banks) = numbers.split_at(self.single.len() * Lags::<1>::STATE);
-        self.single.iter_mut().zip(single.chunks_exact(Lags::<1>::STATE)).for_each(|(b, s)| b.lags.set_state(s));
+        let (lagged_pair, banks) = numbers.split_at(self.lagged_pair.len() * Lags::<1>::STATE);
+        self.lagged_pair
+            .iter_mut()
+            .zip(lagged_pair.chunks_exact(Lags::<1>::STATE))
+            .for_each(|(b, s)| b.lags.set_state(s));
         self.banks.iter_mut().zip(banks.chunks_exact(Lags::<13>::STATE)).for_each(|(b, s)| b.lags.set_state(s));
         Ok(())
     }

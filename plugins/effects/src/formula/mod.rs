@@ -1,4 +1,4 @@
-//! Effect `formula`: what the user writes down, without a compiler.
+//! Effect `formula`: an expression in the model file, without a compiler.
 //!
 //! ```toml
 //! [[effect]]
@@ -13,25 +13,25 @@
 //!
 //! The coefficient times the expression is
 //!
-//! | `acts_on` | unit of coefficient × expression | what the channels show |
+//! | `acts_on` | unit of coefficient × expression | response |
 //! |---|---|---|
 //! | `tmN.force.x\|y\|z` | N on the test mass, ORF | `1/m_m` on `tmN.accel` |
-//! | `tmN.accel.x\|y\|z` | m s⁻² of the test mass, ORF | itself |
-//! | `sc.force.x\|y\|z` | N on the spacecraft, SRF | both test masses stay behind, `−T_S^{O_i} e/m_S` |
-//! | `sc.torque.x\|y\|z` | N m on the spacecraft, SRF | `J_S⁻¹ e` in the attitude, `sc.alpha` |
+//! | `tmN.accel.x\|y\|z` | m s⁻² of the test mass, ORF | `tmN.accel` |
+//! | `sc.force.x\|y\|z` | N on the spacecraft, SRF | `−T_S^{O_i} e/m_S` on the test masses |
+//! | `sc.torque.x\|y\|z` | N m on the spacecraft, SRF | `J_S⁻¹ e` on the attitude, `sc.alpha` |
 //!
-//! **Names.** `hk.NAME` the telemetry's housekeeping; `alpha.x`, `omega.x` the spacecraft's angular acceleration and rate (SRF,
-//! rad s⁻², rad s⁻¹); `r1.x`, `u1.x` displacement and known acceleration of a test mass (ORF, m, m s⁻²);
-//! `command.mps_force.x`, `command.mps_torque.x`, `command.tm1.force.x`, `command.tm1.torque.x` what acted as commanded (SRF or
-//! ORF, N, N m); `sun.x` the direction from the Sun (SRF); `time_s` seconds since the first epoch of the run; `pi`.
+//! **Names.** `hk.NAME` housekeeping; `alpha.x`, `omega.x` angular acceleration and rate of the spacecraft (SRF, rad
+//! s⁻², rad s⁻¹); `r1.x`, `u1.x` displacement and known acceleration of a test mass (ORF, m, m s⁻²);
+//! `command.mps_force.x`, `command.mps_torque.x`, `command.tm1.force.x`, `command.tm1.torque.x` commands as executed
+//! (SRF or ORF, N, N m); `sun.x` direction from the Sun (SRF); `time_s` seconds since the run's first epoch; `pi`.
 //!
-//! **Functions.** `sin cos tan asin acos atan sinh cosh tanh exp ln log10 sqrt abs sign`, `min max atan2` of two; with memory:
-//! `lag(x, s)` first-order lag, `lowpass(x, hz)` the same by its corner, `highpass(x, hz)` the rest, `derivative(x)` backward
-//! difference, `integral(x)` from the first epoch of the run, a missing value adding nothing. See [`crate::lag::Lags`] for what
-//! lags do where values are missing. `-x^2` is −(x²).
+//! **Functions.** `sin cos tan asin acos atan sinh cosh tanh exp ln log10 sqrt abs sign`; `min max atan2` of two
+//! arguments. With state: `lag(x, s)` first-order lag; `lowpass(x, hz)` the same by its corner frequency; `highpass(x,
+//! hz)` its complement; `derivative(x)` backward difference; `integral(x)` from the run's first epoch, missing values
+//! counting as zero. [`crate::lag::Lags`] states how lags treat missing values. `-x^2` is −(x²).
 //!
-//! A row without a value, by a column that has none or by a division by zero, is not used. **Trap**: a regressor made from the very
-//! readout that it must explain (`r1.y` acting on `tm1.accel.y`) fits the readout's noise.
+//! Rows where a column is missing or the expression is not finite are not used. **Limit**: an expression of the readout
+//! that it must explain (`r1.y` acting on `tm1.accel.y`) is correlated with its noise and biased (errors in variables).
 
 mod program;
 mod text;
@@ -41,20 +41,21 @@ use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
-    AXES, Place, axis_of, behind_spacecraft, loaded, manifest, mission, on_channels, response, saved, turning,
+    AXES, SeriesRef, axis_of, keep_available, loaded, manifest, mission, response, responses_to_spacecraft_force,
+    responses_to_spacecraft_torque, saved,
 };
 pub use program::Program;
-pub use text::{TextError, Tree, read};
+pub use text::{TextError, Tree, parse};
 
 const STATE: &[u8; 8] = b"formula1";
-/// Where all columns have values, but the formula has none in so many epochs from the first, it never will, s.
-const HOPELESS_S: f64 = 600.0;
+/// Duration without a single value, from the first row with all inputs, after which the run stops, s.
+const MAX_UNDEFINED_S: f64 = 600.0;
 
-/// A text from outside: read, compiled, run on a few rows. Whatever it is, no panic.
+/// Fuzz entry: parses, compiles and runs any bytes on a few rows; must not panic.
 pub fn fuzz_formula(bytes: &[u8]) {
     let text = String::from_utf8_lossy(bytes);
     let known = ["hk.a".to_owned(), "alpha.x".to_owned()];
-    let made = read(&text).and_then(|tree| Program::new(&tree, &known, 0.1));
+    let made = parse(&text).and_then(|tree| Program::new(&tree, &known, 0.1));
     match made {
         Ok(mut program) => {
             let rows = vec![[0.0, -1.0, f64::NAN].as_slice(); program.names().len()];
@@ -64,7 +65,7 @@ pub fn fuzz_formula(bytes: &[u8]) {
     }
 }
 
-/// Every name that a formula may use here, with its column.
+/// Names that a formula may use, with their columns.
 fn names(available: &Available) -> Vec<(String, Column)> {
     let mut names = Vec::new();
     for column in &available.columns {
@@ -76,7 +77,7 @@ fn names(available: &Available) -> Vec<(String, Column)> {
         } else {
             None
         };
-        // A name with other letters could not be told from an expression.
+        // The parser cannot tell other names from expressions.
         let plain = |n: &String| n.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_' || b == b'.');
         names.extend(short.filter(plain).map(|short| (short, column.clone())));
     }
@@ -115,19 +116,19 @@ pub struct Formula {
     unit: String,
     range: Vec<f64>,
     linked: Option<Linked>,
-    /// Rows whose columns all have values: how many, how many of them without a value of the formula, and Unix ns of the run's
-    /// first row.
-    asked: u64,
-    without: u64,
+    /// Rows in which all inputs have values, how many of them have no value of the formula, and the run's first row,
+    /// Unix ns.
+    rows_with_inputs: u64,
+    rows_without_value: u64,
     first_ns: Option<i64>,
 }
 
 #[derive(Debug)]
 struct Linked {
     program: Program,
-    /// Column of each of the program's names; none for the time.
+    /// Input column per name of the program; `None` for the time.
     inputs: Vec<Option<In>>,
-    /// So that a formula of no column has rows.
+    /// Provides rows to a formula without columns.
     clock: In,
     out: Out,
 }
@@ -141,54 +142,58 @@ impl Formula {
         Err(PluginError::error(format!("effect {}: {what}", self.name())))
     }
 
-    fn responses(&self, series: &Place) -> Result<Vec<Response>, PluginError> {
+    fn responses(&self, series: &SeriesRef) -> Result<Vec<Response>, PluginError> {
         let mut parts = self.acts_on.split('.');
         let axis = axis_of(&self.acts_on);
         let known = parts.clone().count() == 3 && self.acts_on.rsplit('.').next().is_some_and(|a| AXES.contains(&a));
         match (parts.next().unwrap_or_default(), parts.next().unwrap_or_default()) {
-            ("sc", "force") if known => Ok(behind_spacecraft(&self.mission, axis, series)),
-            ("sc", "torque") if known => Ok(turning(&self.mission, axis, series)),
+            ("sc", "force") if known => Ok(responses_to_spacecraft_force(&self.mission, axis, series)),
+            ("sc", "torque") if known => Ok(responses_to_spacecraft_torque(&self.mission, axis, series)),
             (tm @ ("tm1" | "tm2"), what @ ("force" | "accel")) if known => {
                 let mass_kg = self.mission.test_mass(tm, "the effect formula")?.mass_kg;
                 let factor = if what == "force" { 1.0 / mass_kg } else { 1.0 };
                 Ok(vec![response(format!("{tm}.accel.{}", AXES[axis]), series, factor)])
             }
             _ => self.refuse(&format!(
-                "`acts_on` = \"{}\" must be tm1.force.x or tm1.accel.x (tm2, y, z likewise), sc.force.x or sc.torque.x",
+                "parameter `acts_on` = \"{}\" must be tm1.force.x, tm1.accel.x (or tm2, y, z), sc.force.x or sc.torque.x",
                 self.acts_on
             )),
         }
     }
 
-    /// Tells of rows without a value, each time when there are ten times as many.
-    fn count(&mut self, times: &[i64], columns: &[&[f64]], values: &[f64]) -> Result<(), PluginError> {
-        let hopeless = (HOPELESS_S / self.mission.dt_s()) as u64;
+    /// Counts rows without a value, and logs a warning at each power of ten.
+    ///
+    /// # Errors
+    /// No row has a value within [`MAX_UNDEFINED_S`].
+    fn count_undefined(&mut self, times: &[i64], columns: &[&[f64]], values: &[f64]) -> Result<(), PluginError> {
+        let limit = (MAX_UNDEFINED_S / self.mission.dt_s()) as u64;
         for (k, value) in values.iter().enumerate() {
             if !columns.iter().all(|c| c[k].is_finite()) {
                 continue;
             }
-            self.asked += 1;
+            self.rows_with_inputs += 1;
             if value.is_finite() {
                 continue;
             }
-            self.without += 1;
-            if self.without == hopeless && self.asked == hopeless {
+            self.rows_without_value += 1;
+            if self.rows_without_value == limit && self.rows_with_inputs == limit {
                 return self.refuse(&format!(
-                    "the expression has no value in any of the {hopeless} epochs in which all its columns have one: `{}` divides \
-                     by zero, or takes a root or a logarithm of a negative number; mend it",
+                    "`{}` has no finite value in any of the first {limit} epochs in which all its columns have one; check it for a \
+                     division by zero or a root or logarithm of a negative number",
                     self.expression
                 ));
             }
-            let decade = self.without >= 10 && 10_u64.pow(self.without.ilog10()) == self.without;
+            let decade = self.rows_without_value >= 10
+                && 10_u64.pow(self.rows_without_value.ilog10()) == self.rows_without_value;
             if decade {
                 self.log.message(
                     Level::Warn,
                     &format!(
-                        "effect {}: so far {} of {} epochs have no value of `{}`, though all its columns have one; the last at Unix \
-                         time {} ns. They are not used",
+                        "effect {}: {} of {} epochs so far are not used, because the expression has no finite value there although \
+                         all its columns do: `{}`; the last at Unix time {} ns",
                         self.name(),
-                        self.without,
-                        self.asked,
+                        self.rows_without_value,
+                        self.rows_with_inputs,
                         self.expression,
                         times[k]
                     ),
@@ -202,12 +207,12 @@ impl Formula {
 impl Effect for Formula {
     const MANIFEST: Manifest = manifest(
         "formula",
-        "The user's own expression",
+        "An expression of the user",
         &[
             Parameter::text("acts_on", "", &[], "tmN.force.AXIS, tmN.accel.AXIS, sc.force.AXIS or sc.torque.AXIS"),
-            Parameter::text("expression", "", &[], "what acts per unit of the coefficient"),
+            Parameter::text("expression", "", &[], "expression that acts per unit of the coefficient"),
             Parameter::text("unit", "", &[], "SI unit of the coefficient"),
-            Parameter::f64_list("range", "", &[], "physical range of the coefficient, two numbers"),
+            Parameter::f64_list("range", "", &[], "physical range of the coefficient: lower, upper"),
         ],
         &[],
         &["commands"],
@@ -223,29 +228,28 @@ impl Effect for Formula {
             unit: setup.text("unit")?,
             range: setup.f64_list("range")?,
             linked: None,
-            asked: 0,
-            without: 0,
+            rows_with_inputs: 0,
+            rows_without_value: 0,
             first_ns: None,
         };
         if formula.instance.is_empty() || formula.instance.contains('.') {
-            return formula
-                .refuse("its instance must be a name without dots, of your own choice: instance = \"battery\"");
+            return formula.refuse("the instance must be a name without dots, e.g. instance = \"battery\"");
         }
         if formula.expression.trim().is_empty() {
             return formula
-                .refuse("`expression` is not given; write one, as in expression = \"lag(hk.NAME, 120) * alpha.z\"");
+                .refuse("parameter `expression` is not set; e.g. expression = \"lag(hk.NAME, 120) * alpha.z\"");
         }
         if formula.unit.trim().is_empty() {
             return formula.refuse(
-                "`unit` is not given; coefficient times expression must be what `acts_on` says, so name the coefficient's SI \
-                 unit, as in unit = \"N A-1\"",
+                "parameter `unit` is not set; give the coefficient's SI unit, so that coefficient times expression has the unit \
+                 of `acts_on`, e.g. unit = \"N A-1\"",
             );
         }
         match formula.range[..] {
             [lower, upper] if lower < upper => Ok(formula),
             _ => formula.refuse(&format!(
-                "`range` = {:?} must be two numbers, lower and upper end of what the coefficient can be: without one a slow force is \
-                 \"explained\" by anything that is slow",
+                "parameter `range` = {:?} must be two numbers, the physical range [lower, upper] of the coefficient; without a \
+                 range any slow expression fits any slow force",
                 formula.range
             )),
         }
@@ -255,7 +259,7 @@ impl Effect for Formula {
         let mut known = names(available);
         known.push(("time_s".to_owned(), Column::default()));
         let texts: Vec<String> = known.iter().map(|(name, _)| name.clone()).collect();
-        let made = read(&self.expression).and_then(|tree| Program::new(&tree, &texts, self.mission.dt_s()));
+        let made = parse(&self.expression).and_then(|tree| Program::new(&tree, &texts, self.mission.dt_s()));
         let program = match made {
             Ok(program) => program,
             Err(error) => return self.refuse(&error.marked(&self.expression)),
@@ -266,12 +270,12 @@ impl Effect for Formula {
             inputs.push(column.map(|(_, column)| link.read(&Want::of(column))).transpose()?);
         }
         let Some(channel) = available.of_kind("channel").next() else {
-            return on_channels(available, &self.name(), self.responses(&Place::default())?).map(drop);
+            return keep_available(available, &self.name(), self.responses(&SeriesRef::default())?).map(drop);
         };
         let clock = link.read(&Want::of(channel))?;
         let series = "formula".to_owned();
         let out = link.series(&series, "", "")?;
-        let responses = on_channels(available, &self.name(), self.responses(&(link.table(), series))?)?;
+        let responses = keep_available(available, &self.name(), self.responses(&(link.table(), series))?)?;
         self.linked = Some(Linked { program, inputs, clock, out });
         let (lower, upper) = (self.range[0], self.range[1]);
         link.coefficient(&Coefficient {
@@ -290,7 +294,7 @@ impl Effect for Formula {
 
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
         let Some(linked) = &mut self.linked else {
-            return Err(PluginError::fatal("formula: called before it was linked"));
+            return Err(PluginError::fatal("formula: process called before link"));
         };
         let times = input.times_of(linked.clock);
         let Some(&begin_ns) = times.first() else { return Ok(()) };
@@ -308,20 +312,20 @@ impl Effect for Formula {
         let before = values.len();
         linked.program.push(times, &columns, values)?;
         let values = &mut values[before..];
-        // An infinite value is none either.
+        // Infinite counts as missing.
         values.iter_mut().filter(|x| x.is_infinite()).for_each(|x| *x = f64::NAN);
         if values.iter().any(|x| x.is_nan()) {
             let values = values.to_vec();
-            self.count(times, &columns, &values)?;
+            self.count_undefined(times, &columns, &values)?;
         } else {
-            self.asked += values.len() as u64;
+            self.rows_with_inputs += values.len() as u64;
         }
         Ok(())
     }
 
     fn save(&self) -> Result<Vec<u8>, PluginError> {
         let first_ns = self.first_ns.unwrap_or(i64::MIN).cast_unsigned();
-        let whole = [self.asked, self.without, first_ns].map(f64::from_bits);
+        let whole = [self.rows_with_inputs, self.rows_without_value, first_ns].map(f64::from_bits);
         let program = self.linked.iter().flat_map(|linked| linked.program.state());
         Ok(saved(STATE, whole.into_iter().chain(program)))
     }
@@ -329,8 +333,8 @@ impl Effect for Formula {
     fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
         let count = 3 + self.linked.as_ref().map_or(0, |linked| linked.program.state().len());
         let numbers = loaded(STATE, &self.name(), count, state)?;
-        let [asked, without, first_ns] = [0, 1, 2].map(|i| numbers[i].to_bits());
-        (self.asked, self.without) = (asked, without);
+        let [rows_with_inputs, rows_without_value, first_ns] = [0, 1, 2].map(|i| numbers[i].to_bits());
+        (self.rows_with_inputs, self.rows_without_value) = (rows_with_inputs, rows_without_value);
         self.first_ns = Some(first_ns.cast_signed()).filter(|ns| *ns != i64::MIN);
         if let Some(linked) = &mut self.linked {
             linked.program.set_state(&numbers[3..]);

@@ -1,8 +1,8 @@
-//! A formula over columns: a list of steps, each of which makes a column of a batch.
+//! Formulas compiled to a list of steps, each of which computes one column per batch.
 //!
-//! Arithmetic is compiled and evaluated by `exmex` over whole columns: its operands are [`Lane`]s, not numbers, so what it costs to walk
-//! through an expression is paid once for [`PIECE`] rows. Functions that remember earlier rows stand between such
-//! expressions: `lag(x, 60) * y` is a step for the lag and one for the product.
+//! `exmex` evaluates arithmetic over [`Values`], whole chunks of rows, so interpreting an expression is paid once per
+//! [`CHUNK_ROWS`] rows. Functions with state are steps of their own: `lag(x, 60) * y` is one step for the lag and one
+//! for the product.
 
 use exmex::{BinOp, ExError, ExResult, Express, FlatEx, MakeOperators, Operator as ExOperator};
 use std::f64::consts::{PI, TAU};
@@ -11,72 +11,72 @@ use std::str::FromStr;
 use super::text::{TextError, Tree};
 use crate::lag::Lags;
 
-/// Rows evaluated at once: a column of them stays in the fastest cache.
-pub(super) const PIECE: usize = 1024;
+/// Rows evaluated at once; a chunk fits in the L1 cache.
+pub(super) const CHUNK_ROWS: usize = 1024;
 
-/// A number, or one for each row.
+/// A constant, or one number per row.
 #[derive(Clone, Debug)]
-pub(super) enum Lane {
-    /// The same for each row.
-    Same(f64),
-    /// One for each row.
-    Rows(Vec<f64>),
+pub(super) enum Values {
+    /// Equal in all rows.
+    Constant(f64),
+    /// One number per row.
+    PerRow(Vec<f64>),
 }
 
-impl Default for Lane {
+impl Default for Values {
     fn default() -> Self {
-        Self::Same(f64::NAN)
+        Self::Constant(f64::NAN)
     }
 }
 
-/// `exmex` wants it for literals; formulas have theirs as variables.
-impl FromStr for Lane {
+/// Required by `exmex` for literals, which formulas pass as variables.
+impl FromStr for Values {
     type Err = std::num::ParseFloatError;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
-        text.parse().map(Self::Same)
+        text.parse().map(Self::Constant)
     }
 }
 
-impl Lane {
+impl Values {
     fn map(self, f: impl Fn(f64) -> f64) -> Self {
         match self {
-            Self::Same(x) => Self::Same(f(x)),
-            Self::Rows(mut rows) => {
+            Self::Constant(x) => Self::Constant(f(x)),
+            Self::PerRow(mut rows) => {
                 rows.iter_mut().for_each(|x| *x = f(*x));
-                Self::Rows(rows)
+                Self::PerRow(rows)
             }
         }
     }
 
     fn zip(self, other: Self, f: impl Fn(f64, f64) -> f64) -> Self {
         match (self, other) {
-            (Self::Same(x), Self::Same(y)) => Self::Same(f(x, y)),
-            (Self::Rows(rows), Self::Same(y)) => Self::Rows(rows).map(|x| f(x, y)),
-            (Self::Same(x), Self::Rows(rows)) => Self::Rows(rows).map(|y| f(x, y)),
-            (Self::Rows(mut rows), Self::Rows(others)) => {
+            (Self::Constant(x), Self::Constant(y)) => Self::Constant(f(x, y)),
+            (Self::PerRow(rows), Self::Constant(y)) => Self::PerRow(rows).map(|x| f(x, y)),
+            (Self::Constant(x), Self::PerRow(rows)) => Self::PerRow(rows).map(|y| f(x, y)),
+            (Self::PerRow(mut rows), Self::PerRow(others)) => {
                 rows.iter_mut().zip(others).for_each(|(x, y)| *x = f(*x, y));
-                Self::Rows(rows)
+                Self::PerRow(rows)
             }
         }
     }
 }
 
-/// The operators of formulas over [`Lane`]s.
+/// Operators over [`Values`].
 #[derive(Clone, Debug)]
-pub(super) struct Lanes;
+pub(super) struct ColumnOperators;
 
 fn power(x: f64, y: f64) -> f64 {
     if y == 2.0 { x * x } else { x.powf(y) }
 }
 
-impl MakeOperators<Lane> for Lanes {
-    fn make<'a>() -> Vec<ExOperator<'a, Lane>> {
-        let both = |sign, apply: fn(Lane, Lane) -> Lane| {
-            // Everything is bracketed, so no operator comes before another.
+impl MakeOperators<Values> for ColumnOperators {
+    fn make<'a>() -> Vec<ExOperator<'a, Values>> {
+        let both = |sign, apply: fn(Values, Values) -> Values| {
+            // The text is fully bracketed, so priorities do not matter.
             ExOperator::make_bin(sign, BinOp { apply, prio: 0, is_commutative: false })
         };
-        let one = |name, apply: fn(Lane) -> Lane| ExOperator::make_unary(name, apply);
+        let one = |name, apply: fn(Values) -> Values| ExOperator::make_unary(name, apply);
         vec![
             both("+", |a, b| a.zip(b, |a, b| a + b)),
             both("-", |a, b| a.zip(b, |a, b| a - b)),
@@ -106,13 +106,13 @@ impl MakeOperators<Lane> for Lanes {
     }
 }
 
-/// Functions of one argument without memory.
+/// Functions of one argument, without state.
 pub(super) const FUNCTIONS: [&str; 15] =
     ["sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "exp", "ln", "log10", "sqrt", "abs", "sign"];
-/// Functions of two.
-pub(super) const OF_TWO: [&str; 3] = ["min", "max", "atan2"];
-/// Functions that remember, with what their second argument must be, where they have one.
-pub(super) const STREAMING: [(&str, Option<&str>); 5] = [
+/// Functions of two arguments, without state.
+pub(super) const BINARY_FUNCTIONS: [&str; 3] = ["min", "max", "atan2"];
+/// Functions with state, and the requirement on their second argument if they have one.
+pub(super) const STATEFUL_FUNCTIONS: [(&str, Option<&str>); 5] = [
     ("lag", Some("a time in seconds, 0 or more")),
     ("lowpass", Some("a frequency in hertz above 0")),
     ("highpass", Some("a frequency in hertz above 0")),
@@ -120,41 +120,41 @@ pub(super) const STREAMING: [(&str, Option<&str>); 5] = [
     ("integral", None),
 ];
 
-/// What remembers earlier rows.
+/// State of a function with memory.
 #[derive(Clone, Debug)]
-enum Memory {
-    /// First-order lag; what is left above it when `above`.
-    Lag { lag: Box<Lags<1>>, above: bool },
-    /// `(x_k − x_{k−1})/Δt`; the value before and its time.
-    Derivative { before: f64, at_ns: i64 },
-    /// Mean over the sample of `∫ x dt` from the first row; what has been gathered.
-    Integral { gathered: f64 },
+enum Filter {
+    /// First-order lag, or input minus lag for `highpass`.
+    Lag { lag: Box<Lags<1>>, highpass: bool },
+    /// `(x_k − x_{k−1})/Δt`: the previous value and its time.
+    Derivative { previous: f64, at_ns: i64 },
+    /// Mean over the sample of `∫ x dt` from the first row: the integral so far.
+    Integral { integral: f64 },
 }
 
-impl Memory {
+impl Filter {
     const STATE: usize = Lags::<1>::STATE;
 
     fn push(&mut self, time_ns: &[i64], input: &[f64], dt_s: f64) -> Vec<f64> {
         let mut out = Vec::with_capacity(input.len());
         match self {
-            Self::Lag { lag, above } => {
+            Self::Lag { lag, highpass } => {
                 lag.push(time_ns, input, |_, rows| out.extend_from_slice(rows));
-                if *above {
+                if *highpass {
                     out.iter_mut().zip(input).for_each(|(low, x)| *low = x - *low);
                 }
             }
-            Self::Derivative { before, at_ns } => {
+            Self::Derivative { previous, at_ns } => {
                 let step_ns = (dt_s * 1.5e9) as i64;
                 for (&now_ns, &x) in time_ns.iter().zip(input) {
-                    out.push(if now_ns - *at_ns < step_ns { (x - *before) / dt_s } else { f64::NAN });
-                    (*before, *at_ns) = (x, now_ns);
+                    out.push(if now_ns - *at_ns < step_ns { (x - *previous) / dt_s } else { f64::NAN });
+                    (*previous, *at_ns) = (x, now_ns);
                 }
             }
-            Self::Integral { gathered } => {
+            Self::Integral { integral } => {
                 for x in input {
-                    // A missing value adds nothing.
-                    out.push(*gathered + 0.5 * dt_s * x);
-                    *gathered += if x.is_finite() { dt_s * x } else { 0.0 };
+                    // A missing value counts as zero.
+                    out.push(*integral + 0.5 * dt_s * x);
+                    *integral += if x.is_finite() { dt_s * x } else { 0.0 };
                 }
             }
         }
@@ -164,8 +164,8 @@ impl Memory {
     fn state(&self) -> Vec<f64> {
         let mut state = match self {
             Self::Lag { lag, .. } => lag.state().collect(),
-            Self::Derivative { before, at_ns } => vec![*before, f64::from_bits(at_ns.cast_unsigned())],
-            Self::Integral { gathered } => vec![*gathered],
+            Self::Derivative { previous, at_ns } => vec![*previous, f64::from_bits(at_ns.cast_unsigned())],
+            Self::Integral { integral } => vec![*integral],
         };
         state.resize(Self::STATE, 0.0);
         state
@@ -174,34 +174,34 @@ impl Memory {
     fn set_state(&mut self, state: &[f64]) {
         match self {
             Self::Lag { lag, .. } => lag.set_state(state),
-            Self::Derivative { before, at_ns } => {
-                (*before, *at_ns) = (state[0], state[1].to_bits().cast_signed());
+            Self::Derivative { previous, at_ns } => {
+                (*previous, *at_ns) = (state[0], state[1].to_bits().cast_signed());
             }
-            Self::Integral { gathered } => *gathered = state[0],
+            Self::Integral { integral } => *integral = state[0],
         }
     }
 }
 
-/// Where an operand comes from.
+/// Source of an operand.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Operand {
     Number(f64),
-    /// A column of the batch, by its index in the list of names.
+    /// Input column, by its index in the program's names.
     Column(usize),
-    /// What a step has made.
+    /// Result of an earlier step.
     Step(usize),
 }
 
-/// One step.
+/// A step of a program.
 #[derive(Clone, Debug)]
 enum Step {
-    /// Arithmetic: the expression, and its operands in the order of its variables.
-    Arithmetic(Box<FlatEx<Lane, Lanes>>, Vec<Operand>),
-    /// A function that remembers.
-    Streaming(Memory, Operand),
+    /// Expression, and its operands in the order of its variables.
+    Arithmetic(Box<FlatEx<Values, ColumnOperators>>, Vec<Operand>),
+    /// Function with state.
+    Stateful(Filter, Operand),
 }
 
-/// A formula ready to run.
+/// A compiled formula.
 #[derive(Clone, Debug)]
 pub struct Program {
     names: Vec<String>,
@@ -210,16 +210,16 @@ pub struct Program {
     dt_s: f64,
 }
 
-/// Names for a text that looks for one: the three nearest.
+/// The three known names nearest to an unknown one.
 fn nearest(name: &str, known: &[String]) -> String {
-    let mut by_distance: Vec<(usize, &String)> = known.iter().map(|k| (distance(name, k), k)).collect();
+    let mut by_distance: Vec<(usize, &String)> = known.iter().map(|k| (edit_distance(name, k), k)).collect();
     by_distance.sort();
     let all: Vec<String> = by_distance.iter().take(3).map(|(_, k)| format!("`{k}`")).collect();
     all.join(", ")
 }
 
-/// Edits between two names (Levenshtein).
-fn distance(a: &str, b: &str) -> usize {
+/// Edit distance between two names (Levenshtein).
+fn edit_distance(a: &str, b: &str) -> usize {
     let mut row: Vec<usize> = (0..=b.len()).collect();
     for (i, x) in a.bytes().enumerate() {
         let mut corner = row[0];
@@ -233,7 +233,7 @@ fn distance(a: &str, b: &str) -> usize {
     row[b.len()]
 }
 
-/// Arithmetic in the making.
+/// Expression under construction.
 #[derive(Default)]
 struct Expression {
     text: String,
@@ -241,7 +241,7 @@ struct Expression {
 }
 
 impl Expression {
-    /// Variables are sorted by name in `exmex`: leading zeros keep their order.
+    /// Appends an operand. `exmex` sorts variables by name; leading zeros keep their order.
     fn operand(&mut self, operand: Operand) {
         let same = |o: &Operand| *o == operand;
         let i = self.operands.iter().position(same).unwrap_or_else(|| {
@@ -264,7 +264,7 @@ fn refused(error: &ExError) -> TextError {
 }
 
 impl Compiler<'_> {
-    /// The tree as arithmetic over what the steps before it make.
+    /// Compiles a tree into an expression over the results of earlier steps.
     fn arithmetic(&mut self, tree: &Tree, out: &mut Expression) -> Result<(), TextError> {
         match tree {
             Tree::Number(number) => out.operand(Operand::Number(*number)),
@@ -272,18 +272,18 @@ impl Compiler<'_> {
                 let operand = self.name(name, *at)?;
                 out.operand(operand);
             }
-            Tree::Minus(inner) => {
+            Tree::Negate(inner) => {
                 out.text.push_str("minus(");
                 self.arithmetic(inner, out)?;
                 out.text.push(')');
             }
-            Tree::Both(operator, a, b) => self.both(&operator.sign().to_string(), a, b, out)?,
+            Tree::Binary(operator, a, b) => self.binary(&operator.sign().to_string(), a, b, out)?,
             Tree::Call(function, arguments, at) => self.call(function, arguments, *at, out)?,
         }
         Ok(())
     }
 
-    fn both(&mut self, sign: &str, a: &Tree, b: &Tree, out: &mut Expression) -> Result<(), TextError> {
+    fn binary(&mut self, sign: &str, a: &Tree, b: &Tree, out: &mut Expression) -> Result<(), TextError> {
         out.text.push('(');
         self.arithmetic(a, out)?;
         out.text.push_str(&format!(" {sign} "));
@@ -327,52 +327,55 @@ impl Compiler<'_> {
             self.arithmetic(&arguments[0], out)?;
             out.text.push(')');
             Ok(())
-        } else if OF_TWO.contains(&function) {
+        } else if BINARY_FUNCTIONS.contains(&function) {
             count(2)?;
-            self.both(function, &arguments[0], &arguments[1], out)
-        } else if let Some((_, second)) = STREAMING.iter().find(|(name, _)| *name == function) {
+            self.binary(function, &arguments[0], &arguments[1], out)
+        } else if let Some((_, second)) = STATEFUL_FUNCTIONS.iter().find(|(name, _)| *name == function) {
             count(1 + usize::from(second.is_some()))?;
             let number = match (second, arguments.get(1)) {
                 (Some(wanted), Some(argument)) => self.constant(function, argument, wanted, at)?,
                 _ => 0.0,
             };
-            let memory = self.memory(function, number);
+            let filter = self.filter(function, number);
             let input = self.operand(&arguments[0])?;
-            self.steps.push(Step::Streaming(memory, input));
+            self.steps.push(Step::Stateful(filter, input));
             out.operand(Operand::Step(self.steps.len() - 1));
             Ok(())
         } else {
-            let all = FUNCTIONS.iter().chain(&OF_TWO).chain(STREAMING.iter().map(|(name, _)| name));
+            let all = FUNCTIONS.iter().chain(&BINARY_FUNCTIONS).chain(STATEFUL_FUNCTIONS.iter().map(|(name, _)| name));
             let all: Vec<String> = all.map(|name| (*name).to_owned()).collect();
             Err(TextError::new(format!("unknown function `{function}`; the nearest: {}", nearest(function, &all)), at))
         }
     }
 
-    fn memory(&self, function: &str, number: f64) -> Memory {
-        let lag = |lag_s: f64, above: bool| Memory::Lag { lag: Box::new(Lags::new([lag_s], self.dt_s)), above };
+    fn filter(&self, function: &str, number: f64) -> Filter {
+        let lag = |lag_s: f64, highpass: bool| Filter::Lag { lag: Box::new(Lags::new([lag_s], self.dt_s)), highpass };
         match function {
             "lag" => lag(number, false),
             "lowpass" => lag(1.0 / (TAU * number), false),
             "highpass" => lag(1.0 / (TAU * number), true),
-            "derivative" => Memory::Derivative { before: f64::NAN, at_ns: i64::MIN / 2 },
-            _ => Memory::Integral { gathered: 0.0 },
+            "derivative" => Filter::Derivative { previous: f64::NAN, at_ns: i64::MIN / 2 },
+            _ => Filter::Integral { integral: 0.0 },
         }
     }
 
-    /// The number that an argument without names stands for.
+    /// Value of an argument that contains no names.
+    ///
+    /// # Errors
+    /// The argument is not constant, or out of range.
     fn constant(&mut self, function: &str, tree: &Tree, wanted: &str, at: usize) -> Result<f64, TextError> {
         let refuse = || TextError::new(format!("the second argument of `{function}` must be {wanted}"), at);
-        let before = (self.names.len(), self.steps.len());
+        let previous = (self.names.len(), self.steps.len());
         let value = match self.operand(tree)? {
             Operand::Number(number) => number,
-            _ if (self.names.len(), self.steps.len()) != (before.0, before.1 + 1) => return Err(refuse()),
+            _ if (self.names.len(), self.steps.len()) != (previous.0, previous.1 + 1) => return Err(refuse()),
             _ => match self.steps.pop() {
                 Some(Step::Arithmetic(expression, operands))
                     if operands.iter().all(|o| matches!(o, Operand::Number(_))) =>
                 {
-                    match evaluate(&expression, &operands, |_| Lane::default()).map_err(|e| refused(&e))? {
-                        Lane::Same(number) => number,
-                        Lane::Rows(_) => f64::NAN,
+                    match evaluate(&expression, &operands, |_| Values::default()).map_err(|e| refused(&e))? {
+                        Values::Constant(number) => number,
+                        Values::PerRow(_) => f64::NAN,
                     }
                 }
                 _ => return Err(refuse()),
@@ -382,7 +385,7 @@ impl Compiler<'_> {
         if fits { Ok(value) } else { Err(refuse()) }
     }
 
-    /// The tree as something that a step can take: a number, a column, or what a step makes.
+    /// Compiles a tree into an operand: a number, a column, or the result of a step.
     fn operand(&mut self, tree: &Tree) -> Result<Operand, TextError> {
         let mut expression = Expression::default();
         self.arithmetic(tree, &mut expression)?;
@@ -396,57 +399,57 @@ impl Compiler<'_> {
 }
 
 fn evaluate(
-    expression: &FlatEx<Lane, Lanes>,
+    expression: &FlatEx<Values, ColumnOperators>,
     operands: &[Operand],
-    mut lane: impl FnMut(&Operand) -> Lane,
-) -> ExResult<Lane> {
+    mut values: impl FnMut(&Operand) -> Values,
+) -> ExResult<Values> {
     let of = |operand: &Operand| match operand {
-        Operand::Number(number) => Lane::Same(*number),
-        other => lane(other),
+        Operand::Number(number) => Values::Constant(*number),
+        other => values(other),
     };
     expression.eval_vec(operands.iter().map(of).collect())
 }
 
 impl Program {
-    /// Makes a program of a tree over the names that there are.
+    /// Compiles a tree over known names; `dt_s` is the sample interval, s.
     ///
     /// # Errors
-    /// [`TextError`] for an unknown name or function, or arguments that do not fit.
+    /// [`TextError`] for an unknown name or function, or invalid arguments.
     pub fn new(tree: &Tree, known: &[String], dt_s: f64) -> Result<Self, TextError> {
         let mut compiler = Compiler { known, names: Vec::new(), steps: Vec::new(), dt_s };
         let result = compiler.operand(tree)?;
         Ok(Self { names: compiler.names, steps: compiler.steps, result, dt_s })
     }
 
-    /// Names of the columns that [`Self::push`] takes.
+    /// Names of the columns that [`Self::push`] takes, in order.
     #[must_use]
     pub fn names(&self) -> &[String] {
         &self.names
     }
 
-    /// Rows in, the formula's values out: `columns` in the order of [`Self::names`].
+    /// Appends the formula's value per row to `out`; `columns` in the order of [`Self::names`], `time_ns` in Unix ns.
     ///
     /// # Errors
-    /// None that a formula can bring about: `exmex` found a number of operands that is not its own.
+    /// An internal inconsistency of `exmex`; no formula causes it.
     pub fn push(&mut self, time_ns: &[i64], columns: &[&[f64]], out: &mut Vec<f64>) -> ExResult<()> {
-        let mut made: Vec<Lane> = Vec::with_capacity(self.steps.len());
-        for (piece, times) in time_ns.chunks(PIECE).enumerate() {
-            let rows = piece * PIECE..piece * PIECE + times.len();
+        let mut made: Vec<Values> = Vec::with_capacity(self.steps.len());
+        for (chunk, times) in time_ns.chunks(CHUNK_ROWS).enumerate() {
+            let rows = chunk * CHUNK_ROWS..chunk * CHUNK_ROWS + times.len();
             made.clear();
             for step in &mut self.steps {
-                // What a step makes is used once.
-                let mut lane = |operand: &Operand| match *operand {
-                    Operand::Number(number) => Lane::Same(number),
-                    Operand::Column(i) => Lane::Rows(columns[i][rows.clone()].to_vec()),
+                // Each result is used once.
+                let mut values = |operand: &Operand| match *operand {
+                    Operand::Number(number) => Values::Constant(number),
+                    Operand::Column(i) => Values::PerRow(columns[i][rows.clone()].to_vec()),
                     Operand::Step(i) => std::mem::take(&mut made[i]),
                 };
                 let next = match step {
-                    Step::Arithmetic(expression, operands) => evaluate(expression, operands, lane)?,
-                    Step::Streaming(memory, Operand::Column(i)) => {
-                        Lane::Rows(memory.push(times, &columns[*i][rows.clone()], self.dt_s))
+                    Step::Arithmetic(expression, operands) => evaluate(expression, operands, values)?,
+                    Step::Stateful(filter, Operand::Column(i)) => {
+                        Values::PerRow(filter.push(times, &columns[*i][rows.clone()], self.dt_s))
                     }
-                    Step::Streaming(memory, operand) => {
-                        Lane::Rows(memory.push(times, &spread(lane(operand), times.len()), self.dt_s))
+                    Step::Stateful(filter, operand) => {
+                        Values::PerRow(filter.push(times, &per_row(values(operand), times.len()), self.dt_s))
                     }
                 };
                 made.push(next);
@@ -454,40 +457,40 @@ impl Program {
             match self.result {
                 Operand::Number(number) => out.extend(std::iter::repeat_n(number, times.len())),
                 Operand::Column(i) => out.extend_from_slice(&columns[i][rows]),
-                Operand::Step(_) => out.append(&mut spread(made.pop().unwrap_or_default(), times.len())),
+                Operand::Step(_) => out.append(&mut per_row(made.pop().unwrap_or_default(), times.len())),
             }
         }
         Ok(())
     }
 
-    fn memories(&mut self) -> impl Iterator<Item = &mut Memory> {
-        self.steps.iter_mut().filter_map(|s| if let Step::Streaming(memory, _) = s { Some(memory) } else { None })
+    fn filters(&mut self) -> impl Iterator<Item = &mut Filter> {
+        self.steps.iter_mut().filter_map(|s| if let Step::Stateful(filter, _) = s { Some(filter) } else { None })
     }
 
-    /// All that the next rows depend on.
+    /// State on which later rows depend.
     #[must_use]
     pub fn state(&self) -> Vec<f64> {
-        let streaming = self.steps.iter().filter_map(|s| if let Step::Streaming(m, _) = s { Some(m) } else { None });
-        streaming.flat_map(Memory::state).collect()
+        let streaming = self.steps.iter().filter_map(|s| if let Step::Stateful(m, _) = s { Some(m) } else { None });
+        streaming.flat_map(Filter::state).collect()
     }
 
-    /// Takes back what [`Self::state`] gave.
+    /// Restores [`Self::state`].
     pub fn set_state(&mut self, state: &[f64]) {
-        self.memories().zip(state.chunks_exact(Memory::STATE)).for_each(|(memory, state)| memory.set_state(state));
+        self.filters().zip(state.chunks_exact(Filter::STATE)).for_each(|(filter, state)| filter.set_state(state));
     }
 }
 
-/// One value per row.
-fn spread(lane: Lane, rows: usize) -> Vec<f64> {
-    match lane {
-        Lane::Same(number) => vec![number; rows],
-        Lane::Rows(rows) => rows,
+/// Expands to one value per row.
+fn per_row(values: Values, rows: usize) -> Vec<f64> {
+    match values {
+        Values::Constant(number) => vec![number; rows],
+        Values::PerRow(rows) => rows,
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::text::{Operator, read, tests::trees};
+    use super::super::text::{Operator, parse, tests::trees};
     use super::*;
     use proptest::prelude::*;
 
@@ -499,7 +502,7 @@ mod tests {
     }
 
     fn program(text: &str) -> Program {
-        let made = read(text).and_then(|tree| Program::new(&tree, &known(), DT_S));
+        let made = parse(text).and_then(|tree| Program::new(&tree, &known(), DT_S));
         made.unwrap_or_else(|e| panic!("{}", e.marked(text)))
     }
 
@@ -507,7 +510,7 @@ mod tests {
         (0..rows as i64).map(|k| 2_000_000_000_000_000_000 + k * 100_000_000).collect()
     }
 
-    /// Columns by their names.
+    /// Runs a program on the columns of its names.
     fn run(program: &mut Program, time_ns: &[i64], all: &[Vec<f64>; 3]) -> Vec<f64> {
         let columns: Vec<&[f64]> =
             program.names().iter().map(|n| &*all[NAMES.iter().position(|k| k == n).unwrap()]).collect();
@@ -521,14 +524,14 @@ mod tests {
         [column(|t| 294.0 + t.sin()), column(|t| 290.0 + (1.7 * t).cos()), column(|t| (31.0 * t).sin())]
     }
 
-    /// A tree evaluated number by number, as a hand would.
-    fn by_hand(tree: &Tree, row: &[f64; 3]) -> f64 {
+    /// Reference: recursive evaluation row by row.
+    fn evaluate_row(tree: &Tree, row: &[f64; 3]) -> f64 {
         match tree {
             Tree::Number(x) => *x,
             Tree::Name(name, _) => row[NAMES.iter().position(|n| n == name).unwrap()],
-            Tree::Minus(inner) => -by_hand(inner, row),
-            Tree::Both(operator, a, b) => {
-                let (a, b) = (by_hand(a, row), by_hand(b, row));
+            Tree::Negate(inner) => -evaluate_row(inner, row),
+            Tree::Binary(operator, a, b) => {
+                let (a, b) = (evaluate_row(a, row), evaluate_row(b, row));
                 match operator {
                     Operator::Add => a + b,
                     Operator::Subtract => a - b,
@@ -538,7 +541,7 @@ mod tests {
                 }
             }
             Tree::Call(name, arguments, _) => {
-                let x = by_hand(&arguments[0], row);
+                let x = evaluate_row(&arguments[0], row);
                 match name.as_str() {
                     "sin" => x.sin(),
                     "abs" => x.abs(),
@@ -550,19 +553,19 @@ mod tests {
 
     proptest! {
         #[test]
-        fn arithmetic_is_that_of_the_tree(tree in trees(NAMES)) {
+        fn arithmetic_matches_recursive_evaluation(tree in trees(NAMES)) {
             let all = columns(30);
             let mut program = Program::new(&tree, &known(), DT_S).unwrap();
             let got = run(&mut program, &times(30), &all);
             for k in 0..30 {
-                let want = by_hand(&tree, &[all[0][k], all[1][k], all[2][k]]);
+                let want = evaluate_row(&tree, &[all[0][k], all[1][k], all[2][k]]);
                 prop_assert!(got[k].to_bits() == want.to_bits() || got[k].is_nan() && want.is_nan(), "{} {}", got[k], want);
             }
         }
 
-        /// Whatever the pieces, and with the state saved and taken back between them.
+        /// Splitting the rows and saving the state in between leaves the output bit by bit the same.
         #[test]
-        fn neither_pieces_nor_saved_states_change_a_bit(cut in 0_usize..3000) {
+        fn chunks_and_saved_states_do_not_change_the_output(cut in 0_usize..3000) {
             let text = "lag(hk.a - lowpass(hk.b, 0.01), 33) * derivative(alpha.x) + integral(highpass(alpha.x, 0.3)) ^ 2";
             let (all, time_ns) = (columns(3000), times(3000));
             let whole = run(&mut program(text), &time_ns, &all);
@@ -576,16 +579,16 @@ mod tests {
         }
 
         #[test]
-        fn no_tree_makes_it_panic(text in "[-+*/^(), 0-9a-z.]{0,60}") {
-            if let Ok(tree) = read(&text) {
+        fn no_tree_makes_the_compiler_panic(text in "[-+*/^(), 0-9a-z.]{0,60}") {
+            if let Ok(tree) = parse(&text) {
                 let _ = Program::new(&tree, &known(), DT_S);
             }
         }
     }
 
-    /// Against sums written out row by row.
+    /// Reference: recursions written out row by row.
     #[test]
-    fn functions_that_remember_do_what_they_say() {
+    fn stateful_functions_match_explicit_recursions() {
         let (all, time_ns) = (columns(2000), times(2000));
         let x = &all[2];
         let derivative = run(&mut program("derivative(alpha.x)"), &time_ns, &all);
@@ -604,7 +607,7 @@ mod tests {
         let tau = 1.0 / (TAU * 0.2);
         for k in 0..2000 {
             let next = x[k] + (y - x[k]) * (-DT_S / tau).exp();
-            // The mean of an exponential is its change over its rate.
+            // Mean of an exponential: its change over its rate.
             let mean = x[k] + (y - next) * tau / DT_S;
             assert!((low[k] - mean).abs() < 1e-12 && low[k] == lag[k] && high[k] == x[k] - low[k]);
             y = next;
@@ -617,7 +620,7 @@ mod tests {
     }
 
     #[test]
-    fn across_a_jump_of_time_there_is_no_derivative() {
+    fn a_derivative_is_undefined_after_a_gap() {
         let mut time_ns = times(10);
         time_ns[5..].iter_mut().for_each(|t| *t += 400_000_000);
         let got = run(&mut program("derivative(hk.a)"), &time_ns, &columns(10));
@@ -625,7 +628,7 @@ mod tests {
     }
 
     #[test]
-    fn what_does_not_fit_is_marked() {
+    fn invalid_names_and_arguments_are_located() {
         for (text, at, part) in [
             ("hk.a * alfa.x", 7, "unknown name `alfa.x`; the nearest: `alpha.x`"),
             ("1 + lagg(hk.a, 3)", 4, "unknown function `lagg`; the nearest: `lag`"),
@@ -636,7 +639,7 @@ mod tests {
             ("lag(hk.a, -1)", 0, "must be a time in seconds"),
             ("lowpass(hk.a, 0)", 0, "above 0"),
         ] {
-            let error = Program::new(&read(text).unwrap(), &known(), DT_S).expect_err(text);
+            let error = Program::new(&parse(text).unwrap(), &known(), DT_S).expect_err(text);
             assert!(error.at == at && error.what.contains(part), "{text}: {error:?}");
         }
     }

@@ -1,4 +1,4 @@
-//! Reading a formula: text to tree, with the place of whatever is wrong.
+//! Parser of formulas, with the position of any error.
 //!
 //! ```text
 //! sum     = product { ("+" | "-") product }
@@ -10,17 +10,17 @@
 
 use std::fmt;
 
-/// Longest formula, bytes: one that is longer is no formula.
-const LONGEST: usize = 4096;
-/// Deepest nesting of brackets and signs.
-const DEEPEST: usize = 64;
+/// Maximum length of a formula, bytes.
+const MAX_BYTES: usize = 4096;
+/// Maximum nesting of brackets and signs, and number of operands in a row.
+const MAX_DEPTH: usize = 64;
 
-/// What is wrong with a formula, and where.
+/// An error in a formula, with its position.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TextError {
-    /// What is wrong.
+    /// Message.
     pub what: String,
-    /// Byte of the text at which it is.
+    /// Byte offset in the text.
     pub at: usize,
 }
 
@@ -29,7 +29,7 @@ impl TextError {
         Self { what: what.into(), at }
     }
 
-    /// The sentence, the formula below it, and a caret below the place.
+    /// The message, the formula below it, and a caret below the position.
     #[must_use]
     pub fn marked(&self, text: &str) -> String {
         let before = text.get(..self.at).map_or(0, |before| before.chars().count());
@@ -38,7 +38,7 @@ impl TextError {
     }
 }
 
-/// Operators between two operands.
+/// Binary operators.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Operator {
     /// `+`
@@ -62,29 +62,29 @@ impl Operator {
     }
 }
 
-/// A formula.
+/// Syntax tree of a formula.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Tree {
-    /// A number, not negative.
+    /// A nonnegative number.
     Number(f64),
-    /// A name, and the byte of the text at which it stands.
+    /// A name, with its byte offset.
     Name(String, usize),
-    /// The opposite.
-    Minus(Box<Tree>),
-    /// Two operands.
-    Both(Operator, Box<Tree>, Box<Tree>),
-    /// A function of arguments, and the byte at which its name stands.
+    /// Negation.
+    Negate(Box<Tree>),
+    /// Operator with two operands.
+    Binary(Operator, Box<Tree>, Box<Tree>),
+    /// Function call, with the byte offset of its name.
     Call(String, Vec<Tree>, usize),
 }
 
-/// Fully bracketed, so that reading it again gives the same tree, places apart.
+/// Fully bracketed: parsing it again gives the same tree, offsets apart.
 impl fmt::Display for Tree {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Number(number) => write!(f, "{number:?}"),
             Self::Name(name, _) => f.write_str(name),
-            Self::Minus(inner) => write!(f, "(-{inner})"),
-            Self::Both(operator, a, b) => write!(f, "({a}{}{b})", operator.sign()),
+            Self::Negate(inner) => write!(f, "(-{inner})"),
+            Self::Binary(operator, a, b) => write!(f, "({a}{}{b})", operator.sign()),
             Self::Call(function, arguments, _) => {
                 write!(f, "{function}(")?;
                 for (i, argument) in arguments.iter().enumerate() {
@@ -96,31 +96,31 @@ impl fmt::Display for Tree {
     }
 }
 
-/// Reads a formula.
+/// Parses a formula.
 ///
 /// # Errors
-/// [`TextError`] says what is wrong and where.
-pub fn read(text: &str) -> Result<Tree, TextError> {
-    if text.len() > LONGEST {
-        return Err(TextError::new(format!("the formula is longer than {LONGEST} bytes"), LONGEST));
+/// [`TextError`]: message and position.
+pub fn parse(text: &str) -> Result<Tree, TextError> {
+    if text.len() > MAX_BYTES {
+        return Err(TextError::new(format!("the formula is longer than {MAX_BYTES} bytes"), MAX_BYTES));
     }
-    let mut reader = Reader { text, at: 0, depth: 0 };
-    let tree = reader.sum()?;
-    match reader.peek() {
+    let mut parser = Parser { text, at: 0, depth: 0 };
+    let tree = parser.sum()?;
+    match parser.peek() {
         None => Ok(tree),
-        Some(')') => Err(TextError::new("this bracket closes nothing", reader.at)),
-        Some(_) => Err(TextError::new("an operator or the end is missing here", reader.at)),
+        Some(')') => Err(TextError::new("this bracket was not opened", parser.at)),
+        Some(_) => Err(TextError::new("expected an operator or the end", parser.at)),
     }
 }
 
-struct Reader<'a> {
+struct Parser<'a> {
     text: &'a str,
     at: usize,
     depth: usize,
 }
 
-impl Reader<'_> {
-    /// The next character that is no space.
+impl Parser<'_> {
+    /// Next character that is not white space.
     fn peek(&mut self) -> Option<char> {
         let rest = self.text.get(self.at..)?;
         let trimmed = rest.trim_start();
@@ -128,25 +128,25 @@ impl Reader<'_> {
         trimmed.chars().next()
     }
 
-    /// Takes one of these characters if it comes next.
-    fn take(&mut self, any: &str) -> Option<char> {
+    /// Consumes the next character if it is one of these.
+    fn take_any(&mut self, any: &str) -> Option<char> {
         let next = self.peek().filter(|c| any.contains(*c))?;
         self.at += next.len_utf8();
         Some(next)
     }
 
-    /// Takes characters as long as they are of a kind.
-    fn run(&mut self, mut of_kind: impl FnMut(char) -> bool) -> String {
+    /// Consumes characters while `of_kind` holds.
+    fn take_while(&mut self, mut of_kind: impl FnMut(char) -> bool) -> String {
         let rest = self.text.get(self.at..).unwrap_or_default();
         let taken: String = rest.chars().take_while(|c| of_kind(*c)).collect();
         self.at += taken.len();
         taken
     }
 
-    fn deeper<T>(&mut self, inner: impl FnOnce(&mut Self) -> Result<T, TextError>) -> Result<T, TextError> {
+    fn nested<T>(&mut self, inner: impl FnOnce(&mut Self) -> Result<T, TextError>) -> Result<T, TextError> {
         self.depth += 1;
-        if self.depth > DEEPEST {
-            return Err(TextError::new(format!("nested more than {DEEPEST} deep"), self.at));
+        if self.depth > MAX_DEPTH {
+            return Err(TextError::new(format!("nested more than {MAX_DEPTH} deep"), self.at));
         }
         let made = inner(self);
         self.depth -= 1;
@@ -156,90 +156,90 @@ impl Reader<'_> {
     fn chain(&mut self, signs: &str, next: impl Fn(&mut Self) -> Result<Tree, TextError>) -> Result<Tree, TextError> {
         let mut tree = next(self)?;
         let mut length = 0;
-        while let Some(sign) = self.take(signs) {
-            // A long chain leans to the left, as deep as it is long.
+        while let Some(sign) = self.take_any(signs) {
+            // The tree of a chain is as deep as the chain is long.
             length += 1;
-            if length > DEEPEST {
+            if length > MAX_DEPTH {
                 return Err(TextError::new(
-                    format!("more than {DEEPEST} operands in a row; bracket some of them"),
+                    format!("more than {MAX_DEPTH} operands in a row; bracket some of them"),
                     self.at,
                 ));
             }
             let operator =
                 Operator::ALL.iter().find(|(_, s)| *s == sign).map_or(Operator::Add, |(operator, _)| *operator);
-            tree = Tree::Both(operator, Box::new(tree), Box::new(next(self)?));
+            tree = Tree::Binary(operator, Box::new(tree), Box::new(next(self)?));
         }
         Ok(tree)
     }
 
     fn sum(&mut self) -> Result<Tree, TextError> {
-        self.deeper(|r| r.chain("+-", |r| r.chain("*/", Self::signed)))
+        self.nested(|r| r.chain("+-", |r| r.chain("*/", Self::signed)))
     }
 
     fn signed(&mut self) -> Result<Tree, TextError> {
-        match self.take("+-") {
-            Some('-') => Ok(Tree::Minus(Box::new(self.deeper(Self::signed)?))),
-            Some(_) => self.deeper(Self::signed),
+        match self.take_any("+-") {
+            Some('-') => Ok(Tree::Negate(Box::new(self.nested(Self::signed)?))),
+            Some(_) => self.nested(Self::signed),
             None => self.power(),
         }
     }
 
     fn power(&mut self) -> Result<Tree, TextError> {
         let base = self.atom()?;
-        if self.take("^").is_none() {
+        if self.take_any("^").is_none() {
             return Ok(base);
         }
-        let exponent = self.deeper(Self::signed)?;
-        Ok(Tree::Both(Operator::Power, Box::new(base), Box::new(exponent)))
+        let exponent = self.nested(Self::signed)?;
+        Ok(Tree::Binary(Operator::Power, Box::new(base), Box::new(exponent)))
     }
 
     fn atom(&mut self) -> Result<Tree, TextError> {
         let next = self.peek();
         let at = self.at;
         match next {
-            None => Err(TextError::new("the formula ends where a number, a name or a bracket should come", at)),
+            None => Err(TextError::new("unexpected end of the formula: expected a number, a name or a bracket", at)),
             Some('(') => {
-                self.take("(");
+                self.take_any("(");
                 let inner = self.sum()?;
                 self.close(at)?;
                 Ok(inner)
             }
             Some(c) if c.is_ascii_digit() || c == '.' => self.number(at),
             Some(c) if c.is_ascii_alphabetic() || c == '_' => {
-                let name = self.run(|c| c.is_ascii_alphanumeric() || c == '_' || c == '.');
-                if self.take("(").is_none() {
+                let name = self.take_while(|c| c.is_ascii_alphanumeric() || c == '_' || c == '.');
+                if self.take_any("(").is_none() {
                     return Ok(Tree::Name(name, at));
                 }
                 let mut arguments = vec![self.sum()?];
-                while self.take(",").is_some() {
+                while self.take_any(",").is_some() {
                     arguments.push(self.sum()?);
                 }
                 self.close(at)?;
                 Ok(Tree::Call(name, arguments, at))
             }
-            Some(c) => Err(TextError::new(format!("`{}` cannot stand here", c.escape_debug()), at)),
+            Some(c) => Err(TextError::new(format!("`{}` is unexpected here", c.escape_debug()), at)),
         }
     }
 
     fn close(&mut self, opened: usize) -> Result<(), TextError> {
         match self.peek() {
-            _ if self.take(")").is_some() => Ok(()),
-            None => Err(TextError::new("what opens here is never closed", opened)),
-            Some(_) => Err(TextError::new("an operator or a closing bracket is missing here", self.at)),
+            _ if self.take_any(")").is_some() => Ok(()),
+            None => Err(TextError::new("this bracket is not closed", opened)),
+            Some(_) => Err(TextError::new("expected an operator or a closing bracket", self.at)),
         }
     }
 
     fn number(&mut self, at: usize) -> Result<Tree, TextError> {
         let mut last = ' ';
-        // A sign belongs to the number only behind an e.
-        let text = self.run(|c| {
+        // A sign is part of a number only in an exponent.
+        let text = self.take_while(|c| {
             let part =
                 c.is_ascii_alphanumeric() || c == '.' || ((c == '+' || c == '-') && (last == 'e' || last == 'E'));
             last = c;
             part
         });
         let number = text.parse::<f64>().ok().filter(|x| x.is_finite());
-        number.map(Tree::Number).ok_or_else(|| TextError::new(format!("`{text}` is no number"), at))
+        number.map(Tree::Number).ok_or_else(|| TextError::new(format!("`{text}` is not a number"), at))
     }
 }
 
@@ -249,7 +249,7 @@ pub(super) mod tests {
     use proptest::prelude::*;
 
     fn printed(text: &str) -> String {
-        read(text).map_or_else(|e| panic!("{text}: {}", e.marked(text)), |tree| tree.to_string())
+        parse(text).map_or_else(|e| panic!("{text}: {}", e.marked(text)), |tree| tree.to_string())
     }
 
     #[test]
@@ -272,35 +272,35 @@ pub(super) mod tests {
     }
 
     #[test]
-    fn what_is_wrong_is_marked() {
+    fn errors_are_located() {
         for (text, at, part) in [
-            ("a + * b", 4, "`*` cannot stand here"),
-            ("sin(a", 0, "never closed"),
+            ("a + * b", 4, "`*` is unexpected here"),
+            ("sin(a", 0, "not closed"),
             ("(a + b c)", 7, "closing bracket"),
             ("a b", 2, "operator"),
-            ("a)", 1, "closes nothing"),
-            ("1.2.3", 0, "no number"),
-            ("", 0, "ends where"),
-            ("3 + ", 4, "ends where"),
+            ("a)", 1, "not opened"),
+            ("1.2.3", 0, "not a number"),
+            ("", 0, "unexpected end"),
+            ("3 + ", 4, "unexpected end"),
             ("a × b", 2, "operator"),
             ("hk.a $ 2", 5, "operator"),
         ] {
-            let error = read(text).expect_err(text);
+            let error = parse(text).expect_err(text);
             assert!(error.at == at && error.what.contains(part), "{text}: {error:?}");
         }
-        let error = read("a + ÄÄ").expect_err("no letters of ours");
-        assert_eq!(error.marked("a + ÄÄ"), "column 5: `Ä` cannot stand here\n  a + ÄÄ\n      ^");
+        let error = parse("a + ÄÄ").expect_err("no letters of ours");
+        assert_eq!(error.marked("a + ÄÄ"), "column 5: `Ä` is unexpected here\n  a + ÄÄ\n      ^");
     }
 
     #[test]
-    fn what_never_ends_is_refused() {
+    fn long_and_deep_formulas_are_refused() {
         for text in ["(".repeat(4000), "-".repeat(4000), "2^".repeat(2000), "1+".repeat(2000), "f(".repeat(2000)] {
-            assert!(read(&text).is_err());
+            assert!(parse(&text).is_err());
         }
-        assert!(read(&"1".repeat(5000)).is_err());
+        assert!(parse(&"1".repeat(5000)).is_err());
     }
 
-    /// Any tree of a few leaves.
+    /// Random trees of a few leaves.
     pub(in super::super) fn trees(names: &'static [&'static str]) -> impl Strategy<Value = Tree> {
         let leaf = prop_oneof![
             (0.0..1e3_f64).prop_map(Tree::Number),
@@ -309,8 +309,8 @@ pub(super) mod tests {
         leaf.prop_recursive(4, 24, 2, |inner| {
             let operator = prop::sample::select(&Operator::ALL[..]);
             prop_oneof![
-                inner.clone().prop_map(|tree| Tree::Minus(Box::new(tree))),
-                (operator, inner.clone(), inner.clone()).prop_map(|((operator, _), a, b)| Tree::Both(
+                inner.clone().prop_map(|tree| Tree::Negate(Box::new(tree))),
+                (operator, inner.clone(), inner.clone()).prop_map(|((operator, _), a, b)| Tree::Binary(
                     operator,
                     Box::new(a),
                     Box::new(b)
@@ -324,33 +324,33 @@ pub(super) mod tests {
         })
     }
 
-    fn without_places(tree: Tree) -> Tree {
+    fn without_offsets(tree: Tree) -> Tree {
         match tree {
             Tree::Name(name, _) => Tree::Name(name, 0),
-            Tree::Minus(inner) => Tree::Minus(Box::new(without_places(*inner))),
-            Tree::Both(o, a, b) => Tree::Both(o, Box::new(without_places(*a)), Box::new(without_places(*b))),
-            Tree::Call(name, all, _) => Tree::Call(name, all.into_iter().map(without_places).collect(), 0),
+            Tree::Negate(inner) => Tree::Negate(Box::new(without_offsets(*inner))),
+            Tree::Binary(o, a, b) => Tree::Binary(o, Box::new(without_offsets(*a)), Box::new(without_offsets(*b))),
+            Tree::Call(name, all, _) => Tree::Call(name, all.into_iter().map(without_offsets).collect(), 0),
             Tree::Number(_) => tree,
         }
     }
 
     proptest! {
         #[test]
-        fn what_is_printed_reads_back(tree in trees(&["hk.a", "alpha.x", "t_s"])) {
-            let again = read(&tree.to_string());
-            prop_assert_eq!(again.map(without_places), Ok(tree));
+        fn printed_trees_parse_back(tree in trees(&["hk.a", "alpha.x", "t_s"])) {
+            let again = parse(&tree.to_string());
+            prop_assert_eq!(again.map(without_offsets), Ok(tree));
         }
 
         #[test]
-        fn no_text_makes_it_panic(text in "\\PC{0,200}") {
-            if let Err(error) = read(&text) {
+        fn no_text_makes_the_parser_panic(text in "\\PC{0,200}") {
+            if let Err(error) = parse(&text) {
                 let _ = error.marked(&text);
             }
         }
 
         #[test]
-        fn nor_does_one_of_the_right_letters(text in "[-+*/^().,e0-9a-z _]{0,120}") {
-            if let Err(error) = read(&text) {
+        fn no_text_of_formula_characters_makes_the_parser_panic(text in "[-+*/^().,e0-9a-z _]{0,120}") {
+            if let Err(error) = parse(&text) {
                 let _ = error.marked(&text);
             }
         }

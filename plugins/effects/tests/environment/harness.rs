@@ -1,4 +1,4 @@
-//! An effect across the border: columns in, and what it says that it adds to a channel out.
+//! Runs an effect through the plugin interface: columns in, and the declared contribution to each channel out.
 
 use dragfree_engine::border::{Config, Instance, Kind, Library, LinkRequest, Linked, Rows};
 use dragfree_engine::table::Column;
@@ -29,18 +29,18 @@ pub(crate) fn times(rows: usize) -> Vec<i64> {
     (0..rows as i64).map(|k| START_NS + k * 100_000_000).collect()
 }
 
-/// Columns with their rows; those that nobody fills are zero.
+/// Columns with their rows; columns that no test fills are zero.
 #[derive(Clone)]
-pub(crate) struct World {
+pub(crate) struct Telemetry {
     pub(crate) columns: Vec<Column>,
     pub(crate) rows: Vec<Vec<f64>>,
     pub(crate) time_ns: Vec<i64>,
 }
 
-impl World {
-    /// Nine channels, what hinf-dfacs makes besides, and housekeeping of the names and units given.
+impl Telemetry {
+    /// The nine channels, other columns of hinf-dfacs, and housekeeping with the given names and units.
     pub(crate) fn new(rows: usize, housekeeping: &[(&str, &str)]) -> Self {
-        let mut world = Self { columns: Vec::new(), rows: Vec::new(), time_ns: times(rows) };
+        let mut telemetry = Self { columns: Vec::new(), rows: Vec::new(), time_ns: times(rows) };
         for (vector, unit, frame) in [
             ("tm1.accel", "m s-2", "ORF_1"),
             ("tm2.accel", "m s-2", "ORF_2"),
@@ -61,13 +61,13 @@ impl World {
                 } else {
                     BTreeMap::new()
                 };
-                world.add("reconstruction", &format!("{vector}.{axis}"), unit, frame, attributes);
+                telemetry.add("reconstruction", &format!("{vector}.{axis}"), unit, frame, attributes);
             }
         }
         for (name, unit) in housekeeping {
-            world.add("grid", name, unit, "", BTreeMap::new());
+            telemetry.add("grid", name, unit, "", BTreeMap::new());
         }
-        world
+        telemetry
     }
 
     pub(crate) fn add(
@@ -92,7 +92,7 @@ impl World {
         &self.rows[self.columns.iter().position(|c| c.name == name).unwrap_or_else(|| panic!("no column {name}"))]
     }
 
-    /// Makes and links an effect.
+    /// Creates and links an effect.
     pub(crate) fn link(
         &self,
         id: &str,
@@ -101,7 +101,11 @@ impl World {
         candidate: bool,
     ) -> Result<(Instance, Linked), String> {
         let library = library();
-        let plugin = library.plugins.iter().find(|p| p.kind == Kind::Effect && p.manifest.id == id).expect("it exists");
+        let plugin = library
+            .plugins
+            .iter()
+            .find(|p| p.kind == Kind::Effect && p.manifest.id == id)
+            .expect("the library contains the effect");
         let mut all: Map<String, Value> =
             plugin.manifest.parameters.iter().map(|p| (p.name.clone(), p.default.clone())).collect();
         if let Value::Object(given) = parameters {
@@ -117,7 +121,7 @@ impl World {
         Ok((effect, linked))
     }
 
-    /// Its series, over rows `from..to`.
+    /// Series of the effect over rows `from..to`.
     pub(crate) fn process(&self, effect: &mut Instance, linked: &Linked, from: usize, to: usize) -> Vec<Vec<f64>> {
         let input: Vec<Rows<'_>> = linked
             .reads
@@ -134,8 +138,8 @@ impl World {
         made.into_iter().flat_map(|batch| batch.columns).collect()
     }
 
-    /// What an effect adds to each channel when its coefficients have these values, by the last parts of their names behind
-    /// the instance (empty for the only one).
+    /// Contribution of an effect to each channel for given values of its coefficients, by the last part of their names
+    /// (empty for the only coefficient).
     pub(crate) fn added(
         &self,
         id: &str,
@@ -148,8 +152,8 @@ impl World {
         let written: Vec<&Column> = linked.writes.iter().flat_map(|t| &t.columns).collect();
         let series = |table: &str, name: &str| {
             let own = written.iter().position(|c| c.table == table && c.name == name).map(|i| &made[i]);
-            let theirs = || self.columns.iter().position(|c| c.table == table && c.name == name).map(|i| &self.rows[i]);
-            own.or_else(theirs).unwrap_or_else(|| panic!("no series {name} in {table}")).clone()
+            let input = || self.columns.iter().position(|c| c.table == table && c.name == name).map(|i| &self.rows[i]);
+            own.or_else(input).unwrap_or_else(|| panic!("no series {name} in {table}")).clone()
         };
         let mut added: BTreeMap<String, Vec<f64>> = BTreeMap::new();
         assert_eq!(linked.coefficients.len(), values.len(), "{:?}", linked.coefficients);
@@ -158,7 +162,7 @@ impl World {
             let coefficient = linked.coefficients.iter().find(|c| c.name == name);
             let coefficient = coefficient.unwrap_or_else(|| panic!("no {name} in {:?}", linked.coefficients));
             let range = coefficient.lower..=coefficient.upper;
-            assert!(range.contains(value), "{name} = {value} lies beyond its range");
+            assert!(range.contains(value), "{name} = {value} is out of range");
             for response in &coefficient.responses {
                 let column = series(&response.table, &response.series);
                 let sum = added.entry(response.channel.clone()).or_insert_with(|| vec![0.0; column.len()]);
@@ -169,8 +173,8 @@ impl World {
     }
 }
 
-/// The largest difference over the largest expected value.
-pub(crate) fn apart(got: &[f64], want: &[f64]) -> f64 {
+/// Largest difference, relative to the largest expected value.
+pub(crate) fn relative_difference(got: &[f64], want: &[f64]) -> f64 {
     assert_eq!(got.len(), want.len());
     let most = |x: f64, y: f64| if y.is_nan() { f64::INFINITY } else { x.max(y) };
     let scale = want.iter().map(|x| x.abs()).fold(0.0, most);

@@ -1,8 +1,8 @@
-//! Effects of the environment across the border: what each says that it adds to a channel, against physics computed another way.
+//! Effects of the environment through the plugin interface, compared with independent physics.
 
 mod harness;
 
-use harness::{AXES, DT_S, START_NS, World, apart, mission};
+use harness::{AXES, DT_S, START_NS, Telemetry, mission, relative_difference};
 use nalgebra::{Matrix3, Vector3};
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -10,13 +10,13 @@ use std::collections::BTreeMap;
 
 const MU_0: f64 = 1.256_637_061_27e-6;
 
-/// `T_S^{O_i}`, from the mission file's angle, written out.
+/// `T_S^{O_i}` from the mission file's angle.
 fn orf_from_srf(tm: usize) -> Matrix3<f64> {
     let (sin, cos) = [std::f64::consts::FRAC_PI_6, -std::f64::consts::FRAC_PI_6][tm].sin_cos();
     Matrix3::new(cos, sin, 0.0, -sin, cos, 0.0, 0.0, 0.0, 1.0)
 }
 
-/// Three channels of an accelerometer-like vector, as rows of vectors.
+/// The three channels of a vector as one vector per row.
 fn vectors(added: &BTreeMap<String, Vec<f64>>, stem: &str, rows: usize) -> Vec<Vector3<f64>> {
     let of = |axis: usize, k: usize| added.get(&format!("{stem}.{}", AXES[axis])).map_or(0.0, |column| column[k]);
     (0..rows).map(|k| Vector3::from_fn(|axis, _| of(axis, k))).collect()
@@ -26,31 +26,36 @@ fn flat(vectors: &[Vector3<f64>]) -> Vec<f64> {
     vectors.iter().flat_map(|v| v.iter().copied()).collect()
 }
 
-/// Both test masses against what stays behind a spacecraft that is accelerated, SRF, m/s².
-fn stay_behind(added: &BTreeMap<String, Vec<f64>>, spacecraft: &[Vector3<f64>], bound: f64) {
+/// Asserts the response of both test masses to accelerations of the spacecraft, SRF, m s⁻²; a wrong sign must fail.
+fn assert_test_masses_see(added: &BTreeMap<String, Vec<f64>>, spacecraft: &[Vector3<f64>], bound: f64) {
     for tm in 0..2 {
         let want: Vec<Vector3<f64>> = spacecraft.iter().map(|a| orf_from_srf(tm) * -a).collect();
         let got = flat(&vectors(added, &format!("tm{}.accel", tm + 1), want.len()));
-        assert!(apart(&got, &flat(&want)) < bound, "tm{}: {}", tm + 1, apart(&got, &flat(&want)));
+        assert!(
+            relative_difference(&got, &flat(&want)) < bound,
+            "tm{}: {}",
+            tm + 1,
+            relative_difference(&got, &flat(&want))
+        );
         let turned: Vec<f64> = flat(&want).iter().map(|x| -x).collect();
-        assert!(apart(&got, &turned) > 0.5, "the test sees a sign");
+        assert!(relative_difference(&got, &turned) > 0.5, "a wrong sign must fail");
     }
 }
 
-/// `τ ẏ = T − y` in small steps, with names that say nothing.
+/// Reference: `τ ẏ = T − y` in small steps. The column names carry no meaning.
 #[test]
-fn a_lagged_difference_of_temperatures_pushes_along_the_axis() {
+fn thermal_matches_the_lag_equation() {
     let rows = 6000;
-    let mut world = World::new(rows, &[("hk.b7", "K"), ("hk.a", "K"), ("hk.volts", "V")]);
-    world.fill("hk.b7", |t| 294.0 + if t > 50.0 { 0.02 } else { 0.0 });
-    world.fill("hk.a", |t| 293.0 + 0.01 * (0.05 * t).sin());
+    let mut telemetry = Telemetry::new(rows, &[("hk.b7", "K"), ("hk.a", "K"), ("hk.volts", "V")]);
+    telemetry.fill("hk.b7", |t| 294.0 + if t > 50.0 { 0.02 } else { 0.0 });
+    telemetry.fill("hk.a", |t| 293.0 + 0.01 * (0.05 * t).sin());
     let (k, tau) = (3e-11, 77.0);
     let parameters = json!({"plus": "hk.b7", "minus": "hk.a", "lag_s": tau});
-    let added = world.added("thermal", "tm2.y", parameters, &[("", k)]);
+    let added = telemetry.added("thermal", "tm2.y", parameters, &[("", k)]);
     assert_eq!(added.len(), 1);
     let lagged = |name: &str| {
         let steps = 50;
-        let mut y = world.row(name)[0];
+        let mut y = telemetry.row(name)[0];
         let of = |u: &f64| {
             let mut mean = 0.0;
             for _ in 0..steps {
@@ -60,28 +65,29 @@ fn a_lagged_difference_of_temperatures_pushes_along_the_axis() {
             }
             mean
         };
-        world.row(name).iter().map(of).collect::<Vec<f64>>()
+        telemetry.row(name).iter().map(of).collect::<Vec<f64>>()
     };
     let (plus, minus) = (lagged("hk.b7"), lagged("hk.a"));
     let want: Vec<f64> = (0..rows).map(|i| k * (plus[i] - minus[i] - 1.0)).collect();
     let got: Vec<f64> = added["tm2.accel.y"].iter().map(|x| x - k).collect();
-    assert!(apart(&got, &want) < 1e-8, "{}", apart(&got, &want));
-    let no_lag: Vec<f64> = (0..rows).map(|i| k * (world.row("hk.b7")[i] - world.row("hk.a")[i] - 1.0)).collect();
-    assert!(apart(&no_lag, &want) > 0.1, "a test without a lag's trace would prove nothing");
+    assert!(relative_difference(&got, &want) < 1e-8, "{}", relative_difference(&got, &want));
+    let no_lag: Vec<f64> =
+        (0..rows).map(|i| k * (telemetry.row("hk.b7")[i] - telemetry.row("hk.a")[i] - 1.0)).collect();
+    assert!(relative_difference(&no_lag, &want) > 0.1, "the lag must be visible");
 }
 
-/// Every pair once at every lag, and a bank that the first writes and the others find.
+/// Every pair occurs once at every lag; a second instance reuses the series of the first.
 #[test]
-fn a_thermal_candidate_tries_every_pair_at_every_lag() {
-    let mut world = World::new(10, &[("hk.p", "K"), ("hk.q", "K"), ("hk.r", "K"), ("hk.volts", "V")]);
-    let (_, first) = world.link("thermal", "tm1.x", json!({}), true).expect("linked");
+fn a_thermal_candidate_has_every_pair_at_every_lag() {
+    let mut telemetry = Telemetry::new(10, &[("hk.p", "K"), ("hk.q", "K"), ("hk.r", "K"), ("hk.volts", "V")]);
+    let (_, first) = telemetry.link("thermal", "tm1.x", json!({}), true).expect("linked");
     assert_eq!(first.coefficients[0].variants.len(), 3 * 13);
     let written: Vec<_> = first.writes.iter().flat_map(|t| t.columns.clone()).collect();
     assert_eq!(written.len(), 3 * 13);
-    let rows = world.time_ns.len();
-    world.rows.extend(written.iter().map(|_| vec![0.0; rows]));
-    world.columns.extend(written);
-    let (_, second) = world.link("thermal", "tm2.z", json!({}), true).expect("linked");
+    let rows = telemetry.time_ns.len();
+    telemetry.rows.extend(written.iter().map(|_| vec![0.0; rows]));
+    telemetry.columns.extend(written);
+    let (_, second) = telemetry.link("thermal", "tm2.z", json!({}), true).expect("linked");
     assert!(second.writes.is_empty() && second.reads.is_empty());
     let variant = &second.coefficients[0].variants[13 + 1];
     assert_eq!(json!(variant.shape), json!({"plus": "hk.p", "minus": "hk.r", "lag_s": 45.0}));
@@ -90,50 +96,58 @@ fn a_thermal_candidate_tries_every_pair_at_every_lag() {
     assert_eq!((responses[0].series.as_str(), responses[0].factor), ("lag(hk.p,45)", 1.0));
     assert_eq!((responses[1].series.as_str(), responses[1].factor), ("lag(hk.r,45)", -1.0));
     assert!(responses.iter().all(|r| r.channel == "tm2.accel.z"));
-    // The shape of a variant, as parameters, gives the responses of the variant.
-    let (_, third) = world.link("thermal", "tm2.z", json!(variant.shape), false).expect("linked");
+    // A variant's shape, given as parameters, reproduces its responses.
+    let (_, third) = telemetry.link("thermal", "tm2.z", json!(variant.shape), false).expect("linked");
     assert_eq!(third.coefficients[0].responses, variant.responses);
 }
 
-/// Forces by finite differences of the energy of two electrodes at `∓ΔV/2` and a charged test mass between them: with
-/// charges `q` held and voltages held, `F = d/dx [½ΣC V² − ½(q + ΣC V)²/ΣC]`, of which the part odd in q is the stray voltage's.
+/// Reference: the energy of two electrodes at `∓ΔV/2` and a charged test mass between them. At constant charge and
+/// voltages `F = d/dx [½ΣC V² − ½(q + ΣC V)²/ΣC]`; its part odd in q is due to the stray voltage.
 #[test]
-fn a_charge_is_pushed_from_the_higher_voltage() {
-    let mut world = World::new(50, &[("hk.q9", "C"), ("hk.other", "C")]);
-    world.fill("hk.q9", |t| 1e-13 * (1.0 - 0.3 * t));
+fn charge_matches_the_electrostatic_energy() {
+    let mut telemetry = Telemetry::new(50, &[("hk.q9", "C"), ("hk.other", "C")]);
+    telemetry.fill("hk.q9", |t| 1e-13 * (1.0 - 0.3 * t));
     let (voltage, capacitance, gradient) = (0.4, 34.2e-12, 291e-12);
-    let added = world.added("charge", "tm1", json!({"charge": "hk.q9"}), &[("", voltage)]);
+    let added = telemetry.added("charge", "tm1", json!({"charge": "hk.q9"}), &[("", voltage)]);
     let energy = |q: f64, x: f64| {
-        // The rest of the capacitance is that of the grounded housing.
+        // The remaining capacitance is to the grounded housing.
         let c = [1e-12 + gradient * x, 1e-12 - gradient * x, capacitance - 2e-12];
         let v = [-0.5 * voltage, 0.5 * voltage, 0.0];
         let (total, charged): (f64, f64) = (c.iter().sum(), q + c.iter().zip(v).map(|(c, v)| c * v).sum::<f64>());
         0.5 * c.iter().zip(v).map(|(c, v)| c * v * v).sum::<f64>() - 0.5 * charged * charged / total
     };
     let force = |q: f64| (energy(q, 1e-5) - energy(q, -1e-5)) / 2e-5;
-    let want: Vec<f64> =
-        world.row("hk.q9").iter().map(|q| 0.5 * (force(*q) - force(-q)) / mission().test_mass["tm1"].mass_kg).collect();
-    assert!(apart(&added["tm1.accel.x"], &want) < 1e-4, "{}", apart(&added["tm1.accel.x"], &want));
-    let (_, tried) = world.link("charge", "tm2", json!({}), true).expect("linked");
+    let want: Vec<f64> = telemetry
+        .row("hk.q9")
+        .iter()
+        .map(|q| 0.5 * (force(*q) - force(-q)) / mission().test_mass["tm1"].mass_kg)
+        .collect();
+    assert!(
+        relative_difference(&added["tm1.accel.x"], &want) < 1e-4,
+        "{}",
+        relative_difference(&added["tm1.accel.x"], &want)
+    );
+    let (_, tried) = telemetry.link("charge", "tm2", json!({}), true).expect("linked");
     assert_eq!(tried.coefficients[0].variants.len(), 2);
-    let refused = world.link("charge", "tm1", json!({"charge": "hk.q8"}), false).map(drop).expect_err("no such column");
+    let refused =
+        telemetry.link("charge", "tm1", json!({"charge": "hk.q8"}), false).map(drop).expect_err("no such column");
     assert!(refused.contains("hk.q9, hk.other"), "{refused}");
 }
 
-/// Forces by finite differences of the energy `−(m_r·B + χV B²/2μ0)` in a field whose gradient grows and shrinks as one.
+/// Reference: finite differences of the energy `−(m_r·B + χV B²/2μ0)` in a field of constant form.
 #[test]
-fn a_magnet_is_drawn_up_the_gradient() {
-    let mut world = World::new(80, &[("hk.g", "T m-1"), ("hk.b", "T"), ("hk.c", "T")]);
-    world.fill("hk.g", |t| 8e-6 * (1.0 + 0.3 * (0.9 * t).sin()));
-    world.fill("hk.b", |t| 5e-7 + 2e-7 * (1.7 * t).cos());
-    // Symmetric, without trace; the gradiometer measures its xx.
+fn magnetic_matches_the_field_energy() {
+    let mut telemetry = Telemetry::new(80, &[("hk.g", "T m-1"), ("hk.b", "T"), ("hk.c", "T")]);
+    telemetry.fill("hk.g", |t| 8e-6 * (1.0 + 0.3 * (0.9 * t).sin()));
+    telemetry.fill("hk.b", |t| 5e-7 + 2e-7 * (1.7 * t).cos());
+    // Symmetric and traceless; the gradiometer measures its xx element.
     let gamma = Matrix3::new(1.0, 0.25, -0.125, 0.25, -0.375, 0.375, -0.125, 0.375, -0.625);
     let (chi, density, mass_kg) = (2e-4, 2e4, 1.96);
     let moment = Vector3::new(1e-8, -2e-8, 5e-9);
-    // The column measures y; x and z of the field are steady.
+    // The column measures y; x and z of the field are constant.
     let (steady, sensed) = (Vector3::new(3e-7, 0.0, -4e-7), 1);
     let mut want = Vec::new();
-    for (g, b) in world.row("hk.g").iter().zip(world.row("hk.b")) {
+    for (g, b) in telemetry.row("hk.g").iter().zip(telemetry.row("hk.b")) {
         let energy = |r: Vector3<f64>| {
             let field = steady + Vector3::y() * *b + gamma * r * *g;
             -(moment.dot(&field) + chi * mass_kg / density / (2.0 * MU_0) * field.norm_squared())
@@ -147,50 +161,50 @@ fn a_magnet_is_drawn_up_the_gradient() {
     let values: Vec<(&str, f64)> =
         names.iter().enumerate().map(|(i, n)| (*n, if i < 3 { linear[i] } else { product[i - 3] })).collect();
     let parameters = json!({"gradient": "hk.g", "field": "hk.b"});
-    let added = world.added("magnetic", "tm2", parameters, &values);
+    let added = telemetry.added("magnetic", "tm2", parameters, &values);
     let got = flat(&vectors(&added, "tm2.accel", want.len()));
-    assert!(apart(&got, &flat(&want)) < 1e-9, "{}", apart(&got, &flat(&want)));
+    assert!(relative_difference(&got, &flat(&want)) < 1e-9, "{}", relative_difference(&got, &flat(&want)));
     for wrong in 0..6 {
         let mut values = values.clone();
         values[wrong].1 *= -1.0;
-        let added = world.added("magnetic", "tm2", json!({"gradient": "hk.g", "field": "hk.b"}), &values);
-        assert!(apart(&flat(&vectors(&added, "tm2.accel", want.len())), &flat(&want)) > 0.01, "{wrong}");
+        let added = telemetry.added("magnetic", "tm2", json!({"gradient": "hk.g", "field": "hk.b"}), &values);
+        assert!(relative_difference(&flat(&vectors(&added, "tm2.accel", want.len())), &flat(&want)) > 0.01, "{wrong}");
     }
-    // Two fields times one gradient, and two squares; all six coefficients in one order.
-    let (_, tried) = world.link("magnetic", "tm1", json!({}), true).expect("linked");
+    // Two fields with one gradient, and two squares; the six coefficients list them in one order.
+    let (_, tried) = telemetry.link("magnetic", "tm1", json!({}), true).expect("linked");
     let variants = |i: usize| tried.coefficients[i].variants.clone();
     assert!((0..6).all(|i| variants(i).len() == 4));
     assert!((0..4).all(|v| variants(0)[v].shape == variants(5)[v].shape));
     assert_eq!(variants(3)[3].shape["gradient"], "hk.c");
     assert_eq!(variants(3)[3].unit.as_deref(), Some("m s-2 T-2"));
-    let again = world.link("magnetic", "tm1", json!(variants(3)[3].shape), false).expect("linked").1;
+    let again = telemetry.link("magnetic", "tm1", json!(variants(3)[3].shape), false).expect("linked").1;
     assert_eq!(again.coefficients[3].responses, variants(3)[3].responses);
 }
 
-/// Slug and spacecraft, each with its own equation of motion, in small steps.
+/// Reference: equations of motion of slug and spacecraft in small steps.
 #[test]
-fn what_sloshes_holds_the_spacecraft_back() {
+fn slosh_matches_two_body_dynamics() {
     let rows = 600;
-    let mut world = World::new(rows, &[]);
-    world.fill("used.mps_force_srf_n.y", |t| 1e-5 * if t < 20.0 { 1.0 } else { (0.6 * t).sin() });
-    world.fill("used.tm1.force_orf_n.x", |t| 3e-6 * (0.3 * t).cos());
-    world.fill("used.tm2.force_orf_n.y", |t| 2e-6 * (0.4 * t).sin());
-    world.fill("used.sun_srf.y", |t| 0.1 * (0.05 * t).cos());
-    world.fill("used.mps_force_srf_n.x", |t| (1.1 * t).sin());
+    let mut telemetry = Telemetry::new(rows, &[]);
+    telemetry.fill("used.mps_force_srf_n.y", |t| 1e-5 * if t < 20.0 { 1.0 } else { (0.6 * t).sin() });
+    telemetry.fill("used.tm1.force_orf_n.x", |t| 3e-6 * (0.3 * t).cos());
+    telemetry.fill("used.tm2.force_orf_n.y", |t| 2e-6 * (0.4 * t).sin());
+    telemetry.fill("used.sun_srf.y", |t| 0.1 * (0.05 * t).cos());
+    telemetry.fill("used.mps_force_srf_n.x", |t| (1.1 * t).sin());
     let m = mission();
     let (mass_kg, mu, f0_hz, zeta) = (m.spacecraft.mass_kg, 0.1_f64, 0.15, 0.05);
     let pressure_n = m.solar_pressure.as_ref().expect("sunlight").force_n;
-    let row = |name: &str, k: usize| world.row(name)[k];
+    let row = |name: &str, k: usize| telemetry.row(name)[k];
     let net_n: Vec<f64> = (0..rows)
         .map(|k| {
-            // The electrodes' recoil: o_1 of bench 1 and o_2 of bench 2, components along s_2.
+            // Recoil of the electrodes: components of o_1 (bench 1) and o_2 (bench 2) along s_2.
             let recoil = 0.5 * row("used.tm1.force_orf_n.x", k) + 0.75_f64.sqrt() * row("used.tm2.force_orf_n.y", k);
             row("used.mps_force_srf_n.y", k) + pressure_n * row("used.sun_srf.y", k) - recoil
         })
         .collect();
     let (slug_kg, omega, steps) = (mass_kg * mu, std::f64::consts::TAU * f0_hz, 4000);
     let h = DT_S / f64::from(steps);
-    // At rest under the first force: all of it is accelerated alike.
+    // At rest under the first force.
     let (mut x, mut v) = (-net_n[0] / mass_kg / (omega * omega), 0.0);
     let more: Vec<Vector3<f64>> = net_n
         .iter()
@@ -213,52 +227,52 @@ fn what_sloshes_holds_the_spacecraft_back() {
         .collect();
     let raised = (1.0 - mu).sqrt();
     let parameters = json!({"f0_hz": f0_hz / raised, "zeta": zeta / raised});
-    let added = world.added("slosh", "sc.y", parameters, &[("", mu / (1.0 - mu))]);
-    stay_behind(&added, &more, 1e-5);
+    let added = telemetry.added("slosh", "sc.y", parameters, &[("", mu / (1.0 - mu))]);
+    assert_test_masses_see(&added, &more, 1e-5);
 }
 
 /// A momentum in one sample is a step of velocity, an angular momentum one of rate.
 #[test]
 fn a_hit_pushes_and_turns_the_spacecraft_once() {
-    let world = World::new(40, &[]);
+    let telemetry = Telemetry::new(40, &[]);
     let (momentum, arm) = (Vector3::new(0.0, 4e-6, 0.0), Vector3::new(0.5, 0.4, -0.3));
     let angular: Vector3<f64> = arm.cross(&momentum);
     let values =
         [("momentum", momentum.y), ("angular_x", angular.x), ("angular_y", angular.y), ("angular_z", angular.z)];
     // In the middle of the sixth sample.
     let at = json!({"at_ns": START_NS + 550_000_000_i64});
-    let added = world.added("impulse", "sc.y", at.clone(), &values);
+    let added = telemetry.added("impulse", "sc.y", at.clone(), &values);
     let in_sixth = |total: Vector3<f64>| -> Vec<Vector3<f64>> {
         (0..40).map(|k| if k == 5 { total / DT_S } else { Vector3::zeros() }).collect()
     };
-    stay_behind(&added, &in_sixth(momentum / 1500.0), 1e-12);
+    assert_test_masses_see(&added, &in_sixth(momentum / 1500.0), 1e-12);
     let inertia = Matrix3::new(800.0, 13.0, 10.0, 13.0, 800.0, 12.0, 10.0, 12.0, 1000.0);
     let rate = inertia.lu().solve(&angular).expect("an inertia");
     let got = flat(&vectors(&added, "sc.alpha", 40));
-    assert!(apart(&got, &flat(&in_sixth(rate))) < 1e-12);
+    assert!(relative_difference(&got, &flat(&in_sixth(rate))) < 1e-12);
 
     // A turn: the same by itself, over two seconds.
-    let turned = world.added("impulse", "sc.psi", json!({"at_ns": START_NS, "pulse_s": 2.0}), &[("", 7e-7)]);
+    let turned = telemetry.added("impulse", "sc.psi", json!({"at_ns": START_NS, "pulse_s": 2.0}), &[("", 7e-7)]);
     let sum: Vector3<f64> = vectors(&turned, "sc.alpha", 40).iter().sum::<Vector3<f64>>() * DT_S;
     let rate = inertia.lu().solve(&Vector3::new(0.0, 0.0, 7e-7)).expect("an inertia");
     assert!((sum - rate).norm() < 1e-12 * rate.norm(), "{sum} {rate}");
     assert!(turned.len() == 3 && turned["sc.alpha.z"][19] > 0.0 && turned["sc.alpha.z"][20].abs() < 1e-30);
 
-    // A glitch: all its momentum, on one axis of one test mass.
-    let glitch = world.added("impulse", "tm2.z", json!({"at_ns": START_NS, "decay_s": 0.1}), &[("", -3e-11)]);
+    // A glitch transfers its momentum to one axis of one test mass.
+    let glitch = telemetry.added("impulse", "tm2.z", json!({"at_ns": START_NS, "decay_s": 0.1}), &[("", -3e-11)]);
     let sum = glitch["tm2.accel.z"].iter().sum::<f64>() * DT_S;
     assert!(glitch.len() == 1 && (sum + 3e-11 / 1.96).abs() < 1e-9 * 3e-11, "{sum:e}");
 
-    let refused = world.link("impulse", "sc.y", json!({}), false).map(drop).expect_err("no time");
+    let refused = telemetry.link("impulse", "sc.y", json!({}), false).map(drop).expect_err("no time");
     assert!(refused.contains("at_ns"), "{refused}");
 }
 
-/// A transient of a candidate is what the effect in the model makes of its shape.
+/// A candidate's transient equals the effect in a model with the same shape.
 #[test]
-fn the_transients_of_a_candidate_are_what_the_model_would_add() {
-    let world = World::new(4000, &[]);
+fn candidate_transients_match_the_effect_in_a_model() {
+    let telemetry = Telemetry::new(4000, &[]);
     for instance in ["sc.z", "sc.theta", "tm1.x"] {
-        let (_, tried) = world.link("impulse", instance, json!({}), true).expect("linked");
+        let (_, tried) = telemetry.link("impulse", instance, json!({}), true).expect("linked");
         for coefficient in &tried.coefficients {
             let name = &coefficient.name;
             for transient in coefficient.transients.iter().take(4) {
@@ -274,23 +288,27 @@ fn the_transients_of_a_candidate_are_what_the_model_would_add() {
                     .map(|n| (n.clone(), if n == last { 1e-8 } else { 0.0 }))
                     .collect();
                 let values: Vec<(&str, f64)> = values.iter().map(|(n, v)| (n.as_str(), *v)).collect();
-                let added = world.added("impulse", instance, shape, &values);
+                let added = telemetry.added("impulse", instance, shape, &values);
                 for (channel, factor) in &transient.channels {
                     let want: Vec<f64> = transient.kernel.iter().take(3997).map(|k| 1e-8 * factor * k).collect();
                     let got = &added[channel][3..3 + want.len()];
                     assert!(added[channel][..3].iter().all(|x| *x == 0.0));
-                    assert!(apart(got, &want) < 1e-5, "{instance} {name} {channel}: {}", apart(got, &want));
+                    assert!(
+                        relative_difference(got, &want) < 1e-5,
+                        "{instance} {name} {channel}: {}",
+                        relative_difference(got, &want)
+                    );
                 }
             }
         }
     }
 }
 
-/// Three thrusters with noise of their own: force and torque follow from where they sit, and K from nothing else.
+/// Reference: three thrusters with independent noise; force and torque follow from their positions and directions.
 #[test]
-fn noise_of_single_thrusters_pushes_as_it_turns() {
+fn mps_correlation_matches_single_thruster_noise() {
     let rows = 30;
-    let mut world = World::new(rows, &[]);
+    let mut telemetry = Telemetry::new(rows, &[]);
     let directions = Matrix3::new(1.0, 0.2, 0.0, 0.1, 1.0, 0.3, 0.0, -0.2, 1.0);
     let positions = Matrix3::new(0.5, -0.8, 0.1, 0.7, 0.3, -0.9, -0.2, 0.4, 0.6);
     let torques = Matrix3::from_columns(&[0, 1, 2].map(|i| positions.column(i).cross(&directions.column(i))));
@@ -302,9 +320,9 @@ fn noise_of_single_thrusters_pushes_as_it_turns() {
     let sunlight = Vector3::from(pressure.arm_srf_m).cross(&(sun * pressure.force_n));
     for (i, axis) in AXES.into_iter().enumerate() {
         let inverse = m.spacecraft.inertia_inverse();
-        world.fill(&format!("used.mps_torque_srf_nm.{axis}"), |t| known(t)[i]);
-        world.fill(&format!("used.sun_srf.{axis}"), |_| sun[i]);
-        world.fill(&format!("sc.alpha_srf_rad_s2.{axis}"), |t| {
+        telemetry.fill(&format!("used.mps_torque_srf_nm.{axis}"), |t| known(t)[i]);
+        telemetry.fill(&format!("used.sun_srf.{axis}"), |_| sun[i]);
+        telemetry.fill(&format!("sc.alpha_srf_rad_s2.{axis}"), |t| {
             (inverse * (known(t) + sunlight + torques * noise(t)))[i]
         });
     }
@@ -312,21 +330,21 @@ fn noise_of_single_thrusters_pushes_as_it_turns() {
     let names: Vec<String> =
         AXES.iter().flat_map(|f| AXES.iter().map(move |t| format!("force_{f}_by_torque_{t}"))).collect();
     let values: Vec<(&str, f64)> = names.iter().enumerate().map(|(i, n)| (n.as_str(), gain[(i / 3, i % 3)])).collect();
-    let added = world.added("mps-correlation", "layout", json!({}), &values);
+    let added = telemetry.added("mps-correlation", "layout", json!({}), &values);
     let spacecraft: Vec<Vector3<f64>> =
         (0..rows).map(|k| directions * noise(DT_S * k as f64) / m.spacecraft.mass_kg).collect();
-    stay_behind(&added, &spacecraft, 1e-7);
+    assert_test_masses_see(&added, &spacecraft, 1e-7);
 }
 
 #[test]
-fn noise_names_its_process() {
-    let world = World::new(3, &[]);
+fn noise_effects_name_their_process() {
+    let telemetry = Telemetry::new(3, &[]);
     for (id, instance, process) in [
         ("mps-noise", "sc.x", "thruster_force:sc.x"),
         ("torque-noise", "sc.z", "thruster_torque:sc.z"),
         ("is-noise", "tm1.y", "readout:tm1.y"),
     ] {
-        let (_, linked) = world.link(id, instance, json!({}), false).expect("linked");
+        let (_, linked) = telemetry.link(id, instance, json!({}), false).expect("linked");
         let c = &linked.coefficients[0];
         assert_eq!((c.noise.as_str(), c.initial, c.unit.as_str()), (process, 1.0, "1"));
         assert!(c.responses.is_empty() && linked.writes.is_empty());
@@ -338,45 +356,47 @@ fn formula(acts_on: &str, expression: &str) -> Value {
 }
 
 #[test]
-fn a_formula_acts_where_it_says() {
-    let mut world = World::new(50, &[("hk.a", "A")]);
-    world.fill("hk.a", |t| 1.0 + (0.7 * t).sin());
-    world.fill("sc.alpha_srf_rad_s2.z", |t| 1e-9 * t);
-    let product: Vec<f64> = (0..50).map(|k| world.row("hk.a")[k] * world.row("sc.alpha_srf_rad_s2.z")[k]).collect();
+fn a_formula_acts_on_the_named_channels() {
+    let mut telemetry = Telemetry::new(50, &[("hk.a", "A")]);
+    telemetry.fill("hk.a", |t| 1.0 + (0.7 * t).sin());
+    telemetry.fill("sc.alpha_srf_rad_s2.z", |t| 1e-9 * t);
+    let product: Vec<f64> =
+        (0..50).map(|k| telemetry.row("hk.a")[k] * telemetry.row("sc.alpha_srf_rad_s2.z")[k]).collect();
     let times = |factor: f64| product.iter().map(|x| factor * x).collect::<Vec<f64>>();
-    let added = |acts_on: &str| world.added("formula", "mine", formula(acts_on, "hk.a * alpha.z"), &[("", 2.0)]);
-    assert!(apart(&added("tm2.force.y")["tm2.accel.y"], &times(2.0 / 1.96)) < 1e-14);
-    assert!(apart(&added("tm1.accel.z")["tm1.accel.z"], &times(2.0)) < 1e-14);
+    let added = |acts_on: &str| telemetry.added("formula", "mine", formula(acts_on, "hk.a * alpha.z"), &[("", 2.0)]);
+    assert!(relative_difference(&added("tm2.force.y")["tm2.accel.y"], &times(2.0 / 1.96)) < 1e-14);
+    assert!(relative_difference(&added("tm1.accel.z")["tm1.accel.z"], &times(2.0)) < 1e-14);
     let pushed: Vec<Vector3<f64>> = product.iter().map(|x| Vector3::x() * (2.0 * x / 1500.0)).collect();
-    stay_behind(&added("sc.force.x"), &pushed, 1e-14);
+    assert_test_masses_see(&added("sc.force.x"), &pushed, 1e-14);
     let inertia = Matrix3::new(800.0, 13.0, 10.0, 13.0, 800.0, 12.0, 10.0, 12.0, 1000.0);
     let turned: Vec<Vector3<f64>> =
         product.iter().map(|x| inertia.lu().solve(&(Vector3::y() * (2.0 * x))).expect("an inertia")).collect();
-    assert!(apart(&flat(&vectors(&added("sc.torque.y"), "sc.alpha", 50)), &flat(&turned)) < 1e-12);
-    let seconds = world.added("formula", "mine", formula("tm1.accel.x", "time_s"), &[("", 1.0)]);
+    assert!(relative_difference(&flat(&vectors(&added("sc.torque.y"), "sc.alpha", 50)), &flat(&turned)) < 1e-12);
+    let seconds = telemetry.added("formula", "mine", formula("tm1.accel.x", "time_s"), &[("", 1.0)]);
     assert!((0..50).all(|k| (seconds["tm1.accel.x"][k] - DT_S * (k as f64 + 0.5)).abs() < 1e-9));
 }
 
 #[test]
-fn a_bad_formula_is_refused_with_the_column_marked() {
-    let mut world = World::new(7000, &[("hk.battery_current_a", "A"), ("hk.zero", "1")]);
-    world.fill("hk.battery_current_a", |t| t + 1.0);
-    let refused = |parameters: Value| world.link("formula", "mine", parameters, false).map(drop).expect_err("refused");
-    let said = refused(formula("tm1.force.x", "2 * hk.battery_curent_a"));
+fn an_invalid_formula_is_refused_with_its_position() {
+    let mut telemetry = Telemetry::new(7000, &[("hk.battery_current_a", "A"), ("hk.zero", "1")]);
+    telemetry.fill("hk.battery_current_a", |t| t + 1.0);
+    let refused =
+        |parameters: Value| telemetry.link("formula", "mine", parameters, false).map(drop).expect_err("refused");
+    let message = refused(formula("tm1.force.x", "2 * hk.battery_curent_a"));
     let mark = "column 5: unknown name `hk.battery_curent_a`; the nearest: `hk.battery_current_a`";
-    assert!(said.contains(mark) && said.contains("  2 * hk.battery_curent_a\n      ^"), "{said}");
+    assert!(message.contains(mark) && message.contains("  2 * hk.battery_curent_a\n      ^"), "{message}");
     assert!(refused(formula("tm1.push.x", "1")).contains("sc.torque.x"));
     assert!(refused(json!({"acts_on": "tm1.force.x", "expression": "1", "range": [0.0, 1.0]})).contains("`unit`"));
     let no_range = json!({"acts_on": "tm1.force.x", "expression": "1", "unit": "N"});
     assert!(refused(no_range).contains("`range`"));
-    // Nothing but divisions by zero: told after ten minutes.
+    // A formula that is never finite is refused after ten minutes of data.
     let hopeless = formula("tm1.accel.x", "hk.battery_current_a / hk.zero");
-    let (mut effect, linked) = world.link("formula", "mine", hopeless, false).expect("linked");
+    let (mut effect, linked) = telemetry.link("formula", "mine", hopeless, false).expect("linked");
     let rows = dragfree_engine::border::Rows {
-        time_ns: &world.time_ns,
-        columns: linked.reads.iter().flatten().map(|r| &*world.rows[r.available]).collect(),
+        time_ns: &telemetry.time_ns,
+        columns: linked.reads.iter().flatten().map(|r| &*telemetry.rows[r.available]).collect(),
     };
-    // All columns of the world are of two tables with the same rows.
+    // All columns belong to two tables with equal rows.
     let mut tables = Vec::new();
     let mut rest = rows.columns;
     for table in &linked.reads {
@@ -384,12 +404,12 @@ fn a_bad_formula_is_refused_with_the_column_marked() {
         tables.push(dragfree_engine::border::Rows { time_ns: rows.time_ns, columns: rest });
         rest = others;
     }
-    let said = effect.process(&tables, i64::MAX).map(drop).expect_err("no value anywhere").to_string();
-    assert!(said.contains("divides by zero") && said.contains("6000 epochs"), "{said}");
+    let message = effect.process(&tables, i64::MAX).map(drop).expect_err("no value anywhere").to_string();
+    assert!(message.contains("division by zero") && message.contains("6000 epochs"), "{message}");
 }
 
-/// Effects with a memory: id, instance, parameters.
-fn with_memory() -> Vec<(&'static str, &'static str, Value, bool)> {
+/// Effects with state: id, instance, parameters, candidate.
+fn effects_with_state() -> Vec<(&'static str, &'static str, Value, bool)> {
     let long = "lag(hk.a, 20) * derivative(hk.b) + integral(highpass(hk.a, 0.1)) * time_s";
     vec![
         ("thermal", "tm1.x", json!({"plus": "hk.a", "minus": "hk.b", "lag_s": 12.0}), false),
@@ -401,25 +421,25 @@ fn with_memory() -> Vec<(&'static str, &'static str, Value, bool)> {
 
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(12))]
-    /// Whatever the batches, and with the state carried from one instance to another between them.
+    /// Splitting the rows and saving the state in between leaves the output bit by bit the same.
     #[test]
-    fn neither_batches_nor_saved_states_change_a_bit(cut in 1_usize..2999, gap in 0_usize..900) {
-        let mut world = World::new(3000, &[("hk.a", "K"), ("hk.b", "K")]);
+    fn batches_and_saved_states_do_not_change_the_output(cut in 1_usize..2999, gap in 0_usize..900) {
+        let mut telemetry = Telemetry::new(3000, &[("hk.a", "K"), ("hk.b", "K")]);
         let missing = move |t: f64| (100.0..100.0 + DT_S * gap as f64).contains(&t);
-        world.fill("hk.a", move |t| if missing(t) { f64::NAN } else { 290.0 + (0.1 * t).sin() });
-        world.fill("hk.b", |t| 290.0 + (0.17 * t).cos());
-        world.fill("used.mps_force_srf_n.x", move |t| if missing(t) { f64::NAN } else { 1e-6 * (0.3 * t).sin() });
-        for (id, instance, parameters, candidate) in with_memory() {
-            let link = || world.link(id, instance, parameters.clone(), candidate).expect("linked");
+        telemetry.fill("hk.a", move |t| if missing(t) { f64::NAN } else { 290.0 + (0.1 * t).sin() });
+        telemetry.fill("hk.b", |t| 290.0 + (0.17 * t).cos());
+        telemetry.fill("used.mps_force_srf_n.x", move |t| if missing(t) { f64::NAN } else { 1e-6 * (0.3 * t).sin() });
+        for (id, instance, parameters, candidate) in effects_with_state() {
+            let link = || telemetry.link(id, instance, parameters.clone(), candidate).expect("linked");
             let (mut one, linked) = link();
-            let whole = world.process(&mut one, &linked, 0, 3000);
+            let whole = telemetry.process(&mut one, &linked, 0, 3000);
             let (mut first, _) = link();
-            let mut parts = world.process(&mut first, &linked, 0, cut);
+            let mut parts = telemetry.process(&mut first, &linked, 0, cut);
             let (mut second, _) = link();
             let state = first.save().expect("a state");
             second.load(&state).expect("its state");
             prop_assert_eq!(second.save().expect("a state"), state);
-            for (all, more) in parts.iter_mut().zip(world.process(&mut second, &linked, cut, 3000)) {
+            for (all, more) in parts.iter_mut().zip(telemetry.process(&mut second, &linked, cut, 3000)) {
                 all.extend(more);
             }
             let bits = |all: &[Vec<f64>]| -> Vec<Vec<u64>> {
@@ -432,7 +452,7 @@ proptest! {
         }
     }
 
-    /// Whatever the text, the formula's reader gives a tree or an error.
+    /// The parser returns a tree or an error for any bytes.
     #[test]
     fn no_bytes_make_a_formula_panic(bytes in prop::collection::vec(any::<u8>(), 0..400)) {
         dragfree_effects::formula::fuzz_formula(&bytes);

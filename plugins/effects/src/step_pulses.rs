@@ -1,71 +1,70 @@
-//! Even pushes at the steps of a column.
+//! Rectangular pulses at the steps of a column.
 
 use std::collections::VecDeque;
 
-use crate::common::rows_between;
+use crate::common::skipped_rows;
 
-/// The last values of a column, and from them what is given at its steps: a step of height h at an epoch gives h evenly over the
-/// `n` rows from that epoch on, so that the mean of row k is `(u_k − u_{k−n})/(n Δt)`.
+/// Recent values of a column, which give a rectangular pulse at each of its steps: a step of height h gives h evenly
+/// over the next `n` rows. The sum of all pulses in row k is `(u_k − u_{k−n})/(n Δt)`.
 ///
-/// A column that lacks values has its last one; before the first, NaN, and at the first it has always been so. Rows that are left
-/// out altogether are rows without a value.
+/// A missing value is replaced by the last one. Before the first value the output is NaN; the first value is no step.
+/// Absent rows count as rows without a value.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Steps {
-    /// The newest last; one more than the longest push, full from the first value on.
+pub(crate) struct StepPulses {
+    /// `max_rows + 1` values, newest last.
     values: VecDeque<f64>,
-    longest: usize,
+    max_rows: usize,
     dt_s: f64,
     /// Time of the last row, Unix ns; 0 before the first.
     last_ns: i64,
 }
 
-impl Steps {
-    /// For pushes over at most `longest` rows.
-    pub(crate) fn new(longest: usize, dt_s: f64) -> Self {
-        let longest = longest.max(1);
-        Self { values: VecDeque::from(vec![f64::NAN; longest + 1]), longest, dt_s, last_ns: 0 }
+impl StepPulses {
+    /// Pulses of at most `max_rows` rows.
+    pub(crate) fn new(max_rows: usize, dt_s: f64) -> Self {
+        let max_rows = max_rows.max(1);
+        Self { values: VecDeque::from(vec![f64::NAN; max_rows + 1]), max_rows, dt_s, last_ns: 0 }
     }
 
-    /// The next row.
+    /// Adds a row.
     pub(crate) fn push(&mut self, now_ns: i64, value: f64) {
-        let held = self.values[self.longest];
-        if held.is_nan() {
+        let last = self.values[self.max_rows];
+        if last.is_nan() {
             if value.is_finite() {
                 self.values.iter_mut().for_each(|v| *v = value);
             }
         } else {
-            let left_out = rows_between(self.last_ns, now_ns, self.dt_s).min(self.longest as u64);
-            for _ in 0..left_out {
-                self.turn(held);
+            let skipped = skipped_rows(self.last_ns, now_ns, self.dt_s).min(self.max_rows as u64);
+            for _ in 0..skipped {
+                self.shift(last);
             }
-            self.turn(if value.is_finite() { value } else { held });
+            self.shift(if value.is_finite() { value } else { last });
         }
         self.last_ns = now_ns;
     }
 
-    fn turn(&mut self, value: f64) {
+    fn shift(&mut self, value: f64) {
         self.values.pop_front();
         self.values.push_back(value);
     }
 
-    /// Mean over the last row of what is given over `rows` rows, s⁻¹.
+    /// Mean over the newest row of pulses `rows` long, s⁻¹ times the unit of the column.
     pub(crate) fn mean(&self, rows: usize) -> f64 {
-        let rows = rows.clamp(1, self.longest);
-        (self.values[self.longest] - self.values[self.longest - rows]) / (rows as f64 * self.dt_s)
+        let rows = rows.clamp(1, self.max_rows);
+        (self.values[self.max_rows] - self.values[self.max_rows - rows]) / (rows as f64 * self.dt_s)
     }
 
-    /// Number of [`Self::state`]'s numbers.
+    /// Length of [`Self::state`].
     pub(crate) fn state_len(&self) -> usize {
-        self.longest + 2
+        self.max_rows + 2
     }
 
-    /// All that the next rows depend on.
+    /// State on which later rows depend; the time is stored as the bits of a float.
     pub(crate) fn state(&self) -> impl Iterator<Item = f64> {
-        // Bits carry a whole number through, whatever its size.
         self.values.iter().copied().chain([f64::from_bits(self.last_ns.cast_unsigned())])
     }
 
-    /// Takes back what [`Self::state`] gave, [`Self::state_len`] numbers.
+    /// Restores [`Self::state`], [`Self::state_len`] numbers.
     pub(crate) fn set_state(&mut self, state: &[f64]) {
         if let Some((last_ns, values)) = state.split_last() {
             self.values = values.iter().copied().collect();
@@ -81,7 +80,7 @@ mod tests {
 
     const DT_S: f64 = 0.1;
 
-    fn run(steps: &mut Steps, first: i64, values: &[f64], rows: usize) -> Vec<f64> {
+    fn run(steps: &mut StepPulses, first: i64, values: &[f64], rows: usize) -> Vec<f64> {
         let of = |(k, x): (usize, &f64)| {
             steps.push(100_000_000 * (first + k as i64), *x);
             steps.mean(rows)
@@ -89,11 +88,11 @@ mod tests {
         values.iter().enumerate().map(of).collect()
     }
 
-    /// A flag that is up for a while: what it gives it takes back, evenly, and nothing before.
+    /// A flag set from row 20 to 60.
     #[test]
-    fn what_a_rise_gives_a_fall_takes_back() {
+    fn a_rise_and_a_fall_give_opposite_pulses() {
         let values: Vec<f64> = (0..100).map(|k| f64::from(u8::from((20..60).contains(&k)))).collect();
-        let given = run(&mut Steps::new(30, DT_S), 0, &values, 10);
+        let given = run(&mut StepPulses::new(30, DT_S), 0, &values, 10);
         for (k, got) in given.iter().enumerate() {
             let want = if (20..30).contains(&k) {
                 1.0
@@ -107,18 +106,18 @@ mod tests {
     }
 
     #[test]
-    fn a_column_that_begins_high_has_not_just_risen() {
-        let given = run(&mut Steps::new(5, DT_S), 0, &[f64::NAN, 1.0, 1.0, f64::NAN, 1.0], 3);
+    fn the_first_value_is_no_step() {
+        let given = run(&mut StepPulses::new(5, DT_S), 0, &[f64::NAN, 1.0, 1.0, f64::NAN, 1.0], 3);
         assert!(given[0].is_nan());
         assert_eq!(given[1..], [0.0; 4]);
     }
 
-    /// A push that began before a gap goes on in it, and rows left out are rows without a value.
+    /// A pulse continues over a gap, and absent rows count.
     #[test]
-    fn a_gap_takes_time() {
+    fn absent_rows_are_missing_values() {
         let values = [0.0, 1.0, f64::NAN, f64::NAN, f64::NAN, 1.0, 1.0];
-        let whole = run(&mut Steps::new(8, DT_S), 0, &values, 5);
-        let mut steps = Steps::new(8, DT_S);
+        let whole = run(&mut StepPulses::new(8, DT_S), 0, &values, 5);
+        let mut steps = StepPulses::new(8, DT_S);
         let mut jumped = run(&mut steps, 0, &values[..2], 5);
         jumped.extend(run(&mut steps, 5, &values[5..], 5));
         assert_eq!(jumped, [&whole[..2], &whole[5..]].concat());
@@ -127,17 +126,17 @@ mod tests {
 
     proptest! {
         #[test]
-        fn neither_pieces_nor_saved_states_change_a_bit(
+        fn chunks_and_saved_states_do_not_change_the_output(
             values in prop::collection::vec(prop_oneof![4 => -3.0..3.0, 1 => Just(f64::NAN)], 1..200),
             cut in 0.0..1.0_f64,
         ) {
             let cut = (cut * values.len() as f64) as usize;
-            let whole = run(&mut Steps::new(20, DT_S), 0, &values, 7);
-            let mut first = Steps::new(20, DT_S);
+            let whole = run(&mut StepPulses::new(20, DT_S), 0, &values, 7);
+            let mut first = StepPulses::new(20, DT_S);
             let mut parts = run(&mut first, 0, &values[..cut], 7);
             let state: Vec<f64> = first.state().collect();
             prop_assert_eq!(state.len(), first.state_len());
-            let mut second = Steps::new(20, DT_S);
+            let mut second = StepPulses::new(20, DT_S);
             second.set_state(&state);
             parts.extend(run(&mut second, cut as i64, &values[cut..], 7));
             let bits = |x: &[f64]| x.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
