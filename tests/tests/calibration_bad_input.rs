@@ -240,7 +240,7 @@ fn status_flags_take_values_out_and_are_counted() {
     assert_eq!(run.count("preprocess", "is.status_values"), 6 * 6_000);
     assert_eq!(run.count("preprocess", "ifo.status_values"), 3_000);
     assert_eq!(run.epochs(), (EPOCHS, 0), "the other test mass goes on");
-    assert!(run.notes().contains("is: values left out: 36000 under a status flag"), "{}", run.notes());
+    assert!(run.notes().contains("is: invalid values: 36000 under a status flag"), "{}", run.notes());
     assert_right(&run);
 }
 

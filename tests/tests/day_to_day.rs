@@ -224,6 +224,6 @@ fn a_missing_day_is_a_gap() {
     assert_eq!(counts["grid.cut_gaps"], 1, "{counts}");
     assert_eq!(long["epochs_used"], 216_000);
     let notes = long["quality"]["notes"].to_string();
-    assert!(notes.contains("left out of the grid, the longest 162000.1 s"), "{notes}");
+    assert!(notes.contains("omitted from the grid, the longest 162000.1 s"), "{notes}");
     assert_eq!(long["verdict"], "agree", "{notes}");
 }

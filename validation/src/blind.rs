@@ -1,9 +1,9 @@
-//! The blind campaign: telemetry with effects that a seed alone has drawn, diagnosed, and scored when the seal is opened.
+//! The blind campaign: telemetry with effects drawn by a seed, diagnosed, and scored after the seal is opened.
 //!
-//! Each seed goes the way of a user: `simulate --hidden`, `run`, `diagnose`, then `reveal`. The folder with the sealed truth is moved
-//! away before anything reads the telemetry. Where every cause that was accepted is true and can be added to a model, that is done:
-//! the same telemetry is calibrated again, and other telemetry with the same hidden causes, which no fit has seen, is predicted by the
-//! model before, by the model after and by one that has the true values.
+//! Each seed runs `simulate --hidden`, `run`, `diagnose` and `reveal`, as a user would. The sealed truth is moved away
+//! before anything reads the telemetry. If every accepted cause is true and can be added to a model, the same telemetry
+//! is calibrated again, and other telemetry with the same hidden causes is predicted by the model before, the model
+//! after, and one with the true values.
 
 use std::ffi::OsStr;
 use std::ops::RangeInclusive;
@@ -19,39 +19,39 @@ use crate::campaign::{CampaignError, Meter, note, work};
 use crate::program::{Chain, Hidden, Program, root, solution};
 use crate::records::{Keyed, Results, Solution};
 
-/// Hidden seeds up to this one served to develop the method, and count in no campaign.
+/// Seeds up to this one were used in development and are excluded.
 pub const DEVELOPED_ON: u32 = 100;
 
-/// One seed.
+/// Result of one seed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Blind {
     /// Length and kind of the data.
     pub configuration: String,
-    /// Seed of what is hidden and of the noise.
+    /// Seed of hidden effects and noise.
     pub seed: u32,
     /// Digest of the plugins' libraries, twelve hexadecimal digits.
     pub build: String,
-    /// Seconds that the diagnosis took.
+    /// Duration of the diagnosis, s.
     pub diagnosis_s: f64,
-    /// What `reveal` says of it.
+    /// Score by `reveal`.
     pub score: Value,
-    /// What the model says of the offset with nothing added.
+    /// Offset by the model without additions.
     pub before: Solution,
-    /// What became of it when what was found was added; none where nothing could be, or something false was accepted.
+    /// Offset by the extended model; `None` if nothing could be added or a false cause was accepted.
     pub after: Option<After>,
 }
 
-/// A model with what was found.
+/// An extended model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct After {
-    /// What was added.
+    /// Added effects.
     pub added: Vec<String>,
-    /// The offset from the same telemetry.
+    /// Offset from the same telemetry.
     pub offset: Solution,
-    /// χ²/dof of telemetry that no fit has seen: the model before, with what was found, and with the true values of that; none where
-    /// the truth has no value that a model can take.
+    /// χ²/dof of telemetry that no fit has used: model before, model after, and with the true values; `None` if the
+    /// truth has no value that a model can take.
     pub held_out_chi2_per_dof: [Option<f64>; 3],
 }
 
@@ -65,10 +65,10 @@ impl Keyed for Blind {
     }
 }
 
-/// Runs the seeds that are not in `results` yet, so many at once.
+/// Runs the seeds that `results` lacks, `at_once` in parallel.
 ///
 /// # Errors
-/// [`CampaignError`]; what was done by then is on disk, and the next call goes on.
+/// [`CampaignError`]; results so far are on disk, and the next call continues.
 pub fn blind(
     program: &Program,
     seeds: RangeInclusive<u32>,
@@ -140,11 +140,10 @@ pub fn blind(
     }
 }
 
-/// Telemetry that is kept out has the noise of a seed so many above.
+/// Offset between the seed of the noise and that of the withheld telemetry.
 const OTHER_NOISE: u32 = 1_000_000;
 
-/// What of a diagnosis can be added to a model: everything that was accepted, where all of it is true and none of it is a level or
-/// happened once.
+/// Accepted causes to add to a model, if all of them are true and none is a noise level or a transient.
 fn to_add(diagnosis: &Value, score: &Value) -> Vec<String> {
     let accepted: Vec<&Value> =
         diagnosis["candidates"].as_array().into_iter().flatten().filter(|c| c["accepted"] == true).collect();
@@ -157,7 +156,7 @@ fn to_add(diagnosis: &Value, score: &Value) -> Vec<String> {
     accepted.into_iter().map(name).collect()
 }
 
-/// One seed's files.
+/// Files of one seed.
 struct Set<'a> {
     program: &'a Program,
     folder: &'a Path,
@@ -221,7 +220,7 @@ impl Set<'_> {
     }
 }
 
-/// The true values and shape of an effect as `model add` takes them; none where not all are known.
+/// True values and shape of an effect as arguments of `model add`; `None` if not all are known.
 fn truth_as_words(score: &Value, name: &str) -> Option<Vec<String>> {
     let effects = score["effects"].as_array()?;
     let named =

@@ -1,4 +1,4 @@
-//! What a blind campaign says: the numbers against their bars, and the confusion matrix.
+//! Report of a blind campaign: numbers with their bars, and the confusion matrix.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -10,13 +10,13 @@ use serde_json::Value;
 use crate::blind::Blind;
 use crate::records::Solution;
 
-/// Significance from which an effect should be found.
+/// Significance from which an effect should be detected.
 const PLAIN: f64 = 8.0;
 
-/// Name of a set without anything hidden.
+/// Label of a set without hidden effects.
 const NOTHING: &str = "nothing";
 
-/// An effect that acted, in a set.
+/// A true effect of a set.
 struct Acted<'a> {
     line: &'a Blind,
     effect: &'a Value,
@@ -27,27 +27,27 @@ impl Acted<'_> {
         self.effect["effect"].as_str().unwrap_or("?")
     }
 
-    /// Significance for which its size was drawn.
+    /// Nominal significance of its size.
     fn drawn(&self) -> f64 {
         self.effect["expected_significance"].as_f64().unwrap_or(0.0)
     }
 
-    /// Significance that the diagnosis's own σ gives the truth; none where it tells no σ.
+    /// Significance of the truth with the diagnosis's own σ; `None` without σ.
     fn at_hand(&self) -> Option<f64> {
         self.effect["significance_at_hand"].as_f64()
     }
 
-    /// Whether an effect of this kind at this place is installed.
+    /// Whether such an effect is installed.
     fn is_covered(&self) -> bool {
         self.effect["covered"] == true
     }
 
-    /// Whether it is accepted, or named among the confounders of what is.
+    /// Whether it is accepted, or a listed confounder of an accepted one.
     fn is_found(&self) -> bool {
         self.effect["outcome"] == "accepted" || self.effect["outcome"] == "confounded"
     }
 
-    /// Whether it is called unexplained, with its driver, where it has one, among the first three witnesses.
+    /// Whether it is reported as unexplained, with its driver (if any) among the first three.
     fn is_pointed_at(&self) -> bool {
         let has_driver = self.effect["drivers"].as_array().is_some_and(|d| !d.is_empty());
         self.effect["outcome"] == "unexplained"
@@ -60,7 +60,7 @@ fn effects(line: &Blind) -> Vec<Acted<'_>> {
     all.iter().map(|effect| Acted { line, effect }).collect()
 }
 
-/// What a diagnosis says first: the kind that it accepts, or its verdict.
+/// First answer of a diagnosis: the kind of its first accepted candidate, or its verdict.
 fn said(line: &Blind) -> &str {
     match line.score["accepted"].get(0).and_then(Value::as_str) {
         Some(name) => name.split(':').next().unwrap_or(name),
@@ -72,12 +72,12 @@ fn false_causes(line: &Blind) -> usize {
     line.score["false_causes"].as_array().map_or(0, Vec::len)
 }
 
-/// `17 of 20, 85 %`.
+/// A ratio as text, `17 of 20, 85 %`.
 fn part(k: usize, n: usize) -> String {
     if n == 0 { "none".to_owned() } else { format!("{k} of {n}, {:.0} %", 100.0 * k as f64 / n as f64) }
 }
 
-/// Errors over σ of some solutions of the offset.
+/// Errors over σ of several offset solutions.
 fn pulls<'a>(solutions: impl Iterator<Item = &'a Solution>) -> Vec<f64> {
     solutions.flat_map(Solution::pulls).filter(|p| p.is_finite()).collect()
 }
@@ -86,7 +86,7 @@ fn rms(values: &[f64]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / values.len().max(1) as f64).sqrt()
 }
 
-/// The generated part of VALIDATION.md, and the bars that are missed.
+/// Generated part of VALIDATION.md, and the missed bars.
 #[must_use]
 pub fn numbers(lines: &[Blind]) -> (String, Vec<String>) {
     if lines.is_empty() {
@@ -219,7 +219,7 @@ fn provenance(lines: &[Blind]) -> String {
     )
 }
 
-/// Kind by kind, found over sets.
+/// Detections per kind over sets.
 fn kinds(singles: &[Acted<'_>]) -> String {
     let mut rows: BTreeMap<&str, [(usize, usize); 3]> = BTreeMap::new();
     for a in singles {
@@ -241,7 +241,7 @@ fn kinds(singles: &[Acted<'_>]) -> String {
     text
 }
 
-/// The confusion matrices of the sets with one effect or none: what was hidden against what was said first. None without results.
+/// Confusion matrices of the sets with at most one effect: hidden effect against first answer. `None` without results.
 ///
 /// # Errors
 /// [`ChartError`].
@@ -266,7 +266,7 @@ pub fn picture(lines: &[Blind]) -> Result<Option<String>, ChartError> {
         if counts.is_empty() {
             continue;
         }
-        // Nothing and the kinds that nobody covers stand last, as do the answers that belong to them.
+        // No effect and uncovered kinds come last, with the answers that belong to them.
         let order =
             |name: &str| (matches!(name, NOTHING | "sufficient" | "unexplained"), covered.get(name) == Some(&false));
         let sorted = |names: BTreeSet<&str>| {

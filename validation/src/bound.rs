@@ -1,17 +1,15 @@
-//! What any estimator could know at best of the offsets, from the mission's noise alone: no data, no sums, no segment.
+//! Cramér–Rao bound of the offsets from the mission's noise alone, without data, segments or normal equations.
 //!
-//! Relative to a test mass the housing at `b` shows `−α×b` through the mean of two samples, so with `α̂` the regressors of
-//! the channels are `Φ = −cos(πf dt) [α̂×]`. Over a span `T` real, stationary data carry the information
+//! The regressors of the channels are `Φ = −cos(πf dt) [α̂×]`. Stationary data over a span `T` carry the information
 //!
 //! ```text
 //! N = 2T ∫ Re E[Φᴴ Σ⁻¹ Φ] df,   f from 0 to Nyquist, one-sided spectra
 //! ```
 //!
-//! which takes two spectra. **Σ**, the noise of the channels: readouts through the second difference, stray and
-//! electrostatic accelerations, and what is not known of the thrusters' noise: its force in every channel, its torque
-//! through the levers. Commands are known; of force and torque together the attitude readout tells what it can, and the
-//! rest is their conditional covariance. **S_α̂**, the excitation: `α = S w − K S n` in the closed loop with torque noise
-//! `w` and attitude readout `n`, minus what nobody sees of it, as the error of the best `α̂` is orthogonal to it.
+//! **Σ** is the noise of the channels: readouts through the second difference, accelerations of the test masses, and
+//! the covariance of the thrusters' force and torque noise conditional on the attitude readout. **S_α̂** is the
+//! excitation, `α = S w − K S n` in the closed loop with torque noise `w` and attitude readout noise `n`, minus the
+//! spectrum of the best estimate's error, which is orthogonal to it.
 
 use dragfree_physics::control_design::{DesignError, design};
 use dragfree_physics::frames::skew;
@@ -22,12 +20,12 @@ use std::f64::consts::{PI, TAU};
 
 type C64 = Complex<f64>;
 
-/// Points of the integral, evenly in ln f.
+/// Number of integration points, evenly spaced in ln f.
 const POINTS: usize = 6000;
-/// Where the integral begins, Hz: below it lies less than a millionth of the information.
+/// Lower limit of the integral, Hz; less than a millionth of the information lies below.
 const LOWEST_HZ: f64 = 1e-5;
 
-/// Why there is no bound.
+/// Error of a bound.
 #[derive(Debug, thiserror::Error)]
 pub enum BoundError {
     /// The mission lacks something.
@@ -36,7 +34,7 @@ pub enum BoundError {
     /// The mission has no controllers.
     #[error(transparent)]
     Design(#[from] DesignError),
-    /// Some combination of channels has no noise, or some offset is not seen.
+    /// A combination of channels has no noise, or an offset is unobservable.
     #[error("{0} is singular: give every readout and every test mass a noise in the mission file")]
     Singular(&'static str),
 }
@@ -46,7 +44,7 @@ type WrenchPsd = Box<dyn Fn(f64) -> Matrix6<f64>>;
 /// Open loop of the three attitude channels at a frequency in Hz.
 type OpenLoop = Box<dyn Fn(f64) -> [C64; 3]>;
 
-/// Everything that the two spectra are made of.
+/// Inputs of the two spectra.
 pub struct Case {
     /// Sampling interval, s.
     pub dt_s: f64,
@@ -56,7 +54,7 @@ pub struct Case {
     pub inertia_inverse: Matrix3<f64>,
     /// `T_S^O` of both test masses.
     pub dcm_orf_from_srf: [Matrix3<f64>; 2],
-    /// Their offsets, ORF, m: the levers of torque that nobody knows.
+    /// Their offsets, ORF, m: levers of the unknown torque.
     pub offset_orf_m: [Vector3<f64>; 2],
     /// Noise of the thrusters.
     pub wrench_psd: WrenchPsd,
@@ -82,10 +80,10 @@ pub struct InformationBound {
 }
 
 impl Case {
-    /// The case of a mission file.
+    /// The case of a mission.
     ///
     /// # Errors
-    /// [`BoundError`] when the mission lacks a noise or a design.
+    /// [`BoundError`]: the mission lacks a noise level or a controller design.
     pub fn of(mission: &Mission) -> Result<Self, BoundError> {
         const NEEDED_BY: &str = "the information bound";
         let n = &mission.noise;
@@ -154,17 +152,20 @@ impl Case {
         let s = (self.wrench_psd)(f_hz);
         let j = &self.inertia_inverse;
 
-        // What the attitude readout leaves open of force and torque; it sees the mean of two samples of torque.
-        let mut sees = SMatrix::<f64, 3, 6>::zeros();
-        sees.fixed_view_mut::<3, 3>(0, 3).copy_from(&(j * cos));
+        // Covariance of force and torque conditional on the attitude readout, which sees the mean torque of two
+        // samples.
+        let mut attitude_response = SMatrix::<f64, 3, 6>::zeros();
+        attitude_response.fixed_view_mut::<3, 3>(0, 3).copy_from(&(j * cos));
         let attitude = Matrix3::identity() * (differenced * self.attitude.psd(f_hz));
-        let gain = s * sees.transpose() * (sees * s * sees.transpose() + attitude).try_inverse()?;
-        let left = s - gain * sees * s;
+        let gain = s
+            * attitude_response.transpose()
+            * (attitude_response * s * attitude_response.transpose() + attitude).try_inverse()?;
+        let unknown = s - gain * attitude_response * s;
 
         let torque = s.fixed_view::<3, 3>(3, 3).into_owned();
         let disturbance = j * torque * j.transpose();
-        let unseen = j * left.fixed_view::<3, 3>(3, 3) * j.transpose();
-        // Acceleration over a sample to attitude at its end, s²: dt²/2 (z + 1)/(z − 1)².
+        let unseen = j * unknown.fixed_view::<3, 3>(3, 3) * j.transpose();
+        // Transfer from acceleration over a sample to attitude at its end, s²: dt²/2 (z + 1)/(z − 1)².
         let z = C64::from_polar(1.0, TAU * f_hz * self.dt_s);
         let integrators = (z + 1.0) / ((z - 1.0) * (z - 1.0)) * (0.5 * self.dt_s.powi(2));
         let sensitivity = (self.open_loop)(f_hz).map(|l| (l + 1.0).inv());
@@ -174,13 +175,13 @@ impl Case {
             (sensitivity[a] * sensitivity[b].conj()).re * disturbance[(a, b)] + own - unseen[(a, b)]
         });
 
-        let mut enters = Matrix6::zeros();
+        let mut channel_response = Matrix6::zeros();
         for i in 0..2 {
             let dcm = self.dcm_orf_from_srf[i];
-            enters.fixed_view_mut::<3, 3>(3 * i, 0).copy_from(&(-dcm / self.mass_kg));
-            enters.fixed_view_mut::<3, 3>(3 * i, 3).copy_from(&(skew(&self.offset_orf_m[i]) * dcm * j));
+            channel_response.fixed_view_mut::<3, 3>(3 * i, 0).copy_from(&(-dcm / self.mass_kg));
+            channel_response.fixed_view_mut::<3, 3>(3 * i, 3).copy_from(&(skew(&self.offset_orf_m[i]) * dcm * j));
         }
-        let mut noise = enters * left * enters.transpose() * (cos * cos);
+        let mut noise = channel_response * unknown * channel_response.transpose() * (cos * cos);
         for (i, axis) in (0..2).flat_map(|i| (0..3).map(move |axis| (i, axis))) {
             noise[(3 * i + axis, 3 * i + axis)] +=
                 differenced * self.readout[i][axis].psd(f_hz) + cos * cos * self.stray[i][axis].psd(f_hz);
@@ -188,14 +189,14 @@ impl Case {
         Some((excitation, noise))
     }
 
-    /// The bounds for a span of data in seconds, within a band in Hz.
+    /// Bounds for `span_s` seconds of data in a band, Hz.
     ///
     /// # Errors
     /// [`BoundError::Singular`].
     pub fn bound_in(&self, span_s: f64, band_hz: std::ops::Range<f64>) -> Result<InformationBound, BoundError> {
         const NOISE: BoundError = BoundError::Singular("the noise of the channels");
         const SEEN: BoundError = BoundError::Singular("the information");
-        // The channels of −[α×] b for α along each axis of SRF.
+        // Channels of −[α×] b for α along each axis of SRF.
         let regressors = [0, 1, 2].map(|axis| {
             let mut g = Matrix6::zeros();
             for i in 0..2 {
@@ -209,24 +210,24 @@ impl Case {
         for k in 0..POINTS {
             let f = band_hz.start * (step * (k as f64 + 0.5)).exp();
             let (excitation, noise) = self.spectra(f).ok_or(NOISE)?;
-            let mut apart = Matrix6::zeros();
+            let mut separate = Matrix6::zeros();
             for i in 0..2 {
                 let own = noise.fixed_view::<3, 3>(3 * i, 3 * i).try_inverse().ok_or(NOISE)?;
-                apart.fixed_view_mut::<3, 3>(3 * i, 3 * i).copy_from(&own);
+                separate.fixed_view_mut::<3, 3>(3 * i, 3 * i).copy_from(&own);
             }
-            let together = noise.try_inverse().ok_or(NOISE)?;
+            let combined = noise.try_inverse().ok_or(NOISE)?;
             let weight = 2.0 * span_s * (PI * f * self.dt_s).cos().powi(2) * f * step;
             for (a, b) in (0..3).flat_map(|a| (0..3).map(move |b| (a, b))) {
                 let power = weight * excitation[(a, b)];
-                joint += regressors[a].transpose() * together * regressors[b] * power;
-                single += regressors[a].transpose() * apart * regressors[b] * power;
+                joint += regressors[a].transpose() * combined * regressors[b] * power;
+                single += regressors[a].transpose() * separate * regressors[b] * power;
             }
         }
         let sigmas = |information: &Matrix6<f64>| -> Result<[f64; 6], BoundError> {
             let covariance = information.try_inverse().ok_or(SEEN)?;
             Ok(std::array::from_fn(|i| covariance[(i, i)].sqrt()))
         };
-        // Under the survey both housings move together: b_i = T_S^O c + what the survey says.
+        // With the survey both housings move together: b_i = T_S^O c + constant.
         let mut tied = SMatrix::<f64, 6, 3>::zeros();
         for i in 0..2 {
             tied.fixed_view_mut::<3, 3>(3 * i, 0).copy_from(&self.dcm_orf_from_srf[i]);
@@ -240,7 +241,7 @@ impl Case {
         })
     }
 
-    /// The bounds for a span of data in seconds, up to Nyquist.
+    /// Bounds for `span_s` seconds of data, up to Nyquist.
     ///
     /// # Errors
     /// [`BoundError::Singular`].
@@ -249,7 +250,8 @@ impl Case {
     }
 }
 
-/// The basis of what the survey leaves open: both housings along an axis of SRF together, one column each, orthonormal.
+/// Orthonormal basis, 6 × 3, of the directions that the survey leaves free: both housings along an axis of SRF
+/// together.
 #[must_use]
 pub fn free_space(dcm_orf_from_srf: &[Matrix3<f64>; 2]) -> DMatrix<f64> {
     DMatrix::from_fn(6, 3, |row, axis| dcm_orf_from_srf[row / 3][(row % 3, axis)] * 0.5_f64.sqrt())
@@ -279,12 +281,11 @@ mod tests {
         }
     }
 
-    /// A study in Python, another program with PID loops of its own, summed the normal equations of 25 simulated days, a Hann
-    /// window each, and logged σ of two digits: 3.2, 0.064 and 0.061 mm for both test masses, 3.6, 0.064 and 0.064 mm apart,
-    /// 0.072, 0.064 and 0.047 mm with the survey. It counted one observation every 1.5 bins for the window's bandwidth; the
-    /// untapered data have one in each.
+    /// Reference: σ of an independent Python study that summed normal equations of 25 simulated days with Hann windows,
+    /// rounded to two digits. It counted one observation every 1.5 bins for the window's bandwidth; untapered data have
+    /// one in each.
     #[test]
-    fn sums_over_simulated_days_of_another_program_agree() {
+    fn bounds_match_an_independent_simulation_study() {
         let dt_s = 0.1;
         let inertia = Matrix3::new(800.0, 13.0, 10.0, 13.0, 800.0, 12.0, 10.0, 12.0, 1000.0);
         let white = NoiseShape::white;
@@ -303,7 +304,7 @@ mod tests {
             readout: std::array::from_fn(|_| [white(1.5e-12), white(1.8e-9), white(3e-9)]),
             stray: std::array::from_fn(|_| [NoiseShape::default(), white(6e-15 / 1.96), white(6e-15 / 1.96)]),
             open_loop: Box::new(move |f| {
-                // A low pass, then proportional, derivative and integral gains, no delay.
+                // A low pass, then proportional, derivative and integral gains, without delay.
                 let (w, z) = (0.35_f64, C64::from_polar(1.0, TAU * f * dt_s));
                 let a = 1.0 - (-6.0 * w * dt_s).exp();
                 let filter = C64::from(a) / (C64::from(1.0) - z.inv() * (1.0 - a));
@@ -319,8 +320,8 @@ mod tests {
         near(&bound.surveyed_m[..3], &mm([0.072, 0.064, 0.047]), 0.03, "surveyed");
     }
 
-    /// One second in closed form: nothing but white noise s_n of acceleration on every channel, and α̂ white with the torque
-    /// noise, as nothing controls it and the readout is perfect: N = 2T f_N ½ s_α/s_n (|e_a × e_j|² summed), σ = 1/√N.
+    /// Closed form for white noise s_n on every channel and white α̂ (no control, perfect readout): N = 2T f_N ½
+    /// s_α/s_n (|e_a × e_j|² summed), σ = 1/√N.
     #[test]
     fn white_noise_has_a_closed_form() {
         let (dt_s, torque, noise) = (0.1, 1e-10_f64, 1e-12_f64);
@@ -336,7 +337,7 @@ mod tests {
             stray: std::array::from_fn(|_| std::array::from_fn(|_| NoiseShape::white(noise))),
             open_loop: Box::new(|_| [C64::from(0.0); 3]),
         };
-        // cos² of the regressors and of the noise cancel; two of the three axes of α move each coefficient.
+        // cos² of regressors and noise cancel; two of the three axes of α act on each coefficient.
         let information = 2.0 * 5.0 * (torque / noise).powi(2) * 2.0;
         let bound = case.bound_in(1.0, 1e-5..5.0 * (1.0 - 1e-9)).unwrap();
         near(&bound.single_m, &[information.powf(-0.5); 6], 1e-3, "single");
@@ -344,19 +345,19 @@ mod tests {
         near(&bound.surveyed_m, &[(2.0 * information).powf(-0.5) * 1.0; 6], 1e-3, "surveyed");
     }
 
-    /// More knowledge never hurts, and σ falls with the root of the span.
+    /// More information never increases σ, and σ falls with the root of the span.
     #[test]
-    fn bounds_are_in_their_order() {
+    fn more_information_gives_smaller_bounds() {
         let case = Case::of(&taiji()).unwrap();
         let (day, month) = (case.bound(86_400.0).unwrap(), case.bound(25.0 * 86_400.0).unwrap());
         for i in 0..6 {
             assert!(day.surveyed_m[i] <= day.joint_m[i] && day.joint_m[i] <= day.single_m[i], "{day:?}");
             assert!((day.surveyed_m[i] / month.surveyed_m[i] - 5.0).abs() < 1e-9);
         }
-        // Twins: a quieter attitude readout shakes the spacecraft less, a noisier interferometer tells less.
+        // A quieter attitude readout excites the spacecraft less; a noisier interferometer carries less information.
         let with = |change: &dyn Fn(&mut Mission)| {
             let mut m = taiji();
-            // The controllers are those of the mission as it is.
+            // The controllers stay those of the original mission.
             change(&mut m);
             Case { open_loop: Case::of(&taiji()).unwrap().open_loop, ..Case::of(&m).unwrap() }.bound(86_400.0).unwrap()
         };
@@ -366,10 +367,9 @@ mod tests {
         assert!(loud.surveyed_m[0] > 1.05 * day.surveyed_m[0], "{loud:?} {day:?}");
     }
 
-    /// Single thrusters push and turn at once: whoever knows the torque knows part of the force, so that ignoring the
-    /// correlation would give less.
+    /// For single thrusters torque determines part of the force, so neglecting the correlation increases σ.
     #[test]
-    fn correlated_thrusters_tell_of_their_force() {
+    fn correlated_thrusters_reduce_the_bound() {
         let thrusters = mission(include_str!("../../fixtures/missions/taiji-thrusters.toml"));
         let case = Case::of(&thrusters).unwrap();
         let known = case.bound(86_400.0).unwrap();
@@ -386,9 +386,9 @@ mod tests {
         }
     }
 
-    /// Two housings that move together: free; apart: not.
+    /// Housings that move together are free, apart they are not.
     #[test]
-    fn the_survey_leaves_three_directions() {
+    fn the_survey_leaves_three_free_directions() {
         let dcm = [turned(30.0), turned(-30.0)];
         let free = free_space(&dcm);
         assert!((free.transpose() * &free - DMatrix::identity(3, 3)).norm() < 1e-14);

@@ -1,8 +1,8 @@
-//! The campaign: many seeds of one day, and twins in which something is wrong on purpose.
+//! The coverage campaign: many seeds of one day, and twins with a deliberate error.
 //!
-//! A **twin** is run twice: *unprotected*, with everything off that saves the product from a wrong mission file, where its
-//! statistics must fail, or the tests have no power; and as the *product* is, where they should not. Twins are six hours
-//! long, and their prior of the offsets is wide, so that only the data speak.
+//! A **twin** runs in two configurations: *unprotected*, without the features that correct a wrong mission file, where
+//! the statistics must fail if the tests have power; and *product*, where they should pass. Twins are six hours long
+//! and have a wide prior of the offsets, so that the data dominate.
 
 use std::collections::VecDeque;
 use std::fmt::Write as _;
@@ -13,12 +13,12 @@ use std::time::Instant;
 use crate::program::{Chain, Program, ProgramError, line, root};
 use crate::records::{Line, RecordError, Results};
 
-/// Hours of a twin.
+/// Length of a twin, h.
 pub const TWIN_HOURS: f64 = 6.0;
-/// Seeds of the twins.
+/// Number of seeds of the twins.
 pub const TWIN_SEEDS: u32 = 40;
 
-/// Why a campaign stopped.
+/// Error that stops a campaign.
 #[derive(Debug, thiserror::Error)]
 pub enum CampaignError {
     /// The program.
@@ -30,17 +30,17 @@ pub enum CampaignError {
     /// A bound.
     #[error(transparent)]
     Bound(#[from] crate::bound::BoundError),
-    /// A product without a part.
+    /// A product lacks a part.
     #[error("configuration {configuration}, seed {seed}: the product lacks {what}")]
     Product {
-        /// What was run.
+        /// Configuration.
         configuration: String,
         /// Seed.
         seed: u32,
         /// What is missing.
         what: String,
     },
-    /// A file of its own making.
+    /// A file of the campaign.
     #[error("{path}: {reason}", path = path.display())]
     File {
         /// The file.
@@ -50,12 +50,12 @@ pub enum CampaignError {
     },
 }
 
-/// What the mission file that `run` is given says otherwise than the truth.
+/// Difference between the mission file given to `run` and the truth.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Belief {
     /// Nothing.
     True,
-    /// PSDs of `[noise]` tables times a factor.
+    /// PSDs of `[noise]` tables, scaled by a factor.
     Scaled(&'static [&'static str], f64),
 }
 
@@ -64,13 +64,13 @@ pub enum Belief {
 pub struct Twin {
     /// Name; the configuration adds `unprotected` or `product`.
     pub name: &'static str,
-    /// In words, for the report.
+    /// Description in the report.
     pub words: &'static str,
-    /// What `run` believes.
+    /// Mission file of `run`.
     pub belief: Belief,
-    /// Effects that the simulation has and nobody else knows.
+    /// Effects in the simulation that the model lacks.
     pub effects: &'static [&'static str],
-    /// Whether it is run as the product is, too.
+    /// Whether it also runs as the product.
     pub with_product: bool,
     /// Seeds.
     pub seeds: u32,
@@ -80,7 +80,7 @@ const THRUST: &[&str] = &["thruster_force", "thruster_torque"];
 const READOUTS: &[&str] = &["ifo_x", "is_x", "is_y", "is_z", "is_angle", "dws_local", "dws_long_arm"];
 const LOUD_IS: &[&str] = &["is-noise:tm1.y=2", "is-noise:tm1.z=2", "is-noise:tm2.y=2", "is-noise:tm2.z=2"];
 
-/// All twins; the first is the control, in which nothing is wrong.
+/// All twins; the first is the control, without error.
 pub const TWINS: [Twin; 9] = [
     Twin {
         name: "control",
@@ -157,20 +157,20 @@ pub const TWINS: [Twin; 9] = [
 ];
 
 impl Twin {
-    /// Name of its configuration without protection.
+    /// Name of its unprotected configuration.
     #[must_use]
     pub fn unprotected(&self) -> String {
         format!("{} unprotected", self.name)
     }
 
-    /// Name of its configuration as the product is.
+    /// Name of its product configuration.
     #[must_use]
     pub fn product(&self) -> String {
         format!("{} product", self.name)
     }
 }
 
-/// Name of the campaign's own configuration.
+/// Name of the configuration without twin.
 pub const NOMINAL: &str = "nominal";
 
 /// All configurations in the order of the results.
@@ -179,8 +179,8 @@ pub fn configurations() -> Vec<String> {
     std::iter::once(NOMINAL.to_owned()).chain(TWINS.iter().flat_map(|t| [t.unprotected(), t.product()])).collect()
 }
 
-/// Files that the chains are made of.
-pub(crate) struct Workshop {
+/// Folder with the files of the chains.
+pub(crate) struct ScratchFolder {
     folder: PathBuf,
 }
 
@@ -214,10 +214,10 @@ fn scale_asd(mission: &mut toml::Table, noise: &str, factor: f64) -> Option<()> 
     Some(())
 }
 
-impl Workshop {
+impl ScratchFolder {
     /// An empty folder for telemetry and archives, and the files of the chains.
     pub(crate) fn new(folder: &Path) -> Result<Self, CampaignError> {
-        // What a kill left behind: telemetry, half a gigabyte a day.
+        // Removes telemetry of an interrupted run, half a gigabyte a day.
         if folder.exists() {
             std::fs::remove_dir_all(folder).map_err(|e| file(folder, &e))?;
         }
@@ -229,7 +229,7 @@ impl Workshop {
         self.folder.join(name)
     }
 
-    /// The default mission with other amplitudes, `(noise, factor)`.
+    /// The default mission with scaled amplitudes, `(noise, factor)`.
     pub(crate) fn mission(
         &self,
         name: &str,
@@ -238,7 +238,7 @@ impl Workshop {
     ) -> Result<PathBuf, CampaignError> {
         let mut mission = parse(&taiji())?;
         if let Some(frozen) = controllers {
-            // The law that flew was designed for the truth; only what is believed of the noise changes.
+            // The controllers were designed for the truth; only the stated noise changes.
             mission.extend(parse(frozen)?);
         }
         for (noise, factor) in amplitudes {
@@ -249,7 +249,7 @@ impl Workshop {
         Ok(path)
     }
 
-    /// The chain of a twin; unprotected or as the product is.
+    /// The chain of a twin, unprotected or as the product.
     fn chain(&self, program: &Program, twin: &Twin, protected: bool) -> Result<Chain, CampaignError> {
         let mut chain = Chain { pipeline: science_mode(), ..Chain::default() };
         if !protected {
@@ -257,7 +257,7 @@ impl Workshop {
             let stages = pipeline.get_mut("stage").and_then(toml::Value::as_array_mut);
             for stage in stages.into_iter().flatten().filter_map(toml::Value::as_table_mut) {
                 let off = match stage.get("plugin").and_then(toml::Value::as_str) {
-                    // Without adaptation the recursion's own covariance is that of its gains.
+                    // Without adaptation the covariance of the recursion is that of its gains.
                     Some("es-akf") => "adaptation = \"off\"\ngate_sigma = 0.0\ncalibrated_sigma = false",
                     Some("qp-check") => "refinements = 0",
                     _ => continue,
@@ -265,7 +265,7 @@ impl Workshop {
                 let off: toml::Table = off.parse().map_err(|e| file(&chain.pipeline, &e))?;
                 stage.insert("parameters".to_owned(), off.into());
             }
-            // Relative paths of the pipeline start at its own folder.
+            // Relative paths start at the pipeline's folder.
             for (key, path) in [("mission", taiji()), ("model", root().join("fixtures/models/com-offset.toml"))] {
                 let header = pipeline.get_mut("pipeline").and_then(toml::Value::as_table_mut);
                 let header = header.ok_or_else(|| file(&chain.pipeline, &"no table [pipeline]"))?;
@@ -296,7 +296,7 @@ impl Workshop {
     }
 }
 
-/// One simulation and the configurations that run on it.
+/// One simulation, with the configurations that use it.
 struct Task {
     seed: u32,
     hours: f64,
@@ -305,7 +305,7 @@ struct Task {
 }
 
 impl Task {
-    /// Hours of data handled: what it costs, about.
+    /// Approximate cost, hours of data.
     fn weight(&self) -> f64 {
         self.hours * (0.5 + self.runs.len() as f64)
     }
@@ -335,10 +335,10 @@ impl Meter {
 /// A line on stderr.
 pub fn note(text: &str) {
     use std::io::Write as _;
-    let _ = writeln!(std::io::stderr(), "{text}"); // nobody is left to tell
+    let _ = writeln!(std::io::stderr(), "{text}"); // no way to report a failing stderr
 }
 
-/// Does tasks, so many at once.
+/// Runs tasks on `at_once` threads.
 pub(crate) fn work<T: Send>(
     tasks: Vec<T>,
     at_once: usize,
@@ -351,7 +351,7 @@ pub(crate) fn work<T: Send>(
             scope.spawn(|| {
                 while let Some(task) = queue.lock().ok().and_then(|mut q| q.pop_front()) {
                     if let Err(error) = each(task) {
-                        // The first failure ends the campaign; what is on disk stays.
+                        // The first failure ends the campaign; results on disk stay.
                         if let (Ok(mut queue), Ok(mut failed)) = (queue.lock(), failed.lock()) {
                             queue.clear();
                             failed.get_or_insert(error);
@@ -364,10 +364,10 @@ pub(crate) fn work<T: Send>(
     failed.into_inner().ok().flatten().map_or(Ok(()), Err)
 }
 
-/// Runs what is not in `results` yet: seeds `first..=last` of the campaign, and the twins of those seeds.
+/// Runs the seeds that `results` lacks, and the twins of those seeds.
 ///
 /// # Errors
-/// [`CampaignError`]; what was done by then is on disk, and the next call goes on.
+/// [`CampaignError`]; results so far are on disk, and the next call continues.
 pub fn coverage(
     program: &Program,
     seeds: std::ops::RangeInclusive<u32>,
@@ -379,13 +379,13 @@ pub fn coverage(
     if dropped > 0 {
         note(&format!("{dropped} results of another build are dropped and measured again"));
     }
-    let workshop = Workshop::new(scratch)?;
+    let scratch_folder = ScratchFolder::new(scratch)?;
     let nominal = Chain { pipeline: science_mode(), ..Chain::default() };
     let mut twins = Vec::new();
     for twin in &TWINS {
-        twins.push((twin, twin.unprotected(), workshop.chain(program, twin, false)?));
+        twins.push((twin, twin.unprotected(), scratch_folder.chain(program, twin, false)?));
         if twin.with_product {
-            twins.push((twin, twin.product(), workshop.chain(program, twin, true)?));
+            twins.push((twin, twin.product(), scratch_folder.chain(program, twin, true)?));
         }
     }
     let mut tasks = Vec::new();
@@ -404,11 +404,11 @@ pub fn coverage(
     }
     let meter = Meter::new(tasks.iter().map(Task::weight).sum());
     let results = Mutex::new(results);
-    // Two days at once on one thread each take less time than one after the other on two.
+    // Two single-threaded days in parallel are faster than two days in sequence on two threads.
     work(tasks, 2, |task| {
         let weight = task.weight();
         let name = format!("seed-{}-{}-{}", task.seed, task.hours, task.effects.len());
-        let folder = workshop.path(&name);
+        let folder = scratch_folder.path(&name);
         let mut arguments: Vec<String> =
             ["--hours", &task.hours.to_string(), "--seed", &task.seed.to_string()].map(str::to_owned).to_vec();
         arguments.extend(task.effects.iter().flat_map(|e| ["--effect".to_owned(), (*e).to_owned()]));
@@ -437,7 +437,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_belief_changes_the_noise_and_nothing_else() {
+    fn a_belief_changes_only_the_noise() {
         let mut mission = parse(&taiji()).unwrap();
         let before = mission.clone();
         scale_asd(&mut mission, "thruster_force", 10.0_f64.sqrt()).unwrap();
@@ -449,9 +449,9 @@ mod tests {
         assert!(THRUST.iter().chain(READOUTS).all(|n| scale_asd(&mut mission, n, 1.0).is_some()));
     }
 
-    /// Twins bear different names, and the first is the control.
+    /// Twins have distinct names, and the first is the control.
     #[test]
-    fn twins_are_told_apart() {
+    fn twins_have_distinct_names() {
         let names = configurations();
         let distinct: std::collections::BTreeSet<&String> = names.iter().collect();
         assert_eq!(distinct.len(), names.len());
@@ -460,7 +460,7 @@ mod tests {
     }
 
     #[test]
-    fn work_does_everything_once_and_stops_at_a_failure() {
+    fn work_runs_each_task_once_and_stops_at_a_failure() {
         let done = Mutex::new(Vec::new());
         work((0..50).collect(), 2, |i| {
             done.lock().unwrap().push(i);

@@ -1,5 +1,5 @@
-//! The measurements behind VALIDATION.md: seeded campaigns of the real program, statistics with bounds, information
-//! bounds from the mission's noise alone, and the report that is made of committed results.
+//! Measurements behind VALIDATION.md: seeded campaigns of the program, statistics with bounds, information bounds from
+//! the mission's noise, and the report generated from committed results.
 
 pub mod blind;
 pub mod blind_report;

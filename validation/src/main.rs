@@ -1,4 +1,4 @@
-//! `dragfree-validation`: measures, and writes the generated parts of VALIDATION.md.
+//! `dragfree-validation`: runs the measurements, and writes the generated parts of VALIDATION.md.
 
 use clap::{Args, Parser, Subcommand};
 use dragfree_validation::campaign::{self, CampaignError, note};

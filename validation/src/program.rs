@@ -1,4 +1,4 @@
-//! The program under test, run as a user runs it: `dragfree simulate`, then `dragfree run`.
+//! The program under test, called as a user calls it: `dragfree simulate`, then `dragfree run`.
 
 use serde_json::Value;
 use sha2::{Digest as _, Sha256};
@@ -11,10 +11,10 @@ use dragfree_engine::telemetry::first_message;
 
 use crate::records::{COEFFICIENTS, Line, Solution, rounded};
 
-/// A run that gave no result.
+/// Error of a run.
 #[derive(Debug, thiserror::Error)]
 pub enum ProgramError {
-    /// It did not start.
+    /// The program did not start.
     #[error("{command}: {source}")]
     Start {
         /// What was called.
@@ -22,25 +22,25 @@ pub enum ProgramError {
         /// Why.
         source: std::io::Error,
     },
-    /// It ended with an error.
+    /// The program failed.
     #[error("{command}: {status}\n{message}")]
     Failed {
         /// What was called.
         command: String,
         /// Exit status.
         status: std::process::ExitStatus,
-        /// What it said.
+        /// Its message.
         message: String,
     },
-    /// It said something else than expected.
+    /// The output has another form than expected.
     #[error("{command}: {what} is missing in what it printed")]
     Answer {
         /// What was called.
         command: String,
-        /// Name of the part.
+        /// Missing part.
         what: String,
     },
-    /// A file of its own making cannot be read or removed.
+    /// A file of the run cannot be read or removed.
     #[error("{path}: {reason}", path = path.display())]
     File {
         /// The file.
@@ -63,7 +63,7 @@ pub struct Program {
     threads: usize,
 }
 
-/// Telemetry of one simulation. The truth was read and removed before anything could calibrate it.
+/// Telemetry of a simulation, from which the truth was read and removed before any calibration.
 #[derive(Clone, Debug)]
 pub struct Simulated {
     /// The files, oldest first.
@@ -72,7 +72,7 @@ pub struct Simulated {
     pub truth_m: [f64; 6],
 }
 
-/// Telemetry of one simulation with something hidden in it, and its sealed truth, which lies elsewhere.
+/// Telemetry of a simulation with hidden effects, and its sealed truth in another folder.
 #[derive(Clone, Debug)]
 pub struct Hidden {
     /// The files, oldest first.
@@ -83,7 +83,7 @@ pub struct Hidden {
     pub truth_m: [f64; 6],
 }
 
-/// What `run` is given besides the telemetry.
+/// Inputs of `run` besides the telemetry.
 #[derive(Clone, Debug, Default)]
 pub struct Chain {
     /// Pipeline file.
@@ -95,10 +95,10 @@ pub struct Chain {
 }
 
 impl Program {
-    /// Builds program and plugins, so that nothing stale is measured, and finds them beside this program.
+    /// Builds program and plugins, so that the measured program is current.
     ///
     /// # Errors
-    /// [`ProgramError`] when the workspace does not build.
+    /// [`ProgramError`]: the workspace does not build.
     pub fn build() -> Result<Self, ProgramError> {
         let folder = std::env::current_exe()
             .map_err(|source| ProgramError::Start { command: "this program".to_owned(), source })?
@@ -115,7 +115,7 @@ impl Program {
         Ok(Self { exe: folder.join(format!("dragfree{}", std::env::consts::EXE_SUFFIX)), threads: 1 })
     }
 
-    /// The same program with so many threads for one run; one unless asked for more.
+    /// The same program with a number of threads for each run; the default is one.
     #[must_use]
     pub fn with_threads(&self, threads: usize) -> Self {
         Self { exe: self.exe.clone(), threads }
@@ -128,7 +128,7 @@ impl Program {
         command
     }
 
-    /// Digest of the plugins' libraries: results of two digests are not of one program.
+    /// Digest of the plugins' libraries, which identifies a build.
     ///
     /// # Errors
     /// [`ProgramError`].
@@ -142,7 +142,7 @@ impl Program {
         Ok(digest.iter().take(6).map(|byte| format!("{byte:02x}")).collect())
     }
 
-    /// Freezes the controllers that a mission designs into a file with the section `control`.
+    /// Writes the controllers designed for a mission to a file with the section `control`.
     ///
     /// # Errors
     /// [`ProgramError`].
@@ -150,7 +150,7 @@ impl Program {
         output(self.command().arg("design").arg(mission).arg("--freeze").arg(to), &[0]).map(|_| ())
     }
 
-    /// Simulates into a new folder and takes the truth away.
+    /// Simulates into a new folder, reads the truth and removes it.
     ///
     /// # Errors
     /// [`ProgramError`].
@@ -175,7 +175,7 @@ impl Program {
         Ok(Simulated { files: paths("files"), truth_m })
     }
 
-    /// Simulates with what a seed hides, into `folder`, and moves the truth away from the telemetry; `noise` is the seed of all else.
+    /// Simulates with hidden effects into `folder` and moves the truth away; `noise` is the seed of everything else.
     ///
     /// # Errors
     /// [`ProgramError`].
@@ -207,7 +207,7 @@ impl Program {
         Ok(Hidden { files: all("files").collect(), sealed: away.join(name), truth_m })
     }
 
-    /// `dragfree model` with these words.
+    /// Runs `dragfree model` with arguments.
     ///
     /// # Errors
     /// [`ProgramError`].
@@ -215,7 +215,7 @@ impl Program {
         output(self.command().arg("model").args(words), &[0]).map(|_| ())
     }
 
-    /// Which effect is missing from the model of a product.
+    /// Runs `dragfree diagnose` on a product.
     ///
     /// # Errors
     /// [`ProgramError`].
@@ -226,7 +226,7 @@ impl Program {
         json(&mut command, &[0])
     }
 
-    /// Opens the seal and gives the score of a diagnosis.
+    /// Runs `dragfree reveal`, which scores a diagnosis against the sealed truth.
     ///
     /// # Errors
     /// [`ProgramError`].
@@ -237,7 +237,8 @@ impl Program {
         Ok(json(command.arg("--json"), &[0])?["score"].take())
     }
 
-    /// Runs a chain over telemetry and gives the product as JSON. Loss of data and an inconsistent model are results.
+    /// Runs a chain over telemetry and returns the product as JSON. Exit codes for lost data and an inconsistent model
+    /// are accepted.
     ///
     /// # Errors
     /// [`ProgramError`].
@@ -328,7 +329,7 @@ pub fn line(configuration: &str, seed: u32, build: &str, truth_m: &[f64; 6], pro
     })
 }
 
-/// By how much `qp-check` says that it widened each σ.
+/// Inflation of each σ by `qp-check`.
 fn qp_widened(product: &Value) -> Result<[f64; 6], String> {
     let widened = &product["quality"]["stages"]["qp-check"]["widened"];
     let mut all = [1.0; 6];
@@ -375,7 +376,7 @@ mod tests {
         let mut coefficients = Vec::new();
         let mut covariance = serde_json::Map::new();
         let mut names = serde_json::Map::new();
-        // Names in another order than ours.
+        // The product has the names in another order.
         let order: Vec<&str> = COEFFICIENTS.iter().rev().copied().collect();
         for (label, scale) in [("es-akf", 2.0), ("qp", 1.0), ("adopted", 1.0)] {
             for (i, name) in order.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Results on disk: one JSON line for each configuration and seed, appended as soon as it is known.
+//! Results on disk: one JSON line per configuration and seed, appended as soon as it is known.
 
 use nalgebra::DMatrix;
 use serde::de::DeserializeOwned;
@@ -17,10 +17,10 @@ pub const COEFFICIENTS: [&str; 6] = [
     "com-offset.tm2.z",
 ];
 
-/// A file of results that cannot be used.
+/// Error of a file of results.
 #[derive(Debug, thiserror::Error)]
 pub enum RecordError {
-    /// It cannot be read or written.
+    /// The file cannot be read or written.
     #[error("{path}: {source}", path = path.display())]
     Io {
         /// The file.
@@ -28,12 +28,12 @@ pub enum RecordError {
         /// Why.
         source: std::io::Error,
     },
-    /// A line that is complete is no result.
+    /// A complete line is not a result.
     #[error("{path}, line {line}: {source}; results are written by `dragfree-validation` alone", path = path.display())]
     Line {
         /// The file.
         path: PathBuf,
-        /// Counted from 1.
+        /// Line number, from 1.
         line: usize,
         /// Why.
         source: serde_json::Error,
@@ -84,11 +84,11 @@ impl Solution {
     }
 }
 
-/// What one run of the program gave.
+/// Result of one run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Line {
-    /// What was run.
+    /// Configuration.
     pub configuration: String,
     /// Seed of the simulation.
     pub seed: u32,
@@ -108,9 +108,9 @@ pub struct Line {
     pub nis_dof: f64,
     /// χ²/dof of the batch solution against the noise of the mission file.
     pub chi2_per_dof: f64,
-    /// By how much the ES-AKF widened its σ for what it saw, per test mass.
+    /// Factor by which the ES-AKF inflated its σ, per test mass.
     pub sigma_stretch: [f64; 2],
-    /// By how much the batch solution widened its σ for what it saw, per coefficient.
+    /// Factor by which the batch solution inflated its σ, per coefficient.
     pub qp_widened: [f64; 6],
     /// σ of the recursion's end, as the paper reports it, m.
     pub p_end_sigma_m: [f64; 6],
@@ -118,29 +118,29 @@ pub struct Line {
     pub es_akf: Solution,
     /// Batch solution.
     pub qp: Solution,
-    /// What the product adopts; none where it is the batch solution as it stands.
+    /// Adopted solution; `None` if it is the batch solution unchanged.
     pub adopted: Option<Solution>,
 }
 
 impl Line {
-    /// Recursive and batch solution with their σ as they were before anything widened them.
+    /// Recursive and batch solution with σ before inflation.
     #[must_use]
     pub fn bare(&self) -> (Solution, Solution) {
         (self.es_akf.divided(|i| self.sigma_stretch[i / 3]), self.qp.divided(|i| self.qp_widened[i]))
     }
 
-    /// What the product adopts.
+    /// Adopted solution.
     #[must_use]
     pub fn adopted(&self) -> &Solution {
         self.adopted.as_ref().unwrap_or(&self.qp)
     }
 }
 
-/// A result that is there once for each key and build.
+/// A result with a key, unique per build.
 pub trait Keyed {
     /// Configuration and seed.
     fn key(&self) -> (String, u32);
-    /// Digest of what made it.
+    /// Digest of the build.
     fn build(&self) -> &str;
 }
 
@@ -154,20 +154,19 @@ impl Keyed for Line {
     }
 }
 
-/// A file of results that grows.
+/// A growing file of results.
 #[derive(Debug)]
 pub struct Results<T> {
     path: PathBuf,
     file: File,
-    /// What is there.
+    /// Results.
     pub lines: Vec<T>,
 }
 
-/// The results of a file, none where there is no file. A last line without its end was cut off by a kill and does not
-/// count.
+/// Results of a file; empty if it does not exist. A last line without its end was interrupted and is ignored.
 ///
 /// # Errors
-/// [`RecordError`] when a complete line is no result.
+/// [`RecordError`]: a complete line is not a result.
 pub fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, RecordError> {
     let text = match std::fs::read_to_string(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
@@ -181,11 +180,11 @@ pub fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, RecordError> {
 }
 
 impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
-    /// Opens a file to go on with, or a new one. Results of another build are dropped from it: a table of two builds says
-    /// nothing of either. Gives how many.
+    /// Opens a file to continue, or a new one. Removes results of another build, as a table must not mix builds;
+    /// returns their number.
     ///
     /// # Errors
-    /// [`RecordError`] when the file holds something else or cannot be written.
+    /// [`RecordError`]: the file has another form or cannot be written.
     pub fn open(path: &Path, build: &str) -> Result<(Self, usize), RecordError> {
         let io = |source| RecordError::Io { path: path.to_owned(), source };
         let mut lines: Vec<T> = read(path)?;
@@ -196,7 +195,7 @@ impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
         for line in &lines {
             write_line(&mut text, line, path)?;
         }
-        // Whatever was cut off is gone with the old file; a kill leaves one or the other whole.
+        // Writing a new file drops an interrupted line; a kill leaves either file whole.
         let fresh = path.with_extension("tmp");
         std::fs::create_dir_all(path.parent().unwrap_or(Path::new("."))).map_err(io)?;
         std::fs::write(&fresh, text).map_err(io)?;
@@ -205,7 +204,7 @@ impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
         Ok((Self { path: path.to_owned(), file, lines }, dropped))
     }
 
-    /// Whether a result is there.
+    /// Whether a result exists.
     #[must_use]
     pub fn has(&self, configuration: &str, seed: u32) -> bool {
         self.lines.iter().any(|line| line.key() == (configuration.to_owned(), seed))
@@ -223,7 +222,7 @@ impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
         Ok(())
     }
 
-    /// Writes the file again in the order of configurations and seeds, so that it does not depend on who finished first.
+    /// Rewrites the file in the order of configurations and seeds, independent of the order of completion.
     ///
     /// # Errors
     /// [`RecordError::Io`].
@@ -251,7 +250,7 @@ fn write_line<T: Serialize>(text: &mut Vec<u8>, line: &T, path: &Path) -> Result
     Ok(())
 }
 
-/// Seven significant digits: more than any statistic needs, and files that a person can read.
+/// Rounds to seven significant digits, more than any statistic needs.
 #[must_use]
 pub fn rounded(value: f64) -> f64 {
     format!("{value:.6e}").parse().unwrap_or(value)
@@ -301,7 +300,7 @@ pub(crate) mod tests {
         assert_eq!(c, c.transpose());
     }
 
-    /// A kill at any byte of the last write: what was complete stays, once, and the rest is done again.
+    /// An interruption at any byte of the last write keeps all complete lines once; the rest is repeated.
     #[test]
     fn a_kill_in_the_middle_loses_and_doubles_nothing() {
         let dir = tempfile::tempdir().unwrap();

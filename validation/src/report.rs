@@ -1,4 +1,4 @@
-//! The generated parts of VALIDATION.md and its pictures, made of committed results alone.
+//! Generated parts of VALIDATION.md and its pictures, from committed results alone.
 
 use dragfree_chart::{ChartError, Line as Curve, Panel, Scale, Stroke, svg};
 use dragfree_physics::frames::dcm_turned_about_z;
@@ -18,27 +18,27 @@ use crate::speed::Speed;
 use crate::stats::{self, Bounds};
 use crate::table::{REGIMES, Row, configuration};
 
-/// Probability that any check of a campaign fails although every σ is right.
+/// False-alarm rate of all checks of a campaign together.
 pub const FALSE_ALARM: f64 = 0.01;
 /// σ of the paper's table, mm.
 const PAPER_SIGMA_MM: [f64; 6] = [1.335, 0.17, 0.09, 3.76, 0.14, 0.08];
 /// Errors of the paper's table, mm.
 const PAPER_ERROR_MM: [f64; 6] = [0.06, 1.4, 0.51, 0.68, 0.1, 0.35];
-/// Days of the table to beat.
+/// Length of the long runs, days.
 pub const TABLE_DAYS: u32 = 25;
 /// Short names of the coefficients.
 const SHORT: [&str; 6] = ["tm1.x", "tm1.y", "tm1.z", "tm2.x", "tm2.y", "tm2.z"];
 
-/// Everything that was measured.
+/// All results.
 #[derive(Clone, Debug, Default)]
 pub struct Measured {
-    /// The campaign.
+    /// Coverage campaign.
     pub coverage: Vec<Line>,
-    /// The table to beat.
+    /// The paper's table.
     pub table: Vec<Row>,
     /// Ratios of speed.
     pub speed: Option<Speed>,
-    /// Hidden effects.
+    /// Blind campaign.
     pub blind: Vec<Blind>,
 }
 
@@ -46,7 +46,7 @@ impl Measured {
     /// Reads a folder of results.
     ///
     /// # Errors
-    /// [`CampaignError`] when a file is no result.
+    /// [`CampaignError`]: a file has another form.
     pub fn read(folder: &Path) -> Result<Self, CampaignError> {
         Ok(Self {
             coverage: read(&folder.join("coverage.jsonl"))?,
@@ -57,7 +57,7 @@ impl Measured {
     }
 }
 
-/// One statistic within its bounds, or not.
+/// A statistic and its bounds.
 struct Check {
     what: String,
     value: f64,
@@ -69,13 +69,13 @@ impl Check {
         self.bounds.hold(self.value)
     }
 
-    /// The value; bold where it is outside.
+    /// The value, bold if it is out of bounds.
     fn cell(&self, text: &str) -> String {
         if self.holds() { text.to_owned() } else { format!("**{text}**") }
     }
 }
 
-/// The solutions that are judged.
+/// Solutions to check.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
     EsAkf,
@@ -103,12 +103,12 @@ impl Kind {
     }
 }
 
-/// The columns of a six by six identity that belong to one test mass.
+/// Columns of the 6 × 6 identity that belong to one test mass.
 fn test_mass(i: usize) -> DMatrix<f64> {
     DMatrix::from_fn(6, 3, |row, column| f64::from(u8::from(row == 3 * i + column)))
 }
 
-/// Mean NEES per degree of freedom of three.
+/// Mean NEES divided by its three degrees of freedom.
 fn nees(solutions: &[&Solution], basis: &DMatrix<f64>) -> f64 {
     let each = solutions.iter().map(|s| {
         let error = DVector::from_row_slice(&s.error_m);
@@ -148,7 +148,7 @@ fn seeds(lines: &[&Line]) -> String {
     }
 }
 
-/// What was run, when and with what.
+/// What was run, when and with which build.
 fn provenance(lines: &[&Line]) -> String {
     let join = |of: &dyn Fn(&Line) -> String| {
         lines.iter().map(|l| of(l)).collect::<BTreeSet<_>>().into_iter().collect::<Vec<_>>().join(", ")
@@ -156,14 +156,15 @@ fn provenance(lines: &[&Line]) -> String {
     format!("{}, build {}, {}", join(&|l| l.software.clone()), join(&|l| l.build.clone()), join(&|l| l.date.clone()))
 }
 
-/// The part about the campaign, and what of it is outside its bounds.
+/// Section on the campaign, and the statistics out of bounds.
 fn coverage(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
     let lines: Vec<&Line> = all.iter().filter(|l| l.configuration == NOMINAL).collect();
     let n = lines.len();
     if n == 0 {
         return ("Not measured yet.\n".to_owned(), Vec::new());
     }
-    // Per solution and coefficient two coverages, a mean and an rms; per solution and set of directions a NEES; verdicts.
+    // Number of checks: per solution and coefficient two coverages, a mean and an rms; per solution and set of
+    // directions a NEES; verdicts.
     let checks = 4 * 6 * Kind::ALL.len() + 4 + 1;
     let alarm = FALSE_ALARM / checks as f64;
     let counts = [1.0, 2.0].map(|z| stats::accepted_counts(stats::within(z), n, alarm).unwrap_or((0, n)));
@@ -202,7 +203,7 @@ fn coverage(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
             } else {
                 String::new()
             };
-            // What is adopted is the QP's own but for a few days: judged, and not printed twice.
+            // The adopted solution is the QP's on nearly all days: checked, but not printed again.
             if kind != Kind::Adopted || adopted_apart > 0 {
                 let _ = writeln!(
                     rows,
@@ -228,7 +229,7 @@ fn coverage(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
     }
     let verdicts = |name: &str| lines.iter().filter(|l| l.verdict == name).count();
     let disagree = verdicts("disagree");
-    // At most: the difference of two solutions of the same data is smaller than the sum of their variances says.
+    // Upper bound: the difference of two solutions of the same data varies less than the sum of their variances.
     let promised = 6.0 * (1.0 - stats::within(3.0));
     let most = (0..=n).rev().find(|k| stats::clopper_pearson(*k, n, 2.0 * alarm).low <= promised).unwrap_or(n);
     let check = Check {
@@ -294,7 +295,7 @@ fn coverage(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
     (text, failed)
 }
 
-/// Statistics of a twin that must fail where it is unprotected.
+/// Statistics of a twin that must fail if it is unprotected.
 struct Twinned {
     cells: Vec<String>,
     failed: Vec<&'static str>,
@@ -309,7 +310,7 @@ fn twin(lines: &[&Line], unprotected: bool, free: &DMatrix<f64>, alarm: f64) -> 
     let qp: Vec<&Solution> = solutions.iter().map(|s| &s.1).collect();
     let dof: f64 = lines.iter().map(|l| l.nis_dof).sum();
     let nis = lines.iter().map(|l| l.nis * l.nis_dof).sum::<f64>() / dof;
-    // Both test masses feel the same thrust: their degrees of freedom count once.
+    // Both test masses share the thrust: count their degrees of freedom once.
     let bounds = stats::chi2_per_dof(3.0 * n as f64, alarm);
     let recursive = 0.5 * (nees(&es_akf, &test_mass(0)) + nees(&es_akf, &test_mass(1)));
     let batch = nees(&qp, free);
@@ -326,7 +327,7 @@ fn twin(lines: &[&Line], unprotected: bool, free: &DMatrix<f64>, alarm: f64) -> 
         let inside: usize = all.iter().map(|s| s.pulls().iter().filter(|p| p.abs() <= 1.0).count()).sum();
         format!("{:.0} %", 100.0 * inside as f64 / (6 * all.len()) as f64)
     };
-    // The product's NIS follows its adaptation; as χ² it is only distributed without.
+    // With adaptation NIS is not χ² distributed.
     let nis_bounds = stats::chi2_per_dof(dof, alarm);
     let verdicts = |name: &str| lines.iter().filter(|l| l.verdict == name).count();
     let worst = |all: &[&Solution]| mm(range(all.iter().flat_map(|s| s.error_m).map(f64::abs)).1);
@@ -342,7 +343,7 @@ fn twin(lines: &[&Line], unprotected: bool, free: &DMatrix<f64>, alarm: f64) -> 
     Twinned { cells, failed, agree: verdicts("agree") }
 }
 
-/// The part about the twins, and what of it is not as it should be.
+/// Section on the twins, and those that do not behave as required.
 fn twins(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
     let of = |name: &str| all.iter().filter(|l| l.configuration == name).collect::<Vec<&Line>>();
     let runs = TWINS.iter().map(|t| 1 + usize::from(t.with_product)).sum::<usize>();
@@ -417,7 +418,7 @@ fn twins(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
     (text, problems)
 }
 
-/// The table to beat, and what misses its bar.
+/// Section on the paper's table, and the missed bars.
 fn table(all: &[Row]) -> (String, Vec<String>) {
     if all.is_empty() {
         return ("Not measured yet.\n".to_owned(), Vec::new());
@@ -492,14 +493,14 @@ fn table(all: &[Row]) -> (String, Vec<String>) {
     (text, missed)
 }
 
-/// The picture: how often the truth lies in an interval, over how often it should.
+/// Picture of observed over nominal coverage.
 fn picture(all: &[Line], free: &DMatrix<f64>) -> Result<Option<String>, ChartError> {
     let lines: Vec<&Line> = all.iter().filter(|l| l.configuration == NOMINAL).collect();
     if lines.is_empty() {
         return Ok(None);
     }
     let recursive: Vec<f64> = lines.iter().flat_map(|l| l.es_akf.pulls()).collect();
-    // The QP along the three directions that are its own.
+    // The QP along its three free directions.
     let batch: Vec<f64> = lines
         .iter()
         .flat_map(|l| {
@@ -517,7 +518,7 @@ fn picture(all: &[Line], free: &DMatrix<f64>) -> Result<Option<String>, ChartErr
             })
             .collect()
     };
-    // Kolmogorov's bound for as many independent pulls as the QP has (Dvoretzky, Kiefer, Wolfowitz; Massart).
+    // Dvoretzky–Kiefer–Wolfowitz–Massart bound for the QP's number of independent pulls.
     let width = ((2.0 / FALSE_ALARM).ln() / (2.0 * batch.len() as f64)).sqrt();
     let bound = |shift: f64| claimed().map(|p| (p, (p + shift).clamp(0.0, 1.0))).collect::<Vec<_>>();
     let curve = |label: &str, colour: usize, stroke: Stroke, points: Vec<(f64, f64)>| Curve {
@@ -544,20 +545,20 @@ fn picture(all: &[Line], free: &DMatrix<f64>) -> Result<Option<String>, ChartErr
     svg(&[panel], 1).map(Some)
 }
 
-/// What the results say.
+/// A report.
 pub struct Report {
-    /// Generated parts by the name of their markers.
+    /// Generated parts by marker name.
     pub parts: BTreeMap<&'static str, String>,
-    /// Pictures, each with its place; those without a campaign are left out.
+    /// Pictures with their places; omitted without a campaign.
     pub pictures: Vec<(PathBuf, String)>,
-    /// Everything that is outside of its bounds or misses its bar.
+    /// Statistics out of bounds and missed bars.
     pub failed: Vec<String>,
 }
 
-/// Makes the report.
+/// Creates the report.
 ///
 /// # Errors
-/// [`CampaignError`] when the default mission cannot be read, or the picture not drawn.
+/// [`CampaignError`]: the default mission cannot be read, or a picture cannot be drawn.
 pub fn report(measured: &Measured) -> Result<Report, CampaignError> {
     let mission = serde_json::to_string(&parse(&taiji())?).map_err(|e| file(&taiji(), &e))?;
     let mission = Mission::from_json(&mission).map_err(|e| file(&taiji(), &e))?;
@@ -600,7 +601,7 @@ pub fn picture_path(name: &str) -> PathBuf {
     root().join("ops-guide/src/pictures").join(name).with_extension("svg")
 }
 
-/// A document with its generated parts replaced; none when a part has no markers.
+/// A document with its generated parts replaced; `None` if a part has no markers.
 #[must_use]
 pub fn rewritten(document: &str, parts: &BTreeMap<&'static str, String>) -> Option<String> {
     let mut text = document.to_owned();
@@ -641,7 +642,7 @@ mod tests {
     use rand_distr::{Distribution, StandardNormal};
     use rand_xoshiro::Xoshiro256PlusPlus;
 
-    /// VALIDATION.md and the pictures are what the committed results say.
+    /// VALIDATION.md and the pictures match the committed results.
     #[test]
     fn validation_is_what_the_results_say() {
         let found = report(&Measured::read(&root().join("validation/results")).unwrap()).unwrap();
@@ -657,7 +658,7 @@ mod tests {
         free_space(&[30.0_f64, -30.0].map(|a| dcm_turned_about_z(a.to_radians())))
     }
 
-    /// Solutions whose errors are normal with `scale` times the σ that they claim; the QP's in its free space.
+    /// Solutions whose errors are normal with `scale` times the claimed σ; the QP's in its free space.
     fn campaign(n: u32, scale: f64, shift_m: f64) -> Vec<Line> {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(1);
         let free = free();
@@ -676,8 +677,7 @@ mod tests {
             .collect()
     }
 
-    /// A hundred honest days pass all checks; errors of 1.3σ, a bias of 0.6σ or a dozen disagreements do
-    /// not.
+    /// 100 days with right σ pass all checks; errors of 1.3σ, a bias of 0.6σ or a dozen disagreements fail.
     #[test]
     fn the_campaign_has_power() {
         assert_eq!(coverage(&campaign(100, 1.0, 0.0), &free()).1, Vec::<String>::new());
@@ -691,7 +691,7 @@ mod tests {
         assert_eq!(quarrel.len(), 1, "{quarrel:?}");
     }
 
-    /// A twin that nothing sees is told, as is a control that fails.
+    /// A twin that no statistic detects, and a control that fails, are reported.
     #[test]
     fn a_twin_without_power_is_told() {
         let mut lines = campaign(40, 1.0, 0.0);

@@ -1,4 +1,4 @@
-//! Ratios of speed. Times belong to a machine, ratios hold elsewhere, so only they are kept.
+//! Ratios of speed. Times depend on the machine, so only ratios are kept.
 
 use serde::{Deserialize, Serialize};
 use std::fmt::Write as _;
@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
-use crate::campaign::{CampaignError, Workshop, file, science_mode, taiji};
+use crate::campaign::{CampaignError, ScratchFolder, file, science_mode, taiji};
 use crate::program::{Chain, Program, root};
 use crate::stats::median;
 
@@ -15,7 +15,7 @@ use crate::stats::median;
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Speed {
-    /// Day of the measurement.
+    /// Date of the measurement.
     pub date: String,
     /// The ratios.
     pub ratios: Vec<Ratio>,
@@ -25,27 +25,27 @@ pub struct Speed {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ratio {
-    /// What is compared with what.
+    /// What is compared.
     pub what: String,
-    /// How many times faster.
+    /// Speed ratio.
     pub times: f64,
-    /// The bar.
+    /// Required ratio.
     pub bar: f64,
-    /// How to measure it again.
+    /// Command that measures it.
     pub command: String,
 }
 
-/// How often a whole program is timed; the median counts.
+/// Number of timings of a whole program, of which the median counts.
 const REPEATS: usize = 3;
 const DAY_S: f64 = 86_400.0;
-/// What the benchmark of candidates adds up.
+/// Benchmarks that add up to the cost of candidates.
 const SIX_HOURS_S: f64 = 21_600.0;
 
 impl Speed {
-    /// Reads a file; none where there is none.
+    /// Reads a file; `None` if it does not exist.
     ///
     /// # Errors
-    /// [`CampaignError::File`] when it holds something else.
+    /// [`CampaignError::File`]: the file has another form.
     pub fn read(path: &Path) -> Result<Option<Self>, CampaignError> {
         match std::fs::read_to_string(path) {
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
@@ -92,7 +92,7 @@ fn bench(package: &str, name: &str) -> Result<(), CampaignError> {
     }
 }
 
-/// Measures everything, on a machine that does nothing else, and writes the file.
+/// Measures all ratios, on an otherwise idle machine, and writes the file.
 ///
 /// # Errors
 /// [`CampaignError`].
@@ -106,13 +106,13 @@ pub fn measure(program: &Program, path: &Path, scratch: &Path) -> Result<(), Cam
     const CANDIDATES: &str = "100 candidates";
     let seconds = |name: &str| Ok::<_, CampaignError>(1e-9 * criterion(&[CANDIDATES, name])?);
 
-    let workshop = Workshop::new(scratch)?;
+    let scratch_folder = ScratchFolder::new(scratch)?;
     let program = program.with_threads(2);
     let chain = Chain { pipeline: science_mode(), ..Chain::default() };
     let (mut simulating, mut running) = (Vec::new(), Vec::new());
     let mut date = String::new();
     for repeat in 0..REPEATS {
-        let folder = workshop.path(&format!("speed-{repeat}"));
+        let folder = scratch_folder.path(&format!("speed-{repeat}"));
         let start = Instant::now();
         let simulated = program.simulate(&taiji(), &folder, &["--days", "1"])?;
         simulating.push(start.elapsed().as_secs_f64());

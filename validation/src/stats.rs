@@ -1,10 +1,10 @@
-//! Bounds of statistics when every σ is right: binomial, χ², normal.
+//! Bounds of statistics under the hypothesis that every σ is right: binomial, χ², normal.
 //!
-//! A bound at a false-alarm rate `a` is left with probability `a` in all, half of it on either side.
+//! Bounds with a false-alarm rate `a` are two-sided, `a/2` on either side.
 
 use nalgebra::{DMatrix, DVector};
 
-/// An interval, ends included.
+/// A closed interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Bounds {
     /// Lower end.
@@ -99,7 +99,7 @@ fn beta_i(x: f64, a: f64, b: f64) -> f64 {
     front * h
 }
 
-/// Where a growing function of [low, high] takes a value, by bisection to the last bit.
+/// Inverse of an increasing function on [low, high], by bisection to the last bit.
 fn inverse(f: impl Fn(f64) -> f64, value: f64, mut low: f64, mut high: f64) -> f64 {
     for _ in 0..200 {
         let middle = 0.5 * (low + high);
@@ -118,7 +118,7 @@ pub fn chi2_cdf(x: f64, dof: f64) -> f64 {
     gamma_p(0.5 * dof, 0.5 * x)
 }
 
-/// The value below which χ² with `dof` degrees of freedom stays with probability `p`.
+/// Quantile `p` of χ² with `dof` degrees of freedom.
 #[must_use]
 pub fn chi2_quantile(p: f64, dof: f64) -> f64 {
     inverse(|x| chi2_cdf(x, dof), p, 0.0, 20.0 * dof + 200.0)
@@ -130,13 +130,13 @@ pub fn within(z: f64) -> f64 {
     chi2_cdf(z * z, 1.0)
 }
 
-/// `z` of which `within(z) = p`.
+/// Inverse of [`within`].
 #[must_use]
 pub fn half_width(p: f64) -> f64 {
     chi2_quantile(p, 1.0).sqrt()
 }
 
-/// Bounds of χ²/dof. Beyond ten thousand degrees of freedom by Wilson and Hilferty, exact there to 1e-7.
+/// Bounds of χ²/dof; above 10⁴ degrees of freedom by Wilson and Hilferty's approximation.
 #[must_use]
 pub fn chi2_per_dof(dof: f64, false_alarm: f64) -> Bounds {
     if dof > 1e4 {
@@ -162,7 +162,7 @@ pub fn mean(n: usize, false_alarm: f64) -> Bounds {
     Bounds { low: -z, high: z }
 }
 
-/// Clopper and Pearson's interval for the probability behind `k` of `n`, with confidence `1 − false_alarm`.
+/// Clopper–Pearson interval for the probability behind `k` of `n`, with confidence `1 − false_alarm`.
 #[must_use]
 pub fn clopper_pearson(k: usize, n: usize, false_alarm: f64) -> Bounds {
     let (k, n, tail) = (k as f64, n as f64, 0.5 * false_alarm);
@@ -171,7 +171,7 @@ pub fn clopper_pearson(k: usize, n: usize, false_alarm: f64) -> Bounds {
     Bounds { low, high }
 }
 
-/// The counts of `n` whose Clopper–Pearson interval holds the probability `p`: both ends included.
+/// Smallest and largest count of `n` whose Clopper–Pearson interval contains the probability `p`.
 #[must_use]
 pub fn accepted_counts(p: f64, n: usize, false_alarm: f64) -> Option<(usize, usize)> {
     let mut held = (0..=n).filter(|k| clopper_pearson(*k, n, false_alarm).hold(p));
@@ -179,8 +179,8 @@ pub fn accepted_counts(p: f64, n: usize, false_alarm: f64) -> Option<(usize, usi
     Some((first, held.next_back().unwrap_or(first)))
 }
 
-/// `(Bᵀe)ᵀ (BᵀCB)⁻¹ (Bᵀe)`: normalised error squared in the space that the columns of `basis` span; none where the
-/// covariance is not positive definite there.
+/// Normalised estimation error squared in the space spanned by the columns of `basis`, `(Bᵀe)ᵀ (BᵀCB)⁻¹ (Bᵀe)`; `None`
+/// if the covariance is not positive definite there.
 #[must_use]
 pub fn nees(error: &DVector<f64>, covariance: &DMatrix<f64>, basis: &DMatrix<f64>) -> Option<f64> {
     let e = basis.transpose() * error;
@@ -188,7 +188,7 @@ pub fn nees(error: &DVector<f64>, covariance: &DMatrix<f64>, basis: &DMatrix<f64
     Some(e.dot(&c.cholesky()?.solve(&e)))
 }
 
-/// The middle value.
+/// Median.
 #[must_use]
 pub fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
@@ -213,7 +213,7 @@ mod tests {
 
     /// Tables of χ² (Abramowitz and Stegun 26.8); two degrees of freedom in closed form, −2 ln(1 − p).
     #[test]
-    fn chi2_is_that_of_the_tables() {
+    fn chi2_matches_tables() {
         for (p, dof, wanted) in
             [(0.95, 1.0, 3.841_46), (0.975, 10.0, 20.483_2), (0.025, 10.0, 3.246_97), (0.99, 100.0, 135.807)]
         {
@@ -228,7 +228,7 @@ mod tests {
         near(half_width(0.95), 1.959_963_985, 1e-8);
     }
 
-    /// Both forms of the bounds agree where they meet; far out the spread is √(2/dof).
+    /// Both formulas agree where they meet; for large dof the width is √(2/dof).
     #[test]
     fn chi2_of_many_degrees_of_freedom_is_normal() {
         let (exact, approximate) = (chi2_per_dof(9_999.0, 1e-4), chi2_per_dof(10_001.0, 1e-4));
@@ -237,9 +237,9 @@ mod tests {
         near(chi2_per_dof(2e8, 0.05).high, 1.0 + 1.959_964e-4, 2e-8);
     }
 
-    /// Clopper and Pearson's own cases: nothing and everything in closed form, 5 of 10 and 15 of 20 from tables.
+    /// Reference: closed form for 0 and n of n, tables for 5 of 10 and 15 of 20.
     #[test]
-    fn clopper_and_pearson_are_those_of_the_tables() {
+    fn clopper_pearson_matches_tables() {
         let none = clopper_pearson(0, 10, 0.05);
         near(none.high, 1.0 - 0.025_f64.powf(0.1), 1e-12);
         assert_eq!(none.low, 0.0);
@@ -252,9 +252,9 @@ mod tests {
         near(most.high, 0.913_429, 1e-6);
     }
 
-    /// The counts outside have the probability that was stated, summed term by term.
+    /// The rejected counts have at most the stated probability, summed term by term.
     #[test]
-    fn accepted_counts_leave_out_what_was_stated() {
+    fn accepted_counts_have_the_stated_false_alarm_rate() {
         let (n, p, alarm) = (100_usize, within(1.0), 1e-3);
         let (low, high) = accepted_counts(p, n, alarm).expect("some counts are accepted");
         let mut term = (1.0 - p).powi(100);
@@ -265,7 +265,7 @@ mod tests {
             }
             term *= (n - k) as f64 / (k + 1) as f64 * p / (1.0 - p);
         }
-        // At most what was stated; a discrete law seldom reaches it.
+        // A discrete distribution seldom reaches the stated rate.
         assert!(outside < alarm && outside > 0.2 * alarm, "{low} {high} {outside}");
     }
 
@@ -279,10 +279,9 @@ mod tests {
             .collect()
     }
 
-    /// A hundred honest σ pass at one false alarm in a thousand; σ half or twice as large as they claim do not, in any
-    /// of the statistics.
+    /// 100 normal deviates pass at a false-alarm rate of 1e-3; with σ wrong by a factor of two every statistic fails.
     #[test]
-    fn bounds_pass_honest_sigmas_and_fail_others() {
+    fn bounds_accept_right_sigmas_and_reject_others() {
         let n = 100;
         let verdicts = |scale: f64| {
             let z = deviates(1, n, scale);
@@ -302,10 +301,10 @@ mod tests {
         assert!(mean(n, 1e-3).hold(shifted - 0.5) && !mean(n, 1e-3).hold(shifted));
     }
 
-    /// Three coordinates of which two are tied: in the free plane NEES is χ² with two degrees of freedom and knows nothing
-    /// of the tie; with the correlation left out it is not.
+    /// Three coordinates, two of them tied: NEES in the free plane is χ² with two degrees of freedom; without the
+    /// correlation it is not.
     #[test]
-    fn nees_lives_in_the_free_space() {
+    fn nees_uses_the_free_space() {
         // e = (a, b, b) with a, b correlated by 0.8.
         let covariance = DMatrix::from_row_slice(3, 3, &[1.0, 0.8, 0.8, 0.8, 1.0, 1.0, 0.8, 1.0, 1.0]);
         let half = 0.5_f64.sqrt();
@@ -323,12 +322,12 @@ mod tests {
         };
         assert!(chi2_per_dof(4000.0, 1e-3).hold(sum(&covariance)), "{}", sum(&covariance));
         assert!(nees(&DVector::zeros(3), &covariance, &DMatrix::identity(3, 3)).is_none_or(f64::is_finite));
-        // Half the variance: twice the NEES.
+        // Half the variance doubles NEES.
         assert!(!chi2_per_dof(4000.0, 1e-3).hold(sum(&(covariance * 0.5))));
     }
 
     #[test]
-    fn the_median_is_in_the_middle() {
+    fn median_of_odd_and_even_counts() {
         assert_eq!((median(vec![3.0, 1.0, 2.0]), median(vec![4.0, 1.0, 2.0, 3.0])), (2.0, 2.5));
     }
 }

@@ -1,4 +1,4 @@
-//! The table to beat: 25 days in three regimes of noise, the first day of them alone, and the information bounds.
+//! The paper's table: 25 days in three noise regimes, their first day alone, and the information bounds.
 
 use dragfree_physics::mission::Mission;
 use serde::{Deserialize, Serialize};
@@ -6,16 +6,16 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
 use crate::bound::Case;
-use crate::campaign::{CampaignError, Meter, Workshop, file, note, parse, science_mode, work};
+use crate::campaign::{CampaignError, Meter, ScratchFolder, file, note, parse, science_mode, work};
 use crate::program::{Chain, Program, line, root};
 use crate::records::{Keyed, Line, Results, rounded};
 
-/// A regime of noise.
+/// A noise regime.
 #[derive(Clone, Copy, Debug)]
 pub struct Regime {
     /// Name of its results.
     pub name: &'static str,
-    /// In words, for the report.
+    /// Description in the report.
     pub words: &'static str,
     mission: MissionFile,
 }
@@ -23,7 +23,7 @@ pub struct Regime {
 #[derive(Clone, Copy, Debug)]
 enum MissionFile {
     Fixture(&'static str),
-    /// The default mission with an amplitude times a factor.
+    /// Scaled amplitude of the default mission, if any.
     Scaled(&'static str, f64),
 }
 
@@ -42,7 +42,7 @@ pub const REGIMES: [Regime; 3] = [
     },
 ];
 
-/// A run beside what could be known.
+/// A run with its information bounds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Row {
@@ -50,9 +50,9 @@ pub struct Row {
     pub run: Line,
     /// True offsets, m.
     pub truth_m: [f64; 6],
-    /// Bound of σ from one test mass alone, m.
+    /// Bound of σ by one test mass alone, m.
     pub single_m: [f64; 6],
-    /// Bound of σ from both and the survey, m.
+    /// Bound of σ by both test masses and the survey, m.
     pub surveyed_m: [f64; 6],
 }
 
@@ -84,10 +84,10 @@ struct Task {
     lengths: Vec<u32>,
 }
 
-/// Runs what is not in `results` yet, `at_once` regimes at a time; 25 days of one take 14 GB of `scratch`.
+/// Runs what `results` lacks, `at_once` regimes in parallel; 25 days of one take 14 GB of `scratch`.
 ///
 /// # Errors
-/// [`CampaignError`]; what was done by then is on disk, and the next call goes on.
+/// [`CampaignError`]; results so far are on disk, and the next call continues.
 pub fn table(
     program: &Program,
     seeds: &[u32],
@@ -97,13 +97,13 @@ pub fn table(
     scratch: &Path,
 ) -> Result<(), CampaignError> {
     let build = program.digest()?;
-    // Two threads each, so that the last one alone still has both cores.
+    // Two threads each, so that the last regime uses both cores.
     let program = program.with_threads(2);
     let (results, dropped) = Results::<Row>::open(results, &build)?;
     if dropped > 0 {
         note(&format!("{dropped} rows of another build are dropped and measured again"));
     }
-    let workshop = Workshop::new(scratch)?;
+    let scratch_folder = ScratchFolder::new(scratch)?;
     let mut tasks = Vec::new();
     for (regime, seed) in REGIMES.iter().flat_map(|r| seeds.iter().map(move |s| (r, *s))) {
         let mut lengths = vec![1, days];
@@ -111,7 +111,7 @@ pub fn table(
         lengths.retain(|days| !results.has(&configuration(regime.name, *days), seed));
         let path = match regime.mission {
             MissionFile::Fixture(name) => root().join("fixtures/missions").join(name),
-            MissionFile::Scaled(noise, factor) => workshop.mission(regime.name, &[(noise, factor)], None)?,
+            MissionFile::Scaled(noise, factor) => scratch_folder.mission(regime.name, &[(noise, factor)], None)?,
         };
         if !lengths.is_empty() {
             tasks.push(Task { regime: *regime, path, seed, lengths });
@@ -121,7 +121,7 @@ pub fn table(
     let results = Mutex::new(results);
     work(tasks, at_once, |task| {
         let case = Case::of(&mission(&task.path)?)?;
-        let folder = workshop.path(&format!("{}-{}", task.regime.name, task.seed));
+        let folder = scratch_folder.path(&format!("{}-{}", task.regime.name, task.seed));
         let longest = task.lengths.iter().copied().fold(1, u32::max);
         let arguments = ["--days", &longest.to_string(), "--seed", &task.seed.to_string()].map(str::to_owned);
         let simulated = program.simulate(&task.path, &folder, &arguments)?;

@@ -1,4 +1,4 @@
-//! Maps of colours: a ratio over time and frequency, red above one, blue below.
+//! Heat maps of a ratio over two axes; red above one, blue below.
 
 use plotters::prelude::*;
 
@@ -7,33 +7,33 @@ use crate::{ChartError, refused};
 /// A cell of a map.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cell {
-    /// Ends along x.
+    /// Limits in x.
     pub x: [f64; 2],
-    /// Ends along y, above zero.
+    /// Limits in y, positive.
     pub y: [f64; 2],
-    /// What its colour tells.
+    /// Ratio shown by the colour.
     pub ratio: f64,
-    /// Whether it has a frame.
+    /// Whether it is framed.
     pub framed: bool,
 }
 
-/// One pair of axes, x linear and y logarithmic.
+/// A map; x is linear, y logarithmic.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeatMap {
-    /// Above the axes.
+    /// Title.
     pub title: String,
-    /// Below, with the unit.
+    /// Label of x, with the unit.
     pub x_label: String,
-    /// Left, with the unit.
+    /// Label of y, with the unit.
     pub y_label: String,
-    /// Cells; where there is none, the map is grey.
+    /// Cells; grey elsewhere.
     pub cells: Vec<Cell>,
 }
 
-/// Ratios from the inverse of this to this have colours of their own.
+/// Colour scale: from the inverse of this ratio to this ratio.
 const MOST: f64 = 4.0;
 
-/// Both ends of the colours, which remain apart for the colour-blind, and their middle.
+/// End and middle colours, distinguishable for the colour-blind.
 const BELOW: [f64; 3] = [33.0, 102.0, 172.0];
 const EVEN: [f64; 3] = [247.0; 3];
 const ABOVE: [f64; 3] = [178.0, 24.0, 43.0];
@@ -41,7 +41,7 @@ const ABOVE: [f64; 3] = [178.0, 24.0, 43.0];
 const PANEL: (u32, u32) = (560, 300);
 const LEGEND: u32 = 60;
 
-/// The colour of a ratio: even steps of its logarithm.
+/// Colour of a ratio, linear in its logarithm.
 fn colour(ratio: f64) -> RGBColor {
     let place = if ratio > 0.0 { (ratio.ln() / MOST.ln()).clamp(-1.0, 1.0) } else { -1.0 };
     let end = if place < 0.0 { BELOW } else { ABOVE };
@@ -49,10 +49,10 @@ fn colour(ratio: f64) -> RGBColor {
     RGBColor(r, g, b)
 }
 
-/// Draws maps, `columns` in a row, and what the colours mean below them.
+/// Draws maps, `columns` in a row, with a colour scale below.
 ///
 /// # Errors
-/// [`ChartError`]: a map without a cell, or the library's own refusal.
+/// [`ChartError`]: a map without cells, or a failure of the drawing library.
 pub fn svg(maps: &[HeatMap], columns: usize, legend: &str) -> Result<String, ChartError> {
     let columns = columns.clamp(1, maps.len().max(1));
     let rows = maps.len().div_ceil(columns);
@@ -107,7 +107,7 @@ fn draw(map: &HeatMap, area: &Area<'_>) -> Result<(), ChartError> {
         .map_err(refused)
 }
 
-/// A strip of the colours with three of its values.
+/// Colour scale with three labelled values.
 fn explain(area: &Area<'_>, legend: &str) -> Result<(), ChartError> {
     const STEPS: i32 = 60;
     const LEFT: i32 = 80;
@@ -143,7 +143,7 @@ mod tests {
                 RGBColor(178, 24, 43)
             ]
         );
-        // Half of the way from white to red.
+        // Halfway from white to red.
         assert_eq!(colour(2.0), RGBColor(213, 136, 145));
     }
 

@@ -1,5 +1,4 @@
-//! Charts as SVG: spectra and their bounds on logarithmic axes, series and counts on linear ones, and maps of colours ([`heat`]), tables of
-//! counts ([`matrix`]).
+//! Charts as SVG: lines on linear or logarithmic axes, heat maps ([`heat`]) and tables of counts ([`matrix`]).
 
 pub mod heat;
 pub mod matrix;
@@ -9,23 +8,23 @@ use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
 use plotters::prelude::*;
 use std::ops::Range;
 
-/// How a line is drawn.
+/// Style of a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stroke {
-    /// What was measured or computed.
+    /// Solid: measured or computed.
     Solid,
-    /// What it is held against.
+    /// Dashed: a bound or reference.
     Dashed,
-    /// An area in which something lies by chance: its points run round it.
+    /// Filled: a confidence region, given by its outline.
     Area,
 }
 
-/// How an axis is divided.
+/// Scale of an axis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Scale {
-    /// By decades; only what is positive has a place.
+    /// Logarithmic; positive values only.
     Logarithmic,
-    /// Evenly.
+    /// Linear.
     Linear,
 }
 
@@ -34,7 +33,7 @@ impl Scale {
         value.is_finite() && (self == Self::Linear || value > 0.0)
     }
 
-    /// Place of a value in a range, 0 to 1.
+    /// Position of a value in a range, 0 to 1.
     fn place(self, value: f64, range: &Range<f64>) -> f64 {
         match self {
             Self::Logarithmic => (value / range.start).ln() / (range.end / range.start).ln(),
@@ -42,67 +41,67 @@ impl Scale {
         }
     }
 
-    /// A mark of an axis over a range.
+    /// Tick marks of an axis over a range.
     fn text(self, value: f64, range: &Range<f64>) -> String {
         match self {
             Self::Logarithmic => format!("{value:.0e}"),
-            // Rounded, so that a sum of tenths does not show its last bit, and is zero where it should be.
+            // Rounds away the error of summed steps, so that zero is zero.
             Self::Linear if value.abs() < 1e-9 * (range.end - range.start) => "0".to_owned(),
             Self::Linear => format!("{}", format!("{value:.6e}").parse().unwrap_or(value)),
         }
     }
 }
 
-/// One line of a panel.
+/// A line of a panel.
 #[derive(Clone, Debug)]
 pub struct Line {
-    /// Text of the legend; empty for none.
+    /// Legend; empty for none.
     pub label: String,
-    /// Place in [`PALETTE`]; a bound shares the colour of what it bounds.
+    /// Index in [`PALETTE`]; a bound shares the colour of its line.
     pub colour: usize,
-    /// How it is drawn.
+    /// Style.
     pub stroke: Stroke,
-    /// Points in the order of x; those that have no place on the axes are left out.
+    /// Points in order of x; points outside the axes are omitted.
     pub points: Vec<(f64, f64)>,
 }
 
-/// One pair of axes.
+/// A panel: one pair of axes.
 #[derive(Clone, Debug)]
 pub struct Panel {
-    /// Above the axes.
+    /// Title.
     pub title: String,
-    /// Below, with the unit.
+    /// Label of x, with the unit.
     pub x_label: String,
-    /// Left, with the unit.
+    /// Label of y, with the unit.
     pub y_label: String,
-    /// How x is divided.
+    /// Scale of x.
     pub x_scale: Scale,
-    /// How y is divided.
+    /// Scale of y.
     pub y_scale: Scale,
     /// Limits of x.
     pub x: Range<f64>,
-    /// Limits of y; `None` for whole decades around the points, or a little more than the points.
+    /// Limits of y; `None` for whole decades, or a margin, around the points.
     pub y: Option<Range<f64>>,
-    /// The lines, the first at the bottom.
+    /// Lines, in drawing order.
     pub lines: Vec<Line>,
 }
 
-/// Colours that remain apart for the colour-blind (Okabe and Ito).
+/// Colours distinguishable for the colour-blind (Okabe and Ito).
 pub const PALETTE: [(u8, u8, u8); 7] =
     [(0, 114, 178), (213, 94, 0), (0, 158, 115), (204, 121, 167), (230, 159, 0), (86, 180, 233), (90, 90, 90)];
 
-/// The picture could not be drawn.
+/// Error of a drawing.
 #[derive(Debug, thiserror::Error)]
 pub enum ChartError {
-    /// No point can be shown.
+    /// No point lies on the axes.
     #[error("panel \"{panel}\" has no point with x in {x:?} that its axes can show (logarithmic ones: above zero)")]
     Empty {
         /// Title of the panel.
         panel: String,
-        /// Its limits.
+        /// Limits of its axes.
         x: Range<f64>,
     },
-    /// The drawing library refused.
+    /// The drawing library failed.
     #[error("the picture could not be drawn: {0}")]
     Drawing(String),
 }
@@ -119,7 +118,7 @@ impl Panel {
         self.lines.iter().flat_map(|l| &l.points).filter(|point| self.shows(point))
     }
 
-    /// Limits of y: as asked, or around what is shown.
+    /// Limits of y: as given, or around the points.
     fn limits(&self) -> Result<Range<f64>, ChartError> {
         if let Some(y) = &self.y {
             return Ok(y.clone());
@@ -137,7 +136,7 @@ impl Panel {
         Ok(10_f64.powf(lo)..10_f64.powf(hi.max(lo + 1.0)))
     }
 
-    /// Where the legend hides the fewest points.
+    /// Corner in which the legend covers the fewest points.
     fn emptiest_corner(&self, y: &Range<f64>) -> SeriesLabelPosition {
         let covered = |right: bool, upper: bool| {
             let near = |at: f64, end: bool, reach: f64| if end { at > 1.0 - reach } else { at < reach };
@@ -247,10 +246,10 @@ fn refused<E: std::fmt::Display>(error: E) -> ChartError {
     ChartError::Drawing(error.to_string())
 }
 
-/// Draws panels side by side, `columns` in a row.
+/// Draws panels, `columns` in a row.
 ///
 /// # Errors
-/// [`ChartError`]: a panel without a point, or the library's own refusal.
+/// [`ChartError`]: a panel without points, or a failure of the drawing library.
 pub fn svg(panels: &[Panel], columns: usize) -> Result<String, ChartError> {
     let columns = columns.clamp(1, panels.len().max(1));
     let rows = panels.len().div_ceil(columns);

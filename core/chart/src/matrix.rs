@@ -1,4 +1,4 @@
-//! Tables of counts as pictures: what was there against what was said.
+//! Tables of counts as pictures, such as confusion matrices.
 
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
@@ -8,38 +8,38 @@ use crate::{ChartError, refused};
 /// A table of counts.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Matrix {
-    /// Above it.
+    /// Title.
     pub title: String,
-    /// What the rows are.
+    /// Row labels.
     pub rows: Vec<String>,
-    /// What the columns are.
+    /// Column labels.
     pub columns: Vec<String>,
-    /// Row by row.
+    /// Counts, row by row.
     pub counts: Vec<Vec<usize>>,
-    /// Cells that are right, row and column.
+    /// Cells that count as right, (row, column).
     pub right: Vec<(usize, usize)>,
 }
 
 const CELL: i32 = 26;
-/// Room for the names of rows and of columns.
+/// Space for row and column labels.
 const LEFT: i32 = 150;
 const TOP: i32 = 150;
 const MARGIN: i32 = 14;
 
-/// Right and wrong remain apart for the colour-blind.
+/// Colours of right and wrong cells, distinguishable for the colour-blind.
 const RIGHT: [f64; 3] = [0.0, 114.0, 178.0];
 const WRONG: [f64; 3] = [213.0, 94.0, 0.0];
 
-/// The more of its row, the darker.
+/// Shade: darker with the cell's share of its row.
 fn colour(of: [f64; 3], part: f64) -> RGBColor {
     let [r, g, b] = of.map(|full| (255.0 + (full - 255.0) * (0.25 + 0.75 * part)).round() as u8);
     RGBColor(r, g, b)
 }
 
-/// Draws tables below one another.
+/// Draws tables one below the other.
 ///
 /// # Errors
-/// [`ChartError`]: a table without a cell, or the library's own refusal.
+/// [`ChartError`]: a table without cells, or a failure of the drawing library.
 pub fn svg(tables: &[Matrix]) -> Result<String, ChartError> {
     let high = |m: &Matrix| TOP + CELL * m.rows.len() as i32 + MARGIN;
     let wide = tables.iter().map(|m| LEFT + CELL * m.columns.len() as i32 + 3 * MARGIN).max().unwrap_or(0);
@@ -92,7 +92,7 @@ fn draw(m: &Matrix, area: &DrawingArea<SVGBackend<'_>, plotters::coord::Shift>, 
             area.draw(&Rectangle::new([(x, y), (x + CELL, y + CELL)], grey)).map_err(refused)?;
         }
     }
-    // Above what their neighbours have drawn.
+    // Drawn after all cells.
     for (i, j) in m.right.iter().filter(|(i, j)| *i < m.rows.len() && *j < m.columns.len()) {
         let (x, y) = (LEFT + CELL * *j as i32, below + CELL * *i as i32);
         area.draw(&Rectangle::new([(x, y), (x + CELL, y + CELL)], BLACK.stroke_width(2))).map_err(refused)?;
@@ -117,7 +117,7 @@ mod tests {
         for word in ["Said of what was hidden", "nothing", "sufficient", "17", "5"] {
             assert!(picture.contains(word), "{word}");
         }
-        // Frames stand above what the neighbours of their cells have drawn.
+        // Frames are drawn after all cells.
         let last = |word: &str| picture.rfind(word).expect("drawn");
         assert!(last("stroke=\"#000000\"") > last("stroke=\"#D7D7D7\""), "{picture}");
         assert!(svg(&[Matrix { rows: Vec::new(), ..table }]).is_err());

@@ -1,40 +1,40 @@
-//! How a diagnosis did against the truth that a simulation sealed.
+//! Scores a diagnosis against the sealed truth of a simulation.
 //!
-//! Simulator and models name effects and places alike, and share no code. A size that was drawn is mostly a coefficient's value;
-//! where it is not, [`expected`] says which values follow from it, or why none does.
+//! Simulator and models use equal names of effects and instances but share no code. The drawn size usually equals the
+//! value of a coefficient; [`expected`] gives the values otherwise, or the reason why none follows.
 
 use serde::Serialize;
 use serde_json::{Map, Value};
 
-/// The true cause of what no effect covers must be among so many drivers.
-const DRIVERS: usize = 3;
+/// Highest rank at which the true housekeeping channel counts as found, for causes that no effect covers.
+const MAX_DRIVER_RANK: usize = 3;
 
-/// Two impulses of one place nearer than this are one: as near as the search keeps a single peak, s.
-const SAME_IMPULSE_S: f64 = 120.0;
+/// Impulses of one instance closer than this are the same, s; the search keeps one peak within this distance.
+const MAX_TIME_ERROR_S: f64 = 120.0;
 
-/// What an effect is called in messages and in confounders, `es-gain:tm1.y`.
+/// Name of an effect as in messages and confounders, `es-gain:tm1.y`.
 fn name(effect: &str, instance: &str) -> String {
     format!("{effect}:{instance}")
 }
 
-/// A cause that acted.
+/// A true cause.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Truth {
     /// Effect of the simulator.
     pub effect: String,
-    /// Where.
+    /// Instance.
     pub instance: String,
     /// Size, in `unit`.
     pub size: f64,
-    /// SI unit of the size; empty where the sealed file does not tell it.
+    /// SI unit of the size; empty if the sealed file does not state it.
     pub unit: String,
     /// Shape parameters of the simulator.
     pub shape: Map<String, Value>,
-    /// Whether it was hidden; otherwise it was asked for with `--effect`.
+    /// Whether it was hidden rather than requested with `--effect`.
     pub hidden: bool,
-    /// Expected |size|/σ, counted from where the effect vanishes; none for what was asked for.
+    /// Expected |size|/σ, relative to the value without effect; `None` for a requested effect.
     pub expected_significance: Option<f64>,
-    /// Expected σ of the size; none for what was asked for.
+    /// Expected σ of the size; `None` for a requested effect.
     pub expected_sigma: Option<f64>,
 }
 
@@ -48,84 +48,84 @@ impl Truth {
     }
 }
 
-/// What became of a cause that acted.
+/// Outcome for a true cause.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Outcome {
-    /// Accepted, effect and place.
+    /// Accepted, with the right effect and instance.
     Accepted,
-    /// Not accepted, but named as what the data cannot tell from an accepted one.
+    /// Not accepted, but listed as a confounder of an accepted candidate.
     Confounded,
-    /// No installed effect covers it, and the diagnosis says that something is unexplained.
+    /// No installed effect covers it, and the diagnosis reports an unexplained residual.
     Unexplained,
     /// None of these.
     Missed,
 }
 
-/// How a diagnosis did as a whole.
+/// Overall result of a diagnosis.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Verdict {
-    /// Everything that acted is accepted, and nothing else.
+    /// All true causes are accepted, and no other.
     Right,
-    /// Everything is accepted or a confounder of what is, and nothing else is accepted.
+    /// All true causes are accepted or confounders of accepted candidates, and no other is accepted.
     Confounded,
-    /// Something is accepted that did not act, and something that acted is not found.
+    /// A false cause is accepted and a true one is not found.
     Wrong,
-    /// Something that acted is not found, and nothing false is accepted.
+    /// A true cause is not found; no false cause is accepted.
     Missed,
-    /// Everything that acted is found, possibly nothing did, and something that did not act is accepted or called unexplained.
+    /// All true causes, if any, are found, but a false cause is accepted or a residual is reported as unexplained.
     #[serde(rename = "false alarm")]
     FalseAlarm,
-    /// The diagnosis accepts nothing false and says that something is unexplained, and so it is.
+    /// No false cause is accepted, and the diagnosis rightly reports an unexplained residual.
     Unexplained,
 }
 
-/// A coefficient beside the value that follows from the truth.
+/// A coefficient compared with its true value.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Compared {
     /// Name.
     pub coefficient: String,
     /// SI unit of all three numbers.
     pub unit: String,
-    /// What follows from the truth.
+    /// True value.
     pub truth: f64,
-    /// What was found.
+    /// Estimate.
     pub value: f64,
-    /// σ of it.
+    /// Its σ.
     pub sigma: f64,
     /// `(value − truth)/σ`.
     pub difference_sigma: f64,
 }
 
-/// A limit beside the value that follows from the truth.
+/// An upper limit compared with the true value.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Limited {
     /// Name.
     pub coefficient: String,
     /// SI unit.
     pub unit: String,
-    /// What follows from the truth; none where nothing does.
+    /// True value, if one follows from the sealed truth.
     pub truth: Option<f64>,
     /// 95 % upper limit on the size.
     pub limit_95: f64,
-    /// σ that the data have for it.
+    /// σ by the data.
     pub sigma: Option<f64>,
 }
 
-/// A cause that acted, beside what the diagnosis says of it.
+/// A true cause with its result in the diagnosis.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Scored {
     /// The truth.
     #[serde(flatten)]
     pub truth: Truth,
-    /// Whether the diagnosis had the effect at this place to try.
+    /// Whether the effect and instance were among the candidates.
     pub covered: bool,
-    /// Why not, where the diagnosis or the installation says.
+    /// Reason if not, if the diagnosis or the installation states one.
     pub not_covered_because: Option<String>,
-    /// What became of it.
+    /// Outcome.
     pub outcome: Outcome,
-    /// Place among the candidates, from 1; none where it is not among them.
+    /// Rank among the candidates, from 1.
     pub rank: Option<usize>,
     /// Whether it is the first candidate.
     pub first: bool,
@@ -133,65 +133,65 @@ pub struct Scored {
     pub accepted: bool,
     /// Accepted candidates that list it as a confounder.
     pub confounder_of: Vec<String>,
-    /// What its own candidate lists as confounders.
+    /// Confounders of its own candidate.
     pub confounders: Vec<String>,
-    /// Coefficients with a value that follows from the truth.
+    /// Coefficients for which a true value follows.
     pub values: Vec<Compared>,
-    /// Why there are none.
+    /// Reason if there are none.
     pub not_compared_because: Option<String>,
-    /// |value|/σ of the candidate's leading coefficient, for a level of noise counted from 1.
+    /// |value|/σ of the candidate's leading coefficient; noise levels count from 1.
     pub significance: Option<f64>,
-    /// |truth|/σ with the σ that the diagnosis has for it, found or not; none where it has none. What was drawn for the σ that such
-    /// data have as a rule may be worth less in these: a charge that drifts evenly tells little.
+    /// |truth|/σ with the σ of the diagnosis, found or not. It may be below the expected significance if these data say little, e.g. a charge that drifts steadily.
     pub significance_at_hand: Option<f64>,
-    /// Fall of χ² by the candidate.
+    /// Decrease of χ² by the candidate.
     pub delta_chi2: Option<f64>,
-    /// Corrected chance.
+    /// Significance after correction for multiple tests.
     pub p_value: Option<f64>,
     /// Whether the value lies in its physical range.
     pub in_range: Option<bool>,
-    /// Shape parameters of the model's effect that follow from the truth.
+    /// True shape parameters of the model's effect.
     pub expected_shape: Map<String, Value>,
-    /// Shape in which the candidate was found.
+    /// Shape of the candidate.
     pub found_shape: Map<String, Value>,
     /// Found minus true time of an impulse, s.
     pub time_error_s: Option<f64>,
-    /// Limits that the diagnosis gives where it does not see the effect.
+    /// Upper limits of an undetected effect.
     pub limits: Vec<Limited>,
-    /// Housekeeping that drives it, where no effect covers it.
+    /// True housekeeping drivers of a cause that no effect covers.
     pub drivers: Vec<String>,
-    /// Place of the first witness made of just these drivers, from 1.
+    /// Rank of the first reported coherence with exactly these drivers, from 1.
     pub driver_rank: Option<usize>,
 }
 
-/// How a diagnosis did.
+/// Score of a diagnosis.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Score {
-    /// As a whole.
+    /// Overall result.
     pub verdict: Verdict,
-    /// Whether that is the best there is to say: `right`, or `unexplained` for what no installed effect covers, with the true
-    /// driver among the first three where housekeeping has one.
+    /// Whether the result is correct: `right`, or `unexplained` for a cause that no installed effect covers, with its
+    /// driver (if any) among the first three.
     pub correct: bool,
-    /// What the diagnosis said: `sufficient`, `missing`, `unexplained`.
+    /// Verdict of the diagnosis: `sufficient`, `missing`, `unexplained`.
     pub diagnosis_verdict: String,
-    /// Forms that it tried.
+    /// Number of forms tried.
     pub tried: u64,
     /// The first candidate, accepted or not.
     pub first: Option<String>,
-    /// What it accepted, in its order.
+    /// Accepted candidates, in the order of the diagnosis.
     pub accepted: Vec<String>,
-    /// What of that neither acted nor stands for something that did.
+    /// Accepted candidates that are neither true nor confounders of an undetected true cause.
     pub false_causes: Vec<String>,
-    /// Everything that acted.
+    /// All true causes.
     pub effects: Vec<Scored>,
-    /// Witnesses of what is unexplained, in the diagnosis's order; none where it calls nothing unexplained.
+    /// Housekeeping coherent with the unexplained residual, in the order of the diagnosis; `None` if nothing is
+    /// unexplained.
     pub coherent_with: Option<Vec<String>>,
 }
 
-/// The value of a coefficient that follows from a truth. Its name is `EFFECT.INSTANCE` and this.
+/// True value of a coefficient; its name is `EFFECT.INSTANCE` followed by `part`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Expected {
-    /// What follows in the name, with its point; empty for the only coefficient.
+    /// Rest of the name with its point; empty for the only coefficient.
     pub part: &'static str,
     /// Unit.
     pub unit: &'static str,
@@ -199,17 +199,17 @@ pub struct Expected {
     pub value: f64,
 }
 
-/// One-based number of a test mass and letter of the axis of `tm1.x` or `tm1`.
+/// One-based number of a test mass, and axis, of `tm1.x` or `tm1`.
 fn test_mass(instance: &str) -> (usize, &str) {
     let (mass, axis) = instance.split_once('.').unwrap_or((instance, ""));
     (if mass == "tm2" { 2 } else { 1 }, axis)
 }
 
-/// The values of the coefficients of the effect of a model that follow from a truth, for the shape in which it was found;
-/// `sealed` is all that was sealed.
+/// True values of the coefficients of a model's effect, for the shape that was found. `sealed` is the whole sealed
+/// content.
 ///
 /// # Errors
-/// None follows, and why.
+/// No value follows; the message says why.
 pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Result<Vec<Expected>, String> {
     let only = |unit, value| Ok(vec![Expected { part: "", unit, value }]);
     let column = |key: &str| shape.get(key).and_then(Value::as_str).unwrap_or_default();
@@ -220,9 +220,9 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
         "time-offset" => only("s", truth.size),
         "stiffness" => only("s-2", truth.size),
         "cross-stiffness" => only("m s-2 rad-1", truth.size),
-        // The level is the factor of the amplitude, as the size is.
+        // The level is a factor of the amplitude, as is the size.
         "mps-noise" | "torque-noise" | "is-noise" if truth.number("line_hz") > 0.0 => {
-            Err("a line is no level".to_owned())
+            Err("a spectral line is not a noise level".to_owned())
         }
         "mps-noise" | "torque-noise" | "is-noise" => only("1", truth.size),
         "tilt-to-length" => {
@@ -244,11 +244,11 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
             let found = parts.clone().find(|(with, ..)| *with == column("with"));
             let all = parts.by_ref().map(|(with, ..)| with).collect::<Vec<_>>().join(" and ");
             let (_, unit, value) =
-                found.ok_or_else(|| format!("it was found to follow {}, and follows {all}", column("with")))?;
+                found.ok_or_else(|| format!("the candidate follows {}, the truth {all}", column("with")))?;
             only(unit, value)
         }
         "slosh" => {
-            // The model's slug is counted against all the rest.
+            // The model's coefficient is the slug's mass relative to the rest.
             only("1", truth.size / (1.0 - truth.size))
         }
         "thermal" => {
@@ -259,27 +259,27 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
             } else if (plus, minus) == (&face("m"), &face("p")) {
                 only("m s-2 K-1", -truth.size)
             } else {
-                Err(format!("it was found to follow {plus} − {minus}, and follows the faces of its own housing"))
+                Err(format!("the candidate follows {plus} − {minus}, the truth the faces of its own housing"))
             }
         }
         "charge" => match column("charge") {
             charge if charge == format!("hk.tm{number}_charge_c") => only("V", truth.size),
-            other => Err(format!("it was found to follow {other}, and follows its own test mass's charge")),
+            other => Err(format!("the candidate follows {other}, the truth its own test mass's charge")),
         },
         "magnetic" if truth.size != 0.0 => {
-            Err("the susceptibility follows from the coefficients only with the tensor of the gradient".to_owned())
+            Err("the susceptibility follows from the coefficients only with the gradient tensor".to_owned())
         }
         "magnetic" => {
-            // Force m ∂B_x/∂x, which is what the gradiometer shows.
+            // Force m ∂B_x/∂x; the gradiometer measures ∂B_x/∂x.
             let mass_kg = sealed["test_mass_kg"][number - 1].as_f64();
-            let mass_kg = mass_kg.ok_or("the sealed file does not tell the test mass's mass")?;
+            let mass_kg = mass_kg.ok_or("the sealed file does not state the mass of the test mass")?;
             match column("gradient") {
                 gradient if gradient == format!("hk.magnetic_gradient{number}_t_m") => Ok(vec![Expected {
                     part: ".gradient_x",
                     unit: "m2 s-2 T-1",
                     value: truth.number("moment_a_m2") / mass_kg,
                 }]),
-                other => Err(format!("it was found to follow {other}, and follows its own test mass's gradient")),
+                other => Err(format!("the candidate follows {other}, the truth its own test mass's gradient")),
             }
         }
         "impulse" if truth.instance.starts_with("tm") => only("N s", truth.size),
@@ -296,14 +296,12 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
             ])
         }
         "impulse" => only("N m s", truth.size),
-        "mps-correlation" => {
-            Err("the coefficients say where the thrusters sit, the size how much noise each has".to_owned())
-        }
+        "mps-correlation" => Err("the coefficients describe the thrusters' positions, the size their noise".to_owned()),
         _ => Err("no bundled effect has a coefficient for it".to_owned()),
     }
 }
 
-/// Shape parameters that follow from a truth, those of the model's effect that are numbers.
+/// True numerical shape parameters of the model's effect.
 fn expected_shape(truth: &Truth) -> Map<String, Value> {
     let given = |names: &[&str], factor: f64| {
         let known = names.iter().filter(|name| truth.shape.contains_key(**name));
@@ -311,7 +309,7 @@ fn expected_shape(truth: &Truth) -> Map<String, Value> {
     };
     match truth.effect.as_str() {
         "thermal" => given(&["lag_s"], 1.0),
-        // As it is seen, with the spacecraft free.
+        // The model's resonance is that with the spacecraft free.
         "slosh" => given(&["f0_hz", "zeta"], (1.0 - truth.size).sqrt().recip()),
         "impulse" if truth.instance.starts_with("tm") => given(&["rise_s", "decay_s"], 1.0),
         "impulse" if ["sc.phi", "sc.theta", "sc.psi"].contains(&truth.instance.as_str()) => given(&["pulse_s"], 1.0),
@@ -319,7 +317,7 @@ fn expected_shape(truth: &Truth) -> Map<String, Value> {
     }
 }
 
-/// Housekeeping whose square or product drives a cause that no bundled effect covers, as telemetry names it.
+/// Housekeeping whose square or product drives a cause that no bundled effect covers, by its telemetry name.
 fn drivers(effect: &str) -> &'static [&'static str] {
     match effect {
         "current-force" => &["battery_current_a"],
@@ -328,7 +326,7 @@ fn drivers(effect: &str) -> &'static [&'static str] {
     }
 }
 
-/// The channels in `d/dt hk.a`, `hk.a^2`, `hk.a * hk.b`, in order.
+/// Channels of a term such as `d/dt hk.a`, `hk.a^2` or `hk.a * hk.b`, sorted.
 fn channels_of(witness: &str) -> Vec<&str> {
     fn bare(part: &str) -> &str {
         let part = part.strip_prefix("d/dt ").unwrap_or(part);
@@ -340,10 +338,10 @@ fn channels_of(witness: &str) -> Vec<&str> {
     names
 }
 
-/// Everything that acted: what was drawn, and what was asked for with `--effect`. An offset is in every model and is left out.
+/// All true causes: drawn, and requested with `--effect`. An offset is part of every model and is omitted.
 ///
 /// # Errors
-/// The sealed content is of another form.
+/// The sealed content has another form.
 pub fn truths(sealed: &Value) -> Result<Vec<Truth>, String> {
     let drawn = sealed["effects"].as_array().ok_or("it has no list of effects")?;
     let mut all = Vec::new();
@@ -361,14 +359,14 @@ pub fn truths(sealed: &Value) -> Result<Vec<Truth>, String> {
         });
     }
     for given in sealed["given"].as_array().into_iter().flatten().filter_map(Value::as_str) {
-        all.push(asked(given).ok_or_else(|| format!("{given} is no effect"))?);
+        all.push(parse_given(given).ok_or_else(|| format!("{given} is not an effect"))?);
     }
     all.retain(|truth| truth.effect != "com-offset");
     Ok(all)
 }
 
-/// `ID:INSTANCE=SIZE[,NAME=VALUE]...`
-fn asked(text: &str) -> Option<Truth> {
+/// Parses `ID:INSTANCE=SIZE[,NAME=VALUE]...`
+fn parse_given(text: &str) -> Option<Truth> {
     let mut parts = text.split(',').map(|part| part.split_once('='));
     let number = |value: &str| value.trim().parse::<f64>().ok();
     let (who, size) = parts.next()??;
@@ -390,31 +388,31 @@ fn asked(text: &str) -> Option<Truth> {
     })
 }
 
-/// Scores what `dragfree diagnose --json` printed against what was sealed. `installed` says whether there is an effect with an
-/// instance.
+/// Scores the output of `dragfree diagnose --json` against the sealed content. `installed(effect, instance)` says
+/// whether such an effect exists.
 ///
 /// # Errors
-/// One of the two is of another form.
+/// An input has another form.
 pub fn score(sealed: &Value, diagnosis: &Value, installed: &dyn Fn(&str, &str) -> bool) -> Result<Score, String> {
     let truths = truths(sealed).map_err(|e| format!("the sealed content: {e}"))?;
-    let said = diagnosis["verdict"].as_str().ok_or("the diagnosis has no `verdict`")?;
+    let diagnosis_verdict = diagnosis["verdict"].as_str().ok_or("the diagnosis has no `verdict`")?;
     let candidates = diagnosis["candidates"].as_array().ok_or("the diagnosis has no `candidates`")?;
-    let judged = Judged { sealed, diagnosis, candidates, installed };
-    let effects: Vec<Scored> = truths.into_iter().map(|truth| judged.scored(truth)).collect();
+    let scorer = Scorer { sealed, diagnosis, candidates, installed };
+    let effects: Vec<Scored> = truths.into_iter().map(|truth| scorer.scored(truth)).collect();
 
     let accepted: Vec<&Value> = candidates.iter().filter(|c| c["accepted"] == true).collect();
-    // One that stands for something that acted is no false cause, unless that is accepted beside it.
-    let stands_for = |c: &&Value| {
+    // A confounder of an undetected true cause is not a false cause.
+    let is_confounder = |c: &&Value| {
         let confounded = effects.iter().filter(|e| !e.accepted);
         confounded.into_iter().any(|e| e.confounder_of.contains(&name_of(c)))
     };
-    let acted = |c: &&Value| effects.iter().any(|e| judged.is(c, &e.truth));
+    let acted = |c: &&Value| effects.iter().any(|e| scorer.matches(c, &e.truth));
     let false_causes: Vec<String> =
-        accepted.iter().filter(|c| !acted(c) && !stands_for(c)).map(|c| name_of(c)).collect();
+        accepted.iter().filter(|c| !acted(c) && !is_confounder(c)).map(|c| name_of(c)).collect();
 
-    let verdict = verdict(&effects, !false_causes.is_empty(), said);
-    let pointed = |e: &Scored| e.drivers.is_empty() || e.driver_rank.is_some_and(|rank| rank <= DRIVERS);
-    let found = |e: &Scored| e.outcome == Outcome::Accepted || (e.outcome == Outcome::Unexplained && pointed(e));
+    let verdict = verdict(&effects, !false_causes.is_empty(), diagnosis_verdict);
+    let driver_found = |e: &Scored| e.drivers.is_empty() || e.driver_rank.is_some_and(|rank| rank <= MAX_DRIVER_RANK);
+    let found = |e: &Scored| e.outcome == Outcome::Accepted || (e.outcome == Outcome::Unexplained && driver_found(e));
     let correct = match verdict {
         Verdict::Right => true,
         Verdict::Unexplained => effects.iter().all(found),
@@ -423,33 +421,33 @@ pub fn score(sealed: &Value, diagnosis: &Value, installed: &dyn Fn(&str, &str) -
     Ok(Score {
         verdict,
         correct,
-        diagnosis_verdict: said.to_owned(),
+        diagnosis_verdict: diagnosis_verdict.to_owned(),
         tried: diagnosis["tried"].as_u64().unwrap_or(0),
         first: candidates.first().map(name_of),
         accepted: accepted.into_iter().map(name_of).collect(),
         false_causes,
         effects,
-        coherent_with: diagnosis["unexplained"]["coherent_with"].as_array().map(|all| texts(all)),
+        coherent_with: diagnosis["unexplained"]["coherent_with"].as_array().map(|all| strings(all)),
     })
 }
 
-fn verdict(effects: &[Scored], any_false: bool, said: &str) -> Verdict {
+fn verdict(effects: &[Scored], any_false: bool, diagnosis_verdict: &str) -> Verdict {
     let any = |outcome| effects.iter().any(|e| e.outcome == outcome);
-    let lost = any(Outcome::Missed);
+    let missed = any(Outcome::Missed);
     if any_false {
-        return if lost || any(Outcome::Unexplained) { Verdict::Wrong } else { Verdict::FalseAlarm };
+        return if missed || any(Outcome::Unexplained) { Verdict::Wrong } else { Verdict::FalseAlarm };
     }
-    match said {
+    match diagnosis_verdict {
         "unexplained" if effects.is_empty() => Verdict::FalseAlarm,
         "unexplained" => Verdict::Unexplained,
-        _ if lost => Verdict::Missed,
+        _ if missed => Verdict::Missed,
         _ if any(Outcome::Unexplained) => Verdict::Unexplained,
         _ if any(Outcome::Confounded) => Verdict::Confounded,
         _ => Verdict::Right,
     }
 }
 
-fn texts(all: &[Value]) -> Vec<String> {
+fn strings(all: &[Value]) -> Vec<String> {
     all.iter().filter_map(Value::as_str).map(str::to_owned).collect()
 }
 
@@ -457,19 +455,19 @@ fn name_of(candidate: &Value) -> String {
     name(candidate["effect"].as_str().unwrap_or_default(), candidate["instance"].as_str().unwrap_or_default())
 }
 
-/// A diagnosis and what it is held against.
-struct Judged<'a> {
+/// A diagnosis and the truth to compare it with.
+struct Scorer<'a> {
     sealed: &'a Value,
     diagnosis: &'a Value,
     candidates: &'a [Value],
     installed: &'a dyn Fn(&str, &str) -> bool,
 }
 
-impl Judged<'_> {
-    /// Found minus true time of an impulse, s; none for all else, and for what happens again and again.
+impl Scorer<'_> {
+    /// Estimated minus true time of an impulse, s; `None` for other effects and for repeated events.
     fn time_error_s(&self, candidate: &Value, truth: &Truth) -> Option<f64> {
         let at_s = truth.shape.get("at_s").and_then(Value::as_f64)?;
-        // An antenna moves many times.
+        // An antenna moves repeatedly.
         if truth.effect != "impulse" || ["sc.phi", "sc.theta", "sc.psi"].contains(&truth.instance.as_str()) {
             return None;
         }
@@ -477,13 +475,13 @@ impl Judged<'_> {
         Some(since_ns as f64 * 1e-9 - at_s)
     }
 
-    /// Whether a candidate is a truth: effect, place and, for what happens once, time.
-    fn is(&self, candidate: &Value, truth: &Truth) -> bool {
+    /// Whether a candidate matches a truth: effect, instance and, for a transient, time.
+    fn matches(&self, candidate: &Value, truth: &Truth) -> bool {
         name_of(candidate) == truth.name()
-            && self.time_error_s(candidate, truth).is_none_or(|error| error.abs() < SAME_IMPULSE_S)
+            && self.time_error_s(candidate, truth).is_none_or(|error| error.abs() < MAX_TIME_ERROR_S)
     }
 
-    /// Whether the diagnosis had the effect to try, or why not.
+    /// Ok if the effect was a candidate, otherwise the reason.
     fn covered(&self, truth: &Truth) -> Result<(), String> {
         if !(self.installed)(&truth.effect, &truth.instance) {
             return Err("no installed effect has this instance".to_owned());
@@ -494,12 +492,12 @@ impl Judged<'_> {
     }
 
     fn scored(&self, truth: Truth) -> Scored {
-        let own = self.candidates.iter().position(|c| self.is(c, &truth));
+        let own = self.candidates.iter().position(|c| self.matches(c, &truth));
         let candidate = own.map(|at| &self.candidates[at]);
         let accepted = candidate.is_some_and(|c| c["accepted"] == true);
         let lists = |c: &&Value| {
             let named = c["confounders"].as_array().into_iter().flatten();
-            c["accepted"] == true && !self.is(c, &truth) && named.into_iter().any(|n| *n == truth.name().as_str())
+            c["accepted"] == true && !self.matches(c, &truth) && named.into_iter().any(|n| *n == truth.name().as_str())
         };
         let confounder_of: Vec<String> = self.candidates.iter().filter(lists).map(name_of).collect();
         let covered = self.covered(&truth);
@@ -530,7 +528,7 @@ impl Judged<'_> {
         let significances = found.chain(limited).map(|(truth, sigma)| (truth - origin).abs() / sigma);
         let significance_at_hand = significances.max_by(f64::total_cmp);
         let drivers: Vec<String> = drivers(&truth.effect).iter().map(|d| (*d).to_owned()).collect();
-        let witnesses = unexplained["coherent_with"].as_array().map(|all| texts(all)).unwrap_or_default();
+        let witnesses = unexplained["coherent_with"].as_array().map(|all| strings(all)).unwrap_or_default();
         let driver_rank =
             witnesses.iter().position(|w| !drivers.is_empty() && channels_of(w) == drivers).map(|at| at + 1);
         let field = |key: &str| candidate.map_or(&Value::Null, |c| &c[key]);
@@ -542,7 +540,7 @@ impl Judged<'_> {
             first: own == Some(0),
             accepted,
             confounder_of,
-            confounders: field("confounders").as_array().map(|all| texts(all)).unwrap_or_default(),
+            confounders: field("confounders").as_array().map(|all| strings(all)).unwrap_or_default(),
             values,
             not_compared_because,
             significance,
@@ -560,7 +558,7 @@ impl Judged<'_> {
         }
     }
 
-    /// Coefficients of a candidate beside what follows from the truth.
+    /// Coefficients of a candidate compared with their true values.
     fn compared(&self, candidate: &Value, truth: &Truth) -> Result<Vec<Compared>, String> {
         let empty = Map::new();
         let expected = expected(truth, candidate["shape"].as_object().unwrap_or(&empty), self.sealed)?;
@@ -570,7 +568,7 @@ impl Judged<'_> {
             let part = c["name"].as_str()?.strip_prefix(&stem)?;
             let expected = expected.iter().find(|e| e.part == part && c["unit"] == e.unit)?;
             let (value, sigma) = (c["value"].as_f64()?, c["sigma"].as_f64()?);
-            // An antenna gives back when it stops what it took when it started, and either may have been found.
+            // An antenna returns the angular momentum when it stops, so either sign is right.
             let turns = truth.effect == "impulse" && truth.instance.starts_with("sc.") && part.is_empty();
             let truth = if turns { expected.value.abs().copysign(value) } else { expected.value };
             Some(Compared {
@@ -583,7 +581,7 @@ impl Judged<'_> {
             })
         });
         match both.collect::<Vec<_>>() {
-            none if none.is_empty() => Err("the candidate has none of the coefficients that follow".to_owned()),
+            none if none.is_empty() => Err("the candidate has none of the coefficients with a true value".to_owned()),
             some => Ok(some),
         }
     }

@@ -21,7 +21,7 @@ fn diagnosis(verdict: &str, candidates: &[Value]) -> Value {
     json!({"verdict": verdict, "tried": 100, "candidates": candidates, "upper_limits": [], "unexplained": null, "not_tried": []})
 }
 
-/// As the bundled effects are.
+/// Bundled effects.
 fn installed(effect: &str, instance: &str) -> bool {
     effect != "opening-angle" && effect != "current-force" && effect != "product-force" && instance != "is"
 }
@@ -35,7 +35,7 @@ fn gain() -> Value {
 }
 
 #[test]
-fn effect_and_place_found_and_nothing_else_is_right() {
+fn the_true_effect_and_instance_alone_is_right() {
     let found = candidate("es-gain:tm2.y", true, 0.104, 0.002, &[]);
     let next = candidate("es-gain:tm1.y", false, 0.01, 0.01, &[]);
     let s = scored(&[gain()], &diagnosis("missing", &[found, next]));
@@ -44,14 +44,14 @@ fn effect_and_place_found_and_nothing_else_is_right() {
     assert_eq!((e.rank, e.first, e.accepted, e.outcome, e.covered), (Some(1), true, true, Outcome::Accepted, true));
     assert!((e.values[0].difference_sigma - 2.0).abs() < 1e-9 && (e.significance.unwrap() - 52.0).abs() < 1e-9);
     assert_eq!((e.truth.expected_significance, e.truth.hidden), (Some(10.0), true));
-    // Nothing hidden and nothing named is right too.
+    // Nothing hidden and nothing accepted is right too.
     let s = scored(&[], &diagnosis("sufficient", &[candidate("es-gain:tm1.y", false, 0.01, 0.01, &[])]));
     assert_eq!((s.verdict, s.correct, s.accepted.len()), (Verdict::Right, true, 0));
 }
 
-/// The place counts: the right effect on the other test mass is a wrong cause.
+/// The right effect at another test mass is a wrong cause.
 #[test]
-fn a_cause_that_did_not_act_is_wrong_or_a_false_alarm() {
+fn a_false_cause_is_wrong_or_a_false_alarm() {
     let other = candidate("es-gain:tm1.y", true, 0.1, 0.01, &[]);
     let s = scored(&[gain()], &diagnosis("missing", std::slice::from_ref(&other)));
     assert_eq!((s.verdict, s.correct, s.effects[0].outcome), (Verdict::Wrong, false, Outcome::Missed));
@@ -65,14 +65,14 @@ fn a_cause_that_did_not_act_is_wrong_or_a_false_alarm() {
 }
 
 #[test]
-fn a_confounder_of_what_is_accepted_is_confounded_and_silence_is_missed() {
+fn an_accepted_confounder_is_confounded_and_no_detection_is_missed() {
     let stands = candidate("es-gain:tm1.y", true, 0.1, 0.01, &["es-gain:tm2.y"]);
     let listed = candidate("es-gain:tm2.y", false, 0.1, 0.01, &[]);
     let s = scored(&[gain()], &diagnosis("missing", &[stands.clone(), listed]));
     assert_eq!((s.verdict, s.correct), (Verdict::Confounded, false));
     assert_eq!((s.effects[0].rank, &s.effects[0].confounder_of[..]), (Some(2), &["es-gain:tm1.y".to_owned()][..]));
     assert!(s.false_causes.is_empty());
-    // Accepted beside the true one it stands for nothing.
+    // A confounder accepted beside the true cause is a false cause.
     let s = scored(&[gain()], &diagnosis("missing", &[candidate("es-gain:tm2.y", true, 0.1, 0.01, &[]), stands]));
     assert_eq!((s.verdict, s.false_causes.len()), (Verdict::FalseAlarm, 1));
 
@@ -85,7 +85,7 @@ fn a_confounder_of_what_is_accepted_is_confounded_and_silence_is_missed() {
 }
 
 #[test]
-fn of_a_pair_both_must_be_found() {
+fn both_of_two_causes_must_be_found() {
     let pair = [gain(), hidden("mps-tilt", "sc.z", 0.03, &json!({}))];
     let one = candidate("es-gain:tm2.y", true, 0.1, 0.01, &[]);
     assert_eq!(scored(&pair, &diagnosis("missing", std::slice::from_ref(&one))).verdict, Verdict::Missed);
@@ -96,9 +96,9 @@ fn of_a_pair_both_must_be_found() {
     assert!((s.effects[1].values[0].difference_sigma - 1.0).abs() < 1e-9);
 }
 
-/// What no installed effect covers, by id, by instance, or because it was not tried.
+/// No installed effect covers it: by id, by instance, or because it was not tried.
 #[test]
-fn an_unknown_kind_is_unexplained_and_its_driver_is_looked_for() {
+fn an_uncovered_cause_is_unexplained_with_its_driver() {
     let unknown = |effect: &str| [hidden(effect, "tm1.x", 1e-13, &json!({"lag_s": 50.0}))];
     let mut told = diagnosis("unexplained", &[]);
     told["unexplained"] = json!({"coherent_with": ["hk.tank_mass_kg", "d/dt hk.tank_mass_kg", "hk.battery_current_a^2",
@@ -108,12 +108,12 @@ fn an_unknown_kind_is_unexplained_and_its_driver_is_looked_for() {
     assert!(!s.effects[0].covered && s.effects[0].outcome == Outcome::Unexplained);
     let s = scored(&unknown("product-force"), &told);
     assert_eq!((s.verdict, s.correct, s.effects[0].driver_rank), (Verdict::Unexplained, false, Some(4)));
-    // An installed effect explains it: that is wrong, and silence is missed.
+    // An installed effect accepted instead is wrong; no detection is missed.
     let s =
         scored(&unknown("current-force"), &diagnosis("missing", &[candidate("thermal:tm1.x", true, 1.0, 0.1, &[])]));
     assert_eq!(s.verdict, Verdict::Wrong);
     assert_eq!(scored(&unknown("current-force"), &diagnosis("sufficient", &[])).verdict, Verdict::Missed);
-    // A covered effect that was left unexplained is not found.
+    // A covered effect that is reported as unexplained is not found.
     let s = scored(&[gain()], &told);
     assert_eq!((s.verdict, s.correct, s.effects[0].outcome), (Verdict::Unexplained, false, Outcome::Missed));
 
@@ -126,7 +126,7 @@ fn an_unknown_kind_is_unexplained_and_its_driver_is_looked_for() {
     assert!(!scored(&[hidden("time-offset", "is", 0.1, &json!({}))], &told).effects[0].covered);
 }
 
-/// What happened once is another event when it is found at another time.
+/// A transient found at another time is another event.
 #[test]
 fn an_impulse_is_found_at_its_time() {
     let hit =
@@ -137,12 +137,12 @@ fn an_impulse_is_found_at_its_time() {
     found["shape"]["at_ns"] = 1_500_100_000_000_i64.into();
     let s = scored(&hit, &diagnosis("missing", std::slice::from_ref(&found)));
     assert!((s.effects[0].time_error_s.unwrap() - 0.1).abs() < 1e-9);
-    // z of the arm times the momentum: 0.5 m × 1e-6 N s.
+    // z of the arm times the momentum, 0.5 m × 1e-6 N s.
     assert_eq!(s.effects[0].values[0].truth, 0.5e-6);
     assert_eq!(s.verdict, Verdict::Right);
     found["shape"]["at_ns"] = 1_700_000_000_000_i64.into();
     assert_eq!(scored(&hit, &diagnosis("missing", &[found])).verdict, Verdict::Wrong);
-    // An antenna stops as it starts: the size counts.
+    // An antenna's sign is free; the size counts.
     let mut stop = candidate("impulse:sc.psi", true, -2e-6, 1e-7, &[]);
     stop["coefficients"][0]["unit"] = "N m s".into();
     stop["shape"]["at_ns"] = 9_000_000_000_000_i64.into();
@@ -150,7 +150,7 @@ fn an_impulse_is_found_at_its_time() {
     assert!((s.effects[0].values[0].difference_sigma - 1.0).abs() < 1e-9 && s.effects[0].time_error_s.is_none());
 }
 
-/// Where a size is not the coefficient: by hand from the physics of either side.
+/// Values that differ from the size, by hand from the physics of either side.
 #[test]
 fn sizes_become_coefficients() {
     let truth = |effect: &str, instance: &str, size: f64, shape: &Value| {
@@ -160,7 +160,7 @@ fn sizes_become_coefficients() {
     let value = |t: &Truth, shape: Value| of(t, shape).unwrap()[0].value;
     // A slug of a fifth of the whole is a quarter of the rest.
     assert!((value(&truth("slosh", "sc.y", 0.2, &json!({})), json!({"f0_hz": 0.03})) - 0.25).abs() < 1e-15);
-    // Its resonance, with the spacecraft free, lies above that with it held, by the root of all over the rest.
+    // The resonance with the spacecraft free exceeds that with it held by the root of all over the rest.
     let slug = truth("slosh", "sc.y", 0.19, &json!({"f0_hz": 0.09, "zeta": 0.02}));
     assert!((expected_shape(&slug)["f0_hz"].as_f64().unwrap() - 0.1).abs() < 1e-12);
     let heat = truth("thermal", "tm2.z", 3e-12, &json!({"lag_s": 480.0}));
@@ -185,9 +185,9 @@ fn sizes_become_coefficients() {
     assert!(of(&truth("product-force", "tm1.x", 1e-13, &json!({})), json!({})).is_err());
 }
 
-/// What was asked for beside the draw acts as well; an offset is in every model.
+/// Requested effects count as true causes; an offset is part of every model.
 #[test]
-fn what_was_asked_for_counts_and_offsets_do_not() {
+fn requested_effects_count_and_offsets_do_not() {
     let mut content = sealed(&[]);
     content["given"] = json!(["thermal:tm1.x=2e-12,lag_s=300", "com-offset:sc.x=0.01"]);
     let all = truths(&content).unwrap();
@@ -197,7 +197,7 @@ fn what_was_asked_for_counts_and_offsets_do_not() {
 }
 
 #[test]
-fn what_is_no_diagnosis_is_refused() {
+fn inputs_of_another_form_are_refused() {
     let missing = score(&sealed(&[]), &json!({"candidates": []}), &installed).unwrap_err();
     assert!(missing.contains("verdict"), "{missing}");
     assert!(score(&sealed(&[]), &json!({"verdict": "missing"}), &installed).unwrap_err().contains("candidates"));

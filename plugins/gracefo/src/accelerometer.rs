@@ -1,26 +1,19 @@
-//! The stage `accelerometer`: what an accelerometer measures takes the place of the displacements of a test mass.
+//! Stage `accelerometer`: measured accelerations in place of the displacements of a test mass.
 //!
-//! A proof mass is held at the centre of its cage, `b` from the spacecraft's centre of mass, and the force that holds
-//! it is measured. Per unit mass it is the cage's own acceleration against free fall,
-//! `a = a_ng + α×b + ω×(ω×b) − Γ b`. The channels of the chain are those of a **free** mass seen from its housing
-//! (eq:TM_SC_relative_acceleration), `r̈ = −a_ng − α×b − ω×(ω×b) + Γ b`: the same with the sign turned. So
-//! `channel = −a`, and every effect and estimator behind it works unchanged.
+//! The instrument measures the force per mass that holds its proof mass at `b` from the spacecraft's centre of mass, `a
+//! = a_ng + α×b + ω×(ω×b) − Γ b`. The channels describe a **free** mass relative to its housing
+//! (eq:TM_SC_relative_acceleration), `r̈ = −a_ng − α×b − ω×(ω×b) + Γ b`. So `channel = −a`.
 //!
-//! `α` is measured by the same instrument. `ω` comes from differences of the attitude SCA1B and not from the gyros
-//! IMU1A: the attitude is in SRF, is without the gyros' drift and holds their data already, while the axes of the gyros
-//! are in no header. `ω` matters little: what changes in `ω×(ω×b)` is 1e-9 s⁻²·b, against 1e-7 s⁻²·b from α.
+//! `α` is measured by the same instrument; its noise attenuates the offset (errors in variables). If the mission states
+//! the noise, the stage writes `E[α | measured α]` ([`crate::angular`]), at most 18,435 samples late; 128 samples next
+//! to a gap have no α, and intervals under 2,048 samples stay as measured. `ω` comes from differences of the attitude
+//! SCA1B, which is in SRF and free of the gyros' drift.
 //!
-//! A measured α carries its instrument's noise into the regressors, and an offset fitted to it is pulled towards zero
-//! (errors in variables). Where the mission tells of the noise, the stage gives `E[α | measured α]` instead (see
-//! [`crate::angular`]). That takes a spectrum: a stretch without gaps of less than 2,048 samples stays as measured, and
-//! 128 samples at either end of a longer one have no α; the rest is late by at most 18,435 samples.
+//! If the spacecraft hardly rotates, α is mostly noise. An offset fitted to it reflects the correlation of linear and
+//! angular readout noise, which share electrodes. The stage compares α with its noise on several time scales and notes
+//! this.
 //!
-//! Where the spacecraft hardly turns, the noise is all there is, and an offset fitted to it tells of whatever lever the
-//! common electrodes of linear and angular readout pretend (centimetres in the ten quiet seconds of the fixtures),
-//! however small its σ. The stage compares α with its noise on every time scale and says so.
-//!
-//! The gradient's `Γ b` is 4e-6 s⁻²·b in low orbit, but constant in a spacecraft that points at the Earth, as are the
-//! instrument's biases (1e-5 m s⁻², 1e-3 rad s⁻²): `qp-check` takes constants and slopes out of every segment.
+//! The gravity gradient `Γ b` and the instrument's biases are nearly constant; `qp-check` removes constants and slopes.
 
 use dragfree_physics::mission::Mission;
 use dragfree_physics::noise::NoiseShape;
@@ -31,18 +24,18 @@ use serde::{Deserialize, Serialize};
 
 use crate::angular::{Row, Wiener};
 
-/// Below this ratio of mean squares a tenth or more of the regressors' power is noise at every frequency.
-const QUIET: f64 = 10.0;
+/// Ratio of mean squares below which noise is a tenth or more of the regressors' power at every frequency.
+const MIN_SIGNAL_RATIO: f64 = 10.0;
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 
-/// Acceleration of a free mass relative to its housing (ORF), from what an accelerometer there measures (SRF).
+/// Acceleration of a free mass relative to its housing, ORF, m s⁻², from the measured one, SRF, m s⁻².
 #[must_use]
 pub fn channel_orf_m_s2(orf_from_srf: &Matrix3<f64>, measured_srf_m_s2: &Vector3<f64>) -> Vector3<f64> {
     -(orf_from_srf * measured_srf_m_s2)
 }
 
-/// Angular rate from the attitude: `q` turns components in SRF into components in IRF.
+/// Angular rate from the attitude; `q` takes components in SRF to components in IRF.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AttitudeRate {
@@ -50,14 +43,14 @@ pub struct AttitudeRate {
 }
 
 impl AttitudeRate {
-    /// Takes the attitude `[w, x, y, z]` of an epoch and gives the mean rate in SRF, rad s⁻¹, since the epoch `step_ns`
-    /// before; NaN when there was none. The half step between mean and end is 1e-8 rad s⁻¹ of a rate of 1e-3.
+    /// Adds the attitude `[w, x, y, z]` of an epoch; returns the mean rate in SRF, rad s⁻¹, since the epoch `step_ns`
+    /// before, NaN without it. The difference between the rates in the middle and at the end of the step is neglected.
     pub fn next(&mut self, time_ns: i64, q: [f64; 4], step_ns: i64) -> Vector3<f64> {
         let unit = |q: [f64; 4]| UnitQuaternion::from_quaternion(Quaternion::new(q[0], q[1], q[2], q[3]));
         let valid = q.iter().all(|x| x.is_finite()) && q.iter().any(|x| *x != 0.0);
         let now = valid.then_some((time_ns, q));
         match (std::mem::replace(&mut self.last, now), now) {
-            // The grid's epochs are rounded to whole nanoseconds.
+            // Epochs are rounded to whole nanoseconds.
             (Some((before_ns, p)), Some(_)) if (time_ns - before_ns - step_ns).abs() <= 1 => {
                 (unit(p).inverse() * unit(q)).scaled_axis() / (step_ns as f64 * 1e-9)
             }
@@ -66,40 +59,40 @@ impl AttitudeRate {
     }
 }
 
-/// Block lengths over which α is compared with its noise: 1, 2, 4 … 512 samples, 0.1 s to 51 s at 10 Hz.
+/// Number of block lengths over which α is compared with its noise: 1, 2, 4 … 512 samples.
 const LEVELS: usize = 10;
 
-/// Fewest steps from which a mean square is taken: its own standard deviation is then about a half.
-const FEWEST_STEPS: u64 = 8;
+/// Minimum number of differences for a mean square, whose relative standard deviation is then about a half.
+const MIN_DIFFERENCES: u64 = 8;
 
-/// Steps between neighbouring blocks of one length.
+/// Differences between adjacent blocks of one length.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct Level {
-    /// Mean of the block before.
+    /// Mean of the previous block.
     last: Option<[f64; 3]>,
-    /// Mean of the first half of the next level's block.
+    /// Mean of the first half of the next longer block.
     half: Option<[f64; 3]>,
     sum: [f64; 3],
     count: u64,
 }
 
-/// Mean squares of the steps between means over neighbouring blocks (twice the Allan variance), per axis and block
-/// length: a turn to and fro shows at the length of half its period, however small it is from sample to sample.
+/// Mean squares of the differences of adjacent block means (twice the Allan variance), per axis and block length. A
+/// slow oscillation shows at half its period even if it is far below the noise of a sample.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Steps {
+pub struct BlockDifferences {
     levels: [Level; LEVELS],
 }
 
-impl Default for Steps {
+impl Default for BlockDifferences {
     fn default() -> Self {
         Self { levels: [Level::default(); LEVELS] }
     }
 }
 
-impl Steps {
-    /// Takes the value of the next epoch. No block and no step reaches across a gap.
+impl BlockDifferences {
+    /// Adds the value of the next epoch. Blocks and differences do not cross gaps.
     pub fn next(&mut self, value: &Vector3<f64>) {
         if value.iter().any(|x| !x.is_finite()) {
             for level in &mut self.levels {
@@ -125,22 +118,22 @@ impl Steps {
         }
     }
 
-    /// Per axis, the largest mean square in units of what noise alone would have, over all block lengths with enough
-    /// steps; none without any.
+    /// Per axis, the largest ratio of the mean square to that of noise over all block lengths with enough differences.
     #[must_use]
-    pub fn over_noise(&self, noise_steps: &[f64; LEVELS]) -> Option<[f64; 3]> {
-        let ratios = self.levels.iter().zip(noise_steps).filter(|(level, _)| level.count >= FEWEST_STEPS);
+    pub fn ratio_to_noise(&self, noise_block_differences: &[f64; LEVELS]) -> Option<[f64; 3]> {
+        let ratios =
+            self.levels.iter().zip(noise_block_differences).filter(|(level, _)| level.count >= MIN_DIFFERENCES);
         ratios
             .map(|(level, noise)| level.sum.map(|s| s / (level.count as f64 * noise)))
             .reduce(|a, b| [0, 1, 2].map(|i| f64::max(a[i], b[i])))
     }
 }
 
-/// Mean square of the steps of noise alone per block length of m samples,
-/// `∫ S(f) 4 sin⁴(π f m dt) / (m² sin²(π f dt)) df` up to Nyquist.
+/// Mean square of the differences of noise alone, per block length of m samples: `∫ S(f) 4 sin⁴(π f m dt) / (m² sin²(π
+/// f dt)) df` up to Nyquist.
 #[must_use]
-pub fn noise_steps(noise: &NoiseShape, dt_s: f64) -> [f64; LEVELS] {
-    // A quarter of the finest oscillation of the longest block.
+pub fn noise_block_differences(noise: &NoiseShape, dt_s: f64) -> [f64; LEVELS] {
+    // Resolves the finest oscillation of the longest block by four points.
     const N: u32 = 1 << (LEVELS + 1);
     let width_hz = 0.5 / dt_s / f64::from(N);
     let mut all = [0.0; LEVELS];
@@ -156,16 +149,16 @@ pub fn noise_steps(noise: &NoiseShape, dt_s: f64) -> [f64; LEVELS] {
     all
 }
 
-/// What must survive a checkpoint.
+/// State of a checkpoint.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct State {
     attitude: AttitudeRate,
-    alpha: Steps,
+    alpha: BlockDifferences,
     rows: u64,
     without_acceleration: u64,
     without_attitude: u64,
-    /// The filter's state, if there is a filter.
+    /// State of the filter, if there is one.
     angular: Option<serde_json::Value>,
 }
 
@@ -190,9 +183,9 @@ pub struct Accelerometer {
     attitude: String,
     orf_from_srf: Matrix3<f64>,
     step_ns: i64,
-    /// Mean squares of the steps of α's noise per block length, (rad s⁻²)², if the mission says how noisy it is.
-    alpha_noise_steps: Option<[f64; LEVELS]>,
-    /// Makes `E[α | measured α]` of the measured α, if the mission says how noisy it is.
+    /// Mean squares of the differences of α's noise per block length, (rad s⁻²)², if the mission states the noise.
+    alpha_noise_differences: Option<[f64; LEVELS]>,
+    /// Filter for `E[α | measured α]`, if the mission states the noise.
     wiener: Option<Wiener>,
     handles: Option<Handles>,
     state: State,
@@ -200,7 +193,7 @@ pub struct Accelerometer {
 
 impl Handles {
     /// Writes a row of the reconstruction.
-    fn give(&self, row: &Row, output: &mut Outputs) {
+    fn emit(&self, row: &Row, output: &mut Outputs) {
         output.time(self.motion).push(row.time_ns);
         for i in 0..3 {
             output.f64(self.alpha[i]).push(row.alpha_srf_rad_s2.map_or(f64::NAN, |a| a[i]));
@@ -218,13 +211,13 @@ impl Stage for Accelerometer {
         id: "accelerometer",
         version: env!("CARGO_PKG_VERSION"),
         licence: "MIT OR Apache-2.0",
-        description: "Lets measured linear and angular accelerations take the place of a test mass's displacements",
+        description: "Uses measured linear and angular accelerations in place of a test mass's displacements",
         parameters: &[
             Parameter::text(
                 "test_mass",
                 "tm1",
                 &["tm1", "tm2"],
-                "test mass of the mission that stands for the proof mass",
+                "test mass of the mission that represents the proof mass",
             ),
             Parameter::text(
                 "linear",
@@ -253,7 +246,7 @@ impl Stage for Accelerometer {
         Ok(Self {
             orf_from_srf: mission.test_mass(&test_mass, "the stage accelerometer")?.dcm_orf_from_srf(),
             step_ns,
-            alpha_noise_steps: noise.as_ref().map(|n| noise_steps(n, dt_s)),
+            alpha_noise_differences: noise.as_ref().map(|n| noise_block_differences(n, dt_s)),
             wiener: noise.map(|n| Wiener::new(n, step_ns)),
             linear: setup.text("linear")?,
             angular: setup.text("angular")?,
@@ -299,7 +292,7 @@ impl Stage for Accelerometer {
     }
 
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
-        let h = self.handles.ok_or_else(|| PluginError::fatal("accelerometer: process before link"))?;
+        let h = self.handles.ok_or_else(|| PluginError::fatal("accelerometer: process called before link"))?;
         output.time(h.channels).extend_from_slice(input.time_ns());
         for (k, time_ns) in input.time_ns().iter().enumerate() {
             let measured = Vector3::from(h.linear.map(|c| input.f64(c)[k]));
@@ -323,42 +316,44 @@ impl Stage for Accelerometer {
                 omega_srf_rad_s: complete(&omega).then(|| omega.into()),
             };
             match &mut self.wiener {
-                Some(wiener) => wiener.next(row, &mut |row| h.give(&row, output)).map_err(|e| transform(&e))?,
-                None => h.give(&row, output),
+                Some(wiener) => wiener.next(row, &mut |row| h.emit(&row, output)).map_err(|e| transform(&e))?,
+                None => h.emit(&row, output),
             }
         }
         Ok(())
     }
 
     fn flush(&mut self, output: &mut Outputs) -> Result<(), PluginError> {
-        let h = self.handles.ok_or_else(|| PluginError::fatal("accelerometer: flush before link"))?;
+        let h = self.handles.ok_or_else(|| PluginError::fatal("accelerometer: flush called before link"))?;
         let Some(wiener) = &mut self.wiener else { return Ok(()) };
-        wiener.finish(&mut |row| h.give(&row, output)).map_err(|e| transform(&e))
+        wiener.finish(&mut |row| h.emit(&row, output)).map_err(|e| transform(&e))
     }
 
     fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
         let mut notes = vec![format!(
-            "{}.accel is the measured linear acceleration with its sign turned; nobody models the non-gravitational \
-             acceleration in it, which is noise here",
+            "{}.accel is the measured linear acceleration with opposite sign; the non-gravitational acceleration in it is not \
+             modelled and counts as noise",
             self.test_mass
         )];
         if self.handles.is_some_and(|h| h.attitude.is_none()) {
             notes.push(format!(
-                "there is no attitude {}: the angular rate is taken as zero and the centrifugal part of the offset, about \
-                 1e-6 s⁻² in low orbit, is left out",
+                "the telemetry has no attitude {}: the angular rate is taken as zero, which neglects the centrifugal part of the \
+                 offset's acceleration, about 1e-6 s⁻² in low orbit",
                 self.attitude
             ));
         }
         let s = &self.state;
         let mut quality = serde_json::Map::new();
-        if let Some(ratio) = self.alpha_noise_steps.as_ref().and_then(|noise| s.alpha.over_noise(noise)) {
-            let quiet: Vec<String> =
-                (0..3).filter(|i| ratio[*i] < QUIET).map(|i| format!("{} ({:.2})", AXES[i], ratio[i])).collect();
+        if let Some(ratio) = self.alpha_noise_differences.as_ref().and_then(|noise| s.alpha.ratio_to_noise(noise)) {
+            let quiet: Vec<String> = (0..3)
+                .filter(|i| ratio[*i] < MIN_SIGNAL_RATIO)
+                .map(|i| format!("{} ({:.2})", AXES[i], ratio[i]))
+                .collect();
             if !quiet.is_empty() {
                 notes.push(format!(
-                    "the measured angular acceleration about {} is hardly more than its noise (ratio of the mean squares \
-                     of their steps, at the best of all block lengths): an offset fitted to it tells how the instrument's linear \
-                     and angular noise go together, not where the mass is",
+                    "the measured angular acceleration about {} hardly exceeds its noise (largest ratio of Allan variances over \
+                     all block lengths): the fitted offset reflects the correlation of the instrument's linear and angular noise; \
+                     use data of a manoeuvre",
                     quiet.join(", ")
                 ));
             }
@@ -373,8 +368,8 @@ impl Stage for Accelerometer {
             let c = wiener.counts();
             if c.as_measured > 0 {
                 notes.push(format!(
-                    "{} rows lie in stretches too short to tell the angular acceleration from its noise and are used as \
-                     measured: where the noise is not small, they pull the offset towards zero",
+                    "{} rows lie in intervals too short for a spectrum; their angular acceleration is used as measured, and its \
+                     noise attenuates the offset",
                     c.as_measured
                 ));
             }
@@ -385,8 +380,8 @@ impl Stage for Accelerometer {
             ]);
         } else {
             notes.push(
-                "the mission does not say how noisy the measured angular acceleration is (noise.accelerometer_angular): it \
-                 is used as measured, and its noise pulls the offset towards zero, nobody can know how far"
+                "the mission file does not state the noise of the measured angular acceleration (noise.accelerometer_angular): \
+                 it is used as measured, and its noise attenuates the offset by an unknown factor; state the noise"
                     .to_owned(),
             );
         }

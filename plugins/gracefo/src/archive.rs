@@ -1,4 +1,4 @@
-//! Where the files are: plain text files, and `.tgz` archives that hold many of them.
+//! Files: plain text files, and `.tgz` archives of them.
 
 use std::fs::File;
 use std::io::{BufRead, BufReader, Read, Seek, SeekFrom};
@@ -24,7 +24,7 @@ pub struct Member {
 }
 
 impl Member {
-    /// What a file name says; `None` for other products, both-spacecraft files (`Y`), reports and stray files.
+    /// Parses a file name; `None` for other products, files of both spacecraft (`Y`), reports and stray files.
     #[must_use]
     pub fn from_name(name: &str) -> Option<Self> {
         let mut parts = name.strip_suffix(".txt")?.split('_');
@@ -47,22 +47,22 @@ impl Member {
     }
 }
 
-/// One file of the run's arguments.
+/// A file given to the run.
 #[derive(Clone, Debug)]
 pub struct Container {
     path: PathBuf,
     packed: bool,
-    /// What it holds that can be read.
+    /// Readable members.
     pub members: Vec<Member>,
     /// Why the listing ends early, if it does.
     pub damage: Option<String>,
 }
 
 impl Container {
-    /// Looks into a file. An archive is recognised by its first bytes, not by its name.
+    /// Lists a file's members. An archive is recognised by its first bytes.
     ///
     /// # Errors
-    /// The file cannot be opened or read at all.
+    /// The file cannot be opened or read.
     pub fn open(path: &Path) -> std::io::Result<Self> {
         let mut container =
             Self { path: path.to_owned(), packed: packed(&mut File::open(path)?)?, members: Vec::new(), damage: None };
@@ -82,10 +82,10 @@ impl Container {
         &self.path
     }
 
-    /// Gives every readable member and its text to `each`, in the order of the archive.
+    /// Calls `each` with every readable member and its text, in archive order.
     ///
     /// # Errors
-    /// The file or the archive ends or breaks; the members before were given.
+    /// The file or archive ends early or is damaged; the members before were passed on.
     pub fn visit(&self, mut each: impl FnMut(Member, &mut dyn BufRead)) -> std::io::Result<()> {
         let file = File::open(&self.path)?;
         if !self.packed {

@@ -1,4 +1,4 @@
-//! The YAML header of a GRACE-FO Level-1 text file: what the columns of a row are.
+//! YAML header of a GRACE-FO Level-1 text file, which defines the columns of a row.
 
 use serde_yaml_ng::{Mapping, Value};
 
@@ -7,54 +7,54 @@ use crate::Level1Error;
 /// The line that ends the header.
 pub const END_OF_HEADER: &str = "# End of YAML header";
 
-/// Headers of the mission are below 60 kB; more than this is no header.
+/// Maximum header size; headers of the mission are below 60 kB.
 pub const MAX_HEADER_BYTES: usize = 1 << 20;
 
-/// The only epoch that the mission counts from, as headers write it.
+/// Epoch of the mission's time tags, as written in headers.
 const EPOCH: &str = "2000-01-01T12:00:00";
 
-/// When a variable has a place in a row.
+/// Which rows contain a variable.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Presence {
-    /// In every row.
+    /// All rows.
     Always,
-    /// In a row whose `prod_flag` has this bit set.
+    /// Rows whose `prod_flag` has this bit set.
     Bit(u8),
-    /// In no row: the header names the variable, but gives it no bit (`statusflag` of ACC1A).
+    /// No row: the header gives the variable no bit (`statusflag` of ACC1A).
     Never,
 }
 
-/// One variable of the header, in the order of a row's columns.
+/// A variable of the header, in column order.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Variable {
     /// Name as written.
     pub name: String,
     /// Unit as written; empty where the header gives none.
     pub units: String,
-    /// When a row has it.
+    /// Which rows contain it.
     pub presence: Presence,
-    /// The header's own value for "no value".
+    /// Value that the header defines as missing.
     pub fill: Option<f64>,
 }
 
-/// What a header says.
+/// A parsed header.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Header {
-    /// `dimensions.num_records`: a claim that real files break.
+    /// `dimensions.num_records`, which real files violate.
     pub num_records: Option<u64>,
     /// `GRACE C`, `GRACE D`.
     pub platform: String,
     /// Variables in the order of a row's columns.
     pub variables: Vec<Variable>,
-    /// Bits of `qualflg` that say the time tag is not on the receiver's time scale.
+    /// Bits of `qualflg` that mean that the time tag is not on the receiver's time scale.
     pub untimed_mask: u32,
 }
 
 impl Header {
-    /// Reads the text above [`END_OF_HEADER`].
+    /// Parses the text above [`END_OF_HEADER`].
     ///
     /// # Errors
-    /// [`Level1Error`] when the text is no YAML, has no list of variables, or counts time from another epoch.
+    /// [`Level1Error`]: invalid YAML, no list of variables, or another epoch.
     pub fn parse(text: &str) -> Result<Self, Level1Error> {
         let root: Value = serde_yaml_ng::from_str(text).map_err(|e| Level1Error::Yaml(e.to_string()))?;
         let header = root.get("header").ok_or(Level1Error::MissingKey("header"))?;
@@ -73,7 +73,7 @@ impl Header {
         let mut variables = Vec::with_capacity(list.len());
         let mut untimed_mask = 0;
         for (name, about) in list.iter().filter_map(named) {
-            // "5th column" or "next column, if prod_flag bit set".
+            // The comment is "5th column" or "next column, if prod_flag bit set".
             let conditional = text_of(about, "comment").contains("prod_flag");
             let presence = match conditional {
                 false => Presence::Always,
@@ -97,7 +97,7 @@ impl Header {
         })
     }
 
-    /// Where a variable stands among the variables.
+    /// Index of a variable.
     #[must_use]
     pub fn index(&self, name: &str) -> Option<usize> {
         self.variables.iter().position(|v| v.name == name)
@@ -108,7 +108,7 @@ fn at<'a>(value: &'a Value, path: &[&str]) -> Option<&'a Value> {
     path.iter().try_fold(value, |v, key| v.get(key))
 }
 
-/// Some headers carry tags such as `!<!> "[1b, 2b]"`; a tag says nothing here.
+/// Removes tags such as `!<!> "[1b, 2b]"`, which carry no information here.
 fn untagged(value: &Value) -> &Value {
     match value {
         Value::Tagged(t) => &t.value,
@@ -129,7 +129,7 @@ fn text_of(about: &Mapping, key: &str) -> String {
     about.get(key).map(scalar).unwrap_or_default()
 }
 
-/// `- NAME: {…}`
+/// Name and body of an item `- NAME: {…}`.
 fn named(item: &Value) -> Option<(String, &Mapping)> {
     let (name, about) = item.as_mapping()?.iter().next()?;
     Some((name.as_str()?.to_owned(), about.as_mapping()?))
@@ -150,8 +150,8 @@ fn bit(meaning: &str) -> Option<(u8, &str)> {
     Some((number, text.trim()))
 }
 
-/// The bits of `prod_flag` that stand for a value. The k-th of them belongs to the k-th conditional variable; the
-/// names differ in spelling (`ICU block number`, `icu_blk_nr`), the order does not.
+/// Bits of `prod_flag` that announce a value. The k-th belongs to the k-th conditional variable: order is reliable,
+/// spelling (`ICU block number`, `icu_blk_nr`) is not.
 fn defined_bits(about: &Mapping) -> Vec<u8> {
     meanings(about).filter_map(|m| bit(&m).filter(|(_, text)| *text != "Not defined").map(|(n, _)| n)).collect()
 }

@@ -1,21 +1,21 @@
-//! GRACE-FO Level-1 text files as a source of tables, and a stage that lets an accelerometer take the place of a
-//! drag-free test mass.
+//! Source of tables from GRACE-FO Level-1 text files, and the stage `accelerometer`, which uses an accelerometer in
+//! place of a drag-free test mass.
 //!
-//! What the files do that a reader of their headers would not expect, and what is done about it:
+//! Deviations of the files from their headers, and their treatment:
 //!
 //! | in the files | here |
 //! |---|---|
-//! | `num_records` is not the number of rows | counted and noted |
-//! | which columns a row has depends on its `prod_flag` | bits and variables are paired from the header |
-//! | the header names a variable that has no bit (`statusflag`) | in no row |
-//! | 1e33 stands for no value | NaN, counted |
-//! | rows out of order, repeated, cut, foreign, of garbage | sorted, or dropped and counted |
-//! | MAG1A has two columns in another order than its header, and microseconds where it says nanoseconds | read as the rows are |
-//! | ACC1A and ACT1A have the accelerometer's axes, ACT1B the spacecraft's, and no header says how they lie | all in SRF |
-//! | the angular columns of ACT1A and ACT1B are zero | left out |
-//! | ACT1A and ACT1B of spacecraft D are C's, transplanted | noted |
-//! | time tags of Level 1A are the on-board receiver's | column attribute `clock`, noted |
-//! | archives hold stray `._*` members | ignored |
+//! | `num_records` differs from the number of rows | counted and noted |
+//! | the columns of a row depend on its `prod_flag` | bits and variables are paired from the header |
+//! | the header names a variable without a bit (`statusflag`) | treated as absent from all rows |
+//! | 1e33 means no value | NaN, counted |
+//! | rows out of order, repeated, truncated, foreign or unreadable | sorted, or dropped and counted |
+//! | MAG1A has two columns in another order than its header, and microseconds for nanoseconds | read as the rows are |
+//! | ACC1A and ACT1A use the accelerometer's axes, ACT1B the spacecraft's, undocumented | all converted to SRF |
+//! | the angular columns of ACT1A and ACT1B are zero | omitted |
+//! | ACT1A and ACT1B of spacecraft D are transplanted from C | noted |
+//! | time tags of Level 1A are those of the on-board receiver | column attribute `clock`, noted |
+//! | archives contain `._*` members | ignored |
 
 pub mod accelerometer;
 pub mod angular;
@@ -30,26 +30,26 @@ use dragfree_sdk::export_plugin;
 
 export_plugin!(stages: [accelerometer::Accelerometer], sources: [source::GraceFo]);
 
-/// Why a file was refused.
+/// Error that makes a file unreadable.
 #[derive(Debug, thiserror::Error)]
 pub enum Level1Error {
-    /// The line that ends a header is not there.
-    #[error("no line `# End of YAML header`: this is no GRACE-FO Level-1 text file, or it was cut in its header")]
+    /// The line that ends a header is missing.
+    #[error("no line `# End of YAML header`: not a GRACE-FO Level-1 text file, or truncated in its header")]
     NoEndOfHeader,
-    /// The header is no YAML.
-    #[error("the header is no YAML: {0}")]
+    /// The header is not valid YAML.
+    #[error("the header is not valid YAML: {0}")]
     Yaml(String),
-    /// The header lacks something.
+    /// The header lacks a key.
     #[error("the header has no {0}")]
     MissingKey(&'static str),
     /// The header lacks a variable of the product.
-    #[error("the header has no variable {0}: not this product, or another release of it")]
+    #[error("the header has no variable {0}: another product, or another release")]
     MissingVariable(&'static str),
     /// Time counts from another epoch.
-    #[error("time counts from `{0}`, not from 2000-01-01T12:00:00")]
+    #[error("time counts from `{0}`, expected 2000-01-01T12:00:00")]
     Epoch(String),
     /// A variable has another unit.
-    #[error("variable {variable} is in `{found}`, not in `{wanted}`: another release of the product")]
+    #[error("variable {variable} is in `{found}`, expected `{wanted}`: another release of the product")]
     Unit {
         /// The variable.
         variable: &'static str,
@@ -58,7 +58,7 @@ pub enum Level1Error {
         /// Unit expected.
         wanted: &'static str,
     },
-    /// The file is another spacecraft's.
+    /// The file belongs to another spacecraft.
     #[error("the header says platform `{found}`, the file name says {wanted}")]
     Platform {
         /// Platform in the header.
@@ -68,12 +68,12 @@ pub enum Level1Error {
     },
 }
 
-/// A stretch of time, half open, in nanoseconds of the tables' time scale.
+/// Half-open time interval, ns of the tables' time scale.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Window {
-    /// First instant inside.
+    /// Start, included.
     pub start_ns: i64,
-    /// First instant after.
+    /// End, excluded.
     pub end_ns: i64,
 }
 
@@ -81,7 +81,7 @@ impl Window {
     /// All time.
     pub const ALL: Self = Self { start_ns: i64::MIN, end_ns: i64::MAX };
 
-    /// Whether an instant is inside.
+    /// Whether a time is inside.
     #[must_use]
     pub const fn contains(self, time_ns: i64) -> bool {
         self.start_ns <= time_ns && time_ns < self.end_ns

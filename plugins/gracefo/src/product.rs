@@ -1,6 +1,6 @@
-//! The products that the source reads and the columns it makes of them.
+//! Products that the source reads, and the columns made of them.
 
-/// What a number of a file is, and with that the unit it must have there and the SI unit it gets.
+/// Physical quantity of a variable: unit in the file and SI unit.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Quantity {
     /// m/s2.
@@ -52,14 +52,14 @@ impl Quantity {
     }
 }
 
-/// A column that the source makes.
+/// An output column.
 #[derive(Clone, Copy, Debug)]
 pub struct Column {
     /// Variable of the header.
     pub variable: &'static str,
     /// Name of the column.
     pub name: &'static str,
-    /// What it is.
+    /// Quantity.
     pub quantity: Quantity,
     /// Frame; empty for scalars and for frames that the tables have no name for.
     pub frame: &'static str,
@@ -70,10 +70,9 @@ pub struct Column {
 pub struct Product {
     /// Name in the file names.
     pub code: &'static str,
-    /// Several instruments write into one file: the variable that tells them apart, and its values.
+    /// Variable that distinguishes instruments in one file, and its values.
     pub instrument: Option<(&'static str, &'static [u8])>,
-    /// The quaternion's first column, if the product has one: `q` and `−q` are one attitude, and interpolation needs
-    /// neighbours of one sign.
+    /// First column of the quaternion, if any. `q` and `−q` are one attitude; interpolation needs a continuous sign.
     pub quaternion: Option<usize>,
     /// Columns.
     pub columns: &'static [Column],
@@ -103,9 +102,9 @@ const fn column(variable: &'static str, name: &'static str, quantity: Quantity, 
 
 use Quantity as Q;
 
-/// The accelerometer's own axes (the headers' AF) are the spacecraft's in another order:
-/// `s_1 = a_3`, `s_2 = a_1`, `s_3 = a_2`. No header says so; ACC1A and ACT1B of one day do
-/// (`tests/real_files.rs`), and a cyclic order is a proper rotation, so axial vectors turn the same way.
+/// The accelerometer's axes (AF in the headers) are a cyclic permutation of SRF, `s_1 = a_3`, `s_2 = a_1`, `s_3 = a_2`,
+/// inferred from ACC1A and ACT1B of one day (`tests/real_files.rs`). It is a proper rotation, so axial vectors permute
+/// alike.
 const ACC1A: &[Column] = &[
     column("lin_accl_z", "lin_accl_srf_m_s2.x", Q::Acceleration, "SRF"),
     column("lin_accl_x", "lin_accl_srf_m_s2.y", Q::Acceleration, "SRF"),
@@ -116,7 +115,7 @@ const ACC1A: &[Column] = &[
     column("qualflg", "qualflg", Q::Flag, ""),
 ];
 
-/// As ACC1A. The angular columns are zero in the files and left out: a column of zeros would pass for a measurement.
+/// As ACC1A. The angular columns are zero in the files and omitted, as zeros would pass for measurements.
 const ACT1A: &[Column] = &[
     column("lin_accl_z", "lin_accl_srf_m_s2.x", Q::Acceleration, "SRF"),
     column("lin_accl_x", "lin_accl_srf_m_s2.y", Q::Acceleration, "SRF"),
@@ -124,7 +123,7 @@ const ACT1A: &[Column] = &[
     column("qualflg", "qualflg", Q::Flag, ""),
 ];
 
-/// Already in SRF. The angular columns are zero by design and left out.
+/// Already in SRF. The angular columns are zero by design and omitted.
 const ACT1B: &[Column] = &[
     column("lin_accl_x", "lin_accl_srf_m_s2.x", Q::Acceleration, "SRF"),
     column("lin_accl_y", "lin_accl_srf_m_s2.y", Q::Acceleration, "SRF"),
@@ -135,7 +134,7 @@ const ACT1B: &[Column] = &[
     column("qualflg", "qualflg", Q::Flag, ""),
 ];
 
-/// One angle per gyro, about an axis that only the mission's handbook gives.
+/// One angle per gyro, about an axis given only in the mission's handbook.
 const IMU1A: &[Column] = &[column("FiltAng", "angle_rad", Q::Angle, ""), column("qualflg", "qualflg", Q::Flag, "")];
 
 /// Attitude of one camera's frame in IRF.
@@ -177,7 +176,7 @@ const GNI1B: &[Column] = &[
     column("qualflg", "qualflg", Q::Flag, ""),
 ];
 
-/// The field is in SF, the satellite's mechanical frame, which is not SRF.
+/// The field is in SF, the satellite's mechanical frame, which differs from SRF.
 const MAG1A: &[Column] = &[
     column("MfvX_RAW", "field_sf_t.x", Q::MagneticField, ""),
     column("MfvY_RAW", "field_sf_t.y", Q::MagneticField, ""),
@@ -249,7 +248,7 @@ pub static PRODUCTS: [Product; 11] = [
     Product { code: "TNK1A", instrument: Some(("tank_id", &[1, 2])), quaternion: None, columns: TNK1A },
 ];
 
-/// The product of a code as it stands in file names.
+/// Product with a code, as in file names.
 #[must_use]
 pub fn find(code: &str) -> Option<&'static Product> {
     PRODUCTS.iter().find(|p| p.code == code)

@@ -1,5 +1,5 @@
-//! The rows of a GRACE-FO Level-1 text file: from bytes to time-ordered SI columns. Nothing in here panics, whatever
-//! the bytes are, and nothing is dropped without being counted.
+//! Rows of a GRACE-FO Level-1 text file: from bytes to time-ordered SI columns. Never panics, whatever the bytes, and
+//! counts everything that it drops.
 
 use std::io::BufRead;
 
@@ -7,43 +7,43 @@ use crate::header::{END_OF_HEADER, Header, MAX_HEADER_BYTES, Presence};
 use crate::product::{Product, Quantity};
 use crate::{Level1Error, Window};
 
-/// Unix seconds of 2000-01-01T12:00:00, the epoch of the mission's time tags. Both scales are labelled alike, so the
-/// times that come out are Unix-like nanoseconds of GPS time (Level 1B) or of the receiver's clock (Level 1A).
+/// Unix seconds of 2000-01-01T12:00:00, the epoch of the time tags. Output times are Unix-like nanoseconds of GPS time
+/// (Level 1B) or of the receiver's clock (Level 1A).
 pub const EPOCH_UNIX_S: i64 = 946_728_000;
 
-/// Time tags beyond the year 2126 are damage; the bound also keeps the nanoseconds inside an `i64`.
+/// Maximum time tag, in the year 2126; it keeps the nanoseconds within an `i64`.
 const MAX_SECONDS: i64 = 4_000_000_000;
 
-/// Rows of the mission are below 600 bytes; a longer line is damage and is skipped without being kept.
+/// Maximum line length; rows of the mission are below 600 bytes, longer lines are skipped.
 const MAX_LINE_BYTES: usize = 1 << 14;
 
-/// The mission writes 1e33 for "no value".
+/// Value that means no value.
 const NO_VALUE: f64 = 1e33;
 
-/// What was found and what was lost.
+/// Counts of what was read and lost.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
     /// Rows kept.
     pub rows: u64,
     /// Lines below the header.
     pub lines: u64,
-    /// Rows that the header promised, where that is not the number of lines.
+    /// Number of rows in the header, if it differs from the number of lines.
     pub promised: Option<u64>,
-    /// Lines that are no row of this product, and the number of the first of them.
+    /// Unreadable lines.
     pub garbage: u64,
     /// Line number, from 1, of the first garbage line.
     pub first_garbage_line: Option<u64>,
     /// 1 if the file ends inside a line or cannot be read to its end.
     pub truncated: u64,
-    /// Values that stand for "no value"; they become NaN.
+    /// Missing values; they become NaN.
     pub fill_values: u64,
-    /// Rows earlier than a row before them; they are sorted in.
+    /// Rows earlier than a previous row; sorted in.
     pub out_of_order: u64,
-    /// Rows of a time that was there before; the first stays.
+    /// Rows with a repeated time; the first is kept.
     pub duplicates: u64,
-    /// Rows of another spacecraft, instrument or time scale than the file should hold.
+    /// Rows of another spacecraft, instrument or time scale; dropped.
     pub foreign: u64,
-    /// Rows whose quality flag says that the time tag is not synchronised; dropped.
+    /// Rows whose quality flag marks the time tag as not synchronised; dropped.
     pub untimed: u64,
     /// Rows outside the window; dropped.
     pub outside_window: u64,
@@ -54,23 +54,23 @@ pub struct Counts {
 pub struct Rows {
     /// Nanoseconds since 1970, see [`EPOCH_UNIX_S`].
     pub time_ns: Vec<i64>,
-    /// One vector per column of the product, SI, NaN where there is no value.
+    /// Values per column of the product, SI; NaN if missing.
     pub columns: Vec<Vec<f64>>,
 }
 
-/// A file that was read.
+/// A parsed file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Parsed {
-    /// One per table of the product.
+    /// Rows per table of the product.
     pub tables: Vec<Rows>,
-    /// What was found and lost.
+    /// Counts.
     pub counts: Counts,
 }
 
-/// Reads a file of `product` and keeps the rows of `spacecraft` (`C` or `D`) inside `window`.
+/// Parses a file of `product`; keeps the rows of `spacecraft` (`C` or `D`) inside `window`.
 ///
 /// # Errors
-/// [`Level1Error`] when the header is no header of this product. Damage below the header is counted instead.
+/// [`Level1Error`]: invalid header. Damage below the header is counted instead.
 pub fn parse(
     reader: &mut (impl BufRead + ?Sized),
     product: &Product,
@@ -121,7 +121,7 @@ pub fn parse(
 }
 
 impl Counts {
-    /// What goes into a report, each under its name. Rows outside the window are no loss.
+    /// Counts for the report, with names. Rows outside the window are no loss.
     pub(crate) fn each(&self) -> [(&'static str, u64); 8] {
         [
             ("header_count_wrong", u64::from(self.promised.is_some())),
@@ -136,7 +136,7 @@ impl Counts {
     }
 }
 
-/// Gives neighbouring quaternions of one rotation one sign. `last` carries the sign over from an earlier file.
+/// Makes the sign of consecutive quaternions continuous. `last` carries the sign over from an earlier file.
 pub fn align_quaternions(rows: &mut Rows, first: usize, last: &mut Option<[f64; 4]>) {
     for k in 0..rows.time_ns.len() {
         let mut q = [0, 1, 2, 3].map(|i| rows.columns[first + i][k]);
@@ -154,7 +154,7 @@ pub fn align_quaternions(rows: &mut Rows, first: usize, last: &mut Option<[f64; 
     }
 }
 
-/// Sorts by time where needed and drops all but the first row of a time.
+/// Sorts by time and drops all but the first row of a time.
 pub(crate) fn order(rows: &mut Rows, counts: &mut Counts) {
     let mut latest = i64::MIN;
     let mut late = 0;
@@ -182,7 +182,7 @@ pub(crate) fn order(rows: &mut Rows, counts: &mut Counts) {
 
 enum Line {
     Whole,
-    /// The input ends, or fails, inside this line.
+    /// The input ends or fails inside this line.
     Cut,
     End,
 }
@@ -198,7 +198,7 @@ impl<'a, R: BufRead + ?Sized> Lines<'a, R> {
         Self { reader, bytes: Vec::new(), number: 0 }
     }
 
-    /// Puts the next line, without its end, into `bytes`; of a line that is too long, the beginning.
+    /// Reads the next line, without its end, into `bytes`; of an overlong line the beginning.
     fn next(&mut self) -> Line {
         self.bytes.clear();
         self.number += 1;
@@ -235,14 +235,14 @@ fn header_text<R: BufRead + ?Sized>(lines: &mut Lines<'_, R>) -> Result<String, 
     Err(Level1Error::NoEndOfHeader)
 }
 
-/// What a place in a row is for.
+/// Meaning of a position in a row.
 #[derive(Clone, Copy, Debug)]
 enum Field {
     GpsTime,
     Seconds,
     Microseconds,
-    /// `time_ref` or `GRACEFO_id`: MAG1A's rows have them the other way round than its header says, so that either
-    /// may stand in either place.
+    /// `time_ref` or `GRACEFO_id`. MAG1A's rows swap them relative to the header, so either may stand in either
+    /// position.
     Letter,
     Instrument,
     ProductFlag,
@@ -293,8 +293,8 @@ impl<'a> Layout<'a> {
             match (v.name.as_str(), index) {
                 ("gps_time", _) => Field::GpsTime,
                 ("rcvtime_intg" | "time_intg", _) => Field::Seconds,
-                // Microseconds in every product read here, also in MAG1A, whose header says nanoseconds: its rows
-                // stand at 100000 and 600000, and there are 172,800 of them in a day.
+                // Microseconds in every product, also in MAG1A, whose header says nanoseconds: its fractions are 100000
+                // and 600000 in 172,800 rows a day.
                 ("rcvtime_frac" | "time_frac", _) => Field::Microseconds,
                 ("time_ref" | "GRACEFO_id", _) => Field::Letter,
                 ("prod_flag", _) => Field::ProductFlag,
@@ -315,7 +315,7 @@ impl<'a> Layout<'a> {
         Ok(Self { fields, instruments: product.instrument.map_or(&[], |(_, ids)| ids), spacecraft })
     }
 
-    /// Reads one row into `values`.
+    /// Parses one row into `values`.
     fn row(&self, bytes: &[u8], values: &mut [f64], fills: &mut u64) -> Row {
         self.fields_of(bytes, values, fills).unwrap_or(Row::Garbage)
     }
@@ -393,7 +393,7 @@ fn whole_seconds(word: &str) -> Option<i64> {
     Some((EPOCH_UNIX_S + s) * 1_000_000_000)
 }
 
-/// Decimal seconds without the rounding of a float: at 7e8 s an f64 has a grain of 0.1 µs.
+/// Parses decimal seconds without the rounding of an f64, 0.1 µs at 7e8 s.
 fn decimal_seconds(word: &str) -> Option<i64> {
     let Some((whole, fraction)) = word.split_once('.') else { return whole_seconds(word) };
     if fraction.len() > 18 || !fraction.bytes().all(|b| b.is_ascii_digit()) {
@@ -403,7 +403,7 @@ fn decimal_seconds(word: &str) -> Option<i64> {
     Some(whole_seconds(whole)? + nanoseconds.parse::<i64>().ok()?)
 }
 
-/// A flag, most significant bit first.
+/// Parses a flag, most significant bit first.
 fn bits(word: &str) -> Option<u32> {
     u32::from_str_radix(word, 2).ok().filter(|_| !word.starts_with('+'))
 }

@@ -1,4 +1,4 @@
-//! The source `gracefo`: files of the run's arguments in, irregular tables out.
+//! Source `gracefo`: the run's files in, irregular tables out.
 
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
@@ -15,15 +15,15 @@ pub struct GraceFo {
     tables: Vec<(Table, Vec<Out>)>,
 }
 
-/// `GRACE-FO-C` → `C`.
+/// Letter of a spacecraft's name: `C` for `GRACE-FO-C`.
 ///
 /// # Errors
 /// The name ends with neither `C` nor `D`.
 pub fn letter_of(spacecraft: &str) -> Result<char, PluginError> {
     spacecraft.chars().next_back().filter(|c| matches!(c, 'C' | 'D')).ok_or_else(|| {
         PluginError::error(format!(
-            "mission.spacecraft = `{spacecraft}` ends with neither C nor D, which is how the source gracefo tells the two \
-             spacecraft apart; write `GRACE-FO-C` or `GRACE-FO-D`"
+            "mission.spacecraft = `{spacecraft}` must end with C or D, which selects the spacecraft in the source gracefo; write \
+             `GRACE-FO-C` or `GRACE-FO-D`"
         ))
     })
 }
@@ -37,7 +37,7 @@ impl Source for GraceFo {
         parameters: &[Parameter::text_list(
             "products",
             &[],
-            "products to read, such as ACC1A and SCA1B; none means all that the files hold",
+            "products to read, e.g. ACC1A and SCA1B; empty for all in the files",
         )],
         instances: &[],
         needs: &[],

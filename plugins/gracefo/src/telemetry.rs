@@ -1,4 +1,4 @@
-//! All files of one spacecraft as one stream of rows, ordered in time. One day is in memory at a time.
+//! Stream of rows of one spacecraft from all files, ordered in time. One day is in memory at a time.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -10,7 +10,7 @@ use crate::product::{PRODUCTS, Product};
 use crate::rows::{Counts, Parsed, Rows, align_quaternions, order, parse};
 use crate::{Level1Error, Window};
 
-/// Why files cannot be a telemetry stream.
+/// Error that prevents a telemetry stream.
 #[derive(Debug, thiserror::Error)]
 pub enum TelemetryError {
     /// A file cannot be read.
@@ -21,39 +21,39 @@ pub enum TelemetryError {
         /// Why.
         source: std::io::Error,
     },
-    /// No file holds anything of the spacecraft.
+    /// No file contains data of the spacecraft.
     #[error(
-        "none of the {files} files given holds a product of spacecraft {spacecraft}: {seen}; give .tgz archives or .txt \
+        "none of the {files} files given contains a product of spacecraft {spacecraft}: {seen}; give .tgz archives or .txt \
          files named PRODUCT_DATE_SPACECRAFT_RELEASE.txt, and check mission.spacecraft and the parameter products"
     )]
     Nothing {
-        /// How many files.
+        /// Number of files.
         files: usize,
         /// Letter of the spacecraft.
         spacecraft: char,
-        /// What was found instead.
+        /// What the files contain instead.
         seen: String,
     },
-    /// A product that does not exist.
-    #[error("parameter products names `{0}`, which this source does not read; it reads {1}")]
+    /// Unknown product.
+    #[error("parameter products: unknown product `{0}`; known products: {1}")]
     UnknownProduct(String, String),
-    /// A saved state that is not this stream's.
-    #[error("the state is not one of these files: {0}; start the run anew")]
+    /// A saved state of other files.
+    #[error("the saved state does not belong to these files: {0}; rerun from the telemetry without it")]
     ForeignState(String),
 }
 
 /// A table of the stream.
 #[derive(Clone, Debug)]
 pub struct TableId {
-    /// Product that it comes from.
+    /// Product.
     pub product: &'static Product,
-    /// Which of the product's tables.
+    /// Index of the product's table.
     pub part: usize,
     /// Name.
     pub name: String,
 }
 
-/// What is known after the last row given.
+/// State after the last row emitted.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct State {
@@ -61,24 +61,24 @@ struct State {
     tables: Vec<String>,
     /// Index of the day in memory.
     day: usize,
-    /// Rows of that day already given, per table.
+    /// Rows of that day already emitted, per table.
     given: Vec<usize>,
     /// Last quaternion before that day, per table.
     quaternions: Vec<Option<[f64; 4]>>,
-    /// Rows of that day before this time come too late.
+    /// Rows of that day before this time are late.
     not_before_ns: Option<i64>,
     last_ns: Option<i64>,
     log: Log,
 }
 
-/// What was counted and lost.
+/// Counts and losses.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Log {
-    /// `acc1a.rows` and the like; nothing is zero.
+    /// Nonzero counts, such as `acc1a.rows`.
     pub counts: BTreeMap<String, u64>,
-    /// The first of each kind of oddity, by kind and product.
+    /// First anomaly of each kind, by kind and product.
     pub notes: BTreeMap<String, String>,
-    /// Something that should have been there is lost.
+    /// Whether expected data are lost.
     pub data_loss: bool,
 }
 
@@ -99,25 +99,22 @@ impl Log {
             self.count(product, what, n);
         }
         if let Some(promised) = counts.promised {
-            let text = format!("{name}: the header promises {promised} rows, the file holds {}", counts.lines);
+            let text = format!("{name}: the header says {promised} rows, the file has {}", counts.lines);
             self.note("promised", product, text);
         }
         if let Some(line) = counts.first_garbage_line {
-            let text = format!(
-                "{name}: lines that are no rows were left out, {} in all, the first is line {line}",
-                counts.garbage
-            );
+            let text = format!("{name}: {} unreadable lines dropped, first line {line}", counts.garbage);
             self.note("garbage", product, text);
         }
         if counts.truncated > 0 {
-            self.note("truncated", product, format!("{name}: ends inside a line or cannot be read to its end"));
+            self.note("truncated", product, format!("{name}: truncated, or not readable to its end"));
         }
         self.data_loss |= counts.garbage > 0 || counts.truncated > 0;
     }
 
     fn refused(&mut self, member: &Member, error: &Level1Error) {
         self.count(member.product, "files_refused", 1);
-        self.note("refused", member.product, format!("{}: left out, {error}", member.name));
+        self.note("refused", member.product, format!("{}: not used: {error}", member.name));
         self.data_loss = true;
     }
 }
@@ -128,19 +125,19 @@ pub struct Telemetry {
     containers: Vec<Container>,
     spacecraft: char,
     window: Window,
-    /// Tables, in the order of the products.
+    /// Tables, in product order.
     pub tables: Vec<TableId>,
-    /// Rows of the day in memory, per table; `None` before the first row is wanted.
+    /// Rows of the day in memory, per table; `None` until the first row is requested.
     day: Option<Vec<Rows>>,
     quaternions_after: Vec<Option<[f64; 4]>>,
     state: State,
 }
 
 impl Telemetry {
-    /// Looks into the files. `wanted` names products; none means all that are there.
+    /// Lists the files. `wanted` names products; empty for all.
     ///
     /// # Errors
-    /// See [`TelemetryError`].
+    /// [`TelemetryError`].
     pub fn open(
         files: &[PathBuf],
         spacecraft: char,
@@ -166,7 +163,7 @@ impl Telemetry {
                 *log.counts.entry("archives_damaged".to_owned()).or_default() += 1;
                 log.notes.insert(
                     format!("archive.{}", path.display()),
-                    format!("{}: the archive breaks off, what is behind is lost: {damage}", path.display()),
+                    format!("{}: the archive is damaged, data after the damage are lost: {damage}", path.display()),
                 );
                 log.data_loss = true;
             }
@@ -177,7 +174,7 @@ impl Telemetry {
         }
         if dates.is_empty() {
             seen.truncate(4);
-            let seen = if seen.is_empty() { "no product at all".to_owned() } else { seen.join(", ") };
+            let seen = if seen.is_empty() { "no product".to_owned() } else { seen.join(", ") };
             return Err(TelemetryError::Nothing { files: files.len(), spacecraft, seen });
         }
         dates.sort_unstable();
@@ -202,15 +199,15 @@ impl Telemetry {
         Ok(Self { containers, spacecraft, window, tables, day: None, quaternions_after, state })
     }
 
-    /// Gives up to `rows` more rows, in order of time, as (table, row of the table, table's rows of the day). Comes back
-    /// with the time before which every row was given, and whether there is nothing more.
+    /// Emits up to `rows` more rows in time order, as (table, row, rows of the table's day). Returns the time before
+    /// which all rows have been emitted, and whether the stream has ended.
     ///
     /// # Errors
-    /// A file that was there cannot be read any more.
+    /// A file has become unreadable.
     pub fn next(
         &mut self,
         rows: usize,
-        mut give: impl FnMut(usize, usize, &Rows),
+        mut emit: impl FnMut(usize, usize, &Rows),
     ) -> Result<(i64, bool), TelemetryError> {
         if self.day.is_none() {
             let log = self.load()?;
@@ -219,7 +216,7 @@ impl Telemetry {
         for _ in 0..rows.max(1) {
             let Some((time_ns, table)) = self.head() else { break };
             if let Some(day) = &self.day {
-                give(table, self.state.given[table], &day[table]);
+                emit(table, self.state.given[table], &day[table]);
             }
             self.state.given[table] += 1;
             self.state.last_ns = Some(time_ns);
@@ -236,35 +233,35 @@ impl Telemetry {
         Ok(self.head().map_or((after_last, true), |(time_ns, _)| (time_ns, false)))
     }
 
-    /// What was counted and lost so far.
+    /// Counts and losses so far.
     #[must_use]
     pub fn log(&self) -> &Log {
         &self.state.log
     }
 
-    /// The whole state.
+    /// The state.
     ///
     /// # Errors
-    /// Never in practice; the error is the serialiser's.
+    /// Serialisation failed, which does not happen in practice.
     pub fn save(&self) -> Result<Vec<u8>, serde_json::Error> {
-        // Before the first row nothing was counted: the day is read when it is wanted.
+        // Before the first row no day has been read.
         serde_json::to_vec(&(self.day.is_some(), &self.state))
     }
 
-    /// Takes a state back.
+    /// Restores a state.
     ///
     /// # Errors
-    /// The bytes are no state of a stream of these files, or a file cannot be read any more.
+    /// The bytes are not a state of these files, or a file has become unreadable.
     pub fn load_state(&mut self, bytes: &[u8]) -> Result<(), TelemetryError> {
         let (loaded, state): (bool, State) =
             serde_json::from_slice(bytes).map_err(|e| TelemetryError::ForeignState(e.to_string()))?;
         let foreign = |what: &str| Err(TelemetryError::ForeignState(what.to_owned()));
         if state.dates != self.state.dates || state.tables != self.state.tables {
-            return foreign("it was saved with other days or products");
+            return foreign("it has other days or products");
         }
         let n = self.tables.len();
         if state.day >= state.dates.len() || state.given.len() != n || state.quaternions.len() != n {
-            return foreign("its parts do not fit together");
+            return foreign("it is inconsistent");
         }
         self.state = state;
         self.day = None;
@@ -272,7 +269,7 @@ impl Telemetry {
             self.load()?;
             let day = self.day.as_deref().unwrap_or_default();
             if day.iter().zip(&self.state.given).any(|(rows, given)| *given > rows.time_ns.len()) {
-                return foreign("a file has fewer rows than were given already");
+                return foreign("a file has fewer rows than were read before");
             }
         }
         Ok(())
@@ -285,8 +282,7 @@ impl Telemetry {
         day.iter().enumerate().filter_map(next).min()
     }
 
-    /// Reads the day of the state into memory; the log is what the state's becomes when the day is read for the first
-    /// time.
+    /// Reads the current day into memory; returns the log to adopt if the day is read for the first time.
     fn load(&mut self) -> Result<Log, TelemetryError> {
         let date = &self.state.dates[self.state.day];
         let mut log = self.state.log.clone();
@@ -301,12 +297,12 @@ impl Telemetry {
                     }
                 }
             });
-            // A broken archive was noted when it was opened.
+            // A damaged archive was noted when it was opened.
             if let (Err(source), None) = (visited, &container.damage) {
                 return Err(TelemetryError::Read { path: container.path().to_owned(), source });
             }
         }
-        // Of two releases the newer one's rows come first, and the first row of a time stays.
+        // Rows of the newer release come first, and the first row of a time is kept.
         files.sort_by(|(a, _), (b, _)| b.release.cmp(&a.release));
         for (member, parsed) in &files {
             log.file(member, &parsed.counts);

@@ -1,6 +1,6 @@
 //! `E[α | measured α]`: the slope of a regression on it, against the theory of errors in variables.
 
-use dragfree_gracefo::angular::{BLOCK, BRIDGED, Counts, FEWEST, MOST_PENDING, REACH, Row, Wiener};
+use dragfree_gracefo::angular::{BLOCK, Counts, HALF_LENGTH, MAX_BRIDGED, MAX_PENDING, MIN_SAMPLES, Row, Wiener};
 use dragfree_physics::noise::NoiseShape;
 use dragfree_physics::process::normal;
 use nalgebra::{Matrix3, Vector3};
@@ -83,7 +83,7 @@ fn run(rows: &[Row], noise: NoiseShape) -> (Vec<Row>, Counts) {
     let mut out = Vec::new();
     for (k, row) in rows.iter().enumerate() {
         wiener.next(*row, &mut |r| out.push(r)).expect("a spectrum");
-        assert!(k + 1 - out.len() <= MOST_PENDING, "the lag is bounded");
+        assert!(k + 1 - out.len() <= MAX_PENDING, "the lag is bounded");
     }
     wiener.finish(&mut |r| out.push(r)).expect("a spectrum");
     (out, wiener.counts())
@@ -132,7 +132,7 @@ fn the_slope_is_one_where_that_on_the_measured_is_attenuated() {
             let (filtered, counts) = run(&s.rows, stated(1.0));
             assert_eq!(
                 counts,
-                Counts { filtered: 40_000 - 2 * REACH as u64, as_measured: 0, near_gap: 2 * REACH as u64 }
+                Counts { filtered: 40_000 - 2 * HALF_LENGTH as u64, as_measured: 0, near_gap: 2 * HALF_LENGTH as u64 }
             );
             raw.extend(slopes(&s.rows, &s.channel));
             clean.extend(slopes(&filtered, &s.channel));
@@ -203,10 +203,10 @@ fn with_gaps(gaps: &[(usize, usize)]) -> Series {
 
 #[test]
 fn gaps_are_respected() {
-    let long = BRIDGED + 1;
+    let long = MAX_BRIDGED + 1;
     // Missing at the start; single ones; the longest that is bridged, across the end of the first block too; a gap; a stretch
     // too short; a gap; missing at the end.
-    let gaps = [(0, 5), (700, 1), (1_500, BRIDGED), (BLOCK + 4, 2), (30_000, long), (31_000, 50), (59_990, 10)];
+    let gaps = [(0, 5), (700, 1), (1_500, MAX_BRIDGED), (BLOCK + 4, 2), (30_000, long), (31_000, 50), (59_990, 10)];
     let s = with_gaps(&gaps);
     let (out, counts) = run(&s.rows, stated(1.0));
     assert_eq!(out.len(), s.rows.len());
@@ -219,7 +219,7 @@ fn gaps_are_respected() {
         let stretch = stretches.iter().find(|(a, b)| (*a..*b).contains(&k));
         match stretch {
             _ if missing(k) => assert_eq!(got.alpha_srf_rad_s2, None, "{k}: nothing is invented"),
-            Some((a, b)) if k >= a + REACH && k + REACH < *b => {
+            Some((a, b)) if k >= a + HALF_LENGTH && k + HALF_LENGTH < *b => {
                 let (got, raw) = (got.alpha_srf_rad_s2.expect("a value"), raw.alpha_srf_rad_s2);
                 assert!(
                     raw.is_some_and(|raw| (0..3).all(|i| got[i] != raw[i] && (got[i] - raw[i]).abs() < 6.0 * NOISE))
@@ -237,13 +237,13 @@ fn gaps_are_respected() {
         }
     }
     assert_eq!(counts, expected);
-    assert!(expected.as_measured == 31_000 - 30_000 - long as u64 && (expected.as_measured as usize) < FEWEST);
+    assert!(expected.as_measured == 31_000 - 30_000 - long as u64 && (expected.as_measured as usize) < MIN_SAMPLES);
 }
 
 /// What lies beyond a gap changes nothing before it, and an epoch that is left out is a gap.
 #[test]
 fn nothing_crosses_a_gap() {
-    let s = with_gaps(&[(30_000, BRIDGED + 1)]);
+    let s = with_gaps(&[(30_000, MAX_BRIDGED + 1)]);
     let (whole, _) = run(&s.rows, stated(1.0));
     let (first, _) = run(&s.rows[..30_000], stated(1.0));
     let (second, _) = run(&s.rows[30_004..], stated(1.0));
@@ -255,9 +255,9 @@ fn nothing_crosses_a_gap() {
 
 #[test]
 fn a_saved_filter_goes_on_bit_by_bit() {
-    let s = with_gaps(&[(700, 2), (BLOCK + FEWEST - 1, 3), (40_000, 7)]);
+    let s = with_gaps(&[(700, 2), (BLOCK + MIN_SAMPLES - 1, 3), (40_000, 7)]);
     let (whole, counts) = run(&s.rows, stated(1.0));
-    let cuts = [1, 701, BLOCK + FEWEST, BLOCK + FEWEST + 2, BLOCK + FEWEST + 3, 30_000, 40_003, 40_100];
+    let cuts = [1, 701, BLOCK + MIN_SAMPLES, BLOCK + MIN_SAMPLES + 2, BLOCK + MIN_SAMPLES + 3, 30_000, 40_003, 40_100];
     let mut wiener = Wiener::new(stated(1.0), STEP_NS);
     let mut out = Vec::new();
     for (k, row) in s.rows.iter().enumerate() {
@@ -303,7 +303,10 @@ fn a_grid_that_follows_its_clock_has_no_gap() {
         row.time_ns -= [3_600, 7_200].into_iter().filter(|jump| k > *jump).count() as i64 * STEP_NS / 4;
     }
     let (moved, moved_counts) = run(&s.rows, stated(1.0));
-    assert_eq!(counts, Counts { filtered: 60_000 - 2 - 2 * REACH as u64, as_measured: 0, near_gap: 2 * REACH as u64 });
+    assert_eq!(
+        counts,
+        Counts { filtered: 60_000 - 2 - 2 * HALF_LENGTH as u64, as_measured: 0, near_gap: 2 * HALF_LENGTH as u64 }
+    );
     assert_eq!(counts, moved_counts);
     assert!(even.iter().zip(&moved).all(|(a, b)| a.alpha_srf_rad_s2 == b.alpha_srf_rad_s2));
 }

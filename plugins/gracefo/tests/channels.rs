@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use dragfree_gracefo::Window;
-use dragfree_gracefo::accelerometer::{AttitudeRate, Steps, channel_orf_m_s2, noise_steps};
+use dragfree_gracefo::accelerometer::{AttitudeRate, BlockDifferences, channel_orf_m_s2, noise_block_differences};
 use dragfree_gracefo::archive::Container;
 use dragfree_gracefo::rows::{Rows, parse};
 use dragfree_physics::noise::NoiseShape;
@@ -119,13 +119,13 @@ fn a_gap_has_no_rate() {
 /// White noise of one-sided PSD `S` has means over m samples of variance `S/(2 m dt)`, and steps of twice that.
 #[test]
 fn steps_of_noise_follow_its_spectrum() {
-    let white = noise_steps(&NoiseShape::white(3e-8), 0.1);
+    let white = noise_block_differences(&NoiseShape::white(3e-8), 0.1);
     for (level, step) in white.iter().enumerate() {
         let want = 9e-16 / (0.1 * f64::from(1_u32 << level));
         assert!((step / want - 1.0).abs() < 1e-3, "{level}: {step:e} against {want:e}");
     }
     // A term in f⁻² at a block of one: asd² f_c² · 4π dt ∫₀^{π/2} sin²x/x² dx, and the integral is Si(π) − 2/π.
-    let corner = noise_steps(&NoiseShape::with_corner(3e-8, 5.0, 2), 0.1)[0] - white[0];
+    let corner = noise_block_differences(&NoiseShape::with_corner(3e-8, 5.0, 2), 0.1)[0] - white[0];
     let want = 9e-16 * 25.0 * 4.0 * std::f64::consts::PI * 0.1 * (1.851_937_051_982_466 - std::f64::consts::FRAC_2_PI);
     assert!((corner / want - 1.0).abs() < 1e-5, "{corner:e} against {want:e}");
 }
@@ -133,11 +133,11 @@ fn steps_of_noise_follow_its_spectrum() {
 #[test]
 fn steps_do_not_cross_gaps() {
     let run = |values: &[f64]| {
-        let mut steps = Steps::default();
+        let mut steps = BlockDifferences::default();
         for x in values {
             steps.next(&Vector3::new(*x, 0.0, 1.0));
         }
-        steps.over_noise(&[1.0; 10])
+        steps.ratio_to_noise(&[1.0; 10])
     };
     assert_eq!(run(&[1.0; 8]), None, "seven steps are too few");
     // Nine steps of 2; the one of 90 lies across the gap. Blocks of two come to four steps and do not count.
@@ -152,13 +152,13 @@ fn steps_do_not_cross_gaps() {
 #[test]
 fn the_real_spacecraft_hardly_turns_in_these_ten_seconds() {
     let rows = table("1A", "ACC1A");
-    let noise = noise_steps(&NoiseShape::with_corner(7e-8, 0.01, 2), 0.1);
+    let noise = noise_block_differences(&NoiseShape::with_corner(7e-8, 0.01, 2), 0.1);
     let ratio = |extra: &dyn Fn(usize) -> f64| {
-        let mut steps = Steps::default();
+        let mut steps = BlockDifferences::default();
         for k in 0..rows.time_ns.len() {
             steps.next(&Vector3::from([3, 4, 5].map(|i| rows.columns[i][k] + extra(k))));
         }
-        steps.over_noise(&noise).expect("a hundred rows")
+        steps.ratio_to_noise(&noise).expect("a hundred rows")
     };
     assert!(ratio(&|_| 0.0).iter().all(|r| *r < 3.0), "{:?}", ratio(&|_| 0.0));
     assert!(ratio(&|k| if k == 50 { 1e-5 } else { 0.0 }).iter().all(|r| *r > 10.0));

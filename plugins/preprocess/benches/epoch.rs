@@ -1,5 +1,5 @@
-//! One epoch of 61 columns through the stage, the border included: ten minutes in two batches, after the
-//! opening. Divide by the 6,000 epochs of an iteration.
+//! Cost of 61 columns through the stage and the plugin interface: ten minutes in two batches, 6,000 epochs an
+//! iteration.
 
 #[path = "../tests/common/mod.rs"]
 mod common;

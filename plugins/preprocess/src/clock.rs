@@ -1,9 +1,8 @@
-//! Epochs of the grid, and the phase of a table's samples against them.
+//! Epochs of the grid, and the phase of a table's samples relative to them.
 //!
-//! The grid is a chain of segments, each `origin + round(k · 1e9 / rate)`. A segment begins where the reference table
-//! (the densest mandatory one) begins, where its clock jumps to another phase, and after a gap too long to fill. So
-//! the reference's samples lie on their epochs, within their jitter, before and after a jump; nothing is interpolated
-//! across one, and the row before it is blank, so that no difference of rows spans it.
+//! The grid is a chain of segments, each `origin + round(k · 1e9 / rate)`. A segment begins with the reference table
+//! (the densest mandatory one), where its clock jumps, and after a gap too long to fill. The reference's samples thus
+//! lie on their epochs within their jitter. The row before a jump is blank, so that no difference of rows spans it.
 
 use std::collections::VecDeque;
 
@@ -14,7 +13,7 @@ use crate::bytes::{Reader, StateError, Writer};
 pub(crate) struct Rate {
     period_ns: f64,
     half_ns: i64,
-    /// The period where it is a whole number of nanoseconds.
+    /// The period, if it is a whole number of nanoseconds.
     whole_ns: Option<i64>,
 }
 
@@ -22,7 +21,7 @@ impl Rate {
     pub(crate) fn new(rate_hz: f64) -> Self {
         let period_ns = 1e9 / rate_hz;
         let whole = period_ns.round();
-        // 1e9/rate is within one unit of rounding of the whole number when the rate is one such as 10 or 0.3.
+        // For rates such as 10 or 0.3 the rounding error of 1e9/rate is at most one unit.
         let whole_ns = ((period_ns - whole).abs() <= whole * f64::EPSILON && whole >= 1.0).then_some(whole as i64);
         Self { period_ns, half_ns: (period_ns / 2.0).round() as i64, whole_ns }
     }
@@ -32,7 +31,7 @@ impl Rate {
         self.whole_ns.map_or_else(|| (k as f64 * self.period_ns).round() as i64, |p| k * p)
     }
 
-    /// The `k` whose offset is nearest.
+    /// Index `k` with the nearest offset.
     pub(crate) fn nearest(&self, offset_ns: i64) -> i64 {
         match self.whole_ns {
             Some(p) => (offset_ns + p / 2).div_euclid(p),
@@ -40,7 +39,7 @@ impl Rate {
         }
     }
 
-    /// A part of the period, ns.
+    /// Fraction of the period, ns.
     pub(crate) fn part_ns(&self, part: f64) -> i64 {
         (part * self.period_ns).round() as i64
     }
@@ -53,7 +52,7 @@ impl Rate {
     /// Median phase of `times` against `origin`, ns, within half a period; 0 without times.
     pub(crate) fn phase(&self, origin: i64, times: &[i64]) -> i64 {
         let Some(first) = times.first() else { return 0 };
-        // Phases are taken against the first one: the median of angles on a circle needs a cut away from them.
+        // A median on a circle needs a cut away from the data: phases are relative to the first.
         let mut offsets: Vec<i64> = times.iter().map(|t| self.wrap(t - first)).collect();
         let middle = (offsets.len() - 1) / 2;
         self.wrap(first - origin + *offsets.select_nth_unstable(middle).1)
@@ -67,16 +66,16 @@ struct Segment {
     origin_ns: i64,
 }
 
-/// Where a time belongs.
+/// Assignment of a time to the grid.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Place {
-    /// On this row, which may be one past the last so far or later.
+    /// Row, possibly later than the last row so far.
     Row(i64),
-    /// On no row: before the grid, between two segments, or on the blank row before a segment.
+    /// No row: before the grid, between two segments, or on the blank row before a segment.
     Nowhere,
 }
 
-/// The epochs of all rows that still matter.
+/// Epochs of the rows in use.
 #[derive(Clone, Debug)]
 pub(crate) struct Epochs {
     pub(crate) rate: Rate,
@@ -92,7 +91,7 @@ impl Epochs {
         !self.segments.is_empty()
     }
 
-    /// A new segment from `row` on.
+    /// Begins a segment at a row.
     pub(crate) fn begin(&mut self, first_row: i64, origin_ns: i64) {
         self.segments.push_back(Segment { first_row, origin_ns });
     }
@@ -117,7 +116,7 @@ impl Epochs {
         Place::Nowhere
     }
 
-    /// Row of a time of the newest segment, and the distance from its epoch.
+    /// Row of a time in the newest segment, and the distance from its epoch, ns.
     pub(crate) fn newest(&self, time_ns: i64) -> (i64, i64) {
         self.segments.back().map_or((0, 0), |s| {
             let k = self.rate.nearest(time_ns - s.origin_ns).max(0);
@@ -125,7 +124,7 @@ impl Epochs {
         })
     }
 
-    /// Forgets segments that end before `row`.
+    /// Drops segments that end before `row`.
     pub(crate) fn forget_before(&mut self, row: i64) {
         while self.segments.get(1).is_some_and(|s| s.first_row <= row) {
             self.segments.pop_front();
@@ -154,7 +153,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn ten_hertz_is_exact_for_ever_and_other_rates_round_each_epoch_by_itself() {
+    fn epochs_do_not_accumulate_rounding() {
         let ten = Rate::new(10.0);
         assert_eq!(ten.offset_ns(864_000 * 365 * 50), 86_400 * 365 * 50 * 1_000_000_000);
         let three = Rate::new(3.0);
@@ -162,19 +161,19 @@ mod tests {
             assert_eq!(three.offset_ns(k), (k as f64 * 1e9 / 3.0).round() as i64);
             assert_eq!(three.nearest(three.offset_ns(k) + 150_000_000), k);
         }
-        // No drift: every third epoch of 3 Hz is a whole second.
+        // Every third epoch of 3 Hz is a whole second, without drift.
         assert_eq!(three.offset_ns(3 * 86_400), 86_400 * 1_000_000_000);
     }
 
     #[test]
-    fn a_phase_next_to_the_cut_keeps_one_sign() {
+    fn a_phase_near_half_a_period_keeps_its_sign() {
         let ten = Rate::new(10.0);
         let times: Vec<i64> = (0..21).map(|k| 49_000_000 + k * 100_000_000 + (k % 3 - 1) * 2_000_000).collect();
         assert_eq!(ten.phase(0, &times), 49_000_000);
     }
 
     #[test]
-    fn between_two_segments_there_is_no_row() {
+    fn no_row_lies_between_two_segments() {
         let mut epochs = Epochs::new(Rate::new(10.0));
         epochs.begin(0, 1_000_000_000);
         epochs.begin(5, 1_540_000_000);

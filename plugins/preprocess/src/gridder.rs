@@ -1,12 +1,12 @@
-//! Many irregular tables in, one uniform table out.
+//! Irregular tables in, one uniform table out.
 //!
-//! Every decision depends on the telemetry alone, never on where a batch ends: a row is taken up when all that could
-//! bear on it has come. In order:
-//! 1. [`Series`] guards and cleans the rows of each table;
-//! 2. the opening ten minutes say which table is the reference and which tables are slow;
-//! 3. the reference lays the epochs ([`Epochs`]), the other fast tables take their places on them;
-//! 4. stuck and outlying samples are blanked in blocks of [`BLOCK`] rows;
-//! 5. slow tables are interpolated at the epochs, and the rows go out.
+//! Every decision depends on the telemetry alone, not on batch boundaries: a row is processed when all rows that can
+//! influence it have arrived. In order:
+//! 1. [`Series`] checks and cleans the rows of each table.
+//! 2. The first ten minutes determine the reference table and the slow tables.
+//! 3. The reference defines the epochs ([`Epochs`]); samples of the other fast tables are assigned to them.
+//! 4. Stuck samples and outliers are blanked in blocks of [`BLOCK`] rows.
+//! 5. Slow tables are interpolated to the epochs, and the rows are emitted.
 
 use crate::bytes::{Reader, StateError, Writer};
 use crate::clock::{Epochs, Place, Rate};
@@ -14,106 +14,105 @@ use crate::layout::{Mandatory, TableSpec};
 use crate::outliers::{self, BLOCK, MARGIN};
 use crate::series::{LATEST_NS, Reason, Series, Tally, Window};
 
-/// Telemetry from which rates are learnt, on both sides of the first mandatory row.
-const OPENING_NS: i64 = 600_000_000_000;
+/// Duration of telemetry from which rates are measured, before and after the first mandatory row.
+const RATE_WINDOW_NS: i64 = 600_000_000_000;
 
-/// Samples that must agree before a table's clock is said to have jumped.
-const AGREEING: usize = 20;
+/// Number of samples that must agree on a new phase before a clock jump is declared.
+const PHASE_SAMPLES: usize = 20;
 
-/// After the last row before a gap too long to fill so much is filled nevertheless, for what follows to forget.
-const FORGET_S: f64 = 600.0;
+/// Blank rows inserted before a gap too long to fill, s, so that later stages reset their memory.
+const MAX_BLANK_S: f64 = 600.0;
 
-/// Rows kept after they went out, for the outlier test of the rows that follow.
+/// Emitted rows kept for the outlier test of the rows that follow.
 const HISTORY: i64 = MARGIN as i64;
 
-/// Most rows that wait, and most that one call gives: an hour's gap becomes 36,000 rows at once, and a day's must not
-/// fill the memory. What is over waits for the next call.
-pub(crate) const MOST_ROWS: i64 = 65_536;
+/// Maximum number of waiting rows, and of rows per call. It bounds memory when a long gap becomes rows at once.
+pub(crate) const MAX_ROWS: i64 = 65_536;
 
-/// What can be set.
+/// Settings.
 #[derive(Clone, Debug)]
 pub(crate) struct Config {
     /// Rate of the grid, Hz.
     pub(crate) rate_hz: f64,
     /// Threshold of the outlier test in standard deviations of the second difference; 0 for none.
     pub(crate) outlier_sigma: f64,
-    /// So many equal samples in a row are stuck; 0 for no such test.
+    /// Number of equal consecutive samples that count as stuck; 0 disables the test.
     pub(crate) stuck_samples: u32,
-    /// A slow table is interpolated across, and held beyond its last row for, so many of its intervals.
+    /// Number of its own intervals over which a slow table is interpolated, and held after its last row.
     pub(crate) hold_intervals: f64,
     /// Longest gap that is filled with blank rows, s.
     pub(crate) max_gap_s: f64,
 }
 
-/// Where the rows go.
+/// Destination of the rows.
 pub(crate) trait Sink {
     /// Epochs, Unix ns.
     fn times(&mut self) -> &mut Vec<i64>;
     /// Values of a column of a table.
     fn column(&mut self, table: usize, column: usize) -> &mut Vec<f64>;
-    /// How old the latest row of a table is at each epoch, s, where somebody wants to know.
+    /// Age of the latest row of a table at each epoch, s, if requested.
     fn age(&mut self, table: usize) -> Option<&mut Vec<f64>>;
 }
 
-/// A run of equal samples of one column.
+/// Run of equal samples of one column.
 #[derive(Clone, Copy, Debug, Default)]
 struct Run {
     bits: u64,
     length: u32,
-    /// The column has been something else than zero: one that is zero from the start is not there at all.
+    /// Whether the column has been nonzero; a column that is zero from the start is absent.
     moved: bool,
 }
 
-/// A table whose samples are placed on epochs.
+/// A table whose samples are assigned to epochs.
 #[derive(Clone, Debug)]
 struct Fast {
-    /// Samples lie so much after the epochs, ns; none before the first sample.
+    /// Phase of the samples after the epochs, ns; `None` before the first sample.
     phase_ns: Option<i64>,
-    /// Row of the last sample placed.
+    /// Row of the last sample assigned.
     last_row: i64,
-    /// A second sample came for `last_row`.
+    /// Whether a second sample came for `last_row`.
     crowded: bool,
     /// Rows with a sample.
     filled: u64,
-    /// Cells of the waiting rows, a window per column.
+    /// Values of the waiting rows, per column.
     cells: Vec<Window<f64>>,
     runs: Vec<Run>,
 }
 
-/// How a table is treated.
+/// Treatment of a table.
 #[derive(Clone, Debug)]
 enum Class {
     Fast(Fast),
-    /// Interpolated; interval in ns.
+    /// Interpolated; interval, ns.
     Slow(i64),
 }
 
-/// The longest stretch of epochs that could not be used.
+/// A run of consecutive unusable epochs.
 #[derive(Clone, Copy, Debug, Default)]
-pub(crate) struct Stretch {
+pub(crate) struct EpochRun {
     pub(crate) rows: u64,
     pub(crate) from_ns: i64,
 }
 
-/// What the report needs to know of the grid.
+/// Counts for the report.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Summary {
     pub(crate) used: u64,
     pub(crate) rejected: u64,
-    pub(crate) longest: Stretch,
-    current: Stretch,
-    /// Gaps too long to fill: how many, and the longest, ns and from when.
+    pub(crate) longest: EpochRun,
+    current: EpochRun,
+    /// Gaps too long to fill: number, and the longest with its start, ns.
     pub(crate) cut_gaps: u64,
     pub(crate) longest_cut_ns: i64,
     pub(crate) longest_cut_from_ns: i64,
-    /// Times when the reference's clock jumped and the grid with it, and the first.
+    /// Jumps of the reference's clock: number, and time of the first.
     pub(crate) rephased: u64,
     pub(crate) first_rephased_ns: i64,
 }
 
-/// What was learnt of a table, for the report.
+/// Properties of a table, for the report.
 #[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Learnt {
+pub(crate) struct TableSummary {
     pub(crate) name: String,
     pub(crate) interval_s: Option<f64>,
     pub(crate) interpolated: bool,
@@ -122,7 +121,7 @@ pub(crate) struct Learnt {
     pub(crate) absent: Vec<String>,
 }
 
-/// The grid in the making.
+/// Builds the grid.
 #[derive(Clone, Debug)]
 pub(crate) struct Gridder {
     config: Config,
@@ -130,18 +129,18 @@ pub(crate) struct Gridder {
     classes: Vec<Class>,
     /// Median interval in the opening, ns; 0 where unknown.
     intervals: Vec<i64>,
-    /// Index of the table that lays the epochs, once the opening is over.
+    /// Index of the reference table, once it is known.
     reference: Option<usize>,
     epochs: Epochs,
-    /// Every telemetry row before this has come, Unix ns.
+    /// All telemetry rows before this time have arrived, Unix ns.
     complete_ns: i64,
     /// Time of the first row of a mandatory table.
     first_ns: Option<i64>,
-    /// Time of the reference's last row taken up.
+    /// Time of the last processed row of the reference, Unix ns.
     last_reference_ns: i64,
-    /// First row of `cells`; rows from 0 on.
+    /// First row of `cells`; rows count from 0.
     base: i64,
-    /// Rows made so far, rows whose runs were counted, rows cleaned, rows given.
+    /// Number of rows created, checked for stuck samples, checked for outliers, and emitted.
     rows: i64,
     counted: i64,
     cleaned: i64,
@@ -176,29 +175,29 @@ impl Gridder {
         }
     }
 
-    /// Takes rows of a table as they came.
+    /// Adds rows of a table in telemetry order.
     pub(crate) fn take(&mut self, table: usize, times: &[i64], columns: &[&[f64]]) {
         self.tables[table].take(times, columns);
     }
 
-    /// Gives every row that is ready, or [`MOST_ROWS`]. Every row before `complete_ns` has been taken.
+    /// Emits the rows that are ready, at most [`MAX_ROWS`]. All rows before `complete_ns` have been added.
     pub(crate) fn advance(&mut self, complete_ns: i64, sink: &mut impl Sink) {
-        // At the end of the data hosts say "for ever"; tomorrow's rows are still to come, so that is no promise to keep.
+        // At the end of the data hosts pass a time beyond all rows; a later day may still add rows.
         let complete_ns = if complete_ns < LATEST_NS { complete_ns } else { self.after_last_row() };
         self.complete_ns = self.complete_ns.max(complete_ns);
         let first = self.given;
-        while self.step(false, first + MOST_ROWS, sink) {}
+        while self.step(false, first + MAX_ROWS, sink) {}
     }
 
     fn after_last_row(&self) -> i64 {
         self.tables.iter().filter_map(|t| t.times.as_slice().last()).max().map_or(0, |last| last + 1)
     }
 
-    /// There is no more: gives the rest.
+    /// Ends the data: emits the remaining rows.
     pub(crate) fn flush(&mut self, sink: &mut impl Sink) {
         self.complete_ns = self.complete_ns.max(self.after_last_row());
         while self.step(true, i64::MAX, sink) {}
-        // What has no place now will have none: the grid ends with the reference.
+        // Rows without an epoch remain without one: the grid ends with the reference.
         for (series, class) in self.tables.iter_mut().zip(&self.classes) {
             if matches!(class, Class::Fast(_)) {
                 let rest = series.times.len();
@@ -208,9 +207,9 @@ impl Gridder {
         }
     }
 
-    /// One round; true when another may give more.
+    /// One pass; true if another may emit more.
     fn step(&mut self, flush: bool, most: i64, sink: &mut impl Sink) -> bool {
-        if !self.learnt(flush) {
+        if !self.learn_rates(flush) {
             return false;
         }
         let rows = self.rows;
@@ -220,17 +219,17 @@ impl Gridder {
                 settled_ns = settled_ns.min(self.fill(table, flush));
             }
         }
-        // Blocks of rows must not depend on how many rows may wait.
+        // Block boundaries must not depend on the number of waiting rows.
         self.clean(settled_ns, flush && !blocked);
         let given = self.given;
         self.give(most, flush, sink);
         self.given < most && (self.given > given || self.rows > rows)
     }
 
-    // ---- 2. the opening ----
+    // ---- 2. rates and reference ----
 
-    /// Learns rates and the reference from the opening; false until it is over.
-    fn learnt(&mut self, flush: bool) -> bool {
+    /// Determines rates and the reference table; false while telemetry is insufficient.
+    fn learn_rates(&mut self, flush: bool) -> bool {
         if self.reference.is_some() {
             return true;
         }
@@ -238,18 +237,18 @@ impl Gridder {
         let first = self.tables.iter().filter(mandatory).filter_map(|t| t.times.as_slice().first()).min();
         self.first_ns = self.first_ns.or(first.copied());
         let Some(first_ns) = self.first_ns else {
-            self.forget_early_rows(self.complete_ns);
+            self.drop_early_rows(self.complete_ns);
             return false;
         };
-        if !flush && self.complete_ns < first_ns.saturating_add(OPENING_NS) {
+        if !flush && self.complete_ns < first_ns.saturating_add(RATE_WINDOW_NS) {
             return false;
         }
-        self.forget_early_rows(first_ns);
-        let end_ns = first_ns.saturating_add(OPENING_NS);
+        self.drop_early_rows(first_ns);
+        let end_ns = first_ns.saturating_add(RATE_WINDOW_NS);
         let period_ns = self.epochs.rate.part_ns(1.0);
         self.intervals = self.tables.iter().map(|t| median_interval(t.times.as_slice(), end_ns)).collect();
         self.classes = (0..self.tables.len()).map(|t| self.class_of(t, period_ns)).collect();
-        // The densest mandatory table; the first of those within a tenth of one another.
+        // The densest mandatory table; the first of those whose intervals agree within 10 %.
         let mut best: Option<(usize, i64)> = None;
         for (t, series) in self.tables.iter().enumerate().filter(|(_, t)| t.spec.mandatory) {
             let interval = if self.intervals[t] > 0 { self.intervals[t] } else { i64::MAX / 10 };
@@ -268,9 +267,9 @@ impl Gridder {
         let usual_ns = if spec.name == "ephemeris" { 60_000_000_000 } else { period_ns };
         let interval_ns = match self.intervals[table] {
             0 => stated_ns.unwrap_or(usual_ns),
-            learnt => learnt,
+            measured => measured,
         };
-        // A twentieth more than two periods: half the grid's rate, with jitter.
+        // Up to half the grid's rate, with 5 % margin for jitter.
         if spec.never_interpolated || interval_ns <= period_ns / 20 * 41 {
             let count = spec.columns.len();
             Class::Fast(Fast {
@@ -286,23 +285,23 @@ impl Gridder {
         }
     }
 
-    /// Rows long before the first epoch have no use.
-    fn forget_early_rows(&mut self, first_ns: i64) {
+    /// Drops rows long before the first epoch.
+    fn drop_early_rows(&mut self, first_ns: i64) {
         for series in &mut self.tables {
-            let early = series.times.as_slice().partition_point(|t| *t < first_ns.saturating_sub(OPENING_NS));
+            let early = series.times.as_slice().partition_point(|t| *t < first_ns.saturating_sub(RATE_WINDOW_NS));
             series.tally.add(Reason::Outside, early as u64);
             series.drop_front(early);
         }
     }
 
-    // ---- 3. epochs and places ----
+    // ---- 3. epochs and samples ----
 
-    /// Places the reference's rows and makes rows for them. Gives the time up to which that is settled, and whether
-    /// more rows were needed than may wait.
+    /// Assigns the reference's rows and creates rows for them. Returns the time up to which that is final, and whether
+    /// the limit of waiting rows was reached.
     fn lay_epochs(&mut self, flush: bool) -> (i64, bool) {
         let Some(reference) = self.reference else { return (0, false) };
         let rate = self.epochs.rate;
-        let agree_ns = rate.offset_ns(AGREEING as i64);
+        let agree_ns = rate.offset_ns(PHASE_SAMPLES as i64);
         let off_limit_ns = rate.part_ns(0.25);
         let mut placed: Vec<i64> = Vec::new();
         let mut used = 0;
@@ -325,7 +324,7 @@ impl Gridder {
                     break;
                 }
                 if let Some(phase) = self.agreed_phase(reference, used, time) {
-                    // The last row of the old phase lies half to one and a half intervals back, and is blank.
+                    // The last row of the old phase, half to one and a half intervals back, is blanked.
                     let (last, _) = self.epochs.newest(time - rate.part_ns(1.0));
                     let last = last.max(self.rows - 1);
                     if !self.make_rows(last + 1) {
@@ -336,7 +335,7 @@ impl Gridder {
                     self.put(reference, &placed, used - placed.len());
                     placed.clear();
                     self.blank_row(last);
-                    // Time goes on by half an interval at least: a clock that jumped back loses its first sample.
+                    // Epochs must advance by half an interval: a clock that jumps back loses its first sample.
                     let lost = time + phase - self.epochs.time_ns(last) < rate.part_ns(0.55);
                     let origin = time + phase + if lost { rate.offset_ns(1) } else { 0 };
                     self.epochs.begin(last + 1, origin);
@@ -366,7 +365,7 @@ impl Gridder {
         (waiting.unwrap_or(self.complete_ns).min(self.complete_ns), blocked)
     }
 
-    /// The first segment, or one after a gap too long to fill.
+    /// Begins the first segment, or one after a gap too long to fill.
     fn begin_segment(&mut self, reference: usize, at: usize, time: i64) {
         let rate = self.epochs.rate;
         let phase = rate.phase(time, self.following(reference, at, time));
@@ -377,43 +376,43 @@ impl Gridder {
                 self.summary.longest_cut_ns = gap_ns;
                 self.summary.longest_cut_from_ns = self.last_reference_ns;
             }
-            self.rows += self.forget_rows();
+            self.rows += self.blank_rows_before_cut();
         }
         self.epochs.begin(self.rows, time + phase);
         self.last_reference_ns = time;
     }
 
-    /// Blank rows before a gap too long to fill.
-    fn forget_rows(&self) -> i64 {
-        ((FORGET_S.min(self.config.max_gap_s) * self.config.rate_hz) as i64).max(1)
+    /// Number of blank rows before a gap too long to fill.
+    fn blank_rows_before_cut(&self) -> i64 {
+        ((MAX_BLANK_S.min(self.config.max_gap_s) * self.config.rate_hz) as i64).max(1)
     }
 
-    /// The table's next times within the span in which a clock must agree with itself.
+    /// Times of the table within the span in which samples must agree on a phase.
     fn following(&self, table: usize, at: usize, time: i64) -> &[i64] {
         let times = &self.tables[table].times.as_slice()[at..];
-        let end_ns = time.saturating_add(self.epochs.rate.offset_ns(AGREEING as i64));
+        let end_ns = time.saturating_add(self.epochs.rate.offset_ns(PHASE_SAMPLES as i64));
         &times[..times.partition_point(|t| *t < end_ns)]
     }
 
-    /// Median phase of the samples from `time` on against `time`, if they agree within an eighth of a period.
+    /// Median phase of the samples from `time` on relative to `time`, if they agree within an eighth of a period.
     fn agreed_phase(&self, table: usize, at: usize, time: i64) -> Option<i64> {
         let rate = self.epochs.rate;
         let times = self.following(table, at, time);
         let limit = rate.part_ns(0.125);
-        let agree = times.len() >= AGREEING / 2 && times.iter().all(|t| rate.wrap(t - time).abs() <= limit);
+        let agree = times.len() >= PHASE_SAMPLES / 2 && times.iter().all(|t| rate.wrap(t - time).abs() <= limit);
         agree.then(|| rate.phase(time, times))
     }
 
-    /// Makes rows up to `rows`, whose cells [`Self::grow_cells`] makes later; false when not all of them may wait.
+    /// Creates rows up to `rows`, whose cells [`Self::grow_cells`] adds; false if the limit of waiting rows is reached.
     fn make_rows(&mut self, rows: i64) -> bool {
-        let most = self.given + MOST_ROWS;
+        let most = self.given + MAX_ROWS;
         if self.rows < rows {
             self.rows = rows.min(most).max(self.rows);
         }
         self.rows >= rows
     }
 
-    /// Blank cells for the rows that have none yet.
+    /// Adds blank cells for new rows.
     fn grow_cells(&mut self) {
         let length = (self.rows - self.base) as usize;
         for class in &mut self.classes {
@@ -448,14 +447,14 @@ impl Gridder {
         }
     }
 
-    /// Places a table's rows on the rows there are. Gives the time up to which that is settled.
+    /// Assigns a table's rows to existing rows. Returns the time up to which that is final.
     fn fill(&mut self, table: usize, flush: bool) -> i64 {
         let Class::Fast(fast) = &self.classes[table] else { return i64::MAX };
         let mut phase_ns = fast.phase_ns;
         let rate = self.epochs.rate;
-        let agree_ns = rate.offset_ns(AGREEING as i64);
+        let agree_ns = rate.offset_ns(PHASE_SAMPLES as i64);
         let off_limit_ns = rate.part_ns(0.25);
-        // Epochs before this are laid for good.
+        // Epochs before this time are final.
         let reference_next = self.reference.and_then(|r| self.tables[r].times.as_slice().first().copied());
         let laid_ns = reference_next.unwrap_or(self.complete_ns).min(self.complete_ns) - rate.part_ns(1.0);
         let cut = (laid_ns - self.last_reference_ns) as f64 > self.config.max_gap_s * 1e9;
@@ -478,7 +477,7 @@ impl Gridder {
             let mut place = self.epochs.place(time - phase);
             if let Place::Row(row) = place {
                 if row >= self.rows {
-                    if !cut || row < self.rows + self.forget_rows() {
+                    if !cut || row < self.rows + self.blank_rows_before_cut() {
                         break;
                     }
                     place = Place::Nowhere;
@@ -520,14 +519,14 @@ impl Gridder {
         waiting.unwrap_or(laid_ns).min(laid_ns)
     }
 
-    /// Copies samples, from the `from`-th waiting on, into the cells of their rows.
+    /// Copies samples, from the `from`-th waiting one on, into the cells of their rows.
     fn put(&mut self, table: usize, rows: &[i64], from: usize) {
         let Class::Fast(fast) = &mut self.classes[table] else { return };
         let series = &mut self.tables[table];
-        let mut lonely = rows.first().is_none_or(|r| *r > fast.last_row && *r >= self.given);
-        lonely &= rows.windows(2).all(|w| w[0] < w[1]);
+        let mut one_per_row = rows.first().is_none_or(|r| *r > fast.last_row && *r >= self.given);
+        one_per_row &= rows.windows(2).all(|w| w[0] < w[1]);
         let base = self.base;
-        if lonely {
+        if one_per_row {
             for (cells, source) in fast.cells.iter_mut().zip(&series.columns) {
                 let cells = cells.as_mut_slice();
                 let source = &source.as_slice()[from..from + rows.len()];
@@ -546,7 +545,7 @@ impl Gridder {
             if *row < self.given || *row < fast.last_row {
                 series.tally.add(Reason::Outside, 1);
             } else if *row == fast.last_row {
-                // Two samples for one epoch: a slip of the clock. Neither is used.
+                // Two samples for one epoch: the clock slipped, and neither is used.
                 series.tally.add(Reason::Crowded, if fast.crowded { 1 } else { 2 });
                 if !fast.crowded {
                     fast.crowded = true;
@@ -567,7 +566,7 @@ impl Gridder {
 
     // ---- 4. stuck and outlying samples ----
 
-    /// Cleans whole blocks of rows that no sample can reach any more.
+    /// Cleans complete blocks of final rows.
     fn clean(&mut self, settled_ns: i64, flush: bool) {
         let mut settled = self.rows;
         if !flush {
@@ -575,7 +574,7 @@ impl Gridder {
             let earlier = self.counted;
             while settled > earlier && self.epochs.time_ns(settled - 1) >= limit {
                 settled = match self.epochs.place(limit) {
-                    // Straight there when the last segment reaches back so far.
+                    // Direct lookup if the last segment reaches back far enough.
                     Place::Row(row) if row < settled - 1 && self.epochs.time_ns(row) < limit => row + 1,
                     _ => settled - 1,
                 };
@@ -593,7 +592,7 @@ impl Gridder {
         }
     }
 
-    /// Blanks samples that repeat themselves, up to row `end`.
+    /// Blanks stuck samples up to row `end`.
     fn count_runs(&mut self, end: i64) {
         let stuck = self.config.stuck_samples;
         let (from, to) = ((self.counted - self.base) as usize, (end.max(self.counted) - self.base) as usize);
@@ -648,9 +647,9 @@ impl Gridder {
         }
     }
 
-    // ---- 5. rows out ----
+    // ---- 5. output ----
 
-    /// How far beyond an epoch slow tables must be complete, ns.
+    /// Time after an epoch up to which slow tables must have arrived, ns.
     fn look_ahead_ns(&self) -> i64 {
         let slow =
             self.classes.iter().filter_map(|c| if let Class::Slow(interval) = c { Some(*interval) } else { None });
@@ -705,16 +704,15 @@ impl Gridder {
         self.epochs.forget_before(keep);
     }
 
-    /// Linear between two rows of a slow table no more than the hold apart; the last row's value for as long as the
-    /// hold, NaN beyond. Flags are held. The error of a linear step of interval T is at most `max|x¨| T²/8`: 3 m for
-    /// an orbit at 60 s, 2e-11 for the components of a unit vector that turns with the Earth around the Sun, and a
-    /// unit vector is shortened by as much.
+    /// Linear interpolation between rows of a slow table within the hold time; after the last row its value for the
+    /// hold time, then NaN. Flags are held. The error over an interval T is at most `max|ẍ| T²/8`, which is negligible
+    /// for orbits and directions at one packet per minute.
     fn interpolate(&mut self, table: usize, interval_ns: i64, epochs: &[i64], sink: &mut impl Sink) {
         let series = &mut self.tables[table];
         let times = series.times.as_slice();
         let across = across_ns(interval_ns, self.config.hold_intervals);
         let hold = (interval_ns as f64 * self.config.hold_intervals) as i64;
-        // Row of the table before each epoch with the weight of the next one; none where nothing is near.
+        // Row of the table before each epoch, with the weight of the next row; `None` beyond the hold time.
         let mut at = 0;
         let mut weights: Vec<Option<(usize, f64)>> = Vec::with_capacity(epochs.len());
         for &epoch in epochs {
@@ -747,10 +745,10 @@ impl Gridder {
         series.drop_front(at);
     }
 
-    /// Counts the epochs that can be used: all that is mandatory for both is there, and one test mass is whole. The other may be
-    /// silent for a while, or for good.
+    /// Counts usable epochs: all columns needed in common, and all of at least one test mass.
     fn summarise(&mut self, times: &[i64], window: std::ops::Range<usize>) {
-        // A bit for what every epoch needs, and two for each test mass: x by one way or the other, and all the rest of it.
+        // Bits: one for the columns needed in common, and two per test mass, for x by either readout and for the
+        // others.
         const REST: u64 = 1 << 8;
         let (one, each) = (|tm: u8| 1u64 << tm, |tm: u8| 1u64 << (2 + tm));
         self.mask.clear();
@@ -803,8 +801,8 @@ impl Gridder {
 
     // ---- report and state ----
 
-    /// What was learnt of each table.
-    pub(crate) fn learnt_tables(&self) -> Vec<Learnt> {
+    /// Properties of each table, for the report.
+    pub(crate) fn table_summaries(&self) -> Vec<TableSummary> {
         let given = self.summary.used + self.summary.rejected;
         let describe = |(t, series): (usize, &Series)| {
             let fast = if let Some(Class::Fast(fast)) = self.classes.get(t) { Some(fast) } else { None };
@@ -813,7 +811,7 @@ impl Gridder {
                 let name = |c: usize| series.spec.columns[c].name.clone();
                 (0..fast.runs.len()).filter(still).map(name).collect()
             });
-            Learnt {
+            TableSummary {
                 name: series.spec.name.clone(),
                 interval_s: (self.intervals[t] > 0).then(|| self.intervals[t] as f64 * 1e-9),
                 interpolated: matches!(self.classes.get(t), Some(Class::Slow(_))),
@@ -825,12 +823,12 @@ impl Gridder {
         self.tables.iter().enumerate().map(describe).collect()
     }
 
-    /// Name of the reference.
+    /// Name of the reference table.
     pub(crate) fn reference_name(&self) -> Option<&str> {
         self.reference.map(|r| self.tables[r].spec.name.as_str())
     }
 
-    /// Begins a new count: what was counted so far has been reported.
+    /// Resets the counts after a report.
     pub(crate) fn reset_counts(&mut self) {
         self.summary = Summary::default();
         for (t, series) in self.tables.iter_mut().enumerate() {
@@ -874,7 +872,7 @@ impl Gridder {
         w.0
     }
 
-    /// Takes a state back; on an error nothing has changed.
+    /// Restores a state; on an error nothing has changed.
     pub(crate) fn load(&mut self, state: &[u8]) -> Result<(), StateError> {
         let specs = self.tables.iter().map(|t| t.spec.clone()).collect();
         let mut new = Self::new(self.config.clone(), specs);
@@ -920,7 +918,7 @@ impl Gridder {
         Ok(())
     }
 
-    /// Everything that must be equal for a state to fit.
+    /// Settings and columns that must be equal for a state to fit.
     fn fingerprint(&self) -> String {
         let c = &self.config;
         let mut text =
@@ -933,15 +931,15 @@ impl Gridder {
     }
 }
 
-/// First words of a state.
+/// Identifier of the state's format.
 const MAGIC: &str = "dragfree preprocess state 1";
 
-/// Rows of a slow table no more than this apart are neighbours: the hold, with a tenth for jitter.
+/// Largest distance of neighbouring rows of a slow table, ns: the hold time plus 10 % for jitter.
 fn across_ns(interval_ns: i64, hold_intervals: f64) -> i64 {
     (interval_ns as f64 * hold_intervals * 1.1) as i64
 }
 
-/// Median interval of the times before `end_ns`; 0 where there are fewer than three.
+/// Median interval of the times before `end_ns`; 0 with fewer than three times.
 fn median_interval(times: &[i64], end_ns: i64) -> i64 {
     let times = &times[..times.partition_point(|t| *t < end_ns)];
     let mut intervals: Vec<i64> = times.windows(2).map(|w| w[1] - w[0]).collect();
@@ -1008,8 +1006,8 @@ impl Summary {
         Ok(Self {
             used,
             rejected,
-            longest: Stretch { rows: g, from_ns: a.cast_signed() },
-            current: Stretch { rows: h, from_ns: b.cast_signed() },
+            longest: EpochRun { rows: g, from_ns: a.cast_signed() },
+            current: EpochRun { rows: h, from_ns: b.cast_signed() },
             cut_gaps,
             longest_cut_ns: c.cast_signed(),
             longest_cut_from_ns: d.cast_signed(),

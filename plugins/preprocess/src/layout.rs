@@ -1,4 +1,4 @@
-//! What the tables of the telemetry mean: which columns a status flag covers, which are readouts, what they must be.
+//! Meaning of the telemetry's tables: status flags and the columns they cover, readouts, units and frames.
 
 use dragfree_physics::mission::Limits;
 use dragfree_sdk::Column;
@@ -8,44 +8,44 @@ use dragfree_sdk::Column;
 pub(crate) struct ColumnSpec {
     /// Name in its table, `tm1.r_orf_m.x`.
     pub(crate) name: String,
-    /// Largest magnitude that is not refused, SI.
+    /// Largest valid magnitude, SI.
     pub(crate) limit: f64,
-    /// A flag: held, never interpolated.
+    /// A flag, which is held rather than interpolated.
     pub(crate) flag: bool,
-    /// An instrument's measurement: repeating itself exactly means that it is stuck.
+    /// An instrument's measurement; exact repetition means that it is stuck.
     pub(crate) instrument: bool,
-    /// A displacement or an angle: cannot leave its line and come back.
+    /// A displacement or an angle, which the outlier test applies to.
     pub(crate) readout: bool,
-    /// Its absence makes an epoch unusable.
+    /// Whether an epoch needs it.
     pub(crate) mandatory: Mandatory,
 }
 
 /// Whether an epoch needs a column.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Mandatory {
-    /// It does not.
+    /// Not needed.
     No,
-    /// It does.
+    /// Needed.
     Yes,
-    /// Of this test mass it needs one such column: x by interferometer or by capacitive readout. An epoch needs one test mass.
+    /// One of this test mass's columns is needed: x by interferometer or by capacitive readout. One test mass suffices.
     OneOf(u8),
-    /// Of this test mass it needs every such column.
+    /// All of this test mass's columns are needed.
     EachOf(u8),
 }
 
-/// A status column and what it covers.
+/// A status column and the columns it covers.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct StatusRule {
     /// Index of the status column.
     pub(crate) status: usize,
-    /// Bits that count.
+    /// Relevant bits.
     mask: u64,
-    /// Columns that are not to be used when one of the bits is set.
+    /// Columns that are invalid while one of the bits is set.
     pub(crate) covers: Vec<usize>,
 }
 
 impl StatusRule {
-    /// True when a status says "do not use". A status that is no whole number says so with every bit.
+    /// Whether a status invalidates its columns. A value that is not a whole number counts as all bits.
     pub(crate) fn raised(&self, status: f64) -> bool {
         let bits = if status >= 0.0 && status.fract() == 0.0 && status < 1.8e19 { status as u64 } else { u64::MAX };
         bits & self.mask != 0
@@ -63,13 +63,13 @@ pub(crate) struct TableSpec {
     pub(crate) status: Vec<StatusRule>,
     /// Rate that the telemetry states, Hz.
     pub(crate) stated_rate_hz: Option<f64>,
-    /// Never interpolated, whatever its rate: instruments and commands.
+    /// An instrument or a command, never interpolated whatever its rate.
     pub(crate) never_interpolated: bool,
-    /// One of the tables without which there is no grid.
+    /// A mandatory table.
     pub(crate) mandatory: bool,
 }
 
-/// What a column of `telemetry.proto` must be: unit and frame. None for columns that it does not define.
+/// Unit and frame of a column by `telemetry.proto`; `None` for columns that it does not define.
 pub(crate) fn expected(table: &str, column: &str) -> Option<(&'static str, &'static str)> {
     let parts: Vec<&str> = column.split('.').collect();
     let orf = match parts[0] {
@@ -101,7 +101,7 @@ pub(crate) fn grid_name(table: &str, column: &str, only_column: bool) -> String 
     if only_column && column == "value" { table } else { format!("{table}.{column}") }
 }
 
-/// What is known of a table from its columns.
+/// Specification of a table from its columns.
 pub(crate) fn table_spec(
     name: &str,
     columns: &[&Column],
@@ -136,7 +136,7 @@ pub(crate) fn table_spec(
     }
 }
 
-/// The rate that a column's metadata state, Hz.
+/// Rate stated by a column's metadata, Hz.
 pub(crate) fn stated_rate_hz(columns: &[&Column]) -> Option<f64> {
     columns
         .iter()
@@ -148,8 +148,8 @@ fn is_status(column: &str) -> bool {
     column == "status" || column.ends_with(".status")
 }
 
-/// A column `P.status` covers the columns below `P`. `dws.status` has a bit for each of three groups; a bit nobody
-/// has defined covers all of them.
+/// Status rules: `P.status` covers the columns below `P`. `dws.status` has one bit for each of three groups; an
+/// undefined bit covers all of them.
 fn status_rules(table: &str, columns: &[&Column]) -> Vec<StatusRule> {
     let below = |prefix: &str| -> Vec<usize> {
         let covered = |c: &Column| !is_status(&c.name) && c.name.starts_with(prefix);
@@ -179,7 +179,7 @@ fn needed(table: &str, mandatory: bool, columns: &[&Column], test_masses: &[&str
         ("dws", _) if mandatory && column.name.starts_with("sc_crf_rad.") => Mandatory::Yes,
         ("is" | "dws" | "ifo", _) => Mandatory::No,
         _ if mandatory => {
-            // A mission's own instrument: its accelerations where it has any, else all that it measures.
+            // A mission's own instrument: its accelerations if it has any, otherwise all its measurements.
             let acceleration = |c: &Column| c.unit == "m s-2" || c.unit == "rad s-2";
             let any = columns.iter().any(|c| acceleration(c));
             let measured = !is_status(&column.name) && !column.unit.is_empty() && column.unit != "1";
@@ -195,7 +195,7 @@ mod tests {
     use crate::testing::columns;
 
     #[test]
-    fn a_status_covers_what_lies_below_it() {
+    fn a_status_covers_the_columns_below_it() {
         let owned =
             columns("dws", &["tm1.theta_orf_rad", "tm2.theta_orf_rad", "sc_crf_rad.phi", "sc_crf_rad.psi", "status"]);
         let all: Vec<&Column> = owned.iter().collect();
@@ -221,7 +221,7 @@ mod tests {
     }
 
     #[test]
-    fn the_contract_states_unit_and_frame() {
+    fn telemetry_columns_have_unit_and_frame() {
         assert_eq!(expected("is", "tm2.r_orf_m.y"), Some(("m", "ORF_2")));
         assert_eq!(expected("dws", "sc_crf_rad.phi"), Some(("rad", "CRF")));
         assert_eq!(expected("command", "mps_torque_srf_nm.x"), Some(("N m", "SRF")));

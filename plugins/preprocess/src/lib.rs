@@ -1,16 +1,14 @@
-//! Stage `preprocess`: every irregular table of the telemetry onto one uniform grid of epochs.
+//! Stage `preprocess`: brings every irregular table of the telemetry onto one uniform grid of epochs.
 //!
-//! A value that cannot be trusted becomes NaN and is counted by table and reason; nothing is dropped in silence and no
-//! instrument is interpolated. [`Preprocess`] is the stage; the parts are
-//! `series` (guards and cleans a table's rows), `clock` (epochs and phases), `outliers` (the robust test), `layout`
-//! (what columns mean) and `gridder` (the order of it all).
+//! An invalid value becomes NaN and is counted by table and reason; no instrument is interpolated. [`Preprocess`] is
+//! the stage. `series` checks and cleans a table's rows, `clock` holds epochs and phases, `outliers` the robust test,
+//! `layout` the meaning of columns, `gridder` the sequence of steps.
 //!
-//! Two clocks that disagree are never reconciled by interpolation:
-//! * samples within half an interval of their epoch, after the table's constant phase is taken off, are its samples;
-//! * when twenty samples agree on another phase, the clock has jumped: the row before is blank and, if it was the
-//!   reference's clock, the epochs go on with the new phase;
-//! * at another rate than the mission's (9.7 Hz), samples and epochs slip past each other: an epoch without a sample,
-//!   or with two, is blank.
+//! Samples are assigned to epochs without interpolation:
+//! * A sample within half an interval of an epoch, after removal of the table's constant phase, belongs to it.
+//! * If twenty samples agree on another phase, the clock has jumped. The row before the jump is blank. If it is the
+//!   reference's clock, the epochs continue with the new phase.
+//! * At a rate other than the mission's, samples slip against the epochs: an epoch with no sample, or two, is blank.
 
 mod bytes;
 mod clock;

@@ -1,29 +1,29 @@
-//! Samples that leave their neighbours' line and come back: the signature of a bad readout, never of a motion.
+//! Outlier test: up to three samples that leave the line of their neighbours and return to it.
 //!
-//! A readout of a displacement or an angle is the double integral of an acceleration. A kick bends its line, a
-//! regulated thrust pulse shifts it, a lock of a phase meter steps it; none of them brings it back onto the *same*
-//! line within three samples. So a run of one to three samples is an outlier only when
-//! 1. both of its ends deviate from the chord between their neighbours by more than `sigma/2` robust standard
-//!    deviations of the second difference (for one sample: its second difference exceeds `sigma`), and
+//! A displacement or an angle is the double integral of an acceleration. A force bends its line, a thrust pulse shifts
+//! it and a phase-meter slip steps it; none returns to the *same* line within three samples. A run of one to three
+//! samples is an outlier if
+//! 1. both of its ends deviate from the chord between their neighbours by more than `sigma/2` robust standard deviations
+//!    of the second difference (for one sample: its second difference exceeds `sigma`), and
 //! 2. the slopes before and after the run agree with the chord within a quarter of that deviation, and
-//! 3. the deviation also stands out from the second differences of the sixteen rows around it.
+//! 3. the deviation exceeds the same multiple of the local scale, from the sixteen rows around it.
 //!
-//! The standard deviation comes from the upper quartile of |D²| over a block of rows: for Gaussian noise,
-//! `1.1503 σ`; untouched by 8 % of bad samples; zero, which switches the test off, for a quantised readout
-//! that seldom moves. In Gaussian noise of any spectrum, condition 1 alone is met with probability
-//! `erfc(sigma · 0.85 / √2)` per sample where the quartile of a block is 15 % low: below 1e-9 from `sigma` = 7.3 on.
+//! The standard deviation comes from the upper quartile of |D²| over a block, `1.1503 σ` for Gaussian noise. It
+//! tolerates 8 % of bad samples and is zero, which disables the test, for a quantised readout that seldom changes. With
+//! a quartile 15 % too low, condition 1 alone has the false alarm probability `erfc(sigma · 0.85/√2)` per sample: below
+//! 1e-9 from 7.3 on.
 
-/// Rows before and after a block that the test looks at.
+/// Rows before and after a block that the test reads.
 pub(crate) const MARGIN: usize = 12;
 
-/// Rows tested with one scale.
+/// Rows that share one robust scale.
 pub(crate) const BLOCK: usize = 256;
 
-/// Fewest second differences from which a scale is taken.
-const FEWEST: usize = 32;
+/// Minimum number of second differences for a scale.
+const MIN_DIFFERENCES: usize = 32;
 
-/// Longest run of bad samples.
-const LONGEST_RUN: usize = 3;
+/// Maximum length of an outlier run.
+const MAX_RUN: usize = 3;
 
 /// Upper quartile of |x| for a standard normal x.
 const QUARTILE: f64 = 1.150_349_380_376_008;
@@ -31,8 +31,7 @@ const QUARTILE: f64 = 1.150_349_380_376_008;
 /// Median of |x| for a standard normal x.
 const MEDIAN: f64 = 0.674_489_750_196_081_7;
 
-/// Makes outliers among `x[from..to]` NaN and returns how many; values outside are only looked at.
-/// `scratch` saves an allocation.
+/// Replaces outliers among `x[from..to]` by NaN and returns their number; reads values outside. `scratch` is a buffer.
 pub(crate) fn remove(x: &mut [f64], from: usize, to: usize, sigma: f64, scratch: &mut Vec<f64>) -> u64 {
     let (first, last) = (from.max(1), to.min(x.len().saturating_sub(1)));
     if last <= first {
@@ -42,13 +41,13 @@ pub(crate) fn remove(x: &mut [f64], from: usize, to: usize, sigma: f64, scratch:
     scratch.extend(x[first - 1..=last].windows(3).map(|w| (w[0] - 2.0 * w[1] + w[2]).abs()));
     let largest = scratch.iter().copied().fold(0.0, f64::max);
     scratch.retain(|d| !d.is_nan());
-    if scratch.len() < FEWEST {
+    if scratch.len() < MIN_DIFFERENCES {
         return 0;
     }
     let quartile = scratch.len() * 3 / 4;
     let scale = *scratch.select_nth_unstable_by(quartile, f64::total_cmp).1 / QUARTILE;
     let threshold = sigma * scale;
-    // Nearly always the end: nothing in the block stands out.
+    // The common case: nothing in the block exceeds the threshold.
     if scale <= 0.0 || largest <= threshold {
         return 0;
     }
@@ -67,9 +66,9 @@ pub(crate) fn remove(x: &mut [f64], from: usize, to: usize, sigma: f64, scratch:
     removed
 }
 
-/// Length of a run of bad samples that begins at `a`.
+/// Length of an outlier run that begins at `a`.
 fn run_at(x: &[f64], a: usize, threshold: f64, sigma: f64) -> Option<usize> {
-    (1..=LONGEST_RUN).find(|&length| {
+    (1..=MAX_RUN).find(|&length| {
         let b = a + length - 1;
         if a < 2 || b + 2 >= x.len() {
             return false;
@@ -86,7 +85,7 @@ fn run_at(x: &[f64], a: usize, threshold: f64, sigma: f64) -> Option<usize> {
     })
 }
 
-/// Standard deviation of the second difference around a run, from the median; 0 where there are too few rows.
+/// Standard deviation of the second difference around a run, from the median; 0 with too few rows.
 fn local_scale(x: &[f64], a: usize, b: usize) -> f64 {
     let second = |k: usize| (x[k - 1] - 2.0 * x[k] + x[k + 1]).abs();
     let before = (a.saturating_sub(10).max(1)..a.saturating_sub(1)).map(second);
@@ -106,7 +105,7 @@ mod tests {
 
     const SIGMA: f64 = 20.0;
 
-    /// A slow swing with white noise of 1 unit.
+    /// Slow oscillation with unit white noise.
     fn readout(rows: usize, seed: u64) -> Vec<f64> {
         let mut noise = Noise::new(seed);
         (0..rows).map(|k| 50.0 * (k as f64 * 0.02).sin() + noise.gauss()).collect()
@@ -141,17 +140,16 @@ mod tests {
         assert_eq!(removed_rows(x, SIGMA), bad);
     }
 
-    /// 200,000 samples at sigma = 7.3: expected false alarms below 2e-4, so one is a failure at that level.
-    /// At 3 the same data must lose samples, or the test would see nothing.
+    /// Expected false alarms below 2e-4 at sigma = 7.3. At 3 the same data must lose samples.
     #[test]
-    fn nothing_in_gaussian_noise_is_an_outlier() {
+    fn gaussian_noise_has_no_outliers() {
         let x = readout(200_000, 11);
         assert!(removed_rows(x.clone(), 7.3).is_empty());
         assert!(!removed_rows(x, 3.0).is_empty());
     }
 
     #[test]
-    fn kicks_steps_pulses_and_louder_stretches_are_motions() {
+    fn dynamic_signals_and_noise_bursts_are_kept() {
         let mut shapes: Vec<Vec<f64>> = Vec::new();
         let after = |k: usize, f: &dyn Fn(f64) -> f64| -> Vec<f64> {
             (0..1024).map(|i| if i < k { 0.0 } else { f((i - k) as f64) }).collect()
@@ -169,7 +167,7 @@ mod tests {
             let x: Vec<f64> = readout(1024, 5).iter().zip(shape).map(|(a, b)| a + b).collect();
             assert!(removed_rows(x, SIGMA).is_empty(), "shape {s}");
         }
-        // Two seconds of noise a hundred times louder.
+        // Two seconds of noise 100 times larger.
         let mut noise = Noise::new(8);
         let mut x = readout(1024, 6);
         x[500..520].iter_mut().for_each(|v| *v += 100.0 * noise.gauss());

@@ -1,4 +1,4 @@
-//! The rows of one telemetry table on their way to the grid: guarded, cleaned, counted.
+//! Rows of one telemetry table before they reach the grid: checks, cleaning, counts.
 
 use crate::bytes::{Reader, StateError, Writer};
 use crate::layout::TableSpec;
@@ -46,22 +46,22 @@ impl<T: Copy> Window<T> {
     }
 }
 
-/// Why a row or a value did not reach the grid, or what else was noticed about it.
+/// Why a row or a value is not on the grid, or a remark about it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Reason {
     /// Row: same time and values as the one before.
     Duplicate,
-    /// Row: same time, other values; neither of the two can be trusted.
+    /// Row: same time, other values; both rows are dropped.
     Conflicting,
-    /// Row: earlier than one already taken.
+    /// Row: earlier than the row before it.
     Late,
     /// Row: a time before 1970 or after 2116.
     BadTime,
-    /// Row: two rows of one table belong to the same epoch; neither is used, so that the slip is visible as a gap.
+    /// Row: two rows of a table belong to one epoch; both are dropped, so that the slip shows as a gap.
     Crowded,
-    /// Row: before the grid's first epoch, after its last, or within a gap that the grid leaves out.
+    /// Row: before the first epoch, after the last, or in a gap that the grid omits.
     Outside,
-    /// Row: at the last epoch before the table's clock jumped; left out, so that no difference spans the jump.
+    /// Row: last epoch before the table's clock jumped; dropped, so that no difference spans the jump.
     BeforeJump,
     /// Row: placed, but more than a quarter of an interval from its epoch.
     OffPhase,
@@ -75,7 +75,7 @@ pub(crate) enum Reason {
     Limit,
     /// Value: repeated exactly.
     Stuck,
-    /// Value: left its neighbours' line and came back.
+    /// Value: outlier, see `outliers`.
     Outlier,
     /// The table's clock jumped.
     ClockJump,
@@ -103,15 +103,15 @@ impl Reason {
         (Self::ClockJump, "clock_jumps"),
     ];
 
-    /// Corruption rather than operation: data that were sent and cannot be used.
+    /// Reasons that mean corrupted data rather than normal operation.
     pub(crate) const LOSSES: [Self; 5] = [Self::Conflicting, Self::Late, Self::BadTime, Self::Crowded, Self::Infinite];
 }
 
-/// Counts by [`Reason`], and rows in and on the grid.
+/// Counts by [`Reason`], with rows received and placed.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Tally {
     counts: [u64; REASONS],
-    /// Rows given.
+    /// Rows received.
     pub(crate) rows_in: u64,
     /// Rows on the grid, or held for interpolation.
     pub(crate) rows_placed: u64,
@@ -140,19 +140,19 @@ impl Tally {
     }
 }
 
-/// Times outside this are garbage; the bound keeps every difference within an i64.
+/// Upper bound of valid times; it keeps every difference within an i64.
 pub(crate) const LATEST_NS: i64 = 1 << 62;
 
-/// One table's rows that wait for their place.
+/// Rows of one table that wait for assignment to epochs.
 #[derive(Clone, Debug)]
 pub(crate) struct Series {
     pub(crate) spec: TableSpec,
     pub(crate) times: Window<i64>,
     pub(crate) columns: Vec<Window<f64>>,
     pub(crate) tally: Tally,
-    /// Time of the last row taken or refused as conflicting.
+    /// Time of the last row accepted, or dropped as conflicting.
     last_time: Option<i64>,
-    /// The row of `last_time` was refused as conflicting.
+    /// Whether the row of `last_time` was dropped as conflicting.
     conflicting: bool,
 }
 
@@ -162,7 +162,7 @@ impl Series {
         Self { spec, times: Window::default(), columns, tally: Tally::default(), last_time: None, conflicting: false }
     }
 
-    /// Takes rows as they came: `times` and one slice per column.
+    /// Adds rows in telemetry order: `times`, Unix ns, and one slice per column.
     pub(crate) fn take(&mut self, times: &[i64], columns: &[&[f64]]) {
         self.tally.rows_in += times.len() as u64;
         let mut last = self.last_time.unwrap_or(-1);
@@ -197,7 +197,7 @@ impl Series {
         }
         match self.last_time {
             Some(last) if t < last => return self.tally.add(Reason::Late, 1),
-            Some(last) if t == last => return self.take_twin(t, row),
+            Some(last) if t == last => return self.push_same_time(t, row),
             _ => {}
         }
         let mut tally = std::mem::take(&mut self.tally);
@@ -211,13 +211,13 @@ impl Series {
         self.conflicting = false;
     }
 
-    /// A second row of the same time.
-    fn take_twin(&mut self, t: i64, row: &[f64]) {
+    /// Handles a row with the time of the row before.
+    fn push_same_time(&mut self, t: i64, row: &[f64]) {
         if self.conflicting {
             return self.tally.add(Reason::Conflicting, 1);
         }
         if self.times.as_slice().last() != Some(&t) {
-            // Its twin is on the grid already, which the host's promise of complete times rules out.
+            // The first row is on the grid already; possible only if the host violates `complete_until_ns`.
             return self.tally.add(Reason::Late, 1);
         }
         let clean = self.clean(row, &mut Tally::default());
@@ -232,7 +232,7 @@ impl Series {
         }
     }
 
-    /// A row with every refused value NaN.
+    /// The row with invalid values replaced by NaN.
     fn clean(&self, row: &[f64], tally: &mut Tally) -> Vec<f64> {
         let mut flagged = vec![false; row.len()];
         for rule in &self.spec.status {
@@ -255,7 +255,7 @@ impl Series {
             .collect()
     }
 
-    /// Forgets the first `count` rows.
+    /// Drops the first `count` rows.
     pub(crate) fn drop_front(&mut self, count: usize) {
         self.times.drop_front(count);
         self.columns.iter_mut().for_each(|c| c.drop_front(count));

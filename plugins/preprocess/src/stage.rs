@@ -1,4 +1,4 @@
-//! The stage: columns in, columns out, and what the product says about them.
+//! The stage: links columns, feeds the gridder, and writes the report.
 
 use chrono::DateTime;
 use dragfree_physics::mission::Mission;
@@ -6,25 +6,25 @@ use dragfree_sdk::prelude::*;
 use serde_json::json;
 use std::collections::BTreeMap;
 
-use crate::gridder::{Config, Gridder, Learnt, Sink};
+use crate::gridder::{Config, Gridder, Sink, TableSummary};
 use crate::layout::{expected, grid_name, stated_rate_hz, table_spec};
 use crate::series::Reason;
 
-/// Irregular tables of telemetry in, the uniform table `grid` out.
+/// Stage that turns irregular telemetry tables into the uniform table `grid`.
 #[derive(Debug)]
 pub struct Preprocess {
     mission: Mission,
     mandatory: Vec<String>,
     config: Config,
-    /// Per table the columns read and the columns written.
+    /// Columns read and written, per table.
     tables: Vec<(Vec<In>, Vec<Out>)>,
-    /// The table of `/ephemeris` and the column of its age: on board, the last packet is held.
+    /// The table `ephemeris` and the column of its age: on board the last packet is held.
     age: Option<(usize, Out)>,
     grid: Option<Table>,
     gridder: Option<Gridder>,
 }
 
-/// Rows go straight into the host's columns.
+/// Sink that writes into the host's columns.
 struct Host<'a> {
     output: &'a mut Outputs,
     grid: Table,
@@ -46,7 +46,7 @@ impl Sink for Host<'_> {
 }
 
 fn not_linked() -> PluginError {
-    PluginError::fatal("preprocess: called before it was linked; the host must link a stage before it gives it data")
+    PluginError::fatal("preprocess: process called before link")
 }
 
 impl Stage for Preprocess {
@@ -54,41 +54,41 @@ impl Stage for Preprocess {
         id: "preprocess",
         version: env!("CARGO_PKG_VERSION"),
         licence: "MIT OR Apache-2.0",
-        description: "Brings all telemetry onto one grid of epochs; gaps, duplicates, status flags and outliers become NaN",
+        description: "Brings all telemetry onto one grid of epochs; invalid and missing values become NaN",
         parameters: &[
             Parameter::text_list(
                 "mandatory",
                 &["is", "dws"],
-                "topics without which nothing can be calibrated; the densest lays the epochs",
+                "topics that a calibration needs; the densest defines the epochs",
             ),
             Parameter::f64(
                 "outlier_sigma",
                 "1",
                 10.0,
                 0.0..=1e9,
-                "a displacement or angle that leaves its line by more than this and comes back is refused, in standard \
-                 deviations of its second difference; below 7.3 Gaussian noise raises false alarms; 0 = off",
+                "outlier threshold for displacements and angles, in standard deviations of their second difference; below 7.3 \
+                 Gaussian noise raises false alarms; 0 = off",
             ),
             Parameter::i64(
                 "stuck_samples",
                 "1",
                 10,
                 0..=10_000,
-                "so many equal samples of an instrument in a row are refused; 0 = off",
+                "number of equal consecutive samples of an instrument that are invalid (stuck); 0 = off",
             ),
             Parameter::f64(
                 "hold_intervals",
                 "1",
                 2.0,
                 1.0..=100.0,
-                "slow telemetry is interpolated across, and held for, so many of its own intervals",
+                "number of its own intervals over which slow telemetry is interpolated and held",
             ),
             Parameter::f64(
                 "max_gap_s",
                 "s",
                 21_600.0,
                 1.0..=1e6,
-                "longer gaps are left out of the grid instead of filled with rows of NaN",
+                "longest gap filled with rows of NaN; longer ones are omitted from the grid",
             ),
         ],
         instances: &[],
@@ -100,7 +100,7 @@ impl Stage for Preprocess {
         let mandatory = setup.text_list("mandatory")?;
         if mandatory.is_empty() {
             return Err(PluginError::error(
-                "parameter mandatory = []: one table must lay the epochs; name the instrument, such as [\"is\", \"dws\"]",
+                "parameter mandatory = []: a mandatory table must define the epochs; name the instruments, e.g. [\"is\", \"dws\"]",
             ));
         }
         let config = Config {
@@ -123,14 +123,14 @@ impl Stage for Preprocess {
         }
         let names: Vec<&str> = found.iter().map(|(name, _)| *name).collect();
         if let Some(missing) = self.mandatory.iter().find(|m| !names.contains(&m.as_str())) {
-            let found = if names.is_empty() { "no topic at all".to_owned() } else { names.join(", ") };
+            let found = if names.is_empty() { "no topics".to_owned() } else { names.join(", ") };
             return Err(PluginError::error(format!(
-                "topic {missing} is missing from the telemetry, which has {found}; without it nothing can be calibrated: \
-                 give files that hold it, or name other topics in preprocess' parameter `mandatory`"
+                "topic {missing} is missing from the telemetry, which has {found}; a calibration needs it: give files that \
+                 contain it, or set other topics in preprocess' parameter `mandatory`"
             )));
         }
         let test_masses: Vec<&str> = self.mission.test_mass.keys().map(String::as_str).collect();
-        self.ask_for_missing_readouts(available, link, &test_masses)?;
+        self.require_readouts(available, link, &test_masses)?;
         let grid = link.table("grid", self.config.rate_hz);
         let mut specs = Vec::with_capacity(found.len());
         for (name, columns) in &found {
@@ -197,9 +197,8 @@ impl Stage for Preprocess {
 }
 
 impl Preprocess {
-    /// Asks for what the calibration of a drag-free mission cannot do without, so that a topic without it is refused
-    /// in the host's words.
-    fn ask_for_missing_readouts(
+    /// Requests the readouts that a drag-free calibration needs, so that the host names a missing one.
+    fn require_readouts(
         &self,
         available: &Available,
         link: &mut Link<'_>,
@@ -223,26 +222,26 @@ impl Preprocess {
     }
 }
 
-/// Unix nanoseconds as a date, in the time scale of the telemetry.
+/// Unix nanoseconds as a date in the telemetry's time scale.
 fn date(time_ns: i64) -> String {
     DateTime::from_timestamp_nanos(time_ns).format("%Y-%m-%dT%H:%M:%S%.3f").to_string()
 }
 
 fn report_of(gridder: &Gridder, config: &Config) -> Report {
-    let learnt = gridder.learnt_tables();
+    let summaries = gridder.table_summaries();
     let summary = &gridder.summary;
     let mut counts: BTreeMap<String, u64> = BTreeMap::new();
     let mut data_loss = false;
-    for (series, learnt) in gridder.tables.iter().zip(&learnt) {
+    for (series, table) in gridder.tables.iter().zip(&summaries) {
         for (reason, name) in Reason::ALL {
             let count = series.tally.get(reason);
             if count > 0 {
-                counts.insert(format!("{}.{name}", learnt.name), count);
+                counts.insert(format!("{}.{name}", table.name), count);
                 data_loss |= Reason::LOSSES.contains(&reason);
             }
         }
-        if let Some(missing) = learnt.missing.filter(|m| *m > 0) {
-            counts.insert(format!("{}.missing_epochs", learnt.name), missing);
+        if let Some(missing) = table.missing.filter(|m| *m > 0) {
+            counts.insert(format!("{}.missing_epochs", table.name), missing);
         }
     }
     for (name, count) in [("grid.rephased", summary.rephased), ("grid.cut_gaps", summary.cut_gaps)] {
@@ -251,29 +250,29 @@ fn report_of(gridder: &Gridder, config: &Config) -> Report {
         }
     }
     let mut quality = serde_json::Map::new();
-    quality.insert("telemetry".to_owned(), learnt.iter().map(|l| (l.name.clone(), describe(l))).collect());
+    quality.insert("telemetry".to_owned(), summaries.iter().map(|l| (l.name.clone(), describe(l))).collect());
     Report {
         epochs_used: Some(summary.used),
         epochs_rejected: Some(summary.rejected),
-        // A run without one usable epoch has lost all that it was given.
+        // A run without a usable epoch counts as data loss.
         data_loss: data_loss || summary.used == 0,
         counts,
-        notes: notes(gridder, &learnt, config),
+        notes: notes(gridder, &summaries, config),
         quality,
         ..Report::default()
     }
 }
 
-fn describe(learnt: &Learnt) -> serde_json::Value {
+fn describe(summary: &TableSummary) -> serde_json::Value {
     json!({
-        "rate_hz": learnt.interval_s.map(|s| 1.0 / s),
-        "interpolated": learnt.interpolated,
-        "after_epoch_s": learnt.phase_s,
+        "rate_hz": summary.interval_s.map(|s| 1.0 / s),
+        "interpolated": summary.interpolated,
+        "after_epoch_s": summary.phase_s,
     })
 }
 
-/// Why values are left out, in words.
-const REFUSED: [(Reason, &str); 6] = [
+/// Reasons for invalid values, in words.
+const VALUE_REASONS: [(Reason, &str); 6] = [
     (Reason::Status, "under a status flag"),
     (Reason::NotANumber, "NaN"),
     (Reason::Infinite, "infinite"),
@@ -282,30 +281,30 @@ const REFUSED: [(Reason, &str); 6] = [
     (Reason::Outlier, "outliers"),
 ];
 
-/// What an operator should know, in sentences.
-fn notes(gridder: &Gridder, learnt: &[Learnt], config: &Config) -> Vec<String> {
+/// Remarks for the operator.
+fn notes(gridder: &Gridder, summaries: &[TableSummary], config: &Config) -> Vec<String> {
     let summary = &gridder.summary;
     let period_s = 1.0 / config.rate_hz;
     let epochs = summary.used + summary.rejected;
     let mut notes = Vec::new();
     let Some(reference) = gridder.reference_name() else {
-        return vec!["no row of any mandatory topic came, so there is no epoch".to_owned()];
+        return vec!["no mandatory topic has a row, so there are no epochs".to_owned()];
     };
     if summary.used == 0 {
         notes.push(format!(
-            "not one of {epochs} epochs has all mandatory channels of any test mass, so there is nothing to calibrate"
+            "none of {epochs} epochs has all mandatory channels of a test mass, so there is nothing to calibrate"
         ));
     }
     if summary.longest.rows > 0 {
         notes.push(format!(
-            "longest stretch of epochs without all mandatory channels: {:.1} s from {}",
+            "longest time without all mandatory channels: {:.1} s from {}",
             summary.longest.rows as f64 * period_s,
             date(summary.longest.from_ns)
         ));
     }
     if summary.cut_gaps > 0 {
         notes.push(format!(
-            "{} gap(s) of {reference} longer than max_gap_s = {} s are left out of the grid, the longest {:.1} s from {}",
+            "{} gap(s) of {reference} longer than max_gap_s = {} s are omitted from the grid, the longest {:.1} s from {}",
             summary.cut_gaps,
             config.max_gap_s,
             summary.longest_cut_ns as f64 * 1e-9,
@@ -314,30 +313,31 @@ fn notes(gridder: &Gridder, learnt: &[Learnt], config: &Config) -> Vec<String> {
     }
     if summary.rephased > 0 {
         notes.push(format!(
-            "the clock of {reference} jumped {} time(s), first at {}; the epochs follow it and the one before each jump is \
+            "the clock of {reference} jumped {} time(s), first at {}; the epochs follow it, and the epoch before each jump is \
              blank",
             summary.rephased,
             date(summary.first_rephased_ns)
         ));
     }
-    for (series, l) in gridder.tables.iter().zip(learnt) {
+    for (series, l) in gridder.tables.iter().zip(summaries) {
         let table = &l.name;
         if series.tally.rows_in == 0 {
-            notes.push(format!("{table}: not one row came"));
+            notes.push(format!("{table}: no rows"));
         } else if let Some(missing) = l.missing.filter(|m| *m > 0) {
             notes.push(format!("{table}: no sample at {missing} of {epochs} epochs"));
         }
-        let refused = REFUSED.iter().map(|(reason, what)| (series.tally.get(*reason), what)).filter(|(n, _)| *n > 0);
+        let refused =
+            VALUE_REASONS.iter().map(|(reason, what)| (series.tally.get(*reason), what)).filter(|(n, _)| *n > 0);
         let refused: Vec<String> = refused.map(|(n, what)| format!("{n} {what}")).collect();
         if !refused.is_empty() {
-            notes.push(format!("{table}: values left out: {}", refused.join(", ")));
+            notes.push(format!("{table}: invalid values: {}", refused.join(", ")));
         }
         if let (true, Some(interval)) = (series.spec.mandatory, l.interval_s)
             && (interval / period_s - 1.0).abs() > 1e-3
         {
             notes.push(format!(
-                "{table} comes at {:.4} Hz where the mission says {} Hz; epochs without a sample are blank and slips are \
-                 counted: correct mission.sample_rate_hz",
+                "{table} has a rate of {:.4} Hz but the mission file says {} Hz, so epochs without a sample are blank; correct \
+                 mission.sample_rate_hz",
                 1.0 / interval,
                 config.rate_hz
             ));
@@ -347,7 +347,7 @@ fn notes(gridder: &Gridder, learnt: &[Learnt], config: &Config) -> Vec<String> {
         }
         if !l.absent.is_empty() {
             let columns = l.absent.join(", ");
-            notes.push(format!("{table}: {columns} have no value but zero and are taken as not measured"));
+            notes.push(format!("{table}: {columns} are zero throughout and count as not measured"));
         }
     }
     notes

@@ -1,4 +1,4 @@
-//! What the tests share: a noise generator and columns with the units of their names.
+//! Shared by the tests: a noise generator, and columns with units and frames.
 
 use crate::layout::expected;
 use dragfree_sdk::Column;
@@ -26,7 +26,7 @@ impl Noise {
     }
 }
 
-/// Columns of a table with the unit and frame of the contract; a flag where it has none.
+/// Columns of a table with the unit and frame of `telemetry.proto`; a flag if it has none.
 pub(crate) fn columns(table: &str, names: &[&str]) -> Vec<Column> {
     let column = |name: &&str| {
         let (unit, frame) = expected(table, name).unwrap_or(if *name == "value" { ("K", "") } else { ("", "") });

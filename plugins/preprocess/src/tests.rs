@@ -2,14 +2,14 @@
 
 use proptest::prelude::*;
 
-use crate::gridder::{Config, Gridder, MOST_ROWS, Sink};
+use crate::gridder::{Config, Gridder, MAX_ROWS, Sink};
 use crate::layout::{TableSpec, table_spec};
 use crate::series::Reason;
 use crate::testing::{Noise, columns};
 
 const DT: i64 = 100_000_000;
 const SECOND: i64 = 1_000_000_000;
-/// A start that is no multiple of anything.
+/// Start time that is not a multiple of the period or a second.
 const START: i64 = 2_051_222_400_123_456_789;
 
 /// A table of telemetry: name, names of columns, rows.
@@ -23,7 +23,7 @@ struct Telemetry {
 const IS: [&str; 5] = ["tm1.r_orf_m.x", "tm1.r_orf_m.y", "tm1.r_orf_m.z", "tm1.att_orf_rad.phi", "tm1.status"];
 const DWS: [&str; 5] = ["tm1.theta_orf_rad", "sc_crf_rad.phi", "sc_crf_rad.theta", "sc_crf_rad.psi", "status"];
 
-/// A table whose columns are white noise of 1e-9 around a slow swing; columns named `status` are zero.
+/// A table of white noise of 1e-9 on a slow oscillation; columns named `status` are zero.
 fn telemetry(name: &'static str, columns: &[&'static str], times: impl Iterator<Item = i64>, seed: u64) -> Telemetry {
     let mut noise = Noise::new(seed);
     let value = |column: &str, t: i64, noise: &mut Noise| {
@@ -51,7 +51,7 @@ fn spec(t: &Telemetry) -> TableSpec {
     table_spec(t.name, &owned.iter().collect::<Vec<_>>(), matches!(t.name, "is" | "dws"), &["tm1"], Some(&limits))
 }
 
-/// What came out.
+/// Output of the gridder.
 #[derive(Clone, Default)]
 struct Grid {
     times: Vec<i64>,
@@ -79,9 +79,8 @@ impl Grid {
     }
 }
 
-/// Runs telemetry through a gridder in pieces of `piece` rows of the first table, saving and loading after each piece
-/// for which `restore` says so. Rows within a table go in as they stand; a row belongs to the piece in which the
-/// latest time so far falls.
+/// Runs telemetry through a gridder in pieces of `piece` rows of the first table; saves and restores after each piece
+/// for which `restore` is true. Rows keep their order; a row belongs to the piece of the latest time so far.
 fn run_with(tables: &[Telemetry], config: &Config, piece: usize, restore: impl Fn(usize) -> bool) -> (Grid, Gridder) {
     let mut gridder = Gridder::new(config.clone(), tables.iter().map(spec).collect());
     let mut grid = Grid {
@@ -139,7 +138,7 @@ fn count(gridder: &Gridder, table: usize, reason: Reason) -> u64 {
     gridder.tables[table].tally.get(reason)
 }
 
-/// Every row given is on the grid, waiting for interpolation, or counted.
+/// Asserts that every row is on the grid, waits for interpolation, or is counted.
 fn assert_accounted(gridder: &Gridder) {
     use Reason::{BadTime, BeforeJump, Conflicting, Crowded, Duplicate, Late, Outside};
     for series in &gridder.tables {
@@ -159,7 +158,7 @@ fn assert_accounted(gridder: &Gridder) {
 }
 
 #[test]
-fn clean_telemetry_comes_out_bit_for_bit_at_its_own_times() {
+fn clean_telemetry_is_unchanged() {
     let tables = is_and_dws(20_000);
     let (grid, gridder) = run(&tables);
     assert_eq!(grid.times, steady(20_000).collect::<Vec<_>>());
@@ -174,7 +173,7 @@ fn clean_telemetry_comes_out_bit_for_bit_at_its_own_times() {
 }
 
 #[test]
-fn jitter_below_half_an_interval_loses_no_sample_and_moves_no_epoch() {
+fn jitter_below_half_an_interval_loses_no_sample() {
     let mut noise = Noise::new(4);
     let times: Vec<i64> = steady(20_000).map(|t| t + ((noise.uniform() - 0.5) * 0.45 * DT as f64) as i64).collect();
     let mut tables = is_and_dws(20_000);
@@ -183,23 +182,23 @@ fn jitter_below_half_an_interval_loses_no_sample_and_moves_no_epoch() {
     let values: Vec<f64> = tables[0].rows.iter().map(|r| r.1[0]).collect();
     assert_eq!(grid.tables[0][0], values);
     assert_eq!(gridder.summary.rejected, 0);
-    // Epochs are DT apart and lie in the middle of the jitter: median of 20 samples, uniform within ±0.225 DT.
+    // Epochs are DT apart, in the middle of the jitter: median of 20 samples, uniform within ±0.225 DT.
     assert!(grid.times.windows(2).all(|w| w[1] - w[0] == DT));
     assert!((grid.times[0] - START).abs() < DT * 15 / 100);
 }
 
 #[test]
-fn a_constant_phase_of_one_table_is_its_own() {
+fn a_constant_phase_of_a_table_is_measured() {
     let mut tables = is_and_dws(9_000);
     tables[1] = telemetry("dws", &DWS, steady(9_000).map(|t| t + 49_999_999), 2);
     let (grid, gridder) = run(&tables);
     assert_eq!(grid.times[0], START);
     assert_eq!(grid.tables[1][1], tables[1].rows.iter().map(|r| r.1[1]).collect::<Vec<_>>());
-    assert_eq!(gridder.learnt_tables()[1].phase_s, Some(0.049_999_999));
+    assert_eq!(gridder.table_summaries()[1].phase_s, Some(0.049_999_999));
 }
 
 #[test]
-fn a_gap_becomes_blank_rows_and_is_told() {
+fn a_gap_becomes_blank_rows_and_is_reported() {
     let keep = |k: &i64| !(3_000..39_000).contains(k);
     let times: Vec<i64> = (0..45_000).filter(keep).map(|k| START + k * DT).collect();
     let tables = vec![telemetry("is", &IS, times.iter().copied(), 1), telemetry("dws", &DWS, times.iter().copied(), 2)];
@@ -208,12 +207,12 @@ fn a_gap_becomes_blank_rows_and_is_told() {
     assert_eq!((gridder.summary.used, gridder.summary.rejected), (9_000, 36_000));
     assert_eq!((gridder.summary.longest.rows, gridder.summary.longest.from_ns), (36_000, START + 3_000 * DT));
     assert!(grid.tables[0][0][3_000..39_000].iter().all(|v| v.is_nan()));
-    assert_eq!(gridder.learnt_tables()[0].missing, Some(36_000));
+    assert_eq!(gridder.table_summaries()[0].missing, Some(36_000));
 }
 
 #[test]
-fn long_gaps_go_out_in_bounded_pieces_and_longer_ones_are_left_out() {
-    // Five hours are filled, a week is not.
+fn long_gaps_are_emitted_in_bounded_pieces_or_omitted() {
+    // A gap of five hours is filled; a week is omitted.
     let five_hours = 5 * 36_000;
     let week = 7 * 864_000;
     let keep = |k: &i64| *k < 8_000 || (8_000 + five_hours..16_000 + five_hours).contains(k);
@@ -227,10 +226,10 @@ fn long_gaps_go_out_in_bounded_pieces_and_longer_ones_are_left_out() {
         telemetry("dws", &DWS, times.iter().copied().chain([START + week / 2 * DT]).sorted(), 2),
     ];
     let (grid, gridder) = run(&tables);
-    assert!(grid.largest_call <= MOST_ROWS as usize, "{}", grid.largest_call);
+    assert!(grid.largest_call <= MAX_ROWS as usize, "{}", grid.largest_call);
     assert_eq!(grid.times.len() as i64, 16_000 + five_hours + 6_000 + 8_000);
     assert_eq!(gridder.summary.cut_gaps, 1);
-    // Ten minutes of blank rows, then epochs with the new phase exactly.
+    // Ten minutes of blank rows, then epochs with the new phase.
     let cut = (16_000 + five_hours) as usize;
     assert!(grid.tables[0][0][cut..cut + 6_000].iter().all(|v| v.is_nan()));
     assert_eq!(grid.times[cut + 6_000], START + (20_000 + week) * DT + 37_000_000);
@@ -239,7 +238,7 @@ fn long_gaps_go_out_in_bounded_pieces_and_longer_ones_are_left_out() {
     assert_accounted(&gridder);
 }
 
-/// Sorted times; `Iterator::sorted` without a crate.
+/// Sorts times, as a method of iterators.
 trait Sorted: Iterator<Item = i64> + Sized {
     fn sorted(self) -> std::vec::IntoIter<i64> {
         let mut all: Vec<i64> = self.collect();
@@ -250,7 +249,7 @@ trait Sorted: Iterator<Item = i64> + Sized {
 impl<I: Iterator<Item = i64>> Sorted for I {}
 
 #[test]
-fn the_epochs_follow_a_clock_that_jumps_and_no_difference_spans_the_jump() {
+fn epochs_follow_a_clock_jump_and_no_difference_spans_it() {
     for jump_ns in
         [-65_000_000, -52_000_000, -45_000_000, -30_000_000, 26_000_000, 50_000_000, 130_000_000, 1_234_567_890]
     {
@@ -259,7 +258,7 @@ fn the_epochs_follow_a_clock_that_jumps_and_no_difference_spans_the_jump() {
             vec![telemetry("is", &IS, times.iter().copied(), 1), telemetry("dws", &DWS, times.iter().copied(), 2)];
         let (grid, gridder) = run(&tables);
         assert_eq!(gridder.summary.rephased, 1, "{jump_ns}");
-        // Every value stands at the very time at which it was sampled, before and after.
+        // Every value keeps the exact time of its sample.
         for (t, table) in tables.iter().enumerate() {
             let mut found = 0;
             for (time, v) in grid.times.iter().zip(&grid.tables[t][1]).filter(|(_, v)| !v.is_nan()) {
@@ -270,7 +269,7 @@ fn the_epochs_follow_a_clock_that_jumps_and_no_difference_spans_the_jump() {
             assert!(found >= if jump_ns < -DT / 2 { 8_998 } else { 8_999 }, "{jump_ns}: {found}");
             assert!(grid.times.windows(2).all(|w| w[1] - w[0] > DT / 2 && w[1] - w[0] <= DT * 3 / 2));
         }
-        // Neighbouring rows with values are one interval apart.
+        // Neighbouring valid rows are one interval apart.
         let full: Vec<bool> = grid.tables[0][1].iter().map(|v| !v.is_nan()).collect();
         for k in 1..full.len() {
             assert!(!(full[k - 1] && full[k]) || grid.times[k] - grid.times[k - 1] == DT, "{jump_ns} at row {k}");
@@ -280,7 +279,7 @@ fn the_epochs_follow_a_clock_that_jumps_and_no_difference_spans_the_jump() {
 }
 
 #[test]
-fn a_jump_of_one_tables_clock_alone_blanks_one_row_of_it() {
+fn a_clock_jump_of_another_table_blanks_one_of_its_rows() {
     let mut tables = is_and_dws(9_000);
     let times = (0..9_000).map(|k| START + k * DT + if k >= 7_000 { 40_000_000 } else { 0 });
     tables[1] = telemetry("dws", &DWS, times, 2);
@@ -293,13 +292,13 @@ fn a_jump_of_one_tables_clock_alone_blanks_one_row_of_it() {
 }
 
 #[test]
-fn a_rate_that_is_not_the_missions_is_seen_and_nothing_is_made_up() {
+fn a_wrong_rate_is_reported_without_interpolation() {
     for period_ns in [103_092_784, 98_039_216] {
         let times: Vec<i64> = (0..20_000).map(|k| START + k * period_ns).collect();
         let tables =
             vec![telemetry("is", &IS, times.iter().copied(), 1), telemetry("dws", &DWS, times.iter().copied(), 2)];
         let (grid, gridder) = run(&tables);
-        let interval = gridder.learnt_tables()[0].interval_s.unwrap();
+        let interval = gridder.table_summaries()[0].interval_s.unwrap();
         assert!((interval * 1e9 - period_ns as f64).abs() < 1.0);
         let mut used = 0;
         for (time, v) in grid.times.iter().zip(&grid.tables[0][1]).filter(|(_, v)| !v.is_nan()) {
@@ -308,7 +307,7 @@ fn a_rate_that_is_not_the_missions_is_seen_and_nothing_is_made_up() {
             assert!((near.0 - time).abs() <= DT * 3 / 4);
             used += 1;
         }
-        // Each slip costs one row (too slow) or two samples (too fast).
+        // Each slip costs one row (rate too low) or two samples (too high).
         let slips = 20_000.0 * (period_ns - DT).abs() as f64 / DT as f64;
         assert!(f64::from(used) > 20_000.0 - 3.0 * slips, "{used}, {slips} slips");
         assert!(gridder.summary.rejected as f64 > 0.5 * slips, "{}", gridder.summary.rejected);
@@ -317,7 +316,7 @@ fn a_rate_that_is_not_the_missions_is_seen_and_nothing_is_made_up() {
 }
 
 #[test]
-fn slow_telemetry_is_interpolated_held_and_given_up() {
+fn slow_telemetry_is_interpolated_then_held_then_missing() {
     let mut tables = is_and_dws(9_000);
     // One row every 10 s, one missing at 300 s, none from 600 s to 700 s; the value is the time in seconds.
     let seconds = (0..90).map(|k| k * 10).filter(|s| *s != 300 && !(601..700).contains(s));
@@ -335,13 +334,13 @@ fn slow_telemetry_is_interpolated_held_and_given_up() {
             _ => assert_eq!(*v, 890.0),
         }
     }
-    // The age of the row that is the latest: 0 at a row, growing across a missing one.
+    // Age of the latest row: 0 at a row, growing over a missing one.
     let age = &grid.ages[2];
     for (second, want) in [(0.0, 0.0), (9.9, 9.9), (10.0, 0.0), (305.0, 15.0), (615.0, 15.0), (700.0, 0.0)] {
         assert!((age[(second * 10.0) as usize] - want).abs() < 1e-6, "{second} s: {}", age[(second * 10.0) as usize]);
     }
     assert!(age[6_500].is_nan() && grid.ages[0].iter().all(|a| *a == 0.0));
-    // A flag is never between two values; a raised one blanks what it covers.
+    // A flag is never interpolated; a raised flag blanks the columns it covers.
     assert!(grid.tables[3][1].iter().all(|v| v.is_nan() || v.fract() == 0.0));
     assert!(grid.tables[3][0][..900].iter().all(|v| !v.is_nan()) && grid.tables[3][0][1_000].is_nan());
     assert_accounted(&gridder);
@@ -356,7 +355,7 @@ fn instruments_are_never_interpolated() {
 }
 
 #[test]
-fn status_limits_and_stuck_values_blank_what_they_concern() {
+fn status_limits_and_stuck_values_blank_their_columns() {
     let mut tables = is_and_dws(9_000);
     let is = &mut tables[0].rows;
     is[100].1[4] = 1.0;
@@ -379,24 +378,24 @@ fn status_limits_and_stuck_values_blank_what_they_concern() {
     let counts = [Status, NotANumber, Infinite, Limit, Stuck, Outlier].map(|r| count(&gridder, 0, r));
     assert_eq!(counts, [4, 1, 1, 1, 10, 1]);
     assert_eq!(count(&gridder, 1, Status), 3);
-    // x by capacitive readout is all there is here: 100, 200, 300, 400, 700 and 800.
+    // Only capacitive readouts here: 100, 200, 300, 400, 700 and 800 are rejected.
     assert_eq!(gridder.summary.rejected, 6);
 }
 
 #[test]
-fn a_column_that_is_zero_from_the_start_is_not_there_rather_than_stuck() {
+fn a_column_of_zeros_is_absent_rather_than_stuck() {
     let mut tables = is_and_dws(7_000);
     tables[0].rows.iter_mut().for_each(|r| r.1[3] = 0.0);
     let (grid, gridder) = run(&tables);
     assert!(grid.tables[0][3].iter().all(|v| *v == 0.0));
-    assert_eq!(gridder.learnt_tables()[0].absent, ["tm1.att_orf_rad.phi"]);
-    // Stuck at any other value it is refused.
+    assert_eq!(gridder.table_summaries()[0].absent, ["tm1.att_orf_rad.phi"]);
+    // Constant at any other value it is stuck.
     tables[0].rows.iter_mut().for_each(|r| r.1[3] = 1e-8);
     assert!(run(&tables).0.tables[0][3].iter().all(|v| v.is_nan()));
 }
 
 #[test]
-fn twins_late_rows_and_garbage_times_are_counted() {
+fn duplicate_late_and_invalid_times_are_counted() {
     let mut tables = is_and_dws(7_000);
     let is = &mut tables[0].rows;
     let twin = is[100].clone();
@@ -416,7 +415,7 @@ fn twins_late_rows_and_garbage_times_are_counted() {
 }
 
 #[test]
-fn a_state_that_does_not_fit_is_refused_and_changes_nothing() {
+fn an_unfitting_state_is_refused_without_changes() {
     let tables = is_and_dws(7_000);
     let specs = || tables.iter().map(spec).collect::<Vec<_>>();
     let mut gridder = run(&tables).1;
@@ -428,7 +427,7 @@ fn a_state_that_does_not_fit_is_refused_and_changes_nothing() {
     let mut other = Gridder::new(Config { stuck_samples: 11, ..config() }, specs());
     assert!(other.load(&state).is_err());
     assert!(gridder.save() == state);
-    // Whatever bit is turned, loading ends with a state or an error, never with a panic.
+    // Any flipped bit gives a state or an error, no panic.
     for k in (0..state.len()).step_by(7) {
         let mut bent = state.clone();
         bent[k] ^= 0x80;
@@ -440,7 +439,7 @@ fn a_state_that_does_not_fit_is_refused_and_changes_nothing() {
 }
 
 #[test]
-fn tomorrow_goes_on_where_today_ended() {
+fn a_saved_state_continues_on_the_next_day() {
     let whole = is_and_dws(16_000);
     let day = |from: usize, to: usize| -> Vec<Telemetry> {
         whole.iter().map(|t| Telemetry { rows: t.rows[from..to].to_vec(), ..t.clone() }).collect()
@@ -462,8 +461,8 @@ fn tomorrow_goes_on_where_today_ended() {
     assert_eq!((second.summary.used, second.summary.rejected), (8_000, 0));
 }
 
-/// Telemetry with everything wrong with it that can be.
-fn mess(seed: u64, rows: i64) -> Vec<Telemetry> {
+/// Telemetry with every kind of corruption.
+fn corrupt_telemetry(seed: u64, rows: i64) -> Vec<Telemetry> {
     let mut noise = Noise::new(seed);
     let mut jump = 0;
     let mut times = Vec::new();
@@ -512,9 +511,9 @@ fn mess(seed: u64, rows: i64) -> Vec<Telemetry> {
 }
 
 #[test]
-fn results_do_not_depend_on_where_batches_end_nor_on_a_state_in_between() {
-    let tables = mess(77, 12_000);
-    // Rows later than the piece they belong to are late in one cut and not in another: only ordered rows here.
+fn results_do_not_depend_on_batches_or_saved_states() {
+    let tables = corrupt_telemetry(77, 12_000);
+    // A row is late or not depending on the piece, so this test uses ordered rows only.
     let ordered: Vec<Telemetry> = tables
         .into_iter()
         .map(|mut t| {
@@ -536,10 +535,10 @@ proptest! {
 
     #[test]
     fn every_row_is_on_the_grid_or_counted(seed in 0_u64..1_000_000, rows in 1_i64..9_000, piece in 1_usize..5_000) {
-        let tables = mess(seed, rows);
+        let tables = corrupt_telemetry(seed, rows);
         let (grid, gridder) = run_with(&tables, &config(), piece, |_| false);
         assert_accounted(&gridder);
-        // No instrument's value appears that was not telemetered.
+        // No instrument value appears that was not in the telemetry.
         for (t, table) in tables.iter().enumerate().take(2) {
             let mut sent: Vec<u64> = table.rows.iter().map(|r| r.1[1].to_bits()).collect();
             sent.sort_unstable();

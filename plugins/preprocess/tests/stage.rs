@@ -1,4 +1,4 @@
-//! What the host and the operator see of the stage.
+//! The stage through the plugin interface.
 
 mod common;
 
@@ -6,11 +6,11 @@ use common::{START_NS, append, columns, library, link, process, telemetry, topic
 use dragfree_engine::table::Batch;
 
 #[test]
-fn the_grid_names_every_column_and_keeps_unit_frame_and_attributes() {
+fn the_grid_keeps_unit_frame_and_attributes_of_every_column() {
     let columns = columns(&topics());
     let (_stage, linked) = link(&library(), &columns).unwrap();
     let grid = &linked.writes[0];
-    // One column is our own: how old the packet is that the spacecraft holds.
+    // The additional column is the age of the packet held on board.
     assert_eq!((grid.name.as_str(), grid.rate_hz, grid.columns.len()), ("grid", 10.0, columns.len() + 1));
     assert!(grid.columns.iter().any(|c| c.name == "ephemeris.age_s" && c.unit == "s"));
     for (read, written) in columns.iter().zip(grid.columns.iter().filter(|c| c.name != "ephemeris.age_s")) {
@@ -25,7 +25,7 @@ fn the_grid_names_every_column_and_keeps_unit_frame_and_attributes() {
 }
 
 #[test]
-fn a_missing_topic_is_named_with_what_was_found() {
+fn a_missing_topic_is_named_with_those_found() {
     for missing in ["is", "dws"] {
         let mut topics = topics();
         topics.retain(|t| t.name != missing);
@@ -38,7 +38,7 @@ fn a_missing_topic_is_named_with_what_was_found() {
 }
 
 #[test]
-fn another_unit_or_frame_and_a_missing_field_are_refused_by_name() {
+fn wrong_units_frames_and_missing_fields_are_refused_by_name() {
     let good = columns(&topics());
     for (change, words) in [
         (("is", "tm1.r_orf_m.y", "mm", "ORF_1"), "tm1.r_orf_m.y"),
@@ -56,10 +56,10 @@ fn another_unit_or_frame_and_a_missing_field_are_refused_by_name() {
 }
 
 #[test]
-fn rows_and_report_do_not_depend_on_batches_nor_on_a_restored_state() {
+fn rows_and_report_do_not_depend_on_batches_or_saved_states() {
     let (library, topics) = (library(), topics());
     let (available, mut data) = (columns(&topics), telemetry(&topics, 1_500));
-    // One value each of NaN and infinity, a raised flag, and ten seconds without the interferometers.
+    // One NaN, one infinity, a raised flag, and ten seconds without the interferometers.
     data[0].columns[1][700] = f64::NAN;
     data[0].columns[2][800] = f64::INFINITY;
     data[2].columns[7][900] = 4.0;
@@ -88,8 +88,8 @@ fn rows_and_report_do_not_depend_on_batches_nor_on_a_restored_state() {
     assert!(whole == run(1, false) && whole == run(777, true));
     assert_eq!(whole.0, (0..15_000).map(|k| START_NS + k * 100_000_000).collect::<Vec<_>>());
     let report = &whole.2;
-    // x by the capacitive readout stands in for the interferometers, the second test mass goes on at 700 and 800; without the
-    // attitude 900 is lost.
+    // The capacitive x replaces the interferometers and test mass 2 suffices at 700 and 800; without attitude, 900 is
+    // lost.
     assert_eq!((&report["epochs_used"], &report["epochs_rejected"]), (&14_999.into(), &1.into()));
     assert_eq!(report["data_loss"], true);
     let counts =
@@ -100,7 +100,7 @@ fn rows_and_report_do_not_depend_on_batches_nor_on_a_restored_state() {
 }
 
 #[test]
-fn a_state_of_something_else_is_refused() {
+fn a_foreign_state_is_refused() {
     let (mut stage, _) = link(&library(), &columns(&topics())).unwrap();
     let error = stage.load(b"{}").err().unwrap().to_string();
     assert!(error.contains("state of preprocess"), "{error}");

@@ -1,4 +1,4 @@
-//! The stage across the border, fed as the engine feeds it, with the topics of telemetry.proto.
+//! The stage through the plugin interface, with the topics of telemetry.proto.
 #![allow(dead_code, reason = "each test program uses a part of it")]
 
 use dragfree_engine::border::{Config, Instance, Kind, Library, LinkRequest, Linked, Rows};
@@ -8,8 +8,7 @@ use std::path::Path;
 
 pub(crate) const START_NS: i64 = 2_051_222_400_000_000_000;
 
-/// The shared library lies beside the test's own program: the one that this test run built, where the one in the folder
-/// above may be older.
+/// The library beside the test's program is the one of this test run; that in the folder above may be older.
 pub(crate) fn library() -> Library {
     let folder = std::env::current_exe().unwrap().parent().unwrap().to_owned();
     let name = format!("{}dragfree_preprocess{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
@@ -90,7 +89,7 @@ pub(crate) fn columns(topics: &[Topic]) -> Vec<Column> {
     topics.iter().flat_map(of).collect()
 }
 
-/// `seconds` of telemetry: values of 1e-9 that never repeat, status columns zero.
+/// Telemetry of `seconds`: values of 1e-9 that never repeat, status columns zero.
 pub(crate) fn telemetry(topics: &[Topic], seconds: i64) -> Vec<Batch> {
     let mut word = 7_u64;
     let mut value = move || {
@@ -116,7 +115,7 @@ pub(crate) fn link(library: &Library, available: &[Column]) -> Result<(Instance,
     Ok((stage, linked))
 }
 
-/// Gives the stage its rows from `from_ns` to `to_ns` and returns its one table.
+/// Processes rows from `from_ns` to `to_ns` and returns the stage's table.
 pub(crate) fn process(
     stage: &mut Instance,
     linked: &Linked,
