@@ -1,4 +1,4 @@
-//! Calibrations of simulated telemetry: the run, what came of it, the truth.
+//! Calibrations of simulated telemetry: run, result and truth.
 
 use crate::{dragfree, fixture};
 use serde_json::Value;
@@ -15,7 +15,7 @@ pub const TRUTH_M: [(&str, f64); 6] = [
     ("com-offset.tm2.z", 0.0),
 ];
 
-/// `dragfree run` of the science-mode pipeline in `folder`, into the archive `archive` there, answering in JSON.
+/// `dragfree run` of the science-mode pipeline in `folder`, into the archive `archive` there, with JSON output.
 #[must_use]
 pub fn science_mode(folder: &Path) -> Command {
     of_pipeline(folder, &fixture("pipelines/science-mode.toml"))
@@ -45,11 +45,11 @@ pub fn changed_mission(folder: &Path, name: &str, changes: &[(&str, &str)]) -> P
     path
 }
 
-/// What came of a run.
+/// Result of a run.
 pub struct Run {
     /// Exit code.
     pub code: Option<i32>,
-    /// What it said.
+    /// Standard error.
     pub stderr: String,
     /// The product, or null.
     pub product: Value,
@@ -77,7 +77,7 @@ impl Run {
         assert_eq!(found, (Some(code), &Value::from(verdict)), "{} {}", self.stderr, self.notes());
     }
 
-    /// A count of a stage; 0 where there is none.
+    /// A count of a stage; 0 if absent.
     #[must_use]
     pub fn count(&self, stage: &str, what: &str) -> u64 {
         self.product["quality"]["counts"][stage][what].as_u64().unwrap_or(0)
@@ -93,7 +93,7 @@ impl Run {
         (count("epochs_used"), count("epochs_rejected"))
     }
 
-    /// The sentences of the product.
+    /// The notes of the product.
     #[must_use]
     pub fn notes(&self) -> String {
         self.product["quality"]["notes"].to_string()

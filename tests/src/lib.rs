@@ -1,4 +1,4 @@
-//! What the whole-program tests share: the built program, its plugins, the repository's fixtures.
+//! Shared by the whole-program tests: the built program, its plugins, the repository's fixtures.
 
 pub mod calibration;
 pub mod foreign;
@@ -20,7 +20,7 @@ pub fn fixture(path: &str) -> PathBuf {
     root().join("fixtures").join(path)
 }
 
-/// The folder of the program and its plugins, built once per test program so that no test meets a stale one.
+/// Folder of the program and its plugins, built once per test program so that no test uses a stale build.
 ///
 /// # Panics
 /// The workspace does not build.
@@ -44,7 +44,7 @@ pub fn built() -> &'static Path {
     })
 }
 
-/// The program with the built plugins alone, in `folder`.
+/// The program, restricted to the built plugins, with `folder` as its working directory.
 #[must_use]
 pub fn dragfree(folder: &Path) -> Command {
     let mut command = Command::new(built().join(format!("dragfree{}", std::env::consts::EXE_SUFFIX)));
@@ -52,10 +52,10 @@ pub fn dragfree(folder: &Path) -> Command {
     command
 }
 
-/// Runs a command and gives its standard output; its exit code must be `code`.
+/// Runs a command, asserts its exit code, and returns its output.
 ///
 /// # Panics
-/// The exit code is another.
+/// The exit code differs.
 pub fn expect(command: &mut Command, code: i32) -> Output {
     let output = command.output().unwrap_or_else(|e| panic!("{command:?}: {e}"));
     assert_eq!(
@@ -68,20 +68,20 @@ pub fn expect(command: &mut Command, code: i32) -> Output {
     output
 }
 
-/// The JSON that a command prints; its exit code must be `code`.
+/// Runs a command, asserts its exit code, and parses its output as JSON.
 ///
 /// # Panics
-/// The exit code is another, or the output is no JSON.
+/// The exit code differs, or the output is not JSON.
 pub fn json(command: &mut Command, code: i32) -> serde_json::Value {
     let output = expect(command, code);
     serde_json::from_slice(&output.stdout)
         .unwrap_or_else(|e| panic!("{command:?}: {e}\n{}", String::from_utf8_lossy(&output.stdout)))
 }
 
-/// Compiles a plugin written in C into `folder` and gives its path.
+/// Compiles a plugin written in C into `folder` and returns its path.
 ///
 /// # Panics
-/// There is no C compiler, or the source does not compile without a warning.
+/// There is no C compiler, or the source does not compile without warnings.
 pub fn compile_plugin(folder: &Path, source: &str, name: &str, defines: &[&str]) -> PathBuf {
     let library = folder.join(format!("{}{name}{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX));
     let compiler = std::env::var_os("CC").unwrap_or_else(|| "cc".into());
@@ -125,11 +125,10 @@ pub fn coefficient(product: &serde_json::Value, name: &str, solution: &str) -> (
     (one["value"].as_f64().unwrap_or(f64::NAN), one["sigma"].as_f64().unwrap_or(f64::NAN))
 }
 
-/// Copies the SDK's example plugin `clumsy` into `folder`: cargo leaves earlier builds beside the newest one, so its own
-/// folder is no plugin folder.
+/// Copies the SDK's example plugin `clumsy` into `folder`. Its own folder may hold earlier builds too.
 ///
 /// # Panics
-/// It was not built.
+/// The example was not built.
 pub fn example_plugin(folder: &Path) {
     let library = format!("{}clumsy{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
     std::fs::copy(built().join("examples").join(&library), folder.join(&library)).expect("the example is built");

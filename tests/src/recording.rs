@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::Arc;
 
-/// A message of a file, free to be changed.
+/// A message of a file, with public fields to change.
 #[derive(Clone, Debug)]
 pub struct Message {
     /// Topic, `/is`.
@@ -26,7 +26,7 @@ impl Recording {
     /// Reads a telemetry file.
     ///
     /// # Panics
-    /// It is no sound telemetry.
+    /// The file is damaged.
     #[must_use]
     pub fn read(path: &Path) -> Self {
         let bytes = std::fs::read(path).expect("readable");
@@ -58,7 +58,7 @@ impl Recording {
         &self.messages
     }
 
-    /// Writes the messages that `change` leaves, each as it leaves it.
+    /// Writes the messages for which `change` returns a message.
     pub fn write(&self, to: &Path, mut change: impl FnMut(Message) -> Option<Message>) {
         self.write_all(to, self.messages.iter().filter_map(|m| change(m.clone())));
     }
@@ -97,7 +97,7 @@ impl Recording {
     }
 }
 
-/// Fields of one level: number, wire type, and where the value lies.
+/// Fields of one message: number, wire type, and position of the value.
 fn fields(bytes: &[u8]) -> Vec<(u64, u64, std::ops::Range<usize>)> {
     let mut at = 0;
     let varint = |at: &mut usize| {
@@ -136,7 +136,7 @@ fn fields(bytes: &[u8]) -> Vec<(u64, u64, std::ops::Range<usize>)> {
     found
 }
 
-/// Where the value of a field lies; `path` has the field's number at each level.
+/// Position of a field's value; `path` lists the field number per level.
 fn find(bytes: &[u8], path: &[u64]) -> Option<std::ops::Range<usize>> {
     let (first, rest) = path.split_first()?;
     let (_, _, range) = fields(bytes).into_iter().find(|(number, _, _)| number == first)?;
@@ -148,7 +148,7 @@ fn find(bytes: &[u8], path: &[u64]) -> Option<std::ops::Range<usize>> {
 }
 
 impl Message {
-    /// A double; none where it was not sent, which means zero unless the message around it is not there either.
+    /// A double; `None` if it was not sent. In proto3 that means zero, unless the enclosing message is absent.
     #[must_use]
     pub fn double(&self, path: &[u64]) -> Option<f64> {
         self.data.get(find(&self.data, path)?)?.try_into().ok().map(f64::from_le_bytes)
@@ -163,10 +163,10 @@ impl Message {
         self.data[range].copy_from_slice(&value.to_le_bytes());
     }
 
-    /// Sets a small number, such as a status, whether it was sent or not: of two, the later counts, and messages merge.
+    /// Sets a small integer such as a status, sent before or not: messages merge, and the later value wins.
     ///
     /// # Panics
-    /// A field number above 15.
+    /// The field number exceeds 15.
     pub fn set_number(&mut self, path: &[u64], value: u8) {
         let Some((last, outer)) = path.split_last() else { return };
         let small = |number: u64, kind: u64| u8::try_from(number << 3 | kind).expect("a small field number");
@@ -178,7 +178,7 @@ impl Message {
         self.data.extend(bytes);
     }
 
-    /// Leaves a field of the outermost level out.
+    /// Removes a field of the outermost message.
     pub fn remove(&mut self, field: u64) {
         let mut kept = Vec::with_capacity(self.data.len());
         let mut start = 0;

@@ -1,4 +1,4 @@
-//! GRACE-FO through the whole program: real files that show nothing, and a manoeuvre made here that shows the offset.
+//! GRACE-FO through the whole program: real quiet data, and a simulated manoeuvre that determines the offset.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -19,9 +19,9 @@ fn qp(product: &Value, axis: &str) -> (Option<f64>, Option<f64>) {
     (c["value"].as_f64(), c["sigma"].as_f64())
 }
 
-/// Ten quiet seconds of real telemetry: the run must say that it saw nothing, and along which axes.
+/// Ten quiet seconds of real telemetry: the verdict is `weak` and names the directions.
 #[test]
-fn the_real_files_end_in_weak_with_the_directions_named() {
+fn real_quiet_data_are_weak_in_named_directions() {
     let dir = tempfile::tempdir().expect("directory");
     let files = ["1A", "1B"].map(|l| fixture(&format!("gracefo/gracefo_{l}_2023-06-01_RL04.ascii.noLRI.tgz")));
     let product = run(dir.path(), &files);
@@ -29,13 +29,13 @@ fn the_real_files_end_in_weak_with_the_directions_named() {
     let directions = product["weak_directions"].to_string();
     for axis in ["x", "y", "z"] {
         assert!(directions.contains(&format!("com-offset.tm1.{axis}")), "{directions}");
-        // No σ, or one that is more than a third of the box in which the offset must lie anyway.
+        // No σ, or one above a third of the box of the offset.
         let (_, sigma) = qp(&product, axis);
         assert!(sigma.is_none_or(|s| s > 5e-4 / 3.0), "{axis}: σ = {sigma:?} m");
     }
 }
 
-/// Normal deviates from a linear congruential generator and the polar method, so that the file never changes.
+/// Normal deviates from a linear congruential generator and the polar method, reproducible for ever.
 struct Noise(u64);
 
 impl Noise {
@@ -75,11 +75,10 @@ fn header(rows: u32, variables: &[(&str, &str)], extra: &str) -> String {
     text + "# End of YAML header\n"
 }
 
-/// Half an hour in which the magnetic torquers turn the spacecraft to and fro about its three axes, each with a
-/// period of its own, as in the mission's own calibrations; the amplitudes are those of 1 mN m. The proof mass lies
-/// `b` from the centre of mass.
+/// Half an hour in which the magnetic torquers oscillate the spacecraft about three axes with different periods, with
+/// the amplitudes of 1 mN m, as in the mission's calibrations. The proof mass is at `b`.
 fn manoeuvre(folder: &Path, b: [f64; 3]) -> [std::path::PathBuf; 2] {
-    // The accelerometer's clock is fast, as in the real files, so that its epochs slip past the grid's.
+    // The accelerometer's clock is fast, as in the real files, so its epochs slip against the grid.
     const DT_US: u64 = 99_993;
     const DT_S: f64 = DT_US as f64 * 1e-6;
     const START_S: u64 = 738_849_600;
@@ -130,7 +129,7 @@ fn manoeuvre(folder: &Path, b: [f64; 3]) -> [std::path::PathBuf; 2] {
         let rate = |i: usize, t: f64| -amplitude[i] / turn_rate[i] * (turn_rate[i] * t).cos();
         let omega = [rate(0, t), 1.105e-3 + rate(1, t), rate(2, t)];
         let (euler, inner) = (cross(alpha, b), cross(omega, cross(omega, b)));
-        // White, 3e-10 m s⁻²/√Hz and 3e-8 rad s⁻²/√Hz, as on the quiet axes of the real file; drag varies slowly.
+        // White noise, 3e-10 m s⁻²/√Hz and 3e-8 rad s⁻²/√Hz, as on the quiet axes of the real file; drag varies slowly.
         let drag = 3e-8 * (t / 900.0).sin();
         let linear = [0, 1, 2].map(|i| {
             bias_linear[i]
@@ -177,10 +176,9 @@ fn manoeuvre(folder: &Path, b: [f64; 3]) -> [std::path::PathBuf; 2] {
     })
 }
 
-/// The same pipeline finds an offset when the spacecraft turns enough to show it. 4σ on three axes: a right run fails
-/// once in 5,000; a turned sign or two axes exchanged would be off by 20σ and more.
+/// 4σ on three axes: false alarm 1 in 5,000. A wrong sign or swapped axes would be off by 20σ.
 #[test]
-fn a_calibration_manoeuvre_shows_the_offset() {
+fn a_calibration_manoeuvre_determines_the_offset() {
     let dir = tempfile::tempdir().expect("directory");
     let b = [1.2e-4, -2.0e-4, 2.6e-4];
     let product = run(dir.path(), &manoeuvre(dir.path(), b));

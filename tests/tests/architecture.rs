@@ -1,4 +1,4 @@
-//! The arrows of ARCHITECTURE.md, read from `cargo metadata`.
+//! The dependency rules of ARCHITECTURE.md, checked against `cargo metadata`.
 
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
@@ -28,7 +28,7 @@ fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
         .collect()
 }
 
-/// What a crate of ours may depend on among our crates.
+/// Workspace crates that a workspace crate may depend on.
 fn allowed(crate_name: &str) -> &'static [&'static str] {
     match crate_name {
         "dragfree-abi" | "dragfree-schema" | "dragfree-chart" | "dragfree-score" => &[],
@@ -54,7 +54,7 @@ fn allowed(crate_name: &str) -> &'static [&'static str] {
     }
 }
 
-fn arrows_up(dependencies: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
+fn forbidden_dependencies(dependencies: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
     let ours = |name: &&String| dependencies.contains_key(*name);
     dependencies
         .iter()
@@ -68,23 +68,25 @@ fn arrows_up(dependencies: &BTreeMap<String, BTreeSet<String>>) -> Vec<String> {
 }
 
 #[test]
-fn every_arrow_points_down() {
+fn dependencies_follow_the_architecture() {
     let found = dependencies();
     assert!(found.len() >= 15, "the workspace has its crates: {:?}", found.keys());
-    assert_eq!(arrows_up(&found), Vec::<String>::new());
+    assert_eq!(forbidden_dependencies(&found), Vec::<String>::new());
     assert!(found["dragfree-abi"].is_empty(), "the border depends on nothing");
 }
 
 #[test]
-fn an_arrow_that_points_up_is_seen() {
+fn a_forbidden_dependency_is_detected() {
     let mut broken = dependencies();
     broken.get_mut("dragfree-engine").expect("the engine").insert("dragfree-physics".to_owned());
     broken.get_mut("dragfree-es-akf").expect("a plugin").insert("dragfree-engine".to_owned());
-    assert_eq!(arrows_up(&broken), ["dragfree-engine -> dragfree-physics", "dragfree-es-akf -> dragfree-engine"]);
+    assert_eq!(
+        forbidden_dependencies(&broken),
+        ["dragfree-engine -> dragfree-physics", "dragfree-es-akf -> dragfree-engine"]
+    );
 }
 
-/// The truth of a simulation and the effects that a calibration fits share no code: what one does wrong the other would
-/// not see.
+/// Simulator and effects share no code, so that one would reveal an error of the other.
 #[test]
 fn the_simulator_shares_no_code_with_the_effects() {
     let found = dependencies();

@@ -1,4 +1,4 @@
-//! Bad input: a clear error or a warning, counted in the product, nothing lost, never a panic.
+//! Bad input: an error or a counted warning, no loss of good data, no panic.
 
 use dragfree_tests::recording::{Message, Recording};
 use dragfree_tests::{dragfree, fixture, json, simulate};
@@ -10,7 +10,7 @@ use tempfile::TempDir;
 
 const SECOND_NS: u64 = 1_000_000_000;
 
-/// Three hours of telemetry, made once.
+/// Three hours of telemetry, simulated once.
 fn telemetry() -> &'static Path {
     static FILE: OnceLock<(TempDir, PathBuf)> = OnceLock::new();
     let (_, file) = FILE.get_or_init(|| {
@@ -61,7 +61,7 @@ impl Run {
     }
 }
 
-/// Runs science mode over files that `make` lays into a folder.
+/// Runs science mode over files that `make` writes into a folder.
 fn run(make: impl FnOnce(&Path) -> Vec<PathBuf>) -> Run {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let files = make(dir.path());
@@ -87,7 +87,7 @@ fn run_changed(change: impl FnOnce(Vec<Message>) -> Vec<Message>) -> Run {
 }
 
 #[test]
-fn sound_telemetry_is_the_measure() {
+fn unchanged_telemetry_is_the_reference() {
     let run = run_changed(|messages| messages);
     assert_eq!(run.code(), Some(0), "{}", run.stderr());
     assert_eq!(run.archived(), 1);
@@ -100,7 +100,7 @@ fn sound_telemetry_is_the_measure() {
 }
 
 #[test]
-fn a_file_cut_in_the_middle_of_a_chunk_gives_what_its_crc_vouches_for() {
+fn a_truncated_file_gives_its_intact_chunks() {
     let run = run(|dir| {
         let bytes = std::fs::read(telemetry()).expect("readable");
         let file = dir.join("cut.mcap");
@@ -115,7 +115,7 @@ fn a_file_cut_in_the_middle_of_a_chunk_gives_what_its_crc_vouches_for() {
 }
 
 #[test]
-fn flipped_bits_cost_one_chunk() {
+fn flipped_bits_lose_one_chunk() {
     let run = run(|dir| {
         let mut bytes = std::fs::read(telemetry()).expect("readable");
         let summary = mcap::Summary::read(&bytes).expect("an MCAP file").expect("a summary");
@@ -144,7 +144,7 @@ fn a_missing_topic_is_named() {
     }
 }
 
-/// Puts NaN in place of the doubles of a message: in `InertialSensors`, all of them but status are doubles.
+/// Replaces the doubles of a message by NaN: all fields of `InertialSensors` but status.
 fn poison(message: &mut Message) {
     // Wire: tm1 { r_orf_m { x y z } … }: tags and lengths, then 9 = field 1, fixed64.
     let mut i = 0;
@@ -170,7 +170,7 @@ fn nan_is_rejected_epoch_by_epoch_and_counted() {
 }
 
 #[test]
-fn a_gap_of_an_hour_is_a_gap() {
+fn a_gap_of_an_hour_rejects_its_epochs() {
     let run = run_changed(|messages| {
         let start = messages[0].log_time + 3_000 * SECOND_NS;
         messages.into_iter().filter(|m| !(start..start + 3_600 * SECOND_NS).contains(&m.log_time)).collect()
@@ -191,7 +191,7 @@ fn duplicates_change_nothing() {
 }
 
 #[test]
-fn two_files_that_overlap_in_any_order_are_one() {
+fn overlapping_files_in_any_order_are_merged() {
     let sound = run_changed(|m| m).product();
     let parts = run(|dir| {
         let cut = |m: &[Message], a: u64, b: u64| {
@@ -208,10 +208,10 @@ fn two_files_that_overlap_in_any_order_are_one() {
 }
 
 #[test]
-fn an_unsorted_file_is_put_in_order() {
+fn an_unsorted_file_is_sorted() {
     let sound = run_changed(|m| m).product();
     let shuffled = run_changed(|mut messages| {
-        // Neighbours change places within windows of some seconds.
+        // Neighbouring messages swap within windows of seconds.
         for block in messages.chunks_mut(200) {
             block.reverse();
         }
@@ -222,7 +222,7 @@ fn an_unsorted_file_is_put_in_order() {
 }
 
 #[test]
-fn an_empty_file_and_a_file_of_another_kind_are_told() {
+fn empty_and_foreign_files_are_reported() {
     for (content, said) in [(&b""[..], "empty"), (b"this is no telemetry at all, but a text\n", "MCAP")] {
         let run = run(|dir| {
             let file = dir.join("strange.mcap");
@@ -236,7 +236,7 @@ fn an_empty_file_and_a_file_of_another_kind_are_told() {
 }
 
 #[test]
-fn a_mission_file_that_is_wrong_is_refused_by_key() {
+fn a_wrong_mission_file_is_refused_with_its_key() {
     let taiji = std::fs::read_to_string(fixture("missions/taiji.toml")).expect("readable");
     for (from, to, said) in [
         ("mass_kg = 1500.0", "mass_kg = 1500.0\ncolour = 3", "colour"),
@@ -275,7 +275,7 @@ fn telemetry_of_another_spacecraft_is_refused() {
 }
 
 #[test]
-fn a_time_window_cuts_and_says_when_nothing_is_left() {
+fn a_time_window_selects_data_or_reports_that_none_are_left() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let base = |arguments: &[&str]| {
         let mut command = dragfree(dir.path());

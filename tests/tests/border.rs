@@ -1,11 +1,11 @@
-//! Plugins that the workspace did not build: a stage and an effect in C that work, and all that misbehave.
+//! Plugins built outside the workspace: a stage and an effect in C, and plugins that misbehave.
 
 use dragfree_tests::{coefficient, compile_plugin, dragfree, example_plugin, expect, fixture, json, simulate};
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 use tempfile::TempDir;
 
-/// Half an hour of telemetry, made once.
+/// Half an hour of telemetry, simulated once.
 fn telemetry() -> &'static Path {
     static FILE: OnceLock<(TempDir, PathBuf)> = OnceLock::new();
     let (_, file) = FILE.get_or_init(|| {
@@ -49,10 +49,10 @@ fn a_stage_in_c_runs_in_a_pipeline() {
     assert_eq!(product["quality"]["counts"]["c-scale"]["rows"], 18_000, "{product}");
 }
 
-/// The model's effect is one in C; the QP estimates its coefficient beside the offsets. The flown gain is right, so
-/// the estimate lies within 5σ of zero (false-alarm rate 6e-7), and it is an estimate: σ is finite and below the prior.
+/// The QP estimates the coefficient of an effect in C beside the offsets. The flown gain is right, so the estimate lies
+/// within 5σ of zero (false alarm 6e-7), with σ below the prior's.
 #[test]
-fn an_effect_in_c_is_estimated_like_every_other() {
+fn an_effect_in_c_is_estimated() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     compile_plugin(dir.path(), "c_plugins.c", "c_plugins", &[]);
     let model = dir.path().join("gain.toml");
@@ -69,7 +69,7 @@ fn an_effect_in_c_is_estimated_like_every_other() {
     assert_eq!(product["model"]["effects"], serde_json::json!(["com-offset", "c-es-gain"]));
 }
 
-/// A plugin that misbehaves in one way, compiled and run; gives the exit code and what was said.
+/// Compiles and runs a plugin that misbehaves in one way; returns exit code and message.
 fn misbehaving(way: u32) -> (Option<i32>, String) {
     let dir = tempfile::tempdir().expect("a temporary folder");
     compile_plugin(dir.path(), "bad_plugins.c", "bad", &[&format!("-DBAD={way}")]);
@@ -82,7 +82,7 @@ fn misbehaving(way: u32) -> (Option<i32>, String) {
 }
 
 #[test]
-fn every_misbehaviour_is_told_and_none_is_a_crash() {
+fn every_misbehaviour_is_reported_without_a_crash() {
     for (way, said) in [
         (1, "ABI version 2"),
         (2, "the third batch is too much"),
@@ -102,9 +102,9 @@ fn every_misbehaviour_is_told_and_none_is_a_crash() {
     }
 }
 
-/// A plugin in Rust that panics at each point of its life: the host says so, ends, and leaves nothing in the archive.
+/// A Rust plugin that panics at each call: the host reports it and leaves nothing in the archive.
 #[test]
-fn a_panic_stops_at_the_border() {
+fn a_panic_does_not_cross_the_plugin_interface() {
     for place in ["new", "link", "process", "flush", "report"] {
         let dir = tempfile::tempdir().expect("a temporary folder");
         let pipeline = pipeline(dir.path(), &format!("plugin = \"clumsy\"\nparameters = {{ panic_in = \"{place}\" }}"));
@@ -125,9 +125,9 @@ fn a_plugin_without_a_panic_goes_through() {
     assert_eq!(product["quality"]["counts"]["clumsy"]["rows"], 18_000, "{product}");
 }
 
-/// An early stage that wrote an unknown key, or NaN, failed the next stage in Rust when the whole day had been read.
+/// An unknown key or NaN in the report of an early stage must not fail a later stage.
 #[test]
-fn an_odd_report_of_an_early_stage_fails_no_later_one() {
+fn an_unexpected_report_of_a_stage_does_not_fail_later_ones() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     compile_plugin(dir.path(), "bad_plugins.c", "bad", &["-DBAD=11"]);
     example_plugin(dir.path());
@@ -151,7 +151,7 @@ fn a_discarded_batch_is_counted_as_lost() {
 }
 
 #[test]
-fn a_file_that_is_no_plugin_is_listed_with_its_reason() {
+fn a_file_that_is_not_a_plugin_is_listed_with_the_reason() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let library = dir.path().join(format!("libnothing{}", std::env::consts::DLL_SUFFIX));
     std::fs::write(&library, "this is no library").expect("writable");
@@ -163,7 +163,7 @@ fn a_file_that_is_no_plugin_is_listed_with_its_reason() {
 
 #[cfg(unix)]
 #[test]
-fn a_plugin_that_everybody_can_change_is_refused() {
+fn a_world_writable_plugin_is_refused() {
     use std::os::unix::fs::PermissionsExt;
     let dir = tempfile::tempdir().expect("a temporary folder");
     let library = compile_plugin(dir.path(), "c_plugins.c", "c_plugins", &[]);

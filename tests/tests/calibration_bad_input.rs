@@ -1,8 +1,8 @@
-//! Bad input and the calibration: what is missing or wrong is left out and counted, and what is left gives the right offsets.
+//! Bad input and the calibration: missing or invalid data are excluded and counted, and the offsets stay right.
 //!
-//! All tests change copies of the same six hours (seed 1). Every product's coefficients must lie within 3σ of the truth: with the
-//! noise of one seed that is one draw of twelve correlated numbers, so a right program fails with probability 3.2 % at
-//! most (union bound), whatever the number of tests. That a wrong offset would be seen is the last test's business.
+//! All tests change copies of the same six hours (seed 1). Coefficients must lie within 3σ of the truth: one draw of
+//! twelve correlated numbers, which fails with a probability of at most 3.2 % (union bound), whatever the number of
+//! tests. The last test checks that a wrong offset is detected.
 
 use dragfree_tests::calibration::{Run, TRUTH_M, changed_mission, science_mode};
 use dragfree_tests::recording::{Message, Recording};
@@ -18,7 +18,7 @@ use tempfile::TempDir;
 const SECOND_NS: u64 = 1_000_000_000;
 const EPOCHS: u64 = 216_000;
 
-/// Six hours of telemetry, made once.
+/// Six hours of telemetry, simulated once.
 fn sound() -> &'static (TempDir, PathBuf, Recording) {
     static SOUND: OnceLock<(TempDir, PathBuf, Recording)> = OnceLock::new();
     SOUND.get_or_init(|| {
@@ -41,7 +41,7 @@ fn run(folder: &Path, files: &[PathBuf], mission: Option<&Path>, model: Option<&
     Run::of(&mut command)
 }
 
-/// A run over the six hours as `change` leaves them.
+/// A run over the six hours changed by `change`.
 fn run_changed(change: impl FnMut(Message) -> Option<Message>) -> Run {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let file = dir.path().join("changed.mcap");
@@ -49,7 +49,7 @@ fn run_changed(change: impl FnMut(Message) -> Option<Message>) -> Run {
     run(dir.path(), &[file], None, None)
 }
 
-/// Whether a message lies in a stretch of the six hours, s.
+/// Whether a message lies in an interval of the six hours, s.
 fn within(message: &Message, from_s: u64, until_s: u64) -> bool {
     let start = sound().2.start_ns();
     (start + from_s * SECOND_NS..start + until_s * SECOND_NS).contains(&message.log_time)
@@ -75,7 +75,7 @@ fn assert_right(run: &Run) {
     }
 }
 
-/// The product of the telemetry as it is.
+/// The product of the unchanged telemetry.
 fn reference() -> &'static Run {
     static REFERENCE: OnceLock<Run> = OnceLock::new();
     REFERENCE.get_or_init(|| {
@@ -84,7 +84,7 @@ fn reference() -> &'static Run {
     })
 }
 
-/// Runs without an intact third of the day are right and wider, never narrower.
+/// Runs that lack a third of the data are right, with larger σ.
 fn assert_wider(run: &Run, factor: std::ops::RangeInclusive<f64>) {
     for name in ["com-offset.tm1.y", "com-offset.tm1.z", "com-offset.tm2.y", "com-offset.tm2.z"] {
         let ratio = coefficient(&run.product, name, "qp").1 / coefficient(&reference().product, name, "qp").1;
@@ -100,7 +100,7 @@ fn sound_telemetry_is_the_measure() {
 }
 
 #[test]
-fn gaps_of_seconds_minutes_and_hours_are_left_out() {
+fn gaps_of_seconds_minutes_and_hours_are_excluded() {
     const GAPS_S: [(u64, u64); 5] = [(1_000, 1_003), (2_000, 2_001), (4_000, 4_060), (5_000, 5_300), (9_000, 16_200)];
     let run = run_changed(|m| (!GAPS_S.iter().any(|(from, until)| within(&m, *from, *until))).then_some(m));
     assert_eq!(run.code, Some(0), "{}", run.stderr);
@@ -108,13 +108,13 @@ fn gaps_of_seconds_minutes_and_hours_are_left_out() {
     assert_eq!(run.epochs(), (EPOCHS - lost, lost));
     assert!(run.notes().contains("7200.0 s from 2035-01-01T02:30:00"), "{}", run.notes());
     assert_right(&run);
-    // 65 % of the epochs are left: σ grows by 1.24, and by more for what the edges of stretches cost.
+    // 65 % of the epochs remain: σ grows by 1.24, and more for the edges of intervals.
     assert_wider(&run, 1.15..=2.2);
 }
 
-/// Without one instrument for two of six hours the epochs of those hours are lost to whoever needs it; σ grows by √(6/4).
+/// An instrument that is missing for two of six hours loses those epochs; σ grows by √(6/4).
 #[test]
-fn an_instrument_that_is_silent_for_hours_costs_those_hours() {
+fn a_missing_instrument_loses_its_epochs() {
     for topic in ["/ifo", "/is"] {
         let run = run_changed(|m| (!(is(&m, topic) && within(&m, 7_200, 14_400))).then_some(m));
         assert_eq!(run.code, Some(0), "{topic}: {}", run.stderr);
@@ -128,10 +128,9 @@ fn an_instrument_that_is_silent_for_hours_costs_those_hours() {
     }
 }
 
-/// Where nobody knows the attitude nobody knows the angular acceleration: it is left out, not replaced by the commanded torque,
-/// which would pull x by centimetres.
+/// Without attitude the angular acceleration is unknown; the commanded torque in its place would bias x by centimetres.
 #[test]
-fn an_attitude_that_is_silent_for_hours_is_not_made_of_commands() {
+fn a_missing_attitude_is_not_replaced_by_commands() {
     let run = run_changed(|m| (!(is(&m, "/dws") && within(&m, 7_200, 14_400))).then_some(m));
     run.assert_ended(0, "agree");
     assert_eq!(run.epochs(), (EPOCHS - 72_000, 72_000));
@@ -148,8 +147,8 @@ fn model_of_tm1(folder: &Path) -> PathBuf {
     path
 }
 
-/// Right offsets of the first test mass, and none of the second. Without the survey x is hardly seen, so `agree` and `weak` are both
-/// right words, `disagree` is not.
+/// Right offsets of the first test mass, none of the second. Without the survey x is hardly observable, so `agree` and
+/// `weak` are both acceptable.
 fn assert_tm1_is_right(run: &Run) {
     assert_eq!(run.code, Some(0), "{} {}", run.stderr, run.notes());
     for (name, truth) in &TRUTH_M[..3] {
@@ -165,14 +164,14 @@ fn assert_tm1_is_right(run: &Run) {
 }
 
 #[test]
-fn a_model_of_one_test_mass_is_right_beside_data_of_both() {
+fn a_model_of_one_test_mass_is_right_with_data_of_both() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let model = model_of_tm1(dir.path());
     assert_tm1_is_right(&run(dir.path(), std::slice::from_ref(&sound().1), None, Some(&model)));
 }
 
 #[test]
-fn a_test_mass_without_any_data_does_not_take_the_other_with_it() {
+fn a_test_mass_without_data_does_not_affect_the_other() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let file = dir.path().join("changed.mcap");
     sound().2.write(&file, |mut m| {
@@ -187,9 +186,9 @@ fn a_test_mass_without_any_data_does_not_take_the_other_with_it() {
     assert_tm1_is_right(&run(dir.path(), &[file], None, Some(&model)));
 }
 
-/// Commands that were not sent down are rebuilt by the control law, to 1e-9: the offsets are those of the whole telemetry.
+/// Missing commands are rebuilt from the control law to 1e-9: the offsets equal those of the whole telemetry.
 #[test]
-fn commands_missing_for_hours_are_rebuilt_and_said_to_be() {
+fn missing_commands_are_rebuilt_and_reported() {
     let run = run_changed(|m| (!(is(&m, "/command") && within(&m, 7_200, 14_400))).then_some(m));
     assert_eq!(run.code, Some(0), "{}", run.stderr);
     assert_eq!(run.count("hinf-dfacs", "commands_replayed"), 72_000);
@@ -200,19 +199,19 @@ fn commands_missing_for_hours_are_rebuilt_and_said_to_be() {
     assert_near(&run, 1e-3);
 }
 
-/// Before the replayed law has settled there is nothing to rebuild commands from: those epochs are not used.
+/// Commands cannot be rebuilt before the replayed law has settled; those epochs are not used.
 #[test]
-fn commands_missing_from_the_start_are_not_invented() {
+fn commands_missing_from_the_start_are_not_rebuilt() {
     let run = run_changed(|m| (!(is(&m, "/command") && within(&m, 0, 3_600))).then_some(m));
     assert_eq!(run.code, Some(0), "{}", run.stderr);
     assert_eq!(run.count("hinf-dfacs", "commands_missing"), 36_000);
     assert_eq!(run.count("hinf-dfacs", "commands_replayed"), 0);
     assert_right(&run);
-    // Five of six hours are left: √(6/5).
+    // Five of six hours remain: √(6/5).
     assert_wider(&run, 1.0..=1.3);
 }
 
-/// The coefficients are those of the sound telemetry to a part of σ.
+/// The coefficients equal those of the unchanged telemetry within a fraction of σ.
 fn assert_near(run: &Run, part_of_sigma: f64) {
     for (name, _) in TRUTH_M {
         for solution in ["es-akf", "qp"] {
@@ -225,7 +224,7 @@ fn assert_near(run: &Run, part_of_sigma: f64) {
 }
 
 #[test]
-fn status_flags_take_values_out_and_are_counted() {
+fn flagged_values_are_excluded_and_counted() {
     let run = run_changed(|mut m| {
         if is(&m, "/is") && within(&m, 3_000, 3_600) {
             m.set_number(&[1, 3], 1);
@@ -244,9 +243,9 @@ fn status_flags_take_values_out_and_are_counted() {
     assert_right(&run);
 }
 
-/// A readout at its limit says the same number again and again, or one that no test mass can have.
+/// A saturated readout repeats a number, or exceeds the displacement of any test mass.
 #[test]
-fn saturated_readouts_are_left_out_and_counted() {
+fn saturated_readouts_are_excluded_and_counted() {
     let run = run_changed(|mut m| {
         if is(&m, "/is") && within(&m, 3_000, 3_600) {
             m.set_double(&[1, 1, 2], 5e-6);
@@ -271,7 +270,7 @@ fn outliers(topic: &str, path: &[u64], sample_sigma: f64, sigmas: f64) -> (Run, 
     let run = run_changed(|mut m| {
         if is(&m, topic) {
             k += 1;
-            // Knuth's multiplier scatters them.
+            // Knuth's multiplicative hash scatters them.
             if k.wrapping_mul(6_364_136_223_846_793_005) >> 33 < (1 << 31) / 1000 {
                 let value = m.double(path).expect("sent");
                 m.set_double(path, value + sigmas * sample_sigma * if k % 2 == 0 { 1.0 } else { -1.0 });
@@ -283,11 +282,9 @@ fn outliers(topic: &str, path: &[u64], sample_sigma: f64, sigmas: f64) -> (Run, 
     (run, put)
 }
 
-/// The part of lone outliers of `sigmas` standard deviations in white samples of σ = 1 that `preprocess` promises to find at its
-/// default `outlier_sigma` of ten: the deviation from the chord of the neighbours beyond five standard deviations of a second
-/// difference, which is √6; the slopes on both sides within a quarter of the deviation of the chord's; and the deviation as large
-/// against the second differences around, by the median of nine on either side. Drawn here sample by sample: 0.98 by the slopes,
-/// 0.93 by the median of eighteen.
+/// Expected detection rate of single outliers of `sigmas` standard deviations in white noise at the default
+/// `outlier_sigma` of ten, by the three conditions of `preprocess::outliers`, sampled directly. The second difference
+/// has √6 σ.
 fn found_in_white_noise(sigmas: f64) -> f64 {
     const DRAWS: u32 = 40_000;
     const AT: usize = 12;
@@ -308,11 +305,8 @@ fn found_in_white_noise(sigmas: f64) -> f64 {
     found.count() as f64 / f64::from(DRAWS)
 }
 
-/// White readout noise of one-sided ASD `a` at 10 Hz has the standard deviation `a √5` per sample; 20 of them make 16 standard
-/// deviations of a second difference. They are removed, counted, and bridged in the channels: the offsets and their σ stay as they are.
-///
-/// As many are found as [`found_in_white_noise`] says, within 3.9 standard deviations of a binomial (1e-4 on either side for each of
-/// four), of which half a per cent is taken off: so many have a second outlier among the four samples that make slopes and chord.
+/// White readout noise of one-sided ASD `a` at 10 Hz has σ = `a √5` per sample; 20σ make 16 standard deviations of a
+/// second difference. They are removed, counted and bridged; the offsets stay.
 #[test]
 fn outliers_in_one_of_a_thousand_samples_do_no_harm() {
     let promised = found_in_white_noise(20.0);

@@ -1,4 +1,4 @@
-//! `dragfree compare` on telemetry whose hidden cause is known here and nowhere in what the program reads.
+//! `dragfree compare` on telemetry whose hidden cause no input of the program contains.
 
 use dragfree_tests::calibration::science_mode;
 use dragfree_tests::{dragfree, simulate};
@@ -10,7 +10,7 @@ const PRODUCT: &str = "COM1B_2035-01-01_SC1_01_0001";
 /// Simulates and calibrates three hours in `folder`.
 fn calibrate(folder: &Path, arguments: &[&str]) {
     let file = simulate(folder, &[&["--hours", "3"], arguments].concat()).remove(0);
-    // The truth is gone before anything reads the telemetry.
+    // The truth is removed before the telemetry is read.
     std::fs::remove_dir_all(folder.join("truth")).expect("removable");
     let run = science_mode(folder).arg(&file).output().expect("runs");
     assert!(matches!(run.status.code(), Some(0 | 4)), "{}", String::from_utf8_lossy(&run.stderr));
@@ -26,13 +26,13 @@ fn channels(comparison: &Value) -> &Vec<Value> {
     comparison["channels"].as_array().expect("channels")
 }
 
-/// Names of what fails.
+/// Names of failed tests.
 fn failing(comparison: &Value) -> Vec<&str> {
     let fails = channels(comparison).iter().filter(|c| c["passes"] == false);
     fails.map(|c| c["name"].as_str().expect("a name")).collect()
 }
 
-/// Nothing but the page itself is needed: no script, no address but the name of SVG's own grammar, no file; pictures for every question.
+/// The page is self-contained: no script, no link but the name space of SVG, no file; a picture per question.
 fn self_contained(page: &str) {
     assert!(page.starts_with("<!DOCTYPE html>") && page.trim_end().ends_with("</html>"));
     for forbidden in ["<script", "<link", "<img", "<iframe", "@import", "url(", "src=", "<?xml"] {
@@ -54,10 +54,10 @@ fn self_contained(page: &str) {
     }
 }
 
-/// With nothing hidden everything passes (a false alarm in one of a hundred), and the power of each channel is that of the mission's
-/// noise to its own uncertainty: five deviations for fifteen of them.
+/// Without a hidden effect everything passes (false alarm 1 %), and each channel's power equals the mission's noise
+/// within its uncertainty.
 #[test]
-fn a_sound_model_passes_in_every_channel() {
+fn a_right_model_passes_in_every_channel() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     calibrate(dir.path(), &["--seed", "11"]);
     let c: Value = serde_json::from_str(&compare(dir.path(), &["--json"], 0)).expect("JSON");
@@ -87,10 +87,10 @@ fn a_sound_model_passes_in_every_channel() {
     assert!(screen.lines().all(|line| line.chars().count() <= 80), "{screen}");
 }
 
-/// Thrusters that push 30 % too little along the spacecraft's y: the channels that see y fail, and what both test masses see along y.
-/// The attitude, x, z and the null combinations do not, and the filter's own statistics pass.
+/// Thrusters 30 % too weak along y: the channels of y and the common combination fail; attitude, x, z, the null
+/// combinations and the filter's statistics pass.
 #[test]
-fn a_wrong_force_on_the_spacecraft_fails_and_its_null_combinations_do_not() {
+fn a_wrong_spacecraft_force_fails_except_in_null_combinations() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     calibrate(dir.path(), &["--seed", "12", "--effect", "mps-gain:sc.y=-0.3"]);
     let c: Value = serde_json::from_str(&compare(dir.path(), &["--json"], 4)).expect("JSON");
@@ -109,7 +109,7 @@ fn a_wrong_force_on_the_spacecraft_fails_and_its_null_combinations_do_not() {
     assert!(screen.lines().all(|line| line.chars().count() <= 80), "{screen}");
 }
 
-/// A readout of one test mass that is 1.5 times as noisy: no force on the spacecraft, so the null combinations say it.
+/// A readout with 1.5 times its noise is no force on the spacecraft, so the null combinations fail.
 #[test]
 fn a_noisy_readout_fails_in_the_null_combinations() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -120,13 +120,13 @@ fn a_noisy_readout_fails_in_the_null_combinations() {
     assert!(!failing.iter().any(|name| name.starts_with("tm1") || name.ends_with('x')), "{failing:?}");
     let coloured = c["innovations"].as_array().expect("innovations").iter().filter(|i| i["passes"] == false);
     assert_eq!(coloured.map(|i| i["readout"].as_str()).collect::<Vec<_>>(), [Some("tm2.z")]);
-    // The level is all that is wrong.
+    // Only the level fails.
     let z = channels(&c).iter().find(|c| c["name"] == "tm2.accel.z").expect("there");
     let [ratio, fitted] = ["chi2_per_dof", "chi2_per_dof_fitted_levels"].map(|k| z[k].as_f64().expect("a ratio"));
     assert!(ratio > 1.5 && (fitted - 1.0).abs() < 0.03, "{ratio} {fitted}");
 }
 
-/// Half an hour: a sentence, not a number.
+/// Half an hour is too little: an error, not a result.
 #[test]
 fn a_comparison_of_too_little_data_is_refused() {
     let dir = tempfile::tempdir().expect("a temporary folder");

@@ -1,4 +1,4 @@
-//! Day to day: a state carried over midnight gives what one long run gives, and nothing else is taken for one.
+//! A state carried over midnight gives the results of one long run, and unfitting states are refused.
 
 use dragfree_tests::{built, coefficient, dragfree, fixture, json, simulate};
 use serde_json::Value;
@@ -12,7 +12,7 @@ struct Telemetry {
     _dir: TempDir,
     /// Three hours before midnight and three hours after it.
     days: [PathBuf; 2],
-    /// What one run over both gives.
+    /// Product of one run over both.
     long: Value,
 }
 
@@ -74,14 +74,14 @@ fn assert_same(product: &Value, long: &Value) {
 }
 
 #[test]
-fn two_days_with_a_state_are_one_long_run() {
+fn two_days_with_a_state_equal_one_long_run() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let first = first_day(dir.path());
     let second = json(run(dir.path(), &["--load-state", "state"]).arg(&telemetry().days[1]), 0);
     assert_same(&second, &telemetry().long);
     assert_eq!(first["day"], "2035-01-01");
     assert_eq!(second["day"], "2035-01-02");
-    // The twin: the second day alone, or the first, is something else.
+    // Negative control: either day alone gives another result.
     let alone = json(run(dir.path(), &[]).arg(&telemetry().days[1]), 0);
     for product in [&first, &alone] {
         let of = |p: &Value| coefficient(p, "com-offset.tm1.y", "qp").1;
@@ -89,14 +89,14 @@ fn two_days_with_a_state_are_one_long_run() {
     }
 }
 
-/// The operator's habit: one state file, resumed from and saved to, and all files at hand given.
+/// One state file, loaded and saved every day, with all files at hand as arguments.
 #[test]
-fn one_state_file_serves_every_day_and_old_files_do_no_harm() {
+fn one_state_file_serves_every_day_and_old_files_are_ignored() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     first_day(dir.path());
     let mut second = run(dir.path(), &["--load-state", "state", "--save-state", "state"]);
     assert_same(&json(second.args(&telemetry().days), 0), &telemetry().long);
-    // Nothing is left to do, and that is an error, not an empty product.
+    // No new data is an error, not an empty product.
     let output = run(dir.path(), &["--load-state", "state"]).args(&telemetry().days).output().expect("runs");
     assert_eq!(output.status.code(), Some(1), "{}", String::from_utf8_lossy(&output.stderr));
     assert_eq!(products(dir.path()), 2);
@@ -107,10 +107,10 @@ fn products(folder: &Path) -> usize {
     entries.filter(|e| e.path().extension().is_some_and(|x| x == "toml")).count()
 }
 
-/// Killed at any time, the second day can be run again: the state is yesterday's or today's, never half of one, and it is
-/// today's only when the product is archived.
+/// After a kill at any time the second day can be run again: the state is yesterday's or today's, complete, and today's
+/// only once the product is archived.
 #[test]
-fn a_kill_loses_nothing() {
+fn an_interrupted_day_can_be_run_again() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     first_day(dir.path());
     let yesterday = std::fs::read(dir.path().join("state")).expect("a state");
@@ -161,7 +161,7 @@ fn a_damaged_state_is_refused() {
     assert_refused(dir.path(), run(dir.path(), &["--load-state", "nowhere"]), &["nowhere"]);
 }
 
-/// A state goes with its mission, its model and its plugins; each is named when it is another.
+/// A state belongs to its mission, model and plugins; the error names what differs.
 #[test]
 fn a_state_of_another_mission_model_or_plugin_is_refused() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -184,7 +184,7 @@ fn a_state_of_another_mission_model_or_plugin_is_refused() {
     let second = run(dir.path(), &["--load-state", "state", "--model", "model.toml"]);
     assert_refused(dir.path(), second, &["model", "replay from the start"]);
 
-    // The same plugin, built anew: bytes after the end of a library change its digest and nothing else.
+    // A rebuilt plugin: bytes appended to a library change its digest only.
     let programs = dir.path().join("programs");
     std::fs::create_dir(&programs).expect("writable");
     let wanted =
@@ -206,7 +206,7 @@ fn a_state_of_another_mission_model_or_plugin_is_refused() {
     assert_refused(dir.path(), second, &["another build of plugin es-akf", "replay from the start"]);
 }
 
-/// A missing day is a gap: with the state carried across it, the same as both days in one run.
+/// A missing day is a gap: the carried state gives the same as one run over both days.
 #[test]
 fn a_missing_day_is_a_gap() {
     let dir = tempfile::tempdir().expect("a temporary folder");

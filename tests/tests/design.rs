@@ -1,4 +1,4 @@
-//! `dragfree design`: what a controls engineer reads of it.
+//! Output of `dragfree design`.
 
 use dragfree_tests::{dragfree, expect, fixture, json};
 use serde_json::Value;
@@ -22,9 +22,9 @@ fn number(value: &Value, key: &str) -> f64 {
     value[key].as_f64().unwrap_or_else(|| panic!("{key} of {value}"))
 }
 
-/// Every bound of the contract on all fifteen channels, from the program's own words.
+/// Every bound on all fifteen channels, from the program's output.
 #[test]
-fn the_default_mission_keeps_every_bound() {
+fn the_default_mission_meets_every_bound() {
     let report = design(&fixture("missions/taiji.toml"), 0);
     let channels = report["channels"].as_array().expect("channels");
     assert_eq!(channels.len(), 15);
@@ -37,7 +37,7 @@ fn the_default_mission_keeps_every_bound() {
     assert!(number(&report, "allocation_residual") < 1e-12);
 }
 
-/// Another requirement is another controller; the other channels stay as they are.
+/// Another requirement changes its controller and no other channel.
 #[test]
 fn a_changed_requirement_gives_another_controller() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -51,9 +51,9 @@ fn a_changed_requirement_gives_another_controller() {
     }
 }
 
-/// What nobody can build is refused with the requirement and a frequency.
+/// An infeasible requirement is refused with its name and a frequency.
 #[test]
-fn a_greedy_requirement_is_named() {
+fn an_infeasible_requirement_is_named() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let mission = changed(dir.path(), "tm_phi_rad_rthz = 2e-7", "tm_phi_rad_rthz = 1e-7");
     let output = expect(dragfree(dir.path()).arg("design").arg(&mission), 1);
@@ -61,7 +61,7 @@ fn a_greedy_requirement_is_named() {
     assert!(error.contains("tm_phi_rad_rthz") && error.contains("Hz"), "{error}");
 }
 
-/// Frozen controllers fly as designed ones do: telemetry is the same byte for byte but for the file's header.
+/// Frozen controllers fly as designed ones: equal telemetry but for the header.
 #[test]
 fn frozen_controllers_are_the_designed_ones() {
     let dir = tempfile::tempdir().expect("a temporary folder");

@@ -1,4 +1,4 @@
-//! Housekeeping that is no good, and candidates that are not: a sentence each, and the rest of the diagnosis as ever.
+//! Unusable housekeeping and candidates: each is reported, and the rest of the diagnosis is unaffected.
 
 use dragfree_tests::calibration::science_mode;
 use dragfree_tests::recording::Recording;
@@ -9,7 +9,7 @@ use std::path::Path;
 /// Length of the telemetry, h.
 const HOURS: f64 = 3.0;
 
-/// Calibrates a file with a model, the pipeline's where there is none, and diagnoses the product.
+/// Calibrates a file with a model, by default the pipeline's, and diagnoses the product.
 fn diagnosed(folder: &Path, telemetry: &Path, model: Option<&Path>) -> Value {
     let mut run = science_mode(folder);
     run.arg(telemetry);
@@ -21,11 +21,10 @@ fn diagnosed(folder: &Path, telemetry: &Path, model: Option<&Path>) -> Value {
     json(dragfree(folder).args(["diagnose", id, "--archive", "archive", "--json", "-q"]), 0)
 }
 
-/// One channel has nothing for an hour, another hangs at one value, a third comes with every sixth packet alone. The gap is told, the
-/// channel that hangs gives no form, the slow one is used, nothing is accepted
-/// (nothing is hidden; false alarms 1 %), and no number is anything but a number.
+/// One channel has a gap of an hour, another is stuck, a third has every sixth packet. The gap is reported, the stuck
+/// channel has no form, the slow one is used, nothing is accepted (false alarm 1 %), and all numbers are finite.
 #[test]
-fn housekeeping_with_gaps_that_hangs_or_is_slow() {
+fn housekeeping_with_gaps_stuck_or_slow() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let hours = HOURS.to_string();
     let file = simulate(folder.path(), &["--hours", &hours, "--seed", "21"]).remove(0);
@@ -59,23 +58,23 @@ fn housekeeping_with_gaps_that_hangs_or_is_slow() {
         .find(|pair| pair[0].as_str().is_some_and(|name| name.contains("eh1_xp_temperature_k")));
     let gap = gap.expect("the gap is told")[1].as_str().expect("a sentence");
     assert!(gap.contains("no value in") && gap.contains("left out"), "{gap}");
-    // Every other temperature serves, and so does the slow charge.
+    // All other temperatures are used, and the slow charge.
     let limits = d["upper_limits"].as_array().expect("limits");
     let of = |effect: &str| limits.iter().filter(|l| l["effect"] == effect).collect::<Vec<_>>();
     let uses = |l: &Value, column: &str| l["shape"].as_object().is_some_and(|s| s.values().any(|v| v == column));
     assert!(!of("thermal").is_empty() && of("thermal").iter().all(|l| !uses(l, "hk.eh1_xp_temperature_k")));
     assert_eq!(of("charge").len(), 2);
-    // A flag that hangs has no steps.
+    // A constant flag has no steps.
     assert!(of("impulse").iter().all(|l| !uses(l, "hk.antenna_move_flag")), "{:?}", of("impulse"));
     for l in limits {
         assert!(l["limit_95"].is_f64() && l["sigma"].is_f64(), "{l}");
     }
 }
 
-/// A model that has a candidate's series under another name, all but a thousandth of its power: a second gain of the same electrode is not
-/// named, and its σ says that these data do not tell the two apart, where the other test mass's gain is known as ever.
+/// The model contains a candidate's series under another name but for a thousandth of its power: the second gain of
+/// that electrode is not accepted, its σ shows the collinearity, and the other test mass's gain is unaffected.
 #[test]
-fn a_candidate_that_the_model_has_under_another_name() {
+fn a_candidate_collinear_with_the_model() {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let hours = HOURS.to_string();
     let file = simulate(folder.path(), &["--hours", &hours, "--seed", "22"]).remove(0);

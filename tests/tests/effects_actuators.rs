@@ -1,16 +1,16 @@
-//! Effects that the simulator's truth has and the model knows: their size comes out, and the offsets stay right.
+//! Simulated effects that the model contains: both solutions recover the size, and the offsets stay right.
 //!
-//! Truth and model share no code: the one acts on states inside the loop, the other works from telemetry. Six hours of the default
-//! mission, seed 1, chosen before the first run; sizes are above eight standard deviations of what six hours tell.
+//! Truth and model share no code: the former acts on states inside the loop, the latter uses telemetry. Six hours of
+//! the default mission, seed 1, chosen before the first run; sizes exceed 8σ.
 //!
-//! **False alarms.** Everything is asked within 4σ, which a right answer misses with probability 6e-5: for the effect's
-//! coefficients, six offsets and two solutions below 1.2e-3 a test.
+//! **False alarms**: everything is required within 4σ (6e-5 each); with coefficients, six offsets and two solutions
+//! below 1.2e-3 per test.
 
 use dragfree_tests::{coefficient, dragfree, fixture, json, simulate};
 use serde_json::Value;
 
 const SIGMAS: f64 = 4.0;
-/// Below this the test would not see a wrong sign or factor.
+/// Minimum significance for the test to detect a wrong sign or factor.
 const SIGNIFICANCE: f64 = 8.0;
 
 /// The offsets of the paper's Table tab:com_calibration_results, m.
@@ -42,7 +42,7 @@ fn calibrated(effects: &[(&str, &str, f64)]) -> Value {
     json(command.args(["--archive", "archive", "--json"]), 0)
 }
 
-/// The sizes come out by both methods, which agree, and so do the offsets.
+/// Asserts that both methods recover the sizes, agree, and give the right offsets.
 fn recovers(effects: &[(&str, &str, f64)], by: &[&str]) {
     let product = calibrated(effects);
     let mut report = String::new();
@@ -76,17 +76,17 @@ fn recovers(effects: &[(&str, &str, f64)], by: &[&str]) {
 const BOTH: [&str; 2] = ["qp", "es-akf"];
 
 #[test]
-fn crosstalk_of_electrodes_and_of_a_capacitive_readout() {
+fn crosstalk_of_electrodes_and_of_a_readout_is_recovered() {
     recovers(&[("es-crosstalk", "tm1.z-x", 0.03), ("is-crosstalk", "tm2.y-z", 0.15)], &BOTH);
 }
 
 #[test]
-fn thrusters_that_are_turned() {
+fn a_thruster_tilt_is_recovered() {
     recovers(&[("mps-tilt", "sc.x", 0.05)], &BOTH);
 }
 
-/// Its trace is in the attitude channels, which the filter does not follow.
+/// Visible in the attitude channels, which the filter does not use.
 #[test]
-fn a_late_attitude() {
+fn an_attitude_delay_is_recovered() {
     recovers(&[("time-offset", "dws", 0.09)], &["qp"]);
 }

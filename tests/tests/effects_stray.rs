@@ -1,4 +1,5 @@
-//! Effects of the environment, end to end: the simulator pushes, the calibration whose model knows it finds size and offset.
+//! Effects of the environment, end to end: a calibration whose model contains the simulated effect recovers size and
+//! offset.
 
 use dragfree_tests::{coefficient, dragfree, fixture, json, simulate};
 use serde_json::Value;
@@ -34,7 +35,7 @@ fn calibrated(truth: &[&str], effects: &[Entry<'_>]) -> Value {
     let mut arguments = vec!["--hours", "6", "--seed", "5"];
     truth.iter().for_each(|effect| arguments.extend(["--effect", effect]));
     let file = simulate(dir.path(), &arguments).remove(0);
-    // Segments of an hour and three quarters: slow causes lie below the lowest bins of the usual ones, 1.2 mHz.
+    // Segments of 1.75 hours: slow causes lie below the lowest bins of the default segments.
     let text = std::fs::read_to_string(fixture("pipelines/science-mode.toml")).expect("readable");
     let text = text.replace("../", &format!("{}/", fixture("").display()));
     let long = "plugin = \"qp-check\"\nparameters = { segment_s = 6553.6 }";
@@ -45,7 +46,8 @@ fn calibrated(truth: &[&str], effects: &[Entry<'_>]) -> Value {
     json(run.arg("--model").arg(model(dir.path(), effects)), 0)
 }
 
-/// Within four standard deviations of the truth: a false alarm in 6e-5 of all looks; and so large that a wrong sign is 16σ off, not seeing it 8σ.
+/// Within 4σ of the truth (false alarm 6e-5 each); the size is such that a wrong sign is 16σ and a missing effect 8σ
+/// off.
 fn found(product: &Value, name: &str, truth: f64) {
     let (value, sigma) = coefficient(product, name, "qp");
     let pull = (value - truth) / sigma;
@@ -63,9 +65,9 @@ fn offsets_found(product: &Value) {
     }
 }
 
-/// Heat on one test mass, charge on the other.
+/// Thermal force on one test mass, charge on the other.
 #[test]
-fn heat_and_charge_come_out_as_they_were_put_in() {
+fn thermal_and_charge_coefficients_are_recovered() {
     let product = calibrated(
         &["thermal:tm1.x=8e-10,lag_s=480", "charge:tm2=0.5"],
         &[
@@ -82,10 +84,10 @@ fn heat_and_charge_come_out_as_they_were_put_in() {
     offsets_found(&product);
 }
 
-/// Propellant, and a force that no bundled effect knows, by the user's own formula. The slug is 3 % of the spacecraft, 3/97 of
-/// the rest, and its resonance with the spacecraft free is higher by 1/√0.97.
+/// Slosh, and a force that no bundled effect covers, by a formula. The slug is 3 % of the spacecraft, 3/97 of the rest;
+/// its resonance with the spacecraft free is higher by 1/√0.97.
 #[test]
-fn a_slug_and_a_formula_come_out_as_they_were_put_in() {
+fn slosh_and_formula_coefficients_are_recovered() {
     let formula = "acts_on = \"tm1.accel.y\"\nexpression = \"lag(hk.battery_current_a ^ 2, 50)\"\nunit = \"m s-2 A-2\"\n\
                    range = [-5e-12, 5e-12]";
     let raised = 0.97_f64.sqrt();

@@ -14,7 +14,7 @@ struct Telemetry {
     short: PathBuf,
 }
 
-/// Six hours (seed 1, chosen before the first run) and a quarter of an hour, made once.
+/// Six hours (seed 1, chosen before the first run) and a quarter of an hour, simulated once.
 fn telemetry() -> &'static Telemetry {
     static FILES: OnceLock<Telemetry> = OnceLock::new();
     FILES.get_or_init(|| {
@@ -34,8 +34,7 @@ fn run(folder: &Path, file: &Path, arguments: &[&str]) -> Command {
     command
 }
 
-/// Ten coefficients within 3σ: under the null the test fails with probability 2.7 % (union bound, 10 × 0.27 %); the
-/// seed is 1, not one that passes. Its twin is `a_wrong_nominal_sign_is_not_within_three_sigma`.
+/// Ten coefficients within 3σ: false alarm 2.7 % (union bound, 10 × 0.27 %) for seed 1, chosen before the first run.
 #[test]
 fn six_hours_give_the_offsets_within_three_sigma() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -43,7 +42,7 @@ fn six_hours_give_the_offsets_within_three_sigma() {
     for (name, truth_m) in TRUTH_M {
         for solution in ["es-akf", "qp"] {
             let (value, sigma) = coefficient(&product, name, solution);
-            // The x axis of one test mass alone is hardly seen in six hours: the QP sees it through the baseline.
+            // One test mass alone hardly determines x in six hours: the QP determines it through the baseline.
             if solution == "es-akf" && name.ends_with('x') {
                 continue;
             }
@@ -52,7 +51,7 @@ fn six_hours_give_the_offsets_within_three_sigma() {
             assert!(pull.abs() <= 3.0, "{name} by {solution}: {value} ± {sigma} m, {pull:.2}σ from the truth");
         }
     }
-    // What the surveyed baseline is worth: b_x is seen by the filter of one test mass through the noisy y and z alone.
+    // Effect of the survey: the filter of one test mass determines b_x only through the noisy y and z.
     for name in ["com-offset.tm1.x", "com-offset.tm2.x"] {
         let (one_alone, both) = (coefficient(&product, name, "es-akf").1, coefficient(&product, name, "qp").1);
         assert!(both < one_alone / 5.0, "{name}: σ = {both} m with the baseline, {one_alone} m without");
@@ -62,9 +61,9 @@ fn six_hours_give_the_offsets_within_three_sigma() {
     assert_eq!(product["epochs_used"], 216_000, "{product}");
 }
 
-/// The twin: telemetry of a spacecraft whose centre of mass lies 15 mm aside does not give the paper's offsets.
+/// Negative control: a centre of mass displaced by 15 mm does not give the paper's offsets.
 #[test]
-fn an_offset_that_is_another_is_seen() {
+fn a_different_offset_is_detected() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let file = simulate(dir.path(), &["--hours", "6", "--seed", "2", "--effect", "com-offset:sc.y=0.015"]).remove(0);
     let product = json(&mut run(dir.path(), &file, &[]), 0);
@@ -76,7 +75,7 @@ fn an_offset_that_is_another_is_seen() {
     assert!((value - TRUTH_M[1].1).abs() > 5.0 * sigma, "15 mm are seen: {value} ± {sigma}");
 }
 
-/// What a product says, without what names this very run.
+/// A product without the fields that identify the run.
 fn essence(mut product: Value) -> Value {
     for key in ["id", "path", "created", "date_created"] {
         product.as_object_mut().expect("an object").remove(key);
@@ -98,7 +97,7 @@ fn attachments(folder: &Path) -> Vec<(String, Vec<u8>)> {
 }
 
 #[test]
-fn results_are_bit_identical_whatever_the_batches_and_threads() {
+fn results_do_not_depend_on_batches_and_threads() {
     let results: Vec<_> = [["1", "1"], ["777", "1"], ["65536", "1"], ["777", "2"], ["65536", "2"]]
         .iter()
         .map(|[rows, threads]| {
@@ -119,9 +118,9 @@ fn results_are_bit_identical_whatever_the_batches_and_threads() {
     assert!(results[0].1.iter().any(|(name, _)| name.ends_with(".mcap")), "time series lie beside the product");
 }
 
-/// Day after day with the state carried on gives what one long run gives, bit by bit.
+/// Days with a carried state equal one long run, bit by bit.
 #[test]
-fn a_state_saved_and_restored_goes_on_as_if_nothing_had_happened() {
+fn a_restored_state_continues_bit_by_bit() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let file = &telemetry().short;
     let codes = |c: &mut Command| {
@@ -137,7 +136,7 @@ fn a_state_saved_and_restored_goes_on_as_if_nothing_had_happened() {
 }
 
 #[test]
-fn a_state_that_is_damaged_or_of_another_chain_is_refused() {
+fn a_damaged_or_foreign_state_is_refused() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let file = &telemetry().short;
     run(dir.path(), file, &["--until", "2035-01-01T00:20:00Z", "--save-state", "state"]).output().expect("runs");

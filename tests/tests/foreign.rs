@@ -8,7 +8,7 @@ use std::fmt::Write;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
-/// Another spacecraft than the default mission's in every number that may differ. The seed was set before the first run.
+/// A spacecraft that differs from the default mission in every number. The seed was set before the first run.
 const FLIGHT: Flight = Flight {
     seconds: 6.0 * 3600.0,
     seed: 1,
@@ -50,13 +50,13 @@ fn mission(folder: &Path, controllers: bool) -> PathBuf {
         text.replace_range(key_at..end, &format!("{key} = {value:e}"));
     }
     if controllers {
-        // This controller knows neither stiffness nor sunlight.
+        // This controller has no stiffness and sunlight compensation.
         for (from, to) in [("[solar_pressure]", "[requirements]"), ("[control]", "[actuators]")] {
             let (start, end) = (text.find(from).expect("a table"), text.find(to).expect("a table"));
             text.replace_range(start..end, "");
         }
         text = text.lines().filter(|l| !l.starts_with("stiffness_")).fold(String::new(), |all, l| all + l + "\n");
-        // Nor a limit of the electrodes, nor what turning the spacecraft does to the test masses.
+        // Nor limits of the electrodes and compensation of rotation.
         text = text.replace("electrostatic_force_limit_n = 5e-9", "electrostatic_force_limit_n = 1e-6");
         text.push_str("\n[control]\ndelay_samples = 0\nlever_feed_forward = false\n");
         let (w, loops) = (FLIGHT.loops, |w: f64| Loops::section(w));
@@ -115,7 +115,7 @@ fn pulls(product: &Value, truth: &Flight) -> Vec<(String, f64)> {
     all
 }
 
-/// Ten pulls within 3σ: a false alarm in 2.7 % at most (union bound).
+/// Ten pulls within 3σ: false alarm at most 2.7 % (union bound).
 fn assert_within_three_sigma(product: &Value) {
     for (name, pull) in pulls(product, &FLIGHT) {
         assert!(pull.abs() <= 3.0, "{name} is {pull:.2}σ from the truth");
@@ -131,7 +131,7 @@ fn telemetry_of_another_producer_needs_a_mission_file_alone() {
     assert_within_three_sigma(&run.product);
 }
 
-/// The twin: against offsets on the other side of the drawings the same pulls are far outside.
+/// Negative control: against mirrored offsets the same pulls are far outside.
 #[test]
 fn mirrored_offsets_are_not_within_three_sigma() {
     let run = run(USUAL, records(), |dir| mission(dir, false));
@@ -140,9 +140,9 @@ fn mirrored_offsets_are_not_within_three_sigma() {
     assert!(pulls.iter().any(|(_, pull)| pull.abs() > 3.0), "{pulls:?}");
 }
 
-/// Noise levels in the mission file that are not those of the flight: the QP measures its own.
+/// With wrong noise levels in the mission file the QP measures its own.
 #[test]
-fn a_mission_file_with_other_noise_levels_still_gives_honest_errors() {
+fn wrong_noise_levels_in_the_mission_file_give_right_errors() {
     let run = run(USUAL, records(), |_| fixture("missions/taiji.toml"));
     assert!(matches!(run.code, Some(0 | 4)), "{}", run.stderr);
     for (name, pull) in pulls(&run.product, &FLIGHT).into_iter().filter(|(name, _)| name.ends_with("qp")) {
@@ -159,9 +159,9 @@ fn commands_that_are_not_telemetered_are_rebuilt_by_the_controllers_of_the_missi
     assert_within_three_sigma(&run.product);
 }
 
-/// Another controller flew than the one in the mission file: the two solutions contradict each other, and it is said.
+/// The mission file has another controller than the flown one: the verdict is a disagreement.
 #[test]
-fn commands_rebuilt_by_the_wrong_controller_are_noticed() {
+fn commands_rebuilt_by_a_wrong_controller_are_detected() {
     let container = Container { command: false, ..USUAL };
     let run = run(container, records(), |_| fixture("missions/taiji.toml"));
     assert_eq!(run.code, Some(4), "{}", run.stderr);
@@ -169,9 +169,9 @@ fn commands_rebuilt_by_the_wrong_controller_are_noticed() {
     assert_eq!(run.product["verdict"], "disagree", "{}", run.product);
 }
 
-/// However the file is laid out, the same bytes of telemetry give the same result.
+/// The layout of the file does not change the result.
 #[test]
-fn the_container_does_not_matter() {
+fn results_do_not_depend_on_the_file_layout() {
     let hour = &records()[..36_000];
     let reference = run(USUAL, hour, |dir| mission(dir, false)).product["coefficients"].clone();
     assert!(reference.is_array());
@@ -188,13 +188,13 @@ fn the_container_does_not_matter() {
 }
 
 #[test]
-fn without_an_ephemeris_the_run_goes_on() {
+fn a_run_works_without_an_ephemeris() {
     let run = run(Container { ephemeris: false, ..USUAL }, records(), |dir| mission(dir, false));
     assert_eq!(run.code, Some(0), "{} {}", run.stderr, run.product);
     assert_within_three_sigma(&run.product);
 }
 
-/// What is diagnosed of six hours with something hidden in them.
+/// Diagnosis of six hours with a hidden effect.
 fn diagnosed(hidden: Hidden) -> Value {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let file = dir.path().join("foreign.mcap");
@@ -212,7 +212,7 @@ fn diagnosed(hidden: Hidden) -> Value {
     serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{}", String::from_utf8_lossy(&output.stderr)))
 }
 
-/// The one candidate that is accepted, by its name, and how far its only coefficient is from the truth, in σ.
+/// Name of the single accepted candidate, and the error of its only coefficient in σ.
 fn found(d: &Value, truth: f64) -> (String, Value, f64) {
     let all: Vec<&Value> =
         d["candidates"].as_array().expect("a list").iter().filter(|c| c["accepted"] == true).collect();
@@ -222,14 +222,14 @@ fn found(d: &Value, truth: f64) -> (String, Value, f64) {
     (name, all[0].clone(), (value - truth) / sigma)
 }
 
-/// Nothing hidden in telemetry of another producer, nothing named (false alarms: one in a hundred).
+/// Without a hidden effect nothing is named (false alarm 1 %).
 #[test]
-fn another_producers_sound_model_is_sufficient() {
+fn another_producers_right_model_is_sufficient() {
     let d = diagnosed(Hidden::default());
     assert_eq!(d["verdict"], "sufficient", "{:#}", d["candidates"][0]);
 }
 
-/// Effects that another producer has hidden, its own way: named alone, in their place, with their size within 4σ (6e-5 each).
+/// Effects of the other producer: named alone, with instance and size within 4σ (6e-5 each).
 #[test]
 fn another_producers_hidden_gain_and_crosstalk_are_found() {
     for (name, truth, hidden) in [
@@ -241,9 +241,9 @@ fn another_producers_hidden_gain_and_crosstalk_are_found() {
     }
 }
 
-/// A readout that shows a tenth too much: itself, or what it names as its confounder, the gain of the electrodes along the same axis.
+/// A readout scale of 1.1: accepted, or listed as a confounder of the electrode gain along the same axis.
 #[test]
-fn another_producers_wrong_readout_is_found_or_named_beside_its_confounder() {
+fn another_producers_readout_scale_is_found_or_listed_as_a_confounder() {
     let (accepted, candidate, pull) = found(&diagnosed(Hidden { shown_tm1_y: 0.1, ..Hidden::default() }), 0.1);
     let beside = candidate["confounders"].as_array().is_some_and(|c| c.iter().any(|name| name == "is-scale:tm1.y"));
     assert!(
@@ -252,9 +252,9 @@ fn another_producers_wrong_readout_is_found_or_named_beside_its_confounder() {
     );
 }
 
-/// Heat through one housing, by thermometers that no plugin has heard of: the right pair, the lag within a third.
+/// A thermal force, with thermometers of unknown names: the right pair, the lag within a third.
 #[test]
-fn another_producers_heat_is_found_by_its_own_thermometers() {
+fn another_producers_thermal_force_is_found_with_its_thermometers() {
     let truth = 2e-11;
     let (accepted, candidate, pull) = found(&diagnosed(Hidden { heat_tm1_x: truth, ..Hidden::default() }), truth);
     assert!(accepted == "thermal:tm1.x" && pull.abs() < 4.0, "{pull} {candidate:#}");
@@ -264,9 +264,9 @@ fn another_producers_heat_is_found_by_its_own_thermometers() {
     assert!((lag_s / HEAT_LAG_S - 1.0).abs() < 0.34, "{lag_s}");
 }
 
-/// A blow of the sky: within a second of its time, with its momentum.
+/// An impulse: within a second of its time, with its momentum.
 #[test]
-fn another_producers_blow_is_found_with_its_time_and_momentum() {
+fn another_producers_impulse_is_found_with_its_time_and_momentum() {
     let (at_s, momentum) = (2.2 * 3600.0, 2e-6);
     let (accepted, candidate, pull) =
         found(&diagnosed(Hidden { blow: Some((at_s, momentum)), ..Hidden::default() }), momentum);

@@ -1,4 +1,4 @@
-//! `--effect`, `--hidden` and `reveal` as a user meets them.
+//! `--effect`, `--hidden` and `reveal` in a user's workflow.
 
 use dragfree_tests::{dragfree, expect, fixture, json};
 use serde_json::Value;
@@ -34,9 +34,9 @@ fn files(made: &Value) -> Vec<String> {
     made["files"].as_array().expect("files").iter().map(|f| f.as_str().expect("a path").to_owned()).collect()
 }
 
-/// The digest of the sealed file is all that the telemetry of a hidden effect tells, in the file of each day.
+/// Telemetry of a hidden effect contains only the digest of the sealed file, in each day's file.
 #[test]
-fn telemetry_tells_the_digest_and_nothing_else() {
+fn telemetry_contains_only_the_digest_of_the_truth() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let plain = json(&mut simulate(dir.path(), "plain", &[]), 0);
     let hidden = json(&mut simulate(dir.path(), "hidden", &["--hidden", "3"]), 0);
@@ -49,7 +49,7 @@ fn telemetry_tells_the_digest_and_nothing_else() {
     for (a, b) in files(&plain).iter().zip(files(&hidden)) {
         let (mut a, mut b) = (metadata(&dir.path().join(a)), metadata(&dir.path().join(b)));
         assert_eq!(b.0.remove("sealed_sha256").as_deref(), opened["sha256"].as_str());
-        // The writer tells when a channel first spoke by the order of its records only.
+        // Channel records appear in the order of first messages.
         assert_eq!(a.0, b.0);
         assert!(a.1.len() > 50 && a.1.remove("/is").is_some() && b.1.remove("/is").is_some());
         assert_eq!(a.1, b.1);
@@ -61,7 +61,7 @@ fn telemetry_tells_the_digest_and_nothing_else() {
         assert!(!text.contains(effect["effect"].as_str().expect("an id")), "{text}");
     }
 
-    // The same again is the same; other noise is another file, and what is there is not overwritten.
+    // The same seeds give the same file, other noise another; existing files are not overwritten.
     let again = json(&mut simulate(dir.path(), "again", &["--hidden", "3"]), 0);
     let bytes =
         |made: &Value| std::fs::read(dir.path().join(made["sealed_file"].as_str().expect("a path"))).expect("read");
@@ -71,7 +71,7 @@ fn telemetry_tells_the_digest_and_nothing_else() {
 }
 
 #[test]
-fn a_sealed_file_that_was_changed_is_told() {
+fn a_changed_sealed_file_is_reported() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let made = json(&mut simulate(dir.path(), "out", &["--hidden", "5"]), 0);
     let sealed = dir.path().join(made["sealed_file"].as_str().expect("a path"));
@@ -81,7 +81,7 @@ fn a_sealed_file_that_was_changed_is_told() {
     assert!(shown.lines().all(|line| line.chars().count() <= 80), "{shown}");
 
     let text = std::fs::read_to_string(&sealed).expect("a sealed file");
-    // Another letter of the about, another digest.
+    // A change of one letter changes the digest.
     std::fs::write(&sealed, text.replace("hides", "hid")).expect("writable");
     let refused = expect(dragfree(dir.path()).arg("reveal").arg(&sealed), 1);
     let refused = String::from_utf8_lossy(&refused.stderr).into_owned();
@@ -93,9 +93,9 @@ fn a_sealed_file_that_was_changed_is_told() {
     assert!(refused.contains("names no sealed file"), "{refused}");
 }
 
-/// The help's list and the simulator's answer name the same effects.
+/// The help and the simulator's message name the same effects.
 #[test]
-fn the_help_lists_what_the_simulator_has() {
+fn the_help_lists_the_effects_of_the_simulator() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let help = expect(dragfree(dir.path()).args(["simulate", "--help"]), 0);
     let help = String::from_utf8_lossy(&help.stdout).into_owned();
@@ -108,7 +108,7 @@ fn the_help_lists_what_the_simulator_has() {
     for id in &ids {
         assert!(list.contains(&format!(" {id}:")), "{id} is not in the help: {list}");
     }
-    // As many as the help names, the examples at its end apart.
+    // As many as in the help, apart from its examples.
     let named = list.split("Some have").next().unwrap_or_default();
     let entries =
         named.split_whitespace().filter(|word| word.contains(':') && word.contains(|c: char| c.is_lowercase()));

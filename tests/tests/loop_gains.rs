@@ -1,5 +1,5 @@
-//! Coefficients made of commands. A command knows what every readout told the controller, so that a fit that does not know as much
-//! finds gains that are not there: both solutions must, and must agree.
+//! Coefficients of command regressors. The regression must condition on the same past data as the controller, or the
+//! gain estimate is biased; both solutions must agree.
 
 use dragfree_tests::calibration::{Run, of_pipeline};
 use dragfree_tests::{coefficient, dragfree, expect, fixture};
@@ -9,7 +9,7 @@ use tempfile::TempDir;
 
 const HIDDEN: [(&str, f64); 3] = [("es-gain:tm1.y", 0.1), ("mps-gain:sc.y", 0.06), ("es-gain:tm2.z", 0.0)];
 
-/// Telemetry and a model in a folder of their own.
+/// Telemetry and a model in a temporary folder.
 type Prepared = (TempDir, PathBuf, PathBuf);
 
 /// Six hours with the gains of [`HIDDEN`], and a model that estimates all of them; simulated once for all tests.
@@ -53,10 +53,10 @@ fn name(effect: &str) -> String {
     effect.replacen(':', ".", 1)
 }
 
-/// Three gains of two solutions within 4σ: a false alarm once in 2600. Verdict: nine differences at 3σ and the survey, 2.6 % at most, less
-/// as both solutions rest on the same data.
+/// Three gains of two solutions within 4σ: false alarm 1 in 2600. Verdict: nine differences at 3σ and the survey, at
+/// most 2.6 %.
 #[test]
-fn gains_are_right_in_both_solutions_and_the_solutions_agree() {
+fn gains_are_right_in_both_solutions() {
     let together = run("");
     together.assert_ended(0, "agree");
     assert_eq!(together.product["quality"]["stages"]["es-akf"]["tm1"]["followed"], serde_json::json!(["tm1", "tm2"]));
@@ -64,15 +64,15 @@ fn gains_are_right_in_both_solutions_and_the_solutions_agree() {
         for solution in ["es-akf", "qp"] {
             let (value, sigma) = coefficient(&together.product, &name(effect), solution);
             assert!((value - truth).abs() < 4.0 * sigma, "{effect} by {solution}: {value} ± {sigma} for {truth}");
-            // A size that six hours can tell at all: σ of 1 % for y, 2.5 % along z, where no interferometer looks.
+            // σ of 1 % for y and 2.5 % along z, which no interferometer reads.
             assert!(sigma < 0.03, "{effect} by {solution}: ± {sigma}");
         }
     }
 }
 
-/// The twin: with a filter for each test mass the same gains are far off, and the verdict says so.
+/// Negative control: a filter per test mass biases the same gains, and the verdict reports it.
 #[test]
-fn filters_that_know_one_test_mass_each_find_gains_that_are_not_there() {
+fn separate_filters_per_test_mass_are_biased() {
     let apart = run("follow = \"each\"");
     apart.assert_ended(4, "disagree");
     for (effect, truth) in HIDDEN {

@@ -1,14 +1,14 @@
-//! Model files with history and the ladder of revisions, whole programs on two hours of telemetry.
+//! Model files with history and the ladder of revisions, as whole programs on two hours of telemetry.
 
 use dragfree_tests::{compile_plugin, dragfree, expect, fixture, json, simulate};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Cross-talk of the simulated test mass 1; an effect in C that the workspace did not build explains it.
+/// Cross-talk of the simulated test mass 1, covered by an effect in C built outside the workspace.
 const CROSSTALK: f64 = 0.1;
 
-/// A reader's folder: a model, two hours of telemetry of which the second is kept out of the fit, a plugin.
+/// A user's folder: a model, two hours of telemetry, one of them withheld from the fit, and a plugin.
 struct Desk {
     dir: tempfile::TempDir,
     hours: [PathBuf; 2],
@@ -42,7 +42,7 @@ impl Desk {
         command
     }
 
-    /// Runs one of the hours; a weak or inconsistent result is a result.
+    /// Runs one hour; a weak or inconsistent result is accepted.
     fn run(&self, hour: usize, model: &str) -> Value {
         let mut command = dragfree(self.path());
         command.arg("run").arg(fixture("pipelines/science-mode.toml")).arg(&self.hours[hour]);
@@ -52,7 +52,8 @@ impl Desk {
         serde_json::from_slice(&output.stdout).expect("JSON")
     }
 
-    /// The model fitted to the first hour, and with its coefficients but the offset fixed on the second: two products.
+    /// Two products: the model fitted to the first hour, and evaluated on the second with its coefficients but the
+    /// offset fixed.
     fn fit_and_hold_out(&self) -> [String; 2] {
         let fitted = self.run(0, "m.toml");
         let id = fitted["id"].as_str().expect("an id");
@@ -77,10 +78,10 @@ fn narrow(text: &str) {
     }
 }
 
-/// Cross-talk of 10 % is added to the model, and then cross-talk of the other test mass that is not there, held at 10 %. The first
-/// helps on the hour that was kept out, the second does not and is named.
+/// A true cross-talk of 10 % is added to the model, then a false one of the other test mass, fixed at 10 %. The first
+/// improves the withheld hour; the second does not and is named.
 #[test]
-fn the_ladder_shows_what_helps_and_names_what_does_not() {
+fn the_ladder_separates_useful_from_useless_effects() {
     let desk = Desk::new();
     let mut products = vec![desk.fit_and_hold_out()];
     let add = ["model", "add", "m.toml", "c-es-crosstalk:tm1.y-x", "--set", "scale=1.0", "--prior-sigma", "0.1"];
@@ -93,7 +94,7 @@ fn the_ladder_shows_what_helps_and_names_what_does_not() {
 
     let truth = desk.truth.to_str().expect("text");
     let mut arguments = vec!["ladder"];
-    // Not in the order of parentage.
+    // Not in order of ancestry.
     arguments.extend(products.iter().rev().map(|[fitted, _]| fitted.as_str()));
     arguments.push("--held-out");
     arguments.extend(products.iter().map(|[_, held]| held.as_str()));
@@ -113,7 +114,7 @@ fn the_ladder_shows_what_helps_and_names_what_does_not() {
     let parents: Vec<_> = rungs.iter().map(|r| r["parent"].as_str()).collect();
     assert_eq!(parents, [None, Some(names[0]), Some(names[1])]);
 
-    // The fall is what the significance of the coefficient promises: (value/σ)², from a Σ that is not quite the one of χ².
+    // The decrease is (value/σ)² of the coefficient, whose Σ differs slightly from that of χ².
     let values = rungs[1]["coefficients"].as_array().expect("coefficients");
     let gain = values.iter().find(|c| c["name"] == "c-es-crosstalk.tm1.y-x").expect("the effect's coefficient");
     let (value, sigma) = (gain["value"].as_f64().expect("a value"), gain["sigma"].as_f64().expect("a sigma"));
@@ -126,7 +127,7 @@ fn the_ladder_shows_what_helps_and_names_what_does_not() {
     assert_eq!(rungs[2]["held_out"]["verdict"], "over-fitted");
     assert!(fall(&rungs[2]["held_out"]) < 0.0 && fall(&rungs[2]) < 0.0);
     assert_eq!(ladder["over_fitted"][0]["effects"], serde_json::json!(["c-es-crosstalk:tm2.y-x"]));
-    // The truth that the user named.
+    // The truth named by the user.
     let offset = &rungs[1]["coefficients"].as_array().expect("coefficients")[1];
     assert_eq!(offset["name"], "com-offset.tm1.y");
     let (error, truth) = (offset["error"].as_f64().expect("known"), offset["truth"].as_f64().expect("known"));
@@ -134,7 +135,7 @@ fn the_ladder_shows_what_helps_and_names_what_does_not() {
         (offset["value"].as_f64().expect("a value") - truth - error).abs() < 1e-12 && (truth - 0.1554).abs() < 1e-4
     );
 
-    // What was fitted cannot be held out, under its own revision or as the child of another.
+    // Fitted data cannot be withheld, under the same revision or a descendant.
     for (held_out, part) in [(&products[0][0], "dragfree model fix"), (&products[1][0], "has seen 2035-01-01 already")]
     {
         let mut wrong = desk.command(&["ladder", &products[0][0], "--held-out", held_out]);
@@ -144,7 +145,7 @@ fn the_ladder_shows_what_helps_and_names_what_does_not() {
 }
 
 #[test]
-fn every_change_is_a_revision_and_every_revision_can_be_seen() {
+fn every_change_makes_a_revision_that_can_be_shown() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let original = std::fs::read_to_string(fixture("models/com-offset.toml")).expect("readable");
     std::fs::write(dir.path().join("m.toml"), &original).expect("writable");
@@ -171,7 +172,7 @@ fn every_change_is_a_revision_and_every_revision_can_be_seen() {
     assert!(now.starts_with("# The model that every mission starts with"), "{now}");
     assert_eq!(std::fs::read_to_string(dir.path().join("m.history/1.toml")).expect("kept"), original);
 
-    // By hand, and another command after it.
+    // An edit by hand, followed by a command.
     std::fs::write(dir.path().join("m.toml"), now.replacen("estimate = true", "estimate = false", 1))
         .expect("writable");
     let shown = text(&mut model(&["show", "m.toml"]));
@@ -189,7 +190,7 @@ fn every_change_is_a_revision_and_every_revision_can_be_seen() {
     narrow(&logged);
     assert!(logged.contains("− com-offset:tm2") && logged.contains("~ com-offset:tm1 (estimate)"), "{logged}");
 
-    // What is wrong is said, with what there is; and nothing is changed by it.
+    // Errors list the alternatives and change nothing.
     let before = std::fs::read(dir.path().join("m.toml")).expect("readable");
     for (arguments, part) in [
         (&["add", "m.toml", "com-offset:tm3"][..], "no instance `tm3`; it has tm1, tm2"),

@@ -1,4 +1,4 @@
-//! An author's way: a skeleton written, built as it is, validated, and run in a model over simulated telemetry.
+//! A plugin author's workflow: a skeleton is written, built, validated, and run in a model on simulated telemetry.
 
 use dragfree_tests::calibration::{Run, of_pipeline, science_mode};
 use dragfree_tests::{built, coefficient, compile_plugin, dragfree, expect, fixture, json, root, simulate};
@@ -47,7 +47,7 @@ fn simulated(folder: &Path, arguments: &[&str]) -> Vec<PathBuf> {
     simulate(folder, arguments)
 }
 
-/// What `validate` says of a file: whether it passed, and the detail of each check.
+/// Result of `validate` for a library.
 fn validated(folder: &Path, library: &Path, more: &[&str]) -> Value {
     let mut command = dragfree(folder);
     let output = command.args(["plugins", "validate", "--json"]).arg(library).args(more).output().expect("runs");
@@ -65,7 +65,7 @@ fn assert_passes(folder: &Path, library: &Path, checks: usize) {
     }
 }
 
-/// The checks that failed, with what was said.
+/// Failed checks with their messages.
 fn failures(result: &Value) -> Vec<(String, String)> {
     let checks =
         result["plugins"].as_array().into_iter().flatten().flat_map(|p| p["checks"].as_array().into_iter().flatten());
@@ -74,7 +74,7 @@ fn failures(result: &Value) -> Vec<(String, String)> {
     failed.map(|c| (text(&c["check"]), text(&c["detail"]))).collect()
 }
 
-/// Every kind in both languages is a plugin as it is.
+/// Skeletons of every kind in both languages build and pass.
 #[test]
 fn every_skeleton_builds_and_passes_the_validator() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -97,7 +97,7 @@ fn every_skeleton_builds_and_passes_the_validator() {
     expect(dragfree(&dir.path().join("my-effect-c")).args(words), 0);
     let model = std::fs::read_to_string(dir.path().join("my-effect-c/model.toml")).expect("a model");
     assert!(model.contains("my-effect-c") && model.contains("hk.battery_current_a"), "{model}");
-    // The stage works in a chain, and what is there is not overwritten.
+    // The stage runs in a chain, and existing files are not overwritten.
     let dir = dir.path();
     let text = format!(
         "[pipeline]\nname = \"test\"\nmission = '{}'\nmodel = 'model.toml'\n[[stage]]\nplugin = \"preprocess\"\n[[stage]]\nplugin = \"my-stage-c\"\n[[stage]]\nplugin = \"my-stage-rust\"\n",
@@ -119,7 +119,7 @@ fn every_skeleton_builds_and_passes_the_validator() {
     assert!(String::from_utf8_lossy(&refused.stderr).contains("not empty"));
 }
 
-/// What ships passes what it preaches: an effect, the four stages, and the simulator, by their ids.
+/// The bundled plugins pass the validator.
 #[test]
 fn the_bundled_plugins_pass_the_validator() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -128,7 +128,7 @@ fn the_bundled_plugins_pass_the_validator() {
     }
 }
 
-/// Each misbehaviour is found by the check that looks for it, and none ends the program that asks.
+/// Each misbehaviour is found by its check, and none ends the program.
 #[test]
 fn misbehaviour_is_found_and_a_crash_is_a_result() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -157,9 +157,8 @@ fn misbehaviour_is_found_and_a_crash_is_a_result() {
     assert!(found[0].1.contains("no shared library"), "{found:?}");
 }
 
-/// A thermal force of 8e-9 m s⁻² per kelvin across the housing along x: either skeleton finds a force of 1.96 kg times that within 3σ
-/// and sees it at more than 10σ. On telemetry without it the coefficient is within 3σ of zero. Both skeletons compute the same, so that
-/// a right program fails with probability 0.5 %.
+/// A thermal force of 8e-9 m s⁻² per kelvin along x: either skeleton finds 1.96 kg times that within 3σ and above 10σ,
+/// and zero within 3σ without it. False alarm 0.5 %.
 #[test]
 fn a_simulated_force_is_found_by_a_skeleton() {
     const SIZE_M_S2_K: f64 = 8e-9;

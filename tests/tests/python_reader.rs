@@ -1,5 +1,5 @@
-//! Another implementation reads what we write: the Python packages `mcap` and `mcap-protobuf-support`, from the schema
-//! in the file alone. Skipped with a message where there is no Python, or no package index to install them from.
+//! Our files read by the Python packages `mcap` and `mcap-protobuf-support`, from the schema in the file alone. Skipped
+//! with a message without Python or a package index.
 
 #![allow(clippy::print_stdout, reason = "a skipped test says so")]
 
@@ -12,7 +12,7 @@ use std::sync::OnceLock;
 
 const PACKAGES: [&str; 3] = ["mcap==1.2.2", "mcap-protobuf-support==0.5.3", "protobuf>=5,<7"];
 
-/// A Python with the packages; `None`, and a message, where there is none to be had.
+/// A Python with the packages; `None`, with a message, if unavailable.
 fn python() -> Option<&'static Path> {
     static PYTHON: OnceLock<Option<PathBuf>> = OnceLock::new();
     let found = PYTHON.get_or_init(|| {
@@ -53,7 +53,7 @@ fn assert_near(got: &Value, want: f64, what: &str) {
     assert!((got - want).abs() <= 1e-12 * want.abs(), "{what}: {got} against {want}");
 }
 
-/// Our reader and the Python one find the same numbers in the simulator's telemetry and in the time series.
+/// Our reader and the Python one find equal numbers in telemetry and time series.
 #[test]
 fn python_reads_what_we_write() {
     let Some(python) = python() else { return };
@@ -107,7 +107,7 @@ fn first_double(data: &[u8]) -> f64 {
     f64::from_le_bytes(data[3..11].try_into().expect("eight bytes"))
 }
 
-/// The hand-made file of the other producer is one that others can read: what we test our reader with is sound.
+/// The other producer's file is readable by others.
 #[test]
 fn python_reads_the_other_producer() {
     let Some(python) = python() else { return };

@@ -1,10 +1,10 @@
-//! The control law replayed from telemetry, against the law that flew.
+//! The control law replayed from telemetry, compared with the flown one.
 
 use dragfree_tests::{dragfree, fixture, json, simulate};
 use serde_json::Value;
 use std::path::Path;
 
-/// The science pipeline with more time for the replayed law to settle than it takes to forget its state.
+/// The science pipeline with a settling time longer than the law's memory.
 fn pipeline(folder: &Path) -> std::path::PathBuf {
     let text = std::fs::read_to_string(fixture("pipelines/science-mode.toml")).expect("the fixture is there");
     let fixtures = fixture("");
@@ -29,10 +29,10 @@ fn notes(product: &Value) -> String {
     product["quality"]["notes"].to_string()
 }
 
-/// Beside telemetered commands the replay starts from nothing where the flown law had settled, and reads telemetry through
-/// `preprocess`; once it has forgotten its start it is the flown law to 1e-9 in each of the six vectors.
+/// The replay starts from zero and reads telemetry through `preprocess`; after its memory it equals the flown commands
+/// to 1e-9 in each of six vectors.
 #[test]
-fn rebuilt_commands_are_those_that_flew() {
+fn rebuilt_commands_equal_the_flown_ones() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let files = simulate(dir.path(), &["--hours", "2"]);
     let product = run(dir.path(), &files, None, 0);

@@ -1,4 +1,4 @@
-//! The story that `dragfree demo` tells and the guide's page follows: a hidden effect, found, added, and opened.
+//! The story of `dragfree demo` and of the guide: a hidden effect is found, added to the model, and revealed.
 
 use dragfree_tests::calibration::TRUTH_M;
 use dragfree_tests::{coefficient, dragfree, fixture, json};
@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::OnceLock;
 
-/// The demo, told once. Its seeds (noise 5 and 6, hidden 38) were fixed before the first run.
+/// The demo, run once. Its seeds (noise 5 and 6, hidden 38) were fixed before the first run.
 fn told() -> &'static Value {
     static STORY: OnceLock<Value> = OnceLock::new();
     STORY.get_or_init(|| {
@@ -20,14 +20,14 @@ fn number(value: &Value) -> f64 {
     value.as_f64().unwrap_or_else(|| panic!("{value} is no number"))
 }
 
-/// How far the adopted value is from the truth, in its σ.
+/// Error of the adopted value over its σ.
 fn pull(product: &Value, name: &str, truth_m: f64) -> f64 {
     let (value, sigma) = coefficient(product, name, "adopted");
     (value - truth_m) / sigma
 }
 
-/// Six coefficients within 3σ with the effect: that fails by chance in 1.6 % (union bound). Without it both y are beyond 8σ while
-/// every test of the fit is content, which is the point of the story.
+/// With the effect six coefficients lie within 3σ (false alarm 1.6 %, union bound). Without it both y are beyond 8σ
+/// although the tests of the fit pass.
 #[test]
 fn the_offset_is_wrong_without_the_effect_and_right_with_it() {
     let (before, after) = (&told()["story"]["before"], &told()["story"]["after"]);
@@ -41,7 +41,7 @@ fn the_offset_is_wrong_without_the_effect_and_right_with_it() {
     assert_eq!(told()["id"], after["id"], "the demo's own answer is the mended product");
 }
 
-/// Effect and place first, with its size within 4σ (a false alarm in 6e-5); the seal says so.
+/// Effect and instance first, size within 4σ (false alarm 6e-5), confirmed by the sealed truth.
 #[test]
 fn the_hidden_effect_is_named_first_and_the_score_is_right() {
     let story = &told()["story"];
@@ -54,21 +54,21 @@ fn the_hidden_effect_is_named_first_and_the_score_is_right() {
     assert_eq!((score["verdict"].as_str(), score["correct"].as_bool()), (Some("right"), Some(true)), "{score:#}");
     let size = &hidden["values"][0];
     assert!(number(&size["difference_sigma"]).abs() < 4.0, "{size}");
-    // What was drawn is what the simulator says that it drew.
+    // The drawn size equals the simulator's statement.
     assert_eq!(size["truth"], hidden["size"]);
     // The significance is the expected one ± 1.
     let apart = number(&hidden["significance"]) - number(&hidden["expected_significance"]);
     assert!(apart.abs() < 4.0, "{hidden:#}");
 }
 
-/// On hours that no fit has seen, a value v of an effect that is θ ± σ there lowers χ² by (2vθ − v²)/σ², known to 2v/σ.
+/// On withheld hours, a value v of an effect that is θ ± σ there lowers χ² by (2vθ − v²)/σ², known to 2v/σ.
 #[test]
-fn the_mended_model_predicts_hours_that_it_has_not_seen() {
+fn the_extended_model_predicts_withheld_hours() {
     let ladder = &told()["story"]["ladder"];
     let [old, new] = &ladder["revisions"].as_array().expect("revisions")[..] else { panic!("two revisions: {ladder}") };
     assert!(number(&new["held_out"]["chi2_per_dof"]) < number(&old["held_out"]["chi2_per_dof"]), "{ladder:#}");
     assert_eq!(new["held_out"]["verdict"], "helps");
-    // Both weigh the same epochs, whatever of the noise each of them has estimated.
+    // Both use the same epochs, whatever noise each has estimated.
     assert_eq!((number(&new["fall"]["uncertainty"]), &new["dof"]), (0.0, &old["dof"]));
 
     let size = &told()["story"]["score"]["effects"][0]["values"][0];
@@ -78,10 +78,10 @@ fn the_mended_model_predicts_hours_that_it_has_not_seen() {
     assert!((fall - expected).abs() < 3.0 * error, "{fall} against {expected} ± {error}");
 }
 
-/// Every size that the simulator can draw has its coefficient, by name and unit, among those that a diagnosis tries: an effect that
-/// is asked for stands beside the limit that the story's diagnosis gives for it. Impulses and levels of noise have no limits.
+/// Every size that the simulator can draw has a coefficient with its name and unit: a requested effect appears with a
+/// limit in the diagnosis. Impulses and noise levels have no limits.
 #[test]
-fn sizes_of_the_simulator_are_coefficients_of_the_models() {
+fn every_simulated_size_has_a_model_coefficient() {
     let asked = [
         "es-gain:tm1.z=0.01",
         "es-crosstalk:tm2.z-y=0.01",

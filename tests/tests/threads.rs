@@ -1,4 +1,4 @@
-//! Threads change the time that a simulation takes and nothing else.
+//! Threads change the duration of a simulation, not its result.
 
 use dragfree_tests::simulate;
 use std::path::Path;

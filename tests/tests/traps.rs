@@ -1,7 +1,7 @@
-//! Traps: telemetry or settings that look perfect to a filter and give wrong offsets. The verdict must not fall for them, and must
-//! not cry wolf without them.
+//! Data and settings for which a filter is consistent but its offsets are biased. The verdict must be `disagree` for
+//! them and must not be without them.
 //!
-//! Seeds are 1, 2 and 3. Nothing is tuned to them: what the tests ask of each is stated with its false-alarm rate.
+//! Seeds are 1, 2 and 3, without tuning; each test states its false-alarm rate.
 
 use dragfree_tests::calibration::{Run, TRUTH_M, changed_mission, of_pipeline};
 use dragfree_tests::{coefficient, dragfree, fixture};
@@ -33,7 +33,8 @@ const TORQUE: &str = "asd_nm_rthz = 1e-7 ";
 const LOUD_TORQUE: &str = "asd_nm_rthz = 1e-6 ";
 const SURVEY: &str = "baseline_srf_m = [0.0, 0.36, 0.0] ";
 
-/// A spacecraft ten times as restless: its attitude says more of the offsets in six hours than the default one's in weeks.
+/// A spacecraft with ten times the angular excitation, whose six hours determine the offsets better than weeks of the
+/// default one.
 fn restless() -> &'static (TempDir, Vec<PathBuf>) {
     static FILES: OnceLock<(TempDir, Vec<PathBuf>)> = OnceLock::new();
     FILES.get_or_init(|| {
@@ -42,7 +43,7 @@ fn restless() -> &'static (TempDir, Vec<PathBuf>) {
     })
 }
 
-/// What the data say of a constraint: distance and σ, m.
+/// Residual and σ of a constraint, m.
 fn pull(run: &Run, constraint: &str) -> (f64, f64) {
     let all = &run.product["quality"]["stages"]["qp-check"]["constraints"];
     let one = all.as_array().into_iter().flatten().find(|c| c["constraint"] == constraint);
@@ -67,24 +68,24 @@ fn run(file: &Path, mission: &Path, parameters: &str, without: &[&str], argument
 
 const COMMANDED: &str = "angular_acceleration = \"commanded\"";
 
-/// Without a trap: a contradiction is a false alarm with probability below 6 × 0.27 % (two solutions) + 0.1 % (survey) +
-/// 6 × 0.01 % (box) per seed, 5.3 % for the three.
+/// Without a bias: per seed a contradiction has a probability below 6 × 0.27 % (two solutions) + 0.1 % (survey) + 6 ×
+/// 0.01 % (box), 5.3 % for three seeds.
 #[test]
-fn sound_days_are_not_contradicted() {
+fn right_solutions_do_not_disagree() {
     for file in default_files() {
         let run = run(file, &fixture("missions/taiji.toml"), "", &[], &[]);
         run.assert_ended(0, "agree");
     }
 }
 
-/// The paper's loop makes the thrusters' noise a part of the command: taken for the angular acceleration it pulls `b_x` of either
-/// test mass by centimetres, and the innovations of the filter show nothing of it.
+/// Feedback makes thruster noise part of the command. Used as angular acceleration, the command biases `b_x` by
+/// centimetres, and the filter's innovations do not show it.
 #[test]
-fn a_commanded_torque_taken_for_the_angular_acceleration_is_a_disagreement() {
+fn commanded_torque_as_angular_acceleration_gives_a_disagreement() {
     for file in default_files() {
         let run = run(file, &fixture("missions/taiji.toml"), COMMANDED, &[], &[]);
         run.assert_ended(4, "disagree");
-        // The trap is there: the filter is pleased, and wrong by centimetres.
+        // The bias is present: NIS is consistent, and the error is centimetres.
         let nis = run.product["nis"].as_f64().expect("a number");
         assert!((nis - 1.0).abs() < 0.02, "{nis}");
         let (x_m, sigma_m) = coefficient(&run.product, "com-offset.tm1.x", "es-akf");
@@ -99,9 +100,9 @@ fn a_commanded_torque_taken_for_the_angular_acceleration_is_a_disagreement() {
     }
 }
 
-/// The verdict hangs neither on the filter nor on the survey: the trap is seen with one of them missing, and with both.
+/// The disagreement is detected without the filter, without the survey, and without both.
 #[test]
-fn the_trap_is_seen_without_filter_and_without_survey() {
+fn the_disagreement_needs_neither_filter_nor_survey() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let no_survey =
         changed_mission(dir.path(), "m.toml", &[("[housing]", ""), (SURVEY, "# "), ("baseline_tolerance_m", "# ")]);
@@ -116,9 +117,9 @@ fn the_trap_is_seen_without_filter_and_without_survey() {
     }
 }
 
-/// The attitude's second difference as angular acceleration: errors in variables, 1 % of the offset is left.
+/// The second difference of the attitude as angular acceleration: errors in variables attenuate the offset to 1 %.
 #[test]
-fn a_second_difference_taken_for_the_angular_acceleration_is_a_disagreement() {
+fn a_second_difference_as_angular_acceleration_gives_a_disagreement() {
     let parameters = "angular_acceleration = \"second-difference\"";
     for file in default_files() {
         let run = run(file, &fixture("missions/taiji.toml"), parameters, &[], &[]);
@@ -127,10 +128,10 @@ fn a_second_difference_taken_for_the_angular_acceleration_is_a_disagreement() {
     }
 }
 
-/// A survey that is wrong by a millimetre along z, where the data are sharp enough to know. The distance that the product
-/// tells is the millimetre within 3σ (three draws: a false alarm in 0.8 %).
+/// A survey error of a millimetre along z, where the data are accurate. The reported residual is the millimetre within
+/// 3σ (three draws: false alarm 0.8 %).
 #[test]
-fn a_survey_wrong_by_a_millimetre_is_noticed() {
+fn a_survey_error_of_a_millimetre_is_detected() {
     let (dir, files) = restless();
     let right = changed_mission(dir.path(), "right.toml", &[(TORQUE, LOUD_TORQUE)]);
     let wrong = changed_mission(
@@ -150,12 +151,12 @@ fn a_survey_wrong_by_a_millimetre_is_noticed() {
         assert!(notes.contains("baseline.z: the data alone put it") && notes.contains("multiplier"), "{notes}");
         let (distance_m, sigma_m) = pull(&run, "baseline.z");
         assert!((distance_m + 1e-3).abs() <= 3.0 * sigma_m, "{distance_m} ± {sigma_m}");
-        // Six standard deviations: below, the test would lack the power that it claims.
+        // Six standard deviations, as claimed for the power of this test.
         assert!(sigma_m < 1e-3 / 6.0, "{sigma_m}");
     }
 }
 
-/// Three quarters of an hour without a survey: x of both test masses is not seen, and it is said so by name.
+/// Without a survey, 45 minutes do not determine x of either test mass; the verdict names it.
 #[test]
 fn a_short_record_without_a_survey_is_weak_in_named_directions() {
     let dir = tempfile::tempdir().expect("a temporary folder");
@@ -168,14 +169,14 @@ fn a_short_record_without_a_survey_is_weak_in_named_directions() {
         for name in ["com-offset.tm1.x", "com-offset.tm2.x", "is not seen", "against a range of"] {
             assert!(weak.contains(name), "{weak}");
         }
-        // The combinations that are seen are not called weak: y is known to 3 mm.
+        // Observable combinations are not called weak: y is known to 3 mm.
         assert!(!weak.contains(".y") && !weak.contains(".z"), "{weak}");
     }
 }
 
-/// A spacecraft that does not turn says nothing of its centre of mass: σ stays at what the drawings leave, nothing is invented.
+/// Without rotation the offsets are unobservable: σ stays at the prior's.
 #[test]
-fn a_spacecraft_that_does_not_turn_is_weak_everywhere() {
+fn a_spacecraft_without_rotation_is_weak_everywhere() {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let quiet = changed_mission(
         dir.path(),
@@ -189,7 +190,7 @@ fn a_spacecraft_that_does_not_turn_is_weak_everywhere() {
     let run = run(&folder.join("SC1_2035-01-01.mcap"), &quiet, "", &[], &[]);
     run.assert_ended(0, "weak");
     let weak = run.product["weak_directions"].as_array().expect("directions");
-    // Six unknowns, of which the survey ties three to the other three.
+    // Six unknowns, three of which the survey ties to the other three.
     assert_eq!(weak.len(), 3, "{weak:?}");
     for (name, half_range_m) in [("x", 0.0273), ("y", 0.0273), ("z", 0.02)] {
         for tm in ["tm1", "tm2"] {

@@ -1,4 +1,4 @@
-//! MCAP by hand, from its specification.
+//! MCAP written from its specification.
 
 use std::io::Write;
 use std::path::Path;
@@ -6,18 +6,18 @@ use std::path::Path;
 use super::Record;
 use super::wire;
 
-/// How the records are laid into the file.
+/// Layout of the file.
 #[derive(Clone, Copy, Debug)]
 pub struct Container {
-    /// Messages in chunks, or one by one.
+    /// Whether messages are in chunks.
     pub chunks: bool,
-    /// Chunks compressed with zstd, or not at all.
+    /// Whether chunks are compressed with zstd.
     pub zstd: bool,
-    /// Summary, statistics and indexes, or nothing after the data.
+    /// Whether the file has summary, statistics and indexes.
     pub summary: bool,
-    /// `/command` among the topics.
+    /// Whether the topic `/command` exists.
     pub command: bool,
-    /// `/ephemeris` among the topics.
+    /// Whether the topic `/ephemeris` exists.
     pub ephemeris: bool,
 }
 
@@ -115,7 +115,7 @@ struct Chunk {
 struct Writer {
     out: Vec<u8>,
     container: Container,
-    /// Messages of the open chunk, and per channel their times and places.
+    /// Messages of the open chunk, with times and positions per channel.
     open: Vec<u8>,
     index: [Vec<(u64, u64)>; TOPICS.len()],
     messages: usize,

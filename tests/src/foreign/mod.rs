@@ -1,7 +1,7 @@
-//! Telemetry by another producer: its own simulator, its own controllers, its own bytes.
+//! Telemetry by an independent producer: its own simulator, controllers and encoder.
 //!
-//! Written from `telemetry.proto` and the MCAP specification alone, sharing no code with the simulator plugin, the
-//! physics crate or the engine's encoder: what those have wrong, this has not.
+//! Written from `telemetry.proto` and the MCAP specification alone, without code of the simulator plugin, the physics
+//! crate or the engine's encoder, so that it does not share their errors.
 
 mod file;
 mod spacecraft;

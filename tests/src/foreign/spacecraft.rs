@@ -1,12 +1,12 @@
-//! A spacecraft with two test masses in a closed loop: small angles, forces constant over a step, exact steps.
+//! A spacecraft with two test masses in a closed loop: small angles, forces constant over a step, exact integration.
 
 /// Samples per second.
 const RATE_HZ: f64 = 10.0;
 const DT_S: f64 = 1.0 / RATE_HZ;
-/// The loop runs so long before the first sample that is kept.
+/// Settling time before the first recorded sample.
 const SETTLE_S: f64 = 3_000.0;
 
-/// What flies: noise levels (one-sided amplitude densities), offsets, controllers.
+/// A simulation: noise levels (one-sided amplitude densities), offsets, controllers.
 #[derive(Clone, Copy, Debug)]
 pub struct Flight {
     /// Length, s.
@@ -29,28 +29,28 @@ pub struct Flight {
     pub sunlight_n: f64,
     /// Bandwidths.
     pub loops: Loops,
-    /// What nobody is told.
+    /// Hidden effects.
     pub hidden: Hidden,
 }
 
-/// What is not as the mission file says.
+/// Differences from the mission file.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Hidden {
-    /// Part of the electrodes' push along y of test mass 2 that acts along x.
+    /// Fraction of the electrodes' force along y of test mass 2 that acts along x.
     pub aside_tm2_y_x: f64,
-    /// The thrusters push so much more than commanded along y of SRF.
+    /// Gain error of the thrusters along y of SRF.
     pub thrust_y: f64,
-    /// The capacitive readout of y of test mass 1 shows so much more than there is.
+    /// Scale error of the capacitive readout of y of test mass 1.
     pub shown_tm1_y: f64,
     /// Acceleration of test mass 1 along x per kelvin between the sides of its housing, behind a lag of [`HEAT_LAG_S`], m s⁻² K⁻¹.
     pub heat_tm1_x: f64,
-    /// A blow along x of SRF at this time after the first sample, s, and its momentum, N s.
+    /// Impulse along x of SRF: time after the first sample, s, and momentum, N s.
     pub blow: Option<(f64, f64)>,
 }
 
-/// How long the heat takes from where it is measured to where it pushes, s.
+/// Lag between thermometer and force, s.
 pub const HEAT_LAG_S: f64 = 700.0;
-/// Relaxation of the temperatures, s, and how far they wander, K.
+/// Relaxation time of the temperatures, s, and their standard deviation, K.
 const HEAT_S: f64 = 1500.0;
 const HEAT_K: f64 = 0.03;
 
@@ -68,8 +68,8 @@ pub struct Loops {
 }
 
 impl Loops {
-    /// The digital controller of a loop of bandwidth `w` as one second-order section `[b0, b1, b2, a1, a2]` behind a
-    /// gain: a filtered position, its difference and its sum.
+    /// Digital controller of a loop of bandwidth `w`: one second-order section `[b0, b1, b2, a1, a2]` behind a gain,
+    /// from filtered position, difference and sum.
     #[must_use]
     pub fn section(w: f64) -> (f64, [f64; 5]) {
         let a = smoothing(w);
@@ -87,7 +87,7 @@ fn pid(w: f64) -> (f64, f64, f64) {
     (w * w, 1.7 * w, 0.08 * w * w * w)
 }
 
-/// One sample: what is read at `t_k`, and what is commanded from `t_k` on.
+/// One sample: readouts at `t_k`, and commands from `t_k` on.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Record {
     /// Capacitive displacement, ORF, m.
@@ -106,7 +106,7 @@ pub struct Record {
     pub torque_nm: [f64; 3],
     /// Electrostatic force, ORF, N.
     pub electrostatic_n: [[f64; 3]; 2],
-    /// Temperatures left and right of test mass 1, and of the battery, which pushes nothing, K.
+    /// Temperatures left and right of test mass 1, and of the battery, which has no effect, K.
     pub temperature_k: [f64; 3],
 }
 
@@ -202,7 +202,7 @@ impl Flight {
     }
 }
 
-/// Flies, and gives one record per sample.
+/// Runs the simulation and returns one record per sample.
 #[must_use]
 pub fn fly(flight: &Flight) -> Vec<Record> {
     let mut dice = Dice::new(flight.seed);
@@ -213,7 +213,7 @@ pub fn fly(flight: &Flight) -> Vec<Record> {
     let sunlight = [flight.sunlight_n, 0.0, 0.0];
     let sunlight_torque = cross([0.1, 0.0, 0.6], sunlight);
     let hidden = &flight.hidden;
-    // Dice of their own: what is hidden does not change the noise.
+    // A separate random stream, so that hidden effects do not change the noise.
     let mut weather = Dice::new(flight.seed + 1_000_000);
     let (mut temperature_k, mut felt_k) = ([0.0; 3], 0.0);
     let (settle, keep) = ((SETTLE_S * RATE_HZ) as usize, (flight.seconds * RATE_HZ) as usize);
@@ -228,7 +228,8 @@ pub fn fly(flight: &Flight) -> Vec<Record> {
             record.dws_tm_rad[i] = [0.0; 2].map(|x: f64| x + dice.white(1e-9));
         }
         for t in &mut temperature_k {
-            // A step of the process that forgets within HEAT_S and wanders HEAT_K, rms; unit deviates are white of √(2/rate).
+            // Ornstein–Uhlenbeck step with relaxation time HEAT_S and standard deviation HEAT_K; unit deviates are
+            // white of √(2/rate).
             *t += -*t * DT_S / HEAT_S + HEAT_K * (2.0 * DT_S / HEAT_S).sqrt() * weather.white((2.0 / RATE_HZ).sqrt());
         }
         felt_k += (temperature_k[0] - temperature_k[1] - felt_k) * DT_S / HEAT_LAG_S;
@@ -237,7 +238,7 @@ pub fn fly(flight: &Flight) -> Vec<Record> {
         if k >= settle {
             records.push(record);
         }
-        // From here to the next sample everything is constant.
+        // Everything is constant until the next sample.
         let mut force: [f64; 3] =
             std::array::from_fn(|a| record.force_n[a] + sunlight[a] + dice.white(flight.thrust_n));
         force[1] += hidden.thrust_y * record.force_n[1];
@@ -249,7 +250,7 @@ pub fn fly(flight: &Flight) -> Vec<Record> {
         let mut on_spacecraft = force;
         let mut torque_on_spacecraft = torque;
         for i in 0..2 {
-            // The electrodes push the spacecraft back.
+            // Recoil of the electrodes.
             let back = to_srf(i, record.electrostatic_n[i]);
             let twist = to_srf(i, cross(offset[i], record.electrostatic_n[i]));
             for a in 0..3 {
@@ -282,7 +283,7 @@ pub fn fly(flight: &Flight) -> Vec<Record> {
     records
 }
 
-/// Nine loops and who acts for them.
+/// Nine loops and their actuators.
 fn control(loops: &mut [Loop; 9], bandwidths: &Loops, record: &mut Record) {
     let mut wanted = |k: usize, w: f64, y: f64| loops[k].acceleration(w, y);
     let turn = [0, 1, 2].map(|k| wanted(k, bandwidths.attitude, record.dws_sc_rad[k]));

@@ -1,4 +1,4 @@
-//! Protobuf's wire format by hand: proto3, so a zero is not sent.
+//! Protobuf's wire format, written from its specification; proto3 does not send zeros.
 
 use super::Record;
 
@@ -44,7 +44,7 @@ fn nested(out: &mut Vec<u8>, field: u32, fill: impl FnOnce(&mut Vec<u8>)) {
     bytes(out, field, &inner);
 }
 
-/// `InertialSensors`, with a field of its own that nobody else knows.
+/// `InertialSensors`, with an additional unknown field.
 pub(super) fn inertial_sensors(r: &Record) -> Vec<u8> {
     let mut out = Vec::new();
     for i in 0..2 {
@@ -112,14 +112,14 @@ pub(super) fn scalar(value: f64) -> Vec<u8> {
     out
 }
 
-/// Name, number, type, and of which message.
+/// Name, number, type and message of a field.
 type Field = (&'static str, u32, u32, &'static str);
 
 const DOUBLE: u32 = 1;
 const UINT32: u32 = 13;
 const MESSAGE: u32 = 11;
 
-/// A `FileDescriptorSet` with one file that holds the messages of this producer.
+/// A `FileDescriptorSet` with one file that contains this producer's messages.
 pub(super) fn descriptor_set() -> Vec<u8> {
     let vec3 = [("x", 1, DOUBLE, ""), ("y", 2, DOUBLE, ""), ("z", 3, DOUBLE, "")];
     let angles = [("phi", 1, DOUBLE, ""), ("theta", 2, DOUBLE, ""), ("psi", 3, DOUBLE, "")];
