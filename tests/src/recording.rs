@@ -63,7 +63,7 @@ impl Recording {
         self.write_all(to, self.messages.iter().filter_map(|m| change(m.clone())));
     }
 
-    /// Writes these messages, in this order, to the channels of the recording; a topic without a message has no channel.
+    /// Writes messages, in this order, to the channels of the recording; a topic without messages has no channel.
     ///
     /// # Panics
     /// The file cannot be written.

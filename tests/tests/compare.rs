@@ -67,7 +67,7 @@ fn a_right_model_passes_in_every_channel() {
         let (ratio, dof) = (channel["chi2_per_dof"].as_f64().expect("a ratio"), channel["dof"].as_f64().expect("dof"));
         assert!((ratio - 1.0).abs() < 5.0 * (2.0 / dof).sqrt() && dof > 9e4, "{} {ratio} {dof}", channel["name"]);
         assert_eq!(channel["tests"].as_array().expect("tests").len(), 5);
-        // Nine ratios of ten lie in intervals that hold 95 of a hundred: of 128 all but 6 ± 2.5, and not none less than 16.
+        // Of 128 ratios 6 ± 2.5 are expected outside their 95 % intervals; 18 is nearly 5σ.
         let inside = |i: usize| {
             let r = channel["measured_psd"][i].as_f64()? / channel["predicted_psd"][i].as_f64()?;
             let [low, high] = [0, 1].map(|k| channel["interval_95"][i][k].as_f64());
@@ -79,7 +79,7 @@ fn a_right_model_passes_in_every_channel() {
     }
     assert_eq!(c["hours_ns"].as_array().expect("hours").len(), 3);
     assert_eq!(c["nis"]["passes"], true);
-    // One in a hundred fails by chance, as does one in a hundred with housekeeping beside it.
+    // False alarms: 1 % for each of the two families of tests.
     let innovations = c["innovations"].as_array().expect("innovations");
     assert!(innovations.len() == 6 && innovations.iter().all(|i| i["passes"] == true), "{innovations:#?}");
     assert_eq!(c["together"], Value::Array(Vec::new()));

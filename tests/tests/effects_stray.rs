@@ -29,7 +29,7 @@ fn model(folder: &Path, effects: &[Entry<'_>]) -> std::path::PathBuf {
     path
 }
 
-/// The product of six hours (seed 5, chosen before the first run) with these effects in the truth and those in the model.
+/// Product of six hours (seed 5, chosen before the first run) with effects in the truth and effects in the model.
 fn calibrated(truth: &[&str], effects: &[Entry<'_>]) -> Value {
     let dir: TempDir = tempfile::tempdir().expect("a temporary folder");
     let mut arguments = vec!["--hours", "6", "--seed", "5"];

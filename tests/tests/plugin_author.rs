@@ -6,8 +6,8 @@ use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// Writes a skeleton and builds it with what this machine has already: cargo offline, with the lock file of this workspace, into a
-/// target folder that stays from test to test; or make. Gives the library.
+/// Writes a skeleton and builds it offline, with cargo and this workspace's lock file into a persistent target folder,
+/// or with make. Returns the library.
 fn skeleton(folder: &Path, name: &str, kind: &str, language: &str) -> PathBuf {
     let out = folder.join(name);
     let mut new = dragfree(folder);

@@ -141,7 +141,8 @@ pub struct Scored {
     pub not_compared_because: Option<String>,
     /// |value|/σ of the candidate's leading coefficient; noise levels count from 1.
     pub significance: Option<f64>,
-    /// |truth|/σ with the σ of the diagnosis, found or not. It may be below the expected significance if these data say little, e.g. a charge that drifts steadily.
+    /// Significance |truth|/σ with the σ of the diagnosis, found or not. It is below the expected one if these data say
+    /// little, e.g. for a charge that drifts steadily.
     pub significance_at_hand: Option<f64>,
     /// Decrease of χ² by the candidate.
     pub delta_chi2: Option<f64>,

@@ -112,15 +112,14 @@ fn mean_and_its_sigma(x: &[f64]) -> (f64, f64) {
     (mean, (x.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n * (n - 1.0))).sqrt())
 }
 
-/// Twelve series of 66 minutes of each kind. The mean slope is within 4.5 of its own standard deviations (36 slopes: a right
-/// filter fails once in 10,000 runs) of 1, less what theory says that it is short; on the measured α it is within as
-/// much of the attenuation, and fails the test of the filtered one.
+/// Twelve series of 66 minutes of each kind. The mean slope is within 4.5 of its standard deviations of 1, less the
+/// theoretical shortfall (36 slopes, false alarm 1e-4). On the measured α it shows the attenuation and fails.
 #[test]
-fn the_slope_is_one_where_that_on_the_measured_is_attenuated() {
+fn the_filtered_slope_is_one_and_the_measured_one_attenuated() {
     let kinds = [
         // From 100 at low frequencies to 0.3 at Nyquist.
         Signal::with_ratio_at_zero(100.0, 0.896),
-        // From 10 to 0.03: most bins hold nothing.
+        // From 10 to 0.03: most bins contain no signal.
         Signal::with_ratio_at_zero(10.0, 0.896),
         // 1 everywhere: half of the offset.
         Signal::with_ratio_at_zero(1.0, 0.0),
@@ -137,7 +136,7 @@ fn the_slope_is_one_where_that_on_the_measured_is_attenuated() {
             raw.extend(slopes(&s.rows, &s.channel));
             clean.extend(slopes(&filtered, &s.channel));
         }
-        // Three filters, each from a third of the samples on the mean, in segments of 512 that overlap by half (correlation
+        // Three filters, each from a third of the samples on average, in segments of 512 with 50 % overlap (correlation
         // 1/36), and three bins (variance 0.6).
         let short = signal.shortfall(2.0 * 40_000.0 / 3.0 / 512.0 / 1.056 / 0.6);
         let (clean, clean_sigma) = mean_and_its_sigma(&clean);
@@ -149,8 +148,8 @@ fn the_slope_is_one_where_that_on_the_measured_is_attenuated() {
     }
 }
 
-/// A manoeuvre of nine minutes in three quiet hours: its rows must not be weighed down by the quiet ones. Within
-/// 4.5σ of its own scatter (18 slopes), and of the theory's shortfall.
+/// A manoeuvre of nine minutes within three quiet hours keeps its scale, within 4.5σ of the scatter (18 slopes) and the
+/// theoretical shortfall.
 #[test]
 fn a_manoeuvre_after_quiet_hours_keeps_its_scale() {
     let signal = Signal::with_ratio_at_zero(100.0, 0.896);
@@ -172,15 +171,15 @@ fn a_manoeuvre_after_quiet_hours_keeps_its_scale() {
     assert!(sigma < 0.02, "{sigma}");
 }
 
-/// A mission that states five times the power there is, for a signal as strong as the true noise: taken at its word,
-/// nothing but noise would have been measured. The spectrum at Nyquist, 0.3 + 1 of the true noise where the mission says
-/// 5, bounds the noise: 1.3 at most, so that the slope exceeds 1 by no more than the theory of a noise of 1.3.
+/// The mission states five times the true noise power, for a signal as strong as the true noise. The spectrum at
+/// Nyquist, 1.3 of the true noise, bounds the noise, so the slope exceeds 1 by at most the theory for 1.3.
 #[test]
-fn an_overstated_noise_does_not_silence_the_signal() {
+fn an_overstated_noise_does_not_suppress_the_signal() {
     let signal = Signal::with_ratio_at_zero(100.0, 0.896);
     let s = series(1, 40_000, signal);
     let (filtered, _) = run(&s.rows, stated(5.0_f64.sqrt()));
-    // With noise n taken for 1, W = 1 − n/S_m: the slope is ⟨W S_α⟩/⟨W² S_m⟩ = ⟨(1 − n/S_m) S_α⟩/⟨(1 − n/S_m)(S_m − n)⟩.
+    // With noise n in place of 1, W = 1 − n/S_m, and the slope is ⟨W S_α⟩/⟨W² S_m⟩ = ⟨(1 − n/S_m) S_α⟩/⟨(1 − n/S_m)(S_m
+    // − n)⟩.
     let mut sums = (0.0, 0.0);
     for k in 0..1000 {
         let r = signal.ratio((f64::from(k) + 0.5) * std::f64::consts::PI / 1000.0);
@@ -192,7 +191,7 @@ fn an_overstated_noise_does_not_silence_the_signal() {
     }
 }
 
-/// Rows with gaps of every kind; the first of each pair is its first epoch, the second its length.
+/// Rows with gaps, given as (first epoch, length).
 fn with_gaps(gaps: &[(usize, usize)]) -> Series {
     let mut s = series(1, 60_000, Signal::with_ratio_at_zero(10.0, 0.896));
     for (first, length) in gaps {
@@ -204,8 +203,8 @@ fn with_gaps(gaps: &[(usize, usize)]) -> Series {
 #[test]
 fn gaps_are_respected() {
     let long = MAX_BRIDGED + 1;
-    // Missing at the start; single ones; the longest that is bridged, across the end of the first block too; a gap; a stretch
-    // too short; a gap; missing at the end.
+    // Missing at the start; single samples; the longest bridged run, also across a block boundary; a gap; an interval
+    // that is too short; a gap; missing at the end.
     let gaps = [(0, 5), (700, 1), (1_500, MAX_BRIDGED), (BLOCK + 4, 2), (30_000, long), (31_000, 50), (59_990, 10)];
     let s = with_gaps(&gaps);
     let (out, counts) = run(&s.rows, stated(1.0));
@@ -240,9 +239,9 @@ fn gaps_are_respected() {
     assert!(expected.as_measured == 31_000 - 30_000 - long as u64 && (expected.as_measured as usize) < MIN_SAMPLES);
 }
 
-/// What lies beyond a gap changes nothing before it, and an epoch that is left out is a gap.
+/// Rows after a gap do not influence those before it, and an absent epoch is a gap.
 #[test]
-fn nothing_crosses_a_gap() {
+fn the_filter_does_not_cross_gaps() {
     let s = with_gaps(&[(30_000, MAX_BRIDGED + 1)]);
     let (whole, _) = run(&s.rows, stated(1.0));
     let (first, _) = run(&s.rows[..30_000], stated(1.0));
@@ -274,16 +273,15 @@ fn a_saved_filter_goes_on_bit_by_bit() {
     assert!(bits(&out) == bits(&whole) && wiener.counts() == counts);
 }
 
-/// The bias passes whatever the filter, noise alone leaves next to nothing, and constant data stay constant.
+/// The bias passes unchanged, noise alone is suppressed, and constant data stay constant.
 #[test]
-fn the_bias_stays_and_noise_goes() {
+fn the_bias_passes_and_noise_is_suppressed() {
     let s = series(1, 40_000, Signal::with_ratio_at_zero(0.0, 0.0));
     let (out, _) = run(&s.rows, stated(1.0));
     let inside: Vec<[f64; 3]> = out.iter().filter_map(|r| r.alpha_srf_rad_s2).collect();
     for (i, bias) in [-7.8e-4, 1.3e-5, 1.2e-4].into_iter().enumerate() {
         let power = inside.iter().map(|a| (a[i] - bias).powi(2)).sum::<f64>() / inside.len() as f64;
-        // A bin passes by accident once in 44, and then with a gain of about 0.2: 1e-3 of the power. Two hundred times less
-        // than all, against a factor of five of scatter over the few bins that pass.
+        // A bin of noise passes once in 44 with a gain of about 0.2: 1e-3 of the power; a margin of five for scatter.
         assert!(power < 5e-3 * NOISE * NOISE, "axis {i}: {power:e}");
     }
     let constant: Vec<Row> = s.rows.iter().map(|r| Row { alpha_srf_rad_s2: Some([1e-3, 0.0, -2e-5]), ..*r }).collect();
@@ -293,10 +291,10 @@ fn the_bias_stays_and_noise_goes() {
     }
 }
 
-/// The accelerometer's clock is fast: every 3,600 samples the grid blanks an epoch and moves by a quarter of a step. The
-/// samples around it are as even as before, and only the blank rows and the ends have no α.
+/// The accelerometer's clock is fast: every 3,600 samples the grid blanks an epoch and shifts by a quarter of a step.
+/// Samples stay even, and only the blank rows and the ends have no α.
 #[test]
-fn a_grid_that_follows_its_clock_has_no_gap() {
+fn a_grid_shift_below_half_a_step_is_no_gap() {
     let mut s = with_gaps(&[(3_600, 1), (7_200, 1)]);
     let (even, counts) = run(&s.rows, stated(1.0));
     for (k, row) in s.rows.iter_mut().enumerate() {

@@ -3,8 +3,8 @@
 //! A displacement or an angle is the double integral of an acceleration. A force bends its line, a thrust pulse shifts
 //! it and a phase-meter slip steps it; none returns to the *same* line within three samples. A run of one to three
 //! samples is an outlier if
-//! 1. both of its ends deviate from the chord between their neighbours by more than `sigma/2` robust standard deviations
-//!    of the second difference (for one sample: its second difference exceeds `sigma`), and
+//! 1. both of its ends deviate from the chord between their neighbours by more than `sigma/2` robust standard
+//!    deviations of the second difference (for one sample: its second difference exceeds `sigma`), and
 //! 2. the slopes before and after the run agree with the chord within a quarter of that deviation, and
 //! 3. the deviation exceeds the same multiple of the local scale, from the sixteen rows around it.
 //!

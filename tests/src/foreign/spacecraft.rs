@@ -42,7 +42,8 @@ pub struct Hidden {
     pub thrust_y: f64,
     /// Scale error of the capacitive readout of y of test mass 1.
     pub shown_tm1_y: f64,
-    /// Acceleration of test mass 1 along x per kelvin between the sides of its housing, behind a lag of [`HEAT_LAG_S`], m s⁻² K⁻¹.
+    /// Acceleration of test mass 1 along x per kelvin between the sides of its housing, lagged by [`HEAT_LAG_S`], m s⁻²
+    /// K⁻¹.
     pub heat_tm1_x: f64,
     /// Impulse along x of SRF: time after the first sample, s, and momentum, N s.
     pub blow: Option<(f64, f64)>,
