@@ -418,22 +418,20 @@ impl Source for Sim {
         Ok(Report { counts: counts.into(), quality, attachments: sealed.collect(), ..Report::default() })
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        let saved = Saved {
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        let mut saved = Saved {
             simulator: self.simulator.save().map_err(refuse)?,
             housekeeping: self.housekeeping.state(),
             counts: self.counts.clone(),
         };
-        Ok(serde_json::to_vec(&saved)?)
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let saved: Saved = serde_json::from_slice(state)?;
-        self.simulator.load(&saved.simulator).map_err(refuse)?;
-        if !self.housekeeping.set_state(saved.housekeeping) {
-            return Err(PluginError::error("state of the simulator: its housekeeping is another version's"));
+        state.document(&mut saved)?;
+        if state.is_loading() {
+            self.simulator.load(&saved.simulator).map_err(refuse)?;
+            if !self.housekeeping.set_state(saved.housekeeping) {
+                return Err(PluginError::error("state of the simulator: its housekeeping is another version's"));
+            }
+            self.counts = saved.counts;
         }
-        self.counts = saved.counts;
         Ok(())
     }
 }

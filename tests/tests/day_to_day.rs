@@ -157,6 +157,7 @@ fn a_damaged_state_is_refused() {
     damage("cut", &sound[..sound.len() * 9 / 10], "digest");
     damage("longer", &[&sound[..], b"more"].concat(), "digest");
     damage("empty", b"", "too short");
+    damage("older", &[b"DFSTATE2", &sound[8..]].concat(), "older version of the program");
     damage("other", &std::fs::read(fixture("missions/taiji.toml")).expect("readable"), "no state");
     assert_refused(dir.path(), run(dir.path(), &["--load-state", "nowhere"]), &["nowhere"]);
 }

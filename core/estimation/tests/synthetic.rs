@@ -12,6 +12,7 @@ use dragfree_estimation::state;
 use dragfree_estimation::stored::Stored;
 use dragfree_physics::frames::dcm_turned_about_z;
 use dragfree_physics::mission::Mission;
+use dragfree_schema::state::{State, load, save};
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
@@ -704,9 +705,12 @@ fn daily_sums_stacked_are_one_long_run() {
     feed(0..ROWS, &mut long);
     let mut first = begin();
     feed(0..midnight, &mut first);
-    let bytes = state::save("two days", &first.0.state, &first.1, &plan());
+    let visit = |state: &mut State<'_>, run: &mut (Segmenter, Collected, Analyser)| {
+        state::visit(state, "two days", &mut run.0.state, &mut run.1, &plan())
+    };
+    let bytes = save("mine", 1, |state| visit(state, &mut first)).expect("a state");
     let mut second = begin();
-    (second.0.state, second.1) = state::load(&bytes, "two days", &second.0.state, &second.1).expect("our own state");
+    load("mine", 1, &bytes, |state| visit(state, &mut second)).expect("our own state");
     feed(midnight..ROWS, &mut second);
 
     let want = solve(&long.1.all(&plan()));

@@ -89,7 +89,10 @@ impl std::fmt::Display for StateError {
             ),
             Self::Damaged => write!(f, "the state is damaged or cut off: use an earlier state, or start without one"),
             Self::Differs { what, found, expected } => {
-                write!(f, "the state was saved with another {what}, {found}; this run has {expected}: start without a state")
+                write!(
+                    f,
+                    "the state was saved with another {what}, {found}; this run has {expected}: start without a state"
+                )
             }
             Self::Content(what) => write!(
                 f,
@@ -106,11 +109,7 @@ impl std::error::Error for StateError {}
 ///
 /// # Errors
 /// Those of `visit`.
-pub fn save<E>(
-    plugin: &str,
-    version: u32,
-    visit: impl FnOnce(&mut State<'_>) -> Result<(), E>,
-) -> Result<Vec<u8>, E> {
+pub fn save<E>(plugin: &str, version: u32, visit: impl FnOnce(&mut State<'_>) -> Result<(), E>) -> Result<Vec<u8>, E> {
     let mut state = State(Direction::Save(MARK.to_vec()));
     state.put(&u64::from(version).to_le_bytes());
     state.put(&(plugin.len() as u64).to_le_bytes());

@@ -59,16 +59,8 @@ impl Stage for Clumsy {
         Ok(Report { counts: counts.into(), ..Report::default() })
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        Ok(self.rows.to_le_bytes().to_vec())
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let rows = state
-            .try_into()
-            .map_err(|_| PluginError::error(format!("{} bytes are no state of clumsy", state.len())))?;
-        self.rows = u64::from_le_bytes(rows);
-        Ok(())
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        Ok(state.u64(&mut self.rows)?)
     }
 }
 

@@ -39,10 +39,7 @@
 //!     fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
 //!         Ok(Report::default())
 //!     }
-//!     fn save(&self) -> Result<Vec<u8>, PluginError> {
-//!         Ok(Vec::new())
-//!     }
-//!     fn load(&mut self, _state: &[u8]) -> Result<(), PluginError> {
+//!     fn state(&mut self, _state: &mut State<'_>) -> Result<(), PluginError> {
 //!         Ok(())
 //!     }
 //! }
@@ -62,7 +59,7 @@ mod setup;
 pub use batch::{Inputs, Outputs, Progress};
 pub use dragfree_schema::{
     Attachment, Coefficient, Colour, Column, Constraint, Covariance, Estimate, NoiseProcess, NoiseResponse, NoiseShape,
-    NoiseTerm, Report, Response, Shape, Transient, Variant,
+    NoiseTerm, Report, Response, Shape, Transient, Variant, state,
 };
 pub use error::PluginError;
 pub use link::{Available, EffectLink, In, Link, Out, Table, Want};
@@ -72,6 +69,7 @@ pub use setup::{Level, Log, Setup};
 
 /// Everything a plugin needs.
 pub mod prelude {
+    pub use crate::state::{State, StateError};
     pub use crate::{
         Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Effect, EffectLink, Estimate, In,
         Inputs, Level, Link, Log, Manifest, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm, Out, Outputs,

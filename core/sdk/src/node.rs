@@ -1,6 +1,7 @@
 //! The three traits a plugin implements, and the one shape in which they cross the border.
 
 use dragfree_schema::Report;
+use dragfree_schema::state::{self, State};
 
 use crate::batch::{Inputs, Outputs, Progress};
 use crate::error::PluginError;
@@ -45,17 +46,15 @@ pub trait Stage: Sized + Send + 'static {
     /// See [`PluginError`].
     fn report(&mut self, earlier: &[Report]) -> Result<Report, PluginError>;
 
-    /// The whole state as bytes.
-    ///
-    /// # Errors
-    /// See [`PluginError`].
-    fn save(&self) -> Result<Vec<u8>, PluginError>;
+    /// Version of what [`Self::state`] visits; raise it when that changes.
+    const STATE_VERSION: u32 = 1;
 
-    /// Takes a state back.
+    /// Visits all that the next rows depend on, in one order for saving and for loading; after an error the instance is not used
+    /// any more.
     ///
     /// # Errors
-    /// The bytes are not a state of this stage.
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError>;
+    /// What is loaded does not fit this stage.
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError>;
 }
 
 /// A physical cause: telemetry in, regressors out, row by row.
@@ -81,28 +80,15 @@ pub trait Effect: Sized + Send + 'static {
     /// See [`PluginError`].
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError>;
 
-    /// The whole state as bytes; empty for an effect without memory.
-    ///
-    /// # Errors
-    /// See [`PluginError`].
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        Ok(Vec::new())
-    }
+    /// Version of what [`Self::state`] visits; raise it when that changes.
+    const STATE_VERSION: u32 = 1;
 
-    /// Takes a state back.
+    /// Visits all that the next rows depend on, in one order for saving and for loading; an effect without memory visits nothing.
     ///
     /// # Errors
-    /// The bytes are not a state of this effect.
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        if state.is_empty() {
-            Ok(())
-        } else {
-            Err(PluginError::error(format!(
-                "effect {} has no state, yet {} bytes of one were given",
-                Self::MANIFEST.id,
-                state.len()
-            )))
-        }
+    /// What is loaded does not fit this effect.
+    fn state(&mut self, _state: &mut State<'_>) -> Result<(), PluginError> {
+        Ok(())
     }
 }
 
@@ -135,17 +121,15 @@ pub trait Source: Sized + Send + 'static {
     /// See [`PluginError`].
     fn report(&mut self) -> Result<Report, PluginError>;
 
-    /// The whole state as bytes.
-    ///
-    /// # Errors
-    /// See [`PluginError`].
-    fn save(&self) -> Result<Vec<u8>, PluginError>;
+    /// Version of what [`Self::state`] visits; raise it when that changes.
+    const STATE_VERSION: u32 = 1;
 
-    /// Takes a state back.
+    /// Visits all that the next rows depend on, in one order for saving and for loading; after an error the instance is not used
+    /// any more.
     ///
     /// # Errors
-    /// The bytes are not a state of this source.
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError>;
+    /// What is loaded does not fit this source.
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError>;
 }
 
 /// What the border calls.
@@ -155,8 +139,8 @@ pub(crate) trait Node: Send {
     fn next(&mut self, rows: usize, output: &mut Outputs) -> Result<Progress, PluginError>;
     fn flush(&mut self, output: &mut Outputs) -> Result<(), PluginError>;
     fn report(&mut self, earlier: &[Report]) -> Result<Report, PluginError>;
-    fn save(&self) -> Result<Vec<u8>, PluginError>;
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError>;
+    fn save(&mut self) -> Result<Vec<u8>, PluginError>;
+    fn load(&mut self, bytes: &[u8]) -> Result<(), PluginError>;
 }
 
 pub(crate) struct StageNode<T>(pub(crate) T);
@@ -186,11 +170,11 @@ impl<T: Stage> Node for StageNode<T> {
     fn report(&mut self, earlier: &[Report]) -> Result<Report, PluginError> {
         self.0.report(earlier)
     }
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        self.0.save()
+    fn save(&mut self) -> Result<Vec<u8>, PluginError> {
+        state::save(T::MANIFEST.id, T::STATE_VERSION, |state| self.0.state(state))
     }
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        self.0.load(state)
+    fn load(&mut self, bytes: &[u8]) -> Result<(), PluginError> {
+        state::load(T::MANIFEST.id, T::STATE_VERSION, bytes, |state| self.0.state(state))
     }
 }
 
@@ -218,11 +202,13 @@ impl<T: Effect> Node for EffectNode<T> {
     fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
         Ok(Report::default())
     }
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        self.effect.save()
+    fn save(&mut self) -> Result<Vec<u8>, PluginError> {
+        let name = format!("{}:{}", T::MANIFEST.id, self.instance);
+        state::save(&name, T::STATE_VERSION, |state| self.effect.state(state))
     }
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        self.effect.load(state)
+    fn load(&mut self, bytes: &[u8]) -> Result<(), PluginError> {
+        let name = format!("{}:{}", T::MANIFEST.id, self.instance);
+        state::load(&name, T::STATE_VERSION, bytes, |state| self.effect.state(state))
     }
 }
 
@@ -242,10 +228,10 @@ impl<T: Source> Node for SourceNode<T> {
     fn report(&mut self, _earlier: &[Report]) -> Result<Report, PluginError> {
         self.0.report()
     }
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        self.0.save()
+    fn save(&mut self) -> Result<Vec<u8>, PluginError> {
+        state::save(T::MANIFEST.id, T::STATE_VERSION, |state| self.0.state(state))
     }
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        self.0.load(state)
+    fn load(&mut self, bytes: &[u8]) -> Result<(), PluginError> {
+        state::load(T::MANIFEST.id, T::STATE_VERSION, bytes, |state| self.0.state(state))
     }
 }

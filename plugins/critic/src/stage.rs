@@ -132,11 +132,7 @@ impl Stage for Critic {
         Ok(report)
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        Err(PluginError::error("critic: has no state to resume from; run it over the whole stretch at once"))
-    }
-
-    fn load(&mut self, _state: &[u8]) -> Result<(), PluginError> {
+    fn state(&mut self, _state: &mut State<'_>) -> Result<(), PluginError> {
         Err(PluginError::error("critic: has no state to resume from; run it over the whole stretch at once"))
     }
 }

@@ -1,5 +1,5 @@
 //! Parts shared by several effects: parsing of instance names, responses of test masses and attitude, lookup of
-//! housekeeping columns, saved state.
+//! housekeeping columns.
 
 use dragfree_physics::mission::{Mission, MissionError};
 use dragfree_sdk::prelude::*;
@@ -140,27 +140,4 @@ pub(crate) fn mission(setup: &Setup) -> Result<Mission, MissionError> {
 pub(crate) fn skipped_rows(before_ns: i64, now_ns: i64, dt_s: f64) -> u64 {
     let rows = ((now_ns - before_ns) as f64 * 1e-9 / dt_s).round();
     if rows >= 2.0 { rows as u64 - 1 } else { 0 }
-}
-
-/// Encodes a state: a mark that identifies its owner and layout, then the numbers, little endian.
-pub(crate) fn saved(mark: &[u8; 8], numbers: impl IntoIterator<Item = f64>) -> Vec<u8> {
-    let mut bytes = mark.to_vec();
-    bytes.extend(numbers.into_iter().flat_map(f64::to_le_bytes));
-    bytes
-}
-
-/// Decodes `count` numbers written by [`saved`].
-///
-/// # Errors
-/// The mark or the length differs.
-pub(crate) fn loaded(mark: &[u8; 8], by: &str, count: usize, bytes: &[u8]) -> Result<Vec<f64>, PluginError> {
-    let (words, rest) = bytes.strip_prefix(mark).unwrap_or(&[0]).as_chunks::<8>();
-    if !rest.is_empty() || words.len() != count {
-        return Err(PluginError::error(format!(
-            "effect {by}: a saved state of {} bytes does not fit the {count} numbers expected: it comes from another version or \
-             model; rerun from the telemetry without it",
-            bytes.len()
-        )));
-    }
-    Ok(words.iter().map(|word| f64::from_le_bytes(*word)).collect())
 }

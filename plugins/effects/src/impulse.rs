@@ -26,8 +26,8 @@ use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
-    AXES, SLOW_HZ, SeriesRef, accel_channel_of, axis_of, find_housekeeping, housekeeping_in, keep_available, loaded,
-    manifest, mission, response, responses_to_spacecraft_force, responses_to_spacecraft_torque, saved, tm_of,
+    AXES, SLOW_HZ, SeriesRef, accel_channel_of, axis_of, find_housekeeping, housekeeping_in, keep_available, manifest,
+    mission, response, responses_to_spacecraft_force, responses_to_spacecraft_torque, tm_of,
 };
 use crate::step_pulses::StepPulses;
 
@@ -46,7 +46,6 @@ const FLAG_PULSES_S: [f64; 5] = [1.0, 3.0, 10.0, 30.0, 100.0];
 /// Pulse length from which the series may be stored at [`SLOW_HZ`]: the first zero of its spectrum is at a fifth of
 /// that.
 const SLOW_PULSE_S: f64 = 100.0;
-const STATE: &[u8; 8] = b"impulse1";
 
 /// Time course of a transferred momentum.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -400,20 +399,8 @@ impl Effect for Impulse {
         Ok(())
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        Ok(saved(STATE, self.flag_pulses.iter().flat_map(|s| s.pulses.state())))
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let counts: Vec<usize> = self.flag_pulses.iter().map(|s| s.pulses.state_len()).collect();
-        let numbers = loaded(STATE, &self.name(), counts.iter().sum(), state)?;
-        let mut rest = numbers.as_slice();
-        for (FlagPulses { pulses, .. }, count) in self.flag_pulses.iter_mut().zip(counts) {
-            let (own, others) = rest.split_at(count);
-            pulses.set_state(own);
-            rest = others;
-        }
-        Ok(())
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        Ok(self.flag_pulses.iter_mut().try_for_each(|s| s.pulses.visit(state))?)
     }
 }
 

@@ -1,5 +1,7 @@
 //! Banks of first-order lags of one column.
 
+use dragfree_sdk::state::{State, StateError};
+
 use crate::common::skipped_rows;
 
 /// Time over which the last input is held where values are missing, at least, s.
@@ -121,28 +123,22 @@ impl<const N: usize> Lags<N> {
         }
     }
 
-    /// Length of [`Self::state`].
-    pub const STATE: usize = N + 3;
-
-    /// State on which later rows depend; integers are stored as the bits of a float.
-    pub fn state(&self) -> impl Iterator<Item = f64> {
-        let whole = [self.missing, self.last_ns.cast_unsigned()].map(f64::from_bits);
-        self.y.into_iter().chain([self.last_input]).chain(whole)
-    }
-
-    /// Restores [`Self::state`], [`Self::STATE`] numbers.
-    pub fn set_state(&mut self, state: &[f64]) {
-        if let Some((y, [last_input, missing, last_ns])) = state.split_at_checked(N) {
-            self.y.copy_from_slice(y);
-            self.last_input = *last_input;
-            (self.missing, self.last_ns) = (missing.to_bits(), last_ns.to_bits().cast_signed());
-        }
+    /// Visits all that the next rows depend on.
+    ///
+    /// # Errors
+    /// The state ends.
+    pub fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        state.f64s(&mut self.y)?;
+        state.f64(&mut self.last_input)?;
+        state.u64(&mut self.missing)?;
+        state.i64(&mut self.last_ns)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dragfree_sdk::state;
     use proptest::prelude::*;
 
     const DT_S: f64 = 0.1;
@@ -230,10 +226,9 @@ mod tests {
             let whole = run(&mut Lags::new([0.5, 33.0], DT_S), &time_ns, &input);
             let mut first = Lags::new([0.5, 33.0], DT_S);
             let [mut a, mut b] = run(&mut first, &time_ns[..cut], &input[..cut]);
-            let state: Vec<f64> = first.state().collect();
-            prop_assert_eq!(state.len(), Lags::<2>::STATE);
+            let saved = state::save("lags", 1, |state| first.visit(state)).expect("saved");
             let mut second = Lags::new([0.5, 33.0], DT_S);
-            second.set_state(&state);
+            state::load("lags", 1, &saved, |state| second.visit(state)).expect("its own state");
             let [c, d] = run(&mut second, &time_ns[cut..], &input[cut..]);
             a.extend(c);
             b.extend(d);

@@ -15,7 +15,6 @@ use crate::common::{AXES, SeriesRef, axis_of, mission, tm_of};
 
 /// Names of the angles about x, y and z.
 pub(crate) const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
-const STATE: &[u8; 8] = b"linear/1";
 
 /// A column that an earlier stage writes.
 #[derive(Clone, Debug, PartialEq)]
@@ -607,33 +606,10 @@ impl<E: LinearEffect> Effect for Linear<E> {
         Ok(())
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        if self.computed.is_empty() {
-            return Ok(Vec::new());
-        }
-        let mut bytes = STATE.to_vec();
-        for series in &self.computed {
-            bytes.extend_from_slice(&series.state.value.to_le_bytes());
-            bytes.extend_from_slice(&series.state.time_ns.unwrap_or(i64::MIN).to_le_bytes());
-        }
-        Ok(bytes)
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let body = if self.computed.is_empty() { Some(state) } else { state.strip_prefix(STATE) };
-        let (words, rest) = body.unwrap_or(&[0]).as_chunks::<8>();
-        if !rest.is_empty() || words.len() != 2 * self.computed.len() {
-            return Err(PluginError::error(format!(
-                "{}: a saved state of {} bytes does not fit its {} series: it comes from another version or model; rerun from the \
-                 telemetry without it",
-                self.name(),
-                state.len(),
-                self.computed.len()
-            )));
-        }
-        for (series, word) in self.computed.iter_mut().zip(words.chunks_exact(2)) {
-            series.state.value = f64::from_le_bytes(word[0]);
-            series.state.time_ns = Some(i64::from_le_bytes(word[1])).filter(|t| *t != i64::MIN);
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        for series in &mut self.computed {
+            state.f64(&mut series.state.value)?;
+            state.option(&mut series.state.time_ns, State::i64)?;
         }
         Ok(())
     }

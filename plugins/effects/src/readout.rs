@@ -279,7 +279,7 @@ mod tests {
     fn time_offset_matches_the_derivative() {
         let late = |channels: &'static [usize]| {
             move |w: &mut crate::test_spacecraft::Deviations, tau: f64| {
-                channels.iter().for_each(|c| w.readout_delay_s[*c] += tau)
+                channels.iter().for_each(|c| w.readout_delay_s[*c] += tau);
             }
         };
         TestSpacecraft::new().assert_matches_derivative::<TimeOffset>("ifo", "", &[&late(&[0, 3])]);

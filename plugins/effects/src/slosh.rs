@@ -15,11 +15,9 @@ use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
-    AXES, SeriesRef, axis_of, keep_available, loaded, manifest, mission, responses_to_spacecraft_force, saved,
-    skipped_rows,
+    AXES, SeriesRef, axis_of, keep_available, manifest, mission, responses_to_spacecraft_force, skipped_rows,
 };
 
-const STATE: &[u8; 8] = b"slosh/1\n";
 const MAX_RATIO: f64 = 0.3;
 /// Longest gap over which the last force is held, s; after a longer one the slug starts at rest.
 const MAX_HOLD_S: f64 = 60.0;
@@ -295,20 +293,11 @@ impl Effect for Slosh {
         Ok(())
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        let whole = [self.missing, self.last_ns.cast_unsigned()].map(f64::from_bits);
-        let modes = self.modes.iter().flat_map(|(mode, _)| mode.state);
-        Ok(saved(STATE, [self.last_input].into_iter().chain(whole).chain(modes)))
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let numbers = loaded(STATE, &self.name(), 3 + 2 * self.modes.len(), state)?;
-        (self.last_input, self.missing) = (numbers[0], numbers[1].to_bits());
-        self.last_ns = numbers[2].to_bits().cast_signed();
-        for ((mode, _), state) in self.modes.iter_mut().zip(numbers[3..].chunks_exact(2)) {
-            mode.state = [state[0], state[1]];
-        }
-        Ok(())
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        state.f64(&mut self.last_input)?;
+        state.u64(&mut self.missing)?;
+        state.i64(&mut self.last_ns)?;
+        Ok(self.modes.iter_mut().try_for_each(|(mode, _)| state.f64s(&mut mode.state))?)
     }
 }
 

@@ -2,6 +2,8 @@
 
 use std::collections::VecDeque;
 
+use dragfree_sdk::state::{State, StateError};
+
 use crate::common::skipped_rows;
 
 /// Recent values of a column, which give a rectangular pulse at each of its steps: a step of height h gives h evenly
@@ -54,28 +56,20 @@ impl StepPulses {
         (self.values[self.max_rows] - self.values[self.max_rows - rows]) / (rows as f64 * self.dt_s)
     }
 
-    /// Length of [`Self::state`].
-    pub(crate) fn state_len(&self) -> usize {
-        self.max_rows + 2
-    }
-
-    /// State on which later rows depend; the time is stored as the bits of a float.
-    pub(crate) fn state(&self) -> impl Iterator<Item = f64> {
-        self.values.iter().copied().chain([f64::from_bits(self.last_ns.cast_unsigned())])
-    }
-
-    /// Restores [`Self::state`], [`Self::state_len`] numbers.
-    pub(crate) fn set_state(&mut self, state: &[f64]) {
-        if let Some((last_ns, values)) = state.split_last() {
-            self.values = values.iter().copied().collect();
-            self.last_ns = last_ns.to_bits().cast_signed();
-        }
+    /// Visits all that the next rows depend on.
+    ///
+    /// # Errors
+    /// The state ends.
+    pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        state.f64s(&mut self.values)?;
+        state.i64(&mut self.last_ns)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dragfree_sdk::state;
     use proptest::prelude::*;
 
     const DT_S: f64 = 0.1;
@@ -134,10 +128,9 @@ mod tests {
             let whole = run(&mut StepPulses::new(20, DT_S), 0, &values, 7);
             let mut first = StepPulses::new(20, DT_S);
             let mut parts = run(&mut first, 0, &values[..cut], 7);
-            let state: Vec<f64> = first.state().collect();
-            prop_assert_eq!(state.len(), first.state_len());
+            let saved = state::save("steps", 1, |state| first.visit(state)).expect("saved");
             let mut second = StepPulses::new(20, DT_S);
-            second.set_state(&state);
+            state::load("steps", 1, &saved, |state| second.visit(state)).expect("its own state");
             parts.extend(run(&mut second, cut as i64, &values[cut..], 7));
             let bits = |x: &[f64]| x.iter().map(|x| x.to_bits()).collect::<Vec<_>>();
             prop_assert_eq!(bits(&whole), bits(&parts));

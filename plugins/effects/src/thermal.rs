@@ -13,12 +13,11 @@ use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
-    SLOW_HZ, SeriesRef, TM_AXES, accel_channel_of, find_housekeeping, housekeeping_in, keep_available, loaded,
-    manifest, mission, response, saved,
+    SLOW_HZ, SeriesRef, TM_AXES, accel_channel_of, find_housekeeping, housekeeping_in, keep_available, manifest,
+    mission, response,
 };
 use crate::lag::Lags;
 
-const STATE: &[u8; 8] = b"thermal1";
 const MAX_PER_KELVIN: f64 = 1e-9;
 
 /// Lags of a candidate, s: 30 s to 4,000 s in steps of 1.5, whole seconds.
@@ -209,20 +208,8 @@ impl Effect for Thermal {
         Ok(())
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        let lagged_pair = self.lagged_pair.iter().flat_map(|bank| bank.lags.state());
-        Ok(saved(STATE, lagged_pair.chain(self.banks.iter().flat_map(|bank| bank.lags.state()))))
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let count = self.lagged_pair.len() * Lags::<1>::STATE + self.banks.len() * Lags::<13>::STATE;
-        let numbers = loaded(STATE, &self.name(), count, state)?;
-        let (lagged_pair, banks) = numbers.split_at(self.lagged_pair.len() * Lags::<1>::STATE);
-        self.lagged_pair
-            .iter_mut()
-            .zip(lagged_pair.chunks_exact(Lags::<1>::STATE))
-            .for_each(|(b, s)| b.lags.set_state(s));
-        self.banks.iter_mut().zip(banks.chunks_exact(Lags::<13>::STATE)).for_each(|(b, s)| b.lags.set_state(s));
-        Ok(())
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        self.lagged_pair.iter_mut().try_for_each(|bank| bank.lags.visit(state))?;
+        Ok(self.banks.iter_mut().try_for_each(|bank| bank.lags.visit(state))?)
     }
 }

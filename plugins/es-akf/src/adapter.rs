@@ -306,6 +306,14 @@ impl Stage for EsAkf {
         Ok(report)
     }
 
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        let mut bytes = if state.is_loading() { Vec::new() } else { self.save()? };
+        state.bytes(&mut bytes)?;
+        if state.is_loading() { self.load(&bytes) } else { Ok(()) }
+    }
+}
+
+impl EsAkf {
     fn save(&self) -> Result<Vec<u8>, PluginError> {
         let mut words = Vec::new();
         let mut out = Words::Write(&mut words);
@@ -334,9 +342,7 @@ impl Stage for EsAkf {
         self.last_ns = begun.then_some(last.cast_signed());
         Ok(())
     }
-}
 
-impl EsAkf {
     /// The columns and the filter of these test masses.
     fn link_body(
         &self,

@@ -158,8 +158,6 @@ struct State {
     rows: u64,
     without_acceleration: u64,
     without_attitude: u64,
-    /// State of the filter, if there is one.
-    angular: Option<serde_json::Value>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -389,16 +387,8 @@ impl Stage for Accelerometer {
         Ok(Report { counts, notes, quality, ..Report::default() })
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        let angular = self.wiener.as_ref().map(Wiener::save).transpose()?;
-        Ok(serde_json::to_vec(&State { angular, ..self.state.clone() })?)
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        self.state = serde_json::from_slice(state)?;
-        if let (Some(wiener), Some(angular)) = (&mut self.wiener, self.state.angular.take()) {
-            wiener.load(angular)?;
-        }
-        Ok(())
+    fn state(&mut self, state: &mut dragfree_sdk::state::State<'_>) -> Result<(), PluginError> {
+        state.document(&mut self.state)?;
+        Ok(self.wiener.iter_mut().try_for_each(|wiener| wiener.visit(state))?)
     }
 }

@@ -161,21 +161,12 @@ impl Wiener {
         self.state.counts
     }
 
-    /// The state.
+    /// Visits the whole state.
     ///
     /// # Errors
-    /// Serialisation failed, which does not happen in practice.
-    pub fn save(&self) -> Result<serde_json::Value, serde_json::Error> {
-        serde_json::to_value(&self.state)
-    }
-
-    /// Restores a state.
-    ///
-    /// # Errors
-    /// The value is not a state of this filter.
-    pub fn load(&mut self, state: serde_json::Value) -> Result<(), serde_json::Error> {
-        self.state = serde_json::from_value(state)?;
-        Ok(())
+    /// What is loaded is no state of a filter.
+    pub fn visit(&mut self, state: &mut dragfree_sdk::state::State<'_>) -> Result<(), dragfree_sdk::state::StateError> {
+        state.document(&mut self.state)
     }
 
     /// Emits the first `count` pending rows, filtered with their own spectrum.

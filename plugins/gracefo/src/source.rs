@@ -117,11 +117,7 @@ impl Source for GraceFo {
         })
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        Ok(self.telemetry.save()?)
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        Ok(self.telemetry.load_state(state)?)
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        self.telemetry.visit(state)
     }
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+use dragfree_sdk::PluginError;
 use serde::{Deserialize, Serialize};
 
 use crate::archive::{Container, Member};
@@ -239,22 +240,21 @@ impl Telemetry {
         &self.state.log
     }
 
-    /// The state.
+    /// Visits the whole state.
     ///
     /// # Errors
-    /// Serialisation failed, which does not happen in practice.
-    pub fn save(&self) -> Result<Vec<u8>, serde_json::Error> {
-        // Before the first row no day has been read.
-        serde_json::to_vec(&(self.day.is_some(), &self.state))
+    /// What is loaded is no state of a stream of these files, or a file cannot be read any more.
+    pub fn visit(&mut self, state: &mut dragfree_sdk::state::State<'_>) -> Result<(), PluginError> {
+        // Before the first row nothing was counted: the day is read when it is wanted.
+        let mut saved = (self.day.is_some(), self.state.clone());
+        state.document(&mut saved)?;
+        if state.is_loading() {
+            self.set_state(saved)?;
+        }
+        Ok(())
     }
 
-    /// Restores a state.
-    ///
-    /// # Errors
-    /// The bytes are not a state of these files, or a file has become unreadable.
-    pub fn load_state(&mut self, bytes: &[u8]) -> Result<(), TelemetryError> {
-        let (loaded, state): (bool, State) =
-            serde_json::from_slice(bytes).map_err(|e| TelemetryError::ForeignState(e.to_string()))?;
+    fn set_state(&mut self, (loaded, state): (bool, State)) -> Result<(), TelemetryError> {
         let foreign = |what: &str| Err(TelemetryError::ForeignState(what.to_owned()));
         if state.dates != self.state.dates || state.tables != self.state.tables {
             return foreign("it has other days or products");

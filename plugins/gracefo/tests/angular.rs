@@ -3,6 +3,7 @@
 use dragfree_gracefo::angular::{BLOCK, Counts, HALF_LENGTH, MAX_BRIDGED, MAX_PENDING, MIN_SAMPLES, Row, Wiener};
 use dragfree_physics::noise::NoiseShape;
 use dragfree_physics::process::normal;
+use dragfree_sdk::state;
 use nalgebra::{Matrix3, Vector3};
 use rand::SeedableRng;
 use rand_xoshiro::Xoshiro256PlusPlus;
@@ -261,9 +262,9 @@ fn a_saved_filter_goes_on_bit_by_bit() {
     let mut out = Vec::new();
     for (k, row) in s.rows.iter().enumerate() {
         if cuts.contains(&k) {
-            let bytes = serde_json::to_vec(&wiener.save().expect("a state")).expect("bytes");
+            let bytes = state::save("wiener", 1, |state| wiener.visit(state)).expect("a state");
             wiener = Wiener::new(stated(1.0), STEP_NS);
-            wiener.load(serde_json::from_slice(&bytes).expect("bytes")).expect("a state");
+            state::load("wiener", 1, &bytes, |state| wiener.visit(state)).expect("its own state");
         }
         wiener.next(*row, &mut |r| out.push(r)).expect("a spectrum");
     }

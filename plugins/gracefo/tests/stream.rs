@@ -6,6 +6,7 @@ use dragfree_gracefo::archive::Container;
 use dragfree_gracefo::rows::EPOCH_UNIX_S;
 use dragfree_gracefo::telemetry::Telemetry;
 use dragfree_gracefo::{Window, source::letter_of};
+use dragfree_sdk::{PluginError, state};
 
 /// 2023-06-01T00:00:00 on the mission's time scale.
 const MIDNIGHT_NS: i64 = (EPOCH_UNIX_S + 738_849_600) * 1_000_000_000;
@@ -75,26 +76,34 @@ fn rows_come_in_order_of_time_whatever_the_batch() {
     }
 }
 
+fn saved(stream: &mut Telemetry) -> Vec<u8> {
+    state::save("gracefo", 1, |state| stream.visit(state)).expect("saves")
+}
+
+fn load(stream: &mut Telemetry, bytes: &[u8]) -> Result<(), PluginError> {
+    state::load("gracefo", 1, bytes, |state| stream.visit(state))
+}
+
 #[test]
 fn a_stream_resumes_where_it_was_saved() {
     let mut stream = open(&both(), &["ACC1A", "SCA1B"]);
-    let fresh = stream.save().expect("saves");
+    let fresh = saved(&mut stream);
     let first = drain(&mut stream, 10, 7);
-    let state = stream.save().expect("saves");
+    let state = saved(&mut stream);
     let rest = drain(&mut stream, 10, usize::MAX);
     let log = stream.log().clone();
 
     let mut other = open(&both(), &["ACC1A", "SCA1B"]);
-    other.load_state(&state).expect("loads");
+    load(&mut other, &state).expect("loads");
     assert!(drain(&mut other, 33, usize::MAX) == rest);
     assert_eq!(other.log(), &log, "nothing is counted twice");
-    other.load_state(&fresh).expect("loads");
+    load(&mut other, &fresh).expect("loads");
     let again = drain(&mut other, 5, usize::MAX);
     assert!(again == [first, rest].concat());
 
-    assert!(open(&both(), &["ACC1A"]).load_state(&state).is_err(), "other tables");
-    assert!(other.load_state(&state[..state.len() / 2]).is_err());
-    assert!(other.load_state(b"").is_err());
+    assert!(load(&mut open(&both(), &["ACC1A"]), &state).is_err(), "other tables");
+    assert!(load(&mut other, &state[..state.len() / 2]).is_err());
+    assert!(load(&mut other, b"").is_err());
 }
 
 #[test]
@@ -144,9 +153,9 @@ fn days_follow_each_other_and_late_rows_are_dropped() {
     }
     let mut stream = open(&files, &[]);
     let first = drain(&mut stream, 75, 2);
-    let state = stream.save().expect("saves");
+    let state = saved(&mut stream);
     let mut other = open(&files, &[]);
-    other.load_state(&state).expect("loads");
+    load(&mut other, &state).expect("loads");
     assert!([first, drain(&mut other, 75, usize::MAX)].concat() == whole, "resumed on the second day");
 }
 

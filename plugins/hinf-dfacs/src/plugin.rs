@@ -535,6 +535,14 @@ impl Stage for HinfDfacs {
         Ok(report)
     }
 
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        let mut bytes = if state.is_loading() { Vec::new() } else { self.save()? };
+        state.bytes(&mut bytes)?;
+        if state.is_loading() { self.load(&bytes) } else { Ok(()) }
+    }
+}
+
+impl HinfDfacs {
     fn save(&self) -> Result<Vec<u8>, PluginError> {
         let linked = self.linked.as_ref().ok_or_else(not_linked)?;
         let mut out = Writer(STATE.to_vec());

@@ -6,7 +6,7 @@
 
 use std::collections::VecDeque;
 
-use crate::bytes::{Reader, StateError, Writer};
+use dragfree_sdk::state::{State, StateError};
 
 /// Rate of the grid.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -60,7 +60,7 @@ impl Rate {
 }
 
 /// A stretch of epochs with one phase.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Segment {
     first_row: i64,
     origin_ns: i64,
@@ -131,20 +131,11 @@ impl Epochs {
         }
     }
 
-    pub(crate) fn save(&self, w: &mut Writer) {
-        w.u64(self.segments.len() as u64);
-        for s in &self.segments {
-            w.i64(s.first_row);
-            w.i64(s.origin_ns);
-        }
-    }
-
-    pub(crate) fn load(&mut self, r: &mut Reader<'_>) -> Result<(), StateError> {
-        self.segments.clear();
-        for _ in 0..r.count(16)? {
-            self.segments.push_back(Segment { first_row: r.i64()?, origin_ns: r.i64()? });
-        }
-        Ok(())
+    pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        state.queue(&mut self.segments, |state, segment| {
+            state.i64(&mut segment.first_row)?;
+            state.i64(&mut segment.origin_ns)
+        })
     }
 }
 

@@ -8,11 +8,11 @@
 //! 4. Stuck samples and outliers are blanked in blocks of [`BLOCK`] rows.
 //! 5. Slow tables are interpolated to the epochs, and the rows are emitted.
 
-use crate::bytes::{Reader, StateError, Writer};
 use crate::clock::{Epochs, Place, Rate};
 use crate::layout::{Mandatory, TableSpec};
 use crate::outliers::{self, BLOCK, MARGIN};
 use crate::series::{LATEST_NS, Reason, Series, Tally, Window};
+use dragfree_sdk::state::{State, StateError};
 
 /// Duration of telemetry from which rates are measured, before and after the first mandatory row.
 const RATE_WINDOW_NS: i64 = 600_000_000_000;
@@ -271,15 +271,7 @@ impl Gridder {
         };
         // Up to half the grid's rate, with 5 % margin for jitter.
         if spec.never_interpolated || interval_ns <= period_ns / 20 * 41 {
-            let count = spec.columns.len();
-            Class::Fast(Fast {
-                phase_ns: None,
-                last_row: -1,
-                crowded: false,
-                filled: 0,
-                cells: vec![Window::default(); count],
-                runs: vec![Run::default(); count],
-            })
+            Class::Fast(Fast::new(spec.columns.len()))
         } else {
             Class::Slow(interval_ns)
         }
@@ -839,82 +831,56 @@ impl Gridder {
         }
     }
 
-    /// The whole state.
-    pub(crate) fn save(&self) -> Vec<u8> {
-        let mut w = Writer::default();
-        w.text(MAGIC);
-        w.text(&self.fingerprint());
-        self.tables.iter().for_each(|t| t.save(&mut w));
-        w.i64s(&self.intervals);
-        w.u64(self.classes.len() as u64);
-        for class in &self.classes {
-            match class {
-                Class::Slow(interval) => w.option(Some(*interval)),
-                Class::Fast(fast) => {
-                    w.option(None);
-                    fast.save(&mut w);
-                }
+    /// Visits the whole state; what is loaded into is fresh.
+    pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        state.same("set of tables or parameters", &self.fingerprint())?;
+        self.tables.iter_mut().try_for_each(|table| table.visit(state))?;
+        state.i64_list(&mut self.intervals)?;
+        let classes = state.count(self.classes.len())?;
+        if self.intervals.len() != self.tables.len() || (classes != 0 && classes != self.tables.len()) {
+            return Err(StateError::Content("tables"));
+        }
+        if state.is_loading() {
+            self.classes =
+                self.tables[..classes].iter().map(|t| Class::Fast(Fast::new(t.spec.columns.len()))).collect();
+        }
+        for class in &mut self.classes {
+            let mut interval = if let Class::Slow(interval) = class { Some(*interval) } else { None };
+            state.option(&mut interval, State::i64)?;
+            match (interval, &mut *class) {
+                (Some(interval), _) if interval <= 0 => return Err(StateError::Content("an interval")),
+                (Some(interval), _) => *class = Class::Slow(interval),
+                (None, Class::Fast(fast)) => fast.visit(state)?,
+                (None, Class::Slow(_)) => return Err(StateError::Content("a kind of table")),
             }
         }
-        w.option(self.reference.map(|r| r as i64));
-        self.epochs.save(&mut w);
-        w.option(self.first_ns);
-        w.i64s(&[
-            self.complete_ns,
-            self.last_reference_ns,
-            self.base,
-            self.rows,
-            self.counted,
-            self.cleaned,
-            self.given,
-        ]);
-        self.summary.save(&mut w);
-        w.0
-    }
-
-    /// Restores a state; on an error nothing has changed.
-    pub(crate) fn load(&mut self, state: &[u8]) -> Result<(), StateError> {
-        let specs = self.tables.iter().map(|t| t.spec.clone()).collect();
-        let mut new = Self::new(self.config.clone(), specs);
-        let mut r = Reader::new(state);
-        r.text_is(MAGIC, "format")?;
-        r.text_is(&new.fingerprint(), "set of tables or parameters")?;
-        for table in &mut new.tables {
-            table.load(&mut r)?;
+        state.option(&mut self.reference, State::usize)?;
+        if self.reference.is_some_and(|r| r >= classes) {
+            return Err(StateError::Content("a table of reference"));
         }
-        let layout = StateError::Foreign("layout");
-        new.intervals = r.i64s()?;
-        let classes = r.count(16)?;
-        if new.intervals.len() != new.tables.len() || (classes != 0 && classes != new.tables.len()) {
-            return Err(layout);
+        self.epochs.visit(state)?;
+        state.option(&mut self.first_ns, State::i64)?;
+        for counter in [
+            &mut self.complete_ns,
+            &mut self.last_reference_ns,
+            &mut self.base,
+            &mut self.rows,
+            &mut self.counted,
+            &mut self.cleaned,
+            &mut self.given,
+        ] {
+            state.i64(counter)?;
         }
-        for table in 0..classes {
-            new.classes.push(match r.option()? {
-                Some(interval) if interval > 0 => Class::Slow(interval),
-                Some(_) => return Err(layout),
-                None => Class::Fast(Fast::load(&mut r, new.tables[table].spec.columns.len())?),
-            });
-        }
-        new.reference = match r.option()? {
-            None => None,
-            Some(r) => Some(usize::try_from(r).ok().filter(|r| *r < classes).ok_or(StateError::Foreign("layout"))?),
-        };
-        new.epochs.load(&mut r)?;
-        new.first_ns = r.option()?;
-        let counters: [i64; 7] = r.i64s()?.try_into().map_err(|_| StateError::Foreign("layout"))?;
-        [new.complete_ns, new.last_reference_ns, new.base, new.rows, new.counted, new.cleaned, new.given] = counters;
-        new.summary = Summary::load(&mut r)?;
-        r.end()?;
-        let ordered = [0, new.base, new.given, new.cleaned, new.counted, new.rows].is_sorted();
-        let waiting = (new.rows - new.base) as usize;
+        self.summary.visit(state)?;
+        let ordered = [0, self.base, self.given, self.cleaned, self.counted, self.rows].is_sorted();
+        let waiting = (self.rows - self.base) as usize;
         let whole = |class: &Class| match class {
             Class::Fast(fast) => fast.cells.iter().all(|c| c.len() == waiting),
             Class::Slow(_) => true,
         };
-        if !ordered || !new.classes.iter().all(whole) || (new.reference.is_none() && new.rows > 0) {
-            return Err(layout);
+        if !ordered || !self.classes.iter().all(whole) || (self.reference.is_none() && self.rows > 0) {
+            return Err(StateError::Content("rows that do not fit together"));
         }
-        *self = new;
         Ok(())
     }
 
@@ -930,9 +896,6 @@ impl Gridder {
         text
     }
 }
-
-/// Identifier of the state's format.
-const MAGIC: &str = "dragfree preprocess state 1";
 
 /// Largest distance of neighbouring rows of a slow table, ns: the hold time plus 10 % for jitter.
 fn across_ns(interval_ns: i64, hold_intervals: f64) -> i64 {
@@ -951,68 +914,44 @@ fn median_interval(times: &[i64], end_ns: i64) -> i64 {
 }
 
 impl Fast {
-    fn save(&self, w: &mut Writer) {
-        w.option(self.phase_ns);
-        w.i64(self.last_row);
-        w.flag(self.crowded);
-        w.u64(self.filled);
-        for (cells, run) in self.cells.iter().zip(&self.runs) {
-            w.f64s(cells.as_slice());
-            w.u64(run.bits);
-            w.u64(u64::from(run.length));
-            w.flag(run.moved);
+    fn new(columns: usize) -> Self {
+        Self {
+            phase_ns: None,
+            last_row: -1,
+            crowded: false,
+            filled: 0,
+            cells: vec![Window::default(); columns],
+            runs: vec![Run::default(); columns],
         }
     }
 
-    fn load(r: &mut Reader<'_>, columns: usize) -> Result<Self, StateError> {
-        let mut fast = Self {
-            phase_ns: r.option()?,
-            last_row: r.i64()?,
-            crowded: r.flag()?,
-            filled: r.u64()?,
-            cells: Vec::with_capacity(columns),
-            runs: Vec::with_capacity(columns),
-        };
-        for _ in 0..columns {
-            fast.cells.push(Window::from_vec(r.f64s()?));
-            let bits = r.u64()?;
-            let length = u32::try_from(r.u64()?).map_err(|_| StateError::Foreign("layout"))?;
-            fast.runs.push(Run { bits, length, moved: r.flag()? });
+    fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        state.option(&mut self.phase_ns, State::i64)?;
+        state.i64(&mut self.last_row)?;
+        state.flag(&mut self.crowded)?;
+        state.u64(&mut self.filled)?;
+        for (cells, run) in self.cells.iter_mut().zip(&mut self.runs) {
+            cells.visit(state, State::f64_list)?;
+            state.u64(&mut run.bits)?;
+            state.u32(&mut run.length)?;
+            state.flag(&mut run.moved)?;
         }
-        Ok(fast)
+        Ok(())
     }
 }
 
 impl Summary {
-    fn words(&self) -> [u64; 11] {
-        let times = [self.longest.from_ns, self.current.from_ns, self.longest_cut_ns, self.longest_cut_from_ns];
-        let [a, b, c, d] = times.map(i64::cast_unsigned);
-        let jump = self.first_rephased_ns.cast_unsigned();
-        let counts = [self.used, self.rejected, self.longest.rows, self.current.rows, self.cut_gaps, self.rephased];
-        let [e, f, g, h, i, j] = counts;
-        [a, b, c, d, e, f, g, h, i, j, jump]
-    }
-
-    fn save(&self, w: &mut Writer) {
-        self.words().iter().for_each(|word| w.u64(*word));
-    }
-
-    fn load(r: &mut Reader<'_>) -> Result<Self, StateError> {
-        let mut words = [0; 11];
-        for word in &mut words {
-            *word = r.u64()?;
+    fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        for count in [&mut self.used, &mut self.rejected, &mut self.cut_gaps, &mut self.rephased] {
+            state.u64(count)?;
         }
-        let [a, b, c, d, used, rejected, g, h, cut_gaps, rephased, jump] = words;
-        Ok(Self {
-            used,
-            rejected,
-            longest: EpochRun { rows: g, from_ns: a.cast_signed() },
-            current: EpochRun { rows: h, from_ns: b.cast_signed() },
-            cut_gaps,
-            longest_cut_ns: c.cast_signed(),
-            longest_cut_from_ns: d.cast_signed(),
-            rephased,
-            first_rephased_ns: jump.cast_signed(),
-        })
+        for run in [&mut self.longest, &mut self.current] {
+            state.u64(&mut run.rows)?;
+            state.i64(&mut run.from_ns)?;
+        }
+        for time_ns in [&mut self.longest_cut_ns, &mut self.longest_cut_from_ns, &mut self.first_rephased_ns] {
+            state.i64(time_ns)?;
+        }
+        Ok(())
     }
 }

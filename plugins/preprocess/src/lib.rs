@@ -10,7 +10,6 @@
 //!   reference's clock, the epochs continue with the new phase.
 //! * At a rate other than the mission's, samples slip against the epochs: an epoch with no sample, or two, is blank.
 
-mod bytes;
 mod clock;
 mod gridder;
 mod layout;

@@ -1,7 +1,7 @@
 //! Rows of one telemetry table before they reach the grid: checks, cleaning, counts.
 
-use crate::bytes::{Reader, StateError, Writer};
 use crate::layout::TableSpec;
+use dragfree_sdk::state::{State, StateError};
 
 /// A vector that is drained at the front in amortised constant time.
 #[derive(Clone, Debug, Default)]
@@ -11,8 +11,14 @@ pub(crate) struct Window<T> {
 }
 
 impl<T: Copy> Window<T> {
-    pub(crate) fn from_vec(data: Vec<T>) -> Self {
-        Self { data, head: 0 }
+    /// Visits the values that wait, by `list`.
+    pub(crate) fn visit<'s>(
+        &mut self,
+        state: &mut State<'s>,
+        list: impl FnOnce(&mut State<'s>, &mut Vec<T>) -> Result<(), StateError>,
+    ) -> Result<(), StateError> {
+        self.data.drain(..std::mem::take(&mut self.head));
+        list(state, &mut self.data)
     }
     pub(crate) fn as_slice(&self) -> &[T] {
         &self.data[self.head..]
@@ -124,19 +130,10 @@ impl Tally {
     pub(crate) fn get(&self, reason: Reason) -> u64 {
         self.counts[reason as usize]
     }
-    pub(crate) fn save(&self, w: &mut Writer) {
-        self.counts.iter().for_each(|c| w.u64(*c));
-        w.u64(self.rows_in);
-        w.u64(self.rows_placed);
-    }
-    pub(crate) fn load(r: &mut Reader<'_>) -> Result<Self, StateError> {
-        let mut tally = Self::default();
-        for count in &mut tally.counts {
-            *count = r.u64()?;
-        }
-        tally.rows_in = r.u64()?;
-        tally.rows_placed = r.u64()?;
-        Ok(tally)
+    fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        self.counts.iter_mut().try_for_each(|count| state.u64(count))?;
+        state.u64(&mut self.rows_in)?;
+        state.u64(&mut self.rows_placed)
     }
 }
 
@@ -261,26 +258,15 @@ impl Series {
         self.columns.iter_mut().for_each(|c| c.drop_front(count));
     }
 
-    pub(crate) fn save(&self, w: &mut Writer) {
-        w.i64s(self.times.as_slice());
-        self.columns.iter().for_each(|c| w.f64s(c.as_slice()));
-        self.tally.save(w);
-        w.option(self.last_time);
-        w.flag(self.conflicting);
-    }
-
-    pub(crate) fn load(&mut self, r: &mut Reader<'_>) -> Result<(), StateError> {
-        self.times = Window::from_vec(r.i64s()?);
-        for column in &mut self.columns {
-            *column = Window::from_vec(r.f64s()?);
-        }
+    pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        self.times.visit(state, State::i64_list)?;
+        self.columns.iter_mut().try_for_each(|column| column.visit(state, State::f64_list))?;
         if self.columns.iter().any(|c| c.len() != self.times.len()) {
-            return Err(StateError::Foreign("layout"));
+            return Err(StateError::Content("columns of another length than their times"));
         }
-        self.tally = Tally::load(r)?;
-        self.last_time = r.option()?;
-        self.conflicting = r.flag()?;
-        Ok(())
+        self.tally.visit(state)?;
+        state.option(&mut self.last_time, State::i64)?;
+        state.flag(&mut self.conflicting)
     }
 }
 

@@ -187,12 +187,8 @@ impl Stage for Preprocess {
         Ok(report)
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        Ok(self.gridder.as_ref().ok_or_else(not_linked)?.save())
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        Ok(self.gridder.as_mut().ok_or_else(not_linked)?.load(state)?)
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        Ok(self.gridder.as_mut().ok_or_else(not_linked)?.visit(state)?)
     }
 }
 

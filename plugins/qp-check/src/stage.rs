@@ -111,17 +111,13 @@ impl Stage for QpCheck {
         self.linked.as_mut().ok_or_else(before_link)?.report(earlier)
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        let linked = self.linked.as_ref().ok_or_else(before_link)?;
-        Ok(state::save(&linked.signature, &linked.segmenter.state, &linked.collected, linked.analyser.plan()))
-    }
-
-    fn load(&mut self, bytes: &[u8]) -> Result<(), PluginError> {
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
         let linked = self.linked.as_mut().ok_or_else(before_link)?;
-        let fresh = linked.nothing_collected();
-        (linked.segmenter.state, linked.collected) =
-            state::load(bytes, &linked.signature, &linked.segmenter.state, &fresh)?;
-        Ok(())
+        if state.is_loading() {
+            linked.collected = linked.nothing_collected();
+        }
+        let Linked { signature, segmenter, collected, analyser, .. } = linked;
+        Ok(state::visit(state, signature, &mut segmenter.state, collected, analyser.plan())?)
     }
 }
 

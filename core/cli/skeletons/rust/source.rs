@@ -61,14 +61,8 @@ impl Source for Swing {
         Ok(Report::default())
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        Ok(self.next_ns.to_le_bytes().to_vec())
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let refuse = |_| PluginError::error(format!("{} bytes are no state of {{NAME}}", state.len()));
-        self.next_ns = i64::from_le_bytes(state.try_into().map_err(refuse)?);
-        Ok(())
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        Ok(state.i64(&mut self.next_ns)?)
     }
 }
 

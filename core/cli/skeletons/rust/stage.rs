@@ -57,15 +57,9 @@ impl Stage for Scaled {
         Ok(Report { counts: [("rows".to_owned(), self.rows)].into(), ..Report::default() })
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        // CHANGE: everything that the next row depends on.
-        Ok(self.rows.to_le_bytes().to_vec())
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let refuse = |_| PluginError::error(format!("{} bytes are no state of {{NAME}}", state.len()));
-        self.rows = u64::from_le_bytes(state.try_into().map_err(refuse)?);
-        Ok(())
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        // CHANGE: everything that the next row depends on, for saving and for loading.
+        Ok(state.u64(&mut self.rows)?)
     }
 }
 

@@ -5,7 +5,9 @@ use sha2::{Digest, Sha256};
 
 use super::{Chain, ChainError, Queue};
 
-const MAGIC: &[u8; 8] = b"DFSTATE2";
+const MAGIC: &[u8; 8] = b"DFSTATE3";
+/// What the states of every version begin with.
+const ANY_VERSION: &[u8; 7] = b"DFSTATE";
 
 #[derive(Serialize, Deserialize)]
 struct Header {
@@ -120,8 +122,14 @@ pub fn resumes_at_ns(bytes: &[u8]) -> Result<i64, ChainError> {
 fn open(bytes: &[u8]) -> Result<(Header, &[u8]), ChainError> {
     let refuse = |what: &str| ChainError::State { what: what.to_owned() };
     let (body, digest) = bytes.split_last_chunk::<32>().ok_or_else(|| refuse("too short to be one"))?;
-    if !body.starts_with(MAGIC) {
+    if !body.starts_with(ANY_VERSION) {
         return Err(refuse("this file is no state of a chain"));
+    }
+    if !body.starts_with(MAGIC) {
+        return Err(refuse(
+            "it was saved by an older version of the program, which this one cannot read; replay the day before with this \
+             version and --save-state, or start without --load-state",
+        ));
     }
     if Sha256::digest(body).as_slice() != digest {
         return Err(refuse("it is damaged: its digest does not match; use an earlier state"));

@@ -41,13 +41,12 @@ use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
-    AXES, SeriesRef, axis_of, keep_available, loaded, manifest, mission, response, responses_to_spacecraft_force,
-    responses_to_spacecraft_torque, saved,
+    AXES, SeriesRef, axis_of, keep_available, manifest, mission, response, responses_to_spacecraft_force,
+    responses_to_spacecraft_torque,
 };
 pub use program::Program;
 pub use text::{TextError, Tree, parse};
 
-const STATE: &[u8; 8] = b"formula1";
 /// Duration without a single value, from the first row with all inputs, after which the run stops, s.
 const MAX_UNDEFINED_S: f64 = 600.0;
 
@@ -323,22 +322,10 @@ impl Effect for Formula {
         Ok(())
     }
 
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        let first_ns = self.first_ns.unwrap_or(i64::MIN).cast_unsigned();
-        let whole = [self.rows_with_inputs, self.rows_without_value, first_ns].map(f64::from_bits);
-        let program = self.linked.iter().flat_map(|linked| linked.program.state());
-        Ok(saved(STATE, whole.into_iter().chain(program)))
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let count = 3 + self.linked.as_ref().map_or(0, |linked| linked.program.state().len());
-        let numbers = loaded(STATE, &self.name(), count, state)?;
-        let [rows_with_inputs, rows_without_value, first_ns] = [0, 1, 2].map(|i| numbers[i].to_bits());
-        (self.rows_with_inputs, self.rows_without_value) = (rows_with_inputs, rows_without_value);
-        self.first_ns = Some(first_ns.cast_signed()).filter(|ns| *ns != i64::MIN);
-        if let Some(linked) = &mut self.linked {
-            linked.program.set_state(&numbers[3..]);
-        }
-        Ok(())
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
+        state.u64(&mut self.rows_with_inputs)?;
+        state.u64(&mut self.rows_without_value)?;
+        state.option(&mut self.first_ns, State::i64)?;
+        Ok(self.linked.iter_mut().try_for_each(|linked| linked.program.visit(state))?)
     }
 }

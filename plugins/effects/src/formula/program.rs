@@ -4,6 +4,7 @@
 //! [`CHUNK_ROWS`] rows. Functions with state are steps of their own: `lag(x, 60) * y` is one step for the lag and one
 //! for the product.
 
+use dragfree_sdk::state::{State, StateError};
 use exmex::{BinOp, ExError, ExResult, Express, FlatEx, MakeOperators, Operator as ExOperator};
 use std::f64::consts::{PI, TAU};
 use std::str::FromStr;
@@ -132,8 +133,6 @@ enum Filter {
 }
 
 impl Filter {
-    const STATE: usize = Lags::<1>::STATE;
-
     fn push(&mut self, time_ns: &[i64], input: &[f64], dt_s: f64) -> Vec<f64> {
         let mut out = Vec::with_capacity(input.len());
         match self {
@@ -161,23 +160,14 @@ impl Filter {
         out
     }
 
-    fn state(&self) -> Vec<f64> {
-        let mut state = match self {
-            Self::Lag { lag, .. } => lag.state().collect(),
-            Self::Derivative { previous, at_ns } => vec![*previous, f64::from_bits(at_ns.cast_unsigned())],
-            Self::Integral { integral } => vec![*integral],
-        };
-        state.resize(Self::STATE, 0.0);
-        state
-    }
-
-    fn set_state(&mut self, state: &[f64]) {
+    fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
         match self {
-            Self::Lag { lag, .. } => lag.set_state(state),
+            Self::Lag { lag, .. } => lag.visit(state),
             Self::Derivative { previous, at_ns } => {
-                (*previous, *at_ns) = (state[0], state[1].to_bits().cast_signed());
+                state.f64(previous)?;
+                state.i64(at_ns)
             }
-            Self::Integral { integral } => *integral = state[0],
+            Self::Integral { integral } => state.f64(integral),
         }
     }
 }
@@ -463,20 +453,14 @@ impl Program {
         Ok(())
     }
 
-    fn filters(&mut self) -> impl Iterator<Item = &mut Filter> {
-        self.steps.iter_mut().filter_map(|s| if let Step::Stateful(filter, _) = s { Some(filter) } else { None })
-    }
-
-    /// State on which later rows depend.
-    #[must_use]
-    pub fn state(&self) -> Vec<f64> {
-        let streaming = self.steps.iter().filter_map(|s| if let Step::Stateful(m, _) = s { Some(m) } else { None });
-        streaming.flat_map(Filter::state).collect()
-    }
-
-    /// Restores [`Self::state`].
-    pub fn set_state(&mut self, state: &[f64]) {
-        self.filters().zip(state.chunks_exact(Filter::STATE)).for_each(|(filter, state)| filter.set_state(state));
+    /// Visits all that the next rows depend on.
+    ///
+    /// # Errors
+    /// The state ends.
+    pub fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        let mut filters =
+            self.steps.iter_mut().filter_map(|s| if let Step::Stateful(filter, _) = s { Some(filter) } else { None });
+        filters.try_for_each(|filter| filter.visit(state))
     }
 }
 
@@ -492,6 +476,7 @@ fn per_row(values: Values, rows: usize) -> Vec<f64> {
 mod tests {
     use super::super::text::{Operator, parse, tests::trees};
     use super::*;
+    use dragfree_sdk::state;
     use proptest::prelude::*;
 
     const DT_S: f64 = 0.1;
@@ -573,7 +558,8 @@ mod tests {
             let mut first = program(text);
             let mut out = run(&mut first, &time_ns[..cut], &part(0, cut));
             let mut second = program(text);
-            second.set_state(&first.state());
+            let saved = state::save("program", 1, |state| first.visit(state)).expect("saved");
+            state::load("program", 1, &saved, |state| second.visit(state)).expect("its own state");
             out.extend(run(&mut second, &time_ns[cut..], &part(cut, 3000)));
             prop_assert!(whole.iter().zip(&out).all(|(a, b)| a.to_bits() == b.to_bits()) && whole.len() == out.len());
         }
