@@ -70,6 +70,7 @@ static dragfree_status bad_process(void *self, const dragfree_inputs_v1 *inputs,
   return DRAGFREE_OK;
 }
 
+#if BAD == 11 || BAD == 12
 /* As `printf` writes it: `nan` is no JSON. */
 static dragfree_status bad_report(void *self, const char *earlier, const dragfree_writer_v1 *writer,
                                   dragfree_error_v1 *error) {
@@ -87,6 +88,7 @@ static dragfree_status bad_report(void *self, const char *earlier, const dragfre
 #endif
   return writer->write(writer->context, (const uint8_t *)text, (size_t)n);
 }
+#endif
 
 static dragfree_status bad_create(uint32_t index, const dragfree_host_v1 *host, const dragfree_config_v1 *config,
                                   dragfree_node_v1 *node, dragfree_error_v1 *error) {

@@ -26,3 +26,19 @@ fn the_committed_schemas_are_those_of_the_types() {
     committed::<Model>("model");
     committed::<Report>("report");
 }
+
+/// The examples of the guide are declarations: nothing in them is left out when they are read.
+#[test]
+fn the_coefficients_of_the_guide_are_coefficients() {
+    let guide = include_str!("../../../ops-guide/src/plugins.md");
+    let examples: Vec<&str> = guide.split("```json\n").skip(1).filter_map(|rest| rest.split("```").next()).collect();
+    assert_eq!(examples.len(), 2);
+    for text in examples {
+        let example: serde_json::Value = serde_json::from_str(text).expect("JSON");
+        let read: Coefficient = serde_json::from_str(text).expect("a coefficient");
+        let again = serde_json::to_value(&read).expect("JSON");
+        for (key, value) in example.as_object().expect("an object") {
+            assert_eq!(again[key], *value, "{key}");
+        }
+    }
+}

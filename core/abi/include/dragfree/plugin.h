@@ -14,6 +14,10 @@
  *    different instances may be called at the same time on different threads;
  *  - the host never unloads a library.
  *
+ * What crosses as JSON (manifests, coefficients, constraints, noise processes, reports) has JSON Schemas in the folder
+ * dragfree/schema beside this header, with every key and its meaning. JSON has neither NaN nor infinity: write null.
+ * In a declaration an unknown key is refused; in a report it is left out and noted in the product.
+ *
  * Life of an instance, with the functions that may be called in each state:
  *
  *   created --link--> linked --activate--> active --flush--> flushed --report--> reported
@@ -102,10 +106,12 @@ typedef struct dragfree_host_v1 {
 } dragfree_host_v1;
 
 /* The configuration of an instance, valid during `create` only. `json` is one object: `parameters` (every declared
- * parameter, checked, defaults filled in), `mission` (the mission file), `instance` (effects), `files`, `start_ns`,
- * `end_ns` (sources). The getters walk it by dotted path, "parameters.gain", "mission.spacecraft.mass_kg", so that
- * plain C needs no JSON parser; DRAGFREE_ERROR where there is no such number or string. A string from `get_text` is
- * valid during `create`. */
+ * parameter, checked, defaults filled in), `mission` (the mission file), `instance` (effects), `candidate` (effects:
+ * true where the effect is not in the model and a diagnosis tries it), `needs` (stages: what effects of the model ask
+ * for in their manifests; a stage that knows how to make one of these makes it), `threads` (how many an instance may
+ * use, itself included; results must not depend on it), `files`, `start_ns`, `end_ns` (sources). The getters walk it
+ * by dotted path, "parameters.gain", "mission.spacecraft.mass_kg", so that plain C needs no JSON parser; DRAGFREE_ERROR
+ * where there is no such number or string. A string from `get_text` is valid during `create`. */
 typedef struct dragfree_config_v1 {
   void *context;
   const char *json;
@@ -137,13 +143,37 @@ typedef struct dragfree_link_v1 {
   void *context;
   uint32_t available_count;
   const dragfree_column_v1 *available;
-  /* {"coefficients":[…],"constraints":[…]}: what the model's effects have declared up to here. */
+  /* {"coefficients":[…],"constraints":[…],"noise":[…]}: what was declared up to here; schema/model. */
   const char *model_json;
   dragfree_status (*read)(void *context, const dragfree_column_v1 *wanted, dragfree_slot_v1 *slot);
   dragfree_status (*write)(void *context, const dragfree_column_v1 *column);
-  /* Effects only. A coefficient: {"name":"com-offset.tm1.x","unit":"m","frame":"ORF_1","lower":…,"upper":…,
-   * "initial":…,"prior_sigma":…}. A constraint: {"name":"baseline.x","kind":"survey","terms":[["com-offset.tm1.x",
-   * 0.86]],"lower":…,"upper":…,"unit":"m","parts":2}; constraints of one name from several instances add their terms. */
+  /* Effects only; schema/coefficient and schema/constraint have all keys.
+   *
+   * A coefficient: {"name":"my-force.tm1.y","unit":"N A-1","frame":"ORF_1","lower":-1e-9,"upper":1e-9,"initial":0.0,
+   * "prior_sigma":null}. Its name is EFFECT.INSTANCE, or EFFECT.INSTANCE.NAME where there are several. How channels
+   * respond to it is said in one of these ways:
+   *  - a written column with the attributes {"kind":"regressor","coefficient":"my-force.tm1.y",
+   *    "channel":"tm1.accel.y"}: what one unit of the coefficient adds to the channel;
+   *  - "responses":[{"channel":"tm1.accel.y","table":"effect/my-force:tm1","series":"current","factor":0.51}]: a
+   *    factor times a series, a column with the attribute kind = series of this effect or of one before it, and with
+   *    "times":"com-offset.tm1.x" times the value of another coefficient;
+   *  - "noise":"thruster_force:sc.x": it multiplies the amplitude of a noise process, 1 for the declared level;
+   *  - "colours":{"process":"thruster_force:sc.x","numerator":[0,0,1],"denominator":[0.4,0.06,1]}, beside responses:
+   *    what follows the commands follows the actuators' noise too, whose power it makes |1 + cH(s)|^2 times as large;
+   *    polynomials in s, the constant first.
+   * A candidate (`candidate` of the configuration) declares what it may be in place of what it is:
+   *  - "variants":[{"shape":{"lag_s":45.0},"responses":[…],"unit":"N K-1","range":[-1,1],"colours":{…}}]: one for
+   *    each form; `shape` are the parameters that give the effect this form in a model; unit, range and colours where
+   *    they are not the coefficient's own;
+   *  - "transients":[{"shape":{"decay_s":3.0},"kernel":[0.0,0.6,0.4],"channels":[["tm1.accel.x",1.0]]}]: courses of
+   *    short duration, a mean per sample from the one in which it begins; the host finds the time and gives it as the
+   *    parameter `at_ns`.
+   * An effect with a parameter `fine` (0 or 1) is asked again about the shape that stood out, for variants near it.
+   *
+   * A constraint, lower <= sum of weights times coefficients <= upper: {"name":"baseline.x","kind":"survey","terms":
+   * [["com-offset.tm1.x",0.86]],"lower":0.1799,"upper":0.1801,"unit":"m","parts":2}. Constraints of one name from
+   * several instances add their terms; with fewer than `parts` of them the host drops it. `kind`: survey, a
+   * measurement with a tolerance, or range, a physical bound. */
   dragfree_status (*coefficient)(void *context, const char *json);
   dragfree_status (*constraint)(void *context, const char *json);
 } dragfree_link_v1;
@@ -184,7 +214,15 @@ typedef struct dragfree_node_v1 {
   /* [active] There will be no more input: give what a lag held back. */
   dragfree_status (*flush)(void *self, struct ArrowArray *outputs, dragfree_error_v1 *error);
   /* [flushed; a source: active] The result as JSON; `earlier_json` is the array of the reports of the stages before
-   * this one. May be NULL: nothing to report. */
+   * this one, each with `plugin`. May be NULL: nothing to report. Every key is optional; schema/report has all:
+   * {"coefficients":[{"name":"my-force.tm1.y","solution":"mine","value":1.5e-10,"sigma":2e-11,"unit":"N A-1",
+   *                   "frame":"ORF_1"}],
+   *  "covariance":{"mine":{"names":["my-force.tm1.y"],"matrix":[[4e-22]]}},
+   *  "verdict":"agree", "weak_directions":["…"], "chi2_per_dof":1.01, "nis":0.99, "commands":"telemetered",
+   *  "epochs_used":863990, "epochs_rejected":10, "counts":{"spikes":3}, "notes":["a sentence for the operator"],
+   *  "quality":{"free":"figures"}, "attachments":[{"suffix":"mine.json","text":"{}"}],
+   *  "data_loss":false (true: exit code 3), "inconsistent":false (true: exit code 4)}. A source may give `time_scale`,
+   * `mission` and `spacecraft` in `quality`. */
   dragfree_status (*report)(void *self, const char *earlier_json, const dragfree_writer_v1 *writer,
                             dragfree_error_v1 *error);
   /* [active] The whole state as bytes. May be NULL together with `load`: the instance has no state. */
@@ -199,8 +237,10 @@ typedef struct dragfree_node_v1 {
 typedef struct dragfree_factory_v1 {
   uint32_t count;
   /* The manifest of plugin `index` < `count` as JSON, static: {"id":"gain","version":"1.0.0","licence":"MIT",
-   * "description":"…","instances":["tm1"],"parameters":[{"name":"gain","type":"f64","unit":"1","default":1.0,
-   * "minimum":0.0,"maximum":10.0,"help":"…"}]}. Types: f64, i64, bool, text, f64_list, text_list; `choices` for text. */
+   * "description":"…","instances":["tm1"],"needs":["commands"],"parameters":[{"name":"gain","type":"f64","unit":"1",
+   * "default":1.0,"minimum":0.0,"maximum":10.0,"help":"…"}]}. Types: f64, i64, bool, text, f64_list, text_list;
+   * `choices` for text. `needs` of an effect: columns that stages before it make on demand only, by the names that
+   * those stages give them (commands, torque-response, dws-delay-response by hinf-dfacs). schema/manifest has all. */
   const char *(*manifest)(uint32_t index);
   /* Makes an instance: fills `node`, returns DRAGFREE_OK; otherwise leaves it untouched and says why. */
   dragfree_status (*create)(uint32_t index, const dragfree_host_v1 *host, const dragfree_config_v1 *config,

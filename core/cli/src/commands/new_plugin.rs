@@ -14,6 +14,16 @@ macro_rules! skeleton {
     };
 }
 
+/// A JSON Schema of the border, beside its header.
+macro_rules! schema {
+    ($name:literal) => {
+        (
+            concat!("include/dragfree/schema/", $name, ".schema.json"),
+            include_str!(concat!("../../../abi/include/dragfree/schema/", $name, ".schema.json")),
+        )
+    };
+}
+
 /// Path and text of every file.
 fn files(kind: PluginKind, language: Language) -> Vec<(&'static str, &'static str)> {
     match language {
@@ -43,6 +53,12 @@ fn files(kind: PluginKind, language: Language) -> Vec<(&'static str, &'static st
                 ("README.md", skeleton!("c/README.md")),
                 ("include/dragfree/plugin.h", include_str!("../../../abi/include/dragfree/plugin.h")),
                 ("include/dragfree/rows.h", include_str!("../../../abi/include/dragfree/rows.h")),
+                schema!("coefficient"),
+                schema!("constraint"),
+                schema!("manifest"),
+                schema!("model"),
+                schema!("noise_process"),
+                schema!("report"),
             ]
         }
     }
