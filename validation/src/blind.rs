@@ -11,59 +11,15 @@ use std::path::Path;
 use std::sync::Mutex;
 use std::time::Instant;
 
-use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
 use crate::blind_report::numbers;
 use crate::campaign::{CampaignError, Meter, note, work};
 use crate::program::{Chain, Hidden, Program, root, solution};
-use crate::records::{Keyed, Results, Solution};
+use crate::records::{After, Blind, Results};
 
 /// Seeds up to this one were used in development and are excluded.
 pub const DEVELOPED_ON: u32 = 100;
-
-/// Result of one seed.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Blind {
-    /// Length and kind of the data.
-    pub configuration: String,
-    /// Seed of hidden effects and noise.
-    pub seed: u32,
-    /// Digest of the plugins' libraries, twelve hexadecimal digits.
-    pub build: String,
-    /// Duration of the diagnosis, s.
-    pub diagnosis_s: f64,
-    /// Score by `reveal`.
-    pub score: Value,
-    /// Offset by the model without additions.
-    pub before: Solution,
-    /// Offset by the extended model; `None` if nothing could be added or a false cause was accepted.
-    pub after: Option<After>,
-}
-
-/// An extended model.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct After {
-    /// Added effects.
-    pub added: Vec<String>,
-    /// Offset from the same telemetry.
-    pub offset: Solution,
-    /// χ²/dof of telemetry that no fit has used: model before, model after, and with the true values; `None` if the
-    /// truth has no value that a model can take.
-    pub held_out_chi2_per_dof: [Option<f64>; 3],
-}
-
-impl Keyed for Blind {
-    fn key(&self) -> (String, u32) {
-        (self.configuration.clone(), self.seed)
-    }
-
-    fn build(&self) -> &str {
-        &self.build
-    }
-}
 
 /// Runs the seeds that `results` lacks, `at_once` in parallel.
 ///

@@ -7,8 +7,7 @@ use dragfree_chart::ChartError;
 use dragfree_chart::matrix::{Matrix, svg};
 use serde_json::Value;
 
-use crate::blind::Blind;
-use crate::records::Solution;
+use crate::records::{Blind, Solution};
 
 /// Significance from which an effect should be detected.
 const PLAIN: f64 = 8.0;
@@ -293,7 +292,7 @@ pub fn picture(lines: &[Blind]) -> Result<Option<String>, ChartError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::blind::After;
+    use crate::records::After;
     use crate::records::tests::line as product;
     use serde_json::json;
 

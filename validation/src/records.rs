@@ -3,6 +3,7 @@
 use nalgebra::DMatrix;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
+use serde_json::Value;
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
@@ -145,6 +146,49 @@ pub trait Keyed {
 }
 
 impl Keyed for Line {
+    fn key(&self) -> (String, u32) {
+        (self.configuration.clone(), self.seed)
+    }
+
+    fn build(&self) -> &str {
+        &self.build
+    }
+}
+
+/// Result of one seed of the blind campaign.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Blind {
+    /// Length and kind of the data.
+    pub configuration: String,
+    /// Seed of hidden effects and noise.
+    pub seed: u32,
+    /// Digest of the plugins' libraries, twelve hexadecimal digits.
+    pub build: String,
+    /// Duration of the diagnosis, s.
+    pub diagnosis_s: f64,
+    /// Score by `reveal`.
+    pub score: Value,
+    /// Offset by the model without additions.
+    pub before: Solution,
+    /// Offset by the extended model; `None` if nothing could be added or a false cause was accepted.
+    pub after: Option<After>,
+}
+
+/// An extended model.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct After {
+    /// Added effects.
+    pub added: Vec<String>,
+    /// Offset from the same telemetry.
+    pub offset: Solution,
+    /// χ²/dof of telemetry that no fit has used: model before, model after, and with the true values; `None` if the
+    /// truth has no value that a model can take.
+    pub held_out_chi2_per_dof: [Option<f64>; 3],
+}
+
+impl Keyed for Blind {
     fn key(&self) -> (String, u32) {
         (self.configuration.clone(), self.seed)
     }

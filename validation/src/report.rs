@@ -8,12 +8,11 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-use crate::blind::Blind;
 use crate::blind_report;
 use crate::bound::free_space;
 use crate::campaign::{CampaignError, NOMINAL, TWINS, Twin, file, note, parse, taiji};
 use crate::program::root;
-use crate::records::{Line, Solution, read};
+use crate::records::{Blind, Line, Solution, read};
 use crate::speed::Speed;
 use crate::stats::{self, Bounds};
 use crate::table::{REGIMES, Row, configuration};

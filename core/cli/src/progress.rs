@@ -2,7 +2,7 @@
 
 use crate::args::Global;
 use crate::utc;
-use dragfree_engine::run::Progress;
+use dragfree_workflow::calibrate::Progress;
 use std::io::{IsTerminal as _, Write as _};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};

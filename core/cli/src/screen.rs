@@ -5,7 +5,7 @@ use crate::utc;
 use dragfree_engine::border::{Manifest, Parameter, ParameterType};
 use dragfree_engine::product::{Coefficient, Listing, Product};
 use dragfree_engine::registry::Registry;
-use dragfree_engine::run::{CheckReport, CheckedNode};
+use dragfree_workflow::calibrate::{CheckReport, CheckedNode};
 use serde_json::Value;
 use std::fmt::Write as _;
 use std::path::Path;

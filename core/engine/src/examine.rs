@@ -1,87 +1,34 @@
-//! A second look at the data of a product: its inputs through its chain once more, with another stage in place of the estimators.
+//! A second pass over the data of a product: its inputs go through its chain once more, up to and with the effects, and the columns
+//! that the caller chooses come back to it.
 
-use serde::{Deserialize, Serialize};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use crate::EngineError;
 use crate::border::Kind;
-use crate::chain::{self, Forget};
-use crate::config::{EffectEntry, Model, Node};
+use crate::chain::{self, Chain, Sink};
+use crate::config::{EffectEntry, Mission, Model, Node};
 use crate::product::Product;
 use crate::registry::Registry;
 use crate::replay;
 use crate::run::{Progress, RunOptions, Setup, carry, carry_all, window};
+use crate::sources::Sources;
 
-/// Where the inputs of a product lay, in a file beside it that is no part of it: places change, content does not.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-pub struct Sources {
-    /// Pipeline file.
-    pub pipeline: PathBuf,
-    /// Mission file.
-    pub mission: PathBuf,
-    /// Model file.
-    pub model: PathBuf,
-    /// Telemetry.
-    pub telemetry: Vec<PathBuf>,
-    /// First time that was asked for, Unix ns.
-    pub from_ns: Option<i64>,
-    /// End of the time that was asked for, Unix ns.
-    pub until_ns: Option<i64>,
-}
-
-impl Sources {
-    pub(crate) fn of(setup: &Setup, options: &RunOptions) -> Self {
-        let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
-        Self {
-            pipeline: absolute(&setup.pipeline.path),
-            mission: absolute(&setup.mission.path),
-            model: absolute(&setup.model.path),
-            telemetry: options.files.iter().map(|f| absolute(f)).collect(),
-            from_ns: options.from_ns,
-            until_ns: options.until_ns,
-        }
-    }
-
-    fn path(product: &Path) -> PathBuf {
-        product.with_extension("sources.json")
-    }
-
-    pub(crate) fn write(&self, product: &Path) -> Result<(), EngineError> {
-        let path = Self::path(product);
-        let text = serde_json::to_string_pretty(self).unwrap_or_default() + "\n";
-        std::fs::write(&path, text).map_err(|source| EngineError::Io { action: "write", path, source })
-    }
-
-    /// Reads them.
-    ///
-    /// # Errors
-    /// [`EngineError::Io`] where there is no such file beside the product.
-    pub fn read(product: &Path) -> Result<Self, EngineError> {
-        let path = Self::path(product);
-        let text = std::fs::read_to_string(&path).map_err(|source| EngineError::Io {
-            action: "read where the inputs lay, from",
-            path: path.clone(),
-            source,
-        })?;
-        serde_json::from_str(&text).map_err(|e| EngineError::Io { action: "read", path, source: e.into() })
-    }
-}
-
-/// What to do with the data of a product.
+/// Which data are examined, and how.
 pub struct Examination<'a> {
     /// The product.
     pub product: &'a Product,
     /// Where its inputs are now.
     pub sources: &'a Sources,
-    /// Stage that stands in place of all behind the effects, with its parameters.
-    pub stage: (&'a str, toml::Table),
     /// Effects that are tried beside those of the model.
     pub candidates: Vec<EffectEntry>,
-    /// Threads.
+    /// Threads; results do not depend on them.
     pub threads: usize,
-    /// Most rows in one call of a plugin.
+    /// Most rows in one call; results do not depend on it.
     pub batch_rows: usize,
 }
+
+/// A consumer of columns, with the indices of those that it wants in [`Chain::columns`].
+pub type Wanted<C> = (C, Vec<usize>);
 
 /// Every instance of every installed effect that is not in a model. An effect that may act anywhere is not tried: its place is the
 /// user's to say.
@@ -121,15 +68,17 @@ pub fn model(sources: &Sources) -> Result<Model, EngineError> {
     Ok(Model::load(&sources.model)?)
 }
 
-/// Carries the data of a product through its chain and gives what could not be tried.
+/// Carries the data of a product through its chain. `link` sees the linked chain before a row is read; what it makes takes the rows of
+/// the columns that it wants ([`Sink::tapped`]). Gives that back, and the candidates that could not be linked, with the reason.
 ///
 /// # Errors
-/// An input has changed since the product was made, is gone, or a plugin fails.
-pub fn examine(
+/// An input has changed since the product was made, is gone, or a plugin fails; or `link` refuses.
+pub fn examine<C: Sink, E: From<EngineError>>(
     registry: &Registry,
     what: &Examination<'_>,
+    link: impl FnOnce(&Chain, &Mission) -> Result<Wanted<C>, E>,
     progress: &mut dyn FnMut(Progress),
-) -> Result<Vec<(String, String)>, EngineError> {
+) -> Result<(C, Vec<(String, String)>), E> {
     let sources = what.sources;
     unchanged(what.product, sources)?;
     let options = RunOptions {
@@ -149,21 +98,19 @@ pub fn examine(
     };
     let mut setup = Setup::load(&options)?;
     setup.model.candidates.clone_from(&what.candidates);
-    let keep =
-        setup.pipeline.nodes.iter().position(|n| *n == Node::Effects).map_or(setup.pipeline.nodes.len(), |i| i + 1);
-    setup.pipeline.nodes.truncate(keep);
-    let (plugin, parameters) = (what.stage.0.to_owned(), what.stage.1.clone());
-    setup.pipeline.nodes.push(Node::Stage { plugin, parameters });
+    let nodes = &mut setup.pipeline.nodes;
+    nodes.truncate(nodes.iter().position(|n| *n == Node::Effects).map_or(nodes.len(), |i| i + 1));
     let mut feed = setup.feed(registry, &options, window(&options, None))?;
     let tables = feed.get().tables().to_vec();
-    let mut chain = chain::build(registry, &setup.pipeline, &setup.mission, &setup.model, &tables, carry(&options))?;
-    let covered = carry_all(feed.get(), &mut chain, &mut Forget, progress)?;
-    if covered.is_none() {
-        return Err(EngineError::NoRows { files: options.files });
+    let mut chain = chain::build(registry, &setup.pipeline, &setup.mission, &setup.model, &tables, carry(&options))
+        .map_err(EngineError::from)?;
+    let (mut consumer, columns) = link(&chain, &setup.mission)?;
+    chain.tap(&columns).map_err(EngineError::from)?;
+    if carry_all(feed.get(), &mut chain, &mut consumer, progress)?.is_none() {
+        return Err(EngineError::NoRows { files: options.files }.into());
     }
-    chain.finish(&mut Forget)?;
-    chain.reports()?;
-    Ok(chain.not_tried)
+    chain.finish(&mut consumer).map_err(EngineError::from)?;
+    Ok((consumer, chain.not_tried))
 }
 
 /// The inputs are those that the product names.

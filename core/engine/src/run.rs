@@ -11,11 +11,11 @@ use crate::EngineError;
 use crate::border::hex;
 use crate::chain::{self, Carry, Chain, Sink};
 use crate::config::{Mission, Model, Pipeline};
-use crate::examine::Sources;
 use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions, Summary};
 use crate::product::{self, Draft, Loss, Product, ProductWriter, Stage, Status, Stream};
 use crate::registry::Registry;
 use crate::replay;
+use crate::sources::Sources;
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{FileHeader, TelemetryWriter, interface_tables};
 
@@ -237,7 +237,7 @@ pub fn run(
     let summary = feed.get().summary()?;
     let draft = draft(&setup, options, &chain, &feed, summary, reports, &covered)?;
     let written = writer.commit(&draft)?;
-    Sources::of(&setup, options).write(&written.path)?;
+    sources(&setup, options).write(&written.path)?;
     // After the product: a kill in between costs a second run of the day, never the day.
     if let Some((path, bytes)) = state {
         write_state(path, &bytes)?;
@@ -424,6 +424,19 @@ fn draft(
         reports: summary.report.into_iter().chain(reports).collect(),
         created: options.created,
     })
+}
+
+/// Where the inputs of a run lie.
+fn sources(setup: &Setup, options: &RunOptions) -> Sources {
+    let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
+    Sources {
+        pipeline: absolute(&setup.pipeline.path),
+        mission: absolute(&setup.mission.path),
+        model: absolute(&setup.model.path),
+        telemetry: options.files.iter().map(|f| absolute(f)).collect(),
+        from_ns: options.from_ns,
+        until_ns: options.until_ns,
+    }
 }
 
 fn digest(parameters: &serde_json::Map<String, Value>) -> String {

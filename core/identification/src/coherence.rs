@@ -3,7 +3,7 @@
 //! For each housekeeping value, its derivative, its square and the products of two, the complex cross-spectrum with `Σ⁻¹ r` of the
 //! residuals r, each at unit power, which is what is left of each channel when all others are known (what acts on one test mass is
 //! seen there, far below the thrusters' noise, which moves all of them and which their own currents follow), is summed over long
-//! segments, in wide bands below [`crate::gram::SLOW_HZ`]. A lag between cause and force turns the phase and leaves the coherence.
+//! segments, in wide bands below [`crate::decimate::SLOW_HZ`]. A lag between cause and force turns the phase and leaves the coherence.
 //! For n complex observations without relation `−2(n−1) log(1 − |γ|²)` is χ² with two degrees of freedom, whatever the driver
 //! (Goodman 1957).
 //!
@@ -18,8 +18,8 @@ use dragfree_estimation::spectra::{Plan, Transformer};
 use nalgebra::{Complex, DMatrix, DMatrixView};
 use serde::{Deserialize, Serialize};
 
+use crate::decimate::SLOW_HZ;
 use crate::distributions::{corrected, ln_chi2_above};
-use crate::gram::SLOW_HZ;
 
 /// Ratio of the ends of a band.
 const RATIO: f64 = 1.6;

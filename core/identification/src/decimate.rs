@@ -6,6 +6,9 @@
 
 use nalgebra::{DVector, DVectorView};
 
+/// What is slow has nothing above this frequency.
+pub const SLOW_HZ: f64 = 0.05;
+
 /// Running means in a row.
 const ORDER: i32 = 5;
 

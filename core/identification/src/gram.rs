@@ -16,11 +16,8 @@ use dragfree_estimation::spectra::{Plan, Spectra, Transformer, triangle};
 use nalgebra::{DMatrix, DMatrixView};
 
 use crate::coherence::HousekeepingCoherence;
-use crate::decimate::{Decimator, Response};
+use crate::decimate::{Decimator, Response, SLOW_HZ};
 use crate::transient::{Part, Search, Transients};
-
-/// Slow series have nothing above this.
-pub const SLOW_HZ: f64 = 0.05;
 
 /// Long segments are so many times as long as the short ones.
 pub const LONG: usize = 16;

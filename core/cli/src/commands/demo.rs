@@ -7,6 +7,7 @@ use crate::text::{self, Paint, labelled};
 use crate::{bundled, truth};
 use clap::Parser as _;
 use dragfree_engine::product;
+use dragfree_workflow::Archived;
 use serde_json::{Value, json};
 use std::fs::{self, OpenOptions};
 use std::io::{ErrorKind, Write as _};
@@ -91,7 +92,7 @@ pub(super) fn execute(folder: &Path, global: &Global, paint: Paint) -> Result<Do
     let ladder = ["ladder", &first, &second, "--held-out", &first_held_out, &second_held_out, "--truth", &truth];
     let ladder = story.tell(&[&ladder[..], &["--archive", &archive]].concat())?;
 
-    let (product, path) = products::open(&second, &story.archive)?;
+    let Archived { product, path } = products::open(&second, &story.archive)?;
     let code = super::run::code(&product);
     if global.json {
         let mut all = product::to_json(&product, &path);
@@ -168,7 +169,7 @@ impl Story<'_> {
 
     /// The newest product of a day.
     fn newest(&self, day: &str) -> Result<String, Failure> {
-        Ok(products::open(day, &self.archive)?.0.id().to_owned())
+        Ok(products::open(day, &self.archive)?.product.id().to_owned())
     }
 }
 

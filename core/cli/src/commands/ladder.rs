@@ -6,13 +6,13 @@ use crate::failure::Failure;
 use crate::text::{self, Paint, columns, labelled};
 use crate::truth;
 use dragfree_chart::{Line, Panel, Scale, Stroke, svg};
-use dragfree_engine::ladder::{Fall, Ladder, Rung, Value, Verdict, Window, ladder};
 use dragfree_engine::product::Product;
+use dragfree_workflow::ladder::{Fall, Ladder, Rung, Value, Verdict, Window, ladder};
 use std::path::Path;
 
 pub(super) fn execute(command: &Arguments, json: bool, paint: Paint) -> Result<Done, Failure> {
     let open = |names: &[String]| -> Result<Vec<Product>, Failure> {
-        names.iter().map(|name| Ok(products::open(name, &command.archive.folder)?.0)).collect()
+        names.iter().map(|name| Ok(products::open(name, &command.archive.folder)?.product)).collect()
     };
     let (fitted, held_out) = (open(&command.products)?, open(&command.held_out)?);
     let truth = command.truth.as_deref().map(truth::first).transpose()?.unwrap_or_default();

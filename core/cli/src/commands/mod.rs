@@ -9,6 +9,7 @@ mod model;
 mod new_plugin;
 mod plugins;
 mod products;
+mod replay;
 mod reveal;
 mod run;
 mod simulate;

@@ -208,7 +208,7 @@ fn evidence(candidate: &Value) -> String {
 }
 
 fn fix(command: &ModelFix, json: bool, paint: Paint) -> Result<Done, Failure> {
-    let (product, _) = products::open(&command.product, &command.archive.folder)?;
+    let product = products::open(&command.product, &command.archive.folder)?.product;
     let out = command.out.clone().unwrap_or_else(|| command.model.with_extension("fixed.toml"));
     if out.canonicalize().ok().is_some_and(|out| command.model.canonicalize().ok() == Some(out)) {
         return Err(Failure::Usage(

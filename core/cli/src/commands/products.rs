@@ -5,8 +5,9 @@ use crate::args::Products;
 use crate::failure::Failure;
 use crate::screen;
 use crate::text::Paint;
-use dragfree_engine::product::{self, Product};
-use std::path::{Path, PathBuf};
+use dragfree_engine::product;
+use dragfree_workflow::Archived;
+use std::path::Path;
 
 pub(super) fn execute(command: &Products, json: bool, paint: Paint) -> Result<Done, Failure> {
     match command {
@@ -23,19 +24,19 @@ pub(super) fn execute(command: &Products, json: bool, paint: Paint) -> Result<Do
 }
 
 /// A product by its file, or by a name in the archive, and its file.
-pub(super) fn open(name: &str, archive: &Path) -> Result<(Product, PathBuf), Failure> {
+pub(super) fn open(name: &str, archive: &Path) -> Result<Archived, Failure> {
     let file = Path::new(name);
     if file.is_file() {
-        return Ok((product::read(file).map_err(Failure::engine)?, file.to_owned()));
+        return Ok(Archived { product: product::read(file).map_err(Failure::engine)?, path: file.to_owned() });
     }
     exists(archive)?;
     let entry = product::find(archive, name).map_err(Failure::engine)?;
-    Ok((entry.product, entry.path))
+    Ok(Archived { product: entry.product, path: entry.path })
 }
 
 /// `name` is a product's file, or a name in the archive.
 fn show(name: &str, archive: &Path, json: bool, paint: Paint) -> Result<Done, Failure> {
-    let (product, path) = open(name, archive)?;
+    let Archived { product, path } = open(name, archive)?;
     if json {
         return Ok(Done::json(&product::to_json(&product, &path)));
     }

@@ -7,7 +7,7 @@ use crate::progress::Meter;
 use crate::screen;
 use crate::text::Paint;
 use dragfree_engine::product::{self, Product};
-use dragfree_engine::run::{Outcome, RunOptions, check, run};
+use dragfree_workflow::calibrate::{Options, Outcome, calibrate, check};
 use std::fmt::Write as _;
 use std::path::Path;
 use std::time::SystemTime;
@@ -31,7 +31,7 @@ pub(super) fn execute(command: &Run, global: &Global, paint: Paint) -> Result<Do
 /// Runs the pipeline and archives the product.
 pub(super) fn archive(command: &Run, global: &Global) -> Result<Outcome, Failure> {
     let registry = super::registry(global)?;
-    let options = RunOptions {
+    let options = Options {
         from_ns: command.from,
         until_ns: command.until,
         batch_rows: command.batch_rows as usize,
@@ -40,7 +40,7 @@ pub(super) fn archive(command: &Run, global: &Global) -> Result<Outcome, Failure
         ..options(&command.chain, global)
     };
     let mut meter = Meter::new("run", global);
-    run(&registry, &options, &mut |progress| meter.show(&progress)).map_err(Failure::engine)
+    calibrate(&registry, &options, &mut |progress| meter.show(&progress)).map_err(Failure::engine)
 }
 
 /// `dragfree config check`: links as a run would.
@@ -52,8 +52,8 @@ pub(super) fn config_check(chain: &Chain, global: &Global) -> Result<Done, Failu
     Ok(Done::new(screen::check(&report)))
 }
 
-fn options(chain: &Chain, global: &Global) -> RunOptions {
-    RunOptions {
+fn options(chain: &Chain, global: &Global) -> Options {
+    Options {
         pipeline: chain.pipeline.clone(),
         files: chain.files.clone(),
         mission: chain.mission.clone(),

@@ -4,7 +4,7 @@ use dragfree_schema::{Coefficient, Constraint, NoiseProcess};
 use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 
-use super::{Carry, Chain, ChainError, ChainNode, Queue, Reader, Route};
+use super::{Carry, Chain, ChainError, ChainNode, Queue, Route, Tap};
 use crate::border::{BorderError, Config, Instance, Kind, LinkRequest, Linked, hex};
 use crate::config::{EffectEntry, Mission, Model, Node, Pipeline, resolve_parameters};
 use crate::registry::{Found, Registry};
@@ -34,9 +34,11 @@ pub fn build(
             coefficients: Vec::new(),
             constraints: Vec::new(),
             noise: Vec::new(),
+            columns: Vec::new(),
             not_tried: Vec::new(),
             feed_tables: feed_tables.to_vec(),
             feed_routes: vec![Route::default(); feed_tables.len()],
+            tap: Tap::default(),
             carry: Carry { batch_rows: carry.batch_rows.max(1), ..carry },
             complete_until_ns: i64::MIN,
             mission_sha256: hex(&Sha256::digest(mission.value.to_string())),
@@ -55,6 +57,7 @@ pub fn build(
             pipeline.path.display()
         )));
     }
+    builder.chain.columns = std::mem::take(&mut builder.available);
     builder.chain.model_sha256 = hex(&Sha256::digest(builder.model_json(false)));
     Ok(builder.chain)
 }
@@ -262,26 +265,10 @@ impl Builder<'_> {
         let mut inputs = Vec::new();
         for (input, columns) in linked.reads.iter().enumerate() {
             let Some(first) = columns.first().map(|c| &self.available[c.available]) else { continue };
+            let (table, uniform) = (first.table.clone(), first.rate_hz > 0.0);
             let names: Vec<&str> = columns.iter().map(|c| self.available[c.available].name.as_str()).collect();
-            let reader = |table: &TableSpec| Reader {
-                node: index,
-                input,
-                columns: names.iter().filter_map(|n| table.columns.iter().position(|c| c.name == *n)).collect(),
-            };
-            inputs.push(Queue::new(first.table.clone(), first.rate_hz > 0.0, columns.len()));
-            for (table, route) in self.chain.feed_tables.iter().zip(&mut self.chain.feed_routes) {
-                if table.name == first.table {
-                    route.readers.push(reader(table));
-                }
-            }
-            for maker in &mut self.chain.nodes {
-                for (table, route) in maker.writes.iter().zip(&mut maker.routes) {
-                    if table.name == first.table {
-                        route.readers.push(reader(table));
-                        wave = wave.max(maker.wave + 1);
-                    }
-                }
-            }
+            inputs.push(Queue::new(table.clone(), uniform, columns.len()));
+            wave = wave.max(self.chain.subscribe(&table, &names, Some(index), input));
         }
         (inputs, wave)
     }

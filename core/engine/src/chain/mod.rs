@@ -17,7 +17,7 @@ use std::sync::{Mutex, PoisonError};
 use dragfree_schema::{Coefficient, Constraint, NoiseProcess, Report};
 
 use crate::border::{BorderError, Instance, PluginInfo, Rows};
-use crate::table::{Batch, Chunk, TableSpec};
+use crate::table::{Batch, Chunk, Column, TableSpec};
 use queue::Queue;
 
 /// What can go wrong between plugins.
@@ -41,12 +41,10 @@ pub enum ChainError {
         what: String,
     },
     /// Tables that should have the same rows do not.
-    #[error(
-        "plugin {plugin}: its input tables have different rows: {what}; the stage that makes one of them is at fault"
-    )]
+    #[error("the tables that {reader} reads have different rows: {what}; the stage that makes one of them is at fault")]
     Join {
-        /// The reader.
-        plugin: String,
+        /// The plugin that reads them, or the host.
+        reader: String,
         /// Which table, which time.
         what: String,
     },
@@ -64,23 +62,18 @@ pub enum ChainError {
     Sink(String),
 }
 
-/// Takes the rows of tables that belong beside the product.
+/// Takes rows out of the chain.
 pub trait Sink {
-    /// Rows of one table, ordered by time.
+    /// Rows of one table that belongs beside the product, ordered by time.
     ///
     /// # Errors
     /// A sentence for the operator.
-    fn rows(&mut self, table: &TableSpec, batch: &Batch) -> Result<(), String>;
-}
-
-/// A sink that keeps nothing.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Forget;
-
-impl Sink for Forget {
     fn rows(&mut self, _table: &TableSpec, _batch: &Batch) -> Result<(), String> {
         Ok(())
     }
+
+    /// Rows of the columns that [`Chain::tap`] asked for, in the order asked for, joined by time.
+    fn tapped(&mut self, _time_ns: &[i64], _columns: &[&[f64]]) {}
 }
 
 /// A plugin at its place in the chain.
@@ -124,7 +117,8 @@ struct Route {
 
 #[derive(Clone, Debug)]
 struct Reader {
-    node: usize,
+    /// None for the tap.
+    node: Option<usize>,
     input: usize,
     /// Columns of the table, in the reader's order.
     columns: Vec<usize>,
@@ -156,10 +150,13 @@ pub struct Chain {
     pub constraints: Vec<Constraint>,
     /// Noise in the channels, as its stages declared it.
     pub noise: Vec<NoiseProcess>,
+    /// Columns of the feed and of every plugin, in the order in which they are made.
+    pub columns: Vec<Column>,
     /// Candidates that could not be linked, with the reason.
     pub not_tried: Vec<(String, String)>,
     feed_tables: Vec<TableSpec>,
     feed_routes: Vec<Route>,
+    tap: Tap,
     carry: Carry,
     complete_until_ns: i64,
     /// Digests of what a state must have been saved with.
@@ -167,7 +164,65 @@ pub struct Chain {
     model_sha256: String,
 }
 
+/// Columns that leave the chain for its host, joined by time.
+#[derive(Debug, Default)]
+struct Tap {
+    inputs: Vec<Queue>,
+    /// Input, and column of it, of every column asked for.
+    order: Vec<(usize, usize)>,
+}
+
 impl Chain {
+    /// Hands columns to the host ([`Sink::tapped`]); `columns` are indices into [`Self::columns`].
+    ///
+    /// # Errors
+    /// Their rates differ, or one is irregular: their rows cannot be joined.
+    pub fn tap(&mut self, columns: &[usize]) -> Result<(), ChainError> {
+        let wanted: Vec<Column> = columns.iter().map(|c| self.columns[*c].clone()).collect();
+        let rate_hz = wanted.first().map_or(0.0, |c| c.rate_hz);
+        if let Some(other) = wanted.iter().find(|c| c.rate_hz != rate_hz || c.rate_hz <= 0.0) {
+            let what = format!("{} comes at {} Hz, {} at {rate_hz} Hz", other.name, other.rate_hz, wanted[0].name);
+            return Err(ChainError::Join { reader: TAP.to_owned(), what });
+        }
+        let mut tables: Vec<(&str, Vec<&str>)> = Vec::new();
+        let mut order = Vec::new();
+        for column in &wanted {
+            let input = tables.iter().position(|(table, _)| *table == column.table).unwrap_or_else(|| {
+                tables.push((&column.table, Vec::new()));
+                tables.len() - 1
+            });
+            let names = &mut tables[input].1;
+            order.push((input, names.len()));
+            names.push(&column.name);
+        }
+        self.tap.order = order;
+        for (input, (table, names)) in tables.into_iter().enumerate() {
+            self.tap.inputs.push(Queue::new(table.to_owned(), true, names.len()));
+            self.subscribe(table, &names, None, input);
+        }
+        Ok(())
+    }
+
+    /// Routes columns of a table to a node, or to the tap; gives the first wave after those that make them.
+    fn subscribe(&mut self, table: &str, names: &[&str], node: Option<usize>, input: usize) -> usize {
+        let reader = |made: &TableSpec| Reader {
+            node,
+            input,
+            columns: names.iter().filter_map(|n| made.columns.iter().position(|c| c.name == *n)).collect(),
+        };
+        for (made, route) in self.feed_tables.iter().zip(&mut self.feed_routes).filter(|(t, _)| t.name == table) {
+            route.readers.push(reader(made));
+        }
+        let mut wave = 0;
+        for maker in &mut self.nodes {
+            for (made, route) in maker.writes.iter().zip(&mut maker.routes).filter(|(t, _)| t.name == table) {
+                route.readers.push(reader(made));
+                wave = wave.max(maker.wave + 1);
+            }
+        }
+        wave
+    }
+
     /// Every row before this time has gone into the chain, Unix ns.
     #[must_use]
     pub fn complete_until_ns(&self) -> i64 {
@@ -188,7 +243,8 @@ impl Chain {
     pub fn feed(&mut self, chunk: Chunk, sink: &mut dyn Sink) -> Result<(), ChainError> {
         for piece in pieces(chunk, self.carry.batch_rows) {
             for (i, batch) in piece.batches.iter().enumerate() {
-                publish(&mut self.nodes, &self.feed_tables[i], &self.feed_routes[i], batch, sink)?;
+                let (table, route) = (&self.feed_tables[i], &self.feed_routes[i]);
+                publish(&mut self.nodes, &mut self.tap, table, route, batch, sink)?;
             }
             self.complete_until_ns = piece.complete_until_ns;
             self.advance(sink)?;
@@ -210,10 +266,11 @@ impl Chain {
             self.distribute(i, &made, sink)?;
             while self.round(false, sink)? {}
         }
-        for node in &self.nodes {
-            if let Some(left) = node.inputs.iter().find(|q| q.uniform && q.rows() > 0) {
+        let readers = self.nodes.iter().map(|n| (n.name(), &n.inputs)).chain([(TAP, &self.tap.inputs)]);
+        for (reader, inputs) in readers {
+            if let Some(left) = inputs.iter().find(|q| q.uniform && q.rows() > 0) {
                 return Err(ChainError::Join {
-                    plugin: node.name().to_owned(),
+                    reader: reader.to_owned(),
                     what: format!("table {} has {} rows more than the others at the end", left.table, left.rows()),
                 });
             }
@@ -283,13 +340,29 @@ impl Chain {
                 }
             }
         }
-        Ok(busy)
+        Ok(self.pour(sink)? || busy)
+    }
+
+    /// Hands the tap's rows to the host, at most a batch of them; false where there are none.
+    fn pour(&mut self, sink: &mut dyn Sink) -> Result<bool, ChainError> {
+        let Tap { inputs, order } = &mut self.tap;
+        let rows = inputs.iter().map(Queue::rows).min().unwrap_or(0).min(self.carry.batch_rows);
+        if rows == 0 {
+            return Ok(false);
+        }
+        check_join(TAP, inputs, rows)?;
+        let tables: Vec<Rows<'_>> = inputs.iter().map(|q| q.front(rows)).collect();
+        let columns: Vec<&[f64]> = order.iter().map(|(input, column)| tables[*input].columns[*column]).collect();
+        sink.tapped(tables[0].time_ns, &columns);
+        inputs.iter_mut().for_each(|q| q.consume(rows));
+        Ok(true)
     }
 
     /// Most rows that a reader of a node has not used yet.
     fn unread(&self, node: &ChainNode) -> usize {
         let readers = node.routes.iter().flat_map(|route| &route.readers);
-        readers.map(|r| self.nodes[r.node].inputs[r.input].rows()).max().unwrap_or(0)
+        let inputs = |r: &Reader| r.node.map_or(&self.tap.inputs, |node| &self.nodes[node].inputs);
+        readers.map(|r| inputs(r)[r.input].rows()).max().unwrap_or(0)
     }
 
     fn distribute(&mut self, node: usize, made: &[Batch], sink: &mut dyn Sink) -> Result<(), ChainError> {
@@ -297,13 +370,16 @@ impl Chain {
         let writes = std::mem::take(&mut self.nodes[node].writes);
         let mut result = Ok(());
         for ((table, route), batch) in writes.iter().zip(&routes).zip(made) {
-            result = result.and_then(|()| publish(&mut self.nodes, table, route, batch, sink));
+            result = result.and_then(|()| publish(&mut self.nodes, &mut self.tap, table, route, batch, sink));
         }
         self.nodes[node].routes = routes;
         self.nodes[node].writes = writes;
         result
     }
 }
+
+/// Who reads the tap, in messages.
+const TAP: &str = "the host";
 
 /// What a node made in one call: one batch per written table; none where there was nothing to call it for.
 type Made = Result<Option<Vec<Batch>>, ChainError>;
@@ -325,6 +401,7 @@ impl ChainNode {
 
 fn publish(
     nodes: &mut [ChainNode],
+    tap: &mut Tap,
     table: &TableSpec,
     route: &Route,
     batch: &Batch,
@@ -334,7 +411,8 @@ fn publish(
         return Ok(());
     }
     for reader in &route.readers {
-        nodes[reader.node].inputs[reader.input].push(batch, &reader.columns);
+        let inputs = reader.node.map_or(&mut tap.inputs, |node| &mut nodes[node].inputs);
+        inputs[reader.input].push(batch, &reader.columns);
     }
     if route.archive {
         sink.rows(table, batch).map_err(ChainError::Sink)?;
@@ -348,7 +426,7 @@ fn step(node: &mut ChainNode, complete_until_ns: i64, batch_rows: usize, new_row
     if rows == 0 && (node.has_uniform() || !new_rows) {
         return Ok(None);
     }
-    check_join(node, rows)?;
+    check_join(node.name(), &node.inputs, rows)?;
     let given: Vec<usize> = node.inputs.iter().map(|q| if q.uniform { rows } else { q.rows() }).collect();
     let tables: Vec<Rows<'_>> = node.inputs.iter().zip(&given).map(|(q, n)| q.front(*n)).collect();
     let batches = match node.instance.process(&tables, complete_until_ns)? {
@@ -380,15 +458,15 @@ fn discarded(node: &mut ChainNode, rows: usize) -> Vec<Batch> {
         .collect()
 }
 
-fn check_join(node: &ChainNode, rows: usize) -> Result<(), ChainError> {
-    let mut uniform = node.inputs.iter().filter(|q| q.uniform);
+fn check_join(reader: &str, inputs: &[Queue], rows: usize) -> Result<(), ChainError> {
+    let mut uniform = inputs.iter().filter(|q| q.uniform);
     let Some(first) = uniform.next() else { return Ok(()) };
     let times = first.front(rows).time_ns;
     for queue in uniform {
         let other = queue.front(rows).time_ns;
         if let Some(i) = (0..rows).find(|i| times[*i] != other[*i]) {
             return Err(ChainError::Join {
-                plugin: node.name().to_owned(),
+                reader: reader.to_owned(),
                 what: format!(
                     "at the same row, {} has {} ns and {} has {} ns",
                     first.table, times[i], queue.table, other[i]

@@ -131,8 +131,9 @@ impl Model {
         format!("{counter}-{}", self.digest())
     }
 
-    /// Counter and digest of a revision's name that [`Model::name`] made; `None` for a name written by hand.
-    pub(crate) fn parts(revision: &str) -> Option<(u32, &str)> {
+    /// Counter and digest of a revision's name that this program made; `None` for a name written by hand.
+    #[must_use]
+    pub fn parts(revision: &str) -> Option<(u32, &str)> {
         let (counter, digest) = revision.split_once('-')?;
         let hexadecimal = digest.len() == DIGITS && digest.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
         Some((counter.parse().ok().filter(|_| hexadecimal)?, digest))

@@ -3,10 +3,31 @@
 use std::fmt;
 use std::io::{self, Read, Seek, SeekFrom};
 
-use super::scan::{Piece, Stored};
-
 /// Largest piece that is read, bytes, compressed or not. A length beyond it is damage or an attack.
 pub(super) const MAX_PIECE: u64 = 1 << 29;
+
+/// How the records of a piece are stored.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Stored {
+    /// As they are, in the data section.
+    Loose,
+    /// In a chunk.
+    Chunk { compression: String, uncompressed_size: u64, crc: u32 },
+}
+
+/// A stretch of a file with messages: a chunk, or a run of loose messages.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Piece {
+    /// Where its bytes begin in the file.
+    pub(super) offset: u64,
+    /// How many there are.
+    pub(super) length: u64,
+    /// Earliest log time, as told.
+    pub(super) start: u64,
+    /// Latest log time, as told.
+    pub(super) end: u64,
+    pub(super) stored: Stored,
+}
 
 /// Why the records of a piece are not there.
 #[derive(Debug)]

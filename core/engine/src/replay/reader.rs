@@ -8,10 +8,10 @@ use mcap::records::op;
 
 use super::ReplayError;
 use super::block::{Block, drain};
-use super::inflate::{InflateError, Inflater};
+use super::inflate::{InflateError, Inflater, Piece, Stored};
 use super::losses::{Finding, Losses};
 use super::records::{Cursor, Message};
-use super::scan::{Piece, Source, Stored};
+use super::scan::Source;
 use super::tables::{Route, Routes};
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{Cells, Decoder, WireError};

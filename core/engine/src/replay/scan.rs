@@ -14,7 +14,7 @@ use std::sync::Arc;
 use mcap::MAGIC;
 use mcap::records::op;
 
-use super::inflate::{InflateError, Inflater, MAX_PIECE};
+use super::inflate::{InflateError, Inflater, MAX_PIECE, Piece, Stored};
 use super::losses::{Finding, Losses};
 use super::records::{
     Channel, ChunkHeader, ChunkIndex, Cursor, FOOTER, MESSAGE_HEADER, Message, RECORD_HEADER, Schema, Statistics,
@@ -53,29 +53,6 @@ impl Source {
             Self::Memory(_, bytes) => Box::new(Bytes::new(Arc::clone(bytes))),
         })
     }
-}
-
-/// How the records of a piece are stored.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Stored {
-    /// As they are, in the data section.
-    Loose,
-    /// In a chunk.
-    Chunk { compression: String, uncompressed_size: u64, crc: u32 },
-}
-
-/// A stretch of a file with messages: a chunk, or a run of loose messages.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) struct Piece {
-    /// Where its bytes begin in the file.
-    pub(super) offset: u64,
-    /// How many there are.
-    pub(super) length: u64,
-    /// Earliest log time, as told.
-    pub(super) start: u64,
-    /// Latest log time, as told.
-    pub(super) end: u64,
-    pub(super) stored: Stored,
 }
 
 /// What a file defines.

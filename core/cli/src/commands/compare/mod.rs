@@ -2,15 +2,13 @@
 
 mod page;
 
-use super::{Done, diagnose, products};
+use super::{Done, replay};
 use crate::args::{Compare, Global};
 use crate::failure::Failure;
 use crate::text::{Paint, columns, labelled};
-use dragfree_engine::product::Product;
 use dragfree_identification::coherence::{Coherence, StepwiseCoherence};
-use dragfree_identification::compare::{Channel, Comparison, Innovations, Kind, Nis, Test, compare};
-use dragfree_identification::scores::CandidateScorer;
-use std::collections::BTreeMap;
+use dragfree_identification::compare::{Channel, Comparison, Innovations, Kind, Test};
+use dragfree_workflow::compare::compare;
 use std::path::Path;
 
 /// Exit code where the model contradicts the data.
@@ -20,13 +18,8 @@ const INCONSISTENT: u8 = 4;
 const NAMED: usize = 5;
 
 pub(super) fn execute(command: &Compare, global: &Global, paint: Paint) -> Result<Done, Failure> {
-    let (names, archive) = (&command.products, &command.archive.folder);
-    let (record, mission) = diagnose::gather_model(names, archive, global)?;
-    let noise = diagnose::noise(&record, &mission)?;
-    let opened = names.iter().map(|name| Ok(products::open(name, archive)?.0)).collect::<Result<Vec<_>, Failure>>()?;
-    let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise);
-    let innovations = Innovations::judge(&octaves(&opened), record.gathered.rate_hz);
-    let comparison = compare(&scorer, nis(&opened), innovations).map_err(Failure::engine)?;
+    let names = &command.products;
+    let comparison = replay::with_meter(names, &command.archive.folder, global, compare)?;
     if let Some(path) = &command.page {
         let meaning = (!comparison.passes).then(|| meaning(&comparison));
         let page = page::page(&comparison, names, meaning)?;
@@ -38,41 +31,6 @@ pub(super) fn execute(command: &Compare, global: &Global, paint: Paint) -> Resul
         Done::new(screen(&comparison, names, command.page.as_deref(), paint))
     };
     Ok(Done { code: if comparison.passes { 0 } else { INCONSISTENT }, ..done })
-}
-
-/// What the products say of the recursive filter, together: three readouts an update.
-fn nis(products: &[Product]) -> Option<Nis> {
-    let of = |p: &Product| {
-        let updates = *p.quality.counts.get("es-akf")?.get("updates")?;
-        (p.quality.nis.is_finite() && updates > 0).then_some((p.quality.nis, 3.0 * updates as f64))
-    };
-    let all: Vec<(f64, f64)> = products.iter().filter_map(of).collect();
-    let dof: f64 = all.iter().map(|(_, n)| n).sum();
-    (!all.is_empty()).then(|| Nis::new(all.iter().map(|(nis, n)| nis * n).sum::<f64>() / dof, dof))
-}
-
-/// Mean square and count of each readout's innovations, octave by octave, of all products together.
-fn octaves(products: &[Product]) -> BTreeMap<String, Vec<(f64, u64)>> {
-    let mut all: BTreeMap<String, Vec<(f64, u64)>> = BTreeMap::new();
-    for stage in products.iter().filter_map(|p| p.quality.stages.get("es-akf")) {
-        for (body, figures) in stage {
-            let Some(axes) = figures.get("innovation_octaves").and_then(|o| o.as_table()) else { continue };
-            for (axis, octaves) in axes {
-                let numbers = |key: &str| octaves.get(key).and_then(|x| x.as_array()).into_iter().flatten();
-                let sum = all.entry(format!("{body}.{axis}")).or_default();
-                for (k, (power, n)) in numbers("power").zip(numbers("count")).enumerate() {
-                    let (power, n) = (power.as_float().unwrap_or(0.0), n.as_integer().unwrap_or(0).max(0) as u64);
-                    if sum.len() == k {
-                        sum.push((0.0, 0));
-                    }
-                    let (mean, count) = sum[k];
-                    let total = (count + n).max(1);
-                    sum[k] = ((mean * count as f64 + power * n as f64) / total as f64, count + n);
-                }
-            }
-        }
-    }
-    all
 }
 
 fn screen(c: &Comparison, names: &[String], page: Option<&Path>, paint: Paint) -> String {

@@ -1,5 +1,5 @@
 use super::*;
-use crate::product::{self, Draft, ProductWriter, Stage, Status, Stream};
+use dragfree_engine::product::{self, Draft, ProductWriter, Stage, Status, Stream};
 use serde_json::json;
 
 /// 2035-01-01.

@@ -7,8 +7,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
-use crate::config::Model;
-use crate::product::{Coefficient, Product};
+use dragfree_engine::config::Model;
+use dragfree_engine::product::{Coefficient, Product};
 
 /// Why products make no ladder.
 #[derive(Debug, thiserror::Error)]
@@ -342,7 +342,7 @@ fn any<'a>(days: &Days<'a>) -> &'a Product {
 /// Effects that ran, `ID:INSTANCE`.
 fn effects(product: &Product) -> Vec<String> {
     let ran = product.history.iter().filter(|s| s.kind == "effect");
-    let name = |s: &crate::product::Stage| {
+    let name = |s: &dragfree_engine::product::Stage| {
         if s.instance.is_empty() { s.plugin.clone() } else { format!("{}:{}", s.plugin, s.instance) }
     };
     ran.map(name).collect()

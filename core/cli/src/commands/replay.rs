@@ -1,0 +1,40 @@
+//! The data of archived products once more, with progress on stderr.
+
+use super::products;
+use crate::args::{BATCH_ROWS, Global};
+use crate::failure::Failure;
+use crate::progress::Meter;
+use dragfree_workflow::calibrate::Progress;
+use dragfree_workflow::{Archived, Pass, Replay, WorkflowError};
+use std::path::Path;
+
+/// Does a job on products by their names in an archive.
+pub(super) fn with_meter<T>(
+    names: &[String],
+    archive: &Path,
+    global: &Global,
+    job: impl FnOnce(&Replay<'_>, &mut dyn FnMut(Pass, usize, Progress)) -> Result<T, WorkflowError>,
+) -> Result<T, Failure> {
+    let products: Vec<Archived> = names.iter().map(|name| products::open(name, archive)).collect::<Result<_, _>>()?;
+    let registry = super::registry(global)?;
+    let threads = super::threads(global);
+    let replay = Replay { registry: &registry, products: &products, threads, batch_rows: BATCH_ROWS as usize };
+    let mut shown: Option<(Pass, usize, Meter)> = None;
+    let mut progress = |pass: Pass, product: usize, progress: Progress| {
+        if shown.as_ref().is_none_or(|(of, number, _)| (*of, *number) != (pass, product)) {
+            shown = Some((pass, product, Meter::new(name(pass), global)));
+        }
+        if let Some((.., meter)) = &mut shown {
+            meter.show(&progress);
+        }
+    };
+    job(&replay, &mut progress).map_err(Failure::engine)
+}
+
+fn name(pass: Pass) -> &'static str {
+    match pass {
+        Pass::Residuals => "compare",
+        Pass::Transients => "look",
+        Pass::Candidates => "diagnose",
+    }
+}

@@ -1,0 +1,108 @@
+//! Which effect is missing from the model of some products.
+//!
+//! The data are read twice: transients have to be detected before they can be weighed against what lasts. They are read once more
+//! where the shape of a candidate stands out that its effect can try in finer steps.
+
+use std::collections::BTreeMap;
+
+use dragfree_engine::examine::has_parameter;
+use dragfree_engine::run::Progress;
+use dragfree_identification::diagnosis::{self, Diagnosis, Found, RefinementRequest};
+use dragfree_identification::record::Record;
+use dragfree_identification::scores::CandidateScorer;
+use dragfree_identification::transient::Detection;
+
+use crate::WorkflowError;
+use crate::replay::{FINE, Pass, Replay, What, noise, sum};
+
+/// Most transients that become candidates.
+const MOST_EVENTS: usize = 8;
+
+/// A transient becomes a candidate if a search of pure noise has as loud a peak with a smaller chance than this; whether it is certain
+/// is decided among the candidates.
+const WORTH_TRYING: f64 = 0.5;
+
+/// A detection within this of a louder one is its ringing in another window, ns.
+const SAME_EVENT_NS: i64 = 3_600_000_000_000;
+
+/// A diagnosis and the sums that it rests on.
+pub struct Diagnosed {
+    /// Sums.
+    pub record: Record,
+    /// What they say.
+    pub diagnosis: Diagnosis,
+}
+
+/// Diagnoses the data of products of one model. `progress` is told the pass and the number of the product.
+///
+/// # Errors
+/// [`WorkflowError`]: an input has changed, the products do not belong together, or there is too little data.
+pub fn diagnose(
+    replay: &Replay<'_>,
+    progress: &mut dyn FnMut(Pass, usize, Progress),
+) -> Result<Diagnosed, WorkflowError> {
+    let found = sum(replay, What::Transients, progress)?.0.gathered.transients;
+    let detected: Vec<Detection> = found.certain(WORTH_TRYING).take(MOST_EVENTS).cloned().collect();
+    let mut pass = |requests: &[RefinementRequest], tried_before: &BTreeMap<String, usize>| {
+        let (mut record, mission) = sum(replay, What::Candidates(&detected, requests), progress)?;
+        record.gathered.transients = found.clone();
+        let noise = noise(&record, &mission)?;
+        let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise);
+        let mut diagnosis = diagnosis::diagnose(&scorer, tried_before)?;
+        diagnosis.not_tried.extend(record.not_tried.iter().cloned());
+        Ok::<_, WorkflowError>(Diagnosed { record, diagnosis })
+    };
+    let first = pass(&[], &BTreeMap::new())?;
+    let mut requests = first.diagnosis.refinement_requests.clone();
+    requests.retain(|request| has_parameter(replay.registry, &request.effect, FINE));
+    if requests.is_empty() {
+        return Ok(first);
+    }
+    let mut tried = first.diagnosis.forms;
+    tried.retain(|effect, _| requests.iter().any(|request| request.effect == *effect));
+    // Sums are large, and these are made again.
+    drop(first.record);
+    pass(&requests, &tried)
+}
+
+impl Diagnosed {
+    /// Transients that were detected and are no part of the answer, the loudest first; without what rings beside a louder one.
+    #[must_use]
+    pub fn unexplained_transients(&self) -> Vec<&Detection> {
+        let seen = self.record.gathered.transients.certain(self.diagnosis.false_alarm_rate);
+        unexplained(seen, &self.diagnosis.candidates)
+    }
+}
+
+fn unexplained<'a>(seen: impl Iterator<Item = &'a Detection>, candidates: &[Found]) -> Vec<&'a Detection> {
+    let accepted = candidates.iter().filter(|f| f.accepted);
+    let mut told: Vec<i64> = accepted.filter_map(|f| f.shape.get("at_ns")?.as_i64()).collect();
+    let mut is_new = |detection: &&Detection| {
+        let new = told.iter().all(|at_ns| (at_ns - detection.at_ns).abs() > SAME_EVENT_NS);
+        told.push(detection.at_ns);
+        new
+    };
+    seen.filter(|detection| is_new(detection)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_rings_beside_something_louder_is_not_told_again() {
+        let detection = |at_s: i64| Detection {
+            effect: "impulse".to_owned(),
+            instance: "tm1.x".to_owned(),
+            coefficient: "impulse.tm1.x".to_owned(),
+            unit: "N s".to_owned(),
+            shape: serde_json::Map::new(),
+            at_ns: 1_000_000_000 * at_s,
+            significance: 10.0,
+        };
+        let seen = [20_000, 21_800, 24_000, 5_000].map(detection);
+        // The third rings beside the second, which rings beside the first.
+        let times: Vec<i64> = unexplained(seen.iter(), &[]).iter().map(|h| h.at_ns / 1_000_000_000).collect();
+        assert_eq!(times, [20_000, 5_000]);
+    }
+}

@@ -1,0 +1,83 @@
+//! The jobs behind the commands: calibrate a day, compare the model with the data, diagnose what is missing, climb the ladder of
+//! models. Each takes options, the registry of plugins and a callback for progress, and gives values; none prints, knows a
+//! terminal or asks a clock.
+
+pub mod calibrate;
+pub mod compare;
+pub mod diagnose;
+pub mod ladder;
+mod replay;
+mod sums;
+
+pub use replay::{Archived, Pass, Replay};
+
+use std::path::PathBuf;
+
+use dragfree_engine::EngineError;
+use dragfree_estimation::estimate::EstimateError;
+use dragfree_identification::compare::CompareError;
+use dragfree_identification::diagnosis::DiagnosisError;
+use dragfree_identification::record::RecordError;
+use dragfree_physics::mission::MissionError;
+
+/// Why a comparison or a diagnosis failed.
+#[derive(Debug, thiserror::Error)]
+pub enum WorkflowError {
+    /// The chain cannot be run again over the data.
+    #[error(transparent)]
+    Engine(#[from] EngineError),
+    /// What a plugin declares makes no sense.
+    #[error("{0}")]
+    Declaration(String),
+    /// The mission file lacks something.
+    #[error(transparent)]
+    Mission(#[from] MissionError),
+    /// The model cannot be fitted.
+    #[error(transparent)]
+    Estimate(#[from] EstimateError),
+    /// Products that do not belong together.
+    #[error(transparent)]
+    Record(#[from] RecordError),
+    /// No comparison.
+    #[error(transparent)]
+    Compare(#[from] CompareError),
+    /// No diagnosis.
+    #[error(transparent)]
+    Diagnosis(#[from] DiagnosisError),
+    /// No product was named.
+    #[error("no product was named")]
+    NoProduct,
+    /// There is nothing to explain.
+    #[error(
+        "the chain makes no channel to explain: put a stage before the effects that makes some, such as hinf-dfacs"
+    )]
+    NoChannel,
+    /// A response names a series that nobody makes.
+    #[error(
+        "a response is to column {name} of table {table}, which nobody makes; the effect that declares it is at fault"
+    )]
+    NoColumn {
+        /// Table.
+        table: String,
+        /// Column.
+        name: String,
+    },
+    /// Normal equations that cannot be used.
+    #[error("{}: {what}", path.display())]
+    Reference {
+        /// The file beside the product.
+        path: PathBuf,
+        /// Why.
+        what: String,
+    },
+    /// A detection without its template.
+    #[error(
+        "{effect} has no waveform any more for the transient at {at_ns} ns: its plugin declares others in every pass"
+    )]
+    NoTemplate {
+        /// Effect and instance.
+        effect: String,
+        /// Unix ns.
+        at_ns: i64,
+    },
+}

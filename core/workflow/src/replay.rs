@@ -1,0 +1,140 @@
+//! The data of archived products once more, through the chains that made them, into sums.
+
+use std::path::PathBuf;
+
+use dragfree_engine::examine::{Examination, candidates, examine, has_parameter, model};
+use dragfree_engine::product::Product;
+use dragfree_engine::registry::Registry;
+use dragfree_engine::run::Progress;
+use dragfree_engine::sources::Sources;
+use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_identification::diagnosis::RefinementRequest;
+use dragfree_identification::record::Record;
+use dragfree_identification::transient::Detection;
+use dragfree_physics::mission::Mission;
+
+use crate::WorkflowError;
+use crate::sums::{ColumnSums, Request};
+
+/// Parameter of an effect whose candidate can be tried about one shape in fine steps.
+pub(crate) const FINE: &str = "fine";
+
+/// Parameter of an effect that acts once, at a time that the host finds.
+const AT_NS: &str = "at_ns";
+
+/// A product and its file.
+#[derive(Clone, Debug)]
+pub struct Archived {
+    /// The product.
+    pub product: Product,
+    /// Its file.
+    pub path: PathBuf,
+}
+
+/// Which data are replayed, and how.
+pub struct Replay<'a> {
+    /// Plugins.
+    pub registry: &'a Registry,
+    /// Products of one model.
+    pub products: &'a [Archived],
+    /// Threads; results do not depend on them.
+    pub threads: usize,
+    /// Most rows in one call of a plugin; results do not depend on it.
+    pub batch_rows: usize,
+}
+
+/// What a pass over the data is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pass {
+    /// Residuals of the model.
+    Residuals,
+    /// Matched filters for transients.
+    Transients,
+    /// Sums of all candidates.
+    Candidates,
+}
+
+/// What is summed.
+#[derive(Clone, Copy)]
+pub(crate) enum What<'a> {
+    /// The model alone.
+    Model,
+    /// Nothing but transients.
+    Transients,
+    /// Every candidate: transients at these times, and in fine steps about these shapes what can be tried so.
+    Candidates(&'a [Detection], &'a [RefinementRequest]),
+}
+
+impl What<'_> {
+    fn pass(self) -> Pass {
+        match self {
+            Self::Model => Pass::Residuals,
+            Self::Transients => Pass::Transients,
+            Self::Candidates(..) => Pass::Candidates,
+        }
+    }
+}
+
+/// Sums of the data of all products. `progress` is told the pass and the number of the product.
+pub(crate) fn sum(
+    replay: &Replay<'_>,
+    what: What<'_>,
+    progress: &mut dyn FnMut(Pass, usize, Progress),
+) -> Result<(Record, Mission), WorkflowError> {
+    let Replay { registry, products, threads, batch_rows } = *replay;
+    let mut whole: Option<(Record, Mission)> = None;
+    for (number, Archived { product, path }) in products.iter().enumerate() {
+        let sources = Sources::read(path)?;
+        let equations = path.with_extension("neq.json");
+        let mut all = candidates(registry, &model(&sources)?);
+        match what {
+            What::Model => all.clear(),
+            What::Transients => all.retain(|e| has_parameter(registry, &e.id, AT_NS)),
+            What::Candidates(_, requests) => {
+                for request in requests {
+                    let of = |e: &&mut dragfree_engine::config::EffectEntry| {
+                        (&e.id, &e.instance) == (&request.effect, &request.instance)
+                    };
+                    for entry in all.iter_mut().filter(of) {
+                        let value = |v| toml::Value::try_from(v).ok();
+                        let shape = request.shape.iter().filter_map(|(k, v)| Some((k.clone(), value(v)?)));
+                        entry.parameters = shape.collect();
+                        entry.parameters.insert(FINE.to_owned(), toml::Value::Integer(1));
+                    }
+                }
+            }
+        }
+        let request = Request {
+            only_transients: matches!(what, What::Transients),
+            detected: if let What::Candidates(detected, _) = what { Some(detected) } else { None },
+            reference: equations.is_file().then_some(equations.as_path()),
+            threads,
+        };
+        let examination = Examination { product, sources: &sources, candidates: all, threads, batch_rows };
+        let mut mission = None;
+        let (sums, not_tried) = examine(
+            registry,
+            &examination,
+            |chain, file| {
+                let read = mission.insert(Mission::from_json(&file.value.to_string())?);
+                ColumnSums::link(&request, chain, read)
+            },
+            &mut |p| progress(what.pass(), number, p),
+        )?;
+        let mut record = sums.record();
+        record.not_tried.extend(not_tried);
+        match (&mut whole, mission) {
+            (Some((sum, _)), _) => sum.add(&record)?,
+            (None, mission) => whole = mission.map(|mission| (record, mission)),
+        }
+    }
+    whole.ok_or(WorkflowError::NoProduct)
+}
+
+/// The mission's noise in the channels of a record.
+pub(crate) fn noise(record: &Record, mission: &Mission) -> Result<NoiseModel, WorkflowError> {
+    let measured = |d: &bool| if *d { Measured::Differenced } else { Measured::Directly };
+    let channels: Vec<(&str, Measured)> =
+        record.candidate_set.channels.iter().map(String::as_str).zip(record.differenced.iter().map(measured)).collect();
+    Ok(NoiseModel::new(mission, &channels, 1.0 / record.gathered.rate_hz)?)
+}

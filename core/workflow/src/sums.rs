@@ -1,0 +1,515 @@
+//! From the columns of a chain to sums: channels, the model's series, those of every candidate and housekeeping, cut into segments
+//! as rows come.
+
+use std::borrow::Cow;
+use std::collections::{BTreeMap, HashSet};
+use std::path::Path;
+
+use dragfree_engine::chain::{Chain, Sink};
+use dragfree_engine::examine::Wanted;
+use dragfree_estimation::colour;
+use dragfree_estimation::estimate::{Observed, Refinement, estimate_with};
+use dragfree_estimation::segments::{Segmenter, all_finite, longest_length};
+use dragfree_estimation::sigma::{BandNoise, Measured, NoiseModel};
+use dragfree_estimation::spectra::Plan;
+use dragfree_estimation::stored::Stored;
+use dragfree_identification::candidates::{CandidateSet, Coefficient as Unknown, Form, Rule, Term};
+use dragfree_identification::coherence::HousekeepingCoherence;
+use dragfree_identification::decimate::SLOW_HZ;
+use dragfree_identification::gram::{Columns, GramAccumulator, LONG};
+use dragfree_identification::record::Record;
+use dragfree_identification::transient::{Detection, Search, Template};
+use dragfree_identification::waveform::Waveform;
+use dragfree_physics::mission::Mission;
+use dragfree_sdk::{Available, Coefficient, Colour, Column, Constraint, Response, Shape, Variant};
+use nalgebra::DMatrix;
+
+use crate::WorkflowError;
+
+/// Length of a short segment, s.
+const SEGMENT_S: f64 = 1638.4;
+
+/// Rows at the start that wait for the first value of every candidate's series, s: housekeeping may come once a minute.
+const PATIENCE_S: f64 = 120.0;
+
+/// How often Σ is measured from the residuals of the reference.
+const REFINEMENTS: usize = 3;
+
+/// A candidate whose series lack more than this part of their rows is not tried.
+const MISSING: f64 = 0.01;
+
+/// The table of columns that no plugin makes: waveforms that begin at a detection.
+const WAVEFORMS: &str = "waveforms";
+
+/// What is summed.
+pub(crate) struct Request<'a> {
+    /// Only matched filters run; nothing of any candidate is summed.
+    pub(crate) only_transients: bool,
+    /// Transients that were detected before: candidates have waveforms that begin there, and no matched filter runs.
+    pub(crate) detected: Option<&'a [Detection]>,
+    /// Normal equations of the product: residuals for the matched filters and for the coherences.
+    pub(crate) reference: Option<&'a Path>,
+    /// Threads; results do not depend on them.
+    pub(crate) threads: usize,
+}
+
+/// Sums of the columns of a chain; takes their rows.
+pub(crate) struct ColumnSums {
+    names: Vec<String>,
+    candidate_set: CandidateSet,
+    differenced: Vec<bool>,
+    base: usize,
+    /// Waveforms that begin at known times, and where they stand among the columns.
+    waveforms: Vec<Waveform>,
+    waveforms_at: usize,
+    segmenter: Segmenter,
+    accumulator: GramAccumulator,
+    rate_hz: f64,
+    /// Last value of each column.
+    held: Vec<f64>,
+    /// Rows without a value, per column, after the first ones.
+    missing: Vec<u64>,
+    rows: u64,
+    waiting: bool,
+}
+
+impl Sink for ColumnSums {
+    fn tapped(&mut self, time_ns: &[i64], columns: &[&[f64]]) {
+        let begun: Vec<Vec<f64>> = self.waveforms.iter().map(|c| c.over(time_ns)).collect();
+        let mut columns = columns.to_vec();
+        columns.splice(self.waveforms_at..self.waveforms_at, begun.iter().map(Vec::as_slice));
+        self.push(time_ns, &columns);
+    }
+}
+
+fn name_of(channel: &Column) -> &str {
+    match channel.attribute("channel") {
+        "" => &channel.name,
+        name => name,
+    }
+}
+
+fn finite(x: f64) -> Option<f64> {
+    x.is_finite().then_some(x)
+}
+
+fn measured(channel: &Column) -> Measured {
+    if channel.attribute("average") == "1" { Measured::Directly } else { Measured::Differenced }
+}
+
+/// What the chain has, as a plugin behind the effects would see it.
+fn available(chain: &Chain) -> Available {
+    Available {
+        columns: chain.columns.clone(),
+        coefficients: chain.coefficients.clone(),
+        constraints: chain.constraints.clone(),
+        noise: chain.noise.clone(),
+    }
+}
+
+impl ColumnSums {
+    /// Chooses the columns of a linked chain that a request needs.
+    ///
+    /// # Errors
+    /// There is no channel, the mission does not know the noise of one, or the reference is of another model.
+    pub(crate) fn link(request: &Request<'_>, chain: &Chain, mission: &Mission) -> Result<Wanted<Self>, WorkflowError> {
+        let available = available(chain);
+        let channels: Vec<&Column> = available.of_kind("channel").collect();
+        let Some(rate_hz) = channels.first().map(|c| c.rate_hz) else {
+            return Err(WorkflowError::NoChannel);
+        };
+        let differenced: Vec<bool> = channels.iter().map(|c| c.attribute("average") == "2").collect();
+        let templates = templates(&available, &channels, &differenced);
+        let waveforms = waveforms(request.detected.unwrap_or_default(), &templates, rate_hz)?;
+        let sorted = Series::sort(&available, &channels, request.only_transients, &waveforms)?;
+        let housekeeping: Vec<&Column> =
+            available.columns.iter().filter(|c| c.table == "grid" && c.name.starts_with("hk.")).collect();
+        let of = |c: &&Column| (c.table.clone(), c.name.clone());
+        let series = sorted.keys.iter().filter(|(table, _)| table != WAVEFORMS).cloned();
+        let keys = channels.iter().map(of).chain(series).chain(housekeeping.iter().map(of));
+        let place = |(table, name): (String, String)| {
+            let at = available.columns.iter().position(|c| c.table == table && c.name == name);
+            at.ok_or(WorkflowError::NoColumn { table, name })
+        };
+        let wanted: Vec<usize> = keys.map(place).collect::<Result<_, _>>()?;
+        let names: Vec<String> =
+            channels.iter().map(|c| name_of(c).to_owned()).chain(sorted.keys.iter().map(|(_, n)| n.clone())).collect();
+        let length = longest_length((SEGMENT_S * rate_hz).round() as usize);
+        let plan = Plan::slow(LONG * length, length, rate_hz);
+        let all = Columns {
+            names: names.clone(),
+            channels: channels.len(),
+            base: channels.len() + sorted.base,
+            fast: channels.len() + sorted.fast,
+            energy: waveforms.iter().map(|c| c.energy(&plan, differenced.contains(&true))).collect(),
+        };
+        let candidate_set = candidate_set(&available, &channels, &sorted, &waveforms);
+        let residual = residual(request.reference, mission, &candidate_set, &channels, &all, length)?;
+        // As they are called in telemetry: `hk/battery_current_a`.
+        let topics: Vec<String> = housekeeping.iter().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
+        let whole: Vec<(&str, Measured)> = channels.iter().map(|c| (name_of(c), measured(c))).collect();
+        let noise = NoiseModel::new(mission, &whole, 1.0 / rate_hz)?;
+        let inverse = |hz: f64| {
+            let sigma = noise.psd(hz);
+            let nothing = DMatrix::zeros(sigma.nrows(), sigma.ncols());
+            sigma.cholesky().map_or(nothing, |c| c.inverse())
+        };
+        // Matched filters whiten with the mission's Σ: a Σ measured from these data has taken up the power of the transient.
+        let inverses =
+            plan.bands.iter().map(|b| (plan.bin_hz(b.end as f64 - 0.5), inverse(plan.frequency_hz(*b)))).collect();
+        let templates = if request.detected.is_some() { Vec::new() } else { templates };
+        let search = Search::new(templates, residual.clone(), inverses).on(request.threads);
+        let coherence = |plan: &Plan| {
+            let whitening = plan.bands.iter().map(|b| inverse(plan.frequency_hz(*b))).collect();
+            HousekeepingCoherence::new(topics, plan, residual, whitening)
+        };
+        let width = wanted.len() + waveforms.len();
+        let averaged: Vec<bool> =
+            (0..width).map(|i| (all.channels..names.len()).contains(&i) && differenced.iter().any(|d| *d)).collect();
+        let sums = Self {
+            held: vec![f64::NAN; width],
+            missing: vec![0; width],
+            rows: 0,
+            waiting: true,
+            segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged).of_first(all.fast),
+            base: all.base,
+            waveforms_at: all.fast - waveforms.len(),
+            waveforms,
+            accumulator: GramAccumulator::new(all, length, rate_hz, request.threads, coherence, search),
+            names,
+            candidate_set,
+            differenced,
+            rate_hz,
+        };
+        Ok((sums, wanted))
+    }
+
+    fn push(&mut self, time_ns: &[i64], columns: &[&[f64]]) {
+        let mut filled: Vec<Cow<'_, [f64]>> = Vec::with_capacity(columns.len() - self.base);
+        for (j, column) in columns.iter().enumerate().skip(self.base) {
+            if all_finite(column) {
+                self.held[j] = column.last().copied().unwrap_or(self.held[j]);
+                filled.push(Cow::Borrowed(column));
+                continue;
+            }
+            let mut held = self.held[j];
+            let mut missing = 0;
+            filled.push(
+                column
+                    .iter()
+                    .map(|x| {
+                        if x.is_finite() {
+                            held = *x;
+                        } else {
+                            missing += 1;
+                        }
+                        held
+                    })
+                    .collect(),
+            );
+            self.held[j] = held;
+            if !self.waiting {
+                self.missing[j] += missing;
+            }
+        }
+        let mut first = columns.first().map_or_else(Vec::new, |c| c.to_vec());
+        if self.waiting {
+            let patience = ((PATIENCE_S * self.rate_hz) as u64).saturating_sub(self.rows) as usize;
+            let lacks = |k: usize| filled.iter().any(|c| c[k].is_nan());
+            let wait = (0..time_ns.len()).take_while(|k| *k < patience && lacks(*k)).count();
+            first[..wait].fill(f64::NAN);
+            self.waiting = wait == time_ns.len();
+        }
+        // Whoever has no value by now has none at all, and stays at zero.
+        for column in filled.iter_mut().filter(|c| c.iter().any(|x| x.is_nan())) {
+            column.to_mut().iter_mut().filter(|x| x.is_nan()).for_each(|x| *x = 0.0);
+        }
+        self.rows += time_ns.len() as u64;
+        let all: Vec<&[f64]> = std::iter::once(first.as_slice())
+            .chain(columns[1..self.base].iter().copied())
+            .chain(filled.iter().map(AsRef::as_ref))
+            .collect();
+        self.segmenter.cut(time_ns, &all, &mut self.accumulator);
+    }
+
+    /// The sums; candidates whose series have gaps are left out, with the reason.
+    pub(crate) fn record(mut self) -> Record {
+        self.segmenter.cut_end(&mut self.accumulator);
+        let mut candidate_set = self.candidate_set;
+        let mut not_tried = Vec::new();
+        let gappy = |column: usize| {
+            self.missing[column] as f64 > MISSING * self.rows.max(1) as f64 || self.held[column].is_nan()
+        };
+        let model = candidate_set.model();
+        let mut fewer: BTreeMap<usize, usize> = BTreeMap::new();
+        for c in &mut candidate_set.coefficients[model..] {
+            let before = c.forms.len();
+            let mut culprit = None;
+            c.forms.retain(|f| {
+                let bad = f.terms.iter().find(|t| t.column >= self.base && gappy(t.column));
+                culprit = bad.map(|t| t.column).or(culprit);
+                bad.is_none()
+            });
+            if let (false, Some(column)) = (c.forms.is_empty(), culprit) {
+                *fewer.entry(column).or_default() += before - c.forms.len();
+            }
+            if let (true, Some(column)) = (before > 0 && c.forms.is_empty(), culprit) {
+                not_tried.push((
+                    format!("{}:{}", c.effect, c.instance),
+                    format!(
+                        "{} has no value in {} of {} epochs: what it is made of has gaps",
+                        self.names[column], self.missing[column], self.rows
+                    ),
+                ));
+            }
+        }
+        not_tried.extend(fewer.into_iter().map(|(column, forms)| {
+            let (missing, rows) = (self.missing[column], self.rows);
+            let reason =
+                format!("it has no value in {missing} of {rows} epochs, so {forms} forms of effects are left out");
+            (self.names[column].clone(), reason)
+        }));
+        Record { candidate_set, differenced: self.differenced, gathered: self.accumulator.finish(), not_tried }
+    }
+}
+
+/// Residuals as combinations of the base columns, at the coefficients that the product's own sums give where there are some.
+fn residual(
+    reference: Option<&Path>,
+    mission: &Mission,
+    candidate_set: &CandidateSet,
+    channels: &[&Column],
+    columns: &Columns,
+    length: usize,
+) -> Result<DMatrix<f64>, WorkflowError> {
+    let n = channels.len();
+    let mut theta: Vec<f64> = candidate_set.coefficients.iter().map(|c| c.initial).collect();
+    if let Some(path) = reference {
+        let refuse = |what: String| WorkflowError::Reference { path: path.to_owned(), what };
+        let text = std::fs::read_to_string(path).map_err(|e| refuse(e.to_string()))?;
+        let mut value: serde_json::Value = serde_json::from_str(&text).map_err(|e| refuse(e.to_string()))?;
+        let stored: Stored = serde_json::from_value(value["sums"].take()).map_err(|e| refuse(e.to_string()))?;
+        let (layout, plan, sums) = Stored::stack(&[stored]).map_err(|e| refuse(e.to_string()))?;
+        let model = candidate_set.model();
+        let same = layout.coefficients.iter().eq(candidate_set.coefficients[..model].iter().map(|c| &c.name));
+        if !same || plan.length != length {
+            return Err(refuse("belongs to another model, or to segments of another length".to_owned()));
+        }
+        if sums.total.segments > 0 {
+            let of = |name: &String| channels.iter().find(|c| name_of(c) == name);
+            let seen: Vec<(&str, Measured)> =
+                layout.channels.iter().filter_map(of).map(|c| (name_of(c), measured(c))).collect();
+            let noise = NoiseModel::new(mission, &seen, 1.0 / plan.rate_hz)?;
+            let observed = Observed { layout: &layout, plan: &plan, sums: &sums, prediction: None };
+            let (unknowns, bounds) = (candidate_set.unknowns(&[]), candidate_set.bounds());
+            let noise = BandNoise::new(&noise, &plan);
+            let solved = estimate_with(&observed, &noise, &unknowns, &bounds, REFINEMENTS, Refinement::Levels)?;
+            theta.iter_mut().zip(solved.theta.iter()).for_each(|(t, s)| *t = *s);
+        }
+    }
+    let mut residual = DMatrix::identity(n, columns.base);
+    for (i, c) in candidate_set.coefficients[..candidate_set.model()].iter().enumerate() {
+        for t in &c.forms[0].terms {
+            residual[(t.channel, t.column)] -= theta[i] * t.factor * t.times.map_or(1.0, |other| theta[other]);
+        }
+    }
+    Ok(residual)
+}
+
+/// Waveforms that begin where transients were detected.
+fn waveforms(detected: &[Detection], templates: &[Template], rate_hz: f64) -> Result<Vec<Waveform>, WorkflowError> {
+    let waveform = |detection: &Detection| {
+        let of = |t: &&Template| {
+            (&t.effect, &t.instance, &t.coefficient) == (&detection.effect, &detection.instance, &detection.coefficient)
+        };
+        let own = |t: &&Template| t.shape.iter().all(|(key, value)| detection.shape.get(key) == Some(value));
+        let template = templates.iter().find(|t| of(t) && own(t)).ok_or_else(|| WorkflowError::NoTemplate {
+            effect: format!("{}:{}", detection.effect, detection.instance),
+            at_ns: detection.at_ns,
+        })?;
+        let step_ns = (1e9 / rate_hz).round() as i64;
+        Ok(Waveform { at_ns: detection.at_ns, step_ns, kernel: template.kernel.clone() })
+    };
+    detected.iter().map(waveform).collect()
+}
+
+/// The series behind the channels, sorted as the sums want them.
+struct Series {
+    /// Table and name: of the model, of candidates, slow ones of candidates.
+    keys: Vec<(String, String)>,
+    base: usize,
+    fast: usize,
+    /// How each coefficient acts, by its name, where it is not by variants.
+    responses: BTreeMap<String, Vec<Response>>,
+}
+
+impl Series {
+    fn sort(
+        available: &Available,
+        channels: &[&Column],
+        only_model: bool,
+        waveforms: &[Waveform],
+    ) -> Result<Self, WorkflowError> {
+        let mut responses: BTreeMap<String, Vec<Response>> = BTreeMap::new();
+        let declared = available.responses().map_err(|e| WorkflowError::Declaration(e.message().to_owned()))?;
+        for (c, r) in declared {
+            responses.entry(c.name.clone()).or_default().push(r);
+        }
+        let exists = |r: &&Response| channels.iter().any(|c| name_of(c) == r.channel);
+        let slow = |r: &Response| {
+            let column = available.column(&r.table, &r.series);
+            column.is_some_and(|c| c.attribute("below_hz").parse::<f64>().is_ok_and(|hz| hz <= SLOW_HZ))
+        };
+        let mut keys: Vec<(String, String)> = Vec::new();
+        let mut seen = HashSet::new();
+        let mut counts = [0; 2];
+        for part in 0..3 {
+            for c in available.coefficients.iter().filter(|c| !(c.candidate && only_model)) {
+                let own = responses.get(&c.name).into_iter().flatten();
+                for r in own.chain(c.variants.iter().flat_map(|v| &v.responses)).filter(exists) {
+                    let wanted = match part {
+                        0 => !c.candidate,
+                        1 => c.candidate && !slow(r),
+                        _ => c.candidate,
+                    };
+                    let key = (r.table.clone(), r.series.clone());
+                    if wanted && seen.insert(key.clone()) {
+                        keys.push(key);
+                    }
+                }
+            }
+            if part == 1 {
+                keys.extend((0..waveforms.len()).map(|k| (WAVEFORMS.to_owned(), format!("waveform {k}"))));
+            }
+            if part < 2 {
+                counts[part] = keys.len();
+            }
+        }
+        Ok(Self { keys, base: counts[0], fast: counts[1], responses })
+    }
+}
+
+fn candidate_set(available: &Available, channels: &[&Column], series: &Series, waveforms: &[Waveform]) -> CandidateSet {
+    let column: BTreeMap<(&str, &str), usize> =
+        series.keys.iter().enumerate().map(|(i, (t, n))| ((t.as_str(), n.as_str()), channels.len() + i)).collect();
+    let coefficient = |name: &String| available.coefficients.iter().position(|c| !c.candidate && c.name == *name);
+    let terms = |responses: &[Response]| -> Vec<Term> {
+        let term = |r: &Response| {
+            let times = match &r.times {
+                Some(other) => Some(coefficient(other)?),
+                None => None,
+            };
+            Some(Term {
+                channel: channels.iter().position(|c| name_of(c) == r.channel)?,
+                column: *column.get(&(r.table.as_str(), r.series.as_str()))?,
+                factor: r.factor,
+                times,
+            })
+        };
+        // What acts through a coefficient that the model lacks does not act.
+        responses.iter().filter_map(term).collect()
+    };
+    let unknown = |c: &Coefficient| {
+        let colour = |c: &Colour| colour::Colour {
+            process: c.process.clone(),
+            numerator: c.numerator.clone(),
+            denominator: c.denominator.clone(),
+        };
+        let form = |shape: &Shape, responses: &[Response], unit: Option<&String>, range: Option<[f64; 2]>| Form {
+            colours: None,
+            shape: shape.iter().map(|(k, v)| (k.clone(), v.clone())).collect(),
+            unit: unit.unwrap_or(&c.unit).clone(),
+            lower: finite(range.map_or(c.lower, |r| r[0])),
+            upper: finite(range.map_or(c.upper, |r| r[1])),
+            terms: terms(responses),
+        };
+        let forms = if !c.variants.is_empty() {
+            let form = |v: &Variant| Form {
+                colours: v.colours.as_ref().map(colour),
+                ..form(&v.shape, &v.responses, v.unit.as_ref(), v.range)
+            };
+            c.variants.iter().map(form).collect()
+        } else {
+            match series.responses.get(&c.name) {
+                Some(responses) => {
+                    let colours = c.colours.as_ref().map(colour);
+                    vec![Form { colours, ..form(&c.shape, responses, None, None) }]
+                }
+                None if c.candidate => Vec::new(),
+                None => vec![form(&c.shape, &[], None, None)],
+            }
+        };
+        Unknown {
+            name: c.name.clone(),
+            effect: c.effect.clone(),
+            instance: c.instance.clone(),
+            initial: c.initial,
+            prior_sigma: finite(c.prior_sigma),
+            estimate: c.estimate,
+            candidate: c.candidate,
+            transient: false,
+            forms,
+            noise: c.noise.clone(),
+        }
+    };
+    // Whatever has the waveform of something that was found may have been the cause.
+    let transient = |c: &Coefficient| {
+        let at = |(k, waveform): (usize, &Waveform)| {
+            let transient = c.transients.iter().find(|t| t.kernel == waveform.kernel)?;
+            let mut shape: serde_json::Map<_, _> = transient.shape.clone().into_iter().collect();
+            shape.insert("at_ns".to_owned(), waveform.at_ns.into());
+            let column = *column.get(&(WAVEFORMS, format!("waveform {k}").as_str()))?;
+            let term = |(name, factor): &(String, f64)| {
+                let channel = channels.iter().position(|c| name_of(c) == name)?;
+                Some(Term { channel, column, factor: *factor, times: None })
+            };
+            let terms = transient.channels.iter().filter_map(term).collect();
+            let (lower, upper) = (finite(c.lower), finite(c.upper));
+            Some(Form { shape, unit: c.unit.clone(), lower, upper, terms, colours: None })
+        };
+        let forms: Vec<Form> = waveforms.iter().enumerate().filter_map(at).collect();
+        (!forms.is_empty()).then(|| Unknown { transient: true, noise: String::new(), forms, ..unknown(c) })
+    };
+    let rule = |r: &Constraint| Rule {
+        name: r.name.clone(),
+        survey: r.kind == "survey",
+        terms: r.terms.iter().filter_map(|(name, weight)| Some((coefficient(name)?, *weight))).collect(),
+        lower: finite(r.lower),
+        upper: finite(r.upper),
+    };
+    CandidateSet {
+        channels: channels.iter().map(|c| name_of(c).to_owned()).collect(),
+        coefficients: available
+            .coefficients
+            .iter()
+            .map(unknown)
+            .chain(available.coefficients.iter().filter_map(transient))
+            .collect(),
+        rules: available.constraints.iter().map(rule).collect(),
+    }
+}
+
+fn templates(available: &Available, channels: &[&Column], differenced: &[bool]) -> Vec<Template> {
+    let mut out = Vec::new();
+    for c in available.coefficients.iter().filter(|c| c.candidate) {
+        for t in &c.transients {
+            let at = |(name, factor): &(String, f64)| {
+                let channel = channels.iter().position(|c| name_of(c) == name)?;
+                Some((channel, *factor, differenced[channel]))
+            };
+            let channels: Vec<(usize, f64, bool)> = t.channels.iter().filter_map(at).collect();
+            if !channels.is_empty() && !t.kernel.is_empty() {
+                out.push(Template {
+                    effect: c.effect.clone(),
+                    instance: c.instance.clone(),
+                    coefficient: c.name.clone(),
+                    unit: c.unit.clone(),
+                    shape: t.shape.iter().map(|(k, v)| (k.clone(), v.clone())).collect(),
+                    kernel: t.kernel.clone(),
+                    channels,
+                });
+            }
+        }
+    }
+    out
+}
