@@ -1,4 +1,4 @@
-//! What is asked: the model, and the forms of everything that is not in it.
+//! The model, and the forms of every candidate.
 
 use dragfree_estimation::colour::Colour;
 use dragfree_estimation::estimate::{Bound, Unknown};
@@ -6,7 +6,7 @@ use dragfree_estimation::spectra::{Layout, Regressor};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-/// A channel's answer to a coefficient.
+/// A channel's response to a coefficient.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Term {
     /// Index of the channel.
@@ -30,9 +30,9 @@ pub struct Form {
     pub lower: Option<f64>,
     /// Upper end of its physical range, none for ∞.
     pub upper: Option<f64>,
-    /// How it acts.
+    /// Responses of the channels.
     pub terms: Vec<Term>,
-    /// A noise that it colours.
+    /// A noise process that it filters.
     #[serde(default)]
     pub colours: Option<Colour>,
 }
@@ -52,14 +52,14 @@ pub struct Coefficient {
     pub prior_sigma: Option<f64>,
     /// Whether the model estimates it.
     pub estimate: bool,
-    /// Whether it is no part of the model.
+    /// Whether it is a candidate, no part of the model.
     pub candidate: bool,
-    /// Whether its forms are waveforms at times at which something was found to happen.
+    /// Whether its forms are waveforms at the times of detected transients.
     #[serde(default)]
     pub transient: bool,
     /// Its forms; one for a coefficient of the model.
     pub forms: Vec<Form>,
-    /// A process of the mission's noise that it multiplies.
+    /// A noise process whose level it multiplies.
     pub noise: String,
 }
 
@@ -89,14 +89,14 @@ pub struct CandidateSet {
     pub rules: Vec<Rule>,
 }
 
-/// An effect at a place, in one form: what can be added to a model.
+/// An instance of an effect in one form, which can be added to a model.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Candidate {
     /// Effect.
     pub effect: String,
     /// Instance.
     pub instance: String,
-    /// Whether it is a waveform at a time at which something was found to happen.
+    /// Whether it is a waveform at the time of a detected transient.
     pub transient: bool,
     /// Indices of its coefficients, with the form of each.
     pub parts: Vec<(usize, Form)>,
@@ -109,8 +109,8 @@ impl CandidateSet {
         self.coefficients.iter().take_while(|c| !c.candidate).count()
     }
 
-    /// Every instance of every effect that is not in the model, with the indices of its coefficients; noise apart, and what happens
-    /// once apart from what lasts.
+    /// Every instance of every effect that is not in the model, as the indices of its coefficients: without noise
+    /// levels, and transients apart from lasting causes.
     #[must_use]
     pub fn places(&self) -> Vec<Vec<usize>> {
         let mut places: Vec<Vec<usize>> = Vec::new();

@@ -1,16 +1,15 @@
-//! Housekeeping as witness: which channel of the telemetry is coherent with what nobody explains.
+//! Coherence of housekeeping with the residuals.
 //!
-//! For each housekeeping value, its derivative, its square and the products of two, the complex cross-spectrum with `Σ⁻¹ r` of the
-//! residuals r, each at unit power, which is what is left of each channel when all others are known (what acts on one test mass is
-//! seen there, far below the thrusters' noise, which moves all of them and which their own currents follow), is summed over long
-//! segments, in wide bands below [`crate::decimate::SLOW_HZ`]. A lag between cause and force turns the phase and leaves the coherence.
-//! For n complex observations without relation `−2(n−1) log(1 − |γ|²)` is χ² with two degrees of freedom, whatever the driver
-//! (Goodman 1957).
+//! Drivers are each housekeeping value, its derivative, its square and the products of two. Their cross-spectra with
+//! `Σ⁻¹ r` of the residuals r are summed over long segments, in wide bands below [`crate::decimate::SLOW_HZ`]. `Σ⁻¹ r`,
+//! at unit power, is what is left of a channel given all others: a force on one test mass shows there far below the
+//! thrusters' noise, which moves all channels. A lag between cause and force turns the phase and leaves the coherence.
+//! For n complex observations without relation `−2(n−1) log(1 − |γ|²)` is χ² with two degrees of freedom, whatever the
+//! driver (Goodman 1957).
 //!
-//! Channels of housekeeping go with one another, and one that drives a residual makes all of its kin light up. So
-//! [`HousekeepingCoherence::together`] asks again, one after the other: what goes with the residual beside those that were named already, by the
-//! partial coherence (Bendat and Piersol, Random Data, 4th ed., §7.3), until chance says as much. What all of them explain is their
-//! multiple coherence.
+//! Housekeeping channels are coherent with one another, so one cause raises many coherences.
+//! [`HousekeepingCoherence::stepwise_coherence`] selects drivers by their partial coherence given those selected before
+//! (Bendat and Piersol, Random Data, 4th ed., §7.3); what all of them explain is their multiple coherence.
 
 use std::ops::Range;
 
@@ -24,14 +23,14 @@ use crate::distributions::{corrected, ln_chi2_above};
 /// Ratio of the ends of a band.
 const RATIO: f64 = 1.6;
 
-/// With more channels of housekeeping than this their products are too many to try.
+/// Products of two are drivers if there are no more housekeeping channels than this.
 const MOST_FOR_PRODUCTS: usize = 100;
 
-/// Independent observations per bin of a segment under a Hann window, alone and beside the one before it that it overlaps by half:
-/// neighbouring bins tell much the same.
+/// Independent observations per bin of a segment under a Hann window: of a segment alone, and of one that overlaps the
+/// one before it by half. Neighbouring bins are correlated.
 const WORTH: [f64; 2] = [0.514, 0.48];
 
-/// What may drive a force.
+/// A function of housekeeping that may drive a force.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Driver {
     /// A value.
@@ -57,35 +56,35 @@ pub struct Coherence {
     pub statistic: f64,
     /// Its degrees of freedom.
     pub dof: f64,
-    /// How often chance had its say: drivers of one channel of housekeeping and products of two have half each, however many there are
-    /// of them.
+    /// Trials for the correction of the p-value: drivers of one housekeeping channel and products of two have half of
+    /// the false-alarm rate each, however many there are of them.
     pub trials: f64,
-    /// Part of the residual's power that is coherent, in the band that says most of it; among few observations a larger part is chance.
+    /// Part of the residual's power that is coherent, less its mean without any relation, in the band with the largest
+    /// statistic.
     pub explained: f64,
     /// That band, Hz.
     pub band_hz: [f64; 2],
 }
 
-/// Drivers that go with a channel's residual, each beside those before it.
+/// Drivers that are coherent with a channel's residual, each given those before it.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct StepwiseCoherence {
     /// Channel.
     pub channel: String,
     /// The drivers in words.
     pub drivers: Vec<String>,
-    /// Of each the chance of as much beside those before it, corrected for all drivers of all channels.
+    /// p-value of each given those before it, corrected for all drivers of all channels.
     pub p_values: Vec<f64>,
-    /// Part of the residual's power that is coherent with all of them, in the band where that is largest: their multiple coherence, less
-    /// what chance gives.
+    /// Their multiple coherence in the band where it is largest, less its mean without any relation.
     pub explained: f64,
     /// That band, Hz.
     pub band_hz: [f64; 2],
 }
 
-/// More drivers than these are not named together.
+/// Most drivers that are selected for one channel.
 const MAX_STEPS: usize = 5;
 
-/// A driver of which the others leave less than this has nothing of its own.
+/// A driver is collinear with the selected ones if they leave less than this part of its power.
 const OWN: f64 = 1e-6;
 
 /// The sums.
@@ -108,16 +107,16 @@ pub struct HousekeepingCoherence {
     pub(crate) power: DMatrix<f64>,
     /// Per driver, a column per band and channel: real and imaginary parts of the cross-spectrum.
     pub(crate) cross: [DMatrix<f64>; 2],
-    /// Per band the cross-spectra of the drivers that are no products, real and imaginary parts, lower triangles; none where there are too
-    /// many.
+    /// Per band the cross-spectra of the drivers that are no products, real and imaginary parts, lower triangles; none
+    /// where there are too many.
     pub(crate) among: Vec<[DMatrix<f64>; 2]>,
     /// Per band: complex observations.
     pub(crate) observations: Vec<f64>,
 }
 
 impl HousekeepingCoherence {
-    /// For housekeeping of these names, segments of a plan, residuals made by `residual` (channels × base columns) and `Σ⁻¹` per band of the
-    /// plan.
+    /// For housekeeping of these names, segments of a plan, residuals made by `residual` (channels × base columns) and
+    /// `Σ⁻¹` per band of the plan.
     #[must_use]
     pub fn new(names: Vec<String>, plan: &Plan, residual: DMatrix<f64>, whitening: Vec<DMatrix<f64>>) -> Self {
         let n = names.len();
@@ -249,8 +248,8 @@ impl HousekeepingCoherence {
         }
     }
 
-    /// What goes with each channel's residual, one driver beside the other; only channels with any, and no products. `alarm` is the chance
-    /// that any is named of all.
+    /// Forward selection of drivers, without products, for each channel's residual; only channels with any. `alarm` is
+    /// the false-alarm rate over all channels.
     #[must_use]
     pub fn stepwise_coherence(&self, channels: &[String], alarm: f64) -> Vec<StepwiseCoherence> {
         (0..channels.len()).filter_map(|c| self.stepwise_coherence_of(channels, c, alarm)).collect()
@@ -258,7 +257,8 @@ impl HousekeepingCoherence {
 
     fn stepwise_coherence_of(&self, channels: &[String], c: usize, alarm: f64) -> Option<StepwiseCoherence> {
         let singles = self.among.first().map_or(0, |a| a[0].nrows());
-        // Per band the Hermitian matrix of the drivers and, last, the residual, from which each driver named is swept.
+        // Per band the Hermitian matrix of the drivers and, last, the residual, from which each selected driver is
+        // swept.
         let mut bands: Vec<DMatrix<Complex<f64>>> = (0..self.bands.len())
             .map(|b| {
                 let column = b * channels.len() + c;
@@ -321,7 +321,7 @@ impl HousekeepingCoherence {
         })
     }
 
-    /// How coherent each driver is with the residual of each channel, the first what chance gives most rarely.
+    /// Coherence of each driver with the residual of each channel, the most significant first.
     #[must_use]
     pub fn coherences(&self, channels: &[String]) -> Vec<Coherence> {
         let mut all = Vec::new();
@@ -339,7 +339,7 @@ impl HousekeepingCoherence {
                     }
                     let column = b * channels.len() + c;
                     let squared = (self.cross[0][(d, column)].powi(2) + self.cross[1][(d, column)].powi(2)) / power;
-                    // Without any relation |γ|² is above x with a chance of (1 − x)^(n−1), and 1/n in the mean.
+                    // Without any relation P(|γ|² > x) = (1 − x)^(n−1), and the mean of |γ|² is 1/n.
                     let said = -2.0 * (n - 1.0) * (-squared.min(1.0 - 1e-12)).ln_1p();
                     statistic += said;
                     dof += 2.0;
@@ -358,7 +358,8 @@ impl HousekeepingCoherence {
                 }
             }
         }
-        // Among many products with a channel that hardly moves, one follows what its factor explains a little better by chance.
+        // Corrected for the number of trials: a product with a nearly constant channel is its other factor, slightly
+        // better by chance.
         let worth = |c: &Coherence| c.statistic - 2.0 * c.trials.ln();
         all.sort_by(|a, b| worth(b).total_cmp(&worth(a)));
         all
@@ -409,8 +410,8 @@ mod tests {
     /// As many as are tried together.
     const NAMES: usize = 50;
 
-    /// Three segments that overlap, of white channels and housekeeping as `change` leaves them; housekeeping 0 is a flag that is up in the
-    /// last quarter alone.
+    /// Three segments that overlap, of white channels and housekeeping as `change` leaves them; housekeeping 0 is a
+    /// flag that is up in the last quarter alone.
     fn segments(seed: u64, change: impl Fn(&mut [Vec<f64>], &mut [Vec<f64>])) -> (HousekeepingCoherence, Vec<String>) {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         let plan = Plan::new(1024, 1.0);
@@ -445,11 +446,10 @@ mod tests {
         coherence.coherences(&names)
     }
 
-    /// Of housekeeping that has nothing to do with any channel, one coherence in a hundred is as large as chance makes one in a
-    /// hundred, and one in ten thousand so; values and derivatives of one channel are told apart poorly, so that the spread is that of a
-    /// third of them. False alarm 1e-5 each.
+    /// p-values of independent housekeeping are uniform. Values and derivatives of one channel are correlated, so that
+    /// the spread is that of a third of them. False alarm 1e-5 each.
     #[test]
-    fn nothing_is_coherent_more_often_than_by_chance() {
+    fn p_values_of_independent_housekeeping_are_uniform() {
         let chances: Vec<f64> = coherences(1, 0.0).iter().map(|w| chi2_tails(w.statistic / w.dof, w.dof).1).collect();
         let n = chances.len() as f64;
         for p in [1e-1, 1e-2, 1e-4] {
@@ -459,10 +459,11 @@ mod tests {
         }
     }
 
-    /// Two drivers, each with twice the amplitude of the noise, and a noisy copy of the first: all three go with the channel, with 4/9, 4/9
-    /// and 2/9 of its power, and two of them explain 8/9 of it, to which the third adds nothing.
+    /// Two drivers, each with twice the amplitude of the noise, and a noisy copy of the first. All three are coherent
+    /// with the channel, with 4/9, 4/9 and 2/9 of its power. Two of them explain 8/9 of it, to which the third adds
+    /// nothing.
     #[test]
-    fn a_copy_of_a_driver_is_not_named_beside_it() {
+    fn a_copy_of_a_driver_is_not_selected_beside_it() {
         let together = |parts: &[(usize, f64)]| {
             let (coherence, names) = segments(7, |channels, housekeeping| {
                 for (driver, part) in parts {
@@ -475,7 +476,7 @@ mod tests {
             (coherence.coherences(&names), coherence.stepwise_coherence(&names, 1e-3))
         };
         let (pairs, found) = together(&[(1, 2.0), (2, 2.0)]);
-        // In narrow bands a derivative is as coherent as what it is the derivative of.
+        // In narrow bands a derivative is as coherent as its value.
         let lights_up = |name: &str| pairs.iter().take(6).any(|w| w.of == [name] && w.channel == "channel 0");
         assert!(["hk/1", "hk/2", "hk/3"].into_iter().all(lights_up), "{:?}", &pairs[..6]);
         assert_eq!(found.len(), 1, "{found:?}");
@@ -484,7 +485,7 @@ mod tests {
         assert_eq!((found[0].channel.as_str(), &drivers[..]), ("channel 0", &["hk/1", "hk/2"][..]));
         // The largest of the bands, of 20 observations and more each: (1 − γ²)√(2/n)γ = 0.03, of which four σ.
         assert!((found[0].explained - 8.0 / 9.0).abs() < 0.13, "{found:?}");
-        // Nothing goes with nothing; the chance of this test is 1e-3.
+        // Without drivers none is selected, with a false alarm of 1e-3.
         assert_eq!(together(&[]).1, []);
     }
 

@@ -1,19 +1,21 @@
-//! Where the model fails: what it leaves of each channel, band and hour against what the noise of the mission predicts.
+//! Where the model fails: residual power per channel, band and hour against the prediction of the mission's noise.
 //!
-//! The model is fitted as [`crate::diagnosis`] fits it, and its residuals are held against Σ as the mission file has it: a Σ that was
-//! refined from the residuals explains everything by construction. `R_b`, measured over predicted power of a band, has the mean 1 and
-//! n complex observations, `2n R_b` being χ² with 2n degrees of freedom. n follows from the weights of the tapered, overlapping
-//! segments ([`dragfree_estimation::spectra::Spectra::observations`]); what the model's few coefficients take of it is not counted.
+//! The model is fitted as [`crate::diagnosis`] fits it, and its residuals are compared with Σ of the mission file: a Σ
+//! refined from the residuals would explain them by construction. `R_b`, measured over predicted power of a band, has
+//! the mean 1 and n complex observations, `2n R_b` being χ² with 2n degrees of freedom. n follows from the weights of
+//! the tapered, overlapping segments ([`dragfree_estimation::spectra::Spectra::observations`]); what the model's few
+//! coefficients take of it is not counted.
 //!
-//! Every channel is tested by five questions, each at [`FALSE_ALARM`] over the number of all tests (Bonferroni):
+//! Every channel has five tests, each at [`FALSE_ALARM`] over the number of all tests (Bonferroni):
 //! `level`, `bands`, `hours`, `cumulative` and `ljung-box`; see [`Test`].
 //!
-//! **Null combinations.** A force on the spacecraft moves it under every test mass: with a the spacecraft's acceleration, the channels
-//! of mass i hold `A_i a`, whose columns are those of the processes `thruster_force` of Σ. From each mass alone a is `A_i⁺ z_i`, so that
-//! `A_1⁺ z_1 − A_2⁺ z_2` is free of it: a null space of the thrusters of three dimensions, and its axes are those of the spacecraft; their mean is the
-//! acceleration *common* to both.
-//! No thrust, commanded or not, no solar pressure and no wrong gain of a thruster reaches these. What does act on one mass alone, or on
-//! its readout. So a model that fails in the channels and not in the null combinations has its fault in the forces on the spacecraft.
+//! **Null combinations.** A force on the spacecraft moves it under every test mass: with a the spacecraft's
+//! acceleration, the channels of mass i hold `A_i a`, whose columns are those of the processes `thruster_force` of Σ.
+//! From each mass alone a is `A_i⁺ z_i`, so that `A_1⁺ z_1 − A_2⁺ z_2` is free of it: a null space of the thrusters of
+//! three dimensions, and its axes are those of the spacecraft; their mean is the acceleration *common* to both. No
+//! thrust, commanded or not, no solar pressure and no wrong gain of a thruster reaches these. What does act on one mass
+//! alone, or on its readout. So a model that fails in the channels and not in the null combinations has its fault in
+//! the forces on the spacecraft.
 
 use std::collections::BTreeMap;
 use std::f64::consts::PI;
@@ -31,19 +33,20 @@ use crate::coherence::{Coherence, StepwiseCoherence};
 use crate::distributions::{chi2_per_dof_quantile, chi2_tails, corrected, kolmogorov, two_sided};
 use crate::scores::CandidateScorer;
 
-/// Chance that anything fails where the model and the mission's noise are right; all tests of all channels together.
+/// False-alarm rate of all tests of all channels together.
 pub const FALSE_ALARM: f64 = 0.01;
 
-/// Independent segments of full length below which nothing is said.
+/// Independent segments of full length below which there is no comparison.
 const LEAST_SEGMENTS: f64 = 4.0;
 
-/// Lags of the portmanteau test. Bands are 1/16 of their frequency wide, so a longer lag turns round within one.
+/// Lags of the portmanteau test. Bands are 1/16 of their frequency wide: the cosine of a longer lag turns round within
+/// one.
 const LAGS: usize = 10;
 
-/// Chances outside the intervals of spectra, on both sides together.
+/// Probability outside the intervals of spectra, on both sides together.
 const OUTSIDE: f64 = 0.05;
 
-/// Coherences that are told.
+/// Most coherences in the result.
 const MOST_COHERENCES: usize = 40;
 
 /// A power of a band against its prediction.
@@ -51,7 +54,7 @@ const MOST_COHERENCES: usize = 40;
 pub struct Cell {
     /// First and last frequency, Hz.
     pub band_hz: [f64; 2],
-    /// Measured over predicted power; nothing where no segment reaches.
+    /// Measured over predicted power; none where no segment reaches.
     pub chi2_per_dof: Option<f64>,
     /// Degrees of freedom.
     pub dof: f64,
@@ -61,21 +64,24 @@ pub struct Cell {
 #[derive(Clone, Debug, Serialize)]
 pub struct Test {
     /// * `level`: χ²/dof over all bands.
-    /// * `bands`: χ²/dof of the band that is farthest from 1: narrow ones (1/16), thirds of a decade, and everything below the end of
+    /// * `bands`: χ²/dof of the band that is farthest from 1: narrow ones (1/16), thirds of a decade, and everything
+    ///   below the end of
     ///   each third.
     /// * `hours`: the same of single hours, in thirds of a decade.
-    /// * `cumulative`: the cumulative periodogram of the whitened residual, its largest distance from a straight line times √n
+    /// * `cumulative`: the cumulative periodogram of the whitened residual, its largest distance from a straight line
+    ///   times √n
     ///   (Bartlett 1955); it does not ask for the level.
-    /// * `ljung-box`: autocorrelations of the whitened residual at ten lags, taken from its spectrum: `r_k = ∫ R cos 2πfkΔt df / ∫ R df`,
+    /// * `ljung-box`: autocorrelations of the whitened residual at ten lags, taken from its spectrum: `r_k = ∫ R cos
+    ///   2πfkΔt df / ∫ R df`,
     ///   and `Q = rᵀ C⁻¹ r` with the covariance C that bands of that width give. With bands of one bin it is Ljung and Box's n Σ r_k².
     pub name: &'static str,
     /// What is compared.
     pub statistic: f64,
-    /// Chance of as much, corrected for what was looked at within the test.
+    /// p-value, corrected for the cells within the test.
     pub p_value: f64,
-    /// Whether `p_value` is above what is allowed to this test.
+    /// Whether `p_value` is above the rate of this test.
     pub passes: bool,
-    /// Where it was found.
+    /// The cell that is farthest out.
     pub at: Option<Place>,
 }
 
@@ -96,7 +102,7 @@ pub enum Kind {
     Channel,
     /// The acceleration that all test masses see, along an axis of the spacecraft.
     Common,
-    /// The difference of what two test masses see, which no force on the spacecraft reaches.
+    /// The difference between two test masses, which no force on the spacecraft reaches.
     Null,
 }
 
@@ -121,10 +127,11 @@ pub struct Channel {
     pub chi2_per_dof: f64,
     /// Degrees of freedom.
     pub dof: f64,
-    /// The same against the mission's noise with the levels that fit the residuals best: about 1 where a level is all that is wrong.
+    /// The same against the mission's noise with the levels that fit the residuals best: about 1 where a level is all
+    /// that is wrong.
     pub chi2_per_dof_fitted_levels: f64,
-    /// Share of the whitened power beyond prediction, every third of a decade weighing alike, and only where the excess is certain:
-    /// `Σ (R−1) / Σ R`.
+    /// Share of the whitened power beyond prediction, every third of a decade weighing alike, and only where the excess
+    /// is certain: `Σ (R−1) / Σ R`.
     pub unexplained: f64,
     /// Thirds of a decade, all hours together.
     pub bands: Vec<Cell>,
@@ -142,7 +149,7 @@ pub struct Channel {
     pub passes: bool,
 }
 
-/// The recursive filter's own statistics.
+/// NIS of the recursive filters.
 #[derive(Clone, Debug, Serialize)]
 pub struct Nis {
     /// Mean normalised innovation squared per degree of freedom.
@@ -166,25 +173,27 @@ impl Nis {
 
 /// Innovations of a readout in the recursive filter, octave by octave.
 ///
-/// They are white where the filter's model and the mission's noise are right and its gains are the best ones; a filter that adapts its
-/// gains has others, and one for each test mass does not know what the other one's readouts would tell it. So this says where in frequency
-/// the filter is wrong, and is no part of the verdict.
+/// They are white if the filter's model, the mission's noise and the gains are right. A filter that adapts has other
+/// gains, and one for each test mass lacks the other's readouts. So this tells where in frequency the filter is wrong,
+/// and is no part of the verdict.
 #[derive(Clone, Debug, Serialize)]
 pub struct Innovations {
     /// `tm1.x`.
     pub readout: String,
-    /// Octaves, the highest first: `chi2_per_dof` is the mean square over what the mission's noise predicts for the gains in use.
+    /// Octaves, the highest first: `chi2_per_dof` is the mean square over what the mission's noise predicts for the
+    /// gains in use.
     pub octaves: Vec<Cell>,
-    /// Chance of the octave that is farthest from one, corrected for all octaves of all readouts.
+    /// p-value of the octave that is farthest from one, corrected for all octaves of all readouts.
     pub p_value: f64,
     /// The number of that octave.
     pub farthest: usize,
-    /// Whether the chance is above [`FALSE_ALARM`].
+    /// Whether the p-value is above [`FALSE_ALARM`].
     pub passes: bool,
 }
 
 impl Innovations {
-    /// Judges readouts sampled at `rate_hz` by mean squares and counts of each octave, as [Haar's wavelets][1] give them.
+    /// Judges readouts sampled at `rate_hz` by mean squares and counts of each octave, as [Haar's wavelets][1] give
+    /// them.
     ///
     /// [1]: https://en.wikipedia.org/wiki/Haar_wavelet
     #[must_use]
@@ -209,13 +218,13 @@ impl Innovations {
     }
 }
 
-/// Housekeeping that goes with a residual.
+/// A coherence of housekeeping with a residual that is certain.
 #[derive(Clone, Debug, Serialize)]
 pub struct SignificantCoherence {
     /// The driver and its coherence.
     #[serde(flatten)]
     pub coherence: Coherence,
-    /// Chance of as much, corrected for every driver and channel.
+    /// p-value, corrected for every driver and channel.
     pub p_value: f64,
 }
 
@@ -226,9 +235,9 @@ pub struct Comparison {
     pub verdict: &'static str,
     /// Whether every channel passes every test.
     pub passes: bool,
-    /// Chance of a false alarm of all tests together.
+    /// False-alarm rate of all tests together.
     pub false_alarm_rate: f64,
-    /// Chance that a single test was allowed.
+    /// False-alarm rate of a single test.
     pub false_alarm_rate_per_test: f64,
     /// Segments and their length, s.
     pub segments: u64,
@@ -242,10 +251,10 @@ pub struct Comparison {
     pub nis: Option<Nis>,
     /// The same octave by octave; no part of the verdict either.
     pub innovations: Vec<Innovations>,
-    /// Housekeeping that is coherent with a residual, beyond chance; evidence and no test, since currents of thrusters follow
+    /// Significant coherences of housekeeping with residuals: evidence, not a test, since actuator currents follow
     /// commands, and these the noise.
     pub coherences: Vec<SignificantCoherence>,
-    /// Per channel what goes with its residual beside what was named before, and the multiple coherence of all that is named.
+    /// Per channel the drivers selected by partial coherence, with their multiple coherence.
     pub together: Vec<StepwiseCoherence>,
 }
 
@@ -268,7 +277,7 @@ pub enum CompareError {
     },
 }
 
-/// Measured power per band over what is predicted, with the complex observations behind it.
+/// Measured over predicted power per band, with the complex observations behind it.
 #[derive(Clone, Debug)]
 struct Ratios {
     ratio: Vec<f64>,
@@ -276,8 +285,9 @@ struct Ratios {
 }
 
 impl Ratios {
-    /// Mean over a range of bands, and the observations of it. `Spectra::observations` counts for bands of many bins; neighbouring
-    /// bins of a Hann window share 4/9 of their power, the next 1/36, so that few bins know more than their part.
+    /// Mean over a range of bands, and the observations of it. `Spectra::observations` counts for bands of many bins;
+    /// neighbouring bins of a Hann window share 4/9 of their power, the next 1/36, so that few bins know more than
+    /// their part.
     fn mean(&self, bands: &[Band], range: Range<usize>) -> (f64, f64) {
         let n: f64 = self.observations[range.clone()].iter().sum();
         let sum: f64 = range.clone().map(|b| self.observations[b] * self.ratio[b]).sum();
@@ -288,7 +298,8 @@ impl Ratios {
     }
 }
 
-/// Compares the sums with the mission's noise. `nis` and `innovations` are what the products say of the recursive filter.
+/// Compares the sums with the mission's noise. `nis` and `innovations` are those of the recursive filters, from the
+/// products.
 ///
 /// # Errors
 /// [`CompareError`]: too little data, or a model that cannot be fitted.
@@ -407,7 +418,7 @@ fn unpacked(triangle: &[f64], n: usize) -> DMatrix<f64> {
     })
 }
 
-/// Complex observations of some hours. Their sums leave out that segments overlap by half: what that costs whole segments is taken off.
+/// Complex observations of some hours, corrected for the overlap of segments by half, which their sums do not count.
 fn observations(hours: &Spectra, plan: &Plan) -> Vec<f64> {
     let count = |overlaps: bool| {
         let mut s = Spectra::zero(plan.bands.len(), 0);
@@ -418,8 +429,8 @@ fn observations(hours: &Spectra, plan: &Plan) -> Vec<f64> {
     hours.observations(plan).into_iter().map(|n| n * cost).collect()
 }
 
-/// Σ of the mission as segments see it: under a Hann window a bin holds 2/3 of its own power and 1/6 of each neighbour's, exact for
-/// spectra up to f⁴ (the window's second and fourth moments), and a band the mean of its bins.
+/// Σ of the mission as segments see it: under a Hann window a bin holds 2/3 of its own power and 1/6 of each
+/// neighbour's, exact for spectra up to f⁴ (the window's second and fourth moments), and a band the mean of its bins.
 fn predicted(noise: &NoiseModel, plan: &Plan) -> Vec<DMatrix<f64>> {
     let at = |k: usize| noise.psd(plan.bin_hz(k as f64));
     plan.bands
@@ -433,7 +444,7 @@ fn predicted(noise: &NoiseModel, plan: &Plan) -> Vec<DMatrix<f64>> {
         .collect()
 }
 
-/// What the two test masses have in common, and the null combinations; none where not both see the whole of a force.
+/// Common and null combinations of two test masses; none where not both see every direction of a force.
 fn pairs(noise: &NoiseModel, channels: &[String], rate_hz: f64) -> Vec<(String, DVector<f64>, Kind)> {
     const FORCE: &str = "thruster_force:";
     let n = channels.len();
@@ -497,7 +508,7 @@ fn thirds(bands: &[Band]) -> Vec<Range<usize>> {
 /// Tests of a channel.
 const TESTS: usize = 5;
 
-/// Asks a channel. `allowed` is the false-alarm rate of a single test.
+/// Tests a channel. `allowed` is the false-alarm rate of a single test.
 fn judge(plan: &Plan, total: &Ratios, hours: &[Ratios], hours_ns: &[i64], allowed: f64) -> Channel {
     let bands = &plan.bands;
     let thirds = thirds(bands);
@@ -511,7 +522,7 @@ fn judge(plan: &Plan, total: &Ratios, hours: &[Ratios], hours_ns: &[i64], allowe
     let mean: f64 = part.iter().zip(&total.ratio).map(|(w, r)| w * r).sum();
     let test =
         |name, statistic: f64, p_value: f64, at| Test { name, statistic, p_value, passes: p_value >= allowed, at };
-    // The cell that is farthest out, among all.
+    // The cell that is farthest out.
     let farthest = |name, cells: &[(Cell, Option<i64>)]| {
         let chance = |c: &Cell| c.chi2_per_dof.map_or(1.0, |r| two_sided(r, c.dof));
         let tried = cells.iter().filter(|(c, _)| c.chi2_per_dof.is_some()).count();
@@ -577,7 +588,7 @@ fn judge(plan: &Plan, total: &Ratios, hours: &[Ratios], hours_ns: &[i64], allowe
     }
 }
 
-/// The distance that a Brownian bridge exceeds with this chance.
+/// The distance that a Brownian bridge exceeds with this probability.
 fn kolmogorov_point(p: f64) -> f64 {
     // The first term of the series, of which the next is the fourth power.
     (-0.5 * (0.5 * p).ln()).sqrt()
@@ -617,7 +628,8 @@ mod tests {
     const LENGTH: usize = 256;
     const HOURS: usize = 8;
 
-    /// Of white innovations one readout in a hundred fails of all together; one octave a tenth too loud, of ten thousand, is 7σ.
+    /// Of white innovations one readout in a hundred fails of all together; one octave a tenth too loud, of ten
+    /// thousand, is 7σ.
     #[test]
     fn innovations_are_judged_octave_by_octave() {
         let octaves = |wrong: f64| (0..10).map(|k| (if k == 3 { wrong } else { 1.0 }, 10_000 >> k)).collect::<Vec<_>>();
@@ -631,8 +643,8 @@ mod tests {
         assert!(judged[0].p_value < 1e-9, "{judged:?}");
     }
 
-    /// White noise of unit variance at 1 Hz, eight hours, what `shape` makes of it, cut and judged as a channel whose prediction is white;
-    /// `louder` multiplies the measured power of band and hour.
+    /// White noise of unit variance at 1 Hz, eight hours, what `shape` makes of it, cut and judged as a channel whose
+    /// prediction is white; `louder` multiplies the measured power of band and hour.
     fn judged(seed: u64, allowed: f64, shape: fn(&mut [f64]), louder: fn(f64, usize) -> f64) -> Channel {
         let mut random = Xoshiro256PlusPlus::seed_from_u64(seed);
         let mut x: Vec<f64> = (0..3600 * HOURS).map(|_| StandardNormal.sample(&mut random)).collect();
@@ -671,9 +683,9 @@ mod tests {
         c.tests.iter().filter(|t| !t.passes).map(|t| t.name).collect()
     }
 
-    /// A thousand draws of white noise, each test at 5 %: 50 false alarms are expected with a deviation of 6.9. `level` and `ljung-box`
-    /// are exact; the others are held to the rate and may stay below it, as neighbouring cells share power and bands hide
-    /// distances between their ends.
+    /// A thousand draws of white noise, each test at 5 %: 50 false alarms are expected with a deviation of 6.9. `level`
+    /// and `ljung-box` are exact; the others are held to the rate and may stay below it, as neighbouring cells share
+    /// power and bands hide distances between their ends.
     #[test]
     fn white_noise_fails_at_the_stated_rate() {
         const DRAWS: u64 = 1000;
@@ -692,7 +704,8 @@ mod tests {
         }
     }
 
-    /// Twins that differ by one thing, at the rate of a test in a sound model; each is missed by chance in less than one of a thousand.
+    /// Twins that differ by one thing, at the rate of a test in a sound model; each is missed by chance in less than
+    /// one of a thousand.
     #[test]
     fn what_is_not_white_fails_where_it_is_not() {
         const RATE: f64 = FALSE_ALARM / 15.0;
@@ -705,7 +718,8 @@ mod tests {
         let level = judged(1, RATE, plain, |_, _| 1.1);
         assert!(failed(&level).contains(&"level"), "{:?}", level.tests);
         assert!(!failed(&level).contains(&"cumulative") && !failed(&level).contains(&"ljung-box"), "{:?}", level.tests);
-        // Half as much again in one hour, as much less in the next: 20 % of a third of a decade's σ in the mean, 8σ in the hour.
+        // Half as much again in one hour, as much less in the next: 20 % of a third of a decade's σ in the mean, 8σ in
+        // the hour.
         let hour = judged(1, RATE, plain, |hz, h| match (hz > 0.2, h) {
             (true, 3) => 1.4,
             (true, 4) => 0.6,
@@ -730,8 +744,8 @@ mod tests {
         assert!(level.unexplained > 0.0 && judged(1, RATE, plain, |_, _| 1.0).unexplained == 0.0);
     }
 
-    /// The bundled mission, whose test masses look 30° to either side: with c = cos 30° and s = sin 30°, the first mass sees the
-    /// spacecraft's x as (c, −s, 0) and the second as (c, s, 0).
+    /// The bundled mission, whose test masses look 30° to either side: with c = cos 30° and s = sin 30°, the first mass
+    /// sees the spacecraft's x as (c, −s, 0) and the second as (c, s, 0).
     #[test]
     fn null_combinations_are_those_of_the_geometry() {
         let text = include_str!("../../../fixtures/missions/taiji.toml");

@@ -1,12 +1,12 @@
-//! Fewer samples for what is slow: five running means in a row, and every M-th value of them.
+//! Decimation of slow series: a cascade of five running means (CIC filter), of which every M-th value is kept.
 //!
-//! The response is `(sin πfM/r / M sin πf/r)⁵` at r samples per second. What would fold into the lowest frequencies is weakened by
-//! `(fM/r)⁵`, which matters, as a second difference of readout noise is 1e8 times louder there than where it would land. All columns
-//! pass the same filter, so what one explains of another stays what it was; spectra are divided by the response.
+//! The response is `(sin πfM/r / M sin πf/r)⁵` at r samples per second. Aliases into the lowest frequencies are weaker
+//! by `(fM/r)⁵`; the second difference of readout noise is 1e8 times louder where they come from. All columns pass the
+//! same filter, which keeps their regressions; spectra are divided by the response.
 
 use nalgebra::{DVector, DVectorView};
 
-/// What is slow has nothing above this frequency.
+/// Slow series have nothing above this frequency.
 pub const SLOW_HZ: f64 = 0.05;
 
 /// Running means in a row.
@@ -118,8 +118,8 @@ impl Decimator {
 mod tests {
     use super::*;
 
-    /// A wave below the new Nyquist frequency keeps its phase and loses what the response says, whatever the portions; one that would
-    /// fold to a low frequency is gone; a gap forgets.
+    /// A wave below the new Nyquist frequency keeps its phase and loses what the response says, whatever the portions;
+    /// one that would fold to a low frequency is gone; a gap forgets.
     #[test]
     fn slow_waves_pass_and_fast_ones_do_not_fold() {
         let wave = |cycles: f64| -> Vec<f64> {

@@ -1,4 +1,7 @@
-//! The verdict: is the model sufficient, what is missing, or is there something that nothing explains.
+//! The verdict: the model is sufficient, named effects are missing, or something remains that no candidate explains.
+//!
+//! Forward selection: the candidate with the smallest corrected p-value is added, and all others are scored again
+//! beside it.
 
 use dragfree_estimation::estimate::EstimateError;
 use dragfree_estimation::levels::{Level, Levels};
@@ -17,58 +20,61 @@ use crate::scores::{CandidateScorer, Fit, Scored, WithoutExcess};
 /// Chance of naming an effect when none is hidden.
 pub const FALSE_ALARM: f64 = 0.01;
 
-/// What moves the offset is doubtful below this part of what a level of torque noise is worth.
+/// A candidate that moves the offset is doubtful if its fall of χ² is below this part of that of a level of torque
+/// noise: the unknown part of such a torque is known to first order alone, and leaves traces that candidates follow.
 const BESIDE_A_LEVEL: f64 = 0.02;
 
-/// A mission file knows its noise to this: a level within it is none that is missing.
+/// Relative accuracy of the noise in a mission file: a level within it is not reported as missing.
 const LEVEL_TOLERANCE: f64 = 0.15;
 
-/// A cause whose halves differ so that chance gives it more rarely is none: what is true at one time is true at another.
+/// A candidate is refused if the values of its two halves differ with a smaller p-value than this: a lasting cause is
+/// constant.
 const HALVES_DIFFER: f64 = 1e-3;
 
-/// Rounds of adding the best effect.
+/// Most effects that are added.
 const MOST_ADDED: usize = 4;
 
-/// Candidates that are weighed in full in each round.
+/// Candidates that are evaluated in full in each round.
 const LISTED: usize = 12;
 
-/// Candidates whose likelihood is tried where there is an excess.
+/// Candidates whose likelihood is computed where there is an excess.
 const EXPLAINING: usize = 6;
 
-/// Independent segments of full length below which nothing is said.
+/// Independent segments of full length below which there is no diagnosis.
 const LEAST_SEGMENTS: f64 = 4.0;
 
 /// Standard normal quantile of a one-sided 95 % limit.
 const LIMIT_QUANTILE: f64 = 1.645;
 
-/// An excess is looked at when the power of a third of a decade is above the modelled by this.
+/// Measured over modelled power of a third of a decade above which it is an excess.
 const EXCESS: f64 = 1.25;
 
-/// And so certainly: 3.4e-6 each, over nine channels and fourteen thirds of decades, plain and partial, 1e-3 together.
+/// Significance that an excess needs besides: 3.4e-6 each, 1e-3 over nine channels and fourteen thirds of decades,
+/// plain and partial.
 const EXCESS_SIGMA: f64 = 4.5;
 
-/// Chance that any driver passes for a witness when none is: a part of [`FALSE_ALARM`], the most of which is left to effects.
+/// False-alarm rate of a coherence with housekeeping, over all drivers and channels: a small part of [`FALSE_ALARM`].
 const COHERENCE_ALARM: f64 = 1e-3;
 
-/// Where there is no excess of power, a witness that explains no more than this part of a channel's power, in the band that says most, is
-/// no sign of something unexplained. In a day a few per cent are certain, and a thruster's current goes with the residuals by as much
-/// without driving them: it follows a command, which is made of the readouts that the residuals are made of.
+/// Part of a channel's power that housekeeping has to explain to be unexplained evidence where there is no excess of
+/// power. Actuator currents are coherent with the residuals by a few per cent without driving them: commands and
+/// residuals share the readouts.
 const LEAST_EXPLAINED: f64 = 0.1;
 
-/// Why a candidate has no number.
+/// Why a candidate has no result.
 const UNOBSERVABLE: &str =
-    "these data say nothing of it: what it is made of does not change in them, or the model has the same already";
+    "unobservable in these data: its series do not change in them, or the model contains the same already";
 
-/// What moves the offset by so many σ is no longer told from it.
+/// Bias of the offset, σ, from which a candidate counts as moving it.
 const MOVES_OFFSET: f64 = 3.0;
 
-/// Explanations whose χ² differ by less than this are not told apart: 1 % of χ² with one degree of freedom.
-const AS_GOOD: f64 = 6.63;
+/// Explanations whose χ² differ by less than this are not told apart: the 1 % point of χ² with one degree of freedom.
+const EQUALLY_GOOD: f64 = 6.63;
 
-/// Part of an excess that an explanation may leave.
-const REMAINS: f64 = 1e-3;
+/// Part of the largest excess that an explanation may leave: the forms that are tried differ from the true one.
+const REMAINDER: f64 = 1e-3;
 
-/// What lies wholly below this is a drift: slower than an hour.
+/// An excess wholly below this frequency is called a drift: slower than an hour.
 const DRIFT_HZ: f64 = 1.0 / 3600.0;
 
 /// Why there is no diagnosis.
@@ -90,14 +96,14 @@ pub enum DiagnosisError {
     },
 }
 
-/// An effect that explains something.
+/// A candidate and its evidence.
 #[derive(Clone, Debug, Serialize)]
 pub struct Found {
     /// Effect.
     pub effect: String,
     /// Instance.
     pub instance: String,
-    /// Coefficient that stands out most.
+    /// Coefficient with the largest value over σ.
     pub coefficient: String,
     /// Its value, in `unit`.
     pub value: f64,
@@ -109,41 +115,41 @@ pub struct Found {
     pub shape: Map<String, Value>,
     /// Every coefficient of the effect: name, value, σ, unit.
     pub coefficients: Vec<Value>,
-    /// By how much χ² falls.
+    /// Fall of χ².
     pub delta_chi2: f64,
-    /// Chance of as much when nothing is there, corrected for everything tried: every effect has the same part of the false alarms,
-    /// whatever its forms.
+    /// p-value, corrected for everything tried: every effect has the same part of the false-alarm rate, whatever its
+    /// forms.
     pub p_value: f64,
-    /// Its decimal logarithm, where the chance itself is too small for a number; what the list is sorted by.
+    /// Its decimal logarithm, finite where the p-value underflows; the list is sorted by it.
     pub log10_p_value: f64,
     /// Change of the Bayesian information criterion, negative in favour of the effect.
     pub delta_bic: f64,
     /// Whether the value lies inside its physical range.
     pub in_range: bool,
-    /// By how much χ² of each half of the data falls with the value that the other gives; none where there is one half.
+    /// Fall of χ² of each half of the data at the values fitted to the other; none where there is one half.
     pub held_out_delta_chi2: Option<[f64; 2]>,
-    /// Chance that the halves' values differ as much if both are right; none where there is one half.
+    /// p-value of the difference of the halves' values; none where there is one half.
     pub held_out_p_value: Option<f64>,
-    /// χ²/dof without it, under the noise that is left with it.
+    /// χ²/dof without it.
     pub chi2_per_dof_before: f64,
     /// χ²/dof with it.
     pub chi2_per_dof_after: f64,
-    /// By how much the lack of it moves each coefficient of the model that is a length, m.
+    /// Bias of each coefficient of the model that is a length while this is missing, m.
     pub offset_shift_m: BTreeMap<String, f64>,
     /// The same in σ of the coefficient.
     pub offset_shift_sigma: BTreeMap<String, f64>,
-    /// Where it acts.
+    /// Channels on which it acts.
     pub channels: Vec<String>,
-    /// What the data cannot tell from it.
+    /// Candidates and coefficients that the data cannot tell from it.
     pub confounders: Vec<String>,
-    /// Whether it is part of the answer, or only the next on the list.
+    /// Whether it is part of the answer.
     pub accepted: bool,
-    /// Whether it was weighed by what it explains of an excess of power.
+    /// Whether it was selected by the likelihood ratio over an excess of power.
     #[serde(skip)]
     of_excess: bool,
 }
 
-/// What cannot be seen.
+/// The upper limit of a coefficient that is not detected.
 #[derive(Clone, Debug, Serialize)]
 pub struct Limit {
     /// Effect.
@@ -154,7 +160,7 @@ pub struct Limit {
     pub coefficient: String,
     /// 95 % upper limit on its size.
     pub limit_95: f64,
-    /// σ that these data have for it.
+    /// σ of it from these data.
     pub sigma: f64,
     /// Unit.
     pub unit: String,
@@ -162,7 +168,7 @@ pub struct Limit {
     pub shape: Map<String, Value>,
 }
 
-/// What is left over.
+/// Evidence that no candidate explains.
 #[derive(Clone, Debug, Serialize)]
 pub struct Unexplained {
     /// Channels with an excess.
@@ -173,9 +179,9 @@ pub struct Unexplained {
     pub kind: String,
     /// Measured over modelled power, at its worst.
     pub ratio: f64,
-    /// Whether there is more power than modelled; otherwise it is known by its coherence alone.
+    /// Whether there is more power than modelled; otherwise the evidence is coherence alone.
     pub power: bool,
-    /// Housekeeping that is coherent with it, each in its best form: first what chance gives most rarely.
+    /// Housekeeping that is coherent with it, each in its best form, the smallest p-value first.
     pub coherent_with: Vec<String>,
     /// The same with numbers.
     #[serde(rename = "witnesses")]
@@ -187,29 +193,30 @@ pub struct Unexplained {
 pub struct Diagnosis {
     /// `sufficient`, `missing` or `unexplained`.
     pub verdict: String,
-    /// Chance of a false alarm.
+    /// False-alarm rate.
     pub false_alarm_rate: f64,
     /// Forms and levels of effects that were tried; transient templates were tried at every time besides.
     pub tried: usize,
-    /// What explains the data, the best first; those that are accepted stand before the rest.
+    /// Candidates, the accepted ones first, then the best of the rest.
     pub candidates: Vec<Found>,
-    /// Limits of what is not seen.
+    /// Limits of what is not detected.
     pub upper_limits: Vec<Limit>,
-    /// What nobody explains.
+    /// Evidence that no candidate explains.
     pub unexplained: Option<Unexplained>,
-    /// What happened once.
+    /// Transients that were detected.
     pub transients: Vec<Value>,
     /// What could not be tried, and why.
     pub not_tried: Vec<(String, String)>,
-    /// Places that stand out beside the model alone, in their best forms: worth a finer look.
+    /// Candidates that stand out beside the model alone, in their best forms, to be tried again on a finer grid of
+    /// shapes.
     #[serde(skip)]
     pub refinement_requests: Vec<RefinementRequest>,
-    /// Forms that were tried, per effect, this time and before.
+    /// Forms that were tried, per effect, in this pass and before.
     #[serde(skip)]
     pub forms: BTreeMap<String, usize>,
 }
 
-/// An effect at a place, in a form.
+/// A candidate that is to be tried again on a finer grid of shapes about this one.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RefinementRequest {
     /// Effect.
@@ -220,19 +227,21 @@ pub struct RefinementRequest {
     pub shape: Map<String, Value>,
 }
 
-/// How often chance had its say. Every effect has the same part of [`FALSE_ALARM`], and so has the search of transients; an
-/// effect's part is shared by all forms in all places that were tried of it (Bonferroni, with weights that are fixed before the data are seen).
+/// Numbers of trials for the correction of p-values. Every effect, and the search for transients, has the same part of
+/// [`FALSE_ALARM`]; an effect's part is shared by all its forms (weighted Bonferroni; the weights are fixed before the
+/// data are seen).
 ///
-/// Were all forms alike, an effect of one form would pay for the ten thousand pairs of thermometers and lags of another.
+/// With equal weights of all forms, an effect of one form would pay for the ten thousand pairs of thermometers and lags
+/// of another.
 struct Trials {
-    /// Forms and levels per effect, and trials of the search.
+    /// Trials per family: forms and levels of an effect, and those of the transient search.
     forms: BTreeMap<String, f64>,
 }
 
-/// The search of what happens transient, among the effects.
+/// The family of all transients.
 const TRANSIENT: &str = "transient search";
 
-/// Whose part of the false alarms it is.
+/// Family whose part of the false-alarm rate a candidate uses.
 fn family(c: &Candidate) -> &str {
     if c.transient { TRANSIENT } else { &c.effect }
 }
@@ -255,8 +264,8 @@ impl Trials {
         self.forms.iter().filter(|(family, _)| *family != TRANSIENT).map(|(_, n)| n).sum::<f64>() as usize
     }
 
-    /// The chance, and its decimal logarithm, that an effect is worth so much without being there.
-    fn chance(&self, family: &str, chi2: f64, dof: f64) -> (f64, f64) {
+    /// Corrected p-value, and its decimal logarithm, of a fall of χ² in a family.
+    fn p_value(&self, family: &str, chi2: f64, dof: f64) -> (f64, f64) {
         let trials = self.forms.len() as f64 * self.forms.get(family).copied().unwrap_or(1.0).max(1.0);
         let ln_p = ln_chi2_above(chi2, dof);
         let p = corrected(ln_p.exp(), trials);
@@ -264,7 +273,8 @@ impl Trials {
     }
 }
 
-/// Diagnoses the sums; `tried_before` are forms of effects, by which some of those that are tried now were chosen.
+/// Diagnoses the sums. `tried_before` are the numbers of forms, per effect, of an earlier pass that chose forms of this
+/// one.
 ///
 /// # Errors
 /// [`DiagnosisError`]: too little data, or a model that cannot be fitted.
@@ -290,17 +300,18 @@ pub fn diagnose(
     let mut ranked = first.all;
     let mut requests = refinement_requests(&trials, &ranked);
     let mut others: Vec<Found> = loop {
-        likeliest_first(&trials, &mut ranked);
-        let mut weighed: Vec<(Found, Candidate)> = ranked
+        sort_by_p_value(&trials, &mut ranked);
+        let mut evaluated: Vec<(Found, Candidate)> = ranked
             .iter()
             .take(LISTED)
-            .map(|scored| (weigh(scorer, &fit, scored, &ranked, &trials), scored.candidate.clone()))
+            .map(|scored| (evaluate(scorer, &fit, scored, &ranked, &trials), scored.candidate.clone()))
             .collect();
-        for (f, candidate) in &mut weighed {
-            // On a coarse grid of shapes the peak of a wrong colour costs more than all that it explains.
+        for (f, candidate) in &mut evaluated {
+            // Only on the refined grid: on a coarse one the wrong colour costs more likelihood than the regressor
+            // explains.
             let finely = tried_before.contains_key(&candidate.effect);
             let stands_out = f.p_value < FALSE_ALARM && f.in_range && accepted.len() < MOST_ADDED;
-            // The likelihood chooses among its shapes alone: what it is worth beside what colours nothing is told by scores.
+            // The likelihood chooses the shape. The evidence remains the score, as for effects that filter no noise.
             let chosen = if finely && stands_out { scorer.coloured(&fit, candidate)? } else { None };
             if let Some(form) = chosen {
                 f.shape.clone_from(&form.parts[0].1.shape);
@@ -308,34 +319,34 @@ pub fn diagnose(
             }
         }
         if accepted.len() < MOST_ADDED {
-            for (f, candidate) in of_the_excess(scorer, &fit, &trials)? {
+            for (f, candidate) in candidates_of_excess(scorer, &fit, &trials)? {
                 let of = |w: &(Found, Candidate)| (&w.0.effect, &w.0.instance) == (&f.effect, &f.instance);
-                match weighed.iter().position(of) {
-                    Some(i) if weighed[i].0.log10_p_value <= f.log10_p_value => {}
-                    Some(i) => weighed[i] = (f, candidate),
-                    None => weighed.push((f, candidate)),
+                match evaluated.iter().position(of) {
+                    Some(i) if evaluated[i].0.log10_p_value <= f.log10_p_value => {}
+                    Some(i) => evaluated[i] = (f, candidate),
+                    None => evaluated.push((f, candidate)),
                 }
             }
-            weighed.sort_by(|a, b| a.0.log10_p_value.total_cmp(&b.0.log10_p_value));
+            evaluated.sort_by(|a, b| a.0.log10_p_value.total_cmp(&b.0.log10_p_value));
         }
         let helps = |f: &Found| f.held_out_p_value.is_none_or(|p| p > HALVES_DIFFER);
         let good = |(f, _): &(Found, Candidate)| f.p_value < FALSE_ALARM && f.in_range && helps(f);
-        let Some(best) = weighed.iter().position(good).filter(|_| accepted.len() < MOST_ADDED) else {
-            break weighed.into_iter().map(|(f, _)| f).collect();
+        let Some(best) = evaluated.iter().position(good).filter(|_| accepted.len() < MOST_ADDED) else {
+            break evaluated.into_iter().map(|(f, _)| f).collect();
         };
         let mut added = fit.added.clone();
-        added.push(weighed[best].1.clone());
+        added.push(evaluated[best].1.clone());
         fit = scorer.fit(&added)?;
         let before = std::mem::replace(&mut ranked, scorer.rank(&fit).all);
-        let mut f = Found { accepted: true, ..weighed[best].0.clone() };
+        let mut f = Found { accepted: true, ..evaluated[best].0.clone() };
         if !f.of_excess {
-            f.confounders.extend(as_good(&f, &before, &ranked));
+            f.confounders.extend(equally_good(&f, &before, &ranked));
             f.confounders.sort();
             f.confounders.dedup();
         }
         accepted.push(f);
-        // What is found is measured again with Σ as it is without the excess.
-        refresh(scorer, &fit, &mut accepted);
+        // With the excess explained, Σ has changed: all accepted values are estimated again.
+        estimate_again(scorer, &fit, &mut accepted);
     };
 
     let (mut extra, unexplained) = loop {
@@ -346,8 +357,8 @@ pub fn diagnose(
         let ((excess, _), plain) = (levels.excess_bands(), levels.plain_inverses());
         let mut both = accepted.iter().zip(&fit.added);
         let part = |candidate: &Candidate| scorer.part_in(&fit, &plain, candidate, &excess);
-        // What is left of an excess a thousand times as large is what the forms that were tried are beside the true one.
-        let loud = unexplained.as_ref().filter(|u| !u.power || u.ratio > REMAINS * loudest);
+        // A small remainder of the largest excess is what the grid of forms cannot represent.
+        let loud = unexplained.as_ref().filter(|u| !u.power || u.ratio > REMAINDER * loudest);
         let Some(doubtful) = both.position(|(f, c)| is_doubtful(f, part(c), &extra, loud)) else {
             break (extra, unexplained);
         };
@@ -356,9 +367,9 @@ pub fn diagnose(
         added.remove(doubtful);
         fit = scorer.fit(&added)?;
         ranked = scorer.rank(&fit).all;
-        refresh(scorer, &fit, &mut accepted);
+        estimate_again(scorer, &fit, &mut accepted);
     };
-    // Noise is weighed apart: levels stand behind the effects that are accepted and before the rest.
+    // Noise levels stand behind the accepted effects and before the rest.
     extra.sort_by(|a, b| b.accepted.cmp(&a.accepted).then(a.log10_p_value.total_cmp(&b.log10_p_value)));
     let louder: Vec<Found> = extra.iter().filter(|f| f.accepted).cloned().collect();
     let mut candidates: Vec<Found> = accepted.into_iter().chain(louder).collect();
@@ -372,7 +383,7 @@ pub fn diagnose(
         (false, Some(_)) => "unexplained",
         (false, None) => "sufficient",
     };
-    // A shape is told best beside what else was found, or else came next.
+    // The shape beside all accepted effects is better than the one beside the model alone.
     for request in &mut requests {
         let found = candidates.iter().find(|f| (&f.effect, &f.instance) == (&request.effect, &request.instance));
         request.shape = found.map_or_else(|| request.shape.clone(), |f| f.shape.clone());
@@ -392,8 +403,8 @@ pub fn diagnose(
     })
 }
 
-/// Independent short segments that would know as much of the lowest octave of short segments. One band is too narrow to tell: a bin
-/// of a short segment serves many bands of the long ones, and counts in one of them.
+/// Effective number of independent short segments, from the observations in their lowest octave. A single band is too
+/// narrow: a bin of a short segment spans many bands of the long ones, and counts in one of them.
 fn short_segments(scorer: &CandidateScorer<'_>) -> f64 {
     let plan = scorer.plan();
     let octave = LONG * FIRST_BIN..2 * LONG * FIRST_BIN;
@@ -403,13 +414,12 @@ fn short_segments(scorer: &CandidateScorer<'_>) -> f64 {
     observations * LONG as f64 / bins.max(1) as f64
 }
 
-/// Where Σ had to take up an excess, the candidates that may explain it, weighed by the likelihood with a Σ of their own.
+/// Candidates that may explain an excess of power, by the ratio of likelihoods, each with the Σ of its own residuals.
 ///
-/// Under the Σ that has taken it up, nothing that acts in a few bins can be worth more than those bins, however exactly it explains
-/// them; under the Σ that has not, whatever follows the excess by chance is worth thousands. The ratio of the likelihoods, each at the
-/// Σ that its own residuals have, is neither: n observations whose power falls to a part x are worth n log 1/x, by Bartlett's correction
-/// n − (p + 2)/2 of them for p coefficients.
-fn of_the_excess(
+/// A score under the Σ that has absorbed the excess is at most the few observations in it; under the Σ that has not,
+/// whatever follows the excess by chance scores thousands. n observations whose power falls to a part x have the
+/// log-likelihood ratio n log 1/x, where Bartlett's correction leaves n − (p + 2)/2 of them for p coefficients.
+fn candidates_of_excess(
     scorer: &CandidateScorer<'_>,
     fit: &Fit,
     trials: &Trials,
@@ -417,18 +427,18 @@ fn of_the_excess(
     let Some(WithoutExcess { plain, bands, observations }) = scorer.without_excess(fit) else { return Ok(Vec::new()) };
     let before = scorer.deviance(fit, &bands, &fit.added)?;
     let mut ranked = scorer.rank(&plain).all;
-    likeliest_first(trials, &mut ranked);
+    sort_by_p_value(trials, &mut ranked);
     let mut out = Vec::new();
     for scored in ranked.iter().filter(|s| s.in_range).take(EXPLAINING) {
         let mut added = fit.added.clone();
         added.push(scored.candidate.clone());
         let dof = scored.candidate.parts.len() as f64;
         let kept = (1.0 - 0.5 * (dof + 2.0) / observations).max(0.0);
-        // n log 1/x is at most n (1/x − 1), the fall of χ² under the Σ without the excess; beyond that, something else has changed.
+        // n log 1/x is at most n (1/x − 1), the fall of χ² under the Σ that has not absorbed the excess.
         let ratio = (before - scorer.deviance(fit, &bands, &added)?).clamp(0.0, scored.delta_chi2.max(0.0));
         let delta_chi2 = ratio * kept;
-        let (p_value, log10_p_value) = trials.chance(family(&scored.candidate), delta_chi2, dof);
-        let f = weigh(scorer, &plain, scored, &ranked, trials);
+        let (p_value, log10_p_value) = trials.p_value(family(&scored.candidate), delta_chi2, dof);
+        let f = evaluate(scorer, &plain, scored, &ranked, trials);
         let delta_bic = dof * fit.estimate.quality.dof.ln() - delta_chi2;
         let chi2_per_dof_after = f.chi2_per_dof_before - delta_chi2 / fit.estimate.quality.dof;
         let f = Found { delta_chi2, p_value, log10_p_value, delta_bic, chi2_per_dof_after, of_excess: true, ..f };
@@ -437,16 +447,16 @@ fn of_the_excess(
     Ok(out)
 }
 
-/// Whether what was accepted does not stand beside the rest of the answer.
+/// Whether an accepted effect contradicts the rest of the answer.
 ///
-/// - What was weighed by what it explains of an excess, or would be known by what it does where there is one, `part` of its
-///   information, while an excess, or something that housekeeping is coherent with, remains in the channels where it acts: it follows
-///   what is there, as much else does that is slow, and does not explain it. A magnetometer sees the current whose square heats a test mass's housing.
-/// - What moves the offset and is little beside a level of noise that turns the spacecraft, worth less than [`BESIDE_A_LEVEL`] of it: what
-///   α̂ does not know of such a torque is known to first order, and a resonance of 2 % followed torques three times as loud (41 of χ² to
-///   27,000). It is to be asked again when the model has the level.
+/// - It was selected by an excess of power, or has `part` > ½ of its information in the bands of one, and an excess or
+///   a coherence with
+///   housekeeping remains in its channels: it correlates with the cause and is not the cause.
+/// - It moves the offset, and its fall of χ² is below [`BESIDE_A_LEVEL`] of that of a level of torque noise (see
+///   there). It should be
+///   tried again with that level in the model.
 fn is_doubtful(f: &Found, part: f64, extra: &[Found], unexplained: Option<&Unexplained>) -> bool {
-    // Housekeeping that is coherent with what is left says as much of what was chosen for an excess.
+    // For an effect selected by an excess, a remaining coherence is as much evidence as remaining power.
     let remains = |u: &Unexplained| (u.power || f.of_excess) && f.channels.iter().any(|c| u.channels.contains(c));
     let turned = |e: &Found| {
         e.accepted
@@ -457,25 +467,25 @@ fn is_doubtful(f: &Found, part: f64, extra: &[Found], unexplained: Option<&Unexp
     (f.of_excess || part > 0.5) && unexplained.is_some_and(remains) || moves && extra.iter().any(turned)
 }
 
-/// Sorted by the chance of what each is worth, the smallest first.
-fn likeliest_first(trials: &Trials, ranked: &mut [Scored]) {
-    let chance = |s: &Scored| trials.chance(family(&s.candidate), s.delta_chi2, s.candidate.parts.len() as f64).1;
-    ranked.sort_by(|a, b| chance(a).total_cmp(&chance(b)));
+/// Sorts by corrected p-value, the smallest first.
+fn sort_by_p_value(trials: &Trials, ranked: &mut [Scored]) {
+    let p_value = |s: &Scored| trials.p_value(family(&s.candidate), s.delta_chi2, s.candidate.parts.len() as f64).1;
+    ranked.sort_by(|a, b| p_value(a).total_cmp(&p_value(b)));
 }
 
-/// Places that stand out by themselves.
+/// Candidates that stand out beside the model alone.
 fn refinement_requests(trials: &Trials, ranked: &[Scored]) -> Vec<RefinementRequest> {
-    let chance = |s: &Scored| trials.chance(family(&s.candidate), s.delta_chi2, s.candidate.parts.len() as f64).0;
+    let p_value = |s: &Scored| trials.p_value(family(&s.candidate), s.delta_chi2, s.candidate.parts.len() as f64).0;
     let request = |s: &Scored| RefinementRequest {
         effect: s.candidate.effect.clone(),
         instance: s.candidate.instance.clone(),
         shape: s.candidate.parts[0].1.shape.clone(),
     };
-    ranked.iter().filter(|s| !s.candidate.transient && chance(s) < FALSE_ALARM).map(request).collect()
+    ranked.iter().filter(|s| !s.candidate.transient && p_value(s) < FALSE_ALARM).map(request).collect()
 }
 
-/// What explained as much as a candidate before that was there, and nothing beside it: as good an explanation, whatever its shape.
-fn as_good(chosen: &Found, before: &[Scored], beside: &[Scored]) -> Vec<String> {
+/// Candidates that explained as much as `chosen` before it was added, and nothing beside it: equally good explanations.
+fn equally_good(chosen: &Found, before: &[Scored], beside: &[Scored]) -> Vec<String> {
     let worth = |all: &[Scored], name: &str| {
         all.iter().find(|s| !s.candidate.transient && s.candidate.name() == name).map_or(0.0, |s| s.delta_chi2)
     };
@@ -483,12 +493,12 @@ fn as_good(chosen: &Found, before: &[Scored], beside: &[Scored]) -> Vec<String> 
     let own = format!("{}:{}", chosen.effect, chosen.instance);
     names
         .filter(|name| *name != own)
-        .filter(|name| worth(before, name) > chosen.delta_chi2 - AS_GOOD && worth(beside, name) < AS_GOOD)
+        .filter(|name| worth(before, name) > chosen.delta_chi2 - EQUALLY_GOOD && worth(beside, name) < EQUALLY_GOOD)
         .collect()
 }
 
 /// A candidate as it stands beside a fit.
-fn weigh(scorer: &CandidateScorer<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], trials: &Trials) -> Found {
+fn evaluate(scorer: &CandidateScorer<'_>, fit: &Fit, scored: &Scored, ranked: &[Scored], trials: &Trials) -> Found {
     let parts = &scored.candidate.parts;
     let covariance = scored.information.clone().try_inverse();
     let sigma = |j: usize| covariance.as_ref().map_or(f64::INFINITY, |c| c[(j, j)].max(0.0).sqrt());
@@ -498,7 +508,7 @@ fn weigh(scorer: &CandidateScorer<'_>, fit: &Fit, scored: &Scored, ranked: &[Sco
     let dof = parts.len() as f64;
     let halves = scorer.held_out(fit, &scored.candidate);
     let quality = &fit.estimate.quality;
-    let (p_value, log10_p_value) = trials.chance(family(&scored.candidate), scored.delta_chi2, dof);
+    let (p_value, log10_p_value) = trials.p_value(family(&scored.candidate), scored.delta_chi2, dof);
     let (mut offset_shift_m, mut offset_shift_sigma) = (BTreeMap::new(), BTreeMap::new());
     for (k, i) in fit.estimate.free.iter().enumerate() {
         let Some(c) = scorer.candidate_set.coefficients[..scorer.candidate_set.model()].get(*i) else { continue };
@@ -541,14 +551,14 @@ fn weigh(scorer: &CandidateScorer<'_>, fit: &Fit, scored: &Scored, ranked: &[Sco
     }
 }
 
-/// The coefficient that stands out most.
+/// Index of the largest value over σ.
 fn leading(values: &[(f64, f64)]) -> usize {
     let size = |i: &usize| (values[*i].0 / values[*i].1).abs();
     (0..values.len()).max_by(|a, b| size(a).total_cmp(&size(b))).unwrap_or(0)
 }
 
 /// The accepted effects as the fit of all of them has them.
-fn refresh(scorer: &CandidateScorer<'_>, fit: &Fit, found: &mut [Found]) {
+fn estimate_again(scorer: &CandidateScorer<'_>, fit: &Fit, found: &mut [Found]) {
     let mut at = scorer.candidate_set.model();
     let sigma = |i: usize| {
         let k = fit.estimate.free.iter().position(|f| *f == i)?;
@@ -557,7 +567,7 @@ fn refresh(scorer: &CandidateScorer<'_>, fit: &Fit, found: &mut [Found]) {
     for (f, added) in found.iter_mut().zip(&fit.added) {
         let own = at..at + added.parts.len();
         at = own.end;
-        // Of what is over soon the fit does not know how much a window has left.
+        // The fit has no window correction for transients.
         if added.transient {
             continue;
         }
@@ -574,7 +584,7 @@ fn refresh(scorer: &CandidateScorer<'_>, fit: &Fit, found: &mut [Found]) {
     }
 }
 
-/// Levels of noise one after the other, the best first; those that matter are accepted and taken over.
+/// Noise levels by forward selection: those that matter are accepted, and `levels` takes them over.
 fn noise_levels(scorer: &CandidateScorer<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &Trials) -> Vec<Found> {
     let residuals = scorer.residual_psd_of_sets(fit);
     let halves = [0, 1].map(|set| scorer.levels(fit, &scorer.gathered.sets[set], &residuals[set]));
@@ -591,8 +601,9 @@ fn noise_levels(scorer: &CandidateScorer<'_>, fit: &Fit, levels: &mut Levels<'_>
         let best = measured.into_iter().max_by(|a, b| a.1.delta_chi2.total_cmp(&b.1.delta_chi2));
         let Some((i, level)) = best else { return out };
         let c = &scorer.candidate_set.coefficients[i];
-        let (p_value, log10_p_value) = trials.chance(&c.effect, level.delta_chi2, 1.0);
-        // A transient makes one half of the data louder, noise both: as much within chance, or each by half of it at least.
+        let (p_value, log10_p_value) = trials.p_value(&c.effect, level.delta_chi2, 1.0);
+        // A transient raises one half of the data, noise both: equal within chance, or each by half of the rise at
+        // least.
         let (differ, steady) = match halves.each_ref().map(|half| half.level(&c.noise)) {
             [Some(a), Some(b)] => {
                 let difference = (a.value - b.value).abs() / a.sigma.hypot(b.sigma);
@@ -642,7 +653,7 @@ fn noise_levels(scorer: &CandidateScorer<'_>, fit: &Fit, levels: &mut Levels<'_>
     }
 }
 
-/// Times at which something happened that no chance gives; what it was is for the candidates to say.
+/// Transients that are certain; the candidates decide on their cause.
 fn transients(scorer: &CandidateScorer<'_>) -> Vec<Value> {
     scorer.gathered.transients.certain(FALSE_ALARM).map(|h| json!(h)).collect()
 }
@@ -672,8 +683,9 @@ fn limits(scorer: &CandidateScorer<'_>, rest: &[Scored], named: &[Found]) -> Vec
     out
 }
 
-/// Power beyond the modelled noise, channel by channel in thirds of a decade, and what of the telemetry is coherent with what is
-/// left over: either is a sign of something that no effect explains, and a slow force shows by the second long before the first.
+/// Power beyond the modelled noise, channel by channel in thirds of a decade, and housekeeping that is coherent with
+/// the residuals. Either is evidence of an unknown cause; a slow force shows in the coherence long before it shows in
+/// the power.
 fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
     let plan = scorer.plan();
     let channels = &scorer.candidate_set.channels;
@@ -692,7 +704,7 @@ fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>) -> Option<Unex
         .collect();
     let power = !loud.is_empty();
     if !power {
-        // What explains a part of the power leaves the rest: so much more there is than without it.
+        // A driver that explains a part x of the power raises it by 1/(1 − x).
         let of = |w: &Coherence| channels.iter().position(|c| *c == w.channel);
         let best = significant.iter().find(|w| w.explained > LEAST_EXPLAINED)?;
         loud.push((of(best)?, best.band_hz, (1.0 - best.explained.clamp(0.0, 0.999)).recip()));
@@ -708,7 +720,7 @@ fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>) -> Option<Unex
     } else {
         "broadband"
     };
-    // The same housekeeping, its derivative and its square are one hint.
+    // A housekeeping channel, its derivative and its square are one hint.
     let mut hints: Vec<&Coherence> = Vec::new();
     for w in significant.iter().filter(|w| names.contains(&w.channel)) {
         if hints.len() < 10 && hints.iter().all(|hint| hint.of != w.of) {
@@ -731,22 +743,22 @@ fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>) -> Option<Unex
 mod tests {
     use super::*;
 
-    /// Chances of normal deviates: over all forms of all effects together a false alarm is as likely as is said, and the one effect
-    /// with ten thousand forms takes no more of it than the one with a single form.
+    /// Over all forms of all effects together the false-alarm rate is the stated one, and an effect with ten thousand
+    /// forms has the same part of it as one with a single form.
     #[test]
     fn every_effect_has_the_same_part_of_the_false_alarms() {
         let forms = BTreeMap::from([("many".to_owned(), 10_000.0), ("one".to_owned(), 1.0)]);
         let trials = Trials { forms };
         for (effect, n) in [("many", 10_000.0), ("one", 1.0)] {
-            // The χ² at which this effect alone is falsely named with a chance of half a per cent.
+            // The χ² at which this effect alone has half the false-alarm rate.
             let mut chi2 = 0.0;
-            while trials.chance(effect, chi2, 1.0).0 > FALSE_ALARM {
+            while trials.p_value(effect, chi2, 1.0).0 > FALSE_ALARM {
                 chi2 += 0.01;
             }
             let alone = 1.0 - (1.0 - ln_chi2_above(chi2, 1.0).exp()).powf(n);
             assert!((alone / (0.5 * FALSE_ALARM) - 1.0).abs() < 0.02, "{effect}: {alone}");
         }
-        assert!(trials.chance("one", 20.0, 1.0).1 < trials.chance("many", 25.0, 1.0).1);
+        assert!(trials.p_value("one", 20.0, 1.0).1 < trials.p_value("many", 25.0, 1.0).1);
     }
 
     fn found(channels: &[&str], shift: f64, accepted: bool) -> Found {
@@ -809,7 +821,7 @@ mod tests {
         };
         let torque = level("sc.alpha.z", true, 100.0);
         assert!(is_doubtful(&gain, 0.0, &torque, None) && !is_doubtful(&still, 0.0, &torque, None));
-        // A cause that is worth a tenth of the level is no trace of it.
+        // A cause with a tenth of the level's χ² is no trace of it.
         assert!(!is_doubtful(&gain, 0.0, &level("sc.alpha.z", true, 10.0), None));
         assert!(!is_doubtful(&gain, 0.0, &level("sc.alpha.z", false, 100.0), None));
         assert!(!is_doubtful(&gain, 0.0, &level("tm1.accel.y", true, 100.0), None));

@@ -1,4 +1,4 @@
-//! Chances: tails of χ² and of Kolmogorov's distribution, exact where an approximation of a tail would decide.
+//! Tail probabilities of χ² and of Kolmogorov's distribution, accurate far out, where p-values are decided.
 
 /// `ln Γ(x)` for `x > 0` (Lanczos, g = 7, to 1e-14).
 fn ln_gamma(x: f64) -> f64 {
@@ -54,7 +54,7 @@ fn ln_fraction_above(a: f64, x: f64) -> f64 {
     (ln_leading(a, x) + fraction.ln()).min(0.0)
 }
 
-/// Chances that χ² of `dof` degrees of freedom lies below and above `dof * per_dof`.
+/// Probabilities that χ² of `dof` degrees of freedom lies below and above `dof * per_dof`.
 #[must_use]
 pub fn chi2_tails(per_dof: f64, dof: f64) -> (f64, f64) {
     let (a, x) = (0.5 * dof, 0.5 * dof * per_dof);
@@ -69,7 +69,8 @@ pub fn chi2_tails(per_dof: f64, dof: f64) -> (f64, f64) {
     (1.0 - above, above)
 }
 
-/// Logarithm of the chance that χ² of `dof` degrees of freedom is above `chi2`; a number where the chance itself is none any more.
+/// Logarithm of the probability that χ² of `dof` degrees of freedom is above `chi2`; finite where the probability
+/// underflows.
 #[must_use]
 pub fn ln_chi2_above(chi2: f64, dof: f64) -> f64 {
     let (a, x) = (0.5 * dof, 0.5 * chi2);
@@ -79,13 +80,13 @@ pub fn ln_chi2_above(chi2: f64, dof: f64) -> f64 {
     if x < a + 1.0 { (-series_below(a, x)).ln_1p() } else { ln_fraction_above(a, x) }
 }
 
-/// Chance that a normal number is so many σ from its mean or more, on either side.
+/// Probability that a normal number is so many σ from its mean or more, on either side.
 #[must_use]
 pub fn normal_tails(sigmas: f64) -> f64 {
     ln_chi2_above(sigmas * sigmas, 1.0).exp()
 }
 
-/// Chance of a χ²/dof at least as far out as this, on either side.
+/// Two-sided p-value of a χ²/dof.
 #[must_use]
 pub fn two_sided(per_dof: f64, dof: f64) -> f64 {
     let (below, above) = chi2_tails(per_dof, dof);
@@ -106,7 +107,7 @@ pub fn chi2_per_dof_quantile(p: f64, dof: f64) -> f64 {
     0.5 * (low + high)
 }
 
-/// Chance that the largest distance of a Brownian bridge from zero exceeds `x` (Kolmogorov 1933).
+/// Probability that the largest distance of a Brownian bridge from zero exceeds `x` (Kolmogorov 1933).
 #[must_use]
 pub fn kolmogorov(x: f64) -> f64 {
     // The alternating series needs many terms where the chance is one anyway.
@@ -117,7 +118,7 @@ pub fn kolmogorov(x: f64) -> f64 {
     (1..50).map(term).sum::<f64>().clamp(0.0, 1.0)
 }
 
-/// Chance of a p-value as small as `p` in the best of `tried`: `1 − (1 − p)^n`.
+/// p-value of the best of `tried` (Šidák): `1 − (1 − p)^n`.
 #[must_use]
 pub fn corrected(p: f64, tried: f64) -> f64 {
     (-(tried * (-p).ln_1p()).exp_m1()).clamp(0.0, 1.0)
@@ -127,8 +128,8 @@ pub fn corrected(p: f64, tried: f64) -> f64 {
 mod tests {
     use super::*;
 
-    /// Tables of χ²: P(χ²₁ > 3.841459) = 0.05, P(χ²₂ > 2 ln 100) = 0.01, P(χ²₂₀ < 10.85081) = 0.05, P(χ²₉ > 60) = 1.3378e-9, and
-    /// `P(χ²₂ > 2x) = e^{-x}` far out.
+    /// Tables of χ²: P(χ²₁ > 3.841459) = 0.05, P(χ²₂ > 2 ln 100) = 0.01, P(χ²₂₀ < 10.85081) = 0.05, P(χ²₉ > 60) =
+    /// 1.3378e-9, and `P(χ²₂ > 2x) = e^{-x}` far out.
     #[test]
     fn tails_are_those_of_the_tables() {
         let above = |chi2: f64, dof: f64| chi2_tails(chi2 / dof, dof).1;
@@ -136,7 +137,8 @@ mod tests {
         assert!((above(2.0 * 100f64.ln(), 2.0) - 0.01).abs() < 1e-12);
         assert!((chi2_tails(10.850_81 / 20.0, 20.0).0 - 0.05).abs() < 1e-6);
         assert!((above(120.0, 2.0) / (-60f64).exp() - 1.0).abs() < 1e-10);
-        // A hundred thousand degrees of freedom, two deviations up: the normal 0.022750 and Edgeworth's √(8/dof)/6 (z²−1) φ(z).
+        // A hundred thousand degrees of freedom, two deviations up: the normal 0.022750 and Edgeworth's √(8/dof)/6
+        // (z²−1) φ(z).
         let far = above(1e5 + 2.0 * (2e5f64).sqrt(), 1e5);
         assert!((far / (0.022_750 + 0.000_241) - 1.0).abs() < 1e-3, "{far}");
         for (p, dof) in [(0.025, 3.0), (0.975, 3.0), (0.5, 1e4)] {
@@ -144,10 +146,10 @@ mod tests {
         }
     }
 
-    /// Where the chance itself is no number any more its logarithm is: for two degrees of freedom `−χ²/2`, for one that of the
-    /// leading terms `e^{−χ²/2} √(2/(π χ²)) (1 − 1/χ²)`.
+    /// Where the probability underflows its logarithm is finite: for two degrees of freedom `−χ²/2`, for one that of
+    /// the leading terms `e^{−χ²/2} √(2/(π χ²)) (1 − 1/χ²)`.
     #[test]
-    fn a_chance_has_a_logarithm_however_small() {
+    fn the_logarithm_of_a_probability_is_finite_however_small() {
         let chi2: f64 = 4000.0;
         assert!((ln_chi2_above(chi2, 2.0) + 0.5 * chi2).abs() < 1e-9);
         let leading = -0.5 * chi2 - 0.5 * (std::f64::consts::FRAC_PI_2 * chi2).ln() + (-chi2.recip()).ln_1p();
@@ -157,7 +159,7 @@ mod tests {
     }
 
     #[test]
-    fn a_chance_is_corrected_for_all_trials() {
+    fn a_p_value_is_corrected_for_all_trials() {
         assert!((corrected(1e-6, 1000.0) - 1e-3).abs() < 1e-6);
         assert_eq!(corrected(0.5, 1e6), 1.0);
     }

@@ -1,13 +1,12 @@
-//! Sums over everything that might explain the data: channels, the model's series and those of every candidate, cut once.
+//! Gram matrices per band of channels, the model's series and those of every candidate: `Σ Re(x* xᵀ)` over segments.
 //!
-//! Per band the Gram matrix `Σ Re(x* xᵀ)` of all columns, by matrix products, so that any model made of them is solved and ranked
-//! without reading the data again. What the data of every second stretch of time say is kept apart from the rest: the
-//! two must not contradict each other about a cause.
+//! Any model made of these columns is solved from the sums without reading the data again. Alternate stretches of time
+//! are summed apart, so that a candidate can be tested for constancy on two interleaved halves.
 //!
-//! Time is cut twice. Segments of one length serve the bands from [`SLOW_HZ`] on; segments [`LONG`] times as long, of samples that
-//! [`crate::decimate`] has thinned out, serve those below, where heat, charge and drifts act and where a short segment sees nothing
-//! under its window's main lobe; a run shorter than one of them is one segment for the bins that its halves do not have. Series that
-//! are slow by their nature stand last and are in the long segments alone.
+//! Two lengths of segments cover the bands. Short ones serve those from [`SLOW_HZ`] on. Segments [`LONG`] times as
+//! long, of samples that [`crate::decimate`] has decimated, serve those below, where heat, charge and drifts act and
+//! which lie under the main lobe of a short window. A run shorter than a long segment is one segment for the bins that
+//! its halves do not have. Slow series stand last and are in the long segments alone.
 
 use std::ops::Range;
 
@@ -25,17 +24,17 @@ pub const LONG: usize = 16;
 /// Halvings of a long segment that make a short one.
 const HALVINGS: usize = LONG.ilog2() as usize;
 
-/// Transients are looked for in long segments, halves and quarters.
+/// Matched filters run in long segments, halves and quarters.
 const SHORTEST_LOOKED_AT: usize = 2;
 
-/// Thinned samples come at least this many times as often as [`SLOW_HZ`]: what folds there is then weaker by 1e7.
+/// Decimated samples come at least this many times as often as [`SLOW_HZ`]: aliases below it are then weaker by 1e7.
 const THIN: f64 = 6.0;
 
-/// Stretches of this length go to the first and the second set in turn, s: a choice, so that three hours have one of each. A long
-/// segment spans several and belongs to that of its middle.
+/// Stretches of this length belong to the first and the second half in turn, s, so that three hours have one of each. A
+/// long segment spans several and belongs to the half of its middle.
 const STRETCH_S: f64 = 1.5 * 3600.0;
 
-/// The map of where the model fails has one row for this time, ns.
+/// Time of one row of the maps of `compare`, ns.
 pub const HOUR_NS: i64 = 3_600_000_000_000;
 
 /// What the columns are, in the order in which they are handed in.
@@ -49,20 +48,20 @@ pub struct Columns {
     pub base: usize,
     /// All but the slow ones.
     pub fast: usize,
-    /// Of columns that stand last among those, and are not zero for a short time alone: what all of it would add to the diagonal of the
-    /// Gram matrix, per band. A window leaves a part of it, by the time at which it happens.
+    /// Energy per band of the waveforms, which stand last among those: what they would add to the diagonal of the Gram
+    /// matrix without a taper. A taper leaves a part of it that depends on their time.
     pub energy: Vec<Vec<f64>>,
 }
 
 impl Columns {
-    /// Energy per band of one that is not zero for a short time alone.
+    /// Energy per band of a waveform.
     #[must_use]
     pub fn energy_of(&self, column: usize) -> Option<&[f64]> {
         let first = self.fast.checked_sub(self.energy.len())?;
         self.energy.get(column.checked_sub(first)?).map(Vec::as_slice)
     }
 
-    /// Columns that take part in a band.
+    /// Number of columns in a band.
     fn active(&self, plan: &Plan, band: usize) -> usize {
         if plan.bin_hz(plan.bands[band].end as f64) <= SLOW_HZ { self.names.len() } else { self.fast }
     }
@@ -113,16 +112,16 @@ pub struct Hour {
     pub spectra: Spectra,
 }
 
-/// Everything that was gathered.
+/// All sums of some telemetry.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GramSums {
-    /// What the columns are.
+    /// Columns.
     pub columns: Columns,
     /// Samples of a short segment.
     pub length: usize,
     /// Samples per second.
     pub rate_hz: f64,
-    /// Sums of the first and the second set of stretches.
+    /// Sums of the two interleaved halves.
     pub sets: [Gram; 2],
     /// The base columns hour by hour, in the bands of short segments ([`Self::hour_plan`]).
     pub hours: Vec<Hour>,
@@ -154,7 +153,7 @@ impl GramSums {
     }
 }
 
-/// Gathers segments.
+/// Sums segments.
 pub struct GramAccumulator {
     /// Bands of the sums.
     whole: Plan,
@@ -168,7 +167,7 @@ pub struct GramAccumulator {
     segmenter: Segmenter,
     long: Plan,
     long_bench: SegmentTransform,
-    /// Grams from the diagonal down.
+    /// Gram matrices from the diagonal down.
     gathered: GramSums,
 }
 
@@ -257,8 +256,8 @@ fn add_square(g: &mut DMatrix<f64>, a: &DMatrixView<'_, f64>) {
 }
 
 impl GramAccumulator {
-    /// A gatherer of short segments of `length` samples. `coherence` is made for the plan of long segments; their housekeeping follows
-    /// the columns.
+    /// Sums short segments of `length` samples, and long ones. `coherence` is called with the plan of long segments;
+    /// housekeeping follows the columns.
     #[must_use]
     pub fn new(
         columns: Columns,
@@ -300,7 +299,7 @@ impl GramAccumulator {
         }
     }
 
-    /// What has been gathered.
+    /// The sums.
     #[must_use]
     pub fn finish(mut self) -> GramSums {
         let bands = self.gathered.sets.iter_mut().flat_map(|set| &mut set.bands);
@@ -330,7 +329,7 @@ impl GramAccumulator {
         }
     }
 
-    /// The thinned samples, and whoever takes their segments.
+    /// The decimator, and what takes segments of its samples.
     fn low(&mut self) -> (&mut Decimator, &mut Segmenter, Low<'_>) {
         let low = Low {
             response: self.decimator.response(),
@@ -351,7 +350,7 @@ pub(crate) fn whole_plan(length: usize, rate_hz: f64) -> Plan {
     Plan::slow(LONG * length, length, rate_hz)
 }
 
-/// The plan of long segments of thinned samples, and how many samples one of them stands for.
+/// The plan of long segments of decimated samples, and the factor of the decimation.
 pub(crate) fn low_plan(length: usize, rate_hz: f64) -> (Plan, usize) {
     let mut factor = 1;
     while (LONG * length).is_multiple_of(8 * factor) && rate_hz / (2 * factor) as f64 >= THIN * SLOW_HZ {
@@ -360,7 +359,7 @@ pub(crate) fn low_plan(length: usize, rate_hz: f64) -> (Plan, usize) {
     (Plan::slow(LONG * length / factor, length / factor, rate_hz / factor as f64), factor)
 }
 
-/// Which set a segment belongs to.
+/// The half that a segment belongs to.
 fn set_of(middle_ns: i64) -> usize {
     middle_ns.div_euclid((STRETCH_S * 1e9) as i64).rem_euclid(2) as usize
 }
@@ -450,7 +449,7 @@ impl Cuts for Low<'_> {
         self.look(even, Part::All, first_ns);
     }
 
-    /// What happens in the last hour of a run is under no other window but its edge.
+    /// The last hour of a run lies under no other window but its edge.
     fn tail(&mut self, first_ns: i64, columns: &[&[f64]]) {
         let columns = &columns[..self.gathered.columns.base];
         let samples = columns.first().map_or(0, |c| c.len());
@@ -465,12 +464,12 @@ impl Cuts for Low<'_> {
 }
 
 impl Low<'_> {
-    /// Step of the thinned samples, ns.
+    /// Step of the decimated samples, ns.
     fn step_ns(&self) -> i64 {
         (1e9 / self.long.rate_hz).round() as i64
     }
 
-    /// Spectra of the samples before they were thinned.
+    /// Spectra of the samples before the decimation.
     fn transform(&mut self, plan: &Plan, taper: usize, columns: &[&[f64]]) {
         let samples = columns.first().map_or(0, |c| c.len());
         self.bench.transform(plan, taper, columns);
@@ -480,7 +479,7 @@ impl Low<'_> {
         }
     }
 
-    /// For what happens transient, in the segment that was taken last.
+    /// Runs the matched filters on the segment that was transformed last.
     fn look(&mut self, samples: usize, part: Part, first_ns: i64) {
         let base = self.bench.base(self.gathered.columns.base);
         // A template begins with the first half of its first sample.
@@ -488,11 +487,10 @@ impl Low<'_> {
         self.search.segment(self.long, samples, part, first_ns, &base, &mut self.gathered.transients);
     }
 
-    /// A segment of the `taper`-th length of a plan whose bands begin as those of the sums; with the same for all samples, by which it
-    /// counts.
+    /// A segment of the `taper`-th length. `plans` are that of the decimated samples, whose lowest bands are those of
+    /// the sums, and that of all samples, which gives its weight.
     fn take(&mut self, plans: [&Plan; 2], taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
         let [plan, counted] = plans;
-        // What follows the columns are housekeeping values.
         let (columns, housekeeping) = columns.split_at(self.gathered.columns.names.len());
         self.transform(plan, taper, columns);
         let set = &mut self.gathered.sets[set_of(middle_ns(first_ns, columns, plan.rate_hz))];

@@ -1,4 +1,4 @@
-//! What was gathered, as bytes: a header in JSON, then every number as it is in memory.
+//! Sums as bytes: a header in JSON, then every number as it is in memory.
 
 use std::io::{self, Read, Write};
 
@@ -32,7 +32,7 @@ pub enum RecordError {
     /// Not ours, or damaged.
     #[error("the gathered sums are damaged ({0}): gather them again")]
     Damaged(&'static str),
-    /// Different questions.
+    /// Sums of different candidates, columns or segments.
     #[error(
         "the products were made with different {0}, so their sums do not add: diagnose products of one mission, model and pipeline together"
     )]

@@ -1,12 +1,12 @@
-//! Which cause is missing: every candidate against what the model leaves, from the sums alone.
+//! Score tests (Lagrange multiplier tests) of every candidate against the residuals of the model, from the sums alone.
 //!
-//! With the model fitted and Σ measured from its residuals, adding coefficients p to the fitted ones q lowers χ² by `sᵀ S⁻¹ s`,
-//! `s = c_p − N_pq θ_q`, `S = N_pp − N_pq N_qq⁻¹ N_qp`; all of it is linear in the Gram matrices, and exact for that Σ. Σ is that of
-//! the mission with its levels measured (see `dragfree_estimation::levels`) and has taken up a plain excess that nobody explains.
+//! With the model fitted, adding coefficients p to the fitted ones q lowers χ² by `sᵀ S⁻¹ s`, `s = c_p − N_pq θ_q`, `S
+//! = N_pp − N_pq N_qq⁻¹ N_qp`. All of it is linear in the Gram matrices, and exact for the Σ in use: that of the
+//! mission with its levels measured (`dragfree_estimation::levels`), which also absorbs an unexplained excess of power.
 //! Values beyond a coefficient's hard range are no explanation: χ² is taken at the best point inside.
 //!
-//! Shapes are scanned on the grid of the forms, and between neighbours by mixing the two, which for a lag or a resonance on a fine
-//! grid is an interpolation.
+//! Shape parameters are scanned on the grid of the forms. Between neighbours the series of the two are mixed, which on
+//! a fine grid of lags or resonances is an interpolation.
 
 use std::collections::BTreeMap;
 
@@ -19,19 +19,20 @@ use nalgebra::{Cholesky, DMatrix, DVector};
 use crate::candidates::{Candidate, CandidateSet};
 use crate::gram::{Gram, GramSums};
 
-/// How often Σ is measured from the residuals.
+/// Refinements of Σ from the residuals.
 const REFINEMENTS: usize = 3;
 
-/// Summits of the score over a grid of shapes from which a higher likelihood is looked for.
+/// Local maxima of the score over a grid of shapes from which the search for the highest likelihood starts.
 const SUMMITS: usize = 3;
 
-/// Projection above which two causes cannot be told apart.
+/// Correlation of two candidates, beside the model, above which the data cannot tell them apart.
 pub const CONFOUNDED: f64 = 0.95;
 
-/// A window that leaves less than the inverse of this of a waveform's energy leaves too little to judge it by.
-const MOST_WINDOWED: f64 = 4.0;
+/// The taper's loss of a waveform's energy is corrected up to this factor: with less left, its amplitude rests on too
+/// few samples.
+const MAX_TAPER_LOSS: f64 = 4.0;
 
-/// What is left of a candidate's information beside the model when it is called degenerate with it.
+/// A candidate is degenerate with the model if the model leaves less than this part of its information.
 const DEGENERATE: f64 = 0.02;
 
 /// A model fitted to the sums.
@@ -43,19 +44,19 @@ pub struct Fit {
     layout: Layout,
     /// Columns of the layout among all.
     columns: Vec<usize>,
-    /// What candidates are judged by: all data, and each set of stretches.
+    /// Scores over all data, and over each of the two interleaved halves.
     scores: Scores,
     halves: [Scores; 2],
 }
 
-/// A model solved.
+/// The solution of a model.
 struct Solved {
     layout: Layout,
     columns: Vec<usize>,
     estimate: Estimate,
 }
 
-/// A fit with an excess of power that nothing explains, under the Σ that the mission's noise has.
+/// A fit with an unexplained excess of power, under the mission's Σ, which has not absorbed the excess.
 pub struct WithoutExcess {
     /// The fit.
     pub plain: Fit,
@@ -74,46 +75,46 @@ pub struct Scored {
     pub value: DVector<f64>,
     /// Whether the free fit lies inside them.
     pub in_range: bool,
-    /// By how much χ² falls.
+    /// Fall of χ².
     pub delta_chi2: f64,
     /// Information of its coefficients beside the model.
     pub information: DMatrix<f64>,
-    /// By what the weights of the sums over- or understate the information, see [`CandidateScorer::window_corrected`].
+    /// Corrected over plain information, see [`CandidateScorer::window_corrected`].
     understated: f64,
-    /// Part of the information that the model leaves it.
+    /// Part of its information that the model leaves.
     pub left: f64,
-    /// By how much its absence moves each free coefficient of the fit.
+    /// Bias of each free coefficient of the fit while the candidate is missing.
     pub shift: DVector<f64>,
 }
 
 /// All candidates beside a fit.
 #[derive(Clone, Debug)]
 pub struct Ranked {
-    /// Each place of each effect in its best form, the best first.
+    /// Each instance of each effect in its best form, the best first.
     pub all: Vec<Scored>,
-    /// Forms that were tried, per effect; but for transients.
+    /// Forms that were tried, per effect, without transients.
     pub tried: BTreeMap<String, usize>,
-    /// Places of effects of which these data say nothing: what they are made of does not change, or the model has it already.
+    /// Instances without information in these data: their series do not vary, or the model contains the same already.
     pub unobservable: Vec<String>,
 }
 
 /// A candidate fitted to each half of the data.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Halves {
-    /// By how much χ² of each half falls with the values that the other gives. A half that knows little of a slow cause gives values
-    /// that are no good, and that is no evidence against the cause.
+    /// Fall of χ² of each half at the values fitted to the other (cross-validation). A negative one is no evidence
+    /// against a slow cause, of which a half may hold little information.
     pub gains: [f64; 2],
-    /// χ² of the difference of the two halves' values, one degree of freedom per coefficient: the evidence against it.
+    /// χ² of the difference of the two halves' values, one degree of freedom per coefficient: the test of constancy.
     pub difference_chi2: f64,
 }
 
-/// Everything that is asked of the sums.
+/// Scores candidates from the sums.
 pub struct CandidateScorer<'a> {
     /// Model and candidates.
     pub candidate_set: &'a CandidateSet,
     /// Sums.
     pub gathered: &'a GramSums,
-    /// Both sets together.
+    /// Both halves together.
     pub total: Gram,
     /// Noise of the mission.
     pub noise: &'a NoiseModel,
@@ -121,7 +122,7 @@ pub struct CandidateScorer<'a> {
     plan: Plan,
 }
 
-/// What a band needs: residual against columns, and the model's columns against columns, under `Σ⁻¹`.
+/// Inner products under `Σ⁻¹`, summed over bands: residuals with columns, and the model's regressors with columns.
 struct Scores {
     /// Column, channel: `Σ_b (residual · Σ⁻¹)`.
     residual: DMatrix<f64>,
@@ -129,9 +130,9 @@ struct Scores {
     model: Vec<DMatrix<f64>>,
     /// `N_qq⁻¹` with what surveys and ranges know.
     covariance: DMatrix<f64>,
-    /// Score of the free coefficients that ranges hold back.
+    /// Score of the free coefficients that stand at the end of a range.
     bound_score: DVector<f64>,
-    /// `Σ⁻¹` times what makes information of sums, per band.
+    /// Per band, `Σ⁻¹` times the weight that turns sums into information.
     weights: Vec<DMatrix<f64>>,
     theta: DVector<f64>,
 }
@@ -206,7 +207,7 @@ impl<'a> CandidateScorer<'a> {
         Scores { residual, model, covariance, bound_score: estimate.bound_score.clone(), weights, theta: theta.clone() }
     }
 
-    /// The mission's noise as a fit has it, beside residuals that some of the sums have.
+    /// Levels of the mission's noise beside the residual spectra `measured` of some of the sums.
     #[must_use]
     pub fn levels<'b>(&'b self, fit: &Fit, gram: &Gram, measured: &'b [DMatrix<f64>]) -> Levels<'b> {
         let unknowns = self.candidate_set.unknowns(&fit.added);
@@ -214,8 +215,8 @@ impl<'a> CandidateScorer<'a> {
         Levels::new(self.noise, &self.plan, &gram.weights, measured).coloured(&self.plan, &colours)
     }
 
-    /// Where Σ had to take up an excess: the fit as it stands without that. What explains the excess shows here, and so does what follows
-    /// it by chance.
+    /// The fit under a Σ that has not absorbed the excess of power; none where there is no excess. Under it the cause
+    /// of the excess scores high, and so does whatever correlates with the excess by chance.
     #[must_use]
     pub fn without_excess(&self, fit: &Fit) -> Option<WithoutExcess> {
         let measured = self.residual_psd(fit);
@@ -235,10 +236,10 @@ impl<'a> CandidateScorer<'a> {
         Some(WithoutExcess { plain, bands, observations })
     }
 
-    /// `−2 log` of the likelihood of the model with what was added, up to a constant of the data, where what it does not explain of an
-    /// excess in some bands is taken up; `fit` has the levels of the noise.
+    /// `−2 log` of the likelihood of the model with `added`, up to a constant of the data. In `bands` the noise absorbs
+    /// the excess that the model leaves; elsewhere it has the levels of `fit`.
     ///
-    /// It has a minimum where the excess is explained and one where it is taken up, and the lower one counts.
+    /// It has one minimum where the excess is explained and one where it is absorbed. The lower one is returned.
     ///
     /// # Errors
     /// As [`Self::fit`].
@@ -254,8 +255,8 @@ impl<'a> CandidateScorer<'a> {
         Ok(least)
     }
 
-    /// `−2 log` of the likelihood of the model with what was added, up to a constant of the data, with levels of the noise and what the
-    /// added ones colour.
+    /// `−2 log` of the likelihood of the model with `added`, up to a constant of the data, with fitted levels of the
+    /// noise and with the noise that `added` filter.
     ///
     /// # Errors
     /// As [`Self::fit`].
@@ -270,9 +271,9 @@ impl<'a> CandidateScorer<'a> {
         Ok(levels.deviance(&measured, &vec![false; self.plan.bands.len()]))
     }
 
-    /// Of a candidate that colours the noise, the form with the highest likelihood: the scores know nothing of the colour. From the forms
-    /// with the best scores to a neighbour on the grid of shapes, as long as one is better. `None` for
-    /// one that colours nothing.
+    /// The form of highest likelihood of a candidate that filters a noise process, which scores do not account for: a
+    /// hill climb on the grid of shapes from the local maxima of the score. `None` for a candidate that filters
+    /// nothing.
     ///
     /// # Errors
     /// As [`Self::fit`].
@@ -372,12 +373,12 @@ impl<'a> CandidateScorer<'a> {
     fn score(&self, scores: &Scores, candidate: Candidate) -> Option<Scored> {
         let own = self.between(&self.total, scores, &candidate, &candidate);
         let (score, with_model) = Self::against(scores, &candidate);
-        // What the lack of the candidate pushed to the end of its range comes back when the candidate is there: the solution stands at no
-        // optimum of the data, and a gain of 0.1 had looked like 0.3 beside an offset that it had moved by its whole box.
+        // The missing candidate may have pushed a coefficient to the end of its range, where the score of the data is
+        // not zero. Beside the candidate that coefficient moves back, so its score enters the candidate's.
         let score = score - &with_model * (&scores.covariance * &scores.bound_score);
         let information = &own - &with_model * &scores.covariance * with_model.transpose();
         let left = (0..own.nrows()).map(|i| information[(i, i)] / own[(i, i)]).fold(1.0, f64::min);
-        // A coefficient that nothing sees, or that the model has already.
+        // Unobservable, or contained in the model.
         if left.is_nan() || left <= 1e-9 {
             return None;
         }
@@ -394,7 +395,7 @@ impl<'a> CandidateScorer<'a> {
         Some(Scored { candidate, value, in_range, delta_chi2, information, understated: 1.0, left, shift })
     }
 
-    /// The part of what would be known of a candidate under some `Σ⁻¹` that comes from some of the bands.
+    /// The part of a candidate's information under the given `Σ⁻¹` that comes from `bands`.
     #[must_use]
     pub fn part_in(&self, fit: &Fit, inverses: &[DMatrix<f64>], candidate: &Candidate, bands: &[bool]) -> f64 {
         let kept = self.total.weights.equal_time_weights();
@@ -406,10 +407,9 @@ impl<'a> CandidateScorer<'a> {
         of(&here).component_div(&of(&weights)).mean()
     }
 
-    /// What a candidate is worth: bands that stand for little time count for what they are (see [`Spectra::equal_time_weights`]); and a waveform that
-    /// is over soon is as well known as if there were no window, wherever in a segment it lies. Its amplitude and the noise beside it
-    /// are windowed alike, while the sums' weights are right for what lasts: they would make its σ too small by 1.6 in the middle of
-    /// a segment that overlaps no other, and too large near its ends.
+    /// Corrects the information of a candidate for the weights of the sums. What lasts is weighted by the time that
+    /// each band covers ([`Spectra::equal_time_weights`] count all alike). A short waveform has the information of
+    /// least squares without a taper: signal and noise are tapered alike, so its position in a segment must not matter.
     fn window_corrected(&self, fit: &Fit, mut scored: Scored) -> Scored {
         let (weights, candidate) = (&self.total.weights, &scored.candidate);
         let equal_time = weights.equal_time_weights();
@@ -417,7 +417,7 @@ impl<'a> CandidateScorer<'a> {
         let energy = candidate.parts.iter().flat_map(|(_, form)| &form.terms).find_map(|t| {
             let energy = self.gathered.columns.energy_of(t.column)?;
             let windowed = self.total.bands.iter().zip(&equal_time).map(|(g, k)| g[(t.column, t.column)] * k);
-            Some(energy.iter().copied().zip(windowed).map(ratio).map(|r| r.min(MOST_WINDOWED)).collect())
+            Some(energy.iter().copied().zip(windowed).map(ratio).map(|r| r.min(MAX_TAPER_LOSS)).collect())
         });
         let lasts = || equal_time.iter().copied().zip(weights.kept()).map(|(e, k)| ratio((k, e)).min(1.0)).collect();
         let factors: Vec<f64> = energy.unwrap_or_else(lasts);
@@ -435,8 +435,8 @@ impl<'a> CandidateScorer<'a> {
         scored
     }
 
-    /// Every place of every effect that is not in the fit, in its best form; the best first. Also how many forms of each effect were
-    /// tried, and the names of those of which these data say nothing.
+    /// Every instance of every effect that is not in the fit, in its best form, the best first; with the number of
+    /// forms tried per effect, and the unobservable instances.
     #[must_use]
     pub fn rank(&self, fit: &Fit) -> Ranked {
         let scores = &fit.scores;
@@ -450,7 +450,7 @@ impl<'a> CandidateScorer<'a> {
             let forms = first.forms.len();
             let scored: Vec<Option<Scored>> =
                 (0..forms).map(|f| self.score(scores, self.candidate_set.candidate(&place, f))).collect();
-            // The search of transients counts its own trials.
+            // The matched filters count their own trials.
             if !first.transient {
                 *tried.entry(first.effect.clone()).or_default() += scored.iter().flatten().count();
             }
@@ -461,7 +461,7 @@ impl<'a> CandidateScorer<'a> {
                 }
                 continue;
             };
-            // There is nothing between two times.
+            // Forms of a transient differ in time and cannot be mixed.
             let best = if first.transient { best.clone() } else { self.between_neighbours(scores, &scored, best) };
             ranked.push(self.window_corrected(fit, best));
         }
@@ -488,7 +488,7 @@ impl<'a> CandidateScorer<'a> {
         winner
     }
 
-    /// What the two sets of stretches say of a candidate; `None` where one of them says nothing.
+    /// A candidate fitted to each half of the data; `None` where it is unobservable in one.
     #[must_use]
     pub fn held_out(&self, fit: &Fit, candidate: &Candidate) -> Option<Halves> {
         let judge = |set: usize| {
@@ -509,13 +509,13 @@ impl<'a> CandidateScorer<'a> {
         })
     }
 
-    /// Causes that the data cannot tell from `scored`, and coefficients of the model that it is degenerate with.
+    /// Candidates that the data cannot tell from `scored`, and a coefficient of the model that it is degenerate with.
     #[must_use]
     pub fn confounders(&self, fit: &Fit, scored: &Scored, ranked: &[Scored]) -> Vec<String> {
         let scores = &fit.scores;
         let direction = |s: &Scored| (Self::against(scores, &s.candidate).1.transpose() * &s.value, s.value.clone());
         let (model, value) = direction(scored);
-        // As the sums have it, like what is shared.
+        // Without the window correction, like `shared`.
         let norm = |s: &Scored, v: &DVector<f64>| v.dot(&(&s.information * v)) / s.understated;
         let mut names = Vec::new();
         for other in ranked.iter().filter(|o| o.candidate.name() != scored.candidate.name()) {
@@ -536,13 +536,13 @@ impl<'a> CandidateScorer<'a> {
         names
     }
 
-    /// Cross-spectra of the residuals of a fit, per band, over those expected of a PSD of one: a measured Σ.
+    /// Cross-spectra of the residuals of a fit per band, over those of white noise of unit PSD: a measured Σ.
     #[must_use]
     pub fn residual_psd(&self, fit: &Fit) -> Vec<DMatrix<f64>> {
         Self::residual(&self.total, &fit.layout, &fit.columns, &fit.estimate.theta)
     }
 
-    /// The same of each set of stretches.
+    /// The same of each half.
     #[must_use]
     pub fn residual_psd_of_sets(&self, fit: &Fit) -> [Vec<DMatrix<f64>>; 2] {
         let of = |gram: &Gram| Self::residual(gram, &fit.layout, &fit.columns, &fit.estimate.theta);
@@ -559,13 +559,12 @@ impl<'a> CandidateScorer<'a> {
     }
 }
 
-/// How far its one differing number is away, and the candidate.
+/// Distance in the one shape parameter that differs, and the candidate.
 type Neighbour<'a> = (f64, &'a Candidate);
 
-/// Candidates of the same place that differ in one number of their shape, the next below and above.
+/// Forms of the same instance that differ in one shape parameter: the next below and the next above.
 fn neighbours<'a>(of: &Candidate, all: impl Iterator<Item = &'a Candidate>) -> Vec<Neighbour<'a>> {
     let shape = &of.parts[0].1.shape;
-    // Of each number the next below and above.
     let mut nearest: BTreeMap<(&str, bool), Neighbour<'_>> = BTreeMap::new();
     for other in all {
         let theirs = &other.parts[0].1.shape;
@@ -645,8 +644,8 @@ mod tests {
         Form { shape, unit: "1".to_owned(), lower: None, upper: None, terms, colours: None }
     }
 
-    /// A model of one coefficient; pushes of either channel at one time as candidates, the second of both channels; and one that lasts
-    /// at the first's place.
+    /// A model of one coefficient. Candidates: transients at one time in the first channel, in both and in the second,
+    /// and a lasting cause at the first's instance.
     fn candidate_set() -> CandidateSet {
         let at = &[("at_ns", 1)];
         CandidateSet {
@@ -662,7 +661,7 @@ mod tests {
         }
     }
 
-    /// `size` of the waveform, and `push` of what lasts, which is like the model's own series to nine tenths.
+    /// `size` of the waveform, and `push` of the lasting series, whose correlation with the model's is 0.9.
     fn gathered(seed: u64, samples: usize, at: usize, size: f64, push: f64) -> GramSums {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         let mut white = || -> Vec<f64> { (0..samples).map(|_| StandardNormal.sample(&mut rng)).collect() };
@@ -700,7 +699,7 @@ mod tests {
         let text = include_str!("../../../fixtures/missions/taiji.toml");
         let value: toml::Value = toml::from_str(text).unwrap();
         let mission = Mission::from_json(&serde_json::to_string(&value).unwrap()).unwrap();
-        // The mission says nothing of such channels: their noise is white.
+        // The mission file has no noise for such channels: white.
         NoiseModel::new(&mission, &[("first", Measured::Directly), ("second", Measured::Directly)], 1.0).unwrap()
     }
 
@@ -709,9 +708,9 @@ mod tests {
         ranked.all.iter().find(of).unwrap_or_else(|| panic!("{instance} is not ranked")).clone()
     }
 
-    /// Wherever in a short segment an event lies, its σ is that of least squares over its four samples, `√(½/4)`, to a tenth; by the
-    /// weights of the sums alone it would be smaller, by a fifth at some times, as it lies in the middle of a long one. Its size lies within 4.5σ of the truth (false alarm 7e-6, eight
-    /// of them).
+    /// Wherever in a segment an event lies, its σ is that of least squares over its four samples, `√(½/4)`, to a tenth;
+    /// by the weights of the sums alone it would be smaller. Its size lies within 4.5σ of the truth (false alarm 7e-6,
+    /// eight times).
     #[test]
     fn an_event_has_the_error_of_least_squares_wherever_it_is() {
         let (candidate_set, noise) = (candidate_set(), noise());
@@ -729,9 +728,9 @@ mod tests {
         assert!(natural.iter().all(|x| *x < 0.95), "{natural:?}");
     }
 
-    /// What is missing pushes the model's coefficient, which is nothing, to nine tenths, and its range ends at one tenth: beside the candidate it
-    /// comes back, and the candidate has the size that it has where there is no range. Without that its size would be 0.91/0.19. Within 4.5σ,
-    /// twice (false alarm 1.4e-5).
+    /// The missing cause pushes the model's coefficient, whose truth is 0, to 0.9, and its range ends at 0.1. Beside
+    /// the candidate it moves back, and the candidate has the size that it has without a range; otherwise it would be
+    /// 0.91/0.19. Within 4.5σ, twice (false alarm 1.4e-5).
     #[test]
     fn what_a_range_holds_back_comes_back_beside_a_candidate() {
         let (mut candidate_set, noise) = (candidate_set(), noise());
@@ -753,8 +752,8 @@ mod tests {
         }
     }
 
-    /// What shares the waveform and nearly all channels is a confounder, whatever the windows leave of it; what acts on another channel
-    /// is none; and what lasts at the same place is ranked apart.
+    /// A candidate with the same waveform and nearly the same channels is a confounder, whatever the taper leaves of
+    /// it. One that acts on another channel is none, and a lasting cause of the same instance is ranked apart.
     #[test]
     fn an_event_is_told_from_what_it_can_be_told_from() {
         let (candidate_set, noise) = (candidate_set(), noise());
@@ -767,9 +766,9 @@ mod tests {
         assert_eq!(scorer.confounders(&fit, &one, &ranked.all), ["e:both"]);
         assert_eq!(scorer.confounders(&fit, &both, &ranked.all), ["e:one"]);
         assert!(ranked.all.iter().any(|s| !s.candidate.transient && s.candidate.instance == "one"));
-        // Forms of transients are counted by their search.
+        // Forms of transients are counted by the matched filters.
         assert_eq!(ranked.tried, BTreeMap::from([("e".to_owned(), 1)]));
-        // What was added is not ranked again, and leaves nothing of itself.
+        // What was added is not ranked again, and the residual no longer holds it.
         let fit = scorer.fit(&[one.candidate]).unwrap();
         let left = scorer.rank(&fit);
         assert!(left.all.iter().all(|s| s.candidate.instance != "one"));

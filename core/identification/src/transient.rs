@@ -1,13 +1,14 @@
-//! What happens transient: every template at every time, by the filter that is matched to it and to the noise.
+//! Detection of transients: for every template, at every time, the filter that is matched to it and to the noise.
 //!
-//! With residuals r whose spectrum is Σ and a template `T(f)` that begins at `t`, `n(t) = Σ_f Re T* Σ⁻¹ r e^{2πift}` is largest where
-//! it fits best; one inverse transform gives all times. Under a window w the noise of n is not the same at all times: with
-//! `u = Σ^{-1/2} T` in the time domain, of unit energy, its variance is `D V(t)`, `D = Σ_f T* Σ⁻¹ T`, `V(t) = Σ_s u²(s − t) w²(s)`, whether
-//! the filter is short against the window or rings through all of it. The significance is `n/√(D V)`.
+//! With residuals r whose spectrum is Σ and a template `T(f)` that begins at `t`, `n(t) = Σ_f Re T* Σ⁻¹ r e^{2πift}` is
+//! largest where it fits best; one inverse transform gives all times. Under a window w the noise of n is not the same
+//! at all times: with `u = Σ^{-1/2} T` in the time domain, of unit energy, its variance is `D V(t)`, `D = Σ_f T* Σ⁻¹
+//! T`, `V(t) = Σ_s u²(s − t) w²(s)`, whether the filter is short against the window or rings through all of it. The
+//! significance is `n/√(D V)`.
 //!
-//! A detection of the spacecraft stands out of broad noise and is looked for in short segments. What pushes a test mass for a minute is
-//! known by the velocity that is left, below 2 mHz, where a short segment sees nothing: it is looked for in long ones. How large it is,
-//! and whether it is the cause, is not said here: what is found becomes a candidate among all others (`crate::diagnosis`).
+//! A hit on the spacecraft stands out of broad-band noise and is detected in short segments. A push of a test mass for
+//! a minute leaves a velocity, whose information lies below 2 mHz, and is detected in long ones. Detections become
+//! candidates among all others; their amplitude and cause are decided there ([`crate::diagnosis`]).
 
 use std::collections::BTreeMap;
 use std::f64::consts::{PI, TAU};
@@ -23,28 +24,29 @@ use serde_json::{Map, Value};
 
 use crate::distributions::normal_tails;
 
-/// Significance below which a peak is not kept.
+/// Peaks of a lower significance are not kept.
 const LEAST: f64 = 5.0;
 
-/// Peaks of about this many σ are just certain. Noise behind a filter whose power has the mean squared frequency ν² crosses u upwards
-/// `ν T e^{−u²/2}` times in T (Rice, Bell Syst. Tech. J. 24, 46): as often as `√(2π) u ν T` independent normal numbers are above it.
+/// Level u, σ, at which trials are counted: about that of the weakest certain peak. Noise behind a filter whose power
+/// has the mean squared frequency ν² crosses u upwards `ν T e^{−u²/2}` times in T (Rice, Bell Syst. Tech. J. 24, 46):
+/// as often as `√(2π) u ν T` independent normal numbers exceed it.
 const LOUD: f64 = 6.0;
 
-/// Nothing is looked for where a segment's window leaves less than this of the noise's power: there is too little to weigh it
-/// against what else could have happened.
+/// Times where the taper leaves less than this part of the noise's power are skipped: other causes could not be told
+/// apart there.
 const LEAST_VARIANCE: f64 = 0.1;
 
 /// Median of the size of a standard normal number.
 const MEDIAN: f64 = 0.674_49;
 
-/// Peaks of one cause nearer than this are one, s: in short segments, and in long ones, where the filter of what is known below 2 mHz
-/// rings for half an hour on either side. A second, smaller event within it is not told.
+/// Peaks nearer than this to a higher one are part of it, s: in short segments, and in long ones, where a filter of the
+/// information below 2 mHz rings for half an hour on either side. A second, smaller event within it is not detected.
 const NEAR_S: [f64; 2] = [120.0, 1800.0];
 
 /// Peaks that are kept.
 const MOST: usize = 50;
 
-/// A short waveform of something, and how the channels answer.
+/// A short waveform, and the channels that respond to it.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Template {
     /// Effect.
@@ -63,7 +65,7 @@ pub struct Template {
     pub channels: Vec<(usize, f64, bool)>,
 }
 
-/// A template that was found.
+/// A template that was detected.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Detection {
     /// Effect.
@@ -82,7 +84,7 @@ pub struct Detection {
     pub significance: f64,
 }
 
-/// What was found.
+/// All detections.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Transients {
     /// Peaks, the loudest first.
@@ -92,7 +94,7 @@ pub struct Transients {
 }
 
 impl Transients {
-    /// Peaks that chance gives in fewer searches than this.
+    /// Peaks whose p-value over the whole search is below `chance`.
     pub fn certain(&self, chance: f64) -> impl Iterator<Item = &Detection> {
         self.detections.iter().filter(move |h| normal_tails(h.significance) * self.tried < chance)
     }
@@ -111,25 +113,25 @@ pub struct Search {
     templates: Vec<Template>,
     /// Residual of each channel as a combination of the base columns.
     residual: DMatrix<f64>,
-    /// Upper end of each band, Hz, and `Σ⁻¹` in it; nothing is looked at above.
+    /// Upper end of each band, Hz, and `Σ⁻¹` in it; filters end there.
     inverses: Vec<(f64, DMatrix<f64>)>,
     /// One of [`NEAR_S`].
     near_s: f64,
     threads: usize,
-    /// What segments of a length need, made for the first of each.
+    /// Filters for segments of a length, made for the first of each.
     prepared: BTreeMap<usize, Prepared>,
 }
 
-/// Where a segment is looked at: at the times at which no other segment is looked at.
+/// Times of a segment at which its filter outputs are used, so that each time is used once.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Part {
     /// Its middle half, where segments overlap by half.
     MiddleHalf,
-    /// All of it, as far as the window leaves something.
+    /// All of it, as far as the taper leaves enough power.
     All,
 }
 
-/// A template as the filter wants it.
+/// A matched filter.
 struct Filter {
     conjugate: Vec<Complex64>,
     /// `√D`, `D = Σ_f t`, `t = T* Σ⁻¹ T`.
@@ -145,7 +147,7 @@ struct Filter {
 /// Mean of a squared Hann window times two: the power of a segment's noise over that where the window is one.
 const WINDOW_POWER: f64 = 0.75;
 
-/// Templates as the filter wants them.
+/// The matched filters of all templates.
 struct Prepared {
     inverse: Arc<dyn ComplexToReal<f64>>,
     filters: Vec<Filter>,
@@ -154,8 +156,8 @@ struct Prepared {
 }
 
 impl Search {
-    /// Looks for `templates` in residuals made by `residual` (channels × base columns); `inverses` are the upper end of each band,
-    /// Hz, and `Σ⁻¹` in it.
+    /// Detects `templates` in residuals made by `residual` (channels × base columns); `inverses` are the upper end of
+    /// each band, Hz, and `Σ⁻¹` in it.
     #[must_use]
     pub fn new(templates: Vec<Template>, residual: DMatrix<f64>, inverses: Vec<(f64, DMatrix<f64>)>) -> Self {
         Self { templates, residual, inverses, near_s: NEAR_S[0], threads: 1, prepared: BTreeMap::new() }
@@ -167,7 +169,7 @@ impl Search {
         Self { threads: threads.max(1), ..self }
     }
 
-    /// The same for samples of which `factor` have become one, up to a frequency.
+    /// The same for samples decimated by `factor`, up to a frequency.
     #[must_use]
     pub fn thinned(&self, factor: usize, below_hz: f64) -> Self {
         let template = |t: &Template| Template {
@@ -252,7 +254,7 @@ impl Search {
         Prepared { filters: self.templates.iter().map(filter).collect(), inverse: fft.inverse, mean }
     }
 
-    /// What a template's matched filter makes of whitened residuals, bin by bin.
+    /// Output of a template's matched filter for whitened residuals, bin by bin.
     fn filtered(&self, plan: &Plan, n: usize, of: usize, white: &DMatrix<f64>, prepared: &Prepared) -> Vec<Complex64> {
         let mut spectrum = vec![Complex64::default(); n / 2 + 1];
         for (c, factor, averaged) in &self.templates[of].channels {
@@ -316,7 +318,8 @@ impl Search {
         self.prepared.insert(n, prepared);
     }
 
-    /// Looks for one template at some times of a segment of as many samples as `time` has; `None` where it cannot be seen.
+    /// Output of one filter at some times of a segment of as many samples as `time` has; `None` where the template is
+    /// unobservable.
     fn look(
         &self,
         plan: &Plan,
@@ -340,8 +343,9 @@ impl Search {
         }
         // The transform sums the bins of both signs.
         let significance = |k: usize| 0.5 * time[k] / (filter.deviation[k] * filter.root);
-        // Noise may be louder than Σ says. Its median does not see what happens a few times and is soon over; and what a peak
-        // leaves of the filtered power does not see what happens transient, however long it rings.
+        // Noise may exceed the mission's Σ. Two robust estimates of its level: the median of the output, which short
+        // events leave alone, and the power less that of the highest peak, which one event leaves alone however long it
+        // rings.
         let mut sizes: Vec<f64> = looked.iter().map(|k| significance(*k).abs()).collect();
         let half = sizes.len() / 2;
         let median = *sizes.select_nth_unstable_by(half, f64::total_cmp).1 / MEDIAN;
@@ -353,7 +357,7 @@ impl Search {
     }
 }
 
-/// What the search for one template saw in a segment.
+/// Output of one matched filter in a segment.
 struct MatchedFilterOutput {
     template: usize,
     /// Independent trials.
@@ -390,7 +394,7 @@ impl Transforms {
     }
 }
 
-/// Keeps a peak if no louder one is near.
+/// Keeps a peak if no higher one is near.
 fn keep(detections: &mut Vec<Detection>, template: &Template, near_s: f64, at_ns: i64, significance: f64) {
     let near = |h: &Detection| (h.at_ns - at_ns).abs() < (near_s * 1e9) as i64;
     if detections.iter().any(|h| near(h) && h.significance >= significance)
@@ -467,8 +471,8 @@ mod tests {
         found.detections
     }
 
-    /// At its sample or the next, by the right template, with the significance `size √8` of least squares (within 4σ, false alarm
-    /// 1e-4), in the middle of a segment; and nothing where there is nothing.
+    /// At its sample or the next, by the right template, with the significance `size √8` of least squares (within 4σ,
+    /// false alarm 1e-4), in the middle of a segment; and nothing where there is nothing.
     #[test]
     fn an_event_has_its_time_and_the_significance_of_least_squares() {
         let detection = &detections(1, 0.5, Part::MiddleHalf, (4.0, N / 2), 0.0)[0];
@@ -478,8 +482,8 @@ mod tests {
         assert!(detections(2, 0.5, Part::MiddleHalf, (0.0, 0), 0.0).is_empty());
     }
 
-    /// Through a filter that rings for a quarter of the segment an event is found all the same, however loud, in all of it; to a
-    /// period of the highest frequency that is left.
+    /// Through a filter that rings for a quarter of the segment an event is found all the same, however loud, in all of
+    /// it; to a period of the highest frequency that is left.
     #[test]
     fn an_event_that_rings_is_found_however_loud_it_is() {
         for (size, at) in [(15.0, 1500), (500.0, 1500), (30.0, 900), (500.0, 3200)] {
@@ -489,8 +493,8 @@ mod tests {
         }
     }
 
-    /// Noise has a variance of one in units of σ at every time, near the ends of a segment too, behind a filter that rings through a
-    /// quarter of it: 400 sets, each number within 4.5σ (false alarm 7e-6, three of them).
+    /// Noise has a variance of one in units of σ at every time, near the ends of a segment too, behind a filter that
+    /// rings through a quarter of it: 400 sets, each number within 4.5σ (false alarm 7e-6, three of them).
     #[test]
     fn noise_is_as_loud_at_the_ends_as_in_the_middle() {
         let (plan, search) = (Plan::new(N, 1.0), search(0.003));
@@ -515,7 +519,8 @@ mod tests {
         assert!(power.iter().all(|p| (p - 1.0).abs() < 4.5 * sigma), "{power:?}");
     }
 
-    /// White noise has a mean squared frequency of a twelfth of the rate's square: what is said of the number of trials is Rice's.
+    /// White noise has a mean squared frequency of a twelfth of the rate's square: what is said of the number of trials
+    /// is Rice's.
     #[test]
     fn trials_are_as_many_as_the_noise_has_crossings() {
         let mut search = search(0.5);
@@ -527,14 +532,14 @@ mod tests {
         assert!((found.tried / (TAU.sqrt() * LOUD * crossings) - 1.0).abs() < 0.01, "{}", found.tried);
     }
 
-    /// Through two bins alone it rings over the whole segment: the median of the filter's output is the event itself, and only what
-    /// its peak leaves tells that there is nothing else.
+    /// Through two bins alone it rings over the whole segment: the median of the filter's output is the event itself,
+    /// and only what its peak leaves tells that there is nothing else.
     #[test]
     fn an_event_that_rings_over_the_whole_segment_is_found() {
         assert!(!detections(3, 0.0012, Part::MiddleHalf, (500.0, AT), 0.0).is_empty());
     }
 
-    /// What goes on and on is no event.
+    /// A lasting wave is no event.
     #[test]
     fn a_wave_is_no_event() {
         for part in [Part::MiddleHalf, Part::All] {

@@ -1,4 +1,4 @@
-//! The waveform of something that happens transient, at a known time.
+//! Waveforms of transients at known times.
 
 use dragfree_estimation::spectra::{Band, Plan};
 
@@ -24,8 +24,8 @@ impl Waveform {
         time_ns.iter().map(mean).collect()
     }
 
-    /// `4 ∫ |K|² df` over each band of a plan, K its transform: what all of it, without a window, would add to the diagonal of the Gram
-    /// matrix. `averaged` where the columns are means of two samples.
+    /// `4 ∫ |K|² df` over each band of a plan, K its transform: what all of it, without a window, would add to the
+    /// diagonal of the Gram matrix. `averaged` where the columns are means of two samples.
     #[must_use]
     pub fn energy(&self, plan: &Plan, averaged: bool) -> Vec<f64> {
         let dt_s = plan.rate_hz.recip();
@@ -39,7 +39,8 @@ impl Waveform {
             (re * re + im * im) * dt_s * dt_s * mean
         };
         let band = |b: &Band| {
-            // By the midpoint rule; where the bands are wide a waveform has little that changes within a quarter of one.
+            // By the midpoint rule; where the bands are wide a waveform has little that changes within a quarter of
+            // one.
             let parts = b.bins().min(4);
             let (first, width) = (b.first as f64 - 0.5, b.bins() as f64 / parts as f64);
             let at = |i: usize| power(plan.bin_hz(first + (i as f64 + 0.5) * width));

@@ -11,7 +11,8 @@ use toml::Table;
 use crate::WorkflowError;
 use crate::replay::{Pass, Replay, What, noise, sum};
 
-/// Compares the data of products of one model with the mission's noise. `progress` is told the pass and the number of the product.
+/// Compares the data of products of one model with the mission's noise. `progress` is told the pass and the number of
+/// the product.
 ///
 /// # Errors
 /// [`WorkflowError`]: an input has changed, the products do not belong together, or there is too little data.
@@ -35,7 +36,8 @@ fn filters(stage: &Table) -> impl Iterator<Item = (&str, &Table, &Table)> {
     })
 }
 
-/// Readouts in one update of a stage's filters, their mean where these differ: each filter follows some bodies, each body has some axes.
+/// Readouts in one update of a stage's filters, their mean where these differ: each filter follows some bodies, each
+/// body has some axes.
 fn readouts_per_update(stage: &Table) -> Option<f64> {
     let axes = |name: &str| filters(stage).find(|(body, ..)| *body == name).map_or(0, |(.., octaves)| octaves.len());
     let followed = |(body, figures, _): (&str, &Table, &Table)| -> Vec<String> {
@@ -96,7 +98,8 @@ mod tests {
         text.concat().parse().expect("TOML")
     }
 
-    /// Two filters of three readouts have three an update, one filter of both bodies has six: with three its bounds were √2 too wide.
+    /// Two filters of three readouts have three an update, one filter of both bodies has six: with three its bounds
+    /// were √2 too wide.
     #[test]
     fn a_joint_filter_has_six_readouts_an_update() {
         assert_eq!(readouts_per_update(&stage(&[&["tm1"], &["tm2"]])), Some(3.0));

@@ -1,7 +1,7 @@
 //! Which effect is missing from the model of some products.
 //!
-//! The data are read twice: transients have to be detected before they can be weighed against what lasts. They are read once more
-//! where the shape of a candidate stands out that its effect can try in finer steps.
+//! The data are read twice: transients have to be detected before they can be weighed against what lasts. They are read
+//! once more where the shape of a candidate stands out that its effect can try in finer steps.
 
 use std::collections::BTreeMap;
 
@@ -18,8 +18,8 @@ use crate::replay::{FINE, Pass, Replay, What, noise, sum};
 /// Most transients that become candidates.
 const MOST_EVENTS: usize = 8;
 
-/// A transient becomes a candidate if a search of pure noise has as loud a peak with a smaller chance than this; whether it is certain
-/// is decided among the candidates.
+/// A transient becomes a candidate if a search of pure noise has as loud a peak with a smaller chance than this;
+/// whether it is certain is decided among the candidates.
 const WORTH_TRYING: f64 = 0.5;
 
 /// A detection within this of a louder one is its ringing in another window, ns.
@@ -66,7 +66,8 @@ pub fn diagnose(
 }
 
 impl Diagnosed {
-    /// Transients that were detected and are no part of the answer, the loudest first; without what rings beside a louder one.
+    /// Transients that were detected and are no part of the answer, the loudest first; without what rings beside a
+    /// louder one.
     #[must_use]
     pub fn unexplained_transients(&self) -> Vec<&Detection> {
         let seen = self.record.gathered.transients.certain(self.diagnosis.false_alarm_rate);

@@ -1,7 +1,8 @@
-//! The ladder of model revisions: how the error falls from one to the next, on the days of the fit and on days kept out of it.
+//! The ladder of model revisions: how the error falls from one to the next, on the days of the fit and on days kept out
+//! of it.
 //!
-//! χ² is that of the mission file's Σ, which is the same for every revision: with a Σ from the residuals each revision would be
-//! its own measure.
+//! χ² is that of the mission file's Σ, which is the same for every revision: with a Σ from the residuals each revision
+//! would be its own measure.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -57,8 +58,8 @@ pub struct Rung {
     pub revision: String,
     /// Parent as the products have it.
     pub parent: Option<String>,
-    /// Revision that changes are told from: the parent, or where it has no product, the one with most of these effects and no
-    /// other.
+    /// Revision that changes are told from: the parent, or where it has no product, the one with most of these effects
+    /// and no other.
     pub compared_with: Option<String>,
     /// Effects, `ID:INSTANCE`.
     pub effects: Vec<String>,
@@ -183,8 +184,8 @@ pub struct OverFitted {
 /// Sets the uncertainty beyond which a fall of χ² is told from different epochs.
 const SIGMAS: f64 = 3.0;
 
-/// Makes the ladder of `products`; `held_out` are products of `dragfree model fix` of those revisions on other days, `truth` gives
-/// the true value of a coefficient in its SI unit.
+/// Makes the ladder of `products`; `held_out` are products of `dragfree model fix` of those revisions on other days,
+/// `truth` gives the true value of a coefficient in its SI unit.
 ///
 /// # Errors
 /// [`LadderError`] says which product does not fit, and why.
@@ -414,8 +415,8 @@ fn fit<'a>(days: impl Iterator<Item = &'a Product>) -> Fit {
     let mut channels: Vec<(String, f64, f64)> = Vec::new();
     for product in days {
         let figures = weighed(product);
-        // Degrees of freedom lack what the stage estimated, of coefficients and of noise, and the sum over observations must not
-        // depend on that. Products of before tell these alone.
+        // Degrees of freedom lack what the stage estimated, of coefficients and of noise, and the sum over observations
+        // must not depend on that. Products of before tell these alone.
         let told = |f: &toml::Table| {
             let observations = float(f, "observations");
             if observations.is_nan() { float(f, "dof") + adopted(product).len() as f64 } else { observations }
@@ -456,7 +457,8 @@ fn fall(before: &Fit, after: &Fit, who: &str, notes: &mut Vec<String>) -> Option
         notes.push(format!("revisions {who} do not weigh the same channels, so their χ² cannot be compared"));
         return None;
     }
-    // A lag or a gap of a new column takes epochs away: per observation times observations, and what the others may hold.
+    // A lag or a gap of a new column takes epochs away: per observation times observations, and what the others may
+    // hold.
     let apart = (before.dof - after.dof).abs();
     let uncertainty = if apart < 1e-6 * after.dof { 0.0 } else { (2.0 * apart).sqrt() };
     if uncertainty > 0.0 {

@@ -1,6 +1,6 @@
-//! The jobs behind the commands: calibrate a day, compare the model with the data, diagnose what is missing, climb the ladder of
-//! models. Each takes options, the registry of plugins and a callback for progress, and gives values; none prints, knows a
-//! terminal or asks a clock.
+//! The jobs behind the commands: calibrate a day, compare the model with the data, diagnose what is missing, climb the
+//! ladder of models. Each takes options, the registry of plugins and a callback for progress, and gives values; none
+//! prints, knows a terminal or asks a clock.
 
 pub mod calibrate;
 pub mod compare;

@@ -1,5 +1,5 @@
-//! From the columns of a chain to sums: channels, the model's series, those of every candidate and housekeeping, cut into segments
-//! as rows come.
+//! From the columns of a chain to sums: channels, the model's series, those of every candidate and housekeeping, cut
+//! into segments as rows come.
 
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashSet};
@@ -154,7 +154,8 @@ impl ColumnSums {
             let nothing = DMatrix::zeros(sigma.nrows(), sigma.ncols());
             sigma.cholesky().map_or(nothing, |c| c.inverse())
         };
-        // Matched filters whiten with the mission's Σ: a Σ measured from these data has taken up the power of the transient.
+        // Matched filters whiten with the mission's Σ: a Σ measured from these data has taken up the power of the
+        // transient.
         let inverses =
             plan.bands.iter().map(|b| (plan.bin_hz(b.end as f64 - 0.5), inverse(plan.frequency_hz(*b)))).collect();
         let templates = if request.detected.is_some() { Vec::new() } else { templates };
@@ -273,7 +274,8 @@ impl ColumnSums {
     }
 }
 
-/// Residuals as combinations of the base columns, at the coefficients that the product's own sums give where there are some.
+/// Residuals as combinations of the base columns, at the coefficients that the product's own sums give where there are
+/// some.
 fn residual(
     reference: Option<&Path>,
     mission: &Mission,

@@ -230,7 +230,8 @@ fn other_channels_or_epochs_are_not_taken_for_a_better_model() {
     assert!(ladder.over_fitted.is_empty());
 }
 
-/// A stage that measures the noise band by band has fewer degrees of freedom than one that measures levels alone: of the same epochs.
+/// A stage that measures the noise band by band has fewer degrees of freedom than one that measures levels alone: of
+/// the same epochs.
 #[test]
 fn a_noise_measured_in_another_way_takes_no_epochs_away() {
     let with = |made: Made<'static>, noise: f64| Made { noise: Some(noise), ..made };

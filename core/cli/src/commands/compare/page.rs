@@ -90,7 +90,7 @@ pub(crate) fn page(c: &Comparison, names: &[String], meaning: Option<&str>) -> R
          between the dashed limits.",
         &lines(c, cumulative)?,
     );
-    out += "<h2>What goes with it</h2>\n<p>Housekeeping whose waveform goes with what is left over, below 50 mHz, by the part of the power that \
+    out += "<h2>What goes with it</h2>\n<p>Housekeeping that is coherent with what is left over, below 50 mHz, by the part of the power that \
             it shares in its best band. A place to look and no cause: currents of thrusters follow the commands, and these the noise.</p>\n";
     out += &bars(c);
     if !c.together.is_empty() {
