@@ -6,29 +6,23 @@
 
 use std::f64::consts::TAU;
 
+pub use dragfree_schema::Colour;
 use realfft::num_complex::Complex64;
-use serde::{Deserialize, Serialize};
 
 use crate::spectra::{Band, Plan};
 
 /// Points of a band at which a response is taken: a resonance may be narrower than the band.
 const POINTS: usize = 16;
 
-/// What a coefficient does to a process of the noise.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-pub struct Colour {
-    /// Name of the process, as [`crate::sigma::NoiseModel::process_names`] has it.
-    pub process: String,
-    /// `H(s)`, s in s⁻¹: coefficients of the numerator's polynomial, the constant first.
-    pub numerator: Vec<f64>,
-    /// The same of its denominator.
-    pub denominator: Vec<f64>,
+/// What a [`Colour`] does to the power of its process.
+pub trait ColourPower {
+    /// `|1 + cH|²` of the coefficient c, its mean over a band.
+    #[must_use]
+    fn power(&self, coefficient: f64, plan: &Plan, band: Band) -> f64;
 }
 
-impl Colour {
-    /// `|1 + cH|²`, its mean over a band.
-    #[must_use]
-    pub fn power(&self, coefficient: f64, plan: &Plan, band: Band) -> f64 {
+impl ColourPower for Colour {
+    fn power(&self, coefficient: f64, plan: &Plan, band: Band) -> f64 {
         let polynomial =
             |c: &[f64], s: Complex64| c.iter().rev().fold(Complex64::default(), |sum, c| sum * s + Complex64::from(*c));
         let at = |i: usize| {

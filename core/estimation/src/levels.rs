@@ -13,7 +13,7 @@ use std::ops::Range;
 
 use nalgebra::{Cholesky, DMatrix};
 
-use crate::colour::Colour;
+use crate::colour::{Colour, ColourPower};
 use crate::sigma::NoiseModel;
 use crate::spectra::{Plan, Spectra};
 use crate::verdict::chi2_per_dof_at;

@@ -7,7 +7,6 @@ use std::path::Path;
 
 use dragfree_engine::chain::{Chain, Sink};
 use dragfree_engine::examine::Wanted;
-use dragfree_estimation::colour;
 use dragfree_estimation::estimate::{Observed, Refinement, estimate_with};
 use dragfree_estimation::segments::{Segmenter, all_finite, longest_length};
 use dragfree_estimation::sigma::{BandNoise, Measured, NoiseModel};
@@ -21,7 +20,7 @@ use dragfree_identification::record::Record;
 use dragfree_identification::transient::{Detection, Search, Template};
 use dragfree_identification::waveform::Waveform;
 use dragfree_physics::mission::Mission;
-use dragfree_sdk::{Available, Coefficient, Colour, Column, Constraint, Response, Shape, Variant};
+use dragfree_sdk::{Available, Coefficient, Column, Constraint, Response, Shape, Variant};
 use nalgebra::DMatrix;
 
 use crate::WorkflowError;
@@ -412,11 +411,6 @@ fn candidate_set(available: &Available, channels: &[&Column], series: &Series, w
         responses.iter().filter_map(term).collect()
     };
     let unknown = |c: &Coefficient| {
-        let colour = |c: &Colour| colour::Colour {
-            process: c.process.clone(),
-            numerator: c.numerator.clone(),
-            denominator: c.denominator.clone(),
-        };
         let form = |shape: &Shape, responses: &[Response], unit: Option<&String>, range: Option<[f64; 2]>| Form {
             colours: None,
             shape: shape.iter().map(|(k, v)| (k.clone(), v.clone())).collect(),
@@ -427,14 +421,14 @@ fn candidate_set(available: &Available, channels: &[&Column], series: &Series, w
         };
         let forms = if !c.variants.is_empty() {
             let form = |v: &Variant| Form {
-                colours: v.colours.as_ref().map(colour),
+                colours: v.colours.clone(),
                 ..form(&v.shape, &v.responses, v.unit.as_ref(), v.range)
             };
             c.variants.iter().map(form).collect()
         } else {
             match series.responses.get(&c.name) {
                 Some(responses) => {
-                    let colours = c.colours.as_ref().map(colour);
+                    let colours = c.colours.clone();
                     vec![Form { colours, ..form(&c.shape, responses, None, None) }]
                 }
                 None if c.candidate => Vec::new(),

@@ -601,11 +601,7 @@ fn unknown(c: &Coefficient) -> Unknown {
         initial: c.initial,
         prior_sigma: c.prior_sigma,
         estimate: c.estimate,
-        colours: c.colours.as_ref().map(|c| dragfree_estimation::colour::Colour {
-            process: c.process.clone(),
-            numerator: c.numerator.clone(),
-            denominator: c.denominator.clone(),
-        }),
+        colours: c.colours.clone(),
     }
 }
 
