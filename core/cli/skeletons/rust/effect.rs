@@ -96,7 +96,7 @@ impl Effect for ForceByChannel {
         Ok(())
     }
 
-    // An effect with a memory, a lag or an integral, also has `save` and `load`.
+    // An effect with a memory, a lag or an integral, also has `state`, which visits it for saving and loading.
 }
 
 export_plugin!(effects: [ForceByChannel]);
