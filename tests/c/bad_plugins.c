@@ -4,10 +4,15 @@
  *   7 gives one row too few          8 fails in create                 9 a manifest that is no JSON
  *  10 a fatal error in mid-stream   11 a report with NaN and unknown keys   12 a report with a text for a number
  *  13 noise in a channel that nobody makes
+ *  21 prints to stdout              22 writes to memory that is not its own
+ *  23 aborts                       24 aborts in a thread of its own  25 never returns from create
+ *  26 says its own name in a failure
  */
 #include <dragfree/rows.h>
 #include <fenv.h>
+#include <pthread.h>
 #include <stdio.h>
+#include <unistd.h>
 
 typedef struct {
   dragfree_slot_v1 x;
@@ -43,6 +48,13 @@ static dragfree_status bad_link(void *self, const dragfree_link_v1 *link, dragfr
   return link->write(link->context, &copy);
 }
 
+#if BAD == 24
+static void *aborting(void *unused) {
+  (void)unused;
+  abort();
+}
+#endif
+
 static dragfree_status bad_process(void *self, const dragfree_inputs_v1 *inputs, struct ArrowArray *outputs,
                                    dragfree_error_v1 *error) {
   bad *s = self;
@@ -54,6 +66,18 @@ static dragfree_status bad_process(void *self, const dragfree_inputs_v1 *inputs,
   if (s->calls == 3) return say(error, DRAGFREE_FATAL, "the third batch is fatal");
 #elif BAD == 3
   if (s->calls % 2 == 0) return say(error, DRAGFREE_DISCARD, "not this one");
+#elif BAD == 21
+  printf("a plugin prints to stdout\n");
+  if (write(1, "a plugin writes to descriptor 1\n", 32) != 32) return say(error, DRAGFREE_ERROR, "no stdout");
+#elif BAD == 22
+  *(volatile int *)(intptr_t)8 = 1;
+#elif BAD == 23
+  abort();
+#elif BAD == 24
+  pthread_t thread;
+  if (!pthread_create(&thread, NULL, aborting, NULL)) pthread_join(thread, NULL);
+#elif BAD == 26
+  return say(error, DRAGFREE_ERROR, "bad: told twice");
 #elif BAD == 6
   fesetround(FE_UPWARD);
 #endif
@@ -95,6 +119,9 @@ static dragfree_status bad_create(uint32_t index, const dragfree_host_v1 *host, 
   (void)index;
   (void)host;
   (void)config;
+#if BAD == 25
+  for (;;) sleep(1);
+#endif
 #if BAD == 8
   return say(error, DRAGFREE_ERROR, "this plugin never comes to life");
 #endif

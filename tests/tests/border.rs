@@ -144,6 +144,72 @@ fn an_unexpected_report_of_a_stage_does_not_fail_later_ones() {
     assert_eq!(product["quality"]["counts"]["clumsy"]["reports"], 2, "preprocess and bad, {product}");
 }
 
+/// What a plugin prints goes to stderr, through its own library or the descriptor; stdout holds the product alone.
+#[test]
+fn what_a_plugin_prints_is_no_result() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    compile_plugin(dir.path(), "bad_plugins.c", "bad", &["-DBAD=21"]);
+    let pipeline = pipeline(dir.path(), "plugin = \"bad\"");
+    let output = expect(&mut run(dir.path(), &pipeline), 0);
+    let product: serde_json::Value = serde_json::from_slice(&output.stdout).expect("stdout is one JSON value");
+    assert_eq!(product["id"], "COM1B_2035-01-01_SC1_01_0001");
+    let stderr = String::from_utf8_lossy(&output.stderr);
+    for said in ["a plugin prints to stdout", "a plugin writes to descriptor 1"] {
+        assert!(stderr.contains(said), "{said}: {stderr}");
+    }
+}
+
+/// A crash ends the program by its signal, and the last words name the plugin.
+#[cfg(unix)]
+#[test]
+fn a_crash_names_the_plugin() {
+    for (way, said) in [
+        (22, "plugin bad: process: crashed: SIGSEGV"),
+        (23, "plugin bad: process: crashed: SIGABRT"),
+        (24, "while these plugins ran: bad: SIGABRT"),
+    ] {
+        let (code, stderr) = misbehaving(way);
+        assert_eq!(code, None, "way {way}: {stderr}");
+        assert!(stderr.contains(said), "way {way} should say {said}: {stderr}");
+    }
+}
+
+#[test]
+fn a_plugin_that_hangs_is_stopped_by_the_validator() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let library = compile_plugin(dir.path(), "bad_plugins.c", "bad", &["-DBAD=25"]);
+    let begun = std::time::Instant::now();
+    let mut command = dragfree(dir.path());
+    let result = json(command.args(["plugins", "validate", "--json", "--time-limit", "1.5"]).arg(&library), 1);
+    assert!(begun.elapsed().as_secs_f64() < 30.0, "one check was waited for, and not its default of a minute");
+    let checks = result["plugins"][0]["checks"].as_array().expect("checks");
+    let last = checks.last().expect("a check");
+    assert_eq!((checks.len(), &last["check"], &last["passed"]), (2, &"create".into(), &false.into()), "{result:#}");
+    assert!(last["detail"].as_str().is_some_and(|detail| detail.contains("after 1.5 s")), "{last}");
+}
+
+/// Two files of one id: the error names both, wherever the plugin is needed.
+#[test]
+fn one_id_in_two_libraries_is_an_error() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    compile_plugin(dir.path(), "bad_plugins.c", "bad", &["-DBAD=21"]);
+    compile_plugin(dir.path(), "bad_plugins.c", "worse", &["-DBAD=2"]);
+    let pipeline = pipeline(dir.path(), "plugin = \"bad\"");
+    let told = expect(&mut run(dir.path(), &pipeline), 1);
+    let told = String::from_utf8_lossy(&told.stderr).into_owned();
+    let list = json(dragfree(dir.path()).args(["plugins", "list", "--json", "--plugin-dir"]).arg(dir.path()), 1);
+    for text in [told, list["error"].to_string()] {
+        assert!(text.contains("libbad.so") && text.contains("libworse.so"), "{text}");
+    }
+}
+
+#[test]
+fn a_message_names_its_plugin_once() {
+    let (code, stderr) = misbehaving(26);
+    assert_eq!(code, Some(1));
+    assert!(stderr.contains("plugin bad: process: told twice"), "{stderr}");
+}
+
 #[test]
 fn a_discarded_batch_is_counted_as_lost() {
     let (code, stderr) = misbehaving(3);

@@ -33,9 +33,12 @@ pub(crate) struct Global {
     /// No progress, errors only
     #[arg(short, long, global = true, conflicts_with = "verbose")]
     pub(crate) quiet: bool,
-    /// Progress and logs on stderr; twice for more
+    /// Progress and log lines on stderr; twice for more
     #[arg(short, long, global = true, action = ArgAction::Count)]
     pub(crate) verbose: u8,
+    /// Write the log lines of -vv into a file, a JSON object a line
+    #[arg(long, global = true, value_name = "FILE")]
+    pub(crate) log_json: Option<PathBuf>,
     /// Colours
     #[arg(long, global = true, value_enum, default_value_t = Colour::Auto, value_name = "WHEN")]
     pub(crate) color: Colour,
@@ -60,6 +63,8 @@ pub(crate) enum Command {
         #[arg(long, value_name = "DIR", default_value = "dragfree-demo")]
         dir: PathBuf,
     },
+    /// Write the files of a new mission: mission, pipeline and model, with comments
+    Init(Init),
     /// Simulate telemetry: one file per day, the truth apart in DIR/truth/
     Simulate(Simulate),
     /// Open what `simulate --hidden` hid, check that it was not changed since, and score a diagnosis against it
@@ -86,6 +91,36 @@ pub(crate) enum Command {
     Model(Model),
     /// The error from model revision to revision, on days of the fit and on days kept out of it
     Ladder(Ladder),
+    /// Print what completes this command line in a shell
+    Completions {
+        /// Shell
+        #[arg(value_enum)]
+        shell: Shell,
+    },
+    /// Write the man pages
+    #[command(hide = true)]
+    Man {
+        /// Folder for the pages
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+    },
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Shell {
+    Bash,
+    Zsh,
+    Fish,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Init {
+    /// Folder for the files
+    #[arg(value_name = "DIR")]
+    pub(crate) folder: PathBuf,
+    /// Mission to start from: a file, or the name of one that comes with the program
+    #[arg(long, value_name = "MISSION", default_value = "taiji")]
+    pub(crate) mission: PathBuf,
 }
 
 /// What `simulate --help` ends with; the simulator has the last word, and a test compares.
@@ -106,7 +141,7 @@ Some have named shapes, as thermal:tm1.x=2e-12,lag_s=480. A question, as
 #[derive(Debug, Args)]
 #[command(after_help = EFFECTS)]
 pub(crate) struct Simulate {
-    /// Mission file
+    /// Mission file, or the name of one that comes with the program: taiji
     #[arg(value_name = "MISSION.toml")]
     pub(crate) mission: PathBuf,
     /// Folder for the telemetry
@@ -193,7 +228,7 @@ pub(crate) struct Run {
 /// What a run is linked from.
 #[derive(Debug, Args)]
 pub(crate) struct Chain {
-    /// Pipeline file
+    /// Pipeline file, or the name of one that comes with the program: science-mode
     #[arg(value_name = "PIPELINE.toml")]
     pub(crate) pipeline: PathBuf,
     /// Telemetry, in any order
@@ -279,6 +314,9 @@ pub(crate) struct Validate {
     /// File for a source that reads some; repeatable
     #[arg(long, value_name = "FILE")]
     pub(crate) file: Vec<PathBuf>,
+    /// Seconds after which a check that is not done is stopped
+    #[arg(long, value_name = "S", default_value_t = 60.0, value_parser = positive)]
+    pub(crate) time_limit: f64,
     /// One check, in this very process: what this command asks of its children
     #[arg(long, hide = true)]
     pub(crate) check: Option<String>,
@@ -304,7 +342,7 @@ pub(crate) struct NewPlugin {
     /// Folder to write [default: NAME]
     #[arg(long, value_name = "DIR")]
     pub(crate) out: Option<PathBuf>,
-    /// Folder of the SDK, for Rust [default: the one that this program was built from]
+    /// Folder of the SDK, for Rust [default: the one that came with this program]
     #[arg(long, value_name = "DIR", conflicts_with = "sdk_git")]
     pub(crate) sdk: Option<PathBuf>,
     /// Repository of the SDK, for Rust
@@ -421,6 +459,9 @@ pub(crate) struct ModelAdd {
     /// Standard deviation before any data, SI; repeatable
     #[arg(long, value_name = "[NAME=]SIGMA", value_parser = named_number)]
     pub(crate) prior_sigma: Vec<(Option<String>, f64)>,
+    /// Mission that the effect is tried with [default: the bundled one]
+    #[arg(long, value_name = "MISSION.toml")]
+    pub(crate) mission: Option<PathBuf>,
     /// Take effect and shape from the output of `dragfree diagnose --json`
     #[arg(long, value_name = "DIAGNOSIS.json")]
     pub(crate) from: Option<PathBuf>,
@@ -538,15 +579,19 @@ mod tests {
             "dragfree diagnose COM1B_2035-01-01_SC1_01_0001 b.toml --archive d --json",
             "dragfree design m.toml --pictures d --freeze c.toml",
             "dragfree config check p.toml",
+            "dragfree init d --mission taiji",
+            "dragfree completions zsh",
             "dragfree plugins list --json --plugin-dir a --plugin-dir b",
             "dragfree plugins inspect es-akf",
             "dragfree plugins validate libmy_effect.so --mission m.toml --set channel=hk.a --file a.dat --json",
+            "dragfree plugins validate es-akf --time-limit 2.5",
             "dragfree plugins new my-effect --kind effect --lang c --out d",
             "dragfree plugins new my-effect --kind stage --sdk ../core/sdk",
             "dragfree products list --json",
             "dragfree products show COM1B_2035-01-01_SC1_01_0001 --archive d --color never",
             "dragfree --threads 2 -q run p.toml",
             "dragfree -vv run p.toml",
+            "dragfree run p.toml --log-json l.jsonl",
             "dragfree model show m.toml --revision 2",
             "dragfree model log m.toml --json",
             "dragfree model add m.toml es-gain:tm1.y --set lag_s=480 --value 0.01 --prior-sigma 0.05",

@@ -33,6 +33,12 @@ pub(crate) enum Failure {
     /// There is no SDK to depend on.
     #[error("there is no SDK in {}; name its folder with --sdk, or its repository with --sdk-git", .0.display())]
     NoSdk(PathBuf),
+    /// A name of nothing that comes with the program.
+    #[error("there is no file {name}, and no {kind} `{name}` comes with dragfree; it has {known}")]
+    NoName { kind: &'static str, name: String, known: String },
+    /// A file is in the way.
+    #[error("{} is there already and stays as it is; name another folder", .0.display())]
+    Taken(PathBuf),
     /// A check that does not exist.
     #[error("there is no check {0}")]
     NoCheck(String),

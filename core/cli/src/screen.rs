@@ -170,7 +170,7 @@ pub(crate) fn listing(listing: &Listing, folder: &Path, paint: Paint) -> String 
 }
 
 /// Every plugin and every file that was refused.
-pub(crate) fn plugins(registry: &Registry, paint: Paint) -> String {
+pub(crate) fn plugins(registry: &Registry, clash: Option<&str>, paint: Paint) -> String {
     let heading = ["plugin", "kind", "version", "file"].map(str::to_owned).to_vec();
     let mut rows: Vec<_> = registry
         .plugins()
@@ -189,6 +189,9 @@ pub(crate) fn plugins(registry: &Registry, paint: Paint) -> String {
         let _ = writeln!(screen, "{} {}", paint.doubtful("refused:"), refused.path.display());
         screen += &text::labelled("", &refused.reason);
     }
+    if let Some(sentence) = clash {
+        screen += &text::labelled("error", sentence).replacen("error", &paint.bad("error"), 1);
+    }
     screen
 }
 
@@ -197,6 +200,9 @@ pub(crate) fn check(report: &CheckReport) -> String {
     let mut screen = text::labelled("pipeline", &report.pipeline);
     screen += &text::labelled("mission", &report.mission);
     screen += &text::labelled("model", &format!("revision {}: {}", report.model, report.coefficients.join(" ")));
+    if let Some(free) = report.free_bytes {
+        screen += &text::labelled("free", &format!("{:.1} GB where the archive is", free as f64 * 1e-9));
+    }
     screen.push('\n');
     let heading = ["plugin", "version", "reads", "writes"].map(str::to_owned).to_vec();
     let row = |node: &CheckedNode| {
@@ -224,7 +230,10 @@ pub(crate) fn manifest(kind: &str, manifest: &Manifest, library: &Path, paint: P
     }
     for parameter in &manifest.parameters {
         screen.push('\n');
-        let unit = if parameter.unit.is_empty() { String::new() } else { format!(" in {}", parameter.unit) };
+        let unit = match parameter.unit.as_str() {
+            "" | "1" => String::new(),
+            unit => format!(" in {unit}"),
+        };
         let _ = writeln!(screen, "{}  {}{unit}", paint.bold(&parameter.name), parameter.kind);
         screen += &text::labelled("", &parameter.help);
         screen += &text::labelled("default", &parameter.default.to_string());
@@ -277,7 +286,7 @@ pub(crate) fn listing_json(listing: &Listing) -> Value {
 }
 
 /// Every plugin and every file that was refused, as JSON.
-pub(crate) fn plugins_json(registry: &Registry) -> Value {
+pub(crate) fn plugins_json(registry: &Registry, clash: Option<&str>) -> Value {
     let plugins = registry.plugins().map(|found| {
         serde_json::json!({
             "id": found.info.manifest.id,
@@ -292,7 +301,7 @@ pub(crate) fn plugins_json(registry: &Registry) -> Value {
         .refused()
         .iter()
         .map(|refused| serde_json::json!({"path": refused.path.to_string_lossy(), "reason": refused.reason}));
-    serde_json::json!({"plugins": plugins.collect::<Vec<_>>(), "refused": refused.collect::<Vec<_>>()})
+    serde_json::json!({"plugins": plugins.collect::<Vec<_>>(), "refused": refused.collect::<Vec<_>>(), "error": clash})
 }
 
 #[cfg(test)]

@@ -89,6 +89,16 @@ pub(crate) fn labelled(label: &str, words: &str) -> String {
     lines.iter().map(|line| format!("{}\n", line.trim_end())).collect()
 }
 
+/// A word as a shell takes it.
+pub(crate) fn quoted(word: &str) -> String {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "-_./:=,+@".contains(c);
+    if !word.is_empty() && word.chars().all(plain) {
+        word.to_owned()
+    } else {
+        format!("'{}'", word.replace('\'', r"'\''"))
+    }
+}
+
 /// `216 000`.
 pub(crate) fn grouped(number: u64) -> String {
     let digits = number.to_string();
@@ -186,5 +196,14 @@ mod tests {
         assert_eq!(labelled("a", ""), "a\n");
         let text = wrapped(&"word ".repeat(40));
         assert!(text.lines().count() == 3 && text.lines().all(|line| width(line) <= WIDTH), "{text}");
+    }
+
+    #[test]
+    fn a_word_with_a_space_or_an_apostrophe_is_one_word_to_a_shell() {
+        for (word, expected) in
+            [("a/b-c_1.toml", "a/b-c_1.toml"), ("my demo", "'my demo'"), ("it's", r"'it'\''s'"), ("", "''")]
+        {
+            assert_eq!(quoted(word), expected);
+        }
     }
 }

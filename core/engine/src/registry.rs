@@ -49,7 +49,7 @@ pub enum RegistryError {
         near: String,
     },
     /// Two libraries have it.
-    #[error("{kind} `{id}` is in both {} and {}; remove one", first.display(), second.display())]
+    #[error("{kind} `{id}` is in both {} and {}; remove one of the files, or leave its folder out", first.display(), second.display())]
     Twice {
         /// What was wanted.
         kind: Kind,
@@ -77,7 +77,11 @@ impl Registry {
                 match Library::open(&path) {
                     // The same bytes under another name are the same plugin, not a second one.
                     Ok(library) if this.libraries.iter().any(|l| l.sha256 == library.sha256) => {}
-                    Ok(library) => this.libraries.push(Arc::new(library)),
+                    Ok(library) => {
+                        let plugins = library.plugins.len();
+                        tracing::debug!(path = %path.display(), sha256 = library.sha256, plugins, "opened");
+                        this.libraries.push(Arc::new(library));
+                    }
                     Err(BorderError::Refused { path, reason }) => this.refused.push(Refused { path, reason }),
                     Err(other) => this.refused.push(Refused { path, reason: other.to_string() }),
                 }
@@ -97,6 +101,14 @@ impl Registry {
     #[must_use]
     pub fn refused(&self) -> &[Refused] {
         &self.refused
+    }
+
+    /// That no two libraries have a plugin of one kind and id.
+    ///
+    /// # Errors
+    /// [`RegistryError::Twice`] names both files.
+    pub fn check_ids(&self) -> Result<(), RegistryError> {
+        self.plugins().try_for_each(|p| self.find(p.info.kind, &p.info.manifest.id).map(|_| ()))
     }
 
     /// A plugin by kind and id.

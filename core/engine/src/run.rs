@@ -199,7 +199,7 @@ pub fn check(registry: &Registry, options: &RunOptions) -> Result<CheckReport, E
             })
             .collect(),
         coefficients: chain.coefficients.iter().filter(|c| c.estimate).map(|c| c.name.clone()).collect(),
-        free_bytes: None,
+        free_bytes: free_bytes(&options.archive),
     })
 }
 
@@ -217,11 +217,13 @@ pub fn run(
     progress: &mut dyn FnMut(Progress),
 ) -> Result<Outcome, EngineError> {
     let setup = Setup::load(options)?;
+    let next_state = options.state_out.as_deref().map(NextState::begin).transpose()?;
     let state = options.state_in.as_ref().map(|path| read_state(path)).transpose()?;
     let resume_ns = state.as_ref().map(|s| chain::resumes_at_ns(s)).transpose()?;
     let mut feed = setup.feed(registry, options, window(options, resume_ns))?;
     let tables = feed.get().tables().to_vec();
     let mut chain = chain::build(registry, &setup.pipeline, &setup.mission, &setup.model, &tables, carry(options))?;
+    log(&setup, options, &chain);
     if let Some(state) = &state {
         chain.load(state)?;
     }
@@ -230,19 +232,37 @@ pub fn run(
     let covered = carry_all(feed.get(), &mut chain, &mut series, progress)?;
     let Some(covered) = covered else { return Err(EngineError::NoRows { files: options.files.clone() }) };
     // Before the ends are flushed, so that tomorrow goes on in the middle of the lags.
-    let state = options.state_out.as_ref().map(|path| Ok::<_, EngineError>((path, chain.save()?))).transpose()?;
+    let next_state = next_state.map(|next| next.write(&chain.save()?)).transpose()?;
     chain.finish(&mut series)?;
     let reports = chain.reports()?;
     series.finish()?;
     let summary = feed.get().summary()?;
     let draft = draft(&setup, options, &chain, &feed, summary, reports, &covered)?;
-    let written = writer.commit(&draft)?;
-    sources(&setup, options).write(&written.path)?;
+    sources(&setup, options).write(&writer.staged_unlisted(product::SOURCES))?;
     // After the product: a kill in between costs a second run of the day, never the day.
-    if let Some((path, bytes)) = state {
-        write_state(path, &bytes)?;
-    }
+    tracing::debug!(epochs_from_ns = covered.first_ns, epochs_to_ns = covered.last_ns, "every stage has reported");
+    let written = writer.commit_with(&draft, || next_state.map_or(Ok(()), NextState::place))?;
+    tracing::info!(id = written.product.id(), path = %written.path.display(), "archived");
     Ok(Outcome { product: written.product, path: written.path })
+}
+
+/// Tells what is about to run.
+fn log(setup: &Setup, options: &RunOptions, chain: &Chain) {
+    let coefficients = chain.coefficients.iter().filter(|c| c.estimate).count();
+    tracing::info!(
+        pipeline = setup.pipeline.name,
+        mission = setup.mission.name,
+        model = setup.model.identity().0,
+        plugins = chain.nodes.len(),
+        coefficients,
+        files = options.files.len(),
+        "linked"
+    );
+    for node in &chain.nodes {
+        let written: usize = node.writes.iter().map(|table| table.columns.len()).sum();
+        let version = &node.info.manifest.version;
+        tracing::debug!(plugin = node.name(), %version, columns_read = node.reads.len(), columns_written = written, "linked");
+    }
 }
 
 /// Rows that went into the chain.
@@ -287,16 +307,53 @@ fn read_state(path: &Path) -> Result<Vec<u8>, EngineError> {
     std::fs::read(path).map_err(|source| EngineError::Io { action: "read the state", path: path.to_owned(), source })
 }
 
-/// Writes the state beside itself and renames it: a kill leaves the old state or the new one.
-fn write_state(path: &Path, bytes: &[u8]) -> Result<(), EngineError> {
-    let io = |source| EngineError::Io { action: "write the state", path: path.to_owned(), source };
-    let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    std::fs::create_dir_all(folder).map_err(io)?;
-    let mut file = tempfile::NamedTempFile::new_in(folder).map_err(io)?;
-    std::io::Write::write_all(&mut file, bytes).map_err(io)?;
-    file.as_file().sync_all().map_err(io)?;
-    file.persist(path).map_err(|e| io(e.error))?;
-    std::fs::File::open(folder).and_then(|f| f.sync_all()).map_err(io)
+/// The state for the next day, written beside its place and renamed: a kill leaves the old state or the new one.
+struct NextState<'a> {
+    path: &'a Path,
+    folder: &'a Path,
+    file: tempfile::NamedTempFile,
+}
+
+impl<'a> NextState<'a> {
+    /// Opens the file, so that a place that cannot be written is refused before the day is read.
+    fn begin(path: &'a Path) -> Result<Self, EngineError> {
+        let io = |source| EngineError::Io { action: "write the state", path: path.to_owned(), source };
+        if path.is_dir() {
+            return Err(io(std::io::ErrorKind::IsADirectory.into()));
+        }
+        let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        std::fs::create_dir_all(folder).map_err(io)?;
+        Ok(Self { path, folder, file: tempfile::NamedTempFile::new_in(folder).map_err(io)? })
+    }
+
+    fn write(mut self, bytes: &[u8]) -> Result<Self, EngineError> {
+        let written = std::io::Write::write_all(&mut self.file, bytes).and_then(|()| self.file.as_file().sync_all());
+        written.map_err(|source| EngineError::Io { action: "write the state", path: self.path.to_owned(), source })?;
+        Ok(self)
+    }
+
+    fn place(self) -> Result<(), EngineError> {
+        let io = |source| EngineError::Io { action: "write the state", path: self.path.to_owned(), source };
+        self.file.persist(self.path).map_err(|e| io(e.error))?;
+        // The state is in its place; only a power failure could still take the rename back.
+        if let Err(error) = std::fs::File::open(self.folder).and_then(|f| f.sync_all()) {
+            tracing::warn!("the folder {} cannot be flushed to disk: {error}", self.folder.display());
+        }
+        Ok(())
+    }
+}
+
+/// Bytes left for this user where the archive is, or will be: in the nearest folder that exists.
+#[cfg(unix)]
+fn free_bytes(archive: &Path) -> Option<u64> {
+    let archive = std::path::absolute(archive).ok()?;
+    let space = rustix::fs::statvfs(archive.ancestors().find(|folder| folder.is_dir())?).ok()?;
+    Some(space.f_bavail.saturating_mul(space.f_frsize))
+}
+
+#[cfg(not(unix))]
+fn free_bytes(_archive: &Path) -> Option<u64> {
+    None
 }
 
 /// The time series beside the product; written only when a stage has any.

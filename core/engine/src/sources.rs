@@ -4,6 +4,7 @@ use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
 use crate::EngineError;
+use crate::product::SOURCES;
 
 /// Where the inputs of a product lay, in a file beside it that is no part of it: places change, content does not.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -24,13 +25,12 @@ pub struct Sources {
 
 impl Sources {
     fn path(product: &Path) -> PathBuf {
-        product.with_extension("sources.json")
+        product.with_extension(SOURCES)
     }
 
-    pub(crate) fn write(&self, product: &Path) -> Result<(), EngineError> {
-        let path = Self::path(product);
+    pub(crate) fn write(&self, path: &Path) -> Result<(), EngineError> {
         let text = serde_json::to_string_pretty(self).unwrap_or_default() + "\n";
-        std::fs::write(&path, text).map_err(|source| EngineError::Io { action: "write", path, source })
+        std::fs::write(path, text).map_err(|source| EngineError::Io { action: "write", path: path.to_owned(), source })
     }
 
     /// Reads them.

@@ -3,7 +3,7 @@
 use super::{Done, products};
 use crate::args::{Arguments, Global};
 use crate::failure::Failure;
-use crate::text::{self, Paint, labelled};
+use crate::text::{self, Paint, labelled, quoted};
 use crate::{bundled, truth};
 use clap::Parser as _;
 use dragfree_engine::product;
@@ -121,7 +121,7 @@ struct Story<'a> {
 
 impl Story<'_> {
     fn show(&self, text: &str) -> Result<(), Failure> {
-        if self.global.json { Ok(()) } else { crate::print(text).map_err(Failure::engine) }
+        if self.global.json { Ok(()) } else { crate::output::print(text).map_err(Failure::engine) }
     }
 
     fn say(&self, sentence: &str) -> Result<(), Failure> {
@@ -180,11 +180,13 @@ fn summary(diagnosis: &Value) -> String {
     let tried = text::grouped(diagnosis["tried"].as_u64().unwrap_or(0));
     let mut lines = labelled("verdict", &format!("{}, of {tried} forms of effects", word(&diagnosis["verdict"])));
     for found in diagnosis["candidates"].as_array().into_iter().flatten().filter(|c| c["accepted"] == true) {
-        let size = text::measured(number(&found["value"]), number(&found["sigma"]));
+        let (unit, factor) = text::readable_unit(found["unit"].as_str().unwrap_or_default());
+        let size = text::measured(number(&found["value"]) * factor, number(&found["sigma"]) * factor);
+        let size = format!("{size} {unit}");
         let (fall, chance) = (number(&found["delta_chi2"]), number(&found["p_value"]));
-        let unit = word(&found["unit"]);
         let name = format!("{}:{}", word(&found["effect"]), word(&found["instance"]));
-        lines += &labelled("missing", &format!("{name} = {size} {unit}, χ² falls by {fall:.0}, chance {chance:.1e}"));
+        lines +=
+            &labelled("missing", &format!("{name} = {}, χ² falls by {fall:.0}, chance {chance:.1e}", size.trim_end()));
         for (name, sigmas) in found["offset_shift_sigma"].as_object().into_iter().flatten() {
             let (shift_mm, sigmas) = (1e3 * number(&found["offset_shift_m"][name]), number(sigmas));
             if sigmas.abs() > 1.0 {
@@ -193,16 +195,6 @@ fn summary(diagnosis: &Value) -> String {
         }
     }
     lines
-}
-
-/// As a shell takes it.
-fn quoted(word: &str) -> String {
-    let plain = |c: char| c.is_ascii_alphanumeric() || "-_./:=,+@".contains(c);
-    if !word.is_empty() && word.chars().all(plain) {
-        word.to_owned()
-    } else {
-        format!("'{}'", word.replace('\'', r"'\''"))
-    }
 }
 
 /// Removes what an earlier demo made.
@@ -263,14 +255,5 @@ mod tests {
         fs::write(&path, "changed").expect("write");
         place(&path, "first").expect("left alone");
         assert_eq!(fs::read_to_string(&path).expect("read"), "changed");
-    }
-
-    #[test]
-    fn a_word_with_a_space_or_an_apostrophe_is_one_word_to_a_shell() {
-        for (word, expected) in
-            [("a/b-c_1.toml", "a/b-c_1.toml"), ("my demo", "'my demo'"), ("it's", r"'it'\''s'"), ("", "''")]
-        {
-            assert_eq!(quoted(word), expected);
-        }
     }
 }

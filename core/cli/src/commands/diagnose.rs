@@ -20,10 +20,10 @@ pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Resu
     if global.json {
         return Ok(Done::json(&serde_json::to_value(&diagnosed.diagnosis).map_err(Failure::engine)?));
     }
-    Ok(Done::new(screen(&diagnosed, command.top, paint)))
+    Ok(Done::new(screen(&diagnosed, command.top, &super::repeated(None, global), paint)))
 }
 
-fn screen(diagnosed: &Diagnosed, top: usize, paint: Paint) -> String {
+fn screen(diagnosed: &Diagnosed, top: usize, repeated: &str, paint: Paint) -> String {
     let Diagnosed { record, diagnosis: d } = diagnosed;
     let mut out = String::new();
     let verdict = match d.verdict.as_str() {
@@ -72,7 +72,7 @@ fn screen(diagnosed: &Diagnosed, top: usize, paint: Paint) -> String {
         let _ = writeln!(out, "  Near a gap or the end there is too little to weigh it: run two days' files as one.");
     }
     if let Some(f) = accepted.first() {
-        let _ = writeln!(out, "\nnext      dragfree model add MODEL.toml {}:{}", f.effect, f.instance);
+        let _ = writeln!(out, "\nnext      dragfree model add MODEL.toml {}:{}{repeated}", f.effect, f.instance);
     }
     for (name, reason) in &d.not_tried {
         let _ = writeln!(out, "not tried {name}: {reason}");
@@ -84,11 +84,11 @@ fn put(out: &mut String, f: &Found) {
     let _ = writeln!(out, "  {}:{}", f.effect, f.instance);
     let _ = writeln!(
         out,
-        "    {} = {:.4e} ± {:.1e} {}, χ² falls by {:.0}, chance {:.1e}{}",
+        "    {} = {:.4e} ± {:.1e}{}, χ² falls by {:.0}, chance {:.1e}{}",
         f.coefficient,
         f.value,
         f.sigma,
-        f.unit,
+        if f.unit == "1" { String::new() } else { format!(" {}", f.unit) },
         f.delta_chi2,
         f.p_value,
         if f.in_range { "" } else { ", at the end of its range" }

@@ -2,8 +2,10 @@
 
 mod compare;
 mod demo;
+mod describe;
 mod design;
 mod diagnose;
+mod init;
 mod ladder;
 mod model;
 mod new_plugin;
@@ -17,9 +19,9 @@ mod validate;
 
 use crate::args::{Arguments, Command, Config, Global};
 use crate::failure::Failure;
-use crate::text::Paint;
+use crate::text::{self, Paint};
 use dragfree_engine::registry::Registry;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// What a command leaves: text for stdout and the exit code.
 #[derive(Debug)]
@@ -43,6 +45,9 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
     let global = &arguments.global;
     match &arguments.command {
         Command::Demo { dir } => demo::execute(dir, global, paint),
+        Command::Init(command) => init::execute(command, global.json),
+        Command::Completions { shell } => describe::completions(*shell),
+        Command::Man { out } => describe::man(out),
         Command::Simulate(command) => simulate::execute(command, global),
         Command::Reveal(command) => reveal::execute(command, global, paint),
         Command::Design(command) => design::execute(command, global, paint),
@@ -57,8 +62,15 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
     }
 }
 
-/// The plugins of the folders asked for and of the program's own.
+/// The plugins of the folders asked for and of the program's own; two of one id are an error.
 fn registry(global: &Global) -> Result<Registry, Failure> {
+    let registry = discovered(global)?;
+    registry.check_ids().map_err(Failure::engine)?;
+    Ok(registry)
+}
+
+/// The same as they were found.
+fn discovered(global: &Global) -> Result<Registry, Failure> {
     let listed = std::env::var_os("DRAGFREE_PLUGIN_PATH").unwrap_or_default();
     let listed = std::env::split_paths(&listed).filter(|folder| !folder.as_os_str().is_empty());
     let mut folders: Vec<PathBuf> = global.plugin_dir.iter().cloned().chain(listed).collect();
@@ -77,6 +89,14 @@ fn own_folders() -> Vec<PathBuf> {
     };
     let installed = beside.join("../lib/dragfree");
     [beside, installed].into_iter().filter(|folder| folder.is_dir()).collect()
+}
+
+/// What a suggested command repeats of this one, so that it finds the same products and plugins; a space before each word.
+fn repeated(archive: Option<&Path>, global: &Global) -> String {
+    let archive = archive.into_iter().map(|folder| ("--archive", folder));
+    let plugins = global.plugin_dir.iter().map(|folder| ("--plugin-dir", folder.as_path()));
+    let word = |(flag, folder): (&str, &Path)| format!(" {flag} {}", text::quoted(&folder.to_string_lossy()));
+    archive.chain(plugins).map(word).collect()
 }
 
 /// Threads that may work: as asked for, or as many as the machine has.

@@ -5,8 +5,10 @@ use crate::args::{Global, Model as Command, ModelAdd, ModelFix};
 use crate::failure::Failure;
 use crate::text::{self, Paint, columns, labelled};
 use dragfree_engine::border::{Kind, Manifest, ParameterType};
-use dragfree_engine::config::{EffectEntry, Model, Prior, resolve_parameters};
+use dragfree_engine::config::{EffectEntry, Model, Prior};
+use dragfree_engine::registry::Found;
 use dragfree_engine::revisions::{self, Change, Committed, Edit, Log, Logged, Place, What};
+use dragfree_engine::validate::{Finding, Subject};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -21,11 +23,11 @@ pub(super) fn execute(command: &Command, global: &Global, paint: Paint) -> Resul
         Command::Add(command) => add(command, global, paint),
         Command::Remove { model, effect } => {
             let (id, instance) = split(effect);
-            change(model, json, paint, |edit| edit.remove(id, instance))
+            change(model, global, paint, |edit| edit.remove(id, instance))
         }
-        Command::Restore { model, revision } => change(model, json, paint, |edit| edit.restore(revision)),
-        Command::Commit { model } => change(model, json, paint, |_| Ok(())),
-        Command::Fix(command) => fix(command, json, paint),
+        Command::Restore { model, revision } => change(model, global, paint, |edit| edit.restore(revision)),
+        Command::Commit { model } => change(model, global, paint, |_| Ok(())),
+        Command::Fix(command) => fix(command, global, paint),
     }
 }
 
@@ -36,7 +38,7 @@ fn split(effect: &str) -> (&str, Option<&str>) {
 
 fn change(
     path: &Path,
-    json: bool,
+    global: &Global,
     paint: Paint,
     act: impl FnOnce(&mut Edit) -> Result<(), revisions::RevisionError>,
 ) -> Result<Done, Failure> {
@@ -44,10 +46,19 @@ fn change(
     let revision = edit.model().map(|m| m.revision.clone()).unwrap_or_default();
     act(&mut edit).map_err(Failure::engine)?;
     let committed = edit.commit().map_err(Failure::engine)?;
-    Ok(done(path, &revision, committed.as_ref(), json, paint))
+    Ok(done(path, &revision, committed.as_ref(), None, global, paint))
 }
 
-fn done(path: &Path, revision: &str, committed: Option<&Committed>, json: bool, paint: Paint) -> Done {
+/// What a command has made; `archive` where it read a product.
+fn done(
+    path: &Path,
+    revision: &str,
+    committed: Option<&Committed>,
+    archive: Option<&Path>,
+    global: &Global,
+    paint: Paint,
+) -> Done {
+    let json = global.json;
     let Some(made) = committed else {
         if json {
             let value =
@@ -79,7 +90,8 @@ fn done(path: &Path, revision: &str, committed: Option<&Committed>, json: bool, 
     let parent = made.parent.as_deref().map_or(String::new(), |parent| format!("{parent} → "));
     text += &format!("revision  {parent}{}\n", paint.bold(&made.revision));
     text += &format!("model     {}\nhistory   {}\n", path.display(), made.history.display());
-    text += &format!("next      dragfree run PIPELINE.toml FILE... --model {}\n", path.display());
+    let (model, repeated) = (text::quoted(&path.to_string_lossy()), super::repeated(archive, global));
+    text += &format!("next      dragfree run PIPELINE.toml FILE... --model {model}{repeated}\n");
     Done::new(text)
 }
 
@@ -111,11 +123,30 @@ fn add(command: &ModelAdd, global: &Global, paint: Paint) -> Result<Done, Failur
         entry.parameters.insert(name.clone(), parameter(manifest, name, value)?);
     }
     entry.check_instance(manifest).map_err(Failure::Usage)?;
-    let file = command.model.display().to_string();
-    resolve_parameters(&file, manifest, &entry.parameters).map_err(Failure::engine)?;
     priors(&mut entry, command)?;
-    let done = change(&command.model, global.json, paint, |edit| edit.add(&entry, &comment))?;
+    accepted(&found, &entry, command.mission.as_deref())?;
+    let done = change(&command.model, global, paint, |edit| edit.add(&entry, &comment))?;
     Ok(done)
+}
+
+/// Asks the effect itself whether it takes the parameters, and whether it has the coefficients that are given a prior.
+fn accepted(found: &Found, entry: &EffectEntry, mission: Option<&Path>) -> Result<(), Failure> {
+    let mission = super::validate::mission(mission)?;
+    let subject = Subject {
+        opened: &found.opened,
+        plugin: &found.info,
+        mission: &mission,
+        parameters: &entry.parameters,
+        files: &[],
+    };
+    let refused = |error: Finding| {
+        Failure::Usage(format!("{error}; tried with the mission {}, --mission names another", mission.name))
+    };
+    let Some(names) = subject.coefficients(&entry.instance).map_err(refused)? else { return Ok(()) };
+    match entry.prior.keys().find(|name| !names.contains(name)) {
+        Some(name) => Err(Failure::Usage(format!("{entry} has no coefficient `{name}`; it has {}", names.join(", ")))),
+        None => Ok(()),
+    }
 }
 
 /// A parameter's value as the plugin declares it: texts need no quotes, lists no brackets.
@@ -202,12 +233,12 @@ fn proposed(path: &Path, candidate: &Value) -> Result<EffectEntry, Failure> {
 /// Why the effect is there, for whoever reads the file.
 fn evidence(candidate: &Value) -> String {
     let number = |key: &str| candidate[key].as_f64().unwrap_or(f64::NAN);
-    let unit = word(&candidate["unit"]);
-    let size = text::measured(number("value"), number("sigma"));
-    format!("diagnosed: {size} {unit}, Δχ² {:.0}", number("delta_chi2"))
+    let (unit, factor) = text::readable_unit(word(&candidate["unit"]));
+    let size = format!("{} {unit}", text::measured(number("value") * factor, number("sigma") * factor));
+    format!("diagnosed: {}, Δχ² {:.0}", size.trim_end(), number("delta_chi2"))
 }
 
-fn fix(command: &ModelFix, json: bool, paint: Paint) -> Result<Done, Failure> {
+fn fix(command: &ModelFix, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let product = products::open(&command.product, &command.archive.folder)?.product;
     let out = command.out.clone().unwrap_or_else(|| command.model.with_extension("fixed.toml"));
     if out.canonicalize().ok().is_some_and(|out| command.model.canonicalize().ok() == Some(out)) {
@@ -224,8 +255,8 @@ fn fix(command: &ModelFix, json: bool, paint: Paint) -> Result<Done, Failure> {
     let mut edit = Edit::begin_or_new(&out).map_err(Failure::engine)?;
     edit.fix(&command.model, &product.model.revision, &values, &command.keep).map_err(Failure::engine)?;
     let committed = edit.commit().map_err(Failure::engine)?;
-    let mut made = done(&out, "", committed.as_ref(), json, paint);
-    if !json {
+    let mut made = done(&out, "", committed.as_ref(), Some(&command.archive.folder), global, paint);
+    if !global.json {
         made.text = format!("fixed     at the values of {} ({solution})\n", product.id()) + &made.text;
     }
     Ok(made)
@@ -441,6 +472,8 @@ mod tests {
         let entry = proposed(&path, &first).expect("an effect");
         assert_eq!(entry.to_string(), "thermal:tm1.x");
         assert_eq!(parameters(&entry), ["lag_s = 480.0", "from = \"hk.a\""]);
+        let number = json!({"value": 0.5, "sigma": 0.01, "unit": "1", "delta_chi2": 9.0});
+        assert_eq!(evidence(&number), "diagnosed: 0.500 ± 0.010, Δχ² 9", "the unit of a number is none");
         assert_eq!(evidence(&first), "diagnosed: (2.700 ± 0.040)e-12 m s-2 K-1, Δχ² 4175");
         assert_eq!(candidate(&path, None, Some(2)).expect("the second")["instance"], "tm2.y");
         assert_eq!(candidate(&path, Some("es-gain:tm2.y"), None).expect("by name")["instance"], "tm2.y");

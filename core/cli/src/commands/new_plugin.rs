@@ -3,10 +3,8 @@
 use crate::args::{Language, NewPlugin, PluginKind};
 use crate::commands::Done;
 use crate::failure::Failure;
-use std::path::{Path, PathBuf};
-
-/// Where this program's SDK was when the program was built.
-const SDK: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../sdk");
+use crate::installed;
+use std::path::PathBuf;
 
 macro_rules! skeleton {
     ($file:literal) => {
@@ -112,6 +110,12 @@ pub(super) fn execute(new: &NewPlugin, json: bool) -> Result<Done, Failure> {
         std::fs::write(&path, fill(text)).map_err(Failure::io("write", &path))?;
         written.push(path.to_string_lossy().into_owned());
     }
+    // The versions that the SDK was tested with.
+    if let (Language::Rust, None, Some(lock)) = (new.lang, &new.sdk_git, installed::sdk_lock()) {
+        let to = folder.join("Cargo.lock");
+        std::fs::copy(&lock, &to).map_err(Failure::io("write", &to))?;
+        written.push(to.to_string_lossy().into_owned());
+    }
     if json {
         return Ok(Done::json(&serde_json::json!({ "folder": folder.to_string_lossy(), "files": written })));
     }
@@ -130,12 +134,11 @@ fn sdk(new: &NewPlugin) -> Result<(String, String), Failure> {
     if let Some(url) = &new.sdk_git {
         return Ok((format!("git = {url:?}"), format!("the repository {url}")));
     }
-    let asked = new.sdk.as_deref().unwrap_or(Path::new(SDK));
+    let asked = new.sdk.clone().unwrap_or_else(installed::sdk);
     match asked.canonicalize() {
         Ok(path) if path.join("Cargo.toml").is_file() => {
             let shown = path.display().to_string();
-            let by =
-                if new.sdk.is_some() { "named when this was written" } else { "that this `dragfree` was built from" };
+            let by = if new.sdk.is_some() { "named when this was written" } else { "that came with this `dragfree`" };
             Ok((
                 format!("path = {shown:?}"),
                 format!("the folder `{shown}`, {by}; change it in `Cargo.toml` when it moves"),
@@ -143,6 +146,6 @@ fn sdk(new: &NewPlugin) -> Result<(String, String), Failure> {
         }
         // A C plugin needs the header alone.
         _ if new.lang == Language::C => Ok((String::new(), String::new())),
-        _ => Err(Failure::NoSdk(asked.to_owned())),
+        _ => Err(Failure::NoSdk(asked)),
     }
 }

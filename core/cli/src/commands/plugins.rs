@@ -9,8 +9,15 @@ use dragfree_engine::registry::Registry;
 
 pub(super) fn execute(command: &Plugins, global: &Global, paint: Paint) -> Result<Done, Failure> {
     match command {
-        Plugins::List if global.json => Ok(Done::json(&screen::plugins_json(&super::registry(global)?))),
-        Plugins::List => Ok(Done::new(screen::plugins(&super::registry(global)?, paint))),
+        Plugins::List => {
+            let registry = super::discovered(global)?;
+            let clash = registry.check_ids().err().map(|error| error.to_string());
+            let code = u8::from(clash.is_some());
+            if global.json {
+                return Ok(Done { code, ..Done::json(&screen::plugins_json(&registry, clash.as_deref())) });
+            }
+            Ok(Done { code, text: screen::plugins(&registry, clash.as_deref(), paint) })
+        }
         Plugins::Inspect { id } => inspect(&super::registry(global)?, id, global.json, paint),
         Plugins::Validate(validate) => super::validate::execute(validate, global, paint),
         Plugins::New(new) => super::new_plugin::execute(new, global.json),

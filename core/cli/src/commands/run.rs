@@ -24,7 +24,7 @@ pub(super) fn execute(command: &Run, global: &Global, paint: Paint) -> Result<Do
         return Ok(Done { code, ..Done::json(&product::to_json(&outcome.product, &outcome.path)) });
     }
     let mut text = screen::product(&outcome.product, &outcome.path, paint);
-    let _ = writeln!(text, "next      {}", next(&outcome.product, &command.chain.archive.folder));
+    let _ = writeln!(text, "next      {}", next(&outcome.product, &command.chain.archive.folder, global));
     Ok(Done { text, code })
 }
 
@@ -80,6 +80,6 @@ pub(super) fn code(product: &Product) -> u8 {
 }
 
 /// The command that shows the product again.
-pub(super) fn next(product: &Product, archive: &Path) -> String {
-    format!("dragfree products show {} --archive {}", product.id(), archive.display())
+pub(super) fn next(product: &Product, archive: &Path, global: &Global) -> String {
+    format!("dragfree products show {}{}", product.id(), super::repeated(Some(archive), global))
 }

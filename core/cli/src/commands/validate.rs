@@ -12,10 +12,8 @@ use serde_json::{Value, json};
 use std::io::Read as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitStatus, Stdio};
+use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
-
-/// A check that takes longer is taken for one that never ends.
-const LONGEST: Duration = Duration::from_secs(120);
 
 /// What a child's answer begins with; a plugin may print what it likes before it.
 const ANSWER: &str = "dragfree-check ";
@@ -39,8 +37,11 @@ pub(super) fn execute(validate: &Validate, global: &Global, paint: Paint) -> Res
                 let mut result = ask(validate, &path, check.name(), Some((&kind, &id)));
                 result["check"] = json!(check.name());
                 checks.push(result);
-                // Where it does not come to life, nothing else can be looked at.
-                if checks.last().is_some_and(|c| c["passed"] == false) && matches!(check, Check::Create | Check::Link) {
+                // Where it does not come to life or hangs, nothing else can be looked at.
+                let ends = |c: &Value| {
+                    c["stopped"] == true || c["passed"] == false && matches!(check, Check::Create | Check::Link)
+                };
+                if checks.last().is_some_and(ends) {
                     break;
                 }
             }
@@ -97,27 +98,35 @@ fn ask(validate: &Validate, path: &Path, check: &str, plugin: Option<(&str, &str
     for file in &validate.file {
         command.arg("--file").arg(file);
     }
-    match answer(command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped())) {
+    let limit = Duration::from_secs_f64(validate.time_limit);
+    match answer(command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped()), limit) {
         Ok((Some(status), stdout, stderr)) => {
             let line = stdout.lines().rev().find_map(|line| line.strip_prefix(ANSWER));
             let told = line.and_then(|line| serde_json::from_str(line).ok());
             told.unwrap_or_else(|| failed(format!("{}{}", ended(status), last_line(&stderr))))
         }
-        Ok((None, ..)) => failed(format!("was not done after {} s and was stopped", LONGEST.as_secs())),
+        Ok((None, ..)) => {
+            let detail =
+                format!("was not done after {} s and was stopped; --time-limit gives it longer", validate.time_limit);
+            json!({ "passed": false, "stopped": true, "detail": detail })
+        }
         Err(error) => failed(format!("cannot be run: {error}")),
     }
 }
 
 /// Status, where it ended in time, and what it wrote to stdout and stderr.
-fn answer(command: &mut Command) -> std::io::Result<(Option<ExitStatus>, String, String)> {
+fn answer(command: &mut Command, limit: Duration) -> std::io::Result<(Option<ExitStatus>, String, String)> {
     let mut child = command.spawn()?;
+    // A process that the plugin started may hold the pipes open after the child's end: nobody waits for their end alone.
     let read = |pipe: Option<Box<dyn std::io::Read + Send>>| {
+        let (sender, receiver) = std::sync::mpsc::channel();
         std::thread::spawn(move || {
             let mut bytes = Vec::new();
             // What was written until the pipe broke is what there is.
             let _ = pipe.map(|mut pipe| pipe.read_to_end(&mut bytes));
-            String::from_utf8_lossy(&bytes).into_owned()
-        })
+            let _ = sender.send(String::from_utf8_lossy(&bytes).into_owned()); // nobody may be waiting any more
+        });
+        receiver
     };
     let stdout = read(child.stdout.take().map(|pipe| Box::new(pipe) as _));
     let stderr = read(child.stderr.take().map(|pipe| Box::new(pipe) as _));
@@ -125,7 +134,7 @@ fn answer(command: &mut Command) -> std::io::Result<(Option<ExitStatus>, String,
     let status = loop {
         match child.try_wait()? {
             Some(status) => break Some(status),
-            None if begun.elapsed() > LONGEST => {
+            None if begun.elapsed() > limit => {
                 child.kill()?;
                 child.wait()?;
                 break None;
@@ -133,7 +142,7 @@ fn answer(command: &mut Command) -> std::io::Result<(Option<ExitStatus>, String,
             None => std::thread::sleep(Duration::from_millis(5)),
         }
     };
-    let text = |thread: std::thread::JoinHandle<String>| thread.join().unwrap_or_default();
+    let text = |pipe: Receiver<String>| pipe.recv_timeout(limit).unwrap_or_default();
     Ok((status, text(stdout), text(stderr)))
 }
 
@@ -191,7 +200,8 @@ fn told(answer: &Value) -> Done {
 }
 
 /// The mission given, or the bundled one.
-fn mission(path: Option<&Path>) -> Result<Mission, Failure> {
+/// The mission of a file, or the bundled one.
+pub(super) fn mission(path: Option<&Path>) -> Result<Mission, Failure> {
     if let Some(path) = path {
         return Mission::load(path).map_err(Failure::engine);
     }

@@ -7,8 +7,9 @@ use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
 use std::ffi::{CStr, CString, c_char, c_void};
 
+use super::crash::Name;
 use super::library::{Kind, Library, PluginInfo};
-use super::{BorderError, arrow, floats, read};
+use super::{BorderError, arrow, floats, read, without_name};
 use crate::table::{Batch, Column, TableSpec};
 
 /// What an instance is made from: the JSON object that `dragfree_config_v1` describes.
@@ -74,6 +75,8 @@ pub struct SourceStep {
 pub struct Instance {
     /// Id, with the instance of an effect: `com-offset:tm1`.
     pub name: String,
+    /// The same, for the last words of a crash.
+    crash_name: Name,
     /// What it is.
     pub kind: Kind,
     node: abi::NodeV1,
@@ -94,7 +97,7 @@ impl Drop for Instance {
     fn drop(&mut self) {
         if let Some(destroy) = self.node.destroy {
             // SAFETY: called once, in whatever state.
-            unsafe { destroy(self.node.self_) };
+            self.crash_name.during("destroy", || unsafe { destroy(self.node.self_) });
         }
     }
 }
@@ -498,7 +501,8 @@ impl Instance {
         let mut context = ConfigContext { value: &config.value, texts: Vec::new() };
         let raw = abi::ConfigV1 { context: (&raw mut context).cast(), json: json.as_ptr(), get_f64, get_text };
         let mut node = abi::NodeV1::empty();
-        guarded_call(&name, "create", |error| {
+        let crash_name = Name::of(&name);
+        guarded_call(crash_name, &name, "create", |error| {
             // SAFETY: every pointer lives during the call; the host and its name live as long as the node.
             unsafe { create(plugin.index, &raw const *host, &raw const raw, &raw mut node, error) }
         })?;
@@ -507,6 +511,7 @@ impl Instance {
         }
         Ok(Self {
             name,
+            crash_name,
             kind: plugin.kind,
             node,
             _host: host,
@@ -703,7 +708,7 @@ impl Instance {
             return Err(self.rule(call, "it failed before and must not be called again".to_owned()));
         }
         let node = self.node.self_;
-        let result = guarded_call(&self.name, call, |error| work(node, error));
+        let result = guarded_call(self.crash_name, &self.name, call, |error| work(node, error));
         self.dead = result.is_err();
         result
     }
@@ -747,6 +752,7 @@ impl Instance {
 /// Makes a call with an error buffer, watches the floating-point control word, and turns the status into a result:
 /// `Ok(false)` for a discarded batch.
 fn guarded_call(
+    name: Name,
     plugin: &str,
     call: &'static str,
     work: impl FnOnce(*mut abi::ErrorV1) -> abi::Status,
@@ -754,14 +760,15 @@ fn guarded_call(
     let mut text = [0u8; 4096];
     let mut error = abi::ErrorV1 { text: text.as_mut_ptr().cast(), capacity: text.len() };
     let before = floats::control_word();
-    let status = work(&raw mut error);
+    let status = name.during(call, || work(&raw mut error));
     if floats::control_word() != before {
         floats::restore(before);
         let what = "it changed the floating-point control word, which would change every later result".to_owned();
         return Err(BorderError::Rule { plugin: plugin.to_owned(), call, what });
     }
     let end = text.iter().position(|b| *b == 0).unwrap_or(text.len());
-    let message = String::from_utf8_lossy(&text[..end]).into_owned();
+    let message = String::from_utf8_lossy(&text[..end]);
+    let message = without_name(plugin, &message).to_owned();
     match status {
         abi::OK => Ok(true),
         abi::DISCARD => {

@@ -9,6 +9,7 @@ use std::mem::ManuallyDrop;
 use std::path::{Path, PathBuf};
 
 use super::BorderError;
+use super::crash::{self, Name};
 
 /// What a plugin is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -81,6 +82,13 @@ impl Library {
         let sha256 = hex(&Sha256::digest(&bytes));
         check_permissions(path).map_err(&refuse)?;
         check_lock(path, &sha256).map_err(&refuse)?;
+        crash::install();
+        Name::of(&path.to_string_lossy()).during("open", || Self::load(path, sha256))
+    }
+
+    /// Opens a file that was checked: what runs code of the library.
+    fn load(path: &Path, sha256: String) -> Result<Self, BorderError> {
+        let refuse = |reason: String| BorderError::Refused { path: path.to_owned(), reason };
         // SAFETY: opening a library runs its initialisers; the operator vouches for the plugin folder, and the checks
         // above refuse a file that somebody else could have changed.
         let library = unsafe { libloading::Library::new(path) }

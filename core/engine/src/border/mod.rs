@@ -4,6 +4,7 @@
 #![allow(unsafe_code, reason = "this module calls through the C border")]
 
 mod arrow;
+mod crash;
 mod floats;
 mod instance;
 mod library;
@@ -15,6 +16,13 @@ pub(crate) use library::hex;
 pub use library::{Kind, Library, PluginInfo};
 
 use std::path::PathBuf;
+
+/// A plugin's message without its own name in front, which every message is told with.
+pub(crate) fn without_name<'a>(plugin: &str, message: &'a str) -> &'a str {
+    let id = plugin.split_once(':').map_or(plugin, |(id, _)| id);
+    let rest = |name| message.strip_prefix(name).and_then(|rest| rest.strip_prefix(':'));
+    rest(plugin).or_else(|| rest(id)).map_or(message, str::trim_start)
+}
 
 /// What can go wrong at the border.
 #[derive(Debug, thiserror::Error)]

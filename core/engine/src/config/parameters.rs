@@ -31,7 +31,10 @@ pub fn resolve(file: &str, manifest: &Manifest, given: &toml::Table) -> Result<M
 }
 
 fn check(parameter: &Parameter, value: &toml::Value) -> Result<Value, String> {
-    let unit = if parameter.unit.is_empty() { String::new() } else { format!(" in {}", parameter.unit) };
+    let unit = match parameter.unit.as_str() {
+        "" | "1" => String::new(),
+        unit => format!(" in {unit}"),
+    };
     match parameter.kind {
         ParameterType::F64 => number(parameter, value)
             .map(Value::from)
@@ -112,7 +115,7 @@ mod tests {
             ("gian = 3", "`gian` is no parameter; it has gain, mode, list"),
             ("gain = 30", "from 0 to 10"),
             ("gain = nan", "finite"),
-            ("gain = \"3\"", "must be a finite number in 1"),
+            ("gain = \"3\"", "must be a finite number from 0 to 10"),
             ("mode = \"c\"", "one of a, b"),
             ("list = [1, inf]", "finite numbers"),
         ] {

@@ -19,6 +19,9 @@ use std::time::{Duration, Instant};
 /// A claim that stays longer is one that a killed writer left.
 const PATIENCE: Duration = Duration::from_secs(5);
 
+/// Suffix of the file that says where the inputs lay. No product lists it: places change, content does not.
+pub(crate) const SOURCES: &str = "sources.json";
+
 /// Revisions have four digits.
 const LAST_REVISION: u32 = 9999;
 
@@ -38,6 +41,7 @@ pub struct ProductWriter {
     archive: PathBuf,
     staging: tempfile::TempDir,
     staged: BTreeMap<String, PathBuf>,
+    beside: BTreeMap<String, PathBuf>,
 }
 
 impl ProductWriter {
@@ -49,7 +53,7 @@ impl ProductWriter {
         fs::create_dir_all(archive).map_err(ProductError::io("make the archive", archive))?;
         let staging = tempfile::Builder::new().prefix(".staging-").tempdir_in(archive);
         let staging = staging.map_err(ProductError::io("write in the archive", archive))?;
-        Ok(Self { archive: archive.to_owned(), staging, staged: BTreeMap::new() })
+        Ok(Self { archive: archive.to_owned(), staging, staged: BTreeMap::new(), beside: BTreeMap::new() })
     }
 
     /// Path at which the caller writes the file that will lie beside the product as `ID.suffix`.
@@ -59,11 +63,30 @@ impl ProductWriter {
         path
     }
 
+    /// The same for a file that the product does not list, since what it holds may change: where the inputs lay.
+    pub fn staged_unlisted(&mut self, suffix: &str) -> PathBuf {
+        let path = self.staging.path().join(suffix);
+        self.beside.insert(suffix.to_owned(), path.clone());
+        path
+    }
+
     /// Writes the product of `draft` as the next free revision of its day.
     ///
     /// # Errors
     /// [`ProductError`]; nothing is left in the archive then.
-    pub fn commit(mut self, draft: &Draft) -> Result<Written, ProductError> {
+    pub fn commit(self, draft: &Draft) -> Result<Written, ProductError> {
+        self.commit_with(draft, || Ok(()))
+    }
+
+    /// The same; `last_step` runs once every file has its name, and the product stays only if it succeeds.
+    ///
+    /// # Errors
+    /// [`ProductError`] or the error of `last_step`; nothing is left in the archive then.
+    pub fn commit_with<E: From<ProductError>>(
+        mut self,
+        draft: &Draft,
+        last_step: impl FnOnce() -> Result<(), E>,
+    ) -> Result<Written, E> {
         let stem = draft::stem(draft)?;
         self.attach(&draft.reports)?;
         let attachments = self.staged.iter().map(|(suffix, path)| seal(suffix, path));
@@ -88,7 +111,9 @@ impl ProductWriter {
             if next_free(&self.archive, &stem, revision)? == revision {
                 let supersedes = superseded(&self.archive, &stem, draft, &attachments)?;
                 let product = draft::product(draft, revision, attachments, supersedes)?;
-                let path = self.place(&product)?;
+                let (placed, path) = self.place(&product)?;
+                last_step()?;
+                placed.keep();
                 drop(claim);
                 return Ok(Written { product, path });
             }
@@ -106,7 +131,7 @@ impl ProductWriter {
                 if !suffix.starts_with(|c: char| c.is_ascii_lowercase()) || !suffix.chars().all(plain) {
                     return Err(refuse("a suffix is lower-case letters, digits, '.', '-' and '_', a letter first"));
                 }
-                if suffix == "toml" || self.staged.contains_key(suffix) {
+                if suffix == "toml" || self.staged.contains_key(suffix) || self.beside.contains_key(suffix) {
                     return Err(refuse("that file exists already"));
                 }
                 let path = self.staged(suffix);
@@ -116,8 +141,8 @@ impl ProductWriter {
         Ok(())
     }
 
-    /// Gives every staged file its name, the product last.
-    fn place(&self, product: &Product) -> Result<PathBuf, ProductError> {
+    /// Gives every staged file its name, the product last; the names are taken away again unless they are kept.
+    fn place(&self, product: &Product) -> Result<(Placed, PathBuf), ProductError> {
         let staged = self.staging.path().join("product.toml");
         let text = product.emit()?;
         let mut file = File::create_new(&staged).map_err(ProductError::io("write", &staged))?;
@@ -128,15 +153,14 @@ impl ProductWriter {
             return Err(ProductError::Damaged { path: staged, reason: "it does not read as it was written".into() });
         }
         let mut placed = Placed::default();
-        for (suffix, from) in &self.staged {
+        for (suffix, from) in self.staged.iter().chain(&self.beside) {
             placed.link(from, self.archive.join(format!("{}.{suffix}", product.id())))?;
         }
         sync_folder(&self.archive)?;
         let path = self.archive.join(format!("{}.toml", product.id()));
         placed.link(&staged, path.clone())?;
         sync_folder(&self.archive)?;
-        placed.keep();
-        Ok(path)
+        Ok((placed, path))
     }
 }
 
@@ -342,7 +366,9 @@ pub fn list(archive: &Path) -> Result<Listing, ProductError> {
     for name in names.iter().filter(|name| !name.ends_with(".toml")) {
         let owned = |entry: &Entry| {
             let suffix = name.strip_prefix(entry.product.id()).and_then(|rest| rest.strip_prefix('.'));
-            suffix.is_some_and(|suffix| entry.product.attachments.iter().any(|file| file.suffix == suffix))
+            suffix.is_some_and(|suffix| {
+                suffix == SOURCES || entry.product.attachments.iter().any(|file| file.suffix == suffix)
+            })
         };
         if !listing.entries.iter().any(owned) {
             let reason = "belongs to no sound product; a run that was stopped may have left it".to_owned();
@@ -383,10 +409,17 @@ pub fn find(archive: &Path, id: &str) -> Result<Entry, ProductError> {
     let id = id.strip_suffix(".toml").unwrap_or(id);
     let path = archive.join(format!("{id}.toml"));
     let day = id.parse::<NaiveDate>().is_ok();
-    let listing = list(archive)?;
-    let found = listing.entries.into_iter().rev().find(|entry| {
+    let mut entries = list(archive)?.entries;
+    entries.retain(|entry| {
         entry.path == path || entry.stem() == id || (day && entry.product.header.non_standard_attributes.day == id)
     });
+    let of_other_series = |entry: &&Entry| entries.last().is_some_and(|last| last.series() != entry.series());
+    if entries.iter().any(|entry| of_other_series(&entry)) {
+        let mut stems: Vec<String> = entries.iter().map(|entry| entry.stem().to_owned()).collect();
+        stems.dedup();
+        return Err(ProductError::Several { day: id.to_owned(), folder: archive.to_owned(), stems: stems.join(", ") });
+    }
+    let found = entries.pop();
     match found {
         Some(entry) => Ok(entry),
         None if path.is_file() => {

@@ -5,6 +5,7 @@ use super::file::{
     Attachment, Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Loss, Model,
     NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Supersedes, Variable,
 };
+use crate::border::without_name;
 use chrono::{DateTime, NaiveDate, SecondsFormat, Utc};
 use dragfree_schema::Report;
 use std::collections::{BTreeMap, BTreeSet};
@@ -168,7 +169,7 @@ fn quality(draft: &Draft) -> Quality {
     let reported =
         |report: &Report| (!report.counts.is_empty()).then(|| (report.plugin.clone(), report.counts.clone()));
     let note = |report: &Report| -> Vec<String> {
-        report.notes.iter().map(|note| format!("{}: {note}", report.plugin)).collect()
+        report.notes.iter().map(|note| format!("{}: {}", report.plugin, without_name(&report.plugin, note))).collect()
     };
     let figures =
         |report: &Report| (!report.quality.is_empty()).then(|| (report.plugin.clone(), table(&report.quality)));

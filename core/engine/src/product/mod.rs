@@ -12,6 +12,7 @@ mod emit;
 mod file;
 mod json;
 
+pub(crate) use archive::SOURCES;
 pub use archive::{Entry, Listing, Problem, ProductWriter, Written, find, list};
 pub use draft::Draft;
 pub use file::{
@@ -109,6 +110,16 @@ pub enum ProductError {
         id: String,
         /// Archive.
         folder: PathBuf,
+    },
+    /// A day alone does not say which product is meant.
+    #[error("{} has several products of {day}: name one of {stems}", folder.display())]
+    Several {
+        /// Day asked for.
+        day: String,
+        /// Archive.
+        folder: PathBuf,
+        /// Ids without revision, by comma.
+        stems: String,
     },
     /// All revisions of that day are used up.
     #[error("all 9999 revisions of {0} are taken; raise the release in the pipeline file")]

@@ -104,6 +104,47 @@ fn a_product_reads_as_it_was_written() {
 }
 
 #[test]
+fn a_failed_last_step_leaves_nothing() {
+    let folder = tempfile::tempdir().expect("folder");
+    let mut writer = ProductWriter::begin(folder.path()).expect("begin");
+    std::fs::write(writer.staged_unlisted("sources.json"), "{}").expect("written");
+    let refused = ProductError::Time(7);
+    let error = writer.commit_with(&draft(0.0909), || Err(refused)).expect_err("the last step failed");
+    assert!(matches!(error, ProductError::Time(7)), "{error}");
+    assert_eq!(visible(folder.path()), Vec::<String>::new());
+    let mut writer = ProductWriter::begin(folder.path()).expect("begin");
+    std::fs::write(writer.staged_unlisted("sources.json"), "{}").expect("written");
+    writer.commit(&draft(0.0909)).expect("committed");
+    assert_eq!(visible(folder.path()).len(), 3, "product, attachment, sources");
+    assert!(list(folder.path()).expect("list").problems.is_empty(), "the sources of a product are no leftover");
+}
+
+#[test]
+fn a_day_of_two_spacecraft_is_asked_about() {
+    let folder = tempfile::tempdir().expect("folder");
+    let other = Draft { spacecraft: "SC2".into(), ..draft(0.1) };
+    for draft in [&draft(0.0909), &draft(0.0910), &other] {
+        write(folder.path(), draft);
+    }
+    let error = find(folder.path(), "2035-01-01").expect_err("which one?").to_string();
+    assert!(error.contains("name one of COM1B_2035-01-01_SC1_01, COM1B_2035-01-01_SC2_01"), "{error}");
+    let one = find(folder.path(), "COM1B_2035-01-01_SC1_01").expect("the latest of one spacecraft");
+    assert_eq!(one.product.id(), "COM1B_2035-01-01_SC1_01_0002");
+}
+
+#[test]
+fn a_note_is_told_once_with_its_stage() {
+    let folder = tempfile::tempdir().expect("folder");
+    let mut draft = draft(0.0909);
+    draft.reports[0].notes = vec!["es-akf: slow".to_owned(), "es-akf is slow".to_owned()];
+    let notes = write(folder.path(), &draft).product.quality.notes;
+    assert!(
+        notes.contains(&"es-akf: slow".to_owned()) && notes.contains(&"es-akf: es-akf is slow".to_owned()),
+        "{notes:?}"
+    );
+}
+
+#[test]
 fn json_has_the_keys_of_the_contract_and_null_for_missing_numbers() {
     let folder = tempfile::tempdir().expect("folder");
     let Written { product, path } = write(folder.path(), &draft(0.0909));

@@ -15,8 +15,9 @@ pub(super) const MODEL: &str = r#"{"coefficients":[{"name":"example.tm1","effect
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 
-/// What there may be before a stage, the most first: telemetry, grid, reconstruction and regressors; without the last two; telemetry
-/// alone. Before an effect there is always a reconstruction. Housekeeping is what the plugin's own text parameters name, `hk.NAME`, with the unit at the end of the name.
+/// What there may be before a stage, the most first: telemetry, grid, reconstruction and regressors; without the last two;
+/// telemetry alone. Before an effect there is always a reconstruction. Housekeeping is what the plugin's own text parameters name, `hk.NAME` alone
+/// or in an expression, with the unit at the end of the name.
 pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) -> Vec<Vec<Column>> {
     if kind == Kind::Source {
         return vec![Vec::new()];
@@ -34,7 +35,9 @@ pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) 
     let grid = grid.map(|c| column("grid", format!("{}.{}", c.table, c.name), (c.unit.clone(), c.frame.clone()), &[]));
     let mut grid: Vec<Column> = grid.collect();
     let mut housekeeping = Vec::new();
-    for name in parameters.values().filter_map(Value::as_str).filter_map(|text| text.strip_prefix("hk.")) {
+    let is_name = |c: char| c.is_ascii_alphanumeric() || c == '_' || c == '.';
+    let words = parameters.values().filter_map(Value::as_str).flat_map(|text| text.split(|c| !is_name(c)));
+    for name in words.filter_map(|word| word.strip_prefix("hk.")) {
         let unit = housekeeping_unit(name);
         if !grid.iter().any(|c| c.name == format!("hk.{name}")) {
             grid.push(column("grid", format!("hk.{name}"), (unit.clone(), String::new()), &[]));

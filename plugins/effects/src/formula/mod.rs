@@ -238,6 +238,9 @@ impl Effect for Formula {
             return formula
                 .refuse("parameter `expression` is not set; e.g. expression = \"lag(hk.NAME, 120) * alpha.z\"");
         }
+        if let Err(error) = read(&formula.expression) {
+            return formula.refuse(&error.marked(&formula.expression));
+        }
         if formula.unit.trim().is_empty() {
             return formula.refuse(
                 "parameter `unit` is not set; give the coefficient's SI unit, so that coefficient times expression has the unit \

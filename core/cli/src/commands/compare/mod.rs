@@ -28,12 +28,13 @@ pub(super) fn execute(command: &Compare, global: &Global, paint: Paint) -> Resul
     let done = if global.json {
         Done::json(&serde_json::to_value(&comparison).map_err(Failure::engine)?)
     } else {
-        Done::new(screen(&comparison, names, command.page.as_deref(), paint))
+        let names = names.join(" ") + &super::repeated(Some(&command.archive.folder), global);
+        Done::new(screen(&comparison, &names, command.page.as_deref(), paint))
     };
     Ok(Done { code: if comparison.passes { 0 } else { INCONSISTENT }, ..done })
 }
 
-fn screen(c: &Comparison, names: &[String], page: Option<&Path>, paint: Paint) -> String {
+fn screen(c: &Comparison, names: &str, page: Option<&Path>, paint: Paint) -> String {
     let (word, sentence) = if c.passes {
         (paint.good("passes"), "passes: what the model leaves is the noise of the mission")
     } else {
@@ -85,7 +86,6 @@ fn screen(c: &Comparison, names: &[String], page: Option<&Path>, paint: Paint) -
     } else if !suspects.is_empty() {
         out += &labelled("coherent", &format!("{}: where to look, not a cause", suspects.join(", ")));
     }
-    let names = names.join(" ");
     let next = if c.passes {
         format!("`dragfree diagnose {names}` sees effects that are too small for a spectrum, by what they go with")
     } else {
