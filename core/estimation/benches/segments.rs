@@ -4,8 +4,9 @@ use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use dragfree_estimation::estimate::{Observed, Unknown, estimate};
 use dragfree_estimation::prediction::Prediction;
 use dragfree_estimation::segments::{Collected, Segmenter};
-use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_estimation::sigma::NoiseModel;
 use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor};
+use dragfree_hinf_dfacs::noise::declared;
 use dragfree_physics::mission::Mission;
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
@@ -29,7 +30,7 @@ fn bench(criterion: &mut Criterion) {
     let text = include_str!("../../../fixtures/missions/taiji.toml");
     let value: serde_json::Value = toml::from_str(text).expect("the fixture is TOML");
     let mission = Mission::from_json(&value.to_string()).expect("the fixture is a mission");
-    let model = NoiseModel::new(&mission, &CHANNELS.map(|c| (c, Measured::Differenced)), 0.1).expect("a noise model");
+    let model = NoiseModel::new(&declared(&mission, &["ifo_x"; 2]), &CHANNELS, 0.1).expect("a noise model");
     let regressors = (0..18)
         .map(|series| {
             let coefficient = series / 3;
@@ -49,7 +50,7 @@ fn bench(criterion: &mut Criterion) {
     let times: Vec<i64> = (0..ROWS as i64).map(|k| 100_000_000 * k).collect();
     let mut analyser = Analyser::new(Plan::new(16_384, 10.0), &layout);
     let run = |analyser: &mut Analyser| {
-        let prediction = Prediction::new(&model, &[Measured::Differenced; 9], &layout, analyser.plan());
+        let prediction = Prediction::new(&model, &[true; 9], &layout, analyser.plan());
         let mut collected = Collected::new(analyser.plan(), &layout, prediction);
         let mut segmenter = Segmenter::new(16_384, 100_000_000, (0..27).map(|j| j >= 9).collect());
         segmenter.push(&times, &slices, analyser, &mut collected);

@@ -1,4 +1,4 @@
-//! Effects that colour a noise of the mission: what moves with the spacecraft is driven by the thrusters' noise as by their commands.
+//! Effects that filter a declared noise process: what moves with the spacecraft is driven by the thrusters' noise as by their commands.
 //!
 //! A residual that a coefficient c leaves, `z = (1 + cH)(F + n)` with F known and n not, holds `(1 + cH) n` when `cHF` is explained.
 //! Under a Σ without that, a gain in the loop is biased, as commands answer to the noise: the whitened residual is no longer what is

@@ -160,7 +160,7 @@ pub struct Quality {
     pub chi2_per_dof: f64,
     /// Degrees of freedom of it.
     pub dof: f64,
-    /// χ²/dof with Σ as the mission file has it.
+    /// χ²/dof with Σ as declared.
     pub chi2_per_dof_modelled_sigma: f64,
     /// Each channel alone, with Σ from the residuals.
     pub channels: Vec<ChannelQuality>,
@@ -212,11 +212,11 @@ pub fn estimate(
 pub enum Refinement {
     /// Every band, with its correlations.
     Bands,
-    /// The levels of the mission's processes alone; see [`crate::levels`]. For models with regressors that the loop makes of the noise.
+    /// The levels of the declared processes alone; see [`crate::levels`]. For models with regressors that the loop makes of the noise.
     Levels,
 }
 
-/// As [`estimate`], with Σ refined in one way or the other, and the mission's noise in the bands of the plan.
+/// As [`estimate`], with Σ refined in one way or the other, and the declared noise in the bands of the plan.
 ///
 /// # Errors
 /// As [`estimate`].

@@ -1,12 +1,12 @@
-//! Levels of the noise: which process of the mission is louder or quieter than the mission file says.
+//! Levels of the noise: which declared process is louder or quieter than its declaration says.
 //!
-//! The residuals' measured spectra Ŵ against `Σ + (k² − 1) P` for each named process P, by Whittle's likelihood
-//! `Σ_b 2n_b (log det Σ_b + tr Σ_b⁻¹ Ŵ_b)`; k is the process's amplitude over the mission's.
+//! The residuals' measured spectra Ŵ against `Σ + (k² − 1) P` for each named component P, by Whittle's likelihood
+//! `Σ_b 2n_b (log det Σ_b + tr Σ_b⁻¹ Ŵ_b)`; k is the component's amplitude over the declared one.
 //!
 //! **Why not Σ band by band, where commands are regressors.** In the loop a command is the thrusters' noise w behind a strictly
 //! causal filter, u = Uw. With a gain wrong by δ the residual is `(1 + δU) w`, and `∫ log|1 + δU|² df = 0` (Szegő, Jensen): a Σ that
 //! is free in every band fits each δ as well as any other, and refining it walks away from the truth, by +5 to +12 % on clean
-//! data. What tells δ is that w has the shape that the mission file gives it. So shapes stay, and levels alone are measured.
+//! data. What tells δ is that w has the declared shape. So shapes stay, and levels alone are measured.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -33,7 +33,7 @@ const EXCESS: f64 = 2.0;
 pub struct Level {
     /// Name of the process.
     pub process: String,
-    /// Amplitude over the mission's.
+    /// Amplitude over the declared one.
     pub value: f64,
     /// Its σ.
     pub sigma: f64,
@@ -91,7 +91,7 @@ fn inverted(sigma: &DMatrix<f64>) -> DMatrix<f64> {
 
 /// What is compared: per band its complex observations, the measured spectra and the modelled ones.
 pub struct Levels<'a> {
-    /// Processes by name, per band, at the mission's levels.
+    /// Components by name, per band, at the declared levels.
     processes: BTreeMap<&'a str, Vec<DMatrix<f64>>>,
     /// Middle of each band, Hz.
     hz: Vec<f64>,
@@ -337,21 +337,36 @@ impl<'a> Levels<'a> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dragfree_physics::mission::Mission;
+    use dragfree_schema::{NoiseProcess, NoiseResponse, NoiseShape};
 
-    use crate::sigma::Measured;
+    const CHANNELS: [&str; 4] = ["a.x", "a.y", "b.x", "b.y"];
 
-    const CHANNELS: [(&str, Measured); 4] = [
-        ("tm1.accel.x", Measured::Differenced),
-        ("tm1.accel.y", Measured::Differenced),
-        ("tm2.accel.x", Measured::Differenced),
-        ("tm2.accel.y", Measured::Differenced),
-    ];
-
-    fn mission() -> Mission {
-        let text = include_str!("../../../fixtures/missions/taiji.toml");
-        let value: toml::Value = toml::from_str(text).unwrap();
-        Mission::from_json(&serde_json::to_string(&value).unwrap()).unwrap()
+    /// Two bodies that look 30° to either side and are shaken by one force, each axis with a readout of its own: x quiet, y loud.
+    fn noise() -> NoiseModel {
+        let (cos, sin) = (0.75_f64.sqrt(), 0.5);
+        let gains = [[cos, sin], [-sin, cos], [cos, -sin], [sin, cos]].map(|row| row.map(|g| g / 1500.0).to_vec());
+        let force = NoiseProcess {
+            name: "force".to_owned(),
+            spectrum: Some(NoiseShape::white(1e-7)),
+            components: vec!["force:x".to_owned(), "force:y".to_owned()],
+            enters: CHANNELS.map(str::to_owned).into_iter().zip(gains).collect(),
+            ..NoiseProcess::default()
+        };
+        let own = |channel: &str, asd: f64, response: NoiseResponse| NoiseProcess {
+            name: format!("{response:?}:{channel}"),
+            spectrum: Some(NoiseShape::white(asd)),
+            components: vec![format!("{response:?}:{channel}")],
+            response,
+            enters: [(channel.to_owned(), vec![1.0])].into(),
+            ..NoiseProcess::default()
+        };
+        let readouts = CHANNELS.iter().zip([1.4e-12, 1.8e-9].into_iter().cycle());
+        let mut declared = vec![force];
+        declared.extend(readouts.map(|(channel, asd)| own(channel, asd, NoiseResponse::Differenced)));
+        declared.extend(
+            CHANNELS.iter().map(|c| NoiseProcess { components: Vec::new(), ..own(c, 3e-15, NoiseResponse::Held) }),
+        );
+        NoiseModel::new(&declared, &CHANNELS, 0.1).unwrap()
     }
 
     fn weights(plan: &Plan, segments: usize) -> Spectra {
@@ -364,12 +379,11 @@ mod tests {
     /// `1/√(4 Σ n tr (Σ⁻¹P)²)` by Fisher's information, which is `4k² Σ n tr (Σ⁻¹ P)²` for an amplitude k where Σ has the process.
     #[test]
     fn a_level_is_measured_with_the_error_that_fisher_gives() {
-        let mission = mission();
-        let noise = NoiseModel::new(&mission, &CHANNELS, 0.1).unwrap();
+        let noise = noise();
         let plan = Plan::new(4096, 10.0);
         let weights = weights(&plan, 20);
         let hz: Vec<f64> = plan.bands.iter().map(|b| plan.frequency_hz(*b)).collect();
-        let name = "readout:tm1.y";
+        let name = "Differenced:a.y";
         let of = |f: &f64| noise.process_psd(name, *f).unwrap();
         let truth: Vec<DMatrix<f64>> = hz.iter().map(|f| noise.psd(*f) + of(f) * (1.7_f64.powi(2) - 1.0)).collect();
         let mut levels = Levels::new(&noise, &plan, &weights, &truth);
@@ -395,11 +409,10 @@ mod tests {
     /// A process that a coefficient colours is what is measured, at its own level; without the colour its level would be another.
     #[test]
     fn a_coloured_process_has_its_own_level() {
-        let mission = mission();
-        let noise = NoiseModel::new(&mission, &CHANNELS, 0.1).unwrap();
+        let noise = noise();
         let plan = Plan::new(16_384, 10.0);
         let weights = weights(&plan, 20);
-        let name = "thruster_force:sc.y";
+        let name = "force:y";
         let omega = std::f64::consts::TAU * 0.06;
         let colour = Colour {
             process: name.to_owned(),
@@ -420,11 +433,10 @@ mod tests {
     }
 
     /// A force on one test mass far below the thrusters' noise, invisible in its channel's power, is taken up where the others cancel
-    /// the thrusters, exactly where it doubles what is left there in a whole group of bands. Without it Σ⁻¹ is the mission's.
+    /// the thrusters, exactly where it doubles what is left there in a whole group of bands. Without it Σ⁻¹ is that of the declared noise.
     #[test]
     fn an_excess_below_the_thrusters_is_taken_up() {
-        let mission = mission();
-        let noise = NoiseModel::new(&mission, &CHANNELS, 0.1).unwrap();
+        let noise = noise();
         let plan = Plan::new(16_384, 10.0);
         let weights = weights(&plan, 20);
         let sigma: Vec<DMatrix<f64>> = plan.bands.iter().map(|b| noise.psd(plan.frequency_hz(*b))).collect();

@@ -1,25 +1,25 @@
 //! The prediction-error fit: the same coefficients in the time domain, causally, as a check on every one of them.
 //!
-//! A fit by spectra is unbiased under feedback when Σ is right over the whole band and segments lose nothing at their ends. Here
-//! nothing is cut into segments: each channel and its regressors pass the causal filter that makes the channel's noise white, and
-//! the coefficients are those that make the filter's one-step predictions best (Ljung, *System Identification*, §7 and §13.4: the
-//! direct method, unbiased in closed loop when the noise model is right).
+//! A fit by spectra is unbiased under feedback when Σ is right over the whole band and segments lose nothing at their
+//! ends. Here nothing is cut into segments: each channel and its regressors pass the causal filter that makes the
+//! channel's noise white, and the coefficients are those that make the filter's one-step predictions best (Ljung,
+//! *System Identification*, §7 and §13.4: the direct method, unbiased in closed loop when the noise model is right).
 //!
-//! A channel's noise is taken as `a cos²(πf dt) + b (4 sin²(πf dt)/dt²)²`, an acceleration held over a sample and a white readout
-//! differenced twice; both levels follow the residuals' spectrum, at the first segment and whenever their number has doubled.
-//! With `y = z − 2 + z⁻¹` that is `b y²/dt⁴ + a (1 + y/4)` up to the sampling, so the filter is the inverse of a polynomial of
-//! second degree. What is slower than 3 mHz, constant and drifting accelerations above all, is taken out of channels and
-//! regressors by the same causal filter.
+//! A channel's noise is taken as `a cos²(πf dt) + b (4 sin²(πf dt)/dt²)²`, an acceleration held over a sample and a
+//! white readout differenced twice; both levels follow the residuals' spectrum, at the first segment and whenever their
+//! number has doubled. With `y = z − 2 + z⁻¹` that is `b y²/dt⁴ + a (1 + y/4)` up to the sampling, so the filter is the
+//! inverse of a polynomial of second degree. What is slower than 3 mHz, constant and drifting accelerations above all,
+//! is taken out of channels and regressors by the same causal filter.
 //!
-//! Channels are taken one by one. That costs efficiency, and truth only for regressors made of commands, which know the other channels'
-//! past (`es-gain` −0.30 ± 0.09, `mps-gain` 0.09 ± 0.03 where there is none): for those this is no check. The covariance is that of the
-//! blocks' scatter.
+//! Channels are taken one by one. That costs efficiency, and truth only for regressors made of commands, which know the
+//! other channels' past (`es-gain` −0.30 ± 0.09, `mps-gain` 0.09 ± 0.03 where there is none): for those this is no
+//! check. The covariance is that of the blocks' scatter.
 
 use dragfree_physics::levels::{self, Bin, Levels};
 use nalgebra::{Cholesky, DMatrix, DVector};
 
 use crate::normal::{accumulate, residuals};
-use crate::sigma::{Measured, NoiseModel};
+use crate::sigma::NoiseModel;
 use crate::spectra::{Layout, MAX_BLOCKS, Plan, Spectra};
 
 /// Slower than this is not seen.
@@ -42,14 +42,15 @@ struct Whitener {
 }
 
 impl Whitener {
-    fn new(levels: Levels, measured: Measured, dt_s: f64) -> Self {
+    fn new(levels: Levels, differenced: bool, dt_s: f64) -> Self {
         let pole = (-std::f64::consts::TAU * WASHOUT_HZ * dt_s).exp();
         // A sample of white noise of one-sided PSD S has the variance S f_s/2.
         let (held, readout) = (levels.held * 0.5 / dt_s, levels.readout * 0.5 / dt_s / dt_s.powi(4));
-        if measured == Measured::Directly || readout <= 0.0 {
+        if !differenced || readout <= 0.0 {
             return Self { c: [0.0; 2], pole, variance: held };
         }
-        // readout y² + held y/4 + held = 0, then z with z − 2 + 1/z = y inside the unit circle; held ≪ readout keeps y complex.
+        // readout y² + held y/4 + held = 0, then z with z − 2 + 1/z = y inside the unit circle; held ≪ readout keeps y
+        // complex.
         let half = -held / 8.0 / readout;
         let square = half * half - held / readout;
         let roots = if square < 0.0 {
@@ -141,7 +142,8 @@ pub struct State {
 #[derive(Clone)]
 pub struct Prediction {
     layout: Layout,
-    measured: Vec<Measured>,
+    /// Per channel, whether it is a second difference of a displacement.
+    differenced: Vec<bool>,
     dt_s: f64,
     /// Per channel its regressors.
     regressors: Vec<Vec<usize>>,
@@ -153,9 +155,10 @@ pub struct Prediction {
 }
 
 impl Prediction {
-    /// A fit with the levels of the model; none when the modelled Σ is singular.
+    /// A fit with the levels of the model; none when the modelled Σ is singular. `differenced` says of each channel
+    /// whether it is a second difference of a displacement.
     #[must_use]
-    pub fn new(model: &NoiseModel, measured: &[Measured], layout: &Layout, plan: &Plan) -> Option<Self> {
+    pub fn new(model: &NoiseModel, differenced: &[bool], layout: &Layout, plan: &Plan) -> Option<Self> {
         let dt_s = 1.0 / plan.rate_hz;
         let sigma: Vec<DMatrix<f64>> = plan.bands.iter().map(|b| model.psd(plan.frequency_hz(*b))).collect();
         let inverses =
@@ -166,14 +169,14 @@ impl Prediction {
         let levels = (0..channels)
             .map(|c| {
                 let psd: Vec<f64> = sigma.iter().map(|s| s[(c, c)]).collect();
-                fit(&frequencies, &psd, &bins, measured[c], dt_s)
+                fit(&frequencies, &psd, &bins, differenced[c], dt_s)
             })
             .collect();
         let regressors = (0..channels)
             .map(|c| (0..layout.regressors.len()).filter(|r| layout.regressors[*r].channel == c).collect());
         let mut prediction = Self {
             regressors: regressors.collect(),
-            measured: measured.to_vec(),
+            differenced: differenced.to_vec(),
             dt_s,
             inverses,
             whiteners: Vec::new(),
@@ -193,8 +196,8 @@ impl Prediction {
 
     /// Filters for the levels of the state; to be called when the state was put in from outside.
     pub fn design(&mut self) {
-        let pairs = self.state.levels.iter().zip(&self.measured);
-        self.whiteners = pairs.map(|(l, m)| Whitener::new(*l, *m, self.dt_s)).collect();
+        let pairs = self.state.levels.iter().zip(&self.differenced);
+        self.whiteners = pairs.map(|(l, d)| Whitener::new(*l, *d, self.dt_s)).collect();
     }
 
     /// Adds samples without a gap among them, one slice per column of the sums, the first at `first_ns`.
@@ -311,7 +314,7 @@ impl Prediction {
         let frequencies: Vec<f64> = plan.bands.iter().map(|b| plan.frequency_hz(*b)).collect();
         for c in 0..self.layout.channels.len() {
             let psd: Vec<f64> = residual.iter().zip(&spectra.expected).map(|(r, e)| r[(c, c)] / e).collect();
-            self.state.levels[c] = fit(&frequencies, &psd, &spectra.expected, self.measured[c], self.dt_s);
+            self.state.levels[c] = fit(&frequencies, &psd, &spectra.expected, self.differenced[c], self.dt_s);
         }
         self.design();
     }
@@ -327,7 +330,7 @@ impl Prediction {
 }
 
 /// Levels that fit a spectrum.
-fn fit(frequencies: &[f64], psd: &[f64], weights: &[f64], measured: Measured, dt_s: f64) -> Levels {
+fn fit(frequencies: &[f64], psd: &[f64], weights: &[f64], differenced: bool, dt_s: f64) -> Levels {
     let bins: Vec<Bin> = frequencies
         .iter()
         .zip(psd)
@@ -336,14 +339,12 @@ fn fit(frequencies: &[f64], psd: &[f64], weights: &[f64], measured: Measured, dt
         .filter(|b| b.frequency_hz > WASHOUT_HZ)
         .collect();
     let unknown = Levels { held: 1.0, readout: 0.0 };
-    match measured {
-        Measured::Differenced => levels::fit(&bins, dt_s).unwrap_or(unknown),
-        Measured::Directly => {
-            let used = bins.iter().filter(|b| b.psd.is_finite() && b.weight > 0.0);
-            let (sum, weight) = used.fold((0.0, 0.0), |(s, w), b| (s + b.weight * b.psd, w + b.weight));
-            if sum > 0.0 { Levels { held: sum / weight, readout: 0.0 } } else { unknown }
-        }
+    if differenced {
+        return levels::fit(&bins, dt_s).unwrap_or(unknown);
     }
+    let used = bins.iter().filter(|b| b.psd.is_finite() && b.weight > 0.0);
+    let (sum, weight) = used.fold((0.0, 0.0), |(s, w), b| (s + b.weight * b.psd, w + b.weight));
+    if sum > 0.0 { Levels { held: sum / weight, readout: 0.0 } } else { unknown }
 }
 
 /// Scalar product in four lanes.
@@ -368,7 +369,7 @@ mod tests {
     fn the_filter_is_the_root_of_the_spectrum() {
         let dt = 0.1;
         for (held, readout) in [(4.4e-21, 3.2e-18), (4.4e-21, 2e-24), (1e-10, 1e-10), (1e-20, 1e-30)] {
-            let w = Whitener::new(Levels { held, readout }, Measured::Differenced, dt);
+            let w = Whitener::new(Levels { held, readout }, true, dt);
             for f in [1e-4, 1e-3, 0.01, 0.03, 0.1, 0.5, 1.0, 3.0, 4.9] {
                 let phase = std::f64::consts::TAU * f * dt;
                 let re = 1.0 + w.c[0] * phase.cos() + w.c[1] * (2.0 * phase).cos();
@@ -386,7 +387,7 @@ mod tests {
     #[test]
     fn the_level_of_a_direct_measurement_is_its_mean() {
         let f = [0.1, 1.0, 2.0];
-        let l = fit(&f, &[2.0; 3], &[1.0; 3], Measured::Directly, 0.1);
+        let l = fit(&f, &[2.0; 3], &[1.0; 3], false, 0.1);
         assert_eq!(l, Levels { held: 2.0, readout: 0.0 });
     }
 }

@@ -1,4 +1,4 @@
-//! Σ from the residuals: telemetry whose noise is not that of the mission file must not be weighed by the mission file.
+//! Σ from the residuals: telemetry whose noise is not the declared one must not be weighed by the declaration.
 //!
 //! After Vitale et al. (arXiv:1404.4792): solve, measure the residuals' spectrum, solve again. In the coordinates in which the
 //! model says "white with unit variance" (`L⁻¹r`, `LLᵀ = Σ_model`), the residuals' measured covariance Ŵ of a band about 1/7
@@ -59,7 +59,7 @@ pub enum SigmaError {
     /// Two channels measure the same without noise of their own.
     #[error(
         "the modelled noise of the channels is not positive definite at {frequency_hz:.3e} Hz: some combination of channels has no \
-         noise at all; give every readout and every test mass a noise in the mission file"
+         noise at all; the stage that makes the channels must declare a noise for each readout, from the mission file's [noise]"
     )]
     Singular {
         /// Frequency.

@@ -1,278 +1,163 @@
-//! Σ(f): the modelled cross-spectral matrix of the channels, from the mission's noise.
+//! Σ(f): the modelled cross-spectral matrix of the channels, from the noise processes that the stages declare.
 //!
-//! Every process is a constant matrix (how it enters the channels) times its one-sided PSD times the response of the channel's
-//! way of measuring. From displacements (`average = 2`) a mean acceleration over `[t_k, t_k+1)` is seen through
-//! `(φ_{k−1}+φ_k)/2`, power response cos²(π f dt), and readout noise through the second difference, power response
-//! (4 sin²(π f dt)/dt²)². Both are even in time about `t_k`, so Σ is real and symmetric.
+//! A declared process enters the channels through a constant matrix M: it adds `M C Mᵀ` times its one-sided PSD times
+//! the power response of the channels' way of measuring. All responses are even in time about `t_k`, so Σ is real and
+//! symmetric.
 //!
-//! The shapes are those of the continuous processes: what aliases from above Nyquist is a matter of a factor near Nyquist, which
-//! the refinement from residuals takes up (see `refine`).
+//! The shapes are those of the continuous processes: aliasing from above Nyquist is a factor near Nyquist, which the
+//! refinement from residuals takes up (see `refine`).
 
-use nalgebra::{DMatrix, Matrix3, Vector3};
+use std::collections::BTreeMap;
 
-use dragfree_physics::frames::skew;
-use dragfree_physics::mission::{Mission, MissionError};
-use dragfree_physics::noise::NoiseShape;
-use dragfree_physics::thrust_noise::ThrustNoise;
+use dragfree_physics::levels::responses;
+use dragfree_schema::{NoiseProcess, NoiseResponse, NoiseShape};
+use nalgebra::{DMatrix, DVector};
 
 use crate::spectra::{Band, Plan};
 
-/// How a channel's samples come about.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Measured {
-    /// Second difference of a displacement minus the mean known acceleration, `average = 2`.
-    Differenced,
-    /// An accelerometer, `average = 1`.
-    Directly,
-}
+/// A declaration that makes no noise model.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("the declared noise is unusable: {0}")]
+pub struct NoiseError(String);
 
-/// What a channel's name says.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Place {
-    /// Acceleration of a test mass along an axis of its ORF.
-    TestMass { mass: usize, axis: usize },
-    /// Angular acceleration of the spacecraft about an axis of SRF.
-    Spacecraft { axis: usize },
-    /// Anything else.
-    Elsewhere,
-}
-
-const AXES: [&str; 3] = ["x", "y", "z"];
-
-fn place(channel: &str) -> Place {
-    let axis = |name: &str| AXES.iter().position(|a| *a == name);
-    let mut parts = channel.split('.');
-    let words = (parts.next(), parts.next(), parts.next().and_then(axis), parts.next());
-    match words {
-        (Some("tm1"), Some("accel"), Some(axis), None) => Place::TestMass { mass: 0, axis },
-        (Some("tm2"), Some("accel"), Some(axis), None) => Place::TestMass { mass: 1, axis },
-        (Some("sc"), Some("alpha"), Some(axis), None) => Place::Spacecraft { axis },
-        _ => Place::Elsewhere,
-    }
-}
-
-/// Power response of a channel to a process.
-#[derive(Clone, Copy, Debug)]
-enum Response {
-    /// An acceleration held over a sample, seen through the mean of two: cos²(π f dt).
-    Held,
-    /// A readout, differenced twice: (4 sin²(π f dt)/dt²)².
-    Readout,
-    /// Measured as it is.
-    Flat,
-}
-
+/// A process as the channels of the model see it.
 struct Process {
     shape: NoiseShape,
-    response: Response,
+    response: NoiseResponse,
+    /// Channels × channels, over the shape's PSD.
     enters: DMatrix<f64>,
 }
 
-/// A process that an effect may name.
-struct Named {
+/// A component of a declared process whose level may be fitted.
+struct Component {
     name: String,
+    /// Index of the declaration.
+    declared: usize,
     process: Process,
-    /// What it turns the spacecraft by, SRF, over its shape; nothing for what turns nothing. What α̂ does not know of it moves the test
-    /// masses.
-    turns: Option<Vector3<f64>>,
+    /// Index of the estimation error that it drives, and what it contributes to the estimated quantities, over the root
+    /// of its PSD.
+    estimated: Option<(usize, DVector<f64>)>,
 }
 
-/// What remains unknown of the angular acceleration once everything measured has been used, and how it enters the channels.
-struct AngularError {
-    /// `B`, rows of channels, columns of α in SRF: `[b×] T_S^O` in the rows of a test mass, and `−T_S^O C J/m` where the torque
-    /// tells of a force.
-    lever: DMatrix<f64>,
-    /// `J⁻¹ S_M J⁻ᵀ` over the PSD of the torque's shape.
-    disturbance: Matrix3<f64>,
-    torque: NoiseShape,
-    attitude: Option<NoiseShape>,
+/// The error of a minimum-variance estimate `E[q | q + n]` of quantities that a process drives, which enters the
+/// channels.
+struct EstimationError {
+    /// B: channels × quantities.
+    gain: DMatrix<f64>,
+    /// Covariance of the quantities over the PSD of the driving process.
+    driven: DMatrix<f64>,
+    shape: NoiseShape,
+    response: NoiseResponse,
+    /// Noise n of the readout of each quantity; nothing where none is read.
+    readout: Option<(NoiseShape, NoiseResponse)>,
 }
 
 /// The noise model of a set of channels.
 pub struct NoiseModel {
     channels: usize,
-    /// Channels that are residuals of a known motion, so that nothing but noise is left in them.
+    /// Channels in which the declared processes are all there is once the model is taken out.
     residual: Vec<bool>,
     dt_s: f64,
     processes: Vec<Process>,
-    /// Processes that an effect may name, `thruster_force:sc.x`, each alone.
-    named: Vec<Named>,
-    angular_error: Option<AngularError>,
-    /// Channels of whose noise the mission says nothing; they start as white with unit PSD and are measured.
+    components: Vec<Component>,
+    errors: Vec<EstimationError>,
+    /// Channels without declared noise: they start as white with unit PSD and are measured.
     pub unknown: Vec<usize>,
 }
 
 impl NoiseModel {
-    /// Builds the model for channels `(name, how it is measured)` sampled every `dt_s`.
-    ///
-    /// The lever of the remaining error of α̂ is the mission's nominal offset: the noise model alone uses it, the estimate does
-    /// not, and an error of a few millimetres in 0.18 m changes a small part of Σ by a few per cent.
+    /// Builds the model of `channels`, sampled every `dt_s`, from what the stages declare. Channels of a declaration
+    /// that are not among `channels` are left out of it.
     ///
     /// # Errors
-    /// [`MissionError::Missing`] when a channel belongs to a test mass that the mission does not have.
-    pub fn new(mission: &Mission, channels: &[(&str, Measured)], dt_s: f64) -> Result<Self, MissionError> {
-        const NEEDED_BY: &str = "the noise model of qp-check";
+    /// [`NoiseError`] when a declaration contradicts itself or holds a number that is not finite.
+    pub fn new<S: AsRef<str>>(declared: &[NoiseProcess], channels: &[S], dt_s: f64) -> Result<Self, NoiseError> {
         let n = channels.len();
-        let places: Vec<Place> = channels.iter().map(|(name, _)| place(name)).collect();
-        let measured = |i: usize| channels[i].1;
-        let residual = channels.iter().map(|(_, m)| *m == Measured::Differenced).collect();
         let mut model = Self {
             channels: n,
-            residual,
+            residual: vec![true; n],
             dt_s,
             processes: Vec::new(),
-            named: Vec::new(),
-            angular_error: None,
+            components: Vec::new(),
+            errors: Vec::new(),
             unknown: Vec::new(),
         };
-        let noise = &mission.noise;
-        let single = |i: usize, weight: f64| {
-            let mut m = DMatrix::zeros(n, n);
-            m[(i, i)] = weight;
-            m
-        };
-
-        // A force on the spacecraft moves it under every test mass: the same vector, in each ORF.
-        let mut thrust = DMatrix::zeros(n, 3);
-        let mut lever = DMatrix::zeros(n, 3);
-        for (i, place) in places.iter().enumerate() {
-            let Place::TestMass { mass, axis } = *place else { continue };
-            let name = ["tm1", "tm2"][mass];
-            if measured(i) == Measured::Directly && !mission.test_mass.contains_key(name) {
-                continue;
-            }
-            let tm = mission.test_mass(name, NEEDED_BY)?;
-            let dcm = tm.dcm_orf_from_srf();
-            if measured(i) == Measured::Differenced {
-                thrust.row_mut(i).copy_from(&(dcm.row(axis) / -mission.spacecraft.mass_kg));
-            }
-            lever.row_mut(i).copy_from(&(skew(&tm.offset_nominal_orf_m()) * dcm).row(axis));
+        for (index, process) in declared.iter().enumerate() {
+            process.check().map_err(|what| NoiseError(format!("process `{}`: {what}", process.name)))?;
+            model.add(index, process, channels);
         }
-        // The known acceleration holds what the torque tells of the thrusters' force; the rest is noise.
-        let thrusters = ThrustNoise::of(mission);
-        if let Some(thrusters) = &thrusters {
-            for (axis, name) in AXES.iter().enumerate() {
-                let (column, level) = (thrust.column(axis), thrusters.force_given_torque[(axis, axis)]);
-                let enters = column * column.transpose() * level;
-                model.name(format!("thruster_force:sc.{name}"), &thrusters.force_shape, Response::Held, enters);
-            }
-            let left = &thrust * dynamic(&thrusters.force_given_torque) * thrust.transpose();
-            model.add(thrusters.force_shape.clone(), Response::Held, left);
-            lever += &thrust * dynamic(&(thrusters.force_per_torque * mission.spacecraft.inertia()));
-        }
-        if let Some(shape) = &noise.solar_pressure {
-            model.add(shape.shape(), Response::Held, &thrust * thrust.transpose());
-        }
-
-        for (i, place) in places.iter().enumerate() {
-            match (*place, measured(i)) {
-                (Place::TestMass { mass, axis }, Measured::Differenced) => {
-                    let readout = match axis {
-                        0 => noise.ifo_x.as_ref().or(noise.is_x.as_ref()),
-                        1 => noise.is_y.as_ref(),
-                        _ => noise.is_z.as_ref(),
-                    };
-                    if let Some(readout) = readout {
-                        let name = format!("readout:{}.{}", ["tm1", "tm2"][mass], AXES[axis]);
-                        model.name(name, &readout.shape(), Response::Readout, single(i, 1.0));
-                        model.add(readout.shape(), Response::Readout, single(i, 1.0));
-                    }
-                    if let (Some(force), 1 | 2) = (&noise.electrostatic_force, axis) {
-                        let mass_kg = mission.test_mass(["tm1", "tm2"][mass], NEEDED_BY)?.mass_kg;
-                        model.add(force.shape(), Response::Held, single(i, mass_kg.powi(-2)));
-                    }
-                    if let Some(stray) = &noise.test_mass_acceleration {
-                        model.add(stray.shape(), Response::Held, single(i, 1.0));
-                    }
-                }
-                (Place::TestMass { .. }, Measured::Directly) => {
-                    if let Some(shape) = &noise.accelerometer_linear {
-                        model.add(shape.shape(), Response::Flat, single(i, 1.0));
-                    }
-                }
-                (Place::Spacecraft { .. }, Measured::Directly) => {
-                    if let Some(shape) = &noise.accelerometer_angular {
-                        model.add(shape.shape(), Response::Flat, single(i, 1.0));
-                    }
-                }
-                (Place::Spacecraft { .. }, Measured::Differenced) => {
-                    if let Some(shape) = &noise.dws_long_arm {
-                        model.add(shape.shape(), Response::Readout, single(i, 1.0));
-                    }
-                }
-                (Place::Elsewhere, _) => {}
-            }
-        }
-
-        // The attitude channels measure torque noise itself. The error of α̂ = E[α | everything measured] is orthogonal to
-        // everything measured, these channels included: no cross term.
-        let inverse_inertia = mission.spacecraft.inertia().try_inverse().unwrap_or_else(Matrix3::zeros);
-        if let Some(thrusters) = thrusters.filter(|t| t.torque_shape.psd(0.1 / dt_s) > 0.0) {
-            let mut enters = DMatrix::zeros(n, 3);
-            for (i, place) in places.iter().enumerate() {
-                if let (Place::Spacecraft { axis }, Measured::Differenced) = (*place, measured(i)) {
-                    enters.row_mut(i).copy_from(&inverse_inertia.row(axis));
-                }
-            }
-            for (axis, name) in AXES.iter().enumerate() {
-                let (column, level) = (enters.column(axis), thrusters.torque[(axis, axis)]);
-                let own = column * column.transpose() * level;
-                model.name(format!("thruster_torque:sc.{name}"), &thrusters.torque_shape, Response::Held, own);
-                if let Some(named) = model.named.last_mut() {
-                    named.turns = Some(inverse_inertia.column(axis) * level.sqrt());
-                }
-            }
-            let seen = &enters * dynamic(&thrusters.torque) * enters.transpose();
-            model.add(thrusters.torque_shape.clone(), Response::Held, seen);
-            let from_displacements = (0..n).any(|i| measured(i) == Measured::Differenced);
-            if from_displacements && lever.iter().any(|x| *x != 0.0) {
-                model.angular_error = Some(AngularError {
-                    lever: lever.clone(),
-                    disturbance: inverse_inertia * thrusters.torque * inverse_inertia.transpose(),
-                    torque: thrusters.torque_shape,
-                    attitude: noise.dws_long_arm.as_ref().map(|s| s.shape()),
-                });
-            }
-        }
-        // A measured α has its instrument's whole noise. Where the stage gives E[α | measured α], what remains is `W S_n`, less;
-        // but W comes from the telemetry, which is not known here. The whole is the safe side, until the residuals refine it.
-        if let (Some(shape), false) = (&noise.accelerometer_angular, model.angular_error.is_some()) {
-            model.add(shape.shape(), Response::Flat, &lever * lever.transpose());
-        }
-
         let probe = model.psd(0.1 / dt_s);
         model.unknown = (0..n).filter(|i| probe[(*i, *i)] <= 0.0).collect();
-        for i in model.unknown.clone() {
-            model.add(NoiseShape::white(1.0), Response::Flat, single(i, 1.0));
+        for i in &model.unknown {
+            model.residual[*i] = false;
+            let mut enters = DMatrix::zeros(n, n);
+            enters[(*i, *i)] = 1.0;
+            model.processes.push(Process { shape: NoiseShape::white(1.0), response: NoiseResponse::Direct, enters });
         }
         Ok(model)
     }
 
-    fn add(&mut self, shape: NoiseShape, response: Response, enters: DMatrix<f64>) {
-        if enters.iter().any(|x| *x != 0.0) {
-            self.processes.push(Process { shape, response, enters });
+    fn add<S: AsRef<str>>(&mut self, index: usize, declared: &NoiseProcess, channels: &[S]) {
+        let size = declared.size();
+        let mixing = gains(channels, &declared.enters, size);
+        let Some(shape) = &declared.spectrum else {
+            for (residual, row) in self.residual.iter_mut().zip(mixing.row_iter()) {
+                *residual &= row.iter().all(|gain| *gain == 0.0);
+            }
+            return;
+        };
+        let process = |enters| Process { shape: shape.clone(), response: declared.response, enters };
+        let covariance = match &declared.covariance {
+            Some(rows) => matrix(rows, size),
+            None => DMatrix::identity(size, size),
+        };
+        let error = declared.estimate.as_ref().map(|e| {
+            let quantities = matrix(&e.matrix, size);
+            let error = EstimationError {
+                gain: gains(channels, &e.enters, quantities.nrows()),
+                driven: &quantities * &covariance * quantities.transpose(),
+                shape: shape.clone(),
+                response: declared.response,
+                readout: e.readout.as_ref().map(|shape| (shape.clone(), e.readout_response)),
+            };
+            (quantities, error)
+        });
+        let error = error.filter(|(_, error)| is_any(error.gain.as_slice()));
+        for (k, name) in declared.components.iter().enumerate() {
+            let (column, level) = (mixing.column(k), covariance[(k, k)]);
+            let enters = column * column.transpose() * level;
+            let driven = error.as_ref().map(|(quantities, _)| quantities.column(k) * level.sqrt());
+            let estimated = driven.filter(|d| is_any(d.as_slice())).map(|d| (self.errors.len(), d));
+            if estimated.is_some() || is_any(enters.as_slice()) {
+                self.components.push(Component {
+                    name: name.clone(),
+                    declared: index,
+                    process: process(enters),
+                    estimated,
+                });
+            }
         }
+        let enters = &mixing * &covariance * mixing.transpose();
+        if is_any(enters.as_slice()) {
+            self.processes.push(process(enters));
+        }
+        self.errors.extend(error.map(|(_, error)| error));
     }
 
-    fn name(&mut self, name: String, shape: &NoiseShape, response: Response, enters: DMatrix<f64>) {
-        if enters.iter().any(|x| *x != 0.0) {
-            self.named.push(Named { name, process: Process { shape: shape.clone(), response, enters }, turns: None });
-        }
-    }
-
-    /// One-sided cross-spectral matrix of one process alone, by its name: `thruster_force:sc.x`, `thruster_torque:sc.z`,
-    /// `readout:tm1.y`; `None` where the mission or the channels have no such process.
+    /// One-sided cross-spectral matrix of one component alone, by the name that its declaration gives it; `None` where
+    /// there is none.
     ///
-    /// Of a torque it is what Σ gains by a little more of it: in the attitude's channels the torque itself, in the test masses' what α̂ does
-    /// not know of it. α̂ follows the level (`hinf-dfacs` measures it), so that its error stays orthogonal to the attitude's residuals.
+    /// Where an estimate is made from what the component drives, it is what Σ gains by a little more of the component:
+    /// what enters the channels at once, and what the estimate does not know of it. The estimate is taken to follow the
+    /// level, so that its error stays orthogonal to the readout.
     #[must_use]
     pub fn process_psd(&self, name: &str, frequency_hz: f64) -> Option<DMatrix<f64>> {
-        let Named { process: p, turns, .. } = self.named.iter().find(|n| n.name == name)?;
-        let power = p.shape.psd(frequency_hz) * self.response(p.response, frequency_hz);
+        let Component { process: p, estimated, .. } = self.components.iter().find(|c| c.name == name)?;
+        let power = p.shape.psd(frequency_hz) * self.power(p.response, frequency_hz);
         let mut psd = &p.enters * power;
-        if let (Some(turns), Some(error)) = (turns, &self.angular_error) {
-            let [held, differenced] = [Response::Held, Response::Readout].map(|r| self.response(r, frequency_hz));
-            let moves = &error.lever * dynamic(&error.unknown_part(held, differenced, frequency_hz)) * turns;
+        if let Some((index, driven)) = estimated {
+            let error = &self.errors[*index];
+            let moves = &error.gain * self.unknown_part(error, frequency_hz) * driven;
             psd += &moves * moves.transpose() * power;
         }
         Some(psd)
@@ -283,27 +168,36 @@ impl NoiseModel {
     pub fn psd(&self, frequency_hz: f64) -> DMatrix<f64> {
         let mut sigma = DMatrix::zeros(self.channels, self.channels);
         for p in &self.processes {
-            let power = p.shape.psd(frequency_hz) * self.response(p.response, frequency_hz);
+            let power = p.shape.psd(frequency_hz) * self.power(p.response, frequency_hz);
             sigma.iter_mut().zip(&p.enters).for_each(|(s, e)| *s += e * power);
         }
-        if let Some(e) = &self.angular_error {
-            let remaining = e.remaining(
-                self.response(Response::Held, frequency_hz),
-                self.response(Response::Readout, frequency_hz),
-                frequency_hz,
-            );
-            let m = DMatrix::from_fn(3, 3, |i, j| remaining[(i, j)]);
-            sigma += &e.lever * m * e.lever.transpose();
+        for error in &self.errors {
+            sigma += &error.gain * self.remaining(error, frequency_hz) * error.gain.transpose();
         }
         sigma
     }
 
-    /// Names of the processes that [`Self::process_psd`] knows.
+    /// Names of the components that [`Self::process_psd`] knows.
     pub fn process_names(&self) -> impl Iterator<Item = &str> {
-        self.named.iter().map(|n| n.name.as_str())
+        self.components.iter().map(|c| c.name.as_str())
     }
 
-    /// Per channel, whether it is the residual of a known motion; one that is measured directly holds the motion itself.
+    /// Names of the components of each process that has several.
+    #[must_use]
+    pub fn vector_processes(&self) -> Vec<Vec<&str>> {
+        let by_process = self.components.chunk_by(|a, b| a.declared == b.declared);
+        let names = by_process.map(|own| own.iter().map(|c| c.name.as_str()).collect::<Vec<_>>());
+        names.filter(|names| names.len() > 1).collect()
+    }
+
+    /// Whether an estimate that enters the channels is made from what this component drives.
+    #[must_use]
+    pub fn is_estimated(&self, name: &str) -> bool {
+        self.components.iter().any(|c| c.name == name && c.estimated.is_some())
+    }
+
+    /// Per channel, whether the declared processes are all there is in it once the model is taken out; false for a
+    /// channel into which a process of unknown spectrum enters, or none at all.
     #[must_use]
     pub fn residual(&self) -> &[bool] {
         &self.residual
@@ -314,7 +208,7 @@ impl NoiseModel {
     pub fn groups(&self) -> Vec<usize> {
         let mut label: Vec<usize> = (0..self.channels).collect();
         let entries = self.processes.iter().map(|p| p.enters.clone());
-        let entries = entries.chain(self.angular_error.iter().map(|e| &e.lever * e.lever.transpose()));
+        let entries = entries.chain(self.errors.iter().map(|e| &e.gain * e.gain.transpose()));
         for m in entries {
             for i in 0..self.channels {
                 for j in (0..i).filter(|j| m[(i, *j)] != 0.0) {
@@ -326,17 +220,60 @@ impl NoiseModel {
         label
     }
 
-    fn response(&self, response: Response, frequency_hz: f64) -> f64 {
-        let (sin, cos) = (std::f64::consts::PI * frequency_hz * self.dt_s).sin_cos();
+    fn power(&self, response: NoiseResponse, frequency_hz: f64) -> f64 {
+        let [held, differenced] = responses(frequency_hz, self.dt_s);
         match response {
-            Response::Held => cos * cos,
-            Response::Readout => (4.0 * sin * sin / (self.dt_s * self.dt_s)).powi(2),
-            Response::Flat => 1.0,
+            NoiseResponse::Held => held,
+            NoiseResponse::Differenced => differenced,
+            NoiseResponse::Direct => 1.0,
         }
+    }
+
+    /// Spectra of the quantities and of their readout, `S_w` and `S_n`.
+    fn spectra(&self, error: &EstimationError, frequency_hz: f64) -> (DMatrix<f64>, Option<DMatrix<f64>>) {
+        let driven = &error.driven * (self.power(error.response, frequency_hz) * error.shape.psd(frequency_hz));
+        let size = driven.nrows();
+        let readout = error.readout.as_ref().map(|(shape, response)| {
+            let level = self.power(*response, frequency_hz) * shape.psd(frequency_hz);
+            DMatrix::from_diagonal_element(size, size, level)
+        });
+        (driven, readout)
+    }
+
+    /// The part of the estimated quantities that is not known, `S_n (S_w + S_n)⁻¹`: [`Self::remaining`] is this times
+    /// `S_w`, and changes by this times a change of `S_w` times its transpose.
+    fn unknown_part(&self, error: &EstimationError, frequency_hz: f64) -> DMatrix<f64> {
+        let (sw, sn) = self.spectra(error, frequency_hz);
+        let all = || DMatrix::identity(sw.nrows(), sw.nrows());
+        let Some(sn) = sn else { return all() };
+        (&sw + &sn).try_inverse().map_or_else(all, |inverse| sn * inverse)
+    }
+
+    /// `S_w − S_w (S_w + S_n)⁻¹ S_w = S_n (S_w + S_n)⁻¹ S_w`; the second form has no difference of near-equal matrices
+    /// where the readout is good.
+    fn remaining(&self, error: &EstimationError, frequency_hz: f64) -> DMatrix<f64> {
+        let (sw, _) = self.spectra(error, frequency_hz);
+        let r = self.unknown_part(error, frequency_hz) * sw;
+        0.5 * (&r + r.transpose())
     }
 }
 
-/// The mission's noise in the bands of a plan: made once for as many estimates as there are, as a band has up to ten thousand bins.
+fn is_any(numbers: &[f64]) -> bool {
+    numbers.iter().any(|x| *x != 0.0)
+}
+
+/// Channels × components, zero for a channel that is not named.
+fn gains<S: AsRef<str>>(channels: &[S], by_channel: &BTreeMap<String, Vec<f64>>, size: usize) -> DMatrix<f64> {
+    let gain = |i: usize, k: usize| by_channel.get(channels[i].as_ref()).map_or(0.0, |row| row[k]);
+    DMatrix::from_fn(channels.len(), size, gain)
+}
+
+fn matrix(rows: &[Vec<f64>], columns: usize) -> DMatrix<f64> {
+    DMatrix::from_fn(rows.len(), columns, |i, j| rows[i][j])
+}
+
+/// The modelled noise in the bands of a plan: made once for as many estimates as there are, as a band has up to ten
+/// thousand bins.
 pub struct BandNoise<'a> {
     /// At any frequency.
     pub model: &'a NoiseModel,
@@ -357,142 +294,117 @@ impl<'a> BandNoise<'a> {
     }
 }
 
-impl AngularError {
-    /// The part of an angular acceleration that is not known, `S_n (S_w + S_n)⁻¹`: `remaining` is this times `S_w`, and changes by this
-    /// times a change of `S_w` times its transpose.
-    fn unknown_part(&self, held: f64, differenced: f64, frequency_hz: f64) -> Matrix3<f64> {
-        let Some(attitude) = &self.attitude else { return Matrix3::identity() };
-        let sw = self.disturbance * (held * self.torque.psd(frequency_hz));
-        let sn = Matrix3::from_diagonal(&Vector3::repeat(differenced * attitude.psd(frequency_hz)));
-        (sw + sn).try_inverse().map_or_else(Matrix3::identity, |inverse| sn * inverse)
-    }
-
-    /// `R_α = S_w − S_w (S_w + S_n)⁻¹ S_w`: torque noise S_w as the channels see it, given an attitude readout of noise S_n.
-    fn remaining(&self, held: f64, differenced: f64, frequency_hz: f64) -> Matrix3<f64> {
-        let sw = self.disturbance * (held * self.torque.psd(frequency_hz));
-        // S_n (S_w+S_n)⁻¹ S_w, the same as above without the difference of near-equal matrices where the readout is good.
-        let r = self.unknown_part(held, differenced, frequency_hz) * sw;
-        0.5 * (r + r.transpose())
-    }
-}
-
-fn dynamic(m: &Matrix3<f64>) -> DMatrix<f64> {
-    DMatrix::from_column_slice(3, 3, m.as_slice())
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dragfree_schema::NoiseEstimate;
 
-    fn taiji() -> Mission {
-        let text = include_str!("../../../fixtures/missions/taiji.toml");
-        let value: serde_json::Value = toml::from_str(text).expect("the fixture is TOML");
-        Mission::from_json(&value.to_string()).expect("the fixture is a mission")
+    const DT_S: f64 = 0.1;
+
+    fn white(name: &str, asd: f64, response: NoiseResponse, channel: &str, gain: f64) -> NoiseProcess {
+        NoiseProcess {
+            name: name.to_owned(),
+            spectrum: Some(NoiseShape::white(asd)),
+            response,
+            enters: [(channel.to_owned(), vec![gain])].into(),
+            ..NoiseProcess::default()
+        }
     }
 
-    const NINE: [&str; 9] = [
-        "tm1.accel.x",
-        "tm1.accel.y",
-        "tm1.accel.z",
-        "tm2.accel.x",
-        "tm2.accel.y",
-        "tm2.accel.z",
-        "sc.alpha.x",
-        "sc.alpha.y",
-        "sc.alpha.z",
-    ];
-
-    fn nine() -> NoiseModel {
-        NoiseModel::new(&taiji(), &NINE.map(|c| (c, Measured::Differenced)), 0.1).expect("a model")
+    /// A process of ASD 3 drives a quantity by a factor of 2; an estimate of it, read with the ASD `readout`, enters
+    /// the channel.
+    fn estimated(readout: Option<f64>) -> NoiseProcess {
+        NoiseProcess {
+            components: vec!["driver".to_owned()],
+            enters: BTreeMap::new(),
+            estimate: Some(NoiseEstimate {
+                matrix: vec![vec![2.0]],
+                readout: readout.map(NoiseShape::white),
+                readout_response: NoiseResponse::Differenced,
+                enters: [("a".to_owned(), vec![0.5])].into(),
+            }),
+            ..white("driver", 3.0, NoiseResponse::Held, "a", 0.0)
+        }
     }
 
-    /// At 10 mHz thrust noise is 6.7e-11 m s⁻²/√Hz on every axis; the two masses see it through the angle of 60° between them.
     #[test]
-    fn thrust_is_common_to_both_test_masses() {
-        let s = nine().psd(0.01);
-        let thrust = (1e-7f64 / 1500.0).powi(2);
-        assert!((s[(0, 0)] / thrust - 1.0).abs() < 0.03);
-        assert!((s[(0, 3)] / thrust - 0.5).abs() < 0.03);
-        assert!((s[(2, 5)] / thrust - 1.0).abs() < 0.03);
+    fn each_response_has_its_power() {
+        let f = 1.3;
+        let (sin, cos) = (std::f64::consts::PI * f * DT_S).sin_cos();
+        for (response, power) in [
+            (NoiseResponse::Held, cos * cos),
+            (NoiseResponse::Differenced, 16.0 * sin.powi(4) / DT_S.powi(4)),
+            (NoiseResponse::Direct, 1.0),
+        ] {
+            let model = NoiseModel::new(&[white("n", 2.0, response, "a", -3.0)], &["a"], DT_S).expect("a model");
+            assert!((model.psd(f)[(0, 0)] / (36.0 * power) - 1.0).abs() < 1e-12, "{response:?}");
+        }
     }
 
-    /// Independent of the code's matrices: the combination `x_1 − x_2 − y_1 tan 30° − y_2 tan 30°` … is found as the null
-    /// space of the thrust's 3 columns; in it only readout, electrostatic force and stray acceleration are left.
+    /// `M C Mᵀ` of two components that are correlated, on three channels of which the second is not weighed; each
+    /// component alone has its own variance.
     #[test]
-    fn null_combinations_do_not_see_the_thrust() {
-        let s = nine().psd(0.01).view((0, 0), (6, 6)).clone_owned();
-        let eigen = s.symmetric_eigenvalues();
-        let mut values: Vec<f64> = eigen.iter().copied().collect();
-        values.sort_by(f64::total_cmp);
-        let readout = 1.8e-9 * (std::f64::consts::TAU * 0.01).powi(2);
-        assert!(values[2] < 3.0 * readout.powi(2), "{values:?}");
-        assert!(values[3] > 1e2 * values[2]);
+    fn components_may_be_correlated() {
+        let row = |a: f64, b: f64| vec![a, b];
+        let process = NoiseProcess {
+            components: vec!["n:1".to_owned(), "n:2".to_owned()],
+            covariance: Some(vec![row(4.0, 1.0), row(1.0, 9.0)]),
+            enters: [("a", row(1.0, 2.0)), ("b", row(5.0, 5.0)), ("c", row(0.0, 1.0))]
+                .map(|(channel, row)| (channel.to_owned(), row))
+                .into(),
+            ..white("n", 1.0, NoiseResponse::Direct, "a", 1.0)
+        };
+        let model = NoiseModel::new(&[process], &["a", "c"], DT_S).expect("a model");
+        assert_eq!(model.psd(1.0), DMatrix::from_row_slice(2, 2, &[44.0, 19.0, 19.0, 9.0]));
+        let alone = model.process_psd("n:2", 1.0).expect("a component");
+        assert_eq!(alone, DMatrix::from_row_slice(2, 2, &[36.0, 18.0, 18.0, 9.0]));
+        assert_eq!((model.vector_processes(), model.groups()), (vec![vec!["n:1", "n:2"]], vec![0, 0]));
     }
 
-    /// What a process adds to Σ is what Σ gains when the mission file says a little more of it: for a torque in the attitude's channels and,
-    /// through what α̂ does not know, in the test masses'. By differences of two noise models, for every process.
+    /// `S_n S_q/(S_n + S_q)` of a scalar: nothing with a perfect readout, all of `q` with a blind one or none.
     #[test]
-    fn a_process_is_what_sigma_gains_by_a_little_more_of_it() {
+    fn the_error_of_an_estimate_has_both_limits() {
+        let f = 0.7;
+        let (sin, cos) = (std::f64::consts::PI * f * DT_S).sin_cos();
+        let all = 36.0 * cos * cos;
+        let error = |readout| NoiseModel::new(&[estimated(readout)], &["a"], DT_S).expect("a model").psd(f)[(0, 0)];
+        assert!(error(Some(1e-12)) < 1e-20 * all);
+        assert!((error(Some(1e12)) / (0.25 * all) - 1.0).abs() < 1e-12);
+        assert!((error(None) / (0.25 * all) - 1.0).abs() < 1e-12);
+        let sn = 0.04 * 16.0 * sin.powi(4) / DT_S.powi(4);
+        assert!((error(Some(0.2)) / (0.25 * sn * all / (sn + all)) - 1.0).abs() < 1e-12);
+    }
+
+    /// What a component is said to add is what Σ gains when a little more of it is declared, the estimate's error
+    /// included.
+    #[test]
+    fn a_component_is_what_sigma_gains_by_a_little_more_of_it() {
+        let model = |asd: f64| {
+            let spectrum = Some(NoiseShape::white(asd));
+            NoiseModel::new(&[NoiseProcess { spectrum, ..estimated(Some(0.2)) }], &["a"], DT_S).expect("a model")
+        };
         let more = 1e-6_f64;
-        let louder = |table: &dyn Fn(&mut Mission)| {
-            let mut mission = taiji();
-            table(&mut mission);
-            NoiseModel::new(&mission, &NINE.map(|c| (c, Measured::Differenced)), 0.1).expect("a model")
-        };
-        let factor = (1.0 + more).sqrt();
-        let torque = louder(&|m| m.noise.thruster_torque.as_mut().expect("there").asd_nm_rthz *= factor);
-        let force = louder(&|m| m.noise.thruster_force.as_mut().expect("there").asd_n_rthz *= factor);
-        let base = nine();
-        for f in [1e-3, 0.03, 0.08, 0.3, 2.0] {
-            for (louder, process) in [(&torque, "thruster_torque"), (&force, "thruster_force")] {
-                let gained = (louder.psd(f) - base.psd(f)) / more;
-                let parts = ["x", "y", "z"].map(|a| base.process_psd(&format!("{process}:sc.{a}"), f).expect("there"));
-                let sum = &parts[0] + &parts[1] + &parts[2];
-                let scale = |i: usize, j: usize| (base.psd(f)[(i, i)] * base.psd(f)[(j, j)]).sqrt();
-                for i in 0..9 {
-                    for j in 0..9 {
-                        let error = (gained[(i, j)] - sum[(i, j)]).abs();
-                        assert!(error < 1e-5 * scale(i, j), "{process} at {f} Hz, {i} {j}: {error:e}");
-                    }
-                }
-                // At 0.3 Hz α̂ does not know the torque, and Σ of x shows it.
-                assert!(process == "thruster_force" || f != 0.3 || sum[(0, 0)] > 0.01 * base.psd(f)[(0, 0)], "{sum}");
-            }
-        }
-    }
-
-    /// A perfect readout leaves nothing unknown, a blind one the whole torque noise.
-    #[test]
-    fn the_remaining_error_of_alpha_has_both_limits() {
-        let mut mission = taiji();
-        let remaining = |m: &Mission, f: f64| {
-            let model = NoiseModel::new(m, &[("tm1.accel.x", Measured::Differenced)], 0.1).expect("a model");
-            model.angular_error.as_ref().expect("a lever").remaining(1.0, (std::f64::consts::TAU * f).powi(4), f)
-                [(0, 0)]
-        };
-        let all = 1e-14 / (800.0f64 * 800.0);
-        mission.noise.dws_long_arm.as_mut().expect("dws").asd_rad_rthz = 1e-20;
-        assert!(remaining(&mission, 0.1) < 1e-12 * all);
-        mission.noise.dws_long_arm.as_mut().expect("dws").asd_rad_rthz = 1.0;
-        assert!((remaining(&mission, 0.1) / all - 1.0).abs() < 2e-3);
+        let gained = (model(3.0 * (1.0 + more).sqrt()).psd(0.7) - model(3.0).psd(0.7)) / more;
+        let named = model(3.0).process_psd("driver", 0.7).expect("a component");
+        assert!((gained[(0, 0)] / named[(0, 0)] - 1.0).abs() < 1e-5);
+        assert!(model(3.0).is_estimated("driver") && model(3.0).process_psd("another", 0.7).is_none());
     }
 
     #[test]
-    fn the_attitude_stands_apart_from_the_test_masses() {
-        let s = nine().psd(0.05);
-        for i in 0..6 {
-            for j in 6..9 {
-                assert_eq!(s[(i, j)], 0.0);
-            }
-        }
-    }
-
-    #[test]
-    fn a_channel_without_noise_is_named_and_starts_white() {
-        let mut mission = taiji();
-        mission.noise.accelerometer_linear = None;
-        let model = NoiseModel::new(&mission, &[("tm1.accel.x", Measured::Directly)], 1.0).expect("a model");
-        assert_eq!(model.unknown, [0]);
+    fn a_channel_without_declared_noise_starts_white_and_is_no_residual() {
+        let unknown = NoiseProcess { spectrum: None, ..white("motion", 0.0, NoiseResponse::Direct, "b", 1.0) };
+        let own = |channel| white(channel, 1e-9, NoiseResponse::Direct, channel, 1.0);
+        let model = NoiseModel::new(&[own("b"), own("c"), unknown], &["a", "b", "c"], DT_S).expect("a model");
+        assert_eq!((model.unknown.as_slice(), model.residual()), (&[0][..], &[false, false, true][..]));
         assert_eq!(model.psd(0.1)[(0, 0)], 1.0);
+        assert!((model.psd(0.1)[(1, 1)] / 1e-18 - 1.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn a_declaration_that_contradicts_itself_is_refused_by_name() {
+        let wrong =
+            NoiseProcess { components: vec!["n:1".to_owned(); 2], ..white("n", 1.0, NoiseResponse::Held, "a", 1.0) };
+        let refusal = NoiseModel::new(&[wrong], &["a"], DT_S).map(|_| ()).expect_err("two components, one column");
+        assert!(refusal.to_string().contains("`n`"), "{refusal}");
     }
 }

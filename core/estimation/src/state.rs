@@ -119,12 +119,9 @@ mod tests {
     use super::*;
     use crate::prediction::Prediction;
     use crate::segments::Segmenter;
-    use crate::sigma::{Measured, NoiseModel};
+    use crate::sigma::NoiseModel;
     use crate::spectra::{Analyser, Layout, Regressor};
-    use dragfree_physics::mission::Mission;
     use dragfree_schema::state;
-
-    const DAY: [Measured; 1] = [Measured::Directly];
 
     fn layout() -> Layout {
         Layout {
@@ -136,12 +133,9 @@ mod tests {
     }
 
     fn begin() -> (Segmenter, Collected, Analyser) {
-        let text = include_str!("../../../fixtures/missions/taiji.toml");
-        let value: serde_json::Value = toml::from_str(text).expect("the fixture is TOML");
-        let mission = Mission::from_json(&value.to_string()).expect("a mission");
-        let model = NoiseModel::new(&mission, &[("c", DAY[0])], 0.1).expect("a model");
+        let model = NoiseModel::new(&[], &["c"], 0.1).expect("a model");
         let plan = Plan::new(64, 10.0);
-        let prediction = Prediction::new(&model, &DAY, &layout(), &plan);
+        let prediction = Prediction::new(&model, &[false], &layout(), &plan);
         assert!(prediction.is_some());
         let collected = Collected::new(&plan, &layout(), prediction);
         (Segmenter::new(64, 100_000_000, vec![false; 2]), collected, Analyser::new(plan, &layout()))

@@ -1,11 +1,12 @@
 //! Sums as they lie beside a product: what a day leaves behind, to be added to other days and solved again for any Σ.
 
+use dragfree_schema::NoiseProcess;
 use serde::{Deserialize, Serialize};
 
 use crate::spectra::{Block, Layout, Plan, Spectra, Sums, triangle};
 
 /// Version of the layout of stored sums.
-pub const FORMAT: u32 = 1;
+pub const FORMAT: u32 = 2;
 
 /// Sums in a form for JSON, in which every float is exact.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -18,6 +19,9 @@ pub struct Stored {
     pub length: usize,
     /// Samples per second.
     pub rate_hz: f64,
+    /// Declared noise of the channels, from which Σ is made.
+    #[serde(default)]
+    pub noise: Vec<NoiseProcess>,
     /// First and last frequency of each band, Hz.
     pub bands_hz: Vec<[f64; 2]>,
     /// Per band, the lower triangle of the columns' summed cross-spectra, channels, then series; and their weights.
@@ -46,12 +50,13 @@ pub enum StoredError {
 impl Stored {
     /// What is to be stored.
     #[must_use]
-    pub fn new(layout: &Layout, plan: &Plan, spectra: &Spectra) -> Self {
+    pub fn new(layout: &Layout, plan: &Plan, noise: &[NoiseProcess], spectra: &Spectra) -> Self {
         Self {
             format: FORMAT,
             layout: layout.clone(),
             length: plan.length,
             rate_hz: plan.rate_hz,
+            noise: noise.to_vec(),
             bands_hz: plan.bands.iter().map(|b| [b.first, b.end - 1].map(|k| plan.bin_hz(k as f64))).collect(),
             spectra: spectra.clone(),
         }
@@ -69,6 +74,7 @@ impl Stored {
                 (day.layout == first.layout, "channels or effects"),
                 (day.length == first.length, "the length of segments"),
                 (day.rate_hz == first.rate_hz, "the sample rate"),
+                (day.noise == first.noise, "the declared noise"),
             ];
             if let Some((_, what)) = same.into_iter().find(|(same, _)| !same) {
                 return Err(StoredError::Unlike(what));
@@ -105,6 +111,9 @@ impl Stored {
         if !regressors.iter().all(|r| inside(r) && r.factor.is_finite()) {
             return damaged("regressors");
         }
+        if self.noise.iter().any(|p| p.check().is_err()) {
+            return damaged("declared noise");
+        }
         let bands = Plan::new(self.length, self.rate_hz).bands.len();
         let Spectra { packed, expected, weight, weight_squared, .. } = &self.spectra;
         let sizes = [self.bands_hz.len(), expected.len(), weight.len(), weight_squared.len()];
@@ -123,6 +132,16 @@ impl Stored {
 mod tests {
     use super::*;
     use crate::spectra::{Analyser, Regressor};
+    use dragfree_schema::NoiseShape;
+
+    fn declared(asd: f64) -> NoiseProcess {
+        NoiseProcess {
+            name: "n".to_owned(),
+            spectrum: Some(NoiseShape::white(asd)),
+            enters: [("c".to_owned(), vec![1.0])].into(),
+            ..NoiseProcess::default()
+        }
+    }
 
     fn day(seed: u64) -> Stored {
         let layout = Layout {
@@ -136,7 +155,7 @@ mod tests {
         let column =
             |k: u64| -> Vec<f64> { (0..64).map(|t| (1e-9 * (t * t + 7 * k) as f64 * seed as f64).sin()).collect() };
         analyser.add(0, 0, &[&column(1), &column(2)], false, &mut sums);
-        Stored::new(&layout, analyser.plan(), &sums.total)
+        Stored::new(&layout, analyser.plan(), &[declared(1e-12)], &sums.total)
     }
 
     #[test]
@@ -162,6 +181,8 @@ mod tests {
         assert!(change(|d| d.spectra.packed[0] = f64::NAN).contains("damaged"));
         assert!(change(|d| d.length = 10).contains("length"));
         assert!(change(|d| d.rate_hz = 5.0).contains("sample rate"));
+        assert!(change(|d| d.noise = vec![declared(2e-12)]).contains("declared noise"));
+        assert!(change(|d| d.noise = vec![declared(f64::NAN)]).contains("damaged"));
         assert!(change(|d| d.layout.regressors[0].series = 9).contains("regressors"));
         assert!(change(|d| d.layout.coefficients[0] = "g".into()).contains("effects"));
         assert!(Stored::stack(&[]).is_err());

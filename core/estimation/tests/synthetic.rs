@@ -6,10 +6,11 @@
 use dragfree_estimation::estimate::{Bound, Estimate, Observed, Unknown, estimate};
 use dragfree_estimation::prediction::Prediction;
 use dragfree_estimation::segments::{Collected, Segmenter};
-use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_estimation::sigma::NoiseModel;
 use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, Sums};
 use dragfree_estimation::state;
 use dragfree_estimation::stored::Stored;
+use dragfree_hinf_dfacs::noise::declared;
 use dragfree_physics::frames::dcm_turned_about_z;
 use dragfree_physics::mission::Mission;
 use dragfree_schema::state::{State, load, save};
@@ -224,8 +225,13 @@ fn baseline() -> Vec<Bound> {
         .collect()
 }
 
+/// The noise of the mission as the stage that makes the channels declares it.
+fn noise_model(mission: &Mission) -> NoiseModel {
+    NoiseModel::new(&declared(mission, &["ifo_x"; 2]), &CHANNELS, DT_S).expect("a noise model")
+}
+
 fn sums(columns: &[Vec<f64>], mission: &Mission) -> (Sums, Plan, NoiseModel) {
-    let model = NoiseModel::new(mission, &CHANNELS.map(|c| (c, Measured::Differenced)), DT_S).expect("a noise model");
+    let model = noise_model(mission);
     let collected = collect(columns, None);
     (collected.sums, Plan::new(LENGTH, RATE_HZ), model)
 }
@@ -648,10 +654,8 @@ fn the_prediction_error_fit_finds_the_same_offsets() {
         let longer = data(seed, Scene { rows: scene.rows + 2000, ..scene });
         let columns: Vec<Vec<f64>> = longer.iter().map(|c| c[1000..c.len() - 1000].to_vec()).collect();
         let plan = Plan::new(LENGTH, RATE_HZ);
-        let measured = [Measured::Differenced; 9];
-        let model =
-            NoiseModel::new(&mission(), &CHANNELS.map(|c| (c, Measured::Differenced)), DT_S).expect("a noise model");
-        let collected = collect(&columns, Prediction::new(&model, &measured, &layout(), &plan));
+        let model = noise_model(&mission());
+        let collected = collect(&columns, Prediction::new(&model, &[true; 9], &layout(), &plan));
         let prediction = collected.prediction.as_ref();
         let observed = Observed { layout: &layout(), plan: &plan, sums: &collected.all(&plan), prediction };
         let e = estimate(&observed, &model, &unknowns(50.0), &[], 3).expect("a solution");
@@ -684,9 +688,8 @@ fn the_prediction_error_fit_finds_the_same_offsets() {
 fn daily_sums_stacked_are_one_long_run() {
     let columns = data(11, LOOP);
     let plan = || Plan::new(LENGTH, RATE_HZ);
-    let model =
-        NoiseModel::new(&mission(), &CHANNELS.map(|c| (c, Measured::Differenced)), DT_S).expect("a noise model");
-    let prediction = || Prediction::new(&model, &[Measured::Differenced; 9], &layout(), &plan());
+    let model = noise_model(&mission());
+    let prediction = || Prediction::new(&model, &[true; 9], &layout(), &plan());
     let begin = || {
         let segmenter = Segmenter::new(LENGTH, 100_000_000, (0..27).map(|j| j >= 9).collect());
         (segmenter, Collected::new(&plan(), &layout(), prediction()), Analyser::new(plan(), &layout()))
@@ -714,7 +717,7 @@ fn daily_sums_stacked_are_one_long_run() {
     feed(midnight..ROWS, &mut second);
 
     let want = solve(&long.1.all(&plan()));
-    let stored = [&first.1, &second.1].map(|c| Stored::new(&layout(), &plan(), &c.sums.total));
+    let stored = [&first.1, &second.1].map(|c| Stored::new(&layout(), &plan(), &[], &c.sums.total));
     let text = stored.map(|s| serde_json::to_string(&s).expect("JSON"));
     let days: Vec<Stored> = text.iter().map(|t| serde_json::from_str(t).expect("our own")).collect();
     let (_, _, stacked) = Stored::stack(&days).expect("two days");

@@ -2,7 +2,8 @@
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use dragfree_estimation::segments::Segmenter;
-use dragfree_estimation::sigma::{Measured, NoiseModel};
+use dragfree_estimation::sigma::NoiseModel;
+use dragfree_hinf_dfacs::noise::declared;
 use dragfree_identification::candidates::{CandidateSet, Coefficient, Form, Term};
 use dragfree_identification::coherence::HousekeepingCoherence;
 use dragfree_identification::gram::{Columns, GramAccumulator, GramSums};
@@ -127,8 +128,7 @@ fn bench(criterion: &mut Criterion) {
     let text = include_str!("../../../fixtures/missions/taiji.toml");
     let value: serde_json::Value = toml::from_str(text).expect("the fixture is TOML");
     let mission = Mission::from_json(&value.to_string()).expect("the fixture is a mission");
-    let channels = CHANNELS.map(|c| (c, Measured::Differenced));
-    let noise = NoiseModel::new(&mission, &channels, 1.0 / RATE_HZ).expect("a noise model");
+    let noise = NoiseModel::new(&declared(&mission, &["ifo_x"; 2]), &CHANNELS, 1.0 / RATE_HZ).expect("a noise model");
     let mut rng = Xoshiro256PlusPlus::seed_from_u64(1);
     let mut white = || -> f64 { StandardNormal.sample(&mut rng) };
     let mut columns = channels_of(&noise, &mut white);

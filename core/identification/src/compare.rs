@@ -119,7 +119,7 @@ pub struct Channel {
     pub frequency_hz: Vec<f64>,
     /// One-sided PSD of the residual, unit of the channel squared per Hz.
     pub measured_psd: Vec<f64>,
-    /// The same as the mission predicts it.
+    /// The same as the declared noise predicts it.
     pub predicted_psd: Vec<f64>,
     /// Ends of the interval in which 95 % of `measured_psd / predicted_psd` lie if the prediction is right.
     pub interval_95: Vec<[f64; 2]>,
@@ -143,7 +143,7 @@ pub struct Channel {
     pub cumulative_limit: f64,
     /// Autocorrelations of the whitened residual at lags of 1, 2 … samples.
     pub autocorrelation: Vec<f64>,
-    /// Tests; none where the mission file has no noise for the channel.
+    /// Tests; none where the channel holds more than declared noise.
     pub tests: Vec<Test>,
     /// Whether all are passed.
     pub passes: bool,
@@ -340,7 +340,7 @@ pub fn compare(
         Levels::new(scorer.noise, plan, &whole, &measured).coloured(plan, &colours(&unknowns, &fit.estimate.theta));
     levels.fit();
 
-    let known = |i: usize| scorer.noise.residual()[i] && !scorer.noise.unknown.contains(&i);
+    let known = |i: usize| scorer.noise.residual()[i];
     let single = |i: usize| DVector::from_fn(names.len(), |j, _| f64::from(u8::from(i == j)));
     let mut combinations: Vec<(String, DVector<f64>, Kind)> =
         (0..names.len()).map(|i| (names[i].clone(), single(i), Kind::Channel)).collect();
@@ -446,30 +446,34 @@ fn predicted(noise: &NoiseModel, plan: &Plan) -> Vec<DMatrix<f64>> {
 
 /// Common and null combinations of two test masses; none where not both see every direction of a force.
 fn pairs(noise: &NoiseModel, channels: &[String], rate_hz: f64) -> Vec<(String, DVector<f64>, Kind)> {
-    const FORCE: &str = "thruster_force:";
+    let vectors = noise.vector_processes().into_iter().filter(|axes| !axes.iter().any(|a| noise.is_estimated(a)));
+    vectors.map(|axes| pairs_of(noise, &axes, channels, rate_hz)).find(|pairs| !pairs.is_empty()).unwrap_or_default()
+}
+
+/// The same of one vector process, by the names of its components, `PROCESS:AXIS`. A channel's first word names its body.
+fn pairs_of(noise: &NoiseModel, axes: &[&str], channels: &[String], rate_hz: f64) -> Vec<(String, DVector<f64>, Kind)> {
     let n = channels.len();
-    let axes: Vec<&str> = noise.process_names().filter_map(|p| p.strip_prefix(FORCE)).collect();
-    // Each process is one vector times itself: the acceleration along an axis as the channels see it.
+    // Each component is one vector times itself: the acceleration along an axis as the channels see it.
     let columns: Vec<DVector<f64>> = axes
         .iter()
-        .filter_map(|axis| noise.process_psd(&format!("{FORCE}{axis}"), 0.01 * rate_hz))
+        .filter_map(|axis| noise.process_psd(axis, 0.01 * rate_hz))
         .map(|p| p.column(p.diagonal().imax()).into_owned())
         .collect();
-    let mass = |i: usize| channels[i].split('.').next().unwrap_or_default();
-    let mut masses: Vec<&str> = Vec::new();
+    let body = |i: usize| channels[i].split('.').next().unwrap_or_default();
+    let mut bodies: Vec<&str> = Vec::new();
     for i in (0..n).filter(|i| columns.iter().any(|c| c[*i] != 0.0)) {
-        if !masses.contains(&mass(i)) {
-            masses.push(mass(i));
+        if !bodies.contains(&body(i)) {
+            bodies.push(body(i));
         }
     }
-    let [first, second] = masses[..] else { return Vec::new() };
+    let [first, second] = bodies[..] else { return Vec::new() };
     let seen_by = |name: &str| {
-        let rows: Vec<usize> = (0..n).filter(|i| mass(*i) == name).collect();
+        let rows: Vec<usize> = (0..n).filter(|i| body(*i) == name).collect();
         (DMatrix::from_fn(rows.len(), axes.len(), |i, k| columns[k][rows[i]]), rows)
     };
     let (mut a, rows_a) = seen_by(first);
     let (mut b, rows_b) = seen_by(second);
-    // A unit of acceleration along the axis, and up where the first mass sees most of it.
+    // A unit of acceleration along the axis, and up where the first body sees most of it.
     for k in 0..axes.len() {
         let scale = a[(a.column(k).icamax(), k)].signum() * a.column(k).norm();
         a.column_mut(k).unscale_mut(scale);
@@ -483,7 +487,8 @@ fn pairs(noise: &NoiseModel, channels: &[String], rate_hz: f64) -> Vec<(String, 
         let rounded = |x: f64| if x.abs() < 1e-12 { 0.0 } else { x };
         rows_a.iter().enumerate().for_each(|(j, i)| weights[*i] = rounded(of_a * from_a[(k, j)]));
         rows_b.iter().enumerate().for_each(|(j, i)| weights[*i] = rounded(of_b * from_b[(k, j)]));
-        (format!("{name}.{}", axes[k]), weights, kind)
+        let axis = axes[k].split_once(':').map_or(axes[k], |(_, axis)| axis);
+        (format!("{name}.{axis}"), weights, kind)
     };
     [Kind::Common, Kind::Null]
         .into_iter()
@@ -618,9 +623,8 @@ fn autocorrelations(plan: &Plan, part: &[f64], ratio: &[f64], n: f64) -> (Vec<f6
 mod tests {
     use super::*;
     use crate::gram::HOUR_NS;
-    use dragfree_estimation::sigma::Measured;
     use dragfree_estimation::spectra::{Analyser, Layout, Sums};
-    use dragfree_physics::mission::Mission;
+    use dragfree_schema::{NoiseEstimate, NoiseProcess, NoiseShape};
     use rand::SeedableRng;
     use rand_distr::{Distribution, StandardNormal};
     use rand_xoshiro::Xoshiro256PlusPlus;
@@ -748,28 +752,45 @@ mod tests {
     /// sees the spacecraft's x as (c, −s, 0) and the second as (c, s, 0).
     #[test]
     fn null_combinations_are_those_of_the_geometry() {
-        let text = include_str!("../../../fixtures/missions/taiji.toml");
-        let value: serde_json::Value = toml::from_str(text).expect("the fixture is TOML");
-        let mission = Mission::from_json(&value.to_string()).expect("the fixture is a mission");
-        let names: Vec<String> = ["tm1.accel", "tm2.accel", "sc.alpha"]
+        let (c, s) = (0.75f64.sqrt(), 0.5);
+        let names: Vec<String> = ["a.accel", "b.accel", "craft.alpha"]
             .iter()
             .flat_map(|body| ["x", "y", "z"].map(|axis| format!("{body}.{axis}")))
             .collect();
-        let measured: Vec<(&str, Measured)> = names.iter().map(|n| (n.as_str(), Measured::Differenced)).collect();
-        let noise = NoiseModel::new(&mission, &measured, 0.1).expect("a model");
+        let vector = |name: &str, first: usize, rows: &[[f64; 3]]| NoiseProcess {
+            name: name.to_owned(),
+            spectrum: Some(NoiseShape::white(1e-7)),
+            components: ["x", "y", "z"].map(|axis| format!("{name}:craft.{axis}")).to_vec(),
+            enters: names[first..]
+                .iter()
+                .cloned()
+                .zip(rows.iter().map(|row| row.map(|g| -g / 1500.0).to_vec()))
+                .collect(),
+            ..NoiseProcess::default()
+        };
+        let eye = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]];
+        let bodies = [[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0], [c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]];
+        let torque = NoiseProcess {
+            estimate: Some(NoiseEstimate {
+                matrix: eye.map(|row| row.to_vec()).to_vec(),
+                enters: vector("lever", 0, &bodies).enters,
+                ..NoiseEstimate::default()
+            }),
+            ..vector("torque", 6, &eye)
+        };
+        let noise = NoiseModel::new(&[torque, vector("force", 0, &bodies)], &names, 0.1).expect("a model");
         let pairs = pairs(&noise, &names, 10.0);
         assert_eq!(
             pairs.iter().map(|p| p.2 == Kind::Null).collect::<Vec<_>>(),
             [false, false, false, true, true, true]
         );
-        let (c, s) = (0.75f64.sqrt(), 0.5);
         let want = [[c, -s, 0.0, -c, -s, 0.0], [s, c, 0.0, s, -c, 0.0], [0.0, 0.0, 1.0, 0.0, 0.0, -1.0]];
         for ((name, weights, _), want) in pairs[3..].iter().zip(want) {
             let apart = (0..6).map(|i| (weights[i] - want[i]).abs()).fold(0.0, f64::max);
             assert!(apart < 1e-9 && (6..9).all(|i| weights[i] == 0.0), "{name}: {weights}");
-            // No force on the spacecraft is left in them, but for rounding.
+            // No common force is left in them, but for rounding.
             for axis in ["x", "y", "z"] {
-                let force = noise.process_psd(&format!("thruster_force:sc.{axis}"), 0.01).expect("a process");
+                let force = noise.process_psd(&format!("force:craft.{axis}"), 0.01).expect("a process");
                 assert!(weights.dot(&(&force * weights)).abs() < 1e-14 * force.trace());
             }
         }

@@ -147,6 +147,9 @@ pub struct Found {
     /// Whether it was selected by the likelihood ratio over an excess of power.
     #[serde(skip)]
     of_excess: bool,
+    /// Whether it is a level of noise that drives an estimate which enters the channels.
+    #[serde(skip)]
+    drives_estimate: bool,
 }
 
 /// The upper limit of a coefficient that is not detected.
@@ -452,19 +455,15 @@ fn candidates_of_excess(
 /// - It was selected by an excess of power, or has `part` > ½ of its information in the bands of one, and an excess or
 ///   a coherence with
 ///   housekeeping remains in its channels: it correlates with the cause and is not the cause.
-/// - It moves the offset, and its fall of χ² is below [`BESIDE_A_LEVEL`] of that of a level of torque noise (see
+/// - It moves the offset, and its fall of χ² is below [`BESIDE_A_LEVEL`] of that of a level of noise that drives an estimate (see
 ///   there). It should be
 ///   tried again with that level in the model.
 fn is_doubtful(f: &Found, part: f64, extra: &[Found], unexplained: Option<&Unexplained>) -> bool {
     // For an effect selected by an excess, a remaining coherence is as much evidence as remaining power.
     let remains = |u: &Unexplained| (u.power || f.of_excess) && f.channels.iter().any(|c| u.channels.contains(c));
-    let turned = |e: &Found| {
-        e.accepted
-            && e.channels.iter().any(|c| c.starts_with("sc.alpha."))
-            && f.delta_chi2 < BESIDE_A_LEVEL * e.delta_chi2
-    };
+    let louder = |e: &Found| e.accepted && e.drives_estimate && f.delta_chi2 < BESIDE_A_LEVEL * e.delta_chi2;
     let moves = f.offset_shift_sigma.values().any(|sigmas| sigmas.abs() > MOVES_OFFSET);
-    (f.of_excess || part > 0.5) && unexplained.is_some_and(remains) || moves && extra.iter().any(turned)
+    (f.of_excess || part > 0.5) && unexplained.is_some_and(remains) || moves && extra.iter().any(louder)
 }
 
 /// Sorts by corrected p-value, the smallest first.
@@ -548,6 +547,7 @@ fn evaluate(scorer: &CandidateScorer<'_>, fit: &Fit, scored: &Scored, ranked: &[
         confounders: scorer.confounders(fit, scored, ranked),
         accepted: false,
         of_excess: false,
+        drives_estimate: false,
     }
 }
 
@@ -645,6 +645,7 @@ fn noise_levels(scorer: &CandidateScorer<'_>, fit: &Fit, levels: &mut Levels<'_>
             confounders: Vec::new(),
             accepted: matters,
             of_excess: false,
+            drives_estimate: scorer.noise.is_estimated(&c.noise),
         });
         left.retain(|j| *j != i);
         if p_value >= FALSE_ALARM {
@@ -786,6 +787,7 @@ mod tests {
             confounders: Vec::new(),
             accepted,
             of_excess: false,
+            drives_estimate: false,
         }
     }
 
@@ -816,14 +818,15 @@ mod tests {
         assert!(!is_doubtful(&of_excess, 0.1, &[], Some(&excess("tm2.accel.z", true))));
         assert!(!is_doubtful(&of_excess, 0.1, &[], None));
         let (gain, still) = (found(&["tm1.accel.y"], 12.0, true), found(&["tm1.accel.y"], 1.0, true));
-        let level = |channel: &str, accepted, times: f64| {
-            [Found { delta_chi2: times * gain.delta_chi2, ..found(&[channel], 0.0, accepted) }]
+        let level = |drives_estimate, accepted, times: f64| {
+            let delta_chi2 = times * gain.delta_chi2;
+            [Found { delta_chi2, drives_estimate, ..found(&["sc.alpha.z"], 0.0, accepted) }]
         };
-        let torque = level("sc.alpha.z", true, 100.0);
+        let torque = level(true, true, 100.0);
         assert!(is_doubtful(&gain, 0.0, &torque, None) && !is_doubtful(&still, 0.0, &torque, None));
         // A cause with a tenth of the level's χ² is no trace of it.
-        assert!(!is_doubtful(&gain, 0.0, &level("sc.alpha.z", true, 10.0), None));
-        assert!(!is_doubtful(&gain, 0.0, &level("sc.alpha.z", false, 100.0), None));
-        assert!(!is_doubtful(&gain, 0.0, &level("tm1.accel.y", true, 100.0), None));
+        assert!(!is_doubtful(&gain, 0.0, &level(true, true, 10.0), None));
+        assert!(!is_doubtful(&gain, 0.0, &level(true, false, 100.0), None));
+        assert!(!is_doubtful(&gain, 0.0, &level(false, true, 100.0), None));
     }
 }

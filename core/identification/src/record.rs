@@ -2,7 +2,9 @@
 
 use std::io::{self, Read, Write};
 
+use dragfree_estimation::sigma::{NoiseError, NoiseModel};
 use dragfree_estimation::spectra::{Plan, Spectra};
+use dragfree_schema::NoiseProcess;
 use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
 
@@ -11,15 +13,15 @@ use crate::coherence::HousekeepingCoherence;
 use crate::gram::{Columns, Gram, GramSums, Hour, low_plan, whole_plan};
 use crate::transient::{Detection, Transients};
 
-const MAGIC: &[u8; 8] = b"DFSUMS1\n";
+const MAGIC: &[u8; 8] = b"DFSUMS2\n";
 
 /// CandidateSet and sums of some telemetry.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Record {
     /// Model and candidates.
     pub candidate_set: CandidateSet,
-    /// How each channel is measured, true for second differences.
-    pub differenced: Vec<bool>,
+    /// Declared noise of the channels.
+    pub noise: Vec<NoiseProcess>,
     /// Sums.
     pub gathered: GramSums,
     /// Candidates that could not be tried, with the reason.
@@ -42,7 +44,7 @@ pub enum RecordError {
 #[derive(Serialize, Deserialize)]
 struct Header {
     candidate_set: CandidateSet,
-    differenced: Vec<bool>,
+    noise: Vec<NoiseProcess>,
     not_tried: Vec<(String, String)>,
     names: Vec<String>,
     channels: usize,
@@ -98,7 +100,7 @@ impl Record {
         let g = &self.gathered;
         let header = Header {
             candidate_set: self.candidate_set.clone(),
-            differenced: self.differenced.clone(),
+            noise: self.noise.clone(),
             not_tried: self.not_tried.clone(),
             names: g.columns.names.clone(),
             channels: g.columns.channels,
@@ -204,7 +206,15 @@ impl Record {
         let transients = Transients { detections: h.detections, tried: h.tried };
         let gathered =
             GramSums { columns, length: h.length, rate_hz: h.rate_hz, sets, hours, housekeeping: w, transients };
-        Ok(Self { candidate_set: h.candidate_set, differenced: h.differenced, gathered, not_tried: h.not_tried })
+        Ok(Self { candidate_set: h.candidate_set, noise: h.noise, gathered, not_tried: h.not_tried })
+    }
+
+    /// The noise model of the channels.
+    ///
+    /// # Errors
+    /// A declaration contradicts itself.
+    pub fn noise_model(&self) -> Result<NoiseModel, NoiseError> {
+        NoiseModel::new(&self.noise, &self.candidate_set.channels, 1.0 / self.gathered.rate_hz)
     }
 
     /// Adds the sums of other telemetry.
@@ -215,6 +225,7 @@ impl Record {
         let (a, b) = (&self.gathered, &other.gathered);
         let same = [
             (self.candidate_set == other.candidate_set, "models, candidates or housekeeping"),
+            (self.noise == other.noise, "declared noise"),
             (a.columns == b.columns, "columns"),
             (a.length == b.length && a.rate_hz == b.rate_hz, "segments"),
         ];

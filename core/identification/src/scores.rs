@@ -116,7 +116,7 @@ pub struct CandidateScorer<'a> {
     pub gathered: &'a GramSums,
     /// Both halves together.
     pub total: Gram,
-    /// Noise of the mission.
+    /// Noise as it is declared.
     pub noise: &'a NoiseModel,
     noise_in_bands: BandNoise<'a>,
     plan: Plan,
@@ -604,8 +604,6 @@ mod tests {
     use crate::transient::Search;
     use crate::waveform::Waveform;
     use dragfree_estimation::segments::Segmenter;
-    use dragfree_estimation::sigma::Measured;
-    use dragfree_physics::mission::Mission;
     use rand::SeedableRng;
     use rand_distr::{Distribution, StandardNormal};
     use rand_xoshiro::Xoshiro256PlusPlus;
@@ -696,11 +694,8 @@ mod tests {
     }
 
     fn noise() -> NoiseModel {
-        let text = include_str!("../../../fixtures/missions/taiji.toml");
-        let value: toml::Value = toml::from_str(text).unwrap();
-        let mission = Mission::from_json(&serde_json::to_string(&value).unwrap()).unwrap();
-        // The mission file has no noise for such channels: white.
-        NoiseModel::new(&mission, &[("first", Measured::Directly), ("second", Measured::Directly)], 1.0).unwrap()
+        // Channels without declared noise: white.
+        NoiseModel::new(&[], &["first", "second"], 1.0).unwrap()
     }
 
     fn transient(ranked: &Ranked, instance: &str) -> Scored {

@@ -17,5 +17,5 @@ pub mod state;
 pub use column::Column;
 pub use manifest::{Manifest, Parameter, ParameterType};
 pub use model::{Coefficient, Colour, Constraint, Model, Response, Shape, Transient, Variant};
-pub use noise::{NOISE_ATTRIBUTE, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm};
+pub use noise::{NOISE_ATTRIBUTE, NoiseEstimate, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm};
 pub use report::{Attachment, Covariance, Estimate, Report};

@@ -29,11 +29,15 @@ fn the_committed_schemas_are_those_of_the_types() {
 
 /// The examples of the guide are declarations: nothing in them is left out when they are read.
 #[test]
-fn the_coefficients_of_the_guide_are_coefficients() {
+fn the_declarations_of_the_guide_are_declarations() {
     let guide = include_str!("../../../ops-guide/src/plugins.md");
     let examples: Vec<&str> = guide.split("```json\n").skip(1).filter_map(|rest| rest.split("```").next()).collect();
-    assert_eq!(examples.len(), 2);
-    for text in examples {
+    let (noise, coefficients): (Vec<_>, Vec<_>) = examples.into_iter().partition(|e| e.contains("noise_processes"));
+    assert_eq!((noise.len(), coefficients.len()), (1, 2));
+    let attributes: serde_json::Value = serde_json::from_str(noise[0]).expect("JSON");
+    let declared: Vec<NoiseProcess> = serde_json::from_value(attributes["noise_processes"].clone()).expect("noise");
+    assert!(declared.len() == 2 && declared.iter().all(|process| process.check().is_ok()));
+    for text in coefficients {
         let example: serde_json::Value = serde_json::from_str(text).expect("JSON");
         let read: Coefficient = serde_json::from_str(text).expect("a coefficient");
         let again = serde_json::to_value(&read).expect("JSON");

@@ -58,8 +58,8 @@ mod setup;
 
 pub use batch::{Inputs, Outputs, Progress};
 pub use dragfree_schema::{
-    Attachment, Coefficient, Colour, Column, Constraint, Covariance, Estimate, NoiseProcess, NoiseResponse, NoiseShape,
-    NoiseTerm, Report, Response, Shape, Transient, Variant, state,
+    Attachment, Coefficient, Colour, Column, Constraint, Covariance, Estimate, NoiseEstimate, NoiseProcess,
+    NoiseResponse, NoiseShape, NoiseTerm, Report, Response, Shape, Transient, Variant, state,
 };
 pub use error::PluginError;
 pub use link::{Available, EffectLink, In, Link, Out, Table, Want};
@@ -72,8 +72,8 @@ pub mod prelude {
     pub use crate::state::{State, StateError};
     pub use crate::{
         Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Effect, EffectLink, Estimate, In,
-        Inputs, Level, Link, Log, Manifest, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm, Out, Outputs,
-        Parameter, PluginError, Progress, Report, Response, Setup, Shape, Source, Stage, Table, Transient, Variant,
-        Want, export_plugin,
+        Inputs, Level, Link, Log, Manifest, NoiseEstimate, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm, Out,
+        Outputs, Parameter, PluginError, Progress, Report, Response, Setup, Shape, Source, Stage, Table, Transient,
+        Variant, Want, export_plugin,
     };
 }

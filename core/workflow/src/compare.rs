@@ -9,9 +9,9 @@ use dragfree_identification::scores::CandidateScorer;
 use toml::Table;
 
 use crate::WorkflowError;
-use crate::replay::{Pass, Replay, What, noise, sum};
+use crate::replay::{Pass, Replay, What, sum};
 
-/// Compares the data of products of one model with the mission's noise. `progress` is told the pass and the number of
+/// Compares the data of products of one model with the declared noise. `progress` is told the pass and the number of
 /// the product.
 ///
 /// # Errors
@@ -20,8 +20,8 @@ pub fn compare(
     replay: &Replay<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Comparison, WorkflowError> {
-    let (record, mission) = sum(replay, What::Model, progress)?;
-    let noise = noise(&record, &mission)?;
+    let record = sum(replay, What::Model, progress)?;
+    let noise = record.noise_model()?;
     let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise);
     let products = || replay.products.iter().map(|p| &p.product);
     let innovations = Innovations::judge(&octaves(products()), record.gathered.rate_hz);

@@ -13,7 +13,7 @@ use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::transient::Detection;
 
 use crate::WorkflowError;
-use crate::replay::{FINE, Pass, Replay, What, noise, sum};
+use crate::replay::{FINE, Pass, Replay, What, sum};
 
 /// Most transients that become candidates.
 const MOST_EVENTS: usize = 8;
@@ -41,12 +41,12 @@ pub fn diagnose(
     replay: &Replay<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Diagnosed, WorkflowError> {
-    let found = sum(replay, What::Transients, progress)?.0.gathered.transients;
+    let found = sum(replay, What::Transients, progress)?.gathered.transients;
     let detected: Vec<Detection> = found.certain(WORTH_TRYING).take(MOST_EVENTS).cloned().collect();
     let mut pass = |requests: &[RefinementRequest], tried_before: &BTreeMap<String, usize>| {
-        let (mut record, mission) = sum(replay, What::Candidates(&detected, requests), progress)?;
+        let mut record = sum(replay, What::Candidates(&detected, requests), progress)?;
         record.gathered.transients = found.clone();
-        let noise = noise(&record, &mission)?;
+        let noise = record.noise_model()?;
         let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise);
         let mut diagnosis = diagnosis::diagnose(&scorer, tried_before)?;
         diagnosis.not_tried.extend(record.not_tried.iter().cloned());

@@ -15,10 +15,10 @@ use std::path::PathBuf;
 
 use dragfree_engine::EngineError;
 use dragfree_estimation::estimate::EstimateError;
+use dragfree_estimation::sigma::NoiseError;
 use dragfree_identification::compare::CompareError;
 use dragfree_identification::diagnosis::DiagnosisError;
 use dragfree_identification::record::RecordError;
-use dragfree_physics::mission::MissionError;
 
 /// Why a comparison or a diagnosis failed.
 #[derive(Debug, thiserror::Error)]
@@ -29,9 +29,9 @@ pub enum WorkflowError {
     /// What a plugin declares makes no sense.
     #[error("{0}")]
     Declaration(String),
-    /// The mission file lacks something.
+    /// Declared noise that contradicts itself.
     #[error(transparent)]
-    Mission(#[from] MissionError),
+    Noise(#[from] NoiseError),
     /// The model cannot be fitted.
     #[error(transparent)]
     Estimate(#[from] EstimateError),
@@ -48,9 +48,7 @@ pub enum WorkflowError {
     #[error("no product was named")]
     NoProduct,
     /// There is nothing to explain.
-    #[error(
-        "the chain makes no channel to explain: put a stage before the effects that makes some, such as hinf-dfacs"
-    )]
+    #[error("the chain makes no channel to explain: put a stage before the effects that makes some")]
     NoChannel,
     /// A response names a series that nobody makes.
     #[error(

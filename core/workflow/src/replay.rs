@@ -7,11 +7,9 @@ use dragfree_engine::product::Product;
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
-use dragfree_estimation::sigma::{Measured, NoiseModel};
 use dragfree_identification::diagnosis::RefinementRequest;
 use dragfree_identification::record::Record;
 use dragfree_identification::transient::Detection;
-use dragfree_physics::mission::Mission;
 
 use crate::WorkflowError;
 use crate::sums::{ColumnSums, Request};
@@ -80,9 +78,9 @@ pub(crate) fn sum(
     replay: &Replay<'_>,
     what: What<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
-) -> Result<(Record, Mission), WorkflowError> {
+) -> Result<Record, WorkflowError> {
     let Replay { registry, products, threads, batch_rows } = *replay;
-    let mut whole: Option<(Record, Mission)> = None;
+    let mut whole: Option<Record> = None;
     for (number, Archived { product, path }) in products.iter().enumerate() {
         let sources = Sources::read(path)?;
         let equations = path.with_extension("neq.json");
@@ -111,30 +109,16 @@ pub(crate) fn sum(
             threads,
         };
         let examination = Examination { product, sources: &sources, candidates: all, threads, batch_rows };
-        let mut mission = None;
-        let (sums, not_tried) = examine(
-            registry,
-            &examination,
-            |chain, file| {
-                let read = mission.insert(Mission::from_json(&file.value.to_string())?);
-                ColumnSums::link(&request, chain, read)
-            },
-            &mut |p| progress(what.pass(), number, p),
-        )?;
+        let (sums, not_tried) =
+            examine(registry, &examination, |chain, _| ColumnSums::link(&request, chain), &mut |p| {
+                progress(what.pass(), number, p);
+            })?;
         let mut record = sums.record();
         record.not_tried.extend(not_tried);
-        match (&mut whole, mission) {
-            (Some((sum, _)), _) => sum.add(&record)?,
-            (None, mission) => whole = mission.map(|mission| (record, mission)),
+        match &mut whole {
+            Some(sum) => sum.add(&record)?,
+            None => whole = Some(record),
         }
     }
     whole.ok_or(WorkflowError::NoProduct)
-}
-
-/// The mission's noise in the channels of a record.
-pub(crate) fn noise(record: &Record, mission: &Mission) -> Result<NoiseModel, WorkflowError> {
-    let measured = |d: &bool| if *d { Measured::Differenced } else { Measured::Directly };
-    let channels: Vec<(&str, Measured)> =
-        record.candidate_set.channels.iter().map(String::as_str).zip(record.differenced.iter().map(measured)).collect();
-    Ok(NoiseModel::new(mission, &channels, 1.0 / record.gathered.rate_hz)?)
 }

@@ -9,7 +9,7 @@ use dragfree_engine::chain::{Chain, Sink};
 use dragfree_engine::examine::Wanted;
 use dragfree_estimation::estimate::{Observed, Refinement, estimate_with};
 use dragfree_estimation::segments::{Segmenter, all_finite, longest_length};
-use dragfree_estimation::sigma::{BandNoise, Measured, NoiseModel};
+use dragfree_estimation::sigma::{BandNoise, NoiseModel};
 use dragfree_estimation::spectra::Plan;
 use dragfree_estimation::stored::Stored;
 use dragfree_identification::candidates::{CandidateSet, Coefficient as Unknown, Form, Rule, Term};
@@ -19,8 +19,7 @@ use dragfree_identification::gram::{Columns, GramAccumulator, LONG};
 use dragfree_identification::record::Record;
 use dragfree_identification::transient::{Detection, Search, Template};
 use dragfree_identification::waveform::Waveform;
-use dragfree_physics::mission::Mission;
-use dragfree_sdk::{Available, Coefficient, Column, Constraint, Response, Shape, Variant};
+use dragfree_sdk::{Available, Coefficient, Column, Constraint, NoiseProcess, Response, Shape, Variant};
 use nalgebra::DMatrix;
 
 use crate::WorkflowError;
@@ -56,7 +55,7 @@ pub(crate) struct Request<'a> {
 pub(crate) struct ColumnSums {
     names: Vec<String>,
     candidate_set: CandidateSet,
-    differenced: Vec<bool>,
+    noise: Vec<NoiseProcess>,
     base: usize,
     /// Waveforms that begin at known times, and where they stand among the columns.
     waveforms: Vec<Waveform>,
@@ -92,10 +91,6 @@ fn finite(x: f64) -> Option<f64> {
     x.is_finite().then_some(x)
 }
 
-fn measured(channel: &Column) -> Measured {
-    if channel.attribute("average") == "1" { Measured::Directly } else { Measured::Differenced }
-}
-
 /// What the chain has, as a plugin behind the effects would see it.
 fn available(chain: &Chain) -> Available {
     Available {
@@ -110,8 +105,8 @@ impl ColumnSums {
     /// Chooses the columns of a linked chain that a request needs.
     ///
     /// # Errors
-    /// There is no channel, the mission does not know the noise of one, or the reference is of another model.
-    pub(crate) fn link(request: &Request<'_>, chain: &Chain, mission: &Mission) -> Result<Wanted<Self>, WorkflowError> {
+    /// There is no channel, a declared noise contradicts itself, or the reference is of another model.
+    pub(crate) fn link(request: &Request<'_>, chain: &Chain) -> Result<Wanted<Self>, WorkflowError> {
         let available = available(chain);
         let channels: Vec<&Column> = available.of_kind("channel").collect();
         let Some(rate_hz) = channels.first().map(|c| c.rate_hz) else {
@@ -143,17 +138,16 @@ impl ColumnSums {
             energy: waveforms.iter().map(|c| c.energy(&plan, differenced.contains(&true))).collect(),
         };
         let candidate_set = candidate_set(&available, &channels, &sorted, &waveforms);
-        let residual = residual(request.reference, mission, &candidate_set, &channels, &all, length)?;
+        let residual = residual(request.reference, &candidate_set, &channels, &all, length)?;
         // As they are called in telemetry: `hk/battery_current_a`.
         let topics: Vec<String> = housekeeping.iter().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
-        let whole: Vec<(&str, Measured)> = channels.iter().map(|c| (name_of(c), measured(c))).collect();
-        let noise = NoiseModel::new(mission, &whole, 1.0 / rate_hz)?;
+        let noise = NoiseModel::new(&available.noise, &candidate_set.channels, 1.0 / rate_hz)?;
         let inverse = |hz: f64| {
             let sigma = noise.psd(hz);
             let nothing = DMatrix::zeros(sigma.nrows(), sigma.ncols());
             sigma.cholesky().map_or(nothing, |c| c.inverse())
         };
-        // Matched filters whiten with the mission's Σ: a Σ measured from these data has taken up the power of the
+        // Matched filters whiten with the declared Σ: a Σ measured from these data has taken up the power of the
         // transient.
         let inverses =
             plan.bands.iter().map(|b| (plan.bin_hz(b.end as f64 - 0.5), inverse(plan.frequency_hz(*b)))).collect();
@@ -178,7 +172,7 @@ impl ColumnSums {
             accumulator: GramAccumulator::new(all, length, rate_hz, request.threads, coherence, search),
             names,
             candidate_set,
-            differenced,
+            noise: available.noise.clone(),
             rate_hz,
         };
         Ok((sums, wanted))
@@ -269,7 +263,7 @@ impl ColumnSums {
                 format!("it has no value in {missing} of {rows} epochs, so {forms} forms of effects are left out");
             (self.names[column].clone(), reason)
         }));
-        Record { candidate_set, differenced: self.differenced, gathered: self.accumulator.finish(), not_tried }
+        Record { candidate_set, noise: self.noise, gathered: self.accumulator.finish(), not_tried }
     }
 }
 
@@ -277,7 +271,6 @@ impl ColumnSums {
 /// some.
 fn residual(
     reference: Option<&Path>,
-    mission: &Mission,
     candidate_set: &CandidateSet,
     channels: &[&Column],
     columns: &Columns,
@@ -290,17 +283,15 @@ fn residual(
         let text = std::fs::read_to_string(path).map_err(|e| refuse(e.to_string()))?;
         let mut value: serde_json::Value = serde_json::from_str(&text).map_err(|e| refuse(e.to_string()))?;
         let stored: Stored = serde_json::from_value(value["sums"].take()).map_err(|e| refuse(e.to_string()))?;
-        let (layout, plan, sums) = Stored::stack(&[stored]).map_err(|e| refuse(e.to_string()))?;
+        let days = [stored];
+        let (layout, plan, sums) = Stored::stack(&days).map_err(|e| refuse(e.to_string()))?;
         let model = candidate_set.model();
         let same = layout.coefficients.iter().eq(candidate_set.coefficients[..model].iter().map(|c| &c.name));
         if !same || plan.length != length {
             return Err(refuse("belongs to another model, or to segments of another length".to_owned()));
         }
         if sums.total.segments > 0 {
-            let of = |name: &String| channels.iter().find(|c| name_of(c) == name);
-            let seen: Vec<(&str, Measured)> =
-                layout.channels.iter().filter_map(of).map(|c| (name_of(c), measured(c))).collect();
-            let noise = NoiseModel::new(mission, &seen, 1.0 / plan.rate_hz)?;
+            let noise = NoiseModel::new(&days[0].noise, &layout.channels, 1.0 / plan.rate_hz)?;
             let observed = Observed { layout: &layout, plan: &plan, sums: &sums, prediction: None };
             let (unknowns, bounds) = (candidate_set.unknowns(&[]), candidate_set.bounds());
             let noise = BandNoise::new(&noise, &plan);

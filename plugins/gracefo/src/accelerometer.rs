@@ -23,6 +23,7 @@ use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 
 use crate::angular::{Row, Wiener};
+use crate::noise::declared;
 
 /// Ratio of mean squares below which noise is a tenth or more of the regressors' power at every frequency.
 const MIN_SIGNAL_RATIO: f64 = 10.0;
@@ -185,6 +186,8 @@ pub struct Accelerometer {
     alpha_noise_differences: Option<[f64; LEVELS]>,
     /// Filter for `E[α | measured α]`, if the mission states the noise.
     wiener: Option<Wiener>,
+    /// Noise of the channels.
+    declared: Vec<NoiseProcess>,
     handles: Option<Handles>,
     state: State,
 }
@@ -241,8 +244,10 @@ impl Stage for Accelerometer {
         let dt_s = mission.dt_s();
         let step_ns = (dt_s * 1e9).round() as i64;
         let noise = mission.noise.accelerometer_angular.as_ref().map(|n| n.shape());
+        let tm = mission.test_mass(&test_mass, "the stage accelerometer")?;
         Ok(Self {
-            orf_from_srf: mission.test_mass(&test_mass, "the stage accelerometer")?.dcm_orf_from_srf(),
+            orf_from_srf: tm.dcm_orf_from_srf(),
+            declared: declared(&mission.noise, &test_mass, tm),
             step_ns,
             alpha_noise_differences: noise.as_ref().map(|n| noise_block_differences(n, dt_s)),
             wiener: noise.map(|n| Wiener::new(n, step_ns)),
@@ -275,7 +280,9 @@ impl Stage for Accelerometer {
         let [x, y, z] = AXES.map(|a| {
             let name = format!("{}.accel.{a}", self.test_mass);
             let attributes = [("kind", "channel"), ("channel", name.as_str()), ("average", "1")];
-            link.write_with(channels, &name, "m s-2", frame, &attributes)
+            // The noise of all three is declared with the first.
+            let noise = if a == "x" { self.declared.as_slice() } else { &[] };
+            link.write_noisy(channels, &name, "m s-2", frame, &attributes, noise)
         });
         let channel = [x?, y?, z?];
         let motion = link.table("reconstruction", rate_hz);

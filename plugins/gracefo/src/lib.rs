@@ -21,6 +21,7 @@ pub mod accelerometer;
 pub mod angular;
 pub mod archive;
 pub mod header;
+mod noise;
 pub mod product;
 pub mod rows;
 pub mod source;

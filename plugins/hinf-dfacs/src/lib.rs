@@ -5,6 +5,7 @@ mod acting;
 pub mod asked;
 mod bridge;
 pub mod known;
+pub mod noise;
 pub mod pilot;
 mod plugin;
 pub mod reconstruction;

@@ -6,6 +6,7 @@ use nalgebra::Vector3;
 use serde_json::json;
 
 use crate::asked::Needs;
+use crate::noise;
 use crate::pilot::{self, Scale};
 use crate::reconstruction::{AngularAcceleration, Epoch, ROW, Reconstruction, Row, Settings, levels_of};
 use crate::replay::{COMMAND_VECTORS, Comparison};
@@ -189,7 +190,12 @@ impl HinfDfacs {
     }
 }
 
-fn write_columns(link: &mut Link<'_>, table: Table, noise_x: [&'static str; 2]) -> Result<Vec<Out>, PluginError> {
+fn write_columns(
+    link: &mut Link<'_>,
+    table: Table,
+    noise_x: [&'static str; 2],
+    declared: &[NoiseProcess],
+) -> Result<Vec<Out>, PluginError> {
     let mut out = Vec::with_capacity(ROW);
     for (vector, unit) in [("sc.alpha_srf_rad_s2", "rad s-2"), ("sc.omega_srf_rad_s", "rad s-1")] {
         for axis in AXES {
@@ -206,17 +212,19 @@ fn write_columns(link: &mut Link<'_>, table: Table, noise_x: [&'static str; 2]) 
             out.push(link.write(table, &format!("{name}.u_orf_m_s2.{axis}"), "m s-2", &frame)?);
         }
     }
-    let mut channel = |name: &str, unit: &str, frame: &str, noise: &str| {
+    let mut channel = |name: &str, unit: &str, frame: &str, noise: &str, declared: &[NoiseProcess]| {
         let attributes = [("kind", "channel"), ("channel", name), ("average", "2"), ("noise", noise)];
-        link.write_with(table, name, unit, frame, &attributes)
+        link.write_noisy(table, name, unit, frame, &attributes, declared)
     };
     for (tm, name) in ["tm1", "tm2"].iter().enumerate() {
         for (axis, noise) in AXES.iter().zip(noise(tm)) {
-            out.push(channel(&format!("{name}.accel.{axis}"), "m s-2", &format!("ORF_{}", tm + 1), noise)?);
+            out.push(channel(&format!("{name}.accel.{axis}"), "m s-2", &format!("ORF_{}", tm + 1), noise, &[])?);
         }
     }
+    // The noise of all channels is declared with the last of them.
     for axis in AXES {
-        out.push(channel(&format!("sc.alpha.{axis}"), "rad s-2", "SRF", "dws_long_arm")?);
+        let declared = if axis == "z" { declared } else { &[] };
+        out.push(channel(&format!("sc.alpha.{axis}"), "rad s-2", "SRF", "dws_long_arm", declared)?);
     }
     Ok(out)
 }
@@ -386,7 +394,7 @@ impl Stage for HinfDfacs {
             ));
         }
         let table = link.table("reconstruction", rate_hz);
-        let mut out = write_columns(link, table, noise_x)?;
+        let mut out = write_columns(link, table, noise_x, &noise::declared(&self.mission, &noise_x))?;
         for (name, unit, frame) in reconstruction.asked_columns() {
             out.push(link.write_with(table, &name, unit, frame, &[("kind", "series")])?);
         }

@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 
-use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::DMatrix;
 use serde_json::json;
@@ -10,7 +9,7 @@ use serde_json::json;
 use dragfree_estimation::estimate::{Bound, Estimate as Solution, Observed, Refinement, Unknown, estimate_with};
 use dragfree_estimation::prediction::Prediction;
 use dragfree_estimation::segments::{Collected, Segmenter, longest_length};
-use dragfree_estimation::sigma::{BandNoise, Measured, NoiseModel};
+use dragfree_estimation::sigma::{BandNoise, NoiseModel};
 use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, SHORTEST};
 use dragfree_estimation::state;
 use dragfree_estimation::stored::Stored;
@@ -20,7 +19,6 @@ use dragfree_estimation::verdict::{
 
 /// Normal equations over segments, a constrained solution, and a verdict.
 pub struct QpCheck {
-    mission: Mission,
     segment_s: f64,
     refinements: usize,
     refinement: Refinement,
@@ -35,8 +33,11 @@ struct Linked {
     /// Channels that share noise with those of the model, and on which nothing of the model acts.
     left_out: Vec<String>,
     layout: Layout,
+    /// Noise as the stages before declare it, and its model of the channels that are weighed.
+    declared: Vec<NoiseProcess>,
     model: NoiseModel,
-    measured: Vec<Measured>,
+    /// Per channel, whether it is a second difference of a displacement.
+    differenced: Vec<bool>,
     coefficients: Vec<Coefficient>,
     bounds: Vec<Bound>,
     refinements: usize,
@@ -67,7 +68,7 @@ impl Stage for QpCheck {
                 "1",
                 3,
                 0..=10,
-                "how often the noise is measured from the residuals; 0 trusts the mission file",
+                "how often the noise is measured from the residuals; 0 trusts its declaration",
             ),
         ],
         instances: &[],
@@ -76,7 +77,6 @@ impl Stage for QpCheck {
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         Ok(Self {
-            mission: Mission::from_json(setup.mission_json())?,
             segment_s: setup.f64("segment_s")?,
             refinements: usize::try_from(setup.i64("refinements")?)?,
             // Commands are made of the very noise whose spectrum would be measured.
@@ -121,8 +121,8 @@ impl Stage for QpCheck {
     }
 }
 
-const UNKNOWN_NOISE: &str =
-    "the mission file says nothing of its noise, so it is weighed by its residuals alone; a [noise] table would help";
+const UNKNOWN_NOISE: &str = "no stage declares its noise, so it is weighed by its residuals alone; the stage that makes it should \
+     declare one, from the [noise] tables of the mission file";
 
 fn before_link() -> PluginError {
     PluginError::fatal("qp-check was called before it was linked; the host must link first")
@@ -138,8 +138,8 @@ impl Linked {
         };
         let responses = available.responses()?;
         let acted_on = |channel: &str| responses.iter().any(|(_, r)| r.channel == channel);
-        let (channels, left_out) = modelled(&stage.mission, &all, acted_on, rate_hz)?;
-        let measured: Vec<Measured> = channels.iter().map(|c| measured(c)).collect::<Result<_, _>>()?;
+        let (channels, left_out) = modelled(&available.noise, &all, acted_on, rate_hz)?;
+        let differenced: Vec<bool> = channels.iter().map(|c| is_differenced(c)).collect::<Result<_, _>>()?;
         let (layout, series) = layout(available, &channels, &responses)?;
         let series = series.iter().map(|(table, name)| Want::new(name).table(table).rate_hz(rate_hz));
         let columns = channels
@@ -148,11 +148,10 @@ impl Linked {
             .chain(series)
             .map(|want| link.read(&want))
             .collect::<Result<_, _>>()?;
-        let model = noise_model(&stage.mission, &channels, rate_hz)?;
+        let model = noise_model(&available.noise, &channels, rate_hz)?;
         let length = longest_length((stage.segment_s * rate_hz).round() as usize);
         let analyser = Analyser::new(Plan::new(length, rate_hz), &layout);
-        let seen_as_mean =
-            |s: usize| layout.regressors.iter().any(|r| r.series == s && measured[r.channel] == Measured::Differenced);
+        let seen_as_mean = |s: usize| layout.regressors.iter().any(|r| r.series == s && differenced[r.channel]);
         let averaged = std::iter::repeat_n(false, layout.channels.len())
             .chain((0..layout.series.len()).map(seen_as_mean))
             .collect();
@@ -169,12 +168,13 @@ impl Linked {
             collected: nothing_collected(
                 stage.refinement,
                 &model,
-                &measured,
+                &differenced,
                 &layout,
                 &available.coefficients,
                 analyser.plan(),
             ),
-            measured,
+            differenced,
+            declared: available.noise.clone(),
             segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged),
             analyser,
             model,
@@ -201,7 +201,7 @@ impl Linked {
         let sums = collected.all(self.analyser.plan());
         // The open end is stored only where there is nothing else: a later run stores the segment that it becomes.
         let own = if self.collected.sums.total.segments == 0 { &collected.sums } else { &self.collected.sums };
-        let stored = Stored::new(&self.layout, self.analyser.plan(), &own.total);
+        let stored = Stored::new(&self.layout, self.analyser.plan(), &self.declared, &own.total);
         report.counts.insert("epochs_in_segments".to_owned(), segmenter.state.covered);
         if sums.total.segments == 0 {
             self.no_solution(&mut report);
@@ -221,7 +221,7 @@ impl Linked {
             self.refinements,
             self.refinement,
         )?;
-        // What χ² with the mission file's Σ is a sum over: the same for every model of the same data, which `dof` is not.
+        // What χ² with the declared Σ is a sum over: the same for every model of the same data, which `dof` is not.
         let weights = sums.total.kept().into_iter().zip(&sums.total.expected).map(|(kept, expected)| kept * expected);
         let observations = weights.sum::<f64>() * self.layout.channels.len() as f64;
         report.quality.insert("observations".to_owned(), json!(observations));
@@ -232,7 +232,7 @@ impl Linked {
 
     fn nothing_collected(&self) -> Collected {
         let plan = self.analyser.plan();
-        nothing_collected(self.refinement, &self.model, &self.measured, &self.layout, &self.coefficients, plan)
+        nothing_collected(self.refinement, &self.model, &self.differenced, &self.layout, &self.coefficients, plan)
     }
 
     /// Too short for any spectrum: a sentence, not a number.
@@ -292,7 +292,7 @@ impl Linked {
             ));
         }
 
-        // With Σ from the residuals the ratio is 1 by construction; only the mission's Σ can be contradicted.
+        // With Σ from the residuals the ratio is 1 by construction; only the declared Σ can be contradicted.
         report.chi2_per_dof = Some(quality.chi2_per_dof_modelled_sigma);
         report.weak_directions = solution.weak.iter().map(|d| d.sentence.clone()).collect();
         // What is wrong must not hide behind what is not known.
@@ -433,14 +433,14 @@ impl Linked {
 fn nothing_collected(
     refinement: Refinement,
     model: &NoiseModel,
-    measured: &[Measured],
+    differenced: &[bool],
     layout: &Layout,
     coefficients: &[Coefficient],
     plan: &Plan,
 ) -> Collected {
     let initial: Vec<f64> = coefficients.iter().map(|c| c.initial).collect();
     let prediction = match refinement {
-        Refinement::Bands => Prediction::new(model, measured, &layout.linear_at(&initial), plan),
+        Refinement::Bands => Prediction::new(model, differenced, &layout.linear_at(&initial), plan),
         Refinement::Levels => None,
     };
     Collected::new(plan, layout, prediction)
@@ -512,12 +512,12 @@ fn pull_sentence(p: &Pull) -> String {
 /// The channels to weigh, and the names of those left out: where noise is shared, a channel on which no regressor acts is a
 /// witness whose own model is empty.
 fn modelled<'a>(
-    mission: &Mission,
+    noise: &[NoiseProcess],
     channels: &[&'a Column],
     acted_on: impl Fn(&str) -> bool,
     rate_hz: f64,
 ) -> Result<(Vec<&'a Column>, Vec<String>), PluginError> {
-    let group = noise_model(mission, channels, rate_hz)?.groups();
+    let group = noise_model(noise, channels, rate_hz)?.groups();
     let with_effects: Vec<usize> =
         channels.iter().zip(&group).filter(|(c, _)| acted_on(name_of(c))).map(|(_, g)| *g).collect();
     let (kept, left): (Vec<_>, Vec<_>) =
@@ -568,9 +568,9 @@ fn layout(
     Ok((layout, series))
 }
 
-fn noise_model(mission: &Mission, channels: &[&Column], rate_hz: f64) -> Result<NoiseModel, PluginError> {
-    let noise = channels.iter().map(|c| Ok((name_of(c), measured(c)?))).collect::<Result<Vec<_>, PluginError>>()?;
-    Ok(NoiseModel::new(mission, &noise, 1.0 / rate_hz)?)
+fn noise_model(declared: &[NoiseProcess], channels: &[&Column], rate_hz: f64) -> Result<NoiseModel, PluginError> {
+    let names: Vec<&str> = channels.iter().map(|c| name_of(c)).collect();
+    Ok(NoiseModel::new(declared, &names, 1.0 / rate_hz)?)
 }
 
 fn name_of(channel: &Column) -> &str {
@@ -580,10 +580,10 @@ fn name_of(channel: &Column) -> &str {
     }
 }
 
-fn measured(channel: &Column) -> Result<Measured, PluginError> {
+fn is_differenced(channel: &Column) -> Result<bool, PluginError> {
     match channel.attribute("average") {
-        "2" => Ok(Measured::Differenced),
-        "1" => Ok(Measured::Directly),
+        "2" => Ok(true),
+        "1" => Ok(false),
         other => Err(PluginError::error(format!(
             "channel {} has the attribute average = `{other}`; the stage that makes it must say 2 (second differences) or 1 (measured \
              directly)",

@@ -129,6 +129,24 @@ typedef struct dragfree_column_v1 {
   const char *attributes; /* a JSON object of strings, {"kind":"channel"}; NULL for none */
 } dragfree_column_v1;
 
+/* A channel (attribute `kind` = `channel`) is a measured minus a known acceleration. `average` is "2" for one that is
+ * made of second differences of a displacement, which sees the mean of two samples of an acceleration, and "1" for one
+ * that is measured as it is.
+ *
+ * The stage that makes channels declares the noise in them: with any column that it writes, the attribute
+ * `noise_processes`, no string but a JSON array of objects:
+ *   {"name":"gauge","unit":"m","spectrum":[{"asd":1e-12,"corner_hz":1.0,"exponent":0}],"response":"differenced",
+ *    "enters":{"gauge.x":[1.0]}}
+ * `spectrum` is the one-sided power spectral density, the sum of asd^2 (corner_hz/f)^exponent, exponents even; null
+ * where nobody knows it. `response` is how the channels see the process: "held", an acceleration constant over each
+ * sample and seen as the mean of two (power response cos^2(pi f dt)); "differenced", a displacement's readout
+ * differenced twice ((4 sin^2(pi f dt)/dt^2)^2); "direct", as it is. `enters` gives each channel's gains, one for each
+ * component of the process; `covariance` correlates the components; `components` names those whose level may be
+ * measured. `estimate` is for a stage that takes a quantity driven by the process from its minimum-variance estimate,
+ * whose error enters channels: {"matrix":[[...]],"readout":[...],"readout_response": "differenced","enters":{...}}.
+ * All keys: schema/noise_process.schema.json. A channel without declared noise starts as white, and its level is
+ * measured from the residuals. Later stages find all declarations in `model_json`. */
+
 /* Where a column that was asked for will be: `inputs->tables[table].children[1 + column]`; child 0 are the times. */
 typedef struct dragfree_slot_v1 {
   uint32_t table;

@@ -297,9 +297,10 @@ fn check_noise(linked: &Linked, available: &[Column]) -> Result<(), String> {
         process.check().map_err(|what| format!("declares the noise process `{}`: {what}", process.name))?;
         let known = |channel: &str| {
             let written = linked.writes.iter().flat_map(|t| &t.columns);
-            available.iter().chain(written).any(|c| c.name == channel && c.attribute("kind") == "channel")
+            let name = |c: &Column| c.attributes.get("channel").map_or(c.name.clone(), String::clone);
+            available.iter().chain(written).any(|c| c.attribute("kind") == "channel" && name(c) == channel)
         };
-        if let Some((channel, _)) = process.enters.iter().find(|(channel, _)| !known(channel)) {
+        if let Some(channel) = process.channels().find(|channel| !known(channel)) {
             return Err(format!(
                 "declares that the noise process `{}` enters `{channel}`, which is no channel; write it with the attribute kind = channel",
                 process.name

@@ -4,6 +4,7 @@ mod asked;
 mod border;
 mod common;
 mod correlation;
+mod noise;
 mod obedience;
 mod posterior;
 mod slope;

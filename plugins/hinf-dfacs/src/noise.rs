@@ -1,0 +1,133 @@
+//! The noise in the channels, declared from the mission file for the stages that weigh them.
+//!
+//! A force on the spacecraft moves it under every test mass: one vector process, seen by each in its own ORF. What the
+//! known acceleration takes from the torque (see [`ThrustNoise`]) is no noise; what is left of the force is. The
+//! attitude channels measure the torque's noise itself. The error of α̂, the minimum-variance estimate of the angular
+//! acceleration, reaches the test masses through the lever of the nominal offset: a truth some millimetres away changes
+//! a small part of Σ by a few per cent.
+
+use std::collections::BTreeMap;
+
+use dragfree_physics::frames::skew;
+use dragfree_physics::mission::{Mission, TestMass};
+use dragfree_physics::thrust_noise::ThrustNoise;
+use dragfree_sdk::prelude::{NoiseEstimate, NoiseProcess, NoiseResponse, NoiseShape};
+use nalgebra::{DMatrix, Matrix3};
+
+const AXES: [&str; 3] = ["x", "y", "z"];
+
+type Rows = BTreeMap<String, Vec<f64>>;
+
+/// Every noise process in the channels `TM.accel.AXIS` and `sc.alpha.AXIS`. `noise_x` names, per test mass, the noise
+/// table of the instrument that reads its x: `ifo_x` or `is_x`.
+#[must_use]
+pub fn declared(mission: &Mission, noise_x: &[&str]) -> Vec<NoiseProcess> {
+    let thrusters = ThrustNoise::of(mission);
+    let mut thrust = DMatrix::zeros(3 * mission.test_mass.len(), 3);
+    let mut lever = thrust.clone();
+    for (i, tm) in mission.test_mass.values().enumerate() {
+        let dcm = tm.dcm_orf_from_srf();
+        thrust.rows_mut(3 * i, 3).copy_from(&(dcm / -mission.spacecraft.mass_kg));
+        lever.rows_mut(3 * i, 3).copy_from(&(skew(&tm.offset_nominal_orf_m()) * dcm));
+    }
+    if let Some(thrusters) = &thrusters {
+        lever += &thrust * dynamic(&(thrusters.force_per_torque * mission.spacecraft.inertia()));
+    }
+    let masses: Vec<&str> = mission.test_mass.keys().map(String::as_str).collect();
+    let enters = |m: &DMatrix<f64>| -> Rows {
+        let channels = masses.iter().flat_map(|tm| AXES.map(|axis| format!("{tm}.accel.{axis}")));
+        channels.zip(m.row_iter().map(|row| row.iter().copied().collect())).collect()
+    };
+
+    let mut all = Vec::new();
+    if let Some(thrusters) = &thrusters {
+        all.push(NoiseProcess {
+            components: AXES.map(|axis| format!("thruster_force:sc.{axis}")).to_vec(),
+            covariance: Some(rows(&thrusters.force_given_torque)),
+            ..process("thruster_force", "N", thrusters.force_shape.clone(), NoiseResponse::Held, enters(&thrust))
+        });
+    }
+    if let Some(pressure) = &mission.noise.solar_pressure {
+        all.push(process("solar_pressure", "N", pressure.shape(), NoiseResponse::Held, enters(&thrust)));
+    }
+    for (i, (name, tm)) in mission.test_mass.iter().enumerate() {
+        all.extend(of_test_mass(mission, name, tm, noise_x.get(i).copied().unwrap_or_default()));
+    }
+    for axis in AXES {
+        if let Some(sensing) = &mission.noise.dws_long_arm {
+            let (name, enters) = (format!("dws_long_arm:sc.{axis}"), single(&format!("sc.alpha.{axis}"), 1.0));
+            all.push(process(&name, "rad", sensing.shape(), NoiseResponse::Differenced, enters));
+        }
+    }
+    let inverse_inertia = mission.spacecraft.inertia().try_inverse().unwrap_or_else(Matrix3::zeros);
+    if let Some(thrusters) = thrusters.filter(|t| t.torque_shape.psd(1.0) > 0.0) {
+        let attitude = AXES.iter().zip(rows(&inverse_inertia));
+        all.push(NoiseProcess {
+            components: AXES.map(|axis| format!("thruster_torque:sc.{axis}")).to_vec(),
+            covariance: Some(rows(&thrusters.torque)),
+            estimate: Some(NoiseEstimate {
+                matrix: rows(&inverse_inertia),
+                readout: mission.noise.dws_long_arm.as_ref().map(|n| n.shape()),
+                readout_response: NoiseResponse::Differenced,
+                enters: enters(&lever),
+            }),
+            ..process(
+                "thruster_torque",
+                "N m",
+                thrusters.torque_shape,
+                NoiseResponse::Held,
+                attitude.map(|(axis, row)| (format!("sc.alpha.{axis}"), row)).collect(),
+            )
+        });
+    }
+    all
+}
+
+/// What each axis of one test mass has for itself: its readout, the electrostatic force, stray accelerations.
+fn of_test_mass(mission: &Mission, name: &str, tm: &TestMass, noise_x: &str) -> Vec<NoiseProcess> {
+    let noise = &mission.noise;
+    let along_x = if noise_x == "is_x" { &noise.is_x } else { &noise.ifo_x };
+    let mut all = Vec::new();
+    for (axis, readout) in AXES.iter().zip([along_x, &noise.is_y, &noise.is_z]) {
+        let (place, channel) = (format!("{name}.{axis}"), format!("{name}.accel.{axis}"));
+        if let Some(readout) = readout {
+            let label = format!("readout:{place}");
+            all.push(NoiseProcess {
+                components: vec![label.clone()],
+                ..process(&label, "m", readout.shape(), NoiseResponse::Differenced, single(&channel, 1.0))
+            });
+        }
+        if let (Some(force), "y" | "z") = (&noise.electrostatic_force, *axis) {
+            let (label, gain) = (format!("electrostatic_force:{place}"), tm.mass_kg.recip());
+            all.push(process(&label, "N", force.shape(), NoiseResponse::Held, single(&channel, gain)));
+        }
+        if let Some(stray) = &noise.test_mass_acceleration {
+            let label = format!("test_mass_acceleration:{place}");
+            all.push(process(&label, "m s-2", stray.shape(), NoiseResponse::Held, single(&channel, 1.0)));
+        }
+    }
+    all
+}
+
+fn process(name: &str, unit: &str, spectrum: NoiseShape, response: NoiseResponse, enters: Rows) -> NoiseProcess {
+    NoiseProcess {
+        name: name.to_owned(),
+        unit: unit.to_owned(),
+        spectrum: Some(spectrum),
+        response,
+        enters,
+        ..NoiseProcess::default()
+    }
+}
+
+fn single(channel: &str, gain: f64) -> Rows {
+    [(channel.to_owned(), vec![gain])].into()
+}
+
+fn rows(m: &Matrix3<f64>) -> Vec<Vec<f64>> {
+    m.row_iter().map(|row| row.iter().copied().collect()).collect()
+}
+
+fn dynamic(m: &Matrix3<f64>) -> DMatrix<f64> {
+    DMatrix::from_column_slice(3, 3, m.as_slice())
+}
