@@ -238,7 +238,7 @@ impl Effect for Formula {
             return formula
                 .refuse("parameter `expression` is not set; e.g. expression = \"lag(hk.NAME, 120) * alpha.z\"");
         }
-        if let Err(error) = read(&formula.expression) {
+        if let Err(error) = parse(&formula.expression) {
             return formula.refuse(&error.marked(&formula.expression));
         }
         if formula.unit.trim().is_empty() {
