@@ -1,4 +1,4 @@
-//! The stage's mathematics: the sign of a channel and the angular rate, each against something else than itself.
+//! Mathematics of the stage: sign of a channel and angular rate, each against an independent reference.
 
 use std::path::PathBuf;
 
@@ -9,7 +9,7 @@ use dragfree_gracefo::rows::{Rows, parse};
 use dragfree_physics::noise::NoiseShape;
 use nalgebra::{Matrix3, Rotation3, Vector3};
 
-/// Acceleration that an accelerometer measures for its offset, by the matrix that GROOPS sets up in its program
+/// Acceleration measured by an accelerometer at an offset, by the matrix of GROOPS' program
 /// SimulateAccelerometerCoMOffset (centrifugal, Euler, gravity gradient), written out element by element.
 fn offset_acceleration(w: Vector3<f64>, wd: Vector3<f64>, gradient: Matrix3<f64>, d: Vector3<f64>) -> Vector3<f64> {
     let mut m = -gradient;
@@ -25,18 +25,17 @@ fn offset_acceleration(w: Vector3<f64>, wd: Vector3<f64>, gradient: Matrix3<f64>
     m * d
 }
 
-/// A free mass in a turning spacecraft, in coordinates: the spacecraft's centre and the mass move in an inertial frame,
-/// the housing sits at `b` in the spacecraft, and the mass as seen from the housing is differenced twice. The
-/// accelerometer at the same place measures what GROOPS says plus the force on the spacecraft; the channel made of it
-/// must be the displacement's second derivative.
+/// Reference: positions of spacecraft and free mass in an inertial frame, with the housing at `b`, differenced twice as
+/// seen from the housing. The accelerometer measures GROOPS' acceleration plus the force on the spacecraft; its channel
+/// must equal the second derivative of the displacement.
 #[test]
-fn the_channel_is_the_acceleration_of_a_free_mass_in_its_housing() {
+fn the_channel_is_the_acceleration_of_a_free_mass() {
     let b = Vector3::new(0.3, -0.2, 0.4);
     let push = Vector3::new(2e-3, -1e-3, 3e-3);
     let (rate, growth) = (Vector3::new(0.03, 0.05, -0.02), Vector3::new(0.004, -0.006, 0.005));
-    // SRF as seen from IRF at time t, exact to second order in t, which is all that differences about t = 0 see.
+    // SRF relative to IRF at time t, to second order in t, which suffices for differences about t = 0.
     let attitude = |t: f64| Rotation3::new(rate * t) * Rotation3::new(growth * (0.5 * t * t));
-    // The mass starts at the housing's centre and moves with it; nothing acts on it. The spacecraft is pushed.
+    // The mass starts at the housing's centre with its velocity; only the spacecraft is accelerated.
     let start = b;
     let velocity = rate.cross(&b);
     let seen = |t: f64| attitude(t).inverse() * (start + velocity * t - push * (0.5 * t * t)) - b;
@@ -47,12 +46,12 @@ fn the_channel_is_the_acceleration_of_a_free_mass_in_its_housing() {
     let channel = channel_orf_m_s2(&Matrix3::identity(), &measured);
     assert!((channel - second).norm() < 1e-8, "{channel} against {second}");
     assert!((-channel - second).norm() > 1e-3, "the other sign would not pass");
-    // And the regressors of the offset, −α×b − ω×(ω×b), explain all of it but the push.
+    // The regressors −α×b − ω×(ω×b) explain all of it but the force.
     let modelled = -growth.cross(&b) - rate.cross(&rate.cross(&b));
     assert!((channel - modelled + push).norm() < 1e-12);
 }
 
-/// A gravity gradient pulls the free mass along: `+Γ b` in the channel.
+/// A gravity gradient accelerates the free mass: `+Γ b` in the channel.
 #[test]
 fn the_gradient_has_the_sign_of_the_free_mass() {
     let gradient = Matrix3::from_diagonal(&Vector3::new(-1.0, -1.0, 2.0)) * 1.2e-6;
@@ -76,11 +75,10 @@ fn table(level: &str, code: &str) -> Rows {
     found.expect("the product").tables.remove(0)
 }
 
-/// The spacecraft points at its twin and at the Earth, so that it turns once per orbit about the orbit's normal. The
-/// orbit of GNI1B says about which axis, in which sense and how fast; the attitude of SCA1B must agree with it to the
-/// pointing errors, milliradians. The inverse quaternion would turn the other way.
+/// The spacecraft points at its twin, so it rotates once per orbit about the orbit's normal. Axis, sense and rate by
+/// the orbit GNI1B agree with the attitude SCA1B to milliradians; the inverse quaternion would rotate the other way.
 #[test]
-fn the_rate_from_the_attitude_is_that_of_the_orbit() {
+fn the_rate_from_the_attitude_matches_the_orbit() {
     let (attitude, orbit) = (table("1B", "SCA1B"), table("1B", "GNI1B"));
     let mut rate = AttitudeRate::default();
     let at = |rows: &Rows, first: usize, k: usize| Vector3::from([0, 1, 2].map(|i| rows.columns[first + i][k]));
@@ -101,13 +99,13 @@ fn the_rate_from_the_attitude_is_that_of_the_orbit() {
 }
 
 #[test]
-fn a_gap_has_no_rate() {
+fn the_rate_is_undefined_after_a_gap() {
     let mut rate = AttitudeRate::default();
     let q = |angle: f64| [(0.5 * angle).cos(), 0.0, (0.5 * angle).sin(), 0.0];
     let step = 100_000_000;
     assert!(rate.next(0, q(0.0), step).y.is_nan());
     assert!((rate.next(step, q(1e-4), step).y - 1e-3).abs() < 1e-12);
-    // The other sign is the same attitude.
+    // Either sign is the same attitude.
     assert!((rate.next(2 * step, q(2e-4).map(|x| -x), step).y - 1e-3).abs() < 1e-12);
     assert!(rate.next(4 * step, q(4e-4), step).y.is_nan(), "an epoch is missing");
     assert!(rate.next(5 * step, [f64::NAN; 4], step).y.is_nan());
@@ -116,9 +114,10 @@ fn a_gap_has_no_rate() {
     assert!(rate.next(8 * step, [0.0; 4], step).y.is_nan(), "no quaternion at all");
 }
 
-/// White noise of one-sided PSD `S` has means over m samples of variance `S/(2 m dt)`, and steps of twice that.
+/// White noise of one-sided PSD `S` has block means over m samples of variance `S/(2 m dt)`, and differences of twice
+/// that.
 #[test]
-fn steps_of_noise_follow_its_spectrum() {
+fn block_differences_of_noise_follow_its_spectrum() {
     let white = noise_block_differences(&NoiseShape::white(3e-8), 0.1);
     for (level, step) in white.iter().enumerate() {
         let want = 9e-16 / (0.1 * f64::from(1_u32 << level));
@@ -131,7 +130,7 @@ fn steps_of_noise_follow_its_spectrum() {
 }
 
 #[test]
-fn steps_do_not_cross_gaps() {
+fn block_differences_do_not_cross_gaps() {
     let run = |values: &[f64]| {
         let mut steps = BlockDifferences::default();
         for x in values {
@@ -140,17 +139,16 @@ fn steps_do_not_cross_gaps() {
         steps.ratio_to_noise(&[1.0; 10])
     };
     assert_eq!(run(&[1.0; 8]), None, "seven steps are too few");
-    // Nine steps of 2; the one of 90 lies across the gap. Blocks of two come to four steps and do not count.
+    // Nine differences of 2; that of 90 lies across the gap. Blocks of two have four differences and do not count.
     let mut values = vec![0.0, 2.0, 0.0, 2.0, 0.0, f64::NAN];
     values.extend([90.0, 92.0, 90.0, 92.0, 90.0, 92.0]);
     assert_eq!(run(&values), Some([4.0, 0.0, 0.0]));
 }
 
-/// Ten quiet seconds: what ACC1A calls angular acceleration is the noise that the mission file states, within what ten
-/// seconds can say. One pulse of a thruster would show, and so would a slow turn to and fro that is a tenth of
-/// the noise from sample to sample.
+/// In ten quiet seconds the angular acceleration of ACC1A is the noise that the mission file states, within its
+/// statistics. A thruster pulse would show, and so would an oscillation of a tenth of the sample noise.
 #[test]
-fn the_real_spacecraft_hardly_turns_in_these_ten_seconds() {
+fn real_quiet_data_are_mostly_noise() {
     let rows = table("1A", "ACC1A");
     let noise = noise_block_differences(&NoiseShape::with_corner(7e-8, 0.01, 2), 0.1);
     let ratio = |extra: &dyn Fn(usize) -> f64| {

@@ -1,4 +1,4 @@
-//! The parser on files that are wrong. Whatever the bytes are, it must not panic, and what it drops it must count.
+//! The parser on damaged files: no panic for any bytes, and every dropped row is counted.
 
 use std::path::PathBuf;
 use std::sync::LazyLock;
@@ -36,7 +36,7 @@ fn read(code: &str, text: &str) -> Result<Parsed, Level1Error> {
     parse(&mut text.as_bytes(), find(code).expect("product"), 'C', Window::ALL)
 }
 
-/// Everything that comes out of any bytes holds together.
+/// Invariants of the result for any bytes.
 fn check(bytes: &[u8], code: &str) {
     let product = find(code).expect("product");
     let Ok(parsed) = parse(&mut &bytes[..], product, 'C', Window::ALL) else { return };
@@ -112,7 +112,7 @@ proptest! {
     }
 }
 
-/// The seventh and eighth words are the first of the values that a row's `prod_flag` promises.
+/// The seventh and eighth words are the first values that a row's `prod_flag` announces.
 const ROW: &str = "738849601  7650  R  C  00000000   00000100000000000000000000111111  1 2 3 4 5 6 7";
 
 fn with_rows(rows: &str) -> Parsed {
@@ -122,8 +122,8 @@ fn with_rows(rows: &str) -> Parsed {
 }
 
 #[test]
-fn a_row_has_the_columns_that_its_flag_says() {
-    // Linear acceleration along the accelerometer's x alone, then all but its y, then a flag that promises more.
+fn the_flag_of_a_row_selects_its_columns() {
+    // Linear acceleration along the accelerometer's x alone; then all but its y; then a flag that announces more.
     let p = with_rows(
         "738849601 0 R C 00000000 00000000000000000000000000000001 0.25\n\
          738849602 0 R C 00000000 00000000000000000000000000111101 1 3 4 5 6\n\
@@ -169,7 +169,7 @@ fn a_window_keeps_what_is_inside() {
 }
 
 #[test]
-fn a_header_of_its_own_fill_value_is_heeded() {
+fn the_fill_value_of_a_header_is_used() {
     let text = real("ACT1B", 'C').replace("    - lin_accl_y:\n", "    - lin_accl_y:\n        _FillValue: -99.5\n");
     let (header, _) = text.split_once("# End of YAML header\n").expect("header");
     let p = read("ACT1B", &format!("{header}# End of YAML header\n738849600 C 1 -99.5 3 0 0 0 -99.5 0 0 00000000\n"));
@@ -180,7 +180,7 @@ fn a_header_of_its_own_fill_value_is_heeded() {
 }
 
 #[test]
-fn a_header_of_something_else_is_refused_with_a_reason() {
+fn a_foreign_header_is_refused_with_a_reason() {
     let text = real("ACC1A", 'C');
     let refusals = [
         (read("ACC1A", ""), "no line"),
@@ -216,7 +216,7 @@ fn only_names_of_the_mission_are_members() {
 }
 
 #[test]
-fn an_archive_cut_in_the_middle_gives_what_is_before_the_cut() {
+fn a_truncated_archive_gives_its_intact_members() {
     let path = PathBuf::from(env!("CARGO_MANIFEST_DIR"))
         .join("../../fixtures/gracefo/gracefo_1A_2023-06-01_RL04.ascii.noLRI.tgz");
     let whole = std::fs::read(&path).expect("fixture");

@@ -1,4 +1,4 @@
-//! The parser on the mission's own files: 2023-06-01, release 04, both spacecraft, bodies cut to 100 rows.
+//! The parser on files of the mission: 2023-06-01, release 04, both spacecraft, bodies shortened to 100 rows.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -51,7 +51,7 @@ fn every_product_of_both_spacecraft_is_read_without_loss() {
                     assert!(table.time_ns.is_sorted_by(|a, b| a < b), "{code}");
                     assert!(table.columns.iter().all(|col| col.len() == table.time_ns.len()));
                 }
-                // The bodies were cut and the headers were not: only MAS1A, which had 24 rows, tells the truth.
+                // Bodies were shortened but headers kept: only MAS1A, with 24 rows, has the right count.
                 assert_eq!(c.promised.is_none(), code == "MAS1A", "{code}");
             }
         }
@@ -62,7 +62,7 @@ fn every_product_of_both_spacecraft_is_read_without_loss() {
 fn values_and_times_are_those_of_the_rows() {
     let all = read("1A", 'C');
     let acc = &all["ACC1A"].tables[0];
-    // 738849600 7739 … -1.064995712362181e-05 -1.835037928999774e-07 -2.778613076425759e-07 1.296…e-05 0.0001192… -0.00078…
+    // 738849600 7739 … -1.064995712362181e-05 -1.835037928999774e-07 -2.778613076425759e-07 1.296…e-05 …
     assert_eq!(acc.time_ns[0], MIDNIGHT_NS + 7_739_000);
     let first: Vec<f64> = acc.columns.iter().map(|c| c[0]).collect();
     assert_eq!(
@@ -85,7 +85,7 @@ fn values_and_times_are_those_of_the_rows() {
     assert_eq!(tank.columns[0][0], 221.7747955322266 * 1e5);
     assert!(tank.columns[2][0].is_nan(), "a row with pressures has no temperatures");
     assert!(tank.columns[2].iter().any(|k| (250.0..320.0).contains(k)), "temperatures in kelvin");
-    // Rows of MAG1A are half a second apart, which is so only if its fractions are microseconds.
+    // Rows of MAG1A are half a second apart only if their fractions are microseconds.
     let mag = &all["MAG1A"].tables[0];
     assert!(mag.time_ns.windows(2).all(|w| w[1] - w[0] == 500_000_000));
     assert!(mag.columns[0].iter().all(|b| (1e-6..7e-5).contains(b)), "Earth's field in tesla");
@@ -97,11 +97,10 @@ fn values_and_times_are_those_of_the_rows() {
     assert_eq!(orbit.tables[0].columns[0][1], -2123592.510478244);
 }
 
-/// How the accelerometer's axes lie in the spacecraft. ACT1B is ACC1A filtered to 1 Hz and turned into SRF, so that
-/// over the ten seconds that both cover their means agree; 24 ways of turning a right-handed set of axes into
-/// another are tried, and the one that the catalogue uses fits 100 times better than any other.
+/// Orientation of the accelerometer's axes. ACT1B is ACC1A filtered to 1 Hz in SRF, so their means over the common ten
+/// seconds agree. Of 24 rotations of the axes, the one in use fits 100 times better than any other.
 #[test]
-fn the_axes_of_the_accelerometer_are_those_that_act1b_shows() {
+fn the_axes_of_the_accelerometer_match_act1b() {
     let acc = read("1A", 'C').remove("ACC1A").expect("ACC1A").tables.remove(0);
     let act = read("1B", 'C').remove("ACT1B").expect("ACT1B").tables.remove(0);
     let srf = [0, 1, 2].map(|i| mean(&act.columns[i], 10));
@@ -123,8 +122,8 @@ fn the_axes_of_the_accelerometer_are_those_that_act1b_shows() {
     }
 }
 
-/// The angular columns have the accelerometer's axes too: the instrument is least sensitive to rotation about its own
-/// `a_1`, and that noise must come out on `s_2`.
+/// The angular columns use the accelerometer's axes too: the instrument is least sensitive about `a_1`, whose noise
+/// must appear on `s_2`.
 #[test]
 fn the_noisiest_angular_axis_is_the_pitch_axis() {
     for spacecraft in ['C', 'D'] {
@@ -137,7 +136,7 @@ fn the_noisiest_angular_axis_is_the_pitch_axis() {
     }
 }
 
-/// ACT1B of spacecraft D is C's accelerometer, transplanted: its own ACC1A does not agree with it.
+/// ACT1B of spacecraft D is transplanted from C: ACC1A of D disagrees with it.
 #[test]
 fn spacecraft_d_has_a_transplanted_act1b() {
     let acc = read("1A", 'D').remove("ACC1A").expect("ACC1A").tables.remove(0);
@@ -147,7 +146,7 @@ fn spacecraft_d_has_a_transplanted_act1b() {
 }
 
 #[test]
-fn quaternions_of_neighbours_have_one_sign() {
+fn consecutive_quaternions_have_one_sign() {
     let mut rows = Rows {
         time_ns: vec![0, 1, 2, 3],
         columns: vec![vec![1.0, -1.0, f64::NAN, 1.0], vec![0.0, -0.1, 0.0, 0.2], vec![0.0; 4], vec![0.0; 4]],

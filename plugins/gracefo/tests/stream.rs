@@ -25,7 +25,7 @@ fn open(files: &[PathBuf], wanted: &[&str]) -> Telemetry {
     Telemetry::open(files, 'C', Window::ALL, &wanted).expect("opens")
 }
 
-/// Table, time, and the bits of the values.
+/// Table, time, and bits of the values.
 type Row = (usize, i64, Vec<u64>);
 
 fn drain(stream: &mut Telemetry, batch: usize, most: usize) -> Vec<Row> {
@@ -49,7 +49,7 @@ fn drain(stream: &mut Telemetry, batch: usize, most: usize) -> Vec<Row> {
     all
 }
 
-/// Writes one member of the fixtures as a plain file, changed.
+/// Writes a changed member of the fixtures as a plain file.
 fn write(dir: &Path, level: &str, name: &str, as_name: &str, change: impl Fn(String) -> String) -> PathBuf {
     let path = dir.join(as_name);
     let container = Container::open(&fixture(level)).expect("fixture");
@@ -66,9 +66,9 @@ fn write(dir: &Path, level: &str, name: &str, as_name: &str, change: impl Fn(Str
 }
 
 #[test]
-fn rows_come_in_order_of_time_whatever_the_batch() {
+fn rows_are_in_time_order_for_any_batch() {
     let whole = drain(&mut open(&both(), &[]), usize::MAX / 2, 9);
-    // Eleven products of a hundred rows, but MAS1A with 24.
+    // Eleven products of 100 rows, but MAS1A with 24.
     assert_eq!(whole.len(), 1024);
     assert!(whole.is_sorted_by_key(|r| (r.1, r.0)));
     for batch in [1, 7, 777] {
@@ -107,7 +107,7 @@ fn a_stream_resumes_where_it_was_saved() {
 }
 
 #[test]
-fn oddities_of_the_real_files_are_counted_and_lose_nothing() {
+fn deviations_of_the_real_files_are_counted_without_loss() {
     let mut stream = open(&both(), &[]);
     drain(&mut stream, 1000, usize::MAX);
     let log = stream.log();
@@ -122,7 +122,7 @@ fn oddities_of_the_real_files_are_counted_and_lose_nothing() {
 fn days_follow_each_other_and_late_rows_are_dropped() {
     let dir = tempfile::tempdir().expect("directory");
     let name = "SCA1B_2023-06-01_C_04.txt";
-    // The next file: the same rows 98 s later, so that its first two are in the first file already; q as −q.
+    // The next file: the same rows 98 s later, two of which the first file has already; q as −q.
     let later = |text: String| {
         let (header, body) = text.split_once("# End of YAML header\n").expect("header");
         let body: String = body
@@ -160,7 +160,7 @@ fn days_follow_each_other_and_late_rows_are_dropped() {
 }
 
 #[test]
-fn of_two_releases_the_newer_one_counts() {
+fn the_newer_of_two_releases_is_used() {
     let dir = tempfile::tempdir().expect("directory");
     let name = "ACT1B_2023-06-01_C_04.txt";
     let old = write(dir.path(), "1B", name, "ACT1B_2023-06-01_C_03.txt", |t| t.replace("e-07 ", "e-06 "));
@@ -171,7 +171,7 @@ fn of_two_releases_the_newer_one_counts() {
 }
 
 #[test]
-fn damage_is_noted_and_is_a_loss() {
+fn damage_is_noted_as_data_loss() {
     let dir = tempfile::tempdir().expect("directory");
     let acc = "ACC1A_2023-06-01_C_04.txt";
     let files = [
@@ -195,7 +195,7 @@ fn damage_is_noted_and_is_a_loss() {
 }
 
 #[test]
-fn what_cannot_be_a_stream_says_why() {
+fn unusable_files_are_refused_with_a_reason() {
     let nothing = Telemetry::open(&[fixture("1B")], 'C', Window::ALL, &["ACC1A".to_owned()]).expect_err("no ACC1A");
     assert!(nothing.to_string().contains("spacecraft C") && nothing.to_string().contains("ACT1B"), "{nothing}");
     let unknown = Telemetry::open(&both(), 'C', Window::ALL, &["KBR1B".to_owned()]).expect_err("unknown");

@@ -1,25 +1,10 @@
-//! Columns that are made only when an effect of the model asks for them.
+//! Columns written only on request of an effect: commands as executed, and derivatives of `α̂` with respect to a torque
+//! gain and to a delay of the attitude readout. Derivations: Methods, "Derivatives of α̂".
 //!
-//! Two of them are derivatives of `α̂`. `α̂ = α_c + D[θ, α_c]`, where `α_c` is what the commands say and `D` the smoother, which
-//! is linear in both: with `α_c` alone, `α_c + D[0, α_c]`, it is what `α̂` makes of commands; `D[θ, 0]` is what it makes of attitude.
-//!
-//! **Torque.** Were the torque about axis `i` of SRF `(1 + g_i)` times the commanded one `M_i`, one who knew would have
-//! `α_c + g_i J⁻¹ e_i M_i`, with the same attitude. So `∂α̂/∂g_i = J⁻¹ e_i M_i + D[0, J⁻¹ e_i M_i]`: much above the crossover of
-//! 0.08 Hz, where the smoother believes commands, little below. The noise part of the second term pushes the test masses where the
-//! thrusters have a layout ([`crate::reconstruction`], `push_per_turn`).
-//!
-//! **Delay.** A sensor that shows at `t` what was true at `t − τ` reads `θ_k − τ ω_k` to first order: the attitude that is added for
-//! each second of delay is `−ω`, and `∂α̂/∂τ = D[−ω, 0]`. As `α` is held from sample to sample, `−ω` is a chain of straight lines
-//! that bends at `t_k` by `−(α_k − α_{k−1})`: exactly what a spacecraft does that gets these kicks. Attitude that does what is known
-//! leaves nothing to the smoother, `D[−ω, kicks −Δα] = 0`, so that `D[−ω, 0] = D[0, kicks +Δα]`, without any `ω` that might drift.
-//! Where sensing tells all it is `−dα/dt`, as it must be.
-//!
-//! Which `α`? The true one is not known. Of all functions of the data `D[0, kicks Δα̂]` is nearest, as `α̂ = E[α | all data]` and `D`
-//! is linear: what is missing is uncorrelated with everything in the data, so a regression on it is unbiased. Commands alone are not
-//! good enough, causal as they are: below the crossover they answer the thrusters' noise that they leave out (slope of the truth on
-//! them 0.02 at 1–10 mHz). `α̂` has attitude noise in it, which is no harm in the test masses' channels, where the column acts
-//! through the offset: they have their own readouts. For the attitude channels, which share that noise, the column is not made:
-//! they see `−τ dα/dt` without the smoother, and a smoothed command is no longer causal.
+//! `α̂ = α_c + D[θ, α_c]` with the commanded `α_c` and the smoother `D`, which is linear in both arguments.
+//! * Torque: `∂α̂/∂g_i = J⁻¹ e_i M_i + D[0, J⁻¹ e_i M_i]`.
+//! * Delay: `∂α̂/∂τ = D[−ω, 0] = D[0, kicks Δα̂]`, for the channels of the test masses only. The attitude channels share
+//!   the noise of `α̂` and use the command without the smoother.
 
 use nalgebra::{Matrix3, Vector3};
 

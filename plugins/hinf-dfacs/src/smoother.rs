@@ -1,19 +1,17 @@
-//! The spacecraft's angular acceleration given all wavefront sensing and all commands: a fixed-lag disturbance smoother.
+//! Fixed-lag disturbance smoother: the angular acceleration given all wavefront sensing and all commands.
 //!
-//! The attitude obeys `θ̈ = α_known + β + w` with `w` white (thrusters), constant over a sample, and `β` a slowly
-//! wandering torque (sunlight or a controller's integrator that nobody modelled). A Kalman filter runs on
-//! `x = [θ, ω, β]` for each principal axis, and the adjoint recursion of Koopman's disturbance smoother (Biometrika 80,
-//! 1993; Durbin & Koopman, sections 4.4 and 4.5) runs backward over a fixed lag. It gives `E[β + w | data]`, so that
-//! the truth regressed on the result has slope one. Commands are no extra information: they are known functions of past
-//! readouts.
+//! The attitude obeys `θ̈ = α_known + β + w` with white `w` (thrusters), constant over a sample, and a slow random walk
+//! `β` (unmodelled torque). Per principal axis a Kalman filter runs on `x = [θ, ω, β]`, and the adjoint recursion of
+//! Koopman's disturbance smoother (Biometrika 80, 1993; Durbin & Koopman, sections 4.4 and 4.5) runs backward over a
+//! fixed lag. The result `E[β + w | data]` is an unbiased regressor. Commands add no information, as they are functions
+//! of past readouts.
 //!
-//! `J⁻¹ S_M J⁻ᵀ` is symmetric and the sensing is alike about all axes, so that in the eigenvectors of the former, here
-//! called principal axes, the three axes decouple exactly. With one level of torque noise they are those of `J`.
+//! The principal axes are the eigenvectors of the symmetric `J⁻¹ S_M J⁻ᵀ`; sensing is equal about all axes, so the
+//! three axes decouple exactly.
 //!
-//! The sensing's coloured noise needs no states. A term of exponent 4 is white noise twice integrated, as `θ` is, one of
-//! exponent 2 once: what the sensors see, `z = θ + n`, is again a double integrator, with more noise on it. The filter runs
-//! on `z` and its rate; the adjoint recursion tells `w` from `n` by what each adds in a step. Without a leak that is the
-//! exact posterior; a leak moves it by about its decay over the filter's memory.
+//! Coloured sensing noise needs no additional states. Terms of exponent 4 and 2 are white noise integrated twice and
+//! once, so `z = θ + n` is a double integrator with more noise. The filter runs on `z` and its rate, and the adjoint
+//! recursion separates `w` from `n` by their increments. Without leakage this is the exact posterior.
 
 use dragfree_physics::noise::NoiseShape;
 use nalgebra::{Matrix3, Vector3};
@@ -21,20 +19,18 @@ use std::f64::consts::TAU;
 
 use crate::state::{Reader, StateError, Writer};
 
-/// Where the wandering torque's spectrum crosses the thrusters' white one. Far below the crossover at which the
-/// smoother gives up sensing for commands (about 0.08 Hz), so `β` only saves the ends of a record from a constant torque.
+/// Frequency at which the spectrum of `β` crosses the white one. It is far below the frequency at which the smoother
+/// relies on commands, so `β` only protects the ends of a record from a constant torque.
 const DRIFT_CORNER_HZ: f64 = 1e-4;
-/// Standard deviations before any data: attitude (rad), rate (rad/s) and wandering part (rad/s²), all far wider than
-/// a spacecraft in science mode; a torque at the limit of micro-thrusters turns it by 1e-6 rad/s².
+/// Prior standard deviations of attitude (rad), rate (rad/s) and `β` (rad/s²), far wider than in science mode.
 const PRIOR: [f64; 3] = [1e-2, 1e-4, 1e-6];
-/// The lag in time constants of the filter. What lies beyond it would add `e⁻²⁰` of `w`, to be compared with the
-/// loop's own suppression of `α` against `w`, 1e-4 at 1 mHz.
+/// Lag in time constants of the filter; the neglected part of `w` is `e⁻²⁰`.
 const LAG_TIME_CONSTANTS: f64 = 20.0;
-/// Longest lag, s, so that sensing that tells next to nothing does not hold back a day: 40 MB at 10 Hz.
+/// Longest lag, s, which bounds memory when sensing is very noisy: 40 MB at 10 Hz.
 const MOST_LAG_S: f64 = 3600.0;
 
-/// An innovation says something about the noise when the attitude was predicted to within so many variances of a
-/// readout: not after a missing command, when the wide prior expects anything.
+/// Largest prediction variance, in variances of a readout, for which an innovation counts in the noise statistics; it
+/// excludes the time after a missing command.
 const INFORMED: f64 = 1e3;
 
 /// Three numbers, one for each principal axis.
@@ -52,10 +48,9 @@ pub struct Model {
     drift_variance: Axes,
     /// Variance of the white part of a readout, rad².
     readout_variance: f64,
-    /// What the coloured part of the readouts adds in a step to `z` and its rate, `zz`, `zω`, `ωω`; rad², rad² s⁻¹,
-    /// rad² s⁻².
+    /// Increments of the coloured readout noise to `z` and its rate, `zz`, `zω`, `ωω`; rad², rad² s⁻¹, rad² s⁻².
     wander: [f64; 3],
-    /// Samples after which the filter has forgotten all but `1/e`.
+    /// Memory of the filter, samples to `1/e`.
     memory: f64,
     lag: usize,
 }
@@ -79,7 +74,7 @@ impl Model {
         let (once, twice) = (drive(2), drive(4));
         let slowest = disturbance_psd.iter().copied().fold(f64::INFINITY, f64::min);
         let decay = decay_rad_s(once / readout.white_psd(), (slowest + twice) / readout.white_psd());
-        // Where sensing follows every sample the filter forgets at once; it still needs a few samples around.
+        // If sensing is very accurate the filter has no memory, but the smoother still needs a few samples.
         let lag = (LAG_TIME_CONSTANTS / (decay * dt_s)).max(16.0).min((MOST_LAG_S / dt_s).max(16.0));
         Self {
             dt_s,
@@ -93,13 +88,13 @@ impl Model {
         }
     }
 
-    /// Samples after which the filter has forgotten all but `1/e`: what it knows of `w` it knows from readouts about as near.
+    /// Memory of the filter, samples to `1/e`; information on `w` comes from readouts within it.
     #[must_use]
     pub fn memory(&self) -> f64 {
         self.memory
     }
 
-    /// Samples by which the result is late.
+    /// Lag of the result, samples.
     #[must_use]
     pub fn lag(&self) -> usize {
         self.lag
@@ -125,18 +120,18 @@ pub fn residual_psd(frequency_hz: f64, disturbance_psd: f64, readout_psd: f64, d
     disturbance * readout / (disturbance + readout)
 }
 
-/// What the smoother knows about one epoch, SRF.
+/// Smoothed quantities of one epoch, SRF.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Smoothed {
     /// `E[β + w]`, mean over `[t_k, t_{k+1})`, rad s⁻².
     pub disturbance_rad_s2: Vector3<f64>,
-    /// `E[w]` of it: the part by the thrusters' noise.
+    /// Its part `E[w]`, by thruster noise.
     pub noise_rad_s2: Vector3<f64>,
-    /// `E[ω]` relative to CRF at `t_k`, rad s⁻¹, as the sensors see it: with the rate of their coloured noise.
+    /// `E[ω]` relative to CRF at `t_k`, rad s⁻¹, including the rate of the coloured sensing noise.
     pub omega_crf_rad_s: Vector3<f64>,
 }
 
-/// What the backward recursion needs of one epoch; every number for three axes.
+/// Quantities of one epoch for the backward recursion, for three axes.
 #[derive(Clone, Copy, Debug, Default)]
 struct Step {
     /// Predicted ω and β.
@@ -147,11 +142,11 @@ struct Step {
     gain: [Axes; 3],
     /// Innovation over its variance; zero, as the gain, without a readout.
     weighted_innovation: Axes,
-    /// The command of the interval that follows is unknown: attitude and rate are forgotten across it.
+    /// The command of the next interval is unknown: attitude and rate are reset.
     cut: bool,
 }
 
-/// What the filter made of the data up to one epoch.
+/// Filter output up to one epoch.
 #[derive(Clone, Copy, Debug)]
 struct Seen {
     /// Predicted ω and β.
@@ -165,7 +160,7 @@ struct Seen {
 pub struct Turn {
     /// Held over `[t_k, t_{k+1})`, rad s⁻².
     pub held_rad_s2: Vector3<f64>,
-    /// All at once at `t_k`, rad s⁻¹.
+    /// Impulsive at `t_k`, rad s⁻¹.
     pub kick_rad_s: Vector3<f64>,
 }
 
@@ -185,15 +180,14 @@ impl Answer {
     }
 }
 
-/// Whether the attitude does what the known accelerations say: a score test for their gain.
+/// Score test for the gain of the known accelerations.
 ///
-/// An innovation knows all that was known before it, so it is uncorrelated with every earlier command, whatever the loop
-/// did with its readouts; a part of the commands that did not act, or acted without being commanded, shows in the
-/// innovations as the filter's own answer to it. The products of the two are martingale differences, and their sum over the
-/// root of the sum of their squares is a standard normal deviate.
+/// Innovations are uncorrelated with all earlier commands, whatever the control law. A command that did not act as
+/// stated appears in the innovations as the filter's response to it. The products are martingale differences, so their
+/// sum over the root of their sum of squares is a standard normal deviate.
 #[derive(Clone, Debug, Default)]
 struct Obedience {
-    /// By how much the predicted θ, ω, β would miss if the known acceleration had acted once more.
+    /// Change of predicted θ, ω, β if the known acceleration had acted once more.
     answer: [Axes; 3],
     products: Axes,
     squares: Axes,
@@ -219,7 +213,7 @@ impl Obedience {
     }
 }
 
-/// The running smoother. Call [`Self::update`] and then [`Self::advance`] for each epoch.
+/// The smoother. Call [`Self::update`] and then [`Self::advance`] for each epoch.
 #[derive(Clone, Debug)]
 pub struct Smoother {
     model: Model,
@@ -275,7 +269,7 @@ impl Smoother {
                     step.gain[state][i] = k;
                 }
                 step.weighted_innovation[i] = innovation / variance;
-                // The first row as noise times gain: no difference of nearly equal numbers after a wide prior.
+                // The first row as noise times gain avoids cancellation after a wide prior.
                 self.covariance[0][i] = noise * gain[0];
                 self.covariance[1][i] = noise * gain[1];
                 self.covariance[2][i] = noise * gain[2];
@@ -331,21 +325,21 @@ impl Smoother {
         }
     }
 
-    /// Epochs that wait for their future. At twice the lag, [`Self::smooth`] the first half: blocks are counted from
-    /// the first epoch, so that the result knows nothing of how the data came in.
+    /// Number of epochs that wait for later data. At twice the lag, [`Self::smooth`] the first half; blocks count from
+    /// the first epoch, so results do not depend on batches.
     #[must_use]
     pub fn waiting(&self) -> usize {
         self.steps.len()
     }
 
-    /// Smooths the `count` oldest waiting epochs with all the data so far, and lets them go.
+    /// Smooths and removes the `count` oldest waiting epochs.
     pub fn smooth(&mut self, count: usize) -> Vec<Smoothed> {
         let out = self.smoothed(count);
         self.release(count);
         out
     }
 
-    /// What all the data so far say about the `count` oldest waiting epochs.
+    /// Smoothed values of the `count` oldest waiting epochs, with all data so far.
     #[must_use]
     pub fn smoothed(&self, count: usize) -> Vec<Smoothed> {
         self.backward(count, |k| {
@@ -354,16 +348,16 @@ impl Smoother {
         })
     }
 
-    /// Lets the `count` oldest waiting epochs go.
+    /// Removes the `count` oldest waiting epochs.
     pub fn release(&mut self, count: usize) {
         self.steps.drain(..count.min(self.steps.len()));
     }
 
-    /// By how much [`Self::smoothed`] of the `count` oldest waiting epochs would differ if more were known of the acceleration:
-    /// `more(k)` for the epoch that `k` others wait before. `state` goes from the oldest waiting epoch to the one after `count`.
+    /// Change of [`Self::smoothed`] for the `count` oldest waiting epochs due to an additional known acceleration,
+    /// `more(k)` for waiting epoch `k`. `state` advances from the oldest waiting epoch to the one after `count`.
     ///
-    /// The smoother is linear in attitude and known acceleration, and its gains depend only on which epochs have any; so the
-    /// difference is what it makes of that acceleration alone, with an attitude of zero where there is one.
+    /// The smoother is linear, and its gains depend only on which epochs have data, so this is its response to that
+    /// acceleration with zero attitude.
     pub fn answer(&self, state: &mut Answer, count: usize, more: impl Fn(usize) -> Turn) -> Vec<Smoothed> {
         let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
         let principal = |v: &Vector3<f64>| self.model.srf_from_principal.tr_mul(v);
@@ -378,7 +372,8 @@ impl Smoother {
             let (kick, held) = (principal(&turn.kick_rad_s), principal(&turn.held_rad_s2));
             for i in 0..3 {
                 let (miss, gain) = (mean[0][i], step.gain.map(|k| k[i]));
-                // Over the innovation's variance F, from K_ω = P_ωθ/F. At the very start P_ωθ is zero, and so is what is missed.
+                // Relative to the innovation variance F, from K_ω = P_ωθ/F. At the start P_ωθ and the missing term are
+                // zero.
                 let omega_theta = step.covariance[0][i];
                 if omega_theta != 0.0 {
                     now.weighted_innovation[i] = -miss * (gain[1] / omega_theta);
@@ -402,7 +397,7 @@ impl Smoother {
         self.backward(count, |k| seen[k])
     }
 
-    /// The adjoint recursion over all waiting epochs, and what it gives for the `count` oldest.
+    /// Adjoint recursion over all waiting epochs; returns the `count` oldest.
     fn backward(&self, count: usize, seen: impl Fn(usize) -> Seen) -> Vec<Smoothed> {
         let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
         let count = count.min(self.steps.len());
@@ -439,15 +434,15 @@ impl Smoother {
         out
     }
 
-    /// Mean squared innovation over its predicted variance per principal axis: 1 when torque noise and sensing noise
-    /// are as the mission file says. `None` before any readout.
+    /// Normalised innovation squared per principal axis: 1 if torque and sensing noise are as in the mission file.
+    /// `None` before any readout.
     #[must_use]
     pub fn innovation_ratio(&self) -> Option<[f64; 3]> {
         (self.innovations > 0).then(|| self.innovation_squares.map(|s| s / self.innovations as f64))
     }
 
-    /// Correlation of the innovations with the known accelerations before them, in standard deviations per principal
-    /// axis: a standard normal deviate when what is known is what acted. `None` before enough readouts.
+    /// Score of the known accelerations per principal axis, a standard normal deviate if they acted as stated. `None`
+    /// before enough readouts.
     #[must_use]
     pub fn disobedience_sigma(&self) -> Option<[f64; 3]> {
         let o = &self.obedience;
