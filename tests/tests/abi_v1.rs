@@ -54,7 +54,8 @@ fn version_1_plugins_pass_the_validator() {
     }
 }
 
-/// A pipeline of the science-mode stages and these two, the Rust stage behind both estimators so that it reads their reports.
+/// A pipeline of the science-mode stages and these two, the Rust stage behind both estimators so that it reads their
+/// reports.
 fn pipeline(folder: &Path) -> PathBuf {
     let mission = fixture("missions/taiji.toml").display().to_string();
     let stage = |plugin: &str, parameters: &str| format!("[[stage]]\nplugin = \"{plugin}\"\n{parameters}\n");
@@ -85,8 +86,9 @@ fn calibrated(folder: &Path, file: &Path, id: &str, instance: &str, parameters: 
     run
 }
 
-/// A gradient of 8e-9 m s⁻² K⁻¹ on 1.96 kg is simulated: the effect in Rust finds the force within 3σ and at more than 10σ
-/// (false-alarm rate 0.3 %). The stage in Rust wrote its factor times the readout of the file, and read every earlier report.
+/// A gradient of 8e-9 m s⁻² K⁻¹ on 1.96 kg is simulated: the effect in Rust finds the force within 3σ and at more than
+/// 10σ (false-alarm rate 0.3 %). The stage in Rust wrote its factor times the readout of the file, and read every
+/// earlier report.
 #[test]
 fn a_version_1_plugin_in_rust_computes_what_it_did() {
     const SIZE_N_K: f64 = 8e-9 * 1.96;

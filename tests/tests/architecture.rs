@@ -93,8 +93,8 @@ fn the_simulator_shares_no_code_with_the_effects() {
     assert!(!found["dragfree-sim"].contains("dragfree-effects") && !found["dragfree-effects"].contains("dragfree-sim"));
 }
 
-/// Words that only missions, the plugins that own them, tests and documents may know: plugins and effects by their ids, test masses,
-/// channels, noise tables of the mission file.
+/// Words that only missions, the plugins that own them, tests and documents may know: plugins and effects by their ids,
+/// test masses, channels, noise tables of the mission file.
 const OWNED_BY_OTHERS: [&str; 15] = [
     "com-offset",
     "es-gain",
@@ -113,8 +113,8 @@ const OWNED_BY_OTHERS: [&str; 15] = [
     "readout:",
 ];
 
-/// Files that still name some of them: the interface of the bundled mission's telemetry, made-up columns for `plugins validate`,
-/// bundled files and examples for the screen.
+/// Files that still name some of them: the interface of the bundled mission's telemetry, made-up columns for `plugins
+/// validate`, bundled files and examples for the screen.
 const STILL_NAMING: [&str; 9] = [
     "core/engine/src/telemetry/names.rs",
     "core/engine/src/validate/stand.rs",

@@ -1,5 +1,5 @@
-//! The release archive, unpacked into an empty folder and used without this repository: no file of it is on a path that is given,
-//! the environment is cleared and HOME is new.
+//! The release archive, unpacked into an empty folder and used without this repository: no file of it is on a path that
+//! is given, the environment is cleared and HOME is new.
 #![cfg(target_os = "linux")]
 
 use dragfree_tests::{built, expect, json, root};

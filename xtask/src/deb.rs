@@ -1,4 +1,5 @@
-//! A Debian package: an `ar` archive of a format number, a tar with what the package says of itself, and a tar of the files.
+//! A Debian package: an `ar` archive of a format number, a tar with what the package says of itself, and a tar of the
+//! files.
 
 use crate::Failure;
 use crate::tree::Tree;

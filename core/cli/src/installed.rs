@@ -1,6 +1,7 @@
 //! What comes with the program: missions, pipelines and models by name, and the SDK.
 //!
-//! In an installation they lie in `../share/dragfree` from the program, in a build folder in the source tree that it was built from.
+//! In an installation they lie in `../share/dragfree` from the program, in a build folder in the source tree that it
+//! was built from.
 
 use crate::args::{Arguments, Command, Config, Model, Plugins};
 use crate::failure::Failure;

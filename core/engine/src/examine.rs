@@ -1,5 +1,5 @@
-//! A second pass over the data of a product: its inputs go through its chain once more, up to and with the effects, and the columns
-//! that the caller chooses come back to it.
+//! A second pass over the data of a product: its inputs go through its chain once more, up to and with the effects, and
+//! the columns that the caller chooses come back to it.
 
 use std::path::PathBuf;
 
@@ -30,8 +30,8 @@ pub struct Examination<'a> {
 /// A consumer of columns, with the indices of those that it wants in [`Chain::columns`].
 pub type Wanted<C> = (C, Vec<usize>);
 
-/// Every instance of every installed effect that is not in a model. An effect that may act anywhere is not tried: its place is the
-/// user's to say.
+/// Every instance of every installed effect that is not in a model. An effect that may act anywhere is not tried: its
+/// place is the user's to say.
 #[must_use]
 pub fn candidates(registry: &Registry, model: &Model) -> Vec<EffectEntry> {
     let mut all = Vec::new();
@@ -52,8 +52,8 @@ pub fn candidates(registry: &Registry, model: &Model) -> Vec<EffectEntry> {
     all
 }
 
-/// Whether an effect has a parameter: with `at_ns` what it does happens once, at a time that the host finds; with `fine` its candidate
-/// can be tried about one shape in fine steps.
+/// Whether an effect has a parameter: with `at_ns` what it does happens once, at a time that the host finds; with
+/// `fine` its candidate can be tried about one shape in fine steps.
 #[must_use]
 pub fn has_parameter(registry: &Registry, effect: &str, name: &str) -> bool {
     let found = registry.find(Kind::Effect, effect);
@@ -68,8 +68,9 @@ pub fn model(sources: &Sources) -> Result<Model, EngineError> {
     Ok(Model::load(&sources.model)?)
 }
 
-/// Carries the data of a product through its chain. `link` sees the linked chain before a row is read; what it makes takes the rows of
-/// the columns that it wants ([`Sink::tapped`]). Gives that back, and the candidates that could not be linked, with the reason.
+/// Carries the data of a product through its chain. `link` sees the linked chain before a row is read; what it makes
+/// takes the rows of the columns that it wants ([`Sink::tapped`]). Gives that back, and the candidates that could not
+/// be linked, with the reason.
 ///
 /// # Errors
 /// An input has changed since the product was made, is gone, or a plugin fails; or `link` refuses.

@@ -1,9 +1,10 @@
 //! Model files with history: every change makes a revision with a parent, and no revision is ever lost.
 //!
 //! `MODEL.toml` is the newest revision. Every revision that a command made or left behind lies beside it, immutable, as
-//! `MODEL.history/REVISION.toml`. Text is edited in place, so comments and formatting stay. The history is written before the
-//! file, and the file by a rename: a kill at any instruction leaves the old file or the new one, and both revisions once they
-//! were current. `MODEL.toml.lock` holds the new text until it takes the file's name, and keeps a second writer out.
+//! `MODEL.history/REVISION.toml`. Text is edited in place, so comments and formatting stay. The history is written
+//! before the file, and the file by a rename: a kill at any instruction leaves the old file or the new one, and both
+//! revisions once they were current. `MODEL.toml.lock` holds the new text until it takes the file's name, and keeps a
+//! second writer out.
 
 use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
@@ -309,8 +310,8 @@ impl Edit {
         Ok(())
     }
 
-    /// Becomes a child of the revision `base` of the model file `source` in which every estimated effect but those of `keep` (by
-    /// id, or `ID:INSTANCE`) is fixed at `values`, coefficients by name in SI units.
+    /// Becomes a child of the revision `base` of the model file `source` in which every estimated effect but those of
+    /// `keep` (by id, or `ID:INSTANCE`) is fixed at `values`, coefficients by name in SI units.
     ///
     /// # Errors
     /// No such revision; an effect has no value, or two of its coefficients end alike.

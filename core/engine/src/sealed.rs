@@ -128,8 +128,8 @@ impl Sealed {
         serde_json::from_slice(&payload).map_err(|e| form(&e.to_string()))
     }
 
-    /// Checks that telemetry was made with this sealed file: each of `files`, or, where there is none, each in the folder
-    /// above that names a digest. Gives the files that agree; `path` is where this was read.
+    /// Checks that telemetry was made with this sealed file: each of `files`, or, where there is none, each in the
+    /// folder above that names a digest. Gives the files that agree; `path` is where this was read.
     ///
     /// # Errors
     /// [`SealedError::Digest`], [`SealedError::NoDigest`], [`SealedError::Io`].

@@ -1,8 +1,9 @@
-//! Effects that filter a declared noise process: what moves with the spacecraft is driven by the thrusters' noise as by their commands.
+//! Effects that filter a declared noise process: what moves with the spacecraft is driven by the thrusters' noise as by
+//! their commands.
 //!
-//! A residual that a coefficient c leaves, `z = (1 + cH)(F + n)` with F known and n not, holds `(1 + cH) n` when `cHF` is explained.
-//! Under a Σ without that, a gain in the loop is biased, as commands answer to the noise: the whitened residual is no longer what is
-//! new in each sample. So the process has `|1 + cH|²` times its power.
+//! A residual that a coefficient c leaves, `z = (1 + cH)(F + n)` with F known and n not, holds `(1 + cH) n` when `cHF`
+//! is explained. Under a Σ without that, a gain in the loop is biased, as commands answer to the noise: the whitened
+//! residual is no longer what is new in each sample. So the process has `|1 + cH|²` times its power.
 
 use std::f64::consts::TAU;
 
@@ -38,8 +39,8 @@ impl ColourPower for Colour {
 mod tests {
     use super::*;
 
-    /// A resonance at 0.1 Hz with a damping ratio of 0.05 under `−ẍ = a s²/(s² + 2ZΩs + Ω²)`: 1 + c far above, 1 far below, and
-    /// `|1 − ic/(2Z)|²`, 2 for c = 0.1, at the resonance, which a band of one bin sees.
+    /// A resonance at 0.1 Hz with a damping ratio of 0.05 under `−ẍ = a s²/(s² + 2ZΩs + Ω²)`: 1 + c far above, 1 far
+    /// below, and `|1 − ic/(2Z)|²`, 2 for c = 0.1, at the resonance, which a band of one bin sees.
     #[test]
     fn a_resonance_has_its_heights() {
         let omega = TAU * 0.1;

@@ -1,11 +1,12 @@
 //! From the sums to coefficients: normal equations, constrained solution, Σ from the residuals, honest covariance.
 //!
 //! **Covariance.** `C = (N + Σ_rows a aᵀ/σ_row²)⁻¹`, times χ²/dof where that is above one. A constraint says that a
-//! quantity lies in an interval of half width h and nothing else: a uniform density, whose Gaussian equivalent has σ = h/√3. A
-//! survey holds the value near its middle. A range does not: it cuts off, the value stands anywhere in it where the data do not
-//! see, and the rms distance of two points of an interval is √2 h/√3; σ = h. Where a row is *active*, the value stands at its bound and the truth anywhere in the
-//! interval: the mean square about that bound is (2h/√3)². Projecting active rows out would claim that a quantity is known
-//! exactly because the data wanted it outside its range.
+//! quantity lies in an interval of half width h and nothing else: a uniform density, whose Gaussian equivalent has σ =
+//! h/√3. A survey holds the value near its middle. A range does not: it cuts off, the value stands anywhere in it where
+//! the data do not see, and the rms distance of two points of an interval is √2 h/√3; σ = h. Where a row is *active*,
+//! the value stands at its bound and the truth anywhere in the interval: the mean square about that bound is (2h/√3)².
+//! Projecting active rows out would claim that a quantity is known exactly because the data wanted it outside its
+//! range.
 
 use nalgebra::{Cholesky, DMatrix, DVector};
 use serde::Serialize;
@@ -98,7 +99,8 @@ pub struct Estimate {
     pub weak: Vec<Direction>,
     /// Rows at which the solution stands.
     pub active: Vec<Active>,
-    /// The data's score of the free coefficients at the solution, `c − Nθ`, where ranges hold it back; what surveys hold stays where it is.
+    /// The data's score of the free coefficients at the solution, `c − Nθ`, where ranges hold it back; what surveys
+    /// hold stays where it is.
     pub bound_score: DVector<f64>,
     /// Conditions of optimality of the last solution.
     pub kkt: Kkt,
@@ -189,11 +191,12 @@ pub struct ChannelQuality {
     pub by_decade: Vec<(f64, f64, f64, f64)>,
 }
 
-/// Steps for products of two coefficients: each is taken at the other's last value, whose error enters times a gain of some per
-/// cent, so three leave a millionth of it.
+/// Steps for products of two coefficients: each is taken at the other's last value, whose error enters times a gain of
+/// some per cent, so three leave a millionth of it.
 const PRODUCT_STEPS: usize = 3;
 
-/// Solves for the coefficients, and again in the time domain where there is a `prediction`; Σ is measured from the residuals, and the coefficients solved again, `refinements` times.
+/// Solves for the coefficients, and again in the time domain where there is a `prediction`; Σ is measured from the
+/// residuals, and the coefficients solved again, `refinements` times.
 ///
 /// # Errors
 /// [`EstimateError`] when the modelled noise is singular or the constraints contradict each other.
@@ -212,7 +215,8 @@ pub fn estimate(
 pub enum Refinement {
     /// Every band, with its correlations.
     Bands,
-    /// The levels of the declared processes alone; see [`crate::levels`]. For models with regressors that the loop makes of the noise.
+    /// The levels of the declared processes alone; see [`crate::levels`]. For models with regressors that the loop
+    /// makes of the noise.
     Levels,
 }
 
@@ -328,13 +332,13 @@ pub fn estimate_with(
     })
 }
 
-/// Weights with which the score of a gain inside the loop vanishes where the gain is right: each band as much as it is wide, and the
-/// octave above the lowest bin for what lies below it too.
+/// Weights with which the score of a gain inside the loop vanishes where the gain is right: each band as much as it is
+/// wide, and the octave above the lowest bin for what lies below it too.
 ///
-/// A command follows the noise through a strictly causal filter U, and `∫ Re U df = 0` from zero on (see [`crate::levels`]). Below the
-/// lowest bin of an ordinary segment, 1.8 mHz, the loop is stiff, and U is much as it is in the octave above. Left out, that moved gains
-/// of the thrusters by 0.02, more than their σ, whatever the length of the data. Segments that are there for what is slow leave next to
-/// nothing out.
+/// A command follows the noise through a strictly causal filter U, and `∫ Re U df = 0` from zero on (see
+/// [`crate::levels`]). Below the lowest bin of an ordinary segment, 1.8 mHz, the loop is stiff, and U is much as it is
+/// in the octave above. Left out, that moved gains of the thrusters by 0.02, more than their σ, whatever the length of
+/// the data. Segments that are there for what is slow leave next to nothing out.
 fn zero_area_weights(spectra: &Spectra, plan: &Plan) -> Vec<f64> {
     let octave = if plan.first_bin == FIRST_BIN { FIRST_BIN..2 * FIRST_BIN } else { 0..0 };
     // Of frequencies from zero, half a bin belongs to the constant.
@@ -343,8 +347,9 @@ fn zero_area_weights(spectra: &Spectra, plan: &Plan) -> Vec<f64> {
     plan.bands.iter().zip(spectra.equal_time_weights()).map(weight).collect()
 }
 
-/// By how much σ of each free coefficient is larger than the equations with other weights than the true ones say: bands that stand for
-/// little time count as if they stood for all. `C (N + Σ_b (u_b/v_b − 1) N_b) C` against `C`, `used` are the u_b, and v_b the true ones.
+/// By how much σ of each free coefficient is larger than the equations with other weights than the true ones say: bands
+/// that stand for little time count as if they stood for all. `C (N + Σ_b (u_b/v_b − 1) N_b) C` against `C`, `used` are
+/// the u_b, and v_b the true ones.
 fn unevenness(
     spectra: &Spectra,
     used: &[f64],
@@ -479,7 +484,8 @@ impl<'a> Reduced<'a> {
             normal: self.information.clone(),
             right: self.right.clone(),
             rows: self.rows.clone(),
-            // σ with the others held, or the natural size where there is no information: unit curvature, an objective in χ².
+            // σ with the others held, or the natural size where there is no information: unit curvature, an objective
+            // in χ².
             scale: DVector::from_fn(self.free.len(), |k, _| {
                 (self.information[(k, k)] + self.size[k].powi(-2)).sqrt().recip()
             }),
@@ -536,8 +542,8 @@ impl<'a> Reduced<'a> {
         })
     }
 
-    /// What the data say of each row without it: surveys against data and ranges, ranges against data and surveys. `noise` is the
-    /// χ²/dof by which covariances grow.
+    /// What the data say of each row without it: surveys against data and ranges, ranges against data and surveys.
+    /// `noise` is the χ²/dof by which covariances grow.
     fn pulls(&self, active: &[Active], noise: f64) -> (Vec<Pull>, (f64, f64)) {
         let is_survey = |i: usize| self.knowledge[i] == Knowledge::Survey;
         let with = |survey: bool| {
@@ -611,7 +617,8 @@ impl<'a> Reduced<'a> {
     }
 }
 
-/// The prediction-error fit under the same rows; none before its filters have settled, or where it does not see a coefficient.
+/// The prediction-error fit under the same rows; none before its filters have settled, or where it does not see a
+/// coefficient.
 fn check(
     prediction: &Prediction,
     unknowns: &[Unknown],
@@ -652,8 +659,8 @@ fn check(
     }))
 }
 
-/// Pulls of the blocks on the free coefficients, `C (c_b − N_b θ)`, squared and summed, over their expectation when Σ is right
-/// and the same at all times; B blocks share one θ, which takes a part 1/B.
+/// Pulls of the blocks on the free coefficients, `C (c_b − N_b θ)`, squared and summed, over their expectation when Σ
+/// is right and the same at all times; B blocks share one θ, which takes a part 1/B.
 fn scatter(
     sums: &Sums,
     layout: &Layout,
@@ -672,7 +679,8 @@ fn scatter(
         let equations = accumulate(&block.spectra, layout, inverses, &kept);
         let pull = &equations.right - &equations.normal * theta;
         let pull = covariance * DVector::from_fn(free.len(), |k, _| pull[free[k]]);
-        // `kept² Σg²/Σg` with the block's own weights: what the pull's variance is when the block's segments are taken as they lie.
+        // `kept² Σg²/Σg` with the block's own weights: what the pull's variance is when the block's segments are taken
+        // as they lie.
         let own = block.spectra.kept();
         let weights: Vec<f64> =
             kept.iter().zip(&own).map(|(k, own)| if *own > 0.0 { k * k / own } else { 0.0 }).collect();
@@ -738,8 +746,8 @@ fn channel_quality(
         .collect()
 }
 
-/// Frequency, χ²/dof and degrees of freedom of the narrow band that stands out most: a line shows here, because Σ is refined
-/// in bands too wide to follow it.
+/// Frequency, χ²/dof and degrees of freedom of the narrow band that stands out most: a line shows here, because Σ is
+/// refined in bands too wide to follow it.
 fn worst_band(
     residual: &[DMatrix<f64>],
     inverses: &[DMatrix<f64>],
@@ -761,8 +769,8 @@ fn worst_band(
 mod tests {
     use super::*;
 
-    /// `Σ_b w_b e_b Re U_b` over what one bin of all segments weighs, for a command that answers a step by `−(1 − e^{−2πf_c t})` from the
-    /// next sample on: strictly causal, and −1 far below the corner.
+    /// `Σ_b w_b e_b Re U_b` over what one bin of all segments weighs, for a command that answers a step by `−(1 −
+    /// e^{−2πf_c t})` from the next sample on: strictly causal, and −1 far below the corner.
     fn score(plan: &Plan, spectra: &Spectra, weights: &[f64], corner_hz: f64) -> f64 {
         let response = |hz: f64| {
             let turn = nalgebra::Complex::from_polar(1.0, -std::f64::consts::TAU * hz / plan.rate_hz);
@@ -778,9 +786,9 @@ mod tests {
         bands.map(|((band, w), e)| w * e * mean(band)).sum::<f64>() / bin
     }
 
-    /// Of a strictly causal filter the real part has no area. All bands alike leave out what lies below the lowest bin, two and a half
-    /// bins in which `U = −1`; zero-area weights leave out by what U differs in the octave above, `(f/f_c)²` of these: 1 % for a corner of
-    /// ten times its frequency.
+    /// Of a strictly causal filter the real part has no area. All bands alike leave out what lies below the lowest bin,
+    /// two and a half bins in which `U = −1`; zero-area weights leave out by what U differs in the octave above,
+    /// `(f/f_c)²` of these: 1 % for a corner of ten times its frequency.
     #[test]
     fn what_lies_below_the_lowest_bin_counts_with_the_octave_above() {
         let plan = Plan::new(16_384, 10.0);

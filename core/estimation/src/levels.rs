@@ -3,10 +3,11 @@
 //! The residuals' measured spectra Ŵ against `Σ + (k² − 1) P` for each named component P, by Whittle's likelihood
 //! `Σ_b 2n_b (log det Σ_b + tr Σ_b⁻¹ Ŵ_b)`; k is the component's amplitude over the declared one.
 //!
-//! **Why not Σ band by band, where commands are regressors.** In the loop a command is the thrusters' noise w behind a strictly
-//! causal filter, u = Uw. With a gain wrong by δ the residual is `(1 + δU) w`, and `∫ log|1 + δU|² df = 0` (Szegő, Jensen): a Σ that
-//! is free in every band fits each δ as well as any other, and refining it walks away from the truth, by +5 to +12 % on clean
-//! data. What tells δ is that w has the declared shape. So shapes stay, and levels alone are measured.
+//! **Why not Σ band by band, where commands are regressors.** In the loop a command is the thrusters' noise w behind a
+//! strictly causal filter, u = Uw. With a gain wrong by δ the residual is `(1 + δU) w`, and `∫ log|1 + δU|² df = 0`
+//! (Szegő, Jensen): a Σ that is free in every band fits each δ as well as any other, and refining it walks away from
+//! the truth, by +5 to +12 % on clean data. What tells δ is that w has the declared shape. So shapes stay, and levels
+//! alone are measured.
 
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -24,8 +25,8 @@ const MOST: f64 = 20.0;
 /// A level is taken over when `−2 log` of the likelihood falls by more, five σ.
 const LEAST: f64 = 25.0;
 
-/// Where the power of a band is more than so many times what the levels explain, and certainly so, Σ takes up the excess: something
-/// that nobody models must not make others significant.
+/// Where the power of a band is more than so many times what the levels explain, and certainly so, Σ takes up the
+/// excess: something that nobody models must not make others significant.
 const EXCESS: f64 = 2.0;
 
 /// A process with another amplitude.
@@ -65,7 +66,8 @@ struct Whitened {
     power: DMatrix<f64>,
 }
 
-/// `−2 log` of the likelihood up to a constant, with the process's power more by `excess`; infinite where no power is left.
+/// `−2 log` of the likelihood up to a constant, with the process's power more by `excess`; infinite where no power is
+/// left.
 fn deviance(modes: &[Mode], excess: f64) -> f64 {
     let of = |m: &Mode| {
         let power = 1.0 + excess * m.lambda;
@@ -77,8 +79,8 @@ fn deviance(modes: &[Mode], excess: f64) -> f64 {
 /// Ratio of the ends of a group of bands.
 const GROUP: f64 = 2.154_434_690_031_884;
 
-/// Ratio of power from which an excess over `n` complex observations is taken up: four σ by the distribution of χ², a chance of
-/// 3e-5, and no less than [`EXCESS`].
+/// Ratio of power from which an excess over `n` complex observations is taken up: four σ by the distribution of χ², a
+/// chance of 3e-5, and no less than [`EXCESS`].
 fn least_excess(n: f64) -> f64 {
     EXCESS.max(chi2_per_dof_at(2.0 * n.max(0.5), 4.0))
 }
@@ -136,8 +138,9 @@ impl<'a> Levels<'a> {
         &self.modelled
     }
 
-    /// What the likelihood of a level needs: with `Σ = L Lᵀ` and `L⁻¹ P L⁻ᵀ = V Λ Vᵀ` it is `Σ_b 2n_b Σ_j log(1 + eλ_j) + w_j/(1 + eλ_j)`
-    /// up to a constant, `e = k² − 1`, `w` the diagonal of `Vᵀ L⁻¹ Ŵ L⁻ᵀ V`: one decomposition for every amplitude.
+    /// What the likelihood of a level needs: with `Σ = L Lᵀ` and `L⁻¹ P L⁻ᵀ = V Λ Vᵀ` it is `Σ_b 2n_b Σ_j log(1 + eλ_j)
+    /// + w_j/(1 + eλ_j)` up to a constant, `e = k² − 1`, `w` the diagonal of `Vᵀ L⁻¹ Ŵ L⁻ᵀ V`: one decomposition for
+    /// every amplitude.
     fn modes(whitened: &[Whitened], process: &[DMatrix<f64>]) -> Vec<Mode> {
         let mut modes = Vec::new();
         for Whitened { band, weight, inverse_factor, power } in whitened {
@@ -211,9 +214,9 @@ impl<'a> Levels<'a> {
         groups
     }
 
-    /// Measured over modelled power in each channel, over some bands; and the complex observations in them. `partial` is what is left
-    /// of a channel when all others are known, `(Σ⁻¹ Ŵ Σ⁻¹)_cc/(Σ⁻¹)_cc`: what acts on one test mass alone shows there, a million
-    /// times below the noise of the thrusters that moves all of them.
+    /// Measured over modelled power in each channel, over some bands; and the complex observations in them. `partial`
+    /// is what is left of a channel when all others are known, `(Σ⁻¹ Ŵ Σ⁻¹)_cc/(Σ⁻¹)_cc`: what acts on one test mass
+    /// alone shows there, a million times below the noise of the thrusters that moves all of them.
     fn power(&self, bands: Range<usize>, inverses: &[DMatrix<f64>], partial: bool) -> (Vec<f64>, f64) {
         let n: f64 = self.observations[bands.clone()].iter().sum();
         let channels = self.modelled.first().map_or(0, DMatrix::nrows);
@@ -229,8 +232,8 @@ impl<'a> Levels<'a> {
         (sum.into_iter().map(|s| s / n.max(f64::MIN_POSITIVE)).collect(), n)
     }
 
-    /// Excesses: the bands of each group, its complex observations, and the ratios of power in each channel, the larger of the
-    /// plain and the partial one.
+    /// Excesses: the bands of each group, its complex observations, and the ratios of power in each channel, the larger
+    /// of the plain and the partial one.
     #[must_use]
     pub fn excesses(&self) -> Vec<(Range<usize>, f64, Vec<f64>)> {
         let inverses: Vec<DMatrix<f64>> = self.modelled.iter().map(inverted).collect();
@@ -292,7 +295,8 @@ impl<'a> Levels<'a> {
         self.modelled.iter().map(inverted).collect()
     }
 
-    /// The bands in which [`Self::inverses`] take up an excess, and the real observations in them, two for each complex one.
+    /// The bands in which [`Self::inverses`] take up an excess, and the real observations in them, two for each complex
+    /// one.
     #[must_use]
     pub fn excess_bands(&self) -> (Vec<bool>, f64) {
         let pairs = self.inverses().into_iter().zip(self.plain_inverses());
@@ -301,8 +305,9 @@ impl<'a> Levels<'a> {
         (loud, observations)
     }
 
-    /// `−2 log` of Whittle's likelihood of other residuals of the same data, up to a constant: under these levels, and in some bands
-    /// with all power taken up that a channel has of its own beyond what is modelled, so that it is steady in the residuals.
+    /// `−2 log` of Whittle's likelihood of other residuals of the same data, up to a constant: under these levels, and
+    /// in some bands with all power taken up that a channel has of its own beyond what is modelled, so that it is
+    /// steady in the residuals.
     #[must_use]
     pub fn deviance(&self, measured: &[DMatrix<f64>], bands: &[bool]) -> f64 {
         let (processes, hz) = (BTreeMap::new(), self.hz.clone());
@@ -313,7 +318,8 @@ impl<'a> Levels<'a> {
             let log_det = Cholesky::new(inverse).map_or(0.0, |c| 2.0 * c.l().diagonal().map(f64::ln).sum());
             2.0 * n * (power - log_det)
         };
-        // Single channels made louder as a whole, which scales what they share, would bury what little is left when it cancels.
+        // Single channels made louder as a whole, which scales what they share, would bury what little is left when it
+        // cancels.
         let inverses = own.less_in_channels(self.plain_inverses(), |b| bands[b], |_| 1.0);
         inverses.into_iter().zip(measured).zip(&self.observations).filter(|(_, n)| **n > 0.0).map(of).sum()
     }
@@ -341,7 +347,8 @@ mod tests {
 
     const CHANNELS: [&str; 4] = ["a.x", "a.y", "b.x", "b.y"];
 
-    /// Two bodies that look 30° to either side and are shaken by one force, each axis with a readout of its own: x quiet, y loud.
+    /// Two bodies that look 30° to either side and are shaken by one force, each axis with a readout of its own: x
+    /// quiet, y loud.
     fn noise() -> NoiseModel {
         let (cos, sin) = (0.75_f64.sqrt(), 0.5);
         let gains = [[cos, sin], [-sin, cos], [cos, -sin], [sin, cos]].map(|row| row.map(|g| g / 1500.0).to_vec());
@@ -375,8 +382,9 @@ mod tests {
         weights
     }
 
-    /// Measured spectra that are exactly those of one process at 1.7 times its level give that level, no other, and a σ of
-    /// `1/√(4 Σ n tr (Σ⁻¹P)²)` by Fisher's information, which is `4k² Σ n tr (Σ⁻¹ P)²` for an amplitude k where Σ has the process.
+    /// Measured spectra that are exactly those of one process at 1.7 times its level give that level, no other, and a σ
+    /// of `1/√(4 Σ n tr (Σ⁻¹P)²)` by Fisher's information, which is `4k² Σ n tr (Σ⁻¹ P)²` for an amplitude k where Σ
+    /// has the process.
     #[test]
     fn a_level_is_measured_with_the_error_that_fisher_gives() {
         let noise = noise();
@@ -406,7 +414,8 @@ mod tests {
         assert!(levels.modelled().iter().zip(&truth).all(|(a, b)| (a - b).norm() < 1e-6 * b.norm()));
     }
 
-    /// A process that a coefficient colours is what is measured, at its own level; without the colour its level would be another.
+    /// A process that a coefficient colours is what is measured, at its own level; without the colour its level would
+    /// be another.
     #[test]
     fn a_coloured_process_has_its_own_level() {
         let noise = noise();
@@ -432,8 +441,9 @@ mod tests {
         assert!(plain.value > 1.02 && plain.delta_chi2 > LEAST, "{plain:?}");
     }
 
-    /// A force on one test mass far below the thrusters' noise, invisible in its channel's power, is taken up where the others cancel
-    /// the thrusters, exactly where it doubles what is left there in a whole group of bands. Without it Σ⁻¹ is that of the declared noise.
+    /// A force on one test mass far below the thrusters' noise, invisible in its channel's power, is taken up where the
+    /// others cancel the thrusters, exactly where it doubles what is left there in a whole group of bands. Without it
+    /// Σ⁻¹ is that of the declared noise.
     #[test]
     fn an_excess_below_the_thrusters_is_taken_up() {
         let noise = noise();

@@ -60,7 +60,8 @@ pub struct Active {
     pub name: String,
     /// Which bound.
     pub side: Side,
-    /// Lagrange multiplier, 1 per unit of the row: the fall of the objective (half a χ²) per unit by which the bound is moved.
+    /// Lagrange multiplier, 1 per unit of the row: the fall of the objective (half a χ²) per unit by which the bound is
+    /// moved.
     pub multiplier: f64,
 }
 
@@ -290,7 +291,8 @@ mod tests {
         Problem { normal, right, rows, scale: DVector::repeat(n, 1.0), origin: DVector::zeros(n) }
     }
 
-    /// An independent solver: every choice of active bounds, solved as equalities by LU; the feasible one of least objective.
+    /// An independent solver: every choice of active bounds, solved as equalities by LU; the feasible one of least
+    /// objective.
     fn enumerate(problem: &Problem) -> Option<DVector<f64>> {
         let (n, m) = (problem.right.len(), problem.rows.len());
         let mut best: Option<(f64, DVector<f64>)> = None;
@@ -349,8 +351,8 @@ mod tests {
             problem.scale = DVector::from_vec(scale);
             problem.origin = DVector::from_vec(vec![0.3, -0.2, 0.1]);
             match (problem.solve(), enumerate(&problem)) {
-                // In the metric of N, which is distance in σ: a gap of 1e-9 of the objective and violations of 1e-9 under
-                // multipliers of a hundred allow ½ δᵀNδ of 1e-7, since the gradient at the optimum points inward.
+                // In the metric of N, which is distance in σ: a gap of 1e-9 of the objective and violations of 1e-9
+                // under multipliers of a hundred allow ½ δᵀNδ of 1e-7, since the gradient at the optimum points inward.
                 (Ok(got), Some(want)) => {
                     let apart = &got.theta - &want;
                     let objective = 0.5 * want.dot(&(&problem.normal * &want)) - problem.right.dot(&want);

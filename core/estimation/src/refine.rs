@@ -1,18 +1,19 @@
 //! Σ from the residuals: telemetry whose noise is not the declared one must not be weighed by the declaration.
 //!
-//! After Vitale et al. (arXiv:1404.4792): solve, measure the residuals' spectrum, solve again. In the coordinates in which the
-//! model says "white with unit variance" (`L⁻¹r`, `LLᵀ = Σ_model`), the residuals' measured covariance Ŵ of a band about 1/7
-//! wide would be 1 if the model were right. Σ becomes `L W̃ Lᵀ` with
+//! After Vitale et al. (arXiv:1404.4792): solve, measure the residuals' spectrum, solve again. In the coordinates in
+//! which the model says "white with unit variance" (`L⁻¹r`, `LLᵀ = Σ_model`), the residuals' measured covariance Ŵ of a
+//! band about 1/7 wide would be 1 if the model were right. Σ becomes `L W̃ Lᵀ` with
 //!
 //! `W̃ = (n+ν₀)/(n+ν₀−p) · (n Ŵ + ν₀ diag Ŵ)/(n + ν₀)`
 //!
-//! * levels are measured, correlations shrunk towards the model's, with `ν₀ = 2p` pseudo-observations against n measured ones:
-//!   positive definite always, however short the data;
+//! * levels are measured, correlations shrunk towards the model's, with `ν₀ = 2p` pseudo-observations against n
+//!   measured ones: positive definite always, however short the data;
 //! * the model's shape inside the band stays, so a steep spectrum is no trouble;
-//! * the first factor makes the inverse unbiased (complex Wishart with n + ν₀ observations), or a Σ fitted to few data would look
-//!   too well known; the expectation of χ² shrinks by the same factor;
-//! * channels that the model does not connect stay unconnected. Were the attitude channels allowed to correlate with the test
-//!   masses', their measured coherence would *be* the offset's signal, because α̂ is made of them, and Σ would eat it.
+//! * the first factor makes the inverse unbiased (complex Wishart with n + ν₀ observations), or a Σ fitted to few data
+//!   would look too well known; the expectation of χ² shrinks by the same factor;
+//! * channels that the model does not connect stay unconnected. Were the attitude channels allowed to correlate with
+//!   the test masses', their measured coherence would *be* the offset's signal, because α̂ is made of them, and Σ would
+//!   eat it.
 
 use nalgebra::{Cholesky, DMatrix, DVector};
 use std::ops::Range;
@@ -137,8 +138,8 @@ impl Whitening {
         out
     }
 
-    /// `Σ 2n log det Ŵ` over the refined bands, Ŵ within groups alone: of n complex Gaussian observations the likelihood at its best Σ is
-    /// `|Ŵ|^−n` but for constants.
+    /// `Σ 2n log det Ŵ` over the refined bands, Ŵ within groups alone: of n complex Gaussian observations the
+    /// likelihood at its best Σ is `|Ŵ|^−n` but for constants.
     pub(crate) fn deviance(&self, residuals: &[DMatrix<f64>]) -> f64 {
         let mut sum = 0.0;
         for (range, n) in self.coarse.iter().zip(&self.observations) {
@@ -175,7 +176,8 @@ impl Whitening {
         sum / self.expected[range.clone()].iter().sum::<f64>()
     }
 
-    /// `Σ rᴴ Σ⁻¹ r` and its expectation, overall and for each channel alone; `refined` when Σ was fitted to the residuals.
+    /// `Σ rᴴ Σ⁻¹ r` and its expectation, overall and for each channel alone; `refined` when Σ was fitted to the
+    /// residuals.
     pub(crate) fn chi2(&self, residuals: &[DMatrix<f64>], inverses: &[DMatrix<f64>], refined: bool) -> Chi2 {
         let n = self.group.len();
         let mut chi2 = Chi2 { sum: 0.0, expected: 0.0, channel: vec![(0.0, 0.0); n] };
@@ -202,9 +204,9 @@ impl Whitening {
         (expected, expected * self.kept[band])
     }
 
-    /// Whether residuals that the model does not connect are as unrelated as it says: for each pair of groups the sum of `2n ρ²`
-    /// over pairs of channels and refined bands, ρ the real coherence of the residuals, χ² of as many degrees of freedom when it
-    /// is so.
+    /// Whether residuals that the model does not connect are as unrelated as it says: for each pair of groups the sum
+    /// of `2n ρ²` over pairs of channels and refined bands, ρ the real coherence of the residuals, χ² of as many
+    /// degrees of freedom when it is so.
     pub(crate) fn between_groups(&self, residuals: &[DMatrix<f64>]) -> (f64, f64) {
         let (mut sum, mut dof) = (0.0, 0.0);
         for (range, n) in self.coarse.iter().zip(&self.observations) {

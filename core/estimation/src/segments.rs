@@ -10,8 +10,8 @@ pub trait Cuts {
     /// Lengths of segments.
     fn plan(&self) -> &Plan;
 
-    /// A segment of the `taper`-th length, one slice per column, the first sample at `first_ns`; `overlaps` when the segment before it
-    /// has the same length and shares its first half.
+    /// A segment of the `taper`-th length, one slice per column, the first sample at `first_ns`; `overlaps` when the
+    /// segment before it has the same length and shares its first half.
     fn segment(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool);
 
     /// Every sample of a run once, as it comes, of all columns; before the segment that it completes.
@@ -170,7 +170,8 @@ impl Segmenter {
         }
     }
 
-    /// The same with the first `columns` in its segments alone; the others are handed on as they come ([`Cuts::rows`]) and never kept.
+    /// The same with the first `columns` in its segments alone; the others are handed on as they come ([`Cuts::rows`])
+    /// and never kept.
     #[must_use]
     pub fn of_first(mut self, columns: usize) -> Self {
         self.state.run.truncate(columns);
@@ -287,7 +288,8 @@ impl Segmenter {
         let shortest = lengths.last().copied();
         for (taper, length) in lengths.into_iter().enumerate() {
             let mut overlaps = false;
-            // One segment alone keeps half of its information, two that overlap two thirds, and shorter ones do as well.
+            // One segment alone keeps half of its information, two that overlap two thirds, and shorter ones do as
+            // well.
             if at + length + length / 2 > samples && Some(length) != shortest {
                 continue;
             }
@@ -318,8 +320,8 @@ pub fn all_finite(column: &[f64]) -> bool {
     column.iter().fold(true, |all, x| all & x.is_finite())
 }
 
-/// The longest length up to `samples` that is divisible by 4 and has small prime factors, for a fast transform; at least
-/// [`SHORTEST`].
+/// The longest length up to `samples` that is divisible by 4 and has small prime factors, for a fast transform; at
+/// least [`SHORTEST`].
 #[must_use]
 pub fn longest_length(samples: usize) -> usize {
     let smooth = |n: &usize| {
@@ -383,8 +385,8 @@ mod tests {
         }
     }
 
-    /// Runs 1..333, 334..601 and 602..1000 (the average needs a predecessor): each starts its own segments, and what they leave over
-    /// is cut into shorter ones, all but the last, which goes on.
+    /// Runs 1..333, 334..601 and 602..1000 (the average needs a predecessor): each starts its own segments, and what
+    /// they leave over is cut into shorter ones, all but the last, which goes on.
     #[test]
     fn a_segment_never_spans_a_gap_and_little_is_left_over() {
         let mut columns: Vec<Vec<f64>> = (1..4).map(|s| noise(1000, s)).collect();
@@ -399,7 +401,8 @@ mod tests {
         assert_eq!((collected.sums.total.segments, segmenter.state.run[0].len()), (before, 0));
     }
 
-    /// 100 samples: two segments of 64 that overlap, as three halves fit; the four left over are lost. 63: of 32, three; 31: of 16, two.
+    /// 100 samples: two segments of 64 that overlap, as three halves fit; the four left over are lost. 63: of 32,
+    /// three; 31: of 16, two.
     #[test]
     fn short_runs_have_short_segments() {
         for (samples, segments, covered) in [(100, 2, 96), (63, 2, 48), (31, 2, 24), (15, 0, 0)] {

@@ -1,11 +1,12 @@
 //! Cross-spectral sums of one segment length: what the data leave behind once a segment has been read.
 //!
-//! `G_b = Σ_segments Σ_{bins of band b} Re(x* xᵀ)` over the columns x = (channels, series), scaled so that a channel's diagonal is
-//! its one-sided PSD times the number of bins and segments. A regressor is a series times a factor in a channel: series that
-//! several regressors share are transformed once. `N`, `c` and `zᵀΣ⁻¹z` of the design's §6 are linear in `G_b` for **any** real Σ
-//! that is smooth across a band, so Σ can be refined, and a model changed, without reading the data again. Sums add over
-//! segments, days and files. The same sums are kept for blocks of time, at most [`MAX_BLOCKS`] of them, so that what the data
-//! scatter can be compared with what Σ promises, and memory does not grow with the length of a run.
+//! `G_b = Σ_segments Σ_{bins of band b} Re(x* xᵀ)` over the columns x = (channels, series), scaled so that a channel's
+//! diagonal is its one-sided PSD times the number of bins and segments. A regressor is a series times a factor in a
+//! channel: series that several regressors share are transformed once. `N`, `c` and `zᵀΣ⁻¹z` of the design's §6 are
+//! linear in `G_b` for **any** real Σ that is smooth across a band, so Σ can be refined, and a model changed, without
+//! reading the data again. Sums add over segments, days and files. The same sums are kept for blocks of time, at most
+//! [`MAX_BLOCKS`] of them, so that what the data scatter can be compared with what Σ promises, and memory does not grow
+//! with the length of a run.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -78,20 +79,20 @@ impl Band {
     }
 }
 
-/// The main lobe of a Hann window is two bins wide on either side: a segment's constant and slope, which are removed, and what
-/// is left of a slower drift stay below this bin.
+/// The main lobe of a Hann window is two bins wide on either side: a segment's constant and slope, which are removed,
+/// and what is left of a slower drift stay below this bin.
 pub const FIRST_BIN: usize = 3;
 
-/// The first bin of a plan for what is slow ([`Plan::slow`]). A periodic Hann window has a constant in bins −1 to 1 alone, so the
-/// second is free of what a constant leaves; the removed slope takes 0.155 of the power of white noise there, most of its odd part,
-/// and less than 0.016 in any bin above.
+/// The first bin of a plan for what is slow ([`Plan::slow`]). A periodic Hann window has a constant in bins −1 to 1
+/// alone, so the second is free of what a constant leaves; the removed slope takes 0.155 of the power of white noise
+/// there, most of its odd part, and less than 0.016 in any bin above.
 pub const FIRST_SLOW_BIN: usize = 2;
 
 /// What the removed straight line leaves of white noise in [`FIRST_SLOW_BIN`].
 const LEFT_IN_SLOW_BIN: f64 = 0.845;
 
-/// Bins up to this fraction of their frequency are weighed alike, by the mean of Σ over them. A PSD in f⁴ changes by ±12 % across,
-/// and a wrong weight costs information only in second order: half a per cent.
+/// Bins up to this fraction of their frequency are weighed alike, by the mean of Σ over them. A PSD in f⁴ changes by
+/// ±12 % across, and a wrong weight costs information only in second order: half a per cent.
 const RELATIVE_WIDTH: f64 = 1.0 / 16.0;
 
 /// Blocks of time that are kept apart. When there would be more, each becomes twice as long.
@@ -103,8 +104,8 @@ const FIRST_BLOCK_NS: i64 = 3_600_000_000_000;
 /// Shortest segment: below this there is hardly a bin above the window's main lobe.
 pub const SHORTEST: usize = 16;
 
-/// Bands, and the segments whose bins fall into them: of the full length, and of its halves down to [`SHORTEST`] for what gaps
-/// leave over. A short segment has no bins in the lowest bands and counts in the others.
+/// Bands, and the segments whose bins fall into them: of the full length, and of its halves down to [`SHORTEST`] for
+/// what gaps leave over. A short segment has no bins in the lowest bands and counts in the others.
 pub struct Plan {
     /// Samples of the longest segment, divisible by four.
     pub length: usize,
@@ -163,7 +164,8 @@ impl Taper {
     }
 }
 
-/// Bins of segments of `length` samples whose frequencies lie between bins of segments of another length, from `first_bin` on.
+/// Bins of segments of `length` samples whose frequencies lie between bins of segments of another length, from
+/// `first_bin` on.
 fn bins_between(bins: Range<usize>, of: usize, length: usize, first_bin: usize) -> Range<usize> {
     let own = |bin: usize| (bin * length).div_ceil(of);
     let first = own(bins.start).max(first_bin);
@@ -177,7 +179,8 @@ impl Plan {
         Self::from_bin(FIRST_BIN, length, length, rate_hz)
     }
 
-    /// As [`Self::new`]; segments longer than `ordinary` samples, which are there for what is slow, count from [`FIRST_SLOW_BIN`] on.
+    /// As [`Self::new`]; segments longer than `ordinary` samples, which are there for what is slow, count from
+    /// [`FIRST_SLOW_BIN`] on.
     #[must_use]
     pub fn slow(length: usize, ordinary: usize, rate_hz: f64) -> Self {
         Self::from_bin(FIRST_SLOW_BIN, length, ordinary, rate_hz)
@@ -200,8 +203,8 @@ impl Plan {
         Self { tapers, length, rate_hz, bands, first_bin, bins_of: length }
     }
 
-    /// For one segment of another length, between half the longest and the longest: the bands of this plan that half the longest has
-    /// no bins in.
+    /// For one segment of another length, between half the longest and the longest: the bands of this plan that half
+    /// the longest has no bins in.
     #[must_use]
     pub fn between_halves(&self, length: usize) -> Self {
         let out_of_reach = |b: &&Band| b.first < 2 * self.first_bin;
@@ -293,8 +296,8 @@ impl Spectra {
         self.segments += 1;
     }
 
-    /// As [`Self::count_segment`], for a segment that is one of several looks at the same time and serves these bands alone; it
-    /// does not count as a segment.
+    /// As [`Self::count_segment`], for a segment that is one of several looks at the same time and serves these bands
+    /// alone; it does not count as a segment.
     pub fn count_bands(&mut self, plan: &Plan, taper: usize, overlaps: bool, bands: Range<usize>) {
         let taper = &plan.tapers[taper];
         let [w2, w4, _] = taper.window_sums;
@@ -315,27 +318,28 @@ impl Spectra {
         bands.for_each(|b| self.weight_squared[b] += 2.0 * cross * taper.part[b]);
     }
 
-    /// Per band `Σg/Σg²`: sums times this are information, their inverse a covariance. One Hann segment keeps 0.514 of the
-    /// information of its samples, segments that overlap by half 0.947. Zero where no segment reaches.
+    /// Per band `Σg/Σg²`: sums times this are information, their inverse a covariance. One Hann segment keeps 0.514 of
+    /// the information of its samples, segments that overlap by half 0.947. Zero where no segment reaches.
     #[must_use]
     pub fn kept(&self) -> Vec<f64> {
         let pairs = self.weight.iter().zip(&self.weight_squared);
         pairs.map(|(g, g2)| if *g2 > 0.0 { g / g2 } else { 0.0 }).collect()
     }
 
-    /// As [`Self::kept`], with every band worth the same time, that of the highest one: sums times this are the means of the spectra
-    /// times one time.
+    /// As [`Self::kept`], with every band worth the same time, that of the highest one: sums times this are the means
+    /// of the spectra times one time.
     ///
-    /// Where commands are regressors, the score of a gain inside the loop has another expectation in every band and only their sum
-    /// over all bands is zero (see [`crate::levels`]). Bands that stand for less time than others, as the lowest ones do at the ends
-    /// of a run, would bias it.
+    /// Where commands are regressors, the score of a gain inside the loop has another expectation in every band and
+    /// only their sum over all bands is zero (see [`crate::levels`]). Bands that stand for less time than others, as
+    /// the lowest ones do at the ends of a run, would bias it.
     #[must_use]
     pub fn equal_time_weights(&self) -> Vec<f64> {
         let time = self.kept().last().zip(self.weight.last()).map_or(0.0, |(kept, weight)| kept * weight);
         self.weight.iter().map(|g| if *g > 0.0 { time / g } else { 0.0 }).collect()
     }
 
-    /// Per band, complex observations: half the samples that would know as much, times the band's part of all frequencies.
+    /// Per band, complex observations: half the samples that would know as much, times the band's part of all
+    /// frequencies.
     #[must_use]
     pub fn observations(&self, plan: &Plan) -> Vec<f64> {
         let kept = self.kept();
@@ -464,13 +468,14 @@ impl Transformer {
         }
     }
 
-    /// Spectrum of a segment of the `taper`-th length without its constant and slope, under its window: real and imaginary part of
-    /// each bin from the plan's first to the last below Nyquist, so scaled that the sum of their squares is the one-sided PSD.
+    /// Spectrum of a segment of the `taper`-th length without its constant and slope, under its window: real and
+    /// imaginary part of each bin from the plan's first to the last below Nyquist, so scaled that the sum of their
+    /// squares is the one-sided PSD.
     pub fn transform(&mut self, plan: &Plan, taper: usize, samples: &[f64], out: &mut [f64]) {
         let segment = &plan.tapers[taper];
         let (time, spectrum) = (&mut self.time[..segment.length], &mut self.spectrum[..=segment.length / 2]);
-        // The straight line that fits the *windowed* samples best. A fit to the bare samples would take its slope from the ends,
-        // where a second difference of readout noise is a hundred times louder than the lowest bins.
+        // The straight line that fits the *windowed* samples best. A fit to the bare samples would take its slope from
+        // the ends, where a second difference of readout noise is a hundred times louder than the lowest bins.
         let middle = (samples.len() / 2) as f64;
         let (mut sum, mut moment) = (0.0, 0.0);
         for (t, (x, w)) in samples.iter().zip(&segment.window).enumerate() {
@@ -519,8 +524,8 @@ impl Analyser {
         &self.plan
     }
 
-    /// Adds one segment, one slice per column, of the `taper`-th length, the first sample at `first_ns`; `overlaps` when the
-    /// segment before it has the same length and shares its first half.
+    /// Adds one segment, one slice per column, of the `taper`-th length, the first sample at `first_ns`; `overlaps`
+    /// when the segment before it has the same length and shares its first half.
     pub fn add(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool, sums: &mut Sums) {
         for (j, samples) in columns.iter().enumerate() {
             self.transformer.transform(&self.plan, taper, samples, &mut self.scaled[j]);
@@ -605,8 +610,8 @@ mod tests {
         assert!((efficiency(10_000) - 0.947).abs() < 1e-3);
     }
 
-    /// White noise of unit PSD, by the response to each of its samples: every bin of a segment has what `count_bands` promises of it,
-    /// the lowest one of a slow plan too.
+    /// White noise of unit PSD, by the response to each of its samples: every bin of a segment has what `count_bands`
+    /// promises of it, the lowest one of a slow plan too.
     #[test]
     fn every_bin_has_the_power_that_is_promised() {
         let (length, rate_hz) = (256, 2.0);
@@ -633,7 +638,8 @@ mod tests {
         }
     }
 
-    /// A segment of another length has the bins that half the longest lacks, each in the band of its frequency, and no other.
+    /// A segment of another length has the bins that half the longest lacks, each in the band of its frequency, and no
+    /// other.
     #[test]
     fn a_run_between_two_lengths_reaches_below_the_shorter() {
         let plan = Plan::slow(16_384, 1024, 10.0);
@@ -685,7 +691,8 @@ mod tests {
         assert!((total / want - 1.0).abs() < 1e-3, "{total} against {want}");
     }
 
-    /// Blocks add up to the total, overlaps across their ends apart, however often they were joined; and never become many.
+    /// Blocks add up to the total, overlaps across their ends apart, however often they were joined; and never become
+    /// many.
     #[test]
     fn blocks_are_the_total_in_parts() {
         let mut analyser = Analyser::new(Plan::new(16, 1.0), &layout(1));
@@ -706,8 +713,8 @@ mod tests {
         assert!((squares / sums.total.weight_squared[0] - 1.0).abs() < 1e-12);
     }
 
-    /// Two halves of a record, with the tail carried from one to the other, add up to the whole, whichever comes first and
-    /// whatever the length of their blocks.
+    /// Two halves of a record, with the tail carried from one to the other, add up to the whole, whichever comes first
+    /// and whatever the length of their blocks.
     #[test]
     fn sums_of_parts_add_up() {
         let mut analyser = Analyser::new(Plan::new(16, 1.0), &layout(1));

@@ -6,8 +6,8 @@ use crate::prediction::{self, Stretch};
 use crate::segments::{self, Collected};
 use crate::spectra::{Block, MAX_BLOCKS, Plan, Spectra, Sums};
 
-/// Visits the whole state; `layout` says what it is for. Sums of this run and of those before are one in it. What is loaded goes
-/// into a run that has not begun, whose sizes it must have.
+/// Visits the whole state; `layout` says what it is for. Sums of this run and of those before are one in it. What is
+/// loaded goes into a run that has not begun, whose sizes it must have.
 ///
 /// # Errors
 /// What is loaded does not fit.

@@ -102,8 +102,8 @@ impl Difference {
 /// Coefficient by coefficient, `qp − other`.
 ///
 /// Both come from the same data. If the QP were efficient and the other not, the variance of the difference would be
-/// `σ_other² − σ_qp²` (Hausman), but that is zero or negative as soon as one σ is a little off. The sum of the variances holds
-/// whatever their correlation, as long as it is not negative, and errs on the quiet side.
+/// `σ_other² − σ_qp²` (Hausman), but that is zero or negative as soon as one σ is a little off. The sum of the
+/// variances holds whatever their correlation, as long as it is not negative, and errs on the quiet side.
 #[must_use]
 pub fn differences(qp: &[Value], other: &[Value]) -> Vec<Difference> {
     qp.iter()

@@ -1,5 +1,5 @@
-//! The constrained solution against another program: sixty problems solved by quadprog (a dual active-set method), committed with
-//! the script that makes them, `oracles/qp_oracle.py`.
+//! The constrained solution against another program: sixty problems solved by quadprog (a dual active-set method),
+//! committed with the script that makes them, `oracles/qp_oracle.py`.
 
 use dragfree_estimation::qp::{Problem, QpError, Row, Side};
 use nalgebra::{DMatrix, DVector};

@@ -1,7 +1,9 @@
-//! Synthetic channels with known offsets: is the solution unbiased, does its σ cover the truth, and does that fail when Σ is wrong?
+//! Synthetic channels with known offsets: is the solution unbiased, does its σ cover the truth, and does that fail when
+//! Σ is wrong?
 //!
-//! The data are made here from white processes sample by sample, with no code of the crate but the mission file: torque and thrust
-//! noise, readouts differenced twice, and α̂ as the Wiener estimate from the attitude channel, in the frequency domain.
+//! The data are made here from white processes sample by sample, with no code of the crate but the mission file: torque
+//! and thrust noise, readouts differenced twice, and α̂ as the Wiener estimate from the attitude channel, in the
+//! frequency domain.
 
 use dragfree_estimation::estimate::{Bound, Estimate, Observed, Unknown, estimate};
 use dragfree_estimation::prediction::Prediction;
@@ -88,8 +90,9 @@ fn data(seed: u64, scene: Scene) -> Vec<Vec<f64>> {
     let attitude = three(5e-10 * loud, rows + 2);
     let disturbance: Vec<Vector3<f64>> =
         (0..=rows).map(|k| inverse_inertia * Vector3::new(torque[0][k], torque[1][k], torque[2][k])).collect();
-    // The attitude controller's commands are known: no attitude channel sees them, the offsets do. A loop answers the noise of its
-    // readout, so they rise with frequency, and `b_x`, which only the noisy y and z channels see there, is worst known.
+    // The attitude controller's commands are known: no attitude channel sees them, the offsets do. A loop answers the
+    // noise of its readout, so they rise with frequency, and `b_x`, which only the noisy y and z channels see there, is
+    // worst known.
     let shaken = three(shaken_rad_rthz, rows + 3);
     let command: Vec<Vector3<f64>> = (0..=rows)
         .map(|k| Vector3::from_fn(|i, _| (shaken[i][k + 2] - 2.0 * shaken[i][k + 1] + shaken[i][k]) / (DT_S * DT_S)))
@@ -137,8 +140,8 @@ fn data(seed: u64, scene: Scene) -> Vec<Vec<f64>> {
     channels.into_iter().chain(sc).chain(regressors).collect()
 }
 
-/// `E[α | attitude channels]`, circular in time: `S_α h* (|h|² S_α + |d|² S_n)⁻¹ sc`, with h the mean of two samples and d the
-/// second difference. Row k holds the α of `[t_k, t_k+1)`, the later of the two that channel k averages.
+/// `E[α | attitude channels]`, circular in time: `S_α h* (|h|² S_α + |d|² S_n)⁻¹ sc`, with h the mean of two samples
+/// and d the second difference. Row k holds the α of `[t_k, t_k+1)`, the later of the two that channel k averages.
 fn wiener(sc: &[Vec<f64>], inverse_inertia: &Matrix3<f64>, torque_asd: f64, attitude_asd: f64) -> Vec<Vec<f64>> {
     let n = sc[0].len();
     let mut planner = RealFftPlanner::new();
@@ -350,8 +353,8 @@ fn the_modelled_sigma_is_that_of_the_data() {
     assert!(c.consistent(), "NEES/dof {}", c.nees_per_dof());
 }
 
-/// Twin: thrust noise of the right level on every channel, but taken as independent. The centre of mass then looks better known
-/// than it is, since two test masses moved by one force count as two witnesses; re-measured, Σ knows.
+/// Twin: thrust noise of the right level on every channel, but taken as independent. The centre of mass then looks
+/// better known than it is, since two test masses moved by one force count as two witnesses; re-measured, Σ knows.
 #[test]
 fn without_the_common_thrust_the_sigmas_are_wrong() {
     let mut independent = mission();
@@ -376,8 +379,8 @@ fn noise_unlike_the_mission_file_is_remeasured() {
     assert!((refined.chi2_per_dof - 1.0).abs() < 0.02);
 }
 
-/// With `b_1 = b_1(s) , b_2 = b_2(s)` for one common unknown s in SRF, the information is `HᵀNH`: what a survey without any
-/// tolerance is worth. Ours has 20 µm, far below what the data say.
+/// With `b_1 = b_1(s) , b_2 = b_2(s)` for one common unknown s in SRF, the information is `HᵀNH`: what a survey without
+/// any tolerance is worth. Ours has 20 µm, far below what the data say.
 #[test]
 fn the_baseline_sharpens_as_the_information_bound_says() {
     let columns = data(7, LOOP);
@@ -418,7 +421,8 @@ fn weak_directions_are_named_until_the_survey_lifts_them() {
     assert!(solve(&columns, &mission(), &baseline(), 0.02, 3).weak.is_empty());
 }
 
-/// What the tapers let a run know of coefficient 1, against another run of the same length: nothing of the second run's values is used.
+/// What the tapers let a run know of coefficient 1, against another run of the same length: nothing of the second run's
+/// values is used.
 struct Promise {
     /// `σ/σ_whole`.
     growth: f64,
@@ -426,12 +430,12 @@ struct Promise {
     scatter: f64,
 }
 
-/// `N_b` of each band is the whole run's, with the modelled Σ; with holes it shrinks as the band's observations do, which
-/// [`Spectra::observations`](dragfree_estimation::spectra::Spectra::observations) has from the tapers alone.
+/// `N_b` of each band is the whole run's, with the modelled Σ; with holes it shrinks as the band's observations do,
+/// which [`Spectra::observations`](dragfree_estimation::spectra::Spectra::observations) has from the tapers alone.
 ///
-/// Scatter: a band's share `p_b` of the information on the coefficient is measured from n_b complex observations, its excitation
-/// and its noise each to `1/√n_b`. Of the whole run's observations those beside the holes are a part, so the ratio scatters by what
-/// the part does not share: `½ √(2 Σ p_b² (1/n_b − 1/n_b,whole))`.
+/// Scatter: a band's share `p_b` of the information on the coefficient is measured from n_b complex observations, its
+/// excitation and its noise each to `1/√n_b`. Of the whole run's observations those beside the holes are a part, so the
+/// ratio scatters by what the part does not share: `½ √(2 Σ p_b² (1/n_b − 1/n_b,whole))`.
 fn promised(whole: &[Vec<f64>], holed: &[Vec<f64>]) -> Promise {
     const COEFFICIENT: usize = 1;
     let (sums_whole, plan, model) = sums(whole, &mission());
@@ -478,8 +482,8 @@ fn promised(whole: &[Vec<f64>], holed: &[Vec<f64>]) -> Promise {
     Promise { growth, scatter: 0.5 * growth * (2.0 * unshared).sqrt() }
 }
 
-/// A hole, a missing value, and in another run a missing value every 1200 epochs, so that no segment of full length fits: σ grows
-/// as the tapers say of the epochs that are left, within four standard deviations, and still covers.
+/// A hole, a missing value, and in another run a missing value every 1200 epochs, so that no segment of full length
+/// fits: σ grows as the tapers say of the epochs that are left, within four standard deviations, and still covers.
 #[test]
 fn gaps_cost_their_epochs_and_little_else() {
     let sigma = |e: &Estimate, i: usize| e.covariance.as_ref().expect("a covariance")[(i, i)].sqrt();
@@ -494,8 +498,8 @@ fn gaps_cost_their_epochs_and_little_else() {
     holed[20][20_000] = f64::NAN;
     let e = solve(&holed);
     let (growth, promise) = (sigma(&e, 1) / sigma(&solve(&whole), 1), promised(&whole, &holed));
-    // 2002 of 32767 epochs are gone, and of six ends of runs half a segment of up to 4096 is tapered away, 0.4 of it: 1.07 or so, and
-    // more than for the epochs alone, 1.03.
+    // 2002 of 32767 epochs are gone, and of six ends of runs half a segment of up to 4096 is tapered away, 0.4 of it:
+    // 1.07 or so, and more than for the epochs alone, 1.03.
     assert!((1.03..1.13).contains(&promise.growth), "{}", promise.growth);
     assert!(
         (growth - promise.growth).abs() < 4.0 * promise.scatter,
@@ -513,7 +517,8 @@ fn gaps_cost_their_epochs_and_little_else() {
         let mut holed = whole.clone();
         (0..ROWS).step_by(1200).for_each(|k| holed[4][k] = f64::NAN);
         let (e, promise) = (solve(&holed), promised(&whole, &holed));
-        // 1199 epochs hold segments of 512: 0.514 of the first and the last half segment, what two that overlap keep of the rest.
+        // 1199 epochs hold segments of 512: 0.514 of the first and the last half segment, what two that overlap keep of
+        // the rest.
         assert!((1.05..1.30).contains(&promise.growth), "{}", promise.growth);
         excess += sigma(&e, 1) / sigma(&solve(&whole), 1) / promise.growth - 1.0;
         scatter += (promise.scatter / promise.growth).powi(2);
@@ -524,8 +529,8 @@ fn gaps_cost_their_epochs_and_little_else() {
     assert!((71.0..186.0).contains(&sum), "{sum}");
 }
 
-/// Ten seconds, two segments: σ is that of an hour by the square root of the time, and a little more because half a taper is lost
-/// and Σ is known badly; the errors of sixty runs are as large as it says.
+/// Ten seconds, two segments: σ is that of an hour by the square root of the time, and a little more because half a
+/// taper is lost and Σ is known badly; the errors of sixty runs are as large as it says.
 #[test]
 fn ten_seconds_know_what_their_samples_know() {
     let sigma = |e: &Estimate, i: usize| e.covariance.as_ref().expect("a covariance")[(i, i)].sqrt();
@@ -580,8 +585,9 @@ fn a_range_that_is_stated_twice_is_known_once() {
     }
 }
 
-/// The χ² of the survey against the data is one, and grows with a survey that is wrong: by 3σ of the data in `z`, noticed with the
-/// row's name and a multiplier, in four of five runs of twenty (P(χ²_3 > 16.27) = 1e-3, and 0.43 at a distance of 16 of χ²).
+/// The χ² of the survey against the data is one, and grows with a survey that is wrong: by 3σ of the data in `z`,
+/// noticed with the row's name and a multiplier, in four of five runs of twenty (P(χ²_3 > 16.27) = 1e-3, and 0.43 at a
+/// distance of 16 of χ²).
 #[test]
 fn a_survey_that_the_data_contradict_is_noticed() {
     let runs = 20;
@@ -618,7 +624,8 @@ fn a_survey_that_the_data_contradict_is_noticed() {
     assert!((wrong_z / 20.0 / -shift - 1.0).abs() < 4.0 * 0.25 / 20f64.sqrt(), "{wrong_z}");
 }
 
-/// What the blocks scatter is what N promises; half an hour of noise three times as loud in a day of eight hours is not.
+/// What the blocks scatter is what N promises; half an hour of noise three times as loud in a day of eight hours is
+/// not.
 #[test]
 fn the_scatter_of_blocks_measures_the_information() {
     let scene = Scene { rows: 8 * 36_000, ..LOOP };
@@ -645,8 +652,8 @@ fn the_scatter_of_blocks_measures_the_information() {
     assert!(uneven.ratio.iter().copied().fold(0.0, f64::max) > 1.5, "{uneven:?}");
 }
 
-/// The fit in the time domain: unbiased, with a σ that covers, no better than the other by more than chance, and as good a witness
-/// when the noise is not that of the mission file. False alarms: 1e-4 for each sum.
+/// The fit in the time domain: unbiased, with a σ that covers, no better than the other by more than chance, and as
+/// good a witness when the noise is not that of the mission file. False alarms: 1e-4 for each sum.
 #[test]
 fn the_prediction_error_fit_finds_the_same_offsets() {
     let run = |seed: u64, scene: Scene| {
@@ -682,8 +689,8 @@ fn the_prediction_error_fit_finds_the_same_offsets() {
     }
 }
 
-/// Two days, the second with the state of the first: what each has stored, stacked, gives the answer of one run over both, and so does
-/// the second run itself; to 1e-12 of the value, σ alike.
+/// Two days, the second with the state of the first: what each has stored, stacked, gives the answer of one run over
+/// both, and so does the second run itself; to 1e-12 of the value, σ alike.
 #[test]
 fn daily_sums_stacked_are_one_long_run() {
     let columns = data(11, LOOP);

@@ -73,7 +73,8 @@ pub struct Test {
     ///   (Bartlett 1955); it does not ask for the level.
     /// * `ljung-box`: autocorrelations of the whitened residual at ten lags, taken from its spectrum: `r_k = ∫ R cos
     ///   2πfkΔt df / ∫ R df`,
-    ///   and `Q = rᵀ C⁻¹ r` with the covariance C that bands of that width give. With bands of one bin it is Ljung and Box's n Σ r_k².
+    ///   and `Q = rᵀ C⁻¹ r` with the covariance C that bands of that width give. With bands of one bin it is Ljung and
+    ///   Box's n Σ r_k².
     pub name: &'static str,
     /// What is compared.
     pub statistic: f64,
@@ -450,7 +451,8 @@ fn pairs(noise: &NoiseModel, channels: &[String], rate_hz: f64) -> Vec<(String, 
     vectors.map(|axes| pairs_of(noise, &axes, channels, rate_hz)).find(|pairs| !pairs.is_empty()).unwrap_or_default()
 }
 
-/// The same of one vector process, by the names of its components, `PROCESS:AXIS`. A channel's first word names its body.
+/// The same of one vector process, by the names of its components, `PROCESS:AXIS`. A channel's first word names its
+/// body.
 fn pairs_of(noise: &NoiseModel, axes: &[&str], channels: &[String], rate_hz: f64) -> Vec<(String, DVector<f64>, Kind)> {
     let n = channels.len();
     // Each component is one vector times itself: the acceleration along an axis as the channels see it.

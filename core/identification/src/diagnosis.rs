@@ -455,9 +455,8 @@ fn candidates_of_excess(
 /// - It was selected by an excess of power, or has `part` > ½ of its information in the bands of one, and an excess or
 ///   a coherence with
 ///   housekeeping remains in its channels: it correlates with the cause and is not the cause.
-/// - It moves the offset, and its fall of χ² is below [`BESIDE_A_LEVEL`] of that of a level of noise that drives an estimate (see
-///   there). It should be
-///   tried again with that level in the model.
+/// - It moves the offset, and its fall of χ² is below [`BESIDE_A_LEVEL`] of that of a level of noise that drives an
+///   estimate (see there). It should be tried again with that level in the model.
 fn is_doubtful(f: &Found, part: f64, extra: &[Found], unexplained: Option<&Unexplained>) -> bool {
     // For an effect selected by an excess, a remaining coherence is as much evidence as remaining power.
     let remains = |u: &Unexplained| (u.power || f.of_excess) && f.channels.iter().any(|c| u.channels.contains(c));

@@ -1,8 +1,9 @@
 //! What crosses the border between host and plugin as JSON, defined once for both sides.
 //!
-//! A plugin declares a [`Manifest`] when its library is opened; [`Coefficient`]s, [`Constraint`]s and [`NoiseProcess`]es when
-//! it is linked; a [`Report`] when the data are through. Its state crosses as bytes of [`mod@state`]. The host hands on to later stages what earlier ones declared, as a
-//! [`Model`]. `core/abi/include/dragfree/schema` holds the JSON Schema of these types for authors in other languages.
+//! A plugin declares a [`Manifest`] when its library is opened; [`Coefficient`]s, [`Constraint`]s and
+//! [`NoiseProcess`]es when it is linked; a [`Report`] when the data are through. Its state crosses as bytes of
+//! [`mod@state`]. The host hands on to later stages what earlier ones declared, as a [`Model`].
+//! `core/abi/include/dragfree/schema` holds the JSON Schema of these types for authors in other languages.
 //!
 //! Numbers are SI. JSON has neither NaN nor infinity: a missing number and an open end of a range are `null`.
 

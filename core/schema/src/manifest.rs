@@ -17,8 +17,8 @@ pub struct Manifest {
     /// Effects only: the places where it can act, `tm1`, `tm2`.
     #[serde(default)]
     pub instances: Vec<String>,
-    /// Effects only: columns beyond the usual ones that stages before it are asked to make, by the names that those stages give
-    /// them: `commands`, `torque-response`, `dws-delay-response`.
+    /// Effects only: columns beyond the usual ones that stages before it are asked to make, by the names that those
+    /// stages give them: `commands`, `torque-response`, `dws-delay-response`.
     #[serde(default)]
     pub needs: Vec<String>,
     /// Parameters; a pipeline or model file that gives another key is refused.
@@ -30,7 +30,8 @@ pub struct Manifest {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "json-schema", derive(schemars::JsonSchema))]
 pub struct Parameter {
-    /// Name. Two have a meaning for `diagnose`: `at_ns`, when a transient begins, and `fine`, 1 for candidates about one shape.
+    /// Name. Two have a meaning for `diagnose`: `at_ns`, when a transient begins, and `fine`, 1 for candidates about
+    /// one shape.
     pub name: String,
     /// Type of its value.
     #[serde(rename = "type")]

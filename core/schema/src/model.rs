@@ -21,8 +21,8 @@ pub struct Model {
 
 /// A coefficient of an effect.
 ///
-/// It acts in one of four ways: by `responses` or columns of kind `regressor` (a cause that lasts), by `noise` (it multiplies the
-/// amplitude of a noise process), or, as a candidate, by one of its `variants` or `transients`.
+/// It acts in one of four ways: by `responses` or columns of kind `regressor` (a cause that lasts), by `noise` (it
+/// multiplies the amplitude of a noise process), or, as a candidate, by one of its `variants` or `transients`.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "json-schema", derive(schemars::JsonSchema))]
 pub struct Coefficient {
@@ -72,7 +72,8 @@ pub struct Coefficient {
     /// Candidates: the courses that a cause of short duration may have, at a time that the host finds.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub transients: Vec<Transient>,
-    /// A noise process whose amplitude the coefficient multiplies, 1 for the declared level; such a coefficient has no responses.
+    /// A noise process whose amplitude the coefficient multiplies, 1 for the declared level; such a coefficient has no
+    /// responses.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub noise: String,
     /// A noise process that the coefficient filters.
@@ -111,8 +112,8 @@ impl Default for Coefficient {
 /// Shape parameters by name: numbers, or names of columns.
 pub type Shape = BTreeMap<String, serde_json::Value>;
 
-/// How one channel responds to a coefficient: `factor` times a series, times the value of another coefficient where `times`
-/// names one.
+/// How one channel responds to a coefficient: `factor` times a series, times the value of another coefficient where
+/// `times` names one.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "json-schema", derive(schemars::JsonSchema))]
 pub struct Response {
@@ -158,7 +159,8 @@ pub struct Transient {
     pub shape: Shape,
     /// Its course, one mean per sample from the one in which it begins.
     pub kernel: Vec<f64>,
-    /// Channels with the factor with which the course acts on each: unit of the channel per unit of kernel and coefficient.
+    /// Channels with the factor with which the course acts on each: unit of the channel per unit of kernel and
+    /// coefficient.
     pub channels: Vec<(String, f64)>,
 }
 

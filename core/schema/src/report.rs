@@ -3,10 +3,11 @@
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
-/// The result of a stage or a source. Every key is optional; the host merges the reports of all stages into the product.
+/// The result of a stage or a source. Every key is optional; the host merges the reports of all stages into the
+/// product.
 ///
-/// Where several stages give the same single figure, the last one counts. A key that is not listed here is left out and noted
-/// in the product.
+/// Where several stages give the same single figure, the last one counts. A key that is not listed here is left out and
+/// noted in the product.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "json-schema", derive(schemars::JsonSchema))]
 #[serde(default)]

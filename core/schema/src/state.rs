@@ -1,8 +1,9 @@
 //! The state of a plugin as bytes: one function visits every field, for saving and for loading.
 //!
-//! A state begins with a mark, the plugin's id and the version of its layout, and ends with a checksum; between them stand
-//! little-endian words in the order of the visits, numbers bit by bit, NaN included. Bytes that are cut, too long, damaged or
-//! another plugin's are refused before a field is read, and no count makes a reader take more memory than the bytes justify.
+//! A state begins with a mark, the plugin's id and the version of its layout, and ends with a checksum; between them
+//! stand little-endian words in the order of the visits, numbers bit by bit, NaN included. Bytes that are cut, too
+//! long, damaged or another plugin's are refused before a field is read, and no count makes a reader take more memory
+//! than the bytes justify.
 //!
 //! ```
 //! use dragfree_schema::state::{self, State, StateError};
@@ -171,7 +172,8 @@ fn checksum(bytes: &[u8]) -> u64 {
     words.fold(0xcbf2_9ce4_8422_2325, |h, w| (h ^ w).wrapping_mul(0x0000_0100_0000_01b3).rotate_left(23))
 }
 
-/// A state being saved or loaded: every method writes the value that it is given, or replaces it by the one that was saved.
+/// A state being saved or loaded: every method writes the value that it is given, or replaces it by the one that was
+/// saved.
 #[derive(Debug)]
 pub struct State<'a>(Direction<'a>);
 

@@ -1,4 +1,5 @@
-//! The JSON Schema beside plugin.h is that of the types. `DRAGFREE_WRITE_SCHEMA=1 cargo test -p dragfree-schema` writes it anew.
+//! The JSON Schema beside plugin.h is that of the types. `DRAGFREE_WRITE_SCHEMA=1 cargo test -p dragfree-schema` writes
+//! it anew.
 
 use dragfree_schema::{Coefficient, Constraint, Manifest, Model, NoiseProcess, Report};
 use schemars::{JsonSchema, schema_for};

@@ -1,4 +1,5 @@
-//! A stage that counts rows, and panics where it is told to: what the host must survive. Also the shortest whole plugin.
+//! A stage that counts rows, and panics where it is told to: what the host must survive. Also the shortest whole
+//! plugin.
 
 use dragfree_sdk::prelude::*;
 

@@ -1,4 +1,5 @@
-//! What the author of a `dragfree` plugin uses: the traits [`Source`], [`Stage`] and [`Effect`], and [`export_plugin!`].
+//! What the author of a `dragfree` plugin uses: the traits [`Source`], [`Stage`] and [`Effect`], and
+//! [`export_plugin!`].
 //!
 //! A plugin is a struct, a [`Manifest`], and one of the traits:
 //!

@@ -43,8 +43,8 @@ impl Available {
         self.columns.iter().filter(move |c| c.attribute("kind") == kind)
     }
 
-    /// How the channels answer to each coefficient: those that the coefficients declare, and the columns of `kind` `regressor`,
-    /// which are a response with the factor one each.
+    /// How the channels answer to each coefficient: those that the coefficients declare, and the columns of `kind`
+    /// `regressor`, which are a response with the factor one each.
     ///
     /// # Errors
     /// A column is a regressor of a coefficient that nobody declares.
@@ -229,8 +229,8 @@ impl<'a> Link<'a> {
         self.write_noisy(table, name, unit, frame, attributes, &[])
     }
 
-    /// A column with attributes, and noise processes that are declared with it. A process may enter any channel of this stage or
-    /// of one before it; which column it is declared with does not matter.
+    /// A column with attributes, and noise processes that are declared with it. A process may enter any channel of this
+    /// stage or of one before it; which column it is declared with does not matter.
     ///
     /// # Errors
     /// The host refuses it: the name is taken, a process of this name exists, or one of its numbers is not finite.
@@ -296,7 +296,8 @@ impl<'l, 'a> EffectLink<'l, 'a> {
         crate::border::announce_json(self.link.raw, crate::border::Announcement::Coefficient, coefficient)
     }
 
-    /// A series that responses refer to by [`Self::table`] and this name: one value per row, a mean over `[t_k, t_{k+1})`.
+    /// A series that responses refer to by [`Self::table`] and this name: one value per row, a mean over `[t_k,
+    /// t_{k+1})`.
     ///
     /// # Errors
     /// The host refuses it: the name is taken.
@@ -304,8 +305,8 @@ impl<'l, 'a> EffectLink<'l, 'a> {
         self.link.write_with(self.table, name, unit, frame, &[("kind", "series"), ("effect", self.effect)])
     }
 
-    /// As [`Self::shared_series`], of a series without content above `below_hz`, such as one made of housekeeping: nobody need look for
-    /// it there.
+    /// As [`Self::shared_series`], of a series without content above `below_hz`, such as one made of housekeeping:
+    /// nobody need look for it there.
     ///
     /// # Errors
     /// As [`Self::series`].
@@ -326,8 +327,8 @@ impl<'l, 'a> EffectLink<'l, 'a> {
         }
     }
 
-    /// A series of this name of an effect before this one, by its table, or else a new one of this effect. The name must say all
-    /// that the values depend on: `lag(hk.eh1_xp_temperature_k, 480)`.
+    /// A series of this name of an effect before this one, by its table, or else a new one of this effect. The name
+    /// must say all that the values depend on: `lag(hk.eh1_xp_temperature_k, 480)`.
     ///
     /// # Errors
     /// As [`Self::series`].

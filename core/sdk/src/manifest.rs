@@ -1,5 +1,5 @@
-//! What a plugin is and which parameters it takes, as a constant; [`dragfree_schema::Manifest`] is the form that crosses the
-//! border. Validation, `plugins inspect` and the guide's tables derive from it.
+//! What a plugin is and which parameters it takes, as a constant; [`dragfree_schema::Manifest`] is the form that
+//! crosses the border. Validation, `plugins inspect` and the guide's tables derive from it.
 
 use dragfree_schema::ParameterType;
 use serde_json::Value;
@@ -19,8 +19,8 @@ pub struct Manifest {
     pub parameters: &'static [Parameter],
     /// Effects only: the instances that exist, `tm1`, `tm2`.
     pub instances: &'static [&'static str],
-    /// Effects only: columns beyond the usual ones that stages before it are asked to make, by the names that they give them;
-    /// see [`crate::Setup::needs`].
+    /// Effects only: columns beyond the usual ones that stages before it are asked to make, by the names that they give
+    /// them; see [`crate::Setup::needs`].
     pub needs: &'static [&'static str],
 }
 

@@ -49,8 +49,8 @@ pub trait Stage: Sized + Send + 'static {
     /// Version of what [`Self::state`] visits; raise it when that changes.
     const STATE_VERSION: u32 = 1;
 
-    /// Visits all that the next rows depend on, in one order for saving and for loading; after an error the instance is not used
-    /// any more.
+    /// Visits all that the next rows depend on, in one order for saving and for loading; after an error the instance is
+    /// not used any more.
     ///
     /// # Errors
     /// What is loaded does not fit this stage.
@@ -83,7 +83,8 @@ pub trait Effect: Sized + Send + 'static {
     /// Version of what [`Self::state`] visits; raise it when that changes.
     const STATE_VERSION: u32 = 1;
 
-    /// Visits all that the next rows depend on, in one order for saving and for loading; an effect without memory visits nothing.
+    /// Visits all that the next rows depend on, in one order for saving and for loading; an effect without memory
+    /// visits nothing.
     ///
     /// # Errors
     /// What is loaded does not fit this effect.
@@ -124,8 +125,8 @@ pub trait Source: Sized + Send + 'static {
     /// Version of what [`Self::state`] visits; raise it when that changes.
     const STATE_VERSION: u32 = 1;
 
-    /// Visits all that the next rows depend on, in one order for saving and for loading; after an error the instance is not used
-    /// any more.
+    /// Visits all that the next rows depend on, in one order for saving and for loading; after an error the instance is
+    /// not used any more.
     ///
     /// # Errors
     /// What is loaded does not fit this source.

@@ -164,8 +164,8 @@ impl Setup {
         &self.config.instance
     }
 
-    /// Effects: whether this instance is not in the model and only asks to be: it then declares [`crate::Variant`]s, one for each
-    /// value that its shape parameters may have, in place of the one that its parameters name.
+    /// Effects: whether this instance is not in the model and only asks to be: it then declares [`crate::Variant`]s,
+    /// one for each value that its shape parameters may have, in place of the one that its parameters name.
     #[must_use]
     pub fn candidate(&self) -> bool {
         self.config.candidate

@@ -349,8 +349,8 @@ impl Linked {
             .collect()
     }
 
-    /// Values of the QP and what is adopted: the QP's values, because it alone has the survey, the whole band and a measured Σ;
-    /// where it disagrees with the ES-AKF, its σ grows to span both.
+    /// Values of the QP and what is adopted: the QP's values, because it alone has the survey, the whole band and a
+    /// measured Σ; where it disagrees with the ES-AKF, its σ grows to span both.
     fn put_coefficients(&self, solution: &Solution, disagreeing: &[&Difference], report: &mut Report) {
         let names: Vec<String> = solution.free.iter().map(|i| self.coefficients[*i].name.clone()).collect();
         let adopted = solution.covariance.as_ref().map(|c| {
@@ -417,7 +417,8 @@ impl Linked {
         ]);
     }
 
-    /// The normal equations, and the sums that they are made of: what this run adds, and not what an earlier one has stored already.
+    /// The normal equations, and the sums that they are made of: what this run adds, and not what an earlier one has
+    /// stored already.
     fn attach(&self, solution: &Solution, stored: &Stored, report: &mut Report) {
         let mut equations = json!(solution.normal);
         equations["channels"] = json!(self.layout.channels);
@@ -427,9 +428,10 @@ impl Linked {
     }
 }
 
-/// The fit in the time domain takes products of coefficients at their initial values. It takes channels one by one, and a prediction of a
-/// channel from its own past misses what a command knows of the others: where the model has regressors made of commands there is none,
-/// and es-akf with both test masses in one filter is the check in the time domain.
+/// The fit in the time domain takes products of coefficients at their initial values. It takes channels one by one, and
+/// a prediction of a channel from its own past misses what a command knows of the others: where the model has
+/// regressors made of commands there is none, and es-akf with both test masses in one filter is the check in the time
+/// domain.
 fn nothing_collected(
     refinement: Refinement,
     model: &NoiseModel,
@@ -509,8 +511,8 @@ fn pull_sentence(p: &Pull) -> String {
     )
 }
 
-/// The channels to weigh, and the names of those left out: where noise is shared, a channel on which no regressor acts is a
-/// witness whose own model is empty.
+/// The channels to weigh, and the names of those left out: where noise is shared, a channel on which no regressor acts
+/// is a witness whose own model is empty.
 fn modelled<'a>(
     noise: &[NoiseProcess],
     channels: &[&'a Column],
@@ -618,8 +620,8 @@ fn bounds(available: &Available) -> Vec<Bound> {
         .collect()
 }
 
-/// By how much each σ was widened: for residuals beyond the refined Σ, or for blocks of time that scatter more than chance allows,
-/// whichever is more.
+/// By how much each σ was widened: for residuals beyond the refined Σ, or for blocks of time that scatter more than
+/// chance allows, whichever is more.
 fn widened<'a>(solution: &Solution, coefficients: &'a [Coefficient]) -> BTreeMap<&'a str, f64> {
     let by_noise = solution.quality.chi2_per_dof.max(1.0).sqrt();
     let by_blocks = |k: usize| {

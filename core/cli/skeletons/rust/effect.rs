@@ -7,11 +7,12 @@ use dragfree_sdk::prelude::*;
 /// Axes of a test mass's frame.
 const AXES: [&str; 3] = ["x", "y", "z"];
 
-/// CHANGE: the physical range of the coefficient, N per unit of the channel. The solution never leaves it, so a coefficient that
-/// ends at it says that the cause is another.
+/// CHANGE: the physical range of the coefficient, N per unit of the channel. The solution never leaves it, so a
+/// coefficient that ends at it says that the cause is another.
 const RANGE: f64 = 1e-6;
 
-/// CHANGE: how far from zero the coefficient is expected before any data, N per unit of the channel: one standard deviation.
+/// CHANGE: how far from zero the coefficient is expected before any data, N per unit of the channel: one standard
+/// deviation.
 const PRIOR_SIGMA: f64 = 1e-7;
 
 struct Columns {
@@ -78,8 +79,8 @@ impl Effect for ForceByChannel {
             prior_sigma: PRIOR_SIGMA,
             ..Coefficient::default()
         })?;
-        // CHANGE: the channels in which it shows, a column each. Channels hold measured minus known acceleration: `tm1.accel.x` to
-        // `tm2.accel.z` in m s⁻², `sc.alpha.x` to `sc.alpha.z` in rad s⁻².
+        // CHANGE: the channels in which it shows, a column each. Channels hold measured minus known acceleration:
+        // `tm1.accel.x` to `tm2.accel.z` in m s⁻², `sc.alpha.x` to `sc.alpha.z` in rad s⁻².
         let acceleration = link.regressor(&name, &format!("{test_mass}.accel.{axis}"), "m s-2")?;
         self.columns = Some(Columns { channel, reference, acceleration });
         Ok(())
@@ -89,8 +90,8 @@ impl Effect for ForceByChannel {
         let Some(columns) = &self.columns else { return Err(PluginError::fatal("called before it was linked")) };
         let channel = input.f64(columns.channel);
         let reference = columns.reference.map(|column| input.f64(column));
-        // CHANGE: the acceleration that one unit of the coefficient adds, m s⁻², one value a row: the mean from the row's time to the
-        // next row's. No value of the channel, NaN, gives no value here.
+        // CHANGE: the acceleration that one unit of the coefficient adds, m s⁻², one value a row: the mean from the
+        // row's time to the next row's. No value of the channel, NaN, gives no value here.
         let rows = (0..input.rows()).map(|k| (channel[k] - reference.map_or(0.0, |r| r[k])) / self.mass_kg);
         output.f64(columns.acceleration).extend(rows);
         Ok(())

@@ -35,8 +35,8 @@ impl Source for Swing {
     }
 
     fn link(&mut self, link: &mut Link<'_>) -> Result<(), PluginError> {
-        // CHANGE: tables are called as the topics of the telemetry, `is`, `dws`, `hk/NAME`, their columns as its fields; rate 0 is
-        // rows as they come.
+        // CHANGE: tables are called as the topics of the telemetry, `is`, `dws`, `hk/NAME`, their columns as its
+        // fields; rate 0 is rows as they come.
         let table = link.table("hk/example_temperature_k", 0.0);
         self.columns = Some((table, link.write(table, "value", "K", "")?));
         Ok(())

@@ -91,7 +91,8 @@ fn own_folders() -> Vec<PathBuf> {
     [beside, installed].into_iter().filter(|folder| folder.is_dir()).collect()
 }
 
-/// What a suggested command repeats of this one, so that it finds the same products and plugins; a space before each word.
+/// What a suggested command repeats of this one, so that it finds the same products and plugins; a space before each
+/// word.
 fn repeated(archive: Option<&Path>, global: &Global) -> String {
     let archive = archive.into_iter().map(|folder| ("--archive", folder));
     let plugins = global.plugin_dir.iter().map(|folder| ("--plugin-dir", folder.as_path()));

@@ -117,7 +117,8 @@ fn ask(validate: &Validate, path: &Path, check: &str, plugin: Option<(&str, &str
 /// Status, where it ended in time, and what it wrote to stdout and stderr.
 fn answer(command: &mut Command, limit: Duration) -> std::io::Result<(Option<ExitStatus>, String, String)> {
     let mut child = command.spawn()?;
-    // A process that the plugin started may hold the pipes open after the child's end: nobody waits for their end alone.
+    // A process that the plugin started may hold the pipes open after the child's end: nobody waits for their end
+    // alone.
     let read = |pipe: Option<Box<dyn std::io::Read + Send>>| {
         let (sender, receiver) = std::sync::mpsc::channel();
         std::thread::spawn(move || {

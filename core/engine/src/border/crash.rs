@@ -1,6 +1,7 @@
 //! The last words of a program that a plugin has crashed: which plugin it was, and in which call.
 //!
-//! What the signal handler reads is static, so that it may look at it in any state of the program: names are kept for ever, once each.
+//! What the signal handler reads is static, so that it may look at it in any state of the program: names are kept for
+//! ever, once each.
 
 use std::cell::Cell;
 use std::collections::BTreeMap;
@@ -77,8 +78,8 @@ mod handler {
         static INSTALLED: Once = Once::new();
         INSTALLED.call_once(|| {
             for ((signal, _), before) in DEADLY.iter().zip(&BEFORE) {
-                // SAFETY: an all-zero sigaction is a valid one; both structures live during the calls, and the handler does
-                // nothing that a signal handler may not do.
+                // SAFETY: an all-zero sigaction is a valid one; both structures live during the calls, and the handler
+                // does nothing that a signal handler may not do.
                 unsafe {
                     let mut old: libc::sigaction = std::mem::zeroed();
                     let mut new: libc::sigaction = std::mem::zeroed();

@@ -175,7 +175,8 @@ fn check_permissions(_path: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// `plugins.lock` beside the libraries: a table `[sha256]` from file name to digest. Where it exists, nothing else loads.
+/// `plugins.lock` beside the libraries: a table `[sha256]` from file name to digest. Where it exists, nothing else
+/// loads.
 fn check_lock(path: &Path, sha256: &str) -> Result<(), String> {
     #[derive(Deserialize)]
     #[serde(deny_unknown_fields)]

@@ -19,8 +19,8 @@ fn lenient<T: DeserializeOwned>(document: Value) -> Result<(T, Vec<String>), Str
     Ok((read, unknown))
 }
 
-/// Reads a declaration. It is refused with an unknown key: what a plugin declares before the first row can still be corrected, and
-/// a misspelt `responses` would be an effect without any.
+/// Reads a declaration. It is refused with an unknown key: what a plugin declares before the first row can still be
+/// corrected, and a misspelt `responses` would be an effect without any.
 ///
 /// # Errors
 /// A sentence that names the key.

@@ -62,7 +62,8 @@ pub fn build(
     Ok(builder.chain)
 }
 
-/// What the effects of a model want of the stages before them. An effect that does not exist is met again when it is linked.
+/// What the effects of a model want of the stages before them. An effect that does not exist is met again when it is
+/// linked.
 fn needs(registry: &Registry, model: &Model) -> Vec<String> {
     let effects = model.effects.iter().chain(&model.candidates);
     let found = effects.filter_map(|e| registry.find(Kind::Effect, &e.id).ok());

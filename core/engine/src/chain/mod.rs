@@ -291,8 +291,8 @@ impl Chain {
         Ok(reports)
     }
 
-    /// Carries what has come as far as it goes. A plugin may hold rows back for an hour and give them all at once: by one call of each in
-    /// turn, those behind it need not hold what they make of them all at once as well.
+    /// Carries what has come as far as it goes. A plugin may hold rows back for an hour and give them all at once: by
+    /// one call of each in turn, those behind it need not hold what they make of them all at once as well.
     fn advance(&mut self, sink: &mut dyn Sink) -> Result<(), ChainError> {
         let mut new_rows = true;
         while self.round(new_rows, sink)? {
@@ -301,9 +301,9 @@ impl Chain {
         Ok(())
     }
 
-    /// One call of every node that has rows, and of those that wait for none where there is something new; false where there was nothing
-    /// to do. An effect waits while somebody has a whole batch of its rows that cannot be used yet: its inputs are few, and all candidates'
-    /// series are many.
+    /// One call of every node that has rows, and of those that wait for none where there is something new; false where
+    /// there was nothing to do. An effect waits while somebody has a whole batch of its rows that cannot be used yet:
+    /// its inputs are few, and all candidates' series are many.
     fn round(&mut self, new_rows: bool, sink: &mut dyn Sink) -> Result<bool, ChainError> {
         let waves = self.nodes.iter().map(|n| n.wave + 1).max().unwrap_or(0);
         let (until, rows) = (self.complete_until_ns, self.carry.batch_rows);
@@ -420,7 +420,8 @@ fn publish(
     Ok(())
 }
 
-/// One call of a node, with at most so many rows of a uniform table; one that has none is called where there is something new.
+/// One call of a node, with at most so many rows of a uniform table; one that has none is called where there is
+/// something new.
 fn step(node: &mut ChainNode, complete_until_ns: i64, batch_rows: usize, new_rows: bool) -> Made {
     let rows = node.ready().min(batch_rows);
     if rows == 0 && (node.has_uniform() || !new_rows) {

@@ -115,8 +115,8 @@ impl Model {
         })
     }
 
-    /// Six hexadecimal digits of the SHA-256 of the effects as JSON, keys sorted: comments, formatting, revision and parent do
-    /// not enter.
+    /// Six hexadecimal digits of the SHA-256 of the effects as JSON, keys sorted: comments, formatting, revision and
+    /// parent do not enter.
     #[must_use]
     pub fn digest(&self) -> String {
         let mut effects = serde_json::json!(self.effects);
@@ -145,8 +145,8 @@ impl Model {
         Self::parts(&self.revision).is_some_and(|(_, digest)| digest != self.digest())
     }
 
-    /// Revision and parent as products name them. A file that was edited by hand since its revision was made is no longer that
-    /// revision: it is a child of it, `2-5f3a9c+0b11d2`.
+    /// Revision and parent as products name them. A file that was edited by hand since its revision was made is no
+    /// longer that revision: it is a child of it, `2-5f3a9c+0b11d2`.
     #[must_use]
     pub fn identity(&self) -> (String, Option<String>) {
         if self.edited_by_hand() {

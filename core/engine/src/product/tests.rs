@@ -233,7 +233,8 @@ fn concurrent_writers_get_a_revision_each_with_their_own_attachments() {
     }
 }
 
-/// Whoever claimed a revision may find that it is not its to write, and give it up: the next writer waits for it and leaves no gap.
+/// Whoever claimed a revision may find that it is not its to write, and give it up: the next writer waits for it and
+/// leaves no gap.
 #[test]
 fn a_claim_that_is_given_up_leaves_no_gap() {
     let folder = tempfile::tempdir().expect("folder");

@@ -1,9 +1,9 @@
 //! One file from outside: where its pieces lie, which channels it defines, whose it is.
 //!
 //! The walk goes from record to record over the whole data section and reads little more than their headers, so a file
-//! that was cut, has no summary or mixes chunked with loose messages needs no path of its own. The summary serves twice: it
-//! lists the channels, which otherwise only a pass through every chunk finds, and its chunk index is what the walk falls back
-//! on when a record's length is damaged.
+//! that was cut, has no summary or mixes chunked with loose messages needs no path of its own. The summary serves
+//! twice: it lists the channels, which otherwise only a pass through every chunk finds, and its chunk index is what the
+//! walk falls back on when a record's length is damaged.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;

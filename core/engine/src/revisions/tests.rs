@@ -128,8 +128,8 @@ fn a_hand_written_revision_that_was_edited_is_told_by_the_history() {
     assert_eq!(aside.place, Place::Aside, "the file did not come from it, and it is not lost");
 }
 
-/// A kill after any step: the file is the old or the new revision, both are in the history once they were current, and work
-/// goes on when the lock is gone.
+/// A kill after any step: the file is the old or the new revision, both are in the history once they were current, and
+/// work goes on when the lock is gone.
 #[test]
 fn a_kill_between_two_steps_loses_nothing() {
     for survived in 0..=3 {
@@ -317,7 +317,8 @@ proptest! {
     // Every case is flushed to disk some twenty times.
     #![proptest_config(ProptestConfig::with_cases(64))]
 
-    /// What is written is read back, whatever stands in it; and an effect that comes and goes leaves no trace in the model.
+    /// What is written is read back, whatever stands in it; and an effect that comes and goes leaves no trace in the
+    /// model.
     #[test]
     fn a_model_is_read_as_it_was_written(
         effects in prop::collection::vec(effect(), 0..4).prop_map(distinct),

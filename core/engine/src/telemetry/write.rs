@@ -94,9 +94,9 @@ struct Topic {
     done: usize,
 }
 
-/// Writes tables into one MCAP file: protobuf, chunks of about 1 MiB, zstd, CRCs, indexes, statistics; messages in order of
-/// time across topics. The file appears under its name when it is complete; until then, and after any error, there is
-/// no such file.
+/// Writes tables into one MCAP file: protobuf, chunks of about 1 MiB, zstd, CRCs, indexes, statistics; messages in
+/// order of time across topics. The file appears under its name when it is complete; until then, and after any error,
+/// there is no such file.
 pub struct TelemetryWriter {
     path: PathBuf,
     file: McapFile<BufWriter<NamedTempFile>>,

@@ -1,7 +1,8 @@
-//! A plugin by itself: what `plugin.h` asks and what the chain relies on, checked over made-up inputs, without any other plugin.
+//! A plugin by itself: what `plugin.h` asks and what the chain relies on, checked over made-up inputs, without any
+//! other plugin.
 //!
-//! A [`Check`] is run in the process of the caller. A plugin that crashes takes that process with it, so a caller that wants to go
-//! on runs each check in a process of its own, as `dragfree plugins validate` does.
+//! A [`Check`] is run in the process of the caller. A plugin that crashes takes that process with it, so a caller that
+//! wants to go on runs each check in a process of its own, as `dragfree plugins validate` does.
 
 mod session;
 mod stand;
@@ -39,7 +40,8 @@ pub enum Check {
     Batches,
     /// Twice the same input gives the same, bit by bit.
     Replay,
-    /// A state that is saved, loaded and saved again is the same bytes, and the instance that took it over goes on as the first.
+    /// A state that is saved, loaded and saved again is the same bytes, and the instance that took it over goes on as
+    /// the first.
     State,
     /// Bytes that are no state are refused.
     Garbage,
@@ -133,8 +135,8 @@ impl Subject<'_> {
         }
     }
 
-    /// Short names of the coefficients that an instance of an effect announces, `x` of `com-offset.tm1.x`; none where it
-    /// finds no column to its liking among the made-up ones, which says nothing of a mission's own.
+    /// Short names of the coefficients that an instance of an effect announces, `x` of `com-offset.tm1.x`; none where
+    /// it finds no column to its liking among the made-up ones, which says nothing of a mission's own.
     ///
     /// # Errors
     /// [`Finding`]: its parameters are not those it declares, or it refuses them.

@@ -15,9 +15,9 @@ pub(super) const MODEL: &str = r#"{"coefficients":[{"name":"example.tm1","effect
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 
-/// What there may be before a stage, the most first: telemetry, grid, reconstruction and regressors; without the last two;
-/// telemetry alone. Before an effect there is always a reconstruction. Housekeeping is what the plugin's own text parameters name, `hk.NAME` alone
-/// or in an expression, with the unit at the end of the name.
+/// What there may be before a stage, the most first: telemetry, grid, reconstruction and regressors; without the last
+/// two; telemetry alone. Before an effect there is always a reconstruction. Housekeeping is what the plugin's own text
+/// parameters name, `hk.NAME` alone or in an expression, with the unit at the end of the name.
 pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) -> Vec<Vec<Column>> {
     if kind == Kind::Source {
         return vec![Vec::new()];
@@ -69,7 +69,8 @@ pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) 
             known(format!("{tm}.u_orf_m_s2.{axis}"));
         }
     }
-    // What a reconstruction gives on demand (`needs`): commands as they acted, answers of α̂ to torque gains and to a delay.
+    // What a reconstruction gives on demand (`needs`): commands as they acted, answers of α̂ to torque gains and to a
+    // delay.
     let commands = ["mps_force_srf_n", "mps_torque_srf_nm", "sun_srf"].map(str::to_owned).into_iter();
     let of_tm =
         ["tm1", "tm2"].into_iter().flat_map(|tm| ["force_orf_n", "torque_orf_nm"].map(|what| format!("{tm}.{what}")));
