@@ -43,7 +43,7 @@ static dragfree_status bad_link(void *self, const dragfree_link_v1 *link, dragfr
   dragfree_column_v1 copy = {"bad", "bad.y", "m", "ORF_1", s->rate_hz, "{\"archive\":\"true\"}"};
 #if BAD == 13
   copy.attributes = "{\"noise_processes\":[{\"name\":\"shot:bad\",\"unit\":\"m\",\"spectrum\":[{\"asd\":1e-12,"
-                    "\"corner_hz\":1.0,\"exponent\":0}],\"enters\":[[\"bad.y\",1.0]],\"response\":\"direct\"}]}";
+                    "\"corner_hz\":1.0,\"exponent\":0}],\"enters\":{\"bad.y\":[1.0]},\"response\":\"direct\"}]}";
 #endif
   return link->write(link->context, &copy);
 }

@@ -170,7 +170,7 @@ fn sizes_become_coefficients() {
     assert!(of(&heat, faces("1_zp", "1_zm")).unwrap_err().contains("hk.eh1_zp_temperature_k"));
     let drift = truth("offset-drift", "sc.x", 0.0, &json!({"kappa_m_k": 5e-6, "beta_m_kg": 0.0}));
     assert_eq!(of(&drift, json!({"with": "hk.structure_temperature_k"})).unwrap()[0].unit, "m K-1");
-    assert!(of(&drift, json!({"with": "time"})).unwrap_err().contains("follows hk.structure_temperature_k"));
+    assert!(of(&drift, json!({"with": "time"})).unwrap_err().contains("the truth hk.structure_temperature_k"));
     assert_eq!(value(&truth("offset-drift", "sc.x", 1e-9, &json!({})), json!({"with": "time"})), 1e-9);
     let magnet = truth("magnetic", "tm2", 0.0, &json!({"moment_a_m2": 2e-8}));
     assert_eq!(value(&magnet, json!({"gradient": "hk.magnetic_gradient2_t_m"})), 2e-8 / 4.0);

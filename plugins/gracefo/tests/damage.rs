@@ -185,7 +185,7 @@ fn a_foreign_header_is_refused_with_a_reason() {
     let refusals = [
         (read("ACC1A", ""), "no line"),
         (read("ACC1A", &text[..5000]), "no line"),
-        (read("ACC1A", "{[\n# End of YAML header\n"), "no YAML"),
+        (read("ACC1A", "{[\n# End of YAML header\n"), "not valid YAML"),
         (read("ACC1A", "a: 1\n# End of YAML header\n"), "no header"),
         (read("SCA1B", &text), "no variable"),
         (read("ACC1A", &text.replace("m/s2", "mm/s2")), "mm/s2"),

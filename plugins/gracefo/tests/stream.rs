@@ -188,7 +188,7 @@ fn damage_is_noted_as_data_loss() {
     assert_eq!(log.counts["sca1b.files_refused"], 1);
     assert!(log.data_loss);
     for (kind, words) in
-        [("garbage.ACC1A", "10 in all"), ("truncated.ACC1A", "inside a line"), ("refused.SCA1B", "gps_time")]
+        [("garbage.ACC1A", "10 unreadable lines"), ("truncated.ACC1A", "truncated"), ("refused.SCA1B", "gps_time")]
     {
         assert!(log.notes[kind].contains(words), "{}", log.notes[kind]);
     }
