@@ -7,7 +7,7 @@ use std::sync::OnceLock;
 /// What stdout was when the program began.
 static STDOUT: OnceLock<File> = OnceLock::new();
 
-/// Keeps stdout for [`print`] and puts stderr in its place, before a plugin is opened.
+/// Keeps stdout for [`print()`] and puts stderr in its place, before a plugin is opened.
 ///
 /// # Errors
 /// The operating system has no descriptor left.
