@@ -87,7 +87,7 @@ fn own_folders() -> Vec<PathBuf> {
     let Some(beside) = program.ok().and_then(|path| path.parent().map(PathBuf::from)) else {
         return Vec::new();
     };
-    let installed = beside.join("../lib/dragfree");
+    let installed = beside.with_file_name("lib").join("dragfree");
     [beside, installed].into_iter().filter(|folder| folder.is_dir()).collect()
 }
 
