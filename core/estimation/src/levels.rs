@@ -138,9 +138,9 @@ impl<'a> Levels<'a> {
         &self.modelled
     }
 
-    /// What the likelihood of a level needs: with `Σ = L Lᵀ` and `L⁻¹ P L⁻ᵀ = V Λ Vᵀ` it is `Σ_b 2n_b Σ_j log(1 + eλ_j)
-    /// + w_j/(1 + eλ_j)` up to a constant, `e = k² − 1`, `w` the diagonal of `Vᵀ L⁻¹ Ŵ L⁻ᵀ V`: one decomposition for
-    /// every amplitude.
+    /// What the likelihood of a level needs. With `Σ = L Lᵀ` and `L⁻¹ P L⁻ᵀ = V Λ Vᵀ` it is
+    /// `Σ_b 2n_b Σ_j (log(1 + eλ_j) + w_j/(1 + eλ_j))` up to a constant, where `e = k² − 1` and `w` is the diagonal of
+    /// `Vᵀ L⁻¹ Ŵ L⁻ᵀ V`: one decomposition for every amplitude.
     fn modes(whitened: &[Whitened], process: &[DMatrix<f64>]) -> Vec<Mode> {
         let mut modes = Vec::new();
         for Whitened { band, weight, inverse_factor, power } in whitened {
