@@ -32,7 +32,7 @@ fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
 /// Workspace crates that a workspace crate may depend on.
 fn allowed(crate_name: &str) -> &'static [&'static str] {
     match crate_name {
-        "dragfree-abi" | "dragfree-schema" | "dragfree-chart" | "dragfree-score" => &[],
+        "dragfree-abi" | "dragfree-schema" | "dragfree-chart" | "dragfree-score" | "xtask" => &[],
         "dragfree-physics" => &["dragfree-schema"],
         "dragfree-sdk" | "dragfree-engine" => &["dragfree-abi", "dragfree-schema"],
         "dragfree" => &[
@@ -46,8 +46,10 @@ fn allowed(crate_name: &str) -> &'static [&'static str] {
         "dragfree-validation" => &["dragfree-engine", "dragfree-physics", "dragfree-chart"],
         "dragfree-estimation" => &["dragfree-physics", "dragfree-schema"],
         "dragfree-identification" => &["dragfree-schema", "dragfree-estimation"],
-        "dragfree-workflow" => &["dragfree-engine", "dragfree-sdk", "dragfree-estimation", "dragfree-identification"],
-        "dragfree-tests" => &["dragfree-engine"],
+        "dragfree-workflow" => {
+            &["dragfree-schema", "dragfree-engine", "dragfree-estimation", "dragfree-identification"]
+        }
+        "dragfree-tests" => &["dragfree-schema"],
         "dragfree-qp-check" => &["dragfree-sdk", "dragfree-estimation"],
         _ => &["dragfree-sdk", "dragfree-physics"],
     }
@@ -113,8 +115,8 @@ const OWNED_BY_OTHERS: [&str; 15] = [
     "readout:",
 ];
 
-/// Files that still name some of them: the interface of the bundled mission's telemetry, made-up columns for `plugins
-/// validate`, bundled files and examples for the screen.
+/// Files that still name some of them: the interface of the bundled mission's telemetry, made-up columns for
+/// `plugins validate`, bundled files and examples for the screen.
 const STILL_NAMING: [&str; 9] = [
     "core/engine/src/telemetry/names.rs",
     "core/engine/src/validate/stand.rs",
@@ -143,7 +145,7 @@ fn the_core_names_no_plugin_channel_or_test_mass() {
     let mut folders = ["engine", "estimation", "identification", "workflow", "cli"]
         .map(|c| dragfree_tests::root().join("core").join(c).join("src"))
         .to_vec();
-    let (mut seen, mut found) = (0, Vec::new());
+    let (mut seen, mut found, mut still) = (0, Vec::new(), BTreeSet::new());
     while let Some(folder) = folders.pop() {
         for entry in std::fs::read_dir(&folder).expect("a folder").flatten() {
             let path = entry.path();
@@ -152,17 +154,18 @@ fn the_core_names_no_plugin_channel_or_test_mass() {
             } else if path.extension().is_some_and(|e| e == "rs") && path.file_name().is_some_and(|n| n != "tests.rs") {
                 seen += 1;
                 let name = path.strip_prefix(dragfree_tests::root()).expect("inside").display().to_string();
-                if !STILL_NAMING.contains(&name.as_str()) {
-                    let text = std::fs::read_to_string(&path).expect("text");
-                    found.extend(
-                        words_of_others(&text).into_iter().map(|(line, word)| format!("{name}:{line}: {word}")),
-                    );
+                let words = words_of_others(&std::fs::read_to_string(&path).expect("text"));
+                if STILL_NAMING.contains(&name.as_str()) && !words.is_empty() {
+                    still.insert(name);
+                } else {
+                    found.extend(words.into_iter().map(|(line, word)| format!("{name}:{line}: {word}")));
                 }
             }
         }
     }
     assert!(seen > 80, "the files were read: {seen}");
     assert_eq!(found, Vec::<String>::new());
+    assert_eq!(still, STILL_NAMING.map(str::to_owned).into(), "files that no longer need their exception");
 }
 
 #[test]
@@ -259,20 +262,27 @@ fn circles(modules: &BTreeMap<Vec<String>, String>) -> Vec<String> {
 }
 
 /// Crates whose circles remain to be broken.
-const WITH_CIRCLES: [&str; 4] = ["physics", "sdk", "hinf-dfacs", "sim-plugin"];
+const WITH_CIRCLES: [&str; 4] = ["hinf-dfacs", "physics", "sdk", "sim-plugin"];
 
 #[test]
 fn no_modules_import_each_other_in_a_circle() {
     let root = dragfree_tests::root();
     let below = |folder: &str| std::fs::read_dir(root.join(folder)).expect("a folder").flatten().map(|e| e.path());
     let crates = below("core").chain(below("plugins")).chain(["sim-plugin", "validation"].map(|name| root.join(name)));
-    let crates = crates.filter(|folder| !WITH_CIRCLES.iter().any(|name| folder.ends_with(name)));
-    let sources: Vec<_> = crates.map(|folder| folder.join("src")).filter(|source| source.is_dir()).collect();
-    assert!(sources.len() > 10, "the crates were read");
-    let of = |source: &std::path::PathBuf| {
-        circles(&modules(source)).into_iter().map(|pair| format!("{}: {pair}", source.display())).collect::<Vec<_>>()
-    };
-    assert_eq!(sources.iter().flat_map(of).collect::<Vec<_>>(), Vec::<String>::new());
+    let crates: Vec<_> = crates.filter(|folder| folder.join("src").is_dir()).collect();
+    assert!(crates.len() > 10, "the crates were read");
+    let (mut found, mut still) = (Vec::new(), BTreeSet::new());
+    for folder in &crates {
+        let name = folder.file_name().and_then(|name| name.to_str()).expect("a name");
+        let pairs = circles(&modules(&folder.join("src")));
+        if WITH_CIRCLES.contains(&name) && !pairs.is_empty() {
+            still.insert(name);
+        } else {
+            found.extend(pairs.into_iter().map(|pair| format!("{name}: {pair}")));
+        }
+    }
+    assert_eq!(found, Vec::<String>::new());
+    assert_eq!(still, WITH_CIRCLES.into(), "crates that no longer need their exception");
 }
 
 #[test]

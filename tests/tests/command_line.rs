@@ -47,7 +47,7 @@ fn log_lines_tell_what_runs() {
     assert!(told.contains("cannot write the log"), "{told}");
 }
 
-/// `df` is the witness; what other programs write meanwhile is far below a hundredth of a disk.
+/// Compared with what `df` prints; what other programs write meanwhile is far below a hundredth of a disk.
 #[cfg(target_os = "linux")]
 #[test]
 fn the_space_of_the_archive_is_told() {
@@ -139,13 +139,9 @@ fn an_effect_is_asked_before_it_is_added() {
 #[test]
 fn the_unit_of_a_number_is_not_told() {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    compile(dir.path());
+    dragfree_tests::compile_plugin(dir.path(), "c_plugins.c", "c_plugins", &[]);
     let mut inspect = dragfree(dir.path());
     let screen = expect(inspect.args(["plugins", "inspect", "c-scale", "--plugin-dir"]).arg(dir.path()), 0);
     let screen = String::from_utf8_lossy(&screen.stdout).into_owned();
     assert!(screen.lines().any(|line| line == "factor  f64"), "{screen}");
-}
-
-fn compile(folder: &Path) {
-    dragfree_tests::compile_plugin(folder, "c_plugins.c", "c_plugins", &[]);
 }

@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use crate::EngineError;
 use crate::border::Kind;
 use crate::chain::{self, Chain, Sink};
-use crate::config::{EffectEntry, Mission, Model, Node};
+use crate::config::{EffectEntry, Model, Node};
 use crate::product::Product;
 use crate::registry::Registry;
 use crate::replay;
@@ -77,7 +77,7 @@ pub fn model(sources: &Sources) -> Result<Model, EngineError> {
 pub fn examine<C: Sink, E: From<EngineError>>(
     registry: &Registry,
     what: &Examination<'_>,
-    link: impl FnOnce(&Chain, &Mission) -> Result<Wanted<C>, E>,
+    link: impl FnOnce(&Chain) -> Result<Wanted<C>, E>,
     progress: &mut dyn FnMut(Progress),
 ) -> Result<(C, Vec<(String, String)>), E> {
     let sources = what.sources;
@@ -105,7 +105,7 @@ pub fn examine<C: Sink, E: From<EngineError>>(
     let tables = feed.get().tables().to_vec();
     let mut chain = chain::build(registry, &setup.pipeline, &setup.mission, &setup.model, &tables, carry(&options))
         .map_err(EngineError::from)?;
-    let (mut consumer, columns) = link(&chain, &setup.mission)?;
+    let (mut consumer, columns) = link(&chain)?;
     chain.tap(&columns).map_err(EngineError::from)?;
     if carry_all(feed.get(), &mut chain, &mut consumer, progress)?.is_none() {
         return Err(EngineError::NoRows { files: options.files }.into());

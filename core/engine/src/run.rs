@@ -239,8 +239,8 @@ pub fn run(
     let summary = feed.get().summary()?;
     let draft = draft(&setup, options, &chain, &feed, summary, reports, &covered)?;
     sources(&setup, options).write(&writer.staged_unlisted(product::SOURCES))?;
-    // After the product: a kill in between costs a second run of the day, never the day.
     tracing::debug!(epochs_from_ns = covered.first_ns, epochs_to_ns = covered.last_ns, "every stage has reported");
+    // The state after the product: a kill in between costs a second run of the day, never the day.
     let written = writer.commit_with(&draft, || next_state.map_or(Ok(()), NextState::place))?;
     tracing::info!(id = written.product.id(), path = %written.path.display(), "archived");
     Ok(Outcome { product: written.product, path: written.path })

@@ -769,8 +769,8 @@ fn worst_band(
 mod tests {
     use super::*;
 
-    /// `Σ_b w_b e_b Re U_b` over what one bin of all segments weighs, for a command that answers a step by `−(1 −
-    /// e^{−2πf_c t})` from the next sample on: strictly causal, and −1 far below the corner.
+    /// `Σ_b w_b e_b Re U_b` over what one bin of all segments weighs, for a command that answers a step by
+    /// `−(1 − e^{−2πf_c t})` from the next sample on: strictly causal, and −1 far below the corner.
     fn score(plan: &Plan, spectra: &Spectra, weights: &[f64], corner_hz: f64) -> f64 {
         let response = |hz: f64| {
             let turn = nalgebra::Complex::from_polar(1.0, -std::f64::consts::TAU * hz / plan.rate_hz);

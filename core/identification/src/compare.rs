@@ -71,10 +71,9 @@ pub struct Test {
     /// * `cumulative`: the cumulative periodogram of the whitened residual, its largest distance from a straight line
     ///   times √n
     ///   (Bartlett 1955); it does not ask for the level.
-    /// * `ljung-box`: autocorrelations of the whitened residual at ten lags, taken from its spectrum: `r_k = ∫ R cos
-    ///   2πfkΔt df / ∫ R df`,
-    ///   and `Q = rᵀ C⁻¹ r` with the covariance C that bands of that width give. With bands of one bin it is Ljung and
-    ///   Box's n Σ r_k².
+    /// * `ljung-box`: autocorrelations of the whitened residual at ten lags, taken from its spectrum:
+    ///   `r_k = ∫ R cos 2πfkΔt df / ∫ R df`, and `Q = rᵀ C⁻¹ r` with the covariance C that bands of that width give.
+    ///   With bands of one bin it is Ljung and Box's n Σ r_k².
     pub name: &'static str,
     /// What is compared.
     pub statistic: f64,

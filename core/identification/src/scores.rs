@@ -1,7 +1,7 @@
 //! Score tests (Lagrange multiplier tests) of every candidate against the residuals of the model, from the sums alone.
 //!
-//! With the model fitted, adding coefficients p to the fitted ones q lowers χ² by `sᵀ S⁻¹ s`, `s = c_p − N_pq θ_q`, `S
-//! = N_pp − N_pq N_qq⁻¹ N_qp`. All of it is linear in the Gram matrices, and exact for the Σ in use: that of the
+//! With the model fitted, adding coefficients p to the fitted ones q lowers χ² by `sᵀ S⁻¹ s`, `s = c_p − N_pq θ_q`,
+//! `S = N_pp − N_pq N_qq⁻¹ N_qp`. All of it is linear in the Gram matrices, and exact for the Σ in use: that of the
 //! mission with its levels measured (`dragfree_estimation::levels`), which also absorbs an unexplained excess of power.
 //! Values beyond a coefficient's hard range are no explanation: χ² is taken at the best point inside.
 //!

@@ -2,9 +2,9 @@
 //!
 //! With residuals r whose spectrum is Σ and a template `T(f)` that begins at `t`, `n(t) = Σ_f Re T* Σ⁻¹ r e^{2πift}` is
 //! largest where it fits best; one inverse transform gives all times. Under a window w the noise of n is not the same
-//! at all times: with `u = Σ^{-1/2} T` in the time domain, of unit energy, its variance is `D V(t)`, `D = Σ_f T* Σ⁻¹
-//! T`, `V(t) = Σ_s u²(s − t) w²(s)`, whether the filter is short against the window or rings through all of it. The
-//! significance is `n/√(D V)`.
+//! at all times: with `u = Σ^{-1/2} T` in the time domain, of unit energy, its variance is `D V(t)`,
+//! `D = Σ_f T* Σ⁻¹ T`, `V(t) = Σ_s u²(s − t) w²(s)`, whether the filter is short against the window or rings through
+//! all of it. The significance is `n/√(D V)`.
 //!
 //! A hit on the spacecraft stands out of broad-band noise and is detected in short segments. A push of a test mass for
 //! a minute leaves a velocity, whose information lies below 2 mHz, and is detected in long ones. Detections become

@@ -7,6 +7,7 @@
 //!
 //! Numbers are SI. JSON has neither NaN nor infinity: a missing number and an open end of a range are `null`.
 
+mod available;
 mod column;
 mod manifest;
 mod model;
@@ -15,6 +16,7 @@ mod number;
 mod report;
 pub mod state;
 
+pub use available::{Available, NoSuchCoefficient};
 pub use column::Column;
 pub use manifest::{Manifest, Parameter, ParameterType};
 pub use model::{Coefficient, Colour, Constraint, Model, Response, Shape, Transient, Variant};

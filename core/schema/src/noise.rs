@@ -9,9 +9,10 @@ pub const NOISE_ATTRIBUTE: &str = "noise_processes";
 
 /// A noise process: a stationary random signal of one or several components, and how it enters the channels.
 ///
-/// With M the gains of the components in the channels (`enters`) and C their covariance over the spectrum, it adds `M C
-/// Mᵀ` times its one-sided power spectral density times the power response to the channels' cross-spectral matrix. Two
-/// processes are independent. A stage that makes several processes which are not declares one with several components.
+/// With M the gains of the components in the channels (`enters`) and C their covariance over the spectrum, it adds
+/// `M C Mᵀ` times its one-sided power spectral density times the power response to the channels' cross-spectral matrix.
+/// Two processes are independent. A stage that makes several processes which are not declares one with several
+/// components.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "json-schema", derive(schemars::JsonSchema))]
 pub struct NoiseProcess {

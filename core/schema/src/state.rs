@@ -317,14 +317,13 @@ impl State<'_> {
     pub fn queue<T: Default>(
         &mut self,
         values: &mut VecDeque<T>,
-        mut visit: impl FnMut(&mut Self, &mut T) -> Result<(), StateError>,
+        visit: impl FnMut(&mut Self, &mut T) -> Result<(), StateError>,
     ) -> Result<(), StateError> {
-        let count = self.count(values.len())?;
-        if self.is_loading() {
-            values.clear();
-            values.resize_with(count, T::default);
-        }
-        values.iter_mut().try_for_each(|value| visit(self, value))
+        // A queue and a list turn into each other without a copy of their entries.
+        let mut list = Vec::from(std::mem::take(values));
+        let visited = self.list(&mut list, visit);
+        *values = list.into();
+        visited
     }
 
     /// What may be missing.

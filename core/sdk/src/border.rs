@@ -15,10 +15,11 @@ use std::sync::{Arc, Once, OnceLock};
 
 use crate::batch::{InputTable, Inputs, Outputs};
 use crate::error::PluginError;
-use crate::link::{Available, Link, WantParts, Written, pointer};
+use crate::link::{Link, WantParts, Written, pointer};
 use crate::manifest::Manifest;
 use crate::node::{Effect, EffectNode, Node, Source, SourceNode, Stage, StageNode};
 use crate::setup::Setup;
+use dragfree_schema::Available;
 
 // The Arrow crates' array and the header's are the same C struct.
 const _: () = assert!(size_of::<FFI_ArrowArray>() == size_of::<abi::ArrowArray>());
@@ -378,7 +379,7 @@ unsafe extern "C" fn link(this: *mut c_void, raw: *const abi::LinkV1, error: *mu
     unsafe {
         enter(this, error, |instance| {
             let raw = raw.as_ref().ok_or_else(|| PluginError::error("the host gave no link"))?;
-            let available = Available::parse(columns_of(raw)?, &owned(raw.model_json))?;
+            let available = Available::new(columns_of(raw)?, serde_json::from_str(&owned(raw.model_json))?);
             let mut link = Link::new(raw, &available);
             instance.node.link(&available, &mut link)?;
             instance.uniform = link.uniform_input;

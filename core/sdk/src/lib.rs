@@ -59,11 +59,11 @@ mod setup;
 
 pub use batch::{Inputs, Outputs, Progress};
 pub use dragfree_schema::{
-    Attachment, Coefficient, Colour, Column, Constraint, Covariance, Estimate, NoiseEstimate, NoiseProcess,
+    Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Estimate, NoiseEstimate, NoiseProcess,
     NoiseResponse, NoiseShape, NoiseTerm, Report, Response, Shape, Transient, Variant, state,
 };
 pub use error::PluginError;
-pub use link::{Available, EffectLink, In, Link, Out, Table, Want};
+pub use link::{EffectLink, In, Link, Out, Table, Want};
 pub use manifest::{Manifest, Parameter};
 pub use node::{Effect, Source, Stage};
 pub use setup::{Level, Log, Setup};

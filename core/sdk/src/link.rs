@@ -1,80 +1,11 @@
 //! Columns, coefficients and constraints: what a plugin sees, asks for and makes before a byte of data is read.
 
 use dragfree_abi as abi;
-use dragfree_schema::{Coefficient, Column, Constraint, Model, NoiseProcess, Response};
+use dragfree_schema::{Available, Coefficient, Column, Constraint, NoiseProcess};
 use std::ffi::CString;
 use std::ptr;
 
 use crate::error::PluginError;
-
-/// What exists at this point of the chain.
-#[derive(Clone, Debug, Default)]
-pub struct Available {
-    /// Every column made so far, in the order in which they were made.
-    pub columns: Vec<Column>,
-    /// Every coefficient of the model's effects before this point.
-    pub coefficients: Vec<Coefficient>,
-    /// Every constraint on them.
-    pub constraints: Vec<Constraint>,
-    /// Every noise process that stages before this point declared.
-    pub noise: Vec<NoiseProcess>,
-}
-
-impl Available {
-    pub(crate) fn parse(columns: Vec<Column>, model_json: &str) -> Result<Self, PluginError> {
-        let Model { coefficients, constraints, noise } = serde_json::from_str(model_json)?;
-        Ok(Self { columns, coefficients, constraints, noise })
-    }
-
-    /// A column by table and name.
-    #[must_use]
-    pub fn column(&self, table: &str, name: &str) -> Option<&Column> {
-        self.columns.iter().find(|c| c.table == table && c.name == name)
-    }
-
-    /// A column by name, in whichever table.
-    #[must_use]
-    pub fn find(&self, name: &str) -> Option<&Column> {
-        self.columns.iter().find(|c| c.name == name)
-    }
-
-    /// The columns whose attribute `kind` is `kind`.
-    pub fn of_kind<'a>(&'a self, kind: &'a str) -> impl Iterator<Item = &'a Column> {
-        self.columns.iter().filter(move |c| c.attribute("kind") == kind)
-    }
-
-    /// How the channels answer to each coefficient: those that the coefficients declare, and the columns of `kind`
-    /// `regressor`, which are a response with the factor one each.
-    ///
-    /// # Errors
-    /// A column is a regressor of a coefficient that nobody declares.
-    pub fn responses(&self) -> Result<Vec<(&Coefficient, Response)>, PluginError> {
-        let mut all = Vec::new();
-        for column in self.of_kind("regressor") {
-            let name = column.attribute("coefficient");
-            let coefficient = self.coefficient(name).ok_or_else(|| {
-                PluginError::error(format!(
-                    "column {} of table {} is a regressor of coefficient `{name}`, which nobody declares; the effect that makes it \
-                     must announce it in its link",
-                    column.name, column.table
-                ))
-            })?;
-            let channel = column.attribute("channel").to_owned();
-            let (table, series) = (column.table.clone(), column.name.clone());
-            all.push((coefficient, Response { channel, table, series, factor: 1.0, times: None }));
-        }
-        for c in &self.coefficients {
-            all.extend(c.responses.iter().map(|r| (c, r.clone())));
-        }
-        Ok(all)
-    }
-
-    /// A coefficient by name.
-    #[must_use]
-    pub fn coefficient(&self, name: &str) -> Option<&Coefficient> {
-        self.coefficients.iter().find(|c| c.name == name)
-    }
-}
 
 /// A column that a plugin asks for: a name, and what it must be.
 #[derive(Clone, Debug, PartialEq)]
@@ -296,8 +227,8 @@ impl<'l, 'a> EffectLink<'l, 'a> {
         crate::border::announce_json(self.link.raw, crate::border::Announcement::Coefficient, coefficient)
     }
 
-    /// A series that responses refer to by [`Self::table`] and this name: one value per row, a mean over `[t_k,
-    /// t_{k+1})`.
+    /// A series that responses refer to by [`Self::table`] and this name: one value per row, a mean over
+    /// `[t_k, t_{k+1})`.
     ///
     /// # Errors
     /// The host refuses it: the name is taken.

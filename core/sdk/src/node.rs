@@ -1,11 +1,11 @@
 //! The three traits a plugin implements, and the one shape in which they cross the border.
 
-use dragfree_schema::Report;
 use dragfree_schema::state::{self, State};
+use dragfree_schema::{Available, Report};
 
 use crate::batch::{Inputs, Outputs, Progress};
 use crate::error::PluginError;
-use crate::link::{Available, EffectLink, Link};
+use crate::link::{EffectLink, Link};
 use crate::manifest::Manifest;
 use crate::setup::Setup;
 

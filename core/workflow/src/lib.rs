@@ -19,6 +19,7 @@ use dragfree_estimation::sigma::NoiseError;
 use dragfree_identification::compare::CompareError;
 use dragfree_identification::diagnosis::DiagnosisError;
 use dragfree_identification::record::RecordError;
+use dragfree_schema::NoSuchCoefficient;
 
 /// Why a comparison or a diagnosis failed.
 #[derive(Debug, thiserror::Error)]
@@ -26,9 +27,9 @@ pub enum WorkflowError {
     /// The chain cannot be run again over the data.
     #[error(transparent)]
     Engine(#[from] EngineError),
-    /// What a plugin declares makes no sense.
-    #[error("{0}")]
-    Declaration(String),
+    /// An effect makes a regressor of a coefficient that it does not declare.
+    #[error(transparent)]
+    Coefficient(#[from] NoSuchCoefficient),
     /// Declared noise that contradicts itself.
     #[error(transparent)]
     Noise(#[from] NoiseError),

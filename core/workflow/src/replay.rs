@@ -109,10 +109,9 @@ pub(crate) fn sum(
             threads,
         };
         let examination = Examination { product, sources: &sources, candidates: all, threads, batch_rows };
-        let (sums, not_tried) =
-            examine(registry, &examination, |chain, _| ColumnSums::link(&request, chain), &mut |p| {
-                progress(what.pass(), number, p);
-            })?;
+        let (sums, not_tried) = examine(registry, &examination, |chain| ColumnSums::link(&request, chain), &mut |p| {
+            progress(what.pass(), number, p);
+        })?;
         let mut record = sums.record();
         record.not_tried.extend(not_tried);
         match &mut whole {

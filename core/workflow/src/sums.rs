@@ -19,7 +19,7 @@ use dragfree_identification::gram::{Columns, GramAccumulator, LONG};
 use dragfree_identification::record::Record;
 use dragfree_identification::transient::{Detection, Search, Template};
 use dragfree_identification::waveform::Waveform;
-use dragfree_sdk::{Available, Coefficient, Column, Constraint, NoiseProcess, Response, Shape, Variant};
+use dragfree_schema::{Available, Coefficient, Column, Constraint, NoiseProcess, Response, Shape, Variant};
 use nalgebra::DMatrix;
 
 use crate::WorkflowError;
@@ -343,8 +343,7 @@ impl Series {
         waveforms: &[Waveform],
     ) -> Result<Self, WorkflowError> {
         let mut responses: BTreeMap<String, Vec<Response>> = BTreeMap::new();
-        let declared = available.responses().map_err(|e| WorkflowError::Declaration(e.message().to_owned()))?;
-        for (c, r) in declared {
+        for (c, r) in available.responses()? {
             responses.entry(c.name.clone()).or_default().push(r);
         }
         let exists = |r: &&Response| channels.iter().any(|c| name_of(c) == r.channel);

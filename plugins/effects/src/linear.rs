@@ -313,8 +313,9 @@ pub(crate) fn optical_axis_weights(mission: &Mission, tm: usize, axis: usize) ->
     Some(weight.into())
 }
 
-/// Terms of an error in `α̂`: if the angular acceleration is `α̂ + factor · δα`, the test masses show `−factor [T δα ×]
-/// b` beyond `Φ(α̂) b`. `series(j)` is component j of `δα` in SRF. Empty without `com-offset` earlier in the model.
+/// Terms of an error in `α̂`: if the angular acceleration is `α̂ + factor · δα`, the test masses show
+/// `−factor [T δα ×] b` beyond `Φ(α̂) b`. `series(j)` is component j of `δα` in SRF. Empty without `com-offset` earlier
+/// in the model.
 ///
 /// # Errors
 /// The mission has no test mass.

@@ -1,8 +1,8 @@
 //! Effect `thermal`: a force on a test mass proportional to the difference of two temperatures.
 //!
-//! Residual gas, radiation pressure and outgassing of opposite housing faces differ with their temperatures: `a = k (T₊
-//! − T₋)` behind a first-order lag `τ` between thermometer and face, `τ ẏ = T − y` (LISA Pathfinder: arXiv:1905.09060,
-//! 2507.20846).
+//! Residual gas, radiation pressure and outgassing of opposite housing faces differ with their temperatures:
+//! `a = k (T₊ − T₋)` behind a first-order lag `τ` between thermometer and face, `τ ẏ = T − y` (LISA Pathfinder:
+//! arXiv:1905.09060, 2507.20846).
 //!
 //! k: m s⁻² K⁻¹, positive if the test mass is pushed along its axis of ORF while `plus` is warmer. **Range** ±1e-9;
 //! radiation pressure and the radiometric effect give some 1e-11 each. **Confounders**: neighbouring lags, of which the

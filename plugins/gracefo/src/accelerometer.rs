@@ -1,7 +1,7 @@
 //! Stage `accelerometer`: measured accelerations in place of the displacements of a test mass.
 //!
-//! The instrument measures the force per mass that holds its proof mass at `b` from the spacecraft's centre of mass, `a
-//! = a_ng + α×b + ω×(ω×b) − Γ b`. The channels describe a **free** mass relative to its housing
+//! The instrument measures the force per mass that holds its proof mass at `b` from the spacecraft's centre of mass,
+//! `a = a_ng + α×b + ω×(ω×b) − Γ b`. The channels describe a **free** mass relative to its housing
 //! (eq:TM_SC_relative_acceleration), `r̈ = −a_ng − α×b − ω×(ω×b) + Γ b`. So `channel = −a`.
 //!
 //! `α` is measured by the same instrument; its noise attenuates the offset (errors in variables). If the mission states
@@ -130,8 +130,8 @@ impl BlockDifferences {
     }
 }
 
-/// Mean square of the differences of noise alone, per block length of m samples: `∫ S(f) 4 sin⁴(π f m dt) / (m² sin²(π
-/// f dt)) df` up to Nyquist.
+/// Mean square of the differences of noise alone, per block length of m samples:
+/// `∫ S(f) 4 sin⁴(π f m dt) / (m² sin²(π f dt)) df` up to Nyquist.
 #[must_use]
 pub fn noise_block_differences(noise: &NoiseShape, dt_s: f64) -> [f64; LEVELS] {
     // Resolves the finest oscillation of the longest block by four points.

@@ -227,8 +227,8 @@ fn filtered(x: &[f64], taps: &[f64], k: usize) -> f64 {
     taps[0] * x[k] + pairs.sum::<f64>()
 }
 
-/// Taps `h_0 … h_HALF_LENGTH` of the symmetric filter for the mean of the signal in `x`: the solution of `Σ_j h_|j|
-/// R_m(k−j) = R_α(k)`, `|k| ≤ HALF_LENGTH`, with autocorrelations from `S_m` and `W S_m`.
+/// Taps `h_0 … h_HALF_LENGTH` of the symmetric filter for the mean of the signal in `x`: the solution of
+/// `Σ_j h_|j| R_m(k−j) = R_α(k)`, `|k| ≤ HALF_LENGTH`, with autocorrelations from `S_m` and `W S_m`.
 fn wiener(x: &[f64], noise: &NoiseShape, rate_hz: f64) -> Result<Vec<f64>, SpectrumError> {
     let spectrum = welch(x, rate_hz, SEGMENT)?;
     let last = spectrum.psd.len() - 1;

@@ -12,8 +12,8 @@ const AXES: [&str; 3] = ["x", "y", "z"];
 /// Noise of the channels `NAME.accel.AXIS`, measured as they are. The non-gravitational acceleration, which no effect
 /// models, is a process of unknown spectrum: what a model leaves in these channels is not noise alone.
 ///
-/// The measured α enters with the whole noise of its instrument, through the lever of the nominal offset. Where `E[α |
-/// measured α]` is used, less of it remains; how much depends on the telemetry, and the residuals tell.
+/// The measured α enters with the whole noise of its instrument, through the lever of the nominal offset. Where
+/// `E[α | measured α]` is used, less of it remains; how much depends on the telemetry, and the residuals tell.
 pub(crate) fn declared(noise: &Noise, name: &str, tm: &TestMass) -> Vec<NoiseProcess> {
     let channel = |axis: &str| format!("{name}.accel.{axis}");
     let process = |name: &str, unit: &str, spectrum: Option<NoiseShape>, enters| NoiseProcess {

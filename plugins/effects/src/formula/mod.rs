@@ -26,9 +26,9 @@
 //! (SRF or ORF, N, N m); `sun.x` direction from the Sun (SRF); `time_s` seconds since the run's first epoch; `pi`.
 //!
 //! **Functions.** `sin cos tan asin acos atan sinh cosh tanh exp ln log10 sqrt abs sign`; `min max atan2` of two
-//! arguments. With state: `lag(x, s)` first-order lag; `lowpass(x, hz)` the same by its corner frequency; `highpass(x,
-//! hz)` its complement; `derivative(x)` backward difference; `integral(x)` from the run's first epoch, missing values
-//! counting as zero. [`crate::lag::Lags`] states how lags treat missing values. `-x^2` is −(x²).
+//! arguments. With state: `lag(x, s)` first-order lag; `lowpass(x, hz)` the same by its corner frequency;
+//! `highpass(x, hz)` its complement; `derivative(x)` backward difference; `integral(x)` from the run's first epoch,
+//! missing values counting as zero. [`crate::lag::Lags`] states how lags treat missing values. `-x^2` is −(x²).
 //!
 //! Rows where a column is missing or the expression is not finite are not used. **Limit**: an expression of the readout
 //! that it must explain (`r1.y` acting on `tm1.accel.y`) is correlated with its noise and biased (errors in variables).

@@ -1,0 +1,94 @@
+//! What exists at a point of the chain.
+
+use crate::{Coefficient, Column, Constraint, Model, NoiseProcess, Response};
+
+/// Columns and declarations of the plugins before this point, in the order in which they were made.
+#[derive(Clone, Debug, Default)]
+pub struct Available {
+    /// Columns.
+    pub columns: Vec<Column>,
+    /// Coefficients of the model's effects.
+    pub coefficients: Vec<Coefficient>,
+    /// Constraints on them.
+    pub constraints: Vec<Constraint>,
+    /// Noise in the channels.
+    pub noise: Vec<NoiseProcess>,
+}
+
+/// A column is a regressor of a coefficient that no effect declares.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct NoSuchCoefficient {
+    /// Table of the column.
+    pub table: String,
+    /// The column.
+    pub column: String,
+    /// The coefficient that it names.
+    pub coefficient: String,
+}
+
+impl std::fmt::Display for NoSuchCoefficient {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(
+            f,
+            "column {} of table {} is a regressor of coefficient `{}`, which nobody declares; the effect that makes it \
+             must announce it in its link",
+            self.column, self.table, self.coefficient
+        )
+    }
+}
+
+impl std::error::Error for NoSuchCoefficient {}
+
+impl Available {
+    /// Columns, and what a model declares of them.
+    #[must_use]
+    pub fn new(columns: Vec<Column>, model: Model) -> Self {
+        let Model { coefficients, constraints, noise } = model;
+        Self { columns, coefficients, constraints, noise }
+    }
+
+    /// A column by table and name.
+    #[must_use]
+    pub fn column(&self, table: &str, name: &str) -> Option<&Column> {
+        self.columns.iter().find(|c| c.table == table && c.name == name)
+    }
+
+    /// A column by name, in whichever table.
+    #[must_use]
+    pub fn find(&self, name: &str) -> Option<&Column> {
+        self.columns.iter().find(|c| c.name == name)
+    }
+
+    /// The columns whose attribute `kind` is `kind`.
+    pub fn of_kind<'a>(&'a self, kind: &'a str) -> impl Iterator<Item = &'a Column> {
+        self.columns.iter().filter(move |c| c.attribute("kind") == kind)
+    }
+
+    /// How the channels answer to each coefficient: those that the coefficients declare, and the columns of `kind`
+    /// `regressor`, which are a response with the factor one each.
+    ///
+    /// # Errors
+    /// A column is a regressor of a coefficient that nobody declares.
+    pub fn responses(&self) -> Result<Vec<(&Coefficient, Response)>, NoSuchCoefficient> {
+        let mut all = Vec::new();
+        for column in self.of_kind("regressor") {
+            let (table, series) = (column.table.clone(), column.name.clone());
+            let name = column.attribute("coefficient");
+            let Some(coefficient) = self.coefficient(name) else {
+                return Err(NoSuchCoefficient { table, column: series, coefficient: name.to_owned() });
+            };
+            let channel = column.attribute("channel").to_owned();
+            all.push((coefficient, Response { channel, table, series, factor: 1.0, times: None }));
+        }
+        for c in &self.coefficients {
+            all.extend(c.responses.iter().map(|r| (c, r.clone())));
+        }
+        Ok(all)
+    }
+
+    /// A coefficient by name.
+    #[must_use]
+    pub fn coefficient(&self, name: &str) -> Option<&Coefficient> {
+        self.coefficients.iter().find(|c| c.name == name)
+    }
+}
