@@ -105,13 +105,11 @@ fn a_release_works_wherever_it_is_unpacked() {
     let target = built().parent().expect("a target folder").join("skeletons");
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let mut build = release.command(cargo.to_str().expect("text"));
+    // A toolchain belongs to the machine: where it is and which is meant stay as they are.
     let real_home = PathBuf::from(std::env::var_os("HOME").expect("a home"));
-    for (name, folder) in [("CARGO_HOME", ".cargo"), ("RUSTUP_HOME", ".rustup")] {
-        build.env(name, std::env::var_os(name).unwrap_or_else(|| real_home.join(folder).into()));
-    }
-    if let Some(rustc) = std::env::var_os("PATH") {
-        build.env("PATH", rustc);
-    }
+    build.env("CARGO_HOME", real_home.join(".cargo")).env("RUSTUP_HOME", real_home.join(".rustup"));
+    let of_tools = |name: &str| name == "PATH" || name == "CARGO_HOME" || name.starts_with("RUSTUP_");
+    build.envs(std::env::vars_os().filter(|(name, _)| name.to_str().is_some_and(of_tools)));
     build.current_dir(release.home.join("my-stage")).args([
         "build",
         "--quiet",
