@@ -2,6 +2,8 @@
 //! is given, the environment is cleared and HOME is new.
 #![cfg(target_os = "linux")]
 
+mod story;
+
 use dragfree_tests::{built, expect, json, root};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
@@ -129,10 +131,6 @@ fn a_release_works_wherever_it_is_unpacked() {
     assert!(page.contains(".TH dragfree-model-add") && page.contains("prior\\-sigma"), "{page}");
 
     package_holds(&release);
-
-    // The story, last: it takes longest.
-    run(&["demo"]);
-    assert!(release.home.join("dragfree-demo/diagnosis.json").is_file());
     let binary = std::fs::read(release.top.join("share/dragfree/sdk/Cargo.toml")).expect("a manifest");
     assert!(!String::from_utf8_lossy(&binary).contains(root().to_str().expect("text")), "no path of this machine");
 }

@@ -1,5 +1,7 @@
-//! The story of `dragfree demo` and of the guide: a hidden effect is found, added to the model, and revealed.
+//! The story of `dragfree demo`, from an unpacked release, and of the guide: a hidden effect is found, added to the
+//! model, and revealed.
 
+use crate::Release;
 use dragfree_tests::calibration::TRUTH_M;
 use dragfree_tests::{coefficient, dragfree, fixture, json};
 use serde_json::Value;
@@ -11,8 +13,10 @@ use std::sync::OnceLock;
 fn told() -> &'static Value {
     static STORY: OnceLock<Value> = OnceLock::new();
     STORY.get_or_init(|| {
-        let dir = tempfile::tempdir().expect("a temporary folder");
-        json(dragfree(dir.path()).args(["demo", "--json"]), 0)
+        let release = Release::new();
+        let story = json(&mut release.dragfree(&["demo", "--json"]), 0);
+        assert!(release.home.join("dragfree-demo/diagnosis.json").is_file());
+        story
     })
 }
 
