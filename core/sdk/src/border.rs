@@ -4,8 +4,7 @@
 use arrow_array::{Array, ArrayRef, Float64Array, Int64Array, StructArray};
 use arrow_data::ffi::FFI_ArrowArray;
 use arrow_schema::{DataType, Field, Fields};
-use dragfree_schema::{Column, NOISE_ATTRIBUTE, NoiseProcess, Report};
-use serde::Serialize;
+use dragfree_schema::{Available, Column, Report};
 use std::any::Any;
 use std::cell::RefCell;
 use std::ffi::{CStr, CString, c_char, c_void};
@@ -15,11 +14,10 @@ use std::sync::{Arc, Once, OnceLock};
 
 use crate::batch::{InputTable, Inputs, Outputs};
 use crate::error::PluginError;
-use crate::link::{Link, WantParts, Written, pointer};
+use crate::link::{Link, Written};
 use crate::manifest::Manifest;
 use crate::node::{Effect, EffectNode, Node, Source, SourceNode, Stage, StageNode};
 use crate::setup::Setup;
-use dragfree_schema::Available;
 
 // The Arrow crates' array and the header's are the same C struct.
 const _: () = assert!(size_of::<FFI_ArrowArray>() == size_of::<abi::ArrowArray>());
@@ -306,74 +304,6 @@ unsafe fn columns_of(raw: &abi::LinkV1) -> Result<Vec<Column>, PluginError> {
         .collect()
 }
 
-fn status_to_result(status: abi::Status, what: &str) -> Result<(), PluginError> {
-    if status == abi::OK { Ok(()) } else { Err(PluginError { status, message: what.to_owned() }) }
-}
-
-/// `dragfree_link_v1.read`
-pub(crate) fn ask_for_column(
-    raw: &abi::LinkV1,
-    want: Result<WantParts, PluginError>,
-    slot: &mut abi::SlotV1,
-) -> Result<(), PluginError> {
-    let want = want?;
-    let column = abi::ColumnV1 {
-        table: pointer(want.table.as_ref()),
-        name: want.name.as_ptr(),
-        unit: pointer(want.unit.as_ref()),
-        frame: pointer(want.frame.as_ref()),
-        rate_hz: want.rate_hz,
-        attributes: ptr::null(),
-    };
-    // SAFETY: `column` and `slot` live during the call, as the header asks.
-    let status = unsafe { (raw.read)(raw.context, &raw const column, slot) };
-    status_to_result(status, &format!("column {} was refused", want.name.to_string_lossy()))
-}
-
-/// `dragfree_link_v1.write`, with the noise processes that are declared beside the column.
-pub(crate) fn announce_column(raw: &abi::LinkV1, column: &Column, noise: &[NoiseProcess]) -> Result<(), PluginError> {
-    let (table, name) = (CString::new(column.table.as_str())?, CString::new(column.name.as_str())?);
-    let (unit, frame) = (CString::new(column.unit.as_str())?, CString::new(column.frame.as_str())?);
-    let texts = column.attributes.iter().map(|(key, text)| (key.clone(), text.clone().into()));
-    let mut attributes: serde_json::Map<String, serde_json::Value> = texts.collect();
-    if !noise.is_empty() {
-        attributes.insert(NOISE_ATTRIBUTE.to_owned(), serde_json::to_value(noise)?);
-    }
-    let attributes = CString::new(serde_json::to_string(&attributes)?)?;
-    let c = abi::ColumnV1 {
-        table: table.as_ptr(),
-        name: name.as_ptr(),
-        unit: unit.as_ptr(),
-        frame: frame.as_ptr(),
-        rate_hz: column.rate_hz,
-        attributes: attributes.as_ptr(),
-    };
-    // SAFETY: `c` and its strings live during the call.
-    let status = unsafe { (raw.write)(raw.context, &raw const c) };
-    status_to_result(status, &format!("column {} was refused", column.name))
-}
-
-/// What [`announce_json`] announces.
-#[derive(Clone, Copy)]
-pub(crate) enum Announcement {
-    /// `dragfree_link_v1.coefficient`
-    Coefficient,
-    /// `dragfree_link_v1.constraint`
-    Constraint,
-}
-
-/// Announces a coefficient or a constraint.
-pub(crate) fn announce_json(raw: &abi::LinkV1, what: Announcement, value: &impl Serialize) -> Result<(), PluginError> {
-    let json = CString::new(serde_json::to_string(value)?)?;
-    let call = match what {
-        Announcement::Coefficient => raw.coefficient,
-        Announcement::Constraint => raw.constraint,
-    };
-    // SAFETY: `json` lives during the call.
-    let status = unsafe { call(raw.context, json.as_ptr()) };
-    status_to_result(status, &format!("{} was refused", json.to_string_lossy()))
-}
-
 unsafe extern "C" fn link(this: *mut c_void, raw: *const abi::LinkV1, error: *mut abi::ErrorV1) -> abi::Status {
     // SAFETY: the host calls with what the header promises.
     unsafe {
@@ -521,7 +451,7 @@ unsafe fn write_bytes(writer: *const abi::WriterV1, bytes: &[u8]) -> Result<(), 
     let writer = unsafe { writer.as_ref() }.ok_or_else(|| PluginError::error("the host gave no writer"))?;
     // SAFETY: the bytes live during the call.
     let status = unsafe { (writer.write)(writer.context, bytes.as_ptr(), bytes.len()) };
-    status_to_result(status, "the host did not take the bytes")
+    PluginError::unless_ok(status, || "the host did not take the bytes".to_owned())
 }
 
 unsafe extern "C" fn report(

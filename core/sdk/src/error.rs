@@ -33,6 +33,11 @@ impl PluginError {
         Self { status: abi::FATAL, message: message.into() }
     }
 
+    /// What the host's answer means; `sentence` is for the case that the host said nothing itself.
+    pub(crate) fn unless_ok(status: abi::Status, sentence: impl FnOnce() -> String) -> Result<(), Self> {
+        if status == abi::OK { Ok(()) } else { Err(Self { status, message: sentence() }) }
+    }
+
     /// The text.
     #[must_use]
     pub fn message(&self) -> &str {

@@ -52,10 +52,12 @@
 mod batch;
 pub mod border;
 mod error;
+mod host;
 mod link;
 mod manifest;
 mod node;
 mod setup;
+mod want;
 
 pub use batch::{Inputs, Outputs, Progress};
 pub use dragfree_schema::{
@@ -63,10 +65,11 @@ pub use dragfree_schema::{
     NoiseResponse, NoiseShape, NoiseTerm, Report, Response, Shape, Transient, Variant, state,
 };
 pub use error::PluginError;
-pub use link::{EffectLink, In, Link, Out, Table, Want};
+pub use link::{EffectLink, In, Link, Out, Table};
 pub use manifest::{Manifest, Parameter};
 pub use node::{Effect, Source, Stage};
 pub use setup::{Level, Log, Setup};
+pub use want::Want;
 
 /// Everything a plugin needs.
 pub mod prelude {

@@ -2,61 +2,10 @@
 
 use dragfree_abi as abi;
 use dragfree_schema::{Available, Coefficient, Column, Constraint, NoiseProcess};
-use std::ffi::CString;
-use std::ptr;
 
 use crate::error::PluginError;
-
-/// A column that a plugin asks for: a name, and what it must be.
-#[derive(Clone, Debug, PartialEq)]
-pub struct Want {
-    table: Option<String>,
-    name: String,
-    unit: Option<String>,
-    frame: Option<String>,
-    rate_hz: f64,
-}
-
-impl Want {
-    /// A column of this name, in whichever table.
-    pub fn new(name: impl Into<String>) -> Self {
-        Self { table: None, name: name.into(), unit: None, frame: None, rate_hz: 0.0 }
-    }
-
-    /// The very column that was found among the available ones.
-    #[must_use]
-    pub fn of(column: &Column) -> Self {
-        Self::new(&column.name).table(&column.table)
-    }
-
-    /// It must be in this table.
-    #[must_use]
-    pub fn table(mut self, table: impl Into<String>) -> Self {
-        self.table = Some(table.into());
-        self
-    }
-
-    /// It must have this unit.
-    #[must_use]
-    pub fn unit(mut self, unit: impl Into<String>) -> Self {
-        self.unit = Some(unit.into());
-        self
-    }
-
-    /// It must be in this frame.
-    #[must_use]
-    pub fn frame(mut self, frame: impl Into<String>) -> Self {
-        self.frame = Some(frame.into());
-        self
-    }
-
-    /// It must have this rate, Hz.
-    #[must_use]
-    pub fn rate_hz(mut self, rate_hz: f64) -> Self {
-        self.rate_hz = rate_hz;
-        self
-    }
-}
+use crate::host;
+use crate::want::Want;
 
 /// A column that will be read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -105,8 +54,7 @@ impl<'a> Link<'a> {
     /// # Errors
     /// The host has no such column, or its unit, frame or rate is another; the host holds the sentence.
     pub fn read(&mut self, want: &Want) -> Result<In, PluginError> {
-        let mut slot = abi::SlotV1::default();
-        crate::border::ask_for_column(self.raw, want.parts(), &mut slot)?;
+        let slot = host::read(self.raw, want)?;
         // Of a name that raw telemetry shares with a uniform table the host gives the uniform one.
         let rate_hz = self
             .available
@@ -183,7 +131,7 @@ impl<'a> Link<'a> {
             rate_hz: written.rate_hz,
             attributes: attributes.iter().map(|(k, v)| ((*k).to_owned(), (*v).to_owned())).collect(),
         };
-        crate::border::announce_column(self.raw, &column, noise)?;
+        host::write(self.raw, &column, noise)?;
         written.columns.push(column);
         Ok(Out { table: table.index, column: written.columns.len() - 1 })
     }
@@ -224,7 +172,7 @@ impl<'l, 'a> EffectLink<'l, 'a> {
     /// # Errors
     /// The host refuses it: the name is taken.
     pub fn coefficient(&mut self, coefficient: &Coefficient) -> Result<(), PluginError> {
-        crate::border::announce_json(self.link.raw, crate::border::Announcement::Coefficient, coefficient)
+        host::declare(self.link.raw, self.link.raw.coefficient, coefficient)
     }
 
     /// A series that responses refer to by [`Self::table`] and this name: one value per row, a mean over
@@ -297,32 +245,6 @@ impl<'l, 'a> EffectLink<'l, 'a> {
     /// # Errors
     /// The host refuses it: its bounds contradict those of the same name.
     pub fn constraint(&mut self, constraint: &Constraint) -> Result<(), PluginError> {
-        crate::border::announce_json(self.link.raw, crate::border::Announcement::Constraint, constraint)
+        host::declare(self.link.raw, self.link.raw.constraint, constraint)
     }
-}
-
-/// A [`Want`] as C strings.
-pub(crate) struct WantParts {
-    pub(crate) table: Option<CString>,
-    pub(crate) name: CString,
-    pub(crate) unit: Option<CString>,
-    pub(crate) frame: Option<CString>,
-    pub(crate) rate_hz: f64,
-}
-
-impl Want {
-    fn parts(&self) -> Result<WantParts, PluginError> {
-        let c = |s: &Option<String>| s.as_deref().map(CString::new).transpose();
-        Ok(WantParts {
-            table: c(&self.table)?,
-            name: CString::new(self.name.as_str())?,
-            unit: c(&self.unit)?,
-            frame: c(&self.frame)?,
-            rate_hz: self.rate_hz,
-        })
-    }
-}
-
-pub(crate) fn pointer(text: Option<&CString>) -> *const std::ffi::c_char {
-    text.map_or(ptr::null(), |s| s.as_ptr())
 }
