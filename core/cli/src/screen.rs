@@ -339,6 +339,7 @@ mod tests {
             counts: BTreeMap::new(),
             notes: Vec::new(),
             reports: vec![Report { plugin: "qp-check".into(), ..report }],
+            settings: Default::default(),
             created: chrono::DateTime::UNIX_EPOCH,
         };
         ProductWriter::begin(folder).expect("begin").commit(&draft).expect("commit")

@@ -479,6 +479,7 @@ fn draft(
         counts: summary.counts,
         notes,
         reports: summary.report.into_iter().chain(reports).collect(),
+        settings: setup.pipeline.settings.clone(),
         created: options.created,
     })
 }

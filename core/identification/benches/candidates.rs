@@ -10,6 +10,7 @@ use dragfree_identification::gram::{Columns, GramAccumulator, GramSums};
 use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::transient::Search;
 use dragfree_physics::mission::Mission;
+use dragfree_schema::Settings;
 use nalgebra::DMatrix;
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
@@ -139,8 +140,8 @@ fn bench(criterion: &mut Criterion) {
     group.bench_function("sums of six hours", |b| b.iter(|| gathered(black_box(&columns), 2)));
     group.finish();
 
-    let (candidate_set, sums) = (candidate_set(), gathered(&columns, 2));
-    let scorer = CandidateScorer::new(&candidate_set, &sums, &noise);
+    let (candidate_set, sums, settings) = (candidate_set(), gathered(&columns, 2), Settings::default());
+    let scorer = CandidateScorer::new(&candidate_set, &sums, &noise, &settings);
     let fit = scorer.fit(&[]).expect("a solution");
     let mut group = criterion.benchmark_group("100 candidates");
     group.sample_size(10);

@@ -6,8 +6,8 @@
 //! the tapered, overlapping segments ([`dragfree_estimation::spectra::Spectra::observations`]); what the model's few
 //! coefficients take of it is not counted.
 //!
-//! Every channel has five tests, each at [`FALSE_ALARM`] over the number of all tests (Bonferroni):
-//! `level`, `bands`, `hours`, `cumulative` and `ljung-box`; see [`Test`].
+//! Every channel has five tests, each at [`dragfree_schema::Settings::false_alarm`] over the number of all tests
+//! (Bonferroni): `level`, `bands`, `hours`, `cumulative` and `ljung-box`; see [`Test`].
 //!
 //! **Null combinations.** A force on the spacecraft moves it under every test mass: with a the spacecraft's
 //! acceleration, the channels of mass i hold `A_i a`, whose columns are those of the processes `thruster_force` of Σ.
@@ -33,21 +33,9 @@ use crate::coherence::{Coherence, StepwiseCoherence};
 use crate::distributions::{chi2_per_dof_quantile, chi2_tails, corrected, kolmogorov, two_sided};
 use crate::scores::CandidateScorer;
 
-/// False-alarm rate of all tests of all channels together.
-pub const FALSE_ALARM: f64 = 0.01;
-
-/// Independent segments of full length below which there is no comparison.
-const LEAST_SEGMENTS: f64 = 4.0;
-
 /// Lags of the portmanteau test. Bands are 1/16 of their frequency wide: the cosine of a longer lag turns round within
 /// one.
 const LAGS: usize = 10;
-
-/// Probability outside the intervals of spectra, on both sides together.
-const OUTSIDE: f64 = 0.05;
-
-/// Most coherences in the result.
-const MOST_COHERENCES: usize = 40;
 
 /// A power of a band against its prediction.
 #[derive(Clone, Debug, Serialize)]
@@ -156,7 +144,7 @@ pub struct Nis {
     pub value: f64,
     /// Degrees of freedom.
     pub dof: f64,
-    /// Bounds at [`FALSE_ALARM`].
+    /// Bounds at [`dragfree_schema::Settings::false_alarm`].
     pub bounds: [f64; 2],
     /// Whether it lies between them.
     pub passes: bool,
@@ -165,8 +153,8 @@ pub struct Nis {
 impl Nis {
     /// Judges the filter's mean normalised innovation squared.
     #[must_use]
-    pub fn new(value: f64, dof: f64) -> Self {
-        let bounds = [0.5 * FALSE_ALARM, 1.0 - 0.5 * FALSE_ALARM].map(|p| chi2_per_dof_quantile(p, dof));
+    pub fn new(value: f64, dof: f64, false_alarm: f64) -> Self {
+        let bounds = [0.5 * false_alarm, 1.0 - 0.5 * false_alarm].map(|p| chi2_per_dof_quantile(p, dof));
         Self { value, dof, bounds, passes: (bounds[0]..=bounds[1]).contains(&value) }
     }
 }
@@ -187,7 +175,7 @@ pub struct Innovations {
     pub p_value: f64,
     /// The number of that octave.
     pub farthest: usize,
-    /// Whether the p-value is above [`FALSE_ALARM`].
+    /// Whether the p-value is above [`dragfree_schema::Settings::false_alarm`].
     pub passes: bool,
 }
 
@@ -197,7 +185,7 @@ impl Innovations {
     ///
     /// [1]: https://en.wikipedia.org/wiki/Haar_wavelet
     #[must_use]
-    pub fn judge(readouts: &BTreeMap<String, Vec<(f64, u64)>>, rate_hz: f64) -> Vec<Self> {
+    pub fn judge(readouts: &BTreeMap<String, Vec<(f64, u64)>>, rate_hz: f64, false_alarm: f64) -> Vec<Self> {
         let told = |octaves: &Vec<(f64, u64)>| octaves.iter().filter(|(_, n)| *n > 0).count();
         let trials: usize = readouts.values().map(told).sum();
         let band = |k: usize| [2.0, 1.0].map(|of| rate_hz / (of * (2usize << k) as f64));
@@ -212,7 +200,7 @@ impl Innovations {
             let far = octaves.iter().enumerate().min_by(|a, b| chance(a.1).total_cmp(&chance(b.1)))?;
             let p_value = corrected(chance(far.1), trials as f64);
             let farthest = far.0;
-            Some(Self { readout: readout.clone(), passes: p_value >= FALSE_ALARM, p_value, farthest, octaves })
+            Some(Self { readout: readout.clone(), passes: p_value >= false_alarm, p_value, farthest, octaves })
         };
         readouts.iter().filter_map(of).collect()
     }
@@ -266,10 +254,12 @@ pub enum CompareError {
     Estimate(#[from] EstimateError),
     /// Too little data.
     #[error(
-        "a comparison needs at least {LEAST_SEGMENTS} segments of {segment_s:.0} s without a gap, and there are {segments:.1}: give more \
+        "a comparison needs at least {needed} segments of {segment_s:.0} s without a gap, and there are {segments:.1}: give more \
          telemetry, or several products"
     )]
     TooShort {
+        /// Segments that are needed.
+        needed: f64,
         /// Segments there are.
         segments: f64,
         /// Their length.
@@ -308,7 +298,7 @@ pub fn compare(
     nis: Option<Nis>,
     innovations: Vec<Innovations>,
 ) -> Result<Comparison, CompareError> {
-    let (gathered, names) = (scorer.gathered, &scorer.candidate_set.channels);
+    let (gathered, names, settings) = (scorer.gathered, &scorer.candidate_set.channels, scorer.settings);
     // The hours and their sum are of segments of one length, whatever else was gathered.
     let plan = &gathered.hour_plan();
     let base = gathered.columns.base;
@@ -319,8 +309,8 @@ pub fn compare(
     // The lowest band is seen by segments of full length alone, one observation each.
     let lowest = plan.bands.first().map_or(1, |b| b.bins()) as f64;
     let segments = whole_observations.first().map_or(0.0, |n| n / lowest);
-    if segments < LEAST_SEGMENTS {
-        return Err(CompareError::TooShort { segments, segment_s });
+    if segments < settings.min_segments {
+        return Err(CompareError::TooShort { needed: settings.min_segments, segments, segment_s });
     }
     let fit = scorer.fit(&[])?;
     let residual = residual(scorer, fit.estimate.theta.as_slice());
@@ -346,7 +336,8 @@ pub fn compare(
         (0..names.len()).map(|i| (names[i].clone(), single(i), Kind::Channel)).collect();
     combinations.extend(pairs(scorer.noise, names, gathered.rate_hz));
     let tested = |w: &DVector<f64>| (0..names.len()).all(|i| w[i] == 0.0 || known(i));
-    let allowed = FALSE_ALARM / (TESTS * combinations.iter().filter(|(_, w, _)| tested(w)).count().max(1)) as f64;
+    let allowed =
+        settings.false_alarm / (TESTS * combinations.iter().filter(|(_, w, _)| tested(w)).count().max(1)) as f64;
     let hours_ns: Vec<i64> = gathered.hours.iter().map(|h| h.start_ns).collect();
     let channels: Vec<Channel> = combinations
         .into_iter()
@@ -359,7 +350,7 @@ pub fn compare(
             };
             let total = of(&measured, whole_observations.clone());
             let by_hour: Vec<Ratios> = hours.iter().zip(&hour_observations).map(|(m, n)| of(m, n.clone())).collect();
-            let mut channel = judge(plan, &total, &by_hour, &hours_ns, allowed);
+            let mut channel = judge(plan, &total, &by_hour, &hours_ns, allowed, settings.outside_interval);
             channel.measured_psd = measured.iter().map(power).collect();
             channel.chi2_per_dof_fitted_levels = {
                 // The level's prediction lies on the middle of a band, as the plain one it is compared with.
@@ -386,7 +377,7 @@ pub fn compare(
     Ok(Comparison {
         verdict: if passes { "passes" } else { "fails" },
         passes,
-        false_alarm_rate: FALSE_ALARM,
+        false_alarm_rate: settings.false_alarm,
         false_alarm_rate_per_test: allowed,
         segments: whole.segments,
         segment_s,
@@ -394,8 +385,8 @@ pub fn compare(
         channels,
         nis,
         innovations,
-        coherences: coherences.filter(|w| w.p_value < FALSE_ALARM).take(MOST_COHERENCES).collect(),
-        together: gathered.housekeeping.stepwise_coherence(names, FALSE_ALARM),
+        coherences: coherences.filter(|w| w.p_value < settings.false_alarm).take(settings.max_coherences).collect(),
+        together: gathered.housekeeping.stepwise_coherence(names, settings.false_alarm),
     })
 }
 
@@ -515,7 +506,7 @@ fn thirds(bands: &[Band]) -> Vec<Range<usize>> {
 const TESTS: usize = 5;
 
 /// Tests a channel. `allowed` is the false-alarm rate of a single test.
-fn judge(plan: &Plan, total: &Ratios, hours: &[Ratios], hours_ns: &[i64], allowed: f64) -> Channel {
+fn judge(plan: &Plan, total: &Ratios, hours: &[Ratios], hours_ns: &[i64], allowed: f64, outside: f64) -> Channel {
     let bands = &plan.bands;
     let thirds = thirds(bands);
     let hz = |r: &Range<usize>| [bands[r.start].first, bands[r.end - 1].end - 1].map(|k| plan.bin_hz(k as f64));
@@ -570,7 +561,7 @@ fn judge(plan: &Plan, total: &Ratios, hours: &[Ratios], hours_ns: &[i64], allowe
     let both: f64 = whole.iter().filter_map(|c| c.chi2_per_dof).sum();
     let interval = |b: usize| {
         let (_, n) = total.mean(bands, b..b + 1);
-        [0.5 * OUTSIDE, 1.0 - 0.5 * OUTSIDE].map(|p| chi2_per_dof_quantile(p, 2.0 * n))
+        [0.5 * outside, 1.0 - 0.5 * outside].map(|p| chi2_per_dof_quantile(p, 2.0 * n))
     };
     Channel {
         name: String::new(),
@@ -625,7 +616,7 @@ mod tests {
     use super::*;
     use crate::gram::HOUR_NS;
     use dragfree_estimation::spectra::{Analyser, Layout, Sums};
-    use dragfree_schema::{NoiseEstimate, NoiseProcess, NoiseShape};
+use dragfree_schema::{NoiseEstimate, NoiseProcess, NoiseShape, Settings};
     use rand::SeedableRng;
     use rand_distr::{Distribution, StandardNormal};
     use rand_xoshiro::Xoshiro256PlusPlus;
@@ -640,8 +631,8 @@ mod tests {
         let octaves = |wrong: f64| (0..10).map(|k| (if k == 3 { wrong } else { 1.0 }, 10_000 >> k)).collect::<Vec<_>>();
         let readouts =
             |wrong| BTreeMap::from([("tm1.x".to_owned(), octaves(wrong)), ("tm1.y".to_owned(), octaves(1.0))]);
-        assert!(Innovations::judge(&readouts(1.0), 10.0).iter().all(|i| i.passes && i.p_value > 0.99));
-        let judged = Innovations::judge(&readouts(1.3), 10.0);
+        assert!(Innovations::judge(&readouts(1.0), 10.0, 0.01).iter().all(|i| i.passes && i.p_value > 0.99));
+        let judged = Innovations::judge(&readouts(1.3), 10.0, 0.01);
         assert!(!judged[0].passes && judged[1].passes, "{judged:?}");
         // 1250 of variance 2/1250: 7.5σ; Haar's fourth octave of 10 Hz.
         assert_eq!((judged[0].farthest, judged[0].octaves[3].band_hz), (3, [0.3125, 0.625]));
@@ -681,7 +672,7 @@ mod tests {
             .map(|(h, s)| ratios(&s.total, observations(&s.total, plan), &|hz| louder(hz, h)))
             .collect();
         let starts: Vec<i64> = (0..HOURS as i64).map(|h| h * HOUR_NS).collect();
-        judge(plan, &whole, &by_hour, &starts, allowed)
+        judge(plan, &whole, &by_hour, &starts, allowed, Settings::default().outside_interval)
     }
 
     fn failed(c: &Channel) -> Vec<&'static str> {
@@ -713,7 +704,7 @@ mod tests {
     /// one of a thousand.
     #[test]
     fn what_is_not_white_fails_where_it_is_not() {
-        const RATE: f64 = FALSE_ALARM / 15.0;
+        const RATE: f64 = 0.01 / 15.0;
         let plain: fn(&mut [f64]) = |_| ();
         assert!(judged(1, RATE, plain, |_, _| 1.0).passes);
         // A tenth more power above 0.2 Hz: 8,000 observations, 9σ.

@@ -7,6 +7,7 @@ use dragfree_estimation::estimate::EstimateError;
 use dragfree_estimation::levels::{Level, Levels};
 use dragfree_estimation::spectra::FIRST_BIN;
 use dragfree_estimation::verdict::chi2_per_dof_at;
+use dragfree_schema::Settings;
 use serde::Serialize;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
@@ -17,65 +18,12 @@ use crate::distributions::{corrected, ln_chi2_above, normal_tails};
 use crate::gram::LONG;
 use crate::scores::{CandidateScorer, Fit, Scored, WithoutExcess};
 
-/// Chance of naming an effect when none is hidden.
-pub const FALSE_ALARM: f64 = 0.01;
-
-/// A candidate that moves the offset is doubtful if its fall of χ² is below this part of that of a level of torque
-/// noise: the unknown part of such a torque is known to first order alone, and leaves traces that candidates follow.
-const BESIDE_A_LEVEL: f64 = 0.02;
-
-/// Relative accuracy of the noise in a mission file: a level within it is not reported as missing.
-const LEVEL_TOLERANCE: f64 = 0.15;
-
-/// A candidate is refused if the values of its two halves differ with a smaller p-value than this: a lasting cause is
-/// constant.
-const HALVES_DIFFER: f64 = 1e-3;
-
-/// Most effects that are added.
-const MOST_ADDED: usize = 4;
-
-/// Candidates that are evaluated in full in each round.
-const LISTED: usize = 12;
-
-/// Candidates whose likelihood is computed where there is an excess.
-const EXPLAINING: usize = 6;
-
-/// Independent segments of full length below which there is no diagnosis.
-const LEAST_SEGMENTS: f64 = 4.0;
-
 /// Standard normal quantile of a one-sided 95 % limit.
 const LIMIT_QUANTILE: f64 = 1.645;
-
-/// Measured over modelled power of a third of a decade above which it is an excess.
-const EXCESS: f64 = 1.25;
-
-/// Significance that an excess needs besides: 3.4e-6 each, 1e-3 over nine channels and fourteen thirds of decades,
-/// plain and partial.
-const EXCESS_SIGMA: f64 = 4.5;
-
-/// False-alarm rate of a coherence with housekeeping, over all drivers and channels: a small part of [`FALSE_ALARM`].
-const COHERENCE_ALARM: f64 = 1e-3;
-
-/// Part of a channel's power that housekeeping has to explain to be unexplained evidence where there is no excess of
-/// power. Actuator currents are coherent with the residuals by a few per cent without driving them: commands and
-/// residuals share the readouts.
-const LEAST_EXPLAINED: f64 = 0.1;
 
 /// Why a candidate has no result.
 const UNOBSERVABLE: &str =
     "unobservable in these data: its series do not change in them, or the model contains the same already";
-
-/// Bias of the offset, σ, from which a candidate counts as moving it.
-const MOVES_OFFSET: f64 = 3.0;
-
-/// Explanations whose χ² differ by less than this are not told apart: the 1 % point of χ² with one degree of freedom.
-const EQUALLY_GOOD: f64 = 6.63;
-
-/// Part of the largest excess that an explanation may leave: the forms that are tried differ from the true one.
-const REMAINDER: f64 = 1e-3;
-
-/// An excess wholly below this frequency is called a drift: slower than an hour.
-const DRIFT_HZ: f64 = 1.0 / 3600.0;
 
 /// Why there is no diagnosis.
 #[derive(Debug, thiserror::Error)]
@@ -85,10 +33,12 @@ pub enum DiagnosisError {
     Estimate(#[from] EstimateError),
     /// Too little data.
     #[error(
-        "a diagnosis needs at least {LEAST_SEGMENTS} segments of {segment_s:.0} s without a gap, and there are {segments:.1}: give more telemetry, \
+        "a diagnosis needs at least {needed} segments of {segment_s:.0} s without a gap, and there are {segments:.1}: give more telemetry, \
          or several products"
     )]
     TooShort {
+        /// Segments that are needed.
+        needed: f64,
         /// Segments there are.
         segments: f64,
         /// Their length.
@@ -231,7 +181,7 @@ pub struct RefinementRequest {
 }
 
 /// Numbers of trials for the correction of p-values. Every effect, and the search for transients, has the same part of
-/// [`FALSE_ALARM`]; an effect's part is shared by all its forms (weighted Bonferroni; the weights are fixed before the
+/// [`Settings::false_alarm`]; an effect's part is shared by all its forms (weighted Bonferroni; the weights are fixed before the
 /// data are seen).
 ///
 /// With equal weights of all forms, an effect of one form would pay for the ten thousand pairs of thermometers and lags
@@ -285,10 +235,11 @@ pub fn diagnose(
     scorer: &CandidateScorer<'_>,
     tried_before: &BTreeMap<String, usize>,
 ) -> Result<Diagnosis, DiagnosisError> {
+    let settings = scorer.settings;
     let segment_s = scorer.gathered.length as f64 / scorer.gathered.rate_hz;
     let segments = short_segments(scorer);
-    if segments < LEAST_SEGMENTS {
-        return Err(DiagnosisError::TooShort { segments, segment_s });
+    if segments < settings.min_segments {
+        return Err(DiagnosisError::TooShort { needed: settings.min_segments, segments, segment_s });
     }
     let mut fit = scorer.fit(&[])?;
     let mut accepted: Vec<Found> = Vec::new();
@@ -301,19 +252,19 @@ pub fn diagnose(
     tried_before.iter().for_each(|(effect, n)| *forms.entry(effect.clone()).or_default() += n);
     let trials = Trials::new(scorer, &forms);
     let mut ranked = first.all;
-    let mut requests = refinement_requests(&trials, &ranked);
+    let mut requests = refinement_requests(settings, &trials, &ranked);
     let mut others: Vec<Found> = loop {
         sort_by_p_value(&trials, &mut ranked);
         let mut evaluated: Vec<(Found, Candidate)> = ranked
             .iter()
-            .take(LISTED)
+            .take(settings.max_evaluated)
             .map(|scored| (evaluate(scorer, &fit, scored, &ranked, &trials), scored.candidate.clone()))
             .collect();
         for (f, candidate) in &mut evaluated {
             // Only on the refined grid: on a coarse one the wrong colour costs more likelihood than the regressor
             // explains.
             let finely = tried_before.contains_key(&candidate.effect);
-            let stands_out = f.p_value < FALSE_ALARM && f.in_range && accepted.len() < MOST_ADDED;
+            let stands_out = f.p_value < settings.false_alarm && f.in_range && accepted.len() < settings.max_added;
             // The likelihood chooses the shape. The evidence remains the score, as for effects that filter no noise.
             let chosen = if finely && stands_out { scorer.coloured(&fit, candidate)? } else { None };
             if let Some(form) = chosen {
@@ -321,7 +272,7 @@ pub fn diagnose(
                 *candidate = form;
             }
         }
-        if accepted.len() < MOST_ADDED {
+        if accepted.len() < settings.max_added {
             for (f, candidate) in candidates_of_excess(scorer, &fit, &trials)? {
                 let of = |w: &(Found, Candidate)| (&w.0.effect, &w.0.instance) == (&f.effect, &f.instance);
                 match evaluated.iter().position(of) {
@@ -332,9 +283,9 @@ pub fn diagnose(
             }
             evaluated.sort_by(|a, b| a.0.log10_p_value.total_cmp(&b.0.log10_p_value));
         }
-        let helps = |f: &Found| f.held_out_p_value.is_none_or(|p| p > HALVES_DIFFER);
-        let good = |(f, _): &(Found, Candidate)| f.p_value < FALSE_ALARM && f.in_range && helps(f);
-        let Some(best) = evaluated.iter().position(good).filter(|_| accepted.len() < MOST_ADDED) else {
+        let helps = |f: &Found| f.held_out_p_value.is_none_or(|p| p > settings.halves_p_value);
+        let good = |(f, _): &(Found, Candidate)| f.p_value < settings.false_alarm && f.in_range && helps(f);
+        let Some(best) = evaluated.iter().position(good).filter(|_| accepted.len() < settings.max_added) else {
             break evaluated.into_iter().map(|(f, _)| f).collect();
         };
         let mut added = fit.added.clone();
@@ -343,7 +294,7 @@ pub fn diagnose(
         let before = std::mem::replace(&mut ranked, scorer.rank(&fit).all);
         let mut f = Found { accepted: true, ..evaluated[best].0.clone() };
         if !f.of_excess {
-            f.confounders.extend(equally_good(&f, &before, &ranked));
+            f.confounders.extend(equally_good(settings, &f, &before, &ranked));
             f.confounders.sort();
             f.confounders.dedup();
         }
@@ -361,8 +312,8 @@ pub fn diagnose(
         let mut both = accepted.iter().zip(&fit.added);
         let part = |candidate: &Candidate| scorer.part_in(&fit, &plain, candidate, &excess);
         // A small remainder of the largest excess is what the grid of forms cannot represent.
-        let loud = unexplained.as_ref().filter(|u| !u.power || u.ratio > REMAINDER * loudest);
-        let Some(doubtful) = both.position(|(f, c)| is_doubtful(f, part(c), &extra, loud)) else {
+        let loud = unexplained.as_ref().filter(|u| !u.power || u.ratio > settings.excess_remainder * loudest);
+        let Some(doubtful) = both.position(|(f, c)| is_doubtful(settings, f, part(c), &extra, loud)) else {
             break (extra, unexplained);
         };
         others.insert(0, Found { accepted: false, ..accepted.remove(doubtful) });
@@ -394,7 +345,7 @@ pub fn diagnose(
     let upper_limits = limits(scorer, &ranked, &candidates);
     Ok(Diagnosis {
         verdict: verdict.to_owned(),
-        false_alarm_rate: FALSE_ALARM,
+        false_alarm_rate: settings.false_alarm,
         tried: trials.total(),
         candidates,
         upper_limits,
@@ -427,12 +378,13 @@ fn candidates_of_excess(
     fit: &Fit,
     trials: &Trials,
 ) -> Result<Vec<(Found, Candidate)>, DiagnosisError> {
+    let settings = scorer.settings;
     let Some(WithoutExcess { plain, bands, observations }) = scorer.without_excess(fit) else { return Ok(Vec::new()) };
     let before = scorer.deviance(fit, &bands, &fit.added)?;
     let mut ranked = scorer.rank(&plain).all;
     sort_by_p_value(trials, &mut ranked);
     let mut out = Vec::new();
-    for scored in ranked.iter().filter(|s| s.in_range).take(EXPLAINING) {
+    for scored in ranked.iter().filter(|s| s.in_range).take(settings.max_excess_candidates) {
         let mut added = fit.added.clone();
         added.push(scored.candidate.clone());
         let dof = scored.candidate.parts.len() as f64;
@@ -455,13 +407,13 @@ fn candidates_of_excess(
 /// - It was selected by an excess of power, or has `part` > ½ of its information in the bands of one, and an excess or
 ///   a coherence with
 ///   housekeeping remains in its channels: it correlates with the cause and is not the cause.
-/// - It moves the offset, and its fall of χ² is below [`BESIDE_A_LEVEL`] of that of a level of noise that drives an
+/// - It moves the offset, and its fall of χ² is below [`Settings::level_trace`] of that of a level of noise that drives an
 ///   estimate (see there). It should be tried again with that level in the model.
-fn is_doubtful(f: &Found, part: f64, extra: &[Found], unexplained: Option<&Unexplained>) -> bool {
+fn is_doubtful(settings: &Settings, f: &Found, part: f64, extra: &[Found], unexplained: Option<&Unexplained>) -> bool {
     // For an effect selected by an excess, a remaining coherence is as much evidence as remaining power.
     let remains = |u: &Unexplained| (u.power || f.of_excess) && f.channels.iter().any(|c| u.channels.contains(c));
-    let louder = |e: &Found| e.accepted && e.drives_estimate && f.delta_chi2 < BESIDE_A_LEVEL * e.delta_chi2;
-    let moves = f.offset_shift_sigma.values().any(|sigmas| sigmas.abs() > MOVES_OFFSET);
+    let louder = |e: &Found| e.accepted && e.drives_estimate && f.delta_chi2 < settings.level_trace * e.delta_chi2;
+    let moves = f.offset_shift_sigma.values().any(|sigmas| sigmas.abs() > settings.moves_offset_sigmas);
     (f.of_excess || part > 0.5) && unexplained.is_some_and(remains) || moves && extra.iter().any(louder)
 }
 
@@ -472,18 +424,18 @@ fn sort_by_p_value(trials: &Trials, ranked: &mut [Scored]) {
 }
 
 /// Candidates that stand out beside the model alone.
-fn refinement_requests(trials: &Trials, ranked: &[Scored]) -> Vec<RefinementRequest> {
+fn refinement_requests(settings: &Settings, trials: &Trials, ranked: &[Scored]) -> Vec<RefinementRequest> {
     let p_value = |s: &Scored| trials.p_value(family(&s.candidate), s.delta_chi2, s.candidate.parts.len() as f64).0;
     let request = |s: &Scored| RefinementRequest {
         effect: s.candidate.effect.clone(),
         instance: s.candidate.instance.clone(),
         shape: s.candidate.parts[0].1.shape.clone(),
     };
-    ranked.iter().filter(|s| !s.candidate.transient && p_value(s) < FALSE_ALARM).map(request).collect()
+    ranked.iter().filter(|s| !s.candidate.transient && p_value(s) < settings.false_alarm).map(request).collect()
 }
 
 /// Candidates that explained as much as `chosen` before it was added, and nothing beside it: equally good explanations.
-fn equally_good(chosen: &Found, before: &[Scored], beside: &[Scored]) -> Vec<String> {
+fn equally_good(settings: &Settings, chosen: &Found, before: &[Scored], beside: &[Scored]) -> Vec<String> {
     let worth = |all: &[Scored], name: &str| {
         all.iter().find(|s| !s.candidate.transient && s.candidate.name() == name).map_or(0.0, |s| s.delta_chi2)
     };
@@ -491,7 +443,10 @@ fn equally_good(chosen: &Found, before: &[Scored], beside: &[Scored]) -> Vec<Str
     let own = format!("{}:{}", chosen.effect, chosen.instance);
     names
         .filter(|name| *name != own)
-        .filter(|name| worth(before, name) > chosen.delta_chi2 - EQUALLY_GOOD && worth(beside, name) < EQUALLY_GOOD)
+        .filter(|name| {
+            worth(before, name) > chosen.delta_chi2 - settings.equally_good_chi2
+                && worth(beside, name) < settings.equally_good_chi2
+        })
         .collect()
 }
 
@@ -585,6 +540,7 @@ fn estimate_again(scorer: &CandidateScorer<'_>, fit: &Fit, found: &mut [Found]) 
 
 /// Noise levels by forward selection: those that matter are accepted, and `levels` takes them over.
 fn noise_levels(scorer: &CandidateScorer<'_>, fit: &Fit, levels: &mut Levels<'_>, trials: &Trials) -> Vec<Found> {
+    let settings = scorer.settings;
     let residuals = scorer.residual_psd_of_sets(fit);
     let halves = [0, 1].map(|set| scorer.levels(fit, &scorer.gathered.sets[set], &residuals[set]));
     let asked: Vec<usize> = (0..scorer.candidate_set.coefficients.len())
@@ -608,12 +564,13 @@ fn noise_levels(scorer: &CandidateScorer<'_>, fit: &Fit, levels: &mut Levels<'_>
                 let difference = (a.value - b.value).abs() / a.sigma.hypot(b.sigma);
                 let chance = Some(normal_tails(difference)).filter(|_| difference.is_finite());
                 let shows = |half: &Level| (half.value - 1.0) / (level.value - 1.0) > 0.5;
-                (chance, chance.is_none_or(|p| p > HALVES_DIFFER) || shows(&a) && shows(&b))
+                (chance, chance.is_none_or(|p| p > settings.halves_p_value) || shows(&a) && shows(&b))
             }
             _ => (None, true),
         };
-        let matters = p_value < FALSE_ALARM && steady && (level.value.ln()).abs() > LEVEL_TOLERANCE.ln_1p();
-        if p_value < FALSE_ALARM {
+        let matters =
+            p_value < settings.false_alarm && steady && (level.value.ln()).abs() > settings.level_tolerance.ln_1p();
+        if p_value < settings.false_alarm {
             levels.take(&level);
         }
         out.push(Found {
@@ -647,7 +604,7 @@ fn noise_levels(scorer: &CandidateScorer<'_>, fit: &Fit, levels: &mut Levels<'_>
             drives_estimate: scorer.noise.is_estimated(&c.noise),
         });
         left.retain(|j| *j != i);
-        if p_value >= FALSE_ALARM {
+        if p_value >= settings.false_alarm {
             return out;
         }
     }
@@ -655,7 +612,7 @@ fn noise_levels(scorer: &CandidateScorer<'_>, fit: &Fit, levels: &mut Levels<'_>
 
 /// Transients that are certain; the candidates decide on their cause.
 fn transients(scorer: &CandidateScorer<'_>) -> Vec<Value> {
-    scorer.gathered.transients.certain(FALSE_ALARM).map(|h| json!(h)).collect()
+    scorer.gathered.transients.certain(scorer.settings.false_alarm).map(|h| json!(h)).collect()
 }
 
 fn limits(scorer: &CandidateScorer<'_>, rest: &[Scored], named: &[Found]) -> Vec<Limit> {
@@ -687,26 +644,27 @@ fn limits(scorer: &CandidateScorer<'_>, rest: &[Scored], named: &[Found]) -> Vec
 /// the residuals. Either is evidence of an unknown cause; a slow force shows in the coherence long before it shows in
 /// the power.
 fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
+    let settings = scorer.settings;
     let plan = scorer.plan();
     let channels = &scorer.candidate_set.channels;
     let mut loud: Vec<(usize, [f64; 2], f64)> = Vec::new();
     for (bands, n, ratios) in levels.excesses() {
         let hz = |b: usize| plan.frequency_hz(plan.bands[b]);
-        let certain = chi2_per_dof_at(2.0 * n, EXCESS_SIGMA);
-        let above = |(_, ratio): &(usize, f64)| n > 0.0 && *ratio > certain.max(EXCESS);
+        let certain = chi2_per_dof_at(2.0 * n, settings.excess_sigmas);
+        let above = |(_, ratio): &(usize, f64)| n > 0.0 && *ratio > certain.max(settings.excess_ratio);
         let found = ratios.into_iter().enumerate().filter(above);
         loud.extend(found.map(|(c, ratio)| (c, [hz(bands.start), hz(bands.end - 1)], ratio)));
     }
     let all = scorer.gathered.housekeeping.coherences(channels);
     let significant: Vec<Coherence> = all
         .into_iter()
-        .filter(|w| corrected(ln_chi2_above(w.statistic, w.dof).exp(), w.trials) < COHERENCE_ALARM)
+        .filter(|w| corrected(ln_chi2_above(w.statistic, w.dof).exp(), w.trials) < settings.coherence_false_alarm)
         .collect();
     let power = !loud.is_empty();
     if !power {
         // A driver that explains a part x of the power raises it by 1/(1 − x).
         let of = |w: &Coherence| channels.iter().position(|c| *c == w.channel);
-        let best = significant.iter().find(|w| w.explained > LEAST_EXPLAINED)?;
+        let best = significant.iter().find(|w| w.explained > settings.coherence_min_explained)?;
         loud.push((of(best)?, best.band_hz, (1.0 - best.explained.clamp(0.0, 0.999)).recip()));
     }
     let (_, band_hz, ratio) = *loud.iter().max_by(|a, b| a.2.total_cmp(&b.2))?;
@@ -715,7 +673,7 @@ fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>) -> Option<Unex
     names.dedup();
     let kind = if scorer.gathered.transients.detections.iter().any(|h| h.significance > 10.0) {
         "transient"
-    } else if band_hz[1] < DRIFT_HZ {
+    } else if band_hz[1] < settings.drift_hz {
         "drift"
     } else {
         "broadband"
@@ -752,11 +710,11 @@ mod tests {
         for (effect, n) in [("many", 10_000.0), ("one", 1.0)] {
             // The χ² at which this effect alone has half the false-alarm rate.
             let mut chi2 = 0.0;
-            while trials.p_value(effect, chi2, 1.0).0 > FALSE_ALARM {
+            while trials.p_value(effect, chi2, 1.0).0 > Settings::default().false_alarm {
                 chi2 += 0.01;
             }
             let alone = 1.0 - (1.0 - ln_chi2_above(chi2, 1.0).exp()).powf(n);
-            assert!((alone / (0.5 * FALSE_ALARM) - 1.0).abs() < 0.02, "{effect}: {alone}");
+            assert!((alone / (0.5 * Settings::default().false_alarm) - 1.0).abs() < 0.02, "{effect}: {alone}");
         }
         assert!(trials.p_value("one", 20.0, 1.0).1 < trials.p_value("many", 25.0, 1.0).1);
     }
@@ -809,23 +767,24 @@ mod tests {
             (0.9, Some(excess("tm1.accel.x", false)), false),
             (0.9, None, false),
         ] {
-            assert_eq!(is_doubtful(&slow, part, &[], left.as_ref()), doubtful, "{part} {left:?}");
+            assert_eq!(is_doubtful(&Settings::default(), &slow, part, &[], left.as_ref()), doubtful, "{part} {left:?}");
         }
         let of_excess = Found { of_excess: true, ..found(&["tm1.accel.x"], 0.0, true) };
-        assert!(is_doubtful(&of_excess, 0.1, &[], Some(&excess("tm1.accel.x", true))));
-        assert!(is_doubtful(&of_excess, 0.1, &[], Some(&excess("tm1.accel.x", false))));
-        assert!(!is_doubtful(&of_excess, 0.1, &[], Some(&excess("tm2.accel.z", true))));
-        assert!(!is_doubtful(&of_excess, 0.1, &[], None));
+        assert!(is_doubtful(&Settings::default(), &of_excess, 0.1, &[], Some(&excess("tm1.accel.x", true))));
+        assert!(is_doubtful(&Settings::default(), &of_excess, 0.1, &[], Some(&excess("tm1.accel.x", false))));
+        assert!(!is_doubtful(&Settings::default(), &of_excess, 0.1, &[], Some(&excess("tm2.accel.z", true))));
+        assert!(!is_doubtful(&Settings::default(), &of_excess, 0.1, &[], None));
         let (gain, still) = (found(&["tm1.accel.y"], 12.0, true), found(&["tm1.accel.y"], 1.0, true));
         let level = |drives_estimate, accepted, times: f64| {
             let delta_chi2 = times * gain.delta_chi2;
             [Found { delta_chi2, drives_estimate, ..found(&["sc.alpha.z"], 0.0, accepted) }]
         };
         let torque = level(true, true, 100.0);
-        assert!(is_doubtful(&gain, 0.0, &torque, None) && !is_doubtful(&still, 0.0, &torque, None));
+        let doubtful = |f: &Found, extra: &[Found]| is_doubtful(&Settings::default(), f, 0.0, extra, None);
+        assert!(doubtful(&gain, &torque) && !doubtful(&still, &torque));
         // A cause with a tenth of the level's χ² is no trace of it.
-        assert!(!is_doubtful(&gain, 0.0, &level(true, true, 10.0), None));
-        assert!(!is_doubtful(&gain, 0.0, &level(true, false, 100.0), None));
-        assert!(!is_doubtful(&gain, 0.0, &level(false, true, 100.0), None));
+        assert!(!doubtful(&gain, &level(true, true, 10.0)));
+        assert!(!doubtful(&gain, &level(true, false, 100.0)));
+        assert!(!doubtful(&gain, &level(false, true, 100.0)));
     }
 }

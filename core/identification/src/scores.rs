@@ -14,6 +14,7 @@ use dragfree_estimation::estimate::{Estimate, EstimateError, Observed, Refinemen
 use dragfree_estimation::levels::Levels;
 use dragfree_estimation::sigma::{BandNoise, NoiseModel};
 use dragfree_estimation::spectra::{Layout, Plan, Spectra, Sums};
+use dragfree_schema::Settings;
 use nalgebra::{Cholesky, DMatrix, DVector};
 
 use crate::candidates::{Candidate, CandidateSet};
@@ -21,19 +22,6 @@ use crate::gram::{Gram, GramSums};
 
 /// Refinements of Σ from the residuals.
 const REFINEMENTS: usize = 3;
-
-/// Local maxima of the score over a grid of shapes from which the search for the highest likelihood starts.
-const SUMMITS: usize = 3;
-
-/// Correlation of two candidates, beside the model, above which the data cannot tell them apart.
-pub const CONFOUNDED: f64 = 0.95;
-
-/// The taper's loss of a waveform's energy is corrected up to this factor: with less left, its amplitude rests on too
-/// few samples.
-const MAX_TAPER_LOSS: f64 = 4.0;
-
-/// A candidate is degenerate with the model if the model leaves less than this part of its information.
-const DEGENERATE: f64 = 0.02;
 
 /// A model fitted to the sums.
 pub struct Fit {
@@ -118,6 +106,8 @@ pub struct CandidateScorer<'a> {
     pub total: Gram,
     /// Noise as it is declared.
     pub noise: &'a NoiseModel,
+    /// Thresholds.
+    pub settings: &'a Settings,
     noise_in_bands: BandNoise<'a>,
     plan: Plan,
 }
@@ -140,10 +130,15 @@ struct Scores {
 impl<'a> CandidateScorer<'a> {
     /// Takes the sums.
     #[must_use]
-    pub fn new(candidate_set: &'a CandidateSet, gathered: &'a GramSums, noise: &'a NoiseModel) -> Self {
+    pub fn new(
+        candidate_set: &'a CandidateSet,
+        gathered: &'a GramSums,
+        noise: &'a NoiseModel,
+        settings: &'a Settings,
+    ) -> Self {
         let plan = gathered.plan();
         let noise_in_bands = BandNoise::new(noise, &plan);
-        Self { candidate_set, gathered, total: gathered.total(), noise, noise_in_bands, plan }
+        Self { candidate_set, gathered, total: gathered.total(), noise, settings, noise_in_bands, plan }
     }
 
     /// Bands.
@@ -292,7 +287,7 @@ impl<'a> CandidateScorer<'a> {
         let highest = |i: &usize| neighbours(&forms[*i], forms.iter()).iter().all(|(_, n)| score(n) <= scores[*i]);
         let mut summits: Vec<usize> = (0..forms.len()).filter(highest).collect();
         summits.sort_by(|a, b| scores[*b].total_cmp(&scores[*a]));
-        summits.truncate(SUMMITS);
+        summits.truncate(self.settings.likelihood_starts);
         let mut known: BTreeMap<usize, f64> = BTreeMap::new();
         let mut likelihood = |i: usize| -> Result<f64, EstimateError> {
             if let Some(value) = known.get(&i) {
@@ -417,7 +412,7 @@ impl<'a> CandidateScorer<'a> {
         let energy = candidate.parts.iter().flat_map(|(_, form)| &form.terms).find_map(|t| {
             let energy = self.gathered.columns.energy_of(t.column)?;
             let windowed = self.total.bands.iter().zip(&equal_time).map(|(g, k)| g[(t.column, t.column)] * k);
-            Some(energy.iter().copied().zip(windowed).map(ratio).map(|r| r.min(MAX_TAPER_LOSS)).collect())
+            Some(energy.iter().copied().zip(windowed).map(ratio).map(|r| r.min(self.settings.max_taper_loss)).collect())
         });
         let lasts = || equal_time.iter().copied().zip(weights.kept()).map(|(e, k)| ratio((k, e)).min(1.0)).collect();
         let factors: Vec<f64> = energy.unwrap_or_else(lasts);
@@ -523,11 +518,11 @@ impl<'a> CandidateScorer<'a> {
             let own = self.between(&self.total, scores, &scored.candidate, &other.candidate);
             let shared = value.dot(&(&own * &their_value)) - model.dot(&(&scores.covariance * &their_model));
             let both = norm(scored, &value) * norm(other, &their_value);
-            if both > 0.0 && shared.abs() > CONFOUNDED * both.sqrt() {
+            if both > 0.0 && shared.abs() > self.settings.confounded * both.sqrt() {
                 names.push(other.candidate.name());
             }
         }
-        if scored.left < DEGENERATE {
+        if scored.left < self.settings.degenerate {
             let share = |q: usize| model[q].powi(2) * scores.covariance[(q, q)];
             let free = &fit.estimate.free;
             let lead = (0..free.len()).max_by(|a, b| share(*a).total_cmp(&share(*b)));
@@ -708,11 +703,11 @@ mod tests {
     /// eight times).
     #[test]
     fn an_event_has_the_error_of_least_squares_wherever_it_is() {
-        let (candidate_set, noise) = (candidate_set(), noise());
+        let (candidate_set, noise, settings) = (candidate_set(), noise(), Settings::default());
         let mut natural: Vec<f64> = Vec::new();
         for (k, at) in (0..8).map(|k| (k, 9000 + 64 * k)) {
             let gathered = gathered(7 + k as u64, SAMPLES, at, 6.0, 0.0);
-            let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise);
+            let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise, &settings);
             let scored = transient(&scorer.rank(&scorer.fit(&[]).unwrap()), "one");
             let sigma = scored.information[(0, 0)].sqrt().recip();
             let exact = (VARIANCE / 4.0).sqrt();
@@ -728,12 +723,12 @@ mod tests {
     /// 0.91/0.19. Within 4.5σ, twice (false alarm 1.4e-5).
     #[test]
     fn what_a_range_holds_back_comes_back_beside_a_candidate() {
-        let (mut candidate_set, noise) = (candidate_set(), noise());
+        let (mut candidate_set, noise, settings) = (candidate_set(), noise(), Settings::default());
         let gathered = gathered(5, SAMPLES, 9000, 0.0, 1.0);
         for limit in [None, Some(0.1)] {
             let form = &mut candidate_set.coefficients[0].forms[0];
             (form.lower, form.upper) = (limit.map(|x: f64| -x), limit);
-            let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise);
+            let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise, &settings);
             let fit = scorer.fit(&[]).unwrap();
             assert_eq!(fit.estimate.active.len(), usize::from(limit.is_some()));
             let ranked = scorer.rank(&fit);
@@ -751,10 +746,10 @@ mod tests {
     /// it. One that acts on another channel is none, and a lasting cause of the same instance is ranked apart.
     #[test]
     fn an_event_is_told_from_what_it_can_be_told_from() {
-        let (candidate_set, noise) = (candidate_set(), noise());
+        let (candidate_set, noise, settings) = (candidate_set(), noise(), Settings::default());
         assert_eq!(candidate_set.places().len(), 4);
         let gathered = gathered(3, SAMPLES, 9000, 6.0, 0.0);
-        let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise);
+        let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise, &settings);
         let fit = scorer.fit(&[]).unwrap();
         let ranked = scorer.rank(&fit);
         let [one, both] = ["one", "both"].map(|instance| transient(&ranked, instance));

@@ -14,6 +14,7 @@ mod model;
 mod noise;
 mod number;
 mod report;
+mod settings;
 pub mod state;
 
 pub use available::{Available, NoSuchCoefficient};
@@ -22,3 +23,4 @@ pub use manifest::{Manifest, Parameter, ParameterType};
 pub use model::{Coefficient, Colour, Constraint, Model, Response, Shape, Transient, Variant};
 pub use noise::{NOISE_ATTRIBUTE, NoiseEstimate, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm};
 pub use report::{Attachment, Covariance, Estimate, Report};
+pub use settings::Settings;

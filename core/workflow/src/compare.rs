@@ -20,12 +20,13 @@ pub fn compare(
     replay: &Replay<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Comparison, WorkflowError> {
-    let record = sum(replay, What::Model, progress)?;
+    let settings = replay.settings()?;
+    let record = sum(replay, &settings, What::Model, progress)?;
     let noise = record.noise_model()?;
-    let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise);
+    let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, &settings);
     let products = || replay.products.iter().map(|p| &p.product);
-    let innovations = Innovations::judge(&octaves(products()), record.gathered.rate_hz);
-    Ok(compare::compare(&scorer, nis(products()), innovations)?)
+    let innovations = Innovations::judge(&octaves(products()), record.gathered.rate_hz, settings.false_alarm);
+    Ok(compare::compare(&scorer, nis(products(), settings.false_alarm), innovations)?)
 }
 
 /// What a stage says of the innovations of its recursive filters: name of the body, then its figures.
@@ -51,7 +52,7 @@ fn readouts_per_update(stage: &Table) -> Option<f64> {
 }
 
 /// Mean normalised innovation squared of the recursive filters of all products together.
-fn nis<'a>(products: impl Iterator<Item = &'a Product>) -> Option<Nis> {
+fn nis<'a>(products: impl Iterator<Item = &'a Product>, false_alarm: f64) -> Option<Nis> {
     let dof = |p: &Product| {
         let of = |(name, stage): (&String, &Table)| {
             Some(*p.quality.counts.get(name)?.get("updates")? as f64 * readouts_per_update(stage)?)
@@ -61,7 +62,7 @@ fn nis<'a>(products: impl Iterator<Item = &'a Product>) -> Option<Nis> {
     let known = |(nis, dof): &(f64, f64)| nis.is_finite() && *dof > 0.0;
     let all: Vec<(f64, f64)> = products.map(|p| (p.quality.nis, dof(p))).filter(known).collect();
     let dof: f64 = all.iter().map(|(_, n)| n).sum();
-    (!all.is_empty()).then(|| Nis::new(all.iter().map(|(nis, n)| nis * n).sum::<f64>() / dof, dof))
+    (!all.is_empty()).then(|| Nis::new(all.iter().map(|(nis, n)| nis * n).sum::<f64>() / dof, dof, false_alarm))
 }
 
 /// Mean square and count of each readout's innovations, octave by octave, of all products together.
@@ -106,7 +107,7 @@ mod tests {
         assert_eq!(readouts_per_update(&stage(&[&["tm1", "tm2"]])), Some(6.0));
         assert_eq!(readouts_per_update(&stage(&[&["tm1"]])), Some(3.0));
         assert_eq!(readouts_per_update(&Table::new()), None);
-        let width = |dof: f64| Nis::new(1.0, dof).bounds.map(|b| b - 1.0);
+        let width = |dof: f64| Nis::new(1.0, dof, 0.01).bounds.map(|b| b - 1.0);
         // Of χ²/dof the bounds narrow as 1/√dof.
         let [three, six] = [3e6, 6e6].map(width);
         assert!((0..2).all(|i| (three[i] / six[i] - 2f64.sqrt()).abs() < 1e-2), "{three:?} {six:?}");

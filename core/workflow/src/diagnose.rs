@@ -11,19 +11,10 @@ use dragfree_identification::diagnosis::{self, Diagnosis, Found, RefinementReque
 use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::transient::Detection;
+use dragfree_schema::Settings;
 
 use crate::WorkflowError;
 use crate::replay::{FINE, Pass, Replay, What, sum};
-
-/// Most transients that become candidates.
-const MOST_EVENTS: usize = 8;
-
-/// A transient becomes a candidate if a search of pure noise has as loud a peak with a smaller chance than this;
-/// whether it is certain is decided among the candidates.
-const WORTH_TRYING: f64 = 0.5;
-
-/// A detection within this of a louder one is its ringing in another window, ns.
-const SAME_EVENT_NS: i64 = 3_600_000_000_000;
 
 /// A diagnosis and the sums that it rests on.
 pub struct Diagnosed {
@@ -31,6 +22,8 @@ pub struct Diagnosed {
     pub record: Record,
     /// What they say.
     pub diagnosis: Diagnosis,
+    /// Thresholds.
+    pub settings: Settings,
 }
 
 /// Diagnoses the data of products of one model. `progress` is told the pass and the number of the product.
@@ -41,16 +34,18 @@ pub fn diagnose(
     replay: &Replay<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Diagnosed, WorkflowError> {
-    let found = sum(replay, What::Transients, progress)?.gathered.transients;
-    let detected: Vec<Detection> = found.certain(WORTH_TRYING).take(MOST_EVENTS).cloned().collect();
+    let settings = replay.settings()?;
+    let found = sum(replay, &settings, What::Transients, progress)?.gathered.transients;
+    let detected: Vec<Detection> =
+        found.certain(settings.transient_p_value).take(settings.max_transients).cloned().collect();
     let mut pass = |requests: &[RefinementRequest], tried_before: &BTreeMap<String, usize>| {
-        let mut record = sum(replay, What::Candidates(&detected, requests), progress)?;
+        let mut record = sum(replay, &settings, What::Candidates(&detected, requests), progress)?;
         record.gathered.transients = found.clone();
         let noise = record.noise_model()?;
-        let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise);
+        let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, &settings);
         let mut diagnosis = diagnosis::diagnose(&scorer, tried_before)?;
         diagnosis.not_tried.extend(record.not_tried.iter().cloned());
-        Ok::<_, WorkflowError>(Diagnosed { record, diagnosis })
+        Ok::<_, WorkflowError>(Diagnosed { record, diagnosis, settings: settings.clone() })
     };
     let first = pass(&[], &BTreeMap::new())?;
     let mut requests = first.diagnosis.refinement_requests.clone();
@@ -71,15 +66,16 @@ impl Diagnosed {
     #[must_use]
     pub fn unexplained_transients(&self) -> Vec<&Detection> {
         let seen = self.record.gathered.transients.certain(self.diagnosis.false_alarm_rate);
-        unexplained(seen, &self.diagnosis.candidates)
+        unexplained(seen, &self.diagnosis.candidates, self.settings.same_transient_s)
     }
 }
 
-fn unexplained<'a>(seen: impl Iterator<Item = &'a Detection>, candidates: &[Found]) -> Vec<&'a Detection> {
+fn unexplained<'a>(seen: impl Iterator<Item = &'a Detection>, candidates: &[Found], same_s: f64) -> Vec<&'a Detection> {
+    let same_ns = (1e9 * same_s) as i64;
     let accepted = candidates.iter().filter(|f| f.accepted);
     let mut told: Vec<i64> = accepted.filter_map(|f| f.shape.get("at_ns")?.as_i64()).collect();
     let mut is_new = |detection: &&Detection| {
-        let new = told.iter().all(|at_ns| (at_ns - detection.at_ns).abs() > SAME_EVENT_NS);
+        let new = told.iter().all(|at_ns| (at_ns - detection.at_ns).abs() > same_ns);
         told.push(detection.at_ns);
         new
     };
@@ -103,7 +99,7 @@ mod tests {
         };
         let seen = [20_000, 21_800, 24_000, 5_000].map(detection);
         // The third rings beside the second, which rings beside the first.
-        let times: Vec<i64> = unexplained(seen.iter(), &[]).iter().map(|h| h.at_ns / 1_000_000_000).collect();
+        let times: Vec<i64> = unexplained(seen.iter(), &[], 3600.0).iter().map(|h| h.at_ns / 1_000_000_000).collect();
         assert_eq!(times, [20_000, 5_000]);
     }
 }

@@ -10,6 +10,7 @@ use dragfree_engine::sources::Sources;
 use dragfree_identification::diagnosis::RefinementRequest;
 use dragfree_identification::record::Record;
 use dragfree_identification::transient::Detection;
+use dragfree_schema::Settings;
 
 use crate::WorkflowError;
 use crate::sums::{ColumnSums, Request};
@@ -76,6 +77,7 @@ impl What<'_> {
 /// Sums of the data of all products. `progress` is told the pass and the number of the product.
 pub(crate) fn sum(
     replay: &Replay<'_>,
+    settings: &Settings,
     what: What<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Record, WorkflowError> {
@@ -109,9 +111,8 @@ pub(crate) fn sum(
             threads,
         };
         let examination = Examination { product, sources: &sources, candidates: all, threads, batch_rows };
-        let (sums, not_tried) = examine(registry, &examination, |chain| ColumnSums::link(&request, chain), &mut |p| {
-            progress(what.pass(), number, p);
-        })?;
+        let link = |chain: &Chain| ColumnSums::link(&request, chain, settings);
+        let (sums, not_tried) = examine(registry, &examination, link, &mut |p| progress(what.pass(), number, p))?;
         let mut record = sums.record();
         record.not_tried.extend(not_tried);
         match &mut whole {

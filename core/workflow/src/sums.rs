@@ -19,22 +19,15 @@ use dragfree_identification::gram::{Columns, GramAccumulator, LONG};
 use dragfree_identification::record::Record;
 use dragfree_identification::transient::{Detection, Search, Template};
 use dragfree_identification::waveform::Waveform;
-use dragfree_schema::{Available, Coefficient, Column, Constraint, NoiseProcess, Response, Shape, Variant};
+use dragfree_schema::{
+    Available, Coefficient, Column, Constraint, NoiseProcess, Response, Settings, Shape, Variant,
+};
 use nalgebra::DMatrix;
 
 use crate::WorkflowError;
 
-/// Length of a short segment, s.
-const SEGMENT_S: f64 = 1638.4;
-
-/// Rows at the start that wait for the first value of every candidate's series, s: housekeeping may come once a minute.
-const PATIENCE_S: f64 = 120.0;
-
 /// How often Σ is measured from the residuals of the reference.
 const REFINEMENTS: usize = 3;
-
-/// A candidate whose series lack more than this part of their rows is not tried.
-const MISSING: f64 = 0.01;
 
 /// The table of columns that no plugin makes: waveforms that begin at a detection.
 const WAVEFORMS: &str = "waveforms";
@@ -69,6 +62,7 @@ pub(crate) struct ColumnSums {
     missing: Vec<u64>,
     rows: u64,
     waiting: bool,
+    settings: Settings,
 }
 
 impl Sink for ColumnSums {
@@ -106,7 +100,11 @@ impl ColumnSums {
     ///
     /// # Errors
     /// There is no channel, a declared noise contradicts itself, or the reference is of another model.
-    pub(crate) fn link(request: &Request<'_>, chain: &Chain) -> Result<Wanted<Self>, WorkflowError> {
+    pub(crate) fn link(
+        request: &Request<'_>,
+        chain: &Chain,
+        settings: &Settings,
+    ) -> Result<Wanted<Self>, WorkflowError> {
         let available = available(chain);
         let channels: Vec<&Column> = available.of_kind("channel").collect();
         let Some(rate_hz) = channels.first().map(|c| c.rate_hz) else {
@@ -128,7 +126,7 @@ impl ColumnSums {
         let wanted: Vec<usize> = keys.map(place).collect::<Result<_, _>>()?;
         let names: Vec<String> =
             channels.iter().map(|c| name_of(c).to_owned()).chain(sorted.keys.iter().map(|(_, n)| n.clone())).collect();
-        let length = longest_length((SEGMENT_S * rate_hz).round() as usize);
+        let length = longest_length((settings.segment_s * rate_hz).round() as usize);
         let plan = Plan::slow(LONG * length, length, rate_hz);
         let all = Columns {
             names: names.clone(),
@@ -165,6 +163,7 @@ impl ColumnSums {
             missing: vec![0; width],
             rows: 0,
             waiting: true,
+            settings: settings.clone(),
             segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged).of_first(all.fast),
             base: all.base,
             waveforms_at: all.fast - waveforms.len(),
@@ -208,7 +207,7 @@ impl ColumnSums {
         }
         let mut first = columns.first().map_or_else(Vec::new, |c| c.to_vec());
         if self.waiting {
-            let patience = ((PATIENCE_S * self.rate_hz) as u64).saturating_sub(self.rows) as usize;
+            let patience = ((self.settings.patience_s * self.rate_hz) as u64).saturating_sub(self.rows) as usize;
             let lacks = |k: usize| filled.iter().any(|c| c[k].is_nan());
             let wait = (0..time_ns.len()).take_while(|k| *k < patience && lacks(*k)).count();
             first[..wait].fill(f64::NAN);
@@ -232,7 +231,8 @@ impl ColumnSums {
         let mut candidate_set = self.candidate_set;
         let mut not_tried = Vec::new();
         let gappy = |column: usize| {
-            self.missing[column] as f64 > MISSING * self.rows.max(1) as f64 || self.held[column].is_nan()
+            self.missing[column] as f64 > self.settings.max_missing * self.rows.max(1) as f64
+                || self.held[column].is_nan()
         };
         let model = candidate_set.model();
         let mut fewer: BTreeMap<usize, usize> = BTreeMap::new();

@@ -24,7 +24,7 @@ pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Resu
 }
 
 fn screen(diagnosed: &Diagnosed, top: usize, repeated: &str, paint: Paint) -> String {
-    let Diagnosed { record, diagnosis: d } = diagnosed;
+    let Diagnosed { record, diagnosis: d, .. } = diagnosed;
     let mut out = String::new();
     let verdict = match d.verdict.as_str() {
         "missing" => "an effect is missing from the model",

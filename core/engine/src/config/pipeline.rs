@@ -1,5 +1,6 @@
 //! Pipeline and mission files.
 
+use dragfree_schema::Settings;
 use serde::Deserialize;
 use std::path::{Path, PathBuf};
 
@@ -24,6 +25,8 @@ pub struct Pipeline {
     pub source: Option<(String, toml::Table)>,
     /// Stages in order.
     pub nodes: Vec<Node>,
+    /// Thresholds, where they differ from the defaults.
+    pub settings: Settings,
 }
 
 /// An entry of the chain.
@@ -47,6 +50,8 @@ struct File {
     source: Option<SourceEntry>,
     #[serde(default)]
     stage: Vec<StageEntry>,
+    #[serde(default)]
+    settings: Settings,
 }
 
 #[derive(Deserialize)]
@@ -137,6 +142,7 @@ impl Pipeline {
             model: file.pipeline.model.map(|p| folder.join(p)),
             source: file.source.map(|s| (s.plugin, s.parameters)),
             nodes,
+            settings: file.settings,
         })
     }
 }

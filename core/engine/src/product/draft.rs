@@ -7,7 +7,7 @@ use super::file::{
 };
 use crate::border::without_name;
 use chrono::{DateTime, NaiveDate, SecondsFormat, Utc};
-use dragfree_schema::Report;
+use dragfree_schema::{Report, Settings};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// All that a product is made from.
@@ -51,6 +51,8 @@ pub struct Draft {
     pub notes: Vec<String>,
     /// Reports in pipeline order, each with its plugin.
     pub reports: Vec<Report>,
+    /// Thresholds.
+    pub settings: Settings,
     /// When the product is made; the engine has no clock.
     pub created: DateTime<Utc>,
 }
@@ -121,6 +123,7 @@ pub(super) fn product(
         format_version: FORMAT_VERSION.to_owned(),
         header,
         model: draft.model.clone(),
+        settings: toml::Table::try_from(&draft.settings).unwrap_or_default(),
         result,
         quality,
         supersedes,

@@ -27,6 +27,9 @@ pub struct Product {
     pub header: Header,
     /// Model that the estimators used.
     pub model: Model,
+    /// Thresholds; none in products of before they were stored.
+    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
+    pub settings: toml::Table,
     /// What they found.
     pub result: Outcome,
     /// How far to trust it.

@@ -69,6 +69,7 @@ fn draft(value: f64) -> Draft {
             report(json!({"plugin": "es-akf", "nis": 0.99, "epochs_used": 100, "verdict": null})),
             report(qp_report(value)),
         ],
+        settings: Default::default(),
         created: created(1_800_000_000),
     }
 }

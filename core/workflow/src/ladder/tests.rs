@@ -113,6 +113,7 @@ impl Made<'_> {
             counts: BTreeMap::new(),
             notes: Vec::new(),
             reports: vec![serde_json::from_value(report).expect("a report")],
+            settings: Default::default(),
             created: chrono::DateTime::UNIX_EPOCH,
         };
         let folder = tempfile::tempdir().expect("folder");

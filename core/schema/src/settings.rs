@@ -1,0 +1,107 @@
+//! Thresholds of the jobs behind the commands.
+
+use serde::{Deserialize, Serialize};
+
+/// Thresholds of comparison and diagnosis: what each is derived from, or what it trades.
+///
+/// A pipeline file overrides them in its table `[settings]`, where an unknown key is an error; a product stores those that it was
+/// made with.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Settings {
+    /// Chosen. False-alarm rate of a whole comparison or diagnosis: lower misses smaller effects.
+    pub false_alarm: f64,
+    /// Chosen. Independent segments of full length below which there is neither: fewer have too coarse a Σ.
+    pub min_segments: f64,
+    /// Chosen. Length of a short segment, s: longer ones resolve more and leave fewer observations.
+    pub segment_s: f64,
+    /// Chosen. Time at the start that waits for the first value of slow housekeeping, s: it may come once a minute.
+    pub patience_s: f64,
+    /// Chosen. Part of its rows that a candidate's series may lack: gaps are bridged by the last value, which is noise.
+    pub max_missing: f64,
+    /// Chosen. Most transients that become candidates: each is a column of the sums.
+    pub max_transients: usize,
+    /// Chosen. A transient becomes a candidate below this p-value; whether it is certain is decided among the candidates.
+    pub transient_p_value: f64,
+    /// Chosen. Detections this close to a larger one are its ringing in another window, s.
+    pub same_transient_s: f64,
+    /// Chosen. Local maxima of the score over a grid of shapes from which the highest likelihood is searched for.
+    pub likelihood_starts: usize,
+    /// Chosen. Correlation of two candidates, beside the model, above which they are reported as confounders.
+    pub confounded: f64,
+    /// Chosen. A candidate is degenerate with the model if the model leaves less than this part of its information.
+    pub degenerate: f64,
+    /// Chosen. The taper's loss of a waveform's energy is corrected up to this factor: with less left, its amplitude rests on too
+    /// few samples.
+    pub max_taper_loss: f64,
+    /// Chosen. Most effects that are added.
+    pub max_added: usize,
+    /// Chosen. Candidates that are evaluated in full in each round: time against the length of the list.
+    pub max_evaluated: usize,
+    /// Chosen. Candidates whose likelihood is computed where there is an excess: each costs two fits.
+    pub max_excess_candidates: usize,
+    /// Chosen. p-value of the difference of the halves' values below which a candidate is refused: a lasting cause is constant.
+    pub halves_p_value: f64,
+    /// Chosen. Relative accuracy of the noise in a mission file: a level within it is not reported as missing.
+    pub level_tolerance: f64,
+    /// Chosen. A candidate that moves the offset is doubtful if its fall of χ² is below this part of that of a level of torque
+    /// noise: the unknown part of such a torque leaves traces that candidates follow.
+    pub level_trace: f64,
+    /// Chosen. Bias of the offset, σ, from which a candidate counts as moving it.
+    pub moves_offset_sigmas: f64,
+    /// Derived: the 1 % point of χ² with one degree of freedom. Explanations that differ by less are not told apart.
+    pub equally_good_chi2: f64,
+    /// Chosen. Measured over modelled power of a third of a decade above which it is reported as an excess. (Whether Σ absorbs an
+    /// excess is decided at twice the power, in `dragfree_estimation::levels`.)
+    pub excess_ratio: f64,
+    /// Derived: 3.4e-6 each, 1e-3 over nine channels and fourteen thirds of decades, plain and partial.
+    pub excess_sigmas: f64,
+    /// Chosen. Part of the largest excess that an explanation may leave: the forms that are tried differ from the true one.
+    pub excess_remainder: f64,
+    /// Chosen. False-alarm rate of a coherence with housekeeping over all drivers and channels: a small part of `false_alarm`.
+    pub coherence_false_alarm: f64,
+    /// Chosen. Part of a channel's power that housekeeping has to explain to be evidence where there is no excess: currents of
+    /// actuators follow commands, which share the readouts with the residuals, by a few per cent.
+    pub coherence_min_explained: f64,
+    /// Chosen. An excess wholly below this frequency is called a drift, Hz: slower than an hour.
+    pub drift_hz: f64,
+    /// Chosen. Most coherences in a comparison.
+    pub max_coherences: usize,
+    /// Chosen. Probability outside the intervals of the spectra of a comparison.
+    pub outside_interval: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            false_alarm: 0.01,
+            min_segments: 4.0,
+            segment_s: 1638.4,
+            patience_s: 120.0,
+            max_missing: 0.01,
+            max_transients: 8,
+            transient_p_value: 0.5,
+            same_transient_s: 3600.0,
+            likelihood_starts: 3,
+            confounded: 0.95,
+            degenerate: 0.02,
+            max_taper_loss: 4.0,
+            max_added: 4,
+            max_evaluated: 12,
+            max_excess_candidates: 6,
+            halves_p_value: 1e-3,
+            level_tolerance: 0.15,
+            level_trace: 0.02,
+            moves_offset_sigmas: 3.0,
+            equally_good_chi2: 6.63,
+            excess_ratio: 1.25,
+            excess_sigmas: 4.5,
+            excess_remainder: 1e-3,
+            coherence_false_alarm: 1e-3,
+            coherence_min_explained: 0.1,
+            drift_hz: 1.0 / 3600.0,
+            max_coherences: 40,
+            outside_interval: 0.05,
+        }
+    }
+}
