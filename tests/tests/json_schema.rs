@@ -1,6 +1,6 @@
 //! The JSON Schema beside plugin.h is that of the types. With `DRAGFREE_WRITE_SCHEMA=1` this test writes it anew.
 
-use dragfree_schema::{Coefficient, Constraint, Manifest, Model, NoiseProcess, Report};
+use dragfree_schema::{Coefficient, Constraint, Manifest, Model, NoiseProcess, Report, Settings};
 use schemars::{JsonSchema, schema_for};
 use std::path::Path;
 
@@ -25,6 +25,7 @@ fn the_committed_schemas_are_those_of_the_types() {
     committed::<NoiseProcess>("noise_process");
     committed::<Model>("model");
     committed::<Report>("report");
+    committed::<Settings>("settings");
 }
 
 /// The examples of the guide are declarations: nothing in them is left out when they are read.

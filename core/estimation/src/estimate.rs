@@ -8,6 +8,7 @@
 //! Projecting active rows out would claim that a quantity is known exactly because the data wanted it outside its
 //! range.
 
+use dragfree_schema::Settings;
 use nalgebra::{Cholesky, DMatrix, DVector};
 use serde::Serialize;
 
@@ -127,12 +128,6 @@ pub struct Estimate {
 /// Blocks below which nothing is said about their scatter.
 pub const LEAST_BLOCKS: usize = 6;
 
-/// False-alarm rate at which the scatter of the blocks widens σ: one-sided, per coefficient.
-pub const SCATTER_FALSE_ALARM: f64 = 1e-4;
-
-/// Normal quantile of [`SCATTER_FALSE_ALARM`].
-const SCATTER_QUANTILE: f64 = 3.719;
-
 /// The information measured: pulls of single blocks of time against what the normal equations promise.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Scatter {
@@ -140,7 +135,7 @@ pub struct Scatter {
     pub blocks: usize,
     /// Scatter of the blocks' pulls on each free coefficient over what `N` promises, as a ratio of σ.
     pub ratio: Vec<f64>,
-    /// Above this the ratio is no chance ([`SCATTER_FALSE_ALARM`]) and widens σ.
+    /// Above this the ratio is no chance ([`Settings::scatter_sigmas`]) and widens σ.
     pub upper: f64,
 }
 
@@ -207,7 +202,9 @@ pub fn estimate(
     bounds: &[Bound],
     refinements: usize,
 ) -> Result<Estimate, EstimateError> {
-    estimate_with(observed, &BandNoise::new(model, observed.plan), unknowns, bounds, refinements, Refinement::Bands)
+    let settings = Settings::default();
+    let method = Method { refinements, refinement: Refinement::Bands, settings: &settings };
+    estimate_with(observed, &BandNoise::new(model, observed.plan), unknowns, bounds, &method)
 }
 
 /// What of Σ is measured from the residuals.
@@ -220,6 +217,17 @@ pub enum Refinement {
     Levels,
 }
 
+/// How Σ is refined, and from what size on something is judged.
+#[derive(Clone, Copy, Debug)]
+pub struct Method<'a> {
+    /// How often Σ is measured from the residuals.
+    pub refinements: usize,
+    /// What of it.
+    pub refinement: Refinement,
+    /// Thresholds.
+    pub settings: &'a Settings,
+}
+
 /// As [`estimate`], with Σ refined in one way or the other, and the declared noise in the bands of the plan.
 ///
 /// # Errors
@@ -229,10 +237,10 @@ pub fn estimate_with(
     noise: &BandNoise<'_>,
     unknowns: &[Unknown],
     bounds: &[Bound],
-    refinements: usize,
-    refinement: Refinement,
+    method: &Method<'_>,
 ) -> Result<Estimate, EstimateError> {
     let Observed { sums, prediction, plan, layout } = *observed;
+    let Method { refinements, refinement, settings } = *method;
     let spectra = &sums.total;
     let whitening = Whitening::new(noise, plan, spectra)?;
     let even = refinement == Refinement::Levels;
@@ -257,7 +265,7 @@ pub fn estimate_with(
             inverses = match refinement {
                 Refinement::Bands => whitening.refined_inverses(&residual),
                 Refinement::Levels => {
-                    by_levels(noise.model, plan, spectra, &residual, &colours(unknowns, &solved.theta))
+                    by_levels(noise.model, plan, spectra, &residual, &colours(unknowns, &solved.theta), settings)
                 }
             };
         }
@@ -273,11 +281,13 @@ pub fn estimate_with(
     let chi2 = whitening.chi2(&residual, &inverses, fitted);
 
     let reduced = Reduced::new(&equations, unknowns, bounds, &free);
-    let weak = reduced.weak(unknowns, &unseen);
+    let weak = reduced.weak(unknowns, &unseen, settings.weak_direction);
     let dof = (chi2.expected - free.len() as f64).max(1.0);
     let chi2_per_dof = chi2.sum / dof;
     let covariance = reduced.covariance(&solved.active);
-    let scatter = covariance.as_ref().and_then(|c| scatter(sums, layout, &inverses, &solved.theta, c, &free));
+    let scatter = covariance
+        .as_ref()
+        .and_then(|c| scatter(sums, layout, &inverses, &solved.theta, c, &free, settings.scatter_sigmas));
     let covariance = covariance.map(|c| {
         let by_blocks =
             |k: usize| scatter.as_ref().map_or(1.0, |s| if s.ratio[k] > s.upper { s.ratio[k] } else { 1.0 });
@@ -372,10 +382,11 @@ fn by_levels(
     spectra: &Spectra,
     residual: &[DMatrix<f64>],
     colours: &[(&Colour, f64)],
+    settings: &Settings,
 ) -> Vec<DMatrix<f64>> {
     let expected = spectra.expected.iter().map(|e| e.max(f64::MIN_POSITIVE));
     let measured: Vec<DMatrix<f64>> = residual.iter().zip(expected).map(|(r, e)| r / e).collect();
-    let mut levels = Levels::new(model, plan, spectra, &measured).coloured(plan, colours);
+    let mut levels = Levels::new(model, plan, spectra, &measured, settings).coloured(plan, colours);
     levels.fit();
     levels.inverses()
 }
@@ -604,14 +615,14 @@ impl<'a> Reduced<'a> {
         first.map_or_else(String::new, |k| self.unknowns[self.free[k]].unit.clone())
     }
 
-    fn weak(&self, unknowns: &[Unknown], unseen: &[usize]) -> Vec<Direction> {
+    fn weak(&self, unknowns: &[Unknown], unseen: &[usize], from: f64) -> Vec<Direction> {
         let information = self.with_rows(|i, row| match self.knowledge[i] {
             Knowledge::Survey => uniform_sigma(row),
             _ => f64::INFINITY,
         });
         let names: Vec<(&str, &str)> =
             self.free.iter().map(|i| (unknowns[*i].name.as_str(), unknowns[*i].unit.as_str())).collect();
-        let mut weak = verdict::weak_directions(&information, &self.size, &names);
+        let mut weak = verdict::weak_directions(&information, &self.size, &names, from);
         weak.extend(unseen.iter().map(|i| Direction::unseen(&unknowns[*i].name)));
         weak
     }
@@ -668,6 +679,7 @@ fn scatter(
     theta: &DVector<f64>,
     covariance: &DMatrix<f64>,
     free: &[usize],
+    sigmas: f64,
 ) -> Option<Scatter> {
     let blocks = sums.blocks.len();
     if blocks < LEAST_BLOCKS || free.is_empty() {
@@ -691,7 +703,7 @@ fn scatter(
     }
     let dof = blocks as f64 - 1.0;
     let ratio = measured.component_div(&expected).map(|r| (r * blocks as f64 / dof).sqrt());
-    let upper = chi2_per_dof_at(dof, SCATTER_QUANTILE).sqrt();
+    let upper = chi2_per_dof_at(dof, sigmas).sqrt();
     Some(Scatter { blocks, ratio: ratio.iter().copied().collect(), upper })
 }
 

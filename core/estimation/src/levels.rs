@@ -12,6 +12,7 @@
 use std::collections::BTreeMap;
 use std::ops::Range;
 
+use dragfree_schema::Settings;
 use nalgebra::{Cholesky, DMatrix};
 
 use crate::colour::{Colour, ColourPower};
@@ -21,13 +22,6 @@ use crate::verdict::chi2_per_dof_at;
 
 /// Amplitudes that are tried lie between its inverse and this.
 const MOST: f64 = 20.0;
-
-/// A level is taken over when `−2 log` of the likelihood falls by more, five σ.
-const LEAST: f64 = 25.0;
-
-/// Where the power of a band is more than so many times what the levels explain, and certainly so, Σ takes up the
-/// excess: something that nobody models must not make others significant.
-const EXCESS: f64 = 2.0;
 
 /// A process with another amplitude.
 #[derive(Clone, Debug, PartialEq)]
@@ -79,10 +73,10 @@ fn deviance(modes: &[Mode], excess: f64) -> f64 {
 /// Ratio of the ends of a group of bands.
 const GROUP: f64 = 2.154_434_690_031_884;
 
-/// Ratio of power from which an excess over `n` complex observations is taken up: four σ by the distribution of χ², a
-/// chance of 3e-5, and no less than [`EXCESS`].
-fn least_excess(n: f64) -> f64 {
-    EXCESS.max(chi2_per_dof_at(2.0 * n.max(0.5), 4.0))
+/// Ratio of power from which Σ takes up an excess over `n` complex observations: what nobody models must not make other
+/// things significant.
+fn absorbed_excess(settings: &Settings, n: f64) -> f64 {
+    settings.absorbed_excess_ratio.max(chi2_per_dof_at(2.0 * n.max(0.5), settings.absorbed_excess_sigmas))
 }
 
 /// The inverse, or nothing known where there is none.
@@ -100,12 +94,19 @@ pub struct Levels<'a> {
     observations: Vec<f64>,
     measured: &'a [DMatrix<f64>],
     modelled: Vec<DMatrix<f64>>,
+    settings: &'a Settings,
 }
 
 impl<'a> Levels<'a> {
     /// `measured` are the residuals' one-sided cross-spectra per band, `weights` say how well they are known.
     #[must_use]
-    pub fn new(noise: &'a NoiseModel, plan: &Plan, weights: &Spectra, measured: &'a [DMatrix<f64>]) -> Self {
+    pub fn new(
+        noise: &'a NoiseModel,
+        plan: &Plan,
+        weights: &Spectra,
+        measured: &'a [DMatrix<f64>],
+        settings: &'a Settings,
+    ) -> Self {
         let hz: Vec<f64> = plan.bands.iter().map(|b| plan.frequency_hz(*b)).collect();
         let process =
             |name: &'a str| Some((name, hz.iter().map(|f| noise.process_psd(name, *f)).collect::<Option<_>>()?));
@@ -115,6 +116,7 @@ impl<'a> Levels<'a> {
             observations: weights.observations(plan),
             measured,
             hz,
+            settings,
         }
     }
 
@@ -195,7 +197,7 @@ impl<'a> Levels<'a> {
             let Some(whitened) = self.whitened() else { return };
             let levels = names.iter().filter_map(|name| self.level_in(&whitened, name));
             let Some(best) = levels.max_by(|a, b| a.delta_chi2.total_cmp(&b.delta_chi2)) else { return };
-            if best.delta_chi2 < LEAST || (best.value - 1.0).abs() < 1e-3 {
+            if best.delta_chi2 < self.settings.level_delta_chi2 || (best.value - 1.0).abs() < 1e-3 {
                 return;
             }
             self.take(&best);
@@ -253,13 +255,13 @@ impl<'a> Levels<'a> {
             .map(|((sigma, w), n)| {
                 let louder = |c: usize| {
                     let ratio = w[(c, c)] / sigma[(c, c)];
-                    if ratio > least_excess(*n) { ratio.sqrt() } else { 1.0 }
+                    if ratio > absorbed_excess(self.settings, *n) { ratio.sqrt() } else { 1.0 }
                 };
                 let scale: Vec<f64> = (0..sigma.nrows()).map(louder).collect();
                 inverted(&DMatrix::from_fn(sigma.nrows(), sigma.ncols(), |i, j| sigma[(i, j)] * scale[i] * scale[j]))
             })
             .collect();
-        self.less_in_channels(inverses, |_| true, least_excess)
+        self.less_in_channels(inverses, |_| true, |n| absorbed_excess(self.settings, n))
     }
 
     /// Inverses of Σ with what a group of bands has in one channel beyond `least` of its observations taken up.
@@ -312,7 +314,7 @@ impl<'a> Levels<'a> {
     pub fn deviance(&self, measured: &[DMatrix<f64>], bands: &[bool]) -> f64 {
         let (processes, hz) = (BTreeMap::new(), self.hz.clone());
         let (observations, modelled) = (self.observations.clone(), self.modelled.clone());
-        let own = Levels { processes, hz, observations, measured, modelled };
+        let own = Levels { processes, hz, observations, measured, modelled, settings: self.settings };
         let of = |((inverse, w), n): ((DMatrix<f64>, &DMatrix<f64>), &f64)| {
             let power = inverse.dot(w);
             let log_det = Cholesky::new(inverse).map_or(0.0, |c| 2.0 * c.l().diagonal().map(f64::ln).sum());
@@ -387,14 +389,14 @@ mod tests {
     /// has the process.
     #[test]
     fn a_level_is_measured_with_the_error_that_fisher_gives() {
-        let noise = noise();
+        let (noise, settings) = (noise(), Settings::default());
         let plan = Plan::new(4096, 10.0);
         let weights = weights(&plan, 20);
         let hz: Vec<f64> = plan.bands.iter().map(|b| plan.frequency_hz(*b)).collect();
         let name = "Differenced:a.y";
         let of = |f: &f64| noise.process_psd(name, *f).unwrap();
         let truth: Vec<DMatrix<f64>> = hz.iter().map(|f| noise.psd(*f) + of(f) * (1.7_f64.powi(2) - 1.0)).collect();
-        let mut levels = Levels::new(&noise, &plan, &weights, &truth);
+        let mut levels = Levels::new(&noise, &plan, &weights, &truth, &settings);
         let level = levels.level(name).unwrap();
         assert!((level.value / 1.7 - 1.0).abs() < 1e-6, "{level:?}");
         let information: f64 = (hz.iter().zip(&truth).zip(weights.observations(&plan)))
@@ -418,7 +420,7 @@ mod tests {
     /// be another.
     #[test]
     fn a_coloured_process_has_its_own_level() {
-        let noise = noise();
+        let (noise, settings) = (noise(), Settings::default());
         let plan = Plan::new(16_384, 10.0);
         let weights = weights(&plan, 20);
         let name = "force:y";
@@ -434,11 +436,11 @@ mod tests {
                 noise.psd(hz) + noise.process_psd(name, hz).unwrap() * (colour.power(0.05, &plan, *b) - 1.0)
             })
             .collect();
-        let levels = Levels::new(&noise, &plan, &weights, &measured).coloured(&plan, &[(&colour, 0.05)]);
+        let levels = Levels::new(&noise, &plan, &weights, &measured, &settings).coloured(&plan, &[(&colour, 0.05)]);
         assert!(levels.modelled().iter().zip(&measured).all(|(a, b)| (a - b).norm() < 1e-9 * b.norm()));
         assert!((levels.level(name).unwrap().value - 1.0).abs() < 1e-6);
-        let plain = Levels::new(&noise, &plan, &weights, &measured).level(name).unwrap();
-        assert!(plain.value > 1.02 && plain.delta_chi2 > LEAST, "{plain:?}");
+        let plain = Levels::new(&noise, &plan, &weights, &measured, &settings).level(name).unwrap();
+        assert!(plain.value > 1.02 && plain.delta_chi2 > settings.level_delta_chi2, "{plain:?}");
     }
 
     /// A force on one test mass far below the thrusters' noise, invisible in its channel's power, is taken up where the
@@ -446,17 +448,17 @@ mod tests {
     /// Σ⁻¹ is that of the declared noise.
     #[test]
     fn an_excess_below_the_thrusters_is_taken_up() {
-        let noise = noise();
+        let (noise, settings) = (noise(), Settings::default());
         let plan = Plan::new(16_384, 10.0);
         let weights = weights(&plan, 20);
         let sigma: Vec<DMatrix<f64>> = plan.bands.iter().map(|b| noise.psd(plan.frequency_hz(*b))).collect();
-        let levels = Levels::new(&noise, &plan, &weights, &sigma);
+        let levels = Levels::new(&noise, &plan, &weights, &sigma, &settings);
         let (clean, group) = (levels.inverses(), levels.groups().swap_remove(0));
         assert!(clean.iter().zip(&sigma).all(|(a, b)| (a * b - DMatrix::identity(4, 4)).norm() < 1e-3));
         let mut loud = sigma.clone();
         group.clone().for_each(|b| loud[b][(2, 2)] += 2.0 / clean[b][(2, 2)]);
         assert!(group.clone().all(|b| loud[b][(2, 2)] < 1.01 * sigma[b][(2, 2)]));
-        let levels = Levels::new(&noise, &plan, &weights, &loud);
+        let levels = Levels::new(&noise, &plan, &weights, &loud, &settings);
         let (_, _, ratios) = levels.excesses().swap_remove(0);
         assert!((ratios[2] - 3.0).abs() < 1e-3, "{ratios:?}");
         for (b, (own, exact)) in levels.inverses().iter().zip(loud.iter().map(inverted)).enumerate() {

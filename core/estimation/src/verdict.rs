@@ -1,5 +1,6 @@
 //! What the solution is worth: directions that the data do not see, and whether two methods agree.
 
+use dragfree_schema::Settings;
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 use serde::Serialize;
 
@@ -20,15 +21,18 @@ impl Direction {
     }
 }
 
-/// A direction is weak when its σ exceeds this part of the half range: the range then says as much as the data.
-pub const WEAK: f64 = 1.0 / 3.0;
-
 /// Coefficients that share less than this part of the leading one's motion are not named.
 const NAMED: f64 = 0.05;
 
-/// Eigen-directions of the information, scaled by `size`, whose σ exceeds [`WEAK`]; `names` with units.
+/// Eigen-directions of the information, scaled by `size`, whose σ exceeds `from`
+/// ([`Settings::weak_direction`]); `names` with units.
 #[must_use]
-pub fn weak_directions(information: &DMatrix<f64>, size: &DVector<f64>, names: &[(&str, &str)]) -> Vec<Direction> {
+pub fn weak_directions(
+    information: &DMatrix<f64>,
+    size: &DVector<f64>,
+    names: &[(&str, &str)],
+    from: f64,
+) -> Vec<Direction> {
     if names.is_empty() {
         return Vec::new();
     }
@@ -39,7 +43,7 @@ pub fn weak_directions(information: &DMatrix<f64>, size: &DVector<f64>, names: &
         .iter()
         .enumerate()
         .map(|(k, e)| (e.max(0.0).sqrt().recip(), k))
-        .filter(|(s, _)| *s > WEAK)
+        .filter(|(s, _)| *s > from)
         .collect();
     found.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
     found
@@ -87,9 +91,6 @@ pub struct Difference {
     /// `sqrt(σ₁² + σ₂²)`.
     pub sigma: f64,
 }
-
-/// Differences above this many σ are a disagreement: at most 0.27 % of false alarms per coefficient.
-pub const AGREEMENT_SIGMAS: f64 = 3.0;
 
 impl Difference {
     /// Size in σ.
@@ -139,19 +140,11 @@ impl Pull {
     }
 }
 
-/// Two-sided false-alarm rate of [`chi2_bounds`]: with nine channels and their sum, below 1e-4 in all.
-pub const CHI2_FALSE_ALARM: f64 = 1e-5;
-
-/// Normal quantile of [`CHI2_FALSE_ALARM`].
-const CHI2_QUANTILE: f64 = 4.417;
-
-/// Σ is constant in its bands but for the model's shape, so χ²/dof is only ever 1 to about this.
-const CHI2_TOLERANCE: f64 = 0.01;
-
-/// Bounds of χ²/dof at [`CHI2_FALSE_ALARM`], widened by what a Σ in bands cannot follow.
+/// Bounds of χ²/dof at [`Settings::chi2_sigmas`], widened by what a Σ in bands cannot follow.
 #[must_use]
-pub fn chi2_bounds(dof: f64) -> (f64, f64) {
-    (chi2_per_dof_at(dof, -CHI2_QUANTILE) - CHI2_TOLERANCE, chi2_per_dof_at(dof, CHI2_QUANTILE) + CHI2_TOLERANCE)
+pub fn chi2_bounds(settings: &Settings, dof: f64) -> (f64, f64) {
+    let Settings { chi2_sigmas, chi2_tolerance, .. } = *settings;
+    (chi2_per_dof_at(dof, -chi2_sigmas) - chi2_tolerance, chi2_per_dof_at(dof, chi2_sigmas) + chi2_tolerance)
 }
 
 /// The χ²/dof that corresponds to a normal quantile, by Wilson and Hilferty.
@@ -177,7 +170,7 @@ mod tests {
     fn an_unseen_difference_is_named() {
         let a = DVector::from_vec(vec![1.0, 1.0]);
         let information = &a * a.transpose() * 1e6 + DMatrix::identity(2, 2) * (0.5f64 / 9.0);
-        let weak = weak_directions(&information, &DVector::repeat(2, 0.02), &[("b.x", "m"), ("b.y", "m")]);
+        let weak = weak_directions(&information, &DVector::repeat(2, 0.02), &[("b.x", "m"), ("b.y", "m")], 1.0 / 3.0);
         assert_eq!(weak.len(), 1);
         // Along (1, −1)/√2 the information is 0.5/9: σ is 3√2 m along the unit vector, 3 m in each coefficient.
         let sentence = &weak[0].sentence;
@@ -188,9 +181,9 @@ mod tests {
     #[test]
     fn a_well_measured_coefficient_is_not_weak() {
         let information = DMatrix::repeat(1, 1, 1e6);
-        assert!(weak_directions(&information, &DVector::repeat(1, 0.02), &[("b", "m")]).is_empty());
+        assert!(weak_directions(&information, &DVector::repeat(1, 0.02), &[("b", "m")], 1.0 / 3.0).is_empty());
         // 1 mm of σ in a range of ±2 mm is.
-        assert_eq!(weak_directions(&information, &DVector::repeat(1, 0.002), &[("b", "m")]).len(), 1);
+        assert_eq!(weak_directions(&information, &DVector::repeat(1, 0.002), &[("b", "m")], 1.0 / 3.0).len(), 1);
     }
 
     #[test]
@@ -203,10 +196,11 @@ mod tests {
     /// Table values of χ²: for 10 degrees of freedom P(χ² > 41.3) = 1e-5, P(χ² < 0.889) = 1e-4.
     #[test]
     fn bounds_of_chi2_are_those_of_the_tables() {
-        let (low, high) = chi2_bounds(10.0);
-        assert!((high - CHI2_TOLERANCE - 4.3).abs() < 0.1, "{high}");
+        let settings = Settings::default();
+        let (low, high) = chi2_bounds(&settings, 10.0);
+        assert!((high - settings.chi2_tolerance - 4.3).abs() < 0.1, "{high}");
         assert!(low < 0.0889);
-        let (low, high) = chi2_bounds(1e6);
+        let (low, high) = chi2_bounds(&settings, 1e6);
         assert!((low - 0.983_75).abs() < 2e-5 && (high - 1.016_25).abs() < 2e-5, "{low} {high}");
     }
 }

@@ -326,8 +326,8 @@ pub fn compare(
     let hour_observations: Vec<Vec<f64>> = gathered.hours.iter().map(|h| observations(&h.spectra, plan)).collect();
     let predicted = predicted(scorer.noise, plan);
     let unknowns = scorer.candidate_set.unknowns(&[]);
-    let mut levels =
-        Levels::new(scorer.noise, plan, &whole, &measured).coloured(plan, &colours(&unknowns, &fit.estimate.theta));
+    let mut levels = Levels::new(scorer.noise, plan, &whole, &measured, settings)
+        .coloured(plan, &colours(&unknowns, &fit.estimate.theta));
     levels.fit();
 
     let known = |i: usize| scorer.noise.residual()[i];
@@ -616,7 +616,7 @@ mod tests {
     use super::*;
     use crate::gram::HOUR_NS;
     use dragfree_estimation::spectra::{Analyser, Layout, Sums};
-use dragfree_schema::{NoiseEstimate, NoiseProcess, NoiseShape, Settings};
+    use dragfree_schema::{NoiseEstimate, NoiseProcess, NoiseShape, Settings};
     use rand::SeedableRng;
     use rand_distr::{Distribution, StandardNormal};
     use rand_xoshiro::Xoshiro256PlusPlus;

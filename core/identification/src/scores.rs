@@ -10,7 +10,7 @@
 
 use std::collections::BTreeMap;
 
-use dragfree_estimation::estimate::{Estimate, EstimateError, Observed, Refinement, colours, estimate_with};
+use dragfree_estimation::estimate::{Estimate, EstimateError, Method, Observed, Refinement, colours, estimate_with};
 use dragfree_estimation::levels::Levels;
 use dragfree_estimation::sigma::{BandNoise, NoiseModel};
 use dragfree_estimation::spectra::{Layout, Plan, Spectra, Sums};
@@ -166,8 +166,8 @@ impl<'a> CandidateScorer<'a> {
         let observed = Observed { layout: &layout, plan: &self.plan, sums: &sums, prediction: None };
         let unknowns = self.candidate_set.unknowns(added);
         let bounds = self.candidate_set.bounds();
-        let estimate =
-            estimate_with(&observed, &self.noise_in_bands, &unknowns, &bounds, refinements, Refinement::Levels)?;
+        let method = Method { refinements, refinement: Refinement::Levels, settings: self.settings };
+        let estimate = estimate_with(&observed, &self.noise_in_bands, &unknowns, &bounds, &method)?;
         Ok(Solved { layout, columns, estimate })
     }
 
@@ -207,7 +207,7 @@ impl<'a> CandidateScorer<'a> {
     pub fn levels<'b>(&'b self, fit: &Fit, gram: &Gram, measured: &'b [DMatrix<f64>]) -> Levels<'b> {
         let unknowns = self.candidate_set.unknowns(&fit.added);
         let colours = colours(&unknowns, &fit.estimate.theta);
-        Levels::new(self.noise, &self.plan, &gram.weights, measured).coloured(&self.plan, &colours)
+        Levels::new(self.noise, &self.plan, &gram.weights, measured, self.settings).coloured(&self.plan, &colours)
     }
 
     /// The fit under a Σ that has not absorbed the excess of power; none where there is no excess. Under it the cause
@@ -260,7 +260,7 @@ impl<'a> CandidateScorer<'a> {
         let measured = Self::residual(&self.total, &layout, &columns, &estimate.theta);
         let unknowns = self.candidate_set.unknowns(added);
         let colours = colours(&unknowns, &estimate.theta);
-        let levels = Levels::new(self.noise, &self.plan, &self.total.weights, &measured);
+        let levels = Levels::new(self.noise, &self.plan, &self.total.weights, &measured, self.settings);
         let mut levels = levels.coloured(&self.plan, &colours);
         levels.fit();
         Ok(levels.deviance(&measured, &vec![false; self.plan.bands.len()]))

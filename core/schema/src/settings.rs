@@ -1,14 +1,48 @@
-//! Thresholds of the jobs behind the commands.
+//! Thresholds of calibration, comparison, diagnosis and ladder.
 
 use serde::{Deserialize, Serialize};
 
-/// Thresholds of comparison and diagnosis: what each is derived from, or what it trades.
+/// Thresholds: what each is derived from, or what it trades.
 ///
-/// A pipeline file overrides them in its table `[settings]`, where an unknown key is an error; a product stores those that it was
-/// made with.
+/// A pipeline file overrides them in its table `[settings]`; a product stores those that it was made with, and
+/// comparison, diagnosis and ladder use what their first product stores. In σ: quantiles of the normal distribution,
+/// one-sided unless said otherwise.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[cfg_attr(feature = "json-schema", derive(schemars::JsonSchema))]
+#[serde(default)]
 pub struct Settings {
+    /// Chosen: 0.27 % of false alarms per coefficient at most, two-sided. Two solutions that differ by more σ disagree,
+    /// and so do a survey and the data in one row.
+    pub agreement_sigmas: f64,
+    /// Derived: a false alarm in 1e3. All surveys together contradict the data.
+    pub survey_sigmas: f64,
+    /// Derived: a false alarm in 1e4. The data leave a physical range.
+    pub range_sigmas: f64,
+    /// Derived: a false alarm in 1e4 per coefficient. The scatter of blocks of time widens its σ.
+    pub scatter_sigmas: f64,
+    /// Derived: a false alarm in 1e5, two-sided; with nine channels and their sum below 1e-4 in all. Bounds of χ²/dof.
+    pub chi2_sigmas: f64,
+    /// Measured: Σ is constant in its bands but for the declared shape, so χ²/dof is 1 to about this only.
+    pub chi2_tolerance: f64,
+    /// Derived: a false alarm in 1e5. Channels that share no declared noise are coherent.
+    pub group_coherence_sigmas: f64,
+    /// Chosen. Such a coherence below this ratio of χ²/dof changes no σ by more than a per cent and is not reported.
+    pub group_coherence_ratio: f64,
+    /// Chosen. A line is reported from this many times the power of its neighbourhood.
+    pub line_ratio: f64,
+    /// Chosen. A direction is weak when its σ exceeds this part of the half range: the range then says as much as the
+    /// data.
+    pub weak_direction: f64,
+    /// Derived: five σ. A level of noise is adopted when `−2 log` of the likelihood falls by more.
+    pub level_delta_chi2: f64,
+    /// Chosen. Where the power of a band exceeds what the levels explain by this ratio, Σ takes up the excess: less is
+    /// left to be explained by candidates.
+    pub absorbed_excess_ratio: f64,
+    /// Derived: a false alarm in 3e4 per band. The same excess must be as certain as this.
+    pub absorbed_excess_sigmas: f64,
+    /// Chosen: 0.27 % of false alarms, two-sided. A fall of χ² between two revisions counts beyond this many standard
+    /// deviations of what different epochs make.
+    pub ladder_sigmas: f64,
     /// Chosen. False-alarm rate of a whole comparison or diagnosis: lower misses smaller effects.
     pub false_alarm: f64,
     /// Chosen. Independent segments of full length below which there is neither: fewer have too coarse a Σ.
@@ -51,8 +85,7 @@ pub struct Settings {
     pub moves_offset_sigmas: f64,
     /// Derived: the 1 % point of χ² with one degree of freedom. Explanations that differ by less are not told apart.
     pub equally_good_chi2: f64,
-    /// Chosen. Measured over modelled power of a third of a decade above which it is reported as an excess. (Whether Σ absorbs an
-    /// excess is decided at twice the power, in `dragfree_estimation::levels`.)
+    /// Chosen. Measured over modelled power of a third of a decade above which it is reported as an excess.
     pub excess_ratio: f64,
     /// Derived: 3.4e-6 each, 1e-3 over nine channels and fourteen thirds of decades, plain and partial.
     pub excess_sigmas: f64,
@@ -74,6 +107,20 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self {
+            agreement_sigmas: 3.0,
+            survey_sigmas: 3.090,
+            range_sigmas: 3.719,
+            scatter_sigmas: 3.719,
+            chi2_sigmas: 4.417,
+            chi2_tolerance: 0.01,
+            group_coherence_sigmas: 4.265,
+            group_coherence_ratio: 1.02,
+            line_ratio: 1.5,
+            weak_direction: 1.0 / 3.0,
+            level_delta_chi2: 25.0,
+            absorbed_excess_ratio: 2.0,
+            absorbed_excess_sigmas: 4.0,
+            ladder_sigmas: 3.0,
             false_alarm: 0.01,
             min_segments: 4.0,
             segment_s: 1638.4,

@@ -1,6 +1,7 @@
 //! What an instance is made from.
 
 use dragfree_abi as abi;
+use dragfree_schema::Settings;
 use serde::Deserialize;
 use std::ffi::{CString, c_void};
 use std::path::PathBuf;
@@ -24,6 +25,7 @@ struct Config {
     instance: String,
     candidate: bool,
     needs: Vec<String>,
+    settings: Settings,
     threads: Option<usize>,
     files: Vec<PathBuf>,
     start_ns: Option<i64>,
@@ -175,6 +177,12 @@ impl Setup {
     #[must_use]
     pub fn needs(&self, name: &str) -> bool {
         self.config.needs.iter().any(|n| n == name)
+    }
+
+    /// Thresholds: those of the pipeline file's table `[settings]`, or the defaults.
+    #[must_use]
+    pub fn settings(&self) -> &Settings {
+        &self.config.settings
     }
 
     /// Threads that an instance may use, itself included; results must not depend on it.

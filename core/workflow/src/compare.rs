@@ -21,9 +21,9 @@ pub fn compare(
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Comparison, WorkflowError> {
     let settings = replay.settings()?;
-    let record = sum(replay, &settings, What::Model, progress)?;
+    let record = sum(replay, settings, What::Model, progress)?;
     let noise = record.noise_model()?;
-    let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, &settings);
+    let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
     let products = || replay.products.iter().map(|p| &p.product);
     let innovations = Innovations::judge(&octaves(products()), record.gathered.rate_hz, settings.false_alarm);
     Ok(compare::compare(&scorer, nis(products(), settings.false_alarm), innovations)?)

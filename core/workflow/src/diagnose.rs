@@ -35,14 +35,14 @@ pub fn diagnose(
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Diagnosed, WorkflowError> {
     let settings = replay.settings()?;
-    let found = sum(replay, &settings, What::Transients, progress)?.gathered.transients;
+    let found = sum(replay, settings, What::Transients, progress)?.gathered.transients;
     let detected: Vec<Detection> =
         found.certain(settings.transient_p_value).take(settings.max_transients).cloned().collect();
     let mut pass = |requests: &[RefinementRequest], tried_before: &BTreeMap<String, usize>| {
-        let mut record = sum(replay, &settings, What::Candidates(&detected, requests), progress)?;
+        let mut record = sum(replay, settings, What::Candidates(&detected, requests), progress)?;
         record.gathered.transients = found.clone();
         let noise = record.noise_model()?;
-        let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, &settings);
+        let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
         let mut diagnosis = diagnosis::diagnose(&scorer, tried_before)?;
         diagnosis.not_tried.extend(record.not_tried.iter().cloned());
         Ok::<_, WorkflowError>(Diagnosed { record, diagnosis, settings: settings.clone() })

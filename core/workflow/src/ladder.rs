@@ -181,9 +181,6 @@ pub struct OverFitted {
     pub delta_chi2: f64,
 }
 
-/// Sets the uncertainty beyond which a fall of χ² is told from different epochs.
-const SIGMAS: f64 = 3.0;
-
 /// Makes the ladder of `products`; `held_out` are products of `dragfree model fix` of those revisions on other days,
 /// `truth` gives the true value of a coefficient in its SI unit.
 ///
@@ -241,7 +238,8 @@ pub fn ladder(
                     added.join(", ")
                 ));
             }
-            held_out_fit(own, before, &revision, !added.is_empty(), &mut notes)
+            let sigmas = first.settings.ladder_sigmas;
+            held_out_fit(own, before, &revision, !added.is_empty(), sigmas, &mut notes)
         });
         let coefficients = values(own, before, truth);
         revisions.push(Rung {
@@ -501,6 +499,7 @@ fn held_out_fit(
     before: Option<(&String, &Days<'_>)>,
     revision: &str,
     added: bool,
+    sigmas: f64,
     notes: &mut Vec<String>,
 ) -> HeldOut {
     let names = |days: &Days<'_>| {
@@ -525,7 +524,7 @@ fn held_out_fit(
         fall(&of(theirs), &of(own), &format!("{parent} and {revision}, held out,"), notes)
     });
     let verdict = fall.filter(|_| added).map(|fall| match fall.delta_chi2 {
-        delta if delta.abs() < SIGMAS * fall.uncertainty => Verdict::Undecided,
+        delta if delta.abs() < sigmas * fall.uncertainty => Verdict::Undecided,
         delta if delta > 0.0 => Verdict::Helps,
         _ => Verdict::OverFitted,
     });

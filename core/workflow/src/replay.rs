@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use dragfree_engine::chain::Chain;
 use dragfree_engine::examine::{Examination, candidates, examine, has_parameter, model};
 use dragfree_engine::product::Product;
 use dragfree_engine::registry::Registry;
@@ -40,6 +41,13 @@ pub struct Replay<'a> {
     pub threads: usize,
     /// Most rows in one call of a plugin; results do not depend on it.
     pub batch_rows: usize,
+}
+
+impl Replay<'_> {
+    /// Thresholds: those of the first product.
+    pub(crate) fn settings(&self) -> Result<&Settings, WorkflowError> {
+        Ok(&self.products.first().ok_or(WorkflowError::NoProduct)?.product.settings)
+    }
 }
 
 /// What a pass over the data is for.

@@ -7,7 +7,7 @@ use std::path::Path;
 
 use dragfree_engine::chain::{Chain, Sink};
 use dragfree_engine::examine::Wanted;
-use dragfree_estimation::estimate::{Observed, Refinement, estimate_with};
+use dragfree_estimation::estimate::{Method, Observed, Refinement, estimate_with};
 use dragfree_estimation::segments::{Segmenter, all_finite, longest_length};
 use dragfree_estimation::sigma::{BandNoise, NoiseModel};
 use dragfree_estimation::spectra::Plan;
@@ -19,9 +19,7 @@ use dragfree_identification::gram::{Columns, GramAccumulator, LONG};
 use dragfree_identification::record::Record;
 use dragfree_identification::transient::{Detection, Search, Template};
 use dragfree_identification::waveform::Waveform;
-use dragfree_schema::{
-    Available, Coefficient, Column, Constraint, NoiseProcess, Response, Settings, Shape, Variant,
-};
+use dragfree_schema::{Available, Coefficient, Column, Constraint, NoiseProcess, Response, Settings, Shape, Variant};
 use nalgebra::DMatrix;
 
 use crate::WorkflowError;
@@ -136,7 +134,7 @@ impl ColumnSums {
             energy: waveforms.iter().map(|c| c.energy(&plan, differenced.contains(&true))).collect(),
         };
         let candidate_set = candidate_set(&available, &channels, &sorted, &waveforms);
-        let residual = residual(request.reference, &candidate_set, &channels, &all, length)?;
+        let residual = residual(request.reference, &candidate_set, &channels, &all, length, settings)?;
         // As they are called in telemetry: `hk/battery_current_a`.
         let topics: Vec<String> = housekeeping.iter().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
         let noise = NoiseModel::new(&available.noise, &candidate_set.channels, 1.0 / rate_hz)?;
@@ -275,6 +273,7 @@ fn residual(
     channels: &[&Column],
     columns: &Columns,
     length: usize,
+    settings: &Settings,
 ) -> Result<DMatrix<f64>, WorkflowError> {
     let n = channels.len();
     let mut theta: Vec<f64> = candidate_set.coefficients.iter().map(|c| c.initial).collect();
@@ -295,7 +294,8 @@ fn residual(
             let observed = Observed { layout: &layout, plan: &plan, sums: &sums, prediction: None };
             let (unknowns, bounds) = (candidate_set.unknowns(&[]), candidate_set.bounds());
             let noise = BandNoise::new(&noise, &plan);
-            let solved = estimate_with(&observed, &noise, &unknowns, &bounds, REFINEMENTS, Refinement::Levels)?;
+            let method = Method { refinements: REFINEMENTS, refinement: Refinement::Levels, settings };
+            let solved = estimate_with(&observed, &noise, &unknowns, &bounds, &method)?;
             theta.iter_mut().zip(solved.theta.iter()).for_each(|(t, s)| *t = *s);
         }
     }

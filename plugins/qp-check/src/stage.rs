@@ -6,22 +6,23 @@ use dragfree_sdk::prelude::*;
 use nalgebra::DMatrix;
 use serde_json::json;
 
-use dragfree_estimation::estimate::{Bound, Estimate as Solution, Observed, Refinement, Unknown, estimate_with};
+use dragfree_estimation::estimate::{
+    Bound, Estimate as Solution, Method, Observed, Refinement, Unknown, estimate_with,
+};
 use dragfree_estimation::prediction::Prediction;
 use dragfree_estimation::segments::{Collected, Segmenter, longest_length};
 use dragfree_estimation::sigma::{BandNoise, NoiseModel};
 use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, SHORTEST};
 use dragfree_estimation::state;
 use dragfree_estimation::stored::Stored;
-use dragfree_estimation::verdict::{
-    AGREEMENT_SIGMAS, Difference, Pull, Value, chi2_bounds, chi2_quantile, differences,
-};
+use dragfree_estimation::verdict::{Difference, Pull, Value, chi2_bounds, chi2_quantile, differences};
 
 /// Normal equations over segments, a constrained solution, and a verdict.
 pub struct QpCheck {
     segment_s: f64,
     refinements: usize,
     refinement: Refinement,
+    settings: Settings,
     log: Log,
     linked: Option<Linked>,
 }
@@ -42,6 +43,7 @@ struct Linked {
     bounds: Vec<Bound>,
     refinements: usize,
     refinement: Refinement,
+    settings: Settings,
     analyser: Analyser,
     segmenter: Segmenter,
     collected: Collected,
@@ -85,6 +87,7 @@ impl Stage for QpCheck {
             } else {
                 Refinement::Bands
             },
+            settings: setup.settings().clone(),
             log: setup.log(),
             linked: None,
         })
@@ -165,6 +168,7 @@ impl Linked {
             coefficients: available.coefficients.clone(),
             refinements: stage.refinements,
             refinement: stage.refinement,
+            settings: stage.settings.clone(),
             collected: nothing_collected(
                 stage.refinement,
                 &model,
@@ -213,14 +217,9 @@ impl Linked {
             sums: &sums,
             prediction: collected.prediction.as_ref(),
         };
-        let solution = estimate_with(
-            &observed,
-            &BandNoise::new(&self.model, observed.plan),
-            &unknowns,
-            &self.bounds,
-            self.refinements,
-            self.refinement,
-        )?;
+        let method = Method { refinements: self.refinements, refinement: self.refinement, settings: &self.settings };
+        let noise = BandNoise::new(&self.model, observed.plan);
+        let solution = estimate_with(&observed, &noise, &unknowns, &self.bounds, &method)?;
         // What χ² with the declared Σ is a sum over: the same for every model of the same data, which `dof` is not.
         let weights = sums.total.kept().into_iter().zip(&sums.total.expected).map(|(kept, expected)| kept * expected);
         let observations = weights.sum::<f64>() * self.layout.channels.len() as f64;
@@ -279,10 +278,11 @@ impl Linked {
             .collect();
         let compared = differences(&qp, &other);
         let checked = checks(solution, &qp);
-        let disagreeing: Vec<&Difference> = compared.iter().filter(|d| d.sigmas() > AGREEMENT_SIGMAS).collect();
+        let disagreeing: Vec<&Difference> =
+            compared.iter().filter(|d| d.sigmas() > self.settings.agreement_sigmas).collect();
         let mut insane = self.insane(solution);
-        insane.extend(contradictions(solution));
-        for d in checked.iter().filter(|d| d.sigmas() > AGREEMENT_SIGMAS) {
+        insane.extend(contradictions(&self.settings, solution));
+        for d in checked.iter().filter(|d| d.sigmas() > self.settings.agreement_sigmas) {
             insane.push(format!(
                 "{}: the fit by spectra and the prediction-error fit of the same data differ by {:.3e}, {:.1}σ: noise that is not \
                  stationary, or a band that the model does not describe",
@@ -318,13 +318,13 @@ impl Linked {
             ));
         }
         let (frequency_hz, ratio) = quality.worst_band;
-        let (_, high) = chi2_bounds(quality.worst_band_dof);
-        if ratio > high.max(1.5) {
+        let (_, high) = chi2_bounds(&self.settings, quality.worst_band_dof);
+        if ratio > high.max(self.settings.line_ratio) {
             report.notes.push(format!(
                 "residuals near {frequency_hz:.3e} Hz have {ratio:.1} times the power of their neighbourhood: a line that nobody models?"
             ));
         }
-        for p in solution.pulls.iter().filter(|p| p.sigmas() > AGREEMENT_SIGMAS) {
+        for p in solution.pulls.iter().filter(|p| p.sigmas() > self.settings.agreement_sigmas) {
             report.notes.push(pull_sentence(p));
         }
         self.put_coefficients(solution, &disagreeing, report);
@@ -339,7 +339,7 @@ impl Linked {
         std::iter::once(whole)
             .chain(single)
             .filter_map(|(name, ratio, dof)| {
-                let (low, high) = chi2_bounds(dof);
+                let (low, high) = chi2_bounds(&self.settings, dof);
                 (!(low..=high).contains(&ratio)).then(|| {
                     format!(
                         "χ²/dof of {name} is {ratio:.4}, outside [{low:.4}, {high:.4}] even with Σ from the residuals"
@@ -459,26 +459,17 @@ fn checks(solution: &Solution, qp: &[Value]) -> Vec<Difference> {
     differences(qp, &other)
 }
 
-/// Normal quantile of a false alarm in a thousand, for what data and survey say of each other.
-const SURVEY_QUANTILE: f64 = 3.090;
-
-/// Normal quantile of a false alarm in 1e4, for a physical range that the data leave.
-const RANGE_QUANTILE: f64 = 3.719;
-
-/// Normal quantile of a false alarm in 1e5, for coherence where there should be none; and the least that matters.
-const COHERENCE: (f64, f64) = (4.265, 1.02);
-
 /// Sentences about a survey, a range or independent noises that the data contradict.
-fn contradictions(solution: &Solution) -> Vec<String> {
+fn contradictions(settings: &Settings, solution: &Solution) -> Vec<String> {
     let mut out = Vec::new();
     let (chi2, dof) = solution.survey_chi2;
-    if dof > 0.0 && chi2_quantile(chi2 / dof, dof) > SURVEY_QUANTILE {
+    if dof > 0.0 && chi2_quantile(chi2 / dof, dof) > settings.survey_sigmas {
         out.push(format!(
             "the survey contradicts the data: χ² {chi2:.1} on {dof} rows. Either the survey in the mission file is wrong, or the \
              data are read through a wrong model (angular acceleration, gains, frames); see the rows"
         ));
     }
-    for p in solution.pulls.iter().filter(|p| !p.survey && p.sigmas() > RANGE_QUANTILE) {
+    for p in solution.pulls.iter().filter(|p| !p.survey && p.sigmas() > settings.range_sigmas) {
         out.push(format!(
             "{} contradicts the data by {:.1}σ: an effect is missing from the model, or the range is wrong",
             p.constraint,
@@ -486,7 +477,10 @@ fn contradictions(solution: &Solution) -> Vec<String> {
         ));
     }
     let (ratio, dof) = solution.quality.between_groups;
-    if dof > 0.0 && ratio > COHERENCE.1 && chi2_quantile(ratio, dof) > COHERENCE.0 {
+    if dof > 0.0
+        && ratio > settings.group_coherence_ratio
+        && chi2_quantile(ratio, dof) > settings.group_coherence_sigmas
+    {
         out.push(format!(
             "residuals of the attitude and of the test masses are coherent (χ²/dof {ratio:.3} on {dof}): noise that pushes and \
              turns at once, such as thrusters one by one, or an angular acceleration that is not E[α | data]; the offset takes \

@@ -108,7 +108,8 @@ typedef struct dragfree_host_v1 {
 /* The configuration of an instance, valid during `create` only. `json` is one object: `parameters` (every declared
  * parameter, checked, defaults filled in), `mission` (the mission file), `instance` (effects), `candidate` (effects:
  * true where the effect is not in the model and a diagnosis tries it), `needs` (stages: what effects of the model ask
- * for in their manifests; a stage that knows how to make one of these makes it), `threads` (how many an instance may
+ * for in their manifests; a stage that knows how to make one of these makes it), `settings` (thresholds of the
+ * pipeline, or their defaults; schema/settings lists them), `threads` (how many an instance may
  * use, itself included; results must not depend on it), `files`, `start_ns`, `end_ns` (sources). The getters walk it
  * by dotted path, "parameters.gain", "mission.spacecraft.mass_kg", so that plain C needs no JSON parser; DRAGFREE_ERROR
  * where there is no such number or string. A string from `get_text` is valid during `create`. */

@@ -1,6 +1,6 @@
 //! Linking: every plugin of a pipeline made, asked for its columns, and routed, before a byte of data is read.
 
-use dragfree_schema::{Coefficient, Constraint, NoiseProcess};
+use dragfree_schema::{Coefficient, Constraint, NoiseProcess, Settings};
 use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 
@@ -29,6 +29,7 @@ pub fn build(
         model,
         available: feed_tables.iter().filter(|t| !t.truth).flat_map(|t| t.columns.clone()).collect(),
         needs: needs(registry, model),
+        settings: &pipeline.settings,
         chain: Chain {
             nodes: Vec::new(),
             coefficients: Vec::new(),
@@ -79,6 +80,7 @@ struct Builder<'a> {
     model: &'a Model,
     available: Vec<Column>,
     needs: Vec<String>,
+    settings: &'a Settings,
     chain: Chain,
 }
 
@@ -216,6 +218,7 @@ impl Builder<'_> {
                 "instance": instance,
                 "candidate": candidate,
                 "needs": self.needs,
+                "settings": self.settings,
                 "threads": self.chain.carry.threads,
             }),
         };

@@ -51,7 +51,7 @@ struct File {
     #[serde(default)]
     stage: Vec<StageEntry>,
     #[serde(default)]
-    settings: Settings,
+    settings: toml::Table,
 }
 
 #[derive(Deserialize)]
@@ -142,9 +142,25 @@ impl Pipeline {
             model: file.pipeline.model.map(|p| folder.join(p)),
             source: file.source.map(|s| (s.plugin, s.parameters)),
             nodes,
-            settings: file.settings,
+            settings: settings(file.settings).map_err(sense)?,
         })
     }
+}
+
+/// Thresholds: the defaults, and what the table says. Every key must be one, every value a number above zero.
+fn settings(table: toml::Table) -> Result<Settings, String> {
+    let known = toml::Table::try_from(Settings::default()).unwrap_or_default();
+    for (key, value) in &table {
+        if !known.contains_key(key) {
+            let names: Vec<&str> = known.keys().map(String::as_str).collect();
+            return Err(format!("[settings] has no `{key}`; there are {}", names.join(", ")));
+        }
+        let number = value.as_float().or_else(|| value.as_integer().map(|n| n as f64));
+        if !number.is_some_and(|n| n > 0.0 && n.is_finite()) {
+            return Err(format!("[settings] {key} = {value} must be a number above zero"));
+        }
+    }
+    table.try_into().map_err(|e: toml::de::Error| format!("[settings]: {}", e.message()))
 }
 
 /// A mission file as the engine sees it.

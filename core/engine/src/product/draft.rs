@@ -123,7 +123,7 @@ pub(super) fn product(
         format_version: FORMAT_VERSION.to_owned(),
         header,
         model: draft.model.clone(),
-        settings: toml::Table::try_from(&draft.settings).unwrap_or_default(),
+        settings: draft.settings.clone(),
         result,
         quality,
         supersedes,

@@ -2,6 +2,7 @@
 
 use super::ProductError;
 use super::emit::emit;
+use dragfree_schema::Settings;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -27,9 +28,9 @@ pub struct Product {
     pub header: Header,
     /// Model that the estimators used.
     pub model: Model,
-    /// Thresholds; none in products of before they were stored.
-    #[serde(default, skip_serializing_if = "toml::Table::is_empty")]
-    pub settings: toml::Table,
+    /// Thresholds; the present defaults where a product does not store one.
+    #[serde(default)]
+    pub settings: Settings,
     /// What they found.
     pub result: Outcome,
     /// How far to trust it.
