@@ -22,5 +22,5 @@ pub use column::Column;
 pub use manifest::{Manifest, Parameter, ParameterType};
 pub use model::{Coefficient, Colour, Constraint, Model, Response, Shape, Transient, Variant};
 pub use noise::{NOISE_ATTRIBUTE, NoiseEstimate, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm};
-pub use report::{Attachment, Covariance, Estimate, Report};
+pub use report::{Attachment, Covariance, Estimate, Report, Role};
 pub use settings::Settings;

@@ -62,6 +62,19 @@ pub struct Report {
     pub attachments: Vec<Attachment>,
 }
 
+/// What a solution is for. A stage that adjudicates compares the batch solution with every recursive one and says what is adopted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[cfg_attr(feature = "json-schema", derive(schemars::JsonSchema))]
+#[serde(rename_all = "lowercase")]
+pub enum Role {
+    /// Estimated epoch by epoch from past data.
+    Recursive,
+    /// Estimated from all data of a run at once.
+    Batch,
+    /// What the product recommends.
+    Adopted,
+}
+
 /// One coefficient by one solution.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "json-schema", derive(schemars::JsonSchema))]
@@ -70,6 +83,9 @@ pub struct Estimate {
     pub name: String,
     /// Which solution, `es-akf`, `qp` or `adopted`.
     pub solution: String,
+    /// What the solution is for; one without a role is listed and takes no part in the verdict.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub role: Option<Role>,
     /// Value in `unit`; none where there is no estimate.
     pub value: Option<f64>,
     /// One standard deviation in `unit`; none where the data do not determine the coefficient.

@@ -62,7 +62,7 @@ mod want;
 pub use batch::{Inputs, Outputs, Progress};
 pub use dragfree_schema::{
     Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Estimate, NoiseEstimate, NoiseProcess,
-    NoiseResponse, NoiseShape, NoiseTerm, Report, Response, Settings, Shape, Transient, Variant, state,
+    NoiseResponse, NoiseShape, NoiseTerm, Report, Response, Role, Settings, Shape, Transient, Variant, state,
 };
 pub use error::PluginError;
 pub use link::{EffectLink, In, Link, Out, Table};
@@ -77,7 +77,7 @@ pub mod prelude {
     pub use crate::{
         Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Effect, EffectLink, Estimate, In,
         Inputs, Level, Link, Log, Manifest, NoiseEstimate, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm, Out,
-        Outputs, Parameter, PluginError, Progress, Report, Response, Settings, Setup, Shape, Source, Stage, Table,
-        Transient, Variant, Want, export_plugin,
+        Outputs, Parameter, PluginError, Progress, Report, Response, Role, Settings, Setup, Shape, Source, Stage,
+        Table, Transient, Variant, Want, export_plugin,
     };
 }

@@ -398,14 +398,6 @@ fn float(table: &toml::Table, key: &str) -> f64 {
     value.and_then(|v| v.as_float().or_else(|| v.as_integer().map(|i| i as f64))).unwrap_or(f64::NAN)
 }
 
-/// The solution to believe: the adopted one, else the first that there is.
-fn adopted(product: &Product) -> Vec<&Coefficient> {
-    let all = &product.result.coefficients;
-    let solution = all.iter().map(|c| c.solution.as_str()).find(|s| *s == "adopted");
-    let solution = solution.or_else(|| all.first().map(|c| c.solution.as_str())).unwrap_or_default();
-    all.iter().filter(|c| c.solution == solution).collect()
-}
-
 /// Some days together: sums of χ² and of observations.
 fn fit<'a>(days: impl Iterator<Item = &'a Product>) -> Fit {
     let (mut chi2, mut dof) = (0.0, 0.0);
@@ -417,7 +409,7 @@ fn fit<'a>(days: impl Iterator<Item = &'a Product>) -> Fit {
         // must not depend on that. Products of before tell these alone.
         let told = |f: &toml::Table| {
             let observations = float(f, "observations");
-            if observations.is_nan() { float(f, "dof") + adopted(product).len() as f64 } else { observations }
+            if observations.is_nan() { float(f, "dof") + product.result.adopted().len() as f64 } else { observations }
         };
         let observations = figures.map_or(f64::NAN, told);
         chi2 += product.quality.chi2_per_dof * observations;
@@ -503,7 +495,7 @@ fn held_out_fit(
     notes: &mut Vec<String>,
 ) -> HeldOut {
     let names = |days: &Days<'_>| {
-        let all = days.values().flat_map(|p| adopted(p)).map(|c| c.name.clone());
+        let all = days.values().flat_map(|p| p.result.adopted()).map(|c| c.name.clone());
         all.collect::<BTreeSet<_>>()
     };
     let fall = before.and_then(|(parent, theirs)| {
@@ -540,12 +532,12 @@ fn held_out_fit(
 /// Coefficients over the days, beside those of the compared revision and the truth.
 fn values(days: &Days<'_>, before: Option<&Rung>, truth: &dyn Fn(&str) -> Option<f64>) -> Vec<Value> {
     let mut names: Vec<&Coefficient> = Vec::new();
-    for coefficient in days.values().flat_map(|p| adopted(p)) {
+    for coefficient in days.values().flat_map(|p| p.result.adopted()) {
         if !names.iter().any(|known| known.name == coefficient.name) {
             names.push(coefficient);
         }
     }
-    let all: Vec<&Coefficient> = days.values().flat_map(|p| adopted(p)).collect();
+    let all: Vec<&Coefficient> = days.values().flat_map(|p| p.result.adopted()).collect();
     let mean = |name: &str| {
         let of: Vec<&&Coefficient> = all.iter().filter(|c| c.name == name).collect();
         if let [one] = of[..] {

@@ -1,7 +1,7 @@
 //! One step of the ES-AKF with 22 states, full adaptation: by structure, and as printed in dense nalgebra.
 //!
-//! `dense` is the paper's recursion with the products in the cheapest order and nothing allocated; `structured` does the
-//! same, and gates, counts and measures; `with sigma` follows the covariance behind the reported σ besides.
+//! `dense` is the paper's recursion with the products in the cheapest order and nothing allocated; `structured` does
+//! the same, and gates, counts and measures; `with sigma` follows the covariance behind the reported σ besides.
 
 use std::hint::black_box;
 
@@ -10,7 +10,7 @@ use dragfree_es_akf::filter::{Adaptation, Drive, Filter, Settings};
 use dragfree_es_akf::model::{Coefficient, Model, Prior};
 use dragfree_es_akf::shaping::Chain;
 use dragfree_physics::noise::NoiseTerm;
-use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+use nalgebra::{DMatrix, Matrix3, SMatrix, SVector, Vector3};
 
 const N: usize = 22;
 const DT_S: f64 = 0.1;
@@ -25,11 +25,11 @@ fn model() -> Model {
     let q = (1e-7_f64 / 1500.0).powi(2) * 0.5 / DT_S;
     Model {
         dt_s: DT_S,
-        acceleration_m2_s4: [[q, 0.0, 0.0], [0.0, q, 0.0], [0.0, 0.0, q]],
-        shakings: Vec::new(),
-        bias_step_m2_s4: 1e-30,
-        readout_m2: asd.map(|a: f64| a * a * 0.5 / DT_S),
-        chains: std::array::from_fn(|i| exponents[i].iter().map(|&p| chain(asd[i], p)).collect()),
+        acceleration_m2_s4: DMatrix::identity(3, 3) * q,
+        torque_noise: Vec::new(),
+        bias_step_m2_s4: DMatrix::identity(3, 3) * 1e-30,
+        readout_m2: asd.map(|a: f64| a * a * 0.5 / DT_S).to_vec(),
+        chains: (0..3).map(|i| exponents[i].iter().map(|&p| chain(asd[i], p)).collect()).collect(),
         coefficients: vec![Coefficient { initial: 0.0, prior_sigma: 0.1 }; 3],
         prior: Prior { displacement_m: 1e-7, velocity_m_s: 1e-8, bias_m_s2: 1e-9 },
     }
@@ -74,7 +74,7 @@ fn dense() -> impl FnMut() {
         a_n[(i, 6 + i)] = 0.5 * DT_S * DT_S;
     }
     let mut x = SVector::<f64, N>::zeros();
-    let mut r = Matrix3::from_diagonal(&Vector3::from(model.readout_m2));
+    let mut r = Matrix3::from_diagonal(&Vector3::from_row_slice(&model.readout_m2));
     let mut s = r;
     let alpha = 0.999_999;
     move || {

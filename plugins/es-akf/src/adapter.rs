@@ -4,16 +4,20 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use serde_json::json;
 
-use crate::akf::{Akf, MAX_STATES};
 use crate::design::{Choices, model};
 use crate::filter::{Adaptation, Settings};
-use crate::model::{Coefficient as Theta, Model, Prior};
+use crate::model::{Coefficient as Theta, Prior};
 use crate::octaves::Octaves;
-use crate::state::{Bytes, StateError, Words, seal, unseal};
-use crate::tracker::{Average, Factor, Regressor, Rows, Snapshot, Tracker};
+use crate::state::{Words, seal, unseal};
+use crate::tracker::{Average, Factor, Follower, MAX_STATES, Readout, Regressor, Rows, Snapshot, follow};
 
 const AXES: [&str; 3] = ["x", "y", "z"];
-const TEST_MASSES: [&str; 2] = ["tm1", "tm2"];
+/// A column of this name after that of a test mass and a point says that the test mass can be followed.
+const KNOWN_ACCELERATION: &str = "u_orf_m_s2";
+/// Default random walk of the spacecraft's bias acceleration, m s⁻² per √s: it outgrows white thrust noise (0.1 µN/√Hz
+/// on 1500 kg) below 10 µHz, so that a slow force that nobody modelled is followed within a day and everything faster
+/// is left to the data.
+const BIAS_WALK: f64 = 3e-15;
 /// Batches from here on are worth a second thread.
 const THREAD_ROWS: usize = 512;
 
@@ -22,22 +26,31 @@ const THREAD_ROWS: usize = 512;
 pub struct EsAkf {
     mission: Mission,
     settings: Settings,
+    /// `None`: monotone in a filter of one test mass, off in one of several.
+    adaptation: Option<Adaptation>,
     choices: Choices,
     snapshot_s: f64,
     threads: usize,
-    /// Whether both test masses are to be in one filter.
-    both: bool,
+    /// Whether all test masses are in one filter; `None`: where the model has regressors in the loop.
+    together: Option<bool>,
     bodies: Vec<Body>,
     notes: Vec<String>,
     table: Option<Table>,
     last_ns: Option<i64>,
 }
 
-/// What one filter follows, a test mass or both, with its columns; three axes for each test mass.
+/// A test mass that the columns tell of.
+#[derive(Clone, Debug, PartialEq)]
+struct TestMass {
+    name: String,
+    frame: String,
+}
+
+/// The test masses of one filter with its columns; three axes for each test mass.
 #[derive(Debug)]
 struct Body {
-    names: Vec<&'static str>,
-    tracker: Following,
+    test_masses: Vec<TestMass>,
+    follower: Box<dyn Follower>,
     readout_m: Vec<In>,
     u_m_s2: Vec<In>,
     regressors: Vec<Regressor<In>>,
@@ -57,23 +70,6 @@ struct Columns {
     coefficients: Vec<Coefficient>,
 }
 
-/// A filter of one test mass, or of two.
-#[derive(Clone, Debug)]
-enum Following {
-    One(Box<Tracker<3>>),
-    Both(Box<Tracker<6>>),
-}
-
-/// The same for a filter of one test mass and of two.
-macro_rules! each {
-    ($following:expr, $tracker:ident => $body:expr) => {
-        match $following {
-            Following::One($tracker) => $body,
-            Following::Both($tracker) => $body,
-        }
-    };
-}
-
 impl Stage for EsAkf {
     const MANIFEST: Manifest = Manifest {
         id: "es-akf",
@@ -84,14 +80,14 @@ impl Stage for EsAkf {
             Parameter::text(
                 "follow",
                 "auto",
-                &["auto", "each", "both"],
-                "a filter for each test mass, one for both, or one where an effect of the model is made of commands",
+                &["auto", "each", "together"],
+                "a filter for each test mass, or one for all of them; auto: one for all where the model has regressors made of commands",
             ),
             Parameter::text(
                 "adaptation",
-                "monotone",
-                &["monotone", "innovation", "residual", "off"],
-                "how process and readout noise follow the innovations, where a filter has one test mass; monotone is the paper's",
+                "auto",
+                &["auto", "monotone", "innovation", "residual", "off"],
+                "how process and readout noise follow the innovations; monotone is the paper's; auto: monotone for one test mass, off for several",
             ),
             Parameter::f64("forgetting", "1", 0.999_999, 0.0..=1.0, "the paper's alpha: weight of the past per epoch"),
             Parameter::f64("warm_up_s", "s", 600.0, 0.0..=1e6, "time before gating, and at first before adapting"),
@@ -116,16 +112,9 @@ impl Stage for EsAkf {
             Parameter::f64(
                 "bias_walk_m_s2_rts",
                 "m s-2 s-1/2",
-                3e-15,
+                BIAS_WALK,
                 0.0..=1e-3,
-                "random walk of the bias acceleration, where a filter has one test mass",
-            ),
-            Parameter::f64(
-                "bias_walk_both_m_s2_rts",
-                "m s-2 s-1/2",
-                3e-16,
-                0.0..=1e-3,
-                "the same where it has both: no thrust hides the bias there, and a walk too large takes the weight from what is slow",
+                "random walk of the acceleration that slow forces on the spacecraft add, alike for all test masses",
             ),
             Parameter::f64("leak_hz", "Hz", 1e-6, 1e-9..=1.0, "below this, coloured readout noise is white"),
             Parameter::f64(
@@ -145,14 +134,16 @@ impl Stage for EsAkf {
         let rate_hz = mission.mission.sample_rate_hz;
         let epochs = |name: &str| -> Result<u64, PluginError> { Ok((setup.f64(name)? * rate_hz).round() as u64) };
         let adaptation = match setup.text("adaptation")?.as_str() {
-            "monotone" => Adaptation::Monotone,
-            "innovation" => Adaptation::Innovation,
-            "residual" => Adaptation::Residual,
-            _ => Adaptation::Off,
+            "monotone" => Some(Adaptation::Monotone),
+            "innovation" => Some(Adaptation::Innovation),
+            "residual" => Some(Adaptation::Residual),
+            "off" => Some(Adaptation::Off),
+            _ => None,
         };
         Ok(Self {
+            adaptation,
             settings: Settings {
-                adaptation,
+                adaptation: Adaptation::Off,
                 forgetting: setup.f64("forgetting")?,
                 warm_up_epochs: epochs("warm_up_s")?,
                 gate_sigma: setup.f64("gate_sigma")?,
@@ -166,17 +157,16 @@ impl Stage for EsAkf {
                     velocity_m_s: setup.f64("velocity_prior_m_s")?,
                     bias_m_s2: setup.f64("bias_prior_m_s2")?,
                 },
-                bias_walk_m_s2_rts: [setup.f64("bias_walk_m_s2_rts")?, setup.f64("bias_walk_both_m_s2_rts")?],
+                bias_walk_m_s2_rts: setup.f64("bias_walk_m_s2_rts")?,
                 leak_hz: setup.f64("leak_hz")?,
                 unknown_alpha: setup.f64("unknown_alpha")?,
             },
             snapshot_s: setup.f64("output_interval_s")?,
             threads: setup.threads(),
-            both: match setup.text("follow")?.as_str() {
-                "each" => false,
-                "both" => true,
-                // A command knows what all readouts told it.
-                _ => setup.needs("commands"),
+            together: match setup.text("follow")?.as_str() {
+                "each" => Some(false),
+                "together" => Some(true),
+                _ => None,
             },
             mission,
             bodies: Vec::new(),
@@ -188,34 +178,39 @@ impl Stage for EsAkf {
 
     fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
         let table = link.table("es-akf", 0.0);
-        let there: Vec<&'static str> =
-            TEST_MASSES.into_iter().filter(|name| available.find(&format!("{name}.u_orf_m_s2.x")).is_some()).collect();
+        let there = test_masses(available);
         if there.is_empty() {
-            return Err(PluginError::new(
-                "es-akf: no column tm1.u_orf_m_s2.x or tm2.u_orf_m_s2.x is made before this stage, so there is no \
-                 test mass to follow; put hinf-dfacs before it, or leave es-akf out for an accelerometer mission",
-            ));
+            return Err(PluginError::new(format!(
+                "es-akf: no column NAME.{KNOWN_ACCELERATION}.x is made before this stage, so there is no test mass to follow; put \
+                 hinf-dfacs before it, or leave es-akf out for an accelerometer mission"
+            )));
         }
-        let mut apart: Vec<Vec<&'static str>> = there.iter().map(|name| vec![*name]).collect();
-        if self.both && there.len() > 1 {
+        // A command depends on the readouts of all test masses; the regression must condition on the same past data as
+        // the controller, or a coefficient that multiplies a command is biased.
+        let together = match self.together {
+            Some(together) => together,
+            None => available.has_regressors_in_loop()?,
+        };
+        let mut groups: Vec<Vec<TestMass>> = there.iter().map(|test_mass| vec![test_mass.clone()]).collect();
+        if together && there.len() > 1 {
             match self.link_body(&there, table, available, link)? {
                 Ok(body) => {
                     self.bodies.push(body);
-                    apart.clear();
+                    groups.clear();
                 }
                 Err(TooMany(states)) => self.notes.push(format!(
-                    "es-akf: both test masses in one filter would have {states} states, at most {MAX_STATES} are possible, so each has \
-                     its own; their coefficients of effects made of commands are biased, as one does not know what the \
-                     other's readouts told the thrusters: trust qp, or leave effects out of the model"
+                    "es-akf: all test masses in one filter would have {states} states, at most {MAX_STATES} are possible, so each has \
+                     its own; coefficients of effects made of commands are biased there, as a filter of one test mass does not know \
+                     the readouts of the others, which the commands followed: trust qp, or leave effects out of the model"
                 )),
             }
         }
-        for names in apart {
-            let body = self.link_body(&names, table, available, link)?.map_err(|TooMany(states)| {
+        for group in groups {
+            let body = self.link_body(&group, table, available, link)?.map_err(|TooMany(states)| {
                 PluginError::new(format!(
                     "es-akf: {} would have {states} states, at most {MAX_STATES} are possible; leave effects out of \
                      the model, or terms out of the readout noise",
-                    names[0]
+                    group[0].name
                 ))
             })?;
             self.bodies.push(body);
@@ -229,8 +224,8 @@ impl Stage for EsAkf {
         let times = input.time_ns();
         let pieces = self.contiguous(times)?;
         let [first, rest @ ..] = self.bodies.as_mut_slice() else { return Ok(()) };
-        // The test masses share nothing, so the result is the same with one thread or two.
-        let snapshots: Vec<Vec<Row>> = if self.threads == 1 || times.len() < THREAD_ROWS {
+        // Filters share nothing, so the result does not depend on the number of threads.
+        let snapshots: Vec<Vec<Snapshot>> = if self.threads == 1 || times.len() < THREAD_ROWS {
             std::iter::once(first.run(input, &pieces)).chain(rest.iter_mut().map(|b| b.run(input, &pieces))).collect()
         } else {
             std::thread::scope(|scope| {
@@ -265,38 +260,40 @@ impl Stage for EsAkf {
         let (mut nis_sum, mut dof) = (0.0, 0);
         let mut p_end = serde_json::Map::new();
         for body in &self.bodies {
-            let s = body.tracker.summary();
+            let (s, stretch) = (body.follower.summary(), body.follower.stretch());
             nis_sum += s.nis_sum;
             dof += s.readouts.iter().map(|r| r.used).sum::<u64>();
             for (key, n) in s.counts {
                 *report.counts.entry(key.to_owned()).or_default() += n;
             }
             for (c, sigma) in body.coefficients.iter().zip(&s.recursion_sigma) {
-                let name = body.names[0];
+                let name = &body.test_masses[0].name;
                 let key = if p_end.contains_key(&c.name) { format!("{}@{name}", c.name) } else { c.name.clone() };
                 p_end.insert(key, json!(sigma));
             }
-            for (name, readouts) in body.names.iter().zip(s.readouts.chunks(3)) {
+            let names = body.names();
+            let averaged_s = body.follower.result().map(|a| a.span_s);
+            for (test_mass, readouts) in body.test_masses.iter().zip(s.readouts.chunks(3)) {
                 let innovations: Vec<Option<f64>> = readouts.iter().map(|r| r.design_nis).collect();
                 report.quality.insert(
-                    (*name).to_owned(),
+                    test_mass.name.clone(),
                     json!({
-                        "followed": body.names,
+                        "followed": names,
                         "states": s.states,
                         "nis": s.nis,
                         "innovation_variance_over_mission_noise": innovations,
                         "innovation_octaves": innovation_octaves(readouts),
-                        "sigma_stretch": s.stretch,
-                        "averaged_s": s.averaged_s,
+                        "sigma_stretch": stretch,
+                        "averaged_s": averaged_s,
                     }),
                 );
             }
-            if s.stretch > 1.1 {
+            if stretch > 1.1 {
                 report.notes.push(format!(
                     "es-akf: the innovations of {} are up to {:.2} times what the noise of the mission file \
                      predicts; its sigmas were stretched by that. Compare the readout and thrust noise with [noise]",
-                    body.names.join(" and "),
-                    s.stretch
+                    names.join(" and "),
+                    stretch
                 ));
             }
         }
@@ -321,7 +318,7 @@ impl EsAkf {
         out.flag(&mut begun)?;
         out.count(&mut last)?;
         for body in &self.bodies {
-            body.tracker.save(&mut words);
+            body.follower.save(&mut words);
         }
         Ok(seal(&self.layout(), &words))
     }
@@ -331,13 +328,10 @@ impl EsAkf {
         let (mut begun, mut last) = (false, 0);
         words.flag(&mut begun)?;
         words.count(&mut last)?;
-        let mut trackers: Vec<Following> = self.bodies.iter().map(|b| b.tracker.clone()).collect();
-        for tracker in &mut trackers {
-            tracker.load(&mut words)?;
-        }
+        let loaded = self.bodies.iter().map(|b| b.follower.loaded(&mut words)).collect::<Result<Vec<_>, _>>()?;
         words.end()?;
-        for (body, tracker) in self.bodies.iter_mut().zip(trackers) {
-            body.tracker = tracker;
+        for (body, follower) in self.bodies.iter_mut().zip(loaded) {
+            body.follower = follower;
         }
         self.last_ns = begun.then_some(last.cast_signed());
         Ok(())
@@ -346,61 +340,78 @@ impl EsAkf {
     /// The columns and the filter of these test masses.
     fn link_body(
         &self,
-        names: &[&'static str],
+        test_masses: &[TestMass],
         table: Table,
         available: &Available,
         link: &mut Link<'_>,
     ) -> Result<Result<Body, TooMany>, PluginError> {
         let responses = available.responses()?;
-        let Columns { readout_m, u_m_s2, regressors, coefficients } = read_columns(names, &responses, available, link)?;
-        let tracker = match self.following(names, &coefficients, available)? {
-            Ok(tracker) => tracker,
+        let Columns { readout_m, u_m_s2, regressors, coefficients } =
+            read_columns(test_masses, &responses, available, link)?;
+        let follower = match self.follower(test_masses, &coefficients, available)? {
+            Ok(follower) => follower,
             Err(too_many) => return Ok(Err(too_many)),
         };
         let (mut value, mut sigma) = (Vec::new(), Vec::new());
         // A coefficient that two filters estimate is told apart by its test mass.
-        let several = |c: &Coefficient| names.len() == 1 && acts_on_several(&responses, &c.name);
-        let label = |c: &Coefficient| if several(c) { format!("{}@{}", c.name, names[0]) } else { c.name.clone() };
+        let all = self::test_masses(available);
+        let label = |c: &Coefficient| match test_masses {
+            [one] if acts_on_several(&all, &responses, &c.name) => format!("{}@{}", c.name, one.name),
+            _ => c.name.clone(),
+        };
         let archive = [("archive", "true")];
         for c in &coefficients {
             value.push(link.write_with(table, &label(c), &c.unit, &c.frame, &archive)?);
             sigma.push(link.write_with(table, &format!("{}.sigma", label(c)), &c.unit, &c.frame, &archive)?);
         }
         let (mut displacement_m, mut nis) = (Vec::new(), Vec::new());
-        for name in names {
+        for TestMass { name, frame } in test_masses {
             for axis in AXES {
                 let column = format!("{name}.displacement.{axis}");
-                displacement_m.push(link.write_with(table, &column, "m", frame_of(name), &archive)?);
+                displacement_m.push(link.write_with(table, &column, "m", frame, &archive)?);
             }
             nis.push(link.write_with(table, &format!("{name}.nis"), "1", "", &archive)?);
         }
-        let names = names.to_vec();
-        Ok(Ok(Body { names, tracker, readout_m, u_m_s2, regressors, coefficients, value, sigma, displacement_m, nis }))
+        let test_masses = test_masses.to_vec();
+        Ok(Ok(Body {
+            test_masses,
+            follower,
+            readout_m,
+            u_m_s2,
+            regressors,
+            coefficients,
+            value,
+            sigma,
+            displacement_m,
+            nis,
+        }))
     }
 
     /// The filter of these test masses before its first epoch.
-    fn following(
+    fn follower(
         &self,
-        names: &[&'static str],
+        test_masses: &[TestMass],
         coefficients: &[Coefficient],
         available: &Available,
-    ) -> Result<Result<Following, TooMany>, PluginError> {
+    ) -> Result<Result<Box<dyn Follower>, TooMany>, PluginError> {
         let thetas = coefficients.iter().map(prior_of).collect::<Result<Vec<_>, _>>()?;
         let usual = [if self.mission.noise.ifo_x.is_some() { "ifo_x" } else { "is_x" }, "is_y", "is_z"];
-        let noise = |i: usize| {
-            let column = available.find(&format!("{}.r_orf_m.{}", names[i / 3], AXES[i % 3]));
-            column.map(|c| c.attribute("noise")).filter(|n| !n.is_empty()).unwrap_or(usual[i % 3])
-        };
-        Ok(if names.len() > 1 {
-            // Six axes shaken by three thrusts have combinations that hardly anything shakes, which is what makes this filter
-            // worth its price; an adaptation element by element would drown them.
-            let settings = Settings { adaptation: Adaptation::Off, ..self.settings };
-            let model = model::<6>(&self.mission, names, std::array::from_fn(noise), thetas, &self.choices)?;
-            tracker(model, settings, self.snapshot_s).map(Following::Both)
-        } else {
-            let model = model::<3>(&self.mission, names, std::array::from_fn(noise), thetas, &self.choices)?;
-            tracker(model, self.settings, self.snapshot_s).map(Following::One)
-        })
+        let mut readouts = Vec::new();
+        for (TestMass { name, .. }, (axis, usual)) in
+            test_masses.iter().flat_map(|test_mass| AXES.iter().zip(usual).map(move |axis| (test_mass, axis)))
+        {
+            let column = available.find(&format!("{name}.r_orf_m.{axis}"));
+            readouts.push(column.map(|c| c.attribute("noise")).filter(|n| !n.is_empty()).unwrap_or(usual));
+        }
+        let names: Vec<&str> = test_masses.iter().map(|t| t.name.as_str()).collect();
+        let model = model(&self.mission, &names, &readouts, thetas, &self.choices)?;
+        // Several test masses under few forces have combinations of axes that hardly any force moves, which is what a
+        // common filter is for. Adaptation element by element does not keep that null space of Q, so that it must be
+        // asked for.
+        let usual = if names.len() > 1 { Adaptation::Off } else { Adaptation::Monotone };
+        let settings = Settings { adaptation: self.adaptation.unwrap_or(usual), ..self.settings };
+        let states = model.states();
+        Ok(follow(model, settings, self.snapshot_s).ok_or(TooMany(states)))
     }
 
     /// Runs of rows one step apart, each with the number of steps missing before it.
@@ -429,16 +440,16 @@ impl EsAkf {
     fn layout(&self) -> String {
         let bodies = self.bodies.iter().map(|b| {
             let names: Vec<&str> = b.coefficients.iter().map(|c| c.name.as_str()).collect();
-            format!("{}: {} states, {}", b.names.join(" and "), b.tracker.summary().states, names.join(" "))
+            format!("{}: {} states, {}", b.names().join(" and "), b.follower.summary().states, names.join(" "))
         });
         format!("{} Hz; {}", self.mission.mission.sample_rate_hz, bodies.collect::<Vec<_>>().join("; "))
     }
 
-    /// Coefficients with value, σ and covariance. One that acts on both test masses is taken from the filter that knows
-    /// it better: the two share the thrusters' noise, so their mean would promise too much.
+    /// Coefficients with value, σ and covariance. One that several filters estimate is taken from the one with the
+    /// least σ: filters share the thrusters' noise, so that the σ of a mean would be too small.
     fn estimates(&self, report: &mut Report) {
         let results: Vec<(f64, Option<Average>)> =
-            self.bodies.iter().map(|b| (b.tracker.stretch(), b.tracker.result())).collect();
+            self.bodies.iter().map(|b| (b.follower.stretch(), b.follower.result())).collect();
         let sigma = |b: usize, j: usize| -> Option<f64> {
             let (stretch, average) = &results[b];
             let m = self.bodies[b].coefficients.len();
@@ -461,6 +472,7 @@ impl EsAkf {
             report.coefficients.push(Estimate {
                 name: c.name.clone(),
                 solution: "es-akf".to_owned(),
+                role: Some(Role::Recursive),
                 value,
                 sigma: sigma(b, j),
                 unit: c.unit.clone(),
@@ -494,29 +506,34 @@ impl EsAkf {
 /// So many states that no filter holds them.
 struct TooMany(usize);
 
-fn tracker<const D: usize>(model: Model<D>, settings: Settings, snapshot_s: f64) -> Result<Box<Tracker<D>>, TooMany> {
-    let states = model.states();
-    Akf::new(model, settings).map(|filter| Box::new(Tracker::new(filter, snapshot_s))).ok_or(TooMany(states))
-}
-
-/// Frame of a test mass's displacements.
-fn frame_of(test_mass: &str) -> &'static str {
-    if test_mass == TEST_MASSES[0] { "ORF_1" } else { "ORF_2" }
+/// The test masses of which a known acceleration is made, in the order of the columns.
+fn test_masses(available: &Available) -> Vec<TestMass> {
+    let mut all: Vec<TestMass> = Vec::new();
+    for column in &available.columns {
+        let name = column.name.strip_suffix(".x").and_then(|n| n.strip_suffix(KNOWN_ACCELERATION)?.strip_suffix('.'));
+        if let Some(name) = name.filter(|name| all.iter().all(|t| t.name != *name)) {
+            all.push(TestMass { name: name.to_owned(), frame: column.frame.clone() });
+        }
+    }
+    all
 }
 
 /// What the filter of these test masses reads.
 fn read_columns(
-    names: &[&'static str],
+    test_masses: &[TestMass],
     responses: &[(&Coefficient, Response)],
     available: &Available,
     link: &mut Link<'_>,
 ) -> Result<Columns, PluginError> {
     let mut three = |group: &str, unit: &str| -> Result<Vec<In>, PluginError> {
-        let wanted = names.iter().flat_map(|name| AXES.map(|axis| (frame_of(name), format!("{name}.{group}.{axis}"))));
+        let wanted = test_masses
+            .iter()
+            .flat_map(|TestMass { name, frame }| AXES.map(|axis| (frame, format!("{name}.{group}.{axis}"))));
         wanted.map(|(frame, column)| link.read(&Want::new(column).unit(unit).frame(frame))).collect()
     };
-    let (readout_m, u_m_s2) = (three("r_orf_m", "m")?, three("u_orf_m_s2", "m s-2")?);
-    let channels: Vec<String> = names.iter().flat_map(|name| AXES.map(|axis| format!("{name}.accel.{axis}"))).collect();
+    let (readout_m, u_m_s2) = (three("r_orf_m", "m")?, three(KNOWN_ACCELERATION, "m s-2")?);
+    let channels: Vec<String> =
+        test_masses.iter().flat_map(|t| AXES.map(|axis| format!("{}.accel.{axis}", t.name))).collect();
     let mut coefficients: Vec<Coefficient> = Vec::new();
     let mut regressors = Vec::new();
     for (coefficient, response) in responses {
@@ -549,104 +566,23 @@ fn read_columns(
     Ok(Columns { readout_m, u_m_s2, regressors, coefficients })
 }
 
-/// What a filter has to say at the end, whatever it follows.
-struct Summary {
-    states: usize,
-    counts: [(&'static str, u64); 7],
-    nis_sum: f64,
-    nis: Option<f64>,
-    readouts: Vec<Readout>,
-    /// σ of the coefficients as the recursion has it.
-    recursion_sigma: Vec<f64>,
-    stretch: f64,
-    averaged_s: Option<f64>,
-}
-
-/// One readout's innovations.
-struct Readout {
-    used: u64,
-    design_nis: Option<f64>,
-    octaves: Octaves,
-}
-
-/// A row for the archive, whatever is followed.
-struct Row {
-    row: usize,
-    displacement_m: Vec<f64>,
-    value: Vec<f64>,
-    sigma: Vec<f64>,
-    nis: f64,
-}
-
-impl<const D: usize> From<Snapshot<D>> for Row {
-    fn from(s: Snapshot<D>) -> Self {
-        let Snapshot { row, displacement_m, value, sigma, nis } = s;
-        Self { row, displacement_m: displacement_m.to_vec(), value, sigma, nis }
-    }
-}
-
-impl Following {
-    fn summary(&self) -> Summary {
-        each!(self, t => {
-            let (filter, s) = (t.filter(), t.filter().statistics());
-            let readouts = s.readouts.iter().zip(s.design_nis()).zip(s.octaves);
-            Summary {
-                states: filter.model().states(),
-                counts: [
-                    ("updates", s.updates),
-                    ("predictions_only", s.predictions),
-                    ("rejected_readouts", s.rejected),
-                    ("reacquisitions", s.reacquisitions),
-                    ("repairs_of_q", s.repairs_q),
-                    ("repairs_of_p", s.repairs_p),
-                    ("resets", s.resets),
-                ],
-                nis_sum: s.nis_sum,
-                nis: s.nis(),
-                readouts: readouts
-                    .map(|((used, design_nis), octaves)| Readout { used: *used, design_nis, octaves })
-                    .collect(),
-                recursion_sigma: (0..filter.coefficients().len())
-                    .map(|j| filter.recursion_covariance(j, j).sqrt())
-                    .collect(),
-                stretch: t.stretch(),
-                averaged_s: t.result().map(|a| a.span_s),
-            }
-        })
-    }
-
-    fn result(&self) -> Option<Average> {
-        each!(self, t => t.result())
-    }
-
-    fn stretch(&self) -> f64 {
-        each!(self, t => t.stretch())
-    }
-
-    fn save(&self, out: &mut Bytes) {
-        each!(self, t => t.save(out));
-    }
-
-    fn load(&mut self, words: &mut Words<'_>) -> Result<(), StateError> {
-        each!(self, t => t.load(words))
-    }
-}
-
 impl Body {
-    fn run(&mut self, input: &Inputs<'_>, pieces: &[(u64, std::ops::Range<usize>)]) -> Vec<Row> {
-        each!(&mut self.tracker, tracker => {
-            let rows = Rows {
-                readout_m: std::array::from_fn(|i| input.f64(self.readout_m[i])),
-                u_m_s2: std::array::from_fn(|i| input.f64(self.u_m_s2[i])),
-                regressors: self.regressors.iter().map(|r| r.map(|c| input.f64(c))).collect(),
-            };
-            let mut snapshots = Vec::new();
-            for (missing, piece) in pieces {
-                tracker.skip(*missing);
-                snapshots.extend(tracker.process(&rows, piece.clone()).into_iter().map(Row::from));
-            }
-            snapshots
-        })
+    fn names(&self) -> Vec<&str> {
+        self.test_masses.iter().map(|t| t.name.as_str()).collect()
+    }
+
+    fn run(&mut self, input: &Inputs<'_>, pieces: &[(u64, std::ops::Range<usize>)]) -> Vec<Snapshot> {
+        let rows = Rows {
+            readout_m: self.readout_m.iter().map(|c| input.f64(*c)).collect(),
+            u_m_s2: self.u_m_s2.iter().map(|c| input.f64(*c)).collect(),
+            regressors: self.regressors.iter().map(|r| r.map(|c| input.f64(c))).collect(),
+        };
+        let mut snapshots = Vec::new();
+        for (missing, piece) in pieces {
+            self.follower.skip(*missing);
+            snapshots.extend(self.follower.process(&rows, piece.clone()));
+        }
+        snapshots
     }
 }
 
@@ -665,8 +601,8 @@ fn prior_of(c: &Coefficient) -> Result<Theta, PluginError> {
     }
 }
 
-/// Of a test mass's readouts the innovations' mean square over what the mission's noise predicts, octave by octave from the highest, and
-/// how many there are.
+/// Of a test mass's readouts the innovations' mean square over what the mission's noise predicts, octave by octave from
+/// the highest, and how many there are.
 fn innovation_octaves(readouts: &[Readout]) -> serde_json::Map<String, serde_json::Value> {
     let of = |octaves: &Octaves| {
         let (power, count): (Vec<f64>, Vec<u64>) = octaves.powers().unzip();
@@ -675,12 +611,13 @@ fn innovation_octaves(readouts: &[Readout]) -> serde_json::Map<String, serde_jso
     AXES.iter().zip(readouts).map(|(axis, readout)| ((*axis).to_owned(), of(&readout.octaves))).collect()
 }
 
-/// Whether a coefficient has regressors on both test masses.
-fn acts_on_several(responses: &[(&Coefficient, Response)], coefficient: &str) -> bool {
-    let of_it = |name: &str| {
-        responses.iter().any(|(c, r)| c.name == coefficient && r.channel.starts_with(&format!("{name}.accel.")))
+/// Whether a coefficient has regressors on more than one test mass.
+fn acts_on_several(all: &[TestMass], responses: &[(&Coefficient, Response)], coefficient: &str) -> bool {
+    let acted_on = |t: &&TestMass| {
+        let prefix = format!("{}.accel.", t.name);
+        responses.iter().any(|(c, r)| c.name == coefficient && r.channel.starts_with(&prefix))
     };
-    TEST_MASSES.into_iter().all(of_it)
+    all.iter().filter(acted_on).count() > 1
 }
 
 #[cfg(test)]
@@ -690,10 +627,10 @@ mod tests {
     fn stage() -> EsAkf {
         let setup = serde_json::json!({
             "parameters": {
-                "follow": "auto", "adaptation": "monotone", "forgetting": 0.999_999, "warm_up_s": 600.0, "gate_sigma": 6.0,
+                "follow": "auto", "adaptation": "auto", "forgetting": 0.999_999, "warm_up_s": 600.0, "gate_sigma": 6.0,
                 "gate_patience": 30, "calibrated_sigma": true, "check_s": 600.0, "output_interval_s": 60.0,
                 "displacement_prior_m": 1e-6, "velocity_prior_m_s": 1e-7, "bias_prior_m_s2": 1e-7,
-                "bias_walk_m_s2_rts": 3e-15, "bias_walk_both_m_s2_rts": 3e-16, "leak_hz": 1e-6, "unknown_alpha": 1.0,
+                "bias_walk_m_s2_rts": 3e-15, "leak_hz": 1e-6, "unknown_alpha": 1.0,
             },
             "mission": {
                 "mission": { "name": "M", "spacecraft": "S", "sample_rate_hz": 10.0 },

@@ -1,5 +1,5 @@
-//! The extended-state adaptive Kalman filter, equations Final_AKF_X_k to Final_AKF_p_k1, of `D` axes: those of one test mass, as in
-//! the paper, or of two.
+//! The extended-state adaptive Kalman filter, equations Final_AKF_X_k to Final_AKF_p_k1, of `D` axes: those of one test
+//! mass, as in the paper, or of several.
 //!
 //! # Two readings of the printed equations
 //! * eq:Final_AKF_p_k1 carries `P_k`, the covariance of `X̂⁻_{k+1}`, to that of `X̂⁻_{k+2}`, so its `A_d` (and that of
@@ -12,14 +12,13 @@
 //! `P` is only a covariance if `Q̂` and `R̂` are those of the data, and the adaptation moves both for reasons of
 //! stability. So a second covariance `P̃` follows the gains that were really used, under the noise of the mission
 //! file: the error covariance of this estimator, adapted or not, as far as that noise model holds. The innovations
-//! measure how far it does ([`Statistics::design_nis`]). Ten synthetic days at the default pace ended with `P_end` at
-//! 1.00 of that σ under the monotone adaptation, at 0.35 (b_y, b_z) to 1.8 (b_x) under the residual one and at 1.6 to
-//! 1.8 under the innovation one, while the errors stayed within 2σ of `P̃` in all three.
+//! measure how far it does ([`Statistics::design_nis`]).
 //!
 //! # Definiteness
-//! `Q` and `P` are tested every `check_epochs`, not every epoch: adaptation moves `Q̂` by `1 − α` a step, so that nothing
-//! happens in between that matters, and an eigenvalue decomposition costs far more than a step. `Q̂` is singular by construction (one
-//! force drives `r` and `v`), so a `Q̂` that adapts by elements is found slightly indefinite nearly every time.
+//! `Q` and `P` are tested every `check_epochs`, not every epoch: adaptation moves `Q̂` by `1 − α` a step, so that
+//! nothing happens in between that matters, and an eigenvalue decomposition costs far more than a step. `Q̂` is
+//! singular by construction (one force drives `r` and `v`), so a `Q̂` that adapts by elements is found slightly
+//! indefinite nearly every time.
 
 use crate::definite::{Finding, repair};
 use crate::kernel::{
@@ -27,15 +26,14 @@ use crate::kernel::{
 };
 use crate::model::Model;
 use crate::octaves::Octaves;
-use crate::state::{Bytes, StateError, Words};
+use crate::state::{StateError, Words};
 
 /// How `Q̂` and `R̂` follow the innovations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Adaptation {
     /// The paper's proposal: eqs Final_AKF_Q_K and Final_AKF_R_k.
     Monotone,
-    /// eqs sage_husa_Q_update and sage_husa_R_update. The paper calls it unstable; in a trial of one seed over three days, without
-    /// repairs, it lost the z axis after 2.2 days.
+    /// eqs sage_husa_Q_update and sage_husa_R_update; nothing keeps `Q̂` and `R̂` positive, so that it can diverge.
     Innovation,
     /// eqs residual_Q_update and residual_R_update.
     Residual,
@@ -134,14 +132,16 @@ impl<const D: usize> Statistics<D> {
     }
 }
 
-/// The filter. The capacity `N ≥ model.states()` is a multiple of eight; see [`crate::Akf`] for the
-/// one that chooses it.
+/// The filter. The capacity `N ≥ model.states()` is a multiple of eight; see [`crate::tracker::follow`],
+/// which chooses it.
 #[derive(Clone, Debug)]
 pub struct Filter<const N: usize, const D: usize = 3> {
-    model: Model<D>,
+    model: Model,
     settings: Settings,
     transition: Transition<N, D>,
     design_q: Matrix<N>,
+    /// `R` of the mission's noise.
+    design_r: Square<D>,
     /// Entries of the upper triangle of `Q` that are not zero.
     noisy: Vec<(usize, usize)>,
     /// Entries of the upper triangle of `Q̂` that can be other than zero.
@@ -190,21 +190,23 @@ pub struct Filter<const N: usize, const D: usize = 3> {
 }
 
 impl<const N: usize, const D: usize> Filter<N, D> {
-    const R: usize = Model::<D>::R;
-    const V: usize = Model::<D>::V;
-    const BIAS: usize = Model::<D>::BIAS;
-    const THETA: usize = Model::<D>::THETA;
+    const R: usize = Transition::<N, D>::R;
+    const V: usize = Transition::<N, D>::V;
+    const BIAS: usize = Transition::<N, D>::BIAS;
+    const THETA: usize = Transition::<N, D>::THETA;
 
     /// A filter before its first epoch.
     ///
     /// # Panics
-    /// When `N` is no multiple of eight or smaller than `model.states()`.
+    /// When `D` is not the model's number of axes, or `N` is no multiple of eight or smaller than `model.states()`.
     #[must_use]
-    pub fn new(model: Model<D>, settings: Settings) -> Self {
+    pub fn new(model: Model, settings: Settings) -> Self {
+        assert_eq!(D, model.axes(), "axes of the model");
         assert!(N.is_multiple_of(8) && model.states() <= N, "{} states do not fit into {N}", model.states());
         let mut filter = Self {
             transition: Transition::new(&model),
             design_q: Matrix::zero(),
+            design_r: std::array::from_fn(|i| std::array::from_fn(|j| if i == j { model.readout_m2[i] } else { 0.0 })),
             noisy: Vec::new(),
             moving: Vec::new(),
             x: [0.0; N],
@@ -254,7 +256,7 @@ impl<const N: usize, const D: usize> Filter<N, D> {
         self.model.prior_covariance(|i, j, value| p.0[i][j] = value);
         self.p_design = self.p.clone();
         self.q = self.design_q.clone();
-        self.r = diagonal(&self.model.readout_m2);
+        self.r = self.design_r;
         self.s_hat = [[0.0; D]; D];
         self.e_hat = self.r;
         self.s_samples = 0;
@@ -295,10 +297,12 @@ impl<const N: usize, const D: usize> Filter<N, D> {
         }
         self.driven = false;
         self.drift();
-        for i in Self::BIAS..Self::THETA {
-            let walked = self.model.bias_step_m2_s4 * (epochs - 1) as f64;
-            self.p.0[i][i] += walked;
-            self.p_design.0[i][i] += walked;
+        for i in 0..D {
+            for j in 0..D {
+                let walked = self.model.bias_step_m2_s4[(i, j)] * (epochs - 1) as f64;
+                self.p.0[Self::BIAS + i][Self::BIAS + j] += walked;
+                self.p_design.0[Self::BIAS + i][Self::BIAS + j] += walked;
+            }
         }
         // Noise of minutes to days has no memory of the other side of such a gap.
         for i in Self::THETA + self.model.coefficients.len()..self.model.states() {
@@ -325,7 +329,8 @@ impl<const N: usize, const D: usize> Filter<N, D> {
         }
     }
 
-    /// eqs Final_AKF_Q_ITER, Final_AKF_Q_K and Final_AKF_p_k1 of the last epoch, with the `A` of the interval now known.
+    /// eqs Final_AKF_Q_ITER, Final_AKF_Q_K and Final_AKF_p_k1 of the last epoch, with the `A` of the interval now
+    /// known.
     fn time_update(&mut self) {
         let follows = self.has_own_covariance();
         let product = &mut self.product;
@@ -538,7 +543,7 @@ impl<const N: usize, const D: usize> Filter<N, D> {
         if self.has_own_covariance() {
             self.seen_design = self.transition.observed(&self.p_design);
             let hph = self.transition.observed_twice(&self.seen_design);
-            self.s_design = sum(&hph, &diagonal(&self.model.readout_m2));
+            self.s_design = sum(&hph, &self.design_r);
         } else {
             self.s_design = *s;
         }
@@ -609,7 +614,7 @@ impl<const N: usize, const D: usize> Filter<N, D> {
 
     /// The model.
     #[must_use]
-    pub fn model(&self) -> &Model<D> {
+    pub fn model(&self) -> &Model {
         &self.model
     }
 
@@ -623,6 +628,18 @@ impl<const N: usize, const D: usize> Filter<N, D> {
     #[must_use]
     pub fn state(&self) -> &[f64] {
         &self.x[..self.model.states()]
+    }
+
+    /// Estimates of the coefficients.
+    #[must_use]
+    pub fn coefficients(&self) -> &[f64] {
+        &self.x[Self::THETA..][..self.model.coefficients.len()]
+    }
+
+    /// Estimate of the displacement `r`, ORF, m.
+    #[must_use]
+    pub fn displacement_m(&self) -> &[f64] {
+        &self.x[Self::R..Self::V]
     }
 
     /// `P_k[i][j]`, of `X̂⁻` at the last epoch.
@@ -662,21 +679,8 @@ impl<const N: usize, const D: usize> Filter<N, D> {
         self.tracking
     }
 
-    /// Appends everything that the next step depends on.
-    pub fn save(&self, out: &mut Bytes) {
-        self.clone().visit(&mut Words::Write(out)).unwrap_or_else(|_| unreachable!("writing to memory"));
-    }
-
-    /// Restores what [`Filter::save`] wrote for the same model.
-    ///
-    /// # Errors
-    /// [`StateError`] when the bytes end early.
-    pub fn load(&mut self, words: &mut Words<'_>) -> Result<(), StateError> {
-        self.visit(words)
-    }
-
-    /// One list of the state for both directions.
-    fn visit(&mut self, w: &mut Words<'_>) -> Result<(), StateError> {
+    /// One list of all that the next step depends on, for both directions.
+    pub(crate) fn visit(&mut self, w: &mut Words<'_>) -> Result<(), StateError> {
         w.all(&mut self.x)?;
         for m in [&mut self.p, &mut self.q, &mut self.p_design] {
             for row in m.0.iter_mut() {
@@ -728,10 +732,6 @@ impl<const N: usize, const D: usize> Filter<N, D> {
         w.all(&mut s.design_sum)?;
         s.octaves.iter_mut().try_for_each(|o| o.visit(w))
     }
-}
-
-fn diagonal<const D: usize>(d: &[f64; D]) -> Square<D> {
-    std::array::from_fn(|i| std::array::from_fn(|j| if i == j { d[i] } else { 0.0 }))
 }
 
 fn sum<const D: usize>(a: &Square<D>, b: &Square<D>) -> Square<D> {

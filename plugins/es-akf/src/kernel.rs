@@ -12,7 +12,7 @@
 use std::ops::Range;
 
 use crate::model::Model;
-use crate::shaping::Shaking;
+use crate::shaping::TorqueNoiseShaping;
 
 /// A D×D matrix over the readouts.
 pub type Square<const D: usize> = [[f64; D]; D];
@@ -94,9 +94,9 @@ fn combine<const N: usize, const D: usize>(weight: [f64; D], columns: &Columns<N
 pub struct Transition<const N: usize, const D: usize> {
     dt: f64,
     half_dt2: f64,
-    /// States from the first coefficient on that push `v`: coefficients and shakings.
+    /// States from the first coefficient on that push `v`: coefficients and torque_noise.
     pushing: usize,
-    /// The states of noise, of shakings and of the readouts.
+    /// The states of noise, of torque_noise and of the readouts.
     noise: Range<usize>,
     /// Diagonal of `A_n`, by state; one for all others.
     decay: Box<[f64; N]>,
@@ -104,30 +104,33 @@ pub struct Transition<const N: usize, const D: usize> {
     links: Vec<(usize, usize, f64)>,
     /// States that add up in each readout: `r_i` and the outputs of its chains.
     outputs: [Vec<usize>; D],
-    /// What the states from the first coefficient on push, m s⁻² per unit: the regressors of the current step, then the shakings, which
-    /// never change.
+    /// What the states from the first coefficient on push, m s⁻² per unit: the regressors of the current step, then the
+    /// torque_noise, which never change.
     pub phi: Box<[[f64; D]; N]>,
 }
 
 impl<const N: usize, const D: usize> Transition<N, D> {
-    const R: usize = Model::<D>::R;
-    const V: usize = Model::<D>::V;
-    const BIAS: usize = Model::<D>::BIAS;
-    const THETA: usize = Model::<D>::THETA;
+    /// First state of the displacements, velocities, bias accelerations and coefficients.
+    pub const R: usize = 0;
+    /// See [`Self::R`].
+    pub const V: usize = D;
+    /// See [`Self::R`].
+    pub const BIAS: usize = 2 * D;
+    /// See [`Self::R`].
+    pub const THETA: usize = 3 * D;
 
     /// The transition of a model, regressors zero.
     #[must_use]
-    pub fn new(model: &Model<D>) -> Self {
+    pub fn new(model: &Model) -> Self {
         let mut outputs: [Vec<usize>; D] = std::array::from_fn(|axis| vec![Self::R + axis]);
         let mut decay = Box::new([1.0; N]);
         let mut links = Vec::new();
         let mut phi = Box::new([[0.0; D]; N]);
-        for (first, shaking) in model.placed_shakings() {
-            for state in first..first + Shaking::<D>::STATES {
-                decay[state] = shaking.decay();
-                phi[state - Self::THETA] = shaking.lever_m_s2.map(|l| -l);
-            }
-            links.push((first, first + 1, -shaking.gain() / shaking.decay()));
+        for (first, noise) in model.placed_torque_noise() {
+            let (diagonal, [upper, lower]) = noise.factors();
+            decay[first..first + 2].copy_from_slice(&diagonal);
+            phi[first - Self::THETA] = std::array::from_fn(|axis| -noise.lever_m_s2[axis]);
+            links.extend([(first, first + 1, upper), (first + 1, first, lower)]);
         }
         for (axis, first, chain) in model.placed_chains() {
             outputs[axis].push(first);
@@ -141,7 +144,7 @@ impl<const N: usize, const D: usize> Transition<N, D> {
         Self {
             dt: model.dt_s,
             half_dt2: 0.5 * model.dt_s * model.dt_s,
-            pushing: coefficients + Shaking::<D>::STATES * model.shakings.len(),
+            pushing: coefficients + TorqueNoiseShaping::STATES * model.torque_noise.len(),
             noise: Self::THETA + coefficients..model.states(),
             decay,
             links,
@@ -232,14 +235,15 @@ impl<const N: usize, const D: usize> Transition<N, D> {
         for row in &mut d[..Self::BIAS] {
             self.move_mass(row, &[0.0; D]);
         }
-        // · Aᵀ for the columns of the noise, then A · for its rows; a row of noise needs none before its own first block.
+        // · Aᵀ for the columns of the noise, then A · for its rows; a row of noise needs none before its own first
+        // block.
         for (i, row) in d[..end].iter_mut().enumerate() {
             self.move_noise(row, if i < first { 1.0 } else { self.decay[i] });
         }
         for &(i, j, link) in &self.links {
-            let (upper, lower) = d.split_at_mut(j);
+            let [to, from] = d.get_disjoint_mut([i, j]).expect("a link joins two states");
             for l in LANES..N {
-                upper[i][l] += link * lower[0][l];
+                to[l] += link * from[l];
             }
         }
     }

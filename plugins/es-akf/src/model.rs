@@ -1,8 +1,10 @@
 //! The extended-state model (eq:extended_state_space, eq:readout_model), discretised.
 //!
-//! `D` is the number of axes that are followed: three of one test mass as in the paper, or six of both test masses.
+//! It has three axes of each test mass that is followed: one test mass, as in the paper, or several together.
 
-use crate::shaping::{Chain, Shaking};
+use nalgebra::DMatrix;
+
+use crate::shaping::{Chain, TorqueNoiseShaping};
 
 /// What is believed before the first sample, 1σ, and what `r` and `v` fall back to after a loss of track.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -24,48 +26,52 @@ pub struct Coefficient {
     pub prior_sigma: f64,
 }
 
-/// The model of one test mass, or of two, the second's axes after the first's. All components are in the ORF of their test mass.
+/// The model of one test mass or of several, axes one test mass after another, `D` in all. All components are in the
+/// ORF of their test mass.
 ///
-/// The states are `X = [r(D), v(D), a_b(D), θ(m), w(2 per shaking), n(s)]`.
+/// The states are `X = [r(D), v(D), a_b(D), θ(m), w(2 per torque noise), n(s)]`.
 ///
 /// `A` is not stored: with `φ` (3×m) the regressors, mean over `[t_k, t_{k+1})`, it is, exactly for accelerations
 /// constant over a step, `r ← r + dt v + dt²/2 (a_b + φθ + û)`, `v ← v + dt (a_b + φθ + û)`, `n ← A_n n`, and the
 /// identity for `a_b` and `θ`. The offset's regressors are `φ = −[α̂×] − [ω̂×][ω̂×]`; the printed A has `+[α×]`,
 /// against the paper's own eq:TM_SC_relative_acceleration.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Model<const D: usize = 3> {
+pub struct Model {
     /// Step, s.
     pub dt_s: f64,
     /// Covariance of the mean acceleration noise of one step, D×D, m² s⁻⁴: one-sided PSD × sample rate / 2.
     ///
     /// The noise is taken constant over a step, as û and α̂ are means over it, so the blocks of `Q` are
     /// `(dt⁴/4, dt³/2, dt²)`; a continuous white force would have `dt³/3` in place of `dt³/4` in `rr`.
-    pub acceleration_m2_s4: [[f64; D]; D],
-    /// Acceleration noise that is not white.
-    pub shakings: Vec<Shaking<D>>,
-    /// Variance that each component of `a_b` gains in one step, m² s⁻⁴.
-    pub bias_step_m2_s4: f64,
+    pub acceleration_m2_s4: DMatrix<f64>,
+    /// What the angular acceleration leaves unknown of the torque noise, acting through the offsets.
+    pub torque_noise: Vec<TorqueNoiseShaping>,
+    /// Covariance that `a_b` gains in one step, D×D, m² s⁻⁴.
+    pub bias_step_m2_s4: DMatrix<f64>,
     /// Variance of the white part of the readouts, m²: one-sided PSD × sample rate / 2.
-    pub readout_m2: [f64; D],
+    pub readout_m2: Vec<f64>,
     /// Noise-shaping chains of the readouts.
-    pub chains: [Vec<Chain>; D],
+    pub chains: Vec<Vec<Chain>>,
     /// Coefficients that act on these axes.
     pub coefficients: Vec<Coefficient>,
     /// Prior of the other states.
     pub prior: Prior,
 }
 
-impl<const D: usize> Model<D> {
-    /// First state of the displacements.
-    pub const R: usize = 0;
-    /// First state of the velocities.
-    pub const V: usize = D;
-    /// First state of the bias accelerations.
-    pub const BIAS: usize = 2 * D;
-    /// First state of the coefficients.
-    pub const THETA: usize = 3 * D;
+impl Model {
+    /// Number of axes that are followed, three of each test mass.
+    #[must_use]
+    pub fn axes(&self) -> usize {
+        self.readout_m2.len()
+    }
 
-    /// Number of states, `3D + m + 2 per shaking + s`.
+    /// First state of the coefficients, after displacements, velocities and bias accelerations.
+    #[must_use]
+    pub fn theta(&self) -> usize {
+        3 * self.axes()
+    }
+
+    /// Number of states, `3D + m + 2 per torque noise + s`.
     #[must_use]
     pub fn states(&self) -> usize {
         self.first_chain() + self.chains.iter().flatten().map(Chain::states).sum::<usize>()
@@ -73,13 +79,13 @@ impl<const D: usize> Model<D> {
 
     /// First state of the noise-shaping chains.
     fn first_chain(&self) -> usize {
-        Self::THETA + self.coefficients.len() + Shaking::<D>::STATES * self.shakings.len()
+        self.theta() + self.coefficients.len() + TorqueNoiseShaping::STATES * self.torque_noise.len()
     }
 
-    /// What shakes the axes with a spectrum of its own, each with its first state.
-    pub fn placed_shakings(&self) -> impl Iterator<Item = (usize, &Shaking<D>)> {
-        let first = Self::THETA + self.coefficients.len();
-        self.shakings.iter().enumerate().map(move |(i, shaking)| (first + Shaking::<D>::STATES * i, shaking))
+    /// Torque noise, each process with its first state.
+    pub fn placed_torque_noise(&self) -> impl Iterator<Item = (usize, &TorqueNoiseShaping)> {
+        let first = self.theta() + self.coefficients.len();
+        self.torque_noise.iter().enumerate().map(move |(i, noise)| (first + TorqueNoiseShaping::STATES * i, noise))
     }
 
     /// Chains with their axis and their first state.
@@ -96,30 +102,30 @@ impl<const D: usize> Model<D> {
 
     /// `Q` before any adaptation, n×n, by entries through `set(row, column, value)`; zero elsewhere.
     pub fn process_noise(&self, mut set: impl FnMut(usize, usize, f64)) {
-        let dt = self.dt_s;
-        for i in 0..D {
-            for j in 0..D {
-                // A shaking's white noise acts at once as well.
-                let shaken: f64 = self.shakings.iter().map(|s| s.lever_m_s2[i] * s.lever_m_s2[j]).sum();
-                let q = self.acceleration_m2_s4[i][j] + shaken;
-                set(Self::R + i, Self::R + j, q * dt.powi(4) / 4.0);
-                set(Self::R + i, Self::V + j, q * dt.powi(3) / 2.0);
-                set(Self::V + i, Self::R + j, q * dt.powi(3) / 2.0);
-                set(Self::V + i, Self::V + j, q * dt.powi(2));
+        let (dt, axes) = (self.dt_s, self.axes());
+        for i in 0..axes {
+            for j in 0..axes {
+                // A torque noise's deviate acts at once as well.
+                let shaken: f64 = self.torque_noise.iter().map(|s| s.lever_m_s2[i] * s.lever_m_s2[j]).sum();
+                let q = self.acceleration_m2_s4[(i, j)] + shaken;
+                set(i, j, q * dt.powi(4) / 4.0);
+                set(i, axes + j, q * dt.powi(3) / 2.0);
+                set(axes + i, j, q * dt.powi(3) / 2.0);
+                set(axes + i, axes + j, q * dt.powi(2));
+                set(2 * axes + i, 2 * axes + j, self.bias_step_m2_s4[(i, j)]);
             }
-            set(Self::BIAS + i, Self::BIAS + i, self.bias_step_m2_s4);
         }
-        for (first, shaking) in self.placed_shakings() {
-            let gain = shaking.gain();
-            for state in first..first + Shaking::<D>::STATES {
-                for (i, lever) in shaking.lever_m_s2.iter().enumerate() {
-                    for (moved, by) in [(Self::R + i, dt.powi(2) / 2.0), (Self::V + i, dt)] {
+        for (first, noise) in self.placed_torque_noise() {
+            let drive = noise.drive();
+            for (state, gain) in (first..).zip(drive) {
+                for (i, lever) in noise.lever_m_s2.iter().enumerate() {
+                    for (moved, by) in [(i, dt.powi(2) / 2.0), (axes + i, dt)] {
                         set(moved, state, by * lever * gain);
                         set(state, moved, by * lever * gain);
                     }
                 }
-                for other in first..first + Shaking::<D>::STATES {
-                    set(state, other, gain * gain);
+                for (other, other_gain) in (first..).zip(drive) {
+                    set(state, other, gain * other_gain);
                 }
             }
         }
@@ -135,16 +141,17 @@ impl<const D: usize> Model<D> {
 
     /// `P` before the first sample, n×n, by entries through `set(row, column, value)`; zero elsewhere.
     pub fn prior_covariance(&self, mut set: impl FnMut(usize, usize, f64)) {
-        for i in 0..D {
-            set(Self::R + i, Self::R + i, self.prior.displacement_m.powi(2));
-            set(Self::V + i, Self::V + i, self.prior.velocity_m_s.powi(2));
-            set(Self::BIAS + i, Self::BIAS + i, self.prior.bias_m_s2.powi(2));
+        let axes = self.axes();
+        for i in 0..axes {
+            set(i, i, self.prior.displacement_m.powi(2));
+            set(axes + i, axes + i, self.prior.velocity_m_s.powi(2));
+            set(2 * axes + i, 2 * axes + i, self.prior.bias_m_s2.powi(2));
         }
         for (j, c) in self.coefficients.iter().enumerate() {
-            set(Self::THETA + j, Self::THETA + j, c.prior_sigma.powi(2));
+            set(self.theta() + j, self.theta() + j, c.prior_sigma.powi(2));
         }
-        for (first, shaking) in self.placed_shakings() {
-            let stationary = shaking.stationary();
+        for (first, noise) in self.placed_torque_noise() {
+            let stationary = noise.stationary();
             for (i, row) in stationary.iter().enumerate() {
                 for (j, covariance) in row.iter().enumerate() {
                     set(first + i, first + j, *covariance);

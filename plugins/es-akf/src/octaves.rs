@@ -1,9 +1,9 @@
 //! Power of a series octave by octave: of white noise each octave has the same.
 //!
-//! Haar's wavelets: of two neighbours a and b, `(a − b)/√2` belongs to the upper octave and `(a + b)/√2` is passed on, half as often.
-//! For white Gaussian noise of variance σ² all of them are independent with that variance, so that n of an octave have
-//! `Σ d²/σ²` distributed as χ² with n degrees of freedom, whatever the other octaves do. Memory is fixed, and a sample costs two steps
-//! on average however long the series is.
+//! Haar's wavelets: of two neighbours a and b, `(a − b)/√2` belongs to the upper octave and `(a + b)/√2` is passed on,
+//! half as often. For white Gaussian noise of variance σ² all of them are independent with that variance, so that n of
+//! an octave have `Σ d²/σ²` distributed as χ² with n degrees of freedom, whatever the other octaves do. Memory is
+//! fixed, and a sample costs two steps on average however long the series is.
 
 use crate::state::{StateError, Words};
 
@@ -89,8 +89,8 @@ mod tests {
         }
     }
 
-    /// The twin: a sum of neighbours `(x_k + x_{k+1})/√2` has the spectrum `1 + cos 2πfΔt`. Of it the highest octave sees `(x_0 − x_2)/2`, of
-    /// variance 1/2, where 0.02 is 5σ; the octaves far below tend to 2.
+    /// The twin: a sum of neighbours `(x_k + x_{k+1})/√2` has the spectrum `1 + cos 2πfΔt`. Of it the highest octave
+    /// sees `(x_0 − x_2)/2`, of variance 1/2, where 0.02 is 5σ; the octaves far below tend to 2.
     #[test]
     fn what_is_coloured_is_seen_at_its_octave() {
         let x = noise(1 << 16);

@@ -5,6 +5,7 @@
 //! each integrator leaks at `ω_l`: `asd² f_c^p / (f² + f_l²)^{p/2}`, stationary, and equal to the term far above `f_l`.
 
 use dragfree_physics::noise::NoiseTerm;
+use nalgebra::{Complex, Matrix3, Vector3};
 
 /// Chain of leaky integrators `ṅ_i = −ω_l n_i + n_{i+1}`, the last one driven by white noise; `n_0` is the output.
 ///
@@ -57,52 +58,90 @@ impl Chain {
     }
 }
 
-/// White noise that is known from somewhere else where it is slow: `(s/(s + ω))²` of it is left.
+/// The torque noise that the reconstructed angular acceleration leaves unknown, as a process of two states.
 ///
-/// That is what an estimate of an angular acceleration leaves, made of angles with white noise: torques above ω, hardly anything below,
-/// where the error of the estimate falls with `(f/f_c)²`. The torque acts at once, its slow part is taken away by two states,
-/// `e = w − l₁ − l₂`, `l₁ ← a l₁ + g w`, `l₂ ← a l₂ + g (w − l₁)` with `a = e^{−ω dt}`, `g = 1 − a`, which is `((1 − z⁻¹)/(1 − a z⁻¹))²`.
+/// α̂ is the posterior mean given all wavefront sensing. With white torque noise of PSD `q` and white sensing noise of
+/// PSD `r`, sampled every `dt`, its error has the PSD `q g r/(q c + g r)`, `g = |1 − z|⁴/dt⁴`, `c = |1 + z|²/4` (the
+/// second difference of an attitude sees the mean of two samples). Its spectral factor is `√(q a₂) (1 − z⁻¹)²/A(z)`, `A
+/// = 1 + a₁ z⁻¹ + a₂ z⁻²` the factor of the denominator with its zeros inside the unit circle: a Butterworth high-pass
+/// where the corner lies far below Nyquist.
+///
+/// The white deviate acts at once; what the smoother knows of it is taken back by the state `y`, with
+/// `y ← y + μ d + β w`, `d ← (a₂ − μ²) d − μ y + (μ − β²/μ) w`, `β = 2 + a₁`, `μ² = A(1)`.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Shaking<const D: usize = 3> {
-    /// What one σ of the white noise, held for a step, does to each axis, m/s².
-    pub lever_m_s2: [f64; D],
+pub struct TorqueNoiseShaping {
+    /// Acceleration of each axis by one deviate, held for a step, m/s².
+    pub lever_m_s2: Vec<f64>,
+    /// `β`.
+    beta: f64,
+    /// `μ`.
+    mu: f64,
+    /// `a₂`.
     decay: f64,
 }
 
-impl<const D: usize> Shaking<D> {
-    /// Its states `l₂, l₁`.
+impl TorqueNoiseShaping {
+    /// Its states `y, d`; `y` alone acts.
     pub const STATES: usize = 2;
 
-    /// Noise of which `lever_m_s2` is one σ at Nyquist, held for a step of `dt_s`, known below `corner_rad_s`.
+    /// What is left of white noise that acts with `lever_m_s2` (1σ, held for a step) by sensing whose noise crosses it
+    /// at `crossover_rad_s`, the fourth root of the ratio of the two PSDs, `q/r`.
     #[must_use]
-    pub fn new(lever_m_s2: [f64; D], corner_rad_s: f64, dt_s: f64) -> Self {
-        let decay = (-corner_rad_s * dt_s).exp();
-        // At Nyquist each stage has the gain 2/(1 + a).
-        let whole = (0.5 * (1.0 + decay)).powi(2);
-        Self { lever_m_s2: lever_m_s2.map(|l| l * whole), decay }
+    pub fn new(lever_m_s2: Vec<f64>, crossover_rad_s: f64, dt_s: f64) -> Self {
+        // With s = 2 − z − z⁻¹ the denominator is ρ s² + q (4 − s)/4, ρ = r/dt⁴: two roots s, each of a pair z, 1/z.
+        let ratio = (crossover_rad_s * dt_s).powi(4);
+        let middle = Complex::new(ratio / 8.0, 0.0);
+        let apart = (middle * middle - Complex::new(ratio, 0.0)).sqrt();
+        // λ = 1 − z, the smaller of the two, without cancellation.
+        let [first, second] = [middle + apart, middle - apart].map(|s| {
+            let root = (s * s * 0.25 - s).sqrt();
+            let [a, b] = [s * 0.5 + root, s * 0.5 - root];
+            if (Complex::new(1.0, 0.0) - a).norm() < 1.0 { a } else { b }
+        });
+        // A = (1 − z₁ z⁻¹)(1 − z₂ z⁻¹): β = λ₁ + λ₂, A(1) = λ₁ λ₂.
+        let (beta, at_dc) = ((first + second).re, (first * second).re);
+        let decay = 1.0 - beta + at_dc;
+        let lever_m_s2 = lever_m_s2.into_iter().map(|l| l * decay.sqrt()).collect();
+        Self { lever_m_s2, beta, mu: at_dc.sqrt(), decay }
     }
 
-    /// `a`, of each state over one step.
+    /// Transition of `y, d` over one step.
     #[must_use]
-    pub fn decay(&self) -> f64 {
-        self.decay
+    pub fn transition(&self) -> [[f64; 2]; 2] {
+        [[1.0, self.mu], [-self.mu, 1.0 - self.beta]]
     }
 
-    /// `g`: what the noise adds to each state in one step, and what `l₁` takes from `l₂`.
+    /// What one deviate adds to `y, d` in a step.
     #[must_use]
-    pub fn gain(&self) -> f64 {
-        1.0 - self.decay
+    pub fn drive(&self) -> [f64; 2] {
+        [self.beta, self.mu - self.beta * self.beta / self.mu]
     }
 
-    /// Stationary covariance of `l₂, l₁`: the fixed point of their recursion.
+    /// The transition as a diagonal and two shears after it: `y += first · d`, then `d += second · y`.
+    #[must_use]
+    pub fn factors(&self) -> ([f64; 2], [f64; 2]) {
+        ([1.0, self.decay], [self.mu / self.decay, -self.mu])
+    }
+
+    /// Stationary covariance of `y, d`: the solution of `Σ = A Σ Aᵀ + g gᵀ`.
     #[must_use]
     pub fn stationary(&self) -> [[f64; 2]; 2] {
-        let (a, g) = (self.decay, self.gain());
-        let lost = 1.0 - a * a;
-        let first = g * g / lost;
-        let cross = (g * g - a * g * first) / lost;
-        let second = (g * g * first + g * g - 2.0 * a * g * cross) / lost;
-        [[second, cross], [cross, first]]
+        let ([[a, b], [c, d]], [g, h]) = (self.transition(), self.drive());
+        // Unknowns yy, yd, dd.
+        let equations = Matrix3::new(
+            1.0 - a * a,
+            -2.0 * a * b,
+            -b * b,
+            -a * c,
+            1.0 - a * d - b * c,
+            -b * d,
+            -c * c,
+            -2.0 * c * d,
+            1.0 - d * d,
+        );
+        let [yy, yd, dd] =
+            equations.lu().solve(&Vector3::new(g * g, g * h, h * h)).unwrap_or_else(Vector3::zeros).into();
+        [[yy, yd], [yd, dd]]
     }
 }
 
@@ -130,7 +169,7 @@ fn moment(n: usize, c: f64, t: f64) -> f64 {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use nalgebra::{Complex, DMatrix};
 
@@ -174,31 +213,53 @@ mod tests {
         }
     }
 
-    /// Spectrum and stationary covariance of what is left of white noise, from its own state space: `((1 − z⁻¹)/(1 − a z⁻¹))²`, one at
-    /// Nyquist, `(f/f_c)⁴` far below the corner.
+    /// Transfer from the deviate to the acceleration of the first axis, from the state space alone.
+    pub(crate) fn gain(noise: &TorqueNoiseShaping, axis: usize, cycles_per_sample: f64) -> f64 {
+        let z = Complex::from_polar(1.0, std::f64::consts::TAU * cycles_per_sample);
+        let complex = |m: DMatrix<f64>| m.map(|x| Complex::new(x, 0.0));
+        let transition = complex(DMatrix::from_fn(2, 2, |i, j| noise.transition()[i][j]));
+        let drive = complex(DMatrix::from_row_slice(2, 1, &noise.drive()));
+        let inverse = (DMatrix::identity(2, 2) * z - transition).try_inverse().expect("no pole on the unit circle");
+        (noise.lever_m_s2[axis] * (Complex::new(1.0, 0.0) - (inverse * drive)[(0, 0)])).norm()
+    }
+
+    /// The spectrum is that of the smoother's error by Wiener's formula, from far below the crossover to Nyquist, with
+    /// complex poles (sensing as good as torque noise below a quarter of the sample rate) and with real ones.
     #[test]
-    fn what_is_known_where_it_is_slow_is_gone_there() {
-        let (dt, corner) = (0.1, 0.5_f64);
-        let shaking = Shaking::new([2.0], corner, dt);
-        let (a, g) = (shaking.decay(), shaking.gain());
-        let transition = DMatrix::from_row_slice(2, 2, &[a, -g, 0.0, a]);
-        let drive = DMatrix::from_row_slice(2, 1, &[g, g]);
-        let stationary = DMatrix::from_fn(2, 2, |i, j| shaking.stationary()[i][j]);
-        let next = &transition * &stationary * transition.transpose() + &drive * drive.transpose();
-        assert!((&next - &stationary).norm() < 1e-14 * stationary.norm(), "{stationary} is not stationary: {next}");
-        let gain = |f: f64| {
-            let z = Complex::from_polar(1.0, std::f64::consts::TAU * f * dt);
-            let complex = |m: &DMatrix<f64>| m.map(|x| Complex::new(x, 0.0));
-            let zia = DMatrix::identity(2, 2) * z - complex(&transition);
-            let inverse = zia.try_inverse().expect("no pole on the unit circle");
-            let slow = DMatrix::from_element(1, 2, Complex::new(1.0, 0.0)) * inverse * complex(&drive);
-            (shaking.lever_m_s2[0] * (Complex::new(1.0, 0.0) - slow[(0, 0)])).norm()
-        };
-        assert!((gain(5.0) - 2.0).abs() < 1e-12, "{}", gain(5.0));
-        // To the order of ω dt, and of (f/f_c)².
-        for f in [1e-4, 1e-3] {
-            let want = 2.0 * (std::f64::consts::TAU * f / corner).powi(2);
-            assert!((gain(f) / want - 1.0).abs() < 1e-2, "{f} Hz: {} against {want}", gain(f));
+    fn the_error_of_the_smoothed_angular_acceleration_has_wieners_spectrum() {
+        let dt = 0.1;
+        for crossover_rad_s in [0.01, 0.45, 5.0, 27.0, 30.0, 80.0_f64] {
+            let noise = TorqueNoiseShaping::new(vec![2.0], crossover_rad_s, dt);
+            let (q, r) = (4.0, 4.0 / crossover_rad_s.powi(4));
+            for f in [1e-4, 1e-3, 1e-2, 0.07, 0.3, 1.0, 3.0, 4.9] {
+                let half = std::f64::consts::PI * f * dt;
+                let (second_difference, mean) = ((2.0 * half.sin() / dt).powi(4), half.cos().powi(2));
+                let want = q * second_difference * r / (q * mean + second_difference * r);
+                let got = gain(&noise, 0, f * dt).powi(2);
+                // Below the crossover 1 and what the states hold cancel, to (f/f_c)⁴ of them.
+                assert!(
+                    (got - want).abs() < 1e-9 * want + 1e-13 * q,
+                    "{crossover_rad_s} rad/s at {f} Hz: {got:e}, {want:e}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn torque_noise_starts_stationary_and_its_shears_are_its_transition() {
+        for crossover_rad_s in [0.01, 0.45, 27.0, 80.0_f64] {
+            let noise = TorqueNoiseShaping::new(vec![2.0], crossover_rad_s, 0.1);
+            let matrix = |m: [[f64; 2]; 2]| DMatrix::from_fn(2, 2, |i, j| m[i][j]);
+            let (a, sigma) = (matrix(noise.transition()), matrix(noise.stationary()));
+            let drive = DMatrix::from_row_slice(2, 1, &noise.drive());
+            let next = &a * &sigma * a.transpose() + &drive * drive.transpose();
+            assert!((&next - &sigma).norm() < 1e-10 * sigma.norm(), "{sigma} is not stationary: {next}");
+            assert!(sigma.symmetric_eigenvalues().min() > 0.0, "{sigma}");
+            let ([d0, d1], [first, second]) = noise.factors();
+            let sheared = DMatrix::from_row_slice(2, 2, &[1.0, 0.0, second, 1.0])
+                * DMatrix::from_row_slice(2, 2, &[1.0, first, 0.0, 1.0])
+                * DMatrix::from_row_slice(2, 2, &[d0, 0.0, 0.0, d1]);
+            assert!((&sheared - &a).norm() < 1e-12 * a.norm(), "{sheared} against {a}");
         }
     }
 }

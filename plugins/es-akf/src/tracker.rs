@@ -1,9 +1,11 @@
-//! One test mass, or two, over time: the filter, the mean over its last hour, the rows for the archive.
+//! Test masses over time: the filter, the mean over its last hour, the rows for the archive.
 
 use std::collections::VecDeque;
+use std::ops::Range;
 
-use crate::akf::Akf;
-use crate::filter::Drive;
+use crate::filter::{Drive, Filter, Settings};
+use crate::model::Model;
+use crate::octaves::Octaves;
 use crate::state::{Bytes, StateError, Words};
 
 /// The paper's value is the mean of the estimate over the last hour, s.
@@ -15,11 +17,11 @@ const BIN_S: f64 = 10.0;
 
 /// What is read, column by column, all of one length.
 #[derive(Clone, Debug)]
-pub struct Rows<'a, const D: usize = 3> {
+pub struct Rows<'a> {
     /// Measured displacement at `t_k`, axis by axis, m.
-    pub readout_m: [&'a [f64]; D],
+    pub readout_m: Vec<&'a [f64]>,
     /// `û`, mean over `[t_k, t_{k+1})`, axis by axis, m/s².
-    pub u_m_s2: [&'a [f64]; D],
+    pub u_m_s2: Vec<&'a [f64]>,
     /// What the coefficients add.
     pub regressors: Vec<Regressor<&'a [f64]>>,
 }
@@ -33,7 +35,7 @@ pub struct Regressor<C> {
     pub times: Factor,
     /// Constant factor.
     pub factor: f64,
-    /// Which of the axes that are followed.
+    /// Axis of the filter.
     pub axis: usize,
     /// Column.
     pub column: C,
@@ -58,11 +60,11 @@ pub enum Factor {
 
 /// A row for the archive.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Snapshot<const D: usize = 3> {
+pub struct Snapshot {
     /// Index of the row of the batch at which it was taken.
     pub row: usize,
     /// Estimate of the displacement, ORF, m.
-    pub displacement_m: [f64; D],
+    pub displacement_m: Vec<f64>,
     /// Estimates of the coefficients.
     pub value: Vec<f64>,
     /// Their σ for the gains in use and the mission's noise.
@@ -91,10 +93,96 @@ pub struct Average {
     pub covariance: Vec<f64>,
 }
 
-/// A test mass being followed, or both.
+/// Some test masses being followed over time, whatever the dimensions of the filter.
+pub trait Follower: std::fmt::Debug + Send + Sync {
+    /// Rows `range` of a batch; what is given for the archive.
+    fn process(&mut self, rows: &Rows<'_>, range: Range<usize>) -> Vec<Snapshot>;
+
+    /// Epochs that no row stands for.
+    fn skip(&mut self, epochs: u64);
+
+    /// The mean over the last hour, or over the last sixth of a run shorter than six hours; in bins of ten seconds, the
+    /// newest one perhaps not full. `None` before the first epoch.
+    fn result(&self) -> Option<Average>;
+
+    /// By how much σ must be stretched: the worst readout's innovations, rms, over what the mission's noise predicts;
+    /// never less than one, as quiet data do not prove a quiet instrument.
+    fn stretch(&self) -> f64;
+
+    /// Counts and consistency since the start.
+    fn summary(&self) -> Summary;
+
+    /// A copy with the state that [`Follower::save`] wrote for the same model.
+    ///
+    /// # Errors
+    /// [`StateError`] when the bytes end early or have no sense.
+    fn loaded(&self, words: &mut Words<'_>) -> Result<Box<dyn Follower>, StateError>;
+
+    /// Appends everything that the next row depends on.
+    fn save(&self, out: &mut Bytes);
+}
+
+/// Most states that a filter can have.
+pub const MAX_STATES: usize = 64;
+
+/// The filter of a model at the capacity that its axes and states need, with a row for the archive every `snapshot_s`;
+/// `None` for more than [`MAX_STATES`] states or more than three test masses.
+///
+/// Code is made for each pair of sizes, so that the compiler unrolls and vectorises the covariance passes.
+#[must_use]
+pub fn follow(model: Model, settings: Settings, snapshot_s: f64) -> Option<Box<dyn Follower>> {
+    let with = match (model.axes(), model.states()) {
+        (3, ..=16) => boxed::<16, 3>,
+        (3, 17..=24) => boxed::<24, 3>,
+        (3, 25..=32) => boxed::<32, 3>,
+        (3, 33..=48) => boxed::<48, 3>,
+        (3, 49..=MAX_STATES) => boxed::<64, 3>,
+        (6, ..=32) => boxed::<32, 6>,
+        (6, 33..=48) => boxed::<48, 6>,
+        (6, 49..=MAX_STATES) => boxed::<64, 6>,
+        (9, ..=48) => boxed::<48, 9>,
+        (9, 49..=MAX_STATES) => boxed::<64, 9>,
+        _ => return None,
+    };
+    Some(with(model, settings, snapshot_s))
+}
+
+fn boxed<const N: usize, const D: usize>(model: Model, settings: Settings, snapshot_s: f64) -> Box<dyn Follower> {
+    Box::new(Tracker::new(Filter::<N, D>::new(model, settings), snapshot_s))
+}
+
+/// What a filter says at the end.
 #[derive(Clone, Debug)]
-pub struct Tracker<const D: usize = 3> {
-    filter: Akf<D>,
+pub struct Summary {
+    /// States of its model.
+    pub states: usize,
+    /// Counts by their names in the report.
+    pub counts: [(&'static str, u64); 7],
+    /// Sum of the NIS over [`Summary::readouts`].
+    pub nis_sum: f64,
+    /// Mean NIS per degree of freedom.
+    pub nis: Option<f64>,
+    /// Axis by axis.
+    pub readouts: Vec<Readout>,
+    /// σ of the coefficients as the recursion has it.
+    pub recursion_sigma: Vec<f64>,
+}
+
+/// One readout's innovations.
+#[derive(Clone, Copy, Debug)]
+pub struct Readout {
+    /// How many were used after the warm-up.
+    pub used: u64,
+    /// Mean square over what the mission's noise predicts.
+    pub design_nis: Option<f64>,
+    /// The same octave by octave.
+    pub octaves: Octaves,
+}
+
+/// A filter over time.
+#[derive(Clone, Debug)]
+pub struct Tracker<const N: usize, const D: usize = 3> {
+    filter: Filter<N, D>,
     dt_s: f64,
     snapshot_epochs: u64,
     bins: VecDeque<Bin>,
@@ -102,10 +190,10 @@ pub struct Tracker<const D: usize = 3> {
     reported: (f64, u64),
 }
 
-impl<const D: usize> Tracker<D> {
+impl<const N: usize, const D: usize> Tracker<N, D> {
     /// A filter before its first epoch, with a row for the archive every `snapshot_s`.
     #[must_use]
-    pub fn new(filter: Akf<D>, snapshot_s: f64) -> Self {
+    pub fn new(filter: Filter<N, D>, snapshot_s: f64) -> Self {
         let dt_s = filter.model().dt_s;
         let snapshot_epochs = ((snapshot_s / dt_s).round() as u64).max(1);
         Self { filter, dt_s, snapshot_epochs, bins: VecDeque::new(), reported: (0.0, 0) }
@@ -113,46 +201,12 @@ impl<const D: usize> Tracker<D> {
 
     /// The filter.
     #[must_use]
-    pub fn filter(&self) -> &Akf<D> {
+    pub fn filter(&self) -> &Filter<N, D> {
         &self.filter
     }
 
     fn bin_epochs(&self) -> u64 {
         ((BIN_S / self.dt_s).round() as u64).max(1)
-    }
-
-    /// Rows `range` of a batch.
-    pub fn process(&mut self, rows: &Rows<'_, D>, range: std::ops::Range<usize>) -> Vec<Snapshot<D>> {
-        let mut snapshots = Vec::new();
-        let mut phi = vec![[0.0; D]; self.filter.coefficients().len()];
-        for k in range {
-            let mut u = rows.u_m_s2.map(|column| column[k]);
-            phi.iter_mut().for_each(|p| *p = [0.0; D]);
-            for r in &rows.regressors {
-                // A product is linear in its coefficient at the other's estimate of this epoch.
-                let times = match r.times {
-                    Factor::Estimated(j) => self.filter.coefficients()[j],
-                    Factor::Fixed(value) => value,
-                };
-                let added = times * r.factor * r.column[k];
-                match r.coefficient {
-                    Factor::Estimated(j) => phi[j][r.axis] += added,
-                    Factor::Fixed(value) => u[r.axis] += value * added,
-                }
-            }
-            let readout = rows.readout_m.map(|column| column[k]);
-            self.filter.step(readout, Drive { acceleration_m_s2: u, regressors: &phi });
-            self.average();
-            if self.filter.statistics().epochs.is_multiple_of(self.snapshot_epochs) {
-                snapshots.push(self.snapshot(k));
-            }
-        }
-        snapshots
-    }
-
-    /// Epochs that no row stands for.
-    pub fn skip(&mut self, epochs: u64) {
-        self.filter.skip(epochs);
     }
 
     fn average(&mut self) {
@@ -178,7 +232,7 @@ impl<const D: usize> Tracker<D> {
         (AVERAGE_S / (self.bin_epochs() as f64 * self.dt_s)).round() as usize
     }
 
-    fn snapshot(&mut self, row: usize) -> Snapshot<D> {
+    fn snapshot(&mut self, row: usize) -> Snapshot {
         let s = self.filter.statistics();
         let (sum, dof) = (s.nis_sum, s.readouts.iter().sum::<u64>());
         let nis =
@@ -186,13 +240,65 @@ impl<const D: usize> Tracker<D> {
         self.reported = (sum, dof);
         let value = self.filter.coefficients().to_vec();
         let sigma = (0..value.len()).map(|i| self.filter.coefficient_covariance(i, i).sqrt()).collect();
-        Snapshot { row, displacement_m: self.filter.displacement_m(), value, sigma, nis }
+        Snapshot { row, displacement_m: self.filter.displacement_m().to_vec(), value, sigma, nis }
     }
 
-    /// The mean over the last hour, or over the last sixth of a run shorter than six hours; in bins of ten seconds, the
-    /// newest one perhaps not full. `None` before the first epoch.
-    #[must_use]
-    pub fn result(&self) -> Option<Average> {
+    /// One list of the state for both directions.
+    fn visit(&mut self, w: &mut Words<'_>) -> Result<(), StateError> {
+        self.filter.visit(w)?;
+        let m = self.filter.coefficients().len();
+        let mut bins = self.bins.len() as u64;
+        w.count(&mut bins)?;
+        if bins > self.whole_window() as u64 {
+            return Err(StateError::Content("a count of averages"));
+        }
+        self.bins.resize(bins as usize, Bin::default());
+        for bin in &mut self.bins {
+            bin.sum.resize(m, 0.0);
+            bin.covariance.resize(m * m, 0.0);
+            w.count(&mut bin.epochs)?;
+            w.all(&mut bin.sum)?;
+            w.all(&mut bin.covariance)?;
+        }
+        w.all(std::slice::from_mut(&mut self.reported.0))?;
+        w.count(&mut self.reported.1)
+    }
+}
+
+impl<const N: usize, const D: usize> Follower for Tracker<N, D> {
+    fn process(&mut self, rows: &Rows<'_>, range: Range<usize>) -> Vec<Snapshot> {
+        let mut snapshots = Vec::new();
+        let mut phi = vec![[0.0; D]; self.filter.coefficients().len()];
+        for k in range {
+            let mut u: [f64; D] = std::array::from_fn(|axis| rows.u_m_s2[axis][k]);
+            phi.iter_mut().for_each(|p| *p = [0.0; D]);
+            for r in &rows.regressors {
+                // A product is linear in its coefficient at the other's estimate of this epoch.
+                let times = match r.times {
+                    Factor::Estimated(j) => self.filter.coefficients()[j],
+                    Factor::Fixed(value) => value,
+                };
+                let added = times * r.factor * r.column[k];
+                match r.coefficient {
+                    Factor::Estimated(j) => phi[j][r.axis] += added,
+                    Factor::Fixed(value) => u[r.axis] += value * added,
+                }
+            }
+            let readout: [f64; D] = std::array::from_fn(|axis| rows.readout_m[axis][k]);
+            self.filter.step(readout, Drive { acceleration_m_s2: u, regressors: &phi });
+            self.average();
+            if self.filter.statistics().epochs.is_multiple_of(self.snapshot_epochs) {
+                snapshots.push(self.snapshot(k));
+            }
+        }
+        snapshots
+    }
+
+    fn skip(&mut self, epochs: u64) {
+        self.filter.skip(epochs);
+    }
+
+    fn result(&self) -> Option<Average> {
         let m = self.filter.coefficients().len();
         let wanted = self.filter.statistics().epochs / AVERAGE_PART / self.bin_epochs();
         let wanted = usize::try_from(wanted).unwrap_or(usize::MAX).clamp(1, self.whole_window());
@@ -214,45 +320,42 @@ impl<const D: usize> Tracker<D> {
         Some(average)
     }
 
-    /// By how much σ must be stretched: the worst readout's innovations, rms, over what the mission's noise predicts;
-    /// never less than one, as quiet data do not prove a quiet instrument.
-    #[must_use]
-    pub fn stretch(&self) -> f64 {
+    fn stretch(&self) -> f64 {
         self.filter.statistics().design_nis().into_iter().flatten().fold(1.0, f64::max).sqrt()
     }
 
-    /// Appends everything that the next row depends on.
-    pub fn save(&self, out: &mut Bytes) {
-        self.filter.save(out);
+    fn summary(&self) -> Summary {
+        let (filter, s) = (&self.filter, self.filter.statistics());
+        let readouts = s.readouts.iter().zip(s.design_nis()).zip(s.octaves);
+        Summary {
+            states: filter.model().states(),
+            counts: [
+                ("updates", s.updates),
+                ("predictions_only", s.predictions),
+                ("rejected_readouts", s.rejected),
+                ("reacquisitions", s.reacquisitions),
+                ("repairs_of_q", s.repairs_q),
+                ("repairs_of_p", s.repairs_p),
+                ("resets", s.resets),
+            ],
+            nis_sum: s.nis_sum,
+            nis: s.nis(),
+            readouts: readouts
+                .map(|((used, design_nis), octaves)| Readout { used: *used, design_nis, octaves })
+                .collect(),
+            recursion_sigma: (0..filter.coefficients().len())
+                .map(|j| filter.recursion_covariance(j, j).sqrt())
+                .collect(),
+        }
+    }
+
+    fn loaded(&self, words: &mut Words<'_>) -> Result<Box<dyn Follower>, StateError> {
         let mut copy = self.clone();
-        copy.visit(&mut Words::Write(out)).unwrap_or_else(|_| unreachable!("writing to memory"));
+        copy.visit(words)?;
+        Ok(Box::new(copy))
     }
 
-    /// Restores what [`Tracker::save`] wrote for the same model.
-    ///
-    /// # Errors
-    /// [`StateError`] when the bytes end early or have no sense.
-    pub fn load(&mut self, words: &mut Words<'_>) -> Result<(), StateError> {
-        self.filter.load(words)?;
-        self.visit(words)
-    }
-
-    fn visit(&mut self, w: &mut Words<'_>) -> Result<(), StateError> {
-        let m = self.filter.coefficients().len();
-        let mut bins = self.bins.len() as u64;
-        w.count(&mut bins)?;
-        if bins > self.whole_window() as u64 {
-            return Err(StateError::Content("a count of averages"));
-        }
-        self.bins.resize(bins as usize, Bin::default());
-        for bin in &mut self.bins {
-            bin.sum.resize(m, 0.0);
-            bin.covariance.resize(m * m, 0.0);
-            w.count(&mut bin.epochs)?;
-            w.all(&mut bin.sum)?;
-            w.all(&mut bin.covariance)?;
-        }
-        w.all(std::slice::from_mut(&mut self.reported.0))?;
-        w.count(&mut self.reported.1)
+    fn save(&self, out: &mut Bytes) {
+        self.clone().visit(&mut Words::Write(out)).unwrap_or_else(|_| unreachable!("writing to memory"));
     }
 }

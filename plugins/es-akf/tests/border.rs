@@ -31,16 +31,15 @@ fn mission(terms: [&[u32]; 3]) -> Value {
     mission
 }
 
-fn create(mission: &Value, needs: &[&str]) -> Instance {
+fn create(mission: &Value, adaptation: &str) -> Instance {
     let library = library();
     let parameters = json!({
-        "follow": "auto", "adaptation": "monotone", "forgetting": 0.999_999, "warm_up_s": 60.0, "gate_sigma": 6.0, "gate_patience": 30,
+        "follow": "auto", "adaptation": adaptation, "forgetting": 0.999_999, "warm_up_s": 60.0, "gate_sigma": 6.0, "gate_patience": 30,
         "calibrated_sigma": true, "check_s": 60.0, "output_interval_s": 60.0, "displacement_prior_m": 1e-6,
-        "velocity_prior_m_s": 1e-7, "bias_prior_m_s2": 1e-7, "bias_walk_m_s2_rts": 3e-15, "bias_walk_both_m_s2_rts": 3e-16,
-        "leak_hz": 1e-6,
-        "unknown_alpha": 1.0,
+        "velocity_prior_m_s": 1e-7, "bias_prior_m_s2": 1e-7, "bias_walk_m_s2_rts": 3e-15,
+        "leak_hz": 1e-6, "unknown_alpha": 1.0,
     });
-    let value = json!({"parameters": parameters, "mission": mission, "instance": "", "files": [], "needs": needs});
+    let value = json!({"parameters": parameters, "mission": mission, "instance": "", "files": [], "needs": []});
     let plugin = library.plugins.iter().find(|p| p.kind == Kind::Stage).expect("the library has a stage");
     Instance::create(&library, plugin, &Config { value }).expect("the fixture is a mission")
 }
@@ -94,7 +93,17 @@ fn model_json(test_masses: &[u64]) -> String {
 }
 
 /// Ten minutes, cut at `cut` and gone on with from its saved state: the report and the rows for the archive.
-fn run(mission: &Value, test_masses: &[u64], needs: &[&str], cut: usize) -> (Value, Vec<Batch>) {
+fn run(mission: &Value, test_masses: &[u64], in_loop: bool, cut: usize) -> (Value, Vec<Batch>) {
+    run_adapting(mission, test_masses, in_loop, cut, "auto")
+}
+
+fn run_adapting(
+    mission: &Value,
+    test_masses: &[u64],
+    in_loop: bool,
+    cut: usize,
+    adaptation: &str,
+) -> (Value, Vec<Batch>) {
     let (mut columns, mut times, mut rows) = (Vec::new(), Vec::new(), Vec::new());
     for tm in test_masses {
         let (c, t, r) = columns_and_rows(*tm, 6_000);
@@ -102,8 +111,12 @@ fn run(mission: &Value, test_masses: &[u64], needs: &[&str], cut: usize) -> (Val
         rows.extend(r);
         times = t;
     }
+    // As if the offset's regressors were made from commands.
+    for column in columns.iter_mut().filter(|c| in_loop && c.attributes.contains_key("coefficient")) {
+        column.attributes.insert("in_loop".to_owned(), "true".to_owned());
+    }
     let begin = || {
-        let mut stage = create(mission, needs);
+        let mut stage = create(mission, adaptation);
         let request = LinkRequest { available: &columns, model_json: &model_json(test_masses) };
         let linked = stage.link(request).expect("linked");
         stage.activate(65_536).expect("active");
@@ -132,7 +145,7 @@ fn column_of<'a>(read: &ReadColumn, rows: &'a [Vec<f64>], part: &std::ops::Range
 /// Four states for x, three each for y and z: 9 + 3 + 10.
 #[test]
 fn a_mission_file_can_ask_for_the_papers_22_states() {
-    let (report, made) = run(&mission([&[2, 2], &[4], &[4]]), &[1], &[], 6_000);
+    let (report, made) = run(&mission([&[2, 2], &[4], &[4]]), &[1], false, 6_000);
     assert_eq!(report["quality"]["tm1"]["states"], 22, "{report}");
     assert_eq!(report["counts"]["updates"], 5_999, "{report}");
     // Every repair of Q̂ and of P reaches the product.
@@ -141,28 +154,28 @@ fn a_mission_file_can_ask_for_the_papers_22_states() {
     // The last column, the NIS, has no value before the end of the warm-up.
     let (_, estimates) = made[0].columns.split_last().expect("columns");
     assert!(estimates.iter().flatten().all(|x| x.is_finite()));
-    assert_eq!(run(&mission([&[], &[], &[]]), &[1], &[], 6_000).0["quality"]["tm1"]["states"], 16);
+    assert_eq!(run(&mission([&[], &[], &[]]), &[1], false, 6_000).0["quality"]["tm1"]["states"], 16);
 }
 
 /// 18 + 6 + two for each of three torques + 8 of the readouts. A run in two parts ends as one in one.
 #[test]
-fn an_effect_made_of_commands_puts_both_test_masses_into_one_filter() {
+fn regressors_in_the_loop_put_all_test_masses_into_one_filter() {
     let bundled = mission([&[], &[], &[]]);
-    let (report, made) = run(&bundled, &[1, 2], &["commands"], 6_000);
+    let (report, made) = run(&bundled, &[1, 2], true, 6_000);
     for tm in ["tm1", "tm2"] {
         assert_eq!(report["quality"][tm]["followed"], json!(["tm1", "tm2"]), "{report}");
         assert_eq!(report["quality"][tm]["states"], 38, "{report}");
     }
     // Forces on these two have nothing in common, so that some innovations are refused: but epochs count once.
     assert!(report["counts"]["updates"].as_u64().is_some_and(|n| (5_900..6_000).contains(&n)), "{report}");
-    let (in_two, parts) = run(&bundled, &[1, 2], &["commands"], 2_500);
+    let (in_two, parts) = run(&bundled, &[1, 2], true, 2_500);
     assert_eq!(in_two, report);
     let rows = |made: &[Batch]| -> usize { made.iter().map(Batch::rows).sum() };
     assert_eq!(rows(&parts), rows(&made));
     // Without such an effect, and with one test mass, each has its own.
     for (report, test_masses) in [
-        (run(&bundled, &[1, 2], &[], 6_000).0, vec!["tm1", "tm2"]),
-        (run(&bundled, &[2], &["commands"], 6_000).0, vec!["tm2"]),
+        (run(&bundled, &[1, 2], false, 6_000).0, vec!["tm1", "tm2"]),
+        (run(&bundled, &[2], true, 6_000).0, vec!["tm2"]),
     ] {
         for tm in test_masses {
             assert_eq!(report["quality"][tm]["followed"], json!([tm]), "{report}");
@@ -170,10 +183,43 @@ fn an_effect_made_of_commands_puts_both_test_masses_into_one_filter() {
     }
 }
 
+/// A mission file with a third test mass: 27 + 9 + 6 + 12 states in one filter, 16 in each of three.
+#[test]
+fn the_mission_says_how_many_test_masses_there_are() {
+    let mut three = mission([&[], &[], &[]]);
+    three["test_mass"]["tm3"] = three["test_mass"]["tm1"].clone();
+    for (in_loop, followed, states) in [(true, json!(["tm1", "tm2", "tm3"]), 54), (false, json!(["tm3"]), 16)] {
+        let (report, _) = run(&three, &[1, 2, 3], in_loop, 6_000);
+        assert_eq!(report["quality"]["tm3"]["followed"], followed, "{report}");
+        assert_eq!(report["quality"]["tm3"]["states"], states, "{report}");
+        let coefficients = report["coefficients"].as_array().expect("a list");
+        assert_eq!(coefficients.len(), 9);
+        assert!(coefficients.iter().all(|c| c["value"].is_f64() && c["sigma"].as_f64() > Some(0.0)), "{report}");
+    }
+}
+
+/// Adaptation that is asked for acts in a filter of several test masses as in one of one; `auto` leaves the former to
+/// the mission's noise.
+#[test]
+fn a_filter_of_several_test_masses_adapts_where_it_is_asked_to() {
+    let bundled = mission([&[], &[], &[]]);
+    let p_end = |adaptation| {
+        let (report, _) = run_adapting(&bundled, &[1, 2], true, 6_000, adaptation);
+        assert_eq!(report["quality"]["tm1"]["followed"], json!(["tm1", "tm2"]), "{report}");
+        assert!(report["coefficients"].as_array().is_some_and(|c| c.iter().all(|c| c["value"].is_f64())), "{report}");
+        report["quality"]["p_end_sigma"].clone()
+    };
+    let off = p_end("off");
+    assert_eq!(p_end("auto"), off);
+    for adaptation in ["monotone", "innovation", "residual"] {
+        assert_ne!(p_end(adaptation), off, "{adaptation}");
+    }
+}
+
 /// 18 + 6 + 6 + 2·(10 + 9 + 5) states.
 #[test]
-fn both_test_masses_that_do_not_fit_are_followed_apart_and_the_report_says_what_that_means() {
-    let (report, _) = run(&mission([&[8, 8], &[8, 8], &[8]]), &[1, 2], &["commands"], 6_000);
+fn test_masses_that_do_not_fit_into_one_filter_are_followed_apart_and_the_report_says_what_that_means() {
+    let (report, _) = run(&mission([&[8, 8], &[8, 8], &[8]]), &[1, 2], true, 6_000);
     assert_eq!(report["quality"]["tm2"]["followed"], json!(["tm2"]), "{report}");
     let notes = report["notes"].to_string();
     assert!(notes.contains("would have 78 states, at most 64") && notes.contains("trust qp"), "{notes}");
@@ -183,7 +229,7 @@ fn both_test_masses_that_do_not_fit_are_followed_apart_and_the_report_says_what_
 fn more_states_than_there_is_room_for_are_refused_with_their_number() {
     let (columns, ..) = columns_and_rows(1, 0);
     let many: &[u32] = &[8; 5];
-    let mut stage = create(&mission([many, many, many]), &[]);
+    let mut stage = create(&mission([many, many, many]), "auto");
     let request = LinkRequest { available: &columns, model_json: &model_json(&[1]) };
     let refusal = stage.link(request).expect_err("76 states").to_string();
     assert!(refusal.contains("76 states, at most 64") && refusal.contains("readout noise"), "{refusal}");

@@ -14,6 +14,12 @@ use crate::state::{Reader, StateError, Writer};
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 
+/// Whether a column on demand is made from commands, as all but two are: the Sun's direction, and the derivative by a delay of the
+/// wavefront sensing, which is made of the smoothed attitude.
+pub(crate) fn is_in_loop(column: &str) -> bool {
+    !column.starts_with("used.sun_srf.") && !column.starts_with("response.alpha_srf_rad_s2.by_dws_delay.")
+}
+
 /// Columns on demand, each off by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Needs {

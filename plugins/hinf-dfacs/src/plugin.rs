@@ -5,7 +5,7 @@ use dragfree_sdk::prelude::*;
 use nalgebra::Vector3;
 use serde_json::json;
 
-use crate::asked::Needs;
+use crate::asked::{self, Needs};
 use crate::noise;
 use crate::pilot::{self, Scale};
 use crate::reconstruction::{AngularAcceleration, Epoch, ROW, Reconstruction, Row, Settings, levels_of};
@@ -209,7 +209,8 @@ fn write_columns(
             out.push(link.write_with(table, &format!("{name}.r_orf_m.{axis}"), "m", &frame, &[("noise", noise)])?);
         }
         for axis in AXES {
-            out.push(link.write(table, &format!("{name}.u_orf_m_s2.{axis}"), "m s-2", &frame)?);
+            let column = format!("{name}.u_orf_m_s2.{axis}");
+            out.push(link.write_with(table, &column, "m s-2", &frame, &[("in_loop", "true")])?);
         }
     }
     let mut channel = |name: &str, unit: &str, frame: &str, noise: &str, declared: &[NoiseProcess]| {
@@ -396,7 +397,9 @@ impl Stage for HinfDfacs {
         let table = link.table("reconstruction", rate_hz);
         let mut out = write_columns(link, table, noise_x, &noise::declared(&self.mission, &noise_x))?;
         for (name, unit, frame) in reconstruction.asked_columns() {
-            out.push(link.write_with(table, &name, unit, frame, &[("kind", "series")])?);
+            let attributes = [("kind", "series"), ("in_loop", "true")];
+            let attributes = if asked::is_in_loop(&name) { &attributes[..] } else { &attributes[..1] };
+            out.push(link.write_with(table, &name, unit, frame, attributes)?);
         }
         self.linked = Some(Linked {
             reconstruction,

@@ -21,7 +21,6 @@ use dragfree_estimation::verdict::{Difference, Pull, Value, chi2_bounds, chi2_qu
 pub struct QpCheck {
     segment_s: f64,
     refinements: usize,
-    refinement: Refinement,
     settings: Settings,
     log: Log,
     linked: Option<Linked>,
@@ -81,12 +80,6 @@ impl Stage for QpCheck {
         Ok(Self {
             segment_s: setup.f64("segment_s")?,
             refinements: usize::try_from(setup.i64("refinements")?)?,
-            // Commands are made of the very noise whose spectrum would be measured.
-            refinement: if setup.needs("commands") || setup.needs("torque-response") {
-                Refinement::Levels
-            } else {
-                Refinement::Bands
-            },
             settings: setup.settings().clone(),
             log: setup.log(),
             linked: None,
@@ -127,6 +120,28 @@ impl Stage for QpCheck {
 const UNKNOWN_NOISE: &str = "no stage declares its noise, so it is weighed by its residuals alone; the stage that makes it should \
      declare one, from the [noise] tables of the mission file";
 
+/// What this stage brings.
+const SOLUTIONS: [(&str, Role); 2] = [("qp", Role::Batch), ("adopted", Role::Adopted)];
+
+/// A coefficient of the batch solution beside the same of a recursive solution.
+struct Compared<'a> {
+    /// Name of the recursive solution.
+    with: &'a str,
+    /// Batch less recursive.
+    difference: Difference,
+}
+
+/// The recursive solutions of earlier stages, by name.
+fn recursive_solutions(earlier: &[Report]) -> BTreeMap<&str, Vec<Value>> {
+    let mut all: BTreeMap<&str, Vec<Value>> = BTreeMap::new();
+    for e in earlier.iter().flat_map(|r| &r.coefficients).filter(|e| e.role == Some(Role::Recursive)) {
+        if let (Some(value), Some(sigma)) = (e.value, e.sigma) {
+            all.entry(&e.solution).or_default().push(Value { name: e.name.clone(), value, sigma });
+        }
+    }
+    all
+}
+
 fn before_link() -> PluginError {
     PluginError::fatal("qp-check was called before it was linked; the host must link first")
 }
@@ -152,6 +167,8 @@ impl Linked {
             .map(|want| link.read(&want))
             .collect::<Result<_, _>>()?;
         let model = noise_model(&available.noise, &channels, rate_hz)?;
+        // Commands follow the very noise whose spectrum would be measured.
+        let refinement = if available.has_regressors_in_loop()? { Refinement::Levels } else { Refinement::Bands };
         let length = longest_length((stage.segment_s * rate_hz).round() as usize);
         let analyser = Analyser::new(Plan::new(length, rate_hz), &layout);
         let seen_as_mean = |s: usize| layout.regressors.iter().any(|r| r.series == s && differenced[r.channel]);
@@ -167,10 +184,10 @@ impl Linked {
             bounds: bounds(available),
             coefficients: available.coefficients.clone(),
             refinements: stage.refinements,
-            refinement: stage.refinement,
+            refinement,
             settings: stage.settings.clone(),
             collected: nothing_collected(
-                stage.refinement,
+                refinement,
                 &model,
                 &differenced,
                 &layout,
@@ -253,7 +270,7 @@ impl Linked {
         report.verdict = Some("weak".into());
         for c in self.coefficients.iter().filter(|c| c.estimate) {
             report.weak_directions.push(format!("{} is not seen: there is no segment of data", c.name));
-            for solution in ["qp", "adopted"] {
+            for solution in SOLUTIONS {
                 report.coefficients.push(estimate_of(c, solution, None, None));
             }
         }
@@ -270,16 +287,15 @@ impl Linked {
                 Some(Value { name: self.coefficients[*i].name.clone(), value: solution.theta[*i], sigma: sigma(k)? })
             })
             .collect();
-        let other: Vec<Value> = earlier
-            .iter()
-            .flat_map(|r| &r.coefficients)
-            .filter(|e| e.solution == "es-akf")
-            .filter_map(|e| Some(Value { name: e.name.clone(), value: e.value?, sigma: e.sigma? }))
+        let compared: Vec<Compared> = recursive_solutions(earlier)
+            .into_iter()
+            .flat_map(|(with, other)| {
+                differences(&qp, &other).into_iter().map(move |d| Compared { with, difference: d })
+            })
             .collect();
-        let compared = differences(&qp, &other);
         let checked = checks(solution, &qp);
-        let disagreeing: Vec<&Difference> =
-            compared.iter().filter(|d| d.sigmas() > self.settings.agreement_sigmas).collect();
+        let disagreeing: Vec<&Compared> =
+            compared.iter().filter(|c| c.difference.sigmas() > self.settings.agreement_sigmas).collect();
         let mut insane = self.insane(solution);
         insane.extend(contradictions(&self.settings, solution));
         for d in checked.iter().filter(|d| d.sigmas() > self.settings.agreement_sigmas) {
@@ -306,11 +322,11 @@ impl Linked {
         report.inconsistent = !consistent;
         report.notes.extend(insane);
         if compared.is_empty() {
-            report.notes.push("no solution of es-akf to compare with: the verdict rests on the QP alone".into());
+            report.notes.push("no recursive solution to compare with: the verdict rests on the QP alone".into());
         }
-        for d in &disagreeing {
+        for Compared { with, difference: d } in &disagreeing {
             report.notes.push(format!(
-                "{}: qp − es-akf = {:.3e}, {:.1}σ; likely causes: an effect missing from the model (torque gain and inertia act \
+                "{}: qp − {with} = {:.3e}, {:.1}σ; likely causes: an effect missing from the model (torque gain and inertia act \
                  through α̂), noise levels of the filter that are not those of the data, or a stretch that one of the two did not use",
                 d.name,
                 d.difference,
@@ -350,25 +366,27 @@ impl Linked {
     }
 
     /// Values of the QP and what is adopted: the QP's values, because it alone has the survey, the whole band and a
-    /// measured Σ; where it disagrees with the ES-AKF, its σ grows to span both.
-    fn put_coefficients(&self, solution: &Solution, disagreeing: &[&Difference], report: &mut Report) {
+    /// measured Σ; where it disagrees with recursive solutions, its σ grows to span the farthest.
+    fn put_coefficients(&self, solution: &Solution, disagreeing: &[&Compared], report: &mut Report) {
         let names: Vec<String> = solution.free.iter().map(|i| self.coefficients[*i].name.clone()).collect();
         let adopted = solution.covariance.as_ref().map(|c| {
             let widen: Vec<f64> = names
                 .iter()
                 .enumerate()
                 .map(|(k, name)| {
-                    let apart = disagreeing.iter().find(|d| d.name == *name).map_or(0.0, |d| d.difference);
+                    let of_it = disagreeing.iter().map(|c| &c.difference).filter(|d| d.name == *name);
+                    let apart = of_it.map(|d| d.difference.abs()).fold(0.0, f64::max);
                     (1.0 + apart * apart / c[(k, k)]).sqrt()
                 })
                 .collect();
             DMatrix::from_fn(c.nrows(), c.ncols(), |i, j| c[(i, j)] * widen[i] * widen[j])
         });
-        for (label, covariance) in [("qp", &solution.covariance), ("adopted", &adopted)] {
+        for ((label, role), covariance) in SOLUTIONS.into_iter().zip([&solution.covariance, &adopted]) {
             for (i, c) in self.coefficients.iter().enumerate().filter(|(_, c)| c.estimate) {
                 let free = solution.free.iter().position(|f| *f == i);
                 let sigma = free.zip(covariance.as_ref()).map(|(k, c)| c[(k, k)].sqrt());
-                report.coefficients.push(estimate_of(c, label, free.map(|_| solution.theta[i]), sigma));
+                let value = free.map(|_| solution.theta[i]);
+                report.coefficients.push(estimate_of(c, (label, role), value, sigma));
             }
             if let Some(c) = covariance {
                 let matrix = c.row_iter().map(|r| r.iter().copied().collect()).collect();
@@ -377,7 +395,7 @@ impl Linked {
         }
     }
 
-    fn put_quality(&self, solution: &Solution, compared: &[Difference], checked: &[Difference], report: &mut Report) {
+    fn put_quality(&self, solution: &Solution, compared: &[Compared], checked: &[Difference], report: &mut Report) {
         let quality = &solution.quality;
         let active: Vec<_> = solution
             .active
@@ -386,7 +404,9 @@ impl Linked {
             .collect();
         let differences: Vec<_> = compared
             .iter()
-            .map(|d| json!({ "name": d.name, "qp_minus_es_akf": d.difference, "sigmas": d.sigmas() }))
+            .map(|Compared { with, difference: d }| {
+                json!({ "name": d.name, "recursive": with, "batch_minus_recursive": d.difference, "sigmas": d.sigmas() })
+            })
             .collect();
         let predicted: Vec<_> = checked
             .iter()
@@ -430,7 +450,7 @@ impl Linked {
 
 /// The fit in the time domain takes products of coefficients at their initial values. It takes channels one by one, and
 /// a prediction of a channel from its own past misses what a command knows of the others: where the model has
-/// regressors made of commands there is none, and es-akf with both test masses in one filter is the check in the time
+/// regressors made of commands there is none, and a filter of all test masses together is the check in the time
 /// domain.
 fn nothing_collected(
     refinement: Refinement,
@@ -626,10 +646,11 @@ fn widened<'a>(solution: &Solution, coefficients: &'a [Coefficient]) -> BTreeMap
     solution.free.iter().enumerate().map(of).collect()
 }
 
-fn estimate_of(c: &Coefficient, solution: &str, value: Option<f64>, sigma: Option<f64>) -> Estimate {
+fn estimate_of(c: &Coefficient, (solution, role): (&str, Role), value: Option<f64>, sigma: Option<f64>) -> Estimate {
     Estimate {
         name: c.name.clone(),
         solution: solution.to_owned(),
+        role: Some(role),
         value,
         sigma,
         unit: c.unit.clone(),

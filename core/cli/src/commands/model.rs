@@ -247,11 +247,9 @@ fn fix(command: &ModelFix, global: &Global, paint: Paint) -> Result<Done, Failur
                 .to_owned(),
         ));
     }
-    let all = &product.result.coefficients;
-    let solution = ["adopted", "qp"].into_iter().find(|s| all.iter().any(|c| c.solution == *s));
-    let solution = solution.or_else(|| all.first().map(|c| c.solution.as_str())).unwrap_or_default();
-    let values: Vec<(String, f64)> =
-        all.iter().filter(|c| c.solution == solution).map(|c| (c.name.clone(), c.value)).collect();
+    let adopted = product.result.adopted();
+    let solution = adopted.first().map(|c| c.solution.as_str()).unwrap_or_default();
+    let values: Vec<(String, f64)> = adopted.iter().map(|c| (c.name.clone(), c.value)).collect();
     let mut edit = Edit::begin_or_new(&out).map_err(Failure::engine)?;
     edit.fix(&command.model, &product.model.revision, &values, &command.keep).map_err(Failure::engine)?;
     let committed = edit.commit().map_err(Failure::engine)?;

@@ -226,6 +226,7 @@ impl Builder<'_> {
         let mut linked =
             node.link(LinkRequest { available: &self.available, model_json: &self.model_json(candidate) })?;
         self.take_noise(&node.name, std::mem::take(&mut linked.noise))?;
+        self.inherit_loop(&mut linked);
         node.activate(u32::try_from(self.chain.carry.batch_rows).unwrap_or(u32::MAX))?;
         let index = self.chain.nodes.len();
         let (inputs, wave) = self.route(index, &linked);
@@ -261,6 +262,17 @@ impl Builder<'_> {
             self.chain.noise.push(process);
         }
         Ok(())
+    }
+
+    /// A regressor or series of a plugin that reads a series made from commands (attribute `in_loop`) counts as made from commands too.
+    fn inherit_loop(&self, linked: &mut Linked) {
+        let in_loop = |c: &Column| c.attributes.get("in_loop").is_some_and(|a| a == "true");
+        if linked.reads.iter().flatten().any(|r| in_loop(&self.available[r.available])) {
+            let acts = |c: &&mut Column| c.attributes.get("kind").is_some_and(|k| k == "regressor" || k == "series");
+            for column in linked.writes.iter_mut().flat_map(|t| &mut t.columns).filter(acts) {
+                column.attributes.insert("in_loop".to_owned(), "true".to_owned());
+            }
+        }
     }
 
     /// The queues of a new node, its routes entered where its tables are made.

@@ -145,6 +145,7 @@ fn outcome(draft: &Draft) -> Outcome {
     let coefficients = draft.reports.iter().flat_map(|report| &report.coefficients).map(|estimate| Coefficient {
         name: estimate.name.clone(),
         solution: estimate.solution.clone(),
+        role: estimate.role,
         value: estimate.value.unwrap_or(f64::NAN),
         sigma: estimate.sigma.unwrap_or(f64::NAN),
         unit: estimate.unit.clone(),

@@ -2,7 +2,7 @@
 
 use super::ProductError;
 use super::emit::emit;
-use dragfree_schema::Settings;
+use dragfree_schema::{Role, Settings};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
@@ -204,6 +204,19 @@ pub struct Outcome {
     pub covariance: BTreeMap<String, Covariance>,
 }
 
+impl Outcome {
+    /// The solution to use: the adopted one, else a batch solution, else the first that there is.
+    #[must_use]
+    pub fn adopted(&self) -> Vec<&Coefficient> {
+        let all = &self.coefficients;
+        let of = |role: Role| all.iter().find(|c| c.role == Some(role));
+        // Products from before solutions had roles have the name alone.
+        let named = || all.iter().find(|c| c.role.is_none() && c.solution == "adopted");
+        let first = of(Role::Adopted).or_else(named).or_else(|| of(Role::Batch)).or_else(|| all.first());
+        all.iter().filter(|c| first.is_some_and(|first| c.solution == first.solution)).collect()
+    }
+}
+
 /// One coefficient of one solution.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -212,6 +225,9 @@ pub struct Coefficient {
     pub name: String,
     /// `es-akf`, `qp` or `adopted`.
     pub solution: String,
+    /// What the solution is for; absent in products of before, and where the stage said nothing.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub role: Option<Role>,
     /// Value in `unit`.
     pub value: f64,
     /// Standard deviation in `unit`.
