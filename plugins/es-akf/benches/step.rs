@@ -27,7 +27,7 @@ fn model() -> Model {
         dt_s: DT_S,
         acceleration_m2_s4: DMatrix::identity(3, 3) * q,
         torque_noise: Vec::new(),
-        bias_step_m2_s4: DMatrix::identity(3, 3) * 1e-30,
+        bias_step_m2_s4: 1e-30,
         readout_m2: asd.map(|a: f64| a * a * 0.5 / DT_S).to_vec(),
         chains: (0..3).map(|i| exponents[i].iter().map(|&p| chain(asd[i], p)).collect()).collect(),
         coefficients: vec![Coefficient { initial: 0.0, prior_sigma: 0.1 }; 3],

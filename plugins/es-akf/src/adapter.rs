@@ -14,10 +14,6 @@ use crate::tracker::{Average, Factor, Follower, MAX_STATES, Readout, Regressor, 
 const AXES: [&str; 3] = ["x", "y", "z"];
 /// A column of this name after that of a test mass and a point says that the test mass can be followed.
 const KNOWN_ACCELERATION: &str = "u_orf_m_s2";
-/// Default random walk of the spacecraft's bias acceleration, m s⁻² per √s: it outgrows white thrust noise (0.1 µN/√Hz
-/// on 1500 kg) below 10 µHz, so that a slow force that nobody modelled is followed within a day and everything faster
-/// is left to the data.
-const BIAS_WALK: f64 = 3e-15;
 /// Batches from here on are worth a second thread.
 const THREAD_ROWS: usize = 512;
 
@@ -28,7 +24,10 @@ pub struct EsAkf {
     settings: Settings,
     /// `None`: monotone in a filter of one test mass, off in one of several.
     adaptation: Option<Adaptation>,
+    /// For a filter of one test mass.
     choices: Choices,
+    /// In place of that of `choices` in a filter of several.
+    bias_walk_together_m_s2_rts: f64,
     snapshot_s: f64,
     threads: usize,
     /// Whether all test masses are in one filter; `None`: where the model has regressors in the loop.
@@ -112,9 +111,16 @@ impl Stage for EsAkf {
             Parameter::f64(
                 "bias_walk_m_s2_rts",
                 "m s-2 s-1/2",
-                BIAS_WALK,
+                3e-15,
                 0.0..=1e-3,
-                "random walk of the acceleration that slow forces on the spacecraft add, alike for all test masses",
+                "random walk of the bias acceleration, where a filter has one test mass",
+            ),
+            Parameter::f64(
+                "bias_walk_together_m_s2_rts",
+                "m s-2 s-1/2",
+                3e-16,
+                0.0..=1e-3,
+                "the same where it has several: thrust does not mask the bias there, and a faster walk weakens what is slow",
             ),
             Parameter::f64("leak_hz", "Hz", 1e-6, 1e-9..=1.0, "below this, coloured readout noise is white"),
             Parameter::f64(
@@ -161,6 +167,7 @@ impl Stage for EsAkf {
                 leak_hz: setup.f64("leak_hz")?,
                 unknown_alpha: setup.f64("unknown_alpha")?,
             },
+            bias_walk_together_m_s2_rts: setup.f64("bias_walk_together_m_s2_rts")?,
             snapshot_s: setup.f64("output_interval_s")?,
             threads: setup.threads(),
             together: match setup.text("follow")?.as_str() {
@@ -404,11 +411,16 @@ impl EsAkf {
             readouts.push(column.map(|c| c.attribute("noise")).filter(|n| !n.is_empty()).unwrap_or(usual));
         }
         let names: Vec<&str> = test_masses.iter().map(|t| t.name.as_str()).collect();
-        let model = model(&self.mission, &names, &readouts, thetas, &self.choices)?;
+        let several = names.len() > 1;
+        let mut choices = self.choices;
+        if several {
+            choices.bias_walk_m_s2_rts = self.bias_walk_together_m_s2_rts;
+        }
+        let model = model(&self.mission, &names, &readouts, thetas, &choices)?;
         // Several test masses under few forces have combinations of axes that hardly any force moves, which is what a
         // common filter is for. Adaptation element by element does not keep that null space of Q, so that it must be
         // asked for.
-        let usual = if names.len() > 1 { Adaptation::Off } else { Adaptation::Monotone };
+        let usual = if several { Adaptation::Off } else { Adaptation::Monotone };
         let settings = Settings { adaptation: self.adaptation.unwrap_or(usual), ..self.settings };
         let states = model.states();
         Ok(follow(model, settings, self.snapshot_s).ok_or(TooMany(states)))
@@ -630,7 +642,7 @@ mod tests {
                 "follow": "auto", "adaptation": "auto", "forgetting": 0.999_999, "warm_up_s": 600.0, "gate_sigma": 6.0,
                 "gate_patience": 30, "calibrated_sigma": true, "check_s": 600.0, "output_interval_s": 60.0,
                 "displacement_prior_m": 1e-6, "velocity_prior_m_s": 1e-7, "bias_prior_m_s2": 1e-7,
-                "bias_walk_m_s2_rts": 3e-15, "leak_hz": 1e-6, "unknown_alpha": 1.0,
+                "bias_walk_m_s2_rts": 3e-15, "bias_walk_together_m_s2_rts": 3e-16, "leak_hz": 1e-6, "unknown_alpha": 1.0,
             },
             "mission": {
                 "mission": { "name": "M", "spacecraft": "S", "sample_rate_hz": 10.0 },

@@ -297,12 +297,10 @@ impl<const N: usize, const D: usize> Filter<N, D> {
         }
         self.driven = false;
         self.drift();
-        for i in 0..D {
-            for j in 0..D {
-                let walked = self.model.bias_step_m2_s4[(i, j)] * (epochs - 1) as f64;
-                self.p.0[Self::BIAS + i][Self::BIAS + j] += walked;
-                self.p_design.0[Self::BIAS + i][Self::BIAS + j] += walked;
-            }
+        for i in Self::BIAS..Self::THETA {
+            let walked = self.model.bias_step_m2_s4 * (epochs - 1) as f64;
+            self.p.0[i][i] += walked;
+            self.p_design.0[i][i] += walked;
         }
         // Noise of minutes to days has no memory of the other side of such a gap.
         for i in Self::THETA + self.model.coefficients.len()..self.model.states() {

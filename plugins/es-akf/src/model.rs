@@ -46,8 +46,8 @@ pub struct Model {
     pub acceleration_m2_s4: DMatrix<f64>,
     /// What the angular acceleration leaves unknown of the torque noise, acting through the offsets.
     pub torque_noise: Vec<TorqueNoiseShaping>,
-    /// Covariance that `a_b` gains in one step, D×D, m² s⁻⁴.
-    pub bias_step_m2_s4: DMatrix<f64>,
+    /// Variance that each component of `a_b` gains in one step, m² s⁻⁴.
+    pub bias_step_m2_s4: f64,
     /// Variance of the white part of the readouts, m²: one-sided PSD × sample rate / 2.
     pub readout_m2: Vec<f64>,
     /// Noise-shaping chains of the readouts.
@@ -112,8 +112,8 @@ impl Model {
                 set(i, axes + j, q * dt.powi(3) / 2.0);
                 set(axes + i, j, q * dt.powi(3) / 2.0);
                 set(axes + i, axes + j, q * dt.powi(2));
-                set(2 * axes + i, 2 * axes + j, self.bias_step_m2_s4[(i, j)]);
             }
+            set(2 * axes + i, 2 * axes + i, self.bias_step_m2_s4);
         }
         for (first, noise) in self.placed_torque_noise() {
             let drive = noise.drive();

@@ -37,7 +37,7 @@ fn create(mission: &Value, adaptation: &str) -> Instance {
         "follow": "auto", "adaptation": adaptation, "forgetting": 0.999_999, "warm_up_s": 60.0, "gate_sigma": 6.0, "gate_patience": 30,
         "calibrated_sigma": true, "check_s": 60.0, "output_interval_s": 60.0, "displacement_prior_m": 1e-6,
         "velocity_prior_m_s": 1e-7, "bias_prior_m_s2": 1e-7, "bias_walk_m_s2_rts": 3e-15,
-        "leak_hz": 1e-6, "unknown_alpha": 1.0,
+        "bias_walk_together_m_s2_rts": 3e-16, "leak_hz": 1e-6, "unknown_alpha": 1.0,
     });
     let value = json!({"parameters": parameters, "mission": mission, "instance": "", "files": [], "needs": []});
     let plugin = library.plugins.iter().find(|p| p.kind == Kind::Stage).expect("the library has a stage");

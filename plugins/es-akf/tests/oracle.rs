@@ -200,7 +200,7 @@ fn several_test_masses_agree_with_dense_matrices<const D: usize>(epochs: u32) {
             TorqueNoiseShaping::new((0..D).map(|_| 3e-11 * normal()).collect(), 0.5, DT_S),
             TorqueNoiseShaping::new((0..D).map(|_| 3e-11 * normal()).collect(), 0.05, DT_S),
         ],
-        bias_step_m2_s4: DMatrix::identity(D, D) * 1e-30,
+        bias_step_m2_s4: 1e-30,
         readout_m2: (0..D).map(|i| if i % 3 == 0 { 1e-23 } else { 1.6e-17 }).collect(),
         chains: (0..D).map(|i| vec![if i % 3 == 0 { chain(1e-12, 4) } else { chain(1.8e-9, 2) }]).collect(),
         coefficients: vec![Coefficient { initial: 0.05, prior_sigma: 0.1 }; 4],

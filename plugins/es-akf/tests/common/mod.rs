@@ -31,7 +31,7 @@ pub fn model(exponents: [&[u32]; 3], leak_hz: f64) -> Model {
     Model {
         dt_s: DT_S,
         acceleration_m2_s4: DMatrix::identity(3, 3) * force,
-        bias_step_m2_s4: DMatrix::identity(3, 3) * ((3e-15_f64).powi(2) * DT_S),
+        bias_step_m2_s4: (3e-15_f64).powi(2) * DT_S,
         readout_m2: asd.map(|a| a * a * half_rate).to_vec(),
         torque_noise: Vec::new(),
         chains: (0..3)
@@ -149,7 +149,7 @@ impl Simulation {
         let phi = [[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]];
         // A soft controller keeps the test mass near zero; the filter is told what it did.
         let u_m_s2 = std::array::from_fn(|i| -0.01 * self.r[i] - 0.1 * self.v[i]);
-        let bias_step = self.model.bias_step_m2_s4[(0, 0)].sqrt();
+        let bias_step = self.model.bias_step_m2_s4.sqrt();
         for i in 0..3 {
             let known = u_m_s2[i] + (0..3).map(|j| phi[j][i] * self.b_m[j]).sum::<f64>();
             let a = known + self.bias_m_s2[i] + self.drive[i] * self.normal();
