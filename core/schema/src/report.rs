@@ -62,7 +62,8 @@ pub struct Report {
     pub attachments: Vec<Attachment>,
 }
 
-/// What a solution is for. A stage that adjudicates compares the batch solution with every recursive one and says what is adopted.
+/// What a solution is for. A stage that adjudicates compares the batch solution with every recursive one and says what
+/// is adopted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[cfg_attr(feature = "json-schema", derive(schemars::JsonSchema))]
 #[serde(rename_all = "lowercase")]

@@ -4,13 +4,14 @@
 //! cargo run --release -p dragfree-es-akf --example bound -- [MISSION.toml]
 //! ```
 //!
-//! The independent check of the bound in `validation/src/bound.rs`, with which it shares no code and which makes the report: here
-//! the design's own sensitivities and one test mass, there a loop put together from its parts and both; tables of the guide's page
-//! on the filter come from here.
+//! The independent check of the bound in `validation/src/bound.rs`, with which it shares no code and which makes the
+//! report: here the design's own sensitivities and one test mass, there a loop put together from its parts and both;
+//! tables of the guide's page on the filter come from here.
 //!
 //! Nothing of the filter is used. With one-sided spectra, `N = 2T ∫ Σ_k P_k(f) M_kᵀ S(f)⁻¹ M_k df`: `P_k` of the known
-//! angular acceleration about axis `k` of SRF in closed loop, `M_k b = b × e_k`, `S` of what hides it in the acceleration of the
-//! test mass (forces, readouts differenced twice, and the angular acceleration that nobody can know).
+//! angular acceleration about axis `k` of SRF in closed loop, `M_k b = b × e_k`, `S` of what hides it in the
+//! acceleration of the test mass (forces, readouts differenced twice, and the angular acceleration that nobody can
+//! know).
 
 #![allow(clippy::print_stdout, reason = "it prints a table")]
 

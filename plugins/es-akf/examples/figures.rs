@@ -1,5 +1,5 @@
-//! The pictures `akf1_vs_akf2_x|y|z.svg` and `tm1|tm2_com_convergence.svg` of the guide, as the paper has them, from telemetry
-//! of the simulator:
+//! The pictures `akf1_vs_akf2_x|y|z.svg` and `tm1|tm2_com_convergence.svg` of the guide, as the paper has them, from
+//! telemetry of the simulator:
 //!
 //! ```sh
 //! cargo build --release --workspace
@@ -7,8 +7,9 @@
 //! cargo run --release -p dragfree-es-akf --example figures -- DIR ops-guide/src/pictures
 //! ```
 //!
-//! A third argument, `adaptations` or `convergence`, makes one kind alone. Convergence is from all days; the three adaptations are compared over the first three, without the repairs of `Q̂` that the
-//! stage makes and the paper does not.
+//! A third argument, `adaptations` or `convergence`, makes one kind alone. Convergence is from all days; the three
+//! adaptations are compared over the first three, without the repairs of `Q̂` that the stage makes and the paper does
+//! not.
 
 #![allow(clippy::print_stdout, reason = "it prints what the pictures show")]
 

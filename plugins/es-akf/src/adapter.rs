@@ -8,7 +8,6 @@ use crate::design::{Choices, model};
 use crate::filter::{Adaptation, Settings};
 use crate::model::{Coefficient as Theta, Prior};
 use crate::octaves::Octaves;
-use crate::state::{Words, seal, unseal};
 use crate::tracker::{Average, Factor, Follower, MAX_STATES, Readout, Regressor, Rows, Snapshot, follow};
 
 const AXES: [&str; 3] = ["x", "y", "z"];
@@ -32,7 +31,7 @@ pub struct EsAkf {
     threads: usize,
     /// Whether all test masses are in one filter; `None`: where the model has regressors in the loop.
     together: Option<bool>,
-    bodies: Vec<Body>,
+    filters: Vec<LinkedFilter>,
     notes: Vec<String>,
     table: Option<Table>,
     last_ns: Option<i64>,
@@ -45,9 +44,9 @@ struct TestMass {
     frame: String,
 }
 
-/// The test masses of one filter with its columns; three axes for each test mass.
+/// A filter and its columns; three axes for each test mass.
 #[derive(Debug)]
-struct Body {
+struct LinkedFilter {
     test_masses: Vec<TestMass>,
     follower: Box<dyn Follower>,
     readout_m: Vec<In>,
@@ -61,7 +60,7 @@ struct Body {
     nis: Vec<Out>,
 }
 
-/// The columns of a body before its filter is made.
+/// What a filter reads.
 struct Columns {
     readout_m: Vec<In>,
     u_m_s2: Vec<In>,
@@ -80,13 +79,13 @@ impl Stage for EsAkf {
                 "follow",
                 "auto",
                 &["auto", "each", "together"],
-                "a filter for each test mass, or one for all of them; auto: one for all where the model has regressors made of commands",
+                "a filter for each test mass, or one for all; auto: one for all where the model has regressors made of commands",
             ),
             Parameter::text(
                 "adaptation",
                 "auto",
                 &["auto", "monotone", "innovation", "residual", "off"],
-                "how process and readout noise follow the innovations; monotone is the paper's; auto: monotone for one test mass, off for several",
+                "how Q and R follow the innovations; monotone is the paper's; auto: monotone for one test mass, off for several",
             ),
             Parameter::f64("forgetting", "1", 0.999_999, 0.0..=1.0, "the paper's alpha: weight of the past per epoch"),
             Parameter::f64("warm_up_s", "s", 600.0, 0.0..=1e6, "time before gating, and at first before adapting"),
@@ -120,7 +119,7 @@ impl Stage for EsAkf {
                 "m s-2 s-1/2",
                 3e-16,
                 0.0..=1e-3,
-                "the same where it has several: thrust does not mask the bias there, and a faster walk weakens what is slow",
+                "the same where it has several, whose differences thrust does not mask: a faster walk would cost precision",
             ),
             Parameter::f64("leak_hz", "Hz", 1e-6, 1e-9..=1.0, "below this, coloured readout noise is white"),
             Parameter::f64(
@@ -176,7 +175,7 @@ impl Stage for EsAkf {
                 _ => None,
             },
             mission,
-            bodies: Vec::new(),
+            filters: Vec::new(),
             notes: Vec::new(),
             table: None,
             last_ns: None,
@@ -188,8 +187,8 @@ impl Stage for EsAkf {
         let there = test_masses(available);
         if there.is_empty() {
             return Err(PluginError::new(format!(
-                "es-akf: no column NAME.{KNOWN_ACCELERATION}.x is made before this stage, so there is no test mass to follow; put \
-                 hinf-dfacs before it, or leave es-akf out for an accelerometer mission"
+                "es-akf: no column NAME.{KNOWN_ACCELERATION}.x is made before this stage, so there is no test mass to \
+                 follow; put hinf-dfacs before it, or leave es-akf out for an accelerometer mission"
             )));
         }
         // A command depends on the readouts of all test masses; the regression must condition on the same past data as
@@ -200,27 +199,27 @@ impl Stage for EsAkf {
         };
         let mut groups: Vec<Vec<TestMass>> = there.iter().map(|test_mass| vec![test_mass.clone()]).collect();
         if together && there.len() > 1 {
-            match self.link_body(&there, table, available, link)? {
-                Ok(body) => {
-                    self.bodies.push(body);
+            match self.link_filter(&there, table, available, link)? {
+                Ok(filter) => {
+                    self.filters.push(filter);
                     groups.clear();
                 }
                 Err(TooMany(states)) => self.notes.push(format!(
-                    "es-akf: all test masses in one filter would have {states} states, at most {MAX_STATES} are possible, so each has \
-                     its own; coefficients of effects made of commands are biased there, as a filter of one test mass does not know \
-                     the readouts of the others, which the commands followed: trust qp, or leave effects out of the model"
+                    "es-akf: all test masses in one filter would have {states} states, at most {MAX_STATES} are possible, \
+                     so each has its own; coefficients of effects made of commands are biased there, as the commands \
+                     depend on the readouts of all test masses: trust qp, or leave effects out of the model"
                 )),
             }
         }
         for group in groups {
-            let body = self.link_body(&group, table, available, link)?.map_err(|TooMany(states)| {
+            let filter = self.link_filter(&group, table, available, link)?.map_err(|TooMany(states)| {
                 PluginError::new(format!(
                     "es-akf: {} would have {states} states, at most {MAX_STATES} are possible; leave effects out of \
                      the model, or terms out of the readout noise",
                     group[0].name
                 ))
             })?;
-            self.bodies.push(body);
+            self.filters.push(filter);
         }
         self.table = Some(table);
         Ok(())
@@ -230,31 +229,31 @@ impl Stage for EsAkf {
         let Some(table) = self.table else { return Ok(()) };
         let times = input.time_ns();
         let pieces = self.contiguous(times)?;
-        let [first, rest @ ..] = self.bodies.as_mut_slice() else { return Ok(()) };
+        let [first, rest @ ..] = self.filters.as_mut_slice() else { return Ok(()) };
         // Filters share nothing, so the result does not depend on the number of threads.
         let snapshots: Vec<Vec<Snapshot>> = if self.threads == 1 || times.len() < THREAD_ROWS {
             std::iter::once(first.run(input, &pieces)).chain(rest.iter_mut().map(|b| b.run(input, &pieces))).collect()
         } else {
             std::thread::scope(|scope| {
                 let others: Vec<_> = rest.iter_mut().map(|b| scope.spawn(|| b.run(input, &pieces))).collect();
-                let mine = first.run(input, &pieces);
+                let own = first.run(input, &pieces);
                 let joined =
                     others.into_iter().map(|t| t.join().map_err(|_| PluginError::fatal("es-akf: a filter panicked")));
-                std::iter::once(Ok(mine)).chain(joined).collect::<Result<_, _>>()
+                std::iter::once(Ok(own)).chain(joined).collect::<Result<_, _>>()
             })?
         };
         self.last_ns = times.last().copied().or(self.last_ns);
         output.time(table).extend(snapshots[0].iter().map(|s| times[s.row]));
-        for (body, snapshots) in self.bodies.iter().zip(&snapshots) {
+        for (filter, snapshots) in self.filters.iter().zip(&snapshots) {
             for s in snapshots {
                 for j in 0..s.value.len() {
-                    output.f64(body.value[j]).push(s.value[j]);
-                    output.f64(body.sigma[j]).push(s.sigma[j]);
+                    output.f64(filter.value[j]).push(s.value[j]);
+                    output.f64(filter.sigma[j]).push(s.sigma[j]);
                 }
-                for (column, x) in body.displacement_m.iter().zip(&s.displacement_m) {
+                for (column, x) in filter.displacement_m.iter().zip(&s.displacement_m) {
                     output.f64(*column).push(*x);
                 }
-                for column in &body.nis {
+                for column in &filter.nis {
                     output.f64(*column).push(s.nis);
                 }
             }
@@ -266,21 +265,21 @@ impl Stage for EsAkf {
         let mut report = Report { notes: self.notes.clone(), ..Report::default() };
         let (mut nis_sum, mut dof) = (0.0, 0);
         let mut p_end = serde_json::Map::new();
-        for body in &self.bodies {
-            let (s, stretch) = (body.follower.summary(), body.follower.stretch());
+        for filter in &self.filters {
+            let (s, stretch) = (filter.follower.summary(), filter.follower.stretch());
             nis_sum += s.nis_sum;
             dof += s.readouts.iter().map(|r| r.used).sum::<u64>();
             for (key, n) in s.counts {
                 *report.counts.entry(key.to_owned()).or_default() += n;
             }
-            for (c, sigma) in body.coefficients.iter().zip(&s.recursion_sigma) {
-                let name = &body.test_masses[0].name;
+            for (c, sigma) in filter.coefficients.iter().zip(&s.recursion_sigma) {
+                let name = &filter.test_masses[0].name;
                 let key = if p_end.contains_key(&c.name) { format!("{}@{name}", c.name) } else { c.name.clone() };
                 p_end.insert(key, json!(sigma));
             }
-            let names = body.names();
-            let averaged_s = body.follower.result().map(|a| a.span_s);
-            for (test_mass, readouts) in body.test_masses.iter().zip(s.readouts.chunks(3)) {
+            let names = filter.names();
+            let averaged_s = filter.follower.result().map(|a| a.span_s);
+            for (test_mass, readouts) in filter.test_masses.iter().zip(s.readouts.chunks(3)) {
                 let innovations: Vec<Option<f64>> = readouts.iter().map(|r| r.design_nis).collect();
                 report.quality.insert(
                     test_mass.name.clone(),
@@ -311,47 +310,21 @@ impl Stage for EsAkf {
     }
 
     fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
-        let mut bytes = if state.is_loading() { Vec::new() } else { self.save()? };
-        state.bytes(&mut bytes)?;
-        if state.is_loading() { self.load(&bytes) } else { Ok(()) }
+        state.same("mission or model", &self.layout())?;
+        state.option(&mut self.last_ns, State::i64)?;
+        Ok(self.filters.iter_mut().try_for_each(|filter| filter.follower.state(state))?)
     }
 }
 
 impl EsAkf {
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        let mut words = Vec::new();
-        let mut out = Words::Write(&mut words);
-        let (mut begun, mut last) = (self.last_ns.is_some(), self.last_ns.unwrap_or(0).cast_unsigned());
-        out.flag(&mut begun)?;
-        out.count(&mut last)?;
-        for body in &self.bodies {
-            body.follower.save(&mut words);
-        }
-        Ok(seal(&self.layout(), &words))
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let mut words = Words::Read(unseal(&self.layout(), state)?);
-        let (mut begun, mut last) = (false, 0);
-        words.flag(&mut begun)?;
-        words.count(&mut last)?;
-        let loaded = self.bodies.iter().map(|b| b.follower.loaded(&mut words)).collect::<Result<Vec<_>, _>>()?;
-        words.end()?;
-        for (body, follower) in self.bodies.iter_mut().zip(loaded) {
-            body.follower = follower;
-        }
-        self.last_ns = begun.then_some(last.cast_signed());
-        Ok(())
-    }
-
     /// The columns and the filter of these test masses.
-    fn link_body(
+    fn link_filter(
         &self,
         test_masses: &[TestMass],
         table: Table,
         available: &Available,
         link: &mut Link<'_>,
-    ) -> Result<Result<Body, TooMany>, PluginError> {
+    ) -> Result<Result<LinkedFilter, TooMany>, PluginError> {
         let responses = available.responses()?;
         let Columns { readout_m, u_m_s2, regressors, coefficients } =
             read_columns(test_masses, &responses, available, link)?;
@@ -380,7 +353,7 @@ impl EsAkf {
             nis.push(link.write_with(table, &format!("{name}.nis"), "1", "", &archive)?);
         }
         let test_masses = test_masses.to_vec();
-        Ok(Ok(Body {
+        Ok(Ok(LinkedFilter {
             test_masses,
             follower,
             readout_m,
@@ -417,9 +390,8 @@ impl EsAkf {
             choices.bias_walk_m_s2_rts = self.bias_walk_together_m_s2_rts;
         }
         let model = model(&self.mission, &names, &readouts, thetas, &choices)?;
-        // Several test masses under few forces have combinations of axes that hardly any force moves, which is what a
-        // common filter is for. Adaptation element by element does not keep that null space of Q, so that it must be
-        // asked for.
+        // Fewer forces than axes leave Q a null space, the combinations of axes that no thrust moves. Adaptation element
+        // by element does not preserve it, so it is off unless it is asked for.
         let usual = if several { Adaptation::Off } else { Adaptation::Monotone };
         let settings = Settings { adaptation: self.adaptation.unwrap_or(usual), ..self.settings };
         let states = model.states();
@@ -450,28 +422,28 @@ impl EsAkf {
 
     /// What a saved state belongs to.
     fn layout(&self) -> String {
-        let bodies = self.bodies.iter().map(|b| {
-            let names: Vec<&str> = b.coefficients.iter().map(|c| c.name.as_str()).collect();
-            format!("{}: {} states, {}", b.names().join(" and "), b.follower.summary().states, names.join(" "))
+        let filters = self.filters.iter().map(|f| {
+            let names: Vec<&str> = f.coefficients.iter().map(|c| c.name.as_str()).collect();
+            format!("{}: {} states, {}", f.names().join(" and "), f.follower.summary().states, names.join(" "))
         });
-        format!("{} Hz; {}", self.mission.mission.sample_rate_hz, bodies.collect::<Vec<_>>().join("; "))
+        format!("{} Hz; {}", self.mission.mission.sample_rate_hz, filters.collect::<Vec<_>>().join("; "))
     }
 
     /// Coefficients with value, σ and covariance. One that several filters estimate is taken from the one with the
     /// least σ: filters share the thrusters' noise, so that the σ of a mean would be too small.
     fn estimates(&self, report: &mut Report) {
         let results: Vec<(f64, Option<Average>)> =
-            self.bodies.iter().map(|b| (b.follower.stretch(), b.follower.result())).collect();
+            self.filters.iter().map(|f| (f.follower.stretch(), f.follower.result())).collect();
         let sigma = |b: usize, j: usize| -> Option<f64> {
             let (stretch, average) = &results[b];
-            let m = self.bodies[b].coefficients.len();
+            let m = self.filters[b].coefficients.len();
             average.as_ref().map(|a| stretch * a.covariance[j * m + j].sqrt())
         };
         let mut chosen: Vec<(usize, usize)> = Vec::new();
-        for (b, body) in self.bodies.iter().enumerate() {
-            for (j, c) in body.coefficients.iter().enumerate() {
-                let rival = chosen.iter().position(|&(b, j)| self.bodies[b].coefficients[j].name == c.name);
-                match rival {
+        for (b, filter) in self.filters.iter().enumerate() {
+            for (j, c) in filter.coefficients.iter().enumerate() {
+                let known = chosen.iter().position(|&(b, j)| self.filters[b].coefficients[j].name == c.name);
+                match known {
                     None => chosen.push((b, j)),
                     Some(r) if sigma(b, j) < sigma(chosen[r].0, chosen[r].1) => chosen[r] = (b, j),
                     Some(_) => {}
@@ -479,7 +451,7 @@ impl EsAkf {
             }
         }
         for &(b, j) in &chosen {
-            let c = &self.bodies[b].coefficients[j];
+            let c = &self.filters[b].coefficients[j];
             let value = results[b].1.as_ref().map(|a| a.value[j]);
             report.coefficients.push(Estimate {
                 name: c.name.clone(),
@@ -506,11 +478,13 @@ impl EsAkf {
             return;
         }
         let entry = |&(b, i): &(usize, usize), &(d, j): &(usize, usize)| match &results[b] {
-            (stretch, Some(a)) if b == d => stretch * stretch * a.covariance[i * self.bodies[b].coefficients.len() + j],
+            (stretch, Some(a)) if b == d => {
+                stretch * stretch * a.covariance[i * self.filters[b].coefficients.len() + j]
+            }
             _ => 0.0,
         };
         let matrix = chosen.iter().map(|row| chosen.iter().map(|column| entry(row, column)).collect()).collect();
-        let names = chosen.iter().map(|&(b, j)| self.bodies[b].coefficients[j].name.clone()).collect();
+        let names = chosen.iter().map(|&(b, j)| self.filters[b].coefficients[j].name.clone()).collect();
         report.covariance.insert("es-akf".to_owned(), Covariance { names, matrix });
     }
 }
@@ -578,7 +552,7 @@ fn read_columns(
     Ok(Columns { readout_m, u_m_s2, regressors, coefficients })
 }
 
-impl Body {
+impl LinkedFilter {
     fn names(&self) -> Vec<&str> {
         self.test_masses.iter().map(|t| t.name.as_str()).collect()
     }
@@ -635,6 +609,7 @@ fn acts_on_several(all: &[TestMass], responses: &[(&Coefficient, Response)], coe
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dragfree_sdk::state;
 
     fn stage() -> EsAkf {
         let setup = serde_json::json!({
@@ -683,11 +658,11 @@ mod tests {
     #[test]
     fn a_state_of_something_else_is_refused() {
         let mut stage = stage();
-        let saved = stage.save().expect("a state");
-        assert!(stage.load(&saved).is_ok());
-        assert!(stage.load(b"garbage").is_err());
-        assert!(stage.load(&saved[..saved.len() - 1]).is_err());
+        let saved = state::save("es-akf", 1, |state| stage.state(state)).expect("a state");
+        let load = |stage: &mut EsAkf| state::load("es-akf", 1, &saved, |state| stage.state(state));
+        load(&mut stage).expect("its own state");
         stage.mission.mission.sample_rate_hz = 1.0;
-        assert!(stage.load(&saved).expect_err("another rate").message().contains("start anew"));
+        let refusal = load(&mut stage).expect_err("another rate");
+        assert!(refusal.message().contains("another mission or model"), "{}", refusal.message());
     }
 }

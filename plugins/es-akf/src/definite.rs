@@ -12,7 +12,7 @@ const TOLERANCE: f64 = 1e-9;
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Finding {
     /// Positive semidefinite within the tolerance; nothing was changed.
-    Sound,
+    Semidefinite,
     /// Was indefinite; its negative part has been removed.
     Repaired,
     /// Holds NaN or infinities; nothing was changed.
@@ -36,14 +36,14 @@ pub fn repair<const N: usize>(matrix: &mut Matrix<N>, n: usize) -> Finding {
         if by > 0.0 { m[i][j] / by } else { 0.0 }
     });
     if Cholesky::new(&scaled + DMatrix::identity(n, n) * TOLERANCE).is_some() {
-        return Finding::Sound;
+        return Finding::Semidefinite;
     }
     let mut eigen = SymmetricEigen::new(scaled);
     eigen.eigenvalues.iter_mut().for_each(|e| *e = e.max(0.0));
-    let sound = eigen.recompose();
+    let nearest = eigen.recompose();
     for i in 0..n {
         for j in 0..=i {
-            let x = sound[(i, j)] * scale[i] * scale[j];
+            let x = nearest[(i, j)] * scale[i] * scale[j];
             m[i][j] = x;
             m[j][i] = x;
         }
@@ -64,11 +64,11 @@ mod tests {
     }
 
     #[test]
-    fn a_singular_covariance_is_sound() {
+    fn a_singular_covariance_is_semidefinite() {
         let dt = 0.1_f64;
         let mut m = matrix(&[[dt.powi(4) / 4.0, dt.powi(3) / 2.0, 0.0], [dt.powi(3) / 2.0, dt * dt, 0.0], [0.0; 3]]);
         let before = m.clone();
-        assert_eq!(repair(&mut m, 3), Finding::Sound);
+        assert_eq!(repair(&mut m, 3), Finding::Semidefinite);
         assert_eq!(m, before);
     }
 
@@ -80,7 +80,7 @@ mod tests {
         for (got, want) in [(m.0[0][0], 1.25e-20), (m.0[1][0], 1.25e-10), (m.0[0][1], 1.25e-10), (m.0[1][1], 1.25)] {
             assert!((got / want - 1.0).abs() < 1e-12, "{got} against {want}");
         }
-        assert_eq!(repair(&mut m, 3), Finding::Sound);
+        assert_eq!(repair(&mut m, 3), Finding::Semidefinite);
     }
 
     #[test]

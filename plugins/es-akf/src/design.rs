@@ -76,8 +76,8 @@ pub fn model(
         pushed.fixed_view_mut::<3, 3>(3 * t, 0).copy_from(&dcm);
         turned.fixed_view_mut::<3, 3>(3 * t, 0).copy_from(&lever);
         for axis in 0..3 {
-            let held = if axis == 0 { 0.0 } else { white(electrostatic.clone()) / tm.mass_kg.powi(2) };
-            psd[(3 * t + axis, 3 * t + axis)] = white(stray.clone()) + held;
+            let electrodes = if axis == 0 { 0.0 } else { white(electrostatic.clone()) / tm.mass_kg.powi(2) };
+            psd[(3 * t + axis, 3 * t + axis)] = white(stray.clone()) + electrodes;
         }
     }
     let left = thrust.force_given_torque * thrust.force_shape.white_psd() + Matrix3::identity() * white(sunlight);
@@ -175,6 +175,11 @@ mod tests {
         Choices { prior, bias_walk_m_s2_rts: 0.0, leak_hz: 1e-6, unknown_alpha }
     }
 
+    /// States of the chains of each readout.
+    fn states_of_chains(model: &Model) -> Vec<usize> {
+        model.chains.iter().map(|chains| chains.iter().map(Chain::states).sum()).collect()
+    }
+
     /// Numbers by hand: 1e-7 N/√Hz over 1500 kg at 10 Hz, 1e-7 N m/√Hz over about 800 kg m² through 0.18 m.
     #[test]
     fn the_default_mission_in_numbers() {
@@ -184,11 +189,11 @@ mod tests {
         let thrust = (1e-7_f64 / 1500.0).powi(2) * 5.0;
         assert!((still.acceleration_m2_s4[(0, 0)] / thrust - 1.0).abs() < 1e-5);
         assert!((still.readout_m2[0] / ((1.42e-12_f64).powi(2) * 5.0) - 1.0).abs() < 1e-12);
-        assert_eq!(still.chains.each_ref().map(|c| c.iter().map(Chain::states).sum::<usize>()), [2, 1, 1]);
+        assert_eq!(states_of_chains(&still), [2, 1, 1]);
         // −α × b with b = (0.09, 0.156, 0): along z both horizontal components act, over 800 kg m²; x and y see α_z
         // alone.
         let moved = model(1.0);
-        let along_z = moved.acceleration_m2_s4[2][2] - still.acceleration_m2_s4[2][2];
+        let along_z = moved.acceleration_m2_s4[(2, 2)] - still.acceleration_m2_s4[(2, 2)];
         let by_hand = (1e-7_f64 / 800.0 * 0.18).powi(2) * 5.0;
         assert!((along_z / by_hand - 1.0).abs() < 0.05, "{along_z:e} against {by_hand:e}");
         assert!(moved.acceleration_m2_s4[(0, 0)] - still.acceleration_m2_s4[(0, 0)] < by_hand);
@@ -207,8 +212,8 @@ mod tests {
             readout.as_mut().expect("there").terms = vec![term(5e-4, 4)];
         }
         let offset = vec![Coefficient { initial: 0.0, prior_sigma: 0.1 }; 3];
-        let model = model(&mission, &["tm1"], ["ifo_x", "is_y", "is_z"], offset, &choices(1.0)).expect("complete");
-        assert_eq!(model.chains.each_ref().map(|c| c.iter().map(Chain::states).sum::<usize>()), [4, 3, 3]);
+        let model = model(&mission, &["tm1"], &["ifo_x", "is_y", "is_z"], offset, &choices(1.0)).expect("complete");
+        assert_eq!(states_of_chains(&model), [4, 3, 3]);
         assert_eq!(model.states(), 22);
         let stated = |f: f64| 1.42e-12_f64.powi(2) * ((2e-3 / f).powi(4) + (3e-3 / f).powi(2) + (1e-4 / f).powi(2));
         for f in [2e-4_f64, 2e-3, 2e-2] {

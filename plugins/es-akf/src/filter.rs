@@ -10,7 +10,7 @@
 //!
 //! # Uncertainty
 //! `P` is only a covariance if `Q̂` and `R̂` are those of the data, and the adaptation moves both for reasons of
-//! stability. So a second covariance `P̃` follows the gains that were really used, under the noise of the mission
+//! stability. So a second covariance `P̃` has_design the gains that were really used, under the noise of the mission
 //! file: the error covariance of this estimator, adapted or not, as far as that noise model holds. The innovations
 //! measure how far it does ([`Statistics::design_nis`]).
 //!
@@ -20,13 +20,12 @@
 //! singular by construction (one force drives `r` and `v`), so a `Q̂` that adapts by elements is found slightly
 //! indefinite nearly every time.
 
+use dragfree_sdk::state::{State, StateError};
+
 use crate::definite::{Finding, repair};
-use crate::kernel::{
-    Columns, Matrix, Square, Transition, adapt, add_noise, advance, advance_with_foreign_gain, inverse, mix,
-};
+use crate::kernel::{Columns, Matrix, Square, Transition, adapt, add_noise, advance, advance_joseph, inverse, mix};
 use crate::model::Model;
 use crate::octaves::Octaves;
-use crate::state::{StateError, Words};
 
 /// How `Q̂` and `R̂` follow the innovations.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -143,9 +142,9 @@ pub struct Filter<const N: usize, const D: usize = 3> {
     /// `R` of the mission's noise.
     design_r: Square<D>,
     /// Entries of the upper triangle of `Q` that are not zero.
-    noisy: Vec<(usize, usize)>,
+    noise_entries: Vec<(usize, usize)>,
     /// Entries of the upper triangle of `Q̂` that can be other than zero.
-    moving: Vec<(usize, usize)>,
+    adapted_entries: Vec<(usize, usize)>,
     /// `X̂⁺`.
     x: [f64; N],
     /// `P_k`: covariance of the last epoch's `X̂⁻`.
@@ -207,8 +206,8 @@ impl<const N: usize, const D: usize> Filter<N, D> {
             transition: Transition::new(&model),
             design_q: Matrix::zero(),
             design_r: std::array::from_fn(|i| std::array::from_fn(|j| if i == j { model.readout_m2[i] } else { 0.0 })),
-            noisy: Vec::new(),
-            moving: Vec::new(),
+            noise_entries: Vec::new(),
+            adapted_entries: Vec::new(),
             x: [0.0; N],
             p: Matrix::zero(),
             q: Matrix::zero(),
@@ -237,9 +236,9 @@ impl<const N: usize, const D: usize> Filter<N, D> {
         filter.model.process_noise(|i, j, value| design_q.0[i][j] = value);
         let n = filter.model.states();
         let upper = || (0..n).flat_map(|i| (i..n).map(move |j| (i, j)));
-        filter.noisy = upper().filter(|&(i, j)| design_q.0[i][j] != 0.0).collect();
-        filter.moving = match settings.adaptation {
-            Adaptation::Monotone | Adaptation::Off => filter.noisy.clone(),
+        filter.noise_entries = upper().filter(|&(i, j)| design_q.0[i][j] != 0.0).collect();
+        filter.adapted_entries = match settings.adaptation {
+            Adaptation::Monotone | Adaptation::Off => filter.noise_entries.clone(),
             Adaptation::Innovation | Adaptation::Residual => upper().collect(),
         };
         filter.begin_covariances();
@@ -275,7 +274,7 @@ impl<const N: usize, const D: usize> Filter<N, D> {
             }
         }
         self.statistics.epochs += 1;
-        self.keep(next);
+        self.set_drive(next);
         if self.tracking {
             self.age += 1;
             self.measure(readout_m);
@@ -319,7 +318,7 @@ impl<const N: usize, const D: usize> Filter<N, D> {
     }
 
     /// Stores what acts until the next epoch.
-    fn keep(&mut self, next: Drive<'_, D>) {
+    fn set_drive(&mut self, next: Drive<'_, D>) {
         self.u = next.acceleration_m_s2;
         self.driven = self.u.iter().chain(next.regressors.iter().flatten()).all(|x| x.is_finite());
         if self.driven {
@@ -330,14 +329,14 @@ impl<const N: usize, const D: usize> Filter<N, D> {
     /// eqs Final_AKF_Q_ITER, Final_AKF_Q_K and Final_AKF_p_k1 of the last epoch, with the `A` of the interval now
     /// known.
     fn time_update(&mut self) {
-        let follows = self.has_own_covariance();
+        let has_design = self.has_design_covariance();
         let product = &mut self.product;
         self.transition.conjugate(&self.p, product);
         let m = self.transition.columns(&self.seen);
         let w = mix(&self.weight, &m);
         if self.adapt {
             let y = mix(&self.s_hat, &self.gain);
-            let (alpha, q, entries) = (self.settings.forgetting, &mut self.q, &self.moving);
+            let (alpha, q, entries) = (self.settings.forgetting, &mut self.q, &self.adapted_entries);
             let (by_w, by_k) = ([&w, &m], [&y, &self.gain]);
             match self.settings.adaptation {
                 // min{|·|, 0} = 0: what is no noise in the model never becomes one.
@@ -352,24 +351,24 @@ impl<const N: usize, const D: usize> Filter<N, D> {
                 Adaptation::Off => {}
             }
         }
-        add_noise(product, &self.q, &self.moving);
+        add_noise(product, &self.q, &self.adapted_entries);
         advance(&mut self.p, product, &w, &m);
-        if !follows {
+        if !has_design {
             return;
         }
         self.transition.conjugate(&self.p_design, product);
-        add_noise(product, &self.design_q, &self.noisy);
+        add_noise(product, &self.design_q, &self.noise_entries);
         let m = self.transition.columns(&self.seen_design);
-        advance_with_foreign_gain(&mut self.p_design, product, &w, &m, &self.s_design);
+        advance_joseph(&mut self.p_design, product, &w, &m, &self.s_design);
     }
 
     /// The covariance `P̃` of the gains in use under the mission's noise; `P` itself when nothing adapts.
     fn design_covariance(&self) -> &Matrix<N> {
-        if self.has_own_covariance() { &self.p_design } else { &self.p }
+        if self.has_design_covariance() { &self.p_design } else { &self.p }
     }
 
     /// Whether `P̃` differs from `P` and is followed.
-    fn has_own_covariance(&self) -> bool {
+    fn has_design_covariance(&self) -> bool {
         self.settings.calibrated_sigma && self.settings.adaptation != Adaptation::Off
     }
 
@@ -538,7 +537,7 @@ impl<const N: usize, const D: usize> Filter<N, D> {
     }
 
     fn measure_consistency(&mut self, d: &[f64; D], s: &Square<D>, used: [bool; D], settled: bool) {
-        if self.has_own_covariance() {
+        if self.has_design_covariance() {
             self.seen_design = self.transition.observed(&self.p_design);
             let hph = self.transition.observed_twice(&self.seen_design);
             self.s_design = sum(&hph, &self.design_r);
@@ -571,7 +570,7 @@ impl<const N: usize, const D: usize> Filter<N, D> {
         if q == Finding::Repaired && self.settings.adaptation == Adaptation::Monotone {
             // The nearest definite matrix has the blocks of the indefinite one; what stands outside is rounding.
             let mut kept = Matrix::zero();
-            for &(i, j) in &self.noisy {
+            for &(i, j) in &self.noise_entries {
                 kept.0[i][j] = self.q.0[i][j];
             }
             self.q = kept;
@@ -677,39 +676,27 @@ impl<const N: usize, const D: usize> Filter<N, D> {
         self.tracking
     }
 
-    /// One list of all that the next step depends on, for both directions.
-    pub(crate) fn visit(&mut self, w: &mut Words<'_>) -> Result<(), StateError> {
-        w.all(&mut self.x)?;
-        for m in [&mut self.p, &mut self.q, &mut self.p_design] {
-            for row in m.0.iter_mut() {
-                w.all(row)?;
-            }
+    /// Visits all that the next epoch depends on.
+    pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        state.f64s(&mut self.x)?;
+        for matrix in [&mut self.p, &mut self.q, &mut self.p_design] {
+            state.f64s(matrix.0.as_flattened_mut())?;
         }
-        for m in [&mut self.r, &mut self.s_hat, &mut self.e_hat, &mut self.weight, &mut self.s_design] {
-            for row in m {
-                w.all(row)?;
-            }
+        for square in [&mut self.r, &mut self.s_hat, &mut self.e_hat, &mut self.weight, &mut self.s_design] {
+            state.f64s(square.as_flattened_mut())?;
         }
         for columns in [&mut self.seen, &mut self.seen_design, &mut self.gain] {
-            for column in columns {
-                w.all(column)?;
-            }
+            state.f64s(columns.as_flattened_mut())?;
         }
-        for row in self.transition.phi.iter_mut() {
-            w.all(row)?;
-        }
-        w.all(&mut self.u)?;
+        state.f64s(self.transition.phi.as_flattened_mut())?;
+        state.f64s(&mut self.u)?;
         for flag in [&mut self.adapt, &mut self.driven, &mut self.tracking] {
-            w.flag(flag)?;
+            state.flag(flag)?;
         }
         for n in [&mut self.age, &mut self.s_samples] {
-            w.count(n)?;
+            state.u64(n)?;
         }
-        for n in &mut self.refused {
-            let mut wide = u64::from(*n);
-            w.count(&mut wide)?;
-            *n = u32::try_from(wide).map_err(|_| StateError::Content("a count of rejections"))?;
-        }
+        self.refused.iter_mut().try_for_each(|n| state.u32(n))?;
         let s = &mut self.statistics;
         for n in [
             &mut s.epochs,
@@ -721,14 +708,12 @@ impl<const N: usize, const D: usize> Filter<N, D> {
             &mut s.repairs_p,
             &mut s.resets,
         ] {
-            w.count(n)?;
+            state.u64(n)?;
         }
-        for n in &mut s.readouts {
-            w.count(n)?;
-        }
-        w.all(std::slice::from_mut(&mut s.nis_sum))?;
-        w.all(&mut s.design_sum)?;
-        s.octaves.iter_mut().try_for_each(|o| o.visit(w))
+        s.readouts.iter_mut().try_for_each(|n| state.u64(n))?;
+        state.f64(&mut s.nis_sum)?;
+        state.f64s(&mut s.design_sum)?;
+        s.octaves.iter_mut().try_for_each(|octaves| octaves.visit(state))
     }
 }
 

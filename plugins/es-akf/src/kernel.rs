@@ -94,9 +94,9 @@ fn combine<const N: usize, const D: usize>(weight: [f64; D], columns: &Columns<N
 pub struct Transition<const N: usize, const D: usize> {
     dt: f64,
     half_dt2: f64,
-    /// States from the first coefficient on that push `v`: coefficients and torque_noise.
+    /// States from the first coefficient on that push `v`: coefficients and torque noise.
     pushing: usize,
-    /// The states of noise, of torque_noise and of the readouts.
+    /// The states of the torque noise and of the readouts.
     noise: Range<usize>,
     /// Diagonal of `A_n`, by state; one for all others.
     decay: Box<[f64; N]>,
@@ -105,7 +105,7 @@ pub struct Transition<const N: usize, const D: usize> {
     /// States that add up in each readout: `r_i` and the outputs of its chains.
     outputs: [Vec<usize>; D],
     /// What the states from the first coefficient on push, m s⁻² per unit: the regressors of the current step, then the
-    /// torque_noise, which never change.
+    /// levers of the torque noise, which never change.
     pub phi: Box<[[f64; D]; N]>,
 }
 
@@ -317,7 +317,7 @@ pub fn adapt<const N: usize, const D: usize>(
 
 /// Covariance of a filter whose gain `K` was not made for it (Joseph's form, by structure):
 /// `P = A [(I − KH) P (I − KH)ᵀ + K R Kᵀ] Aᵀ + Q = APAᵀ + Q − W Lᵀ − L Wᵀ`, `L = M − W S/2`, `S = H P Hᵀ + R`.
-pub fn advance_with_foreign_gain<const N: usize, const D: usize>(
+pub fn advance_joseph<const N: usize, const D: usize>(
     p: &mut Matrix<N>,
     apaq: &Matrix<N>,
     w: &Columns<N, D>,

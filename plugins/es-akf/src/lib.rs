@@ -21,7 +21,6 @@ pub mod kernel;
 pub mod model;
 pub mod octaves;
 pub mod shaping;
-pub mod state;
 pub mod tracker;
 
 pub use adapter::EsAkf;

@@ -106,8 +106,8 @@ impl Model {
         for i in 0..axes {
             for j in 0..axes {
                 // A torque noise's deviate acts at once as well.
-                let shaken: f64 = self.torque_noise.iter().map(|s| s.lever_m_s2[i] * s.lever_m_s2[j]).sum();
-                let q = self.acceleration_m2_s4[(i, j)] + shaken;
+                let driven: f64 = self.torque_noise.iter().map(|s| s.lever_m_s2[i] * s.lever_m_s2[j]).sum();
+                let q = self.acceleration_m2_s4[(i, j)] + driven;
                 set(i, j, q * dt.powi(4) / 4.0);
                 set(i, axes + j, q * dt.powi(3) / 2.0);
                 set(axes + i, j, q * dt.powi(3) / 2.0);

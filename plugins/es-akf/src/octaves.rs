@@ -5,7 +5,7 @@
 //! an octave have `Σ d²/σ²` distributed as χ² with n degrees of freedom, whatever the other octaves do. Memory is
 //! fixed, and a sample costs two steps on average however long the series is.
 
-use crate::state::{StateError, Words};
+use dragfree_sdk::state::{State, StateError};
 
 /// At 10 Hz the lowest octave ends at 38 µHz; what is slower is not looked at.
 pub const OCTAVES: usize = 17;
@@ -45,16 +45,11 @@ impl Octaves {
         self.sum.iter().zip(&self.count).map_while(seen)
     }
 
-    /// One list of the state for both directions.
-    pub(crate) fn visit(&mut self, w: &mut Words<'_>) -> Result<(), StateError> {
-        for waiting in &mut self.waiting {
-            let (mut there, mut value) = (waiting.is_some(), waiting.unwrap_or(0.0));
-            w.flag(&mut there)?;
-            w.all(std::slice::from_mut(&mut value))?;
-            *waiting = there.then_some(value);
-        }
-        w.all(&mut self.sum)?;
-        self.count.iter_mut().try_for_each(|n| w.count(n))
+    /// Visits all that the next sample depends on.
+    pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        self.waiting.iter_mut().try_for_each(|waiting| state.option(waiting, State::f64))?;
+        state.f64s(&mut self.sum)?;
+        self.count.iter_mut().try_for_each(|n| state.u64(n))
     }
 }
 

@@ -62,9 +62,9 @@ impl Chain {
 ///
 /// α̂ is the posterior mean given all wavefront sensing. With white torque noise of PSD `q` and white sensing noise of
 /// PSD `r`, sampled every `dt`, its error has the PSD `q g r/(q c + g r)`, `g = |1 − z|⁴/dt⁴`, `c = |1 + z|²/4` (the
-/// second difference of an attitude sees the mean of two samples). Its spectral factor is `√(q a₂) (1 − z⁻¹)²/A(z)`, `A
-/// = 1 + a₁ z⁻¹ + a₂ z⁻²` the factor of the denominator with its zeros inside the unit circle: a Butterworth high-pass
-/// where the corner lies far below Nyquist.
+/// second difference of an attitude sees the mean of two samples). Its spectral factor is `√(q a₂) (1 − z⁻¹)²/A(z)`,
+/// `A = 1 + a₁ z⁻¹ + a₂ z⁻²` the factor of the denominator with its zeros inside the unit circle: a Butterworth
+/// high-pass where the corner lies far below Nyquist.
 ///
 /// The white deviate acts at once; what the smoother knows of it is taken back by the state `y`, with
 /// `y ← y + μ d + β w`, `d ← (a₂ − μ²) d − μ y + (μ − β²/μ) w`, `β = 2 + a₁`, `μ² = A(1)`.

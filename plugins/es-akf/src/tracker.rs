@@ -3,10 +3,11 @@
 use std::collections::VecDeque;
 use std::ops::Range;
 
+use dragfree_sdk::state::{State, StateError};
+
 use crate::filter::{Drive, Filter, Settings};
 use crate::model::Model;
 use crate::octaves::Octaves;
-use crate::state::{Bytes, StateError, Words};
 
 /// The paper's value is the mean of the estimate over the last hour, s.
 const AVERAGE_S: f64 = 3600.0;
@@ -112,14 +113,11 @@ pub trait Follower: std::fmt::Debug + Send + Sync {
     /// Counts and consistency since the start.
     fn summary(&self) -> Summary;
 
-    /// A copy with the state that [`Follower::save`] wrote for the same model.
+    /// Visits all that the next row depends on.
     ///
     /// # Errors
-    /// [`StateError`] when the bytes end early or have no sense.
-    fn loaded(&self, words: &mut Words<'_>) -> Result<Box<dyn Follower>, StateError>;
-
-    /// Appends everything that the next row depends on.
-    fn save(&self, out: &mut Bytes);
+    /// [`StateError`] when the state is that of a filter of other dimensions.
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), StateError>;
 }
 
 /// Most states that a filter can have.
@@ -242,27 +240,6 @@ impl<const N: usize, const D: usize> Tracker<N, D> {
         let sigma = (0..value.len()).map(|i| self.filter.coefficient_covariance(i, i).sqrt()).collect();
         Snapshot { row, displacement_m: self.filter.displacement_m().to_vec(), value, sigma, nis }
     }
-
-    /// One list of the state for both directions.
-    fn visit(&mut self, w: &mut Words<'_>) -> Result<(), StateError> {
-        self.filter.visit(w)?;
-        let m = self.filter.coefficients().len();
-        let mut bins = self.bins.len() as u64;
-        w.count(&mut bins)?;
-        if bins > self.whole_window() as u64 {
-            return Err(StateError::Content("a count of averages"));
-        }
-        self.bins.resize(bins as usize, Bin::default());
-        for bin in &mut self.bins {
-            bin.sum.resize(m, 0.0);
-            bin.covariance.resize(m * m, 0.0);
-            w.count(&mut bin.epochs)?;
-            w.all(&mut bin.sum)?;
-            w.all(&mut bin.covariance)?;
-        }
-        w.all(std::slice::from_mut(&mut self.reported.0))?;
-        w.count(&mut self.reported.1)
-    }
 }
 
 impl<const N: usize, const D: usize> Follower for Tracker<N, D> {
@@ -349,13 +326,20 @@ impl<const N: usize, const D: usize> Follower for Tracker<N, D> {
         }
     }
 
-    fn loaded(&self, words: &mut Words<'_>) -> Result<Box<dyn Follower>, StateError> {
-        let mut copy = self.clone();
-        copy.visit(words)?;
-        Ok(Box::new(copy))
-    }
-
-    fn save(&self, out: &mut Bytes) {
-        self.clone().visit(&mut Words::Write(out)).unwrap_or_else(|_| unreachable!("writing to memory"));
+    fn state(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        self.filter.visit(state)?;
+        let m = self.filter.coefficients().len();
+        state.queue(&mut self.bins, |state, bin| {
+            bin.sum.resize(m, 0.0);
+            bin.covariance.resize(m * m, 0.0);
+            state.u64(&mut bin.epochs)?;
+            state.f64s(&mut bin.sum)?;
+            state.f64s(&mut bin.covariance)
+        })?;
+        if self.bins.len() > self.whole_window() {
+            return Err(StateError::Content("a count of averages"));
+        }
+        state.f64(&mut self.reported.0)?;
+        state.u64(&mut self.reported.1)
     }
 }

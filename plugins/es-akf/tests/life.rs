@@ -5,8 +5,8 @@ mod common;
 use common::{Alpha, Epoch, Simulation, model, settings};
 use dragfree_es_akf::filter::{Adaptation, Drive, Filter, Settings};
 use dragfree_es_akf::model::{Coefficient, Model};
-use dragfree_es_akf::state::{StateError, Words};
 use dragfree_es_akf::tracker::{Factor, Follower, Regressor, Rows, follow};
+use dragfree_sdk::state::{self, StateError};
 
 const NAN3: [f64; 3] = [f64::NAN; 3];
 
@@ -281,25 +281,23 @@ fn a_saved_state_resumes_to_the_bit() {
             .collect(),
     };
     let fresh = || follow(model.clone(), gated(), 60.0).expect("16 states");
-    let bytes = |t: &dyn Follower| {
-        let mut out = Vec::new();
-        t.save(&mut out);
-        out
-    };
+    let save = |t: &mut dyn Follower| state::save("es-akf", 1, |state| t.state(state)).expect("a state");
+    let load = |t: &mut dyn Follower, bytes: &[u8]| state::load("es-akf", 1, bytes, |state| t.state(state));
     let mut whole = fresh();
     let snapshots = whole.process(&rows, 0..6_000);
     for cut in [0, 1, 777, 2_001, 3_000, 3_025, 4_010, 5_999] {
         let mut first = fresh();
         let mut both = first.process(&rows, 0..cut);
-        let state = bytes(&*first);
-        let mut words = Words::Read(&state);
-        let mut second = fresh().loaded(&mut words).expect("its own state");
-        words.end().expect("nothing left");
-        assert_eq!(bytes(&*second), state, "cut at {cut}");
+        let saved = save(&mut *first);
+        let mut second = fresh();
+        load(&mut *second, &saved).expect("its own state");
+        assert_eq!(save(&mut *second), saved, "cut at {cut}");
         both.extend(second.process(&rows, cut..6_000));
         assert_eq!(format!("{both:?}"), format!("{snapshots:?}"), "cut at {cut}");
-        assert_eq!(bytes(&*second), bytes(&*whole), "cut at {cut}");
+        assert_eq!(save(&mut *second), save(&mut *whole), "cut at {cut}");
     }
-    let state = bytes(&*whole);
-    assert!(matches!(fresh().loaded(&mut Words::Read(&state[..state.len() / 2])), Err(StateError::Length { .. })));
+    let mut fewer = model.clone();
+    fewer.coefficients.pop();
+    let mut fewer = follow(fewer, gated(), 60.0).expect("15 states");
+    assert!(matches!(load(&mut *fewer, &save(&mut *whole)), Err(StateError::Content(_))));
 }

@@ -258,11 +258,15 @@ fn several_test_masses_agree_with_dense_matrices<const D: usize>(epochs: u32) {
 
     let mut worst = 0.0_f64;
     for k in 0..epochs {
-        let mut readout: [f64; D] = std::array::from_fn(|i| 3.0 * model.readout_m2[i].sqrt() * normal());
+        // Innovations of the covariance that the filter expects, so that estimates stay within a few σ.
+        let expected = (&h * &p * h.transpose() + &r).cholesky().expect("definite").l();
+        let predicted = &h * &x + expected * DVector::from_fn(D, |_, _| normal());
+        let mut readout: [f64; D] = std::array::from_fn(|i| predicted[i]);
         if k % 10 == 3 {
             (readout[1], readout[3]) = (f64::NAN, f64::NAN);
         }
-        let u: [f64; D] = std::array::from_fn(|_| 1e-10 * normal());
+        // A soft controller: the rounding of a displacement must stay far below its σ.
+        let u: [f64; D] = std::array::from_fn(|i| -0.01 * x[i] - 0.1 * x[D + i]);
         let phi: Vec<[f64; D]> = (0..4).map(|_| std::array::from_fn(|_| 1e-9 * normal())).collect();
         if k == 0 {
             (0..D).for_each(|i| x[i] = readout[i]);

@@ -264,7 +264,8 @@ impl Builder<'_> {
         Ok(())
     }
 
-    /// A regressor or series of a plugin that reads a series made from commands (attribute `in_loop`) counts as made from commands too.
+    /// A regressor or series of a plugin that reads a series made from commands (attribute `in_loop`) counts as made
+    /// from commands too.
     fn inherit_loop(&self, linked: &mut Linked) {
         let in_loop = |c: &Column| c.attributes.get("in_loop").is_some_and(|a| a == "true");
         if linked.reads.iter().flatten().any(|r| in_loop(&self.available[r.available])) {
