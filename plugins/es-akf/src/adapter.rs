@@ -390,8 +390,8 @@ impl EsAkf {
             choices.bias_walk_m_s2_rts = self.bias_walk_together_m_s2_rts;
         }
         let model = model(&self.mission, &names, &readouts, thetas, &choices)?;
-        // Fewer forces than axes leave Q a null space, the combinations of axes that no thrust moves. Adaptation element
-        // by element does not preserve it, so it is off unless it is asked for.
+        // Fewer forces than axes leave Q a null space, the combinations of axes that no thrust moves. Adaptation
+        // element by element does not preserve it, so it is off unless it is asked for.
         let usual = if several { Adaptation::Off } else { Adaptation::Monotone };
         let settings = Settings { adaptation: self.adaptation.unwrap_or(usual), ..self.settings };
         let states = model.states();
@@ -420,7 +420,7 @@ impl EsAkf {
         Ok(pieces)
     }
 
-    /// What a saved state belongs to.
+    /// Identifies the filters that a saved state belongs to.
     fn layout(&self) -> String {
         let filters = self.filters.iter().map(|f| {
             let names: Vec<&str> = f.coefficients.iter().map(|c| c.name.as_str()).collect();
@@ -489,10 +489,10 @@ impl EsAkf {
     }
 }
 
-/// So many states that no filter holds them.
+/// Number of states of a filter that is too large.
 struct TooMany(usize);
 
-/// The test masses of which a known acceleration is made, in the order of the columns.
+/// The test masses that have a column of known acceleration, in the order of the columns.
 fn test_masses(available: &Available) -> Vec<TestMass> {
     let mut all: Vec<TestMass> = Vec::new();
     for column in &available.columns {

@@ -20,22 +20,22 @@ pub struct Choices {
     pub bias_walk_m_s2_rts: f64,
     /// Below this frequency coloured readout noise is white, Hz.
     pub leak_hz: f64,
-    /// Part of the torque noise's variance that α̂ does not know, acting through the nominal offset.
+    /// Fraction of the torque noise's variance that α̂ does not know; it acts through the nominal offset.
     pub unknown_alpha: f64,
 }
 
 /// The model of one test mass, or of several in one filter.
 ///
-/// Acceleration noise: thrust and sunlight over the spacecraft's mass, alike for all test masses, the white parts of
-/// electrostatic (y, z) and stray forces, and what α̂ does not know of the torque noise, through the nominal offset.
-/// Where thrusters push and turn at once, û holds the force that the known torque comes with, so that the force given
-/// the torque is left, and the unknown torque brings its force along. The red (`1/f²`) parts of the forces on the test
-/// mass walk with `a_b`.
+/// Acceleration noise is a sum: thrust and sunlight over the spacecraft's mass, common to all test masses; the white
+/// parts of electrostatic (y, z) and stray forces on each; and the error of α̂ through the nominal offset. Where a
+/// thruster pushes and turns at once, û contains the expected force given the known torque. Then the force conditional
+/// on the torque remains, and an unknown torque carries its force. The red (`1/f²`) parts of the forces on the test
+/// mass drive the random walk of `a_b`.
 ///
-/// What α̂ does not know is torque noise above the band of the wavefront sensors. One test mass feels it beside the
-/// thrusters' force, and it is white here, as it makes no difference. Between two test masses that force falls out, and
-/// it is what remains: there it is a [`TorqueNoiseShaping`], known below the frequency at which the torque noise turns
-/// the spacecraft by as much as the sensors' noise.
+/// The error of α̂ is the torque noise above the band of the wavefront sensors. For one test mass it is white: where
+/// its spectrum matters, the force noise of the thrusters exceeds it. The difference of two test masses does not
+/// contain that force, so that several test masses have it as a [`TorqueNoiseShaping`], which is known below the
+/// frequency at which torque noise turns the spacecraft by as much as the sensors' noise.
 ///
 /// `readouts` names the tables under `[noise]` that belong to the readouts x, y, z of each test mass.
 ///

@@ -6,7 +6,7 @@ use nalgebra::DMatrix;
 
 use crate::shaping::{Chain, TorqueNoiseShaping};
 
-/// What is believed before the first sample, 1σ, and what `r` and `v` fall back to after a loss of track.
+/// Prior 1σ before the first sample, and of `r` and `v` after a loss of track.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Prior {
     /// Displacement about the readout at which the track begins, m.

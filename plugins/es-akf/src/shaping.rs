@@ -66,7 +66,7 @@ impl Chain {
 /// `A = 1 + a₁ z⁻¹ + a₂ z⁻²` the factor of the denominator with its zeros inside the unit circle: a Butterworth
 /// high-pass where the corner lies far below Nyquist.
 ///
-/// The white deviate acts at once; what the smoother knows of it is taken back by the state `y`, with
+/// The white deviate acts at once, and the state `y` subtracts what the smoother knows of it:
 /// `y ← y + μ d + β w`, `d ← (a₂ − μ²) d − μ y + (μ − β²/μ) w`, `β = 2 + a₁`, `μ² = A(1)`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct TorqueNoiseShaping {

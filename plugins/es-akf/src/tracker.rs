@@ -11,12 +11,12 @@ use crate::octaves::Octaves;
 
 /// The paper's value is the mean of the estimate over the last hour, s.
 const AVERAGE_S: f64 = 3600.0;
-/// A run shorter than six hours averages this part of itself instead.
+/// A run shorter than six hours averages its last sixth instead.
 const AVERAGE_PART: u64 = 6;
-/// Grain of that mean, s.
+/// Resolution of the averaging window, s.
 const BIN_S: f64 = 10.0;
 
-/// What is read, column by column, all of one length.
+/// Input columns, all of one length.
 #[derive(Clone, Debug)]
 pub struct Rows<'a> {
     /// Measured displacement at `t_k`, axis by axis, m.
@@ -90,24 +90,24 @@ pub struct Average {
     /// Mean estimate per coefficient.
     pub value: Vec<f64>,
     /// Mean covariance over the span, row-major, for the gains in use and the mission's noise. The error of a mean is
-    /// no larger than the mean error: `Cov(mean) ≤ mean(Cov)`, with near equality as the errors of one hour are one.
+    /// no larger than the mean error: `Cov(mean) ≤ mean(Cov)`, nearly equal as errors within an hour are correlated.
     pub covariance: Vec<f64>,
 }
 
-/// Some test masses being followed over time, whatever the dimensions of the filter.
+/// A filter over time, whatever its dimensions.
 pub trait Follower: std::fmt::Debug + Send + Sync {
-    /// Rows `range` of a batch; what is given for the archive.
+    /// Processes rows `range` of a batch; returns the rows for the archive.
     fn process(&mut self, rows: &Rows<'_>, range: Range<usize>) -> Vec<Snapshot>;
 
-    /// Epochs that no row stands for.
+    /// Skips epochs without rows.
     fn skip(&mut self, epochs: u64);
 
     /// The mean over the last hour, or over the last sixth of a run shorter than six hours; in bins of ten seconds, the
     /// newest one perhaps not full. `None` before the first epoch.
     fn result(&self) -> Option<Average>;
 
-    /// By how much σ must be stretched: the worst readout's innovations, rms, over what the mission's noise predicts;
-    /// never less than one, as quiet data do not prove a quiet instrument.
+    /// Factor on σ: the rms of the worst readout's innovations over what the mission's noise predicts, at least one, as
+    /// small innovations do not prove small errors.
     fn stretch(&self) -> f64;
 
     /// Counts and consistency since the start.
