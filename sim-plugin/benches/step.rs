@@ -51,10 +51,10 @@ impl Shares {
         let outside = Outside {
             omega_crf_rad_s: environment.omega_crf_rad_s,
             alpha_crf_rad_s2: environment.alpha_crf_rad_s2,
-            gradient_orf_s2: [environment.gradient_crf_s2; 2],
+            gradient_orf_s2: [environment.gradient_crf_s2; 2].into(),
         };
-        let loads = Loads { torque_srf_nm: Vector3::new(1e-9, -1e-9, 2e-9), ..Loads::default() };
-        let mut state = State::at_rest(&Vector3::zeros(), &Default::default(), &plant, &outside);
+        let loads = Loads { torque_srf_nm: Vector3::new(1e-9, -1e-9, 2e-9), ..Loads::zero(2) };
+        let mut state = State::at_rest(&Vector3::zeros(), &[Default::default(); 2], &plant, &outside);
         let mut noises = Noises::new(&mission).expect("the fixture has noise");
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(1);
         noises.start(&mut rng);

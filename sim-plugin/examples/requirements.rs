@@ -6,7 +6,6 @@ mod record;
 
 use dragfree_chart::{Line, Panel, Scale, Stroke, svg};
 use dragfree_physics::control_design::{ChannelDesign, design};
-use dragfree_physics::mission::CHANNELS;
 use dragfree_physics::spectrum::Spectrum;
 use record::{RESOLUTIONS, Record, bands, requirement_psd, serving, spectra, taiji};
 use std::io::Write as _;
@@ -49,7 +48,7 @@ fn panel(title: &str, unit: &str, lines: Vec<Line>) -> Panel {
 /// Channels of one kind in one panel: spectra, predictions, requirement.
 fn group(title: &str, unit: &str, names: &[&str], record: &Record, channels: &[ChannelDesign]) -> Panel {
     let frequencies: Vec<f64> = (0..=160).map(|i| 10_f64.powf(-4.0 + f64::from(i) / 40.0)).collect();
-    let of = |name: &str| CHANNELS.iter().position(|c| *c == name).expect("a channel");
+    let of = |name: &str| channels.iter().position(|c| c.name == name).expect("a channel");
     let mut lines: Vec<Line> = names
         .iter()
         .enumerate()
@@ -104,7 +103,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     for (c, series) in design.channels.iter().zip(&record.states) {
         let spectra = spectra(series, record.rate_hz);
         let used = bands().map(|band| {
-            let ratio = serving(&spectra, band).ratio(band.0..band.1, |f| requirement_psd(&mission, c.name, f));
+            let ratio = serving(&spectra, band).ratio(band.0..band.1, |f| requirement_psd(&mission, &c.name, f));
             let predicted = serving(&spectra, band).frequency_hz.iter().filter(|f| (band.0..band.1).contains(f));
             let predicted: Vec<f64> = predicted.map(|f| (c.predicted_asd(*f) / c.required_asd(*f)).powi(2)).collect();
             let mean = predicted.iter().sum::<f64>() / predicted.len() as f64;

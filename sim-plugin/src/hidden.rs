@@ -32,7 +32,7 @@ struct Row {
     least_days: f64,
     /// A shape parameter that is drawn between the first and the last of these values, where σ is known.
     shape: Option<(&'static str, &'static [f64])>,
-    /// σ of the size after six hours and after a day by instance, at each value of the shape parameter. What is slow gains much
+    /// σ of the size after six hours and after a day by instance, `{N}` in place of the name of the test mass N, at each value of the shape parameter. What is slow gains much
     /// more between the two than a root of four.
     sigma: &'static [(&'static str, &'static [[f64; 2]])],
 }
@@ -72,17 +72,17 @@ const ROWS: &[Row] = &[
     Row {
         id: "opening-angle",
         range: (1.0e-3, 1.5e-2),
-        sigma: &[("tm1", &[[3.83e-3, 1.92e-3]]), ("tm2", &[[3.83e-3, 1.92e-3]])],
+        sigma: &[("{0}", &[[3.83e-3, 1.92e-3]]), ("{1}", &[[3.83e-3, 1.92e-3]])],
         ..PLAIN
     },
     Row {
         id: "es-gain",
         range: (5.0e-3, 2.0e-1),
         sigma: &[
-            ("tm1.y", &[[1.09e-2, 5.75e-3]]),
-            ("tm1.z", &[[2.61e-2, 1.31e-2]]),
-            ("tm2.y", &[[1.15e-2, 5.87e-3]]),
-            ("tm2.z", &[[2.61e-2, 1.31e-2]]),
+            ("{0}.y", &[[1.09e-2, 5.75e-3]]),
+            ("{0}.z", &[[2.61e-2, 1.31e-2]]),
+            ("{1}.y", &[[1.15e-2, 5.87e-3]]),
+            ("{1}.z", &[[2.61e-2, 1.31e-2]]),
         ],
         ..PLAIN
     },
@@ -90,14 +90,14 @@ const ROWS: &[Row] = &[
         id: "es-crosstalk",
         range: (3.0e-3, 5.0e-2),
         sigma: &[
-            ("tm1.y-x", &[[2.05e-3, 1.03e-3]]),
-            ("tm1.y-z", &[[1.36e-2, 7.13e-3]]),
-            ("tm1.z-x", &[[2.41e-3, 1.21e-3]]),
-            ("tm1.z-y", &[[2.18e-2, 1.10e-2]]),
-            ("tm2.y-x", &[[2.08e-3, 1.04e-3]]),
-            ("tm2.y-z", &[[1.42e-2, 7.27e-3]]),
-            ("tm2.z-x", &[[2.42e-3, 1.21e-3]]),
-            ("tm2.z-y", &[[2.18e-2, 1.10e-2]]),
+            ("{0}.y-x", &[[2.05e-3, 1.03e-3]]),
+            ("{0}.y-z", &[[1.36e-2, 7.13e-3]]),
+            ("{0}.z-x", &[[2.41e-3, 1.21e-3]]),
+            ("{0}.z-y", &[[2.18e-2, 1.10e-2]]),
+            ("{1}.y-x", &[[2.08e-3, 1.04e-3]]),
+            ("{1}.y-z", &[[1.42e-2, 7.27e-3]]),
+            ("{1}.z-x", &[[2.42e-3, 1.21e-3]]),
+            ("{1}.z-y", &[[2.18e-2, 1.10e-2]]),
         ],
         ..PLAIN
     },
@@ -141,10 +141,10 @@ const ROWS: &[Row] = &[
         origin: 1.0,
         signed: false,
         sigma: &[
-            ("tm1.y", &[[1.52e-3, 7.61e-4]]),
-            ("tm1.z", &[[1.53e-3, 7.63e-4]]),
-            ("tm2.y", &[[1.52e-3, 7.61e-4]]),
-            ("tm2.z", &[[1.53e-3, 7.63e-4]]),
+            ("{0}.y", &[[1.52e-3, 7.61e-4]]),
+            ("{0}.z", &[[1.53e-3, 7.63e-4]]),
+            ("{1}.y", &[[1.52e-3, 7.61e-4]]),
+            ("{1}.z", &[[1.53e-3, 7.63e-4]]),
         ],
         ..PLAIN
     },
@@ -152,10 +152,10 @@ const ROWS: &[Row] = &[
         id: "is-scale",
         range: (3.0e-3, 1.0e-1),
         sigma: &[
-            ("tm1.y", &[[1.07e-2, 5.37e-3]]),
-            ("tm1.z", &[[1.34e-2, 6.87e-3]]),
-            ("tm2.y", &[[1.06e-2, 5.50e-3]]),
-            ("tm2.z", &[[1.35e-2, 6.86e-3]]),
+            ("{0}.y", &[[1.07e-2, 5.37e-3]]),
+            ("{0}.z", &[[1.34e-2, 6.87e-3]]),
+            ("{1}.y", &[[1.06e-2, 5.50e-3]]),
+            ("{1}.z", &[[1.35e-2, 6.86e-3]]),
         ],
         ..PLAIN
     },
@@ -163,21 +163,21 @@ const ROWS: &[Row] = &[
         id: "is-crosstalk",
         range: (3.0e-3, 1.0e-1),
         sigma: &[
-            ("tm1.x-y", &[[5.93e-2, 3.09e-2]]),
-            ("tm1.x-z", &[[6.99e-2, 3.61e-2]]),
-            ("tm1.y-z", &[[1.34e-2, 6.74e-3]]),
-            ("tm1.z-y", &[[1.06e-2, 5.42e-3]]),
-            ("tm2.x-y", &[[4.04e-2, 3.08e-2]]),
-            ("tm2.x-z", &[[5.17e-2, 3.61e-2]]),
-            ("tm2.y-z", &[[1.34e-2, 6.89e-3]]),
-            ("tm2.z-y", &[[1.05e-2, 5.39e-3]]),
+            ("{0}.x-y", &[[5.93e-2, 3.09e-2]]),
+            ("{0}.x-z", &[[6.99e-2, 3.61e-2]]),
+            ("{0}.y-z", &[[1.34e-2, 6.74e-3]]),
+            ("{0}.z-y", &[[1.06e-2, 5.42e-3]]),
+            ("{1}.x-y", &[[4.04e-2, 3.08e-2]]),
+            ("{1}.x-z", &[[5.17e-2, 3.61e-2]]),
+            ("{1}.y-z", &[[1.34e-2, 6.89e-3]]),
+            ("{1}.z-y", &[[1.05e-2, 5.39e-3]]),
         ],
         ..PLAIN
     },
     Row {
         id: "tilt-to-length",
         range: (1.0e-4, 3.0e-3),
-        sigma: &[("tm1", &[[7.79e-4, 3.87e-4]]), ("tm2", &[[8.05e-4, 4.02e-4]])],
+        sigma: &[("{0}", &[[7.79e-4, 3.87e-4]]), ("{1}", &[[8.05e-4, 4.02e-4]])],
         ..PLAIN
     },
     Row {
@@ -192,32 +192,32 @@ const ROWS: &[Row] = &[
         range: (0.0, 5.0e-11),
         shape: Some(("lag_s", &[60.0, 480.0, 3000.0])),
         sigma: &[
-            ("tm1.x", &[[5.59e-12, 7.23e-13], [4.25e-12, 8.58e-13], [7.39e-12, 1.83e-12]]),
-            ("tm1.y", &[[8.65e-12, 1.53e-12], [7.06e-12, 1.78e-12], [1.41e-11, 3.02e-12]]),
-            ("tm1.z", &[[8.73e-12, 2.37e-12], [6.99e-12, 2.67e-12], [5.92e-12, 3.31e-12]]),
-            ("tm2.x", &[[4.97e-12, 9.05e-13], [4.11e-12, 1.06e-12], [6.42e-12, 2.03e-12]]),
-            ("tm2.y", &[[9.25e-12, 1.28e-12], [7.97e-12, 1.55e-12], [1.83e-11, 3.55e-12]]),
-            ("tm2.z", &[[9.05e-12, 3.02e-12], [8.52e-12, 3.44e-12], [8.89e-12, 5.73e-12]]),
+            ("{0}.x", &[[5.59e-12, 7.23e-13], [4.25e-12, 8.58e-13], [7.39e-12, 1.83e-12]]),
+            ("{0}.y", &[[8.65e-12, 1.53e-12], [7.06e-12, 1.78e-12], [1.41e-11, 3.02e-12]]),
+            ("{0}.z", &[[8.73e-12, 2.37e-12], [6.99e-12, 2.67e-12], [5.92e-12, 3.31e-12]]),
+            ("{1}.x", &[[4.97e-12, 9.05e-13], [4.11e-12, 1.06e-12], [6.42e-12, 2.03e-12]]),
+            ("{1}.y", &[[9.25e-12, 1.28e-12], [7.97e-12, 1.55e-12], [1.83e-11, 3.55e-12]]),
+            ("{1}.z", &[[9.05e-12, 3.02e-12], [8.52e-12, 3.44e-12], [8.89e-12, 5.73e-12]]),
         ],
         ..PLAIN
     },
     Row {
         id: "magnetic",
         range: (0.0, 1.0e-4),
-        sigma: &[("tm1", &[[3.11e-4, 2.29e-5]]), ("tm2", &[[3.23e-4, 2.42e-5]])],
+        sigma: &[("{0}", &[[3.11e-4, 2.29e-5]]), ("{1}", &[[3.23e-4, 2.42e-5]])],
         ..PLAIN
     },
     Row {
         id: "magnetic",
         carrier: Some("moment_a_m2"),
         range: (0.0, 2.0e-8),
-        sigma: &[("tm1", &[[6.29e-8, 2.04e-9]]), ("tm2", &[[6.98e-8, 2.28e-9]])],
+        sigma: &[("{0}", &[[6.29e-8, 2.04e-9]]), ("{1}", &[[6.98e-8, 2.28e-9]])],
         ..PLAIN
     },
     Row {
         id: "charge",
         range: (0.0, 1.0e-1),
-        sigma: &[("tm1", &[[4.12e-3, 2.40e-3]]), ("tm2", &[[7.42e-3, 2.23e-3]])],
+        sigma: &[("{0}", &[[4.12e-3, 2.40e-3]]), ("{1}", &[[7.42e-3, 2.23e-3]])],
         ..PLAIN
     },
     Row {
@@ -260,12 +260,12 @@ const ROWS: &[Row] = &[
         range: (0.0, 2.0e-9),
         power: 0.0,
         sigma: &[
-            ("tm1.x", &[[1.63e-12, 1.64e-12]]),
-            ("tm1.y", &[[1.91e-12, 1.91e-12]]),
-            ("tm1.z", &[[2.62e-12, 2.62e-12]]),
-            ("tm2.x", &[[1.63e-12, 1.64e-12]]),
-            ("tm2.y", &[[1.91e-12, 1.91e-12]]),
-            ("tm2.z", &[[2.62e-12, 2.62e-12]]),
+            ("{0}.x", &[[1.63e-12, 1.64e-12]]),
+            ("{0}.y", &[[1.91e-12, 1.91e-12]]),
+            ("{0}.z", &[[2.62e-12, 2.62e-12]]),
+            ("{1}.x", &[[1.63e-12, 1.64e-12]]),
+            ("{1}.y", &[[1.91e-12, 1.91e-12]]),
+            ("{1}.z", &[[2.62e-12, 2.62e-12]]),
         ],
         ..PLAIN
     },
@@ -274,12 +274,12 @@ const ROWS: &[Row] = &[
         covered: false,
         range: (0.0, 1.0e-12),
         sigma: &[
-            ("tm1.x", &[[1.64e-14, 6.05e-16]]),
-            ("tm1.y", &[[1.99e-14, 6.94e-16]]),
-            ("tm1.z", &[[2.74e-14, 9.46e-16]]),
-            ("tm2.x", &[[1.64e-14, 6.05e-16]]),
-            ("tm2.y", &[[1.99e-14, 6.94e-16]]),
-            ("tm2.z", &[[2.74e-14, 9.46e-16]]),
+            ("{0}.x", &[[1.64e-14, 6.05e-16]]),
+            ("{0}.y", &[[1.99e-14, 6.94e-16]]),
+            ("{0}.z", &[[2.74e-14, 9.46e-16]]),
+            ("{1}.x", &[[1.64e-14, 6.05e-16]]),
+            ("{1}.y", &[[1.99e-14, 6.94e-16]]),
+            ("{1}.z", &[[2.74e-14, 9.46e-16]]),
         ],
         ..PLAIN
     },
@@ -288,12 +288,12 @@ const ROWS: &[Row] = &[
         covered: false,
         range: (0.0, 1.0e-12),
         sigma: &[
-            ("tm1.x", &[[2.75e-13, 6.86e-15]]),
-            ("tm1.y", &[[3.31e-13, 7.87e-15]]),
-            ("tm1.z", &[[4.55e-13, 1.07e-14]]),
-            ("tm2.x", &[[2.75e-13, 6.86e-15]]),
-            ("tm2.y", &[[3.31e-13, 7.87e-15]]),
-            ("tm2.z", &[[4.55e-13, 1.07e-14]]),
+            ("{0}.x", &[[2.75e-13, 6.86e-15]]),
+            ("{0}.y", &[[3.31e-13, 7.87e-15]]),
+            ("{0}.z", &[[4.55e-13, 1.07e-14]]),
+            ("{1}.x", &[[2.75e-13, 6.86e-15]]),
+            ("{1}.y", &[[3.31e-13, 7.87e-15]]),
+            ("{1}.z", &[[4.55e-13, 1.07e-14]]),
         ],
         ..PLAIN
     },
@@ -321,21 +321,21 @@ pub struct Hidden {
 }
 
 impl Hidden {
-    /// Draws by `seed` for a simulation of `days`.
+    /// Draws by `seed` for a simulation of `days` of a spacecraft with these test masses.
     ///
     /// # Panics
     /// Never: every row of the table names an effect, its instances and its parameters, as a test sees to.
     #[must_use]
-    pub fn draw(seed: u64, days: f64) -> Self {
+    pub fn draw(seed: u64, days: f64, test_masses: &[String]) -> Self {
         let mut rng = stream(seed, "hidden");
         let luck: f64 = rng.random();
         let mut drawn: Vec<Drawn> = Vec::new();
         if luck >= NOTHING {
             let uncovered = luck >= 1.0 - UNCOVERED;
             let pair = luck < NOTHING + PAIR;
-            drawn.extend(draw_one(&mut rng, days, |row| row.covered != uncovered));
+            drawn.extend(draw_one(&mut rng, days, test_masses, |row| row.covered != uncovered));
             if let (true, Some(first)) = (pair, drawn.first().map(|d| d.asked.kind.id)) {
-                drawn.extend(draw_one(&mut rng, days, |row| row.covered && row.id != first));
+                drawn.extend(draw_one(&mut rng, days, test_masses, |row| row.covered && row.id != first));
             }
         }
         let salt = (0..4).map(|_| format!("{:016x}", rng.random::<u64>())).collect();
@@ -366,7 +366,7 @@ impl Drawn {
             asked.kind.shape.iter().zip(&asked.shape).map(|(s, v)| (s.name.to_owned(), json!(v))).collect();
         json!({
             "effect": asked.kind.id,
-            "instance": asked.place.to_string(),
+            "instance": asked.instance,
             "size": asked.size,
             "unit": asked.kind.size.unit,
             "shape": shape,
@@ -418,29 +418,46 @@ fn pick<'a, T>(rng: &mut Xoshiro256PlusPlus, from: &'a [T]) -> Option<&'a T> {
     from.get((rng.random::<f64>() * from.len() as f64) as usize)
 }
 
-fn draw_one(rng: &mut Xoshiro256PlusPlus, days: f64, wanted: impl Fn(&Row) -> bool) -> Option<Drawn> {
+/// An instance of the table on a spacecraft with these test masses; `None` where it has no such test mass.
+fn instance(place: &str, test_masses: &[String]) -> Option<String> {
+    let Some((number, rest)) = place.strip_prefix('{').and_then(|place| place.split_once('}')) else {
+        return Some(place.to_owned());
+    };
+    let name = test_masses.get(number.parse::<usize>().ok()?)?;
+    Some(format!("{name}{rest}"))
+}
+
+fn draw_one(
+    rng: &mut Xoshiro256PlusPlus,
+    days: f64,
+    test_masses: &[String],
+    wanted: impl Fn(&Row) -> bool,
+) -> Option<Drawn> {
     // A place where the effect is seen whatever its shape.
-    let seen = |row: &Row, sigma: &[[f64; 2]]| sigma.iter().all(|s| interval(row, row.after(*s, days)).is_some());
+    let seen = |row: &Row, (place, sigma): &(&str, &[[f64; 2]])| {
+        instance(place, test_masses).is_some() && sigma.iter().all(|s| interval(row, row.after(*s, days)).is_some())
+    };
     let rows: Vec<&Row> = ROWS
         .iter()
-        .filter(|row| wanted(row) && days >= row.least_days && row.sigma.iter().any(|(_, s)| seen(row, s)))
+        .filter(|row| wanted(row) && days >= row.least_days && row.sigma.iter().any(|place| seen(row, place)))
         .collect();
     let row = *pick(rng, &rows)?;
-    let places: Vec<_> = row.sigma.iter().filter(|(_, s)| seen(row, s)).collect();
+    let places: Vec<_> = row.sigma.iter().filter(|place| seen(row, place)).collect();
     let (place, sigmas) = pick(rng, &places)?;
     let shape = row.shape.map(|(name, grid)| (name, log_uniform(rng, (grid[0], grid[grid.len() - 1]))));
     let sigma = row.sigma_at(sigmas, shape.map_or(1.0, |(_, value)| value), days);
     let amount = log_uniform(rng, interval(row, sigma)?) * if row.signed && rng.random() { -1.0 } else { 1.0 };
 
     let size = if row.carrier.is_some() { 0.0 } else { row.origin + amount };
-    let mut text = format!("{}:{place}={size:e}", row.id);
+    let mut text = format!("{}:{}={size:e}", row.id, instance(place, test_masses)?);
     for (name, value) in shape.into_iter().chain(row.carrier.map(|name| (name, amount))) {
         text += &format!(",{name}={value:e}");
     }
     if row.id == "impulse" {
         text += &format!(",at_s={:.1}", 86_400.0 * days * (0.1 + 0.8 * rng.random::<f64>()));
     }
-    let asked = Asked::parse(&text).unwrap_or_else(|error| unreachable!("the table of hidden effects: {error}"));
+    let asked =
+        Asked::parse(&text, test_masses).unwrap_or_else(|error| unreachable!("the table of hidden effects: {error}"));
     Some(Drawn { asked, covered: row.covered, amount, sigma })
 }
 
@@ -448,6 +465,19 @@ fn draw_one(rng: &mut Xoshiro256PlusPlus, days: f64, wanted: impl Fn(&Row) -> bo
 mod tests {
     use super::*;
     use std::collections::BTreeMap;
+
+    fn both() -> Vec<String> {
+        ["tm1", "tm2"].map(str::to_owned).to_vec()
+    }
+
+    /// With one test mass nothing of a second one is drawn, and its own name is used.
+    #[test]
+    fn only_test_masses_that_there_are_get_effects() {
+        let one = ["cube".to_owned()];
+        let drawn: Vec<Drawn> = (0..500).flat_map(|seed| Hidden::draw(seed, 3.0, &one).drawn).collect();
+        let named = |prefix: &str| drawn.iter().filter(|d| d.asked.instance.starts_with(prefix)).count();
+        assert!(named("cube") > 50 && named("sc.") > 50 && named("tm") == 0 && named("{") == 0);
+    }
 
     /// Three thousand seeds: the chances within 4.5σ of a binomial (false alarm 7e-6 each), sizes physical, significances
     /// where they should be, every row drawn.
@@ -457,7 +487,7 @@ mod tests {
         // Three days: offset-drift is not seen in one.
         let (mut nothing, mut pairs, mut uncovered, mut seen) = (0.0, 0.0, 0.0, BTreeMap::new());
         for seed in 0..n {
-            let hidden = Hidden::draw(seed, 3.0);
+            let hidden = Hidden::draw(seed, 3.0, &both());
             nothing += f64::from(hidden.drawn.is_empty());
             pairs += f64::from(hidden.drawn.len() == 2);
             uncovered += f64::from(hidden.drawn.iter().any(|d| !d.covered));
@@ -487,13 +517,14 @@ mod tests {
 
     #[test]
     fn a_seed_draws_the_same_and_another_draws_another() {
-        let text = |seed: u64| Hidden::draw(seed, 2.0).content(&json!({"noise_seed": 5})).to_string();
+        let text = |seed: u64| Hidden::draw(seed, 2.0, &both()).content(&json!({"noise_seed": 5})).to_string();
         assert_eq!(text(4), text(4));
         assert_ne!(text(4), text(5));
-        let salts: std::collections::BTreeSet<String> = (0..100).map(|seed| Hidden::draw(seed, 1.0).salt).collect();
+        let salts: std::collections::BTreeSet<String> =
+            (0..100).map(|seed| Hidden::draw(seed, 1.0, &both()).salt).collect();
         assert!(salts.len() == 100 && salts.iter().all(|salt| salt.len() == 64));
         // More days show smaller effects: the same seed aims at the same significance.
-        let one = (0..100).map(|seed| (Hidden::draw(seed, 1.0), Hidden::draw(seed, 1.2)));
+        let one = (0..100).map(|seed| (Hidden::draw(seed, 1.0, &both()), Hidden::draw(seed, 1.2, &both())));
         let shrunk = one.filter(|(a, b)| a.drawn.first().is_some_and(|a| a.sigma > b.drawn[0].sigma)).count();
         assert!(shrunk > 50, "{shrunk}");
     }
@@ -503,13 +534,15 @@ mod tests {
     fn the_table_names_effects_that_exist() {
         for row in ROWS {
             for (place, sigma) in row.sigma {
-                Asked::parse(&format!("{}:{place}={}", row.id, row.origin)).unwrap();
+                let place = instance(place, &both()).unwrap();
+                Asked::parse(&format!("{}:{place}={}", row.id, row.origin), &both()).unwrap();
                 assert_eq!(sigma.len(), row.shape.map_or(1, |(_, grid)| grid.len()), "{} {place}", row.id);
                 // More time tells at least as much, to the three digits that are printed.
                 assert!(sigma.iter().all(|[six, day]| 0.0 < *day && *day <= 1.01 * six && six.is_finite()));
             }
             for name in row.carrier.into_iter().chain(row.shape.map(|(name, _)| name)) {
-                Asked::parse(&format!("{}:{}={},{name}=1e-12", row.id, row.sigma[0].0, row.origin))
+                let place = instance(row.sigma[0].0, &both()).unwrap();
+                Asked::parse(&format!("{}:{place}={},{name}=1e-12", row.id, row.origin), &both())
                     .map_or_else(|e| assert!(!e.to_string().contains("no parameter"), "{e}"), drop);
             }
         }

@@ -72,6 +72,11 @@ const THERMOSTATS: [Thermostat; 2] = [
     Thermostat { ambient_k: -4.0, lag_s: 30_000.0, set_k: 291.0, half_band_k: 0.05, heating_k_s: 1.3e-4 },
 ];
 
+/// Constants of a housing: those of the two that are known in turn.
+pub(crate) fn of_housing<T>(known: &[T; 2], housing: usize) -> &T {
+    &known[housing % 2]
+}
+
 /// What the two heaters make of the difference across each axis of each housing, K when they are on for good.
 const HEATER_ACROSS_K: [[[f64; 2]; 3]; 2] =
     [[[1.2e-3, -4e-4], [-6e-4, 9e-4], [5e-4, 7e-4]], [[-9e-4, 6e-4], [8e-4, 5e-4], [-4e-4, -8e-4]]];
@@ -90,11 +95,11 @@ pub struct Interior {
     /// Structure, K.
     pub structure_k: f64,
     /// Optical benches, K.
-    pub bench_k: [f64; 2],
+    pub bench_k: Vec<f64>,
     /// Mean temperature of the electrode housings, K.
-    pub housing_k: [f64; 2],
+    pub housing_k: Vec<f64>,
     /// Temperature of the positive face minus that of the negative one, by housing and axis of ORF, K.
-    pub across_k: [[f64; 3]; 2],
+    pub across_k: Vec<[f64; 3]>,
     /// Battery and tank, K.
     pub heated_k: [f64; 2],
     /// Their heaters.
@@ -120,11 +125,11 @@ pub struct Interior {
     /// Magnetic field from outside, SRF, T.
     pub interplanetary_t: [f64; 3],
     /// Factor of the field of the units and of its gradient, one per test mass.
-    pub units_field: [f64; 2],
+    pub units_field: Vec<f64>,
     /// Charge of the test masses, C.
-    pub charge_c: [f64; 2],
+    pub charge_c: Vec<f64>,
     /// UV lamps.
-    pub lamp: [bool; 2],
+    pub lamp: Vec<bool>,
     /// Pressure around the test masses, Pa.
     pub pressure_pa: f64,
     /// The antenna moves.
@@ -153,11 +158,11 @@ impl Interior {
 struct Drifts {
     panel: NoiseProcess,
     structure: NoiseProcess,
-    bench: [NoiseProcess; 2],
-    across: [[NoiseProcess; 3]; 2],
+    bench: Vec<NoiseProcess>,
+    across: Vec<[NoiseProcess; 3]>,
     bus: NoiseProcess,
     interplanetary: [NoiseProcess; 3],
-    units: [NoiseProcess; 2],
+    units: Vec<NoiseProcess>,
 }
 
 /// The running inside of the spacecraft.
@@ -205,15 +210,16 @@ fn follow(value: &mut f64, target: f64, lag_s: f64) {
 }
 
 impl Drifts {
-    fn new() -> Self {
+    fn new(housings: usize) -> Self {
+        let all = 0..housings;
         Self {
             panel: drift(1.0, 1e-5, 4),
             structure: drift(0.3, 1e-5, 4),
-            bench: std::array::from_fn(|_| drift(0.1, 1e-5, 4)),
-            across: std::array::from_fn(|_| std::array::from_fn(|_| drift(2e-5, 1e-3, 4))),
+            bench: all.clone().map(|_| drift(0.1, 1e-5, 4)).collect(),
+            across: all.clone().map(|_| std::array::from_fn(|_| drift(2e-5, 1e-3, 4))).collect(),
             bus: drift(1e-2, 1e-5, 4),
             interplanetary: std::array::from_fn(|_| drift(2e-8, 1e-3, 2)),
-            units: std::array::from_fn(|_| drift(0.3, 1e-5, 4)),
+            units: all.map(|_| drift(0.3, 1e-5, 4)).collect(),
         }
     }
 
@@ -228,11 +234,11 @@ impl Drifts {
 }
 
 impl Running {
-    /// The inside at the start of a simulation: in its cycle, wherever the seed has it.
+    /// The inside at the start of a simulation, with so many housings: in its cycle, wherever the seed has it.
     #[must_use]
-    pub fn new(seed: u64, dt_s: f64, influences: &Influences) -> Self {
+    pub fn new(seed: u64, dt_s: f64, housings: usize, influences: &Influences) -> Self {
         let mut rng = stream(seed, "interior");
-        let mut drifts = Drifts::new();
+        let mut drifts = Drifts::new(housings);
         for process in drifts.all() {
             process.start(&mut rng);
         }
@@ -245,9 +251,9 @@ impl Running {
             sun_angle_rad: 0.0,
             panel_k: 338.0,
             structure_k: 296.5,
-            bench_k: [294.1, 294.3],
-            housing_k: [294.2, 294.4],
-            across_k: STANDING_ACROSS_K,
+            bench_k: (0..housings).map(|i| *of_housing(&[294.1, 294.3], i)).collect(),
+            housing_k: (0..housings).map(|i| *of_housing(&[294.2, 294.4], i)).collect(),
+            across_k: (0..housings).map(|i| *of_housing(&STANDING_ACROSS_K, i)).collect(),
             heated_k,
             heater: std::array::from_fn(|_| rng.random()),
             warmth: [0.6, 0.4],
@@ -260,9 +266,11 @@ impl Running {
             thrust_n: [BIAS_N; 6],
             valve_k: [301.0; 6],
             interplanetary_t: [0.0; 3],
-            units_field: [1.0; 2],
-            charge_c: CHARGING_E_S.map(|rate| rate * 2e4 * ELEMENTARY_C * rng.random::<f64>()),
-            lamp: [false; 2],
+            units_field: vec![1.0; housings],
+            charge_c: (0..housings)
+                .map(|i| of_housing(&CHARGING_E_S, i) * 2e4 * ELEMENTARY_C * rng.random::<f64>())
+                .collect(),
+            lamp: vec![false; housings],
             pressure_pa: 8e-6,
             antenna_moves: false,
             antenna_wait_s: ANTENNA_S.1 * rng.random::<f64>(),
@@ -344,14 +352,14 @@ impl Running {
                 follow(&mut now.warmth[i], f64::from(now.heater[i]), 700.0);
             }
         }
-        for i in 0..2 {
+        for i in 0..now.bench_k.len() {
             let bench_k = 294.1 + 0.2 * i as f64 + 0.3 * (now.structure_k - 296.5) + drifts.bench[i].next(rng);
             follow(&mut now.bench_k[i], bench_k, lag(7200.0));
             let bench_k = now.bench_k[i];
             follow(&mut now.housing_k[i], bench_k + 0.1, lag(1800.0));
             for axis in 0..3 {
-                let [battery, tank] = HEATER_ACROSS_K[i][axis];
-                now.across_k[i][axis] = STANDING_ACROSS_K[i][axis]
+                let [battery, tank] = of_housing(&HEATER_ACROSS_K, i)[axis];
+                now.across_k[i][axis] = of_housing(&STANDING_ACROSS_K, i)[axis]
                     + battery * (now.warmth[0] - 0.6)
                     + tank * (now.warmth[1] - 0.4)
                     + drifts.across[i][axis].next(rng);
@@ -366,16 +374,16 @@ impl Running {
         for (axis, process) in drifts.interplanetary.iter_mut().enumerate() {
             now.interplanetary_t[axis] = process.next(rng);
         }
-        for i in 0..2 {
+        for i in 0..now.units_field.len() {
             now.units_field[i] = 1.0 + FIELD_PER_A * (now.battery_a - 2.1) + 1e-2 * drifts.units[i].next(rng);
         }
     }
 
     fn charging(&mut self) {
-        for i in 0..2 {
+        for i in 0..self.now.charge_c.len() {
             let (charge_c, lamp) = (&mut self.now.charge_c[i], &mut self.now.lamp[i]);
             // Each cosmic ray brings some tens of charges: 23 e/s with the scatter of 570 e/√Hz, one-sided.
-            let arrived = CHARGING_E_S[i] * STEP_S + 400.0 * normal(&mut self.rng);
+            let arrived = of_housing(&CHARGING_E_S, i) * STEP_S + 400.0 * normal(&mut self.rng);
             *charge_c += arrived * ELEMENTARY_C;
             if *lamp {
                 follow(charge_c, 0.0, DISCHARGE_S);
@@ -434,7 +442,7 @@ mod tests {
     };
 
     fn running() -> Running {
-        Running::new(7, 0.1, &SUN)
+        Running::new(7, 0.1, 2, &SUN)
     }
 
     /// Two insides with the same random numbers, of which the second differs by `change`; their differences over time.

@@ -15,7 +15,7 @@ pub mod simulator;
 mod testing;
 pub mod thrusters;
 
-use dragfree_physics::mission::Mission;
+use dragfree_physics::mission::{ANGLES, AXES, Mission, TestMass};
 use dragfree_sdk::prelude::*;
 use nalgebra::Vector3;
 use rand::SeedableRng;
@@ -24,7 +24,7 @@ use serde::{Deserialize, Serialize};
 
 use effects::Asked;
 use hidden::Hidden;
-use housekeeping::{CHANNELS, Housekeeping};
+use housekeeping::{Channel, Housekeeping};
 use simulator::{Epoch, Settings, SimulationError, Simulator};
 
 /// 2035-01-01T00:00:00, where the paper's simulation starts, Unix ns.
@@ -40,8 +40,7 @@ struct Topic {
 }
 
 impl Topic {
-    /// Columns are given as groups: field path, names below it, unit, frame.
-    fn new(link: &mut Link<'_>, name: &str, groups: &[(&str, &[&str], &str, &str)]) -> Result<Self, PluginError> {
+    fn new(link: &mut Link<'_>, name: &str, groups: &[Group]) -> Result<Self, PluginError> {
         let table = link.table(name, 0.0);
         let mut columns = Vec::new();
         for (path, parts, unit, frame) in groups {
@@ -59,11 +58,11 @@ impl Topic {
         Self { table, columns, times_ns: Vec::new(), rows: Vec::new() }
     }
 
-    /// Takes a row: one value for each column.
-    fn push<const N: usize>(&mut self, time_ns: i64, values: [f64; N]) {
-        debug_assert_eq!(N, self.columns.len());
+    /// Begins a row; one value for each column follows.
+    fn row(&mut self, time_ns: i64) -> &mut Vec<f64> {
+        debug_assert_eq!(self.rows.len(), self.times_ns.len() * self.columns.len());
         self.times_ns.push(time_ns);
-        self.rows.extend_from_slice(&values);
+        &mut self.rows
     }
 
     /// Hands the rows to the host.
@@ -79,7 +78,8 @@ impl Topic {
 
 struct Topics {
     is: Topic,
-    ifo: Topic,
+    /// `None` where no test mass has an interferometer.
+    ifo: Option<Topic>,
     dws: Topic,
     command: Option<Topic>,
     ephemeris: Topic,
@@ -92,70 +92,73 @@ struct Topics {
 const VALID: f64 = 0.0;
 /// Status of a capacitive readout at the end of its range, bit 0.
 const SATURATED: f64 = 1.0;
-const XYZ: &[&str] = &["x", "y", "z"];
-const ANGLES: &[&str] = &["phi", "theta", "psi"];
+const XYZ: &[&str] = &AXES;
+const PHI_THETA_PSI: &[&str] = &ANGLES;
+
+/// A group of columns: field path, names below it, unit, frame.
+type Group = (String, &'static [&'static str], &'static str, String);
+
+fn group(path: impl Into<String>, parts: &'static [&'static str], unit: &'static str, frame: &str) -> Group {
+    (path.into(), parts, unit, frame.to_owned())
+}
 
 impl Topics {
-    fn new(link: &mut Link<'_>, command: bool) -> Result<Self, PluginError> {
+    fn new(
+        link: &mut Link<'_>,
+        mission: &Mission,
+        housekeeping: &[Channel],
+        command: bool,
+    ) -> Result<Self, PluginError> {
+        // Groups of each test mass one after the other, then those of the spacecraft.
+        let each = |groups: &dyn Fn(&str, &TestMass, &str) -> Vec<Group>| -> Vec<Group> {
+            let of = |(name, tm): (&String, &TestMass)| groups(name, tm, &mission.frame(name));
+            mission.test_mass.iter().flat_map(of).collect()
+        };
         let is = Topic::new(
             link,
             "is",
-            &[
-                ("tm1.r_orf_m", XYZ, "m", "ORF_1"),
-                ("tm1.att_orf_rad", ANGLES, "rad", "ORF_1"),
-                ("tm1.status", &[], "", ""),
-                ("tm2.r_orf_m", XYZ, "m", "ORF_2"),
-                ("tm2.att_orf_rad", ANGLES, "rad", "ORF_2"),
-                ("tm2.status", &[], "", ""),
-            ],
+            &each(&|name, _, frame| {
+                vec![
+                    group(format!("{name}.r_orf_m"), XYZ, "m", frame),
+                    group(format!("{name}.att_orf_rad"), PHI_THETA_PSI, "rad", frame),
+                    group(format!("{name}.status"), &[], "", ""),
+                ]
+            }),
         )?;
-        let ifo = Topic::new(
-            link,
-            "ifo",
-            &[
-                ("tm1.x_orf_m", &[], "m", "ORF_1"),
-                ("tm1.status", &[], "", ""),
-                ("tm2.x_orf_m", &[], "m", "ORF_2"),
-                ("tm2.status", &[], "", ""),
-            ],
-        )?;
-        let dws = Topic::new(
-            link,
-            "dws",
-            &[
-                ("tm1.theta_orf_rad", &[], "rad", "ORF_1"),
-                ("tm1.psi_orf_rad", &[], "rad", "ORF_1"),
-                ("tm2.theta_orf_rad", &[], "rad", "ORF_2"),
-                ("tm2.psi_orf_rad", &[], "rad", "ORF_2"),
-                ("sc_crf_rad", ANGLES, "rad", "CRF"),
-                ("status", &[], "", ""),
-            ],
-        )?;
-        let command = command
-            .then(|| {
-                Topic::new(
-                    link,
-                    "command",
-                    &[
-                        ("mps_force_srf_n", XYZ, "N", "SRF"),
-                        ("mps_torque_srf_nm", XYZ, "N m", "SRF"),
-                        ("tm1.force_orf_n", XYZ, "N", "ORF_1"),
-                        ("tm1.torque_orf_nm", XYZ, "N m", "ORF_1"),
-                        ("tm2.force_orf_n", XYZ, "N", "ORF_2"),
-                        ("tm2.torque_orf_nm", XYZ, "N m", "ORF_2"),
-                    ],
-                )
-            })
-            .transpose()?;
+        let of_ifo = each(&|name, tm, frame| {
+            let axes = (0..3).filter(|axis| tm.has_interferometer(*axis));
+            let mut groups: Vec<_> =
+                axes.map(|axis| group(format!("{name}.{}_orf_m", AXES[axis]), &[], "m", frame)).collect();
+            if !groups.is_empty() {
+                groups.push(group(format!("{name}.status"), &[], "", ""));
+            }
+            groups
+        });
+        let ifo = if of_ifo.is_empty() { None } else { Some(Topic::new(link, "ifo", &of_ifo)?) };
+        let mut of_dws = each(&|name, tm, frame| {
+            let angles = ANGLES.into_iter().skip(1).filter(|_| tm.has_interferometer(0));
+            angles.map(|angle| group(format!("{name}.{angle}_orf_rad"), &[], "rad", frame)).collect()
+        });
+        of_dws.extend([group("sc_crf_rad", PHI_THETA_PSI, "rad", "CRF"), group("status", &[], "", "")]);
+        let dws = Topic::new(link, "dws", &of_dws)?;
+        let mut of_command =
+            vec![group("mps_force_srf_n", XYZ, "N", "SRF"), group("mps_torque_srf_nm", XYZ, "N m", "SRF")];
+        of_command.extend(each(&|name, _, frame| {
+            vec![
+                group(format!("{name}.force_orf_n"), XYZ, "N", frame),
+                group(format!("{name}.torque_orf_nm"), XYZ, "N m", frame),
+            ]
+        }));
+        let command = command.then(|| Topic::new(link, "command", &of_command)).transpose()?;
         let ephemeris = Topic::new(
             link,
             "ephemeris",
             &[
-                ("r_sc_irf_m", XYZ, "m", "IRF"),
-                ("v_sc_irf_m_s", XYZ, "m s-1", "IRF"),
-                ("omega_crf_rad_s", XYZ, "rad s-1", "CRF"),
-                ("alpha_crf_rad_s2", XYZ, "rad s-2", "CRF"),
-                ("sun_srf", XYZ, "1", "SRF"),
+                group("r_sc_irf_m", XYZ, "m", "IRF"),
+                group("v_sc_irf_m_s", XYZ, "m s-1", "IRF"),
+                group("omega_crf_rad_s", XYZ, "rad s-1", "CRF"),
+                group("alpha_crf_rad_s2", XYZ, "rad s-2", "CRF"),
+                group("sun_srf", XYZ, "1", "SRF"),
             ],
         )?;
         let mut scalar = |name: &str, unit: &str, place: &str, rate_hz: f64| -> Result<Topic, PluginError> {
@@ -165,82 +168,70 @@ impl Topics {
             Ok(Topic::of(table, vec![link.write_with(table, "value", unit, "", &attributes)?]))
         };
         let housekeeping =
-            CHANNELS.iter().map(|c| scalar(c.name, c.unit, c.place, c.rate_hz)).collect::<Result<_, _>>()?;
+            housekeeping.iter().map(|c| scalar(&c.name, c.unit, &c.place, c.rate_hz)).collect::<Result<_, _>>()?;
         let at_limit = scalar("actuators_at_limit", "1", "control computer", 1.0)?;
-        let truth = Topic::new(
-            link,
-            "truth",
-            &[
-                ("r1_orf_m", XYZ, "m", "ORF_1"),
-                ("r2_orf_m", XYZ, "m", "ORF_2"),
-                ("sc_crf_rad", ANGLES, "rad", "CRF"),
-                ("omega_srf_rad_s", XYZ, "rad s-1", "SRF"),
-                ("alpha_srf_rad_s2", XYZ, "rad s-2", "SRF"),
-                ("b1_orf_m", XYZ, "m", "ORF_1"),
-                ("b2_orf_m", XYZ, "m", "ORF_2"),
-                ("nongrav_accel_srf_m_s2", XYZ, "m s-2", "SRF"),
-            ],
-        )?;
+        // The interface numbers the test masses of the truth.
+        let numbered = |letter: &str| -> Vec<Group> {
+            let of =
+                |(i, name): (usize, &String)| group(format!("{letter}{}_orf_m", i + 1), XYZ, "m", &mission.frame(name));
+            mission.test_mass.keys().enumerate().map(of).collect()
+        };
+        let mut of_truth = numbered("r");
+        of_truth.extend([
+            group("sc_crf_rad", PHI_THETA_PSI, "rad", "CRF"),
+            group("omega_srf_rad_s", XYZ, "rad s-1", "SRF"),
+            group("alpha_srf_rad_s2", XYZ, "rad s-2", "SRF"),
+        ]);
+        of_truth.extend(numbered("b"));
+        of_truth.push(group("nongrav_accel_srf_m_s2", XYZ, "m s-2", "SRF"));
+        let truth = Topic::new(link, "truth", &of_truth)?;
         Ok(Self { is, ifo, dws, command, ephemeris, housekeeping, at_limit, truth })
     }
 
     fn push(&mut self, e: &Epoch) {
-        let (t, m, c) = (e.time_ns, &e.measured, &e.command);
-        let [a, b] = &m.is_r_orf_m;
-        let [p, q] = &m.is_att_orf_rad;
-        let [s1, s2] = m.is_saturated.map(|saturated| if saturated { SATURATED } else { VALID });
-        self.is.push(t, [a.x, a.y, a.z, p.x, p.y, p.z, s1, b.x, b.y, b.z, q.x, q.y, q.z, s2]);
-        let [x1, x2] = m.ifo_x_orf_m;
-        self.ifo.push(t, [x1, VALID, x2, VALID]);
-        let ([[t1, p1], [t2, p2]], sc) = (m.dws_orf_rad, &m.dws_sc_crf_rad);
-        self.dws.push(t, [t1, p1, t2, p2, sc.x, sc.y, sc.z, VALID]);
+        let (t, m) = (e.time_ns, &e.measured);
+        let (is, dws) = (self.is.row(t), self.dws.row(t));
+        for tm in &m.tm {
+            is.extend(tm.is_r_orf_m.iter().chain(&tm.is_att_orf_rad));
+            is.push(if tm.is_saturated { SATURATED } else { VALID });
+            dws.extend(tm.dws_orf_rad.iter().filter(|x| !x.is_nan()));
+        }
+        dws.extend(&m.dws_sc_crf_rad);
+        dws.push(VALID);
+        if let Some(topic) = &mut self.ifo {
+            let row = topic.row(t);
+            for tm in &m.tm {
+                let before = row.len();
+                row.extend(tm.ifo_orf_m.iter().filter(|x| !x.is_nan()));
+                if row.len() > before {
+                    row.push(VALID);
+                }
+            }
+        }
         if let Some(topic) = &mut self.command {
-            let [a, b] = &c.tm;
-            topic.push::<18>(
-                t,
-                flat([
-                    &c.mps_force_srf_n,
-                    &c.mps_torque_srf_nm,
-                    &a.force_orf_n,
-                    &a.torque_orf_nm,
-                    &b.force_orf_n,
-                    &b.torque_orf_nm,
-                ]),
-            );
+            topic.row(t).extend(e.command.numbers());
         }
         if let Some(p) = &e.ephemeris {
             let vectors = [&p.r_sc_irf_m, &p.v_sc_irf_m_s, &p.omega_crf_rad_s, &p.alpha_crf_rad_s2, &p.sun_srf];
-            self.ephemeris.push::<15>(t, flat(vectors));
+            self.ephemeris.row(t).extend(vectors.into_iter().flatten());
         }
         let truth = &e.truth;
-        let vectors = [
-            &truth.r_orf_m[0],
-            &truth.r_orf_m[1],
-            &truth.sc_crf_rad,
-            &truth.omega_srf_rad_s,
-            &truth.alpha_srf_rad_s2,
-            &truth.offset_orf_m[0],
-            &truth.offset_orf_m[1],
-            &truth.nongrav_srf_m_s2,
-        ];
-        self.truth.push::<24>(t, flat(vectors));
+        let turning = [&truth.sc_crf_rad, &truth.omega_srf_rad_s, &truth.alpha_srf_rad_s2];
+        let vectors = truth.r_orf_m.iter().chain(turning).chain(&truth.offset_orf_m).chain([&truth.nongrav_srf_m_s2]);
+        self.truth.row(t).extend(vectors.flatten());
     }
 
     fn give(&mut self, output: &mut Outputs) {
         let Self { is, ifo, dws, command, ephemeris, housekeeping, at_limit, truth } = self;
-        let slow = housekeeping.iter_mut().chain([is, ifo, dws, ephemeris, at_limit, truth]).chain(command);
+        let slow =
+            housekeeping.iter_mut().chain([is]).chain(ifo).chain([dws, ephemeris, at_limit, truth]).chain(command);
         slow.for_each(|topic| topic.give(output));
     }
 }
 
-/// Vectors one after the other.
-fn flat<const VECTORS: usize, const NUMBERS: usize>(vectors: [&Vector3<f64>; VECTORS]) -> [f64; NUMBERS] {
-    const { assert!(NUMBERS == 3 * VECTORS) };
-    std::array::from_fn(|i| vectors[i / 3][i % 3])
-}
-
 /// The source.
 pub struct Sim {
+    mission: Mission,
     simulator: Simulator,
     housekeeping: Housekeeping,
     telemeter_command: bool,
@@ -271,7 +262,7 @@ impl Counts {
         self.all += 1;
         self.at_limit += u64::from(epoch.at_limit);
         self.untold += u64::from(epoch.at_limit);
-        self.saturated += u64::from(epoch.measured.is_saturated.contains(&true));
+        self.saturated += u64::from(epoch.measured.tm.iter().any(|tm| tm.is_saturated));
     }
 }
 
@@ -295,7 +286,7 @@ impl Source for Sim {
         id: "sim",
         version: env!("CARGO_PKG_VERSION"),
         licence: "MIT OR Apache-2.0",
-        description: "Simulates the closed loop of a drag-free spacecraft with two test masses",
+        description: "Simulates the closed loop of a drag-free spacecraft and its test masses",
         parameters: &[
             Parameter::i64("seed", "", 1, 0..=i64::MAX, "seed of everything random"),
             Parameter::f64_list(
@@ -311,7 +302,7 @@ impl Source for Sim {
             Parameter::text_list(
                 "effects",
                 &[],
-                "ID:INSTANCE=SIZE[,NAME=VALUE]..., as es-gain:tm1.y=0.02; what is not there is answered with the list",
+                "ID:INSTANCE=SIZE[,NAME=VALUE]..., as mps-gain:sc.y=0.02; what is not there is answered with the list",
             ),
         ],
         instances: &[],
@@ -330,9 +321,10 @@ impl Source for Sim {
             ))
         })?;
         let given = setup.text_list("effects")?;
-        let mut effects = given.iter().map(|text| Asked::parse(text)).collect::<Result<Vec<_>, _>>()?;
+        let names: Vec<String> = mission.test_mass.keys().cloned().collect();
+        let mut effects = given.iter().map(|text| Asked::parse(text, &names)).collect::<Result<Vec<_>, _>>()?;
         let days = (end_ns - start_ns) as f64 / 86_400e9;
-        let hidden = u64::try_from(setup.i64("hidden")?).ok().map(|seed| Hidden::draw(seed, days));
+        let hidden = u64::try_from(setup.i64("hidden")?).ok().map(|seed| Hidden::draw(seed, days, &names));
         effects.extend(hidden.iter().flat_map(|h| &h.drawn).map(|d| d.asked.clone()));
         let seed = setup.i64("seed")?.cast_unsigned();
         let settings = Settings {
@@ -345,16 +337,15 @@ impl Source for Sim {
         };
         let simulator = Simulator::new(&mission, settings).map_err(refuse)?;
         let sealed = hidden.map(|hidden| {
-            let offset_m: serde_json::Map<_, _> = (0..2)
-                .flat_map(|i| (0..3).map(move |j| (i, j)))
-                .map(|(i, j)| {
-                    let name = format!("com-offset.tm{}.{}", i + 1, ["x", "y", "z"][j]);
-                    (name, simulator.offset_orf_m()[i][j].into())
-                })
+            let offset_m: serde_json::Map<_, _> = names
+                .iter()
+                .zip(simulator.offset_orf_m())
+                .flat_map(|(name, offset)| AXES.iter().zip(offset).map(move |(axis, value)| (name, axis, *value)))
+                .map(|(name, axis, value)| (format!("com-offset.{name}.{axis}"), value.into()))
                 .collect();
-            let mass_kg = |name: &str| mission.test_mass.get(name).map(|tm| tm.mass_kg);
+            let masses_kg: Vec<f64> = mission.test_mass.values().map(|tm| tm.mass_kg).collect();
             let about = serde_json::json!({
-                "test_mass_kg": [mass_kg("tm1"), mass_kg("tm2")],
+                "test_mass_kg": masses_kg,
                 "mission": mission.mission.name, "spacecraft": mission.mission.spacecraft, "noise_seed": seed,
                 "start_ns": start_ns, "end_ns": end_ns, "given": given, "offset_m": offset_m,
             });
@@ -365,7 +356,7 @@ impl Source for Sim {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         rng.long_jump();
         Ok(Self {
-            housekeeping: Housekeeping::new(mission.dt_s(), rng),
+            housekeeping: Housekeeping::new(&names, mission.dt_s(), rng),
             simulator,
             telemeter_command: setup.bool("command")?,
             every_second: mission.mission.sample_rate_hz.round().max(1.0) as i64,
@@ -374,15 +365,16 @@ impl Source for Sim {
             topics: None,
             identity: [
                 ("time_scale", "UTC".to_owned()),
-                ("mission", mission.mission.name),
-                ("spacecraft", mission.mission.spacecraft),
+                ("mission", mission.mission.name.clone()),
+                ("spacecraft", mission.mission.spacecraft.clone()),
             ],
+            mission,
             counts: Counts::default(),
         })
     }
 
     fn link(&mut self, link: &mut Link<'_>) -> Result<(), PluginError> {
-        self.topics = Some(Topics::new(link, self.telemeter_command)?);
+        self.topics = Some(Topics::new(link, &self.mission, self.housekeeping.channels(), self.telemeter_command)?);
         Ok(())
     }
 
@@ -394,13 +386,13 @@ impl Source for Sim {
             }
             let (index, time_ns) = (self.simulator.index(), self.simulator.time_ns());
             self.housekeeping.read(index, self.simulator.inside(), |i, value| {
-                topics.housekeeping[i].push(time_ns, [value]);
+                topics.housekeeping[i].row(time_ns).push(value);
             });
             let epoch = self.simulator.step().map_err(refuse)?;
             topics.push(&epoch);
             self.counts.add(&epoch);
             if index.rem_euclid(self.every_second) == 0 {
-                topics.at_limit.push(time_ns, [std::mem::take(&mut self.counts.untold) as f64]);
+                topics.at_limit.row(time_ns).push(std::mem::take(&mut self.counts.untold) as f64);
             }
         }
         topics.give(output);

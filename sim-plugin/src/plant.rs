@@ -4,6 +4,7 @@
 //! Inertial positions never appear: at one astronomical unit a float has 3e-5 m of grain.
 
 use dragfree_physics::attitude::{derivative, from_rotation_vector, rotation_vector, turn, unit};
+use dragfree_physics::control::PerTestMass;
 use dragfree_physics::mission::{Mission, MissionError};
 use nalgebra::{Matrix3, Quaternion, Vector3};
 
@@ -39,12 +40,12 @@ pub struct Plant {
     pub sc_inertia: Matrix3<f64>,
     /// `J_S⁻¹`.
     pub sc_inertia_inverse: Matrix3<f64>,
-    /// Test masses 1 and 2.
-    pub tm: [TestMassBody; 2],
+    /// The test masses, in the order of their names.
+    pub tm: Vec<TestMassBody>,
 }
 
 /// State of a test mass.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TestMassState {
     /// `r_i`, relative to the housing's centre, ORF, m.
     pub r_orf_m: Vector3<f64>,
@@ -63,12 +64,13 @@ pub struct State {
     pub q_srf_from_crf: Quaternion<f64>,
     /// `ω_SI`, SRF, rad/s.
     pub omega_srf_rad_s: Vector3<f64>,
-    /// Test masses 1 and 2.
-    pub tm: [TestMassState; 2],
+    /// The test masses.
+    pub tm: PerTestMass<TestMassState>,
 }
 
-/// Numbers in a [`State`].
-pub const STATE_NUMBERS: usize = 33;
+/// Numbers of the spacecraft in a [`State`], and of each test mass.
+const SPACECRAFT_NUMBERS: usize = 7;
+const TEST_MASS_NUMBERS: usize = 13;
 
 /// Loads on a test mass, constant over a sample.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -90,11 +92,17 @@ pub struct Loads {
     pub force_srf_n: Vector3<f64>,
     /// Their torque about the centre of mass, `M_T + D_S`, SRF, N m.
     pub torque_srf_nm: Vector3<f64>,
-    /// Test masses 1 and 2.
-    pub tm: [TestMassLoads; 2],
+    /// The test masses.
+    pub tm: PerTestMass<TestMassLoads>,
 }
 
 impl Loads {
+    /// No loads on a spacecraft with so many test masses.
+    #[must_use]
+    pub fn zero(test_masses: usize) -> Self {
+        Self { tm: PerTestMass::from_fn(test_masses, |_| TestMassLoads::default()), ..Self::default() }
+    }
+
     /// What pushes the spacecraft, the electrodes' reaction with it, SRF, N.
     #[must_use]
     pub fn net_force_srf_n(&self, plant: &Plant) -> Vector3<f64> {
@@ -110,8 +118,8 @@ pub struct Outside {
     pub omega_crf_rad_s: Vector3<f64>,
     /// `ω̇_CI`, CRF, rad/s².
     pub alpha_crf_rad_s2: Vector3<f64>,
-    /// `Γ` in both ORF, s⁻².
-    pub gradient_orf_s2: [Matrix3<f64>; 2],
+    /// `Γ` in each ORF, s⁻².
+    pub gradient_orf_s2: PerTestMass<Matrix3<f64>>,
 }
 
 /// Means over the sample that was integrated.
@@ -127,9 +135,10 @@ pub struct Means {
 struct Held {
     torque_srf_nm: Vector3<f64>,
     nongrav_srf_m_s2: Vector3<f64>,
-    tm: [HeldTestMass; 2],
+    tm: PerTestMass<HeldTestMass>,
 }
 
+#[derive(Clone, Copy, Default)]
 struct HeldTestMass {
     /// `−T a_ng + (F_E + d_m)/m_m + a_sg`.
     acceleration_orf_m_s2: Vector3<f64>,
@@ -147,13 +156,11 @@ impl Plant {
     pub fn new(
         mission: &Mission,
         com_offset_srf_m: &Vector3<f64>,
-        stiffness: &[[Matrix3<f64>; 3]; 2],
+        stiffness: &[[Matrix3<f64>; 3]],
     ) -> Result<Self, MissionError> {
         const NEEDED_BY: &str = "the simulator";
-        let tm = |i: usize, name: &str| -> Result<TestMassBody, MissionError> {
-            let section = mission.test_mass(name, NEEDED_BY)?;
+        let tm = mission.test_mass.iter().zip(stiffness).map(|((name, section), [tt, tr, rr])| {
             let inertia_inverse = section.inertia_inverse(name, NEEDED_BY)?;
-            let [tt, tr, rr] = &stiffness[i];
             let stiffness_tr = section.stiffness_tr().component_mul(tr);
             Ok(TestMassBody {
                 mass_kg: section.mass_kg,
@@ -166,12 +173,12 @@ impl Plant {
                 stiffness_rt: inertia_inverse * stiffness_tr.transpose() * section.mass_kg,
                 stiffness_rr: section.stiffness_rr().component_mul(rr),
             })
-        };
+        });
         Ok(Self {
             sc_mass_kg: mission.spacecraft.mass_kg,
             sc_inertia: mission.spacecraft.inertia(),
             sc_inertia_inverse: mission.spacecraft.inertia_inverse(),
-            tm: [tm(0, "tm1")?, tm(1, "tm2")?],
+            tm: tm.collect::<Result<_, MissionError>>()?,
         })
     }
 
@@ -184,16 +191,17 @@ impl Plant {
             torque -= body.dcm_orf_from_srf.tr_mul(&load.torque_orf_nm) + body.offset_srf_m.cross(&f);
         }
         let nongrav = force / self.sc_mass_kg;
-        let tm = std::array::from_fn(|i| {
-            let (body, load) = (&self.tm[i], &loads.tm[i]);
+        let pairs = self.tm.iter().zip(&loads.tm).zip(&outside.gradient_orf_s2);
+        let tm = pairs.map(|((body, load), gradient_orf_s2)| {
             let t = &body.dcm_orf_from_srf;
             HeldTestMass {
                 acceleration_orf_m_s2: load.force_orf_n / body.mass_kg + load.acceleration_orf_m_s2 - t * nongrav,
                 torque_orf_nm: load.torque_orf_nm,
                 angular_acceleration_orf_rad_s2: load.angular_acceleration_orf_rad_s2,
-                gradient_orf_s2: outside.gradient_orf_s2[i],
+                gradient_orf_s2: *gradient_orf_s2,
             }
         });
+        let tm = tm.collect();
         Held { torque_srf_nm: torque, nongrav_srf_m_s2: nongrav, tm }
     }
 
@@ -258,22 +266,22 @@ impl State {
     #[must_use]
     pub fn at_rest(
         sc_rad: &Vector3<f64>,
-        tm: &[(Vector3<f64>, Vector3<f64>); 2],
+        tm: &[(Vector3<f64>, Vector3<f64>)],
         plant: &Plant,
         outside: &Outside,
     ) -> Self {
         let q_srf_from_crf = from_rotation_vector(sc_rad);
         let omega_srf_rad_s = turn(&q_srf_from_crf, &outside.omega_crf_rad_s);
-        let tm = std::array::from_fn(|i| {
-            let q_mrf_from_orf = from_rotation_vector(&tm[i].1);
+        let tm = plant.tm.iter().zip(tm).map(|(body, (r_orf_m, angle_rad))| {
+            let q_mrf_from_orf = from_rotation_vector(angle_rad);
             TestMassState {
-                r_orf_m: tm[i].0,
+                r_orf_m: *r_orf_m,
                 v_orf_m_s: Vector3::zeros(),
                 q_mrf_from_orf,
-                omega_mrf_rad_s: turn(&q_mrf_from_orf, &(plant.tm[i].dcm_orf_from_srf * omega_srf_rad_s)),
+                omega_mrf_rad_s: turn(&q_mrf_from_orf, &(body.dcm_orf_from_srf * omega_srf_rad_s)),
             }
         });
-        Self { q_srf_from_crf, omega_srf_rad_s, tm }
+        Self { q_srf_from_crf, omega_srf_rad_s, tm: tm.collect() }
     }
 
     /// Attitude of the spacecraft relative to CRF, `φ, θ, ψ`, rad.
@@ -294,7 +302,7 @@ impl State {
     /// All numbers, for a checkpoint.
     #[must_use]
     pub fn to_numbers(&self) -> Vec<f64> {
-        let mut out = Vec::with_capacity(STATE_NUMBERS);
+        let mut out = Vec::with_capacity(SPACECRAFT_NUMBERS + TEST_MASS_NUMBERS * self.tm.len());
         out.extend_from_slice(self.q_srf_from_crf.coords.as_slice());
         out.extend_from_slice(self.omega_srf_rad_s.as_slice());
         for s in &self.tm {
@@ -306,19 +314,23 @@ impl State {
         out
     }
 
-    /// The inverse of [`Self::to_numbers`].
+    /// The inverse of [`Self::to_numbers`]; `None` for a state of another number of test masses.
     #[must_use]
-    pub fn from_numbers(n: &[f64; STATE_NUMBERS]) -> Self {
-        let v = |i: usize| Vector3::new(n[i], n[i + 1], n[i + 2]);
+    pub fn from_numbers(numbers: &[f64], test_masses: usize) -> Option<Self> {
+        if numbers.len() != SPACECRAFT_NUMBERS + TEST_MASS_NUMBERS * test_masses {
+            return None;
+        }
+        let v = |n: &[f64]| Vector3::from_column_slice(&n[..3]);
         // nalgebra keeps the vector part first.
-        let q = |i: usize| Quaternion::new(n[i + 3], n[i], n[i + 1], n[i + 2]);
-        let tm = |i: usize| TestMassState {
-            r_orf_m: v(i),
-            v_orf_m_s: v(i + 3),
-            q_mrf_from_orf: q(i + 6),
-            omega_mrf_rad_s: v(i + 10),
-        };
-        Self { q_srf_from_crf: q(0), omega_srf_rad_s: v(4), tm: [tm(7), tm(20)] }
+        let q = |n: &[f64]| Quaternion::new(n[3], n[0], n[1], n[2]);
+        let (spacecraft, tm) = numbers.split_at(SPACECRAFT_NUMBERS);
+        let tm = tm.chunks_exact(TEST_MASS_NUMBERS).map(|n| TestMassState {
+            r_orf_m: v(n),
+            v_orf_m_s: v(&n[3..]),
+            q_mrf_from_orf: q(&n[6..]),
+            omega_mrf_rad_s: v(&n[10..]),
+        });
+        Some(Self { q_srf_from_crf: q(spacecraft), omega_srf_rad_s: v(&spacecraft[4..]), tm: tm.collect() })
     }
 }
 
@@ -349,7 +361,7 @@ mod tests {
             sc_mass_kg: 1500.0,
             sc_inertia: inertia,
             sc_inertia_inverse: inertia.try_inverse().unwrap(),
-            tm: [body(std::f64::consts::FRAC_PI_6, 0.18), body(-std::f64::consts::FRAC_PI_6, -0.18)],
+            tm: vec![body(std::f64::consts::FRAC_PI_6, 0.18), body(-std::f64::consts::FRAC_PI_6, -0.18)],
         }
     }
 
@@ -357,12 +369,12 @@ mod tests {
         Outside {
             omega_crf_rad_s: Vector3::zeros(),
             alpha_crf_rad_s2: Vector3::zeros(),
-            gradient_orf_s2: [Matrix3::zeros(); 2],
+            gradient_orf_s2: [Matrix3::zeros(); 2].into(),
         }
     }
 
     fn at_rest(plant: &Plant) -> State {
-        State::at_rest(&Vector3::zeros(), &Default::default(), plant, &nothing())
+        State::at_rest(&Vector3::zeros(), &[Default::default(); 2], plant, &nothing())
     }
 
     /// Components in the frame that `q` starts from.
@@ -384,7 +396,7 @@ mod tests {
         };
         let (l0, e0) = of_sc(&y);
         for _ in 0..20_000 {
-            plant.step(&mut y, &Loads::default(), &nothing(), 1e-3);
+            plant.step(&mut y, &Loads::zero(2), &nothing(), 1e-3);
         }
         let (l1, e1) = of_sc(&y);
         assert!((l1 - l0).norm() < 1e-6 * l0.norm() && (e1 / e0 - 1.0).abs() < 1e-6, "{l0} {l1} {e0} {e1}");
@@ -398,7 +410,7 @@ mod tests {
         };
         let (l0, e0) = of_tm(&y);
         for _ in 0..20_000 {
-            plant.step(&mut y, &Loads::default(), &nothing(), 1e-3);
+            plant.step(&mut y, &Loads::zero(2), &nothing(), 1e-3);
         }
         let (l1, e1) = of_tm(&y);
         assert!((l1 - l0).norm() < 1e-6 * l0.norm() && (e1 / e0 - 1.0).abs() < 1e-6, "{l0} {l1} {e0} {e1}");
@@ -409,7 +421,7 @@ mod tests {
     #[test]
     fn electrodes_are_internal_forces() {
         let plant = plant();
-        let mut loads = Loads::default();
+        let mut loads = Loads::zero(2);
         loads.tm[0].force_orf_n = Vector3::new(1e-9, -3e-9, 2e-9);
         loads.tm[0].torque_orf_nm = Vector3::new(2e-12, 1e-12, -4e-12);
         loads.tm[1].force_orf_n = Vector3::new(0.0, 4e-9, -1e-9);
@@ -443,7 +455,7 @@ mod tests {
         for (body, tm) in plant.tm.iter().zip(&mut y.tm) {
             tm.v_orf_m_s = -(body.dcm_orf_from_srf * y.omega_srf_rad_s.cross(&body.offset_srf_m));
         }
-        let loads = Loads { torque_srf_nm: Vector3::new(0.0, 0.0, 1000.0 * alpha), ..Loads::default() };
+        let loads = Loads { torque_srf_nm: Vector3::new(0.0, 0.0, 1000.0 * alpha), ..Loads::zero(2) };
         let seconds = 20.0;
         for _ in 0..(seconds / dt_s).round() as usize {
             plant.step(&mut y, &loads, &nothing(), dt_s);
@@ -483,7 +495,7 @@ mod tests {
                 acceleration_orf_m_s2: v(i + 2, 1e-10),
                 angular_acceleration_orf_rad_s2: v(i + 3, 1e-9),
             };
-            let loads = Loads { force_srf_n: v(7, 1e-6), torque_srf_nm: v(8, 1e-6), tm: [tm(1), tm(4)] };
+            let loads = Loads { force_srf_n: v(7, 1e-6), torque_srf_nm: v(8, 1e-6), tm: [tm(1), tm(4)].into() };
             let before = y;
             let means = plant.step(&mut y, &loads, &nothing(), dt_s);
             let omega = (before.omega_srf_rad_s + y.omega_srf_rad_s) * 0.5;
@@ -512,7 +524,7 @@ mod tests {
     #[test]
     fn thrust_moves_the_housings_not_the_masses() {
         let plant = plant();
-        let loads = Loads { force_srf_n: Vector3::new(3e-6, 0.0, 0.0), ..Loads::default() };
+        let loads = Loads { force_srf_n: Vector3::new(3e-6, 0.0, 0.0), ..Loads::zero(2) };
         let mut y = at_rest(&plant);
         plant.step(&mut y, &loads, &nothing(), 0.1);
         let want = plant.tm[0].dcm_orf_from_srf * Vector3::new(-2e-10, 0.0, 0.0);
@@ -524,7 +536,7 @@ mod tests {
         let mut y = at_rest(&plant());
         y.tm[1].v_orf_m_s.z = 3.0;
         y.q_srf_from_crf = from_rotation_vector(&Vector3::new(0.1, 0.2, 0.3));
-        let numbers: [f64; STATE_NUMBERS] = y.to_numbers().try_into().unwrap();
-        assert_eq!(State::from_numbers(&numbers), y);
+        assert_eq!(State::from_numbers(&y.to_numbers(), 2), Some(y));
+        assert_eq!(State::from_numbers(&y.to_numbers(), 1), None);
     }
 }

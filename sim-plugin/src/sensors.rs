@@ -1,7 +1,7 @@
 //! Readouts of one epoch, and every random process of the loop.
 
 use dragfree_physics::attitude::rotation_vector;
-use dragfree_physics::control::{Readout, TestMassReadout};
+use dragfree_physics::control::{PerTestMass, Readout, TestMassReadout};
 use dragfree_physics::mission::{Limits, Mission, MissionError};
 use dragfree_physics::noise::NoiseShape;
 use dragfree_physics::process::{NoiseBank, NoiseProcess};
@@ -12,21 +12,40 @@ use crate::plant::{Loads, State};
 
 const NEEDED_BY: &str = "the simulator";
 
+/// Everything that the instruments say of one test mass at `t_k`.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct MeasuredTestMass {
+    /// Capacitive displacement, ORF, m.
+    pub is_r_orf_m: Vector3<f64>,
+    /// Capacitive attitude `φ, θ, ψ`, ORF, rad.
+    pub is_att_orf_rad: Vector3<f64>,
+    /// Whether the capacitive readout is at the end of its range.
+    pub is_saturated: bool,
+    /// Interferometers along the axes of ORF, m; NaN along an axis without one.
+    pub ifo_orf_m: Vector3<f64>,
+    /// Local wavefront sensing `θ, ψ`, ORF, rad; NaN without an interferometer along x.
+    pub dws_orf_rad: [f64; 2],
+}
+
 /// Everything that the instruments say at `t_k`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Measured {
-    /// Capacitive displacement of both test masses, ORF, m.
-    pub is_r_orf_m: [Vector3<f64>; 2],
-    /// Capacitive attitude `φ, θ, ψ`, ORF, rad.
-    pub is_att_orf_rad: [Vector3<f64>; 2],
-    /// Whether a capacitive readout is at the end of its range.
-    pub is_saturated: [bool; 2],
-    /// Interferometers, ORF x, m.
-    pub ifo_x_orf_m: [f64; 2],
-    /// Local wavefront sensing `θ, ψ`, ORF, rad.
-    pub dws_orf_rad: [[f64; 2]; 2],
+    /// The test masses.
+    pub tm: PerTestMass<MeasuredTestMass>,
     /// Long-arm wavefront sensing of the spacecraft, CRF, rad.
     pub dws_sc_crf_rad: Vector3<f64>,
+}
+
+impl MeasuredTestMass {
+    /// The best readout of each degree of freedom.
+    fn best(&self) -> TestMassReadout {
+        let [theta, psi] = self.dws_orf_rad;
+        let (optical, capacitive) = (Vector3::new(f64::NAN, theta, psi), &self.is_att_orf_rad);
+        let best = |optical: &Vector3<f64>, capacitive: &Vector3<f64>| {
+            optical.zip_map(capacitive, |optical, capacitive| if optical.is_nan() { capacitive } else { optical })
+        };
+        TestMassReadout { r_orf_m: best(&self.ifo_orf_m, &self.is_r_orf_m), att_orf_rad: best(&optical, capacitive) }
+    }
 }
 
 impl Measured {
@@ -37,40 +56,31 @@ impl Measured {
             v.apply(|x| *x = x.clamp(-limit, limit));
             beyond
         };
-        for i in 0..2 {
-            let r = hold(&mut self.is_r_orf_m[i], limits.displacement_m);
-            let att = hold(&mut self.is_att_orf_rad[i], limits.angle_rad);
-            self.is_saturated[i] = r | att;
+        for tm in &mut self.tm {
+            let r = hold(&mut tm.is_r_orf_m, limits.displacement_m);
+            let att = hold(&mut tm.is_att_orf_rad, limits.angle_rad);
+            tm.is_saturated = r | att;
         }
     }
 
     /// What the controller uses of it.
     #[must_use]
     pub fn readout(&self, sun_srf: Option<Vector3<f64>>) -> Readout {
-        let tm = std::array::from_fn(|i| TestMassReadout {
-            r_orf_m: Vector3::new(self.ifo_x_orf_m[i], self.is_r_orf_m[i].y, self.is_r_orf_m[i].z),
-            att_orf_rad: Vector3::new(self.is_att_orf_rad[i].x, self.dws_orf_rad[i][0], self.dws_orf_rad[i][1]),
-        });
-        Readout { sc_crf_rad: self.dws_sc_crf_rad, tm, sun_srf }
+        Readout { sc_crf_rad: self.dws_sc_crf_rad, tm: self.tm.map(MeasuredTestMass::best), sun_srf }
     }
 }
-
-/// Random processes of the loop.
-const PROCESSES: usize = 44;
 
 /// The random processes, each independent of the others.
 #[derive(Clone, Debug)]
 pub struct Noises {
-    bank: NoiseBank<PROCESSES>,
-    /// Of the epoch that was measured last.
-    samples: [f64; PROCESSES],
+    bank: NoiseBank,
     places: Places,
 }
 
 /// Where the processes stand in the bank; the further axes follow the first.
 #[derive(Clone, Debug)]
 struct Places {
-    tm: [TestMassPlaces; 2],
+    tm: Vec<TestMassPlaces>,
     dws_sc: usize,
     mps_force: usize,
     mps_torque: usize,
@@ -81,11 +91,12 @@ struct Places {
 struct TestMassPlaces {
     is_r: usize,
     is_att: usize,
-    ifo_x: usize,
-    /// θ and ψ.
-    dws: usize,
-    /// y and z: nothing drives the electrodes along the sensitive axis.
-    es_force: usize,
+    /// Along each axis with an interferometer.
+    ifo: [Option<usize>; 3],
+    /// θ and ψ, where x has an interferometer.
+    dws: Option<usize>,
+    /// Along each axis on which electrodes push.
+    es_force: [Option<usize>; 3],
     es_torque: usize,
     acceleration: usize,
 }
@@ -104,9 +115,8 @@ impl Noises {
             }};
         }
         let (is_x, is_y, is_z, is_angle) = (process!(is_x), process!(is_y), process!(is_z), process!(is_angle));
-        let (ifo_x, dws_tm, dws_sc) = (process!(ifo_x), process!(dws_local), process!(dws_long_arm));
-        let (es_force, es_torque) = (process!(electrostatic_force), process!(electrostatic_torque));
-        let acceleration = process!(test_mass_acceleration);
+        let dws_sc = process!(dws_long_arm);
+        let (es_torque, acceleration) = (process!(electrostatic_torque), process!(test_mass_acceleration));
         let (mut mps_force, mut mps_torque) = (process!(thruster_force), process!(thruster_torque));
         if mission.thrusters.as_ref().is_some_and(|t| !t.unit.is_empty()) {
             // The units have noise of their own.
@@ -118,30 +128,38 @@ impl Noises {
             |table| NoiseProcess::with_lines(&table.shape(), &table.lines(), dt_s),
         );
 
-        let mut processes: Vec<NoiseProcess> = Vec::with_capacity(PROCESSES);
+        let mut processes: Vec<NoiseProcess> = Vec::new();
         let mut add = |axes: &[&NoiseProcess]| {
             let place = processes.len();
             processes.extend(axes.iter().map(|p| (*p).clone()));
             place
         };
+        let mut tm = Vec::with_capacity(mission.test_mass.len());
+        for section in mission.test_mass.values() {
+            let (is_r, is_att) = (add(&[&is_x, &is_y, &is_z]), add(&[&is_angle; 3]));
+            let mut ifo = [None; 3];
+            for axis in (0..3).filter(|axis| section.has_interferometer(*axis)) {
+                let (key, noise) = mission.displacement_noise(section, axis);
+                let missing = || MissionError::Missing { section: format!("noise.{key}"), needed_by: NEEDED_BY };
+                let table = noise.ok_or_else(missing)?;
+                ifo[axis] = Some(add(&[&NoiseProcess::with_lines(&table.shape(), &table.lines(), dt_s)]));
+            }
+            let dws = if section.has_interferometer(0) { Some(add(&[&process!(dws_local); 2])) } else { None };
+            let mut es_force = [None; 3];
+            for axis in (0..3).filter(|axis| !section.is_drag_free(*axis)) {
+                es_force[axis] = Some(add(&[&process!(electrostatic_force)]));
+            }
+            let (es_torque, acceleration) = (add(&[&es_torque; 3]), add(&[&acceleration; 3]));
+            tm.push(TestMassPlaces { is_r, is_att, ifo, dws, es_force, es_torque, acceleration });
+        }
         let places = Places {
-            tm: std::array::from_fn(|_| TestMassPlaces {
-                is_r: add(&[&is_x, &is_y, &is_z]),
-                is_att: add(&[&is_angle; 3]),
-                ifo_x: add(&[&ifo_x]),
-                dws: add(&[&dws_tm; 2]),
-                es_force: add(&[&es_force; 2]),
-                es_torque: add(&[&es_torque; 3]),
-                acceleration: add(&[&acceleration; 3]),
-            }),
+            tm,
             dws_sc: add(&[&dws_sc; 3]),
             mps_force: add(&[&mps_force; 3]),
             mps_torque: add(&[&mps_torque; 3]),
             sunlight: add(&[&sunlight]),
         };
-        let processes: [NoiseProcess; PROCESSES] =
-            processes.try_into().unwrap_or_else(|p: Vec<_>| unreachable!("{} processes", p.len()));
-        Ok(Self { bank: NoiseBank::new(processes), samples: [0.0; PROCESSES], places })
+        Ok(Self { bank: NoiseBank::new(processes), places })
     }
 
     /// Takes the thrusters' noise along the axes away, for one that comes from a layout.
@@ -160,43 +178,51 @@ impl Noises {
     #[must_use]
     pub fn slow_readout(&self) -> Readout {
         let slow = |place: usize| self.bank.slow(place);
-        let tm = self.places.tm.each_ref().map(|at| TestMassReadout {
-            r_orf_m: Vector3::new(slow(at.ifo_x), slow(at.is_r + 1), slow(at.is_r + 2)),
-            att_orf_rad: Vector3::new(slow(at.is_att), slow(at.dws), slow(at.dws + 1)),
+        let three = |place: usize| Vector3::from_fn(|i, _| slow(place + i));
+        let tm = self.places.tm.iter().map(|at| {
+            let measured = MeasuredTestMass {
+                is_r_orf_m: three(at.is_r),
+                is_att_orf_rad: three(at.is_att),
+                ifo_orf_m: Vector3::from(at.ifo.map(|place| place.map_or(f64::NAN, slow))),
+                dws_orf_rad: at.dws.map_or([f64::NAN; 2], |place| [slow(place), slow(place + 1)]),
+                ..MeasuredTestMass::default()
+            };
+            measured.best()
         });
-        Readout { sc_crf_rad: Vector3::from_fn(|i, _| slow(self.places.dws_sc + i)), tm, sun_srf: None }
+        Readout { sc_crf_rad: three(self.places.dws_sc), tm: tm.collect(), sun_srf: None }
     }
 
     /// Goes on to the next epoch and samples every instrument.
     pub fn measure(&mut self, y: &State, rng: &mut Xoshiro256PlusPlus) -> Measured {
-        self.samples = self.bank.next(rng);
-        let mut out = Measured::default();
-        for (i, (tm, at)) in y.tm.iter().zip(&self.places.tm).enumerate() {
+        let samples = self.bank.next(rng);
+        let three = |place: usize| Vector3::new(samples[place], samples[place + 1], samples[place + 2]);
+        let tm = y.tm.iter().zip(&self.places.tm).map(|(tm, at)| {
             let angle = rotation_vector(&tm.q_mrf_from_orf);
-            out.is_r_orf_m[i] = tm.r_orf_m + self.three(at.is_r);
-            out.is_att_orf_rad[i] = angle + self.three(at.is_att);
-            out.ifo_x_orf_m[i] = tm.r_orf_m.x + self.samples[at.ifo_x];
-            out.dws_orf_rad[i] = std::array::from_fn(|j| angle[j + 1] + self.samples[at.dws + j]);
-        }
-        out.dws_sc_crf_rad = y.sc_crf_rad() + self.three(self.places.dws_sc);
-        out
+            let ifo = |axis: usize| at.ifo[axis].map_or(f64::NAN, |place| tm.r_orf_m[axis] + samples[place]);
+            MeasuredTestMass {
+                is_r_orf_m: tm.r_orf_m + three(at.is_r),
+                is_att_orf_rad: angle + three(at.is_att),
+                is_saturated: false,
+                ifo_orf_m: Vector3::new(ifo(0), ifo(1), ifo(2)),
+                dws_orf_rad: at.dws.map_or([f64::NAN; 2], |place| [0, 1].map(|j| angle[j + 1] + samples[place + j])),
+            }
+        });
+        Measured { tm: tm.collect(), dws_sc_crf_rad: y.sc_crf_rad() + three(self.places.dws_sc) }
     }
 
     /// Adds the epoch's sample of every force noise to the loads; gives the fluctuation of the sunlight, N.
     #[must_use]
     pub fn disturb(&self, loads: &mut Loads) -> f64 {
-        loads.force_srf_n += self.three(self.places.mps_force);
-        loads.torque_srf_nm += self.three(self.places.mps_torque);
+        let samples = self.bank.samples();
+        let three = |place: usize| Vector3::new(samples[place], samples[place + 1], samples[place + 2]);
+        loads.force_srf_n += three(self.places.mps_force);
+        loads.torque_srf_nm += three(self.places.mps_torque);
         for (tm, at) in loads.tm.iter_mut().zip(&self.places.tm) {
-            tm.force_orf_n += Vector3::new(0.0, self.samples[at.es_force], self.samples[at.es_force + 1]);
-            tm.torque_orf_nm += self.three(at.es_torque);
-            tm.acceleration_orf_m_s2 += self.three(at.acceleration);
+            tm.force_orf_n += Vector3::from(at.es_force.map(|place| place.map_or(0.0, |place| samples[place])));
+            tm.torque_orf_nm += three(at.es_torque);
+            tm.acceleration_orf_m_s2 += three(at.acceleration);
         }
-        self.samples[self.places.sunlight]
-    }
-
-    fn three(&self, place: usize) -> Vector3<f64> {
-        Vector3::from_fn(|i, _| self.samples[place + i])
+        samples[self.places.sunlight]
     }
 
     /// The states of all processes, for a checkpoint between epochs.

@@ -1,9 +1,9 @@
 //! The closed loop, epoch by epoch: measure, command, act.
 
 use dragfree_physics::attitude::{rotation_vector, turn};
-use dragfree_physics::control::{Command, ControlLaw};
+use dragfree_physics::control::{Command, ControlLaw, PerTestMass};
 use dragfree_physics::control_design::growth_per_sample;
-use dragfree_physics::mission::{Actuators, Limits, Mission, MissionError};
+use dragfree_physics::mission::{ANGLES, AXES, Actuators, Limits, Mission, MissionError, SPACECRAFT};
 use dragfree_physics::process::normal;
 use nalgebra::{Matrix3, Vector3};
 use rand::{RngExt, SeedableRng};
@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use crate::effects::{Asked, Basis, EffectError, Effects, Moment, Saved};
 use crate::interior::{Influences, Interior, Running, SavedInterior};
 use crate::orbit::{Constellation, Environment, OrbitError};
-use crate::plant::{Loads, Outside, Plant, STATE_NUMBERS, State};
+use crate::plant::{Loads, Outside, Plant, State};
 use crate::sensors::{Measured, Noises};
 use crate::thrusters::{SavedThrusters, Thrusters};
 
@@ -116,7 +116,7 @@ pub struct Epoch {
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Truth {
     /// Displacements, ORF, m.
-    pub r_orf_m: [Vector3<f64>; 2],
+    pub r_orf_m: PerTestMass<Vector3<f64>>,
     /// Attitude relative to CRF, rad.
     pub sc_crf_rad: Vector3<f64>,
     /// `ω_SI`, SRF, rad/s.
@@ -126,7 +126,7 @@ pub struct Truth {
     /// Mean non-gravitational acceleration, SRF, m/s².
     pub nongrav_srf_m_s2: Vector3<f64>,
     /// Housings relative to the centre of mass, ORF, m.
-    pub offset_orf_m: [Vector3<f64>; 2],
+    pub offset_orf_m: PerTestMass<Vector3<f64>>,
 }
 
 /// What the ground tells about orbit and pointing.
@@ -159,14 +159,16 @@ pub struct Simulator {
     inside: Running,
     /// The plant as the effects began it, before its geometry moves.
     begun: Plant,
-    offset_orf_m: [Vector3<f64>; 2],
+    offset_orf_m: PerTestMass<Vector3<f64>>,
     /// `k_dSC` and its arm.
     sunlight: Option<(f64, Vector3<f64>)>,
     /// `None` where the thrusters do what is commanded.
     thrusters: Option<Thrusters>,
     actuators: Option<Actuators>,
     limits: Option<Limits>,
-    self_gravity: [SelfGravity; 2],
+    self_gravity: Vec<SelfGravity>,
+    /// Names of the test masses.
+    names: Vec<String>,
     /// Error of the determined orbit in Hill's sense of fixed axes: its effect on the Sun's direction, CRF.
     orbit_error_irf_m: Vector3<f64>,
     sun_error_crf: Vector3<f64>,
@@ -176,7 +178,7 @@ pub struct Simulator {
     /// Surroundings at the last packet, and the epoch of it.
     environment: Environment,
     environment_index: i64,
-    gradient_orf_s2: [Matrix3<f64>; 2],
+    gradient_orf_s2: PerTestMass<Matrix3<f64>>,
 }
 
 /// What the spacecraft's own mass does to a test mass.
@@ -228,25 +230,28 @@ impl Simulator {
         rng.jump();
 
         let range = settings.stiffness_error;
-        let stiffness = std::array::from_fn(|_| {
+        let mut factors = || -> [Matrix3<f64>; 3] {
             std::array::from_fn(|_| Matrix3::from_fn(|_, _| 1.0 + range * (2.0 * once.random::<f64>() - 1.0)))
-        });
+        };
+        let stiffness: Vec<_> = mission.test_mass.iter().map(|_| factors()).collect();
         let mut plant = Plant::new(mission, &settings.com_offset_srf_m, &stiffness)?;
         let mut effects = Effects::new(&settings.effects, &Basis { mission }, settings.seed)?;
         effects.begin(&mut plant);
         let mut uniform = |limit: f64| limit * (2.0 * once.random::<f64>() - 1.0);
         let bounds = &mission.self_gravity;
-        let self_gravity = std::array::from_fn(|_| SelfGravity {
+        let mut self_gravity = || SelfGravity {
             acceleration_orf_m_s2: Vector3::from_fn(|i, _| uniform(bounds.acceleration_orf_m_s2[i])),
             drift_orf_m_s3: Vector3::from_fn(|_, _| uniform(bounds.drift_m_s2_day / DAY_S)),
             angular_acceleration_orf_rad_s2: Vector3::from_fn(|_, _| uniform(bounds.angular_acceleration_rad_s2)),
-        });
+        };
+        let self_gravity: Vec<_> = mission.test_mass.iter().map(|_| self_gravity()).collect();
         let orbit_sigma = mission.solar_pressure.as_ref().map_or(0.0, |s| s.orbit_error_m);
         let mut gauss = |sigma: f64| Vector3::from_fn(|_, _| sigma * normal(&mut once));
         let orbit_error_irf_m = gauss(orbit_sigma);
         // The orbit's error is as large along every axis, so its components in CRF are as good a draw.
         let sun_error_crf = gauss(orbit_sigma);
-        let [sc, r1, a1, r2, a2] = std::array::from_fn(|_| gauss(INITIAL_SIGMA));
+        let sc = gauss(INITIAL_SIGMA);
+        let tm: Vec<_> = mission.test_mass.iter().map(|_| (gauss(INITIAL_SIGMA), gauss(INITIAL_SIGMA))).collect();
 
         let mut noises = Noises::new(mission)?;
         noises.start(&mut rng);
@@ -266,8 +271,8 @@ impl Simulator {
             alpha_crf_rad_s2: environment.alpha_crf_rad_s2,
             gradient_orf_s2: gradient_orf(&plant, &environment),
         };
-        let tm = [(r1, a1), (r2, a2)];
-        let at = std::array::from_fn(|i| (tm[i].0 - shown.tm[i].r_orf_m, tm[i].1 - shown.tm[i].att_orf_rad));
+        let at = tm.iter().zip(&shown.tm).map(|((r, angle), shown)| (r - shown.r_orf_m, angle - shown.att_orf_rad));
+        let at: Vec<_> = at.collect();
         let state = State::at_rest(&(sc - shown.sc_crf_rad), &at, &plant, &outside);
         let influences = Influences {
             sun_distance_m: environment.r_sc_irf_m.norm(),
@@ -284,7 +289,7 @@ impl Simulator {
             noises,
             rng,
             effects,
-            inside: Running::new(settings.seed, dt_s, &influences),
+            inside: Running::new(settings.seed, dt_s, mission.test_mass.len(), &influences),
             begun,
             offset_orf_m,
             sunlight: mission.solar_pressure.as_ref().map(|s| (s.force_n, Vector3::from(s.arm_srf_m))),
@@ -292,6 +297,7 @@ impl Simulator {
             actuators: mission.actuators.clone(),
             limits: mission.limits.clone(),
             self_gravity,
+            names: mission.test_mass.keys().cloned().collect(),
             orbit_error_irf_m,
             sun_error_crf,
             state,
@@ -380,7 +386,7 @@ impl Simulator {
             command,
             at_limit: self.at_limit(&command),
             truth: Truth {
-                r_orf_m: [before.tm[0].r_orf_m, before.tm[1].r_orf_m],
+                r_orf_m: before.tm.map(|tm| tm.r_orf_m),
                 sc_crf_rad: before.sc_crf_rad(),
                 omega_srf_rad_s: before.omega_srf_rad_s,
                 alpha_srf_rad_s2: means.alpha_srf_rad_s2,
@@ -430,9 +436,9 @@ impl Simulator {
         &self.inside.now
     }
 
-    /// The housings relative to the centre of mass at the coming epoch, ORF, m.
+    /// The housings relative to the centre of mass at the coming epoch, each in its ORF, m.
     #[must_use]
-    pub fn offset_orf_m(&self) -> &[Vector3<f64>; 2] {
+    pub fn offset_orf_m(&self) -> &[Vector3<f64>] {
         &self.offset_orf_m
     }
 
@@ -471,8 +477,11 @@ impl Simulator {
             (acting.mps_force_srf_n, acting.mps_torque_srf_nm) =
                 thrusters.act(&acting.mps_force_srf_n, &acting.mps_torque_srf_nm);
         }
-        let mut loads =
-            Loads { force_srf_n: acting.mps_force_srf_n, torque_srf_nm: acting.mps_torque_srf_nm, ..Loads::default() };
+        let mut loads = Loads {
+            force_srf_n: acting.mps_force_srf_n,
+            torque_srf_nm: acting.mps_torque_srf_nm,
+            ..Loads::zero(self.plant.tm.len())
+        };
         let elapsed_s = self.index as f64 * self.dt_s;
         for ((load, acting), own) in loads.tm.iter_mut().zip(&acting.tm).zip(&self.self_gravity) {
             load.force_orf_n = acting.force_orf_n;
@@ -510,17 +519,16 @@ impl Simulator {
             value,
             unit,
         };
-        const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
-        for (i, tm) in self.state.tm.iter().enumerate() {
+        for (name, tm) in self.names.iter().zip(&self.state.tm) {
             if let Some((axis, value)) = worst(&tm.r_orf_m, LOST_M) {
-                return Err(lost(format!("tm{}.{}", i + 1, ["x", "y", "z"][axis]), value, "m"));
+                return Err(lost(format!("{name}.{}", AXES[axis]), value, "m"));
             }
             if let Some((axis, value)) = worst(&rotation_vector(&tm.q_mrf_from_orf), LOST_RAD) {
-                return Err(lost(format!("tm{}.{}", i + 1, ANGLES[axis]), value, "rad"));
+                return Err(lost(format!("{name}.{}", ANGLES[axis]), value, "rad"));
             }
         }
         match worst(&self.state.sc_crf_rad(), LOST_RAD) {
-            Some((axis, value)) => Err(lost(format!("sc.{}", ANGLES[axis]), value, "rad")),
+            Some((axis, value)) => Err(lost(format!("{SPACECRAFT}.{}", ANGLES[axis]), value, "rad")),
             None => Ok(()),
         }
     }
@@ -551,8 +559,8 @@ impl Simulator {
     pub fn load(&mut self, bytes: &[u8]) -> Result<(), SimulationError> {
         let refuse = |what: &str| SimulationError::State(what.to_owned());
         let snapshot: Snapshot = serde_json::from_slice(bytes).map_err(|e| refuse(&e.to_string()))?;
-        let numbers: &[f64; STATE_NUMBERS] =
-            snapshot.state.as_slice().try_into().map_err(|_| refuse("the plant has other states"))?;
+        let state = State::from_numbers(&snapshot.state, self.plant.tm.len())
+            .ok_or_else(|| refuse("the plant has other states"))?;
         if !self.noises.set_states(&snapshot.noises) {
             return Err(refuse("the noise has other states"));
         }
@@ -570,14 +578,14 @@ impl Simulator {
         (self.index, self.rng) = (snapshot.index, snapshot.rng);
         // The geometry first: it moves the test masses of the state that goes.
         self.reshape();
-        self.state = State::from_numbers(numbers);
+        self.state = state;
         Ok(self.surroundings(snapshot.environment_index)?)
     }
 }
 
 /// `b_i` in ORF.
-fn offsets(plant: &Plant) -> [Vector3<f64>; 2] {
-    plant.tm.each_ref().map(|tm| tm.dcm_orf_from_srf * tm.offset_srf_m)
+fn offsets(plant: &Plant) -> PerTestMass<Vector3<f64>> {
+    plant.tm.iter().map(|tm| tm.dcm_orf_from_srf * tm.offset_srf_m).collect()
 }
 
 /// A channel whose growth is within this of one drifts and does not diverge: nobody controls it.
@@ -596,9 +604,10 @@ fn refuse_unstable(mission: &Mission) -> Result<(), SimulationError> {
     Ok(())
 }
 
-/// `Γ` in both ORF, for SRF on CRF.
-fn gradient_orf(plant: &Plant, environment: &Environment) -> [Matrix3<f64>; 2] {
-    plant.tm.each_ref().map(|tm| tm.dcm_orf_from_srf * environment.gradient_crf_s2 * tm.dcm_orf_from_srf.transpose())
+/// `Γ` in each ORF, for SRF on CRF.
+fn gradient_orf(plant: &Plant, environment: &Environment) -> PerTestMass<Matrix3<f64>> {
+    let of = |t: &Matrix3<f64>| t * environment.gradient_crf_s2 * t.transpose();
+    plant.tm.iter().map(|tm| of(&tm.dcm_orf_from_srf)).collect()
 }
 
 /// Time of an epoch, Unix ns, to the nearest nanosecond whatever the rate.

@@ -40,14 +40,14 @@ fn bodies() -> Plant {
         sc_mass_kg: 1500.0,
         sc_inertia,
         sc_inertia_inverse: sc_inertia.try_inverse().unwrap(),
-        tm: [body(1.0, Vector3::new(0.001, 0.18, -0.02)), body(-1.0, Vector3::new(0.03, -0.18, 0.01))],
+        tm: vec![body(1.0, Vector3::new(0.001, 0.18, -0.02)), body(-1.0, Vector3::new(0.03, -0.18, 0.01))],
     }
 }
 
 /// The state that `oracles/dynamics.py` starts from.
 fn start() -> State {
     let plant = bodies();
-    let mut y = State::at_rest(&Vector3::zeros(), &Default::default(), &plant, &surroundings(&plant, None, 0.0));
+    let mut y = State::at_rest(&Vector3::zeros(), &[Default::default(); 2], &plant, &surroundings(&plant, None, 0.0));
     y.q_srf_from_crf = from_rotation_vector(&Vector3::new(1e-3, -2e-3, 3e-3));
     y.omega_srf_rad_s = Vector3::new(1e-4, -2e-4, 3e-4);
     for tm in &mut y.tm {
@@ -73,12 +73,12 @@ fn loads(k: u32) -> Loads {
         acceleration_orf_m_s2: v(1e-10, 6 + i, 5 + i),
         angular_acceleration_orf_rad_s2: v(1e-9, 2 + i, 6 + i),
     };
-    Loads { force_srf_n: v(1e-4, 3, 1), torque_srf_nm: v(1e-4, 5, 2), tm: [tm(0), tm(1)] }
+    Loads { force_srf_n: v(1e-4, 3, 1), torque_srf_nm: v(1e-4, 5, 2), tm: [tm(0), tm(1)].into() }
 }
 
 /// CRF's rates and the Sun's gradient in both ORF at `t`; no gradient without a state.
 fn surroundings(plant: &Plant, y: Option<&State>, t_s: f64) -> Outside {
-    let gradient_orf_s2 = y.map_or([Matrix3::zeros(); 2], |y| {
+    let gradient_orf_s2 = y.map_or([Matrix3::zeros(); 2].into(), |y| {
         let angle = (CRF_RATE_RAD_S + 0.5 * CRF_ALPHA_RAD_S2 * t_s) * t_s;
         let dcm_irf_from_crf = Rotation3::from_axis_angle(&Unit::new_normalize(CRF_AXIS), angle);
         let dcm_srf_from_irf = dcm(&y.q_srf_from_crf) * dcm_irf_from_crf.matrix().transpose();
@@ -86,7 +86,7 @@ fn surroundings(plant: &Plant, y: Option<&State>, t_s: f64) -> Outside {
         let r = dcm_srf_from_irf * (R0_IRF_M + V0_IRF_M_S * t_s);
         let (u, d) = (r.normalize(), r.norm());
         let gradient_srf_s2 = (3.0 * u * u.transpose() - Matrix3::identity()) * (MU_SUN_M3_S2 / d.powi(3));
-        plant.tm.each_ref().map(|tm| tm.dcm_orf_from_srf * gradient_srf_s2 * tm.dcm_orf_from_srf.transpose())
+        plant.tm.iter().map(|tm| tm.dcm_orf_from_srf * gradient_srf_s2 * tm.dcm_orf_from_srf.transpose()).collect()
     });
     Outside {
         omega_crf_rad_s: CRF_AXIS * (CRF_RATE_RAD_S + CRF_ALPHA_RAD_S2 * t_s),
@@ -201,7 +201,7 @@ fn every_term_and_every_sign_is_seen() {
                 load.acceleration_orf_m_s2 += omega_orf_rad_s.cross(&tm.v_orf_m_s) * 2.0;
             }
         }),
-        ("no gradient of gravity", |_, _, _, outside| outside.gradient_orf_s2 = [Matrix3::zeros(); 2]),
+        ("no gradient of gravity", |_, _, _, outside| outside.gradient_orf_s2 = [Matrix3::zeros(); 2].into()),
         ("no −F_E on the spacecraft", |plant, _, loads, _| {
             for (body, load) in plant.tm.iter().zip(&loads.tm) {
                 loads.force_srf_n += body.dcm_orf_from_srf.tr_mul(&load.force_orf_n);
@@ -290,7 +290,7 @@ fn undisturbed(dt_s: f64, force_n: f64, twin: Twin) -> (Sums, Sums, Vector3<f64>
     }
     let still = Vector3::zeros();
     let mut outside =
-        Outside { omega_crf_rad_s: still, alpha_crf_rad_s2: still, gradient_orf_s2: [Matrix3::zeros(); 2] };
+        Outside { omega_crf_rad_s: still, alpha_crf_rad_s2: still, gradient_orf_s2: [Matrix3::zeros(); 2].into() };
     let mut y = start();
     y.omega_srf_rad_s = Vector3::new(1e-3, -2e-3, 3e-3);
     y.tm.iter_mut().for_each(|tm| tm.omega_mrf_rad_s = Vector3::new(2e-3, -1e-3, 1e-3));
@@ -298,7 +298,7 @@ fn undisturbed(dt_s: f64, force_n: f64, twin: Twin) -> (Sums, Sums, Vector3<f64>
     let first = inertial.sums(&plant, &y);
     for k in 0..(1000.0 / dt_s).round() as u32 {
         let wave = loads(k / (1.0 / dt_s).round() as u32);
-        let mut acting = Loads::default();
+        let mut acting = Loads::zero(2);
         for (load, wave) in acting.tm.iter_mut().zip(&wave.tm) {
             load.force_orf_n = wave.force_orf_n * (force_n / 1e-7);
             load.torque_orf_nm = wave.torque_orf_nm * (force_n / 1e-7);
@@ -379,14 +379,15 @@ fn drift(substeps: u32) -> State {
     let plant = Plant::new(&taiji(), &Vector3::new(0.001, 0.0, 0.0), &ones).unwrap();
     let omega_crf_rad_s = Vector3::new(1.5e-7, 0.8e-7, -1e-7);
     let gradient = Matrix3::from_diagonal(&Vector3::new(7.9e-14, -3.9e-14, -4e-14));
-    let outside = Outside { omega_crf_rad_s, alpha_crf_rad_s2: Vector3::repeat(1e-14), gradient_orf_s2: [gradient; 2] };
+    let outside =
+        Outside { omega_crf_rad_s, alpha_crf_rad_s2: Vector3::repeat(1e-14), gradient_orf_s2: [gradient; 2].into() };
     let small = Vector3::repeat(5e-8);
     let mut y = State::at_rest(&small, &[(small, small), (-small, -small)], &plant, &outside);
     let mut rng = Xoshiro256PlusPlus::seed_from_u64(7);
     for k in 0..72_000 {
         // White noise of 1e-7 N/√Hz and 1e-7 N m/√Hz at 10 Hz, and steady forces of the electrodes' size.
         let mut noise = |sigma: f64| Vector3::from_fn(|_, _| sigma * normal(&mut rng));
-        let mut loads = Loads { force_srf_n: noise(2.2e-7), torque_srf_nm: noise(2.2e-7), ..Loads::default() };
+        let mut loads = Loads { force_srf_n: noise(2.2e-7), torque_srf_nm: noise(2.2e-7), ..Loads::zero(2) };
         for (i, tm) in loads.tm.iter_mut().enumerate() {
             tm.force_orf_n = Vector3::new(0.0, 1e-9, -1e-9) * (1.0 - 2.0 * i as f64) + noise(5e-14);
             tm.torque_orf_nm = noise(2e-16);

@@ -4,8 +4,8 @@
 use dragfree_physics::attitude::rotation_vector;
 use dragfree_physics::mission::Mission;
 use dragfree_physics::spectrum::welch;
-use dragfree_sim::effects::{Asked, catalogue};
-use dragfree_sim::housekeeping::{CHANNELS, Housekeeping};
+use dragfree_sim::effects::{Asked, EffectError, catalogue};
+use dragfree_sim::housekeeping::{Housekeeping, channels};
 use dragfree_sim::interior::Interior;
 use dragfree_sim::plant::State;
 use dragfree_sim::simulator::{Epoch, Settings, Simulator};
@@ -21,6 +21,14 @@ fn taiji() -> Mission {
     Mission::from_json(&value.to_string()).unwrap()
 }
 
+fn names() -> Vec<String> {
+    taiji().test_mass.keys().cloned().collect()
+}
+
+fn parse(text: &str) -> Result<Asked, EffectError> {
+    Asked::parse(text, &names())
+}
+
 fn settings(effects: &[&str], settle_s: f64) -> Settings {
     Settings {
         seed: 11,
@@ -28,7 +36,7 @@ fn settings(effects: &[&str], settle_s: f64) -> Settings {
         settle_s,
         com_offset_srf_m: Vector3::new(0.001, 0.0, 0.0),
         stiffness_error: 0.2,
-        effects: effects.iter().map(|text| Asked::parse(text).unwrap()).collect(),
+        effects: effects.iter().map(|text| parse(text).unwrap()).collect(),
     }
 }
 
@@ -417,11 +425,11 @@ fn the_optical_frame_opens() {
 #[test]
 fn capacitive_readout_scales_and_mixes() {
     for row in settled("is-scale:tm1.y=0.05", 5) {
-        let shown = row.epoch.measured.is_r_orf_m[0] - row.plain.measured.is_r_orf_m[0];
+        let shown = row.epoch.measured.tm[0].is_r_orf_m - row.plain.measured.tm[0].is_r_orf_m;
         near(&shown, &(axis(1) * 0.05 * row.state.tm[0].r_orf_m.y), 1e-6, "scale");
     }
     for row in settled("is-crosstalk:tm2.y-z=-0.1", 5) {
-        let shown = row.epoch.measured.is_r_orf_m[1] - row.plain.measured.is_r_orf_m[1];
+        let shown = row.epoch.measured.tm[1].is_r_orf_m - row.plain.measured.tm[1].is_r_orf_m;
         near(&shown, &(axis(2) * -0.1 * row.state.tm[1].r_orf_m.y), 1e-6, "cross-talk");
     }
 }
@@ -430,10 +438,10 @@ fn capacitive_readout_scales_and_mixes() {
 fn tilt_shows_as_length() {
     for row in settled("tilt-to-length:tm2=2e-3,psi_m_rad=-1e-3", 5) {
         let angle = rotation_vector(&row.state.tm[1].q_mrf_from_orf);
-        let shown = row.epoch.measured.ifo_x_orf_m[1] - row.plain.measured.ifo_x_orf_m[1];
+        let shown = row.epoch.measured.tm[1].ifo_orf_m.x - row.plain.measured.tm[1].ifo_orf_m.x;
         let want = 2e-3 * angle.y - 1e-3 * angle.z;
         assert!((shown - want).abs() < 1e-6 * want.abs(), "{shown} {want}");
-        assert_eq!(row.epoch.measured.is_r_orf_m, row.plain.measured.is_r_orf_m);
+        assert_eq!(row.epoch.measured.tm[1].is_r_orf_m, row.plain.measured.tm[1].is_r_orf_m);
     }
 }
 
@@ -458,26 +466,26 @@ fn a_late_instrument_shows_the_past() {
                 let [a, b] = [after, late].map(|row| row.state.tm[i].omega_mrf_rad_s);
                 (a - b) / DT_S - dcm(i) * alpha_sc
             };
-            let (found, plain) = (&now.epoch.measured, &now.plain.measured);
-            for i in 0..2 {
+            let (measured, unchanged) = (&now.epoch.measured, &now.plain.measured);
+            for (i, (found, plain)) in measured.tm.iter().zip(&unchanged.tm).enumerate() {
                 let moved = past(i) - now.state.tm[i].r_orf_m;
                 let turned = turned_by(angle(late, i), angle(after, i), alpha(i)) - angle(now, i);
                 if instrument == "is" {
-                    near(&(found.is_r_orf_m[i] - plain.is_r_orf_m[i]), &moved, 1e-4, "is");
-                    near(&(found.is_att_orf_rad[i] - plain.is_att_orf_rad[i]), &turned, 1e-3, "is angles");
+                    near(&(found.is_r_orf_m - plain.is_r_orf_m), &moved, 1e-4, "is");
+                    near(&(found.is_att_orf_rad - plain.is_att_orf_rad), &turned, 1e-3, "is angles");
                 } else {
                     assert_eq!(found.is_r_orf_m, plain.is_r_orf_m);
                 }
-                let x = found.ifo_x_orf_m[i] - plain.ifo_x_orf_m[i];
+                let x = found.ifo_orf_m.x - plain.ifo_orf_m.x;
                 let want = if instrument == "ifo" { moved.x } else { 0.0 };
                 assert!((x - want).abs() <= 1e-4 * want.abs(), "ifo: {x} {want}");
                 for j in 0..2 {
-                    let shown = found.dws_orf_rad[i][j] - plain.dws_orf_rad[i][j];
+                    let shown = found.dws_orf_rad[j] - plain.dws_orf_rad[j];
                     let want = if instrument == "dws" { turned[j + 1] } else { 0.0 };
                     assert!((shown - want).abs() <= 1e-3 * turned.norm(), "dws: {shown} {want}");
                 }
             }
-            let sc = found.dws_sc_crf_rad - plain.dws_sc_crf_rad;
+            let sc = measured.dws_sc_crf_rad - unchanged.dws_sc_crf_rad;
             let turned =
                 turned_by(late.state.sc_crf_rad(), after.state.sc_crf_rad(), alpha_sc) - now.state.sc_crf_rad();
             if instrument == "dws" {
@@ -502,7 +510,7 @@ fn noise_grows_by_the_square() {
     let force = series("mps-noise:sc.y=2", |row| row.sc_accel_srf_m_s2.y * SC_KG);
     let torque = series("torque-noise:sc.z=2", |row| (sc_inertia() * row.alpha_srf_rad_s2).z);
     let shown =
-        series("is-noise:tm2.z=2", |row| row.epoch.measured.is_r_orf_m[1].z - row.plain.measured.is_r_orf_m[1].z);
+        series("is-noise:tm2.z=2", |row| row.epoch.measured.tm[1].is_r_orf_m.z - row.plain.measured.tm[1].is_r_orf_m.z);
     for (series, base, what) in [(force, 1e-14, "force"), (torque, 1e-14, "torque"), (shown, 1.8e-9_f64.powi(2), "is")]
     {
         for band in [0.1..0.5, 0.5..4.9] {
@@ -585,8 +593,8 @@ fn units_of_the_mission_keep_their_noise() {
 /// Housekeeping, 300 s of it, by channel.
 fn housekeeping(effects: &[&str]) -> Vec<Vec<f64>> {
     let mut simulator = Simulator::new(&taiji(), settings(effects, 0.0)).unwrap();
-    let mut sensors = Housekeeping::new(DT_S, Xoshiro256PlusPlus::seed_from_u64(5));
-    let mut channels = vec![Vec::new(); CHANNELS.len()];
+    let mut sensors = Housekeeping::new(&names(), DT_S, Xoshiro256PlusPlus::seed_from_u64(5));
+    let mut channels = vec![Vec::new(); sensors.channels().len()];
     for _ in 0..3000 {
         let index = simulator.index();
         sensors.read(index, simulator.inside(), |i, value| channels[i].push(value));
@@ -602,11 +610,11 @@ fn housekeeping(effects: &[&str]) -> Vec<Vec<f64>> {
 fn housekeeping_does_not_tell_what_is_hidden() {
     let plain = housekeeping(&[]);
     for kind in catalogue() {
-        let effect = example(kind.id, &(kind.places)()[0].to_string());
+        let effect = example(kind.id, &(kind.places)(2)[0].name(&names()));
         let hidden = housekeeping(&[&effect]);
-        for ((channel, a), b) in CHANNELS.iter().zip(&plain).zip(&hidden) {
+        for ((channel, a), b) in channels(&names()).iter().zip(&plain).zip(&hidden) {
             let commanded = channel.place.starts_with("thruster ");
-            let left = ["tank_mass_kg", "tank_pressure_pa"].contains(&channel.name);
+            let left = ["tank_mass_kg", "tank_pressure_pa"].contains(&channel.name.as_str());
             if commanded || left || channel.name == "sun_angle_rad" {
                 continue;
             }
@@ -618,7 +626,7 @@ fn housekeeping_does_not_tell_what_is_hidden() {
     }
     // What is compared would show a change: sunlight that pushes twice as hard opens the valves.
     let pushed = housekeeping(&["solar-pressure:sc=1"]);
-    let valve = CHANNELS.iter().position(|c| c.place == "thruster 1" && c.unit == "A").unwrap();
+    let valve = channels(&names()).iter().position(|c| c.place == "thruster 1" && c.unit == "A").unwrap();
     assert_ne!(plain[valve], pushed[valve]);
 }
 
@@ -650,8 +658,8 @@ fn every_instance_flies_and_resumes_bit_for_bit() {
     let mut plain = Simulator::new(&mission, settings(&[], 5.0)).unwrap();
     run(&mut plain, 100);
     for kind in catalogue() {
-        for place in (kind.places)() {
-            let effect = example(kind.id, &place.to_string());
+        for place in (kind.places)(2) {
+            let effect = example(kind.id, &place.name(&names()));
             let make = || Simulator::new(&mission, settings(&[&effect], 5.0)).unwrap();
             let (mut whole, mut resumed) = (make(), make());
             let first = run(&mut whole, 37);
@@ -687,14 +695,14 @@ fn what_is_not_there_is_answered_with_what_is() {
         ("time-offset:is=-0.1", "SIZE = -0.1"),
         ("mps-correlation:sc=1e-7", "mps-correlation has no instance sc; it has layout"),
     ] {
-        let error = Asked::parse(text).unwrap_err().to_string();
+        let error = parse(text).unwrap_err().to_string();
         assert!(error.contains(told), "{text}: {error}");
     }
-    let list = Asked::parse("x:y=1").unwrap_err().to_string();
+    let list = parse("x:y=1").unwrap_err().to_string();
     for kind in catalogue() {
         assert!(list.contains(kind.id), "{}", kind.id);
         // What the border carries of a message.
-        let about = Asked::parse(&format!("{}:?=0", kind.id)).unwrap_err().to_string();
+        let about = parse(&format!("{}:?=0", kind.id)).unwrap_err().to_string();
         assert!(about.contains(kind.help) && about.len() < 1000, "{about}");
     }
 }

@@ -230,7 +230,7 @@ fn baseline() -> Vec<Bound> {
 
 /// The noise of the mission as the stage that makes the channels declares it.
 fn noise_model(mission: &Mission) -> NoiseModel {
-    NoiseModel::new(&declared(mission, &["ifo_x"; 2]), &CHANNELS, DT_S).expect("a noise model")
+    NoiseModel::new(&declared(mission, &[["ifo_x", "is_y", "is_z"]; 2]), &CHANNELS, DT_S).expect("a noise model")
 }
 
 fn sums(columns: &[Vec<f64>], mission: &Mission) -> (Sums, Plan, NoiseModel) {

@@ -33,7 +33,7 @@ fn problem(name: &str, plant: &GeneralizedPlant, gamma: f64) -> Value {
 fn main() -> Result<(), Box<dyn Error>> {
     let mission = Mission::from_json(&toml::from_str::<Value>(MISSION)?.to_string())?;
     let mut problems: Vec<Value> =
-        design(&mission)?.channels.iter().map(|c| problem(c.name, &c.plant, c.gamma)).collect();
+        design(&mission)?.channels.iter().map(|c| problem(&c.name, &c.plant, c.gamma)).collect();
     for benchmark in serde_json::from_str::<Vec<Value>>(BENCHMARKS)? {
         let [a, b, c, d] = ["a", "b", "c", "d"].map(|key| matrix(&benchmark[key]));
         let number = |key: &str| benchmark[key].as_u64().unwrap_or(0) as usize;

@@ -1,4 +1,4 @@
-//! The DFACS control law: fifteen single-loop controllers behind the static decoupling of the paper
+//! The DFACS control law: a single-loop controller for each channel behind the static decoupling of the paper
 //! (eq:decoupled_input_with_SRP), shared by the simulator and by the stage that replays it.
 //!
 //! One [`ControlLaw::step`] per sample turns the readout at `t_k` into the command that acts over `[t_k, t_{k+1})`.
@@ -8,123 +8,36 @@ use nalgebra::Vector3;
 use std::collections::VecDeque;
 
 use crate::control_design::design;
-use crate::decoupling::{Accelerations, AllocationMatrix, InputVector, LinearPlant};
-use crate::mission::{Actuators, CHANNELS, ChannelController, Mission, MissionError};
+use crate::decoupling::{Allocator, LinearPlant};
+use crate::mission::{Actuators, ChannelController, Mission, MissionError};
+pub use crate::signals::{Command, PerTestMass, Readout, TestMassCommand, TestMassReadout};
 
 const NEEDED_BY: &str = "the control law";
 
-/// Readout of one test mass at `t_k`.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct TestMassReadout {
-    /// Displacement from the housing's centre, ORF, m: x from the interferometer, y and z from the inertial sensor.
-    pub r_orf_m: Vector3<f64>,
-    /// Attitude relative to ORF, rad: `φ` from the inertial sensor, `θ` and `ψ` from local wavefront sensing.
-    pub att_orf_rad: Vector3<f64>,
-}
-
-/// What the controller sees at `t_k`. Every value must be finite: who replays telemetry holds the last valid sample.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Readout {
-    /// Attitude of the spacecraft relative to CRF, `φ, θ, ψ`, rad.
-    pub sc_crf_rad: Vector3<f64>,
-    /// Test masses 1 and 2.
-    pub tm: [TestMassReadout; 2],
-    /// Unit vector from the Sun to the spacecraft, SRF: the latest `/ephemeris` packet at or before `t_k`.
-    /// `None` before the first one: no feed-forward of sunlight.
-    pub sun_srf: Option<Vector3<f64>>,
-}
-
-/// What is commanded of one test mass' electrodes.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct TestMassCommand {
-    /// Electrostatic force on the test mass, ORF, N; none along the sensitive axis x.
-    pub force_orf_n: Vector3<f64>,
-    /// Electrostatic torque on the test mass, ORF, N m.
-    pub torque_orf_nm: Vector3<f64>,
-}
-
-/// What is commanded over one sample interval.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Command {
-    /// Thrust on the spacecraft `F_T`, SRF, N.
-    pub mps_force_srf_n: Vector3<f64>,
-    /// Thrusters' torque about the centre of mass `M_T`, SRF, N m.
-    pub mps_torque_srf_nm: Vector3<f64>,
-    /// Electrostatic commands of test masses 1 and 2.
-    pub tm: [TestMassCommand; 2],
-}
-
-impl Command {
-    pub(crate) fn from_vector(u: &InputVector) -> Self {
-        let at = |i: usize| Vector3::new(u[i], u[i + 1], u[i + 2]);
-        let tm =
-            |i: usize| TestMassCommand { force_orf_n: Vector3::new(0.0, u[i], u[i + 1]), torque_orf_nm: at(i + 2) };
-        Self { mps_force_srf_n: at(0), mps_torque_srf_nm: at(3), tm: [tm(6), tm(11)] }
-    }
-
-    /// Whether any component is at its limit or beyond it.
-    #[must_use]
-    pub fn reaches(&self, limits: &Actuators) -> bool {
-        let reaches = |v: &Vector3<f64>, limit: f64| v.iter().fold(false, |any, x| any | (x.abs() >= limit));
-        let tm = self.tm.iter().fold(false, |any, tm| {
-            any | reaches(&tm.force_orf_n, limits.electrostatic_force_limit_n)
-                | reaches(&tm.torque_orf_nm, limits.electrostatic_torque_limit_nm)
-        });
-        tm | reaches(&self.mps_force_srf_n, limits.thrust_limit_n)
-            | reaches(&self.mps_torque_srf_nm, limits.torque_limit_nm)
-    }
-
-    fn limited(mut self, limits: &Actuators) -> Self {
-        let clamp = |v: &mut Vector3<f64>, limit: f64| v.apply(|x| *x = x.clamp(-limit, limit));
-        clamp(&mut self.mps_force_srf_n, limits.thrust_limit_n);
-        clamp(&mut self.mps_torque_srf_nm, limits.torque_limit_nm);
-        for tm in &mut self.tm {
-            clamp(&mut tm.force_orf_n, limits.electrostatic_force_limit_n);
-            clamp(&mut tm.torque_orf_nm, limits.electrostatic_torque_limit_nm);
-        }
-        self
-    }
-
-    fn vectors(&self) -> [&Vector3<f64>; 6] {
-        let [a, b] = &self.tm;
-        [
-            &self.mps_force_srf_n,
-            &self.mps_torque_srf_nm,
-            &a.force_orf_n,
-            &a.torque_orf_nm,
-            &b.force_orf_n,
-            &b.torque_orf_nm,
-        ]
-    }
-
-    fn from_values(v: &[f64]) -> Self {
-        let at = |i: usize| Vector3::new(v[3 * i], v[3 * i + 1], v[3 * i + 2]);
-        let tm = |i: usize| TestMassCommand { force_orf_n: at(i), torque_orf_nm: at(i + 1) };
-        Self { mps_force_srf_n: at(0), mps_torque_srf_nm: at(1), tm: [tm(2), tm(4)] }
-    }
-}
-
-const WIDTH: usize = CHANNELS.len();
-
-/// The `n`-th second-order section of every channel (direct form II transposed), arrays over the channels.
+/// The `n`-th second-order section of every channel (direct form II transposed), rows over the channels.
 struct Sections {
-    b: [[f64; WIDTH]; 3],
-    a: [[f64; WIDTH]; 2],
-    states: [[f64; WIDTH]; 2],
+    b: [Vec<f64>; 3],
+    a: [Vec<f64>; 2],
+    states: [Vec<f64>; 2],
 }
 
 impl Sections {
     /// A channel that has no such section hands its input on.
-    fn new(controllers: &[&ChannelController; WIDTH], n: usize) -> Self {
+    fn new(controllers: &[&ChannelController], n: usize) -> Self {
         const UNIT: [f64; 5] = [1.0, 0.0, 0.0, 0.0, 0.0];
-        let of =
-            |coefficient: usize| std::array::from_fn(|c| controllers[c].sections.get(n).unwrap_or(&UNIT)[coefficient]);
-        Self { b: [of(0), of(1), of(2)], a: [of(3), of(4)], states: [[0.0; WIDTH]; 2] }
+        let of = |coefficient: usize| -> Vec<f64> {
+            controllers.iter().map(|c| c.sections.get(n).unwrap_or(&UNIT)[coefficient]).collect()
+        };
+        let zero = || vec![0.0; controllers.len()];
+        Self { b: [of(0), of(1), of(2)], a: [of(3), of(4)], states: [zero(), zero()] }
     }
 
-    fn step(&mut self, x: &mut [f64; WIDTH]) {
-        let ([b0, b1, b2], [a1, a2], [s0, s1]) = (&self.b, &self.a, &mut self.states);
-        for c in 0..WIDTH {
+    fn step(&mut self, x: &mut [f64]) {
+        // Slices of one length, so that the loop needs no checks.
+        let width = x.len();
+        let ([b0, b1, b2], [a1, a2]) = (self.b.each_ref().map(|v| &v[..width]), self.a.each_ref().map(|v| &v[..width]));
+        let [s0, s1] = self.states.each_mut().map(|v| &mut v[..width]);
+        for c in 0..width {
             let out = b0[c] * x[c] + s0[c];
             s0[c] = b1[c] * x[c] - a1[c] * out + s1[c];
             s1[c] = b2[c] * x[c] - a2[c] * out;
@@ -135,25 +48,37 @@ impl Sections {
 
 /// The controllers of all channels.
 struct Controllers {
-    gain_s2: [f64; WIDTH],
+    gain_s2: Vec<f64>,
     sections: Vec<Sections>,
+    /// Readouts, and what the controllers make of them.
+    values: Vec<f64>,
 }
 
 impl Controllers {
-    fn new(controllers: &[&ChannelController; WIDTH]) -> Self {
+    fn new(controllers: &[&ChannelController]) -> Self {
         let longest = controllers.iter().map(|c| c.sections.len()).max().unwrap_or(0);
         Self {
-            gain_s2: controllers.map(|c| c.gain_s2),
+            gain_s2: controllers.iter().map(|c| c.gain_s2).collect(),
             sections: (0..longest).map(|n| Sections::new(controllers, n)).collect(),
+            values: vec![0.0; controllers.len()],
         }
     }
 
     /// `u_d = −gain · H(z) y`, channel by channel.
-    fn step(&mut self, mut y: [f64; WIDTH]) -> Accelerations {
-        for sections in &mut self.sections {
-            sections.step(&mut y);
+    fn step(&mut self, y: &Readout) -> &mut [f64] {
+        let (spacecraft, test_masses) = self.values.split_at_mut(3);
+        spacecraft.copy_from_slice(y.sc_crf_rad.as_slice());
+        for (slots, tm) in test_masses.chunks_exact_mut(6).zip(&y.tm) {
+            slots[..3].copy_from_slice(tm.r_orf_m.as_slice());
+            slots[3..].copy_from_slice(tm.att_orf_rad.as_slice());
         }
-        Accelerations::from_fn(|c, _| -self.gain_s2[c] * y[c])
+        for sections in &mut self.sections {
+            sections.step(&mut self.values);
+        }
+        for (value, gain) in self.values.iter_mut().zip(&self.gain_s2) {
+            *value *= -gain;
+        }
+        &mut self.values
     }
 
     fn states(&self) -> impl Iterator<Item = &f64> {
@@ -178,7 +103,7 @@ pub struct StateError {
 /// The running control law.
 pub struct ControlLaw {
     plant: LinearPlant,
-    allocation: AllocationMatrix,
+    allocation: Allocator,
     controllers: Controllers,
     limits: Option<Actuators>,
     /// `k_dSC`, N, and the arm of the force, SRF, m.
@@ -197,23 +122,23 @@ impl ControlLaw {
         if control.channel.is_empty() {
             control.channel = design(mission)?.controllers();
         }
-        let channel = |name: &&str| {
-            control.channel.get(*name).ok_or_else(|| MissionError::Missing {
+        let channel = |name: &String| {
+            control.channel.get(name).ok_or_else(|| MissionError::Missing {
                 section: format!("control.channel.\"{name}\""),
                 needed_by: NEEDED_BY,
             })
         };
-        let channels = CHANNELS.iter().map(channel).collect::<Result<Vec<_>, _>>()?;
-        let controllers = Controllers::new(&std::array::from_fn(|c| channels[c]));
+        let channels = mission.channels();
+        let controllers = Controllers::new(&channels.iter().map(channel).collect::<Result<Vec<_>, _>>()?);
         let plant = LinearPlant::new(mission)?;
-        let allocation = plant.allocation()?.matrix;
+        let allocation = Allocator::new(&plant.allocation()?);
         Ok(Self {
             plant,
             allocation,
             controllers,
             limits: mission.actuators.clone(),
             sunlight: mission.solar_pressure.as_ref().map(|s| (s.force_n, Vector3::from(s.arm_srf_m))),
-            waiting: (0..control.delay_samples).map(|_| Command::default()).collect(),
+            waiting: (0..control.delay_samples).map(|_| Command::zero(mission.test_mass.len())).collect(),
         })
     }
 
@@ -232,9 +157,9 @@ impl ControlLaw {
     /// taken off thrust and torque. (eq:SRP_acceleration_estimate prints `+T F̂/m_S` where `r̈ ∋ −T F̂/m_S`, and zeros
     /// where a test mass sees the spacecraft turn.)
     fn respond(&mut self, y: &Readout) -> Command {
-        let p = [&y.sc_crf_rad, &y.tm[0].r_orf_m, &y.tm[0].att_orf_rad, &y.tm[1].r_orf_m, &y.tm[1].att_orf_rad];
-        let wanted = self.controllers.step(std::array::from_fn(|c| p[c / 3][c % 3])) - self.plant.stiffness(y);
-        let mut command = Command::from_vector(&(self.allocation * wanted));
+        let wanted = self.controllers.step(y);
+        self.plant.take_stiffness_off(y, wanted);
+        let mut command = self.allocation.command(&self.plant, wanted);
         if let (Some((force_n, arm)), Some(sun)) = (&self.sunlight, &y.sun_srf) {
             let force = sun * *force_n;
             command.mps_force_srf_n -= force;
@@ -249,8 +174,7 @@ impl ControlLaw {
     /// Everything that the next steps depend on: controllers' states, then the waiting commands.
     #[must_use]
     pub fn state(&self) -> Vec<f64> {
-        let commands = self.waiting.iter().flat_map(|c| c.vectors().into_iter().flat_map(|v| v.iter().copied()));
-        self.controllers.states().copied().chain(commands).collect()
+        self.controllers.states().copied().chain(self.waiting.iter().flat_map(Command::numbers)).collect()
     }
 
     /// Takes back what [`Self::state`] gave, bit for bit.
@@ -259,7 +183,8 @@ impl ControlLaw {
     /// [`StateError`] when the length is another law's; the law is then unchanged.
     pub fn set_state(&mut self, state: &[f64]) -> Result<(), StateError> {
         let sections = self.controllers.states().count();
-        let expected = sections + 18 * self.waiting.len();
+        let width = self.plant.channels() + 3;
+        let expected = sections + width * self.waiting.len();
         if state.len() != expected {
             return Err(StateError { expected, found: state.len() });
         }
@@ -267,8 +192,8 @@ impl ControlLaw {
         for (slot, value) in self.controllers.states_mut().zip(controllers) {
             *slot = *value;
         }
-        for (slot, values) in self.waiting.iter_mut().zip(commands.chunks_exact(18)) {
-            *slot = Command::from_values(values);
+        for (slot, values) in self.waiting.iter_mut().zip(commands.chunks_exact(width)) {
+            *slot = Command::from_numbers(values);
         }
         Ok(())
     }
@@ -289,19 +214,19 @@ pub(crate) mod tests {
     fn readout(k: usize) -> Readout {
         let v = |i: usize| Vector3::from_fn(|j, _| 1e-8 * ((k * 7 + i * 3 + j) as f64).sin());
         let tm = |i: usize| TestMassReadout { r_orf_m: v(i), att_orf_rad: v(i + 1) };
-        Readout { sc_crf_rad: v(0), tm: [tm(1), tm(3)], sun_srf: Some(Vector3::new(0.866, 0.1, -0.5)) }
+        Readout { sc_crf_rad: v(0), tm: [tm(1), tm(3)].into(), sun_srf: Some(Vector3::new(0.866, 0.1, -0.5)) }
     }
 
     /// A displaced test mass pulls the spacecraft after it, a lateral one is pushed back: the signs of r̈ = −T F_T/m_S + F_E/m_m.
     #[test]
     fn commands_oppose_the_readout() {
-        let mut y = Readout::default();
+        let mut y = Readout::zero(2);
         y.tm[0].r_orf_m = Vector3::new(1e-8, 1e-8, 0.0);
         y.tm[1].r_orf_m = Vector3::new(1e-8, 1e-8, 0.0);
         y.sc_crf_rad = Vector3::new(1e-8, 0.0, 0.0);
         let mut law = law();
         let first = law.step(&y);
-        assert_eq!(first, Command::default(), "a sample of delay");
+        assert_eq!(first, Command::zero(2), "a sample of delay");
         let command = law.step(&y);
         assert!(command.mps_force_srf_n.x > 0.0 && command.mps_torque_srf_nm.x < 0.0, "{command:?}");
         assert!(command.tm[0].force_orf_n.y < 0.0 && command.tm[0].force_orf_n.x == 0.0, "{command:?}");
@@ -312,7 +237,7 @@ pub(crate) mod tests {
     fn feed_forward_cancels_sunlight() {
         let sun = Vector3::new(0.6, 0.0, -0.8);
         let mut law = law();
-        let y = Readout { sun_srf: Some(sun), ..Readout::default() };
+        let y = Readout { sun_srf: Some(sun), ..Readout::zero(2) };
         law.step(&y);
         let command = law.step(&y);
         let force = 6.3513e-5 * sun;
@@ -330,7 +255,7 @@ pub(crate) mod tests {
         law.step(&y);
         let c = law.step(&y);
         let limits = taiji().actuators.unwrap();
-        assert!(c.reaches(&limits) && !Command::default().reaches(&limits));
+        assert!(c.reaches(&limits) && !Command::zero(2).reaches(&limits));
         assert_eq!(c.mps_force_srf_n.amax(), 1e-3);
         assert_eq!(c.mps_torque_srf_nm.amax(), 1e-3);
         assert_eq!(c.tm[0].force_orf_n.amax(), 5e-9);
@@ -357,7 +282,7 @@ pub(crate) mod tests {
         for delay_samples in [0, 1, 3] {
             mission.control = Some(Control { delay_samples, ..Control::default() });
             let mut law = ControlLaw::new(&mission).unwrap();
-            let silent = (0..10).take_while(|_| law.step(&readout(1)) == Command::default()).count();
+            let silent = (0..10).take_while(|_| law.step(&readout(1)) == Command::zero(2)).count();
             assert_eq!(silent, delay_samples as usize);
         }
     }

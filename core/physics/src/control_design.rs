@@ -1,4 +1,4 @@
-//! The design of the fifteen controllers when a mission file brings none: one H-infinity problem per channel, from the
+//! The design of the controllers when a mission file brings none: one H-infinity problem per channel, from the
 //! requirement table and the noise model (eqs W1_weight and W3_weight).
 //!
 //! **The problem.** After the decoupling a channel is `p̈ = u_d + F_u d`, read out as `p + F_y n`; `B` is what the table
@@ -29,7 +29,7 @@ use std::f64::consts::{PI, TAU};
 
 use crate::hinf::{GeneralizedPlant, HinfError, Synthesis, bounded_real, norm};
 use crate::lti::{LtiError, StateSpace, sections_response};
-use crate::mission::{CHANNELS, ChannelController, Mission, MissionError};
+use crate::mission::{ANGLES, AXES, ChannelController, Mission, MissionError, SPACECRAFT};
 use crate::noise::{NoiseShape, NoiseTerm};
 use crate::schur::eigenvalues;
 
@@ -91,7 +91,7 @@ pub enum DesignError {
     )]
     OutOfReach {
         /// Channel.
-        channel: &'static str,
+        channel: String,
         /// Key of the requirement in the mission file.
         requirement: &'static str,
         /// Worst frequency above the relaxed band, Hz.
@@ -111,7 +111,7 @@ pub enum DesignError {
     )]
     TooGreedy {
         /// Channel.
-        channel: &'static str,
+        channel: String,
         /// `W1` or `W3`, whichever uses up more of γ at the worst frequency.
         weight: &'static str,
         /// Where the stacked norm is largest, Hz.
@@ -127,7 +127,7 @@ pub enum DesignError {
     #[error("control design, channel {channel}: {source}")]
     Synthesis {
         /// Channel.
-        channel: &'static str,
+        channel: String,
         /// What went wrong.
         source: HinfError,
     },
@@ -138,7 +138,7 @@ pub enum DesignError {
     )]
     NotKept {
         /// Channel.
-        channel: &'static str,
+        channel: String,
         /// What is above one.
         what: &'static str,
         /// Where, Hz.
@@ -236,8 +236,8 @@ impl Requirement {
 /// What acts on a channel and what it must keep: the mission file seen from one degree of freedom.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ChannelModel {
-    /// Name, one of [`CHANNELS`].
-    pub name: &'static str,
+    /// Name, one of [`Mission::channels`].
+    pub name: String,
     /// `B`.
     pub requirement: Requirement,
     /// `F_u`: acceleration that disturbs the channel, m s⁻² or rad s⁻².
@@ -370,8 +370,8 @@ impl std::fmt::Display for Unattainable {
 /// One channel's controller, and everything that can be said of its loop.
 #[derive(Clone, Debug)]
 pub struct ChannelDesign {
-    /// Channel, one of [`CHANNELS`].
-    pub name: &'static str,
+    /// Channel, one of [`Mission::channels`].
+    pub name: String,
     /// Smallest γ of the synthesis.
     pub gamma: f64,
     /// `‖F_l(P, K)‖∞` of the controller that flies, from its sampled coefficients, by the Hamiltonian test.
@@ -420,7 +420,7 @@ pub struct ChannelDesign {
 /// The whole design.
 #[derive(Clone, Debug)]
 pub struct Design {
-    /// In the order of [`CHANNELS`].
+    /// In the order of [`Mission::channels`].
     pub channels: Vec<ChannelDesign>,
 }
 
@@ -428,31 +428,26 @@ impl Design {
     /// The controllers by channel, as `[control.channel]` holds them.
     #[must_use]
     pub fn controllers(&self) -> BTreeMap<String, ChannelController> {
-        self.channels.iter().map(|c| (c.name.to_owned(), c.controller.clone())).collect()
+        self.channels.iter().map(|c| (c.name.clone(), c.controller.clone())).collect()
     }
 }
 
-/// Designs all fifteen channels; channels of equal weights share one synthesis.
+/// Designs all channels; channels of equal weights share one synthesis.
 ///
 /// # Errors
 /// [`DesignError`] names the channel, the weight and the frequency that stand in the way, or the missing section.
 pub fn design(mission: &Mission) -> Result<Design, DesignError> {
     let sampling = Sampling::of(mission);
-    let mut channels: Vec<ChannelDesign> = Vec::with_capacity(CHANNELS.len());
-    for name in CHANNELS {
-        let model = channel_model(mission, name)?;
-        let twin = channels.iter().find(|c| ChannelModel { name, ..c.model.clone() } == model);
+    let mut channels: Vec<ChannelDesign> = Vec::new();
+    for name in mission.channels() {
+        let model = channel_model(mission, &name)?;
+        let twin = channels.iter().find(|c| ChannelModel { name: name.clone(), ..c.model.clone() } == model);
         channels.push(match twin {
             Some(twin) => ChannelDesign { name, model, ..twin.clone() },
             None => design_channel(model, sampling)?,
         });
     }
     Ok(Design { channels })
-}
-
-/// Splits `tm1.x` into body and degree of freedom.
-fn parts(channel: &'static str) -> (&'static str, &'static str) {
-    channel.split_once('.').unwrap_or((channel, ""))
 }
 
 /// A shape times a factor.
@@ -465,7 +460,7 @@ fn scaled(shape: &NoiseShape, factor: f64) -> impl Iterator<Item = NoiseTerm> + 
 /// Thrusters and sunlight disturb every channel, through the spacecraft's acceleration and, at a test mass, through
 /// `α × b` at the nominal offset; electrodes and stray accelerations disturb a test mass directly. Gains are the
 /// lengths of the rows that take three independent axes to this one.
-fn channel_model(mission: &Mission, name: &'static str) -> Result<ChannelModel, DesignError> {
+fn channel_model(mission: &Mission, name: &str) -> Result<ChannelModel, DesignError> {
     let n = &mission.noise;
     macro_rules! shape {
         ($key:ident) => {
@@ -473,44 +468,50 @@ fn channel_model(mission: &Mission, name: &'static str) -> Result<ChannelModel, 
         };
     }
     let r = Mission::need(&mission.requirements, "requirements", NEEDED_BY)?;
-    let (body, freedom) = parts(name);
+    let (body, freedom) = name.split_once('.').unwrap_or((name, ""));
+    let is_angle = ANGLES.contains(&freedom);
+    let axis = AXES.iter().chain(&ANGLES).position(|f| *f == freedom).unwrap_or_default() % 3;
     let requirement = |key, asd, corner_hz| Requirement { key, asd, corner_hz };
-    let (requirement, readout) = match (body, freedom) {
-        ("sc", _) => (
-            requirement("requirements.sc_attitude_rad_rthz", r.sc_attitude_rad_rthz, r.corner_hz),
-            shape!(dws_long_arm),
-        ),
-        (_, "x") => (requirement("requirements.tm_x_m_rthz", r.tm_x_m_rthz, 0.0), shape!(ifo_x)),
-        (_, "y") => (requirement("requirements.tm_yz_m_rthz", r.tm_yz_m_rthz, 0.0), shape!(is_y)),
-        (_, "z") => (requirement("requirements.tm_yz_m_rthz", r.tm_yz_m_rthz, 0.0), shape!(is_z)),
-        (_, "phi") => (requirement("requirements.tm_phi_rad_rthz", r.tm_phi_rad_rthz, r.corner_hz), shape!(is_angle)),
-        _ => {
-            (requirement("requirements.tm_theta_psi_rad_rthz", r.tm_theta_psi_rad_rthz, r.corner_hz), shape!(dws_local))
-        }
-    };
-    let axis = match freedom {
-        "x" | "phi" => 0,
-        "y" | "theta" => 1,
-        _ => 2,
+    let (requirement, readout) = if body == SPACECRAFT {
+        let key = "requirements.sc_attitude_rad_rthz";
+        (requirement(key, r.sc_attitude_rad_rthz, r.corner_hz), shape!(dws_long_arm))
+    } else {
+        let tm = mission.test_mass(body, NEEDED_BY)?;
+        let requirement = match (is_angle, axis) {
+            (false, 0) => requirement("requirements.tm_x_m_rthz", r.tm_x_m_rthz, 0.0),
+            (false, _) => requirement("requirements.tm_yz_m_rthz", r.tm_yz_m_rthz, 0.0),
+            (true, 0) => requirement("requirements.tm_phi_rad_rthz", r.tm_phi_rad_rthz, r.corner_hz),
+            (true, _) => requirement("requirements.tm_theta_psi_rad_rthz", r.tm_theta_psi_rad_rthz, r.corner_hz),
+        };
+        let readout = if !is_angle {
+            let (key, noise) = mission.displacement_noise(tm, axis);
+            let missing = || MissionError::Missing { section: format!("noise.{key}"), needed_by: NEEDED_BY };
+            noise.ok_or_else(missing)?.shape()
+        } else if axis > 0 && tm.has_interferometer(0) {
+            shape!(dws_local)
+        } else {
+            shape!(is_angle)
+        };
+        (requirement, readout)
     };
     // Rows that take torque and force, SRF, to this channel's acceleration.
     let inverse = mission.spacecraft.inertia_inverse();
     let row = |m: &Matrix3<f64>| m.row(axis).into_owned();
     let (torque, force): (RowVector3<f64>, RowVector3<f64>);
     let mut terms: Vec<NoiseTerm> = Vec::new();
-    if body == "sc" {
+    if body == SPACECRAFT {
         (torque, force) = (row(&inverse), RowVector3::zeros());
     } else {
         let tm = mission.test_mass(body, NEEDED_BY)?;
         let dcm = tm.dcm_orf_from_srf();
-        if matches!(freedom, "phi" | "theta" | "psi") {
+        if is_angle {
             (torque, force) = (row(&(dcm * inverse)), RowVector3::zeros());
             let own = row(&tm.inertia_inverse(body, NEEDED_BY)?);
             terms.extend(scaled(&shape!(electrostatic_torque), own.norm()));
         } else {
             let lever = dcm * Vector3::from(tm.offset_nominal_srf_m).cross_matrix() * inverse;
             (torque, force) = (row(&lever), row(&dcm) / mission.spacecraft.mass_kg);
-            if freedom != "x" {
+            if !tm.is_drag_free(axis) {
                 terms.extend(scaled(&shape!(electrostatic_force), 1.0 / tm.mass_kg));
             }
             terms.extend(n.test_mass_acceleration.iter().flat_map(|t| t.shape().terms));
@@ -524,9 +525,15 @@ fn channel_model(mission: &Mission, name: &'static str) -> Result<ChannelModel, 
         terms.extend(scaled(&noise.shape(), force.norm() + torque.norm() * arm.norm()));
     }
     terms.retain(|t| t.asd > 0.0);
-    let control = mission.control.as_ref().filter(|_| body == "sc");
+    let control = mission.control.as_ref().filter(|_| body == SPACECRAFT);
     let bandwidth_factor = control.map_or(1.0, |c| c.attitude_bandwidth_factor);
-    Ok(ChannelModel { name, requirement, disturbance: NoiseShape { terms }, readout, bandwidth_factor })
+    Ok(ChannelModel {
+        name: name.to_owned(),
+        requirement,
+        disturbance: NoiseShape { terms },
+        readout,
+        bandwidth_factor,
+    })
 }
 
 /// `a n/√(a² + n²)`: the smallest ASD over requirement that `S + T = 1` allows, for `a = |W_1|` and `n = |W_3|`.
@@ -544,7 +551,7 @@ fn must_be_in_reach(model: &ChannelModel, sampling: Sampling) -> Result<(), Desi
     match worst {
         Some((frequency_hz, disturbance_ratio, noise_ratio)) if best_ratio(disturbance_ratio, noise_ratio) > 1.0 => {
             Err(DesignError::OutOfReach {
-                channel: model.name,
+                channel: model.name.clone(),
                 requirement: model.requirement.key,
                 frequency_hz,
                 noise_ratio,
@@ -658,7 +665,7 @@ fn generalized(weights: &Weights, bandwidth: f64, delay: &StateSpace) -> General
 /// One channel: weights, synthesis, the sampled controller, and its certificates.
 fn design_channel(model: ChannelModel, sampling: Sampling) -> Result<ChannelDesign, DesignError> {
     must_be_in_reach(&model, sampling)?;
-    let failed = |source| DesignError::Synthesis { channel: model.name, source };
+    let failed = |source| DesignError::Synthesis { channel: model.name.clone(), source };
     let (problem, synthesis, gamma) = best_problem(&model, sampling).map_err(failed)?;
     let Flown { central, controller, closed, gamma_flown } = sample(&problem, &synthesis, gamma).map_err(failed)?;
     let flown = Loop { model: &model, sampling, controller: &controller };
@@ -670,7 +677,7 @@ fn design_channel(model: ChannelModel, sampling: Sampling) -> Result<ChannelDesi
     let (max_asd_ratio, unattainable) = flown.table()?;
     let margins = flown.margins();
     Ok(ChannelDesign {
-        name: model.name,
+        name: model.name.clone(),
         gamma,
         gamma_flown,
         order: central.order(),
@@ -841,7 +848,7 @@ impl Loop<'_> {
         }
         for (what, (value, frequency_hz)) in [("|S| |W1|", s), ("|T| |W3|", t)] {
             if value > 1.0 {
-                return Err(DesignError::NotKept { channel: self.model.name, what, frequency_hz, value });
+                return Err(DesignError::NotKept { channel: self.model.name.clone(), what, frequency_hz, value });
             }
         }
         Ok((s.0, t.0))
@@ -867,7 +874,12 @@ impl Loop<'_> {
             // Where readout noise alone uses up the requirement, W_3 was capped and promises nothing.
             if promised {
                 let what = "predicted ASD over requirement";
-                return Err(DesignError::NotKept { channel: self.model.name, what, frequency_hz: f, value: ratio });
+                return Err(DesignError::NotKept {
+                    channel: self.model.name.clone(),
+                    what,
+                    frequency_hz: f,
+                    value: ratio,
+                });
             }
             let band = missed.get_or_insert(Unattainable {
                 requirement: self.model.requirement.key,
@@ -923,7 +935,7 @@ impl Loop<'_> {
             .max_by(|(_, (a, b)), (_, (c, d))| a.hypot(*b).total_cmp(&c.hypot(*d)))
             .unwrap_or((BAND_HZ.0, (0.0, 0.0)));
         DesignError::TooGreedy {
-            channel: self.model.name,
+            channel: self.model.name.clone(),
             weight: if s > t { "W1" } else { "W3" },
             frequency_hz,
             gamma,
@@ -1096,7 +1108,7 @@ pub(crate) mod tests {
         let DesignError::OutOfReach { channel, requirement, frequency_hz, noise_ratio, best_ratio, .. } = &error else {
             panic!("{error}")
         };
-        assert_eq!((*channel, *requirement), ("tm1.y", "requirements.tm_yz_m_rthz"));
+        assert_eq!((channel.as_str(), *requirement), ("tm1.y", "requirements.tm_yz_m_rthz"));
         let exact = 1.8 * 2.0_f64.sqrt();
         assert!(
             (frequency_hz / 1e-3 - 1.0).abs() < 1e-6 && (noise_ratio / exact - 1.0).abs() < 1e-6 && *best_ratio > 2.5
@@ -1108,7 +1120,7 @@ pub(crate) mod tests {
         mission.requirements.as_mut().unwrap().tm_x_m_rthz = 1e-10;
         let error = design(&mission).unwrap_err();
         let DesignError::TooGreedy { channel, weight, gamma, frequency_hz, .. } = &error else { panic!("{error}") };
-        assert_eq!((*channel, *weight), ("tm1.x", "W1"));
+        assert_eq!((channel.as_str(), *weight), ("tm1.x", "W1"));
         assert!(*gamma > 1.0 && (1e-4..0.5).contains(frequency_hz), "{error}");
     }
 
@@ -1225,8 +1237,8 @@ pub(crate) mod tests {
             n.is_angle.as_mut().unwrap().asd_rad_rthz *= factor(noises[4]);
             n.dws_local.as_mut().unwrap().asd_rad_rthz *= factor(noises[5]);
             let sampling = Sampling::of(&m);
-            for name in CHANNELS {
-                match design_channel(channel_model(&m, name).unwrap(), sampling) {
+            for name in m.channels() {
+                match design_channel(channel_model(&m, &name).unwrap(), sampling) {
                     Ok(c) => {
                         assert_kept(&c, "random mission");
                         if let Some(band) = c.unattainable {

@@ -1,39 +1,40 @@
 //! The static decoupling of the paper (eqs decoupled_input and generalized_inverse_optimization): the linear plant
-//! `p̈ = A_v p + B_v u` of the nominal mission, and the allocation `B_v†` of fifteen wanted accelerations to sixteen inputs.
+//! `p̈ = A_v p + B_v u` of the nominal mission, and the allocation `B_v†` of the channels' wanted accelerations to the inputs.
+//!
+//! Of `n` test masses there are `3 + 6n` channels. The inputs are thrust and torque of the thrusters, three each, and of
+//! each test mass the electrodes' forces along the axes that are not drag-free and their three torques: with `d` drag-free
+//! axes `6 + 6n − d`, so that `3 − d` of the three directions of thrust are free. The paper's spacecraft has `d = 2`, fifteen
+//! channels and sixteen inputs. One test mass that is drag-free along all of its axes has `d = 3`: nine of each, and
+//! `B_v† = B_v⁻¹`.
 
 use clarabel::algebra::CscMatrix;
 use clarabel::solver::{DefaultSettings, DefaultSolver, IPSolver, SolverStatus, ZeroConeT};
-use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 
-use crate::control::{Command, Readout};
 use crate::mission::{Mission, MissionError};
+use crate::signals::{Command, Readout, TestMassCommand};
 
 const NEEDED_BY: &str = "the control law";
 
-/// Inputs of eq:input_variables_reduced: `F_T` (3), `M_T` (3), then for each test mass `F_E` (y, z) and `M_E` (3).
-pub const INPUTS: usize = 16;
-/// Rows of the input vector that hold the thrust along `s_1`, `s_2`, `s_3`.
-const THRUST: [usize; 3] = [0, 1, 2];
-/// Rows of eq:state_variables that hold `x_1` and `x_2`, and `z_1` and `z_2`.
-const X: [usize; 2] = [3, 9];
-const Z: [usize; 2] = [5, 11];
-/// Rows of the input vector that the electrodes carry.
-const ELECTRODES: std::ops::Range<usize> = 6..INPUTS;
+/// Rows of the input vector that hold thrust and torque of the thrusters.
+const THRUSTERS: usize = 6;
 /// Largest element of `B_v B_v† − 1`, in units of the channels' own accelerations.
 const RESIDUAL_TOLERANCE: f64 = 1e-12;
-
-pub(crate) type Accelerations = SVector<f64, 15>;
-pub(crate) type InputVector = SVector<f64, INPUTS>;
-/// `B_v`: fifteen channels by sixteen inputs, m s⁻² or rad s⁻² per N or N m.
-type InputMatrix = SMatrix<f64, 15, INPUTS>;
-/// `B_v†`: sixteen inputs by fifteen channels, N or N m per m s⁻² or rad s⁻².
-pub type AllocationMatrix = SMatrix<f64, INPUTS, 15>;
+/// Sine of the angle within which two drag-free axes are the same to the thrusters. The electrodes' reaction, `m_m/m_S`, would still
+/// make `B_v` regular, with thrust beyond all use.
+const PARALLEL: f64 = 0.05;
 
 /// The plant of eq:state_space_model that the decoupling assumes: nominal masses, offsets and stiffness.
 pub(crate) struct LinearPlant {
     sc_mass_kg: f64,
     sc_inertia_inverse: Matrix3<f64>,
-    tm: [LinearTestMass; 2],
+    tm: Vec<LinearTestMass>,
+    /// Columns are orthogonal directions of thrust in SRF: those along drag-free axes first, then the free ones.
+    thrust: Matrix3<f64>,
+    /// Whether they are not the axes of SRF in their order.
+    turned: bool,
+    /// How many directions of thrust are free.
+    free: usize,
 }
 
 struct LinearTestMass {
@@ -45,37 +46,130 @@ struct LinearTestMass {
     stiffness_tr: Matrix3<f64>,
     stiffness_rt: Matrix3<f64>,
     stiffness_rr: Matrix3<f64>,
+    /// Axes along which electrodes push.
+    suspended: Vec<usize>,
+}
+
+impl LinearTestMass {
+    /// Inputs of its electrodes.
+    fn inputs(&self) -> usize {
+        self.suspended.len() + 3
+    }
+}
+
+/// Splits directions of thrust into those that drag-free axes take and those that are free; `None` when two drag-free
+/// axes, or three, leave each other no direction of their own.
+fn directions_of_thrust(drag_free: &[Vector3<f64>]) -> Option<(Matrix3<f64>, usize)> {
+    // The axes of SRF where they do: two axes across s_3 take s_1 and s_2, one along s_3 takes s_3.
+    let taken = |axis: usize| drag_free.iter().any(|d| d[axis] != 0.0);
+    let mut order: Vec<usize> = (0..3).filter(|axis| taken(*axis)).collect();
+    let aligned = order.len() == drag_free.len();
+    order.extend((0..3).filter(|axis| !taken(*axis)));
+    let mut basis: Vec<Vector3<f64>> = Vec::new();
+    for axis in drag_free {
+        let rest = basis.iter().fold(*axis, |rest, known| rest - known * known.dot(axis));
+        if rest.norm() < PARALLEL {
+            return None;
+        }
+        basis.push(rest.normalize());
+    }
+    let free = 3 - basis.len();
+    if aligned {
+        let unit = |axis: usize| Vector3::from_fn(|i, _| f64::from(u8::from(i == axis)));
+        return Some((Matrix3::from_columns(&[order[0], order[1], order[2]].map(unit)), free));
+    }
+    while basis.len() < 3 {
+        let rest = |axis: usize| {
+            let unit = Vector3::from_fn(|i, _| f64::from(u8::from(i == axis)));
+            basis.iter().fold(unit, |rest, known| rest - known * known.dot(&unit))
+        };
+        let best = (0..3).map(rest).max_by(|a, b| a.norm().total_cmp(&b.norm()))?;
+        basis.push(best.normalize());
+    }
+    Some((Matrix3::from_columns(&basis), free))
 }
 
 impl LinearPlant {
     pub(crate) fn new(mission: &Mission) -> Result<Self, MissionError> {
         let lever = mission.control.as_ref().is_none_or(|c| c.lever_feed_forward);
-        let tm = |name: &str| -> Result<LinearTestMass, MissionError> {
-            let section = mission.test_mass(name, NEEDED_BY)?;
+        let mut tm = Vec::with_capacity(mission.test_mass.len());
+        let mut drag_free = Vec::new();
+        for (name, section) in &mission.test_mass {
             let inertia_inverse = section.inertia_inverse(name, NEEDED_BY)?;
-            Ok(LinearTestMass {
+            let dcm_orf_from_srf = section.dcm_orf_from_srf();
+            drag_free.extend(
+                (0..3).filter(|axis| section.is_drag_free(*axis)).map(|axis| dcm_orf_from_srf.row(axis).transpose()),
+            );
+            tm.push(LinearTestMass {
                 mass_kg: section.mass_kg,
                 inertia_inverse,
-                dcm_orf_from_srf: section.dcm_orf_from_srf(),
+                dcm_orf_from_srf,
                 offset_srf_m: if lever { Vector3::from(section.offset_nominal_srf_m) } else { Vector3::zeros() },
                 stiffness_tt: section.stiffness_tt(),
                 stiffness_tr: section.stiffness_tr(),
                 stiffness_rt: section.stiffness_rt(&inertia_inverse),
                 stiffness_rr: section.stiffness_rr(),
-            })
-        };
+                suspended: (0..3).filter(|axis| !section.is_drag_free(*axis)).collect(),
+            });
+        }
+        if tm.is_empty() {
+            return Err(MissionError::Missing { section: "test_mass".to_owned(), needed_by: NEEDED_BY });
+        }
+        let (thrust, free) = directions_of_thrust(&drag_free).ok_or_else(|| MissionError::Decoupling {
+            reason: "drag-free axes of the test masses are parallel to within 3°, or more than three, and thrust cannot serve \
+                     all of them; check test_mass.*.drag_free and orf_from_srf_angle_rad"
+                .to_owned(),
+        })?;
         Ok(Self {
             sc_mass_kg: mission.spacecraft.mass_kg,
             sc_inertia_inverse: mission.spacecraft.inertia_inverse(),
-            tm: [tm("tm1")?, tm("tm2")?],
+            tm,
+            thrust,
+            turned: thrust != Matrix3::identity(),
+            free,
         })
     }
 
-    /// `B_v u`: accelerations of the fifteen channels, in the order of [`CHANNELS`].
+    pub(crate) fn channels(&self) -> usize {
+        3 + 6 * self.tm.len()
+    }
+
+    fn inputs(&self) -> usize {
+        THRUSTERS + self.tm.iter().map(LinearTestMass::inputs).sum::<usize>()
+    }
+
+    /// Directions of thrust that are free, as rows of the input vector.
+    fn free_thrust(&self) -> std::ops::Range<usize> {
+        3 - self.free..3
+    }
+
+    /// The inputs of eq:input_variables_reduced: `F_T` along the directions of thrust, `M_T`, then of each test mass `F_E`
+    /// along its suspended axes and `M_E`.
+    fn command(&self, u: &[f64]) -> Command {
+        let three = |i: usize| Vector3::new(u[i], u[i + 1], u[i + 2]);
+        let mut at = THRUSTERS;
+        let tm = self.tm.iter().map(|tm| {
+            let mut force_orf_n = Vector3::zeros();
+            for (axis, value) in tm.suspended.iter().zip(&u[at..]) {
+                force_orf_n[*axis] = *value;
+            }
+            let torque_orf_nm = three(at + tm.suspended.len());
+            at += tm.inputs();
+            TestMassCommand { force_orf_n, torque_orf_nm }
+        });
+        Command { mps_force_srf_n: self.thrust_srf(&three(0)), mps_torque_srf_nm: three(3), tm: tm.collect() }
+    }
+
+    /// Thrust in SRF from its components along the directions of thrust.
+    fn thrust_srf(&self, along: &Vector3<f64>) -> Vector3<f64> {
+        if self.turned { self.thrust * along } else { *along }
+    }
+
+    /// `B_v u`: accelerations of the channels, in the order of [`Mission::channels`].
     ///
     /// `α = J_S⁻¹(M_T − Σ T M_Ej − Σ b_j×(T F_Ej))`, `r̈_i = −T((F_T − Σ T F_Ej)/m_S + α×b_i) + F_Ei/m_i`, and a test
     /// mass turns against its housing by `J_m⁻¹ M_Ei − T α`.
-    fn accelerations(&self, u: &Command) -> Accelerations {
+    fn accelerations(&self, u: &Command) -> Vec<f64> {
         let (mut force, mut torque) = (u.mps_force_srf_n, u.mps_torque_srf_nm);
         for (tm, e) in self.tm.iter().zip(&u.tm) {
             let f = tm.dcm_orf_from_srf.tr_mul(&e.force_orf_n);
@@ -83,132 +177,199 @@ impl LinearPlant {
             torque -= tm.dcm_orf_from_srf.tr_mul(&e.torque_orf_nm) + tm.offset_srf_m.cross(&f);
         }
         let alpha = self.sc_inertia_inverse * torque;
-        let mut out = Accelerations::zeros();
-        out.fixed_rows_mut::<3>(0).copy_from(&alpha);
-        for (i, (tm, e)) in self.tm.iter().zip(&u.tm).enumerate() {
+        let mut out = Vec::with_capacity(self.channels());
+        out.extend(&alpha);
+        for (tm, e) in self.tm.iter().zip(&u.tm) {
             let inertial = force / self.sc_mass_kg + alpha.cross(&tm.offset_srf_m);
-            let r = e.force_orf_n / tm.mass_kg - tm.dcm_orf_from_srf * inertial;
-            let turn = tm.inertia_inverse * e.torque_orf_nm - tm.dcm_orf_from_srf * alpha;
-            out.fixed_rows_mut::<3>(3 + 6 * i).copy_from(&r);
-            out.fixed_rows_mut::<3>(6 + 6 * i).copy_from(&turn);
+            out.extend(&(e.force_orf_n / tm.mass_kg - tm.dcm_orf_from_srf * inertial));
+            out.extend(&(tm.inertia_inverse * e.torque_orf_nm - tm.dcm_orf_from_srf * alpha));
         }
         out
     }
 
     /// `B_v`, column by column.
-    fn input_matrix(&self) -> InputMatrix {
-        let mut b = InputMatrix::zeros();
-        for j in 0..INPUTS {
-            let mut unit = InputVector::zeros();
-            unit[j] = 1.0;
-            b.set_column(j, &self.accelerations(&Command::from_vector(&unit)));
-        }
-        b
+    fn input_matrix(&self) -> DMatrix<f64> {
+        let inputs = self.inputs();
+        let column = |j: usize| {
+            let unit: Vec<f64> = (0..inputs).map(|i| f64::from(u8::from(i == j))).collect();
+            DVector::from_vec(self.accelerations(&self.command(&unit)))
+        };
+        DMatrix::from_columns(&(0..inputs).map(column).collect::<Vec<_>>())
     }
 
-    /// `A_v p̂`.
-    pub(crate) fn stiffness(&self, y: &Readout) -> Accelerations {
-        let mut out = Accelerations::zeros();
+    /// Takes `A_v p̂` off the wanted accelerations of the channels.
+    pub(crate) fn take_stiffness_off(&self, y: &Readout, wanted: &mut [f64]) {
         for (i, (s, tm)) in self.tm.iter().zip(&y.tm).enumerate() {
             let r = s.stiffness_tt * tm.r_orf_m + s.stiffness_tr * tm.att_orf_rad;
             let turn = s.stiffness_rt * tm.r_orf_m + s.stiffness_rr * tm.att_orf_rad;
-            out.fixed_rows_mut::<3>(3 + 6 * i).copy_from(&r);
-            out.fixed_rows_mut::<3>(6 + 6 * i).copy_from(&turn);
+            let of_test_mass = &mut wanted[3 + 6 * i..9 + 6 * i];
+            of_test_mass.iter_mut().zip(r.iter().chain(&turn)).for_each(|(wanted, a)| *wanted -= a);
         }
-        out
     }
 }
 
 /// The allocation and how exactly it is one.
 #[derive(Clone, Debug)]
 pub struct Allocation {
-    /// `B_v†`.
-    pub matrix: AllocationMatrix,
+    /// `B_v†`: inputs by channels, N or N m per m s⁻² or rad s⁻². Inputs are thrust along [`Self::thrust`], torque of the
+    /// thrusters, then of each test mass the electrodes' forces along its suspended axes and their torques.
+    pub matrix: DMatrix<f64>,
+    /// Columns are the directions of thrust in SRF; the axes of SRF where drag-free axes lie along or across `s_3`.
+    pub thrust: Matrix3<f64>,
     /// Largest element of `|B_v B_v† − 1|`.
     pub residual: f64,
-    /// By how much eqs x_axis_thrust, y_axis_thrust and z_axis_thrust are missed, relative to the coefficients they equate.
-    /// The third is kept exactly whatever the geometry; the first two follow when the optical benches mirror each other.
-    pub thrust_rules: [f64; 3],
+    /// By how much the rules of thrust are missed, relative to the coefficients that they equate: eqs x_axis_thrust and
+    /// y_axis_thrust for two test masses that are drag-free along x, and eq z_axis_thrust for each free direction of thrust. The last is
+    /// kept exactly whatever the geometry; the first two follow when the optical benches mirror each other.
+    pub thrust_rules: Vec<f64>,
 }
 
 impl Allocation {
     /// The allocation of a mission.
     ///
     /// # Errors
-    /// [`MissionError`]: a section is missing, the sensitive axes are parallel, or the programme has no solution.
+    /// [`MissionError`]: a section is missing, drag-free axes are parallel, or the programme has no solution.
     pub fn new(mission: &Mission) -> Result<Self, MissionError> {
         LinearPlant::new(mission)?.allocation()
     }
 }
 
+/// A matrix ready to make commands: the columns of `B_v†` one after the other.
+pub(crate) struct Allocator {
+    columns: Vec<f64>,
+    /// `B_v† wanted` of the last call.
+    inputs: Vec<f64>,
+}
+
+impl Allocator {
+    pub(crate) fn new(allocation: &Allocation) -> Self {
+        let inputs = vec![0.0; allocation.matrix.nrows()];
+        Self { columns: allocation.matrix.as_slice().to_vec(), inputs }
+    }
+
+    /// The command that gives the channels these accelerations.
+    pub(crate) fn command(&mut self, plant: &LinearPlant, wanted: &[f64]) -> Command {
+        // −0 keeps the sign of the first term: −0 + x is x, for a zero of either sign too.
+        self.inputs.fill(-0.0);
+        for (column, wanted) in self.columns.chunks_exact(self.inputs.len()).zip(wanted) {
+            for (input, weight) in self.inputs.iter_mut().zip(column) {
+                *input += weight * wanted;
+            }
+        }
+        plant.command(&self.inputs)
+    }
+}
+
 impl LinearPlant {
+    /// How much of each channel's acceleration lies along a free direction of thrust: the components of the suspended axes.
+    fn common_motion(&self, direction: usize) -> Vec<f64> {
+        let mut out = vec![0.0; self.channels()];
+        for (i, tm) in self.tm.iter().enumerate() {
+            let along = tm.dcm_orf_from_srf * self.thrust.column(direction);
+            for axis in &tm.suspended {
+                out[3 + 6 * i + axis] = along[*axis];
+            }
+        }
+        out
+    }
+
     /// `B_v†` of eq:generalized_inverse_optimization under the rules of eqs x_axis_thrust to z_axis_thrust.
     ///
-    /// `B_v` has one input more than channels: `B_v B_v† = 1` leaves one freedom for every channel, thrust along `s_3`
-    /// against the electrodes. The rule for that thrust takes fourteen of the fifteen, `F_Tz ∝ u_d6 + u_d12` and nothing
-    /// else; the electrodes' effort settles the last. So the programme is: least electrostatic acceleration, subject to
-    /// `B_v B_v† = 1` and the rule. The rules for `F_Tx` and `F_Ty` then hold by the symmetry of the two optical frames.
+    /// `B_v B_v† = 1` leaves one freedom for every channel and free direction of thrust, thrust along it against the
+    /// electrodes. The paper's rule for that thrust, `F_Tz ∝ u_d6 + u_d12` and nothing else, is taken for each free direction: it
+    /// carries the motion along it that suspended test masses have in common. The electrodes' effort settles the last freedom.
+    /// So the programme is: least electrostatic acceleration, subject to `B_v B_v† = 1` and the rules. The rules for `F_Tx` and
+    /// `F_Ty` then hold by the symmetry of the two optical frames.
     ///
     /// Read to the letter, eqs x_axis_thrust and y_axis_thrust also forbid thrust for any other channel; with the lever
     /// `α×b` and the electrodes' reaction in `B_v`, that and `B_v B_v† = 1` exclude each other.
     pub(crate) fn allocation(&self) -> Result<Allocation, MissionError> {
         let refuse = |reason: String| MissionError::Decoupling { reason };
-        let sensitive = |i: usize| self.tm[i].dcm_orf_from_srf.row(0).transpose();
-        // The electrodes' reaction, m_m/m_S, would still make B_v regular, with thrust beyond all use.
-        if sensitive(0).cross(&sensitive(1)).norm() < 0.05 {
-            return Err(refuse(
-                "the sensitive axes of tm1 and tm2 are parallel to within 3°, and thrust cannot serve both; \
-                 check test_mass.tm2.orf_from_srf_angle_rad"
-                    .to_owned(),
-            ));
-        }
         let b = self.input_matrix();
         let scale = self.input_scale();
-        let share = self.solve(&b, &scale).map_err(refuse)?;
+        let rules: Vec<Vec<f64>> = self.free_thrust().map(|direction| self.common_motion(direction)).collect();
         let singular =
             || refuse("some channel has no actuator of its own; check masses, inertias and angles".to_owned());
-        let with = |thrust_z: f64| with_thrust_z(&b, thrust_z).ok_or_else(singular);
-        // The solver stops at its tolerance; one Newton step along the freedom that is left makes the optimum exact.
-        let matrix = with(share * scale[THRUST[2]])?;
-        let along = with((share + 1.0) * scale[THRUST[2]])? - matrix;
-        let effort = |m: &AllocationMatrix| {
-            let mut electrodes = *m;
-            for i in 0..INPUTS {
-                electrodes.row_mut(i).scale_mut(if ELECTRODES.contains(&i) { 1.0 / scale[i] } else { 0.0 });
+        let with = |shares: &[f64]| self.with_thrust(&b, &rules, shares).ok_or_else(singular);
+        let units: Vec<f64> = self.free_thrust().map(|row| scale[row]).collect();
+        let scaled = |shares: &[f64]| shares.iter().zip(&units).map(|(share, unit)| share * unit).collect::<Vec<_>>();
+        let shares = if rules.is_empty() { Vec::new() } else { self.solve(&b, &rules, &scale).map_err(refuse)? };
+        // The solver stops at its tolerance; one Newton step along the freedoms that are left makes the optimum exact.
+        let mut matrix = with(&scaled(&shares))?;
+        if !rules.is_empty() {
+            let effort = |m: &DMatrix<f64>| {
+                DMatrix::from_fn(m.nrows(), m.ncols(), |i, j| {
+                    m[(i, j)] * if i >= THRUSTERS { 1.0 / scale[i] } else { 0.0 }
+                })
+            };
+            let here = effort(&matrix);
+            let mut slopes = Vec::with_capacity(rules.len());
+            for direction in 0..rules.len() {
+                let mut one_more = shares.clone();
+                one_more[direction] += 1.0;
+                slopes.push(effort(&(with(&scaled(&one_more))? - &matrix)));
             }
-            electrodes
-        };
-        let (here, slope) = (effort(&matrix), effort(&along));
-        let matrix = with((share - here.dot(&slope) / slope.norm_squared()) * scale[THRUST[2]])?;
+            let curvature = DMatrix::from_fn(slopes.len(), slopes.len(), |i, j| {
+                if i == j { slopes[i].norm_squared() } else { slopes[i].dot(&slopes[j]) }
+            });
+            let gradient = DVector::from_fn(slopes.len(), |i, _| here.dot(&slopes[i]));
+            let step = curvature.lu().solve(&gradient).ok_or_else(singular)?;
+            let best: Vec<f64> = shares.iter().zip(&step).map(|(share, step)| share - step).collect();
+            matrix = with(&scaled(&best))?;
+        }
 
-        let residual = (b * matrix - SMatrix::<f64, 15, 15>::identity()).amax();
+        // Column by column: blocks of a large product would be added in an order that depends on the machine.
+        let product = |j: usize| {
+            let zero = DVector::zeros(self.channels());
+            (0..self.inputs()).fold(zero, |sum, k| sum + b.column(k) * matrix[(k, j)])
+        };
+        let product = DMatrix::from_columns(&(0..self.channels()).map(product).collect::<Vec<_>>());
+        let residual = (product - DMatrix::identity(self.channels(), self.channels())).amax();
         if residual.is_nan() || residual > RESIDUAL_TOLERANCE {
             return Err(refuse(format!(
                 "B B† differs from 1 by {residual:e}, more than {RESIDUAL_TOLERANCE:e}; check masses, inertias and offsets"
             )));
         }
-        let rule = |input: usize, channels: [usize; 2], sign: f64| {
-            let [one, two] = channels.map(|c| matrix[(input, c)]);
-            (one - sign * two).abs() / one.abs()
-        };
-        let [x, y, z] = THRUST;
-        Ok(Allocation { matrix, residual, thrust_rules: [rule(x, X, 1.0), rule(y, X, -1.0), rule(z, Z, 1.0)] })
+        let thrust_rules = self.thrust_rules(&matrix, &rules);
+        Ok(Allocation { matrix, thrust: self.thrust, residual, thrust_rules })
+    }
+
+    fn thrust_rules(&self, matrix: &DMatrix<f64>, rules: &[Vec<f64>]) -> Vec<f64> {
+        let mut missed = Vec::new();
+        if let ([a, b], 1) = (self.tm.as_slice(), self.free)
+            && [a, b].iter().all(|tm| tm.suspended == [1, 2])
+        {
+            for (input, sign) in [(0, 1.0), (1, -1.0)] {
+                let [one, two] = [3, 9].map(|channel| matrix[(input, channel)]);
+                missed.push((one - sign * two).abs() / one.abs());
+            }
+        }
+        for (input, rule) in self.free_thrust().zip(rules) {
+            let largest = (0..rule.len()).max_by(|a, b| rule[*a].abs().total_cmp(&rule[*b].abs())).unwrap_or_default();
+            let unit = matrix[(input, largest)] / rule[largest];
+            let off = (0..rule.len()).map(|channel| (matrix[(input, channel)] - unit * rule[channel]).abs());
+            missed.push(off.fold(0.0, f64::max) / unit.abs());
+        }
+        missed
     }
 
     /// Input that gives a body of the plant the acceleration 1: the programme is solved in these units.
-    fn input_scale(&self) -> InputVector {
+    fn input_scale(&self) -> Vec<f64> {
         let moment = |inverse: &Matrix3<f64>| 3.0 / inverse.trace();
-        let sc = moment(&self.sc_inertia_inverse);
-        let [a, b] = &self.tm;
-        let [ja, jb] = [moment(&a.inertia_inverse), moment(&b.inertia_inverse)];
-        let (m, ma, mb) = (self.sc_mass_kg, a.mass_kg, b.mass_kg);
-        InputVector::from([m, m, m, sc, sc, sc, ma, ma, ja, ja, ja, mb, mb, jb, jb, jb])
+        let mut scale = vec![self.sc_mass_kg; 3];
+        scale.extend([moment(&self.sc_inertia_inverse); 3]);
+        for tm in &self.tm {
+            scale.extend(tm.suspended.iter().map(|_| tm.mass_kg));
+            scale.extend([moment(&tm.inertia_inverse); 3]);
+        }
+        scale
     }
 
-    /// The quadratic programme in Clarabel, unknowns `B_v†` column by column in units of [`Self::input_scale`]; gives the
-    /// thrust along `s_3` per wanted acceleration of `z_1` or `z_2`.
-    fn solve(&self, b: &InputMatrix, scale: &InputVector) -> Result<f64, String> {
-        let unknown = |input: usize, channel: usize| INPUTS * channel + input;
+    /// The quadratic programme in Clarabel, unknowns `B_v†` column by column in units of [`Self::input_scale`]; gives for each
+    /// rule the thrust per acceleration that it is proportional to.
+    fn solve(&self, b: &DMatrix<f64>, rules: &[Vec<f64>], scale: &[f64]) -> Result<Vec<f64>, String> {
+        let (channels, inputs) = (self.channels(), self.inputs());
+        let unknown = |input: usize, channel: usize| inputs * channel + input;
         let (mut rows, mut columns, mut values, mut right) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         let mut equation = |terms: &[(usize, f64)], value: f64| {
             for (column, weight) in terms.iter().filter(|(_, w)| *w != 0.0) {
@@ -218,19 +379,32 @@ impl LinearPlant {
             }
             right.push(value);
         };
-        for wanted in 0..15 {
-            for answer in 0..15 {
-                let terms: Vec<_> = (0..INPUTS).map(|i| (unknown(i, wanted), b[(answer, i)] * scale[i])).collect();
+        for wanted in 0..channels {
+            for answer in 0..channels {
+                let terms: Vec<_> = (0..inputs).map(|i| (unknown(i, wanted), b[(answer, i)] * scale[i])).collect();
                 equation(&terms, f64::from(u8::from(wanted == answer)));
             }
-            if !Z.contains(&wanted) {
-                equation(&[(unknown(THRUST[2], wanted), 1.0)], 0.0);
+            for (input, rule) in self.free_thrust().zip(rules) {
+                if rule[wanted] == 0.0 {
+                    equation(&[(unknown(input, wanted), 1.0)], 0.0);
+                }
             }
         }
-        equation(&[(unknown(THRUST[2], Z[0]), 1.0), (unknown(THRUST[2], Z[1]), -1.0)], 0.0);
+        let mut firsts = Vec::with_capacity(rules.len());
+        for (input, rule) in self.free_thrust().zip(rules) {
+            let mut moved = (0..channels).filter(|channel| rule[*channel] != 0.0);
+            let first = moved.next().ok_or("no suspended axis lies along a free direction of thrust")?;
+            for other in moved {
+                equation(
+                    &[(unknown(input, first), 1.0 / rule[first]), (unknown(input, other), -1.0 / rule[other])],
+                    0.0,
+                );
+            }
+            firsts.push((unknown(input, first), rule[first]));
+        }
 
-        let unknowns = 15 * INPUTS;
-        let costly: Vec<usize> = (0..unknowns).filter(|u| ELECTRODES.contains(&(u % INPUTS))).collect();
+        let unknowns = channels * inputs;
+        let costly: Vec<usize> = (0..unknowns).filter(|u| u % inputs >= THRUSTERS).collect();
         let effort =
             CscMatrix::new_from_triplets(unknowns, unknowns, costly.clone(), costly.clone(), vec![1.0; costly.len()]);
         let equations = CscMatrix::new_from_triplets(right.len(), unknowns, rows, columns, values);
@@ -240,32 +414,41 @@ impl LinearPlant {
                 .map_err(|e| format!("the solver did not accept the allocation: {e}"))?;
         solver.solve();
         match solver.solution.status {
-            SolverStatus::Solved => Ok(solver.solution.x[unknown(THRUST[2], Z[0])]),
+            SolverStatus::Solved => Ok(firsts.iter().map(|(at, rule)| solver.solution.x[*at] / rule).collect()),
             status => {
                 Err(format!("the solver ended with {status:?}, not with an allocation; check masses and inertias"))
             }
         }
     }
-}
 
-/// The allocation with `F_Tz = thrust_z (u_d6 + u_d12)`: the other fifteen inputs follow without freedom. `None` when they
-/// do not.
-fn with_thrust_z(b: &InputMatrix, thrust_z: f64) -> Option<AllocationMatrix> {
-    let mut row = SMatrix::<f64, 1, 15>::zeros();
-    for z in Z {
-        row[z] = thrust_z;
+    /// The allocation whose thrust along each free direction is `share` times its rule: the other inputs follow without
+    /// freedom. `None` when they do not.
+    fn with_thrust(&self, b: &DMatrix<f64>, rules: &[Vec<f64>], shares: &[f64]) -> Option<DMatrix<f64>> {
+        let channels = self.channels();
+        let free = self.free_thrust();
+        let mut wanted = DMatrix::identity(channels, channels);
+        for ((input, rule), share) in free.clone().zip(rules).zip(shares) {
+            for (j, weight) in rule.iter().enumerate() {
+                let thrust = share * weight;
+                wanted.column_mut(j).axpy(-thrust, &b.column(input), 1.0);
+            }
+        }
+        let others = b.clone().remove_columns(free.start, free.len());
+        let mut out = others.lu().solve(&wanted)?.insert_rows(free.start, free.len(), 0.0);
+        for ((input, rule), share) in free.zip(rules).zip(shares) {
+            for (j, weight) in rule.iter().enumerate() {
+                out[(input, j)] = share * weight;
+            }
+        }
+        Some(out)
     }
-    let wanted = SMatrix::<f64, 15, 15>::identity() - b.column(THRUST[2]) * row;
-    let others: SMatrix<f64, 15, 15> = b.remove_column(THRUST[2]);
-    let mut out: AllocationMatrix = others.lu().solve(&wanted)?.insert_row(THRUST[2], 0.0);
-    out.set_row(THRUST[2], &row);
-    Some(out)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::control_design::tests::taiji;
+    use crate::mission::{Axis, TestMass};
 
     fn allocation(mission: &Mission) -> Allocation {
         Allocation::new(mission).unwrap()
@@ -275,7 +458,7 @@ mod tests {
     fn allocation_is_a_right_inverse_and_keeps_the_rules() {
         let a = allocation(&taiji());
         assert!(a.residual < 1e-12 && a.thrust_rules.iter().all(|r| *r < 1e-12), "{a:?}");
-        assert_eq!(a.thrust_rules[2], 0.0);
+        assert_eq!((a.thrust_rules.len(), a.thrust_rules[2], a.thrust), (3, 0.0, Matrix3::identity()));
     }
 
     proptest::proptest! {
@@ -301,7 +484,7 @@ mod tests {
     #[test]
     fn thrust_follows_the_rules_of_the_paper() {
         let b = allocation(&taiji()).matrix;
-        let ([x1, x2], [z1, z2]) = (X, Z);
+        let ([x1, x2], [z1, z2]) = ([3, 9], [5, 11]);
         // −(c F_x + s F_y)/m_S = u_d4 and −(c F_x − s F_y)/m_S = u_d10.
         let (c, s) = (std::f64::consts::FRAC_PI_6.cos(), 0.5);
         // The electrodes' reaction, m_m/m_S, is the only other way to x.
@@ -322,11 +505,12 @@ mod tests {
     fn the_solver_finds_the_least_effort() {
         let plant = LinearPlant::new(&taiji()).unwrap();
         let (b, scale) = (plant.input_matrix(), plant.input_scale());
-        let share = plant.solve(&b, &scale).unwrap();
+        let rules = [plant.common_motion(2)];
+        let share = plant.solve(&b, &rules, &scale).unwrap()[0];
         assert!((share + 0.5).abs() < 1e-6, "{share}");
         let effort = |thrust_z: f64| {
-            let m = with_thrust_z(&b, thrust_z).unwrap();
-            ELECTRODES.map(|i| m.row(i).norm_squared() / (scale[i] * scale[i])).sum::<f64>()
+            let m = plant.with_thrust(&b, &rules, &[thrust_z]).unwrap();
+            (THRUSTERS..16).map(|i| m.row(i).norm_squared() / (scale[i] * scale[i])).sum::<f64>()
         };
         assert!(effort(-750.0) < effort(-757.5) && effort(-750.0) < effort(-742.5));
     }
@@ -342,7 +526,7 @@ mod tests {
         for i in 0..3 {
             b[(i, 7)] += flipped[i];
         }
-        assert!((b * m - SMatrix::<f64, 15, 15>::identity()).amax() > 1e-6);
+        assert!((b * m - DMatrix::identity(15, 15)).amax() > 1e-6);
     }
 
     #[test]
@@ -350,6 +534,73 @@ mod tests {
         let mut mission = taiji();
         mission.test_mass.get_mut("tm2").unwrap().orf_from_srf_angle_rad = std::f64::consts::FRAC_PI_6;
         let error = Allocation::new(&mission).unwrap_err().to_string();
-        assert!(error.contains("sensitive axes"), "{error}");
+        assert!(error.contains("drag-free axes"), "{error}");
+    }
+
+    /// Test masses in any number, each with its drag-free axes.
+    fn mission_of(layout: &[(&str, f64, &[Axis])]) -> Mission {
+        let mut mission = taiji();
+        let one = mission.test_mass["tm1"].clone();
+        mission.housing = None;
+        mission.test_mass = layout
+            .iter()
+            .enumerate()
+            .map(|(i, (name, angle, drag_free))| {
+                let tm = TestMass {
+                    orf_from_srf_angle_rad: *angle,
+                    offset_nominal_srf_m: [0.1 * i as f64, 0.05, -0.02],
+                    drag_free: drag_free.to_vec(),
+                    ..one.clone()
+                };
+                ((*name).to_owned(), tm)
+            })
+            .collect();
+        mission
+    }
+
+    /// A right inverse whatever the number of test masses and of drag-free axes: three to nothing of the directions of thrust are free.
+    #[test]
+    fn any_number_of_test_masses_and_drag_free_axes_has_an_allocation() {
+        use Axis::{X, Y, Z};
+        let layouts: [(&[(&str, f64, &[Axis])], usize, usize); 7] = [
+            (&[("a", 0.3, &[X, Y, Z])], 9, 9),
+            (&[("a", 0.3, &[X, Y])], 10, 9),
+            (&[("a", 0.3, &[X])], 11, 9),
+            (&[("a", 0.0, &[Z])], 11, 9),
+            (&[("a", 0.5, &[])], 12, 9),
+            (&[("a", 0.5, &[X]), ("b", -0.5, &[X]), ("c", 0.0, &[Z])], 21, 21),
+            (&[("a", 0.5, &[X]), ("b", 0.1, &[]), ("c", 2.0, &[X])], 22, 21),
+        ];
+        for (layout, inputs, channels) in layouts {
+            let a = allocation(&mission_of(layout));
+            assert_eq!(a.matrix.shape(), (inputs, channels), "{layout:?}");
+            assert!(a.thrust_rules.iter().all(|rule| *rule < 1e-12), "{layout:?}: {:?}", a.thrust_rules);
+            assert!((a.thrust.transpose() * a.thrust - Matrix3::identity()).amax() < 1e-15, "{layout:?}");
+        }
+        for layout in [&[("a", 0.3, [X, Y].as_slice()), ("b", -0.3, &[X])][..], &[("a", 0.3, &[Z]), ("b", -0.3, &[Z])]]
+        {
+            let error = Allocation::new(&mission_of(layout)).unwrap_err().to_string();
+            assert!(error.contains("drag-free axes"), "{error}");
+        }
+    }
+
+    /// A spacecraft that follows its only test mass along all axes: `F_T = −m_S T_O^S u_d` plus what undoes the lever, and
+    /// the electrodes turn the test mass against the spacecraft, `M_E = J_m (u + T α)`.
+    #[test]
+    fn a_single_drag_free_test_mass_is_followed_by_thrust_alone() {
+        use Axis::{X, Y, Z};
+        let mut mission = mission_of(&[("a", 0.3, &[X, Y, Z])]);
+        mission.test_mass.get_mut("a").unwrap().offset_nominal_srf_m = [0.0; 3];
+        let plant = LinearPlant::new(&mission).unwrap();
+        let allocation = plant.allocation().unwrap();
+        let wanted = [0.0, 0.0, 0.0, 1e-9, -2e-9, 3e-9, 0.0, 0.0, 0.0];
+        let command = Allocator::new(&allocation).command(&plant, &wanted);
+        let t = mission.test_mass["a"].dcm_orf_from_srf();
+        let want = t.tr_mul(&Vector3::new(1e-9, -2e-9, 3e-9)) * -1500.0;
+        assert!((command.mps_force_srf_n - want).amax() < 1e-12 * want.amax(), "{}", command.mps_force_srf_n);
+        assert!(command.mps_torque_srf_nm.amax() < 1e-20);
+        assert_eq!(command.tm[0].force_orf_n, Vector3::zeros());
+        let accelerations = plant.accelerations(&command);
+        assert!(accelerations.iter().zip(&wanted).all(|(a, b)| (a - b).abs() < 1e-21), "{accelerations:?}");
     }
 }

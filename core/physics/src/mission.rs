@@ -34,7 +34,7 @@ pub enum MissionError {
         reason: &'static str,
     },
     /// The actuators cannot move every channel on its own.
-    #[error("mission file: no allocation of the fifteen channels to the actuators: {reason}")]
+    #[error("mission file: no allocation of the channels to the actuators: {reason}")]
     Decoupling {
         /// What is wrong and what to check.
         reason: String,
@@ -49,7 +49,7 @@ pub enum MissionError {
     },
     /// The mission brings no controllers, and none can be designed for it.
     #[error("mission file: {0}")]
-    Design(#[source] Box<crate::control_design::DesignError>),
+    Design(#[source] Box<dyn std::error::Error + Send + Sync>),
 }
 
 /// A whole mission file.
@@ -60,7 +60,7 @@ pub struct Mission {
     pub mission: Identity,
     /// Mass properties of the spacecraft.
     pub spacecraft: Spacecraft,
-    /// Test masses by name, `tm1` and `tm2`.
+    /// Test masses by name; what there is of each comes in the order of their names.
     #[serde(default)]
     pub test_mass: BTreeMap<String, TestMass>,
     /// Survey of the housings.
@@ -75,7 +75,7 @@ pub struct Mission {
     /// Requirement table (tab:state_precision_requirements).
     #[serde(default)]
     pub requirements: Option<Requirements>,
-    /// Controllers of the fifteen channels.
+    /// Controllers of the channels.
     #[serde(default)]
     pub control: Option<Control>,
     /// Actuator limits.
@@ -120,7 +120,23 @@ pub struct Spacecraft {
     pub inertia_srf_kg_m2: [[f64; 3]; 3],
 }
 
-/// `[test_mass.tmN]`
+/// A translational axis of a test mass.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Axis {
+    /// Along `o_1`.
+    X,
+    /// Along `o_2`.
+    Y,
+    /// Along `o_3`.
+    Z,
+}
+
+fn only_x() -> Vec<Axis> {
+    vec![Axis::X]
+}
+
+/// `[test_mass.NAME]`
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct TestMass {
@@ -129,8 +145,19 @@ pub struct TestMass {
     /// Inertia in MRF, kg m², rows.
     #[serde(default)]
     pub inertia_mrf_kg_m2: Option<[[f64; 3]; 3]>,
+    /// Name of its frame ORF; without it `ORF_n` for the n-th test mass by name.
+    #[serde(default)]
+    pub frame: Option<String>,
     /// ORF is SRF turned by this angle about `s_3`, rad.
     pub orf_from_srf_angle_rad: f64,
+    /// Axes that an interferometer reads; the inertial sensor reads the others. Wavefront sensing of `θ` and `ψ` comes with
+    /// the interferometer along x.
+    #[serde(default = "only_x")]
+    pub interferometer: Vec<Axis>,
+    /// Axes along which the spacecraft follows the test mass and no electrode pushes; along the others the electrodes hold the
+    /// test mass.
+    #[serde(default = "only_x")]
+    pub drag_free: Vec<Axis>,
     /// Where the drawings put the housing's centre relative to the spacecraft's centre of mass, SRF, m.
     pub offset_nominal_srf_m: [f64; 3],
     /// Half width of the box around the nominal offset in which the truth must lie, SRF, m.
@@ -150,7 +177,10 @@ pub struct TestMass {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Housing {
-    /// Surveyed vector from housing 2 to housing 1, `b_1 − b_2`, SRF, m.
+    /// The two test masses; without it those of a mission that has two.
+    #[serde(default)]
+    pub between: Option<[String; 2]>,
+    /// Surveyed vector from the second housing to the first, `b_1 − b_2`, SRF, m.
     pub baseline_srf_m: [f64; 3],
     /// Tolerance of the survey per axis, m.
     pub baseline_tolerance_m: f64,
@@ -160,8 +190,12 @@ pub struct Housing {
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Noise {
-    /// Interferometer, along the sensitive axis.
+    /// Interferometer along x.
     pub ifo_x: Option<DisplacementNoise>,
+    /// Interferometer along y.
+    pub ifo_y: Option<DisplacementNoise>,
+    /// Interferometer along z.
+    pub ifo_z: Option<DisplacementNoise>,
     /// Capacitive readout along x, used where there is no interferometer.
     pub is_x: Option<DisplacementNoise>,
     /// Capacitive readout along y.
@@ -178,7 +212,7 @@ pub struct Noise {
     pub thruster_force: Option<ForceNoise>,
     /// Thrusters' torque, per axis of SRF.
     pub thruster_torque: Option<TorqueNoise>,
-    /// Electrostatic force on a test mass, y and z.
+    /// Electrostatic force on a test mass, along the axes that are not drag-free.
     pub electrostatic_force: Option<ForceNoise>,
     /// Electrostatic torque on a test mass.
     pub electrostatic_torque: Option<TorqueNoise>,
@@ -341,8 +375,7 @@ pub struct Requirements {
     pub corner_hz: f64,
 }
 
-/// `[control]`: one discrete controller per channel. Channel names: `sc.phi`, `sc.theta`, `sc.psi`, and for each
-/// test mass `tmN.x`, `tmN.y`, `tmN.z`, `tmN.phi`, `tmN.theta`, `tmN.psi`.
+/// `[control]`: one discrete controller per channel, named as by [`Mission::channels`].
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Control {
@@ -356,7 +389,7 @@ pub struct Control {
     /// and shakes the spacecraft more where the interferometers are quiet, from which the offset is read.
     #[serde(default = "one")]
     pub attitude_bandwidth_factor: f64,
-    /// Controllers by channel: all fifteen, or none for the default design.
+    /// Controllers by channel: all of them, or none for the default design.
     #[serde(default)]
     pub channel: BTreeMap<String, ChannelController>,
 }
@@ -624,10 +657,23 @@ impl Mission {
         positive("mission.sample_rate_hz", self.mission.sample_rate_hz)?;
         positive("spacecraft.mass_kg", self.spacecraft.mass_kg)?;
         inertia("spacecraft.inertia_srf_kg_m2", &self.spacecraft.inertia_srf_kg_m2)?;
+        if self.test_mass.len() > MOST_TEST_MASSES {
+            return Err(value_error("test_mass", &self.test_mass.len(), "must be at most four"));
+        }
         for (name, tm) in &self.test_mass {
             let key = |k: &str| format!("test_mass.{name}.{k}");
-            if name != "tm1" && name != "tm2" {
-                return Err(value_error("test_mass", name, "must be tm1 or tm2"));
+            let plain = name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'_');
+            if name.is_empty() || !plain || name == SPACECRAFT {
+                return Err(value_error(
+                    "test_mass",
+                    name,
+                    "must be of a-z, 0-9 and _, and not sc, the spacecraft's name",
+                ));
+            }
+            for (k, axes) in [("interferometer", &tm.interferometer), ("drag_free", &tm.drag_free)] {
+                if axes.iter().enumerate().any(|(i, axis)| axes[..i].contains(axis)) {
+                    return Err(value_error(&key(k), &format!("{axes:?}"), "must name each axis once"));
+                }
             }
             positive(&key("mass_kg"), tm.mass_kg)?;
             if let Some(rows) = &tm.inertia_mrf_kg_m2 {
@@ -641,6 +687,10 @@ impl Mission {
         }
         if let Some(h) = &self.housing {
             positive("housing.baseline_tolerance_m", h.baseline_tolerance_m)?;
+            if self.baseline().is_none() {
+                let found = h.between.as_ref().map_or_else(|| "missing".to_owned(), |names| format!("{names:?}"));
+                return Err(value_error("housing.between", &found, "must name two test masses of the mission"));
+            }
         }
         self.noise.check(self.mission.sample_rate_hz)?;
         self.orbit.check()?;
@@ -678,12 +728,13 @@ impl Mission {
                 let value = c.attitude_bandwidth_factor;
                 return Err(value_error("control.attitude_bandwidth_factor", &value, "must be between 0.5 and 4"));
             }
+            let channels = self.channels();
             for (name, channel) in &c.channel {
-                if !CHANNELS.contains(&name.as_str()) {
+                if !channels.contains(name) {
                     return Err(value_error(
                         "control.channel",
                         name,
-                        "is no channel; the fifteen are sc.phi, sc.theta, sc.psi and tmN.x, y, z, phi, theta, psi",
+                        "is no channel; they are sc.phi, sc.theta, sc.psi, and x, y, z, phi, theta, psi of each test mass",
                     ));
                 }
                 let finite = channel.gain_s2.is_finite() && channel.sections.iter().flatten().all(|x| x.is_finite());
@@ -693,6 +744,43 @@ impl Mission {
             }
         }
         Ok(())
+    }
+
+    /// The channels in the order of eq:state_variables: the spacecraft's angles, then displacements and angles of each test
+    /// mass, `sc.phi`, `sc.theta`, `sc.psi`, `NAME.x`, `NAME.y`, `NAME.z`, `NAME.phi`, `NAME.theta`, `NAME.psi`.
+    #[must_use]
+    pub fn channels(&self) -> Vec<String> {
+        let angles = ANGLES.map(|angle| format!("{SPACECRAFT}.{angle}"));
+        let of = |name: &String| AXES.into_iter().chain(ANGLES).map(|freedom| format!("{name}.{freedom}")).collect();
+        angles.into_iter().chain(self.test_mass.keys().flat_map(|name| -> Vec<String> { of(name) })).collect()
+    }
+
+    /// Name of the frame ORF of a test mass, `ORF_n` unless the mission gives another; empty without the test mass.
+    #[must_use]
+    pub fn frame(&self, name: &str) -> String {
+        let numbered = self.test_mass.iter().enumerate().find(|(_, (key, _))| *key == name);
+        numbered.map_or_else(String::new, |(i, (_, tm))| tm.frame.clone().unwrap_or_else(|| format!("ORF_{}", i + 1)))
+    }
+
+    /// The two test masses whose housings are surveyed, the one at the end of the baseline first; `None` without a survey.
+    #[must_use]
+    pub fn baseline(&self) -> Option<[&str; 2]> {
+        let housing = self.housing.as_ref()?;
+        let names: Vec<&str> = self.test_mass.keys().map(String::as_str).collect();
+        match (&housing.between, names.as_slice()) {
+            (Some([one, two]), _) if one != two && [one, two].iter().all(|n| self.test_mass.contains_key(*n)) => {
+                Some([one, two])
+            }
+            (None, [one, two]) => Some([one, two]),
+            _ => None,
+        }
+    }
+
+    /// Name and noise of the best readout of a displacement: `ifo_x` where x has an interferometer, else `is_x`.
+    #[must_use]
+    pub fn displacement_noise(&self, test_mass: &TestMass, axis: usize) -> (&'static str, Option<&DisplacementNoise>) {
+        let tables = if test_mass.has_interferometer(axis) { INTERFEROMETER } else { INERTIAL_SENSOR };
+        (tables[axis], self.noise.displacement(tables[axis]))
     }
 
     /// The section of a test mass.
@@ -778,6 +866,18 @@ impl Spacecraft {
 }
 
 impl TestMass {
+    /// Whether an interferometer reads an axis, 0 for x.
+    #[must_use]
+    pub fn has_interferometer(&self, axis: usize) -> bool {
+        self.interferometer.iter().any(|a| *a as usize == axis)
+    }
+
+    /// Whether the spacecraft follows the test mass along an axis, 0 for x.
+    #[must_use]
+    pub fn is_drag_free(&self, axis: usize) -> bool {
+        self.drag_free.iter().any(|a| *a as usize == axis)
+    }
+
     /// `T_S^O`: components in ORF from components in SRF.
     #[must_use]
     pub fn dcm_orf_from_srf(&self) -> Matrix3<f64> {
@@ -840,30 +940,40 @@ const MOST_DELAY_SAMPLES: u32 = 100;
 /// Longest delay of thrusters, s, for the same reason.
 const MOST_THRUSTER_DELAY_S: f64 = 10.0;
 
-/// The fifteen channels in the order of eq:state_variables.
-pub const CHANNELS: [&str; 15] = [
-    "sc.phi",
-    "sc.theta",
-    "sc.psi",
-    "tm1.x",
-    "tm1.y",
-    "tm1.z",
-    "tm1.phi",
-    "tm1.theta",
-    "tm1.psi",
-    "tm2.x",
-    "tm2.y",
-    "tm2.z",
-    "tm2.phi",
-    "tm2.theta",
-    "tm2.psi",
-];
+/// Most test masses that a mission may have.
+pub const MOST_TEST_MASSES: usize = 4;
+/// The spacecraft in names of channels.
+pub const SPACECRAFT: &str = "sc";
+/// Tables of `[noise]` for the interferometers along x, y and z.
+pub const INTERFEROMETER: [&str; 3] = ["ifo_x", "ifo_y", "ifo_z"];
+/// Tables of `[noise]` for the inertial sensor along x, y and z.
+pub const INERTIAL_SENSOR: [&str; 3] = ["is_x", "is_y", "is_z"];
+/// Axes of translation in names of channels and columns.
+pub const AXES: [&str; 3] = ["x", "y", "z"];
+/// Angles about them.
+pub const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
 
 impl Noise {
+    /// The noise of a displacement readout by the name of its table, such as `ifo_x`.
+    #[must_use]
+    pub fn displacement(&self, table: &str) -> Option<&DisplacementNoise> {
+        match table {
+            "ifo_x" => self.ifo_x.as_ref(),
+            "ifo_y" => self.ifo_y.as_ref(),
+            "ifo_z" => self.ifo_z.as_ref(),
+            "is_x" => self.is_x.as_ref(),
+            "is_y" => self.is_y.as_ref(),
+            "is_z" => self.is_z.as_ref(),
+            _ => None,
+        }
+    }
+
     fn check(&self, sample_rate_hz: f64) -> Result<(), MissionError> {
         macro_rules! check { ($($name:ident),*) => { $(if let Some(n) = &self.$name { n.check(concat!("noise.", stringify!($name)), sample_rate_hz)?; })* } }
         check!(
             ifo_x,
+            ifo_y,
+            ifo_z,
             is_x,
             is_y,
             is_z,

@@ -230,34 +230,39 @@ impl NoiseProcess {
     }
 }
 
-/// `N` independent processes of one sample interval, sampled together: arrays over the processes, one pass.
+/// Independent processes of one sample interval, sampled together: rows over the processes, one pass.
 #[derive(Clone, Debug)]
-pub struct NoiseBank<const N: usize> {
+pub struct NoiseBank {
     /// The processes as built, from which [`Self::start`] draws.
     processes: Vec<NoiseProcess>,
     /// First row of `Φ`, `e^{−λdt}/m!`, as far as any process has states.
     transition: Vec<f64>,
-    sigma: [f64; N],
+    sigma: Vec<f64>,
     /// By state, then by process.
-    kick: Vec<[f64; N]>,
-    state: Vec<[f64; N]>,
+    kick: Vec<Vec<f64>>,
+    state: Vec<Vec<f64>>,
     /// Process and line.
     lines: Vec<(usize, RunningLine)>,
+    /// Deviates and samples of the last call, by process.
+    deviates: Vec<f64>,
+    samples: Vec<f64>,
 }
 
-impl<const N: usize> NoiseBank<N> {
+impl NoiseBank {
     /// A bank of processes of one sample interval.
     #[must_use]
-    pub fn new(processes: [NoiseProcess; N]) -> Self {
+    pub fn new(processes: Vec<NoiseProcess>) -> Self {
         let states = processes.iter().map(|p| p.states).max().unwrap_or(0);
         let deepest = processes.iter().find(|p| p.states == states);
         let mut bank = Self {
             transition: (0..states).filter_map(|m| deepest.map(|p| p.transition[(0, m)])).collect(),
-            sigma: std::array::from_fn(|p| processes[p].sigma),
-            kick: (0..states).map(|i| std::array::from_fn(|p| processes[p].kick[i])).collect(),
-            state: vec![[0.0; N]; states],
+            sigma: processes.iter().map(|p| p.sigma).collect(),
+            kick: (0..states).map(|i| processes.iter().map(|p| p.kick[i]).collect()).collect(),
+            state: vec![vec![0.0; processes.len()]; states],
             lines: Vec::new(),
-            processes: processes.into(),
+            deviates: vec![0.0; processes.len()],
+            samples: vec![0.0; processes.len()],
+            processes,
         };
         bank.gather();
         bank
@@ -266,7 +271,7 @@ impl<const N: usize> NoiseBank<N> {
     /// Takes states and lines over from the processes.
     fn gather(&mut self) {
         for (i, row) in self.state.iter_mut().enumerate() {
-            *row = std::array::from_fn(|p| self.processes[p].state[i]);
+            row.iter_mut().zip(&self.processes).for_each(|(slot, process)| *slot = process.state[i]);
         }
         let lines = self.processes.iter().enumerate();
         self.lines = lines.flat_map(|(p, process)| process.lines.iter().map(move |l| (p, l.clone()))).collect();
@@ -296,30 +301,29 @@ impl<const N: usize> NoiseBank<N> {
     }
 
     /// The next sample of every process.
-    pub fn next<R: Rng + ?Sized>(&mut self, rng: &mut R) -> [f64; N] {
-        let mut w = [0.0; N];
-        for x in &mut w {
+    pub fn next<R: Rng + ?Sized>(&mut self, rng: &mut R) -> &[f64] {
+        let (w, out) = (&mut self.deviates[..], &mut self.samples[..]);
+        for x in &mut *w {
             *x = normal(rng);
         }
-        let mut out = [0.0; N];
-        for p in 0..N {
-            out[p] = self.sigma[p] * w[p];
+        for ((out, sigma), w) in out.iter_mut().zip(&self.sigma).zip(&*w) {
+            *out = sigma * w;
         }
         if let Some(row) = self.state.first() {
-            for p in 0..N {
-                out[p] += row[p];
+            for (out, state) in out.iter_mut().zip(row) {
+                *out += state;
             }
         }
         // Row i needs the old rows from i on, so going down overwrites nothing still needed.
         for (i, kick) in self.kick.iter().enumerate() {
             let [row, deeper @ ..] = &mut self.state[i..] else { break };
             let leak = self.transition[0];
-            for p in 0..N {
-                row[p] = leak * row[p] + kick[p] * w[p];
+            for ((state, kick), w) in row.iter_mut().zip(kick).zip(&*w) {
+                *state = leak * *state + kick * w;
             }
             for (other, c) in deeper.iter().zip(&self.transition[1..]) {
-                for p in 0..N {
-                    row[p] += c * other[p];
+                for (state, other) in row.iter_mut().zip(other) {
+                    *state += c * other;
                 }
             }
         }
@@ -327,6 +331,12 @@ impl<const N: usize> NoiseBank<N> {
             out[*p] += line.next();
         }
         out
+    }
+
+    /// What [`Self::next`] gave last; zeros before.
+    #[must_use]
+    pub fn samples(&self) -> &[f64] {
+        &self.samples
     }
 
     /// The states, for a checkpoint.
@@ -338,7 +348,7 @@ impl<const N: usize> NoiseBank<N> {
     /// Takes back what [`Self::states`] gave; false when the length is another bank's.
     #[must_use]
     pub fn set_states(&mut self, states: &[f64]) -> bool {
-        if states.len() != N * self.state.len() + 2 * self.lines.len() {
+        if states.len() != self.processes.len() * self.state.len() + 2 * self.lines.len() {
             return false;
         }
         let slots = self.state.iter_mut().flatten().chain(self.lines.iter_mut().flat_map(|(_, l)| &mut l.phase));
@@ -609,7 +619,7 @@ mod tests {
             NoiseProcess::new(&e, DT_S),
             NoiseProcess::new(&NoiseShape { terms: vec![term(8)] }, DT_S),
         ];
-        let mut bank = NoiseBank::new(processes.clone());
+        let mut bank = NoiseBank::new(processes.to_vec());
         let mut single = processes;
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(9);
         let mut twin = rng.clone();
@@ -617,14 +627,14 @@ mod tests {
         single.iter_mut().for_each(|p| p.start(&mut twin));
         for k in 0..1000 {
             let samples = bank.next(&mut rng);
-            for (i, (process, sample)) in single.iter_mut().zip(samples).enumerate() {
+            for (i, (process, sample)) in single.iter_mut().zip(samples.iter().copied()).enumerate() {
                 let want = process.next(&mut twin);
                 // Sums in another order.
                 let scale = process.state.amax() + process.sigma;
                 assert!((sample - want).abs() < 1e-13 * scale, "process {i}, sample {k}: {sample} {want}");
             }
         }
-        let mut resumed = NoiseBank::new(single);
+        let mut resumed = NoiseBank::new(single.into());
         assert!(!resumed.set_states(&[0.0]) && resumed.set_states(&bank.states()));
         for _ in 0..100 {
             assert_eq!(bank.next(&mut rng), resumed.next(&mut twin));

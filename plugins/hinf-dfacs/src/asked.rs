@@ -6,16 +6,16 @@
 //! * Delay: `∂α̂/∂τ = D[−ω, 0] = D[0, kicks Δα̂]`, for the channels of the test masses only. The attitude channels share
 //!   the noise of `α̂` and use the command without the smoother.
 
+use dragfree_physics::control::PerTestMass;
+use dragfree_physics::mission::{AXES, Mission};
 use nalgebra::{Matrix3, Vector3};
 
-use crate::replay::{COMMAND_VECTORS, CommandNumbers};
+use crate::replay::{CommandNumbers, command_vectors, electrodes_of};
 use crate::smoother::{Answer, Smoothed, Smoother, Turn};
 use crate::state::{Reader, StateError, Writer};
 
-const AXES: [&str; 3] = ["x", "y", "z"];
-
-/// Whether a column on demand is made from commands, as all but two are: the Sun's direction, and the derivative by a delay of the
-/// wavefront sensing, which is made of the smoothed attitude.
+/// Whether a column on demand is made from commands, as all but two are: the Sun's direction, and the derivative by a
+/// delay of the wavefront sensing, which is made of the smoothed attitude.
 pub(crate) fn is_in_loop(column: &str) -> bool {
     !column.starts_with("used.sun_srf.") && !column.starts_with("response.alpha_srf_rad_s2.by_dws_delay.")
 }
@@ -26,8 +26,8 @@ pub struct Needs {
     /// `used.*`: commands and direction of the Sun as `û` has them, means over `[t_k, t_{k+1})`.
     pub commands: bool,
     /// `response.alpha_srf_rad_s2.by_torque_gain.I.J`, `∂α̂_J/∂g_I` for a torque about axis `I` of `(1 + g_I)` times the commanded one:
-    /// `α̂` of one who knows `g` minus that of one who does not. And `response.u_orf_m_s2.by_torque_gain.I.tmN.J`, the same of `û_N`,
-    /// where thrusters have a layout: their torque's noise, which is `E[w]`, says something of their force's.
+    /// `α̂` of one who knows `g` minus that of one who does not. And `response.u_orf_m_s2.by_torque_gain.I.NAME.J`, the same of `û`
+    /// of a test mass, where thrusters have a layout: their torque's noise, which is `E[w]`, says something of their force's.
     pub torque_response: bool,
     /// `response.alpha_srf_rad_s2.by_dws_delay.J`, `∂α̂_J/∂τ` where long-arm sensing shows what was true `τ` before: late minus on
     /// time, so that one who knows `τ` subtracts `τ` times it. For the test masses' channels; see the module.
@@ -57,7 +57,7 @@ struct Used {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Given {
     pub(crate) alpha: bool,
-    pub(crate) u: [bool; 2],
+    pub(crate) u: PerTestMass<bool>,
 }
 
 /// The running columns.
@@ -66,7 +66,10 @@ pub(crate) struct Asked {
     needs: Needs,
     inertia_inverse: Matrix3<f64>,
     /// `−T_S^{O_i} C J/m_S`, m s⁻² per rad s⁻²; zero unless thrusters have a layout.
-    push_per_turn: [Matrix3<f64>; 2],
+    push_per_turn: Vec<Matrix3<f64>>,
+    /// Names, units and frames of the vectors of a command, and names and frames of the test masses.
+    vectors: Vec<(String, &'static str, String)>,
+    test_masses: Vec<(String, String)>,
     /// One for each epoch that waits for the smoother.
     used: Vec<Used>,
     torque: [Answer; 3],
@@ -77,11 +80,13 @@ pub(crate) struct Asked {
 }
 
 impl Asked {
-    pub(crate) fn new(needs: Needs, inertia_inverse: Matrix3<f64>, push_per_turn: [Matrix3<f64>; 2]) -> Self {
+    pub(crate) fn new(needs: Needs, mission: &Mission, push_per_turn: Vec<Matrix3<f64>>) -> Self {
         Self {
             needs,
-            inertia_inverse,
+            inertia_inverse: mission.spacecraft.inertia_inverse(),
             push_per_turn,
+            vectors: command_vectors(mission),
+            test_masses: mission.test_mass.keys().map(|name| (name.clone(), mission.frame(name))).collect(),
             used: Vec::new(),
             torque: Default::default(),
             delay: Answer::default(),
@@ -94,28 +99,29 @@ impl Asked {
     }
 
     /// Name, unit and frame of the columns, in the order of [`crate::reconstruction::Row::asked`].
-    pub(crate) fn columns(&self) -> Vec<(String, &'static str, &'static str)> {
+    pub(crate) fn columns(&self) -> Vec<(String, &'static str, String)> {
         let mut columns = Vec::new();
         if self.needs.commands {
-            for (vector, unit, frame) in COMMAND_VECTORS.into_iter().chain([("sun_srf", "1", "SRF")]) {
-                columns.extend(AXES.map(|axis| (format!("used.{vector}.{axis}"), unit, frame)));
+            let sun = [("sun_srf".to_owned(), "1", "SRF".to_owned())];
+            for (vector, unit, frame) in self.vectors.iter().chain(&sun) {
+                columns.extend(AXES.map(|axis| (format!("used.{vector}.{axis}"), *unit, frame.clone())));
             }
         }
         if self.needs.torque_response {
             for about in AXES {
                 let name = |axis| format!("response.alpha_srf_rad_s2.by_torque_gain.{about}.{axis}");
-                columns.extend(AXES.map(|axis| (name(axis), "rad s-2", "SRF")));
+                columns.extend(AXES.map(|axis| (name(axis), "rad s-2", "SRF".to_owned())));
             }
             for about in AXES.iter().filter(|_| self.layout()) {
-                for (tm, frame) in [("tm1", "ORF_1"), ("tm2", "ORF_2")] {
+                for (tm, frame) in &self.test_masses {
                     let name = |axis| format!("response.u_orf_m_s2.by_torque_gain.{about}.{tm}.{axis}");
-                    columns.extend(AXES.map(|axis| (name(axis), "m s-2", frame)));
+                    columns.extend(AXES.map(|axis| (name(axis), "m s-2", frame.clone())));
                 }
             }
         }
         if self.needs.dws_delay_response {
             let name = |axis| format!("response.alpha_srf_rad_s2.by_dws_delay.{axis}");
-            columns.extend(AXES.map(|axis| (name(axis), "rad s-3", "SRF")));
+            columns.extend(AXES.map(|axis| (name(axis), "rad s-3", "SRF".to_owned())));
         }
         columns
     }
@@ -132,9 +138,10 @@ impl Asked {
         sun_srf: Option<Vector3<f64>>,
     ) {
         let missing = f64::NAN;
-        let mut command = acting.copied().unwrap_or([missing; 18]);
+        let numbers = 3 * self.vectors.len();
+        let mut command = acting.copied().unwrap_or_else(|| CommandNumbers::from_fn(numbers, |_| missing));
         if let Some(tm) = silent {
-            command[6 + 6 * tm..12 + 6 * tm].fill(missing);
+            command[electrodes_of(tm)].fill(missing);
         }
         self.used.push(Used { command, sun_srf: sun_srf.unwrap_or(Vector3::from_element(missing)) });
     }
@@ -180,8 +187,8 @@ impl Asked {
                 put(out, &(turn(about, k) + answer[k].disturbance_rad_s2), given.alpha);
             }
             for answer in answers.iter().filter(|_| layout) {
-                for (push, given) in self.push_per_turn.iter().zip(given.u) {
-                    put(out, &(push * answer[k].noise_rad_s2), given);
+                for (push, given) in self.push_per_turn.iter().zip(&given.u) {
+                    put(out, &(push * answer[k].noise_rad_s2), *given);
                 }
             }
         }
@@ -220,7 +227,8 @@ impl Asked {
         }
         self.used.clear();
         for _ in 0..waiting {
-            let mut used = Used { command: [0.0; 18], sun_srf: Vector3::zeros() };
+            let command = CommandNumbers::from_fn(3 * self.vectors.len(), |_| 0.0);
+            let mut used = Used { command, sun_srf: Vector3::zeros() };
             state.numbers(&mut used.command)?;
             state.numbers(used.sun_srf.as_mut_slice())?;
             self.used.push(used);

@@ -1,6 +1,6 @@
 //! What the commands, the Sun's direction and the readout say about forces and torques (Section IV, `û_i`).
 
-use dragfree_physics::control::{Command, TestMassReadout};
+use dragfree_physics::control::{Command, PerTestMass, TestMassCommand, TestMassReadout};
 use dragfree_physics::mission::{Mission, MissionError};
 use nalgebra::{Matrix3, Vector3};
 
@@ -10,7 +10,7 @@ const NEEDED_BY: &str = "hinf-dfacs";
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KnownMotion {
     /// `û_i`: the known acceleration of each test mass against its housing, without the offset's terms, ORF, m s⁻².
-    pub u_orf_m_s2: [Vector3<f64>; 2],
+    pub u_orf_m_s2: PerTestMass<Vector3<f64>>,
     /// Angular acceleration of the spacecraft relative to IRF that the torques are meant to give, SRF, rad s⁻².
     pub alpha_srf_rad_s2: Vector3<f64>,
 }
@@ -23,7 +23,7 @@ pub struct KnownModel {
     inertia_inverse: Matrix3<f64>,
     /// `k_dSC`, N, and the arm of the force, SRF, m.
     sunlight: Option<(f64, Vector3<f64>)>,
-    tm: [KnownTestMass; 2],
+    tm: Vec<KnownTestMass>,
 }
 
 #[derive(Clone, Debug)]
@@ -39,24 +39,24 @@ impl KnownModel {
     /// Takes what it needs from the mission file.
     ///
     /// # Errors
-    /// [`MissionError::Missing`] without both test masses, [`MissionError::Value`] for a singular inertia.
+    /// [`MissionError::Missing`] without a test mass, [`MissionError::Value`] for a singular inertia.
     pub fn new(mission: &Mission) -> Result<Self, MissionError> {
-        let tm = |name: &str| -> Result<KnownTestMass, MissionError> {
-            let section = mission.test_mass(name, NEEDED_BY)?;
-            Ok(KnownTestMass {
-                mass_kg: section.mass_kg,
-                dcm_orf_from_srf: section.dcm_orf_from_srf(),
-                offset_nominal_srf_m: Vector3::from(section.offset_nominal_srf_m),
-                stiffness_tt: section.stiffness_tt(),
-                stiffness_tr: section.stiffness_tr(),
-            })
-        };
+        if mission.test_mass.is_empty() {
+            return Err(MissionError::Missing { section: "test_mass".to_owned(), needed_by: NEEDED_BY });
+        }
+        let tm = mission.test_mass.values().map(|section| KnownTestMass {
+            mass_kg: section.mass_kg,
+            dcm_orf_from_srf: section.dcm_orf_from_srf(),
+            offset_nominal_srf_m: Vector3::from(section.offset_nominal_srf_m),
+            stiffness_tt: section.stiffness_tt(),
+            stiffness_tr: section.stiffness_tr(),
+        });
         Ok(Self {
             mass_kg: mission.spacecraft.mass_kg,
             inertia_kg_m2: mission.spacecraft.inertia(),
             inertia_inverse: mission.spacecraft.inertia_inverse(),
             sunlight: mission.solar_pressure.as_ref().map(|s| (s.force_n, Vector3::from(s.arm_srf_m))),
-            tm: [tm("tm1")?, tm("tm2")?],
+            tm: tm.collect(),
         })
     }
 
@@ -74,7 +74,7 @@ impl KnownModel {
         &self,
         command: &Command,
         sun_srf: Option<&Vector3<f64>>,
-        readout: &[TestMassReadout; 2],
+        readout: &[TestMassReadout],
         omega_srf_rad_s: &Vector3<f64>,
     ) -> KnownMotion {
         let mut force = command.mps_force_srf_n;
@@ -90,20 +90,19 @@ impl KnownModel {
             torque -= tm.dcm_orf_from_srf.tr_mul(&electrodes.torque_orf_nm) + tm.offset_nominal_srf_m.cross(&push);
         }
         let spacecraft = force / self.mass_kg;
-        let u = |i: usize| {
-            let (tm, readout) = (&self.tm[i], &readout[i]);
-            command.tm[i].force_orf_n / tm.mass_kg - tm.dcm_orf_from_srf * spacecraft
+        let u = |((tm, electrodes), readout): ((&KnownTestMass, &TestMassCommand), &TestMassReadout)| {
+            electrodes.force_orf_n / tm.mass_kg - tm.dcm_orf_from_srf * spacecraft
                 + tm.stiffness_tt * readout.r_orf_m
                 + tm.stiffness_tr * readout.att_orf_rad
         };
-        KnownMotion { u_orf_m_s2: [u(0), u(1)], alpha_srf_rad_s2: self.inertia_inverse * torque }
+        let u_orf_m_s2 = self.tm.iter().zip(&command.tm).zip(readout).map(u).collect();
+        KnownMotion { u_orf_m_s2, alpha_srf_rad_s2: self.inertia_inverse * torque }
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dragfree_physics::control::TestMassCommand;
 
     /// The paper's spacecraft with round numbers: no products of inertia, so that a hand can divide.
     fn model() -> KnownModel {
@@ -128,7 +127,7 @@ mod tests {
     /// +30° and of bench 2 at −30°, so the component along o_2 has opposite signs.
     #[test]
     fn thrust_leaves_the_test_masses_behind() {
-        let got = motion(&Command { mps_force_srf_n: Vector3::new(1.5e-3, 0.0, 0.0), ..Command::default() });
+        let got = motion(&Command { mps_force_srf_n: Vector3::new(1.5e-3, 0.0, 0.0), ..Command::zero(2) });
         close(got.u_orf_m_s2[0], [-C * 1e-6, 0.5e-6, 0.0]);
         close(got.u_orf_m_s2[1], [-C * 1e-6, -0.5e-6, 0.0]);
         close(got.alpha_srf_rad_s2, [0.0, 0.0, 0.0]);
@@ -139,7 +138,7 @@ mod tests {
     /// (1/2, √3/2, 0): the recoil R·(1/2, −√3/2, 0) has components R·(√3/2, −1/2), and the test mass sees minus that.
     #[test]
     fn electrodes_push_the_test_mass_and_the_spacecraft_recoils() {
-        let mut command = Command::default();
+        let mut command = Command::zero(2);
         command.tm[0].force_orf_n = Vector3::new(0.0, 1.96e-9, 0.0);
         let got = motion(&command);
         let recoil = 1.96e-9 / 1500.0;
@@ -151,8 +150,8 @@ mod tests {
 
     #[test]
     fn electrodes_torque_acts_back_on_the_spacecraft() {
-        let mut command = Command::default();
-        command.tm[1] = TestMassCommand { torque_orf_nm: Vector3::new(0.0, 0.0, 1e-11), ..TestMassCommand::default() };
+        let mut command = Command::zero(2);
+        command.tm[1] = TestMassCommand { torque_orf_nm: Vector3::new(0.0, 0.0, 1e-11), ..TestMassCommand::zero(2) };
         close(motion(&command).alpha_srf_rad_s2, [0.0, 0.0, -1e-14]);
         command.tm[1].torque_orf_nm = Vector3::new(8e-12, 0.0, 0.0);
         // o_1 of bench 2 lies at −30°.
@@ -164,7 +163,7 @@ mod tests {
     fn sunlight_pushes_as_thrust_does_and_turns_by_its_arm() {
         let sun = Vector3::new(1.0, 0.0, 0.0);
         let readout = [TestMassReadout::default(); 2];
-        let got = model().motion(&Command::default(), Some(&sun), &readout, &Vector3::zeros());
+        let got = model().motion(&Command::zero(2), Some(&sun), &readout, &Vector3::zeros());
         let a = 6.3513e-5 / 1500.0;
         close(got.u_orf_m_s2[0], [-C * a, 0.5 * a, 0.0]);
         close(got.alpha_srf_rad_s2, [0.0, 0.6 * 6.3513e-5 / 800.0, 0.0]);
@@ -173,7 +172,7 @@ mod tests {
     #[test]
     fn a_spinning_spacecraft_precesses_by_eulers_sign() {
         let omega = Vector3::new(1e-3, 0.0, 2e-3);
-        let got = model().motion(&Command::default(), None, &[TestMassReadout::default(); 2], &omega);
+        let got = model().motion(&Command::zero(2), None, &[TestMassReadout::default(); 2], &omega);
         // ω×Jω = (0, ω_3 J_1 ω_1 − ω_1 J_3 ω_3, 0) = (0, −200·2e-6, 0).
         close(got.alpha_srf_rad_s2, [0.0, 200.0 * 2e-6 / 800.0, 0.0]);
     }
@@ -183,7 +182,7 @@ mod tests {
         let mut readout = [TestMassReadout::default(); 2];
         readout[0].r_orf_m = Vector3::new(1e-9, 2e-9, 3e-9);
         readout[1].att_orf_rad = Vector3::new(1e-6, 0.0, -1e-6);
-        let got = model().motion(&Command::default(), None, &readout, &Vector3::zeros());
+        let got = model().motion(&Command::zero(2), None, &readout, &Vector3::zeros());
         close(got.u_orf_m_s2[0], [-6e-16, -20e-16, -36e-16]);
         close(got.u_orf_m_s2[1], [1e-15, 0.0, -1e-15]);
     }

@@ -1,5 +1,5 @@
 //! Stage `hinf-dfacs`: the known specific force `û_i`, the unbiased angular acceleration `α̂`, the rate `ω̂` and the
-//! nine channels (Section IV; ARCHITECTURE.md, table `reconstruction`).
+//! channels of the test masses and of the attitude (Section IV; ARCHITECTURE.md, table `reconstruction`).
 
 mod acting;
 pub mod asked;

@@ -18,10 +18,10 @@ const AXES: [&str; 3] = ["x", "y", "z"];
 
 type Rows = BTreeMap<String, Vec<f64>>;
 
-/// Every noise process in the channels `TM.accel.AXIS` and `sc.alpha.AXIS`. `noise_x` names, per test mass, the noise
-/// table of the instrument that reads its x: `ifo_x` or `is_x`.
+/// Every noise process in the channels `TM.accel.AXIS` and `sc.alpha.AXIS`. `readouts` names, per test mass, the noise
+/// tables of the instruments that read its x, y and z, such as `ifo_x` or `is_x`.
 #[must_use]
-pub fn declared(mission: &Mission, noise_x: &[&str]) -> Vec<NoiseProcess> {
+pub fn declared(mission: &Mission, readouts: &[[&str; 3]]) -> Vec<NoiseProcess> {
     let thrusters = ThrustNoise::of(mission);
     let mut thrust = DMatrix::zeros(3 * mission.test_mass.len(), 3);
     let mut lever = thrust.clone();
@@ -50,8 +50,8 @@ pub fn declared(mission: &Mission, noise_x: &[&str]) -> Vec<NoiseProcess> {
     if let Some(pressure) = &mission.noise.solar_pressure {
         all.push(process("solar_pressure", "N", pressure.shape(), NoiseResponse::Held, enters(&thrust)));
     }
-    for (i, (name, tm)) in mission.test_mass.iter().enumerate() {
-        all.extend(of_test_mass(mission, name, tm, noise_x.get(i).copied().unwrap_or_default()));
+    for ((name, tm), readouts) in mission.test_mass.iter().zip(readouts) {
+        all.extend(of_test_mass(mission, name, tm, readouts));
     }
     for axis in AXES {
         if let Some(sensing) = &mission.noise.dws_long_arm {
@@ -84,20 +84,19 @@ pub fn declared(mission: &Mission, noise_x: &[&str]) -> Vec<NoiseProcess> {
 }
 
 /// What each axis of one test mass has for itself: its readout, the electrostatic force, stray accelerations.
-fn of_test_mass(mission: &Mission, name: &str, tm: &TestMass, noise_x: &str) -> Vec<NoiseProcess> {
+fn of_test_mass(mission: &Mission, name: &str, tm: &TestMass, readouts: &[&str; 3]) -> Vec<NoiseProcess> {
     let noise = &mission.noise;
-    let along_x = if noise_x == "is_x" { &noise.is_x } else { &noise.ifo_x };
     let mut all = Vec::new();
-    for (axis, readout) in AXES.iter().zip([along_x, &noise.is_y, &noise.is_z]) {
-        let (place, channel) = (format!("{name}.{axis}"), format!("{name}.accel.{axis}"));
-        if let Some(readout) = readout {
+    for (axis, readout) in readouts.iter().enumerate() {
+        let (place, channel) = (format!("{name}.{}", AXES[axis]), format!("{name}.accel.{}", AXES[axis]));
+        if let Some(readout) = noise.displacement(readout) {
             let label = format!("readout:{place}");
             all.push(NoiseProcess {
                 components: vec![label.clone()],
                 ..process(&label, "m", readout.shape(), NoiseResponse::Differenced, single(&channel, 1.0))
             });
         }
-        if let (Some(force), "y" | "z") = (&noise.electrostatic_force, *axis) {
+        if let Some(force) = noise.electrostatic_force.as_ref().filter(|_| !tm.is_drag_free(axis)) {
             let (label, gain) = (format!("electrostatic_force:{place}"), tm.mass_kg.recip());
             all.push(process(&label, "N", force.shape(), NoiseResponse::Held, single(&channel, gain)));
         }

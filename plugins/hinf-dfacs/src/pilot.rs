@@ -9,7 +9,7 @@ use dragfree_physics::levels::{self, Bin};
 use dragfree_physics::spectrum::welch;
 use nalgebra::Vector3;
 
-use crate::reconstruction::{CHANNELS_AT, Row};
+use crate::reconstruction::Row;
 
 /// Length of the stretch, s.
 const LENGTH_S: f64 = 3276.8;
@@ -52,7 +52,7 @@ pub fn length(rate_hz: f64) -> usize {
 /// shorter than eight segments.
 #[must_use]
 pub fn measure(rows: &[Row], rate_hz: f64, held: &Vector3<f64>, readout: f64) -> Scale {
-    let whole = |row: &Row| row.values[CHANNELS_AT + 6..].iter().all(|x| x.is_finite());
+    let whole = |row: &Row| row.attitude_channels().iter().all(|x| x.is_finite());
     let runs = rows.chunk_by(|a, b| whole(a) == whole(b)).filter(|run| whole(&run[0]));
     let longest = runs.max_by_key(|run| run.len()).unwrap_or_default();
     let segment = (SEGMENT_S * rate_hz).round() as usize;
@@ -61,7 +61,7 @@ pub fn measure(rows: &[Row], rate_hz: f64, held: &Vector3<f64>, readout: f64) ->
     }
     let found: Vec<(f64, f64)> = (0..3)
         .filter_map(|axis| {
-            let channel: Vec<f64> = longest.iter().map(|row| row.values[CHANNELS_AT + 6 + axis]).collect();
+            let channel: Vec<f64> = longest.iter().map(|row| row.attitude_channels()[axis]).collect();
             let spectrum = welch(&channel, rate_hz, segment).ok()?;
             let bins: Vec<Bin> = spectrum
                 .frequency_hz

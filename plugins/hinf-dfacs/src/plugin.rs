@@ -1,6 +1,6 @@
 //! The stage at the border: columns in, rows out, a report.
 
-use dragfree_physics::mission::Mission;
+use dragfree_physics::mission::{ANGLES, AXES, INERTIAL_SENSOR, INTERFEROMETER, Mission};
 use dragfree_sdk::prelude::*;
 use nalgebra::Vector3;
 use serde_json::json;
@@ -8,8 +8,8 @@ use serde_json::json;
 use crate::asked::{self, Needs};
 use crate::noise;
 use crate::pilot::{self, Scale};
-use crate::reconstruction::{AngularAcceleration, Epoch, ROW, Reconstruction, Row, Settings, levels_of};
-use crate::replay::{COMMAND_VECTORS, Comparison};
+use crate::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Row, Settings, levels_of, row_length};
+use crate::replay::{CommandNumbers, Comparison, command_vectors};
 use crate::state::{Reader, StateError, Writer};
 
 /// The innovations' variance may differ from the prediction by this much before it is worth a sentence; a day's
@@ -19,8 +19,6 @@ const INNOVATION_TOLERANCE: f64 = 0.1;
 /// acted; a false alarm in 2e-6 of all runs.
 const DISOBEDIENCE: f64 = 5.0;
 const STATE: &[u8; 8] = b"dfacs/6\n";
-const AXES: [&str; 3] = ["x", "y", "z"];
-const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
 
 /// The stage.
 pub struct HinfDfacs {
@@ -41,14 +39,16 @@ struct Linked {
     /// Epochs held back until they have told the levels of the noise; none from then on.
     pilot: Option<Vec<Epoch>>,
     rate_hz: f64,
-    readout: [Option<In>; 15],
-    command: Option<[In; 18]>,
+    readout: Vec<Option<In>>,
+    command: Option<Vec<In>>,
     sun: Option<[In; 3]>,
     ephemeris_age: Option<In>,
     omega_crf: Option<[In; 3]>,
     alpha_crf: Option<[In; 3]>,
     table: Table,
     out: Vec<Out>,
+    /// How many of them are not on demand.
+    always: usize,
     /// Rows on their way out; empty between calls.
     rows: Vec<Row>,
 }
@@ -73,62 +73,63 @@ fn grid(name: &str, unit: &str, frame: &str) -> Want {
 }
 
 impl HinfDfacs {
-    /// The best readout of each of the fifteen degrees of freedom: the interferometer along x where there is one at
-    /// all, local wavefront sensing for `θ` and `ψ`, else the inertial sensor. The angles of the test masses serve only
-    /// the stiffness and the replay and may be missing.
+    /// The best readout of each degree of freedom, and the names of the noise of each test mass's displacements: the
+    /// interferometer along an axis where there is one at all, local wavefront sensing for `θ` and `ψ`, else the inertial sensor. The
+    /// angles of the test masses serve only the stiffness and the replay and may be missing.
     fn link_readouts(
         &mut self,
         available: &Available,
         link: &mut Link<'_>,
-    ) -> Result<([Option<In>; 15], [&'static str; 2]), PluginError> {
-        let mut readout = [None; 15];
-        let mut noise_x = ["ifo_x"; 2];
-        for (i, angle) in ANGLES.iter().enumerate() {
+    ) -> Result<(Vec<Option<In>>, Vec<[&'static str; 3]>), PluginError> {
+        let (mut readout, mut noises) = (Vec::new(), Vec::new());
+        for angle in ANGLES {
             let want = grid(&format!("dws.sc_crf_rad.{angle}"), "rad", "CRF");
-            readout[i] = if self.angular_acceleration == AngularAcceleration::Commanded {
+            readout.push(if self.angular_acceleration == AngularAcceleration::Commanded {
                 link.read_if_available(available, &want)?
             } else {
                 Some(link.read(&want)?)
-            };
+            });
         }
-        for (tm, name) in ["tm1", "tm2"].iter().enumerate() {
-            let frame = format!("ORF_{}", tm + 1);
-            let first = 3 + 6 * tm;
-            let ifo = link.read_if_available(available, &grid(&format!("ifo.{name}.x_orf_m"), "m", &frame))?;
-            if ifo.is_none() {
-                noise_x[tm] = "is_x";
-                self.notes.push(format!("no interferometer for {name}: the inertial sensor reads its x"));
-            }
-            readout[first] = ifo;
-            for (axis, letter) in AXES.iter().enumerate() {
-                if readout[first + axis].is_none() {
-                    let want = grid(&format!("is.{name}.r_orf_m.{letter}"), "m", &frame);
-                    readout[first + axis] = Some(link.read(&want)?);
+        for (name, tm) in &self.mission.test_mass {
+            let frame = self.mission.frame(name);
+            let mut noise = INERTIAL_SENSOR;
+            for (axis, letter) in AXES.into_iter().enumerate() {
+                let want = grid(&format!("ifo.{name}.{letter}_orf_m"), "m", &frame);
+                let optical = link.read_if_available(available, &want)?;
+                if optical.is_some() {
+                    noise[axis] = INTERFEROMETER[axis];
+                } else if tm.has_interferometer(axis) {
+                    self.notes.push(format!("no interferometer for {name}: the inertial sensor reads its {letter}"));
                 }
+                readout.push(match optical {
+                    None => Some(link.read(&grid(&format!("is.{name}.r_orf_m.{letter}"), "m", &frame))?),
+                    some => some,
+                });
             }
-            for (axis, angle) in ANGLES.iter().enumerate() {
+            noises.push(noise);
+            for angle in ANGLES {
                 let dws = grid(&format!("dws.{name}.{angle}_orf_rad"), "rad", &frame);
                 let is = grid(&format!("is.{name}.att_orf_rad.{angle}"), "rad", &frame);
-                readout[first + 3 + axis] = match link.read_if_available(available, &dws)? {
+                readout.push(match link.read_if_available(available, &dws)? {
                     None => link.read_if_available(available, &is)?,
                     some => some,
-                };
+                });
             }
         }
-        Ok((readout, noise_x))
+        Ok((readout, noises))
     }
 
-    fn link_commands(available: &Available, link: &mut Link<'_>) -> Result<Option<[In; 18]>, PluginError> {
+    fn link_commands(&self, available: &Available, link: &mut Link<'_>) -> Result<Option<Vec<In>>, PluginError> {
         if !available.columns.iter().any(|c| c.table == "grid" && c.name.starts_with("command.")) {
             return Ok(None);
         }
-        let mut columns = Vec::with_capacity(18);
-        for (vector, unit, frame) in COMMAND_VECTORS {
+        let mut columns = Vec::new();
+        for (vector, unit, frame) in command_vectors(&self.mission) {
             for axis in AXES {
-                columns.push(link.read(&grid(&format!("command.{vector}.{axis}"), unit, frame))?);
+                columns.push(link.read(&grid(&format!("command.{vector}.{axis}"), unit, &frame))?);
             }
         }
-        Ok(columns.try_into().ok())
+        Ok(Some(columns))
     }
 
     /// A reconstruction from the start, for other levels of the noise.
@@ -193,20 +194,20 @@ impl HinfDfacs {
 fn write_columns(
     link: &mut Link<'_>,
     table: Table,
-    noise_x: [&'static str; 2],
-    declared: &[NoiseProcess],
+    mission: &Mission,
+    noises: &[[&'static str; 3]],
 ) -> Result<Vec<Out>, PluginError> {
-    let mut out = Vec::with_capacity(ROW);
+    let declared = noise::declared(mission, noises);
+    let mut out = Vec::with_capacity(row_length(noises.len()));
     for (vector, unit) in [("sc.alpha_srf_rad_s2", "rad s-2"), ("sc.omega_srf_rad_s", "rad s-1")] {
         for axis in AXES {
             out.push(link.write(table, &format!("{vector}.{axis}"), unit, "SRF")?);
         }
     }
-    let noise = |tm: usize| [noise_x[tm], "is_y", "is_z"];
-    for (tm, name) in ["tm1", "tm2"].iter().enumerate() {
-        let frame = format!("ORF_{}", tm + 1);
-        for (axis, noise) in AXES.iter().zip(noise(tm)) {
-            out.push(link.write_with(table, &format!("{name}.r_orf_m.{axis}"), "m", &frame, &[("noise", noise)])?);
+    for (name, noises) in mission.test_mass.keys().zip(noises) {
+        let frame = mission.frame(name);
+        for (axis, noise) in AXES.iter().zip(noises) {
+            out.push(link.write_with(table, &format!("{name}.r_orf_m.{axis}"), "m", &frame, &[("noise", *noise)])?);
         }
         for axis in AXES {
             let column = format!("{name}.u_orf_m_s2.{axis}");
@@ -217,14 +218,14 @@ fn write_columns(
         let attributes = [("kind", "channel"), ("channel", name), ("average", "2"), ("noise", noise)];
         link.write_noisy(table, name, unit, frame, &attributes, declared)
     };
-    for (tm, name) in ["tm1", "tm2"].iter().enumerate() {
-        for (axis, noise) in AXES.iter().zip(noise(tm)) {
-            out.push(channel(&format!("{name}.accel.{axis}"), "m s-2", &format!("ORF_{}", tm + 1), noise, &[])?);
+    for (name, noises) in mission.test_mass.keys().zip(noises) {
+        for (axis, noise) in AXES.iter().zip(noises) {
+            out.push(channel(&format!("{name}.accel.{axis}"), "m s-2", &mission.frame(name), noise, &[])?);
         }
     }
     // The noise of all channels is declared with the last of them.
     for axis in AXES {
-        let declared = if axis == "z" { declared } else { &[] };
+        let declared = if axis == "z" { declared.as_slice() } else { &[] };
         out.push(channel(&format!("sc.alpha.{axis}"), "rad s-2", "SRF", "dws_long_arm", declared)?);
     }
     Ok(out)
@@ -238,8 +239,11 @@ impl Linked {
         };
         Epoch {
             time_ns: input.time_ns[k],
-            readout: std::array::from_fn(|i| input.readout[i].map_or(f64::NAN, |column| column[k])),
-            command: std::array::from_fn(|i| input.command.map_or(f64::NAN, |columns| columns[i][k])),
+            readout: input.readout.iter().map(|column| column.map_or(f64::NAN, |column| column[k])).collect(),
+            command: match &input.command {
+                Some(columns) => columns.iter().map(|column| column[k]).collect(),
+                None => CommandNumbers::from_fn(input.readout.len() + 3, |_| f64::NAN),
+            },
             sun_srf: vector(&input.sun),
             ephemeris_age_s: input.ephemeris_age.map_or(f64::NAN, |column| column[k]),
             omega_crf_rad_s: vector(&input.omega_crf),
@@ -249,7 +253,7 @@ impl Linked {
 
     fn give(&mut self, output: &mut Outputs) {
         output.time(self.table).extend(self.rows.iter().map(|row| row.time_ns));
-        let (always, asked) = self.out.split_at(ROW);
+        let (always, asked) = self.out.split_at(self.always);
         for (i, column) in always.iter().enumerate() {
             output.f64(*column).extend(self.rows.iter().map(|row| row.values[i]));
         }
@@ -263,8 +267,8 @@ impl Linked {
 /// A batch's columns, looked up once.
 struct Columns<'a> {
     time_ns: &'a [i64],
-    readout: [Option<&'a [f64]>; 15],
-    command: Option<[&'a [f64]; 18]>,
+    readout: Vec<Option<&'a [f64]>>,
+    command: Option<Vec<&'a [f64]>>,
     sun: Option<[&'a [f64]; 3]>,
     ephemeris_age: Option<&'a [f64]>,
     omega_crf: Option<[&'a [f64]; 3]>,
@@ -276,8 +280,8 @@ impl<'a> Columns<'a> {
         let vector = |columns: &Option<[In; 3]>| columns.map(|c| c.map(|c| input.f64(c)));
         Self {
             time_ns: input.time_ns(),
-            readout: linked.readout.map(|c| c.map(|c| input.f64(c))),
-            command: linked.command.map(|c| c.map(|c| input.f64(c))),
+            readout: linked.readout.iter().map(|c| c.map(|c| input.f64(c))).collect(),
+            command: linked.command.as_ref().map(|c| c.iter().map(|c| input.f64(*c)).collect()),
             sun: vector(&linked.sun),
             ephemeris_age: linked.ephemeris_age.map(|c| input.f64(c)),
             omega_crf: vector(&linked.omega_crf),
@@ -348,8 +352,8 @@ impl Stage for HinfDfacs {
     }
 
     fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
-        let (readout, noise_x) = self.link_readouts(available, link)?;
-        let command = Self::link_commands(available, link)?;
+        let (readout, noises) = self.link_readouts(available, link)?;
+        let command = self.link_commands(available, link)?;
         let sun = read_vector(available, link, "ephemeris.sun_srf", "1", "SRF")?;
         let ephemeris_age = link.read_if_available(available, &grid("ephemeris.age_s", "s", ""))?;
         let omega_crf = read_vector(available, link, "ephemeris.omega_crf_rad_s", "rad s-1", "CRF")?;
@@ -373,7 +377,7 @@ impl Stage for HinfDfacs {
                     .to_owned(),
             );
         }
-        let rate_hz = available.column("grid", "is.tm1.r_orf_m.y").map_or(0.0, |c| c.rate_hz);
+        let rate_hz = available.columns.iter().find(|c| c.table == "grid").map_or(0.0, |c| c.rate_hz);
         let settings = Settings {
             rate_hz,
             angular_acceleration: self.angular_acceleration,
@@ -395,11 +399,12 @@ impl Stage for HinfDfacs {
             ));
         }
         let table = link.table("reconstruction", rate_hz);
-        let mut out = write_columns(link, table, noise_x, &noise::declared(&self.mission, &noise_x))?;
+        let mut out = write_columns(link, table, &self.mission, &noises)?;
+        let always = out.len();
         for (name, unit, frame) in reconstruction.asked_columns() {
             let attributes = [("kind", "series"), ("in_loop", "true")];
             let attributes = if asked::is_in_loop(&name) { &attributes[..] } else { &attributes[..1] };
-            out.push(link.write_with(table, &name, unit, frame, attributes)?);
+            out.push(link.write_with(table, &name, unit, &frame, attributes)?);
         }
         self.linked = Some(Linked {
             reconstruction,
@@ -415,6 +420,7 @@ impl Stage for HinfDfacs {
             alpha_crf,
             table,
             out,
+            always,
             rows: Vec::new(),
         });
         Ok(())
@@ -534,7 +540,7 @@ impl Stage for HinfDfacs {
             }
         }
         if let Some(comparison) = linked.reconstruction.comparison() {
-            q.insert("command_replay".to_owned(), comparison_json(comparison));
+            q.insert("command_replay".to_owned(), comparison_json(comparison, &self.mission));
             if !comparison.same_law() {
                 report.notes.push(
                     "flown commands differ from the replayed control law by more than readout noise explains: another \
@@ -585,7 +591,8 @@ impl HinfDfacs {
         let scale = Scale { torque: Vector3::new(numbers[0], numbers[1], numbers[2]), sensing: numbers[3] };
         if waits {
             let count = reader.length(pilot::length(self.linked.as_ref().ok_or_else(not_linked)?.rate_hz))?;
-            let pilot = (0..count).map(|_| Epoch::load(&mut reader)).collect::<Result<_, _>>()?;
+            let test_masses = self.mission.test_mass.len();
+            let pilot = (0..count).map(|_| Epoch::load(test_masses, &mut reader)).collect::<Result<_, _>>()?;
             reader.end()?;
             self.linked.as_mut().ok_or_else(not_linked)?.pilot = Some(pilot);
             return Ok(());
@@ -599,9 +606,9 @@ impl HinfDfacs {
 
 /// `{"samples", "rms_distance": {vector: value}, "mean_distance": {…}, "rms_flown": {…}, "rms_change_of_flown": {…}}`, N and
 /// N m.
-fn comparison_json(comparison: &Comparison) -> serde_json::Value {
-    let by_vector = |values: [f64; 6]| {
-        let pairs = COMMAND_VECTORS.iter().zip(values).map(|((name, _, _), value)| ((*name).to_owned(), json!(value)));
+fn comparison_json(comparison: &Comparison, mission: &Mission) -> serde_json::Value {
+    let by_vector = |values: Vec<f64>| {
+        let pairs = command_vectors(mission).into_iter().zip(values).map(|((name, _, _), value)| (name, json!(value)));
         pairs.collect::<serde_json::Map<_, _>>()
     };
     json!({

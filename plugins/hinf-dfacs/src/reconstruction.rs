@@ -1,7 +1,8 @@
 //! From telemetry on the grid to the `reconstruction` table, epoch by epoch.
 
-use dragfree_physics::control::ControlLaw;
-use dragfree_physics::mission::{Mission, MissionError};
+use dragfree_physics::control::{Command, ControlLaw, PerTestMass};
+use dragfree_physics::few::Few;
+use dragfree_physics::mission::{MOST_TEST_MASSES, Mission, MissionError, TestMass};
 use dragfree_physics::thrust_noise::ThrustNoise;
 use nalgebra::{Matrix3, Vector3};
 
@@ -10,7 +11,7 @@ use crate::asked::{Asked, Given, Needs};
 use crate::bridge::{LONGEST, bridge};
 use crate::known::{KnownModel, KnownMotion};
 use crate::pilot::Scale;
-use crate::replay::{CommandNumbers, Comparison, Held, ReadoutNumbers, Replay, command_from};
+use crate::replay::{CommandNumbers, Comparison, Held, ReadoutNumbers, Replay, electrodes_of};
 use crate::smoother::{Model, Smoothed, Smoother};
 use crate::state::{Reader, StateError, Writer};
 
@@ -54,9 +55,9 @@ pub struct Settings {
 pub struct Epoch {
     /// Unix ns.
     pub time_ns: i64,
-    /// Best readouts, in the order of [`dragfree_physics::mission::CHANNELS`], m and rad.
+    /// Best readouts, in the order of [`Mission::channels`], m and rad.
     pub readout: ReadoutNumbers,
-    /// What acts over `[t_k, t_{k+1})`, in the order of [`crate::replay::COMMAND_VECTORS`], N and N m.
+    /// What acts over `[t_k, t_{k+1})`, in the order of [`crate::replay::command_vectors`], N and N m.
     pub command: CommandNumbers,
     /// Unit vector from the Sun to the spacecraft, SRF.
     pub sun_srf: Vector3<f64>,
@@ -79,11 +80,11 @@ impl Epoch {
         out.numbers(self.alpha_crf_rad_s2.as_slice());
     }
 
-    pub(crate) fn load(state: &mut Reader<'_>) -> Result<Self, StateError> {
+    pub(crate) fn load(test_masses: usize, state: &mut Reader<'_>) -> Result<Self, StateError> {
         let mut epoch = Self {
             time_ns: state.time()?,
-            readout: [0.0; 15],
-            command: [0.0; 18],
+            readout: ReadoutNumbers::from_fn(3 + 6 * test_masses, |_| 0.0),
+            command: CommandNumbers::from_fn(6 + 6 * test_masses, |_| 0.0),
             sun_srf: Vector3::zeros(),
             ephemeris_age_s: 0.0,
             omega_crf_rad_s: Vector3::zeros(),
@@ -99,21 +100,30 @@ impl Epoch {
     }
 }
 
-/// Values in a row of the `reconstruction` table.
-pub const ROW: usize = 27;
-/// First value of the nine channels in a row.
-pub const CHANNELS_AT: usize = 18;
+/// Values in a row of the `reconstruction` table, of a mission with so many test masses.
+#[must_use]
+pub fn row_length(test_masses: usize) -> usize {
+    9 + 9 * test_masses
+}
 
-/// A row: `α̂` (3), `ω̂` (3), `r_1` (3), `û_1` (3), `r_2` (3), `û_2` (3), then the channels `tm1.accel` (3),
-/// `tm2.accel` (3) and `sc.alpha` (3).
+/// A row: `α̂` (3), `ω̂` (3), `r` (3) and `û` (3) of each test mass, then the channels `NAME.accel` (3) of each and
+/// `sc.alpha` (3).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Row {
     /// Unix ns.
     pub time_ns: i64,
     /// Values, NaN where there is none.
-    pub values: [f64; ROW],
+    pub values: Few<f64, { 9 + 9 * MOST_TEST_MASSES }>,
     /// Values of the columns on demand, in the order of [`Reconstruction::asked_columns`].
     pub asked: Vec<f64>,
+}
+
+impl Row {
+    /// The channels of the spacecraft's attitude, `sc.alpha`, rad s⁻².
+    #[must_use]
+    pub fn attitude_channels(&self) -> &[f64] {
+        &self.values[self.values.len() - 3..]
+    }
 }
 
 /// What happened to how many epochs.
@@ -139,15 +149,23 @@ pub struct Counts {
     pub blind: u64,
 }
 
+/// What there is of a test mass in an epoch that waits for the smoother, ORF.
+#[derive(Clone, Copy, Debug, Default)]
+struct PendingTestMass {
+    r_orf_m: Vector3<f64>,
+    /// The same with short holes bridged.
+    bridged_orf_m: Vector3<f64>,
+    u_orf_m_s2: Vector3<f64>,
+}
+
 /// An epoch that waits for the smoother.
 #[derive(Clone, Copy, Debug)]
 struct Pending {
     time_ns: i64,
     attitude_rad: Vector3<f64>,
-    r_orf_m: [Vector3<f64>; 2],
-    /// The same with short holes bridged: attitude, `r_1`, `r_2`.
-    bridged: [Vector3<f64>; 3],
-    u_orf_m_s2: [Vector3<f64>; 2],
+    /// The same with short holes bridged.
+    bridged_rad: Vector3<f64>,
+    tm: PerTestMass<PendingTestMass>,
     /// Commanded, relative to IRF.
     alpha_known_rad_s2: Vector3<f64>,
     /// `ω̇_SI − ω̇_SC = T ω̇_CI − ω_SC×(T ω_CI)`.
@@ -156,41 +174,46 @@ struct Pending {
 }
 
 impl Pending {
-    fn numbers(&self) -> [f64; 33] {
-        let [r1, r2] = self.r_orf_m;
-        let [u1, u2] = self.u_orf_m_s2;
-        let [a, b, c] = self.bridged;
-        let v = [
-            self.attitude_rad,
-            r1,
-            r2,
-            u1,
-            u2,
-            self.alpha_known_rad_s2,
-            self.frame_rad_s2,
-            self.omega_ci_rad_s,
-            a,
-            b,
-            c,
-        ];
-        std::array::from_fn(|i| v[i / 3][i % 3])
+    /// A bridged readout by its place: attitude, then the displacements of each test mass.
+    fn bridged(&self, place: usize) -> f64 {
+        if place < 3 { self.bridged_rad[place] } else { self.tm[place / 3 - 1].bridged_orf_m[place % 3] }
     }
 
-    fn load(state: &mut Reader<'_>) -> Result<Self, StateError> {
-        let time_ns = state.time()?;
-        let mut numbers = [0.0; 33];
-        state.numbers(&mut numbers)?;
-        let v = |i: usize| Vector3::from_column_slice(&numbers[3 * i..3 * i + 3]);
-        Ok(Self {
-            time_ns,
-            attitude_rad: v(0),
-            r_orf_m: [v(1), v(2)],
-            u_orf_m_s2: [v(3), v(4)],
-            alpha_known_rad_s2: v(5),
-            frame_rad_s2: v(6),
-            omega_ci_rad_s: v(7),
-            bridged: [v(8), v(9), v(10)],
-        })
+    fn bridge(&mut self, place: usize, value: f64) {
+        let vector = if place < 3 { &mut self.bridged_rad } else { &mut self.tm[place / 3 - 1].bridged_orf_m };
+        vector[place % 3] = value;
+    }
+
+    fn vectors(&mut self) -> impl Iterator<Item = &mut Vector3<f64>> {
+        let spacecraft = [
+            &mut self.attitude_rad,
+            &mut self.bridged_rad,
+            &mut self.alpha_known_rad_s2,
+            &mut self.frame_rad_s2,
+            &mut self.omega_ci_rad_s,
+        ];
+        let test_masses = self.tm.iter_mut().flat_map(|tm| [&mut tm.r_orf_m, &mut tm.bridged_orf_m, &mut tm.u_orf_m_s2]);
+        spacecraft.into_iter().chain(test_masses)
+    }
+
+    fn save(mut self, out: &mut Writer) {
+        out.time(self.time_ns);
+        self.vectors().for_each(|v| out.numbers(v.as_slice()));
+    }
+
+    fn load(test_masses: usize, state: &mut Reader<'_>) -> Result<Self, StateError> {
+        let zero = Vector3::zeros();
+        let mut out = Self {
+            time_ns: state.time()?,
+            attitude_rad: zero,
+            bridged_rad: zero,
+            tm: PerTestMass::from_fn(test_masses, |_| PendingTestMass::default()),
+            alpha_known_rad_s2: zero,
+            frame_rad_s2: zero,
+            omega_ci_rad_s: zero,
+        };
+        out.vectors().try_for_each(|v| state.numbers(v.as_mut_slice()))?;
+        Ok(out)
     }
 }
 
@@ -202,7 +225,7 @@ pub struct Reconstruction {
     known: KnownModel,
     /// `−T_S^{O_i} C J/m_S`: the acceleration of each test mass, ORF, by the force that comes with the thrusters' torque, from
     /// what that torque does to the spacecraft, SRF; m s⁻² per rad s⁻².
-    push_per_turn: [Matrix3<f64>; 2],
+    push_per_turn: Vec<Matrix3<f64>>,
     smoother: Smoother,
     replay: Option<Replay>,
     held: Held,
@@ -270,28 +293,28 @@ impl Reconstruction {
         let missing = || MissionError::Missing { section: "noise.thruster_torque".to_owned(), needed_by: NEEDED_BY };
         let noise = ThrustNoise::of(mission).filter(|n| !n.torque_shape.terms.is_empty()).ok_or_else(missing)?;
         let model = model(mission, &noise, settings)?;
-        let push_per_turn = |name: &str| -> Result<Matrix3<f64>, MissionError> {
-            let dcm_orf_from_srf = mission.test_mass(name, NEEDED_BY)?.dcm_orf_from_srf();
-            let force_per_turn = noise.force_per_torque * mission.spacecraft.inertia();
-            Ok(dcm_orf_from_srf * force_per_turn / -mission.spacecraft.mass_kg)
-        };
+        let known = KnownModel::new(mission)?;
+        let test_masses = mission.test_mass.len();
+        let force_per_turn = noise.force_per_torque * mission.spacecraft.inertia();
+        let push = |tm: &TestMass| tm.dcm_orf_from_srf() * force_per_turn / -mission.spacecraft.mass_kg;
+        let push_per_turn: Vec<_> = mission.test_mass.values().map(push).collect();
         let replay = if settings.replay {
-            Some(Replay::new(ControlLaw::new(mission)?, !settings.commands, settings.warm_up_s, settings.rate_hz))
+            let (law, numbers) = (ControlLaw::new(mission)?, 6 + 6 * test_masses);
+            Some(Replay::new(law, numbers, !settings.commands, settings.warm_up_s, settings.rate_hz))
         } else {
             None
         };
-        let push_per_turn = [push_per_turn("tm1")?, push_per_turn("tm2")?];
-        let asked = || Asked::new(settings.needs, mission.spacecraft.inertia_inverse(), push_per_turn);
+        let asked = || Asked::new(settings.needs, mission, push_per_turn.clone());
         Ok(Self {
             rate_hz: settings.rate_hz,
             angular_acceleration: settings.angular_acceleration,
             needs_sun: settings.sun && mission.solar_pressure.is_some(),
-            push_per_turn,
             asked: (settings.needs != Needs::default()).then(asked),
-            known: KnownModel::new(mission)?,
+            push_per_turn,
+            known,
             smoother: Smoother::new(model),
             replay,
-            held: Held::new(),
+            held: Held::new(3 + 6 * test_masses),
             acting: Acting::new(mission, 1.0 / settings.rate_hz),
             sun_srf: None,
             packet_sun_srf: None,
@@ -332,13 +355,16 @@ impl Reconstruction {
         let motion = self.known_motion(epoch, &(omega_sc + self.omega_ci_rad_s))?;
         self.smoother.advance(motion.map(|m| m.alpha_srf_rad_s2 - frame_rad_s2).as_ref());
         let missing = Vector3::from_element(f64::NAN);
-        let r_orf_m = [3, 9].map(|i| Vector3::from_column_slice(&epoch.readout[i..i + 3]));
+        let tm = epoch.readout[3..].chunks_exact(6).enumerate().map(|(i, readout)| {
+            let r_orf_m = Vector3::from_column_slice(&readout[..3]);
+            let u_orf_m_s2 = motion.map_or(missing, |m| m.u_orf_m_s2[i]);
+            PendingTestMass { r_orf_m, bridged_orf_m: r_orf_m, u_orf_m_s2 }
+        });
         self.pending.push(Pending {
             time_ns: epoch.time_ns,
             attitude_rad,
-            r_orf_m,
-            bridged: [attitude_rad, r_orf_m[0], r_orf_m[1]],
-            u_orf_m_s2: motion.map_or([missing; 2], |m| m.u_orf_m_s2),
+            bridged_rad: attitude_rad,
+            tm: tm.collect(),
             alpha_known_rad_s2: motion.map_or(missing, |m| m.alpha_srf_rad_s2),
             frame_rad_s2,
             omega_ci_rad_s: self.omega_ci_rad_s,
@@ -353,9 +379,8 @@ impl Reconstruction {
     /// Fills a hole that the two newest epochs end. At least a lag of epochs is always pending, longer than any bridge.
     fn bridge(&mut self) {
         let end = self.pending.len();
-        for component in 0..9 {
-            let (vector, axis) = (component / 3, component % 3);
-            let at = |back: usize| end.checked_sub(back).map_or(f64::NAN, |k| self.pending[k].bridged[vector][axis]);
+        for place in 0..3 + 3 * self.push_per_turn.len() {
+            let at = |back: usize| end.checked_sub(back).map_or(f64::NAN, |k| self.pending[k].bridged(place));
             if !(at(1).is_finite() && at(2).is_finite() && at(3).is_nan()) {
                 continue;
             }
@@ -366,7 +391,7 @@ impl Reconstruction {
             }
             let after = [at(2), at(1)];
             for (k, value) in (end - 2 - missing..).zip(bridge(before, after, missing)) {
-                self.pending[k].bridged[vector][axis] = value;
+                self.pending[k].bridge(place, value);
                 self.counts.readouts_bridged += 1;
             }
         }
@@ -400,14 +425,14 @@ impl Reconstruction {
         // Electrodes of one test mass that nobody tells of: the other one and the spacecraft go on. Their recoil, 1e-9 N on the
         // spacecraft, is a thousandth of the thrusters' noise.
         let without = |tm: usize| -> Option<CommandNumbers> {
-            let theirs = 6 + 6 * tm..12 + 6 * tm;
-            let others = (0..18).filter(|i| !theirs.contains(i));
-            let known = others.clone().all(|i| epoch.command[i].is_finite());
-            known.then(|| std::array::from_fn(|i| if theirs.contains(&i) { 0.0 } else { epoch.command[i] }))
+            let theirs = electrodes_of(tm);
+            let given = |i: usize| if theirs.contains(&i) { 0.0 } else { epoch.command[i] };
+            let others = CommandNumbers::from_fn(epoch.command.len(), given);
+            others.iter().all(|x| x.is_finite()).then_some(others)
         };
         let mut silent = None;
         let told = flown.copied().or(replayed).or_else(|| {
-            silent = (0..2).find(|tm| without(*tm).is_some());
+            silent = (0..self.push_per_turn.len()).find(|tm| without(*tm).is_some());
             silent.and_then(without)
         });
         if silent.is_some() {
@@ -428,7 +453,7 @@ impl Reconstruction {
         }
         let readout = self.held.test_masses();
         Ok(acting.map(|numbers| {
-            let command = command_from(&numbers);
+            let command = Command::from_numbers(&numbers);
             let mut motion = self.known.motion(&command, self.sun_srf.as_ref(), &readout, omega_srf_rad_s);
             if let Some(tm) = silent {
                 motion.u_orf_m_s2[tm] = Vector3::from_element(f64::NAN);
@@ -444,15 +469,15 @@ impl Reconstruction {
         let alpha_crf_rad_s2: Vec<_> = self.pending.iter().zip(&smoothed).filter(|_| delay).map(alpha_crf).collect();
         smoothed.truncate(count);
         for (pending, smoothed) in self.pending.iter_mut().zip(&smoothed) {
-            for (u, push) in pending.u_orf_m_s2.iter_mut().zip(&self.push_per_turn) {
-                *u += push * smoothed.noise_rad_s2;
+            for (tm, push) in pending.tm.iter_mut().zip(&self.push_per_turn) {
+                tm.u_orf_m_s2 += push * smoothed.noise_rad_s2;
             }
         }
         let blind = self.blind(smoothed.len());
         let known = |v: &Vector3<f64>| v.iter().all(|x| x.is_finite());
         let given = |(p, blind): (&Pending, &bool)| Given {
             alpha: known(&p.alpha_known_rad_s2) && !blind,
-            u: p.u_orf_m_s2.each_ref().map(known),
+            u: p.tm.map(|tm| known(&tm.u_orf_m_s2)),
         };
         let mut asked = Vec::new();
         if let Some(columns) = &mut self.asked {
@@ -511,29 +536,27 @@ impl Reconstruction {
                 _ => missing,
             },
         };
-        let [tm1, tm2, sc] = match (before, after) {
-            (Some(a), Some(c)) => {
-                let difference = |read: fn(&Pending) -> Vector3<f64>, known: fn(&Pending) -> Vector3<f64>| {
-                    (read(a) - 2.0 * read(now) + read(c)) * (self.rate_hz * self.rate_hz)
-                        - 0.5 * (known(a) + known(now))
-                };
-                [
-                    difference(|p| p.bridged[1], |p| p.u_orf_m_s2[0]),
-                    difference(|p| p.bridged[2], |p| p.u_orf_m_s2[1]),
-                    difference(|p| p.bridged[0], |p| p.alpha_known_rad_s2 - p.frame_rad_s2),
-                ]
-            }
-            _ => [missing; 3],
-        };
         let omega = smoothed.omega_crf_rad_s + now.omega_ci_rad_s;
-        let vectors =
-            [alpha, omega, now.r_orf_m[0], now.u_orf_m_s2[0], now.r_orf_m[1], now.u_orf_m_s2[1], tm1, tm2, sc];
-        Row { time_ns: now.time_ns, values: std::array::from_fn(|i| vectors[i / 3][i % 3]), asked: Vec::new() }
+        let mut vectors: Few<Vector3<f64>, { 3 + 3 * MOST_TEST_MASSES }> = [alpha, omega].into_iter().collect();
+        for tm in &now.tm {
+            vectors.push(tm.r_orf_m);
+            vectors.push(tm.u_orf_m_s2);
+        }
+        // Measured minus known acceleration, the known one averaged as the second difference averages it.
+        let difference = |read: &dyn Fn(&Pending) -> Vector3<f64>, known: &dyn Fn(&Pending) -> Vector3<f64>| {
+            let (Some(a), Some(c)) = (before, after) else { return missing };
+            (read(a) - 2.0 * read(now) + read(c)) * (self.rate_hz * self.rate_hz) - 0.5 * (known(a) + known(now))
+        };
+        for i in 0..now.tm.len() {
+            vectors.push(difference(&|p| p.tm[i].bridged_orf_m, &|p| p.tm[i].u_orf_m_s2));
+        }
+        vectors.push(difference(&|p| p.bridged_rad, &|p| p.alpha_known_rad_s2 - p.frame_rad_s2));
+        Row { time_ns: now.time_ns, values: vectors.iter().flatten().copied().collect(), asked: Vec::new() }
     }
 
     /// Name, unit and frame of the columns on demand.
     #[must_use]
-    pub fn asked_columns(&self) -> Vec<(String, &'static str, &'static str)> {
+    pub fn asked_columns(&self) -> Vec<(String, &'static str, String)> {
         self.asked.as_ref().map(Asked::columns).unwrap_or_default()
     }
 
@@ -598,8 +621,7 @@ impl Reconstruction {
         out.numbers(&[self.since_attitude]);
         out.flag(self.previous.is_some());
         for pending in self.previous.iter().chain(&self.pending) {
-            out.time(pending.time_ns);
-            out.numbers(&pending.numbers());
+            pending.save(&mut out);
         }
         self.needs().flags().into_iter().for_each(|flag| out.flag(flag));
         if let Some(asked) = &self.asked {
@@ -644,10 +666,11 @@ impl Reconstruction {
         let mut since = [0.0];
         state.numbers(&mut since)?;
         [self.since_attitude] = since;
-        self.previous = if state.flag()? { Some(Pending::load(&mut state)?) } else { None };
+        let test_masses = self.push_per_turn.len();
+        self.previous = if state.flag()? { Some(Pending::load(test_masses, &mut state)?) } else { None };
         self.pending.clear();
         for _ in 0..self.smoother.waiting() {
-            self.pending.push(Pending::load(&mut state)?);
+            self.pending.push(Pending::load(test_masses, &mut state)?);
         }
         let needs = self.needs();
         for flag in needs.flags() {

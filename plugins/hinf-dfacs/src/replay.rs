@@ -1,24 +1,34 @@
 //! The commands that the control law would have given: a stand-in where none were telemetered, a check where they were.
 
-use dragfree_physics::control::{Command, ControlLaw, Readout, TestMassCommand, TestMassReadout};
+use dragfree_physics::control::{ControlLaw, PerTestMass, Readout, TestMassReadout};
+use dragfree_physics::few::Few;
+use dragfree_physics::mission::{MOST_TEST_MASSES, Mission};
 use nalgebra::Vector3;
 
 use crate::state::{Reader, StateError, Writer};
 
-/// A command as numbers: the six vectors of [`COMMAND_VECTORS`], axis by axis.
-pub type CommandNumbers = [f64; 18];
-/// A readout as numbers, in the order of [`dragfree_physics::mission::CHANNELS`].
-pub type ReadoutNumbers = [f64; 15];
+/// A command as numbers: thrust and torque of the thrusters, then force and torque on each test mass, axis by axis.
+pub type CommandNumbers = Few<f64, { 6 + 6 * MOST_TEST_MASSES }>;
+/// A readout as numbers, in the order of [`Mission::channels`].
+pub type ReadoutNumbers = Few<f64, { 3 + 6 * MOST_TEST_MASSES }>;
 
-/// Name, unit and frame of the six vectors of a command.
-pub const COMMAND_VECTORS: [(&str, &str, &str); 6] = [
-    ("mps_force_srf_n", "N", "SRF"),
-    ("mps_torque_srf_nm", "N m", "SRF"),
-    ("tm1.force_orf_n", "N", "ORF_1"),
-    ("tm1.torque_orf_nm", "N m", "ORF_1"),
-    ("tm2.force_orf_n", "N", "ORF_2"),
-    ("tm2.torque_orf_nm", "N m", "ORF_2"),
-];
+/// Name, unit and frame of the vectors of a command.
+#[must_use]
+pub fn command_vectors(mission: &Mission) -> Vec<(String, &'static str, String)> {
+    let thrusters = [("mps_force_srf_n", "N"), ("mps_torque_srf_nm", "N m")];
+    let mut all: Vec<_> = thrusters.map(|(name, unit)| (name.to_owned(), unit, "SRF".to_owned())).into();
+    for name in mission.test_mass.keys() {
+        for (what, unit) in [("force_orf_n", "N"), ("torque_orf_nm", "N m")] {
+            all.push((format!("{name}.{what}"), unit, mission.frame(name)));
+        }
+    }
+    all
+}
+
+/// The numbers of a command that belong to a test mass.
+pub(crate) fn electrodes_of(test_mass: usize) -> std::ops::Range<usize> {
+    6 + 6 * test_mass..12 + 6 * test_mass
+}
 
 /// A readout missing for longer than this stops the replay: the flown controller saw what we did not.
 const LONGEST_HOLD_S: f64 = 1.0;
@@ -29,45 +39,26 @@ const SAME_LAW: f64 = 0.5;
 /// Samples to compare before the replay may stand in for a lost command.
 const PROOF_SAMPLES: u64 = 1000;
 
-pub(crate) fn command_from(numbers: &CommandNumbers) -> Command {
-    let at = |i: usize| Vector3::from_column_slice(&numbers[3 * i..3 * i + 3]);
-    let tm = |i: usize| TestMassCommand { force_orf_n: at(i), torque_orf_nm: at(i + 1) };
-    Command { mps_force_srf_n: at(0), mps_torque_srf_nm: at(1), tm: [tm(2), tm(4)] }
-}
-
-fn numbers_of(command: &Command) -> CommandNumbers {
-    let [a, b] = &command.tm;
-    let vectors = [
-        command.mps_force_srf_n,
-        command.mps_torque_srf_nm,
-        a.force_orf_n,
-        a.torque_orf_nm,
-        b.force_orf_n,
-        b.torque_orf_nm,
-    ];
-    std::array::from_fn(|i| vectors[i / 3][i % 3])
-}
-
 /// The last valid readout, channel by channel.
 #[derive(Clone, Debug)]
 pub(crate) struct Held {
     values: ReadoutNumbers,
     /// Samples since it was read; the maximum before the first.
-    ages: [u32; 15],
+    ages: Vec<u32>,
 }
 
 impl Held {
-    pub(crate) fn new() -> Self {
-        Self { values: [0.0; 15], ages: [u32::MAX; 15] }
+    pub(crate) fn new(channels: usize) -> Self {
+        Self { values: ReadoutNumbers::from_fn(channels, |_| 0.0), ages: vec![u32::MAX; channels] }
     }
 
     pub(crate) fn take(&mut self, readout: &ReadoutNumbers) {
-        for i in 0..15 {
-            if readout[i].is_finite() {
-                self.values[i] = readout[i];
-                self.ages[i] = 0;
+        for ((value, age), readout) in self.values.iter_mut().zip(&mut self.ages).zip(readout) {
+            if readout.is_finite() {
+                *value = *readout;
+                *age = 0;
             } else {
-                self.ages[i] = self.ages[i].saturating_add(1);
+                *age = age.saturating_add(1);
             }
         }
     }
@@ -80,15 +71,16 @@ impl Held {
         Vector3::from_column_slice(&self.values[first..first + 3])
     }
 
-    /// Both test masses; zero before the first readout.
-    pub(crate) fn test_masses(&self) -> [TestMassReadout; 2] {
-        [3, 9].map(|i| TestMassReadout { r_orf_m: self.vector(i), att_orf_rad: self.vector(i + 3) })
+    /// The test masses; zero before the first readout.
+    pub(crate) fn test_masses(&self) -> PerTestMass<TestMassReadout> {
+        let at = (3..self.values.len()).step_by(6);
+        at.map(|i| TestMassReadout { r_orf_m: self.vector(i), att_orf_rad: self.vector(i + 3) }).collect()
     }
 
     pub(crate) fn save(&self, out: &mut Writer) {
         out.numbers(&self.values);
-        for age in self.ages {
-            out.count(u64::from(age));
+        for age in &self.ages {
+            out.count(u64::from(*age));
         }
     }
 
@@ -103,7 +95,7 @@ impl Held {
 
 /// How far the replayed commands are from the flown ones, vector by vector, about their mean difference: an integrator
 /// whose state nobody telemetered differs by a constant.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub struct Comparison {
     samples: u64,
     /// Since the last restart.
@@ -117,10 +109,17 @@ pub struct Comparison {
 }
 
 impl Comparison {
+    fn new(numbers: usize) -> Self {
+        let zero = CommandNumbers::from_fn(numbers, |_| 0.0);
+        let (mean, squares, flown_squares, change_squares) = (zero, zero, zero, zero);
+        let (samples, samples_of_mean, changes, previous) = (0, 0, 0, None);
+        Self { samples, samples_of_mean, mean, squares, flown_squares, changes, change_squares, previous }
+    }
+
     fn take(&mut self, flown: &CommandNumbers, replayed: &CommandNumbers) {
         self.samples += 1;
         self.samples_of_mean += 1;
-        for i in 0..18 {
+        for i in 0..flown.len() {
             let difference = flown[i] - replayed[i];
             let step = difference - self.mean[i];
             self.mean[i] += step / self.samples_of_mean as f64;
@@ -129,7 +128,7 @@ impl Comparison {
         }
         if let Some(previous) = self.previous.replace(*flown) {
             self.changes += 1;
-            for i in 0..18 {
+            for i in 0..flown.len() {
                 self.change_squares[i] += (flown[i] - previous[i]).powi(2);
             }
         }
@@ -137,7 +136,7 @@ impl Comparison {
 
     fn restart(&mut self) {
         self.samples_of_mean = 0;
-        self.mean = CommandNumbers::default();
+        self.mean.fill(0.0);
         self.previous = None;
     }
 
@@ -147,28 +146,28 @@ impl Comparison {
         self.samples
     }
 
-    /// Root mean square length of the difference of each of [`COMMAND_VECTORS`], N or N m.
+    /// Root mean square length of the difference of each of [`command_vectors`], N or N m.
     #[must_use]
-    pub fn rms_distance(&self) -> [f64; 6] {
+    pub fn rms_distance(&self) -> Vec<f64> {
         rms(&self.squares, self.samples)
     }
 
-    /// Length of the mean difference of each of [`COMMAND_VECTORS`] since the last restart, N or N m: what a constant in the
+    /// Length of the mean difference of each of [`command_vectors`] since the last restart, N or N m: what a constant in the
     /// flown controllers' integrators amounts to.
     #[must_use]
-    pub fn mean_distance(&self) -> [f64; 6] {
-        std::array::from_fn(|i| self.mean[3 * i..3 * i + 3].iter().map(|m| m * m).sum::<f64>().sqrt())
+    pub fn mean_distance(&self) -> Vec<f64> {
+        self.mean.chunks_exact(3).map(|m| m.iter().map(|m| m * m).sum::<f64>().sqrt()).collect()
     }
 
     /// Root mean square length of the flown command, N or N m.
     #[must_use]
-    pub fn rms_flown(&self) -> [f64; 6] {
+    pub fn rms_flown(&self) -> Vec<f64> {
         rms(&self.flown_squares, self.samples)
     }
 
     /// Root mean square length of the flown command's change from one sample to the next, N or N m.
     #[must_use]
-    pub fn rms_change(&self) -> [f64; 6] {
+    pub fn rms_change(&self) -> Vec<f64> {
         rms(&self.change_squares, self.changes)
     }
 
@@ -186,7 +185,7 @@ impl Comparison {
         out.numbers(&self.flown_squares);
         out.count(self.changes);
         out.numbers(&self.change_squares);
-        out.optional(self.previous.as_ref().map(<[f64; 18]>::as_slice));
+        out.optional(self.previous.as_deref());
     }
 
     fn load(&mut self, state: &mut Reader<'_>) -> Result<(), StateError> {
@@ -197,16 +196,24 @@ impl Comparison {
         state.numbers(&mut self.flown_squares)?;
         self.changes = state.count()?;
         state.numbers(&mut self.change_squares)?;
-        self.previous = state.optional()?;
+        self.previous = optional(state, self.mean.len())?;
         Ok(())
     }
 }
 
-fn rms(squares: &CommandNumbers, samples: u64) -> [f64; 6] {
-    std::array::from_fn(|i| match samples {
-        0 => 0.0,
-        n => (squares[3 * i..3 * i + 3].iter().sum::<f64>() / n as f64).sqrt(),
-    })
+/// A command that may be there.
+fn optional(state: &mut Reader<'_>, numbers: usize) -> Result<Option<CommandNumbers>, StateError> {
+    if !state.flag()? {
+        return Ok(None);
+    }
+    let mut out = CommandNumbers::from_fn(numbers, |_| 0.0);
+    state.numbers(&mut out)?;
+    Ok(Some(out))
+}
+
+fn rms(squares: &CommandNumbers, samples: u64) -> Vec<f64> {
+    let mean = |squares: &[f64]| (squares.iter().sum::<f64>() / samples as f64).sqrt();
+    squares.chunks_exact(3).map(|squares| if samples == 0 { 0.0 } else { mean(squares) }).collect()
 }
 
 /// The running replay.
@@ -226,7 +233,7 @@ pub(crate) struct Replay {
 }
 
 impl Replay {
-    pub(crate) fn new(law: ControlLaw, alone: bool, warm_up_s: f64, rate_hz: f64) -> Self {
+    pub(crate) fn new(law: ControlLaw, numbers: usize, alone: bool, warm_up_s: f64, rate_hz: f64) -> Self {
         Self {
             fresh: law.state(),
             law,
@@ -235,7 +242,7 @@ impl Replay {
             longest_hold_samples: (LONGEST_HOLD_S * rate_hz).ceil() as u32,
             samples: 0,
             offset: None,
-            comparison: Comparison::default(),
+            comparison: Comparison::new(numbers),
         }
     }
 
@@ -257,7 +264,7 @@ impl Replay {
             return Ok(None);
         }
         let readout = Readout { sc_crf_rad: held.vector(0), tm: held.test_masses(), sun_srf };
-        let mut replayed = numbers_of(&self.law.step(&readout));
+        let mut replayed: CommandNumbers = self.law.step(&readout).numbers().collect();
         self.samples += 1;
         if self.samples <= self.warm_up_samples {
             return Ok(None);
@@ -266,15 +273,13 @@ impl Replay {
             // A change across the gap is not the noise of one sample.
             self.comparison.previous = None;
             let proven = self.alone || (self.comparison.samples >= PROOF_SAMPLES && self.comparison.same_law());
-            let offset = if self.alone { Some([0.0; 18]) } else { self.offset };
+            let offset = if self.alone { Some(replayed.map(|_| 0.0)) } else { self.offset };
             return Ok(offset.filter(|_| proven).map(|offset| {
-                for i in 0..18 {
-                    replayed[i] += offset[i];
-                }
+                replayed.iter_mut().zip(&offset).for_each(|(replayed, offset)| *replayed += offset);
                 replayed
             }));
         };
-        self.offset = Some(std::array::from_fn(|i| flown[i] - replayed[i]));
+        self.offset = Some(CommandNumbers::from_fn(flown.len(), |i| flown[i] - replayed[i]));
         self.comparison.take(flown, &replayed);
         Ok(None)
     }
@@ -286,7 +291,7 @@ impl Replay {
     pub(crate) fn save(&self, out: &mut Writer) {
         out.numbers(&self.law.state());
         out.count(self.samples);
-        out.optional(self.offset.as_ref().map(<[f64; 18]>::as_slice));
+        out.optional(self.offset.as_deref());
         self.comparison.save(out);
     }
 
@@ -295,7 +300,7 @@ impl Replay {
         state.numbers(&mut law)?;
         self.law.set_state(&law)?;
         self.samples = state.count()?;
-        self.offset = state.optional()?;
+        self.offset = optional(state, self.comparison.mean.len())?;
         self.comparison.load(state)
     }
 }

@@ -11,7 +11,7 @@ const GAIN: Number = Number::new("1", -3.0, 3.0);
 pub(super) const KINDS: &[Kind] = &[
     Kind {
         id: "es-gain",
-        places: || tm_axes().into_iter().filter(|place| !matches!(place, Place::TmAxis(_, 0))).collect(),
+        places: |count| tm_axes(count).into_iter().filter(|place| !matches!(place, Place::TmAxis(_, 0))).collect(),
         size: GAIN,
         help: "electrodes: a commanded force F acts as (1 + SIZE) F along the axis",
         shape: &[],
@@ -19,9 +19,9 @@ pub(super) const KINDS: &[Kind] = &[
     },
     Kind {
         id: "es-crosstalk",
-        places: || tm_pairs(&[1, 2]),
+        places: |count| tm_pairs(count, &[1, 2]),
         size: GAIN,
-        help: "electrodes: tm2.y-x lets SIZE times the force commanded along y act along x too",
+        help: "electrodes: NAME.y-x lets SIZE times the force commanded along y act along x too",
         shape: &[],
         build,
     },
@@ -94,15 +94,17 @@ mod tests {
     use nalgebra::Vector3;
 
     fn command() -> Command {
-        let mut c = Command { mps_force_srf_n: Vector3::new(1.0, 2.0, 3.0), ..Command::default() };
+        let mut c = Command { mps_force_srf_n: Vector3::new(1.0, 2.0, 3.0), ..Command::zero(2) };
         c.mps_torque_srf_nm = Vector3::new(4.0, 5.0, 6.0);
         c.tm[1].force_orf_n = Vector3::new(0.0, 7.0, 8.0);
         c
     }
 
     fn acting(effects: &[&str]) -> Command {
-        let asked: Vec<Asked> = effects.iter().map(|text| Asked::parse(text).unwrap()).collect();
-        Effects::new(&asked, &Basis { mission: &crate::testing::taiji() }, 1).unwrap().act(&command())
+        let mission = crate::testing::taiji();
+        let names: Vec<String> = mission.test_mass.keys().cloned().collect();
+        let asked: Vec<Asked> = effects.iter().map(|text| Asked::parse(text, &names).unwrap()).collect();
+        Effects::new(&asked, &Basis { mission: &mission }, 1).unwrap().act(&command())
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! How an effect is asked for: `ID:INSTANCE=SIZE[,NAME=VALUE]...`.
 
-use dragfree_physics::mission::MissionError;
+use dragfree_physics::mission::{ANGLES, AXES, MissionError};
 use std::fmt::{self, Display};
 
 use super::{Basis, Cause, catalogue};
@@ -9,7 +9,7 @@ use super::{Basis, Cause, catalogue};
 #[derive(Debug, thiserror::Error)]
 pub enum EffectError {
     /// The text is of another form.
-    #[error("effect {0}: not of the form ID:INSTANCE=SIZE[,NAME=VALUE]..., as es-gain:tm1.y=0.02; there are {list}", list = list())]
+    #[error("effect {0}: not of the form ID:INSTANCE=SIZE[,NAME=VALUE]..., as mps-gain:sc.y=0.02; there are {list}", list = list())]
     Form(String),
     /// No effect of that name.
     #[error("effect {text}: there is no effect {id}; there are {list}", list = list())]
@@ -71,14 +71,14 @@ pub enum EffectError {
     },
 }
 
-/// Where an effect sits. Axes and angles count from 0: x, y, z and φ, θ, ψ.
+/// Where an effect sits. Test masses count from 0 in the order of their names, axes and angles too: x, y, z and φ, θ, ψ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Place {
     /// `sc`, the spacecraft as a whole.
     Spacecraft,
     /// `layout`, the thrusters where they sit.
     Layout,
-    /// `tm1`, a test mass as a whole.
+    /// `NAME`, a test mass as a whole.
     Tm(usize),
     /// An instrument.
     Instrument(Instrument),
@@ -86,9 +86,9 @@ pub enum Place {
     ScAngle(usize),
     /// `sc.x`, an axis of SRF.
     ScAxis(usize),
-    /// `tm1.x`: test mass and axis of its ORF.
+    /// `NAME.x`: test mass and axis of its ORF.
     TmAxis(usize, usize),
-    /// `tm2.y-x` reads from y into x.
+    /// `NAME.y-x` reads from y into x.
     TmPair {
         /// Test mass.
         tm: usize,
@@ -110,53 +110,52 @@ pub enum Instrument {
     Dws,
 }
 
-const AXES: [&str; 3] = ["x", "y", "z"];
-const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
-
-impl Display for Place {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match *self {
-            Self::Spacecraft => f.write_str("sc"),
-            Self::Layout => f.write_str("layout"),
-            Self::Tm(tm) => write!(f, "tm{}", tm + 1),
-            Self::Instrument(Instrument::Is) => f.write_str("is"),
-            Self::Instrument(Instrument::Ifo) => f.write_str("ifo"),
-            Self::Instrument(Instrument::Dws) => f.write_str("dws"),
-            Self::ScAngle(axis) => write!(f, "sc.{}", ANGLES[axis]),
-            Self::ScAxis(axis) => write!(f, "sc.{}", AXES[axis]),
-            Self::TmAxis(tm, axis) => write!(f, "tm{}.{}", tm + 1, AXES[axis]),
-            Self::TmPair { tm, from, to } => write!(f, "tm{}.{}-{}", tm + 1, AXES[from], AXES[to]),
+impl Place {
+    /// What it is called in a mission with these test masses.
+    #[must_use]
+    pub fn name(self, test_masses: &[String]) -> String {
+        match self {
+            Self::Spacecraft => "sc".to_owned(),
+            Self::Layout => "layout".to_owned(),
+            Self::Tm(tm) => test_masses[tm].clone(),
+            Self::Instrument(Instrument::Is) => "is".to_owned(),
+            Self::Instrument(Instrument::Ifo) => "ifo".to_owned(),
+            Self::Instrument(Instrument::Dws) => "dws".to_owned(),
+            Self::ScAngle(axis) => format!("sc.{}", ANGLES[axis]),
+            Self::ScAxis(axis) => format!("sc.{}", AXES[axis]),
+            Self::TmAxis(tm, axis) => format!("{}.{}", test_masses[tm], AXES[axis]),
+            Self::TmPair { tm, from, to } => format!("{}.{}-{}", test_masses[tm], AXES[from], AXES[to]),
         }
     }
 }
 
 /// The axes of SRF.
-pub(super) fn sc_axes() -> Vec<Place> {
+pub(super) fn sc_axes(_: usize) -> Vec<Place> {
     (0..3).map(Place::ScAxis).collect()
 }
 
 /// About the axes of SRF.
-pub(super) fn sc_angles() -> Vec<Place> {
+pub(super) fn sc_angles(_: usize) -> Vec<Place> {
     (0..3).map(Place::ScAngle).collect()
 }
 
-/// Both test masses.
-pub(super) fn test_masses() -> Vec<Place> {
-    (0..2).map(Place::Tm).collect()
+/// The test masses.
+pub(super) fn test_masses(count: usize) -> Vec<Place> {
+    (0..count).map(Place::Tm).collect()
 }
 
-/// Every axis of both test masses.
-pub(super) fn tm_axes() -> Vec<Place> {
-    (0..2).flat_map(|tm| (0..3).map(move |axis| Place::TmAxis(tm, axis))).collect()
+/// Every axis of every test mass.
+pub(super) fn tm_axes(count: usize) -> Vec<Place> {
+    (0..count).flat_map(|tm| (0..3).map(move |axis| Place::TmAxis(tm, axis))).collect()
 }
 
-/// Every ordered pair of axes of both test masses whose first is among `from`.
-pub(super) fn tm_pairs(from: &[usize]) -> Vec<Place> {
+/// Every ordered pair of axes of a test mass whose first is among `from`, for every test mass.
+pub(super) fn tm_pairs(count: usize, from: &[usize]) -> Vec<Place> {
     let pairs = |tm: usize| {
         let to = move |from: usize| (0..3).filter(move |to| *to != from).map(move |to| Place::TmPair { tm, from, to });
         from.iter().copied().flat_map(to)
     };
-    (0..2).flat_map(pairs).collect()
+    (0..count).flat_map(pairs).collect()
 }
 
 /// A number with its unit and the interval in which it has physical sense.
@@ -190,8 +189,8 @@ pub type Built = Result<Box<dyn Cause>, MissionError>;
 pub struct Kind {
     /// Id.
     pub id: &'static str,
-    /// The instances.
-    pub places: fn() -> Vec<Place>,
+    /// The instances, with so many test masses.
+    pub places: fn(usize) -> Vec<Place>,
     /// Unit and interval of SIZE.
     pub size: Number,
     /// What SIZE is and what a positive one does.
@@ -215,6 +214,8 @@ pub struct Asked {
     pub kind: &'static Kind,
     /// Where.
     pub place: Place,
+    /// The same in words.
+    pub instance: String,
     /// SIZE, in the kind's unit.
     pub size: f64,
     /// Shape parameters in the order of the kind's.
@@ -223,17 +224,18 @@ pub struct Asked {
 
 impl Display for Asked {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}:{}={:e}", self.kind.id, self.place, self.size)?;
+        write!(f, "{}:{}={:e}", self.kind.id, self.instance, self.size)?;
         self.kind.shape.iter().zip(&self.shape).try_for_each(|(shape, value)| write!(f, ",{}={value:e}", shape.name))
     }
 }
 
 impl Asked {
-    /// Reads one effect, as in `es-crosstalk:tm2.y-x=0.03`: 3 % of what is commanded along y acts along x.
+    /// Reads one effect on a spacecraft with these test masses, as in `es-crosstalk:NAME.y-x=0.03`: 3 % of what is commanded
+    /// along y acts along x.
     ///
     /// # Errors
     /// [`EffectError`] names what is wrong and what there is.
-    pub fn parse(text: &str) -> Result<Self, EffectError> {
+    pub fn parse(text: &str, test_masses: &[String]) -> Result<Self, EffectError> {
         let form = || EffectError::Form(text.to_owned());
         let mut parts = text.split(',').map(|part| part.split_once('='));
         let (name, size) = parts.next().flatten().ok_or_else(form)?;
@@ -241,12 +243,13 @@ impl Asked {
         let kind = catalogue()
             .find(|kind| kind.id == id)
             .ok_or_else(|| EffectError::Unknown { text: text.to_owned(), id: id.to_owned() })?;
-        let places = (kind.places)();
-        let place = places.iter().find(|place| place.to_string() == instance).ok_or_else(|| EffectError::Instance {
+        let places = (kind.places)(test_masses.len());
+        let names: Vec<String> = places.iter().map(|place| place.name(test_masses)).collect();
+        let at = names.iter().position(|name| name == instance).ok_or_else(|| EffectError::Instance {
             text: text.to_owned(),
             id: kind.id,
             instance: instance.to_owned(),
-            has: joined(&places),
+            has: names.join(", "),
             about: format!("{} [{}]; parameters: {}", kind.help, kind.size.unit, kind.parameters()),
         })?;
         let size = kind.size.read(text, "SIZE", size)?;
@@ -261,7 +264,7 @@ impl Asked {
             })?;
             shape[i] = kind.shape[i].number.read(text, kind.shape[i].name, value)?;
         }
-        Ok(Self { kind, place: *place, size, shape })
+        Ok(Self { kind, place: places[at], instance: instance.to_owned(), size, shape })
     }
 
     /// Value of a shape parameter of the kind.
@@ -301,10 +304,6 @@ impl Kind {
             shape => shape.iter().map(one).collect::<Vec<_>>().join(", "),
         }
     }
-}
-
-fn joined(all: &[impl Display]) -> String {
-    all.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
 }
 
 /// Ids of everything there is; a message has no room for more.

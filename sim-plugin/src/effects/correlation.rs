@@ -10,7 +10,7 @@ use crate::thrusters::{Layout, ThrusterNoise};
 
 pub(super) const KINDS: &[Kind] = &[Kind {
     id: "mps-correlation",
-    places: || vec![Place::Layout],
+    places: |_| vec![Place::Layout],
     size: Number::new("N Hz^-0.5", 0.0, 1e-5),
     help: "thrusters: noise of this ASD in each of six thrusters, white, in place of the noise along and about the axes; \
            7e-8 is as much force along each axis as 1e-7 there",

@@ -52,7 +52,7 @@ pub(super) const KINDS: &[Kind] = &[
     },
 ];
 
-fn build(asked: &Asked, _: &Basis<'_>) -> Built {
+fn build(asked: &Asked, basis: &Basis<'_>) -> Built {
     Ok(match asked.place {
         Place::ScAxis(axis) => Box::new(OffsetDrift {
             axis,
@@ -65,6 +65,7 @@ fn build(asked: &Asked, _: &Basis<'_>) -> Built {
             angle_rad: asked.size,
             rate_rad_s: asked.shape("rate_rad_s"),
             follow: asked.shape("follow"),
+            side: basis.mission.test_mass.values().nth(tm).map_or(1.0, |tm| tm.orf_from_srf_angle_rad.signum()),
         }),
         _ => unreachable!("instances are axes and test masses"),
     })
@@ -97,6 +98,8 @@ struct Opening {
     angle_rad: f64,
     rate_rad_s: f64,
     follow: f64,
+    /// Sign of the angle by which the mission turns the frame: the frames open away from each other.
+    side: f64,
 }
 
 impl Cause for Opening {
@@ -106,8 +109,7 @@ impl Cause for Opening {
 
     fn reshape(&self, elapsed_s: f64, inside: &Interior, plant: &mut Plant) {
         let half_rad = 0.5 * self.follow * (inside.opening_rad - inside.opening_first_rad);
-        // ORF_1 is turned by +30°, ORF_2 by −30°.
-        let followed_rad = if self.tm == 0 { half_rad } else { -half_rad };
+        let followed_rad = if self.side > 0.0 { half_rad } else { -half_rad };
         let body = &mut plant.tm[self.tm];
         let turn = dcm_turned_about_z(self.angle_rad + self.rate_rad_s * elapsed_s + followed_rad);
         body.dcm_orf_from_srf = turn * body.dcm_orf_from_srf;

@@ -132,7 +132,7 @@ impl Effects {
     /// # Errors
     /// [`EffectError::Mission`] when the mission lacks what one needs.
     pub fn new(asked: &[Asked], basis: &Basis<'_>, seed: u64) -> Result<Self, EffectError> {
-        let name = |a: &Asked| format!("{}:{}", a.kind.id, a.place);
+        let name = |a: &Asked| format!("{}:{}", a.kind.id, a.instance);
         let active = asked.iter().enumerate().map(|(i, one)| {
             // Its size does not enter: the same noise, larger or smaller.
             let before = asked[..i].iter().filter(|other| name(other) == name(one)).count();

@@ -118,7 +118,7 @@ impl Cause for Excess {
 
     fn read(&mut self, now: &Moment<'_>, rng: &mut Xoshiro256PlusPlus, measured: &mut Measured) {
         if let Place::TmAxis(tm, axis) = self.place {
-            measured.is_r_orf_m[tm][axis] += self.next(now.elapsed_s, rng);
+            measured.tm[tm].is_r_orf_m[axis] += self.next(now.elapsed_s, rng);
         }
     }
 

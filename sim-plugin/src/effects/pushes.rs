@@ -14,7 +14,7 @@ const SECONDS: Number = Number::new("s", 0.0, 1e9);
 pub(super) const KINDS: &[Kind] = &[
     Kind {
         id: "solar-pressure",
-        places: || vec![Place::Spacecraft],
+        places: |_| vec![Place::Spacecraft],
         size: Number::new("1", -1.0, 10.0),
         help: "sunlight pushes (1 + SIZE) times as hard, at the mission's arm and what is added to it",
         shape: &[
@@ -26,17 +26,17 @@ pub(super) const KINDS: &[Kind] = &[
     },
     Kind {
         id: "impulse",
-        places: || [sc_axes(), sc_angles(), tm_axes()].concat(),
+        places: |count| [sc_axes(count), sc_angles(count), tm_axes(count)].concat(),
         size: Number::new("N s", -1.0, 1.0),
-        help: "sc.x: a micrometeoroid's momentum; tm1.x: a glitch's; sc.phi: angular momentum (N m s) that each move of \
+        help: "sc.x: a micrometeoroid's momentum; NAME.x: a glitch's; sc.phi: angular momentum (N m s) that each move of \
                the antenna takes at its start and gives back at its end",
         shape: &[
             Shape { name: "at_s", number: SECONDS, default: 3600.0, help: "seconds after the first sample" },
             Shape { name: "arm_x_m", number: ARM, default: 0.5, help: "sc.x: where it hits, SRF x, m" },
             Shape { name: "arm_y_m", number: ARM, default: 0.5, help: "the same, y, m" },
             Shape { name: "arm_z_m", number: ARM, default: 0.3, help: "the same, z, m" },
-            Shape { name: "rise_s", number: Number::new("s", 0.0, 1e5), default: 5.0, help: "tm1.x: rise, s" },
-            Shape { name: "decay_s", number: Number::new("s", 1e-3, 1e5), default: 60.0, help: "tm1.x: decay, s" },
+            Shape { name: "rise_s", number: Number::new("s", 0.0, 1e5), default: 5.0, help: "NAME.x: rise, s" },
+            Shape { name: "decay_s", number: Number::new("s", 1e-3, 1e5), default: 60.0, help: "NAME.x: decay, s" },
             Shape { name: "pulse_s", number: Number::new("s", 0.1, 1e4), default: 10.0, help: "sc.phi: its length, s" },
         ],
         build: impulse,

@@ -1,6 +1,8 @@
 //! Instruments that show something else than what is.
 
 use dragfree_physics::attitude::{rotation_vector, turn};
+use dragfree_physics::few::Few;
+use dragfree_physics::mission::MOST_TEST_MASSES;
 use nalgebra::Vector3;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use std::collections::VecDeque;
@@ -26,9 +28,9 @@ pub(super) const KINDS: &[Kind] = &[
     },
     Kind {
         id: "is-crosstalk",
-        places: || tm_pairs(&[0, 1, 2]),
+        places: |count| tm_pairs(count, &[0, 1, 2]),
         size: RATIO,
-        help: "capacitive readout: tm1.y-x shows SIZE times the displacement along y in x too",
+        help: "capacitive readout: NAME.y-x shows SIZE times the displacement along y in x too",
         shape: &[],
         build: |asked, _| {
             let Place::TmPair { tm, from, to } = asked.place else { unreachable!("instances are pairs of axes") };
@@ -48,7 +50,7 @@ pub(super) const KINDS: &[Kind] = &[
     },
     Kind {
         id: "time-offset",
-        places: || vec![Instrument::Is, Instrument::Ifo, Instrument::Dws].into_iter().map(Place::Instrument).collect(),
+        places: |_| vec![Instrument::Is, Instrument::Ifo, Instrument::Dws].into_iter().map(Place::Instrument).collect(),
         size: Number::new("s", 0.0, 2.0),
         help: "what the instrument shows at t was true SIZE seconds before",
         shape: &[],
@@ -65,7 +67,7 @@ struct Capacitive {
 
 impl Cause for Capacitive {
     fn read(&mut self, now: &Moment<'_>, _rng: &mut Xoshiro256PlusPlus, measured: &mut Measured) {
-        measured.is_r_orf_m[self.tm][self.to] += self.size * now.state.tm[self.tm].r_orf_m[self.from];
+        measured.tm[self.tm].is_r_orf_m[self.to] += self.size * now.state.tm[self.tm].r_orf_m[self.from];
     }
 }
 
@@ -78,20 +80,24 @@ struct TiltToLength {
 impl Cause for TiltToLength {
     fn read(&mut self, now: &Moment<'_>, _rng: &mut Xoshiro256PlusPlus, measured: &mut Measured) {
         let angle = rotation_vector(&now.state.tm[self.tm].q_mrf_from_orf);
-        measured.ifo_x_orf_m[self.tm] += self.theta_m_rad * angle.y + self.psi_m_rad * angle.z;
+        measured.tm[self.tm].ifo_orf_m.x += self.theta_m_rad * angle.y + self.psi_m_rad * angle.z;
     }
 }
 
-/// Displacements and angles of both test masses, then the spacecraft's attitude, each three numbers, with their rates.
+/// Displacements and angles of the test masses, then the spacecraft's attitude.
+type Vectors = Few<Vector3<f64>, { 2 * MOST_TEST_MASSES + 1 }>;
+
+/// What there is to see, with its rates.
 #[derive(Clone, Copy)]
 struct Shown {
-    value: [Vector3<f64>; 5],
-    rate: [Vector3<f64>; 5],
+    value: Vectors,
+    rate: Vectors,
 }
 
 impl Shown {
     fn of(now: &Moment<'_>) -> Self {
-        let mut out = Self { value: [Vector3::zeros(); 5], rate: [Vector3::zeros(); 5] };
+        let zero = Vectors::from_fn(2 * now.state.tm.len() + 1, |_| Vector3::zeros());
+        let mut out = Self { value: zero, rate: zero };
         for (i, tm) in now.state.tm.iter().enumerate() {
             let housing = now.plant.tm[i].dcm_orf_from_srf * now.state.omega_srf_rad_s;
             (out.value[2 * i], out.rate[2 * i]) = (tm.r_orf_m, tm.v_orf_m_s);
@@ -99,22 +105,21 @@ impl Shown {
             out.value[2 * i + 1] = rotation_vector(&tm.q_mrf_from_orf);
             out.rate[2 * i + 1] = tm.omega_mrf_rad_s - turn(&tm.q_mrf_from_orf, &housing);
         }
-        out.value[4] = now.state.sc_crf_rad();
-        out.rate[4] = now.state.omega_srf_rad_s - turn(&now.state.q_srf_from_crf, &now.omega_crf_rad_s);
+        let last = 2 * now.state.tm.len();
+        out.value[last] = now.state.sc_crf_rad();
+        out.rate[last] = now.state.omega_srf_rad_s - turn(&now.state.q_srf_from_crf, &now.omega_crf_rad_s);
         out
     }
 
     /// Between `self` and `next`, `part` of the interval after `self`: the cubic that has their values and rates.
-    fn between(&self, next: &Self, part: f64, dt_s: f64) -> [Vector3<f64>; 5] {
+    fn between(&self, next: &Self, part: f64, dt_s: f64) -> Vectors {
         let (s, rest) = (part, 1.0 - part);
         let (a, b) = (rest * rest * (1.0 + 2.0 * s), s * s * (3.0 - 2.0 * s));
         let (c, d) = (s * rest * rest * dt_s, -s * s * rest * dt_s);
-        std::array::from_fn(|i| self.value[i] * a + next.value[i] * b + self.rate[i] * c + next.rate[i] * d)
+        let at = |i: usize| self.value[i] * a + next.value[i] * b + self.rate[i] * c + next.rate[i] * d;
+        Vectors::from_fn(self.value.len(), at)
     }
 }
-
-/// Numbers in a [`Shown`].
-const SHOWN: usize = 30;
 
 struct TimeOffset {
     instrument: Instrument,
@@ -123,12 +128,15 @@ struct TimeOffset {
     part: f64,
     /// The last samples, newest first.
     past: VecDeque<Shown>,
+    /// Vectors in a sample.
+    vectors: usize,
 }
 
 fn build(asked: &Asked, basis: &Basis<'_>) -> Built {
     let Place::Instrument(instrument) = asked.place else { unreachable!("instances are instruments") };
     let late = asked.size / basis.mission.dt_s();
-    Ok(Box::new(TimeOffset { instrument, samples: late as usize, part: late.fract(), past: VecDeque::new() }))
+    let vectors = 2 * basis.mission.test_mass.len() + 1;
+    Ok(Box::new(TimeOffset { instrument, samples: late as usize, part: late.fract(), past: VecDeque::new(), vectors }))
 }
 
 impl Cause for TimeOffset {
@@ -140,23 +148,23 @@ impl Cause for TimeOffset {
         let oldest = self.past.len() - 1;
         let (after, before) = (self.past[self.samples.min(oldest)], self.past[(self.samples + 1).min(oldest)]);
         let late = before.between(&after, 1.0 - self.part, now.dt_s);
-        let change: [Vector3<f64>; 5] = std::array::from_fn(|i| late[i] - shown.value[i]);
-        for tm in 0..2 {
-            let (displacement, angle) = (change[2 * tm], change[2 * tm + 1]);
+        let change = |i: usize| late[i] - shown.value[i];
+        for (i, tm) in measured.tm.iter_mut().enumerate() {
+            let (displacement, angle) = (change(2 * i), change(2 * i + 1));
             match self.instrument {
                 Instrument::Is => {
-                    measured.is_r_orf_m[tm] += displacement;
-                    measured.is_att_orf_rad[tm] += angle;
+                    tm.is_r_orf_m += displacement;
+                    tm.is_att_orf_rad += angle;
                 }
-                Instrument::Ifo => measured.ifo_x_orf_m[tm] += displacement.x,
+                Instrument::Ifo => tm.ifo_orf_m += displacement,
                 Instrument::Dws => {
-                    measured.dws_orf_rad[tm][0] += angle.y;
-                    measured.dws_orf_rad[tm][1] += angle.z;
+                    tm.dws_orf_rad[0] += angle.y;
+                    tm.dws_orf_rad[1] += angle.z;
                 }
             }
         }
         if self.instrument == Instrument::Dws {
-            measured.dws_sc_crf_rad += change[4];
+            measured.dws_sc_crf_rad += change(self.vectors - 1);
         }
     }
 
@@ -166,9 +174,12 @@ impl Cause for TimeOffset {
     }
 
     fn set_states(&mut self, states: &[f64]) -> bool {
-        let vectors = |v: &[f64]| std::array::from_fn(|i| Vector3::from_column_slice(&v[3 * i..3 * i + 3]));
-        let (whole, rest) = states.as_chunks::<SHOWN>();
-        self.past = whole.iter().map(|s| Shown { value: vectors(&s[..15]), rate: vectors(&s[15..]) }).collect();
-        rest.is_empty() && whole.len() <= self.samples + 2
+        let vectors = |v: &[f64]| v.chunks_exact(3).map(Vector3::from_column_slice).collect();
+        let samples = states.chunks_exact(6 * self.vectors);
+        let fits = samples.remainder().is_empty() && samples.len() <= self.samples + 2;
+        let (values, rates) = (0..3 * self.vectors, 3 * self.vectors..6 * self.vectors);
+        self.past =
+            samples.map(|s| Shown { value: vectors(&s[values.clone()]), rate: vectors(&s[rates.clone()]) }).collect();
+        fits
     }
 }

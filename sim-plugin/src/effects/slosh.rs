@@ -9,7 +9,7 @@ use crate::plant::Loads;
 
 pub(super) const KINDS: &[Kind] = &[Kind {
     id: "slosh",
-    places: || vec![Place::ScAxis(0), Place::ScAxis(1)],
+    places: |_| vec![Place::ScAxis(0), Place::ScAxis(1)],
     size: Number::new("1", 0.0, 0.5),
     help: "propellant: this part of the spacecraft's mass swings along the axis",
     shape: &[

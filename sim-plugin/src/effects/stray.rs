@@ -5,7 +5,7 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 
 use super::asked::{Asked, Kind, Number, Place, Shape, test_masses, tm_axes};
 use super::{Cause, Moment, along};
-use crate::interior::{FIELD_T, GRADIENT_T_M, Interior};
+use crate::interior::{FIELD_T, GRADIENT_T_M, Interior, of_housing};
 use crate::plant::Loads;
 
 /// Vacuum permeability, T m/A, and density of the test mass (gold and platinum), kg/m³.
@@ -121,7 +121,7 @@ struct Magnetic {
 
 /// `∂B_i/∂x_j` of the units' field: symmetric and without trace.
 fn gradient(tm: usize) -> Matrix3<f64> {
-    let [xx, yy, xy, xz, yz] = GRADIENT_T_M[tm];
+    let [xx, yy, xy, xz, yz] = *of_housing(&GRADIENT_T_M, tm);
     Matrix3::new(xx, xy, xz, xy, yy, yz, xz, yz, -xx - yy)
 }
 
@@ -130,7 +130,7 @@ impl Cause for Magnetic {
         let body = &now.plant.tm[self.tm];
         let units = now.inside.units_field[self.tm];
         let field = body.dcm_orf_from_srf * Vector3::from(now.inside.interplanetary_t)
-            + Vector3::from(FIELD_T[self.tm]) * units;
+            + Vector3::from(*of_housing(&FIELD_T, self.tm)) * units;
         let per_field = self.susceptibility / (MU_0_T_M_A * DENSITY_KG_M3);
         let source = field * per_field + along(0) * (self.moment_a_m2 / body.mass_kg);
         loads.tm[self.tm].acceleration_orf_m_s2 += gradient(self.tm) * source * units;

@@ -3,7 +3,7 @@
 
 use dragfree_physics::attitude::rotation_vector;
 use dragfree_physics::frames::omega_matrix;
-use dragfree_physics::mission::{CHANNELS, Mission};
+use dragfree_physics::mission::Mission;
 use dragfree_physics::spectrum::{Spectrum, welch};
 use dragfree_sim::simulator::{Settings, Simulator};
 use nalgebra::Vector3;
@@ -30,7 +30,7 @@ pub(crate) fn settings(seed: u64) -> Settings {
 pub(crate) struct Record {
     /// Rate of the samples, Hz.
     pub(crate) rate_hz: f64,
-    /// The fifteen channels in the order of [`CHANNELS`], m and rad.
+    /// The channels in the order of [`Mission::channels`], m and rad.
     pub(crate) states: Vec<Vec<f64>>,
     /// `r̈_1`, mean over a sample, ORF_1, m/s², axis by axis.
     pub(crate) acceleration_orf_m_s2: [Vec<f64>; 3],
@@ -46,13 +46,13 @@ impl Record {
         let body = simulator.plant().tm[0].clone();
         let mut out = Self {
             rate_hz,
-            states: vec![Vec::with_capacity(epochs); CHANNELS.len()],
+            states: vec![Vec::with_capacity(epochs); mission.channels().len()],
             acceleration_orf_m_s2: Default::default(),
             coupling_orf_m_s2: Default::default(),
         };
         for _ in 0..epochs {
             let y = *simulator.state();
-            let [a, b] = &y.tm;
+            let (a, b) = (&y.tm[0], &y.tm[1]);
             let angles = [a, b].map(|tm| rotation_vector(&tm.q_mrf_from_orf));
             let vectors = [y.sc_crf_rad(), a.r_orf_m, angles[0], b.r_orf_m, angles[1]];
             for (series, value) in out.states.iter_mut().zip(vectors.iter().flat_map(|v| v.iter())) {

@@ -104,7 +104,7 @@ fn to_text(file: &MissionFile, mission: &Mission, design: &Design, allocation: &
     let mut rows = vec![header.map(str::to_owned).to_vec(), units.map(str::to_owned).to_vec()];
     rows.extend(design.channels.iter().map(|c| {
         vec![
-            c.name.to_owned(),
+            c.name.clone(),
             format!("{:.3}", c.gamma),
             c.order.to_string(),
             format!("{:.3}", c.max_s_w1),
@@ -138,8 +138,8 @@ fn to_text(file: &MissionFile, mission: &Mission, design: &Design, allocation: &
             u.requirement, u.from_hz, u.to_hz, u.worst_hz, u.best_ratio, u.predicted_ratio
         );
         match beyond.iter_mut().find(|(known, _)| *known == words) {
-            Some((_, names)) => names.push(c.name),
-            None => beyond.push((words, vec![c.name])),
+            Some((_, names)) => names.push(&c.name),
+            None => beyond.push((words, vec![&c.name])),
         }
     }
     for (words, names) in beyond {
@@ -167,7 +167,7 @@ fn different(design: &Design) -> Vec<(String, &ChannelDesign)> {
         };
         match out.iter_mut().find(|(_, known)| alike(known)) {
             Some((names, _)) => *names += &format!(", {}", c.name),
-            None => out.push((c.name.to_owned(), c)),
+            None => out.push((c.name.clone(), c)),
         }
     }
     out

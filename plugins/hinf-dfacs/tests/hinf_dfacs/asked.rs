@@ -3,11 +3,12 @@
 use dragfree_hinf_dfacs::asked::Needs;
 use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::{Commanded, Smoother};
 use dragfree_hinf_dfacs::reconstruction::{Epoch, Row, Settings};
+use dragfree_hinf_dfacs::replay::CommandNumbers;
 use dragfree_physics::mission::Mission;
 use nalgebra::Vector3;
 use std::f64::consts::TAU;
 
-use crate::common::{AttitudeLoop, DT_S, EVERYTHING, RATE_HZ, late, mission, run, settings, stage};
+use crate::common::{AttitudeLoop, DT_S, EVERYTHING, RATE_HZ, late, mission, run, settings, stage, still, unknown};
 use crate::correlation::layout;
 use crate::slope::{Against, DECADES, Response, of_responses};
 use crate::stream::{alpha, holes, telemetry, with_replay};
@@ -143,8 +144,8 @@ fn nothing(k: usize) -> Epoch {
     let missing = Vector3::from_element(f64::NAN);
     Epoch {
         time_ns: k as i64 * 100_000_000,
-        readout: [0.0; 15],
-        command: [0.0; 18],
+        readout: still(),
+        command: CommandNumbers::from([0.0; 18]),
         sun_srf: missing,
         ephemeris_age_s: f64::NAN,
         omega_crf_rad_s: missing,
@@ -281,9 +282,9 @@ fn used_commands_are_those_that_act() {
 fn replayed_commands_answer_as_flown_ones() {
     let mission = mission();
     let (mut epochs, _) = telemetry(&mission, 4000);
-    epochs[..600].iter_mut().for_each(|epoch| epoch.command = [f64::NAN; 18]);
+    epochs[..600].iter_mut().for_each(|epoch| epoch.command = unknown());
     let flown = run(&mut stage(&mission, &asking(EVERYTHING)), &epochs);
-    epochs.iter_mut().for_each(|epoch| epoch.command = [f64::NAN; 18]);
+    epochs.iter_mut().for_each(|epoch| epoch.command = unknown());
     let alone = Settings { commands: false, needs: EVERYTHING, ..with_replay() };
     let rows = run(&mut stage(&mission, &alone), &epochs);
     assert!(rows[..600].iter().all(|row| row.asked.iter().all(|x| x.is_nan())), "the law settles for 60 s");

@@ -4,7 +4,8 @@ use dragfree_hinf_dfacs::asked::Needs;
 use dragfree_hinf_dfacs::known::KnownModel;
 use dragfree_hinf_dfacs::pilot::Scale;
 use dragfree_hinf_dfacs::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Row, Settings};
-use dragfree_physics::control::{Command, ControlLaw, Readout, TestMassReadout};
+use dragfree_hinf_dfacs::replay::{CommandNumbers, ReadoutNumbers};
+use dragfree_physics::control::{ControlLaw, Readout, TestMassReadout};
 use dragfree_physics::mission::Mission;
 use nalgebra::{Matrix3, Vector3};
 use std::sync::OnceLock;
@@ -95,7 +96,7 @@ impl AttitudeLoop {
     /// One sample under a disturbing torque, with an error of the readout: telemetry and the true mean `α`.
     pub(crate) fn step(&mut self, torque_nm: &Vector3<f64>, error_rad: &Vector3<f64>) -> (Epoch, Vector3<f64>) {
         let y = self.theta + error_rad;
-        let command = self.law.step(&Readout { sc_crf_rad: y, ..Readout::default() });
+        let command = self.law.step(&Readout { sc_crf_rad: y, ..Readout::zero(2) });
         let rest = [TestMassReadout::default(); 2];
         let mut acting = command;
         if self.late {
@@ -112,13 +113,13 @@ impl AttitudeLoop {
         self.omega += alpha * DT_S;
         let time_ns = self.time_ns;
         self.time_ns += 100_000_000;
-        let mut readout = [0.0; 15];
+        let mut readout = still();
         readout[..3].copy_from_slice(y.as_slice());
         let missing = Vector3::from_element(f64::NAN);
         let epoch = Epoch {
             time_ns,
             readout,
-            command: numbers(&command),
+            command: command.numbers().collect(),
             sun_srf: missing,
             ephemeris_age_s: f64::NAN,
             omega_crf_rad_s: missing,
@@ -128,10 +129,14 @@ impl AttitudeLoop {
     }
 }
 
-pub(crate) fn numbers(c: &Command) -> [f64; 18] {
-    let [a, b] = &c.tm;
-    let v = [c.mps_force_srf_n, c.mps_torque_srf_nm, a.force_orf_n, a.torque_orf_nm, b.force_orf_n, b.torque_orf_nm];
-    std::array::from_fn(|i| v[i / 3][i % 3])
+/// A readout of nothing but zeros.
+pub(crate) fn still() -> ReadoutNumbers {
+    ReadoutNumbers::from([0.0; 15])
+}
+
+/// A command that nobody knows.
+pub(crate) fn unknown() -> CommandNumbers {
+    CommandNumbers::from([f64::NAN; 18])
 }
 
 /// A whole record at once.

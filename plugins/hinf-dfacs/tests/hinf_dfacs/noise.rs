@@ -23,7 +23,7 @@ const NINE: [&str; 9] = [
 ];
 
 fn model(mission: &Mission) -> NoiseModel {
-    NoiseModel::new(&declared(mission, &["ifo_x"; 2]), &NINE, 0.1).expect("a model")
+    NoiseModel::new(&declared(mission, &[["ifo_x", "is_y", "is_z"]; 2]), &NINE, 0.1).expect("a model")
 }
 
 /// At 10 mHz thrust noise is 6.7e-11 m s⁻²/√Hz on every axis; the two masses see it through the angle of 60° between
@@ -99,11 +99,11 @@ fn the_attitude_stands_apart_from_the_test_masses() {
 #[test]
 fn the_noise_of_x_is_that_of_the_instrument_that_reads_it() {
     let mission = taiji();
-    let at_1_hz = |noise_x: &[&str]| {
-        let model = NoiseModel::new(&declared(&mission, noise_x), &NINE, 0.1).expect("a model");
+    let at_1_hz = |noise_x: [&str; 2]| {
+        let model = NoiseModel::new(&declared(&mission, &noise_x.map(|x| [x, "is_y", "is_z"])), &NINE, 0.1).expect("a model");
         [0, 3].map(|i| model.process_psd(["readout:tm1.x", "", "", "readout:tm2.x"][i], 1.0).expect("there")[(i, i)])
     };
-    let [first, second] = at_1_hz(&["ifo_x", "is_x"]);
+    let [first, second] = at_1_hz(["ifo_x", "is_x"]);
     let asd =
         |noise: &Option<dragfree_physics::mission::DisplacementNoise>| noise.as_ref().expect("there").shape().psd(1.0);
     let ratio = asd(&mission.noise.is_x) / asd(&mission.noise.ifo_x);

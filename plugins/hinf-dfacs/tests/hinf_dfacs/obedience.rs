@@ -8,7 +8,7 @@ use nalgebra::Vector3;
 use rand::SeedableRng;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
-use crate::common::{AttitudeLoop, RATE_HZ, levels, mission, run, settings, stage};
+use crate::common::{AttitudeLoop, RATE_HZ, levels, mission, run, settings, stage, unknown};
 
 /// Telemetry of a noisy attitude loop; its commands are left out.
 fn telemetry(flying: &Mission, seed: u64, epochs: usize) -> Vec<Epoch> {
@@ -17,7 +17,7 @@ fn telemetry(flying: &Mission, seed: u64, epochs: usize) -> Vec<Epoch> {
     let mut attitude = AttitudeLoop::new(flying);
     let mut gauss = |sigma: f64| Vector3::from_fn(|_, _| sigma * normal(&mut rng));
     let steps = (0..epochs).map(|_| attitude.step(&gauss(torque), &gauss(sensing)).0);
-    steps.map(|epoch| Epoch { command: [f64::NAN; 18], ..epoch }).collect()
+    steps.map(|epoch| Epoch { command: unknown(), ..epoch }).collect()
 }
 
 /// Correlation of the innovations with the rebuilt commands, σ, after an hour.

@@ -1,15 +1,18 @@
 //! The stage as a stream: rows, gaps, states, replayed commands, the turning of CRF.
 
-use crate::common::{AttitudeLoop, EVERYTHING, RATE_HZ, late, levels, mission, run, settings, stage};
+use crate::common::{AttitudeLoop, EVERYTHING, RATE_HZ, late, levels, mission, run, settings, stage, still, unknown};
 use dragfree_hinf_dfacs::pilot;
 use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::{Commanded, Smoother};
-use dragfree_hinf_dfacs::reconstruction::{CHANNELS_AT, Epoch, Reconstruction, Row, Settings, levels_of};
+use dragfree_hinf_dfacs::reconstruction::{Epoch, Reconstruction, Row, Settings, levels_of};
 use dragfree_physics::mission::Mission;
 use nalgebra::Vector3;
 use proptest::prelude::*;
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
 use rand_xoshiro::Xoshiro256PlusPlus;
+
+/// First of the nine channels in a row: after α̂, ω̂, and r and û of two test masses.
+const CHANNELS_AT: usize = 18;
 
 /// Telemetry of the loop under the mission's noise, and the true `α`.
 pub(crate) fn telemetry(mission: &Mission, epochs: usize) -> (Vec<Epoch>, Vec<Vector3<f64>>) {
@@ -208,8 +211,8 @@ fn after_an_hour_of_nothing_it_starts_afresh() {
     let mission = mission();
     let (mut epochs, truth) = telemetry(&mission, 40_000);
     for epoch in &mut epochs[2000..38_000] {
-        epoch.readout = [f64::NAN; 15];
-        epoch.command = [f64::NAN; 18];
+        epoch.readout = still().map(|_| f64::NAN);
+        epoch.command = unknown();
     }
     let rows = run(&mut stage(&mission, &with_replay()), &epochs);
     assert_eq!(rows.len(), epochs.len());
@@ -229,7 +232,7 @@ fn replayed_commands_are_the_flown_ones() {
     let (mut epochs, _) = telemetry(&mission, 4000);
     let flown = run(&mut stage(&mission, &settings(Smoother)), &epochs);
     for epoch in &mut epochs {
-        epoch.command = [f64::NAN; 18];
+        epoch.command = unknown();
     }
     let alone = Settings { commands: false, ..with_replay() };
     let mut replaying = stage(&mission, &alone);
@@ -287,12 +290,12 @@ fn the_turning_of_the_constellation_is_added() {
     let rate = Vector3::new(1e-7, 0.0, 0.0);
     let epochs: Vec<_> = (0..3000)
         .map(|k| {
-            let mut readout = [0.0; 15];
+            let mut readout = still();
             readout[0] = rate.x * f64::from(k) / RATE_HZ;
             Epoch {
                 time_ns: i64::from(k) * 100_000_000,
                 readout,
-                command: [0.0; 18],
+                command: unknown().map(|_| 0.0),
                 sun_srf: Vector3::from_element(f64::NAN),
                 ephemeris_age_s: f64::NAN,
                 // Once a minute; held in between.
