@@ -30,18 +30,18 @@ pub struct Examination<'a> {
 /// A consumer of columns, with the indices of those that it wants in [`Chain::columns`].
 pub type Wanted<C> = (C, Vec<usize>);
 
-/// Every instance of every installed effect that is not in a model. An effect that may act anywhere is not tried: its
-/// place is the user's to say.
+/// Every instance, on this mission, of every installed effect that is not in a model. An effect that may act anywhere
+/// is not tried: its place is the user's to say.
 #[must_use]
-pub fn candidates(registry: &Registry, model: &Model) -> Vec<EffectEntry> {
+pub fn candidates(registry: &Registry, model: &Model, mission: &Mission) -> Vec<EffectEntry> {
     let mut all = Vec::new();
     for found in registry.plugins().filter(|p| p.info.kind == Kind::Effect) {
         let manifest = &found.info.manifest;
-        for instance in &manifest.instances {
-            if !model.effects.iter().any(|e| e.id == manifest.id && e.instance == *instance) {
+        for instance in manifest.instances_on(&mission.value) {
+            if !model.effects.iter().any(|e| e.id == manifest.id && e.instance == instance) {
                 all.push(EffectEntry {
                     id: manifest.id.clone(),
-                    instance: instance.clone(),
+                    instance,
                     estimate: true,
                     prior: std::collections::BTreeMap::new(),
                     parameters: toml::Table::new(),
@@ -58,6 +58,14 @@ pub fn candidates(registry: &Registry, model: &Model) -> Vec<EffectEntry> {
 pub fn has_parameter(registry: &Registry, effect: &str, name: &str) -> bool {
     let found = registry.find(Kind::Effect, effect);
     found.is_ok_and(|f| f.info.manifest.parameters.iter().any(|p| p.name == name))
+}
+
+/// The mission of a product, as its file is now.
+///
+/// # Errors
+/// It cannot be read.
+pub fn mission(sources: &Sources) -> Result<Mission, EngineError> {
+    Ok(Mission::load(&sources.mission)?)
 }
 
 /// The model of a product, as its file is now.

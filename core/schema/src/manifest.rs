@@ -14,7 +14,8 @@ pub struct Manifest {
     pub licence: String,
     /// One sentence.
     pub description: String,
-    /// Effects only: the places where it can act, `tm1`, `tm2`.
+    /// Effects only: the places where it can act, `sc.x`. `{table}` in a name stands for each key of the mission's table of that
+    /// name, as `{test_mass}.x` for the test masses.
     #[serde(default)]
     pub instances: Vec<String>,
     /// Effects only: columns beyond the usual ones that stages before it are asked to make, by the names that those
@@ -24,6 +25,49 @@ pub struct Manifest {
     /// Parameters; a pipeline or model file that gives another key is refused.
     #[serde(default)]
     pub parameters: Vec<Parameter>,
+}
+
+impl Manifest {
+    /// The places where an effect can act on a mission: the names of [`Self::instances`] with the keys of the mission's tables, in
+    /// alphabetical order. Neighbours that name one table are repeated together for each key.
+    #[must_use]
+    pub fn instances_on(&self, mission: &serde_json::Value) -> Vec<String> {
+        let table = |name: &String| template(name).map(|(_, table, _)| table.to_owned());
+        let mut all = Vec::new();
+        for group in self.instances.chunk_by(|a, b| table(a).is_some() && table(a) == table(b)) {
+            let Some(table) = table(&group[0]) else {
+                all.extend_from_slice(group);
+                continue;
+            };
+            let entries = mission.get(&table).and_then(serde_json::Value::as_object);
+            let mut keys: Vec<&String> = entries.into_iter().flat_map(|entries| entries.keys()).collect();
+            keys.sort();
+            for key in keys {
+                let names = group.iter().filter_map(|name| template(name));
+                all.extend(names.map(|(before, _, after)| format!("{before}{key}{after}")));
+            }
+        }
+        all
+    }
+
+    /// Whether there may be a mission on which the effect can act at a place.
+    #[must_use]
+    pub fn may_act_at(&self, instance: &str) -> bool {
+        self.instances.iter().any(|name| match template(name) {
+            None => name == instance,
+            Some((before, _, after)) => {
+                let key = instance.strip_prefix(before).and_then(|rest| rest.strip_suffix(after));
+                key.is_some_and(|key| !key.is_empty() && !key.contains('.'))
+            }
+        })
+    }
+}
+
+/// What stands before, in and behind the braces of a name.
+fn template(name: &str) -> Option<(&str, &str, &str)> {
+    let (before, rest) = name.split_once('{')?;
+    let (table, after) = rest.split_once('}')?;
+    Some((before, table, after))
 }
 
 /// A parameter as declared.
@@ -84,5 +128,32 @@ impl std::fmt::Display for ParameterType {
             Self::F64List => "f64_list",
             Self::TextList => "text_list",
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn manifest(instances: &[&str]) -> Manifest {
+        let text = json!({"id": "e", "version": "1.0.0", "licence": "MIT", "description": "d", "instances": instances});
+        serde_json::from_value(text).expect("a manifest")
+    }
+
+    /// The key is the outer loop for neighbours of one table; other names stay where they are.
+    #[test]
+    fn names_in_braces_stand_for_the_keys_of_a_table() {
+        let manifest = manifest(&["sc.x", "{test_mass}.x", "{test_mass}.y", "{gauge}", "{nothing}.z"]);
+        let mission = json!({"test_mass": {"b": {}, "a": {}}, "gauge": {"g1": 1}});
+        assert_eq!(manifest.instances_on(&mission), ["sc.x", "a.x", "a.y", "b.x", "b.y", "g1"]);
+        assert_eq!(manifest.instances_on(&json!({})), ["sc.x"]);
+    }
+
+    #[test]
+    fn a_place_is_told_from_others_without_a_mission() {
+        let manifest = manifest(&["sc.x", "{test_mass}.y-x"]);
+        assert!(manifest.may_act_at("sc.x") && manifest.may_act_at("tm7.y-x"));
+        assert!(!manifest.may_act_at("sc.y") && !manifest.may_act_at(".y-x") && !manifest.may_act_at("tm7.x-y"));
     }
 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use dragfree_engine::chain::Chain;
-use dragfree_engine::examine::{Examination, candidates, examine, has_parameter, model};
+use dragfree_engine::examine::{self, Examination, candidates, examine, has_parameter, model};
 use dragfree_engine::product::Product;
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::Progress;
@@ -94,7 +94,7 @@ pub(crate) fn sum(
     for (number, Archived { product, path }) in products.iter().enumerate() {
         let sources = Sources::read(path)?;
         let equations = path.with_extension("neq.json");
-        let mut all = candidates(registry, &model(&sources)?);
+        let mut all = candidates(registry, &model(&sources)?, &examine::mission(&sources)?);
         match what {
             What::Model => all.clear(),
             What::Transients => all.retain(|e| has_parameter(registry, &e.id, AT_NS)),

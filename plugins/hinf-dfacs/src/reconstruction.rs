@@ -192,7 +192,8 @@ impl Pending {
             &mut self.frame_rad_s2,
             &mut self.omega_ci_rad_s,
         ];
-        let test_masses = self.tm.iter_mut().flat_map(|tm| [&mut tm.r_orf_m, &mut tm.bridged_orf_m, &mut tm.u_orf_m_s2]);
+        let test_masses =
+            self.tm.iter_mut().flat_map(|tm| [&mut tm.r_orf_m, &mut tm.bridged_orf_m, &mut tm.u_orf_m_s2]);
         spacecraft.into_iter().chain(test_masses)
     }
 

@@ -122,7 +122,7 @@ fn add(command: &ModelAdd, global: &Global, paint: Paint) -> Result<Done, Failur
     for (name, value) in &command.set {
         entry.parameters.insert(name.clone(), parameter(manifest, name, value)?);
     }
-    entry.check_instance(manifest).map_err(Failure::Usage)?;
+    entry.check_instance(manifest, None).map_err(Failure::Usage)?;
     priors(&mut entry, command)?;
     accepted(&found, &entry, command.mission.as_deref())?;
     let done = change(&command.model, global, paint, |edit| edit.add(&entry, &comment))?;

@@ -51,8 +51,7 @@ fn judge(content: &Value, path: &Path, global: &Global) -> Result<Score, Failure
         .map_err(|e| refuse(format!("it is no JSON: {e}; write it with `dragfree diagnose PRODUCT --json`")))?;
     let effects: Vec<_> = super::registry(global)?.plugins().filter(|p| p.info.kind == Kind::Effect).collect();
     let installed = |id: &str, instance: &str| {
-        let has = |instances: &[String]| instances.iter().any(|i| i == instance);
-        effects.iter().any(|p| p.info.manifest.id == id && has(&p.info.manifest.instances))
+        effects.iter().any(|p| p.info.manifest.id == id && p.info.manifest.may_act_at(instance))
     };
     score(content, &diagnosis, &installed).map_err(refuse)
 }

@@ -5,7 +5,7 @@ use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use super::{ConfigError, parse, read};
+use super::{ConfigError, Mission, parse, read};
 use crate::border::{Manifest, hex};
 
 /// A model: a revision and its effects.
@@ -190,15 +190,22 @@ impl EffectEntry {
         coefficient.strip_prefix(&self.coefficient()).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
     }
 
-    /// Refuses an instance that the plugin does not have; a plugin that lists none takes any.
+    /// Refuses an instance that the plugin does not have on a mission, or on any where it is not known; a plugin that lists none
+    /// takes any.
     ///
     /// # Errors
     /// A sentence that lists what there is.
-    pub fn check_instance(&self, manifest: &Manifest) -> Result<(), String> {
-        if manifest.instances.is_empty() || manifest.instances.contains(&self.instance) {
+    pub fn check_instance(&self, manifest: &Manifest, mission: Option<&Mission>) -> Result<(), String> {
+        let instances = mission.map(|mission| manifest.instances_on(&mission.value));
+        let known = match &instances {
+            Some(instances) => instances.contains(&self.instance),
+            None => manifest.may_act_at(&self.instance),
+        };
+        if known || manifest.instances.is_empty() {
             return Ok(());
         }
-        Err(format!("effect {} has no instance `{}`; it has {}", self.id, self.instance, manifest.instances.join(", ")))
+        let there = instances.unwrap_or_else(|| manifest.instances.clone()).join(", ");
+        Err(format!("effect {} has no instance `{}`; it has {there}", self.id, self.instance))
     }
 }
 

@@ -149,8 +149,8 @@ impl Subject<'_> {
 
     /// Runs `check` for each instance; a stage or a source has one.
     fn each(&self, check: impl Fn(&Self, &str) -> Result<(), Finding>, what: &str) -> Result<String, Finding> {
-        let instances = &self.plugin.manifest.instances;
-        if instances.is_empty() {
+        let instances = self.plugin.manifest.instances_on(&self.mission.value);
+        if self.plugin.manifest.instances.is_empty() {
             check(self, "")?;
             return Ok(format!("1 instance: {what}"));
         }
