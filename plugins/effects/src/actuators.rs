@@ -15,8 +15,8 @@ use nalgebra::{Matrix3, Vector3};
 
 use crate::common::{axis_of, manifest};
 use crate::linear::{
-    CoefficientForms, InputColumn, LinearEffect, Series, Term, accel_channel, attitude_channel, offset_coupling_terms,
-    tm_axis, tm_name, tm_pair, vector_terms,
+    Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, accel_channel, attitude_channel, axis_pair,
+    offset_coupling_terms, vector_terms,
 };
 
 const GAIN: [f64; 2] = [-0.3, 0.3];
@@ -35,10 +35,11 @@ fn unit_vector(axis: usize) -> Vector3<f64> {
 fn electrode_terms(
     mission: &Mission,
     by: &'static str,
-    (tm, from, to): (usize, usize, usize),
+    instance: &str,
+    (from, to): (usize, usize),
 ) -> Result<Vec<Term>, PluginError> {
-    let test_mass = mission.test_mass(&tm_name(tm), by)?;
-    let per_newton = 1.0 / test_mass.mass_kg + 1.0 / mission.spacecraft.mass_kg;
+    let tm = &Body::of(mission, instance, by)?;
+    let per_newton = 1.0 / tm.section.mass_kg + 1.0 / mission.spacecraft.mass_kg;
     Ok(vec![Term::new(accel_channel(tm, to), Series::Column(InputColumn::electrodes_force(tm, from)), per_newton)])
 }
 
@@ -47,24 +48,23 @@ fn electrode_terms(
 /// `z = g F_E (1/m_m + 1/m_S)`; g: 1, ±0.3. The change of the recoil torque `b × g F_E` is negligible and followed by
 /// `α̂`. LISA Pathfinder calibrated such gains to per cents (Armano et al., Phys. Rev. D 97, 122002).
 #[derive(Debug)]
-pub(crate) struct EsGain(usize, usize);
+pub(crate) struct EsGain(String);
 
 impl LinearEffect for EsGain {
     const MANIFEST: Manifest = manifest(
         "es-gain",
         "Gain of the electrodes' force along an axis differs from one",
         &[],
-        &["tm1.y", "tm1.z", "tm2.y", "tm2.z"],
+        &["{test_mass}.y", "{test_mass}.z"],
         &["commands"],
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        let (tm, axis) = tm_axis(setup.instance());
-        Ok(Self(tm, axis))
+        Ok(Self(setup.instance().to_owned()))
     }
 
     fn coefficients(&self, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let terms = electrode_terms(mission, "the effect es-gain", (self.0, self.1, self.1))?;
+        let terms = electrode_terms(mission, "the effect es-gain", &self.0, (axis_of(&self.0), axis_of(&self.0)))?;
         Ok(CoefficientForms::only("1", GAIN, terms))
     }
 }
@@ -73,24 +73,23 @@ impl LinearEffect for EsGain {
 ///
 /// `z_to = δ F_E,from (1/m_m + 1/m_S)`; δ: 1, ±0.1.
 #[derive(Debug)]
-pub(crate) struct EsCrosstalk(usize, usize, usize);
+pub(crate) struct EsCrosstalk(String);
 
 impl LinearEffect for EsCrosstalk {
     const MANIFEST: Manifest = manifest(
         "es-crosstalk",
         "Part of the force commanded along one axis also acts along another",
         &[],
-        &["tm1.y-x", "tm1.y-z", "tm1.z-x", "tm1.z-y", "tm2.y-x", "tm2.y-z", "tm2.z-x", "tm2.z-y"],
+        &["{test_mass}.y-x", "{test_mass}.y-z", "{test_mass}.z-x", "{test_mass}.z-y"],
         &["commands"],
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        let (tm, from, to) = tm_pair(setup.instance());
-        Ok(Self(tm, from, to))
+        Ok(Self(setup.instance().to_owned()))
     }
 
     fn coefficients(&self, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let terms = electrode_terms(mission, "the effect es-crosstalk", (self.0, self.1, self.2))?;
+        let terms = electrode_terms(mission, "the effect es-crosstalk", &self.0, axis_pair(&self.0))?;
         Ok(CoefficientForms::only("1", CROSSTALK, terms))
     }
 }
@@ -98,9 +97,8 @@ impl LinearEffect for EsCrosstalk {
 /// Terms of an additional thruster force `matrix · F_T`: `z_i = −T_S^{O_i} matrix F_T/m_S` on all test masses.
 fn thrust_terms(mission: &Mission, matrix: &Matrix3<f64>) -> Vec<Term> {
     let mut terms = Vec::new();
-    for tm in 0..2 {
-        let Some(test_mass) = mission.test_mass.get(&tm_name(tm)) else { continue };
-        let per_newton = test_mass.dcm_orf_from_srf() * matrix / -mission.spacecraft.mass_kg;
+    for tm in &Body::all(mission) {
+        let per_newton = tm.section.dcm_orf_from_srf() * matrix / -mission.spacecraft.mass_kg;
         for (from, column) in per_newton.column_iter().enumerate() {
             terms.extend(vector_terms(tm, &Series::Column(InputColumn::thrust(from)), &column.into()));
         }
@@ -189,7 +187,8 @@ impl LinearEffect for TorqueGain {
             (0..3).map(|j| Term::new(attitude_channel(j), torque.clone(), inverse[(j, axis)])).collect();
         let response = |j| Series::Column(InputColumn::alpha_by_torque_gain(axis, j));
         terms.extend(offset_coupling_terms(available, mission, "the effect torque-gain", response, 1.0)?);
-        for (tm, row) in (0..2).flat_map(|tm| (0..3).map(move |row| (tm, row))) {
+        let bodies = Body::all(mission);
+        for (tm, row) in bodies.iter().flat_map(|tm| (0..3).map(move |row| (tm, row))) {
             let source = InputColumn::known_accel_by_torque_gain(axis, tm, row);
             if available.find(&source.name).is_some() {
                 terms.push(Term::new(accel_channel(tm, row), Series::Column(source), 1.0));

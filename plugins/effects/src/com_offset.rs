@@ -9,7 +9,7 @@ use dragfree_physics::mission::{Housing, Mission, TestMass};
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::common::{AXES, manifest, mission, read_srf_vector};
+use crate::common::{AXES, TEST_MASSES, manifest, mission, read_srf_vector};
 
 /// Regressors `−Ω` in ORF, s⁻², 3 × 3: acceleration along axis `row`, m s⁻², per metre of offset along axis `column`.
 ///
@@ -25,13 +25,13 @@ pub fn regressors(
 }
 
 /// Coefficients of the offset in ORF, m. The ranges are the smallest that contain the mission's box.
-fn coefficients(instance: &str, test_mass: &TestMass) -> [Coefficient; 3] {
+fn coefficients(instance: &str, frame: &str, test_mass: &TestMass) -> [Coefficient; 3] {
     let nominal = test_mass.offset_nominal_orf_m();
     let half = test_mass.dcm_orf_from_srf().abs() * Vector3::from(test_mass.offset_box_srf_m);
     [0, 1, 2].map(|j| Coefficient {
         name: format!("com-offset.{instance}.{}", AXES[j]),
         unit: "m".to_owned(),
-        frame: frame(instance).to_owned(),
+        frame: frame.to_owned(),
         lower: nominal[j] - half[j],
         upper: nominal[j] + half[j],
         initial: nominal[j],
@@ -55,11 +55,11 @@ fn box_constraints(instance: &str, test_mass: &TestMass) -> [Constraint; 3] {
     })
 }
 
-/// This test mass's terms of the baseline survey `T_{O_1}^S b_1 − T_{O_2}^S b_2`, within its tolerance. The engine adds
+/// This test mass's terms of the baseline survey `T_{O_1}^S b_1 − T_{O_2}^S b_2`, within its tolerance; `sign` is 1 for
+/// the test mass at the end of the baseline and −1 for the one at its start. The engine adds
 /// the terms of both test masses and applies the constraint only if both are present (`parts`).
-fn baseline_constraints(instance: &str, test_mass: &TestMass, housing: &Housing) -> [Constraint; 3] {
+fn baseline_constraints(instance: &str, sign: f64, test_mass: &TestMass, housing: &Housing) -> [Constraint; 3] {
     let srf_from_orf = test_mass.dcm_orf_from_srf().transpose();
-    let sign = if instance == "tm1" { 1.0 } else { -1.0 };
     [0, 1, 2].map(|i| Constraint {
         name: format!("baseline.{}", AXES[i]),
         kind: "survey".to_owned(),
@@ -75,10 +75,6 @@ fn baseline_constraints(instance: &str, test_mass: &TestMass, housing: &Housing)
 fn terms(instance: &str, matrix: &Matrix3<f64>, i: usize, sign: f64) -> Vec<(String, f64)> {
     let weighted = (0..3).filter(|j| matrix[(i, *j)] != 0.0);
     weighted.map(|j| (format!("com-offset.{instance}.{}", AXES[j]), sign * matrix[(i, j)])).collect()
-}
-
-fn frame(instance: &str) -> &'static str {
-    if instance == "tm1" { "ORF_1" } else { "ORF_2" }
 }
 
 #[derive(Debug)]
@@ -105,7 +101,7 @@ impl Effect for ComOffset {
         "com-offset",
         "Offset of a test mass's housing from the spacecraft's centre of mass",
         &[],
-        &["tm1", "tm2"],
+        TEST_MASSES,
         &[],
     );
 
@@ -120,7 +116,7 @@ impl Effect for ComOffset {
         let alpha = read_srf_vector(link, "sc.alpha_srf_rad_s2", "rad s-2")?;
         let omega = read_srf_vector(link, "sc.omega_srf_rad_s", "rad s-1")?;
         let test_mass = self.mission.test_mass(&self.instance, "the effect com-offset")?;
-        let coefficients = coefficients(&self.instance, test_mass);
+        let coefficients = coefficients(&self.instance, &self.mission.frame(&self.instance), test_mass);
         for coefficient in &coefficients {
             link.coefficient(coefficient)?;
         }
@@ -143,8 +139,10 @@ impl Effect for ComOffset {
         for constraint in box_constraints(&self.instance, test_mass) {
             link.constraint(&constraint)?;
         }
-        if let (2, Some(housing)) = (self.mission.test_mass.len(), &self.mission.housing) {
-            for constraint in baseline_constraints(&self.instance, test_mass, housing) {
+        let mut ends = self.mission.baseline().into_iter().flatten().zip([1.0, -1.0]);
+        let own = ends.find(|(name, _)| *name == self.instance);
+        if let (Some((_, sign)), Some(housing)) = (own, &self.mission.housing) {
+            for constraint in baseline_constraints(&self.instance, sign, test_mass, housing) {
                 link.constraint(&constraint)?;
             }
         }
@@ -252,7 +250,7 @@ mod tests {
     #[test]
     fn box_constraints_and_ranges_are_tight_at_the_corners() {
         let tm = test_mass(0.4, 0.18);
-        let (constraints, ranges) = (box_constraints("tm1", &tm), coefficients("tm1", &tm));
+        let (constraints, ranges) = (box_constraints("tm1", &tm), coefficients("tm1", "ORF_1", &tm));
         let mut reached = [false; 6];
         for corner in 0..8 {
             let sign = |i: usize| if corner >> i & 1 == 1 { 1.0 } else { -1.0 };
@@ -283,7 +281,8 @@ mod tests {
         let b1 = Vector3::new(0.090_866_025_403_784_44, 0.155_384_572_681_198_96, 0.0);
         let b2 = Vector3::new(0.090_866_025_403_784_44, -0.155_384_572_681_198_96, 0.0);
         let offsets = [("tm1", b1), ("tm2", b2)];
-        let parts = [baseline_constraints("tm1", &tm1, &housing), baseline_constraints("tm2", &tm2, &housing)];
+        let parts =
+            [baseline_constraints("tm1", 1.0, &tm1, &housing), baseline_constraints("tm2", -1.0, &tm2, &housing)];
         for i in 0..3 {
             let [one, two] = [&parts[0][i], &parts[1][i]];
             assert_eq!((one.lower, one.upper, &one.name, one.parts), (two.lower, two.upper, &two.name, 2));

@@ -8,8 +8,10 @@ use dragfree_sdk::prelude::*;
 pub(crate) const AXES: [&str; 3] = ["x", "y", "z"];
 /// Upper band edge of series made from housekeeping, Hz: thermometers and first-order lags pass nothing above it.
 pub(crate) const SLOW_HZ: f64 = 0.05;
-/// Instances of an effect that acts on one axis of one test mass.
-pub(crate) const TM_AXES: [&str; 6] = ["tm1.x", "tm1.y", "tm1.z", "tm2.x", "tm2.y", "tm2.z"];
+/// Instances of an effect on every test mass of the mission.
+pub(crate) const TEST_MASSES: &[&str] = &["{test_mass}"];
+/// Instances of an effect on every axis of every test mass.
+pub(crate) const TM_AXES: &[&str] = &["{test_mass}.x", "{test_mass}.y", "{test_mass}.z"];
 
 /// A manifest with this crate's version and licence.
 pub(crate) const fn manifest(

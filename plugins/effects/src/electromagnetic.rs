@@ -5,8 +5,8 @@ use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
-    AXES, SLOW_HZ, SeriesRef, find_housekeeping, housekeeping_in, keep_available, manifest, mission, response,
-    series_of,
+    AXES, SLOW_HZ, SeriesRef, TEST_MASSES, find_housekeeping, housekeeping_in, keep_available, manifest, mission,
+    response, series_of,
 };
 
 /// `charge`: a charged test mass in the field of stray voltages.
@@ -56,7 +56,7 @@ impl Effect for Charge {
                 "derivative of an x electrode's capacitance along x",
             ),
         ],
-        &["tm1", "tm2"],
+        TEST_MASSES,
         &[],
     );
 
@@ -207,7 +207,7 @@ impl Effect for Magnetic {
             ),
             Parameter::text("field", "", &[], "column of the field, hk.NAME in T; empty for the gradient terms alone"),
         ],
-        &["tm1", "tm2"],
+        TEST_MASSES,
         &[],
     );
 

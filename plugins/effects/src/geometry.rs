@@ -4,10 +4,10 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::Vector3;
 
-use crate::common::{axis_of, manifest};
+use crate::common::{TEST_MASSES, axis_of, manifest};
 use crate::linear::{
-    CoefficientForms, Form, InputColumn, LinearEffect, Multiplier, Series, Term, accel_channel, optical_axis_weights,
-    tm_acceleration, tm_axis, tm_name, vector_terms,
+    Body, CoefficientForms, Form, InputColumn, LinearEffect, Multiplier, Series, Term, accel_channel,
+    optical_axis_weights, optical_pair, tm_acceleration, vector_terms,
 };
 
 const RATE_M_S: [f64; 2] = [-2e-7, 2e-7];
@@ -112,9 +112,8 @@ impl OffsetDrift {
             }
         };
         let mut terms = Vec::new();
-        for tm in 0..2 {
-            let Some(test_mass) = mission.test_mass.get(&tm_name(tm)) else { continue };
-            let t = test_mass.dcm_orf_from_srf();
+        for tm in &Body::all(mission) {
+            let t = tm.section.dcm_orf_from_srf();
             for j in (0..3).filter(|j| *j != self.axis) {
                 // Response −e_j × e to a unit of α̂ about j.
                 let unit = |axis: usize| Vector3::from_fn(|i, _| f64::from(i == axis));
@@ -142,32 +141,38 @@ const OPENING_RAD: [f64; 2] = [-0.1, 0.1];
 /// Confounders: `mps-tilt:sc.z`, which rotates the thrust for both test masses; `is-crosstalk` of x in y; the direction
 /// of the offset.
 #[derive(Debug)]
-pub(crate) struct OpeningAngle(usize);
+pub(crate) struct OpeningAngle(String);
 
 impl LinearEffect for OpeningAngle {
     const MANIFEST: Manifest = manifest(
         "opening-angle",
         "The frame of a test mass is rotated about s_3 from the mission's opening angle",
         &[],
-        &["tm1", "tm2"],
+        TEST_MASSES,
         &["commands"],
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(tm_axis(setup.instance()).0))
+        Ok(Self(setup.instance().to_owned()))
     }
 
     fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let tm = self.0;
+        let tm = &Body::of(mission, &self.0, "the effect opening-angle")?;
         let [x, y] = [0, 1].map(|axis| tm_acceleration(available, mission, tm, axis));
-        let weights = |body: usize| optical_axis_weights(mission, body, 1).map(|w| w[tm]);
-        let (Some(x), Some(y), Some(own), Some(others)) = (x, y, weights(tm), weights(1 - tm)) else {
+        // Weight of this optical axis in y of this test mass, and in y of the other one.
+        let both = optical_pair(available, mission).filter(|both| both.iter().any(|body| body.name == tm.name));
+        let weights = both.and_then(|both| {
+            let place = usize::from(both[1].name == tm.name);
+            let [own, others] = [place, 1 - place].map(|body| optical_axis_weights(&both, &both[body], 1));
+            Some((both[1 - place].clone(), own?[place], others?[place]))
+        });
+        let (Some(x), Some(y), Some((other, own, others))) = (x, y, weights) else {
             return Err(PluginError::error(
                 "effect opening-angle: the acceleration of the housings is observable only with the interferometers of both test \
                  masses; give telemetry with the topic /ifo, or remove the effect from the model",
             ));
         };
-        let mass_kg = mission.test_mass(&tm_name(tm), "the effect opening-angle")?.mass_kg;
+        let mass_kg = tm.section.mass_kg;
         // The housing's acceleration excludes the electrodes' force on the test mass.
         let electrodes = |axis: usize| (Series::Column(InputColumn::electrodes_force(tm, axis)), -1.0 / mass_kg, None);
         let total_x = [x.modelled, x.unmodelled, vec![electrodes(0)]].concat();
@@ -176,7 +181,7 @@ impl LinearEffect for OpeningAngle {
             ((tm, 0), &modelled_y, 1.0),
             ((tm, 1), &total_x, -1.0),
             ((tm, 1), &y.unmodelled, -own),
-            ((1 - tm, 1), &y.unmodelled, -others),
+            ((&other, 1), &y.unmodelled, -others),
         ];
         let mut terms: Vec<Term> = Vec::new();
         for ((to, axis), summands, weight) in rows {

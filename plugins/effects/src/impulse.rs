@@ -308,7 +308,7 @@ impl Effect for Impulse {
                 "sc.phi, theta, psi: column hk.NAME in 1 at whose steps it acts, in place of `at_ns`",
             ),
         ],
-        &["sc.x", "sc.y", "sc.z", "sc.phi", "sc.theta", "sc.psi", "tm1.x", "tm1.y", "tm1.z", "tm2.x", "tm2.y", "tm2.z"],
+        &["sc.x", "sc.y", "sc.z", "sc.phi", "sc.theta", "sc.psi", "{test_mass}.x", "{test_mass}.y", "{test_mass}.z"],
         &[],
     );
 

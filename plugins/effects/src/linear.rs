@@ -16,6 +16,37 @@ use crate::common::{AXES, SeriesRef, axis_of, mission, tm_of};
 /// Names of the angles about x, y and z.
 pub(crate) const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
 
+/// A test mass of the mission.
+#[derive(Clone, Debug)]
+pub(crate) struct Body {
+    pub(crate) name: String,
+    /// Name of its frame ORF.
+    pub(crate) frame: String,
+    pub(crate) section: TestMass,
+}
+
+impl Body {
+    /// All test masses of the mission, in the order of their names.
+    pub(crate) fn all(mission: &Mission) -> Vec<Self> {
+        let body = |(name, section): (&String, &TestMass)| Self {
+            name: name.clone(),
+            frame: mission.frame(name),
+            section: section.clone(),
+        };
+        mission.test_mass.iter().map(body).collect()
+    }
+
+    /// The test mass of an instance such as `NAME` or `NAME.x`.
+    ///
+    /// # Errors
+    /// The mission has no such test mass.
+    pub(crate) fn of(mission: &Mission, instance: &str, by: &'static str) -> Result<Self, PluginError> {
+        let name = tm_of(instance);
+        let section = mission.test_mass(name, by)?.clone();
+        Ok(Self { name: name.to_owned(), frame: mission.frame(name), section })
+    }
+}
+
 /// A column that an earlier stage writes.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct InputColumn {
@@ -40,13 +71,13 @@ impl InputColumn {
     }
 
     /// Commanded force of the electrodes on a test mass, mean over the sample, ORF, N.
-    pub(crate) fn electrodes_force(tm: usize, axis: usize) -> Self {
-        Self::new(format!("used.{}.force_orf_n.{}", tm_name(tm), AXES[axis]), "N", orf(tm))
+    pub(crate) fn electrodes_force(tm: &Body, axis: usize) -> Self {
+        Self::new(format!("used.{}.force_orf_n.{}", tm.name, AXES[axis]), "N", &tm.frame)
     }
 
     /// Commanded torque of the electrodes on a test mass, mean over the sample, ORF, N m.
-    pub(crate) fn electrodes_torque(tm: usize, axis: usize) -> Self {
-        Self::new(format!("used.{}.torque_orf_nm.{}", tm_name(tm), AXES[axis]), "N m", orf(tm))
+    pub(crate) fn electrodes_torque(tm: &Body, axis: usize) -> Self {
+        Self::new(format!("used.{}.torque_orf_nm.{}", tm.name, AXES[axis]), "N m", &tm.frame)
     }
 
     /// Unit vector from the Sun, SRF.
@@ -55,18 +86,18 @@ impl InputColumn {
     }
 
     /// Known acceleration `û` of a test mass, ORF, m s⁻².
-    pub(crate) fn known_accel(tm: usize, axis: usize) -> Self {
-        Self::new(format!("{}.u_orf_m_s2.{}", tm_name(tm), AXES[axis]), "m s-2", orf(tm))
+    pub(crate) fn known_accel(tm: &Body, axis: usize) -> Self {
+        Self::new(format!("{}.u_orf_m_s2.{}", tm.name, AXES[axis]), "m s-2", &tm.frame)
     }
 
     /// Acceleration channel of a test mass, ORF, m s⁻².
-    pub(crate) fn channel(tm: usize, axis: usize) -> Self {
-        Self::new(accel_channel(tm, axis), "m s-2", orf(tm))
+    pub(crate) fn channel(tm: &Body, axis: usize) -> Self {
+        Self::new(accel_channel(tm, axis), "m s-2", &tm.frame)
     }
 
     /// Best readout of a test mass's displacement, ORF, m.
-    pub(crate) fn displacement(tm: usize, axis: usize) -> Self {
-        Self::new(format!("{}.r_orf_m.{}", tm_name(tm), AXES[axis]), "m", orf(tm))
+    pub(crate) fn displacement(tm: &Body, axis: usize) -> Self {
+        Self::new(format!("{}.r_orf_m.{}", tm.name, AXES[axis]), "m", &tm.frame)
     }
 
     /// Estimate `α̂` of the spacecraft's angular acceleration, SRF, rad s⁻².
@@ -81,9 +112,9 @@ impl InputColumn {
     }
 
     /// Derivative `∂û_row/∂g_i` of a test mass, ORF, m s⁻²; written only for thrusters with a layout.
-    pub(crate) fn known_accel_by_torque_gain(i: usize, tm: usize, row: usize) -> Self {
-        let name = format!("response.u_orf_m_s2.by_torque_gain.{}.{}.{}", AXES[i], tm_name(tm), AXES[row]);
-        Self::new(name, "m s-2", orf(tm))
+    pub(crate) fn known_accel_by_torque_gain(i: usize, tm: &Body, row: usize) -> Self {
+        let name = format!("response.u_orf_m_s2.by_torque_gain.{}.{}.{}", AXES[i], tm.name, AXES[row]);
+        Self::new(name, "m s-2", &tm.frame)
     }
 
     /// Derivative `∂α̂_j/∂τ`, SRF, rad s⁻³, for a delay `τ` of the attitude readout.
@@ -92,13 +123,13 @@ impl InputColumn {
     }
 
     /// Angle of a test mass by differential wavefront sensing, ORF, rad.
-    pub(crate) fn angle_by_dws(tm: usize, angle: &str) -> Self {
-        Self::new(format!("dws.{}.{angle}_orf_rad", tm_name(tm)), "rad", orf(tm))
+    pub(crate) fn angle_by_dws(tm: &Body, angle: &str) -> Self {
+        Self::new(format!("dws.{}.{angle}_orf_rad", tm.name), "rad", &tm.frame)
     }
 
     /// Angle of a test mass by the capacitive readout, ORF, rad.
-    pub(crate) fn angle_by_is(tm: usize, angle: &str) -> Self {
-        Self::new(format!("is.{}.att_orf_rad.{angle}", tm_name(tm)), "rad", orf(tm))
+    pub(crate) fn angle_by_is(tm: &Body, angle: &str) -> Self {
+        Self::new(format!("is.{}.att_orf_rad.{angle}", tm.name), "rad", &tm.frame)
     }
 
     /// An available column, with the unit that the effect expects.
@@ -218,15 +249,15 @@ impl CoefficientForms {
     }
 }
 
-/// The column of this name that was written last, e.g. the reconstruction's `tm1.r_orf_m.y` rather than the raw
+/// The column of this name that was written last, e.g. the reconstruction's `NAME.r_orf_m.y` rather than the raw
 /// topic's.
 pub(crate) fn latest_column<'a>(available: &'a Available, name: &str) -> Option<&'a Column> {
     available.columns.iter().rev().find(|c| c.name == name)
 }
 
-/// Name of an acceleration channel, `tm1.accel.x`, m s⁻².
-pub(crate) fn accel_channel(tm: usize, axis: usize) -> String {
-    format!("{}.accel.{}", tm_name(tm), AXES[axis])
+/// Name of an acceleration channel, `NAME.accel.x`, m s⁻².
+pub(crate) fn accel_channel(tm: &Body, axis: usize) -> String {
+    format!("{}.accel.{}", tm.name, AXES[axis])
 }
 
 /// Name of an attitude channel, `sc.alpha.x`, rad s⁻².
@@ -234,23 +265,14 @@ pub(crate) fn attitude_channel(axis: usize) -> String {
     format!("sc.alpha.{}", AXES[axis])
 }
 
-/// Name of a test mass by index: `tm1` for 0.
-pub(crate) fn tm_name(tm: usize) -> String {
-    format!("tm{}", tm + 1)
-}
-
-fn orf(tm: usize) -> String {
-    format!("ORF_{}", tm + 1)
-}
-
 /// Name of a coefficient of the centre-of-mass offset.
-pub(crate) fn offset_name(tm: usize, axis: usize) -> String {
-    format!("com-offset.{}.{}", tm_name(tm), AXES[axis])
+pub(crate) fn offset_name(tm: &Body, axis: usize) -> String {
+    format!("com-offset.{}.{}", tm.name, AXES[axis])
 }
 
 /// Terms of `Φ_row b`, the acceleration of a test mass by its offset: columns and coefficients of `com-offset`. Empty
 /// if that effect is not earlier in the model. The diagonal of `Φ` is of order `ω²`, nearly constant and omitted.
-pub(crate) fn offset_terms(available: &Available, tm: usize, row: usize) -> Vec<(InputColumn, String)> {
+pub(crate) fn offset_terms(available: &Available, tm: &Body, row: usize) -> Vec<(InputColumn, String)> {
     let channel = accel_channel(tm, row);
     let in_model = |name: &str| available.coefficient(name).is_some_and(|c| !c.candidate);
     let column = |name: &str| {
@@ -274,42 +296,48 @@ pub(crate) struct TmAcceleration {
 /// The control loop cancels most of `d`, chiefly thruster noise, by `û`, so `û` alone does not estimate the
 /// acceleration.
 ///
-/// `None` along s_3 and without interferometers on both test masses, where `d` is unobservable.
+/// `None` along s_3 and unless interferometers read x of exactly two test masses, where `d` is unobservable.
 pub(crate) fn tm_acceleration(
     available: &Available,
     mission: &Mission,
-    tm: usize,
+    tm: &Body,
     axis: usize,
 ) -> Option<TmAcceleration> {
-    let reads = |tm: usize| {
-        latest_column(available, &InputColumn::displacement(tm, 0).name).map_or("", |c| c.attribute("noise"))
-    };
-    if axis == 2 || reads(0) != "ifo_x" || reads(1) != "ifo_x" {
+    let both = optical_pair(available, mission)?;
+    if axis == 2 {
         return None;
     }
-    let weight = optical_axis_weights(mission, tm, axis)?;
+    let weights = optical_axis_weights(&both, tm, axis)?;
     let mut modelled = vec![(Series::Column(InputColumn::known_accel(tm, axis)), 1.0, None)];
     for (column, times) in offset_terms(available, tm, axis) {
         modelled.push((Series::Column(column), 1.0, Some(times)));
     }
     let mut unmodelled = Vec::new();
-    for other in (0..2).filter(|other| weight[*other].abs() > 1e-12) {
-        let body = mission.test_mass.get(&tm_name(other))?;
-        let (t, b) = (body.dcm_orf_from_srf(), body.offset_nominal_orf_m());
-        unmodelled.push((Series::Newer(InputColumn::channel(other, 0)), weight[other], None));
+    for (other, weight) in both.iter().zip(weights).filter(|(_, weight)| weight.abs() > 1e-12) {
+        let (t, b) = (other.section.dcm_orf_from_srf(), other.section.offset_nominal_orf_m());
+        unmodelled.push((Series::Newer(InputColumn::channel(other, 0)), weight, None));
         for j in 0..3 {
             let explained = t[(2, j)] * b.y - t[(1, j)] * b.z;
-            unmodelled.push((Series::Column(InputColumn::alpha(j)), -weight[other] * explained, None));
+            unmodelled.push((Series::Column(InputColumn::alpha(j)), -weight * explained, None));
         }
     }
     Some(TmAcceleration { modelled, unmodelled })
 }
 
-/// Weights of the two optical axes that give an axis in their plane; `None` if the optical axes are parallel.
-pub(crate) fn optical_axis_weights(mission: &Mission, tm: usize, axis: usize) -> Option<[f64; 2]> {
-    let dcm = |tm: usize| mission.test_mass.get(&tm_name(tm)).map(TestMass::dcm_orf_from_srf);
-    let both = [dcm(0)?, dcm(1)?];
-    let weight = both[tm].fixed_view::<1, 2>(axis, 0) * Matrix2::from_fn(|i, j| both[i][(0, j)]).try_inverse()?;
+/// The two test masses whose x is read by an interferometer; `None` if there are not exactly two.
+pub(crate) fn optical_pair(available: &Available, mission: &Mission) -> Option<[Body; 2]> {
+    let reads = |tm: &Body| {
+        latest_column(available, &InputColumn::displacement(tm, 0).name).map_or("", |c| c.attribute("noise"))
+    };
+    let optical: Vec<Body> = Body::all(mission).into_iter().filter(|tm| reads(tm) == "ifo_x").collect();
+    optical.try_into().ok()
+}
+
+/// Weights of two optical axes that give an axis in their plane; `None` if the optical axes are parallel.
+pub(crate) fn optical_axis_weights(both: &[Body; 2], tm: &Body, axis: usize) -> Option<[f64; 2]> {
+    let optical = both.each_ref().map(|tm| tm.section.dcm_orf_from_srf());
+    let own = tm.section.dcm_orf_from_srf();
+    let weight = own.fixed_view::<1, 2>(axis, 0) * Matrix2::from_fn(|i, j| optical[i][(0, j)]).try_inverse()?;
     Some(weight.into())
 }
 
@@ -327,9 +355,8 @@ pub(crate) fn offset_coupling_terms(
     factor: f64,
 ) -> Result<Vec<Term>, PluginError> {
     let mut terms = Vec::new();
-    for tm in 0..2 {
-        let Some(test_mass) = mission.test_mass.get(&tm_name(tm)) else { continue };
-        let t = test_mass.dcm_orf_from_srf();
+    for tm in &Body::all(mission) {
+        let t = tm.section.dcm_orf_from_srf();
         for (row, axis) in (0..3).flat_map(|row| (0..3).map(move |axis| (row, axis))).filter(|(r, a)| r != a) {
             let times = offset_name(tm, axis);
             if available.coefficient(&times).is_none_or(|c| c.candidate) {
@@ -350,27 +377,21 @@ pub(crate) fn offset_coupling_terms(
     }
     if mission.test_mass.is_empty() {
         return Err(PluginError::error(format!(
-            "{by}: the mission file has no test mass; add a table [test_mass.tm1]"
+            "{by}: the mission file has no test mass; add a table [test_mass.NAME]"
         )));
     }
     Ok(terms)
 }
 
 /// Terms of an acceleration vector of a test mass, ORF, per unit of a series.
-pub(crate) fn vector_terms(tm: usize, series: &Series, per_unit: &Vector3<f64>) -> Vec<Term> {
+pub(crate) fn vector_terms(tm: &Body, series: &Series, per_unit: &Vector3<f64>) -> Vec<Term> {
     (0..3).map(|row| Term::new(accel_channel(tm, row), series.clone(), per_unit[row])).collect()
 }
 
-/// Indices of an instance: `(0, 1)` for `tm1.y`.
-pub(crate) fn tm_axis(instance: &str) -> (usize, usize) {
-    (usize::from(tm_of(instance) == "tm2"), axis_of(instance))
-}
-
-/// Indices of a pair instance, (test mass, from, to): `(0, 1, 0)` for `tm1.y-x`.
-pub(crate) fn tm_pair(instance: &str) -> (usize, usize, usize) {
+/// Axes of a pair instance, (from, to): `(1, 0)` for `NAME.y-x`.
+pub(crate) fn axis_pair(instance: &str) -> (usize, usize) {
     let (first, to) = instance.split_once('-').unwrap_or((instance, "x"));
-    let (tm, from) = tm_axis(first);
-    (tm, from, axis_of(to))
+    (axis_of(first), axis_of(to))
 }
 
 /// An effect that acts linearly through series with constant factors.

@@ -67,5 +67,5 @@ noise_effect! {
 }
 noise_effect! {
     /// Noise of the capacitive readout along an axis of ORF.
-    IsNoise, "is-noise", "readout", "Level of the capacitive readout noise along an axis", &TM_AXES
+    IsNoise, "is-noise", "readout", "Level of the capacitive readout noise along an axis", TM_AXES
 }

@@ -7,10 +7,10 @@
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 
-use crate::common::manifest;
+use crate::common::{TEST_MASSES, axis_of, manifest};
 use crate::linear::{
-    CoefficientForms, InputColumn, LinearEffect, Series, Term, TmAcceleration, accel_channel, attitude_channel,
-    latest_column, offset_coupling_terms, offset_terms, tm_acceleration, tm_axis, tm_name, tm_pair,
+    Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, TmAcceleration, accel_channel, attitude_channel,
+    axis_pair, latest_column, offset_coupling_terms, offset_terms, tm_acceleration,
 };
 
 const SCALE: [f64; 2] = [-0.2, 0.2];
@@ -24,12 +24,14 @@ const DELAY_S: [f64; 2] = [0.0, 0.2];
 fn second_difference_terms(
     mission: &Mission,
     available: &Available,
-    effect: &str,
-    (tm, from, to): (usize, usize, usize),
+    by: &'static str,
+    instance: &str,
+    (from, to): (usize, usize),
 ) -> Result<Vec<Term>, PluginError> {
+    let tm = &Body::of(mission, instance, by)?;
     let Some(TmAcceleration { modelled, unmodelled }) = tm_acceleration(available, mission, tm, from) else {
         return Err(PluginError::error(format!(
-            "effect {effect}: the acceleration of a test mass is observable only with the interferometers of both test masses; give \
+            "{by}: the acceleration of a test mass is observable only with the interferometers of both test masses; give \
              telemetry with the topic /ifo, or remove the effect from the model"
         )));
     };
@@ -46,58 +48,52 @@ fn second_difference_terms(
 /// z. `d` is in the regressor and in the channel; only an estimator that models it as common to both test masses is
 /// unbiased.
 #[derive(Debug)]
-pub(crate) struct IsScale(usize, usize);
+pub(crate) struct IsScale(String);
 
 impl LinearEffect for IsScale {
     const MANIFEST: Manifest = manifest(
         "is-scale",
         "Scale of the capacitive readout along an axis differs from one",
         &[],
-        &["tm1.y", "tm2.y"],
+        &["{test_mass}.y"],
         &["commands"],
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        let (tm, axis) = tm_axis(setup.instance());
-        Ok(Self(tm, axis))
+        Ok(Self(setup.instance().to_owned()))
     }
 
     fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        Ok(CoefficientForms::only(
-            "1",
-            SCALE,
-            second_difference_terms(mission, available, "is-scale", (self.0, self.1, self.1))?,
-        ))
+        let axis = axis_of(&self.0);
+        let terms = second_difference_terms(mission, available, "the effect is-scale", &self.0, (axis, axis))?;
+        Ok(CoefficientForms::only("1", SCALE, terms))
     }
 }
 
-/// `is-crosstalk`: in instance `tm1.y-z`, `k` times the displacement along y appears in the readout of z.
+/// `is-crosstalk`: in instance `NAME.y-z`, `k` times the displacement along y appears in the readout of z.
 ///
 /// `z_to = k r̈_from = k (û + Φ b + d)_from`; k: 1, ±0.2. No instance ends in x, which the interferometer reads, or
 /// starts in z, where `d` is unobservable.
 #[derive(Debug)]
-pub(crate) struct IsCrosstalk(usize, usize, usize);
+pub(crate) struct IsCrosstalk(String);
 
 impl LinearEffect for IsCrosstalk {
     const MANIFEST: Manifest = manifest(
         "is-crosstalk",
         "Part of the displacement along one axis appears in the capacitive readout of another",
         &[],
-        &["tm1.x-y", "tm1.x-z", "tm1.y-z", "tm2.x-y", "tm2.x-z", "tm2.y-z"],
+        &["{test_mass}.x-y", "{test_mass}.x-z", "{test_mass}.y-z"],
         &["commands"],
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        let (tm, from, to) = tm_pair(setup.instance());
-        Ok(Self(tm, from, to))
+        Ok(Self(setup.instance().to_owned()))
     }
 
     fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        Ok(CoefficientForms::only(
-            "1",
-            SCALE,
-            second_difference_terms(mission, available, "is-crosstalk", (self.0, self.1, self.2))?,
-        ))
+        let axes = axis_pair(&self.0);
+        let terms = second_difference_terms(mission, available, "the effect is-crosstalk", &self.0, axes)?;
+        Ok(CoefficientForms::only("1", SCALE, terms))
     }
 }
 
@@ -109,24 +105,25 @@ impl LinearEffect for IsCrosstalk {
 /// **Collinear with the offset** in x, where `c` acts like `b_z` and `d` like `−b_y` (1 mm/rad for 1 mm). The offset
 /// differs by its response along y and z, and below the bandwidth of the test mass's own attitude control.
 #[derive(Debug)]
-pub(crate) struct TiltToLength(usize);
+pub(crate) struct TiltToLength(String);
 
 impl LinearEffect for TiltToLength {
     const MANIFEST: Manifest = manifest(
         "tilt-to-length",
         "Part of a test mass's angles appears in the interferometer",
         &[],
-        &["tm1", "tm2"],
+        TEST_MASSES,
         &["commands"],
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(tm_axis(setup.instance()).0))
+        Ok(Self(setup.instance().to_owned()))
     }
 
     fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
         const BY: &str = "the effect tilt-to-length";
-        let (tm, name) = (self.0, tm_name(self.0));
+        let tm = &Body::of(mission, &self.0, BY)?;
+        let name = &tm.name;
         let readout = InputColumn::displacement(tm, 0).name;
         if latest_column(available, &readout).is_some_and(|c| c.attribute("noise") != "ifo_x") {
             return Err(PluginError::error(format!(
@@ -134,8 +131,7 @@ impl LinearEffect for TiltToLength {
                  the model"
             )));
         }
-        let test_mass = mission.test_mass(&name, BY)?;
-        let (inverse, t) = (test_mass.inertia_inverse(&name, BY)?, test_mass.dcm_orf_from_srf());
+        let (inverse, t) = (tm.section.inertia_inverse(name, BY)?, tm.section.dcm_orf_from_srf());
         let part = |name: &'static str, angle: usize| {
             let torque = (0..3).map(|j| (InputColumn::electrodes_torque(tm, j), inverse[(angle, j)]));
             let turn = (0..3).map(|j| (InputColumn::alpha(j), -t[(angle, j)]));
@@ -189,7 +185,8 @@ impl LinearEffect for TimeOffset {
             terms.extend(offset_coupling_terms(available, mission, BY, response, -1.0)?);
             return Ok(CoefficientForms::only("s", DELAY_S, terms));
         }
-        for (tm, axis) in (0..2).flat_map(|tm| (0..3).map(move |axis| (tm, axis))) {
+        let bodies = Body::all(mission);
+        for (tm, axis) in bodies.iter().flat_map(|tm| (0..3).map(move |axis| (tm, axis))) {
             let column = latest_column(available, &InputColumn::displacement(tm, axis).name);
             let reads = column.map_or("", |c| c.attribute("noise"));
             if !reads.starts_with("ifo") {
@@ -253,12 +250,12 @@ mod tests {
             column.attributes.insert("noise".to_owned(), "is_x".to_owned());
         }
         for error in [
-            IsScale(1, 1).coefficients(&test_spacecraft.mission, &available).unwrap_err(),
-            IsCrosstalk(0, 1, 2).coefficients(&test_spacecraft.mission, &available).unwrap_err(),
+            IsScale("tm2.y".to_owned()).coefficients(&test_spacecraft.mission, &available).unwrap_err(),
+            IsCrosstalk("tm1.y-z".to_owned()).coefficients(&test_spacecraft.mission, &available).unwrap_err(),
         ] {
             assert!(error.message().contains("only with the interferometers"), "{}", error.message());
         }
-        let error = TiltToLength(0).coefficients(&test_spacecraft.mission, &available).unwrap_err();
+        let error = TiltToLength("tm1".to_owned()).coefficients(&test_spacecraft.mission, &available).unwrap_err();
         assert!(error.message().contains("x of tm1 is read by the inertial sensor"), "{}", error.message());
     }
 

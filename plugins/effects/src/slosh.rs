@@ -135,10 +135,10 @@ impl Slosh {
             }
         }
         for (name, tm) in &self.mission.test_mass {
-            let frame = if name == "tm1" { "ORF_1" } else { "ORF_2" };
+            let frame = self.mission.frame(name);
             let srf_from_orf = tm.dcm_orf_from_srf().transpose();
             for (j, letter) in AXES.iter().enumerate() {
-                let push = Want::new(format!("used.{name}.force_orf_n.{letter}")).unit("N").frame(frame);
+                let push = Want::new(format!("used.{name}.force_orf_n.{letter}")).unit("N").frame(&frame);
                 if srf_from_orf[(axis, j)] != 0.0
                     && let Some(push) = link.read_if_available(available, &push)?
                 {

@@ -5,9 +5,7 @@ use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 
 use crate::common::manifest;
-use crate::linear::{
-    CoefficientForms, InputColumn, LinearEffect, Series, Term, attitude_channel, tm_name, vector_terms,
-};
+use crate::linear::{Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, attitude_channel, vector_terms};
 
 const EXCESS: [f64; 2] = [-0.3, 0.3];
 const ARM_M: [f64; 2] = [-0.5, 0.5];
@@ -48,9 +46,8 @@ impl LinearEffect for SolarPressure {
             .collect()
         };
         let mut force = torque_terms(Vector3::from(pressure.arm_srf_m));
-        for tm in 0..2 {
-            let Some(test_mass) = mission.test_mass.get(&tm_name(tm)) else { continue };
-            let per_unit = test_mass.dcm_orf_from_srf() * (-force_n / mission.spacecraft.mass_kg);
+        for tm in &Body::all(mission) {
+            let per_unit = tm.section.dcm_orf_from_srf() * (-force_n / mission.spacecraft.mass_kg);
             for axis in 0..3 {
                 force.extend(vector_terms(tm, &Series::Column(InputColumn::sun(axis)), &per_unit.column(axis).into()));
             }

@@ -154,7 +154,7 @@ impl Effect for Thermal {
             Parameter::text("minus", "", &[], "column of the temperature that pushes against it, hk.NAME in K"),
             Parameter::f64("lag_s", "s", 480.0, 0.0..=1e5, "first-order lag between temperature and force"),
         ],
-        &TM_AXES,
+        TM_AXES,
         &[],
     );
 

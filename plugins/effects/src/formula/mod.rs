@@ -65,14 +65,14 @@ pub fn fuzz_formula(bytes: &[u8]) {
 }
 
 /// Names that a formula may use, with their columns.
-fn names(available: &Available) -> Vec<(String, Column)> {
+fn names(available: &Available, mission: &Mission) -> Vec<(String, Column)> {
     let mut names = Vec::new();
     for column in &available.columns {
         let name = column.name.as_str();
         let short = if column.table == "grid" && name.starts_with("hk.") {
             Some(name.to_owned())
         } else if column.table == "reconstruction" {
-            short_name(name)
+            short_name(name, mission)
         } else {
             None
         };
@@ -83,23 +83,27 @@ fn names(available: &Available) -> Vec<(String, Column)> {
     names
 }
 
-fn short_name(column: &str) -> Option<String> {
+/// A column of the reconstruction as formulas name it, `r1` and `u1` for the first test mass by name.
+fn short_name(column: &str, mission: &Mission) -> Option<String> {
     let (stem, axis) = column.rsplit_once('.').filter(|(_, axis)| AXES.contains(axis))?;
+    let of_test_mass = || {
+        mission.test_mass.keys().enumerate().find_map(|(i, name)| match stem.strip_prefix(name.as_str()) {
+            Some(".r_orf_m") => Some(format!("r{}", i + 1)),
+            Some(".u_orf_m_s2") => Some(format!("u{}", i + 1)),
+            _ => match stem.strip_prefix("used.")?.strip_prefix(name.as_str())? {
+                ".force_orf_n" => Some(format!("command.{name}.force")),
+                ".torque_orf_nm" => Some(format!("command.{name}.torque")),
+                _ => None,
+            },
+        })
+    };
     let stem = match stem {
-        "sc.alpha_srf_rad_s2" => "alpha",
-        "sc.omega_srf_rad_s" => "omega",
-        "tm1.r_orf_m" => "r1",
-        "tm2.r_orf_m" => "r2",
-        "tm1.u_orf_m_s2" => "u1",
-        "tm2.u_orf_m_s2" => "u2",
-        "used.mps_force_srf_n" => "command.mps_force",
-        "used.mps_torque_srf_nm" => "command.mps_torque",
-        "used.tm1.force_orf_n" => "command.tm1.force",
-        "used.tm1.torque_orf_nm" => "command.tm1.torque",
-        "used.tm2.force_orf_n" => "command.tm2.force",
-        "used.tm2.torque_orf_nm" => "command.tm2.torque",
-        "used.sun_srf" => "sun",
-        _ => return None,
+        "sc.alpha_srf_rad_s2" => "alpha".to_owned(),
+        "sc.omega_srf_rad_s" => "omega".to_owned(),
+        "used.mps_force_srf_n" => "command.mps_force".to_owned(),
+        "used.mps_torque_srf_nm" => "command.mps_torque".to_owned(),
+        "used.sun_srf" => "sun".to_owned(),
+        _ => of_test_mass()?,
     };
     Some(format!("{stem}.{axis}"))
 }
@@ -148,14 +152,15 @@ impl Formula {
         match (parts.next().unwrap_or_default(), parts.next().unwrap_or_default()) {
             ("sc", "force") if known => Ok(responses_to_spacecraft_force(&self.mission, axis, series)),
             ("sc", "torque") if known => Ok(responses_to_spacecraft_torque(&self.mission, axis, series)),
-            (tm @ ("tm1" | "tm2"), what @ ("force" | "accel")) if known => {
+            (tm, what @ ("force" | "accel")) if known && self.mission.test_mass.contains_key(tm) => {
                 let mass_kg = self.mission.test_mass(tm, "the effect formula")?.mass_kg;
                 let factor = if what == "force" { 1.0 / mass_kg } else { 1.0 };
                 Ok(vec![response(format!("{tm}.accel.{}", AXES[axis]), series, factor)])
             }
             _ => self.refuse(&format!(
-                "parameter `acts_on` = \"{}\" must be tm1.force.x, tm1.accel.x (or tm2, y, z), sc.force.x or sc.torque.x",
-                self.acts_on
+                "parameter `acts_on` = \"{}\" must be sc.force.AXIS, sc.torque.AXIS, or NAME.force.AXIS or NAME.accel.AXIS of a test mass: {}",
+                self.acts_on,
+                self.mission.test_mass.keys().cloned().collect::<Vec<_>>().join(", ")
             )),
         }
     }
@@ -208,7 +213,12 @@ impl Effect for Formula {
         "formula",
         "An expression of the user",
         &[
-            Parameter::text("acts_on", "", &[], "tmN.force.AXIS, tmN.accel.AXIS, sc.force.AXIS or sc.torque.AXIS"),
+            Parameter::text(
+                "acts_on",
+                "",
+                &[],
+                "NAME.force.AXIS or NAME.accel.AXIS of a test mass, sc.force.AXIS or sc.torque.AXIS",
+            ),
             Parameter::text("expression", "", &[], "expression that acts per unit of the coefficient"),
             Parameter::text("unit", "", &[], "SI unit of the coefficient"),
             Parameter::f64_list("range", "", &[], "physical range of the coefficient: lower, upper"),
@@ -258,7 +268,7 @@ impl Effect for Formula {
     }
 
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
-        let mut known = names(available);
+        let mut known = names(available, &self.mission);
         known.push(("time_s".to_owned(), Column::default()));
         let texts: Vec<String> = known.iter().map(|(name, _)| name.clone()).collect();
         let made = parse(&self.expression).and_then(|tree| Program::new(&tree, &texts, self.mission.dt_s()));
