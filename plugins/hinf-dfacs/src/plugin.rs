@@ -18,7 +18,7 @@ const INNOVATION_TOLERANCE: f64 = 0.1;
 /// Standard deviations of the innovations' correlation with rebuilt commands above which the commands are not those that
 /// acted; a false alarm in 2e-6 of all runs.
 const DISOBEDIENCE: f64 = 5.0;
-const STATE: &[u8; 8] = b"dfacs/6\n";
+const STATE: &[u8; 8] = b"dfacs/8\n";
 
 /// The stage.
 pub struct HinfDfacs {
@@ -580,7 +580,7 @@ impl HinfDfacs {
     fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
         let mut reader = Reader::new(state);
         if reader.bytes().ok().as_ref() != Some(STATE) {
-            return Err(StateError::Foreign { expected: "version 6" }.into());
+            return Err(StateError::Foreign { expected: "version 8" }.into());
         }
         let waits = reader.flag()?;
         let mut numbers = [0.0; 4];

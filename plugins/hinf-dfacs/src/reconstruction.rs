@@ -16,7 +16,7 @@ use crate::smoother::{Model, Smoothed, Smoother};
 use crate::state::{Reader, StateError, Writer};
 
 const NEEDED_BY: &str = "hinf-dfacs";
-const STATE: &[u8; 8] = b"dfacs/5\n";
+const STATE: &[u8; 8] = b"dfacs/7\n";
 
 /// Where the angular acceleration comes from. Only the smoother gives an unbiased calibration (physics.md §4).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -638,7 +638,7 @@ impl Reconstruction {
     pub fn load(&mut self, bytes: &[u8]) -> Result<(), StateError> {
         let mut state = Reader::new(bytes);
         if state.bytes().ok().as_ref() != Some(STATE) {
-            return Err(StateError::Foreign { expected: "version 5" });
+            return Err(StateError::Foreign { expected: "version 7" });
         }
         self.smoother.load(&mut state)?;
         self.held.load(&mut state)?;

@@ -125,7 +125,7 @@ proptest! {
     #[test]
     fn garbage_is_refused(mut bytes in proptest::collection::vec(any::<u8>(), 0..4000), ours: bool) {
         if ours {
-            bytes.splice(0..0, *b"dfacs/5\n");
+            bytes.splice(0..0, *b"dfacs/7\n");
         }
         prop_assert!(stage(&mission(), &settings(Smoother)).load(&bytes).is_err());
     }
