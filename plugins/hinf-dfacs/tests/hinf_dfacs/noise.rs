@@ -100,7 +100,8 @@ fn the_attitude_stands_apart_from_the_test_masses() {
 fn the_noise_of_x_is_that_of_the_instrument_that_reads_it() {
     let mission = taiji();
     let at_1_hz = |noise_x: [&str; 2]| {
-        let model = NoiseModel::new(&declared(&mission, &noise_x.map(|x| [x, "is_y", "is_z"])), &NINE, 0.1).expect("a model");
+        let model =
+            NoiseModel::new(&declared(&mission, &noise_x.map(|x| [x, "is_y", "is_z"])), &NINE, 0.1).expect("a model");
         [0, 3].map(|i| model.process_psd(["readout:tm1.x", "", "", "readout:tm2.x"][i], 1.0).expect("there")[(i, i)])
     };
     let [first, second] = at_1_hz(["ifo_x", "is_x"]);
