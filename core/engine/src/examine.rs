@@ -6,7 +6,7 @@ use std::path::PathBuf;
 use crate::EngineError;
 use crate::border::Kind;
 use crate::chain::{self, Chain, Sink};
-use crate::config::{EffectEntry, Model, Node};
+use crate::config::{EffectEntry, Mission, Model, Node};
 use crate::product::Product;
 use crate::registry::Registry;
 use crate::replay;
