@@ -1,5 +1,5 @@
-//! One epoch of the loop, whole and by its shares: noise, control law, equations of motion. What is left of the whole is
-//! readout, surroundings and book-keeping.
+//! One epoch of the loop, whole and by its shares: noise, control law, equations of motion. What is left of the whole
+//! is readout, surroundings and book-keeping.
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use dragfree_physics::control::ControlLaw;

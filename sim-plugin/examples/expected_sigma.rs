@@ -1,15 +1,15 @@
-//! One standard deviation of every effect's SIZE after so many hours of the bundled mission, for the table in `src/hidden.rs`:
-//! `expected_sigma HOURS [EFFECT]`.
+//! One standard deviation of every effect's SIZE after so many hours of the bundled mission, for the table in
+//! `src/hidden.rs`: `expected_sigma HOURS [EFFECT]`.
 //!
-//! The time is simulated twice with the same random numbers, without an effect and with a small one. The difference of the
-//! nine residual channels is the effect's regressor, the controller's answer taken out by the commands. The Fisher
+//! The time is simulated twice with the same random numbers, without an effect and with a small one. The difference of
+//! the nine residual channels is the effect's regressor, the controller's answer taken out by the commands. The Fisher
 //! information of it under the mission's noise, after the six offsets (with the surveyed baseline) and a constant and a
 //! slope per channel are fitted, gives σ. For an excess of noise it is that of the spectra.
 
 #![allow(clippy::print_stdout, reason = "it prints a table")]
 
 use dragfree_physics::mission::Mission;
-use dragfree_sim::effects::{Asked, catalogue};
+use dragfree_sim::effects::{EffectRequest, catalogue};
 use dragfree_sim::simulator::{Epoch, Settings, Simulator};
 use nalgebra::{Complex, DMatrix, DVector, Matrix3, SMatrix, Vector3};
 use realfft::RealFftPlanner;
@@ -69,6 +69,10 @@ struct Sample {
     alpha: Vector3<f64>,
 }
 
+fn names(mission: &Mission) -> Vec<String> {
+    mission.test_mass.keys().cloned().collect()
+}
+
 /// Nine residual channels, and with them `α` as the offsets' regressors need it.
 fn residuals(mission: &Mission, samples: usize, effect: Option<&str>) -> (Vec<Vec<f64>>, Vec<Vector3<f64>>) {
     let settings = Settings {
@@ -77,7 +81,7 @@ fn residuals(mission: &Mission, samples: usize, effect: Option<&str>) -> (Vec<Ve
         settle_s: 600.0,
         com_offset_srf_m: Vector3::new(0.001, 0.0, 0.0),
         stiffness_error: 0.2,
-        effects: effect.iter().map(|text| Asked::parse(text).expect("an effect")).collect(),
+        effects: effect.iter().map(|text| EffectRequest::parse(text, &names(mission)).expect("an effect")).collect(),
     };
     let known = Known::new(mission);
     let mut simulator = Simulator::new(mission, settings).expect("the fixture flies");
@@ -88,7 +92,7 @@ fn residuals(mission: &Mission, samples: usize, effect: Option<&str>) -> (Vec<Ve
     for _ in 0..samples + 2 {
         let e = simulator.step().expect("the loop holds");
         let m = &e.measured;
-        let r = |i: usize| Vector3::new(m.ifo_x_orf_m[i], m.is_r_orf_m[i].y, m.is_r_orf_m[i].z);
+        let r = |i: usize| m.tm[i].best().r_orf_m;
         let now =
             Sample { shown: [r(0), r(1), m.dws_sc_crf_rad], known: known.known(&e), alpha: e.truth.alpha_srf_rad_s2 };
         if let Some([a, b]) = &past {
@@ -265,8 +269,8 @@ fn main() {
         }
     };
     for kind in catalogue().filter(|kind| only.as_ref().map_or(kind.id != "com-offset", |id| id == kind.id)) {
-        for place in (kind.places)() {
-            for (effect, size) in shapes(kind.id, &place.to_string()) {
+        for place in (kind.places)(mission.test_mass.len()) {
+            for (effect, size) in shapes(kind.id, &place.name(&names(&mission))) {
                 let (z, _) = residuals(&mission, samples, Some(&effect));
                 let change: Vec<Vec<Complex<f64>>> = z
                     .iter()

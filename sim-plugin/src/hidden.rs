@@ -4,7 +4,8 @@ use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde_json::{Value, json};
 
-use crate::effects::{Asked, stream};
+use crate::effects::EffectRequest;
+use crate::random::stream;
 
 /// Expected significance of what is drawn.
 const SIGNIFICANCE: (f64, f64) = (3.0, 30.0);
@@ -32,8 +33,8 @@ struct Row {
     least_days: f64,
     /// A shape parameter that is drawn between the first and the last of these values, where σ is known.
     shape: Option<(&'static str, &'static [f64])>,
-    /// σ of the size after six hours and after a day by instance, `{N}` in place of the name of the test mass N, at each value of the shape parameter. What is slow gains much
-    /// more between the two than a root of four.
+    /// σ of the size after six hours and after a day by instance, `{N}` in place of the name of the test mass N, at
+    /// each value of the shape parameter. What is slow gains much more between the two than a root of four.
     sigma: &'static [(&'static str, &'static [[f64; 2]])],
 }
 
@@ -50,10 +51,11 @@ const PLAIN: Row = Row {
     sigma: &[],
 };
 
-// σ: printed by the example `expected_sigma` for the bundled mission, after the offsets, a constant and a slope are fitted.
-// Not here, as three σ lie beyond their range whatever the days: stiffness and cross-stiffness, solar-pressure (a constant
-// but for the Sun's slow motion), an offset that follows the propellant, capacitive readout into x, which no residual uses.
-// Nor mps-correlation: at no size is the noise the mission's own, and its correlation has no size, so no significance.
+// σ: printed by the example `expected_sigma` for the bundled mission, after the offsets, a constant and a slope are
+// fitted. Not here, as three σ lie beyond their range whatever the days: stiffness and cross-stiffness, solar-pressure
+// (a constant but for the Sun's slow motion), an offset that follows the propellant, capacitive readout into x, which
+// no residual uses. Nor mps-correlation: at no size is the noise the mission's own, and its correlation has no size, so
+// no significance.
 const ROWS: &[Row] = &[
     Row {
         id: "offset-drift",
@@ -303,7 +305,7 @@ const ROWS: &[Row] = &[
 #[derive(Clone, Debug)]
 pub struct Drawn {
     /// The effect.
-    pub asked: Asked,
+    pub request: EffectRequest,
     covered: bool,
     /// What was drawn, in the unit of `sigma`, counted from where the effect vanishes.
     pub amount: f64,
@@ -334,7 +336,7 @@ impl Hidden {
             let uncovered = luck >= 1.0 - UNCOVERED;
             let pair = luck < NOTHING + PAIR;
             drawn.extend(draw_one(&mut rng, days, test_masses, |row| row.covered != uncovered));
-            if let (true, Some(first)) = (pair, drawn.first().map(|d| d.asked.kind.id)) {
+            if let (true, Some(first)) = (pair, drawn.first().map(|d| d.request.kind.id)) {
                 drawn.extend(draw_one(&mut rng, days, test_masses, |row| row.covered && row.id != first));
             }
         }
@@ -361,14 +363,14 @@ impl Hidden {
 
 impl Drawn {
     fn content(&self) -> Value {
-        let asked = &self.asked;
+        let request = &self.request;
         let shape: serde_json::Map<String, Value> =
-            asked.kind.shape.iter().zip(&asked.shape).map(|(s, v)| (s.name.to_owned(), json!(v))).collect();
+            request.kind.shape.iter().zip(&request.shape).map(|(s, v)| (s.name.to_owned(), json!(v))).collect();
         json!({
-            "effect": asked.kind.id,
-            "instance": asked.instance,
-            "size": asked.size,
-            "unit": asked.kind.size.unit,
+            "effect": request.kind.id,
+            "instance": request.instance,
+            "size": request.size,
+            "unit": request.kind.size.unit,
             "shape": shape,
             "covered": self.covered,
             "significance": self.amount.abs() / self.sigma,
@@ -395,8 +397,8 @@ impl Row {
     }
 }
 
-/// Sizes that are both physical and seen: where even the smallest physical one stands out more, from it up to three times
-/// as much. `None` where the largest is not seen.
+/// Sizes that are both physical and seen: where even the smallest physical one stands out more, from it up to three
+/// times as much. `None` where the largest is not seen.
 fn interval(row: &Row, sigma: f64) -> Option<(f64, f64)> {
     let (seen, glaring) = (SIGNIFICANCE.0 * sigma, SIGNIFICANCE.1 * sigma);
     let (least, most) = row.range;
@@ -456,9 +458,9 @@ fn draw_one(
     if row.id == "impulse" {
         text += &format!(",at_s={:.1}", 86_400.0 * days * (0.1 + 0.8 * rng.random::<f64>()));
     }
-    let asked =
-        Asked::parse(&text, test_masses).unwrap_or_else(|error| unreachable!("the table of hidden effects: {error}"));
-    Some(Drawn { asked, covered: row.covered, amount, sigma })
+    let request = EffectRequest::parse(&text, test_masses)
+        .unwrap_or_else(|error| unreachable!("the table of hidden effects: {error}"));
+    Some(Drawn { request, covered: row.covered, amount, sigma })
 }
 
 #[cfg(test)]
@@ -475,12 +477,12 @@ mod tests {
     fn only_test_masses_that_there_are_get_effects() {
         let one = ["cube".to_owned()];
         let drawn: Vec<Drawn> = (0..500).flat_map(|seed| Hidden::draw(seed, 3.0, &one).drawn).collect();
-        let named = |prefix: &str| drawn.iter().filter(|d| d.asked.instance.starts_with(prefix)).count();
+        let named = |prefix: &str| drawn.iter().filter(|d| d.request.instance.starts_with(prefix)).count();
         assert!(named("cube") > 50 && named("sc.") > 50 && named("tm") == 0 && named("{") == 0);
     }
 
-    /// Three thousand seeds: the chances within 4.5σ of a binomial (false alarm 7e-6 each), sizes physical, significances
-    /// where they should be, every row drawn.
+    /// Three thousand seeds: the chances within 4.5σ of a binomial (false alarm 7e-6 each), sizes physical,
+    /// significances where they should be, every row drawn.
     #[test]
     fn draws_keep_their_chances_and_ranges() {
         let n = 3000;
@@ -493,17 +495,17 @@ mod tests {
             uncovered += f64::from(hidden.drawn.iter().any(|d| !d.covered));
             for d in &hidden.drawn {
                 let significance = d.amount.abs() / d.sigma;
-                assert!(significance >= SIGNIFICANCE.0 * 0.999_999, "{}: {significance}", d.asked);
-                let loud = ROWS.iter().any(|r| r.id == d.asked.kind.id && r.range.0 > 0.0);
-                assert!(significance <= SIGNIFICANCE.1 * 1.000_001 || loud, "{}: {significance}", d.asked);
-                let rows = ROWS.iter().filter(|r| r.id == d.asked.kind.id);
+                assert!(significance >= SIGNIFICANCE.0 * 0.999_999, "{}: {significance}", d.request);
+                let loud = ROWS.iter().any(|r| r.id == d.request.kind.id && r.range.0 > 0.0);
+                assert!(significance <= SIGNIFICANCE.1 * 1.000_001 || loud, "{}: {significance}", d.request);
+                let rows = ROWS.iter().filter(|r| r.id == d.request.kind.id);
                 let physical =
                     rows.map(|r| r.range).any(|(a, b)| (a * 0.999_999..=b * 1.000_001).contains(&d.amount.abs()));
-                assert!(physical, "{}", d.asked);
-                *seen.entry(d.asked.kind.id).or_insert(0) += 1;
+                assert!(physical, "{}", d.request);
+                *seen.entry(d.request.kind.id).or_insert(0) += 1;
             }
             if let [a, b] = &hidden.drawn[..] {
-                assert_ne!(a.asked.kind.id, b.asked.kind.id);
+                assert_ne!(a.request.kind.id, b.request.kind.id);
             }
         }
         for (count, chance) in [(nothing, NOTHING), (pairs, PAIR), (uncovered, UNCOVERED)] {
@@ -535,14 +537,14 @@ mod tests {
         for row in ROWS {
             for (place, sigma) in row.sigma {
                 let place = instance(place, &both()).unwrap();
-                Asked::parse(&format!("{}:{place}={}", row.id, row.origin), &both()).unwrap();
+                EffectRequest::parse(&format!("{}:{place}={}", row.id, row.origin), &both()).unwrap();
                 assert_eq!(sigma.len(), row.shape.map_or(1, |(_, grid)| grid.len()), "{} {place}", row.id);
                 // More time tells at least as much, to the three digits that are printed.
                 assert!(sigma.iter().all(|[six, day]| 0.0 < *day && *day <= 1.01 * six && six.is_finite()));
             }
             for name in row.carrier.into_iter().chain(row.shape.map(|(name, _)| name)) {
                 let place = instance(row.sigma[0].0, &both()).unwrap();
-                Asked::parse(&format!("{}:{place}={},{name}=1e-12", row.id, row.origin), &both())
+                EffectRequest::parse(&format!("{}:{place}={},{name}=1e-12", row.id, row.origin), &both())
                     .map_or_else(|e| assert!(!e.to_string().contains("no parameter"), "{e}"), drop);
             }
         }

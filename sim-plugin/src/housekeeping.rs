@@ -81,8 +81,8 @@ fn face(i: &Interior, tm: usize, axis: usize, side: f64) -> f64 {
     i.housing_k[tm] + 0.5 * side * i.across_k[tm][axis]
 }
 
-/// Field at a magnetometer beside a test mass, SRF as mounted: the field from outside and that of the units, which is as
-/// strong there but turned.
+/// Field at a magnetometer beside a test mass, SRF as mounted: the field from outside and that of the units, which is
+/// as strong there but turned.
 fn field(i: &Interior, tm: usize, axis: usize) -> f64 {
     i.interplanetary_t[axis] + i.units_field[tm] * of_housing(&FIELD_T, tm)[(axis + 1) % 3]
 }

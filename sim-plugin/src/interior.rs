@@ -1,5 +1,5 @@
-//! What goes on inside the spacecraft: heat, currents, propellant, magnetic field, charge. Effects act by these states and
-//! the housekeeping reads them; without effects nothing in the loop depends on them.
+//! What goes on inside the spacecraft: heat, currents, propellant, magnetic field, charge. Effects act by these states
+//! and the housekeeping reads them; without effects nothing in the loop depends on them.
 //!
 //! One step a second. Heat goes panel → structure → bench → electrode housing, each behind a first-order lag; two
 //! thermostats cycle their heaters; levels and fluctuations are those of LISA Pathfinder where it published them
@@ -12,7 +12,7 @@ use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 
-use crate::effects::stream;
+use crate::random::stream;
 
 /// Seconds of a step.
 const STEP_S: f64 = 1.0;
@@ -26,7 +26,8 @@ const EXHAUST_M_S: f64 = 600.0;
 /// Thrusters idle at this thrust, N, and go no lower than the next.
 const BIAS_N: f64 = 15e-6;
 const LEAST_N: f64 = 2e-6;
-/// Charging by cosmic rays, elementary charges per second (23 e/s in flight), and where the UV lamp is switched on and off.
+/// Charging by cosmic rays, elementary charges per second (23 e/s in flight), and where the UV lamp is switched on and
+/// off.
 const CHARGING_E_S: [f64; 2] = [23.0, 28.0];
 const LAMP_ON_E: f64 = 6e5;
 const LAMP_OFF_E: f64 = 2e4;
@@ -496,9 +497,9 @@ mod tests {
         }
     }
 
-    /// By hand: six thrusters at 15 µN take 90 µN whatever balanced force they make; 100 µN along x is more than three of
-    /// them can give way to: 72.7 + 2 × 43.9 µN, and three at their 2 µN. Forces that change within a step count by their
-    /// mean. Each of six thrusters takes its own from 85 kg, rounded to half the float's step.
+    /// By hand: six thrusters at 15 µN take 90 µN whatever balanced force they make; 100 µN along x is more than three
+    /// of them can give way to: 72.7 + 2 × 43.9 µN, and three at their 2 µN. Forces that change within a step count by
+    /// their mean. Each of six thrusters takes its own from 85 kg, rounded to half the float's step.
     #[test]
     fn the_tank_empties_by_what_is_thrust() {
         for (amplitude_n, swing_n, total_n) in [(0.0, 0.0, 90e-6), (5e-6, 4e-6, 90e-6), (100e-6, 30e-6, 166.5e-6)] {
@@ -532,8 +533,8 @@ mod tests {
         assert!((left / (-1.5_f64).exp() - 1.0).abs() < 1e-9, "{left}");
     }
 
-    /// Cosmic rays charge the test mass at 23 e/s with the scatter of 400 e a second; above 6e5 e the lamp takes that off
-    /// behind 400 s, below 2e4 e it goes out and the charge climbs again. Each within 4.5σ, false alarm 7e-6.
+    /// Cosmic rays charge the test mass at 23 e/s with the scatter of 400 e a second; above 6e5 e the lamp takes that
+    /// off behind 400 s, below 2e4 e it goes out and the charge climbs again. Each within 4.5σ, false alarm 7e-6.
     #[test]
     fn a_discharge_resets_the_charge() {
         let mut inside = running();

@@ -9,6 +9,7 @@ pub mod housekeeping;
 pub mod interior;
 pub mod orbit;
 pub mod plant;
+mod random;
 pub mod sensors;
 pub mod simulator;
 #[cfg(test)]
@@ -22,7 +23,7 @@ use rand::SeedableRng;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 
-use effects::Asked;
+use effects::EffectRequest;
 use hidden::Hidden;
 use housekeeping::{Channel, Housekeeping};
 use simulator::{Epoch, Settings, SimulationError, Simulator};
@@ -30,8 +31,8 @@ use simulator::{Epoch, Settings, SimulationError, Simulator};
 /// 2035-01-01T00:00:00, where the paper's simulation starts, Unix ns.
 const DEFAULT_START_NS: i64 = 2_051_222_400_000_000_000;
 
-/// A table, its columns in the order of a row's values, and the rows of the batch at hand: a row is one copy, and a column is
-/// taken out of all of them at once.
+/// A table, its columns in the order of a row's values, and the rows of the batch at hand: a row is one copy, and a
+/// column is taken out of all of them at once.
 struct Topic {
     table: Table,
     columns: Vec<Out>,
@@ -322,10 +323,10 @@ impl Source for Sim {
         })?;
         let given = setup.text_list("effects")?;
         let names: Vec<String> = mission.test_mass.keys().cloned().collect();
-        let mut effects = given.iter().map(|text| Asked::parse(text, &names)).collect::<Result<Vec<_>, _>>()?;
+        let mut effects = given.iter().map(|text| EffectRequest::parse(text, &names)).collect::<Result<Vec<_>, _>>()?;
         let days = (end_ns - start_ns) as f64 / 86_400e9;
         let hidden = u64::try_from(setup.i64("hidden")?).ok().map(|seed| Hidden::draw(seed, days, &names));
-        effects.extend(hidden.iter().flat_map(|h| &h.drawn).map(|d| d.asked.clone()));
+        effects.extend(hidden.iter().flat_map(|h| &h.drawn).map(|d| d.request.clone()));
         let seed = setup.i64("seed")?.cast_unsigned();
         let settings = Settings {
             seed,

@@ -210,8 +210,8 @@ impl Plant {
     /// Displacement and angle are exact for the constant part of the accelerations. What varies within 0.1 s does so by
     /// stiffness and rotation, on time scales above 500 s: the rule's error is below 1e-8 of the acceleration.
     ///
-    /// Displacements midway need no accelerations, and the terms in the rates are solved for their values midway, so that
-    /// stiffness, gradient and torques are worked out once.
+    /// Displacements midway need no accelerations, and the terms in the rates are solved for their values midway, so
+    /// that stiffness, gradient and torques are worked out once.
     pub fn step(&self, y: &mut State, loads: &Loads, outside: &Outside, dt_s: f64) -> Means {
         let held = self.held(loads, outside);
         let half_s = 0.5 * dt_s;
@@ -354,7 +354,8 @@ mod tests {
         }
     }
 
-    /// The paper's spacecraft without stiffness; the test masses are uneven bodies here, to see their gyroscopic torque.
+    /// The paper's spacecraft without stiffness; the test masses are uneven bodies here, to see their gyroscopic
+    /// torque.
     fn plant() -> Plant {
         let inertia = Matrix3::new(800.0, 13.0, 10.0, 13.0, 800.0, 12.0, 10.0, 12.0, 1000.0);
         Plant {
@@ -382,8 +383,8 @@ mod tests {
         turn(&q.conjugate(), v)
     }
 
-    /// Undisturbed bodies keep energy and angular momentum in inertial space. With `+J⁻¹(ω×Jω)`, as the paper prints, the
-    /// momentum turns by a radian here.
+    /// Undisturbed bodies keep energy and angular momentum in inertial space. With `+J⁻¹(ω×Jω)`, as the paper prints,
+    /// the momentum turns by a radian here.
     #[test]
     fn tumbling_bodies_keep_energy_and_momentum() {
         let plant = plant();
@@ -416,8 +417,8 @@ mod tests {
         assert!((l1 - l0).norm() < 1e-6 * l0.norm() && (e1 / e0 - 1.0).abs() < 1e-6, "{l0} {l1} {e0} {e1}");
     }
 
-    /// Electrodes push spacecraft and test masses apart and leave the whole as it was: linear and angular momentum about
-    /// the spacecraft's centre. With `+b×(T F_E)`, as the paper prints, the angular momentum changes by 2 b×F.
+    /// Electrodes push spacecraft and test masses apart and leave the whole as it was: linear and angular momentum
+    /// about the spacecraft's centre. With `+b×(T F_E)`, as the paper prints, the angular momentum changes by 2 b×F.
     #[test]
     fn electrodes_are_internal_forces() {
         let plant = plant();
@@ -442,8 +443,8 @@ mod tests {
         assert!(angular.norm() < 1e-15 * 1e-9 * 10.0, "{angular}");
     }
 
-    /// A free test mass stays where it is while the spacecraft spins up about s_3 under a constant torque: in ORF it moves
-    /// on an arc that is known in closed form. Euler's, Coriolis' and the centrifugal term each carry it.
+    /// A free test mass stays where it is while the spacecraft spins up about s_3 under a constant torque: in ORF it
+    /// moves on an arc that is known in closed form. Euler's, Coriolis' and the centrifugal term each carry it.
     fn error_after_spin_up(dt_s: f64) -> f64 {
         let mut plant = plant();
         plant.sc_inertia = Matrix3::from_diagonal(&Vector3::new(800.0, 800.0, 1000.0));

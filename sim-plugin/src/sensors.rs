@@ -38,7 +38,8 @@ pub struct Measured {
 
 impl MeasuredTestMass {
     /// The best readout of each degree of freedom.
-    fn best(&self) -> TestMassReadout {
+    #[must_use]
+    pub fn best(&self) -> TestMassReadout {
         let [theta, psi] = self.dws_orf_rad;
         let (optical, capacitive) = (Vector3::new(f64::NAN, theta, psi), &self.is_att_orf_rad);
         let best = |optical: &Vector3<f64>, capacitive: &Vector3<f64>| {

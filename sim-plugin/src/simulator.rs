@@ -10,7 +10,7 @@ use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 
-use crate::effects::{Asked, Basis, EffectError, Effects, Moment, Saved};
+use crate::effects::{Basis, EffectError, EffectRequest, Effects, Moment, Saved};
 use crate::interior::{Influences, Interior, Running, SavedInterior};
 use crate::orbit::{Constellation, Environment, OrbitError};
 use crate::plant::{Loads, Outside, Plant, State};
@@ -90,7 +90,7 @@ pub struct Settings {
     /// Largest relative error of a stiffness element.
     pub stiffness_error: f64,
     /// What the controller does not know.
-    pub effects: Vec<Asked>,
+    pub effects: Vec<EffectRequest>,
 }
 
 /// One epoch of the loop.

@@ -50,9 +50,9 @@ impl Layout {
         Ok(Self { wrenches, asd_n_rthz: units.iter().map(|u| u.asd_n_rthz).collect() })
     }
 
-    /// Six units in three pairs 1.5 m from the axis `s_3` and 0.35 m above the centre of mass, thrusting along the rim to
-    /// both sides and 35° up, towards the Sun: as on LISA Pathfinder, sunlight is their seventh. They hold the default
-    /// mission's sunlight from every azimuth within 0.5 to 31 µN, and nothing that pulls them along `s_3`.
+    /// Six units in three pairs 1.5 m from the axis `s_3` and 0.35 m above the centre of mass, thrusting along the rim
+    /// to both sides and 35° up, towards the Sun: as on LISA Pathfinder, sunlight is their seventh. They hold the
+    /// default mission's sunlight from every azimuth within 0.5 to 31 µN, and nothing that pulls them along `s_3`.
     #[must_use]
     pub fn six(asd_n_rthz: f64) -> Self {
         let unit = |k: usize| {
@@ -131,8 +131,8 @@ impl Distribution {
         Self { inverse: least_norm(wrenches), wrenches: wrenches.clone(), range_n }
     }
 
-    /// The thrusts, and whether they make what is wanted. Where the least-norm solution leaves the range, the units that
-    /// do are held at their limit and the others make up for it (cascaded generalised inverses, Bordignon 1996).
+    /// The thrusts, and whether they make what is wanted. Where the least-norm solution leaves the range, the units
+    /// that do are held at their limit and the others make up for it (cascaded generalised inverses, Bordignon 1996).
     fn thrusts(&self, wanted: &Wrench) -> (Channels, bool) {
         let [low, high] = self.range_n;
         let n = self.wrenches.ncols();
@@ -257,7 +257,8 @@ impl Thrusters {
         self.saturated
     }
 
-    /// What the thrusters are told: within their range and in whole steps. Of the axes, forces alone have limit and step.
+    /// What the thrusters are told: within their range and in whole steps. Of the axes, forces alone have limit and
+    /// step.
     fn command(&mut self, wanted: &Wrench) -> Channels {
         let [low, high] = self.limit_n;
         let step_n = self.step_n;
@@ -328,8 +329,9 @@ mod tests {
         (force, Vector3::new(0.1, 0.0, 0.6).cross(&force))
     }
 
-    /// Two units that push along x, 1 m above and 2 m below the centre: `corr(F_x, M_y) = (1 − 2)/√(2·5)` by hand; and the
-    /// samples of both layouts have `Σ d_i (r_i×d_i)ᵀ`: 40,000 samples, 4.5σ of a covariance, false alarm 7e-6 a number.
+    /// Two units that push along x, 1 m above and 2 m below the centre: `corr(F_x, M_y) = (1 − 2)/√(2·5)` by hand; and
+    /// the samples of both layouts have `Σ d_i (r_i×d_i)ᵀ`: 40,000 samples, 4.5σ of a covariance, false alarm 7e-6 a
+    /// number.
     #[test]
     fn noise_pushes_and_turns_at_once() {
         let unit = |z| mission::ThrusterUnit {

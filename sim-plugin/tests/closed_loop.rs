@@ -59,7 +59,8 @@ fn channels_are_decoupled_in_the_exact_plant() {
     }
 }
 
-/// Controllers that cannot hold their channel are refused by name before the first step; those that nobody moves may drift.
+/// Controllers that cannot hold their channel are refused by name before the first step; those that nobody moves may
+/// drift.
 #[test]
 fn controllers_that_cannot_hold_their_channel_are_refused() {
     let mut mission = taiji();
@@ -86,9 +87,9 @@ fn controllers_that_cannot_hold_their_channel_are_refused() {
     }
 }
 
-/// The feed-forward of sunlight knows the orbit to 50 km (1σ along each axis, the paper): over 100 seeds the error of the
-/// telemetered position and of the Sun's direction follow χ² with 300 and 200 degrees of freedom, each within its quantiles
-/// of 1e-4. The twin, an orbit known exactly, has neither.
+/// The feed-forward of sunlight knows the orbit to 50 km (1σ along each axis, the paper): over 100 seeds the error of
+/// the telemetered position and of the Sun's direction follow χ² with 300 and 200 degrees of freedom, each within its
+/// quantiles of 1e-4. The twin, an orbit known exactly, has neither.
 #[test]
 fn sunlight_is_fed_forward_from_an_orbit_that_is_fifty_kilometres_off() {
     let mut mission = taiji();

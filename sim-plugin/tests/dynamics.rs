@@ -1,5 +1,5 @@
-//! The equations of motion against inertial space: another formulation with 60 digits (`oracles/dynamics.py`), conserved
-//! quantities, order and size of the step's error, and the terms that the paper's linear model drops.
+//! The equations of motion against inertial space: another formulation with 60 digits (`oracles/dynamics.py`),
+//! conserved quantities, order and size of the step's error, and the terms that the paper's linear model drops.
 
 use dragfree_physics::attitude::{dcm, from_rotation_vector, rotation_vector};
 use dragfree_physics::frames::dcm_turned_about_z;
@@ -142,8 +142,8 @@ fn distance(a: &[[Vector3<f64>; 5]], b: &[[Vector3<f64>; 5]]) -> (f64, f64) {
     (worst(0..2), worst(2..5))
 }
 
-/// The midpoint rule's error quarters with the step. Extrapolated to no step at all, what is left is the gradient that is
-/// held over a sample, 1e-13 m after 1000 s, and rounding.
+/// The midpoint rule's error quarters with the step. Extrapolated to no step at all, what is left is the gradient that
+/// is held over a sample, 1e-13 m after 1000 s, and rounding.
 #[test]
 fn the_plant_moves_as_inertial_space_says() {
     let want = reference();
@@ -228,7 +228,8 @@ struct Inertial {
     pair_nms: Vector3<f64>,
 }
 
-/// Linear momentum, angular momentum about the origin, energies of rotation, and the test masses' position and velocity.
+/// Linear momentum, angular momentum about the origin, energies of rotation, and the test masses' position and
+/// velocity.
 struct Sums {
     momentum: Vector3<f64>,
     angular: Vector3<f64>,
@@ -280,8 +281,8 @@ impl Inertial {
     }
 }
 
-/// 1000 s without gravity, stiffness or anything from outside; `force_n` is the size of the electrodes' forces. Sums before
-/// and after, and the momentum that the pairs of forces carry in.
+/// 1000 s without gravity, stiffness or anything from outside; `force_n` is the size of the electrodes' forces. Sums
+/// before and after, and the momentum that the pairs of forces carry in.
 fn undisturbed(dt_s: f64, force_n: f64, twin: Twin) -> (Sums, Sums, Vector3<f64>) {
     let mut plant = bodies();
     for body in &mut plant.tm {
@@ -318,8 +319,8 @@ fn assert_quartered(coarse: &[f64], fine: &[f64]) {
     assert!(ratios.iter().all(|r| (r - 4.0).abs() < 0.05), "{ratios:?}");
 }
 
-/// A spacecraft that tumbles about no axis of its own, and test masses that nothing holds: they fly straight on, and every
-/// energy and momentum stays but for `(ω dt)²`, 1.4e-7, in every radian of 3.7.
+/// A spacecraft that tumbles about no axis of its own, and test masses that nothing holds: they fly straight on, and
+/// every energy and momentum stays but for `(ω dt)²`, 1.4e-7, in every radian of 3.7.
 #[test]
 fn undisturbed_bodies_keep_what_they_have() {
     let lost = |dt_s: f64, twin: Twin| {
@@ -342,9 +343,9 @@ fn undisturbed_bodies_keep_what_they_have() {
     assert!(printed[0] > 0.1, "+J⁻¹(ω×Jω), as printed: {printed:?}");
 }
 
-/// Electrodes push bodies apart and leave the whole as it was. The paper lets the reaction act at `b_i`, not where the test
-/// mass is: `r_i × F_E` remains, 1e-17 N m in science mode, and is counted here. The forces are large, 1e-5 N, so that they
-/// stand out from the tumbling.
+/// Electrodes push bodies apart and leave the whole as it was. The paper lets the reaction act at `b_i`, not where the
+/// test mass is: `r_i × F_E` remains, 1e-17 N m in science mode, and is counted here. The forces are large, 1e-5 N, so
+/// that they stand out from the tumbling.
 #[test]
 fn electrodes_carry_no_momentum_in() {
     let lost = |dt_s: f64, twin: Twin| {
@@ -402,8 +403,8 @@ fn drift(substeps: u32) -> State {
     y
 }
 
-/// What a step of 0.1 s costs against 1/16 of it, after two hours and 0.5 mm. The fastest rate is that of the stiffness,
-/// Ω = 1.4e-3 rad/s: `(Ω dt)²/12` in each of the ten radians that go by, 1.7e-8, is 8e-12 m.
+/// What a step of 0.1 s costs against 1/16 of it, after two hours and 0.5 mm. The fastest rate is that of the
+/// stiffness, Ω = 1.4e-3 rad/s: `(Ω dt)²/12` in each of the ten radians that go by, 1.7e-8, is 8e-12 m.
 #[test]
 fn a_step_of_a_tenth_of_a_second_is_short_enough() {
     let fine = drift(16);
@@ -418,9 +419,9 @@ fn a_step_of_a_tenth_of_a_second_is_short_enough() {
     assert!((coarse / halved - 4.05).abs() < 0.05, "{coarse} {halved}");
 }
 
-/// What the paper's linear model drops, in an hour of science mode, at any instant and along any direction: below 1e-15 m/s².
-/// Coriolis' term is the largest, 1.5e-16 m/s² rms: its bound is seven of that away. The centrifugal term of the offset is
-/// above, 7.2e-15 m/s², and is dropped nowhere.
+/// What the paper's linear model drops, in an hour of science mode, at any instant and along any direction: below 1e-15
+/// m/s². Coriolis' term is the largest, 1.5e-16 m/s² rms: its bound is seven of that away. The centrifugal term of the
+/// offset is above, 7.2e-15 m/s², and is dropped nowhere.
 #[test]
 fn dropped_terms_are_small_in_science_mode() {
     const BOUND_M_S2: f64 = 1e-15;

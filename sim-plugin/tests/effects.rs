@@ -4,7 +4,7 @@
 use dragfree_physics::attitude::rotation_vector;
 use dragfree_physics::mission::Mission;
 use dragfree_physics::spectrum::welch;
-use dragfree_sim::effects::{Asked, EffectError, catalogue};
+use dragfree_sim::effects::{EffectError, EffectRequest, catalogue};
 use dragfree_sim::housekeeping::{Housekeeping, channels};
 use dragfree_sim::interior::Interior;
 use dragfree_sim::plant::State;
@@ -25,8 +25,8 @@ fn names() -> Vec<String> {
     taiji().test_mass.keys().cloned().collect()
 }
 
-fn parse(text: &str) -> Result<Asked, EffectError> {
-    Asked::parse(text, &names())
+fn parse(text: &str) -> Result<EffectRequest, EffectError> {
+    EffectRequest::parse(text, &names())
 }
 
 fn settings(effects: &[&str], settle_s: f64) -> Settings {
@@ -136,7 +136,8 @@ fn near(found: &Vector3<f64>, want: &Vector3<f64>, relative: f64, what: &str) {
     assert!((found - want).norm() <= relative * want.norm(), "{what}: found {found}, wanted {want}");
 }
 
-/// What extra loads do to first order: `F` and `M` on the spacecraft, `F_E` on the test masses (ORF) with their reaction.
+/// What extra loads do to first order: `F` and `M` on the spacecraft, `F_E` on the test masses (ORF) with their
+/// reaction.
 fn answers(row: &Row, force: Vector3<f64>, torque: Vector3<f64>, electric: [Vector3<f64>; 2], what: &str) {
     let (mut net, mut moment) = (force, torque);
     for i in 0..2 {
@@ -203,8 +204,9 @@ fn actuators_do_more_or_else_than_commanded() {
     }
 }
 
-/// The loop is closed. Electrodes carry the difference of z between the test masses, `F_1 = −F_2`, and thrust the common
-/// part: `F_2 (1 + g) − F_1 = m (g_1 − g_2)`, so that half of one gain missing asks for 2/(2 + g) = 4/3 of the force.
+/// The loop is closed. Electrodes carry the difference of z between the test masses, `F_1 = −F_2`, and thrust the
+/// common part: `F_2 (1 + g) − F_1 = m (g_1 − g_2)`, so that half of one gain missing asks for 2/(2 + g) = 4/3 of the
+/// force.
 #[test]
 fn the_controller_answers() {
     let mean = |effects: &[&str]| {
@@ -539,10 +541,10 @@ fn a_line_has_its_frequency_and_amplitude() {
     assert!((power / (0.5e-16) - 1.0).abs() < 1e-6, "nothing but the line: {power}");
 }
 
-/// Covariance of force and torque against `Σ S (d, r×d)(d, r×d)ᵀ` of six units, worked out here from where they sit; the
-/// other simulation's noise along the axes, 1e-7 each, differs with it and so adds to the diagonal. Each number within
-/// 4.5σ (false alarm 7e-6), and the twins whose force and torque do not belong together, or whose noise along the axes
-/// goes on in both, are caught.
+/// Covariance of force and torque against `Σ S (d, r×d)(d, r×d)ᵀ` of six units, worked out here from where they sit;
+/// the other simulation's noise along the axes, 1e-7 each, differs with it and so adds to the diagonal. Each number
+/// within 4.5σ (false alarm 7e-6), and the twins whose force and torque do not belong together, or whose noise along
+/// the axes goes on in both, are caught.
 #[test]
 fn noise_of_a_thruster_pushes_and_turns_at_once() {
     let asd_n_rthz = 1e-7_f64;
@@ -604,8 +606,8 @@ fn housekeeping(effects: &[&str]) -> Vec<Vec<f64>> {
 }
 
 /// An effect shows in housekeeping only where the loop acts on what is measured: the thrusters' commands (valves, tank)
-/// and the attitude (Sun sensor and, through the panel, temperatures, by less than a step of their converter). Every other
-/// channel is the same to the last bit, so no channel tells which effect is hidden.
+/// and the attitude (Sun sensor and, through the panel, temperatures, by less than a step of their converter). Every
+/// other channel is the same to the last bit, so no channel tells which effect is hidden.
 #[test]
 fn housekeeping_does_not_tell_what_is_hidden() {
     let plain = housekeeping(&[]);
@@ -646,8 +648,8 @@ fn example(id: &str, place: &str) -> String {
     format!("{id}:{place}={size}")
 }
 
-/// Every instance of every kind flies, leaves the random stream of the loop alone, changes something, and goes on from a
-/// saved state bit for bit.
+/// Every instance of every kind flies, leaves the random stream of the loop alone, changes something, and goes on from
+/// a saved state bit for bit.
 #[test]
 fn every_instance_flies_and_resumes_bit_for_bit() {
     let mission = taiji();

@@ -1,4 +1,5 @@
-//! Orbits against other programs: DE440 and time scales by CSPICE, the spacecraft by SciPy. `oracles/*.py` made the numbers.
+//! Orbits against other programs: DE440 and time scales by CSPICE, the spacecraft by SciPy. `oracles/*.py` made the
+//! numbers.
 
 use std::fmt::Debug;
 use std::str::FromStr;
@@ -94,9 +95,9 @@ fn spacecraft_fly_as_another_program_says() {
     assert_eq!(compared, 45);
 }
 
-/// One year under Sun and Earth. Published: 5.5 m/s at most in three years for arms of 5e9 m under the same forces (S. V. Dhurandhar,
-/// K. R. Nayak, J.-Y. Vinet, arXiv:0809.1935). Without the Earth our arms breathe by 0.6 % and 0.5° from end to end
-/// (`elements.rs` compares the tilt's flexing with Nayak et al.); the Earth adds less than that again.
+/// One year under Sun and Earth. Published: 5.5 m/s at most in three years for arms of 5e9 m under the same forces (S.
+/// V. Dhurandhar, K. R. Nayak, J.-Y. Vinet, arXiv:0809.1935). Without the Earth our arms breathe by 0.6 % and 0.5° from
+/// end to end (`elements.rs` compares the tilt's flexing with Nayak et al.); the Earth adds less than that again.
 #[test]
 fn the_triangle_breathes_within_published_ranges() {
     let constellation = constellation();
@@ -129,8 +130,8 @@ fn the_triangle_breathes_within_published_ranges() {
 
 #[test]
 fn the_centre_trails_the_earth() {
-    // Both longitudes from CSPICE's Earth and SciPy's spacecraft, which start where the mission says: here the other sense
-    // and another angle.
+    // Both longitudes from CSPICE's Earth and SciPy's spacecraft, which start where the mission says: here the other
+    // sense and another angle.
     let ahead = mission(|table| {
         let orbit = table["orbit"].as_table_mut().unwrap();
         orbit.insert("trailing_angle_rad".to_owned(), (-0.3).into());
@@ -195,8 +196,8 @@ fn the_frame_turns_once_a_year() {
     }
 }
 
-/// Between packets the simulator moves `ω_CI` on linearly and holds `Γ`: `ω̈` is n²ω = 8e-21 rad/s³, and `Γ` turns by n, as
-/// its largest difference of 1.2e-13 s⁻² does, 1.4e-18 s⁻² a minute.
+/// Between packets the simulator moves `ω_CI` on linearly and holds `Γ`: `ω̈` is n²ω = 8e-21 rad/s³, and `Γ` turns by
+/// n, as its largest difference of 1.2e-13 s⁻² does, 1.4e-18 s⁻² a minute.
 #[test]
 fn a_minute_between_packets_is_short_enough() {
     let constellation = constellation();

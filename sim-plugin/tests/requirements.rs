@@ -29,9 +29,9 @@ fn attainable(c: &ChannelDesign, band: (f64, f64)) -> bool {
     c.unattainable.is_none_or(|u| band.0 > u.to_hz)
 }
 
-/// In every band of every channel, the spectrum of the true states is the one that the design predicts, to what a day can
-/// tell, and the prediction keeps the table wherever physics lets any controller keep it. The measured spectrum itself
-/// does not exceed the table by more than chance would make one estimate in 150,000 do.
+/// In every band of every channel, the spectrum of the true states is the one that the design predicts, to what a day
+/// can tell, and the prediction keeps the table wherever physics lets any controller keep it. The measured spectrum
+/// itself does not exceed the table by more than chance would make one estimate in 150,000 do.
 #[test]
 fn one_day_meets_the_requirement_table() {
     let mission = taiji();

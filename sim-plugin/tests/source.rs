@@ -279,12 +279,13 @@ fn what_has_no_sense_is_refused_by_name() {
     }
 }
 
-/// What is hidden shows in the attachment that the host seals and nowhere else: tables, columns and their attributes are
-/// the same, and so are rows where the seed draws nothing. The seed is the first that draws something, and nothing.
+/// What is hidden shows in the attachment that the host seals and nowhere else: tables, columns and their attributes
+/// are the same, and so are rows where the seed draws nothing. The seed is the first that draws something, and nothing.
 #[test]
 fn hidden_effects_leave_no_trace_but_their_own() {
     let library = library();
-    let drawn = |seed: i64| Hidden::draw(seed.cast_unsigned(), 120.0 / 86_400.0).drawn.len();
+    let names = ["tm1", "tm2"].map(str::to_owned);
+    let drawn = |seed: i64| Hidden::draw(seed.cast_unsigned(), 120.0 / 86_400.0, &names).drawn.len();
     let something = (0..).find(|seed| drawn(*seed) > 0).unwrap();
     let nothing = (0..).find(|seed| drawn(*seed) == 0).unwrap();
     let hide = |seed: i64| config(120, move |_, p| p["hidden"] = json!(seed));

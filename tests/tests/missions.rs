@@ -1,5 +1,5 @@
-//! Other spacecraft by their mission files alone: two test masses of LISA, and one test mass that is drag-free along all axes. Each
-//! is designed, simulated in closed loop and calibrated over ten seeds.
+//! Other spacecraft by their mission files alone: two test masses of LISA, and one test mass that is drag-free along
+//! all axes. Each is designed, simulated in closed loop and calibrated over ten seeds.
 
 use dragfree_tests::recording::Recording;
 use dragfree_tests::{dragfree, expect, fixture, json};
@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 const SEEDS: u64 = 10;
 /// What `simulate` adds to the nominal offset of both housings unless it is told otherwise, along x of SRF, m.
 const ADDED_M: f64 = 0.001;
-/// Quantiles of χ² with 30 degrees of freedom, three components of an offset over ten seeds, at 0.001 and 0.999: a false alarm of 0.2 %
-/// for each test mass and solution.
+/// Quantiles of χ² with 30 degrees of freedom, three components of an offset over ten seeds, at 0.001 and 0.999: a
+/// false alarm of 0.2 % for each test mass and solution.
 const BOUNDS: (f64, f64) = (11.588, 59.703);
 
 /// A mission of the fixtures with its test masses and its calibrations.
@@ -111,7 +111,8 @@ fn chi2(error: &[f64; 3], covariance: &[[f64; 3]; 3]) -> f64 {
     white.iter().map(|x| x * x).sum()
 }
 
-/// The errors of ten seeds follow their covariances; against a truth two and a half of its σ off, or with half the σ, they do not.
+/// The errors of ten seeds follow their covariances; against a truth two and a half of its σ off, or with half the σ,
+/// they do not.
 fn assert_calibrated(campaign: &Campaign, kind: &str, name: &str) {
     let solutions = campaign.solutions(kind, name);
     let total = |shift: f64, scale: f64| -> f64 {

@@ -14,7 +14,7 @@
 use dragfree_physics::control_design::{DesignError, design};
 use dragfree_physics::frames::skew;
 use dragfree_physics::mission::{Mission, MissionError};
-use dragfree_physics::noise::NoiseShape;
+use dragfree_physics::noise::{NoiseShape, NoiseTerm};
 use nalgebra::{Complex, DMatrix, Matrix3, Matrix6, SMatrix, Vector3};
 use std::f64::consts::{PI, TAU};
 
@@ -52,31 +52,37 @@ pub struct Case {
     pub mass_kg: f64,
     /// Inverse inertia, SRF, kg⁻¹ m⁻².
     pub inertia_inverse: Matrix3<f64>,
-    /// `T_S^O` of both test masses.
-    pub dcm_orf_from_srf: [Matrix3<f64>; 2],
-    /// Their offsets, ORF, m: levers of the unknown torque.
-    pub offset_orf_m: [Vector3<f64>; 2],
+    /// The test masses.
+    pub test_masses: Vec<TestMass>,
     /// Noise of the thrusters.
     pub wrench_psd: WrenchPsd,
     /// Noise of the attitude readout, rad.
     pub attitude: NoiseShape,
-    /// Noise of the displacement readouts, m.
-    pub readout: [[NoiseShape; 3]; 2],
-    /// Accelerations of the test masses themselves, m s⁻².
-    pub stray: [[NoiseShape; 3]; 2],
     /// Attitude control.
     pub open_loop: OpenLoop,
 }
 
-/// σ of the six coefficients, m, in the order of [`crate::records::COEFFICIENTS`].
-#[derive(Clone, Copy, Debug, PartialEq)]
+/// What the channels of one test mass depend on.
+pub struct TestMass {
+    /// `T_S^O`.
+    pub dcm_orf_from_srf: Matrix3<f64>,
+    /// Its offset, ORF, m: the lever of the unknown torque.
+    pub offset_orf_m: Vector3<f64>,
+    /// Noise of the displacement readouts, m.
+    pub readout: [NoiseShape; 3],
+    /// Accelerations of the test mass itself, m s⁻².
+    pub stray: [NoiseShape; 3],
+}
+
+/// σ of the offsets, m: x, y, z of each test mass, ORF.
+#[derive(Clone, Debug, PartialEq)]
 pub struct InformationBound {
     /// Each test mass from its own three channels.
-    pub single_m: [f64; 6],
-    /// Both test masses together, without the survey.
-    pub joint_m: [f64; 6],
-    /// Both, tied by the surveyed baseline.
-    pub surveyed_m: [f64; 6],
+    pub single_m: Vec<f64>,
+    /// All test masses together, without the survey.
+    pub joint_m: Vec<f64>,
+    /// All, tied by surveyed baselines.
+    pub surveyed_m: Vec<f64>,
 }
 
 impl Case {
@@ -92,21 +98,19 @@ impl Case {
                 Mission::need(&n.$key, concat!("noise.", stringify!($key)), NEEDED_BY)?.shape()
             };
         }
-        let (mut dcm, mut offset) = ([Matrix3::zeros(); 2], [Vector3::zeros(); 2]);
-        let (mut readout, mut stray) = (<[[NoiseShape; 3]; 2]>::default(), <[[NoiseShape; 3]; 2]>::default());
-        for (i, name) in ["tm1", "tm2"].into_iter().enumerate() {
-            let tm = mission.test_mass(name, NEEDED_BY)?;
-            (dcm[i], offset[i]) = (tm.dcm_orf_from_srf(), tm.offset_nominal_orf_m());
-            readout[i] = [shape!(ifo_x), shape!(is_y), shape!(is_z)];
+        let mut test_masses = Vec::new();
+        for tm in mission.test_mass.values() {
+            let (mut readout, mut stray) = (<[NoiseShape; 3]>::default(), <[NoiseShape; 3]>::default());
             for axis in 0..3 {
-                stray[i][axis] = n.test_mass_acceleration.as_ref().map(|s| s.shape()).unwrap_or_default();
-                let force = n.electrostatic_force.as_ref().filter(|_| axis > 0).map(|s| s.shape()).unwrap_or_default();
-                let terms = force
-                    .terms
-                    .into_iter()
-                    .map(|t| dragfree_physics::noise::NoiseTerm { asd: t.asd / tm.mass_kg, ..t });
-                stray[i][axis].terms.extend(terms);
+                let (name, noise) = mission.displacement_noise(tm, axis);
+                readout[axis] = Mission::need(&noise, &format!("noise.{name}"), NEEDED_BY)?.shape();
+                stray[axis] = n.test_mass_acceleration.as_ref().map(|s| s.shape()).unwrap_or_default();
+                let electrodes = n.electrostatic_force.as_ref().filter(|_| !tm.is_drag_free(axis));
+                let force = electrodes.map(|s| s.shape()).unwrap_or_default();
+                stray[axis].terms.extend(force.terms.into_iter().map(|t| NoiseTerm { asd: t.asd / tm.mass_kg, ..t }));
             }
+            let (dcm_orf_from_srf, offset_orf_m) = (tm.dcm_orf_from_srf(), tm.offset_nominal_orf_m());
+            test_masses.push(TestMass { dcm_orf_from_srf, offset_orf_m, readout, stray });
         }
         let units = mission.thrusters.as_ref().map(|t| t.unit.clone()).unwrap_or_default();
         let wrench_psd: WrenchPsd = if units.is_empty() {
@@ -135,18 +139,16 @@ impl Case {
             dt_s: mission.dt_s(),
             mass_kg: mission.spacecraft.mass_kg,
             inertia_inverse: mission.spacecraft.inertia_inverse(),
-            dcm_orf_from_srf: dcm,
-            offset_orf_m: offset,
+            test_masses,
             wrench_psd,
             attitude: shape!(dws_long_arm),
-            readout,
-            stray,
             open_loop,
         })
     }
 
-    /// Spectrum of `α̂`, SRF, rad² s⁻⁴/Hz, real part, and noise of the six channels tm1.x … tm2.z, ORF, m² s⁻⁴/Hz.
-    fn spectra(&self, f_hz: f64) -> Option<(Matrix3<f64>, Matrix6<f64>)> {
+    /// Spectrum of `α̂`, SRF, rad² s⁻⁴/Hz, real part, and noise of the channels x, y, z of each test mass,
+    /// ORF, m² s⁻⁴/Hz.
+    fn spectra(&self, f_hz: f64) -> Option<(Matrix3<f64>, DMatrix<f64>)> {
         let (sin, cos) = (PI * f_hz * self.dt_s).sin_cos();
         let differenced = (4.0 * sin * sin / self.dt_s.powi(2)).powi(2);
         let s = (self.wrench_psd)(f_hz);
@@ -175,16 +177,17 @@ impl Case {
             (sensitivity[a] * sensitivity[b].conj()).re * disturbance[(a, b)] + own - unseen[(a, b)]
         });
 
-        let mut channel_response = Matrix6::zeros();
-        for i in 0..2 {
-            let dcm = self.dcm_orf_from_srf[i];
+        let mut channel_response = DMatrix::zeros(3 * self.test_masses.len(), 6);
+        for (i, tm) in self.test_masses.iter().enumerate() {
+            let dcm = tm.dcm_orf_from_srf;
             channel_response.fixed_view_mut::<3, 3>(3 * i, 0).copy_from(&(-dcm / self.mass_kg));
-            channel_response.fixed_view_mut::<3, 3>(3 * i, 3).copy_from(&(skew(&self.offset_orf_m[i]) * dcm * j));
+            channel_response.fixed_view_mut::<3, 3>(3 * i, 3).copy_from(&(skew(&tm.offset_orf_m) * dcm * j));
         }
-        let mut noise = channel_response * unknown * channel_response.transpose() * (cos * cos);
-        for (i, axis) in (0..2).flat_map(|i| (0..3).map(move |axis| (i, axis))) {
-            noise[(3 * i + axis, 3 * i + axis)] +=
-                differenced * self.readout[i][axis].psd(f_hz) + cos * cos * self.stray[i][axis].psd(f_hz);
+        let mut noise = &channel_response * unknown * channel_response.transpose() * (cos * cos);
+        for (i, tm) in self.test_masses.iter().enumerate() {
+            for (axis, (readout, stray)) in tm.readout.iter().zip(&tm.stray).enumerate() {
+                noise[(3 * i + axis, 3 * i + axis)] += differenced * readout.psd(f_hz) + cos * cos * stray.psd(f_hz);
+            }
         }
         Some((excitation, noise))
     }
@@ -196,22 +199,24 @@ impl Case {
     pub fn bound_in(&self, span_s: f64, band_hz: std::ops::Range<f64>) -> Result<InformationBound, BoundError> {
         const NOISE: BoundError = BoundError::Singular("the noise of the channels");
         const SEEN: BoundError = BoundError::Singular("the information");
+        let test_masses = self.test_masses.len();
+        let zeros = || DMatrix::<f64>::zeros(3 * test_masses, 3 * test_masses);
         // Channels of −[α×] b for α along each axis of SRF.
         let regressors = [0, 1, 2].map(|axis| {
-            let mut g = Matrix6::zeros();
-            for i in 0..2 {
-                let alpha = self.dcm_orf_from_srf[i].column(axis).into_owned();
+            let mut g = zeros();
+            for (i, tm) in self.test_masses.iter().enumerate() {
+                let alpha = tm.dcm_orf_from_srf.column(axis).into_owned();
                 g.fixed_view_mut::<3, 3>(3 * i, 3 * i).copy_from(&-skew(&alpha));
             }
             g
         });
         let step = (band_hz.end / band_hz.start).ln() / POINTS as f64;
-        let (mut joint, mut single) = (Matrix6::<f64>::zeros(), Matrix6::<f64>::zeros());
+        let (mut joint, mut single) = (zeros(), zeros());
         for k in 0..POINTS {
             let f = band_hz.start * (step * (k as f64 + 0.5)).exp();
             let (excitation, noise) = self.spectra(f).ok_or(NOISE)?;
-            let mut separate = Matrix6::zeros();
-            for i in 0..2 {
+            let mut separate = zeros();
+            for i in 0..test_masses {
                 let own = noise.fixed_view::<3, 3>(3 * i, 3 * i).try_inverse().ok_or(NOISE)?;
                 separate.fixed_view_mut::<3, 3>(3 * i, 3 * i).copy_from(&own);
             }
@@ -219,26 +224,21 @@ impl Case {
             let weight = 2.0 * span_s * (PI * f * self.dt_s).cos().powi(2) * f * step;
             for (a, b) in (0..3).flat_map(|a| (0..3).map(move |b| (a, b))) {
                 let power = weight * excitation[(a, b)];
-                joint += regressors[a].transpose() * combined * regressors[b] * power;
-                single += regressors[a].transpose() * separate * regressors[b] * power;
+                joint += regressors[a].transpose() * &combined * &regressors[b] * power;
+                single += regressors[a].transpose() * &separate * &regressors[b] * power;
             }
         }
-        let sigmas = |information: &Matrix6<f64>| -> Result<[f64; 6], BoundError> {
-            let covariance = information.try_inverse().ok_or(SEEN)?;
-            Ok(std::array::from_fn(|i| covariance[(i, i)].sqrt()))
+        let sigmas = |information: &DMatrix<f64>| -> Result<Vec<f64>, BoundError> {
+            Ok(sigmas_of(&information.clone().try_inverse().ok_or(SEEN)?))
         };
-        // With the survey both housings move together: b_i = T_S^O c + constant.
-        let mut tied = SMatrix::<f64, 6, 3>::zeros();
-        for i in 0..2 {
-            tied.fixed_view_mut::<3, 3>(3 * i, 0).copy_from(&self.dcm_orf_from_srf[i]);
+        // With the survey all housings move together: b_i = T_S^O c + constant.
+        let mut tied = DMatrix::zeros(3 * test_masses, 3);
+        for (i, tm) in self.test_masses.iter().enumerate() {
+            tied.fixed_view_mut::<3, 3>(3 * i, 0).copy_from(&tm.dcm_orf_from_srf);
         }
-        let centre = (tied.transpose() * joint * tied).try_inverse().ok_or(SEEN)?;
-        let surveyed = tied * centre * tied.transpose();
-        Ok(InformationBound {
-            single_m: sigmas(&single)?,
-            joint_m: sigmas(&joint)?,
-            surveyed_m: std::array::from_fn(|i| surveyed[(i, i)].sqrt()),
-        })
+        let centre = (tied.transpose() * &joint * &tied).try_inverse().ok_or(SEEN)?;
+        let surveyed = &tied * centre * tied.transpose();
+        Ok(InformationBound { single_m: sigmas(&single)?, joint_m: sigmas(&joint)?, surveyed_m: sigmas_of(&surveyed) })
     }
 
     /// Bounds for `span_s` seconds of data, up to Nyquist.
@@ -248,6 +248,10 @@ impl Case {
     pub fn bound(&self, span_s: f64) -> Result<InformationBound, BoundError> {
         self.bound_in(span_s, LOWEST_HZ..0.5 / self.dt_s * (1.0 - 1e-9))
     }
+}
+
+fn sigmas_of(covariance: &DMatrix<f64>) -> Vec<f64> {
+    covariance.diagonal().iter().map(|variance| variance.sqrt()).collect()
 }
 
 /// Orthonormal basis, 6 × 3, of the directions that the survey leaves free: both housings along an axis of SRF
@@ -289,20 +293,19 @@ mod tests {
         let dt_s = 0.1;
         let inertia = Matrix3::new(800.0, 13.0, 10.0, 13.0, 800.0, 12.0, 10.0, 12.0, 1000.0);
         let white = NoiseShape::white;
-        let dcm_orf_from_srf = [turned(30.0), turned(-30.0)];
+        let test_mass = |(angle_deg, y_m)| TestMass {
+            dcm_orf_from_srf: turned(angle_deg),
+            offset_orf_m: turned(angle_deg) * Vector3::new(0.001, y_m, 0.0),
+            readout: [white(1.5e-12), white(1.8e-9), white(3e-9)],
+            stray: [NoiseShape::default(), white(6e-15 / 1.96), white(6e-15 / 1.96)],
+        };
         let case = Case {
             dt_s,
             mass_kg: 1500.0,
             inertia_inverse: inertia.try_inverse().unwrap(),
-            dcm_orf_from_srf,
-            offset_orf_m: [
-                dcm_orf_from_srf[0] * Vector3::new(0.001, 0.18, 0.0),
-                dcm_orf_from_srf[1] * Vector3::new(0.001, -0.18, 0.0),
-            ],
+            test_masses: [(30.0, 0.18), (-30.0, -0.18)].map(test_mass).into(),
             wrench_psd: Box::new(|_| Matrix6::identity() * 1e-14),
             attitude: white(5e-10),
-            readout: std::array::from_fn(|_| [white(1.5e-12), white(1.8e-9), white(3e-9)]),
-            stray: std::array::from_fn(|_| [NoiseShape::default(), white(6e-15 / 1.96), white(6e-15 / 1.96)]),
             open_loop: Box::new(move |f| {
                 // A low pass, then proportional, derivative and integral gains, without delay.
                 let (w, z) = (0.35_f64, C64::from_polar(1.0, TAU * f * dt_s));
@@ -325,24 +328,30 @@ mod tests {
     #[test]
     fn white_noise_has_a_closed_form() {
         let (dt_s, torque, noise) = (0.1, 1e-10_f64, 1e-12_f64);
-        let case = Case {
+        let test_mass = |angle_deg| TestMass {
+            dcm_orf_from_srf: turned(angle_deg),
+            offset_orf_m: Vector3::zeros(),
+            readout: Default::default(),
+            stray: std::array::from_fn(|_| NoiseShape::white(noise)),
+        };
+        let case = |angles_deg: &[f64]| Case {
             dt_s,
             mass_kg: f64::INFINITY,
             inertia_inverse: Matrix3::identity(),
-            dcm_orf_from_srf: [turned(30.0), turned(-30.0)],
-            offset_orf_m: [Vector3::zeros(); 2],
+            test_masses: angles_deg.iter().copied().map(test_mass).collect(),
             wrench_psd: Box::new(move |_| Matrix6::identity() * torque.powi(2)),
             attitude: NoiseShape::white(1e-30),
-            readout: std::array::from_fn(|_| std::array::from_fn(|_| NoiseShape::default())),
-            stray: std::array::from_fn(|_| std::array::from_fn(|_| NoiseShape::white(noise))),
             open_loop: Box::new(|_| [C64::from(0.0); 3]),
         };
         // cos² of regressors and noise cancel; two of the three axes of α act on each coefficient.
         let information = 2.0 * 5.0 * (torque / noise).powi(2) * 2.0;
-        let bound = case.bound_in(1.0, 1e-5..5.0 * (1.0 - 1e-9)).unwrap();
-        near(&bound.single_m, &[information.powf(-0.5); 6], 1e-3, "single");
-        near(&bound.joint_m, &[information.powf(-0.5); 6], 1e-3, "joint");
-        near(&bound.surveyed_m, &[(2.0 * information).powf(-0.5) * 1.0; 6], 1e-3, "surveyed");
+        for angles_deg in [&[30.0, -30.0][..], &[0.0], &[10.0, 70.0, 200.0]] {
+            let bound = case(angles_deg).bound_in(1.0, 1e-5..5.0 * (1.0 - 1e-9)).unwrap();
+            let (all, together) = (angles_deg.len(), information * angles_deg.len() as f64);
+            near(&bound.single_m, &vec![information.powf(-0.5); 3 * all], 1e-3, "single");
+            near(&bound.joint_m, &vec![information.powf(-0.5); 3 * all], 1e-3, "joint");
+            near(&bound.surveyed_m, &vec![together.powf(-0.5); 3 * all], 1e-3, "surveyed");
+        }
     }
 
     /// More information never increases σ, and σ falls with the root of the span.

@@ -136,8 +136,8 @@ pub fn table(
             let row = Row {
                 run,
                 truth_m: simulated.truth_m.map(rounded),
-                single_m: bound.single_m.map(rounded),
-                surveyed_m: bound.surveyed_m.map(rounded),
+                single_m: std::array::from_fn(|i| rounded(bound.single_m[i])),
+                surveyed_m: std::array::from_fn(|i| rounded(bound.surveyed_m[i])),
             };
             if let Ok(mut results) = results.lock() {
                 results.append(row)?;

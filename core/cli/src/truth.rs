@@ -10,12 +10,6 @@ pub(crate) fn first(path: &Path) -> Result<BTreeMap<String, f64>, Failure> {
     first_message(path, "/truth").map_err(Failure::engine)
 }
 
-/// True offset of a coefficient `com-offset.tmN.AXIS`, m.
-pub(crate) fn offset(truth: &BTreeMap<String, f64>, coefficient: &str) -> Option<f64> {
-    let (test_mass, axis) = coefficient.strip_prefix("com-offset.tm")?.split_once('.')?;
-    truth.get(&format!("b{test_mass}_orf_m.{axis}")).copied()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -45,8 +39,9 @@ mod tests {
         writer.write(Chunk { batches: vec![rows], complete_until_ns: 3 }).expect("write");
         writer.finish().expect("finish");
         let truth = first(&path).expect("read");
-        assert_eq!(offset(&truth, "com-offset.tm1.y"), Some(0.15));
-        assert_eq!(offset(&truth, "com-offset.tm1.z"), Some(-0.01));
-        assert_eq!(offset(&truth, "es-gain.tm1.y"), None);
+        let offset = |coefficient| dragfree_score::offset(&truth, coefficient);
+        assert_eq!(offset("com-offset.tm1.y"), Some(0.15));
+        assert_eq!(offset("com-offset.tm1.z"), Some(-0.01));
+        assert_eq!((offset("es-gain.tm1.y"), offset("com-offset.tm2.y")), (None, None));
     }
 }

@@ -30,7 +30,8 @@ fn bench(criterion: &mut Criterion) {
     let text = include_str!("../../../fixtures/missions/taiji.toml");
     let value: serde_json::Value = toml::from_str(text).expect("the fixture is TOML");
     let mission = Mission::from_json(&value.to_string()).expect("the fixture is a mission");
-    let model = NoiseModel::new(&declared(&mission, &[["ifo_x", "is_y", "is_z"]; 2]), &CHANNELS, 0.1).expect("a noise model");
+    let model =
+        NoiseModel::new(&declared(&mission, &[["ifo_x", "is_y", "is_z"]; 2]), &CHANNELS, 0.1).expect("a noise model");
     let regressors = (0..18)
         .map(|series| {
             let coefficient = series / 3;

@@ -129,7 +129,8 @@ fn bench(criterion: &mut Criterion) {
     let text = include_str!("../../../fixtures/missions/taiji.toml");
     let value: serde_json::Value = toml::from_str(text).expect("the fixture is TOML");
     let mission = Mission::from_json(&value.to_string()).expect("the fixture is a mission");
-    let noise = NoiseModel::new(&declared(&mission, &[["ifo_x", "is_y", "is_z"]; 2]), &CHANNELS, 1.0 / RATE_HZ).expect("a noise model");
+    let noise = NoiseModel::new(&declared(&mission, &[["ifo_x", "is_y", "is_z"]; 2]), &CHANNELS, 1.0 / RATE_HZ)
+        .expect("a noise model");
     let mut rng = Xoshiro256PlusPlus::seed_from_u64(1);
     let mut white = || -> f64 { StandardNormal.sample(&mut rng) };
     let mut columns = channels_of(&noise, &mut white);

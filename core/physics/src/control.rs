@@ -217,7 +217,8 @@ pub(crate) mod tests {
         Readout { sc_crf_rad: v(0), tm: [tm(1), tm(3)].into(), sun_srf: Some(Vector3::new(0.866, 0.1, -0.5)) }
     }
 
-    /// A displaced test mass pulls the spacecraft after it, a lateral one is pushed back: the signs of r̈ = −T F_T/m_S + F_E/m_m.
+    /// A displaced test mass pulls the spacecraft after it, a lateral one is pushed back: the signs of r̈ = −T F_T/m_S
+    /// + F_E/m_m.
     #[test]
     fn commands_oppose_the_readout() {
         let mut y = Readout::zero(2);

@@ -1,8 +1,8 @@
 //! The design of the controllers when a mission file brings none: one H-infinity problem per channel, from the
 //! requirement table and the noise model (eqs W1_weight and W3_weight).
 //!
-//! **The problem.** After the decoupling a channel is `p̈ = u_d + F_u d`, read out as `p + F_y n`; `B` is what the table
-//! allows `p`. With `G` the plant as the computer sees it,
+//! **The problem.** After the decoupling a channel is `p̈ = u_d + F_u d`, read out as `p + F_y n`; `B` is what the
+//! table allows `p`. With `G` the plant as the computer sees it,
 //!
 //! ```text
 //! [ p/B      ]   [ G S F_u/B    −T F_y/B   ] [ d ]
@@ -16,8 +16,8 @@
 //! `p/B`; they need no shift off the axis for the Riccati equations, and the controller does not cancel them.
 //!
 //! **Sampling is exact.** `G` is the double integrator behind a hold, with the loop's delay, in the variable `w` of
-//! `z = (1 + w dt/2)/(1 − w dt/2)`: `G(w) = (1 − w dt/2)/w² · ((1 − w dt/2)/(1 + w dt/2))^delay`. The norm is the same on
-//! both sides of that map, so what is proved of the synthesis holds for the sampled loop that flies, up to Nyquist.
+//! `z = (1 + w dt/2)/(1 − w dt/2)`: `G(w) = (1 − w dt/2)/w² · ((1 − w dt/2)/(1 + w dt/2))^delay`. The norm is the same
+//! on both sides of that map, so what is proved of the synthesis holds for the sampled loop that flies, up to Nyquist.
 //!
 //! **Weights** are rational bounds of first order at most ([`Lag`]), never below the mission's own functions of
 //! frequency, and flat below about 3 mHz, so that the controller forgets its past within the hour that a replay has to
@@ -61,9 +61,10 @@ const SLOWEST_RAD_S: f64 = 2e-2;
 const LARGEST_DELAY_ANGLE: f64 = 0.5;
 /// Samples of delay that the synthesis models one by one; a longer delay is an all-pass of this order.
 const MOST_DELAY_STATES: u32 = 3;
-/// The controller is the central one at `min(factor γ, γ^exponent)` of the optimal γ, not at the optimum itself, where it
-/// would trade everything else for the last per cent. Where the roots of that controller are too close to be sampled to full
-/// precision, and the norm of what would fly shows it, the next one is taken; each stays below one where γ does.
+/// The controller is the central one at `min(factor γ, γ^exponent)` of the optimal γ, not at the optimum itself, where
+/// it would trade everything else for the last per cent. Where the roots of that controller are too close to be sampled
+/// to full precision, and the norm of what would fly shows it, the next one is taken; each stays below one where γ
+/// does.
 const BACK_OFF: [(f64, f64); 4] = [(1.1, 0.5), (1.2, 0.25), (1.5, 0.1), (2.0, 0.05)];
 /// The norm of the sampled controller may lie above that of the synthesis by this factor: rounding of its roots.
 const SAMPLED_AS_PROVED: f64 = 1.01;
@@ -176,7 +177,8 @@ impl Lag {
     }
 
     /// A small lag above the given points (frequency in rad/s, magnitude), its `high` no less than `least_high` of its
-    /// `low`. Lifting `low` by some per cent over the largest point lets the fall begin; the least `low · high` is kept.
+    /// `low`. Lifting `low` by some per cent over the largest point lets the fall begin; the least `low · high` is
+    /// kept.
     fn above(points: &[(f64, f64)], least_high: impl Fn(f64) -> f64) -> Self {
         let largest = points.iter().map(|p| p.1).fold(0.0, f64::max);
         let p = WEIGHT_POLE_RAD_S;
@@ -764,9 +766,9 @@ fn forget_time(controller: &ChannelController, dt_s: f64) -> f64 {
     FORGOTTEN.ln() / slowest.ln() * dt_s
 }
 
-/// Factor by which the slowest-dying motion of a channel's sampled loop grows from sample to sample, hold and delay included:
-/// below one when the loop is stable, one for the double integrator without a controller. `None` for coefficients whose
-/// eigenvalues cannot be found.
+/// Factor by which the slowest-dying motion of a channel's sampled loop grows from sample to sample, hold and delay
+/// included: below one when the loop is stable, one for the double integrator without a controller. `None` for
+/// coefficients whose eigenvalues cannot be found.
 #[must_use]
 pub fn growth_per_sample(controller: &ChannelController, delay_samples: u32, dt_s: f64) -> Option<f64> {
     let delay = delay_samples as usize;
@@ -1020,8 +1022,8 @@ pub(crate) mod tests {
         assert!(c.forget_time_s < 3600.0, "{name}: {} s", c.forget_time_s);
     }
 
-    /// The designed loops die out, as fast as their margins say they should; the same ones with the sign of feedback turned,
-    /// or with a gain beyond the margin, grow; without a controller a channel drifts.
+    /// The designed loops die out, as fast as their margins say they should; the same ones with the sign of feedback
+    /// turned, or with a gain beyond the margin, grow; without a controller a channel drifts.
     #[test]
     fn growth_tells_stable_loops_from_others() {
         let mission = taiji();
@@ -1213,8 +1215,8 @@ pub(crate) mod tests {
 
     proptest::proptest! {
         #![proptest_config(proptest::prelude::ProptestConfig { cases: 24, max_shrink_iters: 20, ..Default::default() })]
-        /// Any requirement and noise within a factor of ten, any rate from 1 to 50 Hz: a design that keeps everything, or a
-        /// refusal that physics confirms.
+        /// Any requirement and noise within a factor of ten, any rate from 1 to 50 Hz: a design that keeps everything,
+        /// or a refusal that physics confirms.
         #[test]
         fn weights_follow_any_mission(
             requirements in proptest::array::uniform5(-1.0..1.0_f64),
@@ -1242,7 +1244,8 @@ pub(crate) mod tests {
                     Ok(c) => {
                         assert_kept(&c, "random mission");
                         if let Some(band) = c.unattainable {
-                            // What W_1 and the capped W_3 promise there, and that nothing else than readout noise is the cause.
+                            // What W_1 and the capped W_3 promise there, and that nothing else than readout noise is
+                            // the cause.
                             let readout = c.model.readout_ratio(band.worst_hz);
                             let promised = 1.0_f64.hypot(readout / LARGEST_SHARE);
                             proptest::prop_assert!(readout > LARGEST_SHARE && band.predicted_ratio < promised, "{}", band);

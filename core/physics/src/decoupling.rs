@@ -1,11 +1,12 @@
 //! The static decoupling of the paper (eqs decoupled_input and generalized_inverse_optimization): the linear plant
-//! `p̈ = A_v p + B_v u` of the nominal mission, and the allocation `B_v†` of the channels' wanted accelerations to the inputs.
+//! `p̈ = A_v p + B_v u` of the nominal mission, and the allocation `B_v†` of the channels' wanted accelerations to the
+//! inputs.
 //!
-//! Of `n` test masses there are `3 + 6n` channels. The inputs are thrust and torque of the thrusters, three each, and of
-//! each test mass the electrodes' forces along the axes that are not drag-free and their three torques: with `d` drag-free
-//! axes `6 + 6n − d`, so that `3 − d` of the three directions of thrust are free. The paper's spacecraft has `d = 2`, fifteen
-//! channels and sixteen inputs. One test mass that is drag-free along all of its axes has `d = 3`: nine of each, and
-//! `B_v† = B_v⁻¹`.
+//! Of `n` test masses there are `3 + 6n` channels. The inputs are thrust and torque of the thrusters, three each, and
+//! of each test mass the electrodes' forces along the axes that are not drag-free and their three torques: with `d`
+//! drag-free axes `6 + 6n − d`, so that `3 − d` of the three directions of thrust are free. The paper's spacecraft has
+//! `d = 2`, fifteen channels and sixteen inputs. One test mass that is drag-free along all of its axes has `d = 3`:
+//! nine of each, and `B_v† = B_v⁻¹`.
 
 use clarabel::algebra::CscMatrix;
 use clarabel::solver::{DefaultSettings, DefaultSolver, IPSolver, SolverStatus, ZeroConeT};
@@ -20,8 +21,8 @@ const NEEDED_BY: &str = "the control law";
 const THRUSTERS: usize = 6;
 /// Largest element of `B_v B_v† − 1`, in units of the channels' own accelerations.
 const RESIDUAL_TOLERANCE: f64 = 1e-12;
-/// Sine of the angle within which two drag-free axes are the same to the thrusters. The electrodes' reaction, `m_m/m_S`, would still
-/// make `B_v` regular, with thrust beyond all use.
+/// Sine of the angle within which two drag-free axes are the same to the thrusters. The electrodes' reaction,
+/// `m_m/m_S`, would still make `B_v` regular, with thrust beyond all use.
 const PARALLEL: f64 = 0.05;
 
 /// The plant of eq:state_space_model that the decoupling assumes: nominal masses, offsets and stiffness.
@@ -143,8 +144,8 @@ impl LinearPlant {
         3 - self.free..3
     }
 
-    /// The inputs of eq:input_variables_reduced: `F_T` along the directions of thrust, `M_T`, then of each test mass `F_E`
-    /// along its suspended axes and `M_E`.
+    /// The inputs of eq:input_variables_reduced: `F_T` along the directions of thrust, `M_T`, then of each test mass
+    /// `F_E` along its suspended axes and `M_E`.
     fn command(&self, u: &[f64]) -> Command {
         let three = |i: usize| Vector3::new(u[i], u[i + 1], u[i + 2]);
         let mut at = THRUSTERS;
@@ -211,16 +212,17 @@ impl LinearPlant {
 /// The allocation and how exactly it is one.
 #[derive(Clone, Debug)]
 pub struct Allocation {
-    /// `B_v†`: inputs by channels, N or N m per m s⁻² or rad s⁻². Inputs are thrust along [`Self::thrust`], torque of the
-    /// thrusters, then of each test mass the electrodes' forces along its suspended axes and their torques.
+    /// `B_v†`: inputs by channels, N or N m per m s⁻² or rad s⁻². Inputs are thrust along [`Self::thrust`], torque of
+    /// the thrusters, then of each test mass the electrodes' forces along its suspended axes and their torques.
     pub matrix: DMatrix<f64>,
     /// Columns are the directions of thrust in SRF; the axes of SRF where drag-free axes lie along or across `s_3`.
     pub thrust: Matrix3<f64>,
     /// Largest element of `|B_v B_v† − 1|`.
     pub residual: f64,
     /// By how much the rules of thrust are missed, relative to the coefficients that they equate: eqs x_axis_thrust and
-    /// y_axis_thrust for two test masses that are drag-free along x, and eq z_axis_thrust for each free direction of thrust. The last is
-    /// kept exactly whatever the geometry; the first two follow when the optical benches mirror each other.
+    /// y_axis_thrust for two test masses that are drag-free along x, and eq z_axis_thrust for each free direction of
+    /// thrust. The last is kept exactly whatever the geometry; the first two follow when the optical benches mirror
+    /// each other.
     pub thrust_rules: Vec<f64>,
 }
 
@@ -261,7 +263,8 @@ impl Allocator {
 }
 
 impl LinearPlant {
-    /// How much of each channel's acceleration lies along a free direction of thrust: the components of the suspended axes.
+    /// How much of each channel's acceleration lies along a free direction of thrust: the components of the suspended
+    /// axes.
     fn common_motion(&self, direction: usize) -> Vec<f64> {
         let mut out = vec![0.0; self.channels()];
         for (i, tm) in self.tm.iter().enumerate() {
@@ -276,10 +279,10 @@ impl LinearPlant {
     /// `B_v†` of eq:generalized_inverse_optimization under the rules of eqs x_axis_thrust to z_axis_thrust.
     ///
     /// `B_v B_v† = 1` leaves one freedom for every channel and free direction of thrust, thrust along it against the
-    /// electrodes. The paper's rule for that thrust, `F_Tz ∝ u_d6 + u_d12` and nothing else, is taken for each free direction: it
-    /// carries the motion along it that suspended test masses have in common. The electrodes' effort settles the last freedom.
-    /// So the programme is: least electrostatic acceleration, subject to `B_v B_v† = 1` and the rules. The rules for `F_Tx` and
-    /// `F_Ty` then hold by the symmetry of the two optical frames.
+    /// electrodes. The paper's rule for that thrust, `F_Tz ∝ u_d6 + u_d12` and nothing else, is taken for each free
+    /// direction: it carries the motion along it that suspended test masses have in common. The electrodes' effort
+    /// settles the last freedom. So the programme is: least electrostatic acceleration, subject to `B_v B_v† = 1` and
+    /// the rules. The rules for `F_Tx` and `F_Ty` then hold by the symmetry of the two optical frames.
     ///
     /// Read to the letter, eqs x_axis_thrust and y_axis_thrust also forbid thrust for any other channel; with the lever
     /// `α×b` and the electrodes' reaction in `B_v`, that and `B_v B_v† = 1` exclude each other.
@@ -365,8 +368,8 @@ impl LinearPlant {
         scale
     }
 
-    /// The quadratic programme in Clarabel, unknowns `B_v†` column by column in units of [`Self::input_scale`]; gives for each
-    /// rule the thrust per acceleration that it is proportional to.
+    /// The quadratic programme in Clarabel, unknowns `B_v†` column by column in units of [`Self::input_scale`]; gives
+    /// for each rule the thrust per acceleration that it is proportional to.
     fn solve(&self, b: &DMatrix<f64>, rules: &[Vec<f64>], scale: &[f64]) -> Result<Vec<f64>, String> {
         let (channels, inputs) = (self.channels(), self.inputs());
         let unknown = |input: usize, channel: usize| inputs * channel + input;
@@ -515,7 +518,8 @@ mod tests {
         assert!(effort(-750.0) < effort(-757.5) && effort(-750.0) < effort(-742.5));
     }
 
-    /// The wrong sign of the electrodes' reaction on the spacecraft (eq:SC_attitude_dynamics as printed) is no right inverse.
+    /// The wrong sign of the electrodes' reaction on the spacecraft (eq:SC_attitude_dynamics as printed) is no right
+    /// inverse.
     #[test]
     fn the_printed_reaction_is_seen() {
         let plant = LinearPlant::new(&taiji()).unwrap();
@@ -558,7 +562,8 @@ mod tests {
         mission
     }
 
-    /// A right inverse whatever the number of test masses and of drag-free axes: three to nothing of the directions of thrust are free.
+    /// A right inverse whatever the number of test masses and of drag-free axes: three to nothing of the directions of
+    /// thrust are free.
     #[test]
     fn any_number_of_test_masses_and_drag_free_axes_has_an_allocation() {
         use Axis::{X, Y, Z};
@@ -584,8 +589,8 @@ mod tests {
         }
     }
 
-    /// A spacecraft that follows its only test mass along all axes: `F_T = −m_S T_O^S u_d` plus what undoes the lever, and
-    /// the electrodes turn the test mass against the spacecraft, `M_E = J_m (u + T α)`.
+    /// A spacecraft that follows its only test mass along all axes: `F_T = −m_S T_O^S u_d` plus what undoes the lever,
+    /// and the electrodes turn the test mass against the spacecraft, `M_E = J_m (u + T α)`.
     #[test]
     fn a_single_drag_free_test_mass_is_followed_by_thrust_alone() {
         use Axis::{X, Y, Z};

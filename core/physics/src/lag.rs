@@ -52,8 +52,8 @@ impl Lag {
 mod tests {
     use super::*;
 
-    /// A step of 1 behind 30 ms of a 100 ms sample, then `1 − e^{−t/τ}`: over the first sample its mean is the integral over
-    /// 70 ms, by hand with τ = 200 ms.
+    /// A step of 1 behind 30 ms of a 100 ms sample, then `1 − e^{−t/τ}`: over the first sample its mean is the integral
+    /// over 70 ms, by hand with τ = 200 ms.
     #[test]
     fn a_step_by_hand() {
         let lag = Lag::new(0.2, 0.13, 0.1);

@@ -9,8 +9,8 @@ pub struct Levels {
     pub readout: f64,
 }
 
-/// The power response of a second difference to an acceleration that is held over a sample, `cos²(πf dt)`, and to a readout,
-/// `(4 sin²(πf dt)/dt²)²`.
+/// The power response of a second difference to an acceleration that is held over a sample, `cos²(πf dt)`, and to a
+/// readout, `(4 sin²(πf dt)/dt²)²`.
 #[must_use]
 pub fn responses(frequency_hz: f64, dt_s: f64) -> [f64; 2] {
     let (sin, cos) = (std::f64::consts::PI * frequency_hz * dt_s).sin_cos();
@@ -28,8 +28,9 @@ pub struct Bin {
     pub weight: f64,
 }
 
-/// Levels `a` and `b` of `a cos² + b (4 sin²/dt²)²` that fit a spectrum: least squares of the relative misfit, which is as large in
-/// every bin as its observations allow. Bins without power or weight are left out; `None` when nothing is left.
+/// Levels `a` and `b` of `a cos² + b (4 sin²/dt²)²` that fit a spectrum: least squares of the relative misfit, which is
+/// as large in every bin as its observations allow. Bins without power or weight are left out; `None` when nothing is
+/// left.
 #[must_use]
 pub fn fit(bins: &[Bin], dt_s: f64) -> Option<Levels> {
     let used: Vec<([f64; 2], Bin)> = bins

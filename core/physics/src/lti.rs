@@ -401,8 +401,8 @@ mod tests {
             prop_assert_eq!(back.order(), system.order());
             let points = [1e-4, 1e-2, 0.3, 4.9].map(|f_hz: f64| std::f64::consts::TAU * f_hz * 2.0 * h);
             let wanted = points.map(|angle| at(&system, (angle / 2.0).tan() / h));
-            // Rounding is on the scale of the largest response: near a zero nothing better can be had. How well roots so far apart are
-            // conditioned has no bound in closed form; none of 12,000 draws is above this.
+            // Rounding is on the scale of the largest response: near a zero nothing better can be had. How well roots
+            // so far apart are conditioned has no bound in closed form; none of 12,000 draws is above this.
             let tolerance = 1e-6 * wanted.iter().map(|w| w.norm()).fold(0.0, f64::max);
             for (angle, want) in points.into_iter().zip(wanted) {
                 let sampled = sections_response(&cascade.sections, C64::from_polar(1.0, angle)) * cascade.gain;

@@ -150,12 +150,12 @@ pub struct TestMass {
     pub frame: Option<String>,
     /// ORF is SRF turned by this angle about `s_3`, rad.
     pub orf_from_srf_angle_rad: f64,
-    /// Axes that an interferometer reads; the inertial sensor reads the others. Wavefront sensing of `θ` and `ψ` comes with
-    /// the interferometer along x.
+    /// Axes that an interferometer reads; the inertial sensor reads the others. Wavefront sensing of `θ` and `ψ` comes
+    /// with the interferometer along x.
     #[serde(default = "only_x")]
     pub interferometer: Vec<Axis>,
-    /// Axes along which the spacecraft follows the test mass and no electrode pushes; along the others the electrodes hold the
-    /// test mass.
+    /// Axes along which the spacecraft follows the test mass and no electrode pushes; along the others the electrodes
+    /// hold the test mass.
     #[serde(default = "only_x")]
     pub drag_free: Vec<Axis>,
     /// Where the drawings put the housing's centre relative to the spacecraft's centre of mass, SRF, m.
@@ -385,8 +385,8 @@ pub struct Control {
     /// offsets. Controllers that treat rotation and translation apart do not.
     #[serde(default = "yes")]
     pub lever_feed_forward: bool,
-    /// Bandwidth of the designed attitude loop over the one that its requirement needs. A faster loop keeps the requirement
-    /// and shakes the spacecraft more where the interferometers are quiet, from which the offset is read.
+    /// Bandwidth of the designed attitude loop over the one that its requirement needs. A faster loop keeps the
+    /// requirement and shakes the spacecraft more where the interferometers are quiet, from which the offset is read.
     #[serde(default = "one")]
     pub attitude_bandwidth_factor: f64,
     /// Controllers by channel: all of them, or none for the default design.
@@ -435,7 +435,8 @@ pub struct Actuators {
 }
 
 /// `[thrusters]`: what the thrusters make of a command. Without units, delay and lag act on force and torque along each
-/// axis of SRF, limit and step on the force, and the noise is that of `[noise]` per axis. With units, each has all of it.
+/// axis of SRF, limit and step on the force, and the noise is that of `[noise]` per axis. With units, each has all of
+/// it.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Thrusters {
@@ -499,8 +500,8 @@ pub struct Limits {
     pub angle_rad: f64,
 }
 
-/// `[orbit]`: three spacecraft on a heliocentric triangle. `mission.spacecraft` says which of them is ours, `SC1`, `SC2` or
-/// `SC3`; any other name is the first.
+/// `[orbit]`: three spacecraft on a heliocentric triangle. `mission.spacecraft` says which of them is ours, `SC1`,
+/// `SC2` or `SC3`; any other name is the first.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Orbit {
@@ -746,8 +747,8 @@ impl Mission {
         Ok(())
     }
 
-    /// The channels in the order of eq:state_variables: the spacecraft's angles, then displacements and angles of each test
-    /// mass, `sc.phi`, `sc.theta`, `sc.psi`, `NAME.x`, `NAME.y`, `NAME.z`, `NAME.phi`, `NAME.theta`, `NAME.psi`.
+    /// The channels in the order of eq:state_variables: the spacecraft's angles, then displacements and angles of each
+    /// test mass, `sc.phi`, `sc.theta`, `sc.psi`, `NAME.x`, `NAME.y`, `NAME.z`, `NAME.phi`, `NAME.theta`, `NAME.psi`.
     #[must_use]
     pub fn channels(&self) -> Vec<String> {
         let angles = ANGLES.map(|angle| format!("{SPACECRAFT}.{angle}"));
@@ -762,7 +763,8 @@ impl Mission {
         numbered.map_or_else(String::new, |(i, (_, tm))| tm.frame.clone().unwrap_or_else(|| format!("ORF_{}", i + 1)))
     }
 
-    /// The two test masses whose housings are surveyed, the one at the end of the baseline first; `None` without a survey.
+    /// The two test masses whose housings are surveyed, the one at the end of the baseline first; `None` without a
+    /// survey.
     #[must_use]
     pub fn baseline(&self) -> Option<[&str; 2]> {
         let housing = self.housing.as_ref()?;

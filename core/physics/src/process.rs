@@ -6,7 +6,8 @@
 //!
 //! `y_k = x̂_0 + e_k`, `x̂ ← Φ x̂ + K e_k`, `e_k` white with variance `S`,
 //!
-//! with `K` and `S` of the steady Kalman filter of the sampled integrators (Anderson & Moore, Optimal Filtering, ch. 9).
+//! with `K` and `S` of the steady Kalman filter of the sampled integrators (Anderson & Moore, Optimal Filtering, ch.
+//! 9).
 
 use nalgebra::{SMatrix, SVector};
 use rand::Rng;
@@ -38,8 +39,8 @@ fn incomplete_gamma(m: usize, c: f64) -> f64 {
     (0..12).map(|k| (-c).powi(k as i32) / (factorial(k) * (m + k + 1) as f64)).sum()
 }
 
-/// All terms of a shape as one chain of leaky integrators, sampled: `x_0` is the coloured part of the process, `x_i` its
-/// `i`-th derivative times `dtⁱ`, as if undamped. A term of exponent `2n` is white noise into `x_{n−1}`.
+/// All terms of a shape as one chain of leaky integrators, sampled: `x_0` is the coloured part of the process, `x_i`
+/// its `i`-th derivative times `dtⁱ`, as if undamped. A term of exponent `2n` is white noise into `x_{n−1}`.
 ///
 /// All terms leak alike, so that the steepest one's chain serves them all: `Φ_ij = e^{−λdt}/(j−i)!`.
 struct SampledChain {
@@ -460,8 +461,8 @@ mod tests {
     }
 
     /// One deviate a sample gives the autocovariance of white noise and chains: at every lag, and from the first sample
-    /// on as in the long run. `e^{−λdt}` has the grain `ε`, which moves a pole by `ε/(λ dt)` of its distance from one; a
-    /// deviate too strong by 1e-6 is seen.
+    /// on as in the long run. `e^{−λdt}` has the grain `ε`, which moves a pole by `ε/(λ dt)` of its distance from one;
+    /// a deviate too strong by 1e-6 is seen.
     #[test]
     fn innovation_form_has_the_autocovariance_of_the_shape() {
         for shape in shapes() {
@@ -489,7 +490,8 @@ mod tests {
     }
 
     /// The spectrum in band does not depend on the step: `2 dt S |1 + c (z − Φ)⁻¹ K|²`, evaluated, against the shape.
-    /// The leak takes `n (λ/ω)²`, what folds back adds less than `(ω dt)²/11`. Deviates drawn for another step are seen.
+    /// The leak takes `n (λ/ω)²`, what folds back adds less than `(ω dt)²/11`. Deviates drawn for another step are
+    /// seen.
     #[test]
     fn spectrum_does_not_depend_on_the_step() {
         for shape in shapes() {
@@ -581,7 +583,8 @@ mod tests {
         }
     }
 
-    /// Amplitude, frequency and step of a line against `cos`, over a million samples; the phase is uniform over the seeds.
+    /// Amplitude, frequency and step of a line against `cos`, over a million samples; the phase is uniform over the
+    /// seeds.
     #[test]
     fn lines_keep_amplitude_frequency_and_phase() {
         let line = NoiseLine { amplitude: 3.0, frequency_hz: 0.0551 };

@@ -11,7 +11,8 @@ type Matrix = DMatrix<f64>;
 const AXIS_TOLERANCE: f64 = 1e-12;
 /// Newton steps after the subspace; the first one already reaches rounding.
 const NEWTON_STEPS: usize = 3;
-/// The slowest eigenvalue of the loop keeps at least this part of its distance from the imaginary axis, or rounding has the say.
+/// The slowest eigenvalue of the loop keeps at least this part of its distance from the imaginary axis, or rounding has
+/// the say.
 const KEPT_DISTANCE: f64 = 0.5;
 
 /// Why a Riccati equation has no stabilising solution.
@@ -46,8 +47,9 @@ pub enum RiccatiError {
 /// The symmetric `X` with `Aᵀ X + X A + X R X + Q = 0` and `A + R X` stable, for `H = [[A, R], [−Q, −Aᵀ]]`
 /// (`X = Ric(H)` of Doyle, Glover, Khargonekar and Francis). `R` and `Q` may be indefinite.
 ///
-/// The balanced Hamiltonian's stable subspace by a reordered complex Schur form, then Newton's iteration; at last the loop is looked
-/// at: its eigenvalues are the Hamiltonian's stable ones, and a solution whose loop has lost them to rounding is refused.
+/// The balanced Hamiltonian's stable subspace by a reordered complex Schur form, then Newton's iteration; at last the
+/// loop is looked at: its eigenvalues are the Hamiltonian's stable ones, and a solution whose loop has lost them to
+/// rounding is refused.
 ///
 /// # Errors
 /// [`RiccatiError`] says why there is none.
@@ -100,7 +102,8 @@ fn candidate(hamiltonian: &Matrix) -> Result<Candidate, RiccatiError> {
         return Err(RiccatiError::NoGraph);
     }
     let x = refined(hamiltonian, x);
-    // The loop in the balanced states, where no entry drowns the others: x = diag(scaling) x̃, and X maps states to costates.
+    // The loop in the balanced states, where no entry drowns the others: x = diag(scaling) x̃, and X maps states to
+    // costates.
     let in_balanced_states = Matrix::from_fn(n, n, |i, j| x[(i, j)] * scaling[j] / scaling[n + i]);
     let closed = balanced.view((0, 0), (n, n)) + balanced.view((0, n), (n, n)) * in_balanced_states;
     let slowest = |values: &mut dyn Iterator<Item = f64>| values.fold(f64::NEG_INFINITY, f64::max);
@@ -176,8 +179,8 @@ mod tests {
         );
     }
 
-    /// Whether the numbers of a regulator, in states of one scale, leave no solution: from singular values of the loop, of the
-    /// Hamiltonian and of `[a − z, b]`, not from what the refusal says of itself.
+    /// Whether the numbers of a regulator, in states of one scale, leave no solution: from singular values of the loop,
+    /// of the Hamiltonian and of `[a − z, b]`, not from what the refusal says of itself.
     fn is_excused(refusal: RiccatiError, a: &Matrix, b: &Matrix, h: &Matrix) -> bool {
         let n = a.nrows();
         let at = |m: &Matrix, z: Complex<f64>| complex(m) - DMatrix::identity(m.nrows(), m.nrows()) * z;
@@ -221,8 +224,8 @@ mod tests {
         }
     }
 
-    /// An unstable mode at 1 rad/s that the input reaches by 1e-9: the gain that moves it is 2e9, `X` is 2e18, and of `b bᵀ X` no
-    /// digit below 100 is left.
+    /// An unstable mode at 1 rad/s that the input reaches by 1e-9: the gain that moves it is 2e9, `X` is 2e18, and of
+    /// `b bᵀ X` no digit below 100 is left.
     #[test]
     fn a_mode_that_is_hardly_reached_is_refused_and_said_to_be() {
         let a = Matrix::from_row_slice(2, 2, &[1.0, 0.3, 0.2, -1.0]);
@@ -264,8 +267,9 @@ mod tests {
             let scaled = &unscale * &x * &unscale;
             let rest = &unscale * residual(&h, &x) * &unscale;
             prop_assert!(rest.norm() < 1e-9 * (1.0 + scaled.norm()).powi(2), "{} {}", rest.norm(), scaled.norm());
-            // Theory has no tolerance: the loop's eigenvalues are the Hamiltonian's stable ones. Rounding has none either, because
-            // a solution is given out only where rounding has taken less than half of the slowest one's distance from the axis.
+            // Theory has no tolerance: the loop's eigenvalues are the Hamiltonian's stable ones. Rounding has none
+            // either, because a solution is given out only where rounding has taken less than half of the slowest one's
+            // distance from the axis.
             let closed = &down * (&a - &b * b.transpose() * &x) * &unscale;
             prop_assert!(eigenvalues(&closed).unwrap().iter().all(|z| z.re < 0.0));
         }

@@ -13,8 +13,8 @@ pub type PerTestMass<T> = Few<T, MOST_TEST_MASSES>;
 pub struct TestMassReadout {
     /// Displacement from the housing's centre, ORF, m: by interferometer along its axes, else by the inertial sensor.
     pub r_orf_m: Vector3<f64>,
-    /// Attitude relative to ORF, rad: `θ` and `ψ` from local wavefront sensing where x has an interferometer, else from the
-    /// inertial sensor, as `φ`.
+    /// Attitude relative to ORF, rad: `θ` and `ψ` from local wavefront sensing where x has an interferometer, else from
+    /// the inertial sensor, as `φ`.
     pub att_orf_rad: Vector3<f64>,
 }
 

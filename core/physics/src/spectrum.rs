@@ -97,8 +97,8 @@ pub fn welch(x: &[f64], rate_hz: f64, segment: usize) -> Result<Spectrum, Spectr
     Ok(Spectrum { frequency_hz, psd, segments: segments as usize })
 }
 
-/// Takes the line off a segment that fits the *weighed* samples best, and weighs it. A fit to the bare samples would take its
-/// slope from the ends, where a second difference of readout noise is far louder than the lowest bins.
+/// Takes the line off a segment that fits the *weighed* samples best, and weighs it. A fit to the bare samples would
+/// take its slope from the ends, where a second difference of readout noise is far louder than the lowest bins.
 fn windowed(x: &[f64], window: &[f64], out: &mut [f64]) {
     let middle = 0.5 * x.len() as f64;
     let (mut weight, mut sum, mut first, mut moment) = (0.0, 0.0, 0.0, 0.0);

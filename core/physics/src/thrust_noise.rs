@@ -1,7 +1,7 @@
 //! What the thrusters add beyond their command, as one process of force and torque.
 //!
-//! Along the axes force and torque are independent. In a layout of units each pushes and turns at once: a unit of direction
-//! `d` at `r` makes the wrench `(d, r×d)` of its thrust, and the noise of all has the cross-spectrum
+//! Along the axes force and torque are independent. In a layout of units each pushes and turns at once: a unit of
+//! direction `d` at `r` makes the wrench `(d, r×d)` of its thrust, and the noise of all has the cross-spectrum
 //! `Σ_j S_j (d_j, r_j×d_j)(d_j, r_j×d_j)ᵀ`.
 
 use nalgebra::{Matrix3, Vector3};
@@ -112,8 +112,8 @@ mod tests {
     }
 
     /// Two thrusters along x, 1 m above and 2 m below the centre, of 2 and 1 N²/Hz: `M_y = z F_x`, so `S_FF = 3` and
-    /// `S_FM = 2·1 − 1·2 = 0`. With both above, `S_FM = 2 + 2 = 4`, `S_MM = 2 + 4 = 6`: `C_xy = 2/3`, and `3 − 16/6` is left.
-    /// About the other axes nothing turns.
+    /// `S_FM = 2·1 − 1·2 = 0`. With both above, `S_FM = 2 + 2 = 4`, `S_MM = 2 + 4 = 6`: `C_xy = 2/3`, and `3 − 16/6` is
+    /// left. About the other axes nothing turns.
     #[test]
     fn two_thrusters_by_hand() {
         let unit = |z: f64, psd: f64| ThrusterUnit {
@@ -133,9 +133,9 @@ mod tests {
         assert!((above.force_given_torque - only(0, 0, 1.0 / 3.0)).amax() < 1e-14, "{}", above.force_given_torque);
     }
 
-    /// Least squares of drawn forces on drawn torques of the nine units, and what it leaves, against `C` and the rest. The
-    /// draws know the layout by what a force at a lever does, not by our formula: 40,000 samples, eighteen numbers at 4.5σ,
-    /// false alarm 1.2e-4. With the levers turned round the same regression is tens of σ off.
+    /// Least squares of drawn forces on drawn torques of the nine units, and what it leaves, against `C` and the rest.
+    /// The draws know the layout by what a force at a lever does, not by our formula: 40,000 samples, eighteen numbers
+    /// at 4.5σ, false alarm 1.2e-4. With the levers turned round the same regression is tens of σ off.
     #[test]
     fn a_regression_of_drawn_forces_on_drawn_torques() {
         const SAMPLES: usize = 40_000;

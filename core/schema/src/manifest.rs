@@ -14,8 +14,8 @@ pub struct Manifest {
     pub licence: String,
     /// One sentence.
     pub description: String,
-    /// Effects only: the places where it can act, `sc.x`. `{table}` in a name stands for each key of the mission's table of that
-    /// name, as `{test_mass}.x` for the test masses.
+    /// Effects only: the places where it can act, `sc.x`. `{table}` in a name stands for each key of the mission's
+    /// table of that name, as `{test_mass}.x` for the test masses.
     #[serde(default)]
     pub instances: Vec<String>,
     /// Effects only: columns beyond the usual ones that stages before it are asked to make, by the names that those
@@ -28,8 +28,8 @@ pub struct Manifest {
 }
 
 impl Manifest {
-    /// The places where an effect can act on a mission: the names of [`Self::instances`] with the keys of the mission's tables, in
-    /// alphabetical order. Neighbours that name one table are repeated together for each key.
+    /// The places where an effect can act on a mission: the names of [`Self::instances`] with the keys of the mission's
+    /// tables, in alphabetical order. Neighbours that name one table are repeated together for each key.
     #[must_use]
     pub fn instances_on(&self, mission: &serde_json::Value) -> Vec<String> {
         let table = |name: &String| template(name).map(|(_, table, _)| table.to_owned());

@@ -5,6 +5,7 @@
 
 use serde::Serialize;
 use serde_json::{Map, Value};
+use std::collections::BTreeMap;
 
 /// Highest rank at which the true housekeeping channel counts as found, for causes that no effect covers.
 const MAX_DRIVER_RANK: usize = 3;
@@ -200,10 +201,18 @@ pub struct Expected {
     pub value: f64,
 }
 
-/// One-based number of a test mass, and axis, of `tm1.x` or `tm1`.
-fn test_mass(instance: &str) -> (usize, &str) {
+/// Number of a test mass, the digits at the end of its name, and axis, of `tm1.x` or `tm1`.
+fn test_mass(instance: &str) -> (&str, &str) {
     let (mass, axis) = instance.split_once('.').unwrap_or((instance, ""));
-    (if mass == "tm2" { 2 } else { 1 }, axis)
+    (mass.trim_start_matches(|c: char| !c.is_ascii_digit()), axis)
+}
+
+/// True value of a coefficient `com-offset.NAME.AXIS`, m, in the first message of the truth of a simulation, by field
+/// path.
+#[must_use]
+pub fn offset(truth: &BTreeMap<String, f64>, coefficient: &str) -> Option<f64> {
+    let (number, axis) = test_mass(coefficient.strip_prefix("com-offset.")?);
+    truth.get(&format!("b{number}_orf_m.{axis}")).copied()
 }
 
 /// True values of the coefficients of a model's effect, for the shape that was found. `sealed` is the whole sealed
@@ -272,7 +281,7 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
         }
         "magnetic" => {
             // Force m ∂B_x/∂x; the gradiometer measures ∂B_x/∂x.
-            let mass_kg = sealed["test_mass_kg"][number - 1].as_f64();
+            let mass_kg = number.parse().ok().and_then(|n: usize| sealed["test_mass_kg"][n.checked_sub(1)?].as_f64());
             let mass_kg = mass_kg.ok_or("the sealed file does not state the mass of the test mass")?;
             match column("gradient") {
                 gradient if gradient == format!("hk.magnetic_gradient{number}_t_m") => Ok(vec![Expected {

@@ -17,8 +17,8 @@ pub struct Manifest {
     pub description: &'static str,
     /// Parameters; a key that is not among them is an error.
     pub parameters: &'static [Parameter],
-    /// Effects only: the places where it can act; `{table}` in a name stands for each key of the mission's table of that name, as
-    /// `{test_mass}.x`.
+    /// Effects only: the places where it can act; `{table}` in a name stands for each key of the mission's table of
+    /// that name, as `{test_mass}.x`.
     pub instances: &'static [&'static str],
     /// Effects only: columns beyond the usual ones that stages before it are asked to make, by the names that they give
     /// them; see [`crate::Setup::needs`].

@@ -1,8 +1,8 @@
 //! Time per epoch of the whole stage behind the border, replay of the control law included.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use dragfree_hinf_dfacs::asked::Needs;
-use dragfree_hinf_dfacs::pilot::Scale;
+use dragfree_hinf_dfacs::noise_calibration::NoiseScale;
+use dragfree_hinf_dfacs::on_demand::Needs;
 use dragfree_hinf_dfacs::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Settings};
 use dragfree_physics::mission::Mission;
 use nalgebra::Vector3;
@@ -28,7 +28,7 @@ fn stage(criterion: &mut Criterion) {
             sun: true,
             replay,
             warm_up_s: 600.0,
-            scale: Scale::nominal(),
+            scale: NoiseScale::nominal(),
             needs,
         };
         let mut reconstruction = Reconstruction::new(&mission, &settings).expect("the fixture is complete");
@@ -40,8 +40,8 @@ fn stage(criterion: &mut Criterion) {
                     let wiggle = (k % 97) as f64 * 1e-11;
                     let epoch = Epoch {
                         time_ns: k * 100_000_000,
-                        readout: [wiggle; 15],
-                        command: [wiggle; 18],
+                        readout: [wiggle; 15].into(),
+                        command: [wiggle; 18].into(),
                         sun_srf: Vector3::x(),
                         ephemeris_age_s: f64::NAN,
                         omega_crf_rad_s: Vector3::z() * 2e-7,

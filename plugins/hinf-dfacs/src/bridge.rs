@@ -1,9 +1,10 @@
 //! Bridges over a few missing readouts, for the second differences alone.
 //!
-//! One readout that is missing takes three second differences with it, and a spectrum wants stretches without a hole. A cubic
-//! through the two readouts on either side misses by the size of the readout's own noise (and by `d⁴r/dt⁴`, nothing at these
-//! rates), and the second difference gives that error the spectrum that the noise of a readout has. In a few parts per thousand
-//! of the samples it cannot be seen. The readouts themselves stay missing: a filter has a better prediction than a cubic.
+//! One readout that is missing takes three second differences with it, and a spectrum wants stretches without a hole. A
+//! cubic through the two readouts on either side misses by the size of the readout's own noise (and by `d⁴r/dt⁴`,
+//! nothing at these rates), and the second difference gives that error the spectrum that the noise of a readout has. In
+//! a few parts per thousand of the samples it cannot be seen. The readouts themselves stay missing: a filter has a
+//! better prediction than a cubic.
 
 /// Longest bridge, samples.
 pub(crate) const LONGEST: usize = 5;

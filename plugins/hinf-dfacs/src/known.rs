@@ -63,8 +63,8 @@ impl KnownModel {
     /// The known motion under one command.
     ///
     /// `û_i = −T_S^{O_i}(F̂_T + F̂_SRP − Σ_j T_{O_j}^S F̂_Ej)/m_S + F̂_Ei/m_m + S_TT r_i + S_TR θ_i`, and
-    /// `α = J_S⁻¹(M̂_T + D̂_SRP − Σ T M̂_Ei − Σ b_i×(T F̂_Ei) − ω×J_S ω)` (eq:SC_attitude_dynamics with its two signs put
-    /// right: an electrode that pushes the test mass pushes the spacecraft back).
+    /// `α = J_S⁻¹(M̂_T + D̂_SRP − Σ T M̂_Ei − Σ b_i×(T F̂_Ei) − ω×J_S ω)` (eq:SC_attitude_dynamics with its two signs
+    /// put right: an electrode that pushes the test mass pushes the spacecraft back).
     ///
     /// `sun_srf` is the unit vector from the Sun, `None` where sunlight is not modelled; `omega_srf_rad_s` is relative
     /// to IRF. The stiffness acts on the measured displacement with its noise `n`: `û` gains `S n` where the second
@@ -151,7 +151,7 @@ mod tests {
     #[test]
     fn electrodes_torque_acts_back_on_the_spacecraft() {
         let mut command = Command::zero(2);
-        command.tm[1] = TestMassCommand { torque_orf_nm: Vector3::new(0.0, 0.0, 1e-11), ..TestMassCommand::zero(2) };
+        command.tm[1] = TestMassCommand { torque_orf_nm: Vector3::new(0.0, 0.0, 1e-11), ..TestMassCommand::default() };
         close(motion(&command).alpha_srf_rad_s2, [0.0, 0.0, -1e-14]);
         command.tm[1].torque_orf_nm = Vector3::new(8e-12, 0.0, 0.0);
         // o_1 of bench 2 lies at −30°.

@@ -1,17 +1,17 @@
 //! Stage `hinf-dfacs`: the known specific force `û_i`, the unbiased angular acceleration `α̂`, the rate `ω̂` and the
 //! channels of the test masses and of the attitude (Section IV; ARCHITECTURE.md, table `reconstruction`).
 
-mod acting;
-pub mod asked;
 mod bridge;
 pub mod known;
 pub mod noise;
-pub mod pilot;
+pub mod noise_calibration;
+pub mod on_demand;
 mod plugin;
 pub mod reconstruction;
 pub mod replay;
 pub mod smoother;
 pub mod state;
+mod thruster_response;
 
 pub use plugin::HinfDfacs;
 

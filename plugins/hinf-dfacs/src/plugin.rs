@@ -5,9 +5,9 @@ use dragfree_sdk::prelude::*;
 use nalgebra::Vector3;
 use serde_json::json;
 
-use crate::asked::{self, Needs};
 use crate::noise;
-use crate::pilot::{self, Scale};
+use crate::noise_calibration::{self, NoiseScale};
+use crate::on_demand::{self, Needs};
 use crate::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Row, Settings, levels_of, row_length};
 use crate::replay::{CommandNumbers, Comparison, command_vectors};
 use crate::state::{Reader, StateError, Writer};
@@ -15,9 +15,9 @@ use crate::state::{Reader, StateError, Writer};
 /// The innovations' variance may differ from the prediction by this much before it is worth a sentence; a day's
 /// sampling error is 0.2 %.
 const INNOVATION_TOLERANCE: f64 = 0.1;
-/// Standard deviations of the innovations' correlation with rebuilt commands above which the commands are not those that
-/// acted; a false alarm in 2e-6 of all runs.
-const DISOBEDIENCE: f64 = 5.0;
+/// Standard deviations of the innovations' correlation with rebuilt commands above which the commands are not those
+/// that acted; a false alarm in 2e-6 of all runs.
+const INCONSISTENT_SIGMA: f64 = 5.0;
 const STATE: &[u8; 8] = b"dfacs/8\n";
 
 /// The stage.
@@ -37,7 +37,7 @@ struct Linked {
     settings: Settings,
     all_readouts: bool,
     /// Epochs held back until they have told the levels of the noise; none from then on.
-    pilot: Option<Vec<Epoch>>,
+    held_back: Option<Vec<Epoch>>,
     rate_hz: f64,
     readout: Vec<Option<In>>,
     command: Option<Vec<In>>,
@@ -74,8 +74,8 @@ fn grid(name: &str, unit: &str, frame: &str) -> Want {
 
 impl HinfDfacs {
     /// The best readout of each degree of freedom, and the names of the noise of each test mass's displacements: the
-    /// interferometer along an axis where there is one at all, local wavefront sensing for `θ` and `ψ`, else the inertial sensor. The
-    /// angles of the test masses serve only the stiffness and the replay and may be missing.
+    /// interferometer along an axis where there is one at all, local wavefront sensing for `θ` and `ψ`, else the
+    /// inertial sensor. The angles of the test masses serve only the stiffness and the replay and may be missing.
     fn link_readouts(
         &mut self,
         available: &Available,
@@ -133,7 +133,7 @@ impl HinfDfacs {
     }
 
     /// A reconstruction from the start, for other levels of the noise.
-    fn rebuild(&mut self, scale: Scale) -> Result<(), PluginError> {
+    fn rebuild(&mut self, scale: NoiseScale) -> Result<(), PluginError> {
         let linked = self.linked.as_ref().ok_or_else(not_linked)?;
         let (settings, all_readouts) = (Settings { scale, ..linked.settings }, linked.all_readouts);
         // What there is to say of the control law has been said at the link.
@@ -146,17 +146,18 @@ impl HinfDfacs {
     }
 
     /// Measures the levels of the noise in the epochs that were held back, and lets these go.
-    fn end_pilot(&mut self) -> Result<(), PluginError> {
+    fn calibrate_noise(&mut self) -> Result<(), PluginError> {
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
-        let Some(epochs) = linked.pilot.take() else { return Ok(()) };
+        let Some(epochs) = linked.held_back.take() else { return Ok(()) };
         let mut rows = Vec::new();
         for epoch in &epochs {
             linked.reconstruction.push(epoch, &mut rows)?;
         }
         linked.reconstruction.finish(&mut rows);
         let levels = levels_of(&self.mission);
-        let scale =
-            levels.map_or_else(Scale::nominal, |(held, sensing)| pilot::measure(&rows, linked.rate_hz, &held, sensing));
+        let channels: Vec<_> = rows.iter().map(Row::attitude_channels).collect();
+        let measured = |(held, sensing)| noise_calibration::measure(&channels, linked.rate_hz, &held, sensing);
+        let scale = levels.map_or_else(NoiseScale::nominal, measured);
         self.rebuild(scale)?;
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
         for epoch in &epochs {
@@ -253,12 +254,12 @@ impl Linked {
 
     fn give(&mut self, output: &mut Outputs) {
         output.time(self.table).extend(self.rows.iter().map(|row| row.time_ns));
-        let (always, asked) = self.out.split_at(self.always);
+        let (always, on_demand) = self.out.split_at(self.always);
         for (i, column) in always.iter().enumerate() {
             output.f64(*column).extend(self.rows.iter().map(|row| row.values[i]));
         }
-        for (i, column) in asked.iter().enumerate() {
-            output.f64(*column).extend(self.rows.iter().map(|row| row.asked[i]));
+        for (i, column) in on_demand.iter().enumerate() {
+            output.f64(*column).extend(self.rows.iter().map(|row| row.on_demand[i]));
         }
         self.rows.clear();
     }
@@ -385,7 +386,7 @@ impl Stage for HinfDfacs {
             sun: sun.is_some(),
             replay: false,
             warm_up_s: self.warm_up_s,
-            scale: Scale::nominal(),
+            scale: NoiseScale::nominal(),
             needs: self.needs,
         };
         let all_readouts = readout.iter().all(Option::is_some);
@@ -401,16 +402,16 @@ impl Stage for HinfDfacs {
         let table = link.table("reconstruction", rate_hz);
         let mut out = write_columns(link, table, &self.mission, &noises)?;
         let always = out.len();
-        for (name, unit, frame) in reconstruction.asked_columns() {
+        for (name, unit, frame) in reconstruction.on_demand_columns() {
             let attributes = [("kind", "series"), ("in_loop", "true")];
-            let attributes = if asked::is_in_loop(&name) { &attributes[..] } else { &attributes[..1] };
+            let attributes = if on_demand::is_in_loop(&name) { &attributes[..] } else { &attributes[..1] };
             out.push(link.write_with(table, &name, unit, &frame, attributes)?);
         }
         self.linked = Some(Linked {
             reconstruction,
             settings,
             all_readouts,
-            pilot: (smoother && self.measure_noise).then(Vec::new),
+            held_back: (smoother && self.measure_noise).then(Vec::new),
             rate_hz,
             readout,
             command,
@@ -431,15 +432,15 @@ impl Stage for HinfDfacs {
         let columns = Columns::of(linked, input);
         let rows = columns.time_ns.len();
         let mut k = 0;
-        if let Some(pilot) = &linked.pilot {
-            let end = rows.min(pilot::length(linked.rate_hz) - pilot.len());
+        if let Some(held_back) = &linked.held_back {
+            let end = rows.min(noise_calibration::length(linked.rate_hz) - held_back.len());
             let epochs: Vec<Epoch> = (0..end).map(|k| linked.epoch(&columns, k)).collect();
-            linked.pilot.get_or_insert_default().extend(epochs);
+            linked.held_back.get_or_insert_default().extend(epochs);
             k = end;
-            if linked.pilot.as_ref().is_some_and(|p| p.len() < pilot::length(linked.rate_hz)) {
+            if linked.held_back.as_ref().is_some_and(|p| p.len() < noise_calibration::length(linked.rate_hz)) {
                 return Ok(());
             }
-            self.end_pilot()?;
+            self.calibrate_noise()?;
         }
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
         for k in k..rows {
@@ -451,7 +452,7 @@ impl Stage for HinfDfacs {
     }
 
     fn flush(&mut self, output: &mut Outputs) -> Result<(), PluginError> {
-        self.end_pilot()?;
+        self.calibrate_noise()?;
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
         linked.reconstruction.finish(&mut linked.rows);
         linked.give(output);
@@ -506,7 +507,7 @@ impl Stage for HinfDfacs {
             "measured_over_stated_noise_power".to_owned(),
             json!({ "thruster_torque": scale.torque.as_slice(), "dws_long_arm": scale.sensing }),
         );
-        if scale != Scale::nominal() {
+        if scale != NoiseScale::nominal() {
             report.notes.push(format!(
                 "the first 55 minutes have {:.2?} times the power of the mission file's torque noise about x, y, z and {:.2} times that \
                  of its long-arm wavefront sensing; the measured levels were used for the angular acceleration",
@@ -529,9 +530,9 @@ impl Stage for HinfDfacs {
                 ));
             }
         }
-        if let Some(sigma) = linked.reconstruction.disobedience_sigma() {
+        if let Some(sigma) = linked.reconstruction.inconsistency_sigma() {
             q.insert("command_innovation_correlation_sigma".to_owned(), json!(sigma));
-            if reconstructed && sigma.iter().any(|z| z.abs() > DISOBEDIENCE) {
+            if reconstructed && sigma.iter().any(|z| z.abs() > INCONSISTENT_SIGMA) {
                 report.notes.push(format!(
                     "the spacecraft does not turn as the rebuilt commands say: its attitude's innovations correlate with them \
                      at {sigma:.1?} standard deviations about the principal axes. Another controller flew than [control] of the \
@@ -563,14 +564,14 @@ impl HinfDfacs {
     fn save(&self) -> Result<Vec<u8>, PluginError> {
         let linked = self.linked.as_ref().ok_or_else(not_linked)?;
         let mut out = Writer(STATE.to_vec());
-        out.flag(linked.pilot.is_some());
+        out.flag(linked.held_back.is_some());
         let scale = linked.settings.scale;
         out.numbers(scale.torque.as_slice());
         out.numbers(&[scale.sensing]);
-        match &linked.pilot {
-            Some(pilot) => {
-                out.count(pilot.len() as u64);
-                pilot.iter().for_each(|epoch| epoch.save(&mut out));
+        match &linked.held_back {
+            Some(held_back) => {
+                out.count(held_back.len() as u64);
+                held_back.iter().for_each(|epoch| epoch.save(&mut out));
             }
             None => out.0.extend_from_slice(&linked.reconstruction.save()),
         }
@@ -588,24 +589,25 @@ impl HinfDfacs {
         if !numbers.iter().all(|x| x.is_finite() && *x > 0.0) {
             return Err(reader.damaged("a level of the noise").into());
         }
-        let scale = Scale { torque: Vector3::new(numbers[0], numbers[1], numbers[2]), sensing: numbers[3] };
+        let scale = NoiseScale { torque: Vector3::new(numbers[0], numbers[1], numbers[2]), sensing: numbers[3] };
         if waits {
-            let count = reader.length(pilot::length(self.linked.as_ref().ok_or_else(not_linked)?.rate_hz))?;
+            let count =
+                reader.length(noise_calibration::length(self.linked.as_ref().ok_or_else(not_linked)?.rate_hz))?;
             let test_masses = self.mission.test_mass.len();
-            let pilot = (0..count).map(|_| Epoch::load(test_masses, &mut reader)).collect::<Result<_, _>>()?;
+            let held_back = (0..count).map(|_| Epoch::load(test_masses, &mut reader)).collect::<Result<_, _>>()?;
             reader.end()?;
-            self.linked.as_mut().ok_or_else(not_linked)?.pilot = Some(pilot);
+            self.linked.as_mut().ok_or_else(not_linked)?.held_back = Some(held_back);
             return Ok(());
         }
         self.rebuild(scale)?;
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
-        linked.pilot = None;
+        linked.held_back = None;
         Ok(linked.reconstruction.load(reader.rest())?)
     }
 }
 
-/// `{"samples", "rms_distance": {vector: value}, "mean_distance": {…}, "rms_flown": {…}, "rms_change_of_flown": {…}}`, N and
-/// N m.
+/// `{"samples", "rms_distance": {vector: value}, "mean_distance": {…}, "rms_flown": {…}, "rms_change_of_flown": {…}}`,
+/// N and N m.
 fn comparison_json(comparison: &Comparison, mission: &Mission) -> serde_json::Value {
     let by_vector = |values: Vec<f64>| {
         let pairs = command_vectors(mission).into_iter().zip(values).map(|((name, _, _), value)| (name, json!(value)));

@@ -6,14 +6,14 @@ use dragfree_physics::mission::{MOST_TEST_MASSES, Mission, MissionError, TestMas
 use dragfree_physics::thrust_noise::ThrustNoise;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::acting::Acting;
-use crate::asked::{Asked, Given, Needs};
 use crate::bridge::{LONGEST, bridge};
 use crate::known::{KnownModel, KnownMotion};
-use crate::pilot::Scale;
+use crate::noise_calibration::NoiseScale;
+use crate::on_demand::{Availability, Needs, OnDemand};
 use crate::replay::{CommandNumbers, Comparison, Held, ReadoutNumbers, Replay, electrodes_of};
 use crate::smoother::{Model, Smoothed, Smoother};
 use crate::state::{Reader, StateError, Writer};
+use crate::thruster_response::ThrusterResponse;
 
 const NEEDED_BY: &str = "hinf-dfacs";
 const STATE: &[u8; 8] = b"dfacs/7\n";
@@ -45,7 +45,7 @@ pub struct Settings {
     /// Time after which a replayed control law counts as settled, s.
     pub warm_up_s: f64,
     /// Levels of the noise against the mission file.
-    pub scale: Scale,
+    pub scale: NoiseScale,
     /// Columns on demand.
     pub needs: Needs,
 }
@@ -114,15 +114,16 @@ pub struct Row {
     pub time_ns: i64,
     /// Values, NaN where there is none.
     pub values: Few<f64, { 9 + 9 * MOST_TEST_MASSES }>,
-    /// Values of the columns on demand, in the order of [`Reconstruction::asked_columns`].
-    pub asked: Vec<f64>,
+    /// Values of the columns on demand, in the order of [`Reconstruction::on_demand_columns`].
+    pub on_demand: Vec<f64>,
 }
 
 impl Row {
     /// The channels of the spacecraft's attitude, `sc.alpha`, rad s⁻².
     #[must_use]
-    pub fn attitude_channels(&self) -> &[f64] {
-        &self.values[self.values.len() - 3..]
+    pub fn attitude_channels(&self) -> [f64; 3] {
+        let values = &self.values[self.values.len() - 3..];
+        [values[0], values[1], values[2]]
     }
 }
 
@@ -224,13 +225,13 @@ pub struct Reconstruction {
     angular_acceleration: AngularAcceleration,
     needs_sun: bool,
     known: KnownModel,
-    /// `−T_S^{O_i} C J/m_S`: the acceleration of each test mass, ORF, by the force that comes with the thrusters' torque, from
-    /// what that torque does to the spacecraft, SRF; m s⁻² per rad s⁻².
+    /// `−T_S^{O_i} C J/m_S`: the acceleration of each test mass, ORF, by the force that comes with the thrusters'
+    /// torque, from what that torque does to the spacecraft, SRF; m s⁻² per rad s⁻².
     push_per_turn: Vec<Matrix3<f64>>,
     smoother: Smoother,
     replay: Option<Replay>,
     held: Held,
-    acting: Acting,
+    acting: ThrusterResponse,
     /// At the epoch, and as the last packet told it: on board the feed-forward holds the packet.
     sun_srf: Option<Vector3<f64>>,
     packet_sun_srf: Option<Vector3<f64>>,
@@ -242,7 +243,7 @@ pub struct Reconstruction {
     /// The epoch before the first pending one.
     previous: Option<Pending>,
     /// `None` where nothing is asked for.
-    asked: Option<Asked>,
+    on_demand: Option<OnDemand>,
     counts: Counts,
 }
 
@@ -273,8 +274,8 @@ fn model(mission: &Mission, noise: &ThrustNoise, settings: &Settings) -> Result<
     Ok(Model::new(&(loud * inverse * torque * inverse.transpose() * loud), &sensing, 1.0 / settings.rate_hz))
 }
 
-/// One-sided PSDs of the mission file: what the thrusters' torque does to the angular acceleration about each axis of SRF,
-/// rad² s⁻⁴/Hz, and the white part of the attitude's sensing, rad²/Hz; `None` where it tells neither.
+/// One-sided PSDs of the mission file: what the thrusters' torque does to the angular acceleration about each axis of
+/// SRF, rad² s⁻⁴/Hz, and the white part of the attitude's sensing, rad²/Hz; `None` where it tells neither.
 #[must_use]
 pub fn levels_of(mission: &Mission) -> Option<(Vector3<f64>, f64)> {
     let noise = ThrustNoise::of(mission)?;
@@ -305,18 +306,18 @@ impl Reconstruction {
         } else {
             None
         };
-        let asked = || Asked::new(settings.needs, mission, push_per_turn.clone());
+        let on_demand = || OnDemand::new(settings.needs, mission, push_per_turn.clone());
         Ok(Self {
             rate_hz: settings.rate_hz,
             angular_acceleration: settings.angular_acceleration,
             needs_sun: settings.sun && mission.solar_pressure.is_some(),
-            asked: (settings.needs != Needs::default()).then(asked),
+            on_demand: (settings.needs != Needs::default()).then(on_demand),
             push_per_turn,
             known,
             smoother: Smoother::new(model),
             replay,
             held: Held::new(3 + 6 * test_masses),
-            acting: Acting::new(mission, 1.0 / settings.rate_hz),
+            acting: ThrusterResponse::new(mission, 1.0 / settings.rate_hz),
             sun_srf: None,
             packet_sun_srf: None,
             omega_ci_rad_s: Vector3::zeros(),
@@ -404,7 +405,7 @@ impl Reconstruction {
     }
 
     fn needs(&self) -> Needs {
-        self.asked.as_ref().map(Asked::needs).unwrap_or_default()
+        self.on_demand.as_ref().map(OnDemand::needs).unwrap_or_default()
     }
 
     fn known_motion(
@@ -412,41 +413,41 @@ impl Reconstruction {
         epoch: &Epoch,
         omega_srf_rad_s: &Vector3<f64>,
     ) -> Result<Option<KnownMotion>, StateError> {
-        let flown = epoch.command.iter().all(|x| x.is_finite()).then_some(&epoch.command);
+        let telemetered = epoch.command.iter().all(|x| x.is_finite()).then_some(&epoch.command);
         let replayed = match &mut self.replay {
-            Some(replay) => replay.step(&self.held, self.packet_sun_srf, flown)?,
+            Some(replay) => replay.step(&self.held, self.packet_sun_srf, telemetered)?,
             None => None,
         };
-        let counter = match (flown, &replayed) {
+        let counter = match (telemetered, &replayed) {
             (Some(_), _) => &mut self.counts.commands_telemetered,
             (None, Some(_)) => &mut self.counts.commands_replayed,
             (None, None) => &mut self.counts.commands_missing,
         };
         *counter += 1;
-        // Electrodes of one test mass that nobody tells of: the other one and the spacecraft go on. Their recoil, 1e-9 N on the
-        // spacecraft, is a thousandth of the thrusters' noise.
+        // Electrodes of one test mass that nobody tells of: the other one and the spacecraft go on. Their recoil, 1e-9
+        // N on the spacecraft, is a thousandth of the thrusters' noise.
         let without = |tm: usize| -> Option<CommandNumbers> {
             let theirs = electrodes_of(tm);
             let given = |i: usize| if theirs.contains(&i) { 0.0 } else { epoch.command[i] };
             let others = CommandNumbers::from_fn(epoch.command.len(), given);
             others.iter().all(|x| x.is_finite()).then_some(others)
         };
-        let mut silent = None;
-        let told = flown.copied().or(replayed).or_else(|| {
-            silent = (0..self.push_per_turn.len()).find(|tm| without(*tm).is_some());
-            silent.and_then(without)
+        let mut unknown = None;
+        let commanded = telemetered.copied().or(replayed).or_else(|| {
+            unknown = (0..self.push_per_turn.len()).find(|tm| without(*tm).is_some());
+            unknown.and_then(without)
         });
-        if silent.is_some() {
+        if unknown.is_some() {
             self.counts.commands_missing -= 1;
             self.counts.commands_of_one_test_mass += 1;
         }
-        let thrust = self.acting.act(told.as_ref().and_then(|numbers| numbers.first_chunk().copied()));
-        let acting = told.zip(thrust).map(|(mut numbers, thrust)| {
+        let thrust = self.acting.act(commanded.as_ref().and_then(|numbers| numbers.first_chunk().copied()));
+        let acting = commanded.zip(thrust).map(|(mut numbers, thrust)| {
             numbers[..6].copy_from_slice(&thrust);
             numbers
         });
-        if let Some(asked) = &mut self.asked {
-            asked.take(acting.as_ref(), silent, self.sun_srf);
+        if let Some(on_demand) = &mut self.on_demand {
+            on_demand.take(acting.as_ref(), unknown, self.sun_srf);
         }
         if self.needs_sun && self.sun_srf.is_none() {
             self.counts.sun_missing += 1;
@@ -456,7 +457,7 @@ impl Reconstruction {
         Ok(acting.map(|numbers| {
             let command = Command::from_numbers(&numbers);
             let mut motion = self.known.motion(&command, self.sun_srf.as_ref(), &readout, omega_srf_rad_s);
-            if let Some(tm) = silent {
+            if let Some(tm) = unknown {
                 motion.u_orf_m_s2[tm] = Vector3::from_element(f64::NAN);
             }
             motion
@@ -464,7 +465,7 @@ impl Reconstruction {
     }
 
     fn emit(&mut self, count: usize, rows: &mut Vec<Row>) {
-        let delay = self.asked.as_ref().is_some_and(|asked| asked.needs().dws_delay_response);
+        let delay = self.on_demand.as_ref().is_some_and(|on_demand| on_demand.needs().dws_delay_response);
         let mut smoothed = self.smoother.smoothed(if delay { self.pending.len() } else { count });
         let alpha_crf = |(p, s): (&Pending, &Smoothed)| p.alpha_known_rad_s2 - p.frame_rad_s2 + s.disturbance_rad_s2;
         let alpha_crf_rad_s2: Vec<_> = self.pending.iter().zip(&smoothed).filter(|_| delay).map(alpha_crf).collect();
@@ -476,21 +477,21 @@ impl Reconstruction {
         }
         let blind = self.blind(smoothed.len());
         let known = |v: &Vector3<f64>| v.iter().all(|x| x.is_finite());
-        let given = |(p, blind): (&Pending, &bool)| Given {
+        let available = |(p, blind): (&Pending, &bool)| Availability {
             alpha: known(&p.alpha_known_rad_s2) && !blind,
             u: p.tm.map(|tm| known(&tm.u_orf_m_s2)),
         };
-        let mut asked = Vec::new();
-        if let Some(columns) = &mut self.asked {
-            let leaving: Vec<Given> = self.pending.iter().zip(&blind).map(given).collect();
-            asked = columns.give(&self.smoother, &leaving, &alpha_crf_rad_s2);
+        let mut on_demand = Vec::new();
+        if let Some(columns) = &mut self.on_demand {
+            let leaving: Vec<Availability> = self.pending.iter().zip(&blind).map(available).collect();
+            on_demand = columns.give(&self.smoother, &leaving, &alpha_crf_rad_s2);
         }
         self.smoother.release(count);
-        let mut asked = asked.into_iter();
+        let mut on_demand = on_demand.into_iter();
         rows.reserve(smoothed.len());
         for (k, (smoothed, blind)) in smoothed.iter().zip(blind).enumerate() {
             let row = self.row(k, smoothed, blind);
-            rows.push(Row { asked: asked.next().unwrap_or_default(), ..row });
+            rows.push(Row { on_demand: on_demand.next().unwrap_or_default(), ..row });
         }
         if let Some(last) = smoothed.len().checked_sub(1) {
             self.previous = Some(self.pending[last]);
@@ -498,8 +499,9 @@ impl Reconstruction {
         self.pending.drain(..smoothed.len());
     }
 
-    /// Whether each of the `count` oldest pending epochs is further from every attitude than the smoother remembers. What is
-    /// left of `α̂` there is the command, which answers the very disturbance that it lacks: it would bias the calibration.
+    /// Whether each of the `count` oldest pending epochs is further from every attitude than the smoother remembers.
+    /// What is left of `α̂` there is the command, which answers the very disturbance that it lacks: it would bias the
+    /// calibration.
     fn blind(&mut self, count: usize) -> Vec<bool> {
         let sensed = |pending: &Pending| pending.attitude_rad.iter().all(|x| x.is_finite());
         let memory = self.smoother.model().memory();
@@ -552,13 +554,13 @@ impl Reconstruction {
             vectors.push(difference(&|p| p.tm[i].bridged_orf_m, &|p| p.tm[i].u_orf_m_s2));
         }
         vectors.push(difference(&|p| p.bridged_rad, &|p| p.alpha_known_rad_s2 - p.frame_rad_s2));
-        Row { time_ns: now.time_ns, values: vectors.iter().flatten().copied().collect(), asked: Vec::new() }
+        Row { time_ns: now.time_ns, values: vectors.iter().flatten().copied().collect(), on_demand: Vec::new() }
     }
 
     /// Name, unit and frame of the columns on demand.
     #[must_use]
-    pub fn asked_columns(&self) -> Vec<(String, &'static str, String)> {
-        self.asked.as_ref().map(Asked::columns).unwrap_or_default()
+    pub fn on_demand_columns(&self) -> Vec<(String, &'static str, String)> {
+        self.on_demand.as_ref().map(OnDemand::columns).unwrap_or_default()
     }
 
     /// What happened to how many epochs.
@@ -573,13 +575,13 @@ impl Reconstruction {
         self.smoother.innovation_ratio()
     }
 
-    /// See [`Smoother::disobedience_sigma`].
+    /// See [`Smoother::inconsistency_sigma`].
     #[must_use]
-    pub fn disobedience_sigma(&self) -> Option<[f64; 3]> {
-        self.smoother.disobedience_sigma()
+    pub fn inconsistency_sigma(&self) -> Option<[f64; 3]> {
+        self.smoother.inconsistency_sigma()
     }
 
-    /// Replayed against flown commands; `None` where nothing was compared.
+    /// Replayed against telemetered commands; `None` where nothing was compared.
     #[must_use]
     pub fn comparison(&self) -> Option<&Comparison> {
         self.replay.as_ref().map(Replay::comparison).filter(|c| c.samples() > 0)
@@ -625,8 +627,8 @@ impl Reconstruction {
             pending.save(&mut out);
         }
         self.needs().flags().into_iter().for_each(|flag| out.flag(flag));
-        if let Some(asked) = &self.asked {
-            asked.save(&mut out);
+        if let Some(on_demand) = &self.on_demand {
+            on_demand.save(&mut out);
         }
         out.0
     }
@@ -679,8 +681,8 @@ impl Reconstruction {
                 return Err(state.damaged("it is of a model whose effects ask for other columns"));
             }
         }
-        if let Some(asked) = &mut self.asked {
-            asked.load(self.smoother.waiting(), &mut state)?;
+        if let Some(on_demand) = &mut self.on_demand {
+            on_demand.load(self.smoother.waiting(), &mut state)?;
         }
         state.end()
     }

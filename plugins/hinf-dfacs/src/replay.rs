@@ -30,11 +30,11 @@ pub(crate) fn electrodes_of(test_mass: usize) -> std::ops::Range<usize> {
     6 + 6 * test_mass..12 + 6 * test_mass
 }
 
-/// A readout missing for longer than this stops the replay: the flown controller saw what we did not.
+/// A readout missing for longer than this stops the replay: the telemetered controller saw other data.
 const LONGEST_HOLD_S: f64 = 1.0;
-/// The replayed law is another than the flown one when their commands lie further apart than this part of the flown
-/// command's rms change from one sample to the next. Fresh readout noise makes that change, and the same law fed with
-/// the same readout repeats it exactly.
+/// The replayed law is another than the telemetered one when their commands lie further apart than this part of the
+/// telemetered command's rms change from one sample to the next. Fresh readout noise makes that change, and the same
+/// law fed with the same readout repeats it exactly.
 const SAME_LAW: f64 = 0.5;
 /// Samples to compare before the replay may stand in for a lost command.
 const PROOF_SAMPLES: u64 = 1000;
@@ -93,8 +93,8 @@ impl Held {
     }
 }
 
-/// How far the replayed commands are from the flown ones, vector by vector, about their mean difference: an integrator
-/// whose state nobody telemetered differs by a constant.
+/// How far the replayed commands are from the telemetered ones, vector by vector, about their mean difference: an
+/// integrator whose state nobody telemetered differs by a constant.
 #[derive(Clone, Debug)]
 pub struct Comparison {
     samples: u64,
@@ -116,20 +116,20 @@ impl Comparison {
         Self { samples, samples_of_mean, mean, squares, flown_squares, changes, change_squares, previous }
     }
 
-    fn take(&mut self, flown: &CommandNumbers, replayed: &CommandNumbers) {
+    fn take(&mut self, telemetered: &CommandNumbers, replayed: &CommandNumbers) {
         self.samples += 1;
         self.samples_of_mean += 1;
-        for i in 0..flown.len() {
-            let difference = flown[i] - replayed[i];
+        for i in 0..telemetered.len() {
+            let difference = telemetered[i] - replayed[i];
             let step = difference - self.mean[i];
             self.mean[i] += step / self.samples_of_mean as f64;
             self.squares[i] += step * (difference - self.mean[i]);
-            self.flown_squares[i] += flown[i] * flown[i];
+            self.flown_squares[i] += telemetered[i] * telemetered[i];
         }
-        if let Some(previous) = self.previous.replace(*flown) {
+        if let Some(previous) = self.previous.replace(*telemetered) {
             self.changes += 1;
-            for i in 0..flown.len() {
-                self.change_squares[i] += (flown[i] - previous[i]).powi(2);
+            for i in 0..telemetered.len() {
+                self.change_squares[i] += (telemetered[i] - previous[i]).powi(2);
             }
         }
     }
@@ -152,20 +152,20 @@ impl Comparison {
         rms(&self.squares, self.samples)
     }
 
-    /// Length of the mean difference of each of [`command_vectors`] since the last restart, N or N m: what a constant in the
-    /// flown controllers' integrators amounts to.
+    /// Length of the mean difference of each of [`command_vectors`] since the last restart, N or N m: what a constant
+    /// in the telemetered controllers' integrators amounts to.
     #[must_use]
     pub fn mean_distance(&self) -> Vec<f64> {
         self.mean.chunks_exact(3).map(|m| m.iter().map(|m| m * m).sum::<f64>().sqrt()).collect()
     }
 
-    /// Root mean square length of the flown command, N or N m.
+    /// Root mean square length of the telemetered command, N or N m.
     #[must_use]
     pub fn rms_flown(&self) -> Vec<f64> {
         rms(&self.flown_squares, self.samples)
     }
 
-    /// Root mean square length of the flown command's change from one sample to the next, N or N m.
+    /// Root mean square length of the telemetered command's change from one sample to the next, N or N m.
     #[must_use]
     pub fn rms_change(&self) -> Vec<f64> {
         rms(&self.change_squares, self.changes)
@@ -246,13 +246,13 @@ impl Replay {
         }
     }
 
-    /// One sample. Gives the command that stands in where none was flown, `None` as long as the law is not settled, or
-    /// not known to be the one that flies.
+    /// One sample. Gives the command that stands in where none was telemetered, `None` as long as the law is not
+    /// settled, or not known to be the one that flies.
     pub(crate) fn step(
         &mut self,
         held: &Held,
         sun_srf: Option<Vector3<f64>>,
-        flown: Option<&CommandNumbers>,
+        telemetered: Option<&CommandNumbers>,
     ) -> Result<Option<CommandNumbers>, StateError> {
         if held.oldest() > self.longest_hold_samples {
             if self.samples > 0 {
@@ -269,7 +269,7 @@ impl Replay {
         if self.samples <= self.warm_up_samples {
             return Ok(None);
         }
-        let Some(flown) = flown else {
+        let Some(telemetered) = telemetered else {
             // A change across the gap is not the noise of one sample.
             self.comparison.previous = None;
             let proven = self.alone || (self.comparison.samples >= PROOF_SAMPLES && self.comparison.same_law());
@@ -279,8 +279,8 @@ impl Replay {
                 replayed
             }));
         };
-        self.offset = Some(CommandNumbers::from_fn(flown.len(), |i| flown[i] - replayed[i]));
-        self.comparison.take(flown, &replayed);
+        self.offset = Some(CommandNumbers::from_fn(telemetered.len(), |i| telemetered[i] - replayed[i]));
+        self.comparison.take(telemetered, &replayed);
         Ok(None)
     }
 

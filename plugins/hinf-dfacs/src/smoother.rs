@@ -66,7 +66,8 @@ impl Model {
         let per_sample = 0.5 / dt_s;
         let disturbance_psd: Axes = std::array::from_fn(|i| eigen.eigenvalues[i]);
         let drift_step = TAU * DRIFT_CORNER_HZ * dt_s;
-        // S_2 and S_4 of the coloured part's one-sided PSD, S_2/ω² + S_4/ω⁴; half of them are the intensities of its drives.
+        // S_2 and S_4 of the coloured part's one-sided PSD, S_2/ω² + S_4/ω⁴; half of them are the intensities of its
+        // drives.
         let drive = |exponent: u32| -> f64 {
             let terms = readout.coloured().filter(|t| t.exponent == exponent);
             terms.map(|t| t.asd.powi(2) * (TAU * t.corner_hz).powi(exponent.cast_signed())).sum()
@@ -101,7 +102,8 @@ impl Model {
     }
 }
 
-/// Decay of the slowest pole of the filter, rad/s: the roots of `1 + a/ω² + b/ω⁴`, `s⁴ − a s² + b`, in the left half plane.
+/// Decay of the slowest pole of the filter, rad/s: the roots of `1 + a/ω² + b/ω⁴`, `s⁴ − a s² + b`, in the left half
+/// plane.
 fn decay_rad_s(a: f64, b: f64) -> f64 {
     let discriminant = 0.25 * a * a - b;
     if discriminant < 0.0 { (0.5 * b.sqrt() + 0.25 * a).sqrt() } else { (b / (0.5 * a + discriminant.sqrt())).sqrt() }
@@ -157,20 +159,20 @@ struct Seen {
 
 /// An angular acceleration, SRF.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Turn {
+pub struct Perturbation {
     /// Held over `[t_k, t_{k+1})`, rad s⁻².
     pub held_rad_s2: Vector3<f64>,
     /// Impulsive at `t_k`, rad s⁻¹.
     pub kick_rad_s: Vector3<f64>,
 }
 
-/// State of [`Smoother::answer`]: predicted θ, ω, β at the oldest waiting epoch.
+/// State of [`Smoother::response`]: predicted θ, ω, β at the oldest waiting epoch.
 #[derive(Clone, Debug, Default)]
-pub struct Answer {
+pub struct ResponseState {
     mean: [Axes; 3],
 }
 
-impl Answer {
+impl ResponseState {
     pub(crate) fn save(&self, out: &mut Writer) {
         out.numbers(self.mean.as_flattened());
     }
@@ -186,18 +188,18 @@ impl Answer {
 /// stated appears in the innovations as the filter's response to it. The products are martingale differences, so their
 /// sum over the root of their sum of squares is a standard normal deviate.
 #[derive(Clone, Debug, Default)]
-struct Obedience {
+struct CommandConsistency {
     /// Change of predicted θ, ω, β if the known acceleration had acted once more.
-    answer: [Axes; 3],
+    response: [Axes; 3],
     products: Axes,
     squares: Axes,
 }
 
-impl Obedience {
+impl CommandConsistency {
     fn update(&mut self, axis: usize, innovation: f64, gain: [f64; 3], informed: bool) {
-        let miss = self.answer[0][axis];
+        let miss = self.response[0][axis];
         for (state, k) in gain.into_iter().enumerate() {
-            self.answer[state][axis] -= k * miss;
+            self.response[state][axis] -= k * miss;
         }
         if informed {
             let product = innovation * miss;
@@ -207,9 +209,9 @@ impl Obedience {
     }
 
     fn advance(&mut self, axis: usize, known: f64, dt: f64) {
-        let push = self.answer[2][axis] + known;
-        self.answer[0][axis] += dt * self.answer[1][axis] + 0.5 * dt * dt * push;
-        self.answer[1][axis] += dt * push;
+        let push = self.response[2][axis] + known;
+        self.response[0][axis] += dt * self.response[1][axis] + 0.5 * dt * dt * push;
+        self.response[1][axis] += dt * push;
     }
 }
 
@@ -224,7 +226,7 @@ pub struct Smoother {
     steps: Vec<Step>,
     innovation_squares: Axes,
     innovations: u64,
-    obedience: Obedience,
+    command_consistency: CommandConsistency,
 }
 
 impl Smoother {
@@ -240,7 +242,7 @@ impl Smoother {
             steps: Vec::new(),
             innovation_squares: zero,
             innovations: 0,
-            obedience: Obedience::default(),
+            command_consistency: CommandConsistency::default(),
         }
     }
 
@@ -276,7 +278,7 @@ impl Smoother {
                 self.covariance[3][i] = p11[i] - gain[1] * p01[i];
                 self.covariance[4][i] = p12[i] - gain[1] * p02[i];
                 self.covariance[5][i] = p22[i] - gain[2] * p02[i];
-                self.obedience.update(i, innovation, gain, informed);
+                self.command_consistency.update(i, innovation, gain, informed);
                 if informed {
                     self.innovation_squares[i] += innovation * step.weighted_innovation[i];
                 }
@@ -297,7 +299,7 @@ impl Smoother {
             if let Some(step) = self.steps.last_mut() {
                 step.cut = true;
             }
-            self.obedience.answer = Default::default();
+            self.command_consistency.response = Default::default();
             let zero = [0.0; 3];
             let drifted = std::array::from_fn(|i| p22[i] + self.model.drift_variance[i]);
             self.mean = [zero, zero, self.mean[2]];
@@ -306,7 +308,7 @@ impl Smoother {
         };
         let known = self.model.srf_from_principal.tr_mul(known);
         for i in 0..3 {
-            self.obedience.advance(i, known[i], dt);
+            self.command_consistency.advance(i, known[i], dt);
             let push = self.mean[2][i] + known[i];
             self.mean[0][i] += dt * self.mean[1][i] + half * push;
             self.mean[1][i] += dt * push;
@@ -358,7 +360,12 @@ impl Smoother {
     ///
     /// The smoother is linear, and its gains depend only on which epochs have data, so this is its response to that
     /// acceleration with zero attitude.
-    pub fn answer(&self, state: &mut Answer, count: usize, more: impl Fn(usize) -> Turn) -> Vec<Smoothed> {
+    pub fn response(
+        &self,
+        state: &mut ResponseState,
+        count: usize,
+        more: impl Fn(usize) -> Perturbation,
+    ) -> Vec<Smoothed> {
         let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
         let principal = |v: &Vector3<f64>| self.model.srf_from_principal.tr_mul(v);
         let mut mean = state.mean;
@@ -444,15 +451,15 @@ impl Smoother {
     /// Score of the known accelerations per principal axis, a standard normal deviate if they acted as stated. `None`
     /// before enough readouts.
     #[must_use]
-    pub fn disobedience_sigma(&self) -> Option<[f64; 3]> {
-        let o = &self.obedience;
+    pub fn inconsistency_sigma(&self) -> Option<[f64; 3]> {
+        let o = &self.command_consistency;
         let z = std::array::from_fn(|i| o.products[i] / o.squares[i].sqrt());
         z.iter().all(|z: &f64| z.is_finite()).then_some(z)
     }
 
     pub(crate) fn save(&self, out: &mut Writer) {
-        let o = &self.obedience;
-        out.numbers(o.answer.as_flattened());
+        let o = &self.command_consistency;
+        out.numbers(o.response.as_flattened());
         out.numbers(&o.products);
         out.numbers(&o.squares);
         out.numbers(self.mean.as_flattened());
@@ -470,8 +477,8 @@ impl Smoother {
     }
 
     pub(crate) fn load(&mut self, state: &mut Reader<'_>) -> Result<(), StateError> {
-        let o = &mut self.obedience;
-        state.numbers(o.answer.as_flattened_mut())?;
+        let o = &mut self.command_consistency;
+        state.numbers(o.response.as_flattened_mut())?;
         state.numbers(&mut o.products)?;
         state.numbers(&mut o.squares)?;
         state.numbers(self.mean.as_flattened_mut())?;

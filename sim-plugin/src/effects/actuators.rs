@@ -3,7 +3,7 @@
 use dragfree_physics::control::Command;
 use nalgebra::Matrix3;
 
-use super::asked::{Asked, Built, Kind, Number, Place, sc_axes, tm_axes, tm_pairs};
+use super::request::{Built, EffectRequest, Kind, Number, Place, sc_axes, tm_axes, tm_pairs};
 use super::{Basis, Cause, along};
 
 const GAIN: Number = Number::new("1", -3.0, 3.0);
@@ -51,10 +51,10 @@ pub(super) const KINDS: &[Kind] = &[
     },
 ];
 
-fn build(asked: &Asked, _: &Basis<'_>) -> Built {
-    let size = asked.size;
+fn build(request: &EffectRequest, _: &Basis<'_>) -> Built {
+    let size = request.size;
     let part = |to: usize, from: usize| along(to) * along(from).transpose() * size;
-    let (output, matrix) = match (asked.kind.id, asked.place) {
+    let (output, matrix) = match (request.kind.id, request.place) {
         ("mps-tilt", Place::ScAxis(axis)) => (Output::Thrust, along(axis).cross_matrix() * size),
         ("torque-gain", Place::ScAxis(axis)) => (Output::Torque, part(axis, axis)),
         (_, Place::ScAxis(axis)) => (Output::Thrust, part(axis, axis)),
@@ -103,8 +103,9 @@ mod tests {
     fn acting(effects: &[&str]) -> Command {
         let mission = crate::testing::taiji();
         let names: Vec<String> = mission.test_mass.keys().cloned().collect();
-        let asked: Vec<Asked> = effects.iter().map(|text| Asked::parse(text, &names).unwrap()).collect();
-        Effects::new(&asked, &Basis { mission: &mission }, 1).unwrap().act(&command())
+        let request: Vec<EffectRequest> =
+            effects.iter().map(|text| EffectRequest::parse(text, &names).unwrap()).collect();
+        Effects::new(&request, &Basis { mission: &mission }, 1).unwrap().act(&command())
     }
 
     #[test]

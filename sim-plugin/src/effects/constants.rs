@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
-use super::asked::{Asked, Kind, Number, Place, sc_axes, tm_axes};
+use super::request::{EffectRequest, Kind, Number, Place, sc_axes, tm_axes};
 use super::{Cause, along};
 use crate::plant::Plant;
 
@@ -14,7 +14,7 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("m", -0.1, 0.1),
         help: "both housings sit this much farther along the axis, seen from the centre of mass",
         shape: &[],
-        build: |asked, _| Ok(Box::new(Constant(asked.clone()))),
+        build: |request, _| Ok(Box::new(Constant(request.clone()))),
     },
     Kind {
         id: "stiffness",
@@ -22,7 +22,7 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("s-2", -1e-4, 1e-4),
         help: "added to S_TT: acceleration per displacement; positive pushes away from the centre",
         shape: &[],
-        build: |asked, _| Ok(Box::new(Constant(asked.clone()))),
+        build: |request, _| Ok(Box::new(Constant(request.clone()))),
     },
     Kind {
         id: "cross-stiffness",
@@ -30,11 +30,11 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("m s-2 rad-1", -1e-5, 1e-5),
         help: "added to S_TR: acceleration along the axis per angle about it, and the torque that belongs to it",
         shape: &[],
-        build: |asked, _| Ok(Box::new(Constant(asked.clone()))),
+        build: |request, _| Ok(Box::new(Constant(request.clone()))),
     },
 ];
 
-struct Constant(Asked);
+struct Constant(EffectRequest);
 
 impl Cause for Constant {
     fn begin(&mut self, plant: &mut Plant, _rng: &mut Xoshiro256PlusPlus) {

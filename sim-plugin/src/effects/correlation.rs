@@ -3,7 +3,7 @@
 use dragfree_physics::mission::MissionError;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
-use super::asked::{Asked, Built, Kind, Number, Place};
+use super::request::{Built, EffectRequest, Kind, Number, Place};
 use super::{Basis, Cause, Moment};
 use crate::plant::Loads;
 use crate::thrusters::{Layout, ThrusterNoise};
@@ -21,7 +21,7 @@ pub(super) const KINDS: &[Kind] = &[Kind {
 /// Adds `Σ n_i (d_i, r_i × d_i)` of [`Layout::six`]: the cross-spectrum of force and torque is `Σ S d_i (r_i × d_i)ᵀ`.
 struct Correlation(ThrusterNoise);
 
-fn build(asked: &Asked, basis: &Basis<'_>) -> Built {
+fn build(request: &EffectRequest, basis: &Basis<'_>) -> Built {
     let units = basis.mission.thrusters.as_ref().map_or(0, |thrusters| thrusters.unit.len());
     if units > 0 {
         return Err(MissionError::Value {
@@ -30,7 +30,7 @@ fn build(asked: &Asked, basis: &Basis<'_>) -> Built {
             reason: "have noise of their own already, which pushes and turns at once: change their asd_n_rthz instead",
         });
     }
-    Ok(Box::new(Correlation(ThrusterNoise::new(Layout::six(asked.size), basis.mission.dt_s()))))
+    Ok(Box::new(Correlation(ThrusterNoise::new(Layout::six(request.size), basis.mission.dt_s()))))
 }
 
 impl Cause for Correlation {

@@ -2,7 +2,7 @@
 
 use dragfree_physics::frames::dcm_turned_about_z;
 
-use super::asked::{Asked, Built, Kind, Number, Place, Shape, sc_axes, test_masses};
+use super::request::{Built, EffectRequest, Kind, Number, Place, Shape, sc_axes, test_masses};
 use super::{Basis, Cause, along};
 use crate::interior::Interior;
 use crate::plant::Plant;
@@ -52,19 +52,19 @@ pub(super) const KINDS: &[Kind] = &[
     },
 ];
 
-fn build(asked: &Asked, basis: &Basis<'_>) -> Built {
-    Ok(match asked.place {
+fn build(request: &EffectRequest, basis: &Basis<'_>) -> Built {
+    Ok(match request.place {
         Place::ScAxis(axis) => Box::new(OffsetDrift {
             axis,
-            rate_m_s: asked.size,
-            kappa_m_k: asked.shape("kappa_m_k"),
-            beta_m_kg: asked.shape("beta_m_kg"),
+            rate_m_s: request.size,
+            kappa_m_k: request.shape("kappa_m_k"),
+            beta_m_kg: request.shape("beta_m_kg"),
         }),
         Place::Tm(tm) => Box::new(Opening {
             tm,
-            angle_rad: asked.size,
-            rate_rad_s: asked.shape("rate_rad_s"),
-            follow: asked.shape("follow"),
+            angle_rad: request.size,
+            rate_rad_s: request.shape("rate_rad_s"),
+            follow: request.shape("follow"),
             side: basis.mission.test_mass.values().nth(tm).map_or(1.0, |tm| tm.orf_from_srf_angle_rad.signum()),
         }),
         _ => unreachable!("instances are axes and test masses"),

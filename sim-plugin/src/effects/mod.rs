@@ -1,30 +1,31 @@
 //! Physical effects that the controller and a calibration's model do not know, written from states.
 //!
-//! An effect is asked for as `ID:INSTANCE=SIZE[,NAME=VALUE]...` ([`Asked::parse`]); [`catalogue`] lists all of them. Each
-//! becomes a [`Cause`] that acts inside the loop, so the controller sees it and answers. A family of effects is a file.
+//! An effect is asked for as `ID:INSTANCE=SIZE[,NAME=VALUE]...` ([`EffectRequest::parse`]); [`catalogue`] lists all of
+//! them. Each becomes a [`Cause`] that acts inside the loop, so the controller sees it and answers. A family of effects
+//! is a file.
 
 mod actuators;
-mod asked;
 mod constants;
 mod correlation;
 mod geometry;
 mod noise;
 mod pushes;
 mod readout;
+mod request;
 mod slosh;
 mod stray;
 
 use dragfree_physics::control::Command;
 use dragfree_physics::mission::Mission;
 use nalgebra::Vector3;
-use rand::SeedableRng;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 
 use crate::interior::Interior;
 use crate::plant::{Loads, Plant, State};
+use crate::random::stream;
 use crate::sensors::Measured;
-pub use asked::{Asked, Built, EffectError, Kind, Number, Place, Shape};
+pub use request::{Built, EffectError, EffectRequest, Kind, Number, Place, Shape};
 
 /// Every kind of effect.
 pub fn catalogue() -> impl Iterator<Item = &'static Kind> {
@@ -104,7 +105,7 @@ pub trait Cause: Send {
     }
 }
 
-/// What effects are built from, besides what was asked.
+/// What effects are built from, besides what was requested.
 pub struct Basis<'a> {
     /// The mission.
     pub mission: &'a Mission,
@@ -131,11 +132,11 @@ impl Effects {
     ///
     /// # Errors
     /// [`EffectError::Mission`] when the mission lacks what one needs.
-    pub fn new(asked: &[Asked], basis: &Basis<'_>, seed: u64) -> Result<Self, EffectError> {
-        let name = |a: &Asked| format!("{}:{}", a.kind.id, a.instance);
-        let active = asked.iter().enumerate().map(|(i, one)| {
+    pub fn new(request: &[EffectRequest], basis: &Basis<'_>, seed: u64) -> Result<Self, EffectError> {
+        let name = |a: &EffectRequest| format!("{}:{}", a.kind.id, a.instance);
+        let active = request.iter().enumerate().map(|(i, one)| {
             // Its size does not enter: the same noise, larger or smaller.
-            let before = asked[..i].iter().filter(|other| name(other) == name(one)).count();
+            let before = request[..i].iter().filter(|other| name(other) == name(one)).count();
             Ok(Active { cause: one.cause(basis)?, rng: stream(seed, &format!("{} {before}", name(one))) })
         });
         Ok(Self(active.collect::<Result<_, EffectError>>()?))
@@ -208,13 +209,6 @@ impl Effects {
                 active.cause.set_states(&saved.states)
             })
     }
-}
-
-/// A random stream of its own for everything that has a name: FNV-1a of the name on top of the seed.
-#[must_use]
-pub fn stream(seed: u64, name: &str) -> Xoshiro256PlusPlus {
-    let hash = name.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));
-    Xoshiro256PlusPlus::seed_from_u64(hash.wrapping_add(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15)))
 }
 
 /// Fills slots with saved numbers; false when there are more or fewer.

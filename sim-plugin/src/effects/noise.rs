@@ -1,7 +1,7 @@
 //! Noise that is larger than the mission file says, or has a line.
 //!
-//! The excess is a process of its own, `sqrt(k² − 1)` times the mission's shape: the powers of independent processes add
-//! to `k²`.
+//! The excess is a process of its own, `sqrt(k² − 1)` times the mission's shape: the powers of independent processes
+//! add to `k²`.
 
 use dragfree_physics::mission::Mission;
 use dragfree_physics::noise::NoiseShape;
@@ -10,7 +10,7 @@ use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use std::f64::consts::TAU;
 
-use super::asked::{Asked, Built, Kind, Number, Place, Shape, sc_axes, tm_axes};
+use super::request::{Built, EffectRequest, Kind, Number, Place, Shape, sc_axes, tm_axes};
 use super::{Basis, Cause, Moment, along};
 use crate::plant::{Loads, Plant};
 use crate::sensors::Measured;
@@ -38,10 +38,10 @@ pub(super) const KINDS: &[Kind] = &[
         size: FACTOR,
         help: "thrusters: the force noise along the axis has SIZE times the mission's ASD",
         shape: LINE,
-        build: |asked, basis| {
+        build: |request, basis| {
             let table = &basis.mission.noise.thruster_force;
             let shape = Mission::need(table, "noise.thruster_force", "mps-noise")?.shape();
-            Excess::boxed(asked, basis, &shape)
+            Excess::boxed(request, basis, &shape)
         },
     },
     Kind {
@@ -50,10 +50,10 @@ pub(super) const KINDS: &[Kind] = &[
         size: FACTOR,
         help: "thrusters: the torque noise about the axis has SIZE times the mission's ASD",
         shape: LINE,
-        build: |asked, basis| {
+        build: |request, basis| {
             let table = &basis.mission.noise.thruster_torque;
             let shape = Mission::need(table, "noise.thruster_torque", "torque-noise")?.shape();
-            Excess::boxed(asked, basis, &shape)
+            Excess::boxed(request, basis, &shape)
         },
     },
     Kind {
@@ -62,15 +62,15 @@ pub(super) const KINDS: &[Kind] = &[
         size: FACTOR,
         help: "capacitive readout: the noise along the axis has SIZE times the mission's ASD",
         shape: LINE,
-        build: |asked, basis| {
+        build: |request, basis| {
             let noise = &basis.mission.noise;
-            let (table, section) = match asked.place {
+            let (table, section) = match request.place {
                 Place::TmAxis(_, 0) => (&noise.is_x, "noise.is_x"),
                 Place::TmAxis(_, 1) => (&noise.is_y, "noise.is_y"),
                 _ => (&noise.is_z, "noise.is_z"),
             };
             let shape = Mission::need(table, section, "is-noise")?.shape();
-            Excess::boxed(asked, basis, &shape)
+            Excess::boxed(request, basis, &shape)
         },
     },
 ];
@@ -85,16 +85,16 @@ struct Excess {
 }
 
 impl Excess {
-    fn boxed(asked: &Asked, basis: &Basis<'_>, shape: &NoiseShape) -> Built {
-        let line_amplitude = asked.shape("line_rthz") * shape.white_psd().sqrt();
-        let factor = (asked.size * asked.size - 1.0).sqrt();
+    fn boxed(request: &EffectRequest, basis: &Basis<'_>, shape: &NoiseShape) -> Built {
+        let line_amplitude = request.shape("line_rthz") * shape.white_psd().sqrt();
+        let factor = (request.size * request.size - 1.0).sqrt();
         let mut excess = shape.clone();
         excess.terms.iter_mut().for_each(|term| term.asd *= factor);
         Ok(Box::new(Self {
-            id: asked.kind.id,
-            place: asked.place,
+            id: request.kind.id,
+            place: request.place,
             process: NoiseProcess::new(&excess, basis.mission.dt_s()),
-            line_hz: asked.shape("line_hz"),
+            line_hz: request.shape("line_hz"),
             line_amplitude,
             line_phase_rad: 0.0,
         }))

@@ -4,7 +4,7 @@ use dragfree_physics::mission::Mission;
 use nalgebra::Vector3;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
-use super::asked::{Asked, Built, Kind, Number, Place, Shape, sc_angles, sc_axes, tm_axes};
+use super::request::{Built, EffectRequest, Kind, Number, Place, Shape, sc_angles, sc_axes, tm_axes};
 use super::{Basis, Cause, Moment, along};
 use crate::plant::Loads;
 
@@ -43,8 +43,8 @@ pub(super) const KINDS: &[Kind] = &[
     },
 ];
 
-fn arm(asked: &Asked) -> Vector3<f64> {
-    Vector3::new(asked.shape("arm_x_m"), asked.shape("arm_y_m"), asked.shape("arm_z_m"))
+fn arm(request: &EffectRequest) -> Vector3<f64> {
+    Vector3::new(request.shape("arm_x_m"), request.shape("arm_y_m"), request.shape("arm_z_m"))
 }
 
 struct SolarPressure {
@@ -53,10 +53,10 @@ struct SolarPressure {
     added_srf_m: Vector3<f64>,
 }
 
-fn solar_pressure(asked: &Asked, basis: &Basis<'_>) -> Built {
+fn solar_pressure(request: &EffectRequest, basis: &Basis<'_>) -> Built {
     let section = Mission::need(&basis.mission.solar_pressure, "solar_pressure", "the effect solar-pressure")?;
     let arm_srf_m = Vector3::from(section.arm_srf_m);
-    Ok(Box::new(SolarPressure { size: asked.size, arm_srf_m, added_srf_m: arm(asked) }))
+    Ok(Box::new(SolarPressure { size: request.size, arm_srf_m, added_srf_m: arm(request) }))
 }
 
 impl Cause for SolarPressure {
@@ -67,19 +67,25 @@ impl Cause for SolarPressure {
     }
 }
 
-fn impulse(asked: &Asked, _: &Basis<'_>) -> Built {
-    let size = asked.size;
-    let at_s = asked.shape("at_s");
-    Ok(match asked.place {
+fn impulse(request: &EffectRequest, _: &Basis<'_>) -> Built {
+    let size = request.size;
+    let at_s = request.shape("at_s");
+    Ok(match request.place {
         Place::TmAxis(tm, axis) => {
-            let (rise_s, decay_s) = (asked.shape("rise_s"), asked.shape("decay_s"));
+            let (rise_s, decay_s) = (request.shape("rise_s"), request.shape("decay_s"));
             Box::new(Glitch { tm, axis, momentum_n_s: size, at_s, rise_s, decay_s })
         }
         Place::ScAngle(axis) => {
             let momentum_n_m_s = along(axis) * size;
-            Box::new(Antenna { momentum_n_m_s, pulse_s: asked.shape("pulse_s"), moved: false, sign: 0.0, left_s: 0.0 })
+            Box::new(Antenna {
+                momentum_n_m_s,
+                pulse_s: request.shape("pulse_s"),
+                moved: false,
+                sign: 0.0,
+                left_s: 0.0,
+            })
         }
-        Place::ScAxis(axis) => Box::new(Hit { momentum_n_s: along(axis) * size, arm_srf_m: arm(asked), at_s }),
+        Place::ScAxis(axis) => Box::new(Hit { momentum_n_s: along(axis) * size, arm_srf_m: arm(request), at_s }),
         _ => unreachable!("instances are axes and angles"),
     })
 }

@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use std::collections::VecDeque;
 
-use super::asked::{Asked, Built, Instrument, Kind, Number, Place, Shape, test_masses, tm_axes, tm_pairs};
+use super::request::{Built, EffectRequest, Instrument, Kind, Number, Place, Shape, test_masses, tm_axes, tm_pairs};
 use super::{Basis, Cause, Moment};
 use crate::sensors::Measured;
 
@@ -21,9 +21,9 @@ pub(super) const KINDS: &[Kind] = &[
         size: RATIO,
         help: "capacitive readout: a displacement r shows as (1 + SIZE) r",
         shape: &[],
-        build: |asked, _| {
-            let Place::TmAxis(tm, axis) = asked.place else { unreachable!("instances are axes of a test mass") };
-            Ok(Box::new(Capacitive { tm, from: axis, to: axis, size: asked.size }))
+        build: |request, _| {
+            let Place::TmAxis(tm, axis) = request.place else { unreachable!("instances are axes of a test mass") };
+            Ok(Box::new(Capacitive { tm, from: axis, to: axis, size: request.size }))
         },
     },
     Kind {
@@ -32,9 +32,9 @@ pub(super) const KINDS: &[Kind] = &[
         size: RATIO,
         help: "capacitive readout: NAME.y-x shows SIZE times the displacement along y in x too",
         shape: &[],
-        build: |asked, _| {
-            let Place::TmPair { tm, from, to } = asked.place else { unreachable!("instances are pairs of axes") };
-            Ok(Box::new(Capacitive { tm, from, to, size: asked.size }))
+        build: |request, _| {
+            let Place::TmPair { tm, from, to } = request.place else { unreachable!("instances are pairs of axes") };
+            Ok(Box::new(Capacitive { tm, from, to, size: request.size }))
         },
     },
     Kind {
@@ -43,9 +43,9 @@ pub(super) const KINDS: &[Kind] = &[
         size: LEVER,
         help: "interferometer: x shows SIZE times the test mass's angle θ too",
         shape: &[Shape { name: "psi_m_rad", number: LEVER, default: 0.0, help: "and this times its ψ, m/rad" }],
-        build: |asked, _| {
-            let Place::Tm(tm) = asked.place else { unreachable!("instances are test masses") };
-            Ok(Box::new(TiltToLength { tm, theta_m_rad: asked.size, psi_m_rad: asked.shape("psi_m_rad") }))
+        build: |request, _| {
+            let Place::Tm(tm) = request.place else { unreachable!("instances are test masses") };
+            Ok(Box::new(TiltToLength { tm, theta_m_rad: request.size, psi_m_rad: request.shape("psi_m_rad") }))
         },
     },
     Kind {
@@ -132,9 +132,9 @@ struct TimeOffset {
     vectors: usize,
 }
 
-fn build(asked: &Asked, basis: &Basis<'_>) -> Built {
-    let Place::Instrument(instrument) = asked.place else { unreachable!("instances are instruments") };
-    let late = asked.size / basis.mission.dt_s();
+fn build(request: &EffectRequest, basis: &Basis<'_>) -> Built {
+    let Place::Instrument(instrument) = request.place else { unreachable!("instances are instruments") };
+    let late = request.size / basis.mission.dt_s();
     let vectors = 2 * basis.mission.test_mass.len() + 1;
     Ok(Box::new(TimeOffset { instrument, samples: late as usize, part: late.fract(), past: VecDeque::new(), vectors }))
 }

@@ -3,7 +3,7 @@
 use nalgebra::{Matrix2, Vector2};
 use std::f64::consts::TAU;
 
-use super::asked::{Asked, Built, Kind, Number, Place, Shape};
+use super::request::{Built, EffectRequest, Kind, Number, Place, Shape};
 use super::{Basis, Cause, Moment, along};
 use crate::plant::Loads;
 
@@ -40,12 +40,12 @@ struct Slosh {
     state: Vector2<f64>,
 }
 
-fn build(asked: &Asked, basis: &Basis<'_>) -> Built {
-    let Place::ScAxis(axis) = asked.place else { unreachable!("instances are axes of the spacecraft") };
-    let (omega, zeta) = (TAU * asked.shape("f0_hz"), asked.shape("zeta"));
+fn build(request: &EffectRequest, basis: &Basis<'_>) -> Built {
+    let Place::ScAxis(axis) = request.place else { unreachable!("instances are axes of the spacecraft") };
+    let (omega, zeta) = (TAU * request.shape("f0_hz"), request.shape("zeta"));
     let dt_s = basis.mission.dt_s();
     let mass_kg = basis.mission.spacecraft.mass_kg;
-    let rest_kg = mass_kg * (1.0 - asked.size);
+    let rest_kg = mass_kg * (1.0 - request.size);
     let raised = mass_kg / rest_kg;
     let rates = Matrix2::new(0.0, 1.0, -raised * omega * omega, -raised * 2.0 * zeta * omega);
     // ∫ exp(A s) ds as a series: |A| dt < 1 keeps every digit, larger ones lose none that matter.
@@ -56,7 +56,7 @@ fn build(asked: &Asked, basis: &Basis<'_>) -> Built {
         term = rates * term * (dt_s / f64::from(k + 1));
     }
     let input = integral * Vector2::new(0.0, -1.0 / rest_kg);
-    Ok(Box::new(Slosh { axis, slug_kg: mass_kg * asked.size, transition, input, dt_s, state: Vector2::zeros() }))
+    Ok(Box::new(Slosh { axis, slug_kg: mass_kg * request.size, transition, input, dt_s, state: Vector2::zeros() }))
 }
 
 impl Cause for Slosh {

@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Vector3};
 use rand_xoshiro::Xoshiro256PlusPlus;
 
-use super::asked::{Asked, Kind, Number, Place, Shape, test_masses, tm_axes};
+use super::request::{EffectRequest, Kind, Number, Place, Shape, test_masses, tm_axes};
 use super::{Cause, Moment, along};
 use crate::interior::{FIELD_T, GRADIENT_T_M, Interior, of_housing};
 use crate::plant::Loads;
@@ -27,7 +27,7 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("m s-2 K-1", -1e-8, 1e-8),
         help: "SIZE times the temperature of the positive face of the housing minus that of the negative one, behind a lag",
         shape: &[Shape { name: "lag_s", number: LAG, default: 480.0, help: "lag, s" }],
-        build: |asked, _| Ok(Lagged::boxed(asked, |inside, tm, axis| inside.across_k[tm][axis])),
+        build: |request, _| Ok(Lagged::boxed(request, |inside, tm, axis| inside.across_k[tm][axis])),
     },
     Kind {
         id: "magnetic",
@@ -40,9 +40,9 @@ pub(super) const KINDS: &[Kind] = &[
             default: 0.0,
             help: "remanent moment along x, A m²",
         }],
-        build: |asked, _| {
-            let Place::Tm(tm) = asked.place else { unreachable!("instances are test masses") };
-            Ok(Box::new(Magnetic { tm, susceptibility: asked.size, moment_a_m2: asked.shape("moment_a_m2") }))
+        build: |request, _| {
+            let Place::Tm(tm) = request.place else { unreachable!("instances are test masses") };
+            Ok(Box::new(Magnetic { tm, susceptibility: request.size, moment_a_m2: request.shape("moment_a_m2") }))
         },
     },
     Kind {
@@ -51,9 +51,9 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("V", -10.0, 10.0),
         help: "stray voltage across x: charge/C ∂C/∂x SIZE, along x",
         shape: &[],
-        build: |asked, _| {
-            let Place::Tm(tm) = asked.place else { unreachable!("instances are test masses") };
-            Ok(Box::new(Charge { tm, voltage_v: asked.size }))
+        build: |request, _| {
+            let Place::Tm(tm) = request.place else { unreachable!("instances are test masses") };
+            Ok(Box::new(Charge { tm, voltage_v: request.size }))
         },
     },
     Kind {
@@ -62,7 +62,7 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("m s-2 A-2", -1e-8, 1e-8),
         help: "SIZE times the square of the battery's current, behind a lag",
         shape: &[Shape { name: "lag_s", number: LAG, default: 50.0, help: "lag, s" }],
-        build: |asked, _| Ok(Lagged::boxed(asked, |inside, _, _| inside.battery_a * inside.battery_a)),
+        build: |request, _| Ok(Lagged::boxed(request, |inside, _, _| inside.battery_a * inside.battery_a)),
     },
     Kind {
         id: "product-force",
@@ -70,8 +70,10 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("m s-2 A-1 K-1", -1e-8, 1e-8),
         help: "SIZE times the product of battery current and structure temperature, each about its level",
         shape: &[],
-        build: |asked, _| {
-            Ok(Lagged::boxed(asked, |inside, _, _| (inside.battery_a - CURRENT_A) * (inside.structure_k - STRUCTURE_K)))
+        build: |request, _| {
+            Ok(Lagged::boxed(request, |inside, _, _| {
+                (inside.battery_a - CURRENT_A) * (inside.structure_k - STRUCTURE_K)
+            }))
         },
     },
 ];
@@ -88,10 +90,10 @@ struct Lagged {
 }
 
 impl Lagged {
-    fn boxed(asked: &Asked, driver: fn(&Interior, usize, usize) -> f64) -> Box<dyn Cause> {
-        let Place::TmAxis(tm, axis) = asked.place else { unreachable!("instances are axes of a test mass") };
-        let lag_s = if asked.kind.shape.is_empty() { 0.0 } else { asked.shape("lag_s") };
-        Box::new(Self { tm, axis, size: asked.size, lag_s, driver, value: None })
+    fn boxed(request: &EffectRequest, driver: fn(&Interior, usize, usize) -> f64) -> Box<dyn Cause> {
+        let Place::TmAxis(tm, axis) = request.place else { unreachable!("instances are axes of a test mass") };
+        let lag_s = if request.kind.shape.is_empty() { 0.0 } else { request.shape("lag_s") };
+        Box::new(Self { tm, axis, size: request.size, lag_s, driver, value: None })
     }
 }
 

@@ -1,5 +1,5 @@
-//! The constellation's frame and how it turns (eqs TCI_transformation, CRF_angular_velocity, CRF_angular_acceleration), from
-//! positions, velocities and accelerations, without differences in time.
+//! The constellation's frame and how it turns (eqs TCI_transformation, CRF_angular_velocity, CRF_angular_acceleration),
+//! from positions, velocities and accelerations, without differences in time.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -100,8 +100,8 @@ mod tests {
     use super::*;
     use nalgebra::Rotation3;
 
-    /// Arms of fixed lengths that turn with `ω(t) = (ω_0 + α t)` about a fixed axis: CRF's rates are that rotation's, in body
-    /// axes, where the axis is fixed as well.
+    /// Arms of fixed lengths that turn with `ω(t) = (ω_0 + α t)` about a fixed axis: CRF's rates are that rotation's,
+    /// in body axes, where the axis is fixed as well.
     #[test]
     fn a_turning_triangle_tells_its_rotation() {
         let axis = Vector3::new(0.3, -0.5, 0.8).normalize();

@@ -1,8 +1,9 @@
 //! The triangle at its epoch: three Kepler orbits of one eccentricity and inclination, a third of a turn apart.
 //!
-//! S. V. Dhurandhar et al., Class. Quantum Grav. 22 (2005) 481, with the tilt of K. R. Nayak et al., Class. Quantum Grav. 23 (2006)
-//! 1763: π/3 + 5α/8 for the angle between triangle and ecliptic, where α is arm length over the diameter of the Earth's
-//! orbit, which leaves the arms least flexing. For Taiji: B. Wu et al., Phys. Rev. D 100 (2019) 122001.
+//! S. V. Dhurandhar et al., Class. Quantum Grav. 22 (2005) 481, with the tilt of K. R. Nayak et al., Class. Quantum
+//! Grav. 23 (2006) 1763: π/3 + 5α/8 for the angle between triangle and ecliptic, where α is arm length over the
+//! diameter of the Earth's orbit, which leaves the arms least flexing. For Taiji: B. Wu et al., Phys. Rev. D 100 (2019)
+//! 122001.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -19,7 +20,8 @@ pub(super) fn dcm_irf_from_ecliptic() -> Matrix3<f64> {
     Matrix3::new(1.0, 0.0, 0.0, 0.0, c, -s, 0.0, s, c)
 }
 
-/// SC1, SC2 and SC3 around a centre at the given ecliptic longitude, SC1 at its aphelion and highest above the ecliptic.
+/// SC1, SC2 and SC3 around a centre at the given ecliptic longitude, SC1 at its aphelion and highest above the
+/// ecliptic.
 pub(super) fn triangle(longitude_rad: f64, arm_m: f64) -> [State; 3] {
     let alpha = arm_m / (2.0 * AU_M);
     let (e, inclination) = shape(alpha, std::f64::consts::FRAC_PI_3 + 0.625 * alpha);
@@ -35,7 +37,8 @@ fn shape(alpha: f64, tilt_rad: f64) -> (f64, f64) {
     (out.hypot(up) - 1.0, up.atan2(out))
 }
 
-/// A spacecraft whose aphelion, the highest point of its orbit, has the longitude `apse_rad`, at `anomaly_rad` from there.
+/// A spacecraft whose aphelion, the highest point of its orbit, has the longitude `apse_rad`, at `anomaly_rad` from
+/// there.
 pub(super) fn on_orbit(e: f64, inclination_rad: f64, apse_rad: f64, anomaly_rad: f64) -> State {
     // Counted from aphelion, Kepler's equation is E + e sin E = M.
     let mut anomaly = anomaly_rad;
@@ -79,8 +82,8 @@ mod tests {
         assert!((ecliptic.y.atan2(ecliptic.x) - 1.2).abs() < 1e-12 && ecliptic.z > 0.0);
     }
 
-    /// Arms of 5e9 m, the Sun alone, one year. K. R. Nayak et al. (IUCAA preprint 31/05, "Reducing the flexing of the arms of
-    /// LISA") tell a flexing of about 48,000 km where the untilted triangle has 115,000 km.
+    /// Arms of 5e9 m, the Sun alone, one year. K. R. Nayak et al. (IUCAA preprint 31/05, "Reducing the flexing of the
+    /// arms of LISA") tell a flexing of about 48,000 km where the untilted triangle has 115,000 km.
     #[test]
     fn the_tilt_leaves_the_published_flexing() {
         let alpha = 5e9 / (2.0 * AU_M);

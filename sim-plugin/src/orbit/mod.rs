@@ -1,8 +1,8 @@
 //! Where the constellation is and how it turns: what CRF, the gravity gradient and the Sun's direction need.
 //!
-//! Absolute positions serve nothing else: at one astronomical unit a float has 3e-5 m of grain. Of the arms that is 1e-14, so
-//! the frame's axes have 1e-14 rad of grain, `ω_CI` some 1e-21 rad/s and `ω̇_CI` some 1e-27 rad/s²: next to 2e-7 rad/s
-//! and 3e-14 rad/s², nothing.
+//! Absolute positions serve nothing else: at one astronomical unit a float has 3e-5 m of grain. Of the arms that is
+//! 1e-14, so the frame's axes have 1e-14 rad of grain, `ω_CI` some 1e-21 rad/s and `ω̇_CI` some 1e-27 rad/s²: next to
+//! 2e-7 rad/s and 3e-14 rad/s², nothing.
 
 mod crf;
 mod elements;
@@ -113,8 +113,8 @@ impl Constellation {
         self.ephemeris.check(what, time_ns)
     }
 
-    /// Position and velocity of our spacecraft and of those at the far ends of its arms (SC1, SC2, SC3 for SC1), at a time,
-    /// Unix ns.
+    /// Position and velocity of our spacecraft and of those at the far ends of its arms (SC1, SC2, SC3 for SC1), at a
+    /// time, Unix ns.
     ///
     /// # Errors
     /// [`OrbitError::Span`].

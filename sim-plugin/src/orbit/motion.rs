@@ -1,7 +1,8 @@
 //! Motion of the three spacecraft under the Sun and the Earth (eq:a_g), heliocentric, on a fixed grid of nodes.
 //!
-//! The origin is the Sun, which the Earth pulls as well: next to the printed terms stands the indirect one, `−μ_e r_e/r_e³`.
-//! Forces but gravity are left out: what sunlight does to an orbit is what a drag-free controller takes away.
+//! The origin is the Sun, which the Earth pulls as well: next to the printed terms stands the indirect one,
+//! `−μ_e r_e/r_e³`. Forces but gravity are left out: what sunlight does to an orbit is what a drag-free controller
+//! takes away.
 
 use nalgebra::Vector3;
 
@@ -98,7 +99,8 @@ fn nodes(field: &impl Field, start: [State; 3], step_s: f64, length_s: f64) -> R
     Ok(nodes)
 }
 
-/// One step by extrapolated Störmer sums (E. Hairer, S. P. Nørsett, G. Wanner, Solving Ordinary Differential Equations I, II.14).
+/// One step by extrapolated Störmer sums (E. Hairer, S. P. Nørsett, G. Wanner, Solving Ordinary Differential Equations
+/// I, II.14).
 fn step(field: &impl Field, start: &[State; 3], at_s: f64, step_s: f64) -> Result<[State; 3], OrbitError> {
     let r0 = start.map(|s| s.r_irf_m);
     let first = field.accelerations(at_s, &r0)?;

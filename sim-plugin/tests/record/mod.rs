@@ -85,8 +85,9 @@ pub(crate) fn requirement_psd(mission: &Mission, channel: &str, f_hz: f64) -> f6
     asd * asd
 }
 
-/// Lengths of Welch's segments, s, and the bands for which each is used, Hz. A band begins four bins or more above zero: the
-/// main lobe of the window is four bins wide, and spectra that fall as 1/f⁴ in power would leak into a lower one by half.
+/// Lengths of Welch's segments, s, and the bands for which each is used, Hz. A band begins four bins or more above
+/// zero: the main lobe of the window is four bins wide, and spectra that fall as 1/f⁴ in power would leak into a lower
+/// one by half.
 pub(crate) const RESOLUTIONS: [(f64, f64, f64); 3] =
     [(40_000.0, 1e-4, 1e-3), (5_000.0, 1e-3, 1e-2), (500.0, 1e-2, 1.0)];
 

@@ -16,7 +16,7 @@ pub(super) fn execute(command: &Arguments, json: bool, paint: Paint) -> Result<D
     };
     let (fitted, held_out) = (open(&command.products)?, open(&command.held_out)?);
     let truth = command.truth.as_deref().map(truth::first).transpose()?.unwrap_or_default();
-    let ladder = ladder(&fitted, &held_out, &|name| truth::offset(&truth, name)).map_err(Failure::engine)?;
+    let ladder = ladder(&fitted, &held_out, &|name| dragfree_score::offset(&truth, name)).map_err(Failure::engine)?;
     if let Some(path) = &command.picture {
         let picture = svg(&panels(&ladder), 2).map_err(Failure::engine)?;
         std::fs::write(path, picture).map_err(Failure::io("write", path))?;

@@ -190,8 +190,8 @@ impl EffectEntry {
         coefficient.strip_prefix(&self.coefficient()).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
     }
 
-    /// Refuses an instance that the plugin does not have on a mission, or on any where it is not known; a plugin that lists none
-    /// takes any.
+    /// Refuses an instance that the plugin does not have on a mission, or on any where it is not known; a plugin that
+    /// lists none takes any.
     ///
     /// # Errors
     /// A sentence that lists what there is.

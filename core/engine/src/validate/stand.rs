@@ -53,18 +53,21 @@ pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) 
             });
         }
     }
+    // Test masses of the interface with their frames.
+    let displaced = raw.iter().filter_map(|c| Some((c.name.strip_suffix(".r_orf_m.x")?, c.frame.as_str())));
+    let test_masses: BTreeMap<&str, &str> = displaced.collect();
     let mut reconstruction = Vec::new();
     let mut known = |name: String| {
         let meaning = unit_and_frame(&name);
         // Which of the mission's noises a displacement is read with.
-        let along_x = matches!(name.as_str(), "tm1.r_orf_m.x" | "tm2.r_orf_m.x");
+        let along_x = name.ends_with(".r_orf_m.x");
         let noise = [("noise", "ifo_x")];
         reconstruction.push(column("reconstruction", name, meaning, if along_x { &noise } else { &[] }));
     };
     for axis in AXES {
         known(format!("sc.alpha_srf_rad_s2.{axis}"));
         known(format!("sc.omega_srf_rad_s.{axis}"));
-        for tm in ["tm1", "tm2"] {
+        for tm in test_masses.keys() {
             known(format!("{tm}.r_orf_m.{axis}"));
             known(format!("{tm}.u_orf_m_s2.{axis}"));
         }
@@ -72,8 +75,7 @@ pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) 
     // What a reconstruction gives on demand (`needs`): commands as they acted, answers of α̂ to torque gains and to a
     // delay.
     let commands = ["mps_force_srf_n", "mps_torque_srf_nm", "sun_srf"].map(str::to_owned).into_iter();
-    let of_tm =
-        ["tm1", "tm2"].into_iter().flat_map(|tm| ["force_orf_n", "torque_orf_nm"].map(|what| format!("{tm}.{what}")));
+    let of_tm = test_masses.keys().flat_map(|tm| ["force_orf_n", "torque_orf_nm"].map(|what| format!("{tm}.{what}")));
     for vector in commands.chain(of_tm) {
         AXES.iter().for_each(|axis| known(format!("used.{vector}.{axis}")));
     }
@@ -85,9 +87,8 @@ pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) 
         let name = format!("response.alpha_srf_rad_s2.by_dws_delay.{axis}");
         reconstruction.push(column("reconstruction", name, meaning, &[]));
     }
-    for (body, quantity, unit, frame) in
-        [("tm1", "accel", "m s-2", "ORF_1"), ("tm2", "accel", "m s-2", "ORF_2"), ("sc", "alpha", "rad s-2", "SRF")]
-    {
+    let accelerations = test_masses.iter().map(|(tm, frame)| (*tm, "accel", "m s-2", *frame));
+    for (body, quantity, unit, frame) in accelerations.chain([("sc", "alpha", "rad s-2", "SRF")]) {
         for axis in AXES {
             let name = format!("{body}.{quantity}.{axis}");
             let meaning = (unit.to_owned(), frame.to_owned());

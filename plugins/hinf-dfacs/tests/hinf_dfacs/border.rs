@@ -68,7 +68,7 @@ impl Grid {
                 }
             }
             let first = columns.iter().position(|c| c.name.starts_with("command.")).expect("commands");
-            for (values, command) in rows.columns[first..].iter_mut().zip(epoch.command) {
+            for (values, command) in rows.columns[first..].iter_mut().zip(epoch.command.iter().copied()) {
                 *values.last_mut().expect("a row") = command;
             }
         }
@@ -273,7 +273,8 @@ fn another_controller_is_noticed() {
     assert!(quiet["quality"].get("command_replay").is_none(), "{quiet}");
 }
 
-/// The columns on demand change nothing of the others, through the stretch that is held back for the levels of the noise and after.
+/// The columns on demand change nothing of the others, through the stretch that is held back for the levels of the
+/// noise and after.
 #[test]
 fn what_is_asked_for_comes_beside_the_rest() {
     let grid = Grid::of_the_loop(34_000);
@@ -283,22 +284,22 @@ fn what_is_asked_for_comes_beside_the_rest() {
         ("torque-response", "response.alpha_srf_rad_s2.by_torque_gain.x.x", "rad s-2", "SRF", 9),
         ("dws-delay-response", "response.alpha_srf_rad_s2.by_dws_delay.x", "rad s-3", "SRF", 3),
     ] {
-        let asked = run_asked(&grid, &json!({"compare_commands": false}), 4096, &[needs]);
-        assert_eq!(asked.columns[..27], usual.columns);
-        assert_eq!(asked.rows.time_ns, usual.rows.time_ns);
+        let on_demand = run_asked(&grid, &json!({"compare_commands": false}), 4096, &[needs]);
+        assert_eq!(on_demand.columns[..27], usual.columns);
+        assert_eq!(on_demand.rows.time_ns, usual.rows.time_ns);
         let bits = |o: &Output| -> Vec<u64> { o.rows.columns[..27].iter().flatten().map(|v| v.to_bits()).collect() };
-        assert!(bits(&asked) == bits(&usual), "{needs}");
-        let column = &asked.columns[27];
+        assert!(bits(&on_demand) == bits(&usual), "{needs}");
+        let column = &on_demand.columns[27];
         assert_eq!((column.name.as_str(), column.unit.as_str(), column.frame.as_str()), (first, unit, frame));
-        assert_eq!((asked.columns.len(), column.attributes["kind"].as_str()), (27 + count, "series"));
+        assert_eq!((on_demand.columns.len(), column.attributes["kind"].as_str()), (27 + count, "series"));
         assert!(
-            asked.rows.columns[27..].iter().all(|c| c.len() == 34_000 && c.iter().all(|x| x.is_finite())),
+            on_demand.rows.columns[27..].iter().all(|c| c.len() == 34_000 && c.iter().all(|x| x.is_finite())),
             "{needs}"
         );
     }
     let at = |rows: &Grid, name: &str| rows.columns.iter().position(|c| c.name == name).expect("a column");
-    let asked = run_asked(&grid, &json!({"compare_commands": false}), 4096, &["commands"]);
-    for (column, values) in asked.columns.iter().zip(&asked.rows.columns).skip(27) {
+    let on_demand = run_asked(&grid, &json!({"compare_commands": false}), 4096, &["commands"]);
+    for (column, values) in on_demand.columns.iter().zip(&on_demand.rows.columns).skip(27) {
         let told = column.name.replace("used.sun_srf", "ephemeris.sun_srf").replace("used.", "command.");
         assert_eq!(*values, grid.rows.columns[at(&grid, &told)], "{told}");
     }

@@ -1,8 +1,8 @@
 //! The attitude loop of the paper's spacecraft, with the mission's own control law and the test masses at rest.
 
-use dragfree_hinf_dfacs::asked::Needs;
 use dragfree_hinf_dfacs::known::KnownModel;
-use dragfree_hinf_dfacs::pilot::Scale;
+use dragfree_hinf_dfacs::noise_calibration::NoiseScale;
+use dragfree_hinf_dfacs::on_demand::Needs;
 use dragfree_hinf_dfacs::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Row, Settings};
 use dragfree_hinf_dfacs::replay::{CommandNumbers, ReadoutNumbers};
 use dragfree_physics::control::{ControlLaw, Readout, TestMassReadout};
@@ -16,8 +16,8 @@ pub(crate) const DT_S: f64 = 1.0 / RATE_HZ;
 /// Every column on demand.
 pub(crate) const EVERYTHING: Needs = Needs { commands: true, torque_response: true, dws_delay_response: true };
 
-/// The default mission without sunlight, so that nothing but the loop moves the spacecraft, with its controllers designed
-/// once for all tests.
+/// The default mission without sunlight, so that nothing but the loop moves the spacecraft, with its controllers
+/// designed once for all tests.
 pub(crate) fn mission() -> Mission {
     static MISSION: OnceLock<Mission> = OnceLock::new();
     MISSION.get_or_init(designed).clone()
@@ -48,7 +48,7 @@ pub(crate) fn settings(angular_acceleration: AngularAcceleration) -> Settings {
         sun: false,
         replay: false,
         warm_up_s: 60.0,
-        scale: Scale::nominal(),
+        scale: NoiseScale::nominal(),
         needs: Needs::default(),
     }
 }

@@ -1,7 +1,7 @@
 //! Thrusters one by one: the force that comes with their torque would pass for the offset.
 //!
-//! Loop and stage are linear, so that impulses of every thruster and every sensor through both give the exact offset that a
-//! long record leads to where the truth has none.
+//! Loop and stage are linear, so that impulses of every thruster and every sensor through both give the exact offset
+//! that a long record leads to where the truth has none.
 
 use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::Smoother;
 use dragfree_hinf_dfacs::reconstruction::Row;
@@ -28,7 +28,8 @@ fn with(thrusters: Option<Thrusters>) -> Mission {
     Mission { thrusters, ..mission() }
 }
 
-/// Rows of the stage that is told a mission, after an impulse: of a thruster's thrust, 1e-7 N, or of a sensor, 1e-9 rad.
+/// Rows of the stage that is told a mission, after an impulse: of a thruster's thrust, 1e-7 N, or of a sensor, 1e-9
+/// rad.
 fn rows(told: &Mission, torque_nm: &Vector3<f64>, error_rad: &Vector3<f64>) -> Vec<Row> {
     let mut body = AttitudeLoop::new(&mission());
     let zero = Vector3::zeros();
@@ -89,8 +90,8 @@ fn offset_found(told: &Mission) -> Vector3<f64> {
     information.try_inverse().expect("all axes turn") * right
 }
 
-/// At 3 mHz the smoother gives (0.1 mHz/f)² = 1.1e-3 of the noise to its wandering torque, with which no force comes, and less
-/// above: so much of the twin's 5.6 mm may be left.
+/// At 3 mHz the smoother gives (0.1 mHz/f)² = 1.1e-3 of the noise to its wandering torque, with which no force comes,
+/// and less above: so much of the twin's 5.6 mm may be left.
 #[test]
 fn the_force_that_comes_with_a_torque_is_known() {
     let found = offset_found(&with(Some(layout())));

@@ -1,11 +1,11 @@
 //! Tests of the stage, in one program.
 
-mod asked;
 mod border;
+mod command_consistency;
 mod common;
 mod correlation;
 mod noise;
-mod obedience;
+mod on_demand;
 mod posterior;
 mod slope;
 mod stream;

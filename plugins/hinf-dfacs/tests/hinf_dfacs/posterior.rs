@@ -35,8 +35,8 @@ fn sensing(corner_hz: f64, exponent: u32) -> NoiseShape {
 }
 
 /// Least squares over every unknown at once: attitude and rate at the start and after each missing command, `β_0` and
-/// its steps, `w_k`, and the coloured noise `n` of exponent 2 (one state) or 4 (two), leaking at 1 µHz, with its steps. Gives
-/// `β_k + w_k` and the rate of `θ + n`.
+/// its steps, `w_k`, and the coloured noise `n` of exponent 2 (one state) or 4 (two), leaking at 1 µHz, with its steps.
+/// Gives `β_k + w_k` and the rate of `θ + n`.
 fn dense(corner_hz: f64, exponent: u32) -> (Vec<f64>, Vec<f64>) {
     let w_sigma = (TORQUE_PSD * 5.0).sqrt() / MOMENT_KG_M2;
     let step_sigma = w_sigma * TAU * 1e-4 * DT_S;
@@ -88,8 +88,9 @@ fn dense(corner_hz: f64, exponent: u32) -> (Vec<f64>, Vec<f64>) {
             cuts += 1;
         }
         beta += row(step);
-        // White noise of the intensity integrated once or twice over a sample: a step of variance `I dt`, and one of position
-        // and rate with `[dt³/3, dt²/2; dt²/2, dt] I`, whose position is half the rate's step and `dt³/12` of its own.
+        // White noise of the intensity integrated once or twice over a sample: a step of variance `I dt`, and one of
+        // position and rate with `[dt³/3, dt²/2; dt²/2, dt] I`, whose position is half the rate's step and `dt³/12` of
+        // its own.
         let (first, second) = (5 + 4 * k, 6 + 4 * k);
         match exponent {
             2 => {
@@ -149,8 +150,8 @@ fn errors(smoothed: &[Smoothed], (disturbances, omegas): &(Vec<f64>, Vec<f64>)) 
     worst
 }
 
-/// What the leak does to the posterior is of the order of its decay over the 8 s, 5e-5, of the part of noise; the other terms
-/// are exact to the rounding of the dense solution.
+/// What the leak does to the posterior is of the order of its decay over the 8 s, 5e-5, of the part of noise; the other
+/// terms are exact to the rounding of the dense solution.
 #[test]
 fn smoother_gives_the_posterior_mean() {
     for (corner_hz, exponent, bound) in [(0.0, 0, 1e-6), (2e-3, 4, 1e-6), (0.08, 4, 5e-5), (0.2, 2, 5e-5)] {
@@ -160,8 +161,8 @@ fn smoother_gives_the_posterior_mean() {
     }
 }
 
-/// The twin: noise of the same strength that the smoother is not told of is taken for motion, by twenty times the bound and
-/// more.
+/// The twin: noise of the same strength that the smoother is not told of is taken for motion, by twenty times the bound
+/// and more.
 #[test]
 fn a_smoother_without_colour_misses_the_posterior() {
     for (corner_hz, exponent) in [(0.08, 4), (0.2, 2)] {

@@ -1,10 +1,10 @@
 //! The crux of the calibration: the truth regressed on `α̂` has slope one.
 //!
 //! First without chance: the loop and the stage are linear, so impulses through both give every transfer function and
-//! with them the slope itself, `Re ∫S_αα̂ / ∫S_α̂α̂`. By chance alone a slope has the variance `∫S_e S_α̂ / (2T (∫S_α̂)²)`,
-//! `S_e` being the error's spectrum: to show 0.2 % at four standard deviations a Hann-weighted record would have to be
-//! six days long for 0.1 to 1 Hz, seven months for 10 to 100 mHz and fourteen for 1 to 10 mHz.
-//! Then with chance, on a record of 29 hours, at five standard deviations.
+//! with them the slope itself, `Re ∫S_αα̂ / ∫S_α̂α̂`. By chance alone a slope has the variance
+//! `∫S_e S_α̂ / (2T (∫S_α̂)²)`, `S_e` being the error's spectrum: to show 0.2 % at four standard deviations a
+//! Hann-weighted record would have to be six days long for 0.1 to 1 Hz, seven months for 10 to 100 mHz and fourteen for
+//! 1 to 10 mHz. Then with chance, on a record of 29 hours, at five standard deviations.
 
 use crate::common::{AttitudeLoop, DT_S, RATE_HZ, late, levels, mission, run, settings, stage};
 use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::{self, Commanded, SecondDifference, Smoother};
@@ -62,8 +62,8 @@ pub(crate) struct Against {
 /// `α̂` carries information where it explains at least a tenth of the truth's power.
 const INFORMED: f64 = 0.1;
 
-/// Slope of the truth on `α̂` per decade and axis, exactly, of noise of the mission `flown` through a stage that is told
-/// `told`. The controllers are the same.
+/// Slope of the truth on `α̂` per decade and axis, exactly, of noise of the mission `flown` through a stage that is
+/// told `told`. The controllers are the same.
 fn against(flown: &Mission, told: &Mission, method: AngularAcceleration) -> [[Against; 3]; 4] {
     let responses: Vec<_> = (0..6).map(|input| response(flown, told, method, input)).collect();
     of_responses(flown, &responses)
@@ -121,8 +121,8 @@ fn judged(flown: &Mission, told: &Mission) -> (usize, Vec<String>) {
     (informed().count(), off.collect())
 }
 
-/// The default noise, the quieter regime, sensing ten times and ten thousand times noisier, and a rise below 20 mHz: under
-/// each `α̂` carries information in every decade, if only what the loop makes of the sensing's noise.
+/// The default noise, the quieter regime, sensing ten times and ten thousand times noisier, and a rise below 20 mHz:
+/// under each `α̂` carries information in every decade, if only what the loop makes of the sensing's noise.
 #[test]
 fn truth_on_smoothed_acceleration_has_slope_one() {
     for (asd, corner_hz) in [(5e-10, 2e-3), (2.09e-10, 2e-3), (5e-9, 2e-3), (5e-6, 2e-3), (5e-10, 2e-2)] {

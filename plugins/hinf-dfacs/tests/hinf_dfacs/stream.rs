@@ -1,7 +1,7 @@
 //! The stage as a stream: rows, gaps, states, replayed commands, the turning of CRF.
 
 use crate::common::{AttitudeLoop, EVERYTHING, RATE_HZ, late, levels, mission, run, settings, stage, still, unknown};
-use dragfree_hinf_dfacs::pilot;
+use dragfree_hinf_dfacs::noise_calibration;
 use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::{Commanded, Smoother};
 use dragfree_hinf_dfacs::reconstruction::{Epoch, Reconstruction, Row, Settings, levels_of};
 use dragfree_physics::mission::Mission;
@@ -25,7 +25,7 @@ pub(crate) fn telemetry(mission: &Mission, epochs: usize) -> (Vec<Epoch>, Vec<Ve
 }
 
 fn bits(rows: &[Row]) -> Vec<(i64, Vec<u64>)> {
-    rows.iter().map(|r| (r.time_ns, r.values.iter().chain(&r.asked).map(|v| v.to_bits()).collect())).collect()
+    rows.iter().map(|r| (r.time_ns, r.values.iter().chain(&r.on_demand).map(|v| v.to_bits()).collect())).collect()
 }
 
 pub(crate) fn alpha(row: &Row) -> Vector3<f64> {
@@ -154,8 +154,9 @@ fn missing_sensing_leaves_the_acceleration() {
     assert!(error < 4.0 * noise, "{error} against {noise}");
 }
 
-/// Hours without sensing leave commands alone: from the smoother's memory of 2.8 s into the gap to as long before its end
-/// nothing is given for the acceleration, whatever the blocks. The truth there regressed on the command has a slope far below one.
+/// Hours without sensing leave commands alone: from the smoother's memory of 2.8 s into the gap to as long before its
+/// end nothing is given for the acceleration, whatever the blocks. The truth there regressed on the command has a slope
+/// far below one.
 #[test]
 fn without_sensing_for_hours_no_acceleration_is_invented() {
     let mission = mission();
@@ -334,8 +335,8 @@ fn sunlight_that_nobody_has_seen_yet_is_not_guessed() {
     }
 }
 
-/// Holes of up to five readouts are bridged in the channels alone: these have a value everywhere, off by the readout's noise
-/// differenced twice, while the readouts stay missing; a hole of six is a hole.
+/// Holes of up to five readouts are bridged in the channels alone: these have a value everywhere, off by the readout's
+/// noise differenced twice, while the readouts stay missing; a hole of six is a hole.
 #[test]
 fn short_holes_are_bridged_in_the_channels_alone() {
     let m = mission();
@@ -374,13 +375,15 @@ fn short_holes_are_bridged_in_the_channels_alone() {
             }
         }
     }
-    // Weights −1/6, 2/3, 2/3, −1/6 and the missing noise itself: variance 1 + 0.944. χ² of six holes at 1e-4: 0.11 to 4.6.
+    // Weights −1/6, 2/3, 2/3, −1/6 and the missing noise itself: variance 1 + 0.944. χ² of six holes at 1e-4: 0.11 to
+    // 4.6.
     let ratio: f64 = squares / count / 1.944;
     assert!(count == 6.0 && (0.11..4.6).contains(&ratio), "{ratio}");
     assert_eq!(tested.counts().readouts_bridged, 6 * (1 + 2 + 3 + 4 + 5));
 }
 
-/// Without a word of the second test mass's electrodes the first goes on, its û off by the recoil alone; the second has none.
+/// Without a word of the second test mass's electrodes the first goes on, its û off by the recoil alone; the second has
+/// none.
 #[test]
 fn one_silent_test_mass_does_not_silence_the_other() {
     let m = mission();
@@ -405,9 +408,10 @@ fn one_silent_test_mass_does_not_silence_the_other() {
     assert_eq!((counts.commands_of_one_test_mass, counts.commands_missing), (2000, 0));
 }
 
-/// Levels measured in 55 minutes: with the mission's own noise nothing replaces it, and torque three times as loud about one axis,
-/// or sensing twice, are found. The torque's level rests on 14 bins of 31 segments that overlap: σ = 1/√(14 · 31 · 0.95) = 0.05;
-/// 4σ either way for three axes, two false alarms in ten thousand. The sensing's is known to half a per cent.
+/// Levels measured in 55 minutes: with the mission's own noise nothing replaces it, and torque three times as loud
+/// about one axis, or sensing twice, are found. The torque's level rests on 14 bins of 31 segments that overlap: σ =
+/// 1/√(14 · 31 · 0.95) = 0.05; 4σ either way for three axes, two false alarms in ten thousand. The sensing's is known
+/// to half a per cent.
 #[test]
 fn the_first_stretch_tells_the_levels_of_the_noise() {
     let m = mission();
@@ -415,7 +419,7 @@ fn the_first_stretch_tells_the_levels_of_the_noise() {
         let [t, s] = levels(&m).map(|psd| (0.5 * psd * RATE_HZ).sqrt());
         let mut random = Xoshiro256PlusPlus::seed_from_u64(seed);
         let mut body = AttitudeLoop::new(&m);
-        let epochs: Vec<Epoch> = (0..pilot::length(RATE_HZ))
+        let epochs: Vec<Epoch> = (0..noise_calibration::length(RATE_HZ))
             .map(|_| {
                 let mut gauss = |sigma: f64| {
                     Vector3::from_fn(|_, _| sigma * Distribution::<f64>::sample(&StandardNormal, &mut random))
@@ -426,10 +430,11 @@ fn the_first_stretch_tells_the_levels_of_the_noise() {
             .collect();
         let rows = run(&mut stage(&m, &settings(Smoother)), &epochs);
         let (held, readout) = levels_of(&m).expect("the fixture has noise");
-        pilot::measure(&rows, RATE_HZ, &held, readout)
+        let channels: Vec<_> = rows.iter().map(Row::attitude_channels).collect();
+        noise_calibration::measure(&channels, RATE_HZ, &held, readout)
     };
     for seed in 1..=3 {
-        assert_eq!(measured(1.0, 1.0, seed), pilot::Scale::nominal());
+        assert_eq!(measured(1.0, 1.0, seed), noise_calibration::NoiseScale::nominal());
     }
     let loud = measured(3.0, 1.0, 4);
     assert!((loud.torque.y / 9.0 - 1.0).abs() < 0.2 && loud.torque.x == 1.0 && loud.torque.z == 1.0, "{loud:?}");

@@ -3,15 +3,15 @@
 //!
 //! `α̂ = α_c + D[θ, α_c]` with the commanded `α_c` and the smoother `D`, which is linear in both arguments.
 //! * Torque: `∂α̂/∂g_i = J⁻¹ e_i M_i + D[0, J⁻¹ e_i M_i]`.
-//! * Delay: `∂α̂/∂τ = D[−ω, 0] = D[0, kicks Δα̂]`, for the channels of the test masses only. The attitude channels share
-//!   the noise of `α̂` and use the command without the smoother.
+//! * Delay: `∂α̂/∂τ = D[−ω, 0] = D[0, kicks Δα̂]`, for the channels of the test masses only. The attitude channels
+//!   share the noise of `α̂` and use the command without the smoother.
 
 use dragfree_physics::control::PerTestMass;
 use dragfree_physics::mission::{AXES, Mission};
 use nalgebra::{Matrix3, Vector3};
 
 use crate::replay::{CommandNumbers, command_vectors, electrodes_of};
-use crate::smoother::{Answer, Smoothed, Smoother, Turn};
+use crate::smoother::{Perturbation, ResponseState, Smoothed, Smoother};
 use crate::state::{Reader, StateError, Writer};
 
 /// Whether a column on demand is made from commands, as all but two are: the Sun's direction, and the derivative by a
@@ -25,12 +25,14 @@ pub(crate) fn is_in_loop(column: &str) -> bool {
 pub struct Needs {
     /// `used.*`: commands and direction of the Sun as `û` has them, means over `[t_k, t_{k+1})`.
     pub commands: bool,
-    /// `response.alpha_srf_rad_s2.by_torque_gain.I.J`, `∂α̂_J/∂g_I` for a torque about axis `I` of `(1 + g_I)` times the commanded one:
-    /// `α̂` of one who knows `g` minus that of one who does not. And `response.u_orf_m_s2.by_torque_gain.I.NAME.J`, the same of `û`
-    /// of a test mass, where thrusters have a layout: their torque's noise, which is `E[w]`, says something of their force's.
+    /// `response.alpha_srf_rad_s2.by_torque_gain.I.J`, `∂α̂_J/∂g_I` for a torque about axis `I` of `(1 + g_I)` times
+    /// the commanded one: `α̂` of one who knows `g` minus that of one who does not. And
+    /// `response.u_orf_m_s2.by_torque_gain.I.NAME.J`, the same of `û` of a test mass, where thrusters have a layout:
+    /// their torque's noise, which is `E[w]`, says something of their force's.
     pub torque_response: bool,
-    /// `response.alpha_srf_rad_s2.by_dws_delay.J`, `∂α̂_J/∂τ` where long-arm sensing shows what was true `τ` before: late minus on
-    /// time, so that one who knows `τ` subtracts `τ` times it. For the test masses' channels; see the module.
+    /// `response.alpha_srf_rad_s2.by_dws_delay.J`, `∂α̂_J/∂τ` where long-arm sensing shows what was true `τ` before:
+    /// late minus on time, so that one who knows `τ` subtracts `τ` times it. For the test masses' channels; see the
+    /// module.
     pub dws_delay_response: bool,
 }
 
@@ -53,16 +55,16 @@ struct Used {
     sun_srf: Vector3<f64>,
 }
 
-/// What there is of an epoch that leaves: a derivative of what is not given is not given either.
+/// What there is of an epoch that leaves: without a series there is no derivative of it.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Given {
+pub(crate) struct Availability {
     pub(crate) alpha: bool,
     pub(crate) u: PerTestMass<bool>,
 }
 
 /// The running columns.
 #[derive(Clone, Debug)]
-pub(crate) struct Asked {
+pub(crate) struct OnDemand {
     needs: Needs,
     inertia_inverse: Matrix3<f64>,
     /// `−T_S^{O_i} C J/m_S`, m s⁻² per rad s⁻²; zero unless thrusters have a layout.
@@ -72,14 +74,14 @@ pub(crate) struct Asked {
     test_masses: Vec<(String, String)>,
     /// One for each epoch that waits for the smoother.
     used: Vec<Used>,
-    torque: [Answer; 3],
-    delay: Answer,
-    /// By how much `α̂` changes where the oldest waiting epoch begins, of one estimate of both sides: from one block to the next the
-    /// estimate of the slow torque changes too.
+    torque: [ResponseState; 3],
+    delay: ResponseState,
+    /// By how much `α̂` changes where the oldest waiting epoch begins, of one estimate of both sides: from one block to
+    /// the next the estimate of the slow torque changes too.
     kick_rad_s2: Vector3<f64>,
 }
 
-impl Asked {
+impl OnDemand {
     pub(crate) fn new(needs: Needs, mission: &Mission, push_per_turn: Vec<Matrix3<f64>>) -> Self {
         Self {
             needs,
@@ -89,7 +91,7 @@ impl Asked {
             test_masses: mission.test_mass.keys().map(|name| (name.clone(), mission.frame(name))).collect(),
             used: Vec::new(),
             torque: Default::default(),
-            delay: Answer::default(),
+            delay: ResponseState::default(),
             kick_rad_s2: Vector3::from_element(f64::NAN),
         }
     }
@@ -98,7 +100,7 @@ impl Asked {
         self.needs
     }
 
-    /// Name, unit and frame of the columns, in the order of [`crate::reconstruction::Row::asked`].
+    /// Name, unit and frame of the columns, in the order of [`crate::reconstruction::Row::on_demand`].
     pub(crate) fn columns(&self) -> Vec<(String, &'static str, String)> {
         let mut columns = Vec::new();
         if self.needs.commands {
@@ -130,28 +132,28 @@ impl Asked {
         self.push_per_turn.iter().any(|push| *push != Matrix3::zeros())
     }
 
-    /// Takes what acts over the newest interval. Of the test mass `silent` no command is known.
+    /// Takes what acts over the newest interval. The command of the test mass `unknown` is missing.
     pub(crate) fn take(
         &mut self,
         acting: Option<&CommandNumbers>,
-        silent: Option<usize>,
+        unknown: Option<usize>,
         sun_srf: Option<Vector3<f64>>,
     ) {
         let missing = f64::NAN;
         let numbers = 3 * self.vectors.len();
         let mut command = acting.copied().unwrap_or_else(|| CommandNumbers::from_fn(numbers, |_| missing));
-        if let Some(tm) = silent {
+        if let Some(tm) = unknown {
             command[electrodes_of(tm)].fill(missing);
         }
         self.used.push(Used { command, sun_srf: sun_srf.unwrap_or(Vector3::from_element(missing)) });
     }
 
-    /// Values for the oldest waiting epochs, which leave. `alpha_crf_rad_s2` is the smoothed `α̂` relative to CRF of all that wait,
-    /// NaN where a command is missing; nothing unless a delay is asked for.
+    /// Values for the oldest waiting epochs, which leave. `alpha_crf_rad_s2` is the smoothed `α̂` relative to CRF of
+    /// all that wait, NaN where a command is missing; nothing unless a delay is asked for.
     pub(crate) fn give(
         &mut self,
         smoother: &Smoother,
-        leaving: &[Given],
+        leaving: &[Availability],
         alpha_crf_rad_s2: &[Vector3<f64>],
     ) -> Vec<Vec<f64>> {
         let mut out = vec![Vec::new(); leaving.len()];
@@ -162,57 +164,57 @@ impl Asked {
             }
         }
         if self.needs.torque_response {
-            self.give_torque(smoother, leaving, &mut out);
+            self.torque_columns(smoother, leaving, &mut out);
         }
         if self.needs.dws_delay_response {
-            let answers = self.give_delay(smoother, leaving.len(), alpha_crf_rad_s2);
-            for ((out, given), answer) in out.iter_mut().zip(leaving).zip(answers) {
-                put(out, &answer.disturbance_rad_s2, given.alpha);
+            let responses = self.delay_columns(smoother, leaving.len(), alpha_crf_rad_s2);
+            for ((out, available), response) in out.iter_mut().zip(leaving).zip(responses) {
+                put(out, &response.disturbance_rad_s2, available.alpha);
             }
         }
         self.used.drain(..leaving.len());
         out
     }
 
-    fn give_torque(&mut self, smoother: &Smoother, leaving: &[Given], out: &mut [Vec<f64>]) {
+    fn torque_columns(&mut self, smoother: &Smoother, leaving: &[Availability], out: &mut [Vec<f64>]) {
         let (used, inverse) = (&self.used, &self.inertia_inverse);
         let turn = |about: usize, k: usize| inverse.column(about) * used[k].command[3 + about];
-        let answers = [0, 1, 2].map(|about| {
-            let more = |k| Turn { held_rad_s2: turn(about, k), kick_rad_s: Vector3::zeros() };
-            smoother.answer(&mut self.torque[about], leaving.len(), more)
+        let responses = [0, 1, 2].map(|about| {
+            let more = |k| Perturbation { held_rad_s2: turn(about, k), kick_rad_s: Vector3::zeros() };
+            smoother.response(&mut self.torque[about], leaving.len(), more)
         });
         let layout = self.layout();
-        for (k, (out, given)) in out.iter_mut().zip(leaving).enumerate() {
-            for (about, answer) in answers.iter().enumerate() {
-                put(out, &(turn(about, k) + answer[k].disturbance_rad_s2), given.alpha);
+        for (k, (out, available)) in out.iter_mut().zip(leaving).enumerate() {
+            for (about, response) in responses.iter().enumerate() {
+                put(out, &(turn(about, k) + response[k].disturbance_rad_s2), available.alpha);
             }
-            for answer in answers.iter().filter(|_| layout) {
-                for (push, given) in self.push_per_turn.iter().zip(&given.u) {
-                    put(out, &(push * answer[k].noise_rad_s2), *given);
+            for response in responses.iter().filter(|_| layout) {
+                for (push, available) in self.push_per_turn.iter().zip(&available.u) {
+                    put(out, &(push * response[k].noise_rad_s2), *available);
                 }
             }
         }
     }
 
-    fn give_delay(&mut self, smoother: &Smoother, count: usize, alpha_crf_rad_s2: &[Vector3<f64>]) -> Vec<Smoothed> {
+    fn delay_columns(&mut self, smoother: &Smoother, count: usize, alpha_crf_rad_s2: &[Vector3<f64>]) -> Vec<Smoothed> {
         let change = |k: usize| alpha_crf_rad_s2[k] - alpha_crf_rad_s2[k - 1];
         let first = self.kick_rad_s2;
         let more = |k: usize| {
             let kick = if k == 0 { first } else { change(k) };
             // Next to an unknown command the attitude starts anew: what bends there is not known, and tells nothing.
             let known = kick.iter().all(|x| x.is_finite());
-            Turn { held_rad_s2: Vector3::zeros(), kick_rad_s: if known { kick } else { Vector3::zeros() } }
+            Perturbation { held_rad_s2: Vector3::zeros(), kick_rad_s: if known { kick } else { Vector3::zeros() } }
         };
-        let answer = smoother.answer(&mut self.delay, count, more);
+        let response = smoother.response(&mut self.delay, count, more);
         if (1..alpha_crf_rad_s2.len()).contains(&count) {
             self.kick_rad_s2 = change(count);
         }
-        answer
+        response
     }
 
     pub(crate) fn save(&self, out: &mut Writer) {
         out.numbers(self.kick_rad_s2.as_slice());
-        self.torque.iter().chain([&self.delay]).for_each(|answer| answer.save(out));
+        self.torque.iter().chain([&self.delay]).for_each(|response| response.save(out));
         for used in &self.used {
             out.numbers(&used.command);
             out.numbers(used.sun_srf.as_slice());
@@ -222,8 +224,8 @@ impl Asked {
     /// Takes a state of `waiting` epochs back.
     pub(crate) fn load(&mut self, waiting: usize, state: &mut Reader<'_>) -> Result<(), StateError> {
         state.numbers(self.kick_rad_s2.as_mut_slice())?;
-        for answer in self.torque.iter_mut().chain([&mut self.delay]) {
-            answer.load(state)?;
+        for response in self.torque.iter_mut().chain([&mut self.delay]) {
+            response.load(state)?;
         }
         self.used.clear();
         for _ in 0..waiting {
@@ -237,6 +239,6 @@ impl Asked {
     }
 }
 
-fn put(out: &mut Vec<f64>, value: &Vector3<f64>, given: bool) {
-    out.extend(value.iter().map(|x| if given { *x } else { f64::NAN }));
+fn put(out: &mut Vec<f64>, value: &Vector3<f64>, available: bool) {
+    out.extend(value.iter().map(|x| if available { *x } else { f64::NAN }));
 }

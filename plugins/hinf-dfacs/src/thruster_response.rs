@@ -10,10 +10,10 @@ use crate::state::{Reader, StateError, Writer};
 /// Force, N, and torque, N m, on the spacecraft, SRF.
 pub(crate) type Wrench = [f64; 6];
 
-/// Thrusters that act late. Their range and step are not modelled: a command within the range acts as it is, and rounding it
-/// adds noise.
+/// Thrusters that act late. Their range and step are not modelled: a command within the range acts as it is, and
+/// rounding it adds noise.
 #[derive(Clone, Debug)]
-pub(crate) struct Acting {
+pub(crate) struct ThrusterResponse {
     /// `None` where the thrusters act at once.
     lag: Option<Lag>,
     y: Wrench,
@@ -21,24 +21,24 @@ pub(crate) struct Acting {
     waiting: VecDeque<Wrench>,
 }
 
-impl Acting {
+impl ThrusterResponse {
     pub(crate) fn new(mission: &Mission, dt_s: f64) -> Self {
         let late = mission.thrusters.as_ref().filter(|t| t.lag_s > 0.0 || t.delay_s > 0.0);
         Self { lag: late.map(|t| Lag::new(t.lag_s, t.delay_s, dt_s)), y: Wrench::default(), waiting: VecDeque::new() }
     }
 
-    /// Mean over the sample for which `told` is commanded; `None` for an unknown command. What acted before the first one, or
-    /// before the first after a gap, is taken to be the same: the smoother starts anew there.
-    pub(crate) fn act(&mut self, told: Option<Wrench>) -> Option<Wrench> {
-        let (Some(lag), Some(told)) = (&self.lag, told) else {
+    /// Mean of what acts over a sample in response to its command; `None` for an unknown one. What acted before the
+    /// first one, or before the first after a gap, is taken to be the same: the smoother starts anew there.
+    pub(crate) fn act(&mut self, commanded: Option<Wrench>) -> Option<Wrench> {
+        let (Some(lag), Some(commanded)) = (&self.lag, commanded) else {
             self.waiting.clear();
-            return told;
+            return commanded;
         };
         if self.waiting.is_empty() {
-            self.y = told;
-            self.waiting.extend(std::iter::repeat_n(told, lag.samples() + 1));
+            self.y = commanded;
+            self.waiting.extend(std::iter::repeat_n(commanded, lag.samples() + 1));
         }
-        self.waiting.push_back(told);
+        self.waiting.push_back(commanded);
         let (older, newer) = (&self.waiting[0], &self.waiting[1]);
         let acting = std::array::from_fn(|i| lag.step(&mut self.y[i], older[i], newer[i]));
         self.waiting.pop_front();
@@ -48,8 +48,8 @@ impl Acting {
     pub(crate) fn save(&self, out: &mut Writer) {
         out.numbers(&self.y);
         out.count(self.waiting.len() as u64);
-        for told in &self.waiting {
-            out.numbers(told);
+        for commanded in &self.waiting {
+            out.numbers(commanded);
         }
     }
 
@@ -58,9 +58,9 @@ impl Acting {
         let waiting = state.length(self.lag.as_ref().map_or(0, |lag| lag.samples() + 1))?;
         self.waiting.clear();
         for _ in 0..waiting {
-            let mut told = Wrench::default();
-            state.numbers(&mut told)?;
-            self.waiting.push_back(told);
+            let mut commanded = Wrench::default();
+            state.numbers(&mut commanded)?;
+            self.waiting.push_back(commanded);
         }
         Ok(())
     }

@@ -14,7 +14,7 @@ pub enum EffectError {
     /// No effect of that name.
     #[error("effect {text}: there is no effect {id}; there are {list}", list = list())]
     Unknown {
-        /// What was asked.
+        /// What was requested.
         text: String,
         /// Its id.
         id: String,
@@ -22,7 +22,7 @@ pub enum EffectError {
     /// The effect has no such instance.
     #[error("effect {text}: {id} has no instance {instance}; it has {has}.\n{id}: {about}")]
     Instance {
-        /// What was asked.
+        /// What was requested.
         text: String,
         /// Id of the effect.
         id: &'static str,
@@ -36,7 +36,7 @@ pub enum EffectError {
     /// The effect has no such shape parameter.
     #[error("effect {text}: {id} has no parameter {name}; it has {has}")]
     Parameter {
-        /// What was asked.
+        /// What was requested.
         text: String,
         /// Id of the effect.
         id: &'static str,
@@ -48,7 +48,7 @@ pub enum EffectError {
     /// A number that is none, or has no physical sense.
     #[error("effect {text}: {what} = {value} must be a number from {minimum:e} to {maximum:e} {unit}")]
     Value {
-        /// What was asked.
+        /// What was requested.
         text: String,
         /// Size or parameter.
         what: String,
@@ -64,14 +64,15 @@ pub enum EffectError {
     /// The mission lacks what the effect needs.
     #[error("effect {text}: {source}")]
     Mission {
-        /// What was asked.
+        /// What was requested.
         text: String,
         /// What is missing.
         source: MissionError,
     },
 }
 
-/// Where an effect sits. Test masses count from 0 in the order of their names, axes and angles too: x, y, z and φ, θ, ψ.
+/// Where an effect sits. Test masses count from 0 in the order of their names, axes and angles too: x, y, z and φ, θ,
+/// ψ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Place {
     /// `sc`, the spacecraft as a whole.
@@ -198,7 +199,7 @@ pub struct Kind {
     /// Shape parameters.
     pub shape: &'static [Shape],
     /// Makes it.
-    pub build: fn(&Asked, &Basis<'_>) -> Built,
+    pub build: fn(&EffectRequest, &Basis<'_>) -> Built,
 }
 
 impl fmt::Debug for Kind {
@@ -209,7 +210,7 @@ impl fmt::Debug for Kind {
 
 /// An effect with its place, size and shape.
 #[derive(Clone, Debug)]
-pub struct Asked {
+pub struct EffectRequest {
     /// What kind.
     pub kind: &'static Kind,
     /// Where.
@@ -222,16 +223,16 @@ pub struct Asked {
     pub shape: Vec<f64>,
 }
 
-impl Display for Asked {
+impl Display for EffectRequest {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}:{}={:e}", self.kind.id, self.instance, self.size)?;
         self.kind.shape.iter().zip(&self.shape).try_for_each(|(shape, value)| write!(f, ",{}={value:e}", shape.name))
     }
 }
 
-impl Asked {
-    /// Reads one effect on a spacecraft with these test masses, as in `es-crosstalk:NAME.y-x=0.03`: 3 % of what is commanded
-    /// along y acts along x.
+impl EffectRequest {
+    /// Reads one effect on a spacecraft with these test masses, as in `es-crosstalk:NAME.y-x=0.03`: 3 % of what is
+    /// commanded along y acts along x.
     ///
     /// # Errors
     /// [`EffectError`] names what is wrong and what there is.

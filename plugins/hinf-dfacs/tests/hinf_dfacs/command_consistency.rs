@@ -21,10 +21,10 @@ fn telemetry(flying: &Mission, seed: u64, epochs: usize) -> Vec<Epoch> {
 }
 
 /// Correlation of the innovations with the rebuilt commands, σ, after an hour.
-fn disobedience(flying: &Mission, file: &Mission, seed: u64) -> [f64; 3] {
+fn inconsistency(flying: &Mission, file: &Mission, seed: u64) -> [f64; 3] {
     let mut stage = stage(file, &Settings { commands: false, replay: true, ..settings(Smoother) });
     run(&mut stage, &telemetry(flying, seed, 36_000));
-    stage.disobedience_sigma().expect("an hour is enough")
+    stage.inconsistency_sigma().expect("an hour is enough")
 }
 
 /// The controllers of the default design with other gains.
@@ -43,7 +43,7 @@ fn with_gains(scale: f64) -> Mission {
 #[test]
 fn the_law_that_flew_is_not_suspected() {
     let mission = mission();
-    let squares: f64 = (0..10).flat_map(|seed| disobedience(&mission, &mission, seed)).map(|z| z * z).sum();
+    let squares: f64 = (0..10).flat_map(|seed| inconsistency(&mission, &mission, seed)).map(|z| z * z).sum();
     assert!((8.3..68.0).contains(&squares), "{squares}");
 }
 
@@ -51,7 +51,7 @@ fn the_law_that_flew_is_not_suspected() {
 #[test]
 fn a_wrong_controller_file_is_noticed() {
     for scale in [0.8, 1.25] {
-        let z = disobedience(&with_gains(scale), &mission(), 1);
+        let z = inconsistency(&with_gains(scale), &mission(), 1);
         assert!(z.iter().any(|z| z.abs() > 5.0), "gains {scale}: {z:?}");
     }
 }

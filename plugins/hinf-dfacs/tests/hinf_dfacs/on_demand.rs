@@ -1,6 +1,6 @@
 //! The columns on demand against independent runs of the stage: what they say would change does change.
 
-use dragfree_hinf_dfacs::asked::Needs;
+use dragfree_hinf_dfacs::on_demand::Needs;
 use dragfree_hinf_dfacs::reconstruction::AngularAcceleration::{Commanded, Smoother};
 use dragfree_hinf_dfacs::reconstruction::{Epoch, Row, Settings};
 use dragfree_hinf_dfacs::replay::CommandNumbers;
@@ -20,8 +20,8 @@ fn asking(needs: Needs) -> Settings {
     Settings { needs, ..settings(Smoother) }
 }
 
-/// The loop is linear, so that telemetry of a noise 10,000 times smaller is the same in small; the gyroscopic torque, quadratic and no
-/// part of a response, is then 1e-13 of the rest.
+/// The loop is linear, so that telemetry of a noise 10,000 times smaller is the same in small; the gyroscopic torque,
+/// quadratic and no part of a response, is then 1e-13 of the rest.
 fn quiet(epochs: &[Epoch]) -> Vec<Epoch> {
     let mut epochs = epochs.to_vec();
     for epoch in &mut epochs {
@@ -32,9 +32,9 @@ fn quiet(epochs: &[Epoch]) -> Vec<Epoch> {
 
 /// The values of three or more columns, by the first one's name.
 fn columns(mission: &Mission, needs: Needs, rows: &[Row], first: &str) -> Vec<Vector3<f64>> {
-    let names = stage(mission, &asking(needs)).asked_columns();
+    let names = stage(mission, &asking(needs)).on_demand_columns();
     let at = names.iter().position(|(name, _, _)| name == first).unwrap_or_else(|| panic!("no {first}"));
-    rows.iter().map(|row| Vector3::from_column_slice(&row.asked[at..at + 3])).collect()
+    rows.iter().map(|row| Vector3::from_column_slice(&row.on_demand[at..at + 3])).collect()
 }
 
 fn largest(values: &[Vector3<f64>]) -> f64 {
@@ -56,9 +56,10 @@ fn with_layout() -> Mission {
     Mission { thrusters: Some(layout()), ..mission() }
 }
 
-/// Commands of one axis doubled: α̂, and û where force comes with torque, change by the response, to rounding. As all is linear the
-/// step may be large, and loses no digits. What is left, 4e-12 of what is known and in the first dozen epochs alone, is the smoother's
-/// own rounding under its wide prior: it takes the first attitudes' innovations, 1e14 of their noise in variance, off again.
+/// Commands of one axis doubled: α̂, and û where force comes with torque, change by the response, to rounding. As all
+/// is linear the step may be large, and loses no digits. What is left, 4e-12 of what is known and in the first dozen
+/// epochs alone, is the smoother's own rounding under its wide prior: it takes the first attitudes' innovations, 1e14
+/// of their noise in variance, off again.
 #[test]
 fn a_torque_gain_does_what_its_response_says() {
     const GAIN: f64 = 1.0;
@@ -98,8 +99,9 @@ fn a_torque_gain_does_what_its_response_says() {
     }
 }
 
-/// A spacecraft that does what it is told, about all axes, smoothly: α̂ is α. Attitude read 1 ms late and 1 ms early then changes α̂
-/// by twice the response, but for a part `τ Δt (2πf)²/4` of it, 2.5e-6 at 50 mHz. Readouts and commands go missing.
+/// A spacecraft that does what it is told, about all axes, smoothly: α̂ is α. Attitude read 1 ms late and 1 ms early
+/// then changes α̂ by twice the response, but for a part `τ Δt (2πf)²/4` of it, 2.5e-6 at 50 mHz. Readouts and commands
+/// go missing.
 #[test]
 fn a_delay_does_what_its_response_says() {
     const TAU_S: f64 = 1e-3;
@@ -153,8 +155,8 @@ fn nothing(k: usize) -> Epoch {
     }
 }
 
-/// What a stage makes of attitude alone, the commands zero: minus the integral of the accelerations `alpha_rad_s2`. Missing attitude
-/// and commands are those of `like`.
+/// What a stage makes of attitude alone, the commands zero: minus the integral of the accelerations `alpha_rad_s2`.
+/// Missing attitude and commands are those of `like`.
 fn answer_to_rate(mission: &Mission, like: &[Epoch], alpha_rad_s2: &[Vector3<f64>]) -> Vec<Vector3<f64>> {
     let mut omega: Vector3<f64> = Vector3::zeros();
     let epochs: Vec<Epoch> = like
@@ -176,8 +178,8 @@ fn answer_to_rate(mission: &Mission, like: &[Epoch], alpha_rad_s2: &[Vector3<f64
     run(&mut stage(mission, &settings(Smoother)), &epochs).iter().map(alpha).collect()
 }
 
-/// Under noise, with readouts and commands missing: the response is what a stage makes of minus the rate that α̂ integrates to. In
-/// one block, as α̂ has small steps where two meet, to rounding.
+/// Under noise, with readouts and commands missing: the response is what a stage makes of minus the rate that α̂
+/// integrates to. In one block, as α̂ has small steps where two meet, to rounding.
 #[test]
 fn a_delay_adds_minus_the_rate_to_the_attitude() {
     let mission = mission();
@@ -197,7 +199,8 @@ fn a_delay_adds_minus_the_rate_to_the_attitude() {
     assert!(error < 1e-7, "{error:e}");
 }
 
-/// Slope of the truth on the column, exactly, by impulses as for α̂ itself: one. The twin made of commands is far from that.
+/// Slope of the truth on the column, exactly, by impulses as for α̂ itself: one. The twin made of commands is far from
+/// that.
 #[test]
 fn the_true_change_by_a_delay_on_the_column_has_slope_one() {
     const QUIET: usize = 40_321;
@@ -232,7 +235,7 @@ fn the_true_change_by_a_delay_on_the_column_has_slope_one() {
 
 #[test]
 fn used_commands_are_those_that_act() {
-    let names = stage(&mission(), &asking(COMMANDS)).asked_columns();
+    let names = stage(&mission(), &asking(COMMANDS)).on_demand_columns();
     assert_eq!(names.len(), 21);
     let (epochs, _) = telemetry(&mission(), 3000);
     let mut epochs = holes(epochs);
@@ -246,10 +249,10 @@ fn used_commands_are_those_that_act() {
     let rows = run(&mut stage(&mission(), &asking(COMMANDS)), &epochs);
     for (k, (row, epoch)) in rows.iter().zip(&epochs).enumerate() {
         let told = epoch.command[..12].iter().all(|x| x.is_finite());
-        for (i, (got, want)) in row.asked.iter().zip(&epoch.command).enumerate() {
+        for (i, (got, want)) in row.on_demand.iter().zip(&epoch.command).enumerate() {
             assert!(if told && want.is_finite() { got == want } else { got.is_nan() }, "epoch {k}, {}", names[i].0);
         }
-        let sun = &row.asked[18..];
+        let sun = &row.on_demand[18..];
         assert!(if k < 500 { sun.iter().all(|x| x.is_nan()) } else { *sun == [0.6, 0.8, 0.0] }, "epoch {k}: {sun:?}");
     }
 
@@ -262,7 +265,7 @@ fn used_commands_are_those_that_act() {
         for (row, epoch) in rows.iter().zip(&epochs) {
             if epoch.command[..12].iter().any(|x| x.is_nan()) {
                 before[0] = f64::NAN;
-                assert!(row.asked[i].is_nan());
+                assert!(row.on_demand[i].is_nan());
                 continue;
             }
             if before[0].is_nan() {
@@ -272,12 +275,18 @@ fn used_commands_are_those_that_act() {
             let want = before[0] + (made - before[0]) * ((1.0 - left) / 0.5);
             made = before[0] + (made - before[0]) * left;
             before = [before[1], epoch.command[i]];
-            assert!((row.asked[i] - want).abs() <= 1e-14 * size, "{}: {} against {want}", names[i].0, row.asked[i]);
+            assert!(
+                (row.on_demand[i] - want).abs() <= 1e-14 * size,
+                "{}: {} against {want}",
+                names[i].0,
+                row.on_demand[i]
+            );
         }
     }
 }
 
-/// Without `/command` the law stands in: from the same start its commands are those that flew, and so are the responses.
+/// Without `/command` the law stands in: from the same start its commands are those that flew, and so are the
+/// responses.
 #[test]
 fn replayed_commands_answer_as_flown_ones() {
     let mission = mission();
@@ -287,10 +296,10 @@ fn replayed_commands_answer_as_flown_ones() {
     epochs.iter_mut().for_each(|epoch| epoch.command = unknown());
     let alone = Settings { commands: false, needs: EVERYTHING, ..with_replay() };
     let rows = run(&mut stage(&mission, &alone), &epochs);
-    assert!(rows[..600].iter().all(|row| row.asked.iter().all(|x| x.is_nan())), "the law settles for 60 s");
+    assert!(rows[..600].iter().all(|row| row.on_demand.iter().all(|x| x.is_nan())), "the law settles for 60 s");
     for k in 600..4000 {
-        assert_eq!(rows[k].asked[..18], flown[k].asked[..18], "epoch {k}");
-        assert_eq!(rows[k].asked[21..], flown[k].asked[21..], "epoch {k}");
+        assert_eq!(rows[k].on_demand[..18], flown[k].on_demand[..18], "epoch {k}");
+        assert_eq!(rows[k].on_demand[21..], flown[k].on_demand[21..], "epoch {k}");
     }
 }
 
@@ -299,8 +308,8 @@ fn asking_changes_nothing_else() {
     let mission = late(with_layout());
     let epochs = holes(telemetry(&mission, 2600).0);
     let usual = run(&mut stage(&mission, &settings(Smoother)), &epochs);
-    assert!(usual.iter().all(|row| row.asked.is_empty()));
-    let asked = run(&mut stage(&mission, &asking(EVERYTHING)), &epochs);
-    let bits = |rows: &[Row]| rows.iter().map(|row| row.values.map(f64::to_bits)).collect::<Vec<_>>();
-    assert!(bits(&usual) == bits(&asked));
+    assert!(usual.iter().all(|row| row.on_demand.is_empty()));
+    let on_demand = run(&mut stage(&mission, &asking(EVERYTHING)), &epochs);
+    let bits = |rows: &[Row]| rows.iter().map(|row| row.values.map(|x| x.to_bits())).collect::<Vec<_>>();
+    assert!(bits(&usual) == bits(&on_demand));
 }
