@@ -261,7 +261,7 @@ fn what_has_no_sense_is_refused_by_name() {
                 m["thrusters"]["unit"].as_array_mut().unwrap().truncate(5);
             }),
         ),
-        ("[test_mass.tm2]", refusal(&|m, _| drop(m["test_mass"].as_object_mut().unwrap().remove("tm2")))),
+        ("housing.between", refusal(&|m, _| drop(m["test_mass"].as_object_mut().unwrap().remove("tm2")))),
         ("[noise.dws_local]", refusal(&|m, _| drop(m["noise"].as_object_mut().unwrap().remove("dws_local")))),
         ("[requirements]", refusal(&|m, _| drop(m.as_object_mut().unwrap().remove("requirements")))),
         (

@@ -45,15 +45,34 @@ impl Campaign {
         self.folder.path().join(format!("seed{seed}"))
     }
 
+    /// The product of a seed.
     fn calibrated(&self, seed: u64, hours: &str) -> Value {
         let (telemetry, seed) = (self.telemetry(seed), seed.to_string());
         let mut simulate = dragfree(self.folder.path());
         simulate.arg("simulate").arg(&self.mission).arg("--out").arg(&telemetry);
         expect(simulate.args(["--hours", hours, "--seed", &seed]), 0);
+        self.run(&telemetry, &self.mission, 0)
+    }
+
+    /// The product of a seed's telemetry, read with a mission file; `run` ends with a code.
+    fn run(&self, telemetry: &Path, mission: &Path, code: i32) -> Value {
         let mut run = dragfree(self.folder.path());
-        run.arg("run").arg(fixture("pipelines/science-mode.toml")).arg(file(&telemetry));
-        run.args(["--archive", "archive", "--json", "--mission"]).arg(&self.mission).arg("--model").arg(&self.model);
-        json(&mut run, 0)
+        run.arg("run").arg(fixture("pipelines/science-mode.toml")).arg(file(telemetry));
+        run.args(["--archive", "archive", "--json", "--mission"]).arg(mission).arg("--model").arg(&self.model);
+        json(&mut run, code)
+    }
+
+    /// The product of the first seed, read with a mission file in which texts are replaced. Its solutions disagree, which
+    /// is exit code 4.
+    fn misread(&self, replaced: &[(&str, &str)]) -> Value {
+        let mut text = std::fs::read_to_string(&self.mission).expect("readable");
+        for (from, to) in replaced {
+            assert_eq!(text.matches(from).count(), 1, "{from}");
+            text = text.replace(from, to);
+        }
+        let mission = self.folder.path().join("misread.toml");
+        std::fs::write(&mission, text).expect("writable");
+        self.run(&self.telemetry(1), &mission, 4)
     }
 
     /// The true offset of a test mass in its frame: the nominal one and [`ADDED_M`], turned about s_3.
@@ -68,23 +87,19 @@ impl Campaign {
         [cosine * x + sine * y, cosine * y - sine * x, z]
     }
 
-    /// The solutions of one kind for one test mass against the truth of the simulations.
-    fn solutions(&self, kind: &str, name: &str) -> Vec<Solution> {
+    /// A product's solution of one kind for one test mass against the truth of the simulations.
+    fn solution(&self, product: &Value, kind: &str, name: &str) -> Solution {
         let truth_m = self.truth_m(name);
         let names = ["x", "y", "z"].map(|axis| format!("com-offset.{name}.{axis}"));
-        let one = |product: &Value| {
-            let listed = product["covariance_names"][kind].as_array().expect("names");
-            let at = |name: &String| listed.iter().position(|n| n == name).unwrap_or_else(|| panic!("no {name}"));
-            let error = |i: usize| dragfree_tests::coefficient(product, &names[i], kind).0 - truth_m[i];
-            let covariance = |i: usize, j: usize| {
-                product["covariance"][kind][at(&names[i])][at(&names[j])].as_f64().expect("a number")
-            };
-            Solution {
-                error_m: std::array::from_fn(error),
-                covariance_m2: std::array::from_fn(|i| std::array::from_fn(|j| covariance(i, j))),
-            }
-        };
-        self.products.iter().map(one).collect()
+        let listed = product["covariance_names"][kind].as_array().expect("names");
+        let at = |name: &String| listed.iter().position(|n| n == name).unwrap_or_else(|| panic!("no {name}"));
+        let error = |i: usize| dragfree_tests::coefficient(product, &names[i], kind).0 - truth_m[i];
+        let covariance =
+            |i: usize, j: usize| product["covariance"][kind][at(&names[i])][at(&names[j])].as_f64().expect("a number");
+        Solution {
+            error_m: std::array::from_fn(error),
+            covariance_m2: std::array::from_fn(|i| std::array::from_fn(|j| covariance(i, j))),
+        }
     }
 }
 
@@ -114,7 +129,7 @@ fn chi2(error: &[f64; 3], covariance: &[[f64; 3]; 3]) -> f64 {
 /// The errors of ten seeds follow their covariances; against a truth two and a half of its σ off, or with half the σ,
 /// they do not.
 fn assert_calibrated(campaign: &Campaign, kind: &str, name: &str) {
-    let solutions = campaign.solutions(kind, name);
+    let solutions: Vec<_> = campaign.products.iter().map(|product| campaign.solution(product, kind, name)).collect();
     let total = |shift: f64, scale: f64| -> f64 {
         let one = |s: &Solution| {
             let error: [f64; 3] = std::array::from_fn(|i| s.error_m[i] + shift * s.covariance_m2[i][i].sqrt());
@@ -150,6 +165,16 @@ fn lisa_is_designed_flown_and_calibrated() {
     for name in ["tm1", "tm2"] {
         assert_calibrated(&campaign, "adopted", name);
     }
+    // The test masses in each other's place: a single seed is further off than ten may be together.
+    let swapped = campaign.misread(&[
+        ("= [0.1, 0.25, 0.0]", "= [0.1, -0.25, 0.000]"),
+        ("= [0.1, -0.25, 0.0]", "= [0.1, 0.25, 0.0]"),
+        ("= [0.0, 0.5, 0.0]", "= [0.0, -0.5, 0.0]"),
+    ]);
+    for name in ["tm1", "tm2"] {
+        let wrong = campaign.solution(&swapped, "qp", name);
+        assert!(chi2(&wrong.error_m, &wrong.covariance_m2) > BOUNDS.1, "{name}: {:?}", wrong.error_m);
+    }
 }
 
 /// The telemetry has the interface's messages with one test mass; of the other one there is nothing.
@@ -171,4 +196,7 @@ fn one_test_mass_is_designed_flown_and_calibrated() {
         assert!(messages.iter().all(|m| m.double(&second).is_none()), "{topic}");
     }
     assert_calibrated(&campaign, "adopted", "tm1");
+    let mirrored = campaign.misread(&[("= [0.02, 0.05, -0.03]", "= [0.02, -0.05, -0.03]")]);
+    let wrong = campaign.solution(&mirrored, "qp", "tm1");
+    assert!(chi2(&wrong.error_m, &wrong.covariance_m2) > BOUNDS.1, "{:?}", wrong.error_m);
 }

@@ -256,10 +256,11 @@ typedef struct dragfree_node_v1 {
 typedef struct dragfree_factory_v1 {
   uint32_t count;
   /* The manifest of plugin `index` < `count` as JSON, static: {"id":"gain","version":"1.0.0","licence":"MIT",
-   * "description":"…","instances":["tm1"],"needs":["commands"],"parameters":[{"name":"gain","type":"f64","unit":"1",
-   * "default":1.0,"minimum":0.0,"maximum":10.0,"help":"…"}]}. Types: f64, i64, bool, text, f64_list, text_list;
-   * `choices` for text. `needs` of an effect: columns that stages before it make on demand only, by the names that
-   * those stages give them (commands, torque-response, dws-delay-response by hinf-dfacs). schema/manifest has all. */
+   * "description":"…","instances":["{test_mass}"],"needs":["commands"],"parameters":[{"name":"gain","type":"f64",
+   * "unit":"1","default":1.0,"minimum":0.0,"maximum":10.0,"help":"…"}]}. A name in braces stands for each key of that
+   * table of the mission file. Types: f64, i64, bool, text, f64_list, text_list; `choices` for text. `needs` of an
+   * effect: columns that stages before it make on demand only, by the names that those stages give them (commands,
+   * torque-response, dws-delay-response by hinf-dfacs). schema/manifest has all. */
   const char *(*manifest)(uint32_t index);
   /* Makes an instance: fills `node`, returns DRAGFREE_OK; otherwise leaves it untouched and says why. */
   dragfree_status (*create)(uint32_t index, const dragfree_host_v1 *host, const dragfree_config_v1 *config,

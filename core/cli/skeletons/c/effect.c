@@ -10,7 +10,7 @@
 #define PRIOR_SIGMA "1e-7"
 
 typedef struct {
-  char instance[8]; /* tm1.x */
+  char instance[40]; /* NAME.x: a test mass and an axis */
   char channel[128], reference[128];
   double mass_kg;
   dragfree_slot_v1 channel_slot, reference_slot;
@@ -19,10 +19,10 @@ typedef struct {
 static const char *effect_manifest(uint32_t index) {
   (void)index;
   /* CHANGE: the description; every parameter with unit, default, range and help (a model that gives another key is refused); where
-   * it can act. */
+   * it can act, where {test_mass} stands for each test mass of the mission. */
   return "{\"id\":\"{{NAME}}\",\"version\":\"0.1.0\",\"licence\":\"MIT OR Apache-2.0\","
          "\"description\":\"Force on a test mass in proportion to a housekeeping channel\","
-         "\"instances\":[\"tm1.x\",\"tm1.y\",\"tm1.z\",\"tm2.x\",\"tm2.y\",\"tm2.z\"],\"parameters\":["
+         "\"instances\":[\"{test_mass}.x\",\"{test_mass}.y\",\"{test_mass}.z\"],\"parameters\":["
          "{\"name\":\"channel\",\"type\":\"text\",\"default\":\"hk.battery_current_a\","
          "\"help\":\"housekeeping channel that the force follows, hk.NAME\"},"
          "{\"name\":\"reference\",\"type\":\"text\",\"default\":\"\","
@@ -31,12 +31,16 @@ static const char *effect_manifest(uint32_t index) {
 
 static dragfree_status effect_link(void *self, const dragfree_link_v1 *link, dragfree_error_v1 *error) {
   effect *e = self;
-  const char *unit = "1";
+  const char *unit = "1", *frame = "", *axis = strchr(e->instance, '.') + 1;
   double rate_hz = 0.0;
-  char name[64], column[96], text[512], attributes[256], table[64];
+  char name[96], shown[64], column[192], text[512], attributes[256], table[96];
+  /* CHANGE: the channels in which it shows, a column each. Channels hold measured minus known acceleration: NAME.accel.x to NAME.accel.z
+   * of a test mass in m s-2, sc.alpha.x to sc.alpha.z in rad s-2. */
+  snprintf(shown, sizeof shown, "%.*s.accel.%s", (int)(axis - 1 - e->instance), e->instance, axis);
   /* Table `grid`: what the preprocessing stage has brought onto one grid of epochs. */
   for (uint32_t i = 0; i < link->available_count; i++) {
     const dragfree_column_v1 *have = &link->available[i];
+    if (!strcmp(have->name, shown)) frame = have->frame;
     if (strcmp(have->table, "grid")) continue;
     rate_hz = have->rate_hz;
     if (!strcmp(have->name, e->channel)) unit = have->unit;
@@ -50,17 +54,14 @@ static dragfree_status effect_link(void *self, const dragfree_link_v1 *link, dra
   /* A coefficient is called ID.INSTANCE, or ID.INSTANCE.NAME where an instance has several. CHANGE: its unit. */
   snprintf(name, sizeof name, "{{NAME}}.%s", e->instance);
   snprintf(text, sizeof text,
-           "{\"name\":\"%s\",\"unit\":\"N (%s)-1\",\"frame\":\"ORF_%c\",\"lower\":-" RANGE ",\"upper\":" RANGE
+           "{\"name\":\"%s\",\"unit\":\"N (%s)-1\",\"frame\":\"%s\",\"lower\":-" RANGE ",\"upper\":" RANGE
            ",\"initial\":0.0,\"prior_sigma\":" PRIOR_SIGMA "}",
-           name, unit, e->instance[2]);
+           name, unit, frame);
   if (link->coefficient(link->context, text)) return say(error, DRAGFREE_ERROR, "coefficient refused");
 
-  /* CHANGE: the channels in which it shows, a column each. Channels hold measured minus known acceleration: tm1.accel.x to tm2.accel.z
-   * in m s-2, sc.alpha.x to sc.alpha.z in rad s-2. */
-  snprintf(column, sizeof column, "%s@%.3s.accel.%s", name, e->instance, e->instance + 4);
+  snprintf(column, sizeof column, "%s@%s", name, shown);
   snprintf(table, sizeof table, "effect/{{NAME}}:%s", e->instance);
-  snprintf(attributes, sizeof attributes, "{\"kind\":\"regressor\",\"coefficient\":\"%s\",\"channel\":\"%.3s.accel.%s\"}", name,
-           e->instance, e->instance + 4);
+  snprintf(attributes, sizeof attributes, "{\"kind\":\"regressor\",\"coefficient\":\"%s\",\"channel\":\"%s\"}", name, shown);
   dragfree_column_v1 regressor = {table, column, "m s-2", "", rate_hz, attributes};
   return link->write(link->context, &regressor);
 }
@@ -92,17 +93,17 @@ static dragfree_status effect_create(uint32_t index, const dragfree_host_v1 *hos
                                      dragfree_node_v1 *node, dragfree_error_v1 *error) {
   (void)index;
   (void)host;
-  char path[64];
+  char path[96];
   effect *e = calloc(1, sizeof *e);
   if (!e) return say(error, DRAGFREE_ERROR, "no memory");
-  int known = text_into(config, "instance", e->instance, sizeof e->instance) && strlen(e->instance) == 5 &&
+  int known = text_into(config, "instance", e->instance, sizeof e->instance) && strchr(e->instance, '.') &&
               text_into(config, "parameters.channel", e->channel, sizeof e->channel) &&
               text_into(config, "parameters.reference", e->reference, sizeof e->reference);
   /* The mission file: whatever the effect needs to know of the spacecraft is there. */
-  snprintf(path, sizeof path, "mission.test_mass.%.3s.mass_kg", e->instance);
+  snprintf(path, sizeof path, "mission.test_mass.%.*s.mass_kg", (int)strcspn(e->instance, "."), e->instance);
   if (!known || config->get_f64(config->context, path, &e->mass_kg)) {
     free(e);
-    return say(error, DRAGFREE_ERROR, "an instance such as tm1.x, names of channels below 128 bytes and a mission with that test mass are needed");
+    return say(error, DRAGFREE_ERROR, "an instance NAME.x, names of channels below 128 bytes and a mission with that test mass are needed");
   }
   dragfree_node_v1 made = {0};
   made.self = e;

@@ -43,8 +43,8 @@ impl Effect for ForceByChannel {
             Parameter::text("channel", "hk.battery_current_a", &[], "housekeeping channel that the force follows, hk.NAME"),
             Parameter::text("reference", "", &[], "channel that is taken off it first, in the same unit; empty for none"),
         ],
-        // CHANGE: where it can act.
-        instances: &["tm1.x", "tm1.y", "tm1.z", "tm2.x", "tm2.y", "tm2.z"],
+        // CHANGE: where it can act; `{test_mass}` stands for each test mass of the mission.
+        instances: &["{test_mass}.x", "{test_mass}.y", "{test_mass}.z"],
         needs: &[],
     };
 
@@ -68,20 +68,21 @@ impl Effect for ForceByChannel {
         };
         // A coefficient is called ID.INSTANCE, or ID.INSTANCE.NAME where an instance has several.
         let name = format!("{}.{}", Self::MANIFEST.id, self.instance);
+        // CHANGE: the channels in which it shows, a column each. Channels hold measured minus known acceleration:
+        // `NAME.accel.x` to `NAME.accel.z` of a test mass in m s⁻², `sc.alpha.x` to `sc.alpha.z` in rad s⁻².
         let (test_mass, axis) = self.instance.split_once('.').unwrap_or((&self.instance, AXES[0]));
+        let shown = format!("{test_mass}.accel.{axis}");
         link.coefficient(&Coefficient {
             name: name.clone(),
             // CHANGE: the unit of the coefficient.
             unit: format!("N ({unit})-1"),
-            frame: if test_mass == "tm1" { "ORF_1".to_owned() } else { "ORF_2".to_owned() },
+            frame: available.find(&shown).map_or_else(String::new, |c| c.frame.clone()),
             lower: -RANGE,
             upper: RANGE,
             prior_sigma: PRIOR_SIGMA,
             ..Coefficient::default()
         })?;
-        // CHANGE: the channels in which it shows, a column each. Channels hold measured minus known acceleration:
-        // `tm1.accel.x` to `tm2.accel.z` in m s⁻², `sc.alpha.x` to `sc.alpha.z` in rad s⁻².
-        let acceleration = link.regressor(&name, &format!("{test_mass}.accel.{axis}"), "m s-2")?;
+        let acceleration = link.regressor(&name, &shown, "m s-2")?;
         self.columns = Some(Columns { channel, reference, acceleration });
         Ok(())
     }
