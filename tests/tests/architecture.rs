@@ -87,6 +87,25 @@ fn a_forbidden_dependency_is_detected() {
     );
 }
 
+/// Every package with its features, as built with these kinds of dependencies.
+fn features(kinds: &str) -> BTreeSet<String> {
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let mut tree = Command::new(cargo);
+    tree.current_dir(dragfree_tests::root()).args(["tree", "--workspace", "--offline", "--prefix", "none"]);
+    let tree = dragfree_tests::expect(tree.args(["--no-dedupe", "--format", "{p} {f}", "--edges", kinds]), 0);
+    let lines = String::from_utf8(tree.stdout).expect("text");
+    lines.lines().map(str::to_owned).collect()
+}
+
+/// A dependency of tests that turns on another feature of a shared crate makes `cargo test` compile everything above
+/// that crate again.
+#[test]
+fn tests_do_not_change_the_features_of_the_program() {
+    let (program, tests) = (features("normal,build"), features("normal,build,dev"));
+    assert!(program.len() > 100 && tests.len() > program.len(), "{} {}", program.len(), tests.len());
+    assert_eq!(program.difference(&tests).collect::<Vec<_>>(), Vec::<&String>::new());
+}
+
 /// Simulator and effects share no code, so that one would reveal an error of the other.
 #[test]
 fn the_simulator_shares_no_code_with_the_effects() {
