@@ -983,24 +983,6 @@ impl ChannelDesign {
     pub fn required_asd(&self, f_hz: f64) -> f64 {
         self.model.requirement.asd_at(f_hz)
     }
-
-    /// `F_l(P, K)` of the flown coefficients, in the scaled variable, for certificates of one's own.
-    ///
-    /// # Errors
-    /// [`HinfError`] when the loop has no solution.
-    pub fn closed_loop(&self) -> Result<StateSpace, HinfError> {
-        self.problem().flown(&self.controller)
-    }
-
-    fn problem(&self) -> Problem {
-        Problem {
-            plant: self.plant.clone(),
-            weights: self.weights,
-            bandwidth_rad_s: self.bandwidth_rad_s,
-            half_step: 0.5 * self.sampling.dt_s * self.bandwidth_rad_s,
-            control_unit_s2: self.weights.disturbance.high,
-        }
-    }
 }
 
 #[cfg(test)]
@@ -1011,6 +993,16 @@ pub(crate) mod tests {
         let text = include_str!("../../../fixtures/missions/taiji.toml");
         let value: serde_json::Value = toml::from_str(text).unwrap();
         Mission::from_json(&value.to_string()).unwrap()
+    }
+
+    fn problem(c: &ChannelDesign) -> Problem {
+        Problem {
+            plant: c.plant.clone(),
+            weights: c.weights,
+            bandwidth_rad_s: c.bandwidth_rad_s,
+            half_step: 0.5 * c.sampling.dt_s * c.bandwidth_rad_s,
+            control_unit_s2: c.weights.disturbance.high,
+        }
     }
 
     fn assert_kept(c: &ChannelDesign, context: &str) {
@@ -1198,7 +1190,7 @@ pub(crate) mod tests {
         for c in &design(&taiji()).unwrap().channels[..7] {
             let closed = |factor: f64| {
                 let controller = ChannelController { gain_s2: c.controller.gain_s2 * factor, ..c.controller.clone() };
-                c.problem().flown(&controller).unwrap()
+                problem(c).flown(&controller).unwrap()
             };
             let stable = |factor: f64| closed(factor).poles().unwrap().iter().all(|p| p.re < 0.0);
             let factor = 10.0_f64.powf(c.gain_margin_db / 20.0);
