@@ -442,7 +442,7 @@ impl Simulator {
         &self.offset_orf_m
     }
 
-    /// Seconds since the surroundings were looked at.
+    /// Seconds since the surroundings were updated.
     fn since_packet_s(&self) -> f64 {
         (self.index - self.environment_index) as f64 * self.dt_s
     }

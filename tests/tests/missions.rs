@@ -62,8 +62,8 @@ impl Campaign {
         json(&mut run, code)
     }
 
-    /// The product of the first seed, read with a mission file in which texts are replaced. Its solutions disagree, which
-    /// is exit code 4.
+    /// The product of the first seed, read with a mission file in which texts are replaced. Its solutions disagree,
+    /// which is exit code 4.
     fn misread(&self, replaced: &[(&str, &str)]) -> Value {
         let mut text = std::fs::read_to_string(&self.mission).expect("readable");
         for (from, to) in replaced {

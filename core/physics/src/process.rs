@@ -187,7 +187,7 @@ impl NoiseProcess {
             transition: chain.transition,
             sigma,
             kick: if sigma > 0.0 { kick / sigma } else { Column::zeros() },
-            // What the filter knows and what it does not are independent: their covariances add up to the whole.
+            // Prediction and its error are independent: their covariances add up to the whole.
             stationary: cholesky(&(chain.stationary - prediction)),
             state: Column::zeros(),
             lines: lines.iter().map(line).collect(),
@@ -206,7 +206,7 @@ impl NoiseProcess {
         }
     }
 
-    /// What the past tells of the coming sample: what a slow drift has already built up.
+    /// Prediction of the coming sample from the past: the slow drift that has built up.
     #[must_use]
     pub fn slow(&self) -> f64 {
         self.state[0]

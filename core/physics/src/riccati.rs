@@ -11,8 +11,8 @@ type Matrix = DMatrix<f64>;
 const AXIS_TOLERANCE: f64 = 1e-12;
 /// Newton steps after the subspace; the first one already reaches rounding.
 const NEWTON_STEPS: usize = 3;
-/// The slowest eigenvalue of the loop keeps at least this part of its distance from the imaginary axis, or rounding has
-/// the say.
+/// The slowest eigenvalue of the loop keeps at least this part of its distance from the imaginary axis, or rounding
+/// dominates.
 const KEPT_DISTANCE: f64 = 0.5;
 
 /// Why a Riccati equation has no stabilising solution.
@@ -47,9 +47,8 @@ pub enum RiccatiError {
 /// The symmetric `X` with `Aᵀ X + X A + X R X + Q = 0` and `A + R X` stable, for `H = [[A, R], [−Q, −Aᵀ]]`
 /// (`X = Ric(H)` of Doyle, Glover, Khargonekar and Francis). `R` and `Q` may be indefinite.
 ///
-/// The balanced Hamiltonian's stable subspace by a reordered complex Schur form, then Newton's iteration; at last the
-/// loop is looked at: its eigenvalues are the Hamiltonian's stable ones, and a solution whose loop has lost them to
-/// rounding is refused.
+/// The balanced Hamiltonian's stable subspace by a reordered complex Schur form, then Newton's iteration. The
+/// eigenvalues of the loop must be the Hamiltonian's stable ones: a solution that lost them to rounding is refused.
 ///
 /// # Errors
 /// [`RiccatiError`] says why there is none.

@@ -26,13 +26,12 @@ pub struct Needs {
     /// `used.*`: commands and direction of the Sun as `û` has them, means over `[t_k, t_{k+1})`.
     pub commands: bool,
     /// `response.alpha_srf_rad_s2.by_torque_gain.I.J`, `∂α̂_J/∂g_I` for a torque about axis `I` of `(1 + g_I)` times
-    /// the commanded one: `α̂` of one who knows `g` minus that of one who does not. And
-    /// `response.u_orf_m_s2.by_torque_gain.I.NAME.J`, the same of `û` of a test mass, where thrusters have a layout:
-    /// their torque's noise, which is `E[w]`, says something of their force's.
+    /// the commanded one: `α̂` given `g` minus `α̂` without it. And `response.u_orf_m_s2.by_torque_gain.I.NAME.J`, the
+    /// same of `û` of a test mass, where thrusters have a layout: noise of their torque then correlates with that of
+    /// their force.
     pub torque_response: bool,
-    /// `response.alpha_srf_rad_s2.by_dws_delay.J`, `∂α̂_J/∂τ` where long-arm sensing shows what was true `τ` before:
-    /// late minus on time, so that one who knows `τ` subtracts `τ` times it. For the test masses' channels; see the
-    /// module.
+    /// `response.alpha_srf_rad_s2.by_dws_delay.J`, `∂α̂_J/∂τ` where long-arm sensing shows the attitude `τ` before:
+    /// `α̂` late minus `α̂` on time. For the test masses' channels; see the module.
     pub dws_delay_response: bool,
 }
 
@@ -48,7 +47,7 @@ impl Needs {
     }
 }
 
-/// What acted over one interval as commanded; NaN where nobody knows.
+/// What acted over one interval as commanded; NaN where unknown.
 #[derive(Clone, Copy, Debug)]
 struct Used {
     command: CommandNumbers,
@@ -201,7 +200,7 @@ impl OnDemand {
         let first = self.kick_rad_s2;
         let more = |k: usize| {
             let kick = if k == 0 { first } else { change(k) };
-            // Next to an unknown command the attitude starts anew: what bends there is not known, and tells nothing.
+            // The attitude starts anew after an unknown command, so that its change there carries no information.
             let known = kick.iter().all(|x| x.is_finite());
             Perturbation { held_rad_s2: Vector3::zeros(), kick_rad_s: if known { kick } else { Vector3::zeros() } }
         };

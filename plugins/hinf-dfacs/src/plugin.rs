@@ -36,7 +36,7 @@ struct Linked {
     reconstruction: Reconstruction,
     settings: Settings,
     all_readouts: bool,
-    /// Epochs held back until they have told the levels of the noise; none from then on.
+    /// Epochs held back until the levels of the noise are measured; `None` from then on.
     held_back: Option<Vec<Epoch>>,
     rate_hz: f64,
     readout: Vec<Option<In>>,

@@ -61,7 +61,7 @@ pub struct Epoch {
     pub command: CommandNumbers,
     /// Unit vector from the Sun to the spacecraft, SRF.
     pub sun_srf: Vector3<f64>,
-    /// How old the latest packet of the ephemeris is, s; NaN where nobody tells.
+    /// How old the latest packet of the ephemeris is, s; NaN if not telemetered.
     pub ephemeris_age_s: f64,
     /// `ω_CI`, CRF, rad s⁻¹.
     pub omega_crf_rad_s: Vector3<f64>,
@@ -424,8 +424,8 @@ impl Reconstruction {
             (None, None) => &mut self.counts.commands_missing,
         };
         *counter += 1;
-        // Electrodes of one test mass that nobody tells of: the other one and the spacecraft go on. Their recoil, 1e-9
-        // N on the spacecraft, is a thousandth of the thrusters' noise.
+        // Without the electrodes' commands of one test mass, the others and the spacecraft go on: the recoil on the
+        // spacecraft, 1e-9 N, is a thousandth of the thrusters' noise.
         let without = |tm: usize| -> Option<CommandNumbers> {
             let theirs = electrodes_of(tm);
             let given = |i: usize| if theirs.contains(&i) { 0.0 } else { epoch.command[i] };

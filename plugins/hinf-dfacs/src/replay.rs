@@ -94,7 +94,7 @@ impl Held {
 }
 
 /// How far the replayed commands are from the telemetered ones, vector by vector, about their mean difference: an
-/// integrator whose state nobody telemetered differs by a constant.
+/// integrator whose state is not telemetered differs by a constant.
 #[derive(Clone, Debug)]
 pub struct Comparison {
     samples: u64,
