@@ -5,7 +5,7 @@ use dragfree_physics::lag::Lag;
 use dragfree_physics::mission::{self, MissionError};
 use dragfree_physics::noise::NoiseShape;
 use dragfree_physics::process::NoiseProcess;
-use nalgebra::{DMatrix, DVector, Matrix3, Matrix6, Vector3, Vector6};
+use nalgebra::{DMatrix, DVector, Matrix6, Vector3, Vector6};
 use rand::SeedableRng;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
@@ -75,13 +75,6 @@ impl Layout {
         ));
         let whole = &self.wrenches * psd * self.wrenches.transpose();
         Matrix6::from_fn(|i, j| whole[(i, j)])
-    }
-
-    /// Correlation of force (rows) and torque (columns) noise, SRF.
-    #[must_use]
-    pub fn force_torque_correlation(&self) -> Matrix3<f64> {
-        let psd = self.noise_psd();
-        Matrix3::from_fn(|i, j| psd[(i, 3 + j)] / (psd[(i, i)] * psd[(3 + j, 3 + j)]).sqrt())
     }
 }
 
@@ -346,8 +339,9 @@ mod tests {
         };
         let mut units = vec![unit(1.0), unit(-2.0)];
         units.extend((0..9).map(spread));
-        let correlation = Layout::new(&units).unwrap().force_torque_correlation();
-        assert!((correlation[(0, 1)] + 1.0 / 10.0_f64.sqrt()).abs() < 1e-12, "{correlation}");
+        let psd = Layout::new(&units).unwrap().noise_psd();
+        let correlation = psd[(0, 4)] / (psd[(0, 0)] * psd[(4, 4)]).sqrt();
+        assert!((correlation + 1.0 / 10.0_f64.sqrt()).abs() < 1e-12, "{correlation}");
 
         for layout in [Layout::six(1e-7), Layout::new(&nine().unit).unwrap()] {
             let wanted = layout.noise_psd() * (0.5 / DT_S);

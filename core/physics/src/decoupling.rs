@@ -482,8 +482,11 @@ mod tests {
         assert!(error.contains("drag-free axes"), "{error}");
     }
 
+    /// Test masses: name, angle of the frame, rad, and drag-free axes.
+    type Bodies<'a> = &'a [(&'a str, f64, &'a [Axis])];
+
     /// Test masses in any number, each with its drag-free axes.
-    fn mission_of(layout: &[(&str, f64, &[Axis])]) -> Mission {
+    fn mission_of(layout: Bodies<'_>) -> Mission {
         let mut mission = taiji();
         let one = mission.test_mass["tm1"].clone();
         mission.housing = None;
@@ -508,7 +511,7 @@ mod tests {
     #[test]
     fn any_number_of_test_masses_and_drag_free_axes_has_an_allocation() {
         use Axis::{X, Y, Z};
-        let layouts: [(&[(&str, f64, &[Axis])], usize, usize); 7] = [
+        let layouts: [(Bodies<'_>, usize, usize); 7] = [
             (&[("a", 0.3, &[X, Y, Z])], 9, 9),
             (&[("a", 0.3, &[X, Y])], 10, 9),
             (&[("a", 0.3, &[X])], 11, 9),

@@ -1,10 +1,9 @@
 //! A list of few values kept in place: what there is of each test mass, without an allocation per sample.
 
-use std::fmt;
 use std::ops::{Deref, DerefMut};
 
 /// At most `MOST` values; a slice in every other respect.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Few<T, const MOST: usize> {
     values: [T; MOST],
     length: usize,
@@ -90,18 +89,6 @@ impl<'a, T, const MOST: usize> IntoIterator for &'a mut Few<T, MOST> {
 
     fn into_iter(self) -> Self::IntoIter {
         self.iter_mut()
-    }
-}
-
-impl<T: PartialEq, const MOST: usize> PartialEq for Few<T, MOST> {
-    fn eq(&self, other: &Self) -> bool {
-        **self == **other
-    }
-}
-
-impl<T: fmt::Debug, const MOST: usize> fmt::Debug for Few<T, MOST> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        (**self).fmt(f)
     }
 }
 

@@ -5,7 +5,7 @@
 //! partition, `D_11 ≠ 0`, `D_12` and `D_21` of full rank but not normalised, `D_22 ≠ 0`.
 //!
 //! Two certificates look at a finished loop and know nothing of how its controller came about: the Hamiltonian test of
-//! `‖G‖∞ < γ` ([`norm`], [`norm_is_below`]), and the Bounded Real Lemma's matrix inequality ([`bounded_real`]).
+//! `‖G‖∞ < γ` ([`norm`]), and the Bounded Real Lemma's matrix inequality ([`bounded_real`]).
 
 use nalgebra::linalg::balancing::balance_parlett_reinsch;
 use nalgebra::{Complex, DMatrix};
@@ -552,18 +552,6 @@ pub fn norm(system: &StateSpace, relative_tolerance: f64) -> Result<Norm, HinfEr
     }
 }
 
-/// The Hamiltonian test alone: whether a stable system has `‖G‖∞ < γ`.
-///
-/// # Errors
-/// [`HinfError`] when the poles or the Hamiltonian's eigenvalues cannot be found.
-pub fn norm_is_below(system: &StateSpace, gamma: f64) -> Result<bool, HinfError> {
-    let system = with_balanced_states(system);
-    if must_be_stable(&system).is_err() || largest_singular_value(&system.d) >= gamma {
-        return Ok(false);
-    }
-    Ok(best_gain(&system, &crossings(&system, gamma)?).value < gamma)
-}
-
 /// The Bounded Real Lemma's certificate of `‖G‖∞ < γ`: `X = Xᵀ > 0` with
 /// `[[AᵀX + XA + CᵀC, XB + CᵀD], [BᵀX + DᵀC, DᵀD − γ²I]] < 0`.
 ///
@@ -658,6 +646,15 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
     use serde_json::Value;
+
+    /// The Hamiltonian test alone: whether a stable system has `‖G‖∞ < γ`.
+    fn norm_is_below(system: &StateSpace, gamma: f64) -> Result<bool, HinfError> {
+        let system = with_balanced_states(system);
+        if must_be_stable(&system).is_err() || largest_singular_value(&system.d) >= gamma {
+            return Ok(false);
+        }
+        Ok(best_gain(&system, &crossings(&system, gamma)?).value < gamma)
+    }
 
     fn matrix(value: &Value) -> Matrix {
         let rows: Vec<Vec<f64>> = serde_json::from_value(value.clone()).unwrap();

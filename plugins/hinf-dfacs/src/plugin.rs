@@ -53,6 +53,9 @@ struct Linked {
     rows: Vec<Row>,
 }
 
+/// Names of the noise of a test mass's displacements along x, y, z.
+type Noises = [&'static str; 3];
+
 /// Asks for three columns of the grid, if the first is there.
 fn read_vector(
     available: &Available,
@@ -80,7 +83,7 @@ impl HinfDfacs {
         &mut self,
         available: &Available,
         link: &mut Link<'_>,
-    ) -> Result<(Vec<Option<In>>, Vec<[&'static str; 3]>), PluginError> {
+    ) -> Result<(Vec<Option<In>>, Vec<Noises>), PluginError> {
         let (mut readout, mut noises) = (Vec::new(), Vec::new());
         for angle in ANGLES {
             let want = grid(&format!("dws.sc_crf_rad.{angle}"), "rad", "CRF");
@@ -196,7 +199,7 @@ fn write_columns(
     link: &mut Link<'_>,
     table: Table,
     mission: &Mission,
-    noises: &[[&'static str; 3]],
+    noises: &[Noises],
 ) -> Result<Vec<Out>, PluginError> {
     let declared = noise::declared(mission, noises);
     let mut out = Vec::with_capacity(row_length(noises.len()));
