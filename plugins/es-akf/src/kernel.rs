@@ -241,9 +241,9 @@ impl<const N: usize, const D: usize> Transition<N, D> {
             self.move_noise(row, if i < first { 1.0 } else { self.decay[i] });
         }
         for &(i, j, link) in &self.links {
-            let [to, from] = d.get_disjoint_mut([i, j]).expect("a link joins two states");
+            let from = d[j];
             for l in LANES..N {
-                to[l] += link * from[l];
+                d[i][l] += link * from[l];
             }
         }
     }
