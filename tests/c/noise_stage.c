@@ -1,18 +1,19 @@
-/* A stage `c-gauge` in plain C that makes two channels of its own and declares their noise, and an effect `c-gauge-gain` that acts
- * on both.
+/* A stage `c-gauge` in plain C that makes two channels of its own and declares their noise, and an effect
+ * `c-gauge-gain` that acts on both.
  *
- *   gauge.x (m s-2, measured as it is)     w_k + h_k + GAIN s_k,                                    h_k = (a_{k-1} + a_k)/2
- *   gauge.y (m s-2, from displacements)    (d_{k+1} - 2 d_k + d_{k-1})/dt^2 + 0.8 h_k + GAIN (u_{k-1} + u_k)/2
+ *   gauge.x (m s-2, measured as it is)   w_k + h_k + GAIN s_k,   h_k = (a_{k-1} + a_k)/2
+ *   gauge.y (m s-2, from displacements)  (d_{k+1} - 2 d_k + d_{k-1})/dt^2 + 0.8 h_k + GAIN (u_{k-1} + u_k)/2
  *
- * w, a and d are white Gaussian noise, s and u known random series; each value is a hash of its time, so that batches do not
- * matter. */
+ * w, a and d are white Gaussian noise, s and u known random series; each value is a hash of its time, so that batches
+ * do not matter. */
 #include <dragfree/rows.h>
 #include <math.h>
 #include <stdio.h>
 
 static const double PI = 3.14159265358979323846;
 static const double DT_S = 0.1, GAIN = 2.0;
-/* One-sided amplitude spectral densities: own noise of x, common acceleration, readout of y; and of the known series. */
+/* One-sided amplitude spectral densities: own noise of x, common acceleration, readout of y; and of the known
+ * series. */
 static const double OWN = 3e-10, COMMON = 4e-10, READOUT = 1e-12, SERIES = 1e-9;
 
 typedef struct {

@@ -2,7 +2,7 @@
 
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 
 fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
@@ -85,6 +85,42 @@ fn a_forbidden_dependency_is_detected() {
         forbidden_dependencies(&broken),
         ["dragfree-engine -> dragfree-physics", "dragfree-es-akf -> dragfree-engine"]
     );
+}
+
+/// Files of the tree with one of these extensions, without what is built and without the test data.
+fn sources(extensions: &[&str]) -> Vec<PathBuf> {
+    let (mut folders, mut found) = (vec![dragfree_tests::root().to_owned()], Vec::new());
+    while let Some(folder) = folders.pop() {
+        for path in std::fs::read_dir(&folder).expect("a folder").flatten().map(|entry| entry.path()) {
+            let name = path.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+            if path.is_dir() && !name.starts_with('.') && !["target", "data"].contains(&name) {
+                folders.push(path);
+            } else if path.extension().and_then(|e| e.to_str()).is_some_and(|e| extensions.contains(&e)) {
+                found.push(path);
+            }
+        }
+    }
+    found
+}
+
+/// Numbers of the lines of comment that are wider than code may be.
+fn wide_comments(text: &str) -> Vec<usize> {
+    let comment = |line: &str| ["//", "/*", "*"].iter().any(|mark| line.trim_start().starts_with(mark));
+    let wide = text.lines().enumerate().filter(|(_, line)| line.chars().count() > 120 && comment(line));
+    wide.map(|(n, _)| n + 1).collect()
+}
+
+#[test]
+fn no_comment_is_wider_than_the_code() {
+    let files = sources(&["rs", "c", "h"]);
+    assert!(files.len() > 250, "the files were read: {}", files.len());
+    let of = |path: &PathBuf| {
+        let lines = wide_comments(&std::fs::read_to_string(path).expect("text"));
+        lines.into_iter().map(|n| format!("{}:{n}", path.display())).collect::<Vec<_>>()
+    };
+    assert_eq!(files.iter().flat_map(of).collect::<Vec<_>>(), Vec::<String>::new());
+    let line = format!("    /// {}", "µ".repeat(112));
+    assert_eq!(wide_comments(&format!("{line}\n{line}µ\nlet text = \"{line}{line}\";\n")), [2]);
 }
 
 /// Every package with its features, as built with these kinds of dependencies.
@@ -286,7 +322,7 @@ fn no_modules_import_each_other_in_a_circle() {
     let crates = below("core").chain(below("plugins")).chain(["sim-plugin", "validation"].map(|name| root.join(name)));
     let crates: Vec<_> = crates.filter(|folder| folder.join("src").is_dir()).collect();
     assert!(crates.len() > 10, "the crates were read");
-    let of = |folder: &std::path::PathBuf| {
+    let of = |folder: &PathBuf| {
         circles(&modules(&folder.join("src")))
             .into_iter()
             .map(|pair| format!("{}: {pair}", folder.display()))

@@ -1,5 +1,5 @@
-//! Thresholds in a pipeline file's table `[settings]`: stages decide by them, a product stores them, and `compare` takes
-//! them from there.
+//! Thresholds in a pipeline file's table `[settings]`: stages decide by them, a product stores them, and `compare`
+//! takes them from there.
 
 use dragfree_tests::{dragfree, expect, fixture, json, simulate};
 use serde_json::Value;

@@ -181,8 +181,8 @@ pub struct RefinementRequest {
 }
 
 /// Numbers of trials for the correction of p-values. Every effect, and the search for transients, has the same part of
-/// [`Settings::false_alarm`]; an effect's part is shared by all its forms (weighted Bonferroni; the weights are fixed before the
-/// data are seen).
+/// [`Settings::false_alarm`]; an effect's part is shared by all its forms (weighted Bonferroni; the weights are fixed
+/// before the data are seen).
 ///
 /// With equal weights of all forms, an effect of one form would pay for the ten thousand pairs of thermometers and lags
 /// of another.
@@ -407,8 +407,8 @@ fn candidates_of_excess(
 /// - It was selected by an excess of power, or has `part` > ½ of its information in the bands of one, and an excess or
 ///   a coherence with
 ///   housekeeping remains in its channels: it correlates with the cause and is not the cause.
-/// - It moves the offset, and its fall of χ² is below [`Settings::level_trace`] of that of a level of noise that drives an
-///   estimate (see there). It should be tried again with that level in the model.
+/// - It moves the offset, and its fall of χ² is below [`Settings::level_trace`] of that of a level of noise that drives
+///   an estimate (see there). It should be tried again with that level in the model.
 fn is_doubtful(settings: &Settings, f: &Found, part: f64, extra: &[Found], unexplained: Option<&Unexplained>) -> bool {
     // For an effect selected by an excess, a remaining coherence is as much evidence as remaining power.
     let remains = |u: &Unexplained| (u.power || f.of_excess) && f.channels.iter().any(|c| u.channels.contains(c));

@@ -55,7 +55,8 @@ pub struct Settings {
     pub max_missing: f64,
     /// Chosen. Most transients that become candidates: each is a column of the sums.
     pub max_transients: usize,
-    /// Chosen. A transient becomes a candidate below this p-value; whether it is certain is decided among the candidates.
+    /// Chosen. A transient becomes a candidate below this p-value; whether it is certain is decided among the
+    /// candidates.
     pub transient_p_value: f64,
     /// Chosen. Detections this close to a larger one are its ringing in another window, s.
     pub same_transient_s: f64,
@@ -65,8 +66,8 @@ pub struct Settings {
     pub confounded: f64,
     /// Chosen. A candidate is degenerate with the model if the model leaves less than this part of its information.
     pub degenerate: f64,
-    /// Chosen. The taper's loss of a waveform's energy is corrected up to this factor: with less left, its amplitude rests on too
-    /// few samples.
+    /// Chosen. The taper's loss of a waveform's energy is corrected up to this factor: with less left, its amplitude
+    /// rests on too few samples.
     pub max_taper_loss: f64,
     /// Chosen. Most effects that are added.
     pub max_added: usize,
@@ -74,12 +75,13 @@ pub struct Settings {
     pub max_evaluated: usize,
     /// Chosen. Candidates whose likelihood is computed where there is an excess: each costs two fits.
     pub max_excess_candidates: usize,
-    /// Chosen. p-value of the difference of the halves' values below which a candidate is refused: a lasting cause is constant.
+    /// Chosen. p-value of the difference of the halves' values below which a candidate is refused: a lasting cause is
+    /// constant.
     pub halves_p_value: f64,
     /// Chosen. Relative accuracy of the noise in a mission file: a level within it is not reported as missing.
     pub level_tolerance: f64,
-    /// Chosen. A candidate that moves the offset is doubtful if its fall of χ² is below this part of that of a level of torque
-    /// noise: the unknown part of such a torque leaves traces that candidates follow.
+    /// Chosen. A candidate that moves the offset is doubtful if its fall of χ² is below this part of that of a level of
+    /// torque noise: the unknown part of such a torque leaves traces that candidates follow.
     pub level_trace: f64,
     /// Chosen. Bias of the offset, σ, from which a candidate counts as moving it.
     pub moves_offset_sigmas: f64,
@@ -89,12 +91,14 @@ pub struct Settings {
     pub excess_ratio: f64,
     /// Derived: 3.4e-6 each, 1e-3 over nine channels and fourteen thirds of decades, plain and partial.
     pub excess_sigmas: f64,
-    /// Chosen. Part of the largest excess that an explanation may leave: the forms that are tried differ from the true one.
+    /// Chosen. Part of the largest excess that an explanation may leave: the forms that are tried differ from the true
+    /// one.
     pub excess_remainder: f64,
-    /// Chosen. False-alarm rate of a coherence with housekeeping over all drivers and channels: a small part of `false_alarm`.
+    /// Chosen. False-alarm rate of a coherence with housekeeping over all drivers and channels: a small part of
+    /// `false_alarm`.
     pub coherence_false_alarm: f64,
-    /// Chosen. Part of a channel's power that housekeeping has to explain to be evidence where there is no excess: currents of
-    /// actuators follow commands, which share the readouts with the residuals, by a few per cent.
+    /// Chosen. Part of a channel's power that housekeeping has to explain to be evidence where there is no excess:
+    /// currents of actuators follow commands, which share the readouts with the residuals, by a few per cent.
     pub coherence_min_explained: f64,
     /// Chosen. An excess wholly below this frequency is called a drift, Hz: slower than an hour.
     pub drift_hz: f64,

@@ -281,7 +281,8 @@ typedef struct dragfree_entry_v1 {
 #define DRAGFREE_EXPORT __attribute__((visibility("default")))
 #endif
 
-/* A plugin defines:  DRAGFREE_EXPORT const dragfree_entry_v1 dragfree_entry = { DRAGFREE_ABI_VERSION, 0, get_factory }; */
+/* A plugin defines:
+ *   DRAGFREE_EXPORT const dragfree_entry_v1 dragfree_entry = { DRAGFREE_ABI_VERSION, 0, get_factory }; */
 
 #ifdef __cplusplus
 }

@@ -1,5 +1,5 @@
-/* dragfree/rows.h - helpers for a plugin written in plain C: rows out as a struct array of times and float64 columns, as plugin.h
- * wants it, and columns in. No part of the border: copy it, change it, or do without. */
+/* dragfree/rows.h - helpers for a plugin written in plain C: rows out as a struct array of times and float64
+ * columns, as plugin.h wants it, and columns in. No part of the border: copy it, change it, or do without. */
 #ifndef DRAGFREE_ROWS_H
 #define DRAGFREE_ROWS_H
 

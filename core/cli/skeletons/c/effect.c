@@ -3,10 +3,11 @@
  * The lines to change for another cause are marked with CHANGE. */
 #include <dragfree/rows.h>
 
-/* CHANGE: the physical range of the coefficient, N per unit of the channel. The solution never leaves it, so a coefficient that ends
- * at it says that the cause is another. */
+/* CHANGE: the physical range of the coefficient, N per unit of the channel. The solution never leaves it, so a
+ * coefficient that ends at it says that the cause is another. */
 #define RANGE "1e-6"
-/* CHANGE: how far from zero the coefficient is expected before any data, N per unit of the channel: one standard deviation. */
+/* CHANGE: how far from zero the coefficient is expected before any data, N per unit of the channel: one standard
+ * deviation. */
 #define PRIOR_SIGMA "1e-7"
 
 typedef struct {
@@ -18,8 +19,8 @@ typedef struct {
 
 static const char *effect_manifest(uint32_t index) {
   (void)index;
-  /* CHANGE: the description; every parameter with unit, default, range and help (a model that gives another key is refused); where
-   * it can act, where {test_mass} stands for each test mass of the mission. */
+  /* CHANGE: the description; every parameter with unit, default, range and help (a model that gives another key is
+   * refused); where it can act, where {test_mass} stands for each test mass of the mission. */
   return "{\"id\":\"{{NAME}}\",\"version\":\"0.1.0\",\"licence\":\"MIT OR Apache-2.0\","
          "\"description\":\"Force on a test mass in proportion to a housekeeping channel\","
          "\"instances\":[\"{test_mass}.x\",\"{test_mass}.y\",\"{test_mass}.z\"],\"parameters\":["
@@ -34,8 +35,8 @@ static dragfree_status effect_link(void *self, const dragfree_link_v1 *link, dra
   const char *unit = "1", *frame = "", *axis = strchr(e->instance, '.') + 1;
   double rate_hz = 0.0;
   char name[96], shown[64], column[192], text[512], attributes[256], table[96];
-  /* CHANGE: the channels in which it shows, a column each. Channels hold measured minus known acceleration: NAME.accel.x to NAME.accel.z
-   * of a test mass in m s-2, sc.alpha.x to sc.alpha.z in rad s-2. */
+  /* CHANGE: the channels in which it shows, a column each. Channels hold measured minus known acceleration:
+   * NAME.accel.x to NAME.accel.z of a test mass in m s-2, sc.alpha.x to sc.alpha.z in rad s-2. */
   snprintf(shown, sizeof shown, "%.*s.accel.%s", (int)(axis - 1 - e->instance), e->instance, axis);
   /* Table `grid`: what the preprocessing stage has brought onto one grid of epochs. */
   for (uint32_t i = 0; i < link->available_count; i++) {
@@ -74,8 +75,8 @@ static dragfree_status effect_process(void *self, const dragfree_inputs_v1 *inpu
   const double *reference = *e->reference ? input(table, e->reference_slot.column) : NULL;
   if (!make_table(&outputs[0], input(table, -1), table->length, 1)) return say(error, DRAGFREE_FATAL, "no memory");
   double *acceleration = column(&outputs[0], 0);
-  /* CHANGE: the acceleration that one unit of the coefficient adds, m s-2, one value a row: the mean from the row's time to the next
-   * row's. No value of the channel, NaN, gives no value here. */
+  /* CHANGE: the acceleration that one unit of the coefficient adds, m s-2, one value a row: the mean from the row's
+   * time to the next row's. No value of the channel, NaN, gives no value here. */
   for (int64_t k = 0; k < table->length; k++)
     acceleration[k] = (channel[k] - (reference ? reference[k] : 0.0)) / e->mass_kg;
   return DRAGFREE_OK;

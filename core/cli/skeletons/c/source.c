@@ -13,7 +13,8 @@ typedef struct {
 
 static const char *source_manifest(uint32_t index) {
   (void)index;
-  /* CHANGE: the description; every parameter with unit, default, range and help: a pipeline that gives another key is refused. */
+  /* CHANGE: the description; every parameter with unit, default, range and help: a pipeline that gives another key
+   * is refused. */
   return "{\"id\":\"{{NAME}}\",\"version\":\"0.1.0\",\"licence\":\"MIT OR Apache-2.0\","
          "\"description\":\"A temperature that climbs\",\"parameters\":["
          "{\"name\":\"slope_k_s\",\"type\":\"f64\",\"unit\":\"K s-1\",\"default\":1.2e-5,\"minimum\":-1.0,\"maximum\":1.0,"
@@ -23,8 +24,8 @@ static const char *source_manifest(uint32_t index) {
 static dragfree_status source_link(void *self, const dragfree_link_v1 *link, dragfree_error_v1 *error) {
   (void)self;
   (void)error;
-  /* CHANGE: tables are called as the topics of the telemetry, `is`, `dws`, `hk/NAME`, their columns as its fields; rate 0 is rows as
-   * they come. */
+  /* CHANGE: tables are called as the topics of the telemetry, `is`, `dws`, `hk/NAME`, their columns as its fields;
+   * rate 0 is rows as they come. */
   dragfree_column_v1 value = {"hk/example_temperature_k", "value", "K", "", 0.0, NULL};
   return link->write(link->context, &value);
 }

@@ -11,7 +11,8 @@ typedef struct {
 
 static const char *stage_manifest(uint32_t index) {
   (void)index;
-  /* CHANGE: the description; every parameter with unit, default, range and help: a pipeline that gives another key is refused. */
+  /* CHANGE: the description; every parameter with unit, default, range and help: a pipeline that gives another key
+   * is refused. */
   return "{\"id\":\"{{NAME}}\",\"version\":\"0.1.0\",\"licence\":\"MIT OR Apache-2.0\","
          "\"description\":\"Scales the first test mass's displacement along y\",\"parameters\":["
          "{\"name\":\"factor\",\"type\":\"f64\",\"unit\":\"1\",\"default\":2.0,\"minimum\":-1000.0,\"maximum\":1000.0,"
