@@ -134,6 +134,8 @@ impl Stage for EsAkf {
         needs: &[],
     };
 
+    const STATE_VERSION: u32 = 2;
+
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         let mission = Mission::from_json(setup.mission_json())?;
         let rate_hz = mission.mission.sample_rate_hz;

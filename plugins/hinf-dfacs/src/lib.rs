@@ -10,7 +10,6 @@ mod plugin;
 pub mod reconstruction;
 pub mod replay;
 pub mod smoother;
-pub mod state;
 mod thruster_response;
 
 pub use plugin::HinfDfacs;

@@ -8,11 +8,11 @@
 
 use dragfree_physics::control::PerTestMass;
 use dragfree_physics::mission::{AXES, Mission};
+use dragfree_sdk::state::{State, StateError};
 use nalgebra::{Matrix3, Vector3};
 
-use crate::replay::{CommandNumbers, command_vectors, electrodes_of};
+use crate::replay::{CommandNumbers, command_vectors, electrodes_of, visit_command};
 use crate::smoother::{Perturbation, ResponseState, Smoothed, Smoother};
-use crate::state::{Reader, StateError, Writer};
 
 /// Whether a column on demand is made from commands, as all but two are: the Sun's direction, and the derivative by a
 /// delay of the wavefront sensing, which is made of the smoothed attitude.
@@ -42,13 +42,20 @@ impl Needs {
         self.torque_response || self.dws_delay_response
     }
 
-    pub(crate) fn flags(self) -> [bool; 3] {
-        [self.commands, self.torque_response, self.dws_delay_response]
+    /// For a sentence about a state that is of another model.
+    pub(crate) fn describe(self) -> String {
+        let all = [
+            ("commands", self.commands),
+            ("torque-response", self.torque_response),
+            ("dws-delay-response", self.dws_delay_response),
+        ];
+        let names: Vec<&str> = all.iter().filter(|(_, needed)| *needed).map(|(name, _)| *name).collect();
+        format!("one whose effects need [{}]", names.join(", "))
     }
 }
 
 /// What acted over one interval as commanded; NaN where unknown.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Used {
     command: CommandNumbers,
     sun_srf: Vector3<f64>,
@@ -211,30 +218,18 @@ impl OnDemand {
         response
     }
 
-    pub(crate) fn save(&self, out: &mut Writer) {
-        out.numbers(self.kick_rad_s2.as_slice());
-        self.torque.iter().chain([&self.delay]).for_each(|response| response.save(out));
-        for used in &self.used {
-            out.numbers(&used.command);
-            out.numbers(used.sun_srf.as_slice());
-        }
-    }
-
-    /// Takes a state of `waiting` epochs back.
-    pub(crate) fn load(&mut self, waiting: usize, state: &mut Reader<'_>) -> Result<(), StateError> {
-        state.numbers(self.kick_rad_s2.as_mut_slice())?;
+    /// The state with `waiting` epochs.
+    pub(crate) fn visit(&mut self, waiting: usize, state: &mut State<'_>) -> Result<(), StateError> {
+        state.f64s(self.kick_rad_s2.iter_mut())?;
         for response in self.torque.iter_mut().chain([&mut self.delay]) {
-            response.load(state)?;
+            response.visit(state)?;
         }
-        self.used.clear();
-        for _ in 0..waiting {
-            let command = CommandNumbers::from_fn(3 * self.vectors.len(), |_| 0.0);
-            let mut used = Used { command, sun_srf: Vector3::zeros() };
-            state.numbers(&mut used.command)?;
-            state.numbers(used.sun_srf.as_mut_slice())?;
-            self.used.push(used);
-        }
-        Ok(())
+        let numbers = 3 * self.vectors.len();
+        state.list(&mut self.used, |state, used| {
+            visit_command(state, numbers, &mut used.command)?;
+            state.f64s(used.sun_srf.iter_mut())
+        })?;
+        if self.used.len() == waiting { Ok(()) } else { Err(StateError::Content("a number of waiting commands")) }
     }
 }
 

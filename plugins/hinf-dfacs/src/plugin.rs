@@ -10,7 +10,6 @@ use crate::noise_calibration::{self, NoiseScale};
 use crate::on_demand::{self, Needs};
 use crate::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Row, Settings, levels_of, row_length};
 use crate::replay::{CommandNumbers, Comparison, command_vectors};
-use crate::state::{Reader, StateError, Writer};
 
 /// The innovations' variance may differ from the prediction by this much before it is worth a sentence; a day's
 /// sampling error is 0.2 %.
@@ -18,8 +17,6 @@ const INNOVATION_TOLERANCE: f64 = 0.1;
 /// Standard deviations of the innovations' correlation with rebuilt commands above which the commands are not those
 /// that acted; a false alarm in 2e-6 of all runs.
 const INCONSISTENT_SIGMA: f64 = 5.0;
-const STATE: &[u8; 8] = b"dfacs/8\n";
-
 /// The stage.
 pub struct HinfDfacs {
     mission: Mission,
@@ -333,6 +330,8 @@ impl Stage for HinfDfacs {
         needs: &[],
     };
 
+    const STATE_VERSION: u32 = 2;
+
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         let angular_acceleration = match setup.text("angular_acceleration")?.as_str() {
             "commanded" => AngularAcceleration::Commanded,
@@ -557,55 +556,25 @@ impl Stage for HinfDfacs {
     }
 
     fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
-        let mut bytes = if state.is_loading() { Vec::new() } else { self.save()? };
-        state.bytes(&mut bytes)?;
-        if state.is_loading() { self.load(&bytes) } else { Ok(()) }
-    }
-}
-
-impl HinfDfacs {
-    fn save(&self) -> Result<Vec<u8>, PluginError> {
-        let linked = self.linked.as_ref().ok_or_else(not_linked)?;
-        let mut out = Writer(STATE.to_vec());
-        out.flag(linked.held_back.is_some());
-        let scale = linked.settings.scale;
-        out.numbers(scale.torque.as_slice());
-        out.numbers(&[scale.sensing]);
-        match &linked.held_back {
-            Some(held_back) => {
-                out.count(held_back.len() as u64);
-                held_back.iter().for_each(|epoch| epoch.save(&mut out));
-            }
-            None => out.0.extend_from_slice(&linked.reconstruction.save()),
+        let test_masses = self.mission.test_mass.len();
+        let linked = self.linked.as_mut().ok_or_else(not_linked)?;
+        let mut scale = linked.settings.scale;
+        state.f64s(scale.torque.iter_mut().chain([&mut scale.sensing]))?;
+        if !scale.torque.iter().chain([&scale.sensing]).all(|x| x.is_finite() && *x > 0.0) {
+            return Err(StateError::Content("a level of the noise").into());
         }
-        Ok(out.0)
-    }
-
-    fn load(&mut self, state: &[u8]) -> Result<(), PluginError> {
-        let mut reader = Reader::new(state);
-        if reader.bytes().ok().as_ref() != Some(STATE) {
-            return Err(StateError::Foreign { expected: "version 8" }.into());
-        }
-        let waits = reader.flag()?;
-        let mut numbers = [0.0; 4];
-        reader.numbers(&mut numbers)?;
-        if !numbers.iter().all(|x| x.is_finite() && *x > 0.0) {
-            return Err(reader.damaged("a level of the noise").into());
-        }
-        let scale = NoiseScale { torque: Vector3::new(numbers[0], numbers[1], numbers[2]), sensing: numbers[3] };
-        if waits {
-            let count =
-                reader.length(noise_calibration::length(self.linked.as_ref().ok_or_else(not_linked)?.rate_hz))?;
-            let test_masses = self.mission.test_mass.len();
-            let held_back = (0..count).map(|_| Epoch::load(test_masses, &mut reader)).collect::<Result<_, _>>()?;
-            reader.end()?;
-            self.linked.as_mut().ok_or_else(not_linked)?.held_back = Some(held_back);
+        let most = noise_calibration::length(linked.rate_hz);
+        state.option(&mut linked.held_back, |state, held_back| {
+            state.list(held_back, |state, epoch| epoch.visit(test_masses, state))?;
+            if held_back.len() > most { Err(StateError::Content("a number of epochs")) } else { Ok(()) }
+        })?;
+        if linked.held_back.is_some() {
             return Ok(());
         }
-        self.rebuild(scale)?;
-        let linked = self.linked.as_mut().ok_or_else(not_linked)?;
-        linked.held_back = None;
-        Ok(linked.reconstruction.load(reader.rest())?)
+        if state.is_loading() {
+            self.rebuild(scale)?;
+        }
+        Ok(self.linked.as_mut().ok_or_else(not_linked)?.reconstruction.visit(state)?)
     }
 }
 

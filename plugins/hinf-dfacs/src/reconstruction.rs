@@ -4,20 +4,18 @@ use dragfree_physics::control::{Command, ControlLaw, PerTestMass};
 use dragfree_physics::few::Few;
 use dragfree_physics::mission::{MOST_TEST_MASSES, Mission, MissionError, TestMass};
 use dragfree_physics::thrust_noise::ThrustNoise;
+use dragfree_sdk::state::{State, StateError};
 use nalgebra::{Matrix3, Vector3};
 
 use crate::bridge::{LONGEST, bridge};
 use crate::known::{KnownModel, KnownMotion};
 use crate::noise_calibration::NoiseScale;
 use crate::on_demand::{Availability, Needs, OnDemand};
-use crate::replay::{CommandNumbers, Comparison, Held, ReadoutNumbers, Replay, electrodes_of};
+use crate::replay::{CommandNumbers, Comparison, Held, ReadoutNumbers, Replay, electrodes_of, visit_command};
 use crate::smoother::{Model, Smoothed, Smoother};
-use crate::state::{Reader, StateError, Writer};
 use crate::thruster_response::ThrusterResponse;
 
 const NEEDED_BY: &str = "hinf-dfacs";
-const STATE: &[u8; 8] = b"dfacs/7\n";
-
 /// Where the angular acceleration comes from. Only the smoother gives an unbiased calibration (physics.md §4).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum AngularAcceleration {
@@ -51,7 +49,7 @@ pub struct Settings {
 }
 
 /// Telemetry at `t_k`; NaN where there is none.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 pub struct Epoch {
     /// Unix ns.
     pub time_ns: i64,
@@ -70,33 +68,18 @@ pub struct Epoch {
 }
 
 impl Epoch {
-    pub(crate) fn save(&self, out: &mut Writer) {
-        out.time(self.time_ns);
-        out.numbers(&self.readout);
-        out.numbers(&self.command);
-        out.numbers(self.sun_srf.as_slice());
-        out.numbers(&[self.ephemeris_age_s]);
-        out.numbers(self.omega_crf_rad_s.as_slice());
-        out.numbers(self.alpha_crf_rad_s2.as_slice());
-    }
-
-    pub(crate) fn load(test_masses: usize, state: &mut Reader<'_>) -> Result<Self, StateError> {
-        let mut epoch = Self {
-            time_ns: state.time()?,
-            readout: ReadoutNumbers::from_fn(3 + 6 * test_masses, |_| 0.0),
-            command: CommandNumbers::from_fn(6 + 6 * test_masses, |_| 0.0),
-            sun_srf: Vector3::zeros(),
-            ephemeris_age_s: 0.0,
-            omega_crf_rad_s: Vector3::zeros(),
-            alpha_crf_rad_s2: Vector3::zeros(),
-        };
-        state.numbers(&mut epoch.readout)?;
-        state.numbers(&mut epoch.command)?;
-        state.numbers(epoch.sun_srf.as_mut_slice())?;
-        state.numbers(std::slice::from_mut(&mut epoch.ephemeris_age_s))?;
-        state.numbers(epoch.omega_crf_rad_s.as_mut_slice())?;
-        state.numbers(epoch.alpha_crf_rad_s2.as_mut_slice())?;
-        Ok(epoch)
+    /// Every field, of a mission with so many test masses.
+    pub(crate) fn visit(&mut self, test_masses: usize, state: &mut State<'_>) -> Result<(), StateError> {
+        if state.is_loading() {
+            self.readout = ReadoutNumbers::from_fn(3 + 6 * test_masses, |_| 0.0);
+        }
+        state.i64(&mut self.time_ns)?;
+        state.f64s(self.readout.iter_mut())?;
+        visit_command(state, 6 + 6 * test_masses, &mut self.command)?;
+        state.f64s(self.sun_srf.iter_mut())?;
+        state.f64(&mut self.ephemeris_age_s)?;
+        state.f64s(self.omega_crf_rad_s.iter_mut())?;
+        state.f64s(self.alpha_crf_rad_s2.iter_mut())
     }
 }
 
@@ -160,7 +143,7 @@ struct PendingTestMass {
 }
 
 /// An epoch that waits for the smoother.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Pending {
     time_ns: i64,
     attitude_rad: Vector3<f64>,
@@ -198,24 +181,12 @@ impl Pending {
         spacecraft.into_iter().chain(test_masses)
     }
 
-    fn save(mut self, out: &mut Writer) {
-        out.time(self.time_ns);
-        self.vectors().for_each(|v| out.numbers(v.as_slice()));
-    }
-
-    fn load(test_masses: usize, state: &mut Reader<'_>) -> Result<Self, StateError> {
-        let zero = Vector3::zeros();
-        let mut out = Self {
-            time_ns: state.time()?,
-            attitude_rad: zero,
-            bridged_rad: zero,
-            tm: PerTestMass::from_fn(test_masses, |_| PendingTestMass::default()),
-            alpha_known_rad_s2: zero,
-            frame_rad_s2: zero,
-            omega_ci_rad_s: zero,
-        };
-        out.vectors().try_for_each(|v| state.numbers(v.as_mut_slice()))?;
-        Ok(out)
+    fn visit(&mut self, test_masses: usize, state: &mut State<'_>) -> Result<(), StateError> {
+        if state.is_loading() {
+            self.tm = PerTestMass::from_fn(test_masses, |_| PendingTestMass::default());
+        }
+        state.i64(&mut self.time_ns)?;
+        self.vectors().try_for_each(|v| state.f64s(v.iter_mut()))
     }
 }
 
@@ -593,64 +564,27 @@ impl Reconstruction {
         self.smoother.model().lag()
     }
 
-    /// The whole state.
-    #[must_use]
-    pub fn save(&self) -> Vec<u8> {
-        let mut out = Writer(STATE.to_vec());
-        self.smoother.save(&mut out);
-        self.held.save(&mut out);
-        self.acting.save(&mut out);
-        out.optional(self.sun_srf.as_ref().map(Vector3::as_slice));
-        out.optional(self.packet_sun_srf.as_ref().map(Vector3::as_slice));
-        out.numbers(self.omega_ci_rad_s.as_slice());
-        out.numbers(self.alpha_ci_rad_s2.as_slice());
-        if let Some(replay) = &self.replay {
-            replay.save(&mut out);
-        }
-        let c = self.counts;
-        for count in [
-            c.epochs,
-            c.commands_telemetered,
-            c.commands_replayed,
-            c.commands_missing,
-            c.sun_missing,
-            c.attitude_missing,
-            c.commands_of_one_test_mass,
-            c.readouts_bridged,
-            c.blind,
-        ] {
-            out.count(count);
-        }
-        out.numbers(&[self.since_attitude]);
-        out.flag(self.previous.is_some());
-        for pending in self.previous.iter().chain(&self.pending) {
-            pending.save(&mut out);
-        }
-        self.needs().flags().into_iter().for_each(|flag| out.flag(flag));
-        if let Some(on_demand) = &self.on_demand {
-            on_demand.save(&mut out);
-        }
-        out.0
-    }
-
-    /// Takes a state back, bit for bit.
+    /// Visits the whole state, to save it or to take it back bit for bit.
     ///
     /// # Errors
-    /// [`StateError`] when the bytes are not a state of this stage with this mission; do not use the stage after that.
-    pub fn load(&mut self, bytes: &[u8]) -> Result<(), StateError> {
-        let mut state = Reader::new(bytes);
-        if state.bytes().ok().as_ref() != Some(STATE) {
-            return Err(StateError::Foreign { expected: "version 7" });
+    /// [`StateError`] when the state is of another mission or model; do not use the stage after that.
+    pub fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        let test_masses = self.push_per_turn.len();
+        state.same("mission", &format!("{test_masses} test masses"))?;
+        state.same("model", &self.needs().describe())?;
+        self.smoother.visit(state)?;
+        self.held.visit(state)?;
+        self.acting.visit(state)?;
+        for direction in [&mut self.sun_srf, &mut self.packet_sun_srf] {
+            state.option(direction, |state, v| state.f64s(v.iter_mut()))?;
         }
-        self.smoother.load(&mut state)?;
-        self.held.load(&mut state)?;
-        self.acting.load(&mut state)?;
-        self.sun_srf = state.optional()?.map(Vector3::from);
-        self.packet_sun_srf = state.optional()?.map(Vector3::from);
-        state.numbers(self.omega_ci_rad_s.as_mut_slice())?;
-        state.numbers(self.alpha_ci_rad_s2.as_mut_slice())?;
-        if let Some(replay) = &mut self.replay {
-            replay.load(&mut state)?;
+        state.f64s(self.omega_ci_rad_s.iter_mut().chain(self.alpha_ci_rad_s2.iter_mut()))?;
+        let mut replays = self.replay.is_some();
+        state.flag(&mut replays)?;
+        match &mut self.replay {
+            Some(replay) if replays => replay.visit(state)?,
+            None if !replays => {}
+            _ => return Err(StateError::Content("a replay of commands")),
         }
         let c = &mut self.counts;
         for count in [
@@ -664,26 +598,16 @@ impl Reconstruction {
             &mut c.readouts_bridged,
             &mut c.blind,
         ] {
-            *count = state.count()?;
+            state.u64(count)?;
         }
-        let mut since = [0.0];
-        state.numbers(&mut since)?;
-        [self.since_attitude] = since;
-        let test_masses = self.push_per_turn.len();
-        self.previous = if state.flag()? { Some(Pending::load(test_masses, &mut state)?) } else { None };
-        self.pending.clear();
-        for _ in 0..self.smoother.waiting() {
-            self.pending.push(Pending::load(test_masses, &mut state)?);
+        state.f64(&mut self.since_attitude)?;
+        state.option(&mut self.previous, |state, pending| pending.visit(test_masses, state))?;
+        state.list(&mut self.pending, |state, pending| pending.visit(test_masses, state))?;
+        let waiting = self.smoother.waiting();
+        let on_demand = self.on_demand.as_mut();
+        if self.pending.len() != waiting {
+            return Err(StateError::Content("a number of waiting epochs"));
         }
-        let needs = self.needs();
-        for flag in needs.flags() {
-            if state.flag()? != flag {
-                return Err(state.damaged("it is of a model whose effects ask for other columns"));
-            }
-        }
-        if let Some(on_demand) = &mut self.on_demand {
-            on_demand.load(self.smoother.waiting(), &mut state)?;
-        }
-        state.end()
+        on_demand.map_or(Ok(()), |on_demand| on_demand.visit(waiting, state))
     }
 }

@@ -3,9 +3,8 @@
 use dragfree_physics::control::{ControlLaw, PerTestMass, Readout, TestMassReadout};
 use dragfree_physics::few::Few;
 use dragfree_physics::mission::{MOST_TEST_MASSES, Mission};
+use dragfree_sdk::state::{State, StateError};
 use nalgebra::Vector3;
-
-use crate::state::{Reader, StateError, Writer};
 
 /// A command as numbers: thrust and torque of the thrusters, then force and torque on each test mass, axis by axis.
 pub type CommandNumbers = Few<f64, { 6 + 6 * MOST_TEST_MASSES }>;
@@ -77,19 +76,9 @@ impl Held {
         at.map(|i| TestMassReadout { r_orf_m: self.vector(i), att_orf_rad: self.vector(i + 3) }).collect()
     }
 
-    pub(crate) fn save(&self, out: &mut Writer) {
-        out.numbers(&self.values);
-        for age in &self.ages {
-            out.count(u64::from(*age));
-        }
-    }
-
-    pub(crate) fn load(&mut self, state: &mut Reader<'_>) -> Result<(), StateError> {
-        state.numbers(&mut self.values)?;
-        for age in &mut self.ages {
-            *age = u32::try_from(state.count()?).unwrap_or(u32::MAX);
-        }
-        Ok(())
+    pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        state.f64s(self.values.iter_mut())?;
+        self.ages.iter_mut().try_for_each(|age| state.u32(age))
     }
 }
 
@@ -177,38 +166,29 @@ impl Comparison {
         self.rms_distance().iter().zip(self.rms_change()).all(|(distance, change)| *distance <= SAME_LAW * change)
     }
 
-    fn save(&self, out: &mut Writer) {
-        out.count(self.samples);
-        out.count(self.samples_of_mean);
-        out.numbers(&self.mean);
-        out.numbers(&self.squares);
-        out.numbers(&self.flown_squares);
-        out.count(self.changes);
-        out.numbers(&self.change_squares);
-        out.optional(self.previous.as_deref());
-    }
-
-    fn load(&mut self, state: &mut Reader<'_>) -> Result<(), StateError> {
-        self.samples = state.count()?;
-        self.samples_of_mean = state.count()?;
-        state.numbers(&mut self.mean)?;
-        state.numbers(&mut self.squares)?;
-        state.numbers(&mut self.flown_squares)?;
-        self.changes = state.count()?;
-        state.numbers(&mut self.change_squares)?;
-        self.previous = optional(state, self.mean.len())?;
-        Ok(())
+    fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        state.u64(&mut self.samples)?;
+        state.u64(&mut self.samples_of_mean)?;
+        for numbers in [&mut self.mean, &mut self.squares, &mut self.flown_squares] {
+            state.f64s(numbers.iter_mut())?;
+        }
+        state.u64(&mut self.changes)?;
+        state.f64s(self.change_squares.iter_mut())?;
+        let numbers = self.mean.len();
+        state.option(&mut self.previous, |state, command| visit_command(state, numbers, command))
     }
 }
 
-/// A command that may be there.
-fn optional(state: &mut Reader<'_>, numbers: usize) -> Result<Option<CommandNumbers>, StateError> {
-    if !state.flag()? {
-        return Ok(None);
+/// A command of so many numbers.
+pub(crate) fn visit_command(
+    state: &mut State<'_>,
+    numbers: usize,
+    command: &mut CommandNumbers,
+) -> Result<(), StateError> {
+    if state.is_loading() {
+        *command = CommandNumbers::from_fn(numbers, |_| 0.0);
     }
-    let mut out = CommandNumbers::from_fn(numbers, |_| 0.0);
-    state.numbers(&mut out)?;
-    Ok(Some(out))
+    state.f64s(command.iter_mut())
 }
 
 fn rms(squares: &CommandNumbers, samples: u64) -> Vec<f64> {
@@ -256,7 +236,7 @@ impl Replay {
     ) -> Result<Option<CommandNumbers>, StateError> {
         if held.oldest() > self.longest_hold_samples {
             if self.samples > 0 {
-                self.law.set_state(&self.fresh)?;
+                self.law.set_state(&self.fresh).map_err(|_| StateError::Content("a control law"))?;
                 self.samples = 0;
                 self.offset = None;
                 self.comparison.restart();
@@ -288,19 +268,13 @@ impl Replay {
         &self.comparison
     }
 
-    pub(crate) fn save(&self, out: &mut Writer) {
-        out.numbers(&self.law.state());
-        out.count(self.samples);
-        out.optional(self.offset.as_deref());
-        self.comparison.save(out);
-    }
-
-    pub(crate) fn load(&mut self, state: &mut Reader<'_>) -> Result<(), StateError> {
-        let mut law = self.fresh.clone();
-        state.numbers(&mut law)?;
-        self.law.set_state(&law)?;
-        self.samples = state.count()?;
-        self.offset = optional(state, self.comparison.mean.len())?;
-        self.comparison.load(state)
+    pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        let mut law = self.law.state();
+        state.f64s(&mut law)?;
+        self.law.set_state(&law).map_err(|_| StateError::Content("a control law"))?;
+        state.u64(&mut self.samples)?;
+        let numbers = self.comparison.mean.len();
+        state.option(&mut self.offset, |state, command| visit_command(state, numbers, command))?;
+        self.comparison.visit(state)
     }
 }

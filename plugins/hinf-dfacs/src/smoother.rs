@@ -14,10 +14,9 @@
 //! recursion separates `w` from `n` by their increments. Without leakage this is the exact posterior.
 
 use dragfree_physics::noise::NoiseShape;
+use dragfree_sdk::state::{State, StateError};
 use nalgebra::{Matrix3, Vector3};
 use std::f64::consts::TAU;
-
-use crate::state::{Reader, StateError, Writer};
 
 /// Frequency at which the spectrum of `β` crosses the white one. It is far below the frequency at which the smoother
 /// relies on commands, so `β` only protects the ends of a record from a constant torque.
@@ -173,12 +172,8 @@ pub struct ResponseState {
 }
 
 impl ResponseState {
-    pub(crate) fn save(&self, out: &mut Writer) {
-        out.numbers(self.mean.as_flattened());
-    }
-
-    pub(crate) fn load(&mut self, state: &mut Reader<'_>) -> Result<(), StateError> {
-        state.numbers(self.mean.as_flattened_mut())
+    pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        state.f64s(self.mean.as_flattened_mut())
     }
 }
 
@@ -457,45 +452,21 @@ impl Smoother {
         z.iter().all(|z: &f64| z.is_finite()).then_some(z)
     }
 
-    pub(crate) fn save(&self, out: &mut Writer) {
-        let o = &self.command_consistency;
-        out.numbers(o.response.as_flattened());
-        out.numbers(&o.products);
-        out.numbers(&o.squares);
-        out.numbers(self.mean.as_flattened());
-        out.numbers(self.covariance.as_flattened());
-        out.numbers(&self.innovation_squares);
-        out.count(self.innovations);
-        out.count(self.steps.len() as u64);
-        for step in &self.steps {
-            out.numbers(step.predicted.as_flattened());
-            out.numbers(step.covariance.as_flattened());
-            out.numbers(step.gain.as_flattened());
-            out.numbers(&step.weighted_innovation);
-            out.flag(step.cut);
-        }
-    }
-
-    pub(crate) fn load(&mut self, state: &mut Reader<'_>) -> Result<(), StateError> {
+    pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
         let o = &mut self.command_consistency;
-        state.numbers(o.response.as_flattened_mut())?;
-        state.numbers(&mut o.products)?;
-        state.numbers(&mut o.squares)?;
-        state.numbers(self.mean.as_flattened_mut())?;
-        state.numbers(self.covariance.as_flattened_mut())?;
-        state.numbers(&mut self.innovation_squares)?;
-        self.innovations = state.count()?;
-        let steps = state.length(2 * self.model.lag)?;
-        self.steps.clear();
-        for _ in 0..steps {
-            let mut step = Step::default();
-            state.numbers(step.predicted.as_flattened_mut())?;
-            state.numbers(step.covariance.as_flattened_mut())?;
-            state.numbers(step.gain.as_flattened_mut())?;
-            state.numbers(&mut step.weighted_innovation)?;
-            step.cut = state.flag()?;
-            self.steps.push(step);
-        }
-        Ok(())
+        state.f64s(o.response.as_flattened_mut())?;
+        state.f64s(o.products.iter_mut().chain(&mut o.squares))?;
+        state.f64s(self.mean.as_flattened_mut())?;
+        state.f64s(self.covariance.as_flattened_mut())?;
+        state.f64s(&mut self.innovation_squares)?;
+        state.u64(&mut self.innovations)?;
+        state.list(&mut self.steps, |state, step| {
+            state.f64s(step.predicted.as_flattened_mut())?;
+            state.f64s(step.covariance.as_flattened_mut())?;
+            state.f64s(step.gain.as_flattened_mut())?;
+            state.f64s(&mut step.weighted_innovation)?;
+            state.flag(&mut step.cut)
+        })?;
+        if self.steps.len() > 2 * self.model.lag { Err(StateError::Content("a number of epochs")) } else { Ok(()) }
     }
 }

@@ -4,8 +4,7 @@ use std::collections::VecDeque;
 
 use dragfree_physics::lag::Lag;
 use dragfree_physics::mission::Mission;
-
-use crate::state::{Reader, StateError, Writer};
+use dragfree_sdk::state::{State, StateError};
 
 /// Force, N, and torque, N m, on the spacecraft, SRF.
 pub(crate) type Wrench = [f64; 6];
@@ -45,23 +44,10 @@ impl ThrusterResponse {
         Some(acting)
     }
 
-    pub(crate) fn save(&self, out: &mut Writer) {
-        out.numbers(&self.y);
-        out.count(self.waiting.len() as u64);
-        for commanded in &self.waiting {
-            out.numbers(commanded);
-        }
-    }
-
-    pub(crate) fn load(&mut self, state: &mut Reader<'_>) -> Result<(), StateError> {
-        state.numbers(&mut self.y)?;
-        let waiting = state.length(self.lag.as_ref().map_or(0, |lag| lag.samples() + 1))?;
-        self.waiting.clear();
-        for _ in 0..waiting {
-            let mut commanded = Wrench::default();
-            state.numbers(&mut commanded)?;
-            self.waiting.push_back(commanded);
-        }
-        Ok(())
+    pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        state.f64s(&mut self.y)?;
+        state.queue(&mut self.waiting, |state, commanded| state.f64s(commanded))?;
+        let most = self.lag.as_ref().map_or(0, |lag| lag.samples() + 1);
+        if self.waiting.len() > most { Err(StateError::Content("a number of commands")) } else { Ok(()) }
     }
 }
