@@ -127,7 +127,8 @@ typedef struct dragfree_column_v1 {
   const char *unit;       /* "m"; NULL in `read`: any */
   const char *frame;      /* "ORF_1", "" for none; NULL in `read`: any */
   double rate_hz;         /* rate of a uniform table, 0 for an irregular one; in `read` 0 is any */
-  const char *attributes; /* a JSON object of strings, {"kind":"channel"}; NULL for none */
+  const char *attributes; /* a JSON object of strings, {"kind":"channel"}; NULL for none. A series that you make from
+                           * commands has "in_loop":"true" */
 } dragfree_column_v1;
 
 /* A channel (attribute `kind` = `channel`) is a measured minus a known acceleration. `average` is "2" for one that is
@@ -235,7 +236,7 @@ typedef struct dragfree_node_v1 {
   /* [flushed; a source: active] The result as JSON; `earlier_json` is the array of the reports of the stages before
    * this one, each with `plugin`. May be NULL: nothing to report. Every key is optional; schema/report has all:
    * {"coefficients":[{"name":"my-force.tm1.y","solution":"mine","value":1.5e-10,"sigma":2e-11,"unit":"N A-1",
-   *                   "frame":"ORF_1"}],
+   *                   "frame":"ORF_1", "role":"recursive" (or "batch": the verdict compares them)}],
    *  "covariance":{"mine":{"names":["my-force.tm1.y"],"matrix":[[4e-22]]}},
    *  "verdict":"agree", "weak_directions":["…"], "chi2_per_dof":1.01, "nis":0.99, "commands":"telemetered",
    *  "epochs_used":863990, "epochs_rejected":10, "counts":{"spikes":3}, "notes":["a sentence for the operator"],
