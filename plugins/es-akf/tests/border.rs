@@ -183,6 +183,21 @@ fn regressors_in_the_loop_put_all_test_masses_into_one_filter() {
     }
 }
 
+/// A mission file with a third test mass: 27 + 9 + 6 + 12 states in one filter, 16 in each of three.
+#[test]
+fn the_mission_says_how_many_test_masses_there_are() {
+    let mut three = mission([&[], &[], &[]]);
+    three["test_mass"]["tm3"] = three["test_mass"]["tm1"].clone();
+    for (in_loop, followed, states) in [(true, json!(["tm1", "tm2", "tm3"]), 54), (false, json!(["tm3"]), 16)] {
+        let (report, _) = run(&three, &[1, 2, 3], in_loop, 6_000);
+        assert_eq!(report["quality"]["tm3"]["followed"], followed, "{report}");
+        assert_eq!(report["quality"]["tm3"]["states"], states, "{report}");
+        let coefficients = report["coefficients"].as_array().expect("a list");
+        assert_eq!(coefficients.len(), 9);
+        assert!(coefficients.iter().all(|c| c["value"].is_f64() && c["sigma"].as_f64() > Some(0.0)), "{report}");
+    }
+}
+
 /// Adaptation that is asked for acts in a filter of several test masses as in one of one; `auto` leaves the former to
 /// the mission's noise.
 #[test]
