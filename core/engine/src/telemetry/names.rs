@@ -4,8 +4,8 @@
 ///
 /// The innermost component that names a frame (`orf`, `srf`, `crf`, `irf`) decides; components of a vector or of a set
 /// of angles inherit from the field that holds them. The tokens after the frame are the unit, none of them meaning a
-/// number (`1`). `orf` is the frame of one optical bench: the enclosing `tm1` or `tm2`, or else a digit at the end of
-/// a token before it (`r1_orf_m`), says of which. Without a frame, as for `status`, both are empty.
+/// number (`1`). `orf` is the frame of one optical bench: the digit of the enclosing test mass (`tm1`), or else a digit at
+/// the end of a token before it (`r1_orf_m`), says of which. Without a frame, as for `status`, both are empty.
 #[must_use]
 pub fn unit_and_frame(path: &str) -> (String, String) {
     for component in path.rsplit('.') {
@@ -25,12 +25,10 @@ pub fn unit_and_frame(path: &str) -> (String, String) {
 }
 
 fn bench(path: &str, before: &[&str]) -> Option<char> {
-    let enclosing = path.split('.').find_map(|c| match c {
-        "tm1" => Some('1'),
-        "tm2" => Some('2'),
-        _ => None,
-    });
-    enclosing.or_else(|| before.iter().rev().find_map(|t| t.chars().last().filter(|c| matches!(c, '1' | '2'))))
+    let digit = |text: &str| text.chars().last().filter(char::is_ascii_digit);
+    let enclosing =
+        path.split('.').find_map(|c| c.strip_prefix("tm").filter(|number| number.len() == 1).and_then(digit));
+    enclosing.or_else(|| before.iter().rev().find_map(|t| digit(t)))
 }
 
 /// `["m", "s2"]` → `m s-2`: the first token multiplies, the others divide.

@@ -67,14 +67,14 @@ fn screen(c: &Comparison, names: &str, page: Option<&Path>, paint: Paint) -> Str
         out += &labelled("NIS", &words);
     }
     if !c.innovations.is_empty() && c.innovations.iter().all(|i| i.passes) {
-        out += &labelled("filter", "es-akf's innovations are white in every octave, at the level that it expects");
+        out += &labelled("filter", "its innovations are white in every octave, at the level that it expects");
     }
     let coloured: Vec<String> = c.innovations.iter().filter(|i| !i.passes).map(innovation).collect();
     if !coloured.is_empty() {
         out += &labelled(
             "filter",
             &format!(
-                "es-akf's innovations against what it expects at this noise, where farthest: {}; no part of the verdict",
+                "its innovations against what it expects at this noise, where farthest: {}; no part of the verdict",
                 coloured.join(", ")
             ),
         );

@@ -54,7 +54,7 @@ pub(crate) fn page(c: &Comparison, names: &[String], meaning: Option<&str>) -> R
         section(
             &mut out,
             "What the recursive filter did not foresee",
-            "Innovations of es-akf, each readout less what the filter expected of it, octave by octave: power over what the noise of the \
+            "Innovations of the recursive filter, each readout less what was expected of it, octave by octave: power over what the noise of the \
              mission file lets expect for the gains in use. 95 of 100 points lie in the shaded area where filter and noise are right. Not a \
              part of the verdict: each filter follows one test mass and does not know what the other one's readouts would tell it.",
             &svg(&panels, COLUMNS).map_err(Failure::engine)?,
