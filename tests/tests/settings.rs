@@ -38,7 +38,7 @@ fn thresholds_of_a_pipeline_are_used_and_stored() {
     let told = compare(&default);
     assert!(told.status.code() == Some(1) && String::from_utf8_lossy(&told.stderr).contains("at least 4 segments"));
 
-    let other = calibrate(folder, &telemetry, "agreement_sigmas = 1e-3\nmin_segments = 0.5\n", 4);
+    let other = calibrate(folder, &telemetry, "agreement_sigmas = 1e-3\nmin_segments = 0.25\n", 4);
     assert_eq!((&default["verdict"], &other["verdict"]), (&Value::from("agree"), &Value::from("disagree")));
     let settings = stored(folder, &other);
     assert_eq!(settings["agreement_sigmas"].as_float(), Some(1e-3));

@@ -254,8 +254,8 @@ pub enum CompareError {
     Estimate(#[from] EstimateError),
     /// Too little data.
     #[error(
-        "a comparison needs at least {needed} segments of {segment_s:.0} s without a gap, and there are {segments:.1}: give more \
-         telemetry, or several products"
+        "a comparison needs at least {needed} segments of {segment_s:.0} s without a gap, and there are {segments:.2}: \
+         give more telemetry, or several products"
     )]
     TooShort {
         /// Segments that are needed.

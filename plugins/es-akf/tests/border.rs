@@ -188,6 +188,7 @@ fn regressors_in_the_loop_put_all_test_masses_into_one_filter() {
 fn the_mission_says_how_many_test_masses_there_are() {
     let mut three = mission([&[], &[], &[]]);
     three["test_mass"]["tm3"] = three["test_mass"]["tm1"].clone();
+    three["housing"]["between"] = json!(["tm1", "tm2"]);
     for (in_loop, followed, states) in [(true, json!(["tm1", "tm2", "tm3"]), 54), (false, json!(["tm3"]), 16)] {
         let (report, _) = run(&three, &[1, 2, 3], in_loop, 6_000);
         assert_eq!(report["quality"]["tm3"]["followed"], followed, "{report}");

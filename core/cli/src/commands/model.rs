@@ -8,7 +8,7 @@ use dragfree_engine::border::{Kind, Manifest, ParameterType};
 use dragfree_engine::config::{EffectEntry, Model, Prior};
 use dragfree_engine::registry::Found;
 use dragfree_engine::revisions::{self, Change, Committed, Edit, Log, Logged, Place, What};
-use dragfree_engine::validate::{Finding, Subject};
+use dragfree_engine::validate::Subject;
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 
@@ -122,7 +122,6 @@ fn add(command: &ModelAdd, global: &Global, paint: Paint) -> Result<Done, Failur
     for (name, value) in &command.set {
         entry.parameters.insert(name.clone(), parameter(manifest, name, value)?);
     }
-    entry.check_instance(manifest, None).map_err(Failure::Usage)?;
     priors(&mut entry, command)?;
     accepted(&found, &entry, command.mission.as_deref())?;
     let done = change(&command.model, global, paint, |edit| edit.add(&entry, &comment))?;
@@ -139,10 +138,11 @@ fn accepted(found: &Found, entry: &EffectEntry, mission: Option<&Path>) -> Resul
         parameters: &entry.parameters,
         files: &[],
     };
-    let refused = |error: Finding| {
-        Failure::Usage(format!("{error}; tried with the mission {}, --mission names another", mission.name))
-    };
-    let Some(names) = subject.coefficients(&entry.instance).map_err(refused)? else { return Ok(()) };
+    let refused =
+        |error| Failure::Usage(format!("{error}; tried with the mission {}, --mission names another", mission.name));
+    entry.check_instance(&found.info.manifest, &mission).map_err(refused)?;
+    let names = subject.coefficients(&entry.instance).map_err(|finding| refused(finding.to_string()))?;
+    let Some(names) = names else { return Ok(()) };
     match entry.prior.keys().find(|name| !names.contains(name)) {
         Some(name) => Err(Failure::Usage(format!("{entry} has no coefficient `{name}`; it has {}", names.join(", ")))),
         None => Ok(()),

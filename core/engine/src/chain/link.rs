@@ -107,7 +107,7 @@ impl Builder<'_> {
         let mut constraints: Vec<(Constraint, u32)> = Vec::new();
         for entry in &self.model.effects {
             let found = self.registry.find(Kind::Effect, &entry.id)?;
-            entry.check_instance(&found.info.manifest, Some(self.mission)).map_err(|what| self.model_error(what))?;
+            entry.check_instance(&found.info.manifest, self.mission).map_err(|what| self.model_error(what))?;
             let file = self.model.path.display().to_string();
             let parameters = resolve_parameters(&file, &found.info.manifest, &entry.parameters)?;
             let linked = self.add(&found, parameters, &entry.instance, false)?;

@@ -190,21 +190,16 @@ impl EffectEntry {
         coefficient.strip_prefix(&self.coefficient()).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
     }
 
-    /// Refuses an instance that the plugin does not have on a mission, or on any where it is not known; a plugin that
-    /// lists none takes any.
+    /// Refuses an instance that the plugin does not have on a mission; a plugin that lists none takes any.
     ///
     /// # Errors
     /// A sentence that lists what there is.
-    pub fn check_instance(&self, manifest: &Manifest, mission: Option<&Mission>) -> Result<(), String> {
-        let instances = mission.map(|mission| manifest.instances_on(&mission.value));
-        let known = match &instances {
-            Some(instances) => instances.contains(&self.instance),
-            None => manifest.may_act_at(&self.instance),
-        };
-        if known || manifest.instances.is_empty() {
+    pub fn check_instance(&self, manifest: &Manifest, mission: &Mission) -> Result<(), String> {
+        let instances = manifest.instances_on(&mission.value);
+        if manifest.instances.is_empty() || instances.contains(&self.instance) {
             return Ok(());
         }
-        let there = instances.unwrap_or_else(|| manifest.instances.clone()).join(", ");
+        let there = instances.join(", ");
         Err(format!("effect {} has no instance `{}`; it has {there}", self.id, self.instance))
     }
 }

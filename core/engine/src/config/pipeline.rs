@@ -159,6 +159,9 @@ fn settings(table: toml::Table) -> Result<Settings, String> {
         if !number.is_some_and(|n| n > 0.0 && n.is_finite()) {
             return Err(format!("[settings] {key} = {value} must be a number above zero"));
         }
+        if known[key].is_integer() && !value.is_integer() {
+            return Err(format!("[settings] {key} = {value} must be a whole number above zero"));
+        }
     }
     table.try_into().map_err(|e: toml::de::Error| format!("[settings]: {}", e.message()))
 }
