@@ -14,12 +14,9 @@ use std::time::Instant;
 use serde_json::Value;
 
 use crate::blind_report::numbers;
-use crate::campaign::{CampaignError, Meter, note, work};
+use crate::campaign::{CampaignError, Meter, file, note, work};
 use crate::program::{Chain, Hidden, Program, root, solution};
 use crate::records::{After, Blind, Results};
-
-/// Seeds up to this one were used in development and are excluded.
-pub const DEVELOPED_ON: u32 = 100;
 
 /// Runs the seeds that `results` lacks, `at_once` in parallel.
 ///
@@ -45,7 +42,7 @@ pub fn blind(
     let pipeline = root().join("fixtures/pipelines/science-mode.toml");
     work(left, at_once, |seed| {
         let folder = scratch.join(format!("blind-{seed}"));
-        let io = |e: std::io::Error| CampaignError::File { path: folder.clone(), reason: e.to_string() };
+        let io = |e: std::io::Error| file(&folder, &e);
         if folder.exists() {
             std::fs::remove_dir_all(&folder).map_err(io)?;
         }
@@ -131,7 +128,7 @@ impl Set<'_> {
         unseen: &Hidden,
         lacks: &impl Fn(String) -> CampaignError,
     ) -> Result<After, CampaignError> {
-        let io = |e: std::io::Error| CampaignError::File { path: self.folder.to_owned(), reason: e.to_string() };
+        let io = |e: std::io::Error| file(self.folder, &e);
         let [bare, found, knowing] = ["bare", "found", "knowing"].map(|name| self.folder.join(format!("{name}.toml")));
         for model in [&found, &knowing] {
             std::fs::copy(&bare, model).map_err(io)?;

@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::Instant;
 
-use crate::program::{Chain, Program, ProgramError, line, root};
-use crate::records::{Line, RecordError, Results};
+use crate::program::{Chain, Program, line, root};
+use crate::records::{Line, Results};
 
 /// Length of a twin, h.
 pub const TWIN_HOURS: f64 = 6.0;
@@ -20,43 +20,29 @@ pub const TWIN_SEEDS: u32 = 40;
 
 /// Error that stops a campaign.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum CampaignError {
-    /// The program.
-    #[error(transparent)]
-    Program(#[from] ProgramError),
-    /// The results.
-    #[error(transparent)]
-    Record(#[from] RecordError),
+    /// The program did not start.
+    #[error("{command}: {source}")]
+    Start { command: String, source: std::io::Error },
+    /// The program failed.
+    #[error("{command}: {status}\n{message}")]
+    Failed { command: String, status: std::process::ExitStatus, message: String },
+    /// The output has another form than expected.
+    #[error("{command}: {what} is missing in what it printed")]
+    Answer { command: String, what: String },
+    /// A complete line of a file of results is none.
+    #[error("{path}, line {line}: {source}; results are written by `dragfree-validation` alone", path = path.display())]
+    Line { path: PathBuf, line: usize, source: serde_json::Error },
     /// A bound.
     #[error(transparent)]
     Bound(#[from] crate::bound::BoundError),
     /// A product lacks a part.
     #[error("configuration {configuration}, seed {seed}: the product lacks {what}")]
-    Product {
-        /// Configuration.
-        configuration: String,
-        /// Seed.
-        seed: u32,
-        /// What is missing.
-        what: String,
-    },
+    Product { configuration: String, seed: u32, what: String },
     /// A file of the campaign.
     #[error("{path}: {reason}", path = path.display())]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        reason: String,
-    },
-}
-
-/// Difference between the mission file given to `run` and the truth.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Belief {
-    /// Nothing.
-    True,
-    /// PSDs of `[noise]` tables, scaled by a factor.
-    Scaled(&'static [&'static str], f64),
+    File { path: PathBuf, reason: String },
 }
 
 /// A twin.
@@ -66,8 +52,8 @@ pub struct Twin {
     pub name: &'static str,
     /// Description in the report.
     pub words: &'static str,
-    /// Mission file of `run`.
-    pub belief: Belief,
+    /// Noise tables whose PSD is scaled by a factor in the mission file of `run`.
+    pub scaled: Option<(&'static [&'static str], f64)>,
     /// Effects in the simulation that the model lacks.
     pub effects: &'static [&'static str],
     /// Whether it also runs as the product.
@@ -80,80 +66,26 @@ const THRUST: &[&str] = &["thruster_force", "thruster_torque"];
 const READOUTS: &[&str] = &["ifo_x", "is_x", "is_y", "is_z", "is_angle", "dws_local", "dws_long_arm"];
 const LOUD_IS: &[&str] = &["is-noise:tm1.y=2", "is-noise:tm1.z=2", "is-noise:tm2.y=2", "is-noise:tm2.z=2"];
 
+const fn twin(name: &'static str, words: &'static str, scaled: Option<(&'static [&'static str], f64)>) -> Twin {
+    Twin { name, words, scaled, effects: &[], with_product: true, seeds: TWIN_SEEDS }
+}
+
+/// A twin of one noise alone, unprotected only.
+const fn alone(name: &'static str, words: &'static str, noise: &'static [&'static str], power: f64) -> Twin {
+    Twin { with_product: false, seeds: TWIN_SEEDS / 2, ..twin(name, words, Some((noise, power))) }
+}
+
 /// All twins; the first is the control, without error.
 pub const TWINS: [Twin; 9] = [
-    Twin {
-        name: "control",
-        words: "nothing wrong",
-        belief: Belief::True,
-        effects: &[],
-        with_product: true,
-        seeds: TWIN_SEEDS,
-    },
-    Twin {
-        name: "q-times-10",
-        words: "thrust noise believed 10 times in power (Q×10)",
-        belief: Belief::Scaled(THRUST, 10.0),
-        effects: &[],
-        with_product: true,
-        seeds: TWIN_SEEDS,
-    },
-    Twin {
-        name: "q-over-10",
-        words: "thrust noise believed 1/10 (Q/10)",
-        belief: Belief::Scaled(THRUST, 0.1),
-        effects: &[],
-        with_product: true,
-        seeds: TWIN_SEEDS,
-    },
-    Twin {
-        name: "r-times-10",
-        words: "readout noise believed 10 times (R×10)",
-        belief: Belief::Scaled(READOUTS, 10.0),
-        effects: &[],
-        with_product: true,
-        seeds: TWIN_SEEDS,
-    },
-    Twin {
-        name: "is-noise-times-2",
-        words: "capacitive noise doubled in truth",
-        belief: Belief::True,
-        effects: LOUD_IS,
-        with_product: true,
-        seeds: TWIN_SEEDS,
-    },
-    Twin {
-        name: "force-times-10",
-        words: "force noise alone believed 10 times",
-        belief: Belief::Scaled(&["thruster_force"], 10.0),
-        effects: &[],
-        with_product: false,
-        seeds: TWIN_SEEDS / 2,
-    },
-    Twin {
-        name: "force-over-10",
-        words: "force noise alone believed 1/10",
-        belief: Belief::Scaled(&["thruster_force"], 0.1),
-        effects: &[],
-        with_product: false,
-        seeds: TWIN_SEEDS / 2,
-    },
-    Twin {
-        name: "torque-times-10",
-        words: "torque noise alone believed 10 times",
-        belief: Belief::Scaled(&["thruster_torque"], 10.0),
-        effects: &[],
-        with_product: false,
-        seeds: TWIN_SEEDS / 2,
-    },
-    Twin {
-        name: "torque-over-10",
-        words: "torque noise alone believed 1/10",
-        belief: Belief::Scaled(&["thruster_torque"], 0.1),
-        effects: &[],
-        with_product: false,
-        seeds: TWIN_SEEDS / 2,
-    },
+    twin("control", "nothing wrong", None),
+    twin("q-times-10", "thrust noise believed 10 times in power (Q×10)", Some((THRUST, 10.0))),
+    twin("q-over-10", "thrust noise believed 1/10 (Q/10)", Some((THRUST, 0.1))),
+    twin("r-times-10", "readout noise believed 10 times (R×10)", Some((READOUTS, 10.0))),
+    Twin { effects: LOUD_IS, ..twin("is-noise-times-2", "capacitive noise doubled in truth", None) },
+    alone("force-times-10", "force noise alone believed 10 times", &["thruster_force"], 10.0),
+    alone("force-over-10", "force noise alone believed 1/10", &["thruster_force"], 0.1),
+    alone("torque-times-10", "torque noise alone believed 10 times", &["thruster_torque"], 10.0),
+    alone("torque-over-10", "torque noise alone believed 1/10", &["thruster_torque"], 0.1),
 ];
 
 impl Twin {
@@ -274,7 +206,7 @@ impl ScratchFolder {
             chain.pipeline = self.path("unprotected.toml");
             write(&chain.pipeline, &pipeline.to_string())?;
         }
-        if let Belief::Scaled(noises, power) = twin.belief {
+        if let Some((noises, power)) = twin.scaled {
             let frozen = self.path("controllers.toml");
             if !frozen.exists() {
                 program.freeze(&taiji(), &frozen)?;
@@ -455,8 +387,8 @@ mod tests {
         let names = configurations();
         let distinct: std::collections::BTreeSet<&String> = names.iter().collect();
         assert_eq!(distinct.len(), names.len());
-        assert!(TWINS[0].belief == Belief::True && TWINS[0].effects.is_empty());
-        assert!(TWINS[1..].iter().all(|t| t.belief != Belief::True || !t.effects.is_empty()));
+        assert!(TWINS[0].scaled.is_none() && TWINS[0].effects.is_empty());
+        assert!(TWINS[1..].iter().all(|t| t.scaled.is_some() || !t.effects.is_empty()));
     }
 
     #[test]

@@ -9,46 +9,8 @@ use std::process::Command;
 
 use dragfree_engine::telemetry::first_message;
 
+use crate::campaign::{CampaignError, file};
 use crate::records::{COEFFICIENTS, Line, Solution, rounded};
-
-/// Error of a run.
-#[derive(Debug, thiserror::Error)]
-pub enum ProgramError {
-    /// The program did not start.
-    #[error("{command}: {source}")]
-    Start {
-        /// What was called.
-        command: String,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// The program failed.
-    #[error("{command}: {status}\n{message}")]
-    Failed {
-        /// What was called.
-        command: String,
-        /// Exit status.
-        status: std::process::ExitStatus,
-        /// Its message.
-        message: String,
-    },
-    /// The output has another form than expected.
-    #[error("{command}: {what} is missing in what it printed")]
-    Answer {
-        /// What was called.
-        command: String,
-        /// Missing part.
-        what: String,
-    },
-    /// A file of the run cannot be read or removed.
-    #[error("{path}: {reason}", path = path.display())]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        reason: String,
-    },
-}
 
 /// The repository.
 #[must_use]
@@ -98,10 +60,10 @@ impl Program {
     /// Builds program and plugins, so that the measured program is current.
     ///
     /// # Errors
-    /// [`ProgramError`]: the workspace does not build.
-    pub fn build() -> Result<Self, ProgramError> {
+    /// [`CampaignError`]: the workspace does not build.
+    pub fn build() -> Result<Self, CampaignError> {
         let folder = std::env::current_exe()
-            .map_err(|source| ProgramError::Start { command: "this program".to_owned(), source })?
+            .map_err(|source| CampaignError::Start { command: "this program".to_owned(), source })?
             .parent()
             .map(Path::to_owned)
             .unwrap_or_default();
@@ -131,8 +93,8 @@ impl Program {
     /// Digest of the plugins' libraries, which identifies a build.
     ///
     /// # Errors
-    /// [`ProgramError`].
-    pub fn digest(&self) -> Result<String, ProgramError> {
+    /// [`CampaignError`].
+    pub fn digest(&self) -> Result<String, CampaignError> {
         let mut command = self.command();
         let answer = json(command.args(["plugins", "list", "--json"]), &[0])?;
         let plugins = answer["plugins"].as_array().ok_or_else(|| missing(&command, "plugins"))?;
@@ -145,21 +107,21 @@ impl Program {
     /// Writes the controllers designed for a mission to a file with the section `control`.
     ///
     /// # Errors
-    /// [`ProgramError`].
-    pub fn freeze(&self, mission: &Path, to: &Path) -> Result<(), ProgramError> {
+    /// [`CampaignError`].
+    pub fn freeze(&self, mission: &Path, to: &Path) -> Result<(), CampaignError> {
         output(self.command().arg("design").arg(mission).arg("--freeze").arg(to), &[0]).map(|_| ())
     }
 
     /// Simulates into a new folder, reads the truth and removes it.
     ///
     /// # Errors
-    /// [`ProgramError`].
+    /// [`CampaignError`].
     pub fn simulate(
         &self,
         mission: &Path,
         folder: &Path,
         arguments: &[impl AsRef<OsStr>],
-    ) -> Result<Simulated, ProgramError> {
+    ) -> Result<Simulated, CampaignError> {
         let mut command = self.command();
         command.arg("simulate").arg(mission).arg("--out").arg(folder).args(arguments).arg("--json");
         let made = json(&mut command, &[0])?;
@@ -170,7 +132,7 @@ impl Program {
         let first = truth_files.first().ok_or_else(|| missing(&command, "truth_files"))?;
         let truth_m = offsets_m(first)?;
         for path in &truth_files {
-            std::fs::remove_file(path).map_err(|e| ProgramError::File { path: path.clone(), reason: e.to_string() })?;
+            std::fs::remove_file(path).map_err(|e| file(path, &e))?;
         }
         Ok(Simulated { files: paths("files"), truth_m })
     }
@@ -178,14 +140,14 @@ impl Program {
     /// Simulates with hidden effects into `folder` and moves the truth away; `noise` is the seed of everything else.
     ///
     /// # Errors
-    /// [`ProgramError`].
+    /// [`CampaignError`].
     pub fn hide(
         &self,
         mission: &Path,
         folder: &Path,
         [hidden, noise]: [u32; 2],
         hours: f64,
-    ) -> Result<Hidden, ProgramError> {
+    ) -> Result<Hidden, CampaignError> {
         let (telemetry, away) = (folder.join("telemetry"), folder.join("sealed"));
         let mut command = self.command();
         command.arg("simulate").arg(mission).arg("--out").arg(&telemetry).arg("--json");
@@ -196,11 +158,10 @@ impl Program {
         }
         let made = json(&mut command, &[0])?;
         let sealed = made["sealed_file"].as_str().map(Path::new).ok_or_else(|| missing(&command, "sealed_file"))?;
-        let file = |reason: String| ProgramError::File { path: sealed.to_owned(), reason };
         let (Some(truth), Some(name)) = (sealed.parent(), sealed.file_name()) else {
-            return Err(file("it has no folder".to_owned()));
+            return Err(file(sealed, &"it has no folder"));
         };
-        std::fs::rename(truth, &away).map_err(|e| file(e.to_string()))?;
+        std::fs::rename(truth, &away).map_err(|e| file(sealed, &e))?;
         let all = |key: &str| made[key].as_array().into_iter().flatten().filter_map(Value::as_str).map(PathBuf::from);
         let moved = all("truth_files").find_map(|path| Some(away.join(path.file_name()?)));
         let truth_m = offsets_m(&moved.ok_or_else(|| missing(&command, "truth_files"))?)?;
@@ -210,16 +171,16 @@ impl Program {
     /// Runs `dragfree model` with arguments.
     ///
     /// # Errors
-    /// [`ProgramError`].
-    pub fn model(&self, words: &[&OsStr]) -> Result<(), ProgramError> {
+    /// [`CampaignError`].
+    pub fn model(&self, words: &[&OsStr]) -> Result<(), CampaignError> {
         output(self.command().arg("model").args(words), &[0]).map(|_| ())
     }
 
     /// Runs `dragfree diagnose` on a product.
     ///
     /// # Errors
-    /// [`ProgramError`].
-    pub fn diagnose(&self, product: &Value, archive: &Path) -> Result<Value, ProgramError> {
+    /// [`CampaignError`].
+    pub fn diagnose(&self, product: &Value, archive: &Path) -> Result<Value, CampaignError> {
         let mut command = self.command();
         let id = product["id"].as_str().ok_or_else(|| missing(&command, "id"))?;
         command.arg("diagnose").arg(id).arg("--archive").arg(archive).arg("--json");
@@ -229,8 +190,8 @@ impl Program {
     /// Runs `dragfree reveal`, which scores a diagnosis against the sealed truth.
     ///
     /// # Errors
-    /// [`ProgramError`].
-    pub fn reveal(&self, hidden: &Hidden, diagnosis: &Path) -> Result<Value, ProgramError> {
+    /// [`CampaignError`].
+    pub fn reveal(&self, hidden: &Hidden, diagnosis: &Path) -> Result<Value, CampaignError> {
         let mut command = self.command();
         command.arg("reveal").arg(&hidden.sealed).arg("--diagnosis").arg(diagnosis);
         command.args(hidden.files.iter().flat_map(|file| [OsStr::new("--telemetry"), file.as_os_str()]));
@@ -241,8 +202,8 @@ impl Program {
     /// are accepted.
     ///
     /// # Errors
-    /// [`ProgramError`].
-    pub fn run(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Result<Value, ProgramError> {
+    /// [`CampaignError`].
+    pub fn run(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Result<Value, CampaignError> {
         let mut command = self.command();
         command.arg("run").arg(&chain.pipeline).args(files).arg("--archive").arg(archive).arg("--json");
         for (option, path) in [("--mission", &chain.mission), ("--model", &chain.model)] {
@@ -255,23 +216,22 @@ impl Program {
 }
 
 /// True offsets, m, in a simulation's truth.
-fn offsets_m(truth: &Path) -> Result<[f64; 6], ProgramError> {
-    let file = |reason: String| ProgramError::File { path: truth.to_owned(), reason };
-    let first = first_message(truth, "/truth").map_err(|e| file(e.to_string()))?;
+fn offsets_m(truth: &Path) -> Result<[f64; 6], CampaignError> {
+    let first = first_message(truth, "/truth").map_err(|e| file(truth, &e))?;
     let mut truth_m = [0.0; 6];
     for (i, value) in truth_m.iter_mut().enumerate() {
         let key = format!("b{}_orf_m.{}", i / 3 + 1, ["x", "y", "z"][i % 3]);
-        *value = *first.get(&key).ok_or_else(|| file(format!("it has no {key}")))?;
+        *value = *first.get(&key).ok_or_else(|| file(truth, &format!("it has no {key}")))?;
     }
     Ok(truth_m)
 }
 
-fn output(command: &mut Command, codes: &[i32]) -> Result<Vec<u8>, ProgramError> {
+fn output(command: &mut Command, codes: &[i32]) -> Result<Vec<u8>, CampaignError> {
     let name = format!("{command:?}");
-    let output = command.output().map_err(|source| ProgramError::Start { command: name.clone(), source })?;
+    let output = command.output().map_err(|source| CampaignError::Start { command: name.clone(), source })?;
     match output.status.code() {
         Some(code) if codes.contains(&code) => Ok(output.stdout),
-        _ => Err(ProgramError::Failed {
+        _ => Err(CampaignError::Failed {
             command: name,
             status: output.status,
             message: String::from_utf8_lossy(&output.stderr).into_owned(),
@@ -279,13 +239,13 @@ fn output(command: &mut Command, codes: &[i32]) -> Result<Vec<u8>, ProgramError>
     }
 }
 
-fn json(command: &mut Command, codes: &[i32]) -> Result<Value, ProgramError> {
+fn json(command: &mut Command, codes: &[i32]) -> Result<Value, CampaignError> {
     let text = output(command, codes)?;
     serde_json::from_slice(&text).map_err(|_| missing(command, "a JSON document"))
 }
 
-fn missing(command: &Command, what: &str) -> ProgramError {
-    ProgramError::Answer { command: format!("{command:?}"), what: what.to_owned() }
+fn missing(command: &Command, what: &str) -> CampaignError {
+    CampaignError::Answer { command: format!("{command:?}"), what: what.to_owned() }
 }
 
 /// The result of a product.

@@ -1,5 +1,6 @@
 //! Results on disk: one JSON line per configuration and seed, appended as soon as it is known.
 
+use crate::campaign::{CampaignError, file};
 use nalgebra::DMatrix;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -17,29 +18,6 @@ pub const COEFFICIENTS: [&str; 6] = [
     "com-offset.tm2.y",
     "com-offset.tm2.z",
 ];
-
-/// Error of a file of results.
-#[derive(Debug, thiserror::Error)]
-pub enum RecordError {
-    /// The file cannot be read or written.
-    #[error("{path}: {source}", path = path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// A complete line is not a result.
-    #[error("{path}, line {line}: {source}; results are written by `dragfree-validation` alone", path = path.display())]
-    Line {
-        /// The file.
-        path: PathBuf,
-        /// Line number, from 1.
-        line: usize,
-        /// Why.
-        source: serde_json::Error,
-    },
-}
 
 /// One solution of one run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -210,15 +188,15 @@ pub struct Results<T> {
 /// Results of a file; empty if it does not exist. A last line without its end was interrupted and is ignored.
 ///
 /// # Errors
-/// [`RecordError`]: a complete line is not a result.
-pub fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, RecordError> {
+/// [`CampaignError`]: a complete line is not a result.
+pub fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, CampaignError> {
     let text = match std::fs::read_to_string(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
-        other => other.map_err(|source| RecordError::Io { path: path.to_owned(), source })?,
+        other => other.map_err(|e| file(path, &e))?,
     };
     let complete = text.rfind('\n').map_or("", |end| &text[..end]);
     let parse = |(i, line): (usize, &str)| {
-        serde_json::from_str(line).map_err(|source| RecordError::Line { path: path.to_owned(), line: i + 1, source })
+        serde_json::from_str(line).map_err(|source| CampaignError::Line { path: path.to_owned(), line: i + 1, source })
     };
     complete.lines().enumerate().map(parse).collect()
 }
@@ -228,23 +206,15 @@ impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
     /// returns their number.
     ///
     /// # Errors
-    /// [`RecordError`]: the file has another form or cannot be written.
-    pub fn open(path: &Path, build: &str) -> Result<(Self, usize), RecordError> {
-        let io = |source| RecordError::Io { path: path.to_owned(), source };
+    /// [`CampaignError`]: the file has another form or cannot be written.
+    pub fn open(path: &Path, build: &str) -> Result<(Self, usize), CampaignError> {
         let mut lines: Vec<T> = read(path)?;
         let before = lines.len();
         lines.retain(|line| line.build() == build);
         let dropped = before - lines.len();
-        let mut text = Vec::new();
-        for line in &lines {
-            write_line(&mut text, line, path)?;
-        }
-        // Writing a new file drops an interrupted line; a kill leaves either file whole.
-        let fresh = path.with_extension("tmp");
-        std::fs::create_dir_all(path.parent().unwrap_or(Path::new("."))).map_err(io)?;
-        std::fs::write(&fresh, text).map_err(io)?;
-        std::fs::rename(&fresh, path).map_err(io)?;
-        let file = OpenOptions::new().append(true).open(path).map_err(io)?;
+        std::fs::create_dir_all(path.parent().unwrap_or(Path::new("."))).map_err(|e| file(path, &e))?;
+        replace(path, &lines)?;
+        let file = OpenOptions::new().append(true).open(path).map_err(|e| file(path, &e))?;
         Ok((Self { path: path.to_owned(), file, lines }, dropped))
     }
 
@@ -257,11 +227,10 @@ impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
     /// Appends a result in one write.
     ///
     /// # Errors
-    /// [`RecordError::Io`].
-    pub fn append(&mut self, line: T) -> Result<(), RecordError> {
-        let mut text = Vec::new();
-        write_line(&mut text, &line, &self.path)?;
-        self.file.write_all(&text).map_err(|source| RecordError::Io { path: self.path.clone(), source })?;
+    /// [`CampaignError::File`].
+    pub fn append(&mut self, line: T) -> Result<(), CampaignError> {
+        let text = as_lines(&self.path, std::slice::from_ref(&line))?;
+        self.file.write_all(&text).map_err(|e| file(&self.path, &e))?;
         self.lines.push(line);
         Ok(())
     }
@@ -269,29 +238,32 @@ impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
     /// Rewrites the file in the order of configurations and seeds, independent of the order of completion.
     ///
     /// # Errors
-    /// [`RecordError::Io`].
-    pub fn sort(mut self, configurations: &[&str]) -> Result<(), RecordError> {
+    /// [`CampaignError::File`].
+    pub fn sort(mut self, configurations: &[&str]) -> Result<(), CampaignError> {
         let place = |name: &str| configurations.iter().position(|c| *c == name);
         self.lines.sort_by_key(|line| {
             let (configuration, seed) = line.key();
             (place(&configuration), configuration, seed)
         });
-        let io = |source| RecordError::Io { path: self.path.clone(), source };
-        let mut text = Vec::new();
-        for line in &self.lines {
-            write_line(&mut text, line, &self.path)?;
-        }
-        let fresh = self.path.with_extension("tmp");
-        std::fs::write(&fresh, text).map_err(io)?;
-        std::fs::rename(&fresh, &self.path).map_err(io)
+        replace(&self.path, &self.lines)
     }
 }
 
-fn write_line<T: Serialize>(text: &mut Vec<u8>, line: &T, path: &Path) -> Result<(), RecordError> {
-    serde_json::to_writer(&mut *text, line)
-        .map_err(|source| RecordError::Io { path: path.to_owned(), source: source.into() })?;
-    text.push(b'\n');
-    Ok(())
+/// Replaces a file by these results, without an interrupted line; a kill leaves either file whole.
+fn replace<T: Serialize>(path: &Path, lines: &[T]) -> Result<(), CampaignError> {
+    let fresh = path.with_extension("tmp");
+    std::fs::write(&fresh, as_lines(path, lines)?).map_err(|e| file(path, &e))?;
+    std::fs::rename(&fresh, path).map_err(|e| file(path, &e))
+}
+
+/// Results as JSON, one per line; `path` is for messages.
+fn as_lines<T: Serialize>(path: &Path, lines: &[T]) -> Result<Vec<u8>, CampaignError> {
+    let mut text = Vec::new();
+    for line in lines {
+        serde_json::to_writer(&mut text, line).map_err(|e| file(path, &e))?;
+        text.push(b'\n');
+    }
+    Ok(text)
 }
 
 /// Rounds to seven significant digits, more than any statistic needs.

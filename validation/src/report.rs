@@ -2,7 +2,6 @@
 
 use dragfree_chart::{ChartError, Line as Curve, Panel, Scale, Stroke, svg};
 use dragfree_physics::frames::dcm_turned_about_z;
-use dragfree_physics::mission::Mission;
 use nalgebra::{DMatrix, DVector};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -10,12 +9,12 @@ use std::path::{Path, PathBuf};
 
 use crate::blind_report;
 use crate::bound::free_space;
-use crate::campaign::{CampaignError, NOMINAL, TWINS, Twin, file, note, parse, taiji};
+use crate::campaign::{CampaignError, NOMINAL, TWINS, Twin, file, note, taiji};
 use crate::program::root;
 use crate::records::{Blind, Line, Solution, read};
 use crate::speed::Speed;
 use crate::stats::{self, Bounds};
-use crate::table::{REGIMES, Row, configuration};
+use crate::table::{REGIMES, Row, configuration, mission};
 
 /// False-alarm rate of all checks of a campaign together.
 pub const FALSE_ALARM: f64 = 0.01;
@@ -520,12 +519,6 @@ fn picture(all: &[Line], free: &DMatrix<f64>) -> Result<Option<String>, ChartErr
     // Dvoretzky–Kiefer–Wolfowitz–Massart bound for the QP's number of independent pulls.
     let width = ((2.0 / FALSE_ALARM).ln() / (2.0 * batch.len() as f64)).sqrt();
     let bound = |shift: f64| claimed().map(|p| (p, (p + shift).clamp(0.0, 1.0))).collect::<Vec<_>>();
-    let curve = |label: &str, colour: usize, stroke: Stroke, points: Vec<(f64, f64)>| Curve {
-        label: label.to_owned(),
-        colour,
-        stroke,
-        points,
-    };
     let panel = Panel {
         title: format!("Truth within the interval, {} days", lines.len()),
         x_label: "claimed probability".to_owned(),
@@ -535,10 +528,10 @@ fn picture(all: &[Line], free: &DMatrix<f64>) -> Result<Option<String>, ChartErr
         x: 0.0..1.0,
         y: Some(0.0..1.0),
         lines: vec![
-            curve("1 % bounds", 6, Stroke::Dashed, bound(width)),
-            curve("", 6, Stroke::Dashed, bound(-width)),
-            curve(&format!("ES-AKF, {} pulls", recursive.len()), 1, Stroke::Solid, found(&recursive)),
-            curve(&format!("QP, {} pulls", batch.len()), 0, Stroke::Solid, found(&batch)),
+            Curve::new("1 % bounds", 6, Stroke::Dashed, bound(width)),
+            Curve::new("", 6, Stroke::Dashed, bound(-width)),
+            Curve::new(format!("ES-AKF, {} pulls", recursive.len()), 1, Stroke::Solid, found(&recursive)),
+            Curve::new(format!("QP, {} pulls", batch.len()), 0, Stroke::Solid, found(&batch)),
         ],
     };
     svg(&[panel], 1).map(Some)
@@ -559,8 +552,7 @@ pub struct Report {
 /// # Errors
 /// [`CampaignError`]: the default mission cannot be read, or a picture cannot be drawn.
 pub fn report(measured: &Measured) -> Result<Report, CampaignError> {
-    let mission = serde_json::to_string(&parse(&taiji())?).map_err(|e| file(&taiji(), &e))?;
-    let mission = Mission::from_json(&mission).map_err(|e| file(&taiji(), &e))?;
+    let mission = mission(&taiji())?;
     let dcm = ["tm1", "tm2"].map(|name| mission.test_mass.get(name).map_or(0.0, |tm| tm.orf_from_srf_angle_rad));
     let free = free_space(&dcm.map(dcm_turned_about_z));
     let (coverage, mut failed) = coverage(&measured.coverage, &free);

@@ -72,7 +72,8 @@ pub fn configuration(regime: &str, days: u32) -> String {
     format!("{regime}, {days} days")
 }
 
-fn mission(path: &Path) -> Result<Mission, CampaignError> {
+/// Reads a mission file.
+pub(crate) fn mission(path: &Path) -> Result<Mission, CampaignError> {
     let text = serde_json::to_string(&parse(path)?).map_err(|e| file(path, &e))?;
     Mission::from_json(&text).map_err(|e| file(path, &e))
 }
