@@ -4,7 +4,7 @@
 //! was built from.
 
 use crate::args::{Arguments, Command, Config, Model, Plugins};
-use crate::failure::Failure;
+use crate::failure::{Failure, Refusal};
 use std::path::{Component, Path, PathBuf};
 
 /// The source tree that this program was built from; gone where the program was carried away.
@@ -79,7 +79,7 @@ pub(crate) fn find(kind: Named, given: &Path) -> Result<PathBuf, Failure> {
     if found.is_file() {
         return Ok(found.canonicalize().unwrap_or(found));
     }
-    Err(Failure::NoName { kind: kind.word(), name: given.display().to_string(), known: names(kind).join(", ") })
+    Err(Refusal::NoName { kind: kind.word(), name: given.display().to_string(), known: names(kind).join(", ") }.into())
 }
 
 /// Pipelines that come with the program and are made for a mission that does, by name.

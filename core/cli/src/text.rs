@@ -51,6 +51,27 @@ pub(crate) fn columns(rows: &[Vec<String>]) -> String {
     text
 }
 
+/// A heading and the rows below it, for [`columns`].
+pub(crate) fn table(heading: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> Vec<Vec<String>> {
+    let heading = heading.iter().map(|&cell| cell.to_owned()).collect();
+    std::iter::once(heading).chain(rows).collect()
+}
+
+/// Whether no line is wider than the screen.
+pub(crate) fn fits(text: &str) -> bool {
+    text.lines().all(|line| width(line) <= WIDTH)
+}
+
+/// Each value once, in order of appearance.
+pub(crate) fn distinct<T: PartialEq>(all: impl IntoIterator<Item = T>) -> Vec<T> {
+    all.into_iter().fold(Vec::new(), |mut seen, one| {
+        if !seen.contains(&one) {
+            seen.push(one);
+        }
+        seen
+    })
+}
+
 /// A sentence broken at [`WIDTH`].
 pub(crate) fn wrapped(sentence: &str) -> String {
     let mut text = String::new();

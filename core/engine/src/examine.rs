@@ -7,9 +7,9 @@ use crate::EngineError;
 use crate::border::Kind;
 use crate::chain::{self, Chain, Sink};
 use crate::config::{EffectEntry, Mission, Model, Node};
+use crate::files::{IoContext as _, sha256_of};
 use crate::product::Product;
 use crate::registry::Registry;
-use crate::replay;
 use crate::run::{Progress, RunOptions, Setup, carry, carry_all, window};
 use crate::sources::Sources;
 
@@ -39,13 +39,7 @@ pub fn candidates(registry: &Registry, model: &Model, mission: &Mission) -> Vec<
         let manifest = &found.info.manifest;
         for instance in manifest.instances_on(&mission.value) {
             if !model.effects.iter().any(|e| e.id == manifest.id && e.instance == instance) {
-                all.push(EffectEntry {
-                    id: manifest.id.clone(),
-                    instance,
-                    estimate: true,
-                    prior: std::collections::BTreeMap::new(),
-                    parameters: toml::Table::new(),
-                });
+                all.push(EffectEntry::new(&manifest.id, &instance));
             }
         }
     }
@@ -126,8 +120,7 @@ pub fn examine<C: Sink, E: From<EngineError>>(
 fn unchanged(product: &Product, sources: &Sources) -> Result<(), EngineError> {
     let all = [&sources.pipeline, &sources.mission, &sources.model].into_iter().chain(&sources.telemetry);
     for path in all {
-        let digest =
-            replay::sha256(path).map_err(|source| EngineError::Io { action: "read", path: path.clone(), source })?;
+        let digest = sha256_of(path).at("read", path)?;
         if !product.inputs.iter().any(|input| input.sha256 == digest) {
             return Err(EngineError::Changed { path: path.clone(), product: product.id().to_owned() });
         }

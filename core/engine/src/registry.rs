@@ -33,33 +33,16 @@ pub struct Found {
 
 /// Why there is no plugin.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum RegistryError {
     /// No folder holds it.
     #[error(
         "no {kind} `{id}` in the plugin folders {folders}{near}; `dragfree plugins list` shows what is there, --plugin-dir adds a folder"
     )]
-    Unknown {
-        /// What was wanted.
-        kind: Kind,
-        /// Its id.
-        id: String,
-        /// Where we looked.
-        folders: String,
-        /// What comes near, or which files were refused.
-        near: String,
-    },
+    Unknown { kind: Kind, id: String, folders: String, near: String },
     /// Two libraries have it.
     #[error("{kind} `{id}` is in both {} and {}; remove one of the files, or leave its folder out", first.display(), second.display())]
-    Twice {
-        /// What was wanted.
-        kind: Kind,
-        /// Its id.
-        id: String,
-        /// One file.
-        first: PathBuf,
-        /// The other.
-        second: PathBuf,
-    },
+    Twice { kind: Kind, id: String, first: PathBuf, second: PathBuf },
 }
 
 impl Registry {

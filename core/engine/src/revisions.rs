@@ -15,106 +15,51 @@ use serde::Serialize;
 use toml_edit::{ArrayOfTables, DocumentMut, InlineTable, Item, Table, TableLike, Value, value};
 
 use crate::config::{ConfigError, EffectEntry, Model};
+use crate::files::{IoContext as _, IoError, folder_of, sync_folder};
 
 /// Why a model file could not be changed or its history not be read.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum RevisionError {
     /// The file is no model.
     #[error(transparent)]
     Config(#[from] ConfigError),
     /// The operating system refused something.
-    #[error("cannot {action} {}: {source}", path.display())]
-    Io {
-        /// What was tried.
-        action: &'static str,
-        /// File or folder.
-        path: PathBuf,
-        /// The system's reason.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
     /// Another writer is at work, or was killed.
     #[error(
         "{} exists: another command is changing the model file; try again when it is done. If none is, it was killed: \
          remove that file, the model file itself is whole", path.display()
     )]
-    Locked {
-        /// The lock.
-        path: PathBuf,
-    },
+    Locked { path: PathBuf },
     /// The file was written between reading and replacing it.
     #[error("{} was changed by someone else meanwhile; nothing was done, run the command again", path.display())]
-    Changed {
-        /// The file.
-        path: PathBuf,
-    },
+    Changed { path: PathBuf },
     /// A revision cannot name a file.
     #[error(
         "{}: revision {revision:?} cannot name a file of the history: letters, digits, '.', '_', '+' and '-' may stand in it, no \
          '.' first; change it in the file", path.display()
     )]
-    Name {
-        /// The file.
-        path: PathBuf,
-        /// Its revision.
-        revision: String,
-    },
+    Name { path: PathBuf, revision: String },
     /// The effects are written in a way that cannot be edited.
     #[error("{}: `effect` is not a list of [[effect]] tables; write them so", path.display())]
-    Shape {
-        /// The file.
-        path: PathBuf,
-    },
+    Shape { path: PathBuf },
     /// The effect is in the model already.
     #[error("{}: effect {effect} is in the model already; `dragfree model remove` takes it out", path.display())]
-    There {
-        /// The file.
-        path: PathBuf,
-        /// `ID:INSTANCE`.
-        effect: String,
-    },
+    There { path: PathBuf, effect: String },
     /// The effect is not in the model, or not exactly once.
     #[error("{}: {what}; the model has {known}", path.display())]
-    NoEffect {
-        /// The file.
-        path: PathBuf,
-        /// Which, and why not.
-        what: String,
-        /// What there is.
-        known: String,
-    },
+    NoEffect { path: PathBuf, what: String, known: String },
     /// No such revision.
     #[error("no revision {revision} of {}; there are {known}", path.display())]
-    NoRevision {
-        /// The file.
-        path: PathBuf,
-        /// What was asked for.
-        revision: String,
-        /// What there is.
-        known: String,
-    },
+    NoRevision { path: PathBuf, revision: String, known: String },
     /// A file of the history is not what it was.
     #[error("{}: {reason}; a revision is never changed: take the file from a backup, or remove it", path.display())]
-    Damaged {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
+    Damaged { path: PathBuf, reason: String },
     /// A coefficient cannot be fixed.
     #[error("{}: {what}", path.display())]
-    Fix {
-        /// The file.
-        path: PathBuf,
-        /// What, why and what to do next.
-        what: String,
-    },
-}
-
-impl RevisionError {
-    fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
-        let path = path.into();
-        move |source| Self::Io { action, path, source }
-    }
+    Fix { path: PathBuf, what: String },
 }
 
 /// What differs between two revisions of one effect.
@@ -207,9 +152,9 @@ impl Edit {
     /// # Errors
     /// [`RevisionError`]: it cannot be read, is no model, is read-only, or another writer has it.
     pub fn begin(path: &Path) -> Result<Self, RevisionError> {
-        let path = fs::canonicalize(path).map_err(RevisionError::io("read the model file", path))?;
+        let path = fs::canonicalize(path).at("read the model file", path)?;
         let lock = Lock::take(&path)?;
-        let text = fs::read_to_string(&path).map_err(RevisionError::io("read the model file", &path))?;
+        let text = fs::read_to_string(&path).at("read the model file", &path)?;
         let model = Model::parse(&path, &text)?;
         file_name(&model)?;
         let document = document(&path, &text)?;
@@ -488,36 +433,27 @@ impl Step {
 
 /// Writes a file of the history: whole under its name, or not at all, and read-only.
 fn keep(path: &Path, text: &str) -> Result<(), RevisionError> {
-    let io = |source| RevisionError::Io { action: "write the history", path: path.to_owned(), source };
-    let folder = path.parent().unwrap_or(Path::new("."));
-    fs::create_dir_all(folder).map_err(io)?;
     if path.exists() {
         let reason = "a revision of that name exists already, and is another".to_owned();
         return Err(RevisionError::Damaged { path: path.to_owned(), reason });
     }
-    // The lock is ours, so nobody else has this file; one that a kill left is written anew.
-    let partial = folder.join(format!(".{}.partial", path.file_stem().unwrap_or_default().to_string_lossy()));
-    let mut file = File::create(&partial).map_err(io)?;
-    file.write_all(text.as_bytes()).map_err(io)?;
-    let mut permissions = file.metadata().map_err(io)?.permissions();
-    permissions.set_readonly(true);
-    file.set_permissions(permissions).map_err(io)?;
-    file.sync_all().map_err(io)?;
-    fs::rename(&partial, path).map_err(io)?;
-    sync_folder(folder).map_err(io)?;
-    // The entry of a folder that was just made.
-    sync_folder(folder.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))).map_err(io)
-}
-
-#[cfg(unix)]
-fn sync_folder(folder: &Path) -> std::io::Result<()> {
-    File::open(folder).and_then(|folder| folder.sync_all())
-}
-
-/// Elsewhere a folder is no file that could be flushed.
-#[cfg(not(unix))]
-fn sync_folder(_: &Path) -> std::io::Result<()> {
-    Ok(())
+    let write = || {
+        let folder = folder_of(path);
+        fs::create_dir_all(folder)?;
+        // We hold the lock, so this file is ours, or what a kill left.
+        let partial = folder.join(format!(".{}.partial", path.file_stem().unwrap_or_default().to_string_lossy()));
+        let mut file = File::create(&partial)?;
+        file.write_all(text.as_bytes())?;
+        let mut permissions = file.metadata()?.permissions();
+        permissions.set_readonly(true);
+        file.set_permissions(permissions)?;
+        file.sync_all()?;
+        fs::rename(&partial, path)?;
+        sync_folder(folder)?;
+        // The folder may be new itself.
+        sync_folder(folder_of(folder))
+    };
+    Ok(write().at("write the history", path)?)
 }
 
 /// The right to change a model file: `MODEL.toml.lock`, which only one writer can make.
@@ -534,27 +470,28 @@ impl Lock {
         path.push(".lock");
         let path = PathBuf::from(path);
         if fs::metadata(model).is_ok_and(|m| m.permissions().readonly()) {
-            let source = std::io::Error::from(ErrorKind::PermissionDenied);
-            return Err(RevisionError::Io { action: "change the read-only", path: model.to_owned(), source });
+            return Ok(Err(ErrorKind::PermissionDenied.into()).at("change the read-only", model)?);
         }
         match OpenOptions::new().write(true).create_new(true).open(&path) {
             Ok(file) => Ok(Self { path, file, renamed: false }),
             Err(error) if error.kind() == ErrorKind::AlreadyExists => Err(RevisionError::Locked { path }),
-            Err(source) => Err(RevisionError::Io { action: "lock the model file with", path, source }),
+            Err(error) => Ok(Err(error).at("lock the model file with", path)?),
         }
     }
 
     /// Fills the lock with the text and gives it the file's name, which also ends the lock.
     fn replace(mut self, path: &Path, text: &str) -> Result<(), RevisionError> {
-        let io = |source| RevisionError::Io { action: "write the model file", path: path.to_owned(), source };
-        self.file.write_all(text.as_bytes()).map_err(io)?;
-        if let Ok(old) = fs::metadata(path) {
-            self.file.set_permissions(old.permissions()).map_err(io)?;
-        }
-        self.file.sync_all().map_err(io)?;
-        fs::rename(&self.path, path).map_err(io)?;
-        self.renamed = true;
-        sync_folder(path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))).map_err(io)
+        let mut write = || {
+            self.file.write_all(text.as_bytes())?;
+            if let Ok(old) = fs::metadata(path) {
+                self.file.set_permissions(old.permissions())?;
+            }
+            self.file.sync_all()?;
+            fs::rename(&self.path, path)?;
+            self.renamed = true;
+            sync_folder(folder_of(path))
+        };
+        Ok(write().at("write the model file", path)?)
     }
 }
 
@@ -663,7 +600,7 @@ pub fn log(path: &Path) -> Result<Log, RevisionError> {
 pub fn find(path: &Path, revision: &str) -> Result<(Model, String), RevisionError> {
     let current = Model::load(path)?;
     if current.identity().0 == revision {
-        let text = fs::read_to_string(path).map_err(RevisionError::io("read the model file", path))?;
+        let text = fs::read_to_string(path).at("read the model file", path)?;
         return Ok((Model::parse(path, &text)?, text));
     }
     let kept = history(&history_folder(path))?;
@@ -701,11 +638,11 @@ fn history(folder: &Path) -> Result<History, RevisionError> {
     let entries = match fs::read_dir(folder) {
         Ok(entries) => entries,
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(kept),
-        Err(source) => return Err(RevisionError::Io { action: "read the history", path: folder.to_owned(), source }),
+        other => other.at("read the history", folder)?,
     };
     let mut paths = Vec::new();
     for entry in entries {
-        let path = entry.map_err(RevisionError::io("read the history", folder))?.path();
+        let path = entry.at("read the history", folder)?.path();
         // What a kill left unfinished begins with a dot; it never was a revision.
         if !path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.')) {
             paths.push(path);
@@ -723,7 +660,7 @@ fn history(folder: &Path) -> Result<History, RevisionError> {
 
 /// A file of the history, whose name and digest must be its content's.
 fn sound(path: &Path) -> Result<(Model, String), RevisionError> {
-    let text = fs::read_to_string(path).map_err(RevisionError::io("read the history", path))?;
+    let text = fs::read_to_string(path).at("read the history", path)?;
     let model = Model::parse(path, &text)?;
     let damaged = |reason: String| Err(RevisionError::Damaged { path: path.to_owned(), reason });
     if path.file_name().is_none_or(|name| *name != *format!("{}.toml", model.revision)) {

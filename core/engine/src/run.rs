@@ -3,18 +3,17 @@
 use chrono::{DateTime, Utc};
 use dragfree_schema::Report;
 use serde_json::Value;
-use sha2::{Digest, Sha256};
+use std::io;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use crate::EngineError;
-use crate::border::hex;
 use crate::chain::{self, Carry, Chain, Sink};
 use crate::config::{Mission, Model, Pipeline};
 use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions, Summary};
-use crate::product::{self, Draft, Loss, Product, ProductWriter, Stage, Status, Stream};
+use crate::files::{IoContext as _, IoError, folder_of, sha256, sha256_of, sync_folder};
+use crate::product::{self, Draft, Loss, ProductWriter, Stage, Written};
 use crate::registry::Registry;
-use crate::replay;
 use crate::sources::Sources;
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{FileHeader, TelemetryWriter, interface_tables};
@@ -59,17 +58,6 @@ pub struct Progress {
     pub first_ns: i64,
     /// End, Unix ns, where it is known.
     pub end_ns: Option<i64>,
-    /// Rows of the densest table so far.
-    pub epochs: u64,
-}
-
-/// What came of a run.
-#[derive(Clone, Debug)]
-pub struct Outcome {
-    /// The product.
-    pub product: Product,
-    /// Its file.
-    pub path: PathBuf,
 }
 
 /// What a check found.
@@ -215,10 +203,10 @@ pub fn run(
     registry: &Registry,
     options: &RunOptions,
     progress: &mut dyn FnMut(Progress),
-) -> Result<Outcome, EngineError> {
+) -> Result<Written, EngineError> {
     let setup = Setup::load(options)?;
     let next_state = options.state_out.as_deref().map(NextState::begin).transpose()?;
-    let state = options.state_in.as_ref().map(|path| read_state(path)).transpose()?;
+    let state = options.state_in.as_ref().map(|path| std::fs::read(path).at("read the state", path)).transpose()?;
     let resume_ns = state.as_ref().map(|s| chain::resumes_at_ns(s)).transpose()?;
     let mut feed = setup.feed(registry, options, window(options, resume_ns))?;
     let tables = feed.get().tables().to_vec();
@@ -243,7 +231,7 @@ pub fn run(
     // The state after the product: a kill in between costs a second run of the day, never the day.
     let written = writer.commit_with(&draft, || next_state.map_or(Ok(()), NextState::place))?;
     tracing::info!(id = written.product.id(), path = %written.path.display(), "archived");
-    Ok(Outcome { product: written.product, path: written.path })
+    Ok(written)
 }
 
 /// Tells what is about to run.
@@ -279,17 +267,14 @@ pub(crate) fn carry_all(
 ) -> Result<Option<Covered>, EngineError> {
     let span = feed.span_ns();
     let mut covered: Option<Covered> = None;
-    let mut epochs = 0u64;
     while let Some(chunk) = feed.next()? {
         if let Some((first, last)) = extent(&chunk) {
             let covered = covered.get_or_insert(Covered { first_ns: first, last_ns: last });
             covered.last_ns = covered.last_ns.max(last);
-            epochs += chunk.batches.iter().map(Batch::rows).max().unwrap_or(0) as u64;
             progress(Progress {
                 until_ns: last,
                 first_ns: covered.first_ns,
                 end_ns: span.as_ref().map(|s| s.end).filter(|e| *e != i64::MAX),
-                epochs,
             });
         }
         chain.feed(chunk, sink)?;
@@ -303,41 +288,36 @@ fn extent(chunk: &Chunk) -> Option<(i64, i64)> {
     Some((*densest.time_ns.first()?, *densest.time_ns.last()?))
 }
 
-fn read_state(path: &Path) -> Result<Vec<u8>, EngineError> {
-    std::fs::read(path).map_err(|source| EngineError::Io { action: "read the state", path: path.to_owned(), source })
-}
-
 /// The state for the next day, written beside its place and renamed: a kill leaves the old state or the new one.
 struct NextState<'a> {
     path: &'a Path,
-    folder: &'a Path,
     file: tempfile::NamedTempFile,
 }
 
 impl<'a> NextState<'a> {
     /// Opens the file, so that a place that cannot be written is refused before the day is read.
-    fn begin(path: &'a Path) -> Result<Self, EngineError> {
-        let io = |source| EngineError::Io { action: "write the state", path: path.to_owned(), source };
-        if path.is_dir() {
-            return Err(io(std::io::ErrorKind::IsADirectory.into()));
-        }
-        let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        std::fs::create_dir_all(folder).map_err(io)?;
-        Ok(Self { path, folder, file: tempfile::NamedTempFile::new_in(folder).map_err(io)? })
+    fn begin(path: &'a Path) -> Result<Self, IoError> {
+        let open = || {
+            if path.is_dir() {
+                return Err(io::ErrorKind::IsADirectory.into());
+            }
+            std::fs::create_dir_all(folder_of(path))?;
+            tempfile::NamedTempFile::new_in(folder_of(path))
+        };
+        Ok(Self { path, file: open().at("write the state", path)? })
     }
 
     fn write(mut self, bytes: &[u8]) -> Result<Self, EngineError> {
-        let written = std::io::Write::write_all(&mut self.file, bytes).and_then(|()| self.file.as_file().sync_all());
-        written.map_err(|source| EngineError::Io { action: "write the state", path: self.path.to_owned(), source })?;
+        let written = io::Write::write_all(&mut self.file, bytes).and_then(|()| self.file.as_file().sync_all());
+        written.at("write the state", self.path)?;
         Ok(self)
     }
 
     fn place(self) -> Result<(), EngineError> {
-        let io = |source| EngineError::Io { action: "write the state", path: self.path.to_owned(), source };
-        self.file.persist(self.path).map_err(|e| io(e.error))?;
+        self.file.persist(self.path).map_err(|e| e.error).at("write the state", self.path)?;
         // The state is in its place; only a power failure could still take the rename back.
-        if let Err(error) = std::fs::File::open(self.folder).and_then(|f| f.sync_all()) {
-            tracing::warn!("the folder {} cannot be flushed to disk: {error}", self.folder.display());
+        if let Err(error) = sync_folder(folder_of(self.path)) {
+            tracing::warn!("the folder {} cannot be flushed to disk: {error}", folder_of(self.path).display());
         }
         Ok(())
     }
@@ -421,7 +401,6 @@ fn draft(
     reports: Vec<Report>,
     covered: &Covered,
 ) -> Result<Draft, EngineError> {
-    let day = DateTime::from_timestamp_nanos(covered.first_ns).date_naive();
     let mut history = Vec::new();
     if let FeedKind::Source(source) = feed {
         history.push(Stage {
@@ -465,12 +444,9 @@ fn draft(
         release: setup.pipeline.release,
         mission: setup.mission.name.clone(),
         spacecraft: setup.mission.spacecraft.clone(),
-        day,
         first_ns: covered.first_ns,
         last_ns: covered.last_ns,
         time_scale: summary.time_scale,
-        stream: Stream::Test,
-        status: Status::Quicklook,
         inputs: inputs(setup, options)?,
         history,
         model: product::Model { revision, parent, effects },
@@ -498,7 +474,7 @@ fn sources(setup: &Setup, options: &RunOptions) -> Sources {
 }
 
 fn digest(parameters: &serde_json::Map<String, Value>) -> String {
-    hex(&Sha256::digest(Value::Object(parameters.clone()).to_string()))
+    sha256(Value::Object(parameters.clone()).to_string())
 }
 
 fn inputs(setup: &Setup, options: &RunOptions) -> Result<Vec<product::Input>, EngineError> {
@@ -509,12 +485,11 @@ fn inputs(setup: &Setup, options: &RunOptions) -> Result<Vec<product::Input>, En
         .chain(own.iter().map(|(role, path)| (*role, path.as_path())))
         .chain(state)
         .map(|(role, path)| {
-            let io = |source| EngineError::Io { action: "read", path: path.to_owned(), source };
             Ok(product::Input {
                 role: role.to_owned(),
                 name: path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
-                size: std::fs::metadata(path).map_err(io)?.len(),
-                sha256: replay::sha256(path).map_err(io)?,
+                size: std::fs::metadata(path).at("read", path)?.len(),
+                sha256: sha256_of(path).at("read", path)?,
             })
         })
         .collect()

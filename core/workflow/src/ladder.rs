@@ -13,18 +13,14 @@ use dragfree_engine::product::{Coefficient, Product};
 
 /// Why products make no ladder.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum LadderError {
     /// Products of two spacecraft, or of none.
     #[error("{0}")]
     Products(String),
     /// A product that is no held-out one.
     #[error("{id} cannot be held out: {why}")]
-    HeldOut {
-        /// Product.
-        id: String,
-        /// Why, and what to do next.
-        why: String,
-    },
+    HeldOut { id: String, why: String },
 }
 
 /// Revisions in the order of parentage.

@@ -778,7 +778,7 @@ fn guarded_call(
         }
         abi::ERROR | abi::FATAL => {
             let message = if message.is_empty() { "failed without a word".to_owned() } else { message };
-            Err(BorderError::Plugin { plugin: plugin.to_owned(), call, message, fatal: status == abi::FATAL })
+            Err(BorderError::Plugin { plugin: plugin.to_owned(), call, message })
         }
         other => {
             Err(BorderError::Rule { plugin: plugin.to_owned(), call, what: format!("status {other} does not exist") })

@@ -2,11 +2,11 @@
 
 use dragfree_schema::{Coefficient, Constraint, NoiseProcess, Settings};
 use serde_json::{Map, Value, json};
-use sha2::{Digest, Sha256};
 
 use super::{Carry, Chain, ChainError, ChainNode, Queue, Route, Tap};
-use crate::border::{BorderError, Config, Instance, Kind, LinkRequest, Linked, hex};
+use crate::border::{BorderError, Config, Instance, Kind, LinkRequest, Linked};
 use crate::config::{EffectEntry, Mission, Model, Node, Pipeline, resolve_parameters};
+use crate::files::sha256;
 use crate::registry::{Found, Registry};
 use crate::table::{Column, TableSpec};
 
@@ -42,7 +42,7 @@ pub fn build(
             tap: Tap::default(),
             carry: Carry { batch_rows: carry.batch_rows.max(1), ..carry },
             complete_until_ns: i64::MIN,
-            mission_sha256: hex(&Sha256::digest(mission.value.to_string())),
+            mission_sha256: sha256(mission.value.to_string()),
             model_sha256: String::new(),
         },
     };
@@ -59,7 +59,7 @@ pub fn build(
         )));
     }
     builder.chain.columns = std::mem::take(&mut builder.available);
-    builder.chain.model_sha256 = hex(&Sha256::digest(builder.model_json(false)));
+    builder.chain.model_sha256 = sha256(builder.model_json(false));
     Ok(builder.chain)
 }
 

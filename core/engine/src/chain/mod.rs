@@ -22,6 +22,7 @@ use queue::Queue;
 
 /// What can go wrong between plugins.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum ChainError {
     /// At the border.
     #[error(transparent)]
@@ -34,26 +35,13 @@ pub enum ChainError {
     Config(#[from] crate::config::ConfigError),
     /// The model and the chain do not fit.
     #[error("model {path}: {what}")]
-    Model {
-        /// The model file.
-        path: String,
-        /// What, why and what to do next.
-        what: String,
-    },
+    Model { path: String, what: String },
     /// Tables that should have the same rows do not.
     #[error("the tables that {reader} reads have different rows: {what}; the stage that makes one of them is at fault")]
-    Join {
-        /// The plugin that reads them, or the host.
-        reader: String,
-        /// Which table, which time.
-        what: String,
-    },
+    Join { reader: String, what: String },
     /// A state does not belong to this chain.
     #[error("state: {what}")]
-    State {
-        /// What, why and what to do next.
-        what: String,
-    },
+    State { what: String },
     /// Reports could not be handed on.
     #[error("reports: {0}")]
     Reports(String),

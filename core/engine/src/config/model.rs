@@ -1,12 +1,12 @@
 //! Model files: a list of effects.
 
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::{ConfigError, Mission, parse, read};
-use crate::border::{Manifest, hex};
+use crate::border::Manifest;
+use crate::files::sha256;
 
 /// A model: a revision and its effects.
 #[derive(Clone, Debug)]
@@ -121,7 +121,7 @@ impl Model {
     pub fn digest(&self) -> String {
         let mut effects = serde_json::json!(self.effects);
         effects.sort_all_objects();
-        let mut digest = hex(&Sha256::digest(effects.to_string()));
+        let mut digest = sha256(effects.to_string());
         digest.truncate(DIGITS);
         digest
     }

@@ -6,7 +6,7 @@ use super::file::{
     NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Supersedes, Variable,
 };
 use crate::border::without_name;
-use chrono::{DateTime, NaiveDate, SecondsFormat, Utc};
+use chrono::{DateTime, SecondsFormat, Utc};
 use dragfree_schema::{Report, Settings};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -23,18 +23,12 @@ pub struct Draft {
     pub mission: String,
     /// Spacecraft, `SC1`: letters, digits and `-`.
     pub spacecraft: String,
-    /// UTC day in the product's name, that of the first epoch.
-    pub day: NaiveDate,
     /// First epoch, Unix ns of `time_scale`.
     pub first_ns: i64,
     /// Last epoch, Unix ns of `time_scale`.
     pub last_ns: i64,
     /// `UTC`, `TAI` or `GPS`; empty where the data do not say.
     pub time_scale: String,
-    /// Operations, reprocessing or a test.
-    pub stream: Stream,
-    /// How final the product is.
-    pub status: Status,
     /// Every file that was read.
     pub inputs: Vec<Input>,
     /// Every plugin that ran, in order.
@@ -57,6 +51,11 @@ pub struct Draft {
     pub created: DateTime<Utc>,
 }
 
+/// UTC day of the first epoch.
+fn day(draft: &Draft) -> String {
+    DateTime::from_timestamp_nanos(draft.first_ns).format("%Y-%m-%d").to_string()
+}
+
 /// A product's name without its revision, `COM1B_2035-01-01_SC1_01`.
 pub(super) fn stem(draft: &Draft) -> Result<String, ProductError> {
     let named = |what, value: &str, place, extra: &[char]| {
@@ -65,7 +64,7 @@ pub(super) fn stem(draft: &Draft) -> Result<String, ProductError> {
     };
     named("the product name", &draft.product, "pipeline", &[])?;
     named("the spacecraft", &draft.spacecraft, "mission", &['-'])?;
-    Ok(format!("{}_{}_{}_{:02}", draft.product, draft.day.format("%Y-%m-%d"), draft.spacecraft, draft.release))
+    Ok(format!("{}_{}_{}_{:02}", draft.product, day(draft), draft.spacecraft, draft.release))
 }
 
 /// Builds the product with `revision`; its digest is filled in.
@@ -107,9 +106,9 @@ pub(super) fn product(
             product: draft.product.clone(),
             release: draft.release,
             revision,
-            day: draft.day.format("%Y-%m-%d").to_string(),
-            stream: draft.stream,
-            status: draft.status,
+            day: day(draft),
+            stream: Stream::Test,
+            status: Status::Quicklook,
             time_scale: if draft.time_scale.is_empty() { "unknown" } else { &draft.time_scale }.to_owned(),
             start_time_epoch_ns: draft.first_ns,
             stop_time_epoch_ns: draft.last_ns,

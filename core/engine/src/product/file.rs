@@ -2,9 +2,9 @@
 
 use super::ProductError;
 use super::emit::emit;
+use crate::files::{IoContext as _, sha256};
 use dragfree_schema::{Role, Settings};
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::LazyLock;
@@ -367,7 +367,7 @@ impl Product {
         computed.header.global_attributes.date_created.clear();
         computed.header.non_standard_attributes.revision = 0;
         computed.header.non_standard_attributes.sha256.clear();
-        hexadecimal(&Sha256::digest(computed.canonical()))
+        sha256(computed.canonical())
     }
 
     /// The whole document as JSON without white space, keys sorted.
@@ -394,7 +394,7 @@ impl Product {
 /// # Errors
 /// [`ProductError`]: the file cannot be read, is no product, is from a later version or was changed.
 pub fn read(path: &Path) -> Result<Product, ProductError> {
-    let text = std::fs::read_to_string(path).map_err(ProductError::io("read", path))?;
+    let text = std::fs::read_to_string(path).at("read", path)?;
     let product = parse(&text, path)?;
     if path.file_stem().is_none_or(|stem| stem != product.id()) {
         return Err(ProductError::Damaged {
@@ -432,14 +432,5 @@ fn check(id: &str, document: &serde_json::Value) -> Result<(), ProductError> {
         id: id.to_owned(),
         at: error.instance_path().to_string(),
         reason: error.to_string(),
-    })
-}
-
-/// Lower-case hexadecimal.
-pub(super) fn hexadecimal(bytes: &[u8]) -> String {
-    use std::fmt::Write as _;
-    bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
-        let _ = write!(text, "{byte:02x}"); // writing to a String cannot fail
-        text
     })
 }

@@ -1,5 +1,5 @@
 use super::*;
-use chrono::{DateTime, NaiveDate, Utc};
+use chrono::{DateTime, Utc};
 use dragfree_schema::Report;
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -44,12 +44,9 @@ fn draft(value: f64) -> Draft {
         release: 1,
         mission: "Taiji".into(),
         spacecraft: "SC1".into(),
-        day: NaiveDate::from_ymd_opt(2035, 1, 1).expect("a day"),
         first_ns: 2_051_222_400_000_000_000,
         last_ns: 2_051_222_409_900_000_000,
         time_scale: "UTC".into(),
-        stream: Stream::Test,
-        status: Status::Quicklook,
         inputs: vec![Input { role: "telemetry".into(), name: "a.mcap".into(), size: 7, sha256: ZERO_DIGEST.into() }],
         history: vec![Stage {
             plugin: "qp-check".into(),
@@ -109,9 +106,9 @@ fn a_failed_last_step_leaves_nothing() {
     let folder = tempfile::tempdir().expect("folder");
     let mut writer = ProductWriter::begin(folder.path()).expect("begin");
     std::fs::write(writer.staged_unlisted("sources.json"), "{}").expect("written");
-    let refused = ProductError::Time(7);
+    let refused = ProductError::Full("test".into());
     let error = writer.commit_with(&draft(0.0909), || Err(refused)).expect_err("the last step failed");
-    assert!(matches!(error, ProductError::Time(7)), "{error}");
+    assert!(matches!(error, ProductError::Full(_)), "{error}");
     assert_eq!(visible(folder.path()), Vec::<String>::new());
     let mut writer = ProductWriter::begin(folder.path()).expect("begin");
     std::fs::write(writer.staged_unlisted("sources.json"), "{}").expect("written");

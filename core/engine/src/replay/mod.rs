@@ -16,15 +16,12 @@ mod tables;
 #[cfg(test)]
 mod tests;
 
-use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{self, Read};
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::{self, JoinHandle};
-
-use sha2::{Digest as _, Sha256};
 
 pub use losses::{Finding, Losses};
 
@@ -77,36 +74,17 @@ pub enum ReplayError {
     Worker,
 }
 
-/// One input, as a product cites it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct InputFile {
-    /// Path as given.
-    pub path: PathBuf,
-    /// Size, bytes.
-    pub bytes: u64,
-    /// First log time that its chunks state, Unix ns; `None` without messages.
-    pub first_ns: Option<i64>,
-    /// Last log time that its chunks state, Unix ns.
-    pub last_ns: Option<i64>,
-}
-
 /// Whose data these are and from when.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ReplayInfo {
     /// `UTC`, `TAI` or `GPS`; empty when no file says.
     pub time_scale: String,
-    /// Mission; empty when no file says.
-    pub mission: String,
     /// Spacecraft; empty when no file says.
     pub spacecraft: String,
     /// First log time of all files that the chunks state, Unix ns, before any window.
     pub first_ns: Option<i64>,
     /// Last log time of all files that the chunks state, Unix ns.
     pub last_ns: Option<i64>,
-    /// The files, in order of time.
-    pub files: Vec<InputFile>,
-    /// Every topic that a file defines, read or not.
-    pub topics: Vec<String>,
 }
 
 /// A replay under way.
@@ -158,7 +136,9 @@ impl Replay {
         let (tables, routes) = tables::link(&views, &mut losses)?;
         // Files that ended before their first channel are a loss, not the wrong files.
         if tables.is_empty() && !losses.data_loss() {
-            return Err(ReplayError::NoTelemetry { found: info.topics.join(", ") });
+            let channels = files.iter().flat_map(|(_, scan)| scan.definitions.channels.values());
+            let topics: BTreeSet<&str> = channels.map(|channel| channel.topic.as_str()).collect();
+            return Err(ReplayError::NoTelemetry { found: Vec::from_iter(topics).join(", ") });
         }
         let files = (files.into_iter().zip(routes))
             .map(|((source, scan), routes)| OpenFile { source, pieces: scan.pieces, routes })
@@ -241,22 +221,11 @@ fn info(files: &[(Source, Scan)], losses: &mut Losses) -> Result<ReplayInfo, Rep
     for (source, scan) in files {
         let path = source.path().to_owned();
         let name = path.display().to_string();
-        for channel in scan.definitions.channels.values() {
-            if !info.topics.contains(&channel.topic) {
-                info.topics.push(channel.topic.clone());
-            }
-        }
         let times = times(scan);
         info.first_ns = info.first_ns.into_iter().chain(times.map(|t| t.0)).min();
         info.last_ns = info.last_ns.into_iter().chain(times.map(|t| t.1)).max();
-        info.files.push(InputFile {
-            path: path.clone(),
-            bytes: scan.bytes,
-            first_ns: times.map(|t| t.0),
-            last_ns: times.map(|t| t.1),
-        });
         let Some(metadata) = &scan.metadata else {
-            losses.add(Finding::MissingMetadata, u64::from(scan.bytes > 0), &name, || {
+            losses.add(Finding::FilesWithoutMetadata, u64::from(scan.bytes > 0), &name, || {
                 format!("{name} has no metadata record \"dragfree\": its spacecraft and time scale are taken on trust")
             });
             continue;
@@ -272,25 +241,7 @@ fn info(files: &[(Source, Scan)], losses: &mut Losses) -> Result<ReplayInfo, Rep
             }
         }
     }
-    info.topics.sort();
     let mut take = |key| said.remove(key).unwrap_or_default();
-    (info.time_scale, info.mission, info.spacecraft) = (take("time_scale"), take("mission"), take("spacecraft"));
+    (info.time_scale, info.spacecraft) = (take("time_scale"), take("spacecraft"));
     Ok(info)
-}
-
-/// SHA-256 of a file, in hexadecimal: a pass of its own over all bytes.
-///
-/// # Errors
-/// What the system says when the file cannot be read.
-pub fn sha256(path: &Path) -> io::Result<String> {
-    let mut file = File::open(path)?;
-    let mut hasher = Sha256::new();
-    let mut buffer = vec![0; 1 << 18];
-    loop {
-        match file.read(&mut buffer)? {
-            0 => break,
-            count => hasher.update(&buffer[..count]),
-        }
-    }
-    Ok(hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
 }

@@ -159,7 +159,7 @@ impl Reader {
             Ok(records) => records,
             Err(InflateError::Io(error)) => return Err(io(error)),
             Err(InflateError::Corrupt(why)) => {
-                self.losses.add(Finding::CorruptChunk, 1, &format!("{name}@{}", piece.offset), || {
+                self.losses.add(Finding::CorruptChunks, 1, &format!("{name}@{}", piece.offset), || {
                     format!(
                         "{name}: the chunk at byte {} is corrupt ({why}); its messages from {} to {} ns are lost; fetch the file again",
                         piece.offset, piece.start, piece.end
@@ -170,7 +170,7 @@ impl Reader {
         };
         let first_time = pending.from_ns == i64::MIN;
         if first_time && matches!(&piece.stored, Stored::Chunk { crc: 0, .. }) {
-            self.losses.add(Finding::UncheckedChunk, 1, &name, || {
+            self.losses.add(Finding::ChunksWithoutCrc, 1, &name, || {
                 format!("{name} has chunks without a CRC; damage goes unseen")
             });
         }
@@ -186,12 +186,12 @@ impl Reader {
         for entries in self.entries.chunk_by(|a, b| a.channel == b.channel) {
             let (channel, count) = (entries[0].channel, entries.len());
             match routes.get_mut(&channel) {
-                None => self.losses.add(Finding::UnknownChannel, count as u64, &format!("{name}#{channel}"), || {
+                None => self.losses.add(Finding::MessagesOfUnknownChannels, count as u64, &format!("{name}#{channel}"), || {
                     format!("{name}: {count} messages are of channel {channel}, which the file does not define; they are lost")
                 }),
                 Some(Route::Nowhere { finding, topic }) => {
                     let why = match finding {
-                        Finding::Truth => "it is the truth of a simulation and no calibration may read it",
+                        Finding::TruthMessages => "it is the truth of a simulation and no calibration may read it",
                         _ => "it is not in telemetry.proto; housekeeping belongs under /hk/",
                     };
                     self.losses.add(*finding, count as u64, topic, || format!("{name}: topic {topic} is not read: {why}"));
@@ -200,11 +200,11 @@ impl Reader {
                     let spec = &self.tables[*table];
                     let rows = decode(entries, records, decoder, spec.columns.len());
                     let topic = &spec.name;
-                    self.losses.add(Finding::NonFinite, rows.non_finite, topic, || {
+                    self.losses.add(Finding::NonFiniteValues, rows.non_finite, topic, || {
                         format!("{name}: topic /{topic} has values that are NaN or infinite; they are passed on")
                     });
                     if let Some(error) = rows.error {
-                        self.losses.add(Finding::MalformedMessage, (count - rows.times.len()) as u64, topic, || {
+                        self.losses.add(Finding::MalformedMessages, (count - rows.times.len()) as u64, topic, || {
                             format!("{name}: messages of topic /{topic} contradict their schema ({error}) and are lost")
                         });
                     }
@@ -275,8 +275,9 @@ fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, 
             Ok(Some(record)) => record,
             Ok(None) => break,
             Err(_) => {
-                losses
-                    .add(Finding::DamagedRecord, 1, name, || format!("{name}: a chunk ends in the middle of a record"));
+                losses.add(Finding::DamagedRecords, 1, name, || {
+                    format!("{name}: a chunk ends in the middle of a record")
+                });
                 break;
             }
         };
@@ -285,7 +286,7 @@ fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, 
         }
         let end = records.len() - cursor.0.len();
         let Ok(message) = Message::parse(body) else {
-            losses.add(Finding::DamagedRecord, 1, name, || format!("{name}: a message is shorter than its header"));
+            losses.add(Finding::DamagedRecords, 1, name, || format!("{name}: a message is shorter than its header"));
             continue;
         };
         let time_ns = i64::try_from(message.log_time).unwrap_or(i64::MAX);
@@ -306,13 +307,13 @@ fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, 
             entries.push(Entry { channel: message.channel, time_ns, data: end - message.data.len()..end });
         }
     }
-    losses.add(Finding::TimeOutOfRange, insane, name, || {
+    losses.add(Finding::TimesOutOfRange, insane, name, || {
         format!("{name}: messages are dated before 1980 or after 2200 and were dropped")
     });
-    losses.add(Finding::Backwards, backwards, name, || {
+    losses.add(Finding::BackwardTimes, backwards, name, || {
         format!("{name}: log times run backwards; they were put in order")
     });
-    losses.add(Finding::LateMessage, late, name, || {
+    losses.add(Finding::LateMessages, late, name, || {
         format!("{name}: messages lie outside the times that their chunk states and came too late to be put in order; they are lost")
     });
     later

@@ -109,7 +109,7 @@ pub(super) fn scan(source: &Source, losses: &mut Losses) -> Result<Scan, ScanErr
     let bytes = file.seek(SeekFrom::End(0))?;
     let mut scan = Scan { bytes, ..Scan::default() };
     if bytes == 0 {
-        losses.add(Finding::EmptyFile, 1, &name, || format!("{name} is empty; nothing was read from it"));
+        losses.add(Finding::EmptyFiles, 1, &name, || format!("{name} is empty; nothing was read from it"));
         return Ok(scan);
     }
     let mut magic = Vec::new();
@@ -130,13 +130,13 @@ pub(super) fn scan(source: &Source, losses: &mut Losses) -> Result<Scan, ScanErr
         scan.definitions.channels.entry(id).or_insert(channel);
     }
     if !complete && !scan.pieces.is_empty() {
-        losses.add(Finding::NoSummary, 1, &name, || {
+        losses.add(Finding::FilesWithoutSummary, 1, &name, || {
             format!("{name} has no complete summary; it was read twice. `mcap recover` writes one")
         });
     }
     inspect(&mut file, &mut scan, &doubtful, &name, losses)?;
     if scan.pieces.is_empty() {
-        losses.add(Finding::NoMessages, 1, &name, || format!("{name} holds no messages"));
+        losses.add(Finding::FilesWithoutMessages, 1, &name, || format!("{name} holds no messages"));
     }
     Ok(scan)
 }
@@ -190,7 +190,7 @@ fn inspect(
                     end = end.max(message.log_time);
                 }
             } else if !scan.definitions.take(code, body) {
-                losses.add(Finding::DamagedRecord, 1, name, || {
+                losses.add(Finding::DamagedRecords, 1, name, || {
                     format!("{name}: a schema or channel contradicts another")
                 });
             }
@@ -392,14 +392,14 @@ impl Walk<'_> {
 
     fn cut(&mut self, at: u64) {
         let (name, lost) = (self.name, self.bytes.saturating_sub(at));
-        self.losses.add(Finding::TruncatedFile, 1, name, || {
+        self.losses.add(Finding::TruncatedFiles, 1, name, || {
             format!("{name} ends in the middle: its last {lost} bytes are no whole record and what followed is lost; fetch it again")
         });
     }
 
     fn damaged(&mut self, at: u64, to: u64, why: &str) {
         let name = self.name;
-        self.losses.add(Finding::DamagedRecord, 1, name, || {
+        self.losses.add(Finding::DamagedRecords, 1, name, || {
             format!(
                 "{name}: the record at byte {at} is damaged ({why}); bytes {at} to {to} are lost; fetch the file again"
             )

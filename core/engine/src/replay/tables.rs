@@ -42,8 +42,8 @@ pub(super) fn link(
         for (&id, channel) in &scan.definitions.channels {
             let finding = match telemetry::topic_kind(&channel.topic) {
                 Topic::Telemetry => None,
-                Topic::Truth => Some(Finding::Truth),
-                Topic::Unknown => Some(Finding::UnknownTopic),
+                Topic::Truth => Some(Finding::TruthMessages),
+                Topic::Unknown => Some(Finding::MessagesOfUnknownTopics),
             };
             if let Some(finding) = finding {
                 routes[at].insert(id, Route::Nowhere { finding, topic: channel.topic.clone() });
@@ -51,7 +51,7 @@ pub(super) fn link(
             }
             let layout = layout(path, scan, id)?;
             for field in layout.ignored() {
-                losses.add(Finding::IgnoredField, 1, &format!("{}.{field}", channel.topic), || {
+                losses.add(Finding::IgnoredFields, 1, &format!("{}.{field}", channel.topic), || {
                     format!(
                         "{}: field {field} of {} is no scalar of 32 bits or a double; it is not read",
                         path.display(),
@@ -73,7 +73,7 @@ pub(super) fn link(
     for (feeds, table) in feeds.into_values() {
         // A stage that finds a table relies on it: an empty one is as good as a missing topic, and better told as one.
         if !feeds.iter().any(|f| files[f.file].1.used.contains(&f.channel)) {
-            losses.add(Finding::EmptyTopic, 1, &table.name, || {
+            losses.add(Finding::TopicsWithoutMessages, 1, &table.name, || {
                 format!("topic /{} has no messages; it counts as missing", table.name)
             });
             continue;
@@ -132,7 +132,7 @@ fn extend(
     }
     let (Some(metadata), Some(value)) = (housekeeping, table.columns.first_mut()) else { return Ok(()) };
     let unit = metadata.get("unit").filter(|u| !u.is_empty()).cloned().unwrap_or_else(|| {
-        losses.add(Finding::MissingUnit, 1, topic, || {
+        losses.add(Finding::MissingUnits, 1, topic, || {
             format!("{}: channel {topic} does not state its unit; it is read as a number (1)", path.display())
         });
         "1".to_owned()

@@ -87,26 +87,15 @@ pub(crate) fn column(table: &str, path: &str) -> Column {
 
 /// A schema that is not what the interface says.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum Drift {
     /// Fields are missing; those that came in their place may be the same in another unit or frame.
     #[error("its schema lacks {}{}; a name carries unit and frame, so another name is another quantity",
         missing.join(", "), if instead.is_empty() { String::new() } else { format!(" and has {} instead", instead.join(", ")) })]
-    Missing {
-        /// Paths that the interface has and the file has not.
-        missing: Vec<String>,
-        /// Paths that the file has and the interface has not.
-        instead: Vec<String>,
-    },
+    Missing { missing: Vec<String>, instead: Vec<String> },
     /// A field has another type.
     #[error("its field {path} is of type {found}, where telemetry.proto has {expected}")]
-    Type {
-        /// Path of the field.
-        path: String,
-        /// Type in the file.
-        found: String,
-        /// Type in the interface.
-        expected: String,
-    },
+    Type { path: String, found: String, expected: String },
 }
 
 /// Compares the layout of `topic` in a file with the interface: every field must be there, by name and type; more

@@ -20,4 +20,4 @@ pub(crate) use interface::column;
 pub use interface::{Drift, Topic, check, descriptor, expected, interface_tables, topic_kind};
 pub use layout::{Kind, Layout, LayoutError, Leaf};
 pub use names::unit_and_frame;
-pub use write::{FileHeader, TelemetryWriter, WriteError, Written};
+pub use write::{FileHeader, TelemetryWriter, WriteError};

@@ -8,6 +8,7 @@ mod session;
 mod stand;
 
 use dragfree_schema::{Coefficient, ParameterType};
+use serde::Serialize;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
@@ -24,7 +25,8 @@ const GAP: std::ops::Range<usize> = 2000..2050;
 const BATCHES: [usize; 4] = [EPOCHS, 1, 7, 512];
 
 /// Something that is checked.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Check {
     /// The manifest says who it is, and every default is one that the parameter's own declaration allows.
     Manifest,
@@ -60,26 +62,17 @@ impl Check {
         Self::State,
         Self::Garbage,
     ];
+}
 
-    /// Its name.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Manifest => "manifest",
-            Self::Create => "create",
-            Self::Link => "link",
-            Self::Values => "values",
-            Self::Gaps => "gaps",
-            Self::Batches => "batches",
-            Self::Replay => "replay",
-            Self::State => "state",
-            Self::Garbage => "garbage",
-        }
+impl std::fmt::Display for Check {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.serialize(f)
     }
 }
 
 /// What a check found.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum Finding {
     /// The plugin failed or broke a rule of the border.
     #[error(transparent)]
@@ -92,12 +85,7 @@ pub enum Finding {
     Manifest(String),
     /// What an instance announced or gave is not what the chain relies on.
     #[error("{instance}: {what}")]
-    Broken {
-        /// Id and instance.
-        instance: String,
-        /// What is wrong, and what to do.
-        what: String,
-    },
+    Broken { instance: String, what: String },
 }
 
 /// The plugin and what it is given.

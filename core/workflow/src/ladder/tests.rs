@@ -1,5 +1,5 @@
 use super::*;
-use dragfree_engine::product::{self, Draft, ProductWriter, Stage, Status, Stream};
+use dragfree_engine::product::{self, Draft, ProductWriter, Stage};
 use serde_json::json;
 
 /// 2035-01-01.
@@ -95,12 +95,9 @@ impl Made<'_> {
             release: 1,
             mission: "Taiji".into(),
             spacecraft: "SC1".into(),
-            day: chrono::DateTime::from_timestamp_nanos(first_ns).date_naive(),
             first_ns,
             last_ns: first_ns + DAY_NS - 1,
             time_scale: "UTC".into(),
-            stream: Stream::Test,
-            status: Status::Quicklook,
             inputs: Vec::new(),
             history: self.effects.iter().map(stage).collect(),
             model: product::Model {
