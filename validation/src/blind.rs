@@ -19,10 +19,8 @@ use crate::program::{Chain, Hidden, Program, root, solution};
 use crate::records::{After, Blind, Results};
 
 /// Runs the seeds that `results` lacks, `at_once` in parallel.
-///
-/// # Errors
 /// [`CampaignError`]; results so far are on disk, and the next call continues.
-pub fn blind(
+pub(crate) fn blind(
     program: &Program,
     seeds: RangeInclusive<u32>,
     hours: f64,

@@ -14,14 +14,14 @@ use crate::program::{Chain, Program, line, root};
 use crate::records::{Line, Results};
 
 /// Length of a twin, h.
-pub const TWIN_HOURS: f64 = 6.0;
+pub(crate) const TWIN_HOURS: f64 = 6.0;
 /// Number of seeds of the twins.
-pub const TWIN_SEEDS: u32 = 40;
+pub(crate) const TWIN_SEEDS: u32 = 40;
 
 /// Error that stops a campaign.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "every field is named in its sentence")]
-pub enum CampaignError {
+pub(crate) enum CampaignError {
     /// The program did not start.
     #[error("{command}: {source}")]
     Start { command: String, source: std::io::Error },
@@ -47,19 +47,19 @@ pub enum CampaignError {
 
 /// A twin.
 #[derive(Clone, Copy, Debug)]
-pub struct Twin {
+pub(crate) struct Twin {
     /// Name; the configuration adds `unprotected` or `product`.
-    pub name: &'static str,
+    pub(crate) name: &'static str,
     /// Description in the report.
-    pub words: &'static str,
+    pub(crate) words: &'static str,
     /// Noise tables whose PSD is scaled by a factor in the mission file of `run`.
-    pub scaled: Option<(&'static [&'static str], f64)>,
+    pub(crate) scaled: Option<(&'static [&'static str], f64)>,
     /// Effects in the simulation that the model lacks.
-    pub effects: &'static [&'static str],
+    pub(crate) effects: &'static [&'static str],
     /// Whether it also runs as the product.
-    pub with_product: bool,
+    pub(crate) with_product: bool,
     /// Seeds.
-    pub seeds: u32,
+    pub(crate) seeds: u32,
 }
 
 const THRUST: &[&str] = &["thruster_force", "thruster_torque"];
@@ -76,7 +76,7 @@ const fn alone(name: &'static str, words: &'static str, noise: &'static [&'stati
 }
 
 /// All twins; the first is the control, without error.
-pub const TWINS: [Twin; 9] = [
+pub(crate) const TWINS: [Twin; 9] = [
     twin("control", "nothing wrong", None),
     twin("q-times-10", "thrust noise believed 10 times in power (Q×10)", Some((THRUST, 10.0))),
     twin("q-over-10", "thrust noise believed 1/10 (Q/10)", Some((THRUST, 0.1))),
@@ -90,24 +90,21 @@ pub const TWINS: [Twin; 9] = [
 
 impl Twin {
     /// Name of its unprotected configuration.
-    #[must_use]
-    pub fn unprotected(&self) -> String {
+    pub(crate) fn unprotected(&self) -> String {
         format!("{} unprotected", self.name)
     }
 
     /// Name of its product configuration.
-    #[must_use]
-    pub fn product(&self) -> String {
+    pub(crate) fn product(&self) -> String {
         format!("{} product", self.name)
     }
 }
 
 /// Name of the configuration without twin.
-pub const NOMINAL: &str = "nominal";
+pub(crate) const NOMINAL: &str = "nominal";
 
 /// All configurations in the order of the results.
-#[must_use]
-pub fn configurations() -> Vec<String> {
+pub(crate) fn configurations() -> Vec<String> {
     std::iter::once(NOMINAL.to_owned()).chain(TWINS.iter().flat_map(|t| [t.unprotected(), t.product()])).collect()
 }
 
@@ -265,7 +262,7 @@ impl Meter {
 }
 
 /// A line on stderr.
-pub fn note(text: &str) {
+pub(crate) fn note(text: &str) {
     use std::io::Write as _;
     let _ = writeln!(std::io::stderr(), "{text}"); // no way to report a failing stderr
 }
@@ -297,10 +294,8 @@ pub(crate) fn work<T: Send>(
 }
 
 /// Runs the seeds that `results` lacks, and the twins of those seeds.
-///
-/// # Errors
 /// [`CampaignError`]; results so far are on disk, and the next call continues.
-pub fn coverage(
+pub(crate) fn coverage(
     program: &Program,
     seeds: std::ops::RangeInclusive<u32>,
     results: &Path,

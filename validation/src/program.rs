@@ -13,55 +13,52 @@ use crate::campaign::{CampaignError, file};
 use crate::records::{COEFFICIENTS, Line, Solution, rounded};
 
 /// The repository.
-#[must_use]
-pub fn root() -> &'static Path {
+pub(crate) fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new("."))
 }
 
 /// The built program.
 #[derive(Clone, Debug)]
-pub struct Program {
+pub(crate) struct Program {
     exe: PathBuf,
     threads: usize,
 }
 
 /// Telemetry of a simulation, from which the truth was read and removed before any calibration.
 #[derive(Clone, Debug)]
-pub struct Simulated {
+pub(crate) struct Simulated {
     /// The files, oldest first.
-    pub files: Vec<PathBuf>,
+    pub(crate) files: Vec<PathBuf>,
     /// True offsets, m.
-    pub truth_m: [f64; 6],
+    pub(crate) truth_m: [f64; 6],
 }
 
 /// Telemetry of a simulation with hidden effects, and its sealed truth in another folder.
 #[derive(Clone, Debug)]
-pub struct Hidden {
+pub(crate) struct Hidden {
     /// The files, oldest first.
-    pub files: Vec<PathBuf>,
+    pub(crate) files: Vec<PathBuf>,
     /// The sealed file.
-    pub sealed: PathBuf,
+    pub(crate) sealed: PathBuf,
     /// True offsets, m.
-    pub truth_m: [f64; 6],
+    pub(crate) truth_m: [f64; 6],
 }
 
 /// Inputs of `run` besides the telemetry.
 #[derive(Clone, Debug, Default)]
-pub struct Chain {
+pub(crate) struct Chain {
     /// Pipeline file.
-    pub pipeline: PathBuf,
+    pub(crate) pipeline: PathBuf,
     /// Mission file in place of the pipeline's.
-    pub mission: Option<PathBuf>,
+    pub(crate) mission: Option<PathBuf>,
     /// Model file in place of the pipeline's.
-    pub model: Option<PathBuf>,
+    pub(crate) model: Option<PathBuf>,
 }
 
 impl Program {
     /// Builds program and plugins, so that the measured program is current.
-    ///
-    /// # Errors
     /// [`CampaignError`]: the workspace does not build.
-    pub fn build() -> Result<Self, CampaignError> {
+    pub(crate) fn build() -> Result<Self, CampaignError> {
         let folder = std::env::current_exe()
             .map_err(|source| CampaignError::Start { command: "this program".to_owned(), source })?
             .parent()
@@ -78,8 +75,7 @@ impl Program {
     }
 
     /// The same program with a number of threads for each run; the default is one.
-    #[must_use]
-    pub fn with_threads(&self, threads: usize) -> Self {
+    pub(crate) fn with_threads(&self, threads: usize) -> Self {
         Self { exe: self.exe.clone(), threads }
     }
 
@@ -91,10 +87,8 @@ impl Program {
     }
 
     /// Digest of the plugins' libraries, which identifies a build.
-    ///
-    /// # Errors
     /// [`CampaignError`].
-    pub fn digest(&self) -> Result<String, CampaignError> {
+    pub(crate) fn digest(&self) -> Result<String, CampaignError> {
         let mut command = self.command();
         let answer = json(command.args(["plugins", "list", "--json"]), &[0])?;
         let plugins = answer["plugins"].as_array().ok_or_else(|| missing(&command, "plugins"))?;
@@ -105,18 +99,14 @@ impl Program {
     }
 
     /// Writes the controllers designed for a mission to a file with the section `control`.
-    ///
-    /// # Errors
     /// [`CampaignError`].
-    pub fn freeze(&self, mission: &Path, to: &Path) -> Result<(), CampaignError> {
+    pub(crate) fn freeze(&self, mission: &Path, to: &Path) -> Result<(), CampaignError> {
         output(self.command().arg("design").arg(mission).arg("--freeze").arg(to), &[0]).map(|_| ())
     }
 
     /// Simulates into a new folder, reads the truth and removes it.
-    ///
-    /// # Errors
     /// [`CampaignError`].
-    pub fn simulate(
+    pub(crate) fn simulate(
         &self,
         mission: &Path,
         folder: &Path,
@@ -138,10 +128,8 @@ impl Program {
     }
 
     /// Simulates with hidden effects into `folder` and moves the truth away; `noise` is the seed of everything else.
-    ///
-    /// # Errors
     /// [`CampaignError`].
-    pub fn hide(
+    pub(crate) fn hide(
         &self,
         mission: &Path,
         folder: &Path,
@@ -169,18 +157,14 @@ impl Program {
     }
 
     /// Runs `dragfree model` with arguments.
-    ///
-    /// # Errors
     /// [`CampaignError`].
-    pub fn model(&self, words: &[&OsStr]) -> Result<(), CampaignError> {
+    pub(crate) fn model(&self, words: &[&OsStr]) -> Result<(), CampaignError> {
         output(self.command().arg("model").args(words), &[0]).map(|_| ())
     }
 
     /// Runs `dragfree diagnose` on a product.
-    ///
-    /// # Errors
     /// [`CampaignError`].
-    pub fn diagnose(&self, product: &Value, archive: &Path) -> Result<Value, CampaignError> {
+    pub(crate) fn diagnose(&self, product: &Value, archive: &Path) -> Result<Value, CampaignError> {
         let mut command = self.command();
         let id = product["id"].as_str().ok_or_else(|| missing(&command, "id"))?;
         command.arg("diagnose").arg(id).arg("--archive").arg(archive).arg("--json");
@@ -188,10 +172,8 @@ impl Program {
     }
 
     /// Runs `dragfree reveal`, which scores a diagnosis against the sealed truth.
-    ///
-    /// # Errors
     /// [`CampaignError`].
-    pub fn reveal(&self, hidden: &Hidden, diagnosis: &Path) -> Result<Value, CampaignError> {
+    pub(crate) fn reveal(&self, hidden: &Hidden, diagnosis: &Path) -> Result<Value, CampaignError> {
         let mut command = self.command();
         command.arg("reveal").arg(&hidden.sealed).arg("--diagnosis").arg(diagnosis);
         command.args(hidden.files.iter().flat_map(|file| [OsStr::new("--telemetry"), file.as_os_str()]));
@@ -200,10 +182,8 @@ impl Program {
 
     /// Runs a chain over telemetry and returns the product as JSON. Exit codes for lost data and an inconsistent model
     /// are accepted.
-    ///
-    /// # Errors
     /// [`CampaignError`].
-    pub fn run(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Result<Value, CampaignError> {
+    pub(crate) fn run(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Result<Value, CampaignError> {
         let mut command = self.command();
         command.arg("run").arg(&chain.pipeline).args(files).arg("--archive").arg(archive).arg("--json");
         for (option, path) in [("--mission", &chain.mission), ("--model", &chain.model)] {
@@ -249,10 +229,14 @@ fn missing(command: &Command, what: &str) -> CampaignError {
 }
 
 /// The result of a product.
-///
-/// # Errors
 /// The name of what the product lacks.
-pub fn line(configuration: &str, seed: u32, build: &str, truth_m: &[f64; 6], product: &Value) -> Result<Line, String> {
+pub(crate) fn line(
+    configuration: &str,
+    seed: u32,
+    build: &str,
+    truth_m: &[f64; 6],
+    product: &Value,
+) -> Result<Line, String> {
     let number = |value: &Value, what: &str| value.as_f64().ok_or_else(|| what.to_owned());
     let text = |key: &str| product[key].as_str().map(str::to_owned).ok_or_else(|| key.to_owned());
     let stage = &product["quality"]["stages"]["es-akf"];
@@ -300,10 +284,8 @@ fn qp_widened(product: &Value) -> Result<[f64; 6], String> {
 }
 
 /// One solution of a product.
-///
-/// # Errors
 /// The name of what the product lacks.
-pub fn solution(product: &Value, label: &str, truth_m: &[f64; 6]) -> Result<Solution, String> {
+pub(crate) fn solution(product: &Value, label: &str, truth_m: &[f64; 6]) -> Result<Solution, String> {
     let lacks = || format!("solution {label}");
     let all = product["coefficients"].as_array().ok_or_else(lacks)?;
     let names = product["covariance_names"][label].as_array().ok_or_else(lacks)?;

@@ -10,7 +10,7 @@ use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 
 /// The coefficients of the model, in the order of every array of six.
-pub const COEFFICIENTS: [&str; 6] = [
+pub(crate) const COEFFICIENTS: [&str; 6] = [
     "com-offset.tm1.x",
     "com-offset.tm1.y",
     "com-offset.tm1.z",
@@ -22,19 +22,18 @@ pub const COEFFICIENTS: [&str; 6] = [
 /// One solution of one run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Solution {
+pub(crate) struct Solution {
     /// Estimates, m.
-    pub value_m: [f64; 6],
+    pub(crate) value_m: [f64; 6],
     /// Estimate minus truth, m.
-    pub error_m: [f64; 6],
+    pub(crate) error_m: [f64; 6],
     /// Upper triangle of the covariance by rows, m²; its diagonal is σ².
-    pub covariance_m2: Vec<f64>,
+    pub(crate) covariance_m2: Vec<f64>,
 }
 
 impl Solution {
     /// The whole covariance, m².
-    #[must_use]
-    pub fn covariance(&self) -> DMatrix<f64> {
+    pub(crate) fn covariance(&self) -> DMatrix<f64> {
         DMatrix::from_fn(6, 6, |i, j| {
             let (i, j) = (i.min(j), i.max(j));
             self.covariance_m2[i * 6 - i * (i + 1) / 2 + j]
@@ -42,8 +41,7 @@ impl Solution {
     }
 
     /// σ, m.
-    #[must_use]
-    pub fn sigma_m(&self) -> [f64; 6] {
+    pub(crate) fn sigma_m(&self) -> [f64; 6] {
         let c = self.covariance();
         std::array::from_fn(|i| c[(i, i)].sqrt())
     }
@@ -56,8 +54,7 @@ impl Solution {
     }
 
     /// Error over σ.
-    #[must_use]
-    pub fn pulls(&self) -> [f64; 6] {
+    pub(crate) fn pulls(&self) -> [f64; 6] {
         let sigma = self.sigma_m();
         std::array::from_fn(|i| self.error_m[i] / sigma[i])
     }
@@ -66,57 +63,55 @@ impl Solution {
 /// Result of one run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Line {
+pub(crate) struct Line {
     /// Configuration.
-    pub configuration: String,
+    pub(crate) configuration: String,
     /// Seed of the simulation.
-    pub seed: u32,
+    pub(crate) seed: u32,
     /// Length of the data, h.
-    pub hours: f64,
+    pub(crate) hours: f64,
     /// Day of the run.
-    pub date: String,
+    pub(crate) date: String,
     /// The program and its version.
-    pub software: String,
+    pub(crate) software: String,
     /// Digest of the plugins' libraries, twelve hexadecimal digits.
-    pub build: String,
+    pub(crate) build: String,
     /// Verdict of the product.
-    pub verdict: String,
+    pub(crate) verdict: String,
     /// Normalised innovation squared over its degrees of freedom.
-    pub nis: f64,
+    pub(crate) nis: f64,
     /// Its degrees of freedom.
-    pub nis_dof: f64,
+    pub(crate) nis_dof: f64,
     /// χ²/dof of the batch solution against the noise of the mission file.
-    pub chi2_per_dof: f64,
+    pub(crate) chi2_per_dof: f64,
     /// Factor by which the ES-AKF inflated its σ, per test mass.
-    pub sigma_stretch: [f64; 2],
+    pub(crate) sigma_stretch: [f64; 2],
     /// Factor by which the batch solution inflated its σ, per coefficient.
-    pub qp_widened: [f64; 6],
+    pub(crate) qp_widened: [f64; 6],
     /// σ of the recursion's end, as the paper reports it, m.
-    pub p_end_sigma_m: [f64; 6],
+    pub(crate) p_end_sigma_m: [f64; 6],
     /// Recursive solution.
-    pub es_akf: Solution,
+    pub(crate) es_akf: Solution,
     /// Batch solution.
-    pub qp: Solution,
+    pub(crate) qp: Solution,
     /// Adopted solution; `None` if it is the batch solution unchanged.
-    pub adopted: Option<Solution>,
+    pub(crate) adopted: Option<Solution>,
 }
 
 impl Line {
     /// Recursive and batch solution with σ before inflation.
-    #[must_use]
-    pub fn bare(&self) -> (Solution, Solution) {
+    pub(crate) fn bare(&self) -> (Solution, Solution) {
         (self.es_akf.divided(|i| self.sigma_stretch[i / 3]), self.qp.divided(|i| self.qp_widened[i]))
     }
 
     /// Adopted solution.
-    #[must_use]
-    pub fn adopted(&self) -> &Solution {
+    pub(crate) fn adopted(&self) -> &Solution {
         self.adopted.as_ref().unwrap_or(&self.qp)
     }
 }
 
 /// A result with a key, unique per build.
-pub trait Keyed {
+pub(crate) trait Keyed {
     /// Configuration and seed.
     fn key(&self) -> (String, u32);
     /// Digest of the build.
@@ -136,34 +131,34 @@ impl Keyed for Line {
 /// Result of one seed of the blind campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Blind {
+pub(crate) struct Blind {
     /// Length and kind of the data.
-    pub configuration: String,
+    pub(crate) configuration: String,
     /// Seed of hidden effects and noise.
-    pub seed: u32,
+    pub(crate) seed: u32,
     /// Digest of the plugins' libraries, twelve hexadecimal digits.
-    pub build: String,
+    pub(crate) build: String,
     /// Duration of the diagnosis, s.
-    pub diagnosis_s: f64,
+    pub(crate) diagnosis_s: f64,
     /// Score by `reveal`.
-    pub score: Value,
+    pub(crate) score: Value,
     /// Offset by the model without additions.
-    pub before: Solution,
+    pub(crate) before: Solution,
     /// Offset by the extended model; `None` if nothing could be added or a false cause was accepted.
-    pub after: Option<After>,
+    pub(crate) after: Option<After>,
 }
 
 /// An extended model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct After {
+pub(crate) struct After {
     /// Added effects.
-    pub added: Vec<String>,
+    pub(crate) added: Vec<String>,
     /// Offset from the same telemetry.
-    pub offset: Solution,
+    pub(crate) offset: Solution,
     /// χ²/dof of telemetry that no fit has used: model before, model after, and with the true values; `None` if the
     /// truth has no value that a model can take.
-    pub held_out_chi2_per_dof: [Option<f64>; 3],
+    pub(crate) held_out_chi2_per_dof: [Option<f64>; 3],
 }
 
 impl Keyed for Blind {
@@ -178,18 +173,16 @@ impl Keyed for Blind {
 
 /// A growing file of results.
 #[derive(Debug)]
-pub struct Results<T> {
+pub(crate) struct Results<T> {
     path: PathBuf,
     file: File,
     /// Results.
-    pub lines: Vec<T>,
+    pub(crate) lines: Vec<T>,
 }
 
 /// Results of a file; empty if it does not exist. A last line without its end was interrupted and is ignored.
-///
-/// # Errors
 /// [`CampaignError`]: a complete line is not a result.
-pub fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, CampaignError> {
+pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, CampaignError> {
     let text = match std::fs::read_to_string(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
         other => other.map_err(|e| file(path, &e))?,
@@ -204,10 +197,8 @@ pub fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, CampaignError> {
 impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
     /// Opens a file to continue, or a new one. Removes results of another build, as a table must not mix builds;
     /// returns their number.
-    ///
-    /// # Errors
     /// [`CampaignError`]: the file has another form or cannot be written.
-    pub fn open(path: &Path, build: &str) -> Result<(Self, usize), CampaignError> {
+    pub(crate) fn open(path: &Path, build: &str) -> Result<(Self, usize), CampaignError> {
         let mut lines: Vec<T> = read(path)?;
         let before = lines.len();
         lines.retain(|line| line.build() == build);
@@ -219,16 +210,13 @@ impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
     }
 
     /// Whether a result exists.
-    #[must_use]
-    pub fn has(&self, configuration: &str, seed: u32) -> bool {
+    pub(crate) fn has(&self, configuration: &str, seed: u32) -> bool {
         self.lines.iter().any(|line| line.key() == (configuration.to_owned(), seed))
     }
 
     /// Appends a result in one write.
-    ///
-    /// # Errors
     /// [`CampaignError::File`].
-    pub fn append(&mut self, line: T) -> Result<(), CampaignError> {
+    pub(crate) fn append(&mut self, line: T) -> Result<(), CampaignError> {
         let text = as_lines(&self.path, std::slice::from_ref(&line))?;
         self.file.write_all(&text).map_err(|e| file(&self.path, &e))?;
         self.lines.push(line);
@@ -236,10 +224,8 @@ impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
     }
 
     /// Rewrites the file in the order of configurations and seeds, independent of the order of completion.
-    ///
-    /// # Errors
     /// [`CampaignError::File`].
-    pub fn sort(mut self, configurations: &[&str]) -> Result<(), CampaignError> {
+    pub(crate) fn sort(mut self, configurations: &[&str]) -> Result<(), CampaignError> {
         let place = |name: &str| configurations.iter().position(|c| *c == name);
         self.lines.sort_by_key(|line| {
             let (configuration, seed) = line.key();
@@ -267,8 +253,7 @@ fn as_lines<T: Serialize>(path: &Path, lines: &[T]) -> Result<Vec<u8>, CampaignE
 }
 
 /// Rounds to seven significant digits, more than any statistic needs.
-#[must_use]
-pub fn rounded(value: f64) -> f64 {
+pub(crate) fn rounded(value: f64) -> f64 {
     format!("{value:.6e}").parse().unwrap_or(value)
 }
 

@@ -17,35 +17,33 @@ use crate::stats::{self, Bounds};
 use crate::table::{REGIMES, Row, configuration, mission};
 
 /// False-alarm rate of all checks of a campaign together.
-pub const FALSE_ALARM: f64 = 0.01;
+pub(crate) const FALSE_ALARM: f64 = 0.01;
 /// σ of the paper's table, mm.
 const PAPER_SIGMA_MM: [f64; 6] = [1.335, 0.17, 0.09, 3.76, 0.14, 0.08];
 /// Errors of the paper's table, mm.
 const PAPER_ERROR_MM: [f64; 6] = [0.06, 1.4, 0.51, 0.68, 0.1, 0.35];
 /// Length of the long runs, days.
-pub const TABLE_DAYS: u32 = 25;
+pub(crate) const TABLE_DAYS: u32 = 25;
 /// Short names of the coefficients.
 const SHORT: [&str; 6] = ["tm1.x", "tm1.y", "tm1.z", "tm2.x", "tm2.y", "tm2.z"];
 
 /// All results.
 #[derive(Clone, Debug, Default)]
-pub struct Measured {
+pub(crate) struct Measured {
     /// Coverage campaign.
-    pub coverage: Vec<Line>,
+    pub(crate) coverage: Vec<Line>,
     /// The paper's table.
-    pub table: Vec<Row>,
+    pub(crate) table: Vec<Row>,
     /// Ratios of speed.
-    pub speed: Option<Speed>,
+    pub(crate) speed: Option<Speed>,
     /// Blind campaign.
-    pub blind: Vec<Blind>,
+    pub(crate) blind: Vec<Blind>,
 }
 
 impl Measured {
     /// Reads a folder of results.
-    ///
-    /// # Errors
     /// [`CampaignError`]: a file has another form.
-    pub fn read(folder: &Path) -> Result<Self, CampaignError> {
+    pub(crate) fn read(folder: &Path) -> Result<Self, CampaignError> {
         Ok(Self {
             coverage: read(&folder.join("coverage.jsonl"))?,
             table: read(&folder.join("table.jsonl"))?,
@@ -538,20 +536,18 @@ fn picture(all: &[Line], free: &DMatrix<f64>) -> Result<Option<String>, ChartErr
 }
 
 /// A report.
-pub struct Report {
+pub(crate) struct Report {
     /// Generated parts by marker name.
-    pub parts: BTreeMap<&'static str, String>,
+    pub(crate) parts: BTreeMap<&'static str, String>,
     /// Pictures with their places; omitted without a campaign.
-    pub pictures: Vec<(PathBuf, String)>,
+    pub(crate) pictures: Vec<(PathBuf, String)>,
     /// Statistics out of bounds and missed bars.
-    pub failed: Vec<String>,
+    pub(crate) failed: Vec<String>,
 }
 
 /// Creates the report.
-///
-/// # Errors
 /// [`CampaignError`]: the default mission cannot be read, or a picture cannot be drawn.
-pub fn report(measured: &Measured) -> Result<Report, CampaignError> {
+pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
     let mission = mission(&taiji())?;
     let dcm = ["tm1", "tm2"].map(|name| mission.test_mass.get(name).map_or(0.0, |tm| tm.orf_from_srf_angle_rad));
     let free = free_space(&dcm.map(dcm_turned_about_z));
@@ -581,20 +577,17 @@ pub fn report(measured: &Measured) -> Result<Report, CampaignError> {
 }
 
 /// VALIDATION.md.
-#[must_use]
-pub fn document_path() -> PathBuf {
+pub(crate) fn document_path() -> PathBuf {
     root().join("VALIDATION.md")
 }
 
 /// A picture of the guide.
-#[must_use]
-pub fn picture_path(name: &str) -> PathBuf {
+pub(crate) fn picture_path(name: &str) -> PathBuf {
     root().join("ops-guide/src/pictures").join(name).with_extension("svg")
 }
 
 /// A document with its generated parts replaced; `None` if a part has no markers.
-#[must_use]
-pub fn rewritten(document: &str, parts: &BTreeMap<&'static str, String>) -> Option<String> {
+pub(crate) fn rewritten(document: &str, parts: &BTreeMap<&'static str, String>) -> Option<String> {
     let mut text = document.to_owned();
     for (name, part) in parts {
         let (open, close) = (format!("<!-- generated: {name} -->\n"), format!("<!-- /generated: {name} -->"));
@@ -606,10 +599,8 @@ pub fn rewritten(document: &str, parts: &BTreeMap<&'static str, String>) -> Opti
 }
 
 /// Writes the generated parts of VALIDATION.md and the pictures.
-///
-/// # Errors
 /// [`CampaignError`] when a file cannot be read or written, or lacks a marker.
-pub fn write(folder: &Path) -> Result<(), CampaignError> {
+pub(crate) fn write(folder: &Path) -> Result<(), CampaignError> {
     let report = report(&Measured::read(folder)?)?;
     let path = document_path();
     let document = std::fs::read_to_string(&path).map_err(|e| file(&path, &e))?;

@@ -12,11 +12,11 @@ use crate::records::{Keyed, Line, Results, rounded};
 
 /// A noise regime.
 #[derive(Clone, Copy, Debug)]
-pub struct Regime {
+pub(crate) struct Regime {
     /// Name of its results.
-    pub name: &'static str,
+    pub(crate) name: &'static str,
     /// Description in the report.
-    pub words: &'static str,
+    pub(crate) words: &'static str,
     mission: MissionFile,
 }
 
@@ -28,7 +28,7 @@ enum MissionFile {
 }
 
 /// The regimes.
-pub const REGIMES: [Regime; 3] = [
+pub(crate) const REGIMES: [Regime; 3] = [
     Regime { name: "default", words: "default noise", mission: MissionFile::Fixture("taiji.toml") },
     Regime {
         name: "quiet-dws",
@@ -45,15 +45,15 @@ pub const REGIMES: [Regime; 3] = [
 /// A run with its information bounds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Row {
+pub(crate) struct Row {
     /// The run.
-    pub run: Line,
+    pub(crate) run: Line,
     /// True offsets, m.
-    pub truth_m: [f64; 6],
+    pub(crate) truth_m: [f64; 6],
     /// Bound of σ by one test mass alone, m.
-    pub single_m: [f64; 6],
+    pub(crate) single_m: [f64; 6],
     /// Bound of σ by both test masses and the survey, m.
-    pub surveyed_m: [f64; 6],
+    pub(crate) surveyed_m: [f64; 6],
 }
 
 impl Keyed for Row {
@@ -67,8 +67,7 @@ impl Keyed for Row {
 }
 
 /// Name of a configuration.
-#[must_use]
-pub fn configuration(regime: &str, days: u32) -> String {
+pub(crate) fn configuration(regime: &str, days: u32) -> String {
     format!("{regime}, {days} days")
 }
 
@@ -86,10 +85,8 @@ struct Task {
 }
 
 /// Runs what `results` lacks, `at_once` regimes in parallel; 25 days of one take 14 GB of `scratch`.
-///
-/// # Errors
 /// [`CampaignError`]; results so far are on disk, and the next call continues.
-pub fn table(
+pub(crate) fn table(
     program: &Program,
     seeds: &[u32],
     days: u32,
