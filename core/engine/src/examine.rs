@@ -5,12 +5,12 @@ use std::path::PathBuf;
 
 use crate::EngineError;
 use crate::border::Kind;
-use crate::chain::{self, Chain, Sink};
+use crate::chain::{Chain, Sink};
 use crate::config::{EffectEntry, Mission, Model, Node};
 use crate::files::{IoContext as _, sha256_of};
 use crate::product::Product;
 use crate::registry::Registry;
-use crate::run::{Progress, RunOptions, Setup, carry, carry_all, window};
+use crate::run::{Progress, RunOptions, Setup};
 use crate::sources::Sources;
 
 /// Which data are examined, and how.
@@ -103,15 +103,11 @@ pub fn examine<C: Sink, E: From<EngineError>>(
     setup.model.candidates.clone_from(&what.candidates);
     let nodes = &mut setup.pipeline.nodes;
     nodes.truncate(nodes.iter().position(|n| *n == Node::Effects).map_or(nodes.len(), |i| i + 1));
-    let mut feed = setup.feed(registry, &options, window(&options, None))?;
-    let tables = feed.get().tables().to_vec();
-    let mut chain = chain::build(registry, &setup.pipeline, &setup.mission, &setup.model, &tables, carry(&options))
-        .map_err(EngineError::from)?;
+    let mut feed = setup.feed(registry, None)?;
+    let mut chain = setup.link(registry, feed.tables())?;
     let (mut consumer, columns) = link(&chain)?;
     chain.tap(&columns).map_err(EngineError::from)?;
-    if carry_all(feed.get(), &mut chain, &mut consumer, progress)?.is_none() {
-        return Err(EngineError::NoRows { files: options.files }.into());
-    }
+    setup.carry(feed.as_mut(), &mut chain, &mut consumer, progress)?;
     chain.finish(&mut consumer).map_err(EngineError::from)?;
     Ok((consumer, chain.not_tried))
 }

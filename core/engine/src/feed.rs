@@ -36,6 +36,11 @@ pub trait Feed {
     /// # Errors
     /// The feed failed.
     fn summary(&mut self) -> Result<Summary, EngineError>;
+
+    /// The source plugin, if it is one.
+    fn source(&self) -> Option<&SourceFeed> {
+        None
+    }
 }
 
 /// What a feed has to say at its end.
@@ -222,5 +227,9 @@ impl Feed for SourceFeed {
         report.attachments.retain(|a| a.suffix != SEALED);
         let time_scale = report.quality.get("time_scale").and_then(|v| v.as_str()).filter(|t| !t.is_empty());
         Ok(Summary { time_scale: time_scale.unwrap_or("UTC").to_owned(), report: Some(report), ..Summary::default() })
+    }
+
+    fn source(&self) -> Option<&SourceFeed> {
+        Some(self)
     }
 }
