@@ -3,6 +3,7 @@
 use crate::text::{self, Paint};
 use crate::utc;
 use dragfree_engine::border::{Manifest, Parameter, ParameterType};
+use dragfree_engine::files::Problem;
 use dragfree_engine::product::{Coefficient, Listing, Product};
 use dragfree_engine::registry::Registry;
 use dragfree_workflow::calibrate::{CheckReport, CheckedNode};
@@ -240,6 +241,12 @@ fn range(parameter: &Parameter) -> Option<String> {
     }
 }
 
+/// Files that are not used, as JSON.
+pub(crate) fn problems_json(problems: &[Problem]) -> Vec<Value> {
+    let problem = |p: &Problem| serde_json::json!({"path": p.path.to_string_lossy(), "reason": p.reason});
+    problems.iter().map(problem).collect()
+}
+
 /// An archive as JSON.
 pub(crate) fn listing_json(listing: &Listing) -> Value {
     let entries = listing.entries.iter().map(|entry| {
@@ -261,11 +268,7 @@ pub(crate) fn listing_json(listing: &Listing) -> Value {
             "sha256": attributes.sha256,
         })
     });
-    let problems = listing
-        .problems
-        .iter()
-        .map(|problem| serde_json::json!({"path": problem.path.to_string_lossy(), "reason": problem.reason}));
-    serde_json::json!({"products": entries.collect::<Vec<_>>(), "problems": problems.collect::<Vec<_>>()})
+    serde_json::json!({"products": entries.collect::<Vec<_>>(), "problems": problems_json(&listing.problems)})
 }
 
 /// Every plugin and every file that was refused, as JSON.
@@ -280,11 +283,7 @@ pub(crate) fn plugins_json(registry: &Registry, clash: Option<&str>) -> Value {
             "sha256": found.opened.sha256,
         })
     });
-    let refused = registry
-        .refused()
-        .iter()
-        .map(|refused| serde_json::json!({"path": refused.path.to_string_lossy(), "reason": refused.reason}));
-    serde_json::json!({"plugins": plugins.collect::<Vec<_>>(), "refused": refused.collect::<Vec<_>>(), "error": clash})
+    serde_json::json!({"plugins": plugins.collect::<Vec<_>>(), "refused": problems_json(registry.refused()), "error": clash})
 }
 
 #[cfg(test)]

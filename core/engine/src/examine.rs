@@ -1,8 +1,6 @@
 //! A second pass over the data of a product: its inputs go through its chain once more, up to and with the effects, and
 //! the columns that the caller chooses come back to it.
 
-use std::path::PathBuf;
-
 use crate::EngineError;
 use crate::border::Kind;
 use crate::chain::{Chain, Sink};
@@ -30,10 +28,13 @@ pub struct Examination<'a> {
 /// A consumer of columns, with the indices of those that it wants in [`Chain::columns`].
 pub type Wanted<C> = (C, Vec<usize>);
 
-/// Every instance, on this mission, of every installed effect that is not in a model. An effect that may act anywhere
-/// is not tried: its place is the user's to say.
-#[must_use]
-pub fn candidates(registry: &Registry, model: &Model, mission: &Mission) -> Vec<EffectEntry> {
+/// Every instance of every installed effect that is not in the model of a product, on its mission. An effect without a
+/// list of instances is left out.
+///
+/// # Errors
+/// The mission or the model file cannot be read.
+pub fn candidates(registry: &Registry, sources: &Sources) -> Result<Vec<EffectEntry>, EngineError> {
+    let (mission, model) = (Mission::load(&sources.mission)?, Model::load(&sources.model)?);
     let mut all = Vec::new();
     for found in registry.plugins().filter(|p| p.info.kind == Kind::Effect) {
         let manifest = &found.info.manifest;
@@ -43,7 +44,7 @@ pub fn candidates(registry: &Registry, model: &Model, mission: &Mission) -> Vec<
             }
         }
     }
-    all
+    Ok(all)
 }
 
 /// Whether an effect has a parameter: with `at_ns` what it does happens once, at a time that the host finds; with
@@ -52,22 +53,6 @@ pub fn candidates(registry: &Registry, model: &Model, mission: &Mission) -> Vec<
 pub fn has_parameter(registry: &Registry, effect: &str, name: &str) -> bool {
     let found = registry.find(Kind::Effect, effect);
     found.is_ok_and(|f| f.info.manifest.parameters.iter().any(|p| p.name == name))
-}
-
-/// The mission of a product, as its file is now.
-///
-/// # Errors
-/// It cannot be read.
-pub fn mission(sources: &Sources) -> Result<Mission, EngineError> {
-    Ok(Mission::load(&sources.mission)?)
-}
-
-/// The model of a product, as its file is now.
-///
-/// # Errors
-/// It cannot be read.
-pub fn model(sources: &Sources) -> Result<Model, EngineError> {
-    Ok(Model::load(&sources.model)?)
 }
 
 /// Carries the data of a product through its chain. `link` sees the linked chain before a row is read; what it makes
@@ -89,15 +74,11 @@ pub fn examine<C: Sink, E: From<EngineError>>(
         files: sources.telemetry.clone(),
         mission: Some(sources.mission.clone()),
         model: Some(sources.model.clone()),
-        archive: PathBuf::new(),
         from_ns: sources.from_ns,
         until_ns: sources.until_ns,
         threads: what.threads,
         batch_rows: what.batch_rows,
-        state_in: None,
-        state_out: None,
-        created: chrono::DateTime::UNIX_EPOCH,
-        software: String::new(),
+        ..RunOptions::default()
     };
     let mut setup = Setup::load(&options)?;
     setup.model.candidates.clone_from(&what.candidates);

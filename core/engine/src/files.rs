@@ -17,6 +17,15 @@ pub struct IoError {
     pub source: io::Error,
 }
 
+/// A file that is not used.
+#[derive(Clone, Debug)]
+pub struct Problem {
+    /// The file.
+    pub path: PathBuf,
+    /// What is wrong, one sentence.
+    pub reason: String,
+}
+
 /// Adds action and path to a result of the operating system.
 pub trait IoContext<T> {
     /// The same result; its error says that `action` failed on `path`.

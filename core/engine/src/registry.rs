@@ -4,22 +4,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::border::{BorderError, Config, Instance, Kind, Library, PluginInfo};
+use crate::files::Problem;
 
 /// The plugins that were found.
 #[derive(Debug, Default)]
 pub struct Registry {
     libraries: Vec<Arc<Library>>,
-    refused: Vec<Refused>,
+    refused: Vec<Problem>,
     folders: Vec<PathBuf>,
-}
-
-/// A file in a plugin folder that is not used.
-#[derive(Clone, Debug)]
-pub struct Refused {
-    /// The file.
-    pub path: PathBuf,
-    /// Why.
-    pub reason: String,
 }
 
 /// A plugin of the registry.
@@ -65,8 +57,8 @@ impl Registry {
                         tracing::debug!(path = %path.display(), sha256 = library.sha256, plugins, "opened");
                         this.libraries.push(Arc::new(library));
                     }
-                    Err(BorderError::Refused { path, reason }) => this.refused.push(Refused { path, reason }),
-                    Err(other) => this.refused.push(Refused { path, reason: other.to_string() }),
+                    Err(BorderError::Refused { path, reason }) => this.refused.push(Problem { path, reason }),
+                    Err(other) => this.refused.push(Problem { path, reason: other.to_string() }),
                 }
             }
         }
@@ -82,7 +74,7 @@ impl Registry {
 
     /// Every file that was refused.
     #[must_use]
-    pub fn refused(&self) -> &[Refused] {
+    pub fn refused(&self) -> &[Problem] {
         &self.refused
     }
 

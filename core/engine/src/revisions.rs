@@ -6,7 +6,8 @@
 //! revisions once they were current. `MODEL.toml.lock` holds the new text until it takes the file's name, and keeps a
 //! second writer out.
 
-use std::collections::BTreeSet;
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::{self, File, OpenOptions};
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
@@ -15,7 +16,7 @@ use serde::Serialize;
 use toml_edit::{ArrayOfTables, DocumentMut, InlineTable, Item, Table, TableLike, Value, value};
 
 use crate::config::{ConfigError, EffectEntry, Model};
-use crate::files::{IoContext as _, IoError, folder_of, sync_folder};
+use crate::files::{IoContext as _, IoError, Problem, folder_of, sync_folder};
 
 /// Why a model file could not be changed or its history not be read.
 #[derive(Debug, thiserror::Error)]
@@ -331,12 +332,11 @@ impl Edit {
     fn plan(&self) -> Result<Option<(Vec<Step>, Committed)>, RevisionError> {
         let folder = history_folder(&self.path);
         let kept = history(&folder)?;
-        let counter = |name: &str| Model::parts(name).map(|(counter, _)| counter).or_else(|| name.parse().ok());
         let names = kept.models.iter().map(|(model, _)| model.revision.as_str());
         let names = names
             .chain(self.model().map(|m| m.revision.as_str()))
             .chain(self.parent.as_ref().map(|(name, _)| name.as_str()));
-        let mut next = names.map(|name| counter(name).unwrap_or(1)).max().unwrap_or(0).saturating_add(1);
+        let mut next = names.map(|name| Model::counter(name).unwrap_or(1)).max().unwrap_or(0).saturating_add(1);
 
         let mut steps = Vec::new();
         let mut recorded = None;
@@ -538,7 +538,7 @@ pub struct Log {
     /// Newest first.
     pub revisions: Vec<Logged>,
     /// Files of the history that cannot be used, and why.
-    pub problems: Vec<(PathBuf, String)>,
+    pub problems: Vec<Problem>,
 }
 
 /// Every revision of a model file.
@@ -554,43 +554,30 @@ pub fn log(path: &Path) -> Result<Log, RevisionError> {
         (true, false) => (format!("{}+{}", current.revision, current.digest()), Some(current.revision.clone())),
         _ => current.identity(),
     };
-    let mut all: Vec<(Model, String, Option<String>, bool)> = kept
-        .models
-        .into_iter()
-        .filter(|(model, _)| edited || model.revision != current.revision)
-        .map(|(model, _)| (model.clone(), model.revision.clone(), model.parent, false))
-        .collect();
-    let number = |name: &str, edited: bool| {
-        let made = Model::parts(name).map(|(counter, _)| counter).or_else(|| name.parse().ok());
-        if edited { u32::MAX } else { made.unwrap_or(0) }
+    let logged = |model: Model, revision: String, parent, edited| {
+        let (place, changes) = (Place::Aside, Vec::new());
+        Logged { model, revision, parent, place, changes, edited }
     };
-    all.push((current, revision.clone(), parent, edited));
-    all.sort_by(|a, b| (number(&b.1, b.3), &b.1).cmp(&(number(&a.1, a.3), &a.1)));
-    let mut line = BTreeSet::new();
+    let kept_models = kept.models.into_iter().map(|(model, _)| model);
+    let mut revisions: Vec<Logged> = kept_models
+        .filter(|model| edited || model.revision != current.revision)
+        .map(|model| logged(model.clone(), model.revision, model.parent, false))
+        .collect();
+    revisions.push(logged(current, revision.clone(), parent, edited));
+    let number = |r: &Logged| if r.edited { u32::MAX } else { Model::counter(&r.revision).unwrap_or(0) };
+    revisions.sort_by_cached_key(|r| Reverse((number(r), r.revision.clone())));
+    let effects: BTreeMap<String, Vec<EffectEntry>> =
+        revisions.iter().map(|r| (r.revision.clone(), r.model.effects.clone())).collect();
     let mut at = Some(revision.clone());
-    while let Some(name) = at.filter(|name| !line.contains(name)) {
-        at = all.iter().find(|(_, revision, ..)| *revision == name).and_then(|(_, _, parent, _)| parent.clone());
-        line.insert(name);
+    while let Some(found) = revisions.iter_mut().find(|r| Some(&r.revision) == at.as_ref() && r.place == Place::Aside) {
+        found.place = if found.revision == revision { Place::Current } else { Place::Ancestor };
+        at.clone_from(&found.parent);
     }
-    let revisions = all.iter().map(|(model, name, parent, edited)| {
-        let from = match parent {
-            None => Some(&[][..]),
-            Some(parent) => all.iter().find(|(_, r, ..)| r == parent).map(|(m, ..)| m.effects.as_slice()),
-        };
-        Logged {
-            model: model.clone(),
-            revision: name.clone(),
-            parent: parent.clone(),
-            place: match (*name == revision, line.contains(name)) {
-                (true, _) => Place::Current,
-                (_, true) => Place::Ancestor,
-                _ => Place::Aside,
-            },
-            changes: from.map(|from| changes(from, &model.effects)).unwrap_or_default(),
-            edited: *edited,
-        }
-    });
-    Ok(Log { revisions: revisions.collect(), problems: kept.problems })
+    for r in &mut revisions {
+        let from = r.parent.as_ref().map_or(Some(&[][..]), |parent| effects.get(parent).map(Vec::as_slice));
+        r.changes = from.map(|from| changes(from, &r.model.effects)).unwrap_or_default();
+    }
+    Ok(Log { revisions, problems: kept.problems })
 }
 
 /// A revision of a model file and its text: by its name, or by the number in front where that is enough.
@@ -630,7 +617,7 @@ pub fn history_folder(path: &Path) -> PathBuf {
 struct History {
     /// Sound revisions and their texts, by name.
     models: Vec<(Model, String)>,
-    problems: Vec<(PathBuf, String)>,
+    problems: Vec<Problem>,
 }
 
 fn history(folder: &Path) -> Result<History, RevisionError> {
@@ -652,7 +639,7 @@ fn history(folder: &Path) -> Result<History, RevisionError> {
     for path in paths {
         match sound(&path) {
             Ok(found) => kept.models.push(found),
-            Err(error) => kept.problems.push((path, error.to_string())),
+            Err(error) => kept.problems.push(Problem { path, reason: error.to_string() }),
         }
     }
     Ok(kept)

@@ -345,8 +345,7 @@ fn effects(product: &Product) -> Vec<String> {
 
 /// A revision's number, for an order that people expect.
 fn number(revision: &str) -> (u32, &str) {
-    let made = Model::parts(revision).map(|(counter, _)| counter).or_else(|| revision.parse().ok());
-    (made.unwrap_or(0), revision)
+    (Model::counter(revision).unwrap_or(0), revision)
 }
 
 /// The revision that each is compared with.

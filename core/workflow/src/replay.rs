@@ -1,7 +1,7 @@
 //! The data of archived products once more, through the chains that made them, into sums.
 
 use dragfree_engine::chain::Chain;
-use dragfree_engine::examine::{self, Examination, candidates, examine, has_parameter, model};
+use dragfree_engine::examine::{Examination, candidates, examine, has_parameter};
 use dragfree_engine::product::Written;
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::Progress;
@@ -83,7 +83,7 @@ pub(crate) fn sum(
     for (number, Written { product, path }) in products.iter().enumerate() {
         let sources = Sources::read(path)?;
         let equations = path.with_extension("neq.json");
-        let mut all = candidates(registry, &model(&sources)?, &examine::mission(&sources)?);
+        let mut all = candidates(registry, &sources)?;
         match what {
             What::Model => all.clear(),
             What::Transients => all.retain(|e| has_parameter(registry, &e.id, AT_NS)),

@@ -3,15 +3,17 @@
 use super::{Done, products};
 use crate::args::{Global, Model as Command, ModelAdd, ModelFix};
 use crate::failure::{Failure, Refusal};
+use crate::screen::problems_json;
 use crate::text::{self, Paint, columns, labelled, table};
 use dragfree_engine::border::{Kind, Manifest, ParameterType};
 use dragfree_engine::config::{EffectEntry, Model, Prior};
 use dragfree_engine::files::IoContext as _;
+use dragfree_engine::files::Problem;
 use dragfree_engine::registry::Found;
 use dragfree_engine::revisions::{self, Change, Committed, Edit, Log, Logged, Place, What};
 use dragfree_engine::validate::Subject;
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 pub(super) fn execute(command: &Command, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let json = global.json;
@@ -369,7 +371,7 @@ fn log_text(log: &Log, paint: Paint) -> String {
         );
         text += &labelled("edited", &words).replacen("edited", &paint.doubtful("edited"), 1);
     }
-    for (path, reason) in &log.problems {
+    for Problem { path, reason } in &log.problems {
         text += &format!("{} {reason}\n          {}\n", paint.doubtful("not used:"), path.display());
     }
     text
@@ -401,10 +403,9 @@ fn log_json(log: &Log) -> Value {
             "path": r.model.path.to_string_lossy(),
         })
     };
-    let problem = |(path, reason): &(PathBuf, String)| json!({"path": path.to_string_lossy(), "reason": reason});
     json!({
         "revisions": log.revisions.iter().map(revision).collect::<Vec<_>>(),
-        "problems": log.problems.iter().map(problem).collect::<Vec<_>>(),
+        "problems": problems_json(&log.problems),
     })
 }
 

@@ -59,14 +59,11 @@ fn options(chain: &Chain, global: &Global) -> Options {
         mission: chain.mission.clone(),
         model: chain.model.clone(),
         archive: chain.archive.folder.clone(),
-        from_ns: None,
-        until_ns: None,
         threads: super::threads(global),
         batch_rows: BATCH_ROWS as usize,
-        state_in: None,
-        state_out: None,
         created: SystemTime::now().into(),
         software: super::software(),
+        ..Options::default()
     }
 }
 

@@ -29,7 +29,6 @@ pub(super) fn fields_of(columns: &[Column]) -> Fields {
 
 /// A struct array over rows that stay the host's: no release, nothing to free but the pointers held here.
 pub(super) struct Borrowed {
-    pub(super) array: abi::ArrowArray,
     _children: Vec<abi::ArrowArray>,
     _child_pointers: Vec<*mut abi::ArrowArray>,
     _buffers: Vec<[*const c_void; 2]>,
@@ -37,8 +36,8 @@ pub(super) struct Borrowed {
 }
 
 impl Borrowed {
-    /// The caller keeps `time_ns` and `columns` alive and unchanged as long as the result is used.
-    pub(super) fn new(time_ns: &[i64], columns: &[&[f64]]) -> Self {
+    /// The array and what it points into; the caller keeps this and the rows alive and unchanged while it is used.
+    pub(super) fn new(time_ns: &[i64], columns: &[&[f64]]) -> (Self, abi::ArrowArray) {
         let rows = time_ns.len().cast_signed() as i64;
         let mut buffers: Vec<[*const c_void; 2]> = std::iter::once(time_ns.as_ptr().cast())
             .chain(columns.iter().map(|c| c.as_ptr().cast()))
@@ -63,13 +62,9 @@ impl Borrowed {
             children: child_pointers.as_mut_ptr(),
             ..abi::ArrowArray::empty()
         };
-        Self {
-            array,
-            _children: children,
-            _child_pointers: child_pointers,
-            _buffers: buffers,
-            _own_buffers: own_buffers,
-        }
+        let owned =
+            Self { _children: children, _child_pointers: child_pointers, _buffers: buffers, _own_buffers: own_buffers };
+        (owned, array)
     }
 }
 

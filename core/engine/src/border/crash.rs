@@ -113,13 +113,10 @@ mod handler {
         let index = DEADLY.iter().position(|(deadly, _)| *deadly == signal).unwrap_or(0);
         let mut line = Line { bytes: [0; 1024], length: 0 };
         if let Some((Name(name), call)) = CURRENT.get() {
-            line.put("\ndragfree: plugin ");
-            line.put(name);
-            line.put(": ");
-            line.put(call);
-            line.put(": crashed: ");
-            line.put(DEADLY[index].1);
-            line.put("; report it to its author, `dragfree plugins validate` helps to find it\n");
+            let end = "; report it to its author, `dragfree plugins validate` helps to find it\n";
+            for text in ["\ndragfree: plugin ", name, ": ", call, ": crashed: ", DEADLY[index].1, end] {
+                line.put(text);
+            }
         } else {
             let mut separator = "\ndragfree: crashed outside of the program's own threads while these plugins ran: ";
             for slot in &RUNNING[..NOTED] {

@@ -586,20 +586,8 @@ impl Instance {
     /// The plugin failed or broke a rule of the border.
     pub fn process(&mut self, tables: &[Rows<'_>], complete_until_ns: i64) -> Result<Option<Vec<Batch>>, BorderError> {
         let process = self.function(self.node.process, "process")?;
-        let borrowed: Vec<arrow::Borrowed> =
-            tables.iter().map(|t| arrow::Borrowed::new(t.time_ns, &t.columns)).collect();
-        // A bitwise copy of the structs: their owner stays `borrowed`, and they have no release.
-        let arrays: Vec<abi::ArrowArray> = borrowed
-            .iter()
-            .map(|b| abi::ArrowArray {
-                length: b.array.length,
-                n_buffers: b.array.n_buffers,
-                buffers: b.array.buffers,
-                n_children: b.array.n_children,
-                children: b.array.children,
-                ..abi::ArrowArray::empty()
-            })
-            .collect();
+        let (_owned, arrays): (Vec<_>, Vec<abi::ArrowArray>) =
+            tables.iter().map(|t| arrow::Borrowed::new(t.time_ns, &t.columns)).unzip();
         let inputs = abi::InputsV1 {
             complete_until_ns,
             table_count: u32::try_from(arrays.len()).unwrap_or(u32::MAX),

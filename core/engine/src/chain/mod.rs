@@ -161,11 +161,9 @@ struct Tap {
 }
 
 impl Chain {
-    /// Hands columns to the host ([`Sink::tapped`]); `columns` are indices into [`Self::columns`].
-    ///
-    /// # Errors
-    /// Their rates differ, or one is irregular: their rows cannot be joined.
-    pub fn tap(&mut self, columns: &[usize]) -> Result<(), ChainError> {
+    /// Hands columns to the host ([`Sink::tapped`]); `columns` are indices into [`Self::columns`]. They must have one
+    /// rate: otherwise their rows cannot be joined.
+    pub(crate) fn tap(&mut self, columns: &[usize]) -> Result<(), ChainError> {
         let wanted: Vec<Column> = columns.iter().map(|c| self.columns[*c].clone()).collect();
         let rate_hz = wanted.first().map_or(0.0, |c| c.rate_hz);
         if let Some(other) = wanted.iter().find(|c| c.rate_hz != rate_hz || c.rate_hz <= 0.0) {
@@ -218,8 +216,7 @@ impl Chain {
     }
 
     /// Tables that belong beside the product.
-    #[must_use]
-    pub fn archived_tables(&self) -> Vec<TableSpec> {
+    pub(crate) fn archived_tables(&self) -> Vec<TableSpec> {
         let all = self.nodes.iter().flat_map(|n| n.writes.iter().zip(&n.routes));
         all.filter(|(_, route)| route.archive).map(|(table, _)| table.clone()).collect()
     }

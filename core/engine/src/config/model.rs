@@ -132,11 +132,16 @@ impl Model {
     }
 
     /// Counter and digest of a revision's name that this program made; `None` for a name written by hand.
-    #[must_use]
-    pub fn parts(revision: &str) -> Option<(u32, &str)> {
+    pub(crate) fn parts(revision: &str) -> Option<(u32, &str)> {
         let (counter, digest) = revision.split_once('-')?;
         let hexadecimal = digest.len() == DIGITS && digest.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
         Some((counter.parse().ok().filter(|_| hexadecimal)?, digest))
+    }
+
+    /// Number of a revision: the counter of its name, or the name itself where that is a number.
+    #[must_use]
+    pub fn counter(revision: &str) -> Option<u32> {
+        Self::parts(revision).map(|(counter, _)| counter).or_else(|| revision.parse().ok())
     }
 
     /// Whether the effects are not those that the revision's name has the digest of.

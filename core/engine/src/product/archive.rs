@@ -7,7 +7,7 @@
 use super::ProductError;
 use super::draft::{self, Draft};
 use super::file::{self, Attachment, Product, Supersedes};
-use crate::files::{IoContext as _, sha256_of, sync_folder};
+use crate::files::{IoContext as _, Problem, sha256_of, sync_folder};
 use chrono::NaiveDate;
 use dragfree_schema::Report;
 use std::collections::BTreeMap;
@@ -64,7 +64,7 @@ impl ProductWriter {
     }
 
     /// The same for a file that the product does not list, since what it holds may change: where the inputs lay.
-    pub fn staged_unlisted(&mut self, suffix: &str) -> PathBuf {
+    pub(crate) fn staged_unlisted(&mut self, suffix: &str) -> PathBuf {
         let path = self.staging.path().join(suffix);
         self.beside.insert(suffix.to_owned(), path.clone());
         path
@@ -314,15 +314,6 @@ impl Entry {
         let platform = &self.product.header.global_attributes.platform;
         (attributes.day.clone(), platform.clone(), attributes.product.clone())
     }
-}
-
-/// A file in an archive that is no sound product.
-#[derive(Clone, Debug)]
-pub struct Problem {
-    /// File.
-    pub path: PathBuf,
-    /// What is wrong, one sentence.
-    pub reason: String,
 }
 
 /// Lists an archive. What is damaged or foreign is reported beside the products.

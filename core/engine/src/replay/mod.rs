@@ -6,7 +6,6 @@
 //! holds the pieces of files that overlap the present stretch, never a file.
 
 mod block;
-pub mod fuzz;
 mod inflate;
 mod losses;
 mod reader;
@@ -19,7 +18,7 @@ mod tests;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::{self, JoinHandle};
 
@@ -28,7 +27,7 @@ pub use losses::{Finding, Losses};
 use crate::table::{Chunk, TableSpec};
 use crate::telemetry::{Drift, LayoutError};
 use reader::{OpenFile, Reader, SANE_NS, clamp_ns, is_sane};
-use scan::{Scan, ScanError, Source, scan};
+use scan::{Scan, ScanError, scan};
 
 /// Stretches decoded ahead on the second thread.
 const AHEAD: usize = 2;
@@ -113,27 +112,22 @@ impl Replay {
     /// # Errors
     /// [`ReplayError`] when a file cannot be read at all or does not fit the others or the interface.
     pub fn open(files: &[PathBuf], window_ns: Option<Range<i64>>, threads: usize) -> Result<Self, ReplayError> {
-        Self::from_sources(files.iter().cloned().map(Source::Path).collect(), window_ns, threads)
-    }
-
-    fn from_sources(sources: Vec<Source>, window_ns: Option<Range<i64>>, threads: usize) -> Result<Self, ReplayError> {
-        if sources.is_empty() {
+        if files.is_empty() {
             return Err(ReplayError::NoFiles);
         }
         let mut losses = Losses::default();
-        let mut files = Vec::with_capacity(sources.len());
-        for source in sources {
-            let path = source.path().to_owned();
-            let scan = scan(&source, &mut losses).map_err(|error| match error {
-                ScanError::Io(source) => ReplayError::Io { path, source },
-                ScanError::NotMcap => ReplayError::NotMcap { path },
-            })?;
-            files.push((source, scan));
+        let mut scans = Vec::with_capacity(files.len());
+        for path in files.iter().cloned() {
+            match scan(&path, &mut losses) {
+                Ok(scan) => scans.push((path, scan)),
+                Err(ScanError::Io(source)) => return Err(ReplayError::Io { path, source }),
+                Err(ScanError::NotMcap) => return Err(ReplayError::NotMcap { path }),
+            }
         }
-        files.sort_by_cached_key(|(source, scan)| (times(scan).map(|t| t.0), source.path().to_owned()));
+        let mut files = scans;
+        files.sort_by_cached_key(|(path, scan)| (times(scan).map(|t| t.0), path.clone()));
         let info = info(&files, &mut losses)?;
-        let views: Vec<(&Path, &Scan)> = files.iter().map(|(source, scan)| (source.path(), scan)).collect();
-        let (tables, routes) = tables::link(&views, &mut losses)?;
+        let (tables, routes) = tables::link(&files, &mut losses)?;
         // Files that ended before their first channel are a loss, not the wrong files.
         if tables.is_empty() && !losses.data_loss() {
             let channels = files.iter().flat_map(|(_, scan)| scan.definitions.channels.values());
@@ -141,7 +135,7 @@ impl Replay {
             return Err(ReplayError::NoTelemetry { found: Vec::from_iter(topics).join(", ") });
         }
         let files = (files.into_iter().zip(routes))
-            .map(|((source, scan), routes)| OpenFile { source, pieces: scan.pieces, routes })
+            .map(|((path, scan), routes)| OpenFile { path, pieces: scan.pieces, routes })
             .collect();
         let reader = Reader::new(files, tables.clone(), window_ns.unwrap_or(SANE_NS), losses.clone())?;
         let engine = if threads < 2 { Engine::Here(Box::new(reader)) } else { ahead(reader) };
@@ -215,11 +209,11 @@ fn times(scan: &Scan) -> Option<(i64, i64)> {
     stated.map(|t| (t, t)).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
 }
 
-fn info(files: &[(Source, Scan)], losses: &mut Losses) -> Result<ReplayInfo, ReplayError> {
+fn info(files: &[(PathBuf, Scan)], losses: &mut Losses) -> Result<ReplayInfo, ReplayError> {
     let mut info = ReplayInfo::default();
     let mut said: BTreeMap<&'static str, String> = BTreeMap::new();
-    for (source, scan) in files {
-        let path = source.path().to_owned();
+    for (path, scan) in files {
+        let path = path.clone();
         let name = path.display().to_string();
         let times = times(scan);
         info.first_ns = info.first_ns.into_iter().chain(times.map(|t| t.0)).min();

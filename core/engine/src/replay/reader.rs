@@ -1,6 +1,7 @@
 //! From pieces of files to stretches of time.
 
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::ops::Range;
 use std::path::PathBuf;
 
@@ -11,7 +12,6 @@ use super::block::{Block, drain};
 use super::inflate::{InflateError, Inflater, Piece, Stored};
 use super::losses::{Finding, Losses};
 use super::records::{Cursor, Message};
-use super::scan::Source;
 use super::tables::{Route, Routes};
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{Cells, Decoder, WireError};
@@ -48,7 +48,7 @@ type Key = (i64, usize, u64);
 /// A file ready to be read.
 #[derive(Debug)]
 pub(super) struct OpenFile {
-    pub(super) source: Source,
+    pub(super) path: PathBuf,
     pub(super) pieces: Vec<Piece>,
     pub(super) routes: Routes,
 }
@@ -64,7 +64,7 @@ struct Entry {
 /// Reads the pieces of all files in order of time.
 #[derive(Debug)]
 pub(super) struct Reader {
-    files: Vec<(Source, Routes)>,
+    files: Vec<(PathBuf, Routes)>,
     tables: Vec<TableSpec>,
     queue: BTreeMap<Key, Pending>,
     /// Rows read and not yet delivered, by table.
@@ -88,7 +88,7 @@ impl Reader {
     ) -> Result<Self, ReplayError> {
         let inflater = Inflater::new().map_err(|source| ReplayError::Io { path: PathBuf::from("zstd"), source })?;
         let mut queue = BTreeMap::new();
-        let mut sources = Vec::with_capacity(files.len());
+        let mut opened = Vec::with_capacity(files.len());
         let mut end_ns = i64::MIN;
         for (at, file) in files.into_iter().enumerate() {
             for piece in file.pieces {
@@ -102,22 +102,11 @@ impl Reader {
                     queue.insert((start, at, piece.offset), Pending { piece, from_ns: i64::MIN });
                 }
             }
-            sources.push((file.source, file.routes));
+            opened.push((file.path, file.routes));
         }
         let blocks = tables.iter().map(|_| vec![]).collect();
         let done_ns = i64::MIN;
-        Ok(Self {
-            files: sources,
-            tables,
-            queue,
-            blocks,
-            window_ns,
-            end_ns,
-            done_ns,
-            inflater,
-            entries: vec![],
-            losses,
-        })
+        Ok(Self { files: opened, tables, queue, blocks, window_ns, end_ns, done_ns, inflater, entries: vec![], losses })
     }
 
     pub(super) fn losses(&self) -> &Losses {
@@ -150,11 +139,11 @@ impl Reader {
     /// Reads the rows of a piece that lie between what was delivered and the horizon.
     fn read(&mut self, file: usize, pending: Pending, until_ns: i64) -> Result<(), ReplayError> {
         let horizon_ns = until_ns.saturating_add(HORIZON);
-        let (source, routes) = &mut self.files[file];
-        let name = source.path().display().to_string();
+        let (path, routes) = &mut self.files[file];
+        let name = path.display().to_string();
         let piece = &pending.piece;
-        let io = |error| ReplayError::Io { path: source.path().to_owned(), source: error };
-        let mut opened = source.open().map_err(io)?;
+        let io = |source| ReplayError::Io { path: path.clone(), source };
+        let mut opened = File::open(&*path).map_err(io)?;
         let records = match self.inflater.read(&mut opened, piece) {
             Ok(records) => records,
             Err(InflateError::Io(error)) => return Err(io(error)),

@@ -7,9 +7,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
-use std::io::{self, BufReader, Cursor as Bytes, Read, Seek, SeekFrom};
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
 
 use mcap::MAGIC;
 use mcap::records::op;
@@ -27,33 +26,6 @@ const LOOSE_BYTES: u64 = 1 << 20;
 const MAX_DEFINITION: u64 = 1 << 26;
 /// Buffer of the walk: a chunk's header and the message indexes before the next one.
 const WALK_BUFFER: usize = 1 << 13;
-
-pub(super) trait ReadSeek: Read + Seek + Send {}
-impl<T: Read + Seek + Send> ReadSeek for T {}
-
-/// Where the bytes of a file are.
-#[derive(Clone, Debug)]
-pub(super) enum Source {
-    /// On disk.
-    Path(PathBuf),
-    /// In memory, under a name: for tests and fuzzing.
-    Memory(PathBuf, Arc<[u8]>),
-}
-
-impl Source {
-    pub(super) fn path(&self) -> &Path {
-        match self {
-            Self::Path(path) | Self::Memory(path, _) => path,
-        }
-    }
-
-    pub(super) fn open(&self) -> io::Result<Box<dyn ReadSeek>> {
-        Ok(match self {
-            Self::Path(path) => Box::new(File::open(path)?),
-            Self::Memory(_, bytes) => Box::new(Bytes::new(Arc::clone(bytes))),
-        })
-    }
-}
 
 /// What a file defines.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -103,9 +75,9 @@ impl From<io::Error> for ScanError {
 }
 
 /// Scans one file; what is wrong with it goes to `losses`.
-pub(super) fn scan(source: &Source, losses: &mut Losses) -> Result<Scan, ScanError> {
-    let name = source.path().display().to_string();
-    let mut file = source.open()?;
+pub(super) fn scan(path: &Path, losses: &mut Losses) -> Result<Scan, ScanError> {
+    let name = path.display().to_string();
+    let mut file = File::open(path)?;
     let bytes = file.seek(SeekFrom::End(0))?;
     let mut scan = Scan { bytes, ..Scan::default() };
     if bytes == 0 {
@@ -164,7 +136,7 @@ fn doubtful(pieces: &[Piece], index: &[ChunkIndex], complete: bool) -> Vec<usize
 /// Reads the chunks at `which` for their definitions and their true range of times. A corrupt one is left for the
 /// reader to report.
 fn inspect(
-    file: &mut Box<dyn ReadSeek>,
+    file: &mut File,
     scan: &mut Scan,
     which: &[usize],
     name: &str,
@@ -212,7 +184,7 @@ struct Summary {
 }
 
 /// Reads the summary; an unreadable one is as good as none.
-fn summary(file: &mut Box<dyn ReadSeek>, bytes: u64) -> io::Result<Summary> {
+fn summary(file: &mut File, bytes: u64) -> io::Result<Summary> {
     const TAIL: usize = RECORD_HEADER + FOOTER + MAGIC.len();
     let none = Ok(Summary::default());
     let Some(footer_at) = bytes.checked_sub(TAIL as u64) else { return none };
@@ -269,7 +241,7 @@ struct Walk<'a> {
 }
 
 impl Walk<'_> {
-    fn run(&mut self, file: &mut Box<dyn ReadSeek>) -> io::Result<()> {
+    fn run(&mut self, file: &mut File) -> io::Result<()> {
         let mut known: Vec<u64> = self.index.iter().map(|i| i.offset).collect();
         known.sort_unstable();
         let mut reader = BufReader::with_capacity(WALK_BUFFER, file);

@@ -1,7 +1,7 @@
 //! Tables of a replay: the union of what its files hold, and the way of each channel into them.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::ReplayError;
 use super::losses::{Finding, Losses};
@@ -33,12 +33,12 @@ struct Feed {
 
 /// The tables of `files`, in the order of the interface, and the routes of each file.
 pub(super) fn link(
-    files: &[(&Path, &Scan)],
+    files: &[(PathBuf, Scan)],
     losses: &mut Losses,
 ) -> Result<(Vec<TableSpec>, Vec<Routes>), ReplayError> {
     let mut routes = vec![Routes::new(); files.len()];
     let mut feeds: BTreeMap<(usize, String), (Vec<Feed>, TableSpec)> = BTreeMap::new();
-    for (at, &(path, scan)) in files.iter().enumerate() {
+    for (at, (path, scan)) in files.iter().enumerate() {
         for (&id, channel) in &scan.definitions.channels {
             let finding = match telemetry::topic_kind(&channel.topic) {
                 Topic::Telemetry => None,

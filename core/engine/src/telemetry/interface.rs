@@ -21,14 +21,22 @@ const MESSAGES: [(&str, &str); 7] = [
     ("/truth", "dragfree.telemetry.v1.Truth"),
 ];
 
-static LAYOUTS: LazyLock<Vec<(&str, Layout)>> = LazyLock::new(|| {
-    MESSAGES
-        .iter()
-        .map(|&(topic, message)| {
-            (topic, Layout::parse(DESCRIPTOR, message).expect("the committed descriptor defines every message"))
-        })
-        .collect()
+/// Topic, message and its layout.
+type Entry = (&'static str, &'static str, Layout);
+
+static INTERFACE: LazyLock<Vec<Entry>> = LazyLock::new(|| {
+    let layout = |message| Layout::parse(DESCRIPTOR, message).expect("the committed descriptor defines every message");
+    MESSAGES.iter().map(|&(topic, message)| (topic, message, layout(message))).collect()
 });
+
+fn entry(topic: &str) -> Option<&'static Entry> {
+    let key = match topic.strip_prefix("/hk/") {
+        Some("") => return None,
+        Some(_) => "/hk/",
+        None => topic,
+    };
+    INTERFACE.iter().find(|(name, ..)| *name == key)
+}
 
 /// What a topic is to the interface.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,23 +62,20 @@ pub fn topic_kind(topic: &str) -> Topic {
 /// The message of a topic as the committed interface has it.
 #[must_use]
 pub fn expected(topic: &str) -> Option<&'static Layout> {
-    let key = if topic.starts_with("/hk/") && topic.len() > "/hk/".len() { "/hk/" } else { topic };
-    LAYOUTS.iter().find(|(name, _)| *name == key && (key != "/hk/" || topic != "/hk/")).map(|(_, layout)| layout)
+    entry(topic).map(|(.., layout)| layout)
 }
 
 /// Name of the message of a topic and the descriptor set that defines it, for a writer.
 #[must_use]
 pub fn descriptor(topic: &str) -> Option<(&'static str, &'static [u8])> {
-    expected(topic)?;
-    let key = if topic.starts_with("/hk/") { "/hk/" } else { topic };
-    MESSAGES.iter().find(|(name, _)| *name == key).map(|&(_, message)| (message, DESCRIPTOR))
+    entry(topic).map(|(_, message, _)| (*message, DESCRIPTOR))
 }
 
 /// The tables of a spacecraft that sends everything in the interface, without its housekeeping.
 #[must_use]
 pub fn interface_tables() -> Vec<TableSpec> {
-    let sent = LAYOUTS.iter().filter(|(topic, _)| topic_kind(topic) == Topic::Telemetry);
-    sent.map(|(topic, layout)| table(topic.trim_start_matches('/'), layout)).collect()
+    let sent = INTERFACE.iter().filter(|(topic, ..)| topic_kind(topic) == Topic::Telemetry);
+    sent.map(|(topic, _, layout)| table(topic.trim_start_matches('/'), layout)).collect()
 }
 
 /// A table with the columns of `layout`.

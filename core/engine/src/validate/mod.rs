@@ -15,7 +15,7 @@ use std::path::PathBuf;
 use crate::border::{BorderError, Config, Kind, Library, LinkRequest, Linked, Manifest, PluginInfo};
 use crate::config::{ConfigError, Mission, resolve_parameters};
 use crate::table::Column;
-use session::{Session, is_same};
+use session::{Given, Session, difference};
 
 /// Epochs that a check feeds: ten minutes at 10 Hz.
 const EPOCHS: usize = 6000;
@@ -270,7 +270,7 @@ impl Subject<'_> {
         let whole = gap.is_none();
         let mut session = self.session(instance, gap)?;
         session.advance(EPOCHS, 512)?;
-        let (batches, times_ns, _) = session.finish()?;
+        let Given { batches, times_ns, .. } = session.finish()?;
         for (table, batch) in batches.iter().enumerate() {
             if batch.time_ns.windows(2).any(|pair| pair[0] >= pair[1]) {
                 return Err(self.broken(instance, format!("the times of table {table} do not ascend")));
@@ -299,18 +299,9 @@ impl Subject<'_> {
             let mut session = self.session(instance, None)?;
             session.advance(EPOCHS, size)?;
             let result = session.finish()?;
-            let (whole, _, report) = first.get_or_insert_with(|| result.clone());
-            if let Some(difference) = is_same(whole, &result.0) {
-                let what = format!(
-                    "in batches of {size} in place of {EPOCHS} epochs {difference}; keep what is left over for the next call"
-                );
-                return Err(self.broken(instance, what));
-            }
-            if *report != result.2 {
-                return Err(
-                    self.broken(instance, format!("in batches of {size} in place of {EPOCHS} the report is another"))
-                );
-            }
+            let when = format!("in batches of {size} in place of {EPOCHS} epochs");
+            let whole = first.get_or_insert_with(|| result.clone());
+            self.same(instance, whole, &result, &when, "keep what is left over for the next call")?;
         }
         Ok(())
     }
@@ -321,14 +312,8 @@ impl Subject<'_> {
             session.advance(EPOCHS, 512)?;
             session.finish()
         };
-        let (first, second) = (run()?, run()?);
-        if let Some(difference) = is_same(&first.0, &second.0) {
-            let what = format!(
-                "the second time {difference}; clocks, addresses and random numbers without a seed are no input"
-            );
-            return Err(self.broken(instance, what));
-        }
-        if first.2 == second.2 { Ok(()) } else { Err(self.broken(instance, "the second time the report is another")) }
+        let hint = "clocks, addresses and random numbers without a seed are no input";
+        self.same(instance, &run()?, &run()?, "the second time", hint)
     }
 
     fn state(&self, instance: &str) -> Result<(), Finding> {
@@ -349,17 +334,15 @@ impl Subject<'_> {
         first.advance(EPOCHS, size)?;
         second.advance(EPOCHS, size)?;
         let (first, second) = (first.finish()?, second.finish()?);
-        if let Some(difference) = is_same(&first.0, &second.0) {
-            return Err(self.broken(
-                instance,
-                format!("resumed from its state {difference}; the state must hold all that counts"),
-            ));
-        }
-        if first.2 == second.2 {
-            Ok(())
-        } else {
-            Err(self
-                .broken(instance, "resumed from its state the report is another; the state must hold all that counts"))
+        self.same(instance, &first, &second, "resumed from its state", "the state must hold all that counts")
+    }
+
+    /// That two results are equal; `when` says how the second was made, `hint` what to do about a difference.
+    fn same(&self, instance: &str, a: &Given, b: &Given, when: &str, hint: &str) -> Result<(), Finding> {
+        let report = || (a.report != b.report).then(|| "the report is another".to_owned());
+        match difference(&a.batches, &b.batches).or_else(report) {
+            Some(what) => Err(self.broken(instance, format!("{when} {what}; {hint}"))),
+            None => Ok(()),
         }
     }
 
