@@ -240,7 +240,6 @@ fn kinds(singles: &[Acted<'_>]) -> String {
 }
 
 /// Confusion matrices of the sets with at most one effect: hidden effect against first answer. `None` without results.
-/// [`ChartError`].
 pub(crate) fn picture(lines: &[Blind]) -> Result<Option<String>, ChartError> {
     let plain = |a: &Acted<'_>| a.drawn().max(a.at_hand().unwrap_or(0.0)) >= PLAIN;
     let mut tables = Vec::new();

@@ -87,7 +87,6 @@ pub(crate) struct InformationBound {
 
 impl Case {
     /// The case of a mission.
-    /// [`BoundError`]: the mission lacks a noise level or a controller design.
     pub(crate) fn of(mission: &Mission) -> Result<Self, BoundError> {
         const NEEDED_BY: &str = "the information bound";
         let n = &mission.noise;
@@ -191,7 +190,6 @@ impl Case {
     }
 
     /// Bounds for `span_s` seconds of data in a band, Hz.
-    /// [`BoundError::Singular`].
     pub(crate) fn bound_in(&self, span_s: f64, band_hz: std::ops::Range<f64>) -> Result<InformationBound, BoundError> {
         const NOISE: BoundError = BoundError::Singular("the noise of the channels");
         const SEEN: BoundError = BoundError::Singular("the information");
@@ -238,7 +236,6 @@ impl Case {
     }
 
     /// Bounds for `span_s` seconds of data, up to Nyquist.
-    /// [`BoundError::Singular`].
     pub(crate) fn bound(&self, span_s: f64) -> Result<InformationBound, BoundError> {
         self.bound_in(span_s, LOWEST_HZ..0.5 / self.dt_s * (1.0 - 1e-9))
     }

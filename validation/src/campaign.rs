@@ -294,7 +294,7 @@ pub(crate) fn work<T: Send>(
 }
 
 /// Runs the seeds that `results` lacks, and the twins of those seeds.
-/// [`CampaignError`]; results so far are on disk, and the next call continues.
+/// After an error the results so far are on disk, and the next call continues.
 pub(crate) fn coverage(
     program: &Program,
     seeds: std::ops::RangeInclusive<u32>,
@@ -330,7 +330,6 @@ pub(crate) fn coverage(
         }
     }
     let meter = Meter::new(tasks.iter().map(Task::weight).sum());
-    let results = Mutex::new(results);
     // Two single-threaded days in parallel are faster than two days in sequence on two threads.
     work(tasks, 2, |task| {
         let weight = task.weight();
@@ -344,19 +343,13 @@ pub(crate) fn coverage(
             let product = program.run(&chain, &simulated.files, &folder.join(format!("archive-{i}")))?;
             let found = line(&configuration, task.seed, &build, &simulated.truth_m, &product)
                 .map_err(|what| CampaignError::Product { configuration, seed: task.seed, what })?;
-            if let Ok(mut results) = results.lock() {
-                results.append(found)?;
-            }
+            results.append(found)?;
         }
         std::fs::remove_dir_all(&folder).map_err(|e| file(&folder, &e))?;
         meter.say(weight, &name);
         Ok(())
     })?;
-    let order = configurations();
-    if let Ok(results) = results.into_inner() {
-        results.sort(&order.iter().map(String::as_str).collect::<Vec<_>>())?;
-    }
-    Ok(())
+    results.sort(&configurations()).map(drop)
 }
 
 #[cfg(test)]

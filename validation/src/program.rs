@@ -1,5 +1,6 @@
 //! The program under test, called as a user calls it: `dragfree simulate`, then `dragfree run`.
 
+use serde::Deserialize;
 use serde_json::Value;
 use sha2::{Digest as _, Sha256};
 use std::collections::BTreeMap;
@@ -33,6 +34,14 @@ pub(crate) struct Simulated {
     pub(crate) truth_m: [f64; 6],
 }
 
+/// What `dragfree simulate --json` prints.
+#[derive(Deserialize)]
+struct Made {
+    files: Vec<PathBuf>,
+    truth_files: Vec<PathBuf>,
+    sealed_file: Option<PathBuf>,
+}
+
 /// Telemetry of a simulation with hidden effects, and its sealed truth in another folder.
 #[derive(Clone, Debug)]
 pub(crate) struct Hidden {
@@ -57,7 +66,6 @@ pub(crate) struct Chain {
 
 impl Program {
     /// Builds program and plugins, so that the measured program is current.
-    /// [`CampaignError`]: the workspace does not build.
     pub(crate) fn build() -> Result<Self, CampaignError> {
         let folder = std::env::current_exe()
             .map_err(|source| CampaignError::Start { command: "this program".to_owned(), source })?
@@ -87,7 +95,6 @@ impl Program {
     }
 
     /// Digest of the plugins' libraries, which identifies a build.
-    /// [`CampaignError`].
     pub(crate) fn digest(&self) -> Result<String, CampaignError> {
         let mut command = self.command();
         let answer = json(command.args(["plugins", "list", "--json"]), &[0])?;
@@ -99,36 +106,26 @@ impl Program {
     }
 
     /// Writes the controllers designed for a mission to a file with the section `control`.
-    /// [`CampaignError`].
     pub(crate) fn freeze(&self, mission: &Path, to: &Path) -> Result<(), CampaignError> {
         output(self.command().arg("design").arg(mission).arg("--freeze").arg(to), &[0]).map(|_| ())
     }
 
     /// Simulates into a new folder, reads the truth and removes it.
-    /// [`CampaignError`].
     pub(crate) fn simulate(
         &self,
         mission: &Path,
         folder: &Path,
         arguments: &[impl AsRef<OsStr>],
     ) -> Result<Simulated, CampaignError> {
-        let mut command = self.command();
-        command.arg("simulate").arg(mission).arg("--out").arg(folder).args(arguments).arg("--json");
-        let made = json(&mut command, &[0])?;
-        let paths = |key: &str| -> Vec<PathBuf> {
-            made[key].as_array().into_iter().flatten().filter_map(Value::as_str).map(PathBuf::from).collect()
-        };
-        let truth_files = paths("truth_files");
-        let first = truth_files.first().ok_or_else(|| missing(&command, "truth_files"))?;
-        let truth_m = offsets_m(first)?;
-        for path in &truth_files {
+        let made = self.simulated(mission, folder, arguments)?;
+        let truth_m = offsets_m(&made.truth_files[0])?;
+        for path in &made.truth_files {
             std::fs::remove_file(path).map_err(|e| file(path, &e))?;
         }
-        Ok(Simulated { files: paths("files"), truth_m })
+        Ok(Simulated { files: made.files, truth_m })
     }
 
     /// Simulates with hidden effects into `folder` and moves the truth away; `noise` is the seed of everything else.
-    /// [`CampaignError`].
     pub(crate) fn hide(
         &self,
         mission: &Path,
@@ -137,33 +134,33 @@ impl Program {
         hours: f64,
     ) -> Result<Hidden, CampaignError> {
         let (telemetry, away) = (folder.join("telemetry"), folder.join("sealed"));
-        let mut command = self.command();
-        command.arg("simulate").arg(mission).arg("--out").arg(&telemetry).arg("--json");
-        for (option, value) in
-            [("--hidden", hidden.to_string()), ("--seed", noise.to_string()), ("--hours", hours.to_string())]
-        {
-            command.args([option, &value]);
-        }
-        let made = json(&mut command, &[0])?;
-        let sealed = made["sealed_file"].as_str().map(Path::new).ok_or_else(|| missing(&command, "sealed_file"))?;
+        let [hidden, noise, hours] = [hidden.to_string(), noise.to_string(), hours.to_string()];
+        let arguments = ["--hidden", &hidden, "--seed", &noise, "--hours", &hours];
+        let made = self.simulated(mission, &telemetry, &arguments)?;
+        let sealed = made.sealed_file.unwrap_or_default();
         let (Some(truth), Some(name)) = (sealed.parent(), sealed.file_name()) else {
-            return Err(file(sealed, &"it has no folder"));
+            return Err(file(&sealed, &"it has no folder"));
         };
-        std::fs::rename(truth, &away).map_err(|e| file(sealed, &e))?;
-        let all = |key: &str| made[key].as_array().into_iter().flatten().filter_map(Value::as_str).map(PathBuf::from);
-        let moved = all("truth_files").find_map(|path| Some(away.join(path.file_name()?)));
-        let truth_m = offsets_m(&moved.ok_or_else(|| missing(&command, "truth_files"))?)?;
-        Ok(Hidden { files: all("files").collect(), sealed: away.join(name), truth_m })
+        std::fs::rename(truth, &away).map_err(|e| file(&sealed, &e))?;
+        let truth_m = offsets_m(&away.join(made.truth_files[0].file_name().unwrap_or_default()))?;
+        Ok(Hidden { files: made.files, sealed: away.join(name), truth_m })
+    }
+
+    /// Runs `dragfree simulate`; there is at least one file of truth.
+    fn simulated(&self, mission: &Path, folder: &Path, arguments: &[impl AsRef<OsStr>]) -> Result<Made, CampaignError> {
+        let mut command = self.command();
+        command.arg("simulate").arg(mission).arg("--out").arg(folder).args(arguments).arg("--json");
+        let made: Made =
+            serde_json::from_value(json(&mut command, &[0])?).map_err(|e| missing(&command, &e.to_string()))?;
+        if made.truth_files.is_empty() { Err(missing(&command, "truth_files")) } else { Ok(made) }
     }
 
     /// Runs `dragfree model` with arguments.
-    /// [`CampaignError`].
     pub(crate) fn model(&self, words: &[&OsStr]) -> Result<(), CampaignError> {
         output(self.command().arg("model").args(words), &[0]).map(|_| ())
     }
 
     /// Runs `dragfree diagnose` on a product.
-    /// [`CampaignError`].
     pub(crate) fn diagnose(&self, product: &Value, archive: &Path) -> Result<Value, CampaignError> {
         let mut command = self.command();
         let id = product["id"].as_str().ok_or_else(|| missing(&command, "id"))?;
@@ -172,7 +169,6 @@ impl Program {
     }
 
     /// Runs `dragfree reveal`, which scores a diagnosis against the sealed truth.
-    /// [`CampaignError`].
     pub(crate) fn reveal(&self, hidden: &Hidden, diagnosis: &Path) -> Result<Value, CampaignError> {
         let mut command = self.command();
         command.arg("reveal").arg(&hidden.sealed).arg("--diagnosis").arg(diagnosis);
@@ -182,7 +178,6 @@ impl Program {
 
     /// Runs a chain over telemetry and returns the product as JSON. Exit codes for lost data and an inconsistent model
     /// are accepted.
-    /// [`CampaignError`].
     pub(crate) fn run(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Result<Value, CampaignError> {
         let mut command = self.command();
         command.arg("run").arg(&chain.pipeline).args(files).arg("--archive").arg(archive).arg("--json");
@@ -229,7 +224,7 @@ fn missing(command: &Command, what: &str) -> CampaignError {
 }
 
 /// The result of a product.
-/// The name of what the product lacks.
+/// An error names what the product lacks.
 pub(crate) fn line(
     configuration: &str,
     seed: u32,
@@ -284,7 +279,7 @@ fn qp_widened(product: &Value) -> Result<[f64; 6], String> {
 }
 
 /// One solution of a product.
-/// The name of what the product lacks.
+/// An error names what the product lacks.
 pub(crate) fn solution(product: &Value, label: &str, truth_m: &[f64; 6]) -> Result<Solution, String> {
     let lacks = || format!("solution {label}");
     let all = product["coefficients"].as_array().ok_or_else(lacks)?;

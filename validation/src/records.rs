@@ -8,6 +8,7 @@ use serde_json::Value;
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// The coefficients of the model, in the order of every array of six.
 pub(crate) const COEFFICIENTS: [&str; 6] = [
@@ -171,17 +172,15 @@ impl Keyed for Blind {
     }
 }
 
-/// A growing file of results.
+/// A growing file of results, shared by threads.
 #[derive(Debug)]
 pub(crate) struct Results<T> {
     path: PathBuf,
-    file: File,
-    /// Results.
-    pub(crate) lines: Vec<T>,
+    /// The file and what is in it.
+    state: Mutex<(File, Vec<T>)>,
 }
 
 /// Results of a file; empty if it does not exist. A last line without its end was interrupted and is ignored.
-/// [`CampaignError`]: a complete line is not a result.
 pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, CampaignError> {
     let text = match std::fs::read_to_string(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
@@ -197,7 +196,6 @@ pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, CampaignE
 impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
     /// Opens a file to continue, or a new one. Removes results of another build, as a table must not mix builds;
     /// returns their number.
-    /// [`CampaignError`]: the file has another form or cannot be written.
     pub(crate) fn open(path: &Path, build: &str) -> Result<(Self, usize), CampaignError> {
         let mut lines: Vec<T> = read(path)?;
         let before = lines.len();
@@ -206,32 +204,38 @@ impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
         std::fs::create_dir_all(path.parent().unwrap_or(Path::new("."))).map_err(|e| file(path, &e))?;
         replace(path, &lines)?;
         let file = OpenOptions::new().append(true).open(path).map_err(|e| file(path, &e))?;
-        Ok((Self { path: path.to_owned(), file, lines }, dropped))
+        Ok((Self { path: path.to_owned(), state: Mutex::new((file, lines)) }, dropped))
+    }
+
+    fn state(&self) -> MutexGuard<'_, (File, Vec<T>)> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Whether a result exists.
     pub(crate) fn has(&self, configuration: &str, seed: u32) -> bool {
-        self.lines.iter().any(|line| line.key() == (configuration.to_owned(), seed))
+        self.state().1.iter().any(|line| line.key() == (configuration.to_owned(), seed))
     }
 
     /// Appends a result in one write.
-    /// [`CampaignError::File`].
-    pub(crate) fn append(&mut self, line: T) -> Result<(), CampaignError> {
+    pub(crate) fn append(&self, line: T) -> Result<(), CampaignError> {
         let text = as_lines(&self.path, std::slice::from_ref(&line))?;
-        self.file.write_all(&text).map_err(|e| file(&self.path, &e))?;
-        self.lines.push(line);
+        let mut state = self.state();
+        state.0.write_all(&text).map_err(|e| file(&self.path, &e))?;
+        state.1.push(line);
         Ok(())
     }
 
-    /// Rewrites the file in the order of configurations and seeds, independent of the order of completion.
-    /// [`CampaignError::File`].
-    pub(crate) fn sort(mut self, configurations: &[&str]) -> Result<(), CampaignError> {
-        let place = |name: &str| configurations.iter().position(|c| *c == name);
-        self.lines.sort_by_key(|line| {
+    /// Rewrites the file in the order of configurations and seeds, independent of the order of completion; gives the
+    /// results.
+    pub(crate) fn sort(self, configurations: &[impl AsRef<str>]) -> Result<Vec<T>, CampaignError> {
+        let place = |name: &str| configurations.iter().position(|c| c.as_ref() == name);
+        let (_, mut lines) = self.state.into_inner().unwrap_or_else(PoisonError::into_inner);
+        lines.sort_by_key(|line| {
             let (configuration, seed) = line.key();
             (place(&configuration), configuration, seed)
         });
-        replace(&self.path, &self.lines)
+        replace(&self.path, &lines)?;
+        Ok(lines)
     }
 }
 
@@ -306,7 +310,7 @@ pub(crate) mod tests {
     fn a_kill_in_the_middle_loses_and_doubles_nothing() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("results.jsonl");
-        let (mut results, dropped) = Results::open(&path, "abc").unwrap();
+        let (results, dropped) = Results::open(&path, "abc").unwrap();
         assert_eq!(dropped, 0);
         for seed in [2, 1] {
             results.append(line("nominal", seed)).unwrap();
@@ -316,7 +320,7 @@ pub(crate) mod tests {
         let first = whole.iter().position(|b| *b == b'\n').unwrap() + 1;
         for cut in (first..whole.len()).step_by(7).chain([whole.len() - 1]) {
             std::fs::write(&path, &whole[..cut]).unwrap();
-            let (mut results, _) = Results::<Line>::open(&path, "abc").unwrap();
+            let (results, _) = Results::<Line>::open(&path, "abc").unwrap();
             assert!(results.has("nominal", 2) && !results.has("nominal", 1), "cut at {cut}");
             results.append(line("nominal", 1)).unwrap();
             drop(results);
@@ -332,10 +336,10 @@ pub(crate) mod tests {
     fn results_of_another_build_are_dropped_and_nonsense_is_refused() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("results.jsonl");
-        let (mut results, _) = Results::open(&path, "abc").unwrap();
+        let (results, _) = Results::open(&path, "abc").unwrap();
         results.append(line("nominal", 1)).unwrap();
         let (results, dropped) = Results::<Line>::open(&path, "def").unwrap();
-        assert_eq!((results.lines.len(), dropped), (0, 1));
+        assert_eq!((results.state().1.len(), dropped), (0, 1));
         std::fs::write(&path, "{}\n").unwrap();
         let error = Results::<Line>::open(&path, "abc").unwrap_err().to_string();
         assert!(error.contains("line 1"), "{error}");

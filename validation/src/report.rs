@@ -42,7 +42,6 @@ pub(crate) struct Measured {
 
 impl Measured {
     /// Reads a folder of results.
-    /// [`CampaignError`]: a file has another form.
     pub(crate) fn read(folder: &Path) -> Result<Self, CampaignError> {
         Ok(Self {
             coverage: read(&folder.join("coverage.jsonl"))?,
@@ -546,7 +545,6 @@ pub(crate) struct Report {
 }
 
 /// Creates the report.
-/// [`CampaignError`]: the default mission cannot be read, or a picture cannot be drawn.
 pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
     let mission = mission(&taiji())?;
     let dcm = ["tm1", "tm2"].map(|name| mission.test_mass.get(name).map_or(0.0, |tm| tm.orf_from_srf_angle_rad));
@@ -599,7 +597,6 @@ pub(crate) fn rewritten(document: &str, parts: &BTreeMap<&'static str, String>) 
 }
 
 /// Writes the generated parts of VALIDATION.md and the pictures.
-/// [`CampaignError`] when a file cannot be read or written, or lacks a marker.
 pub(crate) fn write(folder: &Path) -> Result<(), CampaignError> {
     let report = report(&Measured::read(folder)?)?;
     let path = document_path();

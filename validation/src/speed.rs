@@ -43,7 +43,6 @@ const SIX_HOURS_S: f64 = 21_600.0;
 
 impl Speed {
     /// Reads a file; `None` if it does not exist.
-    /// [`CampaignError::File`]: the file has another form.
     pub(crate) fn read(path: &Path) -> Result<Option<Self>, CampaignError> {
         match std::fs::read_to_string(path) {
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
@@ -90,7 +89,6 @@ fn bench(package: &str, name: &str) -> Result<(), CampaignError> {
 }
 
 /// Measures all ratios, on an otherwise idle machine, and writes the file.
-/// [`CampaignError`].
 pub(crate) fn measure(program: &Program, path: &Path, scratch: &Path) -> Result<(), CampaignError> {
     bench("dragfree-es-akf", "step")?;
     bench("dragfree-identification", "candidates")?;

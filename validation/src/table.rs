@@ -3,7 +3,6 @@
 use dragfree_physics::mission::Mission;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
 
 use crate::bound::Case;
 use crate::campaign::{CampaignError, Meter, ScratchFolder, file, note, parse, science_mode, work};
@@ -85,7 +84,7 @@ struct Task {
 }
 
 /// Runs what `results` lacks, `at_once` regimes in parallel; 25 days of one take 14 GB of `scratch`.
-/// [`CampaignError`]; results so far are on disk, and the next call continues.
+/// After an error the results so far are on disk, and the next call continues.
 pub(crate) fn table(
     program: &Program,
     seeds: &[u32],
@@ -116,7 +115,6 @@ pub(crate) fn table(
         }
     }
     let meter = Meter::new(tasks.len() as f64);
-    let results = Mutex::new(results);
     work(tasks, at_once, |task| {
         let case = Case::of(&mission(&task.path)?)?;
         let folder = scratch_folder.path(&format!("{}-{}", task.regime.name, task.seed));
@@ -137,17 +135,12 @@ pub(crate) fn table(
                 single_m: std::array::from_fn(|i| rounded(bound.single_m[i])),
                 surveyed_m: std::array::from_fn(|i| rounded(bound.surveyed_m[i])),
             };
-            if let Ok(mut results) = results.lock() {
-                results.append(row)?;
-            }
+            results.append(row)?;
         }
         std::fs::remove_dir_all(&folder).map_err(|e| file(&folder, &e))?;
         meter.say(1.0, &format!("{}, seed {}", task.regime.name, task.seed));
         Ok(())
     })?;
     let order: Vec<String> = REGIMES.iter().flat_map(|r| [days, 1].map(|days| configuration(r.name, days))).collect();
-    if let Ok(results) = results.into_inner() {
-        results.sort(&order.iter().map(String::as_str).collect::<Vec<_>>())?;
-    }
-    Ok(())
+    results.sort(&order).map(drop)
 }

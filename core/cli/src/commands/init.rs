@@ -3,7 +3,7 @@
 use super::Done;
 use crate::args::Init;
 use crate::failure::{Failure, Refusal};
-use crate::installed::{self, Named};
+use crate::installed;
 use crate::text::quoted;
 use dragfree_engine::files::IoContext as _;
 use std::fs::OpenOptions;
@@ -17,7 +17,7 @@ pub(super) fn execute(init: &Init, json: bool) -> Result<Done, Failure> {
     let read = |path: &Path| std::fs::read_to_string(path).at("read", path);
     let name = init.mission.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let pipeline =
-        installed::pipeline_of(&name).map_or_else(|| installed::find(Named::Pipeline, Path::new(PIPELINE)), Ok)?;
+        installed::pipeline_of(&name).map_or_else(|| installed::find(installed::PIPELINE, Path::new(PIPELINE)), Ok)?;
     let pipeline_text = read(&pipeline)?;
     let given = |key: &str| {
         let line = pipeline_text.lines().find_map(|line| line.strip_prefix(key)?.trim_start().strip_prefix('='));

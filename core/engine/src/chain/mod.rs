@@ -478,36 +478,16 @@ fn check_rows(node: &ChainNode, batches: &[Batch], rows: usize) -> Result<(), Ch
 }
 
 /// Cuts a chunk by time so that no table has many more than `rows` rows in one piece.
-fn pieces(chunk: Chunk, rows: usize) -> Vec<Chunk> {
-    let densest = chunk.batches.iter().max_by_key(|b| b.rows()).filter(|b| b.rows() > rows);
-    let Some(densest) = densest else { return vec![chunk] };
-    let mut cuts: Vec<i64> = (rows..densest.rows()).step_by(rows.max(1)).map(|i| densest.time_ns[i]).collect();
+fn pieces(mut chunk: Chunk, rows: usize) -> Vec<Chunk> {
+    let densest = chunk.batches.iter().max_by_key(|b| b.rows());
+    let times = densest.map_or(&[][..], |b| &b.time_ns).iter().copied();
+    let mut cuts: Vec<i64> = times.skip(rows).step_by(rows).filter(|t| *t <= chunk.complete_until_ns).collect();
     cuts.dedup();
-    cuts.retain(|t| *t <= chunk.complete_until_ns);
-    cuts.push(chunk.complete_until_ns);
-    let mut starts = vec![0usize; chunk.batches.len()];
-    let last = cuts.len() - 1;
-    cuts.iter()
-        .enumerate()
-        .map(|(k, until)| {
-            let batches = chunk
-                .batches
-                .iter()
-                .zip(&mut starts)
-                .map(|(batch, start)| {
-                    let end =
-                        if k == last { batch.rows() } else { batch.time_ns.partition_point(|t| t < until).max(*start) };
-                    let cut = Batch {
-                        time_ns: batch.time_ns[*start..end].to_vec(),
-                        columns: batch.columns.iter().map(|c| c[*start..end].to_vec()).collect(),
-                    };
-                    *start = end;
-                    cut
-                })
-                .collect();
-            Chunk { batches, complete_until_ns: *until }
-        })
-        .collect()
+    // From the end, so that every row is moved once.
+    let mut pieces: Vec<Chunk> = cuts.into_iter().rev().map(|cut| chunk.split_off(cut)).collect();
+    pieces.push(chunk);
+    pieces.reverse();
+    pieces
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The product file: its layout, its digest, reading and emitting.
+//! The product file: its layout, its digest, reading and emitting. The JSON Schema refuses unknown keys.
 
 use super::ProductError;
 use super::emit::emit;
@@ -20,7 +20,6 @@ static SCHEMA: LazyLock<jsonschema::Validator> = LazyLock::new(|| {
 
 /// A product: header blocks after GRACE-FO's Level-1B, then what the run found and how.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Product {
     /// Version of the layout, [`FORMAT_VERSION`].
     pub format_version: String,
@@ -50,7 +49,6 @@ pub struct Product {
 
 /// Header blocks with the names of GRACE-FO's Level-1B files.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Header {
     /// How many of each.
     pub dimensions: Dimensions,
@@ -64,7 +62,6 @@ pub struct Header {
 
 /// How many of each.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Dimensions {
     /// Epochs, used and rejected.
     pub epoch: u64,
@@ -78,7 +75,6 @@ pub struct Dimensions {
 
 /// Attributes of CF and ACDD.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct GlobalAttributes {
     /// `COM1B_2035-01-01_SC1_01_0001`, also the file's name.
     pub id: String,
@@ -108,7 +104,6 @@ pub struct GlobalAttributes {
 
 /// Attributes that CF and ACDD do not know.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct NonStandardAttributes {
     /// Product name, `COM1B`.
     pub product: String,
@@ -162,7 +157,6 @@ pub enum Status {
 
 /// A quantity of the product.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Variable {
     /// Name, as in the result.
     pub name: String,
@@ -178,7 +172,6 @@ pub struct Variable {
 
 /// Model that the estimators used.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Model {
     /// Its revision.
     pub revision: String,
@@ -191,7 +184,6 @@ pub struct Model {
 
 /// What the estimators found.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Outcome {
     /// Epoch of the coefficients, Unix ns of the product's time scale: the end of the window.
     pub epoch_ns: i64,
@@ -219,7 +211,6 @@ impl Outcome {
 
 /// One coefficient of one solution.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Coefficient {
     /// `com-offset.tm1.x`.
     pub name: String,
@@ -240,7 +231,6 @@ pub struct Coefficient {
 
 /// A covariance; its units are the products of those of the coefficients.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Covariance {
     /// Coefficients of the rows, n.
     pub names: Vec<String>,
@@ -250,7 +240,6 @@ pub struct Covariance {
 
 /// How far to trust the result.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Quality {
     /// Epochs that entered the result.
     pub epochs_used: u64,
@@ -279,7 +268,6 @@ pub struct Quality {
 
 /// The revision that a product takes the place of.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Supersedes {
     /// Its id.
     pub id: String,
@@ -291,7 +279,6 @@ pub struct Supersedes {
 
 /// A file that was read.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Input {
     /// What it is: `telemetry`, `mission`, `model`, `pipeline` or `state`.
     pub role: String,
@@ -305,7 +292,6 @@ pub struct Input {
 
 /// A plugin that ran.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Stage {
     /// Plugin, `qp-check`.
     pub plugin: String,
@@ -325,7 +311,6 @@ pub struct Stage {
 
 /// Data that were lost.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Loss {
     /// What was lost, `corrupt chunk`.
     pub kind: String,
@@ -337,7 +322,6 @@ pub struct Loss {
 
 /// A file beside the product.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Attachment {
     /// What follows the product's id, `neq.json`.
     pub suffix: String,

@@ -7,7 +7,7 @@ use super::ReplayError;
 use super::losses::{Finding, Losses};
 use super::scan::Scan;
 use crate::table::TableSpec;
-use crate::telemetry::{self, Decoder, Layout, Topic};
+use crate::telemetry::{self, Decoder, Layout};
 
 /// Where the messages of a channel go.
 #[derive(Clone, Debug)]
@@ -40,10 +40,10 @@ pub(super) fn link(
     let mut feeds: BTreeMap<(usize, String), (Vec<Feed>, TableSpec)> = BTreeMap::new();
     for (at, (path, scan)) in files.iter().enumerate() {
         for (&id, channel) in &scan.definitions.channels {
-            let finding = match telemetry::topic_kind(&channel.topic) {
-                Topic::Telemetry => None,
-                Topic::Truth => Some(Finding::TruthMessages),
-                Topic::Unknown => Some(Finding::MessagesOfUnknownTopics),
+            let finding = match channel.topic.as_str() {
+                telemetry::TRUTH => Some(Finding::TruthMessages),
+                topic if telemetry::expected(topic).is_none() => Some(Finding::MessagesOfUnknownTopics),
+                _ => None,
             };
             if let Some(finding) = finding {
                 routes[at].insert(id, Route::Nowhere { finding, topic: channel.topic.clone() });

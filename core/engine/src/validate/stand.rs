@@ -22,7 +22,7 @@ pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) 
     if kind == Kind::Source {
         return vec![Vec::new()];
     }
-    let raw: Vec<Column> = interface_tables().into_iter().filter(|t| t.name != "hk/").flat_map(|t| t.columns).collect();
+    let raw: Vec<Column> = interface_tables().into_iter().flat_map(|t| t.columns).collect();
     let column = |table: &str, name: String, (unit, frame): (String, String), attributes: &[(&str, &str)]| Column {
         table: table.to_owned(),
         name,
@@ -40,17 +40,10 @@ pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) 
     for name in words.filter_map(|word| word.strip_prefix("hk.")) {
         let unit = housekeeping_unit(name);
         if !grid.iter().any(|c| c.name == format!("hk.{name}")) {
-            grid.push(column("grid", format!("hk.{name}"), (unit.clone(), String::new()), &[]));
-            let table = format!("hk/{name}");
-            let attributes = BTreeMap::new();
-            housekeeping.push(Column {
-                table,
-                name: "value".to_owned(),
-                unit,
-                frame: String::new(),
-                rate_hz: 0.0,
-                attributes,
-            });
+            let meaning = (unit, String::new());
+            grid.push(column("grid", format!("hk.{name}"), meaning.clone(), &[]));
+            let value = column(&format!("hk/{name}"), "value".to_owned(), meaning, &[]);
+            housekeeping.push(Column { rate_hz: 0.0, ..value });
         }
     }
     // Test masses of the interface with their frames.
