@@ -52,24 +52,6 @@ impl Measured {
     }
 }
 
-/// A statistic and its bounds.
-struct Check {
-    what: String,
-    value: f64,
-    bounds: Bounds,
-}
-
-impl Check {
-    fn holds(&self) -> bool {
-        self.bounds.hold(self.value)
-    }
-
-    /// The value, bold if it is out of bounds.
-    fn cell(&self, text: &str) -> String {
-        if self.holds() { text.to_owned() } else { format!("**{text}**") }
-    }
-}
-
 /// Solutions to check.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Kind {
@@ -167,11 +149,13 @@ fn coverage(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
         (stats::mean(n, alarm), stats::rms(n, alarm), stats::chi2_per_dof(3.0 * n as f64, alarm));
     let count_bounds = counts.map(|(low, high)| Bounds { low: low as f64, high: high as f64 });
     let mut failed = Vec::new();
-    let mut judge = |check: Check, text: &str| {
-        if !check.holds() {
-            failed.push(format!("{}: {text}, outside [{:.4}, {:.4}]", check.what, check.bounds.low, check.bounds.high));
+    // The text of a value, bold if it is out of bounds.
+    let mut judge = |what: String, value: f64, bounds: Bounds, text: String| {
+        if bounds.hold(value) {
+            return text;
         }
-        check.cell(text)
+        failed.push(format!("{what}: {text}, outside [{:.4}, {:.4}]", bounds.low, bounds.high));
+        format!("**{text}**")
     };
     let adopted_apart = lines.iter().filter(|l| l.adopted.is_some()).count();
     let mut rows = String::new();
@@ -183,13 +167,12 @@ fn coverage(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
             let mut cells = Vec::new();
             for (z, bounds) in [1.0, 2.0].into_iter().zip(count_bounds) {
                 let k = pulls.iter().filter(|p| p.abs() <= z).count();
-                let check = Check { what: what(&format!("within {z}σ")), value: k as f64, bounds };
-                cells.push(judge(check, &k.to_string()));
+                cells.push(judge(what(&format!("within {z}σ")), k as f64, bounds, k.to_string()));
             }
             let m = mean(&pulls);
-            cells.push(judge(Check { what: what("mean pull"), value: m, bounds: mean_bounds }, &format!("{m:+.2}")));
+            cells.push(judge(what("mean pull"), m, mean_bounds, format!("{m:+.2}")));
             let r = rms(&pulls);
-            cells.push(judge(Check { what: what("rms pull"), value: r, bounds: rms_bounds }, &format!("{r:.2}")));
+            cells.push(judge(what("rms pull"), r, rms_bounds, format!("{r:.2}")));
             let sigma = stats::median(lines.iter().map(|l| kind.of(l).sigma_m()[i]).collect());
             let p_end = if kind == Kind::EsAkf {
                 let end = stats::median(lines.iter().map(|l| l.p_end_sigma_m[i]).collect());
@@ -219,20 +202,16 @@ fn coverage(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
         ("QP", nees(&of(Kind::Qp), free)),
         ("adopted", nees(&of(Kind::Adopted), free)),
     ] {
-        let check = Check { what: format!("NEES/dof of {what}"), value, bounds: nees_bounds };
-        squares.push(format!("{what} {}", judge(check, &format!("{value:.3}"))));
+        let text = judge(format!("NEES/dof of {what}"), value, nees_bounds, format!("{value:.3}"));
+        squares.push(format!("{what} {text}"));
     }
     let verdicts = |name: &str| lines.iter().filter(|l| l.verdict == name).count();
     let disagree = verdicts("disagree");
     // Upper bound: the difference of two solutions of the same data varies less than the sum of their variances.
     let promised = 6.0 * (1.0 - stats::within(3.0));
     let most = (0..=n).rev().find(|k| stats::clopper_pearson(*k, n, 2.0 * alarm).low <= promised).unwrap_or(n);
-    let check = Check {
-        what: "verdicts `disagree`".to_owned(),
-        value: disagree as f64,
-        bounds: Bounds { low: 0.0, high: most as f64 },
-    };
-    let disagree = judge(check, &disagree.to_string());
+    let most_bounds = Bounds { low: 0.0, high: most as f64 };
+    let disagree = judge("verdicts `disagree`".to_owned(), disagree as f64, most_bounds, disagree.to_string());
     let (nis, chi2) = (range(lines.iter().map(|l| l.nis)), range(lines.iter().map(|l| l.chi2_per_dof)));
 
     let mut text = String::new();
@@ -311,12 +290,12 @@ fn twin(lines: &[&Line], unprotected: bool, free: &DMatrix<f64>, alarm: f64) -> 
     let batch = nees(&qp, free);
     let mut failed = Vec::new();
     let mut cell = |what: &'static str, value: f64, bounds: Bounds, judged: bool, digits: usize| {
-        let check = Check { what: what.to_owned(), value, bounds };
-        if judged && !check.holds() {
-            failed.push(what);
-        }
         let text = format!("{value:.digits$}");
-        if judged { check.cell(&text) } else { text }
+        if !judged || bounds.hold(value) {
+            return text;
+        }
+        failed.push(what);
+        format!("**{text}**")
     };
     let share = |all: &[&Solution]| {
         let inside: usize = all.iter().map(|s| s.pulls().iter().filter(|p| p.abs() <= 1.0).count()).sum();

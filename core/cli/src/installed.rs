@@ -97,7 +97,7 @@ pub(crate) fn resolve(arguments: &mut Arguments) -> Result<(), Failure> {
         Command::Config(Config::Check(command)) => chain(command),
         Command::Plugins(Plugins::Validate(command)) => put_if(MISSION, &mut command.mission),
         Command::Init(command) => put(MISSION, &mut command.mission),
-        // The commands that change a model ask for a file: what comes with the program is everybody's.
+        // Commands that change a model take a file only: installed models are shared.
         Command::Model(Model::Show { model, .. }) => put(MODEL, model),
         Command::Model(Model::Add(command)) => put_if(MISSION, &mut command.mission),
         _ => Ok(()),

@@ -291,7 +291,6 @@ mod tests {
     use super::*;
     use dragfree_engine::product::{Draft, Model, ProductWriter, Written};
     use dragfree_engine::schema::Report;
-    use std::collections::BTreeMap;
 
     const PLAIN: Paint = Paint(false);
 
@@ -309,14 +308,11 @@ mod tests {
             spacecraft: "SC1".into(),
             first_ns: 2_051_222_400_000_000_000,
             last_ns: 2_051_243_999_900_000_000,
-            time_scale: "UTC".into(),
             inputs: Vec::new(),
             history: Vec::new(),
             model: Model { revision: "1".into(), parent: None, effects: vec!["com-offset".into()] },
             software: "0.1.0".into(),
-            losses: Vec::new(),
-            counts: BTreeMap::new(),
-            notes: Vec::new(),
+            replay: dragfree_engine::feed::Summary { time_scale: "UTC".into(), ..Default::default() },
             reports: vec![Report { plugin: "qp-check".into(), ..report }],
             settings: Default::default(),
             created: chrono::DateTime::UNIX_EPOCH,

@@ -211,7 +211,7 @@ pub fn run(
     let mut writer = ProductWriter::begin(&options.archive)?;
     let mut series = Series::create(&chain, &mut writer, &setup)?;
     let covered = setup.carry(feed.as_mut(), &mut chain, &mut series, progress)?;
-    // Before the ends are flushed, so that tomorrow goes on in the middle of the lags.
+    // Saved before the flush, because the next day continues within the lags.
     let next_state = next_state.map(|next| next.write(&chain.save()?)).transpose()?;
     chain.finish(&mut series)?;
     let reports = chain.reports()?;
@@ -219,13 +219,13 @@ pub fn run(
     let draft = draft(&setup, &chain, feed.as_mut(), reports, &covered)?;
     sources(&setup).write(&writer.staged_unlisted(product::SOURCES))?;
     tracing::debug!(epochs_from_ns = covered.first_ns, epochs_to_ns = covered.last_ns, "every stage has reported");
-    // The state after the product: a kill in between costs a second run of the day, never the day.
+    // The state last: after a kill in between, the day can be run again.
     let written = writer.commit_with(&draft, || next_state.map_or(Ok(()), NextState::place))?;
     tracing::info!(id = written.product.id(), path = %written.path.display(), "archived");
     Ok(written)
 }
 
-/// Tells what is about to run.
+/// Logs the linked chain.
 fn log(setup: &Setup<'_>, chain: &Chain) {
     let coefficients = chain.coefficients.iter().filter(|c| c.estimate).count();
     tracing::info!(
@@ -349,7 +349,7 @@ impl Sink for Series {
             }
             chunk.batches.push(if mine { batch.clone() } else { Batch::empty(t.columns.len()) });
         }
-        // A table that has not spoken yet may still come with earlier rows.
+        // A table without any row so far may still deliver earlier ones.
         chunk.complete_until_ns = self.last_ns.iter().map(|t| t.unwrap_or(i64::MIN)).min().unwrap_or(i64::MIN);
         writer.write(chunk).map_err(|e| e.to_string())
     }
@@ -375,15 +375,14 @@ fn draft(
     reports: Vec<Report>,
     covered: &Covered,
 ) -> Result<Draft, EngineError> {
-    let summary = feed.summary()?;
+    let mut replay = feed.summary()?;
     let source = feed.source().map(|s| stage(&s.found.info, "", &s.found.opened.sha256, &s.parameters));
     let nodes = chain.nodes.iter().map(|n| {
         let instance = n.name().split_once(':').map_or("", |(_, instance)| instance);
         stage(&n.info, instance, &n.sha256, &n.parameters)
     });
     let history = source.into_iter().chain(nodes).collect();
-    let mut losses = summary.losses;
-    losses.extend(chain.nodes.iter().filter(|n| n.discarded_rows > 0).map(|n| Loss {
+    replay.losses.extend(chain.nodes.iter().filter(|n| n.discarded_rows > 0).map(|n| Loss {
         kind: "discarded_rows".to_owned(),
         count: n.discarded_rows,
         detail: format!("plugin {} discarded batches; its log says why", n.name()),
@@ -391,9 +390,8 @@ fn draft(
     let mut effects: Vec<String> = setup.model.effects.iter().map(|e| e.id.clone()).collect();
     effects.dedup();
     let (revision, parent) = setup.model.identity();
-    let mut notes = summary.notes;
     if setup.model.edited_by_hand() {
-        notes.push(format!(
+        replay.notes.push(format!(
             "the model file was edited by hand since revision {} was made; `dragfree model commit` makes a revision of it",
             setup.model.revision
         ));
@@ -406,15 +404,12 @@ fn draft(
         spacecraft: setup.mission.spacecraft.clone(),
         first_ns: covered.first_ns,
         last_ns: covered.last_ns,
-        time_scale: summary.time_scale,
         inputs: inputs(setup)?,
         history,
         model: product::Model { revision, parent, effects },
         software: setup.options.software.clone(),
-        losses,
-        counts: summary.counts,
-        notes,
-        reports: summary.report.into_iter().chain(reports).collect(),
+        reports: replay.report.take().into_iter().chain(reports).collect(),
+        replay,
         settings: setup.pipeline.settings.clone(),
         created: setup.options.created,
     })

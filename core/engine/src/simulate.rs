@@ -134,7 +134,7 @@ impl SimulateOptions {
 /// Chunks that wait for a writer: enough to keep it busy, and memory stays flat.
 const QUEUE: usize = 4;
 
-/// A file that is written on this thread or on one of its own.
+/// A writer on this thread or on one of its own.
 enum Pen<'scope> {
     Here(Box<TelemetryWriter>),
     There { queue: SyncSender<Option<Chunk>>, thread: ScopedJoinHandle<'scope, Result<Option<PathBuf>, WriteError>> },
@@ -144,7 +144,7 @@ impl<'scope> Pen<'scope> {
     fn there(scope: &'scope Scope<'scope, '_>, mut writer: TelemetryWriter) -> Self {
         let (queue, chunks) = sync_channel::<Option<Chunk>>(QUEUE);
         let thread = scope.spawn(move || {
-            // Without the word that all is said, there is no file.
+            // A queue that ends without `None` was abandoned: its file is dropped.
             while let Ok(said) = chunks.recv() {
                 match said {
                     Some(chunk) => writer.write(chunk)?,
@@ -156,7 +156,7 @@ impl<'scope> Pen<'scope> {
         Self::There { queue, thread }
     }
 
-    /// Writes, or asks to; gives the pen back.
+    /// Writes a chunk, or queues it; gives the pen back.
     fn write(self, chunk: Chunk) -> Result<Self, WriteError> {
         match self {
             Self::Here(mut writer) => {
@@ -165,7 +165,7 @@ impl<'scope> Pen<'scope> {
             }
             Self::There { queue, thread } => match queue.send(Some(chunk)) {
                 Ok(()) => Ok(Self::There { queue, thread }),
-                // The other side is gone: it failed at an earlier chunk.
+                // The thread has ended: it failed at an earlier chunk.
                 Err(_) => Err(join(thread).expect_err("a writer stops early only with an error")),
             },
         }
@@ -186,7 +186,7 @@ impl<'scope> Pen<'scope> {
         match self {
             Self::Here(writer) => writer.finish(),
             Self::There { queue, thread } => {
-                // A writer that is gone says why when it is joined.
+                // If the thread has ended, joining it gives its error.
                 let _ = queue.send(None);
                 join(thread).map(|path| path.expect("a writer that is told to finish does"))
             }

@@ -60,25 +60,24 @@ fn screen(ladder: &Ladder, picture: Option<&Path>, paint: Paint) -> String {
     for rung in ladder.revisions.iter().filter(|r| r.held_out.as_ref().is_some_and(|h| h.verdict.is_some())) {
         let Some((verdict, fall)) = rung.held_out.as_ref().and_then(|h| Some((h.verdict?, h.fall?))) else { continue };
         let what = rung.added.join(", ");
-        let (word, sentence) = match verdict {
-            Verdict::Helps => (
-                paint.good("helps"),
-                format!("helps: {what} lowers χ² by {} on days that it was not fitted to", figure(fall)),
-            ),
+        let (painted, sentence) = match verdict {
+            Verdict::Helps => {
+                (paint.good("helps"), format!("{what} lowers χ² by {} on days that it was not fitted to", figure(fall)))
+            }
             Verdict::OverFitted => (
                 paint.bad("over-fitted"),
                 format!(
-                    "over-fitted: {what} raises χ² by {} on days that it was not fitted to; take it out with `dragfree model remove`",
+                    "{what} raises χ² by {} on days that it was not fitted to; take it out with `dragfree model remove`",
                     figure(Fall { delta_chi2: -fall.delta_chi2, ..fall })
                 ),
             ),
             Verdict::Undecided => (
                 paint.doubtful("undecided"),
-                format!("undecided: {what} changes χ² by {}, no more than other epochs may", figure(fall)),
+                format!("{what} changes χ² by {}, no more than other epochs may", figure(fall)),
             ),
         };
-        let plain = sentence.split(':').next().unwrap_or_default().to_owned();
-        screen += &labelled(&format!("{} ", rung.revision), &sentence).replacen(&plain, &word, 1);
+        let sentence = format!("{}: {sentence}", word(verdict));
+        screen += &labelled(&format!("{} ", rung.revision), &sentence).replacen(word(verdict), &painted, 1);
     }
     for note in &ladder.notes {
         screen += &labelled("note", note);
@@ -125,18 +124,21 @@ fn figures(revision: &str, fit: &Fit, fall: Option<Fall>) -> Vec<String> {
     vec![revision.to_owned(), format!("{:.0}", fit.chi2), ratio(fit.chi2_per_dof), ratio(fit.rms), ratio(fit.nis), fall]
 }
 
+fn word(verdict: Verdict) -> &'static str {
+    match verdict {
+        Verdict::Helps => "helps",
+        Verdict::OverFitted => "over-fitted",
+        Verdict::Undecided => "undecided",
+    }
+}
+
 /// The same on the days kept out.
 fn kept_out(ladder: &Ladder) -> String {
     let heading = ["held out", "χ²", "χ²/dof", "rms", "NIS", "χ² falls by", ""];
     let row = |rung: &Rung| {
         let held = rung.held_out.as_ref()?;
-        let word = match held.verdict {
-            None => "",
-            Some(Verdict::Helps) => "helps",
-            Some(Verdict::OverFitted) => "over-fitted",
-            Some(Verdict::Undecided) => "undecided",
-        };
-        Some([figures(&rung.revision, &held.fit, held.fall), vec![word.to_owned()]].concat())
+        let verdict = held.verdict.map_or("", word).to_owned();
+        Some([figures(&rung.revision, &held.fit, held.fall), vec![verdict]].concat())
     };
     let rows = table(&heading, ladder.revisions.iter().filter_map(row));
     if rows.len() > 1 { columns(&rows) + "\n" } else { String::new() }

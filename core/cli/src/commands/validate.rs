@@ -37,7 +37,7 @@ pub(super) fn execute(validate: &Validate, global: &Global, paint: Paint) -> Res
                 let mut result = ask(validate, &path, &check.to_string(), Some((&kind, &id)));
                 result["check"] = json!(check);
                 checks.push(result);
-                // Where it does not come to life or hangs, nothing else can be looked at.
+                // An instance that cannot be created or linked, or hangs, ends the checks.
                 let ends = |c: &Value| {
                     c["stopped"] == true || c["passed"] == false && matches!(check, Check::Create | Check::Link)
                 };
@@ -117,8 +117,7 @@ fn ask(validate: &Validate, path: &Path, check: &str, plugin: Option<(&str, &str
 /// Status, where it ended in time, and what it wrote to stdout and stderr.
 fn answer(command: &mut Command, limit: Duration) -> std::io::Result<(Option<ExitStatus>, String, String)> {
     let mut child = command.spawn()?;
-    // A process that the plugin started may hold the pipes open after the child's end: nobody waits for their end
-    // alone.
+    // A process started by the plugin may keep the pipes open after the child's end, hence the threads and time limits.
     let read = |pipe: Option<Box<dyn std::io::Read + Send>>| {
         let (sender, receiver) = std::sync::mpsc::channel();
         std::thread::spawn(move || {

@@ -1,4 +1,4 @@
-//! A living plugin: made, linked, fed, asked, freed.
+//! A plugin instance: created, linked, fed, asked for report and state, destroyed.
 
 use arrow_schema::{DataType, Fields, ffi::FFI_ArrowSchema};
 use dragfree_abi as abi;
@@ -35,7 +35,7 @@ pub struct ReadColumn {
     pub available: usize,
 }
 
-/// What an instance said when it was linked.
+/// What an instance declared when it was linked.
 #[derive(Clone, Debug, Default)]
 pub struct Linked {
     /// Per input table, in slot order: the columns read.
@@ -59,7 +59,7 @@ pub struct Rows<'a> {
     pub columns: Vec<&'a [f64]>,
 }
 
-/// What a source gave.
+/// One step of a source.
 #[derive(Debug)]
 pub struct SourceStep {
     /// One batch per written table.
@@ -70,14 +70,14 @@ pub struct SourceStep {
     pub done: bool,
 }
 
-/// A living plugin.
+/// A plugin instance.
 #[derive(Debug)]
 pub struct Instance {
     /// Id, with the instance of an effect: `com-offset:tm1`.
     pub name: String,
-    /// The same, for the last words of a crash.
+    /// The same, for the crash report.
     crash_name: Name,
-    /// What it is.
+    /// Source, stage or effect.
     pub kind: Kind,
     node: abi::NodeV1,
     // Lives as long as the node, which holds a pointer to it.
@@ -523,7 +523,7 @@ impl Instance {
         })
     }
 
-    /// Lets it say what it reads and writes.
+    /// Links it: it declares what it reads and writes.
     ///
     /// # Errors
     /// A column is missing or is another than wanted: [`BorderError::Link`] holds the sentence.
@@ -551,7 +551,7 @@ impl Instance {
         let link = self.function(self.node.link, "link")?;
         // SAFETY: every pointer lives during the call.
         let result = self.call("link", |node, error| unsafe { link(node, &raw const raw, error) });
-        // The host's own sentence says more than the plugin's echo of it.
+        // The host's own message is more precise than the plugin's.
         if let Some(sentence) = context.refused {
             self.dead = true;
             return Err(BorderError::Link { plugin: self.name.clone(), sentence });
@@ -570,7 +570,7 @@ impl Instance {
         Ok(linked)
     }
 
-    /// Lets it take memory.
+    /// Lets it allocate for batches of at most `max_rows` rows.
     ///
     /// # Errors
     /// The plugin failed.
@@ -615,7 +615,7 @@ impl Instance {
         Ok(SourceStep { batches, complete_until_ns: progress.complete_until_ns, done: progress.done != 0 })
     }
 
-    /// What a lag held back.
+    /// The rows that a lag held back.
     ///
     /// # Errors
     /// The plugin failed or broke a rule of the border.
@@ -628,7 +628,7 @@ impl Instance {
         batches.ok_or_else(|| self.rule("flush", "nothing to discard here".to_owned()))
     }
 
-    /// The report; keys that it does not have are notes in it.
+    /// The report; unknown keys become notes in it.
     ///
     /// # Errors
     /// The plugin failed, or gave what cannot be understood: the sentence names the key.
@@ -710,7 +710,7 @@ impl Instance {
         let mut arrays: Vec<abi::ArrowArray> = self.output_fields.iter().map(|_| abi::ArrowArray::empty()).collect();
         let pointer = arrays.as_mut_ptr();
         let called = self.call_or_discard(call, |node, error| work(node, pointer, error));
-        // Whatever came of the call, arrays that were filled are taken, and so released.
+        // Arrays are taken, and so released, even after a failed call.
         let batches: Result<Vec<Batch>, String> = arrays
             .into_iter()
             .zip(&self.output_fields)

@@ -1,4 +1,4 @@
-//! Plugin libraries: found, checked, opened, asked what they hold.
+//! Plugin libraries: checked, opened, their manifests read.
 
 use dragfree_abi as abi;
 use dragfree_schema::Manifest;
@@ -49,7 +49,7 @@ pub struct PluginInfo {
     /// Its index in the factory.
     #[serde(skip)]
     pub index: u32,
-    /// What it says of itself.
+    /// Its manifest.
     pub manifest: Manifest,
 }
 

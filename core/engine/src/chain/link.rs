@@ -3,7 +3,7 @@
 use dragfree_schema::{Coefficient, Constraint, NoiseProcess, Settings};
 use serde_json::{Map, Value, json};
 
-use super::{Carry, Chain, ChainError, ChainNode, Queue, Route, Tap};
+use super::{Carry, Chain, ChainError, ChainNode, Queue, Route};
 use crate::border::{BorderError, Config, Instance, Kind, LinkRequest, Linked};
 use crate::config::{EffectEntry, Mission, Model, Node, Pipeline, resolve_parameters};
 use crate::files::sha256;
@@ -31,19 +31,12 @@ pub fn build(
         needs: needs(registry, model),
         settings: &pipeline.settings,
         chain: Chain {
-            nodes: Vec::new(),
-            coefficients: Vec::new(),
-            constraints: Vec::new(),
-            noise: Vec::new(),
-            columns: Vec::new(),
-            not_tried: Vec::new(),
             feed_tables: feed_tables.to_vec(),
             feed_routes: vec![Route::default(); feed_tables.len()],
-            tap: Tap::default(),
             carry: Carry { batch_rows: carry.batch_rows.max(1), ..carry },
             complete_until_ns: i64::MIN,
             mission_sha256: sha256(mission.value.to_string()),
-            model_sha256: String::new(),
+            ..Chain::default()
         },
     };
     for node in &pipeline.nodes {

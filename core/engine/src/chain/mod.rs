@@ -1,8 +1,8 @@
 //! The chain: plugins linked by their columns, rows flowing from the feed through stages and effects.
 //!
-//! Uniform tables are joined row by row, so a stage that is late by a fixed lag delays those behind it and nothing
-//! else; nobody keeps books on lags. Results do not depend on where batches end nor on the number of threads: an
-//! instance sees its rows in one order, whoever carries them.
+//! Uniform tables are joined row by row, so a lag of a stage delays the stages after it and needs no bookkeeping.
+//! Results depend neither on the ends of batches nor on the number of threads: each instance sees its rows in one
+//! order.
 
 mod link;
 mod queue;
@@ -50,7 +50,7 @@ pub enum ChainError {
     Sink(String),
 }
 
-/// Takes rows out of the chain.
+/// A consumer of rows that leave the chain.
 pub trait Sink {
     /// Rows of one table that belongs beside the product, ordered by time.
     ///
@@ -94,6 +94,16 @@ impl ChainNode {
     pub fn name(&self) -> &str {
         &self.instance.name
     }
+
+    /// Rows that one call could take now.
+    fn ready(&self) -> usize {
+        self.inputs.iter().filter(|q| q.uniform).map(Queue::rows).min().unwrap_or(0)
+    }
+
+    /// Whether it goes row by row through some table; others take whatever there is.
+    fn has_uniform(&self) -> bool {
+        self.inputs.iter().any(|q| q.uniform)
+    }
 }
 
 /// Where the rows of a table go.
@@ -128,7 +138,7 @@ impl Default for Carry {
 }
 
 /// A linked chain.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Chain {
     /// Its plugins in order.
     pub nodes: Vec<ChainNode>,
@@ -221,7 +231,7 @@ impl Chain {
         all.filter(|(_, route)| route.archive).map(|(table, _)| table.clone()).collect()
     }
 
-    /// Carries a stretch of the feed as far as it goes.
+    /// Pushes a chunk of the feed through the chain.
     ///
     /// # Errors
     /// A plugin failed, or broke a rule.
@@ -237,7 +247,7 @@ impl Chain {
         Ok(())
     }
 
-    /// The feed is at its end: carries what is left and flushes every lag.
+    /// Ends the feed: processes the remaining rows and flushes every lag.
     ///
     /// # Errors
     /// A plugin failed, or broke a rule.
@@ -276,8 +286,8 @@ impl Chain {
         Ok(reports)
     }
 
-    /// Carries what has come as far as it goes. A plugin may hold rows back for an hour and give them all at once: by
-    /// one call of each in turn, those behind it need not hold what they make of them all at once as well.
+    /// Calls nodes in rounds until none has input. A plugin may hold rows back for an hour and give them at once; one
+    /// call of each node per round bounds the queues after it.
     fn advance(&mut self, sink: &mut dyn Sink) -> Result<(), ChainError> {
         let mut new_rows = true;
         while self.round(new_rows, sink)? {
@@ -286,9 +296,8 @@ impl Chain {
         Ok(())
     }
 
-    /// One call of every node that has rows, and of those that wait for none where there is something new; false where
-    /// there was nothing to do. An effect waits while somebody has a whole batch of its rows that cannot be used yet:
-    /// its inputs are few, and all candidates' series are many.
+    /// Calls each node that has rows once, and with `new_rows` those that read no uniform table; false if none was due.
+    /// An effect waits while a reader has a whole batch of its rows: to queue inputs takes less memory than outputs.
     fn round(&mut self, new_rows: bool, sink: &mut dyn Sink) -> Result<bool, ChainError> {
         let waves = self.nodes.iter().map(|n| n.wave + 1).max().unwrap_or(0);
         let (until, rows) = (self.complete_until_ns, self.carry.batch_rows);
@@ -366,23 +375,11 @@ impl Chain {
 /// Who reads the tap, in messages.
 const TAP: &str = "the host";
 
-/// What a node made in one call: one batch per written table; none where there was nothing to call it for.
+/// What a node made in one call: one batch per written table; `None` if it was not called.
 type Made = Result<Option<Vec<Batch>>, ChainError>;
 
-/// Starting a thread costs about what a few hundred rows of a stage do.
+/// Rows from which a thread is worth its start.
 const SPAWN_WORTH_ROWS: usize = 512;
-
-impl ChainNode {
-    /// Rows that one call could take now.
-    fn ready(&self) -> usize {
-        self.inputs.iter().filter(|q| q.uniform).map(Queue::rows).min().unwrap_or(0)
-    }
-
-    /// Whether it goes row by row through some table; others take whatever there is.
-    fn has_uniform(&self) -> bool {
-        self.inputs.iter().any(|q| q.uniform)
-    }
-}
 
 fn publish(
     nodes: &mut [ChainNode],
@@ -405,8 +402,7 @@ fn publish(
     Ok(())
 }
 
-/// One call of a node, with at most so many rows of a uniform table; one that has none is called where there is
-/// something new.
+/// Calls a node with at most `batch_rows` rows of its uniform tables; one without uniform tables only with `new_rows`.
 fn step(node: &mut ChainNode, complete_until_ns: i64, batch_rows: usize, new_rows: bool) -> Made {
     let rows = node.ready().min(batch_rows);
     if rows == 0 && (node.has_uniform() || !new_rows) {

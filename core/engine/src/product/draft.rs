@@ -2,13 +2,14 @@
 
 use super::ProductError;
 use super::file::{
-    Attachment, Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Loss, Model,
+    Attachment, Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Model,
     NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Supersedes, Variable,
 };
 use crate::border::without_name;
+use crate::feed::Summary;
 use chrono::{DateTime, SecondsFormat, Utc};
 use dragfree_schema::{Report, Settings};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 /// All that a product is made from.
 #[derive(Clone, Debug)]
@@ -27,8 +28,6 @@ pub struct Draft {
     pub first_ns: i64,
     /// Last epoch, Unix ns of `time_scale`.
     pub last_ns: i64,
-    /// `UTC`, `TAI` or `GPS`; empty where the data do not say.
-    pub time_scale: String,
     /// Every file that was read.
     pub inputs: Vec<Input>,
     /// Every plugin that ran, in order.
@@ -37,12 +36,8 @@ pub struct Draft {
     pub model: Model,
     /// Version of the program, with its commit where it is known.
     pub software: String,
-    /// Data that were lost.
-    pub losses: Vec<Loss>,
-    /// Counts of the replay; those of the stages stand in their reports.
-    pub counts: BTreeMap<String, u64>,
-    /// Sentences of the replay; those of the stages stand in their reports.
-    pub notes: Vec<String>,
+    /// Time scale, losses, counts and notes of the replay; those of the stages stand in their reports.
+    pub replay: Summary,
     /// Reports in pipeline order, each with its plugin.
     pub reports: Vec<Report>,
     /// Thresholds.
@@ -109,7 +104,8 @@ pub(super) fn product(
             day: day(draft),
             stream: Stream::Test,
             status: Status::Quicklook,
-            time_scale: if draft.time_scale.is_empty() { "unknown" } else { &draft.time_scale }.to_owned(),
+            time_scale: if draft.replay.time_scale.is_empty() { "unknown" } else { &draft.replay.time_scale }
+                .to_owned(),
             start_time_epoch_ns: draft.first_ns,
             stop_time_epoch_ns: draft.last_ns,
             frames: frames(&result.coefficients),
@@ -128,14 +124,14 @@ pub(super) fn product(
         supersedes,
         inputs: draft.inputs.clone(),
         history: draft.history.clone(),
-        losses: draft.losses.clone(),
+        losses: draft.replay.losses.clone(),
         attachments,
     };
     product.header.non_standard_attributes.sha256 = product.digest();
     Ok(product)
 }
 
-/// The last stage that says something has the word: qp-check stands after the filter and has seen its report.
+/// The value of the last stage that reports one: it has seen the earlier reports.
 fn last<T>(draft: &Draft, get: impl Fn(&Report) -> Option<T>) -> Option<T> {
     draft.reports.iter().rev().find_map(get)
 }
@@ -168,7 +164,7 @@ fn quality(draft: &Draft) -> Quality {
             weak_directions.push(direction.clone());
         }
     }
-    let replayed = Some(("replay".to_owned(), draft.counts.clone())).filter(|(_, counts)| !counts.is_empty());
+    let replayed = Some(("replay".to_owned(), draft.replay.counts.clone())).filter(|(_, counts)| !counts.is_empty());
     let reported =
         |report: &Report| (!report.counts.is_empty()).then(|| (report.plugin.clone(), report.counts.clone()));
     let note = |report: &Report| -> Vec<String> {
@@ -182,10 +178,11 @@ fn quality(draft: &Draft) -> Quality {
         commands: last(draft, |report| report.commands.clone()),
         chi2_per_dof: last(draft, |report| report.chi2_per_dof).unwrap_or(f64::NAN),
         nis: last(draft, |report| report.nis).unwrap_or(f64::NAN),
-        data_loss: !draft.losses.is_empty() || draft.reports.iter().any(|report| report.data_loss),
+        data_loss: !draft.replay.losses.is_empty() || draft.reports.iter().any(|report| report.data_loss),
         inconsistent: draft.reports.iter().any(|report| report.inconsistent),
         weak_directions,
         notes: draft
+            .replay
             .notes
             .iter()
             .map(|note| format!("replay: {note}"))

@@ -1,4 +1,5 @@
 use super::*;
+use crate::feed::Summary;
 use chrono::{DateTime, Utc};
 use dragfree_schema::Report;
 use proptest::prelude::*;
@@ -46,7 +47,6 @@ fn draft(value: f64) -> Draft {
         spacecraft: "SC1".into(),
         first_ns: 2_051_222_400_000_000_000,
         last_ns: 2_051_222_409_900_000_000,
-        time_scale: "UTC".into(),
         inputs: vec![Input { role: "telemetry".into(), name: "a.mcap".into(), size: 7, sha256: ZERO_DIGEST.into() }],
         history: vec![Stage {
             plugin: "qp-check".into(),
@@ -59,9 +59,12 @@ fn draft(value: f64) -> Draft {
         }],
         model: Model { revision: "1".into(), parent: None, effects: vec!["com-offset".into()] },
         software: "0.1.0".into(),
-        losses: Vec::new(),
-        counts: BTreeMap::from([("gaps".into(), 2)]),
-        notes: vec!["a topic is not in the interface".into()],
+        replay: Summary {
+            time_scale: "UTC".into(),
+            counts: BTreeMap::from([("gaps".into(), 2)]),
+            notes: vec!["a topic is not in the interface".into()],
+            ..Summary::default()
+        },
         reports: vec![
             report(json!({"plugin": "es-akf", "nis": 0.99, "epochs_used": 100, "verdict": null})),
             report(qp_report(value)),
@@ -261,7 +264,7 @@ fn a_claim_or_a_file_left_by_a_killed_writer_costs_a_revision_and_nothing_else()
 fn a_failed_commit_leaves_nothing() {
     let folder = tempfile::tempdir().expect("folder");
     let mut bad = draft(0.0909);
-    bad.time_scale = "Mars".into();
+    bad.replay.time_scale = "Mars".into();
     let error = ProductWriter::begin(folder.path()).expect("begin").commit(&bad).expect_err("no such time scale");
     let said = error.to_string();
     assert!(said.contains("/header/non_standard_attributes/time_scale") && said.contains("Mars"), "{said}");

@@ -1,4 +1,4 @@
-//! What a replay met that is not sound data: counted by kind, told in words, never skipped silently.
+//! Defects that a replay finds in its data: counted by kind, described, never skipped silently.
 
 use std::collections::{BTreeMap, BTreeSet};
 

@@ -30,11 +30,11 @@ const BATCHES: [usize; 4] = [EPOCHS, 1, 7, 512];
 pub enum Check {
     /// The manifest says who it is, and every default is one that the parameter's own declaration allows.
     Manifest,
-    /// Every instance comes to life.
+    /// Every instance can be created.
     Create,
     /// Every instance finds its columns, and what it announces is whole.
     Link,
-    /// Times ascend, nothing is infinite; an effect gives a row for a row, and a finite one once it has run in.
+    /// Times ascend, no value is infinite; an effect gives one row per input row, finite after its transient.
     Values,
     /// Missing values are no failure.
     Gaps,
@@ -70,7 +70,7 @@ impl std::fmt::Display for Check {
     }
 }
 
-/// What a check found.
+/// Why a check fails.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum Finding {
@@ -285,7 +285,7 @@ impl Subject<'_> {
                 let what = format!("table {table} has {} rows for {} given", batch.time_ns.len(), times_ns.len());
                 return Err(self.broken(instance, what + "; an effect gives one for each, at its time"));
             }
-            // What has a memory may have to run in.
+            // An effect with memory may have a transient: only the second half must be finite.
             if whole && batch.columns.iter().any(|column| column[column.len() / 2..].iter().any(|x| !x.is_finite())) {
                 return Err(self.broken(instance, format!("table {table} has NaN where every input was finite")));
             }
@@ -370,7 +370,7 @@ impl Subject<'_> {
     }
 }
 
-/// Who it is, in a form that file names, model files and messages can carry; defaults that its own declaration allows.
+/// Checks id, version and texts, and that every default is allowed by the parameter's own declaration.
 fn manifest(manifest: &Manifest, kind: Kind) -> Result<String, Finding> {
     let fail = |what: String| Err(Finding::Manifest(what));
     let plain = |text: &str| {

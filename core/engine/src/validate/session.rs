@@ -1,4 +1,4 @@
-//! An instance that is fed epoch by epoch, and what it gave.
+//! A plugin instance under test: fed with generated rows, its output collected.
 
 use std::ops::Range;
 

@@ -1,4 +1,4 @@
-//! Where a plugin stands while it is checked: the columns of a whole chain, and values for them.
+//! The test environment of a plugin: the columns of a whole chain, and values for them.
 
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;
@@ -136,7 +136,7 @@ fn uniform(seed: u64) -> f64 {
     ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// Bytes without sense.
+/// Pseudo-random bytes.
 pub(super) fn noise_bytes(count: u64) -> Vec<u8> {
     (0..count).map(|k| (256.0 * uniform(k)) as u8).collect()
 }

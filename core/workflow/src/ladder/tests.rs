@@ -97,7 +97,6 @@ impl Made<'_> {
             spacecraft: "SC1".into(),
             first_ns,
             last_ns: first_ns + DAY_NS - 1,
-            time_scale: "UTC".into(),
             inputs: Vec::new(),
             history: self.effects.iter().map(stage).collect(),
             model: product::Model {
@@ -106,9 +105,7 @@ impl Made<'_> {
                 effects: Vec::new(),
             },
             software: "0.1.0".into(),
-            losses: Vec::new(),
-            counts: BTreeMap::new(),
-            notes: Vec::new(),
+            replay: dragfree_engine::feed::Summary { time_scale: "UTC".into(), ..Default::default() },
             reports: vec![serde_json::from_value(report).expect("a report")],
             settings: Default::default(),
             created: chrono::DateTime::UNIX_EPOCH,
