@@ -22,26 +22,14 @@ pub(crate) fn product(product: &Product, path: &Path, paint: Paint) -> String {
     let mut screen = String::new();
     let title = format!("{}  {} {}", product.id(), header.global_attributes.project, header.global_attributes.platform);
     let _ = writeln!(screen, "{}", paint.bold(&title));
-    screen += &text::labelled(
-        "window",
-        &format!(
-            "{} to {} {}",
-            utc::format(attributes.start_time_epoch_ns),
-            utc::format(attributes.stop_time_epoch_ns),
-            attributes.time_scale
-        ),
-    );
+    let (start, stop) = (attributes.start_time_epoch_ns, attributes.stop_time_epoch_ns);
+    let window = format!("{} to {} {}", utc::format(start), utc::format(stop), attributes.time_scale);
     let commands = quality.commands.as_deref().map_or(String::new(), |commands| format!(", commands {commands}"));
-    screen += &text::labelled(
-        "epochs",
-        &format!(
-            "{} used, {} rejected{commands}",
-            text::grouped(quality.epochs_used),
-            text::grouped(quality.epochs_rejected)
-        ),
-    );
-    screen +=
-        &text::labelled("model", &format!("revision {}: {}", product.model.revision, product.model.effects.join(", ")));
+    let (used, rejected) = (text::grouped(quality.epochs_used), text::grouped(quality.epochs_rejected));
+    let model = format!("revision {}: {}", product.model.revision, product.model.effects.join(", "));
+    screen += &text::labelled("window", &window);
+    screen += &text::labelled("epochs", &format!("{used} used, {rejected} rejected{commands}"));
+    screen += &text::labelled("model", &model);
     screen.push('\n');
     screen += &coefficients(&product.result.coefficients);
     screen.push('\n');

@@ -39,7 +39,6 @@ pub enum RegistryError {
 
 impl Registry {
     /// Opens every shared library in the folders. A file that is refused is kept with its reason, and is no error.
-    #[must_use]
     pub fn discover(folders: &[PathBuf]) -> Self {
         let mut this = Self { folders: folders.to_vec(), ..Self::default() };
         let mut seen = std::collections::BTreeSet::new();
@@ -73,7 +72,6 @@ impl Registry {
     }
 
     /// Every file that was refused.
-    #[must_use]
     pub fn refused(&self) -> &[Problem] {
         &self.refused
     }

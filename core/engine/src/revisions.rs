@@ -85,7 +85,6 @@ pub struct Change {
 }
 
 /// What turned the effects `old` into `new`.
-#[must_use]
 pub fn changes(old: &[EffectEntry], new: &[EffectEntry]) -> Vec<Change> {
     let same = |a: &EffectEntry, b: &EffectEntry| a.id == b.id && a.instance == b.instance;
     let mut out = Vec::new();
@@ -175,7 +174,6 @@ impl Edit {
     }
 
     /// The model as it was found.
-    #[must_use]
     pub fn model(&self) -> Option<&Model> {
         self.found.as_ref().map(|(_, model)| model)
     }
@@ -608,7 +606,6 @@ pub fn find(path: &Path, revision: &str) -> Result<(Model, String), RevisionErro
 }
 
 /// `MODEL.history` beside `MODEL.toml`.
-#[must_use]
 pub fn history_folder(path: &Path) -> PathBuf {
     path.with_extension("history")
 }

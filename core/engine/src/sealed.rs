@@ -53,7 +53,6 @@ fn from_hex(text: &str) -> Option<Vec<u8>> {
 
 impl Sealed {
     /// Seals a text.
-    #[must_use]
     pub fn new(content: &str) -> Self {
         let file = json!({
             "format": FORMAT,

@@ -209,7 +209,6 @@ fn test_mass(instance: &str) -> (&str, &str) {
 
 /// True value of a coefficient `com-offset.NAME.AXIS`, m, in the first message of the truth of a simulation, by field
 /// path.
-#[must_use]
 pub fn offset(truth: &BTreeMap<String, f64>, coefficient: &str) -> Option<f64> {
     let (number, axis) = test_mass(coefficient.strip_prefix("com-offset.")?);
     truth.get(&format!("b{number}_orf_m.{axis}")).copied()

@@ -62,7 +62,6 @@ pub fn diagnose(
 
 impl Diagnosed {
     /// Detected transients that no accepted candidate explains, by decreasing significance; of close ones the first.
-    #[must_use]
     pub fn unexplained_transients(&self) -> Vec<&Detection> {
         let seen = self.record.gathered.transients.certain(self.diagnosis.false_alarm_rate);
         unexplained(seen, &self.diagnosis.candidates, self.settings.same_transient_s)

@@ -15,7 +15,7 @@ use std::time::SystemTime;
 /// Done, but data were lost.
 const DATA_LOSS: u8 = 3;
 /// Done, but the model is inconsistent with the data.
-const INCONSISTENT: u8 = 4;
+pub(super) const INCONSISTENT: u8 = 4;
 
 pub(super) fn execute(command: &Run, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let outcome = archive(command, global)?;

@@ -587,7 +587,7 @@ impl Instance {
     pub fn process(&mut self, tables: &[Rows<'_>], complete_until_ns: i64) -> Result<Option<Vec<Batch>>, BorderError> {
         let process = self.function(self.node.process, "process")?;
         let (_owned, arrays): (Vec<_>, Vec<abi::ArrowArray>) =
-            tables.iter().map(|t| arrow::Borrowed::new(t.time_ns, &t.columns)).unzip();
+            tables.iter().map(|t| arrow::borrow(t.time_ns, &t.columns)).unzip();
         let inputs = abi::InputsV1 {
             complete_until_ns,
             table_count: u32::try_from(arrays.len()).unwrap_or(u32::MAX),

@@ -90,7 +90,6 @@ pub struct ChainNode {
 
 impl ChainNode {
     /// Id, with the instance of an effect.
-    #[must_use]
     pub fn name(&self) -> &str {
         &self.instance.name
     }
@@ -220,7 +219,6 @@ impl Chain {
     }
 
     /// Every row before this time has gone into the chain, Unix ns.
-    #[must_use]
     pub fn complete_until_ns(&self) -> i64 {
         self.complete_until_ns
     }

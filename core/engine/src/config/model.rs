@@ -117,7 +117,6 @@ impl Model {
 
     /// Six hexadecimal digits of the SHA-256 of the effects as JSON, keys sorted: comments, formatting, revision and
     /// parent do not enter.
-    #[must_use]
     pub fn digest(&self) -> String {
         let mut effects = serde_json::json!(self.effects);
         effects.sort_all_objects();
@@ -139,20 +138,17 @@ impl Model {
     }
 
     /// Number of a revision: the counter of its name, or the name itself where that is a number.
-    #[must_use]
     pub fn counter(revision: &str) -> Option<u32> {
         Self::parts(revision).map(|(counter, _)| counter).or_else(|| revision.parse().ok())
     }
 
     /// Whether the effects are not those that the revision's name has the digest of.
-    #[must_use]
     pub fn edited_by_hand(&self) -> bool {
         Self::parts(&self.revision).is_some_and(|(_, digest)| digest != self.digest())
     }
 
     /// Revision and parent as products name them. A file that was edited by hand since its revision was made is no
     /// longer that revision: it is a child of it, `2-5f3a9c+0b11d2`.
-    #[must_use]
     pub fn identity(&self) -> (String, Option<String>) {
         if self.edited_by_hand() {
             (format!("{}+{}", self.revision, self.digest()), Some(self.revision.clone()))
@@ -172,7 +168,6 @@ impl std::fmt::Display for EffectEntry {
 
 impl EffectEntry {
     /// An effect whose coefficients are estimated, nothing else said.
-    #[must_use]
     pub fn new(id: &str, instance: &str) -> Self {
         Self {
             id: id.to_owned(),
@@ -184,13 +179,11 @@ impl EffectEntry {
     }
 
     /// Start of the names of its coefficients: `es-gain.tm1.y`, which is the whole name where there is one coefficient.
-    #[must_use]
     pub fn coefficient(&self) -> String {
         if self.instance.is_empty() { self.id.clone() } else { format!("{}.{}", self.id, self.instance) }
     }
 
     /// Whether a coefficient is one of this effect's.
-    #[must_use]
     pub fn owns(&self, coefficient: &str) -> bool {
         coefficient.strip_prefix(&self.coefficient()).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
     }

@@ -198,7 +198,6 @@ pub struct Outcome {
 
 impl Outcome {
     /// The solution to use: the adopted one, else a batch solution, else the first that there is.
-    #[must_use]
     pub fn adopted(&self) -> Vec<&Coefficient> {
         let all = &self.coefficients;
         let of = |role: Role| all.iter().find(|c| c.role == Some(role));
@@ -333,7 +332,6 @@ pub struct Attachment {
 
 impl Product {
     /// `COM1B_2035-01-01_SC1_01_0001`.
-    #[must_use]
     pub fn id(&self) -> &str {
         &self.header.global_attributes.id
     }
@@ -343,7 +341,6 @@ impl Product {
     /// Its bytes are the document as JSON without white space, keys sorted, missing numbers `null`; left out are the
     /// creation date, the id and revision, what it supersedes and the digest itself. The same inputs, plugins,
     /// parameters and model therefore give the same digest, whenever and how often they are run.
-    #[must_use]
     pub fn digest(&self) -> String {
         let mut computed = self.clone();
         computed.supersedes = None;

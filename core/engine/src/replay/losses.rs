@@ -59,7 +59,6 @@ pub enum Finding {
 
 impl Finding {
     /// True where data were there and are not in the tables.
-    #[must_use]
     pub fn is_loss(self) -> bool {
         self <= Self::LateMessages
     }
@@ -82,19 +81,16 @@ pub struct Losses {
 
 impl Losses {
     /// How often `finding` was met.
-    #[must_use]
     pub fn count(&self, finding: Finding) -> u64 {
         self.counts.get(&finding).copied().unwrap_or(0)
     }
 
     /// Everything met, by the key of its kind.
-    #[must_use]
     pub fn counts(&self) -> BTreeMap<String, u64> {
         self.counts.iter().map(|(finding, &count)| (finding.to_string(), count)).collect()
     }
 
     /// What was lost, as a product states it.
-    #[must_use]
     pub fn entries(&self) -> Vec<Loss> {
         let of = |finding| self.messages.iter().filter(move |(f, _)| *f == finding).map(|(_, text)| text.as_str());
         let lost = self.counts.iter().filter(|(finding, _)| finding.is_loss());
@@ -107,13 +103,11 @@ impl Losses {
     }
 
     /// What was odd and cost no data, in the order of its finding: the first sentences of each kind.
-    #[must_use]
     pub fn notes(&self) -> Vec<String> {
         self.messages.iter().filter(|(finding, _)| !finding.is_loss()).map(|(_, text)| text.clone()).collect()
     }
 
     /// True when data were lost.
-    #[must_use]
     pub fn data_loss(&self) -> bool {
         self.counts.keys().any(|f| f.is_loss())
     }

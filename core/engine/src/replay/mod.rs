@@ -144,13 +144,11 @@ impl Replay {
 
     /// The tables, in the order of the interface, housekeeping last by name. A table that is not here is a topic that
     /// no file has.
-    #[must_use]
     pub fn tables(&self) -> &[TableSpec] {
         &self.tables
     }
 
     /// Whose data these are and from when.
-    #[must_use]
     pub fn info(&self) -> &ReplayInfo {
         &self.info
     }
@@ -174,7 +172,6 @@ impl Replay {
     }
 
     /// What was met until the last stretch delivered; complete when [`Replay::next`] has said `None`.
-    #[must_use]
     pub fn losses(&self) -> &Losses {
         &self.losses
     }

@@ -122,7 +122,6 @@ struct Pattern {
 
 impl Encoder {
     /// An encoder of the table from which `message` was made.
-    #[must_use]
     pub fn new(message: MessageType) -> Self {
         Self { message, last: None }
     }

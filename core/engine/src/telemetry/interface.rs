@@ -42,19 +42,16 @@ fn entry(topic: &str) -> Option<&'static Entry> {
 }
 
 /// The message of a topic as the committed interface has it.
-#[must_use]
 pub fn expected(topic: &str) -> Option<&'static Layout> {
     entry(topic).map(|(.., layout)| layout)
 }
 
 /// Name of the message of a topic and the descriptor set that defines it, for a writer.
-#[must_use]
 pub fn descriptor(topic: &str) -> Option<(&'static str, &'static [u8])> {
     entry(topic).map(|(_, message, _)| (*message, DESCRIPTOR))
 }
 
 /// The tables of a spacecraft that sends everything in the interface, without its housekeeping.
-#[must_use]
 pub fn interface_tables() -> Vec<TableSpec> {
     let sent = INTERFACE.iter().filter(|(topic, ..)| !matches!(*topic, TRUTH | "/hk/"));
     sent.map(|(topic, _, layout)| table(topic.trim_start_matches('/'), layout)).collect()

@@ -158,13 +158,11 @@ impl Layout {
     }
 
     /// The columns, in the order of the schema's text.
-    #[must_use]
     pub fn leaves(&self) -> &[Leaf] {
         &self.leaves
     }
 
     /// Paths of the fields that are no column: repeated, text, bytes, 64-bit integers, groups, too deep.
-    #[must_use]
     pub fn ignored(&self) -> &[String] {
         &self.ignored
     }

@@ -6,7 +6,6 @@
 /// of angles inherit from the field that holds them. The tokens after the frame are the unit, none of them meaning a
 /// number (`1`). `orf` is the frame of one optical bench: the digit of the enclosing test mass (`tm1`), or else a digit at
 /// the end of a token before it (`r1_orf_m`), says of which. Without a frame, as for `status`, both are empty.
-#[must_use]
 pub fn unit_and_frame(path: &str) -> (String, String) {
     for component in path.rsplit('.') {
         let tokens: Vec<&str> = component.split('_').collect();

@@ -51,17 +51,10 @@ pub enum Check {
 
 impl Check {
     /// In the order in which they make sense.
-    pub const ALL: [Self; 9] = [
-        Self::Manifest,
-        Self::Create,
-        Self::Link,
-        Self::Values,
-        Self::Gaps,
-        Self::Batches,
-        Self::Replay,
-        Self::State,
-        Self::Garbage,
-    ];
+    pub const ALL: [Self; 9] = {
+        use Check::*;
+        [Manifest, Create, Link, Values, Gaps, Batches, Replay, State, Garbage]
+    };
 }
 
 impl std::fmt::Display for Check {
@@ -412,7 +405,6 @@ fn manifest(manifest: &Manifest, kind: Kind) -> Result<String, Finding> {
 }
 
 /// The result of a check as `dragfree plugins validate` hands it from process to process.
-#[must_use]
 pub fn to_json(result: &Result<String, Finding>) -> Value {
     match result {
         Ok(detail) => json!({ "passed": true, "detail": detail }),
