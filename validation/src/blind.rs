@@ -13,7 +13,8 @@ use std::time::Instant;
 use serde_json::Value;
 
 use crate::blind_report::numbers;
-use crate::campaign::{CampaignError, Meter, file, note, work};
+use crate::campaign::{Meter, note, work};
+use crate::error::{CampaignError, file};
 use crate::program::{Chain, Hidden, Program, root, solution};
 use crate::records::{After, Blind, Results};
 

@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::Instant;
 
+use crate::error::{CampaignError, file};
 use crate::program::{Chain, Program, line, root};
 use crate::records::{Line, Results};
 
@@ -17,33 +18,6 @@ use crate::records::{Line, Results};
 pub(crate) const TWIN_HOURS: f64 = 6.0;
 /// Number of seeds of the twins.
 pub(crate) const TWIN_SEEDS: u32 = 40;
-
-/// Error that stops a campaign.
-#[derive(Debug, thiserror::Error)]
-#[allow(missing_docs, reason = "every field is named in its sentence")]
-pub(crate) enum CampaignError {
-    /// The program did not start.
-    #[error("{command}: {source}")]
-    Start { command: String, source: std::io::Error },
-    /// The program failed.
-    #[error("{command}: {status}\n{message}")]
-    Failed { command: String, status: std::process::ExitStatus, message: String },
-    /// The output has another form than expected.
-    #[error("{command}: {what} is missing in what it printed")]
-    Answer { command: String, what: String },
-    /// A complete line of a file of results is none.
-    #[error("{path}, line {line}: {source}; results are written by `dragfree-validation` alone", path = path.display())]
-    Line { path: PathBuf, line: usize, source: serde_json::Error },
-    /// A bound.
-    #[error(transparent)]
-    Bound(#[from] crate::bound::BoundError),
-    /// A product lacks a part.
-    #[error("configuration {configuration}, seed {seed}: the product lacks {what}")]
-    Product { configuration: String, seed: u32, what: String },
-    /// A file of the campaign.
-    #[error("{path}: {reason}", path = path.display())]
-    File { path: PathBuf, reason: String },
-}
 
 /// A twin.
 #[derive(Clone, Copy, Debug)]
@@ -115,10 +89,6 @@ pub(crate) struct ScratchFolder {
 
 fn write(path: &Path, text: &str) -> Result<(), CampaignError> {
     std::fs::write(path, text).map_err(|e| file(path, &e))
-}
-
-pub(crate) fn file(path: &Path, reason: &dyn std::fmt::Display) -> CampaignError {
-    CampaignError::File { path: path.to_owned(), reason: reason.to_string() }
 }
 
 pub(crate) fn parse(path: &Path) -> Result<toml::Table, CampaignError> {

@@ -5,6 +5,7 @@ mod blind;
 mod blind_report;
 mod bound;
 mod campaign;
+mod error;
 mod program;
 mod records;
 mod report;
@@ -12,8 +13,9 @@ mod speed;
 mod stats;
 mod table;
 
-use campaign::{CampaignError, note};
+use campaign::note;
 use clap::{Args, Parser, Subcommand};
+use error::CampaignError;
 use program::{Program, root};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;

@@ -10,7 +10,7 @@ use std::process::Command;
 
 use dragfree_engine::telemetry::first_message;
 
-use crate::campaign::{CampaignError, file};
+use crate::error::{CampaignError, file};
 use crate::records::{COEFFICIENTS, Line, Solution, rounded};
 
 /// The repository.

@@ -1,6 +1,6 @@
 //! Results on disk: one JSON line per configuration and seed, appended as soon as it is known.
 
-use crate::campaign::{CampaignError, file};
+use crate::error::{CampaignError, file};
 use nalgebra::DMatrix;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};

@@ -9,7 +9,8 @@ use std::path::{Path, PathBuf};
 
 use crate::blind_report;
 use crate::bound::free_space;
-use crate::campaign::{CampaignError, NOMINAL, TWINS, Twin, file, note, taiji};
+use crate::campaign::{NOMINAL, TWINS, Twin, note, taiji};
+use crate::error::{CampaignError, file};
 use crate::program::root;
 use crate::records::{Blind, Line, Solution, read};
 use crate::speed::Speed;

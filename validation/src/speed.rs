@@ -7,7 +7,8 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
-use crate::campaign::{CampaignError, ScratchFolder, file, science_mode, taiji};
+use crate::campaign::{ScratchFolder, science_mode, taiji};
+use crate::error::{CampaignError, file};
 use crate::program::{Chain, Program, root};
 use crate::stats::median;
 

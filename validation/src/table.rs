@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
 use crate::bound::Case;
-use crate::campaign::{CampaignError, Meter, ScratchFolder, file, note, parse, science_mode, work};
+use crate::campaign::{Meter, ScratchFolder, note, parse, science_mode, work};
+use crate::error::{CampaignError, file};
 use crate::program::{Chain, Program, line, root};
 use crate::records::{Keyed, Line, Results, rounded};
 

@@ -100,11 +100,10 @@ impl Registry {
             }),
             (None, _) => {
                 let folders: Vec<_> = self.folders.iter().map(|f| f.display().to_string()).collect();
-                let near = match self.refused.iter().find(|r| r.path.to_string_lossy().contains(&id.replace('-', "_")))
-                {
-                    Some(refused) => format!(" ({} was refused: {})", refused.path.display(), refused.reason),
-                    None => String::new(),
-                };
+                let file = id.replace('-', "_");
+                let refused = self.refused.iter().find(|r| r.path.to_string_lossy().contains(&file));
+                let near =
+                    refused.map(|r| format!(" ({} was refused: {})", r.path.display(), r.reason)).unwrap_or_default();
                 Err(RegistryError::Unknown { kind, id: id.to_owned(), folders: folders.join(", "), near })
             }
         }

@@ -8,7 +8,7 @@
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File};
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 
@@ -468,12 +468,12 @@ impl Lock {
         path.push(".lock");
         let path = PathBuf::from(path);
         if fs::metadata(model).is_ok_and(|m| m.permissions().readonly()) {
-            return Ok(Err(ErrorKind::PermissionDenied.into()).at("change the read-only", model)?);
+            let source = ErrorKind::PermissionDenied.into();
+            return Err(IoError { action: "change the read-only", path: model.to_owned(), source }.into());
         }
-        match OpenOptions::new().write(true).create_new(true).open(&path) {
-            Ok(file) => Ok(Self { path, file, renamed: false }),
+        match File::create_new(&path) {
             Err(error) if error.kind() == ErrorKind::AlreadyExists => Err(RevisionError::Locked { path }),
-            Err(error) => Ok(Err(error).at("lock the model file with", path)?),
+            made => Ok(Self { file: made.at("lock the model file with", &path)?, path, renamed: false }),
         }
     }
 

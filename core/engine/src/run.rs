@@ -322,18 +322,13 @@ impl Series {
             version: setup.options.software.clone(),
             ..FileHeader::default()
         };
-        let writer = if tables.is_empty() {
-            None
-        } else {
-            Some(TelemetryWriter::create(&product.staged("mcap"), &tables, &header)?)
-        };
+        let create = || TelemetryWriter::create(&product.staged("mcap"), &tables, &header);
+        let writer = (!tables.is_empty()).then(create).transpose()?;
         Ok(Self { last_ns: vec![None; tables.len()], tables, writer })
     }
 
     fn finish(self) -> Result<(), EngineError> {
-        if let Some(writer) = self.writer {
-            writer.finish()?;
-        }
+        self.writer.map(TelemetryWriter::finish).transpose()?;
         Ok(())
     }
 }

@@ -6,7 +6,7 @@ use crate::failure::{Failure, Refusal};
 use crate::installed;
 use crate::text::quoted;
 use dragfree_engine::files::IoContext as _;
-use std::fs::OpenOptions;
+use std::fs::File;
 use std::io::Write as _;
 use std::path::Path;
 
@@ -60,7 +60,7 @@ pub(super) fn execute(init: &Init, json: bool) -> Result<Done, Failure> {
         return Err(Refusal::Taken(taken.clone()).into());
     }
     for (path, (_, text)) in places.iter().zip(&texts) {
-        let made = OpenOptions::new().write(true).create_new(true).open(path);
+        let made = File::create_new(path);
         made.and_then(|mut file| file.write_all(text.as_bytes())).at("write", path)?;
     }
     let files = places.each_ref().map(|path| path.display().to_string());

@@ -177,24 +177,11 @@ impl Builder<'_> {
             }
             self.chain.coefficients.push(c);
         }
-        match unused.first() {
-            Some(key) => {
-                let names: Vec<_> = self
-                    .chain
-                    .coefficients
-                    .iter()
-                    .filter(|c| c.effect == entry.id && c.instance == entry.instance)
-                    .map(|c| c.name.as_str())
-                    .collect();
-                Err(self.model_error(format!(
-                    "effect {}:{}: prior.{key} is no coefficient; it has {}",
-                    entry.id,
-                    entry.instance,
-                    names.join(", ")
-                )))
-            }
-            None => Ok(()),
-        }
+        let Some(key) = unused.first() else { return Ok(()) };
+        let own = |c: &&Coefficient| c.effect == entry.id && c.instance == entry.instance;
+        let names: Vec<_> = self.chain.coefficients.iter().filter(own).map(|c| c.name.as_str()).collect();
+        let (id, instance, names) = (&entry.id, &entry.instance, names.join(", "));
+        Err(self.model_error(format!("effect {id}:{instance}: prior.{key} is no coefficient; it has {names}")))
     }
 
     fn add(

@@ -11,7 +11,7 @@ use crate::files::{IoContext as _, Problem, sha256_of, sync_folder};
 use chrono::NaiveDate;
 use dragfree_schema::Report;
 use std::collections::BTreeMap;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File};
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -182,10 +182,12 @@ impl Claim {
     /// `None` where another writer has it. A claim that a killed writer left costs one revision number, no more.
     fn take(archive: &Path, stem: &str, revision: u32) -> Result<Option<Self>, ProductError> {
         let path = archive.join(format!(".{stem}_{revision:04}.claim"));
-        match OpenOptions::new().write(true).create_new(true).open(&path) {
-            Ok(_) => Ok(Some(Self(path))),
+        match File::create_new(&path) {
             Err(error) if error.kind() == ErrorKind::AlreadyExists => Ok(None),
-            Err(error) => Ok(Err(error).at("write", path)?),
+            made => {
+                made.at("write", &path)?;
+                Ok(Some(Self(path)))
+            }
         }
     }
 }

@@ -112,20 +112,12 @@ pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) 
 /// `A` of `battery_current_a`; a housekeeping name ends with its unit.
 fn housekeeping_unit(name: &str) -> String {
     match name.rsplit('_').next().unwrap_or_default() {
-        "a" => "A",
-        "k" => "K",
-        "v" => "V",
-        "w" => "W",
-        "t" => "T",
-        "c" => "C",
-        "pa" => "Pa",
-        "hz" => "Hz",
-        "kg" => "kg",
-        "rad" => "rad",
-        "m" => "m",
-        _ => "1",
+        letter @ ("a" | "k" | "v" | "w" | "t" | "c") => letter.to_ascii_uppercase(),
+        unit @ ("kg" | "rad" | "m") => unit.to_owned(),
+        "pa" => "Pa".to_owned(),
+        "hz" => "Hz".to_owned(),
+        _ => "1".to_owned(),
     }
-    .to_owned()
 }
 
 /// A number in `0..1` that depends on all bits of `seed` (SplitMix64's mixing).
