@@ -8,24 +8,19 @@
 use std::ffi::OsStr;
 use std::ops::RangeInclusive;
 use std::path::Path;
-use std::sync::Mutex;
 use std::time::Instant;
 
 use serde_json::Value;
 
 use crate::blind_report::numbers;
-use crate::campaign::{CampaignError, Meter, note, work};
+use crate::campaign::{Meter, note, work};
+use crate::error::{CampaignError, file};
 use crate::program::{Chain, Hidden, Program, root, solution};
 use crate::records::{After, Blind, Results};
 
-/// Seeds up to this one were used in development and are excluded.
-pub const DEVELOPED_ON: u32 = 100;
-
 /// Runs the seeds that `results` lacks, `at_once` in parallel.
-///
-/// # Errors
-/// [`CampaignError`]; results so far are on disk, and the next call continues.
-pub fn blind(
+/// After an error the results so far are on disk, and the next call continues.
+pub(crate) fn blind(
     program: &Program,
     seeds: RangeInclusive<u32>,
     hours: f64,
@@ -41,11 +36,10 @@ pub fn blind(
     }
     let left: Vec<u32> = seeds.filter(|seed| !results.has(&configuration, *seed)).collect();
     let meter = Meter::new(left.len() as f64);
-    let results = Mutex::new(results);
     let pipeline = root().join("fixtures/pipelines/science-mode.toml");
     work(left, at_once, |seed| {
         let folder = scratch.join(format!("blind-{seed}"));
-        let io = |e: std::io::Error| CampaignError::File { path: folder.clone(), reason: e.to_string() };
+        let io = |e: std::io::Error| file(&folder, &e);
         if folder.exists() {
             std::fs::remove_dir_all(&folder).map_err(io)?;
         }
@@ -80,20 +74,13 @@ pub fn blind(
             },
             score: score.clone(),
         };
-        if let Ok(mut results) = results.lock() {
-            results.append(line)?;
-        }
+        results.append(line)?;
         std::fs::remove_dir_all(&folder).map_err(io)?;
         meter.say(1.0, &format!("seed {seed}: {} ({diagnosis_s} s)", score["verdict"].as_str().unwrap_or("?")));
         Ok(())
     })?;
-    match results.into_inner() {
-        Ok(results) => {
-            note(&numbers(&results.lines).0);
-            Ok(results.sort(&[&configuration])?)
-        }
-        Err(_) => Ok(()),
-    }
+    note(&numbers(&results.sort(&[&configuration])?).0);
+    Ok(())
 }
 
 /// Offset between the seed of the noise and that of the withheld telemetry.
@@ -131,7 +118,7 @@ impl Set<'_> {
         unseen: &Hidden,
         lacks: &impl Fn(String) -> CampaignError,
     ) -> Result<After, CampaignError> {
-        let io = |e: std::io::Error| CampaignError::File { path: self.folder.to_owned(), reason: e.to_string() };
+        let io = |e: std::io::Error| file(self.folder, &e);
         let [bare, found, knowing] = ["bare", "found", "knowing"].map(|name| self.folder.join(format!("{name}.toml")));
         for model in [&found, &knowing] {
             std::fs::copy(&bare, model).map_err(io)?;

@@ -86,8 +86,7 @@ fn rms(values: &[f64]) -> f64 {
 }
 
 /// Generated part of VALIDATION.md, and the missed bars.
-#[must_use]
-pub fn numbers(lines: &[Blind]) -> (String, Vec<String>) {
+pub(crate) fn numbers(lines: &[Blind]) -> (String, Vec<String>) {
     if lines.is_empty() {
         return ("Not measured yet.\n".to_owned(), Vec::new());
     }
@@ -241,10 +240,7 @@ fn kinds(singles: &[Acted<'_>]) -> String {
 }
 
 /// Confusion matrices of the sets with at most one effect: hidden effect against first answer. `None` without results.
-///
-/// # Errors
-/// [`ChartError`].
-pub fn picture(lines: &[Blind]) -> Result<Option<String>, ChartError> {
+pub(crate) fn picture(lines: &[Blind]) -> Result<Option<String>, ChartError> {
     let plain = |a: &Acted<'_>| a.drawn().max(a.at_hand().unwrap_or(0.0)) >= PLAIN;
     let mut tables = Vec::new();
     for (title, wanted) in

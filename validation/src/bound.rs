@@ -27,7 +27,7 @@ const LOWEST_HZ: f64 = 1e-5;
 
 /// Error of a bound.
 #[derive(Debug, thiserror::Error)]
-pub enum BoundError {
+pub(crate) enum BoundError {
     /// The mission lacks something.
     #[error(transparent)]
     Mission(#[from] MissionError),
@@ -45,52 +45,49 @@ type WrenchPsd = Box<dyn Fn(f64) -> Matrix6<f64>>;
 type OpenLoop = Box<dyn Fn(f64) -> [C64; 3]>;
 
 /// Inputs of the two spectra.
-pub struct Case {
+pub(crate) struct Case {
     /// Sampling interval, s.
-    pub dt_s: f64,
+    pub(crate) dt_s: f64,
     /// Mass of the spacecraft, kg.
-    pub mass_kg: f64,
+    pub(crate) mass_kg: f64,
     /// Inverse inertia, SRF, kg⁻¹ m⁻².
-    pub inertia_inverse: Matrix3<f64>,
+    pub(crate) inertia_inverse: Matrix3<f64>,
     /// The test masses.
-    pub test_masses: Vec<TestMass>,
+    pub(crate) test_masses: Vec<TestMass>,
     /// Noise of the thrusters.
-    pub wrench_psd: WrenchPsd,
+    pub(crate) wrench_psd: WrenchPsd,
     /// Noise of the attitude readout, rad.
-    pub attitude: NoiseShape,
+    pub(crate) attitude: NoiseShape,
     /// Attitude control.
-    pub open_loop: OpenLoop,
+    pub(crate) open_loop: OpenLoop,
 }
 
 /// What the channels of one test mass depend on.
-pub struct TestMass {
+pub(crate) struct TestMass {
     /// `T_S^O`.
-    pub dcm_orf_from_srf: Matrix3<f64>,
+    pub(crate) dcm_orf_from_srf: Matrix3<f64>,
     /// Its offset, ORF, m: the lever of the unknown torque.
-    pub offset_orf_m: Vector3<f64>,
+    pub(crate) offset_orf_m: Vector3<f64>,
     /// Noise of the displacement readouts, m.
-    pub readout: [NoiseShape; 3],
+    pub(crate) readout: [NoiseShape; 3],
     /// Accelerations of the test mass itself, m s⁻².
-    pub stray: [NoiseShape; 3],
+    pub(crate) stray: [NoiseShape; 3],
 }
 
 /// σ of the offsets, m: x, y, z of each test mass, ORF.
 #[derive(Clone, Debug, PartialEq)]
-pub struct InformationBound {
+pub(crate) struct InformationBound {
     /// Each test mass from its own three channels.
-    pub single_m: Vec<f64>,
+    pub(crate) single_m: Vec<f64>,
     /// All test masses together, without the survey.
-    pub joint_m: Vec<f64>,
+    pub(crate) joint_m: Vec<f64>,
     /// All, tied by surveyed baselines.
-    pub surveyed_m: Vec<f64>,
+    pub(crate) surveyed_m: Vec<f64>,
 }
 
 impl Case {
     /// The case of a mission.
-    ///
-    /// # Errors
-    /// [`BoundError`]: the mission lacks a noise level or a controller design.
-    pub fn of(mission: &Mission) -> Result<Self, BoundError> {
+    pub(crate) fn of(mission: &Mission) -> Result<Self, BoundError> {
         const NEEDED_BY: &str = "the information bound";
         let n = &mission.noise;
         macro_rules! shape {
@@ -193,10 +190,7 @@ impl Case {
     }
 
     /// Bounds for `span_s` seconds of data in a band, Hz.
-    ///
-    /// # Errors
-    /// [`BoundError::Singular`].
-    pub fn bound_in(&self, span_s: f64, band_hz: std::ops::Range<f64>) -> Result<InformationBound, BoundError> {
+    pub(crate) fn bound_in(&self, span_s: f64, band_hz: std::ops::Range<f64>) -> Result<InformationBound, BoundError> {
         const NOISE: BoundError = BoundError::Singular("the noise of the channels");
         const SEEN: BoundError = BoundError::Singular("the information");
         let test_masses = self.test_masses.len();
@@ -242,10 +236,7 @@ impl Case {
     }
 
     /// Bounds for `span_s` seconds of data, up to Nyquist.
-    ///
-    /// # Errors
-    /// [`BoundError::Singular`].
-    pub fn bound(&self, span_s: f64) -> Result<InformationBound, BoundError> {
+    pub(crate) fn bound(&self, span_s: f64) -> Result<InformationBound, BoundError> {
         self.bound_in(span_s, LOWEST_HZ..0.5 / self.dt_s * (1.0 - 1e-9))
     }
 }
@@ -256,8 +247,7 @@ fn sigmas_of(covariance: &DMatrix<f64>) -> Vec<f64> {
 
 /// Orthonormal basis, 6 × 3, of the directions that the survey leaves free: both housings along an axis of SRF
 /// together.
-#[must_use]
-pub fn free_space(dcm_orf_from_srf: &[Matrix3<f64>; 2]) -> DMatrix<f64> {
+pub(crate) fn free_space(dcm_orf_from_srf: &[Matrix3<f64>; 2]) -> DMatrix<f64> {
     DMatrix::from_fn(6, 3, |row, axis| dcm_orf_from_srf[row / 3][(row % 3, axis)] * 0.5_f64.sqrt())
 }
 

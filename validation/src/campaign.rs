@@ -10,172 +10,75 @@ use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::Instant;
 
-use crate::program::{Chain, Program, ProgramError, line, root};
-use crate::records::{Line, RecordError, Results};
+use crate::error::{CampaignError, file};
+use crate::program::{Chain, Program, line, root};
+use crate::records::{Line, Results};
 
 /// Length of a twin, h.
-pub const TWIN_HOURS: f64 = 6.0;
+pub(crate) const TWIN_HOURS: f64 = 6.0;
 /// Number of seeds of the twins.
-pub const TWIN_SEEDS: u32 = 40;
-
-/// Error that stops a campaign.
-#[derive(Debug, thiserror::Error)]
-pub enum CampaignError {
-    /// The program.
-    #[error(transparent)]
-    Program(#[from] ProgramError),
-    /// The results.
-    #[error(transparent)]
-    Record(#[from] RecordError),
-    /// A bound.
-    #[error(transparent)]
-    Bound(#[from] crate::bound::BoundError),
-    /// A product lacks a part.
-    #[error("configuration {configuration}, seed {seed}: the product lacks {what}")]
-    Product {
-        /// Configuration.
-        configuration: String,
-        /// Seed.
-        seed: u32,
-        /// What is missing.
-        what: String,
-    },
-    /// A file of the campaign.
-    #[error("{path}: {reason}", path = path.display())]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        reason: String,
-    },
-}
-
-/// Difference between the mission file given to `run` and the truth.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Belief {
-    /// Nothing.
-    True,
-    /// PSDs of `[noise]` tables, scaled by a factor.
-    Scaled(&'static [&'static str], f64),
-}
+pub(crate) const TWIN_SEEDS: u32 = 40;
 
 /// A twin.
 #[derive(Clone, Copy, Debug)]
-pub struct Twin {
+pub(crate) struct Twin {
     /// Name; the configuration adds `unprotected` or `product`.
-    pub name: &'static str,
+    pub(crate) name: &'static str,
     /// Description in the report.
-    pub words: &'static str,
-    /// Mission file of `run`.
-    pub belief: Belief,
+    pub(crate) words: &'static str,
+    /// Noise tables whose PSD is scaled by a factor in the mission file of `run`.
+    pub(crate) scaled: Option<(&'static [&'static str], f64)>,
     /// Effects in the simulation that the model lacks.
-    pub effects: &'static [&'static str],
+    pub(crate) effects: &'static [&'static str],
     /// Whether it also runs as the product.
-    pub with_product: bool,
+    pub(crate) with_product: bool,
     /// Seeds.
-    pub seeds: u32,
+    pub(crate) seeds: u32,
 }
 
 const THRUST: &[&str] = &["thruster_force", "thruster_torque"];
 const READOUTS: &[&str] = &["ifo_x", "is_x", "is_y", "is_z", "is_angle", "dws_local", "dws_long_arm"];
 const LOUD_IS: &[&str] = &["is-noise:tm1.y=2", "is-noise:tm1.z=2", "is-noise:tm2.y=2", "is-noise:tm2.z=2"];
 
+const fn twin(name: &'static str, words: &'static str, scaled: Option<(&'static [&'static str], f64)>) -> Twin {
+    Twin { name, words, scaled, effects: &[], with_product: true, seeds: TWIN_SEEDS }
+}
+
+/// A twin of one noise alone, unprotected only.
+const fn alone(name: &'static str, words: &'static str, noise: &'static [&'static str], power: f64) -> Twin {
+    Twin { with_product: false, seeds: TWIN_SEEDS / 2, ..twin(name, words, Some((noise, power))) }
+}
+
 /// All twins; the first is the control, without error.
-pub const TWINS: [Twin; 9] = [
-    Twin {
-        name: "control",
-        words: "nothing wrong",
-        belief: Belief::True,
-        effects: &[],
-        with_product: true,
-        seeds: TWIN_SEEDS,
-    },
-    Twin {
-        name: "q-times-10",
-        words: "thrust noise believed 10 times in power (Q×10)",
-        belief: Belief::Scaled(THRUST, 10.0),
-        effects: &[],
-        with_product: true,
-        seeds: TWIN_SEEDS,
-    },
-    Twin {
-        name: "q-over-10",
-        words: "thrust noise believed 1/10 (Q/10)",
-        belief: Belief::Scaled(THRUST, 0.1),
-        effects: &[],
-        with_product: true,
-        seeds: TWIN_SEEDS,
-    },
-    Twin {
-        name: "r-times-10",
-        words: "readout noise believed 10 times (R×10)",
-        belief: Belief::Scaled(READOUTS, 10.0),
-        effects: &[],
-        with_product: true,
-        seeds: TWIN_SEEDS,
-    },
-    Twin {
-        name: "is-noise-times-2",
-        words: "capacitive noise doubled in truth",
-        belief: Belief::True,
-        effects: LOUD_IS,
-        with_product: true,
-        seeds: TWIN_SEEDS,
-    },
-    Twin {
-        name: "force-times-10",
-        words: "force noise alone believed 10 times",
-        belief: Belief::Scaled(&["thruster_force"], 10.0),
-        effects: &[],
-        with_product: false,
-        seeds: TWIN_SEEDS / 2,
-    },
-    Twin {
-        name: "force-over-10",
-        words: "force noise alone believed 1/10",
-        belief: Belief::Scaled(&["thruster_force"], 0.1),
-        effects: &[],
-        with_product: false,
-        seeds: TWIN_SEEDS / 2,
-    },
-    Twin {
-        name: "torque-times-10",
-        words: "torque noise alone believed 10 times",
-        belief: Belief::Scaled(&["thruster_torque"], 10.0),
-        effects: &[],
-        with_product: false,
-        seeds: TWIN_SEEDS / 2,
-    },
-    Twin {
-        name: "torque-over-10",
-        words: "torque noise alone believed 1/10",
-        belief: Belief::Scaled(&["thruster_torque"], 0.1),
-        effects: &[],
-        with_product: false,
-        seeds: TWIN_SEEDS / 2,
-    },
+pub(crate) const TWINS: [Twin; 9] = [
+    twin("control", "nothing wrong", None),
+    twin("q-times-10", "thrust noise believed 10 times in power (Q×10)", Some((THRUST, 10.0))),
+    twin("q-over-10", "thrust noise believed 1/10 (Q/10)", Some((THRUST, 0.1))),
+    twin("r-times-10", "readout noise believed 10 times (R×10)", Some((READOUTS, 10.0))),
+    Twin { effects: LOUD_IS, ..twin("is-noise-times-2", "capacitive noise doubled in truth", None) },
+    alone("force-times-10", "force noise alone believed 10 times", &["thruster_force"], 10.0),
+    alone("force-over-10", "force noise alone believed 1/10", &["thruster_force"], 0.1),
+    alone("torque-times-10", "torque noise alone believed 10 times", &["thruster_torque"], 10.0),
+    alone("torque-over-10", "torque noise alone believed 1/10", &["thruster_torque"], 0.1),
 ];
 
 impl Twin {
     /// Name of its unprotected configuration.
-    #[must_use]
-    pub fn unprotected(&self) -> String {
+    pub(crate) fn unprotected(&self) -> String {
         format!("{} unprotected", self.name)
     }
 
     /// Name of its product configuration.
-    #[must_use]
-    pub fn product(&self) -> String {
+    pub(crate) fn product(&self) -> String {
         format!("{} product", self.name)
     }
 }
 
 /// Name of the configuration without twin.
-pub const NOMINAL: &str = "nominal";
+pub(crate) const NOMINAL: &str = "nominal";
 
 /// All configurations in the order of the results.
-#[must_use]
-pub fn configurations() -> Vec<String> {
+pub(crate) fn configurations() -> Vec<String> {
     std::iter::once(NOMINAL.to_owned()).chain(TWINS.iter().flat_map(|t| [t.unprotected(), t.product()])).collect()
 }
 
@@ -186,10 +89,6 @@ pub(crate) struct ScratchFolder {
 
 fn write(path: &Path, text: &str) -> Result<(), CampaignError> {
     std::fs::write(path, text).map_err(|e| file(path, &e))
-}
-
-pub(crate) fn file(path: &Path, reason: &dyn std::fmt::Display) -> CampaignError {
-    CampaignError::File { path: path.to_owned(), reason: reason.to_string() }
 }
 
 pub(crate) fn parse(path: &Path) -> Result<toml::Table, CampaignError> {
@@ -274,7 +173,7 @@ impl ScratchFolder {
             chain.pipeline = self.path("unprotected.toml");
             write(&chain.pipeline, &pipeline.to_string())?;
         }
-        if let Belief::Scaled(noises, power) = twin.belief {
+        if let Some((noises, power)) = twin.scaled {
             let frozen = self.path("controllers.toml");
             if !frozen.exists() {
                 program.freeze(&taiji(), &frozen)?;
@@ -333,7 +232,7 @@ impl Meter {
 }
 
 /// A line on stderr.
-pub fn note(text: &str) {
+pub(crate) fn note(text: &str) {
     use std::io::Write as _;
     let _ = writeln!(std::io::stderr(), "{text}"); // no way to report a failing stderr
 }
@@ -365,10 +264,8 @@ pub(crate) fn work<T: Send>(
 }
 
 /// Runs the seeds that `results` lacks, and the twins of those seeds.
-///
-/// # Errors
-/// [`CampaignError`]; results so far are on disk, and the next call continues.
-pub fn coverage(
+/// After an error the results so far are on disk, and the next call continues.
+pub(crate) fn coverage(
     program: &Program,
     seeds: std::ops::RangeInclusive<u32>,
     results: &Path,
@@ -403,7 +300,6 @@ pub fn coverage(
         }
     }
     let meter = Meter::new(tasks.iter().map(Task::weight).sum());
-    let results = Mutex::new(results);
     // Two single-threaded days in parallel are faster than two days in sequence on two threads.
     work(tasks, 2, |task| {
         let weight = task.weight();
@@ -417,19 +313,13 @@ pub fn coverage(
             let product = program.run(&chain, &simulated.files, &folder.join(format!("archive-{i}")))?;
             let found = line(&configuration, task.seed, &build, &simulated.truth_m, &product)
                 .map_err(|what| CampaignError::Product { configuration, seed: task.seed, what })?;
-            if let Ok(mut results) = results.lock() {
-                results.append(found)?;
-            }
+            results.append(found)?;
         }
         std::fs::remove_dir_all(&folder).map_err(|e| file(&folder, &e))?;
         meter.say(weight, &name);
         Ok(())
     })?;
-    let order = configurations();
-    if let Ok(results) = results.into_inner() {
-        results.sort(&order.iter().map(String::as_str).collect::<Vec<_>>())?;
-    }
-    Ok(())
+    results.sort(&configurations()).map(drop)
 }
 
 #[cfg(test)]
@@ -455,8 +345,8 @@ mod tests {
         let names = configurations();
         let distinct: std::collections::BTreeSet<&String> = names.iter().collect();
         assert_eq!(distinct.len(), names.len());
-        assert!(TWINS[0].belief == Belief::True && TWINS[0].effects.is_empty());
-        assert!(TWINS[1..].iter().all(|t| t.belief != Belief::True || !t.effects.is_empty()));
+        assert!(TWINS[0].scaled.is_none() && TWINS[0].effects.is_empty());
+        assert!(TWINS[1..].iter().all(|t| t.scaled.is_some() || !t.effects.is_empty()));
     }
 
     #[test]

@@ -1,9 +1,22 @@
-//! `dragfree-validation`: runs the measurements, and writes the generated parts of VALIDATION.md.
+//! Measurements behind VALIDATION.md: seeded campaigns of the program, statistics with bounds, information bounds from
+//! the mission's noise, and the report generated from committed results.
 
+mod blind;
+mod blind_report;
+mod bound;
+mod campaign;
+mod error;
+mod program;
+mod records;
+mod report;
+mod speed;
+mod stats;
+mod table;
+
+use campaign::note;
 use clap::{Args, Parser, Subcommand};
-use dragfree_validation::campaign::{self, CampaignError, note};
-use dragfree_validation::program::{Program, root};
-use dragfree_validation::{blind, report, speed, table};
+use error::CampaignError;
+use program::{Program, root};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::process::ExitCode;

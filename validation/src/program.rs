@@ -1,5 +1,6 @@
 //! The program under test, called as a user calls it: `dragfree simulate`, then `dragfree run`.
 
+use serde::Deserialize;
 use serde_json::Value;
 use sha2::{Digest as _, Sha256};
 use std::collections::BTreeMap;
@@ -9,99 +10,65 @@ use std::process::Command;
 
 use dragfree_engine::telemetry::first_message;
 
+use crate::error::{CampaignError, file};
 use crate::records::{COEFFICIENTS, Line, Solution, rounded};
 
-/// Error of a run.
-#[derive(Debug, thiserror::Error)]
-pub enum ProgramError {
-    /// The program did not start.
-    #[error("{command}: {source}")]
-    Start {
-        /// What was called.
-        command: String,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// The program failed.
-    #[error("{command}: {status}\n{message}")]
-    Failed {
-        /// What was called.
-        command: String,
-        /// Exit status.
-        status: std::process::ExitStatus,
-        /// Its message.
-        message: String,
-    },
-    /// The output has another form than expected.
-    #[error("{command}: {what} is missing in what it printed")]
-    Answer {
-        /// What was called.
-        command: String,
-        /// Missing part.
-        what: String,
-    },
-    /// A file of the run cannot be read or removed.
-    #[error("{path}: {reason}", path = path.display())]
-    File {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        reason: String,
-    },
-}
-
 /// The repository.
-#[must_use]
-pub fn root() -> &'static Path {
+pub(crate) fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap_or(Path::new("."))
 }
 
 /// The built program.
 #[derive(Clone, Debug)]
-pub struct Program {
+pub(crate) struct Program {
     exe: PathBuf,
     threads: usize,
 }
 
 /// Telemetry of a simulation, from which the truth was read and removed before any calibration.
 #[derive(Clone, Debug)]
-pub struct Simulated {
+pub(crate) struct Simulated {
     /// The files, oldest first.
-    pub files: Vec<PathBuf>,
+    pub(crate) files: Vec<PathBuf>,
     /// True offsets, m.
-    pub truth_m: [f64; 6],
+    pub(crate) truth_m: [f64; 6],
+}
+
+/// What `dragfree simulate --json` prints.
+#[derive(Deserialize)]
+struct Made {
+    files: Vec<PathBuf>,
+    truth_files: Vec<PathBuf>,
+    sealed_file: Option<PathBuf>,
 }
 
 /// Telemetry of a simulation with hidden effects, and its sealed truth in another folder.
 #[derive(Clone, Debug)]
-pub struct Hidden {
+pub(crate) struct Hidden {
     /// The files, oldest first.
-    pub files: Vec<PathBuf>,
+    pub(crate) files: Vec<PathBuf>,
     /// The sealed file.
-    pub sealed: PathBuf,
+    pub(crate) sealed: PathBuf,
     /// True offsets, m.
-    pub truth_m: [f64; 6],
+    pub(crate) truth_m: [f64; 6],
 }
 
 /// Inputs of `run` besides the telemetry.
 #[derive(Clone, Debug, Default)]
-pub struct Chain {
+pub(crate) struct Chain {
     /// Pipeline file.
-    pub pipeline: PathBuf,
+    pub(crate) pipeline: PathBuf,
     /// Mission file in place of the pipeline's.
-    pub mission: Option<PathBuf>,
+    pub(crate) mission: Option<PathBuf>,
     /// Model file in place of the pipeline's.
-    pub model: Option<PathBuf>,
+    pub(crate) model: Option<PathBuf>,
 }
 
 impl Program {
     /// Builds program and plugins, so that the measured program is current.
-    ///
-    /// # Errors
-    /// [`ProgramError`]: the workspace does not build.
-    pub fn build() -> Result<Self, ProgramError> {
+    pub(crate) fn build() -> Result<Self, CampaignError> {
         let folder = std::env::current_exe()
-            .map_err(|source| ProgramError::Start { command: "this program".to_owned(), source })?
+            .map_err(|source| CampaignError::Start { command: "this program".to_owned(), source })?
             .parent()
             .map(Path::to_owned)
             .unwrap_or_default();
@@ -116,8 +83,7 @@ impl Program {
     }
 
     /// The same program with a number of threads for each run; the default is one.
-    #[must_use]
-    pub fn with_threads(&self, threads: usize) -> Self {
+    pub(crate) fn with_threads(&self, threads: usize) -> Self {
         Self { exe: self.exe.clone(), threads }
     }
 
@@ -129,10 +95,7 @@ impl Program {
     }
 
     /// Digest of the plugins' libraries, which identifies a build.
-    ///
-    /// # Errors
-    /// [`ProgramError`].
-    pub fn digest(&self) -> Result<String, ProgramError> {
+    pub(crate) fn digest(&self) -> Result<String, CampaignError> {
         let mut command = self.command();
         let answer = json(command.args(["plugins", "list", "--json"]), &[0])?;
         let plugins = answer["plugins"].as_array().ok_or_else(|| missing(&command, "plugins"))?;
@@ -143,83 +106,62 @@ impl Program {
     }
 
     /// Writes the controllers designed for a mission to a file with the section `control`.
-    ///
-    /// # Errors
-    /// [`ProgramError`].
-    pub fn freeze(&self, mission: &Path, to: &Path) -> Result<(), ProgramError> {
+    pub(crate) fn freeze(&self, mission: &Path, to: &Path) -> Result<(), CampaignError> {
         output(self.command().arg("design").arg(mission).arg("--freeze").arg(to), &[0]).map(|_| ())
     }
 
     /// Simulates into a new folder, reads the truth and removes it.
-    ///
-    /// # Errors
-    /// [`ProgramError`].
-    pub fn simulate(
+    pub(crate) fn simulate(
         &self,
         mission: &Path,
         folder: &Path,
         arguments: &[impl AsRef<OsStr>],
-    ) -> Result<Simulated, ProgramError> {
-        let mut command = self.command();
-        command.arg("simulate").arg(mission).arg("--out").arg(folder).args(arguments).arg("--json");
-        let made = json(&mut command, &[0])?;
-        let paths = |key: &str| -> Vec<PathBuf> {
-            made[key].as_array().into_iter().flatten().filter_map(Value::as_str).map(PathBuf::from).collect()
-        };
-        let truth_files = paths("truth_files");
-        let first = truth_files.first().ok_or_else(|| missing(&command, "truth_files"))?;
-        let truth_m = offsets_m(first)?;
-        for path in &truth_files {
-            std::fs::remove_file(path).map_err(|e| ProgramError::File { path: path.clone(), reason: e.to_string() })?;
+    ) -> Result<Simulated, CampaignError> {
+        let made = self.simulated(mission, folder, arguments)?;
+        let truth_m = offsets_m(&made.truth_files[0])?;
+        for path in &made.truth_files {
+            std::fs::remove_file(path).map_err(|e| file(path, &e))?;
         }
-        Ok(Simulated { files: paths("files"), truth_m })
+        Ok(Simulated { files: made.files, truth_m })
     }
 
     /// Simulates with hidden effects into `folder` and moves the truth away; `noise` is the seed of everything else.
-    ///
-    /// # Errors
-    /// [`ProgramError`].
-    pub fn hide(
+    pub(crate) fn hide(
         &self,
         mission: &Path,
         folder: &Path,
         [hidden, noise]: [u32; 2],
         hours: f64,
-    ) -> Result<Hidden, ProgramError> {
+    ) -> Result<Hidden, CampaignError> {
         let (telemetry, away) = (folder.join("telemetry"), folder.join("sealed"));
-        let mut command = self.command();
-        command.arg("simulate").arg(mission).arg("--out").arg(&telemetry).arg("--json");
-        for (option, value) in
-            [("--hidden", hidden.to_string()), ("--seed", noise.to_string()), ("--hours", hours.to_string())]
-        {
-            command.args([option, &value]);
-        }
-        let made = json(&mut command, &[0])?;
-        let sealed = made["sealed_file"].as_str().map(Path::new).ok_or_else(|| missing(&command, "sealed_file"))?;
-        let file = |reason: String| ProgramError::File { path: sealed.to_owned(), reason };
+        let [hidden, noise, hours] = [hidden.to_string(), noise.to_string(), hours.to_string()];
+        let arguments = ["--hidden", &hidden, "--seed", &noise, "--hours", &hours];
+        let made = self.simulated(mission, &telemetry, &arguments)?;
+        let sealed = made.sealed_file.unwrap_or_default();
         let (Some(truth), Some(name)) = (sealed.parent(), sealed.file_name()) else {
-            return Err(file("it has no folder".to_owned()));
+            return Err(file(&sealed, &"it has no folder"));
         };
-        std::fs::rename(truth, &away).map_err(|e| file(e.to_string()))?;
-        let all = |key: &str| made[key].as_array().into_iter().flatten().filter_map(Value::as_str).map(PathBuf::from);
-        let moved = all("truth_files").find_map(|path| Some(away.join(path.file_name()?)));
-        let truth_m = offsets_m(&moved.ok_or_else(|| missing(&command, "truth_files"))?)?;
-        Ok(Hidden { files: all("files").collect(), sealed: away.join(name), truth_m })
+        std::fs::rename(truth, &away).map_err(|e| file(&sealed, &e))?;
+        let truth_m = offsets_m(&away.join(made.truth_files[0].file_name().unwrap_or_default()))?;
+        Ok(Hidden { files: made.files, sealed: away.join(name), truth_m })
+    }
+
+    /// Runs `dragfree simulate`; there is at least one file of truth.
+    fn simulated(&self, mission: &Path, folder: &Path, arguments: &[impl AsRef<OsStr>]) -> Result<Made, CampaignError> {
+        let mut command = self.command();
+        command.arg("simulate").arg(mission).arg("--out").arg(folder).args(arguments).arg("--json");
+        let made: Made =
+            serde_json::from_value(json(&mut command, &[0])?).map_err(|e| missing(&command, &e.to_string()))?;
+        if made.truth_files.is_empty() { Err(missing(&command, "truth_files")) } else { Ok(made) }
     }
 
     /// Runs `dragfree model` with arguments.
-    ///
-    /// # Errors
-    /// [`ProgramError`].
-    pub fn model(&self, words: &[&OsStr]) -> Result<(), ProgramError> {
+    pub(crate) fn model(&self, words: &[&OsStr]) -> Result<(), CampaignError> {
         output(self.command().arg("model").args(words), &[0]).map(|_| ())
     }
 
     /// Runs `dragfree diagnose` on a product.
-    ///
-    /// # Errors
-    /// [`ProgramError`].
-    pub fn diagnose(&self, product: &Value, archive: &Path) -> Result<Value, ProgramError> {
+    pub(crate) fn diagnose(&self, product: &Value, archive: &Path) -> Result<Value, CampaignError> {
         let mut command = self.command();
         let id = product["id"].as_str().ok_or_else(|| missing(&command, "id"))?;
         command.arg("diagnose").arg(id).arg("--archive").arg(archive).arg("--json");
@@ -227,10 +169,7 @@ impl Program {
     }
 
     /// Runs `dragfree reveal`, which scores a diagnosis against the sealed truth.
-    ///
-    /// # Errors
-    /// [`ProgramError`].
-    pub fn reveal(&self, hidden: &Hidden, diagnosis: &Path) -> Result<Value, ProgramError> {
+    pub(crate) fn reveal(&self, hidden: &Hidden, diagnosis: &Path) -> Result<Value, CampaignError> {
         let mut command = self.command();
         command.arg("reveal").arg(&hidden.sealed).arg("--diagnosis").arg(diagnosis);
         command.args(hidden.files.iter().flat_map(|file| [OsStr::new("--telemetry"), file.as_os_str()]));
@@ -239,10 +178,7 @@ impl Program {
 
     /// Runs a chain over telemetry and returns the product as JSON. Exit codes for lost data and an inconsistent model
     /// are accepted.
-    ///
-    /// # Errors
-    /// [`ProgramError`].
-    pub fn run(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Result<Value, ProgramError> {
+    pub(crate) fn run(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Result<Value, CampaignError> {
         let mut command = self.command();
         command.arg("run").arg(&chain.pipeline).args(files).arg("--archive").arg(archive).arg("--json");
         for (option, path) in [("--mission", &chain.mission), ("--model", &chain.model)] {
@@ -255,23 +191,22 @@ impl Program {
 }
 
 /// True offsets, m, in a simulation's truth.
-fn offsets_m(truth: &Path) -> Result<[f64; 6], ProgramError> {
-    let file = |reason: String| ProgramError::File { path: truth.to_owned(), reason };
-    let first = first_message(truth, "/truth").map_err(|e| file(e.to_string()))?;
+fn offsets_m(truth: &Path) -> Result<[f64; 6], CampaignError> {
+    let first = first_message(truth, "/truth").map_err(|e| file(truth, &e))?;
     let mut truth_m = [0.0; 6];
     for (i, value) in truth_m.iter_mut().enumerate() {
         let key = format!("b{}_orf_m.{}", i / 3 + 1, ["x", "y", "z"][i % 3]);
-        *value = *first.get(&key).ok_or_else(|| file(format!("it has no {key}")))?;
+        *value = *first.get(&key).ok_or_else(|| file(truth, &format!("it has no {key}")))?;
     }
     Ok(truth_m)
 }
 
-fn output(command: &mut Command, codes: &[i32]) -> Result<Vec<u8>, ProgramError> {
+fn output(command: &mut Command, codes: &[i32]) -> Result<Vec<u8>, CampaignError> {
     let name = format!("{command:?}");
-    let output = command.output().map_err(|source| ProgramError::Start { command: name.clone(), source })?;
+    let output = command.output().map_err(|source| CampaignError::Start { command: name.clone(), source })?;
     match output.status.code() {
         Some(code) if codes.contains(&code) => Ok(output.stdout),
-        _ => Err(ProgramError::Failed {
+        _ => Err(CampaignError::Failed {
             command: name,
             status: output.status,
             message: String::from_utf8_lossy(&output.stderr).into_owned(),
@@ -279,20 +214,24 @@ fn output(command: &mut Command, codes: &[i32]) -> Result<Vec<u8>, ProgramError>
     }
 }
 
-fn json(command: &mut Command, codes: &[i32]) -> Result<Value, ProgramError> {
+fn json(command: &mut Command, codes: &[i32]) -> Result<Value, CampaignError> {
     let text = output(command, codes)?;
     serde_json::from_slice(&text).map_err(|_| missing(command, "a JSON document"))
 }
 
-fn missing(command: &Command, what: &str) -> ProgramError {
-    ProgramError::Answer { command: format!("{command:?}"), what: what.to_owned() }
+fn missing(command: &Command, what: &str) -> CampaignError {
+    CampaignError::Answer { command: format!("{command:?}"), what: what.to_owned() }
 }
 
 /// The result of a product.
-///
-/// # Errors
-/// The name of what the product lacks.
-pub fn line(configuration: &str, seed: u32, build: &str, truth_m: &[f64; 6], product: &Value) -> Result<Line, String> {
+/// An error names what the product lacks.
+pub(crate) fn line(
+    configuration: &str,
+    seed: u32,
+    build: &str,
+    truth_m: &[f64; 6],
+    product: &Value,
+) -> Result<Line, String> {
     let number = |value: &Value, what: &str| value.as_f64().ok_or_else(|| what.to_owned());
     let text = |key: &str| product[key].as_str().map(str::to_owned).ok_or_else(|| key.to_owned());
     let stage = &product["quality"]["stages"]["es-akf"];
@@ -340,10 +279,8 @@ fn qp_widened(product: &Value) -> Result<[f64; 6], String> {
 }
 
 /// One solution of a product.
-///
-/// # Errors
-/// The name of what the product lacks.
-pub fn solution(product: &Value, label: &str, truth_m: &[f64; 6]) -> Result<Solution, String> {
+/// An error names what the product lacks.
+pub(crate) fn solution(product: &Value, label: &str, truth_m: &[f64; 6]) -> Result<Solution, String> {
     let lacks = || format!("solution {label}");
     let all = product["coefficients"].as_array().ok_or_else(lacks)?;
     let names = product["covariance_names"][label].as_array().ok_or_else(lacks)?;

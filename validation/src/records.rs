@@ -1,5 +1,6 @@
 //! Results on disk: one JSON line per configuration and seed, appended as soon as it is known.
 
+use crate::error::{CampaignError, file};
 use nalgebra::DMatrix;
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
@@ -7,9 +8,10 @@ use serde_json::Value;
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 /// The coefficients of the model, in the order of every array of six.
-pub const COEFFICIENTS: [&str; 6] = [
+pub(crate) const COEFFICIENTS: [&str; 6] = [
     "com-offset.tm1.x",
     "com-offset.tm1.y",
     "com-offset.tm1.z",
@@ -18,45 +20,21 @@ pub const COEFFICIENTS: [&str; 6] = [
     "com-offset.tm2.z",
 ];
 
-/// Error of a file of results.
-#[derive(Debug, thiserror::Error)]
-pub enum RecordError {
-    /// The file cannot be read or written.
-    #[error("{path}: {source}", path = path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// A complete line is not a result.
-    #[error("{path}, line {line}: {source}; results are written by `dragfree-validation` alone", path = path.display())]
-    Line {
-        /// The file.
-        path: PathBuf,
-        /// Line number, from 1.
-        line: usize,
-        /// Why.
-        source: serde_json::Error,
-    },
-}
-
 /// One solution of one run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Solution {
+pub(crate) struct Solution {
     /// Estimates, m.
-    pub value_m: [f64; 6],
+    pub(crate) value_m: [f64; 6],
     /// Estimate minus truth, m.
-    pub error_m: [f64; 6],
+    pub(crate) error_m: [f64; 6],
     /// Upper triangle of the covariance by rows, m²; its diagonal is σ².
-    pub covariance_m2: Vec<f64>,
+    pub(crate) covariance_m2: Vec<f64>,
 }
 
 impl Solution {
     /// The whole covariance, m².
-    #[must_use]
-    pub fn covariance(&self) -> DMatrix<f64> {
+    pub(crate) fn covariance(&self) -> DMatrix<f64> {
         DMatrix::from_fn(6, 6, |i, j| {
             let (i, j) = (i.min(j), i.max(j));
             self.covariance_m2[i * 6 - i * (i + 1) / 2 + j]
@@ -64,8 +42,7 @@ impl Solution {
     }
 
     /// σ, m.
-    #[must_use]
-    pub fn sigma_m(&self) -> [f64; 6] {
+    pub(crate) fn sigma_m(&self) -> [f64; 6] {
         let c = self.covariance();
         std::array::from_fn(|i| c[(i, i)].sqrt())
     }
@@ -78,8 +55,7 @@ impl Solution {
     }
 
     /// Error over σ.
-    #[must_use]
-    pub fn pulls(&self) -> [f64; 6] {
+    pub(crate) fn pulls(&self) -> [f64; 6] {
         let sigma = self.sigma_m();
         std::array::from_fn(|i| self.error_m[i] / sigma[i])
     }
@@ -88,57 +64,55 @@ impl Solution {
 /// Result of one run.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Line {
+pub(crate) struct Line {
     /// Configuration.
-    pub configuration: String,
+    pub(crate) configuration: String,
     /// Seed of the simulation.
-    pub seed: u32,
+    pub(crate) seed: u32,
     /// Length of the data, h.
-    pub hours: f64,
+    pub(crate) hours: f64,
     /// Day of the run.
-    pub date: String,
+    pub(crate) date: String,
     /// The program and its version.
-    pub software: String,
+    pub(crate) software: String,
     /// Digest of the plugins' libraries, twelve hexadecimal digits.
-    pub build: String,
+    pub(crate) build: String,
     /// Verdict of the product.
-    pub verdict: String,
+    pub(crate) verdict: String,
     /// Normalised innovation squared over its degrees of freedom.
-    pub nis: f64,
+    pub(crate) nis: f64,
     /// Its degrees of freedom.
-    pub nis_dof: f64,
+    pub(crate) nis_dof: f64,
     /// χ²/dof of the batch solution against the noise of the mission file.
-    pub chi2_per_dof: f64,
+    pub(crate) chi2_per_dof: f64,
     /// Factor by which the ES-AKF inflated its σ, per test mass.
-    pub sigma_stretch: [f64; 2],
+    pub(crate) sigma_stretch: [f64; 2],
     /// Factor by which the batch solution inflated its σ, per coefficient.
-    pub qp_widened: [f64; 6],
+    pub(crate) qp_widened: [f64; 6],
     /// σ of the recursion's end, as the paper reports it, m.
-    pub p_end_sigma_m: [f64; 6],
+    pub(crate) p_end_sigma_m: [f64; 6],
     /// Recursive solution.
-    pub es_akf: Solution,
+    pub(crate) es_akf: Solution,
     /// Batch solution.
-    pub qp: Solution,
+    pub(crate) qp: Solution,
     /// Adopted solution; `None` if it is the batch solution unchanged.
-    pub adopted: Option<Solution>,
+    pub(crate) adopted: Option<Solution>,
 }
 
 impl Line {
     /// Recursive and batch solution with σ before inflation.
-    #[must_use]
-    pub fn bare(&self) -> (Solution, Solution) {
+    pub(crate) fn bare(&self) -> (Solution, Solution) {
         (self.es_akf.divided(|i| self.sigma_stretch[i / 3]), self.qp.divided(|i| self.qp_widened[i]))
     }
 
     /// Adopted solution.
-    #[must_use]
-    pub fn adopted(&self) -> &Solution {
+    pub(crate) fn adopted(&self) -> &Solution {
         self.adopted.as_ref().unwrap_or(&self.qp)
     }
 }
 
 /// A result with a key, unique per build.
-pub trait Keyed {
+pub(crate) trait Keyed {
     /// Configuration and seed.
     fn key(&self) -> (String, u32);
     /// Digest of the build.
@@ -158,34 +132,34 @@ impl Keyed for Line {
 /// Result of one seed of the blind campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Blind {
+pub(crate) struct Blind {
     /// Length and kind of the data.
-    pub configuration: String,
+    pub(crate) configuration: String,
     /// Seed of hidden effects and noise.
-    pub seed: u32,
+    pub(crate) seed: u32,
     /// Digest of the plugins' libraries, twelve hexadecimal digits.
-    pub build: String,
+    pub(crate) build: String,
     /// Duration of the diagnosis, s.
-    pub diagnosis_s: f64,
+    pub(crate) diagnosis_s: f64,
     /// Score by `reveal`.
-    pub score: Value,
+    pub(crate) score: Value,
     /// Offset by the model without additions.
-    pub before: Solution,
+    pub(crate) before: Solution,
     /// Offset by the extended model; `None` if nothing could be added or a false cause was accepted.
-    pub after: Option<After>,
+    pub(crate) after: Option<After>,
 }
 
 /// An extended model.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct After {
+pub(crate) struct After {
     /// Added effects.
-    pub added: Vec<String>,
+    pub(crate) added: Vec<String>,
     /// Offset from the same telemetry.
-    pub offset: Solution,
+    pub(crate) offset: Solution,
     /// χ²/dof of telemetry that no fit has used: model before, model after, and with the true values; `None` if the
     /// truth has no value that a model can take.
-    pub held_out_chi2_per_dof: [Option<f64>; 3],
+    pub(crate) held_out_chi2_per_dof: [Option<f64>; 3],
 }
 
 impl Keyed for Blind {
@@ -198,27 +172,23 @@ impl Keyed for Blind {
     }
 }
 
-/// A growing file of results.
+/// A growing file of results, shared by threads.
 #[derive(Debug)]
-pub struct Results<T> {
+pub(crate) struct Results<T> {
     path: PathBuf,
-    file: File,
-    /// Results.
-    pub lines: Vec<T>,
+    /// The file and what is in it.
+    state: Mutex<(File, Vec<T>)>,
 }
 
 /// Results of a file; empty if it does not exist. A last line without its end was interrupted and is ignored.
-///
-/// # Errors
-/// [`RecordError`]: a complete line is not a result.
-pub fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, RecordError> {
+pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, CampaignError> {
     let text = match std::fs::read_to_string(path) {
         Err(error) if error.kind() == ErrorKind::NotFound => String::new(),
-        other => other.map_err(|source| RecordError::Io { path: path.to_owned(), source })?,
+        other => other.map_err(|e| file(path, &e))?,
     };
     let complete = text.rfind('\n').map_or("", |end| &text[..end]);
     let parse = |(i, line): (usize, &str)| {
-        serde_json::from_str(line).map_err(|source| RecordError::Line { path: path.to_owned(), line: i + 1, source })
+        serde_json::from_str(line).map_err(|source| CampaignError::Line { path: path.to_owned(), line: i + 1, source })
     };
     complete.lines().enumerate().map(parse).collect()
 }
@@ -226,77 +196,68 @@ pub fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, RecordError> {
 impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
     /// Opens a file to continue, or a new one. Removes results of another build, as a table must not mix builds;
     /// returns their number.
-    ///
-    /// # Errors
-    /// [`RecordError`]: the file has another form or cannot be written.
-    pub fn open(path: &Path, build: &str) -> Result<(Self, usize), RecordError> {
-        let io = |source| RecordError::Io { path: path.to_owned(), source };
+    pub(crate) fn open(path: &Path, build: &str) -> Result<(Self, usize), CampaignError> {
         let mut lines: Vec<T> = read(path)?;
         let before = lines.len();
         lines.retain(|line| line.build() == build);
         let dropped = before - lines.len();
-        let mut text = Vec::new();
-        for line in &lines {
-            write_line(&mut text, line, path)?;
-        }
-        // Writing a new file drops an interrupted line; a kill leaves either file whole.
-        let fresh = path.with_extension("tmp");
-        std::fs::create_dir_all(path.parent().unwrap_or(Path::new("."))).map_err(io)?;
-        std::fs::write(&fresh, text).map_err(io)?;
-        std::fs::rename(&fresh, path).map_err(io)?;
-        let file = OpenOptions::new().append(true).open(path).map_err(io)?;
-        Ok((Self { path: path.to_owned(), file, lines }, dropped))
+        std::fs::create_dir_all(path.parent().unwrap_or(Path::new("."))).map_err(|e| file(path, &e))?;
+        replace(path, &lines)?;
+        let file = OpenOptions::new().append(true).open(path).map_err(|e| file(path, &e))?;
+        Ok((Self { path: path.to_owned(), state: Mutex::new((file, lines)) }, dropped))
+    }
+
+    fn state(&self) -> MutexGuard<'_, (File, Vec<T>)> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// Whether a result exists.
-    #[must_use]
-    pub fn has(&self, configuration: &str, seed: u32) -> bool {
-        self.lines.iter().any(|line| line.key() == (configuration.to_owned(), seed))
+    pub(crate) fn has(&self, configuration: &str, seed: u32) -> bool {
+        self.state().1.iter().any(|line| line.key() == (configuration.to_owned(), seed))
     }
 
     /// Appends a result in one write.
-    ///
-    /// # Errors
-    /// [`RecordError::Io`].
-    pub fn append(&mut self, line: T) -> Result<(), RecordError> {
-        let mut text = Vec::new();
-        write_line(&mut text, &line, &self.path)?;
-        self.file.write_all(&text).map_err(|source| RecordError::Io { path: self.path.clone(), source })?;
-        self.lines.push(line);
+    pub(crate) fn append(&self, line: T) -> Result<(), CampaignError> {
+        let text = as_lines(&self.path, std::slice::from_ref(&line))?;
+        let mut state = self.state();
+        state.0.write_all(&text).map_err(|e| file(&self.path, &e))?;
+        state.1.push(line);
         Ok(())
     }
 
-    /// Rewrites the file in the order of configurations and seeds, independent of the order of completion.
-    ///
-    /// # Errors
-    /// [`RecordError::Io`].
-    pub fn sort(mut self, configurations: &[&str]) -> Result<(), RecordError> {
-        let place = |name: &str| configurations.iter().position(|c| *c == name);
-        self.lines.sort_by_key(|line| {
+    /// Rewrites the file in the order of configurations and seeds, independent of the order of completion; gives the
+    /// results.
+    pub(crate) fn sort(self, configurations: &[impl AsRef<str>]) -> Result<Vec<T>, CampaignError> {
+        let place = |name: &str| configurations.iter().position(|c| c.as_ref() == name);
+        let (_, mut lines) = self.state.into_inner().unwrap_or_else(PoisonError::into_inner);
+        lines.sort_by_key(|line| {
             let (configuration, seed) = line.key();
             (place(&configuration), configuration, seed)
         });
-        let io = |source| RecordError::Io { path: self.path.clone(), source };
-        let mut text = Vec::new();
-        for line in &self.lines {
-            write_line(&mut text, line, &self.path)?;
-        }
-        let fresh = self.path.with_extension("tmp");
-        std::fs::write(&fresh, text).map_err(io)?;
-        std::fs::rename(&fresh, &self.path).map_err(io)
+        replace(&self.path, &lines)?;
+        Ok(lines)
     }
 }
 
-fn write_line<T: Serialize>(text: &mut Vec<u8>, line: &T, path: &Path) -> Result<(), RecordError> {
-    serde_json::to_writer(&mut *text, line)
-        .map_err(|source| RecordError::Io { path: path.to_owned(), source: source.into() })?;
-    text.push(b'\n');
-    Ok(())
+/// Replaces a file by these results, without an interrupted line; a kill leaves either file whole.
+fn replace<T: Serialize>(path: &Path, lines: &[T]) -> Result<(), CampaignError> {
+    let fresh = path.with_extension("tmp");
+    std::fs::write(&fresh, as_lines(path, lines)?).map_err(|e| file(path, &e))?;
+    std::fs::rename(&fresh, path).map_err(|e| file(path, &e))
+}
+
+/// Results as JSON, one per line; `path` is for messages.
+fn as_lines<T: Serialize>(path: &Path, lines: &[T]) -> Result<Vec<u8>, CampaignError> {
+    let mut text = Vec::new();
+    for line in lines {
+        serde_json::to_writer(&mut text, line).map_err(|e| file(path, &e))?;
+        text.push(b'\n');
+    }
+    Ok(text)
 }
 
 /// Rounds to seven significant digits, more than any statistic needs.
-#[must_use]
-pub fn rounded(value: f64) -> f64 {
+pub(crate) fn rounded(value: f64) -> f64 {
     format!("{value:.6e}").parse().unwrap_or(value)
 }
 
@@ -349,7 +310,7 @@ pub(crate) mod tests {
     fn a_kill_in_the_middle_loses_and_doubles_nothing() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("results.jsonl");
-        let (mut results, dropped) = Results::open(&path, "abc").unwrap();
+        let (results, dropped) = Results::open(&path, "abc").unwrap();
         assert_eq!(dropped, 0);
         for seed in [2, 1] {
             results.append(line("nominal", seed)).unwrap();
@@ -359,7 +320,7 @@ pub(crate) mod tests {
         let first = whole.iter().position(|b| *b == b'\n').unwrap() + 1;
         for cut in (first..whole.len()).step_by(7).chain([whole.len() - 1]) {
             std::fs::write(&path, &whole[..cut]).unwrap();
-            let (mut results, _) = Results::<Line>::open(&path, "abc").unwrap();
+            let (results, _) = Results::<Line>::open(&path, "abc").unwrap();
             assert!(results.has("nominal", 2) && !results.has("nominal", 1), "cut at {cut}");
             results.append(line("nominal", 1)).unwrap();
             drop(results);
@@ -375,10 +336,10 @@ pub(crate) mod tests {
     fn results_of_another_build_are_dropped_and_nonsense_is_refused() {
         let dir = tempfile::tempdir().unwrap();
         let path = dir.path().join("results.jsonl");
-        let (mut results, _) = Results::open(&path, "abc").unwrap();
+        let (results, _) = Results::open(&path, "abc").unwrap();
         results.append(line("nominal", 1)).unwrap();
         let (results, dropped) = Results::<Line>::open(&path, "def").unwrap();
-        assert_eq!((results.lines.len(), dropped), (0, 1));
+        assert_eq!((results.state().1.len(), dropped), (0, 1));
         std::fs::write(&path, "{}\n").unwrap();
         let error = Results::<Line>::open(&path, "abc").unwrap_err().to_string();
         assert!(error.contains("line 1"), "{error}");

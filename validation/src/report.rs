@@ -2,7 +2,6 @@
 
 use dragfree_chart::{ChartError, Line as Curve, Panel, Scale, Stroke, svg};
 use dragfree_physics::frames::dcm_turned_about_z;
-use dragfree_physics::mission::Mission;
 use nalgebra::{DMatrix, DVector};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -10,67 +9,47 @@ use std::path::{Path, PathBuf};
 
 use crate::blind_report;
 use crate::bound::free_space;
-use crate::campaign::{CampaignError, NOMINAL, TWINS, Twin, file, note, parse, taiji};
+use crate::campaign::{NOMINAL, TWINS, Twin, note, taiji};
+use crate::error::{CampaignError, file};
 use crate::program::root;
 use crate::records::{Blind, Line, Solution, read};
 use crate::speed::Speed;
 use crate::stats::{self, Bounds};
-use crate::table::{REGIMES, Row, configuration};
+use crate::table::{REGIMES, Row, configuration, mission};
 
 /// False-alarm rate of all checks of a campaign together.
-pub const FALSE_ALARM: f64 = 0.01;
+pub(crate) const FALSE_ALARM: f64 = 0.01;
 /// σ of the paper's table, mm.
 const PAPER_SIGMA_MM: [f64; 6] = [1.335, 0.17, 0.09, 3.76, 0.14, 0.08];
 /// Errors of the paper's table, mm.
 const PAPER_ERROR_MM: [f64; 6] = [0.06, 1.4, 0.51, 0.68, 0.1, 0.35];
 /// Length of the long runs, days.
-pub const TABLE_DAYS: u32 = 25;
+pub(crate) const TABLE_DAYS: u32 = 25;
 /// Short names of the coefficients.
 const SHORT: [&str; 6] = ["tm1.x", "tm1.y", "tm1.z", "tm2.x", "tm2.y", "tm2.z"];
 
 /// All results.
 #[derive(Clone, Debug, Default)]
-pub struct Measured {
+pub(crate) struct Measured {
     /// Coverage campaign.
-    pub coverage: Vec<Line>,
+    pub(crate) coverage: Vec<Line>,
     /// The paper's table.
-    pub table: Vec<Row>,
+    pub(crate) table: Vec<Row>,
     /// Ratios of speed.
-    pub speed: Option<Speed>,
+    pub(crate) speed: Option<Speed>,
     /// Blind campaign.
-    pub blind: Vec<Blind>,
+    pub(crate) blind: Vec<Blind>,
 }
 
 impl Measured {
     /// Reads a folder of results.
-    ///
-    /// # Errors
-    /// [`CampaignError`]: a file has another form.
-    pub fn read(folder: &Path) -> Result<Self, CampaignError> {
+    pub(crate) fn read(folder: &Path) -> Result<Self, CampaignError> {
         Ok(Self {
             coverage: read(&folder.join("coverage.jsonl"))?,
             table: read(&folder.join("table.jsonl"))?,
             speed: Speed::read(&folder.join("speed.json"))?,
             blind: read(&folder.join("blind.jsonl"))?,
         })
-    }
-}
-
-/// A statistic and its bounds.
-struct Check {
-    what: String,
-    value: f64,
-    bounds: Bounds,
-}
-
-impl Check {
-    fn holds(&self) -> bool {
-        self.bounds.hold(self.value)
-    }
-
-    /// The value, bold if it is out of bounds.
-    fn cell(&self, text: &str) -> String {
-        if self.holds() { text.to_owned() } else { format!("**{text}**") }
     }
 }
 
@@ -171,11 +150,13 @@ fn coverage(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
         (stats::mean(n, alarm), stats::rms(n, alarm), stats::chi2_per_dof(3.0 * n as f64, alarm));
     let count_bounds = counts.map(|(low, high)| Bounds { low: low as f64, high: high as f64 });
     let mut failed = Vec::new();
-    let mut judge = |check: Check, text: &str| {
-        if !check.holds() {
-            failed.push(format!("{}: {text}, outside [{:.4}, {:.4}]", check.what, check.bounds.low, check.bounds.high));
+    // The text of a value, bold if it is out of bounds.
+    let mut judge = |what: String, value: f64, bounds: Bounds, text: String| {
+        if bounds.hold(value) {
+            return text;
         }
-        check.cell(text)
+        failed.push(format!("{what}: {text}, outside [{:.4}, {:.4}]", bounds.low, bounds.high));
+        format!("**{text}**")
     };
     let adopted_apart = lines.iter().filter(|l| l.adopted.is_some()).count();
     let mut rows = String::new();
@@ -187,13 +168,12 @@ fn coverage(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
             let mut cells = Vec::new();
             for (z, bounds) in [1.0, 2.0].into_iter().zip(count_bounds) {
                 let k = pulls.iter().filter(|p| p.abs() <= z).count();
-                let check = Check { what: what(&format!("within {z}σ")), value: k as f64, bounds };
-                cells.push(judge(check, &k.to_string()));
+                cells.push(judge(what(&format!("within {z}σ")), k as f64, bounds, k.to_string()));
             }
             let m = mean(&pulls);
-            cells.push(judge(Check { what: what("mean pull"), value: m, bounds: mean_bounds }, &format!("{m:+.2}")));
+            cells.push(judge(what("mean pull"), m, mean_bounds, format!("{m:+.2}")));
             let r = rms(&pulls);
-            cells.push(judge(Check { what: what("rms pull"), value: r, bounds: rms_bounds }, &format!("{r:.2}")));
+            cells.push(judge(what("rms pull"), r, rms_bounds, format!("{r:.2}")));
             let sigma = stats::median(lines.iter().map(|l| kind.of(l).sigma_m()[i]).collect());
             let p_end = if kind == Kind::EsAkf {
                 let end = stats::median(lines.iter().map(|l| l.p_end_sigma_m[i]).collect());
@@ -223,20 +203,16 @@ fn coverage(all: &[Line], free: &DMatrix<f64>) -> (String, Vec<String>) {
         ("QP", nees(&of(Kind::Qp), free)),
         ("adopted", nees(&of(Kind::Adopted), free)),
     ] {
-        let check = Check { what: format!("NEES/dof of {what}"), value, bounds: nees_bounds };
-        squares.push(format!("{what} {}", judge(check, &format!("{value:.3}"))));
+        let text = judge(format!("NEES/dof of {what}"), value, nees_bounds, format!("{value:.3}"));
+        squares.push(format!("{what} {text}"));
     }
     let verdicts = |name: &str| lines.iter().filter(|l| l.verdict == name).count();
     let disagree = verdicts("disagree");
     // Upper bound: the difference of two solutions of the same data varies less than the sum of their variances.
     let promised = 6.0 * (1.0 - stats::within(3.0));
     let most = (0..=n).rev().find(|k| stats::clopper_pearson(*k, n, 2.0 * alarm).low <= promised).unwrap_or(n);
-    let check = Check {
-        what: "verdicts `disagree`".to_owned(),
-        value: disagree as f64,
-        bounds: Bounds { low: 0.0, high: most as f64 },
-    };
-    let disagree = judge(check, &disagree.to_string());
+    let most_bounds = Bounds { low: 0.0, high: most as f64 };
+    let disagree = judge("verdicts `disagree`".to_owned(), disagree as f64, most_bounds, disagree.to_string());
     let (nis, chi2) = (range(lines.iter().map(|l| l.nis)), range(lines.iter().map(|l| l.chi2_per_dof)));
 
     let mut text = String::new();
@@ -315,12 +291,12 @@ fn twin(lines: &[&Line], unprotected: bool, free: &DMatrix<f64>, alarm: f64) -> 
     let batch = nees(&qp, free);
     let mut failed = Vec::new();
     let mut cell = |what: &'static str, value: f64, bounds: Bounds, judged: bool, digits: usize| {
-        let check = Check { what: what.to_owned(), value, bounds };
-        if judged && !check.holds() {
-            failed.push(what);
-        }
         let text = format!("{value:.digits$}");
-        if judged { check.cell(&text) } else { text }
+        if !judged || bounds.hold(value) {
+            return text;
+        }
+        failed.push(what);
+        format!("**{text}**")
     };
     let share = |all: &[&Solution]| {
         let inside: usize = all.iter().map(|s| s.pulls().iter().filter(|p| p.abs() <= 1.0).count()).sum();
@@ -520,12 +496,6 @@ fn picture(all: &[Line], free: &DMatrix<f64>) -> Result<Option<String>, ChartErr
     // Dvoretzky–Kiefer–Wolfowitz–Massart bound for the QP's number of independent pulls.
     let width = ((2.0 / FALSE_ALARM).ln() / (2.0 * batch.len() as f64)).sqrt();
     let bound = |shift: f64| claimed().map(|p| (p, (p + shift).clamp(0.0, 1.0))).collect::<Vec<_>>();
-    let curve = |label: &str, colour: usize, stroke: Stroke, points: Vec<(f64, f64)>| Curve {
-        label: label.to_owned(),
-        colour,
-        stroke,
-        points,
-    };
     let panel = Panel {
         title: format!("Truth within the interval, {} days", lines.len()),
         x_label: "claimed probability".to_owned(),
@@ -535,32 +505,28 @@ fn picture(all: &[Line], free: &DMatrix<f64>) -> Result<Option<String>, ChartErr
         x: 0.0..1.0,
         y: Some(0.0..1.0),
         lines: vec![
-            curve("1 % bounds", 6, Stroke::Dashed, bound(width)),
-            curve("", 6, Stroke::Dashed, bound(-width)),
-            curve(&format!("ES-AKF, {} pulls", recursive.len()), 1, Stroke::Solid, found(&recursive)),
-            curve(&format!("QP, {} pulls", batch.len()), 0, Stroke::Solid, found(&batch)),
+            Curve::new("1 % bounds", 6, Stroke::Dashed, bound(width)),
+            Curve::new("", 6, Stroke::Dashed, bound(-width)),
+            Curve::new(format!("ES-AKF, {} pulls", recursive.len()), 1, Stroke::Solid, found(&recursive)),
+            Curve::new(format!("QP, {} pulls", batch.len()), 0, Stroke::Solid, found(&batch)),
         ],
     };
     svg(&[panel], 1).map(Some)
 }
 
 /// A report.
-pub struct Report {
+pub(crate) struct Report {
     /// Generated parts by marker name.
-    pub parts: BTreeMap<&'static str, String>,
+    pub(crate) parts: BTreeMap<&'static str, String>,
     /// Pictures with their places; omitted without a campaign.
-    pub pictures: Vec<(PathBuf, String)>,
+    pub(crate) pictures: Vec<(PathBuf, String)>,
     /// Statistics out of bounds and missed bars.
-    pub failed: Vec<String>,
+    pub(crate) failed: Vec<String>,
 }
 
 /// Creates the report.
-///
-/// # Errors
-/// [`CampaignError`]: the default mission cannot be read, or a picture cannot be drawn.
-pub fn report(measured: &Measured) -> Result<Report, CampaignError> {
-    let mission = serde_json::to_string(&parse(&taiji())?).map_err(|e| file(&taiji(), &e))?;
-    let mission = Mission::from_json(&mission).map_err(|e| file(&taiji(), &e))?;
+pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
+    let mission = mission(&taiji())?;
     let dcm = ["tm1", "tm2"].map(|name| mission.test_mass.get(name).map_or(0.0, |tm| tm.orf_from_srf_angle_rad));
     let free = free_space(&dcm.map(dcm_turned_about_z));
     let (coverage, mut failed) = coverage(&measured.coverage, &free);
@@ -589,20 +555,17 @@ pub fn report(measured: &Measured) -> Result<Report, CampaignError> {
 }
 
 /// VALIDATION.md.
-#[must_use]
-pub fn document_path() -> PathBuf {
+pub(crate) fn document_path() -> PathBuf {
     root().join("VALIDATION.md")
 }
 
 /// A picture of the guide.
-#[must_use]
-pub fn picture_path(name: &str) -> PathBuf {
+pub(crate) fn picture_path(name: &str) -> PathBuf {
     root().join("ops-guide/src/pictures").join(name).with_extension("svg")
 }
 
 /// A document with its generated parts replaced; `None` if a part has no markers.
-#[must_use]
-pub fn rewritten(document: &str, parts: &BTreeMap<&'static str, String>) -> Option<String> {
+pub(crate) fn rewritten(document: &str, parts: &BTreeMap<&'static str, String>) -> Option<String> {
     let mut text = document.to_owned();
     for (name, part) in parts {
         let (open, close) = (format!("<!-- generated: {name} -->\n"), format!("<!-- /generated: {name} -->"));
@@ -614,10 +577,7 @@ pub fn rewritten(document: &str, parts: &BTreeMap<&'static str, String>) -> Opti
 }
 
 /// Writes the generated parts of VALIDATION.md and the pictures.
-///
-/// # Errors
-/// [`CampaignError`] when a file cannot be read or written, or lacks a marker.
-pub fn write(folder: &Path) -> Result<(), CampaignError> {
+pub(crate) fn write(folder: &Path) -> Result<(), CampaignError> {
     let report = report(&Measured::read(folder)?)?;
     let path = document_path();
     let document = std::fs::read_to_string(&path).map_err(|e| file(&path, &e))?;

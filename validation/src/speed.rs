@@ -7,32 +7,33 @@ use std::path::Path;
 use std::process::Command;
 use std::time::Instant;
 
-use crate::campaign::{CampaignError, ScratchFolder, file, science_mode, taiji};
+use crate::campaign::{ScratchFolder, science_mode, taiji};
+use crate::error::{CampaignError, file};
 use crate::program::{Chain, Program, root};
 use crate::stats::median;
 
 /// Measured ratios.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Speed {
+pub(crate) struct Speed {
     /// Date of the measurement.
-    pub date: String,
+    pub(crate) date: String,
     /// The ratios.
-    pub ratios: Vec<Ratio>,
+    pub(crate) ratios: Vec<Ratio>,
 }
 
 /// One ratio.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Ratio {
+pub(crate) struct Ratio {
     /// What is compared.
-    pub what: String,
+    pub(crate) what: String,
     /// Speed ratio.
-    pub times: f64,
+    pub(crate) times: f64,
     /// Required ratio.
-    pub bar: f64,
+    pub(crate) bar: f64,
     /// Command that measures it.
-    pub command: String,
+    pub(crate) command: String,
 }
 
 /// Number of timings of a whole program, of which the median counts.
@@ -43,10 +44,7 @@ const SIX_HOURS_S: f64 = 21_600.0;
 
 impl Speed {
     /// Reads a file; `None` if it does not exist.
-    ///
-    /// # Errors
-    /// [`CampaignError::File`]: the file has another form.
-    pub fn read(path: &Path) -> Result<Option<Self>, CampaignError> {
+    pub(crate) fn read(path: &Path) -> Result<Option<Self>, CampaignError> {
         match std::fs::read_to_string(path) {
             Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
             Err(error) => Err(file(path, &error)),
@@ -55,8 +53,7 @@ impl Speed {
     }
 
     /// The table of the report.
-    #[must_use]
-    pub fn table(&self) -> String {
+    pub(crate) fn table(&self) -> String {
         let mut text = format!("Measured on {}; a number below its bar is **bold**.\n\n", self.date);
         text += "| what | times faster | bar | command |\n|---|---|---|---|\n";
         for r in &self.ratios {
@@ -93,10 +90,7 @@ fn bench(package: &str, name: &str) -> Result<(), CampaignError> {
 }
 
 /// Measures all ratios, on an otherwise idle machine, and writes the file.
-///
-/// # Errors
-/// [`CampaignError`].
-pub fn measure(program: &Program, path: &Path, scratch: &Path) -> Result<(), CampaignError> {
+pub(crate) fn measure(program: &Program, path: &Path, scratch: &Path) -> Result<(), CampaignError> {
     bench("dragfree-es-akf", "step")?;
     bench("dragfree-identification", "candidates")?;
     const STEP: &str = "es-akf step, 22 states";

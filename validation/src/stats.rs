@@ -6,17 +6,16 @@ use nalgebra::{DMatrix, DVector};
 
 /// A closed interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Bounds {
+pub(crate) struct Bounds {
     /// Lower end.
-    pub low: f64,
+    pub(crate) low: f64,
     /// Upper end.
-    pub high: f64,
+    pub(crate) high: f64,
 }
 
 impl Bounds {
     /// Whether a value is inside.
-    #[must_use]
-    pub fn hold(&self, value: f64) -> bool {
+    pub(crate) fn hold(&self, value: f64) -> bool {
         (self.low..=self.high).contains(&value)
     }
 }
@@ -113,32 +112,27 @@ fn inverse(f: impl Fn(f64) -> f64, value: f64, mut low: f64, mut high: f64) -> f
 }
 
 /// Probability that χ² with `dof` degrees of freedom is at most `x`.
-#[must_use]
-pub fn chi2_cdf(x: f64, dof: f64) -> f64 {
+pub(crate) fn chi2_cdf(x: f64, dof: f64) -> f64 {
     gamma_p(0.5 * dof, 0.5 * x)
 }
 
 /// Quantile `p` of χ² with `dof` degrees of freedom.
-#[must_use]
-pub fn chi2_quantile(p: f64, dof: f64) -> f64 {
+pub(crate) fn chi2_quantile(p: f64, dof: f64) -> f64 {
     inverse(|x| chi2_cdf(x, dof), p, 0.0, 20.0 * dof + 200.0)
 }
 
 /// Probability that a normal deviate is within `z` standard deviations.
-#[must_use]
-pub fn within(z: f64) -> f64 {
+pub(crate) fn within(z: f64) -> f64 {
     chi2_cdf(z * z, 1.0)
 }
 
 /// Inverse of [`within`].
-#[must_use]
-pub fn half_width(p: f64) -> f64 {
+pub(crate) fn half_width(p: f64) -> f64 {
     chi2_quantile(p, 1.0).sqrt()
 }
 
 /// Bounds of χ²/dof; above 10⁴ degrees of freedom by Wilson and Hilferty's approximation.
-#[must_use]
-pub fn chi2_per_dof(dof: f64, false_alarm: f64) -> Bounds {
+pub(crate) fn chi2_per_dof(dof: f64, false_alarm: f64) -> Bounds {
     if dof > 1e4 {
         let (v, z) = (2.0 / (9.0 * dof), half_width(1.0 - false_alarm));
         let bound = |z: f64| (1.0 - v + z * v.sqrt()).powi(3);
@@ -149,22 +143,19 @@ pub fn chi2_per_dof(dof: f64, false_alarm: f64) -> Bounds {
 }
 
 /// Bounds of the rms of `n` standard normal deviates about zero.
-#[must_use]
-pub fn rms(n: usize, false_alarm: f64) -> Bounds {
+pub(crate) fn rms(n: usize, false_alarm: f64) -> Bounds {
     let b = chi2_per_dof(n as f64, false_alarm);
     Bounds { low: b.low.sqrt(), high: b.high.sqrt() }
 }
 
 /// Bounds of the mean of `n` standard normal deviates.
-#[must_use]
-pub fn mean(n: usize, false_alarm: f64) -> Bounds {
+pub(crate) fn mean(n: usize, false_alarm: f64) -> Bounds {
     let z = half_width(1.0 - false_alarm) / (n as f64).sqrt();
     Bounds { low: -z, high: z }
 }
 
 /// Clopper–Pearson interval for the probability behind `k` of `n`, with confidence `1 − false_alarm`.
-#[must_use]
-pub fn clopper_pearson(k: usize, n: usize, false_alarm: f64) -> Bounds {
+pub(crate) fn clopper_pearson(k: usize, n: usize, false_alarm: f64) -> Bounds {
     let (k, n, tail) = (k as f64, n as f64, 0.5 * false_alarm);
     let low = if k == 0.0 { 0.0 } else { inverse(|p| beta_i(p, k, n - k + 1.0), tail, 0.0, 1.0) };
     let high = if k == n { 1.0 } else { inverse(|p| beta_i(p, k + 1.0, n - k), 1.0 - tail, 0.0, 1.0) };
@@ -172,8 +163,7 @@ pub fn clopper_pearson(k: usize, n: usize, false_alarm: f64) -> Bounds {
 }
 
 /// Smallest and largest count of `n` whose Clopper–Pearson interval contains the probability `p`.
-#[must_use]
-pub fn accepted_counts(p: f64, n: usize, false_alarm: f64) -> Option<(usize, usize)> {
+pub(crate) fn accepted_counts(p: f64, n: usize, false_alarm: f64) -> Option<(usize, usize)> {
     let mut held = (0..=n).filter(|k| clopper_pearson(*k, n, false_alarm).hold(p));
     let first = held.next()?;
     Some((first, held.next_back().unwrap_or(first)))
@@ -181,16 +171,14 @@ pub fn accepted_counts(p: f64, n: usize, false_alarm: f64) -> Option<(usize, usi
 
 /// Normalised estimation error squared in the space spanned by the columns of `basis`, `(Bᵀe)ᵀ (BᵀCB)⁻¹ (Bᵀe)`; `None`
 /// if the covariance is not positive definite there.
-#[must_use]
-pub fn nees(error: &DVector<f64>, covariance: &DMatrix<f64>, basis: &DMatrix<f64>) -> Option<f64> {
+pub(crate) fn nees(error: &DVector<f64>, covariance: &DMatrix<f64>, basis: &DMatrix<f64>) -> Option<f64> {
     let e = basis.transpose() * error;
     let c = basis.transpose() * covariance * basis;
     Some(e.dot(&c.cholesky()?.solve(&e)))
 }
 
 /// Median.
-#[must_use]
-pub fn median(mut values: Vec<f64>) -> f64 {
+pub(crate) fn median(mut values: Vec<f64>) -> f64 {
     values.sort_by(f64::total_cmp);
     let n = values.len();
     match n {

@@ -3,20 +3,20 @@
 use dragfree_physics::mission::Mission;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
 
 use crate::bound::Case;
-use crate::campaign::{CampaignError, Meter, ScratchFolder, file, note, parse, science_mode, work};
+use crate::campaign::{Meter, ScratchFolder, note, parse, science_mode, work};
+use crate::error::{CampaignError, file};
 use crate::program::{Chain, Program, line, root};
 use crate::records::{Keyed, Line, Results, rounded};
 
 /// A noise regime.
 #[derive(Clone, Copy, Debug)]
-pub struct Regime {
+pub(crate) struct Regime {
     /// Name of its results.
-    pub name: &'static str,
+    pub(crate) name: &'static str,
     /// Description in the report.
-    pub words: &'static str,
+    pub(crate) words: &'static str,
     mission: MissionFile,
 }
 
@@ -28,7 +28,7 @@ enum MissionFile {
 }
 
 /// The regimes.
-pub const REGIMES: [Regime; 3] = [
+pub(crate) const REGIMES: [Regime; 3] = [
     Regime { name: "default", words: "default noise", mission: MissionFile::Fixture("taiji.toml") },
     Regime {
         name: "quiet-dws",
@@ -45,15 +45,15 @@ pub const REGIMES: [Regime; 3] = [
 /// A run with its information bounds.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Row {
+pub(crate) struct Row {
     /// The run.
-    pub run: Line,
+    pub(crate) run: Line,
     /// True offsets, m.
-    pub truth_m: [f64; 6],
+    pub(crate) truth_m: [f64; 6],
     /// Bound of σ by one test mass alone, m.
-    pub single_m: [f64; 6],
+    pub(crate) single_m: [f64; 6],
     /// Bound of σ by both test masses and the survey, m.
-    pub surveyed_m: [f64; 6],
+    pub(crate) surveyed_m: [f64; 6],
 }
 
 impl Keyed for Row {
@@ -67,12 +67,12 @@ impl Keyed for Row {
 }
 
 /// Name of a configuration.
-#[must_use]
-pub fn configuration(regime: &str, days: u32) -> String {
+pub(crate) fn configuration(regime: &str, days: u32) -> String {
     format!("{regime}, {days} days")
 }
 
-fn mission(path: &Path) -> Result<Mission, CampaignError> {
+/// Reads a mission file.
+pub(crate) fn mission(path: &Path) -> Result<Mission, CampaignError> {
     let text = serde_json::to_string(&parse(path)?).map_err(|e| file(path, &e))?;
     Mission::from_json(&text).map_err(|e| file(path, &e))
 }
@@ -85,10 +85,8 @@ struct Task {
 }
 
 /// Runs what `results` lacks, `at_once` regimes in parallel; 25 days of one take 14 GB of `scratch`.
-///
-/// # Errors
-/// [`CampaignError`]; results so far are on disk, and the next call continues.
-pub fn table(
+/// After an error the results so far are on disk, and the next call continues.
+pub(crate) fn table(
     program: &Program,
     seeds: &[u32],
     days: u32,
@@ -118,7 +116,6 @@ pub fn table(
         }
     }
     let meter = Meter::new(tasks.len() as f64);
-    let results = Mutex::new(results);
     work(tasks, at_once, |task| {
         let case = Case::of(&mission(&task.path)?)?;
         let folder = scratch_folder.path(&format!("{}-{}", task.regime.name, task.seed));
@@ -139,17 +136,12 @@ pub fn table(
                 single_m: std::array::from_fn(|i| rounded(bound.single_m[i])),
                 surveyed_m: std::array::from_fn(|i| rounded(bound.surveyed_m[i])),
             };
-            if let Ok(mut results) = results.lock() {
-                results.append(row)?;
-            }
+            results.append(row)?;
         }
         std::fs::remove_dir_all(&folder).map_err(|e| file(&folder, &e))?;
         meter.say(1.0, &format!("{}, seed {}", task.regime.name, task.seed));
         Ok(())
     })?;
     let order: Vec<String> = REGIMES.iter().flat_map(|r| [days, 1].map(|days| configuration(r.name, days))).collect();
-    if let Ok(results) = results.into_inner() {
-        results.sort(&order.iter().map(String::as_str).collect::<Vec<_>>())?;
-    }
-    Ok(())
+    results.sort(&order).map(drop)
 }

@@ -65,6 +65,14 @@ pub struct Line {
     pub points: Vec<(f64, f64)>,
 }
 
+impl Line {
+    /// A line; an empty label is not in the legend.
+    #[must_use]
+    pub fn new(label: impl Into<String>, colour: usize, stroke: Stroke, points: Vec<(f64, f64)>) -> Self {
+        Self { label: label.into(), colour, stroke, points }
+    }
+}
+
 /// A panel: one pair of axes.
 #[derive(Clone, Debug)]
 pub struct Panel {
@@ -110,6 +118,19 @@ pub enum ChartError {
 const PANEL: (u32, u32) = (560, 380);
 
 impl Panel {
+    /// A panel over frequency in Hz, both axes logarithmic.
+    #[must_use]
+    pub fn over_frequency(
+        title: impl Into<String>,
+        y_label: impl Into<String>,
+        x: Range<f64>,
+        lines: Vec<Line>,
+    ) -> Self {
+        let (x_scale, y_scale) = (Scale::Logarithmic, Scale::Logarithmic);
+        let x_label = "frequency / Hz".to_owned();
+        Self { title: title.into(), x_label, y_label: y_label.into(), x_scale, y_scale, x, y: None, lines }
+    }
+
     fn shows(&self, (x, y): &(f64, f64)) -> bool {
         self.x.contains(x) && self.x_scale.shows(*x) && self.y_scale.shows(*y)
     }

@@ -360,16 +360,6 @@ pub(crate) enum PluginKind {
     Source,
 }
 
-impl std::fmt::Display for PluginKind {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Self::Effect => "effect",
-            Self::Stage => "stage",
-            Self::Source => "source",
-        })
-    }
-}
-
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Language {
     Rust,

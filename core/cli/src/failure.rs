@@ -3,12 +3,12 @@
 use std::error::Error;
 use std::path::PathBuf;
 
-/// A failure of the command itself; the engine has its own.
+/// Any error: of the engine, of a library, or a [`Refusal`].
+pub(crate) type Failure = Box<dyn Error>;
+
+/// What the command line itself refuses.
 #[derive(Debug, thiserror::Error)]
-pub(crate) enum Failure {
-    /// The operating system refused something.
-    #[error("cannot {action} {}: {source}", path.display())]
-    Io { action: &'static str, path: PathBuf, source: std::io::Error },
+pub(crate) enum Refusal {
     /// A plugin folder that was asked for is not there.
     #[error("the plugin folder {} does not exist; correct --plugin-dir or DRAGFREE_PLUGIN_PATH", .0.display())]
     PluginFolder(PathBuf),
@@ -24,9 +24,6 @@ pub(crate) enum Failure {
     /// A diagnosis that names no effect to add.
     #[error("{}: {what}", path.display())]
     Diagnosis { path: PathBuf, what: String },
-    /// Arguments that make no sense together.
-    #[error("{0}")]
-    Usage(String),
     /// A skeleton would have to share a folder.
     #[error("{} is not empty; name another folder with --out", .0.display())]
     NoPluginFolder(PathBuf),
@@ -39,27 +36,6 @@ pub(crate) enum Failure {
     /// A file is in the way.
     #[error("{} is there already and stays as it is; name another folder", .0.display())]
     Taken(PathBuf),
-    /// A check that does not exist.
-    #[error("there is no check {0}")]
-    NoCheck(String),
-    /// `--set` without a value.
-    #[error("--set {0}: NAME=VALUE is needed")]
-    NoParameter(String),
-    /// The engine failed.
-    #[error(transparent)]
-    Engine(#[from] Box<dyn Error>),
-}
-
-impl Failure {
-    pub(crate) fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
-        let path = path.into();
-        move |source| Self::Io { action, path, source }
-    }
-
-    /// A failure from any error of the engine.
-    pub(crate) fn engine(error: impl Error + 'static) -> Self {
-        Self::Engine(Box::new(error))
-    }
 }
 
 /// The error and, a line each, the causes that it does not tell itself.
@@ -79,17 +55,18 @@ pub(crate) fn chain(error: &dyn Error) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dragfree_engine::files::IoError;
 
     #[derive(Debug, thiserror::Error)]
     #[error("the pipeline stopped")]
     struct Outer {
-        source: Failure,
+        source: IoError,
     }
 
     #[test]
     fn causes_are_told_once() {
         let full = || std::io::Error::from(std::io::ErrorKind::StorageFull);
-        let inner = Failure::Io { action: "write", path: "a.toml".into(), source: full() };
+        let inner = IoError { action: "write", path: "a.toml".into(), source: full() };
         assert_eq!(chain(&inner), format!("cannot write a.toml: {}", full()));
         assert_eq!(
             chain(&Outer { source: inner }),

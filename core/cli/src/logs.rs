@@ -3,6 +3,7 @@
 use crate::args::Global;
 use crate::failure::Failure;
 use crate::progress;
+use dragfree_engine::files::IoContext as _;
 use std::fs::File;
 use std::io::{IsTerminal as _, Write};
 use std::sync::Mutex;
@@ -43,7 +44,7 @@ pub(crate) fn start(global: &Global, colour: bool) -> Result<(), Failure> {
         .with_filter(level);
     let file = match &global.log_json {
         Some(path) => {
-            let file = File::create(path).map_err(Failure::io("write the log", path))?;
+            let file = File::create(path).at("write the log", path)?;
             Some(tracing_subscriber::fmt::layer().json().with_writer(Mutex::new(file)).with_filter(LevelFilter::DEBUG))
         }
         None => None,

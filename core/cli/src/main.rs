@@ -27,20 +27,19 @@ fn main() -> ExitCode {
         Colour::Auto => allowed && terminal,
     };
     if let Err(error) = logs::start(&arguments.global, colour(std::io::stderr().is_terminal())) {
-        return complain(&error);
+        return complain(&*error);
     }
     let paint = text::Paint(colour(std::io::stdout().is_terminal()));
     if let Err(error) = output::reserve() {
         return complain(&error);
     }
-    let done = installed::resolve(&mut arguments).and_then(|()| commands::execute(&arguments, paint));
-    match done {
-        Ok(done) => match output::print(&done.text) {
-            Ok(()) => ExitCode::from(done.code),
-            Err(error) => complain(&error),
-        },
-        Err(error) => complain(&error),
-    }
+    let mut run = || -> Result<u8, failure::Failure> {
+        installed::resolve(&mut arguments)?;
+        let done = commands::execute(&arguments, paint)?;
+        output::print(&done.text)?;
+        Ok(done.code)
+    };
+    run().map_or_else(|error| complain(&*error), ExitCode::from)
 }
 
 fn complain(error: &dyn std::error::Error) -> ExitCode {

@@ -78,7 +78,7 @@ pub(crate) fn clear_line() {
 
 /// `run  2035-01-01 03:00:00  21600 × real time  50 %  1 s left`.
 fn line(job: &str, elapsed: Duration, progress: &Progress) -> String {
-    let Progress { first_ns, until_ns, end_ns, .. } = *progress;
+    let Progress { first_ns, until_ns, end_ns } = *progress;
     let seconds = |from: i64, to: i64| to.saturating_sub(from).max(0) as f64 * 1e-9;
     let done_s = seconds(first_ns, until_ns);
     let rate = done_s / elapsed.as_secs_f64().max(1e-9);
@@ -104,7 +104,7 @@ mod tests {
     #[test]
     fn rate_and_time_left_follow_from_the_epochs() {
         let said = |hours: i64, end_ns: Option<i64>| {
-            let progress = Progress { until_ns: START_NS + hours * HOUR_NS, first_ns: START_NS, end_ns, epochs: 0 };
+            let progress = Progress { until_ns: START_NS + hours * HOUR_NS, first_ns: START_NS, end_ns };
             line("run", Duration::from_secs(1), &progress)
         };
         let end_ns = Some(START_NS + 6 * HOUR_NS);

@@ -3,6 +3,7 @@
 use crate::text::{self, Paint};
 use crate::utc;
 use dragfree_engine::border::{Manifest, Parameter, ParameterType};
+use dragfree_engine::files::Problem;
 use dragfree_engine::product::{Coefficient, Listing, Product};
 use dragfree_engine::registry::Registry;
 use dragfree_workflow::calibrate::{CheckReport, CheckedNode};
@@ -21,26 +22,14 @@ pub(crate) fn product(product: &Product, path: &Path, paint: Paint) -> String {
     let mut screen = String::new();
     let title = format!("{}  {} {}", product.id(), header.global_attributes.project, header.global_attributes.platform);
     let _ = writeln!(screen, "{}", paint.bold(&title));
-    screen += &text::labelled(
-        "window",
-        &format!(
-            "{} to {} {}",
-            utc::format(attributes.start_time_epoch_ns),
-            utc::format(attributes.stop_time_epoch_ns),
-            attributes.time_scale
-        ),
-    );
+    let (start, stop) = (attributes.start_time_epoch_ns, attributes.stop_time_epoch_ns);
+    let window = format!("{} to {} {}", utc::format(start), utc::format(stop), attributes.time_scale);
     let commands = quality.commands.as_deref().map_or(String::new(), |commands| format!(", commands {commands}"));
-    screen += &text::labelled(
-        "epochs",
-        &format!(
-            "{} used, {} rejected{commands}",
-            text::grouped(quality.epochs_used),
-            text::grouped(quality.epochs_rejected)
-        ),
-    );
-    screen +=
-        &text::labelled("model", &format!("revision {}: {}", product.model.revision, product.model.effects.join(", ")));
+    let (used, rejected) = (text::grouped(quality.epochs_used), text::grouped(quality.epochs_rejected));
+    let model = format!("revision {}: {}", product.model.revision, product.model.effects.join(", "));
+    screen += &text::labelled("window", &window);
+    screen += &text::labelled("epochs", &format!("{used} used, {rejected} rejected{commands}"));
+    screen += &text::labelled("model", &model);
     screen.push('\n');
     screen += &coefficients(&product.result.coefficients);
     screen.push('\n');
@@ -65,23 +54,21 @@ fn coefficients(coefficients: &[Coefficient]) -> String {
     if coefficients.is_empty() {
         return "no stage estimated a coefficient\n".to_owned();
     }
-    let solutions = distinct(coefficients, |c| &c.solution);
-    let names = distinct(coefficients, |c| &c.name);
+    let solutions = text::distinct(coefficients.iter().map(|c| c.solution.as_str()));
+    let names = text::distinct(coefficients.iter().map(|c| c.name.as_str()));
     let cell = |c: &Coefficient| {
         let (_, factor) = text::readable_unit(&c.unit);
         text::measured(c.value * factor, c.sigma * factor)
     };
     let place = |c: &Coefficient| format!("{} {}", text::readable_unit(&c.unit).0, c.frame).trim().to_owned();
-    let heading = ["coefficient"].into_iter().chain(solutions.iter().copied()).map(str::to_owned);
-    let mut rows = vec![heading.collect::<Vec<_>>()];
-    for name in &names {
+    let row = |name: &&str| {
         let of = |solution: &str| coefficients.iter().find(|c| c.name == *name && c.solution == solution);
         let cells = solutions.iter().map(|solution| of(solution).map_or_else(|| "-".to_owned(), cell));
         let place = coefficients.iter().find(|c| c.name == *name).map_or_else(String::new, place);
-        rows.push([(*name).to_owned()].into_iter().chain(cells).chain([place]).collect());
-    }
-    let wide = text::columns(&rows);
-    if wide.lines().all(|line| text::width(line) <= text::WIDTH) {
+        [(*name).to_owned()].into_iter().chain(cells).chain([place]).collect()
+    };
+    let wide = text::columns(&text::table(&[&["coefficient"], &solutions[..]].concat(), names.iter().map(row)));
+    if text::fits(&wide) {
         return wide;
     }
     let mut narrow = String::new();
@@ -92,17 +79,6 @@ fn coefficients(coefficients: &[Coefficient]) -> String {
         narrow += &text::columns(&rows.collect::<Vec<_>>());
     }
     narrow
-}
-
-/// The texts that `of` gives, each once, in order of appearance.
-fn distinct(coefficients: &[Coefficient], of: impl Fn(&Coefficient) -> &str) -> Vec<&str> {
-    let mut seen = Vec::new();
-    for text in coefficients.iter().map(of) {
-        if !seen.contains(&text) {
-            seen.push(text);
-        }
-    }
-    seen
 }
 
 fn verdict(product: &Product, paint: Paint) -> String {
@@ -147,7 +123,7 @@ pub(crate) fn listing(listing: &Listing, folder: &Path, paint: Paint) -> String 
     if listing.entries.is_empty() {
         let _ = writeln!(screen, "no product in {}", folder.display());
     } else {
-        let heading = ["product", "epochs", "verdict", "χ²/dof", "model", ""].map(str::to_owned).to_vec();
+        let heading = ["product", "epochs", "verdict", "χ²/dof", "model", ""];
         let row = |entry: &dragfree_engine::product::Entry| {
             let product = &entry.product;
             vec![
@@ -159,8 +135,7 @@ pub(crate) fn listing(listing: &Listing, folder: &Path, paint: Paint) -> String 
                 if entry.latest { "latest" } else { "" }.to_owned(),
             ]
         };
-        let rows: Vec<_> = [heading].into_iter().chain(listing.entries.iter().map(row)).collect();
-        screen += &text::columns(&rows);
+        screen += &text::columns(&text::table(&heading, listing.entries.iter().map(row)));
     }
     for problem in &listing.problems {
         let _ = writeln!(screen, "{} {}", paint.doubtful("not used:"), problem.reason);
@@ -171,7 +146,6 @@ pub(crate) fn listing(listing: &Listing, folder: &Path, paint: Paint) -> String 
 
 /// Every plugin and every file that was refused.
 pub(crate) fn plugins(registry: &Registry, clash: Option<&str>, paint: Paint) -> String {
-    let heading = ["plugin", "kind", "version", "file"].map(str::to_owned).to_vec();
     let mut rows: Vec<_> = registry
         .plugins()
         .map(|found| {
@@ -183,7 +157,7 @@ pub(crate) fn plugins(registry: &Registry, clash: Option<&str>, paint: Paint) ->
     let mut screen = if rows.is_empty() {
         "no plugin was found; --plugin-dir names a folder, `cargo build --release` makes the bundled ones\n".to_owned()
     } else {
-        text::columns(&[vec![heading], rows].concat())
+        text::columns(&text::table(&["plugin", "kind", "version", "file"], rows))
     };
     for refused in registry.refused() {
         let _ = writeln!(screen, "{} {}", paint.doubtful("refused:"), refused.path.display());
@@ -204,13 +178,11 @@ pub(crate) fn check(report: &CheckReport) -> String {
         screen += &text::labelled("free", &format!("{:.1} GB where the archive is", free as f64 * 1e-9));
     }
     screen.push('\n');
-    let heading = ["plugin", "version", "reads", "writes"].map(str::to_owned).to_vec();
     let row = |node: &CheckedNode| {
         let count = |columns: &[String]| format!("{} columns", columns.len());
         vec![node.name.clone(), node.version.clone(), count(&node.reads), count(&node.writes)]
     };
-    let rows: Vec<_> = [heading].into_iter().chain(report.nodes.iter().map(row)).collect();
-    screen += &text::columns(&rows);
+    screen += &text::columns(&text::table(&["plugin", "version", "reads", "writes"], report.nodes.iter().map(row)));
     screen += "\nevery column fits; the names of all columns with --json\n";
     screen
 }
@@ -257,6 +229,12 @@ fn range(parameter: &Parameter) -> Option<String> {
     }
 }
 
+/// Files that are not used, as JSON.
+pub(crate) fn problems_json(problems: &[Problem]) -> Vec<Value> {
+    let problem = |p: &Problem| serde_json::json!({"path": p.path.to_string_lossy(), "reason": p.reason});
+    problems.iter().map(problem).collect()
+}
+
 /// An archive as JSON.
 pub(crate) fn listing_json(listing: &Listing) -> Value {
     let entries = listing.entries.iter().map(|entry| {
@@ -278,11 +256,7 @@ pub(crate) fn listing_json(listing: &Listing) -> Value {
             "sha256": attributes.sha256,
         })
     });
-    let problems = listing
-        .problems
-        .iter()
-        .map(|problem| serde_json::json!({"path": problem.path.to_string_lossy(), "reason": problem.reason}));
-    serde_json::json!({"products": entries.collect::<Vec<_>>(), "problems": problems.collect::<Vec<_>>()})
+    serde_json::json!({"products": entries.collect::<Vec<_>>(), "problems": problems_json(&listing.problems)})
 }
 
 /// Every plugin and every file that was refused, as JSON.
@@ -297,19 +271,14 @@ pub(crate) fn plugins_json(registry: &Registry, clash: Option<&str>) -> Value {
             "sha256": found.opened.sha256,
         })
     });
-    let refused = registry
-        .refused()
-        .iter()
-        .map(|refused| serde_json::json!({"path": refused.path.to_string_lossy(), "reason": refused.reason}));
-    serde_json::json!({"plugins": plugins.collect::<Vec<_>>(), "refused": refused.collect::<Vec<_>>(), "error": clash})
+    serde_json::json!({"plugins": plugins.collect::<Vec<_>>(), "refused": problems_json(registry.refused()), "error": clash})
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dragfree_engine::product::{Draft, Model, ProductWriter, Status, Stream, Written};
+    use dragfree_engine::product::{Draft, Model, ProductWriter, Written};
     use dragfree_engine::schema::Report;
-    use std::collections::BTreeMap;
 
     const PLAIN: Paint = Paint(false);
 
@@ -325,19 +294,13 @@ mod tests {
             release: 1,
             mission: "Taiji".into(),
             spacecraft: "SC1".into(),
-            day: "2035-01-01".parse().expect("a day"),
             first_ns: 2_051_222_400_000_000_000,
             last_ns: 2_051_243_999_900_000_000,
-            time_scale: "UTC".into(),
-            stream: Stream::Test,
-            status: Status::Quicklook,
             inputs: Vec::new(),
             history: Vec::new(),
             model: Model { revision: "1".into(), parent: None, effects: vec!["com-offset".into()] },
             software: "0.1.0".into(),
-            losses: Vec::new(),
-            counts: BTreeMap::new(),
-            notes: Vec::new(),
+            replay: dragfree_engine::feed::Summary { time_scale: "UTC".into(), ..Default::default() },
             reports: vec![Report { plugin: "qp-check".into(), ..report }],
             settings: Default::default(),
             created: chrono::DateTime::UNIX_EPOCH,

@@ -51,42 +51,57 @@ pub(crate) fn columns(rows: &[Vec<String>]) -> String {
     text
 }
 
+/// A heading and the rows below it, for [`columns`].
+pub(crate) fn table(heading: &[&str], rows: impl IntoIterator<Item = Vec<String>>) -> Vec<Vec<String>> {
+    let heading = heading.iter().map(|&cell| cell.to_owned()).collect();
+    std::iter::once(heading).chain(rows).collect()
+}
+
+/// Whether no line is wider than the screen.
+pub(crate) fn fits(text: &str) -> bool {
+    text.lines().all(|line| width(line) <= WIDTH)
+}
+
+/// Each value once, in order of appearance.
+pub(crate) fn distinct<T: PartialEq>(all: impl IntoIterator<Item = T>) -> Vec<T> {
+    all.into_iter().fold(Vec::new(), |mut seen, one| {
+        if !seen.contains(&one) {
+            seen.push(one);
+        }
+        seen
+    })
+}
+
 /// A sentence broken at [`WIDTH`].
 pub(crate) fn wrapped(sentence: &str) -> String {
-    let mut text = String::new();
-    let mut column = 0;
-    for word in sentence.split_whitespace() {
-        if column > 0 && column + 1 + width(word) > WIDTH {
-            text.push('\n');
-            column = 0;
-        } else if column > 0 {
-            text.push(' ');
-            column += 1;
-        }
-        text += word;
-        column += width(word);
-    }
-    text + "\n"
+    wrap(String::new(), 0, sentence)
 }
 
 /// `label` and then `words`, broken at [`WIDTH`] and indented under the first word.
 pub(crate) fn labelled(label: &str, words: &str) -> String {
     const INDENT: usize = 10;
-    let mut lines = vec![format!("{label:<INDENT$}")];
-    let mut empty = true;
+    wrap(format!("{label:<INDENT$}"), INDENT, words)
+}
+
+fn wrap(first: String, indent: usize, words: &str) -> String {
+    let (mut lines, mut line, mut empty) = (String::new(), first, true);
     for word in words.split_whitespace() {
-        let line = lines.last_mut().expect("there is a first line");
-        if !empty && width(line) + 1 + width(word) > WIDTH {
-            lines.push(format!("{:INDENT$}{word}", ""));
-        } else {
-            if !empty {
-                line.push(' ');
-            }
-            line.push_str(word);
+        if !empty && width(&line) + 1 + width(word) > WIDTH {
+            lines += &format!(
+                "{line}
+"
+            );
+            line = " ".repeat(indent);
+        } else if !empty {
+            line.push(' ');
         }
+        line += word;
         empty = false;
     }
-    lines.iter().map(|line| format!("{}\n", line.trim_end())).collect()
+    lines
+        + line.trim_end()
+        + "
+"
 }
 
 /// A word as a shell takes it.

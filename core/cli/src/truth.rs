@@ -7,7 +7,7 @@ use std::path::Path;
 
 /// The first message of `/truth` in a file, by field path, `b1_orf_m.x`.
 pub(crate) fn first(path: &Path) -> Result<BTreeMap<String, f64>, Failure> {
-    first_message(path, "/truth").map_err(Failure::engine)
+    Ok(first_message(path, "/truth")?)
 }
 
 #[cfg(test)]

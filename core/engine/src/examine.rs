@@ -1,16 +1,14 @@
 //! A second pass over the data of a product: its inputs go through its chain once more, up to and with the effects, and
 //! the columns that the caller chooses come back to it.
 
-use std::path::PathBuf;
-
 use crate::EngineError;
 use crate::border::Kind;
-use crate::chain::{self, Chain, Sink};
+use crate::chain::{Chain, Sink};
 use crate::config::{EffectEntry, Mission, Model, Node};
+use crate::files::{IoContext as _, sha256_of};
 use crate::product::Product;
 use crate::registry::Registry;
-use crate::replay;
-use crate::run::{Progress, RunOptions, Setup, carry, carry_all, window};
+use crate::run::{Progress, RunOptions, Setup};
 use crate::sources::Sources;
 
 /// Which data are examined, and how.
@@ -30,50 +28,30 @@ pub struct Examination<'a> {
 /// A consumer of columns, with the indices of those that it wants in [`Chain::columns`].
 pub type Wanted<C> = (C, Vec<usize>);
 
-/// Every instance, on this mission, of every installed effect that is not in a model. An effect that may act anywhere
-/// is not tried: its place is the user's to say.
-#[must_use]
-pub fn candidates(registry: &Registry, model: &Model, mission: &Mission) -> Vec<EffectEntry> {
+/// Every instance of every installed effect that is not in the model of a product, on its mission. An effect without a
+/// list of instances is left out.
+///
+/// # Errors
+/// The mission or the model file cannot be read.
+pub fn candidates(registry: &Registry, sources: &Sources) -> Result<Vec<EffectEntry>, EngineError> {
+    let (mission, model) = (Mission::load(&sources.mission)?, Model::load(&sources.model)?);
     let mut all = Vec::new();
     for found in registry.plugins().filter(|p| p.info.kind == Kind::Effect) {
         let manifest = &found.info.manifest;
         for instance in manifest.instances_on(&mission.value) {
             if !model.effects.iter().any(|e| e.id == manifest.id && e.instance == instance) {
-                all.push(EffectEntry {
-                    id: manifest.id.clone(),
-                    instance,
-                    estimate: true,
-                    prior: std::collections::BTreeMap::new(),
-                    parameters: toml::Table::new(),
-                });
+                all.push(EffectEntry::new(&manifest.id, &instance));
             }
         }
     }
-    all
+    Ok(all)
 }
 
 /// Whether an effect has a parameter: with `at_ns` what it does happens once, at a time that the host finds; with
 /// `fine` its candidate can be tried about one shape in fine steps.
-#[must_use]
 pub fn has_parameter(registry: &Registry, effect: &str, name: &str) -> bool {
     let found = registry.find(Kind::Effect, effect);
     found.is_ok_and(|f| f.info.manifest.parameters.iter().any(|p| p.name == name))
-}
-
-/// The mission of a product, as its file is now.
-///
-/// # Errors
-/// It cannot be read.
-pub fn mission(sources: &Sources) -> Result<Mission, EngineError> {
-    Ok(Mission::load(&sources.mission)?)
-}
-
-/// The model of a product, as its file is now.
-///
-/// # Errors
-/// It cannot be read.
-pub fn model(sources: &Sources) -> Result<Model, EngineError> {
-    Ok(Model::load(&sources.model)?)
 }
 
 /// Carries the data of a product through its chain. `link` sees the linked chain before a row is read; what it makes
@@ -95,29 +73,21 @@ pub fn examine<C: Sink, E: From<EngineError>>(
         files: sources.telemetry.clone(),
         mission: Some(sources.mission.clone()),
         model: Some(sources.model.clone()),
-        archive: PathBuf::new(),
         from_ns: sources.from_ns,
         until_ns: sources.until_ns,
         threads: what.threads,
         batch_rows: what.batch_rows,
-        state_in: None,
-        state_out: None,
-        created: chrono::DateTime::UNIX_EPOCH,
-        software: String::new(),
+        ..RunOptions::default()
     };
     let mut setup = Setup::load(&options)?;
     setup.model.candidates.clone_from(&what.candidates);
     let nodes = &mut setup.pipeline.nodes;
     nodes.truncate(nodes.iter().position(|n| *n == Node::Effects).map_or(nodes.len(), |i| i + 1));
-    let mut feed = setup.feed(registry, &options, window(&options, None))?;
-    let tables = feed.get().tables().to_vec();
-    let mut chain = chain::build(registry, &setup.pipeline, &setup.mission, &setup.model, &tables, carry(&options))
-        .map_err(EngineError::from)?;
+    let mut feed = setup.feed(registry, None)?;
+    let mut chain = setup.link(registry, feed.tables())?;
     let (mut consumer, columns) = link(&chain)?;
     chain.tap(&columns).map_err(EngineError::from)?;
-    if carry_all(feed.get(), &mut chain, &mut consumer, progress)?.is_none() {
-        return Err(EngineError::NoRows { files: options.files }.into());
-    }
+    setup.carry(feed.as_mut(), &mut chain, &mut consumer, progress)?;
     chain.finish(&mut consumer).map_err(EngineError::from)?;
     Ok((consumer, chain.not_tried))
 }
@@ -126,8 +96,7 @@ pub fn examine<C: Sink, E: From<EngineError>>(
 fn unchanged(product: &Product, sources: &Sources) -> Result<(), EngineError> {
     let all = [&sources.pipeline, &sources.mission, &sources.model].into_iter().chain(&sources.telemetry);
     for path in all {
-        let digest =
-            replay::sha256(path).map_err(|source| EngineError::Io { action: "read", path: path.clone(), source })?;
+        let digest = sha256_of(path).at("read", path)?;
         if !product.inputs.iter().any(|input| input.sha256 == digest) {
             return Err(EngineError::Changed { path: path.clone(), product: product.id().to_owned() });
         }

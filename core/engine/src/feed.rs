@@ -36,6 +36,11 @@ pub trait Feed {
     /// # Errors
     /// The feed failed.
     fn summary(&mut self) -> Result<Summary, EngineError>;
+
+    /// The source plugin, if it is one.
+    fn source(&self) -> Option<&SourceFeed> {
+        None
+    }
 }
 
 /// What a feed has to say at its end.
@@ -43,8 +48,6 @@ pub trait Feed {
 pub struct Summary {
     /// `UTC`, `TAI` or `GPS`.
     pub time_scale: String,
-    /// Spacecraft that the data are from; empty where they do not say.
-    pub spacecraft: String,
     /// What was counted.
     pub counts: BTreeMap<String, u64>,
     /// What was lost.
@@ -114,7 +117,6 @@ impl Feed for FileFeed {
         let losses = self.replay.losses();
         Ok(Summary {
             time_scale: self.replay.info().time_scale.clone(),
-            spacecraft: self.replay.info().spacecraft.clone(),
             counts: losses.counts(),
             losses: losses.entries(),
             notes: losses.notes(),
@@ -223,12 +225,11 @@ impl Feed for SourceFeed {
     fn summary(&mut self) -> Result<Summary, EngineError> {
         let mut report = self.instance.report("[]").map_err(chain::ChainError::from)?;
         report.attachments.retain(|a| a.suffix != SEALED);
-        let text = |key: &str| report.quality.get(key).and_then(|v| v.as_str()).unwrap_or_default().to_owned();
-        Ok(Summary {
-            time_scale: Some(text("time_scale")).filter(|t| !t.is_empty()).unwrap_or_else(|| "UTC".to_owned()),
-            spacecraft: text("spacecraft"),
-            report: Some(report),
-            ..Summary::default()
-        })
+        let time_scale = report.quality.get("time_scale").and_then(|v| v.as_str()).filter(|t| !t.is_empty());
+        Ok(Summary { time_scale: time_scale.unwrap_or("UTC").to_owned(), report: Some(report), ..Summary::default() })
+    }
+
+    fn source(&self) -> Option<&SourceFeed> {
+        Some(self)
     }
 }

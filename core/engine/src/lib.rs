@@ -8,6 +8,7 @@ pub mod chain;
 pub mod config;
 pub mod examine;
 pub mod feed;
+pub mod files;
 pub mod product;
 pub mod registry;
 pub mod replay;
@@ -26,6 +27,7 @@ use std::path::PathBuf;
 
 /// Why a run or a simulation failed.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum EngineError {
     /// A file of the configuration.
     #[error(transparent)]
@@ -49,68 +51,30 @@ pub enum EngineError {
     #[error(transparent)]
     Product(#[from] product::ProductError),
     /// The operating system refused something.
-    #[error("cannot {action} {}: {source}", path.display())]
-    Io {
-        /// What was tried.
-        action: &'static str,
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] files::IoError),
     /// Neither the command line nor the pipeline names a file.
     #[error("{}: names no {what}, and the command line gives none; add `{what} = \"…\"` or pass --{what}", pipeline.display())]
-    NotNamed {
-        /// `mission` or `model`.
-        what: &'static str,
-        /// The pipeline.
-        pipeline: PathBuf,
-    },
+    NotNamed { what: &'static str, pipeline: PathBuf },
     /// No telemetry was given.
     #[error("{}: has no [source], so it reads telemetry files, and none was given; pass MCAP files", pipeline.display())]
-    NoFiles {
-        /// The pipeline.
-        pipeline: PathBuf,
-    },
+    NoFiles { pipeline: PathBuf },
     /// The files hold no topic of the interface.
     #[error("there is no telemetry in {}: {said}", files.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join(", "))]
-    NoTelemetry {
-        /// The files.
-        files: Vec<PathBuf>,
-        /// What the replay found in them.
-        said: String,
-    },
+    NoTelemetry { files: Vec<PathBuf>, said: String },
     /// There is not one row in the window.
     #[error("there is no telemetry in the time that was asked for ({} files); check --from and --until", files.len())]
-    NoRows {
-        /// The files.
-        files: Vec<PathBuf>,
-    },
+    NoRows { files: Vec<PathBuf> },
     /// The telemetry is not of the mission's spacecraft.
     #[error("the telemetry is of spacecraft {telemetry}, the mission file {} is for {mission}; use that spacecraft's mission file", path.display())]
-    WrongSpacecraft {
-        /// What the files say.
-        telemetry: String,
-        /// What the mission says.
-        mission: String,
-        /// The mission file.
-        path: PathBuf,
-    },
+    WrongSpacecraft { telemetry: String, mission: String, path: PathBuf },
     /// A simulation of no time.
     #[error("there is nothing to simulate: the end is not after the start")]
     EmptyWindow,
     /// An input of a product is not what it was.
     #[error("{} is not what it was when {product} was made from it; run the product again, or put the file back", path.display())]
-    Changed {
-        /// The file.
-        path: PathBuf,
-        /// The product.
-        product: String,
-    },
+    Changed { path: PathBuf, product: String },
     /// A file would be overwritten.
     #[error("{} exists already and is not overwritten; choose another folder with --out, or remove it", path.display())]
-    Exists {
-        /// The file.
-        path: PathBuf,
-    },
+    Exists { path: PathBuf },
 }

@@ -4,22 +4,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::border::{BorderError, Config, Instance, Kind, Library, PluginInfo};
+use crate::files::Problem;
 
 /// The plugins that were found.
 #[derive(Debug, Default)]
 pub struct Registry {
     libraries: Vec<Arc<Library>>,
-    refused: Vec<Refused>,
+    refused: Vec<Problem>,
     folders: Vec<PathBuf>,
-}
-
-/// A file in a plugin folder that is not used.
-#[derive(Clone, Debug)]
-pub struct Refused {
-    /// The file.
-    pub path: PathBuf,
-    /// Why.
-    pub reason: String,
 }
 
 /// A plugin of the registry.
@@ -33,38 +25,20 @@ pub struct Found {
 
 /// Why there is no plugin.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum RegistryError {
     /// No folder holds it.
     #[error(
         "no {kind} `{id}` in the plugin folders {folders}{near}; `dragfree plugins list` shows what is there, --plugin-dir adds a folder"
     )]
-    Unknown {
-        /// What was wanted.
-        kind: Kind,
-        /// Its id.
-        id: String,
-        /// Where we looked.
-        folders: String,
-        /// What comes near, or which files were refused.
-        near: String,
-    },
+    Unknown { kind: Kind, id: String, folders: String, near: String },
     /// Two libraries have it.
     #[error("{kind} `{id}` is in both {} and {}; remove one of the files, or leave its folder out", first.display(), second.display())]
-    Twice {
-        /// What was wanted.
-        kind: Kind,
-        /// Its id.
-        id: String,
-        /// One file.
-        first: PathBuf,
-        /// The other.
-        second: PathBuf,
-    },
+    Twice { kind: Kind, id: String, first: PathBuf, second: PathBuf },
 }
 
 impl Registry {
     /// Opens every shared library in the folders. A file that is refused is kept with its reason, and is no error.
-    #[must_use]
     pub fn discover(folders: &[PathBuf]) -> Self {
         let mut this = Self { folders: folders.to_vec(), ..Self::default() };
         let mut seen = std::collections::BTreeSet::new();
@@ -82,8 +56,8 @@ impl Registry {
                         tracing::debug!(path = %path.display(), sha256 = library.sha256, plugins, "opened");
                         this.libraries.push(Arc::new(library));
                     }
-                    Err(BorderError::Refused { path, reason }) => this.refused.push(Refused { path, reason }),
-                    Err(other) => this.refused.push(Refused { path, reason: other.to_string() }),
+                    Err(BorderError::Refused { path, reason }) => this.refused.push(Problem { path, reason }),
+                    Err(other) => this.refused.push(Problem { path, reason: other.to_string() }),
                 }
             }
         }
@@ -98,8 +72,7 @@ impl Registry {
     }
 
     /// Every file that was refused.
-    #[must_use]
-    pub fn refused(&self) -> &[Refused] {
+    pub fn refused(&self) -> &[Problem] {
         &self.refused
     }
 
@@ -127,11 +100,10 @@ impl Registry {
             }),
             (None, _) => {
                 let folders: Vec<_> = self.folders.iter().map(|f| f.display().to_string()).collect();
-                let near = match self.refused.iter().find(|r| r.path.to_string_lossy().contains(&id.replace('-', "_")))
-                {
-                    Some(refused) => format!(" ({} was refused: {})", refused.path.display(), refused.reason),
-                    None => String::new(),
-                };
+                let file = id.replace('-', "_");
+                let refused = self.refused.iter().find(|r| r.path.to_string_lossy().contains(&file));
+                let near =
+                    refused.map(|r| format!(" ({} was refused: {})", r.path.display(), r.reason)).unwrap_or_default();
                 Err(RegistryError::Unknown { kind, id: id.to_owned(), folders: folders.join(", "), near })
             }
         }

@@ -6,8 +6,9 @@
 //! revisions once they were current. `MODEL.toml.lock` holds the new text until it takes the file's name, and keeps a
 //! second writer out.
 
-use std::collections::BTreeSet;
-use std::fs::{self, File, OpenOptions};
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::{self, File};
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 
@@ -15,106 +16,51 @@ use serde::Serialize;
 use toml_edit::{ArrayOfTables, DocumentMut, InlineTable, Item, Table, TableLike, Value, value};
 
 use crate::config::{ConfigError, EffectEntry, Model};
+use crate::files::{IoContext as _, IoError, Problem, folder_of, sync_folder};
 
 /// Why a model file could not be changed or its history not be read.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum RevisionError {
     /// The file is no model.
     #[error(transparent)]
     Config(#[from] ConfigError),
     /// The operating system refused something.
-    #[error("cannot {action} {}: {source}", path.display())]
-    Io {
-        /// What was tried.
-        action: &'static str,
-        /// File or folder.
-        path: PathBuf,
-        /// The system's reason.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
     /// Another writer is at work, or was killed.
     #[error(
         "{} exists: another command is changing the model file; try again when it is done. If none is, it was killed: \
          remove that file, the model file itself is whole", path.display()
     )]
-    Locked {
-        /// The lock.
-        path: PathBuf,
-    },
+    Locked { path: PathBuf },
     /// The file was written between reading and replacing it.
     #[error("{} was changed by someone else meanwhile; nothing was done, run the command again", path.display())]
-    Changed {
-        /// The file.
-        path: PathBuf,
-    },
+    Changed { path: PathBuf },
     /// A revision cannot name a file.
     #[error(
         "{}: revision {revision:?} cannot name a file of the history: letters, digits, '.', '_', '+' and '-' may stand in it, no \
          '.' first; change it in the file", path.display()
     )]
-    Name {
-        /// The file.
-        path: PathBuf,
-        /// Its revision.
-        revision: String,
-    },
+    Name { path: PathBuf, revision: String },
     /// The effects are written in a way that cannot be edited.
     #[error("{}: `effect` is not a list of [[effect]] tables; write them so", path.display())]
-    Shape {
-        /// The file.
-        path: PathBuf,
-    },
+    Shape { path: PathBuf },
     /// The effect is in the model already.
     #[error("{}: effect {effect} is in the model already; `dragfree model remove` takes it out", path.display())]
-    There {
-        /// The file.
-        path: PathBuf,
-        /// `ID:INSTANCE`.
-        effect: String,
-    },
+    There { path: PathBuf, effect: String },
     /// The effect is not in the model, or not exactly once.
     #[error("{}: {what}; the model has {known}", path.display())]
-    NoEffect {
-        /// The file.
-        path: PathBuf,
-        /// Which, and why not.
-        what: String,
-        /// What there is.
-        known: String,
-    },
+    NoEffect { path: PathBuf, what: String, known: String },
     /// No such revision.
     #[error("no revision {revision} of {}; there are {known}", path.display())]
-    NoRevision {
-        /// The file.
-        path: PathBuf,
-        /// What was asked for.
-        revision: String,
-        /// What there is.
-        known: String,
-    },
+    NoRevision { path: PathBuf, revision: String, known: String },
     /// A file of the history is not what it was.
     #[error("{}: {reason}; a revision is never changed: take the file from a backup, or remove it", path.display())]
-    Damaged {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
+    Damaged { path: PathBuf, reason: String },
     /// A coefficient cannot be fixed.
     #[error("{}: {what}", path.display())]
-    Fix {
-        /// The file.
-        path: PathBuf,
-        /// What, why and what to do next.
-        what: String,
-    },
-}
-
-impl RevisionError {
-    fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
-        let path = path.into();
-        move |source| Self::Io { action, path, source }
-    }
+    Fix { path: PathBuf, what: String },
 }
 
 /// What differs between two revisions of one effect.
@@ -139,7 +85,6 @@ pub struct Change {
 }
 
 /// What turned the effects `old` into `new`.
-#[must_use]
 pub fn changes(old: &[EffectEntry], new: &[EffectEntry]) -> Vec<Change> {
     let same = |a: &EffectEntry, b: &EffectEntry| a.id == b.id && a.instance == b.instance;
     let mut out = Vec::new();
@@ -207,9 +152,9 @@ impl Edit {
     /// # Errors
     /// [`RevisionError`]: it cannot be read, is no model, is read-only, or another writer has it.
     pub fn begin(path: &Path) -> Result<Self, RevisionError> {
-        let path = fs::canonicalize(path).map_err(RevisionError::io("read the model file", path))?;
+        let path = fs::canonicalize(path).at("read the model file", path)?;
         let lock = Lock::take(&path)?;
-        let text = fs::read_to_string(&path).map_err(RevisionError::io("read the model file", &path))?;
+        let text = fs::read_to_string(&path).at("read the model file", &path)?;
         let model = Model::parse(&path, &text)?;
         file_name(&model)?;
         let document = document(&path, &text)?;
@@ -229,7 +174,6 @@ impl Edit {
     }
 
     /// The model as it was found.
-    #[must_use]
     pub fn model(&self) -> Option<&Model> {
         self.found.as_ref().map(|(_, model)| model)
     }
@@ -386,12 +330,11 @@ impl Edit {
     fn plan(&self) -> Result<Option<(Vec<Step>, Committed)>, RevisionError> {
         let folder = history_folder(&self.path);
         let kept = history(&folder)?;
-        let counter = |name: &str| Model::parts(name).map(|(counter, _)| counter).or_else(|| name.parse().ok());
         let names = kept.models.iter().map(|(model, _)| model.revision.as_str());
         let names = names
             .chain(self.model().map(|m| m.revision.as_str()))
             .chain(self.parent.as_ref().map(|(name, _)| name.as_str()));
-        let mut next = names.map(|name| counter(name).unwrap_or(1)).max().unwrap_or(0).saturating_add(1);
+        let mut next = names.map(|name| Model::counter(name).unwrap_or(1)).max().unwrap_or(0).saturating_add(1);
 
         let mut steps = Vec::new();
         let mut recorded = None;
@@ -488,36 +431,27 @@ impl Step {
 
 /// Writes a file of the history: whole under its name, or not at all, and read-only.
 fn keep(path: &Path, text: &str) -> Result<(), RevisionError> {
-    let io = |source| RevisionError::Io { action: "write the history", path: path.to_owned(), source };
-    let folder = path.parent().unwrap_or(Path::new("."));
-    fs::create_dir_all(folder).map_err(io)?;
     if path.exists() {
         let reason = "a revision of that name exists already, and is another".to_owned();
         return Err(RevisionError::Damaged { path: path.to_owned(), reason });
     }
-    // The lock is ours, so nobody else has this file; one that a kill left is written anew.
-    let partial = folder.join(format!(".{}.partial", path.file_stem().unwrap_or_default().to_string_lossy()));
-    let mut file = File::create(&partial).map_err(io)?;
-    file.write_all(text.as_bytes()).map_err(io)?;
-    let mut permissions = file.metadata().map_err(io)?.permissions();
-    permissions.set_readonly(true);
-    file.set_permissions(permissions).map_err(io)?;
-    file.sync_all().map_err(io)?;
-    fs::rename(&partial, path).map_err(io)?;
-    sync_folder(folder).map_err(io)?;
-    // The entry of a folder that was just made.
-    sync_folder(folder.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))).map_err(io)
-}
-
-#[cfg(unix)]
-fn sync_folder(folder: &Path) -> std::io::Result<()> {
-    File::open(folder).and_then(|folder| folder.sync_all())
-}
-
-/// Elsewhere a folder is no file that could be flushed.
-#[cfg(not(unix))]
-fn sync_folder(_: &Path) -> std::io::Result<()> {
-    Ok(())
+    let write = || {
+        let folder = folder_of(path);
+        fs::create_dir_all(folder)?;
+        // We hold the lock, so this file is ours, or what a kill left.
+        let partial = folder.join(format!(".{}.partial", path.file_stem().unwrap_or_default().to_string_lossy()));
+        let mut file = File::create(&partial)?;
+        file.write_all(text.as_bytes())?;
+        let mut permissions = file.metadata()?.permissions();
+        permissions.set_readonly(true);
+        file.set_permissions(permissions)?;
+        file.sync_all()?;
+        fs::rename(&partial, path)?;
+        sync_folder(folder)?;
+        // The folder may be new itself.
+        sync_folder(folder_of(folder))
+    };
+    Ok(write().at("write the history", path)?)
 }
 
 /// The right to change a model file: `MODEL.toml.lock`, which only one writer can make.
@@ -534,27 +468,28 @@ impl Lock {
         path.push(".lock");
         let path = PathBuf::from(path);
         if fs::metadata(model).is_ok_and(|m| m.permissions().readonly()) {
-            let source = std::io::Error::from(ErrorKind::PermissionDenied);
-            return Err(RevisionError::Io { action: "change the read-only", path: model.to_owned(), source });
+            let source = ErrorKind::PermissionDenied.into();
+            return Err(IoError { action: "change the read-only", path: model.to_owned(), source }.into());
         }
-        match OpenOptions::new().write(true).create_new(true).open(&path) {
-            Ok(file) => Ok(Self { path, file, renamed: false }),
+        match File::create_new(&path) {
             Err(error) if error.kind() == ErrorKind::AlreadyExists => Err(RevisionError::Locked { path }),
-            Err(source) => Err(RevisionError::Io { action: "lock the model file with", path, source }),
+            made => Ok(Self { file: made.at("lock the model file with", &path)?, path, renamed: false }),
         }
     }
 
     /// Fills the lock with the text and gives it the file's name, which also ends the lock.
     fn replace(mut self, path: &Path, text: &str) -> Result<(), RevisionError> {
-        let io = |source| RevisionError::Io { action: "write the model file", path: path.to_owned(), source };
-        self.file.write_all(text.as_bytes()).map_err(io)?;
-        if let Ok(old) = fs::metadata(path) {
-            self.file.set_permissions(old.permissions()).map_err(io)?;
-        }
-        self.file.sync_all().map_err(io)?;
-        fs::rename(&self.path, path).map_err(io)?;
-        self.renamed = true;
-        sync_folder(path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."))).map_err(io)
+        let mut write = || {
+            self.file.write_all(text.as_bytes())?;
+            if let Ok(old) = fs::metadata(path) {
+                self.file.set_permissions(old.permissions())?;
+            }
+            self.file.sync_all()?;
+            fs::rename(&self.path, path)?;
+            self.renamed = true;
+            sync_folder(folder_of(path))
+        };
+        Ok(write().at("write the model file", path)?)
     }
 }
 
@@ -601,7 +536,7 @@ pub struct Log {
     /// Newest first.
     pub revisions: Vec<Logged>,
     /// Files of the history that cannot be used, and why.
-    pub problems: Vec<(PathBuf, String)>,
+    pub problems: Vec<Problem>,
 }
 
 /// Every revision of a model file.
@@ -617,43 +552,30 @@ pub fn log(path: &Path) -> Result<Log, RevisionError> {
         (true, false) => (format!("{}+{}", current.revision, current.digest()), Some(current.revision.clone())),
         _ => current.identity(),
     };
-    let mut all: Vec<(Model, String, Option<String>, bool)> = kept
-        .models
-        .into_iter()
-        .filter(|(model, _)| edited || model.revision != current.revision)
-        .map(|(model, _)| (model.clone(), model.revision.clone(), model.parent, false))
-        .collect();
-    let number = |name: &str, edited: bool| {
-        let made = Model::parts(name).map(|(counter, _)| counter).or_else(|| name.parse().ok());
-        if edited { u32::MAX } else { made.unwrap_or(0) }
+    let logged = |model: Model, revision: String, parent, edited| {
+        let (place, changes) = (Place::Aside, Vec::new());
+        Logged { model, revision, parent, place, changes, edited }
     };
-    all.push((current, revision.clone(), parent, edited));
-    all.sort_by(|a, b| (number(&b.1, b.3), &b.1).cmp(&(number(&a.1, a.3), &a.1)));
-    let mut line = BTreeSet::new();
+    let kept_models = kept.models.into_iter().map(|(model, _)| model);
+    let mut revisions: Vec<Logged> = kept_models
+        .filter(|model| edited || model.revision != current.revision)
+        .map(|model| logged(model.clone(), model.revision, model.parent, false))
+        .collect();
+    revisions.push(logged(current, revision.clone(), parent, edited));
+    let number = |r: &Logged| if r.edited { u32::MAX } else { Model::counter(&r.revision).unwrap_or(0) };
+    revisions.sort_by_cached_key(|r| Reverse((number(r), r.revision.clone())));
+    let effects: BTreeMap<String, Vec<EffectEntry>> =
+        revisions.iter().map(|r| (r.revision.clone(), r.model.effects.clone())).collect();
     let mut at = Some(revision.clone());
-    while let Some(name) = at.filter(|name| !line.contains(name)) {
-        at = all.iter().find(|(_, revision, ..)| *revision == name).and_then(|(_, _, parent, _)| parent.clone());
-        line.insert(name);
+    while let Some(found) = revisions.iter_mut().find(|r| Some(&r.revision) == at.as_ref() && r.place == Place::Aside) {
+        found.place = if found.revision == revision { Place::Current } else { Place::Ancestor };
+        at.clone_from(&found.parent);
     }
-    let revisions = all.iter().map(|(model, name, parent, edited)| {
-        let from = match parent {
-            None => Some(&[][..]),
-            Some(parent) => all.iter().find(|(_, r, ..)| r == parent).map(|(m, ..)| m.effects.as_slice()),
-        };
-        Logged {
-            model: model.clone(),
-            revision: name.clone(),
-            parent: parent.clone(),
-            place: match (*name == revision, line.contains(name)) {
-                (true, _) => Place::Current,
-                (_, true) => Place::Ancestor,
-                _ => Place::Aside,
-            },
-            changes: from.map(|from| changes(from, &model.effects)).unwrap_or_default(),
-            edited: *edited,
-        }
-    });
-    Ok(Log { revisions: revisions.collect(), problems: kept.problems })
+    for r in &mut revisions {
+        let from = r.parent.as_ref().map_or(Some(&[][..]), |parent| effects.get(parent).map(Vec::as_slice));
+        r.changes = from.map(|from| changes(from, &r.model.effects)).unwrap_or_default();
+    }
+    Ok(Log { revisions, problems: kept.problems })
 }
 
 /// A revision of a model file and its text: by its name, or by the number in front where that is enough.
@@ -663,7 +585,7 @@ pub fn log(path: &Path) -> Result<Log, RevisionError> {
 pub fn find(path: &Path, revision: &str) -> Result<(Model, String), RevisionError> {
     let current = Model::load(path)?;
     if current.identity().0 == revision {
-        let text = fs::read_to_string(path).map_err(RevisionError::io("read the model file", path))?;
+        let text = fs::read_to_string(path).at("read the model file", path)?;
         return Ok((Model::parse(path, &text)?, text));
     }
     let kept = history(&history_folder(path))?;
@@ -684,7 +606,6 @@ pub fn find(path: &Path, revision: &str) -> Result<(Model, String), RevisionErro
 }
 
 /// `MODEL.history` beside `MODEL.toml`.
-#[must_use]
 pub fn history_folder(path: &Path) -> PathBuf {
     path.with_extension("history")
 }
@@ -693,7 +614,7 @@ pub fn history_folder(path: &Path) -> PathBuf {
 struct History {
     /// Sound revisions and their texts, by name.
     models: Vec<(Model, String)>,
-    problems: Vec<(PathBuf, String)>,
+    problems: Vec<Problem>,
 }
 
 fn history(folder: &Path) -> Result<History, RevisionError> {
@@ -701,11 +622,11 @@ fn history(folder: &Path) -> Result<History, RevisionError> {
     let entries = match fs::read_dir(folder) {
         Ok(entries) => entries,
         Err(error) if error.kind() == ErrorKind::NotFound => return Ok(kept),
-        Err(source) => return Err(RevisionError::Io { action: "read the history", path: folder.to_owned(), source }),
+        other => other.at("read the history", folder)?,
     };
     let mut paths = Vec::new();
     for entry in entries {
-        let path = entry.map_err(RevisionError::io("read the history", folder))?.path();
+        let path = entry.at("read the history", folder)?.path();
         // What a kill left unfinished begins with a dot; it never was a revision.
         if !path.file_name().is_some_and(|name| name.to_string_lossy().starts_with('.')) {
             paths.push(path);
@@ -715,7 +636,7 @@ fn history(folder: &Path) -> Result<History, RevisionError> {
     for path in paths {
         match sound(&path) {
             Ok(found) => kept.models.push(found),
-            Err(error) => kept.problems.push((path, error.to_string())),
+            Err(error) => kept.problems.push(Problem { path, reason: error.to_string() }),
         }
     }
     Ok(kept)
@@ -723,7 +644,7 @@ fn history(folder: &Path) -> Result<History, RevisionError> {
 
 /// A file of the history, whose name and digest must be its content's.
 fn sound(path: &Path) -> Result<(Model, String), RevisionError> {
-    let text = fs::read_to_string(path).map_err(RevisionError::io("read the history", path))?;
+    let text = fs::read_to_string(path).at("read the history", path)?;
     let model = Model::parse(path, &text)?;
     let damaged = |reason: String| Err(RevisionError::Damaged { path: path.to_owned(), reason });
     if path.file_name().is_none_or(|name| *name != *format!("{}.toml", model.revision)) {

@@ -2,25 +2,25 @@
 
 use chrono::{DateTime, Utc};
 use dragfree_schema::Report;
-use serde_json::Value;
-use sha2::{Digest, Sha256};
+use serde_json::{Map, Value};
+use std::io;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 use crate::EngineError;
-use crate::border::hex;
-use crate::chain::{self, Carry, Chain, Sink};
+use crate::border::PluginInfo;
+use crate::chain::{self, Carry, Chain, ChainNode, Sink};
 use crate::config::{Mission, Model, Pipeline};
-use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions, Summary};
-use crate::product::{self, Draft, Loss, Product, ProductWriter, Stage, Status, Stream};
+use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions};
+use crate::files::{IoContext as _, IoError, folder_of, sha256, sha256_of, sync_folder};
+use crate::product::{self, Draft, Loss, ProductWriter, Stage, Written};
 use crate::registry::Registry;
-use crate::replay;
 use crate::sources::Sources;
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{FileHeader, TelemetryWriter, interface_tables};
 
 /// What to run.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct RunOptions {
     /// Pipeline file.
     pub pipeline: PathBuf,
@@ -59,17 +59,6 @@ pub struct Progress {
     pub first_ns: i64,
     /// End, Unix ns, where it is known.
     pub end_ns: Option<i64>,
-    /// Rows of the densest table so far.
-    pub epochs: u64,
-}
-
-/// What came of a run.
-#[derive(Clone, Debug)]
-pub struct Outcome {
-    /// The product.
-    pub product: Product,
-    /// Its file.
-    pub path: PathBuf,
 }
 
 /// What a check found.
@@ -102,15 +91,16 @@ pub struct CheckedNode {
     pub writes: Vec<String>,
 }
 
-/// The files of a run, read.
-pub(crate) struct Setup {
+/// The options of a run and its files, read.
+pub(crate) struct Setup<'a> {
+    pub(crate) options: &'a RunOptions,
     pub(crate) pipeline: Pipeline,
     pub(crate) mission: Mission,
     pub(crate) model: Model,
 }
 
-impl Setup {
-    pub(crate) fn load(options: &RunOptions) -> Result<Self, EngineError> {
+impl<'a> Setup<'a> {
+    pub(crate) fn load(options: &'a RunOptions) -> Result<Self, EngineError> {
         let pipeline = Pipeline::load(&options.pipeline)?;
         let choose = |given: &Option<PathBuf>, own: &Option<PathBuf>, what: &'static str| {
             given
@@ -120,15 +110,15 @@ impl Setup {
         };
         let mission = Mission::load(&choose(&options.mission, &pipeline.mission, "mission")?)?;
         let model = Model::load(&choose(&options.model, &pipeline.model, "model")?)?;
-        Ok(Self { pipeline, mission, model })
+        Ok(Self { options, pipeline, mission, model })
     }
 
-    pub(crate) fn feed(
-        &self,
-        registry: &Registry,
-        options: &RunOptions,
-        window: Option<Range<i64>>,
-    ) -> Result<FeedKind, EngineError> {
+    /// Opens the feed for the window of the options, from `resume_ns` on.
+    pub(crate) fn feed(&self, registry: &Registry, resume_ns: Option<i64>) -> Result<Box<dyn Feed>, EngineError> {
+        let options = self.options;
+        let (start, end) = (options.from_ns.max(resume_ns), options.until_ns);
+        let window: Option<Range<i64>> =
+            (start.is_some() || end.is_some()).then(|| start.unwrap_or(i64::MIN)..end.unwrap_or(i64::MAX));
         match &self.pipeline.source {
             Some((id, parameters)) => {
                 let source = SourceOptions {
@@ -138,34 +128,38 @@ impl Setup {
                     window_ns: window,
                     rows: options.batch_rows,
                 };
-                Ok(FeedKind::Source(Box::new(SourceFeed::open(registry, id, &self.mission, &source)?)))
+                Ok(Box::new(SourceFeed::open(registry, id, &self.mission, &source)?))
             }
             None if options.files.is_empty() => Err(EngineError::NoFiles { pipeline: options.pipeline.clone() }),
-            None => {
-                Ok(FeedKind::Files(Box::new(FileFeed::open(&options.files, window, options.threads, &self.mission)?)))
+            None => Ok(Box::new(FileFeed::open(&options.files, window, options.threads, &self.mission)?)),
+        }
+    }
+
+    pub(crate) fn link(&self, registry: &Registry, tables: &[TableSpec]) -> Result<Chain, EngineError> {
+        let carry = Carry { batch_rows: self.options.batch_rows, threads: self.options.threads };
+        Ok(chain::build(registry, &self.pipeline, &self.mission, &self.model, tables, carry)?)
+    }
+
+    /// Carries every row of the feed into the chain.
+    pub(crate) fn carry(
+        &self,
+        feed: &mut dyn Feed,
+        chain: &mut Chain,
+        sink: &mut dyn Sink,
+        progress: &mut dyn FnMut(Progress),
+    ) -> Result<Covered, EngineError> {
+        let end_ns = feed.span_ns().map(|span| span.end).filter(|end| *end != i64::MAX);
+        let mut covered: Option<Covered> = None;
+        while let Some(chunk) = feed.next()? {
+            if let Some((first_ns, last_ns)) = extent(&chunk) {
+                let covered = covered.get_or_insert(Covered { first_ns, last_ns });
+                covered.last_ns = covered.last_ns.max(last_ns);
+                progress(Progress { until_ns: last_ns, first_ns: covered.first_ns, end_ns });
             }
+            chain.feed(chunk, sink)?;
         }
+        covered.ok_or_else(|| EngineError::NoRows { files: self.options.files.clone() })
     }
-}
-
-pub(crate) enum FeedKind {
-    Files(Box<FileFeed>),
-    Source(Box<SourceFeed>),
-}
-
-impl FeedKind {
-    pub(crate) fn get(&mut self) -> &mut dyn Feed {
-        match self {
-            Self::Files(feed) => feed.as_mut(),
-            Self::Source(feed) => feed.as_mut(),
-        }
-    }
-}
-
-pub(crate) fn window(options: &RunOptions, resume_ns: Option<i64>) -> Option<Range<i64>> {
-    let start = options.from_ns.max(resume_ns);
-    (start.is_some() || options.until_ns.is_some())
-        .then(|| start.unwrap_or(i64::MIN)..options.until_ns.unwrap_or(i64::MAX))
 }
 
 /// Links a pipeline over its feed without reading a row.
@@ -174,37 +168,25 @@ pub(crate) fn window(options: &RunOptions, resume_ns: Option<i64>) -> Option<Ran
 /// Whatever would keep the run from starting.
 pub fn check(registry: &Registry, options: &RunOptions) -> Result<CheckReport, EngineError> {
     let setup = Setup::load(options)?;
-    let mut feed = match (&setup.pipeline.source, options.files.is_empty()) {
-        (None, true) => None,
-        _ => Some(setup.feed(registry, options, window(options, None))?),
+    let tables = match (&setup.pipeline.source, options.files.is_empty()) {
+        (None, true) => interface_tables(),
+        _ => setup.feed(registry, None)?.tables().to_vec(),
     };
-    let tables = feed.as_mut().map_or_else(interface_tables, |f| f.get().tables().to_vec());
-    let chain = chain::build(registry, &setup.pipeline, &setup.mission, &setup.model, &tables, carry(options))?;
+    let chain = setup.link(registry, &tables)?;
+    let checked = |n: &ChainNode| CheckedNode {
+        name: n.name().to_owned(),
+        version: n.info.manifest.version.clone(),
+        reads: n.reads.clone(),
+        writes: n.writes.iter().flat_map(|t| &t.columns).map(|c| format!("{}:{}", c.table, c.name)).collect(),
+    };
     Ok(CheckReport {
         pipeline: setup.pipeline.name,
         mission: setup.mission.name,
         model: setup.model.identity().0,
-        nodes: chain
-            .nodes
-            .iter()
-            .map(|n| CheckedNode {
-                name: n.name().to_owned(),
-                version: n.info.manifest.version.clone(),
-                reads: n.reads.clone(),
-                writes: n
-                    .writes
-                    .iter()
-                    .flat_map(|t| t.columns.iter().map(|c| format!("{}:{}", t.name, c.name)))
-                    .collect(),
-            })
-            .collect(),
+        nodes: chain.nodes.iter().map(checked).collect(),
         coefficients: chain.coefficients.iter().filter(|c| c.estimate).map(|c| c.name.clone()).collect(),
         free_bytes: free_bytes(&options.archive),
     })
-}
-
-pub(crate) fn carry(options: &RunOptions) -> Carry {
-    Carry { batch_rows: options.batch_rows, threads: options.threads }
 }
 
 /// Runs a pipeline and archives its product.
@@ -215,39 +197,36 @@ pub fn run(
     registry: &Registry,
     options: &RunOptions,
     progress: &mut dyn FnMut(Progress),
-) -> Result<Outcome, EngineError> {
+) -> Result<Written, EngineError> {
     let setup = Setup::load(options)?;
     let next_state = options.state_out.as_deref().map(NextState::begin).transpose()?;
-    let state = options.state_in.as_ref().map(|path| read_state(path)).transpose()?;
+    let state = options.state_in.as_ref().map(|path| std::fs::read(path).at("read the state", path)).transpose()?;
     let resume_ns = state.as_ref().map(|s| chain::resumes_at_ns(s)).transpose()?;
-    let mut feed = setup.feed(registry, options, window(options, resume_ns))?;
-    let tables = feed.get().tables().to_vec();
-    let mut chain = chain::build(registry, &setup.pipeline, &setup.mission, &setup.model, &tables, carry(options))?;
-    log(&setup, options, &chain);
+    let mut feed = setup.feed(registry, resume_ns)?;
+    let mut chain = setup.link(registry, feed.tables())?;
+    log(&setup, &chain);
     if let Some(state) = &state {
         chain.load(state)?;
     }
     let mut writer = ProductWriter::begin(&options.archive)?;
-    let mut series = Series::create(&chain, &mut writer, &setup, options)?;
-    let covered = carry_all(feed.get(), &mut chain, &mut series, progress)?;
-    let Some(covered) = covered else { return Err(EngineError::NoRows { files: options.files.clone() }) };
-    // Before the ends are flushed, so that tomorrow goes on in the middle of the lags.
+    let mut series = Series::create(&chain, &mut writer, &setup)?;
+    let covered = setup.carry(feed.as_mut(), &mut chain, &mut series, progress)?;
+    // Saved before the flush, because the next day continues within the lags.
     let next_state = next_state.map(|next| next.write(&chain.save()?)).transpose()?;
     chain.finish(&mut series)?;
     let reports = chain.reports()?;
     series.finish()?;
-    let summary = feed.get().summary()?;
-    let draft = draft(&setup, options, &chain, &feed, summary, reports, &covered)?;
-    sources(&setup, options).write(&writer.staged_unlisted(product::SOURCES))?;
+    let draft = draft(&setup, &chain, feed.as_mut(), reports, &covered)?;
+    sources(&setup).write(&writer.staged_unlisted(product::SOURCES))?;
     tracing::debug!(epochs_from_ns = covered.first_ns, epochs_to_ns = covered.last_ns, "every stage has reported");
-    // The state after the product: a kill in between costs a second run of the day, never the day.
+    // The state last: after a kill in between, the day can be run again.
     let written = writer.commit_with(&draft, || next_state.map_or(Ok(()), NextState::place))?;
     tracing::info!(id = written.product.id(), path = %written.path.display(), "archived");
-    Ok(Outcome { product: written.product, path: written.path })
+    Ok(written)
 }
 
-/// Tells what is about to run.
-fn log(setup: &Setup, options: &RunOptions, chain: &Chain) {
+/// Logs the linked chain.
+fn log(setup: &Setup<'_>, chain: &Chain) {
     let coefficients = chain.coefficients.iter().filter(|c| c.estimate).count();
     tracing::info!(
         pipeline = setup.pipeline.name,
@@ -255,7 +234,7 @@ fn log(setup: &Setup, options: &RunOptions, chain: &Chain) {
         model = setup.model.identity().0,
         plugins = chain.nodes.len(),
         coefficients,
-        files = options.files.len(),
+        files = setup.options.files.len(),
         "linked"
     );
     for node in &chain.nodes {
@@ -271,73 +250,42 @@ pub(crate) struct Covered {
     last_ns: i64,
 }
 
-pub(crate) fn carry_all(
-    feed: &mut dyn Feed,
-    chain: &mut Chain,
-    sink: &mut dyn Sink,
-    progress: &mut dyn FnMut(Progress),
-) -> Result<Option<Covered>, EngineError> {
-    let span = feed.span_ns();
-    let mut covered: Option<Covered> = None;
-    let mut epochs = 0u64;
-    while let Some(chunk) = feed.next()? {
-        if let Some((first, last)) = extent(&chunk) {
-            let covered = covered.get_or_insert(Covered { first_ns: first, last_ns: last });
-            covered.last_ns = covered.last_ns.max(last);
-            epochs += chunk.batches.iter().map(Batch::rows).max().unwrap_or(0) as u64;
-            progress(Progress {
-                until_ns: last,
-                first_ns: covered.first_ns,
-                end_ns: span.as_ref().map(|s| s.end).filter(|e| *e != i64::MAX),
-                epochs,
-            });
-        }
-        chain.feed(chunk, sink)?;
-    }
-    Ok(covered)
-}
-
 /// First and last time of the densest table of a chunk: slow tables may begin long before.
 fn extent(chunk: &Chunk) -> Option<(i64, i64)> {
     let densest = chunk.batches.iter().max_by_key(|b| b.rows())?;
     Some((*densest.time_ns.first()?, *densest.time_ns.last()?))
 }
 
-fn read_state(path: &Path) -> Result<Vec<u8>, EngineError> {
-    std::fs::read(path).map_err(|source| EngineError::Io { action: "read the state", path: path.to_owned(), source })
-}
-
 /// The state for the next day, written beside its place and renamed: a kill leaves the old state or the new one.
 struct NextState<'a> {
     path: &'a Path,
-    folder: &'a Path,
     file: tempfile::NamedTempFile,
 }
 
 impl<'a> NextState<'a> {
     /// Opens the file, so that a place that cannot be written is refused before the day is read.
-    fn begin(path: &'a Path) -> Result<Self, EngineError> {
-        let io = |source| EngineError::Io { action: "write the state", path: path.to_owned(), source };
-        if path.is_dir() {
-            return Err(io(std::io::ErrorKind::IsADirectory.into()));
-        }
-        let folder = path.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        std::fs::create_dir_all(folder).map_err(io)?;
-        Ok(Self { path, folder, file: tempfile::NamedTempFile::new_in(folder).map_err(io)? })
+    fn begin(path: &'a Path) -> Result<Self, IoError> {
+        let open = || {
+            if path.is_dir() {
+                return Err(io::ErrorKind::IsADirectory.into());
+            }
+            std::fs::create_dir_all(folder_of(path))?;
+            tempfile::NamedTempFile::new_in(folder_of(path))
+        };
+        Ok(Self { path, file: open().at("write the state", path)? })
     }
 
     fn write(mut self, bytes: &[u8]) -> Result<Self, EngineError> {
-        let written = std::io::Write::write_all(&mut self.file, bytes).and_then(|()| self.file.as_file().sync_all());
-        written.map_err(|source| EngineError::Io { action: "write the state", path: self.path.to_owned(), source })?;
+        let written = io::Write::write_all(&mut self.file, bytes).and_then(|()| self.file.as_file().sync_all());
+        written.at("write the state", self.path)?;
         Ok(self)
     }
 
     fn place(self) -> Result<(), EngineError> {
-        let io = |source| EngineError::Io { action: "write the state", path: self.path.to_owned(), source };
-        self.file.persist(self.path).map_err(|e| io(e.error))?;
+        self.file.persist(self.path).map_err(|e| e.error).at("write the state", self.path)?;
         // The state is in its place; only a power failure could still take the rename back.
-        if let Err(error) = std::fs::File::open(self.folder).and_then(|f| f.sync_all()) {
-            tracing::warn!("the folder {} cannot be flushed to disk: {error}", self.folder.display());
+        if let Err(error) = sync_folder(folder_of(self.path)) {
+            tracing::warn!("the folder {} cannot be flushed to disk: {error}", folder_of(self.path).display());
         }
         Ok(())
     }
@@ -364,33 +312,23 @@ struct Series {
 }
 
 impl Series {
-    fn create(
-        chain: &Chain,
-        product: &mut ProductWriter,
-        setup: &Setup,
-        options: &RunOptions,
-    ) -> Result<Self, EngineError> {
+    fn create(chain: &Chain, product: &mut ProductWriter, setup: &Setup<'_>) -> Result<Self, EngineError> {
         let tables = chain.archived_tables();
         let header = FileHeader {
             time_scale: "UTC".to_owned(),
             mission: setup.mission.name.clone(),
             spacecraft: setup.mission.spacecraft.clone(),
             producer: "dragfree".to_owned(),
-            version: options.software.clone(),
+            version: setup.options.software.clone(),
             ..FileHeader::default()
         };
-        let writer = if tables.is_empty() {
-            None
-        } else {
-            Some(TelemetryWriter::create(&product.staged("mcap"), &tables, &header)?)
-        };
+        let create = || TelemetryWriter::create(&product.staged("mcap"), &tables, &header);
+        let writer = (!tables.is_empty()).then(create).transpose()?;
         Ok(Self { last_ns: vec![None; tables.len()], tables, writer })
     }
 
     fn finish(self) -> Result<(), EngineError> {
-        if let Some(writer) = self.writer {
-            writer.finish()?;
-        }
+        self.writer.map(TelemetryWriter::finish).transpose()?;
         Ok(())
     }
 }
@@ -406,45 +344,40 @@ impl Sink for Series {
             }
             chunk.batches.push(if mine { batch.clone() } else { Batch::empty(t.columns.len()) });
         }
-        // A table that has not spoken yet may still come with earlier rows.
+        // A table without any row so far may still deliver earlier ones.
         chunk.complete_until_ns = self.last_ns.iter().map(|t| t.unwrap_or(i64::MIN)).min().unwrap_or(i64::MIN);
         writer.write(chunk).map_err(|e| e.to_string())
     }
 }
 
+/// A plugin that ran, as a product names it.
+fn stage(info: &PluginInfo, instance: &str, library_sha256: &str, parameters: &Map<String, Value>) -> Stage {
+    Stage {
+        plugin: info.manifest.id.clone(),
+        instance: instance.to_owned(),
+        kind: info.kind.to_string(),
+        version: info.manifest.version.clone(),
+        abi: dragfree_abi::ABI_VERSION.to_string(),
+        library_sha256: library_sha256.to_owned(),
+        parameters_sha256: sha256(Value::Object(parameters.clone()).to_string()),
+    }
+}
+
 fn draft(
-    setup: &Setup,
-    options: &RunOptions,
+    setup: &Setup<'_>,
     chain: &Chain,
-    feed: &FeedKind,
-    summary: Summary,
+    feed: &mut dyn Feed,
     reports: Vec<Report>,
     covered: &Covered,
 ) -> Result<Draft, EngineError> {
-    let day = DateTime::from_timestamp_nanos(covered.first_ns).date_naive();
-    let mut history = Vec::new();
-    if let FeedKind::Source(source) = feed {
-        history.push(Stage {
-            plugin: source.found.info.manifest.id.clone(),
-            instance: String::new(),
-            kind: source.found.info.kind.to_string(),
-            version: source.found.info.manifest.version.clone(),
-            abi: dragfree_abi::ABI_VERSION.to_string(),
-            library_sha256: source.found.opened.sha256.clone(),
-            parameters_sha256: digest(&source.parameters),
-        });
-    }
-    history.extend(chain.nodes.iter().map(|n| Stage {
-        plugin: n.info.manifest.id.clone(),
-        instance: n.name().split_once(':').map(|(_, i)| i.to_owned()).unwrap_or_default(),
-        kind: n.info.kind.to_string(),
-        version: n.info.manifest.version.clone(),
-        abi: dragfree_abi::ABI_VERSION.to_string(),
-        library_sha256: n.sha256.clone(),
-        parameters_sha256: digest(&n.parameters),
-    }));
-    let mut losses = summary.losses;
-    losses.extend(chain.nodes.iter().filter(|n| n.discarded_rows > 0).map(|n| Loss {
+    let mut replay = feed.summary()?;
+    let source = feed.source().map(|s| stage(&s.found.info, "", &s.found.opened.sha256, &s.parameters));
+    let nodes = chain.nodes.iter().map(|n| {
+        let instance = n.name().split_once(':').map_or("", |(_, instance)| instance);
+        stage(&n.info, instance, &n.sha256, &n.parameters)
+    });
+    let history = source.into_iter().chain(nodes).collect();
+    replay.losses.extend(chain.nodes.iter().filter(|n| n.discarded_rows > 0).map(|n| Loss {
         kind: "discarded_rows".to_owned(),
         count: n.discarded_rows,
         detail: format!("plugin {} discarded batches; its log says why", n.name()),
@@ -452,9 +385,8 @@ fn draft(
     let mut effects: Vec<String> = setup.model.effects.iter().map(|e| e.id.clone()).collect();
     effects.dedup();
     let (revision, parent) = setup.model.identity();
-    let mut notes = summary.notes;
     if setup.model.edited_by_hand() {
-        notes.push(format!(
+        replay.notes.push(format!(
             "the model file was edited by hand since revision {} was made; `dragfree model commit` makes a revision of it",
             setup.model.revision
         ));
@@ -465,56 +397,45 @@ fn draft(
         release: setup.pipeline.release,
         mission: setup.mission.name.clone(),
         spacecraft: setup.mission.spacecraft.clone(),
-        day,
         first_ns: covered.first_ns,
         last_ns: covered.last_ns,
-        time_scale: summary.time_scale,
-        stream: Stream::Test,
-        status: Status::Quicklook,
-        inputs: inputs(setup, options)?,
+        inputs: inputs(setup)?,
         history,
         model: product::Model { revision, parent, effects },
-        software: options.software.clone(),
-        losses,
-        counts: summary.counts,
-        notes,
-        reports: summary.report.into_iter().chain(reports).collect(),
+        software: setup.options.software.clone(),
+        reports: replay.report.take().into_iter().chain(reports).collect(),
+        replay,
         settings: setup.pipeline.settings.clone(),
-        created: options.created,
+        created: setup.options.created,
     })
 }
 
 /// Where the inputs of a run lie.
-fn sources(setup: &Setup, options: &RunOptions) -> Sources {
+fn sources(setup: &Setup<'_>) -> Sources {
     let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
     Sources {
         pipeline: absolute(&setup.pipeline.path),
         mission: absolute(&setup.mission.path),
         model: absolute(&setup.model.path),
-        telemetry: options.files.iter().map(|f| absolute(f)).collect(),
-        from_ns: options.from_ns,
-        until_ns: options.until_ns,
+        telemetry: setup.options.files.iter().map(|f| absolute(f)).collect(),
+        from_ns: setup.options.from_ns,
+        until_ns: setup.options.until_ns,
     }
 }
 
-fn digest(parameters: &serde_json::Map<String, Value>) -> String {
-    hex(&Sha256::digest(Value::Object(parameters.clone()).to_string()))
-}
-
-fn inputs(setup: &Setup, options: &RunOptions) -> Result<Vec<product::Input>, EngineError> {
-    let telemetry = options.files.iter().map(|f| ("telemetry", f.as_path()));
+fn inputs(setup: &Setup<'_>) -> Result<Vec<product::Input>, EngineError> {
+    let telemetry = setup.options.files.iter().map(|f| ("telemetry", f.as_path()));
     let own = [("pipeline", &setup.pipeline.path), ("mission", &setup.mission.path), ("model", &setup.model.path)];
-    let state = options.state_in.iter().map(|f| ("state", f.as_path()));
+    let state = setup.options.state_in.iter().map(|f| ("state", f.as_path()));
     telemetry
         .chain(own.iter().map(|(role, path)| (*role, path.as_path())))
         .chain(state)
         .map(|(role, path)| {
-            let io = |source| EngineError::Io { action: "read", path: path.to_owned(), source };
             Ok(product::Input {
                 role: role.to_owned(),
                 name: path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
-                size: std::fs::metadata(path).map_err(io)?.len(),
-                sha256: replay::sha256(path).map_err(io)?,
+                size: std::fs::metadata(path).at("read", path)?.len(),
+                sha256: sha256_of(path).at("read", path)?,
             })
         })
         .collect()

@@ -2,10 +2,11 @@
 //! changes it unseen either.
 
 use serde_json::{Value, json};
-use sha2::{Digest, Sha256};
 use std::fs::File;
 use std::io::{Read as _, Write as _};
 use std::path::{Path, PathBuf};
+
+use crate::files::{IoContext as _, IoError, hex, sha256};
 
 /// Key of the digest in the Metadata record of every telemetry file of the simulation.
 pub const DIGEST_KEY: &str = "sealed_sha256";
@@ -15,43 +16,23 @@ const HEAD_BYTES: u64 = 1 << 20;
 
 /// Why a sealed file cannot be written or opened.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum SealedError {
     /// The operating system refused something.
-    #[error("cannot {action} {}: {source}", path.display())]
-    Io {
-        /// What was tried.
-        action: &'static str,
-        /// The file.
-        path: PathBuf,
-        /// The system's reason.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
     /// Another sealed file is there.
     #[error("{} exists already, holds something else and is not overwritten; choose another folder with --out", .0.display())]
     Exists(PathBuf),
     /// The file is none.
     #[error("{} is no sealed file: {reason}; `dragfree simulate --hidden` writes them as truth/*.sealed.json", path.display())]
-    Form {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
+    Form { path: PathBuf, reason: String },
     /// The telemetry belongs to another sealed file, or this one was changed.
     #[error(
         "{}: its SHA-256 is {found}, the telemetry {} was made with {expected}; it was changed or is another simulation's",
         path.display(), telemetry.display()
     )]
-    Digest {
-        /// The sealed file.
-        path: PathBuf,
-        /// Its digest.
-        found: String,
-        /// The telemetry.
-        telemetry: PathBuf,
-        /// The digest that the telemetry tells.
-        expected: String,
-    },
+    Digest { path: PathBuf, found: String, telemetry: PathBuf, expected: String },
     /// The telemetry tells no digest.
     #[error("{} names no sealed file; it was simulated without --hidden", .0.display())]
     NoDigest(PathBuf),
@@ -65,10 +46,6 @@ pub struct Sealed {
     pub sha256: String,
 }
 
-fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
-
 fn from_hex(text: &str) -> Option<Vec<u8>> {
     let pair = |at: usize| u8::from_str_radix(text.get(at..at + 2)?, 16).ok();
     (0..text.len()).step_by(2).map(pair).collect()
@@ -76,7 +53,6 @@ fn from_hex(text: &str) -> Option<Vec<u8>> {
 
 impl Sealed {
     /// Seals a text.
-    #[must_use]
     pub fn new(content: &str) -> Self {
         let file = json!({
             "format": FORMAT,
@@ -84,7 +60,7 @@ impl Sealed {
             "payload": hex(content.as_bytes()),
         });
         let bytes = format!("{file:#}\n").into_bytes();
-        Self { sha256: hex(&Sha256::digest(&bytes)), bytes }
+        Self { sha256: sha256(&bytes), bytes }
     }
 
     /// Writes the file; one with the same bytes, of an interrupted run, may be there.
@@ -92,16 +68,15 @@ impl Sealed {
     /// # Errors
     /// [`SealedError::Exists`], [`SealedError::Io`].
     pub fn write(&self, path: &Path) -> Result<(), SealedError> {
-        let io = |action| move |source| SealedError::Io { action, path: path.to_owned(), source };
         if path.exists() {
-            let there = std::fs::read(path).map_err(io("read"))?;
+            let there = std::fs::read(path).at("read", path)?;
             return if there == self.bytes { Ok(()) } else { Err(SealedError::Exists(path.to_owned())) };
         }
         if let Some(folder) = path.parent() {
-            std::fs::create_dir_all(folder).map_err(io("make the folder of"))?;
+            std::fs::create_dir_all(folder).at("make the folder of", path)?;
         }
-        let mut file = File::create_new(path).map_err(io("write"))?;
-        file.write_all(&self.bytes).and_then(|()| file.sync_all()).map_err(io("write"))
+        let mut file = File::create_new(path).at("write", path)?;
+        Ok(file.write_all(&self.bytes).and_then(|()| file.sync_all()).at("write", path)?)
     }
 
     /// Reads a file.
@@ -109,9 +84,8 @@ impl Sealed {
     /// # Errors
     /// [`SealedError::Io`].
     pub fn read(path: &Path) -> Result<Self, SealedError> {
-        let io = |source| SealedError::Io { action: "read", path: path.to_owned(), source };
-        let bytes = std::fs::read(path).map_err(io)?;
-        Ok(Self { sha256: hex(&Sha256::digest(&bytes)), bytes })
+        let bytes = std::fs::read(path).at("read", path)?;
+        Ok(Self { sha256: sha256(&bytes), bytes })
     }
 
     /// What is in it. `path` is for messages.
@@ -164,9 +138,8 @@ fn telemetry_above(path: &Path) -> Vec<PathBuf> {
 
 /// The digest that a telemetry file tells; `None` where it tells none.
 fn digest_of(telemetry: &Path) -> Result<Option<String>, SealedError> {
-    let io = |source| SealedError::Io { action: "read", path: telemetry.to_owned(), source };
     let mut head = Vec::new();
-    File::open(telemetry).and_then(|file| file.take(HEAD_BYTES).read_to_end(&mut head)).map_err(io)?;
+    File::open(telemetry).and_then(|file| file.take(HEAD_BYTES).read_to_end(&mut head)).at("read", telemetry)?;
     let ignore_end = mcap::read::Options::IgnoreEndMagic.into();
     let Ok(records) = mcap::read::LinearReader::new_with_options(&head, ignore_end) else { return Ok(None) };
     Ok(records.map_while(Result::ok).find_map(|record| match record {

@@ -9,11 +9,12 @@ use std::thread::{Scope, ScopedJoinHandle};
 use crate::EngineError;
 use crate::config::Mission;
 use crate::feed::{Feed, SourceFeed, SourceOptions};
+use crate::files::IoContext as _;
 use crate::registry::Registry;
 use crate::run::Progress;
 use crate::sealed::{DIGEST_KEY, Sealed};
-use crate::table::{Batch, Chunk, TableSpec};
-use crate::telemetry::{FileHeader, TelemetryWriter, WriteError, Written};
+use crate::table::{Chunk, TableSpec};
+use crate::telemetry::{FileHeader, TelemetryWriter, WriteError};
 
 /// What to simulate.
 #[derive(Clone, Debug)]
@@ -98,7 +99,6 @@ pub fn simulate(
             done: SimulateOutcome { sealed_file, ..SimulateOutcome::default() },
             sealed,
         };
-        let mut epochs = 0;
         loop {
             let chunk = match feed.next() {
                 Ok(Some(chunk)) => chunk,
@@ -106,13 +106,7 @@ pub fn simulate(
                 // A writer that failed has failed at earlier rows.
                 Err(failure) => return Err(days.abandon().err().unwrap_or(failure)),
             };
-            epochs += chunk.batches.iter().map(Batch::rows).max().unwrap_or(0) as u64;
-            progress(Progress {
-                until_ns: chunk.complete_until_ns,
-                first_ns: window.start,
-                end_ns: Some(window.end),
-                epochs,
-            });
+            progress(Progress { until_ns: chunk.complete_until_ns, first_ns: window.start, end_ns: Some(window.end) });
             days.write(chunk)?;
         }
         days.close()?;
@@ -130,9 +124,7 @@ impl SimulateOptions {
         let folder = if truth { self.out.join("truth") } else { self.out.clone() };
         folder.join(format!("{}_{day}.mcap", mission.spacecraft))
     }
-}
 
-impl SimulateOptions {
     fn sealed_path(&self, mission: &Mission, window: &Range<i64>) -> PathBuf {
         let day = DateTime::from_timestamp_nanos(window.start).date_naive();
         self.out.join("truth").join(format!("{}_{day}.sealed.json", mission.spacecraft))
@@ -142,17 +134,17 @@ impl SimulateOptions {
 /// Chunks that wait for a writer: enough to keep it busy, and memory stays flat.
 const QUEUE: usize = 4;
 
-/// A file that is written on this thread or on one of its own.
+/// A writer on this thread or on one of its own.
 enum Pen<'scope> {
     Here(Box<TelemetryWriter>),
-    There { queue: SyncSender<Option<Chunk>>, thread: ScopedJoinHandle<'scope, Result<Option<Written>, WriteError>> },
+    There { queue: SyncSender<Option<Chunk>>, thread: ScopedJoinHandle<'scope, Result<Option<PathBuf>, WriteError>> },
 }
 
 impl<'scope> Pen<'scope> {
     fn there(scope: &'scope Scope<'scope, '_>, mut writer: TelemetryWriter) -> Self {
         let (queue, chunks) = sync_channel::<Option<Chunk>>(QUEUE);
         let thread = scope.spawn(move || {
-            // Without the word that all is said, there is no file.
+            // A queue that ends without `None` was abandoned: its file is dropped.
             while let Ok(said) = chunks.recv() {
                 match said {
                     Some(chunk) => writer.write(chunk)?,
@@ -164,7 +156,7 @@ impl<'scope> Pen<'scope> {
         Self::There { queue, thread }
     }
 
-    /// Writes, or asks to; gives the pen back.
+    /// Writes a chunk, or queues it; gives the pen back.
     fn write(self, chunk: Chunk) -> Result<Self, WriteError> {
         match self {
             Self::Here(mut writer) => {
@@ -173,7 +165,7 @@ impl<'scope> Pen<'scope> {
             }
             Self::There { queue, thread } => match queue.send(Some(chunk)) {
                 Ok(()) => Ok(Self::There { queue, thread }),
-                // The other side is gone: it failed at an earlier chunk.
+                // The thread has ended: it failed at an earlier chunk.
                 Err(_) => Err(join(thread).expect_err("a writer stops early only with an error")),
             },
         }
@@ -192,17 +184,17 @@ impl<'scope> Pen<'scope> {
 
     fn finish(self) -> Result<PathBuf, WriteError> {
         match self {
-            Self::Here(writer) => writer.finish().map(|w| w.path),
+            Self::Here(writer) => writer.finish(),
             Self::There { queue, thread } => {
-                // A writer that is gone says why when it is joined.
+                // If the thread has ended, joining it gives its error.
                 let _ = queue.send(None);
-                join(thread).map(|w| w.expect("a writer that is told to finish does").path)
+                join(thread).map(|path| path.expect("a writer that is told to finish does"))
             }
         }
     }
 }
 
-fn join(thread: ScopedJoinHandle<'_, Result<Option<Written>, WriteError>>) -> Result<Option<Written>, WriteError> {
+fn join<T>(thread: ScopedJoinHandle<'_, T>) -> T {
     thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
 }
 
@@ -260,11 +252,7 @@ impl<'scope> DayFiles<'scope, '_> {
         let pen = |truth: bool, tables: &[TableSpec]| {
             let path = self.options.path(self.mission, day, truth);
             if let Some(folder) = path.parent() {
-                std::fs::create_dir_all(folder).map_err(|source| EngineError::Io {
-                    action: "make the folder",
-                    path: folder.to_owned(),
-                    source,
-                })?;
+                std::fs::create_dir_all(folder).at("make the folder", folder)?;
             }
             let tables: Vec<TableSpec> = tables.iter().filter(|t| t.truth == truth).cloned().collect();
             let writer = TelemetryWriter::create(&path, &tables, &header)?;
@@ -297,6 +285,7 @@ impl<'scope> DayFiles<'scope, '_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::table::Batch;
     use crate::telemetry::interface_tables;
 
     /// Times and one number for every column of `ifo`.

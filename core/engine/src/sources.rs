@@ -1,9 +1,11 @@
 //! Where the inputs of a product lay when it was made.
 
 use serde::{Deserialize, Serialize};
+use std::io;
 use std::path::{Path, PathBuf};
 
 use crate::EngineError;
+use crate::files::IoContext as _;
 use crate::product::SOURCES;
 
 /// Where the inputs of a product lay, in a file beside it that is no part of it: places change, content does not.
@@ -24,13 +26,9 @@ pub struct Sources {
 }
 
 impl Sources {
-    fn path(product: &Path) -> PathBuf {
-        product.with_extension(SOURCES)
-    }
-
     pub(crate) fn write(&self, path: &Path) -> Result<(), EngineError> {
         let text = serde_json::to_string_pretty(self).unwrap_or_default() + "\n";
-        std::fs::write(path, text).map_err(|source| EngineError::Io { action: "write", path: path.to_owned(), source })
+        Ok(std::fs::write(path, text).at("write", path)?)
     }
 
     /// Reads them.
@@ -38,12 +36,8 @@ impl Sources {
     /// # Errors
     /// [`EngineError::Io`] where there is no such file beside the product.
     pub fn read(product: &Path) -> Result<Self, EngineError> {
-        let path = Self::path(product);
-        let text = std::fs::read_to_string(&path).map_err(|source| EngineError::Io {
-            action: "read where the inputs lay, from",
-            path: path.clone(),
-            source,
-        })?;
-        serde_json::from_str(&text).map_err(|e| EngineError::Io { action: "read", path, source: e.into() })
+        let path = product.with_extension(SOURCES);
+        let text = std::fs::read_to_string(&path).at("read where the inputs lay, from", &path)?;
+        Ok(serde_json::from_str(&text).map_err(io::Error::from).at("read", path)?)
     }
 }

@@ -26,13 +26,11 @@ pub struct Batch {
 
 impl Batch {
     /// An empty batch with `columns` columns.
-    #[must_use]
     pub fn empty(columns: usize) -> Self {
         Self { time_ns: Vec::new(), columns: vec![Vec::new(); columns] }
     }
 
     /// Takes the rows at and after `time_ns` out.
-    #[must_use]
     pub fn split_off(&mut self, time_ns: i64) -> Self {
         let at = self.time_ns.partition_point(|t| *t < time_ns);
         Self {
@@ -42,7 +40,6 @@ impl Batch {
     }
 
     /// Number of rows.
-    #[must_use]
     pub fn rows(&self) -> usize {
         self.time_ns.len()
     }
@@ -59,7 +56,6 @@ pub struct Chunk {
 
 impl Chunk {
     /// Takes the rows at and after `time_ns` out; this chunk is complete until then at most.
-    #[must_use]
     pub fn split_off(&mut self, time_ns: i64) -> Self {
         let later = self.batches.iter_mut().map(|b| b.split_off(time_ns)).collect();
         let complete_until_ns = self.complete_until_ns;

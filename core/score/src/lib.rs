@@ -209,7 +209,6 @@ fn test_mass(instance: &str) -> (&str, &str) {
 
 /// True value of a coefficient `com-offset.NAME.AXIS`, m, in the first message of the truth of a simulation, by field
 /// path.
-#[must_use]
 pub fn offset(truth: &BTreeMap<String, f64>, coefficient: &str) -> Option<f64> {
     let (number, axis) = test_mass(coefficient.strip_prefix("com-offset.")?);
     truth.get(&format!("b{number}_orf_m.{axis}")).copied()
@@ -221,7 +220,8 @@ pub fn offset(truth: &BTreeMap<String, f64>, coefficient: &str) -> Option<f64> {
 /// # Errors
 /// No value follows; the message says why.
 pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Result<Vec<Expected>, String> {
-    let only = |unit, value| Ok(vec![Expected { part: "", unit, value }]);
+    let part = |part, unit, value| Expected { part, unit, value };
+    let only = |unit, value| Ok(vec![part("", unit, value)]);
     let column = |key: &str| shape.get(key).and_then(Value::as_str).unwrap_or_default();
     let (number, axis) = test_mass(&truth.instance);
     match truth.effect.as_str() {
@@ -236,12 +236,12 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
         }
         "mps-noise" | "torque-noise" | "is-noise" => only("1", truth.size),
         "tilt-to-length" => {
-            let part = |part, value| Expected { part, unit: "m rad-1", value };
-            Ok(vec![part(".theta", truth.size), part(".psi", truth.number("psi_m_rad"))])
+            let psi = truth.number("psi_m_rad");
+            Ok(vec![part(".theta", "m rad-1", truth.size), part(".psi", "m rad-1", psi)])
         }
         "solar-pressure" => {
-            let arm = |part, name| Expected { part, unit: "m", value: truth.number(name) };
-            let force = Expected { part: ".force", unit: "1", value: truth.size };
+            let arm = |name, key| part(name, "m", truth.number(key));
+            let force = part(".force", "1", truth.size);
             Ok(vec![force, arm(".arm_x", "arm_x_m"), arm(".arm_y", "arm_y_m"), arm(".arm_z", "arm_z_m")])
         }
         "offset-drift" => {
@@ -257,10 +257,8 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
                 found.ok_or_else(|| format!("the candidate follows {}, the truth {all}", column("with")))?;
             only(unit, value)
         }
-        "slosh" => {
-            // The model's coefficient is the slug's mass relative to the rest.
-            only("1", truth.size / (1.0 - truth.size))
-        }
+        // The model's coefficient is the slug's mass relative to the rest.
+        "slosh" => only("1", truth.size / (1.0 - truth.size)),
         "thermal" => {
             let face = |side| format!("hk.eh{number}_{axis}{side}_temperature_k");
             let (plus, minus) = (column("plus"), column("minus"));
@@ -284,11 +282,9 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
             let mass_kg = number.parse().ok().and_then(|n: usize| sealed["test_mass_kg"][n.checked_sub(1)?].as_f64());
             let mass_kg = mass_kg.ok_or("the sealed file does not state the mass of the test mass")?;
             match column("gradient") {
-                gradient if gradient == format!("hk.magnetic_gradient{number}_t_m") => Ok(vec![Expected {
-                    part: ".gradient_x",
-                    unit: "m2 s-2 T-1",
-                    value: truth.number("moment_a_m2") / mass_kg,
-                }]),
+                gradient if gradient == format!("hk.magnetic_gradient{number}_t_m") => {
+                    Ok(vec![part(".gradient_x", "m2 s-2 T-1", truth.number("moment_a_m2") / mass_kg)])
+                }
                 other => Err(format!("the candidate follows {other}, the truth its own test mass's gradient")),
             }
         }
@@ -297,7 +293,6 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
             let arm = ["arm_x_m", "arm_y_m", "arm_z_m"].map(|name| truth.number(name));
             let along = ["x", "y", "z"].map(|letter| if letter == axis { truth.size } else { 0.0 });
             let turned = |i: usize, j: usize| arm[i] * along[j] - arm[j] * along[i];
-            let part = |part, unit, value| Expected { part, unit, value };
             Ok(vec![
                 part(".momentum", "N s", truth.size),
                 part(".angular_x", "N m s", turned(1, 2)),

@@ -1,5 +1,3 @@
 //! One calibration: a pipeline over telemetry, into a product of the archive.
 
-pub use dragfree_engine::run::{
-    CheckReport, CheckedNode, Outcome, Progress, RunOptions as Options, check, run as calibrate,
-};
+pub use dragfree_engine::run::{CheckReport, CheckedNode, Progress, RunOptions as Options, check, run as calibrate};

@@ -1,7 +1,7 @@
 //! Which effect is missing from the model of some products.
 //!
-//! The data are read twice: transients have to be detected before they can be weighed against what lasts. They are read
-//! once more where the shape of a candidate stands out that its effect can try in finer steps.
+//! The data are read twice: transients must be detected before they are compared with lasting effects. They are read a
+//! third time if the shape of a candidate can be refined.
 
 use std::collections::BTreeMap;
 
@@ -61,9 +61,7 @@ pub fn diagnose(
 }
 
 impl Diagnosed {
-    /// Transients that were detected and are no part of the answer, the loudest first; without what rings beside a
-    /// louder one.
-    #[must_use]
+    /// Detected transients that no accepted candidate explains, by decreasing significance; of close ones the first.
     pub fn unexplained_transients(&self) -> Vec<&Detection> {
         let seen = self.record.gathered.transients.certain(self.diagnosis.false_alarm_rate);
         unexplained(seen, &self.diagnosis.candidates, self.settings.same_transient_s)

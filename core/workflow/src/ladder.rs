@@ -1,8 +1,8 @@
 //! The ladder of model revisions: how the error falls from one to the next, on the days of the fit and on days kept out
 //! of it.
 //!
-//! χ² is that of the mission file's Σ, which is the same for every revision: with a Σ from the residuals each revision
-//! would be its own measure.
+//! χ² is computed with the mission file's Σ, which all revisions share; with a Σ from residuals it could not be
+//! compared between revisions.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -13,18 +13,14 @@ use dragfree_engine::product::{Coefficient, Product};
 
 /// Why products make no ladder.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum LadderError {
     /// Products of two spacecraft, or of none.
     #[error("{0}")]
     Products(String),
     /// A product that is no held-out one.
     #[error("{id} cannot be held out: {why}")]
-    HeldOut {
-        /// Product.
-        id: String,
-        /// Why, and what to do next.
-        why: String,
-    },
+    HeldOut { id: String, why: String },
 }
 
 /// Revisions in the order of parentage.
@@ -347,10 +343,9 @@ fn effects(product: &Product) -> Vec<String> {
     ran.map(name).collect()
 }
 
-/// A revision's number, for an order that people expect.
+/// Sort key of a revision: its number, then its name.
 fn number(revision: &str) -> (u32, &str) {
-    let made = Model::parts(revision).map(|(counter, _)| counter).or_else(|| revision.parse().ok());
-    (made.unwrap_or(0), revision)
+    (Model::counter(revision).unwrap_or(0), revision)
 }
 
 /// The revision that each is compared with.
@@ -382,7 +377,7 @@ fn order(of: &BTreeMap<String, Days<'_>>, parents: &BTreeMap<String, Option<Stri
             open.extend(children(Some(next)));
         }
     }
-    // Names written by hand can make a circle, which no root leads into.
+    // Parents written by hand can form a cycle, which no root reaches.
     let rest: Vec<String> = of.keys().filter(|r| !out.contains(r)).cloned().collect();
     out.extend(rest);
     out
@@ -531,13 +526,9 @@ fn held_out_fit(
 
 /// Coefficients over the days, beside those of the compared revision and the truth.
 fn values(days: &Days<'_>, before: Option<&Rung>, truth: &dyn Fn(&str) -> Option<f64>) -> Vec<Value> {
-    let mut names: Vec<&Coefficient> = Vec::new();
-    for coefficient in days.values().flat_map(|p| p.result.adopted()) {
-        if !names.iter().any(|known| known.name == coefficient.name) {
-            names.push(coefficient);
-        }
-    }
     let all: Vec<&Coefficient> = days.values().flat_map(|p| p.result.adopted()).collect();
+    let mut seen = BTreeSet::new();
+    let names: Vec<&Coefficient> = all.iter().copied().filter(|c| seen.insert(&c.name)).collect();
     let mean = |name: &str| {
         let of: Vec<&&Coefficient> = all.iter().filter(|c| c.name == name).collect();
         if let [one] = of[..] {

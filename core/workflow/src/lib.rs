@@ -9,7 +9,7 @@ pub mod ladder;
 mod replay;
 mod sums;
 
-pub use replay::{Archived, Pass, Replay};
+pub use replay::{Pass, Replay};
 
 use std::path::PathBuf;
 
@@ -23,6 +23,7 @@ use dragfree_schema::NoSuchCoefficient;
 
 /// Why a comparison or a diagnosis failed.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum WorkflowError {
     /// The chain cannot be run again over the data.
     #[error(transparent)]
@@ -55,28 +56,13 @@ pub enum WorkflowError {
     #[error(
         "a response is to column {name} of table {table}, which nobody makes; the effect that declares it is at fault"
     )]
-    NoColumn {
-        /// Table.
-        table: String,
-        /// Column.
-        name: String,
-    },
+    NoColumn { table: String, name: String },
     /// Normal equations that cannot be used.
     #[error("{}: {what}", path.display())]
-    Reference {
-        /// The file beside the product.
-        path: PathBuf,
-        /// Why.
-        what: String,
-    },
+    Reference { path: PathBuf, what: String },
     /// A detection without its template.
     #[error(
         "{effect} has no waveform any more for the transient at {at_ns} ns: its plugin declares others in every pass"
     )]
-    NoTemplate {
-        /// Effect and instance.
-        effect: String,
-        /// Unix ns.
-        at_ns: i64,
-    },
+    NoTemplate { effect: String, at_ns: i64 },
 }

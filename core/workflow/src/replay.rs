@@ -1,10 +1,8 @@
 //! The data of archived products once more, through the chains that made them, into sums.
 
-use std::path::PathBuf;
-
 use dragfree_engine::chain::Chain;
-use dragfree_engine::examine::{self, Examination, candidates, examine, has_parameter, model};
-use dragfree_engine::product::Product;
+use dragfree_engine::examine::{Examination, candidates, examine, has_parameter};
+use dragfree_engine::product::Written;
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
@@ -22,21 +20,12 @@ pub(crate) const FINE: &str = "fine";
 /// Parameter of an effect that acts once, at a time that the host finds.
 const AT_NS: &str = "at_ns";
 
-/// A product and its file.
-#[derive(Clone, Debug)]
-pub struct Archived {
-    /// The product.
-    pub product: Product,
-    /// Its file.
-    pub path: PathBuf,
-}
-
 /// Which data are replayed, and how.
 pub struct Replay<'a> {
     /// Plugins.
     pub registry: &'a Registry,
     /// Products of one model.
-    pub products: &'a [Archived],
+    pub products: &'a [Written],
     /// Threads; results do not depend on them.
     pub threads: usize,
     /// Most rows in one call of a plugin; results do not depend on it.
@@ -91,10 +80,10 @@ pub(crate) fn sum(
 ) -> Result<Record, WorkflowError> {
     let Replay { registry, products, threads, batch_rows } = *replay;
     let mut whole: Option<Record> = None;
-    for (number, Archived { product, path }) in products.iter().enumerate() {
+    for (number, Written { product, path }) in products.iter().enumerate() {
         let sources = Sources::read(path)?;
         let equations = path.with_extension("neq.json");
-        let mut all = candidates(registry, &model(&sources)?, &examine::mission(&sources)?);
+        let mut all = candidates(registry, &sources)?;
         match what {
             What::Model => all.clear(),
             What::Transients => all.retain(|e| has_parameter(registry, &e.id, AT_NS)),

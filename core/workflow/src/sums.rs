@@ -211,7 +211,7 @@ impl ColumnSums {
             first[..wait].fill(f64::NAN);
             self.waiting = wait == time_ns.len();
         }
-        // Whoever has no value by now has none at all, and stays at zero.
+        // A column without any value so far has none at all and stays at zero.
         for column in filled.iter_mut().filter(|c| c.iter().any(|x| x.is_nan())) {
             column.to_mut().iter_mut().filter(|x| x.is_nan()).for_each(|x| *x = 0.0);
         }
@@ -397,7 +397,7 @@ fn candidate_set(available: &Available, channels: &[&Column], series: &Series, w
                 times,
             })
         };
-        // What acts through a coefficient that the model lacks does not act.
+        // A response scaled by a coefficient that the model lacks is dropped.
         responses.iter().filter_map(term).collect()
     };
     let unknown = |c: &Coefficient| {
@@ -438,7 +438,7 @@ fn candidate_set(available: &Available, channels: &[&Column], series: &Series, w
             noise: c.noise.clone(),
         }
     };
-    // Whatever has the waveform of something that was found may have been the cause.
+    // Every coefficient with the waveform of a detection is a candidate for its cause.
     let transient = |c: &Coefficient| {
         let at = |(k, waveform): (usize, &Waveform)| {
             let transient = c.transients.iter().find(|t| t.kernel == waveform.kernel)?;

@@ -2,14 +2,14 @@
 
 use super::{Done, products};
 use crate::args::{Arguments, Global};
-use crate::failure::Failure;
+use crate::failure::{Failure, Refusal};
 use crate::text::{self, Paint, labelled, quoted};
 use crate::{bundled, truth};
 use clap::Parser as _;
-use dragfree_engine::product;
-use dragfree_workflow::Archived;
+use dragfree_engine::files::IoContext as _;
+use dragfree_engine::product::{self, Written};
 use serde_json::{Value, json};
-use std::fs::{self, OpenOptions};
+use std::fs::{self, File};
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 
@@ -92,7 +92,7 @@ pub(super) fn execute(folder: &Path, global: &Global, paint: Paint) -> Result<Do
     let ladder = ["ladder", &first, &second, "--held-out", &first_held_out, &second_held_out, "--truth", &truth];
     let ladder = story.tell(&[&ladder[..], &["--archive", &archive]].concat())?;
 
-    let Archived { product, path } = products::open(&second, &story.archive)?;
+    let Written { product, path } = products::open(&second, &story.archive)?;
     let code = super::run::code(&product);
     if global.json {
         let mut all = product::to_json(&product, &path);
@@ -121,7 +121,10 @@ struct Story<'a> {
 
 impl Story<'_> {
     fn show(&self, text: &str) -> Result<(), Failure> {
-        if self.global.json { Ok(()) } else { crate::output::print(text).map_err(Failure::engine) }
+        if !self.global.json {
+            crate::output::print(text)?;
+        }
+        Ok(())
     }
 
     fn say(&self, sentence: &str) -> Result<(), Failure> {
@@ -142,7 +145,7 @@ impl Story<'_> {
     fn run(&mut self, words: &[&str], into: Option<&str>, json: bool) -> Result<String, Failure> {
         let words: Vec<&str> = std::iter::once("dragfree").chain(words.iter().copied()).collect();
         self.announce(&words, into)?;
-        let mut arguments = Arguments::try_parse_from(&words).map_err(Failure::engine)?;
+        let mut arguments = Arguments::try_parse_from(&words)?;
         arguments.global = Global { json, ..self.global.clone() };
         Ok(super::execute(&arguments, self.paint)?.text)
     }
@@ -152,19 +155,20 @@ impl Story<'_> {
         let words: Vec<&str> = words.iter().map(AsRef::as_ref).collect();
         let text = self.run(&words, None, self.global.json)?;
         self.show(&text)?;
-        if self.global.json { serde_json::from_str(&text).map_err(Failure::engine) } else { Ok(Value::Null) }
+        Ok(if self.global.json { serde_json::from_str(&text)? } else { Value::Null })
     }
 
     /// Runs a command that answers in JSON, into a file, and gives the answer.
     fn keep(&mut self, words: &[&str], file: &str) -> Result<Value, Failure> {
         let text = self.run(words, Some(file), true)?;
-        fs::write(file, &text).map_err(Failure::io("write", file))?;
-        serde_json::from_str(&text).map_err(Failure::engine)
+        fs::write(file, &text).at("write", file)?;
+        Ok(serde_json::from_str(&text)?)
     }
 
     fn copy(&mut self, from: &Path, to: &Path) -> Result<(), Failure> {
         self.announce(&["cp", &from.display().to_string(), &to.display().to_string()], None)?;
-        fs::copy(from, to).map(|_| ()).map_err(Failure::io("write", to))
+        fs::copy(from, to).at("write", to)?;
+        Ok(())
     }
 
     /// The newest product of a day.
@@ -201,17 +205,17 @@ fn summary(diagnosis: &Value) -> String {
 fn clear(path: &Path) -> Result<(), Failure> {
     let removed = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
     match removed {
-        Err(error) if error.kind() != ErrorKind::NotFound => Err(Failure::io("remove the earlier demo's", path)(error)),
-        _ => Ok(()),
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
+        other => Ok(other.at("remove the earlier demo's", path)?),
     }
 }
 
 /// Makes `folder` the demo's own: it must be new, empty or an earlier demo's.
 fn own(folder: &Path) -> Result<(), Failure> {
-    fs::create_dir_all(folder).map_err(Failure::io("make", folder))?;
-    let empty = fs::read_dir(folder).map_err(Failure::io("read", folder))?.next().is_none();
+    fs::create_dir_all(folder).at("make", folder)?;
+    let empty = fs::read_dir(folder).at("read", folder)?.next().is_none();
     if !empty && !folder.join(MARK).is_file() {
-        return Err(Failure::NoDemoFolder(folder.to_owned()));
+        return Err(Refusal::NoDemoFolder(folder.to_owned()).into());
     }
     place(
         &folder.join(MARK),
@@ -222,13 +226,14 @@ fn own(folder: &Path) -> Result<(), Failure> {
 /// Writes a bundled file; one that is there is the user's and stays.
 fn place(path: &Path, text: &str) -> Result<(), Failure> {
     if let Some(folder) = path.parent() {
-        fs::create_dir_all(folder).map_err(Failure::io("make", folder))?;
+        fs::create_dir_all(folder).at("make", folder)?;
     }
-    match OpenOptions::new().write(true).create_new(true).open(path) {
-        Ok(mut file) => file.write_all(text.as_bytes()).map_err(Failure::io("write", path)),
+    let written = match File::create_new(path) {
+        Ok(mut file) => file.write_all(text.as_bytes()),
         Err(error) if error.kind() == ErrorKind::AlreadyExists => Ok(()),
-        Err(error) => Err(Failure::io("write", path)(error)),
-    }
+        Err(error) => Err(error),
+    };
+    Ok(written.at("write", path)?)
 }
 
 #[cfg(test)]
@@ -240,7 +245,7 @@ mod tests {
         let folder = tempfile::tempdir().expect("folder");
         let mine = folder.path().join("mine.txt");
         fs::write(&mine, "mine").expect("write");
-        assert!(matches!(own(folder.path()), Err(Failure::NoDemoFolder(_))));
+        assert!(own(folder.path()).is_err_and(|e| e.is::<Refusal>()));
         assert_eq!(fs::read_dir(folder.path()).expect("folder").count(), 1);
         fs::remove_file(&mine).expect("remove");
         own(folder.path()).expect("an empty folder will do");

@@ -4,6 +4,7 @@ use super::Done;
 use crate::args::{Arguments, Shell};
 use crate::failure::Failure;
 use clap::CommandFactory as _;
+use dragfree_engine::files::IoContext as _;
 use std::path::Path;
 
 pub(super) fn completions(shell: Shell) -> Result<Done, Failure> {
@@ -14,12 +15,12 @@ pub(super) fn completions(shell: Shell) -> Result<Done, Failure> {
     };
     let mut text = Vec::new();
     clap_complete::generate(shell, &mut Arguments::command(), "dragfree", &mut text);
-    Ok(Done::new(String::from_utf8(text).map_err(Failure::engine)?))
+    Ok(Done::new(String::from_utf8(text)?))
 }
 
 /// A page for the program and one for each command, `dragfree-model-add.1`.
 pub(super) fn man(folder: &Path) -> Result<Done, Failure> {
-    std::fs::create_dir_all(folder).map_err(Failure::io("make the folder", folder))?;
-    clap_mangen::generate_to(Arguments::command(), folder).map_err(Failure::io("write", folder))?;
+    std::fs::create_dir_all(folder).at("make the folder", folder)?;
+    clap_mangen::generate_to(Arguments::command(), folder).at("write", folder)?;
     Ok(Done::new(String::new()))
 }

@@ -3,9 +3,10 @@
 use super::Done;
 use crate::args::{Design as Arguments, Global};
 use crate::failure::Failure;
-use crate::text::{Paint, columns, labelled};
-use dragfree_chart::{Line, Panel, Scale, Stroke, svg};
+use crate::text::{Paint, columns, labelled, table};
+use dragfree_chart::{Line, Panel, Stroke, svg};
 use dragfree_engine::config::Mission as MissionFile;
+use dragfree_engine::files::IoContext as _;
 use dragfree_physics::control_design::{ChannelDesign, Design, design};
 use dragfree_physics::decoupling::Allocation;
 use dragfree_physics::mission::{Control, Mission};
@@ -14,17 +15,17 @@ use std::f64::consts::TAU;
 use std::path::Path;
 
 pub(super) fn execute(command: &Arguments, global: &Global, paint: Paint) -> Result<Done, Failure> {
-    let file = MissionFile::load(&command.mission).map_err(Failure::engine)?;
-    let mission = Mission::from_json(&file.value.to_string()).map_err(Failure::engine)?;
-    let design = design(&mission).map_err(Failure::engine)?;
-    let allocation = Allocation::new(&mission).map_err(Failure::engine)?;
+    let file = MissionFile::load(&command.mission)?;
+    let mission = Mission::from_json(&file.value.to_string())?;
+    let design = design(&mission)?;
+    let allocation = Allocation::new(&mission)?;
     let mut written = Vec::new();
     if let Some(folder) = &command.pictures {
-        std::fs::create_dir_all(folder).map_err(Failure::io("make the folder", folder))?;
+        std::fs::create_dir_all(folder).at("make the folder", folder)?;
         let nyquist_hz = 0.5 * mission.mission.sample_rate_hz;
         let sensitivity = sensitivities(&design, nyquist_hz);
         for (name, panels) in [("sensitivity.svg", sensitivity), ("prediction.svg", predictions(&design, nyquist_hz))] {
-            let picture = svg(&panels, 2).map_err(Failure::engine)?;
+            let picture = svg(&panels, 2)?;
             written.push(write(&folder.join(name), &picture)?);
         }
     }
@@ -42,16 +43,15 @@ pub(super) fn execute(command: &Arguments, global: &Global, paint: Paint) -> Res
 }
 
 fn write(path: &Path, text: &str) -> Result<String, Failure> {
-    std::fs::write(path, text).map_err(Failure::io("write", path))?;
+    std::fs::write(path, text).at("write", path)?;
     Ok(path.display().to_string())
 }
 
 /// The controllers as a mission file holds them.
 fn frozen(mission: &Mission, design: &Design) -> Result<String, Failure> {
     let control = Control { channel: design.controllers(), ..mission.control.clone().unwrap_or_default() };
-    let table =
-        toml::Table::from_iter([("control".to_owned(), toml::Value::try_from(&control).map_err(Failure::engine)?)]);
-    let text = toml::to_string(&table).map_err(Failure::engine)?;
+    let table = toml::Table::from_iter([("control".to_owned(), toml::Value::try_from(&control)?)]);
+    let text = toml::to_string(&table)?;
     Ok(format!("# Controllers by `dragfree design`: in a mission file, in place of its [control].\n{text}"))
 }
 
@@ -101,7 +101,7 @@ fn to_text(file: &MissionFile, mission: &Mission, design: &Design, allocation: &
     let mut text = format!("{}, {delay} sample(s) of delay\n\n", paint.bold(&head));
     let header = ["channel", "gamma", "order", "S/bound", "T/bound", "gain", "phase", "delay", "modulus", "memory"];
     let units = ["", "", "", "", "", "dB", "deg", "s", "", "s"];
-    let mut rows = vec![header.map(str::to_owned).to_vec(), units.map(str::to_owned).to_vec()];
+    let mut rows = table(&header, [units.map(str::to_owned).to_vec()]);
     rows.extend(design.channels.iter().map(|c| {
         vec![
             c.name.clone(),
@@ -174,8 +174,7 @@ fn different(design: &Design) -> Vec<(String, &ChannelDesign)> {
 }
 
 fn line(label: &str, colour: usize, stroke: Stroke, range: (f64, f64), value: impl Fn(f64) -> f64) -> Line {
-    let points = frequencies(range.0, range.1).map(|f| (f, value(f))).collect();
-    Line { label: label.to_owned(), colour, stroke, points }
+    Line::new(label, colour, stroke, frequencies(range.0, range.1).map(|f| (f, value(f))).collect())
 }
 
 /// Lowest frequency of the pictures of the loop, Hz: the bounds hold from there.
@@ -186,20 +185,14 @@ fn sensitivities(design: &Design, nyquist_hz: f64) -> Vec<Panel> {
     let range = (LOW_HZ, nyquist_hz * 0.999);
     different(design)
         .into_iter()
-        .map(|(title, c)| Panel {
-            title,
-            x_label: "frequency / Hz".to_owned(),
-            y_label: "gain".to_owned(),
-            x_scale: Scale::Logarithmic,
-            y_scale: Scale::Logarithmic,
-            x: LOW_HZ..nyquist_hz,
-            y: Some(1e-8..1e4),
-            lines: vec![
+        .map(|(title, c)| {
+            let lines = vec![
                 line("1/|W1|", 0, Stroke::Dashed, range, |f| 1.0 / c.weights.w1(f)),
                 line("1/|W3|", 1, Stroke::Dashed, range, |f| 1.0 / c.weights.w3(f)),
                 line("|S|", 0, Stroke::Solid, range, |f| c.sensitivity(f).norm()),
                 line("|T|", 1, Stroke::Solid, range, |f| c.complementary(f).norm()),
-            ],
+            ];
+            Panel { y: Some(1e-8..1e4), ..Panel::over_frequency(title, "gain", LOW_HZ..nyquist_hz, lines) }
         })
         .collect()
 }
@@ -211,19 +204,11 @@ fn predictions(design: &Design, nyquist_hz: f64) -> Vec<Panel> {
         .into_iter()
         .map(|(title, c)| {
             let unit = if c.name.ends_with(['x', 'y', 'z']) { "m" } else { "rad" };
-            Panel {
-                title,
-                x_label: "frequency / Hz".to_owned(),
-                y_label: format!("ASD / {unit}/√Hz"),
-                x_scale: Scale::Logarithmic,
-                y_scale: Scale::Logarithmic,
-                x: range.0..range.1,
-                y: None,
-                lines: vec![
-                    line("requirement", 6, Stroke::Dashed, range, |f| c.required_asd(f)),
-                    line("predicted", 0, Stroke::Solid, range, |f| c.predicted_asd(f)),
-                ],
-            }
+            let lines = vec![
+                line("requirement", 6, Stroke::Dashed, range, |f| c.required_asd(f)),
+                line("predicted", 0, Stroke::Solid, range, |f| c.predicted_asd(f)),
+            ];
+            Panel::over_frequency(title, format!("ASD / {unit}/√Hz"), range.0..range.1, lines)
         })
         .collect()
 }

@@ -2,10 +2,11 @@
 
 use super::Done;
 use crate::args::Init;
-use crate::failure::Failure;
-use crate::installed::{self, Named};
+use crate::failure::{Failure, Refusal};
+use crate::installed;
 use crate::text::quoted;
-use std::fs::OpenOptions;
+use dragfree_engine::files::IoContext as _;
+use std::fs::File;
 use std::io::Write as _;
 use std::path::Path;
 
@@ -13,10 +14,10 @@ use std::path::Path;
 const PIPELINE: &str = "science-mode";
 
 pub(super) fn execute(init: &Init, json: bool) -> Result<Done, Failure> {
-    let read = |path: &Path| std::fs::read_to_string(path).map_err(Failure::io("read", path));
+    let read = |path: &Path| std::fs::read_to_string(path).at("read", path);
     let name = init.mission.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let pipeline =
-        installed::pipeline_of(&name).map_or_else(|| installed::find(Named::Pipeline, Path::new(PIPELINE)), Ok)?;
+        installed::pipeline_of(&name).map_or_else(|| installed::find(installed::PIPELINE, Path::new(PIPELINE)), Ok)?;
     let pipeline_text = read(&pipeline)?;
     let given = |key: &str| {
         let line = pipeline_text.lines().find_map(|line| line.strip_prefix(key)?.trim_start().strip_prefix('='));
@@ -53,14 +54,14 @@ pub(super) fn execute(init: &Init, json: bool) -> Result<Done, Failure> {
             ),
         ),
     ];
-    std::fs::create_dir_all(&init.folder).map_err(Failure::io("make the folder", &init.folder))?;
+    std::fs::create_dir_all(&init.folder).at("make the folder", &init.folder)?;
     let places = texts.each_ref().map(|(file, _)| init.folder.join(file));
     if let Some(taken) = places.iter().find(|path| path.exists()) {
-        return Err(Failure::Taken(taken.clone()));
+        return Err(Refusal::Taken(taken.clone()).into());
     }
     for (path, (_, text)) in places.iter().zip(&texts) {
-        let made = OpenOptions::new().write(true).create_new(true).open(path);
-        made.and_then(|mut file| file.write_all(text.as_bytes())).map_err(Failure::io("write", path))?;
+        let made = File::create_new(path);
+        made.and_then(|mut file| file.write_all(text.as_bytes())).at("write", path)?;
     }
     let files = places.each_ref().map(|path| path.display().to_string());
     if json {

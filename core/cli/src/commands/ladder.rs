@@ -3,11 +3,12 @@
 use super::{Done, products};
 use crate::args::Ladder as Arguments;
 use crate::failure::Failure;
-use crate::text::{self, Paint, columns, labelled};
+use crate::text::{self, Paint, columns, distinct, labelled, table};
 use crate::truth;
 use dragfree_chart::{Line, Panel, Scale, Stroke, svg};
+use dragfree_engine::files::IoContext as _;
 use dragfree_engine::product::Product;
-use dragfree_workflow::ladder::{Fall, Ladder, Rung, Value, Verdict, Window, ladder};
+use dragfree_workflow::ladder::{Fall, Fit, Ladder, Rung, Value, Verdict, Window, ladder};
 use std::path::Path;
 
 pub(super) fn execute(command: &Arguments, json: bool, paint: Paint) -> Result<Done, Failure> {
@@ -16,10 +17,10 @@ pub(super) fn execute(command: &Arguments, json: bool, paint: Paint) -> Result<D
     };
     let (fitted, held_out) = (open(&command.products)?, open(&command.held_out)?);
     let truth = command.truth.as_deref().map(truth::first).transpose()?.unwrap_or_default();
-    let ladder = ladder(&fitted, &held_out, &|name| dragfree_score::offset(&truth, name)).map_err(Failure::engine)?;
+    let ladder = ladder(&fitted, &held_out, &|name| dragfree_score::offset(&truth, name))?;
     if let Some(path) = &command.picture {
-        let picture = svg(&panels(&ladder), 2).map_err(Failure::engine)?;
-        std::fs::write(path, picture).map_err(Failure::io("write", path))?;
+        let picture = svg(&panels(&ladder), 2)?;
+        std::fs::write(path, picture).at("write", path)?;
     }
     if json {
         return Ok(Done::json(&serde_json::json!(ladder)));
@@ -29,12 +30,8 @@ pub(super) fn execute(command: &Arguments, json: bool, paint: Paint) -> Result<D
 
 fn screen(ladder: &Ladder, picture: Option<&Path>, paint: Paint) -> String {
     let mut screen = labelled("fit", &days(&ladder.days));
-    let mut held: Vec<Window> = Vec::new();
-    for window in ladder.revisions.iter().filter_map(|r| r.held_out.as_ref()).flat_map(|h| &h.days) {
-        if !held.contains(window) {
-            held.push(window.clone());
-        }
-    }
+    let held_out = ladder.revisions.iter().filter_map(|r| r.held_out.as_ref());
+    let held: Vec<Window> = distinct(held_out.flat_map(|h| h.days.iter().cloned()));
     if !held.is_empty() {
         screen += &labelled("held out", &days(&held));
     }
@@ -63,25 +60,24 @@ fn screen(ladder: &Ladder, picture: Option<&Path>, paint: Paint) -> String {
     for rung in ladder.revisions.iter().filter(|r| r.held_out.as_ref().is_some_and(|h| h.verdict.is_some())) {
         let Some((verdict, fall)) = rung.held_out.as_ref().and_then(|h| Some((h.verdict?, h.fall?))) else { continue };
         let what = rung.added.join(", ");
-        let (word, sentence) = match verdict {
-            Verdict::Helps => (
-                paint.good("helps"),
-                format!("helps: {what} lowers χ² by {} on days that it was not fitted to", figure(fall)),
-            ),
+        let (painted, sentence) = match verdict {
+            Verdict::Helps => {
+                (paint.good("helps"), format!("{what} lowers χ² by {} on days that it was not fitted to", figure(fall)))
+            }
             Verdict::OverFitted => (
                 paint.bad("over-fitted"),
                 format!(
-                    "over-fitted: {what} raises χ² by {} on days that it was not fitted to; take it out with `dragfree model remove`",
+                    "{what} raises χ² by {} on days that it was not fitted to; take it out with `dragfree model remove`",
                     figure(Fall { delta_chi2: -fall.delta_chi2, ..fall })
                 ),
             ),
             Verdict::Undecided => (
                 paint.doubtful("undecided"),
-                format!("undecided: {what} changes χ² by {}, no more than other epochs may", figure(fall)),
+                format!("{what} changes χ² by {}, no more than other epochs may", figure(fall)),
             ),
         };
-        let plain = sentence.split(':').next().unwrap_or_default().to_owned();
-        screen += &labelled(&format!("{} ", rung.revision), &sentence).replacen(&plain, &word, 1);
+        let sentence = format!("{}: {sentence}", word(verdict));
+        screen += &labelled(&format!("{} ", rung.revision), &sentence).replacen(word(verdict), &painted, 1);
     }
     for note in &ladder.notes {
         screen += &labelled("note", note);
@@ -117,51 +113,44 @@ fn ratio(x: f64) -> String {
     if x.is_finite() { format!("{x:.4}") } else { "-".to_owned() }
 }
 
-fn fallen(fall: Option<Fall>) -> String {
-    fall.map_or_else(|| "-".to_owned(), figure)
-}
-
 /// One row a revision.
 fn steps(ladder: &Ladder) -> String {
-    let heading = ["revision", "χ²", "χ²/dof", "rms", "NIS", "χ² falls by"].map(str::to_owned).to_vec();
-    let row = |rung: &Rung| {
-        let fit = &rung.fit;
-        let figures =
-            [format!("{:.0}", fit.chi2), ratio(fit.chi2_per_dof), ratio(fit.rms), ratio(fit.nis), fallen(rung.fall)];
-        std::iter::once(rung.revision.clone()).chain(figures).collect()
-    };
-    let rows: Vec<_> = std::iter::once(heading).chain(ladder.revisions.iter().map(row)).collect();
-    columns(&rows)
+    let row = |rung: &Rung| figures(&rung.revision, &rung.fit, rung.fall);
+    columns(&table(&["revision", "χ²", "χ²/dof", "rms", "NIS", "χ² falls by"], ladder.revisions.iter().map(row)))
+}
+
+fn figures(revision: &str, fit: &Fit, fall: Option<Fall>) -> Vec<String> {
+    let fall = fall.map_or_else(|| "-".to_owned(), figure);
+    vec![revision.to_owned(), format!("{:.0}", fit.chi2), ratio(fit.chi2_per_dof), ratio(fit.rms), ratio(fit.nis), fall]
+}
+
+fn word(verdict: Verdict) -> &'static str {
+    match verdict {
+        Verdict::Helps => "helps",
+        Verdict::OverFitted => "over-fitted",
+        Verdict::Undecided => "undecided",
+    }
 }
 
 /// The same on the days kept out.
 fn kept_out(ladder: &Ladder) -> String {
-    let heading = ["held out", "χ²", "χ²/dof", "rms", "NIS", "χ² falls by", ""].map(str::to_owned).to_vec();
+    let heading = ["held out", "χ²", "χ²/dof", "rms", "NIS", "χ² falls by", ""];
     let row = |rung: &Rung| {
         let held = rung.held_out.as_ref()?;
-        let word = match held.verdict {
-            None => "",
-            Some(Verdict::Helps) => "helps",
-            Some(Verdict::OverFitted) => "over-fitted",
-            Some(Verdict::Undecided) => "undecided",
-        };
-        let fit = &held.fit;
-        let figures =
-            [format!("{:.0}", fit.chi2), ratio(fit.chi2_per_dof), ratio(fit.rms), ratio(fit.nis), fallen(held.fall)];
-        Some(std::iter::once(rung.revision.clone()).chain(figures).chain([word.to_owned()]).collect())
+        let verdict = held.verdict.map_or("", word).to_owned();
+        Some([figures(&rung.revision, &held.fit, held.fall), vec![verdict]].concat())
     };
-    let rows: Vec<_> = std::iter::once(heading).chain(ladder.revisions.iter().filter_map(row)).collect();
+    let rows = table(&heading, ladder.revisions.iter().filter_map(row));
     if rows.len() > 1 { columns(&rows) + "\n" } else { String::new() }
+}
+
+fn channel_names(ladder: &Ladder) -> Vec<&str> {
+    distinct(ladder.revisions.iter().flat_map(|r| &r.fit.channels).map(|c| c.channel.as_str()))
 }
 
 /// χ²/dof of each channel, a column a channel.
 fn channels(ladder: &Ladder) -> String {
-    let mut names: Vec<&str> = Vec::new();
-    for channel in ladder.revisions.iter().flat_map(|r| &r.fit.channels) {
-        if !names.contains(&channel.channel.as_str()) {
-            names.push(&channel.channel);
-        }
-    }
+    let names = channel_names(ladder);
     if names.is_empty() {
         return "no stage weighed the channels one by one\n".to_owned();
     }
@@ -187,13 +176,7 @@ fn channels(ladder: &Ladder) -> String {
 
 /// Coefficients in the order in which revisions bring them.
 fn names(ladder: &Ladder) -> Vec<&str> {
-    let mut names: Vec<&str> = Vec::new();
-    for value in ladder.revisions.iter().flat_map(|r| &r.coefficients) {
-        if !names.contains(&value.name.as_str()) {
-            names.push(&value.name);
-        }
-    }
-    names
+    distinct(ladder.revisions.iter().flat_map(|r| &r.coefficients).map(|c| c.name.as_str()))
 }
 
 /// A block a coefficient, a row a revision.
@@ -210,7 +193,7 @@ fn coefficients(ladder: &Ladder) -> String {
         }
         cells
     };
-    let mut rows = vec![["coefficient", "value", "", "change"].map(str::to_owned).to_vec()];
+    let mut rows = table(&["coefficient", "value", "", "change"], []);
     if ladder.revisions.iter().flat_map(|r| &r.coefficients).any(|c| c.error.is_some()) {
         rows[0].push("true error".to_owned());
     }
@@ -229,7 +212,7 @@ fn coefficients(ladder: &Ladder) -> String {
         return "no revision estimates a coefficient\n".to_owned();
     }
     let wide = columns(&rows);
-    if wide.lines().all(|line| text::width(line) <= text::WIDTH) {
+    if text::fits(&wide) {
         return wide;
     }
     // The error goes under the value.
@@ -274,13 +257,8 @@ fn panels(ladder: &Ladder) -> Vec<Panel> {
     let mut overall = vec![tread("all channels".to_owned(), 0, &|r| Some(r.fit.chi2_per_dof))];
     overall.push(tread("held out".to_owned(), 1, &|r| Some(r.held_out.as_ref()?.fit.chi2_per_dof)));
     overall.push(tread("NIS".to_owned(), 2, &|r| Some(r.fit.nis)));
-    let mut known: Vec<&str> = Vec::new();
-    for channel in ladder.revisions.iter().flat_map(|r| &r.fit.channels) {
-        if !known.contains(&channel.channel.as_str()) {
-            known.push(&channel.channel);
-        }
-    }
-    let by_channel = known.iter().enumerate().map(|(number, name)| {
+    let by_channel = channel_names(ladder);
+    let by_channel = by_channel.iter().enumerate().map(|(number, name)| {
         tread((*name).to_owned(), number, &|r| Some(r.fit.channels.iter().find(|c| c.channel == *name)?.chi2_per_dof))
     });
     let by_channel: Vec<Line> = by_channel.collect();

@@ -18,7 +18,7 @@ mod simulate;
 mod validate;
 
 use crate::args::{Arguments, Command, Config, Global};
-use crate::failure::Failure;
+use crate::failure::{Failure, Refusal};
 use crate::text::{self, Paint};
 use dragfree_engine::registry::Registry;
 use std::path::{Path, PathBuf};
@@ -65,7 +65,7 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
 /// The plugins of the folders asked for and of the program's own; two of one id are an error.
 fn registry(global: &Global) -> Result<Registry, Failure> {
     let registry = discovered(global)?;
-    registry.check_ids().map_err(Failure::engine)?;
+    registry.check_ids()?;
     Ok(registry)
 }
 
@@ -75,7 +75,7 @@ fn discovered(global: &Global) -> Result<Registry, Failure> {
     let listed = std::env::split_paths(&listed).filter(|folder| !folder.as_os_str().is_empty());
     let mut folders: Vec<PathBuf> = global.plugin_dir.iter().cloned().chain(listed).collect();
     if let Some(missing) = folders.iter().find(|folder| !folder.is_dir()) {
-        return Err(Failure::PluginFolder(missing.clone()));
+        return Err(Refusal::PluginFolder(missing.clone()).into());
     }
     folders.extend(own_folders());
     Ok(Registry::discover(&folders))

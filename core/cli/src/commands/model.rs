@@ -2,22 +2,25 @@
 
 use super::{Done, products};
 use crate::args::{Global, Model as Command, ModelAdd, ModelFix};
-use crate::failure::Failure;
-use crate::text::{self, Paint, columns, labelled};
+use crate::failure::{Failure, Refusal};
+use crate::screen::problems_json;
+use crate::text::{self, Paint, columns, labelled, table};
 use dragfree_engine::border::{Kind, Manifest, ParameterType};
 use dragfree_engine::config::{EffectEntry, Model, Prior};
+use dragfree_engine::files::IoContext as _;
+use dragfree_engine::files::Problem;
 use dragfree_engine::registry::Found;
 use dragfree_engine::revisions::{self, Change, Committed, Edit, Log, Logged, Place, What};
 use dragfree_engine::validate::Subject;
 use serde_json::{Value, json};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 pub(super) fn execute(command: &Command, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let json = global.json;
     match command {
         Command::Show { model, revision } => show(model, revision.as_deref(), json, paint),
         Command::Log { model } => {
-            let log = revisions::log(model).map_err(Failure::engine)?;
+            let log = revisions::log(model)?;
             Ok(if json { Done::json(&log_json(&log)) } else { Done::new(log_text(&log, paint)) })
         }
         Command::Add(command) => add(command, global, paint),
@@ -42,10 +45,10 @@ fn change(
     paint: Paint,
     act: impl FnOnce(&mut Edit) -> Result<(), revisions::RevisionError>,
 ) -> Result<Done, Failure> {
-    let mut edit = Edit::begin(path).map_err(Failure::engine)?;
+    let mut edit = Edit::begin(path)?;
     let revision = edit.model().map(|m| m.revision.clone()).unwrap_or_default();
-    act(&mut edit).map_err(Failure::engine)?;
-    let committed = edit.commit().map_err(Failure::engine)?;
+    act(&mut edit)?;
+    let committed = edit.commit()?;
     Ok(done(path, &revision, committed.as_ref(), None, global, paint))
 }
 
@@ -115,17 +118,16 @@ fn add(command: &ModelAdd, global: &Global, paint: Paint) -> Result<Done, Failur
             let (id, instance) = split(effect);
             EffectEntry::new(id, instance.unwrap_or_default())
         }
-        (None, None) => return Err(Failure::Usage("name an effect, or a diagnosis with --from".to_owned())),
+        (None, None) => return Err("name an effect, or a diagnosis with --from".into()),
     };
-    let found = super::registry(global)?.find(Kind::Effect, &entry.id).map_err(Failure::engine)?;
+    let found = super::registry(global)?.find(Kind::Effect, &entry.id)?;
     let manifest = &found.info.manifest;
     for (name, value) in &command.set {
         entry.parameters.insert(name.clone(), parameter(manifest, name, value)?);
     }
     priors(&mut entry, command)?;
     accepted(&found, &entry, command.mission.as_deref())?;
-    let done = change(&command.model, global, paint, |edit| edit.add(&entry, &comment))?;
-    Ok(done)
+    change(&command.model, global, paint, |edit| edit.add(&entry, &comment))
 }
 
 /// Asks the effect itself whether it takes the parameters, and whether it has the coefficients that are given a prior.
@@ -139,12 +141,12 @@ fn accepted(found: &Found, entry: &EffectEntry, mission: Option<&Path>) -> Resul
         files: &[],
     };
     let refused =
-        |error| Failure::Usage(format!("{error}; tried with the mission {}, --mission names another", mission.name));
+        |error| Failure::from(format!("{error}; tried with the mission {}, --mission names another", mission.name));
     entry.check_instance(&found.info.manifest, &mission).map_err(refused)?;
     let names = subject.coefficients(&entry.instance).map_err(|finding| refused(finding.to_string()))?;
     let Some(names) = names else { return Ok(()) };
     match entry.prior.keys().find(|name| !names.contains(name)) {
-        Some(name) => Err(Failure::Usage(format!("{entry} has no coefficient `{name}`; it has {}", names.join(", ")))),
+        Some(name) => Err(format!("{entry} has no coefficient `{name}`; it has {}", names.join(", ")).into()),
         None => Ok(()),
     }
 }
@@ -163,8 +165,7 @@ fn parameter(manifest: &Manifest, name: &str, value: &str) -> Result<toml::Value
         Some(ParameterType::F64List) => bracketed().or_else(|| literal(&format!("[{value}]"))),
         _ => literal(value),
     };
-    parsed
-        .ok_or_else(|| Failure::Usage(format!("--set {name}={value}: the value is no number, truth or text in quotes")))
+    Ok(parsed.ok_or_else(|| format!("--set {name}={value}: the value is no number, truth or text in quotes"))?)
 }
 
 /// Priors of the command line; a value without a name belongs to the only coefficient that an effect may have.
@@ -181,18 +182,20 @@ fn priors(entry: &mut EffectEntry, command: &ModelAdd) -> Result<(), Failure> {
     put(&command.prior_sigma, |prior, number| prior.sigma = Some(number));
     entry.estimate = command.fixed.is_empty();
     if let Some((_, sigma)) = command.prior_sigma.iter().find(|(_, sigma)| *sigma <= 0.0) {
-        return Err(Failure::Usage(format!("--prior-sigma {sigma}: a standard deviation is above zero")));
+        return Err(format!("--prior-sigma {sigma}: a standard deviation is above zero").into());
     }
     Ok(())
 }
 
 /// The candidate of a diagnosis: the named one, or that of a rank.
 fn candidate(path: &Path, effect: Option<&str>, rank: Option<u16>) -> Result<Value, Failure> {
-    let text = std::fs::read_to_string(path).map_err(Failure::io("read", path))?;
-    let refuse = |what: String| Failure::Diagnosis { path: path.to_owned(), what };
+    let text = std::fs::read_to_string(path).at("read", path)?;
+    let refuse = |what: String| Refusal::Diagnosis { path: path.to_owned(), what };
     let diagnosis: Value = serde_json::from_str(&text).map_err(|e| refuse(format!("it is no JSON: {e}")))?;
     let Some(candidates) = diagnosis["candidates"].as_array() else {
-        return Err(refuse("it has no `candidates`; write it with `dragfree diagnose PRODUCT --json`".to_owned()));
+        return Err(
+            refuse("it has no `candidates`; write it with `dragfree diagnose PRODUCT --json`".to_owned()).into()
+        );
     };
     let name = |c: &Value| format!("{}:{}", word(&c["effect"]), word(&c["instance"]));
     let names: Vec<String> = candidates.iter().map(name).collect();
@@ -200,7 +203,8 @@ fn candidate(path: &Path, effect: Option<&str>, rank: Option<u16>) -> Result<Val
         return Err(refuse(format!(
             "it has no candidate (verdict: {}), so there is nothing to add",
             word(&diagnosis["verdict"])
-        )));
+        ))
+        .into());
     }
     let at = match effect {
         None => usize::from(rank.unwrap_or(1)) - 1,
@@ -210,10 +214,10 @@ fn candidate(path: &Path, effect: Option<&str>, rank: Option<u16>) -> Result<Val
             names.iter().position(fits).unwrap_or(usize::MAX)
         }
     };
-    candidates.get(at).cloned().ok_or_else(|| {
+    Ok(candidates.get(at).cloned().ok_or_else(|| {
         let asked = effect.map_or_else(|| format!("rank {}", at + 1), |effect| format!("candidate {effect}"));
         refuse(format!("it has no {asked}; it has {}", names.join(", ")))
-    })
+    })?)
 }
 
 fn word(value: &Value) -> &str {
@@ -224,7 +228,7 @@ fn word(value: &Value) -> &str {
 fn proposed(path: &Path, candidate: &Value) -> Result<EffectEntry, Failure> {
     let mut entry = EffectEntry::new(word(&candidate["effect"]), word(&candidate["instance"]));
     for (name, value) in candidate["shape"].as_object().into_iter().flatten() {
-        let what = |e| Failure::Diagnosis { path: path.to_owned(), what: format!("shape.{name} = {value}: {e}") };
+        let what = |e| Refusal::Diagnosis { path: path.to_owned(), what: format!("shape.{name} = {value}: {e}") };
         entry.parameters.insert(name.clone(), toml::Value::try_from(value).map_err(what)?);
     }
     Ok(entry)
@@ -242,17 +246,17 @@ fn fix(command: &ModelFix, global: &Global, paint: Paint) -> Result<Done, Failur
     let product = products::open(&command.product, &command.archive.folder)?.product;
     let out = command.out.clone().unwrap_or_else(|| command.model.with_extension("fixed.toml"));
     if out.canonicalize().ok().is_some_and(|out| command.model.canonicalize().ok() == Some(out)) {
-        return Err(Failure::Usage(
+        return Err(
             "--out is the model file itself: what is fixed there could not be estimated again; name another file"
-                .to_owned(),
-        ));
+                .into(),
+        );
     }
     let adopted = product.result.adopted();
     let solution = adopted.first().map(|c| c.solution.as_str()).unwrap_or_default();
     let values: Vec<(String, f64)> = adopted.iter().map(|c| (c.name.clone(), c.value)).collect();
-    let mut edit = Edit::begin_or_new(&out).map_err(Failure::engine)?;
-    edit.fix(&command.model, &product.model.revision, &values, &command.keep).map_err(Failure::engine)?;
-    let committed = edit.commit().map_err(Failure::engine)?;
+    let mut edit = Edit::begin_or_new(&out)?;
+    edit.fix(&command.model, &product.model.revision, &values, &command.keep)?;
+    let committed = edit.commit()?;
     let mut made = done(&out, "", committed.as_ref(), Some(&command.archive.folder), global, paint);
     if !global.json {
         made.text = format!("fixed     at the values of {} ({solution})\n", product.id()) + &made.text;
@@ -262,8 +266,8 @@ fn fix(command: &ModelFix, global: &Global, paint: Paint) -> Result<Done, Failur
 
 fn show(path: &Path, revision: Option<&str>, json: bool, paint: Paint) -> Result<Done, Failure> {
     let model = match revision {
-        None => Model::load(path).map_err(Failure::engine)?,
-        Some(revision) => revisions::find(path, revision).map_err(Failure::engine)?.0,
+        None => Model::load(path)?,
+        Some(revision) => revisions::find(path, revision)?.0,
     };
     let (name, parent) = model.identity();
     if json {
@@ -293,15 +297,14 @@ fn show(path: &Path, revision: Option<&str>, json: bool, paint: Paint) -> Result
 
 /// A row per effect; what a prior or a parameter says goes below where the row would be too wide.
 fn effects(effects: &[EffectEntry]) -> String {
-    let heading = ["effect", "instance", "coefficients", "prior", "parameters"].map(str::to_owned).to_vec();
     let row = |e: &EffectEntry| {
         let state = if e.estimate { "estimated" } else { "fixed" };
         let instance = if e.instance.is_empty() { "-" } else { &e.instance };
         vec![e.id.clone(), instance.to_owned(), state.to_owned(), prior(e).join("; "), parameters(e).join(", ")]
     };
-    let rows: Vec<_> = std::iter::once(heading).chain(effects.iter().map(row)).collect();
+    let rows = table(&["effect", "instance", "coefficients", "prior", "parameters"], effects.iter().map(row));
     let wide = columns(&rows);
-    if wide.lines().all(|line| text::width(line) <= text::WIDTH) {
+    if text::fits(&wide) {
         return wide;
     }
     let short: Vec<_> = rows.iter().map(|row| row[..3].to_vec()).collect();
@@ -342,8 +345,7 @@ fn parameters(effect: &EffectEntry) -> Vec<String> {
 }
 
 fn log_text(log: &Log, paint: Paint) -> String {
-    let heading = ["", "revision", "parent", "changes"].map(str::to_owned).to_vec();
-    let mut rows = vec![heading];
+    let mut rows = table(&["", "revision", "parent", "changes"], []);
     for revision in &log.revisions {
         let mark = match revision.place {
             Place::Current => "*",
@@ -369,7 +371,7 @@ fn log_text(log: &Log, paint: Paint) -> String {
         );
         text += &labelled("edited", &words).replacen("edited", &paint.doubtful("edited"), 1);
     }
-    for (path, reason) in &log.problems {
+    for Problem { path, reason } in &log.problems {
         text += &format!("{} {reason}\n          {}\n", paint.doubtful("not used:"), path.display());
     }
     text
@@ -401,10 +403,9 @@ fn log_json(log: &Log) -> Value {
             "path": r.model.path.to_string_lossy(),
         })
     };
-    let problem = |(path, reason): &(PathBuf, String)| json!({"path": path.to_string_lossy(), "reason": reason});
     json!({
         "revisions": log.revisions.iter().map(revision).collect::<Vec<_>>(),
-        "problems": log.problems.iter().map(problem).collect::<Vec<_>>(),
+        "problems": problems_json(&log.problems),
     })
 }
 

@@ -2,8 +2,9 @@
 
 use crate::args::{Language, NewPlugin, PluginKind};
 use crate::commands::Done;
-use crate::failure::Failure;
+use crate::failure::{Failure, Refusal};
 use crate::installed;
+use dragfree_engine::files::IoContext as _;
 use std::path::PathBuf;
 
 macro_rules! skeleton {
@@ -85,16 +86,20 @@ pub(super) fn execute(new: &NewPlugin, json: bool) -> Result<Done, Failure> {
     let folder = new.out.clone().unwrap_or_else(|| PathBuf::from(name));
     let taken = std::fs::read_dir(&folder).is_ok_and(|mut entries| entries.next().is_some());
     if taken {
-        return Err(Failure::NoPluginFolder(folder));
+        return Err(Refusal::NoPluginFolder(folder).into());
     }
     let (sdk, sdk_said) = sdk(new)?;
-    let kind = if new.kind == PluginKind::Effect { "An effect".to_owned() } else { format!("A {}", new.kind) };
+    let kind = match new.kind {
+        PluginKind::Effect => "An effect",
+        PluginKind::Stage => "A stage",
+        PluginKind::Source => "A source",
+    };
     let place = if new.lang == Language::Rust { "target/release" } else { "." };
     let (add, run) = add(name, new.kind, place);
     let values = [
         ("{{NAME}}", name.as_str()),
         ("{{FILE}}", &name.replace('-', "_")),
-        ("{{A_KIND}}", &kind),
+        ("{{A_KIND}}", kind),
         ("{{SDK}}", &sdk),
         ("{{SDK_SAID}}", &sdk_said),
         ("{{ADD}}", &add),
@@ -105,15 +110,15 @@ pub(super) fn execute(new: &NewPlugin, json: bool) -> Result<Done, Failure> {
     for (path, text) in files(new.kind, new.lang) {
         let path = folder.join(fill(path));
         if let Some(parent) = path.parent() {
-            std::fs::create_dir_all(parent).map_err(Failure::io("make the folder", parent))?;
+            std::fs::create_dir_all(parent).at("make the folder", parent)?;
         }
-        std::fs::write(&path, fill(text)).map_err(Failure::io("write", &path))?;
+        std::fs::write(&path, fill(text)).at("write", &path)?;
         written.push(path.to_string_lossy().into_owned());
     }
     // The versions that the SDK was tested with.
     if let (Language::Rust, None, Some(lock)) = (new.lang, &new.sdk_git, installed::sdk_lock()) {
         let to = folder.join("Cargo.lock");
-        std::fs::copy(&lock, &to).map_err(Failure::io("write", &to))?;
+        std::fs::copy(&lock, &to).at("write", &to)?;
         written.push(to.to_string_lossy().into_owned());
     }
     if json {
@@ -146,6 +151,6 @@ fn sdk(new: &NewPlugin) -> Result<(String, String), Failure> {
         }
         // A C plugin needs the header alone.
         _ if new.lang == Language::C => Ok((String::new(), String::new())),
-        _ => Err(Failure::NoSdk(asked)),
+        _ => Err(Refusal::NoSdk(asked).into()),
     }
 }

@@ -2,7 +2,7 @@
 
 use super::Done;
 use crate::args::{Global, Plugins};
-use crate::failure::Failure;
+use crate::failure::{Failure, Refusal};
 use crate::screen;
 use crate::text::Paint;
 use dragfree_engine::registry::Registry;
@@ -26,7 +26,7 @@ pub(super) fn execute(command: &Plugins, global: &Global, paint: Paint) -> Resul
 
 fn inspect(registry: &Registry, id: &str, json: bool, paint: Paint) -> Result<Done, Failure> {
     let found = registry.plugins().find(|found| found.info.manifest.id == id);
-    let found = found.ok_or_else(|| Failure::Plugin(id.to_owned()))?;
+    let found = found.ok_or_else(|| Refusal::Plugin(id.to_owned()))?;
     let (info, library) = (&found.info, &found.opened);
     if json {
         return Ok(Done::json(&serde_json::json!({

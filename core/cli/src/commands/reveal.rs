@@ -2,9 +2,10 @@
 
 use super::Done;
 use crate::args::{Global, Reveal};
-use crate::failure::Failure;
-use crate::text::{self, Paint, columns, labelled};
+use crate::failure::{Failure, Refusal};
+use crate::text::{self, Paint, columns, labelled, table};
 use dragfree_engine::border::Kind;
+use dragfree_engine::files::IoContext as _;
 use dragfree_engine::sealed::Sealed;
 use dragfree_score::{Compared, Outcome, Score, Scored, Verdict, score};
 use serde_json::Value;
@@ -12,9 +13,9 @@ use std::path::Path;
 
 pub(super) fn execute(command: &Reveal, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let path = &command.sealed;
-    let sealed = Sealed::read(path).map_err(Failure::engine)?;
-    let content = sealed.content(path).map_err(Failure::engine)?;
-    let checked = sealed.check(path, &command.telemetry).map_err(Failure::engine)?;
+    let sealed = Sealed::read(path)?;
+    let content = sealed.content(path)?;
+    let checked = sealed.check(path, &command.telemetry)?;
     let scored = command.diagnosis.as_deref().map(|diagnosis| judge(&content, diagnosis, global)).transpose()?;
     if global.json {
         let mut value = serde_json::json!({"sha256": sealed.sha256, "telemetry": checked, "content": content});
@@ -45,15 +46,15 @@ pub(super) fn execute(command: &Reveal, global: &Global, paint: Paint) -> Result
 
 /// Scores a diagnosis, with the effects that are installed here.
 fn judge(content: &Value, path: &Path, global: &Global) -> Result<Score, Failure> {
-    let text = std::fs::read_to_string(path).map_err(Failure::io("read", path))?;
-    let refuse = |what: String| Failure::Diagnosis { path: path.to_owned(), what };
+    let text = std::fs::read_to_string(path).at("read", path)?;
+    let refuse = |what: String| Refusal::Diagnosis { path: path.to_owned(), what };
     let diagnosis: Value = serde_json::from_str(&text)
         .map_err(|e| refuse(format!("it is no JSON: {e}; write it with `dragfree diagnose PRODUCT --json`")))?;
     let effects: Vec<_> = super::registry(global)?.plugins().filter(|p| p.info.kind == Kind::Effect).collect();
     let installed = |id: &str, instance: &str| {
         effects.iter().any(|p| p.info.manifest.id == id && p.info.manifest.may_act_at(instance))
     };
-    score(content, &diagnosis, &installed).map_err(refuse)
+    Ok(score(content, &diagnosis, &installed).map_err(refuse)?)
 }
 
 fn verdict(score: &Score, paint: Paint) -> String {
@@ -124,8 +125,7 @@ fn outcomes(effects: &[Scored]) -> String {
             sigma(e.significance),
         ]
     };
-    let heading = ["hidden", "rank", "outcome", "expected", "found"].map(str::to_owned).to_vec();
-    columns(&std::iter::once(heading).chain(effects.iter().map(row)).collect::<Vec<_>>())
+    columns(&table(&["hidden", "rank", "outcome", "expected", "found"], effects.iter().map(row)))
 }
 
 /// A row for every size that can be compared; the unit is left out where the row would be too wide.
@@ -140,9 +140,8 @@ fn values(compared: &[&Compared]) -> String {
             unit.to_owned(),
         ]
     };
-    let heading = ["size", "true", "found", "off by", ""].map(str::to_owned).to_vec();
-    let mut rows: Vec<_> = std::iter::once(heading).chain(compared.iter().map(row)).collect();
-    if columns(&rows).lines().any(|line| text::width(line) > text::WIDTH) {
+    let mut rows = table(&["size", "true", "found", "off by", ""], compared.iter().map(row));
+    if !text::fits(&columns(&rows)) {
         rows.iter_mut().for_each(|row| row.truncate(4));
     }
     columns(&rows)

@@ -6,8 +6,8 @@ use crate::failure::Failure;
 use crate::progress::Meter;
 use crate::screen;
 use crate::text::Paint;
-use dragfree_engine::product::{self, Product};
-use dragfree_workflow::calibrate::{Options, Outcome, calibrate, check};
+use dragfree_engine::product::{self, Product, Written};
+use dragfree_workflow::calibrate::{Options, calibrate, check};
 use std::fmt::Write as _;
 use std::path::Path;
 use std::time::SystemTime;
@@ -15,7 +15,7 @@ use std::time::SystemTime;
 /// Done, but data were lost.
 const DATA_LOSS: u8 = 3;
 /// Done, but the model is inconsistent with the data.
-const INCONSISTENT: u8 = 4;
+pub(super) const INCONSISTENT: u8 = 4;
 
 pub(super) fn execute(command: &Run, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let outcome = archive(command, global)?;
@@ -29,7 +29,7 @@ pub(super) fn execute(command: &Run, global: &Global, paint: Paint) -> Result<Do
 }
 
 /// Runs the pipeline and archives the product.
-pub(super) fn archive(command: &Run, global: &Global) -> Result<Outcome, Failure> {
+pub(super) fn archive(command: &Run, global: &Global) -> Result<Written, Failure> {
     let registry = super::registry(global)?;
     let options = Options {
         from_ns: command.from,
@@ -40,14 +40,14 @@ pub(super) fn archive(command: &Run, global: &Global) -> Result<Outcome, Failure
         ..options(&command.chain, global)
     };
     let mut meter = Meter::new("run", global);
-    calibrate(&registry, &options, &mut |progress| meter.show(&progress)).map_err(Failure::engine)
+    Ok(calibrate(&registry, &options, &mut |progress| meter.show(&progress))?)
 }
 
 /// `dragfree config check`: links as a run would.
 pub(super) fn config_check(chain: &Chain, global: &Global) -> Result<Done, Failure> {
-    let report = check(&super::registry(global)?, &options(chain, global)).map_err(Failure::engine)?;
+    let report = check(&super::registry(global)?, &options(chain, global))?;
     if global.json {
-        return Ok(Done::json(&serde_json::to_value(&report).map_err(Failure::engine)?));
+        return Ok(Done::json(&serde_json::to_value(&report)?));
     }
     Ok(Done::new(screen::check(&report)))
 }
@@ -59,14 +59,11 @@ fn options(chain: &Chain, global: &Global) -> Options {
         mission: chain.mission.clone(),
         model: chain.model.clone(),
         archive: chain.archive.folder.clone(),
-        from_ns: None,
-        until_ns: None,
         threads: super::threads(global),
         batch_rows: BATCH_ROWS as usize,
-        state_in: None,
-        state_out: None,
         created: SystemTime::now().into(),
         software: super::software(),
+        ..Options::default()
     }
 }
 

@@ -53,5 +53,5 @@ pub(super) fn run(command: &Simulate, global: &Global) -> Result<SimulateOutcome
         threads: super::threads(global),
     };
     let mut meter = Meter::new("simulate", global);
-    simulate(&registry, &options, &mut |progress| meter.show(&progress)).map_err(Failure::engine)
+    Ok(simulate(&registry, &options, &mut |progress| meter.show(&progress))?)
 }

@@ -3,7 +3,7 @@
 use super::Done;
 use crate::args::{Global, Validate};
 use crate::bundled;
-use crate::failure::Failure;
+use crate::failure::{Failure, Refusal};
 use crate::text::{self, Paint};
 use dragfree_engine::border::{Library, PluginInfo};
 use dragfree_engine::config::Mission;
@@ -34,10 +34,10 @@ pub(super) fn execute(validate: &Validate, global: &Global, paint: Paint) -> Res
             checks.push(json!({ "check": "open", "passed": false, "detail": kind }));
         } else {
             for check in Check::ALL {
-                let mut result = ask(validate, &path, check.name(), Some((&kind, &id)));
-                result["check"] = json!(check.name());
+                let mut result = ask(validate, &path, &check.to_string(), Some((&kind, &id)));
+                result["check"] = json!(check);
                 checks.push(result);
-                // Where it does not come to life or hangs, nothing else can be looked at.
+                // An instance that cannot be created or linked, or hangs, ends the checks.
                 let ends = |c: &Value| {
                     c["stopped"] == true || c["passed"] == false && matches!(check, Check::Create | Check::Link)
                 };
@@ -64,7 +64,7 @@ fn found(validate: &Validate, global: &Global) -> Result<Vec<(String, String, Pa
     let all: Vec<_> = of_id
         .map(|found| (found.info.kind.to_string(), found.info.manifest.id.clone(), found.opened.path.clone()))
         .collect();
-    if all.is_empty() { Err(Failure::Plugin(validate.target.clone())) } else { Ok(all) }
+    if all.is_empty() { Err(Refusal::Plugin(validate.target.clone()).into()) } else { Ok(all) }
 }
 
 /// The plugins of a file, as a child of ours sees them; where it cannot be opened, the reason in place of the kind.
@@ -117,8 +117,7 @@ fn ask(validate: &Validate, path: &Path, check: &str, plugin: Option<(&str, &str
 /// Status, where it ended in time, and what it wrote to stdout and stderr.
 fn answer(command: &mut Command, limit: Duration) -> std::io::Result<(Option<ExitStatus>, String, String)> {
     let mut child = command.spawn()?;
-    // A process that the plugin started may hold the pipes open after the child's end: nobody waits for their end
-    // alone.
+    // A process started by the plugin may keep the pipes open after the child's end, hence the threads and time limits.
     let read = |pipe: Option<Box<dyn std::io::Read + Send>>| {
         let (sender, receiver) = std::sync::mpsc::channel();
         std::thread::spawn(move || {
@@ -186,8 +185,9 @@ fn child(validate: &Validate, check: &str) -> Result<Done, Failure> {
         validate.kind.as_ref().is_none_or(|kind| *kind == p.kind.to_string())
             && validate.id.as_ref().is_none_or(|id| *id == p.manifest.id)
     };
-    let plugin = library.plugins.iter().find(wanted).ok_or_else(|| Failure::Plugin(validate.target.clone()))?;
-    let check = Check::ALL.into_iter().find(|c| c.name() == check).ok_or_else(|| Failure::NoCheck(check.to_owned()))?;
+    let plugin = library.plugins.iter().find(wanted).ok_or_else(|| Refusal::Plugin(validate.target.clone()))?;
+    let check =
+        Check::ALL.into_iter().find(|c| c.to_string() == check).ok_or_else(|| format!("there is no check {check}"))?;
     let mission = mission(validate.mission.as_deref())?;
     let parameters = validate.set.iter().map(|text| parameter(text)).collect::<Result<toml::Table, Failure>>()?;
     let subject =
@@ -200,19 +200,18 @@ fn told(answer: &Value) -> Done {
     Done { text: format!("\n{ANSWER}{answer}\n"), code: u8::from(answer["passed"] != true) }
 }
 
-/// The mission given, or the bundled one.
 /// The mission of a file, or the bundled one.
 pub(super) fn mission(path: Option<&Path>) -> Result<Mission, Failure> {
     if let Some(path) = path {
-        return Mission::load(path).map_err(Failure::engine);
+        return Ok(Mission::load(path)?);
     }
     let text = bundled::FILES.iter().find(|(path, _)| *path == bundled::MISSION).map_or("", |(_, text)| text);
-    Mission::parse(Path::new(bundled::MISSION), text).map_err(Failure::engine)
+    Ok(Mission::parse(Path::new(bundled::MISSION), text)?)
 }
 
 /// `NAME=VALUE`, the value as TOML has it, or else a text.
 fn parameter(text: &str) -> Result<(String, toml::Value), Failure> {
-    let (name, value) = text.split_once('=').ok_or_else(|| Failure::NoParameter(text.to_owned()))?;
+    let (name, value) = text.split_once('=').ok_or_else(|| format!("--set {text}: NAME=VALUE is needed"))?;
     let parsed = toml::from_str::<toml::Table>(&format!("value = {value}")).ok().and_then(|mut t| t.remove("value"));
     Ok((name.trim().to_owned(), parsed.unwrap_or_else(|| toml::Value::from(value))))
 }

@@ -27,50 +27,29 @@ pub(super) fn fields_of(columns: &[Column]) -> Fields {
         .collect()
 }
 
-/// A struct array over rows that stay the host's: no release, nothing to free but the pointers held here.
-pub(super) struct Borrowed {
-    pub(super) array: abi::ArrowArray,
-    _children: Vec<abi::ArrowArray>,
-    _child_pointers: Vec<*mut abi::ArrowArray>,
-    _buffers: Vec<[*const c_void; 2]>,
-    _own_buffers: Box<[*const c_void; 1]>,
-}
-
-impl Borrowed {
-    /// The caller keeps `time_ns` and `columns` alive and unchanged as long as the result is used.
-    pub(super) fn new(time_ns: &[i64], columns: &[&[f64]]) -> Self {
-        let rows = time_ns.len().cast_signed() as i64;
-        let mut buffers: Vec<[*const c_void; 2]> = std::iter::once(time_ns.as_ptr().cast())
-            .chain(columns.iter().map(|c| c.as_ptr().cast()))
-            .map(|values| [ptr::null(), values])
-            .collect();
-        let mut children: Vec<abi::ArrowArray> = buffers
-            .iter_mut()
-            .map(|b| abi::ArrowArray {
-                length: rows,
-                n_buffers: 2,
-                buffers: b.as_mut_ptr(),
-                ..abi::ArrowArray::empty()
-            })
-            .collect();
-        let mut child_pointers: Vec<*mut abi::ArrowArray> = children.iter_mut().map(|c| &raw mut *c).collect();
-        let mut own_buffers = Box::new([ptr::null()]);
-        let array = abi::ArrowArray {
-            length: rows,
-            n_buffers: 1,
-            buffers: own_buffers.as_mut_ptr(),
-            n_children: child_pointers.len().cast_signed() as i64,
-            children: child_pointers.as_mut_ptr(),
-            ..abi::ArrowArray::empty()
-        };
-        Self {
-            array,
-            _children: children,
-            _child_pointers: child_pointers,
-            _buffers: buffers,
-            _own_buffers: own_buffers,
-        }
-    }
+/// A struct array over rows that stay the host's: no release, nothing to free but what it points into, which comes with
+/// it. The caller keeps that and the rows alive and unchanged while the array is used.
+pub(super) fn borrow(time_ns: &[i64], columns: &[&[f64]]) -> (impl Sized + use<>, abi::ArrowArray) {
+    let rows = time_ns.len().cast_signed() as i64;
+    let mut buffers: Vec<[*const c_void; 2]> = std::iter::once(time_ns.as_ptr().cast())
+        .chain(columns.iter().map(|c| c.as_ptr().cast()))
+        .map(|values| [ptr::null(), values])
+        .collect();
+    let mut children: Vec<abi::ArrowArray> = buffers
+        .iter_mut()
+        .map(|b| abi::ArrowArray { length: rows, n_buffers: 2, buffers: b.as_mut_ptr(), ..abi::ArrowArray::empty() })
+        .collect();
+    let mut child_pointers: Vec<*mut abi::ArrowArray> = children.iter_mut().map(|c| &raw mut *c).collect();
+    let mut own_buffers = Box::new([ptr::null()]);
+    let array = abi::ArrowArray {
+        length: rows,
+        n_buffers: 1,
+        buffers: own_buffers.as_mut_ptr(),
+        n_children: child_pointers.len().cast_signed() as i64,
+        children: child_pointers.as_mut_ptr(),
+        ..abi::ArrowArray::empty()
+    };
+    ((children, child_pointers, buffers, own_buffers), array)
 }
 
 /// Takes a plugin's array: checks its shape, copies the rows, releases it.

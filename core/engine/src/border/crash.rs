@@ -1,18 +1,17 @@
-//! The last words of a program that a plugin has crashed: which plugin it was, and in which call.
+//! A signal handler that names the plugin, and the call, in which the program crashed.
 //!
-//! What the signal handler reads is static, so that it may look at it in any state of the program: names are kept for
-//! ever, once each.
+//! It reads static memory alone, which is valid in any state of the program: each name is leaked once.
 
 use std::cell::Cell;
 use std::collections::BTreeMap;
 use std::sync::atomic::{AtomicPtr, Ordering};
 use std::sync::{Mutex, PoisonError};
 
-/// A plugin's name, kept for ever.
+/// A plugin's name, never freed.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Name(&'static &'static str);
 
-/// Calls that are noted at a time; a thread beyond them goes unnamed in the crash of another thread.
+/// Most calls noted at a time; the crash report of another thread omits those beyond.
 const NOTED: usize = 64;
 
 thread_local! {
@@ -36,7 +35,7 @@ impl Name {
         Self(kept)
     }
 
-    /// Does `work`, which enters the plugin; a signal in it tells the name.
+    /// Runs `work`, which calls the plugin; a crash in it is reported under this name.
     pub(super) fn during<R>(self, call: &'static str, work: impl FnOnce() -> R) -> R {
         let outer = CURRENT.replace(Some((self, call)));
         let mark = std::ptr::from_ref(self.0).cast_mut();
@@ -60,8 +59,8 @@ mod handler {
     use std::sync::atomic::Ordering;
     use std::sync::{Once, OnceLock};
 
-    /// Signals of a crash, with what they mean.
-    const DEADLY: [(c_int, &str); 6] = [
+    /// Signals of a crash and their meaning.
+    const FATAL_SIGNALS: [(c_int, &str); 6] = [
         (libc::SIGSEGV, "SIGSEGV, memory that is not its own"),
         (libc::SIGBUS, "SIGBUS, memory that is not there"),
         (libc::SIGILL, "SIGILL, an illegal instruction"),
@@ -70,20 +69,20 @@ mod handler {
         (libc::SIGTRAP, "SIGTRAP, a trap"),
     ];
 
-    /// What handled each signal before: Rust's own handler tells of an overflown stack.
-    static BEFORE: [OnceLock<libc::sigaction>; DEADLY.len()] = [const { OnceLock::new() }; DEADLY.len()];
+    /// Previous handlers; Rust's own one reports a stack overflow.
+    static BEFORE: [OnceLock<libc::sigaction>; FATAL_SIGNALS.len()] = [const { OnceLock::new() }; FATAL_SIGNALS.len()];
 
-    /// Makes the signals tell; once.
+    /// Installs the handler, once.
     pub(in super::super) fn install() {
         static INSTALLED: Once = Once::new();
         INSTALLED.call_once(|| {
-            for ((signal, _), before) in DEADLY.iter().zip(&BEFORE) {
+            for ((signal, _), before) in FATAL_SIGNALS.iter().zip(&BEFORE) {
                 // SAFETY: an all-zero sigaction is a valid one; both structures live during the calls, and the handler
                 // does nothing that a signal handler may not do.
                 unsafe {
                     let mut old: libc::sigaction = std::mem::zeroed();
                     let mut new: libc::sigaction = std::mem::zeroed();
-                    new.sa_sigaction = last_words as extern "C" fn(c_int, *mut siginfo_t, *mut c_void) as usize;
+                    new.sa_sigaction = report_crash as extern "C" fn(c_int, *mut siginfo_t, *mut c_void) as usize;
                     new.sa_flags = libc::SA_SIGINFO | libc::SA_ONSTACK;
                     if libc::sigaction(*signal, std::ptr::null(), &raw mut old) == 0 {
                         let _ = before.set(old); // set once, by `call_once`
@@ -94,7 +93,7 @@ mod handler {
         });
     }
 
-    /// Text put together without memory from the heap; what does not fit is left out.
+    /// Text on the stack: a handler must not allocate. What does not fit is cut.
     struct Line {
         bytes: [u8; 1024],
         length: usize,
@@ -108,22 +107,19 @@ mod handler {
         }
     }
 
-    /// Tells the plugin, puts the earlier handler back and lets the signal come again.
-    extern "C" fn last_words(signal: c_int, info: *mut siginfo_t, _: *mut c_void) {
-        let index = DEADLY.iter().position(|(deadly, _)| *deadly == signal).unwrap_or(0);
+    /// Reports the plugin, restores the previous handler and lets the signal come again.
+    extern "C" fn report_crash(signal: c_int, info: *mut siginfo_t, _: *mut c_void) {
+        let index = FATAL_SIGNALS.iter().position(|(fatal, _)| *fatal == signal).unwrap_or(0);
         let mut line = Line { bytes: [0; 1024], length: 0 };
         if let Some((Name(name), call)) = CURRENT.get() {
-            line.put("\ndragfree: plugin ");
-            line.put(name);
-            line.put(": ");
-            line.put(call);
-            line.put(": crashed: ");
-            line.put(DEADLY[index].1);
-            line.put("; report it to its author, `dragfree plugins validate` helps to find it\n");
+            let end = "; report it to its author, `dragfree plugins validate` helps to find it\n";
+            for text in ["\ndragfree: plugin ", name, ": ", call, ": crashed: ", FATAL_SIGNALS[index].1, end] {
+                line.put(text);
+            }
         } else {
             let mut separator = "\ndragfree: crashed outside of the program's own threads while these plugins ran: ";
             for slot in &RUNNING[..NOTED] {
-                // SAFETY: the slots hold null or what `Name::of` keeps for ever.
+                // SAFETY: the slots hold null or what `Name::of` has leaked.
                 if let Some(name) = unsafe { slot.load(Ordering::Relaxed).as_ref() } {
                     line.put(separator);
                     line.put(name);
@@ -132,7 +128,7 @@ mod handler {
             }
             if line.length > 0 {
                 line.put(": ");
-                line.put(DEADLY[index].1);
+                line.put(FATAL_SIGNALS[index].1);
                 line.put("\n");
             }
         }
@@ -156,6 +152,6 @@ mod handler {
 #[cfg(unix)]
 pub(super) use handler::install;
 
-/// Elsewhere there are no signals to tell of.
+/// Elsewhere there are no signals.
 #[cfg(not(unix))]
 pub(super) fn install() {}

@@ -19,7 +19,6 @@ pub(super) fn restore(word: u32) {
     unsafe { std::arch::asm!("ldmxcsr [{}]", in(reg) &raw const word, options(nostack, readonly, preserves_flags)) };
 }
 
-/// The control bits of the calling thread: rounding, flush-to-zero, exception masks; 0 where we cannot read them.
 #[cfg(target_arch = "aarch64")]
 pub(super) fn control_word() -> u32 {
     let word: u64;
@@ -28,19 +27,16 @@ pub(super) fn control_word() -> u32 {
     word as u32
 }
 
-/// Puts the control bits back.
 #[cfg(target_arch = "aarch64")]
 pub(super) fn restore(word: u32) {
     // SAFETY: writes a value that `control_word` read.
     unsafe { std::arch::asm!("msr fpcr, {}", in(reg) u64::from(word), options(nomem, nostack, preserves_flags)) };
 }
 
-/// The control bits of the calling thread: rounding, flush-to-zero, exception masks; 0 where we cannot read them.
 #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
 pub(super) fn control_word() -> u32 {
     0
 }
 
-/// Puts the control bits back.
 #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
 pub(super) fn restore(_word: u32) {}

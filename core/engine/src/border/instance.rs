@@ -1,4 +1,4 @@
-//! A living plugin: made, linked, fed, asked, freed.
+//! A plugin instance: created, linked, fed, asked for report and state, destroyed.
 
 use arrow_schema::{DataType, Fields, ffi::FFI_ArrowSchema};
 use dragfree_abi as abi;
@@ -35,7 +35,7 @@ pub struct ReadColumn {
     pub available: usize,
 }
 
-/// What an instance said when it was linked.
+/// What an instance declared when it was linked.
 #[derive(Clone, Debug, Default)]
 pub struct Linked {
     /// Per input table, in slot order: the columns read.
@@ -59,7 +59,7 @@ pub struct Rows<'a> {
     pub columns: Vec<&'a [f64]>,
 }
 
-/// What a source gave.
+/// One step of a source.
 #[derive(Debug)]
 pub struct SourceStep {
     /// One batch per written table.
@@ -70,14 +70,14 @@ pub struct SourceStep {
     pub done: bool,
 }
 
-/// A living plugin.
+/// A plugin instance.
 #[derive(Debug)]
 pub struct Instance {
     /// Id, with the instance of an effect: `com-offset:tm1`.
     pub name: String,
-    /// The same, for the last words of a crash.
+    /// The same, for the crash report.
     crash_name: Name,
-    /// What it is.
+    /// Source, stage or effect.
     pub kind: Kind,
     node: abi::NodeV1,
     // Lives as long as the node, which holds a pointer to it.
@@ -523,7 +523,7 @@ impl Instance {
         })
     }
 
-    /// Lets it say what it reads and writes.
+    /// Links it: it declares what it reads and writes.
     ///
     /// # Errors
     /// A column is missing or is another than wanted: [`BorderError::Link`] holds the sentence.
@@ -551,7 +551,7 @@ impl Instance {
         let link = self.function(self.node.link, "link")?;
         // SAFETY: every pointer lives during the call.
         let result = self.call("link", |node, error| unsafe { link(node, &raw const raw, error) });
-        // The host's own sentence says more than the plugin's echo of it.
+        // The host's own message is more precise than the plugin's.
         if let Some(sentence) = context.refused {
             self.dead = true;
             return Err(BorderError::Link { plugin: self.name.clone(), sentence });
@@ -570,7 +570,7 @@ impl Instance {
         Ok(linked)
     }
 
-    /// Lets it take memory.
+    /// Lets it allocate for batches of at most `max_rows` rows.
     ///
     /// # Errors
     /// The plugin failed.
@@ -586,20 +586,8 @@ impl Instance {
     /// The plugin failed or broke a rule of the border.
     pub fn process(&mut self, tables: &[Rows<'_>], complete_until_ns: i64) -> Result<Option<Vec<Batch>>, BorderError> {
         let process = self.function(self.node.process, "process")?;
-        let borrowed: Vec<arrow::Borrowed> =
-            tables.iter().map(|t| arrow::Borrowed::new(t.time_ns, &t.columns)).collect();
-        // A bitwise copy of the structs: their owner stays `borrowed`, and they have no release.
-        let arrays: Vec<abi::ArrowArray> = borrowed
-            .iter()
-            .map(|b| abi::ArrowArray {
-                length: b.array.length,
-                n_buffers: b.array.n_buffers,
-                buffers: b.array.buffers,
-                n_children: b.array.n_children,
-                children: b.array.children,
-                ..abi::ArrowArray::empty()
-            })
-            .collect();
+        let (_owned, arrays): (Vec<_>, Vec<abi::ArrowArray>) =
+            tables.iter().map(|t| arrow::borrow(t.time_ns, &t.columns)).unzip();
         let inputs = abi::InputsV1 {
             complete_until_ns,
             table_count: u32::try_from(arrays.len()).unwrap_or(u32::MAX),
@@ -627,7 +615,7 @@ impl Instance {
         Ok(SourceStep { batches, complete_until_ns: progress.complete_until_ns, done: progress.done != 0 })
     }
 
-    /// What a lag held back.
+    /// The rows that a lag held back.
     ///
     /// # Errors
     /// The plugin failed or broke a rule of the border.
@@ -640,7 +628,7 @@ impl Instance {
         batches.ok_or_else(|| self.rule("flush", "nothing to discard here".to_owned()))
     }
 
-    /// The report; keys that it does not have are notes in it.
+    /// The report; unknown keys become notes in it.
     ///
     /// # Errors
     /// The plugin failed, or gave what cannot be understood: the sentence names the key.
@@ -722,7 +710,7 @@ impl Instance {
         let mut arrays: Vec<abi::ArrowArray> = self.output_fields.iter().map(|_| abi::ArrowArray::empty()).collect();
         let pointer = arrays.as_mut_ptr();
         let called = self.call_or_discard(call, |node, error| work(node, pointer, error));
-        // Whatever came of the call, arrays that were filled are taken, and so released.
+        // Arrays are taken, and so released, even after a failed call.
         let batches: Result<Vec<Batch>, String> = arrays
             .into_iter()
             .zip(&self.output_fields)
@@ -778,7 +766,7 @@ fn guarded_call(
         }
         abi::ERROR | abi::FATAL => {
             let message = if message.is_empty() { "failed without a word".to_owned() } else { message };
-            Err(BorderError::Plugin { plugin: plugin.to_owned(), call, message, fatal: status == abi::FATAL })
+            Err(BorderError::Plugin { plugin: plugin.to_owned(), call, message })
         }
         other => {
             Err(BorderError::Rule { plugin: plugin.to_owned(), call, what: format!("status {other} does not exist") })

@@ -1,9 +1,8 @@
-//! Plugin libraries: found, checked, opened, asked what they hold.
+//! Plugin libraries: checked, opened, their manifests read.
 
 use dragfree_abi as abi;
 use dragfree_schema::Manifest;
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 use std::ffi::{CStr, CString};
 use std::mem::ManuallyDrop;
 use std::path::{Path, PathBuf};
@@ -38,11 +37,7 @@ impl Kind {
 
 impl std::fmt::Display for Kind {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self {
-            Self::Source => "source",
-            Self::Stage => "stage",
-            Self::Effect => "effect",
-        })
+        self.serialize(f)
     }
 }
 
@@ -54,7 +49,7 @@ pub struct PluginInfo {
     /// Its index in the factory.
     #[serde(skip)]
     pub index: u32,
-    /// What it says of itself.
+    /// Its manifest.
     pub manifest: Manifest,
 }
 
@@ -79,7 +74,7 @@ impl Library {
     pub fn open(path: &Path) -> Result<Self, BorderError> {
         let refuse = |reason: String| BorderError::Refused { path: path.to_owned(), reason };
         let bytes = std::fs::read(path).map_err(|e| refuse(format!("cannot be read: {e}")))?;
-        let sha256 = hex(&Sha256::digest(&bytes));
+        let sha256 = crate::files::sha256(&bytes);
         check_permissions(path).map_err(&refuse)?;
         check_lock(path, &sha256).map_err(&refuse)?;
         crash::install();
@@ -150,14 +145,6 @@ impl Library {
         // SAFETY: the id is NUL-terminated; the header promises null or a static factory.
         Ok(unsafe { get(id.as_ptr()).as_ref() })
     }
-}
-
-pub(crate) fn hex(bytes: &[u8]) -> String {
-    use std::fmt::Write;
-    bytes.iter().fold(String::new(), |mut text, b| {
-        let _ = write!(text, "{b:02x}");
-        text
-    })
 }
 
 #[cfg(unix)]

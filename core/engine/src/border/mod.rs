@@ -12,7 +12,6 @@ mod read;
 
 pub use dragfree_schema::{Manifest, Parameter, ParameterType};
 pub use instance::{Config, Instance, LinkRequest, Linked, ReadColumn, Rows, SourceStep};
-pub(crate) use library::hex;
 pub use library::{Kind, Library, PluginInfo};
 
 use std::path::PathBuf;
@@ -26,43 +25,18 @@ pub(crate) fn without_name<'a>(plugin: &str, message: &'a str) -> &'a str {
 
 /// What can go wrong at the border.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum BorderError {
     /// A library was refused.
     #[error("{}: refused: {reason}", path.display())]
-    Refused {
-        /// The file.
-        path: PathBuf,
-        /// Why, and what to do next.
-        reason: String,
-    },
+    Refused { path: PathBuf, reason: String },
     /// A plugin refused its configuration or its columns, or failed.
     #[error("plugin {plugin}: {call}: {message}")]
-    Plugin {
-        /// Id of the plugin.
-        plugin: String,
-        /// The call that failed.
-        call: &'static str,
-        /// The plugin's own words.
-        message: String,
-        /// The instance must never be called again.
-        fatal: bool,
-    },
+    Plugin { plugin: String, call: &'static str, message: String },
     /// A plugin broke the rules of the border.
     #[error("plugin {plugin}: {call}: broke the rules of plugin.h: {what}; report it to its author")]
-    Rule {
-        /// Id of the plugin.
-        plugin: String,
-        /// The call.
-        call: &'static str,
-        /// The rule.
-        what: String,
-    },
+    Rule { plugin: String, call: &'static str, what: String },
     /// Columns do not fit.
     #[error("plugin {plugin}: {sentence}")]
-    Link {
-        /// Id of the plugin.
-        plugin: String,
-        /// What is wanted, what is there, what to do.
-        sentence: String,
-    },
+    Link { plugin: String, sentence: String },
 }

@@ -2,11 +2,11 @@
 
 use dragfree_schema::{Coefficient, Constraint, NoiseProcess, Settings};
 use serde_json::{Map, Value, json};
-use sha2::{Digest, Sha256};
 
-use super::{Carry, Chain, ChainError, ChainNode, Queue, Route, Tap};
-use crate::border::{BorderError, Config, Instance, Kind, LinkRequest, Linked, hex};
+use super::{Carry, Chain, ChainError, ChainNode, Queue, Route};
+use crate::border::{BorderError, Config, Instance, Kind, LinkRequest, Linked};
 use crate::config::{EffectEntry, Mission, Model, Node, Pipeline, resolve_parameters};
+use crate::files::sha256;
 use crate::registry::{Found, Registry};
 use crate::table::{Column, TableSpec};
 
@@ -31,19 +31,12 @@ pub fn build(
         needs: needs(registry, model),
         settings: &pipeline.settings,
         chain: Chain {
-            nodes: Vec::new(),
-            coefficients: Vec::new(),
-            constraints: Vec::new(),
-            noise: Vec::new(),
-            columns: Vec::new(),
-            not_tried: Vec::new(),
             feed_tables: feed_tables.to_vec(),
             feed_routes: vec![Route::default(); feed_tables.len()],
-            tap: Tap::default(),
             carry: Carry { batch_rows: carry.batch_rows.max(1), ..carry },
             complete_until_ns: i64::MIN,
-            mission_sha256: hex(&Sha256::digest(mission.value.to_string())),
-            model_sha256: String::new(),
+            mission_sha256: sha256(mission.value.to_string()),
+            ..Chain::default()
         },
     };
     for node in &pipeline.nodes {
@@ -59,7 +52,7 @@ pub fn build(
         )));
     }
     builder.chain.columns = std::mem::take(&mut builder.available);
-    builder.chain.model_sha256 = hex(&Sha256::digest(builder.model_json(false)));
+    builder.chain.model_sha256 = sha256(builder.model_json(false));
     Ok(builder.chain)
 }
 
@@ -184,24 +177,11 @@ impl Builder<'_> {
             }
             self.chain.coefficients.push(c);
         }
-        match unused.first() {
-            Some(key) => {
-                let names: Vec<_> = self
-                    .chain
-                    .coefficients
-                    .iter()
-                    .filter(|c| c.effect == entry.id && c.instance == entry.instance)
-                    .map(|c| c.name.as_str())
-                    .collect();
-                Err(self.model_error(format!(
-                    "effect {}:{}: prior.{key} is no coefficient; it has {}",
-                    entry.id,
-                    entry.instance,
-                    names.join(", ")
-                )))
-            }
-            None => Ok(()),
-        }
+        let Some(key) = unused.first() else { return Ok(()) };
+        let own = |c: &&Coefficient| c.effect == entry.id && c.instance == entry.instance;
+        let names: Vec<_> = self.chain.coefficients.iter().filter(own).map(|c| c.name.as_str()).collect();
+        let (id, instance, names) = (&entry.id, &entry.instance, names.join(", "));
+        Err(self.model_error(format!("effect {id}:{instance}: prior.{key} is no coefficient; it has {names}")))
     }
 
     fn add(

@@ -1,8 +1,8 @@
 //! The chain: plugins linked by their columns, rows flowing from the feed through stages and effects.
 //!
-//! Uniform tables are joined row by row, so a stage that is late by a fixed lag delays those behind it and nothing
-//! else; nobody keeps books on lags. Results do not depend on where batches end nor on the number of threads: an
-//! instance sees its rows in one order, whoever carries them.
+//! Uniform tables are joined row by row, so a lag of a stage delays the stages after it and needs no bookkeeping.
+//! Results depend neither on the ends of batches nor on the number of threads: each instance sees its rows in one
+//! order.
 
 mod link;
 mod queue;
@@ -22,6 +22,7 @@ use queue::Queue;
 
 /// What can go wrong between plugins.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum ChainError {
     /// At the border.
     #[error(transparent)]
@@ -34,26 +35,13 @@ pub enum ChainError {
     Config(#[from] crate::config::ConfigError),
     /// The model and the chain do not fit.
     #[error("model {path}: {what}")]
-    Model {
-        /// The model file.
-        path: String,
-        /// What, why and what to do next.
-        what: String,
-    },
+    Model { path: String, what: String },
     /// Tables that should have the same rows do not.
     #[error("the tables that {reader} reads have different rows: {what}; the stage that makes one of them is at fault")]
-    Join {
-        /// The plugin that reads them, or the host.
-        reader: String,
-        /// Which table, which time.
-        what: String,
-    },
+    Join { reader: String, what: String },
     /// A state does not belong to this chain.
     #[error("state: {what}")]
-    State {
-        /// What, why and what to do next.
-        what: String,
-    },
+    State { what: String },
     /// Reports could not be handed on.
     #[error("reports: {0}")]
     Reports(String),
@@ -62,7 +50,7 @@ pub enum ChainError {
     Sink(String),
 }
 
-/// Takes rows out of the chain.
+/// A consumer of rows that leave the chain.
 pub trait Sink {
     /// Rows of one table that belongs beside the product, ordered by time.
     ///
@@ -102,9 +90,18 @@ pub struct ChainNode {
 
 impl ChainNode {
     /// Id, with the instance of an effect.
-    #[must_use]
     pub fn name(&self) -> &str {
         &self.instance.name
+    }
+
+    /// Rows that one call could take now.
+    fn ready(&self) -> usize {
+        self.inputs.iter().filter(|q| q.uniform).map(Queue::rows).min().unwrap_or(0)
+    }
+
+    /// Whether it goes row by row through some table; others take whatever there is.
+    fn has_uniform(&self) -> bool {
+        self.inputs.iter().any(|q| q.uniform)
     }
 }
 
@@ -140,7 +137,7 @@ impl Default for Carry {
 }
 
 /// A linked chain.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Chain {
     /// Its plugins in order.
     pub nodes: Vec<ChainNode>,
@@ -173,11 +170,9 @@ struct Tap {
 }
 
 impl Chain {
-    /// Hands columns to the host ([`Sink::tapped`]); `columns` are indices into [`Self::columns`].
-    ///
-    /// # Errors
-    /// Their rates differ, or one is irregular: their rows cannot be joined.
-    pub fn tap(&mut self, columns: &[usize]) -> Result<(), ChainError> {
+    /// Hands columns to the host ([`Sink::tapped`]); `columns` are indices into [`Self::columns`]. They must have one
+    /// rate: otherwise their rows cannot be joined.
+    pub(crate) fn tap(&mut self, columns: &[usize]) -> Result<(), ChainError> {
         let wanted: Vec<Column> = columns.iter().map(|c| self.columns[*c].clone()).collect();
         let rate_hz = wanted.first().map_or(0.0, |c| c.rate_hz);
         if let Some(other) = wanted.iter().find(|c| c.rate_hz != rate_hz || c.rate_hz <= 0.0) {
@@ -224,19 +219,17 @@ impl Chain {
     }
 
     /// Every row before this time has gone into the chain, Unix ns.
-    #[must_use]
     pub fn complete_until_ns(&self) -> i64 {
         self.complete_until_ns
     }
 
     /// Tables that belong beside the product.
-    #[must_use]
-    pub fn archived_tables(&self) -> Vec<TableSpec> {
+    pub(crate) fn archived_tables(&self) -> Vec<TableSpec> {
         let all = self.nodes.iter().flat_map(|n| n.writes.iter().zip(&n.routes));
         all.filter(|(_, route)| route.archive).map(|(table, _)| table.clone()).collect()
     }
 
-    /// Carries a stretch of the feed as far as it goes.
+    /// Pushes a chunk of the feed through the chain.
     ///
     /// # Errors
     /// A plugin failed, or broke a rule.
@@ -252,7 +245,7 @@ impl Chain {
         Ok(())
     }
 
-    /// The feed is at its end: carries what is left and flushes every lag.
+    /// Ends the feed: processes the remaining rows and flushes every lag.
     ///
     /// # Errors
     /// A plugin failed, or broke a rule.
@@ -291,8 +284,8 @@ impl Chain {
         Ok(reports)
     }
 
-    /// Carries what has come as far as it goes. A plugin may hold rows back for an hour and give them all at once: by
-    /// one call of each in turn, those behind it need not hold what they make of them all at once as well.
+    /// Calls nodes in rounds until none has input. A plugin may hold rows back for an hour and give them at once; one
+    /// call of each node per round bounds the queues after it.
     fn advance(&mut self, sink: &mut dyn Sink) -> Result<(), ChainError> {
         let mut new_rows = true;
         while self.round(new_rows, sink)? {
@@ -301,9 +294,8 @@ impl Chain {
         Ok(())
     }
 
-    /// One call of every node that has rows, and of those that wait for none where there is something new; false where
-    /// there was nothing to do. An effect waits while somebody has a whole batch of its rows that cannot be used yet:
-    /// its inputs are few, and all candidates' series are many.
+    /// Calls each node that has rows once, and with `new_rows` those that read no uniform table; false if none was due.
+    /// An effect waits while a reader has a whole batch of its rows: to queue inputs takes less memory than outputs.
     fn round(&mut self, new_rows: bool, sink: &mut dyn Sink) -> Result<bool, ChainError> {
         let waves = self.nodes.iter().map(|n| n.wave + 1).max().unwrap_or(0);
         let (until, rows) = (self.complete_until_ns, self.carry.batch_rows);
@@ -381,23 +373,11 @@ impl Chain {
 /// Who reads the tap, in messages.
 const TAP: &str = "the host";
 
-/// What a node made in one call: one batch per written table; none where there was nothing to call it for.
+/// What a node made in one call: one batch per written table; `None` if it was not called.
 type Made = Result<Option<Vec<Batch>>, ChainError>;
 
-/// Starting a thread costs about what a few hundred rows of a stage do.
+/// Rows from which a thread is worth its start.
 const SPAWN_WORTH_ROWS: usize = 512;
-
-impl ChainNode {
-    /// Rows that one call could take now.
-    fn ready(&self) -> usize {
-        self.inputs.iter().filter(|q| q.uniform).map(Queue::rows).min().unwrap_or(0)
-    }
-
-    /// Whether it goes row by row through some table; others take whatever there is.
-    fn has_uniform(&self) -> bool {
-        self.inputs.iter().any(|q| q.uniform)
-    }
-}
 
 fn publish(
     nodes: &mut [ChainNode],
@@ -420,8 +400,7 @@ fn publish(
     Ok(())
 }
 
-/// One call of a node, with at most so many rows of a uniform table; one that has none is called where there is
-/// something new.
+/// Calls a node with at most `batch_rows` rows of its uniform tables; one without uniform tables only with `new_rows`.
 fn step(node: &mut ChainNode, complete_until_ns: i64, batch_rows: usize, new_rows: bool) -> Made {
     let rows = node.ready().min(batch_rows);
     if rows == 0 && (node.has_uniform() || !new_rows) {
@@ -493,36 +472,16 @@ fn check_rows(node: &ChainNode, batches: &[Batch], rows: usize) -> Result<(), Ch
 }
 
 /// Cuts a chunk by time so that no table has many more than `rows` rows in one piece.
-fn pieces(chunk: Chunk, rows: usize) -> Vec<Chunk> {
-    let densest = chunk.batches.iter().max_by_key(|b| b.rows()).filter(|b| b.rows() > rows);
-    let Some(densest) = densest else { return vec![chunk] };
-    let mut cuts: Vec<i64> = (rows..densest.rows()).step_by(rows.max(1)).map(|i| densest.time_ns[i]).collect();
+fn pieces(mut chunk: Chunk, rows: usize) -> Vec<Chunk> {
+    let densest = chunk.batches.iter().max_by_key(|b| b.rows());
+    let times = densest.map_or(&[][..], |b| &b.time_ns).iter().copied();
+    let mut cuts: Vec<i64> = times.skip(rows).step_by(rows).filter(|t| *t <= chunk.complete_until_ns).collect();
     cuts.dedup();
-    cuts.retain(|t| *t <= chunk.complete_until_ns);
-    cuts.push(chunk.complete_until_ns);
-    let mut starts = vec![0usize; chunk.batches.len()];
-    let last = cuts.len() - 1;
-    cuts.iter()
-        .enumerate()
-        .map(|(k, until)| {
-            let batches = chunk
-                .batches
-                .iter()
-                .zip(&mut starts)
-                .map(|(batch, start)| {
-                    let end =
-                        if k == last { batch.rows() } else { batch.time_ns.partition_point(|t| t < until).max(*start) };
-                    let cut = Batch {
-                        time_ns: batch.time_ns[*start..end].to_vec(),
-                        columns: batch.columns.iter().map(|c| c[*start..end].to_vec()).collect(),
-                    };
-                    *start = end;
-                    cut
-                })
-                .collect();
-            Chunk { batches, complete_until_ns: *until }
-        })
-        .collect()
+    // From the end, so that every row is moved once.
+    let mut pieces: Vec<Chunk> = cuts.into_iter().rev().map(|cut| chunk.split_off(cut)).collect();
+    pieces.push(chunk);
+    pieces.reverse();
+    pieces
 }
 
 #[cfg(test)]

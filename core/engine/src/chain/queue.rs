@@ -50,9 +50,7 @@ impl Queue {
             self.start = 0;
         }
     }
-}
 
-impl Queue {
     pub(super) fn columns(&self) -> usize {
         self.columns.len()
     }

@@ -14,41 +14,20 @@ use std::path::{Path, PathBuf};
 
 /// A file that cannot be used.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum ConfigError {
     /// It cannot be read.
     #[error("{}: cannot be read: {source}; check the path", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
+    Read { path: PathBuf, source: std::io::Error },
     /// It is not TOML of the shape wanted: unknown keys, wrong types.
     #[error("{}: {source}", path.display())]
-    Shape {
-        /// The file.
-        path: PathBuf,
-        /// What and where.
-        source: Box<toml::de::Error>,
-    },
+    Shape { path: PathBuf, source: Box<toml::de::Error> },
     /// It is TOML, but has no sense.
     #[error("{}: {what}", path.display())]
-    Sense {
-        /// The file.
-        path: PathBuf,
-        /// What, why and what to do next.
-        what: String,
-    },
+    Sense { path: PathBuf, what: String },
     /// A plugin's parameters are not those that it declares.
     #[error("{file}: parameters of {plugin}: {what}")]
-    Parameter {
-        /// The file that gives them.
-        file: String,
-        /// The plugin.
-        plugin: String,
-        /// What, why and what to do next.
-        what: String,
-    },
+    Parameter { file: String, plugin: String, what: String },
 }
 
 fn read(path: &Path) -> Result<String, ConfigError> {

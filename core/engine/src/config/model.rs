@@ -1,12 +1,12 @@
 //! Model files: a list of effects.
 
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use super::{ConfigError, Mission, parse, read};
-use crate::border::{Manifest, hex};
+use crate::border::Manifest;
+use crate::files::sha256;
 
 /// A model: a revision and its effects.
 #[derive(Clone, Debug)]
@@ -117,11 +117,10 @@ impl Model {
 
     /// Six hexadecimal digits of the SHA-256 of the effects as JSON, keys sorted: comments, formatting, revision and
     /// parent do not enter.
-    #[must_use]
     pub fn digest(&self) -> String {
         let mut effects = serde_json::json!(self.effects);
         effects.sort_all_objects();
-        let mut digest = hex(&Sha256::digest(effects.to_string()));
+        let mut digest = sha256(effects.to_string());
         digest.truncate(DIGITS);
         digest
     }
@@ -132,22 +131,24 @@ impl Model {
     }
 
     /// Counter and digest of a revision's name that this program made; `None` for a name written by hand.
-    #[must_use]
-    pub fn parts(revision: &str) -> Option<(u32, &str)> {
+    pub(crate) fn parts(revision: &str) -> Option<(u32, &str)> {
         let (counter, digest) = revision.split_once('-')?;
         let hexadecimal = digest.len() == DIGITS && digest.bytes().all(|b| matches!(b, b'0'..=b'9' | b'a'..=b'f'));
         Some((counter.parse().ok().filter(|_| hexadecimal)?, digest))
     }
 
+    /// Number of a revision: the counter of its name, or the name itself where that is a number.
+    pub fn counter(revision: &str) -> Option<u32> {
+        Self::parts(revision).map(|(counter, _)| counter).or_else(|| revision.parse().ok())
+    }
+
     /// Whether the effects are not those that the revision's name has the digest of.
-    #[must_use]
     pub fn edited_by_hand(&self) -> bool {
         Self::parts(&self.revision).is_some_and(|(_, digest)| digest != self.digest())
     }
 
     /// Revision and parent as products name them. A file that was edited by hand since its revision was made is no
     /// longer that revision: it is a child of it, `2-5f3a9c+0b11d2`.
-    #[must_use]
     pub fn identity(&self) -> (String, Option<String>) {
         if self.edited_by_hand() {
             (format!("{}+{}", self.revision, self.digest()), Some(self.revision.clone()))
@@ -167,7 +168,6 @@ impl std::fmt::Display for EffectEntry {
 
 impl EffectEntry {
     /// An effect whose coefficients are estimated, nothing else said.
-    #[must_use]
     pub fn new(id: &str, instance: &str) -> Self {
         Self {
             id: id.to_owned(),
@@ -179,13 +179,11 @@ impl EffectEntry {
     }
 
     /// Start of the names of its coefficients: `es-gain.tm1.y`, which is the whole name where there is one coefficient.
-    #[must_use]
     pub fn coefficient(&self) -> String {
         if self.instance.is_empty() { self.id.clone() } else { format!("{}.{}", self.id, self.instance) }
     }
 
     /// Whether a coefficient is one of this effect's.
-    #[must_use]
     pub fn owns(&self, coefficient: &str) -> bool {
         coefficient.strip_prefix(&self.coefficient()).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
     }

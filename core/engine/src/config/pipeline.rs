@@ -125,13 +125,9 @@ impl Pipeline {
         if nodes.iter().filter(|n| **n == Node::Effects).count() > 1 {
             return Err(sense("has `effects = true` twice; the model's effects stand at one place".to_owned()));
         }
-        let product_ok =
-            !file.pipeline.product.is_empty() && file.pipeline.product.bytes().all(|b| b.is_ascii_alphanumeric());
-        if !product_ok {
-            return Err(sense(format!(
-                "product = \"{}\" must be letters and digits: it begins file names",
-                file.pipeline.product
-            )));
+        let product = &file.pipeline.product;
+        if product.is_empty() || !product.bytes().all(|b| b.is_ascii_alphanumeric()) {
+            return Err(sense(format!("product = \"{product}\" must be letters and digits: it begins file names")));
         }
         Ok(Self {
             path: path.to_owned(),

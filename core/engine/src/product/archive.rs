@@ -7,11 +7,11 @@
 use super::ProductError;
 use super::draft::{self, Draft};
 use super::file::{self, Attachment, Product, Supersedes};
+use crate::files::{IoContext as _, Problem, sha256_of, sync_folder};
 use chrono::NaiveDate;
 use dragfree_schema::Report;
-use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
-use std::fs::{self, File, OpenOptions};
+use std::fs::{self, File};
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -50,9 +50,9 @@ impl ProductWriter {
     /// # Errors
     /// [`ProductError::Io`]: the folder cannot be made or written.
     pub fn begin(archive: &Path) -> Result<Self, ProductError> {
-        fs::create_dir_all(archive).map_err(ProductError::io("make the archive", archive))?;
+        fs::create_dir_all(archive).at("make the archive", archive)?;
         let staging = tempfile::Builder::new().prefix(".staging-").tempdir_in(archive);
-        let staging = staging.map_err(ProductError::io("write in the archive", archive))?;
+        let staging = staging.at("write in the archive", archive)?;
         Ok(Self { archive: archive.to_owned(), staging, staged: BTreeMap::new(), beside: BTreeMap::new() })
     }
 
@@ -64,7 +64,7 @@ impl ProductWriter {
     }
 
     /// The same for a file that the product does not list, since what it holds may change: where the inputs lay.
-    pub fn staged_unlisted(&mut self, suffix: &str) -> PathBuf {
+    pub(crate) fn staged_unlisted(&mut self, suffix: &str) -> PathBuf {
         let path = self.staging.path().join(suffix);
         self.beside.insert(suffix.to_owned(), path.clone());
         path
@@ -135,7 +135,7 @@ impl ProductWriter {
                     return Err(refuse("that file exists already"));
                 }
                 let path = self.staged(suffix);
-                fs::write(&path, &attachment.text).map_err(ProductError::io("write", path))?;
+                fs::write(&path, &attachment.text).at("write", path)?;
             }
         }
         Ok(())
@@ -145,10 +145,13 @@ impl ProductWriter {
     fn place(&self, product: &Product) -> Result<(Placed, PathBuf), ProductError> {
         let staged = self.staging.path().join("product.toml");
         let text = product.emit()?;
-        let mut file = File::create_new(&staged).map_err(ProductError::io("write", &staged))?;
-        file.write_all(text.as_bytes()).map_err(ProductError::io("write", &staged))?;
-        file.sync_all().map_err(ProductError::io("write", &staged))?;
-        let back = fs::read_to_string(&staged).map_err(ProductError::io("read", &staged))?;
+        let write = || {
+            let mut file = File::create_new(&staged)?;
+            file.write_all(text.as_bytes())?;
+            file.sync_all()
+        };
+        write().at("write", &staged)?;
+        let back = fs::read_to_string(&staged).at("read", &staged)?;
         if file::parse(&back, &staged)?.canonical() != product.canonical() {
             return Err(ProductError::Damaged { path: staged, reason: "it does not read as it was written".into() });
         }
@@ -156,35 +159,20 @@ impl ProductWriter {
         for (suffix, from) in self.staged.iter().chain(&self.beside) {
             placed.link(from, self.archive.join(format!("{}.{suffix}", product.id())))?;
         }
-        sync_folder(&self.archive)?;
+        sync_folder(&self.archive).at("write", &self.archive)?;
         let path = self.archive.join(format!("{}.toml", product.id()));
         placed.link(&staged, path.clone())?;
-        sync_folder(&self.archive)?;
+        sync_folder(&self.archive).at("write", &self.archive)?;
         Ok((placed, path))
     }
 }
 
 /// Makes a staged file durable and takes its digest.
 fn seal(suffix: &str, path: &Path) -> Result<Attachment, ProductError> {
-    let mut file = File::open(path).map_err(ProductError::io("read", path))?;
-    file.sync_all().map_err(ProductError::io("write", path))?;
-    let mut digest = Sha256::new();
-    let size = std::io::copy(&mut file, &mut DigestWriter(&mut digest)).map_err(ProductError::io("read", path))?;
-    Ok(Attachment { suffix: suffix.to_owned(), size, sha256: file::hexadecimal(&digest.finalize()) })
-}
-
-/// Lets `io::copy` feed a digest.
-struct DigestWriter<'a>(&'a mut Sha256);
-
-impl std::io::Write for DigestWriter<'_> {
-    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
-        self.0.update(bytes);
-        Ok(bytes.len())
-    }
-
-    fn flush(&mut self) -> std::io::Result<()> {
-        Ok(())
-    }
+    let file = File::open(path).at("read", path)?;
+    file.sync_all().at("write", path)?;
+    let size = file.metadata().at("read", path)?.len();
+    Ok(Attachment { suffix: suffix.to_owned(), size, sha256: sha256_of(path).at("read", path)? })
 }
 
 /// The right to write one revision: a hidden file that only one writer can make.
@@ -194,10 +182,12 @@ impl Claim {
     /// `None` where another writer has it. A claim that a killed writer left costs one revision number, no more.
     fn take(archive: &Path, stem: &str, revision: u32) -> Result<Option<Self>, ProductError> {
         let path = archive.join(format!(".{stem}_{revision:04}.claim"));
-        match OpenOptions::new().write(true).create_new(true).open(&path) {
-            Ok(_) => Ok(Some(Self(path))),
+        match File::create_new(&path) {
             Err(error) if error.kind() == ErrorKind::AlreadyExists => Ok(None),
-            Err(source) => Err(ProductError::Io { action: "write", path, source }),
+            made => {
+                made.at("write", &path)?;
+                Ok(Some(Self(path)))
+            }
         }
     }
 }
@@ -214,8 +204,7 @@ struct Placed(Vec<PathBuf>);
 
 impl Placed {
     fn link(&mut self, from: &Path, to: PathBuf) -> Result<(), ProductError> {
-        fs::hard_link(from, &to)
-            .map_err(ProductError::io("place (the archive's file system must have hard links)", &to))?;
+        fs::hard_link(from, &to).at("place (the archive's file system must have hard links)", &to)?;
         self.0.push(to);
         Ok(())
     }
@@ -233,17 +222,6 @@ impl Drop for Placed {
     }
 }
 
-#[cfg(unix)]
-fn sync_folder(folder: &Path) -> Result<(), ProductError> {
-    File::open(folder).and_then(|folder| folder.sync_all()).map_err(ProductError::io("write", folder))
-}
-
-/// Elsewhere a folder is no file that could be flushed.
-#[cfg(not(unix))]
-fn sync_folder(_: &Path) -> Result<(), ProductError> {
-    Ok(())
-}
-
 /// The first revision from `from` on after every one that has a file in the archive.
 fn next_free(archive: &Path, stem: &str, from: u32) -> Result<u32, ProductError> {
     let taken = names(archive)?.into_iter().filter_map(|name| {
@@ -257,8 +235,8 @@ fn next_free(archive: &Path, stem: &str, from: u32) -> Result<u32, ProductError>
 /// Names in the archive that are text and not hidden, in order.
 fn names(archive: &Path) -> Result<Vec<String>, ProductError> {
     let mut names = Vec::new();
-    for entry in fs::read_dir(archive).map_err(ProductError::io("read the archive", archive))? {
-        let entry = entry.map_err(ProductError::io("read the archive", archive))?;
+    for entry in fs::read_dir(archive).at("read the archive", archive)? {
+        let entry = entry.at("read the archive", archive)?;
         if let Ok(name) = entry.file_name().into_string()
             && !name.starts_with('.')
         {
@@ -340,15 +318,6 @@ impl Entry {
     }
 }
 
-/// A file in an archive that is no sound product.
-#[derive(Clone, Debug)]
-pub struct Problem {
-    /// File.
-    pub path: PathBuf,
-    /// What is wrong, one sentence.
-    pub reason: String,
-}
-
 /// Lists an archive. What is damaged or foreign is reported beside the products.
 ///
 /// # Errors
@@ -391,7 +360,7 @@ pub fn list(archive: &Path) -> Result<Listing, ProductError> {
 fn complete(product: Product, path: &Path) -> Result<Product, ProductError> {
     for attachment in &product.attachments {
         let beside = path.with_extension(&attachment.suffix);
-        let size = fs::metadata(&beside).map_err(ProductError::io("read", &beside))?.len();
+        let size = fs::metadata(&beside).at("read", &beside)?.len();
         if size != attachment.size {
             let reason = format!("it has {size} bytes, the product says {}", attachment.size);
             return Err(ProductError::Damaged { path: beside, reason });

@@ -2,13 +2,14 @@
 
 use super::ProductError;
 use super::file::{
-    Attachment, Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Loss, Model,
+    Attachment, Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Model,
     NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Supersedes, Variable,
 };
 use crate::border::without_name;
-use chrono::{DateTime, NaiveDate, SecondsFormat, Utc};
+use crate::feed::Summary;
+use chrono::{DateTime, SecondsFormat, Utc};
 use dragfree_schema::{Report, Settings};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 /// All that a product is made from.
 #[derive(Clone, Debug)]
@@ -23,18 +24,10 @@ pub struct Draft {
     pub mission: String,
     /// Spacecraft, `SC1`: letters, digits and `-`.
     pub spacecraft: String,
-    /// UTC day in the product's name, that of the first epoch.
-    pub day: NaiveDate,
     /// First epoch, Unix ns of `time_scale`.
     pub first_ns: i64,
     /// Last epoch, Unix ns of `time_scale`.
     pub last_ns: i64,
-    /// `UTC`, `TAI` or `GPS`; empty where the data do not say.
-    pub time_scale: String,
-    /// Operations, reprocessing or a test.
-    pub stream: Stream,
-    /// How final the product is.
-    pub status: Status,
     /// Every file that was read.
     pub inputs: Vec<Input>,
     /// Every plugin that ran, in order.
@@ -43,18 +36,19 @@ pub struct Draft {
     pub model: Model,
     /// Version of the program, with its commit where it is known.
     pub software: String,
-    /// Data that were lost.
-    pub losses: Vec<Loss>,
-    /// Counts of the replay; those of the stages stand in their reports.
-    pub counts: BTreeMap<String, u64>,
-    /// Sentences of the replay; those of the stages stand in their reports.
-    pub notes: Vec<String>,
+    /// Time scale, losses, counts and notes of the replay; those of the stages stand in their reports.
+    pub replay: Summary,
     /// Reports in pipeline order, each with its plugin.
     pub reports: Vec<Report>,
     /// Thresholds.
     pub settings: Settings,
     /// When the product is made; the engine has no clock.
     pub created: DateTime<Utc>,
+}
+
+/// UTC day of the first epoch.
+fn day(draft: &Draft) -> String {
+    DateTime::from_timestamp_nanos(draft.first_ns).format("%Y-%m-%d").to_string()
 }
 
 /// A product's name without its revision, `COM1B_2035-01-01_SC1_01`.
@@ -65,7 +59,7 @@ pub(super) fn stem(draft: &Draft) -> Result<String, ProductError> {
     };
     named("the product name", &draft.product, "pipeline", &[])?;
     named("the spacecraft", &draft.spacecraft, "mission", &['-'])?;
-    Ok(format!("{}_{}_{}_{:02}", draft.product, draft.day.format("%Y-%m-%d"), draft.spacecraft, draft.release))
+    Ok(format!("{}_{}_{}_{:02}", draft.product, day(draft), draft.spacecraft, draft.release))
 }
 
 /// Builds the product with `revision`; its digest is filled in.
@@ -107,10 +101,11 @@ pub(super) fn product(
             product: draft.product.clone(),
             release: draft.release,
             revision,
-            day: draft.day.format("%Y-%m-%d").to_string(),
-            stream: draft.stream,
-            status: draft.status,
-            time_scale: if draft.time_scale.is_empty() { "unknown" } else { &draft.time_scale }.to_owned(),
+            day: day(draft),
+            stream: Stream::Test,
+            status: Status::Quicklook,
+            time_scale: if draft.replay.time_scale.is_empty() { "unknown" } else { &draft.replay.time_scale }
+                .to_owned(),
             start_time_epoch_ns: draft.first_ns,
             stop_time_epoch_ns: draft.last_ns,
             frames: frames(&result.coefficients),
@@ -129,14 +124,14 @@ pub(super) fn product(
         supersedes,
         inputs: draft.inputs.clone(),
         history: draft.history.clone(),
-        losses: draft.losses.clone(),
+        losses: draft.replay.losses.clone(),
         attachments,
     };
     product.header.non_standard_attributes.sha256 = product.digest();
     Ok(product)
 }
 
-/// The last stage that says something has the word: qp-check stands after the filter and has seen its report.
+/// The value of the last stage that reports one: it has seen the earlier reports.
 fn last<T>(draft: &Draft, get: impl Fn(&Report) -> Option<T>) -> Option<T> {
     draft.reports.iter().rev().find_map(get)
 }
@@ -169,7 +164,7 @@ fn quality(draft: &Draft) -> Quality {
             weak_directions.push(direction.clone());
         }
     }
-    let replayed = Some(("replay".to_owned(), draft.counts.clone())).filter(|(_, counts)| !counts.is_empty());
+    let replayed = Some(("replay".to_owned(), draft.replay.counts.clone())).filter(|(_, counts)| !counts.is_empty());
     let reported =
         |report: &Report| (!report.counts.is_empty()).then(|| (report.plugin.clone(), report.counts.clone()));
     let note = |report: &Report| -> Vec<String> {
@@ -183,10 +178,11 @@ fn quality(draft: &Draft) -> Quality {
         commands: last(draft, |report| report.commands.clone()),
         chi2_per_dof: last(draft, |report| report.chi2_per_dof).unwrap_or(f64::NAN),
         nis: last(draft, |report| report.nis).unwrap_or(f64::NAN),
-        data_loss: !draft.losses.is_empty() || draft.reports.iter().any(|report| report.data_loss),
+        data_loss: !draft.replay.losses.is_empty() || draft.reports.iter().any(|report| report.data_loss),
         inconsistent: draft.reports.iter().any(|report| report.inconsistent),
         weak_directions,
         notes: draft
+            .replay
             .notes
             .iter()
             .map(|note| format!("replay: {note}"))

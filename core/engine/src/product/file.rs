@@ -1,10 +1,10 @@
-//! The product file: its layout, its digest, reading and emitting.
+//! The product file: its layout, its digest, reading and emitting. The JSON Schema refuses unknown keys.
 
 use super::ProductError;
 use super::emit::emit;
+use crate::files::{IoContext as _, sha256};
 use dragfree_schema::{Role, Settings};
 use serde::{Deserialize, Serialize};
-use sha2::{Digest, Sha256};
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::LazyLock;
@@ -20,7 +20,6 @@ static SCHEMA: LazyLock<jsonschema::Validator> = LazyLock::new(|| {
 
 /// A product: header blocks after GRACE-FO's Level-1B, then what the run found and how.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Product {
     /// Version of the layout, [`FORMAT_VERSION`].
     pub format_version: String,
@@ -50,7 +49,6 @@ pub struct Product {
 
 /// Header blocks with the names of GRACE-FO's Level-1B files.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Header {
     /// How many of each.
     pub dimensions: Dimensions,
@@ -64,7 +62,6 @@ pub struct Header {
 
 /// How many of each.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Dimensions {
     /// Epochs, used and rejected.
     pub epoch: u64,
@@ -78,7 +75,6 @@ pub struct Dimensions {
 
 /// Attributes of CF and ACDD.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct GlobalAttributes {
     /// `COM1B_2035-01-01_SC1_01_0001`, also the file's name.
     pub id: String,
@@ -108,7 +104,6 @@ pub struct GlobalAttributes {
 
 /// Attributes that CF and ACDD do not know.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct NonStandardAttributes {
     /// Product name, `COM1B`.
     pub product: String,
@@ -162,7 +157,6 @@ pub enum Status {
 
 /// A quantity of the product.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Variable {
     /// Name, as in the result.
     pub name: String,
@@ -178,7 +172,6 @@ pub struct Variable {
 
 /// Model that the estimators used.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Model {
     /// Its revision.
     pub revision: String,
@@ -191,7 +184,6 @@ pub struct Model {
 
 /// What the estimators found.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Outcome {
     /// Epoch of the coefficients, Unix ns of the product's time scale: the end of the window.
     pub epoch_ns: i64,
@@ -206,7 +198,6 @@ pub struct Outcome {
 
 impl Outcome {
     /// The solution to use: the adopted one, else a batch solution, else the first that there is.
-    #[must_use]
     pub fn adopted(&self) -> Vec<&Coefficient> {
         let all = &self.coefficients;
         let of = |role: Role| all.iter().find(|c| c.role == Some(role));
@@ -219,7 +210,6 @@ impl Outcome {
 
 /// One coefficient of one solution.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Coefficient {
     /// `com-offset.tm1.x`.
     pub name: String,
@@ -240,7 +230,6 @@ pub struct Coefficient {
 
 /// A covariance; its units are the products of those of the coefficients.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Covariance {
     /// Coefficients of the rows, n.
     pub names: Vec<String>,
@@ -250,7 +239,6 @@ pub struct Covariance {
 
 /// How far to trust the result.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Quality {
     /// Epochs that entered the result.
     pub epochs_used: u64,
@@ -279,7 +267,6 @@ pub struct Quality {
 
 /// The revision that a product takes the place of.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Supersedes {
     /// Its id.
     pub id: String,
@@ -291,7 +278,6 @@ pub struct Supersedes {
 
 /// A file that was read.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Input {
     /// What it is: `telemetry`, `mission`, `model`, `pipeline` or `state`.
     pub role: String,
@@ -305,7 +291,6 @@ pub struct Input {
 
 /// A plugin that ran.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Stage {
     /// Plugin, `qp-check`.
     pub plugin: String,
@@ -325,7 +310,6 @@ pub struct Stage {
 
 /// Data that were lost.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Loss {
     /// What was lost, `corrupt chunk`.
     pub kind: String,
@@ -337,7 +321,6 @@ pub struct Loss {
 
 /// A file beside the product.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
 pub struct Attachment {
     /// What follows the product's id, `neq.json`.
     pub suffix: String,
@@ -349,7 +332,6 @@ pub struct Attachment {
 
 impl Product {
     /// `COM1B_2035-01-01_SC1_01_0001`.
-    #[must_use]
     pub fn id(&self) -> &str {
         &self.header.global_attributes.id
     }
@@ -359,7 +341,6 @@ impl Product {
     /// Its bytes are the document as JSON without white space, keys sorted, missing numbers `null`; left out are the
     /// creation date, the id and revision, what it supersedes and the digest itself. The same inputs, plugins,
     /// parameters and model therefore give the same digest, whenever and how often they are run.
-    #[must_use]
     pub fn digest(&self) -> String {
         let mut computed = self.clone();
         computed.supersedes = None;
@@ -367,7 +348,7 @@ impl Product {
         computed.header.global_attributes.date_created.clear();
         computed.header.non_standard_attributes.revision = 0;
         computed.header.non_standard_attributes.sha256.clear();
-        hexadecimal(&Sha256::digest(computed.canonical()))
+        sha256(computed.canonical())
     }
 
     /// The whole document as JSON without white space, keys sorted.
@@ -394,7 +375,7 @@ impl Product {
 /// # Errors
 /// [`ProductError`]: the file cannot be read, is no product, is from a later version or was changed.
 pub fn read(path: &Path) -> Result<Product, ProductError> {
-    let text = std::fs::read_to_string(path).map_err(ProductError::io("read", path))?;
+    let text = std::fs::read_to_string(path).at("read", path)?;
     let product = parse(&text, path)?;
     if path.file_stem().is_none_or(|stem| stem != product.id()) {
         return Err(ProductError::Damaged {
@@ -432,14 +413,5 @@ fn check(id: &str, document: &serde_json::Value) -> Result<(), ProductError> {
         id: id.to_owned(),
         at: error.instance_path().to_string(),
         reason: error.to_string(),
-    })
-}
-
-/// Lower-case hexadecimal.
-pub(super) fn hexadecimal(bytes: &[u8]) -> String {
-    use std::fmt::Write as _;
-    bytes.iter().fold(String::with_capacity(2 * bytes.len()), |mut text, byte| {
-        let _ = write!(text, "{byte:02x}"); // writing to a String cannot fail
-        text
     })
 }

@@ -5,7 +5,6 @@ use serde_json::{Map, Value, json};
 use std::path::Path;
 
 /// The product that lies at `path`; a missing number is `null`.
-#[must_use]
 pub fn to_json(product: &Product, path: &Path) -> Value {
     let attributes = &product.header.non_standard_attributes;
     let quality = &product.quality;

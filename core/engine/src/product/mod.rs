@@ -13,7 +13,7 @@ mod file;
 mod json;
 
 pub(crate) use archive::SOURCES;
-pub use archive::{Entry, Listing, Problem, ProductWriter, Written, find, list};
+pub use archive::{Entry, Listing, ProductWriter, Written, find, list};
 pub use draft::Draft;
 pub use file::{
     Attachment, Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Loss, Model,
@@ -21,116 +21,48 @@ pub use file::{
 };
 pub use json::to_json;
 
+use crate::files::IoError;
 use std::path::PathBuf;
 
 /// Why a product could not be made, written or read.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum ProductError {
     /// The operating system refused something.
-    #[error("cannot {action} {}: {source}", path.display())]
-    Io {
-        /// What was tried, "write".
-        action: &'static str,
-        /// File or folder.
-        path: PathBuf,
-        /// The system's reason.
-        source: std::io::Error,
-    },
+    #[error(transparent)]
+    Io(#[from] IoError),
     /// Two stages, or one stage twice, want to write the same file beside the product.
     #[error("stage {stage} attaches {suffix:?}, but {reason}; rename the attachment in the plugin")]
-    Attachment {
-        /// Stage.
-        stage: String,
-        /// Suffix asked for.
-        suffix: String,
-        /// Why not.
-        reason: &'static str,
-    },
+    Attachment { stage: String, suffix: String, reason: &'static str },
     /// A part of the product's name holds a character that would break the name apart.
     #[error(
         "{what} {value:?} cannot stand in a file name: only letters, digits and '-' may; change it in the {place} file"
     )]
-    Name {
-        /// Which part.
-        what: &'static str,
-        /// Its value.
-        value: String,
-        /// Where it is set.
-        place: &'static str,
-    },
-    /// A time outside what dates can hold.
-    #[error("time {0} ns is beyond the calendar")]
-    Time(i64),
+    Name { what: &'static str, value: String, place: &'static str },
     /// The document breaks the schema.
     #[error("product {id} breaks its schema at {at}: {reason}")]
-    Schema {
-        /// Product.
-        id: String,
-        /// JSON pointer of the offending value, `/result/coefficients/0/sigma`.
-        at: String,
-        /// What is wrong there.
-        reason: String,
-    },
+    Schema { id: String, at: String, reason: String },
     /// The file is no TOML.
     #[error("{} is no product: {source}", path.display())]
-    Parse {
-        /// File.
-        path: PathBuf,
-        /// Where the text goes wrong.
-        source: Box<toml::de::Error>,
-    },
+    Parse { path: PathBuf, source: Box<toml::de::Error> },
     /// The product cannot be expressed in TOML.
     #[error("product {id} cannot be written as TOML: {source}")]
-    Emit {
-        /// Product.
-        id: String,
-        /// Why.
-        source: toml::ser::Error,
-    },
+    Emit { id: String, source: toml::ser::Error },
     /// The file was changed after it was archived, or did not survive being written.
     #[error("{} is damaged: {reason}; restore it from a copy, or run the day again", path.display())]
-    Damaged {
-        /// File.
-        path: PathBuf,
-        /// What does not fit.
-        reason: String,
-    },
+    Damaged { path: PathBuf, reason: String },
     /// The file was written by a later program.
     #[error("{} has format version {found}, this program reads {FORMAT_VERSION}; use a newer dragfree", path.display())]
-    Format {
-        /// File.
-        path: PathBuf,
-        /// Version found.
-        found: String,
-    },
+    Format { path: PathBuf, found: String },
     /// No such product.
     #[error("no product {id} in {}; `dragfree products list` shows what there is", folder.display())]
-    NotFound {
-        /// Name asked for.
-        id: String,
-        /// Archive.
-        folder: PathBuf,
-    },
+    NotFound { id: String, folder: PathBuf },
     /// A day alone does not say which product is meant.
     #[error("{} has several products of {day}: name one of {stems}", folder.display())]
-    Several {
-        /// Day asked for.
-        day: String,
-        /// Archive.
-        folder: PathBuf,
-        /// Ids without revision, by comma.
-        stems: String,
-    },
+    Several { day: String, folder: PathBuf, stems: String },
     /// All revisions of that day are used up.
     #[error("all 9999 revisions of {0} are taken; raise the release in the pipeline file")]
     Full(String),
-}
-
-impl ProductError {
-    fn io(action: &'static str, path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
-        let path = path.into();
-        move |source| Self::Io { action, path, source }
-    }
 }
 
 #[cfg(test)]

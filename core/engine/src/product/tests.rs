@@ -1,5 +1,6 @@
 use super::*;
-use chrono::{DateTime, NaiveDate, Utc};
+use crate::feed::Summary;
+use chrono::{DateTime, Utc};
 use dragfree_schema::Report;
 use proptest::prelude::*;
 use serde_json::{Value, json};
@@ -44,12 +45,8 @@ fn draft(value: f64) -> Draft {
         release: 1,
         mission: "Taiji".into(),
         spacecraft: "SC1".into(),
-        day: NaiveDate::from_ymd_opt(2035, 1, 1).expect("a day"),
         first_ns: 2_051_222_400_000_000_000,
         last_ns: 2_051_222_409_900_000_000,
-        time_scale: "UTC".into(),
-        stream: Stream::Test,
-        status: Status::Quicklook,
         inputs: vec![Input { role: "telemetry".into(), name: "a.mcap".into(), size: 7, sha256: ZERO_DIGEST.into() }],
         history: vec![Stage {
             plugin: "qp-check".into(),
@@ -62,9 +59,12 @@ fn draft(value: f64) -> Draft {
         }],
         model: Model { revision: "1".into(), parent: None, effects: vec!["com-offset".into()] },
         software: "0.1.0".into(),
-        losses: Vec::new(),
-        counts: BTreeMap::from([("gaps".into(), 2)]),
-        notes: vec!["a topic is not in the interface".into()],
+        replay: Summary {
+            time_scale: "UTC".into(),
+            counts: BTreeMap::from([("gaps".into(), 2)]),
+            notes: vec!["a topic is not in the interface".into()],
+            ..Summary::default()
+        },
         reports: vec![
             report(json!({"plugin": "es-akf", "nis": 0.99, "epochs_used": 100, "verdict": null})),
             report(qp_report(value)),
@@ -109,9 +109,9 @@ fn a_failed_last_step_leaves_nothing() {
     let folder = tempfile::tempdir().expect("folder");
     let mut writer = ProductWriter::begin(folder.path()).expect("begin");
     std::fs::write(writer.staged_unlisted("sources.json"), "{}").expect("written");
-    let refused = ProductError::Time(7);
+    let refused = ProductError::Full("test".into());
     let error = writer.commit_with(&draft(0.0909), || Err(refused)).expect_err("the last step failed");
-    assert!(matches!(error, ProductError::Time(7)), "{error}");
+    assert!(matches!(error, ProductError::Full(_)), "{error}");
     assert_eq!(visible(folder.path()), Vec::<String>::new());
     let mut writer = ProductWriter::begin(folder.path()).expect("begin");
     std::fs::write(writer.staged_unlisted("sources.json"), "{}").expect("written");
@@ -264,7 +264,7 @@ fn a_claim_or_a_file_left_by_a_killed_writer_costs_a_revision_and_nothing_else()
 fn a_failed_commit_leaves_nothing() {
     let folder = tempfile::tempdir().expect("folder");
     let mut bad = draft(0.0909);
-    bad.time_scale = "Mars".into();
+    bad.replay.time_scale = "Mars".into();
     let error = ProductWriter::begin(folder.path()).expect("begin").commit(&bad).expect_err("no such time scale");
     let said = error.to_string();
     assert!(said.contains("/header/non_standard_attributes/time_scale") && said.contains("Mars"), "{said}");

@@ -78,10 +78,10 @@ pub(super) fn drain(blocks: &mut Vec<Block>, until_ns: i64, columns: usize, topi
         block.next = row;
     }
     blocks.retain(|b| b.head().is_some());
-    losses.add(Finding::Duplicate, duplicates, topic, || {
+    losses.add(Finding::DuplicateMessages, duplicates, topic, || {
         format!("{topic}: messages that were there already were dropped")
     });
-    losses.add(Finding::Conflict, conflicts, topic, || {
+    losses.add(Finding::ConflictingMessages, conflicts, topic, || {
         format!("{topic}: messages of one time with different values; the first in the order of the files was kept")
     });
     batch

@@ -1,92 +1,72 @@
-//! What a replay met that is not sound data: counted by kind, told in words, never skipped silently.
+//! Defects that a replay finds in its data: counted by kind, described, never skipped silently.
 
 use std::collections::{BTreeMap, BTreeSet};
+
+use serde::Serialize;
 
 use crate::product::Loss;
 
 /// Sentences kept of each kind; the counts go on.
 const MESSAGES_PER_KIND: usize = 8;
 
-/// One kind of finding.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+/// One kind of finding; its name is the key of the count in a product.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Finding {
     /// A file that ends before its end: cut, or still being written.
-    TruncatedFile,
+    TruncatedFiles,
     /// A file without a byte.
-    EmptyFile,
+    EmptyFiles,
     /// A chunk whose CRC, compression or size is wrong; all its messages are lost.
-    CorruptChunk,
+    CorruptChunks,
     /// A record that makes no sense where it stands; what it held is lost.
-    DamagedRecord,
+    DamagedRecords,
     /// A message that is not what its schema says; lost.
-    MalformedMessage,
+    MalformedMessages,
     /// A message on a channel that the file does not define; lost.
-    UnknownChannel,
+    MessagesOfUnknownChannels,
     /// A message before 1980 or after 2200; dropped.
-    TimeOutOfRange,
+    TimesOutOfRange,
     /// A message earlier than its file's index says, found too late to be put in order; lost.
-    LateMessage,
+    LateMessages,
     /// A message of a time at which its topic already has other values; the first in the order of the files counts.
-    Conflict,
+    ConflictingMessages,
     /// A message that repeats one of the same topic, time and values; dropped.
-    Duplicate,
+    DuplicateMessages,
     /// A message with an earlier time than the one before it on its channel; put in order.
-    Backwards,
+    BackwardTimes,
     /// A transmitted value that is NaN or infinite; passed on.
-    NonFinite,
+    NonFiniteValues,
     /// A message of a topic that is not in the interface; not read.
-    UnknownTopic,
+    MessagesOfUnknownTopics,
     /// A message of `/truth`, which a calibration must not see; not read.
-    Truth,
+    TruthMessages,
     /// A field that cannot be a column (repeated, text, 64-bit integers), per channel; not read.
-    IgnoredField,
+    IgnoredFields,
     /// A housekeeping channel that does not state its unit.
-    MissingUnit,
+    MissingUnits,
     /// A file without a `dragfree` metadata record, so nobody knows whose it is.
-    MissingMetadata,
+    FilesWithoutMetadata,
     /// A chunk written without a CRC.
-    UncheckedChunk,
+    ChunksWithoutCrc,
     /// A file without a usable summary; its channels were found by reading all of it.
-    NoSummary,
+    FilesWithoutSummary,
     /// A file without a message.
-    NoMessages,
+    FilesWithoutMessages,
     /// A topic of the interface that is defined and has no message in any file; it makes no table.
-    EmptyTopic,
+    TopicsWithoutMessages,
 }
 
 impl Finding {
-    /// Key of the count in a product.
-    #[must_use]
-    pub fn key(self) -> &'static str {
-        match self {
-            Self::TruncatedFile => "truncated_files",
-            Self::EmptyFile => "empty_files",
-            Self::CorruptChunk => "corrupt_chunks",
-            Self::DamagedRecord => "damaged_records",
-            Self::MalformedMessage => "malformed_messages",
-            Self::UnknownChannel => "messages_of_unknown_channels",
-            Self::TimeOutOfRange => "times_out_of_range",
-            Self::LateMessage => "late_messages",
-            Self::Conflict => "conflicting_messages",
-            Self::Duplicate => "duplicate_messages",
-            Self::Backwards => "backward_times",
-            Self::NonFinite => "non_finite_values",
-            Self::UnknownTopic => "messages_of_unknown_topics",
-            Self::Truth => "truth_messages",
-            Self::IgnoredField => "ignored_fields",
-            Self::MissingUnit => "missing_units",
-            Self::MissingMetadata => "files_without_metadata",
-            Self::UncheckedChunk => "chunks_without_crc",
-            Self::NoSummary => "files_without_summary",
-            Self::NoMessages => "files_without_messages",
-            Self::EmptyTopic => "topics_without_messages",
-        }
-    }
-
     /// True where data were there and are not in the tables.
-    #[must_use]
     pub fn is_loss(self) -> bool {
-        self <= Self::LateMessage
+        self <= Self::LateMessages
+    }
+}
+
+impl std::fmt::Display for Finding {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.serialize(f)
     }
 }
 
@@ -101,24 +81,21 @@ pub struct Losses {
 
 impl Losses {
     /// How often `finding` was met.
-    #[must_use]
     pub fn count(&self, finding: Finding) -> u64 {
         self.counts.get(&finding).copied().unwrap_or(0)
     }
 
     /// Everything met, by the key of its kind.
-    #[must_use]
     pub fn counts(&self) -> BTreeMap<String, u64> {
-        self.counts.iter().map(|(finding, &count)| (finding.key().to_owned(), count)).collect()
+        self.counts.iter().map(|(finding, &count)| (finding.to_string(), count)).collect()
     }
 
     /// What was lost, as a product states it.
-    #[must_use]
     pub fn entries(&self) -> Vec<Loss> {
         let of = |finding| self.messages.iter().filter(move |(f, _)| *f == finding).map(|(_, text)| text.as_str());
         let lost = self.counts.iter().filter(|(finding, _)| finding.is_loss());
         lost.map(|(&finding, &count)| Loss {
-            kind: finding.key().to_owned(),
+            kind: finding.to_string(),
             count,
             detail: of(finding).collect::<Vec<_>>().join("; "),
         })
@@ -126,13 +103,11 @@ impl Losses {
     }
 
     /// What was odd and cost no data, in the order of its finding: the first sentences of each kind.
-    #[must_use]
     pub fn notes(&self) -> Vec<String> {
         self.messages.iter().filter(|(finding, _)| !finding.is_loss()).map(|(_, text)| text.clone()).collect()
     }
 
     /// True when data were lost.
-    #[must_use]
     pub fn data_loss(&self) -> bool {
         self.counts.keys().any(|f| f.is_loss())
     }

@@ -6,7 +6,6 @@
 //! holds the pieces of files that overlap the present stretch, never a file.
 
 mod block;
-pub mod fuzz;
 mod inflate;
 mod losses;
 mod reader;
@@ -16,22 +15,19 @@ mod tables;
 #[cfg(test)]
 mod tests;
 
-use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{self, Read};
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
 use std::ops::Range;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::{self, JoinHandle};
-
-use sha2::{Digest as _, Sha256};
 
 pub use losses::{Finding, Losses};
 
 use crate::table::{Chunk, TableSpec};
 use crate::telemetry::{Drift, LayoutError};
 use reader::{OpenFile, Reader, SANE_NS, clamp_ns, is_sane};
-use scan::{Scan, ScanError, Source, scan};
+use scan::{Scan, ScanError, scan};
 
 /// Stretches decoded ahead on the second thread.
 const AHEAD: usize = 2;
@@ -77,36 +73,17 @@ pub enum ReplayError {
     Worker,
 }
 
-/// One input, as a product cites it.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct InputFile {
-    /// Path as given.
-    pub path: PathBuf,
-    /// Size, bytes.
-    pub bytes: u64,
-    /// First log time that its chunks state, Unix ns; `None` without messages.
-    pub first_ns: Option<i64>,
-    /// Last log time that its chunks state, Unix ns.
-    pub last_ns: Option<i64>,
-}
-
 /// Whose data these are and from when.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct ReplayInfo {
     /// `UTC`, `TAI` or `GPS`; empty when no file says.
     pub time_scale: String,
-    /// Mission; empty when no file says.
-    pub mission: String,
     /// Spacecraft; empty when no file says.
     pub spacecraft: String,
     /// First log time of all files that the chunks state, Unix ns, before any window.
     pub first_ns: Option<i64>,
     /// Last log time of all files that the chunks state, Unix ns.
     pub last_ns: Option<i64>,
-    /// The files, in order of time.
-    pub files: Vec<InputFile>,
-    /// Every topic that a file defines, read or not.
-    pub topics: Vec<String>,
 }
 
 /// A replay under way.
@@ -135,33 +112,30 @@ impl Replay {
     /// # Errors
     /// [`ReplayError`] when a file cannot be read at all or does not fit the others or the interface.
     pub fn open(files: &[PathBuf], window_ns: Option<Range<i64>>, threads: usize) -> Result<Self, ReplayError> {
-        Self::from_sources(files.iter().cloned().map(Source::Path).collect(), window_ns, threads)
-    }
-
-    fn from_sources(sources: Vec<Source>, window_ns: Option<Range<i64>>, threads: usize) -> Result<Self, ReplayError> {
-        if sources.is_empty() {
+        if files.is_empty() {
             return Err(ReplayError::NoFiles);
         }
         let mut losses = Losses::default();
-        let mut files = Vec::with_capacity(sources.len());
-        for source in sources {
-            let path = source.path().to_owned();
-            let scan = scan(&source, &mut losses).map_err(|error| match error {
-                ScanError::Io(source) => ReplayError::Io { path, source },
-                ScanError::NotMcap => ReplayError::NotMcap { path },
-            })?;
-            files.push((source, scan));
+        let mut scans = Vec::with_capacity(files.len());
+        for path in files.iter().cloned() {
+            match scan(&path, &mut losses) {
+                Ok(scan) => scans.push((path, scan)),
+                Err(ScanError::Io(source)) => return Err(ReplayError::Io { path, source }),
+                Err(ScanError::NotMcap) => return Err(ReplayError::NotMcap { path }),
+            }
         }
-        files.sort_by_cached_key(|(source, scan)| (times(scan).map(|t| t.0), source.path().to_owned()));
+        let mut files = scans;
+        files.sort_by_cached_key(|(path, scan)| (times(scan).map(|t| t.0), path.clone()));
         let info = info(&files, &mut losses)?;
-        let views: Vec<(&Path, &Scan)> = files.iter().map(|(source, scan)| (source.path(), scan)).collect();
-        let (tables, routes) = tables::link(&views, &mut losses)?;
+        let (tables, routes) = tables::link(&files, &mut losses)?;
         // Files that ended before their first channel are a loss, not the wrong files.
         if tables.is_empty() && !losses.data_loss() {
-            return Err(ReplayError::NoTelemetry { found: info.topics.join(", ") });
+            let channels = files.iter().flat_map(|(_, scan)| scan.definitions.channels.values());
+            let topics: BTreeSet<&str> = channels.map(|channel| channel.topic.as_str()).collect();
+            return Err(ReplayError::NoTelemetry { found: Vec::from_iter(topics).join(", ") });
         }
         let files = (files.into_iter().zip(routes))
-            .map(|((source, scan), routes)| OpenFile { source, pieces: scan.pieces, routes })
+            .map(|((path, scan), routes)| OpenFile { path, pieces: scan.pieces, routes })
             .collect();
         let reader = Reader::new(files, tables.clone(), window_ns.unwrap_or(SANE_NS), losses.clone())?;
         let engine = if threads < 2 { Engine::Here(Box::new(reader)) } else { ahead(reader) };
@@ -170,13 +144,11 @@ impl Replay {
 
     /// The tables, in the order of the interface, housekeeping last by name. A table that is not here is a topic that
     /// no file has.
-    #[must_use]
     pub fn tables(&self) -> &[TableSpec] {
         &self.tables
     }
 
     /// Whose data these are and from when.
-    #[must_use]
     pub fn info(&self) -> &ReplayInfo {
         &self.info
     }
@@ -200,7 +172,6 @@ impl Replay {
     }
 
     /// What was met until the last stretch delivered; complete when [`Replay::next`] has said `None`.
-    #[must_use]
     pub fn losses(&self) -> &Losses {
         &self.losses
     }
@@ -235,28 +206,17 @@ fn times(scan: &Scan) -> Option<(i64, i64)> {
     stated.map(|t| (t, t)).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
 }
 
-fn info(files: &[(Source, Scan)], losses: &mut Losses) -> Result<ReplayInfo, ReplayError> {
+fn info(files: &[(PathBuf, Scan)], losses: &mut Losses) -> Result<ReplayInfo, ReplayError> {
     let mut info = ReplayInfo::default();
     let mut said: BTreeMap<&'static str, String> = BTreeMap::new();
-    for (source, scan) in files {
-        let path = source.path().to_owned();
+    for (path, scan) in files {
+        let path = path.clone();
         let name = path.display().to_string();
-        for channel in scan.definitions.channels.values() {
-            if !info.topics.contains(&channel.topic) {
-                info.topics.push(channel.topic.clone());
-            }
-        }
         let times = times(scan);
         info.first_ns = info.first_ns.into_iter().chain(times.map(|t| t.0)).min();
         info.last_ns = info.last_ns.into_iter().chain(times.map(|t| t.1)).max();
-        info.files.push(InputFile {
-            path: path.clone(),
-            bytes: scan.bytes,
-            first_ns: times.map(|t| t.0),
-            last_ns: times.map(|t| t.1),
-        });
         let Some(metadata) = &scan.metadata else {
-            losses.add(Finding::MissingMetadata, u64::from(scan.bytes > 0), &name, || {
+            losses.add(Finding::FilesWithoutMetadata, u64::from(scan.bytes > 0), &name, || {
                 format!("{name} has no metadata record \"dragfree\": its spacecraft and time scale are taken on trust")
             });
             continue;
@@ -272,25 +232,7 @@ fn info(files: &[(Source, Scan)], losses: &mut Losses) -> Result<ReplayInfo, Rep
             }
         }
     }
-    info.topics.sort();
     let mut take = |key| said.remove(key).unwrap_or_default();
-    (info.time_scale, info.mission, info.spacecraft) = (take("time_scale"), take("mission"), take("spacecraft"));
+    (info.time_scale, info.spacecraft) = (take("time_scale"), take("spacecraft"));
     Ok(info)
-}
-
-/// SHA-256 of a file, in hexadecimal: a pass of its own over all bytes.
-///
-/// # Errors
-/// What the system says when the file cannot be read.
-pub fn sha256(path: &Path) -> io::Result<String> {
-    let mut file = File::open(path)?;
-    let mut hasher = Sha256::new();
-    let mut buffer = vec![0; 1 << 18];
-    loop {
-        match file.read(&mut buffer)? {
-            0 => break,
-            count => hasher.update(&buffer[..count]),
-        }
-    }
-    Ok(hasher.finalize().iter().map(|byte| format!("{byte:02x}")).collect())
 }

@@ -1,6 +1,7 @@
 //! From pieces of files to stretches of time.
 
 use std::collections::BTreeMap;
+use std::fs::File;
 use std::ops::Range;
 use std::path::PathBuf;
 
@@ -11,7 +12,6 @@ use super::block::{Block, drain};
 use super::inflate::{InflateError, Inflater, Piece, Stored};
 use super::losses::{Finding, Losses};
 use super::records::{Cursor, Message};
-use super::scan::Source;
 use super::tables::{Route, Routes};
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{Cells, Decoder, WireError};
@@ -48,7 +48,7 @@ type Key = (i64, usize, u64);
 /// A file ready to be read.
 #[derive(Debug)]
 pub(super) struct OpenFile {
-    pub(super) source: Source,
+    pub(super) path: PathBuf,
     pub(super) pieces: Vec<Piece>,
     pub(super) routes: Routes,
 }
@@ -64,7 +64,7 @@ struct Entry {
 /// Reads the pieces of all files in order of time.
 #[derive(Debug)]
 pub(super) struct Reader {
-    files: Vec<(Source, Routes)>,
+    files: Vec<(PathBuf, Routes)>,
     tables: Vec<TableSpec>,
     queue: BTreeMap<Key, Pending>,
     /// Rows read and not yet delivered, by table.
@@ -88,7 +88,7 @@ impl Reader {
     ) -> Result<Self, ReplayError> {
         let inflater = Inflater::new().map_err(|source| ReplayError::Io { path: PathBuf::from("zstd"), source })?;
         let mut queue = BTreeMap::new();
-        let mut sources = Vec::with_capacity(files.len());
+        let mut opened = Vec::with_capacity(files.len());
         let mut end_ns = i64::MIN;
         for (at, file) in files.into_iter().enumerate() {
             for piece in file.pieces {
@@ -102,22 +102,11 @@ impl Reader {
                     queue.insert((start, at, piece.offset), Pending { piece, from_ns: i64::MIN });
                 }
             }
-            sources.push((file.source, file.routes));
+            opened.push((file.path, file.routes));
         }
         let blocks = tables.iter().map(|_| vec![]).collect();
         let done_ns = i64::MIN;
-        Ok(Self {
-            files: sources,
-            tables,
-            queue,
-            blocks,
-            window_ns,
-            end_ns,
-            done_ns,
-            inflater,
-            entries: vec![],
-            losses,
-        })
+        Ok(Self { files: opened, tables, queue, blocks, window_ns, end_ns, done_ns, inflater, entries: vec![], losses })
     }
 
     pub(super) fn losses(&self) -> &Losses {
@@ -150,16 +139,16 @@ impl Reader {
     /// Reads the rows of a piece that lie between what was delivered and the horizon.
     fn read(&mut self, file: usize, pending: Pending, until_ns: i64) -> Result<(), ReplayError> {
         let horizon_ns = until_ns.saturating_add(HORIZON);
-        let (source, routes) = &mut self.files[file];
-        let name = source.path().display().to_string();
+        let (path, routes) = &mut self.files[file];
+        let name = path.display().to_string();
         let piece = &pending.piece;
-        let io = |error| ReplayError::Io { path: source.path().to_owned(), source: error };
-        let mut opened = source.open().map_err(io)?;
+        let io = |source| ReplayError::Io { path: path.clone(), source };
+        let mut opened = File::open(&*path).map_err(io)?;
         let records = match self.inflater.read(&mut opened, piece) {
             Ok(records) => records,
             Err(InflateError::Io(error)) => return Err(io(error)),
             Err(InflateError::Corrupt(why)) => {
-                self.losses.add(Finding::CorruptChunk, 1, &format!("{name}@{}", piece.offset), || {
+                self.losses.add(Finding::CorruptChunks, 1, &format!("{name}@{}", piece.offset), || {
                     format!(
                         "{name}: the chunk at byte {} is corrupt ({why}); its messages from {} to {} ns are lost; fetch the file again",
                         piece.offset, piece.start, piece.end
@@ -170,7 +159,7 @@ impl Reader {
         };
         let first_time = pending.from_ns == i64::MIN;
         if first_time && matches!(&piece.stored, Stored::Chunk { crc: 0, .. }) {
-            self.losses.add(Finding::UncheckedChunk, 1, &name, || {
+            self.losses.add(Finding::ChunksWithoutCrc, 1, &name, || {
                 format!("{name} has chunks without a CRC; damage goes unseen")
             });
         }
@@ -186,12 +175,12 @@ impl Reader {
         for entries in self.entries.chunk_by(|a, b| a.channel == b.channel) {
             let (channel, count) = (entries[0].channel, entries.len());
             match routes.get_mut(&channel) {
-                None => self.losses.add(Finding::UnknownChannel, count as u64, &format!("{name}#{channel}"), || {
+                None => self.losses.add(Finding::MessagesOfUnknownChannels, count as u64, &format!("{name}#{channel}"), || {
                     format!("{name}: {count} messages are of channel {channel}, which the file does not define; they are lost")
                 }),
                 Some(Route::Nowhere { finding, topic }) => {
                     let why = match finding {
-                        Finding::Truth => "it is the truth of a simulation and no calibration may read it",
+                        Finding::TruthMessages => "it is the truth of a simulation and no calibration may read it",
                         _ => "it is not in telemetry.proto; housekeeping belongs under /hk/",
                     };
                     self.losses.add(*finding, count as u64, topic, || format!("{name}: topic {topic} is not read: {why}"));
@@ -200,11 +189,11 @@ impl Reader {
                     let spec = &self.tables[*table];
                     let rows = decode(entries, records, decoder, spec.columns.len());
                     let topic = &spec.name;
-                    self.losses.add(Finding::NonFinite, rows.non_finite, topic, || {
+                    self.losses.add(Finding::NonFiniteValues, rows.non_finite, topic, || {
                         format!("{name}: topic /{topic} has values that are NaN or infinite; they are passed on")
                     });
                     if let Some(error) = rows.error {
-                        self.losses.add(Finding::MalformedMessage, (count - rows.times.len()) as u64, topic, || {
+                        self.losses.add(Finding::MalformedMessages, (count - rows.times.len()) as u64, topic, || {
                             format!("{name}: messages of topic /{topic} contradict their schema ({error}) and are lost")
                         });
                     }
@@ -275,8 +264,9 @@ fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, 
             Ok(Some(record)) => record,
             Ok(None) => break,
             Err(_) => {
-                losses
-                    .add(Finding::DamagedRecord, 1, name, || format!("{name}: a chunk ends in the middle of a record"));
+                losses.add(Finding::DamagedRecords, 1, name, || {
+                    format!("{name}: a chunk ends in the middle of a record")
+                });
                 break;
             }
         };
@@ -285,7 +275,7 @@ fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, 
         }
         let end = records.len() - cursor.0.len();
         let Ok(message) = Message::parse(body) else {
-            losses.add(Finding::DamagedRecord, 1, name, || format!("{name}: a message is shorter than its header"));
+            losses.add(Finding::DamagedRecords, 1, name, || format!("{name}: a message is shorter than its header"));
             continue;
         };
         let time_ns = i64::try_from(message.log_time).unwrap_or(i64::MAX);
@@ -306,13 +296,13 @@ fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, 
             entries.push(Entry { channel: message.channel, time_ns, data: end - message.data.len()..end });
         }
     }
-    losses.add(Finding::TimeOutOfRange, insane, name, || {
+    losses.add(Finding::TimesOutOfRange, insane, name, || {
         format!("{name}: messages are dated before 1980 or after 2200 and were dropped")
     });
-    losses.add(Finding::Backwards, backwards, name, || {
+    losses.add(Finding::BackwardTimes, backwards, name, || {
         format!("{name}: log times run backwards; they were put in order")
     });
-    losses.add(Finding::LateMessage, late, name, || {
+    losses.add(Finding::LateMessages, late, name, || {
         format!("{name}: messages lie outside the times that their chunk states and came too late to be put in order; they are lost")
     });
     later

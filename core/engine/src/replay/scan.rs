@@ -7,9 +7,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
-use std::io::{self, BufReader, Cursor as Bytes, Read, Seek, SeekFrom};
-use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::io::{self, BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
 
 use mcap::MAGIC;
 use mcap::records::op;
@@ -27,33 +26,6 @@ const LOOSE_BYTES: u64 = 1 << 20;
 const MAX_DEFINITION: u64 = 1 << 26;
 /// Buffer of the walk: a chunk's header and the message indexes before the next one.
 const WALK_BUFFER: usize = 1 << 13;
-
-pub(super) trait ReadSeek: Read + Seek + Send {}
-impl<T: Read + Seek + Send> ReadSeek for T {}
-
-/// Where the bytes of a file are.
-#[derive(Clone, Debug)]
-pub(super) enum Source {
-    /// On disk.
-    Path(PathBuf),
-    /// In memory, under a name: for tests and fuzzing.
-    Memory(PathBuf, Arc<[u8]>),
-}
-
-impl Source {
-    pub(super) fn path(&self) -> &Path {
-        match self {
-            Self::Path(path) | Self::Memory(path, _) => path,
-        }
-    }
-
-    pub(super) fn open(&self) -> io::Result<Box<dyn ReadSeek>> {
-        Ok(match self {
-            Self::Path(path) => Box::new(File::open(path)?),
-            Self::Memory(_, bytes) => Box::new(Bytes::new(Arc::clone(bytes))),
-        })
-    }
-}
 
 /// What a file defines.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -103,13 +75,13 @@ impl From<io::Error> for ScanError {
 }
 
 /// Scans one file; what is wrong with it goes to `losses`.
-pub(super) fn scan(source: &Source, losses: &mut Losses) -> Result<Scan, ScanError> {
-    let name = source.path().display().to_string();
-    let mut file = source.open()?;
+pub(super) fn scan(path: &Path, losses: &mut Losses) -> Result<Scan, ScanError> {
+    let name = path.display().to_string();
+    let mut file = File::open(path)?;
     let bytes = file.seek(SeekFrom::End(0))?;
     let mut scan = Scan { bytes, ..Scan::default() };
     if bytes == 0 {
-        losses.add(Finding::EmptyFile, 1, &name, || format!("{name} is empty; nothing was read from it"));
+        losses.add(Finding::EmptyFiles, 1, &name, || format!("{name} is empty; nothing was read from it"));
         return Ok(scan);
     }
     let mut magic = Vec::new();
@@ -130,13 +102,13 @@ pub(super) fn scan(source: &Source, losses: &mut Losses) -> Result<Scan, ScanErr
         scan.definitions.channels.entry(id).or_insert(channel);
     }
     if !complete && !scan.pieces.is_empty() {
-        losses.add(Finding::NoSummary, 1, &name, || {
+        losses.add(Finding::FilesWithoutSummary, 1, &name, || {
             format!("{name} has no complete summary; it was read twice. `mcap recover` writes one")
         });
     }
     inspect(&mut file, &mut scan, &doubtful, &name, losses)?;
     if scan.pieces.is_empty() {
-        losses.add(Finding::NoMessages, 1, &name, || format!("{name} holds no messages"));
+        losses.add(Finding::FilesWithoutMessages, 1, &name, || format!("{name} holds no messages"));
     }
     Ok(scan)
 }
@@ -164,7 +136,7 @@ fn doubtful(pieces: &[Piece], index: &[ChunkIndex], complete: bool) -> Vec<usize
 /// Reads the chunks at `which` for their definitions and their true range of times. A corrupt one is left for the
 /// reader to report.
 fn inspect(
-    file: &mut Box<dyn ReadSeek>,
+    file: &mut File,
     scan: &mut Scan,
     which: &[usize],
     name: &str,
@@ -190,7 +162,7 @@ fn inspect(
                     end = end.max(message.log_time);
                 }
             } else if !scan.definitions.take(code, body) {
-                losses.add(Finding::DamagedRecord, 1, name, || {
+                losses.add(Finding::DamagedRecords, 1, name, || {
                     format!("{name}: a schema or channel contradicts another")
                 });
             }
@@ -212,7 +184,7 @@ struct Summary {
 }
 
 /// Reads the summary; an unreadable one is as good as none.
-fn summary(file: &mut Box<dyn ReadSeek>, bytes: u64) -> io::Result<Summary> {
+fn summary(file: &mut File, bytes: u64) -> io::Result<Summary> {
     const TAIL: usize = RECORD_HEADER + FOOTER + MAGIC.len();
     let none = Ok(Summary::default());
     let Some(footer_at) = bytes.checked_sub(TAIL as u64) else { return none };
@@ -269,7 +241,7 @@ struct Walk<'a> {
 }
 
 impl Walk<'_> {
-    fn run(&mut self, file: &mut Box<dyn ReadSeek>) -> io::Result<()> {
+    fn run(&mut self, file: &mut File) -> io::Result<()> {
         let mut known: Vec<u64> = self.index.iter().map(|i| i.offset).collect();
         known.sort_unstable();
         let mut reader = BufReader::with_capacity(WALK_BUFFER, file);
@@ -392,14 +364,14 @@ impl Walk<'_> {
 
     fn cut(&mut self, at: u64) {
         let (name, lost) = (self.name, self.bytes.saturating_sub(at));
-        self.losses.add(Finding::TruncatedFile, 1, name, || {
+        self.losses.add(Finding::TruncatedFiles, 1, name, || {
             format!("{name} ends in the middle: its last {lost} bytes are no whole record and what followed is lost; fetch it again")
         });
     }
 
     fn damaged(&mut self, at: u64, to: u64, why: &str) {
         let name = self.name;
-        self.losses.add(Finding::DamagedRecord, 1, name, || {
+        self.losses.add(Finding::DamagedRecords, 1, name, || {
             format!(
                 "{name}: the record at byte {at} is damaged ({why}); bytes {at} to {to} are lost; fetch the file again"
             )

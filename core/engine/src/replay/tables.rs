@@ -1,13 +1,13 @@
 //! Tables of a replay: the union of what its files hold, and the way of each channel into them.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::ReplayError;
 use super::losses::{Finding, Losses};
 use super::scan::Scan;
 use crate::table::TableSpec;
-use crate::telemetry::{self, Decoder, Layout, Topic};
+use crate::telemetry::{self, Decoder, Layout};
 
 /// Where the messages of a channel go.
 #[derive(Clone, Debug)]
@@ -33,17 +33,17 @@ struct Feed {
 
 /// The tables of `files`, in the order of the interface, and the routes of each file.
 pub(super) fn link(
-    files: &[(&Path, &Scan)],
+    files: &[(PathBuf, Scan)],
     losses: &mut Losses,
 ) -> Result<(Vec<TableSpec>, Vec<Routes>), ReplayError> {
     let mut routes = vec![Routes::new(); files.len()];
     let mut feeds: BTreeMap<(usize, String), (Vec<Feed>, TableSpec)> = BTreeMap::new();
-    for (at, &(path, scan)) in files.iter().enumerate() {
+    for (at, (path, scan)) in files.iter().enumerate() {
         for (&id, channel) in &scan.definitions.channels {
-            let finding = match telemetry::topic_kind(&channel.topic) {
-                Topic::Telemetry => None,
-                Topic::Truth => Some(Finding::Truth),
-                Topic::Unknown => Some(Finding::UnknownTopic),
+            let finding = match channel.topic.as_str() {
+                telemetry::TRUTH => Some(Finding::TruthMessages),
+                topic if telemetry::expected(topic).is_none() => Some(Finding::MessagesOfUnknownTopics),
+                _ => None,
             };
             if let Some(finding) = finding {
                 routes[at].insert(id, Route::Nowhere { finding, topic: channel.topic.clone() });
@@ -51,7 +51,7 @@ pub(super) fn link(
             }
             let layout = layout(path, scan, id)?;
             for field in layout.ignored() {
-                losses.add(Finding::IgnoredField, 1, &format!("{}.{field}", channel.topic), || {
+                losses.add(Finding::IgnoredFields, 1, &format!("{}.{field}", channel.topic), || {
                     format!(
                         "{}: field {field} of {} is no scalar of 32 bits or a double; it is not read",
                         path.display(),
@@ -73,7 +73,7 @@ pub(super) fn link(
     for (feeds, table) in feeds.into_values() {
         // A stage that finds a table relies on it: an empty one is as good as a missing topic, and better told as one.
         if !feeds.iter().any(|f| files[f.file].1.used.contains(&f.channel)) {
-            losses.add(Finding::EmptyTopic, 1, &table.name, || {
+            losses.add(Finding::TopicsWithoutMessages, 1, &table.name, || {
                 format!("topic /{} has no messages; it counts as missing", table.name)
             });
             continue;
@@ -132,7 +132,7 @@ fn extend(
     }
     let (Some(metadata), Some(value)) = (housekeeping, table.columns.first_mut()) else { return Ok(()) };
     let unit = metadata.get("unit").filter(|u| !u.is_empty()).cloned().unwrap_or_else(|| {
-        losses.add(Finding::MissingUnit, 1, topic, || {
+        losses.add(Finding::MissingUnits, 1, topic, || {
             format!("{}: channel {topic} does not state its unit; it is read as a number (1)", path.display())
         });
         "1".to_owned()

@@ -252,7 +252,7 @@ fn a_damaged_history_is_told_and_not_used() {
     fs::write(&kept, text.replace("0.05", "0.5")).expect("written");
     let log = log(&path).expect("a log");
     assert_eq!(log.problems.len(), 1);
-    assert!(log.problems[0].1.contains("have the digest"), "{:?}", log.problems);
+    assert!(log.problems[0].reason.contains("have the digest"), "{:?}", log.problems);
     assert!(matches!(find(&path, &added.revision), Err(RevisionError::NoRevision { .. })));
 }
 

@@ -49,7 +49,6 @@ pub struct Decoder {
 
 impl Decoder {
     /// A decoder that fills the columns to which `layout` points.
-    #[must_use]
     pub fn new(layout: &Layout) -> Self {
         Self { entered: vec![0; layout.nodes.len()], nodes: layout.nodes.clone(), message: 0, non_finite: 0 }
     }

@@ -12,37 +12,19 @@ use crate::table::{Batch, TableSpec};
 
 /// Why a table cannot be written as messages.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum EncodeError {
     /// A table of the interface has a column that its message has not.
     #[error(
         "table {table} has a column {column} that its message {message} in telemetry.proto does not have; rename the column or the table"
     )]
-    UnknownColumn {
-        /// Name of the table.
-        table: String,
-        /// Name of the column.
-        column: String,
-        /// Name of the message.
-        message: String,
-    },
+    UnknownColumn { table: String, column: String, message: String },
     /// A value of an integer field is no such integer.
     #[error("column {column} holds {value}, which is not a {kind}")]
-    NotAnInteger {
-        /// Path of the column.
-        column: String,
-        /// The value.
-        value: f64,
-        /// Type of the field.
-        kind: Kind,
-    },
+    NotAnInteger { column: String, value: f64, kind: Kind },
     /// The generated schema is refused, as it would be by a reader.
     #[error("table {table} makes no message: {source}")]
-    Layout {
-        /// Name of the table.
-        table: String,
-        /// What is wrong with it.
-        source: LayoutError,
-    },
+    Layout { table: String, source: LayoutError },
 }
 
 /// The message that a table becomes: its name, the schema that defines it and where each column lies in it.
@@ -140,7 +122,6 @@ struct Pattern {
 
 impl Encoder {
     /// An encoder of the table from which `message` was made.
-    #[must_use]
     pub fn new(message: MessageType) -> Self {
         Self { message, last: None }
     }

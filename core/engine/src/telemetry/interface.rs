@@ -10,6 +10,9 @@ use crate::table::{Column, TableSpec};
 /// `telemetry.proto` as a serialised FileDescriptorSet; a test compiles the text again and compares the bytes.
 const DESCRIPTOR: &[u8] = include_bytes!("telemetry.binpb");
 
+/// The truth of a simulation, which no calibration may read.
+pub(crate) const TRUTH: &str = "/truth";
+
 /// Topics of the interface and their messages. Housekeeping topics share one message, under the name `/hk/`.
 const MESSAGES: [(&str, &str); 7] = [
     ("/is", "dragfree.telemetry.v1.InertialSensors"),
@@ -18,59 +21,40 @@ const MESSAGES: [(&str, &str); 7] = [
     ("/command", "dragfree.telemetry.v1.Command"),
     ("/ephemeris", "dragfree.telemetry.v1.Ephemeris"),
     ("/hk/", "dragfree.telemetry.v1.Scalar"),
-    ("/truth", "dragfree.telemetry.v1.Truth"),
+    (TRUTH, "dragfree.telemetry.v1.Truth"),
 ];
 
-static LAYOUTS: LazyLock<Vec<(&str, Layout)>> = LazyLock::new(|| {
-    MESSAGES
-        .iter()
-        .map(|&(topic, message)| {
-            (topic, Layout::parse(DESCRIPTOR, message).expect("the committed descriptor defines every message"))
-        })
-        .collect()
+/// Topic, message and its layout.
+type Entry = (&'static str, &'static str, Layout);
+
+static INTERFACE: LazyLock<Vec<Entry>> = LazyLock::new(|| {
+    let layout = |message| Layout::parse(DESCRIPTOR, message).expect("the committed descriptor defines every message");
+    MESSAGES.iter().map(|&(topic, message)| (topic, message, layout(message))).collect()
 });
 
-/// What a topic is to the interface.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Topic {
-    /// Telemetry with a message of its own, or a housekeeping scalar.
-    Telemetry,
-    /// The truth of a simulation, which no calibration may read.
-    Truth,
-    /// Not in the interface.
-    Unknown,
-}
-
-/// What `topic` is to the interface.
-#[must_use]
-pub fn topic_kind(topic: &str) -> Topic {
-    match topic {
-        "/truth" => Topic::Truth,
-        topic if expected(topic).is_some() => Topic::Telemetry,
-        _ => Topic::Unknown,
-    }
+fn entry(topic: &str) -> Option<&'static Entry> {
+    let key = match topic.strip_prefix("/hk/") {
+        Some("") => return None,
+        Some(_) => "/hk/",
+        None => topic,
+    };
+    INTERFACE.iter().find(|(name, ..)| *name == key)
 }
 
 /// The message of a topic as the committed interface has it.
-#[must_use]
 pub fn expected(topic: &str) -> Option<&'static Layout> {
-    let key = if topic.starts_with("/hk/") && topic.len() > "/hk/".len() { "/hk/" } else { topic };
-    LAYOUTS.iter().find(|(name, _)| *name == key && (key != "/hk/" || topic != "/hk/")).map(|(_, layout)| layout)
+    entry(topic).map(|(.., layout)| layout)
 }
 
 /// Name of the message of a topic and the descriptor set that defines it, for a writer.
-#[must_use]
 pub fn descriptor(topic: &str) -> Option<(&'static str, &'static [u8])> {
-    expected(topic)?;
-    let key = if topic.starts_with("/hk/") { "/hk/" } else { topic };
-    MESSAGES.iter().find(|(name, _)| *name == key).map(|&(_, message)| (message, DESCRIPTOR))
+    entry(topic).map(|(_, message, _)| (*message, DESCRIPTOR))
 }
 
 /// The tables of a spacecraft that sends everything in the interface, without its housekeeping.
-#[must_use]
 pub fn interface_tables() -> Vec<TableSpec> {
-    let sent = LAYOUTS.iter().filter(|(topic, _)| topic_kind(topic) == Topic::Telemetry);
-    sent.map(|(topic, layout)| table(topic.trim_start_matches('/'), layout)).collect()
+    let sent = INTERFACE.iter().filter(|(topic, ..)| !matches!(*topic, TRUTH | "/hk/"));
+    sent.map(|(topic, _, layout)| table(topic.trim_start_matches('/'), layout)).collect()
 }
 
 /// A table with the columns of `layout`.
@@ -87,26 +71,15 @@ pub(crate) fn column(table: &str, path: &str) -> Column {
 
 /// A schema that is not what the interface says.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum Drift {
     /// Fields are missing; those that came in their place may be the same in another unit or frame.
     #[error("its schema lacks {}{}; a name carries unit and frame, so another name is another quantity",
         missing.join(", "), if instead.is_empty() { String::new() } else { format!(" and has {} instead", instead.join(", ")) })]
-    Missing {
-        /// Paths that the interface has and the file has not.
-        missing: Vec<String>,
-        /// Paths that the file has and the interface has not.
-        instead: Vec<String>,
-    },
+    Missing { missing: Vec<String>, instead: Vec<String> },
     /// A field has another type.
     #[error("its field {path} is of type {found}, where telemetry.proto has {expected}")]
-    Type {
-        /// Path of the field.
-        path: String,
-        /// Type in the file.
-        found: String,
-        /// Type in the interface.
-        expected: String,
-    },
+    Type { path: String, found: String, expected: String },
 }
 
 /// Compares the layout of `topic` in a file with the interface: every field must be there, by name and type; more
@@ -167,10 +140,7 @@ mod tests {
         assert_eq!(expected("/is").unwrap().leaves().len(), 14);
         assert_eq!(expected("/command").unwrap().leaves().len(), 18);
         assert_eq!(expected("/hk/battery_current_a").unwrap().leaves()[0].path, "value");
-        assert_eq!(topic_kind("/hk/a"), Topic::Telemetry);
-        assert_eq!(topic_kind("/hk/"), Topic::Unknown);
-        assert_eq!(topic_kind("/isx"), Topic::Unknown);
-        assert_eq!(topic_kind("/truth"), Topic::Truth);
+        assert!(expected("/hk/a").is_some() && expected("/hk/").is_none() && expected("/isx").is_none());
     }
 
     fn drifted(edit: impl Fn(&str) -> String, topic: &str, message: &str) -> Result<(), Drift> {

@@ -6,6 +6,7 @@ use std::fmt;
 use prost::Message;
 use prost_types::field_descriptor_proto::{Label, Type};
 use prost_types::{DescriptorProto, FileDescriptorSet};
+use serde::Serialize;
 
 /// Deepest nesting of messages that is followed; what lies deeper is ignored like a string.
 const MAX_DEPTH: usize = 16;
@@ -32,7 +33,8 @@ pub enum LayoutError {
 }
 
 /// Scalar types of a field that become a column of float64; every one of them fits exactly.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
 #[allow(missing_docs, reason = "the names are those of protobuf")]
 pub enum Kind {
     Double,
@@ -65,17 +67,7 @@ impl Kind {
 
 impl fmt::Display for Kind {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(match self {
-            Self::Double => "double",
-            Self::Float => "float",
-            Self::Uint32 => "uint32",
-            Self::Int32 => "int32",
-            Self::Sint32 => "sint32",
-            Self::Fixed32 => "fixed32",
-            Self::Sfixed32 => "sfixed32",
-            Self::Bool => "bool",
-            Self::Enum => "enum",
-        })
+        self.serialize(f)
     }
 }
 
@@ -166,13 +158,11 @@ impl Layout {
     }
 
     /// The columns, in the order of the schema's text.
-    #[must_use]
     pub fn leaves(&self) -> &[Leaf] {
         &self.leaves
     }
 
     /// Paths of the fields that are no column: repeated, text, bytes, 64-bit integers, groups, too deep.
-    #[must_use]
     pub fn ignored(&self) -> &[String] {
         &self.ignored
     }

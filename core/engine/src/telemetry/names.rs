@@ -3,10 +3,9 @@
 /// Unit and frame of the column at a dotted `path`, `tm1.r_orf_m.x` → (`m`, `ORF_1`).
 ///
 /// The innermost component that names a frame (`orf`, `srf`, `crf`, `irf`) decides; components of a vector or of a set
-/// of angles inherit from the field that holds them. The tokens after the frame are the unit, none of them meaning a
-/// number (`1`). `orf` is the frame of one optical bench: the digit of the enclosing test mass (`tm1`), or else a digit
-/// at the end of a token before it (`r1_orf_m`), says of which. Without a frame, as for `status`, both are empty.
-#[must_use]
+/// of angles inherit from the field that holds them. The tokens after the frame are the unit; no token means a number
+/// (`1`). `orf` is the frame of one optical bench, numbered by the enclosing test mass (`tm1`), or else by a digit at
+/// the end of a token before it (`r1_orf_m`). Without a frame, as for `status`, both are empty.
 pub fn unit_and_frame(path: &str) -> (String, String) {
     for component in path.rsplit('.') {
         let tokens: Vec<&str> = component.split('_').collect();

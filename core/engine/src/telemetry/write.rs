@@ -1,7 +1,6 @@
 //! Tables as an MCAP file that every common viewer plots.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
 
@@ -9,50 +8,28 @@ use tempfile::NamedTempFile;
 
 use super::encode::{EncodeError, Encoder, MessageType};
 use super::mcap_file::McapFile;
+use crate::files::{folder_of, sync_folder};
 use crate::table::{Batch, Chunk, TableSpec};
 
 /// Why a file cannot be written.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum WriteError {
     /// The file system refuses.
     #[error("cannot write {path}: {source}; check the folder, its permissions and its free space", path = path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system said.
-        source: io::Error,
-    },
+    Io { path: PathBuf, source: io::Error },
     /// A table does not fit its message.
     #[error(transparent)]
     Encode(#[from] EncodeError),
     /// Rows that are not in order of time, or come after later ones were written.
     #[error("table {table}: a row at {time_ns} ns after one at {after_ns} ns; rows must come in order of time")]
-    OutOfOrder {
-        /// Name of the table.
-        table: String,
-        /// Time of the row, Unix ns.
-        time_ns: i64,
-        /// Time that was already written, Unix ns.
-        after_ns: i64,
-    },
+    OutOfOrder { table: String, time_ns: i64, after_ns: i64 },
     /// A time before 1970, which a file cannot hold.
     #[error("table {table}: a row at {time_ns} ns lies before 1970; MCAP times are unsigned")]
-    NegativeTime {
-        /// Name of the table.
-        table: String,
-        /// Time of the row, Unix ns.
-        time_ns: i64,
-    },
+    NegativeTime { table: String, time_ns: i64 },
     /// A batch that has not the columns of its table.
     #[error("table {table}: {found} columns of {rows} rows each were due, the batch has something else", found = columns)]
-    Shape {
-        /// Name of the table.
-        table: String,
-        /// Columns of the table.
-        columns: usize,
-        /// Rows of the batch.
-        rows: usize,
-    },
+    Shape { table: String, columns: usize, rows: usize },
 }
 
 /// What the Metadata record `dragfree` says.
@@ -70,17 +47,6 @@ pub struct FileHeader {
     pub version: String,
     /// Anything else worth keeping.
     pub extra: BTreeMap<String, String>,
-}
-
-/// What was written.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Written {
-    /// The file, under its final name.
-    pub path: PathBuf,
-    /// Its size, bytes.
-    pub bytes: u64,
-    /// Messages in it.
-    pub messages: u64,
 }
 
 /// One table on its way into the file.
@@ -102,7 +68,6 @@ pub struct TelemetryWriter {
     file: McapFile<BufWriter<NamedTempFile>>,
     topics: Vec<Topic>,
     message: Vec<u8>,
-    messages: u64,
     written_until_ns: i64,
 }
 
@@ -140,7 +105,7 @@ impl TelemetryWriter {
                 done: 0,
             });
         }
-        Ok(Self { path: path.to_owned(), file, topics, message: Vec::new(), messages: 0, written_until_ns: i64::MIN })
+        Ok(Self { path: path.to_owned(), file, topics, message: Vec::new(), written_until_ns: i64::MIN })
     }
 
     /// Takes the rows of a chunk, one batch per table in the order of [`TelemetryWriter::create`], and writes
@@ -155,22 +120,21 @@ impl TelemetryWriter {
         self.write_before(chunk.complete_until_ns)
     }
 
-    /// Writes what is left, closes the file, makes it durable and gives it its name.
+    /// Writes what is left, closes the file, makes it durable and gives it its name, which is returned.
     ///
     /// # Errors
     /// [`WriteError`]; there is no file then.
-    pub fn finish(mut self) -> Result<Written, WriteError> {
+    pub fn finish(mut self) -> Result<PathBuf, WriteError> {
         self.write_before(i64::MAX)?;
-        let Self { path, file, messages, .. } = self;
+        let Self { path, file, .. } = self;
         let io = |source| WriteError::Io { path: path.clone(), source };
         let file = file.finish().map_err(io)?;
         let file = file.into_inner().map_err(|e| io(e.into_error()))?;
         file.as_file().sync_all().map_err(io)?;
-        let bytes = file.as_file().metadata().map_err(io)?.len();
         file.persist(&path).map_err(|e| io(e.error))?;
         // A rename is durable when its folder is.
-        File::open(folder(&path)).and_then(|f| f.sync_all()).map_err(io)?;
-        Ok(Written { path, bytes, messages })
+        sync_folder(folder_of(&path)).map_err(io)?;
+        Ok(path)
     }
 
     fn write_before(&mut self, until_ns: i64) -> Result<(), WriteError> {
@@ -186,7 +150,6 @@ impl TelemetryWriter {
                         .message(topic.channel, log_time, &self.message)
                         .map_err(|source| WriteError::Io { path: self.path.clone(), source })?;
                     topic.done += 1;
-                    self.messages += 1;
                 }
             }
         }
@@ -266,13 +229,6 @@ fn channel_metadata(table: &TableSpec, message: &MessageType) -> BTreeMap<String
     metadata
 }
 
-fn folder(path: &Path) -> &Path {
-    match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    }
-}
-
 /// A file beside `path`, removed unless it is renamed.
 fn temporary(path: &Path) -> io::Result<NamedTempFile> {
     let mut builder = tempfile::Builder::new();
@@ -282,7 +238,7 @@ fn temporary(path: &Path) -> io::Result<NamedTempFile> {
         use std::os::unix::fs::PermissionsExt as _;
         builder.permissions(std::fs::Permissions::from_mode(0o666)); // less the umask, as of any new file
     }
-    builder.tempfile_in(folder(path))
+    builder.tempfile_in(folder_of(path))
 }
 
 #[cfg(test)]
@@ -318,7 +274,7 @@ mod tests {
         let mut writer = TelemetryWriter::create(&path, &tables(), &FileHeader::default()).unwrap();
         writer.write(chunk(&[0, 1, 2, 3], &[0], 1)).unwrap();
         writer.write(chunk(&[], &[1, 2, 3], 3)).unwrap();
-        assert_eq!(writer.finish().unwrap().messages, 8);
+        writer.finish().unwrap();
         let file = std::fs::read(&path).unwrap();
         let order: Vec<(i64, String)> = mcap::MessageStream::new(&file)
             .unwrap()

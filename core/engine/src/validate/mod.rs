@@ -8,13 +8,14 @@ mod session;
 mod stand;
 
 use dragfree_schema::{Coefficient, ParameterType};
+use serde::Serialize;
 use serde_json::{Value, json};
 use std::path::PathBuf;
 
 use crate::border::{BorderError, Config, Kind, Library, LinkRequest, Linked, Manifest, PluginInfo};
 use crate::config::{ConfigError, Mission, resolve_parameters};
 use crate::table::Column;
-use session::{Session, is_same};
+use session::{Given, Session, difference};
 
 /// Epochs that a check feeds: ten minutes at 10 Hz.
 const EPOCHS: usize = 6000;
@@ -24,15 +25,16 @@ const GAP: std::ops::Range<usize> = 2000..2050;
 const BATCHES: [usize; 4] = [EPOCHS, 1, 7, 512];
 
 /// Something that is checked.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Check {
     /// The manifest says who it is, and every default is one that the parameter's own declaration allows.
     Manifest,
-    /// Every instance comes to life.
+    /// Every instance can be created.
     Create,
     /// Every instance finds its columns, and what it announces is whole.
     Link,
-    /// Times ascend, nothing is infinite; an effect gives a row for a row, and a finite one once it has run in.
+    /// Times ascend, no value is infinite; an effect gives one row per input row, finite after its transient.
     Values,
     /// Missing values are no failure.
     Gaps,
@@ -49,37 +51,21 @@ pub enum Check {
 
 impl Check {
     /// In the order in which they make sense.
-    pub const ALL: [Self; 9] = [
-        Self::Manifest,
-        Self::Create,
-        Self::Link,
-        Self::Values,
-        Self::Gaps,
-        Self::Batches,
-        Self::Replay,
-        Self::State,
-        Self::Garbage,
-    ];
+    pub const ALL: [Self; 9] = {
+        use Check::*;
+        [Manifest, Create, Link, Values, Gaps, Batches, Replay, State, Garbage]
+    };
+}
 
-    /// Its name.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Manifest => "manifest",
-            Self::Create => "create",
-            Self::Link => "link",
-            Self::Values => "values",
-            Self::Gaps => "gaps",
-            Self::Batches => "batches",
-            Self::Replay => "replay",
-            Self::State => "state",
-            Self::Garbage => "garbage",
-        }
+impl std::fmt::Display for Check {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.serialize(f)
     }
 }
 
-/// What a check found.
+/// Why a check fails.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "every field is named in its sentence")]
 pub enum Finding {
     /// The plugin failed or broke a rule of the border.
     #[error(transparent)]
@@ -92,12 +78,7 @@ pub enum Finding {
     Manifest(String),
     /// What an instance announced or gave is not what the chain relies on.
     #[error("{instance}: {what}")]
-    Broken {
-        /// Id and instance.
-        instance: String,
-        /// What is wrong, and what to do.
-        what: String,
-    },
+    Broken { instance: String, what: String },
 }
 
 /// The plugin and what it is given.
@@ -282,7 +263,7 @@ impl Subject<'_> {
         let whole = gap.is_none();
         let mut session = self.session(instance, gap)?;
         session.advance(EPOCHS, 512)?;
-        let (batches, times_ns, _) = session.finish()?;
+        let Given { batches, times_ns, .. } = session.finish()?;
         for (table, batch) in batches.iter().enumerate() {
             if batch.time_ns.windows(2).any(|pair| pair[0] >= pair[1]) {
                 return Err(self.broken(instance, format!("the times of table {table} do not ascend")));
@@ -297,7 +278,7 @@ impl Subject<'_> {
                 let what = format!("table {table} has {} rows for {} given", batch.time_ns.len(), times_ns.len());
                 return Err(self.broken(instance, what + "; an effect gives one for each, at its time"));
             }
-            // What has a memory may have to run in.
+            // An effect with memory may have a transient: only the second half must be finite.
             if whole && batch.columns.iter().any(|column| column[column.len() / 2..].iter().any(|x| !x.is_finite())) {
                 return Err(self.broken(instance, format!("table {table} has NaN where every input was finite")));
             }
@@ -311,18 +292,9 @@ impl Subject<'_> {
             let mut session = self.session(instance, None)?;
             session.advance(EPOCHS, size)?;
             let result = session.finish()?;
-            let (whole, _, report) = first.get_or_insert_with(|| result.clone());
-            if let Some(difference) = is_same(whole, &result.0) {
-                let what = format!(
-                    "in batches of {size} in place of {EPOCHS} epochs {difference}; keep what is left over for the next call"
-                );
-                return Err(self.broken(instance, what));
-            }
-            if *report != result.2 {
-                return Err(
-                    self.broken(instance, format!("in batches of {size} in place of {EPOCHS} the report is another"))
-                );
-            }
+            let when = format!("in batches of {size} in place of {EPOCHS} epochs");
+            let whole = first.get_or_insert_with(|| result.clone());
+            self.same(instance, whole, &result, &when, "keep what is left over for the next call")?;
         }
         Ok(())
     }
@@ -333,14 +305,8 @@ impl Subject<'_> {
             session.advance(EPOCHS, 512)?;
             session.finish()
         };
-        let (first, second) = (run()?, run()?);
-        if let Some(difference) = is_same(&first.0, &second.0) {
-            let what = format!(
-                "the second time {difference}; clocks, addresses and random numbers without a seed are no input"
-            );
-            return Err(self.broken(instance, what));
-        }
-        if first.2 == second.2 { Ok(()) } else { Err(self.broken(instance, "the second time the report is another")) }
+        let hint = "clocks, addresses and random numbers without a seed are no input";
+        self.same(instance, &run()?, &run()?, "the second time", hint)
     }
 
     fn state(&self, instance: &str) -> Result<(), Finding> {
@@ -361,17 +327,15 @@ impl Subject<'_> {
         first.advance(EPOCHS, size)?;
         second.advance(EPOCHS, size)?;
         let (first, second) = (first.finish()?, second.finish()?);
-        if let Some(difference) = is_same(&first.0, &second.0) {
-            return Err(self.broken(
-                instance,
-                format!("resumed from its state {difference}; the state must hold all that counts"),
-            ));
-        }
-        if first.2 == second.2 {
-            Ok(())
-        } else {
-            Err(self
-                .broken(instance, "resumed from its state the report is another; the state must hold all that counts"))
+        self.same(instance, &first, &second, "resumed from its state", "the state must hold all that counts")
+    }
+
+    /// That two results are equal; `when` says how the second was made, `hint` what to do about a difference.
+    fn same(&self, instance: &str, a: &Given, b: &Given, when: &str, hint: &str) -> Result<(), Finding> {
+        let report = || (a.report != b.report).then(|| "the report is another".to_owned());
+        match difference(&a.batches, &b.batches).or_else(report) {
+            Some(what) => Err(self.broken(instance, format!("{when} {what}; {hint}"))),
+            None => Ok(()),
         }
     }
 
@@ -399,7 +363,7 @@ impl Subject<'_> {
     }
 }
 
-/// Who it is, in a form that file names, model files and messages can carry; defaults that its own declaration allows.
+/// Checks id, version and texts, and that every default is allowed by the parameter's own declaration.
 fn manifest(manifest: &Manifest, kind: Kind) -> Result<String, Finding> {
     let fail = |what: String| Err(Finding::Manifest(what));
     let plain = |text: &str| {
@@ -441,7 +405,6 @@ fn manifest(manifest: &Manifest, kind: Kind) -> Result<String, Finding> {
 }
 
 /// The result of a check as `dragfree plugins validate` hands it from process to process.
-#[must_use]
 pub fn to_json(result: &Result<String, Finding>) -> Value {
     match result {
         Ok(detail) => json!({ "passed": true, "detail": detail }),

@@ -1,4 +1,4 @@
-//! An instance that is fed epoch by epoch, and what it gave.
+//! A plugin instance under test: fed with generated rows, its output collected.
 
 use std::ops::Range;
 
@@ -117,15 +117,14 @@ impl Session {
         }
     }
 
-    /// What it gave since the rows were forgotten last, the times that it was given, and its report.
-    pub(super) fn finish(mut self) -> Result<(Vec<Batch>, Vec<i64>, String), Finding> {
+    /// Flushes it and asks for its report.
+    pub(super) fn finish(mut self) -> Result<Given, Finding> {
         if self.kind != Kind::Source {
             let rest = self.node.flush()?;
             self.take(rest);
         }
-        // As text: NaN is not equal to itself.
         let report = serde_json::to_string(&self.node.report("[]")?).unwrap_or_default();
-        Ok((self.batches, self.times_ns, report))
+        Ok(Given { batches: self.batches, times_ns: self.times_ns, report })
     }
 
     pub(super) fn save(&mut self) -> Result<Vec<u8>, Finding> {
@@ -137,8 +136,19 @@ impl Session {
     }
 }
 
+/// What an instance gave.
+#[derive(Clone)]
+pub(super) struct Given {
+    /// Rows since they were forgotten last.
+    pub(super) batches: Vec<Batch>,
+    /// Times that it was given since.
+    pub(super) times_ns: Vec<i64>,
+    /// Its report, as text: NaN is not equal to itself.
+    pub(super) report: String,
+}
+
 /// Where two results differ; every NaN is no value, and so alike.
-pub(super) fn is_same(a: &[Batch], b: &[Batch]) -> Option<String> {
+pub(super) fn difference(a: &[Batch], b: &[Batch]) -> Option<String> {
     for (table, (a, b)) in a.iter().zip(b).enumerate() {
         if a.time_ns != b.time_ns {
             return Some(format!("table {table} has {} rows in place of {}, or other times", b.rows(), a.rows()));

@@ -1,4 +1,4 @@
-//! Where a plugin stands while it is checked: the columns of a whole chain, and values for them.
+//! The test environment of a plugin: the columns of a whole chain, and values for them.
 
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;
@@ -22,7 +22,7 @@ pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) 
     if kind == Kind::Source {
         return vec![Vec::new()];
     }
-    let raw: Vec<Column> = interface_tables().into_iter().filter(|t| t.name != "hk/").flat_map(|t| t.columns).collect();
+    let raw: Vec<Column> = interface_tables().into_iter().flat_map(|t| t.columns).collect();
     let column = |table: &str, name: String, (unit, frame): (String, String), attributes: &[(&str, &str)]| Column {
         table: table.to_owned(),
         name,
@@ -40,17 +40,10 @@ pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) 
     for name in words.filter_map(|word| word.strip_prefix("hk.")) {
         let unit = housekeeping_unit(name);
         if !grid.iter().any(|c| c.name == format!("hk.{name}")) {
-            grid.push(column("grid", format!("hk.{name}"), (unit.clone(), String::new()), &[]));
-            let table = format!("hk/{name}");
-            let attributes = BTreeMap::new();
-            housekeeping.push(Column {
-                table,
-                name: "value".to_owned(),
-                unit,
-                frame: String::new(),
-                rate_hz: 0.0,
-                attributes,
-            });
+            let meaning = (unit, String::new());
+            grid.push(column("grid", format!("hk.{name}"), meaning.clone(), &[]));
+            let value = column(&format!("hk/{name}"), "value".to_owned(), meaning, &[]);
+            housekeeping.push(Column { rate_hz: 0.0, ..value });
         }
     }
     // Test masses of the interface with their frames.
@@ -119,20 +112,12 @@ pub(super) fn stands(kind: Kind, rate_hz: f64, parameters: &Map<String, Value>) 
 /// `A` of `battery_current_a`; a housekeeping name ends with its unit.
 fn housekeeping_unit(name: &str) -> String {
     match name.rsplit('_').next().unwrap_or_default() {
-        "a" => "A",
-        "k" => "K",
-        "v" => "V",
-        "w" => "W",
-        "t" => "T",
-        "c" => "C",
-        "pa" => "Pa",
-        "hz" => "Hz",
-        "kg" => "kg",
-        "rad" => "rad",
-        "m" => "m",
-        _ => "1",
+        letter @ ("a" | "k" | "v" | "w" | "t" | "c") => letter.to_ascii_uppercase(),
+        unit @ ("kg" | "rad" | "m") => unit.to_owned(),
+        "pa" => "Pa".to_owned(),
+        "hz" => "Hz".to_owned(),
+        _ => "1".to_owned(),
     }
-    .to_owned()
 }
 
 /// A number in `0..1` that depends on all bits of `seed` (SplitMix64's mixing).
@@ -143,7 +128,7 @@ fn uniform(seed: u64) -> f64 {
     ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64
 }
 
-/// Bytes without sense.
+/// Pseudo-random bytes.
 pub(super) fn noise_bytes(count: u64) -> Vec<u8> {
     (0..count).map(|k| (256.0 * uniform(k)) as u8).collect()
 }

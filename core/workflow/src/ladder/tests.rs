@@ -1,5 +1,5 @@
 use super::*;
-use dragfree_engine::product::{self, Draft, ProductWriter, Stage, Status, Stream};
+use dragfree_engine::product::{self, Draft, ProductWriter, Stage};
 use serde_json::json;
 
 /// 2035-01-01.
@@ -95,12 +95,8 @@ impl Made<'_> {
             release: 1,
             mission: "Taiji".into(),
             spacecraft: "SC1".into(),
-            day: chrono::DateTime::from_timestamp_nanos(first_ns).date_naive(),
             first_ns,
             last_ns: first_ns + DAY_NS - 1,
-            time_scale: "UTC".into(),
-            stream: Stream::Test,
-            status: Status::Quicklook,
             inputs: Vec::new(),
             history: self.effects.iter().map(stage).collect(),
             model: product::Model {
@@ -109,9 +105,7 @@ impl Made<'_> {
                 effects: Vec::new(),
             },
             software: "0.1.0".into(),
-            losses: Vec::new(),
-            counts: BTreeMap::new(),
-            notes: Vec::new(),
+            replay: dragfree_engine::feed::Summary { time_scale: "UTC".into(), ..Default::default() },
             reports: vec![serde_json::from_value(report).expect("a report")],
             settings: Default::default(),
             created: chrono::DateTime::UNIX_EPOCH,

@@ -2,17 +2,16 @@
 
 mod page;
 
+use super::run::INCONSISTENT;
 use super::{Done, replay};
 use crate::args::{Compare, Global};
 use crate::failure::Failure;
-use crate::text::{Paint, columns, labelled};
+use crate::text::{self, Paint, columns, labelled};
+use dragfree_engine::files::IoContext as _;
 use dragfree_identification::coherence::{Coherence, StepwiseCoherence};
 use dragfree_identification::compare::{Channel, Comparison, Innovations, Kind, Test};
 use dragfree_workflow::compare::compare;
 use std::path::Path;
-
-/// Exit code where the model contradicts the data.
-const INCONSISTENT: u8 = 4;
 
 /// Housekeeping channels that the screen names.
 const NAMED: usize = 5;
@@ -23,10 +22,10 @@ pub(super) fn execute(command: &Compare, global: &Global, paint: Paint) -> Resul
     if let Some(path) = &command.page {
         let meaning = (!comparison.passes).then(|| meaning(&comparison));
         let page = page::page(&comparison, names, meaning)?;
-        std::fs::write(path, page).map_err(Failure::io("write", path))?;
+        std::fs::write(path, page).at("write", path)?;
     }
     let done = if global.json {
-        Done::json(&serde_json::to_value(&comparison).map_err(Failure::engine)?)
+        Done::json(&serde_json::to_value(&comparison)?)
     } else {
         let names = names.join(" ") + &super::repeated(Some(&command.archive.folder), global);
         Done::new(screen(&comparison, &names, command.page.as_deref(), paint))
@@ -107,8 +106,7 @@ fn innovation(i: &Innovations) -> String {
 
 /// One row a channel.
 fn table(c: &Comparison) -> String {
-    let heading =
-        ["channel", "χ²/dof", "95 %", "levels", "excess", "fails in", "where most"].map(str::to_owned).to_vec();
+    let heading = ["channel", "χ²/dof", "95 %", "levels", "excess", "fails in", "where most"];
     let row = |channel: &Channel| {
         let letters = channel.tests.iter().map(|t| if t.passes { '·' } else { letter(t) });
         let worst =
@@ -125,7 +123,7 @@ fn table(c: &Comparison) -> String {
             place.unwrap_or_default(),
         ]
     };
-    columns(&std::iter::once(heading).chain(c.channels.iter().map(row)).collect::<Vec<_>>())
+    columns(&text::table(&heading, c.channels.iter().map(row)))
 }
 
 fn letter(test: &Test) -> char {

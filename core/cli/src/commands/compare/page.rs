@@ -57,7 +57,7 @@ pub(crate) fn page(c: &Comparison, names: &[String], meaning: Option<&str>) -> R
             "Innovations of the recursive filter, each readout less what was expected of it, octave by octave: power over what the noise of the \
              mission file lets expect for the gains in use. 95 of 100 points lie in the shaded area where filter and noise are right. Not a \
              part of the verdict: each filter follows one test mass and does not know what the other one's readouts would tell it.",
-            &svg(&panels, COLUMNS).map_err(Failure::engine)?,
+            &svg(&panels, COLUMNS)?,
         );
     }
     section(
@@ -80,8 +80,7 @@ pub(crate) fn page(c: &Comparison, names: &[String], meaning: Option<&str>) -> R
         "When",
         "The same hour by hour. Red is louder than predicted, blue quieter. Single cells of low frequency scatter widely, as an hour holds \
          few of their waves: a frame marks the cells for which chance is no excuse.",
-        &heat::svg(&maps, COLUMNS, "measured over predicted power; a frame where that is no chance")
-            .map_err(Failure::engine)?,
+        &heat::svg(&maps, COLUMNS, "measured over predicted power; a frame where that is no chance")?,
     );
     section(
         &mut out,
@@ -143,48 +142,35 @@ fn table(c: &Comparison, word: impl Fn(bool) -> &'static str) -> String {
 }
 
 fn lines(c: &Comparison, of: fn(&Channel) -> Panel) -> Result<String, Failure> {
-    svg(&c.channels.iter().map(of).collect::<Vec<_>>(), COLUMNS).map_err(Failure::engine)
-}
-
-fn line(label: &str, colour: usize, stroke: Stroke, points: Vec<(f64, f64)>) -> Line {
-    Line { label: label.to_owned(), colour, stroke, points }
+    Ok(svg(&c.channels.iter().map(of).collect::<Vec<_>>(), COLUMNS)?)
 }
 
 /// A panel over frequency.
 fn over_frequency(channel: &Channel, y_label: &str, lines: Vec<Line>) -> Panel {
     let ends = [channel.frequency_hz.first(), channel.frequency_hz.last()].map(|f| f.copied().unwrap_or(1.0));
-    Panel {
-        title: channel.name.clone(),
-        x_label: "frequency / Hz".to_owned(),
-        y_label: y_label.to_owned(),
-        x_scale: Scale::Logarithmic,
-        y_scale: Scale::Logarithmic,
-        x: 0.9 * ends[0]..1.1 * ends[1],
-        y: None,
-        lines,
-    }
+    Panel::over_frequency(&channel.name, y_label, 0.9 * ends[0]..1.1 * ends[1], lines)
 }
 
 /// The interval around one, times what `of` makes of each frequency, round and back.
 fn area(channel: &Channel, of: impl Fn(usize, f64) -> f64) -> Line {
     let n = channel.frequency_hz.len();
     let end = |b: usize, k: usize| (channel.frequency_hz[b], of(b, channel.interval_95[b][k]));
-    line("95 of 100", 6, Stroke::Area, (0..n).map(|b| end(b, 0)).chain((0..n).rev().map(|b| end(b, 1))).collect())
+    Line::new("95 of 100", 6, Stroke::Area, (0..n).map(|b| end(b, 0)).chain((0..n).rev().map(|b| end(b, 1))).collect())
 }
 
 fn amplitude(channel: &Channel) -> Panel {
     let root = |psd: &[f64]| channel.frequency_hz.iter().zip(psd).map(|(f, p)| (*f, p.max(0.0).sqrt())).collect();
     let unit = if channel.name.starts_with("sc.") { "rad s⁻² Hz^-1/2" } else { "m s⁻² Hz^-1/2" };
     let around = area(channel, |b, ratio| (ratio * channel.predicted_psd[b]).sqrt());
-    let measured = line("measured", 0, Stroke::Solid, root(&channel.measured_psd));
-    let predicted = line("predicted", 1, Stroke::Dashed, root(&channel.predicted_psd));
+    let measured = Line::new("measured", 0, Stroke::Solid, root(&channel.measured_psd));
+    let predicted = Line::new("predicted", 1, Stroke::Dashed, root(&channel.predicted_psd));
     over_frequency(channel, unit, vec![around, measured, predicted])
 }
 
 fn ratio(channel: &Channel) -> Panel {
     let f = &channel.frequency_hz;
     let measured = f.iter().zip(channel.measured_psd.iter().zip(&channel.predicted_psd)).map(|(f, (m, p))| (*f, m / p));
-    let lines = vec![area(channel, |_, ratio| ratio), line("measured", 0, Stroke::Solid, measured.collect())];
+    let lines = vec![area(channel, |_, ratio| ratio), Line::new("measured", 0, Stroke::Solid, measured.collect())];
     Panel { y: Some(0.1..10.0), ..over_frequency(channel, "measured / predicted power", lines) }
 }
 
@@ -196,16 +182,11 @@ fn innovations(readout: &Innovations) -> Panel {
     let around = end(0.025).chain(end(0.975).rev()).collect();
     let measured = octaves.iter().map(|o| (middle(o), o.chi2_per_dof.unwrap_or(1.0).max(1e-3))).collect();
     let ends = [octaves.first(), octaves.last()].map(|o| o.map_or(1.0, |o| middle(o)));
-    Panel {
-        title: readout.readout.clone(),
-        x_label: "frequency / Hz".to_owned(),
-        y_label: "innovation / expected power".to_owned(),
-        x_scale: Scale::Logarithmic,
-        y_scale: Scale::Logarithmic,
-        x: 0.7 * ends[0]..1.4 * ends[1],
-        y: Some(0.1..10.0),
-        lines: vec![line("95 of 100", 6, Stroke::Area, around), line("measured", 0, Stroke::Solid, measured)],
-    }
+    let lines =
+        vec![Line::new("95 of 100", 6, Stroke::Area, around), Line::new("measured", 0, Stroke::Solid, measured)];
+    let panel =
+        Panel::over_frequency(&readout.readout, "innovation / expected power", 0.7 * ends[0]..1.4 * ends[1], lines);
+    Panel { y: Some(0.1..10.0), ..panel }
 }
 
 fn cumulative(channel: &Channel) -> Panel {
@@ -222,9 +203,9 @@ fn cumulative(channel: &Channel) -> Panel {
         x: 0.0..1.0,
         y: Some(-1.1 * most..1.1 * most),
         lines: vec![
-            line("measured", 0, Stroke::Solid, apart),
-            line("limits", 1, Stroke::Dashed, flat(limit)),
-            line("", 1, Stroke::Dashed, flat(-limit)),
+            Line::new("measured", 0, Stroke::Solid, apart),
+            Line::new("limits", 1, Stroke::Dashed, flat(limit)),
+            Line::new("", 1, Stroke::Dashed, flat(-limit)),
         ],
     }
 }
