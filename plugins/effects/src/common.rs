@@ -10,6 +10,8 @@ pub(crate) const AXES: [&str; 3] = ["x", "y", "z"];
 pub(crate) const SLOW_HZ: f64 = 0.05;
 /// Instances of an effect on every test mass of the mission.
 pub(crate) const TEST_MASSES: &[&str] = &["{test_mass}"];
+/// Instances of an effect along or about every axis of SRF.
+pub(crate) const SC_AXES: &[&str] = &["sc.x", "sc.y", "sc.z"];
 /// Instances of an effect on every axis of every test mass.
 pub(crate) const TM_AXES: &[&str] = &["{test_mass}.x", "{test_mass}.y", "{test_mass}.z"];
 
@@ -93,9 +95,14 @@ pub(crate) fn keep_available(
     Ok(responses)
 }
 
+/// Whether a column is housekeeping on the common grid.
+pub(crate) fn is_housekeeping(column: &Column) -> bool {
+    column.table == "grid" && column.name.starts_with("hk.")
+}
+
 /// Housekeeping columns with a unit, in telemetry order. Effects select by unit because missions differ in names.
 pub(crate) fn housekeeping_in<'a>(available: &'a Available, unit: &'a str) -> impl Iterator<Item = &'a Column> {
-    available.columns.iter().filter(move |c| c.table == "grid" && c.name.starts_with("hk.") && c.unit == unit)
+    available.columns.iter().filter(move |c| is_housekeeping(c) && c.unit == unit)
 }
 
 /// Finds the housekeeping column that a parameter names.
