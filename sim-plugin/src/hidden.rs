@@ -212,19 +212,19 @@ const ROWS: &[Row] = &[
     },
 ];
 
-/// One effect that was drawn.
+/// A drawn effect.
 #[derive(Clone, Debug)]
 pub struct Drawn {
     /// The effect.
     pub request: EffectRequest,
     covered: bool,
-    /// What was drawn, in the unit of `sigma`, counted from where the effect vanishes.
+    /// Drawn amount in the unit of `sigma`; zero is no effect.
     pub amount: f64,
     /// Expected standard deviation of the amount.
     pub sigma: f64,
 }
 
-/// Everything that a seed hides.
+/// All effects that a seed hides.
 #[derive(Clone, Debug)]
 pub struct Hidden {
     seed: u64,
@@ -255,7 +255,7 @@ impl Hidden {
         Self { seed, drawn, salt }
     }
 
-    /// What is sealed, with what the caller adds.
+    /// Content of the sealed document, with the caller's members.
     #[must_use]
     pub fn content(&self, more: &Value) -> Value {
         let effects: Vec<Value> = self.drawn.iter().map(Drawn::content).collect();
@@ -304,7 +304,7 @@ impl Row {
         between * (known / days).powf(self.power)
     }
 
-    /// The same at any value of it, by log-log interpolation.
+    /// σ after `days` at any value of the shape parameter, by log-log interpolation.
     fn sigma_at(&self, sigma: &[[f64; 2]], value: f64, days: f64) -> f64 {
         let Some((_, grid)) = self.shape else { return self.after(sigma[0], days) };
         let i = grid.partition_point(|x| *x <= value).clamp(1, grid.len() - 1);
@@ -314,8 +314,8 @@ impl Row {
     }
 }
 
-/// Sizes that are both physical and seen: where even the smallest physical one stands out more, from it up to three
-/// times as much. `None` where the largest is not seen.
+/// Amounts in the physical range with a significance in [`SIGNIFICANCE`]; if even the smallest physical amount exceeds
+/// it, up to three times that. `None` if the largest physical amount is not significant.
 fn interval(row: &Row, sigma: f64) -> Option<(f64, f64)> {
     let (seen, glaring) = (SIGNIFICANCE.0 * sigma, SIGNIFICANCE.1 * sigma);
     let (least, most) = row.range;
@@ -333,7 +333,7 @@ fn log_uniform(rng: &mut Xoshiro256PlusPlus, (least, most): (f64, f64)) -> f64 {
 }
 
 fn pick<'a, T>(rng: &mut Xoshiro256PlusPlus, from: &'a [T]) -> Option<&'a T> {
-    // Never the length itself: random() is below 1.
+    // random() is below 1, so the index is below the length.
     from.get((rng.random::<f64>() * from.len() as f64) as usize)
 }
 
@@ -352,7 +352,7 @@ fn draw_one(
     test_masses: &[String],
     wanted: impl Fn(&Row) -> bool,
 ) -> Option<Drawn> {
-    // A place where the effect is seen whatever its shape.
+    // An instance at which the effect is significant at every value of the shape parameter.
     let seen = |row: &Row, (place, sigma): &(&str, &[[f64; 2]])| {
         instance(place, test_masses).is_some() && sigma.iter().all(|s| interval(row, row.after(*s, days)).is_some())
     };

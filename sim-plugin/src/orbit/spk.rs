@@ -1,7 +1,7 @@
 //! Positions from an SPK file (NAIF's "SPK Required Reading" and "DAF Required Reading"): little-endian, segments of
 //! type 2, Chebyshev polynomials of position in records of equal length.
 //!
-//! A file is checked whole when it is opened, so that a position can fail for one reason alone: no segment has it.
+//! A file is checked completely when it is opened; after that, a position fails only if no segment covers it.
 
 use nalgebra::Vector3;
 
@@ -18,7 +18,7 @@ const M_PER_KM: f64 = 1000.0;
 /// A light year, farther than any planet.
 const MOST_KM: f64 = 1e13;
 
-/// Why an SPK file was refused, or has no answer.
+/// Why an SPK file was refused, or does not cover a position.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SpkError {
     /// The first record is not an SPK's.
@@ -35,7 +35,7 @@ pub enum SpkError {
         /// Where, words of 8 bytes from the start, from 1.
         word: usize,
     },
-    /// A segment is whole, but of a kind that is not read here.
+    /// A segment of an unsupported type.
     #[error("SPK file: the segment of {target} relative to {center} has {what} {found}; only {needed} is read")]
     Unsupported {
         /// NAIF's number of the body.
