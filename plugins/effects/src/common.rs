@@ -4,8 +4,8 @@
 use dragfree_physics::mission::{Mission, MissionError};
 use dragfree_sdk::prelude::*;
 
-/// Axes as the columns name them.
-pub(crate) const AXES: [&str; 3] = ["x", "y", "z"];
+pub(crate) use dragfree_physics::mission::{ANGLES, AXES};
+
 /// Upper band edge of series made from housekeeping, Hz: thermometers and first-order lags pass nothing above it.
 pub(crate) const SLOW_HZ: f64 = 0.05;
 /// Instances of an effect on every test mass of the mission.
@@ -41,6 +41,12 @@ pub(crate) fn tm_of(instance: &str) -> &str {
 /// Acceleration channel of an instance: `tm1.accel.x` for `tm1.x`.
 pub(crate) fn accel_channel_of(instance: &str) -> String {
     format!("{}.accel.{}", tm_of(instance), AXES[axis_of(instance)])
+}
+
+/// A coefficient in the range ±`max`, of which its prior standard deviation is a third.
+pub(crate) fn symmetric(name: String, unit: &str, max: f64) -> Coefficient {
+    let (unit, prior_sigma) = (unit.to_owned(), max / 3.0);
+    Coefficient { name, unit, lower: -max, upper: max, prior_sigma, ..Coefficient::default() }
 }
 
 /// Table and name of a series.

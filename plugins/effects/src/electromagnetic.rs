@@ -6,7 +6,7 @@ use serde_json::json;
 
 use crate::common::{
     AXES, SLOW_HZ, SeriesRef, TEST_MASSES, find_housekeeping, housekeeping_in, keep_available, manifest, mission,
-    response, series_of,
+    response, series_of, symmetric,
 };
 
 /// `charge`: a charged test mass in the field of stray voltages.
@@ -173,14 +173,7 @@ impl Magnetic {
 
     fn coefficient(&self, name: &str, of_product: bool, squared: bool) -> Coefficient {
         let (max, unit) = scale(of_product, squared);
-        Coefficient {
-            name: format!("magnetic.{}.{name}", self.instance),
-            unit: unit.to_owned(),
-            lower: -max,
-            upper: max,
-            prior_sigma: max / 3.0,
-            ..Coefficient::default()
-        }
+        symmetric(format!("magnetic.{}.{name}", self.instance), unit, max)
     }
 }
 

@@ -27,7 +27,7 @@ use serde_json::json;
 
 use crate::common::{
     AXES, SLOW_HZ, SeriesRef, accel_channel_of, axis_of, find_housekeeping, housekeeping_in, keep_available, manifest,
-    mission, response, responses_to_spacecraft_force, responses_to_spacecraft_torque, tm_of,
+    mission, response, responses_to_spacecraft_force, responses_to_spacecraft_torque, symmetric, tm_of,
 };
 use crate::step_pulses::StepPulses;
 
@@ -153,14 +153,8 @@ impl Impulse {
         available: &Available,
         pulse: &SeriesRef,
     ) -> Result<Vec<(Coefficient, Vec<Response>)>, PluginError> {
-        let coefficient = |part: &str, unit: &str, max: f64| Coefficient {
-            name: format!("impulse.{}{part}", self.instance),
-            unit: unit.to_owned(),
-            lower: -max,
-            upper: max,
-            prior_sigma: max / 3.0,
-            ..Coefficient::default()
-        };
+        let coefficient =
+            |part: &str, unit: &str, max: f64| symmetric(format!("impulse.{}{part}", self.instance), unit, max);
         let on = |responses| keep_available(available, &self.name(), responses);
         let turn = |part: &str, axis: usize| -> Result<_, PluginError> {
             Ok((

@@ -14,9 +14,6 @@ use nalgebra::{Matrix2, Vector3};
 
 use crate::common::{AXES, SeriesRef, axis_of, mission, tm_of};
 
-/// Names of the angles about x, y and z.
-pub(crate) const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
-
 /// A test mass of the mission.
 #[derive(Clone, Debug)]
 pub(crate) struct Body {

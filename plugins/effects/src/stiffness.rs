@@ -8,8 +8,8 @@
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 
-use crate::common::{TM_AXES, axis_of, manifest};
-use crate::linear::{ANGLES, Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, accel_channel};
+use crate::common::{ANGLES, TM_AXES, axis_of, manifest};
+use crate::linear::{Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, accel_channel};
 
 const STIFFNESS_S2: [f64; 2] = [-1e-5, 1e-5];
 const CROSS_M_S2_RAD: [f64; 2] = [-1e-6, 1e-6];

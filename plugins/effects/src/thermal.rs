@@ -14,7 +14,7 @@ use serde_json::json;
 
 use crate::common::{
     SLOW_HZ, SeriesRef, TM_AXES, accel_channel_of, find_housekeeping, housekeeping_in, keep_available, manifest,
-    mission, response,
+    mission, response, symmetric,
 };
 use crate::lag::Lags;
 
@@ -172,14 +172,7 @@ impl Effect for Thermal {
     }
 
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
-        let mut coefficient = Coefficient {
-            name: format!("thermal.{}", self.instance),
-            unit: "m s-2 K-1".to_owned(),
-            lower: -MAX_PER_KELVIN,
-            upper: MAX_PER_KELVIN,
-            prior_sigma: MAX_PER_KELVIN / 3.0,
-            ..Coefficient::default()
-        };
+        let mut coefficient = symmetric(format!("thermal.{}", self.instance), "m s-2 K-1", MAX_PER_KELVIN);
         // Checks the channel first.
         keep_available(available, &self.name(), vec![self.force_response(&SeriesRef::default(), 1.0)])?;
         if self.candidate {
