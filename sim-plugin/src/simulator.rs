@@ -28,6 +28,7 @@ const LOST_M: f64 = 1e-3;
 const LOST_RAD: f64 = 0.1;
 
 /// Why a simulation cannot go on.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum SimulationError {
     /// The mission file is not suitable.
@@ -48,29 +49,13 @@ pub enum SimulationError {
          {delay_samples} sample(s) of delay; correct its gain, its sections or control.delay_samples, or leave \
          [control.channel] out for the H-infinity design"
     )]
-    Unstable {
-        /// Channel.
-        channel: String,
-        /// Factor per sample; NaN when its coefficients overflow.
-        growth: f64,
-        /// Delay of the loop.
-        delay_samples: u32,
-    },
+    Unstable { channel: String, growth: f64, delay_samples: u32 },
     /// The loop diverged.
     #[error(
         "the loop diverged {elapsed_s} s after the start of the simulation: {what} = {value:e} {unit}; \
          check [control], [actuators] and the sizes of the effects"
     )]
-    Diverged {
-        /// Seconds since the loop was closed.
-        elapsed_s: f64,
-        /// Body and axis.
-        what: String,
-        /// The value.
-        value: f64,
-        /// Its unit.
-        unit: &'static str,
-    },
+    Diverged { elapsed_s: f64, what: String, value: f64, unit: &'static str },
     /// A saved state of another simulation.
     #[error("state of the simulator: {0}; it was saved with another mission or parameters")]
     State(String),

@@ -76,6 +76,7 @@ const FORGOTTEN: f64 = 1e-9;
 const GRID: usize = 3000;
 
 /// Why a mission has no design: which channel, which weight, where, and what to change.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum DesignError {
     /// The mission file lacks something.
@@ -89,17 +90,11 @@ pub enum DesignError {
          {best_ratio:.3} times. Relax the requirement or choose a quieter readout"
     )]
     OutOfReach {
-        /// Channel.
         channel: String,
-        /// Key of the requirement in the mission file.
         requirement: &'static str,
-        /// Worst frequency above the relaxed band, Hz.
         frequency_hz: f64,
-        /// `|W_3|` there, uncapped.
         noise_ratio: f64,
-        /// `|W_1|` there.
         disturbance_ratio: f64,
-        /// Smallest possible ASD over requirement.
         best_ratio: f64,
     },
     /// The γ-iteration ends above one.
@@ -109,42 +104,22 @@ pub enum DesignError {
          reduce noise or disturbance, or sample faster"
     )]
     TooGreedy {
-        /// Channel.
         channel: String,
-        /// `W1` or `W3`, whichever uses up more of γ at the worst frequency.
         weight: &'static str,
-        /// Where the stacked norm is largest, Hz.
         frequency_hz: f64,
-        /// Smallest γ.
         gamma: f64,
-        /// Key of the requirement in the mission file.
         requirement: &'static str,
-        /// Half a hold and the loop's delay, s.
         loop_delay_s: f64,
     },
     /// The synthesis itself failed.
     #[error("control design, channel {channel}: {source}")]
-    Synthesis {
-        /// Channel.
-        channel: String,
-        /// What went wrong.
-        source: HinfError,
-    },
+    Synthesis { channel: String, source: HinfError },
     /// The sampled loop exceeds a bound of the design.
     #[error(
         "control design, channel {channel}: the sampled loop breaks its bound at {frequency_hz:.3e} Hz, {what} = \
          {value:.4}; a shorter delay or a faster sample rate helps"
     )]
-    NotKept {
-        /// Channel.
-        channel: String,
-        /// Quantity that exceeds one.
-        what: &'static str,
-        /// Where, Hz.
-        frequency_hz: f64,
-        /// Its value.
-        value: f64,
-    },
+    NotKept { channel: String, what: &'static str, frequency_hz: f64, value: f64 },
 }
 
 impl From<DesignError> for MissionError {

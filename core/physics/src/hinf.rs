@@ -31,14 +31,12 @@ const LIFT: f64 = 1e-9;
 const SMALLEST_GAMMA: f64 = 1e-9;
 
 /// Condition of Glover and Doyle's theorem that fails at a given γ, in the order of evaluation.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum Obstacle {
     /// γ is below the bound of the direct terms, which no controller changes.
     #[error("the direct term from w to z alone has a gain of {at_least}")]
-    Direct {
-        /// `max(σ̄[D_1111 D_1112], σ̄[D_1111ᵀ D_1121ᵀ])`.
-        at_least: f64,
-    },
+    Direct { at_least: f64 },
     /// The control Riccati equation.
     #[error("X∞ does not exist: {0}")]
     ControlRiccati(RiccatiError),
@@ -47,27 +45,19 @@ pub enum Obstacle {
     FilterRiccati(RiccatiError),
     /// `X∞` is not positive semidefinite.
     #[error("X∞ has the negative eigenvalue {smallest}: full information would not suffice")]
-    ControlIndefinite {
-        /// Smallest eigenvalue of `X∞` over its largest in size.
-        smallest: f64,
-    },
+    ControlIndefinite { smallest: f64 },
     /// `Y∞` is not positive semidefinite.
     #[error("Y∞ has the negative eigenvalue {smallest}: full control would not suffice")]
-    FilterIndefinite {
-        /// Smallest eigenvalue of `Y∞` over its largest in size.
-        smallest: f64,
-    },
+    FilterIndefinite { smallest: f64 },
     /// Control and estimation are each feasible, but not combined.
     #[error(
         "the spectral radius of X∞ Y∞ is {ratio} γ², not below γ²: states to be controlled are estimated too poorly"
     )]
-    Coupling {
-        /// `ρ(X∞ Y∞)/γ²`.
-        ratio: f64,
-    },
+    Coupling { ratio: f64 },
 }
 
 /// Why a synthesis or a certificate failed.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum HinfError {
     /// Numbers of measurements and controls do not fit the plant.
@@ -75,16 +65,7 @@ pub enum HinfError {
         "a plant of {outputs} outputs and {inputs} inputs cannot have {measurements} measurements and {controls} \
          controls: there must be at least as many errors z as controls, and as many disturbances w as measurements"
     )]
-    Partition {
-        /// Outputs of the plant.
-        outputs: usize,
-        /// Inputs of the plant.
-        inputs: usize,
-        /// Measurements `y`.
-        measurements: usize,
-        /// Controls `u`.
-        controls: usize,
-    },
+    Partition { outputs: usize, inputs: usize, measurements: usize, controls: usize },
     /// `D_12` has not full column rank.
     #[error("some control costs nothing at high frequency (D_12 has not full column rank): weigh every control")]
     FreeControl,
@@ -93,40 +74,19 @@ pub enum HinfError {
     PerfectMeasurement,
     /// An unstable mode is not controllable.
     #[error("the unstable mode at {re:e} + {im:e}i rad/s cannot be reached by the control")]
-    NotStabilisable {
-        /// Real part, rad/s.
-        re: f64,
-        /// Imaginary part, rad/s.
-        im: f64,
-    },
+    NotStabilisable { re: f64, im: f64 },
     /// An unstable mode is not observable.
     #[error("the unstable mode at {re:e} + {im:e}i rad/s is not observable in the measurements")]
-    NotDetectable {
-        /// Real part, rad/s.
-        re: f64,
-        /// Imaginary part, rad/s.
-        im: f64,
-    },
+    NotDetectable { re: f64, im: f64 },
     /// No controller at this γ.
     #[error("no controller reaches γ = {gamma}: {obstacle}")]
-    Infeasible {
-        /// The γ requested.
-        gamma: f64,
-        /// First condition that fails.
-        obstacle: Obstacle,
-    },
+    Infeasible { gamma: f64, obstacle: Obstacle },
     /// The system is unstable and has no norm.
     #[error("the system is not stable (a pole at {re:e} rad/s): its norm is infinite")]
-    Unstable {
-        /// Largest real part of its poles, rad/s.
-        re: f64,
-    },
+    Unstable { re: f64 },
     /// The strict inequality has no solution at this γ.
     #[error("the Bounded Real Lemma's inequality has no strict solution at γ = {gamma}; the norm is not below it")]
-    NotBounded {
-        /// The γ requested.
-        gamma: f64,
-    },
+    NotBounded { gamma: f64 },
     /// An interconnection or an eigenvalue computation failed.
     #[error(transparent)]
     System(#[from] LtiError),

@@ -31,35 +31,21 @@ pub(crate) fn blocks<const R: usize, const C: usize>(grid: [[&Matrix; C]; R]) ->
 }
 
 /// Why a system could not be built or converted.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum LtiError {
     /// Dimensions of the matrices disagree.
     #[error("state space of A {a:?}, B {b:?}, C {c:?}, D {d:?} (rows, columns): A must be n×n, B n×m, C p×n, D p×m")]
-    Shape {
-        /// Rows and columns of A.
-        a: (usize, usize),
-        /// Rows and columns of B.
-        b: (usize, usize),
-        /// Rows and columns of C.
-        c: (usize, usize),
-        /// Rows and columns of D.
-        d: (usize, usize),
-    },
+    Shape { a: (usize, usize), b: (usize, usize), c: (usize, usize), d: (usize, usize) },
     /// The algebraic loop of an interconnection is singular.
     #[error("the interconnection has an algebraic loop: I − D_K D_22 is singular; give plant or controller a lag")]
     AlgebraicLoop,
     /// The system has no second-order sections with unit gain at zero frequency.
     #[error("system with gain {gain} at zero frequency cannot be scaled by it; a controller here needs a finite gain")]
-    NoStaticGain {
-        /// Gain at zero frequency.
-        gain: f64,
-    },
+    NoStaticGain { gain: f64 },
     /// The eigenvalue iteration failed.
     #[error("the eigenvalues of a {order}×{order} matrix were not found; its entries are not finite or overflow")]
-    Eigenvalues {
-        /// Number of states.
-        order: usize,
-    },
+    Eigenvalues { order: usize },
 }
 
 /// `ẋ = A x + B u`, `y = C x + D u`.

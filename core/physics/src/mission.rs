@@ -11,42 +11,23 @@ use crate::frames::dcm_turned_about_z;
 use crate::noise::{NoiseLine, NoiseShape, NoiseTerm};
 
 /// Why a mission file was refused: what, where, and what to do next.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum MissionError {
     /// The text is not a mission: unknown key, wrong type, missing key.
     #[error(
         "mission file: {key}: {source}; every key carries its unit, and fixtures/missions/taiji.toml shows them all"
     )]
-    Shape {
-        /// Dotted key at which reading stopped.
-        key: String,
-        /// What was found and expected.
-        source: serde_json::Error,
-    },
+    Shape { key: String, source: serde_json::Error },
     /// A value is not physical.
     #[error("mission file: {key} = {value} {reason}")]
-    Value {
-        /// Dotted key.
-        key: String,
-        /// The value as written.
-        value: String,
-        /// What a value must satisfy.
-        reason: &'static str,
-    },
+    Value { key: String, value: String, reason: &'static str },
     /// The actuators cannot accelerate every channel independently.
     #[error("mission file: no allocation of the channels to the actuators: {reason}")]
-    Decoupling {
-        /// What is wrong and what to check.
-        reason: String,
-    },
+    Decoupling { reason: String },
     /// A section that a plugin needs is missing.
     #[error("mission file: section [{section}] is missing; {needed_by} needs it")]
-    Missing {
-        /// Dotted section.
-        section: String,
-        /// What needs it.
-        needed_by: &'static str,
-    },
+    Missing { section: String, needed_by: &'static str },
     /// The mission file has no controllers, and the design of controllers failed.
     #[error("mission file: {0}")]
     Design(#[source] Box<dyn std::error::Error + Send + Sync>),
@@ -227,8 +208,8 @@ pub struct Noise {
 }
 
 macro_rules! noise_table {
-    ($(#[$doc:meta])* $name:ident, $term:ident, $key:ident, $line:ident, $amplitude:ident, $unit:literal) => {
-        $(#[$doc])*
+    ($what:literal, $name:ident, $term:ident, $key:ident, $line:ident, $amplitude:ident, $unit:literal) => {
+        #[doc = concat!("Noise of ", $what, ".")]
         #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
         #[serde(deny_unknown_fields)]
         pub struct $name {
@@ -316,28 +297,34 @@ macro_rules! noise_table {
 }
 
 noise_table!(
-    /// Noise of a displacement readout.
-    DisplacementNoise, DisplacementTerm, asd_m_rthz, DisplacementLine, amplitude_m, "m"
+    "a displacement readout",
+    DisplacementNoise,
+    DisplacementTerm,
+    asd_m_rthz,
+    DisplacementLine,
+    amplitude_m,
+    "m"
+);
+noise_table!("an angle readout", AngleNoise, AngleTerm, asd_rad_rthz, AngleLine, amplitude_rad, "rad");
+noise_table!("a force", ForceNoise, ForceTerm, asd_n_rthz, ForceLine, amplitude_n, "N");
+noise_table!("a torque", TorqueNoise, TorqueTerm, asd_nm_rthz, TorqueLine, amplitude_nm, "N m");
+noise_table!(
+    "an acceleration",
+    AccelerationNoise,
+    AccelerationTerm,
+    asd_m_s2_rthz,
+    AccelerationLine,
+    amplitude_m_s2,
+    "m s⁻²"
 );
 noise_table!(
-    /// Noise of an angle readout.
-    AngleNoise, AngleTerm, asd_rad_rthz, AngleLine, amplitude_rad, "rad"
-);
-noise_table!(
-    /// Noise of a force.
-    ForceNoise, ForceTerm, asd_n_rthz, ForceLine, amplitude_n, "N"
-);
-noise_table!(
-    /// Noise of a torque.
-    TorqueNoise, TorqueTerm, asd_nm_rthz, TorqueLine, amplitude_nm, "N m"
-);
-noise_table!(
-    /// Noise of an acceleration.
-    AccelerationNoise, AccelerationTerm, asd_m_s2_rthz, AccelerationLine, amplitude_m_s2, "m s⁻²"
-);
-noise_table!(
-    /// Noise of an angular acceleration.
-    AngularAccelerationNoise, AngularAccelerationTerm, asd_rad_s2_rthz, AngularAccelerationLine, amplitude_rad_s2, "rad s⁻²"
+    "an angular acceleration",
+    AngularAccelerationNoise,
+    AngularAccelerationTerm,
+    asd_rad_s2_rthz,
+    AngularAccelerationLine,
+    amplitude_rad_s2,
+    "rad s⁻²"
 );
 
 /// `[solar_pressure]` (eqs SRP_transfer_function and SRP_torque).

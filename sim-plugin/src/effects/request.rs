@@ -6,6 +6,7 @@ use std::fmt::{self, Display};
 use super::{Basis, Cause, catalogue};
 
 /// Why an effect was refused.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum EffectError {
     /// The text does not have the form of an effect.
@@ -13,62 +14,19 @@ pub enum EffectError {
     Form(String),
     /// No effect of that name.
     #[error("effect {text}: there is no effect {id}; there are {list}", list = list())]
-    Unknown {
-        /// What was requested.
-        text: String,
-        /// Its id.
-        id: String,
-    },
+    Unknown { text: String, id: String },
     /// The effect has no such instance.
     #[error("effect {text}: {id} has no instance {instance}; it has {has}.\n{id}: {about}")]
-    Instance {
-        /// What was requested.
-        text: String,
-        /// Id of the effect.
-        id: &'static str,
-        /// The instance.
-        instance: String,
-        /// The instances there are.
-        has: String,
-        /// Description of the effect.
-        about: String,
-    },
+    Instance { text: String, id: &'static str, instance: String, has: String, about: String },
     /// The effect has no such shape parameter.
     #[error("effect {text}: {id} has no parameter {name}; it has {has}")]
-    Parameter {
-        /// What was requested.
-        text: String,
-        /// Id of the effect.
-        id: &'static str,
-        /// The name.
-        name: String,
-        /// The parameters there are.
-        has: String,
-    },
+    Parameter { text: String, id: &'static str, name: String, has: String },
     /// A value is not a number or out of range.
     #[error("effect {text}: {what} = {value} must be a number from {minimum:e} to {maximum:e} {unit}")]
-    Value {
-        /// What was requested.
-        text: String,
-        /// Size or parameter.
-        what: String,
-        /// As written.
-        value: String,
-        /// Smallest.
-        minimum: f64,
-        /// Largest.
-        maximum: f64,
-        /// SI unit.
-        unit: &'static str,
-    },
+    Value { text: String, what: String, value: String, minimum: f64, maximum: f64, unit: &'static str },
     /// The mission lacks a section that the effect needs.
     #[error("effect {text}: {source}")]
-    Mission {
-        /// What was requested.
-        text: String,
-        /// What is missing.
-        source: MissionError,
-    },
+    Mission { text: String, source: MissionError },
 }
 
 /// Instance of an effect. Test masses count from 0 in the order of their names, axes and angles too: x, y, z and φ, θ,

@@ -22,6 +22,7 @@ use spk::SpkError;
 pub use motion::State;
 
 /// Why an orbit is not available.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum OrbitError {
     /// The mission's `[orbit]`.
@@ -38,16 +39,7 @@ pub enum OrbitError {
         "missing ephemeris span: {what} {when} UTC lies outside the ephemeris, DE440 from {first} to {last} TDB; \
          choose a time within it"
     )]
-    Span {
-        /// What the time is of.
-        what: &'static str,
-        /// The time, UTC.
-        when: String,
-        /// Start of the span, TDB.
-        first: String,
-        /// End of the span, TDB.
-        last: String,
-    },
+    Span { what: &'static str, when: String, first: String, last: String },
 }
 
 /// The surroundings of one spacecraft at one instant.
