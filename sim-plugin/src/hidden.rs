@@ -1,4 +1,4 @@
-//! What `--hidden SEED` hides: effects drawn by the seed alone, so large that the days at hand show them at 3σ to 30σ.
+//! Effects that `--hidden SEED` adds: drawn from the seed alone, with sizes of 3σ to 30σ for the simulated time.
 
 use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
@@ -7,313 +7,224 @@ use serde_json::{Value, json};
 use crate::effects::EffectRequest;
 use crate::random::stream;
 
-/// Expected significance of what is drawn.
+/// Smallest and largest expected significance of an effect.
 const SIGNIFICANCE: (f64, f64) = (3.0, 30.0);
-/// Chances of nothing, of a pair and of a kind that no bundled effect covers; the rest is one effect alone.
+/// Probabilities of no effect, of a pair, and of an effect that no bundled one models; otherwise there is one effect.
 const NOTHING: f64 = 0.1;
 const PAIR: f64 = 0.15;
 const UNCOVERED: f64 = 0.1;
 
-/// A kind of effect as it is drawn.
+/// An effect in the table, with the range of its size.
 struct Row {
     id: &'static str,
-    /// Whether a bundled effect covers it.
+    /// Whether a bundled effect models it.
     covered: bool,
-    /// The shape parameter that carries the drawn size in place of SIZE, which is then 0.
+    /// Shape parameter that takes the drawn amount in place of SIZE, which is then 0.
     carrier: Option<&'static str>,
-    /// Smallest and largest size with physical sense (design: the effects' table, and the parameters' sources).
+    /// Physical range of the amount.
     range: (f64, f64),
-    /// Sizes count from here: 1 for a factor of noise.
+    /// SIZE without an effect: 1 for a factor of noise.
     origin: f64,
-    /// Either sign is drawn.
+    /// Whether the amount may be negative.
     signed: bool,
-    /// Below six hours and beyond a day σ falls with time to this power.
+    /// Exponent of the decrease of σ with time, below six hours and beyond a day.
     power: f64,
-    /// Shorter simulations may not see it at all.
+    /// Minimum duration of a simulation, days.
     least_days: f64,
-    /// A shape parameter that is drawn between the first and the last of these values, where σ is known.
+    /// Shape parameter, drawn between the first and the last of these values, and the values at which σ is tabulated.
     shape: Option<(&'static str, &'static [f64])>,
-    /// σ of the size after six hours and after a day by instance, `{N}` in place of the name of the test mass N, at
-    /// each value of the shape parameter. What is slow gains much more between the two than a root of four.
-    sigma: &'static [(&'static str, &'static [[f64; 2]])],
+    /// Instances, with `{N}` for the name of test mass N.
+    places: &'static [&'static str],
+    /// σ of the size after six hours and after a day: for each place, for each value of the shape parameter.
+    sigma: &'static [f64],
 }
 
-const PLAIN: Row = Row {
-    id: "",
-    covered: true,
-    carrier: None,
-    range: (0.0, f64::INFINITY),
-    origin: 0.0,
-    signed: true,
-    power: 0.5,
-    least_days: 0.0,
-    shape: None,
-    sigma: &[],
-};
+const SC_AXES: &[&str] = &["sc.x", "sc.y", "sc.z"];
+const TEST_MASSES: &[&str] = &["{0}", "{1}"];
+const TM_YZ: &[&str] = &["{0}.y", "{0}.z", "{1}.y", "{1}.z"];
+const TM_AXES: &[&str] = &["{0}.x", "{0}.y", "{0}.z", "{1}.x", "{1}.y", "{1}.z"];
 
-// σ: printed by the example `expected_sigma` for the bundled mission, after the offsets, a constant and a slope are
-// fitted. Not here, as three σ lie beyond their range whatever the days: stiffness and cross-stiffness, solar-pressure
-// (a constant but for the Sun's slow motion), an offset that follows the propellant, capacitive readout into x, which
-// no residual uses. Nor mps-correlation: at no size is the noise the mission's own, and its correlation has no size, so
-// no significance.
+/// A kind of either sign that a bundled effect covers, without a shape parameter; σ falls as the root of the time.
+const fn row(id: &'static str, range: (f64, f64), places: &'static [&'static str], sigma: &'static [f64]) -> Row {
+    Row {
+        id,
+        covered: true,
+        carrier: None,
+        range,
+        origin: 0.0,
+        signed: true,
+        power: 0.5,
+        least_days: 0.0,
+        shape: None,
+        places,
+        sigma,
+    }
+}
+
+// σ is printed by the example `expected_sigma` for the bundled mission, with offsets, a constant and a slope fitted.
+// Effects are missing whose range never reaches three σ: stiffness, cross-stiffness, solar-pressure, an offset that
+// follows the propellant, and capacitive readout into x, which no residual uses. mps-correlation has no size whose
+// significance could be stated.
 const ROWS: &[Row] = &[
     Row {
-        id: "offset-drift",
-        range: (2.3e-10, 5.8e-8),
         power: 1.5,
-        sigma: &[("sc.x", &[[1.78e-7, 2.21e-8]]), ("sc.y", &[[1.48e-7, 1.84e-8]]), ("sc.z", &[[8.73e-8, 1.09e-8]])],
-        ..PLAIN
+        ..row("offset-drift", (2.3e-10, 5.8e-8), SC_AXES, &[1.78e-7, 2.21e-8, 1.48e-7, 1.84e-8, 8.73e-8, 1.09e-8])
     },
     Row {
-        id: "offset-drift",
         carrier: Some("kappa_m_k"),
-        range: (1.0e-6, 2.0e-5),
-        sigma: &[("sc.x", &[[1.04e-4, 1.45e-5]]), ("sc.y", &[[1.25e-4, 1.76e-5]]), ("sc.z", &[[1.64e-4, 2.45e-5]])],
-        ..PLAIN
+        ..row("offset-drift", (1.0e-6, 2.0e-5), SC_AXES, &[1.04e-4, 1.45e-5, 1.25e-4, 1.76e-5, 1.64e-4, 2.45e-5])
     },
-    Row {
-        id: "opening-angle",
-        range: (1.0e-3, 1.5e-2),
-        sigma: &[("{0}", &[[3.83e-3, 1.92e-3]]), ("{1}", &[[3.83e-3, 1.92e-3]])],
-        ..PLAIN
-    },
-    Row {
-        id: "es-gain",
-        range: (5.0e-3, 2.0e-1),
-        sigma: &[
-            ("{0}.y", &[[1.09e-2, 5.75e-3]]),
-            ("{0}.z", &[[2.61e-2, 1.31e-2]]),
-            ("{1}.y", &[[1.15e-2, 5.87e-3]]),
-            ("{1}.z", &[[2.61e-2, 1.31e-2]]),
+    row("opening-angle", (1.0e-3, 1.5e-2), TEST_MASSES, &[3.83e-3, 1.92e-3, 3.83e-3, 1.92e-3]),
+    row("es-gain", (5.0e-3, 2.0e-1), TM_YZ, &[1.09e-2, 5.75e-3, 2.61e-2, 1.31e-2, 1.15e-2, 5.87e-3, 2.61e-2, 1.31e-2]),
+    row(
+        "es-crosstalk",
+        (3.0e-3, 5.0e-2),
+        &["{0}.y-x", "{0}.y-z", "{0}.z-x", "{0}.z-y", "{1}.y-x", "{1}.y-z", "{1}.z-x", "{1}.z-y"],
+        &[
+            2.05e-3, 1.03e-3, 1.36e-2, 7.13e-3, 2.41e-3, 1.21e-3, 2.18e-2, 1.10e-2, 2.08e-3, 1.04e-3, 1.42e-2, 7.27e-3,
+            2.42e-3, 1.21e-3, 2.18e-2, 1.10e-2,
         ],
-        ..PLAIN
-    },
+    ),
+    row("mps-gain", (1.0e-2, 1.0e-1), SC_AXES, &[9.48e-3, 4.78e-3, 7.54e-3, 3.78e-3, 1.71e-2, 8.48e-3]),
+    row("mps-tilt", (5.0e-3, 6.0e-2), SC_AXES, &[3.52e-3, 1.77e-3, 3.09e-3, 1.56e-3, 5.52e-3, 2.76e-3]),
+    row("torque-gain", (1.0e-2, 5.0e-2), SC_AXES, &[1.01e-2, 5.07e-3, 1.01e-2, 5.04e-3, 1.08e-2, 5.35e-3]),
     Row {
-        id: "es-crosstalk",
-        range: (3.0e-3, 5.0e-2),
-        sigma: &[
-            ("{0}.y-x", &[[2.05e-3, 1.03e-3]]),
-            ("{0}.y-z", &[[1.36e-2, 7.13e-3]]),
-            ("{0}.z-x", &[[2.41e-3, 1.21e-3]]),
-            ("{0}.z-y", &[[2.18e-2, 1.10e-2]]),
-            ("{1}.y-x", &[[2.08e-3, 1.04e-3]]),
-            ("{1}.y-z", &[[1.42e-2, 7.27e-3]]),
-            ("{1}.z-x", &[[2.42e-3, 1.21e-3]]),
-            ("{1}.z-y", &[[2.18e-2, 1.10e-2]]),
-        ],
-        ..PLAIN
-    },
-    Row {
-        id: "mps-gain",
-        range: (1.0e-2, 1.0e-1),
-        sigma: &[("sc.x", &[[9.48e-3, 4.78e-3]]), ("sc.y", &[[7.54e-3, 3.78e-3]]), ("sc.z", &[[1.71e-2, 8.48e-3]])],
-        ..PLAIN
-    },
-    Row {
-        id: "mps-tilt",
-        range: (5.0e-3, 6.0e-2),
-        sigma: &[("sc.x", &[[3.52e-3, 1.77e-3]]), ("sc.y", &[[3.09e-3, 1.56e-3]]), ("sc.z", &[[5.52e-3, 2.76e-3]])],
-        ..PLAIN
-    },
-    Row {
-        id: "torque-gain",
-        range: (1.0e-2, 5.0e-2),
-        sigma: &[("sc.x", &[[1.01e-2, 5.07e-3]]), ("sc.y", &[[1.01e-2, 5.04e-3]]), ("sc.z", &[[1.08e-2, 5.35e-3]])],
-        ..PLAIN
-    },
-    Row {
-        id: "mps-noise",
-        range: (3.0e-1, 2.0),
         origin: 1.0,
         signed: false,
-        sigma: &[("sc.x", &[[3.35e-3, 1.67e-3]]), ("sc.y", &[[4.81e-3, 2.41e-3]]), ("sc.z", &[[1.95e-2, 9.77e-3]])],
-        ..PLAIN
+        ..row("mps-noise", (3.0e-1, 2.0), SC_AXES, &[3.35e-3, 1.67e-3, 4.81e-3, 2.41e-3, 1.95e-2, 9.77e-3])
     },
     Row {
-        id: "torque-noise",
-        range: (3.0e-1, 2.0),
         origin: 1.0,
         signed: false,
-        sigma: &[("sc.x", &[[1.32e-2, 6.61e-3]]), ("sc.y", &[[1.32e-2, 6.61e-3]]), ("sc.z", &[[1.40e-2, 6.99e-3]])],
-        ..PLAIN
+        ..row("torque-noise", (3.0e-1, 2.0), SC_AXES, &[1.32e-2, 6.61e-3, 1.32e-2, 6.61e-3, 1.40e-2, 6.99e-3])
     },
     Row {
-        id: "is-noise",
-        range: (3.0e-1, 2.0),
         origin: 1.0,
         signed: false,
-        sigma: &[
-            ("{0}.y", &[[1.52e-3, 7.61e-4]]),
-            ("{0}.z", &[[1.53e-3, 7.63e-4]]),
-            ("{1}.y", &[[1.52e-3, 7.61e-4]]),
-            ("{1}.z", &[[1.53e-3, 7.63e-4]]),
+        ..row(
+            "is-noise",
+            (3.0e-1, 2.0),
+            TM_YZ,
+            &[1.52e-3, 7.61e-4, 1.53e-3, 7.63e-4, 1.52e-3, 7.61e-4, 1.53e-3, 7.63e-4],
+        )
+    },
+    row("is-scale", (3.0e-3, 1.0e-1), TM_YZ, &[1.07e-2, 5.37e-3, 1.34e-2, 6.87e-3, 1.06e-2, 5.50e-3, 1.35e-2, 6.86e-3]),
+    row(
+        "is-crosstalk",
+        (3.0e-3, 1.0e-1),
+        &["{0}.x-y", "{0}.x-z", "{0}.y-z", "{0}.z-y", "{1}.x-y", "{1}.x-z", "{1}.y-z", "{1}.z-y"],
+        &[
+            5.93e-2, 3.09e-2, 6.99e-2, 3.61e-2, 1.34e-2, 6.74e-3, 1.06e-2, 5.42e-3, 4.04e-2, 3.08e-2, 5.17e-2, 3.61e-2,
+            1.34e-2, 6.89e-3, 1.05e-2, 5.39e-3,
         ],
-        ..PLAIN
-    },
+    ),
+    row("tilt-to-length", (1.0e-4, 3.0e-3), TEST_MASSES, &[7.79e-4, 3.87e-4, 8.05e-4, 4.02e-4]),
     Row {
-        id: "is-scale",
-        range: (3.0e-3, 1.0e-1),
-        sigma: &[
-            ("{0}.y", &[[1.07e-2, 5.37e-3]]),
-            ("{0}.z", &[[1.34e-2, 6.87e-3]]),
-            ("{1}.y", &[[1.06e-2, 5.50e-3]]),
-            ("{1}.z", &[[1.35e-2, 6.86e-3]]),
-        ],
-        ..PLAIN
-    },
-    Row {
-        id: "is-crosstalk",
-        range: (3.0e-3, 1.0e-1),
-        sigma: &[
-            ("{0}.x-y", &[[5.93e-2, 3.09e-2]]),
-            ("{0}.x-z", &[[6.99e-2, 3.61e-2]]),
-            ("{0}.y-z", &[[1.34e-2, 6.74e-3]]),
-            ("{0}.z-y", &[[1.06e-2, 5.42e-3]]),
-            ("{1}.x-y", &[[4.04e-2, 3.08e-2]]),
-            ("{1}.x-z", &[[5.17e-2, 3.61e-2]]),
-            ("{1}.y-z", &[[1.34e-2, 6.89e-3]]),
-            ("{1}.z-y", &[[1.05e-2, 5.39e-3]]),
-        ],
-        ..PLAIN
-    },
-    Row {
-        id: "tilt-to-length",
-        range: (1.0e-4, 3.0e-3),
-        sigma: &[("{0}", &[[7.79e-4, 3.87e-4]]), ("{1}", &[[8.05e-4, 4.02e-4]])],
-        ..PLAIN
-    },
-    Row {
-        id: "time-offset",
-        range: (1.0e-3, 1.0e-1),
         signed: false,
-        sigma: &[("is", &[[2.20e-2, 1.16e-2]]), ("ifo", &[[5.13e-4, 2.57e-4]]), ("dws", &[[5.87e-3, 2.91e-3]])],
-        ..PLAIN
+        ..row(
+            "time-offset",
+            (1.0e-3, 1.0e-1),
+            &["is", "ifo", "dws"],
+            &[2.20e-2, 1.16e-2, 5.13e-4, 2.57e-4, 5.87e-3, 2.91e-3],
+        )
     },
     Row {
-        id: "thermal",
-        range: (0.0, 5.0e-11),
         shape: Some(("lag_s", &[60.0, 480.0, 3000.0])),
-        sigma: &[
-            ("{0}.x", &[[5.59e-12, 7.23e-13], [4.25e-12, 8.58e-13], [7.39e-12, 1.83e-12]]),
-            ("{0}.y", &[[8.65e-12, 1.53e-12], [7.06e-12, 1.78e-12], [1.41e-11, 3.02e-12]]),
-            ("{0}.z", &[[8.73e-12, 2.37e-12], [6.99e-12, 2.67e-12], [5.92e-12, 3.31e-12]]),
-            ("{1}.x", &[[4.97e-12, 9.05e-13], [4.11e-12, 1.06e-12], [6.42e-12, 2.03e-12]]),
-            ("{1}.y", &[[9.25e-12, 1.28e-12], [7.97e-12, 1.55e-12], [1.83e-11, 3.55e-12]]),
-            ("{1}.z", &[[9.05e-12, 3.02e-12], [8.52e-12, 3.44e-12], [8.89e-12, 5.73e-12]]),
-        ],
-        ..PLAIN
+        ..row(
+            "thermal",
+            (0.0, 5.0e-11),
+            TM_AXES,
+            &[
+                5.59e-12, 7.23e-13, 4.25e-12, 8.58e-13, 7.39e-12, 1.83e-12, 8.65e-12, 1.53e-12, 7.06e-12, 1.78e-12,
+                1.41e-11, 3.02e-12, 8.73e-12, 2.37e-12, 6.99e-12, 2.67e-12, 5.92e-12, 3.31e-12, 4.97e-12, 9.05e-13,
+                4.11e-12, 1.06e-12, 6.42e-12, 2.03e-12, 9.25e-12, 1.28e-12, 7.97e-12, 1.55e-12, 1.83e-11, 3.55e-12,
+                9.05e-12, 3.02e-12, 8.52e-12, 3.44e-12, 8.89e-12, 5.73e-12,
+            ],
+        )
     },
+    row("magnetic", (0.0, 1.0e-4), TEST_MASSES, &[3.11e-4, 2.29e-5, 3.23e-4, 2.42e-5]),
     Row {
-        id: "magnetic",
-        range: (0.0, 1.0e-4),
-        sigma: &[("{0}", &[[3.11e-4, 2.29e-5]]), ("{1}", &[[3.23e-4, 2.42e-5]])],
-        ..PLAIN
-    },
-    Row {
-        id: "magnetic",
         carrier: Some("moment_a_m2"),
-        range: (0.0, 2.0e-8),
-        sigma: &[("{0}", &[[6.29e-8, 2.04e-9]]), ("{1}", &[[6.98e-8, 2.28e-9]])],
-        ..PLAIN
+        ..row("magnetic", (0.0, 2.0e-8), TEST_MASSES, &[6.29e-8, 2.04e-9, 6.98e-8, 2.28e-9])
     },
+    row("charge", (0.0, 1.0e-1), TEST_MASSES, &[4.12e-3, 2.40e-3, 7.42e-3, 2.23e-3]),
     Row {
-        id: "charge",
-        range: (0.0, 1.0e-1),
-        sigma: &[("{0}", &[[4.12e-3, 2.40e-3]]), ("{1}", &[[7.42e-3, 2.23e-3]])],
-        ..PLAIN
-    },
-    Row {
-        id: "slosh",
-        range: (1.0e-3, 5.0e-2),
         signed: false,
         shape: Some(("f0_hz", &[0.005, 0.012, 0.03, 0.08, 0.2])),
-        sigma: &[
-            (
-                "sc.x",
-                &[[4.07e-3, 2.04e-3], [4.06e-3, 2.04e-3], [3.90e-3, 1.96e-3], [2.29e-3, 1.16e-3], [1.16e-3, 5.85e-4]],
-            ),
-            (
-                "sc.y",
-                &[[4.61e-3, 2.30e-3], [4.59e-3, 2.29e-3], [4.32e-3, 2.16e-3], [2.38e-3, 1.15e-3], [7.53e-4, 3.76e-4]],
-            ),
-        ],
-        ..PLAIN
+        ..row(
+            "slosh",
+            (1.0e-3, 5.0e-2),
+            &["sc.x", "sc.y"],
+            &[
+                4.07e-3, 2.04e-3, 4.06e-3, 2.04e-3, 3.90e-3, 1.96e-3, 2.29e-3, 1.16e-3, 1.16e-3, 5.85e-4, 4.61e-3,
+                2.30e-3, 4.59e-3, 2.29e-3, 4.32e-3, 2.16e-3, 2.38e-3, 1.15e-3, 7.53e-4, 3.76e-4,
+            ],
+        )
     },
     Row {
-        id: "impulse",
-        range: (0.0, 2.0e-4),
         power: 0.0,
-        sigma: &[("sc.x", &[[4.43e-8, 4.43e-8]]), ("sc.y", &[[5.49e-8, 5.49e-8]]), ("sc.z", &[[1.72e-7, 1.72e-7]])],
-        ..PLAIN
+        ..row("impulse", (0.0, 2.0e-4), SC_AXES, &[4.43e-8, 4.43e-8, 5.49e-8, 5.49e-8, 1.72e-7, 1.72e-7])
     },
     Row {
-        id: "impulse",
-        range: (0.0, 1.0e-4),
         least_days: 0.25,
-        sigma: &[
-            ("sc.phi", &[[1.29e-7, 7.12e-8]]),
-            ("sc.theta", &[[1.29e-7, 7.12e-8]]),
-            ("sc.psi", &[[1.30e-7, 7.20e-8]]),
-        ],
-        ..PLAIN
+        ..row(
+            "impulse",
+            (0.0, 1.0e-4),
+            &["sc.phi", "sc.theta", "sc.psi"],
+            &[1.29e-7, 7.12e-8, 1.29e-7, 7.12e-8, 1.30e-7, 7.20e-8],
+        )
     },
     Row {
-        id: "impulse",
-        range: (0.0, 2.0e-9),
         power: 0.0,
-        sigma: &[
-            ("{0}.x", &[[1.63e-12, 1.64e-12]]),
-            ("{0}.y", &[[1.91e-12, 1.91e-12]]),
-            ("{0}.z", &[[2.62e-12, 2.62e-12]]),
-            ("{1}.x", &[[1.63e-12, 1.64e-12]]),
-            ("{1}.y", &[[1.91e-12, 1.91e-12]]),
-            ("{1}.z", &[[2.62e-12, 2.62e-12]]),
-        ],
-        ..PLAIN
+        ..row(
+            "impulse",
+            (0.0, 2.0e-9),
+            TM_AXES,
+            &[
+                1.63e-12, 1.64e-12, 1.91e-12, 1.91e-12, 2.62e-12, 2.62e-12, 1.63e-12, 1.64e-12, 1.91e-12, 1.91e-12,
+                2.62e-12, 2.62e-12,
+            ],
+        )
     },
     Row {
-        id: "current-force",
         covered: false,
-        range: (0.0, 1.0e-12),
-        sigma: &[
-            ("{0}.x", &[[1.64e-14, 6.05e-16]]),
-            ("{0}.y", &[[1.99e-14, 6.94e-16]]),
-            ("{0}.z", &[[2.74e-14, 9.46e-16]]),
-            ("{1}.x", &[[1.64e-14, 6.05e-16]]),
-            ("{1}.y", &[[1.99e-14, 6.94e-16]]),
-            ("{1}.z", &[[2.74e-14, 9.46e-16]]),
-        ],
-        ..PLAIN
+        ..row(
+            "current-force",
+            (0.0, 1.0e-12),
+            TM_AXES,
+            &[
+                1.64e-14, 6.05e-16, 1.99e-14, 6.94e-16, 2.74e-14, 9.46e-16, 1.64e-14, 6.05e-16, 1.99e-14, 6.94e-16,
+                2.74e-14, 9.46e-16,
+            ],
+        )
     },
     Row {
-        id: "product-force",
         covered: false,
-        range: (0.0, 1.0e-12),
-        sigma: &[
-            ("{0}.x", &[[2.75e-13, 6.86e-15]]),
-            ("{0}.y", &[[3.31e-13, 7.87e-15]]),
-            ("{0}.z", &[[4.55e-13, 1.07e-14]]),
-            ("{1}.x", &[[2.75e-13, 6.86e-15]]),
-            ("{1}.y", &[[3.31e-13, 7.87e-15]]),
-            ("{1}.z", &[[4.55e-13, 1.07e-14]]),
-        ],
-        ..PLAIN
+        ..row(
+            "product-force",
+            (0.0, 1.0e-12),
+            TM_AXES,
+            &[
+                2.75e-13, 6.86e-15, 3.31e-13, 7.87e-15, 4.55e-13, 1.07e-14, 2.75e-13, 6.86e-15, 3.31e-13, 7.87e-15,
+                4.55e-13, 1.07e-14,
+            ],
+        )
     },
 ];
 
-/// One effect that was drawn.
+/// A drawn effect.
 #[derive(Clone, Debug)]
 pub struct Drawn {
     /// The effect.
     pub request: EffectRequest,
     covered: bool,
-    /// What was drawn, in the unit of `sigma`, counted from where the effect vanishes.
+    /// Drawn amount in the unit of `sigma`; zero is no effect.
     pub amount: f64,
     /// Expected standard deviation of the amount.
     pub sigma: f64,
 }
 
-/// Everything that a seed hides.
+/// All effects that a seed hides.
 #[derive(Clone, Debug)]
 pub struct Hidden {
     seed: u64,
@@ -344,7 +255,7 @@ impl Hidden {
         Self { seed, drawn, salt }
     }
 
-    /// What is sealed, with what the caller adds.
+    /// Content of the sealed document, with the caller's members.
     #[must_use]
     pub fn content(&self, more: &Value) -> Value {
         let effects: Vec<Value> = self.drawn.iter().map(Drawn::content).collect();
@@ -380,6 +291,12 @@ impl Drawn {
 }
 
 impl Row {
+    /// Places with their σ at each value of the shape parameter.
+    fn sigmas(&self) -> impl Iterator<Item = (&'static str, &'static [[f64; 2]])> {
+        let (pairs, _) = self.sigma.as_chunks::<2>();
+        self.places.iter().copied().zip(pairs.chunks_exact(self.shape.map_or(1, |(_, grid)| grid.len())))
+    }
+
     /// σ after `days` at one value of the shape parameter.
     fn after(&self, [six_hours, day]: [f64; 2], days: f64) -> f64 {
         let known = days.clamp(0.25, 1.0);
@@ -387,7 +304,7 @@ impl Row {
         between * (known / days).powf(self.power)
     }
 
-    /// The same at any value of it, by log-log interpolation.
+    /// σ after `days` at any value of the shape parameter, by log-log interpolation.
     fn sigma_at(&self, sigma: &[[f64; 2]], value: f64, days: f64) -> f64 {
         let Some((_, grid)) = self.shape else { return self.after(sigma[0], days) };
         let i = grid.partition_point(|x| *x <= value).clamp(1, grid.len() - 1);
@@ -397,8 +314,8 @@ impl Row {
     }
 }
 
-/// Sizes that are both physical and seen: where even the smallest physical one stands out more, from it up to three
-/// times as much. `None` where the largest is not seen.
+/// Amounts in the physical range with a significance in [`SIGNIFICANCE`]; if even the smallest physical amount exceeds
+/// it, up to three times that. `None` if the largest physical amount is not significant.
 fn interval(row: &Row, sigma: f64) -> Option<(f64, f64)> {
     let (seen, glaring) = (SIGNIFICANCE.0 * sigma, SIGNIFICANCE.1 * sigma);
     let (least, most) = row.range;
@@ -416,7 +333,7 @@ fn log_uniform(rng: &mut Xoshiro256PlusPlus, (least, most): (f64, f64)) -> f64 {
 }
 
 fn pick<'a, T>(rng: &mut Xoshiro256PlusPlus, from: &'a [T]) -> Option<&'a T> {
-    // Never the length itself: random() is below 1.
+    // random() is below 1, so the index is below the length.
     from.get((rng.random::<f64>() * from.len() as f64) as usize)
 }
 
@@ -435,16 +352,15 @@ fn draw_one(
     test_masses: &[String],
     wanted: impl Fn(&Row) -> bool,
 ) -> Option<Drawn> {
-    // A place where the effect is seen whatever its shape.
+    // An instance at which the effect is significant at every value of the shape parameter.
     let seen = |row: &Row, (place, sigma): &(&str, &[[f64; 2]])| {
         instance(place, test_masses).is_some() && sigma.iter().all(|s| interval(row, row.after(*s, days)).is_some())
     };
-    let rows: Vec<&Row> = ROWS
-        .iter()
-        .filter(|row| wanted(row) && days >= row.least_days && row.sigma.iter().any(|place| seen(row, place)))
-        .collect();
+    let places = |row: &Row| row.sigmas().filter(|place| seen(row, place)).collect::<Vec<_>>();
+    let rows: Vec<&Row> =
+        ROWS.iter().filter(|row| wanted(row) && days >= row.least_days && !places(row).is_empty()).collect();
     let row = *pick(rng, &rows)?;
-    let places: Vec<_> = row.sigma.iter().filter(|place| seen(row, place)).collect();
+    let places = places(row);
     let (place, sigmas) = pick(rng, &places)?;
     let shape = row.shape.map(|(name, grid)| (name, log_uniform(rng, (grid[0], grid[grid.len() - 1]))));
     let sigma = row.sigma_at(sigmas, shape.map_or(1.0, |(_, value)| value), days);
@@ -535,15 +451,16 @@ mod tests {
     #[test]
     fn the_table_names_effects_that_exist() {
         for row in ROWS {
-            for (place, sigma) in row.sigma {
+            let grid = row.shape.map_or(1, |(_, grid)| grid.len());
+            assert_eq!(row.sigma.len(), 2 * grid * row.places.len(), "{}", row.id);
+            for (place, sigma) in row.sigmas() {
                 let place = instance(place, &both()).unwrap();
                 EffectRequest::parse(&format!("{}:{place}={}", row.id, row.origin), &both()).unwrap();
-                assert_eq!(sigma.len(), row.shape.map_or(1, |(_, grid)| grid.len()), "{} {place}", row.id);
                 // More time tells at least as much, to the three digits that are printed.
                 assert!(sigma.iter().all(|[six, day]| 0.0 < *day && *day <= 1.01 * six && six.is_finite()));
             }
             for name in row.carrier.into_iter().chain(row.shape.map(|(name, _)| name)) {
-                let place = instance(row.sigma[0].0, &both()).unwrap();
+                let place = instance(row.places[0], &both()).unwrap();
                 EffectRequest::parse(&format!("{}:{place}={},{name}=1e-12", row.id, row.origin), &both())
                     .map_or_else(|e| assert!(!e.to_string().contains("no parameter"), "{e}"), drop);
             }

@@ -1,4 +1,4 @@
-//! Housekeeping scalars: what sensors tell about the inside of the spacecraft, and channels that mean nothing.
+//! Housekeeping scalars: readings of the spacecraft's interior, and decoy channels unrelated to any effect.
 
 use dragfree_physics::noise::{NoiseShape, NoiseTerm};
 use dragfree_physics::process::NoiseProcess;
@@ -6,15 +6,16 @@ use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use std::f64::consts::TAU;
 
+use crate::effects::fill;
 use crate::interior::{FIELD_T, GRADIENT_T_M, Interior, of_housing};
 
-/// One scalar: where it is measured, what it is, how often.
+/// A housekeeping scalar.
 pub struct Channel {
     /// Name behind `hk/`.
     pub name: String,
     /// Unit.
     pub unit: &'static str,
-    /// Place on the spacecraft.
+    /// Location on the spacecraft.
     pub place: String,
     /// Rate, Hz.
     pub rate_hz: f64,
@@ -25,11 +26,11 @@ pub struct Channel {
     source: Source,
 }
 
-/// Where a value comes from.
+/// Source of a value.
 enum Source {
-    /// A state.
+    /// A state of the interior.
     State(Read),
-    /// Nothing that matters: a level, a cycle by amplitude and period (s), and a drift by its ASD at 10 µHz.
+    /// A decoy: level, cycle by amplitude and period (s), and drift by its ASD at 10 µHz.
     Decoy { level: f64, cycle: (f64, f64), drift: f64 },
 }
 
@@ -81,8 +82,7 @@ fn face(i: &Interior, tm: usize, axis: usize, side: f64) -> f64 {
     i.housing_k[tm] + 0.5 * side * i.across_k[tm][axis]
 }
 
-/// Field at a magnetometer beside a test mass, SRF as mounted: the field from outside and that of the units, which is
-/// as strong there but turned.
+/// Field at a magnetometer beside a test mass, SRF: the external field, and that of the units with its axes permuted.
 fn field(i: &Interior, tm: usize, axis: usize) -> f64 {
     i.interplanetary_t[axis] + i.units_field[tm] * of_housing(&FIELD_T, tm)[(axis + 1) % 3]
 }
@@ -95,7 +95,7 @@ fn valve(i: &Interior, thruster: usize) -> f64 {
     0.04 + 3e3 * i.thrust_n[thruster]
 }
 
-/// What is downlinked of a spacecraft with these test masses.
+/// Housekeeping channels of a spacecraft with these test masses.
 #[must_use]
 pub fn channels(test_masses: &[String]) -> Vec<Channel> {
     let housings = 0..test_masses.len();
@@ -209,13 +209,13 @@ impl Housekeeping {
         Self { channels, every, processes, phases, rng, dt_s }
     }
 
-    /// What is sampled.
+    /// The channels.
     #[must_use]
     pub fn channels(&self) -> &[Channel] {
         &self.channels
     }
 
-    /// Gives the values due at an epoch with their index in [`Self::channels`].
+    /// Passes the values due at an epoch to `give`, with their index in [`Self::channels`].
     pub fn read(&mut self, index: i64, inside: &Interior, mut give: impl FnMut(usize, f64)) {
         for (i, channel) in self.channels.iter().enumerate() {
             if index.rem_euclid(self.every[i]) != 0 {
@@ -239,17 +239,10 @@ impl Housekeeping {
         (self.rng.clone(), self.processes.iter().flat_map(NoiseProcess::states).collect())
     }
 
-    /// Takes back what [`Self::state`] gave; false when it is another version's.
+    /// Restores [`Self::state`]; false if the length differs.
     #[must_use]
     pub fn set_state(&mut self, (rng, states): (Xoshiro256PlusPlus, Vec<f64>)) -> bool {
-        let slots: Vec<&mut f64> = self.processes.iter_mut().flat_map(NoiseProcess::states_mut).collect();
-        if slots.len() != states.len() {
-            return false;
-        }
-        for (slot, value) in slots.into_iter().zip(states) {
-            *slot = value;
-        }
         self.rng = rng;
-        true
+        fill(self.processes.iter_mut().flat_map(NoiseProcess::states_mut), &states)
     }
 }

@@ -1,5 +1,5 @@
-//! What goes on inside the spacecraft: heat, currents, propellant, magnetic field, charge. Effects act by these states
-//! and the housekeeping reads them; without effects nothing in the loop depends on them.
+//! Interior of the spacecraft: temperatures, currents, propellant, magnetic field, charge. Effects depend on these
+//! states and the housekeeping reads them; without effects the loop does not depend on them.
 //!
 //! One step a second. Heat goes panel → structure → bench → electrode housing, each behind a first-order lag; two
 //! thermostats cycle their heaters; levels and fluctuations are those of LISA Pathfinder where it published them
@@ -12,6 +12,7 @@ use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 
+use crate::effects::fill;
 use crate::random::stream;
 
 /// Seconds of a step.
@@ -23,7 +24,7 @@ const AU_M: f64 = 149_597_870_700.0;
 const ELEMENTARY_C: f64 = 1.602_176_634e-19;
 /// Exhaust velocity of a cold-gas thruster, m/s.
 const EXHAUST_M_S: f64 = 600.0;
-/// Thrusters idle at this thrust, N, and go no lower than the next.
+/// Thrust of an idle thruster, N, and the smallest thrust.
 const BIAS_N: f64 = 15e-6;
 const LEAST_N: f64 = 2e-6;
 /// Charging by cosmic rays, elementary charges per second (23 e/s in flight), and where the UV lamp is switched on and
@@ -37,7 +38,7 @@ const DISCHARGE_S: f64 = 400.0;
 pub const FIELD_T: [[f64; 3]; 2] = [[6e-7, -4e-7, 3e-7], [-5e-7, -5e-7, 4e-7]];
 /// Gradient of the field of the units in ORF: xx, yy, xy, xz, yz.
 pub const GRADIENT_T_M: [[f64; 5]; 2] = [[8e-6, -3e-6, 2e-6, -1e-6, 3e-6], [-7e-6, 4e-6, 1e-6, 2e-6, -2e-6]];
-/// How much the field of the units grows, relative, per ampere of the battery.
+/// Relative increase of the units' field per ampere of the battery.
 const FIELD_PER_A: f64 = 0.3;
 /// Mean current of the battery, A, and what each heater takes.
 const BUS_A: f64 = 1.9;
@@ -47,7 +48,7 @@ const ANTENNA_S: (f64, f64) = (9000.0, 9000.0);
 const ANTENNA_MOVE_S: f64 = 90.0;
 /// Time constant of the outgassing, s.
 const OUTGASSING_S: f64 = 2.6e6;
-/// What each of the six thrusters takes of a thrust along SRF: the smallest forces that add up to it.
+/// Least-norm distribution of a thrust along SRF over the six thrusters.
 const DIRECTIONS: [[f64; 3]; 6] = [
     [0.577, 0.0, 0.408],
     [-0.289, 0.5, 0.408],
@@ -57,7 +58,7 @@ const DIRECTIONS: [[f64; 3]; 6] = [
     [0.289, 0.5, -0.408],
 ];
 
-/// A thermostat: the node cools towards its surroundings, and a heater with hysteresis keeps it up.
+/// A node that cools towards its surroundings, with a heater controlled with hysteresis.
 struct Thermostat {
     /// Below the structure, K.
     ambient_k: f64,
@@ -73,18 +74,18 @@ const THERMOSTATS: [Thermostat; 2] = [
     Thermostat { ambient_k: -4.0, lag_s: 30_000.0, set_k: 291.0, half_band_k: 0.05, heating_k_s: 1.3e-4 },
 ];
 
-/// Constants of a housing: those of the two that are known in turn.
+/// Constants of a housing; they repeat after the second housing.
 pub(crate) fn of_housing<T>(known: &[T; 2], housing: usize) -> &T {
     &known[housing % 2]
 }
 
-/// What the two heaters make of the difference across each axis of each housing, K when they are on for good.
+/// Steady-state temperature difference by each heater across each axis of each housing, K.
 const HEATER_ACROSS_K: [[[f64; 2]; 3]; 2] =
     [[[1.2e-3, -4e-4], [-6e-4, 9e-4], [5e-4, 7e-4]], [[-9e-4, 6e-4], [8e-4, 5e-4], [-4e-4, -8e-4]]];
 /// Standing difference across each axis, K.
 const STANDING_ACROSS_K: [[f64; 3]; 2] = [[4e-3, -7e-3, 11e-3], [-5e-3, 6e-3, 9e-3]];
 
-/// The states, all of them numbers that a sensor could read.
+/// States of the interior.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Interior {
     /// Sunlight, W/m².
@@ -111,9 +112,9 @@ pub struct Interior {
     pub battery_a: f64,
     /// Propellant left, kg.
     pub tank_kg: f64,
-    /// The same a step before, kg and, of the structure, K: what lies between two steps is a line.
+    /// Propellant a step before, kg, for linear interpolation.
     pub tank_before_kg: f64,
-    /// See [`Self::tank_before_kg`].
+    /// Temperature of the structure a step before, K.
     pub structure_before_k: f64,
     /// Propellant at the first sample, kg.
     pub tank_first_kg: f64,
@@ -137,17 +138,17 @@ pub struct Interior {
     pub antenna_moves: bool,
     /// Seconds until the antenna starts or stops.
     pub antenna_wait_s: f64,
-    /// Opening angle of the constellation, which the telescopes follow, and the same at the first sample, rad.
+    /// Opening angle of the constellation, which the telescopes follow, rad.
     pub opening_rad: f64,
-    /// See [`Self::opening_rad`].
+    /// Opening angle at the first sample, rad.
     pub opening_first_rad: f64,
 }
 
 impl Interior {
-    /// Propellant (kg) and temperature of the structure (K) without steps, one second late.
+    /// Propellant (kg) and temperature of the structure (K), interpolated linearly with a delay of one step.
     #[must_use]
     pub fn smooth(&self, elapsed_s: f64) -> (f64, f64) {
-        // Epochs are multiples of the interval to rounding.
+        // Epochs are rounded multiples of the interval.
         let part = (elapsed_s / STEP_S - (elapsed_s / STEP_S + 1e-6).floor()).max(0.0);
         let between = |before: f64, now: f64| before + (now - before) * part;
         (between(self.tank_before_kg, self.tank_kg), between(self.structure_before_k, self.structure_k))
@@ -166,7 +167,7 @@ struct Drifts {
     units: Vec<NoiseProcess>,
 }
 
-/// The running inside of the spacecraft.
+/// The running model of the interior.
 pub struct Running {
     /// The states at the coming epoch.
     pub now: Interior,
@@ -189,7 +190,7 @@ pub struct SavedInterior {
     epochs: u32,
 }
 
-/// What the outside does to the inside.
+/// External inputs of the interior.
 #[derive(Clone, Copy, Debug)]
 pub struct Influences {
     /// From the Sun, m.
@@ -200,7 +201,7 @@ pub struct Influences {
     pub opening_rad: f64,
 }
 
-/// A random walk's cousin: ASD at a frequency, falling as `1/f^(exponent/2)`.
+/// Noise of ASD `asd` at `at_hz`, falling as `1/f^(exponent/2)`.
 fn drift(asd: f64, at_hz: f64, exponent: u32) -> NoiseProcess {
     NoiseProcess::new(&NoiseShape { terms: vec![NoiseTerm { asd, corner_hz: at_hz, exponent }] }, STEP_S)
 }
@@ -235,7 +236,7 @@ impl Drifts {
 }
 
 impl Running {
-    /// The inside at the start of a simulation, with so many housings: in its cycle, wherever the seed has it.
+    /// The interior at the start of a simulation, with random phases of its cycles.
     #[must_use]
     pub fn new(seed: u64, dt_s: f64, housings: usize, influences: &Influences) -> Self {
         let mut rng = stream(seed, "interior");
@@ -280,7 +281,7 @@ impl Running {
         };
         let every = (STEP_S / dt_s).round().max(1.0) as i64;
         let mut out = Self { now, drifts, rng, every, thrust_sum_srf_n: Vector3::zeros(), epochs: 0 };
-        // The lags start where their drivers are.
+        // Start the lags settled.
         for _ in 0..3 {
             out.heat(influences, true);
         }
@@ -290,19 +291,19 @@ impl Running {
         out
     }
 
-    /// Takes note of what the thrusters did over an epoch.
+    /// Records the thrust of an epoch.
     pub fn thrust(&mut self, force_srf_n: &Vector3<f64>) {
         self.thrust_sum_srf_n += force_srf_n;
         self.epochs += 1;
     }
 
-    /// Whether the inside moves on at an epoch.
+    /// Whether a step ends at an epoch.
     #[must_use]
     pub fn due(&self, index: i64) -> bool {
         index.rem_euclid(self.every) == 0
     }
 
-    /// Moves on by a step, to an epoch.
+    /// Advances by a step, to an epoch.
     pub fn step(&mut self, index: i64, influences: &Influences) {
         (self.now.tank_before_kg, self.now.structure_before_k) = (self.now.tank_kg, self.now.structure_k);
         self.propulsion();
@@ -330,7 +331,7 @@ impl Running {
         }
     }
 
-    /// `at_once`: nodes jump to where they would settle.
+    /// `at_once`: nodes take their steady state.
     fn heat(&mut self, influences: &Influences, at_once: bool) {
         let lag = |s: f64| if at_once { 1e-9 } else { s };
         let (now, drifts, rng) = (&mut self.now, &mut self.drifts, &mut self.rng);
@@ -416,19 +417,12 @@ impl Running {
         }
     }
 
-    /// Takes back what [`Self::save`] gave; false when it is another version's.
+    /// Restores [`Self::save`]; false if the length differs.
     #[must_use]
     pub fn load(&mut self, saved: &SavedInterior) -> bool {
-        let slots: Vec<&mut f64> = self.drifts.all().flat_map(NoiseProcess::states_mut).collect();
-        if slots.len() != saved.drifts.len() {
-            return false;
-        }
-        for (slot, value) in slots.into_iter().zip(&saved.drifts) {
-            *slot = *value;
-        }
         (self.now, self.rng) = (saved.now.clone(), saved.rng.clone());
         (self.thrust_sum_srf_n, self.epochs) = (saved.thrust_sum_srf_n.into(), saved.epochs);
-        true
+        fill(self.drifts.all().flat_map(NoiseProcess::states_mut), &saved.drifts)
     }
 }
 

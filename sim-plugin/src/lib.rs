@@ -1,7 +1,6 @@
 //! Source `sim`: a day in the closed loop of a drag-free spacecraft, as telemetry and, apart from it, the truth.
 //!
-//! Truth-side physics stands here and is written from states; it shares no code with the effects that a calibration
-//! fits.
+//! The true physics is computed from states and shares no code with the effects that a calibration fits.
 
 pub mod effects;
 pub mod hidden;
@@ -31,8 +30,7 @@ use simulator::{Epoch, Settings, SimulationError, Simulator};
 /// 2035-01-01T00:00:00, where the paper's simulation starts, Unix ns.
 const DEFAULT_START_NS: i64 = 2_051_222_400_000_000_000;
 
-/// A table, its columns in the order of a row's values, and the rows of the batch at hand: a row is one copy, and a
-/// column is taken out of all of them at once.
+/// A table with its columns and the rows of the current batch, stored row by row.
 struct Topic {
     table: Table,
     columns: Vec<Out>,
@@ -66,7 +64,7 @@ impl Topic {
         &mut self.rows
     }
 
-    /// Hands the rows to the host.
+    /// Passes the rows to the host.
     fn give(&mut self, output: &mut Outputs) {
         output.time(self.table).append(&mut self.times_ns);
         let width = self.columns.len();
@@ -171,7 +169,7 @@ impl Topics {
         let housekeeping =
             housekeeping.iter().map(|c| scalar(&c.name, c.unit, &c.place, c.rate_hz)).collect::<Result<_, _>>()?;
         let at_limit = scalar("actuators_at_limit", "1", "control computer", 1.0)?;
-        // The interface numbers the test masses of the truth.
+        // The interface control document numbers the test masses of the truth.
         let numbered = |letter: &str| -> Vec<Group> {
             let of =
                 |(i, name): (usize, &String)| group(format!("{letter}{}_orf_m", i + 1), XYZ, "m", &mission.frame(name));
@@ -239,20 +237,20 @@ pub struct Sim {
     /// Samples in a second.
     every_second: i64,
     end_ns: i64,
-    /// What is hidden, for the host to seal.
+    /// Hidden effects, for the host to seal.
     sealed: Option<String>,
     topics: Option<Topics>,
     identity: [(&'static str, String); 3],
     counts: Counts,
 }
 
-/// What the report counts, epochs.
+/// Numbers of epochs, for the report.
 #[derive(Clone, Default, Serialize, Deserialize)]
 struct Counts {
     all: u64,
     /// With a command at its limit or beyond the thrusters.
     at_limit: u64,
-    /// Of those, how many no packet of `/hk/actuators_at_limit` has told yet.
+    /// Of those, the ones not yet in a packet of `/hk/actuators_at_limit`.
     untold: u64,
     /// With a capacitive readout at the end of its range.
     saturated: u64,
@@ -276,7 +274,7 @@ struct Saved {
 
 fn refuse(error: SimulationError) -> PluginError {
     match error {
-        // A lost loop stays lost.
+        // The loop does not recover.
         SimulationError::Diverged { .. } => PluginError::fatal(error.to_string()),
         other => PluginError::from(other),
     }
@@ -353,7 +351,7 @@ impl Source for Sim {
             hidden.content(&about).to_string()
         });
         simulator.constellation().check("the end of the simulation,", end_ns).map_err(|e| refuse(e.into()))?;
-        // The third stream of the seed; the loop takes the first two.
+        // The third stream of the seed; the loop uses the first two.
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         rng.long_jump();
         Ok(Self {

@@ -1,14 +1,14 @@
 //! The equations of motion of spacecraft and test masses in relative coordinates (design: the paper's Section II with
 //! the signs of `ops-guide`), and their integration over one sample.
 //!
-//! Inertial positions never appear: at one astronomical unit a float has 3e-5 m of grain.
+//! Inertial positions are not used: at one astronomical unit the resolution of a double is too coarse.
 
 use dragfree_physics::attitude::{derivative, from_rotation_vector, rotation_vector, turn, unit};
 use dragfree_physics::control::PerTestMass;
 use dragfree_physics::mission::{Mission, MissionError};
 use nalgebra::{Matrix3, Quaternion, Vector3};
 
-/// One test mass in the mission's numbers and in the truth's.
+/// Constants of a test mass.
 #[derive(Clone, Debug)]
 pub struct TestMassBody {
     /// Mass `m_m`, kg.
@@ -68,7 +68,7 @@ pub struct State {
     pub tm: PerTestMass<TestMassState>,
 }
 
-/// Numbers of the spacecraft in a [`State`], and of each test mass.
+/// Number of values of the spacecraft in a [`State`], and of each test mass.
 const SPACECRAFT_NUMBERS: usize = 7;
 const TEST_MASS_NUMBERS: usize = 13;
 
@@ -97,13 +97,13 @@ pub struct Loads {
 }
 
 impl Loads {
-    /// No loads on a spacecraft with so many test masses.
+    /// Zero loads.
     #[must_use]
     pub fn zero(test_masses: usize) -> Self {
         Self { tm: PerTestMass::from_fn(test_masses, |_| TestMassLoads::default()), ..Self::default() }
     }
 
-    /// What pushes the spacecraft, the electrodes' reaction with it, SRF, N.
+    /// Net force on the spacecraft, with the electrodes' reaction, SRF, N.
     #[must_use]
     pub fn net_force_srf_n(&self, plant: &Plant) -> Vector3<f64> {
         let pairs = plant.tm.iter().zip(&self.tm);
@@ -111,7 +111,7 @@ impl Loads {
     }
 }
 
-/// What turns and pulls from outside, over a sample.
+/// Rotation of CRF and gravity gradient over a sample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Outside {
     /// `ω_CI` at the start of the sample, CRF, rad/s.
@@ -131,7 +131,7 @@ pub struct Means {
     pub nongrav_srf_m_s2: Vector3<f64>,
 }
 
-/// Everything that stays the same within a sample, worked out once.
+/// Quantities that are constant within a sample.
 struct Held {
     torque_srf_nm: Vector3<f64>,
     nongrav_srf_m_s2: Vector3<f64>,
@@ -205,13 +205,13 @@ impl Plant {
         Held { torque_srf_nm: torque, nongrav_srf_m_s2: nongrav, tm }
     }
 
-    /// Moves `y` on by `dt_s` under constant loads (midpoint rule) and gives the sample's means.
+    /// Advances `y` by `dt_s` under constant loads (midpoint rule) and returns the sample's means.
     ///
-    /// Displacement and angle are exact for the constant part of the accelerations. What varies within 0.1 s does so by
-    /// stiffness and rotation, on time scales above 500 s: the rule's error is below 1e-8 of the acceleration.
+    /// Displacement and angle are exact for constant accelerations. Accelerations vary by stiffness and rotation only, on
+    /// time scales far longer than a sample.
     ///
-    /// Displacements midway need no accelerations, and the terms in the rates are solved for their values midway, so
-    /// that stiffness, gradient and torques are worked out once.
+    /// Midpoint displacements need no accelerations, and only the terms in the rates are iterated, so stiffness, gradient
+    /// and torques are evaluated once.
     pub fn step(&self, y: &mut State, loads: &Loads, outside: &Outside, dt_s: f64) -> Means {
         let held = self.held(loads, outside);
         let half_s = 0.5 * dt_s;
@@ -232,14 +232,14 @@ impl Plant {
 }
 
 impl TestMassBody {
-    /// Moves a test mass on; `omega`, `alpha` are the spacecraft's rates midway, SRF.
+    /// Advances a test mass; `omega`, `alpha` are the spacecraft's rate and angular acceleration at the midpoint, SRF.
     fn step(&self, y: &mut TestMassState, held: &HeldTestMass, omega: &Vector3<f64>, alpha: &Vector3<f64>, dt_s: f64) {
         let half_s = 0.5 * dt_s;
         let (omega_o, alpha_o) = (self.dcm_orf_from_srf * omega, self.dcm_orf_from_srf * alpha);
         let r = y.r_orf_m + y.v_orf_m_s * half_s;
         let q = y.q_mrf_from_orf + derivative(&y.q_mrf_from_orf, &y.omega_mrf_rad_s, &omega_o) * half_s;
         let rho = self.dcm_orf_from_srf * self.offset_srf_m + r;
-        // Twice the vector part is the small angle; the stiffness is linear in it anyway.
+        // Twice the vector part is the small angle.
         let angle = q.imag() * 2.0;
 
         let still = held.acceleration_orf_m_s2 + held.gradient_orf_s2 * rho
@@ -290,7 +290,7 @@ impl State {
         rotation_vector(&self.q_srf_from_crf)
     }
 
-    /// Whether no displacement and no half-angle sine's double exceeds its limit; never with NaN.
+    /// Whether displacements and angles (twice the vector part of a quaternion) are within limits; false for NaN.
     #[must_use]
     pub fn is_within(&self, limit_m: f64, limit_rad: f64) -> bool {
         let within = |v: &Vector3<f64>, limit: f64| v.iter().fold(true, |all, x| all & (x.abs() <= limit));
@@ -321,7 +321,7 @@ impl State {
             return None;
         }
         let v = |n: &[f64]| Vector3::from_column_slice(&n[..3]);
-        // nalgebra keeps the vector part first.
+        // nalgebra stores the vector part first.
         let q = |n: &[f64]| Quaternion::new(n[3], n[0], n[1], n[2]);
         let (spacecraft, tm) = numbers.split_at(SPACECRAFT_NUMBERS);
         let tm = tm.chunks_exact(TEST_MASS_NUMBERS).map(|n| TestMassState {

@@ -3,7 +3,7 @@
 use rand::SeedableRng;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
-/// A random stream of its own for everything that has a name: FNV-1a of the name on top of the seed.
+/// An independent random stream per name: FNV-1a of the name combined with the seed.
 #[must_use]
 pub(crate) fn stream(seed: u64, name: &str) -> Xoshiro256PlusPlus {
     let hash = name.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));

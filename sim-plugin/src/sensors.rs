@@ -1,4 +1,4 @@
-//! Readouts of one epoch, and every random process of the loop.
+//! Readouts of one epoch, and the random processes of the loop.
 
 use dragfree_physics::attitude::rotation_vector;
 use dragfree_physics::control::{PerTestMass, Readout, TestMassReadout};
@@ -12,7 +12,7 @@ use crate::plant::{Loads, State};
 
 const NEEDED_BY: &str = "the simulator";
 
-/// Everything that the instruments say of one test mass at `t_k`.
+/// Readouts of one test mass at `t_k`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct MeasuredTestMass {
     /// Capacitive displacement, ORF, m.
@@ -27,7 +27,7 @@ pub struct MeasuredTestMass {
     pub dws_orf_rad: [f64; 2],
 }
 
-/// Everything that the instruments say at `t_k`.
+/// All readouts at `t_k`.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Measured {
     /// The test masses.
@@ -50,7 +50,7 @@ impl MeasuredTestMass {
 }
 
 impl Measured {
-    /// Holds the capacitive readouts within their range.
+    /// Limits the capacitive readouts to their range.
     pub fn saturate(&mut self, limits: &Limits) {
         let hold = |v: &mut Vector3<f64>, limit: f64| {
             let beyond = v.iter().fold(false, |any, x| any | (x.abs() > limit));
@@ -64,7 +64,7 @@ impl Measured {
         }
     }
 
-    /// What the controller uses of it.
+    /// Inputs of the controller.
     #[must_use]
     pub fn readout(&self, sun_srf: Option<Vector3<f64>>) -> Readout {
         Readout { sc_crf_rad: self.dws_sc_crf_rad, tm: self.tm.map(MeasuredTestMass::best), sun_srf }
@@ -78,7 +78,7 @@ pub struct Noises {
     places: Places,
 }
 
-/// Where the processes stand in the bank; the further axes follow the first.
+/// Index of the first axis of each process in the bank; the other axes follow.
 #[derive(Clone, Debug)]
 struct Places {
     tm: Vec<TestMassPlaces>,
@@ -120,7 +120,7 @@ impl Noises {
         let (es_torque, acceleration) = (process!(electrostatic_torque), process!(test_mass_acceleration));
         let (mut mps_force, mut mps_torque) = (process!(thruster_force), process!(thruster_torque));
         if mission.thrusters.as_ref().is_some_and(|t| !t.unit.is_empty()) {
-            // The units have noise of their own.
+            // The units have their own noise.
             let silence = NoiseProcess::new(&NoiseShape::default(), dt_s);
             (mps_force, mps_torque) = (silence.clone(), silence);
         }
@@ -141,8 +141,7 @@ impl Noises {
             let mut ifo = [None; 3];
             for axis in (0..3).filter(|axis| section.has_interferometer(*axis)) {
                 let (key, noise) = mission.displacement_noise(section, axis);
-                let missing = || MissionError::Missing { section: format!("noise.{key}"), needed_by: NEEDED_BY };
-                let table = noise.ok_or_else(missing)?;
+                let table = Mission::need(&noise, &format!("noise.{key}"), NEEDED_BY)?;
                 ifo[axis] = Some(add(&[&NoiseProcess::with_lines(&table.shape(), &table.lines(), dt_s)]));
             }
             let dws = if section.has_interferometer(0) { Some(add(&[&process!(dws_local); 2])) } else { None };
@@ -163,19 +162,19 @@ impl Noises {
         Ok(Self { bank: NoiseBank::new(processes), places })
     }
 
-    /// Takes the thrusters' noise along the axes away, for one that comes from a layout.
+    /// Removes the thrusters' noise along the axes, which that of a layout replaces.
     pub fn silence_thrusters(&mut self) {
         for process in self.places.mps_force..self.places.mps_torque + 3 {
             self.bank.silence(process);
         }
     }
 
-    /// Draws every slow part from its stationary distribution.
+    /// Draws all states from their stationary distribution.
     pub fn start(&mut self, rng: &mut Xoshiro256PlusPlus) {
         self.bank.start(rng);
     }
 
-    /// What the drifts alone make the instruments show: acquisition brought these readouts to zero, not the masses.
+    /// Readouts by the initial drifts alone. Acquisition nulls the readouts rather than the displacements.
     #[must_use]
     pub fn slow_readout(&self) -> Readout {
         let slow = |place: usize| self.bank.slow(place);
@@ -193,7 +192,7 @@ impl Noises {
         Readout { sc_crf_rad: three(self.places.dws_sc), tm: tm.collect(), sun_srf: None }
     }
 
-    /// Goes on to the next epoch and samples every instrument.
+    /// Advances to the next epoch and samples every instrument.
     pub fn measure(&mut self, y: &State, rng: &mut Xoshiro256PlusPlus) -> Measured {
         let samples = self.bank.next(rng);
         let three = |place: usize| Vector3::new(samples[place], samples[place + 1], samples[place + 2]);
@@ -211,7 +210,7 @@ impl Noises {
         Measured { tm: tm.collect(), dws_sc_crf_rad: y.sc_crf_rad() + three(self.places.dws_sc) }
     }
 
-    /// Adds the epoch's sample of every force noise to the loads; gives the fluctuation of the sunlight, N.
+    /// Adds the epoch's sample of every force noise to the loads; returns the fluctuation of the sunlight, N.
     #[must_use]
     pub fn disturb(&self, loads: &mut Loads) -> f64 {
         let samples = self.bank.samples();
@@ -232,7 +231,7 @@ impl Noises {
         self.bank.states()
     }
 
-    /// Takes back what [`Self::states`] gave; false when the length is another mission's.
+    /// Restores [`Self::states`]; false if the length differs.
     #[must_use]
     pub fn set_states(&mut self, states: &[f64]) -> bool {
         self.bank.set_states(states)

@@ -17,79 +17,64 @@ use crate::plant::{Loads, Outside, Plant, State};
 use crate::sensors::{Measured, Noises};
 use crate::thrusters::{SavedThrusters, Thrusters};
 
-/// Spread of the first displacements and angles, as the instruments show them, m and rad (the paper).
+/// Standard deviation of the initial readouts, m and rad (the paper).
 const INITIAL_SIGMA: f64 = 5e-8;
 /// Seconds of a day.
 const DAY_S: f64 = 86_400.0;
 /// Seconds between packets of `/ephemeris`.
 const EPHEMERIS_S: f64 = 60.0;
-/// Beyond these the loop is lost, m and rad.
+/// Displacement, m, and angle, rad, beyond which the loop has diverged.
 const LOST_M: f64 = 1e-3;
 const LOST_RAD: f64 = 0.1;
 
 /// Why a simulation cannot go on.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum SimulationError {
-    /// The mission file does not do.
+    /// The mission file is not suitable.
     #[error(transparent)]
     Mission(#[from] MissionError),
-    /// There is no orbit, or none at that time.
+    /// There is no orbit at that time.
     #[error(transparent)]
     Orbit(#[from] OrbitError),
-    /// An effect cannot be had.
+    /// An effect was refused.
     #[error(transparent)]
     Effect(#[from] EffectError),
-    /// A parameter has no sense.
+    /// A parameter is invalid.
     #[error("{0}")]
     Parameter(String),
-    /// The mission's own controllers do not hold a channel.
+    /// A controller of the mission file does not stabilise its channel.
     #[error(
         "mission file: control.channel.\"{channel}\" makes an unstable loop, growing by {growth:.4} a sample with \
          {delay_samples} sample(s) of delay; correct its gain, its sections or control.delay_samples, or leave \
          [control.channel] out for the H-infinity design"
     )]
-    Unstable {
-        /// Channel.
-        channel: String,
-        /// Factor per sample; NaN when its coefficients overflow.
-        growth: f64,
-        /// Delay of the loop.
-        delay_samples: u32,
-    },
+    Unstable { channel: String, growth: f64, delay_samples: u32 },
     /// The loop diverged.
     #[error(
         "the loop diverged {elapsed_s} s after the start of the simulation: {what} = {value:e} {unit}; \
          check [control], [actuators] and the sizes of the effects"
     )]
-    Diverged {
-        /// Seconds since the loop was closed.
-        elapsed_s: f64,
-        /// Body and axis.
-        what: String,
-        /// The value.
-        value: f64,
-        /// Its unit.
-        unit: &'static str,
-    },
-    /// A saved state is another simulation's.
+    Diverged { elapsed_s: f64, what: String, value: f64, unit: &'static str },
+    /// A saved state of another simulation.
     #[error("state of the simulator: {0}; it was saved with another mission or parameters")]
     State(String),
 }
 
-/// What a simulation is asked for, besides the mission.
+/// Settings of a simulation, besides the mission.
 #[derive(Clone, Debug)]
 pub struct Settings {
-    /// Seed of everything random.
+    /// Seed of all random numbers.
     pub seed: u64,
     /// First epoch, Unix ns.
     pub start_ns: i64,
     /// Seconds that the loop runs before the first epoch.
     pub settle_s: f64,
-    /// Where the housings truly are, against the drawings, relative to the centre of mass, SRF, m.
+    /// True minus nominal position of the housings relative to the centre of mass, SRF, m.
     pub com_offset_srf_m: Vector3<f64>,
     /// Largest relative error of a stiffness element.
     pub stiffness_error: f64,
-    /// What the controller does not know.
+    /// Effects unknown to the controller.
     pub effects: Vec<EffectRequest>,
 }
 
@@ -102,7 +87,7 @@ pub struct Epoch {
     pub time_ns: i64,
     /// Readouts at `t_k`.
     pub measured: Measured,
-    /// What was commanded over `[t_k, t_{k+1})`.
+    /// Command over `[t_k, t_{k+1})`.
     pub command: Command,
     /// Whether the command is at its limit, or beyond the thrusters.
     pub at_limit: bool,
@@ -129,7 +114,7 @@ pub struct Truth {
     pub offset_orf_m: PerTestMass<Vector3<f64>>,
 }
 
-/// What the ground tells about orbit and pointing.
+/// Orbit and pointing as determined on ground.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ephemeris {
     /// Determined position, IRF, m.
@@ -157,19 +142,19 @@ pub struct Simulator {
     rng: Xoshiro256PlusPlus,
     effects: Effects,
     inside: Running,
-    /// The plant as the effects began it, before its geometry moves.
+    /// The plant with its initial geometry.
     begun: Plant,
     offset_orf_m: PerTestMass<Vector3<f64>>,
     /// `k_dSC` and its arm.
     sunlight: Option<(f64, Vector3<f64>)>,
-    /// `None` where the thrusters do what is commanded.
+    /// `None` if the thrusters apply the command.
     thrusters: Option<Thrusters>,
     actuators: Option<Actuators>,
     limits: Option<Limits>,
     self_gravity: Vec<SelfGravity>,
     /// Names of the test masses.
     names: Vec<String>,
-    /// Error of the determined orbit in Hill's sense of fixed axes: its effect on the Sun's direction, CRF.
+    /// Error of the determined orbit, IRF, and an equal one for the Sun's direction, CRF, m.
     orbit_error_irf_m: Vector3<f64>,
     sun_error_crf: Vector3<f64>,
     state: State,
@@ -181,14 +166,14 @@ pub struct Simulator {
     gradient_orf_s2: PerTestMass<Matrix3<f64>>,
 }
 
-/// What the spacecraft's own mass does to a test mass.
+/// Residual gravity of the spacecraft at a test mass.
 struct SelfGravity {
     acceleration_orf_m_s2: Vector3<f64>,
     drift_orf_m_s3: Vector3<f64>,
     angular_acceleration_orf_rad_s2: Vector3<f64>,
 }
 
-/// Everything that changes while the loop runs.
+/// State of the simulation.
 #[derive(Serialize, Deserialize)]
 struct Snapshot {
     index: i64,
@@ -202,7 +187,7 @@ struct Snapshot {
     thrusters: Option<SavedThrusters>,
 }
 
-/// What is true at the coming epoch, borrowed from the simulator field by field: its effects change meanwhile.
+/// True quantities at the next epoch, borrowed field by field because the effects are borrowed mutably.
 macro_rules! now {
     ($simulator:expr, $sunlight:expr) => {
         Moment {
@@ -224,7 +209,7 @@ impl Simulator {
     /// [`SimulationError`]: a section is missing, or the loop diverges while it settles.
     pub fn new(mission: &Mission, settings: Settings) -> Result<Self, SimulationError> {
         refuse_unstable(mission)?;
-        // One stream for what is drawn once and one for the noise: a parameter changes no noise.
+        // Constants and noise have separate streams, so that a parameter changes no noise.
         let mut once = Xoshiro256PlusPlus::seed_from_u64(settings.seed);
         let mut rng = once.clone();
         rng.jump();
@@ -248,7 +233,7 @@ impl Simulator {
         let orbit_sigma = mission.solar_pressure.as_ref().map_or(0.0, |s| s.orbit_error_m);
         let mut gauss = |sigma: f64| Vector3::from_fn(|_, _| sigma * normal(&mut once));
         let orbit_error_irf_m = gauss(orbit_sigma);
-        // The orbit's error is as large along every axis, so its components in CRF are as good a draw.
+        // The orbit's error is isotropic, so the components in CRF may be drawn independently.
         let sun_error_crf = gauss(orbit_sigma);
         let sc = gauss(INITIAL_SIGMA);
         let tm: Vec<_> = mission.test_mass.iter().map(|_| (gauss(INITIAL_SIGMA), gauss(INITIAL_SIGMA))).collect();
@@ -310,7 +295,7 @@ impl Simulator {
         };
         if simulator.effects.moves() {
             simulator.reshape();
-            // The first shape is where the test masses were caught, no move.
+            // The first change of the geometry does not move the test masses.
             simulator.state = state;
         }
         while simulator.index < 0 {
@@ -397,7 +382,7 @@ impl Simulator {
         })
     }
 
-    /// Looks around at an epoch.
+    /// Updates the surroundings at an epoch.
     fn surroundings(&mut self, index: i64) -> Result<(), OrbitError> {
         self.environment = self.constellation.at(epoch_ns(self.settings.start_ns, index, self.dt_s))?;
         self.environment_index = index;
@@ -418,8 +403,7 @@ impl Simulator {
         }
     }
 
-    /// The surroundings now. `ω_CI` moves on linearly from the last packet, wrong by 1e-17 rad/s after a minute; `Γ`
-    /// is held and taken with SRF on CRF, wrong by 1e-19 m/s² at a test mass.
+    /// The current surroundings: `ω_CI` extrapolated linearly from the last packet; `Γ` held, with SRF taken as CRF.
     fn outside(&self) -> Outside {
         let e = &self.environment;
         let since_s = self.since_packet_s();
@@ -447,7 +431,7 @@ impl Simulator {
         (self.index - self.environment_index) as f64 * self.dt_s
     }
 
-    /// What the outside does to the inside.
+    /// External inputs of the interior.
     fn influences(&self) -> Influences {
         let e = &self.environment;
         Influences {
@@ -457,8 +441,7 @@ impl Simulator {
         }
     }
 
-    /// Brings the geometry up to the coming epoch. Where the centre of mass wanders, the housings move against the test
-    /// masses.
+    /// Updates the geometry to the next epoch. A drift of the centre of mass moves the housings against the test masses.
     fn reshape(&mut self) {
         let elapsed_s = self.index as f64 * self.dt_s;
         let mut plant = self.begun.clone();
@@ -470,7 +453,7 @@ impl Simulator {
         self.offset_orf_m = offsets(&self.plant);
     }
 
-    /// What truly acts over the coming sample.
+    /// True loads over the next sample.
     fn loads(&mut self, command: &Command) -> Loads {
         let mut acting = self.effects.act(command);
         if let Some(thrusters) = &mut self.thrusters {
@@ -552,7 +535,7 @@ impl Simulator {
         serde_json::to_vec(&snapshot).map_err(|e| SimulationError::State(e.to_string()))
     }
 
-    /// Takes a state back.
+    /// Restores a state.
     ///
     /// # Errors
     /// [`SimulationError::State`] when the bytes are not a state of this simulation.
@@ -576,7 +559,7 @@ impl Simulator {
         }
         self.law.set_state(&snapshot.law).map_err(|e| refuse(&e.to_string()))?;
         (self.index, self.rng) = (snapshot.index, snapshot.rng);
-        // The geometry first: it moves the test masses of the state that goes.
+        // The geometry first, because it moves the test masses of the current state.
         self.reshape();
         self.state = state;
         Ok(self.surroundings(snapshot.environment_index)?)
@@ -588,10 +571,10 @@ fn offsets(plant: &Plant) -> PerTestMass<Vector3<f64>> {
     plant.tm.iter().map(|tm| tm.dcm_orf_from_srf * tm.offset_srf_m).collect()
 }
 
-/// A channel whose growth is within this of one drifts and does not diverge: nobody controls it.
+/// Excess of a channel's growth per sample over one that counts as rounding: a channel without control drifts.
 const DRIFTING: f64 = 1e-6;
 
-/// Refuses controllers of the mission's own that cannot hold their channel.
+/// Refuses controllers of the mission file that do not stabilise their channel.
 fn refuse_unstable(mission: &Mission) -> Result<(), SimulationError> {
     let Some(control) = &mission.control else { return Ok(()) };
     let delay_samples = control.delay_samples;
@@ -612,7 +595,7 @@ fn gradient_orf(plant: &Plant, environment: &Environment) -> PerTestMass<Matrix3
 
 /// Time of an epoch, Unix ns, to the nearest nanosecond whatever the rate.
 fn epoch_ns(start_ns: i64, index: i64, dt_s: f64) -> i64 {
-    // Whole seconds apart from the rest: 25 days in ns leave no fraction to a float.
+    // Whole seconds separately, because nanoseconds of weeks exceed the resolution of a double.
     let rate_hz = 1.0 / dt_s;
     let seconds = (index as f64 / rate_hz).floor();
     let rest_s = (index as f64 - seconds * rate_hz) / rate_hz;

@@ -1,4 +1,4 @@
-//! What the unit tests share.
+//! Fixture of the unit tests.
 
 use dragfree_physics::mission::Mission;
 

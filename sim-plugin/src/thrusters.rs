@@ -1,5 +1,5 @@
-//! What the thrusters make of a command: range, step, delay and lag, along each axis or in each unit of a layout; in a
-//! layout each unit's noise pushes and turns the spacecraft at once.
+//! Response of the thrusters to a command: range, step, delay and lag, per axis or per unit of a layout. The noise of a
+//! unit is a correlated force and torque.
 
 use dragfree_physics::lag::Lag;
 use dragfree_physics::mission::{self, MissionError};
@@ -17,7 +17,7 @@ type Channels = DVector<f64>;
 /// Force on the spacecraft, SRF, N, above its torque about the centre of mass, N m.
 type Wrench = Vector6<f64>;
 
-/// Where thrusters sit and push.
+/// Positions and directions of the thrusters.
 #[derive(Clone, Debug)]
 pub struct Layout {
     /// Column `i`: wrench of a thrust of 1 N of unit `i`, `(d_i, r_i × d_i)`.
@@ -39,7 +39,7 @@ impl Layout {
             })
             .collect();
         let wrenches = DMatrix::from_fn(6, columns.len(), |i, j| columns[j][i]);
-        // A lever of a millimetre is no lever.
+        // Levers below a millimetre do not count.
         if wrenches.rank(1e-3) < 6 {
             return Err(MissionError::Value {
                 key: "thrusters.unit".to_owned(),
@@ -51,8 +51,7 @@ impl Layout {
     }
 
     /// Six units in three pairs 1.5 m from the axis `s_3` and 0.35 m above the centre of mass, thrusting along the rim
-    /// to both sides and 35° up, towards the Sun: as on LISA Pathfinder, sunlight is their seventh. They hold the
-    /// default mission's sunlight from every azimuth within 0.5 to 31 µN, and nothing that pulls them along `s_3`.
+    /// in both directions and 35° upwards, towards the Sun. Sunlight provides the opposite force along `s_3`.
     #[must_use]
     pub fn six(asd_n_rthz: f64) -> Self {
         let unit = |k: usize| {
@@ -94,7 +93,7 @@ pub struct ThrusterNoise {
 }
 
 impl ThrusterNoise {
-    /// White noise of every unit, sampled every `dt_s`: its random stream is all its state.
+    /// White noise of every unit, sampled every `dt_s`; the random stream is its only state.
     #[must_use]
     pub fn new(layout: Layout, dt_s: f64) -> Self {
         let units = layout.asd_n_rthz.iter().map(|asd| NoiseProcess::new(&NoiseShape::white(*asd), dt_s)).collect();
@@ -111,7 +110,7 @@ impl ThrusterNoise {
     }
 }
 
-/// Thrusts that add up to a wanted wrench, as near to the middle of their range as they can.
+/// Thrusts that add up to a wanted wrench, as close to the middle of their range as possible.
 #[derive(Clone, Debug)]
 struct Distribution {
     wrenches: DMatrix<f64>,
@@ -124,8 +123,8 @@ impl Distribution {
         Self { inverse: least_norm(wrenches), wrenches: wrenches.clone(), range_n }
     }
 
-    /// The thrusts, and whether they make what is wanted. Where the least-norm solution leaves the range, the units
-    /// that do are held at their limit and the others make up for it (cascaded generalised inverses, Bordignon 1996).
+    /// The thrusts, and whether they give the wanted wrench. Units whose least-norm thrust is out of range are held at
+    /// their limit and the others compensate (cascaded generalised inverses, Bordignon 1996).
     fn thrusts(&self, wanted: &Wrench) -> (Channels, bool) {
         let [low, high] = self.range_n;
         let n = self.wrenches.ncols();
@@ -162,7 +161,7 @@ fn least_norm(wrenches: &DMatrix<f64>) -> DMatrix<f64> {
     wrenches.clone().pseudo_inverse(1e-9).unwrap_or_else(|_| DMatrix::zeros(wrenches.ncols(), 6))
 }
 
-/// The units of a layout at work.
+/// The running units of a layout.
 #[derive(Clone, Debug)]
 struct Units {
     distribution: Distribution,
@@ -204,7 +203,7 @@ impl Thrusters {
         } else {
             let layout = Layout::new(&section.unit)?;
             let distribution = Distribution::new(&layout.wrenches, limit_n);
-            // The fourth stream of the seed: loop and housekeeping have the first three.
+            // The fourth stream of the seed; loop and housekeeping use the first three.
             let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
             rng.long_jump();
             rng.jump();
@@ -225,7 +224,7 @@ impl Thrusters {
     pub fn act(&mut self, force_srf_n: &Vector3<f64>, torque_srf_nm: &Vector3<f64>) -> (Vector3<f64>, Vector3<f64>) {
         let command = self.command(&wrench(force_srf_n, torque_srf_nm));
         if self.waiting.is_empty() {
-            // Before the first command, it has been there for ever.
+            // Start settled at the first command.
             self.y = command.clone();
             self.waiting.extend(std::iter::repeat_n(command.clone(), self.lag.samples() + 1));
         }
@@ -244,14 +243,13 @@ impl Thrusters {
         }
     }
 
-    /// Whether the last command was beyond the thrusters.
+    /// Whether the last command was out of range.
     #[must_use]
     pub fn saturated(&self) -> bool {
         self.saturated
     }
 
-    /// What the thrusters are told: within their range and in whole steps. Of the axes, forces alone have limit and
-    /// step.
+    /// The command limited to the range and rounded to steps; along axes, limit and step apply to forces only.
     fn command(&mut self, wanted: &Wrench) -> Channels {
         let [low, high] = self.limit_n;
         let step_n = self.step_n;
@@ -279,7 +277,7 @@ impl Thrusters {
         }
     }
 
-    /// Takes back what [`Self::save`] gave; false when it is another mission's.
+    /// Restores [`Self::save`]; false for a state of another mission.
     #[must_use]
     pub fn load(&mut self, saved: SavedThrusters) -> bool {
         let n = self.y.len();

@@ -22,7 +22,7 @@ struct Sections {
 }
 
 impl Sections {
-    /// A channel that has no such section hands its input on.
+    /// A channel without such a section passes its input through.
     fn new(controllers: &[&ChannelController], n: usize) -> Self {
         const UNIT: [f64; 5] = [1.0, 0.0, 0.0, 0.0, 0.0];
         let of = |coefficient: usize| -> Vec<f64> {
@@ -50,7 +50,7 @@ impl Sections {
 struct Controllers {
     gain_s2: Vec<f64>,
     sections: Vec<Sections>,
-    /// Readouts, and what the controllers make of them.
+    /// Readouts, overwritten by the outputs.
     values: Vec<f64>,
 }
 
@@ -90,7 +90,7 @@ impl Controllers {
     }
 }
 
-/// A saved state does not fit this control law.
+/// A saved state of another control law.
 #[derive(Debug, thiserror::Error)]
 #[error("state of the control law: {found} numbers where {expected} belong; it was saved with another mission file")]
 pub struct StateError {
@@ -108,7 +108,7 @@ pub struct ControlLaw {
     limits: Option<Actuators>,
     /// `k_dSC`, N, and the arm of the force, SRF, m.
     sunlight: Option<(f64, Vector3<f64>)>,
-    /// Commands that wait for their interval, oldest first; as many as samples of delay.
+    /// Delayed commands, oldest first; one per sample of delay.
     waiting: VecDeque<Command>,
 }
 
@@ -171,16 +171,16 @@ impl ControlLaw {
         }
     }
 
-    /// Everything that the next steps depend on: controllers' states, then the waiting commands.
+    /// The state: that of the controllers, then the delayed commands.
     #[must_use]
     pub fn state(&self) -> Vec<f64> {
         self.controllers.states().copied().chain(self.waiting.iter().flat_map(Command::numbers)).collect()
     }
 
-    /// Takes back what [`Self::state`] gave, bit for bit.
+    /// Restores [`Self::state`] exactly.
     ///
     /// # Errors
-    /// [`StateError`] when the length is another law's; the law is then unchanged.
+    /// [`StateError`] if the length differs; the law is then unchanged.
     pub fn set_state(&mut self, state: &[f64]) -> Result<(), StateError> {
         let sections = self.controllers.states().count();
         let width = self.plant.channels() + 3;
@@ -200,10 +200,10 @@ impl ControlLaw {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use super::*;
-    use crate::control_design::tests::taiji;
     use crate::mission::Control;
+    use crate::testing::taiji;
     use nalgebra::Matrix3;
 
     fn law() -> ControlLaw {

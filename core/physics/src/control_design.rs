@@ -15,7 +15,7 @@
 //! Because the disturbance enters where the control does, the integrators of `G` are reached from `d` and seen in
 //! `p/B`; they need no shift off the axis for the Riccati equations, and the controller does not cancel them.
 //!
-//! **Sampling is exact.** `G` is the double integrator behind a hold, with the loop's delay, in the variable `w` of
+//! **Sampling is exact.** `G` is the double integrator with a hold and the loop's delay, in the variable `w` of
 //! `z = (1 + w dt/2)/(1 − w dt/2)`: `G(w) = (1 − w dt/2)/w² · ((1 − w dt/2)/(1 + w dt/2))^delay`. The norm is the same
 //! on both sides of that map, so what is proved of the synthesis holds for the sampled loop that flies, up to Nyquist.
 //!
@@ -39,45 +39,44 @@ const NEEDED_BY: &str = "the control design";
 
 /// The table's band, Hz.
 const BAND_HZ: (f64, f64) = (1e-4, 1.0);
-/// Below this frequency a requirement may be out of reach of any controller without the design failing, Hz: readouts
-/// get noisier towards low frequencies, and the table does not always follow them.
+/// Below this frequency an unattainable requirement is reported and does not fail the design, Hz.
 const RELAXED_BELOW_HZ: f64 = 1e-3;
 /// Largest share of a requirement that readout noise may take in the weight `W_3`; `T` is never exactly 1.
 const LARGEST_SHARE: f64 = 0.9;
 /// Poles of the weights, rad/s. The controller's slowest pole is about half of it, and forgets within an hour.
 const WEIGHT_POLE_RAD_S: f64 = 2e-2;
-/// A weight whose largest value is below this is flat: with so much room its shape is not worth a slow state.
+/// A weight whose largest value is below this is constant, which saves a slow state.
 const LARGEST_FLAT: f64 = 0.7;
-/// `W_3` falls to no less than this part of its value at low frequency: it bounds the peak of `T`.
+/// Smallest ratio of `W_3` at high frequency to its value at low frequency; it bounds the peak of `T`.
 const LEAST_FALL: f64 = 0.6;
-/// Disturbance over requirement in units of the square of the expected bandwidth, tried in turn until one is
-/// feasible. A tenth is what a well damped loop needs; a loop with more headroom is faster.
+/// Ratios of disturbance over requirement to the square of the expected bandwidth, tried in turn. A well damped loop
+/// needs about a tenth; a smaller ratio gives a faster loop.
 const HEADROOM: [f64; 3] = [1.0 / 12.0, 1.0 / 24.0, 1.0 / 48.0];
-/// A headroom is taken at once when its γ is below this.
+/// γ below which no further headroom is tried.
 const GOOD_GAMMA: f64 = 0.96;
-/// Slowest expected bandwidth, rad/s: a channel that nothing disturbs still has to settle.
+/// Smallest expected bandwidth, rad/s, for channels with little disturbance.
 const SLOWEST_RAD_S: f64 = 2e-2;
 /// Largest product of bandwidth and delay (half a hold and the loop's samples).
 const LARGEST_DELAY_ANGLE: f64 = 0.5;
-/// Samples of delay that the synthesis models one by one; a longer delay is an all-pass of this order.
+/// Largest number of states for the delay in the synthesis; a longer delay is an all-pass of this order.
 const MOST_DELAY_STATES: u32 = 3;
-/// The controller is the central one at `min(factor γ, γ^exponent)` of the optimal γ, not at the optimum itself, where
-/// it would trade everything else for the last per cent. Where the roots of that controller are too close to be sampled
-/// to full precision, and the norm of what would fly shows it, the next one is taken; each stays below one where γ
-/// does.
+/// Bounds `min(factor γ, γ^exponent)` above the optimal γ at which the central controller is taken. At the optimum the
+/// controller is ill-conditioned. If the norm of the sampled loop exceeds that of the synthesis, because roots are too
+/// close to each other, the next bound is tried; each is below one if γ is.
 const BACK_OFF: [(f64, f64); 4] = [(1.1, 0.5), (1.2, 0.25), (1.5, 0.1), (2.0, 0.05)];
-/// The norm of the sampled controller may lie above that of the synthesis by this factor: rounding of its roots.
+/// Accepted ratio of the norm of the sampled loop to that of the synthesis.
 const SAMPLED_AS_PROVED: f64 = 1.01;
 /// Relative tolerance of γ.
 const GAMMA_TOLERANCE: f64 = 1e-5;
-/// Certificates are taken this much above the norm.
+/// Ratio of a certificate's bound to the norm.
 const CERTIFICATE_MARGIN: f64 = 1.001;
-/// Part of its initial state that a controller has forgotten after its `forget_time_s`.
+/// Remaining part of the initial state that defines `forget_time_s`.
 const FORGOTTEN: f64 = 1e-9;
 /// Points of the frequency grids.
 const GRID: usize = 3000;
 
 /// Why a mission has no design: which channel, which weight, where, and what to change.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum DesignError {
     /// The mission file lacks something.
@@ -91,17 +90,11 @@ pub enum DesignError {
          {best_ratio:.3} times. Relax the requirement or choose a quieter readout"
     )]
     OutOfReach {
-        /// Channel.
         channel: String,
-        /// Key of the requirement in the mission file.
         requirement: &'static str,
-        /// Worst frequency above the relaxed band, Hz.
         frequency_hz: f64,
-        /// `|W_3|` there, uncapped.
         noise_ratio: f64,
-        /// `|W_1|` there.
         disturbance_ratio: f64,
-        /// Smallest possible ASD over requirement.
         best_ratio: f64,
     },
     /// The γ-iteration ends above one.
@@ -111,42 +104,22 @@ pub enum DesignError {
          reduce noise or disturbance, or sample faster"
     )]
     TooGreedy {
-        /// Channel.
         channel: String,
-        /// `W1` or `W3`, whichever uses up more of γ at the worst frequency.
         weight: &'static str,
-        /// Where the stacked norm is largest, Hz.
         frequency_hz: f64,
-        /// Smallest γ.
         gamma: f64,
-        /// Key of the requirement in the mission file.
         requirement: &'static str,
-        /// Half a hold and the loop's delay, s.
         loop_delay_s: f64,
     },
     /// The synthesis itself failed.
     #[error("control design, channel {channel}: {source}")]
-    Synthesis {
-        /// Channel.
-        channel: String,
-        /// What went wrong.
-        source: HinfError,
-    },
-    /// The sampled controller does not keep what was designed.
+    Synthesis { channel: String, source: HinfError },
+    /// The sampled loop exceeds a bound of the design.
     #[error(
         "control design, channel {channel}: the sampled loop breaks its bound at {frequency_hz:.3e} Hz, {what} = \
          {value:.4}; a shorter delay or a faster sample rate helps"
     )]
-    NotKept {
-        /// Channel.
-        channel: String,
-        /// What is above one.
-        what: &'static str,
-        /// Where, Hz.
-        frequency_hz: f64,
-        /// How much it is.
-        value: f64,
-    },
+    NotKept { channel: String, what: &'static str, frequency_hz: f64, value: f64 },
 }
 
 impl From<DesignError> for MissionError {
@@ -190,7 +163,7 @@ impl Lag {
         };
         let best = (0..20).map(candidate).min_by(|a, b| (a.low * a.high).total_cmp(&(b.low * b.high)));
         let flat = Self::flat(largest.max(least_high(largest)));
-        // Nor is a fall of a tenth worth a state.
+        // A fall of less than a tenth does not justify a state.
         best.filter(|lag| largest >= LARGEST_FLAT && lag.high < LARGEST_SHARE * lag.low).unwrap_or(flat)
     }
 
@@ -198,7 +171,7 @@ impl Lag {
     #[must_use]
     pub fn magnitude(&self, omega: f64) -> f64 {
         let p = self.pole_rad_s;
-        // Divided through by the larger of the two, so that nothing overflows.
+        // `hypot` does not overflow.
         (self.high * omega).hypot(self.low * p) / omega.hypot(p)
     }
 
@@ -216,7 +189,7 @@ impl Lag {
     }
 }
 
-/// What the table asks of a channel.
+/// Requirement of a channel.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Requirement {
     /// Key in the mission file.
@@ -235,7 +208,7 @@ impl Requirement {
     }
 }
 
-/// What acts on a channel and what it must keep: the mission file seen from one degree of freedom.
+/// Disturbance, readout noise and requirement of one degree of freedom.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ChannelModel {
     /// Name, one of [`Mission::channels`].
@@ -246,7 +219,7 @@ pub struct ChannelModel {
     pub disturbance: NoiseShape,
     /// `F_y`: noise of the readout, m or rad.
     pub readout: NoiseShape,
-    /// Bandwidth over the one that the requirement needs.
+    /// Bandwidth relative to what the requirement needs.
     pub bandwidth_factor: f64,
 }
 
@@ -341,7 +314,7 @@ impl Weights {
 
 /// A band in which the flown loop exceeds the table because readout noise alone takes more than nine tenths of it: with
 /// `S + T = 1` no controller makes `|S|² |W_1|² + |T|² |W_3|²` smaller than `1/(|W_1|⁻² + |W_3|⁻²)`. A `best_ratio`
-/// above one is a requirement that physics does not give.
+/// above one is a requirement that no controller can meet.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Unattainable {
     /// Key of the requirement in the mission file.
@@ -352,9 +325,9 @@ pub struct Unattainable {
     pub to_hz: f64,
     /// Frequency of the largest excess, Hz.
     pub worst_hz: f64,
-    /// What the flown loop has there, over the requirement.
+    /// Predicted ASD over the requirement there.
     pub predicted_ratio: f64,
-    /// The best that any controller could have there, over the requirement.
+    /// Smallest possible ASD over the requirement there.
     pub best_ratio: f64,
 }
 
@@ -369,7 +342,7 @@ impl std::fmt::Display for Unattainable {
     }
 }
 
-/// One channel's controller, and everything that can be said of its loop.
+/// Controller of one channel, with margins and certificates of its loop.
 #[derive(Clone, Debug)]
 pub struct ChannelDesign {
     /// Channel, one of [`Mission::channels`].
@@ -399,7 +372,7 @@ pub struct ChannelDesign {
     /// Bounded Real Lemma of the flown loop at 1.001 of its norm: largest eigenvalue of the inequality's left side over
     /// its largest in size; negative.
     pub lmi_max_eigenvalue: f64,
-    /// Time after which the controller remembers 1e-9 of its initial state, s.
+    /// Time after which [`FORGOTTEN`] of the controller's initial state remains, s.
     pub forget_time_s: f64,
     /// Acceleration per displacement at zero frequency, s⁻²: a static load `a` leaves `a/static_stiffness_s2`.
     pub static_stiffness_s2: f64,
@@ -407,9 +380,9 @@ pub struct ChannelDesign {
     pub controller: ChannelController,
     /// The weights.
     pub weights: Weights,
-    /// Where the table asks for more than physics gives, if anywhere.
+    /// Band in which the requirement is unattainable, if any.
     pub unattainable: Option<Unattainable>,
-    /// What acts on the channel and what it must keep.
+    /// Disturbance, readout noise and requirement.
     pub model: ChannelModel,
     /// The generalized plant of the synthesis, `(d, n, u) → (p/B, effort, −y)`, in the scaled variable
     /// `w/bandwidth`.
@@ -487,8 +460,7 @@ fn channel_model(mission: &Mission, name: &str) -> Result<ChannelModel, DesignEr
         };
         let readout = if !is_angle {
             let (key, noise) = mission.displacement_noise(tm, axis);
-            let missing = || MissionError::Missing { section: format!("noise.{key}"), needed_by: NEEDED_BY };
-            noise.ok_or_else(missing)?.shape()
+            Mission::need(&noise, &format!("noise.{key}"), NEEDED_BY)?.shape()
         } else if axis > 0 && tm.has_interferometer(0) {
             shape!(dws_local)
         } else {
@@ -522,7 +494,7 @@ fn channel_model(mission: &Mission, name: &str) -> Result<ChannelModel, DesignEr
     terms.extend(scaled(&shape!(thruster_force), force.norm()));
     terms.extend(scaled(&shape!(thruster_torque), torque.norm()));
     if let (Some(noise), Some(sun)) = (&n.solar_pressure, &mission.solar_pressure) {
-        // The direction turns with the orbit: bounded by the worst one.
+        // Worst case over the direction of the Sun, which turns with the orbit.
         let arm = Vector3::from(sun.arm_srf_m);
         terms.extend(scaled(&noise.shape(), force.norm() + torque.norm() * arm.norm()));
     }
@@ -565,7 +537,7 @@ fn must_be_in_reach(model: &ChannelModel, sampling: Sampling) -> Result<(), Desi
     }
 }
 
-/// A synthesis problem with the scales that make it dimensionless.
+/// A dimensionless synthesis problem with its scales.
 #[derive(Clone)]
 struct Problem {
     plant: GeneralizedPlant,
@@ -611,7 +583,7 @@ impl Problem {
         Ok(ChannelController { gain_s2: cascade.gain * self.control_unit_s2, sections: cascade.sections })
     }
 
-    /// `F_l(P, K)` of the coefficients that fly, behind the loop's own delay, sample by sample.
+    /// `F_l(P, K)` of the sampled controller, with the exact delay of the loop.
     fn flown(&self, controller: &ChannelController) -> Result<StateSpace, HinfError> {
         let gain = controller.gain_s2 / self.control_unit_s2;
         let system = StateSpace::from_sections(&controller.sections, gain, self.half_step);
@@ -623,7 +595,7 @@ impl Problem {
     }
 }
 
-/// A delay of so many samples, `((1 − hs)/(1 + hs))^samples`; in fewer states, an all-pass of the same delay.
+/// A delay `((1 − hs)/(1 + hs))^samples`, or an all-pass of the same delay with `most_states` states.
 fn delay_line(samples: u32, most_states: u32, half_step: f64) -> StateSpace {
     let states = samples.min(most_states);
     let h = half_step * f64::from(samples) / f64::from(states.max(1));
@@ -712,7 +684,26 @@ struct Flown {
     gamma_flown: f64,
 }
 
-/// The central controller nearest to the optimum whose samples keep what was proved, or else the best.
+/// The first attempt whose figure of merit is good, or the one with the smallest.
+fn first_good<O: Copy, T>(
+    options: &[O],
+    good: impl Fn(f64) -> bool,
+    attempt: impl Fn(O) -> Result<(f64, T), HinfError>,
+) -> Result<(f64, T), HinfError> {
+    let mut best = attempt(options[0])?;
+    for option in &options[1..] {
+        if good(best.0) {
+            break;
+        }
+        let next = attempt(*option)?;
+        if next.0 < best.0 {
+            best = next;
+        }
+    }
+    Ok(best)
+}
+
+/// The central controller nearest to the optimum whose sampled loop keeps the norm of the synthesis, or the best.
 fn sample(problem: &Problem, synthesis: &Synthesis, gamma: f64) -> Result<Flown, HinfError> {
     let attempt = |(factor, exponent): (f64, f64)| {
         let bound = if gamma < 1.0 { (factor * gamma).min(gamma.powf(exponent)) } else { factor * gamma };
@@ -720,19 +711,9 @@ fn sample(problem: &Problem, synthesis: &Synthesis, gamma: f64) -> Result<Flown,
         let controller = problem.sampled(&central)?;
         let closed = problem.flown(&controller)?;
         let gamma_flown = norm(&closed, GAMMA_TOLERANCE).map_or(f64::INFINITY, |n| n.value);
-        Ok::<_, HinfError>((gamma_flown / bound, Flown { central, controller, closed, gamma_flown }))
+        Ok((gamma_flown / bound, Flown { central, controller, closed, gamma_flown }))
     };
-    let mut best = attempt(BACK_OFF[0])?;
-    for back_off in &BACK_OFF[1..] {
-        if best.0 <= SAMPLED_AS_PROVED {
-            break;
-        }
-        let next = attempt(*back_off)?;
-        if next.0 < best.0 {
-            best = next;
-        }
-    }
-    Ok(best.1)
+    first_good(&BACK_OFF, |excess| excess <= SAMPLED_AS_PROVED, attempt).map(|(_, flown)| flown)
 }
 
 /// The first headroom whose γ is good, or the best of all.
@@ -741,19 +722,10 @@ fn best_problem(model: &ChannelModel, sampling: Sampling) -> Result<(Problem, Sy
         let problem = Problem::new(model, sampling, headroom);
         let synthesis = Synthesis::new(&problem.plant)?;
         let gamma = synthesis.optimum(GAMMA_TOLERANCE)?.gamma;
-        Ok::<_, HinfError>((problem, synthesis, gamma))
+        Ok((gamma, (problem, synthesis)))
     };
-    let mut best = try_one(HEADROOM[0])?;
-    for headroom in &HEADROOM[1..] {
-        if best.2 < GOOD_GAMMA {
-            break;
-        }
-        let next = try_one(*headroom)?;
-        if next.2 < best.2 {
-            best = next;
-        }
-    }
-    Ok(best)
+    let (gamma, (problem, synthesis)) = first_good(&HEADROOM, |gamma| gamma < GOOD_GAMMA, try_one)?;
+    Ok((problem, synthesis, gamma))
 }
 
 /// Time after which the slowest pole of a controller has decayed to [`FORGOTTEN`], s.
@@ -766,14 +738,13 @@ fn forget_time(controller: &ChannelController, dt_s: f64) -> f64 {
     FORGOTTEN.ln() / slowest.ln() * dt_s
 }
 
-/// Factor by which the slowest-dying motion of a channel's sampled loop grows from sample to sample, hold and delay
-/// included: below one when the loop is stable, one for the double integrator without a controller. `None` for
-/// coefficients whose eigenvalues cannot be found.
+/// Spectral radius of a channel's sampled loop with hold and delay: below one if the loop is stable, one for the double
+/// integrator without a controller. `None` if the eigenvalues cannot be found.
 #[must_use]
 pub fn growth_per_sample(controller: &ChannelController, delay_samples: u32, dt_s: f64) -> Option<f64> {
     let delay = delay_samples as usize;
     let order = 2 + delay + 2 * controller.sections.len();
-    // States: position, velocity, commands on their way (the next to act first), sections. One column per unit state.
+    // States: position, velocity, delayed commands (the next to act first), sections. One column per unit state.
     let columns = (0..order).map(|unit| {
         let now: Vec<f64> = (0..order).map(|i| f64::from(u8::from(i == unit))).collect();
         let mut next = vec![0.0; order];
@@ -834,9 +805,19 @@ impl Loop<'_> {
         open / (open + 1.0)
     }
 
+    /// `|S| |W_1|` and `|T| |W_3|`.
+    fn weighted(&self, weights: &Weights, f_hz: f64) -> (f64, f64) {
+        (self.sensitivity(f_hz).norm() * weights.w1(f_hz), self.complementary(f_hz).norm() * weights.w3(f_hz))
+    }
+
+    /// ASD of the disturbance without control over the requirement.
+    fn uncontrolled(&self, f_hz: f64) -> f64 {
+        self.sampling.held_integrators(f_hz).norm() * self.model.disturbance_ratio(f_hz)
+    }
+
     /// ASDs over the requirement: disturbance's part and readout noise's part.
     fn shares(&self, f_hz: f64) -> (f64, f64) {
-        let disturbance = self.sampling.held_integrators(f_hz).norm() * self.model.disturbance_ratio(f_hz);
+        let disturbance = self.uncontrolled(f_hz);
         (self.sensitivity(f_hz).norm() * disturbance, self.complementary(f_hz).norm() * self.model.readout_ratio(f_hz))
     }
 
@@ -844,7 +825,7 @@ impl Loop<'_> {
     fn bounds(&self, weights: &Weights) -> Result<(f64, f64), DesignError> {
         let (mut s, mut t) = ((0.0, 0.0), (0.0, 0.0));
         for f in self.sampling.grid(0.1 * BAND_HZ.0, f64::INFINITY) {
-            let values = (self.sensitivity(f).norm() * weights.w1(f), self.complementary(f).norm() * weights.w3(f));
+            let values = self.weighted(weights, f);
             s = if values.0 > s.0 { (values.0, f) } else { s };
             t = if values.1 > t.0 { (values.1, f) } else { t };
         }
@@ -856,16 +837,15 @@ impl Loop<'_> {
         Ok((s.0, t.0))
     }
 
-    /// The table in its band: largest predicted ASD over requirement where it can be met, and the band where not.
+    /// Largest predicted ASD over requirement where it is attainable, and the band where it is not.
     fn table(&self) -> Result<(f64, Option<Unattainable>), DesignError> {
         let mut largest: f64 = 0.0;
         let mut missed: Option<Unattainable> = None;
         for f in self.sampling.grid(BAND_HZ.0, BAND_HZ.1) {
             let (disturbance, noise) = self.shares(f);
             let ratio = disturbance.hypot(noise);
-            let free = self.sampling.held_integrators(f).norm() * self.model.disturbance_ratio(f);
             let readout = self.model.readout_ratio(f);
-            let best = best_ratio(free, readout);
+            let best = best_ratio(self.uncontrolled(f), readout);
             let promised = readout <= LARGEST_SHARE;
             if promised {
                 largest = largest.max(ratio);
@@ -873,15 +853,10 @@ impl Loop<'_> {
             if ratio <= 1.0 {
                 continue;
             }
-            // Where readout noise alone uses up the requirement, W_3 was capped and promises nothing.
+            // W_3 is capped where readout noise alone exceeds its share, and guarantees nothing there.
             if promised {
-                let what = "predicted ASD over requirement";
-                return Err(DesignError::NotKept {
-                    channel: self.model.name.clone(),
-                    what,
-                    frequency_hz: f,
-                    value: ratio,
-                });
+                let (what, channel) = ("predicted ASD over requirement", self.model.name.clone());
+                return Err(DesignError::NotKept { channel, what, frequency_hz: f, value: ratio });
             }
             let band = missed.get_or_insert(Unattainable {
                 requirement: self.model.requirement.key,
@@ -912,7 +887,7 @@ impl Loop<'_> {
             if (x > 0.0) != (y > 0.0) {
                 let part = between(x, y);
                 let at_hz = f + part * (g - f);
-                // Angle from −1, which delay turns the loop towards when positive.
+                // Angle from −1; delay turns the loop towards −1 if positive.
                 let angle = (-(l + (m - l) * part)).arg();
                 crossover_hz = crossover_hz.max(at_hz);
                 phase = phase.min(angle.abs());
@@ -928,11 +903,9 @@ impl Loop<'_> {
         Margins { crossover_rad_s: TAU * crossover_hz, gain_db, phase_deg: phase.to_degrees(), delay_s: delay, modulus }
     }
 
-    /// The error of a channel whose best γ is above one: the frequency and the weight that ask for most.
+    /// Error of a channel whose smallest γ is above one, with the limiting frequency and weight.
     fn too_greedy(&self, weights: &Weights, gamma: f64) -> DesignError {
-        let shares =
-            |f: f64| (self.sensitivity(f).norm() * weights.w1(f), self.complementary(f).norm() * weights.w3(f));
-        let worst = self.sampling.grid(BAND_HZ.0, f64::INFINITY).map(|f| (f, shares(f)));
+        let worst = self.sampling.grid(BAND_HZ.0, f64::INFINITY).map(|f| (f, self.weighted(weights, f)));
         let (frequency_hz, (s, t)) = worst
             .max_by(|(_, (a, b)), (_, (c, d))| a.hypot(*b).total_cmp(&c.hypot(*d)))
             .unwrap_or((BAND_HZ.0, (0.0, 0.0)));
@@ -986,14 +959,9 @@ impl ChannelDesign {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use super::*;
-
-    pub(crate) fn taiji() -> Mission {
-        let text = include_str!("../../../fixtures/missions/taiji.toml");
-        let value: serde_json::Value = toml::from_str(text).unwrap();
-        Mission::from_json(&value.to_string()).unwrap()
-    }
+    use crate::testing::taiji;
 
     fn problem(c: &ChannelDesign) -> Problem {
         Problem {

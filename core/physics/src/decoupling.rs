@@ -21,8 +21,8 @@ const THRUSTERS: usize = 6;
 const RESIDUAL_TOLERANCE: f64 = 1e-12;
 /// Newton steps towards the least effort.
 const NEWTON_STEPS: usize = 4;
-/// Sine of the angle within which two drag-free axes are the same to the thrusters. The electrodes' reaction,
-/// `m_m/m_S`, would still make `B_v` regular, with thrust beyond all use.
+/// Sine of the angle within which two drag-free axes count as parallel. By the electrodes' reaction, `m_m/m_S`, `B_v`
+/// would still be regular, but the thrust unusably large.
 const PARALLEL: f64 = 0.05;
 
 /// The plant of eq:state_space_model that the decoupling assumes: nominal masses, offsets and stiffness.
@@ -58,14 +58,15 @@ impl LinearTestMass {
     }
 }
 
-/// Splits directions of thrust into those that drag-free axes take and those that are free; `None` when two drag-free
-/// axes, or three, leave each other no direction of their own.
+/// Orthogonal directions of thrust, those along drag-free axes first, and the number of free ones; `None` if drag-free
+/// axes are parallel or more than three.
 fn directions_of_thrust(drag_free: &[Vector3<f64>]) -> Option<(Matrix3<f64>, usize)> {
-    // The axes of SRF where they do: two axes across s_3 take s_1 and s_2, one along s_3 takes s_3.
+    // Use the axes of SRF if they suffice: two drag-free axes across s_3 use s_1 and s_2, one along s_3 uses s_3.
     let taken = |axis: usize| drag_free.iter().any(|d| d[axis] != 0.0);
     let mut order: Vec<usize> = (0..3).filter(|axis| taken(*axis)).collect();
     let aligned = order.len() == drag_free.len();
     order.extend((0..3).filter(|axis| !taken(*axis)));
+    let unit = |axis: usize| Vector3::from_fn(|i, _| f64::from(u8::from(i == axis)));
     let mut basis: Vec<Vector3<f64>> = Vec::new();
     for axis in drag_free {
         let rest = basis.iter().fold(*axis, |rest, known| rest - known * known.dot(axis));
@@ -76,12 +77,11 @@ fn directions_of_thrust(drag_free: &[Vector3<f64>]) -> Option<(Matrix3<f64>, usi
     }
     let free = 3 - basis.len();
     if aligned {
-        let unit = |axis: usize| Vector3::from_fn(|i, _| f64::from(u8::from(i == axis)));
         return Some((Matrix3::from_columns(&[order[0], order[1], order[2]].map(unit)), free));
     }
     while basis.len() < 3 {
         let rest = |axis: usize| {
-            let unit = Vector3::from_fn(|i, _| f64::from(u8::from(i == axis)));
+            let unit = unit(axis);
             basis.iter().fold(unit, |rest, known| rest - known * known.dot(&unit))
         };
         let best = (0..3).map(rest).max_by(|a, b| a.norm().total_cmp(&b.norm()))?;
@@ -198,7 +198,7 @@ impl LinearPlant {
         DMatrix::from_columns(&(0..inputs).map(column).collect::<Vec<_>>())
     }
 
-    /// Takes `A_v p̂` off the wanted accelerations of the channels.
+    /// Subtracts `A_v p̂` from the wanted accelerations of the channels.
     pub(crate) fn take_stiffness_off(&self, y: &Readout, wanted: &mut [f64]) {
         for (i, (s, tm)) in self.tm.iter().zip(&y.tm).enumerate() {
             let r = s.stiffness_tt * tm.r_orf_m + s.stiffness_tr * tm.att_orf_rad;
@@ -209,7 +209,7 @@ impl LinearPlant {
     }
 }
 
-/// The allocation and how exactly it is one.
+/// The allocation, with measures of its accuracy.
 #[derive(Clone, Debug)]
 pub struct Allocation {
     /// `B_v†`: inputs by channels, N or N m per m s⁻² or rad s⁻². Inputs are thrust along [`Self::thrust`], torque of
@@ -219,7 +219,7 @@ pub struct Allocation {
     pub thrust: Matrix3<f64>,
     /// Largest element of `|B_v B_v† − 1|`.
     pub residual: f64,
-    /// By how much the rules of thrust are missed, relative to the coefficients that they equate: eqs x_axis_thrust and
+    /// Relative errors of the rules of thrust: eqs x_axis_thrust and
     /// y_axis_thrust for two test masses that are drag-free along x, and eq z_axis_thrust for each free direction of
     /// thrust. The last is kept exactly whatever the geometry; the first two follow when the optical benches mirror
     /// each other.
@@ -236,7 +236,7 @@ impl Allocation {
     }
 }
 
-/// A matrix ready to make commands: the columns of `B_v†` one after the other.
+/// `B_v†` stored by columns, for repeated products.
 pub(crate) struct Allocator {
     columns: Vec<f64>,
     /// `B_v† wanted` of the last call.
@@ -263,8 +263,7 @@ impl Allocator {
 }
 
 impl LinearPlant {
-    /// How much of each channel's acceleration lies along a free direction of thrust: the components of the suspended
-    /// axes.
+    /// Component of each channel's acceleration along a free direction of thrust; zero for axes that are not suspended.
     fn common_motion(&self, direction: usize) -> Vec<f64> {
         let mut out = vec![0.0; self.channels()];
         for (i, tm) in self.tm.iter().enumerate() {
@@ -300,7 +299,7 @@ impl LinearPlant {
         let effort = |m: &DMatrix<f64>| {
             DMatrix::from_fn(m.nrows(), m.ncols(), |i, j| m[(i, j)] * if i >= THRUSTERS { 1.0 / scale[i] } else { 0.0 })
         };
-        // The effort is quadratic in the shares: one Newton step finds its least value, the others take off rounding.
+        // The effort is quadratic in the shares: one Newton step minimises it, the others reduce rounding.
         let mut shares = vec![0.0; rules.len()];
         let mut matrix = with(&shares)?;
         for _ in 0..if rules.is_empty() { 0 } else { NEWTON_STEPS } {
@@ -320,7 +319,7 @@ impl LinearPlant {
             matrix = with(&shares)?;
         }
 
-        // Column by column: blocks of a large product would be added in an order that depends on the machine.
+        // Column by column: the summation order of a blocked product depends on the machine.
         let product = |j: usize| {
             let zero = DVector::zeros(self.channels());
             (0..self.inputs()).fold(zero, |sum, k| sum + b.column(k) * matrix[(k, j)])
@@ -355,7 +354,7 @@ impl LinearPlant {
         missed
     }
 
-    /// Input that gives a body of the plant the acceleration 1: the unit of effort.
+    /// Input that gives a body unit acceleration: the unit of effort.
     fn input_scale(&self) -> Vec<f64> {
         let moment = |inverse: &Matrix3<f64>| 3.0 / inverse.trace();
         let mut scale = vec![self.sc_mass_kg; 3];
@@ -367,8 +366,8 @@ impl LinearPlant {
         scale
     }
 
-    /// The allocation whose thrust along each free direction is `share` times its rule: the other inputs follow without
-    /// freedom. `None` when they do not.
+    /// The allocation whose thrust along each free direction is `share` times its rule, which determines all other
+    /// inputs; `None` if their matrix is singular.
     fn with_thrust(&self, b: &DMatrix<f64>, rules: &[Vec<f64>], shares: &[f64]) -> Option<DMatrix<f64>> {
         let channels = self.channels();
         let free = self.free_thrust();
@@ -393,8 +392,8 @@ impl LinearPlant {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::control_design::tests::taiji;
     use crate::mission::{Axis, TestMass};
+    use crate::testing::taiji;
 
     fn allocation(mission: &Mission) -> Allocation {
         Allocation::new(mission).unwrap()

@@ -1,8 +1,8 @@
-//! A list of few values kept in place: what there is of each test mass, without an allocation per sample.
+//! A list of bounded length stored inline: values per test mass without an allocation per sample.
 
 use std::ops::{Deref, DerefMut};
 
-/// At most `MOST` values; a slice in every other respect.
+/// At most `MOST` values; dereferences to a slice.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Few<T, const MOST: usize> {
     values: [T; MOST],
@@ -10,7 +10,7 @@ pub struct Few<T, const MOST: usize> {
 }
 
 impl<T: Copy + Default, const MOST: usize> Few<T, MOST> {
-    /// `length` values by their index.
+    /// `length` values as a function of their index.
     ///
     /// # Panics
     /// `length` is above `MOST`.
@@ -24,13 +24,13 @@ impl<T: Copy + Default, const MOST: usize> Few<T, MOST> {
     /// Adds a value.
     ///
     /// # Panics
-    /// There are `MOST` already.
+    /// The list has `MOST` values already.
     pub fn push(&mut self, value: T) {
         self.values[self.length] = value;
         self.length += 1;
     }
 
-    /// One value for each of these.
+    /// Maps each value.
     #[must_use]
     pub fn map<U: Copy + Default>(&self, mut f: impl FnMut(&T) -> U) -> Few<U, MOST> {
         Few::from_fn(self.length, |i| f(&self.values[i]))

@@ -4,13 +4,13 @@
 //! Control 34, 831, 1989) in the general form of Glover and Doyle (Systems & Control Letters 11, 167, 1988): any
 //! partition, `D_11 ≠ 0`, `D_12` and `D_21` of full rank but not normalised, `D_22 ≠ 0`.
 //!
-//! Two certificates look at a finished loop and know nothing of how its controller came about: the Hamiltonian test of
-//! `‖G‖∞ < γ` ([`norm`]), and the Bounded Real Lemma's matrix inequality ([`bounded_real`]).
+//! Two certificates verify a closed loop independently of the synthesis: the Hamiltonian test of `‖G‖∞ < γ` ([`norm`])
+//! and the matrix inequality of the Bounded Real Lemma ([`bounded_real`]).
 
 use nalgebra::linalg::balancing::balance_parlett_reinsch;
 use nalgebra::{Complex, DMatrix};
 
-use crate::lti::{LtiError, StateSpace};
+use crate::lti::{LtiError, StateSpace, blocks};
 use crate::riccati::{RiccatiError, stabilising_solution};
 use crate::schur::{complex, eigenvalues, lyapunov, singular_value_range};
 
@@ -19,26 +19,24 @@ type Matrix = DMatrix<f64>;
 
 /// Relative size below which a singular value counts as zero.
 const RANK_TOLERANCE: f64 = 1e-7;
-/// Relative size of a negative eigenvalue of `X∞` or `Y∞` that is put down to rounding.
+/// Relative size of a negative eigenvalue of `X∞` or `Y∞` that counts as rounding.
 const DEFINITE_TOLERANCE: f64 = 1e-9;
-/// A difference this small against its terms is zero.
+/// Ratio of a difference to its terms below which it counts as zero.
 const CANCELLED: f64 = 1e-13;
-/// γ is searched for up to here, on the scale of the plant.
+/// Upper limit of the search for γ, relative to the direct terms' bound.
 const LARGEST_GAMMA: f64 = 1e9;
-/// Covariance added to every state of a certificate, relative to the largest.
+/// Regularisation of the states' covariance, relative to its largest element.
 const LIFT: f64 = 1e-9;
-/// A plant whose γ is smaller than this has a perfect controller.
+/// Lower limit of the search for γ.
 const SMALLEST_GAMMA: f64 = 1e-9;
 
-/// What stands in the way of a controller with a given γ: the conditions of Glover and Doyle's theorem in turn.
+/// Condition of Glover and Doyle's theorem that fails at a given γ, in the order of evaluation.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
 pub enum Obstacle {
-    /// The direct terms that no controller reaches.
+    /// γ is below the bound of the direct terms, which no controller changes.
     #[error("the direct term from w to z alone has a gain of {at_least}")]
-    Direct {
-        /// `max(σ̄[D_1111 D_1112], σ̄[D_1111ᵀ D_1121ᵀ])`.
-        at_least: f64,
-    },
+    Direct { at_least: f64 },
     /// The control Riccati equation.
     #[error("X∞ does not exist: {0}")]
     ControlRiccati(RiccatiError),
@@ -47,25 +45,19 @@ pub enum Obstacle {
     FilterRiccati(RiccatiError),
     /// `X∞` is not positive semidefinite.
     #[error("X∞ has the negative eigenvalue {smallest}: full information would not suffice")]
-    ControlIndefinite {
-        /// Smallest eigenvalue of `X∞` over its largest in size.
-        smallest: f64,
-    },
+    ControlIndefinite { smallest: f64 },
     /// `Y∞` is not positive semidefinite.
     #[error("Y∞ has the negative eigenvalue {smallest}: full control would not suffice")]
-    FilterIndefinite {
-        /// Smallest eigenvalue of `Y∞` over its largest in size.
-        smallest: f64,
-    },
-    /// Control and estimation each succeed, but not together.
-    #[error("the spectral radius of X∞ Y∞ is {ratio} γ²: what must be controlled cannot be estimated well enough")]
-    Coupling {
-        /// `ρ(X∞ Y∞)/γ²`.
-        ratio: f64,
-    },
+    FilterIndefinite { smallest: f64 },
+    /// Control and estimation are each feasible, but not combined.
+    #[error(
+        "the spectral radius of X∞ Y∞ is {ratio} γ², not below γ²: states to be controlled are estimated too poorly"
+    )]
+    Coupling { ratio: f64 },
 }
 
 /// Why a synthesis or a certificate failed.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum HinfError {
     /// Numbers of measurements and controls do not fit the plant.
@@ -73,58 +65,28 @@ pub enum HinfError {
         "a plant of {outputs} outputs and {inputs} inputs cannot have {measurements} measurements and {controls} \
          controls: there must be at least as many errors z as controls, and as many disturbances w as measurements"
     )]
-    Partition {
-        /// Outputs of the plant.
-        outputs: usize,
-        /// Inputs of the plant.
-        inputs: usize,
-        /// Measurements `y`.
-        measurements: usize,
-        /// Controls `u`.
-        controls: usize,
-    },
+    Partition { outputs: usize, inputs: usize, measurements: usize, controls: usize },
     /// `D_12` has not full column rank.
     #[error("some control costs nothing at high frequency (D_12 has not full column rank): weigh every control")]
     FreeControl,
     /// `D_21` has not full row rank.
     #[error("some measurement has no noise at high frequency (D_21 has not full row rank): add noise to every one")]
     PerfectMeasurement,
-    /// An unstable mode cannot be moved.
+    /// An unstable mode is not controllable.
     #[error("the unstable mode at {re:e} + {im:e}i rad/s cannot be reached by the control")]
-    NotStabilisable {
-        /// Real part, rad/s.
-        re: f64,
-        /// Imaginary part, rad/s.
-        im: f64,
-    },
-    /// An unstable mode cannot be seen.
-    #[error("the unstable mode at {re:e} + {im:e}i rad/s does not show in the measurements")]
-    NotDetectable {
-        /// Real part, rad/s.
-        re: f64,
-        /// Imaginary part, rad/s.
-        im: f64,
-    },
+    NotStabilisable { re: f64, im: f64 },
+    /// An unstable mode is not observable.
+    #[error("the unstable mode at {re:e} + {im:e}i rad/s is not observable in the measurements")]
+    NotDetectable { re: f64, im: f64 },
     /// No controller at this γ.
     #[error("no controller reaches γ = {gamma}: {obstacle}")]
-    Infeasible {
-        /// What was asked for.
-        gamma: f64,
-        /// What failed first.
-        obstacle: Obstacle,
-    },
-    /// A norm was asked of a system that has none.
+    Infeasible { gamma: f64, obstacle: Obstacle },
+    /// The system is unstable and has no norm.
     #[error("the system is not stable (a pole at {re:e} rad/s): its norm is infinite")]
-    Unstable {
-        /// Largest real part of its poles, rad/s.
-        re: f64,
-    },
+    Unstable { re: f64 },
     /// The strict inequality has no solution at this γ.
     #[error("the Bounded Real Lemma's inequality has no strict solution at γ = {gamma}; the norm is not below it")]
-    NotBounded {
-        /// What was asked for.
-        gamma: f64,
-    },
+    NotBounded { gamma: f64 },
     /// An interconnection or an eigenvalue computation failed.
     #[error(transparent)]
     System(#[from] LtiError),
@@ -164,7 +126,7 @@ pub struct Optimum {
     pub gamma: f64,
     /// Largest γ found infeasible, a relative tolerance below.
     pub refused: f64,
-    /// What stood in the way there; `None` when γ could be taken to nothing.
+    /// The condition that fails there; `None` if γ has no positive lower bound.
     pub obstacle: Option<Obstacle>,
 }
 
@@ -181,14 +143,11 @@ fn largest_singular_value(m: &Matrix) -> f64 {
 }
 
 fn horizontal(left: &Matrix, right: &Matrix) -> Matrix {
-    let mut out = Matrix::zeros(left.nrows(), left.ncols() + right.ncols());
-    out.view_mut((0, 0), left.shape()).copy_from(left);
-    out.view_mut((0, left.ncols()), right.shape()).copy_from(right);
-    out
+    blocks([[left, right]])
 }
 
 fn vertical(upper: &Matrix, lower: &Matrix) -> Matrix {
-    horizontal(&upper.transpose(), &lower.transpose()).transpose()
+    blocks([[upper], [lower]])
 }
 
 /// `diag(γ² I, 0)` with `count` entries of γ² in a square of `size`.
@@ -245,7 +204,7 @@ impl Synthesis {
         let c2 = c.rows(z, measurements).into_owned();
         reachable(a, &b2).map_err(|s| HinfError::NotStabilisable { re: s.re, im: s.im })?;
         reachable(&a.transpose(), &c2.transpose()).map_err(|s| HinfError::NotDetectable { re: s.re, im: s.im })?;
-        // Scaling the states changes nothing but the conditioning.
+        // Scaling the states improves conditioning and changes nothing else.
         let mut balanced = a.clone();
         let scaling = balance_parlett_reinsch(&mut balanced);
         let (up, down) = (Matrix::from_diagonal(&scaling), Matrix::from_diagonal(&scaling.map(|s| 1.0 / s)));
@@ -328,7 +287,7 @@ impl Synthesis {
         if y < -DEFINITE_TOLERANCE {
             return Err(Obstacle::FilterIndefinite { smallest: y });
         }
-        // X∞ and Y∞ differ in scale by orders of magnitude; their product is balanced before its eigenvalues.
+        // `eigenvalues` balances the product, because X∞ and Y∞ differ in scale by orders of magnitude.
         let radius = eigenvalues(&(&solved.x * &solved.y))
             .map_or(f64::INFINITY, |values| values.iter().map(|v| v.re).fold(0.0, f64::max));
         let ratio = radius / (gamma * gamma);
@@ -365,7 +324,7 @@ impl Synthesis {
                 Err(obstacle) => refused = (middle, Some(obstacle)),
             }
         }
-        // A floor that was never tried is the direct terms' bound.
+        // If no γ was refused, the floor is the bound of the direct terms.
         let bound = Obstacle::Direct { at_least: floor };
         let obstacle = refused.1.or((floor > SMALLEST_GAMMA).then_some(bound));
         Ok(Optimum { gamma, refused: refused.0, obstacle })
@@ -423,12 +382,9 @@ impl Synthesis {
 /// `[[A, 0], [−Q, −Aᵀ]] − [B; −S] R⁻¹ [Sᵀ, Bᵀ]`.
 fn hamiltonian(a: &Matrix, b: &Matrix, q: &Matrix, s: &Matrix, r_inverse: &Matrix) -> Matrix {
     let n = a.nrows();
-    let mut h = Matrix::zeros(2 * n, 2 * n);
-    h.view_mut((0, 0), (n, n)).copy_from(a);
-    h.view_mut((n, 0), (n, n)).copy_from(&-q);
-    h.view_mut((n, n), (n, n)).copy_from(&-a.transpose());
+    let mut h = blocks([[a, &Matrix::zeros(n, n)], [&-q, &-a.transpose()]]);
     h -= vertical(b, &-s) * r_inverse * horizontal(&s.transpose(), &b.transpose());
-    // In mixed sensitivity the measurement tells the disturbance, and this block cancels but for rounding.
+    // In mixed sensitivity this block cancels except for rounding.
     let mut constant = h.view_mut((n, 0), (n, n));
     if constant.amax() <= CANCELLED * q.amax() {
         constant.fill(0.0);
@@ -442,10 +398,10 @@ fn reachable(a: &Matrix, b: &Matrix) -> Result<(), C64> {
     let modes = eigenvalues(a).ok_or(C64::from(f64::NAN))?;
     let size = a.norm().max(f64::MIN_POSITIVE);
     for mode in modes.into_iter().filter(|m| m.re >= -RANK_TOLERANCE * size) {
-        let mut pencil = DMatrix::<C64>::zeros(n, n + b.ncols());
-        pencil.view_mut((0, 0), (n, n)).copy_from(&(complex(a) - DMatrix::from_diagonal_element(n, n, mode)));
-        pencil.view_mut((0, n), b.shape()).copy_from(&complex(b));
-        // Rows of one size, so that small states count as much as large ones.
+        let mut pencil = complex(&horizontal(a, b));
+        let mut square = pencil.columns_mut(0, n);
+        square -= DMatrix::from_diagonal_element(n, n, mode);
+        // Normalise rows, so that the rank test does not depend on the scale of the states.
         for mut row in pencil.row_iter_mut() {
             let length = row.norm();
             if length > 0.0 {
@@ -464,11 +420,11 @@ fn reachable(a: &Matrix, b: &Matrix) -> Result<(), C64> {
 pub struct Norm {
     /// Largest singular value of the response over all frequencies.
     pub value: f64,
-    /// Frequency of the largest one found, rad/s; infinite when the direct term is it.
+    /// Frequency of the maximum, rad/s; infinite for the direct term.
     pub frequency_rad_s: f64,
 }
 
-/// The same system with balanced states: nothing else changes.
+/// The same system with balanced states.
 fn with_balanced_states(system: &StateSpace) -> StateSpace {
     let mut a = system.a.clone();
     let scaling = balance_parlett_reinsch(&mut a);
@@ -490,7 +446,7 @@ fn norm_hamiltonian(system: &StateSpace, gamma: f64) -> Option<Matrix> {
 }
 
 /// Frequencies at which a singular value may pass γ, ascending, rad/s: imaginary parts of eigenvalues near the axis.
-/// Generous, since each is looked at afterwards.
+/// The tolerance is generous, since each candidate is evaluated afterwards.
 fn crossings(system: &StateSpace, gamma: f64) -> Result<Vec<f64>, HinfError> {
     let order = 2 * system.order();
     let unknown = || HinfError::System(LtiError::Eigenvalues { order });
@@ -556,7 +512,7 @@ pub fn norm(system: &StateSpace, relative_tolerance: f64) -> Result<Norm, HinfEr
 /// `[[AᵀX + XA + CᵀC, XB + CᵀD], [BᵀX + DᵀC, DᵀD − γ²I]] < 0`.
 ///
 /// The states are scaled so that a white input gives them unit covariance, and the lower rows are divided by γ:
-/// eigenvalues then have the size of squared gains, and of rates.
+/// eigenvalues are then comparable with squared gains and rates.
 #[derive(Clone, Debug)]
 pub struct BoundedReal {
     /// The bound that is proved.
@@ -579,7 +535,7 @@ fn inequality(system: &StateSpace, gamma: f64, x: &Matrix) -> f64 {
     let side = (x * b + c.transpose() * d) / gamma;
     let m = d.ncols();
     let lower = d.transpose() * d / (gamma * gamma) - Matrix::identity(m, m);
-    let whole = vertical(&horizontal(&corner, &side), &horizontal(&side.transpose(), &lower));
+    let whole = blocks([[&corner, &side], [&side.transpose(), &lower]]);
     let values = whole.symmetric_eigenvalues();
     values.max() / values.amax()
 }
@@ -591,7 +547,8 @@ fn in_states(system: &StateSpace, scaling: &Matrix) -> Option<StateSpace> {
     Some(StateSpace { a: &inverse * a * scaling, b: inverse * b, c: c * scaling, d: d.clone() })
 }
 
-/// A Cholesky factor of the states' covariance under white noise, slightly lifted where some state is not reached.
+/// Cholesky factor of the states' covariance under white noise, regularised by [`LIFT`] for states that are not
+/// controllable.
 fn covariance_factor(system: &StateSpace) -> Option<Matrix> {
     let mut a = system.a.clone();
     let up = Matrix::from_diagonal(&balance_parlett_reinsch(&mut a));
@@ -603,8 +560,8 @@ fn covariance_factor(system: &StateSpace) -> Option<Matrix> {
 }
 
 impl BoundedReal {
-    /// Evaluates the inequality of another system of the same order at this certificate's `X`: what is left of the
-    /// proof when a coefficient changes.
+    /// Evaluates the inequality of another system of the same order at this certificate's `X`; not negative where the
+    /// certificate does not prove the bound for it.
     #[must_use]
     pub fn largest_eigenvalue_for(&self, system: &StateSpace) -> f64 {
         in_states(system, &self.scaling).map_or(f64::NAN, |system| inequality(&system, self.gamma, &self.x))

@@ -1,13 +1,13 @@
 //! Delay and first-order lag of an actuator.
 
-/// Delay and first-order lag of a command that holds from sample to sample, exactly: `τ ẏ = u(t − delay) − y`.
+/// Exact delay and first-order lag of a sample-and-hold command: `τ ẏ = u(t − delay) − y`.
 #[derive(Clone, Debug)]
 pub struct Lag {
     samples: usize,
-    /// The rest of the delay as a part of a sample.
+    /// Fraction of a sample in the delay.
     part: f64,
-    /// Until a part of the sample is over the older command holds, then the newer one: for both stretches how much of
-    /// `y − u` is left at its end, and in its mean.
+    /// The older command acts for the fraction `part` of a sample, then the newer one. For both intervals, the factor of
+    /// `y − u` at the end and in the mean.
     left: [f64; 2],
     mean: [f64; 2],
 }
@@ -17,7 +17,7 @@ impl Lag {
     #[must_use]
     pub fn new(lag_s: f64, delay_s: f64, dt_s: f64) -> Self {
         let delay = delay_s / dt_s;
-        // A delay of whole samples must not become one less and a rest.
+        // Rounding must not turn a whole number of samples into the next lower one.
         let samples = (delay + 1e-9).floor();
         let part = (delay - samples).max(0.0);
         let left = |stretch: f64| if lag_s > 0.0 { (-stretch * dt_s / lag_s).exp() } else { 0.0 };
@@ -29,13 +29,13 @@ impl Lag {
         Self { samples: samples as usize, part, left: stretches.map(left), mean: stretches.map(mean) }
     }
 
-    /// Whole samples of the delay: the newer of [`Self::step`]'s commands is so old, the older one a sample more.
+    /// Whole samples of delay: the age of the newer command of [`Self::step`]; the older one is a sample older.
     #[must_use]
     pub fn samples(&self) -> usize {
         self.samples
     }
 
-    /// The mean over a sample, and `y` moved on to its end.
+    /// Returns the mean over a sample and advances `y` to its end.
     pub fn step(&self, y: &mut f64, older: f64, newer: f64) -> f64 {
         let mut mean = 0.0;
         for (i, (u, stretch)) in [(older, self.part), (newer, 1.0 - self.part)].into_iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Two levels of noise in a second difference, from its spectrum.
+//! Fit of two noise levels to the spectrum of a second difference.
 
 /// Spectral densities of a channel's noise, one-sided: held acceleration, and readout before it is differenced.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -28,9 +28,8 @@ pub struct Bin {
     pub weight: f64,
 }
 
-/// Levels `a` and `b` of `a cos² + b (4 sin²/dt²)²` that fit a spectrum: least squares of the relative misfit, which is
-/// as large in every bin as its observations allow. Bins without power or weight are left out; `None` when nothing is
-/// left.
+/// Least-squares fit of `a cos² + b (4 sin²/dt²)²` to a spectrum, in relative misfit. Bins without power or weight are
+/// omitted; `None` if none is left.
 #[must_use]
 pub fn fit(bins: &[Bin], dt_s: f64) -> Option<Levels> {
     let used: Vec<([f64; 2], Bin)> = bins
@@ -39,7 +38,7 @@ pub fn fit(bins: &[Bin], dt_s: f64) -> Option<Levels> {
         .map(|b| (responses(b.frequency_hz, dt_s), *b))
         .filter(|(r, _)| r[0] > 0.0 && r[1] > 0.0)
         .collect();
-    // Each level alone can be no larger than what is measured; the smallest such values are a start from above.
+    // Start from upper bounds: each level alone cannot exceed the measured spectrum in any bin.
     let least = |i: usize| used.iter().map(|(r, b)| b.psd / r[i]).fold(f64::INFINITY, f64::min);
     let (mut held, mut readout) = (least(0), least(1));
     if used.is_empty() {
@@ -49,7 +48,7 @@ pub fn fit(bins: &[Bin], dt_s: f64) -> Option<Levels> {
         let (mut aa, mut ab, mut bb, mut ay, mut by) = (0.0, 0.0, 0.0, 0.0, 0.0);
         for (r, bin) in &used {
             let model = held * r[0] + readout * r[1];
-            // In units of the present levels, so that the two unknowns are near one.
+            // In units of the current levels, so that the unknowns are near one.
             let (p, q, s, w) = (held * r[0] / model, readout * r[1] / model, bin.psd / model, bin.weight);
             aa += w * p * p;
             ab += w * p * q;
@@ -62,7 +61,7 @@ pub fn fit(bins: &[Bin], dt_s: f64) -> Option<Levels> {
             break;
         }
         let (x, y) = ((ay * bb - by * ab) / determinant, (by * aa - ay * ab) / determinant);
-        // A level that the other explains away falls by a factor of four at most, and stays above zero.
+        // A level falls by a factor of four at most per step, and stays positive.
         (held, readout) = (held * x.max(0.25), readout * y.max(0.25));
     }
     Some(Levels { held, readout })

@@ -20,4 +20,6 @@ pub mod riccati;
 pub mod schur;
 pub mod signals;
 pub mod spectrum;
+#[cfg(test)]
+mod testing;
 pub mod thrust_noise;

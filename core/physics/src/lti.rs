@@ -2,7 +2,7 @@
 //! bilinear transform to sampled second-order sections.
 //!
 //! The bilinear transform `z = (1 + hs)/(1 − hs)`, `h = dt/2`, maps the unit circle onto the imaginary axis, so that a
-//! norm or a bound proved in `s` holds in `z` at the frequency `Im s = tan(ω dt/2)/h`, without approximation.
+//! norm or bound proved in `s` holds exactly in `z`, at the frequency `Im s = tan(ω dt/2)/h`.
 
 use nalgebra::{Complex, DMatrix};
 
@@ -11,39 +11,41 @@ use crate::schur::{complex, eigenvalues};
 type C64 = Complex<f64>;
 type Matrix = DMatrix<f64>;
 
-/// A root whose imaginary part is a smaller part of it than this counts as real.
+/// Ratio of imaginary part to magnitude below which a root counts as real.
 const REAL_TOLERANCE: f64 = 1e-9;
 
+/// A matrix of blocks; those of a row have one height, those of a column one width.
+pub(crate) fn blocks<const R: usize, const C: usize>(grid: [[&Matrix; C]; R]) -> Matrix {
+    let rows = grid.iter().map(|row| row[0].nrows()).sum();
+    let mut out = Matrix::zeros(rows, grid[0].iter().map(|block| block.ncols()).sum());
+    let mut top = 0;
+    for row in grid {
+        let mut left = 0;
+        for block in row {
+            out.view_mut((top, left), block.shape()).copy_from(block);
+            left += block.ncols();
+        }
+        top += row[0].nrows();
+    }
+    out
+}
+
 /// Why a system could not be built or converted.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum LtiError {
-    /// The matrices do not belong together.
+    /// Dimensions of the matrices disagree.
     #[error("state space of A {a:?}, B {b:?}, C {c:?}, D {d:?} (rows, columns): A must be n×n, B n×m, C p×n, D p×m")]
-    Shape {
-        /// Rows and columns of A.
-        a: (usize, usize),
-        /// Rows and columns of B.
-        b: (usize, usize),
-        /// Rows and columns of C.
-        c: (usize, usize),
-        /// Rows and columns of D.
-        d: (usize, usize),
-    },
-    /// An interconnection has an algebraic loop without solution.
+    Shape { a: (usize, usize), b: (usize, usize), c: (usize, usize), d: (usize, usize) },
+    /// The algebraic loop of an interconnection is singular.
     #[error("the interconnection has an algebraic loop: I − D_K D_22 is singular; give plant or controller a lag")]
     AlgebraicLoop,
     /// The system has no second-order sections with unit gain at zero frequency.
     #[error("system with gain {gain} at zero frequency cannot be scaled by it; a controller here needs a finite gain")]
-    NoStaticGain {
-        /// Gain at zero frequency.
-        gain: f64,
-    },
-    /// The eigenvalues could not be found.
+    NoStaticGain { gain: f64 },
+    /// The eigenvalue iteration failed.
     #[error("the eigenvalues of a {order}×{order} matrix were not found; its entries are not finite or overflow")]
-    Eigenvalues {
-        /// Number of states.
-        order: usize,
-    },
+    Eigenvalues { order: usize },
 }
 
 /// `ẋ = A x + B u`, `y = C x + D u`.
@@ -84,8 +86,8 @@ impl StateSpace {
         Self { a: Matrix::zeros(0, 0), b: Matrix::zeros(0, m), c: Matrix::zeros(p, 0), d }
     }
 
-    /// Single-input single-output quotient of polynomials in `s`, highest power first, as many coefficients above as
-    /// below; in controllable canonical form.
+    /// Single-input single-output quotient of two polynomials in `s` of one length, highest power first, in controllable
+    /// canonical form.
     #[must_use]
     pub fn quotient(numerator: &[f64], denominator: &[f64]) -> Self {
         let n = denominator.len() - 1;
@@ -120,18 +122,13 @@ impl StateSpace {
     /// `next · self`: the output of this system drives `next`, whose inputs are as many.
     #[must_use]
     pub fn then(&self, next: &Self) -> Self {
-        let (n, k) = (self.order(), next.order());
-        let mut a = Matrix::zeros(n + k, n + k);
-        a.view_mut((0, 0), (n, n)).copy_from(&self.a);
-        a.view_mut((n, 0), (k, n)).copy_from(&(&next.b * &self.c));
-        a.view_mut((n, n), (k, k)).copy_from(&next.a);
-        let mut b = Matrix::zeros(n + k, self.b.ncols());
-        b.view_mut((0, 0), self.b.shape()).copy_from(&self.b);
-        b.view_mut((n, 0), (k, self.b.ncols())).copy_from(&(&next.b * &self.d));
-        let mut c = Matrix::zeros(next.c.nrows(), n + k);
-        c.view_mut((0, 0), (next.c.nrows(), n)).copy_from(&(&next.d * &self.c));
-        c.view_mut((0, n), next.c.shape()).copy_from(&next.c);
-        Self { a, b, c, d: &next.d * &self.d }
+        let zero = Matrix::zeros(self.order(), next.order());
+        Self {
+            a: blocks([[&self.a, &zero], [&(&next.b * &self.c), &next.a]]),
+            b: blocks([[&self.b], [&(&next.b * &self.d)]]),
+            c: blocks([[&(&next.d * &self.c), &next.c]]),
+            d: &next.d * &self.d,
+        }
     }
 
     /// `F_l(P, K)` (eq:lower_fractional_transformation): this system's last outputs drive `controller`, whose outputs
@@ -140,7 +137,6 @@ impl StateSpace {
     /// # Errors
     /// [`LtiError::AlgebraicLoop`] when the loop through both direct terms cannot be solved.
     pub fn lower_fractional(&self, controller: &Self) -> Result<Self, LtiError> {
-        let (n, k) = (self.order(), controller.order());
         let (u, y) = controller.d.shape();
         let (z, w) = (self.c.nrows() - y, self.b.ncols() - u);
         let (b1, b2) = (self.b.columns(0, w), self.b.columns(w, u));
@@ -155,18 +151,15 @@ impl StateSpace {
         let y_of_x = c2 + &d22 * &u_of_x;
         let y_of_k = &d22 * &u_of_k;
         let y_of_w = &d21 + &d22 * &u_of_w;
-        let mut a = Matrix::zeros(n + k, n + k);
-        a.view_mut((0, 0), (n, n)).copy_from(&(&self.a + b2 * &u_of_x));
-        a.view_mut((0, n), (n, k)).copy_from(&(b2 * &u_of_k));
-        a.view_mut((n, 0), (k, n)).copy_from(&(&controller.b * y_of_x));
-        a.view_mut((n, n), (k, k)).copy_from(&(&controller.a + &controller.b * y_of_k));
-        let mut b = Matrix::zeros(n + k, w);
-        b.view_mut((0, 0), (n, w)).copy_from(&(b1 + b2 * &u_of_w));
-        b.view_mut((n, 0), (k, w)).copy_from(&(&controller.b * y_of_w));
-        let mut c = Matrix::zeros(z, n + k);
-        c.view_mut((0, 0), (z, n)).copy_from(&(c1 + &d12 * &u_of_x));
-        c.view_mut((0, n), (z, k)).copy_from(&(&d12 * &u_of_k));
-        Ok(Self { a, b, c, d: d11 + d12 * u_of_w })
+        Ok(Self {
+            a: blocks([
+                [&(&self.a + b2 * &u_of_x), &(b2 * &u_of_k)],
+                [&(&controller.b * y_of_x), &(&controller.a + &controller.b * y_of_k)],
+            ]),
+            b: blocks([[&(b1 + b2 * &u_of_w)], [&(&controller.b * y_of_w)]]),
+            c: blocks([[&(c1 + &d12 * &u_of_x), &(&d12 * &u_of_k)]]),
+            d: d11 + d12 * u_of_w,
+        })
     }
 
     /// Poles, rad/s.
@@ -177,7 +170,7 @@ impl StateSpace {
         eigenvalues(&self.a).ok_or(LtiError::Eigenvalues { order: self.order() })
     }
 
-    /// The system in `v = 1/s`: `None` with a pole at zero. Its direct term is the static gain.
+    /// The system in `v = 1/s`, whose direct term is the static gain; `None` with a pole at zero.
     fn reciprocal(&self) -> Option<Self> {
         let a = self.a.clone().try_inverse()?;
         let b = -(&a * &self.b);
@@ -193,9 +186,8 @@ impl StateSpace {
     /// A system with one input and one output as `gain · Π sections(z)`, sampled by the bilinear transform with
     /// `half_step` `h = dt/2` in this system's unit of time.
     ///
-    /// Each section `[b0, b1, b2, a1, a2]` has unit gain at zero frequency, so that `gain` is the static gain and no
-    /// section's states grow beyond its input by more than its own peak. Conjugate pairs stay together; the poles
-    /// nearest to the unit circle take the zeros nearest to them first.
+    /// Each section `[b0, b1, b2, a1, a2]` has unit gain at zero frequency, so `gain` is the static gain. Conjugate pairs
+    /// share a section; poles nearest to the unit circle are paired first, with the zeros nearest to them.
     ///
     /// # Errors
     /// [`LtiError::NoStaticGain`] when the gain at zero frequency is zero or infinite.
@@ -208,14 +200,13 @@ impl StateSpace {
         let mut poles = pairs(self.poles()?.into_iter().map(|s| Root::sampled(s.inv(), half_step)));
         poles.sort_by(|p, q| radius(q).total_cmp(&radius(p)));
         let mut zeros: Vec<Root> = zeros.into_iter().map(|v| Root::sampled(v, half_step)).collect();
-        // A pole on its own picks first: what is left of the real zeros is then even in number.
+        // A single pole is paired first, which leaves an even number of real zeros.
         poles.sort_by_key(Vec::len);
         let sections = poles.iter().map(|pole| section(&nearest_zeros(&mut zeros, pole), pole)).collect();
         Ok(Sections { gain, sections })
     }
 
-    /// `gain · Π sections(z)` in continuous time, `z = (1 + hs)/(1 − hs)`: the inverse of [`Self::sections`], from the
-    /// coefficients that are flown.
+    /// `gain · Π sections(z)` in continuous time, `z = (1 + hs)/(1 − hs)`: the inverse of [`Self::sections`].
     #[must_use]
     pub fn from_sections(sections: &[[f64; 5]], gain: f64, half_step: f64) -> Self {
         let h = half_step;
@@ -240,7 +231,7 @@ pub struct Sections {
     pub sections: Vec<[f64; 5]>,
 }
 
-/// A root of a sampled polynomial, with its distance from `z = 1` to full precision.
+/// A root of a polynomial in `z`, with `1 − z` computed without cancellation.
 #[derive(Clone, Copy, Debug)]
 struct Root {
     z: C64,
@@ -267,7 +258,7 @@ impl Root {
     }
 }
 
-/// Groups conjugate pairs, and real roots two by two from the slowest; at most one stands alone.
+/// Groups roots into conjugate pairs and pairs of real roots, slowest first; at most one root stays single.
 fn pairs(roots: impl Iterator<Item = Root>) -> Vec<Vec<Root>> {
     let (mut real, complex): (Vec<Root>, Vec<Root>) = roots.partition(Root::is_real);
     real.sort_by(|a, b| a.from_one.re.total_cmp(&b.from_one.re));
@@ -279,7 +270,7 @@ fn radius(roots: &[Root]) -> f64 {
     roots.iter().map(|r| r.z.norm()).fold(0.0, f64::max)
 }
 
-/// Takes as many zeros as there are poles: those nearest to them, conjugates together.
+/// Removes as many zeros as there are poles, those nearest to them; conjugates stay together.
 fn nearest_zeros(zeros: &mut Vec<Root>, poles: &[Root]) -> Vec<Root> {
     let distance = |group: &[Root]| -> f64 { group.iter().zip(poles).map(|(x, y)| (x.z - y.z).norm()).sum() };
     let mut real: Vec<Root> = zeros.iter().filter(|r| r.is_real()).map(|r| r.real()).collect();

@@ -11,43 +11,24 @@ use crate::frames::dcm_turned_about_z;
 use crate::noise::{NoiseLine, NoiseShape, NoiseTerm};
 
 /// Why a mission file was refused: what, where, and what to do next.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum MissionError {
     /// The text is not a mission: unknown key, wrong type, missing key.
     #[error(
         "mission file: {key}: {source}; every key carries its unit, and fixtures/missions/taiji.toml shows them all"
     )]
-    Shape {
-        /// Dotted key at which reading stopped.
-        key: String,
-        /// What was found and expected.
-        source: serde_json::Error,
-    },
-    /// A value has no physical sense.
+    Shape { key: String, source: serde_json::Error },
+    /// A value is not physical.
     #[error("mission file: {key} = {value} {reason}")]
-    Value {
-        /// Dotted key.
-        key: String,
-        /// The value as written.
-        value: String,
-        /// What a value must satisfy.
-        reason: &'static str,
-    },
-    /// The actuators cannot move every channel on its own.
+    Value { key: String, value: String, reason: &'static str },
+    /// The actuators cannot accelerate every channel independently.
     #[error("mission file: no allocation of the channels to the actuators: {reason}")]
-    Decoupling {
-        /// What is wrong and what to check.
-        reason: String,
-    },
-    /// A section that a plugin needs is not there.
+    Decoupling { reason: String },
+    /// A section that a plugin needs is missing.
     #[error("mission file: section [{section}] is missing; {needed_by} needs it")]
-    Missing {
-        /// Dotted section.
-        section: String,
-        /// Who asked.
-        needed_by: &'static str,
-    },
-    /// The mission brings no controllers, and none can be designed for it.
+    Missing { section: String, needed_by: &'static str },
+    /// The mission file has no controllers, and the design of controllers failed.
     #[error("mission file: {0}")]
     Design(#[source] Box<dyn std::error::Error + Send + Sync>),
 }
@@ -60,7 +41,7 @@ pub struct Mission {
     pub mission: Identity,
     /// Mass properties of the spacecraft.
     pub spacecraft: Spacecraft,
-    /// Test masses by name; what there is of each comes in the order of their names.
+    /// Test masses by name; everything per test mass is in the order of their names.
     #[serde(default)]
     pub test_mass: BTreeMap<String, TestMass>,
     /// Survey of the housings.
@@ -69,7 +50,7 @@ pub struct Mission {
     /// Noise models.
     #[serde(default)]
     pub noise: Noise,
-    /// Mean forces and torques of sunlight.
+    /// Mean force and torque of sunlight.
     #[serde(default)]
     pub solar_pressure: Option<SolarPressure>,
     /// Requirement table (tab:state_precision_requirements).
@@ -81,19 +62,19 @@ pub struct Mission {
     /// Actuator limits.
     #[serde(default)]
     pub actuators: Option<Actuators>,
-    /// What the thrusters make of a command; without it, what is commanded.
+    /// Response of the thrusters to a command; without it, they apply the command.
     #[serde(default)]
     pub thrusters: Option<Thrusters>,
-    /// Self-gravity left over at the test masses.
+    /// Residual self-gravity at the test masses.
     #[serde(default)]
     pub self_gravity: SelfGravity,
     /// Limits of the telemetry beyond which a sample is an outlier.
     #[serde(default)]
     pub limits: Option<Limits>,
-    /// Where the constellation flies.
+    /// Orbits of the constellation.
     #[serde(default)]
     pub orbit: Orbit,
-    /// Free tables for mission-specific plugins, not interpreted here.
+    /// Tables of mission-specific plugins, not interpreted here.
     #[serde(default)]
     pub plugin: BTreeMap<String, serde_json::Value>,
 }
@@ -158,9 +139,9 @@ pub struct TestMass {
     /// hold the test mass.
     #[serde(default = "only_x")]
     pub drag_free: Vec<Axis>,
-    /// Where the drawings put the housing's centre relative to the spacecraft's centre of mass, SRF, m.
+    /// Nominal position of the housing's centre relative to the spacecraft's centre of mass, SRF, m.
     pub offset_nominal_srf_m: [f64; 3],
-    /// Half width of the box around the nominal offset in which the truth must lie, SRF, m.
+    /// Half width of the box around the nominal offset that contains the true one, SRF, m.
     pub offset_box_srf_m: [f64; 3],
     /// `S_TT`, force per displacement and mass, ORF, s⁻², rows.
     #[serde(default)]
@@ -177,7 +158,7 @@ pub struct TestMass {
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Housing {
-    /// The two test masses; without it those of a mission that has two.
+    /// The two test masses; optional in a mission of two.
     #[serde(default)]
     pub between: Option<[String; 2]>,
     /// Surveyed vector from the second housing to the first, `b_1 − b_2`, SRF, m.
@@ -220,15 +201,15 @@ pub struct Noise {
     pub test_mass_acceleration: Option<AccelerationNoise>,
     /// Fluctuation of the solar pressure force.
     pub solar_pressure: Option<ForceNoise>,
-    /// Linear acceleration measured by an accelerometer, with the non-gravitational acceleration nobody models.
+    /// Linear acceleration measured by an accelerometer, with the unmodelled non-gravitational acceleration.
     pub accelerometer_linear: Option<AccelerationNoise>,
     /// Angular acceleration measured by an accelerometer.
     pub accelerometer_angular: Option<AngularAccelerationNoise>,
 }
 
 macro_rules! noise_table {
-    ($(#[$doc:meta])* $name:ident, $term:ident, $key:ident, $line:ident, $amplitude:ident, $unit:literal) => {
-        $(#[$doc])*
+    ($what:literal, $name:ident, $term:ident, $key:ident, $line:ident, $amplitude:ident, $unit:literal) => {
+        #[doc = concat!("Noise of ", $what, ".")]
         #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
         #[serde(deny_unknown_fields)]
         pub struct $name {
@@ -305,11 +286,8 @@ macro_rules! noise_table {
                     positive_or_zero(&format!("{key}.{}", stringify!($key)), asd)?;
                     positive_or_zero(&format!("{key}.corner_hz"), corner_hz)?;
                     if exponent % 2 != 0 || exponent > 8 {
-                        return Err(MissionError::Value {
-                            key: format!("{key}.exponent"),
-                            value: exponent.to_string(),
-                            reason: "must be 0, 2, 4, 6 or 8: a state-space shaping filter has whole states",
-                        });
+                        let reason = "must be 0, 2, 4, 6 or 8: a shaping filter has a whole number of states";
+                        return Err(value_error(&format!("{key}.exponent"), &exponent, reason));
                     }
                 }
                 Ok(())
@@ -319,28 +297,34 @@ macro_rules! noise_table {
 }
 
 noise_table!(
-    /// Noise of a displacement readout.
-    DisplacementNoise, DisplacementTerm, asd_m_rthz, DisplacementLine, amplitude_m, "m"
+    "a displacement readout",
+    DisplacementNoise,
+    DisplacementTerm,
+    asd_m_rthz,
+    DisplacementLine,
+    amplitude_m,
+    "m"
+);
+noise_table!("an angle readout", AngleNoise, AngleTerm, asd_rad_rthz, AngleLine, amplitude_rad, "rad");
+noise_table!("a force", ForceNoise, ForceTerm, asd_n_rthz, ForceLine, amplitude_n, "N");
+noise_table!("a torque", TorqueNoise, TorqueTerm, asd_nm_rthz, TorqueLine, amplitude_nm, "N m");
+noise_table!(
+    "an acceleration",
+    AccelerationNoise,
+    AccelerationTerm,
+    asd_m_s2_rthz,
+    AccelerationLine,
+    amplitude_m_s2,
+    "m s⁻²"
 );
 noise_table!(
-    /// Noise of an angle readout.
-    AngleNoise, AngleTerm, asd_rad_rthz, AngleLine, amplitude_rad, "rad"
-);
-noise_table!(
-    /// Noise of a force.
-    ForceNoise, ForceTerm, asd_n_rthz, ForceLine, amplitude_n, "N"
-);
-noise_table!(
-    /// Noise of a torque.
-    TorqueNoise, TorqueTerm, asd_nm_rthz, TorqueLine, amplitude_nm, "N m"
-);
-noise_table!(
-    /// Noise of an acceleration.
-    AccelerationNoise, AccelerationTerm, asd_m_s2_rthz, AccelerationLine, amplitude_m_s2, "m s⁻²"
-);
-noise_table!(
-    /// Noise of an angular acceleration.
-    AngularAccelerationNoise, AngularAccelerationTerm, asd_rad_s2_rthz, AngularAccelerationLine, amplitude_rad_s2, "rad s⁻²"
+    "an angular acceleration",
+    AngularAccelerationNoise,
+    AngularAccelerationTerm,
+    asd_rad_s2_rthz,
+    AngularAccelerationLine,
+    amplitude_rad_s2,
+    "rad s⁻²"
 );
 
 /// `[solar_pressure]` (eqs SRP_transfer_function and SRP_torque).
@@ -381,12 +365,12 @@ pub struct Requirements {
 pub struct Control {
     /// Samples between a readout and the start of the interval in which its command acts.
     pub delay_samples: u32,
-    /// Whether the allocation cancels what turning the spacecraft does to the test masses, `−α × b` at the nominal
-    /// offsets. Controllers that treat rotation and translation apart do not.
+    /// Whether the allocation cancels the acceleration `−α × b` of the test masses by the spacecraft's rotation, at the
+    /// nominal offsets. Controllers that treat rotation and translation separately do not.
     #[serde(default = "yes")]
     pub lever_feed_forward: bool,
-    /// Bandwidth of the designed attitude loop over the one that its requirement needs. A faster loop keeps the
-    /// requirement and shakes the spacecraft more where the interferometers are quiet, from which the offset is read.
+    /// Bandwidth of the designed attitude loop relative to what its requirement needs. A faster loop excites more
+    /// angular acceleration where the interferometers are quiet, which makes the offset more observable.
     #[serde(default = "one")]
     pub attitude_bandwidth_factor: f64,
     /// Controllers by channel: all of them, or none for the default design.
@@ -403,7 +387,7 @@ fn one() -> f64 {
 }
 
 impl Default for Control {
-    /// A sample of delay, and the default design.
+    /// One sample of delay and the default design.
     fn default() -> Self {
         Self { delay_samples: 1, lever_feed_forward: yes(), attitude_bandwidth_factor: one(), channel: BTreeMap::new() }
     }
@@ -434,9 +418,9 @@ pub struct Actuators {
     pub electrostatic_torque_limit_nm: f64,
 }
 
-/// `[thrusters]`: what the thrusters make of a command. Without units, delay and lag act on force and torque along each
-/// axis of SRF, limit and step on the force, and the noise is that of `[noise]` per axis. With units, each has all of
-/// it.
+/// `[thrusters]`: response of the thrusters to a command. Without units, delay and lag apply to force and torque along
+/// each axis of SRF, limit and step to the force, and the noise is that of `[noise]`. With units, all of these apply to
+/// each unit.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Thrusters {
@@ -459,11 +443,11 @@ pub struct Thrusters {
     pub unit: Vec<ThrusterUnit>,
 }
 
-/// `[[thrusters.unit]]`: one thruster, with white noise of its own in place of the noise per axis.
+/// `[[thrusters.unit]]`: one thruster, whose white noise replaces the noise per axis.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ThrusterUnit {
-    /// Where it pushes, relative to the centre of mass, SRF, m.
+    /// Point of application relative to the centre of mass, SRF, m.
     pub position_srf_m: [f64; 3],
     /// Direction of its force on the spacecraft, SRF, of any length.
     pub direction_srf: [f64; 3],
@@ -471,7 +455,7 @@ pub struct ThrusterUnit {
     pub asd_n_rthz: f64,
 }
 
-/// `[self_gravity]`: bounds of what the masses of the spacecraft do to a test mass; the truth is drawn within them.
+/// `[self_gravity]`: bounds of the spacecraft's residual gravity at a test mass; a simulation draws values within them.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct SelfGravity {
@@ -484,13 +468,13 @@ pub struct SelfGravity {
 }
 
 impl Default for SelfGravity {
-    /// LISA Pathfinder's, without a drift.
+    /// Values of LISA Pathfinder, without a drift.
     fn default() -> Self {
         Self { acceleration_orf_m_s2: [3e-10, 1e-9, 1e-9], angular_acceleration_rad_s2: 5e-9, drift_m_s2_day: 0.0 }
     }
 }
 
-/// `[limits]`: absolute bounds of telemetry, beyond which a sample is refused as unphysical.
+/// `[limits]`: absolute bounds of telemetry, beyond which a sample is unphysical and refused.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Limits {
@@ -500,14 +484,14 @@ pub struct Limits {
     pub angle_rad: f64,
 }
 
-/// `[orbit]`: three spacecraft on a heliocentric triangle. `mission.spacecraft` says which of them is ours, `SC1`,
-/// `SC2` or `SC3`; any other name is the first.
+/// `[orbit]`: three spacecraft on a heliocentric triangle. `mission.spacecraft` selects one of them, `SC1`, `SC2` or
+/// `SC3`; any other name selects the first.
 #[derive(Clone, Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Orbit {
-    /// When the triangle is as designed and SC1 at its aphelion: `YYYY-MM-DD` or `YYYY-MM-DDThh:mm:ss`, UTC.
+    /// Epoch at which the triangle is equilateral and SC1 at its aphelion: `YYYY-MM-DD` or `YYYY-MM-DDThh:mm:ss`, UTC.
     pub epoch_utc: String,
-    /// How far the triangle's centre trails the Earth then, in ecliptic longitude, rad; negative when it leads.
+    /// Ecliptic longitude by which the triangle's centre trails the Earth then, rad; negative if it leads.
     pub trailing_angle_rad: f64,
     /// Length of the arms, m.
     pub arm_length_m: f64,
@@ -544,7 +528,7 @@ impl Orbit {
             return Err(value_error(
                 "orbit.trailing_angle_rad",
                 &self.trailing_angle_rad,
-                "must be 0.1 to π in size: nearer, the Earth tears the triangle apart",
+                "must be 0.1 to π in size: closer to the Earth the triangle is not stable",
             ));
         }
         if !(self.arm_length_m > 0.0 && self.arm_length_m <= MOST_ARM_LENGTH_M) {
@@ -554,7 +538,7 @@ impl Orbit {
     }
 }
 
-/// Nearest to the Earth that a triangle can fly.
+/// Smallest angle between the Earth and a stable triangle.
 const LEAST_TRAILING_RAD: f64 = 0.1;
 /// Longest arms: the orbits are an expansion in arm length over one astronomical unit.
 const MOST_ARM_LENGTH_M: f64 = 1e10;
@@ -568,7 +552,7 @@ fn inverse(inertia: Matrix3<f64>) -> Matrix3<f64> {
     inertia.cholesky().map_or_else(|| Matrix3::from_element(f64::NAN), |c| c.inverse())
 }
 
-/// The dotted key at which reading of a JSON text stopped: the error itself knows line and column alone.
+/// Dotted key at which reading of a JSON text stopped; the error has only line and column.
 fn key_at(text: &str, error: &serde_json::Error) -> String {
     let lines = text.split_inclusive('\n').take(error.line().saturating_sub(1));
     let end = (lines.map(str::len).sum::<usize>() + error.column()).min(text.len());
@@ -583,7 +567,7 @@ fn key_at(text: &str, error: &serde_json::Error) -> String {
                 from = None;
             }
             (b'{', None) => keys.push(""),
-            // Where an object ends without a key that it needs, the object is at fault.
+            // If a required key is missing, the error is at the end of its object.
             (b'}', None) if at + 1 < end => drop(keys.pop()),
             (b':', None) => {
                 if let Some(key) = keys.last_mut() {
@@ -610,34 +594,25 @@ fn value_error(key: &str, value: &dyn std::fmt::Display, reason: &'static str) -
 }
 
 fn positive(key: &str, value: f64) -> Result<(), MissionError> {
-    if value.is_finite() && value > 0.0 {
-        Ok(())
-    } else {
-        Err(value_error(key, &value, "must be finite and above zero"))
-    }
+    let valid = value.is_finite() && value > 0.0;
+    valid.then_some(()).ok_or_else(|| value_error(key, &value, "must be finite and above zero"))
 }
 
 fn positive_or_zero(key: &str, value: f64) -> Result<(), MissionError> {
-    if value.is_finite() && value >= 0.0 {
-        Ok(())
-    } else {
-        Err(value_error(key, &value, "must be finite and not negative"))
-    }
+    let valid = value.is_finite() && value >= 0.0;
+    valid.then_some(()).ok_or_else(|| value_error(key, &value, "must be finite and not negative"))
 }
 
 fn inertia(key: &str, rows: &[[f64; 3]; 3]) -> Result<(), MissionError> {
+    let refuse = |reason| Err(value_error(key, &format!("{rows:?}"), reason));
     let m = matrix(rows);
     if !m.iter().all(|x| x.is_finite()) || m != m.transpose() {
-        return Err(value_error(key, &format!("{rows:?}"), "must be finite and symmetric"));
+        return refuse("must be finite and symmetric");
     }
     let e = m.symmetric_eigenvalues();
     let (lo, sum) = (e.min(), e.sum());
     if lo <= 0.0 || e.iter().any(|x| *x > sum - x) {
-        return Err(value_error(
-            key,
-            &format!("{rows:?}"),
-            "must be positive definite and keep the triangle inequality of its principal moments",
-        ));
+        return refuse("must be positive definite and keep the triangle inequality of its principal moments");
     }
     Ok(())
 }
@@ -680,10 +655,8 @@ impl Mission {
             if let Some(rows) = &tm.inertia_mrf_kg_m2 {
                 inertia(&key("inertia_mrf_kg_m2"), rows)?;
             }
-            for (k, v) in [("offset_box_srf_m", tm.offset_box_srf_m)] {
-                for x in v {
-                    positive(&key(k), x)?;
-                }
+            for x in tm.offset_box_srf_m {
+                positive(&key("offset_box_srf_m"), x)?;
             }
         }
         if let Some(h) = &self.housing {
@@ -790,9 +763,7 @@ impl Mission {
     /// # Errors
     /// [`MissionError::Missing`] when the mission has no such test mass.
     pub fn test_mass(&self, name: &str, needed_by: &'static str) -> Result<&TestMass, MissionError> {
-        self.test_mass
-            .get(name)
-            .ok_or_else(|| MissionError::Missing { section: format!("test_mass.{name}"), needed_by })
+        Self::need(&self.test_mass.get(name), &format!("test_mass.{name}"), needed_by).copied()
     }
 
     /// A section or a noise table that must be there.
@@ -909,10 +880,8 @@ impl TestMass {
     /// # Errors
     /// [`MissionError::Missing`] when the mission gives no inertia; `name` is the section's.
     pub fn inertia(&self, name: &str, needed_by: &'static str) -> Result<Matrix3<f64>, MissionError> {
-        self.inertia_mrf_kg_m2
-            .as_ref()
-            .map(matrix)
-            .ok_or_else(|| MissionError::Missing { section: format!("test_mass.{name}.inertia_mrf_kg_m2"), needed_by })
+        let section = format!("test_mass.{name}.inertia_mrf_kg_m2");
+        Mission::need(&self.inertia_mrf_kg_m2, &section, needed_by).map(matrix)
     }
 
     /// `J_m⁻¹`, MRF, kg⁻¹ m⁻².
@@ -936,7 +905,7 @@ impl TestMass {
     }
 }
 
-/// Longest delay of a loop, samples: beyond it a mission file is in error, not slow.
+/// Longest delay of a loop, samples; a longer one is taken for an error of the file.
 const MOST_DELAY_SAMPLES: u32 = 100;
 
 /// Longest delay of thrusters, s, for the same reason.
@@ -971,26 +940,16 @@ impl Noise {
     }
 
     fn check(&self, sample_rate_hz: f64) -> Result<(), MissionError> {
-        macro_rules! check { ($($name:ident),*) => { $(if let Some(n) = &self.$name { n.check(concat!("noise.", stringify!($name)), sample_rate_hz)?; })* } }
-        check!(
-            ifo_x,
-            ifo_y,
-            ifo_z,
-            is_x,
-            is_y,
-            is_z,
-            is_angle,
-            dws_local,
-            dws_long_arm,
-            thruster_force,
-            thruster_torque,
-            electrostatic_force,
-            electrostatic_torque,
-            test_mass_acceleration,
-            solar_pressure,
-            accelerometer_linear,
+        macro_rules! check {
+            ($($name:ident)*) => {
+                $(if let Some(n) = &self.$name { n.check(concat!("noise.", stringify!($name)), sample_rate_hz)?; })*
+            }
+        }
+        check! {
+            ifo_x ifo_y ifo_z is_x is_y is_z is_angle dws_local dws_long_arm thruster_force thruster_torque
+            electrostatic_force electrostatic_torque test_mass_acceleration solar_pressure accelerometer_linear
             accelerometer_angular
-        );
+        }
         Ok(())
     }
 }

@@ -1,8 +1,8 @@
 //! Random processes that follow a [`NoiseShape`]: exact discretisations, stationary from the first sample, one normal
 //! deviate a sample.
 //!
-//! A term `asd² (f₀/f)^{2n}` is white noise behind `n` leaky integrators. With white noise on top, drawing every state
-//! would take a deviate for each of them. The same Gaussian process in innovation form takes one:
+//! A term `asd² (f₀/f)^{2n}` is white noise through `n` leaky integrators. The innovation form of the process with added
+//! white noise needs one deviate per sample instead of one per state:
 //!
 //! `y_k = x̂_0 + e_k`, `x̂ ← Φ x̂ + K e_k`, `e_k` white with variance `S`,
 //!
@@ -67,8 +67,8 @@ impl SampledChain {
             white: 0.5 * shape.white_psd() / dt_s,
         };
         for term in shape.coloured() {
-            // x_i answers a unit impulse with dtⁱ t^a/a! e^{−λt}, a = n−1−i; covariances are integrals of products of
-            // these. Half the one-sided PSD of the white noise is its two-sided intensity.
+            // Impulse response of x_i: dtⁱ t^a/a! e^{−λt}, a = n−1−i; covariances are integrals of products of these.
+            // The two-sided intensity is half the one-sided PSD of the white noise.
             let n = term.states();
             let intensity = 0.5 * (term.asd * (TAU * term.corner_hz).powi(n as i32)).powi(2);
             let (rate, step) = (2.0 * LEAK_RAD_S * dt_s, intensity * dt_s.powi(2 * n as i32 - 1));
@@ -83,8 +83,7 @@ impl SampledChain {
     }
 
     /// Covariance of the steady Kalman filter's prediction, from the Riccati equation by structure-preserving doubling
-    /// (Chu, Fan, Lin & Wang 2004). What is doubled is the filtered covariance: its equation stays regular without a
-    /// white part.
+    /// (Chu, Fan, Lin & Wang 2004), applied to the filtered covariance, whose equation is regular without a white part.
     fn prediction(&self) -> Square {
         let (phi, q) = (&self.transition, &self.added);
         let variance = q[(0, 0)] + self.white;
@@ -95,7 +94,7 @@ impl SampledChain {
         let mut a = (phi - cross * seen / variance).transpose();
         let mut g = seen.transpose() * seen / variance;
         let mut x = q - cross * cross.transpose() / variance;
-        // 2^40 steps: beyond the memory of the leak.
+        // 2^40 steps exceed the memory of the leak.
         for _ in 0..40 {
             let Some(inverse) = (Square::identity() + g * x).lu().try_inverse() else { break };
             let mixed = inverse * a;
@@ -109,7 +108,7 @@ impl SampledChain {
 }
 
 /// Lower Cholesky factor of a covariance, computed on its correlations: the states differ by many orders of magnitude.
-/// A state without variance stays silent.
+/// A state without variance stays zero.
 fn cholesky(covariance: &Square) -> Square {
     let sigma = |i: usize| covariance[(i, i)].max(0.0).sqrt();
     let correlation = Square::from_fn(|i, j| match (i == j, sigma(i) * sigma(j)) {
@@ -143,7 +142,7 @@ impl RunningLine {
     fn next(&mut self) -> f64 {
         let ([c, s], [dc, ds]) = (self.phase, self.turn);
         let (x, y) = (c * dc - s * ds, s * dc + c * ds);
-        // Newton's step for 1/√(x²+y²) at one: rounding never builds up in the length.
+        // Newton's step for 1/√(x²+y²) at one: the length does not drift by rounding.
         let length = 1.5 - 0.5 * (x * x + y * y);
         self.phase = [x * length, y * length];
         self.amplitude * c
@@ -155,7 +154,7 @@ impl RunningLine {
 pub struct NoiseProcess {
     states: usize,
     transition: Square,
-    /// `√S`, and `K √S`: what one deviate does to the sample and to the states.
+    /// `√S` and `K √S`: gains from a unit deviate to the sample and to the states.
     sigma: f64,
     kick: Column,
     /// Cholesky factor of the stationary covariance of `x̂`.
@@ -165,7 +164,7 @@ pub struct NoiseProcess {
 }
 
 impl NoiseProcess {
-    /// A process of the given shape; it is silent in its coloured terms until [`Self::start`].
+    /// A process of the given shape; its coloured terms are zero until [`Self::start`].
     #[must_use]
     pub fn new(shape: &NoiseShape, dt_s: f64) -> Self {
         Self::with_lines(shape, &[], dt_s)
@@ -187,7 +186,7 @@ impl NoiseProcess {
             transition: chain.transition,
             sigma,
             kick: if sigma > 0.0 { kick / sigma } else { Column::zeros() },
-            // Prediction and its error are independent: their covariances add up to the whole.
+            // Prediction and its error are uncorrelated, so their covariances add.
             stationary: cholesky(&(chain.stationary - prediction)),
             state: Column::zeros(),
             lines: lines.iter().map(line).collect(),
@@ -206,7 +205,7 @@ impl NoiseProcess {
         }
     }
 
-    /// Prediction of the coming sample from the past: the slow drift that has built up.
+    /// Prediction of the next sample from the past.
     #[must_use]
     pub fn slow(&self) -> f64 {
         self.state[0]
@@ -269,7 +268,7 @@ impl NoiseBank {
         bank
     }
 
-    /// Takes states and lines over from the processes.
+    /// Copies states and lines from the processes.
     fn gather(&mut self) {
         for (i, row) in self.state.iter_mut().enumerate() {
             row.iter_mut().zip(&self.processes).for_each(|(slot, process)| *slot = process.state[i]);
@@ -286,7 +285,7 @@ impl NoiseBank {
         self.gather();
     }
 
-    /// Silences one process; the others go on as if it sounded.
+    /// Sets one process to zero; the others and the random stream are not affected.
     pub fn silence(&mut self, process: usize) {
         self.sigma[process] = 0.0;
         for row in self.kick.iter_mut().chain(&mut self.state) {
@@ -315,7 +314,7 @@ impl NoiseBank {
                 *out += state;
             }
         }
-        // Row i needs the old rows from i on, so going down overwrites nothing still needed.
+        // Row i depends on old rows from i on, so ascending order overwrites nothing that is still needed.
         for (i, kick) in self.kick.iter().enumerate() {
             let [row, deeper @ ..] = &mut self.state[i..] else { break };
             let leak = self.transition[0];
@@ -334,7 +333,7 @@ impl NoiseBank {
         out
     }
 
-    /// What [`Self::next`] gave last; zeros before.
+    /// Last result of [`Self::next`]; zeros before.
     #[must_use]
     pub fn samples(&self) -> &[f64] {
         &self.samples
@@ -346,7 +345,7 @@ impl NoiseBank {
         self.state.iter().flatten().chain(self.lines.iter().flat_map(|(_, l)| &l.phase)).copied().collect()
     }
 
-    /// Takes back what [`Self::states`] gave; false when the length is another bank's.
+    /// Restores [`Self::states`]; false if the length differs.
     #[must_use]
     pub fn set_states(&mut self, states: &[f64]) -> bool {
         if states.len() != self.processes.len() * self.state.len() + 2 * self.lines.len() {

@@ -24,10 +24,10 @@ pub enum RiccatiError {
         /// Where, in the unit of the problem, rad/s.
         frequency_rad_s: f64,
     },
-    /// The stable subspace is no graph over the states.
+    /// The stable subspace has no basis `[I; X]`.
     #[error("the stable subspace of its Hamiltonian has no complement")]
     NoGraph,
-    /// The solution is so large that the loop `A + R X` is lost in rounding.
+    /// The loop `A + R X` of the solution is not accurate in double precision.
     #[error(
         "the loop of its solution has an eigenvalue at {slowest_rad_s:e} rad/s where exact arithmetic has the slowest at \
          {exact_rad_s:e} rad/s: an unstable mode that is hardly reached or hardly seen makes the solution so large that double \
@@ -54,12 +54,12 @@ pub enum RiccatiError {
 /// [`RiccatiError`] says why there is none.
 pub fn stabilising_solution(hamiltonian: &Matrix) -> Result<Matrix, RiccatiError> {
     let Candidate { x, slowest_rad_s, exact_rad_s } = candidate(hamiltonian)?;
-    // Not a number is no stable loop either.
+    // False for NaN too.
     let held = slowest_rad_s <= KEPT_DISTANCE * exact_rad_s;
     if held { Ok(x) } else { Err(RiccatiError::LostInRounding { slowest_rad_s, exact_rad_s }) }
 }
 
-/// What solves the equation to rounding, and the slowest eigenvalue of its loop as computed and as it should be.
+/// A solution, and the slowest eigenvalue of its loop: computed from the loop, and from the Hamiltonian.
 struct Candidate {
     x: Matrix,
     slowest_rad_s: f64,
@@ -70,7 +70,7 @@ fn candidate(hamiltonian: &Matrix) -> Result<Candidate, RiccatiError> {
     let n = hamiltonian.nrows() / 2;
     let stable = |m: Matrix| eigenvalues(&m).is_some_and(|values| values.iter().all(|z| z.re < 0.0));
     if hamiltonian.view((n, 0), (n, n)).amax() == 0.0 && stable(hamiltonian.view((0, 0), (n, n)).into_owned()) {
-        // Zero, and not what rounding makes of it: its sign matters to who asks.
+        // Exactly zero: callers test its sign.
         return Ok(Candidate { x: Matrix::zeros(n, n), slowest_rad_s: -1.0, exact_rad_s: -1.0 });
     }
     let mut balanced = hamiltonian.clone();
@@ -82,7 +82,7 @@ fn candidate(hamiltonian: &Matrix) -> Result<Candidate, RiccatiError> {
         return Err(RiccatiError::ImaginaryAxis { frequency_rad_s: z.im.abs() });
     }
     if schur.reorder(|z| z.re < 0.0) != n {
-        // A pair has crossed the axis in rounding.
+        // Rounding moved an eigenvalue across the axis.
         let nearest = schur
             .t
             .diagonal()
@@ -101,8 +101,7 @@ fn candidate(hamiltonian: &Matrix) -> Result<Candidate, RiccatiError> {
         return Err(RiccatiError::NoGraph);
     }
     let x = refined(hamiltonian, x);
-    // The loop in the balanced states, where no entry drowns the others: x = diag(scaling) x̃, and X maps states to
-    // costates.
+    // The loop in the balanced states, x = diag(scaling) x̃; X maps states to costates.
     let in_balanced_states = Matrix::from_fn(n, n, |i, j| x[(i, j)] * scaling[j] / scaling[n + i]);
     let closed = balanced.view((0, 0), (n, n)) + balanced.view((0, n), (n, n)) * in_balanced_states;
     let slowest = |values: &mut dyn Iterator<Item = f64>| values.fold(f64::NEG_INFINITY, f64::max);
@@ -118,7 +117,7 @@ fn residual(hamiltonian: &Matrix, x: &Matrix) -> Matrix {
     &xa + xa.transpose() + x * hamiltonian.view((0, n), (n, n)) * x - hamiltonian.view((n, 0), (n, n))
 }
 
-/// Newton's (Kleinman's) steps as long as they help.
+/// Newton (Kleinman) steps while they halve the residual.
 fn refined(hamiltonian: &Matrix, mut x: Matrix) -> Matrix {
     let n = x.nrows();
     let (a, r) = (hamiltonian.view((0, 0), (n, n)), hamiltonian.view((0, n), (n, n)));

@@ -1,4 +1,4 @@
-//! Complex Schur form, its reordering, and what follows from it: eigenvalues and Lyapunov equations.
+//! Complex Schur form and its reordering; eigenvalues and Lyapunov equations.
 //!
 //! Real matrices are treated as complex ones: no two-by-two blocks, so that reordering is a chain of plane rotations.
 
@@ -97,7 +97,7 @@ impl Schur {
             if sweeps > MOST_SWEEPS {
                 return None;
             }
-            // An unusual shift now and then breaks the rare cycles.
+            // An exceptional shift every ten sweeps breaks rare cycles.
             let by = if sweeps % 10 == 0 { C64::from(t[(last, last - 1)].norm()) } else { shift(&t, last) };
             Self::sweep(&mut q, &mut t, first, last, by);
         }
@@ -192,8 +192,8 @@ pub fn eigenvalues(m: &Matrix) -> Option<Vec<C64>> {
 
 /// Smallest and largest of the `min(rows, columns)` singular values; NaN for entries that are not finite.
 ///
-/// From the smaller Gram matrix, so that the smallest is good to about 1e-8 of the largest. (The library's iteration
-/// for complex singular values has no bound on its steps and does not always end.)
+/// From the smaller Gram matrix, accurate to about 1e-8 of the largest. (nalgebra's iteration for complex singular
+/// values is unbounded and does not always end.)
 #[must_use]
 pub fn singular_value_range(m: &ComplexMatrix) -> (f64, f64) {
     let size = m.norm();

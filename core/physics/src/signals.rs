@@ -1,4 +1,4 @@
-//! What goes into a control law and what comes out of it: readouts and commands of the spacecraft and its test masses.
+//! Inputs and outputs of a control law: readouts and commands of the spacecraft and its test masses.
 
 use nalgebra::Vector3;
 
@@ -18,7 +18,7 @@ pub struct TestMassReadout {
     pub att_orf_rad: Vector3<f64>,
 }
 
-/// What the controller sees at `t_k`. Every value must be finite: who replays telemetry holds the last valid sample.
+/// Readout at `t_k`. Every value must be finite; a replay of telemetry holds the last valid sample.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Readout {
     /// Attitude of the spacecraft relative to CRF, `φ, θ, ψ`, rad.
@@ -26,12 +26,12 @@ pub struct Readout {
     /// The test masses.
     pub tm: PerTestMass<TestMassReadout>,
     /// Unit vector from the Sun to the spacecraft, SRF: the latest `/ephemeris` packet at or before `t_k`.
-    /// `None` before the first one: no feed-forward of sunlight.
+    /// `None` before the first one; sunlight is not fed forward then.
     pub sun_srf: Option<Vector3<f64>>,
 }
 
 impl Readout {
-    /// Everything at zero, of a mission with so many test masses.
+    /// Zero readout.
     #[must_use]
     pub fn zero(test_masses: usize) -> Self {
         let tm = PerTestMass::from_fn(test_masses, |_| TestMassReadout::default());
@@ -39,7 +39,7 @@ impl Readout {
     }
 }
 
-/// What is commanded of one test mass' electrodes.
+/// Command to the electrodes of one test mass.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct TestMassCommand {
     /// Electrostatic force on the test mass, ORF, N; none along the drag-free axes.
@@ -48,7 +48,7 @@ pub struct TestMassCommand {
     pub torque_orf_nm: Vector3<f64>,
 }
 
-/// What is commanded over one sample interval.
+/// Command over one sample interval.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Command {
     /// Thrust on the spacecraft `F_T`, SRF, N.
@@ -60,7 +60,7 @@ pub struct Command {
 }
 
 impl Command {
-    /// Nothing is commanded, on a spacecraft with so many test masses.
+    /// Zero command.
     #[must_use]
     pub fn zero(test_masses: usize) -> Self {
         let tm = PerTestMass::from_fn(test_masses, |_| TestMassCommand::default());

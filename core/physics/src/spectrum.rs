@@ -1,4 +1,4 @@
-//! Welch's estimate of a power spectral density, with what sampling theory says of its scatter.
+//! Welch's estimate of a power spectral density, with its sampling distribution.
 
 use realfft::RealFftPlanner;
 use std::f64::consts::TAU;
@@ -8,7 +8,7 @@ const SEGMENT_CORRELATION: f64 = 1.0 / 36.0;
 /// Variance of a mean of many neighbouring Hann bins, against independent ones: 1 + 2 (4/9 + 1/36).
 const BIN_CORRELATION: f64 = 1.0 + 2.0 * (4.0 / 9.0 + 1.0 / 36.0);
 
-/// A series cannot give a spectrum.
+/// Why a series has no spectrum.
 #[derive(Debug, thiserror::Error)]
 pub enum SpectrumError {
     /// Too few samples, or a segment too short for a window.
@@ -89,7 +89,7 @@ pub fn welch(x: &[f64], rate_hz: f64, segment: usize) -> Result<Spectrum, Spectr
     }
     let last = psd.len() - 1;
     for (i, p) in psd.iter_mut().enumerate() {
-        // Zero and (for even lengths) Nyquist have no partner on the negative side.
+        // Zero and (for even lengths) Nyquist have no negative frequency.
         let sides = if i == 0 || (i == last && segment.is_multiple_of(2)) { 1.0 } else { 2.0 };
         *p *= sides / (rate_hz * power * f64::from(segments));
     }
@@ -97,8 +97,8 @@ pub fn welch(x: &[f64], rate_hz: f64, segment: usize) -> Result<Spectrum, Spectr
     Ok(Spectrum { frequency_hz, psd, segments: segments as usize })
 }
 
-/// Takes the line off a segment that fits the *weighed* samples best, and weighs it. A fit to the bare samples would
-/// take its slope from the ends, where a second difference of readout noise is far louder than the lowest bins.
+/// Subtracts the straight line of the *windowed* least-squares fit from a segment, and applies the window. The slope of
+/// an unweighted fit is dominated by the ends, where a second difference of readout noise exceeds the lowest bins.
 fn windowed(x: &[f64], window: &[f64], out: &mut [f64]) {
     let middle = 0.5 * x.len() as f64;
     let (mut weight, mut sum, mut first, mut moment) = (0.0, 0.0, 0.0, 0.0);
@@ -109,7 +109,7 @@ fn windowed(x: &[f64], window: &[f64], out: &mut [f64]) {
         first += w * t * v;
         moment += w * t * t;
     }
-    // The window is even about the middle, so that constant and slope do not mix.
+    // The window is even about the middle, so constant and slope are orthogonal.
     let (mean, slope) = (sum / weight, first / moment);
     for (i, (o, (v, w))) in out.iter_mut().zip(x.iter().zip(window)).enumerate() {
         *o = (v - mean - slope * (i as f64 - middle)) * w;

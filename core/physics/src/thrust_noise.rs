@@ -1,7 +1,7 @@
-//! What the thrusters add beyond their command, as one process of force and torque.
+//! Noise of the thrusters as one process of force and torque.
 //!
-//! Along the axes force and torque are independent. In a layout of units each pushes and turns at once: a unit of
-//! direction `d` at `r` makes the wrench `(d, r×d)` of its thrust, and the noise of all has the cross-spectrum
+//! Noise per axis has independent force and torque. In a layout of units, a unit of direction `d` at `r` applies the
+//! wrench `(d, r×d)` per unit of thrust, and the sum over units has the cross-spectrum
 //! `Σ_j S_j (d_j, r_j×d_j)(d_j, r_j×d_j)ᵀ`.
 
 use nalgebra::{Matrix3, Vector3};
@@ -14,15 +14,15 @@ use crate::noise::NoiseShape;
 pub struct ThrustNoise {
     /// `S_FF` over the PSD of [`Self::force_shape`], N²/Hz together.
     pub force: Matrix3<f64>,
-    /// Spectrum of the force; nothing where the mission does not tell.
+    /// Spectrum of the force; empty if the mission states none.
     pub force_shape: NoiseShape,
     /// `S_MM` over the PSD of [`Self::torque_shape`], N² m²/Hz together.
     pub torque: Matrix3<f64>,
-    /// Spectrum of the torque; nothing where the mission does not tell.
+    /// Spectrum of the torque; empty if the mission states none.
     pub torque_shape: NoiseShape,
-    /// `C = S_FM S_MM⁻¹`, m⁻¹: the force that a torque of the noise comes with, `E[F | M] = C M`. Zero along the axes.
+    /// `C = S_FM S_MM⁻¹`, m⁻¹: regression of force on torque noise, `E[F | M] = C M`. Zero for noise per axis.
     pub force_per_torque: Matrix3<f64>,
-    /// `S_FF − C S_MF` over the PSD of [`Self::force_shape`]: what is left of the force to whom the torque is known.
+    /// `S_FF − C S_MF` over the PSD of [`Self::force_shape`]: noise of the force given the torque.
     pub force_given_torque: Matrix3<f64>,
 }
 
@@ -59,7 +59,7 @@ impl ThrustNoise {
             torque += turn * turn.transpose() * psd;
             cross += push * turn.transpose() * psd;
         }
-        // A direction about which no unit turns has no torque to tell of a force: the pseudo-inverse leaves it out.
+        // The pseudo-inverse omits directions about which no unit applies a torque.
         let least = torque.symmetric_eigenvalues().max() * 1e-12;
         let inverse = torque.pseudo_inverse(least).unwrap_or_else(|_| Matrix3::zeros());
         let force_per_torque = cross * inverse;

@@ -10,14 +10,14 @@ use crate::error::PluginError;
 
 /// Parameters, mission, and for sources files and window. Everything declared in the manifest is there: the host
 /// checked the values and filled in the defaults.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Setup {
     config: Config,
     mission_json: String,
     log: Log,
 }
 
-#[derive(Debug, Default, Deserialize)]
+#[derive(Clone, Debug, Default, Deserialize)]
 #[serde(default)]
 struct Config {
     parameters: serde_json::Map<String, serde_json::Value>,

@@ -13,7 +13,7 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::common::{axis_of, manifest};
+use crate::common::{SC_AXES, axis_of, manifest};
 use crate::linear::{
     Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, accel_channel, attitude_channel, axis_pair,
     offset_coupling_terms, vector_terms,
@@ -47,8 +47,7 @@ fn electrode_terms(
 ///
 /// `z = g F_E (1/m_m + 1/m_S)`; g: 1, ±0.3. The change of the recoil torque `b × g F_E` is negligible and followed by
 /// `α̂`. LISA Pathfinder calibrated such gains to per cents (Armano et al., Phys. Rev. D 97, 122002).
-#[derive(Debug)]
-pub(crate) struct EsGain(String);
+pub(crate) enum EsGain {}
 
 impl LinearEffect for EsGain {
     const MANIFEST: Manifest = manifest(
@@ -59,12 +58,9 @@ impl LinearEffect for EsGain {
         &["commands"],
     );
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(setup.instance().to_owned()))
-    }
-
-    fn coefficients(&self, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let terms = electrode_terms(mission, "the effect es-gain", &self.0, (axis_of(&self.0), axis_of(&self.0)))?;
+    fn coefficients(setup: &Setup, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
+        let (instance, axis) = (setup.instance(), axis_of(setup.instance()));
+        let terms = electrode_terms(mission, "the effect es-gain", instance, (axis, axis))?;
         Ok(CoefficientForms::only("1", GAIN, terms))
     }
 }
@@ -72,8 +68,7 @@ impl LinearEffect for EsGain {
 /// `es-crosstalk`: in instance `tm2.y-x`, `δ` times the force commanded along y also acts along x.
 ///
 /// `z_to = δ F_E,from (1/m_m + 1/m_S)`; δ: 1, ±0.1.
-#[derive(Debug)]
-pub(crate) struct EsCrosstalk(String);
+pub(crate) enum EsCrosstalk {}
 
 impl LinearEffect for EsCrosstalk {
     const MANIFEST: Manifest = manifest(
@@ -84,12 +79,8 @@ impl LinearEffect for EsCrosstalk {
         &["commands"],
     );
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(setup.instance().to_owned()))
-    }
-
-    fn coefficients(&self, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let terms = electrode_terms(mission, "the effect es-crosstalk", &self.0, axis_pair(&self.0))?;
+    fn coefficients(setup: &Setup, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
+        let terms = electrode_terms(mission, "the effect es-crosstalk", setup.instance(), axis_pair(setup.instance()))?;
         Ok(CoefficientForms::only("1", CROSSTALK, terms))
     }
 }
@@ -110,24 +101,19 @@ fn thrust_terms(mission: &Mission, matrix: &Matrix3<f64>) -> Vec<Term> {
 /// `mps-gain`: thrusters apply `(1 + g) F_T` where `F_T` is commanded along an axis of SRF.
 ///
 /// `z_i = −g T_S^{O_i} e F_T,e/m_S`; g: 1, ±0.3. `α̂` does not depend on forces, so no term acts through it.
-#[derive(Debug)]
-pub(crate) struct MpsGain(usize);
+pub(crate) enum MpsGain {}
 
 impl LinearEffect for MpsGain {
     const MANIFEST: Manifest = manifest(
         "mps-gain",
         "Gain of the thrusters' force along an axis differs from one",
         &[],
-        &["sc.x", "sc.y", "sc.z"],
+        SC_AXES,
         &["commands"],
     );
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(axis_of(setup.instance())))
-    }
-
-    fn coefficients(&self, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let axis = unit_vector(self.0);
+    fn coefficients(setup: &Setup, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
+        let axis = unit_vector(axis_of(setup.instance()));
         Ok(CoefficientForms::only("1", GAIN, thrust_terms(mission, &(axis * axis.transpose()))))
     }
 }
@@ -135,24 +121,15 @@ impl LinearEffect for MpsGain {
 /// `mps-tilt`: the thrusters' frame is rotated by `θ` about an axis `e` of SRF, so `F_T` acts as `F_T + θ e × F_T`.
 ///
 /// `z_i = −θ T_S^{O_i} (e × F_T)/m_S`; θ: rad, ±0.1.
-#[derive(Debug)]
-pub(crate) struct MpsTilt(usize);
+pub(crate) enum MpsTilt {}
 
 impl LinearEffect for MpsTilt {
-    const MANIFEST: Manifest = manifest(
-        "mps-tilt",
-        "The thrusters' frame is rotated about an axis",
-        &[],
-        &["sc.x", "sc.y", "sc.z"],
-        &["commands"],
-    );
+    const MANIFEST: Manifest =
+        manifest("mps-tilt", "The thrusters' frame is rotated about an axis", &[], SC_AXES, &["commands"]);
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(axis_of(setup.instance())))
-    }
-
-    fn coefficients(&self, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        Ok(CoefficientForms::only("rad", TILT_RAD, thrust_terms(mission, &unit_vector(self.0).cross_matrix())))
+    fn coefficients(setup: &Setup, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
+        let axis = unit_vector(axis_of(setup.instance()));
+        Ok(CoefficientForms::only("rad", TILT_RAD, thrust_terms(mission, &axis.cross_matrix())))
     }
 }
 
@@ -163,24 +140,23 @@ impl LinearEffect for MpsTilt {
 ///   (eq:TM_SC_relative_acceleration), a product with the model's offset.
 /// * Test masses, for thrusters with a layout: `g ∂û/∂g`, because `û` contains the force correlated with the estimated
 ///   torque noise, which depends on g.
-#[derive(Debug)]
-pub(crate) struct TorqueGain(usize);
+pub(crate) enum TorqueGain {}
 
 impl LinearEffect for TorqueGain {
     const MANIFEST: Manifest = manifest(
         "torque-gain",
         "Gain of the thrusters' torque about an axis differs from one, or the inertia does",
         &[],
-        &["sc.x", "sc.y", "sc.z"],
+        SC_AXES,
         &["commands", "torque-response"],
     );
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(axis_of(setup.instance())))
-    }
-
-    fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let axis = self.0;
+    fn coefficients(
+        setup: &Setup,
+        mission: &Mission,
+        available: &Available,
+    ) -> Result<Vec<CoefficientForms>, PluginError> {
+        let axis = axis_of(setup.instance());
         let inverse = mission.spacecraft.inertia_inverse();
         let torque = Series::Column(InputColumn::torque(axis));
         let mut terms: Vec<Term> =
@@ -202,7 +178,7 @@ impl LinearEffect for TorqueGain {
 mod tests {
     use super::*;
     use crate::common::AXES;
-    use crate::test_spacecraft::{Deviations, TestSpacecraft};
+    use crate::test_spacecraft::{Deviations, TestSpacecraft, setup};
 
     #[test]
     fn es_gain_matches_the_derivative() {
@@ -270,11 +246,11 @@ mod tests {
     fn torque_gain_acts_on_the_attitude_alone_without_an_offset_in_the_model() {
         let test_spacecraft = TestSpacecraft::new();
         let mut available = test_spacecraft.available();
-        let coefficients = TorqueGain(1).coefficients(&test_spacecraft.mission, &available).unwrap();
+        let coefficients = TorqueGain::coefficients(&setup("sc.y", ""), &test_spacecraft.mission, &available).unwrap();
         assert!(coefficients[0].forms[0].terms.iter().any(|t| t.times.as_deref() == Some("com-offset.tm2.z")));
         // The coefficient of a candidate has no value.
         available.coefficients.iter_mut().for_each(|c| c.candidate = true);
-        let coefficients = TorqueGain(1).coefficients(&test_spacecraft.mission, &available).unwrap();
+        let coefficients = TorqueGain::coefficients(&setup("sc.y", ""), &test_spacecraft.mission, &available).unwrap();
         assert!(coefficients[0].forms[0].terms.iter().all(|t| t.channel.starts_with("sc.alpha") && t.times.is_none()));
         assert_eq!(coefficients[0].forms[0].terms.len(), 3);
     }

@@ -4,12 +4,14 @@
 use dragfree_physics::mission::{Mission, MissionError};
 use dragfree_sdk::prelude::*;
 
-/// Axes as the columns name them.
-pub(crate) const AXES: [&str; 3] = ["x", "y", "z"];
+pub(crate) use dragfree_physics::mission::{ANGLES, AXES};
+
 /// Upper band edge of series made from housekeeping, Hz: thermometers and first-order lags pass nothing above it.
 pub(crate) const SLOW_HZ: f64 = 0.05;
 /// Instances of an effect on every test mass of the mission.
 pub(crate) const TEST_MASSES: &[&str] = &["{test_mass}"];
+/// Instances of an effect along or about every axis of SRF.
+pub(crate) const SC_AXES: &[&str] = &["sc.x", "sc.y", "sc.z"];
 /// Instances of an effect on every axis of every test mass.
 pub(crate) const TM_AXES: &[&str] = &["{test_mass}.x", "{test_mass}.y", "{test_mass}.z"];
 
@@ -39,6 +41,12 @@ pub(crate) fn tm_of(instance: &str) -> &str {
 /// Acceleration channel of an instance: `tm1.accel.x` for `tm1.x`.
 pub(crate) fn accel_channel_of(instance: &str) -> String {
     format!("{}.accel.{}", tm_of(instance), AXES[axis_of(instance)])
+}
+
+/// A coefficient in the range ±`max`, of which its prior standard deviation is a third.
+pub(crate) fn symmetric(name: String, unit: &str, max: f64) -> Coefficient {
+    let (unit, prior_sigma) = (unit.to_owned(), max / 3.0);
+    Coefficient { name, unit, lower: -max, upper: max, prior_sigma, ..Coefficient::default() }
 }
 
 /// Table and name of a series.
@@ -93,9 +101,14 @@ pub(crate) fn keep_available(
     Ok(responses)
 }
 
+/// Whether a column is housekeeping on the common grid.
+pub(crate) fn is_housekeeping(column: &Column) -> bool {
+    column.table == "grid" && column.name.starts_with("hk.")
+}
+
 /// Housekeeping columns with a unit, in telemetry order. Effects select by unit because missions differ in names.
 pub(crate) fn housekeeping_in<'a>(available: &'a Available, unit: &'a str) -> impl Iterator<Item = &'a Column> {
-    available.columns.iter().filter(move |c| c.table == "grid" && c.name.starts_with("hk.") && c.unit == unit)
+    available.columns.iter().filter(move |c| is_housekeeping(c) && c.unit == unit)
 }
 
 /// Finds the housekeeping column that a parameter names.

@@ -12,7 +12,9 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::common::{AXES, axis_of, keep_available, manifest, mission, read_srf_vector, responses_to_spacecraft_force};
+use crate::common::{
+    AXES, axis_of, keep_available, manifest, mission, read_srf_vector, responses_to_spacecraft_force, symmetric,
+};
 
 const MAX_PER_METRE: f64 = 5.0;
 
@@ -60,15 +62,11 @@ impl Effect for MpsCorrelation {
             for torque in AXES {
                 let series = (link.table(), format!("torque_excess.{torque}"));
                 let responses = responses_to_spacecraft_force(&self.mission, axis_of(force), &series);
+                let name = format!("mps-correlation.layout.force_{force}_by_torque_{torque}");
                 link.coefficient(&Coefficient {
-                    name: format!("mps-correlation.layout.force_{force}_by_torque_{torque}"),
-                    unit: "m-1".to_owned(),
                     frame: "SRF".to_owned(),
-                    lower: -MAX_PER_METRE,
-                    upper: MAX_PER_METRE,
-                    prior_sigma: MAX_PER_METRE / 3.0,
                     responses: keep_available(available, "mps-correlation:layout", responses)?,
-                    ..Coefficient::default()
+                    ..symmetric(name, "m-1", MAX_PER_METRE)
                 })?;
             }
         }

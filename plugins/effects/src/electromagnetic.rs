@@ -6,7 +6,7 @@ use serde_json::json;
 
 use crate::common::{
     AXES, SLOW_HZ, SeriesRef, TEST_MASSES, find_housekeeping, housekeeping_in, keep_available, manifest, mission,
-    response, series_of,
+    response, series_of, symmetric,
 };
 
 /// `charge`: a charged test mass in the field of stray voltages.
@@ -19,25 +19,17 @@ use crate::common::{
 /// a thousand. **Confounders**: without a discharge, any slow drift.
 #[derive(Debug)]
 pub(crate) struct Charge {
-    instance: String,
+    setup: Setup,
     mission: Mission,
-    candidate: bool,
-    column: String,
-    capacitance_f: f64,
-    gradient_f_m: f64,
 }
 
 impl Charge {
-    fn name(&self) -> String {
-        format!("charge:{}", self.instance)
-    }
-
     fn responses(&self, available: &Available, column: &Column) -> Result<Vec<Response>, PluginError> {
-        let by = self.name();
-        let mass_kg = self.mission.test_mass(&self.instance, "the effect charge")?.mass_kg;
-        let factor = self.gradient_f_m / (self.capacitance_f * mass_kg);
-        let x = response(format!("{}.accel.x", self.instance), &series_of(column), factor);
-        keep_available(available, &by, vec![x])
+        let instance = self.setup.instance();
+        let mass_kg = self.mission.test_mass(instance, "the effect charge")?.mass_kg;
+        let factor = self.setup.f64("gradient_f_m")? / (self.setup.f64("capacitance_f")? * mass_kg);
+        let x = response(format!("{instance}.accel.x"), &series_of(column), factor);
+        keep_available(available, &format!("charge:{instance}"), vec![x])
     }
 }
 
@@ -61,19 +53,13 @@ impl Effect for Charge {
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self {
-            instance: setup.instance().to_owned(),
-            mission: mission(setup)?,
-            candidate: setup.candidate(),
-            column: setup.text("charge")?,
-            capacitance_f: setup.f64("capacitance_f")?,
-            gradient_f_m: setup.f64("gradient_f_m")?,
-        })
+        Ok(Self { setup: setup.clone(), mission: mission(setup)? })
     }
 
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
+        let instance = self.setup.instance();
         let mut coefficient = Coefficient {
-            name: format!("charge.{}", self.instance),
+            name: format!("charge.{instance}"),
             unit: "V".to_owned(),
             lower: -1.0,
             upper: 1.0,
@@ -81,19 +67,19 @@ impl Effect for Charge {
             ..Coefficient::default()
         };
         let shape = |c: &Column| Shape::from([("charge".to_owned(), json!(c.name))]);
-        if self.candidate {
+        if self.setup.candidate() {
             for column in housekeeping_in(available, "C") {
                 let responses = self.responses(available, column)?;
                 coefficient.variants.push(Variant { shape: shape(column), responses, ..Variant::default() });
             }
             if coefficient.variants.is_empty() {
-                let name = self.name();
                 return Err(PluginError::error(format!(
-                    "effect {name}: the telemetry has no charge (a column hk.* in C), so this candidate has no form"
+                    "effect charge:{instance}: the telemetry has no charge (a column hk.* in C), so this candidate has no form"
                 )));
             }
         } else {
-            let column = find_housekeeping(available, &self.name(), "charge", &self.column, "C")?;
+            let (by, name) = (format!("charge:{instance}"), self.setup.text("charge")?);
+            let column = find_housekeeping(available, &by, "charge", &name, "C")?;
             (coefficient.shape, coefficient.responses) = (shape(column), self.responses(available, column)?);
         }
         link.coefficient(&coefficient)
@@ -117,10 +103,7 @@ impl Effect for Charge {
 /// the units' own field dominates.
 #[derive(Debug)]
 pub(crate) struct Magnetic {
-    instance: String,
-    candidate: bool,
-    gradient: String,
-    field: String,
+    setup: Setup,
     products: Vec<Product>,
 }
 
@@ -149,10 +132,6 @@ const COEFFICIENTS: [(&str, usize, bool); 6] = [
 ];
 
 impl Magnetic {
-    fn name(&self) -> String {
-        format!("magnetic:{}", self.instance)
-    }
-
     /// Series of the product of two columns.
     fn product(
         &mut self,
@@ -173,14 +152,7 @@ impl Magnetic {
 
     fn coefficient(&self, name: &str, of_product: bool, squared: bool) -> Coefficient {
         let (max, unit) = scale(of_product, squared);
-        Coefficient {
-            name: format!("magnetic.{}.{name}", self.instance),
-            unit: unit.to_owned(),
-            lower: -max,
-            upper: max,
-            prior_sigma: max / 3.0,
-            ..Coefficient::default()
-        }
+        symmetric(format!("magnetic.{}.{name}", self.setup.instance()), unit, max)
     }
 }
 
@@ -212,34 +184,25 @@ impl Effect for Magnetic {
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self {
-            instance: setup.instance().to_owned(),
-            candidate: setup.candidate(),
-            gradient: setup.text("gradient")?,
-            field: setup.text("field")?,
-            products: Vec::new(),
-        })
+        Ok(Self { setup: setup.clone(), products: Vec::new() })
     }
 
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
-        let by = self.name();
-        let pairs: Vec<(&Column, Option<&Column>)> = if self.candidate {
+        let instance = self.setup.instance().to_owned();
+        let (by, candidate) = (format!("magnetic:{instance}"), self.setup.candidate());
+        let pairs: Vec<(&Column, Option<&Column>)> = if candidate {
             let gradients: Vec<&Column> = housekeeping_in(available, GRADIENT_UNIT).collect();
             let fields: Vec<&Column> = housekeeping_in(available, FIELD_UNIT).collect();
             let products = gradients.iter().flat_map(|g| fields.iter().map(move |b| (*g, Some(*b))));
             products.chain(fields.iter().map(|b| (*b, Some(*b)))).collect()
         } else {
-            let field = available.columns.iter().find(|c| c.name == self.gradient && c.unit == FIELD_UNIT);
-            let gradient = match field {
+            let (gradient, field) = (self.setup.text("gradient")?, self.setup.text("field")?);
+            let gradient = match available.columns.iter().find(|c| c.name == gradient && c.unit == FIELD_UNIT) {
                 Some(field) => field,
-                None => find_housekeeping(available, &by, "gradient", &self.gradient, GRADIENT_UNIT)?,
+                None => find_housekeeping(available, &by, "gradient", &gradient, GRADIENT_UNIT)?,
             };
-            let field = if self.field.is_empty() {
-                None
-            } else {
-                Some(find_housekeeping(available, &by, "field", &self.field, FIELD_UNIT)?)
-            };
-            vec![(gradient, field)]
+            let find = || find_housekeeping(available, &by, "field", &field, FIELD_UNIT);
+            vec![(gradient, (!field.is_empty()).then(find).transpose()?)]
         };
         if pairs.is_empty() {
             return Err(PluginError::error(format!(
@@ -263,9 +226,9 @@ impl Effect for Magnetic {
             let shape: Shape = names.into_iter().filter_map(|(n, c)| Some((n.to_owned(), json!(c?.name)))).collect();
             for (coefficient, axis, of_product) in &mut coefficients {
                 let series = if *of_product { product.clone() } else { series_of(gradient) };
-                let channel = format!("{}.accel.{}", self.instance, AXES[*axis]);
+                let channel = format!("{instance}.accel.{}", AXES[*axis]);
                 let responses = keep_available(available, &by, vec![response(channel, &series, 1.0)])?;
-                if self.candidate {
+                if candidate {
                     let (max, unit) = scale(*of_product, squared);
                     let (unit, range) = (Some(unit.to_owned()), Some([-max, max]));
                     coefficient.variants.push(Variant { shape: shape.clone(), responses, unit, range, colours: None });

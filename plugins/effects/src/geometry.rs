@@ -4,7 +4,7 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::Vector3;
 
-use crate::common::{TEST_MASSES, axis_of, manifest};
+use crate::common::{SC_AXES, TEST_MASSES, axis_of, is_housekeeping, manifest};
 use crate::linear::{
     Body, CoefficientForms, Form, InputColumn, LinearEffect, Multiplier, Series, Term, accel_channel,
     optical_axis_weights, optical_pair, tm_acceleration, vector_terms,
@@ -25,13 +25,7 @@ const PER_KILOGRAM_M: [f64; 2] = [-2e-2, 2e-2];
 /// * `hk.NAME` in kg: decrease since its first value, e.g. propellant spent. k: m kg⁻¹, ±2e-2.
 ///
 /// Confounders: any other slow drift, which is collinear within a day.
-#[derive(Debug)]
-pub(crate) struct OffsetDrift {
-    axis: usize,
-    with: String,
-    since_ns: Option<i64>,
-    candidate: bool,
-}
+pub(crate) enum OffsetDrift {}
 
 const TIME: &str = "time";
 
@@ -54,80 +48,69 @@ impl LinearEffect for OffsetDrift {
                 "Unix time of zero drift; 0 for the first epoch of the run, which prevents combining runs",
             ),
         ],
-        &["sc.x", "sc.y", "sc.z"],
+        SC_AXES,
         &[],
     );
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self {
-            axis: axis_of(setup.instance()),
-            with: setup.text("with")?,
-            since_ns: Some(setup.i64("since_ns")?).filter(|ns| *ns != 0),
-            candidate: setup.candidate(),
-        })
-    }
-
-    fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let followed = if self.candidate {
-            let columns = available
-                .columns
-                .iter()
-                .filter(|c| c.table == "grid" && c.name.starts_with("hk.") && ["K", "kg"].contains(&c.unit.as_str()));
-            std::iter::once(TIME).chain(columns.map(|c| c.name.as_str())).collect()
-        } else {
-            vec![self.with.as_str()]
-        };
-        let forms = followed.into_iter().map(|with| self.form(with, mission, available)).collect::<Result<_, _>>()?;
+    fn coefficients(
+        setup: &Setup,
+        mission: &Mission,
+        available: &Available,
+    ) -> Result<Vec<CoefficientForms>, PluginError> {
+        let since_ns = Some(setup.i64("since_ns")?).filter(|ns| *ns != 0);
+        let mut followed = vec![setup.text("with")?];
+        if setup.candidate() {
+            let drives = |c: &&Column| ["K", "kg"].contains(&c.unit.as_str());
+            let columns = available.columns.iter().filter(|c| is_housekeeping(c)).filter(drives);
+            followed = std::iter::once(TIME).chain(columns.map(|c| c.name.as_str())).map(str::to_owned).collect();
+        }
+        let axis = axis_of(setup.instance());
+        let forms = followed.iter().map(|with| drift_form(axis, with, since_ns, mission, available));
+        let forms = forms.collect::<Result<_, _>>()?;
         Ok(vec![CoefficientForms { name: "", forms }])
     }
 }
 
-impl OffsetDrift {
-    fn form(&self, with: &str, mission: &Mission, available: &Available) -> Result<Form, PluginError> {
-        let (multiplier, product, unit, range) = if with == TIME {
-            (Multiplier::Time(self.since_ns), "rad s-1", "m s-1", RATE_M_S)
-        } else {
-            let column = available.column("grid", with).filter(|_| with.starts_with("hk."));
-            match column.map(|c| (c, c.unit.as_str())) {
-                Some((c, "K")) => (
-                    Multiplier::Growth { column: InputColumn::of(c, "K"), lost: false },
-                    "rad K s-2",
-                    "m K-1",
-                    PER_KELVIN_M,
-                ),
-                Some((c, "kg")) => (
-                    Multiplier::Growth { column: InputColumn::of(c, "kg"), lost: true },
-                    "rad kg s-2",
-                    "m kg-1",
-                    PER_KILOGRAM_M,
-                ),
-                found => {
-                    return Err(PluginError::error(format!(
-                        "effect offset-drift: parameter `with` = \"{with}\" is {}; set \"time\" or a housekeeping column hk.NAME in K or kg",
-                        found.map_or("not a column of the telemetry".to_owned(), |(_, unit)| format!(
-                            "a column in {unit}"
-                        ))
-                    )));
-                }
-            }
-        };
-        let mut terms = Vec::new();
-        for tm in &Body::all(mission) {
-            let t = tm.section.dcm_orf_from_srf();
-            for j in (0..3).filter(|j| *j != self.axis) {
-                // Response −e_j × e to a unit of α̂ about j.
-                let unit = |axis: usize| Vector3::from_fn(|i, _| f64::from(i == axis));
-                let per_alpha: Vector3<f64> = -t * unit(j).cross(&unit(self.axis));
-                terms.extend(vector_terms(
-                    tm,
-                    &Series::Times(InputColumn::alpha(j), multiplier.clone(), product),
-                    &per_alpha,
-                ));
+/// The form of a drift along an axis that is proportional to the time or to a column.
+fn drift_form(
+    drift_axis: usize,
+    with: &str,
+    since_ns: Option<i64>,
+    mission: &Mission,
+    available: &Available,
+) -> Result<Form, PluginError> {
+    let growth = |c, unit, lost| Multiplier::Growth { column: InputColumn::of(c, unit), lost };
+    let (multiplier, product, unit, range) = if with == TIME {
+        (Multiplier::Time(since_ns), "rad s-1", "m s-1", RATE_M_S)
+    } else {
+        let column = available.column("grid", with).filter(|_| with.starts_with("hk."));
+        match column.map(|c| (c, c.unit.as_str())) {
+            Some((c, "K")) => (growth(c, "K", false), "rad K s-2", "m K-1", PER_KELVIN_M),
+            Some((c, "kg")) => (growth(c, "kg", true), "rad kg s-2", "m kg-1", PER_KILOGRAM_M),
+            found => {
+                return Err(PluginError::error(format!(
+                    "effect offset-drift: parameter `with` = \"{with}\" is {}; set \"time\" or a housekeeping column hk.NAME in K or kg",
+                    found.map_or("not a column of the telemetry".to_owned(), |(_, unit)| format!("a column in {unit}"))
+                )));
             }
         }
-        let shape = Shape::from([("with".to_owned(), with.into())]);
-        Ok(Form::new(shape, unit, range, terms))
+    };
+    let mut terms = Vec::new();
+    for tm in &Body::all(mission) {
+        let t = tm.section.dcm_orf_from_srf();
+        for j in (0..3).filter(|j| *j != drift_axis) {
+            // Response −e_j × e to a unit of α̂ about j.
+            let unit = |axis: usize| Vector3::from_fn(|i, _| f64::from(i == axis));
+            let per_alpha: Vector3<f64> = -t * unit(j).cross(&unit(drift_axis));
+            terms.extend(vector_terms(
+                tm,
+                &Series::Times(InputColumn::alpha(j), multiplier.clone(), product),
+                &per_alpha,
+            ));
+        }
     }
+    let shape = Shape::from([("with".to_owned(), with.into())]);
+    Ok(Form::new(shape, unit, range, terms))
 }
 
 const OPENING_RAD: [f64; 2] = [-0.1, 0.1];
@@ -140,8 +123,7 @@ const OPENING_RAD: [f64; 2] = [-0.1, 0.1];
 ///
 /// Confounders: `mps-tilt:sc.z`, which rotates the thrust for both test masses; `is-crosstalk` of x in y; the direction
 /// of the offset.
-#[derive(Debug)]
-pub(crate) struct OpeningAngle(String);
+pub(crate) enum OpeningAngle {}
 
 impl LinearEffect for OpeningAngle {
     const MANIFEST: Manifest = manifest(
@@ -152,12 +134,12 @@ impl LinearEffect for OpeningAngle {
         &["commands"],
     );
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(setup.instance().to_owned()))
-    }
-
-    fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let tm = &Body::of(mission, &self.0, "the effect opening-angle")?;
+    fn coefficients(
+        setup: &Setup,
+        mission: &Mission,
+        available: &Available,
+    ) -> Result<Vec<CoefficientForms>, PluginError> {
+        let tm = &Body::of(mission, setup.instance(), "the effect opening-angle")?;
         let [x, y] = [0, 1].map(|axis| tm_acceleration(available, mission, tm, axis));
         // Weight of this optical axis in y of this test mass, and in y of the other one.
         let both = optical_pair(available, mission).filter(|both| both.iter().any(|body| body.name == tm.name));
@@ -208,7 +190,7 @@ impl LinearEffect for OpeningAngle {
 mod tests {
     use super::*;
     use crate::common::AXES;
-    use crate::test_spacecraft::{Deviations, ELAPSED_S, TestSpacecraft};
+    use crate::test_spacecraft::{Deviations, ELAPSED_S, TestSpacecraft, setup};
 
     #[test]
     fn offset_drift_matches_the_derivative() {
@@ -234,8 +216,10 @@ mod tests {
     #[test]
     fn a_drift_candidate_has_a_form_for_time_and_each_column_in_kelvin_or_kilogram() {
         let test_spacecraft = TestSpacecraft::new();
-        let effect = OffsetDrift { axis: 0, with: TIME.to_owned(), since_ns: None, candidate: true };
-        let coefficients = effect.coefficients(&test_spacecraft.mission, &test_spacecraft.available()).unwrap();
+        let setup = r#"{"instance": "sc.x", "candidate": true, "parameters": {"with": "time", "since_ns": 0}}"#;
+        let setup = Setup::for_tests(setup).unwrap();
+        let coefficients =
+            OffsetDrift::coefficients(&setup, &test_spacecraft.mission, &test_spacecraft.available()).unwrap();
         let forms: Vec<_> =
             coefficients[0].forms.iter().map(|f| (f.shape["with"].as_str().unwrap(), f.unit.as_str())).collect();
         assert_eq!(forms, [("time", "m s-1"), ("hk.fuel_kg", "m kg-1")]);
@@ -284,8 +268,9 @@ mod tests {
     fn a_drift_refuses_columns_of_other_units() {
         let test_spacecraft = TestSpacecraft::new();
         for (with, why) in [("hk.bus_v", "in V"), ("hk.nothing", "not a column"), ("tm1.r_orf_m.x", "not a column")] {
-            let effect = OffsetDrift { axis: 0, with: with.to_owned(), since_ns: None, candidate: false };
-            let error = effect.coefficients(&test_spacecraft.mission, &test_spacecraft.available()).unwrap_err();
+            let setup = setup("sc.x", &format!(r#""with": "{with}", "since_ns": 0"#));
+            let error =
+                OffsetDrift::coefficients(&setup, &test_spacecraft.mission, &test_spacecraft.available()).unwrap_err();
             assert!(error.message().contains(with) && error.message().contains(why), "{}", error.message());
         }
     }

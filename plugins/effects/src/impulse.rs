@@ -27,7 +27,7 @@ use serde_json::json;
 
 use crate::common::{
     AXES, SLOW_HZ, SeriesRef, accel_channel_of, axis_of, find_housekeeping, housekeeping_in, keep_available, manifest,
-    mission, response, responses_to_spacecraft_force, responses_to_spacecraft_torque, tm_of,
+    mission, response, responses_to_spacecraft_force, responses_to_spacecraft_torque, symmetric, tm_of,
 };
 use crate::step_pulses::StepPulses;
 
@@ -115,8 +115,7 @@ pub(crate) struct Impulse {
     mission: Mission,
     candidate: bool,
     at_ns: i64,
-    decay_s: f64,
-    rise_s: f64,
+    pulse: Pulse,
     pulse_s: f64,
     flag: String,
     out: Option<Out>,
@@ -137,30 +136,14 @@ impl Impulse {
         format!("impulse:{}", self.instance)
     }
 
-    fn pulse(&self) -> Pulse {
-        match self.cause {
-            Cause::Glitch => {
-                Pulse::Glitch { decay_s: self.decay_s.max(self.rise_s), rise_s: self.rise_s.min(self.decay_s) }
-            }
-            Cause::Torque => rectangular(self.pulse_s),
-            Cause::Hit => Pulse::OneSample,
-        }
-    }
-
     /// Coefficients, each with its responses to the pulse.
     fn coefficients(
         &self,
         available: &Available,
         pulse: &SeriesRef,
     ) -> Result<Vec<(Coefficient, Vec<Response>)>, PluginError> {
-        let coefficient = |part: &str, unit: &str, max: f64| Coefficient {
-            name: format!("impulse.{}{part}", self.instance),
-            unit: unit.to_owned(),
-            lower: -max,
-            upper: max,
-            prior_sigma: max / 3.0,
-            ..Coefficient::default()
-        };
+        let coefficient =
+            |part: &str, unit: &str, max: f64| symmetric(format!("impulse.{}{part}", self.instance), unit, max);
         let on = |responses| keep_available(available, &self.name(), responses);
         let turn = |part: &str, axis: usize| -> Result<_, PluginError> {
             Ok((
@@ -320,14 +303,18 @@ impl Effect for Impulse {
             ("sc", false) => Cause::Torque,
             _ => Cause::Glitch,
         };
+        let (decay_s, rise_s, pulse_s) = (setup.f64("decay_s")?, setup.f64("rise_s")?, setup.f64("pulse_s")?);
         Ok(Self {
             cause,
             mission: mission(setup)?,
             candidate: setup.candidate(),
             at_ns: setup.i64("at_ns")?,
-            decay_s: setup.f64("decay_s")?,
-            rise_s: setup.f64("rise_s")?,
-            pulse_s: setup.f64("pulse_s")?,
+            pulse: match cause {
+                Cause::Glitch => Pulse::Glitch { decay_s: decay_s.max(rise_s), rise_s: rise_s.min(decay_s) },
+                Cause::Torque => rectangular(pulse_s),
+                Cause::Hit => Pulse::OneSample,
+            },
+            pulse_s,
             flag: setup.text("flag")?,
             out: None,
             flag_pulses: Vec::new(),
@@ -369,7 +356,7 @@ impl Effect for Impulse {
             link.read(&Want::of(channel))?;
         }
         let mut shape = Shape::from([("at_ns".to_owned(), json!(self.at_ns))]);
-        match self.pulse() {
+        match self.pulse {
             Pulse::Glitch { decay_s, rise_s } => {
                 shape.extend([("decay_s".to_owned(), json!(decay_s)), ("rise_s".to_owned(), json!(rise_s))]);
             }
@@ -393,7 +380,7 @@ impl Effect for Impulse {
             }
         }
         let Some(out) = self.out else { return Ok(()) };
-        let (pulse, dt_s) = (self.pulse(), self.mission.dt_s());
+        let (pulse, dt_s) = (self.pulse, self.mission.dt_s());
         let means = input.time_ns().iter().map(|now_ns| pulse.mean((now_ns - self.at_ns) as f64 * 1e-9, dt_s));
         output.f64(out).extend(means);
         Ok(())

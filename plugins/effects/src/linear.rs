@@ -6,15 +6,13 @@
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
+use std::marker::PhantomData;
 
 use dragfree_physics::mission::{Mission, TestMass};
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix2, Vector3};
 
 use crate::common::{AXES, SeriesRef, axis_of, mission, tm_of};
-
-/// Names of the angles about x, y and z.
-pub(crate) const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
 
 /// A test mass of the mission.
 #[derive(Clone, Debug)]
@@ -395,28 +393,25 @@ pub(crate) fn axis_pair(instance: &str) -> (usize, usize) {
 }
 
 /// An effect that acts linearly through series with constant factors.
-pub(crate) trait LinearEffect: Send + Sized + 'static {
+pub(crate) trait LinearEffect: Send + 'static {
     /// Identity, parameters and instances.
     const MANIFEST: Manifest;
-    /// Reads the configuration.
-    ///
-    /// # Errors
-    /// The configuration is invalid.
-    fn new(setup: &Setup) -> Result<Self, PluginError>;
-    /// The coefficients and their terms.
+    /// The coefficients of the instance that `setup` configures, and their terms.
     ///
     /// # Errors
     /// The mission or the telemetry lacks an input of the effect.
-    fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError>;
+    fn coefficients(
+        setup: &Setup,
+        mission: &Mission,
+        available: &Available,
+    ) -> Result<Vec<CoefficientForms>, PluginError>;
 }
 
 /// SDK effect of a [`LinearEffect`].
-#[derive(Debug)]
 pub(crate) struct Linear<E> {
-    effect: E,
+    effect: PhantomData<E>,
+    setup: Setup,
     mission: Mission,
-    instance: String,
-    candidate: bool,
     computed: Vec<ComputedSeries>,
 }
 
@@ -486,7 +481,7 @@ impl SeriesState {
 
 impl<E: LinearEffect> Linear<E> {
     fn name(&self) -> String {
-        format!("effect {}:{}", E::MANIFEST.id, self.instance)
+        format!("effect {}:{}", E::MANIFEST.id, self.setup.instance())
     }
 
     /// Table and name of a series; registers it for computation if no other effect writes it.
@@ -556,17 +551,11 @@ impl<E: LinearEffect> Effect for Linear<E> {
     const MANIFEST: Manifest = E::MANIFEST;
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self {
-            effect: E::new(setup)?,
-            mission: mission(setup)?,
-            instance: setup.instance().to_owned(),
-            candidate: setup.candidate(),
-            computed: Vec::new(),
-        })
+        Ok(Self { effect: PhantomData, setup: setup.clone(), mission: mission(setup)?, computed: Vec::new() })
     }
 
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
-        let coefficients = self.effect.coefficients(&self.mission, available)?;
+        let coefficients = E::coefficients(&self.setup, &self.mission, available)?;
         let terms: Vec<&Term> = coefficients.iter().flat_map(|p| &p.forms).flat_map(|f| &f.terms).collect();
         self.check_channels(available, &terms)?;
         let mut series_refs: BTreeMap<String, SeriesRef> = BTreeMap::new();
@@ -588,7 +577,7 @@ impl<E: LinearEffect> Effect for Linear<E> {
         for declared in &coefficients {
             let Some(first) = declared.forms.first() else { continue };
             let [lower, upper] = first.range;
-            let stem = format!("{}.{}", E::MANIFEST.id, self.instance);
+            let stem = format!("{}.{}", E::MANIFEST.id, self.setup.instance());
             let mut coefficient = Coefficient {
                 name: if declared.name.is_empty() { stem } else { format!("{stem}.{}", declared.name) },
                 unit: first.unit.clone(),
@@ -598,7 +587,7 @@ impl<E: LinearEffect> Effect for Linear<E> {
                 prior_sigma: upper.abs().max(lower.abs()) / 3.0,
                 ..Coefficient::default()
             };
-            if self.candidate && !first.shape.is_empty() {
+            if self.setup.candidate() && !first.shape.is_empty() {
                 let variant = |form: &Form| Variant {
                     shape: form.shape.clone(),
                     responses: responses(form),

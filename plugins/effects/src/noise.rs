@@ -15,7 +15,7 @@
 
 use dragfree_sdk::prelude::*;
 
-use crate::common::{TM_AXES, manifest};
+use crate::common::{SC_AXES, TM_AXES, manifest};
 
 fn link(process: &str, id: &str, instance: &str, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
     link.coefficient(&Coefficient {
@@ -58,12 +58,12 @@ macro_rules! noise_effect {
 noise_effect! {
     /// Force noise of the thrusters along an axis of SRF.
     MpsNoise, "mps-noise", "thruster_force", "Level of the thrusters' force noise along an axis",
-    &["sc.x", "sc.y", "sc.z"]
+    SC_AXES
 }
 noise_effect! {
     /// Torque noise of the thrusters about an axis of SRF.
     TorqueNoise, "torque-noise", "thruster_torque", "Level of the thrusters' torque noise about an axis",
-    &["sc.x", "sc.y", "sc.z"]
+    SC_AXES
 }
 noise_effect! {
     /// Noise of the capacitive readout along an axis of ORF.

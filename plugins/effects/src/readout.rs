@@ -47,8 +47,7 @@ fn second_difference_terms(
 /// **Limits.** x is read by the interferometer, so its capacitive scale is unobservable, and `d` is unobservable along
 /// z. `d` is in the regressor and in the channel; only an estimator that models it as common to both test masses is
 /// unbiased.
-#[derive(Debug)]
-pub(crate) struct IsScale(String);
+pub(crate) enum IsScale {}
 
 impl LinearEffect for IsScale {
     const MANIFEST: Manifest = manifest(
@@ -59,13 +58,13 @@ impl LinearEffect for IsScale {
         &["commands"],
     );
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(setup.instance().to_owned()))
-    }
-
-    fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let axis = axis_of(&self.0);
-        let terms = second_difference_terms(mission, available, "the effect is-scale", &self.0, (axis, axis))?;
+    fn coefficients(
+        setup: &Setup,
+        mission: &Mission,
+        available: &Available,
+    ) -> Result<Vec<CoefficientForms>, PluginError> {
+        let axis = axis_of(setup.instance());
+        let terms = second_difference_terms(mission, available, "the effect is-scale", setup.instance(), (axis, axis))?;
         Ok(CoefficientForms::only("1", SCALE, terms))
     }
 }
@@ -74,8 +73,7 @@ impl LinearEffect for IsScale {
 ///
 /// `z_to = k r̈_from = k (û + Φ b + d)_from`; k: 1, ±0.2. No instance ends in x, which the interferometer reads, or
 /// starts in z, where `d` is unobservable.
-#[derive(Debug)]
-pub(crate) struct IsCrosstalk(String);
+pub(crate) enum IsCrosstalk {}
 
 impl LinearEffect for IsCrosstalk {
     const MANIFEST: Manifest = manifest(
@@ -86,13 +84,13 @@ impl LinearEffect for IsCrosstalk {
         &["commands"],
     );
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(setup.instance().to_owned()))
-    }
-
-    fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let axes = axis_pair(&self.0);
-        let terms = second_difference_terms(mission, available, "the effect is-crosstalk", &self.0, axes)?;
+    fn coefficients(
+        setup: &Setup,
+        mission: &Mission,
+        available: &Available,
+    ) -> Result<Vec<CoefficientForms>, PluginError> {
+        let axes = axis_pair(setup.instance());
+        let terms = second_difference_terms(mission, available, "the effect is-crosstalk", setup.instance(), axes)?;
         Ok(CoefficientForms::only("1", SCALE, terms))
     }
 }
@@ -104,8 +102,7 @@ impl LinearEffect for IsCrosstalk {
 ///
 /// **Collinear with the offset** in x, where `c` acts like `b_z` and `d` like `−b_y` (1 mm/rad for 1 mm). The offset
 /// differs by its response along y and z, and below the bandwidth of the test mass's own attitude control.
-#[derive(Debug)]
-pub(crate) struct TiltToLength(String);
+pub(crate) enum TiltToLength {}
 
 impl LinearEffect for TiltToLength {
     const MANIFEST: Manifest = manifest(
@@ -116,13 +113,13 @@ impl LinearEffect for TiltToLength {
         &["commands"],
     );
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(setup.instance().to_owned()))
-    }
-
-    fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
+    fn coefficients(
+        setup: &Setup,
+        mission: &Mission,
+        available: &Available,
+    ) -> Result<Vec<CoefficientForms>, PluginError> {
         const BY: &str = "the effect tilt-to-length";
-        let tm = &Body::of(mission, &self.0, BY)?;
+        let tm = &Body::of(mission, setup.instance(), BY)?;
         let name = &tm.name;
         let readout = InputColumn::displacement(tm, 0).name;
         if latest_column(available, &readout).is_some_and(|c| c.attribute("noise") != "ifo_x") {
@@ -156,8 +153,7 @@ impl LinearEffect for TiltToLength {
 /// No instance for the capacitive readout: its delay is unobservable beside the unmodelled acceleration.
 ///
 /// Confounders: a delay of the actuators, which `[thrusters]` of the mission file states; gains at high frequency.
-#[derive(Debug)]
-pub(crate) struct TimeOffset(String);
+pub(crate) enum TimeOffset {}
 
 impl LinearEffect for TimeOffset {
     const MANIFEST: Manifest = manifest(
@@ -168,14 +164,14 @@ impl LinearEffect for TimeOffset {
         &["commands", "dws-delay-response"],
     );
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(setup.instance().to_owned()))
-    }
-
-    fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
+    fn coefficients(
+        setup: &Setup,
+        mission: &Mission,
+        available: &Available,
+    ) -> Result<Vec<CoefficientForms>, PluginError> {
         const BY: &str = "the effect time-offset";
         let mut terms = Vec::new();
-        if self.0 == "dws" {
+        if setup.instance() == "dws" {
             let inverse = mission.spacecraft.inertia_inverse();
             for (row, axis) in (0..3).flat_map(|row| (0..3).map(move |axis| (row, axis))) {
                 let series = Series::Slope(InputColumn::torque(axis), "N m s-1");
@@ -210,7 +206,7 @@ impl LinearEffect for TimeOffset {
 mod tests {
     use super::*;
     use crate::common::AXES;
-    use crate::test_spacecraft::TestSpacecraft;
+    use crate::test_spacecraft::{TestSpacecraft, setup};
     use nalgebra::{Matrix3, Vector3};
 
     /// In the plane of the two optical axes.
@@ -250,12 +246,12 @@ mod tests {
             column.attributes.insert("noise".to_owned(), "is_x".to_owned());
         }
         for error in [
-            IsScale("tm2.y".to_owned()).coefficients(&test_spacecraft.mission, &available).unwrap_err(),
-            IsCrosstalk("tm1.y-z".to_owned()).coefficients(&test_spacecraft.mission, &available).unwrap_err(),
+            IsScale::coefficients(&setup("tm2.y", ""), &test_spacecraft.mission, &available).unwrap_err(),
+            IsCrosstalk::coefficients(&setup("tm1.y-z", ""), &test_spacecraft.mission, &available).unwrap_err(),
         ] {
             assert!(error.message().contains("only with the interferometers"), "{}", error.message());
         }
-        let error = TiltToLength("tm1".to_owned()).coefficients(&test_spacecraft.mission, &available).unwrap_err();
+        let error = TiltToLength::coefficients(&setup("tm1", ""), &test_spacecraft.mission, &available).unwrap_err();
         assert!(error.message().contains("x of tm1 is read by the inertial sensor"), "{}", error.message());
     }
 

@@ -102,12 +102,8 @@ fn colour(instance: &str, (f0_hz, zeta): (f64, f64)) -> Colour {
 /// The effect.
 #[derive(Debug)]
 pub(crate) struct Slosh {
-    instance: String,
+    setup: Setup,
     mission: Mission,
-    candidate: bool,
-    fine: bool,
-    f0_hz: f64,
-    zeta: f64,
     /// Columns and factors that add up to the force on the spacecraft along the axis, N.
     force_terms: Vec<(In, f64)>,
     modes: Vec<(Mode, Out)>,
@@ -120,12 +116,12 @@ pub(crate) struct Slosh {
 
 impl Slosh {
     fn name(&self) -> String {
-        format!("slosh:{}", self.instance)
+        format!("slosh:{}", self.setup.instance())
     }
 
     /// Requests the terms of `F_T + F_SRP − Σ T_{O_j}^S F_Ej` along the axis (eq:TM_SC_relative_acceleration).
     fn link_force(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
-        let axis = axis_of(&self.instance);
+        let axis = axis_of(self.setup.instance());
         let thrust = Want::new(format!("used.mps_force_srf_n.{}", AXES[axis])).unit("N").frame("SRF");
         self.force_terms = vec![(link.read(&thrust)?, 1.0)];
         if let Some(pressure) = &self.mission.solar_pressure {
@@ -156,12 +152,13 @@ impl Slosh {
         available: &Available,
         link: &mut EffectLink<'_, '_>,
     ) -> Result<Vec<Response>, PluginError> {
-        let name = format!("slosh({},{f0_hz},{zeta})", self.instance);
+        let name = format!("slosh({},{f0_hz},{zeta})", self.setup.instance());
         let (table, out) = link.shared_series(available, &name, "m s-2", "SRF")?;
         if let Some(out) = out {
             self.modes.push((Mode::new(f0_hz, zeta, self.mission.dt_s()), out));
         }
-        let mut responses = responses_to_spacecraft_force(&self.mission, axis_of(&self.instance), &(table, name));
+        let mut responses =
+            responses_to_spacecraft_force(&self.mission, axis_of(self.setup.instance()), &(table, name));
         // The series is an acceleration of the spacecraft rather than a force.
         responses.iter_mut().for_each(|r| r.factor *= self.mission.spacecraft.mass_kg);
         keep_available(available, &self.name(), responses)
@@ -211,12 +208,8 @@ impl Effect for Slosh {
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         Ok(Self {
-            instance: setup.instance().to_owned(),
+            setup: setup.clone(),
             mission: mission(setup)?,
-            candidate: setup.candidate(),
-            fine: setup.i64("fine")? == 1,
-            f0_hz: setup.f64("f0_hz")?,
-            zeta: setup.f64("zeta")?,
             force_terms: Vec::new(),
             modes: Vec::new(),
             last_input: f64::NAN,
@@ -233,7 +226,7 @@ impl Effect for Slosh {
         )?;
         self.link_force(available, link)?;
         let mut coefficient = Coefficient {
-            name: format!("slosh.{}", self.instance),
+            name: format!("slosh.{}", self.setup.instance()),
             lower: 0.0,
             upper: MAX_RATIO,
             prior_sigma: MAX_RATIO / 3.0,
@@ -242,17 +235,18 @@ impl Effect for Slosh {
         let shape = |(f0_hz, zeta): (f64, f64)| {
             Shape::from([("f0_hz".to_owned(), json!(f0_hz)), ("zeta".to_owned(), json!(zeta))])
         };
-        if self.candidate {
-            let points: Vec<(f64, f64)> = if self.fine { fine_grid(self.f0_hz).collect() } else { grid().collect() };
+        let point = (self.setup.f64("f0_hz")?, self.setup.f64("zeta")?);
+        if self.setup.candidate() {
+            let fine = self.setup.i64("fine")? == 1;
+            let points: Vec<(f64, f64)> = if fine { fine_grid(point.0).collect() } else { grid().collect() };
             for point in points {
                 let responses = self.responses(point, available, link)?;
-                let colours = Some(colour(&self.instance, point));
+                let colours = Some(colour(self.setup.instance(), point));
                 coefficient.variants.push(Variant { shape: shape(point), responses, colours, ..Variant::default() });
             }
         } else {
-            let point = (self.f0_hz, self.zeta);
             (coefficient.shape, coefficient.responses) = (shape(point), self.responses(point, available, link)?);
-            coefficient.colours = Some(colour(&self.instance, point));
+            coefficient.colours = Some(colour(self.setup.instance(), point));
         }
         link.coefficient(&coefficient)
     }

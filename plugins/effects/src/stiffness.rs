@@ -8,8 +8,8 @@
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 
-use crate::common::{TM_AXES, axis_of, manifest};
-use crate::linear::{ANGLES, Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, accel_channel};
+use crate::common::{ANGLES, TM_AXES, axis_of, manifest};
+use crate::linear::{Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, accel_channel};
 
 const STIFFNESS_S2: [f64; 2] = [-1e-5, 1e-5];
 const CROSS_M_S2_RAD: [f64; 2] = [-1e-6, 1e-6];
@@ -19,8 +19,7 @@ const CROSS_M_S2_RAD: [f64; 2] = [-1e-6, 1e-6];
 /// `z = ΔS r` with the measured displacement; ΔS: s⁻², ±1e-5, positive if the force points away from the centre. The
 /// mission file's stiffness is part of `û` (eq:TM_SC_relative_acceleration, `F_st`). Confounders: gains of the
 /// actuators that hold the test mass.
-#[derive(Debug)]
-pub(crate) struct Stiffness(String);
+pub(crate) enum Stiffness {}
 
 impl LinearEffect for Stiffness {
     const MANIFEST: Manifest = manifest(
@@ -31,12 +30,8 @@ impl LinearEffect for Stiffness {
         &[],
     );
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(setup.instance().to_owned()))
-    }
-
-    fn coefficients(&self, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let (tm, axis) = (&Body::of(mission, &self.0, "the effect stiffness")?, axis_of(&self.0));
+    fn coefficients(setup: &Setup, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
+        let (tm, axis) = (&Body::of(mission, setup.instance(), "the effect stiffness")?, axis_of(setup.instance()));
         let terms = vec![Term::new(accel_channel(tm, axis), Series::Held(InputColumn::displacement(tm, axis)), 1.0)];
         Ok(CoefficientForms::only("s-2", STIFFNESS_S2, terms))
     }
@@ -46,19 +41,19 @@ impl LinearEffect for Stiffness {
 ///
 /// `z = ΔS θ` with the measured angle about the axis: local wavefront sensing for `θ` and `ψ`, the inertial sensor for
 /// `φ`. ΔS: m s⁻² rad⁻¹, ±1e-6. The corresponding torque, `J_m S_RT = m S_TRᵀ`, is in no channel.
-#[derive(Debug)]
-pub(crate) struct CrossStiffness(String);
+pub(crate) enum CrossStiffness {}
 
 impl LinearEffect for CrossStiffness {
     const MANIFEST: Manifest =
         manifest("cross-stiffness", "Force on a test mass per angle beyond the mission file's", &[], TM_AXES, &[]);
 
-    fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self(setup.instance().to_owned()))
-    }
-
-    fn coefficients(&self, mission: &Mission, available: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
-        let (tm, axis) = (&Body::of(mission, &self.0, "the effect cross-stiffness")?, axis_of(&self.0));
+    fn coefficients(
+        setup: &Setup,
+        mission: &Mission,
+        available: &Available,
+    ) -> Result<Vec<CoefficientForms>, PluginError> {
+        let (tm, axis) =
+            (&Body::of(mission, setup.instance(), "the effect cross-stiffness")?, axis_of(setup.instance()));
         let local = InputColumn::angle_by_dws(tm, ANGLES[axis]);
         let angle =
             if available.find(&local.name).is_some() { local } else { InputColumn::angle_by_is(tm, ANGLES[axis]) };
@@ -74,7 +69,7 @@ impl LinearEffect for CrossStiffness {
 mod tests {
     use super::*;
     use crate::common::AXES;
-    use crate::test_spacecraft::TestSpacecraft;
+    use crate::test_spacecraft::{TestSpacecraft, setup};
     use nalgebra::Vector3;
 
     #[test]
@@ -103,7 +98,7 @@ mod tests {
         let mut available = test_spacecraft.available();
         let name = |available: &Available| {
             let coefficients =
-                CrossStiffness("tm2.z".to_owned()).coefficients(&test_spacecraft.mission, available).unwrap();
+                CrossStiffness::coefficients(&setup("tm2.z", ""), &test_spacecraft.mission, available).unwrap();
             coefficients[0].forms[0].terms[0].series.name()
         };
         assert_eq!(name(&available), "held(is.tm2.att_orf_rad.psi)");

@@ -18,8 +18,7 @@ const ARM_M: [f64; 2] = [-0.5, 0.5];
 ///
 /// In science mode the Sun is almost fixed in SRF, so the response is nearly constant and the result is an upper limit.
 /// Confounders: every constant force, self-gravity above all.
-#[derive(Debug)]
-pub(crate) struct SolarPressure;
+pub(crate) enum SolarPressure {}
 
 impl LinearEffect for SolarPressure {
     const MANIFEST: Manifest = manifest(
@@ -30,11 +29,7 @@ impl LinearEffect for SolarPressure {
         &["commands"],
     );
 
-    fn new(_: &Setup) -> Result<Self, PluginError> {
-        Ok(Self)
-    }
-
-    fn coefficients(&self, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
+    fn coefficients(_: &Setup, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
         let pressure = Mission::need(&mission.solar_pressure, "solar_pressure", "the effect solar-pressure")?;
         let (inverse, force_n) = (mission.spacecraft.inertia_inverse(), pressure.force_n);
         let torque_terms = |arm: Vector3<f64>| -> Vec<Term> {

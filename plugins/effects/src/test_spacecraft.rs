@@ -93,6 +93,11 @@ pub(crate) struct TestSpacecraft {
     pub(crate) fuel_change_kg: f64,
 }
 
+/// Setup of an effect; `parameters` are JSON members.
+pub(crate) fn setup(instance: &str, parameters: &str) -> Setup {
+    Setup::for_tests(&format!(r#"{{"instance": "{instance}", "parameters": {{{parameters}}}}}"#)).unwrap()
+}
+
 const NOISE_FORCE_PER_TORQUE: [[f64; 3]; 3] = [[0.3, -0.2, 0.5], [0.1, 0.4, -0.6], [-0.7, 0.2, 0.3]];
 
 fn skewed(i: usize, j: usize) -> f64 {
@@ -399,9 +404,7 @@ impl TestSpacecraft {
         let is_named =
             |template: &&str| ["tm1", "tm2"].iter().any(|tm| template.replace("{test_mass}", tm) == instance);
         assert!(R::MANIFEST.instances.iter().any(is_named), "{instance}");
-        let setup = format!(r#"{{"instance": "{instance}", "parameters": {{{parameters}}}}}"#);
-        let effect = R::new(&Setup::for_tests(&setup).unwrap()).unwrap();
-        let coefficients = effect.coefficients(&self.mission, &self.available()).unwrap();
+        let coefficients = R::coefficients(&setup(instance, parameters), &self.mission, &self.available()).unwrap();
         coefficients.into_iter().map(|p| (p.name.to_owned(), p.forms[0].clone())).collect()
     }
 

@@ -14,7 +14,7 @@ use serde_json::json;
 
 use crate::common::{
     SLOW_HZ, SeriesRef, TM_AXES, accel_channel_of, find_housekeeping, housekeeping_in, keep_available, manifest,
-    mission, response,
+    mission, response, symmetric,
 };
 use crate::lag::Lags;
 
@@ -74,24 +74,20 @@ impl<const N: usize> LaggedColumn<N> {
 /// The effect.
 #[derive(Debug)]
 pub(crate) struct Thermal {
-    instance: String,
+    setup: Setup,
     mission: Mission,
-    candidate: bool,
-    plus: String,
-    minus: String,
-    lag_s: f64,
     lagged_pair: Vec<LaggedColumn<1>>,
     banks: Vec<LaggedColumn<13>>,
 }
 
 impl Thermal {
     fn name(&self) -> String {
-        format!("thermal:{}", self.instance)
+        format!("thermal:{}", self.setup.instance())
     }
 
     /// Response to one lagged temperature.
     fn force_response(&self, temperature: &SeriesRef, factor: f64) -> Response {
-        response(accel_channel_of(&self.instance), temperature, factor)
+        response(accel_channel_of(self.setup.instance()), temperature, factor)
     }
 
     /// Every pair of temperatures at every lag. The sign of k is free, so each pair is listed in one order.
@@ -127,19 +123,21 @@ impl Thermal {
         available: &Available,
         link: &mut EffectLink<'_, '_>,
     ) -> Result<Vec<Response>, PluginError> {
-        if self.plus.is_empty() && self.minus.is_empty() {
-            // Refuses with the list of columns.
-            find_housekeeping(available, &self.name(), "plus", "", "K")?;
-        }
         let mut responses = Vec::new();
-        for (parameter, name, factor) in [("plus", self.plus.clone(), 1.0), ("minus", self.minus.clone(), -1.0)] {
+        for (parameter, factor) in [("plus", 1.0), ("minus", -1.0)] {
+            let name = self.setup.text(parameter)?;
             if name.is_empty() {
                 continue;
             }
             let column = find_housekeeping(available, &self.name(), parameter, &name, "K")?;
-            let ([lagged_name], bank) = LaggedColumn::link(column, [self.lag_s], self.mission.dt_s(), available, link)?;
+            let lag_s = [self.setup.f64("lag_s")?];
+            let ([lagged_name], bank) = LaggedColumn::link(column, lag_s, self.mission.dt_s(), available, link)?;
             responses.push(self.force_response(&lagged_name, factor));
             self.lagged_pair.extend(bank);
+        }
+        if responses.is_empty() {
+            // Refuses with the list of columns.
+            find_housekeeping(available, &self.name(), "plus", "", "K")?;
         }
         Ok(responses)
     }
@@ -159,30 +157,14 @@ impl Effect for Thermal {
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self {
-            instance: setup.instance().to_owned(),
-            mission: mission(setup)?,
-            candidate: setup.candidate(),
-            plus: setup.text("plus")?,
-            minus: setup.text("minus")?,
-            lag_s: setup.f64("lag_s")?,
-            lagged_pair: Vec::new(),
-            banks: Vec::new(),
-        })
+        Ok(Self { setup: setup.clone(), mission: mission(setup)?, lagged_pair: Vec::new(), banks: Vec::new() })
     }
 
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
-        let mut coefficient = Coefficient {
-            name: format!("thermal.{}", self.instance),
-            unit: "m s-2 K-1".to_owned(),
-            lower: -MAX_PER_KELVIN,
-            upper: MAX_PER_KELVIN,
-            prior_sigma: MAX_PER_KELVIN / 3.0,
-            ..Coefficient::default()
-        };
+        let mut coefficient = symmetric(format!("thermal.{}", self.setup.instance()), "m s-2 K-1", MAX_PER_KELVIN);
         // Checks the channel first.
         keep_available(available, &self.name(), vec![self.force_response(&SeriesRef::default(), 1.0)])?;
-        if self.candidate {
+        if self.setup.candidate() {
             coefficient.variants = self.variants(available, link)?;
             if coefficient.variants.is_empty() {
                 return Err(PluginError::error(format!(
@@ -192,12 +174,9 @@ impl Effect for Thermal {
             }
         } else {
             coefficient.responses = self.responses(available, link)?;
-            coefficient.shape = [
-                ("plus".to_owned(), json!(self.plus)),
-                ("minus".to_owned(), json!(self.minus)),
-                ("lag_s".to_owned(), json!(self.lag_s)),
-            ]
-            .into();
+            let text = |name: &str| Ok::<_, PluginError>((name.to_owned(), json!(self.setup.text(name)?)));
+            let lag_s = ("lag_s".to_owned(), json!(self.setup.f64("lag_s")?));
+            coefficient.shape = [text("plus")?, text("minus")?, lag_s].into();
         }
         link.coefficient(&coefficient)
     }

@@ -32,6 +32,7 @@ use dragfree_sdk::export_plugin;
 export_plugin!(stages: [accelerometer::Accelerometer], sources: [source::GraceFo]);
 
 /// Error that makes a file unreadable.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum Level1Error {
     /// The line that ends a header is missing.
@@ -51,22 +52,10 @@ pub enum Level1Error {
     Epoch(String),
     /// A variable has another unit.
     #[error("variable {variable} is in `{found}`, expected `{wanted}`: another release of the product")]
-    Unit {
-        /// The variable.
-        variable: &'static str,
-        /// Unit in the header.
-        found: String,
-        /// Unit expected.
-        wanted: &'static str,
-    },
+    Unit { variable: &'static str, found: String, wanted: &'static str },
     /// The file belongs to another spacecraft.
     #[error("the header says platform `{found}`, the file name says {wanted}")]
-    Platform {
-        /// Platform in the header.
-        found: String,
-        /// Letter of the spacecraft in the file name.
-        wanted: char,
-    },
+    Platform { found: String, wanted: char },
 }
 
 /// Half-open time interval, ns of the tables' time scale.

@@ -12,29 +12,18 @@ use crate::rows::{Counts, Parsed, Rows, align_quaternions, order, parse};
 use crate::{Level1Error, Window};
 
 /// Error that prevents a telemetry stream.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum TelemetryError {
     /// A file cannot be read.
     #[error("{}: {source}; check the path and its permissions", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
+    Read { path: PathBuf, source: std::io::Error },
     /// No file contains data of the spacecraft.
     #[error(
         "none of the {files} files given contains a product of spacecraft {spacecraft}: {seen}; give .tgz archives or .txt \
          files named PRODUCT_DATE_SPACECRAFT_RELEASE.txt, and check mission.spacecraft and the parameter products"
     )]
-    Nothing {
-        /// Number of files.
-        files: usize,
-        /// Letter of the spacecraft.
-        spacecraft: char,
-        /// What the files contain instead.
-        seen: String,
-    },
+    Nothing { files: usize, spacecraft: char, seen: String },
     /// Unknown product.
     #[error("parameter products: unknown product `{0}`; known products: {1}")]
     UnknownProduct(String, String),

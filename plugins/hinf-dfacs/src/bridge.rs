@@ -1,15 +1,14 @@
-//! Bridges over a few missing readouts, for the second differences alone.
+//! Interpolation over a few missing readouts, for the second differences alone.
 //!
-//! One readout that is missing takes three second differences with it, and a spectrum wants stretches without a hole. A
-//! cubic through the two readouts on either side misses by the size of the readout's own noise (and by `d⁴r/dt⁴`,
-//! nothing at these rates), and the second difference gives that error the spectrum that the noise of a readout has. In
-//! a few parts per thousand of the samples it cannot be seen. The readouts themselves stay missing: a filter has a
-//! better prediction than a cubic.
+//! A missing readout affects three second differences, and a spectrum needs intervals without gaps. The error of a cubic
+//! through two readouts on either side is of the size of the readout's noise, with the same spectrum after the second
+//! difference, and negligible if few samples are missing. The readouts themselves stay missing, because a filter
+//! predicts them better.
 
 /// Longest bridge, samples.
 pub(crate) const LONGEST: usize = 5;
 
-/// The values between the two before and the two after a hole of `missing` samples: Lagrange's cubic.
+/// Lagrange's cubic over `missing` samples, from the two values before and the two after them.
 pub(crate) fn bridge(before: [f64; 2], after: [f64; 2], missing: usize) -> impl Iterator<Item = f64> {
     let end = missing as f64 + 1.0;
     let at = [-1.0, 0.0, end, end + 1.0];

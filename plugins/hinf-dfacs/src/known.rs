@@ -1,4 +1,4 @@
-//! What the commands, the Sun's direction and the readout say about forces and torques (Section IV, `û_i`).
+//! Known forces and torques by commands, sunlight and stiffness (Section IV, `û_i`).
 
 use dragfree_physics::control::{Command, PerTestMass, TestMassCommand, TestMassReadout};
 use dragfree_physics::mission::{Mission, MissionError};
@@ -11,7 +11,7 @@ const NEEDED_BY: &str = "hinf-dfacs";
 pub struct KnownMotion {
     /// `û_i`: the known acceleration of each test mass against its housing, without the offset's terms, ORF, m s⁻².
     pub u_orf_m_s2: PerTestMass<Vector3<f64>>,
-    /// Angular acceleration of the spacecraft relative to IRF that the torques are meant to give, SRF, rad s⁻².
+    /// Angular acceleration of the spacecraft relative to IRF by the known torques, SRF, rad s⁻².
     pub alpha_srf_rad_s2: Vector3<f64>,
 }
 
@@ -36,7 +36,7 @@ struct KnownTestMass {
 }
 
 impl KnownModel {
-    /// Takes what it needs from the mission file.
+    /// The model of a mission.
     ///
     /// # Errors
     /// [`MissionError::Missing`] without a test mass, [`MissionError::Value`] for a singular inertia.
@@ -63,12 +63,12 @@ impl KnownModel {
     /// The known motion under one command.
     ///
     /// `û_i = −T_S^{O_i}(F̂_T + F̂_SRP − Σ_j T_{O_j}^S F̂_Ej)/m_S + F̂_Ei/m_m + S_TT r_i + S_TR θ_i`, and
-    /// `α = J_S⁻¹(M̂_T + D̂_SRP − Σ T M̂_Ei − Σ b_i×(T F̂_Ei) − ω×J_S ω)` (eq:SC_attitude_dynamics with its two signs
-    /// put right: an electrode that pushes the test mass pushes the spacecraft back).
+    /// `α = J_S⁻¹(M̂_T + D̂_SRP − Σ T M̂_Ei − Σ b_i×(T F̂_Ei) − ω×J_S ω)` (eq:SC_attitude_dynamics with two signs
+    /// corrected, as the electrodes' reaction acts on the spacecraft).
     ///
     /// `sun_srf` is the unit vector from the Sun, `None` where sunlight is not modelled; `omega_srf_rad_s` is relative
-    /// to IRF. The stiffness acts on the measured displacement with its noise `n`: `û` gains `S n` where the second
-    /// difference of the same readout has `n̈`, so the ratio is `S/(2πf)²`, 2.5 % at 1 mHz for 1e-6 s⁻² and less above.
+    /// to IRF. By the stiffness term `û` contains the readout noise `S n`, small against `n̈` of the second difference of
+    /// the same readout by the ratio `S/(2πf)²`.
     #[must_use]
     pub fn motion(
         &self,

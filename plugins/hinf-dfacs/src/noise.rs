@@ -1,10 +1,9 @@
-//! The noise in the channels, declared from the mission file for the stages that weigh them.
+//! Noise of the channels, declared from the mission file for the estimators.
 //!
-//! A force on the spacecraft moves it under every test mass: one vector process, seen by each in its own ORF. What the
-//! known acceleration takes from the torque (see [`ThrustNoise`]) is no noise; what is left of the force is. The
-//! attitude channels measure the torque's noise itself. The error of α̂, the minimum-variance estimate of the angular
-//! acceleration, reaches the test masses through the lever of the nominal offset: a truth some millimetres away changes
-//! a small part of Σ by a few per cent.
+//! A force on the spacecraft is one vector process that enters the channels of all test masses. The part of the force
+//! noise that is predicted from the torque (see [`ThrustNoise`]) is in the known acceleration; the rest is noise. The
+//! attitude channels contain the torque noise. The error of α̂, the minimum-variance estimate of the angular
+//! acceleration, enters the test masses' channels through the lever of the nominal offset.
 
 use std::collections::BTreeMap;
 
@@ -83,7 +82,7 @@ pub fn declared(mission: &Mission, readouts: &[[&str; 3]]) -> Vec<NoiseProcess> 
     all
 }
 
-/// What each axis of one test mass has for itself: its readout, the electrostatic force, stray accelerations.
+/// Processes of single axes of a test mass: readout, electrostatic force, stray acceleration.
 fn of_test_mass(mission: &Mission, name: &str, tm: &TestMass, readouts: &[&str; 3]) -> Vec<NoiseProcess> {
     let noise = &mission.noise;
     let mut all = Vec::new();

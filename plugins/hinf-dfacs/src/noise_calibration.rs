@@ -1,24 +1,24 @@
-//! Levels of torque and attitude noise, measured in the first stretch of a run.
+//! Levels of torque noise and attitude readout noise, measured in the first interval of a run.
 //!
-//! `α̂` weighs the attitude's sensing against the thrusters' torque, and a wrong weight biases it. So the second
-//! difference of the attitude against the known torques, whose spectrum is `a cos² + b (4 sin²/dt²)²`, is measured
-//! before anything is reconstructed. A level that differs significantly from the mission file's replaces it.
+//! `α̂` combines attitude readouts and commanded torques, and is biased by wrong weights. The levels are therefore fitted
+//! to the spectrum of the attitude channels, `a cos² + b (4 sin²/dt²)²`, before the reconstruction. A level that differs
+//! significantly from the mission file's replaces it.
 
 use dragfree_physics::levels::{self, Bin};
 use dragfree_physics::spectrum::welch;
 use nalgebra::Vector3;
 
-/// Length of the stretch, s.
+/// Length of the interval, s.
 const LENGTH_S: f64 = 3276.8;
 
 /// Length of a segment of its spectrum, s.
 const SEGMENT_S: f64 = 204.8;
 
-/// Below this frequency coloured sensing noise and slow torques are no longer negligible.
+/// Lowest frequency of the fit, Hz: coloured sensing noise and slow torques are not negligible below.
 const LOWEST_HZ: f64 = 0.01;
 
-/// Least difference of a power from the mission file's, natural logarithm, at which it replaces that: five standard
-/// deviations of the measured torque level, which rests on some 14 bins of 31 segments.
+/// Difference of a measured power from the mission file's, natural logarithm, above which it replaces it: five standard
+/// deviations of the measured torque level.
 const SIGNIFICANT_LOG_RATIO: f64 = 0.25;
 
 /// Powers of the noise over those of the mission file.
@@ -31,20 +31,20 @@ pub struct NoiseScale {
 }
 
 impl NoiseScale {
-    /// As the mission file has it.
+    /// The levels of the mission file.
     #[must_use]
     pub fn nominal() -> Self {
         Self { torque: Vector3::repeat(1.0), sensing: 1.0 }
     }
 }
 
-/// Epochs of the stretch.
+/// Number of epochs of the interval.
 #[must_use]
 pub fn length(rate_hz: f64) -> usize {
     (LENGTH_S * rate_hz).round() as usize
 }
 
-/// Measures the levels from the attitude channels of the stretch, SRF, rad s⁻², which do not depend on the weight.
+/// Measures the levels from the attitude channels, SRF, rad s⁻², which do not depend on the weight.
 /// `held` and `readout` are the one-sided PSDs of the mission file, rad² s⁻⁴/Hz per axis of SRF and rad²/Hz. Nominal
 /// where the longest run without a hole is shorter than eight segments.
 #[must_use]

@@ -1,4 +1,4 @@
-//! The stage at the border: columns in, rows out, a report.
+//! The stage: input columns, output rows, report.
 
 use dragfree_physics::mission::{ANGLES, AXES, INERTIAL_SENSOR, INTERFEROMETER, Mission};
 use dragfree_sdk::prelude::*;
@@ -11,11 +11,9 @@ use crate::on_demand::{self, Needs};
 use crate::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Row, Settings, levels_of, row_length};
 use crate::replay::{CommandNumbers, Comparison, command_vectors};
 
-/// The innovations' variance may differ from the prediction by this much before it is worth a sentence; a day's
-/// sampling error is 0.2 %.
+/// Relative difference of the innovations' variance from the prediction above which it is noted.
 const INNOVATION_TOLERANCE: f64 = 0.1;
-/// Standard deviations of the innovations' correlation with rebuilt commands above which the commands are not those
-/// that acted; a false alarm in 2e-6 of all runs.
+/// Standard deviations of the innovations' correlation with rebuilt commands above which it is noted.
 const INCONSISTENT_SIGMA: f64 = 5.0;
 /// The stage.
 pub struct HinfDfacs {
@@ -36,17 +34,12 @@ struct Linked {
     /// Epochs held back until the levels of the noise are measured; `None` from then on.
     held_back: Option<Vec<Epoch>>,
     rate_hz: f64,
-    readout: Vec<Option<In>>,
-    command: Option<Vec<In>>,
-    sun: Option<[In; 3]>,
-    ephemeris_age: Option<In>,
-    omega_crf: Option<[In; 3]>,
-    alpha_crf: Option<[In; 3]>,
+    input: Columns<In>,
     table: Table,
     out: Vec<Out>,
     /// How many of them are not on demand.
     always: usize,
-    /// Rows on their way out; empty between calls.
+    /// Rows to be passed on; empty between calls.
     rows: Vec<Row>,
 }
 
@@ -136,7 +129,7 @@ impl HinfDfacs {
     fn rebuild(&mut self, scale: NoiseScale) -> Result<(), PluginError> {
         let linked = self.linked.as_ref().ok_or_else(not_linked)?;
         let (settings, all_readouts) = (Settings { scale, ..linked.settings }, linked.all_readouts);
-        // What there is to say of the control law has been said at the link.
+        // Notes on the control law were made by `link`.
         let notes = self.notes.clone();
         let reconstruction = self.reconstruction(&settings, all_readouts)?;
         self.notes = notes;
@@ -145,7 +138,7 @@ impl HinfDfacs {
         Ok(())
     }
 
-    /// Measures the levels of the noise in the epochs that were held back, and lets these go.
+    /// Measures the noise levels in the epochs held back, and processes these.
     fn calibrate_noise(&mut self) -> Result<(), PluginError> {
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
         let Some(epochs) = linked.held_back.take() else { return Ok(()) };
@@ -166,7 +159,7 @@ impl HinfDfacs {
         Ok(())
     }
 
-    /// Builds the reconstruction, with the control law beside it where that can be had.
+    /// Builds the reconstruction, with a replay of the control law if possible.
     fn reconstruction(&mut self, settings: &Settings, all_readouts: bool) -> Result<Reconstruction, PluginError> {
         let without = Settings { replay: false, ..*settings };
         if !settings.commands {
@@ -233,25 +226,6 @@ fn write_columns(
 }
 
 impl Linked {
-    fn epoch(&self, input: &Columns<'_>, k: usize) -> Epoch {
-        let vector = |columns: &Option<[&[f64]; 3]>| match columns {
-            Some([x, y, z]) => Vector3::new(x[k], y[k], z[k]),
-            None => Vector3::from_element(f64::NAN),
-        };
-        Epoch {
-            time_ns: input.time_ns[k],
-            readout: input.readout.iter().map(|column| column.map_or(f64::NAN, |column| column[k])).collect(),
-            command: match &input.command {
-                Some(columns) => columns.iter().map(|column| column[k]).collect(),
-                None => CommandNumbers::from_fn(input.readout.len() + 3, |_| f64::NAN),
-            },
-            sun_srf: vector(&input.sun),
-            ephemeris_age_s: input.ephemeris_age.map_or(f64::NAN, |column| column[k]),
-            omega_crf_rad_s: vector(&input.omega_crf),
-            alpha_crf_rad_s2: vector(&input.alpha_crf),
-        }
-    }
-
     fn give(&mut self, output: &mut Outputs) {
         output.time(self.table).extend(self.rows.iter().map(|row| row.time_ns));
         let (always, on_demand) = self.out.split_at(self.always);
@@ -265,28 +239,47 @@ impl Linked {
     }
 }
 
-/// A batch's columns, looked up once.
-struct Columns<'a> {
-    time_ns: &'a [i64],
-    readout: Vec<Option<&'a [f64]>>,
-    command: Option<Vec<&'a [f64]>>,
-    sun: Option<[&'a [f64]; 3]>,
-    ephemeris_age: Option<&'a [f64]>,
-    omega_crf: Option<[&'a [f64]; 3]>,
-    alpha_crf: Option<[&'a [f64]; 3]>,
+/// Input columns: handles, or the values of a batch.
+struct Columns<T> {
+    readout: Vec<Option<T>>,
+    command: Option<Vec<T>>,
+    sun: Option<[T; 3]>,
+    ephemeris_age: Option<T>,
+    omega_crf: Option<[T; 3]>,
+    alpha_crf: Option<[T; 3]>,
 }
 
-impl<'a> Columns<'a> {
-    fn of(linked: &Linked, input: &'a Inputs<'_>) -> Self {
-        let vector = |columns: &Option<[In; 3]>| columns.map(|c| c.map(|c| input.f64(c)));
-        Self {
-            time_ns: input.time_ns(),
-            readout: linked.readout.iter().map(|c| c.map(|c| input.f64(c))).collect(),
-            command: linked.command.as_ref().map(|c| c.iter().map(|c| input.f64(*c)).collect()),
-            sun: vector(&linked.sun),
-            ephemeris_age: linked.ephemeris_age.map(|c| input.f64(c)),
-            omega_crf: vector(&linked.omega_crf),
-            alpha_crf: vector(&linked.alpha_crf),
+impl Columns<In> {
+    fn values<'a>(&self, input: &'a Inputs<'_>) -> Columns<&'a [f64]> {
+        let values = |column: In| input.f64(column);
+        Columns {
+            readout: self.readout.iter().map(|c| c.map(values)).collect(),
+            command: self.command.as_ref().map(|c| c.iter().copied().map(values).collect()),
+            sun: self.sun.map(|c| c.map(values)),
+            ephemeris_age: self.ephemeris_age.map(values),
+            omega_crf: self.omega_crf.map(|c| c.map(values)),
+            alpha_crf: self.alpha_crf.map(|c| c.map(values)),
+        }
+    }
+}
+
+impl Columns<&[f64]> {
+    fn epoch(&self, time_ns: i64, k: usize) -> Epoch {
+        let vector = |columns: &Option<[&[f64]; 3]>| match columns {
+            Some([x, y, z]) => Vector3::new(x[k], y[k], z[k]),
+            None => Vector3::from_element(f64::NAN),
+        };
+        Epoch {
+            time_ns,
+            readout: self.readout.iter().map(|column| column.map_or(f64::NAN, |column| column[k])).collect(),
+            command: match &self.command {
+                Some(columns) => columns.iter().map(|column| column[k]).collect(),
+                None => CommandNumbers::from_fn(self.readout.len() + 3, |_| f64::NAN),
+            },
+            sun_srf: vector(&self.sun),
+            ephemeris_age_s: self.ephemeris_age.map_or(f64::NAN, |column| column[k]),
+            omega_crf_rad_s: vector(&self.omega_crf),
+            alpha_crf_rad_s2: vector(&self.alpha_crf),
         }
     }
 }
@@ -415,12 +408,7 @@ impl Stage for HinfDfacs {
             all_readouts,
             held_back: (smoother && self.measure_noise).then(Vec::new),
             rate_hz,
-            readout,
-            command,
-            sun,
-            ephemeris_age,
-            omega_crf,
-            alpha_crf,
+            input: Columns { readout, command, sun, ephemeris_age, omega_crf, alpha_crf },
             table,
             out,
             always,
@@ -431,12 +419,11 @@ impl Stage for HinfDfacs {
 
     fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
-        let columns = Columns::of(linked, input);
-        let rows = columns.time_ns.len();
+        let (columns, times) = (linked.input.values(input), input.time_ns());
         let mut k = 0;
         if let Some(held_back) = &linked.held_back {
-            let end = rows.min(noise_calibration::length(linked.rate_hz) - held_back.len());
-            let epochs: Vec<Epoch> = (0..end).map(|k| linked.epoch(&columns, k)).collect();
+            let end = times.len().min(noise_calibration::length(linked.rate_hz) - held_back.len());
+            let epochs: Vec<Epoch> = (0..end).map(|k| columns.epoch(times[k], k)).collect();
             linked.held_back.get_or_insert_default().extend(epochs);
             k = end;
             if linked.held_back.as_ref().is_some_and(|p| p.len() < noise_calibration::length(linked.rate_hz)) {
@@ -445,8 +432,8 @@ impl Stage for HinfDfacs {
             self.calibrate_noise()?;
         }
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
-        for k in k..rows {
-            let epoch = linked.epoch(&columns, k);
+        for (k, time_ns) in times.iter().enumerate().skip(k) {
+            let epoch = columns.epoch(*time_ns, k);
             linked.reconstruction.push(&epoch, &mut linked.rows)?;
         }
         linked.give(output);
@@ -467,7 +454,7 @@ impl Stage for HinfDfacs {
         let mut report = Report { notes: self.notes.clone(), ..Report::default() };
         let reconstructed = counts.commands_replayed > counts.commands_telemetered;
         report.commands = Some(if reconstructed { "reconstructed" } else { "telemetered" }.to_owned());
-        for (name, count) in [
+        let counted = [
             ("commands_telemetered", counts.commands_telemetered),
             ("commands_replayed", counts.commands_replayed),
             ("commands_missing", counts.commands_missing),
@@ -476,9 +463,8 @@ impl Stage for HinfDfacs {
             ("attitude_missing", counts.attitude_missing),
             ("readouts_bridged", counts.readouts_bridged),
             ("angular_acceleration_unknown", counts.blind),
-        ] {
-            report.counts.insert(name.to_owned(), count);
-        }
+        ];
+        report.counts = counted.map(|(name, count)| (name.to_owned(), count)).into();
         if counts.commands_replayed > 0 {
             report.notes.push(format!(
                 "commands of {} of {} epochs were not telemetered and come from the replayed control law",

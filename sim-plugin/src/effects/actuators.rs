@@ -1,4 +1,4 @@
-//! Actuators that do something else than they are told.
+//! Actuators whose output differs from the command.
 
 use dragfree_physics::control::Command;
 use nalgebra::Matrix3;
@@ -71,7 +71,7 @@ enum Output {
     Electrodes(usize),
 }
 
-/// Adds `matrix · command` to what acts.
+/// Adds `matrix · command` to the output.
 struct Actuator {
     output: Output,
     matrix: Matrix3<f64>,

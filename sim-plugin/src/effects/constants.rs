@@ -1,4 +1,4 @@
-//! Constants of the plant that are not what the mission file says.
+//! Constants of the plant that differ from the mission file.
 
 use nalgebra::Vector3;
 use rand_xoshiro::Xoshiro256PlusPlus;
@@ -48,7 +48,7 @@ impl Cause for Constant {
             (_, Place::TmAxis(tm, axis)) => {
                 let body = &mut plant.tm[tm];
                 body.stiffness_tr[(axis, axis)] += size;
-                // The same potential: J_m S_RT = m S_TRᵀ.
+                // Force and torque derive from one potential: J_m S_RT = m S_TRᵀ.
                 let torque = along(axis) * (size * body.mass_kg);
                 body.stiffness_rt += body.inertia_inverse * torque * along(axis).transpose();
             }

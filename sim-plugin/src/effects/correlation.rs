@@ -1,4 +1,4 @@
-//! Thruster noise that comes from single thrusters: what pushes the spacecraft turns it, too.
+//! Noise of single thrusters, with correlated force and torque.
 
 use dragfree_physics::mission::MissionError;
 use rand_xoshiro::Xoshiro256PlusPlus;

@@ -1,4 +1,4 @@
-//! Geometry that changes with time: the centre of mass wanders, the optical axes open.
+//! Geometry that changes with time: drift of the centre of mass, opening of the optical axes.
 
 use dragfree_physics::frames::dcm_turned_about_z;
 
@@ -14,18 +14,8 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("m s-1", -1e-5, 1e-5),
         help: "both housings wander along the axis, seen from the centre of mass, by SIZE per second, and by what follows",
         shape: &[
-            Shape {
-                name: "kappa_m_k",
-                number: Number::new("m K-1", -1e-3, 1e-3),
-                default: 0.0,
-                help: "per kelvin of the structure, m/K",
-            },
-            Shape {
-                name: "beta_m_kg",
-                number: Number::new("m kg-1", -1.0, 1.0),
-                default: 0.0,
-                help: "per kilogram of propellant spent, m/kg",
-            },
+            Shape::new("kappa_m_k", Number::new("m K-1", -1e-3, 1e-3), 0.0, "per kelvin of the structure, m/K"),
+            Shape::new("beta_m_kg", Number::new("m kg-1", -1.0, 1.0), 0.0, "per kilogram of propellant spent, m/kg"),
         ],
         build,
     },
@@ -35,18 +25,13 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("rad", -0.5, 0.5),
         help: "the optical frame is turned by SIZE about s_3 beyond the mission's angle",
         shape: &[
-            Shape {
-                name: "rate_rad_s",
-                number: Number::new("rad s-1", -1e-6, 1e-6),
-                default: 0.0,
-                help: "and by this per second, rad/s",
-            },
-            Shape {
-                name: "follow",
-                number: Number::new("1", -2.0, 2.0),
-                default: 0.0,
-                help: "and by this part of what half the opening angle grows",
-            },
+            Shape::new("rate_rad_s", Number::new("rad s-1", -1e-6, 1e-6), 0.0, "and by this per second, rad/s"),
+            Shape::new(
+                "follow",
+                Number::new("1", -2.0, 2.0),
+                0.0,
+                "and by this part of what half the opening angle grows",
+            ),
         ],
         build,
     },
@@ -92,13 +77,13 @@ impl Cause for OffsetDrift {
     }
 }
 
-/// `T_S^O(t)`. The frame's own rate, some nrad/s, adds less than 1e-17 m/s² and is left out of the equations of motion.
+/// `T_S^O(t)`. The rate of the frame is neglected in the equations of motion.
 struct Opening {
     tm: usize,
     angle_rad: f64,
     rate_rad_s: f64,
     follow: f64,
-    /// Sign of the angle by which the mission turns the frame: the frames open away from each other.
+    /// Sign of the mission's angle of the frame: the frames open in opposite directions.
     side: f64,
 }
 

@@ -1,8 +1,7 @@
-//! Physical effects that the controller and a calibration's model do not know, written from states.
+//! Physical effects that are unknown to the controller and to the model of a calibration, computed from true states.
 //!
-//! An effect is asked for as `ID:INSTANCE=SIZE[,NAME=VALUE]...` ([`EffectRequest::parse`]); [`catalogue`] lists all of
-//! them. Each becomes a [`Cause`] that acts inside the loop, so the controller sees it and answers. A family of effects
-//! is a file.
+//! An effect is requested as `ID:INSTANCE=SIZE[,NAME=VALUE]...` ([`EffectRequest::parse`]); [`catalogue`] lists all of
+//! them. Each becomes a [`Cause`] that acts inside the control loop. A module holds a family of effects.
 
 mod actuators;
 mod constants;
@@ -44,7 +43,7 @@ pub fn catalogue() -> impl Iterator<Item = &'static Kind> {
     .flatten()
 }
 
-/// What is true at `t_k`.
+/// True quantities at `t_k`.
 pub struct Moment<'a> {
     /// Since the first sample of the telemetry; negative while the loop settles, s.
     pub elapsed_s: f64,
@@ -54,7 +53,7 @@ pub struct Moment<'a> {
     pub state: &'a State,
     /// True plant.
     pub plant: &'a Plant,
-    /// What goes on inside the spacecraft.
+    /// Interior of the spacecraft.
     pub inside: &'a Interior,
     /// `ω_CI`, CRF, rad/s.
     pub omega_crf_rad_s: Vector3<f64>,
@@ -62,14 +61,14 @@ pub struct Moment<'a> {
     pub sunlight_srf_n: Vector3<f64>,
 }
 
-/// One effect at work. A method is one place of the loop; most effects need one of them.
+/// A running effect. Each method corresponds to a point of the loop; most effects implement one of them.
 ///
-/// Each effect has a random stream of its own: switching one on changes no other noise.
+/// Each effect has its own random stream, so that adding one changes no other noise.
 pub trait Cause: Send {
     /// Changes constants of the plant before the loop is closed.
     fn begin(&mut self, _plant: &mut Plant, _rng: &mut Xoshiro256PlusPlus) {}
 
-    /// Whether it stands in place of the mission's thruster noise along the axes.
+    /// Whether it replaces the mission's thruster noise along the axes.
     fn replaces_thruster_noise(&self) -> bool {
         false
     }
@@ -79,33 +78,33 @@ pub trait Cause: Send {
         false
     }
 
-    /// Changes the geometry of the plant, given as it was begun, to that of an instant.
+    /// Changes the geometry of the plant from the initial one to that of an instant.
     fn reshape(&self, _elapsed_s: f64, _inside: &Interior, _plant: &mut Plant) {}
 
-    /// Changes what the instruments say at `t_k`.
+    /// Changes the readouts at `t_k`.
     fn read(&mut self, _now: &Moment<'_>, _rng: &mut Xoshiro256PlusPlus, _measured: &mut Measured) {}
 
-    /// Changes what the actuators make of the command over `[t_k, t_{k+1})`.
+    /// Changes the forces and torques that result from the command over `[t_k, t_{k+1})`.
     fn act(&mut self, _command: &Command, _acting: &mut Command) {}
 
     /// Adds loads over `[t_k, t_{k+1})`.
     fn push(&mut self, _now: &Moment<'_>, _rng: &mut Xoshiro256PlusPlus, _loads: &mut Loads) {}
 
-    /// Adds what answers to all other loads.
+    /// Adds loads that depend on all other loads.
     fn react(&mut self, _now: &Moment<'_>, _loads: &mut Loads) {}
 
-    /// Everything that the next samples depend on.
+    /// State, for a checkpoint.
     fn states(&self) -> Vec<f64> {
         Vec::new()
     }
 
-    /// Takes back what [`Self::states`] gave; false when it is another effect's.
+    /// Restores [`Self::states`]; false if the length differs.
     fn set_states(&mut self, states: &[f64]) -> bool {
         states.is_empty()
     }
 }
 
-/// What effects are built from, besides what was requested.
+/// Data other than the request from which effects are built.
 pub struct Basis<'a> {
     /// The mission.
     pub mission: &'a Mission,
@@ -128,14 +127,14 @@ pub struct Saved {
 }
 
 impl Effects {
-    /// The effects that were asked for.
+    /// The requested effects.
     ///
     /// # Errors
-    /// [`EffectError::Mission`] when the mission lacks what one needs.
+    /// [`EffectError::Mission`] if the mission lacks a section.
     pub fn new(request: &[EffectRequest], basis: &Basis<'_>, seed: u64) -> Result<Self, EffectError> {
         let name = |a: &EffectRequest| format!("{}:{}", a.kind.id, a.instance);
         let active = request.iter().enumerate().map(|(i, one)| {
-            // Its size does not enter: the same noise, larger or smaller.
+            // The random stream does not depend on the size.
             let before = request[..i].iter().filter(|other| name(other) == name(one)).count();
             Ok(Active { cause: one.cause(basis)?, rng: stream(seed, &format!("{} {before}", name(one))) })
         });
@@ -161,21 +160,21 @@ impl Effects {
         self.0.iter().any(|active| active.cause.moves())
     }
 
-    /// Changes the geometry of the plant, given as it was begun, to that of an instant.
+    /// Changes the geometry of the plant from the initial one to that of an instant.
     pub fn reshape(&self, elapsed_s: f64, inside: &Interior, plant: &mut Plant) {
         for active in &self.0 {
             active.cause.reshape(elapsed_s, inside, plant);
         }
     }
 
-    /// What the instruments say at `t_k`.
+    /// Changes the readouts at `t_k`.
     pub fn read(&mut self, now: &Moment<'_>, measured: &mut Measured) {
         for Active { cause, rng } in &mut self.0 {
             cause.read(now, rng, measured);
         }
     }
 
-    /// What acts when `command` is given.
+    /// Forces and torques that result from a command.
     pub fn act(&mut self, command: &Command) -> Command {
         let mut acting = *command;
         for active in &mut self.0 {
@@ -200,7 +199,7 @@ impl Effects {
         self.0.iter().map(|a| Saved { rng: a.rng.clone(), states: a.cause.states() }).collect()
     }
 
-    /// Takes back what [`Self::save`] gave; false when it is of other effects.
+    /// Restores [`Self::save`]; false for a state of other effects.
     #[must_use]
     pub fn load(&mut self, saved: &[Saved]) -> bool {
         saved.len() == self.0.len()
@@ -211,8 +210,8 @@ impl Effects {
     }
 }
 
-/// Fills slots with saved numbers; false when there are more or fewer.
-fn fill<'a>(slots: impl IntoIterator<Item = &'a mut f64>, states: &[f64]) -> bool {
+/// Fills slots with saved numbers; false if their numbers differ.
+pub(crate) fn fill<'a>(slots: impl IntoIterator<Item = &'a mut f64>, states: &[f64]) -> bool {
     let mut states = states.iter();
     let filled = slots.into_iter().all(|slot| states.next().map(|value| *slot = *value).is_some());
     filled && states.next().is_none()

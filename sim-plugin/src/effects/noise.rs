@@ -1,7 +1,6 @@
-//! Noise that is larger than the mission file says, or has a line.
+//! Noise that exceeds the mission file's, or has a spectral line.
 //!
-//! The excess is a process of its own, `sqrt(k² − 1)` times the mission's shape: the powers of independent processes
-//! add to `k²`.
+//! The excess is an independent process with `sqrt(k² − 1)` times the mission's shape, so that powers add to `k²`.
 
 use dragfree_physics::mission::Mission;
 use dragfree_physics::noise::NoiseShape;
@@ -17,18 +16,13 @@ use crate::sensors::Measured;
 
 const FACTOR: Number = Number::new("1", 1.0, 100.0);
 const LINE: &[Shape] = &[
-    Shape {
-        name: "line_hz",
-        number: Number::new("Hz", 0.0, 5.0),
-        default: 0.0,
-        help: "frequency of a line, 0 for none",
-    },
-    Shape {
-        name: "line_rthz",
-        number: Number::new("Hz^0.5", 0.0, 1e3),
-        default: 0.1,
-        help: "amplitude of the line, in units of the mission's ASD above the corner",
-    },
+    Shape::new("line_hz", Number::new("Hz", 0.0, 5.0), 0.0, "frequency of a line, 0 for none"),
+    Shape::new(
+        "line_rthz",
+        Number::new("Hz^0.5", 0.0, 1e3),
+        0.1,
+        "amplitude of the line, in units of the mission's ASD above the corner",
+    ),
 ];
 
 pub(super) const KINDS: &[Kind] = &[

@@ -1,4 +1,4 @@
-//! Loads on the spacecraft or a test mass that come from outside: sunlight, micrometeoroids, glitches, the antenna.
+//! External and transient loads: sunlight, micrometeoroids, glitches of a test mass, moves of the antenna.
 
 use dragfree_physics::mission::Mission;
 use nalgebra::Vector3;
@@ -18,9 +18,9 @@ pub(super) const KINDS: &[Kind] = &[
         size: Number::new("1", -1.0, 10.0),
         help: "sunlight pushes (1 + SIZE) times as hard, at the mission's arm and what is added to it",
         shape: &[
-            Shape { name: "arm_x_m", number: ARM, default: 0.0, help: "added to the arm, SRF x, m" },
-            Shape { name: "arm_y_m", number: ARM, default: 0.0, help: "the same, y, m" },
-            Shape { name: "arm_z_m", number: ARM, default: 0.0, help: "the same, z, m" },
+            Shape::new("arm_x_m", ARM, 0.0, "added to the arm, SRF x, m"),
+            Shape::new("arm_y_m", ARM, 0.0, "the same, y, m"),
+            Shape::new("arm_z_m", ARM, 0.0, "the same, z, m"),
         ],
         build: solar_pressure,
     },
@@ -31,13 +31,13 @@ pub(super) const KINDS: &[Kind] = &[
         help: "sc.x: a micrometeoroid's momentum; NAME.x: a glitch's; sc.phi: angular momentum (N m s) that each move of \
                the antenna takes at its start and gives back at its end",
         shape: &[
-            Shape { name: "at_s", number: SECONDS, default: 3600.0, help: "seconds after the first sample" },
-            Shape { name: "arm_x_m", number: ARM, default: 0.5, help: "sc.x: where it hits, SRF x, m" },
-            Shape { name: "arm_y_m", number: ARM, default: 0.5, help: "the same, y, m" },
-            Shape { name: "arm_z_m", number: ARM, default: 0.3, help: "the same, z, m" },
-            Shape { name: "rise_s", number: Number::new("s", 0.0, 1e5), default: 5.0, help: "NAME.x: rise, s" },
-            Shape { name: "decay_s", number: Number::new("s", 1e-3, 1e5), default: 60.0, help: "NAME.x: decay, s" },
-            Shape { name: "pulse_s", number: Number::new("s", 0.1, 1e4), default: 10.0, help: "sc.phi: its length, s" },
+            Shape::new("at_s", SECONDS, 3600.0, "seconds after the first sample"),
+            Shape::new("arm_x_m", ARM, 0.5, "sc.x: where it hits, SRF x, m"),
+            Shape::new("arm_y_m", ARM, 0.5, "the same, y, m"),
+            Shape::new("arm_z_m", ARM, 0.3, "the same, z, m"),
+            Shape::new("rise_s", Number::new("s", 0.0, 1e5), 5.0, "NAME.x: rise, s"),
+            Shape::new("decay_s", Number::new("s", 1e-3, 1e5), 60.0, "NAME.x: decay, s"),
+            Shape::new("pulse_s", Number::new("s", 0.1, 1e4), 10.0, "sc.phi: its length, s"),
         ],
         build: impulse,
     },
@@ -99,7 +99,7 @@ struct Hit {
 
 impl Cause for Hit {
     fn push(&mut self, now: &Moment<'_>, _rng: &mut Xoshiro256PlusPlus, loads: &mut Loads) {
-        // The sample whose interval holds the hit; times are multiples of the interval to rounding.
+        // The sample whose interval contains the hit; times are rounded multiples of the interval.
         let sample = |s: f64| (s / now.dt_s + 1e-6).floor();
         if sample(now.elapsed_s) == sample(self.at_s) {
             let force = self.momentum_n_s / now.dt_s;
@@ -120,7 +120,7 @@ struct Glitch {
 }
 
 impl Glitch {
-    /// The part of the momentum that has come after `t` seconds.
+    /// Fraction of the momentum delivered after `t` seconds.
     fn given(&self, t: f64) -> f64 {
         let (rise, decay) = (self.rise_s, self.decay_s);
         if t <= 0.0 {
@@ -143,7 +143,7 @@ impl Cause for Glitch {
     }
 }
 
-/// Each move of the antenna turns the spacecraft the other way, and back when it stops.
+/// Angular momentum that a move of the antenna takes at its start and returns at its end.
 struct Antenna {
     momentum_n_m_s: Vector3<f64>,
     pulse_s: f64,

@@ -1,4 +1,4 @@
-//! Instruments that show something else than what is.
+//! Readouts that differ from the true state.
 
 use dragfree_physics::attitude::{rotation_vector, turn};
 use dragfree_physics::few::Few;
@@ -42,7 +42,7 @@ pub(super) const KINDS: &[Kind] = &[
         places: test_masses,
         size: LEVER,
         help: "interferometer: x shows SIZE times the test mass's angle θ too",
-        shape: &[Shape { name: "psi_m_rad", number: LEVER, default: 0.0, help: "and this times its ψ, m/rad" }],
+        shape: &[Shape::new("psi_m_rad", LEVER, 0.0, "and this times its ψ, m/rad")],
         build: |request, _| {
             let Place::Tm(tm) = request.place else { unreachable!("instances are test masses") };
             Ok(Box::new(TiltToLength { tm, theta_m_rad: request.size, psi_m_rad: request.shape("psi_m_rad") }))
@@ -87,7 +87,7 @@ impl Cause for TiltToLength {
 /// Displacements and angles of the test masses, then the spacecraft's attitude.
 type Vectors = Few<Vector3<f64>, { 2 * MOST_TEST_MASSES + 1 }>;
 
-/// What there is to see, with its rates.
+/// True values and rates of all readouts.
 #[derive(Clone, Copy)]
 struct Shown {
     value: Vectors,
@@ -101,7 +101,7 @@ impl Shown {
         for (i, tm) in now.state.tm.iter().enumerate() {
             let housing = now.plant.tm[i].dcm_orf_from_srf * now.state.omega_srf_rad_s;
             (out.value[2 * i], out.rate[2 * i]) = (tm.r_orf_m, tm.v_orf_m_s);
-            // The rotation vector of a small angle turns as the body does.
+            // The rate of a small rotation vector is the angular rate.
             out.value[2 * i + 1] = rotation_vector(&tm.q_mrf_from_orf);
             out.rate[2 * i + 1] = tm.omega_mrf_rad_s - turn(&tm.q_mrf_from_orf, &housing);
         }
@@ -111,7 +111,7 @@ impl Shown {
         out
     }
 
-    /// Between `self` and `next`, `part` of the interval after `self`: the cubic that has their values and rates.
+    /// Cubic Hermite interpolation between `self` and `next`, at `part` of the interval after `self`.
     fn between(&self, next: &Self, part: f64, dt_s: f64) -> Vectors {
         let (s, rest) = (part, 1.0 - part);
         let (a, b) = (rest * rest * (1.0 + 2.0 * s), s * s * (3.0 - 2.0 * s));
@@ -123,7 +123,7 @@ impl Shown {
 
 struct TimeOffset {
     instrument: Instrument,
-    /// Whole samples and the part of one by which the readout is late.
+    /// Delay of the readout: whole samples, and a fraction of a sample.
     samples: usize,
     part: f64,
     /// The last samples, newest first.
@@ -144,7 +144,7 @@ impl Cause for TimeOffset {
         let shown = Shown::of(now);
         self.past.push_front(shown);
         self.past.truncate(self.samples + 2);
-        // While the loop settles there may be no past yet: the oldest sample is as good.
+        // The first epochs of the settling time use the oldest sample.
         let oldest = self.past.len() - 1;
         let (after, before) = (self.past[self.samples.min(oldest)], self.past[(self.samples + 1).min(oldest)]);
         let late = before.between(&after, 1.0 - self.part, now.dt_s);

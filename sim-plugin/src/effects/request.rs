@@ -1,83 +1,41 @@
-//! How an effect is asked for: `ID:INSTANCE=SIZE[,NAME=VALUE]...`.
+//! Syntax of an effect: `ID:INSTANCE=SIZE[,NAME=VALUE]...`.
 
 use dragfree_physics::mission::{ANGLES, AXES, MissionError};
 use std::fmt::{self, Display};
 
 use super::{Basis, Cause, catalogue};
 
-/// Why an effect cannot be had.
+/// Why an effect was refused.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum EffectError {
-    /// The text is of another form.
+    /// The text does not have the form of an effect.
     #[error("effect {0}: not of the form ID:INSTANCE=SIZE[,NAME=VALUE]..., as mps-gain:sc.y=0.02; there are {list}", list = list())]
     Form(String),
     /// No effect of that name.
     #[error("effect {text}: there is no effect {id}; there are {list}", list = list())]
-    Unknown {
-        /// What was requested.
-        text: String,
-        /// Its id.
-        id: String,
-    },
+    Unknown { text: String, id: String },
     /// The effect has no such instance.
     #[error("effect {text}: {id} has no instance {instance}; it has {has}.\n{id}: {about}")]
-    Instance {
-        /// What was requested.
-        text: String,
-        /// Id of the effect.
-        id: &'static str,
-        /// The instance.
-        instance: String,
-        /// The instances there are.
-        has: String,
-        /// What it is.
-        about: String,
-    },
+    Instance { text: String, id: &'static str, instance: String, has: String, about: String },
     /// The effect has no such shape parameter.
     #[error("effect {text}: {id} has no parameter {name}; it has {has}")]
-    Parameter {
-        /// What was requested.
-        text: String,
-        /// Id of the effect.
-        id: &'static str,
-        /// The name.
-        name: String,
-        /// The parameters there are.
-        has: String,
-    },
-    /// A number that is none, or has no physical sense.
+    Parameter { text: String, id: &'static str, name: String, has: String },
+    /// A value is not a number or out of range.
     #[error("effect {text}: {what} = {value} must be a number from {minimum:e} to {maximum:e} {unit}")]
-    Value {
-        /// What was requested.
-        text: String,
-        /// Size or parameter.
-        what: String,
-        /// As written.
-        value: String,
-        /// Smallest.
-        minimum: f64,
-        /// Largest.
-        maximum: f64,
-        /// SI unit.
-        unit: &'static str,
-    },
-    /// The mission lacks what the effect needs.
+    Value { text: String, what: String, value: String, minimum: f64, maximum: f64, unit: &'static str },
+    /// The mission lacks a section that the effect needs.
     #[error("effect {text}: {source}")]
-    Mission {
-        /// What was requested.
-        text: String,
-        /// What is missing.
-        source: MissionError,
-    },
+    Mission { text: String, source: MissionError },
 }
 
-/// Where an effect sits. Test masses count from 0 in the order of their names, axes and angles too: x, y, z and φ, θ,
+/// Instance of an effect. Test masses count from 0 in the order of their names, axes and angles too: x, y, z and φ, θ,
 /// ψ.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Place {
     /// `sc`, the spacecraft as a whole.
     Spacecraft,
-    /// `layout`, the thrusters where they sit.
+    /// `layout`, all thrusters.
     Layout,
     /// `NAME`, a test mass as a whole.
     Tm(usize),
@@ -93,9 +51,9 @@ pub enum Place {
     TmPair {
         /// Test mass.
         tm: usize,
-        /// Axis that drives.
+        /// Axis of the cause.
         from: usize,
-        /// Axis that answers.
+        /// Axis of the response.
         to: usize,
     },
 }
@@ -112,7 +70,7 @@ pub enum Instrument {
 }
 
 impl Place {
-    /// What it is called in a mission with these test masses.
+    /// Name of the instance in a mission with these test masses.
     #[must_use]
     pub fn name(self, test_masses: &[String]) -> String {
         match self {
@@ -159,12 +117,12 @@ pub(super) fn tm_pairs(count: usize, from: &[usize]) -> Vec<Place> {
     (0..count).flat_map(pairs).collect()
 }
 
-/// A number with its unit and the interval in which it has physical sense.
+/// Unit and physical range of a number.
 #[derive(Clone, Copy, Debug)]
 pub struct Number {
     /// SI unit; `1` for a ratio.
     pub unit: &'static str,
-    /// Smallest value with sense.
+    /// Smallest value.
     pub minimum: f64,
     /// Largest.
     pub maximum: f64,
@@ -177,9 +135,9 @@ pub struct Shape {
     pub name: &'static str,
     /// Unit and interval.
     pub number: Number,
-    /// Value unless given.
+    /// Default value.
     pub default: f64,
-    /// What it is.
+    /// Description.
     pub help: &'static str,
 }
 
@@ -190,15 +148,15 @@ pub type Built = Result<Box<dyn Cause>, MissionError>;
 pub struct Kind {
     /// Id.
     pub id: &'static str,
-    /// The instances, with so many test masses.
+    /// Instances for a number of test masses.
     pub places: fn(usize) -> Vec<Place>,
     /// Unit and interval of SIZE.
     pub size: Number,
-    /// What SIZE is and what a positive one does.
+    /// Meaning and sign of SIZE.
     pub help: &'static str,
     /// Shape parameters.
     pub shape: &'static [Shape],
-    /// Makes it.
+    /// Builds the effect.
     pub build: fn(&EffectRequest, &Basis<'_>) -> Built,
 }
 
@@ -211,11 +169,11 @@ impl fmt::Debug for Kind {
 /// An effect with its place, size and shape.
 #[derive(Clone, Debug)]
 pub struct EffectRequest {
-    /// What kind.
+    /// Kind of effect.
     pub kind: &'static Kind,
-    /// Where.
+    /// Instance.
     pub place: Place,
-    /// The same in words.
+    /// Name of the instance.
     pub instance: String,
     /// SIZE, in the kind's unit.
     pub size: f64,
@@ -235,7 +193,7 @@ impl EffectRequest {
     /// commanded along y acts along x.
     ///
     /// # Errors
-    /// [`EffectError`] names what is wrong and what there is.
+    /// [`EffectError`] names the error and the valid alternatives.
     pub fn parse(text: &str, test_masses: &[String]) -> Result<Self, EffectError> {
         let form = || EffectError::Form(text.to_owned());
         let mut parts = text.split(',').map(|part| part.split_once('='));
@@ -279,6 +237,12 @@ impl EffectRequest {
     }
 }
 
+impl Shape {
+    pub(super) const fn new(name: &'static str, number: Number, default: f64, help: &'static str) -> Self {
+        Self { name, number, default, help }
+    }
+}
+
 impl Number {
     pub(super) const fn new(unit: &'static str, minimum: f64, maximum: f64) -> Self {
         Self { unit, minimum, maximum }
@@ -307,7 +271,7 @@ impl Kind {
     }
 }
 
-/// Ids of everything there is; a message has no room for more.
+/// Ids of all effects, for messages.
 fn list() -> String {
     let ids: Vec<&str> = catalogue().map(|kind| kind.id).collect();
     format!("{}; ask one for what it is, as --effect {}:?=0", ids.join(", "), ids[0])

@@ -1,4 +1,4 @@
-//! Propellant that sloshes: a damped mode of a slug in its tank, driven by the spacecraft and pushing back on it.
+//! Propellant slosh: a damped mode of a slug in its tank, coupled to the spacecraft's translation.
 
 use nalgebra::{Matrix2, Vector2};
 use std::f64::consts::TAU;
@@ -13,13 +13,8 @@ pub(super) const KINDS: &[Kind] = &[Kind {
     size: Number::new("1", 0.0, 0.5),
     help: "propellant: this part of the spacecraft's mass swings along the axis",
     shape: &[
-        Shape {
-            name: "f0_hz",
-            number: Number::new("Hz", 1e-4, 1.0),
-            default: 0.03,
-            help: "frequency of the slug with the spacecraft held, Hz",
-        },
-        Shape { name: "zeta", number: Number::new("1", 0.0, 2.0), default: 0.02, help: "damping ratio" },
+        Shape::new("f0_hz", Number::new("Hz", 1e-4, 1.0), 0.03, "frequency of the slug with the spacecraft held, Hz"),
+        Shape::new("zeta", Number::new("1", 0.0, 2.0), 0.02, "damping ratio"),
     ],
     build,
 }];
@@ -28,12 +23,12 @@ pub(super) const KINDS: &[Kind] = &[Kind {
 ///
 /// `(m_S − m_f) a = F + κ`, `m_f (a + ẍ) = −κ`, `κ = m_f (ω0² x + 2ζω0 ẋ)`.
 ///
-/// The plant has `m_S a = F + F_s`, so the slug adds `F_s = −m_f ẍ`. Under a constant force the motion over a sample is
-/// exact, and so is the mean of `ẍ`, from the change of `ẋ`.
+/// The plant has `m_S a = F + F_s`, so the slug adds `F_s = −m_f ẍ`. The discretisation is exact for a constant force
+/// over a sample, as is the mean of `ẍ`, from the change of `ẋ`.
 struct Slosh {
     axis: usize,
     slug_kg: f64,
-    /// `exp(A dt)` of `(x, ẋ)`, and what a force of 1 N adds over a sample.
+    /// `exp(A dt)` of `(x, ẋ)`, and the response to a force of 1 N over a sample.
     transition: Matrix2<f64>,
     input: Vector2<f64>,
     dt_s: f64,
@@ -48,7 +43,7 @@ fn build(request: &EffectRequest, basis: &Basis<'_>) -> Built {
     let rest_kg = mass_kg * (1.0 - request.size);
     let raised = mass_kg / rest_kg;
     let rates = Matrix2::new(0.0, 1.0, -raised * omega * omega, -raised * 2.0 * zeta * omega);
-    // ∫ exp(A s) ds as a series: |A| dt < 1 keeps every digit, larger ones lose none that matter.
+    // ∫ exp(A s) ds by its power series.
     let (mut term, mut integral, mut transition) = (Matrix2::identity() * dt_s, Matrix2::zeros(), Matrix2::identity());
     for k in 1..40 {
         integral += term;

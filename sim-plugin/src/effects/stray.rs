@@ -1,4 +1,4 @@
-//! Stray forces on a test mass that follow what goes on inside the spacecraft: heat, magnetic field, charge, current.
+//! Stray forces on a test mass by the spacecraft's interior: temperature, magnetic field, charge, current.
 
 use nalgebra::{Matrix3, Vector3};
 use rand_xoshiro::Xoshiro256PlusPlus;
@@ -14,7 +14,7 @@ const DENSITY_KG_M3: f64 = 2.0e4;
 /// Capacitance of the test mass, F, and its derivative along the sensitive axis, F/m (LISA Pathfinder).
 const CAPACITANCE_F: f64 = 34.2e-12;
 const CAPACITANCE_GRADIENT_F_M: f64 = 291e-12;
-/// Levels about which the current and the temperature of the structure move.
+/// Mean current and mean temperature of the structure.
 const CURRENT_A: f64 = 2.1;
 const STRUCTURE_K: f64 = 296.5;
 
@@ -26,7 +26,7 @@ pub(super) const KINDS: &[Kind] = &[
         places: tm_axes,
         size: Number::new("m s-2 K-1", -1e-8, 1e-8),
         help: "SIZE times the temperature of the positive face of the housing minus that of the negative one, behind a lag",
-        shape: &[Shape { name: "lag_s", number: LAG, default: 480.0, help: "lag, s" }],
+        shape: &[Shape::new("lag_s", LAG, 480.0, "lag, s")],
         build: |request, _| Ok(Lagged::boxed(request, |inside, tm, axis| inside.across_k[tm][axis])),
     },
     Kind {
@@ -34,12 +34,7 @@ pub(super) const KINDS: &[Kind] = &[
         places: test_masses,
         size: Number::new("1", -1.0, 1.0),
         help: "SIZE is the susceptibility χ: χ/(μ0 ρ) (B·∇)B, and the remanent moment's ∇(m·B)/m",
-        shape: &[Shape {
-            name: "moment_a_m2",
-            number: Number::new("A m2", -1e-3, 1e-3),
-            default: 0.0,
-            help: "remanent moment along x, A m²",
-        }],
+        shape: &[Shape::new("moment_a_m2", Number::new("A m2", -1e-3, 1e-3), 0.0, "remanent moment along x, A m²")],
         build: |request, _| {
             let Place::Tm(tm) = request.place else { unreachable!("instances are test masses") };
             Ok(Box::new(Magnetic { tm, susceptibility: request.size, moment_a_m2: request.shape("moment_a_m2") }))
@@ -61,7 +56,7 @@ pub(super) const KINDS: &[Kind] = &[
         places: tm_axes,
         size: Number::new("m s-2 A-2", -1e-8, 1e-8),
         help: "SIZE times the square of the battery's current, behind a lag",
-        shape: &[Shape { name: "lag_s", number: LAG, default: 50.0, help: "lag, s" }],
+        shape: &[Shape::new("lag_s", LAG, 50.0, "lag, s")],
         build: |request, _| Ok(Lagged::boxed(request, |inside, _, _| inside.battery_a * inside.battery_a)),
     },
     Kind {
@@ -78,14 +73,14 @@ pub(super) const KINDS: &[Kind] = &[
     },
 ];
 
-/// A force that follows a number of the inside behind a first-order lag.
+/// A force proportional to a quantity of the interior behind a first-order lag.
 struct Lagged {
     tm: usize,
     axis: usize,
     size: f64,
     lag_s: f64,
     driver: fn(&Interior, usize, usize) -> f64,
-    /// The lagged driver; none before the first sample, which finds it settled.
+    /// The lagged quantity; the first sample starts it settled.
     value: Option<f64>,
 }
 

@@ -1,4 +1,4 @@
-//! Where the Earth is, from DE440 as it stands in `fixtures/ephemeris`.
+//! Position of the Earth, from the excerpt of DE440 in `fixtures/ephemeris`.
 
 use chrono::DateTime;
 use nalgebra::Vector3;

@@ -33,7 +33,7 @@ impl LeapSeconds {
     /// Reads the kernel's text.
     ///
     /// # Errors
-    /// [`LeapSecondError`] names the assignment that does not do.
+    /// [`LeapSecondError`] names the invalid assignment.
     pub fn new(text: &str) -> Result<Self, LeapSecondError> {
         let numbers = |key: &'static str, count: usize| -> Result<Vec<f64>, LeapSecondError> {
             let words = assignment(text, key).ok_or(LeapSecondError { key })?;
@@ -62,13 +62,13 @@ impl LeapSeconds {
         let unix_s = unix_ns.div_euclid(1_000_000_000);
         let entry = self.delta_at.partition_point(|(from, _)| *from <= unix_s).saturating_sub(1);
         let tt_minus_utc_s = self.delta_at[entry].1 + self.delta_t_a_s;
-        // The argument may be TT: M1 makes of 2 ms nothing that a float of E would show.
+        // TT in place of TDB: the difference of 2 ms times M1 is below the resolution of E.
         let mean_anomaly = self.m[0] + self.m[1] * (since_j2000_s(unix_ns) + tt_minus_utc_s);
         let eccentric_anomaly = mean_anomaly + self.eb * mean_anomaly.sin();
         tt_minus_utc_s + self.k_s * eccentric_anomaly.sin()
     }
 
-    /// TDB seconds past J2000; a float has 2.4e-7 s of grain here.
+    /// TDB seconds past J2000, with the resolution of a double.
     #[must_use]
     pub fn et_s(&self, unix_ns: i64) -> f64 {
         since_j2000_s(unix_ns) + self.tdb_minus_utc_s(unix_ns)
@@ -77,7 +77,7 @@ impl LeapSeconds {
 
 /// UTC seconds past J2000, leap seconds not counted.
 fn since_j2000_s(unix_ns: i64) -> f64 {
-    // Whole seconds and the rest apart: 1e18 ns are more than a float counts.
+    // Whole seconds separately: 1e18 ns exceed the integers of a double.
     let (whole_s, rest_ns) = (unix_ns.div_euclid(1_000_000_000), unix_ns.rem_euclid(1_000_000_000));
     (whole_s - J2000_UNIX_S) as f64 + rest_ns as f64 * 1e-9
 }

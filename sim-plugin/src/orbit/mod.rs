@@ -1,8 +1,7 @@
-//! Where the constellation is and how it turns: what CRF, the gravity gradient and the Sun's direction need.
+//! Position and rotation of the constellation, for CRF, the gravity gradient and the Sun's direction.
 //!
-//! Absolute positions serve nothing else: at one astronomical unit a float has 3e-5 m of grain. Of the arms that is
-//! 1e-14, so the frame's axes have 1e-14 rad of grain, `ω_CI` some 1e-21 rad/s and `ω̇_CI` some 1e-27 rad/s²: next to
-//! 2e-7 rad/s and 3e-14 rad/s², nothing.
+//! Absolute positions are used here only: at one astronomical unit a double resolves 3e-5 m, which is 1e-14 of an arm
+//! and negligible in the frame's axes and rates.
 
 mod crf;
 mod elements;
@@ -22,7 +21,8 @@ use spk::SpkError;
 
 pub use motion::State;
 
-/// Why there is no orbit.
+/// Why an orbit is not available.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Debug, thiserror::Error)]
 pub enum OrbitError {
     /// The mission's `[orbit]`.
@@ -34,21 +34,12 @@ pub enum OrbitError {
     /// The leap seconds.
     #[error(transparent)]
     LeapSeconds(#[from] LeapSecondError),
-    /// A time without planets.
+    /// A time outside the planetary ephemeris.
     #[error(
         "missing ephemeris span: {what} {when} UTC lies outside the ephemeris, DE440 from {first} to {last} TDB; \
          choose a time within it"
     )]
-    Span {
-        /// What the time is of.
-        what: &'static str,
-        /// The time, UTC.
-        when: String,
-        /// Start of the span, TDB.
-        first: String,
-        /// End of the span, TDB.
-        last: String,
-    },
+    Span { what: &'static str, when: String, first: String, last: String },
 }
 
 /// The surroundings of one spacecraft at one instant.
@@ -72,13 +63,13 @@ pub struct Environment {
     pub opening_rate_rad_s: f64,
 }
 
-/// Three spacecraft around the Sun, from the place of one of them.
+/// Orbits of three spacecraft, seen from one of them.
 #[derive(Clone, Debug)]
 pub struct Constellation {
     ephemeris: Ephemeris,
     epoch_ns: i64,
     motion: Motion,
-    /// Ours, and those at the far ends of its arms in cyclic order.
+    /// Index of our spacecraft, then of the other two in cyclic order.
     numbers: [usize; 3],
 }
 
@@ -157,7 +148,7 @@ impl Constellation {
     }
 }
 
-/// Gradient of a point mass' pull at `r` from it, `μ(3 r̂ r̂ᵀ − 1)/r³`, s⁻².
+/// Gravity gradient of a point mass at `r` from it, `μ(3 r̂ r̂ᵀ − 1)/r³`, s⁻².
 fn tide(r_m: &Vector3<f64>, mu_m3_s2: f64) -> Matrix3<f64> {
     let direction = r_m.normalize();
     (3.0 * direction * direction.transpose() - Matrix3::identity()) * (mu_m3_s2 / r_m.norm().powi(3))

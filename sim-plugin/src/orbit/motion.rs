@@ -1,8 +1,7 @@
 //! Motion of the three spacecraft under the Sun and the Earth (eq:a_g), heliocentric, on a fixed grid of nodes.
 //!
-//! The origin is the Sun, which the Earth pulls as well: next to the printed terms stands the indirect one,
-//! `−μ_e r_e/r_e³`. Forces but gravity are left out: what sunlight does to an orbit is what a drag-free controller
-//! takes away.
+//! The origin is the Sun, which the Earth accelerates too: the indirect term `−μ_e r_e/r_e³` is added to the printed
+//! ones. Other forces are omitted, because a drag-free controller compensates them.
 
 use nalgebra::Vector3;
 
@@ -14,7 +13,7 @@ pub(super) const MU_SUN_M3_S2: f64 = 1.327_124_400_412_794_2e20;
 /// Gravitational parameter of the Earth, m³ s⁻² (DE440).
 pub(super) const MU_EARTH_M3_S2: f64 = 3.986_004_355_070_226e14;
 
-/// Numbers of substeps that are extrapolated to none: order 10.
+/// Numbers of substeps of the extrapolation, of order 10.
 const SUBSTEPS: [u32; 5] = [1, 2, 3, 4, 5];
 /// Seconds between nodes.
 const NODE_S: f64 = 2.0 * 86_400.0;
@@ -42,7 +41,7 @@ struct SunAndEarth<'a> {
 impl Field for SunAndEarth<'_> {
     fn accelerations(&self, at_s: f64, r_irf_m: &[Vector3<f64>; 3]) -> Result<[Vector3<f64>; 3], OrbitError> {
         let (first_s, last_s) = self.ephemeris.span_s();
-        // A time that was checked may round across the span's edge.
+        // A checked time may round across the end of the span.
         let earth = self.ephemeris.earth_irf_m((self.epoch_et_s + at_s).clamp(first_s, last_s))?;
         Ok(r_irf_m.map(|r| gravity_irf_m_s2(&r, &earth)))
     }
@@ -104,7 +103,7 @@ fn nodes(field: &impl Field, start: [State; 3], step_s: f64, length_s: f64) -> R
 fn step(field: &impl Field, start: &[State; 3], at_s: f64, step_s: f64) -> Result<[State; 3], OrbitError> {
     let r0 = start.map(|s| s.r_irf_m);
     let first = field.accelerations(at_s, &r0)?;
-    // Row of Aitken–Neville's table: what gravity adds to v·h, and to v.
+    // Row of the Aitken–Neville table of deviations.
     let mut row: Vec<Bend> = Vec::with_capacity(SUBSTEPS.len());
     for (j, &n) in SUBSTEPS.iter().enumerate() {
         let mut next = vec![bend(field, start, &first, at_s, step_s, n)?];
@@ -121,7 +120,7 @@ fn step(field: &impl Field, start: &[State; 3], at_s: f64, step_s: f64) -> Resul
     }))
 }
 
-/// What gravity adds to straight motion. Kept apart from it, so that rounding is relative to the smaller of them.
+/// Deviation from straight motion by gravity, kept separately to reduce rounding.
 struct Bend {
     r_m: [Vector3<f64>; 3],
     v_m_s: [Vector3<f64>; 3],

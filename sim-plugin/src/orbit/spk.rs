@@ -1,7 +1,7 @@
 //! Positions from an SPK file (NAIF's "SPK Required Reading" and "DAF Required Reading"): little-endian, segments of
 //! type 2, Chebyshev polynomials of position in records of equal length.
 //!
-//! A file is checked whole when it is opened, so that a position can fail for one reason alone: no segment has it.
+//! A file is checked completely when it is opened; after that, a position fails only if no segment covers it.
 
 use nalgebra::Vector3;
 
@@ -18,47 +18,22 @@ const M_PER_KM: f64 = 1000.0;
 /// A light year, farther than any planet.
 const MOST_KM: f64 = 1e13;
 
-/// Why an SPK file was refused, or has no answer.
+/// Why an SPK file was refused, or does not cover a position.
+#[expect(missing_docs, reason = "the messages name the fields")]
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum SpkError {
     /// The first record is not an SPK's.
     #[error("not a little-endian SPK file: {what}; convert a transfer or big-endian file with NAIF's toxfr and bingo")]
-    NotSpk {
-        /// What is wrong.
-        what: String,
-    },
+    NotSpk { what: String },
     /// The file has a hole, ends early or contradicts itself.
     #[error("damaged SPK file: {what} at word {word}; fetch it again and compare its digest")]
-    Damaged {
-        /// What is wrong.
-        what: &'static str,
-        /// Where, words of 8 bytes from the start, from 1.
-        word: usize,
-    },
-    /// A segment is whole, but of a kind that is not read here.
+    Damaged { what: &'static str, word: usize },
+    /// A segment of an unsupported type.
     #[error("SPK file: the segment of {target} relative to {center} has {what} {found}; only {needed} is read")]
-    Unsupported {
-        /// NAIF's number of the body.
-        target: i32,
-        /// NAIF's number of the origin.
-        center: i32,
-        /// Property.
-        what: &'static str,
-        /// Its value.
-        found: i32,
-        /// What can be read.
-        needed: i32,
-    },
+    Unsupported { target: i32, center: i32, what: &'static str, found: i32, needed: i32 },
     /// No segment holds the body at that time.
     #[error("the SPK file has no position of {target} relative to {center} at {et_s} s TDB past J2000")]
-    NotCovered {
-        /// NAIF's number of the body.
-        target: i32,
-        /// NAIF's number of the origin.
-        center: i32,
-        /// When.
-        et_s: f64,
-    },
+    NotCovered { target: i32, center: i32, et_s: f64 },
 }
 
 /// One segment: records of `[middle, radius, x…, y…, z…]`.
