@@ -102,6 +102,17 @@ pub struct Found {
     drives_estimate: bool,
 }
 
+impl Found {
+    /// The same with the evidence of a ratio of likelihoods.
+    fn with_delta_chi2(self, delta_chi2: f64, fit: &Fit, scored: &Scored, trials: &Trials) -> Self {
+        let (dof, data) = (scored.candidate.parts.len() as f64, fit.estimate.quality.dof);
+        let (p_value, log10_p_value) = trials.p_value(family(&scored.candidate), delta_chi2, dof);
+        let delta_bic = dof * data.ln() - delta_chi2;
+        let chi2_per_dof_after = self.chi2_per_dof_before - delta_chi2 / data;
+        Self { delta_chi2, p_value, log10_p_value, delta_bic, chi2_per_dof_after, ..self }
+    }
+}
+
 /// The upper limit of a coefficient that is not detected.
 #[derive(Clone, Debug, Serialize)]
 pub struct Limit {
@@ -273,7 +284,9 @@ pub fn diagnose(
             }
         }
         if accepted.len() < settings.max_added {
-            for (f, candidate) in candidates_of_excess(scorer, &fit, &trials)? {
+            let mut by_likelihood = candidates_of_excess(scorer, &fit, &trials)?;
+            by_likelihood.extend(candidates_beside_levels(scorer, &fit, &trials)?);
+            for (f, candidate) in by_likelihood {
                 let of = |w: &(Found, Candidate)| (&w.0.effect, &w.0.instance) == (&f.effect, &f.instance);
                 match evaluated.iter().position(of) {
                     Some(i) if evaluated[i].0.log10_p_value <= f.log10_p_value => {}
@@ -392,12 +405,34 @@ fn candidates_of_excess(
         // n log 1/x is at most n (1/x − 1), the fall of χ² under the Σ that has not absorbed the excess.
         let ratio = (before - scorer.deviance(fit, &bands, &added)?).clamp(0.0, scored.delta_chi2.max(0.0));
         let delta_chi2 = ratio * kept;
-        let (p_value, log10_p_value) = trials.p_value(family(&scored.candidate), delta_chi2, dof);
-        let f = evaluate(scorer, &plain, scored, &ranked, trials);
-        let delta_bic = dof * fit.estimate.quality.dof.ln() - delta_chi2;
-        let chi2_per_dof_after = f.chi2_per_dof_before - delta_chi2 / fit.estimate.quality.dof;
-        let f = Found { delta_chi2, p_value, log10_p_value, delta_bic, chi2_per_dof_after, of_excess: true, ..f };
-        out.push((f, scored.candidate.clone()));
+        let f = evaluate(scorer, &plain, scored, &ranked, trials).with_delta_chi2(delta_chi2, fit, scored, trials);
+        out.push((Found { of_excess: true, ..f }, scored.candidate.clone()));
+    }
+    Ok(out)
+}
+
+/// Candidates that stand out under the declared levels of the noise, by the ratio of likelihoods with the levels fitted
+/// beside each: a level that was adopted before a gain in the loop has absorbed part of it.
+fn candidates_beside_levels(
+    scorer: &CandidateScorer<'_>,
+    fit: &Fit,
+    trials: &Trials,
+) -> Result<Vec<(Found, Candidate)>, DiagnosisError> {
+    let settings = scorer.settings;
+    let Some(declared) = scorer.with_declared_levels(fit) else { return Ok(Vec::new()) };
+    let mut ranked = scorer.rank(&declared).all;
+    sort_by_p_value(trials, &mut ranked);
+    let bands = scorer.excess_bands(fit);
+    let before = scorer.profile_deviance(&fit.added, &bands)?;
+    let mut out = Vec::new();
+    for scored in ranked.iter().filter(|s| s.in_range && !s.candidate.transient).take(settings.max_excess_candidates) {
+        let f = evaluate(scorer, &declared, scored, &ranked, trials);
+        if f.p_value >= settings.false_alarm {
+            break;
+        }
+        let added = [&fit.added[..], std::slice::from_ref(&scored.candidate)].concat();
+        let delta_chi2 = (before - scorer.profile_deviance(&added, &bands)?).max(0.0);
+        out.push((f.with_delta_chi2(delta_chi2, fit, scored, trials), scored.candidate.clone()));
     }
     Ok(out)
 }

@@ -258,12 +258,27 @@ impl<'a> CandidateScorer<'a> {
         if observations <= 0.0 {
             return None;
         }
-        let mut estimate = fit.estimate.clone();
-        estimate.inverses = levels.plain_inverses();
+        let plain = self.under(fit, levels.plain_inverses());
+        Some(WithoutExcess { plain, bands, observations })
+    }
+
+    /// The fit under the declared levels of the noise; none where the fit has adopted no other. A level that was fitted
+    /// before the candidates has absorbed part of what a gain in the loop does to the power of the noise.
+    #[must_use]
+    pub fn with_declared_levels(&self, fit: &Fit) -> Option<Fit> {
+        let measured = self.residual_psd(fit);
+        let mut levels = self.levels(fit, &self.total, &measured);
+        let declared = levels.inverses();
+        levels.fit();
+        (levels.inverses() != declared).then(|| self.under(fit, declared))
+    }
+
+    /// The same solution with other Σ⁻¹ in the scores.
+    fn under(&self, fit: &Fit, inverses: Vec<DMatrix<f64>>) -> Fit {
+        let estimate = Estimate { inverses, ..fit.estimate.clone() };
         let mut solved = Solved { layout: fit.layout.clone(), columns: fit.columns.clone(), estimate };
         solved.estimate.known += self.scores(&self.total, &solved).normal - &fit.scores.normal;
-        let plain = self.scored(fit.added.clone(), solved);
-        Some(WithoutExcess { plain, bands, observations })
+        self.scored(fit.added.clone(), solved)
     }
 
     /// `−2 log` of the likelihood of the model with `added`, up to a constant of the data. In `bands` the noise absorbs
@@ -285,12 +300,12 @@ impl<'a> CandidateScorer<'a> {
         Ok(least)
     }
 
-    /// `−2 log` of the likelihood of the model with `added`, up to a constant of the data, with fitted levels of the
-    /// noise and with the noise that `added` filter.
+    /// `−2 log` of the likelihood of the model with `added`, up to a constant of the data, with levels of the noise
+    /// fitted beside it and with the noise that `added` filter. In `bands` the noise absorbs the excess that is left.
     ///
     /// # Errors
     /// As [`Self::fit`].
-    fn likelihood(&self, added: &[Candidate]) -> Result<f64, EstimateError> {
+    pub fn profile_deviance(&self, added: &[Candidate], bands: &[bool]) -> Result<f64, EstimateError> {
         let Solved { layout, columns, estimate } = self.solve(added, REFINEMENTS)?;
         let measured = Self::residual(&self.total, &layout, &columns, &estimate.theta);
         let unknowns = self.candidate_set.unknowns(added);
@@ -298,7 +313,7 @@ impl<'a> CandidateScorer<'a> {
         let levels = Levels::new(self.noise, &self.plan, &self.total.weights, &measured, self.settings);
         let mut levels = levels.coloured(&self.plan, &colours);
         levels.fit();
-        Ok(levels.deviance(&measured, &vec![false; self.plan.bands.len()]))
+        Ok(levels.deviance(&measured, bands))
     }
 
     /// The form of highest likelihood of a candidate that filters a noise process, which scores do not account for: a
@@ -324,11 +339,12 @@ impl<'a> CandidateScorer<'a> {
         summits.sort_by(|a, b| scores[*b].total_cmp(&scores[*a]));
         summits.truncate(self.settings.likelihood_starts);
         let mut known: BTreeMap<usize, f64> = BTreeMap::new();
+        let bands = vec![false; self.plan.bands.len()];
         let mut likelihood = |i: usize| -> Result<f64, EstimateError> {
             if let Some(value) = known.get(&i) {
                 return Ok(*value);
             }
-            let value = self.likelihood(&[&fit.added[..], std::slice::from_ref(&forms[i])].concat())?;
+            let value = self.profile_deviance(&[&fit.added[..], std::slice::from_ref(&forms[i])].concat(), &bands)?;
             known.insert(i, value);
             Ok(value)
         };
@@ -425,6 +441,15 @@ impl<'a> CandidateScorer<'a> {
         let delta_chi2 = 2.0 * score.dot(&value) - value.dot(&(&information * &value));
         let shift = &scores.covariance * with_model.transpose() * &value;
         Some(Scored { candidate, value, in_range, delta_chi2, information, understated: 1.0, left, shift })
+    }
+
+    /// Bands in which the noise absorbs an excess beside a fit.
+    #[must_use]
+    pub fn excess_bands(&self, fit: &Fit) -> Vec<bool> {
+        let measured = self.residual_psd(fit);
+        let mut levels = self.levels(fit, &self.total, &measured);
+        levels.fit();
+        levels.excess_bands().0
     }
 
     /// The part of a candidate's information under the given `Σ⁻¹` that comes from `bands`.
