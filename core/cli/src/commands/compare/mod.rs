@@ -2,7 +2,7 @@
 
 mod page;
 
-use super::{Done, replay};
+use super::{Done, INCONSISTENT, replay};
 use crate::args::{Compare, Global};
 use crate::failure::Failure;
 use crate::text::{Paint, columns, labelled};
@@ -10,9 +10,6 @@ use dragfree_identification::coherence::{Coherence, StepwiseCoherence};
 use dragfree_identification::compare::{Channel, Comparison, Innovations, Kind, Test};
 use dragfree_workflow::compare::compare;
 use std::path::Path;
-
-/// Exit code where the model contradicts the data.
-const INCONSISTENT: u8 = 4;
 
 /// Housekeeping channels that the screen names.
 const NAMED: usize = 5;
