@@ -29,6 +29,29 @@ pub fn of_pipeline(folder: &Path, pipeline: &Path) -> Command {
     command
 }
 
+/// `dragfree diagnose` of a product of the archive `archive` in `folder`, as JSON.
+///
+/// # Panics
+/// It fails, the exit code does not tell its verdict, or it calls a model sufficient beside a candidate beyond the
+/// corrected bound.
+#[must_use]
+pub fn diagnose(folder: &Path, product: &Value) -> Value {
+    let id = product["id"].as_str().expect("an id");
+    let output = dragfree(folder).args(["diagnose", id, "--archive", "archive", "--json", "-q"]).output();
+    let output = output.expect("the program runs");
+    let d: Value = serde_json::from_slice(&output.stdout)
+        .unwrap_or_else(|e| panic!("{e}: {}", String::from_utf8_lossy(&output.stderr)));
+    let sufficient = d["verdict"] == "sufficient";
+    assert_eq!(output.status.code(), Some(if sufficient { 0 } else { 4 }), "{}", d["verdict"]);
+    let all = d["candidates"].as_array().expect("candidates");
+    let bound = d["false_alarm_rate"].as_f64();
+    for c in all.iter().filter(|c| c["p_value"].as_f64() < bound && c["accepted"] == false) {
+        assert!(!sufficient && c["refused"].is_string(), "{c:#}");
+    }
+    assert!(!(sufficient && product["verdict"] == "disagree"), "{d:#}");
+    d
+}
+
 /// The bundled mission with changed texts, in `folder`.
 ///
 /// # Panics

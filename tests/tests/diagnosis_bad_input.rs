@@ -1,8 +1,8 @@
 //! Unusable housekeeping and candidates: each is reported, and the rest of the diagnosis is unaffected.
 
-use dragfree_tests::calibration::science_mode;
+use dragfree_tests::calibration::{diagnose, science_mode};
 use dragfree_tests::recording::Recording;
-use dragfree_tests::{dragfree, json, simulate};
+use dragfree_tests::simulate;
 use serde_json::Value;
 use std::path::Path;
 
@@ -17,8 +17,7 @@ fn diagnosed(folder: &Path, telemetry: &Path, model: Option<&Path>) -> Value {
         run.arg("--model").arg(model);
     }
     let product: Value = serde_json::from_slice(&run.output().expect("runs").stdout).expect("a product as JSON");
-    let id = product["id"].as_str().expect("an id");
-    json(dragfree(folder).args(["diagnose", id, "--archive", "archive", "--json", "-q"]), 0)
+    diagnose(folder, &product)
 }
 
 /// One channel has a gap of an hour, another is stuck, a third has every sixth packet. The gap is reported, the stuck

@@ -1,6 +1,7 @@
 //! Telemetry of another producer runs with a mission file alone: other controllers, other noise, offsets a few
 //! millimetres off the nominal, housekeeping never seen before, with and without `/command`.
 
+use dragfree_tests::calibration::diagnose;
 use dragfree_tests::foreign::{Container, Flight, HEAT_LAG_S, Hidden, Loops, Record, fly, write};
 use dragfree_tests::{coefficient, dragfree, fixture};
 use serde_json::Value;
@@ -206,10 +207,7 @@ fn diagnosed(hidden: Hidden) -> Value {
     let run = run.expect("the program runs");
     let product: Value =
         serde_json::from_slice(&run.stdout).unwrap_or_else(|_| panic!("{}", String::from_utf8_lossy(&run.stderr)));
-    let id = product["id"].as_str().expect("an id");
-    let output = dragfree(dir.path()).args(["diagnose", id, "--archive", "archive", "--json", "-q"]).output();
-    let output = output.expect("the program runs");
-    serde_json::from_slice(&output.stdout).unwrap_or_else(|_| panic!("{}", String::from_utf8_lossy(&output.stderr)))
+    diagnose(dir.path(), &product)
 }
 
 /// Name of the single accepted candidate, and the error of its only coefficient in σ.

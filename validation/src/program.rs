@@ -165,7 +165,7 @@ impl Program {
         let mut command = self.command();
         let id = product["id"].as_str().ok_or_else(|| missing(&command, "id"))?;
         command.arg("diagnose").arg(id).arg("--archive").arg(archive).arg("--json");
-        json(&mut command, &[0])
+        json(&mut command, &[0, 4])
     }
 
     /// Runs `dragfree reveal`, which scores a diagnosis against the sealed truth.

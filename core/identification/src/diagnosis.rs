@@ -94,12 +94,30 @@ pub struct Found {
     pub confounders: Vec<String>,
     /// Whether it is part of the answer.
     pub accepted: bool,
+    /// Why it is no part of the answer although its p-value is below the false-alarm rate.
+    pub refused: Option<String>,
     /// Whether it was selected by the likelihood ratio over an excess of power.
     #[serde(skip)]
     of_excess: bool,
     /// Whether it is a level of noise that drives an estimate which enters the channels.
     #[serde(skip)]
     drives_estimate: bool,
+}
+
+impl Found {
+    fn level(&self) -> OtherLevel {
+        let (effect, instance) = (self.effect.clone(), self.instance.clone());
+        OtherLevel { effect, instance, value: self.value, sigma: self.sigma }
+    }
+
+    /// The same with the evidence of a ratio of likelihoods.
+    fn with_delta_chi2(self, delta_chi2: f64, fit: &Fit, scored: &Scored, trials: &Trials) -> Self {
+        let (dof, data) = (scored.candidate.parts.len() as f64, fit.estimate.quality.dof);
+        let (p_value, log10_p_value) = trials.p_value(family(&scored.candidate), delta_chi2, dof);
+        let delta_bic = dof * data.ln() - delta_chi2;
+        let chi2_per_dof_after = self.chi2_per_dof_before - delta_chi2 / data;
+        Self { delta_chi2, p_value, log10_p_value, delta_bic, chi2_per_dof_after, ..self }
+    }
 }
 
 /// The upper limit of a coefficient that is not detected.
@@ -141,6 +159,19 @@ pub struct Unexplained {
     pub coherences: Vec<Coherence>,
 }
 
+/// A level of noise other than declared.
+#[derive(Clone, Debug, Serialize)]
+pub struct OtherLevel {
+    /// Effect that would state it.
+    pub effect: String,
+    /// Instance.
+    pub instance: String,
+    /// Amplitude over the declared one.
+    pub value: f64,
+    /// σ of it.
+    pub sigma: f64,
+}
+
 /// The answer.
 #[derive(Clone, Debug, Serialize)]
 pub struct Diagnosis {
@@ -156,6 +187,10 @@ pub struct Diagnosis {
     pub upper_limits: Vec<Limit>,
     /// Evidence that no candidate explains.
     pub unexplained: Option<Unexplained>,
+    /// Why the model is not called sufficient although neither a candidate was accepted nor an excess was found.
+    pub reasons: Vec<String>,
+    /// Levels of noise other than declared, certain, and within the tolerance of a mission file.
+    pub levels: Vec<OtherLevel>,
     /// Transients that were detected.
     pub transients: Vec<Value>,
     /// What could not be tried, and why.
@@ -273,7 +308,9 @@ pub fn diagnose(
             }
         }
         if accepted.len() < settings.max_added {
-            for (f, candidate) in candidates_of_excess(scorer, &fit, &trials)? {
+            let mut by_likelihood = candidates_of_excess(scorer, &fit, &trials)?;
+            by_likelihood.extend(candidates_beside_levels(scorer, &fit, &trials)?);
+            for (f, candidate) in by_likelihood {
                 let of = |w: &(Found, Candidate)| (&w.0.effect, &w.0.instance) == (&f.effect, &f.instance);
                 match evaluated.iter().position(of) {
                     Some(i) if evaluated[i].0.log10_p_value <= f.log10_p_value => {}
@@ -283,9 +320,11 @@ pub fn diagnose(
             }
             evaluated.sort_by(|a, b| a.0.log10_p_value.total_cmp(&b.0.log10_p_value));
         }
-        let helps = |f: &Found| f.held_out_p_value.is_none_or(|p| p > settings.halves_p_value);
-        let good = |(f, _): &(Found, Candidate)| f.p_value < settings.false_alarm && f.in_range && helps(f);
-        let Some(best) = evaluated.iter().position(good).filter(|_| accepted.len() < settings.max_added) else {
+        for (f, _) in &mut evaluated {
+            f.refused = refusal(settings, f, accepted.len());
+        }
+        let good = |(f, _): &(Found, Candidate)| f.p_value < settings.false_alarm && f.refused.is_none();
+        let Some(best) = evaluated.iter().position(good) else {
             break evaluated.into_iter().map(|(f, _)| f).collect();
         };
         let mut added = fit.added.clone();
@@ -309,20 +348,24 @@ pub fn diagnose(
         let extra = noise_levels(scorer, &fit, &mut levels, &trials);
         let unexplained = unexplained(scorer, &levels);
         let ((excess, _), plain) = (levels.excess_bands(), levels.plain_inverses());
-        let mut both = accepted.iter().zip(&fit.added);
+        let both = accepted.iter().zip(&fit.added);
         let part = |candidate: &Candidate| scorer.part_in(&fit, &plain, candidate, &excess);
         // A small remainder of the largest excess is what the grid of forms cannot represent.
         let loud = unexplained.as_ref().filter(|u| !u.power || u.ratio > settings.excess_remainder * loudest);
-        let Some(doubtful) = both.position(|(f, c)| is_doubtful(settings, f, part(c), &extra, loud)) else {
+        let doubt = |(i, (f, c)): (usize, (&Found, &Candidate))| Some((i, doubt(settings, f, part(c), &extra, loud)?));
+        let Some((doubtful, refused)) = both.enumerate().find_map(doubt) else {
             break (extra, unexplained);
         };
-        others.insert(0, Found { accepted: false, ..accepted.remove(doubtful) });
+        others.insert(0, Found { accepted: false, refused: Some(refused), ..accepted.remove(doubtful) });
         let mut added = fit.added.clone();
         added.remove(doubtful);
         fit = scorer.fit(&added)?;
         ranked = scorer.rank(&fit).all;
         estimate_again(scorer, &fit, &mut accepted);
     };
+    let tolerated = |f: &Found| f.p_value < settings.false_alarm && !f.accepted && f.refused.is_none();
+    let levels = extra.iter().filter(|f| tolerated(f)).map(Found::level).collect();
+    extra.retain(|f| !tolerated(f));
     // Noise levels stand behind the accepted effects and before the rest.
     extra.sort_by(|a, b| b.accepted.cmp(&a.accepted).then(a.log10_p_value.total_cmp(&b.log10_p_value)));
     let louder: Vec<Found> = extra.iter().filter(|f| f.accepted).cloned().collect();
@@ -332,10 +375,15 @@ pub fn diagnose(
     candidates.extend(others);
     candidates.extend(extra.into_iter().filter(|f| !f.accepted));
 
-    let verdict = match (missing, &unexplained) {
+    let refused = |f: &Found| {
+        let reason = f.refused.as_ref()?;
+        Some(format!("{}:{} would lower χ² by {:.0}, and is refused: {reason}", f.effect, f.instance, f.delta_chi2))
+    };
+    let reasons: Vec<String> = if missing { Vec::new() } else { candidates.iter().filter_map(refused).collect() };
+    let verdict = match (missing, unexplained.is_some() || !reasons.is_empty()) {
         (true, _) => "missing",
-        (false, Some(_)) => "unexplained",
-        (false, None) => "sufficient",
+        (false, true) => "unexplained",
+        (false, false) => "sufficient",
     };
     // The shape beside all accepted effects is better than the one beside the model alone.
     for request in &mut requests {
@@ -350,6 +398,8 @@ pub fn diagnose(
         candidates,
         upper_limits,
         unexplained,
+        reasons,
+        levels,
         transients: transients(scorer),
         refinement_requests: requests,
         forms,
@@ -392,29 +442,77 @@ fn candidates_of_excess(
         // n log 1/x is at most n (1/x − 1), the fall of χ² under the Σ that has not absorbed the excess.
         let ratio = (before - scorer.deviance(fit, &bands, &added)?).clamp(0.0, scored.delta_chi2.max(0.0));
         let delta_chi2 = ratio * kept;
-        let (p_value, log10_p_value) = trials.p_value(family(&scored.candidate), delta_chi2, dof);
-        let f = evaluate(scorer, &plain, scored, &ranked, trials);
-        let delta_bic = dof * fit.estimate.quality.dof.ln() - delta_chi2;
-        let chi2_per_dof_after = f.chi2_per_dof_before - delta_chi2 / fit.estimate.quality.dof;
-        let f = Found { delta_chi2, p_value, log10_p_value, delta_bic, chi2_per_dof_after, of_excess: true, ..f };
-        out.push((f, scored.candidate.clone()));
+        let f = evaluate(scorer, &plain, scored, &ranked, trials).with_delta_chi2(delta_chi2, fit, scored, trials);
+        out.push((Found { of_excess: true, ..f }, scored.candidate.clone()));
     }
     Ok(out)
 }
 
-/// Whether an accepted effect contradicts the rest of the answer.
+/// Candidates that stand out under the declared levels of the noise, by the ratio of likelihoods with the levels fitted
+/// beside each: a level that was adopted before a gain in the loop has absorbed part of it.
+fn candidates_beside_levels(
+    scorer: &CandidateScorer<'_>,
+    fit: &Fit,
+    trials: &Trials,
+) -> Result<Vec<(Found, Candidate)>, DiagnosisError> {
+    let settings = scorer.settings;
+    let Some(declared) = scorer.with_declared_levels(fit) else { return Ok(Vec::new()) };
+    let mut ranked = scorer.rank(&declared).all;
+    sort_by_p_value(trials, &mut ranked);
+    let bands = scorer.excess_bands(fit);
+    let before = scorer.profile_deviance(&fit.added, &bands)?;
+    let mut out = Vec::new();
+    for scored in ranked.iter().filter(|s| s.in_range && !s.candidate.transient).take(settings.max_excess_candidates) {
+        let f = evaluate(scorer, &declared, scored, &ranked, trials);
+        if f.p_value >= settings.false_alarm {
+            break;
+        }
+        let added = [&fit.added[..], std::slice::from_ref(&scored.candidate)].concat();
+        let delta_chi2 = (before - scorer.profile_deviance(&added, &bands)?).max(0.0);
+        out.push((f.with_delta_chi2(delta_chi2, fit, scored, trials), scored.candidate.clone()));
+    }
+    Ok(out)
+}
+
+/// Why a candidate beyond the corrected bound is not accepted beside `accepted` others.
+fn refusal(settings: &Settings, f: &Found, accepted: usize) -> Option<String> {
+    if f.p_value >= settings.false_alarm {
+        None
+    } else if !f.in_range {
+        Some("its best value lies outside its physical range".to_owned())
+    } else if let Some(p) = f.held_out_p_value.filter(|p| *p <= settings.halves_p_value) {
+        Some(format!("the two halves of the data give different values (p = {p:.1e}), and a lasting cause is constant"))
+    } else if accepted >= settings.max_added {
+        Some(format!("{accepted} effects are accepted before it, as many as the settings allow"))
+    } else {
+        None
+    }
+}
+
+/// Why an accepted effect contradicts the rest of the answer.
 ///
 /// - It was selected by an excess of power, or has `part` > ½ of its information in the bands of one, and an excess or
 ///   a coherence with
 ///   housekeeping remains in its channels: it correlates with the cause and is not the cause.
 /// - It moves the offset, and its fall of χ² is below [`Settings::level_trace`] of that of a level of noise that drives
 ///   an estimate (see there). It should be tried again with that level in the model.
-fn is_doubtful(settings: &Settings, f: &Found, part: f64, extra: &[Found], unexplained: Option<&Unexplained>) -> bool {
+fn doubt(
+    settings: &Settings,
+    f: &Found,
+    part: f64,
+    extra: &[Found],
+    unexplained: Option<&Unexplained>,
+) -> Option<String> {
     // For an effect selected by an excess, a remaining coherence is as much evidence as remaining power.
-    let remains = |u: &Unexplained| (u.power || f.of_excess) && f.channels.iter().any(|c| u.channels.contains(c));
-    let louder = |e: &Found| e.accepted && e.drives_estimate && f.delta_chi2 < settings.level_trace * e.delta_chi2;
+    let remains = |u: &&Unexplained| (u.power || f.of_excess) && f.channels.iter().any(|c| u.channels.contains(c));
+    let louder = |e: &&Found| e.accepted && e.drives_estimate && f.delta_chi2 < settings.level_trace * e.delta_chi2;
     let moves = f.offset_shift_sigma.values().any(|sigmas| sigmas.abs() > settings.moves_offset_sigmas);
-    (f.of_excess || part > 0.5) && unexplained.is_some_and(remains) || moves && extra.iter().any(louder)
+    if let Some(u) = unexplained.filter(|_| f.of_excess || part > 0.5).filter(remains) {
+        return Some(format!("with it {} still show what no effect explains", u.channels.join(", ")));
+    }
+    let level = extra.iter().find(louder).filter(|_| moves)?;
+    let (effect, instance) = (&level.effect, &level.instance);
+    Some(format!("it may be a trace of {effect}:{instance}; add that to the model and diagnose again"))
 }
 
 /// Sorts by corrected p-value, the smallest first.
@@ -500,6 +598,7 @@ fn evaluate(scorer: &CandidateScorer<'_>, fit: &Fit, scored: &Scored, ranked: &[
         channels,
         confounders: scorer.confounders(fit, scored, ranked),
         accepted: false,
+        refused: None,
         of_excess: false,
         drives_estimate: false,
     }
@@ -600,6 +699,9 @@ fn noise_levels(scorer: &CandidateScorer<'_>, fit: &Fit, levels: &mut Levels<'_>
                 .collect(),
             confounders: Vec::new(),
             accepted: matters,
+            refused: (p_value < settings.false_alarm && !steady).then(|| {
+                format!("the two halves of the data have different levels (p = {:.1e})", differ.unwrap_or(0.0))
+            }),
             of_excess: false,
             drives_estimate: scorer.noise.is_estimated(&c.noise),
         });
@@ -743,6 +845,7 @@ mod tests {
             channels: channels.iter().map(|c| (*c).to_owned()).collect(),
             confounders: Vec::new(),
             accepted,
+            refused: None,
             of_excess: false,
             drives_estimate: false,
         }
@@ -767,20 +870,24 @@ mod tests {
             (0.9, Some(excess("tm1.accel.x", false)), false),
             (0.9, None, false),
         ] {
-            assert_eq!(is_doubtful(&Settings::default(), &slow, part, &[], left.as_ref()), doubtful, "{part} {left:?}");
+            assert_eq!(
+                doubt(&Settings::default(), &slow, part, &[], left.as_ref()).is_some(),
+                doubtful,
+                "{part} {left:?}"
+            );
         }
         let of_excess = Found { of_excess: true, ..found(&["tm1.accel.x"], 0.0, true) };
-        assert!(is_doubtful(&Settings::default(), &of_excess, 0.1, &[], Some(&excess("tm1.accel.x", true))));
-        assert!(is_doubtful(&Settings::default(), &of_excess, 0.1, &[], Some(&excess("tm1.accel.x", false))));
-        assert!(!is_doubtful(&Settings::default(), &of_excess, 0.1, &[], Some(&excess("tm2.accel.z", true))));
-        assert!(!is_doubtful(&Settings::default(), &of_excess, 0.1, &[], None));
+        assert!(doubt(&Settings::default(), &of_excess, 0.1, &[], Some(&excess("tm1.accel.x", true))).is_some());
+        assert!(doubt(&Settings::default(), &of_excess, 0.1, &[], Some(&excess("tm1.accel.x", false))).is_some());
+        assert!(doubt(&Settings::default(), &of_excess, 0.1, &[], Some(&excess("tm2.accel.z", true))).is_none());
+        assert!(doubt(&Settings::default(), &of_excess, 0.1, &[], None).is_none());
         let (gain, still) = (found(&["tm1.accel.y"], 12.0, true), found(&["tm1.accel.y"], 1.0, true));
         let level = |drives_estimate, accepted, times: f64| {
             let delta_chi2 = times * gain.delta_chi2;
             [Found { delta_chi2, drives_estimate, ..found(&["sc.alpha.z"], 0.0, accepted) }]
         };
         let torque = level(true, true, 100.0);
-        let doubtful = |f: &Found, extra: &[Found]| is_doubtful(&Settings::default(), f, 0.0, extra, None);
+        let doubtful = |f: &Found, extra: &[Found]| doubt(&Settings::default(), f, 0.0, extra, None).is_some();
         assert!(doubtful(&gain, &torque) && !doubtful(&still, &torque));
         // A cause with a tenth of the level's χ² is no trace of it.
         assert!(!doubtful(&gain, &level(true, true, 10.0)));

@@ -96,6 +96,16 @@ pub struct Halves {
     pub difference_chi2: f64,
 }
 
+/// A candidate beside the model in some of the data.
+struct Beside {
+    score: DVector<f64>,
+    information: DMatrix<f64>,
+    /// `N_pq`.
+    with_model: DMatrix<f64>,
+    /// Part of its information that the model leaves.
+    left: f64,
+}
+
 /// Scores candidates from the sums.
 pub struct CandidateScorer<'a> {
     /// Model and candidates.
@@ -118,9 +128,11 @@ struct Scores {
     residual: DMatrix<f64>,
     /// The same of the model's regressors, per free coefficient.
     model: Vec<DMatrix<f64>>,
+    /// `N_qq` of the free coefficients, from these data alone.
+    normal: DMatrix<f64>,
     /// `N_qq⁻¹` with what surveys and ranges know.
     covariance: DMatrix<f64>,
-    /// Score of the free coefficients that stand at the end of a range.
+    /// Score of the free coefficients: of those at the end of a range, and in a half of the data of all.
     bound_score: DVector<f64>,
     /// Per band, `Σ⁻¹` times the weight that turns sums into information.
     weights: Vec<DMatrix<f64>>,
@@ -152,11 +164,7 @@ impl<'a> CandidateScorer<'a> {
     /// # Errors
     /// As [`estimate_with`].
     pub fn fit(&self, added: &[Candidate]) -> Result<Fit, EstimateError> {
-        let Solved { layout, columns, estimate } = self.solve(added, REFINEMENTS)?;
-        let [first, second] = &self.gathered.sets;
-        let of = |gram: &Gram| self.scores(gram, &estimate, &layout, &columns);
-        let (scores, halves) = (of(&self.total), [of(first), of(second)]);
-        Ok(Fit { added: added.to_vec(), estimate, layout, columns, scores, halves })
+        Ok(self.scored(added.to_vec(), self.solve(added, REFINEMENTS)?))
     }
 
     fn solve(&self, added: &[Candidate], refinements: usize) -> Result<Solved, EstimateError> {
@@ -171,12 +179,35 @@ impl<'a> CandidateScorer<'a> {
         Ok(Solved { layout, columns, estimate })
     }
 
-    fn scores(&self, gram: &Gram, estimate: &Estimate, layout: &Layout, columns: &[usize]) -> Scores {
+    fn scored(&self, added: Vec<Candidate>, solved: Solved) -> Fit {
+        let mut scores = self.scores(&self.total, &solved);
+        let halves = self.gathered.sets.each_ref().map(|half| self.scores_of_half(half, &scores, &solved));
+        let Solved { layout, columns, estimate } = solved;
+        scores.covariance = estimate.known.clone().try_inverse().unwrap_or(scores.covariance);
+        scores.bound_score = estimate.bound_score.clone();
+        Fit { added, estimate, layout, columns, scores, halves }
+    }
+
+    /// The scores of one of two halves of the data. Surveys and ranges know as much of each half; they and the data
+    /// balance in the total, not in a half, so each half has a score of the model's own coefficients.
+    fn scores_of_half(&self, half: &Gram, total: &Scores, solved: &Solved) -> Scores {
+        let mut scores = self.scores(half, solved);
+        let knowledge = (&solved.estimate.known - &total.normal) * 0.5;
+        let free = solved.estimate.free.len();
+        scores.covariance = (&scores.normal + knowledge).try_inverse().unwrap_or_else(|| DMatrix::zeros(free, free));
+        scores.bound_score -= (&total.bound_score - &solved.estimate.bound_score) * 0.5;
+        scores
+    }
+
+    /// Inner products of some of the data with the residuals of the solution, every band weighted by its own time.
+    /// Neither surveys nor ranges enter `covariance` and `bound_score` here.
+    fn scores(&self, gram: &Gram, solved: &Solved) -> Scores {
+        let Solved { layout, columns, estimate } = solved;
         let n = self.gathered.columns.names.len();
         let channels = self.candidate_set.channels.len();
         let theta = &estimate.theta;
         let linear = layout.linear_at(theta.as_slice());
-        let kept = self.total.weights.equal_time_weights();
+        let kept = gram.weights.equal_time_weights();
         let weights: Vec<DMatrix<f64>> = estimate.inverses.iter().zip(&kept).map(|(w, k)| w * *k).collect();
         let mut residual = DMatrix::zeros(n, channels);
         let free = &estimate.free;
@@ -197,9 +228,15 @@ impl<'a> CandidateScorer<'a> {
                 model[k].rows_mut(0, m).ger(r.factor, &g.column(column), &w.row(r.channel).transpose(), 1.0);
             }
         }
-        let covariance =
-            estimate.known.clone().cholesky().map_or_else(|| DMatrix::zeros(free.len(), free.len()), |c| c.inverse());
-        Scores { residual, model, covariance, bound_score: estimate.bound_score.clone(), weights, theta: theta.clone() }
+        let (mut normal, mut score) = (DMatrix::zeros(free.len(), free.len()), DVector::zeros(free.len()));
+        for r in &linear.regressors {
+            let at = (columns[channels + r.series], r.channel);
+            let Some(k) = free.iter().position(|f| *f == r.coefficient) else { continue };
+            score[k] += r.factor * residual[at];
+            model.iter().enumerate().for_each(|(l, with)| normal[(k, l)] += r.factor * with[at]);
+        }
+        let covariance = DMatrix::zeros(free.len(), free.len());
+        Scores { residual, model, normal, covariance, bound_score: score, weights, theta: theta.clone() }
     }
 
     /// Levels of the mission's noise beside the residual spectra `measured` of some of the sums.
@@ -221,14 +258,27 @@ impl<'a> CandidateScorer<'a> {
         if observations <= 0.0 {
             return None;
         }
-        let mut estimate = fit.estimate.clone();
-        estimate.inverses = levels.plain_inverses();
-        let [first, second] = &self.gathered.sets;
-        let of = |gram: &Gram| self.scores(gram, &estimate, &fit.layout, &fit.columns);
-        let (scores, halves) = (of(&self.total), [of(first), of(second)]);
-        let (added, layout, columns) = (fit.added.clone(), fit.layout.clone(), fit.columns.clone());
-        let plain = Fit { added, estimate, layout, columns, scores, halves };
+        let plain = self.under(fit, levels.plain_inverses());
         Some(WithoutExcess { plain, bands, observations })
+    }
+
+    /// The fit under the declared levels of the noise; none where the fit has adopted no other. A level that was fitted
+    /// before the candidates has absorbed part of what a gain in the loop does to the power of the noise.
+    #[must_use]
+    pub fn with_declared_levels(&self, fit: &Fit) -> Option<Fit> {
+        let measured = self.residual_psd(fit);
+        let mut levels = self.levels(fit, &self.total, &measured);
+        let declared = levels.inverses();
+        levels.fit();
+        (levels.inverses() != declared).then(|| self.under(fit, declared))
+    }
+
+    /// The same solution with other Σ⁻¹ in the scores.
+    fn under(&self, fit: &Fit, inverses: Vec<DMatrix<f64>>) -> Fit {
+        let estimate = Estimate { inverses, ..fit.estimate.clone() };
+        let mut solved = Solved { layout: fit.layout.clone(), columns: fit.columns.clone(), estimate };
+        solved.estimate.known += self.scores(&self.total, &solved).normal - &fit.scores.normal;
+        self.scored(fit.added.clone(), solved)
     }
 
     /// `−2 log` of the likelihood of the model with `added`, up to a constant of the data. In `bands` the noise absorbs
@@ -250,12 +300,12 @@ impl<'a> CandidateScorer<'a> {
         Ok(least)
     }
 
-    /// `−2 log` of the likelihood of the model with `added`, up to a constant of the data, with fitted levels of the
-    /// noise and with the noise that `added` filter.
+    /// `−2 log` of the likelihood of the model with `added`, up to a constant of the data, with levels of the noise
+    /// fitted beside it and with the noise that `added` filter. In `bands` the noise absorbs the excess that is left.
     ///
     /// # Errors
     /// As [`Self::fit`].
-    fn likelihood(&self, added: &[Candidate]) -> Result<f64, EstimateError> {
+    pub fn profile_deviance(&self, added: &[Candidate], bands: &[bool]) -> Result<f64, EstimateError> {
         let Solved { layout, columns, estimate } = self.solve(added, REFINEMENTS)?;
         let measured = Self::residual(&self.total, &layout, &columns, &estimate.theta);
         let unknowns = self.candidate_set.unknowns(added);
@@ -263,7 +313,7 @@ impl<'a> CandidateScorer<'a> {
         let levels = Levels::new(self.noise, &self.plan, &self.total.weights, &measured, self.settings);
         let mut levels = levels.coloured(&self.plan, &colours);
         levels.fit();
-        Ok(levels.deviance(&measured, &vec![false; self.plan.bands.len()]))
+        Ok(levels.deviance(&measured, bands))
     }
 
     /// The form of highest likelihood of a candidate that filters a noise process, which scores do not account for: a
@@ -289,11 +339,12 @@ impl<'a> CandidateScorer<'a> {
         summits.sort_by(|a, b| scores[*b].total_cmp(&scores[*a]));
         summits.truncate(self.settings.likelihood_starts);
         let mut known: BTreeMap<usize, f64> = BTreeMap::new();
+        let bands = vec![false; self.plan.bands.len()];
         let mut likelihood = |i: usize| -> Result<f64, EstimateError> {
             if let Some(value) = known.get(&i) {
                 return Ok(*value);
             }
-            let value = self.likelihood(&[&fit.added[..], std::slice::from_ref(&forms[i])].concat())?;
+            let value = self.profile_deviance(&[&fit.added[..], std::slice::from_ref(&forms[i])].concat(), &bands)?;
             known.insert(i, value);
             Ok(value)
         };
@@ -365,18 +416,20 @@ impl<'a> CandidateScorer<'a> {
         (score, DMatrix::from_fn(terms.len(), scores.model.len(), |i, q| sum(&scores.model[q], i)))
     }
 
-    fn score(&self, scores: &Scores, candidate: Candidate) -> Option<Scored> {
-        let own = self.between(&self.total, scores, &candidate, &candidate);
-        let (score, with_model) = Self::against(scores, &candidate);
+    /// Score and information of a candidate beside the model; none where it is unobservable or contained in the model.
+    fn beside(gram: &Gram, scores: &Scores, candidate: &Candidate) -> Option<Beside> {
+        let own = Self::weighed(gram, &scores.weights, &scores.theta, candidate, candidate);
+        let (score, with_model) = Self::against(scores, candidate);
         // The missing candidate may have pushed a coefficient to the end of its range, where the score of the data is
         // not zero. Beside the candidate that coefficient moves back, so its score enters the candidate's.
         let score = score - &with_model * (&scores.covariance * &scores.bound_score);
         let information = &own - &with_model * &scores.covariance * with_model.transpose();
         let left = (0..own.nrows()).map(|i| information[(i, i)] / own[(i, i)]).fold(1.0, f64::min);
-        // Unobservable, or contained in the model.
-        if left.is_nan() || left <= 1e-9 {
-            return None;
-        }
+        (left > 1e-9).then_some(Beside { score, information, with_model, left })
+    }
+
+    fn score(&self, scores: &Scores, candidate: Candidate) -> Option<Scored> {
+        let Beside { score, information, with_model, left } = Self::beside(&self.total, scores, &candidate)?;
         let bounds: Vec<(f64, f64)> = candidate
             .parts
             .iter()
@@ -388,6 +441,15 @@ impl<'a> CandidateScorer<'a> {
         let delta_chi2 = 2.0 * score.dot(&value) - value.dot(&(&information * &value));
         let shift = &scores.covariance * with_model.transpose() * &value;
         Some(Scored { candidate, value, in_range, delta_chi2, information, understated: 1.0, left, shift })
+    }
+
+    /// Bands in which the noise absorbs an excess beside a fit.
+    #[must_use]
+    pub fn excess_bands(&self, fit: &Fit) -> Vec<bool> {
+        let measured = self.residual_psd(fit);
+        let mut levels = self.levels(fit, &self.total, &measured);
+        levels.fit();
+        levels.excess_bands().0
     }
 
     /// The part of a candidate's information under the given `Σ⁻¹` that comes from `bands`.
@@ -487,9 +549,8 @@ impl<'a> CandidateScorer<'a> {
     #[must_use]
     pub fn held_out(&self, fit: &Fit, candidate: &Candidate) -> Option<Halves> {
         let judge = |set: usize| {
-            let scores = &fit.halves[set];
-            let (score, _) = Self::against(scores, candidate);
-            let information = self.between(&self.gathered.sets[set], scores, candidate, candidate);
+            let Beside { score, information, .. } =
+                Self::beside(&self.gathered.sets[set], &fit.halves[set], candidate)?;
             let covariance = Cholesky::new(information.clone())?.inverse();
             Some((&covariance * &score, score, information, covariance))
         };

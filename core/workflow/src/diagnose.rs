@@ -45,6 +45,7 @@ pub fn diagnose(
         let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
         let mut diagnosis = diagnosis::diagnose(&scorer, tried_before)?;
         diagnosis.not_tried.extend(record.not_tried.iter().cloned());
+        contradict(&mut diagnosis, replay);
         Ok::<_, WorkflowError>(Diagnosed { record, diagnosis, settings: settings.clone() })
     };
     let first = pass(&[], &BTreeMap::new())?;
@@ -58,6 +59,16 @@ pub fn diagnose(
     // Sums are large, and these are made again.
     drop(first.record);
     pass(&requests, &tried)
+}
+
+/// A model whose two solutions disagree is not sufficient, whatever the candidates say.
+fn contradict(diagnosis: &mut Diagnosis, replay: &Replay<'_>) {
+    let disagree = replay.products.iter().filter(|p| p.product.result.verdict.as_deref() == Some("disagree"));
+    let names: Vec<String> = disagree.map(|p| p.product.id().to_string()).collect();
+    if diagnosis.verdict == "sufficient" && !names.is_empty() {
+        diagnosis.verdict = "unexplained".to_owned();
+        diagnosis.reasons.push(format!("the recursive and the batch solution of {} disagree", names.join(", ")));
+    }
 }
 
 impl Diagnosed {

@@ -1,6 +1,6 @@
 //! `dragfree diagnose`: the data of products once more, with every effect that is not in the model.
 
-use super::{Done, replay};
+use super::{Done, INCONSISTENT, replay};
 use crate::args::{Diagnose, Global};
 use crate::failure::Failure;
 use crate::text::Paint;
@@ -18,10 +18,12 @@ pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Resu
         let mut file = std::io::BufWriter::with_capacity(1 << 20, file);
         diagnosed.record.write(&mut file).and_then(|()| file.flush()).at("write", path)?;
     }
+    let code = if diagnosed.diagnosis.verdict == "sufficient" { 0 } else { INCONSISTENT };
     if global.json {
-        return Ok(Done::json(&serde_json::to_value(&diagnosed.diagnosis)?));
+        let value = serde_json::to_value(&diagnosed.diagnosis)?;
+        return Ok(Done { code, ..Done::json(&value) });
     }
-    Ok(Done::new(screen(&diagnosed, command.top, &super::repeated(None, global), paint)))
+    Ok(Done { code, ..Done::new(screen(&diagnosed, command.top, &super::repeated(None, global), paint)) })
 }
 
 fn screen(diagnosed: &Diagnosed, top: usize, repeated: &str, paint: Paint) -> String {
@@ -48,11 +50,18 @@ fn screen(diagnosed: &Diagnosed, top: usize, repeated: &str, paint: Paint) -> St
     let others: Vec<&Found> =
         d.candidates.iter().filter(|f| !f.accepted).take(top.saturating_sub(accepted.len())).collect();
     if !others.is_empty() {
-        let _ = writeln!(out, "\nWhat was tried next, and is no explanation");
+        let _ = writeln!(out, "\nTried next, and not accepted");
         others.iter().for_each(|f| put(&mut out, f));
     }
+    for reason in &d.reasons {
+        out += &crate::text::labelled("reason", reason);
+    }
+    for level in &d.levels {
+        let level = format!("{}:{} = {:.3} ± {:.3}", level.effect, level.instance, level.value, level.sigma);
+        out += &crate::text::labelled("noise", &format!("{level}, within the tolerance of a mission file"));
+    }
     if let Some(u) = &d.unexplained {
-        let _ = writeln!(out, "\nWhat nobody explains");
+        let _ = writeln!(out, "\nWhat no installed effect explains");
         let _ = writeln!(out, "  channels {}", u.channels.join(", "));
         let _ = writeln!(
             out,
@@ -65,7 +74,7 @@ fn screen(diagnosed: &Diagnosed, top: usize, repeated: &str, paint: Paint) -> St
     }
     let unnamed = diagnosed.unexplained_transients();
     if !unnamed.is_empty() {
-        let _ = writeln!(out, "\nWhat was seen to happen, and is no part of the answer");
+        let _ = writeln!(out, "\nTransients that were detected and are no part of the answer");
         for h in unnamed.iter().take(top) {
             let at = DateTime::from_timestamp_nanos(h.at_ns).format("%Y-%m-%dT%H:%M:%SZ");
             let _ = writeln!(out, "  {at}, as {}:{} would, {:.0}σ", h.effect, h.instance, h.significance);
@@ -85,7 +94,7 @@ fn put(out: &mut String, f: &Found) {
     let _ = writeln!(out, "  {}:{}", f.effect, f.instance);
     let _ = writeln!(
         out,
-        "    {} = {:.4e} ± {:.1e}{}, χ² falls by {:.0}, chance {:.1e}{}",
+        "    {} = {:.4e} ± {:.1e}{}, χ² falls by {:.0}, p = {:.1e}{}",
         f.coefficient,
         f.value,
         f.sigma,
@@ -94,6 +103,9 @@ fn put(out: &mut String, f: &Found) {
         f.p_value,
         if f.in_range { "" } else { ", at the end of its range" }
     );
+    if let Some(reason) = &f.refused {
+        out.push_str(&crate::text::labelled("    refused", reason));
+    }
     for (key, value) in &f.shape {
         let _ = writeln!(out, "    {key} = {value}");
     }

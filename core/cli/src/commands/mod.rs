@@ -23,6 +23,9 @@ use crate::text::{self, Paint};
 use dragfree_engine::registry::Registry;
 use std::path::{Path, PathBuf};
 
+/// Exit code where the model contradicts the data, or is not sufficient.
+const INCONSISTENT: u8 = 4;
+
 /// What a command leaves: text for stdout and the exit code.
 #[derive(Debug)]
 pub(crate) struct Done {

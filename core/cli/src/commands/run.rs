@@ -1,6 +1,6 @@
 //! `dragfree run` and `dragfree config check`.
 
-use super::Done;
+use super::{Done, INCONSISTENT};
 use crate::args::{BATCH_ROWS, Chain, Global, Run};
 use crate::failure::Failure;
 use crate::progress::Meter;
@@ -14,8 +14,6 @@ use std::time::SystemTime;
 
 /// Done, but data were lost.
 const DATA_LOSS: u8 = 3;
-/// Done, but the model is inconsistent with the data.
-pub(super) const INCONSISTENT: u8 = 4;
 
 pub(super) fn execute(command: &Run, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let outcome = archive(command, global)?;

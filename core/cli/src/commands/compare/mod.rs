@@ -2,8 +2,7 @@
 
 mod page;
 
-use super::run::INCONSISTENT;
-use super::{Done, replay};
+use super::{Done, INCONSISTENT, replay};
 use crate::args::{Compare, Global};
 use crate::failure::Failure;
 use crate::text::{self, Paint, columns, labelled};
