@@ -89,11 +89,13 @@ fn named_alone(d: &Value, truth: f64) -> String {
 /// A thruster gain of 10 % is named alone at any length. The halves of the data have other bands than the whole: a
 /// half weighted by the whole's bands has a biased score of a gain in the loop, and refuses it.
 #[test]
-fn a_thruster_gain_is_named_at_six_eight_and_ten_hours() {
+fn a_thruster_gain_is_named_from_six_to_twelve_hours() {
     for hours in ["6", "8", "10"] {
         let d = diagnosis(&["--hours", hours, "--seed", "77", "--effect", "mps-gain:sc.y=0.1"]);
         assert_eq!(named_alone(&d, 0.1), "mps-gain:sc.y", "{hours} h");
     }
+    let d = diagnosis(&["--hours", "12", "--seed", "425", "--effect", "mps-gain:sc.z=0.08"]);
+    assert_eq!(named_alone(&d, 0.08), "mps-gain:sc.z");
 }
 
 /// A readout scale and an electrode gain of 5 % along y, which confound each other: one is named alone, the other is

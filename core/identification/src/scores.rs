@@ -137,6 +137,9 @@ struct Scores {
     /// Per band, `Σ⁻¹` times the weight that turns sums into information.
     weights: Vec<DMatrix<f64>>,
     theta: DVector<f64>,
+    /// The same inner products with the weights with which the variance of a score is theirs. Equal weights of bands
+    /// that stand for different times have another variance than their information says.
+    variance: Option<Box<Scores>>,
 }
 
 impl<'a> CandidateScorer<'a> {
@@ -192,6 +195,9 @@ impl<'a> CandidateScorer<'a> {
     /// balance in the total, not in a half, so each half has a score of the model's own coefficients.
     fn scores_of_half(&self, half: &Gram, total: &Scores, solved: &Solved) -> Scores {
         let mut scores = self.scores(half, solved);
+        let pairs = half.weights.equal_time_weights().into_iter().zip(half.weights.kept());
+        let squared: Vec<f64> = pairs.map(|(used, kept)| if kept > 0.0 { used * used / kept } else { 0.0 }).collect();
+        scores.variance = Some(Box::new(self.weighted_scores(half, solved, &squared)));
         let knowledge = (&solved.estimate.known - &total.normal) * 0.5;
         let free = solved.estimate.free.len();
         scores.covariance = (&scores.normal + knowledge).try_inverse().unwrap_or_else(|| DMatrix::zeros(free, free));
@@ -202,13 +208,17 @@ impl<'a> CandidateScorer<'a> {
     /// Inner products of some of the data with the residuals of the solution, every band weighted by its own time.
     /// Neither surveys nor ranges enter `covariance` and `bound_score` here.
     fn scores(&self, gram: &Gram, solved: &Solved) -> Scores {
+        self.weighted_scores(gram, solved, &gram.weights.equal_time_weights())
+    }
+
+    /// The same with other weights of the bands.
+    fn weighted_scores(&self, gram: &Gram, solved: &Solved, of_band: &[f64]) -> Scores {
         let Solved { layout, columns, estimate } = solved;
         let n = self.gathered.columns.names.len();
         let channels = self.candidate_set.channels.len();
         let theta = &estimate.theta;
         let linear = layout.linear_at(theta.as_slice());
-        let kept = gram.weights.equal_time_weights();
-        let weights: Vec<DMatrix<f64>> = estimate.inverses.iter().zip(&kept).map(|(w, k)| w * *k).collect();
+        let weights: Vec<DMatrix<f64>> = estimate.inverses.iter().zip(of_band).map(|(w, k)| w * *k).collect();
         let mut residual = DMatrix::zeros(n, channels);
         let free = &estimate.free;
         let mut model = vec![DMatrix::zeros(n, channels); free.len()];
@@ -236,7 +246,8 @@ impl<'a> CandidateScorer<'a> {
             model.iter().enumerate().for_each(|(l, with)| normal[(k, l)] += r.factor * with[at]);
         }
         let covariance = DMatrix::zeros(free.len(), free.len());
-        Scores { residual, model, normal, covariance, bound_score: score, weights, theta: theta.clone() }
+        let theta = theta.clone();
+        Scores { residual, model, normal, covariance, bound_score: score, weights, theta, variance: None }
     }
 
     /// Levels of the mission's noise beside the residual spectra `measured` of some of the sums.
@@ -428,6 +439,21 @@ impl<'a> CandidateScorer<'a> {
         (left > 1e-9).then_some(Beside { score, information, with_model, left })
     }
 
+    /// Variance of a candidate's score beside the model in a half of the data.
+    fn variance(
+        gram: &Gram,
+        scores: &Scores,
+        candidate: &Candidate,
+        with_model: &DMatrix<f64>,
+    ) -> Option<DMatrix<f64>> {
+        let of = scores.variance.as_deref()?;
+        let own = Self::weighed(gram, &of.weights, &of.theta, candidate, candidate);
+        let shared = Self::against(of, candidate).1;
+        let projection = with_model * &scores.covariance;
+        let both = &shared * projection.transpose();
+        Some(own - both.transpose() - &both + &projection * &of.normal * projection.transpose())
+    }
+
     fn score(&self, scores: &Scores, candidate: Candidate) -> Option<Scored> {
         let Beside { score, information, with_model, left } = Self::beside(&self.total, scores, &candidate)?;
         let bounds: Vec<(f64, f64)> = candidate
@@ -549,10 +575,11 @@ impl<'a> CandidateScorer<'a> {
     #[must_use]
     pub fn held_out(&self, fit: &Fit, candidate: &Candidate) -> Option<Halves> {
         let judge = |set: usize| {
-            let Beside { score, information, .. } =
-                Self::beside(&self.gathered.sets[set], &fit.halves[set], candidate)?;
-            let covariance = Cholesky::new(information.clone())?.inverse();
-            Some((&covariance * &score, score, information, covariance))
+            let (gram, scores) = (&self.gathered.sets[set], &fit.halves[set]);
+            let Beside { score, information, with_model, .. } = Self::beside(gram, scores, candidate)?;
+            let inverse = Cholesky::new(information.clone())?.inverse();
+            let spread = Self::variance(gram, scores, candidate, &with_model)?;
+            Some((&inverse * &score, score, information, &inverse * spread * &inverse))
         };
         let (a, b) = (judge(0)?, judge(1)?);
         let gain = |value: &DVector<f64>, score: &DVector<f64>, information: &DMatrix<f64>| {
