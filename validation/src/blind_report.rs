@@ -125,7 +125,8 @@ pub(crate) fn numbers(lines: &[Blind]) -> (String, Vec<String>) {
             singles.iter().filter(|a| a.is_covered() && (floor..roof).contains(&significance(a))).collect();
         (these.iter().filter(right).count(), these.len())
     };
-    let at_hand = |a: &Acted<'_>| a.at_hand().unwrap_or(0.0);
+    // A set whose truth the diagnosis did not rank has no σ of its own and counts by the drawn significance: it is missed.
+    let at_hand = |a: &Acted<'_>| a.at_hand().unwrap_or_else(|| a.drawn());
     let (k, n) = above(&at_hand, PLAIN, f64::INFINITY);
     row(
         "one effect, above 8σ in the data at hand: right first, or a confounder",

@@ -95,8 +95,8 @@ impl Effect for Charge {
 /// Along axis i the acceleration is `p_i g + c_i g B` for a measured gradient `g(t)` and field component `B(t)`;
 /// Methods, "Magnetic force". Coefficients:
 ///
-/// * `gradient_x|y|z` = `p_i`, m s⁻² per T/m, ±1e-6: remanent moment and steady field.
-/// * `product_x|y|z` = `c_i`, m s⁻² per T · T/m, ±0.1: susceptibility in the measured field.
+/// * `gradient_x|y|z` = `p_i`, m s⁻² per T/m, ±5e-8: remanent moment and steady field.
+/// * `product_x|y|z` = `c_i`, m s⁻² per T · T/m, ±0.012: susceptibility in the measured field.
 ///
 /// Telemetry without gradients uses a field column as its own gradient (`g = B`). The signs follow those of the
 /// columns. **Confounders**: everything that follows the bus current, such as heaters; `g²` and `g B` are collinear if
@@ -116,8 +116,12 @@ struct Product {
 
 const GRADIENT_UNIT: &str = "T m-1";
 const FIELD_UNIT: &str = "T";
-const GRADIENT_MAX: f64 = 1e-6;
-const PRODUCT_MAX: f64 = 0.1;
+/// Three times |χ|/(ρμ₀) with |χ| ≤ 1e-4 and the density ρ = 2e4 kg/m³ of gold and platinum: LISA Pathfinder's test
+/// masses have |χ| = 3.4e-5 (arXiv:2407.04427). The factor three stands for gradients along axes that are not measured.
+const PRODUCT_MAX: f64 = 0.012;
+/// Three times 20 nA m² over 2 kg, twice the moment that LISA Pathfinder allowed, and the susceptibility in a steady
+/// field of 1.5 µT.
+const GRADIENT_MAX: f64 = 5e-8;
 /// Field per gradient of the units that cause both, m: they are decimetres away. It scales ranges of `g = B`.
 const FIELD_PER_GRADIENT_M: f64 = 0.1;
 
