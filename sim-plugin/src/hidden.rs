@@ -238,7 +238,6 @@ impl Hidden {
     ///
     /// # Panics
     /// Never: every row of the table names an effect, its instances and its parameters, as a test sees to.
-    #[must_use]
     pub fn draw(seed: u64, days: f64, test_masses: &[String]) -> Self {
         let mut rng = stream(seed, "hidden");
         let luck: f64 = rng.random();
@@ -256,7 +255,6 @@ impl Hidden {
     }
 
     /// Content of the sealed document, with the caller's members.
-    #[must_use]
     pub fn content(&self, more: &Value) -> Value {
         let effects: Vec<Value> = self.drawn.iter().map(Drawn::content).collect();
         let mut content = json!({

@@ -96,7 +96,6 @@ fn valve(i: &Interior, thruster: usize) -> f64 {
 }
 
 /// Housekeeping channels of a spacecraft with these test masses.
-#[must_use]
 pub fn channels(test_masses: &[String]) -> Vec<Channel> {
     let housings = 0..test_masses.len();
     let mut out = vec![
@@ -191,7 +190,6 @@ pub struct Housekeeping {
 
 impl Housekeeping {
     /// Scalars of a spacecraft with these test masses, sampled next to a loop of sample interval `dt_s`.
-    #[must_use]
     pub fn new(test_masses: &[String], dt_s: f64, mut rng: Xoshiro256PlusPlus) -> Self {
         let channels = channels(test_masses);
         let every: Vec<i64> = channels.iter().map(|c| (1.0 / (c.rate_hz * dt_s)).round().max(1.0) as i64).collect();
@@ -210,7 +208,6 @@ impl Housekeeping {
     }
 
     /// The channels.
-    #[must_use]
     pub fn channels(&self) -> &[Channel] {
         &self.channels
     }
@@ -234,13 +231,11 @@ impl Housekeeping {
     }
 
     /// The state: random stream and processes.
-    #[must_use]
     pub fn state(&self) -> (Xoshiro256PlusPlus, Vec<f64>) {
         (self.rng.clone(), self.processes.iter().flat_map(NoiseProcess::states).collect())
     }
 
     /// Restores [`Self::state`]; false if the length differs.
-    #[must_use]
     pub fn set_state(&mut self, (rng, states): (Xoshiro256PlusPlus, Vec<f64>)) -> bool {
         self.rng = rng;
         fill(self.processes.iter_mut().flat_map(NoiseProcess::states_mut), &states)

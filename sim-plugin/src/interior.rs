@@ -146,7 +146,6 @@ pub struct Interior {
 
 impl Interior {
     /// Propellant (kg) and temperature of the structure (K), interpolated linearly with a delay of one step.
-    #[must_use]
     pub fn smooth(&self, elapsed_s: f64) -> (f64, f64) {
         // Epochs are rounded multiples of the interval.
         let part = (elapsed_s / STEP_S - (elapsed_s / STEP_S + 1e-6).floor()).max(0.0);
@@ -237,7 +236,6 @@ impl Drifts {
 
 impl Running {
     /// The interior at the start of a simulation, with random phases of its cycles.
-    #[must_use]
     pub fn new(seed: u64, dt_s: f64, housings: usize, influences: &Influences) -> Self {
         let mut rng = stream(seed, "interior");
         let mut drifts = Drifts::new(housings);
@@ -298,7 +296,6 @@ impl Running {
     }
 
     /// Whether a step ends at an epoch.
-    #[must_use]
     pub fn due(&self, index: i64) -> bool {
         index.rem_euclid(self.every) == 0
     }
@@ -405,7 +402,6 @@ impl Running {
     }
 
     /// The state, for a checkpoint.
-    #[must_use]
     pub fn save(&self) -> SavedInterior {
         let mut drifts = self.drifts.clone();
         SavedInterior {
@@ -418,7 +414,6 @@ impl Running {
     }
 
     /// Restores [`Self::save`]; false if the length differs.
-    #[must_use]
     pub fn load(&mut self, saved: &SavedInterior) -> bool {
         (self.now, self.rng) = (saved.now.clone(), saved.rng.clone());
         (self.thrust_sum_srf_n, self.epochs) = (saved.thrust_sum_srf_n.into(), saved.epochs);

@@ -98,13 +98,11 @@ pub struct Loads {
 
 impl Loads {
     /// Zero loads.
-    #[must_use]
     pub fn zero(test_masses: usize) -> Self {
         Self { tm: PerTestMass::from_fn(test_masses, |_| TestMassLoads::default()), ..Self::default() }
     }
 
     /// Net force on the spacecraft, with the electrodes' reaction, SRF, N.
-    #[must_use]
     pub fn net_force_srf_n(&self, plant: &Plant) -> Vector3<f64> {
         let pairs = plant.tm.iter().zip(&self.tm);
         pairs.fold(self.force_srf_n, |net, (body, load)| net - body.dcm_orf_from_srf.tr_mul(&load.force_orf_n))
@@ -263,7 +261,6 @@ impl TestMassBody {
 
 impl State {
     /// At rest relative to CRF and to the housings, at the given attitude, displacements and angles.
-    #[must_use]
     pub fn at_rest(
         sc_rad: &Vector3<f64>,
         tm: &[(Vector3<f64>, Vector3<f64>)],
@@ -285,13 +282,11 @@ impl State {
     }
 
     /// Attitude of the spacecraft relative to CRF, `φ, θ, ψ`, rad.
-    #[must_use]
     pub fn sc_crf_rad(&self) -> Vector3<f64> {
         rotation_vector(&self.q_srf_from_crf)
     }
 
     /// Whether displacements and angles (twice the vector part of a quaternion) are within limits; false for NaN.
-    #[must_use]
     pub fn is_within(&self, limit_m: f64, limit_rad: f64) -> bool {
         let within = |v: &Vector3<f64>, limit: f64| v.iter().fold(true, |all, x| all & (x.abs() <= limit));
         let near = |q: &Quaternion<f64>| within(&q.imag(), 0.5 * limit_rad);
@@ -300,7 +295,6 @@ impl State {
     }
 
     /// All numbers, for a checkpoint.
-    #[must_use]
     pub fn to_numbers(&self) -> Vec<f64> {
         let mut out = Vec::with_capacity(SPACECRAFT_NUMBERS + TEST_MASS_NUMBERS * self.tm.len());
         out.extend_from_slice(self.q_srf_from_crf.coords.as_slice());
@@ -315,7 +309,6 @@ impl State {
     }
 
     /// The inverse of [`Self::to_numbers`]; `None` for a state of another number of test masses.
-    #[must_use]
     pub fn from_numbers(numbers: &[f64], test_masses: usize) -> Option<Self> {
         if numbers.len() != SPACECRAFT_NUMBERS + TEST_MASS_NUMBERS * test_masses {
             return None;

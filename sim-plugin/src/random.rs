@@ -4,7 +4,6 @@ use rand::SeedableRng;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
 /// An independent random stream per name: FNV-1a of the name combined with the seed.
-#[must_use]
 pub(crate) fn stream(seed: u64, name: &str) -> Xoshiro256PlusPlus {
     let hash = name.bytes().fold(0xcbf2_9ce4_8422_2325_u64, |h, b| (h ^ u64::from(b)).wrapping_mul(0x100_0000_01b3));
     Xoshiro256PlusPlus::seed_from_u64(hash.wrapping_add(seed.wrapping_mul(0x9e37_79b9_7f4a_7c15)))

@@ -38,7 +38,6 @@ pub struct Measured {
 
 impl MeasuredTestMass {
     /// The best readout of each degree of freedom.
-    #[must_use]
     pub fn best(&self) -> TestMassReadout {
         let [theta, psi] = self.dws_orf_rad;
         let (optical, capacitive) = (Vector3::new(f64::NAN, theta, psi), &self.is_att_orf_rad);
@@ -65,7 +64,6 @@ impl Measured {
     }
 
     /// Inputs of the controller.
-    #[must_use]
     pub fn readout(&self, sun_srf: Option<Vector3<f64>>) -> Readout {
         Readout { sc_crf_rad: self.dws_sc_crf_rad, tm: self.tm.map(MeasuredTestMass::best), sun_srf }
     }
@@ -175,7 +173,6 @@ impl Noises {
     }
 
     /// Readouts by the initial drifts alone. Acquisition nulls the readouts rather than the displacements.
-    #[must_use]
     pub fn slow_readout(&self) -> Readout {
         let slow = |place: usize| self.bank.slow(place);
         let three = |place: usize| Vector3::from_fn(|i, _| slow(place + i));
@@ -211,7 +208,6 @@ impl Noises {
     }
 
     /// Adds the epoch's sample of every force noise to the loads; returns the fluctuation of the sunlight, N.
-    #[must_use]
     pub fn disturb(&self, loads: &mut Loads) -> f64 {
         let samples = self.bank.samples();
         let three = |place: usize| Vector3::new(samples[place], samples[place + 1], samples[place + 2]);
@@ -226,13 +222,11 @@ impl Noises {
     }
 
     /// The states of all processes, for a checkpoint between epochs.
-    #[must_use]
     pub fn states(&self) -> Vec<f64> {
         self.bank.states()
     }
 
     /// Restores [`Self::states`]; false if the length differs.
-    #[must_use]
     pub fn set_states(&mut self, states: &[f64]) -> bool {
         self.bank.set_states(states)
     }

@@ -305,31 +305,26 @@ impl Simulator {
     }
 
     /// Time of the coming epoch, Unix ns.
-    #[must_use]
     pub fn time_ns(&self) -> i64 {
         epoch_ns(self.settings.start_ns, self.index, self.dt_s)
     }
 
     /// Number of the coming epoch.
-    #[must_use]
     pub fn index(&self) -> i64 {
         self.index
     }
 
     /// The true state at the coming epoch.
-    #[must_use]
     pub fn state(&self) -> &State {
         &self.state
     }
 
     /// The true plant, for the constants of the truth and for tests.
-    #[must_use]
     pub fn plant(&self) -> &Plant {
         &self.plant
     }
 
     /// The orbits.
-    #[must_use]
     pub fn constellation(&self) -> &Constellation {
         &self.constellation
     }
@@ -415,13 +410,11 @@ impl Simulator {
     }
 
     /// The inside of the spacecraft at the coming epoch.
-    #[must_use]
     pub fn inside(&self) -> &Interior {
         &self.inside.now
     }
 
     /// The housings relative to the centre of mass at the coming epoch, each in its ORF, m.
-    #[must_use]
     pub fn offset_orf_m(&self) -> &[Vector3<f64>] {
         &self.offset_orf_m
     }

@@ -52,7 +52,6 @@ impl Layout {
 
     /// Six units in three pairs 1.5 m from the axis `s_3` and 0.35 m above the centre of mass, thrusting along the rim
     /// in both directions and 35° upwards, towards the Sun. Sunlight provides the opposite force along `s_3`.
-    #[must_use]
     pub fn six(asd_n_rthz: f64) -> Self {
         let unit = |k: usize| {
             let (sine, cosine) = (60.0 + 120.0 * (k / 2) as f64).to_radians().sin_cos();
@@ -66,7 +65,6 @@ impl Layout {
     }
 
     /// One-sided PSD of force and torque noise together, `Σ S_i (d_i, r_i×d_i)(d_i, r_i×d_i)ᵀ`, SRF, N²/Hz and so on.
-    #[must_use]
     pub fn noise_psd(&self) -> Matrix6<f64> {
         let psd = DMatrix::from_diagonal(&DVector::from_iterator(
             self.asd_n_rthz.len(),
@@ -94,7 +92,6 @@ pub struct ThrusterNoise {
 
 impl ThrusterNoise {
     /// White noise of every unit, sampled every `dt_s`; the random stream is its only state.
-    #[must_use]
     pub fn new(layout: Layout, dt_s: f64) -> Self {
         let units = layout.asd_n_rthz.iter().map(|asd| NoiseProcess::new(&NoiseShape::white(*asd), dt_s)).collect();
         Self { layout, units }
@@ -244,7 +241,6 @@ impl Thrusters {
     }
 
     /// Whether the last command was out of range.
-    #[must_use]
     pub fn saturated(&self) -> bool {
         self.saturated
     }
@@ -268,7 +264,6 @@ impl Thrusters {
     }
 
     /// The state, for a checkpoint.
-    #[must_use]
     pub fn save(&self) -> SavedThrusters {
         SavedThrusters {
             y: self.y.as_slice().to_vec(),
@@ -278,7 +273,6 @@ impl Thrusters {
     }
 
     /// Restores [`Self::save`]; false for a state of another mission.
-    #[must_use]
     pub fn load(&mut self, saved: SavedThrusters) -> bool {
         let n = self.y.len();
         let queue = [0, self.lag.samples() + 1].contains(&saved.waiting.len());

@@ -67,7 +67,6 @@ pub struct Line {
 
 impl Line {
     /// A line; an empty label is not in the legend.
-    #[must_use]
     pub fn new(label: impl Into<String>, colour: usize, stroke: Stroke, points: Vec<(f64, f64)>) -> Self {
         Self { label: label.into(), colour, stroke, points }
     }
@@ -119,7 +118,6 @@ const PANEL: (u32, u32) = (560, 380);
 
 impl Panel {
     /// A panel over frequency in Hz, both axes logarithmic.
-    #[must_use]
     pub fn over_frequency(
         title: impl Into<String>,
         y_label: impl Into<String>,

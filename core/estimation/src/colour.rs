@@ -18,7 +18,6 @@ const POINTS: usize = 16;
 /// What a [`Colour`] does to the power of its process.
 pub trait ColourPower {
     /// `|1 + cH|²` of the coefficient c, its mean over a band.
-    #[must_use]
     fn power(&self, coefficient: f64, plan: &Plan, band: Band) -> f64;
 }
 

@@ -99,7 +99,6 @@ pub struct Levels<'a> {
 
 impl<'a> Levels<'a> {
     /// `measured` are the residuals' one-sided cross-spectra per band, `weights` say how well they are known.
-    #[must_use]
     pub fn new(
         noise: &'a NoiseModel,
         plan: &Plan,
@@ -121,7 +120,6 @@ impl<'a> Levels<'a> {
     }
 
     /// The same where coefficients colour processes.
-    #[must_use]
     pub fn coloured(mut self, plan: &Plan, colours: &[(&Colour, f64)]) -> Self {
         for (colour, coefficient) in colours {
             let Some(process) = self.processes.get_mut(colour.process.as_str()) else { continue };
@@ -135,7 +133,6 @@ impl<'a> Levels<'a> {
     }
 
     /// The modelled spectra, per band, with the levels that were taken over.
-    #[must_use]
     pub fn modelled(&self) -> &[DMatrix<f64>] {
         &self.modelled
     }
@@ -168,7 +165,6 @@ impl<'a> Levels<'a> {
     }
 
     /// The amplitude of a process that fits best; `None` where the channels do not have it.
-    #[must_use]
     pub fn level(&self, name: &str) -> Option<Level> {
         self.level_in(&self.whitened()?, name)
     }
@@ -236,7 +232,6 @@ impl<'a> Levels<'a> {
 
     /// Excesses: the bands of each group, its complex observations, and the ratios of power in each channel, the larger
     /// of the plain and the partial one.
-    #[must_use]
     pub fn excesses(&self) -> Vec<(Range<usize>, f64, Vec<f64>)> {
         let inverses: Vec<DMatrix<f64>> = self.modelled.iter().map(inverted).collect();
         let of = |bands: Range<usize>| {
@@ -248,7 +243,6 @@ impl<'a> Levels<'a> {
     }
 
     /// `Σ⁻¹` per band, with the excess of single channels taken up.
-    #[must_use]
     pub fn inverses(&self) -> Vec<DMatrix<f64>> {
         let bands = self.modelled.iter().zip(self.measured).zip(&self.observations);
         let inverses: Vec<DMatrix<f64>> = bands
@@ -292,14 +286,12 @@ impl<'a> Levels<'a> {
     }
 
     /// `Σ⁻¹` per band as it is modelled, whatever the excess.
-    #[must_use]
     pub fn plain_inverses(&self) -> Vec<DMatrix<f64>> {
         self.modelled.iter().map(inverted).collect()
     }
 
     /// The bands in which [`Self::inverses`] take up an excess, and the real observations in them, two for each complex
     /// one.
-    #[must_use]
     pub fn excess_bands(&self) -> (Vec<bool>, f64) {
         let pairs = self.inverses().into_iter().zip(self.plain_inverses());
         let loud: Vec<bool> = pairs.map(|(full, plain)| (full - &plain).norm() > 1e-9 * plain.norm()).collect();
@@ -310,7 +302,6 @@ impl<'a> Levels<'a> {
     /// `−2 log` of Whittle's likelihood of other residuals of the same data, up to a constant: under these levels, and
     /// in some bands with all power taken up that a channel has of its own beyond what is modelled, so that it is
     /// steady in the residuals.
-    #[must_use]
     pub fn deviance(&self, measured: &[DMatrix<f64>], bands: &[bool]) -> f64 {
         let (processes, hz) = (BTreeMap::new(), self.hz.clone());
         let (observations, modelled) = (self.observations.clone(), self.modelled.clone());
@@ -327,7 +318,6 @@ impl<'a> Levels<'a> {
     }
 
     /// Channels in which a process has power.
-    #[must_use]
     pub fn channels_of(&self, process: &str) -> Vec<usize> {
         let bands = self.processes.get(process).map_or(&[][..], Vec::as_slice);
         let channels = self.modelled.first().map_or(0, DMatrix::nrows);

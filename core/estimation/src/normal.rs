@@ -69,7 +69,6 @@ pub(crate) fn accumulate(spectra: &Spectra, layout: &Layout, inverses: &[DMatrix
 
 /// Summed cross-spectra of the residuals `z − Φθ`, channels × channels, per band; products of coefficients at their
 /// values.
-#[must_use]
 pub fn residual_spectra(spectra: &Spectra, layout: &Layout, theta: &DVector<f64>) -> Vec<DMatrix<f64>> {
     residuals(spectra, &layout.linear_at(theta.as_slice()), spectra.expected.len(), theta)
 }

@@ -157,7 +157,6 @@ pub struct Prediction {
 impl Prediction {
     /// A fit with the levels of the model; none when the modelled Σ is singular. `differenced` says of each channel
     /// whether it is a second difference of a displacement.
-    #[must_use]
     pub fn new(model: &NoiseModel, differenced: &[bool], layout: &Layout, plan: &Plan) -> Option<Self> {
         let dt_s = 1.0 / plan.rate_hz;
         let sigma: Vec<DMatrix<f64>> = plan.bands.iter().map(|b| model.psd(plan.frequency_hz(*b))).collect();
@@ -286,14 +285,12 @@ impl Prediction {
     }
 
     /// Numbers in a block's sums.
-    #[must_use]
     pub fn block_size(&self) -> usize {
         let n = self.layout.coefficients.len();
         n * n + n
     }
 
     /// Whether the number of segments has doubled since the levels were measured.
-    #[must_use]
     pub fn is_due(&self, segments: u64) -> bool {
         segments >= (2 * self.state.trained_at).max(1)
     }

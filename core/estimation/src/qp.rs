@@ -20,7 +20,6 @@ pub struct Row {
 
 impl Row {
     /// Half of the interval's width; infinite when one side is open.
-    #[must_use]
     pub fn half_width(&self) -> f64 {
         0.5 * (self.upper - self.lower)
     }
@@ -236,7 +235,6 @@ impl Problem {
     }
 
     /// The problem as one line of JSON; infinite bounds appear as null.
-    #[must_use]
     pub fn dump(&self) -> String {
         let matrix: Vec<Vec<f64>> = self.normal.row_iter().map(|r| r.iter().copied().collect()).collect();
         serde_json::json!({

@@ -67,14 +67,12 @@ pub struct Collected {
 
 impl Collected {
     /// Nothing yet.
-    #[must_use]
     pub fn new(plan: &Plan, layout: &Layout, prediction: Option<Prediction>) -> Self {
         let sums = Sums::new(plan, layout);
         Self { earlier: sums.clone(), sums, prediction }
     }
 
     /// Sums of this run and of those before.
-    #[must_use]
     pub fn all(&self, plan: &Plan) -> Sums {
         let mut sums = self.earlier.clone();
         sums.add(plan, &self.sums);
@@ -82,7 +80,6 @@ impl Collected {
     }
 
     /// Segments of this run and of those before.
-    #[must_use]
     pub fn segments(&self) -> u64 {
         self.earlier.total.segments + self.sums.total.segments
     }
@@ -149,7 +146,6 @@ pub struct State {
 
 impl Segmenter {
     /// `averaged` has one flag per column.
-    #[must_use]
     pub fn new(length: usize, step_ns: i64, averaged: Vec<bool>) -> Self {
         let n = averaged.len();
         Self {
@@ -172,7 +168,6 @@ impl Segmenter {
 
     /// The same with the first `columns` in its segments alone; the others are handed on as they come ([`Cuts::rows`])
     /// and never kept.
-    #[must_use]
     pub fn of_first(mut self, columns: usize) -> Self {
         self.state.run.truncate(columns);
         self
@@ -315,14 +310,12 @@ impl State {
 }
 
 /// Whether there is a value everywhere; without an early end, so that it is done several at a time.
-#[must_use]
 pub fn all_finite(column: &[f64]) -> bool {
     column.iter().fold(true, |all, x| all & x.is_finite())
 }
 
 /// The longest length up to `samples` that is divisible by 4 and has small prime factors, for a fast transform; at
 /// least [`SHORTEST`].
-#[must_use]
 pub fn longest_length(samples: usize) -> usize {
     let smooth = |n: &usize| {
         let mut m = *n;

@@ -150,7 +150,6 @@ impl NoiseModel {
     /// Where an estimate is made from what the component drives, it is what Σ gains by a little more of the component:
     /// what enters the channels at once, and what the estimate does not know of it. The estimate is taken to follow the
     /// level, so that its error stays orthogonal to the readout.
-    #[must_use]
     pub fn process_psd(&self, name: &str, frequency_hz: f64) -> Option<DMatrix<f64>> {
         let Component { process: p, estimated, .. } = self.components.iter().find(|c| c.name == name)?;
         let power = p.shape.psd(frequency_hz) * self.power(p.response, frequency_hz);
@@ -164,7 +163,6 @@ impl NoiseModel {
     }
 
     /// One-sided cross-spectral matrix at `frequency_hz`, channels × channels, units of the channels squared per Hz.
-    #[must_use]
     pub fn psd(&self, frequency_hz: f64) -> DMatrix<f64> {
         let mut sigma = DMatrix::zeros(self.channels, self.channels);
         for p in &self.processes {
@@ -183,7 +181,6 @@ impl NoiseModel {
     }
 
     /// Names of the components of each process that has several.
-    #[must_use]
     pub fn vector_processes(&self) -> Vec<Vec<&str>> {
         let by_process = self.components.chunk_by(|a, b| a.declared == b.declared);
         let names = by_process.map(|own| own.iter().map(|c| c.name.as_str()).collect::<Vec<_>>());
@@ -191,20 +188,17 @@ impl NoiseModel {
     }
 
     /// Whether an estimate that enters the channels is made from what this component drives.
-    #[must_use]
     pub fn is_estimated(&self, name: &str) -> bool {
         self.components.iter().any(|c| c.name == name && c.estimated.is_some())
     }
 
     /// Per channel, whether the declared processes are all there is in it once the model is taken out; false for a
     /// channel into which a process of unknown spectrum enters, or none at all.
-    #[must_use]
     pub fn residual(&self) -> &[bool] {
         &self.residual
     }
 
     /// A label per channel, the same for channels that a chain of common noises connects.
-    #[must_use]
     pub fn groups(&self) -> Vec<usize> {
         let mut label: Vec<usize> = (0..self.channels).collect();
         let entries = self.processes.iter().map(|p| p.enters.clone());
@@ -283,7 +277,6 @@ pub struct BandNoise<'a> {
 
 impl<'a> BandNoise<'a> {
     /// Of the bands of `plan`.
-    #[must_use]
     pub fn new(model: &'a NoiseModel, plan: &Plan) -> Self {
         let zero = || DMatrix::zeros(model.channels, model.channels);
         let mean = |band: &Band| {

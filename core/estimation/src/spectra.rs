@@ -46,7 +46,6 @@ pub struct Regressor {
 
 impl Layout {
     /// The same with products of two coefficients made linear: the second one has its value in `theta`.
-    #[must_use]
     pub fn linear_at(&self, theta: &[f64]) -> Self {
         let mut linear = self.clone();
         for r in &mut linear.regressors {
@@ -56,7 +55,6 @@ impl Layout {
     }
 
     /// Channels and series together.
-    #[must_use]
     pub fn columns(&self) -> usize {
         self.channels.len() + self.series.len()
     }
@@ -73,7 +71,6 @@ pub struct Band {
 
 impl Band {
     /// Number of bins.
-    #[must_use]
     pub fn bins(self) -> usize {
         self.end - self.first
     }
@@ -174,14 +171,12 @@ fn bins_between(bins: Range<usize>, of: usize, length: usize, first_bin: usize) 
 
 impl Plan {
     /// Segments of `length` samples, divisible by four, and of its halves.
-    #[must_use]
     pub fn new(length: usize, rate_hz: f64) -> Self {
         Self::from_bin(FIRST_BIN, length, length, rate_hz)
     }
 
     /// As [`Self::new`]; segments longer than `ordinary` samples, which are there for what is slow, count from
     /// [`FIRST_SLOW_BIN`] on.
-    #[must_use]
     pub fn slow(length: usize, ordinary: usize, rate_hz: f64) -> Self {
         Self::from_bin(FIRST_SLOW_BIN, length, ordinary, rate_hz)
     }
@@ -205,7 +200,6 @@ impl Plan {
 
     /// For one segment of another length, between half the longest and the longest: the bands of this plan that half
     /// the longest has no bins in.
-    #[must_use]
     pub fn between_halves(&self, length: usize) -> Self {
         let out_of_reach = |b: &&Band| b.first < 2 * self.first_bin;
         let bands: Vec<Band> = self.bands.iter().take_while(out_of_reach).copied().collect();
@@ -214,7 +208,6 @@ impl Plan {
     }
 
     /// Bins of segments of the `taper`-th length that lie between bins of the longest, in the bands of this plan alone.
-    #[must_use]
     pub fn bins_between(&self, taper: usize, bins: Range<usize>) -> Range<usize> {
         let end = self.bands.last().map_or(0, |b| b.end);
         let taper = &self.tapers[taper];
@@ -227,19 +220,16 @@ impl Plan {
     }
 
     /// Bins of each band in segments of the `taper`-th length.
-    #[must_use]
     pub fn bins(&self, taper: usize) -> &[Range<usize>] {
         &self.tapers[taper].bins
     }
 
     /// Frequency of the middle of a band, Hz.
-    #[must_use]
     pub fn frequency_hz(&self, band: Band) -> f64 {
         self.bin_hz(0.5 * (band.first + band.end - 1) as f64)
     }
 
     /// Frequency of a bin of the longest segment, Hz.
-    #[must_use]
     pub fn bin_hz(&self, bin: f64) -> f64 {
         bin * self.rate_hz / self.bins_of as f64
     }
@@ -266,7 +256,6 @@ pub struct Spectra {
 
 impl Spectra {
     /// Nothing added yet.
-    #[must_use]
     pub fn zero(bands: usize, columns: usize) -> Self {
         Self {
             packed: vec![0.0; bands * triangle(columns)],
@@ -320,7 +309,6 @@ impl Spectra {
 
     /// Per band `Σg/Σg²`: sums times this are information, their inverse a covariance. One Hann segment keeps 0.514 of
     /// the information of its samples, segments that overlap by half 0.947. Zero where no segment reaches.
-    #[must_use]
     pub fn kept(&self) -> Vec<f64> {
         let pairs = self.weight.iter().zip(&self.weight_squared);
         pairs.map(|(g, g2)| if *g2 > 0.0 { g / g2 } else { 0.0 }).collect()
@@ -332,7 +320,6 @@ impl Spectra {
     /// Where commands are regressors, the score of a gain inside the loop has another expectation in every band and
     /// only their sum over all bands is zero (see [`crate::levels`]). Bands that stand for less time than others, as
     /// the lowest ones do at the ends of a run, would bias it.
-    #[must_use]
     pub fn equal_time_weights(&self) -> Vec<f64> {
         let time = self.kept().last().zip(self.weight.last()).map_or(0.0, |(kept, weight)| kept * weight);
         self.weight.iter().map(|g| if *g > 0.0 { time / g } else { 0.0 }).collect()
@@ -340,7 +327,6 @@ impl Spectra {
 
     /// Per band, complex observations: half the samples that would know as much, times the band's part of all
     /// frequencies.
-    #[must_use]
     pub fn observations(&self, plan: &Plan) -> Vec<f64> {
         let kept = self.kept();
         plan.bands
@@ -351,7 +337,6 @@ impl Spectra {
     }
 
     /// The lower triangle of band `b`, row after row.
-    #[must_use]
     pub fn band(&self, b: usize, columns: usize) -> &[f64] {
         let n = triangle(columns);
         &self.packed[b * n..(b + 1) * n]
@@ -382,7 +367,6 @@ pub struct Sums {
 
 impl Sums {
     /// Nothing added yet.
-    #[must_use]
     pub fn new(plan: &Plan, layout: &Layout) -> Self {
         let total = Spectra::zero(plan.bands.len(), layout.columns());
         Self { total, block_ns: plan.first_block_ns(), blocks: Vec::new() }
@@ -444,7 +428,6 @@ impl Sums {
 }
 
 /// Entries of the lower triangle of a square of `n` rows.
-#[must_use]
 pub fn triangle(n: usize) -> usize {
     n * (n + 1) / 2
 }
@@ -458,7 +441,6 @@ pub struct Transformer {
 
 impl Transformer {
     /// For the segments of a plan.
-    #[must_use]
     pub fn new(plan: &Plan) -> Self {
         let scratch = plan.tapers.iter().map(|t| t.fft.get_scratch_len()).max().unwrap_or(0);
         Self {
@@ -512,14 +494,12 @@ pub struct Analyser {
 
 impl Analyser {
     /// An analyser of segments with the columns of `layout`.
-    #[must_use]
     pub fn new(plan: Plan, layout: &Layout) -> Self {
         let columns = layout.columns();
         Self { transformer: Transformer::new(&plan), scaled: vec![vec![0.0; plan.length]; columns], columns, plan }
     }
 
     /// Bands and lengths.
-    #[must_use]
     pub fn plan(&self) -> &Plan {
         &self.plan
     }

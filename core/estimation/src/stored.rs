@@ -49,7 +49,6 @@ pub enum StoredError {
 
 impl Stored {
     /// What is to be stored.
-    #[must_use]
     pub fn new(layout: &Layout, plan: &Plan, noise: &[NoiseProcess], spectra: &Spectra) -> Self {
         Self {
             format: FORMAT,

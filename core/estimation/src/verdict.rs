@@ -15,7 +15,6 @@ pub struct Direction {
 
 impl Direction {
     /// A coefficient on which nothing measured depends.
-    #[must_use]
     pub fn unseen(name: &str) -> Self {
         Self { sentence: format!("{name} is not seen: nothing measured depends on it"), sigma_in_sizes: f64::INFINITY }
     }
@@ -26,7 +25,6 @@ const NAMED: f64 = 0.05;
 
 /// Eigen-directions of the information, scaled by `size`, whose σ exceeds `from`
 /// ([`Settings::weak_direction`]); `names` with units.
-#[must_use]
 pub fn weak_directions(
     information: &DMatrix<f64>,
     size: &DVector<f64>,
@@ -94,7 +92,6 @@ pub struct Difference {
 
 impl Difference {
     /// Size in σ.
-    #[must_use]
     pub fn sigmas(&self) -> f64 {
         self.difference.abs() / self.sigma
     }
@@ -105,7 +102,6 @@ impl Difference {
 /// Both come from the same data. If the QP were efficient and the other not, the variance of the difference would be
 /// `σ_other² − σ_qp²` (Hausman), but that is zero or negative as soon as one σ is a little off. The sum of the
 /// variances holds whatever their correlation, as long as it is not negative, and errs on the quiet side.
-#[must_use]
 pub fn differences(qp: &[Value], other: &[Value]) -> Vec<Difference> {
     qp.iter()
         .filter_map(|q| {
@@ -134,28 +130,24 @@ pub struct Pull {
 
 impl Pull {
     /// Size in σ.
-    #[must_use]
     pub fn sigmas(&self) -> f64 {
         self.distance.abs() / self.sigma
     }
 }
 
 /// Bounds of χ²/dof at [`Settings::chi2_sigmas`], widened by what a Σ in bands cannot follow.
-#[must_use]
 pub fn chi2_bounds(settings: &Settings, dof: f64) -> (f64, f64) {
     let Settings { chi2_sigmas, chi2_tolerance, .. } = *settings;
     (chi2_per_dof_at(dof, -chi2_sigmas) - chi2_tolerance, chi2_per_dof_at(dof, chi2_sigmas) + chi2_tolerance)
 }
 
 /// The χ²/dof that corresponds to a normal quantile, by Wilson and Hilferty.
-#[must_use]
 pub fn chi2_per_dof_at(dof: f64, quantile: f64) -> f64 {
     let v = 2.0 / (9.0 * dof);
     (1.0 - v + quantile * v.sqrt()).max(0.0).powi(3)
 }
 
 /// The normal quantile that corresponds to a χ²/dof, the inverse of [`chi2_per_dof_at`].
-#[must_use]
 pub fn chi2_quantile(chi2_per_dof: f64, dof: f64) -> f64 {
     let v = 2.0 / (9.0 * dof);
     (chi2_per_dof.cbrt() - 1.0 + v) / v.sqrt()

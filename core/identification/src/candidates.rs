@@ -104,14 +104,12 @@ pub struct Candidate {
 
 impl CandidateSet {
     /// Coefficients of the model.
-    #[must_use]
     pub fn model(&self) -> usize {
         self.coefficients.iter().take_while(|c| !c.candidate).count()
     }
 
     /// Every instance of every effect that is not in the model, as the indices of its coefficients: without noise
     /// levels, and transients apart from lasting causes.
-    #[must_use]
     pub fn places(&self) -> Vec<Vec<usize>> {
         let mut places: Vec<Vec<usize>> = Vec::new();
         for (i, c) in self.coefficients.iter().enumerate().filter(|(_, c)| c.candidate && !c.forms.is_empty()) {
@@ -129,7 +127,6 @@ impl CandidateSet {
     }
 
     /// The `form`-th form of the coefficients of a place.
-    #[must_use]
     pub fn candidate(&self, place: &[usize], form: usize) -> Candidate {
         let first = &self.coefficients[place[0]];
         Candidate {
@@ -141,7 +138,6 @@ impl CandidateSet {
     }
 
     /// Unknowns of the model and of what was added to it.
-    #[must_use]
     pub fn unknowns(&self, added: &[Candidate]) -> Vec<Unknown> {
         let unknown = |c: &Coefficient, form: &Form, estimate: bool| Unknown {
             name: c.name.clone(),
@@ -159,7 +155,6 @@ impl CandidateSet {
     }
 
     /// Constraints as the estimator takes them.
-    #[must_use]
     pub fn bounds(&self) -> Vec<Bound> {
         let bound = |r: &Rule| Bound {
             name: r.name.clone(),
@@ -172,7 +167,6 @@ impl CandidateSet {
     }
 
     /// The layout of the model with what was added, and the columns that it is made of.
-    #[must_use]
     pub fn layout(&self, names: &[String], added: &[Candidate]) -> (Layout, Vec<usize>) {
         let model = self.model();
         let mut columns: Vec<usize> = (0..self.channels.len()).collect();
@@ -207,13 +201,11 @@ impl CandidateSet {
 
 impl Candidate {
     /// Its name, `es-gain:tm1.y`.
-    #[must_use]
     pub fn name(&self) -> String {
         format!("{}:{}", self.effect, self.instance)
     }
 
     /// Between this form and another of the same place: `part` of the way, shapes in their logarithm.
-    #[must_use]
     pub fn towards(&self, other: &Self, part: f64) -> Self {
         let mut mixed = self.clone();
         for ((_, form), (_, to)) in mixed.parts.iter_mut().zip(&other.parts) {

@@ -117,7 +117,6 @@ pub struct HousekeepingCoherence {
 impl HousekeepingCoherence {
     /// For housekeeping of these names, segments of a plan, residuals made by `residual` (channels × base columns) and
     /// `Σ⁻¹` per band of the plan.
-    #[must_use]
     pub fn new(names: Vec<String>, plan: &Plan, residual: DMatrix<f64>, whitening: Vec<DMatrix<f64>>) -> Self {
         let n = names.len();
         let mut drivers: Vec<Driver> =
@@ -250,7 +249,6 @@ impl HousekeepingCoherence {
 
     /// Forward selection of drivers, without products, for each channel's residual; only channels with any. `alarm` is
     /// the false-alarm rate over all channels.
-    #[must_use]
     pub fn stepwise_coherence(&self, channels: &[String], alarm: f64) -> Vec<StepwiseCoherence> {
         (0..channels.len()).filter_map(|c| self.stepwise_coherence_of(channels, c, alarm)).collect()
     }
@@ -322,7 +320,6 @@ impl HousekeepingCoherence {
     }
 
     /// Coherence of each driver with the residual of each channel, the most significant first.
-    #[must_use]
     pub fn coherences(&self, channels: &[String]) -> Vec<Coherence> {
         let mut all = Vec::new();
         let singles = self.drivers.iter().filter(|d| d.of().len() == 1).count();

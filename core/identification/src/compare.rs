@@ -152,7 +152,6 @@ pub struct Nis {
 
 impl Nis {
     /// Judges the filter's mean normalised innovation squared.
-    #[must_use]
     pub fn new(value: f64, dof: f64, false_alarm: f64) -> Self {
         let bounds = [0.5 * false_alarm, 1.0 - 0.5 * false_alarm].map(|p| chi2_per_dof_quantile(p, dof));
         Self { value, dof, bounds, passes: (bounds[0]..=bounds[1]).contains(&value) }
@@ -184,7 +183,6 @@ impl Innovations {
     /// them.
     ///
     /// [1]: https://en.wikipedia.org/wiki/Haar_wavelet
-    #[must_use]
     pub fn judge(readouts: &BTreeMap<String, Vec<(f64, u64)>>, rate_hz: f64, false_alarm: f64) -> Vec<Self> {
         let told = |octaves: &Vec<(f64, u64)>| octaves.iter().filter(|(_, n)| *n > 0).count();
         let trials: usize = readouts.values().map(told).sum();

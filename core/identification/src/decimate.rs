@@ -20,7 +20,6 @@ pub struct Response {
 
 impl Response {
     /// At a frequency in cycles per sample that comes in.
-    #[must_use]
     pub fn at(self, cycles: f64) -> f64 {
         let angle = std::f64::consts::PI * cycles;
         if angle == 0.0 { 1.0 } else { ((self.factor * angle).sin() / (self.factor * angle.sin())).powi(ORDER) }
@@ -44,7 +43,6 @@ const WORTH_A_THREAD: usize = 1 << 16;
 
 impl Decimator {
     /// For `columns` columns with a sample every `step_ns`, shared among `threads`.
-    #[must_use]
     pub fn new(factor: usize, columns: usize, step_ns: i64, threads: usize) -> Self {
         let mean = vec![1.0 / factor as f64; factor];
         let convolved = |kernel: Vec<f64>| {
@@ -57,13 +55,11 @@ impl Decimator {
     }
 
     /// Nanoseconds between samples that are kept.
-    #[must_use]
     pub fn step_ns(&self) -> i64 {
         self.step_ns * self.factor as i64
     }
 
     /// Its response.
-    #[must_use]
     pub fn response(&self) -> Response {
         Response { factor: self.factor as f64 }
     }

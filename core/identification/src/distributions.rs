@@ -55,7 +55,6 @@ fn ln_fraction_above(a: f64, x: f64) -> f64 {
 }
 
 /// Probabilities that χ² of `dof` degrees of freedom lies below and above `dof * per_dof`.
-#[must_use]
 pub fn chi2_tails(per_dof: f64, dof: f64) -> (f64, f64) {
     let (a, x) = (0.5 * dof, 0.5 * dof * per_dof);
     if x.is_nan() || x <= 0.0 || a <= 0.0 {
@@ -71,7 +70,6 @@ pub fn chi2_tails(per_dof: f64, dof: f64) -> (f64, f64) {
 
 /// Logarithm of the probability that χ² of `dof` degrees of freedom is above `chi2`; finite where the probability
 /// underflows.
-#[must_use]
 pub fn ln_chi2_above(chi2: f64, dof: f64) -> f64 {
     let (a, x) = (0.5 * dof, 0.5 * chi2);
     if x.is_nan() || x <= 0.0 || a <= 0.0 {
@@ -81,20 +79,17 @@ pub fn ln_chi2_above(chi2: f64, dof: f64) -> f64 {
 }
 
 /// Probability that a normal number is so many σ from its mean or more, on either side.
-#[must_use]
 pub fn normal_tails(sigmas: f64) -> f64 {
     ln_chi2_above(sigmas * sigmas, 1.0).exp()
 }
 
 /// Two-sided p-value of a χ²/dof.
-#[must_use]
 pub fn two_sided(per_dof: f64, dof: f64) -> f64 {
     let (below, above) = chi2_tails(per_dof, dof);
     (2.0 * below.min(above)).min(1.0)
 }
 
 /// The χ²/dof below which a part `p` of all draws lies.
-#[must_use]
 pub fn chi2_per_dof_quantile(p: f64, dof: f64) -> f64 {
     let (mut low, mut high) = (0.0, 1.0);
     while chi2_tails(high, dof).0 < p && high < 1e9 {
@@ -108,7 +103,6 @@ pub fn chi2_per_dof_quantile(p: f64, dof: f64) -> f64 {
 }
 
 /// Probability that the largest distance of a Brownian bridge from zero exceeds `x` (Kolmogorov 1933).
-#[must_use]
 pub fn kolmogorov(x: f64) -> f64 {
     // The alternating series needs many terms where the chance is one anyway.
     if x < 0.2 {
@@ -119,7 +113,6 @@ pub fn kolmogorov(x: f64) -> f64 {
 }
 
 /// p-value of the best of `tried` (Šidák): `1 − (1 − p)^n`.
-#[must_use]
 pub fn corrected(p: f64, tried: f64) -> f64 {
     (-(tried * (-p).ln_1p()).exp_m1()).clamp(0.0, 1.0)
 }

@@ -55,7 +55,6 @@ pub struct Columns {
 
 impl Columns {
     /// Energy per band of a waveform.
-    #[must_use]
     pub fn energy_of(&self, column: usize) -> Option<&[f64]> {
         let first = self.fast.checked_sub(self.energy.len())?;
         self.energy.get(column.checked_sub(first)?).map(Vec::as_slice)
@@ -89,7 +88,6 @@ impl Gram {
     }
 
     /// The spectra of some of the columns, in the order asked for; zero where a slow one has nothing.
-    #[must_use]
     pub fn select(&self, columns: &[usize]) -> Spectra {
         let mut out = self.weights.clone();
         out.packed = Vec::with_capacity(self.bands.len() * triangle(columns.len()));
@@ -133,7 +131,6 @@ pub struct GramSums {
 
 impl GramSums {
     /// All segments together.
-    #[must_use]
     pub fn total(&self) -> Gram {
         let mut total = self.sets[0].clone();
         total.add(&self.sets[1]);
@@ -141,13 +138,11 @@ impl GramSums {
     }
 
     /// The plan of the bands of the sums.
-    #[must_use]
     pub fn plan(&self) -> Plan {
         whole_plan(self.length, self.rate_hz)
     }
 
     /// The plan of the bands of the hours.
-    #[must_use]
     pub fn hour_plan(&self) -> Plan {
         Plan::new(self.length, self.rate_hz)
     }
@@ -258,7 +253,6 @@ fn add_square(g: &mut DMatrix<f64>, a: &DMatrixView<'_, f64>) {
 impl GramAccumulator {
     /// Sums short segments of `length` samples, and long ones. `coherence` is called with the plan of long segments;
     /// housekeeping follows the columns.
-    #[must_use]
     pub fn new(
         columns: Columns,
         length: usize,
@@ -300,7 +294,6 @@ impl GramAccumulator {
     }
 
     /// The sums.
-    #[must_use]
     pub fn finish(mut self) -> GramSums {
         let bands = self.gathered.sets.iter_mut().flat_map(|set| &mut set.bands);
         bands.for_each(DMatrix::fill_upper_triangle_with_lower_triangle);

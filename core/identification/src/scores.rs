@@ -144,7 +144,6 @@ struct Scores {
 
 impl<'a> CandidateScorer<'a> {
     /// Takes the sums.
-    #[must_use]
     pub fn new(
         candidate_set: &'a CandidateSet,
         gathered: &'a GramSums,
@@ -157,7 +156,6 @@ impl<'a> CandidateScorer<'a> {
     }
 
     /// Bands.
-    #[must_use]
     pub fn plan(&self) -> &Plan {
         &self.plan
     }
@@ -251,7 +249,6 @@ impl<'a> CandidateScorer<'a> {
     }
 
     /// Levels of the mission's noise beside the residual spectra `measured` of some of the sums.
-    #[must_use]
     pub fn levels<'b>(&'b self, fit: &Fit, gram: &Gram, measured: &'b [DMatrix<f64>]) -> Levels<'b> {
         let unknowns = self.candidate_set.unknowns(&fit.added);
         let colours = colours(&unknowns, &fit.estimate.theta);
@@ -260,7 +257,6 @@ impl<'a> CandidateScorer<'a> {
 
     /// The fit under a Σ that has not absorbed the excess of power; none where there is no excess. Under it the cause
     /// of the excess scores high, and so does whatever correlates with the excess by chance.
-    #[must_use]
     pub fn without_excess(&self, fit: &Fit) -> Option<WithoutExcess> {
         let measured = self.residual_psd(fit);
         let mut levels = self.levels(fit, &self.total, &measured);
@@ -275,7 +271,6 @@ impl<'a> CandidateScorer<'a> {
 
     /// The fit under the declared levels of the noise; none where the fit has adopted no other. A level that was fitted
     /// before the candidates has absorbed part of what a gain in the loop does to the power of the noise.
-    #[must_use]
     pub fn with_declared_levels(&self, fit: &Fit) -> Option<Fit> {
         let measured = self.residual_psd(fit);
         let mut levels = self.levels(fit, &self.total, &measured);
@@ -470,7 +465,6 @@ impl<'a> CandidateScorer<'a> {
     }
 
     /// Bands in which the noise absorbs an excess beside a fit.
-    #[must_use]
     pub fn excess_bands(&self, fit: &Fit) -> Vec<bool> {
         let measured = self.residual_psd(fit);
         let mut levels = self.levels(fit, &self.total, &measured);
@@ -479,7 +473,6 @@ impl<'a> CandidateScorer<'a> {
     }
 
     /// The part of a candidate's information under the given `Σ⁻¹` that comes from `bands`.
-    #[must_use]
     pub fn part_in(&self, fit: &Fit, inverses: &[DMatrix<f64>], candidate: &Candidate, bands: &[bool]) -> f64 {
         let kept = self.total.weights.equal_time_weights();
         let weights: Vec<DMatrix<f64>> = inverses.iter().zip(&kept).map(|(w, k)| w * *k).collect();
@@ -520,7 +513,6 @@ impl<'a> CandidateScorer<'a> {
 
     /// Every instance of every effect that is not in the fit, in its best form, the best first; with the number of
     /// forms tried per effect, and the unobservable instances.
-    #[must_use]
     pub fn rank(&self, fit: &Fit) -> Ranked {
         let scores = &fit.scores;
         let (mut tried, mut unobservable) = (BTreeMap::new(), Vec::new());
@@ -572,7 +564,6 @@ impl<'a> CandidateScorer<'a> {
     }
 
     /// A candidate fitted to each half of the data; `None` where it is unobservable in one.
-    #[must_use]
     pub fn held_out(&self, fit: &Fit, candidate: &Candidate) -> Option<Halves> {
         let judge = |set: usize| {
             let (gram, scores) = (&self.gathered.sets[set], &fit.halves[set]);
@@ -593,7 +584,6 @@ impl<'a> CandidateScorer<'a> {
     }
 
     /// Candidates that the data cannot tell from `scored`, and a coefficient of the model that it is degenerate with.
-    #[must_use]
     pub fn confounders(&self, fit: &Fit, scored: &Scored, ranked: &[Scored]) -> Vec<String> {
         let scores = &fit.scores;
         let direction = |s: &Scored| (Self::against(scores, &s.candidate).1.transpose() * &s.value, s.value.clone());
@@ -620,13 +610,11 @@ impl<'a> CandidateScorer<'a> {
     }
 
     /// Cross-spectra of the residuals of a fit per band, over those of white noise of unit PSD: a measured Σ.
-    #[must_use]
     pub fn residual_psd(&self, fit: &Fit) -> Vec<DMatrix<f64>> {
         Self::residual(&self.total, &fit.layout, &fit.columns, &fit.estimate.theta)
     }
 
     /// The same of each half.
-    #[must_use]
     pub fn residual_psd_of_sets(&self, fit: &Fit) -> [Vec<DMatrix<f64>>; 2] {
         let of = |gram: &Gram| Self::residual(gram, &fit.layout, &fit.columns, &fit.estimate.theta);
         self.gathered.sets.each_ref().map(of)

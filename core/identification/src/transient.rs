@@ -158,19 +158,16 @@ struct Prepared {
 impl Search {
     /// Detects `templates` in residuals made by `residual` (channels × base columns); `inverses` are the upper end of
     /// each band, Hz, and `Σ⁻¹` in it.
-    #[must_use]
     pub fn new(templates: Vec<Template>, residual: DMatrix<f64>, inverses: Vec<(f64, DMatrix<f64>)>) -> Self {
         Self { templates, residual, inverses, near_s: NEAR_S[0], threads: 1, prepared: BTreeMap::new() }
     }
 
     /// The same with the templates shared among threads.
-    #[must_use]
     pub fn on(self, threads: usize) -> Self {
         Self { threads: threads.max(1), ..self }
     }
 
     /// The same for samples decimated by `factor`, up to a frequency.
-    #[must_use]
     pub fn thinned(&self, factor: usize, below_hz: f64) -> Self {
         let template = |t: &Template| Template {
             kernel: t.kernel.chunks(factor).map(|c| c.iter().sum::<f64>() / factor as f64).collect(),

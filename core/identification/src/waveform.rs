@@ -15,7 +15,6 @@ pub struct Waveform {
 
 impl Waveform {
     /// Its means over the samples of some rows.
-    #[must_use]
     pub fn over(&self, time_ns: &[i64]) -> Vec<f64> {
         let mean = |now_ns: &i64| {
             let since = (now_ns - self.at_ns + self.step_ns / 2).div_euclid(self.step_ns);
@@ -26,7 +25,6 @@ impl Waveform {
 
     /// `4 ∫ |K|² df` over each band of a plan, K its transform: what all of it, without a window, would add to the
     /// diagonal of the Gram matrix. `averaged` where the columns are means of two samples.
-    #[must_use]
     pub fn energy(&self, plan: &Plan, averaged: bool) -> Vec<f64> {
         let dt_s = plan.rate_hz.recip();
         let power = |hz: f64| {

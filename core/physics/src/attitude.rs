@@ -8,7 +8,6 @@ use crate::frames::skew;
 /// Components in the body frame from components in the parent frame, `T_A^B`:
 /// `1 − 2w[v×] + 2[v×]²`, which keeps the full precision of small angles.
 #[inline]
-#[must_use]
 pub fn dcm(q: &Quaternion<f64>) -> Matrix3<f64> {
     let v = skew(&q.imag());
     Matrix3::identity() - v * (2.0 * q.w) + v * v * 2.0
@@ -16,7 +15,6 @@ pub fn dcm(q: &Quaternion<f64>) -> Matrix3<f64> {
 
 /// `dcm(q) v`, without the matrix: `v − 2w u×v + 2 u×(u×v)`.
 #[inline]
-#[must_use]
 pub fn turn(q: &Quaternion<f64>, v: &Vector3<f64>) -> Vector3<f64> {
     let u = q.imag();
     let t = u.cross(v) * 2.0;
@@ -25,7 +23,6 @@ pub fn turn(q: &Quaternion<f64>, v: &Vector3<f64>) -> Vector3<f64> {
 
 /// Quaternion of a rotation vector, rad.
 #[inline]
-#[must_use]
 pub fn from_rotation_vector(angle_rad: &Vector3<f64>) -> Quaternion<f64> {
     let half = 0.5 * angle_rad.norm();
     // sin(h)/h by its series where the quotient would be 0/0; the next term is below 1e-18 there.
@@ -35,7 +32,6 @@ pub fn from_rotation_vector(angle_rad: &Vector3<f64>) -> Quaternion<f64> {
 
 /// Rotation vector of a unit quaternion, rad: for small angles the rotations about axes 1, 2, 3 of the body frame.
 #[inline]
-#[must_use]
 pub fn rotation_vector(q: &Quaternion<f64>) -> Vector3<f64> {
     let (v, w) = if q.w < 0.0 { (-q.imag(), -q.w) } else { (q.imag(), q.w) };
     let sine = v.norm();
@@ -46,7 +42,6 @@ pub fn rotation_vector(q: &Quaternion<f64>) -> Vector3<f64> {
 /// `q̇ = ½(q ⊗ ω_body − ω_parent ⊗ q)` with both rates against the same third frame, rad/s: `body` in the body frame,
 /// `parent` in the parent frame.
 #[inline]
-#[must_use]
 pub fn derivative(q: &Quaternion<f64>, body: &Vector3<f64>, parent: &Vector3<f64>) -> Quaternion<f64> {
     let (u, difference) = (q.imag(), body - parent);
     let imag = difference * q.w + u.cross(&(body + parent));
@@ -55,7 +50,6 @@ pub fn derivative(q: &Quaternion<f64>, body: &Vector3<f64>, parent: &Vector3<f64
 
 /// A quaternion whose length is one to within `ε`, made one to within `ε²`.
 #[inline]
-#[must_use]
 pub fn unit(q: &Quaternion<f64>) -> Quaternion<f64> {
     q * (1.5 - 0.5 * q.norm_squared())
 }

@@ -172,7 +172,6 @@ impl ControlLaw {
     }
 
     /// The state: that of the controllers, then the delayed commands.
-    #[must_use]
     pub fn state(&self) -> Vec<f64> {
         self.controllers.states().copied().chain(self.waiting.iter().flat_map(Command::numbers)).collect()
     }

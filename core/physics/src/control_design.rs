@@ -144,7 +144,6 @@ pub struct Lag {
 
 impl Lag {
     /// A constant.
-    #[must_use]
     pub fn flat(value: f64) -> Self {
         Self { low: value, high: value, pole_rad_s: WEIGHT_POLE_RAD_S }
     }
@@ -168,7 +167,6 @@ impl Lag {
     }
 
     /// Magnitude at a frequency in rad/s.
-    #[must_use]
     pub fn magnitude(&self, omega: f64) -> f64 {
         let p = self.pole_rad_s;
         // `hypot` does not overflow.
@@ -202,7 +200,6 @@ pub struct Requirement {
 
 impl Requirement {
     /// Allowed ASD at a frequency, m/√Hz or rad/√Hz.
-    #[must_use]
     pub fn asd_at(&self, f_hz: f64) -> f64 {
         self.asd * (1.0 + (self.corner_hz / f_hz).powi(4)).sqrt()
     }
@@ -294,19 +291,16 @@ pub struct Weights {
 
 impl Weights {
     /// `|W_1| = |G F_u/B|` at a frequency in Hz: the design keeps `|S| ≤ 1/|W_1|`.
-    #[must_use]
     pub fn w1(&self, f_hz: f64) -> f64 {
         self.sampling.held_integrators(f_hz).norm() * self.disturbance.magnitude(self.sampling.warped(f_hz))
     }
 
     /// `|W_2|`, s², at a frequency in Hz: the design keeps `|K S| ≤ 1/|W_2|`.
-    #[must_use]
     pub fn w2(&self, f_hz: f64) -> f64 {
         self.effort_s2 * self.w3(f_hz)
     }
 
     /// `|W_3| = |F_y/B|` at a frequency in Hz: the design keeps `|T| ≤ 1/|W_3|`.
-    #[must_use]
     pub fn w3(&self, f_hz: f64) -> f64 {
         self.readout.magnitude(self.sampling.warped(f_hz))
     }
@@ -401,7 +395,6 @@ pub struct Design {
 
 impl Design {
     /// The controllers by channel, as `[control.channel]` holds them.
-    #[must_use]
     pub fn controllers(&self) -> BTreeMap<String, ChannelController> {
         self.channels.iter().map(|c| (c.name.clone(), c.controller.clone())).collect()
     }
@@ -740,7 +733,6 @@ fn forget_time(controller: &ChannelController, dt_s: f64) -> f64 {
 
 /// Spectral radius of a channel's sampled loop with hold and delay: below one if the loop is stable, one for the double
 /// integrator without a controller. `None` if the eigenvalues cannot be found.
-#[must_use]
 pub fn growth_per_sample(controller: &ChannelController, delay_samples: u32, dt_s: f64) -> Option<f64> {
     let delay = delay_samples as usize;
     let order = 2 + delay + 2 * controller.sections.len();
@@ -926,33 +918,28 @@ impl ChannelDesign {
     }
 
     /// Sensitivity `S = 1/(1 + GK)` of the flown loop, hold and delay included, at a frequency below Nyquist, Hz.
-    #[must_use]
     pub fn sensitivity(&self, f_hz: f64) -> C64 {
         self.flown().sensitivity(f_hz)
     }
 
     /// Complementary sensitivity `T = GK/(1 + GK)` of the flown loop at a frequency below Nyquist, Hz.
-    #[must_use]
     pub fn complementary(&self, f_hz: f64) -> C64 {
         self.flown().complementary(f_hz)
     }
 
     /// Open loop `GK` of the flown loop at a frequency below Nyquist, Hz.
-    #[must_use]
     pub fn open_loop(&self, f_hz: f64) -> C64 {
         self.flown().open(f_hz)
     }
 
     /// Predicted ASD of the channel's true state at a frequency below Nyquist, m/√Hz or rad/√Hz: disturbance through
     /// `G S` and readout noise through `T`.
-    #[must_use]
     pub fn predicted_asd(&self, f_hz: f64) -> f64 {
         let (disturbance, noise) = self.flown().shares(f_hz);
         disturbance.hypot(noise) * self.required_asd(f_hz)
     }
 
     /// What the table allows at a frequency, m/√Hz or rad/√Hz.
-    #[must_use]
     pub fn required_asd(&self, f_hz: f64) -> f64 {
         self.model.requirement.asd_at(f_hz)
     }

@@ -14,7 +14,6 @@ impl<T: Copy + Default, const MOST: usize> Few<T, MOST> {
     ///
     /// # Panics
     /// `length` is above `MOST`.
-    #[must_use]
     pub fn from_fn(length: usize, value: impl FnMut(usize) -> T) -> Self {
         let mut out = Self { values: [T::default(); MOST], length };
         out.values[..length].iter_mut().zip((0..length).map(value)).for_each(|(slot, value)| *slot = value);
@@ -31,7 +30,6 @@ impl<T: Copy + Default, const MOST: usize> Few<T, MOST> {
     }
 
     /// Maps each value.
-    #[must_use]
     pub fn map<U: Copy + Default>(&self, mut f: impl FnMut(&T) -> U) -> Few<U, MOST> {
         Few::from_fn(self.length, |i| f(&self.values[i]))
     }

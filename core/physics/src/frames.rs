@@ -3,14 +3,12 @@
 use nalgebra::{Matrix3, Vector3};
 
 /// Skew-symmetric matrix `v×`: `skew(v) * w == v.cross(&w)`.
-#[must_use]
 pub fn skew(v: &Vector3<f64>) -> Matrix3<f64> {
     Matrix3::new(0.0, -v.z, v.y, v.z, 0.0, -v.x, -v.y, v.x, 0.0)
 }
 
 /// Components in a frame turned by `angle_rad` about axis 3, from components in the parent frame:
 /// `R_z(φ) = [[c, s, 0], [−s, c, 0], [0, 0, 1]]`.
-#[must_use]
 pub fn dcm_turned_about_z(angle_rad: f64) -> Matrix3<f64> {
     let (s, c) = angle_rad.sin_cos();
     Matrix3::new(c, s, 0.0, -s, c, 0.0, 0.0, 0.0, 1.0)
@@ -18,7 +16,6 @@ pub fn dcm_turned_about_z(angle_rad: f64) -> Matrix3<f64> {
 
 /// `Ω(ω, α) = [ω×][ω×] + [α×]`, so that a point at `b` fixed in the rotating frame is accelerated by `Ω b`
 /// (below eq:TM_SC_relative_acceleration). Shape 3×3, s⁻².
-#[must_use]
 pub fn omega_matrix(omega_rad_s: &Vector3<f64>, alpha_rad_s2: &Vector3<f64>) -> Matrix3<f64> {
     let w = skew(omega_rad_s);
     w * w + skew(alpha_rad_s2)

@@ -562,7 +562,6 @@ fn covariance_factor(system: &StateSpace) -> Option<Matrix> {
 impl BoundedReal {
     /// Evaluates the inequality of another system of the same order at this certificate's `X`; not negative where the
     /// certificate does not prove the bound for it.
-    #[must_use]
     pub fn largest_eigenvalue_for(&self, system: &StateSpace) -> f64 {
         in_states(system, &self.scaling).map_or(f64::NAN, |system| inequality(&system, self.gamma, &self.x))
     }

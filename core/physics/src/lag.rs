@@ -14,7 +14,6 @@ pub struct Lag {
 
 impl Lag {
     /// A lag of time constant `lag_s` behind a delay, for commands every `dt_s`.
-    #[must_use]
     pub fn new(lag_s: f64, delay_s: f64, dt_s: f64) -> Self {
         let delay = delay_s / dt_s;
         // Rounding must not turn a whole number of samples into the next lower one.
@@ -30,7 +29,6 @@ impl Lag {
     }
 
     /// Whole samples of delay: the age of the newer command of [`Self::step`]; the older one is a sample older.
-    #[must_use]
     pub fn samples(&self) -> usize {
         self.samples
     }

@@ -11,7 +11,6 @@ pub struct Levels {
 
 /// The power response of a second difference to an acceleration that is held over a sample, `cos²(πf dt)`, and to a
 /// readout, `(4 sin²(πf dt)/dt²)²`.
-#[must_use]
 pub fn responses(frequency_hz: f64, dt_s: f64) -> [f64; 2] {
     let (sin, cos) = (std::f64::consts::PI * frequency_hz * dt_s).sin_cos();
     [cos * cos, (4.0 * sin * sin / (dt_s * dt_s)).powi(2)]
@@ -30,7 +29,6 @@ pub struct Bin {
 
 /// Least-squares fit of `a cos² + b (4 sin²/dt²)²` to a spectrum, in relative misfit. Bins without power or weight are
 /// omitted; `None` if none is left.
-#[must_use]
 pub fn fit(bins: &[Bin], dt_s: f64) -> Option<Levels> {
     let used: Vec<([f64; 2], Bin)> = bins
         .iter()

@@ -80,7 +80,6 @@ impl StateSpace {
     }
 
     /// A gain without states, p×m.
-    #[must_use]
     pub fn gain(d: Matrix) -> Self {
         let (p, m) = d.shape();
         Self { a: Matrix::zeros(0, 0), b: Matrix::zeros(0, m), c: Matrix::zeros(p, 0), d }
@@ -88,7 +87,6 @@ impl StateSpace {
 
     /// Single-input single-output quotient of two polynomials in `s` of one length, highest power first, in controllable
     /// canonical form.
-    #[must_use]
     pub fn quotient(numerator: &[f64], denominator: &[f64]) -> Self {
         let n = denominator.len() - 1;
         let lead = denominator[0];
@@ -103,13 +101,11 @@ impl StateSpace {
     }
 
     /// Number of states.
-    #[must_use]
     pub fn order(&self) -> usize {
         self.a.nrows()
     }
 
     /// `C (sI − A)⁻¹ B + D`, p×m; infinite at a pole.
-    #[must_use]
     pub fn response(&self, s: C64) -> DMatrix<C64> {
         let n = self.order();
         let resolvent = DMatrix::from_diagonal_element(n, n, s) - complex(&self.a);
@@ -120,7 +116,6 @@ impl StateSpace {
     }
 
     /// `next · self`: the output of this system drives `next`, whose inputs are as many.
-    #[must_use]
     pub fn then(&self, next: &Self) -> Self {
         let zero = Matrix::zeros(self.order(), next.order());
         Self {
@@ -207,7 +202,6 @@ impl StateSpace {
     }
 
     /// `gain · Π sections(z)` in continuous time, `z = (1 + hs)/(1 − hs)`: the inverse of [`Self::sections`].
-    #[must_use]
     pub fn from_sections(sections: &[[f64; 5]], gain: f64, half_step: f64) -> Self {
         let h = half_step;
         sections.iter().fold(Self::gain(Matrix::from_element(1, 1, gain)), |system, [b0, b1, b2, a1, a2]| {
@@ -302,7 +296,6 @@ fn section(zeros: &[Root], poles: &[Root]) -> [f64; 5] {
 }
 
 /// `Π sections` at a point `z`.
-#[must_use]
 pub fn sections_response(sections: &[[f64; 5]], z: C64) -> C64 {
     sections.iter().fold(C64::from(1.0), |product, [b0, b1, b2, a1, a2]| {
         product * (z * z * *b0 + z * *b1 + *b2) / (z * z + z * *a1 + *a2)

@@ -253,14 +253,12 @@ macro_rules! noise_table {
 
         impl $name {
             /// The lines without their unit.
-            #[must_use]
             pub fn lines(&self) -> Vec<NoiseLine> {
                 let line = |l: &$line| NoiseLine { amplitude: l.$amplitude, frequency_hz: l.frequency_hz };
                 self.lines.iter().map(line).collect()
             }
 
             /// The shape without its unit.
-            #[must_use]
             pub fn shape(&self) -> NoiseShape {
                 let mut shape = NoiseShape::with_corner(self.$key, self.corner_hz, self.exponent);
                 shape.terms.extend(self.terms.iter().map(|t| NoiseTerm {
@@ -722,7 +720,6 @@ impl Mission {
 
     /// The channels in the order of eq:state_variables: the spacecraft's angles, then displacements and angles of each
     /// test mass, `sc.phi`, `sc.theta`, `sc.psi`, `NAME.x`, `NAME.y`, `NAME.z`, `NAME.phi`, `NAME.theta`, `NAME.psi`.
-    #[must_use]
     pub fn channels(&self) -> Vec<String> {
         let angles = ANGLES.map(|angle| format!("{SPACECRAFT}.{angle}"));
         let of = |name: &String| AXES.into_iter().chain(ANGLES).map(|freedom| format!("{name}.{freedom}")).collect();
@@ -730,7 +727,6 @@ impl Mission {
     }
 
     /// Name of the frame ORF of a test mass, `ORF_n` unless the mission gives another; empty without the test mass.
-    #[must_use]
     pub fn frame(&self, name: &str) -> String {
         let numbered = self.test_mass.iter().enumerate().find(|(_, (key, _))| *key == name);
         numbered.map_or_else(String::new, |(i, (_, tm))| tm.frame.clone().unwrap_or_else(|| format!("ORF_{}", i + 1)))
@@ -738,7 +734,6 @@ impl Mission {
 
     /// The two test masses whose housings are surveyed, the one at the end of the baseline first; `None` without a
     /// survey.
-    #[must_use]
     pub fn baseline(&self) -> Option<[&str; 2]> {
         let housing = self.housing.as_ref()?;
         let names: Vec<&str> = self.test_mass.keys().map(String::as_str).collect();
@@ -752,7 +747,6 @@ impl Mission {
     }
 
     /// Name and noise of the best readout of a displacement: `ifo_x` where x has an interferometer, else `is_x`.
-    #[must_use]
     pub fn displacement_noise(&self, test_mass: &TestMass, axis: usize) -> (&'static str, Option<&DisplacementNoise>) {
         let tables = if test_mass.has_interferometer(axis) { INTERFEROMETER } else { INERTIAL_SENSOR };
         (tables[axis], self.noise.displacement(tables[axis]))
@@ -775,7 +769,6 @@ impl Mission {
     }
 
     /// Seconds between epochs of the common grid.
-    #[must_use]
     pub fn dt_s(&self) -> f64 {
         1.0 / self.mission.sample_rate_hz
     }
@@ -826,13 +819,11 @@ impl Thrusters {
 
 impl Spacecraft {
     /// Inertia `J_S`, SRF, kg m².
-    #[must_use]
     pub fn inertia(&self) -> Matrix3<f64> {
         matrix(&self.inertia_srf_kg_m2)
     }
 
     /// `J_S⁻¹`, SRF, kg⁻¹ m⁻².
-    #[must_use]
     pub fn inertia_inverse(&self) -> Matrix3<f64> {
         inverse(self.inertia())
     }
@@ -840,37 +831,31 @@ impl Spacecraft {
 
 impl TestMass {
     /// Whether an interferometer reads an axis, 0 for x.
-    #[must_use]
     pub fn has_interferometer(&self, axis: usize) -> bool {
         self.interferometer.iter().any(|a| *a as usize == axis)
     }
 
     /// Whether the spacecraft follows the test mass along an axis, 0 for x.
-    #[must_use]
     pub fn is_drag_free(&self, axis: usize) -> bool {
         self.drag_free.iter().any(|a| *a as usize == axis)
     }
 
     /// `T_S^O`: components in ORF from components in SRF.
-    #[must_use]
     pub fn dcm_orf_from_srf(&self) -> Matrix3<f64> {
         dcm_turned_about_z(self.orf_from_srf_angle_rad)
     }
 
     /// Nominal offset in ORF, m.
-    #[must_use]
     pub fn offset_nominal_orf_m(&self) -> Vector3<f64> {
         self.dcm_orf_from_srf() * Vector3::from(self.offset_nominal_srf_m)
     }
 
     /// `S_TT`, s⁻².
-    #[must_use]
     pub fn stiffness_tt(&self) -> Matrix3<f64> {
         matrix(&self.stiffness_tt_orf_s2)
     }
 
     /// `S_TR`, m s⁻² rad⁻¹.
-    #[must_use]
     pub fn stiffness_tr(&self) -> Matrix3<f64> {
         matrix(&self.stiffness_tr_orf_m_s2_rad)
     }
@@ -893,13 +878,11 @@ impl TestMass {
     }
 
     /// `S_RT = m J_m⁻¹ S_TRᵀ`, rad s⁻² per m: force and torque come from one potential.
-    #[must_use]
     pub fn stiffness_rt(&self, inertia_inverse: &Matrix3<f64>) -> Matrix3<f64> {
         inertia_inverse * self.stiffness_tr().transpose() * self.mass_kg
     }
 
     /// `S_RR`, s⁻².
-    #[must_use]
     pub fn stiffness_rr(&self) -> Matrix3<f64> {
         matrix(&self.stiffness_rr_orf_s2)
     }
@@ -926,7 +909,6 @@ pub const ANGLES: [&str; 3] = ["phi", "theta", "psi"];
 
 impl Noise {
     /// The noise of a displacement readout by the name of its table, such as `ifo_x`.
-    #[must_use]
     pub fn displacement(&self, table: &str) -> Option<&DisplacementNoise> {
         match table {
             "ifo_x" => self.ifo_x.as_ref(),

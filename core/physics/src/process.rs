@@ -165,13 +165,11 @@ pub struct NoiseProcess {
 
 impl NoiseProcess {
     /// A process of the given shape; its coloured terms are zero until [`Self::start`].
-    #[must_use]
     pub fn new(shape: &NoiseShape, dt_s: f64) -> Self {
         Self::with_lines(shape, &[], dt_s)
     }
 
     /// A process of the given shape, with lines of random phase.
-    #[must_use]
     pub fn with_lines(shape: &NoiseShape, lines: &[NoiseLine], dt_s: f64) -> Self {
         let chain = SampledChain::new(shape, dt_s);
         let prediction = chain.prediction();
@@ -206,7 +204,6 @@ impl NoiseProcess {
     }
 
     /// Prediction of the next sample from the past.
-    #[must_use]
     pub fn slow(&self) -> f64 {
         self.state[0]
     }
@@ -250,7 +247,6 @@ pub struct NoiseBank {
 
 impl NoiseBank {
     /// A bank of processes of one sample interval.
-    #[must_use]
     pub fn new(processes: Vec<NoiseProcess>) -> Self {
         let states = processes.iter().map(|p| p.states).max().unwrap_or(0);
         let deepest = processes.iter().find(|p| p.states == states);
@@ -295,7 +291,6 @@ impl NoiseBank {
     }
 
     /// As [`NoiseProcess::slow`] of one process.
-    #[must_use]
     pub fn slow(&self, process: usize) -> f64 {
         self.state.first().map_or(0.0, |row| row[process])
     }
@@ -334,19 +329,16 @@ impl NoiseBank {
     }
 
     /// Last result of [`Self::next`]; zeros before.
-    #[must_use]
     pub fn samples(&self) -> &[f64] {
         &self.samples
     }
 
     /// The states, for a checkpoint.
-    #[must_use]
     pub fn states(&self) -> Vec<f64> {
         self.state.iter().flatten().chain(self.lines.iter().flat_map(|(_, l)| &l.phase)).copied().collect()
     }
 
     /// Restores [`Self::states`]; false if the length differs.
-    #[must_use]
     pub fn set_states(&mut self, states: &[f64]) -> bool {
         if states.len() != self.processes.len() * self.state.len() + 2 * self.lines.len() {
             return false;

@@ -73,7 +73,6 @@ fn shift(t: &ComplexMatrix, last: usize) -> C64 {
 
 impl Schur {
     /// Schur form of a square matrix; `None` when the iteration does not settle or an entry is not finite.
-    #[must_use]
     pub fn new(m: ComplexMatrix) -> Option<Self> {
         let n = m.nrows();
         if !m.iter().all(|x| x.re.is_finite() && x.im.is_finite()) {
@@ -170,7 +169,6 @@ impl Schur {
 }
 
 /// A real matrix as a complex one.
-#[must_use]
 pub fn complex(m: &Matrix) -> ComplexMatrix {
     m.map(C64::from)
 }
@@ -178,7 +176,6 @@ pub fn complex(m: &Matrix) -> ComplexMatrix {
 /// Eigenvalues of a real square matrix, balanced first; `None` when the iteration does not settle.
 ///
 /// The real Schur form, whose pairs are conjugate to the last bit; the complex one where the real one does not settle.
-#[must_use]
 pub fn eigenvalues(m: &Matrix) -> Option<Vec<C64>> {
     let mut balanced = m.clone();
     balance_parlett_reinsch(&mut balanced);
@@ -194,7 +191,6 @@ pub fn eigenvalues(m: &Matrix) -> Option<Vec<C64>> {
 ///
 /// From the smaller Gram matrix, accurate to about 1e-8 of the largest. (nalgebra's iteration for complex singular
 /// values is unbounded and does not always end.)
-#[must_use]
 pub fn singular_value_range(m: &ComplexMatrix) -> (f64, f64) {
     let size = m.norm();
     if m.is_empty() || size == 0.0 {
@@ -208,7 +204,6 @@ pub fn singular_value_range(m: &ComplexMatrix) -> (f64, f64) {
 }
 
 /// `X` with `Aᵀ X + X A + Q = 0`; `None` when two eigenvalues of `A` add up to zero.
-#[must_use]
 pub fn lyapunov(a: &Matrix, q: &Matrix) -> Option<Matrix> {
     let n = a.nrows();
     let schur = Schur::new(complex(a))?;

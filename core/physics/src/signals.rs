@@ -32,7 +32,6 @@ pub struct Readout {
 
 impl Readout {
     /// Zero readout.
-    #[must_use]
     pub fn zero(test_masses: usize) -> Self {
         let tm = PerTestMass::from_fn(test_masses, |_| TestMassReadout::default());
         Self { sc_crf_rad: Vector3::zeros(), tm, sun_srf: None }
@@ -61,14 +60,12 @@ pub struct Command {
 
 impl Command {
     /// Zero command.
-    #[must_use]
     pub fn zero(test_masses: usize) -> Self {
         let tm = PerTestMass::from_fn(test_masses, |_| TestMassCommand::default());
         Self { tm, ..Self::default() }
     }
 
     /// Whether any component is at its limit or beyond it.
-    #[must_use]
     pub fn reaches(&self, limits: &Actuators) -> bool {
         let reaches = |v: &Vector3<f64>, limit: f64| v.iter().fold(false, |any, x| any | (x.abs() >= limit));
         let tm = self.tm.iter().fold(false, |any, tm| {
@@ -100,7 +97,6 @@ impl Command {
     ///
     /// # Panics
     /// There are fewer than six numbers, or more than those of [`MOST_TEST_MASSES`].
-    #[must_use]
     pub fn from_numbers(numbers: &[f64]) -> Self {
         let vector = |v: &[f64]| Vector3::from_column_slice(v);
         let (thrusters, test_masses) = numbers.split_at(6);

@@ -46,7 +46,6 @@ pub struct Ratio {
 
 impl Spectrum {
     /// Degrees of freedom of one bin away from zero and Nyquist: `psd·dof/truth` follows χ² with as many.
-    #[must_use]
     pub fn dof(&self) -> f64 {
         let k = self.segments as f64;
         2.0 * k / (1.0 + 2.0 * SEGMENT_CORRELATION * (k - 1.0) / k)

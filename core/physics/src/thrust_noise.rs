@@ -29,7 +29,6 @@ pub struct ThrustNoise {
 impl ThrustNoise {
     /// The noise of `[[thrusters.unit]]`, or, without units, of `[noise.thruster_force]` and `[noise.thruster_torque]`.
     /// `None` where the mission has neither.
-    #[must_use]
     pub fn of(mission: &Mission) -> Option<Self> {
         if let Some(thrusters) = mission.thrusters.as_ref().filter(|t| !t.unit.is_empty()) {
             return Some(Self::of_units(&thrusters.unit));

@@ -41,20 +41,17 @@ impl std::error::Error for NoSuchCoefficient {}
 
 impl Available {
     /// Columns, and what a model declares of them.
-    #[must_use]
     pub fn new(columns: Vec<Column>, model: Model) -> Self {
         let Model { coefficients, constraints, noise } = model;
         Self { columns, coefficients, constraints, noise }
     }
 
     /// A column by table and name.
-    #[must_use]
     pub fn column(&self, table: &str, name: &str) -> Option<&Column> {
         self.columns.iter().find(|c| c.table == table && c.name == name)
     }
 
     /// A column by name, in whichever table.
-    #[must_use]
     pub fn find(&self, name: &str) -> Option<&Column> {
         self.columns.iter().find(|c| c.name == name)
     }
@@ -100,7 +97,6 @@ impl Available {
     }
 
     /// A coefficient by name.
-    #[must_use]
     pub fn coefficient(&self, name: &str) -> Option<&Coefficient> {
         self.coefficients.iter().find(|c| c.name == name)
     }

@@ -21,7 +21,6 @@ pub struct Column {
 
 impl Column {
     /// An attribute, empty where there is none.
-    #[must_use]
     pub fn attribute(&self, key: &str) -> &str {
         self.attributes.get(key).map_or("", String::as_str)
     }

@@ -30,7 +30,6 @@ pub struct Manifest {
 impl Manifest {
     /// The places where an effect can act on a mission: the names of [`Self::instances`] with the keys of the mission's
     /// tables, in alphabetical order. Neighbours that name one table are repeated together for each key.
-    #[must_use]
     pub fn instances_on(&self, mission: &serde_json::Value) -> Vec<String> {
         let table = |name: &String| template(name).map(|(_, table, _)| table.to_owned());
         let mut all = Vec::new();
@@ -51,7 +50,6 @@ impl Manifest {
     }
 
     /// Whether there may be a mission on which the effect can act at a place.
-    #[must_use]
     pub fn may_act_at(&self, instance: &str) -> bool {
         self.instances.iter().any(|name| match template(name) {
             None => name == instance,

@@ -65,7 +65,6 @@ pub struct NoiseEstimate {
 
 impl NoiseProcess {
     /// Number of components.
-    #[must_use]
     pub fn size(&self) -> usize {
         let of_channels = self.enters.values().next().map(Vec::len);
         of_channels.or_else(|| self.estimate.as_ref()?.matrix.first().map(Vec::len)).unwrap_or(0)
@@ -173,7 +172,6 @@ pub struct NoiseTerm {
 
 impl NoiseTerm {
     /// States of a shaping filter of this term.
-    #[must_use]
     pub fn states(&self) -> usize {
         self.exponent as usize / 2
     }
@@ -193,13 +191,11 @@ pub struct NoiseShape {
 
 impl NoiseShape {
     /// White noise of the given ASD, unit/√Hz.
-    #[must_use]
     pub fn white(asd: f64) -> Self {
         Self { terms: vec![NoiseTerm { asd, corner_hz: 1.0, exponent: 0 }] }
     }
 
     /// `a·sqrt(1+(corner/f)^exponent)`, unit/√Hz.
-    #[must_use]
     pub fn with_corner(asd: f64, corner_hz: f64, exponent: u32) -> Self {
         let mut shape = Self::white(asd);
         if exponent > 0 && corner_hz > 0.0 {
@@ -209,13 +205,11 @@ impl NoiseShape {
     }
 
     /// One-sided PSD at `frequency_hz` > 0, unit²/Hz.
-    #[must_use]
     pub fn psd(&self, frequency_hz: f64) -> f64 {
         self.terms.iter().map(|t| t.asd * t.asd * (t.corner_hz / frequency_hz).powi(t.exponent.cast_signed())).sum()
     }
 
     /// White part of the one-sided PSD, unit²/Hz.
-    #[must_use]
     pub fn white_psd(&self) -> f64 {
         self.terms.iter().filter(|t| t.exponent == 0).map(|t| t.asd * t.asd).sum()
     }

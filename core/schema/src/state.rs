@@ -187,7 +187,6 @@ enum Direction<'a> {
 
 impl State<'_> {
     /// Whether values are being replaced by those that were saved.
-    #[must_use]
     pub fn is_loading(&self) -> bool {
         matches!(self.0, Direction::Load(_))
     }

@@ -15,7 +15,6 @@ use crate::common::{AXES, TEST_MASSES, manifest, mission, read_srf_vector};
 ///
 /// `alpha_srf_rad_s2` is the mean over an interval and `omega_srf_rad_s` the rate in its middle. The result is the mean
 /// over the interval up to `[α×]² Δt²/12`, which is negligible at the sample rates of drag-free control.
-#[must_use]
 pub fn regressors(
     dcm_orf_from_srf: &Matrix3<f64>,
     alpha_srf_rad_s2: &Vector3<f64>,

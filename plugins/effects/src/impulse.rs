@@ -65,7 +65,6 @@ pub(crate) enum Pulse {
 
 impl Pulse {
     /// Fraction delivered `t` seconds after the beginning.
-    #[must_use]
     pub(crate) fn delivered(self, t: f64) -> f64 {
         match self {
             _ if t <= 0.0 => 0.0,
@@ -82,7 +81,6 @@ impl Pulse {
     }
 
     /// Mean rate over the sample of `dt_s` that begins `since_s` after the pulse's beginning, s⁻¹.
-    #[must_use]
     pub(crate) fn mean(self, since_s: f64, dt_s: f64) -> f64 {
         (self.delivered(since_s + dt_s) - self.delivered(since_s)) / dt_s
     }

@@ -36,7 +36,6 @@ pub struct Lags<const N: usize> {
 
 impl<const N: usize> Lags<N> {
     /// Lags with time constants `lag_s` and sample interval `dt_s`, s; a lag of 0 returns the input.
-    #[must_use]
     pub fn new(lag_s: [f64; N], dt_s: f64) -> Self {
         let x = lag_s.map(|lag| if lag > 0.0 { dt_s / lag } else { f64::INFINITY });
         Self {

@@ -66,7 +66,6 @@ pub(crate) struct Mode {
 
 impl Mode {
     /// A resonance at `f0_hz` with damping ratio `zeta` below 1.
-    #[must_use]
     pub(crate) fn new(f0_hz: f64, zeta: f64, dt_s: f64) -> Self {
         let (omega, damped) = (TAU * f0_hz, TAU * f0_hz * (1.0 - zeta * zeta).sqrt());
         let (decay, (sin, cos)) = ((-zeta * omega * dt_s).exp(), (damped * dt_s).sin_cos());

@@ -118,14 +118,12 @@ impl<const D: usize> Default for Statistics<D> {
 
 impl<const D: usize> Statistics<D> {
     /// Mean NIS per degree of freedom, gated samples excluded; `None` before the end of the warm-up.
-    #[must_use]
     pub fn nis(&self) -> Option<f64> {
         let dof: u64 = self.readouts.iter().sum();
         (dof > 0).then(|| self.nis_sum / dof as f64)
     }
 
     /// Mean square of each readout's innovation against what the mission's noise predicts for the gains in use.
-    #[must_use]
     pub fn design_nis(&self) -> [Option<f64>; D] {
         std::array::from_fn(|i| (self.readouts[i] > 0).then(|| self.design_sum[i] / self.readouts[i] as f64))
     }
@@ -198,7 +196,6 @@ impl<const N: usize, const D: usize> Filter<N, D> {
     ///
     /// # Panics
     /// When `D` is not the model's number of axes, or `N` is no multiple of eight or smaller than `model.states()`.
-    #[must_use]
     pub fn new(model: Model, settings: Settings) -> Self {
         assert_eq!(D, model.axes(), "axes of the model");
         assert!(N.is_multiple_of(8) && model.states() <= N, "{} states do not fit into {N}", model.states());
@@ -610,68 +607,57 @@ impl<const N: usize, const D: usize> Filter<N, D> {
     }
 
     /// The model.
-    #[must_use]
     pub fn model(&self) -> &Model {
         &self.model
     }
 
     /// Counts and consistency.
-    #[must_use]
     pub fn statistics(&self) -> &Statistics<D> {
         &self.statistics
     }
 
     /// `X̂⁺`, its first `model.states()` entries.
-    #[must_use]
     pub fn state(&self) -> &[f64] {
         &self.x[..self.model.states()]
     }
 
     /// Estimates of the coefficients.
-    #[must_use]
     pub fn coefficients(&self) -> &[f64] {
         &self.x[Self::THETA..][..self.model.coefficients.len()]
     }
 
     /// Estimate of the displacement `r`, ORF, m.
-    #[must_use]
     pub fn displacement_m(&self) -> &[f64] {
         &self.x[Self::R..Self::V]
     }
 
     /// `P_k[i][j]`, of `X̂⁻` at the last epoch.
-    #[must_use]
     pub fn covariance(&self, i: usize, j: usize) -> f64 {
         self.p.0[i][j]
     }
 
     /// `Q̂[i][j]`.
-    #[must_use]
     pub fn process_noise(&self, i: usize, j: usize) -> f64 {
         self.q.0[i.min(j)][i.max(j)]
     }
 
     /// `R̂`.
-    #[must_use]
     pub fn readout_noise(&self) -> &Square<D> {
         &self.r
     }
 
     /// Covariance of coefficients `i` and `j` as the recursion has it, before the last epoch's readout.
-    #[must_use]
     pub fn recursion_covariance(&self, i: usize, j: usize) -> f64 {
         self.p.0[Self::THETA + i][Self::THETA + j]
     }
 
     /// Covariance of coefficients `i` and `j` for the gains in use and the mission's noise, before the last epoch's
     /// readout.
-    #[must_use]
     pub fn coefficient_covariance(&self, i: usize, j: usize) -> f64 {
         self.design_covariance().0[Self::THETA + i][Self::THETA + j]
     }
 
     /// Whether a track has been found.
-    #[must_use]
     pub fn is_tracking(&self) -> bool {
         self.tracking
     }

@@ -32,7 +32,6 @@ pub struct Matrix<const N: usize>(pub Box<[[f64; N]; N]>);
 
 impl<const N: usize> Matrix<N> {
     /// All zero.
-    #[must_use]
     pub fn zero() -> Self {
         Self(Box::new([[0.0; N]; N]))
     }
@@ -120,7 +119,6 @@ impl<const N: usize, const D: usize> Transition<N, D> {
     pub const THETA: usize = 3 * D;
 
     /// The transition of a model, regressors zero.
-    #[must_use]
     pub fn new(model: &Model) -> Self {
         let mut outputs: [Vec<usize>; D] = std::array::from_fn(|axis| vec![Self::R + axis]);
         let mut decay = Box::new([1.0; N]);
@@ -186,13 +184,11 @@ impl<const N: usize, const D: usize> Transition<N, D> {
     }
 
     /// `H x` for a column.
-    #[must_use]
     pub fn observe(&self, x: &[f64; N]) -> [f64; D] {
         std::array::from_fn(|axis| self.outputs[axis].iter().map(|&i| x[i]).sum())
     }
 
     /// `P Hᵀ` of a symmetric `P`.
-    #[must_use]
     pub fn observed(&self, p: &Matrix<N>) -> Columns<N, D> {
         let mut c = [[0.0; N]; D];
         for (column, outputs) in c.iter_mut().zip(&self.outputs) {
@@ -204,7 +200,6 @@ impl<const N: usize, const D: usize> Transition<N, D> {
     }
 
     /// `H C` for the columns `C`.
-    #[must_use]
     pub fn observed_twice(&self, c: &Columns<N, D>) -> Square<D> {
         std::array::from_fn(|i| std::array::from_fn(|j| self.outputs[i].iter().map(|&s| c[j][s]).sum()))
     }
@@ -249,7 +244,6 @@ impl<const N: usize, const D: usize> Transition<N, D> {
     }
 
     /// `A C` for the columns `C`.
-    #[must_use]
     pub fn columns(&self, c: &Columns<N, D>) -> Columns<N, D> {
         let mut moved = *c;
         for column in &mut moved {
@@ -267,7 +261,6 @@ pub fn add_noise<const N: usize>(apa: &mut Matrix<N>, q: &Matrix<N>, entries: &[
 }
 
 /// `Σ_d weight[c][d] columns[d]`.
-#[must_use]
 #[inline]
 pub fn mix<const N: usize, const D: usize>(weight: &Square<D>, columns: &Columns<N, D>) -> Columns<N, D> {
     let mut mixed = [[0.0; N]; D];
@@ -343,7 +336,6 @@ pub fn advance_joseph<const N: usize, const D: usize>(
 
 /// Inverse of a symmetric positive definite matrix over the readouts in `used`, zero elsewhere; `None` when it is not
 /// positive definite. A readout that is not used so drops out of `K = P Hᵀ S⁻¹` and of everything made from it.
-#[must_use]
 pub fn inverse<const D: usize>(s: &Square<D>, used: [bool; D]) -> Option<Square<D>> {
     // LDLᵀ with unused readouts replaced by the unit matrix; `l` below its diagonal of ones.
     let mut l = [[0.0; D]; D];

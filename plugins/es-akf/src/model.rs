@@ -60,19 +60,16 @@ pub struct Model {
 
 impl Model {
     /// Number of axes that are followed, three of each test mass.
-    #[must_use]
     pub fn axes(&self) -> usize {
         self.readout_m2.len()
     }
 
     /// First state of the coefficients, after displacements, velocities and bias accelerations.
-    #[must_use]
     pub fn theta(&self) -> usize {
         3 * self.axes()
     }
 
     /// Number of states, `3D + m + 2 per torque noise + s`.
-    #[must_use]
     pub fn states(&self) -> usize {
         self.first_chain() + self.chains.iter().flatten().map(Chain::states).sum::<usize>()
     }

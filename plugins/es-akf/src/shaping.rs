@@ -22,7 +22,6 @@ pub struct Chain {
 
 impl Chain {
     /// The chain of one coloured term, leaking below `leak_hz`, sampled every `dt_s`.
-    #[must_use]
     pub fn new(term: &NoiseTerm, leak_hz: f64, dt_s: f64) -> Self {
         let states = (term.exponent / 2) as usize;
         let tau = std::f64::consts::TAU;
@@ -46,13 +45,11 @@ impl Chain {
     }
 
     /// Decay of each state over one step.
-    #[must_use]
     pub fn decay(&self) -> f64 {
         self.transition.first().copied().unwrap_or(1.0)
     }
 
     /// Number of states.
-    #[must_use]
     pub fn states(&self) -> usize {
         self.transition.len()
     }
@@ -86,7 +83,6 @@ impl TorqueNoiseShaping {
 
     /// What is left of white noise that acts with `lever_m_s2` (1σ, held for a step) by sensing whose noise crosses it
     /// at `crossover_rad_s`, the fourth root of the ratio of the two PSDs, `q/r`.
-    #[must_use]
     pub fn new(lever_m_s2: Vec<f64>, crossover_rad_s: f64, dt_s: f64) -> Self {
         // With s = 2 − z − z⁻¹ the denominator is ρ s² + q (4 − s)/4, ρ = r/dt⁴: two roots s, each of a pair z, 1/z.
         let ratio = (crossover_rad_s * dt_s).powi(4);
@@ -106,25 +102,21 @@ impl TorqueNoiseShaping {
     }
 
     /// Transition of `y, d` over one step.
-    #[must_use]
     pub fn transition(&self) -> [[f64; 2]; 2] {
         [[1.0, self.mu], [-self.mu, 1.0 - self.beta]]
     }
 
     /// What one deviate adds to `y, d` in a step.
-    #[must_use]
     pub fn drive(&self) -> [f64; 2] {
         [self.beta, self.mu - self.beta * self.beta / self.mu]
     }
 
     /// The transition as a diagonal and two shears after it: `y += first · d`, then `d += second · y`.
-    #[must_use]
     pub fn factors(&self) -> ([f64; 2], [f64; 2]) {
         ([1.0, self.decay], [self.mu / self.decay, -self.mu])
     }
 
     /// Stationary covariance of `y, d`: the solution of `Σ = A Σ Aᵀ + g gᵀ`.
-    #[must_use]
     pub fn stationary(&self) -> [[f64; 2]; 2] {
         let ([[a, b], [c, d]], [g, h]) = (self.transition(), self.drive());
         // Unknowns yy, yd, dd.

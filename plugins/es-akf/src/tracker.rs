@@ -127,7 +127,6 @@ pub const MAX_STATES: usize = 64;
 /// `None` for more than [`MAX_STATES`] states or more than three test masses.
 ///
 /// Code is made for each pair of sizes, so that the compiler unrolls and vectorises the covariance passes.
-#[must_use]
 pub fn follow(model: Model, settings: Settings, snapshot_s: f64) -> Option<Box<dyn Follower>> {
     let with = match (model.axes(), model.states()) {
         (3, ..=16) => boxed::<16, 3>,
@@ -190,7 +189,6 @@ pub struct Tracker<const N: usize, const D: usize = 3> {
 
 impl<const N: usize, const D: usize> Tracker<N, D> {
     /// A filter before its first epoch, with a row for the archive every `snapshot_s`.
-    #[must_use]
     pub fn new(filter: Filter<N, D>, snapshot_s: f64) -> Self {
         let dt_s = filter.model().dt_s;
         let snapshot_epochs = ((snapshot_s / dt_s).round() as u64).max(1);
@@ -198,7 +196,6 @@ impl<const N: usize, const D: usize> Tracker<N, D> {
     }
 
     /// The filter.
-    #[must_use]
     pub fn filter(&self) -> &Filter<N, D> {
         &self.filter
     }

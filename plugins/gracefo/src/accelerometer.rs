@@ -31,7 +31,6 @@ const MIN_SIGNAL_RATIO: f64 = 10.0;
 const AXES: [&str; 3] = ["x", "y", "z"];
 
 /// Acceleration of a free mass relative to its housing, ORF, m s⁻², from the measured one, SRF, m s⁻².
-#[must_use]
 pub fn channel_orf_m_s2(orf_from_srf: &Matrix3<f64>, measured_srf_m_s2: &Vector3<f64>) -> Vector3<f64> {
     -(orf_from_srf * measured_srf_m_s2)
 }
@@ -120,7 +119,6 @@ impl BlockDifferences {
     }
 
     /// Per axis, the largest ratio of the mean square to that of noise over all block lengths with enough differences.
-    #[must_use]
     pub fn ratio_to_noise(&self, noise_block_differences: &[f64; LEVELS]) -> Option<[f64; 3]> {
         let ratios =
             self.levels.iter().zip(noise_block_differences).filter(|(level, _)| level.count >= MIN_DIFFERENCES);
@@ -132,7 +130,6 @@ impl BlockDifferences {
 
 /// Mean square of the differences of noise alone, per block length of m samples:
 /// `∫ S(f) 4 sin⁴(π f m dt) / (m² sin²(π f dt)) df` up to Nyquist.
-#[must_use]
 pub fn noise_block_differences(noise: &NoiseShape, dt_s: f64) -> [f64; LEVELS] {
     // Resolves the finest oscillation of the longest block by four points.
     const N: u32 = 1 << (LEVELS + 1);

@@ -97,7 +97,6 @@ pub struct Wiener {
 
 impl Wiener {
     /// A filter for samples `step_ns` apart and the noise spectrum `noise`, (rad s⁻²)²/Hz.
-    #[must_use]
     pub fn new(noise: NoiseShape, step_ns: i64) -> Self {
         Self { noise, rate_hz: 1e9 / step_ns as f64, step_ns, state: State::default() }
     }
@@ -156,7 +155,6 @@ impl Wiener {
     }
 
     /// Numbers of rows so far.
-    #[must_use]
     pub fn counts(&self) -> Counts {
         self.state.counts
     }

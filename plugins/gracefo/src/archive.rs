@@ -25,7 +25,6 @@ pub struct Member {
 
 impl Member {
     /// Parses a file name; `None` for other products, files of both spacecraft (`Y`), reports and stray files.
-    #[must_use]
     pub fn from_name(name: &str) -> Option<Self> {
         let mut parts = name.strip_suffix(".txt")?.split('_');
         let (code, date, spacecraft, release) = (parts.next()?, parts.next()?, parts.next()?, parts.next()?);
@@ -77,7 +76,6 @@ impl Container {
     }
 
     /// Path as given.
-    #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }

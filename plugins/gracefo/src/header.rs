@@ -98,7 +98,6 @@ impl Header {
     }
 
     /// Index of a variable.
-    #[must_use]
     pub fn index(&self, name: &str) -> Option<usize> {
         self.variables.iter().position(|v| v.name == name)
     }

@@ -72,7 +72,6 @@ impl Window {
     pub const ALL: Self = Self { start_ns: i64::MIN, end_ns: i64::MAX };
 
     /// Whether a time is inside.
-    #[must_use]
     pub const fn contains(self, time_ns: i64) -> bool {
         self.start_ns <= time_ns && time_ns < self.end_ns
     }

@@ -33,7 +33,6 @@ pub enum Quantity {
 
 impl Quantity {
     /// (unit in the file, SI unit, scale, offset): SI value = scale · value + offset.
-    #[must_use]
     pub const fn units(self) -> (&'static str, &'static str, f64, f64) {
         match self {
             Self::Acceleration => ("m/s2", "m s-2", 1.0, 0.0),
@@ -80,13 +79,11 @@ pub struct Product {
 
 impl Product {
     /// Level 1A keeps the time tags of the on-board receiver; Level 1B is on GPS time.
-    #[must_use]
     pub fn on_receiver_time(&self) -> bool {
         self.code.ends_with("1A")
     }
 
     /// Names of the product's tables, one per instrument: `acc1a`, or `sca1a_1`, `sca1a_2`, `sca1a_3`.
-    #[must_use]
     pub fn tables(&self) -> Vec<String> {
         let name = self.code.to_lowercase();
         match self.instrument {
@@ -249,7 +246,6 @@ pub static PRODUCTS: [Product; 11] = [
 ];
 
 /// Product with a code, as in file names.
-#[must_use]
 pub fn find(code: &str) -> Option<&'static Product> {
     PRODUCTS.iter().find(|p| p.code == code)
 }

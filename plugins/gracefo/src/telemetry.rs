@@ -224,7 +224,6 @@ impl Telemetry {
     }
 
     /// Counts and losses so far.
-    #[must_use]
     pub fn log(&self) -> &Log {
         &self.state.log
     }

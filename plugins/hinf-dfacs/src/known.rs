@@ -69,7 +69,6 @@ impl KnownModel {
     /// `sun_srf` is the unit vector from the Sun, `None` where sunlight is not modelled; `omega_srf_rad_s` is relative
     /// to IRF. By the stiffness term `û` contains the readout noise `S n`, small against `n̈` of the second difference of
     /// the same readout by the ratio `S/(2πf)²`.
-    #[must_use]
     pub fn motion(
         &self,
         command: &Command,

@@ -19,7 +19,6 @@ type Rows = BTreeMap<String, Vec<f64>>;
 
 /// Every noise process in the channels `TM.accel.AXIS` and `sc.alpha.AXIS`. `readouts` names, per test mass, the noise
 /// tables of the instruments that read its x, y and z, such as `ifo_x` or `is_x`.
-#[must_use]
 pub fn declared(mission: &Mission, readouts: &[[&str; 3]]) -> Vec<NoiseProcess> {
     let thrusters = ThrustNoise::of(mission);
     let mut thrust = DMatrix::zeros(3 * mission.test_mass.len(), 3);

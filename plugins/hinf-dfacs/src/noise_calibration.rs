@@ -32,14 +32,12 @@ pub struct NoiseScale {
 
 impl NoiseScale {
     /// The levels of the mission file.
-    #[must_use]
     pub fn nominal() -> Self {
         Self { torque: Vector3::repeat(1.0), sensing: 1.0 }
     }
 }
 
 /// Number of epochs of the interval.
-#[must_use]
 pub fn length(rate_hz: f64) -> usize {
     (LENGTH_S * rate_hz).round() as usize
 }
@@ -47,7 +45,6 @@ pub fn length(rate_hz: f64) -> usize {
 /// Measures the levels from the attitude channels, SRF, rad s⁻², which do not depend on the weight.
 /// `held` and `readout` are the one-sided PSDs of the mission file, rad² s⁻⁴/Hz per axis of SRF and rad²/Hz. Nominal
 /// where the longest run without a hole is shorter than eight segments.
-#[must_use]
 pub fn measure(channels: &[[f64; 3]], rate_hz: f64, held: &Vector3<f64>, readout: f64) -> NoiseScale {
     let whole = |row: &[f64; 3]| row.iter().all(|x| x.is_finite());
     let runs = channels.chunk_by(|a, b| whole(a) == whole(b)).filter(|run| whole(&run[0]));

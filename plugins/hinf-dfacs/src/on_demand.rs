@@ -37,7 +37,6 @@ pub struct Needs {
 
 impl Needs {
     /// Whether any column is a derivative of the smoothed `α̂`.
-    #[must_use]
     pub fn responses(&self) -> bool {
         self.torque_response || self.dws_delay_response
     }

@@ -84,7 +84,6 @@ impl Epoch {
 }
 
 /// Values in a row of the `reconstruction` table, of a mission with so many test masses.
-#[must_use]
 pub fn row_length(test_masses: usize) -> usize {
     9 + 9 * test_masses
 }
@@ -103,7 +102,6 @@ pub struct Row {
 
 impl Row {
     /// The channels of the spacecraft's attitude, `sc.alpha`, rad s⁻².
-    #[must_use]
     pub fn attitude_channels(&self) -> [f64; 3] {
         let values = &self.values[self.values.len() - 3..];
         [values[0], values[1], values[2]]
@@ -247,7 +245,6 @@ fn model(mission: &Mission, noise: &ThrustNoise, settings: &Settings) -> Result<
 
 /// One-sided PSDs of the mission file: what the thrusters' torque does to the angular acceleration about each axis of
 /// SRF, rad² s⁻⁴/Hz, and the white part of the attitude's sensing, rad²/Hz; `None` where it tells neither.
-#[must_use]
 pub fn levels_of(mission: &Mission) -> Option<(Vector3<f64>, f64)> {
     let noise = ThrustNoise::of(mission)?;
     let inverse = mission.spacecraft.inertia_inverse();
@@ -529,37 +526,31 @@ impl Reconstruction {
     }
 
     /// Name, unit and frame of the columns on demand.
-    #[must_use]
     pub fn on_demand_columns(&self) -> Vec<(String, &'static str, String)> {
         self.on_demand.as_ref().map(OnDemand::columns).unwrap_or_default()
     }
 
     /// What happened to how many epochs.
-    #[must_use]
     pub fn counts(&self) -> Counts {
         self.counts
     }
 
     /// See [`Smoother::innovation_ratio`].
-    #[must_use]
     pub fn innovation_ratio(&self) -> Option<[f64; 3]> {
         self.smoother.innovation_ratio()
     }
 
     /// See [`Smoother::inconsistency_sigma`].
-    #[must_use]
     pub fn inconsistency_sigma(&self) -> Option<[f64; 3]> {
         self.smoother.inconsistency_sigma()
     }
 
     /// Replayed against telemetered commands; `None` where nothing was compared.
-    #[must_use]
     pub fn comparison(&self) -> Option<&Comparison> {
         self.replay.as_ref().map(Replay::comparison).filter(|c| c.samples() > 0)
     }
 
     /// Samples by which a row is late at least; at most twice as many.
-    #[must_use]
     pub fn lag(&self) -> usize {
         self.smoother.model().lag()
     }

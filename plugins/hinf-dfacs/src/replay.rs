@@ -12,7 +12,6 @@ pub type CommandNumbers = Few<f64, { 6 + 6 * MOST_TEST_MASSES }>;
 pub type ReadoutNumbers = Few<f64, { 3 + 6 * MOST_TEST_MASSES }>;
 
 /// Name, unit and frame of the vectors of a command.
-#[must_use]
 pub fn command_vectors(mission: &Mission) -> Vec<(String, &'static str, String)> {
     let thrusters = [("mps_force_srf_n", "N"), ("mps_torque_srf_nm", "N m")];
     let mut all: Vec<_> = thrusters.map(|(name, unit)| (name.to_owned(), unit, "SRF".to_owned())).into();
@@ -130,38 +129,32 @@ impl Comparison {
     }
 
     /// Samples compared.
-    #[must_use]
     pub fn samples(&self) -> u64 {
         self.samples
     }
 
     /// Root mean square length of the difference of each of [`command_vectors`], N or N m.
-    #[must_use]
     pub fn rms_distance(&self) -> Vec<f64> {
         rms(&self.squares, self.samples)
     }
 
     /// Length of the mean difference of each of [`command_vectors`] since the last restart, N or N m: what a constant
     /// in the telemetered controllers' integrators amounts to.
-    #[must_use]
     pub fn mean_distance(&self) -> Vec<f64> {
         self.mean.chunks_exact(3).map(|m| m.iter().map(|m| m * m).sum::<f64>().sqrt()).collect()
     }
 
     /// Root mean square length of the telemetered command, N or N m.
-    #[must_use]
     pub fn rms_flown(&self) -> Vec<f64> {
         rms(&self.flown_squares, self.samples)
     }
 
     /// Root mean square length of the telemetered command's change from one sample to the next, N or N m.
-    #[must_use]
     pub fn rms_change(&self) -> Vec<f64> {
         rms(&self.change_squares, self.changes)
     }
 
     /// False when readout noise cannot explain the distance: another controller flew.
-    #[must_use]
     pub fn same_law(&self) -> bool {
         self.rms_distance().iter().zip(self.rms_change()).all(|(distance, change)| *distance <= SAME_LAW * change)
     }

@@ -58,7 +58,6 @@ impl Model {
     /// Builds the model from the one-sided PSD of the angular acceleration by the torque noise, `J⁻¹ S_M J⁻ᵀ` (SRF,
     /// rad² s⁻⁴/Hz), the noise of the attitude readout per axis (rad), and the sample interval. Of the readout's terms
     /// those of exponent 0, 2 and 4 are in the model.
-    #[must_use]
     pub fn new(disturbance_psd: &Matrix3<f64>, readout: &NoiseShape, dt_s: f64) -> Self {
         let eigen = disturbance_psd.symmetric_eigen();
         // A one-sided PSD S, sampled at f_s, has the variance S f_s/2.
@@ -89,13 +88,11 @@ impl Model {
     }
 
     /// Memory of the filter, samples to `1/e`; information on `w` comes from readouts within it.
-    #[must_use]
     pub fn memory(&self) -> f64 {
         self.memory
     }
 
     /// Lag of the result, samples.
-    #[must_use]
     pub fn lag(&self) -> usize {
         self.lag
     }
@@ -113,7 +110,6 @@ fn decay_rad_s(a: f64, b: f64) -> f64 {
 ///
 /// `R = S_w − W S_w`, `W = S_w/(S_w + g S_n)`, with `S_w = cos²(πfΔt) disturbance_psd`, `g = (2 sin(πfΔt)/Δt)⁴`. In
 /// SRF the same holds with matrices, `S_w = cos² J⁻¹ S_M J⁻ᵀ` and `W = S_w (S_w + g S_n 1)⁻¹`.
-#[must_use]
 pub fn residual_psd(frequency_hz: f64, disturbance_psd: f64, readout_psd: f64, dt_s: f64) -> f64 {
     let (s, c) = (0.5 * TAU * frequency_hz * dt_s).sin_cos();
     let disturbance = c * c * disturbance_psd;
@@ -226,7 +222,6 @@ pub struct Smoother {
 
 impl Smoother {
     /// Starts before any data.
-    #[must_use]
     pub fn new(model: Model) -> Self {
         let [theta, omega, beta] = PRIOR.map(|sigma| [sigma * sigma; 3]);
         let zero = [0.0; 3];
@@ -242,7 +237,6 @@ impl Smoother {
     }
 
     /// The model.
-    #[must_use]
     pub fn model(&self) -> &Model {
         &self.model
     }
@@ -324,7 +318,6 @@ impl Smoother {
 
     /// Number of epochs that wait for later data. At twice the lag, [`Self::smooth`] the first half; blocks count from
     /// the first epoch, so results do not depend on batches.
-    #[must_use]
     pub fn waiting(&self) -> usize {
         self.steps.len()
     }
@@ -337,7 +330,6 @@ impl Smoother {
     }
 
     /// Smoothed values of the `count` oldest waiting epochs, with all data so far.
-    #[must_use]
     pub fn smoothed(&self, count: usize) -> Vec<Smoothed> {
         self.backward(count, |k| {
             let step = &self.steps[k];
@@ -438,14 +430,12 @@ impl Smoother {
 
     /// Normalised innovation squared per principal axis: 1 if torque and sensing noise are as in the mission file.
     /// `None` before any readout.
-    #[must_use]
     pub fn innovation_ratio(&self) -> Option<[f64; 3]> {
         (self.innovations > 0).then(|| self.innovation_squares.map(|s| s / self.innovations as f64))
     }
 
     /// Score of the known accelerations per principal axis, a standard normal deviate if they acted as stated. `None`
     /// before enough readouts.
-    #[must_use]
     pub fn inconsistency_sigma(&self) -> Option<[f64; 3]> {
         let o = &self.command_consistency;
         let z = std::array::from_fn(|i| o.products[i] / o.squares[i].sqrt());

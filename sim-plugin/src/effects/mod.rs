@@ -149,13 +149,11 @@ impl Effects {
     }
 
     /// Whether the mission's thruster noise along the axes is replaced.
-    #[must_use]
     pub fn replace_thruster_noise(&self) -> bool {
         self.0.iter().any(|active| active.cause.replaces_thruster_noise())
     }
 
     /// Whether the geometry changes with time.
-    #[must_use]
     pub fn moves(&self) -> bool {
         self.0.iter().any(|active| active.cause.moves())
     }
@@ -194,13 +192,11 @@ impl Effects {
     }
 
     /// The states, for a checkpoint.
-    #[must_use]
     pub fn save(&self) -> Vec<Saved> {
         self.0.iter().map(|a| Saved { rng: a.rng.clone(), states: a.cause.states() }).collect()
     }
 
     /// Restores [`Self::save`]; false for a state of other effects.
-    #[must_use]
     pub fn load(&mut self, saved: &[Saved]) -> bool {
         saved.len() == self.0.len()
             && self.0.iter_mut().zip(saved).all(|(active, saved)| {

@@ -71,7 +71,6 @@ pub enum Instrument {
 
 impl Place {
     /// Name of the instance in a mission with these test masses.
-    #[must_use]
     pub fn name(self, test_masses: &[String]) -> String {
         match self {
             Self::Spacecraft => "sc".to_owned(),

@@ -39,13 +39,11 @@ impl Ephemeris {
     }
 
     /// First and last time, TDB seconds past J2000.
-    #[must_use]
     pub fn span_s(&self) -> (f64, f64) {
         self.span_s
     }
 
     /// UTC to TDB.
-    #[must_use]
     pub fn leap_seconds(&self) -> &LeapSeconds {
         &self.leap_seconds
     }

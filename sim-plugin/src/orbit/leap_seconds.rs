@@ -57,7 +57,6 @@ impl LeapSeconds {
     }
 
     /// `TDB − UTC` at a time, s.
-    #[must_use]
     pub fn tdb_minus_utc_s(&self, unix_ns: i64) -> f64 {
         let unix_s = unix_ns.div_euclid(1_000_000_000);
         let entry = self.delta_at.partition_point(|(from, _)| *from <= unix_s).saturating_sub(1);
@@ -69,7 +68,6 @@ impl LeapSeconds {
     }
 
     /// TDB seconds past J2000, with the resolution of a double.
-    #[must_use]
     pub fn et_s(&self, unix_ns: i64) -> f64 {
         since_j2000_s(unix_ns) + self.tdb_minus_utc_s(unix_ns)
     }

@@ -412,7 +412,6 @@ impl Program {
     }
 
     /// Names of the columns that [`Self::push`] takes, in order.
-    #[must_use]
     pub fn names(&self) -> &[String] {
         &self.names
     }

@@ -30,7 +30,6 @@ impl TextError {
     }
 
     /// The message, the formula below it, and a caret below the position.
-    #[must_use]
     pub fn marked(&self, text: &str) -> String {
         let before = text.get(..self.at).map_or(0, |before| before.chars().count());
         let line: String = text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect();
