@@ -11,9 +11,8 @@
 //! inverse of a polynomial of second degree. What is slower than 3 mHz, constant and drifting accelerations above all,
 //! is taken out of channels and regressors by the same causal filter.
 //!
-//! Channels are taken one by one. That costs efficiency, and truth only for regressors made of commands, which know the
-//! other channels' past (`es-gain` −0.30 ± 0.09, `mps-gain` 0.09 ± 0.03 where there is none): for those this is no
-//! check. The covariance is that of the blocks' scatter.
+//! Channels are taken one by one, which costs efficiency. Regressors made of commands depend on the other channels'
+//! past, so that this fit is biased for them and no check. The covariance is that of the blocks' scatter.
 
 use dragfree_physics::levels::{self, Bin, Levels};
 use nalgebra::{Cholesky, DMatrix, DVector};

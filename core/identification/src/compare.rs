@@ -9,19 +9,15 @@
 //! Every channel has five tests, each at [`dragfree_schema::Settings::false_alarm`] over the number of all tests
 //! (Bonferroni): `level`, `bands`, `hours`, `cumulative` and `ljung-box`; see [`Test`].
 //!
-//! **Null combinations.** A force on the spacecraft moves it under every test mass: with a the spacecraft's
-//! acceleration, the channels of mass i hold `A_i a`, whose columns are those of the processes `thruster_force` of Σ.
-//! From each mass alone a is `A_i⁺ z_i`, so that `A_1⁺ z_1 − A_2⁺ z_2` is free of it: a null space of the thrusters of
-//! three dimensions, and its axes are those of the spacecraft; their mean is the acceleration *common* to both. No
-//! thrust, commanded or not, no solar pressure and no wrong gain of a thruster reaches these. What does act on one mass
-//! alone, or on its readout. So a model that fails in the channels and not in the null combinations has its fault in
-//! the forces on the spacecraft.
+//! **Null combinations.** An acceleration a of the spacecraft appears in the channels of mass i as `A_i a`; the columns
+//! of `A_i` are those of the processes `thruster_force` of Σ. `A_1⁺ z_1 − A_2⁺ z_2` is free of a, and the mean of the
+//! two is the *common* acceleration. A model that fails in the channels and not in the null combinations has its fault
+//! in the forces on the spacecraft.
 
 use std::collections::BTreeMap;
 use std::f64::consts::PI;
 use std::ops::Range;
 
-use dragfree_estimation::estimate::EstimateError;
 use dragfree_estimation::estimate::colours;
 use dragfree_estimation::levels::Levels;
 use dragfree_estimation::sigma::NoiseModel;
@@ -31,7 +27,7 @@ use serde::Serialize;
 
 use crate::coherence::{Coherence, StepwiseCoherence};
 use crate::distributions::{chi2_per_dof_quantile, chi2_tails, corrected, kolmogorov, two_sided};
-use crate::scores::CandidateScorer;
+use crate::scores::{CandidateScorer, IdentificationError};
 
 /// Lags of the portmanteau test. Bands are 1/16 of their frequency wide: the cosine of a longer lag turns round within
 /// one.
@@ -244,27 +240,6 @@ pub struct Comparison {
     pub together: Vec<StepwiseCoherence>,
 }
 
-/// Why there is no comparison.
-#[derive(Debug, thiserror::Error)]
-pub enum CompareError {
-    /// Nothing can be fitted.
-    #[error(transparent)]
-    Estimate(#[from] EstimateError),
-    /// Too little data.
-    #[error(
-        "a comparison needs at least {needed} segments of {segment_s:.0} s without a gap, and there are {segments:.2}: \
-         give more telemetry, or several products"
-    )]
-    TooShort {
-        /// Segments that are needed.
-        needed: f64,
-        /// Segments there are.
-        segments: f64,
-        /// Their length.
-        segment_s: f64,
-    },
-}
-
 /// Measured over predicted power per band, with the complex observations behind it.
 #[derive(Clone, Debug)]
 struct Ratios {
@@ -290,12 +265,12 @@ impl Ratios {
 /// products.
 ///
 /// # Errors
-/// [`CompareError`]: too little data, or a model that cannot be fitted.
+/// [`IdentificationError`]: too little data, or a model that cannot be fitted.
 pub fn compare(
     scorer: &CandidateScorer<'_>,
     nis: Option<Nis>,
     innovations: Vec<Innovations>,
-) -> Result<Comparison, CompareError> {
+) -> Result<Comparison, IdentificationError> {
     let (gathered, names, settings) = (scorer.gathered, &scorer.candidate_set.channels, scorer.settings);
     // The hours and their sum are of segments of one length, whatever else was gathered.
     let plan = &gathered.hour_plan();
@@ -303,13 +278,9 @@ pub fn compare(
     let mut whole = Spectra::zero(plan.bands.len(), base);
     gathered.hours.iter().for_each(|h| whole.add(&h.spectra));
     let whole_observations = observations(&whole, plan);
-    let segment_s = gathered.length as f64 / gathered.rate_hz;
     // The lowest band is seen by segments of full length alone, one observation each.
     let lowest = plan.bands.first().map_or(1, |b| b.bins()) as f64;
-    let segments = whole_observations.first().map_or(0.0, |n| n / lowest);
-    if segments < settings.min_segments {
-        return Err(CompareError::TooShort { needed: settings.min_segments, segments, segment_s });
-    }
+    scorer.require("comparison", whole_observations.first().map_or(0.0, |n| n / lowest))?;
     let fit = scorer.fit(&[])?;
     let residual = residual(scorer, fit.estimate.theta.as_slice());
     let psd = |spectra: &Spectra| -> Vec<DMatrix<f64>> {
@@ -378,7 +349,7 @@ pub fn compare(
         false_alarm_rate: settings.false_alarm,
         false_alarm_rate_per_test: allowed,
         segments: whole.segments,
-        segment_s,
+        segment_s: gathered.length as f64 / gathered.rate_hz,
         hours_ns,
         channels,
         nis,

@@ -3,7 +3,6 @@
 //! Forward selection: the candidate with the smallest corrected p-value is added, and all others are scored again
 //! beside it.
 
-use dragfree_estimation::estimate::EstimateError;
 use dragfree_estimation::levels::{Level, Levels};
 use dragfree_estimation::spectra::FIRST_BIN;
 use dragfree_estimation::verdict::chi2_per_dof_at;
@@ -16,7 +15,7 @@ use crate::candidates::Candidate;
 use crate::coherence::Coherence;
 use crate::distributions::{corrected, ln_chi2_above, normal_tails};
 use crate::gram::LONG;
-use crate::scores::{CandidateScorer, Fit, Scored, WithoutExcess};
+use crate::scores::{CandidateScorer, Fit, IdentificationError, Scored, WithoutExcess};
 
 /// Standard normal quantile of a one-sided 95 % limit.
 const LIMIT_QUANTILE: f64 = 1.645;
@@ -24,27 +23,6 @@ const LIMIT_QUANTILE: f64 = 1.645;
 /// Why a candidate has no result.
 const UNOBSERVABLE: &str =
     "unobservable in these data: its series do not change in them, or the model contains the same already";
-
-/// Why there is no diagnosis.
-#[derive(Debug, thiserror::Error)]
-pub enum DiagnosisError {
-    /// Nothing can be fitted.
-    #[error(transparent)]
-    Estimate(#[from] EstimateError),
-    /// Too little data.
-    #[error(
-        "a diagnosis needs at least {needed} segments of {segment_s:.0} s without a gap, and there are {segments:.1}: give more telemetry, \
-         or several products"
-    )]
-    TooShort {
-        /// Segments that are needed.
-        needed: f64,
-        /// Segments there are.
-        segments: f64,
-        /// Their length.
-        segment_s: f64,
-    },
-}
 
 /// A candidate and its evidence.
 #[derive(Clone, Debug, Serialize)]
@@ -265,17 +243,13 @@ impl Trials {
 /// one.
 ///
 /// # Errors
-/// [`DiagnosisError`]: too little data, or a model that cannot be fitted.
+/// [`IdentificationError`]: too little data, or a model that cannot be fitted.
 pub fn diagnose(
     scorer: &CandidateScorer<'_>,
     tried_before: &BTreeMap<String, usize>,
-) -> Result<Diagnosis, DiagnosisError> {
+) -> Result<Diagnosis, IdentificationError> {
     let settings = scorer.settings;
-    let segment_s = scorer.gathered.length as f64 / scorer.gathered.rate_hz;
-    let segments = short_segments(scorer);
-    if segments < settings.min_segments {
-        return Err(DiagnosisError::TooShort { needed: settings.min_segments, segments, segment_s });
-    }
+    scorer.require("diagnosis", short_segments(scorer))?;
     let mut fit = scorer.fit(&[])?;
     let mut accepted: Vec<Found> = Vec::new();
     let loudest = {
@@ -427,7 +401,7 @@ fn candidates_of_excess(
     scorer: &CandidateScorer<'_>,
     fit: &Fit,
     trials: &Trials,
-) -> Result<Vec<(Found, Candidate)>, DiagnosisError> {
+) -> Result<Vec<(Found, Candidate)>, IdentificationError> {
     let settings = scorer.settings;
     let Some(WithoutExcess { plain, bands, observations }) = scorer.without_excess(fit) else { return Ok(Vec::new()) };
     let before = scorer.deviance(fit, &bands, &fit.added)?;
@@ -454,7 +428,7 @@ fn candidates_beside_levels(
     scorer: &CandidateScorer<'_>,
     fit: &Fit,
     trials: &Trials,
-) -> Result<Vec<(Found, Candidate)>, DiagnosisError> {
+) -> Result<Vec<(Found, Candidate)>, IdentificationError> {
     let settings = scorer.settings;
     let Some(declared) = scorer.with_declared_levels(fit) else { return Ok(Vec::new()) };
     let mut ranked = scorer.rank(&declared).all;

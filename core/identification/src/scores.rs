@@ -23,6 +23,21 @@ use crate::gram::{Gram, GramSums};
 /// Refinements of Σ from the residuals.
 const REFINEMENTS: usize = 3;
 
+/// Why there is no comparison or diagnosis.
+#[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the message names the fields")]
+pub enum IdentificationError {
+    /// Nothing can be fitted.
+    #[error(transparent)]
+    Estimate(#[from] EstimateError),
+    /// Too little data.
+    #[error(
+        "a {what} needs at least {needed} segments of {segment_s:.0} s without a gap, and there are {segments:.2}: \
+         give more telemetry, or several products"
+    )]
+    TooShort { what: &'static str, needed: f64, segments: f64, segment_s: f64 },
+}
+
 /// A model fitted to the sums.
 pub struct Fit {
     /// What was added to the model.
@@ -158,6 +173,18 @@ impl<'a> CandidateScorer<'a> {
     /// Bands.
     pub fn plan(&self) -> &Plan {
         &self.plan
+    }
+
+    /// Refuses `segments` short segments where they are too few for `what`.
+    ///
+    /// # Errors
+    /// [`IdentificationError::TooShort`].
+    pub(crate) fn require(&self, what: &'static str, segments: f64) -> Result<(), IdentificationError> {
+        let (needed, segment_s) = (self.settings.min_segments, self.gathered.length as f64 / self.gathered.rate_hz);
+        if segments >= needed {
+            return Ok(());
+        }
+        Err(IdentificationError::TooShort { what, needed, segments, segment_s })
     }
 
     /// Fits the model with what was added.

@@ -16,9 +16,8 @@ use std::path::PathBuf;
 use dragfree_engine::EngineError;
 use dragfree_estimation::estimate::EstimateError;
 use dragfree_estimation::sigma::NoiseError;
-use dragfree_identification::compare::CompareError;
-use dragfree_identification::diagnosis::DiagnosisError;
 use dragfree_identification::record::RecordError;
+use dragfree_identification::scores::IdentificationError;
 use dragfree_schema::NoSuchCoefficient;
 
 /// Why a comparison or a diagnosis failed.
@@ -40,12 +39,9 @@ pub enum WorkflowError {
     /// Products that do not belong together.
     #[error(transparent)]
     Record(#[from] RecordError),
-    /// No comparison.
+    /// No comparison or diagnosis.
     #[error(transparent)]
-    Compare(#[from] CompareError),
-    /// No diagnosis.
-    #[error(transparent)]
-    Diagnosis(#[from] DiagnosisError),
+    Identification(#[from] IdentificationError),
     /// No product was named.
     #[error("no product was named")]
     NoProduct,

@@ -9,16 +9,14 @@
 //! * eq:Final_AKF_Q_ITER needs `P̂_{k+1}` before eq:Final_AKF_p_k1 makes it: it is taken with `Q̂_{k−1}`.
 //!
 //! # Uncertainty
-//! `P` is only a covariance if `Q̂` and `R̂` are those of the data, and the adaptation moves both for reasons of
-//! stability. So a second covariance `P̃` has_design the gains that were really used, under the noise of the mission
-//! file: the error covariance of this estimator, adapted or not, as far as that noise model holds. The innovations
-//! measure how far it does ([`Statistics::design_nis`]).
+//! `P` is a covariance only if `Q̂` and `R̂` are those of the data, and the adaptation moves both for stability. A
+//! second covariance `P̃` follows the gains that were used, under the noise of the mission file: the error covariance
+//! of this estimator as far as that noise model holds, which the innovations test ([`Statistics::design_nis`]).
 //!
 //! # Definiteness
-//! `Q` and `P` are tested every `check_epochs`, not every epoch: adaptation moves `Q̂` by `1 − α` a step, so that
-//! nothing happens in between that matters, and an eigenvalue decomposition costs far more than a step. `Q̂` is
-//! singular by construction (one force drives `r` and `v`), so a `Q̂` that adapts by elements is found slightly
-//! indefinite nearly every time.
+//! `Q` and `P` are tested every `check_epochs`: adaptation moves `Q̂` by `1 − α` a step, and an eigenvalue
+//! decomposition costs far more than a step. `Q̂` is singular (one force drives `r` and `v`), so that one that adapts
+//! by elements is slightly indefinite nearly every time.
 
 use dragfree_sdk::state::{State, StateError};
 

@@ -20,15 +20,8 @@
 //! | `sc.force.x\|y\|z` | N on the spacecraft, SRF | `−T_S^{O_i} e/m_S` on the test masses |
 //! | `sc.torque.x\|y\|z` | N m on the spacecraft, SRF | `J_S⁻¹ e` on the attitude, `sc.alpha` |
 //!
-//! **Names.** `hk.NAME` housekeeping; `alpha.x`, `omega.x` angular acceleration and rate of the spacecraft (SRF, rad
-//! s⁻², rad s⁻¹); `r1.x`, `u1.x` displacement and known acceleration of a test mass (ORF, m, m s⁻²);
-//! `command.mps_force.x`, `command.mps_torque.x`, `command.tm1.force.x`, `command.tm1.torque.x` commands as executed
-//! (SRF or ORF, N, N m); `sun.x` direction from the Sun (SRF); `time_s` seconds since the run's first epoch; `pi`.
-//!
-//! **Functions.** `sin cos tan asin acos atan sinh cosh tanh exp ln log10 sqrt abs sign`; `min max atan2` of two
-//! arguments. With state: `lag(x, s)` first-order lag; `lowpass(x, hz)` the same by its corner frequency;
-//! `highpass(x, hz)` its complement; `derivative(x)` backward difference; `integral(x)` from the run's first epoch,
-//! missing values counting as zero. [`crate::lag::Lags`] states how lags treat missing values. `-x^2` is −(x²).
+//! Names, functions and operators: the guide's page on formulas. [`crate::lag::Lags`] states how functions with state
+//! treat missing values; an integral counts them as zero. `-x^2` is −(x²).
 //!
 //! Rows where a column is missing or the expression is not finite are not used. **Limit**: an expression of the readout
 //! that it must explain (`r1.y` acting on `tm1.accel.y`) is correlated with its noise and biased (errors in variables).
