@@ -99,15 +99,11 @@ pub const PALETTE: [(u8, u8, u8); 7] =
 
 /// Error of a drawing.
 #[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages name the fields")]
 pub enum ChartError {
     /// No point lies on the axes.
     #[error("panel \"{panel}\" has no point with x in {x:?} that its axes can show (logarithmic ones: above zero)")]
-    Empty {
-        /// Title of the panel.
-        panel: String,
-        /// Limits of its axes.
-        x: Range<f64>,
-    },
+    Empty { panel: String, x: Range<f64> },
     /// The drawing library failed.
     #[error("the picture could not be drawn: {0}")]
     Drawing(String),

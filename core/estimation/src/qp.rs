@@ -95,45 +95,26 @@ pub struct Solution {
 
 /// Why there is no solution. The text holds the whole problem.
 #[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages name the fields")]
 pub enum QpError {
     /// A number that is none, or bounds that exclude each other.
     #[error(
         "the quadratic problem is not well posed: {reason}; check the ranges and the survey of the model; the problem was {problem}"
     )]
-    IllPosed {
-        /// What is wrong.
-        reason: String,
-        /// The problem as JSON.
-        problem: String,
-    },
+    IllPosed { reason: String, problem: String },
     /// The solver refused to set it up.
     #[error("the solver did not accept the quadratic problem: {reason}; the problem was {problem}")]
-    Refused {
-        /// The solver's own words.
-        reason: String,
-        /// The problem as JSON.
-        problem: String,
-    },
+    Refused { reason: String, problem: String },
     /// The solver ended with anything but a solution.
     #[error(
         "the solver ended with {status}, not with a solution: do the survey and the ranges contradict each other? The problem was {problem}"
     )]
-    Unsolved {
-        /// The solver's status.
-        status: String,
-        /// The problem as JSON.
-        problem: String,
-    },
+    Unsolved { status: String, problem: String },
     /// The solution fails our own check.
     #[error(
         "the solver's solution fails the conditions of optimality ({kkt:?}, tolerance {KKT_TOLERANCE:e}); the problem was {problem}"
     )]
-    Inexact {
-        /// The residuals.
-        kkt: Kkt,
-        /// The problem as JSON.
-        problem: String,
-    },
+    Inexact { kkt: Kkt, problem: String },
 }
 
 impl Problem {

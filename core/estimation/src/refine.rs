@@ -56,16 +56,14 @@ pub(crate) struct Whitening {
 
 /// Why Σ cannot be used.
 #[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages name the fields")]
 pub enum SigmaError {
     /// Two channels measure the same without noise of their own.
     #[error(
         "the modelled noise of the channels is not positive definite at {frequency_hz:.3e} Hz: some combination of channels has no \
          noise at all; the stage that makes the channels must declare a noise for each readout, from the mission file's [noise]"
     )]
-    Singular {
-        /// Frequency.
-        frequency_hz: f64,
-    },
+    Singular { frequency_hz: f64 },
 }
 
 impl Whitening {

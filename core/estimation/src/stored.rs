@@ -30,13 +30,11 @@ pub struct Stored {
 
 /// Why stored sums cannot be used.
 #[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages name the fields")]
 pub enum StoredError {
     /// Another version.
     #[error("stored sums have format {found}, this program reads {FORMAT}: run the day again")]
-    Format {
-        /// In the file.
-        found: u32,
-    },
+    Format { found: u32 },
     /// Sizes that contradict each other, or numbers that are none.
     #[error("stored sums contradict themselves ({0}): the file is damaged, run the day again")]
     Damaged(&'static str),

@@ -17,13 +17,11 @@ const KEPT_DISTANCE: f64 = 0.5;
 
 /// Why a Riccati equation has no stabilising solution.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages name the fields")]
 pub enum RiccatiError {
     /// The Hamiltonian has eigenvalues on the imaginary axis: no subspace separates.
     #[error("its Hamiltonian has an eigenvalue on the imaginary axis at {frequency_rad_s:e} rad/s")]
-    ImaginaryAxis {
-        /// Where, in the unit of the problem, rad/s.
-        frequency_rad_s: f64,
-    },
+    ImaginaryAxis { frequency_rad_s: f64 },
     /// The stable subspace has no basis `[I; X]`.
     #[error("the stable subspace of its Hamiltonian has no complement")]
     NoGraph,
@@ -33,12 +31,7 @@ pub enum RiccatiError {
          {exact_rad_s:e} rad/s: an unstable mode that is hardly reached or hardly seen makes the solution so large that double \
          precision does not hold the loop; act on that mode or measure it better, or leave it out of the plant"
     )]
-    LostInRounding {
-        /// Largest real part of an eigenvalue of the loop as it was computed, in the unit of the problem, rad/s.
-        slowest_rad_s: f64,
-        /// The largest negative real part of the Hamiltonian's eigenvalues, which are the loop's, rad/s.
-        exact_rad_s: f64,
-    },
+    LostInRounding { slowest_rad_s: f64, exact_rad_s: f64 },
     /// The eigenvalue iteration did not settle.
     #[error("the Schur form of its Hamiltonian was not found; entries are not finite")]
     NotFinite,

@@ -10,15 +10,11 @@ const BIN_CORRELATION: f64 = 1.0 + 2.0 * (4.0 / 9.0 + 1.0 / 36.0);
 
 /// Why a series has no spectrum.
 #[derive(Debug, thiserror::Error)]
+#[expect(missing_docs, reason = "the messages name the fields")]
 pub enum SpectrumError {
     /// Too few samples, or a segment too short for a window.
     #[error("{samples} samples hold no segment of {segment}; a segment needs 8 samples, the series one segment")]
-    TooShort {
-        /// Samples given.
-        samples: usize,
-        /// Samples per segment.
-        segment: usize,
-    },
+    TooShort { samples: usize, segment: usize },
     /// The transform refused.
     #[error("Fourier transform of a segment: {0}")]
     Transform(String),
