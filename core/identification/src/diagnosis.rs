@@ -430,10 +430,9 @@ fn candidates_beside_levels(
     trials: &Trials,
 ) -> Result<Vec<(Found, Candidate)>, IdentificationError> {
     let settings = scorer.settings;
-    let Some(declared) = scorer.with_declared_levels(fit) else { return Ok(Vec::new()) };
+    let Some((declared, bands)) = scorer.with_declared_levels(fit) else { return Ok(Vec::new()) };
     let mut ranked = scorer.rank(&declared).all;
     sort_by_p_value(trials, &mut ranked);
-    let bands = scorer.excess_bands(fit);
     let before = scorer.profile_deviance(&fit.added, &bands)?;
     let mut out = Vec::new();
     for scored in ranked.iter().filter(|s| s.in_range && !s.candidate.transient).take(settings.max_excess_candidates) {
@@ -466,8 +465,7 @@ fn refusal(settings: &Settings, f: &Found, accepted: usize) -> Option<String> {
 /// Why an accepted effect contradicts the rest of the answer.
 ///
 /// - It was selected by an excess of power, or has `part` > ½ of its information in the bands of one, and an excess or
-///   a coherence with
-///   housekeeping remains in its channels: it correlates with the cause and is not the cause.
+///   a coherence with housekeeping remains in its channels: it correlates with the cause and is not the cause.
 /// - It moves the offset, and its fall of χ² is below [`Settings::level_trace`] of that of a level of noise that drives
 ///   an estimate (see there). It should be tried again with that level in the model.
 fn doubt(

@@ -296,14 +296,14 @@ impl<'a> CandidateScorer<'a> {
         Some(WithoutExcess { plain, bands, observations })
     }
 
-    /// The fit under the declared levels of the noise; none where the fit has adopted no other. A level that was fitted
-    /// before the candidates has absorbed part of what a gain in the loop does to the power of the noise.
-    pub fn with_declared_levels(&self, fit: &Fit) -> Option<Fit> {
+    /// The fit under the declared levels of the noise, and the bands of an excess; none where the fit has adopted no
+    /// other level. A level fitted before the candidates has absorbed part of what a gain in the loop does to the noise.
+    pub fn with_declared_levels(&self, fit: &Fit) -> Option<(Fit, Vec<bool>)> {
         let measured = self.residual_psd(fit);
         let mut levels = self.levels(fit, &self.total, &measured);
         let declared = levels.inverses();
         levels.fit();
-        (levels.inverses() != declared).then(|| self.under(fit, declared))
+        (levels.inverses() != declared).then(|| (self.under(fit, declared), levels.excess_bands().0))
     }
 
     /// The same solution with other Σ⁻¹ in the scores.
@@ -489,14 +489,6 @@ impl<'a> CandidateScorer<'a> {
         let delta_chi2 = 2.0 * score.dot(&value) - value.dot(&(&information * &value));
         let shift = &scores.covariance * with_model.transpose() * &value;
         Some(Scored { candidate, value, in_range, delta_chi2, information, understated: 1.0, left, shift })
-    }
-
-    /// Bands in which the noise absorbs an excess beside a fit.
-    pub fn excess_bands(&self, fit: &Fit) -> Vec<bool> {
-        let measured = self.residual_psd(fit);
-        let mut levels = self.levels(fit, &self.total, &measured);
-        levels.fit();
-        levels.excess_bands().0
     }
 
     /// The part of a candidate's information under the given `Σ⁻¹` that comes from `bands`.
