@@ -366,7 +366,7 @@ pub struct ChannelDesign {
     /// Bounded Real Lemma of the flown loop at 1.001 of its norm: largest eigenvalue of the inequality's left side over
     /// its largest in size; negative.
     pub lmi_max_eigenvalue: f64,
-    /// Time after which [`FORGOTTEN`] of the controller's initial state remains, s.
+    /// Time after which `FORGOTTEN` of the controller's initial state remains, s.
     pub forget_time_s: f64,
     /// Acceleration per displacement at zero frequency, s⁻²: a static load `a` leaves `a/static_stiffness_s2`.
     pub static_stiffness_s2: f64,

@@ -60,7 +60,7 @@ pub trait Sink {
         Ok(())
     }
 
-    /// Rows of the columns that [`Chain::tap`] asked for, in the order asked for, joined by time.
+    /// Rows of the columns that `Chain::tap` asked for, in the order asked for, joined by time.
     fn tapped(&mut self, _time_ns: &[i64], _columns: &[&[f64]]) {}
 }
 
