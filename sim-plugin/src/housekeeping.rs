@@ -6,8 +6,8 @@ use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use std::f64::consts::TAU;
 
-use crate::effects::fill;
 use crate::interior::{FIELD_T, GRADIENT_T_M, Interior, of_housing};
+use crate::random::fill;
 
 /// A housekeeping scalar.
 pub struct Channel {

@@ -12,8 +12,7 @@ use rand::RngExt;
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde::{Deserialize, Serialize};
 
-use crate::effects::fill;
-use crate::random::stream;
+use crate::random::{fill, stream};
 
 /// Seconds of a step.
 const STEP_S: f64 = 1.0;

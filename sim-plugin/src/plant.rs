@@ -205,11 +205,11 @@ impl Plant {
 
     /// Advances `y` by `dt_s` under constant loads (midpoint rule) and returns the sample's means.
     ///
-    /// Displacement and angle are exact for constant accelerations. Accelerations vary by stiffness and rotation only, on
-    /// time scales far longer than a sample.
+    /// Displacement and angle are exact for constant accelerations. Accelerations vary by stiffness and rotation only,
+    /// on time scales far longer than a sample.
     ///
-    /// Midpoint displacements need no accelerations, and only the terms in the rates are iterated, so stiffness, gradient
-    /// and torques are evaluated once.
+    /// Midpoint displacements need no accelerations, and only the terms in the rates are iterated, so stiffness,
+    /// gradient and torques are evaluated once.
     pub fn step(&self, y: &mut State, loads: &Loads, outside: &Outside, dt_s: f64) -> Means {
         let held = self.held(loads, outside);
         let half_s = 0.5 * dt_s;

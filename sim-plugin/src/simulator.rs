@@ -434,7 +434,8 @@ impl Simulator {
         }
     }
 
-    /// Updates the geometry to the next epoch. A drift of the centre of mass moves the housings against the test masses.
+    /// Updates the geometry to the next epoch. A drift of the centre of mass moves the housings against the test
+    /// masses.
     fn reshape(&mut self) {
         let elapsed_s = self.index as f64 * self.dt_s;
         let mut plant = self.begun.clone();

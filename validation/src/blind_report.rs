@@ -125,7 +125,8 @@ pub(crate) fn numbers(lines: &[Blind]) -> (String, Vec<String>) {
             singles.iter().filter(|a| a.is_covered() && (floor..roof).contains(&significance(a))).collect();
         (these.iter().filter(right).count(), these.len())
     };
-    // A set whose truth the diagnosis did not rank has no σ of its own and counts by the drawn significance: it is missed.
+    // A set whose truth the diagnosis did not rank has no σ of its own and counts by the drawn significance: it is
+    // missed.
     let at_hand = |a: &Acted<'_>| a.at_hand().unwrap_or_else(|| a.drawn());
     let (k, n) = above(&at_hand, PLAIN, f64::INFINITY);
     row(

@@ -297,7 +297,8 @@ impl<'a> CandidateScorer<'a> {
     }
 
     /// The fit under the declared levels of the noise, and the bands of an excess; none where the fit has adopted no
-    /// other level. A level fitted before the candidates has absorbed part of what a gain in the loop does to the noise.
+    /// other level. A level fitted before the candidates has absorbed part of what a gain in the loop does to the
+    /// noise.
     pub fn with_declared_levels(&self, fit: &Fit) -> Option<(Fit, Vec<bool>)> {
         let measured = self.residual_psd(fit);
         let mut levels = self.levels(fit, &self.total, &measured);

@@ -6,8 +6,8 @@ pub struct Lag {
     samples: usize,
     /// Fraction of a sample in the delay.
     part: f64,
-    /// The older command acts for the fraction `part` of a sample, then the newer one. For both intervals, the factor of
-    /// `y − u` at the end and in the mean.
+    /// The older command acts for the fraction `part` of a sample, then the newer one. For both intervals, the factor
+    /// of `y − u` at the end and in the mean.
     left: [f64; 2],
     mean: [f64; 2],
 }

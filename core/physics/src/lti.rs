@@ -85,8 +85,8 @@ impl StateSpace {
         Self { a: Matrix::zeros(0, 0), b: Matrix::zeros(0, m), c: Matrix::zeros(p, 0), d }
     }
 
-    /// Single-input single-output quotient of two polynomials in `s` of one length, highest power first, in controllable
-    /// canonical form.
+    /// Single-input single-output quotient of two polynomials in `s` of one length, highest power first, in
+    /// controllable canonical form.
     pub fn quotient(numerator: &[f64], denominator: &[f64]) -> Self {
         let n = denominator.len() - 1;
         let lead = denominator[0];
@@ -181,8 +181,8 @@ impl StateSpace {
     /// A system with one input and one output as `gain · Π sections(z)`, sampled by the bilinear transform with
     /// `half_step` `h = dt/2` in this system's unit of time.
     ///
-    /// Each section `[b0, b1, b2, a1, a2]` has unit gain at zero frequency, so `gain` is the static gain. Conjugate pairs
-    /// share a section; poles nearest to the unit circle are paired first, with the zeros nearest to them.
+    /// Each section `[b0, b1, b2, a1, a2]` has unit gain at zero frequency, so `gain` is the static gain. Conjugate
+    /// pairs share a section; poles nearest to the unit circle are paired first, with the zeros nearest to them.
     ///
     /// # Errors
     /// [`LtiError::NoStaticGain`] when the gain at zero frequency is zero or infinite.

@@ -1,8 +1,8 @@
 //! Random processes that follow a [`NoiseShape`]: exact discretisations, stationary from the first sample, one normal
 //! deviate a sample.
 //!
-//! A term `asd² (f₀/f)^{2n}` is white noise through `n` leaky integrators. The innovation form of the process with added
-//! white noise needs one deviate per sample instead of one per state:
+//! A term `asd² (f₀/f)^{2n}` is white noise through `n` leaky integrators. The innovation form of the process with
+//! added white noise needs one deviate per sample instead of one per state:
 //!
 //! `y_k = x̂_0 + e_k`, `x̂ ← Φ x̂ + K e_k`, `e_k` white with variance `S`,
 //!

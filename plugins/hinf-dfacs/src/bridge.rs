@@ -1,8 +1,8 @@
 //! Interpolation over a few missing readouts, for the second differences alone.
 //!
-//! A missing readout affects three second differences, and a spectrum needs intervals without gaps. The error of a cubic
-//! through two readouts on either side is of the size of the readout's noise, with the same spectrum after the second
-//! difference, and negligible if few samples are missing. The readouts themselves stay missing, because a filter
+//! A missing readout affects three second differences, and a spectrum needs intervals without gaps. The error of a
+//! cubic through two readouts on either side is of the size of the readout's noise, with the same spectrum after the
+//! second difference, and negligible if few samples are missing. The readouts themselves stay missing, because a filter
 //! predicts them better.
 
 /// Longest bridge, samples.

@@ -67,8 +67,8 @@ impl KnownModel {
     /// corrected, as the electrodes' reaction acts on the spacecraft).
     ///
     /// `sun_srf` is the unit vector from the Sun, `None` where sunlight is not modelled; `omega_srf_rad_s` is relative
-    /// to IRF. By the stiffness term `û` contains the readout noise `S n`, small against `n̈` of the second difference of
-    /// the same readout by the ratio `S/(2πf)²`.
+    /// to IRF. By the stiffness term `û` contains the readout noise `S n`, small against `n̈` of the second difference
+    /// of the same readout by the ratio `S/(2πf)²`.
     pub fn motion(
         &self,
         command: &Command,

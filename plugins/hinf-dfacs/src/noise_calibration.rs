@@ -1,8 +1,8 @@
 //! Levels of torque noise and attitude readout noise, measured in the first interval of a run.
 //!
-//! `α̂` combines attitude readouts and commanded torques, and is biased by wrong weights. The levels are therefore fitted
-//! to the spectrum of the attitude channels, `a cos² + b (4 sin²/dt²)²`, before the reconstruction. A level that differs
-//! significantly from the mission file's replaces it.
+//! `α̂` combines attitude readouts and commanded torques, and is biased by wrong weights. The levels are therefore
+//! fitted to the spectrum of the attitude channels, `a cos² + b (4 sin²/dt²)²`, before the reconstruction. A level that
+//! differs significantly from the mission file's replaces it.
 
 use dragfree_physics::levels::{self, Bin};
 use dragfree_physics::spectrum::welch;

@@ -206,13 +206,6 @@ impl Effects {
     }
 }
 
-/// Fills slots with saved numbers; false if their numbers differ.
-pub(crate) fn fill<'a>(slots: impl IntoIterator<Item = &'a mut f64>, states: &[f64]) -> bool {
-    let mut states = states.iter();
-    let filled = slots.into_iter().all(|slot| states.next().map(|value| *slot = *value).is_some());
-    filled && states.next().is_none()
-}
-
 /// The unit vector along an axis.
 fn along(axis: usize) -> Vector3<f64> {
     Vector3::from_fn(|i, _| f64::from(i == axis))

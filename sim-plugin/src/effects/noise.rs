@@ -129,6 +129,6 @@ impl Cause for Excess {
 
     fn set_states(&mut self, states: &[f64]) -> bool {
         let slots: Vec<&mut f64> = std::iter::once(&mut self.line_phase_rad).chain(self.process.states_mut()).collect();
-        super::fill(slots, states)
+        crate::random::fill(slots, states)
     }
 }

@@ -68,6 +68,6 @@ impl Cause for Slosh {
     }
 
     fn set_states(&mut self, states: &[f64]) -> bool {
-        super::fill(self.state.iter_mut(), states)
+        crate::random::fill(self.state.iter_mut(), states)
     }
 }
