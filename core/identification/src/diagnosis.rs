@@ -262,6 +262,7 @@ pub fn diagnose(
     let trials = Trials::new(scorer, &forms);
     let mut ranked = first.all;
     let mut requests = refinement_requests(settings, &trials, &ranked);
+    let mut removed = 0;
     let mut others: Vec<Found> = loop {
         sort_by_p_value(&trials, &mut ranked);
         let mut evaluated: Vec<(Found, Candidate)> = ranked
@@ -282,12 +283,16 @@ pub fn diagnose(
             }
         }
         if accepted.len() < settings.max_added {
-            let mut by_likelihood = candidates_of_excess(scorer, &fit, &trials)?;
-            by_likelihood.extend(candidates_beside_levels(scorer, &fit, &trials)?);
-            for (f, candidate) in by_likelihood {
+            let of_excess = candidates_of_excess(scorer, &fit, &trials)?.into_iter().map(|found| (found, false));
+            let beside = candidates_beside_levels(scorer, &fit, &trials)?.into_iter().map(|found| (found, true));
+            for ((f, candidate), beside_levels) in of_excess.chain(beside) {
                 let of = |w: &(Found, Candidate)| (&w.0.effect, &w.0.instance) == (&f.effect, &f.instance);
+                // What is named under the fitted levels has its shape from there: beside an excess the declared ones
+                // weigh the wrong bands.
+                let named = |w: &Found| beside_levels && w.p_value < settings.false_alarm;
+                let stays = |w: &Found| named(w) || w.log10_p_value <= f.log10_p_value;
                 match evaluated.iter().position(of) {
-                    Some(i) if evaluated[i].0.log10_p_value <= f.log10_p_value => {}
+                    Some(i) if stays(&evaluated[i].0) => {}
                     Some(i) => evaluated[i] = (f, candidate),
                     None => evaluated.push((f, candidate)),
                 }
@@ -312,6 +317,16 @@ pub fn diagnose(
             f.confounders.dedup();
         }
         accepted.push(f);
+        // What stood in for the one just accepted is not needed beside it.
+        if removed < settings.max_added
+            && let Some(needless) = needless(scorer, &fit, &trials)?
+        {
+            removed += 1;
+            accepted.remove(needless);
+            added.remove(needless);
+            fit = scorer.fit(&added)?;
+            ranked = scorer.rank(&fit).all;
+        }
         // With the excess explained, Σ has changed: all accepted values are estimated again.
         estimate_again(scorer, &fit, &mut accepted);
     };
@@ -445,6 +460,28 @@ fn candidates_beside_levels(
         out.push((f.with_delta_chi2(delta_chi2, fit, scored, trials), scored.candidate.clone()));
     }
     Ok(out)
+}
+
+/// An effect added before the last one whose evidence beside all others is within the bound.
+fn needless(scorer: &CandidateScorer<'_>, fit: &Fit, trials: &Trials) -> Result<Option<usize>, IdentificationError> {
+    let earlier = fit.added.len().saturating_sub(1);
+    for (i, candidate) in fit.added[..earlier].iter().enumerate().filter(|(_, c)| !c.transient) {
+        let mut others = fit.added.clone();
+        others.remove(i);
+        let without = scorer.fit(&others)?;
+        let ranked = scorer.rank(&without).all;
+        let same =
+            |s: &&Scored| (&s.candidate.effect, &s.candidate.instance) == (&candidate.effect, &candidate.instance);
+        let alone = ranked.iter().find(same).map(|scored| evaluate(scorer, &without, scored, &ranked, trials));
+        let of = |(f, _): &(Found, Candidate)| (&f.effect, &f.instance) == (&candidate.effect, &candidate.instance);
+        let by_likelihood = candidates_beside_levels(scorer, &without, trials)?.into_iter();
+        let by_excess = candidates_of_excess(scorer, &without, trials)?.into_iter();
+        let all = alone.into_iter().chain(by_likelihood.chain(by_excess).filter(of).map(|(f, _)| f));
+        if all.map(|f| f.p_value).fold(1.0, f64::min) >= scorer.settings.false_alarm {
+            return Ok(Some(i));
+        }
+    }
+    Ok(None)
 }
 
 /// Why a candidate beyond the corrected bound is not accepted beside `accepted` others.
