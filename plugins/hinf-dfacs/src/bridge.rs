@@ -1,11 +1,11 @@
-//! Interpolation over a few missing readouts, for the second differences alone.
+//! Interpolation over a few missing readouts, used only for second differences.
 //!
 //! A missing readout affects three second differences, and a spectrum needs intervals without gaps. The error of a
 //! cubic through two readouts on either side is of the size of the readout's noise, with the same spectrum after the
 //! second difference, and negligible if few samples are missing. The readouts themselves stay missing, because a filter
 //! predicts them better.
 
-/// Longest bridge, samples.
+/// Longest gap that is interpolated, samples.
 pub(crate) const LONGEST: usize = 5;
 
 /// Lagrange's cubic over `missing` samples, from the two values before and the two after them.
@@ -29,7 +29,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_cubic_is_met_exactly() {
+    fn a_cubic_is_interpolated_exactly() {
         let p = |t: f64| 1.0 - 2.0 * t + 0.5 * t * t - 0.25 * t * t * t;
         for missing in 1..=LONGEST {
             let end = missing as f64 + 1.0;

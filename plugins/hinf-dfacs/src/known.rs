@@ -9,19 +9,19 @@ const NEEDED_BY: &str = "hinf-dfacs";
 /// The known motion over one sample interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct KnownMotion {
-    /// `û_i`: the known acceleration of each test mass against its housing, without the offset's terms, ORF, m s⁻².
+    /// `û_i`: known acceleration of each test mass relative to its housing without the offset's terms, ORF, m s⁻².
     pub u_orf_m_s2: PerTestMass<Vector3<f64>>,
     /// Angular acceleration of the spacecraft relative to IRF by the known torques, SRF, rad s⁻².
     pub alpha_srf_rad_s2: Vector3<f64>,
 }
 
-/// Nominal masses, inertia, offsets and stiffness.
+/// Model of the known motion: nominal masses, inertia, offsets and stiffness.
 #[derive(Clone, Debug)]
 pub struct KnownModel {
     mass_kg: f64,
     inertia_kg_m2: Matrix3<f64>,
     inertia_inverse: Matrix3<f64>,
-    /// `k_dSC`, N, and the arm of the force, SRF, m.
+    /// `k_dSC`, N, and the lever arm of the force, SRF, m.
     sunlight: Option<(f64, Vector3<f64>)>,
     tm: Vec<KnownTestMass>,
 }
@@ -60,15 +60,14 @@ impl KnownModel {
         })
     }
 
-    /// The known motion under one command.
-    ///
+    /// The known motion under one command:
     /// `û_i = −T_S^{O_i}(F̂_T + F̂_SRP − Σ_j T_{O_j}^S F̂_Ej)/m_S + F̂_Ei/m_m + S_TT r_i + S_TR θ_i`, and
     /// `α = J_S⁻¹(M̂_T + D̂_SRP − Σ T M̂_Ei − Σ b_i×(T F̂_Ei) − ω×J_S ω)` (eq:SC_attitude_dynamics with two signs
     /// corrected, as the electrodes' reaction acts on the spacecraft).
     ///
-    /// `sun_srf` is the unit vector from the Sun, `None` where sunlight is not modelled; `omega_srf_rad_s` is relative
-    /// to IRF. By the stiffness term `û` contains the readout noise `S n`, small against `n̈` of the second difference
-    /// of the same readout by the ratio `S/(2πf)²`.
+    /// `sun_srf` is the unit vector from the Sun, `None` if sunlight is not modelled; `omega_srf_rad_s` is relative to
+    /// IRF. The stiffness term adds the readout noise `S n` to `û`: smaller by `S/(2πf)²` than the `n̈` that the second
+    /// difference of the same readout has.
     pub fn motion(
         &self,
         command: &Command,
@@ -84,13 +83,13 @@ impl KnownModel {
             torque += arm.cross(&pressure);
         }
         for (tm, electrodes) in self.tm.iter().zip(&command.tm) {
-            let push = tm.dcm_orf_from_srf.tr_mul(&electrodes.force_orf_n);
-            force -= push;
-            torque -= tm.dcm_orf_from_srf.tr_mul(&electrodes.torque_orf_nm) + tm.offset_nominal_srf_m.cross(&push);
+            let tm_force = tm.dcm_orf_from_srf.tr_mul(&electrodes.force_orf_n);
+            force -= tm_force;
+            torque -= tm.dcm_orf_from_srf.tr_mul(&electrodes.torque_orf_nm) + tm.offset_nominal_srf_m.cross(&tm_force);
         }
-        let spacecraft = force / self.mass_kg;
+        let spacecraft_accel = force / self.mass_kg;
         let u = |((tm, electrodes), readout): ((&KnownTestMass, &TestMassCommand), &TestMassReadout)| {
-            electrodes.force_orf_n / tm.mass_kg - tm.dcm_orf_from_srf * spacecraft
+            electrodes.force_orf_n / tm.mass_kg - tm.dcm_orf_from_srf * spacecraft_accel
                 + tm.stiffness_tt * readout.r_orf_m
                 + tm.stiffness_tr * readout.att_orf_rad
         };
@@ -103,7 +102,7 @@ impl KnownModel {
 mod tests {
     use super::*;
 
-    /// The paper's spacecraft with round numbers: no products of inertia, so that a hand can divide.
+    /// The paper's spacecraft without products of inertia, so that expected values can be computed by hand.
     fn model() -> KnownModel {
         let text = include_str!("../../../fixtures/missions/taiji.toml");
         let mut mission: Mission = toml::from_str(text).expect("the fixture is a mission");
@@ -122,10 +121,10 @@ mod tests {
 
     const C: f64 = 0.866_025_403_784_438_6;
 
-    /// 1.5 mN along s_1 accelerate the spacecraft by 1e-6 m/s²; both test masses lag behind. o_1 of bench 1 lies at
+    /// 1.5 mN along s_1 accelerate the spacecraft by 1e-6 m/s², the test masses by the opposite. o_1 of bench 1 lies at
     /// +30° and of bench 2 at −30°, so the component along o_2 has opposite signs.
     #[test]
-    fn thrust_leaves_the_test_masses_behind() {
+    fn thrust_accelerates_the_test_masses_relative_to_the_spacecraft() {
         let got = motion(&Command { mps_force_srf_n: Vector3::new(1.5e-3, 0.0, 0.0), ..Command::zero(2) });
         close(got.u_orf_m_s2[0], [-C * 1e-6, 0.5e-6, 0.0]);
         close(got.u_orf_m_s2[1], [-C * 1e-6, -0.5e-6, 0.0]);
@@ -157,9 +156,9 @@ mod tests {
         close(motion(&command).alpha_srf_rad_s2, [-C * 1e-14, 0.5e-14, 0.0]);
     }
 
-    /// Sunlight along +s_1 pushes at (0.1, 0, 0.6) m: torque (0, 0.6, 0) F, as the paper's matrix has it.
+    /// A force F of sunlight along +s_1 at (0.1, 0, 0.6) m has the torque (0, 0.6 m, 0) F, as in the paper's matrix.
     #[test]
-    fn sunlight_pushes_as_thrust_does_and_turns_by_its_arm() {
+    fn sunlight_acts_as_a_force_at_its_lever_arm() {
         let sun = Vector3::new(1.0, 0.0, 0.0);
         let readout = [TestMassReadout::default(); 2];
         let got = model().motion(&Command::zero(2), Some(&sun), &readout, &Vector3::zeros());
@@ -177,7 +176,7 @@ mod tests {
     }
 
     #[test]
-    fn stiffness_acts_at_the_measured_place() {
+    fn stiffness_acts_on_the_measured_displacement() {
         let mut readout = [TestMassReadout::default(); 2];
         readout[0].r_orf_m = Vector3::new(1e-9, 2e-9, 3e-9);
         readout[1].att_orf_rad = Vector3::new(1e-6, 0.0, -1e-6);

@@ -1,5 +1,5 @@
-//! Stage `hinf-dfacs`: the known specific force `û_i`, the unbiased angular acceleration `α̂`, the rate `ω̂` and the
-//! channels of the test masses and of the attitude (Section IV; ARCHITECTURE.md, table `reconstruction`).
+//! Stage `hinf-dfacs`: known specific force `û_i`, unbiased angular acceleration `α̂`, angular velocity `ω̂`, and the
+//! channels of the test masses and the attitude (paper, Section IV; ARCHITECTURE.md, table `reconstruction`).
 
 mod bridge;
 pub mod known;

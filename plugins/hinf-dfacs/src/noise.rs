@@ -1,9 +1,8 @@
-//! Noise of the channels, declared from the mission file for the estimators.
+//! Noise processes of the channels by the mission file, for the estimators (Methods, "Noise covariance").
 //!
-//! A force on the spacecraft is one vector process that enters the channels of all test masses. The part of the force
-//! noise that is predicted from the torque (see [`ThrustNoise`]) is in the known acceleration; the rest is noise. The
-//! attitude channels contain the torque noise. The error of α̂, the minimum-variance estimate of the angular
-//! acceleration, enters the test masses' channels through the lever of the nominal offset.
+//! A force on the spacecraft is one vector process in the channels of all test masses. The part of the force noise
+//! predicted from the torque (see [`ThrustNoise`]) belongs to the known acceleration; the rest is noise. Torque noise
+//! enters the attitude channels. The error of α̂ enters the test masses' channels through the nominal offset.
 
 use std::collections::BTreeMap;
 
@@ -15,25 +14,25 @@ use nalgebra::{DMatrix, Matrix3};
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 
-type Rows = BTreeMap<String, Vec<f64>>;
+/// Gains of a process by channel, one for each component.
+type Gains = BTreeMap<String, Vec<f64>>;
 
-/// Every noise process in the channels `TM.accel.AXIS` and `sc.alpha.AXIS`. `readouts` names, per test mass, the noise
-/// tables of the instruments that read its x, y and z, such as `ifo_x` or `is_x`.
+/// All noise processes in the channels `TM.accel.AXIS`, m s⁻², and `sc.alpha.AXIS`, rad s⁻². `readouts` names, per
+/// test mass, the noise tables of the instruments that read its x, y and z, such as `ifo_x` or `is_x`.
 pub fn declared(mission: &Mission, readouts: &[[&str; 3]]) -> Vec<NoiseProcess> {
     let thrusters = ThrustNoise::of(mission);
-    let mut thrust = DMatrix::zeros(3 * mission.test_mass.len(), 3);
-    let mut lever = thrust.clone();
+    let mut per_force = DMatrix::zeros(3 * mission.test_mass.len(), 3);
+    let mut per_alpha = per_force.clone();
     for (i, tm) in mission.test_mass.values().enumerate() {
         let dcm = tm.dcm_orf_from_srf();
-        thrust.rows_mut(3 * i, 3).copy_from(&(dcm / -mission.spacecraft.mass_kg));
-        lever.rows_mut(3 * i, 3).copy_from(&(skew(&tm.offset_nominal_orf_m()) * dcm));
+        per_force.rows_mut(3 * i, 3).copy_from(&(dcm / -mission.spacecraft.mass_kg));
+        per_alpha.rows_mut(3 * i, 3).copy_from(&(skew(&tm.offset_nominal_orf_m()) * dcm));
     }
     if let Some(thrusters) = &thrusters {
-        lever += &thrust * dynamic(&(thrusters.force_per_torque * mission.spacecraft.inertia()));
+        per_alpha += &per_force * to_dynamic(&(thrusters.force_per_torque * mission.spacecraft.inertia()));
     }
-    let masses: Vec<&str> = mission.test_mass.keys().map(String::as_str).collect();
-    let enters = |m: &DMatrix<f64>| -> Rows {
-        let channels = masses.iter().flat_map(|tm| AXES.map(|axis| format!("{tm}.accel.{axis}")));
+    let gains = |m: &DMatrix<f64>| -> Gains {
+        let channels = mission.test_mass.keys().flat_map(|tm| AXES.map(|axis| format!("{tm}.accel.{axis}")));
         channels.zip(m.row_iter().map(|row| row.iter().copied().collect())).collect()
     };
 
@@ -42,19 +41,19 @@ pub fn declared(mission: &Mission, readouts: &[[&str; 3]]) -> Vec<NoiseProcess> 
         all.push(NoiseProcess {
             components: AXES.map(|axis| format!("thruster_force:sc.{axis}")).to_vec(),
             covariance: Some(rows(&thrusters.force_given_torque)),
-            ..process("thruster_force", "N", thrusters.force_shape.clone(), NoiseResponse::Held, enters(&thrust))
+            ..process("thruster_force", "N", thrusters.force_shape.clone(), NoiseResponse::Held, gains(&per_force))
         });
     }
     if let Some(pressure) = &mission.noise.solar_pressure {
-        all.push(process("solar_pressure", "N", pressure.shape(), NoiseResponse::Held, enters(&thrust)));
+        all.push(process("solar_pressure", "N", pressure.shape(), NoiseResponse::Held, gains(&per_force)));
     }
     for ((name, tm), readouts) in mission.test_mass.iter().zip(readouts) {
         all.extend(of_test_mass(mission, name, tm, readouts));
     }
     for axis in AXES {
         if let Some(sensing) = &mission.noise.dws_long_arm {
-            let (name, enters) = (format!("dws_long_arm:sc.{axis}"), single(&format!("sc.alpha.{axis}"), 1.0));
-            all.push(process(&name, "rad", sensing.shape(), NoiseResponse::Differenced, enters));
+            let (name, gains) = (format!("dws_long_arm:sc.{axis}"), one_gain(&format!("sc.alpha.{axis}"), 1.0));
+            all.push(process(&name, "rad", sensing.shape(), NoiseResponse::Differenced, gains));
         }
     }
     let inverse_inertia = mission.spacecraft.inertia().try_inverse().unwrap_or_else(Matrix3::zeros);
@@ -67,7 +66,7 @@ pub fn declared(mission: &Mission, readouts: &[[&str; 3]]) -> Vec<NoiseProcess> 
                 matrix: rows(&inverse_inertia),
                 readout: mission.noise.dws_long_arm.as_ref().map(|n| n.shape()),
                 readout_response: NoiseResponse::Differenced,
-                enters: enters(&lever),
+                enters: gains(&per_alpha),
             }),
             ..process(
                 "thruster_torque",
@@ -86,27 +85,27 @@ fn of_test_mass(mission: &Mission, name: &str, tm: &TestMass, readouts: &[&str; 
     let noise = &mission.noise;
     let mut all = Vec::new();
     for (axis, readout) in readouts.iter().enumerate() {
-        let (place, channel) = (format!("{name}.{}", AXES[axis]), format!("{name}.accel.{}", AXES[axis]));
+        let (axis_name, channel) = (format!("{name}.{}", AXES[axis]), format!("{name}.accel.{}", AXES[axis]));
         if let Some(readout) = noise.displacement(readout) {
-            let label = format!("readout:{place}");
+            let label = format!("readout:{axis_name}");
             all.push(NoiseProcess {
                 components: vec![label.clone()],
-                ..process(&label, "m", readout.shape(), NoiseResponse::Differenced, single(&channel, 1.0))
+                ..process(&label, "m", readout.shape(), NoiseResponse::Differenced, one_gain(&channel, 1.0))
             });
         }
         if let Some(force) = noise.electrostatic_force.as_ref().filter(|_| !tm.is_drag_free(axis)) {
-            let (label, gain) = (format!("electrostatic_force:{place}"), tm.mass_kg.recip());
-            all.push(process(&label, "N", force.shape(), NoiseResponse::Held, single(&channel, gain)));
+            let (label, gain) = (format!("electrostatic_force:{axis_name}"), tm.mass_kg.recip());
+            all.push(process(&label, "N", force.shape(), NoiseResponse::Held, one_gain(&channel, gain)));
         }
         if let Some(stray) = &noise.test_mass_acceleration {
-            let label = format!("test_mass_acceleration:{place}");
-            all.push(process(&label, "m s-2", stray.shape(), NoiseResponse::Held, single(&channel, 1.0)));
+            let label = format!("test_mass_acceleration:{axis_name}");
+            all.push(process(&label, "m s-2", stray.shape(), NoiseResponse::Held, one_gain(&channel, 1.0)));
         }
     }
     all
 }
 
-fn process(name: &str, unit: &str, spectrum: NoiseShape, response: NoiseResponse, enters: Rows) -> NoiseProcess {
+fn process(name: &str, unit: &str, spectrum: NoiseShape, response: NoiseResponse, enters: Gains) -> NoiseProcess {
     NoiseProcess {
         name: name.to_owned(),
         unit: unit.to_owned(),
@@ -117,7 +116,7 @@ fn process(name: &str, unit: &str, spectrum: NoiseShape, response: NoiseResponse
     }
 }
 
-fn single(channel: &str, gain: f64) -> Rows {
+fn one_gain(channel: &str, gain: f64) -> Gains {
     [(channel.to_owned(), vec![gain])].into()
 }
 
@@ -125,6 +124,6 @@ fn rows(m: &Matrix3<f64>) -> Vec<Vec<f64>> {
     m.row_iter().map(|row| row.iter().copied().collect()).collect()
 }
 
-fn dynamic(m: &Matrix3<f64>) -> DMatrix<f64> {
+fn to_dynamic(m: &Matrix3<f64>) -> DMatrix<f64> {
     DMatrix::from_column_slice(3, 3, m.as_slice())
 }

@@ -8,23 +8,23 @@ use dragfree_physics::levels::{self, Bin};
 use dragfree_physics::spectrum::welch;
 use nalgebra::Vector3;
 
-/// Length of the interval, s.
+/// Length of the first interval, s.
 const LENGTH_S: f64 = 3276.8;
 
 /// Length of a segment of its spectrum, s.
 const SEGMENT_S: f64 = 204.8;
 
-/// Lowest frequency of the fit, Hz: coloured sensing noise and slow torques are not negligible below.
+/// Lowest frequency of the fit, Hz; below, coloured sensing noise and slow torques are not negligible.
 const LOWEST_HZ: f64 = 0.01;
 
-/// Difference of a measured power from the mission file's, natural logarithm, above which it replaces it: five standard
-/// deviations of the measured torque level.
+/// Natural logarithm of measured over stated power above which the measured level is used: five standard deviations of
+/// the torque level.
 const SIGNIFICANT_LOG_RATIO: f64 = 0.25;
 
-/// Powers of the noise over those of the mission file.
+/// Noise power relative to the mission file.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct NoiseScale {
-    /// Torque of the thrusters about each axis of SRF.
+    /// Thruster torque about each axis of SRF.
     pub torque: Vector3<f64>,
     /// Long-arm wavefront sensing.
     pub sensing: f64,
@@ -37,23 +37,23 @@ impl NoiseScale {
     }
 }
 
-/// Number of epochs of the interval.
+/// Number of epochs in the first interval.
 pub fn length(rate_hz: f64) -> usize {
     (LENGTH_S * rate_hz).round() as usize
 }
 
-/// Measures the levels from the attitude channels, SRF, rad s⁻², which do not depend on the weight.
-/// `held` and `readout` are the one-sided PSDs of the mission file, rad² s⁻⁴/Hz per axis of SRF and rad²/Hz. Nominal
-/// where the longest run without a hole is shorter than eight segments.
+/// Measures the levels from the attitude channels, SRF, rad s⁻², which do not depend on the smoother's weights. `held`
+/// and `readout` are one-sided PSDs by the mission file, of the angular acceleration about each axis of SRF,
+/// rad² s⁻⁴/Hz, and of the attitude readout, rad²/Hz. Nominal if no eight segments are free of gaps.
 pub fn measure(channels: &[[f64; 3]], rate_hz: f64, held: &Vector3<f64>, readout: f64) -> NoiseScale {
-    let whole = |row: &[f64; 3]| row.iter().all(|x| x.is_finite());
-    let runs = channels.chunk_by(|a, b| whole(a) == whole(b)).filter(|run| whole(&run[0]));
+    let complete = |row: &[f64; 3]| row.iter().all(|x| x.is_finite());
+    let runs = channels.chunk_by(|a, b| complete(a) == complete(b)).filter(|run| complete(&run[0]));
     let longest = runs.max_by_key(|run| run.len()).unwrap_or_default();
     let segment = (SEGMENT_S * rate_hz).round() as usize;
     if longest.len() < 8 * segment {
         return NoiseScale::nominal();
     }
-    let found: Vec<(f64, f64)> = (0..3)
+    let measured: Vec<(f64, f64)> = (0..3)
         .filter_map(|axis| {
             let channel: Vec<f64> = longest.iter().map(|row| row[axis]).collect();
             let spectrum = welch(&channel, rate_hz, segment).ok()?;
@@ -64,12 +64,12 @@ pub fn measure(channels: &[[f64; 3]], rate_hz: f64, held: &Vector3<f64>, readout
                 .filter(|(f, _)| (LOWEST_HZ..0.49 * rate_hz).contains(*f))
                 .map(|(f, s)| Bin { frequency_hz: *f, psd: *s, weight: 1.0 })
                 .collect();
-            let measured = levels::fit(&bins, 1.0 / rate_hz)?;
-            Some((measured.held / held[axis], measured.readout / readout))
+            let level = levels::fit(&bins, 1.0 / rate_hz)?;
+            Some((level.held / held[axis], level.readout / readout))
         })
         .collect();
     let significant = |ratio: f64| if ratio.ln().abs() > SIGNIFICANT_LOG_RATIO { ratio } else { 1.0 };
-    match found.as_slice() {
+    match measured.as_slice() {
         [x, y, z] => NoiseScale {
             torque: Vector3::new(x.0, y.0, z.0).map(significant),
             sensing: significant((x.1 * y.1 * z.1).cbrt()),

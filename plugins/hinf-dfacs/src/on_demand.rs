@@ -1,10 +1,10 @@
-//! Columns written only on request of an effect: commands as executed, and derivatives of `α̂` with respect to a torque
-//! gain and to a delay of the attitude readout. Derivations: Methods, "Derivatives of α̂".
+//! Columns written only if an effect requests them: commands as executed, and derivatives of `α̂` with respect to a
+//! torque gain and to a delay of the attitude readout. Derivations: Methods, "Derivatives of α̂".
 //!
 //! `α̂ = α_c + D[θ, α_c]` with the commanded `α_c` and the smoother `D`, which is linear in both arguments.
 //! * Torque: `∂α̂/∂g_i = J⁻¹ e_i M_i + D[0, J⁻¹ e_i M_i]`.
-//! * Delay: `∂α̂/∂τ = D[−ω, 0] = D[0, kicks Δα̂]`, for the channels of the test masses only. The attitude channels
-//!   share the noise of `α̂` and use the command without the smoother.
+//! * Delay: `∂α̂/∂τ = D[−ω, 0] = D[0, rate steps Δα̂]`, for the channels of the test masses only. The attitude
+//!   channels share the readout noise of `α̂`; their regressor is the commanded acceleration without the smoother.
 
 use dragfree_physics::control::PerTestMass;
 use dragfree_physics::mission::{AXES, Mission};
@@ -14,24 +14,23 @@ use nalgebra::{Matrix3, Vector3};
 use crate::replay::{CommandNumbers, command_vectors, electrodes_of, visit_command};
 use crate::smoother::{Perturbation, ResponseState, Smoothed, Smoother};
 
-/// Whether a column on demand is made from commands, as all but two are: the Sun's direction, and the derivative by a
-/// delay of the wavefront sensing, which is made of the smoothed attitude.
+/// Whether a requested column is made from commands: all are, except the Sun's direction and the derivative for a delay
+/// of the wavefront sensing, which is made from the smoothed attitude.
 pub(crate) fn is_in_loop(column: &str) -> bool {
     !column.starts_with("used.sun_srf.") && !column.starts_with("response.alpha_srf_rad_s2.by_dws_delay.")
 }
 
-/// Columns on demand, each off by default.
+/// Columns that effects request; none by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Needs {
-    /// `used.*`: commands and direction of the Sun as `û` has them, means over `[t_k, t_{k+1})`.
+    /// `used.*`: commands (N, N m) and Sun direction from which `û` is made, means over `[t_k, t_{k+1})`.
     pub commands: bool,
-    /// `response.alpha_srf_rad_s2.by_torque_gain.I.J`, `∂α̂_J/∂g_I` for a torque about axis `I` of `(1 + g_I)` times
-    /// the commanded one: `α̂` given `g` minus `α̂` without it. And `response.u_orf_m_s2.by_torque_gain.I.NAME.J`, the
-    /// same of `û` of a test mass, where thrusters have a layout: noise of their torque then correlates with that of
-    /// their force.
+    /// `response.alpha_srf_rad_s2.by_torque_gain.I.J`, `∂α̂_J/∂g_I`, rad s⁻², for a torque about axis `I` of
+    /// `(1 + g_I)` times the commanded one. If thrusters have a layout, so that noise of their torque and force is
+    /// correlated, also `response.u_orf_m_s2.by_torque_gain.I.NAME.J`, the derivative of a test mass's `û`, m s⁻².
     pub torque_response: bool,
-    /// `response.alpha_srf_rad_s2.by_dws_delay.J`, `∂α̂_J/∂τ` where long-arm sensing shows the attitude `τ` before:
-    /// `α̂` late minus `α̂` on time. For the test masses' channels; see the module.
+    /// `response.alpha_srf_rad_s2.by_dws_delay.J`, `∂α̂_J/∂τ`, rad s⁻³, for a delay `τ` of long-arm sensing. Only for
+    /// the channels of the test masses; see the module.
     pub dws_delay_response: bool,
 }
 
@@ -41,7 +40,7 @@ impl Needs {
         self.torque_response || self.dws_delay_response
     }
 
-    /// For a sentence about a state that is of another model.
+    /// The needs in words. The state stores them, and the error about a state of another model quotes them.
     pub(crate) fn describe(self) -> String {
         let all = [
             ("commands", self.commands),
@@ -53,51 +52,51 @@ impl Needs {
     }
 }
 
-/// What acted over one interval as commanded; NaN where unknown.
+/// Command as executed and Sun direction of one interval; NaN where unknown.
 #[derive(Clone, Copy, Debug, Default)]
-struct Used {
+struct Executed {
     command: CommandNumbers,
     sun_srf: Vector3<f64>,
 }
 
-/// What there is of an epoch that leaves: without a series there is no derivative of it.
+/// Whether an emitted epoch has `α̂` and each test mass's `û`; otherwise their derivatives are NaN.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Availability {
     pub(crate) alpha: bool,
     pub(crate) u: PerTestMass<bool>,
 }
 
-/// The running columns.
+/// Makes the requested columns.
 #[derive(Clone, Debug)]
 pub(crate) struct OnDemand {
     needs: Needs,
     inertia_inverse: Matrix3<f64>,
-    /// `−T_S^{O_i} C J/m_S`, m s⁻² per rad s⁻²; zero unless thrusters have a layout.
-    push_per_turn: Vec<Matrix3<f64>>,
+    /// See `Reconstruction`; zero unless thrusters have a layout.
+    tm_accel_per_alpha: Vec<Matrix3<f64>>,
     /// Names, units and frames of the vectors of a command, and names and frames of the test masses.
     vectors: Vec<(String, &'static str, String)>,
     test_masses: Vec<(String, String)>,
     /// One for each epoch that waits for the smoother.
-    used: Vec<Used>,
+    executed: Vec<Executed>,
     torque: [ResponseState; 3],
     delay: ResponseState,
-    /// By how much `α̂` changes where the oldest waiting epoch begins, of one estimate of both sides: from one block to
-    /// the next the estimate of the slow torque changes too.
-    kick_rad_s2: Vector3<f64>,
+    /// Change of `α̂` at the start of the oldest waiting epoch. Both values come from the same smoothing, because the
+    /// estimate of the slow torque changes from block to block.
+    first_alpha_change_rad_s2: Vector3<f64>,
 }
 
 impl OnDemand {
-    pub(crate) fn new(needs: Needs, mission: &Mission, push_per_turn: Vec<Matrix3<f64>>) -> Self {
+    pub(crate) fn new(needs: Needs, mission: &Mission, tm_accel_per_alpha: Vec<Matrix3<f64>>) -> Self {
         Self {
             needs,
             inertia_inverse: mission.spacecraft.inertia_inverse(),
-            push_per_turn,
+            tm_accel_per_alpha,
             vectors: command_vectors(mission),
             test_masses: mission.test_mass.keys().map(|name| (name.clone(), mission.frame(name))).collect(),
-            used: Vec::new(),
+            executed: Vec::new(),
             torque: Default::default(),
             delay: ResponseState::default(),
-            kick_rad_s2: Vector3::from_element(f64::NAN),
+            first_alpha_change_rad_s2: Vector3::from_element(f64::NAN),
         }
     }
 
@@ -119,7 +118,7 @@ impl OnDemand {
                 let name = |axis| format!("response.alpha_srf_rad_s2.by_torque_gain.{about}.{axis}");
                 columns.extend(AXES.map(|axis| (name(axis), "rad s-2", "SRF".to_owned())));
             }
-            for about in AXES.iter().filter(|_| self.layout()) {
+            for about in AXES.iter().filter(|_| self.has_layout()) {
                 for (tm, frame) in &self.test_masses {
                     let name = |axis| format!("response.u_orf_m_s2.by_torque_gain.{about}.{tm}.{axis}");
                     columns.extend(AXES.map(|axis| (name(axis), "m s-2", frame.clone())));
@@ -133,105 +132,105 @@ impl OnDemand {
         columns
     }
 
-    fn layout(&self) -> bool {
-        self.push_per_turn.iter().any(|push| *push != Matrix3::zeros())
+    fn has_layout(&self) -> bool {
+        self.tm_accel_per_alpha.iter().any(|matrix| *matrix != Matrix3::zeros())
     }
 
-    /// Takes what acts over the newest interval. The command of the test mass `unknown` is missing.
-    pub(crate) fn take(
+    /// Adds the newest interval. The electrodes' command of test mass `unknown` is missing.
+    pub(crate) fn push(
         &mut self,
-        acting: Option<&CommandNumbers>,
+        command: Option<&CommandNumbers>,
         unknown: Option<usize>,
         sun_srf: Option<Vector3<f64>>,
     ) {
         let missing = f64::NAN;
         let numbers = 3 * self.vectors.len();
-        let mut command = acting.copied().unwrap_or_else(|| CommandNumbers::from_fn(numbers, |_| missing));
+        let mut command = command.copied().unwrap_or_else(|| CommandNumbers::from_fn(numbers, |_| missing));
         if let Some(tm) = unknown {
             command[electrodes_of(tm)].fill(missing);
         }
-        self.used.push(Used { command, sun_srf: sun_srf.unwrap_or(Vector3::from_element(missing)) });
+        self.executed.push(Executed { command, sun_srf: sun_srf.unwrap_or(Vector3::from_element(missing)) });
     }
 
-    /// Values for the oldest waiting epochs, which leave. `alpha_crf_rad_s2` is the smoothed `α̂` relative to CRF of
-    /// all that wait, NaN where a command is missing; nothing unless a delay is asked for.
-    pub(crate) fn give(
+    /// Removes the oldest waiting epochs, one for each of `available`, and returns their values. `alpha_crf_rad_s2` is
+    /// `α̂` relative to CRF of all waiting epochs, NaN where a command is missing; empty unless a delay is requested.
+    pub(crate) fn emit(
         &mut self,
         smoother: &Smoother,
-        leaving: &[Availability],
+        available: &[Availability],
         alpha_crf_rad_s2: &[Vector3<f64>],
     ) -> Vec<Vec<f64>> {
-        let mut out = vec![Vec::new(); leaving.len()];
+        let mut out = vec![Vec::new(); available.len()];
         if self.needs.commands {
-            for (out, used) in out.iter_mut().zip(&self.used) {
-                out.extend_from_slice(&used.command);
-                out.extend_from_slice(used.sun_srf.as_slice());
+            for (out, executed) in out.iter_mut().zip(&self.executed) {
+                out.extend_from_slice(&executed.command);
+                out.extend_from_slice(executed.sun_srf.as_slice());
             }
         }
         if self.needs.torque_response {
-            self.torque_columns(smoother, leaving, &mut out);
+            self.torque_columns(smoother, available, &mut out);
         }
         if self.needs.dws_delay_response {
-            let responses = self.delay_columns(smoother, leaving.len(), alpha_crf_rad_s2);
-            for ((out, available), response) in out.iter_mut().zip(leaving).zip(responses) {
-                put(out, &response.disturbance_rad_s2, available.alpha);
+            let responses = self.by_delay(smoother, available.len(), alpha_crf_rad_s2);
+            for ((out, available), response) in out.iter_mut().zip(available).zip(responses) {
+                push_if(available.alpha, &response.disturbance_rad_s2, out);
             }
         }
-        self.used.drain(..leaving.len());
+        self.executed.drain(..available.len());
         out
     }
 
-    fn torque_columns(&mut self, smoother: &Smoother, leaving: &[Availability], out: &mut [Vec<f64>]) {
-        let (used, inverse) = (&self.used, &self.inertia_inverse);
-        let turn = |about: usize, k: usize| inverse.column(about) * used[k].command[3 + about];
+    fn torque_columns(&mut self, smoother: &Smoother, available: &[Availability], out: &mut [Vec<f64>]) {
+        let (executed, inverse) = (&self.executed, &self.inertia_inverse);
+        let commanded_alpha = |about: usize, k: usize| inverse.column(about) * executed[k].command[3 + about];
         let responses = [0, 1, 2].map(|about| {
-            let more = |k| Perturbation { held_rad_s2: turn(about, k), kick_rad_s: Vector3::zeros() };
-            smoother.response(&mut self.torque[about], leaving.len(), more)
+            let perturb = |k| Perturbation { held_rad_s2: commanded_alpha(about, k), kick_rad_s: Vector3::zeros() };
+            smoother.response(&mut self.torque[about], available.len(), perturb)
         });
-        let layout = self.layout();
-        for (k, (out, available)) in out.iter_mut().zip(leaving).enumerate() {
+        let has_layout = self.has_layout();
+        for (k, (out, available)) in out.iter_mut().zip(available).enumerate() {
             for (about, response) in responses.iter().enumerate() {
-                put(out, &(turn(about, k) + response[k].disturbance_rad_s2), available.alpha);
+                push_if(available.alpha, &(commanded_alpha(about, k) + response[k].disturbance_rad_s2), out);
             }
-            for response in responses.iter().filter(|_| layout) {
-                for (push, available) in self.push_per_turn.iter().zip(&available.u) {
-                    put(out, &(push * response[k].noise_rad_s2), *available);
+            for response in responses.iter().filter(|_| has_layout) {
+                for (accel_per_alpha, available) in self.tm_accel_per_alpha.iter().zip(&available.u) {
+                    push_if(*available, &(accel_per_alpha * response[k].noise_rad_s2), out);
                 }
             }
         }
     }
 
-    fn delay_columns(&mut self, smoother: &Smoother, count: usize, alpha_crf_rad_s2: &[Vector3<f64>]) -> Vec<Smoothed> {
+    fn by_delay(&mut self, smoother: &Smoother, count: usize, alpha_crf_rad_s2: &[Vector3<f64>]) -> Vec<Smoothed> {
         let change = |k: usize| alpha_crf_rad_s2[k] - alpha_crf_rad_s2[k - 1];
-        let first = self.kick_rad_s2;
-        let more = |k: usize| {
-            let kick = if k == 0 { first } else { change(k) };
-            // The attitude starts anew after an unknown command, so that its change there carries no information.
-            let known = kick.iter().all(|x| x.is_finite());
-            Perturbation { held_rad_s2: Vector3::zeros(), kick_rad_s: if known { kick } else { Vector3::zeros() } }
+        let first = self.first_alpha_change_rad_s2;
+        let perturb = |k: usize| {
+            let step = if k == 0 { first } else { change(k) };
+            // The smoother resets the rate after an unknown command, so a rate step there has no effect.
+            let known = step.iter().all(|x| x.is_finite());
+            Perturbation { held_rad_s2: Vector3::zeros(), kick_rad_s: if known { step } else { Vector3::zeros() } }
         };
-        let response = smoother.response(&mut self.delay, count, more);
+        let response = smoother.response(&mut self.delay, count, perturb);
         if (1..alpha_crf_rad_s2.len()).contains(&count) {
-            self.kick_rad_s2 = change(count);
+            self.first_alpha_change_rad_s2 = change(count);
         }
         response
     }
 
-    /// The state with `waiting` epochs.
+    /// Saves or restores the state for `waiting` epochs.
     pub(crate) fn visit(&mut self, waiting: usize, state: &mut State<'_>) -> Result<(), StateError> {
-        state.f64s(self.kick_rad_s2.iter_mut())?;
+        state.f64s(self.first_alpha_change_rad_s2.iter_mut())?;
         for response in self.torque.iter_mut().chain([&mut self.delay]) {
             response.visit(state)?;
         }
         let numbers = 3 * self.vectors.len();
-        state.list(&mut self.used, |state, used| {
-            visit_command(state, numbers, &mut used.command)?;
-            state.f64s(used.sun_srf.iter_mut())
+        state.list(&mut self.executed, |state, executed| {
+            visit_command(state, numbers, &mut executed.command)?;
+            state.f64s(executed.sun_srf.iter_mut())
         })?;
-        if self.used.len() == waiting { Ok(()) } else { Err(StateError::Content("a number of waiting commands")) }
+        if self.executed.len() == waiting { Ok(()) } else { Err(StateError::Content("a number of waiting commands")) }
     }
 }
 
-fn put(out: &mut Vec<f64>, value: &Vector3<f64>, available: bool) {
+fn push_if(available: bool, value: &Vector3<f64>, out: &mut Vec<f64>) {
     out.extend(value.iter().map(|x| if available { *x } else { f64::NAN }));
 }

@@ -11,9 +11,9 @@ use crate::on_demand::{self, Needs};
 use crate::reconstruction::{AngularAcceleration, Epoch, Reconstruction, Row, Settings, levels_of, row_length};
 use crate::replay::{CommandNumbers, Comparison, command_vectors};
 
-/// Relative difference of the innovations' variance from the prediction above which it is noted.
+/// Relative deviation of the innovations' variance from the prediction above which the report has a note.
 const INNOVATION_TOLERANCE: f64 = 0.1;
-/// Standard deviations of the innovations' correlation with rebuilt commands above which it is noted.
+/// Score of replayed commands, in standard deviations, above which the report has a note.
 const INCONSISTENT_SIGMA: f64 = 5.0;
 /// The stage.
 pub struct HinfDfacs {
@@ -31,22 +31,22 @@ struct Linked {
     reconstruction: Reconstruction,
     settings: Settings,
     all_readouts: bool,
-    /// Epochs held back until the levels of the noise are measured; `None` from then on.
+    /// Epochs held back until the noise levels are measured; `None` after that.
     held_back: Option<Vec<Epoch>>,
     rate_hz: f64,
     input: Columns<In>,
     table: Table,
     out: Vec<Out>,
-    /// How many of them are not on demand.
-    always: usize,
-    /// Rows to be passed on; empty between calls.
+    /// Number of columns in `out` that are written without a request.
+    fixed: usize,
+    /// Rows to be written; empty between calls.
     rows: Vec<Row>,
 }
 
-/// Names of the noise of a test mass's displacements along x, y, z.
+/// Names of the noise tables of a test mass's displacements along x, y, z.
 type Noises = [&'static str; 3];
 
-/// Asks for three columns of the grid, if the first is there.
+/// Requests three columns of the grid, if the first is available.
 fn read_vector(
     available: &Available,
     link: &mut Link<'_>,
@@ -66,9 +66,9 @@ fn grid(name: &str, unit: &str, frame: &str) -> Want {
 }
 
 impl HinfDfacs {
-    /// The best readout of each degree of freedom, and the names of the noise of each test mass's displacements: the
-    /// interferometer along an axis where there is one at all, local wavefront sensing for `θ` and `ψ`, else the
-    /// inertial sensor. The angles of the test masses serve only the stiffness and the replay and may be missing.
+    /// The most precise available readout of each degree of freedom, and the noise tables of the displacements:
+    /// interferometer and local wavefront sensing before the inertial sensor. The angles of the test masses may be
+    /// missing, as only the stiffness and the replay need them.
     fn link_readouts(
         &mut self,
         available: &Available,
@@ -92,7 +92,7 @@ impl HinfDfacs {
                 if optical.is_some() {
                     noise[axis] = INTERFEROMETER[axis];
                 } else if tm.has_interferometer(axis) {
-                    self.notes.push(format!("no interferometer for {name}: the inertial sensor reads its {letter}"));
+                    self.notes.push(format!("no interferometer for {name}.{letter}: the inertial sensor is used"));
                 }
                 readout.push(match optical {
                     None => Some(link.read(&grid(&format!("is.{name}.r_orf_m.{letter}"), "m", &frame))?),
@@ -125,11 +125,11 @@ impl HinfDfacs {
         Ok(Some(columns))
     }
 
-    /// A reconstruction from the start, for other levels of the noise.
+    /// Restarts the reconstruction with other noise levels.
     fn rebuild(&mut self, scale: NoiseScale) -> Result<(), PluginError> {
         let linked = self.linked.as_ref().ok_or_else(not_linked)?;
         let (settings, all_readouts) = (Settings { scale, ..linked.settings }, linked.all_readouts);
-        // Notes on the control law were made by `link`.
+        // `link` has made the notes on the control law already.
         let notes = self.notes.clone();
         let reconstruction = self.reconstruction(&settings, all_readouts)?;
         self.notes = notes;
@@ -138,7 +138,7 @@ impl HinfDfacs {
         Ok(())
     }
 
-    /// Measures the noise levels in the epochs held back, and processes these.
+    /// Measures the noise levels in the epochs held back, and then processes these.
     fn calibrate_noise(&mut self) -> Result<(), PluginError> {
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
         let Some(epochs) = linked.held_back.take() else { return Ok(()) };
@@ -165,8 +165,8 @@ impl HinfDfacs {
         if !settings.commands {
             if !all_readouts {
                 return Err(PluginError::error(
-                    "hinf-dfacs: there is no topic /command, and without every readout of /is and /dws the control law \
-                     cannot be replayed in its stead; give telemetry with /command, or with all readouts",
+                    "hinf-dfacs: there is no topic /command, and the control law cannot be replayed instead because \
+                     readouts of /is or /dws are missing; give telemetry with /command, or with all readouts",
                 ));
             }
             return Ok(Reconstruction::new(&self.mission, &Settings { replay: true, ..*settings })?);
@@ -226,10 +226,10 @@ fn write_columns(
 }
 
 impl Linked {
-    fn give(&mut self, output: &mut Outputs) {
+    fn write_rows(&mut self, output: &mut Outputs) {
         output.time(self.table).extend(self.rows.iter().map(|row| row.time_ns));
-        let (always, on_demand) = self.out.split_at(self.always);
-        for (i, column) in always.iter().enumerate() {
+        let (fixed, on_demand) = self.out.split_at(self.fixed);
+        for (i, column) in fixed.iter().enumerate() {
             output.f64(*column).extend(self.rows.iter().map(|row| row.values[i]));
         }
         for (i, column) in on_demand.iter().enumerate() {
@@ -357,15 +357,13 @@ impl Stage for HinfDfacs {
         let sensing = self.mission.noise.dws_long_arm.as_ref().map(|n| n.shape());
         if sensing.is_some_and(|shape| shape.coloured().any(|term| term.exponent > 4)) {
             self.notes.push(
-                "noise.dws_long_arm rises with an exponent above 4, which the estimate of the angular acceleration leaves out"
+                "noise.dws_long_arm has a term of exponent above 4, which the estimated angular acceleration neglects"
                     .to_owned(),
             );
         }
         if sun.is_none() && self.mission.solar_pressure.is_some() {
-            self.notes.push(
-                "no direction of the Sun in /ephemeris: sunlight is not modelled, and the known forces lack it"
-                    .to_owned(),
-            );
+            self.notes
+                .push("no direction of the Sun in /ephemeris: sunlight is not modelled in the known forces".to_owned());
         }
         if omega_crf.is_none() || alpha_crf.is_none() {
             self.notes.push(
@@ -389,14 +387,14 @@ impl Stage for HinfDfacs {
         let smoother = self.angular_acceleration == AngularAcceleration::Smoother;
         if self.needs.responses() && !smoother {
             return Err(PluginError::error(
-                "hinf-dfacs: an effect of the model asks for derivatives of the smoothed angular acceleration, which is not made; \
-                 set angular_acceleration = \"smoother\", or take that effect (of a torque, or of a delay of the wavefront sensing) \
-                 out of the model",
+                "hinf-dfacs: an effect of the model needs derivatives of the smoothed angular acceleration; set \
+                 angular_acceleration = \"smoother\", or remove that effect (a gain of a torque, or a delay of the \
+                 wavefront sensing) from the model",
             ));
         }
         let table = link.table("reconstruction", rate_hz);
         let mut out = write_columns(link, table, &self.mission, &noises)?;
-        let always = out.len();
+        let fixed = out.len();
         for (name, unit, frame) in reconstruction.on_demand_columns() {
             let attributes = [("kind", "series"), ("in_loop", "true")];
             let attributes = if on_demand::is_in_loop(&name) { &attributes[..] } else { &attributes[..1] };
@@ -411,7 +409,7 @@ impl Stage for HinfDfacs {
             input: Columns { readout, command, sun, ephemeris_age, omega_crf, alpha_crf },
             table,
             out,
-            always,
+            fixed,
             rows: Vec::new(),
         });
         Ok(())
@@ -436,7 +434,7 @@ impl Stage for HinfDfacs {
             let epoch = columns.epoch(*time_ns, k);
             linked.reconstruction.push(&epoch, &mut linked.rows)?;
         }
-        linked.give(output);
+        linked.write_rows(output);
         Ok(())
     }
 
@@ -444,7 +442,7 @@ impl Stage for HinfDfacs {
         self.calibrate_noise()?;
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
         linked.reconstruction.finish(&mut linked.rows);
-        linked.give(output);
+        linked.write_rows(output);
         Ok(())
     }
 
@@ -452,8 +450,8 @@ impl Stage for HinfDfacs {
         let linked = self.linked.as_ref().ok_or_else(not_linked)?;
         let counts = linked.reconstruction.counts();
         let mut report = Report { notes: self.notes.clone(), ..Report::default() };
-        let reconstructed = counts.commands_replayed > counts.commands_telemetered;
-        report.commands = Some(if reconstructed { "reconstructed" } else { "telemetered" }.to_owned());
+        let replayed = counts.commands_replayed > counts.commands_telemetered;
+        report.commands = Some(if replayed { "reconstructed" } else { "telemetered" }.to_owned());
         let counted = [
             ("commands_telemetered", counts.commands_telemetered),
             ("commands_replayed", counts.commands_replayed),
@@ -462,7 +460,7 @@ impl Stage for HinfDfacs {
             ("commands_of_one_test_mass", counts.commands_of_one_test_mass),
             ("attitude_missing", counts.attitude_missing),
             ("readouts_bridged", counts.readouts_bridged),
-            ("angular_acceleration_unknown", counts.blind),
+            ("angular_acceleration_unknown", counts.alpha_unknown),
         ];
         report.counts = counted.map(|(name, count)| (name.to_owned(), count)).into();
         if counts.commands_replayed > 0 {
@@ -473,13 +471,13 @@ impl Stage for HinfDfacs {
         }
         if counts.commands_missing > 0 {
             report.notes.push(format!(
-                "commands of {} of {} epochs are neither telemetered nor rebuilt: those epochs are not used",
+                "commands of {} of {} epochs are neither telemetered nor replayed: those epochs are not used",
                 counts.commands_missing, counts.epochs
             ));
         }
         if counts.commands_of_one_test_mass > 0 {
             report.notes.push(format!(
-                "commands of {} of {} epochs lack the electrodes of one test mass, which is left out there",
+                "commands of {} of {} epochs lack the electrodes of one test mass: it is not used in those epochs",
                 counts.commands_of_one_test_mass, counts.epochs
             ));
         }
@@ -513,18 +511,18 @@ impl Stage for HinfDfacs {
             q.insert("attitude_innovation_ratio".to_owned(), json!(ratio));
             if ratio.iter().any(|r| (r - 1.0).abs() > INNOVATION_TOLERANCE) {
                 report.notes.push(format!(
-                    "attitude innovations have {ratio:.2?} of their predicted variance about the principal axes: the noise \
-                     of thrusters' torque or long-arm wavefront sensing is not what the mission file says"
+                    "attitude innovations have {ratio:.2?} times their predicted variance about the principal axes: \
+                     the noise of thruster torque or long-arm wavefront sensing differs from the mission file"
                 ));
             }
         }
         if let Some(sigma) = linked.reconstruction.inconsistency_sigma() {
             q.insert("command_innovation_correlation_sigma".to_owned(), json!(sigma));
-            if reconstructed && sigma.iter().any(|z| z.abs() > INCONSISTENT_SIGMA) {
+            if replayed && sigma.iter().any(|z| z.abs() > INCONSISTENT_SIGMA) {
                 report.notes.push(format!(
-                    "the spacecraft does not turn as the rebuilt commands say: its attitude's innovations correlate with them \
-                     at {sigma:.1?} standard deviations about the principal axes. Another controller flew than [control] of the \
-                     mission file designs or lists, or thrusters and inertia are not what the mission file says"
+                    "the spacecraft does not turn as the replayed commands predict: attitude innovations correlate \
+                     with them at {sigma:.1?} standard deviations about the principal axes. The flown controller, the \
+                     thrusters or the inertia differ from the mission file"
                 ));
             }
         }
@@ -532,8 +530,8 @@ impl Stage for HinfDfacs {
             q.insert("command_replay".to_owned(), comparison_json(comparison, &self.mission));
             if !comparison.same_law() {
                 report.notes.push(
-                    "flown commands differ from the replayed control law by more than readout noise explains: another \
-                     controller flew; the flown commands were used"
+                    "telemetered commands differ from the replayed control law by more than readout noise explains: \
+                     another controller flew; the telemetered commands were used"
                         .to_owned(),
                 );
             }
@@ -547,7 +545,7 @@ impl Stage for HinfDfacs {
         let mut scale = linked.settings.scale;
         state.f64s(scale.torque.iter_mut().chain([&mut scale.sensing]))?;
         if !scale.torque.iter().chain([&scale.sensing]).all(|x| x.is_finite() && *x > 0.0) {
-            return Err(StateError::Content("a level of the noise").into());
+            return Err(StateError::Content("a noise level").into());
         }
         let most = noise_calibration::length(linked.rate_hz);
         state.option(&mut linked.held_back, |state, held_back| {

@@ -1,4 +1,4 @@
-//! From telemetry on the grid to the `reconstruction` table, epoch by epoch.
+//! Makes the rows of the table `reconstruction` from gridded telemetry, epoch by epoch.
 
 use dragfree_physics::control::{Command, ControlLaw, PerTestMass};
 use dragfree_physics::few::Few;
@@ -11,23 +11,23 @@ use crate::bridge::{LONGEST, bridge};
 use crate::known::{KnownModel, KnownMotion};
 use crate::noise_calibration::NoiseScale;
 use crate::on_demand::{Availability, Needs, OnDemand};
-use crate::replay::{CommandNumbers, Comparison, Held, ReadoutNumbers, Replay, electrodes_of, visit_command};
+use crate::replay::{CommandNumbers, Comparison, LastReadout, ReadoutNumbers, Replay, electrodes_of, visit_command};
 use crate::smoother::{Model, Smoothed, Smoother};
 use crate::thruster_response::ThrusterResponse;
 
 const NEEDED_BY: &str = "hinf-dfacs";
-/// Where the angular acceleration comes from. Only the smoother gives an unbiased calibration (physics.md §4).
+/// Source of `α̂`. Only the smoother gives an unbiased calibration (Methods, "Angular acceleration").
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum AngularAcceleration {
     /// `E[α | all wavefront sensing, all commands]`.
     Smoother,
-    /// The commanded torque alone: the loop makes the thrusters' noise a part of the command, which biases `b_x`.
+    /// Commanded torque alone: it lacks the thruster noise to which the controller responds, which biases `b_x`.
     Commanded,
-    /// Second difference of the attitude alone: errors in variables pull the offset to zero.
+    /// Second difference of the attitude alone: readout noise in the regressor attenuates the offset.
     SecondDifference,
 }
 
-/// How to reconstruct.
+/// Settings of a reconstruction.
 #[derive(Clone, Copy, Debug)]
 pub struct Settings {
     /// Rate of the grid, Hz.
@@ -38,37 +38,37 @@ pub struct Settings {
     pub commands: bool,
     /// The Sun's direction is telemetered.
     pub sun: bool,
-    /// Replay the control law: where commands are missing, and beside those that are there.
+    /// Replay the control law, to replace missing commands and to check telemetered ones.
     pub replay: bool,
     /// Time after which a replayed control law counts as settled, s.
     pub warm_up_s: f64,
-    /// Levels of the noise against the mission file.
+    /// Noise power relative to the mission file.
     pub scale: NoiseScale,
-    /// Columns on demand.
+    /// Columns that effects request.
     pub needs: Needs,
 }
 
-/// Telemetry at `t_k`; NaN where there is none.
+/// Telemetry at `t_k`; NaN where missing.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Epoch {
     /// Unix ns.
     pub time_ns: i64,
-    /// Best readouts, in the order of [`Mission::channels`], m and rad.
+    /// The most precise readouts, in the order of [`Mission::channels`], m and rad.
     pub readout: ReadoutNumbers,
-    /// What acts over `[t_k, t_{k+1})`, in the order of [`crate::replay::command_vectors`], N and N m.
+    /// Command for `[t_k, t_{k+1})`, in the order of [`crate::replay::command_vectors`], N and N m.
     pub command: CommandNumbers,
     /// Unit vector from the Sun to the spacecraft, SRF.
     pub sun_srf: Vector3<f64>,
-    /// How old the latest packet of the ephemeris is, s; NaN if not telemetered.
+    /// Age of the latest ephemeris packet, s; NaN if not telemetered.
     pub ephemeris_age_s: f64,
-    /// `ω_CI`, CRF, rad s⁻¹.
+    /// Angular velocity `ω_CI` of CRF relative to IRF, CRF, rad s⁻¹.
     pub omega_crf_rad_s: Vector3<f64>,
-    /// `ω̇_CI`, CRF, rad s⁻².
+    /// Its derivative `ω̇_CI`, CRF, rad s⁻².
     pub alpha_crf_rad_s2: Vector3<f64>,
 }
 
 impl Epoch {
-    /// Every field, of a mission with so many test masses.
+    /// Visits every field; `test_masses` is their number.
     pub(crate) fn visit(&mut self, test_masses: usize, state: &mut State<'_>) -> Result<(), StateError> {
         if state.is_loading() {
             self.readout = ReadoutNumbers::from_fn(3 + 6 * test_masses, |_| 0.0);
@@ -83,20 +83,20 @@ impl Epoch {
     }
 }
 
-/// Values in a row of the `reconstruction` table, of a mission with so many test masses.
+/// Number of values in a row of the table `reconstruction` for a number of test masses.
 pub fn row_length(test_masses: usize) -> usize {
     9 + 9 * test_masses
 }
 
-/// A row: `α̂` (3), `ω̂` (3), `r` (3) and `û` (3) of each test mass, then the channels `NAME.accel` (3) of each and
-/// `sc.alpha` (3).
+/// A row: `α̂` (SRF, rad s⁻²), `ω̂` (SRF, rad s⁻¹), `r` (m) and `û` (m s⁻²) of each test mass in its ORF, then the
+/// channels `NAME.accel` (m s⁻²) of each and `sc.alpha` (rad s⁻²), three values each.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Row {
     /// Unix ns.
     pub time_ns: i64,
-    /// Values, NaN where there is none.
+    /// Values in the order above; NaN where unknown.
     pub values: Few<f64, { 9 + 9 * MOST_TEST_MASSES }>,
-    /// Values of the columns on demand, in the order of [`Reconstruction::on_demand_columns`].
+    /// Values of the requested columns, in the order of [`Reconstruction::on_demand_columns`].
     pub on_demand: Vec<f64>,
 }
 
@@ -108,34 +108,34 @@ impl Row {
     }
 }
 
-/// What happened to how many epochs.
+/// Numbers of epochs by the data that they have.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Counts {
-    /// All.
+    /// All epochs.
     pub epochs: u64,
-    /// With a telemetered command.
+    /// Epochs with a telemetered command.
     pub commands_telemetered: u64,
-    /// With a replayed one.
+    /// Epochs with a replayed command.
     pub commands_replayed: u64,
-    /// Without any.
+    /// Epochs without a command.
     pub commands_missing: u64,
-    /// Without a direction of the Sun, though sunlight is modelled and telemetered.
+    /// Epochs without a Sun direction, if sunlight is modelled and its direction telemetered.
     pub sun_missing: u64,
-    /// Without the spacecraft's attitude.
+    /// Epochs without the spacecraft's attitude.
     pub attitude_missing: u64,
-    /// With a command that lacks the electrodes of one test mass.
+    /// Epochs with a command that lacks the electrodes of one test mass.
     pub commands_of_one_test_mass: u64,
-    /// Readouts (axes) bridged in the channels.
+    /// Missing readouts, per axis, that the channels interpolate.
     pub readouts_bridged: u64,
-    /// So far from any attitude that nothing but the command is known of the angular acceleration.
-    pub blind: u64,
+    /// Epochs without `α̂`, because no attitude readout lies within the smoother's memory.
+    pub alpha_unknown: u64,
 }
 
-/// What there is of a test mass in an epoch that waits for the smoother, ORF.
+/// Data of a test mass in an epoch that waits for the smoother, ORF.
 #[derive(Clone, Copy, Debug, Default)]
 struct PendingTestMass {
     r_orf_m: Vector3<f64>,
-    /// The same with short holes bridged.
+    /// The same with short gaps interpolated.
     bridged_orf_m: Vector3<f64>,
     u_orf_m_s2: Vector3<f64>,
 }
@@ -145,10 +145,10 @@ struct PendingTestMass {
 struct Pending {
     time_ns: i64,
     attitude_rad: Vector3<f64>,
-    /// The same with short holes bridged.
+    /// The same with short gaps interpolated.
     bridged_rad: Vector3<f64>,
     tm: PerTestMass<PendingTestMass>,
-    /// Commanded, relative to IRF.
+    /// Angular acceleration relative to IRF by the known torques, SRF.
     alpha_known_rad_s2: Vector3<f64>,
     /// `ω̇_SI − ω̇_SC = T ω̇_CI − ω_SC×(T ω_CI)`.
     frame_rad_s2: Vector3<f64>,
@@ -156,14 +156,14 @@ struct Pending {
 }
 
 impl Pending {
-    /// A bridged readout by its place: attitude, then the displacements of each test mass.
-    fn bridged(&self, place: usize) -> f64 {
-        if place < 3 { self.bridged_rad[place] } else { self.tm[place / 3 - 1].bridged_orf_m[place % 3] }
+    /// Interpolated readout of an axis, counted over the attitude and the displacements of each test mass.
+    fn bridged(&self, axis: usize) -> f64 {
+        if axis < 3 { self.bridged_rad[axis] } else { self.tm[axis / 3 - 1].bridged_orf_m[axis % 3] }
     }
 
-    fn bridge(&mut self, place: usize, value: f64) {
-        let vector = if place < 3 { &mut self.bridged_rad } else { &mut self.tm[place / 3 - 1].bridged_orf_m };
-        vector[place % 3] = value;
+    fn set_bridged(&mut self, axis: usize, value: f64) {
+        let vector = if axis < 3 { &mut self.bridged_rad } else { &mut self.tm[axis / 3 - 1].bridged_orf_m };
+        vector[axis % 3] = value;
     }
 
     fn vectors(&mut self) -> impl Iterator<Item = &mut Vector3<f64>> {
@@ -188,30 +188,30 @@ impl Pending {
     }
 }
 
-/// The running reconstruction.
+/// Reconstruction of one run: [`Self::push`] epochs in order, then [`Self::finish`].
 pub struct Reconstruction {
     rate_hz: f64,
     angular_acceleration: AngularAcceleration,
     needs_sun: bool,
     known: KnownModel,
-    /// `−T_S^{O_i} C J/m_S`: the acceleration of each test mass, ORF, by the force that comes with the thrusters'
-    /// torque, from what that torque does to the spacecraft, SRF; m s⁻² per rad s⁻².
-    push_per_turn: Vec<Matrix3<f64>>,
+    /// `−T_S^{O_i} C J/m_S` (`C`: [`ThrustNoise::force_per_torque`]): acceleration of each test mass, ORF, by the
+    /// force correlated with torque noise, per angular acceleration by that noise, SRF; m s⁻² per rad s⁻².
+    tm_accel_per_alpha: Vec<Matrix3<f64>>,
     smoother: Smoother,
     replay: Option<Replay>,
-    held: Held,
-    acting: ThrusterResponse,
-    /// At the epoch, and as the last packet told it: on board the feed-forward holds the packet.
+    last_readout: LastReadout,
+    thruster_response: ThrusterResponse,
+    /// Sun direction at the epoch, and in the latest packet, which the feed-forward on board holds.
     sun_srf: Option<Vector3<f64>>,
     packet_sun_srf: Option<Vector3<f64>>,
     omega_ci_rad_s: Vector3<f64>,
     alpha_ci_rad_s2: Vector3<f64>,
     pending: Vec<Pending>,
-    /// Samples from the last attitude to the last epoch that left; infinite before the first.
+    /// Samples from the last attitude readout to the last emitted epoch; infinite before the first readout.
     since_attitude: f64,
     /// The epoch before the first pending one.
     previous: Option<Pending>,
-    /// `None` where nothing is asked for.
+    /// `None` if no effect requests a column.
     on_demand: Option<OnDemand>,
     counts: Counts,
 }
@@ -220,14 +220,14 @@ fn finite(v: &Vector3<f64>) -> Option<Vector3<f64>> {
     v.iter().all(|x| x.is_finite()).then_some(*v)
 }
 
-/// The smoother's model: what the thrusters' noise does to the angular acceleration, and what the sensors see of it.
+/// The smoother's model from the noise of thruster torque and long-arm wavefront sensing.
 fn model(mission: &Mission, noise: &ThrustNoise, settings: &Settings) -> Result<Model, MissionError> {
     let inverse = mission.spacecraft.inertia_inverse();
     let torque = noise.torque * noise.torque_shape.white_psd();
     let mut sensing = Mission::need(&mission.noise.dws_long_arm, "noise.dws_long_arm", NEEDED_BY)?.shape();
     sensing.terms.iter_mut().for_each(|term| term.asd *= settings.scale.sensing.sqrt());
     let refuse = |key: &str, psd: f64| {
-        let reason = "must be above zero: it is what weighs wavefront sensing against commands";
+        let reason = "must be above zero: it sets the weights of wavefront sensing and commands";
         Err(MissionError::Value { key: key.to_owned(), value: psd.sqrt().to_string(), reason })
     };
     let levels = torque.symmetric_eigenvalues();
@@ -239,12 +239,12 @@ fn model(mission: &Mission, noise: &ThrustNoise, settings: &Settings) -> Result<
     if sensing.white_psd() <= 0.0 {
         return refuse("noise.dws_long_arm.asd_rad_rthz", 0.0);
     }
-    let loud = Matrix3::from_diagonal(&settings.scale.torque.map(f64::sqrt));
-    Ok(Model::new(&(loud * inverse * torque * inverse.transpose() * loud), &sensing, 1.0 / settings.rate_hz))
+    let scale = Matrix3::from_diagonal(&settings.scale.torque.map(f64::sqrt));
+    Ok(Model::new(&(scale * inverse * torque * inverse.transpose() * scale), &sensing, 1.0 / settings.rate_hz))
 }
 
-/// One-sided PSDs of the mission file: what the thrusters' torque does to the angular acceleration about each axis of
-/// SRF, rad² s⁻⁴/Hz, and the white part of the attitude's sensing, rad²/Hz; `None` where it tells neither.
+/// One-sided PSDs by the mission file: angular acceleration by thruster torque noise about each axis of SRF,
+/// rad² s⁻⁴/Hz, and the white part of the attitude's readout noise, rad²/Hz; `None` if the file lacks either.
 pub fn levels_of(mission: &Mission) -> Option<(Vector3<f64>, f64)> {
     let noise = ThrustNoise::of(mission)?;
     let inverse = mission.spacecraft.inertia_inverse();
@@ -254,38 +254,38 @@ pub fn levels_of(mission: &Mission) -> Option<(Vector3<f64>, f64)> {
 }
 
 impl Reconstruction {
-    /// Builds the stage for a mission.
+    /// Starts a reconstruction for a mission.
     ///
     /// # Errors
-    /// [`MissionError`] when the mission lacks test masses, the noise of the thrusters' torque or of the long-arm
-    /// wavefront sensing, or, with `settings.replay`, a control law.
+    /// [`MissionError`] if the mission lacks test masses, the noise of thruster torque or of long-arm wavefront
+    /// sensing, or, with `settings.replay`, a control law.
     pub fn new(mission: &Mission, settings: &Settings) -> Result<Self, MissionError> {
         let missing = || MissionError::Missing { section: "noise.thruster_torque".to_owned(), needed_by: NEEDED_BY };
         let noise = ThrustNoise::of(mission).filter(|n| !n.torque_shape.terms.is_empty()).ok_or_else(missing)?;
         let model = model(mission, &noise, settings)?;
         let known = KnownModel::new(mission)?;
         let test_masses = mission.test_mass.len();
-        let force_per_turn = noise.force_per_torque * mission.spacecraft.inertia();
-        let push = |tm: &TestMass| tm.dcm_orf_from_srf() * force_per_turn / -mission.spacecraft.mass_kg;
-        let push_per_turn: Vec<_> = mission.test_mass.values().map(push).collect();
+        let force_per_alpha = noise.force_per_torque * mission.spacecraft.inertia();
+        let accel_per_alpha = |tm: &TestMass| tm.dcm_orf_from_srf() * force_per_alpha / -mission.spacecraft.mass_kg;
+        let tm_accel_per_alpha: Vec<_> = mission.test_mass.values().map(accel_per_alpha).collect();
         let replay = if settings.replay {
             let (law, numbers) = (ControlLaw::new(mission)?, 6 + 6 * test_masses);
             Some(Replay::new(law, numbers, !settings.commands, settings.warm_up_s, settings.rate_hz))
         } else {
             None
         };
-        let on_demand = || OnDemand::new(settings.needs, mission, push_per_turn.clone());
+        let on_demand = || OnDemand::new(settings.needs, mission, tm_accel_per_alpha.clone());
         Ok(Self {
             rate_hz: settings.rate_hz,
             angular_acceleration: settings.angular_acceleration,
             needs_sun: settings.sun && mission.solar_pressure.is_some(),
             on_demand: (settings.needs != Needs::default()).then(on_demand),
-            push_per_turn,
+            tm_accel_per_alpha,
             known,
             smoother: Smoother::new(model),
             replay,
-            held: Held::new(3 + 6 * test_masses),
-            acting: ThrusterResponse::new(mission, 1.0 / settings.rate_hz),
+            last_readout: LastReadout::new(3 + 6 * test_masses),
+            thruster_response: ThrusterResponse::new(mission, 1.0 / settings.rate_hz),
             sun_srf: None,
             packet_sun_srf: None,
             omega_ci_rad_s: Vector3::zeros(),
@@ -297,20 +297,20 @@ impl Reconstruction {
         })
     }
 
-    /// Takes one epoch; `rows` gains those whose lag has passed.
+    /// Adds one epoch, and appends to `rows` those whose lag has passed.
     ///
-    /// Small angles: SRF and CRF differ by the attitude error, 1e-8 rad, so `T_C^S = 1` and the three angles are a
-    /// vector whose second derivative is the angular acceleration relative to CRF.
+    /// SRF and CRF differ by the attitude error, 1e-8 rad. So `T_C^S = 1`, and the three angles form a vector whose
+    /// second derivative is the angular acceleration relative to CRF.
     ///
     /// # Errors
-    /// [`StateError`] when the control law does not take back its own state.
+    /// [`StateError`] if the control law refuses its own initial state.
     pub fn push(&mut self, epoch: &Epoch, rows: &mut Vec<Row>) -> Result<(), StateError> {
         self.counts.epochs += 1;
-        self.held.take(&epoch.readout);
-        // The ephemeris comes once a minute; what it tells moves by 1e-5 in that time.
+        self.last_readout.update(&epoch.readout);
+        // Values of the ephemeris are held if missing: they change by 1e-5 between packets, in a minute.
         self.sun_srf = finite(&epoch.sun_srf).or(self.sun_srf);
-        let held = epoch.ephemeris_age_s >= 1.0 / self.rate_hz && self.packet_sun_srf.is_some();
-        if !held {
+        let same_packet = epoch.ephemeris_age_s >= 1.0 / self.rate_hz && self.packet_sun_srf.is_some();
+        if !same_packet {
             self.packet_sun_srf = self.sun_srf;
         }
         self.omega_ci_rad_s = finite(&epoch.omega_crf_rad_s).unwrap_or(self.omega_ci_rad_s);
@@ -339,18 +339,18 @@ impl Reconstruction {
             frame_rad_s2,
             omega_ci_rad_s: self.omega_ci_rad_s,
         });
-        self.bridge();
+        self.interpolate_gaps();
         if self.smoother.waiting() == 2 * self.lag() {
             self.emit(self.lag(), rows);
         }
         Ok(())
     }
 
-    /// Fills a hole that the two newest epochs end. At least a lag of epochs is always pending, longer than any bridge.
-    fn bridge(&mut self) {
+    /// Interpolates over gaps that the two newest epochs end. Such a gap is still pending: it is shorter than the lag.
+    fn interpolate_gaps(&mut self) {
         let end = self.pending.len();
-        for place in 0..3 + 3 * self.push_per_turn.len() {
-            let at = |back: usize| end.checked_sub(back).map_or(f64::NAN, |k| self.pending[k].bridged(place));
+        for axis in 0..3 + 3 * self.tm_accel_per_alpha.len() {
+            let at = |back: usize| end.checked_sub(back).map_or(f64::NAN, |k| self.pending[k].bridged(axis));
             if !(at(1).is_finite() && at(2).is_finite() && at(3).is_nan()) {
                 continue;
             }
@@ -361,13 +361,13 @@ impl Reconstruction {
             }
             let after = [at(2), at(1)];
             for (k, value) in (end - 2 - missing..).zip(bridge(before, after, missing)) {
-                self.pending[k].bridge(place, value);
+                self.pending[k].set_bridged(axis, value);
                 self.counts.readouts_bridged += 1;
             }
         }
     }
 
-    /// There are no more epochs: gives what waits.
+    /// Ends the data: appends the remaining rows.
     pub fn finish(&mut self, rows: &mut Vec<Row>) {
         self.emit(self.pending.len(), rows);
     }
@@ -383,7 +383,7 @@ impl Reconstruction {
     ) -> Result<Option<KnownMotion>, StateError> {
         let telemetered = epoch.command.iter().all(|x| x.is_finite()).then_some(&epoch.command);
         let replayed = match &mut self.replay {
-            Some(replay) => replay.step(&self.held, self.packet_sun_srf, telemetered)?,
+            Some(replay) => replay.step(&self.last_readout, self.packet_sun_srf, telemetered)?,
             None => None,
         };
         let counter = match (telemetered, &replayed) {
@@ -392,36 +392,35 @@ impl Reconstruction {
             (None, None) => &mut self.counts.commands_missing,
         };
         *counter += 1;
-        // Without the electrodes' commands of one test mass, the others and the spacecraft go on: the recoil on the
+        // If a command lacks the electrodes of one test mass, the other bodies are still modelled: the recoil on the
         // spacecraft, 1e-9 N, is a thousandth of the thrusters' noise.
         let without = |tm: usize| -> Option<CommandNumbers> {
-            let theirs = electrodes_of(tm);
-            let given = |i: usize| if theirs.contains(&i) { 0.0 } else { epoch.command[i] };
-            let others = CommandNumbers::from_fn(epoch.command.len(), given);
+            let mut others = epoch.command;
+            others[electrodes_of(tm)].fill(0.0);
             others.iter().all(|x| x.is_finite()).then_some(others)
         };
         let mut unknown = None;
         let commanded = telemetered.copied().or(replayed).or_else(|| {
-            unknown = (0..self.push_per_turn.len()).find(|tm| without(*tm).is_some());
+            unknown = (0..self.tm_accel_per_alpha.len()).find(|tm| without(*tm).is_some());
             unknown.and_then(without)
         });
         if unknown.is_some() {
             self.counts.commands_missing -= 1;
             self.counts.commands_of_one_test_mass += 1;
         }
-        let thrust = self.acting.act(commanded.as_ref().and_then(|numbers| numbers.first_chunk().copied()));
+        let thrust = self.thruster_response.step(commanded.as_ref().and_then(|numbers| numbers.first_chunk().copied()));
         let acting = commanded.zip(thrust).map(|(mut numbers, thrust)| {
             numbers[..6].copy_from_slice(&thrust);
             numbers
         });
         if let Some(on_demand) = &mut self.on_demand {
-            on_demand.take(acting.as_ref(), unknown, self.sun_srf);
+            on_demand.push(acting.as_ref(), unknown, self.sun_srf);
         }
         if self.needs_sun && self.sun_srf.is_none() {
             self.counts.sun_missing += 1;
             return Ok(None);
         }
-        let readout = self.held.test_masses();
+        let readout = self.last_readout.test_masses();
         Ok(acting.map(|numbers| {
             let command = Command::from_numbers(&numbers);
             let mut motion = self.known.motion(&command, self.sun_srf.as_ref(), &readout, omega_srf_rad_s);
@@ -439,26 +438,26 @@ impl Reconstruction {
         let alpha_crf_rad_s2: Vec<_> = self.pending.iter().zip(&smoothed).filter(|_| delay).map(alpha_crf).collect();
         smoothed.truncate(count);
         for (pending, smoothed) in self.pending.iter_mut().zip(&smoothed) {
-            for (tm, push) in pending.tm.iter_mut().zip(&self.push_per_turn) {
-                tm.u_orf_m_s2 += push * smoothed.noise_rad_s2;
+            for (tm, accel_per_alpha) in pending.tm.iter_mut().zip(&self.tm_accel_per_alpha) {
+                tm.u_orf_m_s2 += accel_per_alpha * smoothed.noise_rad_s2;
             }
         }
-        let blind = self.blind(smoothed.len());
+        let alpha_unknown = self.find_unknown_alpha(smoothed.len());
         let known = |v: &Vector3<f64>| v.iter().all(|x| x.is_finite());
-        let available = |(p, blind): (&Pending, &bool)| Availability {
-            alpha: known(&p.alpha_known_rad_s2) && !blind,
+        let available = |(p, alpha_unknown): (&Pending, &bool)| Availability {
+            alpha: known(&p.alpha_known_rad_s2) && !alpha_unknown,
             u: p.tm.map(|tm| known(&tm.u_orf_m_s2)),
         };
         let mut on_demand = Vec::new();
         if let Some(columns) = &mut self.on_demand {
-            let leaving: Vec<Availability> = self.pending.iter().zip(&blind).map(available).collect();
-            on_demand = columns.give(&self.smoother, &leaving, &alpha_crf_rad_s2);
+            let available: Vec<Availability> = self.pending.iter().zip(&alpha_unknown).map(available).collect();
+            on_demand = columns.emit(&self.smoother, &available, &alpha_crf_rad_s2);
         }
         self.smoother.release(count);
         let mut on_demand = on_demand.into_iter();
         rows.reserve(smoothed.len());
-        for (k, (smoothed, blind)) in smoothed.iter().zip(blind).enumerate() {
-            let row = self.row(k, smoothed, blind);
+        for (k, (smoothed, alpha_unknown)) in smoothed.iter().zip(alpha_unknown).enumerate() {
+            let row = self.row(k, smoothed, alpha_unknown);
             rows.push(Row { on_demand: on_demand.next().unwrap_or_default(), ..row });
         }
         if let Some(last) = smoothed.len().checked_sub(1) {
@@ -467,39 +466,39 @@ impl Reconstruction {
         self.pending.drain(..smoothed.len());
     }
 
-    /// Whether each of the `count` oldest pending epochs is further from every attitude than the smoother remembers.
-    /// What is left of `α̂` there is the command, which answers the very disturbance that it lacks: it would bias the
-    /// calibration.
-    fn blind(&mut self, count: usize) -> Vec<bool> {
+    /// Whether each of the `count` oldest pending epochs is further from every attitude readout than the smoother's
+    /// memory. There `α̂` would be the commanded value, which lacks the disturbance that it counteracts: it would bias
+    /// the calibration.
+    fn find_unknown_alpha(&mut self, count: usize) -> Vec<bool> {
         let sensed = |pending: &Pending| pending.attitude_rad.iter().all(|x| x.is_finite());
         let memory = self.smoother.model().memory();
-        let mut blind = vec![false; count];
-        let mut ahead = f64::INFINITY;
+        let mut unknown = vec![false; count];
+        let mut until_attitude = f64::INFINITY;
         for (k, pending) in self.pending.iter().enumerate().rev() {
-            ahead = if sensed(pending) { 0.0 } else { ahead + 1.0 };
-            if let Some(blind) = blind.get_mut(k) {
-                *blind = ahead > memory;
+            until_attitude = if sensed(pending) { 0.0 } else { until_attitude + 1.0 };
+            if let Some(unknown) = unknown.get_mut(k) {
+                *unknown = until_attitude > memory;
             }
         }
-        for (pending, blind) in self.pending.iter().zip(&mut blind) {
+        for (pending, unknown) in self.pending.iter().zip(&mut unknown) {
             self.since_attitude = if sensed(pending) { 0.0 } else { self.since_attitude + 1.0 };
-            *blind &= self.since_attitude > memory;
-            self.counts.blind += u64::from(*blind);
+            *unknown &= self.since_attitude > memory;
+            self.counts.alpha_unknown += u64::from(*unknown);
         }
-        blind
+        unknown
     }
 
-    fn row(&self, k: usize, smoothed: &Smoothed, blind: bool) -> Row {
+    fn row(&self, k: usize, smoothed: &Smoothed, alpha_unknown: bool) -> Row {
         let now = &self.pending[k];
         let before = if k == 0 { self.previous.as_ref() } else { Some(&self.pending[k - 1]) };
         let after = self.pending.get(k + 1);
         let missing = Vector3::from_element(f64::NAN);
         let alpha = match self.angular_acceleration {
-            AngularAcceleration::Smoother if blind => missing,
+            AngularAcceleration::Smoother if alpha_unknown => missing,
             AngularAcceleration::Smoother => now.alpha_known_rad_s2 + smoothed.disturbance_rad_s2,
             AngularAcceleration::Commanded => now.alpha_known_rad_s2,
             AngularAcceleration::SecondDifference => match (before, after, self.pending.get(k + 2)) {
-                // The mean of the second differences at both ends of the interval.
+                // Mean of the second differences at both ends of the interval.
                 (Some(a), Some(c), Some(d)) => {
                     let sum = d.attitude_rad - c.attitude_rad - now.attitude_rad + a.attitude_rad;
                     sum * (0.5 * self.rate_hz * self.rate_hz) + now.frame_rad_s2
@@ -513,24 +512,24 @@ impl Reconstruction {
             vectors.push(tm.r_orf_m);
             vectors.push(tm.u_orf_m_s2);
         }
-        // Measured minus known acceleration, the known one averaged as the second difference averages it.
-        let difference = |read: &dyn Fn(&Pending) -> Vector3<f64>, known: &dyn Fn(&Pending) -> Vector3<f64>| {
+        // Measured minus known acceleration; a second difference measures the mean of two samples.
+        let channel = |read: &dyn Fn(&Pending) -> Vector3<f64>, known: &dyn Fn(&Pending) -> Vector3<f64>| {
             let (Some(a), Some(c)) = (before, after) else { return missing };
             (read(a) - 2.0 * read(now) + read(c)) * (self.rate_hz * self.rate_hz) - 0.5 * (known(a) + known(now))
         };
         for i in 0..now.tm.len() {
-            vectors.push(difference(&|p| p.tm[i].bridged_orf_m, &|p| p.tm[i].u_orf_m_s2));
+            vectors.push(channel(&|p| p.tm[i].bridged_orf_m, &|p| p.tm[i].u_orf_m_s2));
         }
-        vectors.push(difference(&|p| p.bridged_rad, &|p| p.alpha_known_rad_s2 - p.frame_rad_s2));
+        vectors.push(channel(&|p| p.bridged_rad, &|p| p.alpha_known_rad_s2 - p.frame_rad_s2));
         Row { time_ns: now.time_ns, values: vectors.iter().flatten().copied().collect(), on_demand: Vec::new() }
     }
 
-    /// Name, unit and frame of the columns on demand.
+    /// Name, unit and frame of the requested columns.
     pub fn on_demand_columns(&self) -> Vec<(String, &'static str, String)> {
         self.on_demand.as_ref().map(OnDemand::columns).unwrap_or_default()
     }
 
-    /// What happened to how many epochs.
+    /// Numbers of epochs by the data that they have.
     pub fn counts(&self) -> Counts {
         self.counts
     }
@@ -545,27 +544,27 @@ impl Reconstruction {
         self.smoother.inconsistency_sigma()
     }
 
-    /// Replayed against telemetered commands; `None` where nothing was compared.
+    /// Comparison of replayed with telemetered commands; `None` if there was none.
     pub fn comparison(&self) -> Option<&Comparison> {
         self.replay.as_ref().map(Replay::comparison).filter(|c| c.samples() > 0)
     }
 
-    /// Samples by which a row is late at least; at most twice as many.
+    /// Smallest delay of a row, samples; the largest is twice as long.
     pub fn lag(&self) -> usize {
         self.smoother.model().lag()
     }
 
-    /// Visits the whole state, to save it or to take it back bit for bit.
+    /// Saves or restores the whole state, bit for bit.
     ///
     /// # Errors
-    /// [`StateError`] when the state is of another mission or model; do not use the stage after that.
+    /// [`StateError`] if the state belongs to another mission or model; `self` must not be used after that.
     pub fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
-        let test_masses = self.push_per_turn.len();
+        let test_masses = self.tm_accel_per_alpha.len();
         state.same("mission", &format!("{test_masses} test masses"))?;
         state.same("model", &self.needs().describe())?;
         self.smoother.visit(state)?;
-        self.held.visit(state)?;
-        self.acting.visit(state)?;
+        self.last_readout.visit(state)?;
+        self.thruster_response.visit(state)?;
         for direction in [&mut self.sun_srf, &mut self.packet_sun_srf] {
             state.option(direction, |state, v| state.f64s(v.iter_mut()))?;
         }
@@ -587,7 +586,7 @@ impl Reconstruction {
             &mut c.attitude_missing,
             &mut c.commands_of_one_test_mass,
             &mut c.readouts_bridged,
-            &mut c.blind,
+            &mut c.alpha_unknown,
         ] {
             state.u64(count)?;
         }

@@ -1,4 +1,4 @@
-//! The commands that the control law would have given: a stand-in where none were telemetered, a check where they were.
+//! Replay of the control law on telemetered readouts, to replace missing commands and to check telemetered ones.
 
 use dragfree_physics::control::{ControlLaw, PerTestMass, Readout, TestMassReadout};
 use dragfree_physics::few::Few;
@@ -6,12 +6,12 @@ use dragfree_physics::mission::{MOST_TEST_MASSES, Mission};
 use dragfree_sdk::state::{State, StateError};
 use nalgebra::Vector3;
 
-/// A command as numbers: thrust and torque of the thrusters, then force and torque on each test mass, axis by axis.
+/// A command: force and torque of the thrusters, then force and torque on each test mass, axis by axis, N and N m.
 pub type CommandNumbers = Few<f64, { 6 + 6 * MOST_TEST_MASSES }>;
-/// A readout as numbers, in the order of [`Mission::channels`].
+/// A readout in the order of [`Mission::channels`], m and rad.
 pub type ReadoutNumbers = Few<f64, { 3 + 6 * MOST_TEST_MASSES }>;
 
-/// Name, unit and frame of the vectors of a command.
+/// Name, unit and frame of each vector of a command.
 pub fn command_vectors(mission: &Mission) -> Vec<(String, &'static str, String)> {
     let thrusters = [("mps_force_srf_n", "N"), ("mps_torque_srf_nm", "N m")];
     let mut all: Vec<_> = thrusters.map(|(name, unit)| (name.to_owned(), unit, "SRF".to_owned())).into();
@@ -23,34 +23,34 @@ pub fn command_vectors(mission: &Mission) -> Vec<(String, &'static str, String)>
     all
 }
 
-/// The numbers of a command that belong to a test mass.
+/// Range of a test mass's force and torque in a command.
 pub(crate) fn electrodes_of(test_mass: usize) -> std::ops::Range<usize> {
     6 + 6 * test_mass..12 + 6 * test_mass
 }
 
-/// A readout missing for longer than this stops the replay: the telemetered controller saw other data.
-const LONGEST_HOLD_S: f64 = 1.0;
-/// The replayed law is another than the telemetered one when their commands lie further apart than this part of the
-/// telemetered command's rms change from one sample to the next. Fresh readout noise makes that change, and the same
-/// law fed with the same readout repeats it exactly.
-const SAME_LAW: f64 = 0.5;
-/// Samples to compare before the replay may stand in for a lost command.
-const PROOF_SAMPLES: u64 = 1000;
+/// Longest hold of a missing readout, s. Then the replay restarts, as the controller on board had other data.
+const MAX_HOLD_S: f64 = 1.0;
+/// Largest rms difference of replayed and telemetered commands of the same law, relative to the rms change of the
+/// telemetered command from one sample to the next. That change comes from readout noise, which the same law with the
+/// same readout reproduces exactly.
+const SAME_LAW_RATIO: f64 = 0.5;
+/// Samples to compare before a replayed command may replace a missing one.
+const MIN_COMPARED: u64 = 1000;
 
-/// The last valid readout, channel by channel.
+/// Last valid readout of each channel.
 #[derive(Clone, Debug)]
-pub(crate) struct Held {
+pub(crate) struct LastReadout {
     values: ReadoutNumbers,
-    /// Samples since it was read; the maximum before the first.
+    /// Samples since each readout; the maximum before the first.
     ages: Vec<u32>,
 }
 
-impl Held {
+impl LastReadout {
     pub(crate) fn new(channels: usize) -> Self {
         Self { values: ReadoutNumbers::from_fn(channels, |_| 0.0), ages: vec![u32::MAX; channels] }
     }
 
-    pub(crate) fn take(&mut self, readout: &ReadoutNumbers) {
+    pub(crate) fn update(&mut self, readout: &ReadoutNumbers) {
         for ((value, age), readout) in self.values.iter_mut().zip(&mut self.ages).zip(readout) {
             if readout.is_finite() {
                 *value = *readout;
@@ -61,7 +61,7 @@ impl Held {
         }
     }
 
-    fn oldest(&self) -> u32 {
+    fn largest_age(&self) -> u32 {
         self.ages.iter().copied().fold(0, u32::max)
     }
 
@@ -69,7 +69,7 @@ impl Held {
         Vector3::from_column_slice(&self.values[first..first + 3])
     }
 
-    /// The test masses; zero before the first readout.
+    /// Readouts of the test masses; zero before the first.
     pub(crate) fn test_masses(&self) -> PerTestMass<TestMassReadout> {
         let at = (3..self.values.len()).step_by(6);
         at.map(|i| TestMassReadout { r_orf_m: self.vector(i), att_orf_rad: self.vector(i + 3) }).collect()
@@ -81,8 +81,8 @@ impl Held {
     }
 }
 
-/// How far the replayed commands are from the telemetered ones, vector by vector, about their mean difference: an
-/// integrator whose state is not telemetered differs by a constant.
+/// Deviation of telemetered ("flown") from replayed commands about their mean difference: the states of integrators are
+/// not telemetered and cause a constant difference.
 #[derive(Clone, Debug)]
 pub struct Comparison {
     samples: u64,
@@ -104,14 +104,14 @@ impl Comparison {
         Self { samples, samples_of_mean, mean, squares, flown_squares, changes, change_squares, previous }
     }
 
-    fn take(&mut self, telemetered: &CommandNumbers, replayed: &CommandNumbers) {
+    fn add(&mut self, telemetered: &CommandNumbers, replayed: &CommandNumbers) {
         self.samples += 1;
         self.samples_of_mean += 1;
         for i in 0..telemetered.len() {
             let difference = telemetered[i] - replayed[i];
-            let step = difference - self.mean[i];
-            self.mean[i] += step / self.samples_of_mean as f64;
-            self.squares[i] += step * (difference - self.mean[i]);
+            let deviation = difference - self.mean[i];
+            self.mean[i] += deviation / self.samples_of_mean as f64;
+            self.squares[i] += deviation * (difference - self.mean[i]);
             self.flown_squares[i] += telemetered[i] * telemetered[i];
         }
         if let Some(previous) = self.previous.replace(*telemetered) {
@@ -128,35 +128,35 @@ impl Comparison {
         self.previous = None;
     }
 
-    /// Samples compared.
+    /// Number of samples compared.
     pub fn samples(&self) -> u64 {
         self.samples
     }
 
-    /// Root mean square length of the difference of each of [`command_vectors`], N or N m.
+    /// Rms magnitude of the difference of each of [`command_vectors`] about its mean, N or N m.
     pub fn rms_distance(&self) -> Vec<f64> {
         rms(&self.squares, self.samples)
     }
 
-    /// Length of the mean difference of each of [`command_vectors`] since the last restart, N or N m: what a constant
-    /// in the telemetered controllers' integrators amounts to.
+    /// Magnitude of the mean difference of each of [`command_vectors`] since the last restart, N or N m: the effect of
+    /// unknown integrator states.
     pub fn mean_distance(&self) -> Vec<f64> {
         self.mean.chunks_exact(3).map(|m| m.iter().map(|m| m * m).sum::<f64>().sqrt()).collect()
     }
 
-    /// Root mean square length of the telemetered command, N or N m.
+    /// Rms magnitude of each vector of the telemetered command, N or N m.
     pub fn rms_flown(&self) -> Vec<f64> {
         rms(&self.flown_squares, self.samples)
     }
 
-    /// Root mean square length of the telemetered command's change from one sample to the next, N or N m.
+    /// Rms magnitude of its change from one sample to the next, N or N m.
     pub fn rms_change(&self) -> Vec<f64> {
         rms(&self.change_squares, self.changes)
     }
 
-    /// False when readout noise cannot explain the distance: another controller flew.
+    /// False if readout noise cannot explain the difference, so that another controller flew.
     pub fn same_law(&self) -> bool {
-        self.rms_distance().iter().zip(self.rms_change()).all(|(distance, change)| *distance <= SAME_LAW * change)
+        self.rms_distance().iter().zip(self.rms_change()).all(|(distance, change)| *distance <= SAME_LAW_RATIO * change)
     }
 
     fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
@@ -172,7 +172,7 @@ impl Comparison {
     }
 }
 
-/// A command of so many numbers.
+/// Visits a command of `numbers` values.
 pub(crate) fn visit_command(
     state: &mut State<'_>,
     numbers: usize,
@@ -189,71 +189,71 @@ fn rms(squares: &CommandNumbers, samples: u64) -> Vec<f64> {
     squares.chunks_exact(3).map(|squares| if samples == 0 { 0.0 } else { mean(squares) }).collect()
 }
 
-/// The running replay.
+/// Replay of one control law.
 pub(crate) struct Replay {
     law: ControlLaw,
     /// The law's state before any readout.
-    fresh: Vec<f64>,
-    /// No command was telemetered at all, so the law stands in unproven.
-    alone: bool,
+    initial_state: Vec<f64>,
+    /// Whether no commands are telemetered at all, so that the law is used without a comparison.
+    unverified: bool,
     warm_up_samples: u64,
-    longest_hold_samples: u32,
+    max_hold_samples: u32,
     /// Since the last restart.
     samples: u64,
-    /// Flown minus replayed when both were last there: what the integrators' unknown states amount to.
+    /// Last telemetered minus replayed command, the effect of unknown integrator states.
     offset: Option<CommandNumbers>,
     comparison: Comparison,
 }
 
 impl Replay {
-    pub(crate) fn new(law: ControlLaw, numbers: usize, alone: bool, warm_up_s: f64, rate_hz: f64) -> Self {
+    pub(crate) fn new(law: ControlLaw, numbers: usize, unverified: bool, warm_up_s: f64, rate_hz: f64) -> Self {
         Self {
-            fresh: law.state(),
+            initial_state: law.state(),
             law,
-            alone,
+            unverified,
             warm_up_samples: (warm_up_s * rate_hz).ceil() as u64,
-            longest_hold_samples: (LONGEST_HOLD_S * rate_hz).ceil() as u32,
+            max_hold_samples: (MAX_HOLD_S * rate_hz).ceil() as u32,
             samples: 0,
             offset: None,
             comparison: Comparison::new(numbers),
         }
     }
 
-    /// One sample. Gives the command that stands in where none was telemetered, `None` as long as the law is not
-    /// settled, or not known to be the one that flies.
+    /// Runs the law for one sample. Returns the command that replaces a missing one; `None` until the law has settled
+    /// and is known to be the flown one.
     pub(crate) fn step(
         &mut self,
-        held: &Held,
+        readout: &LastReadout,
         sun_srf: Option<Vector3<f64>>,
         telemetered: Option<&CommandNumbers>,
     ) -> Result<Option<CommandNumbers>, StateError> {
-        if held.oldest() > self.longest_hold_samples {
+        if readout.largest_age() > self.max_hold_samples {
             if self.samples > 0 {
-                self.law.set_state(&self.fresh).map_err(|_| StateError::Content("a control law"))?;
+                self.law.set_state(&self.initial_state).map_err(|_| StateError::Content("a control law"))?;
                 self.samples = 0;
                 self.offset = None;
                 self.comparison.restart();
             }
             return Ok(None);
         }
-        let readout = Readout { sc_crf_rad: held.vector(0), tm: held.test_masses(), sun_srf };
+        let readout = Readout { sc_crf_rad: readout.vector(0), tm: readout.test_masses(), sun_srf };
         let mut replayed: CommandNumbers = self.law.step(&readout).numbers().collect();
         self.samples += 1;
         if self.samples <= self.warm_up_samples {
             return Ok(None);
         }
         let Some(telemetered) = telemetered else {
-            // A change across the gap is not the noise of one sample.
+            // A difference across the gap is not a change within one sample.
             self.comparison.previous = None;
-            let proven = self.alone || (self.comparison.samples >= PROOF_SAMPLES && self.comparison.same_law());
-            let offset = if self.alone { Some(replayed.map(|_| 0.0)) } else { self.offset };
-            return Ok(offset.filter(|_| proven).map(|offset| {
+            let usable = self.unverified || (self.comparison.samples >= MIN_COMPARED && self.comparison.same_law());
+            let offset = if self.unverified { Some(replayed.map(|_| 0.0)) } else { self.offset };
+            return Ok(offset.filter(|_| usable).map(|offset| {
                 replayed.iter_mut().zip(&offset).for_each(|(replayed, offset)| *replayed += offset);
                 replayed
             }));
         };
         self.offset = Some(CommandNumbers::from_fn(telemetered.len(), |i| telemetered[i] - replayed[i]));
-        self.comparison.take(telemetered, &replayed);
+        self.comparison.add(telemetered, &replayed);
         Ok(None)
     }
 

@@ -18,19 +18,19 @@ use dragfree_sdk::state::{State, StateError};
 use nalgebra::{Matrix3, Vector3};
 use std::f64::consts::TAU;
 
-/// Frequency at which the spectrum of `β` crosses the white one. It is far below the frequency at which the smoother
-/// relies on commands, so `β` only protects the ends of a record from a constant torque.
+/// Frequency at which the spectrum of `β` equals the white one. It is far below the frequency at which the smoother
+/// relies on commands, so `β` matters only at the ends of a record, where it absorbs a constant torque.
 const DRIFT_CORNER_HZ: f64 = 1e-4;
 /// Prior standard deviations of attitude (rad), rate (rad/s) and `β` (rad/s²), far wider than in science mode.
 const PRIOR: [f64; 3] = [1e-2, 1e-4, 1e-6];
 /// Lag in time constants of the filter; the neglected part of `w` is `e⁻²⁰`.
 const LAG_TIME_CONSTANTS: f64 = 20.0;
 /// Longest lag, s, which bounds memory when sensing is very noisy: 40 MB at 10 Hz.
-const MOST_LAG_S: f64 = 3600.0;
+const MAX_LAG_S: f64 = 3600.0;
 
-/// Largest prediction variance, in variances of a readout, for which an innovation counts in the noise statistics; it
+/// Largest prediction variance, relative to that of a readout, for which an innovation enters the noise statistics. It
 /// excludes the time after a missing command.
-const INFORMED: f64 = 1e3;
+const MAX_PREDICTED_VARIANCE: f64 = 1e3;
 
 /// Three numbers, one for each principal axis.
 type Axes = [f64; 3];
@@ -47,9 +47,9 @@ pub struct Model {
     drift_variance: Axes,
     /// Variance of the white part of a readout, rad².
     readout_variance: f64,
-    /// Increments of the coloured readout noise to `z` and its rate, `zz`, `zω`, `ωω`; rad², rad² s⁻¹, rad² s⁻².
-    wander: [f64; 3],
-    /// Memory of the filter, samples to `1/e`.
+    /// Covariance per sample of coloured readout noise in `z` and its rate, `zz`, `zω`, `ωω`; rad², rad² s⁻¹, rad² s⁻².
+    coloured_noise: [f64; 3],
+    /// Time constant of the filter, samples.
     memory: f64,
     lag: usize,
 }
@@ -64,35 +64,34 @@ impl Model {
         let per_sample = 0.5 / dt_s;
         let disturbance_psd: Axes = std::array::from_fn(|i| eigen.eigenvalues[i]);
         let drift_step = TAU * DRIFT_CORNER_HZ * dt_s;
-        // S_2 and S_4 of the coloured part's one-sided PSD, S_2/ω² + S_4/ω⁴; half of them are the intensities of its
-        // drives.
-        let drive = |exponent: u32| -> f64 {
+        // S_2 and S_4 of the coloured part's one-sided PSD, S_2/ω² + S_4/ω⁴; its driving noises have half of them.
+        let coefficient = |exponent: u32| -> f64 {
             let terms = readout.coloured().filter(|t| t.exponent == exponent);
             terms.map(|t| t.asd.powi(2) * (TAU * t.corner_hz).powi(exponent.cast_signed())).sum()
         };
-        let (once, twice) = (drive(2), drive(4));
+        let (s2, s4) = (coefficient(2), coefficient(4));
         let slowest = disturbance_psd.iter().copied().fold(f64::INFINITY, f64::min);
-        let decay = decay_rad_s(once / readout.white_psd(), (slowest + twice) / readout.white_psd());
+        let decay = decay_rad_s(s2 / readout.white_psd(), (slowest + s4) / readout.white_psd());
         // If sensing is very accurate the filter has no memory, but the smoother still needs a few samples.
-        let lag = (LAG_TIME_CONSTANTS / (decay * dt_s)).max(16.0).min((MOST_LAG_S / dt_s).max(16.0));
+        let lag = (LAG_TIME_CONSTANTS / (decay * dt_s)).max(16.0).min((MAX_LAG_S / dt_s).max(16.0));
         Self {
             dt_s,
             srf_from_principal: eigen.eigenvectors,
             disturbance_variance: disturbance_psd.map(|s| s * per_sample),
             drift_variance: disturbance_psd.map(|s| s * per_sample * drift_step * drift_step),
             readout_variance: readout.white_psd() * per_sample,
-            wander: [0.5 * (once * dt_s + twice * dt_s.powi(3) / 3.0), 0.25 * twice * dt_s.powi(2), 0.5 * twice * dt_s],
+            coloured_noise: [0.5 * (s2 * dt_s + s4 * dt_s.powi(3) / 3.0), 0.25 * s4 * dt_s.powi(2), 0.5 * s4 * dt_s],
             memory: 1.0 / (decay * dt_s),
             lag: lag.ceil() as usize,
         }
     }
 
-    /// Memory of the filter, samples to `1/e`; information on `w` comes from readouts within it.
+    /// Time constant of the filter, samples; readouts within it carry the information on `w`.
     pub fn memory(&self) -> f64 {
         self.memory
     }
 
-    /// Lag of the result, samples.
+    /// Lag of the smoother, samples.
     pub fn lag(&self) -> usize {
         self.lag
     }
@@ -105,8 +104,8 @@ fn decay_rad_s(a: f64, b: f64) -> f64 {
     if discriminant < 0.0 { (0.5 * b.sqrt() + 0.25 * a).sqrt() } else { (b / (0.5 * a + discriminant.sqrt())).sqrt() }
 }
 
-/// One-sided PSD at `frequency_hz` of `(e_{k−1} + e_k)/2`, where `e` is the error of the smoothed angular acceleration
-/// about one principal axis and the mean over two samples is what a second difference sees, rad² s⁻⁴/Hz.
+/// One-sided PSD at `frequency_hz` of the error of the smoothed angular acceleration about one principal axis, averaged
+/// over two samples as by a second difference, `(e_{k−1} + e_k)/2`; rad² s⁻⁴/Hz.
 ///
 /// `R = S_w − W S_w`, `W = S_w/(S_w + g S_n)`, with `S_w = cos²(πfΔt) disturbance_psd`, `g = (2 sin(πfΔt)/Δt)⁴`. In
 /// SRF the same holds with matrices, `S_w = cos² J⁻¹ S_M J⁻ᵀ` and `W = S_w (S_w + g S_n 1)⁻¹`.
@@ -139,25 +138,25 @@ struct Step {
     gain: [Axes; 3],
     /// Innovation over its variance; zero, as the gain, without a readout.
     weighted_innovation: Axes,
-    /// The command of the next interval is unknown: attitude and rate are reset.
-    cut: bool,
+    /// Whether attitude and rate are reset after this epoch because the command is unknown.
+    reset: bool,
 }
 
-/// Filter output up to one epoch.
+/// Output of the filter at one epoch.
 #[derive(Clone, Copy, Debug)]
-struct Seen {
+struct Filtered {
     /// Predicted ω and β.
     predicted: [Axes; 2],
     /// Innovation over its variance; zero without a readout.
     weighted_innovation: Axes,
 }
 
-/// An angular acceleration, SRF.
+/// An additional angular acceleration over one interval, SRF.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Perturbation {
     /// Held over `[t_k, t_{k+1})`, rad s⁻².
     pub held_rad_s2: Vector3<f64>,
-    /// Impulsive at `t_k`, rad s⁻¹.
+    /// Step of the angular velocity at `t_k`, rad s⁻¹.
     pub kick_rad_s: Vector3<f64>,
 }
 
@@ -180,7 +179,7 @@ impl ResponseState {
 /// sum over the root of their sum of squares is a standard normal deviate.
 #[derive(Clone, Debug, Default)]
 struct CommandConsistency {
-    /// Change of predicted θ, ω, β if the known acceleration had acted once more.
+    /// Change of predicted θ, ω, β per unit of relative gain error.
     response: [Axes; 3],
     products: Axes,
     squares: Axes,
@@ -188,21 +187,21 @@ struct CommandConsistency {
 
 impl CommandConsistency {
     fn update(&mut self, axis: usize, innovation: f64, gain: [f64; 3], informed: bool) {
-        let miss = self.response[0][axis];
+        let theta = self.response[0][axis];
         for (state, k) in gain.into_iter().enumerate() {
-            self.response[state][axis] -= k * miss;
+            self.response[state][axis] -= k * theta;
         }
         if informed {
-            let product = innovation * miss;
+            let product = innovation * theta;
             self.products[axis] += product;
             self.squares[axis] += product * product;
         }
     }
 
     fn advance(&mut self, axis: usize, known: f64, dt: f64) {
-        let push = self.response[2][axis] + known;
-        self.response[0][axis] += dt * self.response[1][axis] + 0.5 * dt * dt * push;
-        self.response[1][axis] += dt * push;
+        let accel = self.response[2][axis] + known;
+        self.response[0][axis] += dt * self.response[1][axis] + 0.5 * dt * dt * accel;
+        self.response[1][axis] += dt * accel;
     }
 }
 
@@ -221,7 +220,7 @@ pub struct Smoother {
 }
 
 impl Smoother {
-    /// Starts before any data.
+    /// Starts from the prior.
     pub fn new(model: Model) -> Self {
         let [theta, omega, beta] = PRIOR.map(|sigma| [sigma * sigma; 3]);
         let zero = [0.0; 3];
@@ -241,7 +240,7 @@ impl Smoother {
         &self.model
     }
 
-    /// Takes the attitude relative to CRF at `t_k` (SRF, rad), `None` where there is none, and returns the filtered ω
+    /// Updates with the attitude relative to CRF at `t_k` (SRF, rad), `None` if missing, and returns the filtered ω
     /// relative to CRF (SRF, rad s⁻¹).
     pub fn update(&mut self, attitude_rad: Option<&Vector3<f64>>) -> Vector3<f64> {
         let [p00, p01, p02, p11, p12, p22] = self.covariance;
@@ -250,7 +249,7 @@ impl Smoother {
         if let Some(attitude) = attitude_rad {
             let y = self.model.srf_from_principal.tr_mul(attitude);
             let noise = self.model.readout_variance;
-            let informed = p00.iter().all(|p| *p < INFORMED * noise);
+            let informed = p00.iter().all(|p| *p < MAX_PREDICTED_VARIANCE * noise);
             for i in 0..3 {
                 let variance = p00[i] + noise;
                 let innovation = y[i] - self.mean[0][i];
@@ -278,15 +277,15 @@ impl Smoother {
         self.model.srf_from_principal * Vector3::from(self.mean[1])
     }
 
-    /// Moves on to `t_{k+1}` under the known part of `θ̈` over `[t_k, t_{k+1})` (SRF, rad s⁻²); `None` when the
-    /// command is unknown.
+    /// Predicts to `t_{k+1}` with the known part of `θ̈` over `[t_k, t_{k+1})` (SRF, rad s⁻²); `None` if the command
+    /// is unknown, which resets attitude and rate to the prior.
     pub fn advance(&mut self, known_rad_s2: Option<&Vector3<f64>>) {
         let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
-        let [zz, zw, ww] = self.model.wander;
+        let [zz, zw, ww] = self.model.coloured_noise;
         let [p00, p01, p02, p11, p12, p22] = self.covariance;
         let Some(known) = known_rad_s2 else {
             if let Some(step) = self.steps.last_mut() {
-                step.cut = true;
+                step.reset = true;
             }
             self.command_consistency.response = Default::default();
             let zero = [0.0; 3];
@@ -298,9 +297,9 @@ impl Smoother {
         let known = self.model.srf_from_principal.tr_mul(known);
         for i in 0..3 {
             self.command_consistency.advance(i, known[i], dt);
-            let push = self.mean[2][i] + known[i];
-            self.mean[0][i] += dt * self.mean[1][i] + half * push;
-            self.mean[1][i] += dt * push;
+            let accel = self.mean[2][i] + known[i];
+            self.mean[0][i] += dt * self.mean[1][i] + half * accel;
+            self.mean[1][i] += dt * accel;
             let q = self.model.disturbance_variance[i];
             let theta_theta = p00[i] + dt * p01[i] + half * p02[i];
             let theta_omega = p01[i] + dt * p11[i] + half * p12[i];
@@ -316,8 +315,8 @@ impl Smoother {
         }
     }
 
-    /// Number of epochs that wait for later data. At twice the lag, [`Self::smooth`] the first half; blocks count from
-    /// the first epoch, so results do not depend on batches.
+    /// Number of epochs that wait for later data. [`Self::smooth`] the first half whenever it reaches twice the lag:
+    /// blocks then count from the first epoch, so results do not depend on batches.
     pub fn waiting(&self) -> usize {
         self.steps.len()
     }
@@ -329,11 +328,11 @@ impl Smoother {
         out
     }
 
-    /// Smoothed values of the `count` oldest waiting epochs, with all data so far.
+    /// Smoothed values of the `count` oldest waiting epochs, given all data so far.
     pub fn smoothed(&self, count: usize) -> Vec<Smoothed> {
         self.backward(count, |k| {
             let step = &self.steps[k];
-            Seen { predicted: step.predicted, weighted_innovation: step.weighted_innovation }
+            Filtered { predicted: step.predicted, weighted_innovation: step.weighted_innovation }
         })
     }
 
@@ -343,7 +342,7 @@ impl Smoother {
     }
 
     /// Change of [`Self::smoothed`] for the `count` oldest waiting epochs due to an additional known acceleration,
-    /// `more(k)` for waiting epoch `k`. `state` advances from the oldest waiting epoch to the one after `count`.
+    /// `perturbation(k)` for waiting epoch `k`. `state` advances by `count` epochs from the oldest waiting one.
     ///
     /// The smoother is linear, and its gains depend only on which epochs have data, so this is its response to that
     /// acceleration with zero attitude.
@@ -351,48 +350,47 @@ impl Smoother {
         &self,
         state: &mut ResponseState,
         count: usize,
-        more: impl Fn(usize) -> Perturbation,
+        perturbation: impl Fn(usize) -> Perturbation,
     ) -> Vec<Smoothed> {
         let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
         let principal = |v: &Vector3<f64>| self.model.srf_from_principal.tr_mul(v);
         let mut mean = state.mean;
-        let mut seen = Vec::with_capacity(self.steps.len());
+        let mut filtered = Vec::with_capacity(self.steps.len());
         for (k, step) in self.steps.iter().enumerate() {
             if k == count {
                 state.mean = mean;
             }
-            let mut now = Seen { predicted: [mean[1], mean[2]], weighted_innovation: [0.0; 3] };
-            let turn = more(k);
-            let (kick, held) = (principal(&turn.kick_rad_s), principal(&turn.held_rad_s2));
+            let mut now = Filtered { predicted: [mean[1], mean[2]], weighted_innovation: [0.0; 3] };
+            let added = perturbation(k);
+            let (kick, held) = (principal(&added.kick_rad_s), principal(&added.held_rad_s2));
             for i in 0..3 {
-                let (miss, gain) = (mean[0][i], step.gain.map(|k| k[i]));
-                // Relative to the innovation variance F, from K_ω = P_ωθ/F. At the start P_ωθ and the missing term are
-                // zero.
+                let (theta, gain) = (mean[0][i], step.gain.map(|k| k[i]));
+                // The innovation, −θ, over its variance F, from K_ω = P_ωθ/F. P_ωθ is zero only after a start, as is θ.
                 let omega_theta = step.covariance[0][i];
                 if omega_theta != 0.0 {
-                    now.weighted_innovation[i] = -miss * (gain[1] / omega_theta);
+                    now.weighted_innovation[i] = -theta * (gain[1] / omega_theta);
                 }
                 for (state, k) in gain.into_iter().enumerate() {
-                    mean[state][i] -= k * miss;
+                    mean[state][i] -= k * theta;
                 }
-                let push = mean[2][i] + held[i];
+                let accel = mean[2][i] + held[i];
                 let omega = mean[1][i] + kick[i];
-                mean[0][i] += dt * omega + half * push;
-                mean[1][i] = omega + dt * push;
+                mean[0][i] += dt * omega + half * accel;
+                mean[1][i] = omega + dt * accel;
             }
-            if step.cut {
+            if step.reset {
                 mean = [[0.0; 3], [0.0; 3], mean[2]];
             }
-            seen.push(now);
+            filtered.push(now);
         }
         if count >= self.steps.len() {
             state.mean = mean;
         }
-        self.backward(count, |k| seen[k])
+        self.backward(count, |k| filtered[k])
     }
 
     /// Adjoint recursion over all waiting epochs; returns the `count` oldest.
-    fn backward(&self, count: usize, seen: impl Fn(usize) -> Seen) -> Vec<Smoothed> {
+    fn backward(&self, count: usize, filtered: impl Fn(usize) -> Filtered) -> Vec<Smoothed> {
         let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
         let count = count.min(self.steps.len());
         let srf = |v: Axes| self.model.srf_from_principal * Vector3::from(v);
@@ -400,14 +398,14 @@ impl Smoother {
         let mut out = vec![Smoothed { disturbance_rad_s2: zero, noise_rad_s2: zero, omega_crf_rad_s: zero }; count];
         let mut adjoint = [[0.0; 3]; 3];
         for (k, step) in self.steps.iter().enumerate().rev() {
-            let Seen { predicted, weighted_innovation } = seen(k);
+            let Filtered { predicted, weighted_innovation } = filtered(k);
             let mut noise = [0.0; 3];
             for i in 0..3 {
                 let [r0, r1, r2] = [adjoint[0][i], adjoint[1][i], adjoint[2][i]];
-                let pushed = half * r0 + dt * r1;
-                noise[i] = self.model.disturbance_variance[i] * pushed;
+                let by_accel = half * r0 + dt * r1;
+                noise[i] = self.model.disturbance_variance[i] * by_accel;
                 // s = Aᵀ r, then r ← s − Hᵀ K·s + Hᵀ v/F.
-                let [s0, s1, s2] = if step.cut { [0.0, 0.0, r2] } else { [r0, dt * r0 + r1, pushed + r2] };
+                let [s0, s1, s2] = if step.reset { [0.0, 0.0, r2] } else { [r0, dt * r0 + r1, by_accel + r2] };
                 let corrected = step.gain[0][i] * s0 + step.gain[1][i] * s1 + step.gain[2][i] * s2;
                 adjoint[0][i] = s0 - corrected + weighted_innovation[i];
                 adjoint[1][i] = s1;
@@ -434,18 +432,18 @@ impl Smoother {
         (self.innovations > 0).then(|| self.innovation_squares.map(|s| s / self.innovations as f64))
     }
 
-    /// Score of the known accelerations per principal axis, a standard normal deviate if they acted as stated. `None`
-    /// before enough readouts.
+    /// Score of the gain of the known accelerations per principal axis, a standard normal deviate if they acted as
+    /// stated. `None` before enough readouts.
     pub fn inconsistency_sigma(&self) -> Option<[f64; 3]> {
-        let o = &self.command_consistency;
-        let z = std::array::from_fn(|i| o.products[i] / o.squares[i].sqrt());
+        let test = &self.command_consistency;
+        let z = std::array::from_fn(|i| test.products[i] / test.squares[i].sqrt());
         z.iter().all(|z: &f64| z.is_finite()).then_some(z)
     }
 
     pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
-        let o = &mut self.command_consistency;
-        state.f64s(o.response.as_flattened_mut())?;
-        state.f64s(o.products.iter_mut().chain(&mut o.squares))?;
+        let test = &mut self.command_consistency;
+        state.f64s(test.response.as_flattened_mut())?;
+        state.f64s(test.products.iter_mut().chain(&mut test.squares))?;
         state.f64s(self.mean.as_flattened_mut())?;
         state.f64s(self.covariance.as_flattened_mut())?;
         state.f64s(&mut self.innovation_squares)?;
@@ -455,7 +453,7 @@ impl Smoother {
             state.f64s(step.covariance.as_flattened_mut())?;
             state.f64s(step.gain.as_flattened_mut())?;
             state.f64s(&mut step.weighted_innovation)?;
-            state.flag(&mut step.cut)
+            state.flag(&mut step.reset)
         })?;
         if self.steps.len() > 2 * self.model.lag { Err(StateError::Content("a number of epochs")) } else { Ok(()) }
     }

@@ -1,4 +1,4 @@
-//! What the thrusters make of a command: the delay and the lag that the mission file says they have.
+//! Response of the thrusters to a command.
 
 use std::collections::VecDeque;
 
@@ -9,26 +9,26 @@ use dragfree_sdk::state::{State, StateError};
 /// Force, N, and torque, N m, on the spacecraft, SRF.
 pub(crate) type Wrench = [f64; 6];
 
-/// Thrusters that act late. Their range and step are not modelled: a command within the range acts as it is, and
-/// rounding it adds noise.
+/// Delay and lag of the thrusters by the mission file. Range and resolution are not modelled: commands within the range
+/// are executed as they are, and rounding only adds noise.
 #[derive(Clone, Debug)]
 pub(crate) struct ThrusterResponse {
-    /// `None` where the thrusters act at once.
+    /// `None` if the thrusters respond at once; `y` is its state.
     lag: Option<Lag>,
     y: Wrench,
-    /// The commands of the delay, oldest first; empty where the one before is unknown.
+    /// Commands within the delay, oldest first; empty if the previous one is unknown.
     waiting: VecDeque<Wrench>,
 }
 
 impl ThrusterResponse {
     pub(crate) fn new(mission: &Mission, dt_s: f64) -> Self {
-        let late = mission.thrusters.as_ref().filter(|t| t.lag_s > 0.0 || t.delay_s > 0.0);
-        Self { lag: late.map(|t| Lag::new(t.lag_s, t.delay_s, dt_s)), y: Wrench::default(), waiting: VecDeque::new() }
+        let slow = mission.thrusters.as_ref().filter(|t| t.lag_s > 0.0 || t.delay_s > 0.0);
+        Self { lag: slow.map(|t| Lag::new(t.lag_s, t.delay_s, dt_s)), y: Wrench::default(), waiting: VecDeque::new() }
     }
 
-    /// Mean of what acts over a sample in response to its command; `None` for an unknown one. What acted before the
-    /// first one, or before the first after a gap, is taken to be the same: the smoother starts anew there.
-    pub(crate) fn act(&mut self, commanded: Option<Wrench>) -> Option<Wrench> {
+    /// Mean wrench over a sample from its command; `None` if the command is unknown. The first command, or the first
+    /// after a gap, is taken to have acted before as well, as the smoother restarts there.
+    pub(crate) fn step(&mut self, commanded: Option<Wrench>) -> Option<Wrench> {
         let (Some(lag), Some(commanded)) = (&self.lag, commanded) else {
             self.waiting.clear();
             return commanded;

@@ -13,7 +13,7 @@ use dragfree_sdk::state::{State, StateError};
 pub(crate) struct Rate {
     period_ns: f64,
     half_ns: i64,
-    /// The period, if it is a whole number of nanoseconds.
+    /// The period if it is a whole number of nanoseconds.
     whole_ns: Option<i64>,
 }
 
@@ -52,7 +52,7 @@ impl Rate {
     /// Median phase of `times` against `origin`, ns, within half a period; 0 without times.
     pub(crate) fn phase(&self, origin: i64, times: &[i64]) -> i64 {
         let Some(first) = times.first() else { return 0 };
-        // A median on a circle needs a cut away from the data: phases are relative to the first.
+        // Phases relative to the first do not wrap near the data, so their median is unambiguous.
         let mut offsets: Vec<i64> = times.iter().map(|t| self.wrap(t - first)).collect();
         let middle = (offsets.len() - 1) / 2;
         self.wrap(first - origin + *offsets.select_nth_unstable(middle).1)

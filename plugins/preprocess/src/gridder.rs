@@ -1,4 +1,4 @@
-//! Irregular tables in, one uniform table out.
+//! Turns irregular tables into one uniform table.
 //!
 //! Every decision depends on the telemetry alone, not on batch boundaries: a row is processed when all rows that can
 //! influence it have arrived. In order:
@@ -59,7 +59,7 @@ pub(crate) trait Sink {
 struct Run {
     bits: u64,
     length: u32,
-    /// Whether the column has been nonzero; a column that is zero from the start is absent.
+    /// Whether the column has been nonzero; a column that is zero throughout counts as not measured.
     moved: bool,
 }
 
@@ -70,9 +70,9 @@ struct Fast {
     phase_ns: Option<i64>,
     /// Row of the last sample assigned.
     last_row: i64,
-    /// Whether a second sample came for `last_row`.
+    /// Whether `last_row` is blank because of a second sample or a clock jump.
     crowded: bool,
-    /// Rows with a sample.
+    /// Number of rows with a sample.
     filled: u64,
     /// Values of the waiting rows, per column.
     cells: Vec<Window<f64>>,
@@ -87,7 +87,7 @@ enum Class {
     Slow(i64),
 }
 
-/// A run of consecutive unusable epochs.
+/// Consecutive unusable epochs.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct EpochRun {
     pub(crate) rows: u64,
@@ -127,7 +127,7 @@ pub(crate) struct Gridder {
     config: Config,
     pub(crate) tables: Vec<Series>,
     classes: Vec<Class>,
-    /// Median interval in the opening, ns; 0 where unknown.
+    /// Median interval in the first ten minutes, ns; 0 if unknown.
     intervals: Vec<i64>,
     /// Index of the reference table, once it is known.
     reference: Option<usize>,
@@ -140,11 +140,11 @@ pub(crate) struct Gridder {
     last_reference_ns: i64,
     /// First row of `cells`; rows count from 0.
     base: i64,
-    /// Number of rows created, checked for stuck samples, checked for outliers, and emitted.
+    /// Numbers of rows created, checked for stuck samples, checked for outliers, and emitted.
     rows: i64,
-    counted: i64,
-    cleaned: i64,
-    given: i64,
+    stuck_checked: i64,
+    outliers_checked: i64,
+    emitted: i64,
     pub(crate) summary: Summary,
     scratch: Vec<f64>,
     mask: Vec<u64>,
@@ -166,9 +166,9 @@ impl Gridder {
             last_reference_ns: 0,
             base: 0,
             rows: 0,
-            counted: 0,
-            cleaned: 0,
-            given: 0,
+            stuck_checked: 0,
+            outliers_checked: 0,
+            emitted: 0,
             summary: Summary::default(),
             scratch: Vec::new(),
             mask: Vec::new(),
@@ -185,7 +185,7 @@ impl Gridder {
         // At the end of the data hosts pass a time beyond all rows; a later day may still add rows.
         let complete_ns = if complete_ns < LATEST_NS { complete_ns } else { self.after_last_row() };
         self.complete_ns = self.complete_ns.max(complete_ns);
-        let first = self.given;
+        let first = self.emitted;
         while self.step(false, first + MAX_ROWS, sink) {}
     }
 
@@ -197,7 +197,7 @@ impl Gridder {
     pub(crate) fn flush(&mut self, sink: &mut impl Sink) {
         self.complete_ns = self.complete_ns.max(self.after_last_row());
         while self.step(true, i64::MAX, sink) {}
-        // Rows without an epoch remain without one: the grid ends with the reference.
+        // The grid ends with the reference, so no later row gets an epoch.
         for (series, class) in self.tables.iter_mut().zip(&self.classes) {
             if matches!(class, Class::Fast(_)) {
                 let rest = series.times.len();
@@ -207,29 +207,29 @@ impl Gridder {
         }
     }
 
-    /// One pass; true if another may emit more.
+    /// Advances every step once; true if another call may emit more rows.
     fn step(&mut self, flush: bool, most: i64, sink: &mut impl Sink) -> bool {
-        if !self.learn_rates(flush) {
+        if !self.measure_rates(flush) {
             return false;
         }
         let rows = self.rows;
-        let (mut settled_ns, blocked) = self.lay_epochs(flush);
+        let (mut settled_ns, blocked) = self.place_reference(flush);
         for table in 0..self.tables.len() {
             if Some(table) != self.reference {
-                settled_ns = settled_ns.min(self.fill(table, flush));
+                settled_ns = settled_ns.min(self.place_samples(table, flush));
             }
         }
         // Block boundaries must not depend on the number of waiting rows.
         self.clean(settled_ns, flush && !blocked);
-        let given = self.given;
-        self.give(most, flush, sink);
-        self.given < most && (self.given > given || self.rows > rows)
+        let emitted = self.emitted;
+        self.emit(most, flush, sink);
+        self.emitted < most && (self.emitted > emitted || self.rows > rows)
     }
 
     // ---- 2. rates and reference ----
 
     /// Determines rates and the reference table; false while telemetry is insufficient.
-    fn learn_rates(&mut self, flush: bool) -> bool {
+    fn measure_rates(&mut self, flush: bool) -> bool {
         if self.reference.is_some() {
             return true;
         }
@@ -288,9 +288,9 @@ impl Gridder {
 
     // ---- 3. epochs and samples ----
 
-    /// Assigns the reference's rows and creates rows for them. Returns the time up to which that is final, and whether
-    /// the limit of waiting rows was reached.
-    fn lay_epochs(&mut self, flush: bool) -> (i64, bool) {
+    /// Assigns the reference's samples and creates rows for them. Returns the time up to which that is final, and
+    /// whether the limit of waiting rows was reached.
+    fn place_reference(&mut self, flush: bool) -> (i64, bool) {
         let Some(reference) = self.reference else { return (0, false) };
         let rate = self.epochs.rate;
         let agree_ns = rate.offset_ns(PHASE_SAMPLES as i64);
@@ -324,7 +324,7 @@ impl Gridder {
                         break;
                     }
                     self.grow_cells();
-                    self.put(reference, &placed, used - placed.len());
+                    self.copy_samples(reference, &placed, used - placed.len());
                     placed.clear();
                     self.blank_row(last);
                     // Epochs must advance by half an interval: a clock that jumps back loses its first sample.
@@ -351,7 +351,7 @@ impl Gridder {
             used += 1;
         }
         self.grow_cells();
-        self.put(reference, &placed, used - placed.len());
+        self.copy_samples(reference, &placed, used - placed.len());
         let waiting = self.tables[reference].times.as_slice().get(used).copied();
         self.tables[reference].drop_front(used);
         (waiting.unwrap_or(self.complete_ns).min(self.complete_ns), blocked)
@@ -397,7 +397,7 @@ impl Gridder {
 
     /// Creates rows up to `rows`, whose cells [`Self::grow_cells`] adds; false if the limit of waiting rows is reached.
     fn make_rows(&mut self, rows: i64) -> bool {
-        let most = self.given + MAX_ROWS;
+        let most = self.emitted + MAX_ROWS;
         if self.rows < rows {
             self.rows = rows.min(most).max(self.rows);
         }
@@ -439,8 +439,8 @@ impl Gridder {
         }
     }
 
-    /// Assigns a table's rows to existing rows. Returns the time up to which that is final.
-    fn fill(&mut self, table: usize, flush: bool) -> i64 {
+    /// Assigns another table's samples to existing rows. Returns the time up to which that is final.
+    fn place_samples(&mut self, table: usize, flush: bool) -> i64 {
         let Class::Fast(fast) = &self.classes[table] else { return i64::MAX };
         let mut phase_ns = fast.phase_ns;
         let rate = self.epochs.rate;
@@ -448,12 +448,12 @@ impl Gridder {
         let off_limit_ns = rate.part_ns(0.25);
         // Epochs before this time are final.
         let reference_next = self.reference.and_then(|r| self.tables[r].times.as_slice().first().copied());
-        let laid_ns = reference_next.unwrap_or(self.complete_ns).min(self.complete_ns) - rate.part_ns(1.0);
-        let cut = (laid_ns - self.last_reference_ns) as f64 > self.config.max_gap_s * 1e9;
+        let final_ns = reference_next.unwrap_or(self.complete_ns).min(self.complete_ns) - rate.part_ns(1.0);
+        let long_gap = (final_ns - self.last_reference_ns) as f64 > self.config.max_gap_s * 1e9;
         let mut placed: Vec<i64> = Vec::new();
         let mut used = 0;
         while let Some(&time) = self.tables[table].times.as_slice().get(used) {
-            if !flush && time >= laid_ns || time >= self.complete_ns {
+            if !flush && time >= final_ns || time >= self.complete_ns {
                 break;
             }
             let ready = flush || self.complete_ns >= time.saturating_add(agree_ns);
@@ -469,7 +469,7 @@ impl Gridder {
             let mut place = self.epochs.place(time - phase);
             if let Place::Row(row) = place {
                 if row >= self.rows {
-                    if !cut || row < self.rows + self.blank_rows_before_cut() {
+                    if !long_gap || row < self.rows + self.blank_rows_before_cut() {
                         break;
                     }
                     place = Place::Nowhere;
@@ -480,7 +480,7 @@ impl Gridder {
                             break;
                         }
                         if let Some(change) = self.agreed_phase(table, used, time) {
-                            self.put(table, &placed, used - placed.len());
+                            self.copy_samples(table, &placed, used - placed.len());
                             placed.clear();
                             self.tables[table].tally.add(Reason::ClockJump, 1);
                             let new = rate.wrap(time + change - self.epochs.time_ns(row));
@@ -501,21 +501,21 @@ impl Gridder {
             placed.push(if let Place::Row(row) = place { row } else { -1 });
             used += 1;
         }
-        self.put(table, &placed, used - placed.len());
+        self.copy_samples(table, &placed, used - placed.len());
         if let Class::Fast(fast) = &mut self.classes[table] {
             fast.phase_ns = phase_ns;
         }
         let series = &mut self.tables[table];
         let waiting = series.times.as_slice().get(used).copied();
         series.drop_front(used);
-        waiting.unwrap_or(laid_ns).min(laid_ns)
+        waiting.unwrap_or(final_ns).min(final_ns)
     }
 
     /// Copies samples, from the `from`-th waiting one on, into the cells of their rows.
-    fn put(&mut self, table: usize, rows: &[i64], from: usize) {
+    fn copy_samples(&mut self, table: usize, rows: &[i64], from: usize) {
         let Class::Fast(fast) = &mut self.classes[table] else { return };
         let series = &mut self.tables[table];
-        let mut one_per_row = rows.first().is_none_or(|r| *r > fast.last_row && *r >= self.given);
+        let mut one_per_row = rows.first().is_none_or(|r| *r > fast.last_row && *r >= self.emitted);
         one_per_row &= rows.windows(2).all(|w| w[0] < w[1]);
         let base = self.base;
         if one_per_row {
@@ -534,7 +534,7 @@ impl Gridder {
             return;
         }
         for (k, row) in rows.iter().enumerate() {
-            if *row < self.given || *row < fast.last_row {
+            if *row < self.emitted || *row < fast.last_row {
                 series.tally.add(Reason::Outside, 1);
             } else if *row == fast.last_row {
                 // Two samples for one epoch: the clock slipped, and neither is used.
@@ -558,12 +558,12 @@ impl Gridder {
 
     // ---- 4. stuck and outlying samples ----
 
-    /// Cleans complete blocks of final rows.
+    /// Blanks stuck samples in all final rows, and outliers in complete blocks of them.
     fn clean(&mut self, settled_ns: i64, flush: bool) {
         let mut settled = self.rows;
         if !flush {
             let limit = settled_ns.saturating_sub(self.epochs.rate.part_ns(3.0));
-            let earlier = self.counted;
+            let earlier = self.stuck_checked;
             while settled > earlier && self.epochs.time_ns(settled - 1) >= limit {
                 settled = match self.epochs.place(limit) {
                     // Direct lookup if the last segment reaches back far enough.
@@ -572,22 +572,23 @@ impl Gridder {
                 };
             }
         }
-        self.count_runs(settled);
+        self.remove_stuck(settled);
         let margin = MARGIN as i64 + i64::from(self.config.stuck_samples);
-        while self.cleaned < self.counted {
-            let end = (self.cleaned + BLOCK as i64).min(self.counted);
-            if !flush && self.cleaned + BLOCK as i64 + margin > self.counted {
+        while self.outliers_checked < self.stuck_checked {
+            let end = (self.outliers_checked + BLOCK as i64).min(self.stuck_checked);
+            if !flush && self.outliers_checked + BLOCK as i64 + margin > self.stuck_checked {
                 break;
             }
-            self.remove_outliers(self.cleaned, end);
-            self.cleaned = end;
+            self.remove_outliers(self.outliers_checked, end);
+            self.outliers_checked = end;
         }
     }
 
     /// Blanks stuck samples up to row `end`.
-    fn count_runs(&mut self, end: i64) {
+    fn remove_stuck(&mut self, end: i64) {
         let stuck = self.config.stuck_samples;
-        let (from, to) = ((self.counted - self.base) as usize, (end.max(self.counted) - self.base) as usize);
+        let (from, to) =
+            ((self.stuck_checked - self.base) as usize, (end.max(self.stuck_checked) - self.base) as usize);
         for (class, series) in self.classes.iter_mut().zip(&mut self.tables) {
             let Class::Fast(fast) = class else { continue };
             for (c, spec) in series.spec.columns.iter().enumerate() {
@@ -617,7 +618,7 @@ impl Gridder {
                 series.tally.add(Reason::Stuck, blanked as u64);
             }
         }
-        self.counted = self.counted.max(end);
+        self.stuck_checked = self.stuck_checked.max(end);
     }
 
     fn remove_outliers(&mut self, from: i64, to: i64) {
@@ -626,7 +627,7 @@ impl Gridder {
             return;
         }
         let low = (from - HISTORY).max(self.base);
-        let high = (to + HISTORY).min(self.counted);
+        let high = (to + HISTORY).min(self.stuck_checked);
         let window = (low - self.base) as usize..(high - self.base) as usize;
         let (from, to) = ((from - low) as usize, (to - low) as usize);
         for (class, series) in self.classes.iter_mut().zip(&mut self.tables) {
@@ -641,31 +642,31 @@ impl Gridder {
 
     // ---- 5. output ----
 
-    /// Time after an epoch up to which slow tables must have arrived, ns.
+    /// Time after an epoch up to which slow tables must have arrived before the epoch is emitted, ns.
     fn look_ahead_ns(&self) -> i64 {
         let slow =
             self.classes.iter().filter_map(|c| if let Class::Slow(interval) = c { Some(*interval) } else { None });
-        slow.map(|interval| across_ns(interval, self.config.hold_intervals)).max().unwrap_or(0)
+        slow.map(|interval| max_interval_ns(interval, self.config.hold_intervals)).max().unwrap_or(0)
     }
 
-    fn give(&mut self, most: i64, flush: bool, sink: &mut impl Sink) {
-        let mut end = self.cleaned.min(most);
+    fn emit(&mut self, most: i64, flush: bool, sink: &mut impl Sink) {
+        let mut end = self.outliers_checked.min(most);
         if !flush {
             let limit = self.complete_ns.saturating_sub(self.look_ahead_ns());
-            while end > self.given && self.epochs.time_ns(end - 1) >= limit {
+            while end > self.emitted && self.epochs.time_ns(end - 1) >= limit {
                 end = match self.epochs.place(limit) {
                     Place::Row(row) if row < end - 1 && self.epochs.time_ns(row) < limit => row + 1,
                     _ => end - 1,
                 };
             }
         }
-        if end <= self.given {
+        if end <= self.emitted {
             return;
         }
         let first = sink.times().len();
-        sink.times().extend((self.given..end).map(|row| self.epochs.time_ns(row)));
+        sink.times().extend((self.emitted..end).map(|row| self.epochs.time_ns(row)));
         let times: Vec<i64> = sink.times()[first..].to_vec();
-        let window = (self.given - self.base) as usize..(end - self.base) as usize;
+        let window = (self.emitted - self.base) as usize..(end - self.base) as usize;
         self.summarise(&times, window.clone());
         for table in 0..self.tables.len() {
             match &self.classes[table] {
@@ -684,7 +685,7 @@ impl Gridder {
                 }
             }
         }
-        self.given = end;
+        self.emitted = end;
         let keep = (end - HISTORY).max(self.base);
         let drop = (keep - self.base) as usize;
         for class in &mut self.classes {
@@ -702,7 +703,7 @@ impl Gridder {
     fn interpolate(&mut self, table: usize, interval_ns: i64, epochs: &[i64], sink: &mut impl Sink) {
         let series = &mut self.tables[table];
         let times = series.times.as_slice();
-        let across = across_ns(interval_ns, self.config.hold_intervals);
+        let max_interval = max_interval_ns(interval_ns, self.config.hold_intervals);
         let hold = (interval_ns as f64 * self.config.hold_intervals) as i64;
         // Row of the table before each epoch, with the weight of the next row; `None` beyond the hold time.
         let mut at = 0;
@@ -712,7 +713,7 @@ impl Gridder {
                 at += 1;
             }
             weights.push(match (times.get(at), times.get(at + 1)) {
-                (Some(&t0), Some(&t1)) if t0 <= epoch && t1 - t0 <= across => {
+                (Some(&t0), Some(&t1)) if t0 <= epoch && t1 - t0 <= max_interval => {
                     Some((at, (epoch - t0) as f64 / (t1 - t0) as f64))
                 }
                 (Some(&t0), _) if t0 <= epoch && epoch - t0 <= hold => Some((at, 0.0)),
@@ -737,14 +738,13 @@ impl Gridder {
         series.drop_front(at);
     }
 
-    /// Counts usable epochs: all columns needed in common, and all of at least one test mass.
+    /// Counts usable epochs: those with all common mandatory columns, and with all of at least one test mass.
     fn summarise(&mut self, times: &[i64], window: std::ops::Range<usize>) {
-        // Bits: one for the columns needed in common, and two per test mass, for x by either readout and for the
-        // others.
-        const REST: u64 = 1 << 8;
+        // Bits: one for the common columns, and two per test mass, for x by either readout and for its other columns.
+        const COMMON: u64 = 1 << 8;
         let (one, each) = (|tm: u8| 1u64 << tm, |tm: u8| 1u64 << (2 + tm));
         self.mask.clear();
-        self.mask.resize(times.len(), REST | each(0) | each(1));
+        self.mask.resize(times.len(), COMMON | each(0) | each(1));
         let mut wanted = [0, 0];
         for (t, series) in self.tables.iter().enumerate() {
             let slow = Window::default();
@@ -759,7 +759,7 @@ impl Gridder {
                     match spec.mandatory {
                         Mandatory::OneOf(tm) => *mask |= if there { one(tm) } else { 0 },
                         Mandatory::EachOf(tm) => *mask &= if there { u64::MAX } else { !each(tm) },
-                        _ => *mask &= if there { u64::MAX } else { !REST },
+                        _ => *mask &= if there { u64::MAX } else { !COMMON },
                     }
                 }
                 match spec.mandatory {
@@ -771,7 +771,7 @@ impl Gridder {
         }
         let whole = |mask: u64| {
             let mut masses = wanted.iter().filter(|w| **w != 0).peekable();
-            mask & REST != 0 && (masses.peek().is_none() || masses.any(|w| mask & w == *w))
+            mask & COMMON != 0 && (masses.peek().is_none() || masses.any(|w| mask & w == *w))
         };
         let summary = &mut self.summary;
         for (mask, time) in self.mask.iter().zip(times) {
@@ -795,7 +795,7 @@ impl Gridder {
 
     /// Properties of each table, for the report.
     pub(crate) fn table_summaries(&self) -> Vec<TableSummary> {
-        let given = self.summary.used + self.summary.rejected;
+        let emitted = self.summary.used + self.summary.rejected;
         let describe = |(t, series): (usize, &Series)| {
             let fast = if let Some(Class::Fast(fast)) = self.classes.get(t) { Some(fast) } else { None };
             let absent = fast.map_or_else(Vec::new, |fast| {
@@ -808,7 +808,7 @@ impl Gridder {
                 interval_s: (self.intervals[t] > 0).then(|| self.intervals[t] as f64 * 1e-9),
                 interpolated: matches!(self.classes.get(t), Some(Class::Slow(_))),
                 phase_s: fast.and_then(|f| f.phase_ns).map(|p| p as f64 * 1e-9),
-                missing: fast.map(|f| given.saturating_sub(f.filled)),
+                missing: fast.map(|f| emitted.saturating_sub(f.filled)),
                 absent,
             }
         };
@@ -831,7 +831,7 @@ impl Gridder {
         }
     }
 
-    /// Visits the whole state; what is loaded into is fresh.
+    /// Saves the whole state, or restores it into a new gridder.
     pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
         state.same("set of tables or parameters", &self.fingerprint())?;
         self.tables.iter_mut().try_for_each(|table| table.visit(state))?;
@@ -856,7 +856,7 @@ impl Gridder {
         }
         state.option(&mut self.reference, State::usize)?;
         if self.reference.is_some_and(|r| r >= classes) {
-            return Err(StateError::Content("a table of reference"));
+            return Err(StateError::Content("a reference table"));
         }
         self.epochs.visit(state)?;
         state.option(&mut self.first_ns, State::i64)?;
@@ -865,14 +865,14 @@ impl Gridder {
             &mut self.last_reference_ns,
             &mut self.base,
             &mut self.rows,
-            &mut self.counted,
-            &mut self.cleaned,
-            &mut self.given,
+            &mut self.stuck_checked,
+            &mut self.outliers_checked,
+            &mut self.emitted,
         ] {
             state.i64(counter)?;
         }
         self.summary.visit(state)?;
-        let ordered = [0, self.base, self.given, self.cleaned, self.counted, self.rows].is_sorted();
+        let ordered = [0, self.base, self.emitted, self.outliers_checked, self.stuck_checked, self.rows].is_sorted();
         let waiting = (self.rows - self.base) as usize;
         let whole = |class: &Class| match class {
             Class::Fast(fast) => fast.cells.iter().all(|c| c.len() == waiting),
@@ -897,8 +897,8 @@ impl Gridder {
     }
 }
 
-/// Largest distance of neighbouring rows of a slow table, ns: the hold time plus 10 % for jitter.
-fn across_ns(interval_ns: i64, hold_intervals: f64) -> i64 {
+/// Longest interval of a slow table that is interpolated, ns: the hold time plus 10 % for jitter.
+fn max_interval_ns(interval_ns: i64, hold_intervals: f64) -> i64 {
     (interval_ns as f64 * hold_intervals * 1.1) as i64
 }
 

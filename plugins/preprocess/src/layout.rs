@@ -8,13 +8,13 @@ use dragfree_sdk::Column;
 pub(crate) struct ColumnSpec {
     /// Name in its table, `tm1.r_orf_m.x`.
     pub(crate) name: String,
-    /// Largest valid magnitude, SI.
+    /// Largest valid magnitude, in the column's SI unit.
     pub(crate) limit: f64,
-    /// A flag, which is held rather than interpolated.
+    /// Whether it is a flag, which is held rather than interpolated.
     pub(crate) flag: bool,
-    /// An instrument's measurement; exact repetition means that it is stuck.
+    /// Whether it is an instrument's measurement; exact repetition means that it is stuck.
     pub(crate) instrument: bool,
-    /// A displacement or an angle, which the outlier test applies to.
+    /// Whether it is a displacement or an angle; these are tested for outliers.
     pub(crate) readout: bool,
     /// Whether an epoch needs it.
     pub(crate) mandatory: Mandatory,
@@ -27,9 +27,9 @@ pub(crate) enum Mandatory {
     No,
     /// Needed.
     Yes,
-    /// One of this test mass's columns is needed: x by interferometer or by capacitive readout. One test mass suffices.
+    /// At least one such column of this test mass is needed: x by interferometer or inertial sensor.
     OneOf(u8),
-    /// All of this test mass's columns are needed.
+    /// All such columns of this test mass are needed. One test mass with its columns suffices.
     EachOf(u8),
 }
 
@@ -63,9 +63,9 @@ pub(crate) struct TableSpec {
     pub(crate) status: Vec<StatusRule>,
     /// Rate that the telemetry states, Hz.
     pub(crate) stated_rate_hz: Option<f64>,
-    /// An instrument or a command, never interpolated whatever its rate.
+    /// Whether it is an instrument or a command, which are not interpolated at any rate.
     pub(crate) never_interpolated: bool,
-    /// A mandatory table.
+    /// Whether a calibration needs it.
     pub(crate) mandatory: bool,
 }
 

@@ -1,8 +1,8 @@
-//! Outlier test: up to three samples that leave the line of their neighbours and return to it.
+//! Outlier test: runs of up to three samples that deviate from the line through their neighbours.
 //!
-//! A displacement or an angle is the double integral of an acceleration. A force bends its line, a thrust pulse shifts
-//! it and a phase-meter slip steps it; none returns to the *same* line within three samples. A run of one to three
-//! samples is an outlier if
+//! A displacement or an angle is the double integral of an acceleration. A force changes its curvature, a thrust pulse
+//! its slope, a phase-meter slip its value; in none of them does it return to the *same* line within three samples. A
+//! run of one to three samples is an outlier if
 //! 1. both of its ends deviate from the chord between their neighbours by more than `sigma/2` robust standard
 //!    deviations of the second difference (for one sample: its second difference exceeds `sigma`), and
 //! 2. the slopes before and after the run agree with the chord within a quarter of that deviation, and

@@ -11,7 +11,7 @@ pub(crate) struct Window<T> {
 }
 
 impl<T: Copy> Window<T> {
-    /// Visits the values that wait, by `list`.
+    /// Saves or restores the remaining values with `list`.
     pub(crate) fn visit<'s>(
         &mut self,
         state: &mut State<'s>,
@@ -52,7 +52,7 @@ impl<T: Copy> Window<T> {
     }
 }
 
-/// Why a row or a value is not on the grid, or a remark about it.
+/// Reason why a row or a value is not on the grid, or a finding that is only counted.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Reason {
     /// Row: same time and values as the one before.

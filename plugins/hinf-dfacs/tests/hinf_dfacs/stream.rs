@@ -194,7 +194,7 @@ fn without_sensing_for_hours_no_acceleration_is_invented() {
     let first = unknown.first().expect("the gap is long") - lost.start;
     assert!((20..40).contains(&first), "{first}");
     assert_eq!(unknown, (lost.start + first..lost.end - first).collect::<Vec<_>>());
-    assert_eq!(stage.counts().blind, unknown.len() as u64);
+    assert_eq!(stage.counts().alpha_unknown, unknown.len() as u64);
     assert!(rows.iter().all(|row| u1(row).x.is_finite()));
 
     // Means over 5 s: what is below 0.1 Hz.
