@@ -113,7 +113,7 @@ fn a_scale_or_a_gain_is_named_from_seven_hours_to_a_day() {
 }
 
 /// Eight hours have 3.5σ of the same scale, and the bound, corrected for all that is tried, is not reached: the halves
-/// must agree on it and its size be within 4σ, whatever the verdict.
+/// must agree on it (false alarm 1e-3, the bound of a refusal) and its size be within 4σ, whatever the verdict.
 #[test]
 fn a_scale_near_the_bound_is_constant_over_the_halves() {
     let d = diagnosis(&["--hours", "8", "--seed", "31", "--effect", "is-scale:tm2.y=0.05"]);

@@ -262,6 +262,7 @@ pub fn diagnose(
     let trials = Trials::new(scorer, &forms);
     let mut ranked = first.all;
     let mut requests = refinement_requests(settings, &trials, &ranked);
+    // As often as effects may be added: two that each stand in for the other must not alternate for ever.
     let mut removed = 0;
     let mut others: Vec<Found> = loop {
         sort_by_p_value(&trials, &mut ranked);
