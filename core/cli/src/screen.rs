@@ -298,7 +298,12 @@ mod tests {
             last_ns: 2_051_243_999_900_000_000,
             inputs: Vec::new(),
             history: Vec::new(),
-            model: Model { revision: "1".into(), parent: None, effects: vec!["com-offset".into()] },
+            model: Model {
+                revision: "1".into(),
+                parent: None,
+                effects: vec!["com-offset".into()],
+                noise_levels: Vec::new(),
+            },
             software: "0.1.0".into(),
             replay: dragfree_engine::feed::Summary { time_scale: "UTC".into(), ..Default::default() },
             reports: vec![Report { plugin: "qp-check".into(), ..report }],

@@ -1,6 +1,8 @@
 //! A second pass over the data of a product: its inputs go through its chain once more, up to and with the effects, and
 //! the columns that the caller chooses come back to it.
 
+use std::collections::BTreeMap;
+
 use crate::EngineError;
 use crate::border::Kind;
 use crate::chain::{Chain, Sink};
@@ -19,6 +21,8 @@ pub struct Examination<'a> {
     pub sources: &'a Sources,
     /// Effects that are tried beside those of the model.
     pub candidates: Vec<EffectEntry>,
+    /// Coefficients of the model that start at another value than the model file's, by name.
+    pub values: &'a BTreeMap<String, f64>,
     /// Threads; results do not depend on them.
     pub threads: usize,
     /// Most rows in one call; results do not depend on it.
@@ -81,6 +85,12 @@ pub fn examine<C: Sink, E: From<EngineError>>(
     };
     let mut setup = Setup::load(&options)?;
     setup.model.candidates.clone_from(&what.candidates);
+    for (name, value) in what.values {
+        let short = name.rsplit('.').next().unwrap_or_default();
+        for entry in setup.model.effects.iter_mut().filter(|e| e.owns(name)) {
+            entry.prior.entry(short.to_owned()).or_default().value = Some(*value);
+        }
+    }
     let nodes = &mut setup.pipeline.nodes;
     nodes.truncate(nodes.iter().position(|n| *n == Node::Effects).map_or(nodes.len(), |i| i + 1));
     let mut feed = setup.feed(registry, None)?;

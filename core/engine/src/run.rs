@@ -1,7 +1,7 @@
 //! One run: a pipeline over a feed, into a product.
 
 use chrono::{DateTime, Utc};
-use dragfree_schema::Report;
+use dragfree_schema::{Coefficient, Report};
 use serde_json::{Map, Value};
 use std::io;
 use std::ops::Range;
@@ -13,7 +13,7 @@ use crate::chain::{self, Carry, Chain, ChainNode, Sink};
 use crate::config::{Mission, Model, Pipeline};
 use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions};
 use crate::files::{IoContext as _, IoError, folder_of, sha256, sha256_of, sync_folder};
-use crate::product::{self, Draft, Loss, ProductWriter, Stage, Written};
+use crate::product::{self, Draft, Loss, NoiseLevel, ProductWriter, Stage, Written};
 use crate::registry::Registry;
 use crate::sources::Sources;
 use crate::table::{Batch, Chunk, TableSpec};
@@ -363,6 +363,14 @@ fn stage(info: &PluginInfo, instance: &str, library_sha256: &str, parameters: &M
     }
 }
 
+/// Levels of noise that the effects of the model state.
+fn noise_levels(chain: &Chain) -> Vec<NoiseLevel> {
+    let stated = chain.coefficients.iter().filter(|c| !c.noise.is_empty() && !c.candidate);
+    let level =
+        |c: &Coefficient| NoiseLevel { coefficient: c.name.clone(), component: c.noise.clone(), value: c.initial };
+    stated.map(level).collect()
+}
+
 fn draft(
     setup: &Setup<'_>,
     chain: &Chain,
@@ -401,7 +409,7 @@ fn draft(
         last_ns: covered.last_ns,
         inputs: inputs(setup)?,
         history,
-        model: product::Model { revision, parent, effects },
+        model: product::Model { revision, parent, effects, noise_levels: noise_levels(chain) },
         software: setup.options.software.clone(),
         reports: replay.report.take().into_iter().chain(reports).collect(),
         replay,

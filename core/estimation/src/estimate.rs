@@ -18,7 +18,7 @@ use crate::normal::{Equations, NormalEquations, accumulate, residuals};
 use crate::prediction::Prediction;
 use crate::qp::{Active, Kkt, Problem, QpError, Row, Side};
 use crate::refine::{Chi2, SigmaError, Whitening};
-use crate::sigma::{BandNoise, NoiseModel};
+use crate::sigma::{BandNoise, NoiseError, NoiseModel};
 use crate::spectra::{Band, FIRST_BIN, Layout, Plan, Spectra, Sums};
 use crate::verdict::{self, Direction, Pull, chi2_per_dof_at};
 
@@ -85,6 +85,9 @@ pub enum EstimateError {
     /// The constrained problem has no solution.
     #[error(transparent)]
     Qp(#[from] QpError),
+    /// Declared noise that cannot be used.
+    #[error(transparent)]
+    Noise(#[from] NoiseError),
 }
 
 /// The solution and how it came about.

@@ -23,6 +23,10 @@ use crate::verdict::chi2_per_dof_at;
 /// Amplitudes that are tried lie between its inverse and this.
 const MOST: f64 = 20.0;
 
+/// Most sweeps of a joint fit over its levels, and the largest step of a logarithm at which it has converged.
+const JOINT_SWEEPS: usize = 30;
+const JOINT_STEP: f64 = 1e-4;
+
 /// A process with another amplitude.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Level {
@@ -198,6 +202,55 @@ impl<'a> Levels<'a> {
             }
             self.take(&best);
         }
+    }
+
+    /// The amplitudes of some processes that fit best together, over the declared ones, and takes them over. Their σ are
+    /// those of the inverse information, `4 Σ n tr(Σ⁻¹P_l Σ⁻¹P_m)` for logarithms of amplitudes. Processes that the
+    /// channels do not have are left out.
+    pub fn fit_jointly(&mut self, names: &[&str]) -> Vec<Level> {
+        let there: Vec<&'a str> = self.processes.keys().copied().filter(|name| names.contains(name)).collect();
+        let mut amplitudes = vec![1.0; there.len()];
+        let mut delta_chi2 = vec![0.0; there.len()];
+        for _ in 0..JOINT_SWEEPS {
+            let mut largest = 0.0_f64;
+            for (i, name) in there.iter().enumerate() {
+                let Some(level) = self.level(name) else { continue };
+                self.take(&level);
+                // The next sweep is relative to this level.
+                let power = level.value * level.value;
+                self.processes.get_mut(name).into_iter().flatten().for_each(|p| *p *= power);
+                amplitudes[i] *= level.value;
+                delta_chi2[i] += level.delta_chi2;
+                largest = largest.max(level.value.ln().abs());
+            }
+            if largest < JOINT_STEP {
+                break;
+            }
+        }
+        let covariance = self.information(&there).try_inverse();
+        let sigma = |i: usize| covariance.as_ref().map_or(f64::INFINITY, |c| c[(i, i)].max(0.0).sqrt());
+        let level = |(i, name): (usize, &&str)| Level {
+            process: (*name).to_owned(),
+            value: amplitudes[i],
+            sigma: amplitudes[i] * sigma(i),
+            delta_chi2: delta_chi2[i],
+        };
+        there.iter().enumerate().map(level).collect()
+    }
+
+    /// Fisher's information on the logarithms of amplitudes.
+    fn information(&self, names: &[&str]) -> DMatrix<f64> {
+        let mut sum = DMatrix::zeros(names.len(), names.len());
+        for (b, sigma) in self.modelled.iter().enumerate().filter(|(b, _)| self.observations[*b] > 0.0) {
+            let inverse = inverted(sigma);
+            let parts: Vec<DMatrix<f64>> = names.iter().map(|name| &inverse * &self.processes[name][b]).collect();
+            for (i, a) in parts.iter().enumerate() {
+                for (j, b_part) in parts.iter().enumerate() {
+                    sum[(i, j)] += 4.0 * self.observations[b] * a.dot(&b_part.transpose());
+                }
+            }
+        }
+        sum
     }
 
     /// Bands in groups of a third of a decade.
@@ -404,6 +457,32 @@ mod tests {
         );
         levels.fit();
         assert!(levels.modelled().iter().zip(&truth).all(|(a, b)| (a - b).norm() < 1e-6 * b.norm()));
+    }
+
+    /// Three levels at once, one above and one below the declared one: each is found, with a σ that is no smaller than
+    /// that of the level alone; what is asked for and not there is left out.
+    #[test]
+    fn levels_are_fitted_jointly() {
+        let (noise, settings) = (noise(), Settings::default());
+        let plan = Plan::new(4096, 10.0);
+        let weights = weights(&plan, 20);
+        let hz: Vec<f64> = plan.bands.iter().map(|b| plan.frequency_hz(*b)).collect();
+        let truth = [("force:x", 1.5), ("force:y", 0.8), ("Differenced:a.y", 2.0)];
+        let of = |f: &f64| {
+            let more = |(name, k): &(&str, f64)| noise.process_psd(name, *f).unwrap() * (k * k - 1.0);
+            truth.iter().fold(noise.psd(*f), |sum, level| sum + more(level))
+        };
+        let measured: Vec<DMatrix<f64>> = hz.iter().map(of).collect();
+        let mut levels = Levels::new(&noise, &plan, &weights, &measured, &settings);
+        let found = levels.fit_jointly(&["nothing", "force:x", "force:y", "Differenced:a.y"]);
+        assert_eq!(found.len(), 3);
+        for (name, k) in truth {
+            let level = found.iter().find(|l| l.process == name).unwrap();
+            assert!((level.value / k - 1.0).abs() < 1e-4, "{level:?}");
+            // Around the solution a level of its own is one, with the σ of the others known.
+            let alone = levels.level(name).unwrap();
+            assert!((alone.value - 1.0).abs() < 1e-4 && level.sigma / k > 0.99 * alone.sigma, "{level:?} {alone:?}");
+        }
     }
 
     /// A process that a coefficient colours is what is measured, at its own level; without the colour its level would

@@ -7,6 +7,7 @@
 
 pub mod colour;
 pub mod estimate;
+pub mod free_levels;
 pub mod levels;
 pub mod normal;
 pub mod prediction;

@@ -20,6 +20,13 @@ use crate::spectra::{Band, Plan};
 #[error("the declared noise is unusable: {0}")]
 pub struct NoiseError(String);
 
+impl NoiseError {
+    /// With this reason.
+    pub(crate) fn of(reason: String) -> Self {
+        Self(reason)
+    }
+}
+
 /// A process as the channels of the model see it.
 struct Process {
     shape: NoiseShape,

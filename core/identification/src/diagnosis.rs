@@ -665,6 +665,9 @@ fn noise_levels(scorer: &CandidateScorer<'_>, fit: &Fit, levels: &mut Levels<'_>
         let best = measured.into_iter().max_by(|a, b| a.1.delta_chi2.total_cmp(&b.1.delta_chi2));
         let Some((i, level)) = best else { return out };
         let c = &scorer.candidate_set.coefficients[i];
+        // A level that the model states is in Σ already; what is measured is relative to it.
+        let stated = if c.candidate { 1.0 } else { c.initial };
+        let (value, sigma) = (stated * level.value, stated * level.sigma);
         let (p_value, log10_p_value) = trials.p_value(&c.effect, level.delta_chi2, 1.0);
         // A transient raises one half of the data, noise both: equal within chance, or each by half of the rise at
         // least.
@@ -686,11 +689,11 @@ fn noise_levels(scorer: &CandidateScorer<'_>, fit: &Fit, levels: &mut Levels<'_>
             effect: c.effect.clone(),
             instance: c.instance.clone(),
             coefficient: c.name.clone(),
-            value: level.value,
-            sigma: level.sigma,
+            value,
+            sigma,
             unit: "1".to_owned(),
             shape: Map::new(),
-            coefficients: vec![json!({ "name": c.name, "value": level.value, "sigma": level.sigma, "unit": "1" })],
+            coefficients: vec![json!({ "name": c.name, "value": value, "sigma": sigma, "unit": "1" })],
             delta_chi2: level.delta_chi2,
             p_value,
             log10_p_value,

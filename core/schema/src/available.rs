@@ -11,7 +11,7 @@ pub struct Available {
     pub coefficients: Vec<Coefficient>,
     /// Constraints on them.
     pub constraints: Vec<Constraint>,
-    /// Noise in the channels.
+    /// Noise in the channels, at the levels that the model's effects state.
     pub noise: Vec<NoiseProcess>,
 }
 

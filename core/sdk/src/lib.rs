@@ -61,8 +61,9 @@ mod want;
 
 pub use batch::{Inputs, Outputs, Progress};
 pub use dragfree_schema::{
-    Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Estimate, NoiseEstimate, NoiseProcess,
-    NoiseResponse, NoiseShape, NoiseTerm, Report, Response, Role, Settings, Shape, Transient, Variant, state,
+    Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Estimate, NoiseEstimate, NoiseLevels,
+    NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm, Report, Response, Role, Settings, Shape, Transient, Variant,
+    state,
 };
 pub use error::PluginError;
 pub use link::{EffectLink, In, Link, Out, Table};
@@ -76,8 +77,8 @@ pub mod prelude {
     pub use crate::state::{State, StateError};
     pub use crate::{
         Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Effect, EffectLink, Estimate, In,
-        Inputs, Level, Link, Log, Manifest, NoiseEstimate, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm, Out,
-        Outputs, Parameter, PluginError, Progress, Report, Response, Role, Settings, Setup, Shape, Source, Stage,
-        Table, Transient, Variant, Want, export_plugin,
+        Inputs, Level, Link, Log, Manifest, NoiseEstimate, NoiseLevels, NoiseProcess, NoiseResponse, NoiseShape,
+        NoiseTerm, Out, Outputs, Parameter, PluginError, Progress, Report, Response, Role, Settings, Setup, Shape,
+        Source, Stage, Table, Transient, Variant, Want, export_plugin,
     };
 }

@@ -1,8 +1,10 @@
 //! The ladder of model revisions: how the error falls from one to the next, on the days of the fit and on days kept out
 //! of it.
 //!
-//! χ² is computed with the mission file's Σ, which all revisions share; with a Σ from residuals it could not be
-//! compared between revisions.
+//! χ² is computed with the mission file's Σ, which revisions share; with a Σ from residuals it could not be compared
+//! between revisions. Where a revision states levels of noise, or missions differ, Σ differs too, and what falls is
+//! `−2 log` of the likelihood, χ² plus `Σ 2n log det Σ`: a larger Σ lowers χ² of any data. Channels of one telemetry
+//! differ between missions by known accelerations alone, so that their likelihoods can be compared.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,6 +12,13 @@ use serde::Serialize;
 
 use dragfree_engine::config::Model;
 use dragfree_engine::product::{Coefficient, Product};
+
+mod missions;
+mod nees;
+
+pub use missions::declared_log_determinant;
+use missions::{Labels, same_telemetry};
+pub use nees::Nees;
 
 /// Why products make no ladder.
 #[derive(Debug, thiserror::Error)]
@@ -72,6 +81,9 @@ pub struct Rung {
     pub fall: Option<Fall>,
     /// Estimated coefficients.
     pub coefficients: Vec<Value>,
+    /// Normalised estimation error squared of each solution, where truth is known.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub nees: Vec<Nees>,
     /// The same model, its coefficients fixed, on days kept out of the fit.
     pub held_out: Option<HeldOut>,
 }
@@ -79,8 +91,14 @@ pub struct Rung {
 /// How well a revision describes some days.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Fit {
-    /// `Σ rᴴ Σ⁻¹ r` with the mission's Σ.
+    /// `Σ rᴴ Σ⁻¹ r` with the mission's Σ, at the levels of noise that the model states.
     pub chi2: f64,
+    /// `Σ 2n log (det Σ/det Σ_mission)` of these levels.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub log_determinant: f64,
+    /// `Σ 2n log det Σ_mission`; zero in a ladder of one mission, `None` where it is unknown.
+    #[serde(skip)]
+    declared_log_determinant: Option<f64>,
     /// Observations, estimated coefficients not subtracted.
     pub dof: f64,
     /// χ² per observation.
@@ -91,6 +109,10 @@ pub struct Fit {
     pub nis: f64,
     /// Each channel.
     pub channels: Vec<Channel>,
+}
+
+fn is_zero(x: &f64) -> bool {
+    *x == 0.0
 }
 
 /// One channel.
@@ -104,7 +126,7 @@ pub struct Channel {
     pub rms: f64,
 }
 
-/// A fall of χ².
+/// A fall of χ², or of `−2 log` of the likelihood where the revisions do not share Σ.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct Fall {
     /// Above zero where the newer revision is better.
@@ -178,7 +200,8 @@ pub struct OverFitted {
 }
 
 /// Makes the ladder of `products`; `held_out` are products of `dragfree model fix` of those revisions on other days,
-/// `truth` gives the true value of a coefficient in its SI unit.
+/// `truth` gives the true value of a coefficient in its SI unit, `declared` the [`declared_log_determinant`] of a
+/// product, which is asked for only where missions differ.
 ///
 /// # Errors
 /// [`LadderError`] says which product does not fit, and why.
@@ -186,14 +209,15 @@ pub fn ladder(
     products: &[Product],
     held_out: &[Product],
     truth: &dyn Fn(&str) -> Option<f64>,
+    declared: &dyn Fn(&Product) -> Option<f64>,
 ) -> Result<Ladder, LadderError> {
     let Some(first) = products.first() else {
         return Err(LadderError::Products("a ladder needs a product; `dragfree run` makes one".to_owned()));
     };
     for other in products.iter().chain(held_out) {
-        if craft(other) != craft(first) {
+        if craft(other) != craft(first) && !same_telemetry(other, first) {
             return Err(LadderError::Products(format!(
-                "{} is of {}, {} is of {}: a ladder is of one spacecraft",
+                "{} is of {}, {} is of {}: a ladder is of one spacecraft, or of one telemetry read with several missions",
                 first.id(),
                 craft(first),
                 other.id(),
@@ -202,12 +226,15 @@ pub fn ladder(
         }
     }
     let mut notes = Vec::new();
-    let mut of = by_revision(products);
+    let labels = Labels::new(products.iter().chain(held_out));
+    // In a ladder of one mission all fits have this term in common.
+    let declared = |p: &Product| if labels.several() { declared(p) } else { Some(0.0) };
+    let mut of = by_revision(products, &labels);
     let days = common(&mut of, &mut notes)?;
-    let parents = compared(&of);
+    let parents = compared(&of, &labels);
     let mut kept_out: BTreeMap<String, BTreeMap<Window, &Product>> = BTreeMap::new();
     for product in held_out {
-        let revision = held_out_of(product, &of, &days)?;
+        let revision = held_out_of(product, &of, &days, &labels)?;
         newer(kept_out.entry(revision).or_default(), product);
     }
 
@@ -222,7 +249,7 @@ pub fn ladder(
         };
         let added = before.map_or_else(Vec::new, |b| missing(&b.effects, &effects));
         let removed = before.map_or_else(Vec::new, |b| missing(&effects, &b.effects));
-        let this = fit(own.values().copied());
+        let this = fit(own.values().copied(), &declared);
         let fall = before.and_then(|b| fall(&b.fit, &this, &format!("{} and {revision}", b.revision), &mut notes));
         let held = kept_out.get(&revision).map(|own| {
             let before = compared_with.as_ref().and_then(|p| Some((p, kept_out.get(p)?)));
@@ -235,7 +262,7 @@ pub fn ladder(
                 ));
             }
             let sigmas = first.settings.ladder_sigmas;
-            held_out_fit(own, before, &revision, !added.is_empty(), sigmas, &mut notes)
+            held_out_fit(own, before, (&revision, !added.is_empty(), sigmas), &declared, &mut notes)
         });
         let coefficients = values(own, before, truth);
         revisions.push(Rung {
@@ -249,6 +276,7 @@ pub fn ladder(
             fit: this,
             fall,
             coefficients,
+            nees: nees::nees(own.values().copied(), truth),
             held_out: held,
         });
     }
@@ -288,10 +316,10 @@ fn newer<'a>(days: &mut Days<'a>, product: &'a Product) {
     }
 }
 
-fn by_revision(products: &[Product]) -> BTreeMap<String, Days<'_>> {
+fn by_revision<'a>(products: &'a [Product], labels: &Labels) -> BTreeMap<String, Days<'a>> {
     let mut of: BTreeMap<String, Days<'_>> = BTreeMap::new();
     for product in products {
-        newer(of.entry(product.model.revision.clone()).or_default(), product);
+        newer(of.entry(labels.of(product)).or_default(), product);
     }
     of
 }
@@ -345,19 +373,29 @@ fn effects(product: &Product) -> Vec<String> {
 
 /// Sort key of a revision: its number, then its name.
 fn number(revision: &str) -> (u32, &str) {
-    (Model::counter(revision).unwrap_or(0), revision)
+    let own = revision.split('@').next().unwrap_or_default();
+    (Model::counter(own).unwrap_or(0), revision)
 }
 
-/// The revision that each is compared with.
-fn compared(of: &BTreeMap<String, Days<'_>>) -> BTreeMap<String, Option<String>> {
+/// The revision that each is compared with: of the same mission; the first of a further mission with the same revision
+/// of an earlier one.
+fn compared(of: &BTreeMap<String, Days<'_>>, labels: &Labels) -> BTreeMap<String, Option<String>> {
     let set = |days: &Days<'_>| effects(any(days)).into_iter().collect::<BTreeSet<_>>();
     let nearest = |revision: &String, days: &Days<'_>| {
-        if let Some(parent) = any(days).model.parent.as_ref().filter(|p| of.contains_key(*p) && *p != revision) {
-            return Some(parent.clone());
+        let parent = any(days).model.parent.as_ref().map(|parent| labels.with(any(days), parent));
+        if let Some(parent) = parent.filter(|p| of.contains_key(p) && p != revision) {
+            return Some(parent);
         }
         let own = set(days);
-        let smaller = of.iter().map(|(r, d)| (set(d), r)).filter(|(s, _)| s.len() < own.len() && s.is_subset(&own));
-        smaller.max_by_key(|(s, r)| (s.len(), number(r))).map(|(_, r)| r.clone())
+        let mission = labels.mission(any(days));
+        let same = of.iter().filter(|(_, d)| labels.mission(any(d)) == mission);
+        let smaller = same.map(|(r, d)| (set(d), r)).filter(|(s, _)| s.len() < own.len() && s.is_subset(&own));
+        if let Some((_, nearest)) = smaller.max_by_key(|(s, r)| (s.len(), number(r))) {
+            return Some(nearest.clone());
+        }
+        let of_model = |d: &Days<'_>| any(d).model.revision.clone();
+        let earlier = of.iter().filter(|(_, d)| labels.mission(any(d)) < mission && of_model(d) == of_model(days));
+        earlier.min_by_key(|(_, d)| labels.mission(any(d))).map(|(r, _)| r.clone())
     };
     of.iter().map(|(revision, days)| (revision.clone(), nearest(revision, days))).collect()
 }
@@ -394,8 +432,9 @@ fn float(table: &toml::Table, key: &str) -> f64 {
 }
 
 /// Some days together: sums of χ² and of observations.
-fn fit<'a>(days: impl Iterator<Item = &'a Product>) -> Fit {
+fn fit<'a>(days: impl Iterator<Item = &'a Product>, declared: &dyn Fn(&Product) -> Option<f64>) -> Fit {
     let (mut chi2, mut dof) = (0.0, 0.0);
+    let (mut log_determinant, mut declared_log_determinant) = (0.0, Some(0.0));
     let (mut nis, mut epochs) = (0.0, 0.0);
     let mut channels: Vec<(String, f64, f64)> = Vec::new();
     for product in days {
@@ -409,6 +448,9 @@ fn fit<'a>(days: impl Iterator<Item = &'a Product>) -> Fit {
         let observations = figures.map_or(f64::NAN, told);
         chi2 += product.quality.chi2_per_dof * observations;
         dof += observations;
+        let of_levels = figures.map(|f| float(f, "log_determinant_over_declared")).filter(|x| !x.is_nan());
+        log_determinant += of_levels.unwrap_or(0.0);
+        declared_log_determinant = declared_log_determinant.zip(declared(product)).map(|(sum, own)| sum + own);
         nis += product.quality.nis * product.quality.epochs_used as f64;
         epochs += product.quality.epochs_used as f64;
         let listed = figures.and_then(|f| f.get("channels")).and_then(toml::Value::as_array);
@@ -427,6 +469,8 @@ fn fit<'a>(days: impl Iterator<Item = &'a Product>) -> Fit {
     };
     Fit {
         chi2,
+        log_determinant,
+        declared_log_determinant,
         dof,
         chi2_per_dof: chi2 / dof,
         rms: (chi2 / dof).sqrt(),
@@ -452,21 +496,41 @@ fn fall(before: &Fit, after: &Fit, who: &str, notes: &mut Vec<String>) -> Option
             before.dof, after.dof
         ));
     }
-    let delta_chi2 = (before.chi2_per_dof - after.chi2_per_dof) * after.dof;
+    let [Some(earlier), Some(later)] = [before, after].map(|fit| fit.declared_log_determinant) else {
+        notes.push(format!(
+            "revisions {who} are of different missions, and the sums beside a product, `.neq.json`, are not there or are \
+             of a part of it: without them the likelihoods under two declarations of noise cannot be compared"
+        ));
+        return None;
+    };
+    let determinants = |fit: &Fit, declared: f64| (fit.log_determinant + declared) / fit.dof;
+    let fall = before.chi2_per_dof - after.chi2_per_dof + (determinants(before, earlier) - determinants(after, later));
+    let delta_chi2 = fall * after.dof;
+    if before.log_determinant != after.log_determinant || earlier != later {
+        notes.push(format!(
+            "revisions {who} have different noise: what falls is −2 log of the likelihood, χ² plus log det Σ"
+        ));
+    }
     delta_chi2.is_finite().then_some(Fall { delta_chi2, uncertainty })
 }
 
 /// The revision that a held-out product belongs to.
-fn held_out_of(product: &Product, of: &BTreeMap<String, Days<'_>>, days: &[Window]) -> Result<String, LadderError> {
+fn held_out_of(
+    product: &Product,
+    of: &BTreeMap<String, Days<'_>>,
+    days: &[Window],
+    labels: &Labels,
+) -> Result<String, LadderError> {
     let refuse = |why: String| LadderError::HeldOut { id: product.id().to_owned(), why };
     let fixed = "`dragfree model fix MODEL.toml --from PRODUCT` writes the model to run it with";
-    if of.contains_key(&product.model.revision) {
+    if of.contains_key(&labels.of(product)) {
         return Err(refuse(format!(
             "it was made with revision {} itself, which estimates its coefficients; {fixed}",
             product.model.revision
         )));
     }
-    let Some((revision, _)) = product.model.parent.as_ref().and_then(|p| of.get_key_value(p)) else {
+    let parent = product.model.parent.as_ref().map(|parent| labels.with(product, parent));
+    let Some((revision, _)) = parent.and_then(|p| of.get_key_value(&p)) else {
         let known: Vec<&str> = of.keys().map(String::as_str).collect();
         return Err(refuse(format!(
             "its model {} is no child of a revision of the ladder ({}); {fixed}",
@@ -484,9 +548,8 @@ fn held_out_of(product: &Product, of: &BTreeMap<String, Days<'_>>, days: &[Windo
 fn held_out_fit(
     own: &Days<'_>,
     before: Option<(&String, &Days<'_>)>,
-    revision: &str,
-    added: bool,
-    sigmas: f64,
+    (revision, added, sigmas): (&str, bool, f64),
+    declared: &dyn Fn(&Product) -> Option<f64>,
     notes: &mut Vec<String>,
 ) -> HeldOut {
     let names = |days: &Days<'_>| {
@@ -507,7 +570,7 @@ fn held_out_fit(
             ));
             return None;
         }
-        let of = |days: &Days<'_>| fit(both.iter().map(|w| days[*w]));
+        let of = |days: &Days<'_>| fit(both.iter().map(|w| days[*w]), declared);
         fall(&of(theirs), &of(own), &format!("{parent} and {revision}, held out,"), notes)
     });
     let verdict = fall.filter(|_| added).map(|fall| match fall.delta_chi2 {
@@ -518,7 +581,7 @@ fn held_out_fit(
     HeldOut {
         products: own.values().map(|p| p.id().to_owned()).collect(),
         days: own.keys().cloned().collect(),
-        fit: fit(own.values().copied()),
+        fit: fit(own.values().copied(), declared),
         fall,
         verdict,
     }

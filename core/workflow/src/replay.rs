@@ -1,5 +1,7 @@
 //! The data of archived products once more, through the chains that made them, into sums.
 
+use std::collections::BTreeMap;
+
 use dragfree_engine::chain::Chain;
 use dragfree_engine::examine::{Examination, candidates, examine, has_parameter};
 use dragfree_engine::product::Written;
@@ -71,6 +73,24 @@ impl What<'_> {
     }
 }
 
+/// Levels of noise of the model of some products, by coefficient: where the products estimate one, the mean of their
+/// estimates weighted by 1/σ², as all of them are weighed by one Σ.
+fn noise_levels(products: &[Written]) -> BTreeMap<String, f64> {
+    let products = || products.iter().map(|p| &p.product);
+    let stated = products().flat_map(|p| &p.model.noise_levels);
+    let mut all: BTreeMap<String, f64> = stated.map(|level| (level.coefficient.clone(), level.value)).collect();
+    for (name, level) in &mut all {
+        let estimates = products().flat_map(|p| p.result.adopted()).filter(|c| c.name == *name);
+        let known = estimates.filter(|c| c.value > 0.0 && c.sigma > 0.0 && c.sigma.is_finite());
+        let weighted = known.map(|c| (c.sigma.powi(-2) * c.value, c.sigma.powi(-2)));
+        let (sum, weight) = weighted.fold((0.0, 0.0), |(sum, weight), (x, w)| (sum + x, weight + w));
+        if weight > 0.0 {
+            *level = sum / weight;
+        }
+    }
+    all
+}
+
 /// Sums of the data of all products. `progress` is told the pass and the number of the product.
 pub(crate) fn sum(
     replay: &Replay<'_>,
@@ -79,6 +99,7 @@ pub(crate) fn sum(
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Record, WorkflowError> {
     let Replay { registry, products, threads, batch_rows } = *replay;
+    let levels = noise_levels(products);
     let mut whole: Option<Record> = None;
     for (number, Written { product, path }) in products.iter().enumerate() {
         let sources = Sources::read(path)?;
@@ -107,7 +128,8 @@ pub(crate) fn sum(
             reference: equations.is_file().then_some(equations.as_path()),
             threads,
         };
-        let examination = Examination { product, sources: &sources, candidates: all, threads, batch_rows };
+        let candidates = all;
+        let examination = Examination { product, sources: &sources, candidates, values: &levels, threads, batch_rows };
         let link = |chain: &Chain| ColumnSums::link(&request, chain, settings);
         let (sums, not_tried) = examine(registry, &examination, link, &mut |p| progress(what.pass(), number, p))?;
         let mut record = sums.record();

@@ -9,7 +9,10 @@
 //! | `torque-noise:sc.AXIS` | `thruster_torque:sc.AXIS`, N m/√Hz, SRF | attitude: `J_S⁻¹ e` |
 //! | `is-noise:tmN.AXIS` | `readout:tmN.AXIS`, m/√Hz, ORF | one axis of one test mass, rising as f² |
 //!
-//! In a model such an effect documents a known level; es-akf and qp-check refine Σ from residuals in any case.
+//! **In a model** the value of the entry scales the declared noise of its component ([`NoiseLevels`])
+//! for the batch solution, the recursive filters, `compare` and `diagnose`. Left free, the batch solution estimates the
+//! level by the likelihood of the residuals; the recursive filters use the value of the entry in any case. The smoother
+//! of the angular acceleration stands before the effects and measures the level of the torque noise by itself.
 //! **Range**: 0.2 to 20. **Confounders**: any unmodelled force of the same spectrum; thruster force along axes that
 //! share the channels that are read; thrusters in a layout, whose force and torque noise are correlated.
 

@@ -199,6 +199,14 @@ impl Stage for EsAkf {
             Some(together) => together,
             None => available.has_regressors_in_loop()?,
         };
+        let free = available.coefficients.iter().filter(|c| c.estimate && !c.noise.is_empty());
+        self.notes.extend(free.map(|c| {
+            format!(
+                "es-akf: {} is {} here, its value in the model file: a filter estimates no level of noise; the batch \
+                 solution does",
+                c.name, c.initial
+            )
+        }));
         let mut groups: Vec<Vec<TestMass>> = there.iter().map(|test_mass| vec![test_mass.clone()]).collect();
         if together && there.len() > 1 {
             match self.link_filter(&there, table, available, link)? {
@@ -391,7 +399,8 @@ impl EsAkf {
         if several {
             choices.bias_walk_m_s2_rts = self.bias_walk_together_m_s2_rts;
         }
-        let model = model(&self.mission, &names, &readouts, thetas, &choices)?;
+        let levels = NoiseLevels::of(&available.coefficients);
+        let model = model(&self.mission, &names, &readouts, thetas, &choices, &levels)?;
         // Fewer forces than axes leave Q a null space, the combinations of axes that no thrust moves. Adaptation
         // element by element does not preserve it, so it is off unless it is asked for.
         let usual = if several { Adaptation::Off } else { Adaptation::Monotone };

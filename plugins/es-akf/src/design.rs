@@ -4,12 +4,15 @@ use dragfree_physics::frames::skew;
 use dragfree_physics::mission::{DisplacementNoise, Mission, MissionError, Noise};
 use dragfree_physics::noise::NoiseShape;
 use dragfree_physics::thrust_noise::ThrustNoise;
+use dragfree_sdk::NoiseLevels;
 use nalgebra::{DMatrix, Matrix3};
 
 use crate::model::{Coefficient, Model, Prior};
 use crate::shaping::{Chain, TorqueNoiseShaping};
 
 const STAGE: &str = "es-akf";
+
+const AXES: [&str; 3] = ["x", "y", "z"];
 
 /// What the mission file does not say.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -37,7 +40,8 @@ pub struct Choices {
 /// contain that force, so that several test masses have it as a [`TorqueNoiseShaping`], which is known below the
 /// frequency at which torque noise turns the spacecraft by as much as the sensors' noise.
 ///
-/// `readouts` names the tables under `[noise]` that belong to the readouts x, y, z of each test mass.
+/// `readouts` names the tables under `[noise]` that belong to the readouts x, y, z of each test mass, `levels` the
+/// amplitudes of components of noise over the mission file's.
 ///
 /// # Errors
 /// [`MissionError::Missing`] when the mission has no such test mass, no readout noise or no thrust noise.
@@ -50,13 +54,30 @@ pub fn model(
     readouts: &[&str],
     coefficients: Vec<Coefficient>,
     choices: &Choices,
+    levels: &NoiseLevels,
 ) -> Result<Model, MissionError> {
     let axes = 3 * test_masses.len();
     assert_eq!(axes, readouts.len(), "readouts of {test_masses:?}");
     let (noise, dt_s) = (&mission.noise, mission.dt_s());
     let tms = test_masses.iter().map(|name| mission.test_mass(name, STAGE)).collect::<Result<Vec<_>, _>>()?;
-    let shapes = readouts.iter().map(|name| readout_noise(noise, name)).collect::<Result<Vec<_>, _>>()?;
-    let thrust = ThrustNoise::of(mission).filter(|t| !t.force_shape.terms.is_empty());
+    // Of an axis of a test mass, over the mission file's.
+    let level = |process: &str, axis: usize| {
+        levels.amplitude(&format!("{process}:{}.{}", test_masses[axis / 3], AXES[axis % 3]))
+    };
+    let mut shapes = readouts.iter().map(|name| readout_noise(noise, name)).collect::<Result<Vec<_>, _>>()?;
+    for (axis, shape) in shapes.iter_mut().enumerate() {
+        shape.terms.iter_mut().for_each(|term| term.asd *= level("readout", axis));
+    }
+    let mut thrust = ThrustNoise::of(mission).filter(|t| !t.force_shape.terms.is_empty());
+    if let Some(thrust) = &mut thrust {
+        let amplitudes = |process: &str| {
+            let of = |axis| levels.amplitude(&format!("{process}:sc.{axis}"));
+            Matrix3::from_diagonal(&AXES.map(of).into())
+        };
+        let (force, torque) = (amplitudes("thruster_force"), amplitudes("thruster_torque"));
+        thrust.force_given_torque = force * thrust.force_given_torque * force;
+        thrust.torque = torque * thrust.torque * torque;
+    }
     let thrust = Mission::need(&thrust, "noise.thruster_force", STAGE)?;
     let white = |shape: Option<NoiseShape>| shape.map_or(0.0, |s| s.white_psd());
     let electrostatic = noise.electrostatic_force.as_ref().map(|n| n.shape());
@@ -76,8 +97,10 @@ pub fn model(
         pushed.fixed_view_mut::<3, 3>(3 * t, 0).copy_from(&dcm);
         turned.fixed_view_mut::<3, 3>(3 * t, 0).copy_from(&lever);
         for axis in 0..3 {
+            let row = 3 * t + axis;
             let electrodes = if axis == 0 { 0.0 } else { white(electrostatic.clone()) / tm.mass_kg.powi(2) };
-            psd[(3 * t + axis, 3 * t + axis)] = white(stray.clone()) + electrodes;
+            psd[(row, row)] = white(stray.clone()) * level("test_mass_acceleration", row).powi(2)
+                + electrodes * level("electrostatic_force", row).powi(2);
         }
     }
     let left = thrust.force_given_torque * thrust.force_shape.white_psd() + Matrix3::identity() * white(sunlight);
@@ -104,8 +127,12 @@ pub fn model(
         }
         None => psd += &turned * (thrust.torque * unknown) * turned.transpose(),
     }
-    let red = |mass_kg: f64| red_walk(electrostatic.as_ref()) / mass_kg.powi(2) + red_walk(stray.as_ref());
-    let red = tms.iter().map(|tm| red(tm.mass_kg)).fold(0.0, f64::max);
+    let red = |(t, mass_kg): (usize, f64)| {
+        let largest = |process: &str| (0..3).map(|axis| level(process, 3 * t + axis).powi(2)).fold(0.0, f64::max);
+        red_walk(electrostatic.as_ref()) / mass_kg.powi(2) * largest("electrostatic_force")
+            + red_walk(stray.as_ref()) * largest("test_mass_acceleration")
+    };
+    let red = tms.iter().map(|tm| tm.mass_kg).enumerate().map(red).fold(0.0, f64::max);
     Ok(Model {
         dt_s,
         acceleration_m2_s4: psd * per_step,
@@ -184,7 +211,9 @@ mod tests {
     #[test]
     fn the_default_mission_in_numbers() {
         let names = ["ifo_x", "is_y", "is_z"];
-        let model = |unknown| model(&taiji(), &["tm1"], &names, vec![], &choices(unknown)).expect("complete");
+        let model = |unknown| {
+            model(&taiji(), &["tm1"], &names, vec![], &choices(unknown), &NoiseLevels::default()).expect("complete")
+        };
         let still = model(0.0);
         let thrust = (1e-7_f64 / 1500.0).powi(2) * 5.0;
         assert!((still.acceleration_m2_s4[(0, 0)] / thrust - 1.0).abs() < 1e-5);
@@ -197,6 +226,48 @@ mod tests {
         let by_hand = (1e-7_f64 / 800.0 * 0.18).powi(2) * 5.0;
         assert!((along_z / by_hand - 1.0).abs() < 0.05, "{along_z:e} against {by_hand:e}");
         assert!(moved.acceleration_m2_s4[(0, 0)] - still.acceleration_m2_s4[(0, 0)] < by_hand);
+    }
+
+    /// Levels of components make the filter that a mission file of these levels makes; one along an axis acts there and
+    /// nowhere else.
+    #[test]
+    fn levels_scale_the_noise_of_their_components() {
+        let names = ["ifo_x", "is_y", "is_z"];
+        let levels = |stated: &[(&str, f64)]| {
+            let level = |(component, k): &(&str, f64)| dragfree_sdk::Coefficient {
+                noise: (*component).to_owned(),
+                initial: *k,
+                ..Default::default()
+            };
+            NoiseLevels::of(&stated.iter().map(level).collect::<Vec<_>>())
+        };
+        let with = |mission: &Mission, stated: &[(&str, f64)]| {
+            model(mission, &["tm1"], &names, vec![], &choices(1.0), &levels(stated)).expect("complete")
+        };
+        let mut louder = taiji();
+        louder.noise.thruster_force.as_mut().expect("there").asd_n_rthz *= 2.0;
+        louder.noise.thruster_torque.as_mut().expect("there").asd_nm_rthz *= 3.0;
+        louder.noise.is_y.as_mut().expect("there").asd_m_rthz *= 1.5;
+        let mut stated: Vec<(String, f64)> = Vec::new();
+        for axis in AXES {
+            stated.push((format!("thruster_force:sc.{axis}"), 2.0));
+            stated.push((format!("thruster_torque:sc.{axis}"), 3.0));
+        }
+        stated.extend([("readout:tm1.y".to_owned(), 1.5), ("readout:tm2.z".to_owned(), 7.0)]);
+        let stated: Vec<(&str, f64)> = stated.iter().map(|(component, k)| (component.as_str(), *k)).collect();
+        let (by_mission, by_levels) = (with(&louder, &[]), with(&taiji(), &stated));
+        let close = |a: f64, b: f64| (a - b).abs() <= 1e-12 * a.abs();
+        assert!(by_mission.acceleration_m2_s4.iter().zip(&by_levels.acceleration_m2_s4).all(|(a, b)| close(*a, *b)));
+        assert!(by_mission.readout_m2.iter().zip(&by_levels.readout_m2).all(|(a, b)| close(*a, *b)));
+        let drive = |m: &Model| m.chains.iter().flatten().flat_map(|c| c.noise.clone()).collect::<Vec<f64>>();
+        assert!(drive(&by_mission).iter().zip(drive(&by_levels)).all(|(a, b)| close(*a, b)));
+
+        // ORF of tm1 is SRF turned about z: a force along z moves the test mass along z alone.
+        let (plain, up) = (with(&taiji(), &[]), with(&taiji(), &[("thruster_force:sc.z", 2.0)]));
+        let more = &up.acceleration_m2_s4 - &plain.acceleration_m2_s4;
+        let alone = (1e-7_f64 / 1500.0).powi(2) * 5.0;
+        assert!((more[(2, 2)] / (3.0 * alone) - 1.0).abs() < 1e-9, "{more}");
+        assert!((0..3).all(|i| (0..3).all(|j| (i, j) == (2, 2) || more[(i, j)].abs() < 1e-9 * alone)), "{more}");
     }
 
     /// Further `terms` of a readout are further chains: 4 + 3 + 3 states, whose spectra add up to what the file says.
@@ -212,7 +283,9 @@ mod tests {
             readout.as_mut().expect("there").terms = vec![term(5e-4, 4)];
         }
         let offset = vec![Coefficient { initial: 0.0, prior_sigma: 0.1 }; 3];
-        let model = model(&mission, &["tm1"], &["ifo_x", "is_y", "is_z"], offset, &choices(1.0)).expect("complete");
+        let model =
+            model(&mission, &["tm1"], &["ifo_x", "is_y", "is_z"], offset, &choices(1.0), &NoiseLevels::default())
+                .expect("complete");
         assert_eq!(states_of_chains(&model), [4, 3, 3]);
         assert_eq!(model.states(), 22);
         let stated = |f: f64| 1.42e-12_f64.powi(2) * ((2e-3 / f).powi(4) + (3e-3 / f).powi(2) + (1e-4 / f).powi(2));
@@ -247,7 +320,8 @@ mod tests {
         let mission = Mission::from_json(&serde_json::to_string(&value).expect("JSON")).expect("a mission");
         let names = ["ifo_x", "is_y", "is_z"];
         let noise = |unknown| {
-            let model = model(&mission, &["tm2"], &names, vec![], &choices(unknown)).expect("complete");
+            let model = model(&mission, &["tm2"], &names, vec![], &choices(unknown), &NoiseLevels::default())
+                .expect("complete");
             Matrix3::from_fn(|i, j| model.acceleration_m2_s4[(i, j)] / 5.0)
         };
         let (known, unknown) = (noise(0.0), noise(1.0));
@@ -275,7 +349,8 @@ mod tests {
         let value: toml::Value = toml::from_str(text).expect("the fixture is TOML");
         let mission = Mission::from_json(&serde_json::to_string(&value).expect("JSON")).expect("a mission");
         let names = ["ifo_x", "is_y", "is_z", "ifo_x", "is_y", "is_z"];
-        let both = model(&mission, &["tm1", "tm2"], &names, vec![], &choices(1.0)).expect("complete");
+        let both =
+            model(&mission, &["tm1", "tm2"], &names, vec![], &choices(1.0), &NoiseLevels::default()).expect("complete");
         let q = DMatrix::from_fn(6, 6, |i, j| both.acceleration_m2_s4[(i, j)] / 5.0);
         let quiet = |weights: [f64; 6]| {
             let w = DMatrix::from_row_slice(1, 6, &weights);
@@ -295,8 +370,12 @@ mod tests {
         let own = (walk(2e-14 / 1.96, 1e-3) + walk(3e-15, 4e-4)) * both.dt_s;
         assert!((both.bias_step_m2_s4 / own - 1.0).abs() < 1e-9, "{:e} against {own:e}", both.bias_step_m2_s4);
 
-        let white = model(&mission, &["tm1"], &["ifo_x", "is_y", "is_z"], vec![], &choices(1.0)).expect("complete");
-        let none = model(&mission, &["tm1"], &["ifo_x", "is_y", "is_z"], vec![], &choices(0.0)).expect("complete");
+        let white =
+            model(&mission, &["tm1"], &["ifo_x", "is_y", "is_z"], vec![], &choices(1.0), &NoiseLevels::default())
+                .expect("complete");
+        let none =
+            model(&mission, &["tm1"], &["ifo_x", "is_y", "is_z"], vec![], &choices(0.0), &NoiseLevels::default())
+                .expect("complete");
         let power = |axis: usize, frequency_hz: f64| -> f64 {
             both.torque_noise.iter().map(|noise| gain(noise, axis, frequency_hz * both.dt_s).powi(2)).sum()
         };
@@ -317,7 +396,8 @@ mod tests {
         let mut mission = taiji();
         mission.noise.is_y = None;
         let error =
-            model(&mission, &["tm1"], &["ifo_x", "is_y", "is_z"], vec![], &choices(1.0)).expect_err("no noise.is_y");
+            model(&mission, &["tm1"], &["ifo_x", "is_y", "is_z"], vec![], &choices(1.0), &NoiseLevels::default())
+                .expect_err("no noise.is_y");
         assert!(error.to_string().contains("noise.is_y"), "{error}");
     }
 }

@@ -9,10 +9,12 @@ use serde_json::json;
 use dragfree_estimation::estimate::{
     Bound, Estimate as Solution, Method, Observed, Refinement, Unknown, estimate_with,
 };
+use dragfree_estimation::free_levels::{WithLevels, estimate_with_levels, log_determinant};
+use dragfree_estimation::levels::Level as NoiseLevel;
 use dragfree_estimation::prediction::Prediction;
 use dragfree_estimation::segments::{Collected, Segmenter, longest_length};
 use dragfree_estimation::sigma::{BandNoise, NoiseModel};
-use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, SHORTEST};
+use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, SHORTEST, Spectra};
 use dragfree_estimation::state;
 use dragfree_estimation::stored::Stored;
 use dragfree_estimation::verdict::{Difference, Pull, Value, chi2_bounds, chi2_quantile, differences};
@@ -117,6 +119,9 @@ impl Stage for QpCheck {
     }
 }
 
+/// Key of what levels of noise in the model change of `−2 log` of the likelihood beside χ²; absent without such levels.
+const LOG_DETERMINANT: &str = "log_determinant_over_declared";
+
 const UNKNOWN_NOISE: &str = "no stage declares its noise, so it is weighed by its residuals alone; the stage that makes it should \
      declare one, from the [noise] tables of the mission file";
 
@@ -208,7 +213,9 @@ impl Linked {
         for c in &self.model.unknown {
             report.notes.push(format!("{}: {UNKNOWN_NOISE}", self.layout.channels[*c]));
         }
-        let unknowns: Vec<Unknown> = self.coefficients.iter().map(unknown).collect();
+        let is_solved_for = |c: &Coefficient| c.estimate && !self.is_free_level(c);
+        let unknowns: Vec<Unknown> =
+            self.coefficients.iter().map(|c| Unknown { estimate: is_solved_for(c), ..unknown(c) }).collect();
         if !self.left_out.is_empty() {
             report.notes.push(format!(
                 "{}: nothing in the model acts on them, so they are left out; as witnesses of the thrusters' noise they would lend \
@@ -236,12 +243,23 @@ impl Linked {
         };
         let method = Method { refinements: self.refinements, refinement: self.refinement, settings: &self.settings };
         let noise = BandNoise::new(&self.model, observed.plan);
-        let solution = estimate_with(&observed, &noise, &unknowns, &self.bounds, &method)?;
+        let free: Vec<Coefficient> = self.coefficients.iter().filter(|c| self.is_free_level(c)).cloned().collect();
+        let WithLevels { estimate: solution, levels, noise: fitted } = if free.is_empty() {
+            let estimate = estimate_with(&observed, &noise, &unknowns, &self.bounds, &method)?;
+            WithLevels { estimate, levels: Vec::new(), noise: Vec::new() }
+        } else {
+            estimate_with_levels(&observed, &self.declared, &free, &unknowns, &self.bounds, &method)?
+        };
+        if self.coefficients.iter().any(|c| !c.noise.is_empty()) {
+            let now = if free.is_empty() { &self.declared } else { &fitted };
+            let ratio = self.log_determinant_ratio(now, &sums.total)?;
+            report.quality.extend(ratio.map(|ratio| (LOG_DETERMINANT.to_owned(), json!(ratio))));
+        }
         // What χ² with the declared Σ is a sum over: the same for every model of the same data, which `dof` is not.
         let weights = sums.total.kept().into_iter().zip(&sums.total.expected).map(|(kept, expected)| kept * expected);
         let observations = weights.sum::<f64>() * self.layout.channels.len() as f64;
         report.quality.insert("observations".to_owned(), json!(observations));
-        self.describe(&solution, earlier, &mut report);
+        self.describe(&solution, &levels, earlier, &mut report);
         self.attach(&solution, &stored, &mut report);
         Ok(report)
     }
@@ -276,7 +294,24 @@ impl Linked {
         }
     }
 
-    fn describe(&self, solution: &Solution, earlier: &[Report], report: &mut Report) {
+    /// Whether this is a level of noise that is estimated, and the channels show it.
+    fn is_free_level(&self, c: &Coefficient) -> bool {
+        c.estimate && self.model.process_names().any(|name| name == c.noise)
+    }
+
+    /// `Σ 2n log (det Σ/det Σ_declared)`: what the levels of the model change of `−2 log` of the likelihood beside χ².
+    fn log_determinant_ratio(&self, now: &[NoiseProcess], total: &Spectra) -> Result<Option<f64>, PluginError> {
+        let mut declared = self.declared.clone();
+        NoiseLevels::of(&self.coefficients).inverse().apply(&mut declared).map_err(PluginError::error)?;
+        let plan = self.analyser.plan();
+        let of = |noise: &[NoiseProcess]| -> Result<Option<f64>, PluginError> {
+            let model = NoiseModel::new(noise, &self.layout.channels, 1.0 / plan.rate_hz)?;
+            Ok(log_determinant(&BandNoise::new(&model, plan), total))
+        };
+        Ok(of(now)?.zip(of(&declared)?).map(|(now, declared)| now - declared))
+    }
+
+    fn describe(&self, solution: &Solution, levels: &[NoiseLevel], earlier: &[Report], report: &mut Report) {
         let quality = &solution.quality;
         let sigma = |k: usize| solution.covariance.as_ref().map(|c| c[(k, k)].sqrt());
         let qp: Vec<Value> = solution
@@ -343,7 +378,7 @@ impl Linked {
         for p in solution.pulls.iter().filter(|p| p.sigmas() > self.settings.agreement_sigmas) {
             report.notes.push(pull_sentence(p));
         }
-        self.put_coefficients(solution, &disagreeing, report);
+        self.put_coefficients(solution, levels, &disagreeing, report);
         self.put_quality(solution, &compared, &checked, report);
     }
 
@@ -367,7 +402,13 @@ impl Linked {
 
     /// Values of the QP and what is adopted: the QP's values, because it alone has the survey, the whole band and a
     /// measured Σ; where it disagrees with recursive solutions, its σ grows to span the farthest.
-    fn put_coefficients(&self, solution: &Solution, disagreeing: &[&Compared], report: &mut Report) {
+    fn put_coefficients(
+        &self,
+        solution: &Solution,
+        levels: &[NoiseLevel],
+        disagreeing: &[&Compared],
+        report: &mut Report,
+    ) {
         let names: Vec<String> = solution.free.iter().map(|i| self.coefficients[*i].name.clone()).collect();
         let adopted = solution.covariance.as_ref().map(|c| {
             let widen: Vec<f64> = names
@@ -386,6 +427,8 @@ impl Linked {
                 let free = solution.free.iter().position(|f| *f == i);
                 let sigma = free.zip(covariance.as_ref()).map(|(k, c)| c[(k, k)].sqrt());
                 let value = free.map(|_| solution.theta[i]);
+                let level = levels.iter().find(|level| level.process == c.noise);
+                let (value, sigma) = level.map_or((value, sigma), |level| (Some(level.value), Some(level.sigma)));
                 report.coefficients.push(estimate_of(c, (label, role), value, sigma));
             }
             if let Some(c) = covariance {

@@ -7,17 +7,23 @@ use crate::text::{self, Paint, columns, distinct, labelled, table};
 use crate::truth;
 use dragfree_chart::{Line, Panel, Scale, Stroke, svg};
 use dragfree_engine::files::IoContext as _;
-use dragfree_engine::product::Product;
-use dragfree_workflow::ladder::{Fall, Fit, Ladder, Rung, Value, Verdict, Window, ladder};
+use dragfree_engine::product::{Product, Written};
+use dragfree_workflow::ladder::{Fall, Fit, Ladder, Rung, Value, Verdict, Window, declared_log_determinant, ladder};
 use std::path::Path;
 
 pub(super) fn execute(command: &Arguments, json: bool, paint: Paint) -> Result<Done, Failure> {
-    let open = |names: &[String]| -> Result<Vec<Product>, Failure> {
-        names.iter().map(|name| Ok(products::open(name, &command.archive.folder)?.product)).collect()
+    let open = |names: &[String]| -> Result<Vec<Written>, Failure> {
+        names.iter().map(|name| products::open(name, &command.archive.folder)).collect()
     };
     let (fitted, held_out) = (open(&command.products)?, open(&command.held_out)?);
+    let declared = |product: &Product| {
+        let written = fitted.iter().chain(&held_out).find(|w| w.product.digest() == product.digest());
+        written.and_then(declared_log_determinant)
+    };
+    let products = |of: &[Written]| of.iter().map(|w| w.product.clone()).collect::<Vec<_>>();
     let truth = command.truth.as_deref().map(truth::first).transpose()?.unwrap_or_default();
-    let ladder = ladder(&fitted, &held_out, &|name| dragfree_score::offset(&truth, name))?;
+    let truth = |name: &str| dragfree_score::offset(&truth, name);
+    let ladder = ladder(&products(&fitted), &products(&held_out), &truth, &declared)?;
     if let Some(path) = &command.picture {
         let picture = svg(&panels(&ladder), 2)?;
         std::fs::write(path, picture).at("write", path)?;
@@ -116,7 +122,26 @@ fn ratio(x: f64) -> String {
 /// One row a revision.
 fn steps(ladder: &Ladder) -> String {
     let row = |rung: &Rung| figures(&rung.revision, &rung.fit, rung.fall);
-    columns(&table(&["revision", "χ²", "χ²/dof", "rms", "NIS", "χ² falls by"], ladder.revisions.iter().map(row)))
+    let heading = ["revision", "χ²", "χ²/dof", "rms", "NIS", "χ² falls by"];
+    columns(&table(&heading, ladder.revisions.iter().map(row))) + &nees(ladder)
+}
+
+/// A column a solution, where truth is known.
+fn nees(ladder: &Ladder) -> String {
+    let solutions = distinct(ladder.revisions.iter().flat_map(|r| &r.nees).map(|n| n.solution.as_str()));
+    if solutions.is_empty() {
+        return String::new();
+    }
+    let heading = std::iter::once("NEES/dof").chain(solutions.iter().copied()).map(str::to_owned).collect();
+    let row = |rung: &Rung| {
+        let of = |solution: &&str| {
+            let found = rung.nees.iter().find(|n| n.solution == *solution);
+            found.map_or_else(|| "-".to_owned(), |n| format!("{:.2} ({})", n.per_dof, n.dof))
+        };
+        std::iter::once(rung.revision.clone()).chain(solutions.iter().map(of)).collect()
+    };
+    let rows: Vec<Vec<String>> = std::iter::once(heading).chain(ladder.revisions.iter().map(row)).collect();
+    format!("\n{}", columns(&rows))
 }
 
 fn figures(revision: &str, fit: &Fit, fall: Option<Fall>) -> Vec<String> {

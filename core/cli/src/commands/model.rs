@@ -12,6 +12,7 @@ use dragfree_engine::files::Problem;
 use dragfree_engine::registry::Found;
 use dragfree_engine::revisions::{self, Change, Committed, Edit, Log, Logged, Place, What};
 use dragfree_engine::validate::Subject;
+use dragfree_schema::Coefficient;
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -108,11 +109,14 @@ fn told(change: &Change) -> (&'static str, String) {
 
 fn add(command: &ModelAdd, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let mut comment = String::new();
+    let mut diagnosed = None;
     let mut entry = match (&command.from, &command.effect) {
         (Some(diagnosis), effect) => {
             let candidate = candidate(diagnosis, effect.as_deref(), command.rank)?;
             comment = evidence(&candidate);
-            proposed(diagnosis, &candidate)?
+            let entry = proposed(diagnosis, &candidate)?;
+            diagnosed = Some(candidate);
+            entry
         }
         (None, Some(effect)) => {
             let (id, instance) = split(effect);
@@ -126,12 +130,16 @@ fn add(command: &ModelAdd, global: &Global, paint: Paint) -> Result<Done, Failur
         entry.parameters.insert(name.clone(), parameter(manifest, name, value)?);
     }
     priors(&mut entry, command)?;
-    accepted(&found, &entry, command.mission.as_deref())?;
+    let coefficients = accepted(&found, &entry, command.mission.as_deref())?;
+    if let Some(candidate) = &diagnosed {
+        start_levels(&mut entry, &coefficients, candidate);
+    }
     change(&command.model, global, paint, |edit| edit.add(&entry, &comment))
 }
 
-/// Asks the effect itself whether it takes the parameters, and whether it has the coefficients that are given a prior.
-fn accepted(found: &Found, entry: &EffectEntry, mission: Option<&Path>) -> Result<(), Failure> {
+/// Asks the effect itself whether it takes the parameters, and whether it has the coefficients that are given a prior;
+/// gives its coefficients, as far as they can be known without telemetry.
+fn accepted(found: &Found, entry: &EffectEntry, mission: Option<&Path>) -> Result<Vec<Coefficient>, Failure> {
     let mission = super::validate::mission(mission)?;
     let subject = Subject {
         opened: &found.opened,
@@ -143,11 +151,29 @@ fn accepted(found: &Found, entry: &EffectEntry, mission: Option<&Path>) -> Resul
     let refused =
         |error| Failure::from(format!("{error}; tried with the mission {}, --mission names another", mission.name));
     entry.check_instance(&found.info.manifest, &mission).map_err(refused)?;
-    let names = subject.coefficients(&entry.instance).map_err(|finding| refused(finding.to_string()))?;
-    let Some(names) = names else { return Ok(()) };
-    match entry.prior.keys().find(|name| !names.contains(name)) {
+    let announced = subject.coefficients(&entry.instance).map_err(|finding| refused(finding.to_string()))?;
+    let Some(coefficients) = announced else { return Ok(Vec::new()) };
+    let names: Vec<&str> = coefficients.iter().map(short).collect();
+    match entry.prior.keys().find(|name| !names.contains(&name.as_str())) {
         Some(name) => Err(format!("{entry} has no coefficient `{name}`; it has {}", names.join(", ")).into()),
-        None => Ok(()),
+        None => Ok(coefficients),
+    }
+}
+
+/// `x` of `com-offset.tm1.x`.
+fn short(coefficient: &Coefficient) -> &str {
+    coefficient.name.rsplit('.').next().unwrap_or_default()
+}
+
+/// Levels of noise start at their diagnosed values, where the command line gives none: a recursive filter estimates no
+/// level and uses this one.
+fn start_levels(entry: &mut EffectEntry, coefficients: &[Coefficient], candidate: &Value) {
+    let all = candidate["coefficients"].as_array();
+    for c in coefficients.iter().filter(|c| !c.noise.is_empty()) {
+        let found = all.and_then(|all| all.iter().find(|found| found["name"] == c.name.as_str()));
+        let value = found.and_then(|found| found["value"].as_f64()).filter(|value| *value > 0.0);
+        let prior = entry.prior.entry(short(c).to_owned()).or_default();
+        prior.value = prior.value.or(value);
     }
 }
 

@@ -1,6 +1,6 @@
 //! Linking: every plugin of a pipeline made, asked for its columns, and routed, before a byte of data is read.
 
-use dragfree_schema::{Coefficient, Constraint, NoiseProcess, Settings};
+use dragfree_schema::{Coefficient, Constraint, NoiseLevels, NoiseProcess, Settings};
 use serde_json::{Map, Value, json};
 
 use super::{Carry, Chain, ChainError, ChainNode, Queue, Route};
@@ -111,6 +111,7 @@ impl Builder<'_> {
         }
         self.chain.constraints =
             constraints.into_iter().filter(|(c, contributed)| *contributed >= c.parts).map(|(c, _)| c).collect();
+        self.apply_noise_levels()?;
         for entry in &self.model.candidates {
             if let Err(reason) = self.candidate(entry) {
                 let name = format!("{}:{}", entry.id, entry.instance);
@@ -118,6 +119,14 @@ impl Builder<'_> {
             }
         }
         Ok(())
+    }
+
+    /// Levels of noise that effects of the model state enter the declared noise here, for every plugin and consumer
+    /// after the effects.
+    fn apply_noise_levels(&mut self) -> Result<(), ChainError> {
+        let levels = NoiseLevels::of(&self.chain.coefficients);
+        let applied = levels.apply(&mut self.chain.noise);
+        applied.map_err(|what| self.model_error(what))
     }
 
     /// An effect that is not in the model: what keeps it from being tried is no error of the run.

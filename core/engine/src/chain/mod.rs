@@ -145,7 +145,7 @@ pub struct Chain {
     pub coefficients: Vec<Coefficient>,
     /// Constraints on them.
     pub constraints: Vec<Constraint>,
-    /// Noise in the channels, as its stages declared it.
+    /// Noise in the channels, as its stages declared it, at the levels that the model states.
     pub noise: Vec<NoiseProcess>,
     /// Columns of the feed and of every plugin, in the order in which they are made.
     pub columns: Vec<Column>,

@@ -180,6 +180,21 @@ pub struct Model {
     pub parent: Option<String>,
     /// Its effects, each once, `com-offset`.
     pub effects: Vec<String>,
+    /// Levels of noise that its effects state.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub noise_levels: Vec<NoiseLevel>,
+}
+
+/// A level of noise with which a run began: the declared amplitude of a component times `value`. An estimate of it is
+/// among the coefficients.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct NoiseLevel {
+    /// `mps-noise.sc.y`
+    pub coefficient: String,
+    /// Component of the declared noise, `thruster_force:sc.y`.
+    pub component: String,
+    /// Amplitude over the declared one.
+    pub value: f64,
 }
 
 /// What the estimators found.

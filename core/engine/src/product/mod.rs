@@ -17,7 +17,7 @@ pub use archive::{Entry, Listing, ProductWriter, Written, find, list};
 pub use draft::Draft;
 pub use file::{
     Attachment, Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Loss, Model,
-    NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Supersedes, Variable, read,
+    NoiseLevel, NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Supersedes, Variable, read,
 };
 pub use json::to_json;
 

@@ -57,7 +57,12 @@ fn draft(value: f64) -> Draft {
             library_sha256: ZERO_DIGEST.into(),
             parameters_sha256: ZERO_DIGEST.into(),
         }],
-        model: Model { revision: "1".into(), parent: None, effects: vec!["com-offset".into()] },
+        model: Model {
+            revision: "1".into(),
+            parent: None,
+            effects: vec!["com-offset".into()],
+            noise_levels: Vec::new(),
+        },
         software: "0.1.0".into(),
         replay: Summary {
             time_scale: "UTC".into(),

@@ -116,16 +116,15 @@ impl Subject<'_> {
         }
     }
 
-    /// Short names of the coefficients that an instance of an effect announces, `x` of `com-offset.tm1.x`; none where
-    /// it finds no column to its liking among the made-up ones, which says nothing of a mission's own.
+    /// The coefficients that an instance of an effect announces; none where it finds no column to its liking among the
+    /// made-up ones, which says nothing of a mission's own.
     ///
     /// # Errors
     /// [`Finding`]: its parameters are not those it declares, or it refuses them.
-    pub fn coefficients(&self, instance: &str) -> Result<Option<Vec<String>>, Finding> {
+    pub fn coefficients(&self, instance: &str) -> Result<Option<Vec<Coefficient>>, Finding> {
         self.create(instance, false)?;
         let Ok((_, _, linked)) = self.linked(instance, false) else { return Ok(None) };
-        let short = |c: &Coefficient| c.name.rsplit('.').next().map(str::to_owned);
-        Ok(Some(linked.coefficients.iter().filter_map(short).collect()))
+        Ok(Some(linked.coefficients))
     }
 
     /// Runs `check` for each instance; a stage or a source has one.

@@ -103,6 +103,7 @@ impl Made<'_> {
                 revision: self.revision.into(),
                 parent: self.parent.map(str::to_owned),
                 effects: Vec::new(),
+                noise_levels: Vec::new(),
             },
             software: "0.1.0".into(),
             replay: dragfree_engine::feed::Summary { time_scale: "UTC".into(), ..Default::default() },
@@ -117,7 +118,8 @@ impl Made<'_> {
 
 fn of(fitted: &[Made<'_>], held_out: &[Made<'_>]) -> Result<Ladder, LadderError> {
     let products = |of: &[Made<'_>]| of.iter().map(Made::product).collect::<Vec<_>>();
-    ladder(&products(fitted), &products(held_out), &|name| (name == "com-offset.tm1.x").then_some(0.1))
+    let truth = |name: &str| (name == "com-offset.tm1.x").then_some(0.1);
+    ladder(&products(fitted), &products(held_out), &truth, &|_| None)
 }
 
 fn near(found: f64, wanted: f64) {
