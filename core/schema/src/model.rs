@@ -15,7 +15,7 @@ pub struct Model {
     pub coefficients: Vec<Coefficient>,
     /// Constraints on them.
     pub constraints: Vec<Constraint>,
-    /// Noise in the channels; the levels that the model's effects state are applied, see [`crate::NoiseLevels`].
+    /// Noise in the channels.
     pub noise: Vec<NoiseProcess>,
 }
 
@@ -72,8 +72,8 @@ pub struct Coefficient {
     /// Candidates: the courses that a cause of short duration may have, at a time that the host finds.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub transients: Vec<Transient>,
-    /// A component of declared noise whose amplitude the coefficient multiplies, 1 for the declared level; such a
-    /// coefficient has no responses. The host applies the initial value to the declared noise ([`crate::NoiseLevels`]).
+    /// A noise process whose amplitude the coefficient multiplies, 1 for the declared level; such a coefficient has no
+    /// responses.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub noise: String,
     /// A noise process that the coefficient filters.
