@@ -112,6 +112,16 @@ fn a_scale_or_a_gain_is_named_from_seven_hours_to_a_day() {
     }
 }
 
+/// Along z no interferometer shows how a test mass moves; the other test mass tells a scale of the readout from an
+/// electrode gain. A readout scale is named alone, in its place, and so is a delay of all capacitive readouts.
+#[test]
+fn errors_of_a_readout_without_interferometer_are_named_alone() {
+    let d = diagnosis(&["--hours", "12", "--seed", "202", "--effect", "is-scale:tm2.z=-0.1"]);
+    assert_eq!(named_alone(&d, -0.1), "is-scale:tm2.z");
+    let d = diagnosis(&["--hours", "12", "--seed", "213", "--effect", "time-offset:is=0.15"]);
+    assert_eq!(named_alone(&d, 0.15), "time-offset:is");
+}
+
 /// Eight hours have 3.5σ of the same scale, and the bound, corrected for all that is tried, is not reached: the halves
 /// must agree on it (false alarm 1e-3, the bound of a refusal) and its size be within 4σ, whatever the verdict.
 #[test]

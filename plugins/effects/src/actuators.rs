@@ -13,7 +13,7 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::common::{SC_AXES, axis_of, manifest};
+use crate::common::{SC_AXES, TM_YZ, axis_of, manifest};
 use crate::linear::{
     Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, accel_channel, attitude_channel, axis_pair,
     offset_coupling_terms, vector_terms,
@@ -50,13 +50,8 @@ fn electrode_terms(
 pub(crate) enum EsGain {}
 
 impl LinearEffect for EsGain {
-    const MANIFEST: Manifest = manifest(
-        "es-gain",
-        "Gain of the electrodes' force along an axis differs from one",
-        &[],
-        &["{test_mass}.y", "{test_mass}.z"],
-        &["commands"],
-    );
+    const MANIFEST: Manifest =
+        manifest("es-gain", "Gain of the electrodes' force along an axis differs from one", &[], TM_YZ, &["commands"]);
 
     fn coefficients(setup: &Setup, mission: &Mission, _: &Available) -> Result<Vec<CoefficientForms>, PluginError> {
         let (instance, axis) = (setup.instance(), axis_of(setup.instance()));

@@ -14,6 +14,8 @@ pub(crate) const TEST_MASSES: &[&str] = &["{test_mass}"];
 pub(crate) const SC_AXES: &[&str] = &["sc.x", "sc.y", "sc.z"];
 /// Instances of an effect on every axis of every test mass.
 pub(crate) const TM_AXES: &[&str] = &["{test_mass}.x", "{test_mass}.y", "{test_mass}.z"];
+/// Instances of an effect on the axes of every test mass that the inertial sensor reads.
+pub(crate) const TM_YZ: &[&str] = &["{test_mass}.y", "{test_mass}.z"];
 
 /// A manifest with this crate's version and licence.
 pub(crate) const fn manifest(

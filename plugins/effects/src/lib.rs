@@ -8,6 +8,7 @@ pub mod formula;
 pub mod lag;
 
 mod actuators;
+mod columns;
 mod common;
 mod correlation;
 mod electromagnetic;
@@ -15,6 +16,7 @@ mod geometry;
 mod impulse;
 mod linear;
 mod noise;
+mod prediction;
 mod readout;
 mod slosh;
 mod step_pulses;

@@ -8,133 +8,13 @@ use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::marker::PhantomData;
 
-use dragfree_physics::mission::{Mission, TestMass};
+use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix2, Vector3};
 
-use crate::common::{AXES, SeriesRef, axis_of, mission, tm_of};
-
-/// A test mass of the mission.
-#[derive(Clone, Debug)]
-pub(crate) struct Body {
-    pub(crate) name: String,
-    /// Name of its frame ORF.
-    pub(crate) frame: String,
-    pub(crate) section: TestMass,
-}
-
-impl Body {
-    /// All test masses of the mission, in the order of their names.
-    pub(crate) fn all(mission: &Mission) -> Vec<Self> {
-        let body = |(name, section): (&String, &TestMass)| Self {
-            name: name.clone(),
-            frame: mission.frame(name),
-            section: section.clone(),
-        };
-        mission.test_mass.iter().map(body).collect()
-    }
-
-    /// The test mass of an instance such as `NAME` or `NAME.x`.
-    ///
-    /// # Errors
-    /// The mission has no such test mass.
-    pub(crate) fn of(mission: &Mission, instance: &str, by: &'static str) -> Result<Self, PluginError> {
-        let name = tm_of(instance);
-        let section = mission.test_mass(name, by)?.clone();
-        Ok(Self { name: name.to_owned(), frame: mission.frame(name), section })
-    }
-}
-
-/// A column that an earlier stage writes.
-#[derive(Clone, Debug, PartialEq)]
-pub(crate) struct InputColumn {
-    pub(crate) name: String,
-    pub(crate) unit: &'static str,
-    pub(crate) frame: String,
-}
-
-impl InputColumn {
-    fn new(name: String, unit: &'static str, frame: impl Into<String>) -> Self {
-        Self { name, unit, frame: frame.into() }
-    }
-
-    /// Commanded force of the thrusters, mean over the sample, SRF, N.
-    pub(crate) fn thrust(axis: usize) -> Self {
-        Self::new(format!("used.mps_force_srf_n.{}", AXES[axis]), "N", "SRF")
-    }
-
-    /// Commanded torque of the thrusters, mean over the sample, SRF, N m.
-    pub(crate) fn torque(axis: usize) -> Self {
-        Self::new(format!("used.mps_torque_srf_nm.{}", AXES[axis]), "N m", "SRF")
-    }
-
-    /// Commanded force of the electrodes on a test mass, mean over the sample, ORF, N.
-    pub(crate) fn electrodes_force(tm: &Body, axis: usize) -> Self {
-        Self::new(format!("used.{}.force_orf_n.{}", tm.name, AXES[axis]), "N", &tm.frame)
-    }
-
-    /// Commanded torque of the electrodes on a test mass, mean over the sample, ORF, N m.
-    pub(crate) fn electrodes_torque(tm: &Body, axis: usize) -> Self {
-        Self::new(format!("used.{}.torque_orf_nm.{}", tm.name, AXES[axis]), "N m", &tm.frame)
-    }
-
-    /// Unit vector from the Sun, SRF.
-    pub(crate) fn sun(axis: usize) -> Self {
-        Self::new(format!("used.sun_srf.{}", AXES[axis]), "1", "SRF")
-    }
-
-    /// Known acceleration `û` of a test mass, ORF, m s⁻².
-    pub(crate) fn known_accel(tm: &Body, axis: usize) -> Self {
-        Self::new(format!("{}.u_orf_m_s2.{}", tm.name, AXES[axis]), "m s-2", &tm.frame)
-    }
-
-    /// Acceleration channel of a test mass, ORF, m s⁻².
-    pub(crate) fn channel(tm: &Body, axis: usize) -> Self {
-        Self::new(accel_channel(tm, axis), "m s-2", &tm.frame)
-    }
-
-    /// Best readout of a test mass's displacement, ORF, m.
-    pub(crate) fn displacement(tm: &Body, axis: usize) -> Self {
-        Self::new(format!("{}.r_orf_m.{}", tm.name, AXES[axis]), "m", &tm.frame)
-    }
-
-    /// Estimate `α̂` of the spacecraft's angular acceleration, SRF, rad s⁻².
-    pub(crate) fn alpha(axis: usize) -> Self {
-        Self::new(format!("sc.alpha_srf_rad_s2.{}", AXES[axis]), "rad s-2", "SRF")
-    }
-
-    /// Derivative `∂α̂_j/∂g_i`, SRF, rad s⁻²; the torque about axis `i` is `1 + g_i` times the commanded one.
-    pub(crate) fn alpha_by_torque_gain(i: usize, j: usize) -> Self {
-        let name = format!("response.alpha_srf_rad_s2.by_torque_gain.{}.{}", AXES[i], AXES[j]);
-        Self::new(name, "rad s-2", "SRF")
-    }
-
-    /// Derivative `∂û_row/∂g_i` of a test mass, ORF, m s⁻²; written only for thrusters with a layout.
-    pub(crate) fn known_accel_by_torque_gain(i: usize, tm: &Body, row: usize) -> Self {
-        let name = format!("response.u_orf_m_s2.by_torque_gain.{}.{}.{}", AXES[i], tm.name, AXES[row]);
-        Self::new(name, "m s-2", &tm.frame)
-    }
-
-    /// Derivative `∂α̂_j/∂τ`, SRF, rad s⁻³, for a delay `τ` of the attitude readout.
-    pub(crate) fn alpha_by_dws_delay(j: usize) -> Self {
-        Self::new(format!("response.alpha_srf_rad_s2.by_dws_delay.{}", AXES[j]), "rad s-3", "SRF")
-    }
-
-    /// Angle of a test mass by differential wavefront sensing, ORF, rad.
-    pub(crate) fn angle_by_dws(tm: &Body, angle: &str) -> Self {
-        Self::new(format!("dws.{}.{angle}_orf_rad", tm.name), "rad", &tm.frame)
-    }
-
-    /// Angle of a test mass by the capacitive readout, ORF, rad.
-    pub(crate) fn angle_by_is(tm: &Body, angle: &str) -> Self {
-        Self::new(format!("is.{}.att_orf_rad.{angle}", tm.name), "rad", &tm.frame)
-    }
-
-    /// An available column, with the unit that the effect expects.
-    pub(crate) fn of(column: &Column, unit: &'static str) -> Self {
-        Self::new(column.name.clone(), unit, &column.frame)
-    }
-}
+pub(crate) use crate::columns::{Body, InputColumn, accel_channel, latest_column};
+use crate::common::{AXES, SeriesRef, axis_of, mission};
+use crate::prediction::{PredictedAcceleration, Predictor};
 
 /// A slowly varying factor of a column.
 #[derive(Clone, Debug, PartialEq)]
@@ -157,8 +37,12 @@ pub(crate) enum Series {
     /// `(3 z_k − z_{k−1})/2` of a channel, NaN at the first sample after a gap. A channel is a mean over two samples
     /// already; this extrapolation undoes the estimators' second averaging up to a second difference.
     Newer(InputColumn),
+    /// Backward difference of [`Self::Newer`] over Δt, with its unit; NaN at the first two samples after a gap.
+    NewerSlope(InputColumn, &'static str),
     /// The column times a [`Multiplier`], with the unit of the product.
     Times(InputColumn, Multiplier, &'static str),
+    /// Second difference of a predicted displacement.
+    Predicted(Box<PredictedAcceleration>),
 }
 
 impl Series {
@@ -169,6 +53,8 @@ impl Series {
             Self::Slope(source, _) => format!("slope({})", source.name),
             Self::Held(source) => format!("held({})", source.name),
             Self::Newer(source) => format!("newer({})", source.name),
+            Self::NewerSlope(source, _) => format!("slope(newer({}))", source.name),
+            Self::Predicted(series) => series.name.clone(),
             Self::Times(source, Multiplier::Time(None), _) => format!("{}*elapsed_s", source.name),
             Self::Times(source, Multiplier::Time(Some(ns)), _) => format!("{}*seconds_since_{ns}_ns", source.name),
             Self::Times(source, Multiplier::Growth { column, lost }, _) => {
@@ -183,14 +69,17 @@ impl Series {
             | Self::Slope(source, _)
             | Self::Held(source)
             | Self::Newer(source)
+            | Self::NewerSlope(source, _)
             | Self::Times(source, _, _) => source,
+            Self::Predicted(series) => &series.axes[0].readout,
         }
     }
 
     fn unit(&self) -> &'static str {
         match self {
             Self::Column(source) | Self::Held(source) | Self::Newer(source) => source.unit,
-            Self::Slope(_, unit) | Self::Times(_, _, unit) => unit,
+            Self::Slope(_, unit) | Self::NewerSlope(_, unit) | Self::Times(_, _, unit) => unit,
+            Self::Predicted(_) => "m s-2",
         }
     }
 }
@@ -245,17 +134,6 @@ impl CoefficientForms {
     pub(crate) fn named(name: &'static str, unit: &str, range: [f64; 2], terms: Vec<Term>) -> Self {
         Self { name, forms: vec![Form::new(Shape::new(), unit, range, terms)] }
     }
-}
-
-/// The column of this name that was written last, e.g. the reconstruction's `NAME.r_orf_m.y` rather than the raw
-/// topic's.
-pub(crate) fn latest_column<'a>(available: &'a Available, name: &str) -> Option<&'a Column> {
-    available.columns.iter().rev().find(|c| c.name == name)
-}
-
-/// Name of an acceleration channel, `NAME.accel.x`, m s⁻².
-pub(crate) fn accel_channel(tm: &Body, axis: usize) -> String {
-    format!("{}.accel.{}", tm.name, AXES[axis])
 }
 
 /// Name of an attitude channel, `sc.alpha.x`, rad s⁻².
@@ -413,6 +291,16 @@ pub(crate) struct Linear<E> {
     setup: Setup,
     mission: Mission,
     computed: Vec<ComputedSeries>,
+    predicted: Vec<PredictedSeries>,
+}
+
+/// A predicted acceleration computed by this effect.
+#[derive(Debug)]
+struct PredictedSeries {
+    predictor: Predictor,
+    readouts: Vec<In>,
+    known: Vec<Vec<(In, f64)>>,
+    out: Out,
 }
 
 /// A series computed by this effect.
@@ -430,6 +318,8 @@ struct SeriesState {
     operation: Operation,
     /// Previous value, or the first value of a multiplier.
     value: f64,
+    /// The value before that one.
+    before: f64,
     /// Time of the previous row, or the origin of elapsed time, Unix ns.
     time_ns: Option<i64>,
 }
@@ -438,6 +328,7 @@ struct SeriesState {
 enum Operation {
     Slope,
     Newer,
+    NewerSlope,
     Hold,
     /// Product with the seconds since `time_ns`.
     Elapsed,
@@ -451,12 +342,16 @@ impl SeriesState {
     /// Value of the next sample, from the column's value `a` at `now`, Unix ns, and the multiplier's.
     fn next(&mut self, now: i64, a: f64, multiplier: f64, dt_s: f64) -> f64 {
         match self.operation {
-            Operation::Slope | Operation::Newer => {
+            Operation::Slope | Operation::Newer | Operation::NewerSlope => {
                 // Undefined across a gap.
                 let follows = self.time_ns.is_some_and(|t| ((now - t) as f64 * 1e-9 - dt_s).abs() < 0.5 * dt_s);
-                let before = if follows { self.value } else { f64::NAN };
-                (self.time_ns, self.value) = (Some(now), a);
-                if matches!(self.operation, Operation::Newer) { 1.5 * a - 0.5 * before } else { (a - before) / dt_s }
+                let [before, second] = if follows { [self.value, self.before] } else { [f64::NAN; 2] };
+                (self.time_ns, self.value, self.before) = (Some(now), a, before);
+                match self.operation {
+                    Operation::Newer => 1.5 * a - 0.5 * before,
+                    Operation::NewerSlope => (1.5 * (a - before) - 0.5 * (before - second)) / dt_s,
+                    _ => (a - before) / dt_s,
+                }
             }
             Operation::Hold => {
                 if a.is_finite() {
@@ -496,6 +391,18 @@ impl<E: LinearEffect> Linear<E> {
             link.read(&want.unit(source.unit).frame(&source.frame))
         };
         let name = series.name();
+        if let Series::Predicted(wanted) = series {
+            let (table, out) = link.shared_series(available, &name, series.unit(), &series.source().frame)?;
+            let Some(out) = out else { return Ok((table, name)) };
+            let (mut readouts, mut known) = (Vec::new(), Vec::new());
+            for axis in &wanted.axes {
+                readouts.push(read(&axis.readout, link)?);
+                let column = |(source, factor): &(InputColumn, f64)| Ok((read(source, link)?, *factor));
+                known.push(axis.known.iter().map(column).collect::<Result<_, PluginError>>()?);
+            }
+            self.predicted.push(PredictedSeries { predictor: Predictor::new(wanted), readouts, known, out });
+            return Ok((table, name));
+        }
         let input = read(series.source(), link)?;
         if let Series::Column(source) = series {
             let table = latest_column(available, &source.name).map(|c| c.table.clone()).unwrap_or_default();
@@ -504,16 +411,17 @@ impl<E: LinearEffect> Linear<E> {
         let (table, out) = link.shared_series(available, &name, series.unit(), &series.source().frame)?;
         let Some(out) = out else { return Ok((table, name)) };
         let (operation, time_ns, multiplier) = match series {
-            Series::Column(_) | Series::Held(_) => (Operation::Hold, None, None),
+            Series::Column(_) | Series::Held(_) | Series::Predicted(_) => (Operation::Hold, None, None),
             Series::Slope(..) => (Operation::Slope, None, None),
             Series::Newer(_) => (Operation::Newer, None, None),
+            Series::NewerSlope(..) => (Operation::NewerSlope, None, None),
             Series::Times(_, Multiplier::Time(since), _) => (Operation::Elapsed, *since, None),
             Series::Times(_, Multiplier::Growth { column, lost }, _) => {
                 (Operation::Growth { sign: if *lost { -1.0 } else { 1.0 } }, None, Some(read(column, link)?))
             }
         };
         self.computed.push(ComputedSeries {
-            state: SeriesState { operation, value: f64::NAN, time_ns },
+            state: SeriesState { operation, value: f64::NAN, before: f64::NAN, time_ns },
             input,
             multiplier,
             out,
@@ -542,7 +450,11 @@ impl<E: LinearEffect> Linear<E> {
             "{} acts on {}, but no earlier stage writes any of them; put hinf-dfacs before the effects in the pipeline, or remove \
              the effect from the model",
             self.name(),
-            if names.is_empty() { "the readouts of an interferometer".to_owned() } else { names.join(", ") }
+            if names.is_empty() {
+                "the readouts of an instrument that is not there".to_owned()
+            } else {
+                names.join(", ")
+            }
         )))
     }
 }
@@ -551,7 +463,13 @@ impl<E: LinearEffect> Effect for Linear<E> {
     const MANIFEST: Manifest = E::MANIFEST;
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self { effect: PhantomData, setup: setup.clone(), mission: mission(setup)?, computed: Vec::new() })
+        Ok(Self {
+            effect: PhantomData,
+            setup: setup.clone(),
+            mission: mission(setup)?,
+            computed: Vec::new(),
+            predicted: Vec::new(),
+        })
     }
 
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
@@ -614,15 +532,34 @@ impl<E: LinearEffect> Effect for Linear<E> {
                 out.push(series.state.next(*now, *a, *multiplier, dt_s));
             }
         }
+        for series in &mut self.predicted {
+            let axes = series.readouts.len();
+            let (mut readout_m, mut known_m_s2) = (vec![0.0; axes], vec![0.0; axes]);
+            let readouts: Vec<&[f64]> = series.readouts.iter().map(|column| input.f64(*column)).collect();
+            let known: Vec<Vec<(&[f64], f64)>> = series
+                .known
+                .iter()
+                .map(|columns| columns.iter().map(|(column, factor)| (input.f64(*column), *factor)).collect())
+                .collect();
+            let out = output.f64(series.out);
+            for (row, now) in input.time_ns().iter().enumerate() {
+                for axis in 0..axes {
+                    readout_m[axis] = readouts[axis][row];
+                    known_m_s2[axis] = known[axis].iter().map(|(column, factor)| column[row] * factor).sum();
+                }
+                out.push(series.predictor.next(*now, &readout_m, &known_m_s2));
+            }
+        }
         Ok(())
     }
 
     fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
         for series in &mut self.computed {
             state.f64(&mut series.state.value)?;
+            state.f64(&mut series.state.before)?;
             state.option(&mut series.state.time_ns, State::i64)?;
         }
-        Ok(())
+        self.predicted.iter_mut().try_for_each(|series| series.predictor.save_or_load(state))
     }
 }
 
@@ -634,7 +571,7 @@ mod tests {
 
     /// Values at samples of 0.1 s from rows (index, value, multiplier).
     fn computed_values(operation: Operation, since_ns: Option<i64>, rows: &[(i64, f64, f64)]) -> Vec<f64> {
-        let mut state = SeriesState { operation, value: NAN, time_ns: since_ns };
+        let mut state = SeriesState { operation, value: NAN, before: NAN, time_ns: since_ns };
         rows.iter().map(|(k, a, multiplier)| state.next(1_000 + k * 100_000_000, *a, *multiplier, 0.1)).collect()
     }
 

@@ -2,16 +2,18 @@
 //!
 //! A readout error `δ(t)` adds its second difference to the channel. A regressor formed from the same readout would be
 //! correlated with its noise (errors in variables), so regressors use the estimated acceleration `û + Φ b + d` instead;
-//! Methods, "Acceleration of a test mass".
+//! Methods, "Acceleration of a test mass". Along s_3, where `d` is unobservable, they use what the past predicts of it;
+//! Methods, "Readout errors normal to the optical plane".
 
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 
-use crate::common::{TEST_MASSES, axis_of, manifest};
+use crate::common::{TEST_MASSES, TM_YZ, axis_of, manifest};
 use crate::linear::{
     Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, TmAcceleration, accel_channel, attitude_channel,
     axis_pair, latest_column, offset_coupling_terms, offset_terms, tm_acceleration,
 };
+use crate::prediction::Normal;
 
 const SCALE: [f64; 2] = [-0.2, 0.2];
 const LEVER_M: [f64; 2] = [-5e-3, 5e-3];
@@ -29,6 +31,11 @@ fn second_difference_terms(
     (from, to): (usize, usize),
 ) -> Result<Vec<Term>, PluginError> {
     let tm = &Body::of(mission, instance, by)?;
+    if from == 2 {
+        let normal = Normal::of(available, mission, by)?;
+        let series = normal.predicted(normal.place(tm, by)?, by)?;
+        return Ok(vec![Term::new(accel_channel(tm, to), Series::Predicted(Box::new(series)), 1.0)]);
+    }
     let Some(TmAcceleration { modelled, unmodelled }) = tm_acceleration(available, mission, tm, from) else {
         return Err(PluginError::error(format!(
             "{by}: the acceleration of a test mass is observable only with the interferometers of both test masses; give \
@@ -44,9 +51,12 @@ fn second_difference_terms(
 /// `z = s r̈ = s (û + Φ b + d)` along the axis; s: 1, ±0.2. Products of `s` with other coefficients are of second
 /// order. Confounders: gains of actuators along the axis, above all `es-gain`.
 ///
-/// **Limits.** x is read by the interferometer, so its capacitive scale is unobservable, and `d` is unobservable along
-/// z. `d` is in the regressor and in the channel; only an estimator that models it as common to both test masses is
-/// unbiased.
+/// * Along y, `d` is in the regressor and in the channel; only an estimator that models it as common to both test
+///   masses is unbiased.
+/// * Along z, `d` is unobservable; the regressor is the second difference of the displacement that past readouts of all
+///   test masses predict.
+///
+/// **Limit.** x is read by the interferometer, so its capacitive scale is unobservable.
 pub(crate) enum IsScale {}
 
 impl LinearEffect for IsScale {
@@ -54,7 +64,7 @@ impl LinearEffect for IsScale {
         "is-scale",
         "Scale of the capacitive readout along an axis differs from one",
         &[],
-        &["{test_mass}.y"],
+        TM_YZ,
         &["commands"],
     );
 
@@ -71,8 +81,9 @@ impl LinearEffect for IsScale {
 
 /// `is-crosstalk`: in instance `NAME.y-z`, `k` times the displacement along y appears in the readout of z.
 ///
-/// `z_to = k r̈_from = k (û + Φ b + d)_from`; k: 1, ±0.2. No instance ends in x, which the interferometer reads, or
-/// starts in z, where `d` is unobservable.
+/// `z_to = k r̈_from = k (û + Φ b + d)_from`; k: 1, ±0.2. From z, where `d` is unobservable, the regressor is made of
+/// the predicted displacement. No instance ends in x, which the interferometer reads. Confounders: `es-crosstalk` of
+/// the same axes.
 pub(crate) enum IsCrosstalk {}
 
 impl LinearEffect for IsCrosstalk {
@@ -80,7 +91,7 @@ impl LinearEffect for IsCrosstalk {
         "is-crosstalk",
         "Part of the displacement along one axis appears in the capacitive readout of another",
         &[],
-        &["{test_mass}.x-y", "{test_mass}.x-z", "{test_mass}.y-z"],
+        &["{test_mass}.x-y", "{test_mass}.x-z", "{test_mass}.y-z", "{test_mass}.z-y"],
         &["commands"],
     );
 
@@ -149,8 +160,8 @@ impl LinearEffect for TiltToLength {
 ///   as common with y, which is on time, is unbiased.
 /// * `dws` acts on the attitude channels with `a = J_S⁻¹ M_T`, and on the test masses through `α̂`, which is late by
 ///   `τ ∂α̂/∂τ`: they show `+τ [T ∂α̂/∂τ ×] b`.
-///
-/// No instance for the capacitive readout: its delay is unobservable beside the unmodelled acceleration.
+/// * `is` acts on all axes that the inertial sensor reads. Beside an interferometer, `d` in the optical plane is on
+///   time and `a = û + Φ b + d`. Otherwise all readouts of `d` are late alike, which does not show, and `a = û + Φ b`.
 ///
 /// Confounders: a delay of the actuators, which `[thrusters]` of the mission file states; gains at high frequency.
 pub(crate) enum TimeOffset {}
@@ -160,7 +171,7 @@ impl LinearEffect for TimeOffset {
         "time-offset",
         "An instrument reports its state with a delay",
         &[],
-        &["ifo", "dws"],
+        &["ifo", "dws", "is"],
         &["commands", "dws-delay-response"],
     );
 
@@ -185,7 +196,7 @@ impl LinearEffect for TimeOffset {
         for (tm, axis) in bodies.iter().flat_map(|tm| (0..3).map(move |axis| (tm, axis))) {
             let column = latest_column(available, &InputColumn::displacement(tm, axis).name);
             let reads = column.map_or("", |c| c.attribute("noise"));
-            if !reads.starts_with("ifo") {
+            if !reads.starts_with(setup.instance()) {
                 continue;
             }
             terms.push(Term::new(
@@ -196,6 +207,19 @@ impl LinearEffect for TimeOffset {
             for (column, times) in offset_terms(available, tm, axis) {
                 let series = Series::Slope(column, "s-3");
                 terms.push(Term { channel: accel_channel(tm, axis), series, factor: -1.0, times: Some(times) });
+            }
+            if setup.instance() != "is" {
+                continue;
+            }
+            for (series, factor, times) in
+                tm_acceleration(available, mission, tm, axis).map(|a| a.unmodelled).into_iter().flatten()
+            {
+                let series = match series {
+                    Series::Newer(column) => Series::NewerSlope(column, "m s-3"),
+                    Series::Column(column) => Series::Slope(column, "rad s-3"),
+                    other => other,
+                };
+                terms.push(Term { channel: accel_channel(tm, axis), series, factor: -factor, times });
             }
         }
         Ok(CoefficientForms::only("s", DELAY_S, terms))
@@ -238,6 +262,38 @@ mod tests {
         }
     }
 
+    /// Along z a prediction of all test masses takes the place of `d`; no interferometer is needed, but the noise of
+    /// thrusters and readouts is.
+    #[test]
+    fn along_z_the_displacement_is_predicted() {
+        let mut test_spacecraft = TestSpacecraft::new();
+        let error = IsScale::coefficients(&setup("tm2.z", ""), &test_spacecraft.mission, &test_spacecraft.available())
+            .unwrap_err();
+        assert!(error.message().contains("noise.thruster_force"), "{}", error.message());
+        test_spacecraft.mission = with_noise(&test_spacecraft.mission);
+        let mut available = test_spacecraft.available();
+        for column in available.columns.iter_mut().filter(|c| c.attribute("noise") == "ifo_x") {
+            column.attributes.insert("noise".to_owned(), "is_x".to_owned());
+        }
+        let terms = |of: Vec<CoefficientForms>| -> Vec<(String, String, f64)> {
+            let all = of[0].forms[0].terms.iter();
+            all.map(|t| (t.channel.clone(), t.series.name(), t.factor)).collect()
+        };
+        let scale = IsScale::coefficients(&setup("tm2.z", ""), &test_spacecraft.mission, &available).unwrap();
+        let predicted = |channel: &str| vec![(channel.to_owned(), "predicted(tm2.accel.z)".to_owned(), 1.0)];
+        assert_eq!(terms(scale), predicted("tm2.accel.z"));
+        let mixed = IsCrosstalk::coefficients(&setup("tm2.z-y", ""), &test_spacecraft.mission, &available).unwrap();
+        assert_eq!(terms(mixed), predicted("tm2.accel.y"));
+    }
+
+    fn with_noise(mission: &Mission) -> Mission {
+        let mut mission = mission.clone();
+        let taiji: serde_json::Value =
+            toml::from_str(include_str!("../../../fixtures/missions/taiji.toml")).expect("the fixture is TOML");
+        mission.noise = Mission::from_json(&taiji.to_string()).expect("the fixture is a mission").noise;
+        mission
+    }
+
     #[test]
     fn readout_effects_need_the_interferometers() {
         let test_spacecraft = TestSpacecraft::new();
@@ -276,6 +332,9 @@ mod tests {
             }
         };
         TestSpacecraft::new().assert_matches_derivative::<TimeOffset>("ifo", "", &[&late(&[0, 3])]);
+        // An unmodelled force in the optical plane is on time in the interferometers.
+        let test_spacecraft = TestSpacecraft { unknown_force_srf_n: UNKNOWN_FORCE_SRF_N, ..TestSpacecraft::new() };
+        test_spacecraft.assert_matches_derivative::<TimeOffset>("is", "", &[&late(&[1, 2, 4, 5])]);
         let smoother_gain = Matrix3::new(0.7, 0.1, -0.2, 0.1, 0.4, 0.05, -0.1, 0.2, 0.9);
         let test_spacecraft = TestSpacecraft { smoother_gain, only_torque_varies: true, ..TestSpacecraft::new() };
         test_spacecraft.assert_matches_derivative::<TimeOffset>("dws", "", &[&late(&[6, 7, 8])]);
