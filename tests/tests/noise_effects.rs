@@ -113,9 +113,10 @@ fn ladder(folder: &Path, products: &[&Value], more: &[&str]) -> Vec<Value> {
 const NEES_BOUNDS: (f64, f64) = (3.555, 49.190);
 
 /// Capacitive readouts three times as loud as declared. Without the levels the recursive filter stretches all of its σ
-/// by what the readouts show, and its NEES is too small; with them NIS and χ² are right at the rate of [`SIGMAS`], and
-/// the NEES is no longer outside bounds of a false-alarm rate of 2e-4, though below its mean: the filter stays cautious. A mission file that declares the same noise makes the same Σ: its
-/// rung is as much better than the first as that of the levels, though it has another name.
+/// by what the readouts show, and its NEES is too small. With them NIS and χ² are right at the rate of [`SIGMAS`], and
+/// the NEES lies inside bounds of a false-alarm rate of 2e-4, though below its mean: the filter stays cautious. A
+/// mission file that declares the same noise makes the same Σ: its rung is as much better than the first as that of the
+/// levels, though it has another name.
 #[test]
 fn levels_of_readouts_make_errors_consistent() {
     let instances = ["tm1.y", "tm1.z", "tm2.y", "tm2.z"];

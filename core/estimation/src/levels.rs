@@ -204,8 +204,8 @@ impl<'a> Levels<'a> {
         }
     }
 
-    /// The amplitudes of some processes that fit best together, over the declared ones, and takes them over. Their σ are
-    /// those of the inverse information, `4 Σ n tr(Σ⁻¹P_l Σ⁻¹P_m)` for logarithms of amplitudes. Processes that the
+    /// The amplitudes of some processes that fit best together, over the declared ones, and takes them over. Their σ
+    /// are those of the inverse information, `4 Σ n tr(Σ⁻¹P_l Σ⁻¹P_m)` for logarithms of amplitudes. Processes that the
     /// channels do not have are left out.
     pub fn fit_jointly(&mut self, names: &[&str]) -> Vec<Level> {
         let there: Vec<&'a str> = self.processes.keys().copied().filter(|name| names.contains(name)).collect();

@@ -11,8 +11,7 @@ use dragfree_engine::files::IoContext as _;
 use dragfree_engine::files::Problem;
 use dragfree_engine::registry::Found;
 use dragfree_engine::revisions::{self, Change, Committed, Edit, Log, Logged, Place, What};
-use dragfree_engine::validate::Subject;
-use dragfree_schema::Coefficient;
+use dragfree_engine::validate::{Coefficient, Subject};
 use serde_json::{Value, json};
 use std::path::Path;
 

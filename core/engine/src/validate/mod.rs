@@ -7,7 +7,8 @@
 mod session;
 mod stand;
 
-use dragfree_schema::{Coefficient, ParameterType};
+pub use dragfree_schema::Coefficient;
+use dragfree_schema::ParameterType;
 use serde::Serialize;
 use serde_json::{Value, json};
 use std::path::PathBuf;
