@@ -86,9 +86,8 @@ pub fn estimate_with_levels(
 /// `Σ 2n log det Σ` over the bands of the sums, n complex observations a band: with χ² it is `−2 log` of the likelihood
 /// up to a constant of the data. `None` where a Σ is singular.
 pub fn log_determinant(noise: &BandNoise<'_>, spectra: &Spectra) -> Option<f64> {
-    let weights = spectra.kept().into_iter().zip(&spectra.expected).map(|(kept, expected)| kept * expected);
     let of = |sigma: &DMatrix<f64>| Some(2.0 * Cholesky::new(sigma.clone())?.l().diagonal().map(f64::ln).sum());
-    noise.mean.iter().zip(weights).filter(|(_, n)| *n > 0.0).map(|(sigma, n)| Some(n * of(sigma)?)).sum()
+    noise.mean.iter().zip(spectra.counted()).filter(|(_, n)| *n > 0.0).map(|(sigma, n)| Some(n * of(sigma)?)).sum()
 }
 
 #[cfg(test)]

@@ -307,6 +307,11 @@ impl Spectra {
         bands.for_each(|b| self.weight_squared[b] += 2.0 * cross * taper.part[b]);
     }
 
+    /// What χ² with the declared Σ counts per band and channel: the observations expected, times the part that is kept.
+    pub fn counted(&self) -> impl Iterator<Item = f64> {
+        self.kept().into_iter().zip(&self.expected).map(|(kept, expected)| kept * expected)
+    }
+
     /// Per band `Σg/Σg²`: sums times this are information, their inverse a covariance. One Hann segment keeps 0.514 of
     /// the information of its samples, segments that overlap by half 0.947. Zero where no segment reaches.
     pub fn kept(&self) -> Vec<f64> {

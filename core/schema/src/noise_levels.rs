@@ -27,19 +27,9 @@ impl NoiseLevels {
         Self { levels }
     }
 
-    /// Whether no level is stated.
-    pub fn is_empty(&self) -> bool {
-        self.levels.is_empty()
-    }
-
     /// Amplitude of a component over the declared one, 1 where none is stated.
     pub fn amplitude(&self, component: &str) -> f64 {
         self.levels.get(component).map_or(1.0, |(_, amplitude)| *amplitude)
-    }
-
-    /// Components whose level is stated, with their amplitudes.
-    pub fn iter(&self) -> impl Iterator<Item = (&str, f64)> {
-        self.levels.iter().map(|(component, (_, amplitude))| (component.as_str(), *amplitude))
     }
 
     /// The levels that undo these.

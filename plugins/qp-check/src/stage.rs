@@ -256,8 +256,7 @@ impl Linked {
             report.quality.extend(ratio.map(|ratio| (LOG_DETERMINANT.to_owned(), json!(ratio))));
         }
         // What χ² with the declared Σ is a sum over: the same for every model of the same data, which `dof` is not.
-        let weights = sums.total.kept().into_iter().zip(&sums.total.expected).map(|(kept, expected)| kept * expected);
-        let observations = weights.sum::<f64>() * self.layout.channels.len() as f64;
+        let observations = sums.total.counted().sum::<f64>() * self.layout.channels.len() as f64;
         report.quality.insert("observations".to_owned(), json!(observations));
         self.describe(&solution, &levels, earlier, &mut report);
         self.attach(&solution, &stored, &mut report);

@@ -91,8 +91,7 @@ pub fn declared_log_determinant(written: &Written) -> Option<f64> {
     });
     NoiseLevels::of(&stated.collect::<Vec<_>>()).inverse().apply(&mut noise).ok()?;
     let model = NoiseModel::new(&noise, &layout.channels, 1.0 / plan.rate_hz).ok()?;
-    let weights = sums.total.kept().into_iter().zip(&sums.total.expected).map(|(kept, expected)| kept * expected);
-    let there = weights.sum::<f64>() * layout.channels.len() as f64;
+    let there = sums.total.counted().sum::<f64>() * layout.channels.len() as f64;
     let whole = super::float(super::weighed(&written.product)?, "observations");
     let complete = (there - whole).abs() <= 1e-9 * whole;
     complete.then(|| log_determinant(&BandNoise::new(&model, &plan), &sums.total)).flatten()
