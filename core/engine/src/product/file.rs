@@ -356,24 +356,31 @@ impl Product {
     /// Its bytes are the document as JSON without white space, keys sorted, missing numbers `null`; left out are the
     /// creation date, the id and revision, what it supersedes and the digest itself. The same inputs, plugins,
     /// parameters and model therefore give the same digest, whenever and how often they are run.
+    ///
+    /// Thresholds count as they stand in the file: another version may have others.
     pub fn digest(&self) -> String {
+        self.digest_beside(self.document().get_mut("settings").map(serde_json::Value::take))
+    }
+
+    /// The digest with these thresholds.
+    fn digest_beside(&self, settings: Option<serde_json::Value>) -> String {
         let mut computed = self.clone();
         computed.supersedes = None;
         computed.header.global_attributes.id.clear();
         computed.header.global_attributes.date_created.clear();
         computed.header.non_standard_attributes.revision = 0;
         computed.header.non_standard_attributes.sha256.clear();
-        sha256(computed.canonical())
+        let mut document = computed.document();
+        match (settings, document.as_object_mut()) {
+            (Some(settings), Some(document)) => document.insert("settings".to_owned(), settings),
+            (None, Some(document)) => document.remove("settings"),
+            (_, None) => None,
+        };
+        sha256(canonical(document))
     }
 
-    /// The whole document as JSON without white space, keys sorted.
-    pub(super) fn canonical(&self) -> Vec<u8> {
-        let mut document = self.document();
-        document.sort_all_objects();
-        document.to_string().into_bytes()
-    }
-
-    fn document(&self) -> serde_json::Value {
+    /// The whole document.
+    pub(super) fn document(&self) -> serde_json::Value {
         serde_json::to_value(self).expect("every key of a product is a string")
     }
 
@@ -383,6 +390,12 @@ impl Product {
         let table = toml::Table::try_from(self);
         Ok(emit(&table.map_err(|source| ProductError::Emit { id: self.id().to_owned(), source })?))
     }
+}
+
+/// A document as JSON without white space, keys sorted.
+fn canonical(mut document: serde_json::Value) -> Vec<u8> {
+    document.sort_all_objects();
+    document.to_string().into_bytes()
 }
 
 /// Reads a product and checks its format version, schema, name and digest.
@@ -412,10 +425,11 @@ pub(super) fn parse(text: &str, path: &Path) -> Result<Product, ProductError> {
         return Err(ProductError::Format { path: path.to_owned(), found: found.to_owned() });
     }
     let name = path.file_stem().unwrap_or_default().to_string_lossy();
-    check(&name, &serde_json::to_value(&document).expect("every key of TOML is a string"))?;
+    let mut stored = serde_json::to_value(&document).expect("every key of TOML is a string");
+    check(&name, &stored)?;
     let product: Product = document.try_into().map_err(table)?;
     let written = &product.header.non_standard_attributes.sha256;
-    let found = product.digest();
+    let found = product.digest_beside(stored.get_mut("settings").map(serde_json::Value::take));
     if found != *written {
         let reason = format!("its digest is {found}, the file says {written}");
         return Err(ProductError::Damaged { path: path.to_owned(), reason });

@@ -1,7 +1,7 @@
 use super::*;
 use crate::feed::Summary;
 use chrono::{DateTime, Utc};
-use dragfree_schema::Report;
+use dragfree_schema::{Report, Settings};
 use proptest::prelude::*;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -194,6 +194,32 @@ fn the_digest_knows_the_result_and_not_the_clock() {
     let mut other_plugin = draft(0.0909);
     other_plugin.history[0].version = "0.1.1".into();
     assert_ne!(first, digest(&other_plugin));
+}
+
+/// A product of a version with a threshold that is gone and without one that is new has the digest of its own text.
+#[test]
+fn thresholds_of_other_versions_are_no_damage() {
+    let folder = tempfile::tempdir().expect("folder");
+    let Written { product, path } = write(folder.path(), &draft(0.0909));
+    let text = std::fs::read_to_string(&path).expect("read");
+    let mut document = serde_json::to_value(&product).expect("document");
+    let settings = document["settings"].as_object_mut().expect("thresholds");
+    settings.insert("gone".to_owned(), json!(3.5));
+    settings.remove("false_alarm").expect("a threshold");
+    document["header"]["global_attributes"]["id"] = json!("");
+    document["header"]["global_attributes"]["date_created"] = json!("");
+    document["header"]["non_standard_attributes"]["revision"] = json!(0);
+    document["header"]["non_standard_attributes"]["sha256"] = json!("");
+    document.sort_all_objects();
+    let digest = crate::files::sha256(document.to_string().into_bytes());
+    let without: Vec<&str> = text.lines().filter(|line| !line.starts_with("false_alarm = ")).collect();
+    let other = without.join("\n").replace("[settings]\n", "[settings]\ngone = 3.5\n");
+    let other = other.replace(&product.header.non_standard_attributes.sha256, &digest);
+    std::fs::write(&path, &other).expect("write");
+    let found = read(&path).expect("a sound product");
+    assert_eq!(found.settings, Settings::default());
+    std::fs::write(&path, other.replace("gone = 3.5", "gone = 3.6")).expect("write");
+    assert!(matches!(read(&path), Err(ProductError::Damaged { .. })), "a changed threshold is damage");
 }
 
 #[test]
