@@ -21,6 +21,10 @@ pub struct Examination<'a> {
     pub sources: &'a Sources,
     /// Effects that are tried beside those of the model.
     pub candidates: Vec<EffectEntry>,
+    /// Effects that are tried in the one form that their parameters say.
+    pub chosen: Vec<EffectEntry>,
+    /// What is asked of stages by name beside what the effects need, such as [`dragfree_schema::PREDICTION_NEED`].
+    pub needs: &'a [&'static str],
     /// Coefficients of the model that start at another value than the model file's, by name.
     pub values: &'a BTreeMap<String, f64>,
     /// Threads; results do not depend on them.
@@ -85,6 +89,8 @@ pub fn examine<C: Sink, E: From<EngineError>>(
     };
     let mut setup = Setup::load(&options)?;
     setup.model.candidates.clone_from(&what.candidates);
+    setup.model.chosen.clone_from(&what.chosen);
+    setup.model.needs = what.needs.iter().map(|need| (*need).to_owned()).collect();
     for (name, value) in what.values {
         let short = name.rsplit('.').next().unwrap_or_default();
         for entry in setup.model.effects.iter_mut().filter(|e| e.owns(name)) {

@@ -18,7 +18,7 @@ use crate::gram::LONG;
 use crate::scores::{CandidateScorer, Fit, IdentificationError, Scored, WithoutExcess};
 
 /// Standard normal quantile of a one-sided 95 % limit.
-const LIMIT_QUANTILE: f64 = 1.645;
+pub const LIMIT_QUANTILE: f64 = 1.645;
 
 /// Why a candidate has no result.
 const UNOBSERVABLE: &str =
@@ -76,14 +76,15 @@ pub struct Found {
     pub refused: Option<String>,
     /// Whether it was selected by the likelihood ratio over an excess of power.
     #[serde(skip)]
-    of_excess: bool,
+    pub of_excess: bool,
     /// Whether it is a level of noise that drives an estimate which enters the channels.
     #[serde(skip)]
-    drives_estimate: bool,
+    pub drives_estimate: bool,
 }
 
 impl Found {
-    fn level(&self) -> OtherLevel {
+    /// As a level that is told and is no cause.
+    pub fn level(&self) -> OtherLevel {
         let (effect, instance) = (self.effect.clone(), self.instance.clone());
         OtherLevel { effect, instance, value: self.value, sigma: self.sigma }
     }
@@ -155,6 +156,8 @@ pub struct OtherLevel {
 pub struct Diagnosis {
     /// `sufficient`, `missing` or `unexplained`.
     pub verdict: String,
+    /// What decided: `spectra` or `innovations`.
+    pub decided_by: String,
     /// False-alarm rate.
     pub false_alarm_rate: f64,
     /// Forms and levels of effects that were tried; transient templates were tried at every time besides.
@@ -180,6 +183,9 @@ pub struct Diagnosis {
     /// Forms that were tried, per effect, in this pass and before.
     #[serde(skip)]
     pub forms: BTreeMap<String, usize>,
+    /// Every instance of every effect in its best form: those that were accepted, and the others beside them.
+    #[serde(skip)]
+    pub best_forms: Vec<Candidate>,
 }
 
 /// A candidate that is to be tried again on a finer grid of shapes about this one.
@@ -199,13 +205,13 @@ pub struct RefinementRequest {
 ///
 /// With equal weights of all forms, an effect of one form would pay for the ten thousand pairs of thermometers and lags
 /// of another.
-struct Trials {
+pub struct Trials {
     /// Trials per family: forms and levels of an effect, and those of the transient search.
     forms: BTreeMap<String, f64>,
 }
 
 /// The family of all transients.
-const TRANSIENT: &str = "transient search";
+pub const TRANSIENT: &str = "transient search";
 
 /// Family whose part of the false-alarm rate a candidate uses.
 fn family(c: &Candidate) -> &str {
@@ -213,7 +219,8 @@ fn family(c: &Candidate) -> &str {
 }
 
 impl Trials {
-    fn new(scorer: &CandidateScorer<'_>, forms: &BTreeMap<String, usize>) -> Self {
+    /// Of the forms that were tried, per effect, and of the levels and transients of `scorer`.
+    pub fn new(scorer: &CandidateScorer<'_>, forms: &BTreeMap<String, usize>) -> Self {
         let mut forms: BTreeMap<String, f64> = forms.iter().map(|(e, n)| (e.clone(), *n as f64)).collect();
         for c in scorer.candidate_set.coefficients.iter().filter(|c| !c.noise.is_empty()) {
             *forms.entry(c.effect.clone()).or_default() += 1.0;
@@ -230,9 +237,14 @@ impl Trials {
         self.forms.iter().filter(|(family, _)| *family != TRANSIENT).map(|(_, n)| n).sum::<f64>() as usize
     }
 
+    /// Trials of a family, one at least.
+    pub fn of(&self, family: &str) -> f64 {
+        self.forms.get(family).copied().unwrap_or(1.0).max(1.0)
+    }
+
     /// Corrected p-value, and its decimal logarithm, of a fall of χ² in a family.
-    fn p_value(&self, family: &str, chi2: f64, dof: f64) -> (f64, f64) {
-        let trials = self.forms.len() as f64 * self.forms.get(family).copied().unwrap_or(1.0).max(1.0);
+    pub fn p_value(&self, family: &str, chi2: f64, dof: f64) -> (f64, f64) {
+        let trials = self.forms.len() as f64 * self.of(family);
         let ln_p = ln_chi2_above(chi2, dof);
         let p = corrected(ln_p.exp(), trials);
         (p, if ln_p > -30.0 { p.log10() } else { (ln_p + trials.ln()) / std::f64::consts::LN_10 })
@@ -381,8 +393,11 @@ pub fn diagnose(
         request.shape = found.map_or_else(|| request.shape.clone(), |f| f.shape.clone());
     }
     let upper_limits = limits(scorer, &ranked, &candidates);
+    let others = ranked.iter().map(|scored| scored.candidate.clone());
+    let best_forms = fit.added.iter().cloned().chain(others).collect();
     Ok(Diagnosis {
         verdict: verdict.to_owned(),
+        decided_by: "spectra".to_owned(),
         false_alarm_rate: settings.false_alarm,
         tried: trials.total(),
         candidates,
@@ -393,8 +408,24 @@ pub fn diagnose(
         transients: transients(scorer),
         refinement_requests: requests,
         forms,
+        best_forms,
         not_tried: first.unobservable.into_iter().map(|name| (name, UNOBSERVABLE.to_owned())).collect(),
     })
+}
+
+/// What the model with `added` leaves unexplained, with the levels of the noise fitted.
+///
+/// # Errors
+/// [`IdentificationError`]: the model cannot be fitted.
+pub fn remaining(
+    scorer: &CandidateScorer<'_>,
+    added: &[Candidate],
+) -> Result<Option<Unexplained>, IdentificationError> {
+    let fit = scorer.fit(added)?;
+    let measured = scorer.residual_psd(&fit);
+    let mut levels = scorer.levels(&fit, &scorer.total, &measured);
+    levels.fit();
+    Ok(unexplained(scorer, &levels))
 }
 
 /// Effective number of independent short segments, from the observations in their lowest octave. A single band is too

@@ -14,6 +14,7 @@ pub mod decimate;
 pub mod diagnosis;
 pub mod distributions;
 pub mod gram;
+pub mod innovations;
 pub mod record;
 pub mod scores;
 pub mod transient;

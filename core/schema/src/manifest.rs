@@ -2,6 +2,14 @@
 
 use serde::{Deserialize, Serialize};
 
+/// Name by which a host asks stages for prediction mode, as effects ask for columns in [`Manifest::needs`].
+///
+/// Every column that effects make regressors of then depends on commands and past readouts alone, so that regressors
+/// can be tested against the innovations of a Kalman predictor of the channels. What a column lacks is named by its
+/// attribute [`crate::UNPREDICTED_ATTRIBUTE`]. Stages declare the noise in the channels without an estimate of what
+/// drives them.
+pub const PREDICTION_NEED: &str = "prediction";
+
 /// What a plugin is and which parameters it takes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "json-schema", derive(schemars::JsonSchema))]

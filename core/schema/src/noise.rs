@@ -7,6 +7,19 @@ use std::collections::BTreeMap;
 /// list out of the attributes and hands it on as [`crate::Model::noise`].
 pub const NOISE_ATTRIBUTE: &str = "noise_processes";
 
+/// Key of a column's attributes in a chain that predicts ([`crate::PREDICTION_NEED`]): the column is the known part of
+/// a quantity, and the value says what the unknown part is, as the text of a JSON object of gains by channel,
+/// `{"sc.alpha.x":1.0}`.
+///
+/// The unknown part is the sum over the channels of gain times the unknown acceleration in the channel: what the noise
+/// processes with the response [`NoiseResponse::Held`] put into it, without readout noise. A column without this
+/// attribute and without [`UNPREDICTED_SLOPE_ATTRIBUTE`] is known completely.
+pub const UNPREDICTED_ATTRIBUTE: &str = "unpredicted";
+
+/// As [`UNPREDICTED_ATTRIBUTE`], for the known part of a rate of change: the gain multiplies the backward difference of
+/// the unknown acceleration over a sampling interval, divided by the interval.
+pub const UNPREDICTED_SLOPE_ATTRIBUTE: &str = "unpredicted_slope";
+
 /// A noise process: a stationary random signal of one or several components, and how it enters the channels.
 ///
 /// With M the gains of the components in the channels (`enters`) and C their covariance over the spectrum, it adds

@@ -181,7 +181,22 @@ impl<'l, 'a> EffectLink<'l, 'a> {
     /// # Errors
     /// The host refuses it: the name is taken.
     pub fn series(&mut self, name: &str, unit: &str, frame: &str) -> Result<Out, PluginError> {
-        self.link.write_with(self.table, name, unit, frame, &[("kind", "series"), ("effect", self.effect)])
+        self.series_with(name, unit, frame, &[])
+    }
+
+    /// As [`Self::series`], with more attributes.
+    ///
+    /// # Errors
+    /// As [`Self::series`].
+    pub fn series_with(
+        &mut self,
+        name: &str,
+        unit: &str,
+        frame: &str,
+        attributes: &[(&str, &str)],
+    ) -> Result<Out, PluginError> {
+        let all = [&[("kind", "series"), ("effect", self.effect)], attributes].concat();
+        self.link.write_with(self.table, name, unit, frame, &all)
     }
 
     /// As [`Self::shared_series`], of a series without content above `below_hz`, such as one made of housekeeping:
@@ -218,10 +233,26 @@ impl<'l, 'a> EffectLink<'l, 'a> {
         unit: &str,
         frame: &str,
     ) -> Result<(String, Option<Out>), PluginError> {
-        match available.of_kind("series").find(|c| c.name == name) {
-            Some(column) => Ok((column.table.clone(), None)),
-            None => Ok((self.table(), Some(self.series(name, unit, frame)?))),
+        self.shared_series_with(available, name, unit, frame, &[])
+    }
+
+    /// As [`Self::shared_series`], with further attributes of the column.
+    ///
+    /// # Errors
+    /// As [`Self::series`].
+    pub fn shared_series_with(
+        &mut self,
+        available: &Available,
+        name: &str,
+        unit: &str,
+        frame: &str,
+        attributes: &[(&str, &str)],
+    ) -> Result<(String, Option<Out>), PluginError> {
+        if let Some(column) = available.of_kind("series").find(|c| c.name == name) {
+            return Ok((column.table.clone(), None));
         }
+        let all = [&[("kind", "series"), ("effect", self.effect)], attributes].concat();
+        Ok((self.table(), Some(self.link.write_with(self.table, name, unit, frame, &all)?)))
     }
 
     /// Name of the table that this effect writes.
@@ -235,9 +266,23 @@ impl<'l, 'a> EffectLink<'l, 'a> {
     /// # Errors
     /// The host refuses it.
     pub fn regressor(&mut self, coefficient: &str, channel: &str, unit: &str) -> Result<Out, PluginError> {
-        let attributes =
-            [("kind", "regressor"), ("coefficient", coefficient), ("channel", channel), ("effect", self.effect)];
-        self.link.write_with(self.table, &format!("{coefficient}@{channel}"), unit, "", &attributes)
+        self.regressor_with(coefficient, channel, unit, &[])
+    }
+
+    /// As [`Self::regressor`], with further attributes of the column.
+    ///
+    /// # Errors
+    /// The host refuses it.
+    pub fn regressor_with(
+        &mut self,
+        coefficient: &str,
+        channel: &str,
+        unit: &str,
+        attributes: &[(&str, &str)],
+    ) -> Result<Out, PluginError> {
+        let own = [("kind", "regressor"), ("coefficient", coefficient), ("channel", channel), ("effect", self.effect)];
+        let all = [&own, attributes].concat();
+        self.link.write_with(self.table, &format!("{coefficient}@{channel}"), unit, "", &all)
     }
 
     /// A constraint on coefficients.

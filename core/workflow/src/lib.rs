@@ -6,6 +6,7 @@ pub mod calibrate;
 pub mod compare;
 pub mod diagnose;
 pub mod ladder;
+mod likelihood;
 mod replay;
 mod sums;
 
@@ -56,6 +57,9 @@ pub enum WorkflowError {
     /// Normal equations that cannot be used.
     #[error("{}: {what}", path.display())]
     Reference { path: PathBuf, what: String },
+    /// The likelihood of innovations needs more than the stages declare.
+    #[error("the likelihood of the innovations is not to be had: {0}; decide by the spectra")]
+    NoLikelihood(String),
     /// A detection without its template.
     #[error(
         "{effect} has no waveform any more for the transient at {at_ns} ns: its plugin declares others in every pass"

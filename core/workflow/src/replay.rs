@@ -20,7 +20,7 @@ use crate::sums::{ColumnSums, Request};
 pub(crate) const FINE: &str = "fine";
 
 /// Parameter of an effect that acts once, at a time that the host finds.
-const AT_NS: &str = "at_ns";
+pub(crate) const AT_NS: &str = "at_ns";
 
 /// Which data are replayed, and how.
 pub struct Replay<'a> {
@@ -50,6 +50,8 @@ pub enum Pass {
     Transients,
     /// Sums of all candidates.
     Candidates,
+    /// Innovations of the channels.
+    Likelihood,
 }
 
 /// What is summed.
@@ -75,7 +77,7 @@ impl What<'_> {
 
 /// Levels of noise of the model of some products, by coefficient: where the products estimate one, the mean of their
 /// estimates weighted by 1/σ², as all of them are weighed by one Σ.
-fn noise_levels(products: &[Written]) -> BTreeMap<String, f64> {
+pub(crate) fn noise_levels(products: &[Written]) -> BTreeMap<String, f64> {
     let products = || products.iter().map(|p| &p.product);
     let stated = products().flat_map(|p| &p.model.noise_levels);
     let mut all: BTreeMap<String, f64> = stated.map(|level| (level.coefficient.clone(), level.value)).collect();
@@ -129,7 +131,16 @@ pub(crate) fn sum(
             threads,
         };
         let candidates = all;
-        let examination = Examination { product, sources: &sources, candidates, values: &levels, threads, batch_rows };
+        let examination = Examination {
+            product,
+            sources: &sources,
+            candidates,
+            chosen: Vec::new(),
+            needs: &[],
+            values: &levels,
+            threads,
+            batch_rows,
+        };
         let link = |chain: &Chain| ColumnSums::link(&request, chain, settings);
         let (sums, not_tried) = examine(registry, &examination, link, &mut |p| progress(what.pass(), number, p))?;
         let mut record = sums.record();

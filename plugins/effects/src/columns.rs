@@ -133,6 +133,13 @@ pub(crate) fn latest_column<'a>(available: &'a Available, name: &str) -> Option<
     available.columns.iter().rev().find(|c| c.name == name)
 }
 
+/// What an available column lacks in prediction mode, its attribute [`UNPREDICTED_ATTRIBUTE`]; `None` for a column that
+/// is known completely, as all are outside of that mode.
+pub(crate) fn unpredicted<'a>(available: &'a Available, column: &InputColumn) -> Option<&'a str> {
+    let column = latest_column(available, &column.name)?;
+    Some(column.attribute(UNPREDICTED_ATTRIBUTE)).filter(|gains| !gains.is_empty())
+}
+
 /// Name of an acceleration channel, `NAME.accel.x`, m s⁻².
 pub(crate) fn accel_channel(tm: &Body, axis: usize) -> String {
     format!("{}.accel.{}", tm.name, AXES[axis])

@@ -8,7 +8,9 @@ use dragfree_physics::frames::omega_matrix;
 use dragfree_physics::mission::{Housing, Mission, TestMass};
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
+use serde_json::{Value, json};
 
+use crate::columns::{InputColumn, unpredicted};
 use crate::common::{AXES, TEST_MASSES, manifest, mission, read_srf_vector};
 
 /// Regressors `−Ω` in ORF, s⁻², 3 × 3: acceleration along axis `row`, m s⁻², per metre of offset along axis `column`.
@@ -76,6 +78,18 @@ fn terms(instance: &str, matrix: &Matrix3<f64>, i: usize, sign: f64) -> Vec<(Str
     weighted.map(|j| (format!("com-offset.{instance}.{}", AXES[j]), sign * matrix[(i, j)])).collect()
 }
 
+/// What the regressors lack where `α̂` is the commanded angular acceleration: their derivatives by its components, SRF,
+/// as gains of the attitude channels. Terms in `ω` are of second order in what is unknown.
+fn unpredicted_gains(dcm_orf_from_srf: &Matrix3<f64>) -> [[String; 3]; 3] {
+    let by_alpha =
+        [Vector3::x(), Vector3::y(), Vector3::z()].map(|unit| regressors(dcm_orf_from_srf, &unit, &Vector3::zeros()));
+    let gains = |row: usize, j: usize| {
+        let gain = |axis: usize| (format!("sc.alpha.{}", AXES[axis]), json!(by_alpha[axis][(row, j)]));
+        Value::from_iter([0, 1, 2].map(gain)).to_string()
+    };
+    [0, 1, 2].map(|row| [0, 1, 2].map(|j| gains(row, j)))
+}
+
 #[derive(Debug)]
 struct Handles {
     alpha: [In; 3],
@@ -121,11 +135,17 @@ impl Effect for ComOffset {
         }
         let mut channels = Vec::new();
         let mut averaged = false;
+        let lacks = unpredicted_gains(&self.dcm_orf_from_srf);
+        let predicts = (0..3).all(|j| unpredicted(available, &InputColumn::alpha(j)).is_some());
         for (row, axis) in AXES.iter().enumerate() {
             let name = format!("{}.accel.{axis}", self.instance);
             let Some(channel) = available.of_kind("channel").find(|c| c.name == name) else { continue };
             averaged |= channel.attribute("average") == "2";
-            let [x, y, z] = [0, 1, 2].map(|j| link.regressor(&coefficients[j].name, &name, "s-2"));
+            let [x, y, z] = [0, 1, 2].map(|j| {
+                let attributes = [(UNPREDICTED_ATTRIBUTE, lacks[row][j].as_str())];
+                let attributes = if predicts { &attributes[..] } else { &[] };
+                link.regressor_with(&coefficients[j].name, &name, "s-2", attributes)
+            });
             channels.push((row, [x?, y?, z?]));
         }
         if channels.is_empty() {

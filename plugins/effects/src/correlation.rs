@@ -8,13 +8,17 @@
 //! Confounder: the centre-of-mass offset, see Methods, "Thruster correlation". Gyroscopic and electrode torques are
 //! nearly constant and stay in `M̂`.
 
+use std::collections::BTreeMap;
+
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 
+use crate::columns::{InputColumn, unpredicted};
 use crate::common::{
     AXES, axis_of, keep_available, manifest, mission, read_srf_vector, responses_to_spacecraft_force, symmetric,
 };
+use crate::linear::attitude_channel;
 
 const MAX_PER_METRE: f64 = 5.0;
 
@@ -56,7 +60,16 @@ impl Effect for MpsCorrelation {
         let torque = read_srf_vector(link, "used.mps_torque_srf_nm", "N m")?;
         let sunlit = self.mission.solar_pressure.is_some() && available.find("used.sun_srf.x").is_some();
         let sun = sunlit.then(|| read_srf_vector(link, "used.sun_srf", "1")).transpose()?;
-        let [x, y, z] = AXES.map(|axis| link.series(&format!("torque_excess.{axis}"), "N m", "SRF"));
+        // In prediction mode α is what is commanded: what is left of the torque is then what no column knows.
+        let predicts = (0..3).all(|j| unpredicted(available, &InputColumn::alpha(j)).is_some());
+        let inertia = self.mission.spacecraft.inertia();
+        let [x, y, z] = [0, 1, 2].map(|j| {
+            let gains: BTreeMap<String, f64> = (0..3).map(|k| (attitude_channel(k), inertia[(j, k)])).collect();
+            let lacks = serde_json::json!(gains).to_string();
+            let attributes = [(UNPREDICTED_ATTRIBUTE, lacks.as_str())];
+            let attributes = if predicts { &attributes[..] } else { &[] };
+            link.series_with(&format!("torque_excess.{}", AXES[j]), "N m", "SRF", attributes)
+        });
         self.handles = Some(Handles { alpha, torque, sun, out: [x?, y?, z?] });
         for force in AXES {
             for torque in AXES {

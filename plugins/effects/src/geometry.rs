@@ -7,7 +7,7 @@ use nalgebra::Vector3;
 use crate::common::{SC_AXES, TEST_MASSES, axis_of, is_housekeeping, manifest};
 use crate::linear::{
     Body, CoefficientForms, Form, InputColumn, LinearEffect, Multiplier, Series, Term, accel_channel,
-    optical_axis_weights, optical_pair, tm_acceleration, vector_terms,
+    optical_axis_weights, optical_pair, tm_acceleration, unpredicted, vector_terms,
 };
 
 const RATE_M_S: [f64; 2] = [-2e-7, 2e-7];
@@ -120,6 +120,7 @@ const OPENING_RAD: [f64; 2] = [-0.1, 0.1];
 /// The test mass sees the housing's acceleration `a = û − F_E/m + Φ b + d` from another direction: `z = −δ e_3 × a`, so
 /// `δ a_y` in x and `−δ a_x` in y. δ: rad, ±0.1. The unmodelled `d` is estimated from the readouts themselves, so its
 /// terms are arranged as derived in Methods, "Opening angle". `d` is observable only where both optical axes are read.
+/// In prediction mode `d` is left to the host.
 ///
 /// Confounders: `mps-tilt:sc.z`, which rotates the thrust for both test masses; `is-crosstalk` of x in y; the direction
 /// of the offset.
@@ -148,6 +149,9 @@ impl LinearEffect for OpeningAngle {
             let [own, others] = [place, 1 - place].map(|body| optical_axis_weights(&both, &both[body], 1));
             Some((both[1 - place].clone(), own?[place], others?[place]))
         });
+        let predicts = (0..2).all(|axis| unpredicted(available, &InputColumn::known_accel(tm, axis)).is_some());
+        // Then there are no terms of `d` to be weighed.
+        let weights = if predicts { Some((tm.clone(), 0.0, 0.0)) } else { weights };
         let (Some(x), Some(y), Some((other, own, others))) = (x, y, weights) else {
             return Err(PluginError::error(
                 "effect opening-angle: the acceleration of the housings is observable only with the interferometers of both test \
@@ -261,6 +265,24 @@ mod tests {
                 other.terms[i].factor = 0.0;
                 assert!(!close(&other), "{:?} has no influence", form.terms[i]);
             }
+        }
+    }
+
+    /// Known and unknown part of the declared series together are what the housing's rotation shows.
+    #[test]
+    fn in_prediction_mode_opening_angle_matches_the_derivative() {
+        for tm in 0..2 {
+            let test_spacecraft = TestSpacecraft {
+                prediction: true,
+                thruster_layout: true,
+                unknown_force_srf_n: UNKNOWN_FORCE_SRF_N,
+                ..TestSpacecraft::new()
+            };
+            test_spacecraft.assert_matches_derivative::<OpeningAngle>(
+                &format!("tm{}", tm + 1),
+                "",
+                &[&|w, angle| w.opening_error_rad[tm] += angle],
+            );
         }
     }
 

@@ -12,7 +12,7 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix2, Vector3};
 
-pub(crate) use crate::columns::{Body, InputColumn, accel_channel, latest_column};
+pub(crate) use crate::columns::{Body, InputColumn, accel_channel, latest_column, unpredicted};
 use crate::common::{AXES, SeriesRef, axis_of, mission};
 use crate::prediction::{PredictedAcceleration, Predictor};
 
@@ -72,6 +72,17 @@ impl Series {
             | Self::NewerSlope(source, _)
             | Self::Times(source, _, _) => source,
             Self::Predicted(series) => &series.axes[0].readout,
+        }
+    }
+
+    /// Attribute by which the series states what it lacks where its source has [`UNPREDICTED_ATTRIBUTE`]. The product
+    /// with a multiplier has none, although it lacks something too: its gains vary with time.
+    fn unpredicted_attribute(&self) -> Option<&'static str> {
+        match self {
+            Self::Held(_) => Some(UNPREDICTED_ATTRIBUTE),
+            Self::Slope(..) => Some(UNPREDICTED_SLOPE_ATTRIBUTE),
+            // A column states it itself; the others are made of channels, and not in prediction mode.
+            Self::Column(_) | Self::Newer(_) | Self::NewerSlope(..) | Self::Times(..) | Self::Predicted(_) => None,
         }
     }
 
@@ -163,7 +174,7 @@ pub(crate) fn offset_terms(available: &Available, tm: &Body, row: usize) -> Vec<
 pub(crate) struct TmAcceleration {
     /// `û + Φ b`.
     pub(crate) modelled: Vec<(Series, f64, Option<String>)>,
-    /// Unmodelled acceleration `d`, estimated from the interferometers.
+    /// Unmodelled acceleration `d`, estimated from the interferometers; empty in prediction mode.
     pub(crate) unmodelled: Vec<(Series, f64, Option<String>)>,
 }
 
@@ -172,22 +183,28 @@ pub(crate) struct TmAcceleration {
 /// The control loop cancels most of `d`, chiefly thruster noise, by `û`, so `û` alone does not estimate the
 /// acceleration.
 ///
-/// `None` along s_3 and unless interferometers read x of exactly two test masses, where `d` is unobservable.
+/// `None` along s_3 and unless interferometers read x of exactly two test masses, where `d` is unobservable. In
+/// prediction mode `d` is left to the host, which predicts it, so that every axis has an acceleration.
 pub(crate) fn tm_acceleration(
     available: &Available,
     mission: &Mission,
     tm: &Body,
     axis: usize,
 ) -> Option<TmAcceleration> {
+    let known = InputColumn::known_accel(tm, axis);
+    let predicts = unpredicted(available, &known).is_some();
+    let mut modelled = vec![(Series::Column(known), 1.0, None)];
+    for (column, times) in offset_terms(available, tm, axis) {
+        modelled.push((Series::Column(column), 1.0, Some(times)));
+    }
+    if predicts {
+        return Some(TmAcceleration { modelled, unmodelled: Vec::new() });
+    }
     let both = optical_pair(available, mission)?;
     if axis == 2 {
         return None;
     }
     let weights = optical_axis_weights(&both, tm, axis)?;
-    let mut modelled = vec![(Series::Column(InputColumn::known_accel(tm, axis)), 1.0, None)];
-    for (column, times) in offset_terms(available, tm, axis) {
-        modelled.push((Series::Column(column), 1.0, Some(times)));
-    }
     let mut unmodelled = Vec::new();
     for (other, weight) in both.iter().zip(weights).filter(|(_, weight)| weight.abs() > 1e-12) {
         let (t, b) = (other.section.dcm_orf_from_srf(), other.section.offset_nominal_orf_m());
@@ -408,7 +425,10 @@ impl<E: LinearEffect> Linear<E> {
             let table = latest_column(available, &source.name).map(|c| c.table.clone()).unwrap_or_default();
             return Ok((table, name));
         }
-        let (table, out) = link.shared_series(available, &name, series.unit(), &series.source().frame)?;
+        let lacks = unpredicted(available, series.source());
+        let attribute = lacks.and_then(|gains| Some((series.unpredicted_attribute()?, gains)));
+        let (table, out) =
+            link.shared_series_with(available, &name, series.unit(), &series.source().frame, attribute.as_slice())?;
         let Some(out) = out else { return Ok((table, name)) };
         let (operation, time_ns, multiplier) = match series {
             Series::Column(_) | Series::Held(_) | Series::Predicted(_) => (Operation::Hold, None, None),

@@ -4,6 +4,8 @@
 //! correlated with its noise (errors in variables), so regressors use the estimated acceleration `û + Φ b + d` instead;
 //! Methods, "Acceleration of a test mass". Along s_3, where `d` is unobservable, they use what the past predicts of it;
 //! Methods, "Readout errors normal to the optical plane".
+//!
+//! In prediction mode regressors are made of `û + Φ b` alone along every axis, and the host accounts for `d`.
 
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
@@ -11,7 +13,7 @@ use dragfree_sdk::prelude::*;
 use crate::common::{TEST_MASSES, TM_YZ, axis_of, manifest};
 use crate::linear::{
     Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, TmAcceleration, accel_channel, attitude_channel,
-    axis_pair, latest_column, offset_coupling_terms, offset_terms, tm_acceleration,
+    axis_pair, latest_column, offset_coupling_terms, offset_terms, tm_acceleration, unpredicted,
 };
 use crate::prediction::Normal;
 
@@ -31,7 +33,8 @@ fn second_difference_terms(
     (from, to): (usize, usize),
 ) -> Result<Vec<Term>, PluginError> {
     let tm = &Body::of(mission, instance, by)?;
-    if from == 2 {
+    let predicts = unpredicted(available, &InputColumn::known_accel(tm, from)).is_some();
+    if from == 2 && !predicts {
         let normal = Normal::of(available, mission, by)?;
         let series = normal.predicted(normal.place(tm, by)?, by)?;
         return Ok(vec![Term::new(accel_channel(tm, to), Series::Predicted(Box::new(series)), 1.0)]);
@@ -159,7 +162,8 @@ impl LinearEffect for TiltToLength {
 /// * `ifo` acts on x of both test masses. The unmodelled acceleration is delayed too; only an estimator that models it
 ///   as common with y, which is on time, is unbiased.
 /// * `dws` acts on the attitude channels with `a = J_S⁻¹ M_T`, and on the test masses through `α̂`, which is late by
-///   `τ ∂α̂/∂τ`: they show `+τ [T ∂α̂/∂τ ×] b`.
+///   `τ ∂α̂/∂τ`: they show `+τ [T ∂α̂/∂τ ×] b`. In prediction mode `a = α̂` for the attitude, whose unknown part is
+///   late too, and nothing acts through `α̂`, which is the commanded one.
 /// * `is` acts on all axes that the inertial sensor reads. Beside an interferometer, `d` in the optical plane is on
 ///   time and `a = û + Φ b + d`. Otherwise all readouts of `d` are late alike, which does not show, and `a = û + Φ b`.
 ///
@@ -182,6 +186,13 @@ impl LinearEffect for TimeOffset {
     ) -> Result<Vec<CoefficientForms>, PluginError> {
         const BY: &str = "the effect time-offset";
         let mut terms = Vec::new();
+        if setup.instance() == "dws" && (0..3).all(|j| unpredicted(available, &InputColumn::alpha(j)).is_some()) {
+            for row in 0..3 {
+                let series = Series::Slope(InputColumn::alpha(row), "rad s-3");
+                terms.push(Term::new(attitude_channel(row), series, -1.0));
+            }
+            return Ok(CoefficientForms::only("s", DELAY_S, terms));
+        }
         if setup.instance() == "dws" {
             let inverse = mission.spacecraft.inertia_inverse();
             for (row, axis) in (0..3).flat_map(|row| (0..3).map(move |axis| (row, axis))) {
@@ -338,6 +349,54 @@ mod tests {
         let smoother_gain = Matrix3::new(0.7, 0.1, -0.2, 0.1, 0.4, 0.05, -0.1, 0.2, 0.9);
         let test_spacecraft = TestSpacecraft { smoother_gain, only_torque_varies: true, ..TestSpacecraft::new() };
         test_spacecraft.assert_matches_derivative::<TimeOffset>("dws", "", &[&late(&[6, 7, 8])]);
+    }
+
+    /// Known and unknown part of the declared series together are what the readouts show, under an unmodelled torque
+    /// and an unmodelled force along every axis.
+    #[test]
+    fn in_prediction_mode_readout_effects_match_the_derivative() {
+        let predicting = || TestSpacecraft {
+            prediction: true,
+            thruster_layout: true,
+            unknown_force_srf_n: [Vector3::new(0.4, -0.7, 0.3), Vector3::new(-0.5, 0.3, 0.6)],
+            ..TestSpacecraft::new()
+        };
+        for (tm, axis) in [(0, 1), (1, 1), (0, 2), (1, 2)] {
+            predicting().assert_matches_derivative::<IsScale>(
+                &format!("tm{}.{}", tm + 1, AXES[axis]),
+                "",
+                &[&|w, s| w.readout_gain[tm][(axis, axis)] += s],
+            );
+        }
+        for (tm, from, to) in [(0, 0, 1), (1, 0, 2), (0, 1, 2), (1, 2, 1)] {
+            predicting().assert_matches_derivative::<IsCrosstalk>(
+                &format!("tm{}.{}-{}", tm + 1, AXES[from], AXES[to]),
+                "",
+                &[&|w, k| w.readout_gain[tm][(to, from)] += k],
+            );
+        }
+        for (instance, channels) in [("ifo", &[0, 3][..]), ("is", &[1, 2, 4, 5]), ("dws", &[6, 7, 8])] {
+            let late = |w: &mut crate::test_spacecraft::Deviations, tau: f64| {
+                channels.iter().for_each(|c: &usize| w.readout_delay_s[*c] += tau);
+            };
+            predicting().assert_matches_derivative::<TimeOffset>(instance, "", &[&late]);
+        }
+    }
+
+    /// Where no interferometer reads, only prediction mode has an acceleration along y, and along z one without the
+    /// noise of the readouts.
+    #[test]
+    fn in_prediction_mode_readout_effects_need_no_interferometer() {
+        let test_spacecraft = TestSpacecraft { prediction: true, ..TestSpacecraft::new() };
+        let mut available = test_spacecraft.available();
+        for column in available.columns.iter_mut().filter(|c| c.attribute("noise") == "ifo_x") {
+            column.attributes.insert("noise".to_owned(), "is_x".to_owned());
+        }
+        for instance in ["tm2.y", "tm2.z"] {
+            let forms = IsScale::coefficients(&setup(instance, ""), &test_spacecraft.mission, &available).unwrap();
+            let names: Vec<String> = forms[0].forms[0].terms.iter().map(|t| t.series.name()).collect();
+            assert!(names.len() == 3 && names[0].starts_with("tm2.u_orf_m_s2."), "{names:?}");
+        }
     }
 
     /// A mass under accelerations held between samples, periodic in `N`, sampled late by exact kinematics. The

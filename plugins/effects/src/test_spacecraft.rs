@@ -6,6 +6,7 @@ use dragfree_physics::frames::dcm_turned_about_z;
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Rotation3, Vector3};
+use serde_json::json;
 use std::collections::BTreeMap;
 
 use crate::com_offset;
@@ -79,6 +80,8 @@ pub(crate) struct TestSpacecraft {
     pub(crate) mission: Mission,
     /// Gain of the smoother on unmodelled angular acceleration.
     pub(crate) smoother_gain: Matrix3<f64>,
+    /// Whether the columns are those of prediction mode: by commands alone, and saying what they lack.
+    pub(crate) prediction: bool,
     /// Whether the unmodelled torque has a correlated force.
     pub(crate) thruster_layout: bool,
     /// Whether the electrodes act; their recoil is a thousand times that of a real spacecraft.
@@ -128,6 +131,7 @@ impl TestSpacecraft {
         Self {
             mission: Mission::from_json(&text).unwrap(),
             smoother_gain: Matrix3::identity(),
+            prediction: false,
             thruster_layout: false,
             electrodes_active: true,
             unknown_force_srf_n: zero,
@@ -235,6 +239,9 @@ impl TestSpacecraft {
 
     /// Estimate `α̂`: the command, corrected by the smoother's gain on the attitude's difference.
     fn alpha_hat(&self, t_s: f64, deviations: &Deviations) -> Vector3<f64> {
+        if self.prediction {
+            return self.commanded_angular_acceleration(t_s);
+        }
         let seen =
             Vector3::from_fn(|i, _| self.angular_acceleration(t_s - deviations.readout_delay_s[6 + i], deviations)[i]);
         self.commanded_angular_acceleration(t_s)
@@ -249,6 +256,14 @@ impl TestSpacecraft {
         let force = self.spacecraft(&forces, &Deviations::default(), 0.0).0 + torque_noise_nm;
         let own = forces.electrodes_orf_n[tm] / self.mission.test_mass["tm1"].mass_kg;
         own - self.dcm(tm) * force / self.mission.spacecraft.mass_kg
+    }
+
+    /// Unknown acceleration in the channels of a test mass: by the unmodelled force and the force correlated with the
+    /// unmodelled torque, m s⁻².
+    fn unknown_acceleration(&self, tm: usize, t_s: f64) -> Vector3<f64> {
+        let forces = self.forces(t_s);
+        let force = self.noise_force() * forces.noise_torque_srf_nm + forces.unknown_force_srf_n;
+        self.dcm(tm) * force / -self.mission.spacecraft.mass_kg
     }
 
     fn offset_regressors(&self, tm: usize, alpha: &Vector3<f64>) -> Matrix3<f64> {
@@ -293,6 +308,15 @@ impl TestSpacecraft {
         let mut all = Available::default();
         all.columns.push(Column { unit: "kg".to_owned(), ..column("grid", "hk.fuel_kg".to_owned(), &[]) });
         all.columns.push(Column { unit: "V".to_owned(), ..column("grid", "hk.bus_v".to_owned(), &[]) });
+        for axis in AXES.iter().filter(|_| self.prediction) {
+            let lacks = |channel: String| [(UNPREDICTED_ATTRIBUTE, json!({ channel: 1.0 }).to_string())];
+            let alpha = lacks(format!("sc.alpha.{axis}"));
+            all.columns.push(column("reconstruction", format!("sc.alpha_srf_rad_s2.{axis}"), &alpha));
+            for tm in ["tm1", "tm2"] {
+                let known = lacks(format!("{tm}.accel.{axis}"));
+                all.columns.push(column("reconstruction", format!("{tm}.u_orf_m_s2.{axis}"), &known));
+            }
+        }
         for (tm, axis) in [1, 2].into_iter().flat_map(|tm| AXES.map(move |axis| (tm, axis))) {
             // A raw topic has a column of the same name.
             all.columns.insert(0, column("is", format!("tm{tm}.r_orf_m.{axis}"), &[]));
@@ -316,7 +340,7 @@ impl TestSpacecraft {
         all
     }
 
-    /// Value of a column or series at `t_s`.
+    /// Value of a column or series at `t_s`; in prediction mode with the unknown part that the column states.
     fn value(&self, name: &str, t_s: f64) -> f64 {
         if let Some(inner) = name.strip_prefix("slope(").and_then(|s| s.strip_suffix(')')) {
             // All forces are linear in time.
@@ -338,7 +362,8 @@ impl TestSpacecraft {
         }
         let forces = self.forces(t_s);
         let nominal = Deviations::default();
-        let alpha = self.alpha_hat(t_s, &nominal);
+        let alpha =
+            if self.prediction { self.angular_acceleration(t_s, &nominal) } else { self.alpha_hat(t_s, &nominal) };
         let index = |part: &str| ["x", "y", "z"].iter().position(|a| *a == part).unwrap();
         let coefficients: Vec<&str> = name.split(['.', '@']).collect();
         let last = *coefficients.last().unwrap();
@@ -349,6 +374,9 @@ impl TestSpacecraft {
             ["used", _, "force_orf_n", a] => forces.electrodes_orf_n[tm][index(a)],
             ["used", _, "torque_orf_nm", a] => forces.electrodes_orf_nm[tm][index(a)],
             ["used", "sun_srf", a] => forces.sun_srf[index(a)],
+            [_, "u_orf_m_s2", a] if self.prediction => {
+                (self.known_acceleration(tm, t_s, &nominal) + self.unknown_acceleration(tm, t_s))[index(a)]
+            }
             [_, "u_orf_m_s2", a] => self.known_acceleration(tm, t_s, &nominal)[index(a)],
             [_, "accel", a] => {
                 (self.second_difference(tm, t_s, &nominal) - self.known_acceleration(tm, t_s, &nominal))[index(a)]

@@ -15,7 +15,7 @@ fn stage(criterion: &mut Criterion) {
     const EPOCHS: u64 = 4096;
     let mut group = criterion.benchmark_group("hinf-dfacs");
     group.throughput(Throughput::Elements(EPOCHS));
-    let everything = Needs { commands: true, torque_response: true, dws_delay_response: true };
+    let everything = Needs { commands: true, torque_response: true, dws_delay_response: true, prediction: false };
     for (name, replay, needs) in [
         ("with replay", true, Needs::default()),
         ("without replay", false, Needs::default()),

@@ -3,6 +3,10 @@
 //! A force on the spacecraft is one vector process in the channels of all test masses. The part of the force noise
 //! predicted from the torque (see [`ThrustNoise`]) belongs to the known acceleration; the rest is noise. Torque noise
 //! enters the attitude channels. The error of α̂ enters the test masses' channels through the nominal offset.
+//!
+//! In prediction mode nothing is estimated: `û` lacks the force correlated with torque noise, so that torque noise
+//! enters the test masses' channels by that force. Its action through the offset is left to the host, which knows it
+//! from the attribute `unpredicted` of the offset's regressors.
 
 use std::collections::BTreeMap;
 
@@ -20,15 +24,26 @@ type Gains = BTreeMap<String, Vec<f64>>;
 /// All noise processes in the channels `TM.accel.AXIS`, m s⁻², and `sc.alpha.AXIS`, rad s⁻². `readouts` names, per
 /// test mass, the noise tables of the instruments that read its x, y and z, such as `ifo_x` or `is_x`.
 pub fn declared(mission: &Mission, readouts: &[[&str; 3]]) -> Vec<NoiseProcess> {
+    processes(mission, readouts, false)
+}
+
+/// As [`declared`], in prediction mode.
+pub fn declared_for_prediction(mission: &Mission, readouts: &[[&str; 3]]) -> Vec<NoiseProcess> {
+    processes(mission, readouts, true)
+}
+
+fn processes(mission: &Mission, readouts: &[[&str; 3]], prediction: bool) -> Vec<NoiseProcess> {
     let thrusters = ThrustNoise::of(mission);
     let mut per_force = DMatrix::zeros(3 * mission.test_mass.len(), 3);
     let mut per_alpha = per_force.clone();
+    let mut per_torque = per_force.clone();
     for (i, tm) in mission.test_mass.values().enumerate() {
         let dcm = tm.dcm_orf_from_srf();
         per_force.rows_mut(3 * i, 3).copy_from(&(dcm / -mission.spacecraft.mass_kg));
         per_alpha.rows_mut(3 * i, 3).copy_from(&(skew(&tm.offset_nominal_orf_m()) * dcm));
     }
     if let Some(thrusters) = &thrusters {
+        per_torque = &per_force * to_dynamic(&thrusters.force_per_torque);
         per_alpha += &per_force * to_dynamic(&(thrusters.force_per_torque * mission.spacecraft.inertia()));
     }
     let gains = |m: &DMatrix<f64>| -> Gains {
@@ -59,22 +74,20 @@ pub fn declared(mission: &Mission, readouts: &[[&str; 3]]) -> Vec<NoiseProcess> 
     let inverse_inertia = mission.spacecraft.inertia().try_inverse().unwrap_or_else(Matrix3::zeros);
     if let Some(thrusters) = thrusters.filter(|t| t.torque_shape.psd(1.0) > 0.0) {
         let attitude = AXES.iter().zip(rows(&inverse_inertia));
+        let mut enters: Gains = attitude.map(|(axis, row)| (format!("sc.alpha.{axis}"), row)).collect();
+        if prediction {
+            enters.extend(gains(&per_torque).into_iter().filter(|(_, row)| row.iter().any(|gain| *gain != 0.0)));
+        }
         all.push(NoiseProcess {
             components: AXES.map(|axis| format!("thruster_torque:sc.{axis}")).to_vec(),
             covariance: Some(rows(&thrusters.torque)),
-            estimate: Some(NoiseEstimate {
+            estimate: (!prediction).then(|| NoiseEstimate {
                 matrix: rows(&inverse_inertia),
                 readout: mission.noise.dws_long_arm.as_ref().map(|n| n.shape()),
                 readout_response: NoiseResponse::Differenced,
                 enters: gains(&per_alpha),
             }),
-            ..process(
-                "thruster_torque",
-                "N m",
-                thrusters.torque_shape,
-                NoiseResponse::Held,
-                attitude.map(|(axis, row)| (format!("sc.alpha.{axis}"), row)).collect(),
-            )
+            ..process("thruster_torque", "N m", thrusters.torque_shape, NoiseResponse::Held, enters)
         });
     }
     all

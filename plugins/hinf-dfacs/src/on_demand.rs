@@ -5,9 +5,12 @@
 //! * Torque: `∂α̂/∂g_i = J⁻¹ e_i M_i + D[0, J⁻¹ e_i M_i]`.
 //! * Delay: `∂α̂/∂τ = D[−ω, 0] = D[0, rate steps Δα̂]`, for the channels of the test masses only. The attitude
 //!   channels share the readout noise of `α̂`; their regressor is the commanded acceleration without the smoother.
+//!
+//! In prediction mode `α̂ = α_c`, and `D` is left out of both.
 
 use dragfree_physics::control::PerTestMass;
 use dragfree_physics::mission::{AXES, Mission};
+use dragfree_sdk::PREDICTION_NEED;
 use dragfree_sdk::state::{State, StateError};
 use nalgebra::{Matrix3, Vector3};
 
@@ -20,7 +23,7 @@ pub(crate) fn is_in_loop(column: &str) -> bool {
     !column.starts_with("used.sun_srf.") && !column.starts_with("response.alpha_srf_rad_s2.by_dws_delay.")
 }
 
-/// Columns that effects request; none by default.
+/// What effects and the host request; nothing by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Needs {
     /// `used.*`: commands (N, N m) and Sun direction from which `û` is made, means over `[t_k, t_{k+1})`.
@@ -32,12 +35,15 @@ pub struct Needs {
     /// `response.alpha_srf_rad_s2.by_dws_delay.J`, `∂α̂_J/∂τ`, rad s⁻³, for a delay `τ` of long-arm sensing. Only for
     /// the channels of the test masses; see the module.
     pub dws_delay_response: bool,
+    /// Prediction mode ([`dragfree_sdk::PREDICTION_NEED`]): columns from which effects make regressors depend on
+    /// commands and past readouts alone.
+    pub prediction: bool,
 }
 
 impl Needs {
     /// Whether any column is a derivative of the smoothed `α̂`.
-    pub fn responses(&self) -> bool {
-        self.torque_response || self.dws_delay_response
+    pub fn smoothed_responses(&self) -> bool {
+        (self.torque_response || self.dws_delay_response) && !self.prediction
     }
 
     /// The needs in words. The state stores them, and the error about a state of another model quotes them.
@@ -46,6 +52,7 @@ impl Needs {
             ("commands", self.commands),
             ("torque-response", self.torque_response),
             ("dws-delay-response", self.dws_delay_response),
+            (PREDICTION_NEED, self.prediction),
         ];
         let names: Vec<&str> = all.iter().filter(|(_, needed)| *needed).map(|(name, _)| *name).collect();
         format!("one whose effects need [{}]", names.join(", "))
@@ -184,6 +191,9 @@ impl OnDemand {
         let (executed, inverse) = (&self.executed, &self.inertia_inverse);
         let commanded_alpha = |about: usize, k: usize| inverse.column(about) * executed[k].command[3 + about];
         let responses = [0, 1, 2].map(|about| {
+            if self.needs.prediction {
+                return vec![Smoothed::default(); available.len()];
+            }
             let perturb = |k| Perturbation { held_rad_s2: commanded_alpha(about, k), kick_rad_s: Vector3::zeros() };
             smoother.response(&mut self.torque[about], available.len(), perturb)
         });
@@ -201,6 +211,9 @@ impl OnDemand {
     }
 
     fn by_delay(&mut self, smoother: &Smoother, count: usize, alpha_crf_rad_s2: &[Vector3<f64>]) -> Vec<Smoothed> {
+        if self.needs.prediction {
+            return vec![Smoothed::default(); count];
+        }
         let change = |k: usize| alpha_crf_rad_s2[k] - alpha_crf_rad_s2[k - 1];
         let first = self.first_alpha_change_rad_s2;
         let perturb = |k: usize| {

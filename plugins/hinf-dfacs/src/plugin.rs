@@ -190,13 +190,21 @@ fn write_columns(
     table: Table,
     mission: &Mission,
     noises: &[Noises],
+    prediction: bool,
 ) -> Result<Vec<Out>, PluginError> {
-    let declared = noise::declared(mission, noises);
+    let declare = if prediction { noise::declared_for_prediction } else { noise::declared };
+    let declared = declare(mission, noises);
+    // What the command lacks is all of the unknown acceleration in the channel of the same axis.
+    let unpredicted = |channel: String| json!({ channel: 1.0 }).to_string();
     let mut out = Vec::with_capacity(row_length(noises.len()));
-    for (vector, unit) in [("sc.alpha_srf_rad_s2", "rad s-2"), ("sc.omega_srf_rad_s", "rad s-1")] {
-        for axis in AXES {
-            out.push(link.write(table, &format!("{vector}.{axis}"), unit, "SRF")?);
-        }
+    for axis in AXES {
+        let unpredicted = unpredicted(format!("sc.alpha.{axis}"));
+        let attributes = [(UNPREDICTED_ATTRIBUTE, unpredicted.as_str())];
+        let attributes = if prediction { &attributes[..] } else { &[] };
+        out.push(link.write_with(table, &format!("sc.alpha_srf_rad_s2.{axis}"), "rad s-2", "SRF", attributes)?);
+    }
+    for axis in AXES {
+        out.push(link.write(table, &format!("sc.omega_srf_rad_s.{axis}"), "rad s-1", "SRF")?);
     }
     for (name, noises) in mission.test_mass.keys().zip(noises) {
         let frame = mission.frame(name);
@@ -205,7 +213,10 @@ fn write_columns(
         }
         for axis in AXES {
             let column = format!("{name}.u_orf_m_s2.{axis}");
-            out.push(link.write_with(table, &column, "m s-2", &frame, &[("in_loop", "true")])?);
+            let unpredicted = unpredicted(format!("{name}.accel.{axis}"));
+            let attributes = [("in_loop", "true"), (UNPREDICTED_ATTRIBUTE, unpredicted.as_str())];
+            let attributes = if prediction { &attributes[..] } else { &attributes[..1] };
+            out.push(link.write_with(table, &column, "m s-2", &frame, attributes)?);
         }
     }
     let mut channel = |name: &str, unit: &str, frame: &str, noise: &str, declared: &[NoiseProcess]| {
@@ -326,7 +337,9 @@ impl Stage for HinfDfacs {
     const STATE_VERSION: u32 = 2;
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
+        let prediction = setup.needs(PREDICTION_NEED);
         let angular_acceleration = match setup.text("angular_acceleration")?.as_str() {
+            _ if prediction => AngularAcceleration::Commanded,
             "commanded" => AngularAcceleration::Commanded,
             "second-difference" => AngularAcceleration::SecondDifference,
             _ => AngularAcceleration::Smoother,
@@ -341,6 +354,7 @@ impl Stage for HinfDfacs {
                 commands: setup.needs("commands"),
                 torque_response: setup.needs("torque-response"),
                 dws_delay_response: setup.needs("dws-delay-response"),
+                prediction,
             },
             linked: None,
             notes: Vec::new(),
@@ -385,7 +399,7 @@ impl Stage for HinfDfacs {
         let all_readouts = readout.iter().all(Option::is_some);
         let reconstruction = self.reconstruction(&settings, all_readouts)?;
         let smoother = self.angular_acceleration == AngularAcceleration::Smoother;
-        if self.needs.responses() && !smoother {
+        if self.needs.smoothed_responses() && !smoother {
             return Err(PluginError::error(
                 "hinf-dfacs: an effect of the model needs derivatives of the smoothed angular acceleration; set \
                  angular_acceleration = \"smoother\", or remove that effect (a gain of a torque, or a delay of the \
@@ -393,7 +407,7 @@ impl Stage for HinfDfacs {
             ));
         }
         let table = link.table("reconstruction", rate_hz);
-        let mut out = write_columns(link, table, &self.mission, &noises)?;
+        let mut out = write_columns(link, table, &self.mission, &noises, self.needs.prediction)?;
         let fixed = out.len();
         for (name, unit, frame) in reconstruction.on_demand_columns() {
             let attributes = [("kind", "series"), ("in_loop", "true")];
@@ -502,7 +516,7 @@ impl Stage for HinfDfacs {
             ));
         }
         q.insert("smoother_lag_s".to_owned(), json!(linked.reconstruction.lag() as f64 / linked.rate_hz));
-        if self.angular_acceleration != AngularAcceleration::Smoother {
+        if self.angular_acceleration != AngularAcceleration::Smoother && !self.needs.prediction {
             report
                 .notes
                 .push(format!("angular_acceleration = \"{method}\" biases the calibration; it is for comparison"));

@@ -152,7 +152,8 @@ struct Pending {
     alpha_known_rad_s2: Vector3<f64>,
     /// `ω̇_SI − ω̇_SC = T ω̇_CI − ω_SC×(T ω_CI)`.
     frame_rad_s2: Vector3<f64>,
-    omega_ci_rad_s: Vector3<f64>,
+    /// `ω_CI`, to which the smoother adds `ω_SC`; in prediction mode with the filtered `ω_SC`.
+    omega_rad_s: Vector3<f64>,
 }
 
 impl Pending {
@@ -172,7 +173,7 @@ impl Pending {
             &mut self.bridged_rad,
             &mut self.alpha_known_rad_s2,
             &mut self.frame_rad_s2,
-            &mut self.omega_ci_rad_s,
+            &mut self.omega_rad_s,
         ];
         let test_masses =
             self.tm.iter_mut().flat_map(|tm| [&mut tm.r_orf_m, &mut tm.bridged_orf_m, &mut tm.u_orf_m_s2]);
@@ -193,6 +194,8 @@ pub struct Reconstruction {
     rate_hz: f64,
     angular_acceleration: AngularAcceleration,
     needs_sun: bool,
+    /// See [`Needs::prediction`].
+    prediction: bool,
     known: KnownModel,
     /// `−T_S^{O_i} C J/m_S` (`C`: [`ThrustNoise::force_per_torque`]): acceleration of each test mass, ORF, by the
     /// force correlated with torque noise, per angular acceleration by that noise, SRF; m s⁻² per rad s⁻².
@@ -274,10 +277,17 @@ impl Reconstruction {
         } else {
             None
         };
+        let prediction = settings.needs.prediction;
         let on_demand = || OnDemand::new(settings.needs, mission, tm_accel_per_alpha.clone());
         Ok(Self {
             rate_hz: settings.rate_hz,
-            angular_acceleration: settings.angular_acceleration,
+            // The smoother and the second difference use later readouts.
+            angular_acceleration: if prediction {
+                AngularAcceleration::Commanded
+            } else {
+                settings.angular_acceleration
+            },
+            prediction,
             needs_sun: settings.sun && mission.solar_pressure.is_some(),
             on_demand: (settings.needs != Needs::default()).then(on_demand),
             tm_accel_per_alpha,
@@ -337,9 +347,12 @@ impl Reconstruction {
             tm: tm.collect(),
             alpha_known_rad_s2: motion.map_or(missing, |m| m.alpha_srf_rad_s2),
             frame_rad_s2,
-            omega_ci_rad_s: self.omega_ci_rad_s,
+            omega_rad_s: if self.prediction { omega_sc + self.omega_ci_rad_s } else { self.omega_ci_rad_s },
         });
-        self.interpolate_gaps();
+        // The interpolation uses later readouts.
+        if !self.prediction {
+            self.interpolate_gaps();
+        }
         if self.smoother.waiting() == 2 * self.lag() {
             self.emit(self.lag(), rows);
         }
@@ -433,7 +446,11 @@ impl Reconstruction {
 
     fn emit(&mut self, count: usize, rows: &mut Vec<Row>) {
         let delay = self.on_demand.as_ref().is_some_and(|on_demand| on_demand.needs().dws_delay_response);
-        let mut smoothed = self.smoother.smoothed(if delay { self.pending.len() } else { count });
+        let mut smoothed = if self.prediction {
+            vec![Smoothed::default(); count]
+        } else {
+            self.smoother.smoothed(if delay { self.pending.len() } else { count })
+        };
         let alpha_crf = |(p, s): (&Pending, &Smoothed)| p.alpha_known_rad_s2 - p.frame_rad_s2 + s.disturbance_rad_s2;
         let alpha_crf_rad_s2: Vec<_> = self.pending.iter().zip(&smoothed).filter(|_| delay).map(alpha_crf).collect();
         smoothed.truncate(count);
@@ -442,7 +459,8 @@ impl Reconstruction {
                 tm.u_orf_m_s2 += accel_per_alpha * smoothed.noise_rad_s2;
             }
         }
-        let alpha_unknown = self.find_unknown_alpha(smoothed.len());
+        let alpha_unknown =
+            if self.prediction { vec![false; smoothed.len()] } else { self.find_unknown_alpha(smoothed.len()) };
         let known = |v: &Vector3<f64>| v.iter().all(|x| x.is_finite());
         let available = |(p, alpha_unknown): (&Pending, &bool)| Availability {
             alpha: known(&p.alpha_known_rad_s2) && !alpha_unknown,
@@ -506,7 +524,7 @@ impl Reconstruction {
                 _ => missing,
             },
         };
-        let omega = smoothed.omega_crf_rad_s + now.omega_ci_rad_s;
+        let omega = smoothed.omega_crf_rad_s + now.omega_rad_s;
         let mut vectors: Few<Vector3<f64>, { 3 + 3 * MOST_TEST_MASSES }> = [alpha, omega].into_iter().collect();
         for tm in &now.tm {
             vectors.push(tm.r_orf_m);

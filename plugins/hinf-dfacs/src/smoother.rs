@@ -117,7 +117,7 @@ pub fn residual_psd(frequency_hz: f64, disturbance_psd: f64, readout_psd: f64, d
 }
 
 /// Smoothed quantities of one epoch, SRF.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Smoothed {
     /// `E[β + w]`, mean over `[t_k, t_{k+1})`, rad s⁻².
     pub disturbance_rad_s2: Vector3<f64>,

@@ -56,15 +56,26 @@ pub fn build(
     Ok(builder.chain)
 }
 
-/// What the effects of a model want of the stages before them. An effect that does not exist is met again when it is
-/// linked.
+/// What the host and the effects of a model want of the stages before them. An effect that does not exist is met again
+/// when it is linked.
 fn needs(registry: &Registry, model: &Model) -> Vec<String> {
-    let effects = model.effects.iter().chain(&model.candidates);
+    let effects = model.effects.iter().chain(&model.candidates).chain(&model.chosen);
     let found = effects.filter_map(|e| registry.find(Kind::Effect, &e.id).ok());
-    let mut needs: Vec<String> = found.flat_map(|f| f.info.manifest.needs.clone()).collect();
+    let mut needs: Vec<String> = found.flat_map(|f| f.info.manifest.needs.clone()).chain(model.needs.clone()).collect();
     needs.sort();
     needs.dedup();
     needs
+}
+
+/// How a plugin stands to the model.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Standing {
+    /// A stage, or an effect of the model.
+    Member,
+    /// An effect that is tried beside the model in every form that it may have.
+    Candidate,
+    /// An effect that is tried beside the model in the form that its parameters say.
+    Chosen,
 }
 
 struct Builder<'a> {
@@ -92,7 +103,7 @@ impl Builder<'_> {
         let found = self.registry.find(Kind::Stage, id)?;
         let file = pipeline.path.display().to_string();
         let parameters = resolve_parameters(&file, &found.info.manifest, parameters)?;
-        self.add(&found, parameters, "", false)?;
+        self.add(&found, parameters, "", Standing::Member)?;
         Ok(())
     }
 
@@ -103,7 +114,7 @@ impl Builder<'_> {
             entry.check_instance(&found.info.manifest, self.mission).map_err(|what| self.model_error(what))?;
             let file = self.model.path.display().to_string();
             let parameters = resolve_parameters(&file, &found.info.manifest, &entry.parameters)?;
-            let linked = self.add(&found, parameters, &entry.instance, false)?;
+            let linked = self.add(&found, parameters, &entry.instance, Standing::Member)?;
             self.take_coefficients(entry, linked.coefficients, false)?;
             for constraint in linked.constraints {
                 self.merge(&mut constraints, constraint)?;
@@ -112,8 +123,10 @@ impl Builder<'_> {
         self.chain.constraints =
             constraints.into_iter().filter(|(c, contributed)| *contributed >= c.parts).map(|(c, _)| c).collect();
         self.apply_noise_levels()?;
-        for entry in &self.model.candidates {
-            if let Err(reason) = self.candidate(entry) {
+        let candidates = self.model.candidates.iter().map(|entry| (entry, Standing::Candidate));
+        let chosen = self.model.chosen.iter().map(|entry| (entry, Standing::Chosen));
+        for (entry, standing) in candidates.chain(chosen) {
+            if let Err(reason) = self.candidate(entry, standing) {
                 let name = format!("{}:{}", entry.id, entry.instance);
                 self.chain.not_tried.push((name, reason.to_string()));
             }
@@ -130,11 +143,16 @@ impl Builder<'_> {
     }
 
     /// An effect that is not in the model: what keeps it from being tried is no error of the run.
-    fn candidate(&mut self, entry: &EffectEntry) -> Result<(), ChainError> {
+    fn candidate(&mut self, entry: &EffectEntry, standing: Standing) -> Result<(), ChainError> {
         let found = self.registry.find(Kind::Effect, &entry.id)?;
+        let mut linked = self.chain.coefficients.iter();
+        if let Some(c) = linked.find(|c| c.effect == entry.id && c.instance == entry.instance) {
+            // Before it is linked, because its table has the name of the other's.
+            return Err(self.model_error(format!("coefficient {} exists twice", c.name)));
+        }
         let file = self.model.path.display().to_string();
         let parameters = resolve_parameters(&file, &found.info.manifest, &entry.parameters)?;
-        let linked = self.add(&found, parameters, &entry.instance, true)?;
+        let linked = self.add(&found, parameters, &entry.instance, standing)?;
         self.take_coefficients(entry, linked.coefficients, true)
     }
 
@@ -198,22 +216,22 @@ impl Builder<'_> {
         found: &Found,
         parameters: Map<String, Value>,
         instance: &str,
-        candidate: bool,
+        standing: Standing,
     ) -> Result<Linked, ChainError> {
         let config = Config {
             value: json!({
                 "parameters": parameters,
                 "mission": self.mission.value,
                 "instance": instance,
-                "candidate": candidate,
+                "candidate": standing == Standing::Candidate,
                 "needs": self.needs,
                 "settings": self.settings,
                 "threads": self.chain.carry.threads,
             }),
         };
         let mut node = found.create(&config)?;
-        let mut linked =
-            node.link(LinkRequest { available: &self.available, model_json: &self.model_json(candidate) })?;
+        let model_json = self.model_json(standing != Standing::Member);
+        let mut linked = node.link(LinkRequest { available: &self.available, model_json: &model_json })?;
         self.take_noise(&node.name, std::mem::take(&mut linked.noise))?;
         self.inherit_loop(&mut linked);
         node.activate(u32::try_from(self.chain.carry.batch_rows).unwrap_or(u32::MAX))?;
@@ -293,4 +311,18 @@ pub(crate) fn open_source(found: &Found, config: &Config) -> Result<(Instance, V
     let linked = instance.link(LinkRequest { available: &[], model_json: "{}" })?;
     instance.activate(u32::MAX)?;
     Ok((instance, linked.writes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::path::Path;
+
+    #[test]
+    fn what_the_host_asks_for_is_needed_once_without_any_effect() {
+        let mut model = Model::parse(Path::new("m.toml"), "[model]\nrevision = \"1\"\n").expect("a model");
+        assert!(needs(&Registry::default(), &model).is_empty());
+        model.needs = vec![dragfree_schema::PREDICTION_NEED.to_owned(); 2];
+        assert_eq!(needs(&Registry::default(), &model), ["prediction"]);
+    }
 }

@@ -21,6 +21,10 @@ pub struct Model {
     pub effects: Vec<EffectEntry>,
     /// Effects that are not in the file but are to be tried beside it.
     pub candidates: Vec<EffectEntry>,
+    /// As `candidates`, each in the one form that its parameters say.
+    pub chosen: Vec<EffectEntry>,
+    /// What the host itself asks of stages by name, beside what the effects need.
+    pub needs: Vec<String>,
 }
 
 /// One `[[effect]]`.
@@ -112,6 +116,8 @@ impl Model {
             parent: file.model.parent,
             effects: file.effect,
             candidates: Vec::new(),
+            chosen: Vec::new(),
+            needs: Vec::new(),
         })
     }
 

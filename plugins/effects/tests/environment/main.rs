@@ -1,6 +1,7 @@
 //! Effects of the environment through the plugin interface, compared with independent physics.
 
 mod harness;
+mod prediction;
 
 use harness::{AXES, DT_S, START_NS, Telemetry, mission, relative_difference};
 use nalgebra::{Matrix3, Vector3};

@@ -2,12 +2,17 @@
 
 use crate::common::{AttitudeLoop, levels, mission};
 use dragfree_engine::border::{Config, Instance, Kind, Library, LinkRequest, Rows};
-use dragfree_engine::table::{Batch, Column};
+use dragfree_engine::chain::{Carry, build};
+use dragfree_engine::config::{Mission, Model, Pipeline};
+use dragfree_engine::registry::Registry;
+use dragfree_engine::table::{Batch, Column, TableSpec};
+use dragfree_sdk::prelude::{PREDICTION_NEED, UNPREDICTED_ATTRIBUTE};
 use nalgebra::Vector3;
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use serde_json::{Value, json};
+use std::path::{Path, PathBuf};
 
 /// Fields of the interface that the stage may read: prefix, leaves, unit, frame.
 const INTERFACE: [(&str, &[&str], &str, &str); 18] = [
@@ -90,10 +95,14 @@ impl Grid {
 /// The shared library that cargo built for this test lies beside its program; the one a folder up is that of the last
 /// `cargo build` and may be stale.
 fn library() -> Library {
+    Library::open(&library_path()).expect("cargo builds the library before its tests")
+}
+
+fn library_path() -> PathBuf {
     let program = std::env::current_exe().expect("a test program has a path");
     let folder = program.parent().expect("target/PROFILE/deps/test");
     let name = format!("{}dragfree_hinf_dfacs{}", std::env::consts::DLL_PREFIX, std::env::consts::DLL_SUFFIX);
-    Library::open(&folder.join(name)).expect("cargo builds the library before its tests")
+    folder.join(name)
 }
 
 fn create(library: &Library, parameters: &Value, needs: &[&str]) -> Instance {
@@ -302,6 +311,61 @@ fn what_is_asked_for_comes_beside_the_rest() {
     for (column, values) in on_demand.columns.iter().zip(&on_demand.rows.columns).skip(27) {
         let told = column.name.replace("used.sun_srf", "ephemeris.sun_srf").replace("used.", "command.");
         assert_eq!(*values, grid.rows.columns[at(&grid, &told)], "{told}");
+    }
+}
+
+/// All columns are those of the commanded angular acceleration, whatever the parameter says, with what they lack.
+#[test]
+fn in_prediction_mode_columns_state_what_they_lack() {
+    let needs = ["commands", "dws-delay-response", "prediction", "torque-response"];
+    let grid = Grid::of_the_loop(3000);
+    let commanded = run(&grid, &json!({"angular_acceleration": "commanded"}), 4096);
+    let at = |o: &Output, name: &str| o.columns.iter().position(|c| c.name == name).expect("a column");
+    for method in ["smoother", "second-difference", "commanded"] {
+        let predicted = run_asked(&grid, &json!({"angular_acceleration": method}), 4096, &needs);
+        for (column, values) in predicted.columns.iter().zip(&predicted.rows.columns) {
+            let lacks = column.attributes.get("unpredicted").map(String::as_str);
+            let want = match column.name.split_once('.').expect("a body") {
+                ("sc", rest) => rest.strip_prefix("alpha_srf_rad_s2.").map(|axis| format!("sc.alpha.{axis}")),
+                (tm, rest) => rest.strip_prefix("u_orf_m_s2.").map(|axis| format!("{tm}.accel.{axis}")),
+            };
+            let want = want.filter(|_| !column.name.starts_with("response.")).map(|of| format!("{{\"{of}\":1.0}}"));
+            assert_eq!(lacks, want.as_deref(), "{}", column.name);
+            if want.is_some() {
+                assert!(*values == commanded.rows.columns[at(&commanded, &column.name)], "{}", column.name);
+            }
+        }
+        assert_eq!(predicted.report["quality"]["angular_acceleration"], "commanded");
+        assert!(!notes(&predicted.report).contains("biases the calibration"), "{}", notes(&predicted.report));
+    }
+    let attributes = |o: &Output| o.columns.iter().flat_map(|c| c.attributes.keys().cloned()).collect::<Vec<_>>();
+    assert!(!attributes(&commanded).contains(&"unpredicted".to_owned()));
+}
+
+/// The stage in a chain of the engine, whose host asks: what it declares has no estimate.
+#[test]
+fn what_the_host_asks_for_reaches_the_stage() {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join("asked");
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let file = library_path();
+    std::fs::copy(&file, folder.join(file.file_name().expect("a file"))).expect("cargo builds the library");
+    let registry = Registry::discover(std::slice::from_ref(&folder));
+    let grid =
+        TableSpec { name: "grid".to_owned(), rate_hz: 10.0, columns: Grid::of_the_loop(1).columns, truth: false };
+    let file = folder.join("pipeline.toml");
+    let text = "[pipeline]\nname = \"p\"\nproduct = \"P\"\nrelease = 1\n[[stage]]\nplugin = \"hinf-dfacs\"\n";
+    std::fs::write(&file, text).expect("written");
+    let pipeline = Pipeline::load(&file).expect("a pipeline");
+    let text = include_str!("../../../../fixtures/missions/taiji.toml");
+    let mission = Mission::parse(Path::new("taiji.toml"), text).expect("a mission");
+    let mut model = Model::parse(Path::new("m.toml"), "[model]\nrevision = \"1\"\n").expect("a model");
+    for asked in [false, true] {
+        model.needs = if asked { vec![PREDICTION_NEED.to_owned()] } else { Vec::new() };
+        let carry = Carry { batch_rows: 4096, threads: 1 };
+        let chain = build(&registry, &pipeline, &mission, &model, std::slice::from_ref(&grid), carry).expect("a chain");
+        let stated = chain.columns.iter().filter(|c| c.attributes.contains_key(UNPREDICTED_ATTRIBUTE)).count();
+        let torque = chain.noise.iter().find(|p| p.name == "thruster_torque").expect("torque noise");
+        assert_eq!((stated, torque.estimate.is_none()), if asked { (9, true) } else { (0, false) });
     }
 }
 

@@ -14,7 +14,8 @@ pub(crate) const RATE_HZ: f64 = 10.0;
 pub(crate) const DT_S: f64 = 1.0 / RATE_HZ;
 
 /// Every column on demand.
-pub(crate) const EVERYTHING: Needs = Needs { commands: true, torque_response: true, dws_delay_response: true };
+pub(crate) const EVERYTHING: Needs =
+    Needs { commands: true, torque_response: true, dws_delay_response: true, prediction: false };
 
 /// The default mission without sunlight, so that nothing but the loop moves the spacecraft, with its controllers
 /// designed once for all tests.

@@ -7,5 +7,6 @@ mod correlation;
 mod noise;
 mod on_demand;
 mod posterior;
+mod prediction;
 mod slope;
 mod stream;

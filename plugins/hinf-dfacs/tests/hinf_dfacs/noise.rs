@@ -1,8 +1,12 @@
 //! The declared noise, as the estimators model it.
 
 use dragfree_estimation::sigma::NoiseModel;
-use dragfree_hinf_dfacs::noise::declared;
+use dragfree_hinf_dfacs::noise::{declared, declared_for_prediction};
 use dragfree_physics::mission::Mission;
+use dragfree_sdk::prelude::{NoiseProcess, NoiseResponse};
+use nalgebra::{DMatrix, Matrix3, Vector3};
+
+use crate::correlation::layout;
 
 fn taiji() -> Mission {
     let text = include_str!("../../../../fixtures/missions/taiji.toml");
@@ -109,4 +113,77 @@ fn the_noise_of_x_is_that_of_the_instrument_that_reads_it() {
         |noise: &Option<dragfree_physics::mission::DisplacementNoise>| noise.as_ref().expect("there").shape().psd(1.0);
     let ratio = asd(&mission.noise.is_x) / asd(&mission.noise.ifo_x);
     assert!((second / first / ratio - 1.0).abs() < 1e-12, "{second:e} {first:e}");
+}
+
+/// `T_S^{O_i}` of the paper's benches at ±30°.
+fn orf_from_srf(tm: usize) -> Matrix3<f64> {
+    let (sin, cos) = [30.0_f64, -30.0][tm].to_radians().sin_cos();
+    Matrix3::new(cos, sin, 0.0, -sin, cos, 0.0, 0.0, 0.0, 1.0)
+}
+
+/// Sum over processes of `M C Mᵀ` in the nine channels, with the PSD at 1 Hz.
+fn in_the_nine(processes: &[&NoiseProcess]) -> DMatrix<f64> {
+    let mut sum = DMatrix::zeros(9, 9);
+    for process in processes {
+        let gains = DMatrix::from_fn(9, 3, |i, j| process.enters.get(NINE[i]).map_or(0.0, |row| row[j]));
+        let covariance = process.covariance.as_ref();
+        let covariance = DMatrix::from_fn(3, 3, |i, j| covariance.map_or(f64::from(u8::from(i == j)), |c| c[i][j]));
+        sum += &gains * covariance * gains.transpose() * process.spectrum.as_ref().expect("known").psd(1.0);
+    }
+    sum
+}
+
+fn named<'a>(all: &'a [NoiseProcess], name: &str) -> &'a NoiseProcess {
+    all.iter().find(|p| p.name == name).unwrap_or_else(|| panic!("no {name}"))
+}
+
+/// Reference: each thruster's wrench as the channels see it, `−T d/m_S` and `J_S⁻¹(r × d)`. Force and torque of one
+/// thruster are one noise.
+#[test]
+fn for_prediction_the_noise_of_a_layout_is_the_sum_over_its_thrusters() {
+    let mission = Mission { thrusters: Some(layout()), ..taiji() };
+    let all = declared_for_prediction(&mission, &[["ifo_x", "is_y", "is_z"]; 2]);
+    let torque = named(&all, "thruster_torque");
+    assert!(torque.estimate.is_none() && torque.enters.len() == 9 && torque.response == NoiseResponse::Held);
+    let inverse = mission.spacecraft.inertia().try_inverse().expect("an inertia");
+    let mut want = DMatrix::zeros(9, 9);
+    for unit in layout().unit {
+        let push = Vector3::from(unit.direction_srf).normalize() * unit.asd_n_rthz;
+        let turn = inverse * Vector3::from(unit.position_srf_m).cross(&push);
+        let pushed = [0, 1].map(|tm| orf_from_srf(tm) * push / -mission.spacecraft.mass_kg);
+        let seen = DMatrix::from_fn(9, 1, |i, _| [pushed[0], pushed[1], turn][i / 3][i % 3]);
+        want += &seen * seen.transpose();
+    }
+    let got = in_the_nine(&[torque, named(&all, "thruster_force")]);
+    let scale = |i: usize, j: usize| (want[(i, i)] * want[(j, j)]).sqrt();
+    let largest = |got: &DMatrix<f64>| {
+        let error = |(i, j): (usize, usize)| (got[(i, j)] - want[(i, j)]).abs() / scale(i, j);
+        (0..9).flat_map(|i| (0..9).map(move |j| (i, j))).map(error).fold(0.0, f64::max)
+    };
+    assert!(largest(&got) < 1e-9, "{:e}", largest(&got));
+    // The twin: without the force that comes with the torque.
+    let mut apart = torque.clone();
+    apart.enters.retain(|channel, _| channel.starts_with("sc.alpha."));
+    assert!(largest(&in_the_nine(&[&apart, named(&all, "thruster_force")])) > 0.1);
+}
+
+/// Noise per axis: the torque enters the attitude alone, by `J_S⁻¹`, and all else is as without prediction.
+#[test]
+fn for_prediction_the_torque_of_axes_enters_the_attitude_alone() {
+    let mission = taiji();
+    let readouts = [["ifo_x", "is_y", "is_z"]; 2];
+    let (all, usual) = (declared_for_prediction(&mission, &readouts), declared(&mission, &readouts));
+    let torque = named(&all, "thruster_torque");
+    let inverse = mission.spacecraft.inertia().try_inverse().expect("an inertia");
+    assert!(torque.estimate.is_none());
+    assert_eq!(torque.enters.keys().collect::<Vec<_>>(), ["sc.alpha.x", "sc.alpha.y", "sc.alpha.z"]);
+    for (i, axis) in ["x", "y", "z"].iter().enumerate() {
+        let row = &torque.enters[&format!("sc.alpha.{axis}")];
+        assert!((0..3).all(|j| (row[j] - inverse[(i, j)]).abs() < 1e-15), "{axis}: {row:?}");
+    }
+    let without = |all: &[NoiseProcess]| -> Vec<NoiseProcess> {
+        all.iter().filter(|p| p.name != "thruster_torque").cloned().collect()
+    };
+    assert_eq!(without(&all), without(&usual));
+    assert!(named(&usual, "thruster_torque").estimate.is_some());
 }

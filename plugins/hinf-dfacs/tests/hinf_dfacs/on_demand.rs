@@ -13,8 +13,8 @@ use crate::correlation::layout;
 use crate::slope::{Against, DECADES, Response, of_responses};
 use crate::stream::{alpha, holes, telemetry, with_replay};
 
-const COMMANDS: Needs = Needs { commands: true, torque_response: false, dws_delay_response: false };
-const DELAY: Needs = Needs { commands: false, torque_response: false, dws_delay_response: true };
+const COMMANDS: Needs = Needs { dws_delay_response: false, torque_response: false, ..EVERYTHING };
+const DELAY: Needs = Needs { commands: false, torque_response: false, ..EVERYTHING };
 
 fn asking(needs: Needs) -> Settings {
     Settings { needs, ..settings(Smoother) }

@@ -1,0 +1,318 @@
+//! From the sums of a pass to a set of effects: the gain in the likelihood of every set, with everything that is not
+//! asked for fitted beside it.
+
+use nalgebra::{DMatrix, DVector};
+
+use super::filter::Sums;
+
+/// Part of a coefficient's information that the others must leave for it to be observable.
+const OBSERVABLE: f64 = 1e-8;
+/// Rounds of fixing values at the ends of their ranges.
+const ROUNDS: usize = 20;
+
+/// An effect that may be in the model or not.
+#[derive(Clone, Debug)]
+pub struct Candidate {
+    /// Its parameters.
+    pub parameters: Vec<usize>,
+    /// Lower ends of their ranges.
+    pub lower: Vec<f64>,
+    /// Upper ends.
+    pub upper: Vec<f64>,
+    /// Logarithm of the weight that it has before any data.
+    pub ln_prior: f64,
+    /// Whether its form is a point of a grid, so that the true one differs from it.
+    pub shaped: bool,
+}
+
+/// What counts as evidence.
+pub struct Evidence<'a> {
+    /// Decimal logarithm of the corrected p-value of a gain of a candidate.
+    pub log10_p: &'a dyn Fn(usize, f64) -> f64,
+    /// The same below which a candidate is added.
+    pub bound: f64,
+    /// Most candidates in a set.
+    pub most: usize,
+    /// Part of the gain of a candidate whose form is a point of a grid that the true form may leave to others.
+    pub remainder: f64,
+}
+
+/// What is known of a sum of parameters beside the data: a Gaussian about `mean`.
+#[derive(Clone, Copy, Debug)]
+pub struct Prior {
+    /// Mean.
+    pub mean: f64,
+    /// Standard deviation.
+    pub sigma: f64,
+}
+
+/// Values, their covariance and the gain 2 Δ ln L.
+#[derive(Clone, Debug)]
+pub struct Fitted {
+    /// Index of the candidate.
+    pub candidate: usize,
+    /// Values inside their ranges.
+    pub values: Vec<f64>,
+    /// Values without ranges.
+    pub free: Vec<f64>,
+    /// Covariance of the free values, everything else fitted.
+    pub covariance: DMatrix<f64>,
+    /// Twice the logarithm of the ratio of likelihoods with and without it.
+    pub gain: f64,
+    /// Others that explain as much in its place, with their probabilities, and its own.
+    pub alternatives: Vec<(usize, f64)>,
+    /// Its probability among them.
+    pub probability: f64,
+}
+
+/// The chosen set, and what the others would add to it.
+#[derive(Clone, Debug)]
+pub struct Selection {
+    /// Effects of the set, in the order of the candidates.
+    pub chosen: Vec<Fitted>,
+    /// The others, each beside the set.
+    pub rest: Vec<Fitted>,
+    /// Candidates without information beside the model.
+    pub unobservable: Vec<usize>,
+    /// Values of all parameters; zero for candidates that are not chosen.
+    pub values: DVector<f64>,
+    /// σ of all parameters of the model and of the set.
+    pub sigma: DVector<f64>,
+}
+
+/// The likelihood near a point as a quadratic form in the values of all parameters.
+pub struct Quadratic {
+    information: DMatrix<f64>,
+    /// Such that `score − information · values` is the derivative at `values`.
+    score: DVector<f64>,
+    base: Vec<usize>,
+    candidates: Vec<Candidate>,
+    /// Information and score of the candidates' parameters, the base fitted, by index of the parameter.
+    profiled: DMatrix<f64>,
+    profiled_score: DVector<f64>,
+}
+
+impl Quadratic {
+    /// From sums about the values `start`, with what is known of weighted sums of parameters. Parameters of no
+    /// candidate are the base, which is in every set.
+    pub fn new(sums: &Sums, start: &[f64], priors: &[(Vec<(usize, f64)>, Prior)], candidates: Vec<Candidate>) -> Self {
+        let mut information = sums.information.clone();
+        let mut score = DVector::from_column_slice(&sums.score) + &information * DVector::from_column_slice(start);
+        for (terms, prior) in priors {
+            let known = prior.sigma.powi(-2);
+            for (i, a) in terms {
+                score[*i] += a * known * prior.mean;
+                terms.iter().for_each(|(j, b)| information[(*i, *j)] += a * b * known);
+            }
+        }
+        let optional = |i: &usize| candidates.iter().any(|c| c.parameters.contains(i));
+        let base: Vec<usize> = (0..start.len()).filter(|i| !optional(i)).collect();
+        let mut quadratic =
+            Self { profiled: information.clone(), profiled_score: score.clone(), information, score, base, candidates };
+        quadratic.profile();
+        quadratic
+    }
+
+    fn profile(&mut self) {
+        let inner = self.inverse(&self.base);
+        let b = &self.base;
+        let p = self.score.len();
+        let across = DMatrix::from_fn(p, b.len(), |i, j| self.information[(i, b[j])]);
+        let along = &across * inner;
+        self.profiled = &self.information - &along * across.transpose();
+        self.profiled_score = &self.score - &along * DVector::from_fn(b.len(), |i, _| self.score[b[i]]);
+    }
+
+    /// Inverse of the information of some parameters; those without any get a variance of zero.
+    fn inverse(&self, of: &[usize]) -> DMatrix<f64> {
+        inverse(&DMatrix::from_fn(of.len(), of.len(), |i, j| self.information[(of[i], of[j])]))
+    }
+
+    fn parameters(&self, set: &[usize]) -> Vec<usize> {
+        set.iter().flat_map(|c| self.candidates[*c].parameters.iter().copied()).collect()
+    }
+
+    /// Values inside the ranges and the gain of a set of candidates.
+    fn fit(&self, set: &[usize]) -> (Vec<f64>, f64) {
+        let at = self.parameters(set);
+        let bounds: Vec<(f64, f64)> = set
+            .iter()
+            .flat_map(|c| self.candidates[*c].lower.iter().copied().zip(self.candidates[*c].upper.iter().copied()))
+            .collect();
+        let n = DMatrix::from_fn(at.len(), at.len(), |i, j| self.profiled[(at[i], at[j])]);
+        let s = DVector::from_fn(at.len(), |i, _| self.profiled_score[at[i]]);
+        let mut fixed: Vec<Option<f64>> = vec![None; at.len()];
+        let mut values = DVector::zeros(at.len());
+        for _ in 0..ROUNDS {
+            let free: Vec<usize> = (0..at.len()).filter(|i| fixed[*i].is_none()).collect();
+            let held = DVector::from_fn(at.len(), |i, _| fixed[i].unwrap_or(0.0));
+            let rest = &s - &n * &held;
+            let own = inverse(&DMatrix::from_fn(free.len(), free.len(), |i, j| n[(free[i], free[j])]));
+            let solved = own * DVector::from_fn(free.len(), |i, _| rest[free[i]]);
+            values = held;
+            free.iter().zip(solved.iter()).for_each(|(i, x)| values[*i] = *x);
+            let outside = free.iter().find(|i| values[**i] < bounds[**i].0 || values[**i] > bounds[**i].1);
+            let Some(i) = outside else { break };
+            fixed[*i] = Some(values[*i].clamp(bounds[*i].0, bounds[*i].1));
+        }
+        let gain = 2.0 * s.dot(&values) - values.dot(&(&n * &values));
+        (values.iter().copied().collect(), gain)
+    }
+
+    /// A candidate beside a set, or in it.
+    fn beside(&self, candidate: usize, set: &[usize]) -> Fitted {
+        let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
+        let all: Vec<usize> = others.iter().copied().chain([candidate]).collect();
+        let (values, with) = self.fit(&all);
+        let (_, without) = self.fit(&others);
+        let at = self.parameters(&all);
+        let own = self.candidates[candidate].parameters.len();
+        let n = DMatrix::from_fn(at.len(), at.len(), |i, j| self.profiled[(at[i], at[j])]);
+        let covariance = inverse(&n);
+        let free = &covariance * DVector::from_fn(at.len(), |i, _| self.profiled_score[at[i]]);
+        let first = at.len() - own;
+        Fitted {
+            candidate,
+            values: values[first..].to_vec(),
+            free: free.as_slice()[first..].to_vec(),
+            covariance: covariance.view((first, first), (own, own)).into_owned(),
+            gain: (with - without).max(0.0),
+            alternatives: Vec::new(),
+            probability: 1.0,
+        }
+    }
+
+    /// Part of the information of a candidate that the base and a set leave.
+    fn left(&self, candidate: usize, set: &[usize]) -> f64 {
+        let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
+        let at = self.parameters(&others);
+        let inner = inverse(&DMatrix::from_fn(at.len(), at.len(), |i, j| self.profiled[(at[i], at[j])]));
+        let left = |p: &usize| {
+            let across = DVector::from_fn(at.len(), |i, _| self.profiled[(*p, at[i])]);
+            (self.profiled[(*p, *p)] - across.dot(&(&inner * &across))) / self.information[(*p, *p)]
+        };
+        self.candidates[candidate].parameters.iter().map(left).fold(f64::INFINITY, f64::min)
+    }
+
+    /// The set of effects: the most significant one is added as long as it is significant,
+    /// one that is not needed beside the others is taken out, and one is exchanged where another explains more.
+    pub fn select(&self, evidence: &Evidence<'_>) -> Selection {
+        let Evidence { bound, most, .. } = *evidence;
+        let log10_p = |c: usize, set: &[usize]| self.log10_p(c, set, evidence);
+        let observable = |c: &usize, set: &[usize]| self.left(*c, set) > OBSERVABLE;
+        let all: Vec<usize> = (0..self.candidates.len()).collect();
+        let unobservable: Vec<usize> = all.iter().copied().filter(|c| !observable(c, &[])).collect();
+        let usable: Vec<usize> = all.into_iter().filter(|c| !unobservable.contains(c)).collect();
+        let mut set: Vec<usize> = Vec::new();
+        // Each step raises the evidence of the set; the number of steps is bounded in case rounding undoes one.
+        for _ in 0..4 * most {
+            let next = usable.iter().filter(|c| !set.contains(c) && observable(c, &set));
+            let all = next.map(|c| (*c, log10_p(*c, &set)));
+            let best = all.min_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, p)| *p < bound && set.len() < most);
+            if let Some((c, _)) = best {
+                set.push(c);
+            }
+            let exchanged = self.exchange(&mut set, &usable);
+            let weak = set.iter().map(|c| (*c, log10_p(*c, &set)));
+            let weakest = weak.max_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, p)| *p >= bound);
+            if let Some((weak, _)) = weakest {
+                set.retain(|c| *c != weak);
+                if best.is_some_and(|(c, _)| c == weak) && !exchanged {
+                    break;
+                }
+            } else if best.is_none() && !exchanged {
+                break;
+            }
+        }
+        set.sort_unstable();
+        let chosen = set.iter().map(|c| self.with_alternatives(*c, &set, &usable)).collect();
+        let rest =
+            usable.iter().filter(|c| !set.contains(c) && observable(c, &set)).map(|c| self.beside(*c, &set)).collect();
+        let (values, sigma) = self.solution(&set);
+        Selection { chosen, rest, unobservable, values, sigma }
+    }
+
+    /// Decimal logarithm of the p-value of a candidate beside a set; that of chance where it may be what the form of
+    /// another leaves.
+    fn log10_p(&self, candidate: usize, set: &[usize], evidence: &Evidence<'_>) -> f64 {
+        let gain = self.beside(candidate, set).gain;
+        let shaped = set.iter().filter(|c| **c != candidate && self.candidates[**c].shaped);
+        let largest = shaped.map(|c| self.beside(*c, set).gain).fold(0.0, f64::max);
+        if gain < evidence.remainder * largest { 0.0 } else { (evidence.log10_p)(candidate, gain) }
+    }
+
+    /// Puts another candidate in the place of one of the set where that has a larger posterior probability.
+    fn exchange(&self, set: &mut [usize], usable: &[usize]) -> bool {
+        let mut changed = false;
+        for i in 0..set.len() {
+            let worth =
+                |set: &[usize]| self.fit(set).1 + 2.0 * set.iter().map(|c| self.candidates[*c].ln_prior).sum::<f64>();
+            let mut best = (set[i], worth(set));
+            for c in usable.iter().filter(|c| !set.contains(c)) {
+                let mut other = set.to_vec();
+                other[i] = *c;
+                let value = worth(&other);
+                if value > best.1 + 1e-6 {
+                    best = (*c, value);
+                }
+            }
+            changed |= best.0 != set[i];
+            set[i] = best.0;
+        }
+        changed
+    }
+
+    fn with_alternatives(&self, candidate: usize, set: &[usize], usable: &[usize]) -> Fitted {
+        let mut fitted = self.beside(candidate, set);
+        let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
+        let (_, without) = self.fit(&others);
+        let evidence = |c: usize| {
+            let all: Vec<usize> = others.iter().copied().chain([c]).collect();
+            0.5 * (self.fit(&all).1 - without) + self.candidates[c].ln_prior
+        };
+        let own = evidence(candidate);
+        let weights: Vec<(usize, f64)> = usable
+            .iter()
+            .filter(|c| !set.contains(c))
+            .map(|c| (*c, (evidence(*c) - own).min(0.0).exp()))
+            .filter(|(_, weight)| *weight > 1e-3)
+            .collect();
+        let sum = 1.0 + weights.iter().map(|(_, w)| w).sum::<f64>();
+        fitted.probability = sum.recip();
+        fitted.alternatives = weights.into_iter().map(|(c, w)| (c, w / sum)).collect();
+        fitted.alternatives.sort_by(|a, b| b.1.total_cmp(&a.1));
+        fitted
+    }
+
+    /// Values and σ of the base and of a set.
+    pub fn solution(&self, set: &[usize]) -> (DVector<f64>, DVector<f64>) {
+        let p = self.score.len();
+        let (mut values, mut sigma) = (DVector::zeros(p), DVector::zeros(p));
+        let at = self.parameters(set);
+        let (inside, _) = self.fit(set);
+        at.iter().zip(inside).for_each(|(i, x)| values[*i] = x);
+        let rest = &self.score - &self.information * &values;
+        let solved = self.inverse(&self.base) * DVector::from_fn(self.base.len(), |i, _| rest[self.base[i]]);
+        self.base.iter().zip(solved.iter()).for_each(|(i, x)| values[*i] = *x);
+        let all: Vec<usize> = self.base.iter().copied().chain(at).collect();
+        let covariance = self.inverse(&all);
+        all.iter().enumerate().for_each(|(k, i)| sigma[*i] = covariance[(k, k)].max(0.0).sqrt());
+        (values, sigma)
+    }
+}
+
+/// Inverse of a symmetric matrix with rows of different units; rows of zeros stay zero.
+fn inverse(m: &DMatrix<f64>) -> DMatrix<f64> {
+    let unit: Vec<f64> = m.diagonal().iter().map(|d| if *d > 0.0 { d.sqrt().recip() } else { 0.0 }).collect();
+    let mut scaled = DMatrix::from_fn(m.nrows(), m.nrows(), |i, j| m[(i, j)] * unit[i] * unit[j]);
+    (0..m.nrows()).filter(|i| unit[*i] == 0.0).for_each(|i| scaled[(i, i)] = 1.0);
+    if m.is_empty() {
+        return scaled;
+    }
+    let eigen = scaled.symmetric_eigen();
+    // What differs from a combination of the others by rounding alone has no information of its own.
+    let least = 1e-13 * eigen.eigenvalues.max().max(1.0);
+    let reciprocal = eigen.eigenvalues.map(|x| if x > least { x.recip() } else { 0.0 });
+    let inner = &eigen.eigenvectors * DMatrix::from_diagonal(&reciprocal) * eigen.eigenvectors.transpose();
+    DMatrix::from_fn(m.nrows(), m.nrows(), |i, j| inner[(i, j)] * unit[i] * unit[j])
+}

@@ -1,0 +1,543 @@
+use std::collections::BTreeMap;
+
+use dragfree_schema::{Colour, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm};
+use nalgebra::{Cholesky, DMatrix, DVector};
+use rand::{RngExt as _, SeedableRng as _};
+use rand_xoshiro::Xoshiro256PlusPlus as StdRng;
+
+use super::decision::{Candidate, Evidence, Prior, Quadratic};
+use super::filter::{FREE, Innovations, POWERS, Parameter, Setup, Sums};
+use super::predictor::Predictor;
+use super::state_space::{NoisePoint, NoiseStates};
+
+const DT_S: f64 = 0.1;
+const STEP_NS: i64 = 100_000_000;
+
+fn process(name: &str, response: NoiseResponse, terms: &[(f64, f64, u32)], enters: &[(&str, &[f64])]) -> NoiseProcess {
+    let term = |(asd, corner_hz, exponent): &(f64, f64, u32)| NoiseTerm {
+        asd: *asd,
+        corner_hz: *corner_hz,
+        exponent: *exponent,
+    };
+    let size = enters[0].1.len();
+    NoiseProcess {
+        name: name.to_owned(),
+        response,
+        spectrum: Some(NoiseShape { terms: terms.iter().map(term).collect() }),
+        enters: enters.iter().map(|(c, gains)| ((*c).to_owned(), gains.to_vec())).collect(),
+        components: (0..size).map(|k| format!("{name}:{k}")).collect(),
+        ..NoiseProcess::default()
+    }
+}
+
+fn channels() -> Vec<String> {
+    ["a", "b"].map(str::to_owned).to_vec()
+}
+
+/// A force that both channels see, correlated with another, and a readout of each.
+fn declared() -> Vec<NoiseProcess> {
+    let force = process("force", NoiseResponse::Held, &[(2.0, 1.0, 0)], &[("a", &[1.0, 0.2]), ("b", &[0.5, -1.0])]);
+    vec![
+        NoiseProcess { covariance: Some(vec![vec![1.0, 0.3], vec![0.3, 2.0]]), ..force },
+        process("first", NoiseResponse::Differenced, &[(0.05, 1.0, 0), (0.05, 0.3, 2)], &[("a", &[1.0])]),
+        process("second", NoiseResponse::Differenced, &[(0.02, 1.0, 0), (0.02, 0.5, 4)], &[("b", &[1.0])]),
+    ]
+}
+
+fn normal(random: &mut StdRng) -> f64 {
+    let (u, v): (f64, f64) = (random.random(), random.random());
+    (-2.0 * (1.0 - u).ln()).sqrt() * (std::f64::consts::TAU * v).cos()
+}
+
+/// Covariances of the channels between samples `lag` apart, from the definitions: means of two held accelerations,
+/// second differences of readouts, and summed white noise among the readouts.
+fn autocovariance(point: &NoisePoint, lag: usize) -> DMatrix<f64> {
+    let known = DMatrix::identity(2, 2) + &point.unpredicted;
+    let levels = |k: usize| point.levels[k];
+    let force = DMatrix::from_row_slice(
+        2,
+        2,
+        &[levels(0) * levels(0), 0.3 * levels(0) * levels(1), 0.3 * levels(0) * levels(1), 2.0 * levels(1) * levels(1)],
+    ) * (4.0 / (2.0 * DT_S));
+    let enters = DMatrix::from_row_slice(2, 2, &[1.0, 0.2, 0.5, -1.0]);
+    // In powers of the delay.
+    let mean = [&known * &enters * 0.5, &known * &enters * 0.5];
+    let slope = &point.unpredicted_slope * &enters * (0.5 / DT_S);
+    let force_gains = [&mean[0] + &slope, mean[1].clone(), -slope];
+    let mut sum = DMatrix::zeros(2, 2);
+    for l in 0..3 - lag.min(3) {
+        sum += &force_gains[l + lag] * &force * force_gains[l].transpose();
+    }
+    let average = |i: usize, gains: [f64; 3], variance: f64, sum: &mut DMatrix<f64>| {
+        for l in 0..3 - lag.min(3) {
+            sum[(i, i)] += gains[l + lag] * gains[l] * variance;
+        }
+    };
+    let per = DT_S.powi(-2);
+    let second = [per, -2.0 * per, per];
+    let step = |corner: f64| std::f64::consts::TAU * corner * DT_S;
+    let white = |asd: f64, level: usize| (asd * levels(level)).powi(2) / (2.0 * DT_S);
+    average(0, second, white(0.05, 2), &mut sum);
+    average(0, [per, -per, 0.0], white(0.05, 2) * step(0.3).powi(2), &mut sum);
+    average(1, second, white(0.02, 3), &mut sum);
+    average(1, [per, 0.0, 0.0], white(0.02, 3) * step(0.5).powi(4), &mut sum);
+    sum
+}
+
+fn system() -> NoiseStates {
+    NoiseStates::new(&declared(), &channels(), DT_S, &[]).expect("a system")
+}
+
+fn some_point(system: &NoiseStates) -> NoisePoint {
+    let mut point = system.declared_point();
+    point.levels = vec![1.1, 0.9, 1.2, 0.8];
+    point.unpredicted[(0, 1)] = 0.3;
+    point.unpredicted[(1, 1)] = -0.2;
+    point.unpredicted_slope[(1, 0)] = 0.04;
+    point
+}
+
+/// Innovations are the data whitened by the Cholesky factor of the covariance of all samples, once the start is over.
+#[test]
+fn innovations_equal_those_of_the_covariance_of_all_samples() {
+    let system = system();
+    let point = some_point(&system);
+    let predictor = Predictor::new(&system, &system.driving(&point)).expect("a predictor");
+    let samples = 300;
+    let covariance = DMatrix::from_fn(2 * samples, 2 * samples, |i, j| {
+        let ((s, a), (t, b)) = ((i / 2, i % 2), (j / 2, j % 2));
+        if s >= t { autocovariance(&point, s - t)[(a, b)] } else { autocovariance(&point, t - s)[(b, a)] }
+    });
+    let factor = Cholesky::new(covariance).expect("positive").l();
+    let mut random = StdRng::seed_from_u64(1);
+    let white = DVector::from_fn(2 * samples, |_, _| normal(&mut random));
+    let data = &factor * &white;
+    let mut state = DVector::zeros(system.transition.nrows());
+    let mut worst = 0.0_f64;
+    for t in 0..samples {
+        let z = DVector::from_fn(2, |i, _| data[2 * t + i] / system.unit[i]);
+        let e = z - &system.output * &state;
+        state = &system.transition * state + &predictor.gain * &e;
+        let whitened = &predictor.whitening * e;
+        if t > 150 {
+            worst = worst.max((whitened[0] - white[2 * t]).abs()).max((whitened[1] - white[2 * t + 1]).abs());
+        }
+    }
+    assert!(worst < 1e-6, "{worst:e}");
+}
+
+/// A pass over `data` (rows of channels) with the series.
+fn pass(
+    system: &NoiseStates,
+    point: &NoisePoint,
+    parameters: Vec<Parameter>,
+    data: &[[f64; 2]],
+    series: &[Vec<f64>],
+    threads: usize,
+) -> Sums {
+    let predictor = Predictor::new(system, &system.driving(point)).expect("a predictor");
+    let count = series.first().map_or(0, Vec::len);
+    let setup = Setup {
+        system,
+        predictor: &predictor,
+        known: Vec::new(),
+        parameters,
+        starts: Vec::new(),
+        series: count,
+        averaged: false,
+        step_ns: STEP_NS,
+        threads,
+    };
+    let mut innovations = Innovations::new(setup);
+    for (t, z) in data.iter().enumerate() {
+        innovations.push(t as i64 * STEP_NS, z, series.get(t).map_or(&[], Vec::as_slice));
+    }
+    innovations.finish()
+}
+
+/// `log L` of the innovations that a pass sums.
+fn log_likelihood(system: &NoiseStates, point: &NoisePoint, data: &[[f64; 2]]) -> f64 {
+    let predictor = Predictor::new(system, &system.driving(point)).expect("a predictor");
+    let sums = pass(system, point, Vec::new(), data, &[], 1);
+    sums.samples as f64 * predictor.whitening.determinant().ln() - 0.5 * sums.chi2
+}
+
+fn noise(samples: usize, seed: u64) -> Vec<[f64; 2]> {
+    let mut random = StdRng::seed_from_u64(seed);
+    (0..samples).map(|_| [30.0 * normal(&mut random), 20.0 * normal(&mut random)]).collect()
+}
+
+fn moved(system: &NoiseStates, point: &NoisePoint, parameter: usize, by: f64) -> NoisePoint {
+    let mut point = point.clone();
+    match parameter {
+        0..4 => point.levels[parameter] *= by.exp(),
+        4 => point.unpredicted[(0, 1)] += by,
+        5 => point.unpredicted[(1, 0)] += by,
+        _ => point.unpredicted_slope[(0, 0)] += by,
+    }
+    assert_eq!(point.levels.len(), system.components.len());
+    point
+}
+
+fn change(system: &NoiseStates, point: &NoisePoint, parameter: usize) -> Parameter {
+    let h = 1e-4;
+    let at = |by: f64| system.driving(&moved(system, point, parameter, by));
+    let driving = (at(h) - at(-h)) / (2.0 * h);
+    let predictor = Predictor::new(system, &system.driving(point)).expect("a predictor");
+    Parameter { responses: Vec::new(), change: Some(predictor.change(system, &driving)) }
+}
+
+/// The score of levels and of everything else that changes the noise is the slope of the likelihood, on data that have
+/// another covariance than the model, so that no part of it is zero. The start is fitted and its squares are left out,
+/// 64 samples of 20,000: 0.3 %.
+#[test]
+fn scores_of_the_noise_are_slopes_of_the_likelihood() {
+    let system = system();
+    let point = some_point(&system);
+    let data = noise(20_000, 2);
+    let parameters: Vec<Parameter> = (0..7).map(|k| change(&system, &point, k)).collect();
+    let sums = pass(&system, &point, parameters, &data, &[], 1);
+    let h = 1e-4;
+    for k in 0..7 {
+        let at = |by: f64| log_likelihood(&system, &moved(&system, &point, k, by), &data);
+        let slope = (at(h) - at(-h)) / (2.0 * h);
+        assert!((sums.score[k] / slope - 1.0).abs() < 5e-3, "{k}: {} against {slope}", sums.score[k]);
+    }
+}
+
+/// The information of levels is the variance of their score over draws of the noise (200 draws: 10 % of a variance).
+#[test]
+fn the_information_is_the_variance_of_the_score() {
+    let system = system();
+    let point = some_point(&system);
+    let predictor = Predictor::new(&system, &system.driving(&point)).expect("a predictor");
+    let parameters: Vec<Parameter> = (0..7).map(|k| change(&system, &point, k)).collect();
+    let (mut squares, mut information) = ([0.0; 7], [0.0; 7]);
+    let draws = 200;
+    for seed in 0..draws {
+        let data = drawn(&system, &predictor, 1500, 100 + seed);
+        let sums = pass(&system, &point, parameters.clone(), &data, &[], 1);
+        for k in 0..7 {
+            squares[k] += sums.score[k].powi(2) / draws as f64;
+            information[k] += sums.information[(k, k)] / draws as f64;
+        }
+    }
+    for k in 0..7 {
+        let ratio = squares[k] / information[k];
+        // Four standard deviations of a variance from 200 draws.
+        assert!((ratio - 1.0).abs() < 0.4, "{k}: {ratio}");
+    }
+}
+
+/// Channels that a predictor's own innovations make.
+fn drawn(system: &NoiseStates, predictor: &Predictor, samples: usize, seed: u64) -> Vec<[f64; 2]> {
+    let mut random = StdRng::seed_from_u64(seed);
+    let root = Cholesky::new(predictor.innovation.clone()).expect("positive").l();
+    let mut state = DVector::zeros(system.transition.nrows());
+    let mut out = Vec::with_capacity(samples);
+    for _ in 0..samples {
+        let e = &root * DVector::from_fn(2, |_, _| normal(&mut random));
+        let z = &system.output * &state + &e;
+        state = &system.transition * state + &predictor.gain * e;
+        out.push([z[0] * system.unit[0], z[1] * system.unit[1]]);
+    }
+    out
+}
+
+/// An effect that filters noise: what the channels see of a component is `1 + c H` times as much, at any frequency.
+#[test]
+fn a_filtered_component_has_the_spectrum_of_its_filter() {
+    let (omega, damping) = (std::f64::consts::TAU * 0.5, 0.1);
+    let colour = Colour {
+        process: "force:0".to_owned(),
+        numerator: vec![0.0, 0.0, 1.0],
+        denominator: vec![omega * omega, damping * omega, 1.0],
+    };
+    let alone = process("force", NoiseResponse::Held, &[(2.0, 1.0, 0)], &[("a", &[1.0])]);
+    let readout = process("first", NoiseResponse::Differenced, &[(1e-4, 1.0, 0)], &[("a", &[1.0])]);
+    let one = ["a".to_owned()];
+    let system = NoiseStates::new(&[alone, readout], &one, DT_S, &[colour]).expect("a system");
+    let spectrum = |coefficient: f64, hz: f64| {
+        let mut point = system.declared_point();
+        point.filtered = vec![coefficient];
+        point.levels[1] = 1e-6;
+        let driving = system.driving(&point);
+        // One-sided density from the transfer function of the driving noise to the channel.
+        type C = nalgebra::Complex<f64>;
+        let n = system.transition.nrows();
+        let z = C::from_polar(1.0, std::f64::consts::TAU * hz * DT_S);
+        let resolvent =
+            DMatrix::from_fn(n, n, |i, j| C::from(-system.transition[(i, j)]) + if i == j { z } else { C::default() });
+        let output = system.output.map(C::from);
+        let states = output * resolvent.try_inverse().expect("no pole on the circle");
+        let row = DVector::from_fn(n + 1, |i, _| if i == 0 { C::from(1.0) } else { states[(0, i - 1)] });
+        let driving = driving.map(C::from);
+        (row.transpose() * driving * row.map(|x| x.conj()))[(0, 0)].re * 2.0 * DT_S * system.unit[0].powi(2)
+    };
+    for hz in [0.05, 0.3, 0.5, 0.7, 2.0] {
+        // The bilinear transform bends frequencies.
+        let bent = 2.0 / DT_S * (std::f64::consts::PI * hz * DT_S).tan();
+        let s = nalgebra::Complex::new(0.0, bent);
+        let h = s * s / (s * s + s * damping * omega + omega * omega);
+        let expected = (nalgebra::Complex::from(1.0) + h * 0.3).norm_sqr();
+        let measured = spectrum(0.3, hz) / spectrum(0.0, hz);
+        assert!((measured / expected - 1.0).abs() < 1e-6, "{hz}: {measured} against {expected}");
+    }
+    // Without the filter it is that of a held force, the mean of two samples.
+    let expected = 4.0 * (std::f64::consts::PI * 0.3 * DT_S).cos().powi(2);
+    assert!((spectrum(0.0, 0.3) / expected - 1.0).abs() < 1e-6);
+}
+
+/// Coloured terms have their spectrum between the least frequency and a tenth of the sampling rate.
+#[test]
+fn coloured_terms_have_their_spectra() {
+    for (response, exponent) in [(NoiseResponse::Held, 2), (NoiseResponse::Held, 4), (NoiseResponse::Differenced, 6)] {
+        let terms = [(1e-9, 1.0, 0), (3.0, 0.01, exponent)];
+        let noise = process("n", response, &terms, &[("a", &[1.0])]);
+        let system = NoiseStates::new(&[noise], &["a".to_owned()], DT_S, &[]).expect("a system");
+        let driving = system.driving(&system.declared_point());
+        type C = nalgebra::Complex<f64>;
+        for hz in [1e-3, 1e-2, 0.1] {
+            let n = system.transition.nrows();
+            let z = C::from_polar(1.0, std::f64::consts::TAU * hz * DT_S);
+            let resolvent = DMatrix::from_fn(n, n, |i, j| {
+                C::from(-system.transition[(i, j)]) + if i == j { z } else { C::default() }
+            });
+            let states = system.output.map(C::from) * resolvent.try_inverse().expect("no pole on the circle");
+            let row = DVector::from_fn(n + 1, |i, _| if i == 0 { C::from(1.0) } else { states[(0, i - 1)] });
+            let psd = (row.transpose() * driving.map(C::from) * row.map(|x| x.conj()))[(0, 0)].re
+                * 2.0
+                * DT_S
+                * system.unit[0].powi(2);
+            let mut expected = 9.0 * (0.01 / hz).powi(exponent.cast_signed());
+            if response == NoiseResponse::Differenced {
+                expected *= (std::f64::consts::TAU * hz).powi(4);
+            }
+            assert!((psd / expected - 1.0).abs() < 0.01, "{response:?} {exponent} {hz}: {}", psd / expected);
+        }
+    }
+}
+
+/// A double integrator under feedback by its noisy readout. A gain of the command is regressed on the command, which is
+/// made of the same noise: its score has mean zero and the variance of its information, 1 % to fail by chance (χ² of
+/// 200 runs). The twin with the command of one sample later has a mean far from zero.
+#[test]
+fn commands_in_the_loop_do_not_bias_a_gain() {
+    let force = process("force", NoiseResponse::Held, &[(1.0, 1.0, 0)], &[("a", &[1.0])]);
+    let readout = process("first", NoiseResponse::Differenced, &[(0.5, 1.0, 0)], &[("a", &[1.0])]);
+    let system = NoiseStates::new(&[force, readout], &["a".to_owned()], DT_S, &[]).expect("a system");
+    let predictor = Predictor::new(&system, &system.driving(&system.declared_point())).expect("a predictor");
+    let (force_sigma, readout_sigma) = ((1.0 / (2.0 * DT_S)).sqrt(), 0.5 * (1.0 / (2.0 * DT_S)).sqrt());
+    let runs = 200;
+    let [mut score, mut squares, mut information, mut wrong, mut wrong_information] = [0.0; 5];
+    for seed in 0..runs {
+        let mut random = StdRng::seed_from_u64(900 + seed);
+        let samples = 2000;
+        let (mut x, mut v, mut last) = (0.0, 0.0, 0.0);
+        let (mut readouts, mut commands) = (Vec::new(), Vec::new());
+        for _ in 0..samples {
+            let read = x + readout_sigma * normal(&mut random);
+            let command = -read - 1.5 * (read - last) / DT_S * 0.3;
+            last = read;
+            readouts.push(read);
+            commands.push(command);
+            let a = command + force_sigma * normal(&mut random);
+            x += v * DT_S + 0.5 * a * DT_S * DT_S;
+            v += a * DT_S;
+        }
+        let sums = |later: usize| {
+            let setup = Setup {
+                system: &system,
+                predictor: &predictor,
+                known: vec![(0, 0, 1.0)],
+                parameters: vec![Parameter { responses: vec![(0, 1, 1.0)], change: None }],
+                starts: Vec::new(),
+                series: 2,
+                averaged: true,
+                step_ns: STEP_NS,
+                threads: 1,
+            };
+            let mut innovations = Innovations::new(setup);
+            for t in 1..samples - 2 {
+                let z = (readouts[t + 1] - 2.0 * readouts[t] + readouts[t - 1]) / (DT_S * DT_S);
+                innovations.push(t as i64 * STEP_NS, &[z], &[commands[t], commands[t + later]]);
+            }
+            innovations.finish()
+        };
+        let (causal, acausal) = (sums(0), sums(1));
+        score += causal.score[0];
+        squares += causal.score[0].powi(2);
+        information += causal.information[(0, 0)];
+        wrong += acausal.score[0];
+        wrong_information += acausal.information[(0, 0)];
+    }
+    // 2.58 σ of a sum of 200, and the 99 % interval of χ² with 200 degrees of freedom. Not the mean of score over root
+    // information: both are made of the same noise.
+    let pull = score / information.sqrt();
+    assert!(pull.abs() < 2.58, "{pull}");
+    let chi2 = runs as f64 * squares / information;
+    assert!((152.2..255.3).contains(&chi2), "{chi2}");
+    assert!(wrong.abs() / wrong_information.sqrt() > 20.0, "{wrong}");
+}
+
+/// Threads change no digit, and a gap makes two stretches of one pass.
+#[test]
+fn results_do_not_depend_on_threads_and_a_gap_separates_two_stretches() {
+    let system = system();
+    let point = some_point(&system);
+    let data = noise(3000, 5);
+    let series: Vec<Vec<f64>> = noise(3000, 6).into_iter().map(|x| x.to_vec()).collect();
+    let own = |k: usize| Parameter { responses: vec![(k % 2, (k / 2) % (2 + POWERS), 1.0 + k as f64)], change: None };
+    let parameters: Vec<Parameter> = (0..45).map(own).chain((0..4).map(|k| change(&system, &point, k))).collect();
+    let one = pass(&system, &point, parameters.clone(), &data, &series, 1);
+    let three = pass(&system, &point, parameters.clone(), &data, &series, 3);
+    assert_eq!(one.information, three.information);
+    assert_eq!(one.score, three.score);
+    let mut gappy = data.clone();
+    gappy[1500][1] = f64::NAN;
+    let with_gap = pass(&system, &point, parameters.clone(), &gappy, &series, 2);
+    assert_eq!((one.samples, with_gap.samples), (3000, 2999));
+    // Two stretches are as good as two passes.
+    let first = pass(&system, &point, parameters.clone(), &data[..1500], &series, 1);
+    let second = pass(&system, &point, parameters, &data[1501..], &series[1501..], 1);
+    // Powers of time, responses of parameters 4, 5, 6, 7, …, count from the first row of all.
+    for k in [0, 1, 2, 3, 45, 46, 47, 48] {
+        let sum = first.score[k] + second.score[k];
+        assert!((with_gap.score[k] / sum - 1.0).abs() < 1e-9, "{k}: {} against {sum}", with_gap.score[k]);
+    }
+}
+
+/// A regressor's score and information are those of the covariance of all samples, the start included.
+#[test]
+fn scores_equal_those_of_the_covariance_of_all_samples() {
+    let system = system();
+    let point = some_point(&system);
+    let samples = 60;
+    let covariance = DMatrix::from_fn(2 * samples, 2 * samples, |i, j| {
+        let ((s, a), (t, b)) = ((i / 2, i % 2), (j / 2, j % 2));
+        if s >= t { autocovariance(&point, s - t)[(a, b)] } else { autocovariance(&point, t - s)[(b, a)] }
+    });
+    // The start is free: its states reach the first two samples.
+    let predictor = Predictor::new(&system, &system.driving(&point)).expect("a predictor");
+    let more = predictor.known_of_the_start(&system) * (FREE - 1.0);
+    let first = DMatrix::from_fn(4, 4, |i, j| more[(i, j)] * system.unit[i % 2] * system.unit[j % 2]);
+    let mut covariance = covariance;
+    let mut free = covariance.view_mut((0, 0), (4, 4));
+    free += first;
+    let inverse = Cholesky::new(covariance).expect("positive").inverse();
+    let data = noise(samples, 8);
+    let series: Vec<Vec<f64>> = noise(samples, 9).into_iter().map(|x| x.to_vec()).collect();
+    let parameters = vec![
+        Parameter { responses: vec![(0, 0, 2.0), (1, 1, -1.0)], change: None },
+        Parameter { responses: vec![(1, 0, 0.5)], change: None },
+    ];
+    let sums = pass(&system, &point, parameters, &data, &series, 1);
+    let z = DVector::from_iterator(2 * samples, data.iter().flatten().copied());
+    let column =
+        |of: &dyn Fn(&[f64]) -> [f64; 2]| DVector::from_iterator(2 * samples, series.iter().flat_map(|s| of(s)));
+    let columns = [column(&|s| [2.0 * s[0], -s[1]]), column(&|s| [0.0, 0.5 * s[0]])];
+    for (k, own) in columns.iter().enumerate() {
+        let score = own.dot(&(&inverse * &z));
+        assert!((sums.score[k] / score - 1.0).abs() < 1e-6, "{k}: {} against {score}", sums.score[k]);
+        for (l, other) in columns.iter().enumerate() {
+            let information = own.dot(&(&inverse * other));
+            assert!((sums.information[(k, l)] / information - 1.0).abs() < 1e-6, "{k} {l}");
+        }
+    }
+    let chi2 = z.dot(&(&inverse * &z));
+    assert!((sums.chi2 / chi2 - 1.0).abs() < 1e-6, "{} against {chi2}", sums.chi2);
+}
+
+fn quadratic(information: DMatrix<f64>, truth: &[f64], candidates: Vec<Candidate>) -> Quadratic {
+    let score: Vec<f64> = (&information * DVector::from_column_slice(truth)).iter().copied().collect();
+    let sums = Sums {
+        information,
+        score,
+        chi2: 0.0,
+        numbers: 0.0,
+        squares: DMatrix::zeros(1, 1),
+        samples: 0,
+        starts: Vec::new(),
+    };
+    Quadratic::new(&sums, &vec![0.0; truth.len()], &[(vec![(0, 1.0)], Prior { mean: 0.0, sigma: 1e6 })], candidates)
+}
+
+fn candidate(parameter: usize) -> Candidate {
+    Candidate { parameters: vec![parameter], lower: vec![-0.3], upper: vec![0.3], ln_prior: 0.0, shaped: false }
+}
+
+/// A gain of 13.8 is at the bound.
+fn evidence(most: usize) -> Evidence<'static> {
+    Evidence { log10_p: &|_, gain| 1.0 - gain / 4.6, bound: -2.0, most, remainder: 1e-3 }
+}
+
+/// What a grid of forms leaves of a strong effect names no other; beside one without a form the same counts.
+#[test]
+fn a_small_remainder_of_a_formed_effect_is_no_evidence() {
+    let information = DMatrix::from_diagonal(&DVector::from_vec(vec![1.0, 1e8, 1e4]));
+    for (shaped, named) in [(true, vec![0]), (false, vec![0, 1])] {
+        let own = vec![Candidate { shaped, ..candidate(1) }, candidate(2)];
+        // Gains of 4e6 and of 400.
+        let selection = quadratic(information.clone(), &[0.0, 0.2, 0.2], own).select(&evidence(3));
+        assert_eq!(selection.chosen.iter().map(|c| c.candidate).collect::<Vec<_>>(), named);
+    }
+}
+
+/// Two causes are found beside a nuisance with which both correlate, and a third that looks like their sum is not.
+#[test]
+fn a_stand_in_is_exchanged_for_the_causes() {
+    let base = DMatrix::from_row_slice(
+        6,
+        4,
+        &[
+            1.0, 0.5, 0.4, 0.0, 1.0, -0.2, 0.9, 0.0, 1.0, 0.8, -0.7, 0.0, 1.0, -0.9, 0.1, 0.0, 1.0, 0.3, 0.3, 0.0, 1.0,
+            0.1, -0.8, 0.0,
+        ],
+    );
+    let mut rows = base.clone() * 200.0;
+    for i in 0..6 {
+        rows[(i, 3)] = 0.7 * (rows[(i, 1)] + rows[(i, 2)]) + if i % 2 == 0 { 30.0 } else { -30.0 };
+    }
+    let information = rows.transpose() * rows;
+    let quadratic = quadratic(information, &[5.0, 0.1, 0.12, 0.0], vec![candidate(1), candidate(2), candidate(3)]);
+    let selection = quadratic.select(&evidence(3));
+    let chosen: Vec<usize> = selection.chosen.iter().map(|c| c.candidate).collect();
+    assert_eq!(chosen, [0, 1]);
+    assert!((selection.chosen[0].values[0] - 0.1).abs() < 1e-9 && (selection.values[0] - 5.0).abs() < 1e-6);
+    assert!(selection.rest.iter().all(|c| c.gain < 1e-6));
+}
+
+/// Outside of its range a value explains only what its best value inside explains; equals share the probability.
+#[test]
+fn ranges_bound_the_gain_and_equals_are_alternatives() {
+    let information = DMatrix::from_row_slice(3, 3, &[1.0, 0.0, 0.0, 0.0, 1e4, 0.999 * 1e4, 0.0, 0.999 * 1e4, 1e4]);
+    let both = || vec![candidate(1), candidate(2)];
+    let alike = quadratic(information.clone(), &[0.0, 0.2, 0.0], both());
+    let selection = alike.select(&evidence(2));
+    assert_eq!((selection.chosen.len(), selection.chosen[0].candidate), (1, 0));
+    // χ² differ by (1 − 0.999²) 1e4 0.2² = 0.8.
+    let other = (-0.5 * (1.0 - 0.999_f64.powi(2)) * 1e4 * 0.04_f64).exp();
+    assert!((selection.chosen[0].alternatives[0].1 - other / (1.0 + other)).abs() < 1e-9);
+    let far = quadratic(information, &[0.0, 2.0, 0.0], both());
+    let beyond = far.select(&evidence(1));
+    let own = &beyond.chosen[0];
+    assert_eq!(own.values[0], 0.3);
+    assert!((own.gain - (2.0 * 1e4 * 2.0 * 0.3 - 1e4 * 0.09)).abs() < 1e-6, "{}", own.gain);
+}
+
+#[test]
+fn noise_that_cannot_be_filtered_is_refused_with_its_name() {
+    let unknown = NoiseProcess { spectrum: None, ..declared().remove(1) };
+    let refused = |declared: &[NoiseProcess]| {
+        NoiseStates::new(declared, &channels(), DT_S, &[]).map(|_| ()).expect_err("refused").0
+    };
+    assert!(refused(&[unknown]).contains("`first`"));
+    assert!(refused(&declared()[1..2]).contains("b is declared"));
+    let mut estimated = declared();
+    estimated[0].estimate = Some(dragfree_schema::NoiseEstimate {
+        matrix: vec![vec![1.0, 0.0]],
+        enters: BTreeMap::from([("a".to_owned(), vec![1.0])]),
+        ..dragfree_schema::NoiseEstimate::default()
+    });
+    assert!(refused(&estimated).contains("estimate"));
+}

@@ -1,0 +1,348 @@
+//! Passes over the data that sum the likelihood of the innovations, and the decision that follows from them.
+//!
+//! Each pass filters the channels at one point: values of the model's coefficients, levels of the noise and the effects
+//! that are named so far. What the sums say is a step from this point; passes are repeated until the step is a small
+//! part of the errors.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use dragfree_engine::chain::Chain;
+use dragfree_engine::config::EffectEntry;
+use dragfree_engine::examine::{Examination, examine};
+use dragfree_engine::product::Written;
+use dragfree_engine::run::Progress;
+use dragfree_engine::sources::Sources;
+use dragfree_identification::innovations::decision::{Candidate, Evidence, Prior, Quadratic, Selection};
+use dragfree_identification::innovations::filter::{Start, Sums};
+use dragfree_schema::{Coefficient, PREDICTION_NEED, Settings};
+use nalgebra::{DMatrix, DVector};
+
+mod pass;
+
+use pass::Filtered;
+
+use crate::WorkflowError;
+use crate::replay::{Pass, Replay, noise_levels};
+
+/// Passes after which the point is taken as it is.
+const PASSES: usize = 6;
+/// A point is reached when nothing moves by more than this part of its σ.
+const REACHED_SIGMAS: f64 = 0.5;
+/// σ of the logarithm of a level before any data: the data decide.
+const LEVEL_PRIOR: f64 = 1.0;
+/// Largest change of the logarithm of a level in one pass: beyond it the quadratic form is no likelihood.
+const LEVEL_STEP: f64 = 0.7;
+/// Where a pass is made.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Point {
+    /// Values of coefficients by name; of candidates only those that are named.
+    pub(crate) values: BTreeMap<String, f64>,
+    /// Amplitudes of components of the noise over the declared ones.
+    pub(crate) levels: BTreeMap<String, f64>,
+    /// Powers of time of each channel, by product; none before the first pass.
+    powers: BTreeMap<String, f64>,
+    /// States at the start of each stretch, by product.
+    starts: Vec<Vec<DVector<f64>>>,
+}
+
+/// What a parameter of the likelihood stands for.
+#[derive(Clone, Debug)]
+pub(crate) enum Meaning {
+    /// A coefficient of the model or of a candidate.
+    Coefficient(Box<Coefficient>),
+    /// The logarithm of the level of a component of the noise.
+    Level,
+    /// A power of time in a channel of one product.
+    Power,
+}
+
+/// The result: a selection with what its parameters stand for.
+pub(crate) struct Decided {
+    pub(crate) selection: Selection,
+    /// Name and meaning of each parameter.
+    pub(crate) parameters: Vec<(String, Meaning)>,
+    /// Effect and instance of each candidate, with its parameters.
+    pub(crate) candidates: Vec<(String, String, Vec<usize>)>,
+    /// The likelihood, for what the model would be without one of the chosen.
+    pub(crate) quadratic: Quadratic,
+    pub(crate) chi2: f64,
+    pub(crate) numbers: f64,
+    pub(crate) channels: BTreeMap<String, BTreeSet<String>>,
+    /// Values of the parameters at which the pass was made.
+    start: Vec<f64>,
+    /// Starts of the stretches, by product.
+    starts: Vec<Vec<Start>>,
+    /// Candidates that could not be tried, and why.
+    pub(crate) not_tried: Vec<(String, String)>,
+}
+
+/// What the decision needs to know of candidates.
+pub(crate) trait Judge {
+    /// Decimal logarithm of the corrected p-value of a gain `2 Δ ln L` of an effect.
+    fn log10_p(&self, effect: &str, gain: f64, dof: usize) -> f64;
+    /// Logarithm of the weight of an effect's instance before any data.
+    fn ln_prior(&self, effect: &str) -> f64;
+}
+
+/// Selects effects by the likelihood of all products: passes until nothing moves.
+///
+/// # Errors
+/// [`WorkflowError::NoLikelihood`] where the declared noise cannot be filtered; otherwise as a replay.
+pub(crate) fn decide(
+    replay: &Replay<'_>,
+    settings: &Settings,
+    chosen: &[EffectEntry],
+    start: BTreeMap<String, f64>,
+    judge: &dyn Judge,
+    progress: &mut dyn FnMut(Pass, usize, Progress),
+) -> Result<Decided, WorkflowError> {
+    let mut point = Point { values: start, ..Point::default() };
+    let opening = one_pass(replay, settings, chosen, &point, judge, progress)?;
+    point = step(&point, &opening);
+    let mut pass = 0;
+    loop {
+        pass += 1;
+        let decided = one_pass(replay, settings, chosen, &point, judge, progress)?;
+        let next = step(&point, &decided);
+        let reached = pass > 1 && reached(&point, &next, &decided);
+        point = next;
+        if reached || pass == PASSES {
+            return Ok(decided);
+        }
+    }
+}
+
+/// The point that the sums of a pass lead to.
+fn step(from: &Point, decided: &Decided) -> Point {
+    let mut to = Point::default();
+    let named: BTreeSet<usize> =
+        decided.selection.chosen.iter().flat_map(|f| decided.candidates[f.candidate].2.iter().copied()).collect();
+    for (i, (name, meaning)) in decided.parameters.iter().enumerate() {
+        let value = decided.selection.values[i];
+        match meaning {
+            Meaning::Coefficient(c) if c.candidate && !named.contains(&i) => {}
+            Meaning::Coefficient(_) => drop(to.values.insert(name.clone(), value)),
+            Meaning::Level => {
+                let before = from.levels.get(name).copied().unwrap_or(1.0).ln();
+                let moved = (value - before).clamp(-LEVEL_STEP, LEVEL_STEP);
+                to.levels.insert(name.clone(), (before + moved).exp());
+            }
+            Meaning::Power => drop(to.powers.insert(name.clone(), value)),
+        }
+    }
+    let moved = &decided.selection.values - DVector::from_column_slice(&decided.start);
+    let state = |start: &Start| &start.state + &start.slope * &moved;
+    to.starts = decided.starts.iter().map(|product| product.iter().map(state).collect()).collect();
+    to
+}
+
+/// Whether two points are the same: the same effects, and nothing moved by more than a part of its σ.
+fn reached(from: &Point, to: &Point, decided: &Decided) -> bool {
+    decided.parameters.iter().enumerate().all(|(i, (name, meaning))| {
+        let near = |a: Option<f64>, b: Option<f64>| match (a, b) {
+            (Some(a), Some(b)) => (a - b).abs() <= REACHED_SIGMAS * decided.selection.sigma[i],
+            (None, None) => true,
+            _ => false,
+        };
+        match meaning {
+            Meaning::Coefficient(_) => near(from.values.get(name).copied(), to.values.get(name).copied()),
+            Meaning::Level => near(from.levels.get(name).map(|x| x.ln()), to.levels.get(name).map(|x| x.ln())),
+            Meaning::Power => true,
+        }
+    })
+}
+
+fn one_pass(
+    replay: &Replay<'_>,
+    settings: &Settings,
+    chosen: &[EffectEntry],
+    point: &Point,
+    judge: &dyn Judge,
+    progress: &mut dyn FnMut(Pass, usize, Progress),
+) -> Result<Decided, WorkflowError> {
+    let levels = noise_levels(replay.products);
+    let mut joined = Joined::default();
+    let mut not_tried = Vec::new();
+    for (number, Written { product, path }) in replay.products.iter().enumerate() {
+        let sources = Sources::read(path)?;
+        let examination = Examination {
+            product,
+            sources: &sources,
+            candidates: Vec::new(),
+            chosen: chosen.to_vec(),
+            needs: &[PREDICTION_NEED],
+            values: &levels,
+            threads: replay.threads,
+            batch_rows: replay.batch_rows,
+        };
+        let link = |chain: &Chain| Filtered::link(chain, point, number, settings, replay.threads);
+        let (filtered, refused) =
+            examine(replay.registry, &examination, link, &mut |p| progress(Pass::Likelihood, number, p))?;
+        not_tried.extend(refused);
+        joined.add(filtered, &mut not_tried, settings);
+    }
+    Ok(joined.decided(point, settings, judge, not_tried))
+}
+
+/// Sums of several products, by the names of the parameters.
+#[derive(Default)]
+struct Joined {
+    parameters: Vec<(String, Meaning)>,
+    surveys: Vec<(Vec<(String, f64)>, Prior)>,
+    channels: BTreeMap<String, BTreeSet<String>>,
+    sums: Option<Sums>,
+    starts: Vec<Starts>,
+}
+
+/// Starts of the stretches of one product.
+struct Starts {
+    own: Vec<Start>,
+    /// Parameters of the product among all.
+    parameters: Vec<(usize, usize)>,
+}
+
+impl Joined {
+    fn add(&mut self, filtered: Filtered, not_tried: &mut Vec<(String, String)>, settings: &Settings) {
+        let Filtered { parameters, surveys, channels, gaps, innovations, .. } = filtered;
+        let own = innovations.finish();
+        let gappy = gaps.refused(settings);
+        let mut kept: Vec<usize> = Vec::new();
+        for (i, (name, _)) in parameters.iter().enumerate() {
+            match gappy.get(name) {
+                Some(reason) => not_tried.push((name.clone(), reason.clone())),
+                None => kept.push(i),
+            }
+        }
+        let places: Vec<usize> = kept
+            .iter()
+            .map(|i| {
+                let at = self.parameters.iter().position(|(name, _)| *name == parameters[*i].0);
+                at.unwrap_or_else(|| {
+                    self.parameters.push(parameters[*i].clone());
+                    self.parameters.len() - 1
+                })
+            })
+            .collect();
+        let p = self.parameters.len();
+        let before = self.sums.take();
+        let mut all = Sums {
+            information: DMatrix::zeros(p, p),
+            score: vec![0.0; p],
+            chi2: own.chi2,
+            numbers: own.numbers,
+            squares: own.squares,
+            samples: own.samples,
+            starts: Vec::new(),
+        };
+        let of_all = kept.iter().copied().zip(places.iter().copied()).collect();
+        self.starts.push(Starts { own: own.starts, parameters: of_all });
+        for (i, a) in kept.iter().zip(&places) {
+            all.score[*a] += own.score[*i];
+            for (j, b) in kept.iter().zip(&places) {
+                all.information[(*a, *b)] += own.information[(*i, *j)];
+            }
+        }
+        if let Some(before) = before {
+            for i in 0..before.score.len() {
+                all.score[i] += before.score[i];
+                for j in 0..before.score.len() {
+                    all.information[(i, j)] += before.information[(i, j)];
+                }
+            }
+            all.chi2 += before.chi2;
+            all.numbers += before.numbers;
+            all.samples += before.samples;
+        }
+        self.sums = Some(all);
+        self.surveys = surveys;
+        self.channels.extend(channels);
+    }
+
+    fn decided(
+        self,
+        point: &Point,
+        settings: &Settings,
+        judge: &dyn Judge,
+        not_tried: Vec<(String, String)>,
+    ) -> Decided {
+        let parameters = self.parameters;
+        let mut groups: Vec<(String, String, Vec<usize>)> = Vec::new();
+        let mut start = Vec::new();
+        let mut priors = Vec::new();
+        for (i, (name, meaning)) in parameters.iter().enumerate() {
+            start.push(match meaning {
+                Meaning::Coefficient(_) => point.values.get(name).copied().unwrap_or(0.0),
+                Meaning::Level => point.levels.get(name).copied().unwrap_or(1.0).ln(),
+                Meaning::Power => point.powers.get(name).copied().unwrap_or(0.0),
+            });
+            match meaning {
+                Meaning::Coefficient(c) if c.candidate => {
+                    match groups.iter_mut().find(|(e, at, _)| *e == c.effect && *at == c.instance) {
+                        Some((.., own)) => own.push(i),
+                        None => groups.push((c.effect.clone(), c.instance.clone(), vec![i])),
+                    }
+                }
+                Meaning::Coefficient(c) if c.prior_sigma.is_finite() && c.prior_sigma > 0.0 => {
+                    priors.push((vec![(i, 1.0)], Prior { mean: c.initial, sigma: c.prior_sigma }));
+                }
+                Meaning::Level => priors.push((vec![(i, 1.0)], Prior { mean: 0.0, sigma: LEVEL_PRIOR })),
+                _ => {}
+            }
+        }
+        let at = |name: &String| parameters.iter().position(|(own, _)| own == name);
+        for (terms, prior) in &self.surveys {
+            let found: Option<Vec<(usize, f64)>> = terms.iter().map(|(name, w)| Some((at(name)?, *w))).collect();
+            priors.extend(found.map(|terms| (terms, *prior)));
+        }
+        let candidates = groups
+            .iter()
+            .map(|(effect, _, own)| {
+                let of = |i: &usize| match &parameters[*i].1 {
+                    Meaning::Coefficient(c) => (c.lower, c.upper),
+                    _ => (f64::NEG_INFINITY, f64::INFINITY),
+                };
+                let (lower, upper) = own.iter().map(of).unzip();
+                let formed = |i: &usize| matches!(&parameters[*i].1, Meaning::Coefficient(c) if !c.shape.is_empty());
+                let shaped = own.iter().any(formed);
+                Candidate { parameters: own.clone(), lower, upper, ln_prior: judge.ln_prior(effect), shaped }
+            })
+            .collect();
+        let p = parameters.len();
+        let sums = self.sums.unwrap_or_else(|| Sums {
+            information: DMatrix::zeros(p, p),
+            score: vec![0.0; p],
+            chi2: 0.0,
+            numbers: 0.0,
+            squares: DMatrix::zeros(0, 0),
+            samples: 0,
+            starts: Vec::new(),
+        });
+        let of_all = |start: Start, of: &[(usize, usize)]| {
+            let mut slope = DMatrix::zeros(start.slope.nrows(), p);
+            of.iter().for_each(|(own, all)| slope.set_column(*all, &start.slope.column(*own)));
+            Start { slope, ..start }
+        };
+        let of_product = |s: Starts| s.own.into_iter().map(|start| of_all(start, &s.parameters)).collect();
+        let starts = self.starts.into_iter().map(of_product).collect();
+        let quadratic = Quadratic::new(&sums, &start, &priors, candidates);
+        let log10_p = |c: usize, gain: f64| judge.log10_p(&groups[c].0, gain, groups[c].2.len());
+        let selection = quadratic.select(&Evidence {
+            log10_p: &log10_p,
+            bound: settings.false_alarm.log10(),
+            most: settings.max_added,
+            remainder: settings.excess_remainder,
+        });
+        Decided {
+            selection,
+            parameters,
+            candidates: groups,
+            quadratic,
+            chi2: sums.chi2,
+            numbers: sums.numbers,
+            channels: self.channels,
+            start,
+            starts,
+            not_tried,
+        }
+    }
+}

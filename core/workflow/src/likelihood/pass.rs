@@ -1,0 +1,418 @@
+//! One pass over one product: from the columns of its chain to the filter of the innovations.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use dragfree_engine::chain::{Chain, Sink};
+use dragfree_engine::examine::Wanted;
+use dragfree_identification::innovations::decision::Prior;
+use dragfree_identification::innovations::filter::{Innovations, POWERS, Parameter, Response, Setup};
+use dragfree_identification::innovations::predictor::{Change, Predictor};
+use dragfree_identification::innovations::state_space::{NoNoise, NoisePoint, NoiseStates, gains};
+use dragfree_schema::{
+    Available, Coefficient, Column, Response as Declared, Settings, UNPREDICTED_ATTRIBUTE, UNPREDICTED_SLOPE_ATTRIBUTE,
+};
+use nalgebra::DMatrix;
+
+use super::{Meaning, Point};
+use crate::WorkflowError;
+
+/// Part of a coefficient's scale, and of a level, over which the noise is differenced. The covariance of the driving
+/// noise is a quadratic form in them, so central differences are exact.
+const DIFFERENCE: f64 = 0.1;
+
+/// Values that a series lacks.
+pub(super) struct Gaps {
+    /// Names of the series.
+    names: Vec<String>,
+    missing: Vec<u64>,
+    never: Vec<bool>,
+    rows: u64,
+    /// Series of each candidate's coefficient.
+    of: BTreeMap<String, Vec<usize>>,
+}
+
+impl Gaps {
+    fn of(responses: &Responses<'_>) -> Self {
+        let series = responses.series.len();
+        let acts = |i: usize| {
+            let own = responses.terms.iter().filter(move |t| t.coefficient == i && t.series >= responses.base);
+            own.map(|t| t.series).collect()
+        };
+        let candidates = responses.coefficients.iter().enumerate().filter(|(_, c)| c.candidate);
+        Self {
+            names: responses.series.iter().map(|(_, name)| name.clone()).collect(),
+            missing: vec![0; series],
+            never: vec![true; series],
+            rows: 0,
+            of: candidates.map(|(i, c)| (c.name.clone(), acts(i))).collect(),
+        }
+    }
+
+    /// Coefficients that act through a series with gaps, and why they are not tried.
+    pub(super) fn refused(&self, settings: &Settings) -> BTreeMap<String, String> {
+        let gappy =
+            |s: &&usize| self.never[**s] || self.missing[**s] as f64 > settings.max_missing * self.rows.max(1) as f64;
+        let reason = |s: &usize| {
+            format!(
+                "{} has no value in {} of {} epochs: what it is made of has gaps",
+                self.names[*s], self.missing[*s], self.rows
+            )
+        };
+        self.of.iter().filter_map(|(name, own)| Some((name.clone(), reason(own.iter().find(gappy)?)))).collect()
+    }
+}
+
+/// A pass over one product.
+pub(super) struct Filtered {
+    pub(super) parameters: Vec<(String, Meaning)>,
+    pub(super) surveys: Vec<(Vec<(String, f64)>, Prior)>,
+    pub(super) channels: BTreeMap<String, BTreeSet<String>>,
+    count: usize,
+    /// Series of the model, whose gaps are gaps of the data.
+    base: usize,
+    held: Vec<f64>,
+    pub(super) gaps: Gaps,
+    patience: u64,
+    pub(super) innovations: Innovations,
+}
+
+fn name_of(channel: &Column) -> &str {
+    match channel.attribute("channel") {
+        "" => &channel.name,
+        name => name,
+    }
+}
+
+/// A response of a coefficient as the likelihood takes it.
+struct Term {
+    /// Its coefficient, and another that multiplies it.
+    coefficient: usize,
+    times: Option<usize>,
+    channel: usize,
+    series: usize,
+    factor: f64,
+    /// What the series lacks of each channel's unknown acceleration, and of its slope.
+    unpredicted: Option<Vec<f64>>,
+    unpredicted_slope: Option<Vec<f64>>,
+}
+
+/// The channels of a linked chain, and what coefficients add to them.
+struct Responses<'a> {
+    channels: Vec<&'a Column>,
+    names: Vec<String>,
+    coefficients: Vec<&'a Coefficient>,
+    /// Table and name of each series, those of the model first.
+    series: Vec<(String, String)>,
+    /// Series of the model.
+    base: usize,
+    terms: Vec<Term>,
+}
+
+impl<'a> Responses<'a> {
+    fn of(available: &'a Available) -> Result<Self, WorkflowError> {
+        let channels: Vec<&Column> = available.of_kind("channel").collect();
+        let names: Vec<String> = channels.iter().map(|c| name_of(c).to_owned()).collect();
+        let coefficients: Vec<&Coefficient> = available.coefficients.iter().filter(|c| c.noise.is_empty()).collect();
+        let mut all = Self { channels, names, coefficients, series: Vec::new(), base: 0, terms: Vec::new() };
+        let mut responses = available.responses()?;
+        // Stable: the model's series come first.
+        responses.sort_by_key(|(c, _)| c.candidate);
+        for (c, response) in responses {
+            all.add(available, c, response);
+        }
+        Ok(all)
+    }
+
+    /// Adds a response; one to a channel that does not exist, or scaled by a coefficient that the model lacks, is none.
+    fn add(&mut self, available: &Available, c: &Coefficient, response: Declared) {
+        let index = |name: &str| self.coefficients.iter().position(|c| c.name == name);
+        let Some(coefficient) = index(&c.name) else { return };
+        let Some(channel) = self.names.iter().position(|n| *n == response.channel) else { return };
+        let times = response.times.as_deref().map(index);
+        if times == Some(None) {
+            return;
+        }
+        let column = available.column(&response.table, &response.series);
+        let lacks = |key: &str| {
+            let text = column.map_or("", |c| c.attribute(key));
+            (!text.is_empty()).then(|| gains(text, &self.names))
+        };
+        let (unpredicted, unpredicted_slope) = (lacks(UNPREDICTED_ATTRIBUTE), lacks(UNPREDICTED_SLOPE_ATTRIBUTE));
+        let key = (response.table, response.series);
+        let series = self.series.iter().position(|s| *s == key).unwrap_or_else(|| {
+            self.series.push(key);
+            self.series.len() - 1
+        });
+        if !c.candidate {
+            self.base = self.series.len();
+        }
+        self.terms.push(Term {
+            coefficient,
+            times: times.flatten(),
+            channel,
+            series,
+            factor: response.factor,
+            unpredicted,
+            unpredicted_slope,
+        });
+    }
+
+    /// Values of the coefficients at a point.
+    fn values(&self, point: &Point) -> Vec<f64> {
+        let value = |c: &&Coefficient| match point.values.get(&c.name) {
+            Some(value) if c.estimate || c.candidate => *value,
+            _ if c.candidate => 0.0,
+            _ => c.initial,
+        };
+        self.coefficients.iter().map(value).collect()
+    }
+
+    /// What a little of a coefficient adds to the channels.
+    fn to(&self, i: usize, values: &[f64]) -> Vec<Response> {
+        let response = |t: &Term| {
+            let scale = match t.times {
+                _ if t.coefficient == i => t.times.map_or(1.0, |other| values[other]),
+                Some(other) if other == i => values[t.coefficient],
+                _ => 0.0,
+            };
+            (scale != 0.0).then_some((t.channel, t.series, t.factor * scale))
+        };
+        self.terms.iter().filter_map(response).collect()
+    }
+
+    /// What the coefficients at these values add to the channels.
+    fn known(&self, values: &[f64]) -> Vec<Response> {
+        let response = |t: &Term| (t.channel, t.series, t.factor * t.scale(values));
+        self.terms.iter().map(response).filter(|(.., factor)| *factor != 0.0).collect()
+    }
+
+    /// Columns of the channels and of the series among those of the chain.
+    fn columns(&self, available: &Available) -> Result<Vec<usize>, WorkflowError> {
+        let place = |(table, name): (String, String)| {
+            let at = available.columns.iter().position(|c| c.table == table && c.name == name);
+            at.ok_or(WorkflowError::NoColumn { table, name })
+        };
+        let channels = self.channels.iter().map(|c| (c.table.clone(), c.name.clone()));
+        channels.chain(self.series.iter().cloned()).map(place).collect()
+    }
+}
+
+impl Term {
+    fn scale(&self, values: &[f64]) -> f64 {
+        values[self.coefficient] * self.times.map_or(1.0, |other| values[other])
+    }
+}
+
+/// The noise at a point, its predictor, and how it changes.
+struct NoiseAt<'a> {
+    responses: &'a Responses<'a>,
+    system: NoiseStates,
+    predictor: Predictor,
+    /// Coefficients that filter a component.
+    filters: Vec<usize>,
+    values: Vec<f64>,
+    levels: Vec<f64>,
+}
+
+impl<'a> NoiseAt<'a> {
+    fn new(available: &Available, responses: &'a Responses<'a>, point: &Point) -> Result<Self, WorkflowError> {
+        let refuse = |e: NoNoise| WorkflowError::NoLikelihood(e.0);
+        let Some(rate_hz) = responses.channels.first().map(|c| c.rate_hz) else { return Err(WorkflowError::NoChannel) };
+        let colours = responses.coefficients.iter().enumerate().filter_map(|(i, c)| Some((i, c.colours.clone()?)));
+        let (filters, colours): (Vec<usize>, Vec<_>) = colours.unzip();
+        let system = NoiseStates::new(&available.noise, &responses.names, 1.0 / rate_hz, &colours).map_err(refuse)?;
+        let values = responses.values(point);
+        let level = |name: &String| point.levels.get(name).copied().unwrap_or(1.0);
+        let levels: Vec<f64> = system.components.iter().map(level).collect();
+        let driving = system.driving(&noise_point(responses, &filters, &values, &levels));
+        let predictor = Predictor::new(&system, &driving).map_err(refuse)?;
+        Ok(Self { responses, system, predictor, filters, values, levels })
+    }
+
+    fn driving(&self, values: &[f64], levels: &[f64]) -> DMatrix<f64> {
+        self.system.driving(&noise_point(self.responses, &self.filters, values, levels))
+    }
+
+    /// How a coefficient changes the noise; none where it does not.
+    fn by_coefficient(&self, i: usize) -> Option<Change> {
+        let lacks = |t: &&Term| t.unpredicted.is_some() || t.unpredicted_slope.is_some();
+        let mut acting = self.responses.terms.iter().filter(lacks);
+        if !self.filters.contains(&i) && !acting.any(|t| t.coefficient == i || t.times == Some(i)) {
+            return None;
+        }
+        let half = DIFFERENCE * reach(self.responses.coefficients[i]);
+        let at = |by: f64| {
+            let mut moved = self.values.clone();
+            moved[i] += by;
+            self.driving(&moved, &self.levels)
+        };
+        Some(self.predictor.change(&self.system, &((at(half) - at(-half)) / (2.0 * half))))
+    }
+
+    /// How the logarithm of the level of a component changes it.
+    fn by_level(&self, k: usize) -> Change {
+        let at = |by: f64| {
+            let mut moved = self.levels.clone();
+            moved[k] *= 1.0 + by;
+            self.driving(&self.values, &moved)
+        };
+        self.predictor.change(&self.system, &((at(DIFFERENCE) - at(-DIFFERENCE)) / (2.0 * DIFFERENCE)))
+    }
+}
+
+/// On what the noise depends, at values of coefficients and levels.
+fn noise_point(responses: &Responses<'_>, filters: &[usize], values: &[f64], levels: &[f64]) -> NoisePoint {
+    let n = responses.names.len();
+    let (mut unpredicted, mut unpredicted_slope) = (DMatrix::zeros(n, n), DMatrix::zeros(n, n));
+    for t in &responses.terms {
+        let value = t.factor * t.scale(values);
+        for (gains, to) in [(&t.unpredicted, &mut unpredicted), (&t.unpredicted_slope, &mut unpredicted_slope)] {
+            for (channel, gain) in gains.iter().flatten().enumerate() {
+                to[(t.channel, channel)] += value * gain;
+            }
+        }
+    }
+    let filtered = filters.iter().map(|i| values[*i]).collect();
+    NoisePoint { levels: levels.to_vec(), unpredicted, unpredicted_slope, filtered }
+}
+
+impl Filtered {
+    /// The filter of one product's chain at a point; `number` is that of the product.
+    ///
+    /// The first pass, which has no powers of time yet, fits these with the model and what is named alone: constants of
+    /// the channels are many σ of the noise between test masses, and a filter without them would take them for noise.
+    ///
+    /// # Errors
+    /// [`WorkflowError::NoLikelihood`] where the declared noise cannot be filtered.
+    pub(super) fn link(
+        chain: &Chain,
+        point: &Point,
+        number: usize,
+        settings: &Settings,
+        threads: usize,
+    ) -> Result<Wanted<Self>, WorkflowError> {
+        let available = Available {
+            columns: chain.columns.clone(),
+            coefficients: chain.coefficients.clone(),
+            constraints: chain.constraints.clone(),
+            noise: chain.noise.clone(),
+        };
+        let responses = Responses::of(&available)?;
+        let noise = NoiseAt::new(&available, &responses, point)?;
+        let opening = point.powers.is_empty();
+        let mut unknowns: Vec<(String, Meaning, Parameter)> = Vec::new();
+        let named = |c: &Coefficient| point.values.contains_key(&c.name);
+        let asked = |c: &Coefficient| if c.candidate { !opening || named(c) } else { c.estimate };
+        for (i, c) in responses.coefficients.iter().enumerate().filter(|(_, c)| asked(c)) {
+            let change = if opening { None } else { noise.by_coefficient(i) };
+            let own = responses.to(i, &noise.values);
+            if !own.is_empty() || change.is_some() {
+                let meaning = Meaning::Coefficient(Box::new((*c).clone()));
+                unknowns.push((c.name.clone(), meaning, Parameter { responses: own, change }));
+            }
+        }
+        for (k, name) in noise.system.components.iter().enumerate().filter(|_| !opening) {
+            let change = Some(noise.by_level(k));
+            unknowns.push((name.clone(), Meaning::Level, Parameter { responses: Vec::new(), change }));
+        }
+        let mut known = responses.known(&noise.values);
+        for (channel, name) in responses.names.iter().enumerate() {
+            for k in 0..POWERS {
+                let power = format!("{name} day^{k} of product {number}");
+                let (series, unit) = (responses.series.len() + k, noise.system.unit[channel]);
+                known.extend(point.powers.get(&power).map(|value| (channel, series, value * unit)));
+                let own = Parameter { responses: vec![(channel, series, unit)], change: None };
+                unknowns.push((power, Meaning::Power, own));
+            }
+        }
+        let mut parameters = Vec::new();
+        let mut filtered = Vec::new();
+        for (name, meaning, parameter) in unknowns {
+            parameters.push((name, meaning));
+            filtered.push(parameter);
+        }
+        let rate_hz = responses.channels.first().map_or(0.0, |c| c.rate_hz);
+        let count = responses.series.len();
+        let innovations = Innovations::new(Setup {
+            system: &noise.system,
+            predictor: &noise.predictor,
+            known,
+            parameters: filtered,
+            starts: point.starts.get(number).cloned().unwrap_or_default(),
+            series: count,
+            averaged: responses.channels.iter().any(|c| c.attribute("average") == "2"),
+            step_ns: (1e9 / rate_hz).round() as i64,
+            threads,
+        });
+        let acting = |i: usize| {
+            let own = responses.terms.iter().filter(move |t| t.coefficient == i);
+            own.map(|t| responses.names[t.channel].clone()).collect()
+        };
+        let named = responses.coefficients.iter().enumerate();
+        let all = Self {
+            surveys: surveys(&available),
+            channels: named.map(|(i, c)| (c.name.clone(), acting(i))).collect(),
+            parameters,
+            count: responses.names.len(),
+            base: responses.base,
+            held: vec![f64::NAN; count],
+            gaps: Gaps::of(&responses),
+            patience: (settings.patience_s * rate_hz) as u64,
+            innovations,
+        };
+        Ok((all, responses.columns(&available)?))
+    }
+}
+
+impl Sink for Filtered {
+    fn tapped(&mut self, time_ns: &[i64], columns: &[&[f64]]) {
+        let mut channels = vec![0.0; self.count];
+        let mut series = vec![0.0; columns.len() - self.count];
+        for (k, time_ns) in time_ns.iter().enumerate() {
+            channels.iter_mut().zip(columns).for_each(|(x, column)| *x = column[k]);
+            let waits = self.gaps.rows < self.patience;
+            let mut begun = true;
+            for (s, x) in series.iter_mut().enumerate() {
+                *x = columns[self.count + s][k];
+                if s < self.base {
+                    continue;
+                }
+                if x.is_finite() {
+                    self.held[s] = *x;
+                    self.gaps.never[s] = false;
+                } else if self.held[s].is_finite() {
+                    *x = self.held[s];
+                    self.gaps.missing[s] += 1;
+                } else {
+                    // Housekeeping may begin late; what never comes is zero, and its effects are not tried.
+                    begun &= !waits;
+                    *x = 0.0;
+                }
+            }
+            self.gaps.never[..self.base].fill(false);
+            self.gaps.rows += 1;
+            if !begun {
+                continue;
+            }
+            self.innovations.push(*time_ns, &channels, &series);
+        }
+    }
+}
+
+/// A scale of a coefficient: its σ before any data, its range, or one.
+fn reach(c: &Coefficient) -> f64 {
+    let widest = c.upper.abs().max(c.lower.abs());
+    let known = [c.prior_sigma, widest].into_iter().find(|x| x.is_finite() && *x > 0.0);
+    known.unwrap_or(1.0)
+}
+
+/// Surveys as Gaussians of the variance of an even distribution.
+fn surveys(available: &Available) -> Vec<(Vec<(String, f64)>, Prior)> {
+    let all = available.constraints.iter().filter(|c| c.kind == "survey");
+    all.filter(|c| c.lower.is_finite() && c.upper.is_finite() && c.upper > c.lower)
+        .map(|c| {
+            let sigma = (c.upper - c.lower) / 12.0_f64.sqrt();
+            (c.terms.clone(), Prior { mean: 0.5 * (c.lower + c.upper), sigma })
+        })
+        .collect()
+}
