@@ -270,21 +270,12 @@ pub(crate) struct Diagnose {
     pub(crate) products: Vec<String>,
     #[command(flatten)]
     pub(crate) archive: Archive,
-    /// What decides: scores of spectra, or the likelihood of innovations, which reads the data two to seven times more
-    #[arg(long, value_enum, default_value_t = DecideBy::Spectra)]
-    pub(crate) decide_by: DecideBy,
     /// Write what was gathered, to be ranked again without the telemetry
     #[arg(long, value_name = "FILE")]
     pub(crate) save_sums: Option<PathBuf>,
     /// Candidates and limits to print; --json has all
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub(crate) top: usize,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub(crate) enum DecideBy {
-    Spectra,
-    Innovations,
 }
 
 #[derive(Debug, Subcommand)]

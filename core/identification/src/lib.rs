@@ -17,5 +17,7 @@ pub mod gram;
 pub mod innovations;
 pub mod record;
 pub mod scores;
+pub mod screen;
+pub mod slow_forces;
 pub mod transient;
 pub mod waveform;

@@ -17,7 +17,7 @@ use dragfree_estimation::spectra::{Layout, Plan, Spectra, Sums};
 use dragfree_schema::Settings;
 use nalgebra::{Cholesky, DMatrix, DVector};
 
-use crate::candidates::{Candidate, CandidateSet};
+use crate::candidates::{Candidate, CandidateSet, Coefficient};
 use crate::gram::{Gram, GramSums};
 
 /// Refinements of Σ from the residuals.
@@ -47,9 +47,7 @@ pub struct Fit {
     layout: Layout,
     /// Columns of the layout among all.
     columns: Vec<usize>,
-    /// Scores over all data, and over each of the two interleaved halves.
     scores: Scores,
-    halves: [Scores; 2],
 }
 
 /// The solution of a model.
@@ -84,10 +82,6 @@ pub struct Scored {
     pub information: DMatrix<f64>,
     /// Corrected over plain information, see [`CandidateScorer::window_corrected`].
     understated: f64,
-    /// Part of its information that the model leaves.
-    pub left: f64,
-    /// Bias of each free coefficient of the fit while the candidate is missing.
-    pub shift: DVector<f64>,
 }
 
 /// All candidates beside a fit.
@@ -101,24 +95,10 @@ pub struct Ranked {
     pub unobservable: Vec<String>,
 }
 
-/// A candidate fitted to each half of the data.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Halves {
-    /// Fall of χ² of each half at the values fitted to the other (cross-validation). A negative one is no evidence
-    /// against a slow cause, of which a half may hold little information.
-    pub gains: [f64; 2],
-    /// χ² of the difference of the two halves' values, one degree of freedom per coefficient: the test of constancy.
-    pub difference_chi2: f64,
-}
-
-/// A candidate beside the model in some of the data.
+/// A candidate beside the model.
 struct Beside {
     score: DVector<f64>,
     information: DMatrix<f64>,
-    /// `N_pq`.
-    with_model: DMatrix<f64>,
-    /// Part of its information that the model leaves.
-    left: f64,
 }
 
 /// Scores candidates from the sums.
@@ -147,14 +127,11 @@ struct Scores {
     normal: DMatrix<f64>,
     /// `N_qq⁻¹` with what surveys and ranges know.
     covariance: DMatrix<f64>,
-    /// Score of the free coefficients: of those at the end of a range, and in a half of the data of all.
+    /// Score of the free coefficients, of those at the end of a range.
     bound_score: DVector<f64>,
     /// Per band, `Σ⁻¹` times the weight that turns sums into information.
     weights: Vec<DMatrix<f64>>,
     theta: DVector<f64>,
-    /// The same inner products with the weights with which the variance of a score is theirs. Equal weights of bands
-    /// that stand for different times have another variance than their information says.
-    variance: Option<Box<Scores>>,
 }
 
 impl<'a> CandidateScorer<'a> {
@@ -209,41 +186,22 @@ impl<'a> CandidateScorer<'a> {
 
     fn scored(&self, added: Vec<Candidate>, solved: Solved) -> Fit {
         let mut scores = self.scores(&self.total, &solved);
-        let halves = self.gathered.sets.each_ref().map(|half| self.scores_of_half(half, &scores, &solved));
         let Solved { layout, columns, estimate } = solved;
         scores.covariance = estimate.known.clone().try_inverse().unwrap_or(scores.covariance);
         scores.bound_score = estimate.bound_score.clone();
-        Fit { added, estimate, layout, columns, scores, halves }
+        Fit { added, estimate, layout, columns, scores }
     }
 
-    /// The scores of one of two halves of the data. Surveys and ranges know as much of each half; they and the data
-    /// balance in the total, not in a half, so each half has a score of the model's own coefficients.
-    fn scores_of_half(&self, half: &Gram, total: &Scores, solved: &Solved) -> Scores {
-        let mut scores = self.scores(half, solved);
-        let pairs = half.weights.equal_time_weights().into_iter().zip(half.weights.kept());
-        let squared: Vec<f64> = pairs.map(|(used, kept)| if kept > 0.0 { used * used / kept } else { 0.0 }).collect();
-        scores.variance = Some(Box::new(self.weighted_scores(half, solved, &squared)));
-        let knowledge = (&solved.estimate.known - &total.normal) * 0.5;
-        let free = solved.estimate.free.len();
-        scores.covariance = (&scores.normal + knowledge).try_inverse().unwrap_or_else(|| DMatrix::zeros(free, free));
-        scores.bound_score -= (&total.bound_score - &solved.estimate.bound_score) * 0.5;
-        scores
-    }
-
-    /// Inner products of some of the data with the residuals of the solution, every band weighted by its own time.
+    /// Inner products of the data with the residuals of the solution, every band weighted by its own time.
     /// Neither surveys nor ranges enter `covariance` and `bound_score` here.
     fn scores(&self, gram: &Gram, solved: &Solved) -> Scores {
-        self.weighted_scores(gram, solved, &gram.weights.equal_time_weights())
-    }
-
-    /// The same with other weights of the bands.
-    fn weighted_scores(&self, gram: &Gram, solved: &Solved, of_band: &[f64]) -> Scores {
         let Solved { layout, columns, estimate } = solved;
         let n = self.gathered.columns.names.len();
         let channels = self.candidate_set.channels.len();
         let theta = &estimate.theta;
         let linear = layout.linear_at(theta.as_slice());
-        let weights: Vec<DMatrix<f64>> = estimate.inverses.iter().zip(of_band).map(|(w, k)| w * *k).collect();
+        let weights: Vec<DMatrix<f64>> =
+            estimate.inverses.iter().zip(gram.weights.equal_time_weights()).map(|(w, k)| w * k).collect();
         let mut residual = DMatrix::zeros(n, channels);
         let free = &estimate.free;
         let mut model = vec![DMatrix::zeros(n, channels); free.len()];
@@ -272,7 +230,7 @@ impl<'a> CandidateScorer<'a> {
         }
         let covariance = DMatrix::zeros(free.len(), free.len());
         let theta = theta.clone();
-        Scores { residual, model, normal, covariance, bound_score: score, weights, theta, variance: None }
+        Scores { residual, model, normal, covariance, bound_score: score, weights, theta }
     }
 
     /// Levels of the mission's noise beside the residual spectra `measured` of some of the sums.
@@ -294,17 +252,6 @@ impl<'a> CandidateScorer<'a> {
         }
         let plain = self.under(fit, levels.plain_inverses());
         Some(WithoutExcess { plain, bands, observations })
-    }
-
-    /// The fit under the declared levels of the noise, and the bands of an excess; none where the fit has adopted no
-    /// other level. A level fitted before the candidates has absorbed part of what a gain in the loop does to the
-    /// noise.
-    pub fn with_declared_levels(&self, fit: &Fit) -> Option<(Fit, Vec<bool>)> {
-        let measured = self.residual_psd(fit);
-        let mut levels = self.levels(fit, &self.total, &measured);
-        let declared = levels.inverses();
-        levels.fit();
-        (levels.inverses() != declared).then(|| (self.under(fit, declared), levels.excess_bands().0))
     }
 
     /// The same solution with other Σ⁻¹ in the scores.
@@ -415,11 +362,6 @@ impl<'a> CandidateScorer<'a> {
         candidate.parts.iter().map(|(_, form)| of(form)).collect()
     }
 
-    /// `N` between two candidates' coefficients, before anything is projected out.
-    fn between(&self, gram: &Gram, scores: &Scores, a: &Candidate, b: &Candidate) -> DMatrix<f64> {
-        Self::weighed(gram, &scores.weights, &scores.theta, a, b)
-    }
-
     fn weighed(
         gram: &Gram,
         weights: &[DMatrix<f64>],
@@ -459,26 +401,11 @@ impl<'a> CandidateScorer<'a> {
         let score = score - &with_model * (&scores.covariance * &scores.bound_score);
         let information = &own - &with_model * &scores.covariance * with_model.transpose();
         let left = (0..own.nrows()).map(|i| information[(i, i)] / own[(i, i)]).fold(1.0, f64::min);
-        (left > 1e-9).then_some(Beside { score, information, with_model, left })
-    }
-
-    /// Variance of a candidate's score beside the model in a half of the data.
-    fn variance(
-        gram: &Gram,
-        scores: &Scores,
-        candidate: &Candidate,
-        with_model: &DMatrix<f64>,
-    ) -> Option<DMatrix<f64>> {
-        let of = scores.variance.as_deref()?;
-        let own = Self::weighed(gram, &of.weights, &of.theta, candidate, candidate);
-        let shared = Self::against(of, candidate).1;
-        let projection = with_model * &scores.covariance;
-        let both = &shared * projection.transpose();
-        Some(own - both.transpose() - &both + &projection * &of.normal * projection.transpose())
+        (left > 1e-9).then_some(Beside { score, information })
     }
 
     fn score(&self, scores: &Scores, candidate: Candidate) -> Option<Scored> {
-        let Beside { score, information, with_model, left } = Self::beside(&self.total, scores, &candidate)?;
+        let Beside { score, information } = Self::beside(&self.total, scores, &candidate)?;
         let bounds: Vec<(f64, f64)> = candidate
             .parts
             .iter()
@@ -488,19 +415,7 @@ impl<'a> CandidateScorer<'a> {
         let in_range = free.iter().zip(&bounds).all(|(x, (lower, upper))| lower <= x && x <= upper);
         let value = if in_range { free } else { inside(&information, &score, &bounds) };
         let delta_chi2 = 2.0 * score.dot(&value) - value.dot(&(&information * &value));
-        let shift = &scores.covariance * with_model.transpose() * &value;
-        Some(Scored { candidate, value, in_range, delta_chi2, information, understated: 1.0, left, shift })
-    }
-
-    /// The part of a candidate's information under the given `Σ⁻¹` that comes from `bands`.
-    pub fn part_in(&self, fit: &Fit, inverses: &[DMatrix<f64>], candidate: &Candidate, bands: &[bool]) -> f64 {
-        let kept = self.total.weights.equal_time_weights();
-        let weights: Vec<DMatrix<f64>> = inverses.iter().zip(&kept).map(|(w, k)| w * *k).collect();
-        let here: Vec<DMatrix<f64>> = weights.iter().zip(bands).map(|(w, b)| w * f64::from(u8::from(*b))).collect();
-        let theta = &fit.scores.theta;
-        let of = |w: &[DMatrix<f64>]| Self::weighed(&self.total, w, theta, candidate, candidate).diagonal();
-        // Of several coefficients, each in its own unit.
-        of(&here).component_div(&of(&weights)).mean()
+        Some(Scored { candidate, value, in_range, delta_chi2, information, understated: 1.0 })
     }
 
     /// Corrects the information of a candidate for the weights of the sums. What lasts is weighted by the time that
@@ -534,12 +449,18 @@ impl<'a> CandidateScorer<'a> {
     /// Every instance of every effect that is not in the fit, in its best form, the best first; with the number of
     /// forms tried per effect, and the unobservable instances.
     pub fn rank(&self, fit: &Fit) -> Ranked {
+        self.rank_where(fit, |_| true)
+    }
+
+    /// The same of some coefficients.
+    pub fn rank_where(&self, fit: &Fit, asked: impl Fn(&Coefficient) -> bool) -> Ranked {
         let scores = &fit.scores;
         let (mut tried, mut unobservable) = (BTreeMap::new(), Vec::new());
         let mut ranked = Vec::new();
         for place in self.candidate_set.places() {
             let first = &self.candidate_set.coefficients[place[0]];
-            if fit.added.iter().any(|a| (&a.effect, &a.instance) == (&first.effect, &first.instance)) {
+            let same = |a: &Candidate| (&a.effect, &a.instance) == (&first.effect, &first.instance);
+            if fit.added.iter().any(same) || !asked(first) {
                 continue;
             }
             let forms = first.forms.len();
@@ -583,61 +504,9 @@ impl<'a> CandidateScorer<'a> {
         winner
     }
 
-    /// A candidate fitted to each half of the data; `None` where it is unobservable in one.
-    pub fn held_out(&self, fit: &Fit, candidate: &Candidate) -> Option<Halves> {
-        let judge = |set: usize| {
-            let (gram, scores) = (&self.gathered.sets[set], &fit.halves[set]);
-            let Beside { score, information, with_model, .. } = Self::beside(gram, scores, candidate)?;
-            let inverse = Cholesky::new(information.clone())?.inverse();
-            let spread = Self::variance(gram, scores, candidate, &with_model)?;
-            Some((&inverse * &score, score, information, &inverse * spread * &inverse))
-        };
-        let (a, b) = (judge(0)?, judge(1)?);
-        let gain = |value: &DVector<f64>, score: &DVector<f64>, information: &DMatrix<f64>| {
-            2.0 * score.dot(value) - value.dot(&(information * value))
-        };
-        let difference = &a.0 - &b.0;
-        Some(Halves {
-            gains: [gain(&b.0, &a.1, &a.2), gain(&a.0, &b.1, &b.2)],
-            difference_chi2: difference.dot(&Cholesky::new(&a.3 + &b.3)?.solve(&difference)),
-        })
-    }
-
-    /// Candidates that the data cannot tell from `scored`, and a coefficient of the model that it is degenerate with.
-    pub fn confounders(&self, fit: &Fit, scored: &Scored, ranked: &[Scored]) -> Vec<String> {
-        let scores = &fit.scores;
-        let direction = |s: &Scored| (Self::against(scores, &s.candidate).1.transpose() * &s.value, s.value.clone());
-        let (model, value) = direction(scored);
-        // Without the window correction, like `shared`.
-        let norm = |s: &Scored, v: &DVector<f64>| v.dot(&(&s.information * v)) / s.understated;
-        let mut names = Vec::new();
-        for other in ranked.iter().filter(|o| o.candidate.name() != scored.candidate.name()) {
-            let (their_model, their_value) = direction(other);
-            let own = self.between(&self.total, scores, &scored.candidate, &other.candidate);
-            let shared = value.dot(&(&own * &their_value)) - model.dot(&(&scores.covariance * &their_model));
-            let both = norm(scored, &value) * norm(other, &their_value);
-            if both > 0.0 && shared.abs() > self.settings.confounded * both.sqrt() {
-                names.push(other.candidate.name());
-            }
-        }
-        if scored.left < self.settings.degenerate {
-            let share = |q: usize| model[q].powi(2) * scores.covariance[(q, q)];
-            let free = &fit.estimate.free;
-            let lead = (0..free.len()).max_by(|a, b| share(*a).total_cmp(&share(*b)));
-            names.extend(lead.map(|q| fit.layout.coefficients[free[q]].clone()));
-        }
-        names
-    }
-
     /// Cross-spectra of the residuals of a fit per band, over those of white noise of unit PSD: a measured Σ.
     pub fn residual_psd(&self, fit: &Fit) -> Vec<DMatrix<f64>> {
         Self::residual(&self.total, &fit.layout, &fit.columns, &fit.estimate.theta)
-    }
-
-    /// The same of each half.
-    pub fn residual_psd_of_sets(&self, fit: &Fit) -> [Vec<DMatrix<f64>>; 2] {
-        let of = |gram: &Gram| Self::residual(gram, &fit.layout, &fit.columns, &fit.estimate.theta);
-        self.gathered.sets.each_ref().map(of)
     }
 
     fn residual(gram: &Gram, layout: &Layout, columns: &[usize], theta: &DVector<f64>) -> Vec<DMatrix<f64>> {
@@ -838,19 +707,16 @@ mod tests {
         }
     }
 
-    /// A candidate with the same waveform and nearly the same channels is a confounder, whatever the taper leaves of
-    /// it. One that acts on another channel is none, and a lasting cause of the same instance is ranked apart.
+    /// A lasting cause of the instance of an event is ranked apart, and what was added is not ranked again.
     #[test]
-    fn an_event_is_told_from_what_it_can_be_told_from() {
+    fn an_event_is_ranked_apart_from_what_lasts() {
         let (candidate_set, noise, settings) = (candidate_set(), noise(), Settings::default());
         assert_eq!(candidate_set.places().len(), 4);
         let gathered = gathered(3, SAMPLES, 9000, 6.0, 0.0);
         let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise, &settings);
         let fit = scorer.fit(&[]).unwrap();
         let ranked = scorer.rank(&fit);
-        let [one, both] = ["one", "both"].map(|instance| transient(&ranked, instance));
-        assert_eq!(scorer.confounders(&fit, &one, &ranked.all), ["e:both"]);
-        assert_eq!(scorer.confounders(&fit, &both, &ranked.all), ["e:one"]);
+        let one = transient(&ranked, "one");
         assert!(ranked.all.iter().any(|s| !s.candidate.transient && s.candidate.instance == "one"));
         // Forms of transients are counted by the matched filters.
         assert_eq!(ranked.tried, BTreeMap::from([("e".to_owned(), 1)]));

@@ -1,7 +1,7 @@
 //! Which effect is missing from the model of some products.
 //!
-//! The data are read twice: transients must be detected before they are compared with lasting effects. They are read a
-//! third time if the shape of a candidate can be refined.
+//! The data are read for transients, for the spectra of all candidates, which choose the form of each, a third time if a
+//! shape can be refined, and then until the likelihood of the innovations, which decides, has settled.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -10,33 +10,26 @@ use dragfree_engine::examine::has_parameter;
 use dragfree_engine::run::Progress;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{
-    self, Diagnosis, Found, LIMIT_QUANTILE, Limit, RefinementRequest, TRANSIENT, Trials,
+    self, Diagnosis, Found, LIMIT_QUANTILE, Limit, TRANSIENT, Trials, UNOBSERVABLE,
 };
 use dragfree_identification::innovations::decision::Fitted;
 use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
+use dragfree_identification::screen::{RefinementRequest, Screened, screen};
+use dragfree_identification::slow_forces::slow_forces;
 use dragfree_identification::transient::Detection;
 use dragfree_schema::Settings;
 use serde_json::{Map, json};
 
 use crate::WorkflowError;
-use crate::likelihood::{self, Decided, Judge, Meaning};
+use crate::likelihood::{Decided, Judge, Meaning, PASSES, Point, one_pass, reached, step};
 use crate::replay::{AT_NS, FINE, Pass, Replay, What, sum};
 
-/// What decides which effect is missing.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Decision {
-    /// Scores of the spectra, under rules for halves of the data and for excesses of power.
-    Spectra,
-    /// The likelihood of the innovations, among the forms that the spectra have chosen.
-    Innovations,
-}
-
-/// A diagnosis and the sums that it rests on.
+/// A diagnosis and the sums that chose the forms of the candidates.
 pub struct Diagnosed {
     /// Sums.
     pub record: Record,
-    /// What they say.
+    /// What is missing.
     pub diagnosis: Diagnosis,
     /// Thresholds.
     pub settings: Settings,
@@ -45,43 +38,96 @@ pub struct Diagnosed {
 /// Diagnoses the data of products of one model. `progress` is told the pass and the number of the product.
 ///
 /// # Errors
-/// [`WorkflowError`]: an input has changed, the products do not belong together, there is too little data, or the
-/// likelihood is asked for and a stage declares noise that cannot be filtered.
+/// [`WorkflowError`]: an input has changed, the products do not belong together, there is too little data, or a stage
+/// declares noise that cannot be filtered.
 pub fn diagnose(
     replay: &Replay<'_>,
-    decision: Decision,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Diagnosed, WorkflowError> {
     let settings = replay.settings()?;
     let found = sum(replay, settings, What::Transients, progress)?.gathered.transients;
     let detected: Vec<Detection> =
         found.certain(settings.transient_p_value).take(settings.max_transients).cloned().collect();
-    let mut pass = |requests: &[RefinementRequest], tried_before: &BTreeMap<String, usize>| {
+    let mut gather = |requests: &[RefinementRequest]| {
         let mut record = sum(replay, settings, What::Candidates(&detected, requests), progress)?;
         record.gathered.transients = found.clone();
         let noise = record.noise_model()?;
-        let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
-        let mut diagnosis = diagnosis::diagnose(&scorer, tried_before)?;
-        diagnosis.not_tried.extend(record.not_tried.iter().cloned());
-        contradict(&mut diagnosis, replay);
-        Ok::<_, WorkflowError>(Diagnosed { record, diagnosis, settings: settings.clone() })
+        let screened = {
+            let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
+            screen(&scorer, &[])?
+        };
+        Ok::<_, WorkflowError>((record, noise, screened))
     };
-    let first = pass(&[], &BTreeMap::new())?;
-    let mut requests = first.diagnosis.refinement_requests.clone();
+    let (mut record, mut noise, mut screened) = gather(&[])?;
+    let mut tried = screened.tried.clone();
+    let mut requests = screened.requests.clone();
     requests.retain(|request| has_parameter(replay.registry, &request.effect, FINE));
-    let by_spectra = if requests.is_empty() {
-        first
-    } else {
-        let mut tried = first.diagnosis.forms;
+    if !requests.is_empty() {
         tried.retain(|effect, _| requests.iter().any(|request| request.effect == *effect));
         // Sums are large, and these are made again.
-        drop(first.record);
-        pass(&requests, &tried)?
-    };
-    match decision {
-        Decision::Spectra => Ok(by_spectra),
-        Decision::Innovations => by_innovations(replay, by_spectra, progress),
+        drop(record);
+        (record, noise, screened) = gather(&requests)?;
+        for (effect, forms) in &screened.tried {
+            *tried.entry(effect.clone()).or_default() += forms;
+        }
     }
+    let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
+    let evidence = Evidence { trials: Trials::new(&scorer, &tried), least: settings.false_alarm, replay };
+    let mut diagnosis = decide(replay, settings, &record, &scorer, screened, &evidence, progress)?;
+    contradict(&mut diagnosis, replay);
+    Ok(Diagnosed { diagnosis, settings: settings.clone(), record })
+}
+
+/// Decides by the likelihood of the innovations among the forms that the spectra choose, beside the effects that are
+/// named so far: passes until nothing moves.
+fn decide(
+    replay: &Replay<'_>,
+    settings: &Settings,
+    record: &Record,
+    scorer: &CandidateScorer<'_>,
+    mut screened: Screened,
+    evidence: &Evidence<'_>,
+    progress: &mut dyn FnMut(Pass, usize, Progress),
+) -> Result<Diagnosis, WorkflowError> {
+    let fit = scorer.fit(&[])?;
+    let model = &record.candidate_set.coefficients[..record.candidate_set.model()];
+    let start = model.iter().zip(fit.estimate.theta.iter()).map(|(c, value)| (c.name.clone(), *value)).collect();
+    let mut point = Point::at(start);
+    let mut slow = slow_forces(scorer, &fit, &record.noise);
+    let mut named: Vec<Candidate> = Vec::new();
+    let mut pass = 0;
+    let (decided, screened) = loop {
+        let chosen: Vec<EffectEntry> = screened.forms.iter().map(entry).collect();
+        let decided = one_pass(replay, settings, &chosen, &slow, &point, evidence, progress)?;
+        let next = step(&point, &decided);
+        // The first pass fits constants alone.
+        let settled = pass > 1 && reached(&point, &next, &decided);
+        point = next;
+        let now = named_forms(&decided, &screened.forms);
+        if pass == PASSES || settled && now == named {
+            break (decided, screened);
+        }
+        if now != named {
+            let beside = screen(scorer, &now)?;
+            // A form that has changed is named in its new form.
+            named = named_forms(&decided, &beside.forms);
+            slow = slow_forces(scorer, &scorer.fit(&named)?, &record.noise);
+            screened = Screened { forms: beside.forms, ..screened };
+        }
+        pass += 1;
+    };
+    answer(settings, record, scorer, &decided, &screened, evidence)
+}
+
+/// The named effects among some forms.
+fn named_forms(decided: &Decided, forms: &[Candidate]) -> Vec<Candidate> {
+    let named = |c: &&Candidate| {
+        let mut all = decided.selection.chosen.iter().map(|f| &decided.candidates[f.candidate]);
+        all.any(|(effect, instance, _)| (effect, instance) == (&c.effect, &c.instance))
+    };
+    let mut all: Vec<Candidate> = forms.iter().filter(named).cloned().collect();
+    all.sort_by_key(Candidate::name);
+    all
 }
 
 /// Corrected p-values of the effects of a replay.
@@ -109,43 +155,21 @@ impl Judge for Evidence<'_> {
     }
 }
 
-/// Decides by the likelihood of the innovations among the best forms that the spectra have found.
-fn by_innovations(
-    replay: &Replay<'_>,
-    by_spectra: Diagnosed,
-    progress: &mut dyn FnMut(Pass, usize, Progress),
-) -> Result<Diagnosed, WorkflowError> {
-    let Diagnosed { record, diagnosis, settings } = by_spectra;
-    let noise = record.noise_model()?;
-    let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, &settings);
-    let trials = Trials::new(&scorer, &diagnosis.forms);
-    let evidence = Evidence { trials, least: settings.false_alarm, replay };
-    let mut forms: Vec<Candidate> = Vec::new();
-    for candidate in &diagnosis.best_forms {
-        let same = |c: &Candidate| (&c.effect, &c.instance) == (&candidate.effect, &candidate.instance);
-        if !forms.iter().any(same) {
-            forms.push(candidate.clone());
-        }
-    }
-    let chosen: Vec<EffectEntry> = forms.iter().map(entry).collect();
-    let fit = scorer.fit(&[])?;
-    let model = &record.candidate_set.coefficients[..record.candidate_set.model()];
-    let mut start: BTreeMap<String, f64> =
-        model.iter().zip(fit.estimate.theta.iter()).map(|(c, value)| (c.name.clone(), *value)).collect();
-    // A start alone: beside a large effect that is not taken off, everything else is seen wrong in the first pass.
-    let by_spectra = diagnosis.candidates.iter().filter(|f| f.accepted).flat_map(|f| &f.coefficients);
-    start.extend(by_spectra.filter_map(|c| Some((c["name"].as_str()?.to_owned(), c["value"].as_f64()?))));
-    let decided = likelihood::decide(replay, &settings, &chosen, start, &evidence, progress)?;
-    let is_named = |c: &&Candidate| {
-        let named = decided.selection.chosen.iter().map(|f| &decided.candidates[f.candidate]);
-        named.into_iter().any(|(effect, instance, _)| (effect, instance) == (&c.effect, &c.instance))
-    };
-    let added: Vec<Candidate> = forms.iter().filter(is_named).cloned().collect();
-    let unexplained = diagnosis::remaining(&scorer, &added)?;
+/// The answer that the last pass gives.
+fn answer(
+    settings: &Settings,
+    record: &Record,
+    scorer: &CandidateScorer<'_>,
+    decided: &Decided,
+    screened: &Screened,
+    evidence: &Evidence<'_>,
+) -> Result<Diagnosis, WorkflowError> {
+    let forms = &screened.forms;
+    let unexplained = diagnosis::remaining(scorer, &named_forms(decided, forms))?;
     let mut named: Vec<Found> =
-        decided.selection.chosen.iter().map(|f| found(&decided, f, &forms, &evidence, true)).collect();
+        decided.selection.chosen.iter().map(|f| found(settings, decided, f, forms, evidence, true)).collect();
     let mut levels = Vec::new();
-    for f in louder(&decided, &record, &evidence) {
+    for f in louder(decided, record, evidence) {
         let certain = f.p_value < settings.false_alarm;
         let beyond = f.value.ln().abs() > settings.level_tolerance.ln_1p();
         match (certain, beyond) {
@@ -156,32 +180,36 @@ fn by_innovations(
     }
     named.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
     let mut others: Vec<Found> =
-        decided.selection.rest.iter().map(|f| found(&decided, f, &forms, &evidence, false)).collect();
+        decided.selection.rest.iter().map(|f| found(settings, decided, f, forms, evidence, false)).collect();
     others.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
-    let upper_limits = decided.selection.rest.iter().flat_map(|f| limits(&decided, f, &forms)).collect();
-    others.truncate(settings.max_evaluated);
-    let verdict = match (named.is_empty(), unexplained.is_some()) {
+    let refused = |f: &Found| {
+        let reason = f.refused.as_ref()?;
+        Some(format!("{}:{} would lower χ² by {:.0}, and is refused: {reason}", f.effect, f.instance, f.delta_chi2))
+    };
+    let reasons: Vec<String> = if named.is_empty() { others.iter().filter_map(refused).collect() } else { Vec::new() };
+    let verdict = match (named.is_empty(), unexplained.is_some() || !reasons.is_empty()) {
         (false, _) => "missing",
         (true, true) => "unexplained",
         (true, false) => "sufficient",
     };
+    others.truncate(settings.max_evaluated);
     named.extend(others);
-    let mut not_tried = diagnosis.not_tried;
-    not_tried.extend(decided.not_tried.iter().cloned());
-    let diagnosis = Diagnosis {
+    let unobservable = screened.unobservable.iter().map(|name| (name.clone(), UNOBSERVABLE.to_owned()));
+    Ok(Diagnosis {
         verdict: verdict.to_owned(),
-        decided_by: "innovations".to_owned(),
+        false_alarm_rate: settings.false_alarm,
+        tried: evidence.trials.total(),
         candidates: named,
-        upper_limits,
+        upper_limits: decided.selection.rest.iter().flat_map(|f| limits(decided, f, forms)).collect(),
         unexplained,
-        reasons: Vec::new(),
+        reasons,
         levels,
-        not_tried,
-        ..diagnosis
-    };
-    let mut diagnosed = Diagnosed { record, diagnosis, settings };
-    contradict(&mut diagnosed.diagnosis, replay);
-    Ok(diagnosed)
+        transients: scorer.gathered.transients.certain(settings.false_alarm).map(|h| json!(h)).collect(),
+        not_tried: unobservable
+            .chain(record.not_tried.iter().cloned())
+            .chain(decided.not_tried.iter().cloned())
+            .collect(),
+    })
 }
 
 /// A model's entry that makes a candidate in its form.
@@ -208,7 +236,14 @@ fn coefficient(decided: &Decided, parameter: usize) -> (&str, &str) {
     }
 }
 
-fn found(decided: &Decided, fitted: &Fitted, forms: &[Candidate], evidence: &Evidence<'_>, accepted: bool) -> Found {
+fn found(
+    settings: &Settings,
+    decided: &Decided,
+    fitted: &Fitted,
+    forms: &[Candidate],
+    evidence: &Evidence<'_>,
+    accepted: bool,
+) -> Found {
     let (effect, instance, own) = &decided.candidates[fitted.candidate];
     let (values, lead) = leading(fitted);
     let form = forms.iter().find(|c| (&c.effect, &c.instance) == (effect, instance));
@@ -251,8 +286,6 @@ fn found(decided: &Decided, fitted: &Fitted, forms: &[Candidate], evidence: &Evi
         log10_p_value,
         delta_bic: dof * decided.numbers.ln() - fitted.gain,
         in_range: fitted.values.iter().zip(&fitted.free).all(|(a, b)| a == b),
-        held_out_delta_chi2: None,
-        held_out_p_value: None,
         chi2_per_dof_before: if accepted { before + fitted.gain / decided.numbers } else { before },
         chi2_per_dof_after: if accepted { before } else { before - fitted.gain / decided.numbers },
         offset_shift_m,
@@ -261,11 +294,13 @@ fn found(decided: &Decided, fitted: &Fitted, forms: &[Candidate], evidence: &Evi
         confounders: fitted.alternatives.iter().filter(|(_, p)| *p > evidence.least).map(confounder).collect(),
         accepted,
         refused: (!accepted && p_value < evidence.least).then(|| {
-            "it may be what the form of a named effect leaves, or as many effects as the settings allow are named"
-                .to_owned()
+            if fitted.beyond > settings.range_sigmas.powi(2) {
+                "its best value lies outside its physical range".to_owned()
+            } else {
+                "it may be what the form of a named effect leaves, or as many effects as the settings allow are named"
+                    .to_owned()
+            }
         }),
-        of_excess: false,
-        drives_estimate: false,
     }
 }
 
@@ -295,8 +330,6 @@ fn louder(decided: &Decided, record: &Record, evidence: &Evidence<'_>) -> Vec<Fo
             log10_p_value,
             delta_bic: decided.numbers.ln() - gain,
             in_range: true,
-            held_out_delta_chi2: None,
-            held_out_p_value: None,
             chi2_per_dof_before: before + gain / decided.numbers,
             chi2_per_dof_after: before,
             offset_shift_m: BTreeMap::new(),
@@ -305,8 +338,6 @@ fn louder(decided: &Decided, record: &Record, evidence: &Evidence<'_>) -> Vec<Fo
             confounders: Vec::new(),
             accepted: false,
             refused: None,
-            of_excess: false,
-            drives_estimate: false,
         })
     })
     .collect()

@@ -58,7 +58,7 @@ pub enum WorkflowError {
     #[error("{}: {what}", path.display())]
     Reference { path: PathBuf, what: String },
     /// The likelihood of innovations needs more than the stages declare.
-    #[error("the likelihood of the innovations is not to be had: {0}; decide by the spectra")]
+    #[error("the likelihood of the innovations is not to be had: {0}")]
     NoLikelihood(String),
     /// A detection without its template.
     #[error(

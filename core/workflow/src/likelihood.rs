@@ -14,7 +14,7 @@ use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_identification::innovations::decision::{Candidate, Evidence, Prior, Quadratic, Selection};
 use dragfree_identification::innovations::filter::{Start, Sums};
-use dragfree_schema::{Coefficient, PREDICTION_NEED, Settings};
+use dragfree_schema::{Coefficient, NoiseProcess, PREDICTION_NEED, Settings};
 use nalgebra::{DMatrix, DVector};
 
 mod pass;
@@ -25,13 +25,14 @@ use crate::WorkflowError;
 use crate::replay::{Pass, Replay, noise_levels};
 
 /// Passes after which the point is taken as it is.
-const PASSES: usize = 6;
+pub(crate) const PASSES: usize = 6;
 /// A point is reached when nothing moves by more than this part of its σ.
 const REACHED_SIGMAS: f64 = 0.5;
 /// σ of the logarithm of a level before any data: the data decide.
 const LEVEL_PRIOR: f64 = 1.0;
 /// Largest change of the logarithm of a level in one pass: beyond it the quadratic form is no likelihood.
 const LEVEL_STEP: f64 = 0.7;
+
 /// Where a pass is made.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Point {
@@ -43,6 +44,13 @@ pub(crate) struct Point {
     powers: BTreeMap<String, f64>,
     /// States at the start of each stretch, by product.
     starts: Vec<Vec<DVector<f64>>>,
+}
+
+impl Point {
+    /// Declared levels, and coefficients of the model at these values.
+    pub(crate) fn at(values: BTreeMap<String, f64>) -> Self {
+        Self { values, ..Self::default() }
+    }
 }
 
 /// What a parameter of the likelihood stands for.
@@ -84,36 +92,8 @@ pub(crate) trait Judge {
     fn ln_prior(&self, effect: &str) -> f64;
 }
 
-/// Selects effects by the likelihood of all products: passes until nothing moves.
-///
-/// # Errors
-/// [`WorkflowError::NoLikelihood`] where the declared noise cannot be filtered; otherwise as a replay.
-pub(crate) fn decide(
-    replay: &Replay<'_>,
-    settings: &Settings,
-    chosen: &[EffectEntry],
-    start: BTreeMap<String, f64>,
-    judge: &dyn Judge,
-    progress: &mut dyn FnMut(Pass, usize, Progress),
-) -> Result<Decided, WorkflowError> {
-    let mut point = Point { values: start, ..Point::default() };
-    let opening = one_pass(replay, settings, chosen, &point, judge, progress)?;
-    point = step(&point, &opening);
-    let mut pass = 0;
-    loop {
-        pass += 1;
-        let decided = one_pass(replay, settings, chosen, &point, judge, progress)?;
-        let next = step(&point, &decided);
-        let reached = pass > 1 && reached(&point, &next, &decided);
-        point = next;
-        if reached || pass == PASSES {
-            return Ok(decided);
-        }
-    }
-}
-
 /// The point that the sums of a pass lead to.
-fn step(from: &Point, decided: &Decided) -> Point {
+pub(crate) fn step(from: &Point, decided: &Decided) -> Point {
     let mut to = Point::default();
     let named: BTreeSet<usize> =
         decided.selection.chosen.iter().flat_map(|f| decided.candidates[f.candidate].2.iter().copied()).collect();
@@ -137,7 +117,7 @@ fn step(from: &Point, decided: &Decided) -> Point {
 }
 
 /// Whether two points are the same: the same effects, and nothing moved by more than a part of its σ.
-fn reached(from: &Point, to: &Point, decided: &Decided) -> bool {
+pub(crate) fn reached(from: &Point, to: &Point, decided: &Decided) -> bool {
     decided.parameters.iter().enumerate().all(|(i, (name, meaning))| {
         let near = |a: Option<f64>, b: Option<f64>| match (a, b) {
             (Some(a), Some(b)) => (a - b).abs() <= REACHED_SIGMAS * decided.selection.sigma[i],
@@ -152,10 +132,15 @@ fn reached(from: &Point, to: &Point, decided: &Decided) -> bool {
     })
 }
 
-fn one_pass(
+/// One pass over all products, with effects in these forms and slow forces beside the declared noise.
+///
+/// # Errors
+/// [`WorkflowError::NoLikelihood`] where the declared noise cannot be filtered; otherwise as a replay.
+pub(crate) fn one_pass(
     replay: &Replay<'_>,
     settings: &Settings,
     chosen: &[EffectEntry],
+    slow: &[NoiseProcess],
     point: &Point,
     judge: &dyn Judge,
     progress: &mut dyn FnMut(Pass, usize, Progress),
@@ -175,7 +160,7 @@ fn one_pass(
             threads: replay.threads,
             batch_rows: replay.batch_rows,
         };
-        let link = |chain: &Chain| Filtered::link(chain, point, number, settings, replay.threads);
+        let link = |chain: &Chain| Filtered::link(chain, point, slow, number, settings, replay.threads);
         let (filtered, refused) =
             examine(replay.registry, &examination, link, &mut |p| progress(Pass::Likelihood, number, p))?;
         not_tried.extend(refused);
@@ -297,14 +282,20 @@ impl Joined {
         let candidates = groups
             .iter()
             .map(|(effect, _, own)| {
-                let of = |i: &usize| match &parameters[*i].1 {
-                    Meaning::Coefficient(c) => (c.lower, c.upper),
-                    _ => (f64::NEG_INFINITY, f64::INFINITY),
+                let coefficients = || {
+                    own.iter().filter_map(|i| match &parameters[*i].1 {
+                        Meaning::Coefficient(c) => Some(c),
+                        _ => None,
+                    })
                 };
-                let (lower, upper) = own.iter().map(of).unzip();
-                let formed = |i: &usize| matches!(&parameters[*i].1, Meaning::Coefficient(c) if !c.shape.is_empty());
-                let shaped = own.iter().any(formed);
-                Candidate { parameters: own.clone(), lower, upper, ln_prior: judge.ln_prior(effect), shaped }
+                Candidate {
+                    parameters: own.clone(),
+                    lower: coefficients().map(|c| c.lower).collect(),
+                    upper: coefficients().map(|c| c.upper).collect(),
+                    prior_sigma: coefficients().map(|c| c.prior_sigma).collect(),
+                    ln_prior: judge.ln_prior(effect),
+                    shaped: coefficients().any(|c| !c.shape.is_empty()),
+                }
             })
             .collect();
         let p = parameters.len();
@@ -331,6 +322,7 @@ impl Joined {
             bound: settings.false_alarm.log10(),
             most: settings.max_added,
             remainder: settings.excess_remainder,
+            range: settings.range_sigmas.powi(2),
         });
         Decided {
             selection,

@@ -8,8 +8,8 @@ use dragfree_engine::product::Written;
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
-use dragfree_identification::diagnosis::RefinementRequest;
 use dragfree_identification::record::Record;
+use dragfree_identification::screen::RefinementRequest;
 use dragfree_identification::transient::Detection;
 use dragfree_schema::Settings;
 

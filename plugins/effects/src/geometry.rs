@@ -113,12 +113,13 @@ fn drift_form(
     Ok(Form::new(shape, unit, range, terms))
 }
 
-const OPENING_RAD: [f64; 2] = [-0.1, 0.1];
+/// Three times what 25 days of 5 nrad/s make of it.
+const OPENING_RAD: [f64; 2] = [-0.033, 0.033];
 
 /// `opening-angle`: the frame of a test mass, with its electrodes and readouts, is rotated by δ about s_3 from `T_S^O`.
 ///
 /// The test mass sees the housing's acceleration `a = û − F_E/m + Φ b + d` from another direction: `z = −δ e_3 × a`, so
-/// `δ a_y` in x and `−δ a_x` in y. δ: rad, ±0.1. The unmodelled `d` is estimated from the readouts themselves, so its
+/// `δ a_y` in x and `−δ a_x` in y. δ: rad, ±0.033. The unmodelled `d` is estimated from the readouts themselves, so its
 /// terms are arranged as derived in Methods, "Opening angle". `d` is observable only where both optical axes are read.
 /// In prediction mode `d` is left to the host.
 ///

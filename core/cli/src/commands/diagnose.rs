@@ -1,24 +1,18 @@
 //! `dragfree diagnose`: the data of products once more, with every effect that is not in the model.
 
 use super::{Done, INCONSISTENT, replay};
-use crate::args::{DecideBy, Diagnose, Global};
+use crate::args::{Diagnose, Global};
 use crate::failure::Failure;
 use crate::text::Paint;
 use chrono::DateTime;
 use dragfree_engine::files::IoContext as _;
 use dragfree_identification::diagnosis::Found;
-use dragfree_workflow::diagnose::{Decision, Diagnosed, diagnose};
+use dragfree_workflow::diagnose::{Diagnosed, diagnose};
 use std::fmt::Write as _;
 use std::io::Write as _;
 
 pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Result<Done, Failure> {
-    let decision = match command.decide_by {
-        DecideBy::Spectra => Decision::Spectra,
-        DecideBy::Innovations => Decision::Innovations,
-    };
-    let diagnosed = replay::with_meter(&command.products, &command.archive.folder, global, |replay, progress| {
-        diagnose(replay, decision, progress)
-    })?;
+    let diagnosed = replay::with_meter(&command.products, &command.archive.folder, global, diagnose)?;
     if let Some(path) = &command.save_sums {
         let file = std::fs::File::create(path).at("write", path)?;
         let mut file = std::io::BufWriter::with_capacity(1 << 20, file);

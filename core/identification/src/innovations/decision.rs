@@ -19,6 +19,8 @@ pub struct Candidate {
     pub lower: Vec<f64>,
     /// Upper ends.
     pub upper: Vec<f64>,
+    /// Standard deviation of each before any data; infinite where nothing is known.
+    pub prior_sigma: Vec<f64>,
     /// Logarithm of the weight that it has before any data.
     pub ln_prior: f64,
     /// Whether its form is a point of a grid, so that the true one differs from it.
@@ -35,6 +37,9 @@ pub struct Evidence<'a> {
     pub most: usize,
     /// Part of the gain of a candidate whose form is a point of a grid that the true form may leave to others.
     pub remainder: f64,
+    /// By how much the likelihood, as twice its logarithm, may be higher outside the ranges of a candidate's values than
+    /// inside before the candidate is refused.
+    pub range: f64,
 }
 
 /// What is known of a sum of parameters beside the data: a Gaussian about `mean`.
@@ -59,6 +64,8 @@ pub struct Fitted {
     pub covariance: DMatrix<f64>,
     /// Twice the logarithm of the ratio of likelihoods with and without it.
     pub gain: f64,
+    /// How much more it would be without ranges.
+    pub beyond: f64,
     /// Others that explain as much in its place, with their probabilities, and its own.
     pub alternatives: Vec<(usize, f64)>,
     /// Its probability among them.
@@ -87,6 +94,8 @@ pub struct Quadratic {
     score: DVector<f64>,
     base: Vec<usize>,
     candidates: Vec<Candidate>,
+    /// Numbers in the data.
+    numbers: f64,
     /// Information and score of the candidates' parameters, the base fitted, by index of the parameter.
     profiled: DMatrix<f64>,
     profiled_score: DVector<f64>,
@@ -107,8 +116,15 @@ impl Quadratic {
         }
         let optional = |i: &usize| candidates.iter().any(|c| c.parameters.contains(i));
         let base: Vec<usize> = (0..start.len()).filter(|i| !optional(i)).collect();
-        let mut quadratic =
-            Self { profiled: information.clone(), profiled_score: score.clone(), information, score, base, candidates };
+        let mut quadratic = Self {
+            profiled: information.clone(),
+            profiled_score: score.clone(),
+            information,
+            score,
+            base,
+            candidates,
+            numbers: sums.numbers.max(1.0),
+        };
         quadratic.profile();
         quadratic
     }
@@ -159,6 +175,25 @@ impl Quadratic {
         (values.iter().copied().collect(), gain)
     }
 
+    /// Logarithm of the evidence of a set: of the probability of the data with the values averaged over what is known of
+    /// them before, up to a constant, and of the weights of its candidates. Of a value of which nothing is known, a
+    /// Gaussian with the information of one number of the data is (Kass and Wasserman, 1995).
+    fn ln_evidence(&self, set: &[usize]) -> f64 {
+        let at = self.parameters(set);
+        let known = set.iter().flat_map(|c| &self.candidates[*c].prior_sigma).zip(&at).map(|(sigma, i)| {
+            let of_one = (self.numbers / self.profiled[(*i, *i)].max(f64::MIN_POSITIVE)).sqrt();
+            if sigma.is_finite() { *sigma } else { of_one }
+        });
+        let known: Vec<f64> = known.collect();
+        let scaled = |i: usize, j: usize| known[i] * self.profiled[(at[i], at[j])] * known[j];
+        let total = DMatrix::from_fn(at.len(), at.len(), |i, j| f64::from(u8::from(i == j)) + scaled(i, j));
+        let score = DVector::from_fn(at.len(), |i, _| known[i] * self.profiled_score[at[i]]);
+        let weights: f64 = set.iter().map(|c| self.candidates[*c].ln_prior).sum();
+        let Some(factor) = total.cholesky() else { return f64::NEG_INFINITY };
+        let ln_det: f64 = factor.l().diagonal().iter().map(|x| 2.0 * x.ln()).sum();
+        0.5 * (score.dot(&factor.solve(&score)) - ln_det) + weights
+    }
+
     /// A candidate beside a set, or in it.
     fn beside(&self, candidate: usize, set: &[usize]) -> Fitted {
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
@@ -177,6 +212,7 @@ impl Quadratic {
             free: free.as_slice()[first..].to_vec(),
             covariance: covariance.view((first, first), (own, own)).into_owned(),
             gain: (with - without).max(0.0),
+            beyond: (free.dot(&(&n * &free)) - self.fit(&others).1 - (with - without)).max(0.0),
             alternatives: Vec::new(),
             probability: 1.0,
         }
@@ -194,37 +230,36 @@ impl Quadratic {
         self.candidates[candidate].parameters.iter().map(left).fold(f64::INFINITY, f64::min)
     }
 
-    /// The set of effects: the most significant one is added as long as it is significant,
-    /// one that is not needed beside the others is taken out, and one is exchanged where another explains more.
+    /// The set of effects of the largest evidence that the search meets, in which each is significant beside the others.
+    ///
+    /// The most significant candidate is added; one is exchanged for another, or for two, where that raises the
+    /// evidence; and what is not significant beside the others is taken out, until a set comes back.
     pub fn select(&self, evidence: &Evidence<'_>) -> Selection {
-        let Evidence { bound, most, .. } = *evidence;
-        let log10_p = |c: usize, set: &[usize]| self.log10_p(c, set, evidence);
         let observable = |c: &usize, set: &[usize]| self.left(*c, set) > OBSERVABLE;
         let all: Vec<usize> = (0..self.candidates.len()).collect();
         let unobservable: Vec<usize> = all.iter().copied().filter(|c| !observable(c, &[])).collect();
         let usable: Vec<usize> = all.into_iter().filter(|c| !unobservable.contains(c)).collect();
+        let mut met: Vec<Vec<usize>> = vec![Vec::new()];
         let mut set: Vec<usize> = Vec::new();
-        // Each step raises the evidence of the set; the number of steps is bounded in case rounding undoes one.
-        for _ in 0..4 * most {
+        loop {
             let next = usable.iter().filter(|c| !set.contains(c) && observable(c, &set));
-            let all = next.map(|c| (*c, log10_p(*c, &set)));
-            let best = all.min_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, p)| *p < bound && set.len() < most);
-            if let Some((c, _)) = best {
+            let significant = next.map(|c| (*c, self.log10_p(*c, &set, evidence)));
+            let best = significant.min_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, p)| *p < evidence.bound);
+            if let Some((c, _)) = best.filter(|_| set.len() < evidence.most) {
                 set.push(c);
             }
-            let exchanged = self.exchange(&mut set, &usable);
-            let weak = set.iter().map(|c| (*c, log10_p(*c, &set)));
-            let weakest = weak.max_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, p)| *p >= bound);
-            if let Some((weak, _)) = weakest {
+            self.exchange(&mut set, &usable, evidence);
+            while let Some(weak) = self.weakest(&set, evidence) {
                 set.retain(|c| *c != weak);
-                if best.is_some_and(|(c, _)| c == weak) && !exchanged {
-                    break;
-                }
-            } else if best.is_none() && !exchanged {
+            }
+            set.sort_unstable();
+            if met.contains(&set) {
                 break;
             }
+            met.push(set.clone());
         }
-        set.sort_unstable();
+        let by_evidence = |a: &Vec<usize>, b: &Vec<usize>| self.ln_evidence(a).total_cmp(&self.ln_evidence(b));
+        let set = met.into_iter().max_by(by_evidence).unwrap_or_default();
         let chosen = set.iter().map(|c| self.with_alternatives(*c, &set, &usable)).collect();
         let rest =
             usable.iter().filter(|c| !set.contains(c) && observable(c, &set)).map(|c| self.beside(*c, &set)).collect();
@@ -232,44 +267,52 @@ impl Quadratic {
         Selection { chosen, rest, unobservable, values, sigma }
     }
 
+    /// The least significant member of a set, if it is not significant beside the others.
+    fn weakest(&self, set: &[usize], evidence: &Evidence<'_>) -> Option<usize> {
+        let all = set.iter().map(|c| (*c, self.log10_p(*c, set, evidence)));
+        all.max_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, p)| *p >= evidence.bound).map(|(c, _)| c)
+    }
+
     /// Decimal logarithm of the p-value of a candidate beside a set; that of chance where it may be what the form of
-    /// another leaves.
+    /// another leaves, and where the data want values outside its ranges.
     fn log10_p(&self, candidate: usize, set: &[usize], evidence: &Evidence<'_>) -> f64 {
-        let gain = self.beside(candidate, set).gain;
+        let Fitted { gain, beyond, .. } = self.beside(candidate, set);
+        if beyond > evidence.range {
+            return 0.0;
+        }
         let shaped = set.iter().filter(|c| **c != candidate && self.candidates[**c].shaped);
         let largest = shaped.map(|c| self.beside(*c, set).gain).fold(0.0, f64::max);
         if gain < evidence.remainder * largest { 0.0 } else { (evidence.log10_p)(candidate, gain) }
     }
 
-    /// Puts another candidate in the place of one of the set where that has a larger posterior probability.
-    fn exchange(&self, set: &mut [usize], usable: &[usize]) -> bool {
-        let mut changed = false;
+    /// Puts another candidate, or two, in the place of one of the set where that has a larger evidence. Two causes may
+    /// together look like a third, which explains more than either of them.
+    fn exchange(&self, set: &mut Vec<usize>, usable: &[usize], evidence: &Evidence<'_>) {
         for i in 0..set.len() {
-            let worth =
-                |set: &[usize]| self.fit(set).1 + 2.0 * set.iter().map(|c| self.candidates[*c].ln_prior).sum::<f64>();
-            let mut best = (set[i], worth(set));
-            for c in usable.iter().filter(|c| !set.contains(c)) {
-                let mut other = set.to_vec();
-                other[i] = *c;
-                let value = worth(&other);
-                if value > best.1 + 1e-6 {
-                    best = (*c, value);
+            let mut others = set.clone();
+            others.remove(i);
+            let left: Vec<usize> = usable.iter().copied().filter(|c| !set.contains(c)).collect();
+            let pairs = left.iter().enumerate().flat_map(|(k, a)| left[k + 1..].iter().map(|b| vec![*a, *b]));
+            let room = others.len() + 2 <= evidence.most;
+            let mut best = (vec![set[i]], self.ln_evidence(set));
+            for own in left.iter().map(|c| vec![*c]).chain(pairs.filter(|_| room)) {
+                let all = [&others[..], &own].concat();
+                let value = self.ln_evidence(&all);
+                let stands = || own.iter().all(|c| self.log10_p(*c, &all, evidence) < evidence.bound);
+                if value > best.1 + 1e-6 && stands() {
+                    best = (own, value);
                 }
             }
-            changed |= best.0 != set[i];
-            set[i] = best.0;
+            let mut own = best.0.into_iter();
+            set[i] = own.next().unwrap_or(set[i]);
+            set.extend(own);
         }
-        changed
     }
 
     fn with_alternatives(&self, candidate: usize, set: &[usize], usable: &[usize]) -> Fitted {
         let mut fitted = self.beside(candidate, set);
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
-        let (_, without) = self.fit(&others);
-        let evidence = |c: usize| {
-            let all: Vec<usize> = others.iter().copied().chain([c]).collect();
-            0.5 * (self.fit(&all).1 - without) + self.candidates[c].ln_prior
-        };
+        let evidence = |c: usize| self.ln_evidence(&others.iter().copied().chain([c]).collect::<Vec<_>>());
         let own = evidence(candidate);
         let weights: Vec<(usize, f64)> = usable
             .iter()

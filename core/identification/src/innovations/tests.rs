@@ -463,12 +463,19 @@ fn quadratic(information: DMatrix<f64>, truth: &[f64], candidates: Vec<Candidate
 }
 
 fn candidate(parameter: usize) -> Candidate {
-    Candidate { parameters: vec![parameter], lower: vec![-0.3], upper: vec![0.3], ln_prior: 0.0, shaped: false }
+    Candidate {
+        parameters: vec![parameter],
+        lower: vec![-0.3],
+        upper: vec![0.3],
+        prior_sigma: vec![0.1],
+        ln_prior: 0.0,
+        shaped: false,
+    }
 }
 
 /// A gain of 13.8 is at the bound.
 fn evidence(most: usize) -> Evidence<'static> {
-    Evidence { log10_p: &|_, gain| 1.0 - gain / 4.6, bound: -2.0, most, remainder: 1e-3 }
+    Evidence { log10_p: &|_, gain| 1.0 - gain / 4.6, bound: -2.0, most, remainder: 1e-3, range: 13.8 }
 }
 
 /// What a grid of forms leaves of a strong effect names no other; beside one without a form the same counts.
@@ -507,7 +514,8 @@ fn a_stand_in_is_exchanged_for_the_causes() {
     assert!(selection.rest.iter().all(|c| c.gain < 1e-6));
 }
 
-/// Outside of its range a value explains only what its best value inside explains; equals share the probability.
+/// Outside of its range a value explains only what its best value inside explains, and data that want a value far
+/// outside name nothing; equals share the probability.
 #[test]
 fn ranges_bound_the_gain_and_equals_are_alternatives() {
     let information = DMatrix::from_row_slice(3, 3, &[1.0, 0.0, 0.0, 0.0, 1e4, 0.999 * 1e4, 0.0, 0.999 * 1e4, 1e4]);
@@ -515,13 +523,15 @@ fn ranges_bound_the_gain_and_equals_are_alternatives() {
     let alike = quadratic(information.clone(), &[0.0, 0.2, 0.0], both());
     let selection = alike.select(&evidence(2));
     assert_eq!((selection.chosen.len(), selection.chosen[0].candidate), (1, 0));
-    // χ² differ by (1 − 0.999²) 1e4 0.2² = 0.8.
-    let other = (-0.5 * (1.0 - 0.999_f64.powi(2)) * 1e4 * 0.04_f64).exp();
+    // Scores of 2000 and 1998 under a prior of σ = 0.1: ½ (0.1 · 2000)²/(1 + 0.1² · 1e4), and the same of 1998.
+    let other = (0.5 * (199.8_f64.powi(2) - 200.0_f64.powi(2)) / 101.0).exp();
     assert!((selection.chosen[0].alternatives[0].1 - other / (1.0 + other)).abs() < 1e-9);
     let far = quadratic(information, &[0.0, 2.0, 0.0], both());
-    let beyond = far.select(&evidence(1));
-    let own = &beyond.chosen[0];
-    assert_eq!(own.values[0], 0.3);
+    let selection = far.select(&evidence(1));
+    assert!(selection.chosen.is_empty());
+    let own = &selection.rest[0];
+    assert_eq!((own.candidate, own.values[0]), (0, 0.3));
+    assert!((own.beyond - (1e4 * 4.0 - own.gain)).abs() < 1e-6 && (own.free[0] - 2.0).abs() < 1e-9);
     assert!((own.gain - (2.0 * 1e4 * 2.0 * 0.3 - 1e4 * 0.09)).abs() < 1e-6, "{}", own.gain);
 }
 

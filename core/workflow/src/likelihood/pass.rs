@@ -9,7 +9,8 @@ use dragfree_identification::innovations::filter::{Innovations, POWERS, Paramete
 use dragfree_identification::innovations::predictor::{Change, Predictor};
 use dragfree_identification::innovations::state_space::{NoNoise, NoisePoint, NoiseStates, gains};
 use dragfree_schema::{
-    Available, Coefficient, Column, Response as Declared, Settings, UNPREDICTED_ATTRIBUTE, UNPREDICTED_SLOPE_ATTRIBUTE,
+    Available, Coefficient, Column, NoiseProcess, Response as Declared, Settings, UNPREDICTED_ATTRIBUTE,
+    UNPREDICTED_SLOPE_ATTRIBUTE,
 };
 use nalgebra::DMatrix;
 
@@ -277,7 +278,8 @@ fn noise_point(responses: &Responses<'_>, filters: &[usize], values: &[f64], lev
 }
 
 impl Filtered {
-    /// The filter of one product's chain at a point; `number` is that of the product.
+    /// The filter of one product's chain at a point, with `slow` forces beside the declared noise; `number` is that of
+    /// the product.
     ///
     /// The first pass, which has no powers of time yet, fits these with the model and what is named alone: constants of
     /// the channels are many σ of the noise between test masses, and a filter without them would take them for noise.
@@ -287,6 +289,7 @@ impl Filtered {
     pub(super) fn link(
         chain: &Chain,
         point: &Point,
+        slow: &[NoiseProcess],
         number: usize,
         settings: &Settings,
         threads: usize,
@@ -295,7 +298,7 @@ impl Filtered {
             columns: chain.columns.clone(),
             coefficients: chain.coefficients.clone(),
             constraints: chain.constraints.clone(),
-            noise: chain.noise.clone(),
+            noise: chain.noise.iter().chain(slow).cloned().collect(),
         };
         let responses = Responses::of(&available)?;
         let noise = NoiseAt::new(&available, &responses, point)?;

@@ -1,0 +1,119 @@
+//! The screen: the form in which each candidate is tried.
+//!
+//! A candidate with a shape (a lag, a resonance, a time) has up to thousands of forms. The spectra choose one of them
+//! beside the effects that are named so far; whether the candidate is named, the likelihood of the innovations decides.
+
+use std::collections::BTreeMap;
+
+use serde_json::{Map, Value};
+
+use crate::candidates::Candidate;
+use crate::diagnosis::{Trials, family};
+use crate::scores::{CandidateScorer, Fit, IdentificationError, Scored, WithoutExcess};
+
+/// Every candidate in the form that the spectra choose.
+#[derive(Clone, Debug)]
+pub struct Screened {
+    /// One form of each instance of each effect, the most significant first.
+    pub forms: Vec<Candidate>,
+    /// Forms that were tried, per effect.
+    pub tried: BTreeMap<String, usize>,
+    /// Instances without information in these data.
+    pub unobservable: Vec<String>,
+    /// Candidates that stand out, to be tried again on a finer grid of shapes.
+    pub requests: Vec<RefinementRequest>,
+}
+
+/// A candidate that is to be tried again on a finer grid of shapes about this one.
+#[derive(Clone, Debug, PartialEq)]
+pub struct RefinementRequest {
+    /// Effect.
+    pub effect: String,
+    /// Instance.
+    pub instance: String,
+    /// Values of the shape parameters.
+    pub shape: Map<String, Value>,
+}
+
+/// Chooses the form of each candidate beside `named` effects; that of a named one beside the others.
+///
+/// # Errors
+/// [`IdentificationError`]: too little data, or a model that cannot be fitted.
+pub fn screen(scorer: &CandidateScorer<'_>, named: &[Candidate]) -> Result<Screened, IdentificationError> {
+    let fit = scorer.fit(named)?;
+    let ranked = scorer.rank(&fit);
+    let trials = Trials::new(scorer, &ranked.tried);
+    let stands_out = |s: &&Scored| !s.candidate.transient && trials.p_value_of(s).0 < scorer.settings.false_alarm;
+    let request = |s: &Scored| RefinementRequest {
+        effect: s.candidate.effect.clone(),
+        instance: s.candidate.instance.clone(),
+        shape: s.candidate.parts[0].1.shape.clone(),
+    };
+    let requests = ranked.all.iter().filter(stands_out).map(request).collect();
+    let mut forms = refined(scorer, &fit, ranked.all, &trials)?;
+    for (i, candidate) in named.iter().enumerate() {
+        let mut others = named.to_vec();
+        others.remove(i);
+        let without = scorer.fit(&others)?;
+        let own = scorer.rank_where(&without, |c| (&c.effect, &c.instance) == (&candidate.effect, &candidate.instance));
+        let form = refined(scorer, &without, own.all, &trials)?.into_iter().next();
+        forms.insert(i, form.unwrap_or_else(|| candidate.clone()));
+    }
+    Ok(Screened { forms, tried: ranked.tried, unobservable: ranked.unobservable, requests })
+}
+
+/// The ranked candidates, one form per instance, with the two cases in which the score chooses badly: where Σ has
+/// absorbed an excess of power, the form that explains more of it is taken, and a candidate that filters a noise has
+/// the form of the highest likelihood.
+fn refined(
+    scorer: &CandidateScorer<'_>,
+    fit: &Fit,
+    mut ranked: Vec<Scored>,
+    trials: &Trials,
+) -> Result<Vec<Candidate>, IdentificationError> {
+    let by_p_value = |all: &mut Vec<Scored>| {
+        all.sort_by(|a, b| trials.p_value_of(a).1.total_cmp(&trials.p_value_of(b).1));
+        // Of an instance that may act once and may last, the more significant of the two.
+        let mut seen = Vec::new();
+        all.retain(|s| {
+            let new = !seen.contains(&s.candidate.name());
+            seen.push(s.candidate.name());
+            new
+        });
+    };
+    by_p_value(&mut ranked);
+    let mut forms: Vec<Candidate> = ranked.into_iter().map(|s| s.candidate).collect();
+    if let Some(WithoutExcess { plain, bands, .. }) = scorer.without_excess(fit) {
+        let of_ranked = |c: &crate::candidates::Coefficient| {
+            forms.iter().any(|f| (&f.effect, &f.instance) == (&c.effect, &c.instance))
+        };
+        let mut of_excess = scorer.rank_where(&plain, of_ranked).all;
+        by_p_value(&mut of_excess);
+        for scored in of_excess.into_iter().take(scorer.settings.max_excess_candidates) {
+            let Some(at) = forms.iter().position(|f| f.name() == scored.candidate.name()) else { continue };
+            if forms[at] == scored.candidate {
+                continue;
+            }
+            let deviance = |form: &Candidate| {
+                let added = [&fit.added[..], std::slice::from_ref(form)].concat();
+                scorer.deviance(fit, &bands, &added)
+            };
+            if deviance(&scored.candidate)? < deviance(&forms[at])? {
+                forms[at] = scored.candidate;
+            }
+        }
+    }
+    for form in &mut forms {
+        if let Some(likelier) = scorer.coloured(fit, form)? {
+            *form = likelier;
+        }
+    }
+    Ok(forms)
+}
+
+impl Trials {
+    /// Corrected p-value of a score, and its decimal logarithm.
+    fn p_value_of(&self, s: &Scored) -> (f64, f64) {
+        self.p_value(family(&s.candidate), s.delta_chi2, s.candidate.parts.len() as f64)
+    }
+}

@@ -1,0 +1,143 @@
+//! Slow forces that no effect explains: random walks of acceleration, one for each way in which a force enters the
+//! channels.
+//!
+//! What an unknown slow force does to a channel looks like whatever slow series is nearest to it. Beside a random walk
+//! of the right power such a series explains no more than chance. The power is that of the highest likelihood of the
+//! residuals' spectra (Whittle): with `Σ_b + Σ_k q_k f_b⁻² g_k g_kᵀ` the modelled spectra in band b and Ŵ_b the
+//! measured ones, the iteration
+//!
+//! ```text
+//! q_k ← q_k √( Σ_b n_b f_b⁻² g_kᵀ Σ⁻¹ Ŵ Σ⁻¹ g_k / Σ_b n_b f_b⁻² g_kᵀ Σ⁻¹ g_k )
+//! ```
+//!
+//! raises the likelihood in every step (majorisation of the Itakura–Saito divergence: Févotte and Idier, Neural
+//! Computation 23, 2421, 2011) and keeps every power positive.
+
+use dragfree_schema::{NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm};
+use nalgebra::{Cholesky, DMatrix, DVector};
+
+use crate::decimate::SLOW_HZ;
+use crate::scores::{CandidateScorer, Fit};
+
+/// Steps of the iteration: a power that is not there has fallen by orders of magnitude after as many.
+const STEPS: usize = 300;
+
+/// Frequency at which the spectral density of a random walk is stated, Hz.
+const STATED_HZ: f64 = 1e-3;
+
+/// Random walks of acceleration beside the declared noise, with the powers that the residuals of a fit have.
+pub fn slow_forces(scorer: &CandidateScorer<'_>, fit: &Fit, declared: &[NoiseProcess]) -> Vec<NoiseProcess> {
+    let channels = &scorer.candidate_set.channels;
+    let mut directions: Vec<(String, DVector<f64>)> = Vec::new();
+    for process in declared.iter().filter(|p| p.response == NoiseResponse::Held) {
+        for k in 0..process.size() {
+            let gain = |c: &String| process.enters.get(c).map_or(0.0, |gains| gains[k]);
+            let direction = DVector::from_iterator(channels.len(), channels.iter().map(gain));
+            let Some(direction) = direction.try_normalize(f64::MIN_POSITIVE) else { continue };
+            let parallel = |(_, other): &(String, DVector<f64>)| direction.dot(other).abs() > 1.0 - 1e-9;
+            if !directions.iter().any(parallel) {
+                let name = process.components.get(k).unwrap_or(&process.name);
+                directions.push((format!("slow force beside {name}"), direction));
+            }
+        }
+    }
+    let plan = scorer.plan();
+    let measured = scorer.residual_psd(fit);
+    let mut levels = scorer.levels(fit, &scorer.total, &measured);
+    levels.fit();
+    let observations = scorer.total.weights.observations(plan);
+    let bands: Vec<Band<'_>> = (0..plan.bands.len())
+        .filter(|b| observations[*b] > 0.0 && plan.frequency_hz(plan.bands[*b]) < SLOW_HZ)
+        .map(|b| Band {
+            hz: plan.frequency_hz(plan.bands[b]),
+            observations: observations[b],
+            modelled: &levels.modelled()[b],
+            measured: &measured[b],
+        })
+        .collect();
+    let gains: Vec<&DVector<f64>> = directions.iter().map(|(_, g)| g).collect();
+    let powers = powers(&bands, &gains);
+    directions
+        .iter()
+        .zip(powers)
+        .filter(|(_, power)| *power > 0.0)
+        .map(|((name, direction), power)| NoiseProcess {
+            name: name.clone(),
+            unit: "m s-2".to_owned(),
+            spectrum: Some(NoiseShape {
+                terms: vec![NoiseTerm { asd: power.sqrt() / STATED_HZ, corner_hz: STATED_HZ, exponent: 2 }],
+            }),
+            response: NoiseResponse::Held,
+            enters: channels.iter().zip(direction.iter()).map(|(c, g)| (c.clone(), vec![*g])).collect(),
+            ..NoiseProcess::default()
+        })
+        .collect()
+}
+
+/// Spectra of a band.
+struct Band<'a> {
+    hz: f64,
+    /// Complex observations.
+    observations: f64,
+    modelled: &'a DMatrix<f64>,
+    measured: &'a DMatrix<f64>,
+}
+
+/// Powers at 1 Hz of random walks along `directions`.
+fn powers(bands: &[Band<'_>], directions: &[&DVector<f64>]) -> Vec<f64> {
+    let Some(lowest) = bands.iter().min_by(|a, b| a.hz.total_cmp(&b.hz)) else { return vec![0.0; directions.len()] };
+    let inverse = |m: &DMatrix<f64>| Cholesky::new(m.clone()).map(|c| c.inverse());
+    let Some(known) = inverse(lowest.modelled) else { return vec![0.0; directions.len()] };
+    // As much as the modelled noise in the lowest band.
+    let mut powers: Vec<f64> = directions.iter().map(|g| lowest.hz.powi(2) / g.dot(&(&known * *g))).collect();
+    for _ in 0..STEPS {
+        let (mut above, mut below) = (vec![0.0; powers.len()], vec![0.0; powers.len()]);
+        for band in bands {
+            let mut total = band.modelled.clone();
+            for (q, g) in powers.iter().zip(directions) {
+                total.ger(q / band.hz.powi(2), g, g, 1.0);
+            }
+            let Some(inverse) = inverse(&total) else { continue };
+            for (k, g) in directions.iter().enumerate() {
+                let along = &inverse * *g;
+                let weight = band.observations / band.hz.powi(2);
+                above[k] += weight * along.dot(&(band.measured * &along));
+                below[k] += weight * g.dot(&along);
+            }
+        }
+        for (q, (a, b)) in powers.iter_mut().zip(above.iter().zip(&below)) {
+            *q *= if *b > 0.0 { (a / b).max(0.0).sqrt() } else { 0.0 };
+        }
+    }
+    powers
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Where the measured spectra are the modelled ones with random walks of known powers, these come back; a direction
+    /// without one has none.
+    #[test]
+    fn powers_of_exact_spectra_come_back() {
+        let directions =
+            [[1.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]].map(|g| DVector::from_row_slice(&g).normalize());
+        let truth = [4e-4, 0.0, 9e-6];
+        let modelled = DMatrix::from_row_slice(3, 3, &[2.0, 1.0, 0.0, 1.0, 2.0, 0.3, 0.0, 0.3, 1.0]);
+        let hz: Vec<f64> = (1..30).map(|k| 1e-3 * f64::from(k)).collect();
+        let measured: Vec<DMatrix<f64>> = hz
+            .iter()
+            .map(|f| {
+                let walks = directions.iter().zip(truth).map(|(g, q)| g * g.transpose() * (q / (f * f)));
+                walks.fold(modelled.clone(), |sum, walk| sum + walk)
+            })
+            .collect();
+        let band = |(f, w)| Band { hz: *f, observations: 5.0, modelled: &modelled, measured: w };
+        let bands: Vec<Band<'_>> = hz.iter().zip(&measured).map(band).collect();
+        let found = powers(&bands, &directions.each_ref());
+        for (q, truth) in found.iter().zip(truth) {
+            // Convergence at a bound is slow: what is not there is below a thousandth of the smallest that is.
+            assert!((q - truth).abs() < 1e-3 * truth + 1e-8, "{found:?}");
+        }
+    }
+}
