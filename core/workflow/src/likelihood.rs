@@ -189,7 +189,7 @@ struct Starts {
 impl Joined {
     fn add(&mut self, filtered: Filtered, not_tried: &mut Vec<(String, String)>, settings: &Settings) {
         let Filtered { parameters, surveys, channels, gaps, innovations, .. } = filtered;
-        let own = innovations.finish();
+        let own = innovations.finish().total();
         let gappy = gaps.refused(settings);
         let mut kept: Vec<usize> = Vec::new();
         for (i, (name, _)) in parameters.iter().enumerate() {

@@ -13,8 +13,15 @@
 //! and fitted out of the sums. Given that state the innovations are white, so this is exact. The state is free: its
 //! variance before any data is [`FREE`] times what it would be by chance, because commands know the readouts before the
 //! first sample, and a state that is independent of them would bias a gain.
+//!
+//! The state is fitted as soon as the rows that follow tell nothing more of it, see [`Predictor::start`]: everything goes
+//! on from the state as it is then found, so that what remains of its influence is what remains of its *error*. The
+//! same at the end of a block of time: its rows are given the blocks before it, as a likelihood is a product of
+//! conditional ones, and the sums of all blocks are those of the whole.
 
-use nalgebra::{DMatrix, DVector};
+use std::sync::{Mutex, PoisonError};
+
+use nalgebra::{DMatrix, DMatrixView, DVector, Dyn};
 
 use super::predictor::{Change, Predictor};
 use super::state_space::NoiseStates;
@@ -23,11 +30,18 @@ use super::state_space::NoiseStates;
 const LANES: usize = 8;
 /// Tiles of a group, whose products are taken together.
 const TILES: usize = 4;
+/// Parameters of a group.
+const WIDE: usize = LANES * TILES;
 /// Rows that are filtered before products are taken.
 const ROWS: usize = 256;
 /// What is left of a start when squares of innovations are summed for levels of the noise, and the longest wait, s.
 const SETTLED: f64 = 1e-2;
 const LONGEST_WAIT_S: f64 = 600.0;
+/// What the rows behind the fit of a start may still tell of it, in squares of whitened innovations: sums are of at least
+/// thousands of these, so it is below the digits that rounding leaves. Where the predictor learns slowly of a slow force
+/// the longest wait comes first. The moving averages are then forgotten, and what slow states remember of them tells
+/// less than 1e-4 of a square: what a sum of 36,000 samples of nine channels loses is 3e-10 of it.
+pub(crate) const TOLD: f64 = 1e-10;
 /// Variance of a start over what it is by chance.
 pub(crate) const FREE: f64 = 1e6;
 /// Powers of time that each channel may follow beside everything else: a constant, a slope, a curvature.
@@ -74,6 +88,94 @@ pub struct Start {
     pub slope: DMatrix<f64>,
 }
 
+/// Sums of a block of time, given all blocks before it. See [`Sums`].
+#[derive(Clone, Debug)]
+pub struct Block {
+    /// Where the block begins: a multiple of its length after the first row of all, ns.
+    pub first_ns: i64,
+    /// Upper triangle of the information, column after column: element (i, j) with i ≤ j is at `j (j + 1) / 2 + i`.
+    pub information: Vec<f64>,
+    /// Score.
+    pub score: Vec<f64>,
+    /// Sum of squares of the whitened innovations.
+    pub chi2: f64,
+    /// Numbers of them.
+    pub numbers: f64,
+    /// `Σ ẽ ẽᵀ` of the settled samples, channels × channels.
+    pub squares: DMatrix<f64>,
+    /// Number of samples.
+    pub samples: u64,
+    /// Number of samples in `squares`: those that no start reaches.
+    pub settled: u64,
+}
+
+/// What a pass gives.
+#[derive(Clone, Debug)]
+pub struct Passed {
+    /// Blocks with at least one sample, in the order of time.
+    pub blocks: Vec<Block>,
+    /// The start of each stretch without a gap.
+    pub starts: Vec<Start>,
+    parameters: usize,
+    channels: usize,
+}
+
+impl Passed {
+    /// The sums of all blocks.
+    pub fn total(&self) -> Sums {
+        let mut sums = Sums::zeros(self.parameters, self.channels);
+        self.blocks.iter().for_each(|block| sums.add(block));
+        sums.starts.clone_from(&self.starts);
+        sums
+    }
+}
+
+impl Sums {
+    /// Sums of nothing.
+    pub fn zeros(parameters: usize, channels: usize) -> Self {
+        Self {
+            information: DMatrix::zeros(parameters, parameters),
+            score: vec![0.0; parameters],
+            chi2: 0.0,
+            numbers: 0.0,
+            squares: DMatrix::zeros(channels, channels),
+            samples: 0,
+            starts: Vec::new(),
+        }
+    }
+
+    /// Adds a block of the same parameters.
+    pub fn add(&mut self, block: &Block) {
+        let mut packed = block.information.iter();
+        for j in 0..self.score.len() {
+            for (i, x) in (0..=j).zip(&mut packed) {
+                self.information[(i, j)] += x;
+                self.information[(j, i)] = self.information[(i, j)];
+            }
+        }
+        self.score.iter_mut().zip(&block.score).for_each(|(to, x)| *to += x);
+        self.chi2 += block.chi2;
+        self.numbers += block.numbers;
+        self.squares += &block.squares;
+        self.samples += block.samples;
+    }
+}
+
+/// The matrices of the filter, laid out for it.
+struct Kernel {
+    channels: usize,
+    /// States as they are filtered, see [`NoiseStates::merged`], made even by one that stays zero.
+    states: usize,
+    /// Of each state: states before and factors.
+    transition: Vec<Vec<(usize, f64)>>,
+    /// Channel, state, factor.
+    output: Vec<(usize, usize, f64)>,
+    /// Two states after two states, their gains channel by channel.
+    gain: Vec<[f64; 2]>,
+    /// Two channels after two channels: channels up to the second of them.
+    whitening: Vec<Vec<[f64; 2]>>,
+}
+
 /// Eight parameters.
 struct Tile {
     /// Channel, lane, series, factor in units of the channel.
@@ -81,24 +183,38 @@ struct Tile {
     /// `∂K`, states × channels; empty where no parameter changes the noise.
     changes: Vec<[f64; LANES]>,
     state: Vec<[f64; LANES]>,
+    next: Vec<[f64; LANES]>,
+    nu: Vec<[f64; LANES]>,
 }
 
+/// Tiles whose products are taken together.
 struct Group {
     tiles: Vec<Tile>,
     /// Whitened ν: lanes of all tiles × (rows × channels).
     whitened: DMatrix<f64>,
 }
 
-/// The matrices of the filter, laid out for it.
-struct Kernel {
-    channels: usize,
-    states: usize,
-    /// State, state before, factor.
-    transition: Vec<(usize, usize, f64)>,
-    /// Channel, state, factor.
-    output: Vec<(usize, usize, f64)>,
-    gain: Vec<f64>,
-    whitening: Vec<f64>,
+/// Products of the lanes of two groups.
+struct Product {
+    groups: (usize, usize),
+    sum: DMatrix<f64>,
+}
+
+/// A start that is not fitted yet.
+struct Pending {
+    /// Its covariance as the blocks before have it, in the units of the channels.
+    covariance: DMatrix<f64>,
+    /// Rows until it is fitted.
+    rows: usize,
+}
+
+/// Rows that wait.
+struct Waiting {
+    /// Series with the powers of time.
+    inputs: Vec<f64>,
+    innovations: Vec<f64>,
+    /// Whether the squares of a row count for the levels.
+    counts: Vec<bool>,
 }
 
 /// A pass over the data.
@@ -107,15 +223,18 @@ pub struct Innovations {
     unit: Vec<f64>,
     /// What is known of the channels: taken off before anything else.
     known: Vec<Response>,
-    /// Parameters, and behind them the start of the moving averages.
+    /// Parameters and the data, and at last the start of the moving averages.
     groups: Vec<Group>,
-    parameters: Vec<Parameter>,
-    /// Groups of parameters.
-    asked: usize,
+    /// `W ∂S Wᵀ` of the parameters that change the noise.
+    changes: Vec<(usize, DMatrix<f64>)>,
+    /// Lane of each parameter, and at last that of the data.
+    lanes: Vec<usize>,
     /// Covariance of the moving averages at a start.
     start: DMatrix<f64>,
-    /// What the starts explain of the squares.
-    by_starts: f64,
+    /// Samples after which a start is fitted.
+    told: usize,
+    /// The start of the stretch that goes on.
+    pending: Option<Pending>,
     /// Whether no row has been filtered since the last start.
     fresh: bool,
     /// Starts as they are known, and as they are found.
@@ -128,23 +247,25 @@ pub struct Innovations {
     settling: usize,
     /// State of the predictor.
     state: Vec<f64>,
+    next: Vec<f64>,
+    z: Vec<f64>,
     /// Samples until squares are summed.
     unsettled: usize,
     last_ns: Option<i64>,
     first_ns: Option<i64>,
     /// Series of the last row, without the powers of time.
     before: Vec<f64>,
-    /// Rows that wait: series with powers of time, innovations, and whether their squares count.
-    inputs: Vec<f64>,
-    innovations: Vec<f64>,
-    counts: Vec<bool>,
-    whitened: DMatrix<f64>,
-    products: Vec<DMatrix<f64>>,
+    waiting: Waiting,
+    /// Those of parameters and data first.
+    products: Vec<Product>,
+    /// Samples of a block, and the number of the block that is summed.
+    block: Option<u64>,
+    number: i64,
+    blocks: Vec<Block>,
     squares: DMatrix<f64>,
     samples: u64,
     /// Samples of which squares are summed.
     settled: u64,
-    chi2: f64,
 }
 
 /// What a pass is made of.
@@ -165,6 +286,8 @@ pub struct Setup<'a> {
     pub averaged: bool,
     /// Sampling interval, ns.
     pub step_ns: i64,
+    /// Length of a block in samples, by time from the first row, gaps included; all in one where there is none.
+    pub block: Option<u64>,
     /// Threads; results do not depend on them.
     pub threads: usize,
 }
@@ -172,46 +295,42 @@ pub struct Setup<'a> {
 impl Innovations {
     /// A pass that has seen nothing.
     pub fn new(setup: Setup<'_>) -> Self {
-        let Setup { system, predictor, known, parameters, starts, series, averaged, step_ns, threads } = setup;
-        let (channels, states) = (system.channels(), system.transition.nrows());
-        let sparse = |m: &DMatrix<f64>| {
-            let all = (0..m.nrows()).flat_map(|i| (0..m.ncols()).map(move |j| (i, j)));
-            all.filter(|at| m[*at] != 0.0).map(|(i, j)| (i, j, m[(i, j)])).collect::<Vec<_>>()
-        };
-        let by_rows = |m: &DMatrix<f64>| m.row_iter().flat_map(|row| row.iter().copied().collect::<Vec<_>>()).collect();
+        let Setup { system, predictor, known, parameters, starts, series, averaged, step_ns, block, threads } = setup;
+        let (channels, moving) = (system.channels(), 2 * system.channels());
+        let kernel = Kernel::new(system, predictor);
         let unit = system.unit.clone();
-        let columns = ROWS * channels;
-        let group = |own: &[Parameter]| {
-            let tiles: Vec<Tile> = own.chunks(LANES).map(|own| Tile::new(own, &unit, states)).collect();
-            Group { whitened: DMatrix::zeros(LANES * tiles.len(), columns), tiles }
+        // Side by side those that change the noise, as a tile without any is filtered faster.
+        let mut order: Vec<usize> = (0..parameters.len()).collect();
+        order.sort_by_key(|i| parameters[*i].change.is_none());
+        let mut lanes = vec![parameters.len(); parameters.len() + 1];
+        order.iter().enumerate().for_each(|(lane, i)| lanes[*i] = lane);
+        // The data have a lane of their own, without a response, for what the fitted starts change.
+        let none = Parameter::default();
+        let own: Vec<&Parameter> = order.iter().map(|i| &parameters[*i]).chain([&none]).collect();
+        let merged = system.merged();
+        let group = |own: &[&Parameter]| {
+            let tiles: Vec<Tile> = own.chunks(LANES).map(|own| Tile::new(own, &unit, &kernel, &merged)).collect();
+            Group { whitened: DMatrix::zeros(LANES * tiles.len(), ROWS * channels), tiles }
         };
-        let mut groups: Vec<Group> = parameters.chunks(LANES * TILES).map(group).collect();
+        let mut groups: Vec<Group> = own.chunks(WIDE).map(group).collect();
         let asked = groups.len();
-        groups.extend(vec![Parameter::default(); 2 * channels].chunks(LANES * TILES).map(group));
-        let products = pairs(groups.len())
-            .map(|(i, j)| {
-                let rows = groups[i].whitened.nrows();
-                DMatrix::zeros(rows, groups.get(j).map_or(1, |g| g.whitened.nrows()))
-            })
-            .collect();
+        groups.push(group(&vec![&none; moving]));
+        let pairs = (0..asked).flat_map(|i| (i..asked).map(move |j| (i, j)));
+        let size = |i: usize| groups[i].whitened.nrows();
+        let product = |(i, j): (usize, usize)| Product { groups: (i, j), sum: DMatrix::zeros(size(i), size(j)) };
+        let products = pairs.chain((0..=asked).map(|i| (i, asked))).map(product).collect();
         let most = (LONGEST_WAIT_S * 1e9 / step_ns as f64) as usize;
-        let settling = predictor.settling(system, SETTLED, most);
+        let start = predictor.known_of_the_start(system) * FREE;
+        let innovation = |(i, p): (usize, &Parameter)| Some((i, p.change.as_ref()?.innovation.clone()));
         let mut pass = Self {
-            kernel: Kernel {
-                channels,
-                states,
-                transition: sparse(&system.transition),
-                output: sparse(&system.output),
-                gain: by_rows(&predictor.gain),
-                whitening: by_rows(&predictor.whitening),
-            },
             known: known.into_iter().map(|(c, s, factor)| (c, s, factor / unit[c])).collect(),
             unit,
             groups,
-            parameters,
-            asked,
-            start: predictor.known_of_the_start(system) * FREE,
-            by_starts: 0.0,
+            changes: parameters.iter().enumerate().filter_map(innovation).collect(),
+            lanes,
+            told: predictor.start(system, &start, TOLD, most),
+            start,
+            pending: None,
             fresh: false,
             known_starts: starts,
             starts: Vec::new(),
@@ -219,21 +338,23 @@ impl Innovations {
             series,
             averaged,
             step_ns,
-            settling,
-            state: vec![0.0; states],
-            unsettled: settling,
+            settling: predictor.settling(system, SETTLED, most),
+            state: vec![0.0; kernel.states],
+            next: vec![0.0; kernel.states],
+            z: vec![0.0; channels],
+            unsettled: 0,
             last_ns: None,
             first_ns: None,
             before: vec![f64::NAN; series],
-            inputs: Vec::new(),
-            innovations: Vec::new(),
-            counts: Vec::new(),
-            whitened: DMatrix::zeros(1, columns),
+            waiting: Waiting { inputs: Vec::new(), innovations: Vec::new(), counts: Vec::new() },
             products,
+            block,
+            number: 0,
+            blocks: Vec::new(),
             squares: DMatrix::zeros(channels, channels),
             samples: 0,
             settled: 0,
-            chi2: 0.0,
+            kernel,
         };
         pass.restart();
         pass
@@ -249,24 +370,36 @@ impl Innovations {
         }
         let first = *self.first_ns.get_or_insert(time_ns);
         if whole {
-            let from = self.inputs.len();
+            self.enter_block(time_ns - first);
+            let from = self.waiting.inputs.len();
             let mean = |(now, before): (&f64, &f64)| if self.averaged { 0.5 * (now + before) } else { *now };
-            self.inputs.extend(series.iter().zip(&self.before).map(mean));
+            self.waiting.inputs.extend(series.iter().zip(&self.before).map(mean));
             let days = (time_ns - first) as f64 / DAY_NS;
-            self.inputs.extend((0..POWERS).map(|k| days.powi(k as i32)));
-            let mut z: Vec<f64> = channels.iter().zip(&self.unit).map(|(z, unit)| z / unit).collect();
-            for (c, s, factor) in &self.known {
-                z[*c] -= factor * self.inputs[from + s];
+            self.waiting.inputs.extend((0..POWERS).map(|k| days.powi(k as i32)));
+            for ((to, z), unit) in self.z.iter_mut().zip(channels).zip(&self.unit) {
+                *to = z / unit;
             }
-            self.kernel.step(&mut self.state, &mut z);
-            self.innovations.extend(z);
+            for (c, s, factor) in &self.known {
+                self.z[*c] -= factor * self.waiting.inputs[from + s];
+            }
+            self.kernel.step(&mut self.state, &mut self.next, &mut self.z);
+            self.waiting.innovations.extend(&self.z);
             self.fresh = false;
-            self.counts.push(self.unsettled == 0);
+            self.waiting.counts.push(self.unsettled == 0);
             self.unsettled = self.unsettled.saturating_sub(1);
+            let told = self.pending.as_mut().is_some_and(|start| {
+                start.rows -= 1;
+                start.rows == 0
+            });
+            if told {
+                self.sum();
+                self.take_start_out();
+                self.pending = None;
+            }
         }
         self.last_ns = Some(time_ns);
         self.before.copy_from_slice(series);
-        if self.counts.len() == ROWS {
+        if self.waiting.counts.len() == ROWS {
             self.sum();
         }
     }
@@ -280,6 +413,17 @@ impl Innovations {
         }
     }
 
+    /// Closes the block before, if `since_ns` from the first row is in another.
+    fn enter_block(&mut self, since_ns: i64) {
+        let Some(length) = self.block else { return };
+        let sample = (since_ns + self.step_ns / 2).div_euclid(self.step_ns);
+        let number = sample.div_euclid(length.max(1).cast_signed());
+        if number != self.number {
+            self.close_block();
+            self.number = number;
+        }
+    }
+
     fn restart(&mut self) {
         let moving = 2 * self.kernel.channels;
         self.state[..moving].fill(0.0);
@@ -288,150 +432,180 @@ impl Innovations {
         }
         let tiles = self.groups.iter_mut().flat_map(|g| &mut g.tiles);
         tiles.for_each(|tile| tile.state[..moving].fill([0.0; LANES]));
-        for i in 0..moving {
-            let group = &mut self.groups[self.asked + i / (LANES * TILES)];
-            let tile = &mut group.tiles[i % (LANES * TILES) / LANES];
-            tile.state.iter_mut().for_each(|state| state[i % LANES] = 0.0);
-            tile.state[i][i % LANES] = -1.0;
+        let lanes = self.groups.last_mut().into_iter().flat_map(|g| &mut g.tiles);
+        for (t, tile) in lanes.enumerate() {
+            tile.state.fill([0.0; LANES]);
+            for i in t * LANES..moving.min((t + 1) * LANES) {
+                tile.state[i][i - t * LANES] = -1.0;
+            }
         }
+        let state = DVector::from_column_slice(&self.state[..moving]);
+        self.starts.push(Start { state, slope: DMatrix::zeros(moving, self.lanes.len() - 1) });
+        self.pending = Some(Pending { covariance: self.start.clone(), rows: self.told });
         self.unsettled = self.settling;
         self.fresh = true;
     }
 
     /// Fits the state at the start out of all sums since then: with D its information, M its covariance before the data
-    /// and B its products with the rest, they lose `B M (1 + D M)⁻¹ Bᵀ`.
+    /// and B its products with the rest, they lose `B G Bᵀ` with `G = M (1 + D M)⁻¹`, which is its covariance
+    /// afterwards. All lanes go on as they would from the start as it is found. That of the data has the difference from
+    /// the innovations from the start as it is known, which stay what drives the lanes of the noise: what these are is
+    /// then the same whenever a start is fitted.
     fn take_start_out(&mut self) {
-        let (moving, wide, groups) = (2 * self.kernel.channels, LANES * TILES, self.groups.len());
-        let places: Vec<(usize, usize)> = pairs(groups).collect();
-        let at = |i: usize, j: usize| places.iter().position(|place| *place == (i, j)).unwrap_or(0);
-        let own = |group: usize| (group - self.asked) * wide;
-        // Products of a group, or of the data, with the states.
-        let with = |group: usize| {
-            let rows = self.groups.get(group).map_or(1, |g| g.whitened.nrows());
-            let mut b = DMatrix::zeros(rows, moving);
-            for other in self.asked..groups {
-                let (product, turned) = if group <= other {
-                    (&self.products[at(group, other)], false)
-                } else {
-                    (&self.products[at(other, group)], true)
-                };
-                for (i, j) in (0..rows).flat_map(|i| (0..wide.min(moving - own(other))).map(move |j| (i, j))) {
-                    b[(i, own(other) + j)] = if turned { product[(j, i)] } else { product[(i, j)] };
-                }
+        let Some(pending) = &mut self.pending else { return };
+        let moving = 2 * self.kernel.channels;
+        let asked = self.groups.len() - 1;
+        let with_start = self.products.len() - self.groups.len();
+        let (own, with) = self.products.split_at_mut(with_start);
+        let Some(information) = with.last().map(|p| p.sum.view((0, 0), (moving, moving)).into_owned()) else { return };
+        let inverse = (DMatrix::identity(moving, moving) + information * &pending.covariance).try_inverse();
+        let gain = &pending.covariance * inverse.unwrap_or_else(|| DMatrix::zeros(moving, moving));
+        let gain = (&gain + gain.transpose()) * 0.5;
+        // Lanes of a group × states.
+        let products: Vec<DMatrix<f64>> = with[..asked].iter().map(|p| p.sum.columns(0, moving).into_owned()).collect();
+        let fitted: Vec<DMatrix<f64>> = products.iter().map(|b| b * &gain).collect();
+        for Product { groups: (i, j), sum } in own {
+            *sum -= &fitted[*i] * products[*j].transpose();
+        }
+        with.iter_mut().for_each(|p| p.sum.fill(0.0));
+        let of = |lane: usize| fitted[lane / WIDE].row(lane % WIDE);
+        let Some((data, parameters)) = self.lanes.split_last() else { return };
+        if let Some(start) = self.starts.last_mut() {
+            start.state += of(*data).transpose();
+            for (i, lane) in parameters.iter().enumerate() {
+                let mut slope = start.slope.column_mut(i);
+                slope -= of(*lane).transpose();
             }
-            b
-        };
-        let mut information = DMatrix::zeros(moving, moving);
-        for group in self.asked..groups {
-            let rows = wide.min(moving - own(group));
-            information.rows_mut(own(group), rows).copy_from(&with(group).rows(0, rows));
         }
-        let unit = DMatrix::identity(moving, moving);
-        let inverse = (unit + &information * &self.start).try_inverse();
-        let gain = &self.start * inverse.unwrap_or_else(|| DMatrix::zeros(moving, moving));
-        let all: Vec<DMatrix<f64>> = (0..=groups).map(with).collect();
-        let before = self.known_starts.get(self.starts.len()).cloned().unwrap_or_else(|| DVector::zeros(moving));
-        let mut slope = DMatrix::zeros(moving, self.parameters.len());
-        for (i, mut column) in slope.column_iter_mut().enumerate() {
-            column.copy_from(&(&gain * all[i / wide].row(i % wide).transpose() * -1.0));
-        }
-        self.starts.push(Start { state: before + &gain * all[groups].row(0).transpose(), slope });
-        self.by_starts += (&all[groups] * &gain * all[groups].transpose())[(0, 0)];
-        for (product, (i, j)) in self.products.iter_mut().zip(places) {
-            if i < self.asked && (j < self.asked || j == groups) {
-                *product -= &all[i] * &gain * all[j].transpose();
-            } else {
-                product.fill(0.0);
+        pending.covariance = gain;
+        let Some((starts, rest)) = self.groups.split_last_mut() else { return };
+        for i in 0..moving {
+            let (tile, at) = (&starts.tiles[i / LANES].state, i % LANES);
+            for (g, group) in rest.iter_mut().enumerate() {
+                for (t, own) in group.tiles.iter_mut().enumerate() {
+                    let by: [f64; LANES] = std::array::from_fn(|l| fitted[g][(t * LANES + l, i)]);
+                    own.state.iter_mut().zip(tile).for_each(|(x, influence)| add(x, -influence[at], &by));
+                }
             }
         }
     }
 
     /// Filters the waiting rows by every parameter and adds the products.
     fn sum(&mut self) {
-        let rows = self.counts.len();
+        let rows = self.waiting.counts.len();
         if rows == 0 {
             return;
         }
         let n = self.kernel.channels;
-        let width = self.series + POWERS;
-        for (row, counts) in self.counts.iter().enumerate() {
-            let e = &self.innovations[row * n..(row + 1) * n];
-            for c in 0..n {
-                let whitened: f64 = (0..=c).map(|d| self.kernel.whitening[c * n + d] * e[d]).sum();
-                self.whitened[(0, row * n + c)] = whitened;
-            }
-            let e = self.whitened.columns(row * n, n).transpose();
-            self.chi2 += e.norm_squared();
-            self.samples += 1;
-            if *counts {
-                self.squares.ger(1.0, &e.column(0), &e.column(0), 1.0);
+        let batch = Batch {
+            rows,
+            width: self.series + POWERS,
+            inputs: &self.waiting.inputs,
+            innovations: &self.waiting.innovations,
+        };
+        let (kernel, threads) = (&self.kernel, self.threads);
+        let starts = usize::from(self.pending.is_none());
+        let (groups, products) = (self.groups.len(), self.products.len());
+        let live = &mut self.groups[..groups - starts];
+        in_parallel(live, threads, |group| group.filter(kernel, &batch));
+        // The lane of the data has what the starts as they are found add to the innovations.
+        let lane = self.lanes.last().copied().unwrap_or(0);
+        let mut white = DVector::zeros(n);
+        for row in 0..rows {
+            kernel.whiten(&self.waiting.innovations[row * n..(row + 1) * n], white.as_mut_slice());
+            let own = &mut self.groups[lane / WIDE].whitened;
+            white.iter().enumerate().for_each(|(c, e)| own[(lane % WIDE, row * n + c)] += *e);
+            if self.waiting.counts[row] {
+                self.squares.ger(1.0, &white, &white, 1.0);
                 self.settled += 1;
             }
         }
-        let batch = Batch { rows, width, inputs: &self.inputs, innovations: &self.innovations };
-        let kernel = &self.kernel;
-        in_parallel(&mut self.groups, self.threads, |_, group| group.filter(kernel, &batch));
-        let (groups, data, columns) = (&self.groups, &self.whitened, rows * n);
-        let places: Vec<(usize, usize)> = pairs(groups.len()).collect();
-        in_parallel(&mut self.products, self.threads, |at, product| {
-            let (i, j) = places[at];
-            let a = groups[i].whitened.columns(0, columns);
-            let b = groups.get(j).map_or(data, |g| &g.whitened).columns(0, columns);
-            product.gemm(1.0, &a, &b.transpose(), 1.0);
+        self.samples += rows as u64;
+        let whitened: Vec<&[f64]> = self.groups.iter().map(|g| g.whitened.as_slice()).collect();
+        let live = products - if starts > 0 { groups } else { 0 };
+        in_parallel(&mut self.products[..live], threads, |Product { groups: (i, j), sum }| {
+            let (a, b) = (sum.nrows(), sum.ncols());
+            let a = DMatrixView::from_slice(whitened[*i], a, rows * n);
+            // Transposed by its strides.
+            let b = DMatrixView::<f64, Dyn, Dyn>::from_slice_with_strides(whitened[*j], rows * n, b, b, 1);
+            sum.gemm(1.0, &a, &b, 1.0);
         });
-        self.inputs.clear();
-        self.innovations.clear();
-        self.counts.clear();
+        self.waiting.inputs.clear();
+        self.waiting.innovations.clear();
+        self.waiting.counts.clear();
     }
 
-    /// The sums, with what the levels of the noise add to them.
-    pub fn finish(mut self) -> Sums {
+    /// Sums what waits and keeps it as a block, with what the levels of the noise add.
+    fn close_block(&mut self) {
         self.sum();
         self.take_start_out();
-        let p = self.parameters.len();
-        let (mut information, mut score) = (DMatrix::zeros(p, p), vec![0.0; p]);
-        let wide = LANES * TILES;
-        for ((i, j), product) in pairs(self.groups.len()).zip(&self.products) {
-            for (a, b) in (0..product.nrows()).flat_map(|a| (0..product.ncols()).map(move |b| (a, b))) {
-                let row = i * wide + a;
-                if i >= self.asked || row >= p {
-                    continue;
-                }
-                if j == self.groups.len() {
-                    score[row] = product[(a, b)];
-                } else if j < self.asked && j * wide + b < p {
-                    information[(row, j * wide + b)] = product[(a, b)];
-                    information[(j * wide + b, row)] = product[(a, b)];
-                }
+        if self.samples == 0 {
+            return;
+        }
+        let Some((data, parameters)) = self.lanes.split_last() else { return };
+        let groups = self.groups.len() - 1;
+        let product = |a: usize, b: usize| {
+            let (a, b) = (a.min(b), a.max(b));
+            let (i, j) = (a / WIDE, b / WIDE);
+            // Rows of a triangle before the i-th.
+            self.products[i * groups - i * i.saturating_sub(1) / 2 + j - i].sum[(a % WIDE, b % WIDE)]
+        };
+        let mut information: Vec<f64> = Vec::with_capacity(parameters.len() * (parameters.len() + 1) / 2);
+        for (j, b) in parameters.iter().enumerate() {
+            information.extend(parameters[..=j].iter().map(|a| product(*a, *b)));
+        }
+        let mut score: Vec<f64> = parameters.iter().map(|a| product(*a, *data)).collect();
+        let settled = self.settled as f64;
+        for (k, (i, own)) in self.changes.iter().enumerate() {
+            score[*i] += 0.5 * (own.component_mul(&self.squares).sum() - settled * own.trace());
+            for (j, other) in &self.changes[..=k] {
+                information[i * (i + 1) / 2 + j] += 0.5 * settled * own.component_mul(other).sum();
             }
         }
-        let samples = self.settled as f64;
-        let changes: Vec<(usize, &DMatrix<f64>)> =
-            self.parameters.iter().enumerate().filter_map(|(i, p)| Some((i, &p.change.as_ref()?.innovation))).collect();
-        for (i, own) in &changes {
-            score[*i] += 0.5 * (own.component_mul(&self.squares).sum() - samples * own.trace());
-            for (j, other) in &changes {
-                information[(*i, *j)] += 0.5 * samples * own.component_mul(other).sum();
-            }
+        let length = self.block.map_or(0, u64::cast_signed);
+        self.blocks.push(Block {
+            first_ns: self.first_ns.unwrap_or(0) + self.number * length * self.step_ns,
+            information,
+            score,
+            chi2: product(*data, *data),
+            numbers: (self.samples as usize * self.kernel.channels) as f64,
+            squares: self.squares.clone(),
+            samples: self.samples,
+            settled: self.settled,
+        });
+        self.products.iter_mut().for_each(|p| p.sum.fill(0.0));
+        self.squares.fill(0.0);
+        self.samples = 0;
+        self.settled = 0;
+    }
+
+    /// The sums by blocks.
+    pub fn finish(mut self) -> Passed {
+        self.close_block();
+        if self.fresh {
+            // No row has followed.
+            self.starts.pop();
         }
-        let (chi2, numbers) = (self.chi2 - self.by_starts, (self.samples as usize * self.kernel.channels) as f64);
-        Sums { information, score, chi2, numbers, squares: self.squares, samples: self.samples, starts: self.starts }
+        let (parameters, channels) = (self.lanes.len() - 1, self.kernel.channels);
+        Passed { blocks: self.blocks, starts: self.starts, parameters, channels }
     }
 }
 
-/// Pairs of groups, each once; the last number stands for the data.
-fn pairs(groups: usize) -> impl Iterator<Item = (usize, usize)> {
-    (0..groups).flat_map(move |i| (i..=groups).map(move |j| (i, j)))
-}
-
-/// Calls `work` with every item and its index, on some threads.
-fn in_parallel<T: Send>(items: &mut [T], threads: usize, work: impl Fn(usize, &mut T) + Sync) {
-    let part = items.len().div_ceil(threads).max(1);
-    std::thread::scope(|scope| {
-        for (number, own) in items.chunks_mut(part).enumerate() {
-            let work = &work;
-            scope.spawn(move || own.iter_mut().enumerate().for_each(|(i, item)| work(number * part + i, item)));
+/// Calls `work` with every item, on some threads.
+fn in_parallel<T: Send>(items: &mut [T], threads: usize, work: impl Fn(&mut T) + Sync) {
+    if threads.min(items.len()) < 2 {
+        return items.iter_mut().for_each(work);
+    }
+    let queue = Mutex::new(items.iter_mut());
+    let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).next();
+    let all = || {
+        while let Some(item) = next() {
+            work(item);
         }
+    };
+    std::thread::scope(|scope| {
+        (1..threads).for_each(|_| drop(scope.spawn(all)));
+        all();
     });
 }
 
@@ -444,17 +618,55 @@ struct Batch<'a> {
 }
 
 impl Kernel {
+    fn new(system: &NoiseStates, predictor: &Predictor) -> Self {
+        let n = system.channels();
+        let merged = system.merged();
+        let states = merged.iter().max().map_or(0, |last| last + 1).next_multiple_of(2);
+        let mut transition = vec![Vec::new(); states];
+        let mut output = Vec::new();
+        let mut seen = vec![false; states];
+        for (j, to) in merged.iter().enumerate() {
+            // One of those that are merged stands for all.
+            if std::mem::replace(&mut seen[*to], true) {
+                continue;
+            }
+            for (i, factor) in system.transition.column(j).iter().enumerate().filter(|(_, x)| **x != 0.0) {
+                transition[merged[i]].push((*to, *factor));
+            }
+            output.extend((0..n).map(|c| (c, *to, system.output[(c, j)])).filter(|(.., factor)| *factor != 0.0));
+        }
+        let mut gain = vec![[0.0; 2]; states / 2 * n];
+        for (i, to) in merged.iter().enumerate() {
+            for c in 0..n {
+                gain[to / 2 * n + c][to % 2] += predictor.gain[(i, c)];
+            }
+        }
+        let w = |c: usize, d: usize| if c < n { predictor.whitening[(c, d)] } else { 0.0 };
+        let two = |c: usize| (0..n.min(c + 2)).map(|d| [w(c, d), w(c + 1, d)]).collect();
+        Self { channels: n, states, transition, output, gain, whitening: (0..n).step_by(2).map(two).collect() }
+    }
+
     /// From what is seen to innovations, for the data.
-    fn step(&self, state: &mut [f64], z: &mut [f64]) {
+    fn step(&self, state: &mut Vec<f64>, next: &mut Vec<f64>, z: &mut [f64]) {
         for (c, s, factor) in &self.output {
             z[*c] -= factor * state[*s];
         }
-        let mut next: Vec<f64> =
-            self.gain.chunks(self.channels).map(|k| k.iter().zip(&*z).map(|(k, e)| k * e).sum()).collect();
-        for (i, j, factor) in &self.transition {
-            next[*i] += factor * state[*j];
+        for (pair, k) in self.gain.chunks_exact(self.channels).enumerate() {
+            for half in 0..2 {
+                let i = 2 * pair + half;
+                let before: f64 = self.transition[i].iter().map(|(j, factor)| factor * state[*j]).sum();
+                next[i] = before + k.iter().zip(&*z).map(|(k, e)| k[half] * e).sum::<f64>();
+            }
         }
-        state.copy_from_slice(&next);
+        std::mem::swap(state, next);
+    }
+
+    fn whiten(&self, e: &[f64], to: &mut [f64]) {
+        for (pair, w) in self.whitening.iter().enumerate() {
+            for (half, to) in to[2 * pair..].iter_mut().take(2).enumerate() {
+                *to = w.iter().zip(e).map(|(w, e)| w[half] * e).sum();
+            }
+        }
     }
 }
 
@@ -467,59 +679,79 @@ impl Group {
 }
 
 impl Tile {
-    fn new(parameters: &[Parameter], unit: &[f64], states: usize) -> Self {
+    fn new(parameters: &[&Parameter], unit: &[f64], kernel: &Kernel, merged: &[usize]) -> Self {
+        let n = unit.len();
         let mut responses: Vec<(usize, usize, usize, f64)> = Vec::new();
         for (lane, parameter) in parameters.iter().enumerate() {
             responses.extend(parameter.responses.iter().map(|(c, s, factor)| (*c, lane, *s, factor / unit[*c])));
         }
         let mut changes = Vec::new();
         for (lane, change) in parameters.iter().enumerate().filter_map(|(lane, p)| Some((lane, p.change.as_ref()?))) {
-            changes.resize(states * unit.len(), [0.0; LANES]);
+            changes.resize(kernel.states * n, [0.0; LANES]);
             for (i, row) in change.gain.row_iter().enumerate() {
-                row.iter().enumerate().for_each(|(c, k)| changes[i * unit.len() + c][lane] = *k);
+                row.iter().enumerate().for_each(|(c, k)| changes[merged[i] * n + c][lane] += *k);
             }
         }
-        Self { responses, changes, state: vec![[0.0; LANES]; states] }
+        let zero = [0.0; LANES];
+        Self {
+            responses,
+            changes,
+            state: vec![zero; kernel.states],
+            next: vec![zero; kernel.states],
+            nu: vec![zero; n],
+        }
     }
 
     fn filter(&mut self, kernel: &Kernel, batch: &Batch<'_>, whitened: &mut DMatrix<f64>, lane: usize) {
         let n = kernel.channels;
-        let mut nu = vec![[0.0; LANES]; n];
-        let mut next = vec![[0.0; LANES]; kernel.states];
+        let wide = whitened.nrows();
+        let columns = whitened.as_mut_slice();
         for row in 0..batch.rows {
-            nu.fill([0.0; LANES]);
+            self.nu.fill([0.0; LANES]);
             let input = &batch.inputs[row * batch.width..(row + 1) * batch.width];
             for (c, lane, s, factor) in &self.responses {
-                nu[*c][*lane] += factor * input[*s];
+                self.nu[*c][*lane] += factor * input[*s];
             }
             for (c, s, factor) in &kernel.output {
-                add(&mut nu[*c], -factor, &self.state[*s]);
+                add(&mut self.nu[*c], -factor, &self.state[*s]);
             }
-            for c in 0..n {
-                let mut white = [0.0; LANES];
-                for d in 0..=c {
-                    add(&mut white, kernel.whitening[c * n + d], &nu[d]);
-                }
-                whitened.column_mut(row * n + c).rows_mut(lane, LANES).copy_from_slice(&white);
-            }
-            for (i, next) in next.iter_mut().enumerate() {
-                *next = [0.0; LANES];
-                for (c, nu) in nu.iter().enumerate() {
-                    add(next, kernel.gain[i * n + c], nu);
+            let to = &mut columns[row * n * wide..(row + 1) * n * wide];
+            for (w, to) in kernel.whitening.iter().zip(to.chunks_mut(2 * wide)) {
+                let two = multiply([[0.0; LANES]; 2], w, &self.nu);
+                for (white, to) in two.iter().zip(to.chunks_exact_mut(wide)) {
+                    to[lane..lane + LANES].copy_from_slice(white);
                 }
             }
-            if !self.changes.is_empty() {
-                let e = &batch.innovations[row * n..(row + 1) * n];
-                for (next, change) in next.iter_mut().zip(self.changes.chunks(n)) {
-                    change.iter().zip(e).for_each(|(change, e)| add(next, -e, change));
+            let e = &batch.innovations[row * n..(row + 1) * n];
+            let pairs = self.next.chunks_exact_mut(2).zip(kernel.gain.chunks_exact(n)).enumerate();
+            for (pair, (next, k)) in pairs {
+                let mut two = [[0.0; LANES]; 2];
+                for (half, to) in two.iter_mut().enumerate() {
+                    for (j, factor) in &kernel.transition[2 * pair + half] {
+                        add(to, *factor, &self.state[*j]);
+                    }
                 }
+                if let Some(changes) = self.changes.get(2 * pair * n..(2 * pair + 2) * n) {
+                    for (to, changes) in two.iter_mut().zip(changes.chunks_exact(n)) {
+                        changes.iter().zip(e).for_each(|(change, e)| add(to, -e, change));
+                    }
+                }
+                next.copy_from_slice(&multiply(two, k, &self.nu));
             }
-            for (i, j, factor) in &kernel.transition {
-                add(&mut next[*i], *factor, &self.state[*j]);
-            }
-            std::mem::swap(&mut self.state, &mut next);
+            std::mem::swap(&mut self.state, &mut self.next);
         }
     }
+}
+
+/// Adds a matrix of two rows times lanes: two at once read each lane once.
+#[inline(always)]
+fn multiply(to: [[f64; LANES]; 2], two: &[[f64; 2]], by: &[[f64; LANES]]) -> [[f64; LANES]; 2] {
+    let [mut first, mut second] = to;
+    for ([p, q], x) in two.iter().zip(by) {
+        add(&mut first, *p, x);
+        add(&mut second, *q, x);
+    }
+    [first, second]
 }
 
 #[inline(always)]

@@ -210,6 +210,24 @@ impl NoiseStates {
         self.processes.iter().enumerate().find_map(|(i, p)| Some((i, of(p)?)))
     }
 
+    /// Place of each state among those that are needed to filter data: a channel sees only the sum of its slow states of
+    /// all orders, and sums follow the same differences as the states at the same distance from the output. With R the
+    /// matrix that sums, `R F = F' R` and `C = C' R`.
+    pub fn merged(&self) -> Vec<usize> {
+        let mut stands: Vec<usize> = (0..self.transition.nrows()).collect();
+        for i in 0..self.channels() {
+            let chains = || self.slow.iter().filter_map(|s| Some((s.order, s.first[i]?)));
+            let Some((longest, whole)) = chains().max() else { continue };
+            for (order, first) in chains() {
+                (0..order).for_each(|k| stands[first + k] = whole + longest - order + k);
+            }
+        }
+        let mut kept = stands.clone();
+        kept.sort_unstable();
+        kept.dedup();
+        stands.iter().map(|s| kept.binary_search(s).unwrap_or(0)).collect()
+    }
+
     /// Channels.
     pub fn channels(&self) -> usize {
         self.output.nrows()

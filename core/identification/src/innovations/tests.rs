@@ -6,7 +6,7 @@ use rand::{RngExt as _, SeedableRng as _};
 use rand_xoshiro::Xoshiro256PlusPlus as StdRng;
 
 use super::decision::{Candidate, Evidence, Prior, Quadratic};
-use super::filter::{FREE, Innovations, POWERS, Parameter, Setup, Sums};
+use super::filter::{FREE, Innovations, POWERS, Parameter, Passed, Setup, Sums, TOLD};
 use super::predictor::Predictor;
 use super::state_space::{NoisePoint, NoiseStates};
 
@@ -135,6 +135,19 @@ fn pass(
     series: &[Vec<f64>],
     threads: usize,
 ) -> Sums {
+    blocks(system, point, parameters, data, series, threads, None).total()
+}
+
+/// The same by blocks.
+fn blocks(
+    system: &NoiseStates,
+    point: &NoisePoint,
+    parameters: Vec<Parameter>,
+    data: &[[f64; 2]],
+    series: &[Vec<f64>],
+    threads: usize,
+    block: Option<u64>,
+) -> Passed {
     let predictor = Predictor::new(system, &system.driving(point)).expect("a predictor");
     let count = series.first().map_or(0, Vec::len);
     let setup = Setup {
@@ -146,6 +159,7 @@ fn pass(
         series: count,
         averaged: false,
         step_ns: STEP_NS,
+        block,
         threads,
     };
     let mut innovations = Innovations::new(setup);
@@ -355,6 +369,7 @@ fn commands_in_the_loop_do_not_bias_a_gain() {
                 series: 2,
                 averaged: true,
                 step_ns: STEP_NS,
+                block: None,
                 threads: 1,
             };
             let mut innovations = Innovations::new(setup);
@@ -362,7 +377,7 @@ fn commands_in_the_loop_do_not_bias_a_gain() {
                 let z = (readouts[t + 1] - 2.0 * readouts[t] + readouts[t - 1]) / (DT_S * DT_S);
                 innovations.push(t as i64 * STEP_NS, &[z], &[commands[t], commands[t + later]]);
             }
-            innovations.finish()
+            innovations.finish().total()
         };
         let (causal, acausal) = (sums(0), sums(1));
         score += causal.score[0];
@@ -446,6 +461,132 @@ fn scores_equal_those_of_the_covariance_of_all_samples() {
     }
     let chi2 = z.dot(&(&inverse * &z));
     assert!((sums.chi2 / chi2 - 1.0).abs() < 1e-6, "{} against {chi2}", sums.chi2);
+}
+
+/// The start is fitted early and its influence on slow states goes on from the fit: sums equal those of the covariance of
+/// all samples, made of the impulse responses of the predictor. They differ by what later samples tell of the start.
+#[test]
+fn a_start_that_is_fitted_early_leaves_no_error() {
+    let slow = process(
+        "slow",
+        NoiseResponse::Held,
+        &[(2.0, 1.0, 2), (1.0, 1.0, 4)],
+        &[("a", &[1.0, 0.0]), ("b", &[-0.5, 1.0])],
+    );
+    let declared: Vec<NoiseProcess> = declared().into_iter().chain([slow]).collect();
+    let system = NoiseStates::new(&declared, &channels(), DT_S, &[]).expect("a system");
+    let point = system.declared_point();
+    let predictor = Predictor::new(&system, &system.driving(&point)).expect("a predictor");
+    let samples = 400;
+    let before = predictor.known_of_the_start(&system) * FREE;
+    let told = predictor.start(&system, &before, TOLD, samples);
+    // Not the moving averages alone: slow states remember them.
+    assert!(told > predictor.settling(&system, TOLD, samples) && told < samples / 2, "{told}");
+    let mut response = DMatrix::identity(2 * samples, 2 * samples);
+    let mut starts = DMatrix::zeros(2 * samples, 4);
+    let (mut gain, mut power) = (predictor.gain.clone(), DMatrix::identity(system.transition.nrows(), 4));
+    for lag in 0..samples {
+        starts.view_mut((2 * lag, 0), (2, 4)).copy_from(&(&system.output * &power));
+        power = &system.transition * power;
+        for t in lag + 1..samples {
+            response.view_mut((2 * t, 2 * (t - lag - 1)), (2, 2)).copy_from(&(&system.output * &gain));
+        }
+        gain = &system.transition * gain;
+    }
+    // Whitened, all samples with all: (1 + O M Oᵀ)⁻¹ = 1 − O (M⁻¹ + Oᵀ O)⁻¹ Oᵀ.
+    let white = DMatrix::identity(samples, samples).kronecker(&predictor.whitening);
+    let whiten = |m: &DMatrix<f64>| &white * response.solve_lower_triangular(m).expect("units on the diagonal");
+    let starts = whiten(&starts);
+    let left = (before.try_inverse().expect("a covariance") + starts.transpose() * &starts).try_inverse();
+    let data = drawn(&system, &predictor, samples, 12);
+    let series: Vec<Vec<f64>> = noise(samples, 13).into_iter().map(|x| x.to_vec()).collect();
+    // Two columns and the data.
+    let all = whiten(&DMatrix::from_fn(2 * samples, 3, |i, k| match k {
+        2 => data[i / 2][i % 2] / system.unit[i % 2],
+        _ if k == i % 2 => series[i / 2][k],
+        _ => 0.0,
+    }));
+    let with = all.transpose() * &starts;
+    let expected = all.transpose() * &all - &with * left.expect("an information") * with.transpose();
+    let parameters =
+        (0..2).map(|c| Parameter { responses: vec![(c, c, system.unit[c])], change: None }).collect::<Vec<_>>();
+    let sums = pass(&system, &point, parameters, &data, &series, 1);
+    let measured = DMatrix::from_fn(3, 3, |i, j| match (i, j) {
+        (2, 2) => sums.chi2,
+        (2, k) | (k, 2) => sums.score[k],
+        at => sums.information[at],
+    });
+    for (i, j) in (0..3).flat_map(|i| (0..3).map(move |j| (i, j))) {
+        let most = TOLD * (expected[(i, i)] * expected[(j, j)]).sqrt();
+        let off = measured[(i, j)] - expected[(i, j)];
+        assert!(off.abs() < most, "{i} {j}: {off:e} of {}", expected[(i, j)]);
+    }
+}
+
+/// What two sums of the same numbers in another order may differ by, in units of their size.
+fn equal(a: &Sums, b: &Sums) {
+    assert_eq!((a.samples, a.numbers), (b.samples, b.numbers));
+    assert!((a.chi2 / b.chi2 - 1.0).abs() < 1e-12, "{} against {}", a.chi2, b.chi2);
+    assert!((&a.squares - &b.squares).amax() < 1e-12 * a.squares.amax());
+    for i in 0..a.score.len() {
+        let size = |j: usize| (a.information[(i, i)] * a.information[(j, j)]).sqrt();
+        let most = 1e-12 * (a.information[(i, i)] * a.chi2).sqrt();
+        assert!((a.score[i] - b.score[i]).abs() < most, "{i}: {} against {}", a.score[i], b.score[i]);
+        for j in 0..a.score.len() {
+            let (own, other) = (a.information[(i, j)], b.information[(i, j)]);
+            assert!((own - other).abs() < 1e-12 * size(j), "{i} {j}: {own} against {other}");
+        }
+    }
+}
+
+/// Blocks are cut by time, a gap does not move them, and each has what its rows add given all before: the blocks up to
+/// any one are a pass that ends with it, also where a block ends in the middle of a start.
+#[test]
+fn blocks_are_what_their_rows_add() {
+    let slow = process("slow", NoiseResponse::Held, &[(2.0, 0.05, 2)], &[("a", &[1.0]), ("b", &[-0.5])]);
+    let declared: Vec<NoiseProcess> = declared().into_iter().chain([slow]).collect();
+    let system = NoiseStates::new(&declared, &channels(), DT_S, &[]).expect("a system");
+    let point = system.declared_point();
+    let predictor = Predictor::new(&system, &system.driving(&point)).expect("a predictor");
+    let mut data = drawn(&system, &predictor, 3000, 21);
+    // A stretch begins 8 samples before a block ends, and a gap goes over the whole fourth block.
+    data[990][0] = f64::NAN;
+    data[1400..2100].fill([f64::NAN; 2]);
+    let series: Vec<Vec<f64>> = noise(3000, 22).into_iter().map(|x| x.to_vec()).collect();
+    let own = |k: usize| Parameter { responses: vec![(k % 2, (k / 2) % (2 + POWERS), 1.0 + k as f64)], change: None };
+    let levels = |k: usize| {
+        let at = |by: f64| {
+            let mut point = point.clone();
+            point.levels[k] *= 1.0 + by;
+            system.driving(&point)
+        };
+        let change = predictor.change(&system, &((at(0.1) - at(-0.1)) / 0.2));
+        Parameter { responses: Vec::new(), change: Some(change) }
+    };
+    let parameters: Vec<Parameter> = (0..20).map(own).chain((0..4).map(levels)).chain((20..45).map(own)).collect();
+    let cut = |samples: usize, block: Option<u64>, threads: usize| {
+        blocks(&system, &point, parameters.clone(), &data[..samples], &series, threads, block)
+    };
+    let all = cut(3000, Some(499), 1);
+    let first = |number: i64| number * 499 * STEP_NS;
+    assert_eq!(all.blocks.iter().map(|b| b.first_ns).collect::<Vec<_>>(), [0, 1, 2, 4, 5, 6].map(first));
+    assert_eq!(all.blocks.iter().map(|b| b.samples).collect::<Vec<_>>(), [499, 498, 402, 395, 499, 6]);
+    equal(&cut(3000, None, 1).total(), &all.total());
+    let mut sums = Sums::zeros(parameters.len(), 2);
+    for (block, end) in all.blocks.iter().zip([499, 998, 1497, 2495, 2994]) {
+        sums.add(block);
+        equal(&cut(end, None, 1).total(), &sums);
+    }
+    let threads = cut(3000, Some(499), 3);
+    for (one, three) in all.blocks.iter().zip(&threads.blocks) {
+        assert_eq!((&one.information, &one.score), (&three.information, &three.score));
+        assert_eq!((one.chi2, &one.squares), (three.chi2, &three.squares));
+    }
+    assert_eq!(all.starts.len(), 3);
+    for (one, whole) in all.starts.iter().zip(&cut(3000, None, 1).starts) {
+        assert!((&one.state - &whole.state).amax() < 1e-9 * whole.state.amax(), "{} {}", one.state, whole.state);
+        assert!((&one.slope - &whole.slope).amax() < 1e-9 * whole.slope.amax());
+    }
 }
 
 fn quadratic(information: DMatrix<f64>, truth: &[f64], candidates: Vec<Candidate>) -> Quadratic {

@@ -345,6 +345,7 @@ impl Filtered {
             series: count,
             averaged: responses.channels.iter().any(|c| c.attribute("average") == "2"),
             step_ns: (1e9 / rate_hz).round() as i64,
+            block: None,
             threads,
         });
         let acting = |i: usize| {
