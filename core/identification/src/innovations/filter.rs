@@ -38,9 +38,8 @@ const ROWS: usize = 256;
 const SETTLED: f64 = 1e-2;
 const LONGEST_WAIT_S: f64 = 600.0;
 /// What the rows behind the fit of a start may still tell of it, in squares of whitened innovations: sums are of at least
-/// thousands of these, so it is below the digits that rounding leaves. Where the predictor learns slowly of a slow force
-/// the longest wait comes first. The moving averages are then forgotten, and what slow states remember of them tells
-/// less than 1e-4 of a square: what a sum of 36,000 samples of nine channels loses is 3e-10 of it.
+/// thousands of these, so it is below the digits that rounding leaves. Between test masses, where the forces are weak,
+/// readouts are averaged over many minutes, so that this takes hours.
 pub(crate) const TOLD: f64 = 1e-10;
 /// Variance of a start over what it is by chance.
 pub(crate) const FREE: f64 = 1e6;
@@ -328,7 +327,7 @@ impl Innovations {
             groups,
             changes: parameters.iter().enumerate().filter_map(innovation).collect(),
             lanes,
-            told: predictor.start(system, &start, TOLD, most),
+            told: predictor.start(system, &start, TOLD, usize::MAX),
             start,
             pending: None,
             fresh: false,
@@ -458,9 +457,7 @@ impl Innovations {
         let with_start = self.products.len() - self.groups.len();
         let (own, with) = self.products.split_at_mut(with_start);
         let Some(information) = with.last().map(|p| p.sum.view((0, 0), (moving, moving)).into_owned()) else { return };
-        let inverse = (DMatrix::identity(moving, moving) + information * &pending.covariance).try_inverse();
-        let gain = &pending.covariance * inverse.unwrap_or_else(|| DMatrix::zeros(moving, moving));
-        let gain = (&gain + gain.transpose()) * 0.5;
+        let gain = known_with(&pending.covariance, &information);
         // Lanes of a group × states.
         let products: Vec<DMatrix<f64>> = with[..asked].iter().map(|p| p.sum.columns(0, moving).into_owned()).collect();
         let fitted: Vec<DMatrix<f64>> = products.iter().map(|b| b * &gain).collect();
@@ -588,6 +585,22 @@ impl Innovations {
         }
         let (parameters, channels) = (self.lanes.len() - 1, self.kernel.channels);
         Passed { blocks: self.blocks, starts: self.starts, parameters, channels }
+    }
+}
+
+/// Covariance of a state with covariance M before some data that have the information D on it: with `M = L Lᵀ` it is
+/// `L (1 + Lᵀ D L)⁻¹ Lᵀ`. The matrix that is inverted is symmetric and has no eigenvalue below one.
+fn known_with(before: &DMatrix<f64>, information: &DMatrix<f64>) -> DMatrix<f64> {
+    let eigen = before.clone().symmetric_eigen();
+    let root = &eigen.eigenvectors * DMatrix::from_diagonal(&eigen.eigenvalues.map(|x| x.max(0.0).sqrt()));
+    let mut inner = root.transpose() * information * &root;
+    inner = (&inner + inner.transpose()) * 0.5 + DMatrix::identity(root.ncols(), root.ncols());
+    match inner.cholesky() {
+        Some(factor) => {
+            let half = factor.l().solve_lower_triangular(&root.transpose()).unwrap_or_else(|| root.transpose());
+            half.transpose() * half
+        }
+        None => before.clone(),
     }
 }
 
