@@ -23,7 +23,7 @@ use std::sync::{Mutex, PoisonError};
 
 use nalgebra::{DMatrix, DMatrixView, DVector, Dyn};
 
-use super::predictor::{Change, Predictor};
+use super::predictor::{Beside, Change, Predictor};
 use super::state_space::NoiseStates;
 
 /// Parameters that are filtered side by side.
@@ -181,9 +181,24 @@ struct Tile {
     responses: Vec<(usize, usize, usize, f64)>,
     /// `∂K`, states × channels; empty where no parameter changes the noise.
     changes: Vec<[f64; LANES]>,
+    /// Filters at zero, each in one lane.
+    filters: Vec<Filter>,
     state: Vec<[f64; LANES]>,
     next: Vec<[f64; LANES]>,
     nu: Vec<[f64; LANES]>,
+}
+
+/// A filter at coefficient zero: states of one parameter.
+struct Filter {
+    lane: usize,
+    /// State, state before, factor.
+    transition: Vec<(usize, usize, f64)>,
+    /// Channel, state, factor.
+    output: Vec<(usize, usize, f64)>,
+    /// `∂K`, states × channels.
+    gain: Vec<f64>,
+    state: Vec<f64>,
+    next: Vec<f64>,
 }
 
 /// Tiles whose products are taken together.
@@ -691,6 +706,38 @@ impl Group {
     }
 }
 
+impl Filter {
+    fn new(lane: usize, of: &Beside) -> Self {
+        let sparse = |m: &DMatrix<f64>| {
+            let all = (0..m.nrows()).flat_map(|i| (0..m.ncols()).map(move |j| (i, j)));
+            all.filter(|at| m[*at] != 0.0).map(|(i, j)| (i, j, m[(i, j)])).collect()
+        };
+        let states = of.gain.nrows();
+        Self {
+            lane,
+            transition: sparse(&of.transition),
+            output: sparse(&of.output),
+            gain: of.gain.transpose().as_slice().to_vec(),
+            state: vec![0.0; states],
+            next: vec![0.0; states],
+        }
+    }
+
+    /// Takes off what is seen of it, and goes on by the innovations `e`.
+    fn step(&mut self, nu: &mut [[f64; LANES]], e: &[f64]) {
+        for (c, s, factor) in &self.output {
+            nu[*c][self.lane] -= factor * self.state[*s];
+        }
+        for (next, k) in self.next.iter_mut().zip(self.gain.chunks_exact(e.len())) {
+            *next = -k.iter().zip(e).map(|(k, e)| k * e).sum::<f64>();
+        }
+        for (i, j, factor) in &self.transition {
+            self.next[*i] += factor * self.state[*j];
+        }
+        std::mem::swap(&mut self.state, &mut self.next);
+    }
+}
+
 impl Tile {
     fn new(parameters: &[&Parameter], unit: &[f64], kernel: &Kernel, merged: &[usize]) -> Self {
         let n = unit.len();
@@ -698,9 +745,10 @@ impl Tile {
         for (lane, parameter) in parameters.iter().enumerate() {
             responses.extend(parameter.responses.iter().map(|(c, s, factor)| (*c, lane, *s, factor / unit[*c])));
         }
-        let mut changes = Vec::new();
+        let (mut changes, mut filters) = (Vec::new(), Vec::new());
         for (lane, change) in parameters.iter().enumerate().filter_map(|(lane, p)| Some((lane, p.change.as_ref()?))) {
             changes.resize(kernel.states * n, [0.0; LANES]);
+            filters.extend(change.beside.as_ref().map(|beside| Filter::new(lane, beside)));
             for (i, row) in change.gain.row_iter().enumerate() {
                 row.iter().enumerate().for_each(|(c, k)| changes[merged[i] * n + c][lane] += *k);
             }
@@ -709,6 +757,7 @@ impl Tile {
         Self {
             responses,
             changes,
+            filters,
             state: vec![zero; kernel.states],
             next: vec![zero; kernel.states],
             nu: vec![zero; n],
@@ -728,6 +777,8 @@ impl Tile {
             for (c, s, factor) in &kernel.output {
                 add(&mut self.nu[*c], -factor, &self.state[*s]);
             }
+            let e = &batch.innovations[row * n..(row + 1) * n];
+            self.filters.iter_mut().for_each(|filter| filter.step(&mut self.nu, e));
             let to = &mut columns[row * n * wide..(row + 1) * n * wide];
             for (w, to) in kernel.whitening.iter().zip(to.chunks_mut(2 * wide)) {
                 let two = multiply([[0.0; LANES]; 2], w, &self.nu);
@@ -735,7 +786,6 @@ impl Tile {
                     to[lane..lane + LANES].copy_from_slice(white);
                 }
             }
-            let e = &batch.innovations[row * n..(row + 1) * n];
             let pairs = self.next.chunks_exact_mut(2).zip(kernel.gain.chunks_exact(n)).enumerate();
             for (pair, (next, k)) in pairs {
                 let mut two = [[0.0; LANES]; 2];

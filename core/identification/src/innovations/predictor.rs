@@ -41,6 +41,20 @@ pub struct Change {
     pub gain: DMatrix<f64>,
     /// `W ∂S Wᵀ`.
     pub innovation: DMatrix<f64>,
+    /// What the change has beside the states of the predictor.
+    pub beside: Option<Beside>,
+}
+
+/// States of a filter at coefficient zero: only the change with this coefficient has them. They follow
+/// `χ⁺ = F χ − ∂K e` and take `C χ` off the change of what is seen.
+#[derive(Clone, Debug)]
+pub struct Beside {
+    /// F, states × states.
+    pub transition: DMatrix<f64>,
+    /// C, channels × states.
+    pub output: DMatrix<f64>,
+    /// `∂K`, states × channels.
+    pub gain: DMatrix<f64>,
 }
 
 /// The covariance of a driving noise in its parts.
@@ -91,18 +105,27 @@ impl Predictor {
         of(stationary(&before.closed, &symmetric(&driven))).ok_or_else(exact)
     }
 
-    /// How the predictor changes when the covariance of the driving noise does, to first order.
+    /// How the predictor changes when the covariance of the driving noise does, to first order. The system is that of the
+    /// predictor, or has the states of filters at zero behind its own ([`NoiseStates::extended`]): these have no gain, as
+    /// nothing drives them, and no part in the steady covariance, but both change.
     pub fn change(&self, system: &NoiseStates, driving: &DMatrix<f64>) -> Change {
-        let (f, c, k) = (&system.transition, &system.output, &self.gain);
+        let (f, c) = (&system.transition, &system.output);
+        let (known, states) = (self.gain.nrows(), f.nrows());
+        let k = &self.gain.clone().resize_vertically(states, 0.0);
         let parts = Parts::of(driving, system.channels());
         let cross = &parts.n * k.transpose();
         let driven = &parts.q - &cross - cross.transpose() + k * &parts.r * k.transpose();
-        let p = stationary(&self.closed, &symmetric(&driven));
+        let p = stationary(&(f - k * c), &symmetric(&driven));
         let innovation = symmetric(&(c * &p * c.transpose() + parts.r));
         let w = &self.whitening;
         let inverse = w.transpose() * w;
         let gain = (f * p * c.transpose() + parts.n - k * &innovation) * inverse;
-        Change { gain, innovation: w * innovation * w.transpose() }
+        let beside = (states > known).then(|| Beside {
+            transition: f.view_range(known.., known..).into_owned(),
+            output: c.columns_range(known..).into_owned(),
+            gain: gain.rows_range(known..).into_owned(),
+        });
+        Change { gain: gain.rows(0, known).into_owned(), innovation: w * innovation * w.transpose(), beside }
     }
 
     /// Covariance of what an infinite past tells of the moving averages: that of their states without what it leaves

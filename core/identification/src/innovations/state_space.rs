@@ -37,20 +37,22 @@ pub struct NoisePoint {
     pub unpredicted: DMatrix<f64>,
     /// The same of its backward difference over the sampling interval.
     pub unpredicted_slope: DMatrix<f64>,
-    /// Coefficients of [`NoiseStates::filters`].
+    /// Coefficients of the filters. One that the system has no states for acts on nothing: it is taken for zero.
     pub filtered: Vec<f64>,
 }
 
 /// An effect that filters a component of noise: the channels see `1 + c H` times what they would see.
+#[derive(Clone)]
 struct Filter {
     component: String,
     /// Response in powers of the delay, with the mean of two samples: numerator and denominator, `d_0 = 1`.
     numerator: Vec<f64>,
     denominator: Vec<f64>,
-    /// Its states among all.
-    first: usize,
+    /// Its states among all; none where its coefficient is zero.
+    first: Option<usize>,
 }
 
+#[derive(Clone)]
 struct Process {
     declared: NoiseProcess,
     enters: DMatrix<f64>,
@@ -60,6 +62,7 @@ struct Process {
 }
 
 /// A sum of `order` repeated summations of white noise, in some of the channels.
+#[derive(Clone)]
 struct Slow {
     order: usize,
     /// First state of each channel that has it; the last of `order` states is seen.
@@ -67,6 +70,7 @@ struct Slow {
 }
 
 /// The system: transition and output, and the covariance of the driving noise at any point.
+#[derive(Clone)]
 pub struct NoiseStates {
     /// Names of the components whose levels may differ.
     pub components: Vec<String>,
@@ -87,10 +91,17 @@ const MEAN: [f64; 3] = [0.5, 0.5, 0.0];
 
 impl NoiseStates {
     /// The system of `channels`, sampled every `dt_s`, driven by `declared` noise, with effects that filter it.
+    /// `filtered` are the coefficients of these: a filter at zero has no states here, see [`NoiseStates::extended`].
     ///
     /// # Errors
     /// [`NoNoise`]: a spectrum is unknown, a channel has no noise of its own, or an estimate takes part of it out.
-    pub fn new(declared: &[NoiseProcess], channels: &[String], dt_s: f64, filters: &[Colour]) -> Result<Self, NoNoise> {
+    pub fn new(
+        declared: &[NoiseProcess],
+        channels: &[String],
+        dt_s: f64,
+        filters: &[Colour],
+        filtered: &[f64],
+    ) -> Result<Self, NoNoise> {
         let n = channels.len();
         let mut components: Vec<String> = Vec::new();
         let mut processes = Vec::new();
@@ -139,10 +150,11 @@ impl NoiseStates {
         }
         let filters: Vec<Filter> = filters
             .iter()
-            .map(|colour| {
+            .zip(filtered)
+            .map(|(colour, coefficient)| {
                 let (numerator, denominator) = discrete(colour, dt_s);
-                let first = states;
-                states += numerator.len() - 1;
+                let first = (*coefficient != 0.0).then_some(states);
+                states += first.map_or(0, |_| numerator.len() - 1);
                 Filter { component: colour.process.clone(), numerator, denominator, first }
             })
             .collect();
@@ -189,20 +201,37 @@ impl NoiseStates {
                 self.output[(i, first + slow.order - 1)] = 1.0;
             }
         }
-        for filter in &self.filters {
+        for (filter, first) in self.filters.iter().filter_map(|f| Some((f, f.first?))) {
             let order = filter.numerator.len() - 1;
             for k in 0..order {
-                self.transition[(filter.first + k, filter.first)] -= filter.denominator.get(k + 1).unwrap_or(&0.0);
+                self.transition[(first + k, first)] -= filter.denominator.get(k + 1).unwrap_or(&0.0);
                 if k + 1 < order {
-                    self.transition[(filter.first + k, filter.first + k + 1)] += 1.0;
+                    self.transition[(first + k, first + k + 1)] += 1.0;
                 }
             }
             if let Some((p, k)) = self.component(&filter.component) {
                 for i in 0..n {
-                    self.output[(i, filter.first)] = self.processes[p].enters[(i, k)] / self.unit[i];
+                    self.output[(i, first)] = self.processes[p].enters[(i, k)] / self.unit[i];
                 }
             }
         }
+    }
+
+    /// The same system with the states of one more filter behind all others. At coefficient zero nothing drives them, so
+    /// that what is predicted is the same; how it changes with the coefficient, see [`Predictor::change`], is not.
+    ///
+    /// [`Predictor::change`]: super::predictor::Predictor::change
+    pub fn extended(&self, filter: usize) -> Self {
+        let mut all = self.clone();
+        let before = self.transition.nrows();
+        if let Some(own) = all.filters.get_mut(filter).filter(|f| f.first.is_none()) {
+            let states = before + own.numerator.len() - 1;
+            own.first = Some(before);
+            all.transition = DMatrix::zeros(states, states);
+            all.output = DMatrix::zeros(self.channels(), states);
+            all.connect(self.channels());
+        }
+        all
     }
 
     fn component(&self, name: &str) -> Option<(usize, usize)> {
@@ -305,14 +334,14 @@ impl NoiseStates {
     fn add_filters(&self, gain: &mut DMatrix<f64>, process: &Process, point: &NoisePoint) {
         let n = self.channels();
         for (filter, coefficient) in self.filters.iter().zip(&point.filtered) {
+            let Some(first) = filter.first else { continue };
             let Some(k) = process.declared.components.iter().position(|c| *c == filter.component) else { continue };
             for i in 0..n {
                 gain[(i, k)] += coefficient * filter.numerator[0] * process.enters[(i, k)] / self.unit[i];
             }
             for j in 1..filter.numerator.len() {
                 let denominator = filter.denominator.get(j).unwrap_or(&0.0);
-                gain[(n + filter.first + j - 1, k)] +=
-                    coefficient * (filter.numerator[j] - denominator * filter.numerator[0]);
+                gain[(n + first + j - 1, k)] += coefficient * (filter.numerator[j] - denominator * filter.numerator[0]);
             }
         }
     }

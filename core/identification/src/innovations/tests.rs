@@ -85,7 +85,7 @@ fn autocovariance(point: &NoisePoint, lag: usize) -> DMatrix<f64> {
 }
 
 fn system() -> NoiseStates {
-    NoiseStates::new(&declared(), &channels(), DT_S, &[]).expect("a system")
+    NoiseStates::new(&declared(), &channels(), DT_S, &[], &[]).expect("a system")
 }
 
 fn some_point(system: &NoiseStates) -> NoisePoint {
@@ -187,7 +187,8 @@ fn moved(system: &NoiseStates, point: &NoisePoint, parameter: usize, by: f64) ->
         0..4 => point.levels[parameter] *= by.exp(),
         4 => point.unpredicted[(0, 1)] += by,
         5 => point.unpredicted[(1, 0)] += by,
-        _ => point.unpredicted_slope[(0, 0)] += by,
+        6 => point.unpredicted_slope[(0, 0)] += by,
+        _ => point.filtered[parameter - 7] += by,
     }
     assert_eq!(point.levels.len(), system.components.len());
     point
@@ -195,27 +196,78 @@ fn moved(system: &NoiseStates, point: &NoisePoint, parameter: usize, by: f64) ->
 
 fn change(system: &NoiseStates, point: &NoisePoint, parameter: usize) -> Parameter {
     let h = 1e-4;
-    let at = |by: f64| system.driving(&moved(system, point, parameter, by));
+    let filter = parameter.checked_sub(7).filter(|k| point.filtered[*k] == 0.0);
+    let extended = filter.map_or_else(|| system.clone(), |k| system.extended(k));
+    let at = |by: f64| extended.driving(&moved(system, point, parameter, by));
     let driving = (at(h) - at(-h)) / (2.0 * h);
     let predictor = Predictor::new(system, &system.driving(point)).expect("a predictor");
-    Parameter { responses: Vec::new(), change: Some(predictor.change(system, &driving)) }
+    Parameter { responses: Vec::new(), change: Some(predictor.change(&extended, &driving)) }
+}
+
+/// A resonance of each component of the force.
+fn colours() -> Vec<Colour> {
+    let colour = |(process, hz): (&str, f64)| {
+        let omega = std::f64::consts::TAU * hz;
+        let denominator = vec![omega * omega, 0.1 * omega, 1.0];
+        Colour { process: process.to_owned(), numerator: vec![0.0, 0.0, 1.0], denominator }
+    };
+    [("force:0", 0.5), ("force:1", 0.8)].map(colour).to_vec()
+}
+
+/// The system and the point of [`some_point`] with effects that filter the force.
+fn filtered(coefficients: [f64; 2]) -> (NoiseStates, NoisePoint) {
+    let system = NoiseStates::new(&declared(), &channels(), DT_S, &colours(), &coefficients).expect("a system");
+    let point = NoisePoint { filtered: coefficients.to_vec(), ..some_point(&system) };
+    (system, point)
 }
 
 /// The score of levels and of everything else that changes the noise is the slope of the likelihood, on data that have
-/// another covariance than the model, so that no part of it is zero. The start is fitted and its squares are left out,
-/// 64 samples of 20,000: 0.3 %.
+/// another covariance than the model, so that no part of it is zero: also of filters, at zero, where the system has no
+/// states for them, and elsewhere. The start is fitted and its squares are left out, 64 samples of 20,000: 0.3 %.
 #[test]
 fn scores_of_the_noise_are_slopes_of_the_likelihood() {
-    let system = system();
-    let point = some_point(&system);
     let data = noise(20_000, 2);
-    let parameters: Vec<Parameter> = (0..7).map(|k| change(&system, &point, k)).collect();
-    let sums = pass(&system, &point, parameters, &data, &[], 1);
-    let h = 1e-4;
-    for k in 0..7 {
-        let at = |by: f64| log_likelihood(&system, &moved(&system, &point, k, by), &data);
-        let slope = (at(h) - at(-h)) / (2.0 * h);
-        assert!((sums.score[k] / slope - 1.0).abs() < 5e-3, "{k}: {} against {slope}", sums.score[k]);
+    for coefficients in [[0.0, 0.0], [0.2, 0.0], [-0.1, 0.3]] {
+        let (system, point) = filtered(coefficients);
+        let parameters: Vec<Parameter> = (0..9).map(|k| change(&system, &point, k)).collect();
+        let sums = pass(&system, &point, parameters, &data, &[], 1);
+        let h = 1e-4;
+        for k in 0..9 {
+            let at = |by: f64| {
+                let moved = moved(&system, &point, k, by);
+                let (system, _) = filtered([moved.filtered[0], moved.filtered[1]]);
+                log_likelihood(&system, &moved, &data)
+            };
+            let slope = (at(h) - at(-h)) / (2.0 * h);
+            assert!(
+                (sums.score[k] / slope - 1.0).abs() < 5e-3,
+                "{coefficients:?} {k}: {} against {slope}",
+                sums.score[k]
+            );
+        }
+    }
+}
+
+/// A filter at zero has states of its own beside the system: the sums are those of one that is in the system with a
+/// coefficient that is next to nothing.
+#[test]
+fn a_filter_at_zero_is_the_limit_of_one_in_the_system() {
+    let data = noise(3000, 3);
+    let sums = |coefficients: [f64; 2]| {
+        let (system, point) = filtered(coefficients);
+        let parameters: Vec<Parameter> = (0..9).map(|k| change(&system, &point, k)).collect();
+        (system.transition.nrows(), pass(&system, &point, parameters, &data, &[], 1))
+    };
+    // Third order each: the resonance and the mean of two samples.
+    let ((states, zero), (more, near)) = (sums([0.0, 0.2]), sums([1e-9, 0.2]));
+    assert_eq!((states, more), (4 + 3, 4 + 6));
+    for i in 0..9 {
+        let size = |j: usize| (zero.information[(i, i)] * zero.information[(j, j)]).sqrt();
+        assert!((zero.score[i] / near.score[i] - 1.0).abs() < 1e-7, "{i}: {} {}", zero.score[i], near.score[i]);
+        for j in 0..9 {
+            let off = zero.information[(i, j)] - near.information[(i, j)];
+            assert!(off.abs() < 1e-7 * size(j), "{i} {j}: {off}");
+        }
     }
 }
 
@@ -270,7 +322,7 @@ fn a_filtered_component_has_the_spectrum_of_its_filter() {
     let alone = process("force", NoiseResponse::Held, &[(2.0, 1.0, 0)], &[("a", &[1.0])]);
     let readout = process("first", NoiseResponse::Differenced, &[(1e-4, 1.0, 0)], &[("a", &[1.0])]);
     let one = ["a".to_owned()];
-    let system = NoiseStates::new(&[alone, readout], &one, DT_S, &[colour]).expect("a system");
+    let system = NoiseStates::new(&[alone, readout], &one, DT_S, &[colour], &[0.3]).expect("a system");
     let spectrum = |coefficient: f64, hz: f64| {
         let mut point = system.declared_point();
         point.filtered = vec![coefficient];
@@ -308,7 +360,7 @@ fn coloured_terms_have_their_spectra() {
     for (response, exponent) in [(NoiseResponse::Held, 2), (NoiseResponse::Held, 4), (NoiseResponse::Differenced, 6)] {
         let terms = [(1e-9, 1.0, 0), (3.0, 0.01, exponent)];
         let noise = process("n", response, &terms, &[("a", &[1.0])]);
-        let system = NoiseStates::new(&[noise], &["a".to_owned()], DT_S, &[]).expect("a system");
+        let system = NoiseStates::new(&[noise], &["a".to_owned()], DT_S, &[], &[]).expect("a system");
         let driving = system.driving(&system.declared_point());
         type C = nalgebra::Complex<f64>;
         for hz in [1e-3, 1e-2, 0.1] {
@@ -339,7 +391,7 @@ fn coloured_terms_have_their_spectra() {
 fn commands_in_the_loop_do_not_bias_a_gain() {
     let force = process("force", NoiseResponse::Held, &[(1.0, 1.0, 0)], &[("a", &[1.0])]);
     let readout = process("first", NoiseResponse::Differenced, &[(0.5, 1.0, 0)], &[("a", &[1.0])]);
-    let system = NoiseStates::new(&[force, readout], &["a".to_owned()], DT_S, &[]).expect("a system");
+    let system = NoiseStates::new(&[force, readout], &["a".to_owned()], DT_S, &[], &[]).expect("a system");
     let predictor = Predictor::new(&system, &system.driving(&system.declared_point())).expect("a predictor");
     let (force_sigma, readout_sigma) = ((1.0 / (2.0 * DT_S)).sqrt(), 0.5 * (1.0 / (2.0 * DT_S)).sqrt());
     let runs = 200;
@@ -474,7 +526,7 @@ fn a_start_that_is_fitted_early_leaves_no_error() {
         &[("a", &[1.0, 0.0]), ("b", &[-0.5, 1.0])],
     );
     let declared: Vec<NoiseProcess> = declared().into_iter().chain([slow]).collect();
-    let system = NoiseStates::new(&declared, &channels(), DT_S, &[]).expect("a system");
+    let system = NoiseStates::new(&declared, &channels(), DT_S, &[], &[]).expect("a system");
     let point = system.declared_point();
     let predictor = Predictor::new(&system, &system.driving(&point)).expect("a predictor");
     let samples = 400;
@@ -545,7 +597,7 @@ fn equal(a: &Sums, b: &Sums) {
 fn blocks_are_what_their_rows_add() {
     let slow = process("slow", NoiseResponse::Held, &[(2.0, 0.05, 2)], &[("a", &[1.0]), ("b", &[-0.5])]);
     let declared: Vec<NoiseProcess> = declared().into_iter().chain([slow]).collect();
-    let system = NoiseStates::new(&declared, &channels(), DT_S, &[]).expect("a system");
+    let system = NoiseStates::new(&declared, &channels(), DT_S, &[], &[]).expect("a system");
     let point = system.declared_point();
     let predictor = Predictor::new(&system, &system.driving(&point)).expect("a predictor");
     let mut data = drawn(&system, &predictor, 3000, 21);
@@ -680,7 +732,7 @@ fn ranges_bound_the_gain_and_equals_are_alternatives() {
 fn noise_that_cannot_be_filtered_is_refused_with_its_name() {
     let unknown = NoiseProcess { spectrum: None, ..declared().remove(1) };
     let refused = |declared: &[NoiseProcess]| {
-        NoiseStates::new(declared, &channels(), DT_S, &[]).map(|_| ()).expect_err("refused").0
+        NoiseStates::new(declared, &channels(), DT_S, &[], &[]).map(|_| ()).expect_err("refused").0
     };
     assert!(refused(&[unknown]).contains("`first`"));
     assert!(refused(&declared()[1..2]).contains("b is declared"));

@@ -221,8 +221,10 @@ impl<'a> NoiseAt<'a> {
         let Some(rate_hz) = responses.channels.first().map(|c| c.rate_hz) else { return Err(WorkflowError::NoChannel) };
         let colours = responses.coefficients.iter().enumerate().filter_map(|(i, c)| Some((i, c.colours.clone()?)));
         let (filters, colours): (Vec<usize>, Vec<_>) = colours.unzip();
-        let system = NoiseStates::new(&available.noise, &responses.names, 1.0 / rate_hz, &colours).map_err(refuse)?;
         let values = responses.values(point);
+        let filtered: Vec<f64> = filters.iter().map(|i| values[*i]).collect();
+        let system = NoiseStates::new(&available.noise, &responses.names, 1.0 / rate_hz, &colours, &filtered);
+        let system = system.map_err(refuse)?;
         let level = |name: &String| point.levels.get(name).copied().unwrap_or(1.0);
         let levels: Vec<f64> = system.components.iter().map(level).collect();
         let driving = system.driving(&noise_point(responses, &filters, &values, &levels));
@@ -242,12 +244,16 @@ impl<'a> NoiseAt<'a> {
             return None;
         }
         let half = DIFFERENCE * reach(self.responses.coefficients[i]);
+        // A filter at zero has no states in the system, but its slope has.
+        let filter = self.filters.iter().position(|own| *own == i).filter(|_| self.values[i] == 0.0);
+        let extended = filter.map(|filter| self.system.extended(filter));
+        let system = extended.as_ref().unwrap_or(&self.system);
         let at = |by: f64| {
             let mut moved = self.values.clone();
             moved[i] += by;
-            self.driving(&moved, &self.levels)
+            system.driving(&noise_point(self.responses, &self.filters, &moved, &self.levels))
         };
-        Some(self.predictor.change(&self.system, &((at(half) - at(-half)) / (2.0 * half))))
+        Some(self.predictor.change(system, &((at(half) - at(-half)) / (2.0 * half))))
     }
 
     /// How the logarithm of the level of a component changes it.
