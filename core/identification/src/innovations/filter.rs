@@ -342,7 +342,7 @@ impl Innovations {
             groups,
             changes: parameters.iter().enumerate().filter_map(innovation).collect(),
             lanes,
-            told: predictor.start(system, &start, TOLD, usize::MAX),
+            told: predictor.start(system, &start, TOLD, 1 << 30),
             start,
             pending: None,
             fresh: false,
@@ -455,7 +455,7 @@ impl Innovations {
         }
         let state = DVector::from_column_slice(&self.state[..moving]);
         self.starts.push(Start { state, slope: DMatrix::zeros(moving, self.lanes.len() - 1) });
-        self.pending = Some(Pending { covariance: self.start.clone(), rows: self.told });
+        self.pending = Some(Pending { covariance: self.start.clone(), rows: usize::MAX });
         self.unsettled = self.settling;
         self.fresh = true;
     }
