@@ -29,11 +29,11 @@ use super::state_space::NoiseStates;
 /// Parameters that are filtered side by side.
 const LANES: usize = 8;
 /// Tiles of a group, whose products are taken together.
-const TILES: usize = 4;
+const TILES: usize = 5;
 /// Parameters of a group.
 const WIDE: usize = LANES * TILES;
 /// Rows that are filtered before products are taken.
-const ROWS: usize = 256;
+const ROWS: usize = 128;
 /// What is left of a start when squares of innovations are summed for levels of the noise, and the longest wait, s.
 const SETTLED: f64 = 1e-2;
 const LONGEST_WAIT_S: f64 = 600.0;
@@ -165,10 +165,10 @@ struct Kernel {
     channels: usize,
     /// States as they are filtered, see [`NoiseStates::merged`], made even by one that stays zero.
     states: usize,
-    /// Of each state: states before and factors.
-    transition: Vec<Vec<(usize, f64)>>,
-    /// Channel, state, factor.
-    output: Vec<(usize, usize, f64)>,
+    /// Two states after two states: for both a state before and a factor, zero where the other has more of them.
+    transition: Vec<Vec<[(usize, f64); 2]>>,
+    /// Of each channel: states and factors.
+    output: Vec<Vec<(usize, f64)>>,
     /// Two states after two states, their gains channel by channel.
     gain: Vec<[f64; 2]>,
     /// Two channels after two channels: channels up to the second of them.
@@ -342,7 +342,7 @@ impl Innovations {
             groups,
             changes: parameters.iter().enumerate().filter_map(innovation).collect(),
             lanes,
-            told: predictor.start(system, &start, TOLD, 1 << 30),
+            told: predictor.start(system, &start, TOLD, 1 << 30).max(1),
             start,
             pending: None,
             fresh: false,
@@ -362,7 +362,7 @@ impl Innovations {
             before: vec![f64::NAN; series],
             waiting: Waiting { inputs: Vec::new(), innovations: Vec::new(), counts: Vec::new() },
             products,
-            block,
+            block: block.map(|samples| samples.max(1)),
             number: 0,
             blocks: Vec::new(),
             squares: DMatrix::zeros(channels, channels),
@@ -431,7 +431,7 @@ impl Innovations {
     fn enter_block(&mut self, since_ns: i64) {
         let Some(length) = self.block else { return };
         let sample = (since_ns + self.step_ns / 2).div_euclid(self.step_ns);
-        let number = sample.div_euclid(length.max(1).cast_signed());
+        let number = sample.div_euclid(length.cast_signed());
         if number != self.number {
             self.close_block();
             self.number = number;
@@ -650,8 +650,8 @@ impl Kernel {
         let n = system.channels();
         let merged = system.merged();
         let states = merged.iter().max().map_or(0, |last| last + 1).next_multiple_of(2);
-        let mut transition = vec![Vec::new(); states];
-        let mut output = Vec::new();
+        let mut rows = vec![Vec::new(); states];
+        let mut output = vec![Vec::new(); n];
         let mut seen = vec![false; states];
         for (j, to) in merged.iter().enumerate() {
             // One of those that are merged stands for all.
@@ -659,10 +659,17 @@ impl Kernel {
                 continue;
             }
             for (i, factor) in system.transition.column(j).iter().enumerate().filter(|(_, x)| **x != 0.0) {
-                transition[merged[i]].push((*to, *factor));
+                rows[merged[i]].push((*to, *factor));
             }
-            output.extend((0..n).map(|c| (c, *to, system.output[(c, j)])).filter(|(.., factor)| *factor != 0.0));
+            for (c, factor) in system.output.column(j).iter().enumerate().filter(|(_, x)| **x != 0.0) {
+                output[c].push((*to, *factor));
+            }
         }
+        let both = |rows: &[Vec<(usize, f64)>]| {
+            let at = |half: usize, k: usize| rows[half].get(k).copied().unwrap_or_default();
+            (0..rows[0].len().max(rows[1].len())).map(|k| [at(0, k), at(1, k)]).collect()
+        };
+        let transition = rows.chunks_exact(2).map(both).collect();
         let mut gain = vec![[0.0; 2]; states / 2 * n];
         for (i, to) in merged.iter().enumerate() {
             for c in 0..n {
@@ -676,15 +683,21 @@ impl Kernel {
 
     /// From what is seen to innovations, for the data.
     fn step(&self, state: &mut Vec<f64>, next: &mut Vec<f64>, z: &mut [f64]) {
-        for (c, s, factor) in &self.output {
-            z[*c] -= factor * state[*s];
+        for (z, output) in z.iter_mut().zip(&self.output) {
+            output.iter().for_each(|(s, factor)| *z -= factor * state[*s]);
         }
-        for (pair, k) in self.gain.chunks_exact(self.channels).enumerate() {
-            for half in 0..2 {
-                let i = 2 * pair + half;
-                let before: f64 = self.transition[i].iter().map(|(j, factor)| factor * state[*j]).sum();
-                next[i] = before + k.iter().zip(&*z).map(|(k, e)| k[half] * e).sum::<f64>();
+        let pairs = self.transition.iter().zip(self.gain.chunks_exact(self.channels));
+        for (next, (before, k)) in next.chunks_exact_mut(2).zip(pairs) {
+            let mut two = [0.0; 2];
+            for [(i, p), (j, q)] in before {
+                two[0] += p * state[*i];
+                two[1] += q * state[*j];
             }
+            for ([p, q], e) in k.iter().zip(&*z) {
+                two[0] += p * e;
+                two[1] += q * e;
+            }
+            next.copy_from_slice(&two);
         }
         std::mem::swap(state, next);
     }
@@ -774,8 +787,10 @@ impl Tile {
             for (c, lane, s, factor) in &self.responses {
                 self.nu[*c][*lane] += factor * input[*s];
             }
-            for (c, s, factor) in &kernel.output {
-                add(&mut self.nu[*c], -factor, &self.state[*s]);
+            for (nu, output) in self.nu.iter_mut().zip(&kernel.output) {
+                let mut sum = *nu;
+                output.iter().for_each(|(s, factor)| add(&mut sum, -factor, &self.state[*s]));
+                *nu = sum;
             }
             let e = &batch.innovations[row * n..(row + 1) * n];
             self.filters.iter_mut().for_each(|filter| filter.step(&mut self.nu, e));
@@ -786,24 +801,34 @@ impl Tile {
                     to[lane..lane + LANES].copy_from_slice(white);
                 }
             }
-            let pairs = self.next.chunks_exact_mut(2).zip(kernel.gain.chunks_exact(n)).enumerate();
-            for (pair, (next, k)) in pairs {
-                let mut two = [[0.0; LANES]; 2];
-                for (half, to) in two.iter_mut().enumerate() {
-                    for (j, factor) in &kernel.transition[2 * pair + half] {
-                        add(to, *factor, &self.state[*j]);
-                    }
+            let pairs = kernel.transition.iter().zip(kernel.gain.chunks_exact(n));
+            for (pair, (next, (before, k))) in self.next.chunks_exact_mut(2).zip(pairs).enumerate() {
+                let (mut first, mut second) = ([0.0; LANES], [0.0; LANES]);
+                for [(i, p), (j, q)] in before {
+                    add(&mut first, *p, &self.state[*i]);
+                    add(&mut second, *q, &self.state[*j]);
                 }
+                let mut two = multiply([first, second], k, &self.nu);
                 if let Some(changes) = self.changes.get(2 * pair * n..(2 * pair + 2) * n) {
-                    for (to, changes) in two.iter_mut().zip(changes.chunks_exact(n)) {
-                        changes.iter().zip(e).for_each(|(change, e)| add(to, -e, change));
-                    }
+                    two = two_changes(two, changes, e);
                 }
-                next.copy_from_slice(&multiply(two, k, &self.nu));
+                next.copy_from_slice(&two);
             }
             std::mem::swap(&mut self.state, &mut self.next);
         }
     }
+}
+
+/// Takes two rows of `∂K` times what drives them off: each lane has a matrix of its own.
+#[inline(always)]
+fn two_changes(from: [[f64; LANES]; 2], changes: &[[f64; LANES]], e: &[f64]) -> [[f64; LANES]; 2] {
+    let [mut first, mut second] = from;
+    let (p, q) = changes.split_at(e.len());
+    for ((e, p), q) in e.iter().zip(p).zip(q) {
+        add(&mut first, -e, p);
+        add(&mut second, -e, q);
+    }
+    [first, second]
 }
 
 /// Adds a matrix of two rows times lanes: two at once read each lane once.
