@@ -54,7 +54,6 @@ fn a_hidden_gain_is_found_with_its_instance_and_size() {
     let (value, sigma) = (first["value"].as_f64().expect("a value"), first["sigma"].as_f64().expect("a sigma"));
     assert!((value - 0.25).abs() < 4.0 * sigma && sigma < 0.05, "{value} ± {sigma}");
     assert!(first["p_value"].as_f64().is_some_and(|p| p < 1e-3) && first["in_range"] == true);
-    assert!(first["held_out_delta_chi2"].as_array().expect("both halves").iter().all(|x| x.as_f64() > Some(0.0)));
     assert!(first["offset_shift_m"]["com-offset.tm2.y"].is_f64());
     // Nothing else is accepted.
     assert_eq!(d["candidates"].as_array().expect("a list").iter().filter(|c| c["accepted"] == true).count(), 1);
@@ -86,10 +85,12 @@ fn named_alone(d: &Value, truth: f64) -> String {
     one.clone()
 }
 
-/// A thruster gain of 10 % is named alone at any length. The halves of the data have other bands than the whole: a
-/// half weighted by the whole's bands has a biased score of a gain in the loop, and refuses it.
+/// A thruster gain of 10 % is named alone at any length, that of two hours too, where it is larger: scores of single
+/// bands of a gain in the loop are biased, and which bands there are depends on the length.
 #[test]
-fn a_thruster_gain_is_named_from_six_to_twelve_hours() {
+fn a_thruster_gain_is_named_from_two_to_twelve_hours() {
+    let d = diagnosis(&["--hours", "2", "--seed", "77", "--effect", "mps-gain:sc.y=0.2"]);
+    assert_eq!(named_alone(&d, 0.2), "mps-gain:sc.y", "2 h");
     for hours in ["6", "8", "10"] {
         let d = diagnosis(&["--hours", hours, "--seed", "77", "--effect", "mps-gain:sc.y=0.1"]);
         assert_eq!(named_alone(&d, 0.1), "mps-gain:sc.y", "{hours} h");
@@ -122,15 +123,27 @@ fn errors_of_a_readout_without_interferometer_are_named_alone() {
     assert_eq!(named_alone(&d, 0.15), "time-offset:is");
 }
 
-/// Eight hours have 3.5σ of the same scale, and the bound, corrected for all that is tried, is not reached: the halves
-/// must agree on it (false alarm 1e-3, the bound of a refusal) and its size be within 4σ, whatever the verdict.
+/// Eight hours have 3.5σ of the same scale, and the bound, corrected for all that is tried, may not be reached: its size
+/// is within 4σ (false alarm 6e-5), whatever the verdict.
 #[test]
-fn a_scale_near_the_bound_is_constant_over_the_halves() {
+fn a_scale_near_the_bound_has_its_size() {
     let d = diagnosis(&["--hours", "8", "--seed", "31", "--effect", "is-scale:tm2.y=0.05"]);
     let all = d["candidates"].as_array().expect("a list");
-    let scale = all.iter().find(|c| c["effect"] == "is-scale" && c["instance"] == "tm2.y").expect("the scale");
+    let pair = ["is-scale", "es-gain"];
+    let of = |c: &&Value| c["instance"] == "tm2.y" && pair.iter().any(|effect| c["effect"] == *effect);
+    let scale = all.iter().find(of).expect("the scale or the gain that confounds it");
     let (value, sigma) = (scale["value"].as_f64().expect("a value"), scale["sigma"].as_f64().expect("a sigma"));
-    assert!((value - 0.05).abs() < 4.0 * sigma && scale["held_out_p_value"].as_f64() > Some(1e-3), "{scale:#}");
+    assert!((value - 0.05).abs() < 4.0 * sigma, "{scale:#}");
+}
+
+/// Two gains whose sum looks like a third effect are found as the pair: each alone explains less than the stand-in.
+#[test]
+fn a_pair_is_not_replaced_by_what_looks_like_both() {
+    let effects = ["--effect", "mps-gain:sc.y=0.08", "--effect", "mps-tilt:sc.z=0.05"];
+    let d = diagnosis(&[&["--hours", "6", "--seed", "5110"][..], &effects].concat());
+    let mut found = accepted(&d);
+    found.sort();
+    assert_eq!(found, ["mps-gain:sc.y", "mps-tilt:sc.z"], "{:#}", d["candidates"]);
 }
 
 /// A gain of the torques of 5 %, of which a level of torque noise fitted before it absorbs most: the level is fitted
@@ -202,11 +215,11 @@ fn increased_torque_noise_is_found_alone() {
     assert!((value - 2.0).abs() < 4.0 * sigma && sigma < 0.05, "{value} ± {sigma}");
 }
 
-/// An hour has three segments: an error, not a result.
+/// Ten minutes are shorter than a segment: an error, not a result.
 #[test]
 fn a_diagnosis_on_too_little_data_is_refused() {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let product = calibrated(folder.path(), &["--hours", "1", "--seed", "13"]);
+    let product = calibrated(folder.path(), &["--hours", "0.2", "--seed", "13"]);
     let id = product["id"].as_str().expect("an id");
     let output = expect(dragfree(folder.path()).args(["diagnose", id, "--archive", "archive", "--json", "-q"]), 1);
     let said = String::from_utf8_lossy(&output.stderr);

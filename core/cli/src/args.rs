@@ -270,9 +270,6 @@ pub(crate) struct Diagnose {
     pub(crate) products: Vec<String>,
     #[command(flatten)]
     pub(crate) archive: Archive,
-    /// Write what was gathered, to be ranked again without the telemetry
-    #[arg(long, value_name = "FILE")]
-    pub(crate) save_sums: Option<PathBuf>,
     /// Candidates and limits to print; --json has all
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub(crate) top: usize,

@@ -214,7 +214,7 @@ pub fn remaining(
 ) -> Result<Option<Unexplained>, IdentificationError> {
     let fit = scorer.fit(added)?;
     let measured = scorer.residual_psd(&fit);
-    let mut levels = scorer.levels(&fit, &scorer.total, &measured);
+    let mut levels = scorer.levels(&fit, scorer.total, &measured);
     levels.fit();
     Ok(unexplained(scorer, &levels))
 }

@@ -1,7 +1,6 @@
 //! Gram matrices per band of channels, the model's series and those of every candidate: `Σ Re(x* xᵀ)` over segments.
 //!
-//! Any model made of these columns is solved from the sums without reading the data again. Alternate stretches of time
-//! are summed apart, so that a candidate can be tested for constancy on two interleaved halves.
+//! Any model made of these columns is solved from the sums without reading the data again.
 //!
 //! Two lengths of segments cover the bands. Short ones serve those from [`SLOW_HZ`] on. Segments [`LONG`] times as
 //! long, of samples that [`crate::decimate`] has decimated, serve those below, where heat, charge and drifts act and
@@ -29,10 +28,6 @@ const SHORTEST_LOOKED_AT: usize = 2;
 
 /// Decimated samples come at least this many times as often as [`SLOW_HZ`]: aliases below it are then weaker by 1e7.
 const THIN: f64 = 6.0;
-
-/// Stretches of this length belong to the first and the second half in turn, s, so that three hours have one of each. A
-/// long segment spans several and belongs to the half of its middle.
-const STRETCH_S: f64 = 1.5 * 3600.0;
 
 /// Time of one row of the maps of `compare`, ns.
 pub const HOUR_NS: i64 = 3_600_000_000_000;
@@ -119,8 +114,8 @@ pub struct GramSums {
     pub length: usize,
     /// Samples per second.
     pub rate_hz: f64,
-    /// Sums of the two interleaved halves.
-    pub sets: [Gram; 2],
+    /// Sums of all segments.
+    pub total: Gram,
     /// The base columns hour by hour, in the bands of short segments ([`Self::hour_plan`]).
     pub hours: Vec<Hour>,
     /// Housekeeping against the residuals.
@@ -130,13 +125,6 @@ pub struct GramSums {
 }
 
 impl GramSums {
-    /// All segments together.
-    pub fn total(&self) -> Gram {
-        let mut total = self.sets[0].clone();
-        total.add(&self.sets[1]);
-        total
-    }
-
     /// The plan of the bands of the sums.
     pub fn plan(&self) -> Plan {
         whole_plan(self.length, self.rate_hz)
@@ -269,7 +257,6 @@ impl GramAccumulator {
         let housekeeping = coherence(&long);
         let all = columns.names.len() + housekeeping.names.len();
         let decimator = Decimator::new(factor, all, (1e9 / rate_hz).round() as i64, threads);
-        let gram = Gram::zero(&columns, &whole);
         Self {
             low_bands,
             bench: SegmentTransform::new(&short, columns.fast, threads),
@@ -281,7 +268,7 @@ impl GramAccumulator {
             gathered: GramSums {
                 length,
                 rate_hz,
-                sets: [gram.clone(), gram],
+                total: Gram::zero(&columns, &whole),
                 hours: Vec::new(),
                 housekeeping,
                 transients: Transients::default(),
@@ -295,8 +282,7 @@ impl GramAccumulator {
 
     /// The sums.
     pub fn finish(mut self) -> GramSums {
-        let bands = self.gathered.sets.iter_mut().flat_map(|set| &mut set.bands);
-        bands.for_each(DMatrix::fill_upper_triangle_with_lower_triangle);
+        self.gathered.total.bands.iter_mut().for_each(DMatrix::fill_upper_triangle_with_lower_triangle);
         self.gathered
     }
 
@@ -352,11 +338,6 @@ pub(crate) fn low_plan(length: usize, rate_hz: f64) -> (Plan, usize) {
     (Plan::slow(LONG * length / factor, length / factor, rate_hz / factor as f64), factor)
 }
 
-/// The half that a segment belongs to.
-fn set_of(middle_ns: i64) -> usize {
-    middle_ns.div_euclid((STRETCH_S * 1e9) as i64).rem_euclid(2) as usize
-}
-
 fn middle_ns(first_ns: i64, columns: &[&[f64]], rate_hz: f64) -> i64 {
     let samples = columns.first().map_or(0, |c| c.len());
     first_ns + (0.5e9 * samples as f64 / rate_hz) as i64
@@ -369,7 +350,7 @@ impl Cuts for GramAccumulator {
 
     fn segment(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
         let middle_ns = middle_ns(first_ns, columns, self.short.rate_hz);
-        let set = &mut self.gathered.sets[set_of(middle_ns)];
+        let set = &mut self.gathered.total;
         let bands = self.low_bands..self.whole.bands.len();
         self.bench.transform(&self.short, taper, columns);
         self.bench.multiply(&self.whole.bins(taper + HALVINGS)[bands.clone()], &mut set.bands[bands.clone()]);
@@ -417,7 +398,7 @@ impl Cuts for Low<'_> {
     }
 
     fn segment(&mut self, taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
-        self.take([self.long, self.whole], taper, first_ns, columns, overlaps);
+        self.take([self.long, self.whole], taper, columns, overlaps);
         // Shorter ones cover the ends of a run.
         if taper <= SHORTEST_LOOKED_AT {
             let part = if taper == 0 { Part::MiddleHalf } else { Part::All };
@@ -435,7 +416,7 @@ impl Cuts for Low<'_> {
         let thinned = self.whole.length / self.long.length;
         let plans = [self.long.between_halves(even), self.whole.between_halves(even * thinned)];
         if even > self.long.length / 2 {
-            self.take([&plans[0], &plans[1]], 0, first_ns, &columns, false);
+            self.take([&plans[0], &plans[1]], 0, &columns, false);
         } else {
             self.transform(&plans[0], 0, &columns[..self.gathered.columns.names.len()]);
         }
@@ -482,11 +463,11 @@ impl Low<'_> {
 
     /// A segment of the `taper`-th length. `plans` are that of the decimated samples, whose lowest bands are those of
     /// the sums, and that of all samples, which gives its weight.
-    fn take(&mut self, plans: [&Plan; 2], taper: usize, first_ns: i64, columns: &[&[f64]], overlaps: bool) {
+    fn take(&mut self, plans: [&Plan; 2], taper: usize, columns: &[&[f64]], overlaps: bool) {
         let [plan, counted] = plans;
         let (columns, housekeeping) = columns.split_at(self.gathered.columns.names.len());
         self.transform(plan, taper, columns);
-        let set = &mut self.gathered.sets[set_of(middle_ns(first_ns, columns, plan.rate_hz))];
+        let set = &mut self.gathered.total;
         let bands = 0..self.low_bands.min(plan.bands.len());
         self.bench.multiply(&plan.bins(taper)[bands.clone()], &mut set.bands[bands.clone()]);
         set.weights.count_bands(counted, taper, overlaps, bands);

@@ -107,8 +107,8 @@ pub struct CandidateScorer<'a> {
     pub candidate_set: &'a CandidateSet,
     /// Sums.
     pub gathered: &'a GramSums,
-    /// Both halves together.
-    pub total: Gram,
+    /// All of them.
+    pub total: &'a Gram,
     /// Noise as it is declared.
     pub noise: &'a NoiseModel,
     /// Thresholds.
@@ -144,7 +144,7 @@ impl<'a> CandidateScorer<'a> {
     ) -> Self {
         let plan = gathered.plan();
         let noise_in_bands = BandNoise::new(noise, &plan);
-        Self { candidate_set, gathered, total: gathered.total(), noise, settings, noise_in_bands, plan }
+        Self { candidate_set, gathered, total: &gathered.total, noise, settings, noise_in_bands, plan }
     }
 
     /// Bands.
@@ -185,7 +185,7 @@ impl<'a> CandidateScorer<'a> {
     }
 
     fn scored(&self, added: Vec<Candidate>, solved: Solved) -> Fit {
-        let mut scores = self.scores(&self.total, &solved);
+        let mut scores = self.scores(self.total, &solved);
         let Solved { layout, columns, estimate } = solved;
         scores.covariance = estimate.known.clone().try_inverse().unwrap_or(scores.covariance);
         scores.bound_score = estimate.bound_score.clone();
@@ -244,7 +244,7 @@ impl<'a> CandidateScorer<'a> {
     /// of the excess scores high, and so does whatever correlates with the excess by chance.
     pub fn without_excess(&self, fit: &Fit) -> Option<WithoutExcess> {
         let measured = self.residual_psd(fit);
-        let mut levels = self.levels(fit, &self.total, &measured);
+        let mut levels = self.levels(fit, self.total, &measured);
         levels.fit();
         let (bands, observations) = levels.excess_bands();
         if observations <= 0.0 {
@@ -258,7 +258,7 @@ impl<'a> CandidateScorer<'a> {
     fn under(&self, fit: &Fit, inverses: Vec<DMatrix<f64>>) -> Fit {
         let estimate = Estimate { inverses, ..fit.estimate.clone() };
         let mut solved = Solved { layout: fit.layout.clone(), columns: fit.columns.clone(), estimate };
-        solved.estimate.known += self.scores(&self.total, &solved).normal - &fit.scores.normal;
+        solved.estimate.known += self.scores(self.total, &solved).normal - &fit.scores.normal;
         self.scored(fit.added.clone(), solved)
     }
 
@@ -271,12 +271,12 @@ impl<'a> CandidateScorer<'a> {
     /// As [`Self::fit`].
     pub fn deviance(&self, fit: &Fit, bands: &[bool], added: &[Candidate]) -> Result<f64, EstimateError> {
         let measured = self.residual_psd(fit);
-        let mut levels = self.levels(fit, &self.total, &measured);
+        let mut levels = self.levels(fit, self.total, &measured);
         levels.fit();
         let mut least = f64::INFINITY;
         for refinements in [0, REFINEMENTS] {
             let Solved { layout, columns, estimate } = self.solve(added, refinements)?;
-            least = least.min(levels.deviance(&Self::residual(&self.total, &layout, &columns, &estimate.theta), bands));
+            least = least.min(levels.deviance(&Self::residual(self.total, &layout, &columns, &estimate.theta), bands));
         }
         Ok(least)
     }
@@ -288,7 +288,7 @@ impl<'a> CandidateScorer<'a> {
     /// As [`Self::fit`].
     pub fn profile_deviance(&self, added: &[Candidate], bands: &[bool]) -> Result<f64, EstimateError> {
         let Solved { layout, columns, estimate } = self.solve(added, REFINEMENTS)?;
-        let measured = Self::residual(&self.total, &layout, &columns, &estimate.theta);
+        let measured = Self::residual(self.total, &layout, &columns, &estimate.theta);
         let unknowns = self.candidate_set.unknowns(added);
         let colours = colours(&unknowns, &estimate.theta);
         let levels = Levels::new(self.noise, &self.plan, &self.total.weights, &measured, self.settings);
@@ -405,7 +405,7 @@ impl<'a> CandidateScorer<'a> {
     }
 
     fn score(&self, scores: &Scores, candidate: Candidate) -> Option<Scored> {
-        let Beside { score, information } = Self::beside(&self.total, scores, &candidate)?;
+        let Beside { score, information } = Self::beside(self.total, scores, &candidate)?;
         let bounds: Vec<(f64, f64)> = candidate
             .parts
             .iter()
@@ -433,7 +433,7 @@ impl<'a> CandidateScorer<'a> {
         let lasts = || equal_time.iter().copied().zip(weights.kept()).map(|(e, k)| ratio((k, e)).min(1.0)).collect();
         let factors: Vec<f64> = energy.unwrap_or_else(lasts);
         let size = |w: &[DMatrix<f64>]| {
-            let own = Self::weighed(&self.total, w, &fit.scores.theta, candidate, candidate);
+            let own = Self::weighed(self.total, w, &fit.scores.theta, candidate, candidate);
             scored.value.dot(&(own * &scored.value))
         };
         let better: Vec<DMatrix<f64>> = fit.scores.weights.iter().zip(&factors).map(|(w, r)| w * *r).collect();
@@ -506,7 +506,7 @@ impl<'a> CandidateScorer<'a> {
 
     /// Cross-spectra of the residuals of a fit per band, over those of white noise of unit PSD: a measured Σ.
     pub fn residual_psd(&self, fit: &Fit) -> Vec<DMatrix<f64>> {
-        Self::residual(&self.total, &fit.layout, &fit.columns, &fit.estimate.theta)
+        Self::residual(self.total, &fit.layout, &fit.columns, &fit.estimate.theta)
     }
 
     fn residual(gram: &Gram, layout: &Layout, columns: &[usize], theta: &DVector<f64>) -> Vec<DMatrix<f64>> {

@@ -44,7 +44,7 @@ pub fn slow_forces(scorer: &CandidateScorer<'_>, fit: &Fit, declared: &[NoisePro
     }
     let plan = scorer.plan();
     let measured = scorer.residual_psd(fit);
-    let mut levels = scorer.levels(fit, &scorer.total, &measured);
+    let mut levels = scorer.levels(fit, scorer.total, &measured);
     levels.fit();
     let observations = scorer.total.weights.observations(plan);
     let bands: Vec<Band<'_>> = (0..plan.bands.len())

@@ -16,7 +16,8 @@ pub struct Settings {
     pub agreement_sigmas: f64,
     /// Derived: a false alarm in 1e3. All surveys together contradict the data.
     pub survey_sigmas: f64,
-    /// Derived: a false alarm in 1e4. The data leave a physical range.
+    /// Derived: a false alarm in 1e4. The data leave a physical range; a candidate that they want outside its range is
+    /// refused.
     pub range_sigmas: f64,
     /// Derived: a false alarm in 1e4 per coefficient. The scatter of blocks of time widens its σ.
     pub scatter_sigmas: f64,
@@ -33,7 +34,8 @@ pub struct Settings {
     /// Chosen. A direction is weak when its σ exceeds this part of the half range: the range then says as much as the
     /// data.
     pub weak_direction: f64,
-    /// Derived: five σ. A level of noise is adopted when `−2 log` of the likelihood falls by more.
+    /// Derived: five σ. A level of noise, or an unknown slow force, is adopted when `−2 log` of the likelihood falls by
+    /// more.
     pub level_delta_chi2: f64,
     /// Chosen. Where the power of a band exceeds what the levels explain by this ratio, Σ takes up the excess: less is
     /// left to be explained by candidates.
@@ -62,10 +64,6 @@ pub struct Settings {
     pub same_transient_s: f64,
     /// Chosen. Local maxima of the score over a grid of shapes from which the highest likelihood is searched for.
     pub likelihood_starts: usize,
-    /// Chosen. Correlation of two candidates, beside the model, above which they are reported as confounders.
-    pub confounded: f64,
-    /// Chosen. A candidate is degenerate with the model if the model leaves less than this part of its information.
-    pub degenerate: f64,
     /// Chosen. The taper's loss of a waveform's energy is corrected up to this factor: with less left, its amplitude
     /// rests on too few samples.
     pub max_taper_loss: f64,
@@ -75,18 +73,8 @@ pub struct Settings {
     pub max_evaluated: usize,
     /// Chosen. Candidates whose likelihood is computed where there is an excess: each costs two fits.
     pub max_excess_candidates: usize,
-    /// Chosen. p-value of the difference of the halves' values below which a candidate is refused: a lasting cause is
-    /// constant.
-    pub halves_p_value: f64,
     /// Chosen. Relative accuracy of the noise in a mission file: a level within it is not reported as missing.
     pub level_tolerance: f64,
-    /// Chosen. A candidate that moves the offset is doubtful if its fall of χ² is below this part of that of a level of
-    /// torque noise: the unknown part of such a torque leaves traces that candidates follow.
-    pub level_trace: f64,
-    /// Chosen. Bias of the offset, σ, from which a candidate counts as moving it.
-    pub moves_offset_sigmas: f64,
-    /// Derived: the 1 % point of χ² with one degree of freedom. Explanations that differ by less are not told apart.
-    pub equally_good_chi2: f64,
     /// Chosen. Measured over modelled power of a third of a decade above which it is reported as an excess.
     pub excess_ratio: f64,
     /// Derived: 3.4e-6 each, 1e-3 over nine channels and fourteen thirds of decades, plain and partial.
@@ -134,17 +122,11 @@ impl Default for Settings {
             transient_p_value: 0.5,
             same_transient_s: 3600.0,
             likelihood_starts: 3,
-            confounded: 0.95,
-            degenerate: 0.02,
             max_taper_loss: 4.0,
             max_added: 4,
             max_evaluated: 12,
             max_excess_candidates: 6,
-            halves_p_value: 1e-3,
             level_tolerance: 0.15,
-            level_trace: 0.02,
-            moves_offset_sigmas: 3.0,
-            equally_good_chi2: 6.63,
             excess_ratio: 1.25,
             excess_sigmas: 4.5,
             excess_remainder: 1e-3,

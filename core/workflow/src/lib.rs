@@ -17,7 +17,7 @@ use std::path::PathBuf;
 use dragfree_engine::EngineError;
 use dragfree_estimation::estimate::EstimateError;
 use dragfree_estimation::sigma::NoiseError;
-use dragfree_identification::record::RecordError;
+use dragfree_identification::record::Unlike;
 use dragfree_identification::scores::IdentificationError;
 use dragfree_schema::NoSuchCoefficient;
 
@@ -39,7 +39,7 @@ pub enum WorkflowError {
     Estimate(#[from] EstimateError),
     /// Products that do not belong together.
     #[error(transparent)]
-    Record(#[from] RecordError),
+    Unlike(#[from] Unlike),
     /// No comparison or diagnosis.
     #[error(transparent)]
     Identification(#[from] IdentificationError),

@@ -5,19 +5,12 @@ use crate::args::{Diagnose, Global};
 use crate::failure::Failure;
 use crate::text::Paint;
 use chrono::DateTime;
-use dragfree_engine::files::IoContext as _;
 use dragfree_identification::diagnosis::Found;
 use dragfree_workflow::diagnose::{Diagnosed, diagnose};
 use std::fmt::Write as _;
-use std::io::Write as _;
 
 pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let diagnosed = replay::with_meter(&command.products, &command.archive.folder, global, diagnose)?;
-    if let Some(path) = &command.save_sums {
-        let file = std::fs::File::create(path).at("write", path)?;
-        let mut file = std::io::BufWriter::with_capacity(1 << 20, file);
-        diagnosed.record.write(&mut file).and_then(|()| file.flush()).at("write", path)?;
-    }
     let code = if diagnosed.diagnosis.verdict == "sufficient" { 0 } else { INCONSISTENT };
     if global.json {
         let value = serde_json::to_value(&diagnosed.diagnosis)?;
