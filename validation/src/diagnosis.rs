@@ -18,7 +18,7 @@ use crate::diagnosis_report::summary;
 use crate::diagnosis_score::{Truth, by_names, by_reveal, name_of, undiagnosed};
 use crate::error::{CampaignError, file};
 use crate::program::{Chain, Hidden, Program, root, solution};
-use crate::records::{Acted, Answer, Diagnosed, Extended, Results, Solution};
+use crate::records::{Acted, Answer, Diagnosed, Extended, Results, Solution, rounded};
 
 /// Length of a set.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -252,7 +252,7 @@ impl Measurement<'_> {
         let chain = Chain { pipeline: science_mode(), mission: made.mission.clone(), model: Some(model) };
         let (said, failed) = match self.diagnosed(&chain, &made) {
             Ok(said) => (Some(said), None),
-            Err(error @ CampaignError::Failed { .. }) => (None, Some(error.to_string())),
+            Err(CampaignError::Failed { message, .. }) => (None, Some(message.trim().to_owned())),
             Err(error) => return Err(error),
         };
         let (answer, effects) = self.scored(&made, said.as_ref())?;
@@ -388,8 +388,8 @@ impl Measurement<'_> {
                 let offset = self.offsets(&products, &made.truth_m)?;
                 Ok(Extended { added, failed: None, offset })
             }
-            Err(error @ CampaignError::Failed { .. }) => {
-                Ok(Extended { added, failed: Some(error.to_string()), offset: Vec::new() })
+            Err(CampaignError::Failed { message, .. }) => {
+                Ok(Extended { added, failed: Some(message.trim().to_owned()), offset: Vec::new() })
             }
             Err(error) => Err(error),
         }
@@ -399,12 +399,14 @@ impl Measurement<'_> {
 /// What a foreign set was drawn with.
 fn told_of(draw: &Draw) -> Value {
     let foreign::Flight { loops, start, .. } = &draw.flight;
+    let [x, y, z] = [loops.x, loops.y, loops.z].map(rounded);
+    let gaps_s: Vec<[f64; 2]> = draw.gaps_s.iter().map(|(at, length)| [rounded(*at), rounded(*length)]).collect();
     json!({
-        "loops_rad_s": { "attitude": loops.attitude, "x": loops.x, "y": loops.y, "z": loops.z },
-        "noise_over_declared": draw.deviation,
-        "settle_s": start.settle_s,
+        "loops_rad_s": { "attitude": loops.attitude.map(rounded), "x": x, "y": y, "z": z },
+        "noise_over_declared": draw.deviation.map(rounded),
+        "settle_s": rounded(start.settle_s),
         "start_ns": draw.start_ns,
-        "gaps_s": draw.gaps_s,
+        "gaps_s": gaps_s,
     })
 }
 

@@ -146,9 +146,15 @@ fn is_found(acted: &Acted) -> bool {
     acted.named || is_in_small_set(acted)
 }
 
-/// Whether something is named or unexplained where nothing is hidden. A level of noise that really is off may be named.
-fn is_alarm(line: &Diagnosed) -> bool {
-    line.answer.as_ref().is_none_or(|a| a.verdict == "unexplained" || !a.false_causes.is_empty())
+/// Whether something is named or unexplained where nothing is hidden, if there is a diagnosis. A level of noise that
+/// really is off may be named.
+fn is_alarm(line: &Diagnosed) -> Option<bool> {
+    line.answer.as_ref().map(|a| a.verdict == "unexplained" || a.unexplained.is_object() || !a.false_causes.is_empty())
+}
+
+/// Whether every noise is as the mission file declares.
+fn is_declared(line: &Diagnosed) -> bool {
+    line.drawn["noise_over_declared"].as_array().is_none_or(|all| all.iter().all(|part| *part == 1.0))
 }
 
 fn names_false_cause(line: &Diagnosed) -> bool {
@@ -186,7 +192,9 @@ fn rows(free: &DMatrix<f64>) -> Vec<Row<'_>> {
         (
             "nothing hidden: something is named or unexplained",
             Bar::TwoOf120,
-            Box::new(|lines| Measured::share(lines.iter().filter(|l| l.effects.is_empty()).map(|l| is_alarm(l)))),
+            Box::new(|lines| {
+                Measured::share(lines.iter().filter(|l| l.effects.is_empty()).filter_map(|l| is_alarm(l)))
+            }),
         ),
         (
             "a false cause is named and no true one, all sets",
@@ -229,6 +237,14 @@ fn rows(free: &DMatrix<f64>) -> Vec<Row<'_>> {
             }),
         ),
         (
+            "nothing hidden, every noise as declared: named or unexplained",
+            Bar::Told,
+            Box::new(|lines| {
+                let clean = lines.iter().filter(|l| l.effects.is_empty() && is_declared(l));
+                Measured::share(clean.filter_map(|l| is_alarm(l)))
+            }),
+        ),
+        (
             "NEES/dof of the offset before the addition",
             Bar::Told,
             Box::new(|lines| nees(lines.iter().filter(|l| l.after.is_some()).flat_map(|l| &l.before), free)),
@@ -261,7 +277,11 @@ fn rows(free: &DMatrix<f64>) -> Vec<Row<'_>> {
                 Measured::share(lines.iter().filter_map(|l| l.after.as_ref()).map(|a| a.failed.is_some()))
             }),
         ),
-        ("the program failed", Bar::Told, Box::new(|lines| Measured::share(lines.iter().map(|l| l.failed.is_some())))),
+        (
+            "the program gave no diagnosis",
+            Bar::AtMost(0),
+            Box::new(|lines| Measured::share(lines.iter().map(|l| l.failed.is_some()))),
+        ),
     ]
 }
 
@@ -341,7 +361,7 @@ mod tests {
     use super::*;
     use crate::records::tests::solution;
     use crate::records::{Answer, Extended};
-    use serde_json::Value;
+    use serde_json::{Value, json};
 
     fn set(length: &str, producer: &str, verdict: &str, named: &[&str], effects: Vec<Acted>) -> Diagnosed {
         let named: Vec<String> = named.iter().map(|n| (*n).to_owned()).collect();
@@ -422,10 +442,14 @@ mod tests {
             set("2h", "own", "missing", &["a:x", "b:x"], vec![acted("a:x", 9.0, None, true)]),
             failed,
         ];
-        assert_eq!(measured(&lines, "nothing hidden"), Measured::Share(3, 4));
+        assert_eq!(measured(&lines, "nothing hidden"), Measured::Share(2, 3));
+        assert_eq!(measured(&lines, "nothing hidden, every noise"), Measured::Share(2, 3));
+        let mut off = lines[1].clone();
+        off.drawn = json!({ "noise_over_declared": [1.0, 1.2, 1.0, 1.0, 1.0] });
+        assert_eq!(measured(&[off], "nothing hidden, every noise"), Measured::Share(0, 0));
         assert_eq!(measured(&lines, "a false cause is named and no"), Measured::Share(1, 5));
         assert_eq!(measured(&lines, "a false cause is named beside"), Measured::Share(1, 1));
-        assert_eq!(measured(&lines, "the program failed"), Measured::Share(1, 5));
+        assert_eq!(measured(&lines, "the program gave no"), Measured::Share(1, 5));
     }
 
     #[test]
