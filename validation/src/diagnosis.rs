@@ -252,7 +252,7 @@ impl Measurement<'_> {
         let chain = Chain { pipeline: science_mode(), mission: made.mission.clone(), model: Some(model) };
         let (said, failed) = match self.diagnosed(&chain, &made) {
             Ok(said) => (Some(said), None),
-            Err(CampaignError::Failed { message, .. }) => (None, Some(message.trim().to_owned())),
+            Err(CampaignError::Failed { message, .. }) => (None, Some(shortened(&message))),
             Err(error) => return Err(error),
         };
         let (answer, effects) = self.scored(&made, said.as_ref())?;
@@ -389,11 +389,16 @@ impl Measurement<'_> {
                 Ok(Extended { added, failed: None, offset })
             }
             Err(CampaignError::Failed { message, .. }) => {
-                Ok(Extended { added, failed: Some(message.trim().to_owned()), offset: Vec::new() })
+                Ok(Extended { added, failed: Some(shortened(&message)), offset: Vec::new() })
             }
             Err(error) => Err(error),
         }
     }
+}
+
+/// The beginning of a message, for a result line.
+fn shortened(message: &str) -> String {
+    message.trim().chars().take(300).collect()
 }
 
 /// What a foreign set was drawn with.
@@ -404,7 +409,11 @@ fn told_of(draw: &Draw) -> Value {
     json!({
         "loops_rad_s": { "attitude": loops.attitude.map(rounded), "x": x, "y": y, "z": z },
         "noise_over_declared": draw.deviation.map(rounded),
-        "settle_s": rounded(start.settle_s),
+        "errors_at_start": {
+            "before_s": rounded(start.before_s),
+            "displacement_m": start.displacement_m.map(|r| r.map(rounded)),
+            "attitude_rad": start.attitude_rad.map(rounded),
+        },
         "start_ns": draw.start_ns,
         "gaps_s": gaps_s,
     })

@@ -128,9 +128,16 @@ impl Bar {
     }
 }
 
-/// Significance with the σ of the diagnosis; as drawn where it states none.
-fn significance(acted: &Acted) -> f64 {
-    acted.significance_at_hand.unwrap_or(acted.drawn_significance)
+/// Significance with the σ of the diagnosis; as drawn where it states none. The σ of an effect that is not named is that
+/// beside everything that is: something false in its place would widen it, and hide that it was missed. The larger
+/// significance counts then.
+fn significance(line: &Diagnosed, acted: &Acted) -> f64 {
+    let beside_others = !acted.named && line.answer.as_ref().is_some_and(|a| !a.named.is_empty());
+    match acted.significance_at_hand {
+        Some(at_hand) if beside_others => at_hand.max(acted.drawn_significance),
+        Some(at_hand) => at_hand,
+        None => acted.drawn_significance,
+    }
 }
 
 /// Whether it is first, or in a small set of confounders.
@@ -184,8 +191,8 @@ type Row<'a> = (&'static str, Bar, Box<dyn Fn(&[&Diagnosed]) -> Measured + 'a>);
 fn rows(free: &DMatrix<f64>) -> Vec<Row<'_>> {
     let singles = |floor: f64| {
         move |lines: &[&Diagnosed]| {
-            let above = lines.iter().filter_map(|l| single(l, true)).filter(|e| significance(e) > floor);
-            Measured::share(above.map(is_first))
+            let known = lines.iter().filter_map(|l| Some((l, single(l, true)?)));
+            Measured::share(known.filter(|(l, e)| significance(l, e) > floor).map(|(_, e)| is_first(e)))
         }
     };
     vec![
@@ -211,7 +218,7 @@ fn rows(free: &DMatrix<f64>) -> Vec<Row<'_>> {
             Bar::AtLeast(95),
             Box::new(|lines| {
                 let pairs = lines.iter().filter(|l| l.effects.len() == 2);
-                let loud = pairs.filter(|l| l.effects.iter().all(|e| significance(e) > 6.0));
+                let loud = pairs.filter(|l| l.effects.iter().all(|e| significance(l, e) > 6.0));
                 Measured::share(loud.map(|l| l.effects.iter().all(is_found)))
             }),
         ),
@@ -335,7 +342,7 @@ fn kinds(lines: &[&Diagnosed]) -> String {
         let [one] = line.effects.as_slice() else { continue };
         let kind = one.name.split(':').next().unwrap_or("?");
         let row = found.entry((kind, line.producer.as_str())).or_default();
-        let cell = &mut row[usize::from(significance(one) < 8.0)];
+        let cell = &mut row[usize::from(significance(line, one) < 8.0)];
         let unexplained = line.answer.as_ref().is_some_and(|a| a.verdict == "unexplained");
         cell.0 += usize::from(if one.known { is_first(one) } else { unexplained });
         cell.1 += 1;
@@ -417,6 +424,9 @@ mod tests {
         ];
         assert_eq!(measured(&lines, "one effect above 6σ"), Measured::Share(1, 2));
         assert_eq!(measured(&lines, "a σ at hand"), Measured::Share(2, 3));
+        // Beside something false its own σ is no measure.
+        let replaced = set("6h", "own", "missing", &["b:x"], vec![acted("a:x", 9.0, Some(2.0), false)]);
+        assert_eq!(measured(&[replaced], "one effect above 6σ"), Measured::Share(0, 1));
         assert_eq!(measured(&lines, "sizes"), Measured::Share(1, 1));
     }
 

@@ -90,11 +90,16 @@ pub(crate) fn by_reveal(score: &Value, diagnosis: &Value) -> (Answer, Vec<Acted>
 
 /// Scores a set by the names of what was hidden; nothing hidden is an empty list.
 pub(crate) fn by_names(truth: &Truth<'_>, diagnosis: &Value) -> (Answer, Vec<Acted>) {
-    let effects: Vec<Acted> = truth.acted.iter().map(|acted| scored(acted, truth.start_ns, diagnosis)).collect();
+    let mut effects: Vec<Acted> = truth.acted.iter().map(|acted| scored(acted, truth.start_ns, diagnosis)).collect();
     let is_true = |c: &Value| {
         let name = name_of(c);
         truth.levels.contains(&name) || truth.acted.iter().any(|acted| matches(c, acted, truth.start_ns))
     };
+    // Levels that are off, and another truth, may come before it.
+    let first_true = accepted(diagnosis).take_while(|c| is_true(c)).map(name_of).collect::<Vec<_>>();
+    for effect in &mut effects {
+        effect.first = effect.named && first_true.contains(&effect.name);
+    }
     let is_confounder = |c: &Value| effects.iter().any(|e| !e.named && e.confounder_of.contains(&name_of(c)));
     let false_causes = accepted(diagnosis).filter(|c| !is_true(c) && !is_confounder(c)).map(name_of).collect();
     (answer(diagnosis, false_causes), effects)
@@ -220,11 +225,15 @@ mod tests {
     }
 
     #[test]
-    fn a_level_that_is_off_may_be_named() {
+    fn a_level_that_is_off_may_be_named_and_come_first() {
         let found = [candidate("mps-noise:sc.x", true, 1.25, &[])];
         let d = diagnosis("missing", &found);
         assert_eq!(by(&[], &[], &d).0.false_causes, ["mps-noise:sc.x"]);
         assert!(by(&[], &["mps-noise:sc.x"], &d).0.false_causes.is_empty());
+        let both = [found[0].clone(), candidate("mps-gain:sc.y", true, 0.11, &[])];
+        let d = diagnosis("missing", &both);
+        assert!(by(&[hidden("mps-gain", "sc.y", 0.1)], &["mps-noise:sc.x"], &d).1[0].first);
+        assert!(!by(&[hidden("mps-gain", "sc.y", 0.1)], &[], &d).1[0].first);
     }
 
     #[test]

@@ -240,7 +240,7 @@ pub(crate) struct Acted {
     pub(crate) significance_at_hand: Option<f64>,
     /// Whether it is accepted.
     pub(crate) named: bool,
-    /// Whether it is the first candidate and accepted.
+    /// Whether it is accepted, and nothing false before it.
     pub(crate) first: bool,
     /// Accepted candidates that list it as a confounder.
     pub(crate) confounder_of: Vec<String>,

@@ -167,8 +167,8 @@ const ROWS: [Row; 45] = [
     row(Cause::ThrustGain, "mps-gain", "1", Place::Sc(X), 8e-3, 0.27),
     row(Cause::ThrustGain, "mps-gain", "1", Place::Sc(Y), 6e-3, 0.27),
     row(Cause::ThrustGain, "mps-gain", "1", Place::Sc(Z), 1e-2, 0.27),
-    row(Cause::ThrustTilt, "mps-tilt", "rad", Place::Sc(X), 4e-3, 0.09),
-    row(Cause::ThrustTilt, "mps-tilt", "rad", Place::Sc(Y), 4e-3, 0.09),
+    row(Cause::ThrustTilt, "mps-tilt", "rad", Place::Sc(X), 4e-4, 0.09),
+    row(Cause::ThrustTilt, "mps-tilt", "rad", Place::Sc(Y), 4e-4, 0.09),
     row(Cause::ThrustTilt, "mps-tilt", "rad", Place::Sc(Z), 6e-3, 0.09),
     row(Cause::TorqueGain, "torque-gain", "1", Place::Sc(X), 1e-2, 0.13),
     row(Cause::TorqueGain, "torque-gain", "1", Place::Sc(Y), 1e-2, 0.13),
@@ -289,14 +289,14 @@ fn loops(dice: &mut Dice) -> Loops {
     }
 }
 
-/// Settled in half of the flights; otherwise the recording begins within a minute of a start with errors.
+/// Settled in half of the flights; otherwise a mode begins with errors within a minute before the first sample.
 fn start(dice: &mut Dice) -> Start {
     if dice.uniform() < 0.5 {
         return Start::SETTLED;
     }
     let [displacement_m, attitude_rad] = [0; 2].map(|_| dice.log_uniform(1e-9, 1e-7));
     Start {
-        settle_s: dice.between(0.0, 60.0),
+        before_s: dice.between(0.0, 60.0),
         displacement_m: [[0.0; 3]; 2].map(|r: [f64; 3]| r.map(|_| displacement_m * dice.between(-1.0, 1.0))),
         attitude_rad: [0.0; 3].map(|_: f64| attitude_rad * dice.between(-1.0, 1.0)),
     }

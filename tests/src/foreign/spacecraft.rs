@@ -3,6 +3,8 @@
 /// Samples per second.
 const RATE_HZ: f64 = 10.0;
 const DT_S: f64 = 1.0 / RATE_HZ;
+/// Settling time before the first recorded sample.
+const SETTLE_S: f64 = 3_000.0;
 
 /// A simulation: noise levels (one-sided amplitude densities), offsets, controllers.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -29,17 +31,17 @@ pub struct Flight {
     pub sunlight_n: f64,
     /// Bandwidths.
     pub loops: Loops,
-    /// State in which the controllers take over.
+    /// Errors at the start of the recording.
     pub start: Start,
     /// Hidden effects.
     pub hidden: Hidden,
 }
 
-/// State in which the controllers take over, and how long before the first recorded sample.
+/// Errors with which a mode of the controllers begins, after fifty minutes in which the loops have settled.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Start {
-    /// Time before the first recorded sample, s.
-    pub settle_s: f64,
+    /// Time of the errors before the first recorded sample, s.
+    pub before_s: f64,
     /// Displacements of the test masses, ORF, m.
     pub displacement_m: [[f64; 3]; 2],
     /// Attitude error, rad.
@@ -47,8 +49,8 @@ pub struct Start {
 }
 
 impl Start {
-    /// At rest, fifty minutes before the first sample.
-    pub const SETTLED: Self = Self { settle_s: 3_000.0, displacement_m: [[0.0; 3]; 2], attitude_rad: [0.0; 3] };
+    /// No errors.
+    pub const SETTLED: Self = Self { before_s: 0.0, displacement_m: [[0.0; 3]; 2], attitude_rad: [0.0; 3] };
 }
 
 /// Differences from the mission file. Axes are those of SRF for thrust and torque, of ORF for the test masses.
@@ -362,14 +364,14 @@ impl Spacecraft {
     /// A flight from its start, before the first recorded sample.
     #[must_use]
     pub fn new(flight: &Flight) -> Self {
-        let [settle, keep] = [flight.start.settle_s, flight.seconds].map(|s| (s * RATE_HZ) as usize);
+        let [settle, keep] = [SETTLE_S, flight.seconds].map(|s| (s * RATE_HZ) as usize);
         let stream = |i: u64| Dice::new(flight.seed + i * 1_000_000);
         Self {
             flight: *flight,
             offset_m: [flight.offset_orf_m(0), flight.offset_orf_m(1)],
-            angle_rad: flight.start.attitude_rad,
+            angle_rad: [0.0; 3],
             rate_rad_s: [0.0; 3],
-            r_m: flight.start.displacement_m,
+            r_m: [[0.0; 3]; 2],
             v_m_s: [[0.0; 3]; 2],
             loops: [Loop::default(); 9],
             dice: stream(0),
@@ -385,6 +387,19 @@ impl Spacecraft {
             k: 0,
             settle,
             end: settle + keep,
+        }
+    }
+
+    /// Adds the errors of the start when their time has come.
+    fn begin(&mut self) {
+        let Start { before_s, displacement_m, attitude_rad } = self.flight.start;
+        if self.k == self.settle - (before_s * RATE_HZ) as usize {
+            for (r, error) in self.r_m.iter_mut().flatten().zip(displacement_m.iter().flatten()) {
+                *r += error;
+            }
+            for (angle, error) in self.angle_rad.iter_mut().zip(attitude_rad) {
+                *angle += error;
+            }
         }
     }
 
@@ -524,6 +539,7 @@ impl Iterator for Spacecraft {
 
     fn next(&mut self) -> Option<Record> {
         while self.k < self.end {
+            self.begin();
             let mut record = self.read();
             self.keep_house(&mut record);
             control(&mut self.loops, &self.flight.loops, &mut record);
