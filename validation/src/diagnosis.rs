@@ -1,9 +1,9 @@
 //! The diagnosis campaign: sets of 2 h to 3 × 24 h by two producers, diagnosed as a user would and scored.
 //!
 //! Each seed determines length, producer, kind and size of what is hidden. Sets of the bundled simulator go through
-//! `simulate --hidden`, `run`, `diagnose` and `reveal`, with the sealed truth moved away in between; sets of the foreign
-//! producer are scored by names. If everything that was named is true, it is added to the model and the same telemetry
-//! is calibrated again.
+//! `simulate --hidden`, `run`, `diagnose` and `reveal`, with the sealed truth moved away in between; sets of the
+//! foreign producer are scored by names. If everything that was named is true, it is added to the model and the same
+//! telemetry is calibrated again.
 
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};

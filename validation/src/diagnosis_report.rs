@@ -128,8 +128,8 @@ impl Bar {
     }
 }
 
-/// Significance with the σ of the diagnosis; as drawn where it states none. The σ of an effect that is not named is that
-/// beside everything that is: something false in its place would widen it, and hide that it was missed. The larger
+/// Significance with the σ of the diagnosis; as drawn where it states none. The σ of an effect that is not named is
+/// that beside everything that is: something false in its place would widen it, and hide that it was missed. The larger
 /// significance counts then.
 fn significance(line: &Diagnosed, acted: &Acted) -> f64 {
     let beside_others = !acted.named && line.answer.as_ref().is_some_and(|a| !a.named.is_empty());

@@ -77,8 +77,8 @@ pub struct Draw {
     pub flight: Flight,
     /// Noise that the mission file declares.
     pub declared: Levels,
-    /// Flown over declared level of thrust, torque, interferometer, capacitive readout and long arm; hidden louder noise
-    /// comes on top.
+    /// Flown over declared level of thrust, torque, interferometer, capacitive readout and long arm; hidden louder
+    /// noise comes on top.
     pub deviation: [f64; 5],
     /// Time of the first sample, ns since 1970.
     pub start_ns: u64,
@@ -140,8 +140,8 @@ enum Place {
     Pair(usize, usize),
 }
 
-/// An effect with the σ of its size after six hours with [`REFERENCE`] bandwidths, and the largest size that the bundled
-/// effect takes as physical.
+/// An effect with the σ of its size after six hours with [`REFERENCE`] bandwidths, and the largest size that the
+/// bundled effect takes as physical.
 struct Row {
     cause: Cause,
     effect: &'static str,
@@ -161,8 +161,8 @@ const Y: usize = 1;
 const Z: usize = 2;
 
 // The table is approximate: σ are of a few diagnoses of this producer's telemetry, or of the bundled simulator where
-// there was none, rounded. They fall with the root of the time, those of an impulse not at all, and those of a gain with
-// the root of the bandwidth. A report must therefore use the σ of the diagnosis itself.
+// there was none, rounded. They fall with the root of the time, those of an impulse not at all, and those of a gain
+// with the root of the bandwidth. A report must therefore use the σ of the diagnosis itself.
 const ROWS: [Row; 45] = [
     row(Cause::ThrustGain, "mps-gain", "1", Place::Sc(X), 8e-3, 0.27),
     row(Cause::ThrustGain, "mps-gain", "1", Place::Sc(Y), 6e-3, 0.27),

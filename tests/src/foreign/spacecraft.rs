@@ -64,7 +64,8 @@ pub struct Hidden {
     pub torque_gain: [f64; 3],
     /// Errors of the electrodes: `[i][to][from]` of the force commanded along `from` acts along `to` too.
     pub electrodes: [Matrix; 2],
-    /// Errors of the capacitive readout: `[i][shown][acted]` of the displacement along `acted` is seen along `shown` too.
+    /// Errors of the capacitive readout: `[i][shown][acted]` of the displacement along `acted` is seen along `shown`
+    /// too.
     pub shown: [Matrix; 2],
     /// Force by the temperatures.
     pub heat: Option<Heat>,
