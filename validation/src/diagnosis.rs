@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use clap::ValueEnum;
-use dragfree_tests::foreign::{self, Draw};
+use dragfree_tests::foreign::Draw;
 use serde_json::{Value, json};
 
 use crate::campaign::{Meter, note, science_mode, taiji, work};
@@ -403,11 +403,12 @@ fn shortened(message: &str) -> String {
 
 /// What a foreign set was drawn with.
 fn told_of(draw: &Draw) -> Value {
-    let foreign::Flight { loops, start, .. } = &draw.flight;
+    let (loops, variation, start) = (&draw.flight.loops, &draw.variation, &draw.variation.start);
+    let attitude = variation.attitude.map(|factor| rounded(factor * loops.attitude));
     let [x, y, z] = [loops.x, loops.y, loops.z].map(rounded);
     let gaps_s: Vec<[f64; 2]> = draw.gaps_s.iter().map(|(at, length)| [rounded(*at), rounded(*length)]).collect();
     json!({
-        "loops_rad_s": { "attitude": loops.attitude.map(rounded), "x": x, "y": y, "z": z },
+        "loops_rad_s": { "attitude": attitude, "x": x, "y": y, "z": z },
         "noise_over_declared": draw.deviation.map(rounded),
         "errors_at_start": {
             "before_s": rounded(start.before_s),
@@ -478,7 +479,7 @@ mod tests {
             let levels = draw.true_levels(TRUE_LEVEL);
             assert!(louder.into_iter().all(|a| (a.size - 1.0).abs() < TRUE_LEVEL || levels.contains(&a.name())));
         }
-        for kind in foreign::KINDS.into_iter().flatten() {
+        for kind in dragfree_tests::foreign::KINDS.into_iter().flatten() {
             assert!(kinds.contains_key(kind), "{kind} is never drawn: {kinds:?}");
         }
         assert!((60..=140).contains(&nothing) && (100..=200).contains(&pairs), "{nothing} {pairs}");

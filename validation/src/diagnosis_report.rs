@@ -8,8 +8,10 @@ use nalgebra::{DMatrix, DVector};
 use crate::records::{Acted, Diagnosed, Solution};
 use crate::stats;
 
-/// Parts of the campaign: title, and whether a set belongs to it.
-const PARTS: [(&str, fn(&Diagnosed) -> bool); 8] = [
+/// A part of the campaign: title, and whether a set belongs to it.
+type Part = (&'static str, fn(&Diagnosed) -> bool);
+
+const PARTS: [Part; 8] = [
     ("all", |_| true),
     ("2 h", |l| l.length == "2h"),
     ("6 h", |l| l.length == "6h"),

@@ -7,7 +7,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use super::file::{Container, PERIOD_NS, Recorder};
-use super::spacecraft::{Blow, Dice, Flight, Heat, Hidden, Line, Loops, Spacecraft, Start};
+use super::spacecraft::{Blow, Dice, Flight, Heat, Hidden, Line, Loops, Spacecraft, Start, Variation};
 
 /// Levels of white noise, one-sided amplitude densities.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -75,6 +75,8 @@ impl Acted {
 pub struct Draw {
     /// The flight.
     pub flight: Flight,
+    /// What it has beyond its numbers.
+    pub variation: Variation,
     /// Noise that the mission file declares.
     pub declared: Levels,
     /// Flown over declared level of thrust, torque, interferometer, capacitive readout and long arm; hidden louder
@@ -100,7 +102,7 @@ const LOUDER: (f64, f64) = (0.4, 1.5);
 /// Largest deviation of the noise from the mission file.
 const DEVIATION: f64 = 0.3;
 /// Bandwidths about which those of a flight are drawn, rad/s, and the largest factor from them.
-const REFERENCE: Loops = Loops { attitude: [0.4; 3], x: 0.45, y: 0.2, z: 0.25 };
+const REFERENCE: Loops = Loops { attitude: 0.4, x: 0.45, y: 0.2, z: 0.25 };
 const BANDWIDTH_FACTOR: f64 = 1.75;
 /// 2035-01-01T00:00:00Z, s since 1970.
 const EPOCH_S: u64 = 2_051_222_400;
@@ -236,17 +238,17 @@ impl Row {
     }
 
     /// Approximate σ after `hours` with these bandwidths.
-    fn sigma(&self, hours: f64, loops: &Loops) -> f64 {
+    fn sigma(&self, hours: f64, loops: &Loops, attitude: [f64; 3]) -> f64 {
         let axis_of_thrusters = |axis: usize, l: &Loops| if axis == Z { l.z } else { l.x };
         let axis_of_electrodes = |axis: usize, l: &Loops| if axis == Z { l.z } else { l.y };
-        let bandwidth = |l: &Loops| match (self.cause, self.place) {
+        let bandwidth = |l: &Loops, attitude: [f64; 3]| match (self.cause, self.place) {
             (Cause::ThrustGain | Cause::ThrustTilt, Place::Sc(axis)) => axis_of_thrusters(axis, l),
-            (Cause::TorqueGain, Place::Sc(axis)) => l.attitude[axis],
+            (Cause::TorqueGain, Place::Sc(axis)) => l.attitude * attitude[axis],
             (Cause::Electrodes | Cause::Readout, Place::Tm(axis) | Place::Pair(axis, _)) => axis_of_electrodes(axis, l),
             _ => 1.0,
         };
         let time = if matches!(self.cause, Cause::Hit | Cause::Glitch) { 1.0 } else { (6.0 / hours).sqrt() };
-        self.sigma_6h * time * (bandwidth(&REFERENCE) / bandwidth(loops)).sqrt()
+        self.sigma_6h * time * (bandwidth(&REFERENCE, [1.0; 3]) / bandwidth(loops, attitude)).sqrt()
     }
 }
 
@@ -281,12 +283,7 @@ fn stream(seed: u64, which: u64) -> Dice {
 
 fn loops(dice: &mut Dice) -> Loops {
     let mut about = |w: f64| dice.log_uniform(w / BANDWIDTH_FACTOR, w * BANDWIDTH_FACTOR);
-    Loops {
-        attitude: REFERENCE.attitude.map(&mut about),
-        x: about(REFERENCE.x),
-        y: about(REFERENCE.y),
-        z: about(REFERENCE.z),
-    }
+    Loops { attitude: REFERENCE.attitude, x: about(REFERENCE.x), y: about(REFERENCE.y), z: about(REFERENCE.z) }
 }
 
 /// Settled in half of the flights; otherwise a mode begins with errors within a minute before the first sample.
@@ -355,7 +352,9 @@ impl Draw {
     #[must_use]
     pub fn new(seed: u64, hours: f64, clean: bool) -> Self {
         let seconds = 3600.0 * hours;
-        let loops = loops(&mut stream(seed, 1));
+        let mut bandwidths = stream(seed, 1);
+        let loops = loops(&mut bandwidths);
+        let attitude = [0.0; 3].map(|_: f64| bandwidths.log_uniform(BANDWIDTH_FACTOR.recip(), BANDWIDTH_FACTOR));
         let mut noise = stream(seed, 2);
         let base = Levels { thrust_n: 0.8e-7, torque_nm: 1.2e-7, ifo_m: 3e-12, is_m: 2.4e-9, dws_rad: 3e-10 };
         let declared = base.scaled([0.0; 5].map(|_: f64| noise.log_uniform(0.7, 1.4)));
@@ -376,13 +375,12 @@ impl Draw {
             ifo_m: flown.ifo_m,
             is_m: flown.is_m,
             dws_rad: flown.dws_rad,
-            stray_m_s2: 3e-15,
             sunlight_n,
             loops,
-            start,
             hidden: Hidden::NONE,
         };
-        let mut draw = Self { flight, declared, deviation, start_ns, gaps_s, acted: Vec::new() };
+        let variation = Variation { attitude, stray_m_s2: 3e-15, start };
+        let mut draw = Self { flight, variation, declared, deviation, start_ns, gaps_s, acted: Vec::new() };
         let mut dice = stream(seed, 5);
         let luck = dice.uniform();
         if !clean && luck >= NOTHING {
@@ -401,7 +399,8 @@ impl Draw {
         let hours = self.flight.seconds / 3600.0;
         let is_possible = |row: &&Row| {
             let noise = row.effect.ends_with("-noise");
-            wanted(row) && (noise || SIGNIFICANCE.0 * row.sigma(hours, &self.flight.loops) < row.most)
+            wanted(row)
+                && (noise || SIGNIFICANCE.0 * row.sigma(hours, &self.flight.loops, self.variation.attitude) < row.most)
         };
         let rows: Vec<&Row> = ROWS.iter().filter(is_possible).collect();
         let mut effects: Vec<&str> = rows.iter().map(|row| row.effect).collect();
@@ -409,7 +408,7 @@ impl Draw {
         let effect = effects[dice.below(effects.len())];
         let rows: Vec<&Row> = rows.into_iter().filter(|row| row.effect == effect).collect();
         let row = rows[dice.below(rows.len())];
-        let sigma = row.sigma(hours, &self.flight.loops);
+        let sigma = row.sigma(hours, &self.flight.loops, self.variation.attitude);
         let most = SIGNIFICANCE.1.min(row.most / sigma);
         let size = sigma * dice.log_uniform(SIGNIFICANCE.0, most) * dice.sign();
         let test_mass = if matches!(row.place, Place::Tm1(_)) { 0 } else { dice.below(2) };
@@ -504,17 +503,16 @@ impl Draw {
     /// A file cannot be written.
     pub fn record(&self, folder: &Path) -> io::Result<Vec<PathBuf>> {
         const PER_DAY: usize = 864_000;
-        let container =
-            Container { chunks: true, zstd: true, summary: true, command: true, ephemeris: true, power: true };
+        let container = Container { chunks: true, zstd: true, summary: true, command: true, ephemeris: true };
         let lost = |t: f64| self.gaps_s.iter().any(|(at, length)| (*at..at + length).contains(&t));
         let (mut files, mut open) = (Vec::new(), None);
-        for (k, r) in Spacecraft::new(&self.flight).enumerate() {
-            if k % PER_DAY == 0 {
+        for (k, r) in Spacecraft::new(&self.flight, &self.variation).enumerate() {
+            if k.is_multiple_of(PER_DAY) {
                 if let Some(day) = open.take() {
                     Recorder::finish(day)?;
                 }
                 let path = folder.join(format!("foreign-{}.mcap", k / PER_DAY + 1));
-                open = Some(Recorder::create(&path, container)?);
+                open = Some(Recorder::create(&path, container, true)?);
                 files.push(path);
             }
             if let Some(day) = open.as_mut().filter(|_| !lost(k as f64 * 0.1)) {
@@ -542,7 +540,7 @@ impl Draw {
             ("noise.dws_local", "asd_rad_rthz", 1e-9),
             ("noise.dws_long_arm", "asd_rad_rthz", levels.dws_rad),
             ("noise.electrostatic_force", "asd_n_rthz", 2e-14),
-            ("noise.test_mass_acceleration", "asd_m_s2_rthz", self.flight.stray_m_s2),
+            ("noise.test_mass_acceleration", "asd_m_s2_rthz", self.variation.stray_m_s2),
             ("solar_pressure", "force_n", self.flight.sunlight_n),
         ] {
             text = with_value(&text, table, key, value)?;

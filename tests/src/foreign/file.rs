@@ -20,8 +20,6 @@ pub struct Container {
     pub command: bool,
     /// Whether the topic `/ephemeris` exists.
     pub ephemeris: bool,
-    /// Whether current and panel temperature of the power system are telemetered.
-    pub power: bool,
 }
 
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
@@ -138,6 +136,8 @@ pub struct Recorder {
     written: u64,
     out: Vec<u8>,
     container: Container,
+    /// Whether current and panel temperature of the power system are telemetered.
+    power: bool,
     /// Messages of the open chunk, with times and positions per channel.
     open: Vec<u8>,
     index: [Vec<(u64, u64)>; TOPICS.len()],
@@ -149,16 +149,18 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// A new file with its definitions.
+    /// A new file with its definitions; `power` tells whether current and panel temperature of the power system are
+    /// telemetered.
     ///
     /// # Errors
     /// The file cannot be written.
-    pub fn create(path: &Path, container: Container) -> io::Result<Self> {
+    pub fn create(path: &Path, container: Container, power: bool) -> io::Result<Self> {
         let mut recorder = Self {
             file: File::create(path)?,
             written: 0,
             out: MAGIC.to_vec(),
             container,
+            power,
             open: Vec::new(),
             index: Default::default(),
             messages: 0,
@@ -181,7 +183,7 @@ impl Recorder {
     }
 
     fn topics(&self) -> usize {
-        if self.container.power { TOPICS.len() } else { WITHOUT_POWER }
+        if self.power { TOPICS.len() } else { WITHOUT_POWER }
     }
 
     /// Appends the `k`-th sample of a flight, at `time_ns`; `k` decides which slower messages come with it.
@@ -195,22 +197,22 @@ impl Recorder {
         if self.container.command {
             self.message(3, time_ns, &wire::command(r))?;
         }
-        if self.container.ephemeris && k % 600 == 0 {
+        if self.container.ephemeris && k.is_multiple_of(600) {
             self.message(4, time_ns, &wire::ephemeris())?;
         }
-        if k % 20 == 0 {
+        if k.is_multiple_of(20) {
             self.message(5, time_ns, &wire::scalar(1.21e9 + (k as f64 / 100.0).sin()))?;
         }
-        if self.container.power && k % 10 == 0 {
+        if self.power && k.is_multiple_of(10) {
             self.message(11, time_ns, &wire::scalar(r.bus_a))?;
         }
-        if k % 100 == 0 {
+        if k.is_multiple_of(100) {
             self.message(6, time_ns, &wire::scalar(2e7 - k as f64))?;
             self.message(7, time_ns, br#"{"says": "all is well"}"#)?;
             for (i, t) in r.temperature_k.into_iter().enumerate() {
                 self.message(8 + i, time_ns, &wire::scalar(t))?;
             }
-            if self.container.power {
+            if self.power {
                 self.message(12, time_ns, &wire::scalar(r.panel_k))?;
             }
         }
@@ -363,7 +365,7 @@ impl Recorder {
 /// # Panics
 /// The file cannot be written.
 pub fn write(path: &Path, records: &[Record], start_ns: u64, container: Container) {
-    let mut recorder = Recorder::create(path, container).expect("the folder is writable");
+    let mut recorder = Recorder::create(path, container, false).expect("the folder is writable");
     for (k, r) in records.iter().enumerate() {
         recorder.sample(k, start_ns + k as u64 * PERIOD_NS, r).expect("the file is writable");
     }

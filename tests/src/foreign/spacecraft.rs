@@ -25,16 +25,28 @@ pub struct Flight {
     pub is_m: f64,
     /// Long-arm wavefront sensing, rad/√Hz.
     pub dws_rad: f64,
-    /// Stray acceleration of each test mass along each axis, m s⁻²/√Hz.
-    pub stray_m_s2: f64,
     /// Force of the sunlight along x of SRF, N, with an arm of (0.1, 0, 0.6) m.
     pub sunlight_n: f64,
     /// Bandwidths.
     pub loops: Loops,
-    /// Errors at the start of the recording.
-    pub start: Start,
     /// Hidden effects.
     pub hidden: Hidden,
+}
+
+/// What a flight may have beyond its numbers.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Variation {
+    /// Factor of the attitude's bandwidth about each axis.
+    pub attitude: [f64; 3],
+    /// Stray acceleration of each test mass along each axis, m s⁻²/√Hz.
+    pub stray_m_s2: f64,
+    /// Errors at the start of the recording.
+    pub start: Start,
+}
+
+impl Variation {
+    /// Nothing.
+    pub const NONE: Self = Self { attitude: [1.0; 3], stray_m_s2: 0.0, start: Start::SETTLED };
 }
 
 /// Errors with which a mode of the controllers begins, after fifty minutes in which the loops have settled.
@@ -108,6 +120,12 @@ impl Hidden {
     };
 }
 
+impl Default for Hidden {
+    fn default() -> Self {
+        Self::NONE
+    }
+}
+
 /// A force on a test mass by the difference of the temperatures left and right of its housing.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Heat {
@@ -167,8 +185,8 @@ const HEAT_K: f64 = 0.03;
 /// Bandwidths of the loops, rad/s.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Loops {
-    /// Attitude, about each axis.
-    pub attitude: [f64; 3],
+    /// Attitude.
+    pub attitude: f64,
     /// Along the sensitive axes, by the thrusters.
     pub x: f64,
     /// Along y, by the electrodes.
@@ -330,13 +348,14 @@ impl Flight {
 /// Runs the simulation and returns one record per sample.
 #[must_use]
 pub fn fly(flight: &Flight) -> Vec<Record> {
-    Spacecraft::new(flight).collect()
+    Spacecraft::new(flight, &Variation::NONE).collect()
 }
 
 /// The simulation as an iterator over its recorded samples; days of data need no memory.
 #[derive(Clone, Debug)]
 pub struct Spacecraft {
     flight: Flight,
+    variation: Variation,
     offset_m: [[f64; 3]; 2],
     angle_rad: [f64; 3],
     rate_rad_s: [f64; 3],
@@ -364,11 +383,12 @@ pub struct Spacecraft {
 impl Spacecraft {
     /// A flight from its start, before the first recorded sample.
     #[must_use]
-    pub fn new(flight: &Flight) -> Self {
+    pub fn new(flight: &Flight, variation: &Variation) -> Self {
         let [settle, keep] = [SETTLE_S, flight.seconds].map(|s| (s * RATE_HZ) as usize);
         let stream = |i: u64| Dice::new(flight.seed + i * 1_000_000);
         Self {
             flight: *flight,
+            variation: *variation,
             offset_m: [flight.offset_orf_m(0), flight.offset_orf_m(1)],
             angle_rad: [0.0; 3],
             rate_rad_s: [0.0; 3],
@@ -393,7 +413,7 @@ impl Spacecraft {
 
     /// Adds the errors of the start when their time has come.
     fn begin(&mut self) {
-        let Start { before_s, displacement_m, attitude_rad } = self.flight.start;
+        let Start { before_s, displacement_m, attitude_rad } = self.variation.start;
         if self.k == self.settle - (before_s * RATE_HZ) as usize {
             for (r, error) in self.r_m.iter_mut().flatten().zip(displacement_m.iter().flatten()) {
                 *r += error;
@@ -521,7 +541,7 @@ impl Spacecraft {
             let (carried, swing) = (to_orf(i, spacecraft), cross(to_orf(i, alpha), self.offset_m[i]));
             for a in 0..3 {
                 let force_n = electrostatic[i][a] + if a > 0 { self.dice.white(2e-14) } else { 0.0 };
-                let stray = hidden[i][a] + self.strays.white(self.flight.stray_m_s2);
+                let stray = hidden[i][a] + self.strays.white(self.variation.stray_m_s2);
                 let (r, v) = (&mut self.r_m[i][a], &mut self.v_m_s[i][a]);
                 let acceleration = stray + force_n / TM_KG - carried[a] - swing[a] + STIFFNESS[a] * *r + PULL[i][a];
                 *r += *v * DT_S + 0.5 * acceleration * DT_S * DT_S;
@@ -543,7 +563,7 @@ impl Iterator for Spacecraft {
             self.begin();
             let mut record = self.read();
             self.keep_house(&mut record);
-            control(&mut self.loops, &self.flight.loops, &mut record);
+            control(&mut self.loops, &self.flight.loops, self.variation.attitude, &mut record);
             self.step(&record);
             self.k += 1;
             if self.k > self.settle {
@@ -555,9 +575,9 @@ impl Iterator for Spacecraft {
 }
 
 /// Nine loops and their actuators.
-fn control(loops: &mut [Loop; 9], bandwidths: &Loops, record: &mut Record) {
+fn control(loops: &mut [Loop; 9], bandwidths: &Loops, attitude: [f64; 3], record: &mut Record) {
     let mut wanted = |k: usize, w: f64, y: f64| loops[k].acceleration(w, y);
-    let turn = [0, 1, 2].map(|k| wanted(k, bandwidths.attitude[k], record.dws_sc_rad[k]));
+    let turn = [0, 1, 2].map(|k| wanted(k, attitude[k] * bandwidths.attitude, record.dws_sc_rad[k]));
     record.torque_nm = times(INERTIA, turn);
     let x = [0, 1].map(|i| wanted(3 + i, bandwidths.x, record.ifo_x_m[i]));
     let y = [0, 1].map(|i| wanted(5 + i, bandwidths.y, record.is_r_m[i][1]));
