@@ -185,9 +185,9 @@ const ROWS: [Row; 45] = [
     row(Cause::Readout, "is-scale", "1", Place::Tm(Z), 1.5e-2, 0.18),
     row(Cause::Readout, "is-crosstalk", "1", Place::Pair(Y, Z), 1.4e-2, 0.18),
     row(Cause::Readout, "is-crosstalk", "1", Place::Pair(Z, Y), 1.1e-2, 0.18),
-    row(Cause::Heat, "thermal", "m s-2 K-1", Place::Tm1(X), 3e-15, 1e-9),
-    row(Cause::Heat, "thermal", "m s-2 K-1", Place::Tm1(Y), 3e-15, 1e-9),
-    row(Cause::Heat, "thermal", "m s-2 K-1", Place::Tm1(Z), 3e-15, 1e-9),
+    row(Cause::Heat, "thermal", "m s-2 K-1", Place::Tm1(X), 1.5e-14, 1e-9),
+    row(Cause::Heat, "thermal", "m s-2 K-1", Place::Tm1(Y), 1.5e-14, 1e-9),
+    row(Cause::Heat, "thermal", "m s-2 K-1", Place::Tm1(Z), 1.5e-14, 1e-9),
     row(Cause::Hit, "impulse", "N s", Place::Sc(X), 4e-8, 1e-3),
     row(Cause::Hit, "impulse", "N s", Place::Sc(Y), 5e-8, 1e-3),
     row(Cause::Hit, "impulse", "N s", Place::Sc(Z), 1.7e-7, 1e-3),
@@ -202,12 +202,12 @@ const ROWS: [Row; 45] = [
     row(Cause::TorqueNoise, "torque-noise", "1", Place::Sc(Z), 1.4e-2, 2.0),
     row(Cause::ReadoutNoise, "is-noise", "1", Place::Tm(Y), 1.5e-3, 2.0),
     row(Cause::ReadoutNoise, "is-noise", "1", Place::Tm(Z), 1.5e-3, 2.0),
-    row(Cause::CurrentSquared, "current-squared", "m s-2 A-2", Place::Tm(X), 1e-16, 1e-9),
-    row(Cause::CurrentSquared, "current-squared", "m s-2 A-2", Place::Tm(Y), 1e-16, 1e-9),
-    row(Cause::CurrentSquared, "current-squared", "m s-2 A-2", Place::Tm(Z), 1e-16, 1e-9),
-    row(Cause::CurrentByPanel, "current-by-panel", "m s-2 A-1 K-1", Place::Tm(X), 4e-16, 1e-9),
-    row(Cause::CurrentByPanel, "current-by-panel", "m s-2 A-1 K-1", Place::Tm(Y), 4e-16, 1e-9),
-    row(Cause::CurrentByPanel, "current-by-panel", "m s-2 A-1 K-1", Place::Tm(Z), 4e-16, 1e-9),
+    row(Cause::CurrentSquared, "current-squared", "m s-2 A-2", Place::Tm(X), 5e-16, 1e-9),
+    row(Cause::CurrentSquared, "current-squared", "m s-2 A-2", Place::Tm(Y), 5e-16, 1e-9),
+    row(Cause::CurrentSquared, "current-squared", "m s-2 A-2", Place::Tm(Z), 5e-16, 1e-9),
+    row(Cause::CurrentByPanel, "current-by-panel", "m s-2 A-1 K-1", Place::Tm(X), 2e-15, 1e-9),
+    row(Cause::CurrentByPanel, "current-by-panel", "m s-2 A-1 K-1", Place::Tm(Y), 2e-15, 1e-9),
+    row(Cause::CurrentByPanel, "current-by-panel", "m s-2 A-1 K-1", Place::Tm(Z), 2e-15, 1e-9),
     row(Cause::ThrustLine, "thrust-line", "N", Place::Sc(X), 5e-10, 1e-4),
     row(Cause::ThrustLine, "thrust-line", "N", Place::Sc(Y), 5e-10, 1e-4),
     row(Cause::ThrustLine, "thrust-line", "N", Place::Sc(Z), 1e-9, 1e-4),
@@ -379,7 +379,7 @@ impl Draw {
             loops,
             hidden: Hidden::NONE,
         };
-        let variation = Variation { attitude, stray_m_s2: 3e-15, start };
+        let variation = Variation { attitude, stray_m_s2: 3e-15, corners_hz: [4e-4, 1e-3], start };
         let mut draw = Self { flight, variation, declared, deviation, start_ns, gaps_s, acted: Vec::new() };
         let mut dice = stream(seed, 5);
         let luck = dice.uniform();
@@ -524,7 +524,7 @@ impl Draw {
     }
 
     /// The mission file of the flight, from that of the bundled mission: declared levels of white noise, and the
-    /// sunlight. `None` if the bundled file lacks a table or key.
+    /// sunlight. The noise of forces on the test masses is flown as the bundled file declares it. `None` if the bundled file lacks a table or key.
     #[must_use]
     pub fn mission(&self, bundled: &str) -> Option<String> {
         let levels = &self.declared;
@@ -539,8 +539,6 @@ impl Draw {
             ("noise.is_angle", "asd_rad_rthz", 1.5e-7),
             ("noise.dws_local", "asd_rad_rthz", 1e-9),
             ("noise.dws_long_arm", "asd_rad_rthz", levels.dws_rad),
-            ("noise.electrostatic_force", "asd_n_rthz", 2e-14),
-            ("noise.test_mass_acceleration", "asd_m_s2_rthz", self.variation.stray_m_s2),
             ("solar_pressure", "force_n", self.flight.sunlight_n),
         ] {
             text = with_value(&text, table, key, value)?;

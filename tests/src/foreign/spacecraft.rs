@@ -40,13 +40,15 @@ pub struct Variation {
     pub attitude: [f64; 3],
     /// Stray acceleration of each test mass along each axis, m s⁻²/√Hz.
     pub stray_m_s2: f64,
+    /// Corners below which the amplitudes of the strays and of the electrodes' force noise rise as 1/f, Hz.
+    pub corners_hz: [f64; 2],
     /// Errors at the start of the recording.
     pub start: Start,
 }
 
 impl Variation {
     /// Nothing.
-    pub const NONE: Self = Self { attitude: [1.0; 3], stray_m_s2: 0.0, start: Start::SETTLED };
+    pub const NONE: Self = Self { attitude: [1.0; 3], stray_m_s2: 0.0, corners_hz: [0.0; 2], start: Start::SETTLED };
 }
 
 /// Errors with which a mode of the controllers begins, after fifty minutes in which the loops have settled.
@@ -301,6 +303,8 @@ impl Loop {
 
 const SC_KG: f64 = 1500.0;
 const TM_KG: f64 = 1.96;
+/// Noise of the electrodes' force along y and z, N/√Hz.
+const ELECTRODES_N: f64 = 2e-14;
 const INERTIA: [[f64; 3]; 3] = [[800.0, 13.0, 10.0], [13.0, 800.0, 12.0], [10.0, 12.0, 1000.0]];
 /// Force per displacement and mass, s⁻².
 const STIFFNESS: [f64; 3] = [-6e-7, -10e-7, -12e-7];
@@ -361,6 +365,8 @@ pub struct Spacecraft {
     rate_rad_s: [f64; 3],
     r_m: [[f64; 3]; 2],
     v_m_s: [[f64; 3]; 2],
+    /// Random walk of the acceleration of each test mass, m/s².
+    slow_m_s2: [[f64; 3]; 2],
     loops: [Loop; 9],
     dice: Dice,
     /// Random streams of their own, so that temperatures, power and strays do not change the noise.
@@ -394,6 +400,7 @@ impl Spacecraft {
             rate_rad_s: [0.0; 3],
             r_m: [[0.0; 3]; 2],
             v_m_s: [[0.0; 3]; 2],
+            slow_m_s2: [[0.0; 3]; 2],
             loops: [Loop::default(); 9],
             dice: stream(0),
             weather: stream(1),
@@ -517,6 +524,16 @@ impl Spacecraft {
         all
     }
 
+    /// Stray acceleration of a test mass along an axis, and the slow part of the electrodes' noise. White noise of ASD
+    /// `a` with a corner `c` is that and a random walk of ASD `a c/f`, whose steps have the variance `(2π a c)² dt/2`.
+    fn stray(&mut self, i: usize, axis: usize) -> f64 {
+        let Variation { stray_m_s2, corners_hz: [stray_hz, electrodes_hz], .. } = self.variation;
+        let electrodes = if axis > 0 { electrodes_hz * ELECTRODES_N / TM_KG } else { 0.0 };
+        let step = std::f64::consts::TAU * (stray_hz * stray_m_s2).hypot(electrodes) * (0.5 * DT_S).sqrt();
+        self.slow_m_s2[i][axis] += step * self.strays.normal();
+        self.slow_m_s2[i][axis] + self.strays.white(stray_m_s2)
+    }
+
     /// Everything is constant until the next sample.
     fn step(&mut self, record: &Record) {
         let (force, torque) = self.thrust(record);
@@ -540,8 +557,8 @@ impl Spacecraft {
         for i in 0..2 {
             let (carried, swing) = (to_orf(i, spacecraft), cross(to_orf(i, alpha), self.offset_m[i]));
             for a in 0..3 {
-                let force_n = electrostatic[i][a] + if a > 0 { self.dice.white(2e-14) } else { 0.0 };
-                let stray = hidden[i][a] + self.strays.white(self.variation.stray_m_s2);
+                let force_n = electrostatic[i][a] + if a > 0 { self.dice.white(ELECTRODES_N) } else { 0.0 };
+                let stray = hidden[i][a] + self.stray(i, a);
                 let (r, v) = (&mut self.r_m[i][a], &mut self.v_m_s[i][a]);
                 let acceleration = stray + force_n / TM_KG - carried[a] - swing[a] + STIFFNESS[a] * *r + PULL[i][a];
                 *r += *v * DT_S + 0.5 * acceleration * DT_S * DT_S;
