@@ -166,6 +166,13 @@ fn is_declared(line: &Diagnosed) -> bool {
     line.drawn["noise_over_declared"].as_array().is_none_or(|all| all.iter().all(|part| *part == 1.0))
 }
 
+/// Whether the diagnosis says that something is left which no effect explains, and blames nothing false for it.
+fn is_told_unexplained(line: &Diagnosed) -> bool {
+    line.answer
+        .as_ref()
+        .is_some_and(|a| (a.verdict == "unexplained" || a.unexplained.is_object()) && a.false_causes.is_empty())
+}
+
 fn names_false_cause(line: &Diagnosed) -> bool {
     line.answer.as_ref().is_some_and(|a| !a.false_causes.is_empty())
 }
@@ -242,7 +249,7 @@ fn rows(free: &DMatrix<f64>) -> Vec<Row<'_>> {
             Bar::AtLeast(95),
             Box::new(|lines| {
                 let loud = lines.iter().filter(|l| single(l, false).is_some_and(|e| e.drawn_significance > 8.0));
-                Measured::share(loud.map(|l| l.answer.as_ref().is_some_and(|a| a.verdict == "unexplained")))
+                Measured::share(loud.map(|l| is_told_unexplained(l)))
             }),
         ),
         (
@@ -345,8 +352,7 @@ fn kinds(lines: &[&Diagnosed]) -> String {
         let kind = one.name.split(':').next().unwrap_or("?");
         let row = found.entry((kind, line.producer.as_str())).or_default();
         let cell = &mut row[usize::from(significance(line, one) < 8.0)];
-        let unexplained = line.answer.as_ref().is_some_and(|a| a.verdict == "unexplained");
-        cell.0 += usize::from(if one.known { is_first(one) } else { unexplained });
+        cell.0 += usize::from(if one.known { is_first(one) } else { is_told_unexplained(line) });
         cell.1 += 1;
     }
     let mut text = "\n| one effect | producer | found above 8σ | below |\n|---|---|---|---|\n".to_owned();
@@ -472,9 +478,10 @@ mod tests {
             set("9h", "foreign", "missing", &["a:x"], pair(false)),
             set("9h", "foreign", "unexplained", &[], vec![acted("thrust-line:sc.x", 9.0, None, false)]),
             set("9h", "foreign", "sufficient", &[], vec![acted("thrust-line:sc.x", 7.0, None, false)]),
+            set("9h", "foreign", "missing", &["c:x"], vec![acted("thrust-line:sc.x", 9.0, None, false)]),
         ];
         assert_eq!(measured(&lines, "pairs"), Measured::Share(1, 2));
-        assert_eq!(measured(&lines, "a kind"), Measured::Share(1, 1));
+        assert_eq!(measured(&lines, "a kind"), Measured::Share(1, 2));
     }
 
     /// One σ in each of six directions is six degrees of freedom, told per three.

@@ -524,7 +524,8 @@ impl Draw {
     }
 
     /// The mission file of the flight, from that of the bundled mission: declared levels of white noise, and the
-    /// sunlight. The noise of forces on the test masses is flown as the bundled file declares it. `None` if the bundled file lacks a table or key.
+    /// sunlight. The noise of forces on the test masses is flown as the bundled file declares it. `None` if the bundled
+    /// file lacks a table or key.
     #[must_use]
     pub fn mission(&self, bundled: &str) -> Option<String> {
         let levels = &self.declared;
