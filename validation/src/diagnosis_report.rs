@@ -28,6 +28,8 @@ const LENGTHS: std::ops::Range<usize> = 1..6;
 const CLEAN_SETS: usize = 120;
 /// Number of sets or sizes below which a bar of a percentage is left open unless it is missed.
 const LEAST: usize = 20;
+/// Number of sizes from which an upper bound of their percentage is judged.
+const LEAST_ABOVE: usize = 100;
 /// Largest confounder set in which a truth counts as found.
 const MAX_SET: usize = 3;
 /// Bounds of NEES/dof after the addition.
@@ -97,7 +99,8 @@ impl Bar {
             (_, m) if m.number() == 0 => true,
             (Self::AtLeast(p), Measured::Share(k, n)) => 100 * k >= p * n,
             (Self::AtMost(p), Measured::Share(k, n)) => 100 * k <= p * n,
-            (Self::Between(a, b), Measured::Share(k, n)) => (a * n..=b * n).contains(&(100 * k)),
+            // All of a few is more than a percentage and says nothing.
+            (Self::Between(a, b), Measured::Share(k, n)) => 100 * k >= a * n && (n < LEAST_ABOVE || 100 * k <= b * n),
             (Self::TwoOf120, Measured::Share(k, n)) => CLEAN_SETS * k <= 2 * n,
             (Self::Nees, Measured::Mean(value, _)) => NEES.contains(&value),
             _ => true,
@@ -507,6 +510,7 @@ mod tests {
         assert_eq!((at_least(19, 19), at_least(49, 50), at_least(48, 50)), ("open", "met", "**missed**"));
         let between = |k| Bar::Between(93, 98).verdict(&[Measured::Share(k, 100)]);
         assert_eq!((between(95), between(99), between(92)), ("met", "**missed**", "**missed**"));
+        assert_eq!(Bar::Between(93, 98).verdict(&[Measured::Share(10, 10)]), "open");
         assert_eq!(Bar::Nees.verdict(&[Measured::Mean(1.3, 40)]), "**missed**");
     }
 
