@@ -43,7 +43,8 @@ fn allowed(crate_name: &str) -> &'static [&'static str] {
             "dragfree-workflow",
             "dragfree-score",
         ],
-        "dragfree-validation" => &["dragfree-engine", "dragfree-physics", "dragfree-chart"],
+        // The tests hold the independent producer of telemetry.
+        "dragfree-validation" => &["dragfree-engine", "dragfree-physics", "dragfree-chart", "dragfree-tests"],
         "dragfree-estimation" => &["dragfree-physics", "dragfree-schema"],
         "dragfree-identification" => &["dragfree-schema", "dragfree-estimation"],
         "dragfree-workflow" => {

@@ -5,6 +5,9 @@ mod blind;
 mod blind_report;
 mod bound;
 mod campaign;
+mod diagnosis;
+mod diagnosis_report;
+mod diagnosis_score;
 mod error;
 mod program;
 mod records;
@@ -15,6 +18,7 @@ mod table;
 
 use campaign::note;
 use clap::{Args, Parser, Subcommand};
+use diagnosis::{Length, Plan, Producer};
 use error::CampaignError;
 use program::{Program, root};
 use std::ops::RangeInclusive;
@@ -40,6 +44,8 @@ enum Command {
     Table(Table),
     /// Hide effects, diagnose, and score when the seals are opened; goes on where it was stopped
     Blind(Blind),
+    /// Diagnose sets of 2 h to 3 × 24 h by two producers and score them; goes on where it was stopped
+    Diagnosis(Diagnosis),
     /// Measure ratios of speed, on a machine that does nothing else
     Speed,
     /// Write the generated parts of VALIDATION.md and the picture from the results
@@ -90,6 +96,31 @@ struct Blind {
     results: Option<PathBuf>,
 }
 
+#[derive(Debug, Args)]
+struct Diagnosis {
+    /// Seeds, FIRST-LAST; each determines length, producer, kind and size
+    #[arg(long, value_parser = seeds, default_value = "1-400")]
+    seeds: RangeInclusive<u32>,
+    /// Length of every set, in place of the seed's
+    #[arg(long, value_enum)]
+    length: Option<Length>,
+    /// Producer of every set, in place of the seed's
+    #[arg(long, value_enum)]
+    producer: Option<Producer>,
+    /// Hide nothing
+    #[arg(long)]
+    clean: bool,
+    /// Further arguments of `dragfree diagnose`, separated by spaces
+    #[arg(long, value_name = "ARGUMENTS", default_value = "", allow_hyphen_values = true)]
+    arguments: String,
+    /// Diagnoses at a time; each takes some 2 GB of memory
+    #[arg(long, default_value_t = AT_ONCE)]
+    at_once: usize,
+    /// File of results
+    #[arg(long, value_name = "FILE")]
+    results: Option<PathBuf>,
+}
+
 const AT_ONCE: usize = 2;
 const SEEDS: RangeInclusive<u32> = 1..=100;
 
@@ -119,6 +150,16 @@ fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
         Command::Blind(b) => {
             let file = b.results.clone().unwrap_or_else(|| results.join("blind.jsonl"));
             blind::blind(&Program::build()?, b.seeds.clone(), b.hours, b.at_once, &file, &scratch)
+        }
+        Command::Diagnosis(d) => {
+            let file = d.results.clone().unwrap_or_else(|| results.join("diagnosis.jsonl"));
+            let plan = Plan {
+                length: d.length,
+                producer: d.producer,
+                clean: d.clean,
+                arguments: d.arguments.split_whitespace().map(str::to_owned).collect(),
+            };
+            diagnosis::diagnosis(&Program::build()?, &plan, d.seeds.clone(), d.at_once, &file, &scratch)
         }
         Command::Speed => speed::measure(&Program::build()?, &speed_file, &scratch),
         Command::Report => report::write(&results),

@@ -105,6 +105,13 @@ impl Program {
         Ok(digest.iter().take(6).map(|byte| format!("{byte:02x}")).collect())
     }
 
+    /// Digest of the program and the plugins' libraries: a diagnosis is made by both.
+    pub(crate) fn whole_digest(&self) -> Result<String, CampaignError> {
+        let exe = std::fs::read(&self.exe).map_err(|e| file(&self.exe, &e))?;
+        let digest = Sha256::new().chain_update(exe).chain_update(self.digest()?).finalize();
+        Ok(digest.iter().take(6).map(|byte| format!("{byte:02x}")).collect())
+    }
+
     /// Writes the controllers designed for a mission to a file with the section `control`.
     pub(crate) fn freeze(&self, mission: &Path, to: &Path) -> Result<(), CampaignError> {
         output(self.command().arg("design").arg(mission).arg("--freeze").arg(to), &[0]).map(|_| ())
@@ -162,9 +169,22 @@ impl Program {
 
     /// Runs `dragfree diagnose` on a product.
     pub(crate) fn diagnose(&self, product: &Value, archive: &Path) -> Result<Value, CampaignError> {
+        self.diagnose_together(std::slice::from_ref(product), archive, &[])
+    }
+
+    /// Runs `dragfree diagnose` on products of one model, with additional arguments.
+    pub(crate) fn diagnose_together(
+        &self,
+        products: &[Value],
+        archive: &Path,
+        arguments: &[&str],
+    ) -> Result<Value, CampaignError> {
         let mut command = self.command();
-        let id = product["id"].as_str().ok_or_else(|| missing(&command, "id"))?;
-        command.arg("diagnose").arg(id).arg("--archive").arg(archive).arg("--json");
+        command.arg("diagnose");
+        for product in products {
+            command.arg(product["id"].as_str().ok_or_else(|| missing(&command, "id"))?);
+        }
+        command.arg("--archive").arg(archive).arg("--json").args(arguments);
         json(&mut command, &[0, 4])
     }
 

@@ -172,6 +172,106 @@ impl Keyed for Blind {
     }
 }
 
+/// Result of one set of the diagnosis campaign.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Diagnosed {
+    /// Length, producer, whether nothing was to be hidden, and arguments: with the seed, the key.
+    pub(crate) configuration: String,
+    /// Seed of everything drawn.
+    pub(crate) seed: u32,
+    /// Digest of program and plugins, twelve hexadecimal digits.
+    pub(crate) build: String,
+    /// Length, as `6h`.
+    pub(crate) length: String,
+    /// `own` or `foreign`.
+    pub(crate) producer: String,
+    /// Additional arguments of `dragfree diagnose`.
+    pub(crate) arguments: String,
+    /// What a foreign set was drawn with: loops, noise, start, gaps. Null for the bundled simulator.
+    pub(crate) drawn: Value,
+    /// Duration of the diagnosis, s.
+    pub(crate) diagnosis_s: f64,
+    /// What the program said when it failed to calibrate or diagnose.
+    pub(crate) failed: Option<String>,
+    /// Verdict of each product.
+    pub(crate) run_verdicts: Vec<String>,
+    /// χ²/dof of each product.
+    pub(crate) chi2_per_dof: Vec<f64>,
+    /// The diagnosis against the truth; `None` if the program failed.
+    pub(crate) answer: Option<Answer>,
+    /// What was hidden, with what became of it.
+    pub(crate) effects: Vec<Acted>,
+    /// Offset of each product by the model without additions.
+    pub(crate) before: Vec<Solution>,
+    /// Offset by the extended model; `None` if nothing was named, or not everything that was named is true.
+    pub(crate) after: Option<Extended>,
+}
+
+/// What a diagnosis said as a whole.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Answer {
+    /// `sufficient`, `missing` or `unexplained`.
+    pub(crate) verdict: String,
+    /// Accepted candidates, best first.
+    pub(crate) named: Vec<String>,
+    /// Those of them that are neither true nor confounded with a truth that was not named.
+    pub(crate) false_causes: Vec<String>,
+    /// The description of an unexplained remainder.
+    pub(crate) unexplained: Value,
+}
+
+/// A hidden effect and what became of it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Acted {
+    /// `EFFECT:INSTANCE`.
+    pub(crate) name: String,
+    /// True size, in `unit`.
+    pub(crate) size: f64,
+    /// SI unit.
+    pub(crate) unit: String,
+    /// Whether a bundled effect covers the kind.
+    pub(crate) known: bool,
+    /// Significance for which its size was drawn, by an approximate table.
+    pub(crate) drawn_significance: f64,
+    /// Significance with the σ of the diagnosis; `None` if it states none for the truth.
+    pub(crate) significance_at_hand: Option<f64>,
+    /// Whether it is accepted.
+    pub(crate) named: bool,
+    /// Whether it is accepted, and nothing false before it.
+    pub(crate) first: bool,
+    /// Accepted candidates that list it as a confounder.
+    pub(crate) confounder_of: Vec<String>,
+    /// Members of the smallest set of an accepted candidate and its confounders that contains it.
+    pub(crate) set_size: Option<usize>,
+    /// Estimate minus truth over σ of each coefficient, where it is accepted.
+    pub(crate) difference_sigma: Vec<f64>,
+}
+
+/// Calibrations with what was named.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct Extended {
+    /// Added effects.
+    pub(crate) added: Vec<String>,
+    /// What the program said when an effect could not be added or the model did not run.
+    pub(crate) failed: Option<String>,
+    /// Offset of each product; none if it failed.
+    pub(crate) offset: Vec<Solution>,
+}
+
+impl Keyed for Diagnosed {
+    fn key(&self) -> (String, u32) {
+        (self.configuration.clone(), self.seed)
+    }
+
+    fn build(&self) -> &str {
+        &self.build
+    }
+}
+
 /// A growing file of results, shared by threads.
 #[derive(Debug)]
 pub(crate) struct Results<T> {

@@ -10,9 +10,10 @@ use std::path::{Path, PathBuf};
 use crate::blind_report;
 use crate::bound::free_space;
 use crate::campaign::{NOMINAL, TWINS, Twin, note, taiji};
+use crate::diagnosis_report;
 use crate::error::{CampaignError, file};
 use crate::program::root;
-use crate::records::{Blind, Line, Solution, read};
+use crate::records::{Blind, Diagnosed, Line, Solution, read};
 use crate::speed::Speed;
 use crate::stats::{self, Bounds};
 use crate::table::{REGIMES, Row, configuration, mission};
@@ -39,6 +40,8 @@ pub(crate) struct Measured {
     pub(crate) speed: Option<Speed>,
     /// Blind campaign.
     pub(crate) blind: Vec<Blind>,
+    /// Diagnosis campaign.
+    pub(crate) diagnosis: Vec<Diagnosed>,
 }
 
 impl Measured {
@@ -49,6 +52,7 @@ impl Measured {
             table: read(&folder.join("table.jsonl"))?,
             speed: Speed::read(&folder.join("speed.json"))?,
             blind: read(&folder.join("blind.jsonl"))?,
+            diagnosis: read(&folder.join("diagnosis.jsonl"))?,
         })
     }
 }
@@ -537,6 +541,8 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
     let speed = measured.speed.as_ref().map_or("Not measured yet.\n".to_owned(), Speed::table);
     let (blind, more) = blind_report::numbers(&measured.blind);
     failed.extend(more);
+    let (diagnosis, more) = diagnosis_report::numbers(&measured.diagnosis, &free);
+    failed.extend(more);
     let drawn =
         [("coverage", picture(&measured.coverage, &free)), ("confusion", blind_report::picture(&measured.blind))];
     let mut pictures = Vec::new();
@@ -550,6 +556,7 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
         ("table", table),
         ("speed", speed),
         ("blind", blind),
+        ("diagnosis", diagnosis),
     ]);
     Ok(Report { parts, pictures, failed })
 }

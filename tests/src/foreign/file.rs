@@ -1,6 +1,7 @@
 //! MCAP written from its specification.
 
-use std::io::Write;
+use std::fs::File;
+use std::io::{self, Write};
 use std::path::Path;
 
 use super::Record;
@@ -23,6 +24,8 @@ pub struct Container {
 
 const MAGIC: &[u8; 8] = b"\x89MCAP0\r\n";
 const MESSAGES_PER_CHUNK: usize = 4_000;
+/// Bytes that are kept before they are written.
+const BUFFER: usize = 1 << 22;
 
 fn text(out: &mut Vec<u8>, text: &str) {
     out.extend_from_slice(&(text.len() as u32).to_le_bytes());
@@ -52,7 +55,7 @@ struct Topic {
     metadata: &'static [(&'static str, &'static str)],
 }
 
-const TOPICS: [Topic; 11] = [
+const TOPICS: [Topic; 13] = [
     Topic { name: "/is", message: "InertialSensors", encoding: "protobuf", metadata: &[] },
     Topic { name: "/ifo", message: "Interferometers", encoding: "protobuf", metadata: &[] },
     Topic { name: "/dws", message: "Dws", encoding: "protobuf", metadata: &[] },
@@ -74,14 +77,28 @@ const TOPICS: [Topic; 11] = [
     Topic { name: "/hk/housing_a_left_k", message: "Scalar", encoding: "protobuf", metadata: THERMOMETER },
     Topic { name: "/hk/housing_a_right_k", message: "Scalar", encoding: "protobuf", metadata: THERMOMETER },
     Topic { name: "/hk/battery_case_k", message: "Scalar", encoding: "protobuf", metadata: THERMOMETER },
+    Topic {
+        name: "/hk/bus_current_a",
+        message: "Scalar",
+        encoding: "protobuf",
+        metadata: &[("unit", "A"), ("place", "power unit"), ("rate_hz", "1")],
+    },
+    Topic {
+        name: "/hk/panel_k",
+        message: "Scalar",
+        encoding: "protobuf",
+        metadata: &[("unit", "K"), ("place", "panel"), ("rate_hz", "0.1")],
+    },
 ];
+/// Topics of a file without the power system's.
+const WITHOUT_POWER: usize = 11;
 
 const THERMOMETER: &[(&str, &str)] = &[("unit", "K"), ("place", "somewhere"), ("rate_hz", "0.1")];
 
-fn definitions() -> Vec<u8> {
+fn definitions(topics: usize) -> Vec<u8> {
     let mut out = Vec::new();
     let descriptors = wire::descriptor_set();
-    for (id, topic) in (1u16..).zip(&TOPICS) {
+    for (id, topic) in (1u16..).zip(&TOPICS[..topics]) {
         let schema_id = if topic.message.is_empty() { 0 } else { id };
         if schema_id != 0 {
             let mut schema = id.to_le_bytes().to_vec();
@@ -112,9 +129,15 @@ struct Chunk {
     uncompressed: u64,
 }
 
-struct Writer {
+/// A file that grows sample by sample.
+pub struct Recorder {
+    file: File,
+    /// Bytes in the file, and bytes that are not yet written to it.
+    written: u64,
     out: Vec<u8>,
     container: Container,
+    /// Whether current and panel temperature of the power system are telemetered.
+    power: bool,
     /// Messages of the open chunk, with times and positions per channel.
     open: Vec<u8>,
     index: [Vec<(u64, u64)>; TOPICS.len()],
@@ -125,8 +148,104 @@ struct Writer {
     whole: Option<(u64, u64)>,
 }
 
-impl Writer {
-    fn message(&mut self, topic: usize, time_ns: u64, data: &[u8]) {
+impl Recorder {
+    /// A new file with its definitions; `power` tells whether current and panel temperature of the power system are
+    /// telemetered.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn create(path: &Path, container: Container, power: bool) -> io::Result<Self> {
+        let mut recorder = Self {
+            file: File::create(path)?,
+            written: 0,
+            out: MAGIC.to_vec(),
+            container,
+            power,
+            open: Vec::new(),
+            index: Default::default(),
+            messages: 0,
+            span: None,
+            chunks: Vec::new(),
+            counts: [0; TOPICS.len()],
+            whole: None,
+        };
+        let mut header = Vec::new();
+        text(&mut header, "");
+        text(&mut header, "somebody else 7.1");
+        record(&mut recorder.out, 0x01, &header);
+        let mut metadata = Vec::new();
+        text(&mut metadata, "dragfree");
+        let who = [("time_scale", "UTC"), ("mission", "Taiji"), ("spacecraft", "SC1"), ("producer", "somebody else")];
+        map(&mut metadata, &who);
+        record(&mut recorder.out, 0x0c, &metadata);
+        recorder.out.extend_from_slice(&definitions(recorder.topics()));
+        Ok(recorder)
+    }
+
+    fn topics(&self) -> usize {
+        if self.power { TOPICS.len() } else { WITHOUT_POWER }
+    }
+
+    /// Appends the `k`-th sample of a flight, at `time_ns`; `k` decides which slower messages come with it.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn sample(&mut self, k: usize, time_ns: u64, r: &Record) -> io::Result<()> {
+        self.message(0, time_ns, &wire::inertial_sensors(r))?;
+        self.message(1, time_ns, &wire::interferometers(r))?;
+        self.message(2, time_ns, &wire::dws(r))?;
+        if self.container.command {
+            self.message(3, time_ns, &wire::command(r))?;
+        }
+        if self.container.ephemeris && k.is_multiple_of(600) {
+            self.message(4, time_ns, &wire::ephemeris())?;
+        }
+        if k.is_multiple_of(20) {
+            self.message(5, time_ns, &wire::scalar(1.21e9 + (k as f64 / 100.0).sin()))?;
+        }
+        if self.power && k.is_multiple_of(10) {
+            self.message(11, time_ns, &wire::scalar(r.bus_a))?;
+        }
+        if k.is_multiple_of(100) {
+            self.message(6, time_ns, &wire::scalar(2e7 - k as f64))?;
+            self.message(7, time_ns, br#"{"says": "all is well"}"#)?;
+            for (i, t) in r.temperature_k.into_iter().enumerate() {
+                self.message(8 + i, time_ns, &wire::scalar(t))?;
+            }
+            if self.power {
+                self.message(12, time_ns, &wire::scalar(r.panel_k))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Ends the file.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn finish(mut self) -> io::Result<()> {
+        self.close_chunk()?;
+        record(&mut self.out, 0x0f, &[0; 4]);
+        self.summary();
+        self.out.extend_from_slice(MAGIC);
+        self.file.write_all(&self.out)
+    }
+
+    fn position(&self) -> u64 {
+        self.written + self.out.len() as u64
+    }
+
+    /// Writes what is kept if it is much.
+    fn spill(&mut self) -> io::Result<()> {
+        if self.out.len() >= BUFFER {
+            self.file.write_all(&self.out)?;
+            self.written += self.out.len() as u64;
+            self.out.clear();
+        }
+        Ok(())
+    }
+
+    fn message(&mut self, topic: usize, time_ns: u64, data: &[u8]) -> io::Result<()> {
         let mut content = ((topic + 1) as u16).to_le_bytes().to_vec();
         content.extend_from_slice(&(self.counts[topic] as u32).to_le_bytes());
         content.extend_from_slice(&time_ns.to_le_bytes());
@@ -139,22 +258,22 @@ impl Writer {
         self.whole = widen(self.whole);
         if !self.container.chunks {
             record(&mut self.out, 0x05, &content);
-            return;
+            return self.spill();
         }
         self.span = widen(self.span);
         self.index[topic].push((time_ns, self.open.len() as u64));
         record(&mut self.open, 0x05, &content);
         self.messages += 1;
         if self.messages == MESSAGES_PER_CHUNK {
-            self.close_chunk();
+            self.close_chunk()?;
         }
+        Ok(())
     }
 
-    fn close_chunk(&mut self) {
-        let Some((first, last)) = self.span.take() else { return };
+    fn close_chunk(&mut self) -> io::Result<()> {
+        let Some((first, last)) = self.span.take() else { return Ok(()) };
         let records = std::mem::take(&mut self.open);
-        let packed =
-            if self.container.zstd { zstd::encode_all(&records[..], 1).expect("zstd") } else { records.clone() };
+        let packed = if self.container.zstd { zstd::encode_all(&records[..], 1)? } else { records.clone() };
         let mut content = first.to_le_bytes().to_vec();
         content.extend_from_slice(&last.to_le_bytes());
         content.extend_from_slice(&(records.len() as u64).to_le_bytes());
@@ -162,13 +281,13 @@ impl Writer {
         text(&mut content, if self.container.zstd { "zstd" } else { "" });
         content.extend_from_slice(&(packed.len() as u64).to_le_bytes());
         content.extend_from_slice(&packed);
-        let start_offset = self.out.len() as u64;
+        let start_offset = self.position();
         record(&mut self.out, 0x06, &content);
-        let (length, indexes) = (self.out.len() as u64 - start_offset, self.out.len() as u64);
+        let (length, indexes) = (self.position() - start_offset, self.position());
         let mut index_offsets = Vec::new();
         for (topic, entries) in self.index.iter_mut().enumerate().filter(|(_, e)| !e.is_empty()) {
             let id = (topic + 1) as u16;
-            index_offsets.push((id, self.out.len() as u64));
+            index_offsets.push((id, self.written + self.out.len() as u64));
             let mut content = id.to_le_bytes().to_vec();
             content.extend_from_slice(&(entries.len() as u32 * 16).to_le_bytes());
             for (time, offset) in entries.drain(..) {
@@ -184,19 +303,21 @@ impl Writer {
             first,
             last,
             index_offsets,
-            index_length: self.out.len() as u64 - indexes,
+            index_length: self.position() - indexes,
             compressed: packed.len() as u64,
             uncompressed: records.len() as u64,
         });
+        self.spill()
     }
 
     fn summary(&mut self) {
-        let start = self.out.len() as u64;
+        let start = self.position();
         if !self.container.summary {
             record(&mut self.out, 0x02, &[0; 20]);
             return;
         }
-        let mut summary = definitions();
+        let topics = self.topics();
+        let mut summary = definitions(topics);
         for c in &self.chunks {
             let mut content = Vec::new();
             for number in [c.first, c.last, c.start_offset, c.length] {
@@ -215,14 +336,14 @@ impl Writer {
         }
         let (first, last) = self.whole.unwrap_or_default();
         let mut content = self.counts.iter().sum::<u64>().to_le_bytes().to_vec();
-        content.extend_from_slice(&(TOPICS.len() as u16 - 1).to_le_bytes());
-        for number in [TOPICS.len() as u32, 0, 1, self.chunks.len() as u32] {
+        content.extend_from_slice(&(topics as u16 - 1).to_le_bytes());
+        for number in [topics as u32, 0, 1, self.chunks.len() as u32] {
             content.extend_from_slice(&number.to_le_bytes());
         }
         content.extend_from_slice(&first.to_le_bytes());
         content.extend_from_slice(&last.to_le_bytes());
-        content.extend_from_slice(&(TOPICS.len() as u32 * 10).to_le_bytes());
-        for (id, count) in (1u16..).zip(self.counts) {
+        content.extend_from_slice(&(topics as u32 * 10).to_le_bytes());
+        for (id, count) in (1u16..).zip(&self.counts[..topics]) {
             content.extend_from_slice(&id.to_le_bytes());
             content.extend_from_slice(&count.to_le_bytes());
         }
@@ -244,52 +365,12 @@ impl Writer {
 /// # Panics
 /// The file cannot be written.
 pub fn write(path: &Path, records: &[Record], start_ns: u64, container: Container) {
-    let mut writer = Writer {
-        out: MAGIC.to_vec(),
-        container,
-        open: Vec::new(),
-        index: Default::default(),
-        messages: 0,
-        span: None,
-        chunks: Vec::new(),
-        counts: [0; TOPICS.len()],
-        whole: None,
-    };
-    let mut header = Vec::new();
-    text(&mut header, "");
-    text(&mut header, "somebody else 7.1");
-    record(&mut writer.out, 0x01, &header);
-    let mut metadata = Vec::new();
-    text(&mut metadata, "dragfree");
-    let who = [("time_scale", "UTC"), ("mission", "Taiji"), ("spacecraft", "SC1"), ("producer", "somebody else")];
-    map(&mut metadata, &who);
-    record(&mut writer.out, 0x0c, &metadata);
-    writer.out.extend_from_slice(&definitions());
+    let mut recorder = Recorder::create(path, container, false).expect("the folder is writable");
     for (k, r) in records.iter().enumerate() {
-        let time = start_ns + k as u64 * 100_000_000;
-        writer.message(0, time, &wire::inertial_sensors(r));
-        writer.message(1, time, &wire::interferometers(r));
-        writer.message(2, time, &wire::dws(r));
-        if container.command {
-            writer.message(3, time, &wire::command(r));
-        }
-        if container.ephemeris && k % 600 == 0 {
-            writer.message(4, time, &wire::ephemeris());
-        }
-        if k % 20 == 0 {
-            writer.message(5, time, &wire::scalar(1.21e9 + (k as f64 / 100.0).sin()));
-        }
-        if k % 100 == 0 {
-            writer.message(6, time, &wire::scalar(2e7 - k as f64));
-            writer.message(7, time, br#"{"says": "all is well"}"#);
-            for (i, t) in r.temperature_k.into_iter().enumerate() {
-                writer.message(8 + i, time, &wire::scalar(t));
-            }
-        }
+        recorder.sample(k, start_ns + k as u64 * PERIOD_NS, r).expect("the file is writable");
     }
-    writer.close_chunk();
-    record(&mut writer.out, 0x0f, &[0; 4]);
-    writer.summary();
-    writer.out.extend_from_slice(MAGIC);
-    std::fs::File::create(path).and_then(|mut f| f.write_all(&writer.out)).expect("the folder is writable");
+    recorder.finish().expect("the file is writable");
 }
+
+/// Time from sample to sample, ns.
+pub const PERIOD_NS: u64 = 100_000_000;

@@ -3,9 +3,13 @@
 //! Written from `telemetry.proto` and the MCAP specification alone, without code of the simulator plugin, the physics
 //! crate or the engine's encoder, so that it does not share their errors.
 
+mod draw;
 mod file;
 mod spacecraft;
 mod wire;
 
-pub use file::{Container, write};
-pub use spacecraft::{Flight, HEAT_LAG_S, Hidden, Loops, Record, fly};
+pub use draw::{Acted, Draw, KINDS, Levels};
+pub use file::{Container, PERIOD_NS, Recorder, write};
+pub use spacecraft::{
+    Blow, Flight, HEAT_LAG_S, Heat, Hidden, Line, Loops, Matrix, Record, Spacecraft, Start, Variation, fly,
+};

@@ -7,7 +7,7 @@ const DT_S: f64 = 1.0 / RATE_HZ;
 const SETTLE_S: f64 = 3_000.0;
 
 /// A simulation: noise levels (one-sided amplitude densities), offsets, controllers.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Flight {
     /// Length, s.
     pub seconds: f64,
@@ -33,30 +33,159 @@ pub struct Flight {
     pub hidden: Hidden,
 }
 
-/// Differences from the mission file.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Hidden {
-    /// Fraction of the electrodes' force along y of test mass 2 that acts along x.
-    pub aside_tm2_y_x: f64,
-    /// Gain error of the thrusters along y of SRF.
-    pub thrust_y: f64,
-    /// Scale error of the capacitive readout of y of test mass 1.
-    pub shown_tm1_y: f64,
-    /// Acceleration of test mass 1 along x per kelvin between the sides of its housing, lagged by [`HEAT_LAG_S`], m s⁻²
-    /// K⁻¹.
-    pub heat_tm1_x: f64,
-    /// Impulse along x of SRF: time after the first sample, s, and momentum, N s.
-    pub blow: Option<(f64, f64)>,
+/// What a flight may have beyond its numbers.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Variation {
+    /// Factor of the attitude's bandwidth about each axis.
+    pub attitude: [f64; 3],
+    /// Stray acceleration of each test mass along each axis, m s⁻²/√Hz.
+    pub stray_m_s2: f64,
+    /// Corners below which the amplitudes of the strays and of the electrodes' force noise rise as 1/f, Hz.
+    pub corners_hz: [f64; 2],
+    /// Errors at the start of the recording.
+    pub start: Start,
 }
 
-/// Lag between thermometer and force, s.
+impl Variation {
+    /// Nothing.
+    pub const NONE: Self = Self { attitude: [1.0; 3], stray_m_s2: 0.0, corners_hz: [0.0; 2], start: Start::SETTLED };
+}
+
+/// Errors with which a mode of the controllers begins, after fifty minutes in which the loops have settled.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Start {
+    /// Time of the errors before the first recorded sample, s.
+    pub before_s: f64,
+    /// Displacements of the test masses, ORF, m.
+    pub displacement_m: [[f64; 3]; 2],
+    /// Attitude error, rad.
+    pub attitude_rad: [f64; 3],
+}
+
+impl Start {
+    /// No errors.
+    pub const SETTLED: Self = Self { before_s: 0.0, displacement_m: [[0.0; 3]; 2], attitude_rad: [0.0; 3] };
+}
+
+/// Differences from the mission file. Axes are those of SRF for thrust and torque, of ORF for the test masses.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Hidden {
+    /// Gain error of the thrusters' force along each axis.
+    pub thrust_gain: [f64; 3],
+    /// Angle by which the thrusters are turned about each axis, rad, small.
+    pub thrust_tilt_rad: [f64; 3],
+    /// Gain error of the thrusters' torque about each axis.
+    pub torque_gain: [f64; 3],
+    /// Errors of the electrodes: `[i][to][from]` of the force commanded along `from` acts along `to` too.
+    pub electrodes: [Matrix; 2],
+    /// Errors of the capacitive readout: `[i][shown][acted]` of the displacement along `acted` is seen along `shown`
+    /// too.
+    pub shown: [Matrix; 2],
+    /// Force by the temperatures.
+    pub heat: Option<Heat>,
+    /// Impulse.
+    pub blow: Option<Blow>,
+    /// Factor of the thrusters' force noise along each axis.
+    pub thrust_noise: [f64; 3],
+    /// Factor of the thrusters' torque noise about each axis.
+    pub torque_noise: [f64; 3],
+    /// Factor of the capacitive readout's noise along each axis.
+    pub is_noise: [[f64; 3]; 2],
+    /// Acceleration by the square of the bus current: test mass, axis, m s⁻² A⁻².
+    pub current_squared: Option<(usize, usize, f64)>,
+    /// Acceleration by the product of bus current and panel temperature, each about its mean: test mass, axis,
+    /// m s⁻² A⁻¹ K⁻¹.
+    pub current_by_panel: Option<(usize, usize, f64)>,
+    /// Sinusoidal force on the spacecraft.
+    pub line: Option<Line>,
+}
+
+/// Three by three numbers, by rows.
+pub type Matrix = [[f64; 3]; 3];
+
+impl Hidden {
+    /// The spacecraft of the mission file.
+    pub const NONE: Self = Self {
+        thrust_gain: [0.0; 3],
+        thrust_tilt_rad: [0.0; 3],
+        torque_gain: [0.0; 3],
+        electrodes: [[[0.0; 3]; 3]; 2],
+        shown: [[[0.0; 3]; 3]; 2],
+        heat: None,
+        blow: None,
+        thrust_noise: [1.0; 3],
+        torque_noise: [1.0; 3],
+        is_noise: [[1.0; 3]; 2],
+        current_squared: None,
+        current_by_panel: None,
+        line: None,
+    };
+}
+
+impl Default for Hidden {
+    fn default() -> Self {
+        Self::NONE
+    }
+}
+
+/// A force on a test mass by the difference of the temperatures left and right of its housing.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Heat {
+    /// Test mass.
+    pub test_mass: usize,
+    /// Axis of ORF.
+    pub axis: usize,
+    /// Acceleration per kelvin by which the left side is warmer, m s⁻² K⁻¹.
+    pub per_k: f64,
+    /// Lag between thermometer and force, s.
+    pub lag_s: f64,
+}
+
+/// A momentum that is transferred once.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Blow {
+    /// Test mass, along an axis of ORF; otherwise the spacecraft, along an axis of SRF through its centre of mass.
+    pub test_mass: Option<usize>,
+    /// Axis.
+    pub axis: usize,
+    /// Time after the first recorded sample, s.
+    pub at_s: f64,
+    /// Momentum, N s.
+    pub momentum_n_s: f64,
+    /// Time constant with which the force on a test mass decays, s; 0 for one sample.
+    pub decay_s: f64,
+}
+
+/// A sinusoidal force on the spacecraft.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Line {
+    /// Axis of SRF.
+    pub axis: usize,
+    /// Amplitude, N.
+    pub force_n: f64,
+    /// Frequency, Hz.
+    pub hz: f64,
+}
+
+/// Usual lag between thermometer and force, s.
 pub const HEAT_LAG_S: f64 = 700.0;
+/// Mean of the bus current, A; relaxation time of its slow part, s, and its standard deviation, A; height, A, and mean
+/// duration, s, of a switched load.
+const BUS_A: f64 = 2.0;
+const BUS_S: f64 = 900.0;
+const BUS_SLOW_A: f64 = 0.2;
+const LOAD_A: f64 = 0.6;
+const LOAD_S: f64 = 1200.0;
+/// Mean of the panel's temperature, K; relaxation time, s, and standard deviation, K.
+const PANEL_K: f64 = 310.0;
+const PANEL_S: f64 = 4000.0;
+const PANEL_SLOW_K: f64 = 1.0;
 /// Relaxation time of the temperatures, s, and their standard deviation, K.
 const HEAT_S: f64 = 1500.0;
 const HEAT_K: f64 = 0.03;
 
 /// Bandwidths of the loops, rad/s.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Loops {
     /// Attitude.
     pub attitude: f64,
@@ -109,20 +238,26 @@ pub struct Record {
     pub electrostatic_n: [[f64; 3]; 2],
     /// Temperatures left and right of test mass 1, and of the battery, which has no effect, K.
     pub temperature_k: [f64; 3],
+    /// Current of the power bus, A.
+    pub bus_a: f64,
+    /// Temperature of the solar panel, K.
+    pub panel_k: f64,
 }
 
 /// xorshift64* and Box–Muller.
-struct Dice {
+#[derive(Clone, Debug)]
+pub(super) struct Dice {
     state: u64,
     kept: Option<f64>,
 }
 
 impl Dice {
-    fn new(seed: u64) -> Self {
+    pub(super) fn new(seed: u64) -> Self {
         Self { state: seed.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1, kept: None }
     }
 
-    fn uniform(&mut self) -> f64 {
+    /// Uniform between 0 and 1.
+    pub(super) fn uniform(&mut self) -> f64 {
         self.state ^= self.state >> 12;
         self.state ^= self.state << 25;
         self.state ^= self.state >> 27;
@@ -138,9 +273,19 @@ impl Dice {
         });
         density * (RATE_HZ / 2.0).sqrt() * unit
     }
+
+    /// Standard normal deviate.
+    fn normal(&mut self) -> f64 {
+        self.white((2.0 / RATE_HZ).sqrt())
+    }
+
+    /// Next sample of an Ornstein–Uhlenbeck process (Euler step).
+    fn relax(&mut self, value: f64, relaxation_s: f64, sigma: f64) -> f64 {
+        value - value * DT_S / relaxation_s + sigma * (2.0 * DT_S / relaxation_s).sqrt() * self.normal()
+    }
 }
 
-#[derive(Clone, Copy, Default)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Loop {
     filtered: f64,
     sum: f64,
@@ -158,6 +303,8 @@ impl Loop {
 
 const SC_KG: f64 = 1500.0;
 const TM_KG: f64 = 1.96;
+/// Noise of the electrodes' force along y and z, N/√Hz.
+const ELECTRODES_N: f64 = 2e-14;
 const INERTIA: [[f64; 3]; 3] = [[800.0, 13.0, 10.0], [13.0, 800.0, 12.0], [10.0, 12.0, 1000.0]];
 /// Force per displacement and mass, s⁻².
 const STIFFNESS: [f64; 3] = [-6e-7, -10e-7, -12e-7];
@@ -193,7 +340,6 @@ fn solve(m: [[f64; 3]; 3], v: [f64; 3]) -> [f64; 3] {
     [dot(v, cross(b, c)) / det, dot(a, cross(v, c)) / det, dot(a, cross(b, v)) / det]
 }
 
-/// Offsets of a flight, `ORF_i`, m.
 impl Flight {
     /// `b_i`, `ORF_i`, m.
     #[must_use]
@@ -206,54 +352,201 @@ impl Flight {
 /// Runs the simulation and returns one record per sample.
 #[must_use]
 pub fn fly(flight: &Flight) -> Vec<Record> {
-    let mut dice = Dice::new(flight.seed);
-    let offset: [[f64; 3]; 2] = [flight.offset_orf_m(0), flight.offset_orf_m(1)];
-    let (mut angle, mut rate) = ([0.0; 3], [0.0; 3]);
-    let (mut r, mut v) = ([[0.0; 3]; 2], [[0.0; 3]; 2]);
-    let mut loops = [Loop::default(); 9];
-    let sunlight = [flight.sunlight_n, 0.0, 0.0];
-    let sunlight_torque = cross([0.1, 0.0, 0.6], sunlight);
-    let hidden = &flight.hidden;
-    // A separate random stream, so that hidden effects do not change the noise.
-    let mut weather = Dice::new(flight.seed + 1_000_000);
-    let (mut temperature_k, mut felt_k) = ([0.0; 3], 0.0);
-    let (settle, keep) = ((SETTLE_S * RATE_HZ) as usize, (flight.seconds * RATE_HZ) as usize);
-    let mut records = Vec::with_capacity(keep);
-    for k in 0..settle + keep {
-        let mut record = Record { dws_sc_rad: angle.map(|a| a + dice.white(flight.dws_rad)), ..Record::default() };
-        for i in 0..2 {
-            record.ifo_x_m[i] = r[i][0] + dice.white(flight.ifo_m);
-            let shown = if i == 0 { 1.0 + hidden.shown_tm1_y } else { 1.0 };
-            record.is_r_m[i] = [r[i][0], shown * r[i][1], r[i][2]].map(|x| x + dice.white(flight.is_m));
+    Spacecraft::new(flight, &Variation::NONE).collect()
+}
+
+/// The simulation as an iterator over its recorded samples; days of data need no memory.
+#[derive(Clone, Debug)]
+pub struct Spacecraft {
+    flight: Flight,
+    variation: Variation,
+    offset_m: [[f64; 3]; 2],
+    angle_rad: [f64; 3],
+    rate_rad_s: [f64; 3],
+    r_m: [[f64; 3]; 2],
+    v_m_s: [[f64; 3]; 2],
+    /// Random walk of the acceleration of each test mass, m/s².
+    slow_m_s2: [[f64; 3]; 2],
+    loops: [Loop; 9],
+    dice: Dice,
+    /// Random streams of their own, so that temperatures, power and strays do not change the noise.
+    weather: Dice,
+    power: Dice,
+    strays: Dice,
+    temperature_k: [f64; 3],
+    felt_k: f64,
+    bus_slow_a: f64,
+    load_on: bool,
+    panel_slow_k: f64,
+    /// Momentum that is still to be transferred to a test mass, N s.
+    left_n_s: f64,
+    /// Samples, those before the first recorded one included.
+    k: usize,
+    settle: usize,
+    end: usize,
+}
+
+impl Spacecraft {
+    /// A flight from its start, before the first recorded sample.
+    #[must_use]
+    pub fn new(flight: &Flight, variation: &Variation) -> Self {
+        let [settle, keep] = [SETTLE_S, flight.seconds].map(|s| (s * RATE_HZ) as usize);
+        let stream = |i: u64| Dice::new(flight.seed + i * 1_000_000);
+        Self {
+            flight: *flight,
+            variation: *variation,
+            offset_m: [flight.offset_orf_m(0), flight.offset_orf_m(1)],
+            angle_rad: [0.0; 3],
+            rate_rad_s: [0.0; 3],
+            r_m: [[0.0; 3]; 2],
+            v_m_s: [[0.0; 3]; 2],
+            slow_m_s2: [[0.0; 3]; 2],
+            loops: [Loop::default(); 9],
+            dice: stream(0),
+            weather: stream(1),
+            power: stream(2),
+            strays: stream(3),
+            temperature_k: [0.0; 3],
+            felt_k: 0.0,
+            bus_slow_a: 0.0,
+            load_on: false,
+            panel_slow_k: 0.0,
+            left_n_s: 0.0,
+            k: 0,
+            settle,
+            end: settle + keep,
+        }
+    }
+
+    /// Adds the errors of the start when their time has come.
+    fn begin(&mut self) {
+        let Start { before_s, displacement_m, attitude_rad } = self.variation.start;
+        if self.k == self.settle - (before_s * RATE_HZ) as usize {
+            for (r, error) in self.r_m.iter_mut().flatten().zip(displacement_m.iter().flatten()) {
+                *r += error;
+            }
+            for (angle, error) in self.angle_rad.iter_mut().zip(attitude_rad) {
+                *angle += error;
+            }
+        }
+    }
+
+    /// Readouts of the state.
+    fn read(&mut self) -> Record {
+        let (flight, hidden, dice) = (&self.flight, &self.flight.hidden, &mut self.dice);
+        let mut record =
+            Record { dws_sc_rad: self.angle_rad.map(|a| a + dice.white(flight.dws_rad)), ..Record::default() };
+        for (i, r) in self.r_m.iter().enumerate() {
+            record.ifo_x_m[i] = r[0] + dice.white(flight.ifo_m);
+            let beside = times(hidden.shown[i], *r);
+            record.is_r_m[i] =
+                std::array::from_fn(|a| r[a] + beside[a] + hidden.is_noise[i][a] * dice.white(flight.is_m));
             record.is_angle_rad[i] = [0.0; 3].map(|x: f64| x + dice.white(1.5e-7));
             record.dws_tm_rad[i] = [0.0; 2].map(|x: f64| x + dice.white(1e-9));
         }
-        for t in &mut temperature_k {
-            // Ornstein–Uhlenbeck step with relaxation time HEAT_S and standard deviation HEAT_K; unit deviates are
-            // white of √(2/rate).
-            *t += -*t * DT_S / HEAT_S + HEAT_K * (2.0 * DT_S / HEAT_S).sqrt() * weather.white((2.0 / RATE_HZ).sqrt());
+        record
+    }
+
+    /// Temperatures and power until this sample, and what housekeeping shows of them.
+    fn keep_house(&mut self, record: &mut Record) {
+        for t in &mut self.temperature_k {
+            *t = self.weather.relax(*t, HEAT_S, HEAT_K);
         }
-        felt_k += (temperature_k[0] - temperature_k[1] - felt_k) * DT_S / HEAT_LAG_S;
-        record.temperature_k = temperature_k.map(|t| 293.0 + t + weather.white(1e-5 * (2.0 / RATE_HZ).sqrt()));
-        control(&mut loops, &flight.loops, &mut record);
-        if k >= settle {
-            records.push(record);
+        let lag_s = self.flight.hidden.heat.map_or(HEAT_LAG_S, |heat| heat.lag_s);
+        self.felt_k += (self.temperature_k[0] - self.temperature_k[1] - self.felt_k) * DT_S / lag_s;
+        record.temperature_k =
+            self.temperature_k.map(|t| 293.0 + t + self.weather.white(1e-5 * (2.0 / RATE_HZ).sqrt()));
+        self.bus_slow_a = self.power.relax(self.bus_slow_a, BUS_S, BUS_SLOW_A);
+        self.panel_slow_k = self.power.relax(self.panel_slow_k, PANEL_S, PANEL_SLOW_K);
+        self.load_on ^= self.power.uniform() < DT_S / LOAD_S;
+        record.bus_a = self.bus_a() + 1e-3 * self.power.normal();
+        record.panel_k = PANEL_K + self.panel_slow_k + 1e-3 * self.power.normal();
+    }
+
+    fn bus_a(&self) -> f64 {
+        BUS_A + self.bus_slow_a + if self.load_on { LOAD_A } else { 0.0 }
+    }
+
+    /// Time since the first recorded sample, s; negative before it.
+    fn time_s(&self) -> f64 {
+        (self.k as f64 - self.settle as f64) * DT_S
+    }
+
+    /// Whether the impulse falls into this sample.
+    fn is_hit(&self, blow: &Blow) -> bool {
+        self.k == self.settle + (blow.at_s * RATE_HZ) as usize
+    }
+
+    /// Thrust and torque that act, SRF, with noise, sunlight and a hit.
+    fn thrust(&mut self, record: &Record) -> ([f64; 3], [f64; 3]) {
+        let (flight, hidden) = (self.flight, self.flight.hidden);
+        let sunlight = [flight.sunlight_n, 0.0, 0.0];
+        let sunlight_torque = cross([0.1, 0.0, 0.6], sunlight);
+        let turned = cross(hidden.thrust_tilt_rad, record.force_n);
+        let mut force: [f64; 3] = std::array::from_fn(|a| {
+            let noise = hidden.thrust_noise[a] * self.dice.white(flight.thrust_n);
+            record.force_n[a] + sunlight[a] + noise + hidden.thrust_gain[a] * record.force_n[a] + turned[a]
+        });
+        if let Some(blow) = hidden.blow.filter(|blow| blow.test_mass.is_none() && self.is_hit(blow)) {
+            force[blow.axis] += blow.momentum_n_s / DT_S;
         }
-        // Everything is constant until the next sample.
-        let mut force: [f64; 3] =
-            std::array::from_fn(|a| record.force_n[a] + sunlight[a] + dice.white(flight.thrust_n));
-        force[1] += hidden.thrust_y * record.force_n[1];
-        if let Some((_, momentum)) = hidden.blow.filter(|(at_s, _)| k == settle + (at_s * RATE_HZ) as usize) {
-            force[0] += momentum / DT_S;
+        if let Some(line) = hidden.line {
+            force[line.axis] += line.force_n * (std::f64::consts::TAU * line.hz * self.time_s()).sin();
         }
-        let torque: [f64; 3] =
-            std::array::from_fn(|a| record.torque_nm[a] + sunlight_torque[a] + dice.white(flight.torque_nm));
-        let mut on_spacecraft = force;
-        let mut torque_on_spacecraft = torque;
-        for i in 0..2 {
+        let torque = std::array::from_fn(|a| {
+            let noise = hidden.torque_noise[a] * self.dice.white(flight.torque_nm);
+            record.torque_nm[a] + sunlight_torque[a] + noise + hidden.torque_gain[a] * record.torque_nm[a]
+        });
+        (force, torque)
+    }
+
+    /// Acceleration of each test mass by hidden forces, ORF.
+    fn hidden_acceleration(&mut self) -> [[f64; 3]; 2] {
+        let mut all = [[0.0; 3]; 2];
+        let hidden = self.flight.hidden;
+        if let Some(heat) = hidden.heat {
+            all[heat.test_mass][heat.axis] += heat.per_k * self.felt_k;
+        }
+        if let Some((i, axis, size)) = hidden.current_squared {
+            all[i][axis] += size * self.bus_a().powi(2);
+        }
+        if let Some((i, axis, size)) = hidden.current_by_panel {
+            all[i][axis] += size * (self.bus_a() - BUS_A) * self.panel_slow_k;
+        }
+        if let Some((blow, i)) = hidden.blow.and_then(|blow| Some((blow, blow.test_mass?))) {
+            if self.is_hit(&blow) {
+                self.left_n_s = blow.momentum_n_s;
+            }
+            let part = if blow.decay_s > 0.0 { 1.0 - (-DT_S / blow.decay_s).exp() } else { 1.0 };
+            all[i][blow.axis] += self.left_n_s * part / DT_S / TM_KG;
+            self.left_n_s -= self.left_n_s * part;
+        }
+        all
+    }
+
+    /// Stray acceleration of a test mass along an axis, and the slow part of the electrodes' noise. White noise of ASD
+    /// `a` with a corner `c` is that and a random walk of ASD `a c/f`, whose steps have the variance `(2π a c)² dt/2`.
+    fn stray(&mut self, i: usize, axis: usize) -> f64 {
+        let Variation { stray_m_s2, corners_hz: [stray_hz, electrodes_hz], .. } = self.variation;
+        let electrodes = if axis > 0 { electrodes_hz * ELECTRODES_N / TM_KG } else { 0.0 };
+        let step = std::f64::consts::TAU * (stray_hz * stray_m_s2).hypot(electrodes) * (0.5 * DT_S).sqrt();
+        self.slow_m_s2[i][axis] += step * self.strays.normal();
+        self.slow_m_s2[i][axis] + self.strays.white(stray_m_s2)
+    }
+
+    /// Everything is constant until the next sample.
+    fn step(&mut self, record: &Record) {
+        let (force, torque) = self.thrust(record);
+        let hidden = self.hidden_acceleration();
+        let electrostatic: [[f64; 3]; 2] = std::array::from_fn(|i| {
+            let (commanded, beside) =
+                (record.electrostatic_n[i], times(self.flight.hidden.electrodes[i], record.electrostatic_n[i]));
+            std::array::from_fn(|a| commanded[a] + beside[a])
+        });
+        let (mut on_spacecraft, mut torque_on_spacecraft) = (force, torque);
+        for (i, acting) in electrostatic.iter().enumerate() {
             // Recoil of the electrodes.
-            let back = to_srf(i, record.electrostatic_n[i]);
-            let twist = to_srf(i, cross(offset[i], record.electrostatic_n[i]));
+            let (back, twist) = (to_srf(i, *acting), to_srf(i, cross(self.offset_m[i], *acting)));
             for a in 0..3 {
                 on_spacecraft[a] -= back[a];
                 torque_on_spacecraft[a] -= twist[a];
@@ -262,32 +555,46 @@ pub fn fly(flight: &Flight) -> Vec<Record> {
         let alpha = solve(INERTIA, torque_on_spacecraft);
         let spacecraft = on_spacecraft.map(|f| f / SC_KG);
         for i in 0..2 {
-            let (carried, swing) = (to_orf(i, spacecraft), cross(to_orf(i, alpha), offset[i]));
+            let (carried, swing) = (to_orf(i, spacecraft), cross(to_orf(i, alpha), self.offset_m[i]));
             for a in 0..3 {
-                let electrostatic = record.electrostatic_n[i][a] + if a > 0 { dice.white(2e-14) } else { 0.0 };
-                let stray = match (i, a) {
-                    (0, 0) => hidden.heat_tm1_x * felt_k,
-                    (1, 0) => hidden.aside_tm2_y_x * record.electrostatic_n[1][1] / TM_KG,
-                    _ => 0.0,
-                };
-                let acceleration =
-                    stray + electrostatic / TM_KG - carried[a] - swing[a] + STIFFNESS[a] * r[i][a] + PULL[i][a];
-                r[i][a] += v[i][a] * DT_S + 0.5 * acceleration * DT_S * DT_S;
-                v[i][a] += acceleration * DT_S;
+                let force_n = electrostatic[i][a] + if a > 0 { self.dice.white(ELECTRODES_N) } else { 0.0 };
+                let stray = hidden[i][a] + self.stray(i, a);
+                let (r, v) = (&mut self.r_m[i][a], &mut self.v_m_s[i][a]);
+                let acceleration = stray + force_n / TM_KG - carried[a] - swing[a] + STIFFNESS[a] * *r + PULL[i][a];
+                *r += *v * DT_S + 0.5 * acceleration * DT_S * DT_S;
+                *v += acceleration * DT_S;
             }
         }
-        for a in 0..3 {
-            angle[a] += rate[a] * DT_S + 0.5 * alpha[a] * DT_S * DT_S;
-            rate[a] += alpha[a] * DT_S;
+        for (a, alpha) in alpha.into_iter().enumerate() {
+            self.angle_rad[a] += self.rate_rad_s[a] * DT_S + 0.5 * alpha * DT_S * DT_S;
+            self.rate_rad_s[a] += alpha * DT_S;
         }
     }
-    records
+}
+
+impl Iterator for Spacecraft {
+    type Item = Record;
+
+    fn next(&mut self) -> Option<Record> {
+        while self.k < self.end {
+            self.begin();
+            let mut record = self.read();
+            self.keep_house(&mut record);
+            control(&mut self.loops, &self.flight.loops, self.variation.attitude, &mut record);
+            self.step(&record);
+            self.k += 1;
+            if self.k > self.settle {
+                return Some(record);
+            }
+        }
+        None
+    }
 }
 
 /// Nine loops and their actuators.
-fn control(loops: &mut [Loop; 9], bandwidths: &Loops, record: &mut Record) {
+fn control(loops: &mut [Loop; 9], bandwidths: &Loops, attitude: [f64; 3], record: &mut Record) {
     let mut wanted = |k: usize, w: f64, y: f64| loops[k].acceleration(w, y);
-    let turn = [0, 1, 2].map(|k| wanted(k, bandwidths.attitude, record.dws_sc_rad[k]));
+    let turn = [0, 1, 2].map(|k| wanted(k, attitude[k] * bandwidths.attitude, record.dws_sc_rad[k]));
     record.torque_nm = times(INERTIA, turn);
     let x = [0, 1].map(|i| wanted(3 + i, bandwidths.x, record.ifo_x_m[i]));
     let y = [0, 1].map(|i| wanted(5 + i, bandwidths.y, record.is_r_m[i][1]));
