@@ -418,6 +418,18 @@ impl<'a> CandidateScorer<'a> {
         Some(Scored { candidate, value, in_range, delta_chi2, information, understated: 1.0 })
     }
 
+    /// The part of a candidate's information under the declared noise that comes from `bands`.
+    pub fn part_in(&self, fit: &Fit, candidate: &Candidate, bands: &[bool]) -> f64 {
+        let theta = &fit.scores.theta;
+        let of = |bands: &dyn Fn(usize) -> bool| {
+            let weights: Vec<DMatrix<f64>> =
+                fit.scores.weights.iter().enumerate().map(|(b, w)| w * f64::from(u8::from(bands(b)))).collect();
+            Self::weighed(self.total, &weights, theta, candidate, candidate).diagonal()
+        };
+        // Of several coefficients, each in its own unit.
+        of(&|b| bands[b]).component_div(&of(&|_| true)).mean()
+    }
+
     /// Corrects the information of a candidate for the weights of the sums. What lasts is weighted by the time that
     /// each band covers ([`Spectra::equal_time_weights`] count all alike). A short waveform has the information of
     /// least squares without a taper: signal and noise are tapered alike, so its position in a segment must not matter.

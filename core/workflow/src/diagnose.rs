@@ -10,7 +10,7 @@ use dragfree_engine::examine::has_parameter;
 use dragfree_engine::run::Progress;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{
-    self, Diagnosis, Found, LIMIT_QUANTILE, Limit, TRANSIENT, Trials, UNOBSERVABLE,
+    self, Diagnosis, Found, LIMIT_QUANTILE, Limit, TRANSIENT, Trials, UNOBSERVABLE, Unexplained,
 };
 use dragfree_identification::innovations::decision::Fitted;
 use dragfree_identification::record::Record;
@@ -93,7 +93,14 @@ fn decide(
     let model = &record.candidate_set.coefficients[..record.candidate_set.model()];
     let start = model.iter().zip(fit.estimate.theta.iter()).map(|(c, value)| (c.name.clone(), *value)).collect();
     let mut point = Point::at(start);
-    let mut slow = slow_forces(scorer, &fit, &record.noise);
+    // A glitch is no slow force, although it has its power.
+    let seen = unexplained(scorer.gathered.transients.certain(settings.false_alarm), &[], settings.same_transient_s);
+    let events = |c: &&Candidate| {
+        let of = |d: &&Detection| (&d.effect, &d.instance) == (&c.effect, &c.instance);
+        c.transient && seen.iter().any(|d| of(&d))
+    };
+    let events: Vec<Candidate> = screened.forms.iter().filter(events).cloned().collect();
+    let mut slow = slow_forces(scorer, &scorer.fit(&events)?, &record.noise);
     let mut named: Vec<Candidate> = Vec::new();
     let mut pass = 0;
     let (decided, screened) = loop {
@@ -196,6 +203,14 @@ fn answer(
     let unexplained = diagnosis::remaining(scorer, &named_forms(decided, forms))?;
     let mut named: Vec<Found> =
         decided.selection.chosen.iter().map(|f| found(settings, decided, f, forms, evidence, true)).collect();
+    let mut others: Vec<Found> =
+        decided.selection.rest.iter().map(|f| found(settings, decided, f, forms, evidence, false)).collect();
+    let doubtful = follows_an_excess(scorer, &named_forms(decided, forms), unexplained.as_ref())?;
+    for f in named.extract_if(.., |f| doubtful.contains(&(f.effect.clone(), f.instance.clone()))) {
+        let channels = unexplained.as_ref().map_or_else(String::new, |u| u.channels.join(", "));
+        let refused = Some(format!("with it {channels} still show what no effect explains"));
+        others.push(Found { accepted: false, refused, ..f });
+    }
     let mut levels = Vec::new();
     for f in louder(decided, record, evidence) {
         let certain = f.p_value < settings.false_alarm;
@@ -207,8 +222,6 @@ fn answer(
         }
     }
     named.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
-    let mut others: Vec<Found> =
-        decided.selection.rest.iter().map(|f| found(settings, decided, f, forms, evidence, false)).collect();
     others.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
     let refused = |f: &Found| {
         let reason = f.refused.as_ref()?;
@@ -238,6 +251,26 @@ fn answer(
             .chain(decided.not_tried.iter().cloned())
             .collect(),
     })
+}
+
+/// Named effects that act where more power than the noise is left with them, in the bands that say most about them: they
+/// follow the cause of that power, and are not it.
+fn follows_an_excess(
+    scorer: &CandidateScorer<'_>,
+    named: &[Candidate],
+    unexplained: Option<&Unexplained>,
+) -> Result<Vec<(String, String)>, WorkflowError> {
+    let Some(u) = unexplained.filter(|u| u.power) else { return Ok(Vec::new()) };
+    let fit = scorer.fit(named)?;
+    let Some(excess) = scorer.without_excess(&fit) else { return Ok(Vec::new()) };
+    let acts = |c: &&Candidate| {
+        let channels = &scorer.candidate_set.channels;
+        let mut own = c.parts.iter().flat_map(|(_, form)| &form.terms).map(|t| &channels[t.channel]);
+        own.any(|channel| u.channels.contains(channel))
+    };
+    let mostly = |c: &&Candidate| scorer.part_in(&excess.plain, c, &excess.bands) > 0.5;
+    let all = named.iter().filter(|c| !c.transient).filter(acts).filter(mostly);
+    Ok(all.map(|c| (c.effect.clone(), c.instance.clone())).collect())
 }
 
 /// A model's entry that makes a candidate in its form.

@@ -68,7 +68,10 @@ fn processes(mission: &Mission, readouts: &[[&str; 3]], prediction: bool) -> Vec
     for axis in AXES {
         if let Some(sensing) = &mission.noise.dws_long_arm {
             let (name, gains) = (format!("dws_long_arm:sc.{axis}"), one_gain(&format!("sc.alpha.{axis}"), 1.0));
-            all.push(process(&name, "rad", sensing.shape(), NoiseResponse::Differenced, gains));
+            all.push(NoiseProcess {
+                components: vec![name.clone()],
+                ..process(&name, "rad", sensing.shape(), NoiseResponse::Differenced, gains)
+            });
         }
     }
     let inverse_inertia = mission.spacecraft.inertia().try_inverse().unwrap_or_else(Matrix3::zeros);

@@ -230,7 +230,7 @@ impl Quadratic {
         self.candidates[candidate].parameters.iter().map(left).fold(f64::INFINITY, f64::min)
     }
 
-    /// The set of effects of the largest evidence that the search meets, in which each is significant beside the others.
+    /// A set of effects in which each is significant beside the others.
     ///
     /// The most significant candidate is added; one is exchanged for another, or for two, where that raises the
     /// evidence; and what is not significant beside the others is taken out, until a set comes back.
@@ -253,11 +253,13 @@ impl Quadratic {
                 set.retain(|c| *c != weak);
             }
             set.sort_unstable();
-            if met.contains(&set) {
+            if let Some(before) = met.iter().position(|other| *other == set) {
+                met.drain(..before);
                 break;
             }
             met.push(set.clone());
         }
+        // One set, or those between which the search goes round.
         let by_evidence = |a: &Vec<usize>, b: &Vec<usize>| self.ln_evidence(a).total_cmp(&self.ln_evidence(b));
         let set = met.into_iter().max_by(by_evidence).unwrap_or_default();
         let chosen = set.iter().map(|c| self.with_alternatives(*c, &set, &usable)).collect();
