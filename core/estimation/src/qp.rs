@@ -121,7 +121,7 @@ impl Problem {
     /// Solves the problem.
     ///
     /// # Errors
-    /// [`QpError`] when the solver ends with anything but `Solved`, or our residuals exceed [`KKT_TOLERANCE`].
+    /// [`QpError`] when the solver ends without a solution, or our residuals exceed [`KKT_TOLERANCE`].
     pub fn solve(&self) -> Result<Solution, QpError> {
         self.check()?;
         let n = self.normal.nrows();
@@ -148,7 +148,9 @@ impl Problem {
         let mut solver = DefaultSolver::new(&CscMatrix::from(&upper), q.as_slice(), &a, &b, &cones, settings)
             .map_err(|e| QpError::Refused { reason: e.to_string(), problem: self.dump() })?;
         solver.solve();
-        if solver.solution.status != SolverStatus::Solved {
+        // A solver that stops a little before its own tolerance has a solution too if the conditions below hold.
+        let near = [SolverStatus::Solved, SolverStatus::AlmostSolved, SolverStatus::InsufficientProgress];
+        if !near.contains(&solver.solution.status) {
             return Err(QpError::Unsolved { status: solver.solution.status.to_string(), problem: self.dump() });
         }
         let u = DVector::from_column_slice(&solver.solution.x);

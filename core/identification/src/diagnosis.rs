@@ -279,6 +279,7 @@ fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>) -> Option<Unex
 #[cfg(test)]
 mod tests {
     use super::*;
+    use dragfree_schema::Settings;
 
     /// Over all forms of all effects together the false-alarm rate is the stated one, and an effect with ten thousand
     /// forms has the same part of it as one with a single form.
