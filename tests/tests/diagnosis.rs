@@ -123,8 +123,8 @@ fn errors_of_a_readout_without_interferometer_are_named_alone() {
     assert_eq!(named_alone(&d, 0.15), "time-offset:is");
 }
 
-/// Eight hours have 3.5σ of the same scale, and the bound, corrected for all that is tried, may not be reached: its size
-/// is within 4σ (false alarm 6e-5), whatever the verdict.
+/// Eight hours have 3.5σ of the same scale, and the bound, corrected for all that is tried, may not be reached: its
+/// size is within 4σ (false alarm 6e-5), whatever the verdict.
 #[test]
 fn a_scale_near_the_bound_has_its_size() {
     let d = diagnosis(&["--hours", "8", "--seed", "31", "--effect", "is-scale:tm2.y=0.05"]);

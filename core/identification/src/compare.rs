@@ -280,7 +280,11 @@ pub fn compare(
     let whole_observations = observations(&whole, plan);
     // The lowest band is seen by segments of full length alone, one observation each.
     let lowest = plan.bands.first().map_or(1, |b| b.bins()) as f64;
-    scorer.require("comparison", whole_observations.first().map_or(0.0, |n| n / lowest))?;
+    scorer.require(
+        "comparison",
+        scorer.settings.min_segments,
+        whole_observations.first().map_or(0.0, |n| n / lowest),
+    )?;
     let fit = scorer.fit(&[])?;
     let residual = residual(scorer, fit.estimate.theta.as_slice());
     let psd = |spectra: &Spectra| -> Vec<DMatrix<f64>> {

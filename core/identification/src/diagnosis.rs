@@ -1,5 +1,5 @@
-//! The answer of a diagnosis: the model is sufficient, named effects are missing, or something remains that no candidate
-//! explains.
+//! The answer of a diagnosis: the model is sufficient, named effects are missing, or something remains that no
+//! candidate explains.
 
 use dragfree_estimation::levels::Levels;
 use dragfree_estimation::verdict::chi2_per_dof_at;

@@ -152,12 +152,12 @@ impl<'a> CandidateScorer<'a> {
         &self.plan
     }
 
-    /// Refuses `segments` short segments where they are too few for `what`.
+    /// Refuses `segments` short segments where they are fewer than `what` needs.
     ///
     /// # Errors
     /// [`IdentificationError::TooShort`].
-    pub(crate) fn require(&self, what: &'static str, segments: f64) -> Result<(), IdentificationError> {
-        let (needed, segment_s) = (self.settings.min_segments, self.gathered.length as f64 / self.gathered.rate_hz);
+    pub(crate) fn require(&self, what: &'static str, needed: f64, segments: f64) -> Result<(), IdentificationError> {
+        let segment_s = self.gathered.length as f64 / self.gathered.rate_hz;
         if segments >= needed {
             return Ok(());
         }

@@ -5,10 +5,12 @@
 
 use std::collections::BTreeMap;
 
+use dragfree_estimation::spectra::FIRST_BIN;
 use serde_json::{Map, Value};
 
 use crate::candidates::Candidate;
 use crate::diagnosis::{Trials, family};
+use crate::gram::LONG;
 use crate::scores::{CandidateScorer, Fit, IdentificationError, Scored, WithoutExcess};
 
 /// Every candidate in the form that the spectra choose.
@@ -40,6 +42,7 @@ pub struct RefinementRequest {
 /// # Errors
 /// [`IdentificationError`]: too little data, or a model that cannot be fitted.
 pub fn screen(scorer: &CandidateScorer<'_>, named: &[Candidate]) -> Result<Screened, IdentificationError> {
+    scorer.require("diagnosis", 1.0, segments(scorer))?;
     let fit = scorer.fit(named)?;
     let ranked = scorer.rank(&fit);
     let trials = Trials::new(scorer, &ranked.tried);
@@ -60,6 +63,17 @@ pub fn screen(scorer: &CandidateScorer<'_>, named: &[Candidate]) -> Result<Scree
         forms.insert(i, form.unwrap_or_else(|| candidate.clone()));
     }
     Ok(Screened { forms, tried: ranked.tried, unobservable: ranked.unobservable, requests })
+}
+
+/// Effective number of independent short segments, from the observations in their lowest octave. A single band is too
+/// narrow: a bin of a short segment spans many bands of the long ones, and counts in one of them.
+fn segments(scorer: &CandidateScorer<'_>) -> f64 {
+    let plan = scorer.plan();
+    let octave = LONG * FIRST_BIN..2 * LONG * FIRST_BIN;
+    let bands =
+        plan.bands.iter().zip(scorer.total.weights.observations(plan)).filter(|(b, _)| octave.contains(&b.first));
+    let (bins, observations) = bands.fold((0, 0.0), |(bins, sum), (b, n)| (bins + b.bins(), sum + n));
+    observations * LONG as f64 / bins.max(1) as f64
 }
 
 /// The ranked candidates, one form per instance, with the two cases in which the score chooses badly: where Σ has

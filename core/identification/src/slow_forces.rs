@@ -11,8 +11,8 @@
 //! ```
 //!
 //! raises the likelihood in every step (majorisation of the Itakura–Saito divergence: Févotte and Idier, Neural
-//! Computation 23, 2421, 2011) and keeps every power positive. A random walk is there when the likelihood says so: beside
-//! one that is not, slow regressors would have less information than they have.
+//! Computation 23, 2421, 2011) and keeps every power positive. A random walk is there when the likelihood says so:
+//! beside one that is not, slow regressors would have less information than they have.
 
 use dragfree_schema::{NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm};
 use nalgebra::{Cholesky, DMatrix, DVector};

@@ -47,7 +47,7 @@ pub struct Settings {
     pub ladder_sigmas: f64,
     /// Chosen. False-alarm rate of a whole comparison or diagnosis: lower misses smaller effects.
     pub false_alarm: f64,
-    /// Chosen. Independent segments of full length below which there is neither: fewer have too coarse a Σ.
+    /// Chosen. Independent segments of full length below which there is no comparison: fewer have too coarse a Σ.
     pub min_segments: f64,
     /// Chosen. Length of a short segment, s: longer ones resolve more and leave fewer observations.
     pub segment_s: f64,

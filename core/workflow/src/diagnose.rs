@@ -1,7 +1,7 @@
 //! Which effect is missing from the model of some products.
 //!
-//! The data are read for transients, for the spectra of all candidates, which choose the form of each, a third time if a
-//! shape can be refined, and then until the likelihood of the innovations, which decides, has settled.
+//! The data are read for transients, for the spectra of all candidates, which choose the form of each, a third time if
+//! a shape can be refined, and then until the likelihood of the innovations, which decides, has settled.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -253,8 +253,8 @@ fn answer(
     })
 }
 
-/// Named effects that act where more power than the noise is left with them, in the bands that say most about them: they
-/// follow the cause of that power, and are not it.
+/// Named effects that act where more power than the noise is left with them, in the bands that say most about them:
+/// they follow the cause of that power, and are not it.
 fn follows_an_excess(
     scorer: &CandidateScorer<'_>,
     named: &[Candidate],

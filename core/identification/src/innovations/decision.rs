@@ -37,8 +37,8 @@ pub struct Evidence<'a> {
     pub most: usize,
     /// Part of the gain of a candidate whose form is a point of a grid that the true form may leave to others.
     pub remainder: f64,
-    /// By how much the likelihood, as twice its logarithm, may be higher outside the ranges of a candidate's values than
-    /// inside before the candidate is refused.
+    /// By how much the likelihood, as twice its logarithm, may be higher outside the ranges of a candidate's values
+    /// than inside before the candidate is refused.
     pub range: f64,
 }
 
@@ -175,8 +175,8 @@ impl Quadratic {
         (values.iter().copied().collect(), gain)
     }
 
-    /// Logarithm of the evidence of a set: of the probability of the data with the values averaged over what is known of
-    /// them before, up to a constant, and of the weights of its candidates. Of a value of which nothing is known, a
+    /// Logarithm of the evidence of a set: of the probability of the data with the values averaged over what is known
+    /// of them before, up to a constant, and of the weights of its candidates. Of a value of which nothing is known, a
     /// Gaussian with the information of one number of the data is (Kass and Wasserman, 1995).
     fn ln_evidence(&self, set: &[usize]) -> f64 {
         let at = self.parameters(set);

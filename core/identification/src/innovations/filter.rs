@@ -14,9 +14,9 @@
 //! variance before any data is [`FREE`] times what it would be by chance, because commands know the readouts before the
 //! first sample, and a state that is independent of them would bias a gain.
 //!
-//! The state is fitted as soon as the rows that follow tell nothing more of it, see [`Predictor::start`]: everything goes
-//! on from the state as it is then found, so that what remains of its influence is what remains of its *error*. The
-//! same at the end of a block of time: its rows are given the blocks before it, as a likelihood is a product of
+//! The state is fitted as soon as the rows that follow tell nothing more of it, see [`Predictor::start`]: everything
+//! goes on from the state as it is then found, so that what remains of its influence is what remains of its *error*.
+//! The same at the end of a block of time: its rows are given the blocks before it, as a likelihood is a product of
 //! conditional ones, and the sums of all blocks are those of the whole.
 
 use std::sync::{Mutex, PoisonError};
@@ -37,9 +37,9 @@ const ROWS: usize = 128;
 /// What is left of a start when squares of innovations are summed for levels of the noise, and the longest wait, s.
 const SETTLED: f64 = 1e-2;
 const LONGEST_WAIT_S: f64 = 600.0;
-/// What the rows behind the fit of a start may still tell of it, in squares of whitened innovations: sums are of at least
-/// thousands of these, so it is below the digits that rounding leaves. Between test masses, where the forces are weak,
-/// readouts are averaged over many minutes, so that this takes hours.
+/// What the rows behind the fit of a start may still tell of it, in squares of whitened innovations: sums are of at
+/// least thousands of these, so it is below the digits that rounding leaves. Between test masses, where the forces are
+/// weak, readouts are averaged over many minutes, so that this takes hours.
 pub(crate) const TOLD: f64 = 1e-10;
 /// Variance of a start over what it is by chance.
 pub(crate) const FREE: f64 = 1e6;
@@ -462,9 +462,9 @@ impl Innovations {
 
     /// Fits the state at the start out of all sums since then: with D its information, M its covariance before the data
     /// and B its products with the rest, they lose `B G Bᵀ` with `G = M (1 + D M)⁻¹`, which is its covariance
-    /// afterwards. All lanes go on as they would from the start as it is found. That of the data has the difference from
-    /// the innovations from the start as it is known, which stay what drives the lanes of the noise: what these are is
-    /// then the same whenever a start is fitted.
+    /// afterwards. All lanes go on as they would from the start as it is found. That of the data has the difference
+    /// from the innovations from the start as it is known, which stay what drives the lanes of the noise: what these
+    /// are is then the same whenever a start is fitted.
     fn take_start_out(&mut self) {
         let Some(pending) = &mut self.pending else { return };
         let moving = 2 * self.kernel.channels;

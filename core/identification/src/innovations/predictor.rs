@@ -105,9 +105,9 @@ impl Predictor {
         of(stationary(&before.closed, &symmetric(&driven))).ok_or_else(exact)
     }
 
-    /// How the predictor changes when the covariance of the driving noise does, to first order. The system is that of the
-    /// predictor, or has the states of filters at zero behind its own ([`NoiseStates::extended`]): these have no gain, as
-    /// nothing drives them, and no part in the steady covariance, but both change.
+    /// How the predictor changes when the covariance of the driving noise does, to first order. The system is that of
+    /// the predictor, or has the states of filters at zero behind its own ([`NoiseStates::extended`]): these have no
+    /// gain, as nothing drives them, and no part in the steady covariance, but both change.
     pub fn change(&self, system: &NoiseStates, driving: &DMatrix<f64>) -> Change {
         let (f, c) = (&system.transition, &system.output);
         let (known, states) = (self.gain.nrows(), f.nrows());

@@ -217,8 +217,8 @@ impl NoiseStates {
         }
     }
 
-    /// The same system with the states of one more filter behind all others. At coefficient zero nothing drives them, so
-    /// that what is predicted is the same; how it changes with the coefficient, see [`Predictor::change`], is not.
+    /// The same system with the states of one more filter behind all others. At coefficient zero nothing drives them,
+    /// so that what is predicted is the same; how it changes with the coefficient, see [`Predictor::change`], is not.
     ///
     /// [`Predictor::change`]: super::predictor::Predictor::change
     pub fn extended(&self, filter: usize) -> Self {
@@ -239,9 +239,9 @@ impl NoiseStates {
         self.processes.iter().enumerate().find_map(|(i, p)| Some((i, of(p)?)))
     }
 
-    /// Place of each state among those that are needed to filter data: a channel sees only the sum of its slow states of
-    /// all orders, and sums follow the same differences as the states at the same distance from the output. With R the
-    /// matrix that sums, `R F = F' R` and `C = C' R`.
+    /// Place of each state among those that are needed to filter data: a channel sees only the sum of its slow states
+    /// of all orders, and sums follow the same differences as the states at the same distance from the output. With R
+    /// the matrix that sums, `R F = F' R` and `C = C' R`.
     pub fn merged(&self) -> Vec<usize> {
         let mut stands: Vec<usize> = (0..self.transition.nrows()).collect();
         for i in 0..self.channels() {

@@ -515,9 +515,10 @@ fn scores_equal_those_of_the_covariance_of_all_samples() {
     assert!((sums.chi2 / chi2 - 1.0).abs() < 1e-6, "{} against {chi2}", sums.chi2);
 }
 
-/// The start is fitted early and its influence on slow states goes on from the fit: sums equal those of the covariance of
-/// all samples, made of the impulse responses of the predictor. They differ by what later samples tell of the start. Where
-/// the longest wait ends before, later samples are as the start that is fitted makes them, and tell nothing of it.
+/// The start is fitted early and its influence on slow states goes on from the fit: sums equal those of the covariance
+/// of all samples, made of the impulse responses of the predictor. They differ by what later samples tell of the start.
+/// Where the longest wait ends before, later samples are as the start that is fitted makes them, and tell nothing of
+/// it.
 #[test]
 fn a_start_that_is_fitted_early_leaves_no_error() {
     let slow = process(
