@@ -14,10 +14,10 @@
 //! variance before any data is [`FREE`] times what it would be by chance, because commands know the readouts before the
 //! first sample, and a state that is independent of them would bias a gain.
 //!
-//! The state is fitted as soon as the rows that follow tell nothing more of it, see [`Predictor::start`]: everything
-//! goes on from the state as it is then found, so that what remains of its influence is what remains of its *error*.
-//! The same at the end of a block of time: its rows are given the blocks before it, as a likelihood is a product of
-//! conditional ones, and the sums of all blocks are those of the whole.
+//! The state is fitted at the end of a stretch without a gap, and at the end of each block of time: everything goes on
+//! from the state as it is then found, with what is still unknown of it. A block's rows are so given the blocks before
+//! it, as a likelihood is a product of conditional ones, and the sums of all blocks are those of the whole. Between test
+//! masses, where forces are weak, readouts are averaged over many minutes: what a start was is told for many hours.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -37,10 +37,6 @@ const ROWS: usize = 128;
 /// What is left of a start when squares of innovations are summed for levels of the noise, and the longest wait, s.
 const SETTLED: f64 = 1e-2;
 const LONGEST_WAIT_S: f64 = 600.0;
-/// What the rows behind the fit of a start may still tell of it, in squares of whitened innovations: sums are of at
-/// least thousands of these, so it is below the digits that rounding leaves. Between test masses, where the forces are
-/// weak, readouts are averaged over many minutes, so that this takes hours.
-pub(crate) const TOLD: f64 = 1e-10;
 /// Variance of a start over what it is by chance.
 pub(crate) const FREE: f64 = 1e6;
 /// Powers of time that each channel may follow beside everything else: a constant, a slope, a curvature.
@@ -214,14 +210,6 @@ struct Product {
     sum: DMatrix<f64>,
 }
 
-/// A start that is not fitted yet.
-struct Pending {
-    /// Its covariance as the blocks before have it, in the units of the channels.
-    covariance: DMatrix<f64>,
-    /// Rows until it is fitted.
-    rows: usize,
-}
-
 /// Rows that wait.
 struct Waiting {
     /// Series with the powers of time.
@@ -245,10 +233,8 @@ pub struct Innovations {
     lanes: Vec<usize>,
     /// Covariance of the moving averages at a start.
     start: DMatrix<f64>,
-    /// Samples after which a start is fitted.
-    told: usize,
-    /// The start of the stretch that goes on.
-    pending: Option<Pending>,
+    /// Covariance of the start of the stretch that goes on, as the blocks before have it.
+    uncertain: DMatrix<f64>,
     /// Whether no row has been filtered since the last start.
     fresh: bool,
     /// Starts as they are known, and as they are found.
@@ -342,9 +328,8 @@ impl Innovations {
             groups,
             changes: parameters.iter().enumerate().filter_map(innovation).collect(),
             lanes,
-            told: predictor.start(system, &start, TOLD, 1 << 30).max(1),
+            uncertain: start.clone(),
             start,
-            pending: None,
             fresh: false,
             known_starts: starts,
             starts: Vec::new(),
@@ -401,15 +386,6 @@ impl Innovations {
             self.fresh = false;
             self.waiting.counts.push(self.unsettled == 0);
             self.unsettled = self.unsettled.saturating_sub(1);
-            let told = self.pending.as_mut().is_some_and(|start| {
-                start.rows -= 1;
-                start.rows == 0
-            });
-            if told {
-                self.sum();
-                self.take_start_out();
-                self.pending = None;
-            }
         }
         self.last_ns = Some(time_ns);
         self.before.copy_from_slice(series);
@@ -455,7 +431,7 @@ impl Innovations {
         }
         let state = DVector::from_column_slice(&self.state[..moving]);
         self.starts.push(Start { state, slope: DMatrix::zeros(moving, self.lanes.len() - 1) });
-        self.pending = Some(Pending { covariance: self.start.clone(), rows: usize::MAX });
+        self.uncertain.copy_from(&self.start);
         self.unsettled = self.settling;
         self.fresh = true;
     }
@@ -466,13 +442,12 @@ impl Innovations {
     /// from the innovations from the start as it is known, which stay what drives the lanes of the noise: what these
     /// are is then the same whenever a start is fitted.
     fn take_start_out(&mut self) {
-        let Some(pending) = &mut self.pending else { return };
         let moving = 2 * self.kernel.channels;
         let asked = self.groups.len() - 1;
         let with_start = self.products.len() - self.groups.len();
         let (own, with) = self.products.split_at_mut(with_start);
         let Some(information) = with.last().map(|p| p.sum.view((0, 0), (moving, moving)).into_owned()) else { return };
-        let gain = known_with(&pending.covariance, &information);
+        let gain = known_with(&self.uncertain, &information);
         // Lanes of a group × states.
         let products: Vec<DMatrix<f64>> = with[..asked].iter().map(|p| p.sum.columns(0, moving).into_owned()).collect();
         let fitted: Vec<DMatrix<f64>> = products.iter().map(|b| b * &gain).collect();
@@ -489,7 +464,7 @@ impl Innovations {
                 slope -= of(*lane).transpose();
             }
         }
-        pending.covariance = gain;
+        self.uncertain = gain;
         let Some((starts, rest)) = self.groups.split_last_mut() else { return };
         for i in 0..moving {
             let (tile, at) = (&starts.tiles[i / LANES].state, i % LANES);
@@ -516,10 +491,7 @@ impl Innovations {
             innovations: &self.waiting.innovations,
         };
         let (kernel, threads) = (&self.kernel, self.threads);
-        let starts = usize::from(self.pending.is_none());
-        let (groups, products) = (self.groups.len(), self.products.len());
-        let live = &mut self.groups[..groups - starts];
-        in_parallel(live, threads, |group| group.filter(kernel, &batch));
+        in_parallel(&mut self.groups, threads, |group| group.filter(kernel, &batch));
         // The lane of the data has what the starts as they are found add to the innovations.
         let lane = self.lanes.last().copied().unwrap_or(0);
         let mut white = DVector::zeros(n);
@@ -534,8 +506,7 @@ impl Innovations {
         }
         self.samples += rows as u64;
         let whitened: Vec<&[f64]> = self.groups.iter().map(|g| g.whitened.as_slice()).collect();
-        let live = products - if starts > 0 { groups } else { 0 };
-        in_parallel(&mut self.products[..live], threads, |Product { groups: (i, j), sum }| {
+        in_parallel(&mut self.products, threads, |Product { groups: (i, j), sum }| {
             let (a, b) = (sum.nrows(), sum.ncols());
             let a = DMatrixView::from_slice(whitened[*i], a, rows * n);
             // Transposed by its strides.

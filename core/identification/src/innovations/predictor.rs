@@ -138,33 +138,6 @@ impl Predictor {
         stationary(&f.into_owned(), &(k * &self.innovation * k.transpose()))
     }
 
-    /// Samples after which a start of covariance `before` is known as well as it will ever be: what all later samples
-    /// tell of it is no more than `part` of the square of a whitened innovation, at most `most`.
-    ///
-    /// With the information R of the later samples and the covariance V that the earlier ones leave, it is tr(V R). The
-    /// innovations of later samples, from the state as it is found, have the covariance `1 + O V Oᵀ` with
-    /// `tr(O V Oᵀ) = tr(V R)`: to take them for white is an error of this size.
-    pub fn start(&self, system: &NoiseStates, before: &DMatrix<f64>, part: f64, most: usize) -> usize {
-        let n = 2 * system.channels();
-        let output = &self.whitening * &system.output;
-        // Information of all samples on the state, that on slow states included: they remember the start for longest.
-        let all = stationary(&self.closed.transpose(), &(output.transpose() * output));
-        let start = |m: &DMatrix<f64>| m.view((0, 0), (n, n)).into_owned();
-        let (whole, unit) = (start(&all), DMatrix::identity(n, n));
-        let mut power = self.closed.clone();
-        let mut samples = 1;
-        while samples < most {
-            let later = start(&(power.transpose() * &all * &power));
-            let told = (&unit + (&whole - &later) * before).try_inverse();
-            if told.is_some_and(|inverse| (before * inverse * later).trace() <= part) {
-                break;
-            }
-            power = &power * &power;
-            samples *= 2;
-        }
-        samples.min(most)
-    }
-
     /// Samples after which what the state was has less than `part` of its influence on the innovations, at most `most`.
     pub fn settling(&self, system: &NoiseStates, part: f64, most: usize) -> usize {
         let n = 2 * system.channels();

@@ -6,7 +6,7 @@ use rand::{RngExt as _, SeedableRng as _};
 use rand_xoshiro::Xoshiro256PlusPlus as StdRng;
 
 use super::decision::{Candidate, Evidence, Prior, Quadratic};
-use super::filter::{FREE, Innovations, POWERS, Parameter, Passed, Setup, Sums, TOLD};
+use super::filter::{FREE, Innovations, POWERS, Parameter, Passed, Setup, Sums};
 use super::predictor::Predictor;
 use super::state_space::{NoisePoint, NoiseStates};
 
@@ -513,99 +513,6 @@ fn scores_equal_those_of_the_covariance_of_all_samples() {
     }
     let chi2 = z.dot(&(&inverse * &z));
     assert!((sums.chi2 / chi2 - 1.0).abs() < 1e-6, "{} against {chi2}", sums.chi2);
-}
-
-/// The start is fitted early and its influence on slow states goes on from the fit: sums equal those of the covariance
-/// of all samples, made of the impulse responses of the predictor. They differ by what later samples tell of the start.
-/// Where the longest wait ends before, later samples are as the start that is fitted makes them, and tell nothing of
-/// it.
-#[test]
-fn a_start_that_is_fitted_early_leaves_no_error() {
-    let slow = process(
-        "slow",
-        NoiseResponse::Held,
-        &[(2.0, 1.0, 2), (1.0, 1.0, 4)],
-        &[("a", &[1.0, 0.0]), ("b", &[-0.5, 1.0])],
-    );
-    let declared: Vec<NoiseProcess> = declared().into_iter().chain([slow]).collect();
-    let system = NoiseStates::new(&declared, &channels(), DT_S, &[], &[]).expect("a system");
-    let point = system.declared_point();
-    let predictor = Predictor::new(&system, &system.driving(&point)).expect("a predictor");
-    let samples = 400;
-    let before = predictor.known_of_the_start(&system) * FREE;
-    let told = predictor.start(&system, &before, TOLD, samples);
-    // Not the moving averages alone: slow states remember them.
-    assert!(told > predictor.settling(&system, TOLD, samples) && told < samples / 2, "{told}");
-    let mut response = DMatrix::identity(2 * samples, 2 * samples);
-    let mut starts = DMatrix::zeros(2 * samples, 4);
-    let (mut gain, mut power) = (predictor.gain.clone(), DMatrix::identity(system.transition.nrows(), 4));
-    for lag in 0..samples {
-        starts.view_mut((2 * lag, 0), (2, 4)).copy_from(&(&system.output * &power));
-        power = &system.transition * power;
-        for t in lag + 1..samples {
-            response.view_mut((2 * t, 2 * (t - lag - 1)), (2, 2)).copy_from(&(&system.output * &gain));
-        }
-        gain = &system.transition * gain;
-    }
-    // Whitened, all samples with all: (1 + O M Oᵀ)⁻¹ = 1 − O (M⁻¹ + Oᵀ O)⁻¹ Oᵀ.
-    let white = DMatrix::identity(samples, samples).kronecker(&predictor.whitening);
-    let whiten = |m: &DMatrix<f64>| &white * response.solve_lower_triangular(m).expect("units on the diagonal");
-    let starts = whiten(&starts);
-    let inverse = before.clone().try_inverse().expect("a covariance");
-    let data = drawn(&system, &predictor, samples, 12);
-    let series: Vec<Vec<f64>> = noise(samples, 13).into_iter().map(|x| x.to_vec()).collect();
-    // Two columns and the data.
-    let all = whiten(&DMatrix::from_fn(2 * samples, 3, |i, k| match k {
-        2 => data[i / 2][i % 2] / system.unit[i % 2],
-        _ if k == i % 2 => series[i / 2][k],
-        _ => 0.0,
-    }));
-    let parameters =
-        (0..2).map(|c| Parameter { responses: vec![(c, c, system.unit[c])], change: None }).collect::<Vec<_>>();
-    for most in [samples, 8] {
-        let told = 2 * predictor.start(&system, &before, TOLD, most);
-        // The fit of the start to the first rows, all as it is from there on, and what the rest would tell.
-        let fitted = |rows: usize| {
-            let (all, starts) = (all.rows(0, rows), starts.rows(0, rows));
-            let left = (&inverse + starts.transpose() * starts).try_inverse().expect("an information");
-            left * starts.transpose() * all
-        };
-        let residuals = |fit: DMatrix<f64>| &all - &starts * &fit;
-        let products = |rows: usize| {
-            let fit = fitted(rows);
-            let prior = fit.transpose() * &inverse * &fit;
-            let left = residuals(fit);
-            left.transpose() * &left + prior
-        };
-        let (expected, exact) = (products(told), products(2 * samples));
-        let mut innovations = Innovations::new(Setup {
-            system: &system,
-            predictor: &predictor,
-            known: Vec::new(),
-            parameters: parameters.clone(),
-            starts: Vec::new(),
-            series: 2,
-            averaged: false,
-            // The longest wait is ten minutes.
-            step_ns: 600_000_000_000 / most as i64,
-            block: None,
-            threads: 1,
-        });
-        for (t, (z, series)) in data.iter().zip(&series).enumerate() {
-            innovations.push(t as i64 * 600_000_000_000 / most as i64, z, series);
-        }
-        let sums = innovations.finish().total();
-        for (i, j) in (0..3).flat_map(|i| (0..3).map(move |j| (i, j))) {
-            let measured = match (i, j) {
-                (2, 2) => sums.chi2,
-                (2, k) | (k, 2) => sums.score[k],
-                at => sums.information[at],
-            };
-            let off = |from: &DMatrix<f64>| (measured - from[(i, j)]).abs() / (from[(i, i)] * from[(j, j)]).sqrt();
-            assert!(off(&expected) < 1e-11, "{most} {i} {j}: {:e}", off(&expected));
-            assert!(most < samples || off(&exact) < TOLD, "{i} {j}: {:e}", off(&exact));
-        }
-    }
 }
 
 /// What two sums of the same numbers in another order may differ by, in units of their size.
