@@ -97,7 +97,7 @@ fn decide(
     let seen = unexplained(scorer.gathered.transients.certain(settings.false_alarm), &[], settings.same_transient_s);
     let events = |c: &&Candidate| {
         let of = |d: &&Detection| (&d.effect, &d.instance) == (&c.effect, &c.instance);
-        c.transient && seen.iter().any(|d| of(&d))
+        c.transient && seen.iter().any(of)
     };
     let events: Vec<Candidate> = screened.forms.iter().filter(events).cloned().collect();
     let mut slow = slow_forces(scorer, &scorer.fit(&events)?, &record.noise);
@@ -107,34 +107,6 @@ fn decide(
         let chosen: Vec<EffectEntry> = screened.forms.iter().map(entry).collect();
         let decided = one_pass(replay, settings, &chosen, &slow, &point, evidence, progress)?;
         let next = step(&point, &decided);
-        if std::env::var_os("DEBUG_PASS").is_some() {
-            eprintln!(
-                "pass {pass}: named {:?}, chi2/dof {:.5}, levels {:?}, values {:?}",
-                decided
-                    .selection
-                    .chosen
-                    .iter()
-                    .map(|f| format!(
-                        "{}:{} {:?} gain {:.1} beyond {:.1}",
-                        decided.candidates[f.candidate].0,
-                        decided.candidates[f.candidate].1,
-                        f.values,
-                        f.gain,
-                        f.beyond
-                    ))
-                    .collect::<Vec<_>>(),
-                decided.chi2 / decided.numbers,
-                next.levels,
-                next.values
-            );
-            for s in &slow {
-                eprintln!(
-                    "  {} {:.2e}",
-                    s.name,
-                    s.spectrum.as_ref().map_or(0.0, |x| x.terms[0].asd * x.terms[0].corner_hz)
-                );
-            }
-        }
         // The first pass fits constants alone.
         let settled = pass > 1 && reached(&point, &next, &decided);
         point = next;

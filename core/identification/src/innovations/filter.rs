@@ -16,8 +16,9 @@
 //!
 //! The state is fitted at the end of a stretch without a gap, and at the end of each block of time: everything goes on
 //! from the state as it is then found, with what is still unknown of it. A block's rows are so given the blocks before
-//! it, as a likelihood is a product of conditional ones, and the sums of all blocks are those of the whole. Between test
-//! masses, where forces are weak, readouts are averaged over many minutes: what a start was is told for many hours.
+//! it, as a likelihood is a product of conditional ones, and the sums of all blocks are those of the whole. Between
+//! test masses, where forces are weak, readouts are averaged over many minutes: what a start was is told for many
+//! hours.
 
 use std::sync::{Mutex, PoisonError};
 
