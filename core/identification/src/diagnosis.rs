@@ -153,8 +153,8 @@ pub struct Diagnosis {
 }
 
 /// Numbers of trials for the correction of p-values. Every effect, and the search for transients, has the same part of
-/// [`Settings::false_alarm`]; an effect's part is shared by all its forms (weighted Bonferroni; the weights are fixed
-/// before the data are seen).
+/// [`dragfree_schema::Settings::false_alarm`]; an effect's part is shared by all its forms (weighted Bonferroni; the
+/// weights are fixed before the data are seen).
 ///
 /// With equal weights of all forms, an effect of one form would pay for the ten thousand pairs of thermometers and lags
 /// of another.

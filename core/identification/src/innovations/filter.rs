@@ -11,8 +11,8 @@
 //! The predictor is the steady one from the first sample on and after every gap. What an infinite past would have told
 //! it of the moving averages is then unknown: a state whose effect on the innovations is filtered beside the parameters
 //! and fitted out of the sums. Given that state the innovations are white, so this is exact. The state is free: its
-//! variance before any data is [`FREE`] times what it would be by chance, because commands know the readouts before the
-//! first sample, and a state that is independent of them would bias a gain.
+//! variance before any data is a million times what it would be by chance, because commands know the readouts before
+//! the first sample, and a state that is independent of them would bias a gain.
 //!
 //! The state is fitted at the end of a stretch without a gap, and at the end of each block of time: everything goes on
 //! from the state as it is then found, with what is still unknown of it. A block's rows are so given the blocks before

@@ -11,7 +11,7 @@
 //! ```
 //!
 //! Coloured terms of the spectra, `(corner/f)^p`, are sums of white noise repeated `p/2` times: the states r. Below
-//! [`LEAST_HZ`] they are flat.
+//! a microhertz they are flat.
 
 use std::collections::BTreeMap;
 use std::f64::consts::TAU;
