@@ -177,7 +177,10 @@ fn answer(
         decided.selection.chosen.iter().map(|f| found(settings, decided, f, forms, evidence, true)).collect();
     let mut others: Vec<Found> =
         decided.selection.rest.iter().map(|f| found(settings, decided, f, forms, evidence, false)).collect();
-    let doubtful = follows_an_excess(scorer, &named_forms(decided, forms), unexplained.as_ref())?;
+    // A small remainder of what was there without them is what the grid of forms cannot represent.
+    let before = diagnosis::remaining(scorer, &[])?.map_or(0.0, |u| u.ratio);
+    let loud = unexplained.as_ref().filter(|u| u.ratio > settings.excess_remainder * before);
+    let doubtful = follows_an_excess(scorer, &named_forms(decided, forms), loud)?;
     for f in named.extract_if(.., |f| doubtful.contains(&(f.effect.clone(), f.instance.clone()))) {
         let channels = unexplained.as_ref().map_or_else(String::new, |u| u.channels.join(", "));
         let refused = Some(format!("with it {channels} still show what no effect explains"));
