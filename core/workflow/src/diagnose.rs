@@ -78,6 +78,9 @@ pub fn diagnose(
     Ok(Diagnosed { diagnosis, settings: settings.clone(), record })
 }
 
+/// Passes that fit constants alone: the first from 1e5 σ, so that rounding leaves some σ to the second.
+const OPENING: usize = 2;
+
 /// Decides by the likelihood of the innovations among the forms that the spectra choose, beside the effects that are
 /// named so far: passes until nothing moves.
 fn decide(
@@ -105,13 +108,13 @@ fn decide(
     let mut pass = 0;
     let (decided, screened) = loop {
         let chosen: Vec<EffectEntry> = screened.forms.iter().map(entry).collect();
-        let decided = one_pass(replay, settings, &chosen, &slow, &point, evidence, progress)?;
+        let opening = pass < OPENING;
+        let decided = one_pass(replay, settings, &chosen, &slow, opening, &point, evidence, progress)?;
         let next = step(&point, &decided);
-        // The first pass fits constants alone.
-        let settled = pass > 1 && reached(&point, &next, &decided);
+        let settled = pass > OPENING && reached(&point, &next, &decided);
         point = next;
         let now = named_forms(&decided, &screened.forms);
-        if pass == PASSES || settled && now == named {
+        if pass == OPENING + PASSES || settled && now == named {
             break (decided, screened);
         }
         if now != named {

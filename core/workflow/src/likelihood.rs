@@ -24,7 +24,7 @@ use pass::Filtered;
 use crate::WorkflowError;
 use crate::replay::{Pass, Replay, noise_levels};
 
-/// Passes after which the point is taken as it is.
+/// Passes after the opening ones after which the point is taken as it is.
 pub(crate) const PASSES: usize = 6;
 /// A point is reached when nothing moves by more than this part of its σ.
 const REACHED_SIGMAS: f64 = 0.5;
@@ -141,6 +141,7 @@ pub(crate) fn one_pass(
     settings: &Settings,
     chosen: &[EffectEntry],
     slow: &[NoiseProcess],
+    opening: bool,
     point: &Point,
     judge: &dyn Judge,
     progress: &mut dyn FnMut(Pass, usize, Progress),
@@ -160,7 +161,7 @@ pub(crate) fn one_pass(
             threads: replay.threads,
             batch_rows: replay.batch_rows,
         };
-        let link = |chain: &Chain| Filtered::link(chain, point, slow, number, settings, replay.threads);
+        let link = |chain: &Chain| Filtered::link(chain, point, slow, opening, number, settings, replay.threads);
         let (filtered, refused) =
             examine(replay.registry, &examination, link, &mut |p| progress(Pass::Likelihood, number, p))?;
         not_tried.extend(refused);

@@ -287,8 +287,8 @@ impl Filtered {
     /// The filter of one product's chain at a point, with `slow` forces beside the declared noise; `number` is that of
     /// the product.
     ///
-    /// The first pass, which has no powers of time yet, fits these with the model and what is named alone: constants of
-    /// the channels are many σ of the noise between test masses, and a filter without them would take them for noise.
+    /// An opening pass fits constants of the channels, powers of time and the model alone: constants are many σ of the
+    /// noise between test masses, and a filter without them would take them for noise.
     ///
     /// # Errors
     /// [`WorkflowError::NoLikelihood`] where the declared noise cannot be filtered.
@@ -296,6 +296,7 @@ impl Filtered {
         chain: &Chain,
         point: &Point,
         slow: &[NoiseProcess],
+        opening: bool,
         number: usize,
         settings: &Settings,
         threads: usize,
@@ -308,7 +309,6 @@ impl Filtered {
         };
         let responses = Responses::of(&available)?;
         let noise = NoiseAt::new(&available, &responses, point)?;
-        let opening = point.powers.is_empty();
         let mut unknowns: Vec<(String, Meaning, Parameter)> = Vec::new();
         let named = |c: &Coefficient| point.values.contains_key(&c.name);
         let asked = |c: &Coefficient| if c.candidate { !opening || named(c) } else { c.estimate };
