@@ -19,7 +19,7 @@ use nalgebra::{DMatrix, DVector};
 
 mod pass;
 
-use pass::Filtered;
+use pass::{Constant, Filtered};
 
 use crate::WorkflowError;
 use crate::replay::{Pass, Replay, noise_levels};
@@ -40,8 +40,10 @@ pub(crate) struct Point {
     pub(crate) values: BTreeMap<String, f64>,
     /// Amplitudes of components of the noise over the declared ones.
     pub(crate) levels: BTreeMap<String, f64>,
-    /// Powers of time of each channel, by product; none before the first pass.
+    /// Powers of time of each channel, by product, beside series with their means; none before the first pass.
     powers: BTreeMap<String, f64>,
+    /// Means of series by table and name, by product.
+    means: Vec<BTreeMap<(String, String), f64>>,
     /// States at the start of each stretch, by product.
     starts: Vec<Vec<DVector<f64>>>,
 }
@@ -78,6 +80,8 @@ pub(crate) struct Decided {
     pub(crate) channels: BTreeMap<String, BTreeSet<String>>,
     /// Values of the parameters at which the pass was made.
     start: Vec<f64>,
+    constants: Vec<Constant>,
+    means: Vec<BTreeMap<(String, String), f64>>,
     /// Starts of the stretches, by product.
     starts: Vec<Vec<Start>>,
     /// Candidates that could not be tried, and why.
@@ -110,6 +114,11 @@ pub(crate) fn step(from: &Point, decided: &Decided) -> Point {
             Meaning::Power => drop(to.powers.insert(name.clone(), value)),
         }
     }
+    for constant in &decided.constants {
+        let own = constant.at(&to.values);
+        to.powers.entry(constant.power.clone()).and_modify(|value| *value -= own);
+    }
+    to.means.clone_from(&decided.means);
     let moved = &decided.selection.values - DVector::from_column_slice(&decided.start);
     let state = |start: &Start| &start.state + &start.slope * &moved;
     to.starts = decided.starts.iter().map(|product| product.iter().map(state).collect()).collect();
@@ -178,6 +187,8 @@ struct Joined {
     channels: BTreeMap<String, BTreeSet<String>>,
     sums: Option<Sums>,
     starts: Vec<Starts>,
+    constants: Vec<Constant>,
+    means: Vec<BTreeMap<(String, String), f64>>,
 }
 
 /// Starts of the stretches of one product.
@@ -189,7 +200,9 @@ struct Starts {
 
 impl Joined {
     fn add(&mut self, filtered: Filtered, not_tried: &mut Vec<(String, String)>, settings: &Settings) {
-        let Filtered { parameters, surveys, channels, gaps, innovations, .. } = filtered;
+        self.means.push(filtered.means());
+        let Filtered { parameters, surveys, channels, gaps, innovations, constants, .. } = filtered;
+        self.constants.extend(constants);
         let own = innovations.finish().total();
         let gappy = gaps.refused(settings);
         let mut kept: Vec<usize> = Vec::new();
@@ -259,7 +272,10 @@ impl Joined {
             start.push(match meaning {
                 Meaning::Coefficient(_) => point.values.get(name).copied().unwrap_or(0.0),
                 Meaning::Level => point.levels.get(name).copied().unwrap_or(1.0).ln(),
-                Meaning::Power => point.powers.get(name).copied().unwrap_or(0.0),
+                Meaning::Power => point.powers.get(name).map_or(0.0, |value| {
+                    let means = self.constants.iter().filter(|c| c.power == *name).map(|c| c.at(&point.values));
+                    value + means.sum::<f64>()
+                }),
             });
             match meaning {
                 Meaning::Coefficient(c) if c.candidate => {
@@ -333,6 +349,8 @@ impl Joined {
             chi2: sums.chi2,
             numbers: sums.numbers,
             channels: self.channels,
+            constants: self.constants,
+            means: self.means,
             start,
             starts,
             not_tried,

@@ -72,6 +72,12 @@ pub(super) struct Filtered {
     /// Series of the model, whose gaps are gaps of the data.
     base: usize,
     held: Vec<f64>,
+    /// What is taken off each series: its mean of an earlier pass.
+    centres: Vec<f64>,
+    sums: Vec<f64>,
+    /// Table and name of each series.
+    keys: Vec<(String, String)>,
+    pub(super) constants: Vec<Constant>,
     pub(super) gaps: Gaps,
     patience: u64,
     pub(super) innovations: Innovations,
@@ -81,6 +87,41 @@ fn name_of(channel: &Column) -> &str {
     match channel.attribute("channel") {
         "" => &channel.name,
         name => name,
+    }
+}
+
+/// What the mean of a series adds to the constant of a channel, per unit of coefficients.
+pub(super) struct Constant {
+    /// Name of the constant.
+    pub(super) power: String,
+    coefficient: Factor,
+    times: Option<Factor>,
+    amount: f64,
+}
+
+/// A coefficient: its name where a point may have another value than this one.
+struct Factor {
+    name: Option<String>,
+    value: f64,
+}
+
+impl Factor {
+    fn of(c: &Coefficient) -> Self {
+        Self {
+            name: (c.estimate || c.candidate).then(|| c.name.clone()),
+            value: if c.candidate { 0.0 } else { c.initial },
+        }
+    }
+
+    fn at(&self, values: &BTreeMap<String, f64>) -> f64 {
+        self.name.as_ref().and_then(|name| values.get(name)).copied().unwrap_or(self.value)
+    }
+}
+
+impl Constant {
+    /// What it is at some values of coefficients.
+    pub(super) fn at(&self, values: &BTreeMap<String, f64>) -> f64 {
+        self.amount * self.coefficient.at(values) * self.times.as_ref().map_or(1.0, |t| t.at(values))
     }
 }
 
@@ -324,12 +365,26 @@ impl Filtered {
             let change = Some(noise.by_level(k));
             unknowns.push((name.clone(), Meaning::Level, Parameter { responses: Vec::new(), change }));
         }
+        // Series without their means: a command may have one of 1e5 σ, which a constant of the channel takes exactly, but
+        // for the digits that it would cost every sum.
+        let means = point.means.get(number);
+        let centre = |key: &(String, String)| means.and_then(|of| of.get(key)).copied().unwrap_or(0.0);
+        let centres: Vec<f64> = responses.series.iter().map(centre).collect();
+        let constant_of = |channel: usize| format!("{} day^0 of product {number}", responses.names[channel]);
+        let constant = |t: &Term| Constant {
+            power: constant_of(t.channel),
+            coefficient: Factor::of(responses.coefficients[t.coefficient]),
+            times: t.times.map(|other| Factor::of(responses.coefficients[other])),
+            amount: t.factor * centres[t.series] / noise.system.unit[t.channel],
+        };
+        let constants: Vec<Constant> = responses.terms.iter().map(constant).collect();
         let mut known = responses.known(&noise.values);
         for (channel, name) in responses.names.iter().enumerate() {
             for k in 0..POWERS {
                 let power = format!("{name} day^{k} of product {number}");
                 let (series, unit) = (responses.series.len() + k, noise.system.unit[channel]);
-                known.extend(point.powers.get(&power).map(|value| (channel, series, value * unit)));
+                let mean = constants.iter().filter(|c| c.power == power).map(|c| c.at(&point.values)).sum::<f64>();
+                known.extend(point.powers.get(&power).map(|value| (channel, series, (value + mean) * unit)));
                 let own = Parameter { responses: vec![(channel, series, unit)], change: None };
                 unknowns.push((power, Meaning::Power, own));
             }
@@ -366,11 +421,23 @@ impl Filtered {
             count: responses.names.len(),
             base: responses.base,
             held: vec![f64::NAN; count],
+            sums: vec![0.0; count],
+            keys: responses.series.clone(),
+            centres,
+            constants,
             gaps: Gaps::of(&responses),
             patience: (settings.patience_s * rate_hz) as u64,
             innovations,
         };
         Ok((all, responses.columns(&available)?))
+    }
+}
+
+impl Filtered {
+    /// Means of the series.
+    pub(super) fn means(&self) -> BTreeMap<(String, String), f64> {
+        let rows = self.gaps.rows.max(1) as f64;
+        self.keys.iter().cloned().zip(self.sums.iter().map(|sum| sum / rows)).collect()
     }
 }
 
@@ -403,6 +470,12 @@ impl Sink for Filtered {
             self.gaps.rows += 1;
             if !begun {
                 continue;
+            }
+            for (s, x) in series.iter_mut().enumerate() {
+                if x.is_finite() {
+                    self.sums[s] += *x;
+                }
+                *x -= self.centres[s];
             }
             self.innovations.push(*time_ns, &channels, &series);
         }
