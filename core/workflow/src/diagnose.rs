@@ -213,7 +213,10 @@ fn answer(
     };
     others.truncate(settings.max_evaluated);
     named.extend(others);
-    let unobservable = screened.unobservable.iter().map(|name| (name.clone(), UNOBSERVABLE.to_owned()));
+    let beside_constants = decided.selection.unobservable.iter().map(|c| &decided.candidates[*c]);
+    let beside_constants = beside_constants.map(|(effect, instance, _)| format!("{effect}:{instance}"));
+    let unobservable = screened.unobservable.iter().cloned().chain(beside_constants);
+    let unobservable = unobservable.map(|name| (name, UNOBSERVABLE.to_owned()));
     Ok(Diagnosis {
         verdict: verdict.to_owned(),
         false_alarm_rate: settings.false_alarm,

@@ -5,8 +5,8 @@ use nalgebra::{DMatrix, DVector};
 
 use super::filter::Sums;
 
-/// Part of a coefficient's information that the others must leave for it to be observable.
-const OBSERVABLE: f64 = 1e-8;
+/// Part of a coefficient's information that the others must leave for it to be observable: below it is rounding.
+const OBSERVABLE: f64 = 1e-11;
 /// Rounds of fixing values at the ends of their ranges.
 const ROUNDS: usize = 20;
 

@@ -365,8 +365,8 @@ impl Filtered {
             let change = Some(noise.by_level(k));
             unknowns.push((name.clone(), Meaning::Level, Parameter { responses: Vec::new(), change }));
         }
-        // Series without their means: a command may have one of 1e5 σ, which a constant of the channel takes exactly, but
-        // for the digits that it would cost every sum.
+        // Series without their means: a command may have one of 1e5 σ, which a constant of the channel takes exactly,
+        // but for the digits that it would cost every sum.
         let means = point.means.get(number);
         let centre = |key: &(String, String)| means.and_then(|of| of.get(key)).copied().unwrap_or(0.0);
         let centres: Vec<f64> = responses.series.iter().map(centre).collect();
