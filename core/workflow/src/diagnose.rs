@@ -109,7 +109,7 @@ fn decide(
     let (decided, screened) = loop {
         let chosen: Vec<EffectEntry> = screened.forms.iter().map(entry).collect();
         let opening = pass < OPENING;
-        let decided = one_pass(replay, settings, &chosen, &slow, opening, &point, evidence, progress)?;
+        let decided = one_pass(replay, &chosen, &slow, opening, &point, evidence, progress)?;
         let next = step(&point, &decided);
         let settled = pass > OPENING && reached(&point, &next, &decided);
         point = next;

@@ -147,7 +147,6 @@ pub(crate) fn reached(from: &Point, to: &Point, decided: &Decided) -> bool {
 /// [`WorkflowError::NoLikelihood`] where the declared noise cannot be filtered; otherwise as a replay.
 pub(crate) fn one_pass(
     replay: &Replay<'_>,
-    settings: &Settings,
     chosen: &[EffectEntry],
     slow: &[NoiseProcess],
     opening: bool,
@@ -155,6 +154,7 @@ pub(crate) fn one_pass(
     judge: &dyn Judge,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Decided, WorkflowError> {
+    let settings = replay.settings()?;
     let levels = noise_levels(replay.products);
     let mut joined = Joined::default();
     let mut not_tried = Vec::new();
