@@ -3,9 +3,10 @@
 //! Data are read twice. The first pass runs a matched filter for every [`transient`] template. The second sums, in
 //! [`gram`], the cross-spectra of channels, of the model's series and of those of every candidate, among them
 //! [`waveform`]s that begin where a transient was detected, and, in [`coherence`], those of housekeeping with the
-//! residuals. Everything else works on these sums: [`scores`] tests the candidates, `dragfree_estimation::levels` the
-//! noise levels, [`diagnosis`] selects, and [`compare`] tests the residuals of the model as it is. No module knows an
-//! effect by name.
+//! residuals. On these sums [`screen`] chooses the form of each candidate by the scores of [`scores`], [`slow_forces`]
+//! measures unknown slow forces, and [`compare`] tests the residuals of the model as it is. Further passes filter the
+//! channels: by their [`innovations`] the likelihood decides what is named, and [`diagnosis`] is the answer. No module
+//! knows an effect by name.
 
 pub mod candidates;
 pub mod coherence;
