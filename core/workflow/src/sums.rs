@@ -59,6 +59,8 @@ pub(crate) struct ColumnSums {
     /// Rows without a value, per column, after the first ones.
     missing: Vec<u64>,
     rows: u64,
+    /// Rows in which the channels and the model's series have values.
+    measured: u64,
     waiting: bool,
     settings: Settings,
 }
@@ -160,6 +162,7 @@ impl ColumnSums {
             held: vec![f64::NAN; width],
             missing: vec![0; width],
             rows: 0,
+            measured: 0,
             waiting: true,
             settings: settings.clone(),
             segmenter: Segmenter::new(length, (1e9 / rate_hz).round() as i64, averaged).of_first(all.fast),
@@ -177,6 +180,9 @@ impl ColumnSums {
 
     fn push(&mut self, time_ns: &[i64], columns: &[&[f64]]) {
         let mut filled: Vec<Cow<'_, [f64]>> = Vec::with_capacity(columns.len() - self.base);
+        // A gap of the telemetry as a whole is none of a candidate's own.
+        let measured: Vec<bool> =
+            (0..time_ns.len()).map(|k| columns[..self.base].iter().all(|c| c[k].is_finite())).collect();
         for (j, column) in columns.iter().enumerate().skip(self.base) {
             if all_finite(column) {
                 self.held[j] = column.last().copied().unwrap_or(self.held[j]);
@@ -188,11 +194,12 @@ impl ColumnSums {
             filled.push(
                 column
                     .iter()
-                    .map(|x| {
+                    .zip(&measured)
+                    .map(|(x, measured)| {
                         if x.is_finite() {
                             held = *x;
                         } else {
-                            missing += 1;
+                            missing += u64::from(*measured);
                         }
                         held
                     })
@@ -216,6 +223,7 @@ impl ColumnSums {
             column.to_mut().iter_mut().filter(|x| x.is_nan()).for_each(|x| *x = 0.0);
         }
         self.rows += time_ns.len() as u64;
+        self.measured += measured.iter().filter(|x| **x).count() as u64;
         let all: Vec<&[f64]> = std::iter::once(first.as_slice())
             .chain(columns[1..self.base].iter().copied())
             .chain(filled.iter().map(AsRef::as_ref))
@@ -229,7 +237,7 @@ impl ColumnSums {
         let mut candidate_set = self.candidate_set;
         let mut not_tried = Vec::new();
         let gappy = |column: usize| {
-            self.missing[column] as f64 > self.settings.max_missing * self.rows.max(1) as f64
+            self.missing[column] as f64 > self.settings.max_missing * self.measured.max(1) as f64
                 || self.held[column].is_nan()
         };
         let model = candidate_set.model();
@@ -250,13 +258,13 @@ impl ColumnSums {
                     format!("{}:{}", c.effect, c.instance),
                     format!(
                         "{} has no value in {} of {} epochs: what it is made of has gaps",
-                        self.names[column], self.missing[column], self.rows
+                        self.names[column], self.missing[column], self.measured
                     ),
                 ));
             }
         }
         not_tried.extend(fewer.into_iter().map(|(column, forms)| {
-            let (missing, rows) = (self.missing[column], self.rows);
+            let (missing, rows) = (self.missing[column], self.measured);
             let reason =
                 format!("it has no value in {missing} of {rows} epochs, so {forms} forms of effects are left out");
             (self.names[column].clone(), reason)

@@ -28,6 +28,9 @@ pub(super) struct Gaps {
     missing: Vec<u64>,
     never: Vec<bool>,
     rows: u64,
+    /// Rows in which the channels and the model's series have values: a gap of the telemetry as a whole is none of a
+    /// candidate's own.
+    measured: u64,
     /// Series of each candidate's coefficient.
     of: BTreeMap<String, Vec<usize>>,
 }
@@ -45,18 +48,20 @@ impl Gaps {
             missing: vec![0; series],
             never: vec![true; series],
             rows: 0,
+            measured: 0,
             of: candidates.map(|(i, c)| (c.name.clone(), acts(i))).collect(),
         }
     }
 
     /// Coefficients that act through a series with gaps, and why they are not tried.
     pub(super) fn refused(&self, settings: &Settings) -> BTreeMap<String, String> {
-        let gappy =
-            |s: &&usize| self.never[**s] || self.missing[**s] as f64 > settings.max_missing * self.rows.max(1) as f64;
+        let gappy = |s: &&usize| {
+            self.never[**s] || self.missing[**s] as f64 > settings.max_missing * self.measured.max(1) as f64
+        };
         let reason = |s: &usize| {
             format!(
                 "{} has no value in {} of {} epochs: what it is made of has gaps",
-                self.names[*s], self.missing[*s], self.rows
+                self.names[*s], self.missing[*s], self.measured
             )
         };
         self.of.iter().filter_map(|(name, own)| Some((name.clone(), reason(own.iter().find(gappy)?)))).collect()
@@ -436,7 +441,7 @@ impl Filtered {
 impl Filtered {
     /// Means of the series.
     pub(super) fn means(&self) -> BTreeMap<(String, String), f64> {
-        let rows = self.gaps.rows.max(1) as f64;
+        let rows = self.gaps.measured.max(1) as f64;
         self.keys.iter().cloned().zip(self.sums.iter().map(|sum| sum / rows)).collect()
     }
 }
@@ -449,6 +454,7 @@ impl Sink for Filtered {
             channels.iter_mut().zip(columns).for_each(|(x, column)| *x = column[k]);
             let waits = self.gaps.rows < self.patience;
             let mut begun = true;
+            let measured = columns[..self.count + self.base].iter().all(|column| column[k].is_finite());
             for (s, x) in series.iter_mut().enumerate() {
                 *x = columns[self.count + s][k];
                 if s < self.base {
@@ -459,7 +465,7 @@ impl Sink for Filtered {
                     self.gaps.never[s] = false;
                 } else if self.held[s].is_finite() {
                     *x = self.held[s];
-                    self.gaps.missing[s] += 1;
+                    self.gaps.missing[s] += u64::from(measured);
                 } else {
                     // Housekeeping may begin late; what never comes is zero, and its effects are not tried.
                     begun &= !waits;
@@ -468,11 +474,12 @@ impl Sink for Filtered {
             }
             self.gaps.never[..self.base].fill(false);
             self.gaps.rows += 1;
+            self.gaps.measured += u64::from(measured);
             if !begun {
                 continue;
             }
             for (s, x) in series.iter_mut().enumerate() {
-                if x.is_finite() {
+                if measured {
                     self.sums[s] += *x;
                 }
                 *x -= self.centres[s];
