@@ -22,7 +22,7 @@ use dragfree_schema::Settings;
 use serde_json::{Map, json};
 
 use crate::WorkflowError;
-use crate::likelihood::{Decided, Judge, Meaning, PASSES, Point, one_pass, reached, step};
+use crate::likelihood::{Decided, Judge, Meaning, PASSES, Point, moved, one_pass, step};
 use crate::replay::{AT_NS, FINE, Pass, Replay, What, sum};
 
 /// A diagnosis and the sums that chose the forms of the candidates.
@@ -78,7 +78,8 @@ pub fn diagnose(
     Ok(Diagnosed { diagnosis, settings: settings.clone(), record })
 }
 
-/// Passes that fit constants alone: the first from 1e5 σ, so that rounding leaves some σ to the second.
+/// Passes that fit constants beside what is named, at the start and after a form has changed: the first from 1e5 σ, so
+/// that rounding leaves some σ to the second.
 const OPENING: usize = 2;
 
 /// Decides by the likelihood of the innovations among the forms that the spectra choose, beside the effects that are
@@ -105,28 +106,52 @@ fn decide(
     let events: Vec<Candidate> = screened.forms.iter().filter(events).cloned().collect();
     let mut slow = slow_forces(scorer, &scorer.fit(&events)?, &record.noise);
     let mut named: Vec<Candidate> = Vec::new();
-    let mut pass = 0;
-    let (decided, screened) = loop {
+    let (mut openings, mut passes) = (OPENING, 0);
+    let (decided, screened, moving) = loop {
         let chosen: Vec<EffectEntry> = screened.forms.iter().map(entry).collect();
-        let opening = pass < OPENING;
+        let opening = openings > 0;
         let decided = one_pass(replay, &chosen, &slow, opening, &point, evidence, progress)?;
         let next = step(&point, &decided);
-        let settled = pass > OPENING && reached(&point, &next, &decided);
-        point = next;
+        if opening {
+            openings -= 1;
+            point = next;
+            continue;
+        }
+        passes += 1;
         let now = named_forms(&decided, &screened.forms);
-        if pass == OPENING + PASSES || settled && now == named {
-            break (decided, screened);
+        let mut moving = moved(&point, &next, &decided);
+        if now != named {
+            moving.extend(differences(&now, &named));
+        }
+        point = next;
+        if passes > 1 && moving.is_empty() || passes == PASSES {
+            break (decided, screened, moving);
         }
         if now != named {
             let beside = screen(scorer, &now)?;
-            // A form that has changed is named in its new form.
+            // A form that has changed is named in its new form, of which the spectra alone know a value.
             named = named_forms(&decided, &beside.forms);
-            slow = slow_forces(scorer, &scorer.fit(&named)?, &record.noise);
+            let fit = scorer.fit(&named)?;
+            let values = &fit.estimate.theta.as_slice()[record.candidate_set.model()..];
+            let parts = named.iter().flat_map(|c| c.parts.iter().map(move |(index, _)| (c, *index)));
+            for ((_, index), value) in parts.zip(values).filter(|((c, _), _)| !now.contains(c)) {
+                // Its mean is another, and constants are far away again.
+                openings = OPENING;
+                point.values.insert(record.candidate_set.coefficients[index].name.clone(), *value);
+            }
+            slow = slow_forces(scorer, &fit, &record.noise);
             screened = Screened { forms: beside.forms, ..screened };
         }
-        pass += 1;
     };
-    answer(settings, record, scorer, &decided, &screened, evidence)
+    answer(settings, record, scorer, &decided, &screened, evidence, &moving)
+}
+
+/// Names of the effects that are in one of two lists in a form in which they are not in the other.
+fn differences(a: &[Candidate], b: &[Candidate]) -> BTreeSet<String> {
+    let only = |of: &[Candidate], other: &[Candidate]| -> Vec<String> {
+        of.iter().filter(|c| !other.contains(c)).map(Candidate::name).collect()
+    };
+    only(a, b).into_iter().chain(only(b, a)).collect()
 }
 
 /// The named effects among some forms.
@@ -173,6 +198,7 @@ fn answer(
     decided: &Decided,
     screened: &Screened,
     evidence: &Evidence<'_>,
+    moving: &BTreeSet<String>,
 ) -> Result<Diagnosis, WorkflowError> {
     let forms = &screened.forms;
     let unexplained = diagnosis::remaining(scorer, &named_forms(decided, forms))?;
@@ -205,7 +231,12 @@ fn answer(
         let reason = f.refused.as_ref()?;
         Some(format!("{}:{} would lower χ² by {:.0}, and is refused: {reason}", f.effect, f.instance, f.delta_chi2))
     };
-    let reasons: Vec<String> = if named.is_empty() { others.iter().filter_map(refused).collect() } else { Vec::new() };
+    let mut reasons: Vec<String> =
+        if named.is_empty() { others.iter().filter_map(refused).collect() } else { Vec::new() };
+    if !moving.is_empty() {
+        let names: Vec<&str> = moving.iter().map(String::as_str).collect();
+        reasons.push(format!("the likelihood is not settled after {PASSES} passes: {} still move", names.join(", ")));
+    }
     let verdict = match (named.is_empty(), unexplained.is_some() || !reasons.is_empty()) {
         (false, _) => "missing",
         (true, true) => "unexplained",

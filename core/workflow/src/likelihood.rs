@@ -24,7 +24,7 @@ use pass::{Constant, Filtered};
 use crate::WorkflowError;
 use crate::replay::{Pass, Replay, noise_levels};
 
-/// Passes after the opening ones after which the point is taken as it is.
+/// Passes that decide, after which the answer is given as it is, with what still moves.
 pub(crate) const PASSES: usize = 6;
 /// A point is reached when nothing moves by more than this part of its σ.
 const REACHED_SIGMAS: f64 = 0.5;
@@ -99,12 +99,13 @@ pub(crate) trait Judge {
 /// The point that the sums of a pass lead to.
 pub(crate) fn step(from: &Point, decided: &Decided) -> Point {
     let mut to = Point::default();
-    let named: BTreeSet<usize> =
-        decided.selection.chosen.iter().flat_map(|f| decided.candidates[f.candidate].2.iter().copied()).collect();
+    let chosen: BTreeSet<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
+    let others = decided.candidates.iter().enumerate().filter(|(c, _)| !chosen.contains(c));
+    let not_named: BTreeSet<usize> = others.flat_map(|(_, (.., own))| own.iter().copied()).collect();
     for (i, (name, meaning)) in decided.parameters.iter().enumerate() {
         let value = decided.selection.values[i];
         match meaning {
-            Meaning::Coefficient(c) if c.candidate && !named.contains(&i) => {}
+            Meaning::Coefficient(_) if not_named.contains(&i) => {}
             Meaning::Coefficient(_) => drop(to.values.insert(name.clone(), value)),
             Meaning::Level => {
                 let before = from.levels.get(name).copied().unwrap_or(1.0).ln();
@@ -125,20 +126,22 @@ pub(crate) fn step(from: &Point, decided: &Decided) -> Point {
     to
 }
 
-/// Whether two points are the same: the same effects, and nothing moved by more than a part of its σ.
-pub(crate) fn reached(from: &Point, to: &Point, decided: &Decided) -> bool {
-    decided.parameters.iter().enumerate().all(|(i, (name, meaning))| {
-        let near = |a: Option<f64>, b: Option<f64>| match (a, b) {
-            (Some(a), Some(b)) => (a - b).abs() <= REACHED_SIGMAS * decided.selection.sigma[i],
-            (None, None) => true,
-            _ => false,
+/// What differs between two points: effects that are in one alone, and what moved by more than a part of its σ.
+pub(crate) fn moved(from: &Point, to: &Point, decided: &Decided) -> BTreeSet<String> {
+    let all = decided.parameters.iter().enumerate();
+    let moving = all.filter(|(i, (name, meaning))| {
+        let (a, b) = match meaning {
+            Meaning::Coefficient(_) => (from.values.get(name).copied(), to.values.get(name).copied()),
+            Meaning::Level => (from.levels.get(name).map(|x| x.ln()), to.levels.get(name).map(|x| x.ln())),
+            Meaning::Power => (None, None),
         };
-        match meaning {
-            Meaning::Coefficient(_) => near(from.values.get(name).copied(), to.values.get(name).copied()),
-            Meaning::Level => near(from.levels.get(name).map(|x| x.ln()), to.levels.get(name).map(|x| x.ln())),
-            Meaning::Power => true,
+        match (a, b) {
+            (Some(a), Some(b)) => (a - b).abs() > REACHED_SIGMAS * decided.selection.sigma[*i],
+            (None, None) => false,
+            _ => true,
         }
-    })
+    });
+    moving.map(|(_, (name, _))| name.clone()).collect()
 }
 
 /// One pass over all products, with effects in these forms and slow forces beside the declared noise.
@@ -176,7 +179,7 @@ pub(crate) fn one_pass(
         not_tried.extend(refused);
         joined.add(filtered, &mut not_tried, settings);
     }
-    Ok(joined.decided(point, settings, judge, not_tried))
+    Ok(joined.decided(point, opening, settings, judge, not_tried))
 }
 
 /// Sums of several products, by the names of the parameters.
@@ -260,6 +263,7 @@ impl Joined {
     fn decided(
         self,
         point: &Point,
+        opening: bool,
         settings: &Settings,
         judge: &dyn Judge,
         not_tried: Vec<(String, String)>,
@@ -278,6 +282,8 @@ impl Joined {
                 }),
             });
             match meaning {
+                // What is named stays so while constants are found.
+                Meaning::Coefficient(c) if c.candidate && opening => {}
                 Meaning::Coefficient(c) if c.candidate => {
                     match groups.iter_mut().find(|(e, at, _)| *e == c.effect && *at == c.instance) {
                         Some((.., own)) => own.push(i),
