@@ -3,11 +3,13 @@
 
 use dragfree_tests::calibration::diagnose;
 use dragfree_tests::foreign::{
-    Blow, Container, Draw, Flight, HEAT_LAG_S, Heat, Hidden, Loops, Record, Spacecraft, Start, fly, write,
+    Blow, Container, Draw, Flight, HEAT_LAG_S, Heat, Hidden, Loops, PERIOD_NS, Record, Recorder, Spacecraft, Start,
+    fly, write,
 };
 use dragfree_tests::{coefficient, dragfree, fixture};
 use serde_json::Value;
 use std::fmt::Write;
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
 
@@ -199,9 +201,19 @@ fn a_run_works_without_an_ephemeris() {
 
 /// Diagnosis of six hours with a hidden effect.
 fn diagnosed(hidden: Hidden) -> Value {
+    diagnosed_without(hidden, 0..0)
+}
+
+/// The same where some samples were not received.
+fn diagnosed_without(hidden: Hidden, lost: Range<usize>) -> Value {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let file = dir.path().join("foreign.mcap");
-    write(&file, &fly(&Flight { hidden, seed: 2, ..FLIGHT }), START_NS, USUAL);
+    let mut recorder = Recorder::create(&file, USUAL, false).expect("the folder is writable");
+    let flown = fly(&Flight { hidden, seed: 2, ..FLIGHT });
+    for (k, r) in flown.iter().enumerate().filter(|(k, _)| !lost.contains(k)) {
+        recorder.sample(k, START_NS + k as u64 * PERIOD_NS, r).expect("the file is writable");
+    }
+    recorder.finish().expect("the file is writable");
     let mut command = dragfree(dir.path());
     command.arg("run").arg(fixture("pipelines/science-mode.toml")).arg(&file);
     let run =
@@ -241,6 +253,17 @@ fn another_producers_hidden_gain_and_crosstalk_are_found() {
         let (accepted, candidate, pull) = found(&diagnosed(hidden), truth);
         assert!(accepted == name && pull.abs() < 4.0, "{pull} {candidate:#}");
     }
+}
+
+/// Ten minutes without any telemetry are no gap of one candidate's commands: all are tried, and the gain is named
+/// within 4σ.
+#[test]
+fn a_gap_of_all_telemetry_leaves_every_candidate() {
+    let d = diagnosed_without(Hidden { thrust_gain: [0.0, 0.1, 0.0], ..Hidden::NONE }, 80_000..86_000);
+    let not_tried = d["not_tried"].to_string();
+    assert!(!not_tried.contains("has gaps"), "{not_tried}");
+    let (accepted, candidate, pull) = found(&d, 0.1);
+    assert!(accepted == "mps-gain:sc.y" && pull.abs() < 4.0, "{pull} {candidate:#}");
 }
 
 /// A readout scale of 1.1: accepted, or listed as a confounder of the electrode gain along the same axis.
