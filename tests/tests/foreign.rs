@@ -207,21 +207,23 @@ fn diagnosed(hidden: Hidden) -> Value {
 /// The same where some samples were not received.
 fn diagnosed_without(hidden: Hidden, lost: Range<usize>) -> Value {
     let dir = tempfile::tempdir().expect("a temporary folder");
-    let file = dir.path().join("foreign.mcap");
+    let product = calibrated(dir.path(), &Flight { hidden, seed: 2, ..FLIGHT }, START_NS, lost);
+    diagnose(dir.path(), &product)
+}
+
+/// The product of a flight from a time on, of which some samples were not received.
+fn calibrated(folder: &Path, flight: &Flight, start_ns: u64, lost: Range<usize>) -> Value {
+    let file = folder.join(format!("foreign-{start_ns}.mcap"));
     let mut recorder = Recorder::create(&file, USUAL, false).expect("the folder is writable");
-    let flown = fly(&Flight { hidden, seed: 2, ..FLIGHT });
-    for (k, r) in flown.iter().enumerate().filter(|(k, _)| !lost.contains(k)) {
-        recorder.sample(k, START_NS + k as u64 * PERIOD_NS, r).expect("the file is writable");
+    for (k, r) in fly(flight).iter().enumerate().filter(|(k, _)| !lost.contains(k)) {
+        recorder.sample(k, start_ns + k as u64 * PERIOD_NS, r).expect("the file is writable");
     }
     recorder.finish().expect("the file is writable");
-    let mut command = dragfree(dir.path());
+    let mut command = dragfree(folder);
     command.arg("run").arg(fixture("pipelines/science-mode.toml")).arg(&file);
-    let run =
-        command.arg("--mission").arg(mission(dir.path(), false)).args(["--archive", "archive", "--json"]).output();
+    let run = command.arg("--mission").arg(mission(folder, false)).args(["--archive", "archive", "--json"]).output();
     let run = run.expect("the program runs");
-    let product: Value =
-        serde_json::from_slice(&run.stdout).unwrap_or_else(|_| panic!("{}", String::from_utf8_lossy(&run.stderr)));
-    diagnose(dir.path(), &product)
+    serde_json::from_slice(&run.stdout).unwrap_or_else(|_| panic!("{}", String::from_utf8_lossy(&run.stderr)))
 }
 
 /// Name of the single accepted candidate, and the error of its only coefficient in σ.
@@ -264,6 +266,36 @@ fn a_gap_of_all_telemetry_leaves_every_candidate() {
     assert!(!not_tried.contains("has gaps"), "{not_tried}");
     let (accepted, candidate, pull) = found(&d, 0.1);
     assert!(accepted == "mps-gain:sc.y" && pull.abs() < 4.0, "{pull} {candidate:#}");
+}
+
+/// Two days of two hours each with a thruster gain: where it is the same the days agree (false alarm 1e-4), where it
+/// is not they do not, each day within 4σ of its own.
+#[test]
+fn a_cause_that_is_not_the_same_every_day_is_told() {
+    const DAY_NS: u64 = 86_400_000_000_000;
+    for gains in [[0.2, 0.2], [0.3, 0.05]] {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        for (day, gain) in (0..).zip(gains) {
+            let hidden = Hidden { thrust_gain: [0.0, gain, 0.0], ..Hidden::NONE };
+            let flight = Flight { hidden, seconds: 7200.0, seed: 3 + day, ..FLIGHT };
+            calibrated(dir.path(), &flight, START_NS + day * DAY_NS, 0..0);
+        }
+        let run = dragfree(dir.path()).args(["diagnose", "2035-03-07..2035-03-08", "--json", "-q"]).output();
+        let run = run.expect("the program runs");
+        assert_eq!(run.status.code(), Some(4), "{}", String::from_utf8_lossy(&run.stderr));
+        let d: Value = serde_json::from_slice(&run.stdout).expect("JSON");
+        let candidates = d["candidates"].as_array().expect("a list");
+        let gain = candidates.iter().find(|c| c["coefficient"] == "mps-gain.sc.y").expect("the gain");
+        assert!(gain["accepted"] == true, "{gain:#}");
+        let by_product = gain["by_product"].as_array().expect("a list");
+        assert_eq!(by_product.len(), 2, "{gain:#}");
+        for (own, truth) in by_product.iter().zip(gains) {
+            let [value, sigma] = ["value", "sigma"].map(|key| own[key].as_f64().expect("a number"));
+            assert!((value - truth).abs() < 4.0 * sigma, "{own:#}");
+        }
+        let p = gain["constancy"]["p_value"].as_f64().expect("a number");
+        assert!(if gains[0] == gains[1] { p > 1e-4 } else { p < 1e-4 }, "{gains:?} {gain:#}");
+    }
 }
 
 /// A readout scale of 1.1: accepted, or listed as a confounder of the electrode gain along the same axis.

@@ -253,7 +253,7 @@ pub(crate) struct Archive {
 
 #[derive(Debug, Args)]
 pub(crate) struct Compare {
-    /// Products of one model: id, id without the revision, day or file
+    /// Products of one model: id, id without the revision, day, DAY..DAY or file
     #[arg(value_name = "PRODUCT", required = true)]
     pub(crate) products: Vec<String>,
     #[command(flatten)]
@@ -265,7 +265,7 @@ pub(crate) struct Compare {
 
 #[derive(Debug, Args)]
 pub(crate) struct Diagnose {
-    /// Products of one model: id, id without the revision, day or file
+    /// Products of one model: id, id without the revision, day, DAY..DAY or file
     #[arg(value_name = "PRODUCT", required = true)]
     pub(crate) products: Vec<String>,
     #[command(flatten)]

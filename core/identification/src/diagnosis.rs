@@ -65,6 +65,47 @@ pub struct Found {
     pub accepted: bool,
     /// Why it is no part of the answer although its p-value is below the false-alarm rate.
     pub refused: Option<String>,
+    /// What each product alone says of `coefficient`, where there are several and the effect is part of the answer.
+    pub by_product: Vec<OfProduct>,
+    /// Whether these agree.
+    pub constancy: Option<Constancy>,
+}
+
+/// What one product says of a coefficient.
+#[derive(Clone, Debug, Serialize)]
+pub struct OfProduct {
+    /// Product.
+    pub product: String,
+    /// Value of the coefficient.
+    pub value: f64,
+    /// σ of it.
+    pub sigma: f64,
+}
+
+/// Whether a coefficient is the same in all products: the weighted sum of squares about the weighted mean.
+#[derive(Clone, Debug, Serialize)]
+pub struct Constancy {
+    /// Sum of squares.
+    pub chi2: f64,
+    /// Degrees of freedom.
+    pub dof: usize,
+    /// Probability of no less by chance.
+    pub p_value: f64,
+}
+
+impl Constancy {
+    /// Of independent values; `None` where fewer than two have any information.
+    pub fn of(values: &[OfProduct]) -> Option<Self> {
+        let known: Vec<(f64, f64)> =
+            values.iter().filter(|v| v.sigma > 0.0).map(|v| (v.value, v.sigma.powi(-2))).collect();
+        if known.len() < 2 {
+            return None;
+        }
+        let mean = known.iter().map(|(x, w)| x * w).sum::<f64>() / known.iter().map(|(_, w)| w).sum::<f64>();
+        let chi2 = known.iter().map(|(x, w)| w * (x - mean).powi(2)).sum::<f64>();
+        let dof = known.len() - 1;
+        Some(Self { chi2, dof, p_value: ln_chi2_above(chi2, dof as f64).exp() })
+    }
 }
 
 impl Found {
@@ -280,6 +321,16 @@ fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>) -> Option<Unex
 mod tests {
     use super::*;
     use dragfree_schema::Settings;
+
+    /// Two values differ by a normal variable of their common σ: χ² is its square, p that of two sides.
+    #[test]
+    fn two_values_agree_as_their_difference_says() {
+        let value = |value, sigma| OfProduct { product: String::new(), value, sigma };
+        let c = Constancy::of(&[value(1.0, 0.3), value(2.0, 0.4)]).expect("two values");
+        assert!((c.chi2 - 4.0).abs() < 1e-12 && c.dof == 1, "{c:?}");
+        assert!((c.p_value - 0.045_500_263_896_358).abs() < 1e-12, "{c:?}");
+        assert!(Constancy::of(&[value(1.0, 0.3), value(0.0, 0.0)]).is_none(), "one has no information");
+    }
 
     /// Over all forms of all effects together the false-alarm rate is the stated one, and an effect with ten thousand
     /// forms has the same part of it as one with a single form.

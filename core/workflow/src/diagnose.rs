@@ -7,12 +7,13 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::has_parameter;
+use dragfree_engine::product::Written;
 use dragfree_engine::run::Progress;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{
-    self, Diagnosis, Found, LIMIT_QUANTILE, Limit, TRANSIENT, Trials, UNOBSERVABLE, Unexplained,
+    self, Constancy, Diagnosis, Found, LIMIT_QUANTILE, Limit, OfProduct, TRANSIENT, Trials, UNOBSERVABLE, Unexplained,
 };
-use dragfree_identification::innovations::decision::Fitted;
+use dragfree_identification::innovations::decision::{Fitted, Quadratic};
 use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::screen::{RefinementRequest, Screened, screen};
@@ -326,6 +327,8 @@ fn found(
     let named: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
     let without: Vec<usize> = named.iter().copied().filter(|c| *c != fitted.candidate).collect();
     let with: Vec<usize> = without.iter().copied().chain([fitted.candidate]).collect();
+    let by_product =
+        if accepted { by_product(decided, &with, own[lead], evidence.replay.products) } else { Vec::new() };
     let [(with, _), (without, sigma)] = [with, without].map(|set| decided.quadratic.solution(&set));
     for (i, (name, meaning)) in decided.parameters.iter().enumerate() {
         if matches!(meaning, Meaning::Coefficient(c) if !c.candidate && c.unit == "m") {
@@ -374,7 +377,18 @@ fn found(
                     .to_owned()
             }
         }),
+        constancy: Constancy::of(&by_product),
+        by_product,
     }
+}
+
+/// What each product alone says of a parameter, with a set of candidates.
+fn by_product(decided: &Decided, set: &[usize], parameter: usize, products: &[Written]) -> Vec<OfProduct> {
+    let of = |(quadratic, written): (&Quadratic, &Written)| {
+        let (values, sigma) = quadratic.solution(set);
+        OfProduct { product: written.product.id().to_owned(), value: values[parameter], sigma: sigma[parameter] }
+    };
+    decided.by_product.iter().zip(products).map(of).collect()
 }
 
 /// Levels of noise that effects could state, as the likelihood has them.
@@ -411,6 +425,8 @@ fn louder(decided: &Decided, record: &Record, evidence: &Evidence<'_>) -> Vec<Fo
             confounders: Vec::new(),
             accepted: false,
             refused: None,
+            by_product: Vec::new(),
+            constancy: None,
         })
     })
     .collect()

@@ -75,6 +75,8 @@ pub(crate) struct Decided {
     pub(crate) candidates: Vec<(String, String, Vec<usize>)>,
     /// The likelihood, for what the model would be without one of the chosen.
     pub(crate) quadratic: Quadratic,
+    /// That of each product by itself; none where there is only one.
+    pub(crate) by_product: Vec<Quadratic>,
     pub(crate) chi2: f64,
     pub(crate) numbers: f64,
     pub(crate) channels: BTreeMap<String, BTreeSet<String>>,
@@ -188,17 +190,54 @@ struct Joined {
     parameters: Vec<(String, Meaning)>,
     surveys: Vec<(Vec<(String, f64)>, Prior)>,
     channels: BTreeMap<String, BTreeSet<String>>,
-    sums: Option<Sums>,
-    starts: Vec<Starts>,
+    parts: Vec<Part>,
     constants: Vec<Constant>,
     means: Vec<BTreeMap<(String, String), f64>>,
 }
 
-/// Starts of the stretches of one product.
-struct Starts {
-    own: Vec<Start>,
+/// Sums of one product.
+struct Part {
+    sums: Sums,
     /// Parameters of the product among all.
-    parameters: Vec<(usize, usize)>,
+    places: Vec<(usize, usize)>,
+}
+
+impl Part {
+    /// Adds the sums to those of `all` parameters.
+    fn add_to(&self, all: &mut Sums) {
+        for (i, a) in &self.places {
+            all.score[*a] += self.sums.score[*i];
+            for (j, b) in &self.places {
+                all.information[(*a, *b)] += self.sums.information[(*i, *j)];
+            }
+        }
+        all.chi2 += self.sums.chi2;
+        all.numbers += self.sums.numbers;
+        all.samples += self.sums.samples;
+    }
+
+    /// Starts of its stretches as they follow all `parameters`.
+    fn starts(&self, parameters: usize) -> Vec<Start> {
+        let of_all = |start: &Start| {
+            let mut slope = DMatrix::zeros(start.slope.nrows(), parameters);
+            self.places.iter().for_each(|(own, all)| slope.set_column(*all, &start.slope.column(*own)));
+            Start { state: start.state.clone(), slope }
+        };
+        self.sums.starts.iter().map(of_all).collect()
+    }
+}
+
+/// No sums of so many parameters.
+fn no_sums(parameters: usize) -> Sums {
+    Sums {
+        information: DMatrix::zeros(parameters, parameters),
+        score: vec![0.0; parameters],
+        chi2: 0.0,
+        numbers: 0.0,
+        squares: DMatrix::zeros(0, 0),
+        samples: 0,
+        starts: Vec::new(),
+    }
 }
 
 impl Joined {
@@ -206,56 +245,20 @@ impl Joined {
         self.means.push(filtered.means());
         let Filtered { parameters, surveys, channels, gaps, innovations, constants, .. } = filtered;
         self.constants.extend(constants);
-        let own = innovations.finish().total();
         let gappy = gaps.refused(settings);
-        let mut kept: Vec<usize> = Vec::new();
-        for (i, (name, _)) in parameters.iter().enumerate() {
-            match gappy.get(name) {
-                Some(reason) => not_tried.push((name.clone(), reason.clone())),
-                None => kept.push(i),
+        let mut places = Vec::new();
+        for (i, parameter) in parameters.into_iter().enumerate() {
+            if let Some(reason) = gappy.get(&parameter.0) {
+                not_tried.push((parameter.0, reason.clone()));
+                continue;
+            }
+            let at = self.parameters.iter().position(|(name, _)| *name == parameter.0);
+            places.push((i, at.unwrap_or(self.parameters.len())));
+            if at.is_none() {
+                self.parameters.push(parameter);
             }
         }
-        let places: Vec<usize> = kept
-            .iter()
-            .map(|i| {
-                let at = self.parameters.iter().position(|(name, _)| *name == parameters[*i].0);
-                at.unwrap_or_else(|| {
-                    self.parameters.push(parameters[*i].clone());
-                    self.parameters.len() - 1
-                })
-            })
-            .collect();
-        let p = self.parameters.len();
-        let before = self.sums.take();
-        let mut all = Sums {
-            information: DMatrix::zeros(p, p),
-            score: vec![0.0; p],
-            chi2: own.chi2,
-            numbers: own.numbers,
-            squares: own.squares,
-            samples: own.samples,
-            starts: Vec::new(),
-        };
-        let of_all = kept.iter().copied().zip(places.iter().copied()).collect();
-        self.starts.push(Starts { own: own.starts, parameters: of_all });
-        for (i, a) in kept.iter().zip(&places) {
-            all.score[*a] += own.score[*i];
-            for (j, b) in kept.iter().zip(&places) {
-                all.information[(*a, *b)] += own.information[(*i, *j)];
-            }
-        }
-        if let Some(before) = before {
-            for i in 0..before.score.len() {
-                all.score[i] += before.score[i];
-                for j in 0..before.score.len() {
-                    all.information[(i, j)] += before.information[(i, j)];
-                }
-            }
-            all.chi2 += before.chi2;
-            all.numbers += before.numbers;
-            all.samples += before.samples;
-        }
-        self.sums = Some(all);
+        self.parts.push(Part { sums: innovations.finish().total(), places });
         self.surveys = surveys;
         self.channels.extend(channels);
     }
@@ -302,7 +305,7 @@ impl Joined {
             let found: Option<Vec<(usize, f64)>> = terms.iter().map(|(name, w)| Some((at(name)?, *w))).collect();
             priors.extend(found.map(|terms| (terms, *prior)));
         }
-        let candidates = groups
+        let candidates: Vec<Candidate> = groups
             .iter()
             .map(|(effect, _, own)| {
                 let coefficients = || {
@@ -322,22 +325,15 @@ impl Joined {
             })
             .collect();
         let p = parameters.len();
-        let sums = self.sums.unwrap_or_else(|| Sums {
-            information: DMatrix::zeros(p, p),
-            score: vec![0.0; p],
-            chi2: 0.0,
-            numbers: 0.0,
-            squares: DMatrix::zeros(0, 0),
-            samples: 0,
-            starts: Vec::new(),
-        });
-        let of_all = |start: Start, of: &[(usize, usize)]| {
-            let mut slope = DMatrix::zeros(start.slope.nrows(), p);
-            of.iter().for_each(|(own, all)| slope.set_column(*all, &start.slope.column(*own)));
-            Start { slope, ..start }
+        let mut sums = no_sums(p);
+        self.parts.iter().for_each(|part| part.add_to(&mut sums));
+        let starts = self.parts.iter().map(|part| part.starts(p)).collect();
+        let of_product = |part: &Part| {
+            let mut own = no_sums(p);
+            part.add_to(&mut own);
+            Quadratic::new(&own, &start, &priors, candidates.clone())
         };
-        let of_product = |s: Starts| s.own.into_iter().map(|start| of_all(start, &s.parameters)).collect();
-        let starts = self.starts.into_iter().map(of_product).collect();
+        let by_product = if self.parts.len() > 1 { self.parts.iter().map(of_product).collect() } else { Vec::new() };
         let quadratic = Quadratic::new(&sums, &start, &priors, candidates);
         let log10_p = |c: usize, gain: f64| judge.log10_p(&groups[c].0, gain, groups[c].2.len());
         let selection = quadratic.select(&Evidence {
@@ -352,6 +348,7 @@ impl Joined {
             parameters,
             candidates: groups,
             quadratic,
+            by_product,
             chi2: sums.chi2,
             numbers: sums.numbers,
             channels: self.channels,

@@ -38,13 +38,13 @@ fn screen(diagnosed: &Diagnosed, top: usize, repeated: &str, paint: Paint) -> St
     let accepted: Vec<&Found> = d.candidates.iter().filter(|f| f.accepted).collect();
     if !accepted.is_empty() {
         let _ = writeln!(out, "\nWhat is missing");
-        accepted.iter().for_each(|f| put(&mut out, f));
+        accepted.iter().for_each(|f| put(&mut out, f, d.false_alarm_rate));
     }
     let others: Vec<&Found> =
         d.candidates.iter().filter(|f| !f.accepted).take(top.saturating_sub(accepted.len())).collect();
     if !others.is_empty() {
         let _ = writeln!(out, "\nTried next, and not accepted");
-        others.iter().for_each(|f| put(&mut out, f));
+        others.iter().for_each(|f| put(&mut out, f, d.false_alarm_rate));
     }
     for reason in &d.reasons {
         out += &crate::text::labelled("reason", reason);
@@ -83,7 +83,8 @@ fn screen(diagnosed: &Diagnosed, top: usize, repeated: &str, paint: Paint) -> St
     out
 }
 
-fn put(out: &mut String, f: &Found) {
+/// `different` is the p-value below which products differ.
+fn put(out: &mut String, f: &Found, different: f64) {
     let _ = writeln!(out, "  {}:{}", f.effect, f.instance);
     let _ = writeln!(
         out,
@@ -110,6 +111,12 @@ fn put(out: &mut String, f: &Found) {
         .collect();
     if !moved.is_empty() {
         let _ = writeln!(out, "    without it {}", moved.join(", "));
+    }
+    if let Some(c) = &f.constancy {
+        let days: Vec<String> = f.by_product.iter().map(|d| format!("{:.3e} ± {:.0e}", d.value, d.sigma)).collect();
+        let verdict = if c.p_value < different { "not the same in all products" } else { "the same in all products" };
+        let text = format!("{verdict}: {} (χ² {:.1} of {}, p = {:.1e})", days.join(", "), c.chi2, c.dof, c.p_value);
+        out.push_str(&crate::text::labelled("    values", &text));
     }
     if !f.confounders.is_empty() {
         let _ = writeln!(out, "    cannot be told from {}", f.confounders.join(", "));

@@ -33,6 +33,23 @@ pub(super) fn open(name: &str, archive: &Path) -> Result<Written, Failure> {
     Ok(Written { product: entry.product, path: entry.path })
 }
 
+/// Products by their names; `DAY..DAY` stands for the latest of every day that has one.
+pub(super) fn open_all(names: &[String], archive: &Path) -> Result<Vec<Written>, Failure> {
+    let mut all = Vec::new();
+    for name in names {
+        let days = name.split_once("..").and_then(|(a, b)| Some((a.parse().ok()?, b.parse().ok()?)));
+        match days.filter(|_| !Path::new(name).is_file()) {
+            Some((first, last)) => {
+                exists(archive)?;
+                let entries = product::find_days(archive, first, last)?;
+                all.extend(entries.into_iter().map(|entry| Written { product: entry.product, path: entry.path }));
+            }
+            None => all.push(open(name, archive)?),
+        }
+    }
+    Ok(all)
+}
+
 /// `name` is a product's file, or a name in the archive.
 fn show(name: &str, archive: &Path, json: bool, paint: Paint) -> Result<Done, Failure> {
     let Written { product, path } = open(name, archive)?;

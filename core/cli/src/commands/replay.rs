@@ -4,7 +4,6 @@ use super::products;
 use crate::args::{BATCH_ROWS, Global};
 use crate::failure::Failure;
 use crate::progress::Meter;
-use dragfree_engine::product::Written;
 use dragfree_workflow::calibrate::Progress;
 use dragfree_workflow::{Pass, Replay, WorkflowError};
 use std::path::Path;
@@ -16,7 +15,7 @@ pub(super) fn with_meter<T>(
     global: &Global,
     job: impl FnOnce(&Replay<'_>, &mut dyn FnMut(Pass, usize, Progress)) -> Result<T, WorkflowError>,
 ) -> Result<T, Failure> {
-    let products: Vec<Written> = names.iter().map(|name| products::open(name, archive)).collect::<Result<_, _>>()?;
+    let products = products::open_all(names, archive)?;
     let registry = super::registry(global)?;
     let threads = super::threads(global);
     let replay = Replay { registry: &registry, products: &products, threads, batch_rows: BATCH_ROWS as usize };

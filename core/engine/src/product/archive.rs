@@ -397,3 +397,25 @@ pub fn find(archive: &Path, id: &str) -> Result<Entry, ProductError> {
         None => Err(missing()),
     }
 }
+
+/// The latest products of all days from `first` to `last` that have one, in order.
+///
+/// # Errors
+/// [`ProductError`]: no day has one, a day has products of several spacecraft, or the folder cannot be read.
+pub fn find_days(archive: &Path, first: NaiveDate, last: NaiveDate) -> Result<Vec<Entry>, ProductError> {
+    let inside = |entry: &Entry| {
+        let day = entry.product.header.non_standard_attributes.day.parse::<NaiveDate>();
+        entry.latest && day.is_ok_and(|day| first <= day && day <= last)
+    };
+    let mut entries: Vec<Entry> = list(archive)?.entries.into_iter().filter(inside).collect();
+    entries.sort_by_key(Entry::series);
+    let day = |entry: &Entry| entry.product.header.non_standard_attributes.day.clone();
+    if let Some(two) = entries.windows(2).find(|two| day(&two[0]) == day(&two[1])) {
+        let stems = two.iter().map(|entry| entry.stem().to_owned()).collect::<Vec<_>>().join(", ");
+        return Err(ProductError::Several { day: day(&two[0]), folder: archive.to_owned(), stems });
+    }
+    if entries.is_empty() {
+        return Err(ProductError::NotFound { id: format!("{first}..{last}"), folder: archive.to_owned() });
+    }
+    Ok(entries)
+}

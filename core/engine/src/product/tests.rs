@@ -355,6 +355,13 @@ fn a_product_is_found_by_id_by_day_and_without_its_revision() {
     assert_eq!(found("COM1B_2035-01-01_SC1_01").expect("stem"), "COM1B_2035-01-01_SC1_01_0002");
     assert_eq!(found("2035-01-01").expect("day"), "COM1B_2035-01-01_SC1_01_0002");
     assert!(matches!(found("2035-01-02"), Err(ProductError::NotFound { .. })));
+    let days = |first: &str, last: &str| {
+        let [first, last] = [first, last].map(|day| day.parse().expect("a day"));
+        find_days(folder.path(), first, last)
+            .map(|all| all.iter().map(|entry| entry.product.id().to_owned()).collect::<Vec<_>>())
+    };
+    assert_eq!(days("2034-12-31", "2035-01-05").expect("days"), ["COM1B_2035-01-01_SC1_01_0002"]);
+    assert!(matches!(days("2035-01-02", "2035-01-05"), Err(ProductError::NotFound { .. })));
 }
 
 proptest! {
