@@ -23,8 +23,8 @@ pub use column::Column;
 pub use manifest::{Manifest, PREDICTION_NEED, Parameter, ParameterType};
 pub use model::{Coefficient, Colour, Constraint, Model, Response, Shape, Transient, Variant};
 pub use noise::{
-    NOISE_ATTRIBUTE, NoiseEstimate, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm, UNPREDICTED_ATTRIBUTE,
-    UNPREDICTED_SLOPE_ATTRIBUTE,
+    AHEAD_ATTRIBUTE, NOISE_ATTRIBUTE, NoiseEstimate, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm,
+    UNPREDICTED_ATTRIBUTE, UNPREDICTED_SLOPE_ATTRIBUTE,
 };
 pub use noise_levels::NoiseLevels;
 pub use report::{Attachment, Covariance, Estimate, Report, Role};

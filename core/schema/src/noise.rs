@@ -20,6 +20,12 @@ pub const UNPREDICTED_ATTRIBUTE: &str = "unpredicted";
 /// the unknown acceleration over a sampling interval, divided by the interval.
 pub const UNPREDICTED_SLOPE_ATTRIBUTE: &str = "unpredicted_slope";
 
+/// Key of a column's attributes in a chain that predicts: channels, as the text of a JSON array of names, of whose next
+/// readout the column knows more than the past of all channels, because it follows readouts that are no channels.
+/// Torques on a test mass follow the angles between it and the spacecraft, which the attitude channels have not read.
+/// The innovations of these channels are not independent of the column, and are not weighed for what acts by it.
+pub const AHEAD_ATTRIBUTE: &str = "ahead_of";
+
 /// A noise process: a stationary random signal of one or several components, and how it enters the channels.
 ///
 /// With M the gains of the components in the channels (`enters`) and C their covariance over the spectrum, it adds

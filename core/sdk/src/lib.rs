@@ -61,9 +61,9 @@ mod want;
 
 pub use batch::{Inputs, Outputs, Progress};
 pub use dragfree_schema::{
-    Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Estimate, NoiseEstimate, NoiseLevels,
-    NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm, PREDICTION_NEED, Report, Response, Role, Settings, Shape,
-    Transient, UNPREDICTED_ATTRIBUTE, UNPREDICTED_SLOPE_ATTRIBUTE, Variant, state,
+    AHEAD_ATTRIBUTE, Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Estimate,
+    NoiseEstimate, NoiseLevels, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm, PREDICTION_NEED, Report, Response,
+    Role, Settings, Shape, Transient, UNPREDICTED_ATTRIBUTE, UNPREDICTED_SLOPE_ATTRIBUTE, Variant, state,
 };
 pub use error::PluginError;
 pub use link::{EffectLink, In, Link, Out, Table};
@@ -76,10 +76,10 @@ pub use want::Want;
 pub mod prelude {
     pub use crate::state::{State, StateError};
     pub use crate::{
-        Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Effect, EffectLink, Estimate, In,
-        Inputs, Level, Link, Log, Manifest, NoiseEstimate, NoiseLevels, NoiseProcess, NoiseResponse, NoiseShape,
-        NoiseTerm, Out, Outputs, PREDICTION_NEED, Parameter, PluginError, Progress, Report, Response, Role, Settings,
-        Setup, Shape, Source, Stage, Table, Transient, UNPREDICTED_ATTRIBUTE, UNPREDICTED_SLOPE_ATTRIBUTE, Variant,
-        Want, export_plugin,
+        AHEAD_ATTRIBUTE, Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Effect,
+        EffectLink, Estimate, In, Inputs, Level, Link, Log, Manifest, NoiseEstimate, NoiseLevels, NoiseProcess,
+        NoiseResponse, NoiseShape, NoiseTerm, Out, Outputs, PREDICTION_NEED, Parameter, PluginError, Progress, Report,
+        Response, Role, Settings, Setup, Shape, Source, Stage, Table, Transient, UNPREDICTED_ATTRIBUTE,
+        UNPREDICTED_SLOPE_ATTRIBUTE, Variant, Want, export_plugin,
     };
 }

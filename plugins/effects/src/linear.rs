@@ -426,9 +426,12 @@ impl<E: LinearEffect> Linear<E> {
             return Ok((table, name));
         }
         let lacks = unpredicted(available, series.source());
-        let attribute = lacks.and_then(|gains| Some((series.unpredicted_attribute()?, gains)));
+        let mut attributes: Vec<(&str, &str)> = Vec::new();
+        attributes.extend(lacks.and_then(|gains| Some((series.unpredicted_attribute()?, gains))));
+        let ahead = latest_column(available, &series.source().name).map_or("", |c| c.attribute(AHEAD_ATTRIBUTE));
+        attributes.extend(Some((AHEAD_ATTRIBUTE, ahead)).filter(|(_, channels)| !channels.is_empty()));
         let (table, out) =
-            link.shared_series_with(available, &name, series.unit(), &series.source().frame, attribute.as_slice())?;
+            link.shared_series_with(available, &name, series.unit(), &series.source().frame, &attributes)?;
         let Some(out) = out else { return Ok((table, name)) };
         let (operation, time_ns, multiplier) = match series {
             Series::Column(_) | Series::Held(_) | Series::Predicted(_) => (Operation::Hold, None, None),

@@ -115,7 +115,8 @@ impl LinearEffect for IsCrosstalk {
 /// Coefficients `.theta` and `.psi`, m rad⁻¹, ±5e-3. Rotational stiffness is neglected.
 ///
 /// **Collinear with the offset** in x, where `c` acts like `b_z` and `d` like `−b_y` (1 mm/rad for 1 mm). The offset
-/// differs by its response along y and z, and below the bandwidth of the test mass's own attitude control.
+/// differs by its response along y and z, and below the bandwidth of the test mass's own attitude control. That control
+/// reads the spacecraft's attitude beside `sc.alpha`: see `AHEAD_ATTRIBUTE`.
 pub(crate) enum TiltToLength {}
 
 impl LinearEffect for TiltToLength {

@@ -92,6 +92,11 @@ pub(crate) struct OnDemand {
     first_alpha_change_rad_s2: Vector3<f64>,
 }
 
+/// Whether a column is the torque of electrodes, which follows the angles of a test mass.
+pub(crate) fn is_torque_on_a_test_mass(column: &str) -> bool {
+    column.starts_with("used.") && column.contains(".torque_orf_nm.")
+}
+
 impl OnDemand {
     pub(crate) fn new(needs: Needs, mission: &Mission, tm_accel_per_alpha: Vec<Matrix3<f64>>) -> Self {
         Self {

@@ -185,6 +185,9 @@ impl HinfDfacs {
     }
 }
 
+/// The channels of the attitude, as [`AHEAD_ATTRIBUTE`] names them.
+const ATTITUDE_CHANNELS: &str = r#"["sc.alpha.x","sc.alpha.y","sc.alpha.z"]"#;
+
 fn write_columns(
     link: &mut Link<'_>,
     table: Table,
@@ -410,9 +413,11 @@ impl Stage for HinfDfacs {
         let mut out = write_columns(link, table, &self.mission, &noises, self.needs.prediction)?;
         let fixed = out.len();
         for (name, unit, frame) in reconstruction.on_demand_columns() {
-            let attributes = [("kind", "series"), ("in_loop", "true")];
-            let attributes = if on_demand::is_in_loop(&name) { &attributes[..] } else { &attributes[..1] };
-            out.push(link.write_with(table, &name, unit, &frame, attributes)?);
+            let mut attributes = vec![("kind", "series")];
+            attributes.extend(on_demand::is_in_loop(&name).then_some(("in_loop", "true")));
+            let follows_angles = self.needs.prediction && on_demand::is_torque_on_a_test_mass(&name);
+            attributes.extend(follows_angles.then_some((AHEAD_ATTRIBUTE, ATTITUDE_CHANNELS)));
+            out.push(link.write_with(table, &name, unit, &frame, &attributes)?);
         }
         self.linked = Some(Linked {
             reconstruction,

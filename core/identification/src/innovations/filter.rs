@@ -54,6 +54,9 @@ pub struct Parameter {
     pub responses: Vec<Response>,
     /// How it changes the noise.
     pub change: Option<Change>,
+    /// Channels whose innovations, whitened with those before them, are not weighed for it: they are not independent of
+    /// what it adds. What is left is the likelihood of the other channels alone.
+    pub not_weighed: Vec<usize>,
 }
 
 /// Sums of a pass. Sums of several stretches of data add.
@@ -183,6 +186,8 @@ struct Tile {
     state: Vec<[f64; LANES]>,
     next: Vec<[f64; LANES]>,
     nu: Vec<[f64; LANES]>,
+    /// Channel and lane that are not weighed.
+    not_weighed: Vec<(usize, usize)>,
 }
 
 /// A filter at coefficient zero: states of one parameter.
@@ -739,6 +744,8 @@ impl Tile {
             }
         }
         let zero = [0.0; LANES];
+        let each = parameters.iter().enumerate();
+        let not_weighed = each.flat_map(|(lane, p)| p.not_weighed.iter().map(move |c| (*c, lane))).collect();
         Self {
             responses,
             changes,
@@ -746,6 +753,7 @@ impl Tile {
             state: vec![zero; kernel.states],
             next: vec![zero; kernel.states],
             nu: vec![zero; n],
+            not_weighed,
         }
     }
 
@@ -773,6 +781,7 @@ impl Tile {
                     to[lane..lane + LANES].copy_from_slice(white);
                 }
             }
+            self.not_weighed.iter().for_each(|(c, own)| to[c * wide + lane + own] = 0.0);
             let pairs = kernel.transition.iter().zip(kernel.gain.chunks_exact(n));
             for (pair, (next, (before, k))) in self.next.chunks_exact_mut(2).zip(pairs).enumerate() {
                 let (mut first, mut second) = ([0.0; LANES], [0.0; LANES]);

@@ -12,6 +12,8 @@ use super::state_space::{NoisePoint, NoiseStates};
 
 const DT_S: f64 = 0.1;
 const STEP_NS: i64 = 100_000_000;
+/// Force beside the torque, in the same unit.
+const FORCE: f64 = 1.0;
 
 fn process(name: &str, response: NoiseResponse, terms: &[(f64, f64, u32)], enters: &[(&str, &[f64])]) -> NoiseProcess {
     let term = |(asd, corner_hz, exponent): &(f64, f64, u32)| NoiseTerm {
@@ -201,7 +203,7 @@ fn change(system: &NoiseStates, point: &NoisePoint, parameter: usize) -> Paramet
     let at = |by: f64| extended.driving(&moved(system, point, parameter, by));
     let driving = (at(h) - at(-h)) / (2.0 * h);
     let predictor = Predictor::new(system, &system.driving(point)).expect("a predictor");
-    Parameter { responses: Vec::new(), change: Some(predictor.change(&extended, &driving)) }
+    Parameter { responses: Vec::new(), change: Some(predictor.change(&extended, &driving)), ..Parameter::default() }
 }
 
 /// A resonance of each component of the force.
@@ -416,7 +418,7 @@ fn commands_in_the_loop_do_not_bias_a_gain() {
                 system: &system,
                 predictor: &predictor,
                 known: vec![(0, 0, 1.0)],
-                parameters: vec![Parameter { responses: vec![(0, 1, 1.0)], change: None }],
+                parameters: vec![Parameter { responses: vec![(0, 1, 1.0)], ..Parameter::default() }],
                 starts: Vec::new(),
                 series: 2,
                 averaged: true,
@@ -447,6 +449,66 @@ fn commands_in_the_loop_do_not_bias_a_gain() {
     assert!(wrong.abs() / wrong_information.sqrt() > 20.0, "{wrong}");
 }
 
+/// An angle has two readouts: one is a channel, a command on another body follows the other. In the channel `a` the angle
+/// shows beside a force; the command may, and does not. Where the innovations of the angle's channel `b` are
+/// weighed for it, the command foretells them, and its score has a mean of many σ; where they are not it has none, 1 %
+/// to fail by chance.
+#[test]
+fn a_command_that_follows_another_readout_is_not_weighed_where_it_foretells() {
+    let force = process("force", NoiseResponse::Held, &[(FORCE, 1.0, 0)], &[("a", &[1.0])]);
+    let torque = process("torque", NoiseResponse::Held, &[(1.0, 1.0, 0)], &[("a", &[1.0]), ("b", &[1.0])]);
+    let first = process("first", NoiseResponse::Differenced, &[(0.01, 1.0, 0)], &[("a", &[1.0])]);
+    let second = process("second", NoiseResponse::Differenced, &[(0.5, 1.0, 0)], &[("b", &[1.0])]);
+    let system = NoiseStates::new(&[force, torque, first, second], &channels(), DT_S, &[], &[]).expect("a system");
+    let predictor = Predictor::new(&system, &system.driving(&system.declared_point())).expect("a predictor");
+    let white = |asd: f64, random: &mut StdRng| asd * (1.0 / (2.0 * DT_S)).sqrt() * normal(random);
+    let mut score = [0.0; 2];
+    let mut information = [0.0; 2];
+    for seed in 0..100 {
+        let mut random = StdRng::seed_from_u64(1900 + seed);
+        let samples = 3000;
+        let mut states = [(0.0, 0.0); 2];
+        let (mut readouts, mut commands) = (Vec::new(), Vec::new());
+        let mut command = 0.0;
+        for _ in 0..samples {
+            let read = [states[0].0 + white(0.01, &mut random), states[1].0 + white(0.5, &mut random)];
+            command = 0.9 * command + 0.1 * (states[1].0 + white(0.5, &mut random));
+            let angular = white(1.0, &mut random);
+            let turned = angular - read[1] - states[1].1;
+            for ((x, v), a) in states.iter_mut().zip([turned + white(FORCE, &mut random), turned]) {
+                *x += *v * DT_S + 0.5 * a * DT_S * DT_S;
+                *v += a * DT_S;
+            }
+            readouts.push(read);
+            commands.push([command, turned - angular]);
+        }
+        for (k, not_weighed) in [Vec::new(), vec![1]].into_iter().enumerate() {
+            let mut innovations = Innovations::new(Setup {
+                system: &system,
+                predictor: &predictor,
+                known: vec![(0, 1, 1.0), (1, 1, 1.0)],
+                parameters: vec![Parameter { responses: vec![(0, 0, 1.0)], not_weighed, ..Parameter::default() }],
+                starts: Vec::new(),
+                series: 2,
+                averaged: true,
+                step_ns: STEP_NS,
+                block: None,
+                threads: 1,
+            });
+            for t in 1..samples - 1 {
+                let z =
+                    [0, 1].map(|c| (readouts[t + 1][c] - 2.0 * readouts[t][c] + readouts[t - 1][c]) / (DT_S * DT_S));
+                innovations.push(t as i64 * STEP_NS, &z, &commands[t]);
+            }
+            let sums = innovations.finish().total();
+            score[k] += sums.score[0];
+            information[k] += sums.information[(0, 0)];
+        }
+    }
+    let pulls = [0, 1].map(|k| score[k] / information[k].sqrt());
+    assert!(pulls[0].abs() > 5.0 && pulls[1].abs() < 2.58, "{pulls:?}");
+}
+
 /// Threads change no digit, and a gap makes two stretches of one pass.
 #[test]
 fn results_do_not_depend_on_threads_and_a_gap_separates_two_stretches() {
@@ -454,7 +516,11 @@ fn results_do_not_depend_on_threads_and_a_gap_separates_two_stretches() {
     let point = some_point(&system);
     let data = noise(3000, 5);
     let series: Vec<Vec<f64>> = noise(3000, 6).into_iter().map(|x| x.to_vec()).collect();
-    let own = |k: usize| Parameter { responses: vec![(k % 2, (k / 2) % (2 + POWERS), 1.0 + k as f64)], change: None };
+    let own = |k: usize| Parameter {
+        responses: vec![(k % 2, (k / 2) % (2 + POWERS), 1.0 + k as f64)],
+        change: None,
+        ..Parameter::default()
+    };
     let parameters: Vec<Parameter> = (0..45).map(own).chain((0..4).map(|k| change(&system, &point, k))).collect();
     let one = pass(&system, &point, parameters.clone(), &data, &series, 1);
     let three = pass(&system, &point, parameters.clone(), &data, &series, 3);
@@ -495,8 +561,8 @@ fn scores_equal_those_of_the_covariance_of_all_samples() {
     let data = noise(samples, 8);
     let series: Vec<Vec<f64>> = noise(samples, 9).into_iter().map(|x| x.to_vec()).collect();
     let parameters = vec![
-        Parameter { responses: vec![(0, 0, 2.0), (1, 1, -1.0)], change: None },
-        Parameter { responses: vec![(1, 0, 0.5)], change: None },
+        Parameter { responses: vec![(0, 0, 2.0), (1, 1, -1.0)], ..Parameter::default() },
+        Parameter { responses: vec![(1, 0, 0.5)], ..Parameter::default() },
     ];
     let sums = pass(&system, &point, parameters, &data, &series, 1);
     let z = DVector::from_iterator(2 * samples, data.iter().flatten().copied());
@@ -545,7 +611,11 @@ fn blocks_are_what_their_rows_add() {
     data[990][0] = f64::NAN;
     data[1400..2100].fill([f64::NAN; 2]);
     let series: Vec<Vec<f64>> = noise(3000, 22).into_iter().map(|x| x.to_vec()).collect();
-    let own = |k: usize| Parameter { responses: vec![(k % 2, (k / 2) % (2 + POWERS), 1.0 + k as f64)], change: None };
+    let own = |k: usize| Parameter {
+        responses: vec![(k % 2, (k / 2) % (2 + POWERS), 1.0 + k as f64)],
+        change: None,
+        ..Parameter::default()
+    };
     let levels = |k: usize| {
         let at = |by: f64| {
             let mut point = point.clone();
@@ -553,7 +623,7 @@ fn blocks_are_what_their_rows_add() {
             system.driving(&point)
         };
         let change = predictor.change(&system, &((at(0.1) - at(-0.1)) / 0.2));
-        Parameter { responses: Vec::new(), change: Some(change) }
+        Parameter { responses: Vec::new(), change: Some(change), ..Parameter::default() }
     };
     let parameters: Vec<Parameter> = (0..20).map(own).chain((0..4).map(levels)).chain((20..45).map(own)).collect();
     let cut = |samples: usize, block: Option<u64>, threads: usize| {

@@ -9,8 +9,8 @@ use dragfree_identification::innovations::filter::{Innovations, POWERS, Paramete
 use dragfree_identification::innovations::predictor::{Change, Predictor};
 use dragfree_identification::innovations::state_space::{NoNoise, NoisePoint, NoiseStates, gains};
 use dragfree_schema::{
-    Available, Coefficient, Column, NoiseProcess, Response as Declared, Settings, UNPREDICTED_ATTRIBUTE,
-    UNPREDICTED_SLOPE_ATTRIBUTE,
+    AHEAD_ATTRIBUTE, Available, Coefficient, Column, NoiseProcess, Response as Declared, Settings,
+    UNPREDICTED_ATTRIBUTE, UNPREDICTED_SLOPE_ATTRIBUTE,
 };
 use nalgebra::DMatrix;
 
@@ -141,6 +141,8 @@ struct Term {
     /// What the series lacks of each channel's unknown acceleration, and of its slope.
     unpredicted: Option<Vec<f64>>,
     unpredicted_slope: Option<Vec<f64>>,
+    /// Channels of whose next readout the series knows more than the past of all channels.
+    ahead: Vec<usize>,
 }
 
 /// The channels of a linked chain, and what coefficients add to them.
@@ -185,6 +187,9 @@ impl<'a> Responses<'a> {
             (!text.is_empty()).then(|| gains(text, &self.names))
         };
         let (unpredicted, unpredicted_slope) = (lacks(UNPREDICTED_ATTRIBUTE), lacks(UNPREDICTED_SLOPE_ATTRIBUTE));
+        let ahead: Vec<String> =
+            serde_json::from_str(column.map_or("", |c| c.attribute(AHEAD_ATTRIBUTE))).unwrap_or_default();
+        let ahead = ahead.iter().filter_map(|name| self.names.iter().position(|own| own == name)).collect();
         let key = (response.table, response.series);
         let series = self.series.iter().position(|s| *s == key).unwrap_or_else(|| {
             self.series.push(key);
@@ -201,6 +206,7 @@ impl<'a> Responses<'a> {
             factor: response.factor,
             unpredicted,
             unpredicted_slope,
+            ahead,
         });
     }
 
@@ -225,6 +231,13 @@ impl<'a> Responses<'a> {
             (scale != 0.0).then_some((t.channel, t.series, t.factor * scale))
         };
         self.terms.iter().filter_map(response).collect()
+    }
+
+    /// Channels of whose innovations what a coefficient adds is not independent.
+    fn not_weighed(&self, i: usize) -> Vec<usize> {
+        let own = self.terms.iter().filter(|t| t.coefficient == i || t.times == Some(i));
+        let channels: BTreeSet<usize> = own.flat_map(|t| t.ahead.iter().copied()).collect();
+        channels.into_iter().collect()
     }
 
     /// What the coefficients at these values add to the channels.
@@ -363,12 +376,13 @@ impl Filtered {
             let own = responses.to(i, &noise.values);
             if !own.is_empty() || change.is_some() {
                 let meaning = Meaning::Coefficient(Box::new((*c).clone()));
-                unknowns.push((c.name.clone(), meaning, Parameter { responses: own, change }));
+                let not_weighed = responses.not_weighed(i);
+                unknowns.push((c.name.clone(), meaning, Parameter { responses: own, change, not_weighed }));
             }
         }
         for (k, name) in noise.system.components.iter().enumerate().filter(|_| !opening) {
             let change = Some(noise.by_level(k));
-            unknowns.push((name.clone(), Meaning::Level, Parameter { responses: Vec::new(), change }));
+            unknowns.push((name.clone(), Meaning::Level, Parameter { change, ..Parameter::default() }));
         }
         // Series without their means: a command may have one of 1e5 σ, which a constant of the channel takes exactly,
         // but for the digits that it would cost every sum.
@@ -390,7 +404,7 @@ impl Filtered {
                 let (series, unit) = (responses.series.len() + k, noise.system.unit[channel]);
                 let mean = constants.iter().filter(|c| c.power == power).map(|c| c.at(&point.values)).sum::<f64>();
                 known.extend(point.powers.get(&power).map(|value| (channel, series, (value + mean) * unit)));
-                let own = Parameter { responses: vec![(channel, series, unit)], change: None };
+                let own = Parameter { responses: vec![(channel, series, unit)], ..Parameter::default() };
                 unknowns.push((power, Meaning::Power, own));
             }
         }
