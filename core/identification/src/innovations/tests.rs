@@ -449,8 +449,8 @@ fn commands_in_the_loop_do_not_bias_a_gain() {
     assert!(wrong.abs() / wrong_information.sqrt() > 20.0, "{wrong}");
 }
 
-/// An angle has two readouts: one is a channel, a command on another body follows the other. In the channel `a` the angle
-/// shows beside a force; the command may, and does not. Where the innovations of the angle's channel `b` are
+/// An angle has two readouts: one is a channel, a command on another body follows the other. In the channel `a` the
+/// angle shows beside a force; the command may, and does not. Where the innovations of the angle's channel `b` are
 /// weighed for it, the command foretells them, and its score has a mean of many σ; where they are not it has none, 1 %
 /// to fail by chance.
 #[test]
