@@ -273,6 +273,9 @@ pub(crate) struct Diagnose {
     /// Candidates and limits to print; --json has all
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub(crate) top: usize,
+    /// Say what length of data would tell a named effect from what it cannot be told from
+    #[arg(long)]
+    pub(crate) next: bool,
 }
 
 #[derive(Debug, Subcommand)]

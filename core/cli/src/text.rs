@@ -80,7 +80,9 @@ pub(crate) fn wrapped(sentence: &str) -> String {
 /// `label` and then `words`, broken at [`WIDTH`] and indented under the first word.
 pub(crate) fn labelled(label: &str, words: &str) -> String {
     const INDENT: usize = 10;
-    wrap(format!("{label:<INDENT$}"), INDENT, words)
+    let first = format!("{:<INDENT$}", format!("{label} "));
+    let indent = width(&first);
+    wrap(first, indent, words)
 }
 
 fn wrap(first: String, indent: usize, words: &str) -> String {
@@ -175,6 +177,12 @@ fn exponent(number: f64) -> i32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_label_and_its_words_are_apart() {
+        assert_eq!(labelled("fit", "a b").trim_end(), "fit       a b");
+        assert_eq!(labelled("    told from", "a b").trim_end(), "    told from a b");
+    }
 
     #[test]
     fn values_are_told_with_two_digits_of_their_error() {

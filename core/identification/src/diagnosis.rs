@@ -61,6 +61,8 @@ pub struct Found {
     pub channels: Vec<String>,
     /// Candidates and coefficients that the data cannot tell from it.
     pub confounders: Vec<String>,
+    /// What it takes to tell it from each confounder that is an effect.
+    pub separations: Vec<Separation>,
     /// Whether it is part of the answer.
     pub accepted: bool,
     /// Why it is no part of the answer although its p-value is below the false-alarm rate.
@@ -70,6 +72,27 @@ pub struct Found {
     /// Whether these agree.
     pub constancy: Option<Constancy>,
 }
+
+/// What it takes to tell an effect from another, if the effect acts with the size that was found.
+#[derive(Clone, Debug, Serialize)]
+pub struct Separation {
+    /// The other, `EFFECT:INSTANCE`.
+    pub from: String,
+    /// By how much χ² is expected to be higher with the other in its place, in these data.
+    pub chi2: f64,
+    /// Length of data like these, over that of these, at which this is 25: five σ.
+    pub times_the_data: f64,
+}
+
+impl Separation {
+    /// From what these data tell; `from` is the other.
+    pub fn new(from: String, chi2: f64) -> Self {
+        Self { from, chi2, times_the_data: SEPARATED_CHI2 / chi2.max(f64::MIN_POSITIVE) }
+    }
+}
+
+/// χ² at which two effects count as told apart: five σ.
+const SEPARATED_CHI2: f64 = 25.0;
 
 /// What one product says of a coefficient.
 #[derive(Clone, Debug, Serialize)]

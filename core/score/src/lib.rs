@@ -300,11 +300,18 @@ pub fn expected(truth: &Truth, shape: &Map<String, Value>, sealed: &Value) -> Re
                 part(".angular_z", "N m s", turned(0, 1)),
             ])
         }
+        // Pulses at the steps of another flag have another size.
+        "impulse" if shape.get("flag").is_some_and(|flag| flag != ANTENNA_FLAG) => {
+            Err(format!("the candidate acts at the steps of another flag than {ANTENNA_FLAG}"))
+        }
         "impulse" => only("N m s", truth.size),
         "mps-correlation" => Err("the coefficients describe the thrusters' positions, the size their noise".to_owned()),
         _ => Err("no bundled effect has a coefficient for it".to_owned()),
     }
 }
+
+/// Flag of the simulator's antenna, whose moves turn the spacecraft.
+const ANTENNA_FLAG: &str = "hk.antenna_move_flag";
 
 /// True numerical shape parameters of the model's effect.
 fn expected_shape(truth: &Truth) -> Map<String, Value> {

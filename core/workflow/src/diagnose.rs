@@ -11,7 +11,8 @@ use dragfree_engine::product::Written;
 use dragfree_engine::run::Progress;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{
-    self, Constancy, Diagnosis, Found, LIMIT_QUANTILE, Limit, OfProduct, TRANSIENT, Trials, UNOBSERVABLE, Unexplained,
+    self, Constancy, Diagnosis, Found, LIMIT_QUANTILE, Limit, OfProduct, Separation, TRANSIENT, Trials, UNOBSERVABLE,
+    Unexplained,
 };
 use dragfree_identification::innovations::decision::{Fitted, Quadratic};
 use dragfree_identification::record::Record;
@@ -338,7 +339,11 @@ fn found(
     }
     let channels: BTreeSet<&String> =
         own.iter().filter_map(|i| decided.channels.get(&decided.parameters[*i].0)).flatten().collect();
-    let confounder = |(c, _): &(usize, f64)| format!("{}:{}", decided.candidates[*c].0, decided.candidates[*c].1);
+    let rivals: Vec<usize> = fitted.alternatives.iter().filter(|(_, p)| *p > evidence.least).map(|(c, _)| *c).collect();
+    let name_of = |c: &usize| format!("{}:{}", decided.candidates[*c].0, decided.candidates[*c].1);
+    let set = &named;
+    let separation = |c: &usize| Separation::new(name_of(c), decided.quadratic.separation(fitted.candidate, *c, set));
+    let separations: Vec<Separation> = rivals.iter().map(separation).collect();
     let before = decided.chi2 / decided.numbers;
     let (name, unit) = coefficient(decided, own[lead]);
     Found {
@@ -367,7 +372,8 @@ fn found(
         offset_shift_m,
         offset_shift_sigma,
         channels: channels.into_iter().cloned().collect(),
-        confounders: fitted.alternatives.iter().filter(|(_, p)| *p > evidence.least).map(confounder).collect(),
+        confounders: rivals.iter().map(name_of).collect(),
+        separations,
         accepted,
         refused: (!accepted && p_value < evidence.least).then(|| {
             if fitted.beyond > settings.range_sigmas.powi(2) {
@@ -423,6 +429,7 @@ fn louder(decided: &Decided, record: &Record, evidence: &Evidence<'_>) -> Vec<Fo
             offset_shift_sigma: BTreeMap::new(),
             channels: channels_of(record, &c.noise),
             confounders: Vec::new(),
+            separations: Vec::new(),
             accepted: false,
             refused: None,
             by_product: Vec::new(),

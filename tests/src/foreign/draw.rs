@@ -484,14 +484,16 @@ impl Draw {
     /// Names of noise levels that differ from the declared ones by more than `part`, the hidden ones among them.
     #[must_use]
     pub fn true_levels(&self, part: f64) -> Vec<String> {
-        let [thrust, torque, _, is, _] = self.deviation;
+        let [thrust, torque, ifo, is, _] = self.deviation;
         let hidden = &self.flight.hidden;
         let mut all = Vec::new();
         for (a, axis) in AXES.into_iter().enumerate() {
             all.push((format!("mps-noise:sc.{axis}"), thrust * hidden.thrust_noise[a]));
             all.push((format!("torque-noise:sc.{axis}"), torque * hidden.torque_noise[a]));
             for i in 0..2 {
-                all.push((format!("is-noise:tm{}.{axis}", i + 1), is * hidden.is_noise[i][a]));
+                // The interferometer reads x.
+                let readout = if a == 0 { ifo } else { is * hidden.is_noise[i][a] };
+                all.push((format!("is-noise:tm{}.{axis}", i + 1), readout));
             }
         }
         all.into_iter().filter(|(_, level)| (level - 1.0).abs() > part).map(|(name, _)| name).collect()

@@ -16,11 +16,13 @@ pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Resu
         let value = serde_json::to_value(&diagnosed.diagnosis)?;
         return Ok(Done { code, ..Done::json(&value) });
     }
-    Ok(Done { code, ..Done::new(screen(&diagnosed, command.top, &super::repeated(None, global), paint)) })
+    Ok(Done { code, ..Done::new(screen(&diagnosed, command, &super::repeated(None, global), paint)) })
 }
 
-fn screen(diagnosed: &Diagnosed, top: usize, repeated: &str, paint: Paint) -> String {
+fn screen(diagnosed: &Diagnosed, command: &Diagnose, repeated: &str, paint: Paint) -> String {
     let Diagnosed { record, diagnosis: d, .. } = diagnosed;
+    let top = command.top;
+    let ask = Ask { next: command.next, different: d.false_alarm_rate };
     let mut out = String::new();
     let verdict = match d.verdict.as_str() {
         "missing" => "an effect is missing from the model",
@@ -38,13 +40,13 @@ fn screen(diagnosed: &Diagnosed, top: usize, repeated: &str, paint: Paint) -> St
     let accepted: Vec<&Found> = d.candidates.iter().filter(|f| f.accepted).collect();
     if !accepted.is_empty() {
         let _ = writeln!(out, "\nWhat is missing");
-        accepted.iter().for_each(|f| put(&mut out, f, d.false_alarm_rate));
+        accepted.iter().for_each(|f| put(&mut out, f, ask));
     }
     let others: Vec<&Found> =
         d.candidates.iter().filter(|f| !f.accepted).take(top.saturating_sub(accepted.len())).collect();
     if !others.is_empty() {
         let _ = writeln!(out, "\nTried next, and not accepted");
-        others.iter().for_each(|f| put(&mut out, f, d.false_alarm_rate));
+        others.iter().for_each(|f| put(&mut out, f, ask));
     }
     for reason in &d.reasons {
         out += &crate::text::labelled("reason", reason);
@@ -83,8 +85,19 @@ fn screen(diagnosed: &Diagnosed, top: usize, repeated: &str, paint: Paint) -> St
     out
 }
 
-/// `different` is the p-value below which products differ.
-fn put(out: &mut String, f: &Found, different: f64) {
+/// What is asked of each effect.
+#[derive(Clone, Copy)]
+struct Ask {
+    /// What would tell it from others.
+    next: bool,
+    /// p-value below which products differ.
+    different: f64,
+}
+
+/// Length over that of the data from which on it is no advice.
+const LONGEST: f64 = 1000.0;
+
+fn put(out: &mut String, f: &Found, ask: Ask) {
     let _ = writeln!(out, "  {}:{}", f.effect, f.instance);
     let _ = writeln!(
         out,
@@ -114,11 +127,21 @@ fn put(out: &mut String, f: &Found, different: f64) {
     }
     if let Some(c) = &f.constancy {
         let days: Vec<String> = f.by_product.iter().map(|d| format!("{:.3e} ± {:.0e}", d.value, d.sigma)).collect();
-        let verdict = if c.p_value < different { "not the same in all products" } else { "the same in all products" };
+        let verdict =
+            if c.p_value < ask.different { "not the same in all products" } else { "the same in all products" };
         let text = format!("{verdict}: {} (χ² {:.1} of {}, p = {:.1e})", days.join(", "), c.chi2, c.dof, c.p_value);
         out.push_str(&crate::text::labelled("    values", &text));
     }
     if !f.confounders.is_empty() {
         let _ = writeln!(out, "    cannot be told from {}", f.confounders.join(", "));
+    }
+    for s in f.separations.iter().filter(|_| ask.next) {
+        let length = if s.times_the_data < LONGEST {
+            format!("{:.1} times these data", s.times_the_data.max(1.0))
+        } else {
+            "no length of such data: a test on the ground, or a manoeuvre".to_owned()
+        };
+        let text = format!("{} at 5σ: {length} (now {:.1}σ)", s.from, s.chi2.sqrt());
+        out.push_str(&crate::text::labelled("    told from", &text));
     }
 }

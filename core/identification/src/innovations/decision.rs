@@ -311,6 +311,20 @@ impl Quadratic {
         }
     }
 
+    /// By how much χ² is expected to be higher with another candidate in the place of one of a set, if that one acts with
+    /// its fitted values: what the other and the rest of the set leave of it. Grows with the length of the data.
+    pub fn separation(&self, candidate: usize, from: usize, set: &[usize]) -> f64 {
+        let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).chain([from]).collect();
+        let (own, at) = (self.parameters(&[candidate]), self.parameters(&others));
+        let n = |rows: &[usize], columns: &[usize]| {
+            DMatrix::from_fn(rows.len(), columns.len(), |i, j| self.profiled[(rows[i], columns[j])])
+        };
+        let across = n(&own, &at);
+        let left = n(&own, &own) - &across * inverse(&n(&at, &at)) * across.transpose();
+        let values = DVector::from_vec(self.beside(candidate, set).values);
+        values.dot(&(left * &values)).max(0.0)
+    }
+
     fn with_alternatives(&self, candidate: usize, set: &[usize], usable: &[usize]) -> Fitted {
         let mut fitted = self.beside(candidate, set);
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();

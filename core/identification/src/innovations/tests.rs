@@ -719,6 +719,19 @@ fn a_stand_in_is_exchanged_for_the_causes() {
 
 /// Outside of its range a value explains only what its best value inside explains, and data that want a value far
 /// outside name nothing; equals share the probability.
+/// One of two candidates with a correlation of ρ acts: the other explains ρ² of it, and four times the data tell
+/// four times as much.
+#[test]
+fn the_separation_of_two_is_what_one_leaves_of_the_other() {
+    for (length, rho) in [(1.0, 0.0), (1.0, 0.8), (4.0, 0.8)] {
+        let n = 1e4 * length;
+        let information = DMatrix::from_row_slice(3, 3, &[1.0, 0.0, 0.0, 0.0, n, rho * n, 0.0, rho * n, n]);
+        let own = quadratic(information, &[0.0, 0.2, 0.0], vec![candidate(1), candidate(2)]);
+        let expected = 0.04 * n * (1.0 - rho * rho);
+        assert!((own.separation(0, 1, &[0]) / expected - 1.0).abs() < 1e-9);
+    }
+}
+
 #[test]
 fn ranges_bound_the_gain_and_equals_are_alternatives() {
     let information = DMatrix::from_row_slice(3, 3, &[1.0, 0.0, 0.0, 0.0, 1e4, 0.999 * 1e4, 0.0, 0.999 * 1e4, 1e4]);
