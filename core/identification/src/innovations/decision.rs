@@ -311,8 +311,8 @@ impl Quadratic {
         }
     }
 
-    /// By how much χ² is expected to be higher with another candidate in the place of one of a set, if that one acts with
-    /// its fitted values: what the other and the rest of the set leave of it. Grows with the length of the data.
+    /// By how much χ² is expected to be higher with another candidate in the place of one of a set, if that one acts
+    /// with its fitted values: what the other and the rest of the set leave of it. Grows with the length of the data.
     pub fn separation(&self, candidate: usize, from: usize, set: &[usize]) -> f64 {
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).chain([from]).collect();
         let (own, at) = (self.parameters(&[candidate]), self.parameters(&others));
