@@ -164,6 +164,22 @@ fn accepted(d: &Value) -> Vec<String> {
     d["candidates"].as_array().expect("a list").iter().filter(|c| c["accepted"] == true).map(name).collect()
 }
 
+/// A hit off the centre of mass: its momentum p and angular momentum L = r × p within 4σ (false alarm 6e-5 each), and
+/// nothing else beside it. With L on the attitude alone, where the commands show none of it, L came out as zero.
+#[test]
+fn a_hit_off_the_centre_of_mass_is_found_with_its_angular_momentum() {
+    let hit = "impulse:sc.x=7e-6,at_s=3000.03,arm_y_m=0.6,arm_z_m=0.3";
+    let d = diagnosis(&["--hours", "2", "--seed", "31", "--effect", hit]);
+    assert_eq!(accepted(&d), ["impulse:sc.x"]);
+    let found = d["candidates"][0]["coefficients"].as_array().expect("coefficients");
+    let truth = [("momentum", 7e-6), ("angular_x", 0.0), ("angular_y", 2.1e-6), ("angular_z", -4.2e-6)];
+    for (name, truth) in truth {
+        let c = found.iter().find(|c| c["name"] == format!("impulse.sc.x.{name}").as_str()).expect("a coefficient");
+        let (value, sigma) = (c["value"].as_f64().expect("a value"), c["sigma"].as_f64().expect("a sigma"));
+        assert!((value - truth).abs() < 4.0 * sigma && sigma < 4e-7, "{c:#}, true {truth}");
+    }
+}
+
 /// A glitch with a decay of a minute: named with its instance, its time to two minutes (the remaining velocity carries
 /// no more) and its size within 4σ, alone.
 #[test]

@@ -14,8 +14,9 @@
 //!
 //! The regressor is the mean over each sample, s⁻¹, of a pulse of integral one. A momentum p on the spacecraft gives
 //! `−T_S^{O_i} p/m_S` (eq:TM_SC_relative_acceleration). The lever arm of a hit is unknown, so its angular momentum L
-//! has coefficients of its own, `J_S⁻¹ L` in the attitude (eq:SC_attitude_dynamics); through the offset it acts by way
-//! of `α̂`. A momentum on a test mass gives `p/m_m`.
+//! has coefficients of its own, `J_S⁻¹ L` in the attitude (eq:SC_attitude_dynamics); on a test mass it acts through the
+//! offset, by way of `α̂` or, where that is what is commanded, by responses of its own. A momentum on a test mass gives
+//! `p/m_m`.
 //!
 //! **Range**: ±1e-3 N s and N m s on the spacecraft (LISA Pathfinder: 0.2 to 230 µN s), ±1e-7 N s on a test mass.
 //! **Sign**: along the axis of SRF or ORF. **Confounders**: a hit and simultaneous glitches; an outlier of the
@@ -146,7 +147,7 @@ impl Impulse {
         let turn = |part: &str, axis: usize| -> Result<_, PluginError> {
             Ok((
                 coefficient(part, "N m s", MAX_SPACECRAFT),
-                on(responses_to_spacecraft_torque(&self.mission, axis, pulse))?,
+                on(responses_to_spacecraft_torque(available, &self.mission, axis, pulse))?,
             ))
         };
         Ok(match self.cause {

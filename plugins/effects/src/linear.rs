@@ -13,7 +13,7 @@ use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix2, Vector3};
 
 pub(crate) use crate::columns::{Body, InputColumn, accel_channel, latest_column, unpredicted};
-use crate::common::{AXES, SeriesRef, axis_of, mission};
+use crate::common::{AXES, SeriesRef, axis_of, mission, through_offset};
 use crate::prediction::{PredictedAcceleration, Predictor};
 
 /// A slowly varying factor of a column.
@@ -249,23 +249,15 @@ pub(crate) fn offset_coupling_terms(
 ) -> Result<Vec<Term>, PluginError> {
     let mut terms = Vec::new();
     for tm in &Body::all(mission) {
-        let t = tm.section.dcm_orf_from_srf();
-        for (row, axis) in (0..3).flat_map(|row| (0..3).map(move |axis| (row, axis))).filter(|(r, a)| r != a) {
-            let times = offset_name(tm, axis);
-            if available.coefficient(&times).is_none_or(|c| c.candidate) {
-                continue;
-            }
-            // (−a × b)_row = ε a_other b_axis, where `other` is the third axis.
-            let other = 3 - row - axis;
-            let sign = if (row + 1) % 3 == axis { 1.0 } else { -1.0 };
-            for j in 0..3 {
-                terms.push(Term {
-                    channel: accel_channel(tm, row),
-                    series: series(j),
-                    factor: sign * factor * t[(other, j)],
-                    times: Some(times.clone()),
-                });
-            }
+        for j in 0..3 {
+            let alpha = Vector3::ith(j, factor);
+            let coupled = through_offset(available, &tm.name, &tm.section.dcm_orf_from_srf(), &alpha);
+            terms.extend(coupled.map(|(row, times, factor)| Term {
+                channel: accel_channel(tm, row),
+                series: series(j),
+                factor,
+                times: Some(times),
+            }));
         }
     }
     if mission.test_mass.is_empty() {

@@ -153,7 +153,7 @@ impl TestSpacecraft {
             torque_srf_nm: ramp(2),
             electrodes_orf_n: [ramp(3), ramp(4)],
             electrodes_orf_nm: [ramp(5), ramp(6)],
-            sun_srf: ramp(7),
+            sun_srf: ramp(17),
             noise_torque_srf_nm: ramp(8),
             unknown_force_srf_n: self.unknown_force_srf_n[0] + self.unknown_force_srf_n[1] * t_s,
         }

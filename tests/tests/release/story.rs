@@ -83,7 +83,8 @@ fn the_extended_model_predicts_withheld_hours() {
 }
 
 /// Every size that the simulator can draw has a coefficient with its name and unit: a requested effect appears with a
-/// limit in the diagnosis. Impulses and noise levels have no limits.
+/// limit in the diagnosis. Impulses and noise levels have no limits; and the light of a Sun that stands still in SRF is
+/// a constant force and torque, of which the diagnosis says that these data do not show it.
 #[test]
 fn every_simulated_size_has_a_model_coefficient() {
     let asked = [
@@ -111,10 +112,15 @@ fn every_simulated_size_has_a_model_coefficient() {
     let opened = json(dragfree(dir.path()).arg("reveal").arg(sealed).args(["--diagnosis", "d.json", "--json"]), 0);
     let mut compared = BTreeSet::new();
     for effect in opened["score"]["effects"].as_array().expect("effects").iter().filter(|e| e["hidden"] == false) {
+        compared.insert(effect["effect"].as_str().expect("an id").to_owned());
+        if effect["effect"] == "solar-pressure" {
+            let why = effect["not_covered_because"].as_str().expect("a reason");
+            assert!(why.starts_with("unobservable"), "{effect:#}");
+            continue;
+        }
         let limits = effect["limits"].as_array().expect("limits");
         assert!(!limits.is_empty() && effect["covered"] == true, "{effect:#}");
         assert!(limits.iter().all(|l| l["truth"].is_f64()), "{effect:#}");
-        compared.insert(effect["effect"].as_str().expect("an id").to_owned());
     }
     assert_eq!(compared.len(), asked.len(), "{compared:?}");
 }

@@ -5,8 +5,9 @@ use nalgebra::{DMatrix, DVector};
 
 use super::filter::Sums;
 
-/// Part of a coefficient's information that the others must leave for it to be observable: below it is rounding.
-const OBSERVABLE: f64 = 1e-11;
+/// By how many times the error that rounding is expected to make a number must differ from zero to be no rounding: sums
+/// of n products have one of √n ε (Higham and Mary, 2019), and each product comes from several operations.
+const ROUNDING: f64 = 30.0;
 /// Rounds of fixing values at the ends of their ranges.
 const ROUNDS: usize = 20;
 
@@ -99,6 +100,8 @@ pub struct Quadratic {
     /// Information and score of the candidates' parameters, the base fitted, by index of the parameter.
     profiled: DMatrix<f64>,
     profiled_score: DVector<f64>,
+    /// What rounding may leave of the information of each parameter, the base fitted.
+    rounding: Vec<f64>,
 }
 
 impl Quadratic {
@@ -124,6 +127,7 @@ impl Quadratic {
             base,
             candidates,
             numbers: sums.numbers.max(1.0),
+            rounding: Vec::new(),
         };
         quadratic.profile();
         quadratic
@@ -137,6 +141,11 @@ impl Quadratic {
         let along = &across * inner;
         self.profiled = &self.information - &along * across.transpose();
         self.profiled_score = &self.score - &along * DVector::from_fn(b.len(), |i, _| self.score[b[i]]);
+        // Each number of the information is wrong by a part of √(I_ii I_jj); what the base leaves is a sum of them.
+        let size = |i: usize| self.information[(i, i)].max(0.0).sqrt();
+        let part = ROUNDING * self.numbers.sqrt() * f64::EPSILON;
+        let sums = (0..p).map(|i| size(i) + (0..b.len()).map(|j| along[(i, j)].abs() * size(b[j])).sum::<f64>());
+        self.rounding = sums.map(|sum| part * sum * sum).collect();
     }
 
     /// Inverse of the information of some parameters; those without any get a variance of zero.
@@ -218,16 +227,15 @@ impl Quadratic {
         }
     }
 
-    /// Part of the information of a candidate that the base and a set leave.
-    fn left(&self, candidate: usize, set: &[usize]) -> f64 {
+    /// Whether the base and a set leave more of the information of each parameter of a candidate than rounding may.
+    fn observable(&self, candidate: usize, set: &[usize]) -> bool {
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
         let at = self.parameters(&others);
         let inner = inverse(&DMatrix::from_fn(at.len(), at.len(), |i, j| self.profiled[(at[i], at[j])]));
-        let left = |p: &usize| {
+        self.candidates[candidate].parameters.iter().all(|p| {
             let across = DVector::from_fn(at.len(), |i, _| self.profiled[(*p, at[i])]);
-            (self.profiled[(*p, *p)] - across.dot(&(&inner * &across))) / self.information[(*p, *p)]
-        };
-        self.candidates[candidate].parameters.iter().map(left).fold(f64::INFINITY, f64::min)
+            self.profiled[(*p, *p)] - across.dot(&(&inner * &across)) > self.rounding[*p]
+        })
     }
 
     /// A set of effects in which each is significant beside the others.
@@ -235,7 +243,7 @@ impl Quadratic {
     /// The most significant candidate is added; one is exchanged for another, or for two, where that raises the
     /// evidence; and what is not significant beside the others is taken out, until a set comes back.
     pub fn select(&self, evidence: &Evidence<'_>) -> Selection {
-        let observable = |c: &usize, set: &[usize]| self.left(*c, set) > OBSERVABLE;
+        let observable = |c: &usize, set: &[usize]| self.observable(*c, set);
         let all: Vec<usize> = (0..self.candidates.len()).collect();
         let unobservable: Vec<usize> = all.iter().copied().filter(|c| !observable(c, &[])).collect();
         let usable: Vec<usize> = all.into_iter().filter(|c| !unobservable.contains(c)).collect();

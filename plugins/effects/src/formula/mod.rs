@@ -138,13 +138,13 @@ impl Formula {
         Err(PluginError::error(format!("effect {}: {what}", self.name())))
     }
 
-    fn responses(&self, series: &SeriesRef) -> Result<Vec<Response>, PluginError> {
+    fn responses(&self, available: &Available, series: &SeriesRef) -> Result<Vec<Response>, PluginError> {
         let mut parts = self.acts_on.split('.');
         let axis = axis_of(&self.acts_on);
         let known = parts.clone().count() == 3 && self.acts_on.rsplit('.').next().is_some_and(|a| AXES.contains(&a));
         match (parts.next().unwrap_or_default(), parts.next().unwrap_or_default()) {
             ("sc", "force") if known => Ok(responses_to_spacecraft_force(&self.mission, axis, series)),
-            ("sc", "torque") if known => Ok(responses_to_spacecraft_torque(&self.mission, axis, series)),
+            ("sc", "torque") if known => Ok(responses_to_spacecraft_torque(available, &self.mission, axis, series)),
             (tm, what @ ("force" | "accel")) if known && self.mission.test_mass.contains_key(tm) => {
                 let mass_kg = self.mission.test_mass(tm, "the effect formula")?.mass_kg;
                 let factor = if what == "force" { 1.0 / mass_kg } else { 1.0 };
@@ -275,12 +275,13 @@ impl Effect for Formula {
             inputs.push(column.map(|(_, column)| link.read(&Want::of(column))).transpose()?);
         }
         let Some(channel) = available.of_kind("channel").next() else {
-            return keep_available(available, &self.name(), self.responses(&SeriesRef::default())?).map(drop);
+            return keep_available(available, &self.name(), self.responses(available, &SeriesRef::default())?)
+                .map(drop);
         };
         let clock = link.read(&Want::of(channel))?;
         let series = "formula".to_owned();
         let out = link.series(&series, "", "")?;
-        let responses = keep_available(available, &self.name(), self.responses(&(link.table(), series))?)?;
+        let responses = keep_available(available, &self.name(), self.responses(available, &(link.table(), series))?)?;
         self.linked = Some(Linked { program, inputs, clock, out });
         let (lower, upper) = (self.range[0], self.range[1]);
         link.coefficient(&Coefficient {
