@@ -140,6 +140,11 @@ pub(crate) fn unpredicted<'a>(available: &'a Available, column: &InputColumn) ->
     Some(column.attribute(UNPREDICTED_ATTRIBUTE)).filter(|gains| !gains.is_empty())
 }
 
+/// Whether `α̂` is what is commanded, as in prediction mode, and lacks what anything else does to the attitude.
+pub(crate) fn alpha_is_commanded(available: &Available) -> bool {
+    (0..3).all(|j| unpredicted(available, &InputColumn::alpha(j)).is_some())
+}
+
 /// Name of an acceleration channel, `NAME.accel.x`, m s⁻².
 pub(crate) fn accel_channel(tm: &Body, axis: usize) -> String {
     format!("{}.accel.{}", tm.name, AXES[axis])

@@ -10,7 +10,7 @@ use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 use serde_json::{Value, json};
 
-use crate::columns::{InputColumn, unpredicted};
+use crate::columns::alpha_is_commanded;
 use crate::common::{AXES, TEST_MASSES, manifest, mission, read_srf_vector};
 
 /// Regressors `−Ω` in ORF, s⁻², 3 × 3: acceleration along axis `row`, m s⁻², per metre of offset along axis `column`.
@@ -136,7 +136,7 @@ impl Effect for ComOffset {
         let mut channels = Vec::new();
         let mut averaged = false;
         let lacks = unpredicted_gains(&self.dcm_orf_from_srf);
-        let predicts = (0..3).all(|j| unpredicted(available, &InputColumn::alpha(j)).is_some());
+        let predicts = alpha_is_commanded(available);
         for (row, axis) in AXES.iter().enumerate() {
             let name = format!("{}.accel.{axis}", self.instance);
             let Some(channel) = available.of_kind("channel").find(|c| c.name == name) else { continue };

@@ -14,7 +14,7 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::columns::{InputColumn, unpredicted};
+use crate::columns::alpha_is_commanded;
 use crate::common::{
     AXES, axis_of, keep_available, manifest, mission, read_srf_vector, responses_to_spacecraft_force, symmetric,
 };
@@ -61,7 +61,7 @@ impl Effect for MpsCorrelation {
         let sunlit = self.mission.solar_pressure.is_some() && available.find("used.sun_srf.x").is_some();
         let sun = sunlit.then(|| read_srf_vector(link, "used.sun_srf", "1")).transpose()?;
         // In prediction mode α is what is commanded: what is left of the torque is then what no column knows.
-        let predicts = (0..3).all(|j| unpredicted(available, &InputColumn::alpha(j)).is_some());
+        let predicts = alpha_is_commanded(available);
         let inertia = self.mission.spacecraft.inertia();
         let [x, y, z] = [0, 1, 2].map(|j| {
             let gains: BTreeMap<String, f64> = (0..3).map(|k| (attitude_channel(k), inertia[(j, k)])).collect();

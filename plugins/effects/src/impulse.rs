@@ -28,9 +28,10 @@ use serde_json::json;
 
 use crate::common::{
     AXES, SLOW_HZ, SeriesRef, accel_channel_of, axis_of, find_housekeeping, housekeeping_in, keep_available, manifest,
-    mission, response, responses_to_spacecraft_force, responses_to_spacecraft_torque, symmetric, tm_of,
+    mission, response, responses_to_spacecraft_force, symmetric, tm_of,
 };
 use crate::step_pulses::StepPulses;
+use crate::torque::responses_to_spacecraft_torque;
 
 const MAX_SPACECRAFT: f64 = 1e-3;
 const MAX_TEST_MASS: f64 = 1e-7;

@@ -25,6 +25,7 @@ mod sunlight;
 #[cfg(test)]
 mod test_spacecraft;
 mod thermal;
+mod torque;
 
 pub use com_offset::ComOffset;
 

@@ -13,8 +13,9 @@ use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix2, Vector3};
 
 pub(crate) use crate::columns::{Body, InputColumn, accel_channel, latest_column, unpredicted};
-use crate::common::{AXES, SeriesRef, axis_of, mission, through_offset};
+use crate::common::{AXES, SeriesRef, axis_of, mission};
 use crate::prediction::{PredictedAcceleration, Predictor};
+use crate::torque::{offset_name, through_offset};
 
 /// A slowly varying factor of a column.
 #[derive(Clone, Debug, PartialEq)]
@@ -152,11 +153,6 @@ pub(crate) fn attitude_channel(axis: usize) -> String {
     format!("sc.alpha.{}", AXES[axis])
 }
 
-/// Name of a coefficient of the centre-of-mass offset.
-pub(crate) fn offset_name(tm: &Body, axis: usize) -> String {
-    format!("com-offset.{}.{}", tm.name, AXES[axis])
-}
-
 /// Terms of `Φ_row b`, the acceleration of a test mass by its offset: columns and coefficients of `com-offset`. Empty
 /// if that effect is not earlier in the model. The diagonal of `Φ` is of order `ω²`, nearly constant and omitted.
 pub(crate) fn offset_terms(available: &Available, tm: &Body, row: usize) -> Vec<(InputColumn, String)> {
@@ -166,7 +162,7 @@ pub(crate) fn offset_terms(available: &Available, tm: &Body, row: usize) -> Vec<
         let mut all = available.of_kind("regressor");
         all.find(|c| c.attribute("coefficient") == name && c.attribute("channel") == channel).cloned()
     };
-    let names = (0..3).filter(|j| *j != row).map(|j| offset_name(tm, j)).filter(|name| in_model(name));
+    let names = (0..3).filter(|j| *j != row).map(|j| offset_name(&tm.name, j)).filter(|name| in_model(name));
     names.filter_map(|name| Some((InputColumn::of(&column(&name)?, "s-2"), name))).collect()
 }
 

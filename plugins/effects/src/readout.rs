@@ -10,6 +10,7 @@
 use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 
+use crate::columns::alpha_is_commanded;
 use crate::common::{TEST_MASSES, TM_YZ, axis_of, manifest};
 use crate::linear::{
     Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, TmAcceleration, accel_channel, attitude_channel,
@@ -187,7 +188,7 @@ impl LinearEffect for TimeOffset {
     ) -> Result<Vec<CoefficientForms>, PluginError> {
         const BY: &str = "the effect time-offset";
         let mut terms = Vec::new();
-        if setup.instance() == "dws" && (0..3).all(|j| unpredicted(available, &InputColumn::alpha(j)).is_some()) {
+        if setup.instance() == "dws" && alpha_is_commanded(available) {
             for row in 0..3 {
                 let series = Series::Slope(InputColumn::alpha(row), "rad s-3");
                 terms.push(Term::new(attitude_channel(row), series, -1.0));

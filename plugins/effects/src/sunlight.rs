@@ -4,10 +4,12 @@ use dragfree_physics::mission::Mission;
 use dragfree_sdk::prelude::*;
 use nalgebra::{Matrix3, Vector3};
 
-use crate::common::{alpha_is_commanded, manifest, through_offset};
+use crate::columns::alpha_is_commanded;
+use crate::common::manifest;
 use crate::linear::{
     Body, CoefficientForms, InputColumn, LinearEffect, Series, Term, accel_channel, attitude_channel, vector_terms,
 };
+use crate::torque::through_offset;
 
 const EXCESS: [f64; 2] = [-0.3, 0.3];
 const ARM_M: [f64; 2] = [-0.5, 0.5];

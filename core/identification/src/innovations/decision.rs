@@ -243,14 +243,13 @@ impl Quadratic {
     /// The most significant candidate is added; one is exchanged for another, or for two, where that raises the
     /// evidence; and what is not significant beside the others is taken out, until a set comes back.
     pub fn select(&self, evidence: &Evidence<'_>) -> Selection {
-        let observable = |c: &usize, set: &[usize]| self.observable(*c, set);
         let all: Vec<usize> = (0..self.candidates.len()).collect();
-        let unobservable: Vec<usize> = all.iter().copied().filter(|c| !observable(c, &[])).collect();
+        let unobservable: Vec<usize> = all.iter().copied().filter(|c| !self.observable(*c, &[])).collect();
         let usable: Vec<usize> = all.into_iter().filter(|c| !unobservable.contains(c)).collect();
         let mut met: Vec<Vec<usize>> = vec![Vec::new()];
         let mut set: Vec<usize> = Vec::new();
         loop {
-            let next = usable.iter().filter(|c| !set.contains(c) && observable(c, &set));
+            let next = usable.iter().filter(|c| !set.contains(c) && self.observable(**c, &set));
             let significant = next.map(|c| (*c, self.log10_p(*c, &set, evidence)));
             let best = significant.min_by(|a, b| a.1.total_cmp(&b.1)).filter(|(_, p)| *p < evidence.bound);
             if let Some((c, _)) = best.filter(|_| set.len() < evidence.most) {
@@ -271,8 +270,11 @@ impl Quadratic {
         let by_evidence = |a: &Vec<usize>, b: &Vec<usize>| self.ln_evidence(a).total_cmp(&self.ln_evidence(b));
         let set = met.into_iter().max_by(by_evidence).unwrap_or_default();
         let chosen = set.iter().map(|c| self.with_alternatives(*c, &set, &usable)).collect();
-        let rest =
-            usable.iter().filter(|c| !set.contains(c) && observable(c, &set)).map(|c| self.beside(*c, &set)).collect();
+        let rest = usable
+            .iter()
+            .filter(|c| !set.contains(c) && self.observable(**c, &set))
+            .map(|c| self.beside(*c, &set))
+            .collect();
         let (values, sigma) = self.solution(&set);
         Selection { chosen, rest, unobservable, values, sigma }
     }

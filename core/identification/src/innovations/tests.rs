@@ -717,8 +717,6 @@ fn a_stand_in_is_exchanged_for_the_causes() {
     assert!(selection.rest.iter().all(|c| c.gain < 1e-6));
 }
 
-/// Outside of its range a value explains only what its best value inside explains, and data that want a value far
-/// outside name nothing; equals share the probability.
 /// One of two candidates with a correlation of ρ acts: the other explains ρ² of it, and four times the data tell
 /// four times as much.
 #[test]
@@ -732,6 +730,8 @@ fn the_separation_of_two_is_what_one_leaves_of_the_other() {
     }
 }
 
+/// Outside of its range a value explains only what its best value inside explains, and data that want a value far
+/// outside name nothing; equals share the probability.
 #[test]
 fn ranges_bound_the_gain_and_equals_are_alternatives() {
     let information = DMatrix::from_row_slice(3, 3, &[1.0, 0.0, 0.0, 0.0, 1e4, 0.999 * 1e4, 0.0, 0.999 * 1e4, 1e4]);

@@ -35,8 +35,8 @@ use serde_json::json;
 
 use crate::common::{
     AXES, SeriesRef, axis_of, keep_available, manifest, mission, response, responses_to_spacecraft_force,
-    responses_to_spacecraft_torque,
 };
+use crate::torque::responses_to_spacecraft_torque;
 pub use program::Program;
 pub use text::{TextError, Tree, parse};
 
