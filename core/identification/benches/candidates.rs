@@ -108,6 +108,7 @@ fn gathered(columns: &[Vec<f64>], threads: usize) -> GramSums {
         base,
         fast: base + CANDIDATES - SLOW,
         energy: Vec::new(),
+        housekeeping_units: Vec::new(),
     };
     let residual = DMatrix::from_fn(CHANNELS.len(), base, |i, j| f64::from(u8::from(i == j)));
     let search = Search::new(Vec::new(), residual.clone(), Vec::new());

@@ -13,7 +13,7 @@
 
 use std::ops::Range;
 
-use dragfree_estimation::spectra::{Plan, Transformer};
+use dragfree_estimation::spectra::{Band, Plan, Transformer};
 use nalgebra::{Complex, DMatrix, DMatrixView};
 use serde::{Deserialize, Serialize};
 
@@ -112,6 +112,23 @@ pub struct HousekeepingCoherence {
     pub(crate) among: Vec<[DMatrix<f64>; 2]>,
     /// Per band: complex observations.
     pub(crate) observations: Vec<f64>,
+    /// Per band and channel: `(Σ⁻¹)_cc`.
+    weight: DMatrix<f64>,
+    /// Time between samples of a segment, s.
+    step_s: f64,
+}
+
+/// What a function says of a channel in one band, or in other numbers of equal noise.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Part {
+    /// Complex observations.
+    pub(crate) observations: f64,
+    /// Power of the residual.
+    pub(crate) power: f64,
+    /// Power that one unit of the function has.
+    pub(crate) squared: f64,
+    /// Its product with the residual.
+    pub(crate) along: f64,
 }
 
 impl HousekeepingCoherence {
@@ -134,6 +151,12 @@ impl HousekeepingCoherence {
             first = end;
         }
         let channels = residual.nrows();
+        let weight = DMatrix::from_fn(bands.len(), channels, |b, c| {
+            let common = |band: &Band| bands[b][1].min(band.end).saturating_sub(bands[b][0].max(band.first)) as f64;
+            let all = plan.bands.iter().zip(&whitening).map(|(band, m)| (common(band), m[(c, c)]));
+            let (bins, sum) = all.fold((0.0, 0.0), |(bins, sum), (n, x)| (bins + n, sum + n * x));
+            if bins > 0.0 { sum / bins } else { 0.0 }
+        });
         let wide = bands.len() * channels;
         let singles = if n <= MOST_FOR_PRODUCTS { 3 * n } else { 0 };
         Self {
@@ -143,6 +166,8 @@ impl HousekeepingCoherence {
             power: DMatrix::zeros(drivers.len(), bands.len()),
             cross: [DMatrix::zeros(drivers.len(), wide), DMatrix::zeros(drivers.len(), wide)],
             observations: vec![0.0; bands.len()],
+            weight,
+            step_s: (bin_hz * plan.length as f64).recip(),
             names,
             drivers,
             residual,
@@ -319,6 +344,38 @@ impl HousekeepingCoherence {
         })
     }
 
+    /// What a driver with a frequency response says of a channel in the bands from `from_hz` on; a derivative is one by
+    /// time.
+    pub(crate) fn parts(
+        &self,
+        channel: usize,
+        driver: Driver,
+        response: impl Fn(f64) -> Complex<f64>,
+        from_hz: f64,
+    ) -> Vec<Part> {
+        let channels = self.residual.nrows();
+        let Some(d) = self.drivers.iter().position(|own| *own == driver) else { return Vec::new() };
+        let unit = if matches!(driver, Driver::Derivative(_)) { (2.0 * self.step_s).recip() } else { 1.0 };
+        let part = |(b, [first, end]): (usize, &[usize; 2])| {
+            let weight = self.weight[(b, channel)];
+            let power = self.residual_power[(b, channel)];
+            let usable = *first as f64 * self.bin_hz >= from_hz && self.observations[b] > 2.0;
+            if !usable || power <= 0.0 || weight <= 0.0 {
+                return None;
+            }
+            let response = response((*first as f64 * (*end as f64 - 1.0)).sqrt() * self.bin_hz) * unit;
+            let column = b * channels + channel;
+            let cross = Complex::new(self.cross[0][(d, column)], self.cross[1][(d, column)]);
+            Some(Part {
+                observations: self.observations[b] - 1.0,
+                power,
+                squared: weight * response.norm_sqr() * self.power[(d, b)],
+                along: weight.sqrt() * (response.conj() * cross).re,
+            })
+        };
+        self.bands.iter().enumerate().filter_map(part).collect()
+    }
+
     /// Coherence of each driver with the residual of each channel, the most significant first.
     pub fn coherences(&self, channels: &[String]) -> Vec<Coherence> {
         let mut all = Vec::new();
@@ -364,14 +421,22 @@ impl HousekeepingCoherence {
 }
 
 impl Driver {
-    fn of(self) -> Vec<usize> {
+    /// The factors of a product, each by itself.
+    pub fn factors(self) -> Vec<Self> {
+        match self {
+            Self::Product(i, j) => vec![Self::Value(i), Self::Value(j)],
+            _ => Vec::new(),
+        }
+    }
+
+    pub(crate) fn of(self) -> Vec<usize> {
         match self {
             Self::Value(i) | Self::Derivative(i) | Self::Square(i) => vec![i],
             Self::Product(i, j) => vec![i, j],
         }
     }
 
-    fn label(self, names: &[String]) -> String {
+    pub(crate) fn label(self, names: &[String]) -> String {
         match self {
             Self::Value(i) => names[i].clone(),
             Self::Derivative(i) => format!("d/dt {}", names[i]),
@@ -380,7 +445,7 @@ impl Driver {
         }
     }
 
-    fn samples(self, values: &[&[f64]], level: &[f64]) -> Vec<f64> {
+    pub(crate) fn samples(self, values: &[&[f64]], level: &[f64]) -> Vec<f64> {
         match self {
             Self::Value(i) => values[i].to_vec(),
             Self::Derivative(i) => {

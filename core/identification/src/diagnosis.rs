@@ -165,7 +165,7 @@ pub struct Unexplained {
     pub channels: Vec<String>,
     /// Lowest and highest frequency of it, Hz.
     pub band_hz: [f64; 2],
-    /// `broadband`, `transient` or `drift`.
+    /// `broadband`, `transient`, `drift`, or `driven` where a function of housekeeping explains it.
     pub kind: String,
     /// Measured over modelled power, at its worst.
     pub ratio: f64,
@@ -206,6 +206,8 @@ pub struct Diagnosis {
     pub upper_limits: Vec<Limit>,
     /// Evidence that no candidate explains.
     pub unexplained: Option<Unexplained>,
+    /// Formulas that would explain it, as a model states them.
+    pub formulas: Vec<Found>,
     /// Why the model is not called sufficient although neither a candidate was accepted nor an excess was found.
     pub reasons: Vec<String>,
     /// Levels of noise other than declared, certain, and within the tolerance of a mission file.

@@ -15,6 +15,7 @@ use nalgebra::{DMatrix, DMatrixView};
 
 use crate::coherence::HousekeepingCoherence;
 use crate::decimate::{Decimator, Response, SLOW_HZ};
+use crate::driven::{SlowSamples, Thinner};
 use crate::transient::{Part, Search, Transients};
 
 /// Long segments are so many times as long as the short ones.
@@ -46,6 +47,8 @@ pub struct Columns {
     /// Energy per band of the waveforms, which stand last among those: what they would add to the diagonal of the Gram
     /// matrix without a taper. A taper leaves a part of it that depends on their time.
     pub energy: Vec<Vec<f64>>,
+    /// Units of housekeeping, whose samples follow the columns.
+    pub housekeeping_units: Vec<String>,
 }
 
 impl Columns {
@@ -120,6 +123,8 @@ pub struct GramSums {
     pub hours: Vec<Hour>,
     /// Housekeeping against the residuals.
     pub housekeeping: HousekeepingCoherence,
+    /// Slow samples of both.
+    pub slow: SlowSamples,
     /// The loudest transients.
     pub transients: Transients,
 }
@@ -150,6 +155,7 @@ pub struct GramAccumulator {
     segmenter: Segmenter,
     long: Plan,
     long_bench: SegmentTransform,
+    thinner: Thinner,
     /// Gram matrices from the diagonal down.
     gathered: GramSums,
 }
@@ -257,6 +263,10 @@ impl GramAccumulator {
         let housekeeping = coherence(&long);
         let all = columns.names.len() + housekeeping.names.len();
         let decimator = Decimator::new(factor, all, (1e9 / rate_hz).round() as i64, threads);
+        let names = housekeeping.names.clone();
+        let (units, residual) = (columns.housekeeping_units.clone(), housekeeping.residual.clone());
+        let thinner = Thinner::new(names, units, decimator.step_ns(), residual, columns.names.len());
+        let slow = thinner.nothing();
         Self {
             low_bands,
             bench: SegmentTransform::new(&short, columns.fast, threads),
@@ -264,6 +274,7 @@ impl GramAccumulator {
             search,
             segmenter: Segmenter::new(long.length, decimator.step_ns(), vec![false; all]),
             decimator,
+            thinner,
             long_bench: SegmentTransform::new(&long, columns.names.len(), threads),
             gathered: GramSums {
                 length,
@@ -271,6 +282,7 @@ impl GramAccumulator {
                 total: Gram::zero(&columns, &whole),
                 hours: Vec::new(),
                 housekeeping,
+                slow,
                 transients: Transients::default(),
                 columns,
             },
@@ -283,6 +295,7 @@ impl GramAccumulator {
     /// The sums.
     pub fn finish(mut self) -> GramSums {
         self.gathered.total.bands.iter_mut().for_each(DMatrix::fill_upper_triangle_with_lower_triangle);
+        self.gathered.slow = self.thinner.finish();
         self.gathered
     }
 
@@ -308,8 +321,8 @@ impl GramAccumulator {
         }
     }
 
-    /// The decimator, and what takes segments of its samples.
-    fn low(&mut self) -> (&mut Decimator, &mut Segmenter, Low<'_>) {
+    /// The segmenter of decimated samples, and what takes its segments.
+    fn low(&mut self) -> (&mut Segmenter, Low<'_>) {
         let low = Low {
             response: self.decimator.response(),
             rate_hz: self.short.rate_hz,
@@ -320,7 +333,7 @@ impl GramAccumulator {
             search: &mut self.long_search,
             gathered: &mut self.gathered,
         };
-        (&mut self.decimator, &mut self.segmenter, low)
+        (&mut self.segmenter, low)
     }
 }
 
@@ -365,15 +378,17 @@ impl Cuts for GramAccumulator {
     }
 
     fn rows(&mut self, first_ns: i64, columns: &[&[f64]]) {
-        let (decimator, segmenter, mut low) = self.low();
-        let (times, thinned) = decimator.push(first_ns, columns);
+        let (times, thinned) = self.decimator.push(first_ns, columns);
         let thinned: Vec<&[f64]> = thinned.iter().map(Vec::as_slice).collect();
+        self.thinner.push(&times, &thinned);
+        let (segmenter, mut low) = self.low();
         segmenter.cut(&times, &thinned, &mut low);
     }
 
     fn gap(&mut self) {
-        let (decimator, segmenter, mut low) = self.low();
-        decimator.gap();
+        self.decimator.gap();
+        self.thinner.gap();
+        let (segmenter, mut low) = self.low();
         segmenter.cut_end(&mut low);
     }
 }

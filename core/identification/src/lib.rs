@@ -14,6 +14,7 @@ pub mod compare;
 pub mod decimate;
 pub mod diagnosis;
 pub mod distributions;
+pub mod driven;
 pub mod gram;
 pub mod innovations;
 pub mod record;

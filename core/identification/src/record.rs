@@ -55,6 +55,7 @@ impl Record {
         g.hours.extend(other.gathered.hours.iter().cloned());
         g.hours.sort_by_key(|h| h.start_ns);
         g.housekeeping.add(&other.gathered.housekeeping);
+        g.slow.add(&other.gathered.slow);
         g.transients.add(&other.gathered.transients);
         Ok(())
     }

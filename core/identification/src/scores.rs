@@ -650,6 +650,7 @@ mod tests {
             base: 3,
             fast: 5,
             energy: vec![waveform.energy(&plan, false)],
+            housekeeping_units: Vec::new(),
         };
         let residual = DMatrix::from_fn(2, 3, |i, j| f64::from(u8::from(i == j)));
         let coherence = |plan: &Plan| {

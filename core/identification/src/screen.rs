@@ -117,6 +117,18 @@ fn refined(
             }
         }
     }
+    // What is slow shows most below the lowest band of the spectra.
+    let of_forms = |place: &Vec<usize>| {
+        let first = &scorer.candidate_set.coefficients[place[0]];
+        forms.iter().any(|f| (&f.effect, &f.instance) == (&first.effect, &first.instance))
+    };
+    let places: Vec<Vec<usize>> = scorer.candidate_set.places().into_iter().filter(of_forms).collect();
+    let fast = scorer.gathered.columns.fast;
+    for slow in scorer.gathered.slow.forms_of(&places, scorer.candidate_set, fast, &fit.added, scorer.noise) {
+        if let Some(form) = forms.iter_mut().find(|f| !f.transient && f.name() == slow.name()) {
+            *form = slow;
+        }
+    }
     for form in &mut forms {
         if let Some(likelier) = scorer.coloured(fit, form)? {
             *form = likelier;

@@ -10,6 +10,7 @@ use dragfree_engine::examine::has_parameter;
 use dragfree_engine::product::Written;
 use dragfree_engine::run::Progress;
 use dragfree_identification::candidates::Candidate;
+use dragfree_identification::decimate::SLOW_HZ;
 use dragfree_identification::diagnosis::{
     self, Constancy, Diagnosis, Found, LIMIT_QUANTILE, Limit, OfProduct, Separation, TRANSIENT, Trials, UNOBSERVABLE,
     Unexplained,
@@ -25,6 +26,7 @@ use serde_json::{Map, json};
 
 use crate::WorkflowError;
 use crate::likelihood::{Decided, Judge, Meaning, PASSES, Point, moved, one_pass, step};
+use crate::proposals::{FORMULA, Proposal, proposals};
 use crate::replay::{AT_NS, FINE, Pass, Replay, What, sum};
 
 /// A diagnosis and the sums that chose the forms of the candidates.
@@ -50,8 +52,9 @@ pub fn diagnose(
     let found = sum(replay, settings, What::Transients, progress)?.gathered.transients;
     let detected: Vec<Detection> =
         found.certain(settings.transient_p_value).take(settings.max_transients).cloned().collect();
-    let mut gather = |requests: &[RefinementRequest]| {
-        let mut record = sum(replay, settings, What::Candidates(&detected, requests), progress)?;
+    let mut gather = |requests: &[RefinementRequest], proposals: &[Proposal]| {
+        let entries: Vec<EffectEntry> = proposals.iter().map(|p| p.entry.clone()).collect();
+        let mut record = sum(replay, settings, What::Candidates(&detected, requests, &entries), progress)?;
         record.gathered.transients = found.clone();
         let noise = record.noise_model()?;
         let screened = {
@@ -60,22 +63,24 @@ pub fn diagnose(
         };
         Ok::<_, WorkflowError>((record, noise, screened))
     };
-    let (mut record, mut noise, mut screened) = gather(&[])?;
+    let (mut record, mut noise, mut screened) = gather(&[], &[])?;
     let mut tried = screened.tried.clone();
     let mut requests = screened.requests.clone();
     requests.retain(|request| has_parameter(replay.registry, &request.effect, FINE));
-    if !requests.is_empty() {
+    let (proposals, formulas) = proposals(replay, &record)?;
+    if !requests.is_empty() || !proposals.is_empty() {
         tried.retain(|effect, _| requests.iter().any(|request| request.effect == *effect));
         // Sums are large, and these are made again.
         drop(record);
-        (record, noise, screened) = gather(&requests)?;
+        (record, noise, screened) = gather(&requests, &proposals)?;
         for (effect, forms) in &screened.tried {
             *tried.entry(effect.clone()).or_default() += forms;
         }
     }
+    tried.insert(FORMULA.to_owned(), formulas);
     let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
-    let evidence = Evidence { trials: Trials::new(&scorer, &tried), least: settings.false_alarm, replay };
-    let mut diagnosis = decide(replay, settings, &record, &scorer, screened, &evidence, progress)?;
+    let evidence = Evidence { trials: Trials::new(&scorer, &tried), least: settings.false_alarm, replay, proposals };
+    let mut diagnosis = decide(settings, &record, &scorer, screened, &evidence, progress)?;
     contradict(&mut diagnosis, replay);
     Ok(Diagnosed { diagnosis, settings: settings.clone(), record })
 }
@@ -87,7 +92,6 @@ const OPENING: usize = 2;
 /// Decides by the likelihood of the innovations among the forms that the spectra choose, beside the effects that are
 /// named so far: passes until nothing moves.
 fn decide(
-    replay: &Replay<'_>,
     settings: &Settings,
     record: &Record,
     scorer: &CandidateScorer<'_>,
@@ -110,9 +114,9 @@ fn decide(
     let mut named: Vec<Candidate> = Vec::new();
     let (mut openings, mut passes) = (OPENING, 0);
     let (decided, screened, moving) = loop {
-        let chosen: Vec<EffectEntry> = screened.forms.iter().map(entry).collect();
+        let chosen: Vec<EffectEntry> = screened.forms.iter().map(|form| evidence.entry(form)).collect();
         let opening = openings > 0;
-        let decided = one_pass(replay, &chosen, &slow, opening, &point, evidence, progress)?;
+        let decided = one_pass(evidence.replay, &chosen, &slow, opening, &point, evidence, progress)?;
         let next = step(&point, &decided);
         if opening {
             openings -= 1;
@@ -173,9 +177,32 @@ struct Evidence<'a> {
     /// Probability from which another explanation is named beside the chosen one.
     least: f64,
     replay: &'a Replay<'a>,
+    /// Formulas among the candidates.
+    proposals: Vec<Proposal>,
 }
 
 impl Evidence<'_> {
+    /// A model's entry that makes a candidate in its form.
+    fn entry(&self, candidate: &Candidate) -> EffectEntry {
+        if let Some(proposal) = self.proposal(&candidate.effect, &candidate.instance) {
+            return proposal.entry.clone();
+        }
+        let mut entry = EffectEntry::new(&candidate.effect, &candidate.instance);
+        let shape = candidate.parts.iter().flat_map(|(_, form)| &form.shape);
+        entry.parameters = shape.filter_map(|(k, v)| Some((k.clone(), toml::Value::try_from(v).ok()?))).collect();
+        entry
+    }
+
+    /// The formula of a candidate that is one.
+    fn proposal(&self, effect: &str, instance: &str) -> Option<&Proposal> {
+        self.proposals.iter().find(|p| (p.entry.id.as_str(), p.entry.instance.as_str()) == (effect, instance))
+    }
+
+    /// The same by its whole name, `formula:NAME`.
+    fn proposal_named(&self, name: &str) -> Option<&Proposal> {
+        name.split_once(':').and_then(|(effect, instance)| self.proposal(effect, instance))
+    }
+
     /// What acts once was searched for at every time.
     fn family<'b>(&self, effect: &'b str) -> &'b str {
         if has_parameter(self.replay.registry, effect, AT_NS) { TRANSIENT } else { effect }
@@ -208,6 +235,9 @@ fn answer(
         decided.selection.chosen.iter().map(|f| found(settings, decided, f, forms, evidence, true)).collect();
     let mut others: Vec<Found> =
         decided.selection.rest.iter().map(|f| found(settings, decided, f, forms, evidence, false)).collect();
+    let is_formula = |f: &Found| evidence.proposal(&f.effect, &f.instance).is_some();
+    let formulas: Vec<Found> = named.extract_if(.., |f| is_formula(f)).collect();
+    others.retain(|f| !is_formula(f));
     // A small remainder of what was there without them is what the grid of forms cannot represent.
     let before = diagnosis::remaining(scorer, &[])?.map_or(0.0, |u| u.ratio);
     let loud = unexplained.as_ref().filter(|u| u.ratio > settings.excess_remainder * before);
@@ -217,6 +247,7 @@ fn answer(
         let refused = Some(format!("with it {channels} still show what no effect explains"));
         others.push(Found { accepted: false, refused, ..f });
     }
+    let unexplained = followed(unexplained, &formulas, evidence, scorer);
     let mut levels = Vec::new();
     for f in louder(decided, record, evidence) {
         let certain = f.p_value < settings.false_alarm;
@@ -255,8 +286,9 @@ fn answer(
         false_alarm_rate: settings.false_alarm,
         tried: evidence.trials.total(),
         candidates: named,
-        upper_limits: decided.selection.rest.iter().flat_map(|f| limits(decided, f, forms)).collect(),
+        upper_limits: decided.selection.rest.iter().flat_map(|f| limits(decided, f, forms, evidence)).collect(),
         unexplained,
+        formulas,
         reasons,
         levels,
         transients: scorer.gathered.transients.certain(settings.false_alarm).map(|h| json!(h)).collect(),
@@ -265,6 +297,44 @@ fn answer(
             .chain(decided.not_tried.iter().cloned())
             .collect(),
     })
+}
+
+/// What is unexplained, with the drivers of the proposed formulas first among what is coherent with it.
+fn followed(
+    unexplained: Option<Unexplained>,
+    formulas: &[Found],
+    evidence: &Evidence<'_>,
+    scorer: &CandidateScorer<'_>,
+) -> Option<Unexplained> {
+    if formulas.is_empty() {
+        return unexplained;
+    }
+    let mut u = unexplained.unwrap_or_else(|| {
+        let plan = scorer.plan();
+        let lowest_hz = plan.bands.first().map_or(0.0, |band| plan.frequency_hz(*band));
+        Unexplained {
+            channels: Vec::new(),
+            band_hz: [lowest_hz, SLOW_HZ],
+            kind: "driven".to_owned(),
+            ratio: 1.0,
+            power: false,
+            coherent_with: Vec::new(),
+            coherences: Vec::new(),
+        }
+    });
+    let names = |f: &Found| [vec![format!("{}:{}", f.effect, f.instance)], f.confounders.clone()].concat();
+    let of = |name: String| evidence.proposal_named(&name).map(|p| p.driver.clone());
+    let drivers: Vec<String> = formulas.iter().flat_map(names).filter_map(of).collect();
+    let before = std::mem::take(&mut u.coherent_with);
+    for driver in drivers.into_iter().chain(before) {
+        if !u.coherent_with.contains(&driver) {
+            u.coherent_with.push(driver);
+        }
+    }
+    u.channels.extend(formulas.iter().flat_map(|f| f.channels.clone()));
+    u.channels.sort();
+    u.channels.dedup();
+    Some(u)
 }
 
 /// Named effects that act where more power than the noise is left with them, in the bands that say most about them:
@@ -285,14 +355,6 @@ fn follows_an_excess(
     let mostly = |c: &&Candidate| scorer.part_in(&excess.plain, c, &excess.bands) > 0.5;
     let all = named.iter().filter(|c| !c.transient).filter(acts).filter(mostly);
     Ok(all.map(|c| (c.effect.clone(), c.instance.clone())).collect())
-}
-
-/// A model's entry that makes a candidate in its form.
-fn entry(candidate: &Candidate) -> EffectEntry {
-    let mut entry = EffectEntry::new(&candidate.effect, &candidate.instance);
-    let shape = candidate.parts.iter().flat_map(|(_, form)| &form.shape);
-    entry.parameters = shape.filter_map(|(k, v)| Some((k.clone(), toml::Value::try_from(v).ok()?))).collect();
-    entry
 }
 
 /// Values and σ of a candidate's coefficients; index of the largest over its σ.
@@ -353,7 +415,11 @@ fn found(
         value: values[lead].0,
         sigma: values[lead].1,
         unit: unit.to_owned(),
-        shape: form.map(|c| c.parts[0].1.shape.clone()).unwrap_or_default(),
+        shape: match (evidence.proposal(effect, instance), form) {
+            (Some(p), _) => p.entry.parameters.iter().map(|(k, value)| (k.clone(), json!(value))).collect(),
+            (None, Some(form)) => form.parts[0].1.shape.clone(),
+            (None, None) => Map::new(),
+        },
         coefficients: own
             .iter()
             .zip(&values)
@@ -449,8 +515,12 @@ fn channels_of(record: &Record, component: &str) -> Vec<String> {
     .collect()
 }
 
-fn limits(decided: &Decided, fitted: &Fitted, forms: &[Candidate]) -> Vec<Limit> {
+/// Limits of a candidate's coefficients; none of a formula, which the data themselves have written.
+fn limits(decided: &Decided, fitted: &Fitted, forms: &[Candidate], evidence: &Evidence<'_>) -> Vec<Limit> {
     let (effect, instance, own) = &decided.candidates[fitted.candidate];
+    if evidence.proposal(effect, instance).is_some() {
+        return Vec::new();
+    }
     let form = forms.iter().find(|c| (&c.effect, &c.instance) == (effect, instance));
     let limit = |(k, i): (usize, &usize)| {
         let sigma = fitted.covariance[(k, k)].max(0.0).sqrt();

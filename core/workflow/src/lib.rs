@@ -7,6 +7,7 @@ pub mod compare;
 pub mod diagnose;
 pub mod ladder;
 mod likelihood;
+mod proposals;
 mod replay;
 mod sums;
 

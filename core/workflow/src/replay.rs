@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 
 use dragfree_engine::chain::Chain;
+use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{Examination, candidates, examine, has_parameter};
 use dragfree_engine::product::Written;
 use dragfree_engine::registry::Registry;
@@ -61,8 +62,9 @@ pub(crate) enum What<'a> {
     Model,
     /// Nothing but transients.
     Transients,
-    /// Every candidate: transients at these times, and in fine steps about these shapes what can be tried so.
-    Candidates(&'a [Detection], &'a [RefinementRequest]),
+    /// Every candidate: transients at these times, in fine steps about these shapes what can be tried so, and these
+    /// effects in the form that they state.
+    Candidates(&'a [Detection], &'a [RefinementRequest], &'a [EffectEntry]),
 }
 
 impl What<'_> {
@@ -110,11 +112,9 @@ pub(crate) fn sum(
         match what {
             What::Model => all.clear(),
             What::Transients => all.retain(|e| has_parameter(registry, &e.id, AT_NS)),
-            What::Candidates(_, requests) => {
+            What::Candidates(_, requests, _) => {
                 for request in requests {
-                    let of = |e: &&mut dragfree_engine::config::EffectEntry| {
-                        (&e.id, &e.instance) == (&request.effect, &request.instance)
-                    };
+                    let of = |e: &&mut EffectEntry| (&e.id, &e.instance) == (&request.effect, &request.instance);
                     for entry in all.iter_mut().filter(of) {
                         let value = |v| toml::Value::try_from(v).ok();
                         let shape = request.shape.iter().filter_map(|(k, v)| Some((k.clone(), value(v)?)));
@@ -126,7 +126,7 @@ pub(crate) fn sum(
         }
         let request = Request {
             only_transients: matches!(what, What::Transients),
-            detected: if let What::Candidates(detected, _) = what { Some(detected) } else { None },
+            detected: if let What::Candidates(detected, ..) = what { Some(detected) } else { None },
             reference: equations.is_file().then_some(equations.as_path()),
             threads,
         };
@@ -135,7 +135,7 @@ pub(crate) fn sum(
             product,
             sources: &sources,
             candidates,
-            chosen: Vec::new(),
+            chosen: if let What::Candidates(.., chosen) = what { chosen.to_vec() } else { Vec::new() },
             needs: &[],
             values: &levels,
             threads,

@@ -134,6 +134,7 @@ impl ColumnSums {
             base: channels.len() + sorted.base,
             fast: channels.len() + sorted.fast,
             energy: waveforms.iter().map(|c| c.energy(&plan, differenced.contains(&true))).collect(),
+            housekeeping_units: housekeeping.iter().map(|c| c.unit.clone()).collect(),
         };
         let candidate_set = candidate_set(&available, &channels, &sorted, &waveforms);
         let residual = residual(request.reference, &candidate_set, &channels, &all, length, settings)?;

@@ -67,6 +67,10 @@ fn screen(diagnosed: &Diagnosed, command: &Diagnose, repeated: &str, paint: Pain
             let _ = writeln!(out, "  coherent with {}", u.coherent_with.join(", "));
         }
     }
+    if !d.formulas.is_empty() {
+        let _ = writeln!(out, "\nFormulas that would explain it");
+        d.formulas.iter().for_each(|f| put(&mut out, f, ask));
+    }
     let unnamed = diagnosed.unexplained_transients();
     if !unnamed.is_empty() {
         let _ = writeln!(out, "\nTransients that were detected and are no part of the answer");
@@ -79,10 +83,25 @@ fn screen(diagnosed: &Diagnosed, command: &Diagnose, repeated: &str, paint: Pain
     if let Some(f) = accepted.first() {
         let _ = writeln!(out, "\nnext      dragfree model add MODEL.toml {}:{}{repeated}", f.effect, f.instance);
     }
+    if let Some(f) = d.formulas.first() {
+        let _ = writeln!(out, "\nnext      {}", added(f, repeated));
+    }
     for (name, reason) in &d.not_tried {
         let _ = writeln!(out, "not tried {name}: {reason}");
     }
     out
+}
+
+/// The command that adds a formula to a model.
+fn added(f: &Found, repeated: &str) -> String {
+    let set = |(key, value): (&String, &serde_json::Value)| match value {
+        serde_json::Value::Array(ends) => {
+            format!(" --set {key}={}", ends.iter().map(ToString::to_string).collect::<Vec<_>>().join(","))
+        }
+        value => format!(" --set \"{key}={}\"", value.as_str().unwrap_or_default()),
+    };
+    let parameters: String = f.shape.iter().map(set).collect();
+    format!("dragfree model add MODEL.toml {}:{}{parameters}{repeated}", f.effect, f.instance)
 }
 
 /// What is asked of each effect.

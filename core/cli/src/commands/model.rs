@@ -222,7 +222,11 @@ fn candidate(path: &Path, effect: Option<&str>, rank: Option<u16>) -> Result<Val
             refuse("it has no `candidates`; write it with `dragfree diagnose PRODUCT --json`".to_owned()).into()
         );
     };
-    let name = |c: &Value| format!("{}:{}", word(&c["effect"]), word(&c["instance"]));
+    let formulas = diagnosis["formulas"].as_array();
+    let accepted = |c: &&Value| c["accepted"] == true;
+    let (named, others): (Vec<&Value>, Vec<&Value>) = candidates.iter().partition(accepted);
+    let candidates: Vec<&Value> = named.into_iter().chain(formulas.into_iter().flatten()).chain(others).collect();
+    let name = |c: &&Value| format!("{}:{}", word(&c["effect"]), word(&c["instance"]));
     let names: Vec<String> = candidates.iter().map(name).collect();
     if names.is_empty() {
         return Err(refuse(format!(
@@ -239,7 +243,7 @@ fn candidate(path: &Path, effect: Option<&str>, rank: Option<u16>) -> Result<Val
             names.iter().position(fits).unwrap_or(usize::MAX)
         }
     };
-    Ok(candidates.get(at).cloned().ok_or_else(|| {
+    Ok(candidates.get(at).copied().cloned().ok_or_else(|| {
         let asked = effect.map_or_else(|| format!("rank {}", at + 1), |effect| format!("candidate {effect}"));
         refuse(format!("it has no {asked}; it has {}", names.join(", ")))
     })?)
