@@ -1,31 +1,15 @@
 //! Forces that follow a function of housekeeping: which function explains the residual of a channel best, over the whole
 //! of each product.
 //!
-//! A slow cause shows most below the lowest frequency of the segments of [`crate::gram`], where heat, currents and what
-//! they heat change from hour to hour. Here residuals and housekeeping are kept as samples some hundred seconds apart. A
-//! channel is taken given the others, `y = gᵀ r` with `g = Σ⁻¹ e_c / (Σ⁻¹)_cc`: the thrusters' noise, which moves all
-//! test masses, is gone from it, and a force along the channel is not. With the covariance of its declared noise the
-//! amplitude of a function is that of generalised least squares beside powers of time. What is faster than these samples
-//! comes from the cross-spectra of [`crate::coherence`]. The amplitude a is one, the level of the noise one in each band
-//! and one of the samples: with n numbers of power P before and P(a) after, the likelihood rises by `½ Σ n log(P/P(a))`.
-
-use std::collections::{BTreeMap, BTreeSet};
+//! The amplitude a of a function is one. What is slow is told by [`crate::slow_samples`], what is faster by the
+//! cross-spectra of [`crate::coherence`]; the level of the noise is one in each band and one of the samples. With n
+//! numbers of power P before and P(a) after, the logarithm of the likelihood rises by `½ Σ n log(P/P(a))`.
 
 use dragfree_estimation::sigma::NoiseModel;
-use nalgebra::{Cholesky, Complex, DMatrix, DVector};
+use nalgebra::{Complex, DMatrix};
 
-use crate::candidates::{Candidate, CandidateSet, Form};
 use crate::coherence::{Driver, HousekeepingCoherence, Part};
-use crate::decimate::Decimator;
-
-/// Distance of samples, s; a multiple of it where there would be more than [`MOST`] in a product.
-const STEP_S: f64 = 100.0;
-
-/// Most samples of a product in a fit, whose cost grows with their square.
-const MOST: usize = 432;
-
-/// Powers of time beside every function, from the zeroth.
-const POWERS: usize = 3;
+use crate::slow_samples::{OWN, SlowSamples, Stretch, Whitened};
 
 /// Ratio of the lags that are tried before the best is refined.
 const RATIO: f64 = 2.0;
@@ -39,12 +23,6 @@ const LEVEL_ROUNDS: usize = 10;
 
 /// Functions of one housekeeping channel, and products, that are given for a channel.
 const ALTERNATIVES: usize = 2;
-
-/// Part of the power of a function that is rounding.
-const OWN: f64 = 1e-9;
-
-/// Frequencies in the integral of a covariance, per 1/T.
-const FINENESS: f64 = 4.0;
 
 /// What lies between a cause and its force.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -70,132 +48,7 @@ pub struct Driven {
     pub gain: f64,
 }
 
-/// Samples without a gap.
-#[derive(Clone, Debug, Default, PartialEq)]
-struct Stretch {
-    first_ns: i64,
-    /// By channel.
-    residual: Vec<Vec<f64>>,
-    /// Series of candidates, by index of the column after those of the model.
-    series: Vec<Vec<f64>>,
-    housekeeping: Vec<Vec<f64>>,
-}
-
-impl Stretch {
-    fn columns(&self) -> Vec<&[f64]> {
-        self.residual.iter().chain(&self.series).chain(&self.housekeeping).map(Vec::as_slice).collect()
-    }
-
-    /// Of columns in that order, with as many residuals and series as here.
-    fn with(&self, first_ns: i64, mut columns: Vec<Vec<f64>>) -> Self {
-        let housekeeping = columns.split_off(self.residual.len() + self.series.len());
-        let series = columns.split_off(self.residual.len());
-        Self { first_ns, residual: columns, series, housekeeping }
-    }
-}
-
-impl Stretch {
-    fn len(&self) -> usize {
-        self.residual.first().map_or(0, Vec::len)
-    }
-}
-
-/// Slow samples of residuals and housekeeping, by product.
-#[derive(Clone, Debug, PartialEq)]
-pub struct SlowSamples {
-    names: Vec<String>,
-    units: Vec<String>,
-    step_s: f64,
-    /// Columns of the model.
-    base: usize,
-    products: Vec<Vec<Stretch>>,
-}
-
-/// Makes them of samples that come more often.
-#[derive(Debug)]
-pub(crate) struct Thinner {
-    decimator: Decimator,
-    residual: DMatrix<f64>,
-    samples: SlowSamples,
-}
-
-impl Thinner {
-    /// For samples every `step_ns`, residuals as combinations (channels × base columns), and housekeeping of these names
-    /// and units.
-    pub(crate) fn new(
-        names: Vec<String>,
-        units: Vec<String>,
-        step_ns: i64,
-        residual: DMatrix<f64>,
-        columns: usize,
-    ) -> Self {
-        let factor = ((1e9 * STEP_S / step_ns as f64).round() as usize).max(1);
-        let base = residual.ncols();
-        let decimator = Decimator::new(factor, residual.nrows() + columns - base + names.len(), step_ns, 1);
-        let step_s = 1e-9 * decimator.step_ns() as f64;
-        let samples = SlowSamples { names, units, step_s, base, products: vec![vec![Stretch::default()]] };
-        Self { decimator, residual, samples }
-    }
-
-    /// Samples of all columns, and after them of housekeeping, at these times.
-    pub(crate) fn push(&mut self, times: &[i64], columns: &[&[f64]]) {
-        let Some(&first_ns) = times.first() else { return };
-        let (base, rest) = columns.split_at(self.samples.base);
-        let residual = |row: usize| -> Vec<f64> {
-            let of = |k: usize| self.residual.row(row).iter().zip(base).map(|(a, x)| a * x[k]).sum();
-            (0..times.len()).map(of).collect()
-        };
-        let residuals: Vec<Vec<f64>> = (0..self.residual.nrows()).map(residual).collect();
-        let all: Vec<&[f64]> = residuals.iter().map(Vec::as_slice).chain(rest.iter().copied()).collect();
-        let (times, thinned) = self.decimator.push(first_ns, &all);
-        let Some(stretch) = self.samples.products.last_mut().and_then(|all| all.last_mut()) else { return };
-        let Some(first_ns) = times.first() else { return };
-        if stretch.len() == 0 {
-            let series = vec![Vec::new(); rest.len() - self.samples.names.len()];
-            let empty = Stretch { residual: vec![Vec::new(); residuals.len()], series, ..Stretch::default() };
-            *stretch = empty.with(*first_ns, thinned);
-            return;
-        }
-        let own = stretch.residual.iter_mut().chain(&mut stretch.series).chain(&mut stretch.housekeeping);
-        own.zip(&thinned).for_each(|(all, new)| all.extend_from_slice(new));
-    }
-
-    /// The run has ended.
-    pub(crate) fn gap(&mut self) {
-        self.decimator.gap();
-        if let Some(all) = self.samples.products.last_mut() {
-            all.push(Stretch::default());
-        }
-    }
-
-    /// No samples.
-    pub(crate) fn nothing(&self) -> SlowSamples {
-        SlowSamples { products: Vec::new(), ..self.samples.clone() }
-    }
-
-    pub(crate) fn finish(mut self) -> SlowSamples {
-        self.samples.products.iter_mut().for_each(|all| all.retain(|stretch| stretch.len() > POWERS));
-        self.samples
-    }
-}
-
-/// Whitened samples of a channel, from which powers of time are taken off.
-struct Whitened {
-    /// Lower Cholesky factors of the covariance, by stretch.
-    factors: Vec<DMatrix<f64>>,
-    /// Part of each channel in the combination.
-    gains: DVector<f64>,
-    /// Orthonormal powers of time of all products, and what is added to the model.
-    beside: DMatrix<f64>,
-    y: DVector<f64>,
-}
-
 impl SlowSamples {
-    /// Adds other products with the same housekeeping.
-    pub fn add(&mut self, other: &Self) {
-        self.products.extend(other.products.iter().cloned());
-    }
-
     /// Functions that are tried for each channel by [`Self::driven`].
     pub fn functions(&self, housekeeping: &HousekeepingCoherence) -> usize {
         self.forms(housekeeping).len()
@@ -244,174 +97,6 @@ impl SlowSamples {
             }
         }
         all
-    }
-
-    /// With no more samples in a product than [`MOST`], and the lengths of the running means that they have passed, s.
-    fn thinned(&self) -> (Self, Vec<f64>) {
-        let longest = self.products.iter().map(|all| all.iter().map(Stretch::len).sum::<usize>()).max().unwrap_or(0);
-        let factor = longest.div_ceil(MOST);
-        if factor <= 1 {
-            return (self.clone(), vec![self.step_s]);
-        }
-        let step_ns = (1e9 * self.step_s).round() as i64;
-        let thin = |stretch: &Stretch| {
-            let columns = stretch.columns();
-            let mut decimator = Decimator::new(factor, columns.len(), step_ns, 1);
-            let (times, thinned) = decimator.push(stretch.first_ns, &columns);
-            stretch.with(times.first().copied().unwrap_or_default(), thinned)
-        };
-        let product = |all: &Vec<Stretch>| all.iter().map(thin).filter(|s| s.len() > POWERS).collect();
-        let step_s = self.step_s * factor as f64;
-        let thin = Self {
-            names: self.names.clone(),
-            units: self.units.clone(),
-            step_s,
-            base: self.base,
-            products: self.products.iter().map(product).collect(),
-        };
-        (thin, vec![self.step_s, step_s])
-    }
-
-    /// A channel given the others, whitened; none where its noise is unknown or there are too few samples.
-    fn whitened(&self, channel: usize, noise: &NoiseModel, means_s: &[f64]) -> Option<Whitened> {
-        let longest = self.products.iter().flatten().map(Stretch::len).max()?;
-        // The combination that is quietest in the middle of the frequencies, in their logarithm.
-        let length_s = longest as f64 * self.step_s;
-        let middle_hz = (2.0 * length_s * self.step_s).sqrt().recip();
-        let inverse = noise.psd(middle_hz).cholesky()?.inverse();
-        let gains = inverse.column(channel) / inverse[(channel, channel)];
-        let covariance = self.covariance(&gains, noise, longest, means_s);
-        let factor_of = |n: usize| {
-            let toeplitz = DMatrix::from_fn(n, n, |i, j| covariance[i.abs_diff(j)]);
-            Some(Cholesky::new(toeplitz)?.unpack())
-        };
-        let stretches: Vec<&Stretch> = self.products.iter().flatten().collect();
-        let factors: Vec<DMatrix<f64>> = stretches.iter().map(|s| factor_of(s.len())).collect::<Option<_>>()?;
-        let rows: usize = stretches.iter().map(|s| s.len()).sum();
-        let (mut y, mut powers) = (DVector::zeros(rows), DMatrix::zeros(rows, POWERS * self.products.len()));
-        let mut first = 0;
-        for (product, all) in self.products.iter().enumerate() {
-            let start_ns = all.first().map_or(0, |s| s.first_ns);
-            for stretch in all {
-                for k in 0..stretch.len() {
-                    let of = |(r, gain): (&Vec<f64>, &f64)| gain * r[k];
-                    y[first + k] = stretch.residual.iter().zip(gains.iter()).map(of).sum();
-                    let days = (1e-9 * (stretch.first_ns - start_ns) as f64 + k as f64 * self.step_s) / 86_400.0;
-                    (0..POWERS).for_each(|p| powers[(first + k, POWERS * product + p)] = days.powi(p as i32));
-                }
-                first += stretch.len();
-            }
-        }
-        let mut whitened = Whitened { factors, gains, beside: powers, y };
-        whitened.beside = whitened.whiten(&whitened.beside)?.qr().q();
-        let y = whitened.whiten(&DMatrix::from_column_slice(rows, 1, whitened.y.as_slice()))?;
-        whitened.y = whitened.left(&y).column(0).into_owned();
-        (rows > whitened.beside.ncols() + 1).then_some(whitened)
-    }
-
-    /// Covariance of the noise of a combination of channels by the distance of samples.
-    fn covariance(&self, gains: &DVector<f64>, noise: &NoiseModel, longest: usize, means_s: &[f64]) -> Vec<f64> {
-        let length_s = longest as f64 * self.step_s;
-        let step_hz = (FINENESS * length_s).recip();
-        // Above the rate of the samples five running means leave nothing.
-        let count = (2.0 / self.step_s / step_hz) as usize;
-        let power = |k: &usize| {
-            let hz = (*k as f64 + 0.5) * step_hz;
-            let filter: f64 = means_s.iter().map(|mean_s| sinc(std::f64::consts::PI * hz * mean_s).powi(10)).product();
-            (hz, filter * gains.dot(&(noise.psd(hz) * gains)) * step_hz)
-        };
-        let spectrum: Vec<(f64, f64)> = (0..count).collect::<Vec<_>>().iter().map(power).collect();
-        let at = |lag: usize| {
-            let angle = std::f64::consts::TAU * lag as f64 * self.step_s;
-            spectrum.iter().map(|(hz, power)| power * (angle * hz).cos()).sum()
-        };
-        (0..longest).map(at).collect()
-    }
-
-    /// Forms of candidates that the samples choose: for each place of which all forms act along one channel by slow
-    /// series, the form that explains most of it beside what is `added`.
-    pub fn forms_of(
-        &self,
-        places: &[Vec<usize>],
-        set: &CandidateSet,
-        fast: usize,
-        added: &[Candidate],
-        noise: &NoiseModel,
-    ) -> Vec<Candidate> {
-        let (thin, means_s) = self.thinned();
-        let mut by_channel: BTreeMap<usize, Vec<&Vec<usize>>> = BTreeMap::new();
-        for place in places {
-            let terms = || place.iter().flat_map(|i| &set.coefficients[*i].forms).flat_map(|form| &form.terms);
-            let channel = terms().next().map(|t| t.channel);
-            let slow = terms().all(|t| t.column >= fast && Some(t.channel) == channel && t.times.is_none());
-            let plain = place.iter().all(|i| !set.coefficients[*i].transient && set.coefficients[*i].forms.len() > 1);
-            if let (Some(channel), true) = (channel, slow && plain) {
-                by_channel.entry(channel).or_default().push(place);
-            }
-        }
-        let mut chosen = Vec::new();
-        for (channel, places) in by_channel {
-            let Some(mut whitened) = thin.whitened(channel, noise, &means_s) else { continue };
-            let parts = added.iter().flat_map(|c| &c.parts).map(|(_, form)| form);
-            let acting: Vec<DVector<f64>> = parts.filter_map(|form| thin.acting(form, &whitened.gains)).collect();
-            if !acting.is_empty() {
-                let Some(white) = whitened.whiten(&DMatrix::from_columns(&acting)) else { continue };
-                whitened.add(&white);
-            }
-            let columns = || places.iter().flat_map(|p| p.iter()).flat_map(|i| &set.coefficients[*i].forms);
-            let used: BTreeSet<usize> = columns().flat_map(|form| &form.terms).map(|t| t.column).collect();
-            let used: Vec<usize> = used.into_iter().collect();
-            let plain: Vec<DVector<f64>> = used.iter().filter_map(|column| thin.column(*column)).collect();
-            if plain.len() < used.len() {
-                continue;
-            }
-            let Some(white) = whitened.whiten(&DMatrix::from_columns(&plain)) else { continue };
-            let left = whitened.left(&white);
-            let gain = |candidate: &Candidate| {
-                let of = |(_, form): &(usize, Form)| {
-                    let mut sum = DVector::zeros(whitened.y.len());
-                    for t in &form.terms {
-                        let at = used.binary_search(&t.column).unwrap_or(0);
-                        sum.axpy(t.factor, &left.column(at), 1.0);
-                    }
-                    sum
-                };
-                let unit = |d: DVector<f64>| d.try_normalize(f64::MIN_POSITIVE);
-                let d: Vec<DVector<f64>> = candidate.parts.iter().map(of).filter_map(unit).collect();
-                if d.is_empty() {
-                    return 0.0;
-                }
-                let d = DMatrix::from_columns(&d);
-                let along = d.tr_mul(&whitened.y);
-                d.tr_mul(&d).pseudo_inverse(OWN).map_or(0.0, |inverse| along.dot(&(inverse * &along)))
-            };
-            for place in places {
-                let forms = 0..set.coefficients[place[0]].forms.len();
-                let all = forms.map(|form| set.candidate(place, form)).map(|c| (gain(&c), c));
-                chosen.extend(all.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, c)| c));
-            }
-        }
-        chosen
-    }
-
-    /// A series of a candidate in all stretches.
-    fn column(&self, column: usize) -> Option<DVector<f64>> {
-        let at = column.checked_sub(self.base)?;
-        let all: Option<Vec<&Vec<f64>>> = self.products.iter().flatten().map(|s| s.series.get(at)).collect();
-        Some(DVector::from_vec(all?.into_iter().flatten().copied().collect()))
-    }
-
-    /// What a unit of a form adds to a combination of channels; none where it adds nothing.
-    fn acting(&self, form: &Form, gains: &DVector<f64>) -> Option<DVector<f64>> {
-        let mut sum: Option<DVector<f64>> = None;
-        for t in &form.terms {
-            let own = self.column(t.column)? * (t.factor * gains[t.channel]);
-            sum = Some(match sum {
-                Some(sum) => sum + own,
-                None => own,
-            });
-        }
-        sum.filter(|s| s.norm_squared() > 0.0)
     }
 
     /// Samples of a function in all stretches.
@@ -486,10 +171,6 @@ fn symbol_and_power(text: &str) -> Option<(String, i32)> {
     let (symbol, power) = text.split_at(end);
     let power = if power.is_empty() { 1 } else { power.parse().ok()? };
     (!symbol.is_empty()).then(|| (symbol.to_owned(), power))
-}
-
-fn sinc(x: f64) -> f64 {
-    if x == 0.0 { 1.0 } else { x.sin() / x }
 }
 
 impl Memory {
@@ -596,44 +277,92 @@ fn gain(parts: &[Part]) -> f64 {
     parts.iter().zip(&left).map(|(p, left)| 2.0 * p.observations * (p.power / left).ln()).sum()
 }
 
-impl Whitened {
-    /// Columns of samples of all stretches, whitened; none where a covariance is singular.
-    fn whiten(&self, columns: &DMatrix<f64>) -> Option<DMatrix<f64>> {
-        let mut all = columns.clone();
-        let mut first = 0;
-        for factor in &self.factors {
-            let mut rows = all.rows_mut(first, factor.nrows());
-            if !factor.solve_lower_triangular_mut(&mut rows) {
-                return None;
-            }
-            first += factor.nrows();
-        }
-        Some(all)
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::slow_samples::tests::{noise, samples};
+    use dragfree_estimation::spectra::Plan;
+
+    /// Housekeeping without sums of segments: what is fast is told by nothing.
+    fn none(names: usize) -> HousekeepingCoherence {
+        let named = (0..names).map(|i| format!("hk/{i}")).collect();
+        let mut coherence =
+            HousekeepingCoherence::new(named, &Plan::new(1024, 1.0), DMatrix::identity(2, 2), Vec::new());
+        coherence.level = vec![0.0; names];
+        coherence
     }
 
-    /// Whitened columns without what powers of time and what is added explain.
-    fn left(&self, white: &DMatrix<f64>) -> DMatrix<f64> {
-        white - &self.beside * self.beside.tr_mul(white)
+    fn wave(period_h: f64, phase: f64) -> impl Fn(f64) -> f64 {
+        move |t: f64| (std::f64::consts::TAU * t / (3600.0 * period_h) + phase).sin()
     }
 
-    /// Whitened columns are in the model too.
-    fn add(&mut self, white: &DMatrix<f64>) {
-        for k in 0..white.ncols() {
-            let column = DMatrix::from_column_slice(white.nrows(), 1, white.column(k).as_slice());
-            // Twice, so that rounding leaves nothing of the others in it.
-            let left = self.left(&self.left(&column));
-            if left.norm_squared() > OWN * column.norm_squared() {
-                self.beside = DMatrix::from_columns(
-                    &self
-                        .beside
-                        .column_iter()
-                        .map(|c| c.into_owned())
-                        .chain([left.column(0) / left.norm()])
-                        .collect::<Vec<_>>(),
-                );
+    /// A force behind a lag is told with its cause and its lag, on the channel on which it acts first; of a force that
+    /// is the square of a cause the square is told.
+    #[test]
+    fn a_force_is_told_with_its_cause_and_its_lag() {
+        // Up for a third of every three hours.
+        let up = |t: f64| f64::from(u8::from((t / 3600.0) % 3.0 < 1.0));
+        let lag_s = 700.0;
+        let behind = move |t: f64| {
+            let hour = (t / 3600.0) % 3.0;
+            let since = |h: f64| 3600.0 * (hour - h);
+            let settled = if t < 10_800.0 { 1.0 } else { 0.0 };
+            // Settled at the start, and nearly so before each rise.
+            if hour < 1.0 {
+                settled + (1.0 - settled) * (1.0 - (-since(0.0) / lag_s).exp())
+            } else {
+                (-since(1.0) / lag_s).exp()
             }
-        }
-        let y = DMatrix::from_column_slice(self.y.len(), 1, self.y.as_slice());
-        self.y = self.left(&y).column(0).into_owned();
+        };
+        let other = wave(2.3, 0.4);
+        let all = samples(8, 24.0, |t| 5e-14 * behind(t), &[], &[&other, &up]);
+        let housekeeping = none(2);
+        let found = all.driven(&[0], &noise(), &housekeeping);
+        let Some(Driven { driver: Driver::Value(1) | Driver::Square(1), memory: Memory::Lag(found_s), .. }) =
+            found.first()
+        else {
+            panic!("{found:?}");
+        };
+        assert!((found_s - lag_s).abs() < 0.1 * lag_s, "{found:?}");
+        let cause = wave(3.1, 0.0);
+        let all = samples(9, 24.0, |t| 5e-14 * cause(t).powi(2), &[], &[&other, &cause]);
+        let found = all.driven(&[0], &noise(), &housekeeping);
+        assert!(matches!(found[0].driver, Driver::Square(1)), "{found:?}");
+        let expression = all.expression(found[0].driver, Memory::Lag(120.0), &housekeeping);
+        assert_eq!(expression, "lag(hk.1^2, 120.0)");
+        assert_eq!(all.unit_of_amplitude(found[0].driver, Memory::None), "m s-2 A-2");
+        assert_eq!(all.unit_of_amplitude(Driver::Derivative(0), Memory::Integral), "m s-2 A-1");
+    }
+
+    /// Without a force the gain of one function is χ² of one degree of freedom, so that its mean over 300 sets is one:
+    /// false alarm 1e-5. The twin: half of the noise's amplitude as a force in the shape of the function.
+    #[test]
+    fn gains_are_chi_squared_without_a_force() {
+        let gain = |seed: u64, size: f64| {
+            let cause = wave(1.7, 0.1 * seed as f64);
+            let all = samples(seed, 6.0, |t| size * cause(t), &[], &[&cause]);
+            let (thin, means_s) = all.thinned();
+            let whitened = thin.whitened(0, &noise(), &means_s).expect("a covariance");
+            let housekeeping = none(1);
+            let search = Search { samples: &thin, housekeeping: &housekeeping, channel: 0, whitened };
+            search.gains(&[(Driver::Value(0), Memory::None)])[0]
+        };
+        let mean = |size: f64| (0..300).map(|seed| gain(seed, size)).sum::<f64>() / 300.0;
+        let quiet = mean(0.0);
+        assert!((quiet - 1.0).abs() < 4.4 * (2.0_f64 / 300.0).sqrt(), "{quiet}");
+        assert!(mean(2e-15) > 2.0, "a force of 2e-15 m s⁻²");
+    }
+
+    /// The lag of a step settles as an exponential; the integral of a constant is a straight line.
+    #[test]
+    fn memories_are_those_of_continuous_time() {
+        let step: Vec<f64> = (0..50).map(|k| f64::from(u8::from(k > 0))).collect();
+        let out = Memory::Lag(500.0).behind(step, 100.0);
+        // Between the first two samples the cause rises along a straight line.
+        let ramp = 1.0 - 5.0 * (1.0 - (-0.2_f64).exp());
+        assert!((out[1] - ramp).abs() < 1e-12, "{}", out[1]);
+        assert!((out[11] - (1.0 - (1.0 - ramp) * (-2.0_f64).exp())).abs() < 1e-12, "{}", out[11]);
+        let line = Memory::Integral.behind(vec![2.0; 4], 100.0);
+        assert_eq!(line, [100.0, 300.0, 500.0, 700.0].map(|x| x + line[0] - 100.0));
     }
 }

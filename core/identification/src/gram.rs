@@ -15,7 +15,7 @@ use nalgebra::{DMatrix, DMatrixView};
 
 use crate::coherence::HousekeepingCoherence;
 use crate::decimate::{Decimator, Response, SLOW_HZ};
-use crate::driven::{SlowSamples, Thinner};
+use crate::slow_samples::{SlowSamples, Thinner};
 use crate::transient::{Part, Search, Transients};
 
 /// Long segments are so many times as long as the short ones.

@@ -21,5 +21,6 @@ pub mod record;
 pub mod scores;
 pub mod screen;
 pub mod slow_forces;
+pub mod slow_samples;
 pub mod transient;
 pub mod waveform;
