@@ -21,8 +21,11 @@ const LAG_STEPS: usize = 10;
 /// the error of the levels falls by that part in each round.
 const LEVEL_ROUNDS: usize = 10;
 
-/// Functions of one housekeeping channel, and products, that are given for a channel.
-const ALTERNATIVES: usize = 2;
+/// Functions of one housekeeping channel that are given for the channel of which most is explained.
+const SINGLES: usize = 6;
+
+/// Products that are given for it.
+const PRODUCTS: usize = 3;
 
 /// What lies between a cause and its force.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -44,7 +47,7 @@ pub struct Driven {
     pub driver: Driver,
     /// What lies between it and the force.
     pub memory: Memory,
-    /// Twice the rise of the logarithm of the likelihood.
+    /// Twice the rise of the logarithm of the likelihood with the declared noise.
     pub gain: f64,
 }
 
@@ -57,46 +60,70 @@ impl SlowSamples {
     fn forms(&self, housekeeping: &HousekeepingCoherence) -> Vec<(Driver, Memory)> {
         let memories = self.memories();
         let with = |driver: &Driver| {
-            let all = if driver.factors().is_empty() { &memories[..] } else { &[Memory::None] };
+            let all = match driver {
+                Driver::Product(..) => &[Memory::None],
+                // The integral of a derivative is the value.
+                Driver::Derivative(_) => &memories[1..],
+                _ => &memories[..],
+            };
             all.iter().map(|memory| (*driver, *memory)).collect::<Vec<_>>()
         };
         housekeeping.drivers.iter().flat_map(with).collect()
     }
 
-    /// Lags from the distance of samples to the length of the longest stretch.
+    /// Lags from a part of the distance of samples, by which slow samples move, to the length of the longest stretch;
+    /// the integral first.
     fn memories(&self) -> Vec<Memory> {
         let longest = self.products.iter().flatten().map(Stretch::len).max().unwrap_or(0) as f64;
         let count = longest.max(1.0).log2() as i32;
-        let lags = (0..count).map(|k| Memory::Lag(self.step_s * RATIO.powi(k)));
-        [Memory::None, Memory::Integral].into_iter().chain(lags).collect()
+        let lags = (-2..count).map(|k| Memory::Lag(self.step_s * RATIO.powi(k)));
+        [Memory::Integral, Memory::None].into_iter().chain(lags).collect()
     }
 
-    /// For each of some channels the functions of housekeeping that explain most of its residual, the best first, no
-    /// two of the same housekeeping: some that explain more than the best of as many would by chance. `noise` is that
-    /// of the channels.
+    /// Functions of housekeeping that explain the residual of that of some channels best of which most is explained, and
+    /// the first of them for the others, since a force along one shows in all: where they explain more than the best of
+    /// as many would by chance. The best first; `noise` is that of the channels.
     pub fn driven(&self, channels: &[usize], noise: &NoiseModel, housekeeping: &HousekeepingCoherence) -> Vec<Driven> {
         let (thin, means_s) = self.thinned();
         let forms = thin.forms(housekeeping);
         let chance = 2.0 * ((forms.len() * channels.len()) as f64).ln();
-        let mut all = Vec::new();
-        for channel in channels {
-            let Some(whitened) = thin.whitened(*channel, noise, &means_s) else { continue };
-            let search = Search { samples: &thin, housekeeping, channel: *channel, whitened };
-            let gains = search.gains(&forms);
-            let mut order: Vec<usize> = (0..forms.len()).filter(|i| gains[*i] > chance).collect();
-            order.sort_by(|a, b| gains[*b].total_cmp(&gains[*a]));
-            // A product with what hardly changes is its other factor, slightly better by chance: each kind has its own.
-            let mut of: Vec<Vec<usize>> = Vec::new();
-            for i in order {
-                let own = forms[i].0.of();
-                let alike = of.iter().filter(|other| other.len() == own.len()).count();
-                if alike < ALTERNATIVES && !of.contains(&own) {
-                    of.push(own);
-                    all.push(search.refined(forms[i]));
-                }
+        let search = |channel: &usize| {
+            let whitened = thin.whitened(*channel, noise, &means_s)?;
+            Some(Search { samples: &thin, housekeeping, channel: *channel, whitened })
+        };
+        let searches: Vec<Search<'_>> = channels.iter().filter_map(search).collect();
+        let all: Vec<Vec<Gain>> = searches.iter().map(|search| search.gains(&forms)).collect();
+        let most = |gains: &Vec<Gain>| {
+            gains.iter().filter(|g| g.fitted > chance).map(|g| g.declared).fold(f64::NEG_INFINITY, f64::max)
+        };
+        let Some(best) = (0..all.len()).max_by(|a, b| most(&all[*a]).total_cmp(&most(&all[*b]))) else {
+            return Vec::new();
+        };
+        let mut order: Vec<usize> = (0..forms.len()).filter(|i| all[best][*i].fitted > chance).collect();
+        order.sort_by(|a, b| all[best][*b].declared.total_cmp(&all[best][*a].declared));
+        // A product with what hardly changes is its other factor, slightly better by chance: each kind has its own.
+        let mut functions: Vec<(Driver, Memory)> = Vec::new();
+        for i in order {
+            let own = forms[i].0.of();
+            let alike = functions.iter().filter(|(other, _)| other.of().len() == own.len()).count();
+            let most = if own.len() == 1 { SINGLES } else { PRODUCTS };
+            if alike < most && functions.iter().all(|(other, _)| other.of() != own) {
+                functions.push(searches[best].refined(forms[i]));
             }
         }
-        all
+        let first = |factors: usize| functions.iter().position(|(driver, _)| driver.of().len() == factors);
+        let firsts = [first(1), first(2)];
+        let of_channel = |(s, f): (usize, usize)| {
+            let (driver, memory) = functions[f];
+            let gain = searches[s].gains(&[functions[f]])[0];
+            let asked = s == best || firsts.contains(&Some(f));
+            let channel = searches[s].channel;
+            (asked && gain.fitted > chance).then_some(Driven { channel, driver, memory, gain: gain.declared })
+        };
+        let places = (0..functions.len()).flat_map(|f| (0..searches.len()).map(move |s| (s, f)));
+        let mut found: Vec<Driven> = places.filter_map(of_channel).collect();
+        found.sort_by(|a, b| b.gain.total_cmp(&a.gain));
+        found
     }
 
     /// Samples of a function in all stretches.
@@ -220,13 +247,13 @@ struct Search<'a> {
 
 impl Search<'_> {
     /// Gains of some functions.
-    fn gains(&self, forms: &[(Driver, Memory)]) -> Vec<f64> {
+    fn gains(&self, forms: &[(Driver, Memory)]) -> Vec<Gain> {
         let (w, samples) = (&self.whitened, self.samples);
         let mut all = DMatrix::zeros(w.y.len(), forms.len());
         for (mut column, (driver, memory)) in all.column_iter_mut().zip(forms) {
             column.copy_from_slice(&samples.series(*driver, *memory, &self.housekeeping.level));
         }
-        let Some(whole) = w.whiten(&all) else { return vec![0.0; forms.len()] };
+        let Some(whole) = w.whiten(&all) else { return vec![Gain::default(); forms.len()] };
         let own = w.left(&whole);
         let observations = 0.5 * (w.y.len() - w.beside.ncols()) as f64;
         let nyquist_hz = 0.5 / samples.step_s;
@@ -239,27 +266,43 @@ impl Search<'_> {
         };
         let gain = |(k, (driver, memory)): (usize, &(Driver, Memory))| {
             let fast = self.housekeeping.parts(self.channel, *driver, |hz| memory.at(hz), nyquist_hz);
-            gain(&[&[part(k)], &fast[..]].concat())
+            Gain::of(part(k), &fast)
         };
         forms.iter().enumerate().map(gain).collect()
     }
 
     /// The best memory of a function, between the lags that are tried too.
-    fn refined(&self, (driver, best): (Driver, Memory)) -> Driven {
-        let gain = |memory: Memory| self.gains(&[(driver, memory)])[0];
+    fn refined(&self, (driver, best): (Driver, Memory)) -> (Driver, Memory) {
+        let gain = |memory: Memory| self.gains(&[(driver, memory)])[0].declared;
         let all = self.samples.memories().into_iter().map(|memory| (memory, gain(memory)));
-        let (mut memory, mut most) = all.max_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((best, 0.0));
-        if let Memory::Lag(lag_s) = memory {
-            let (mut low, mut high) = ((lag_s / RATIO).ln(), (lag_s * RATIO).ln());
-            let golden = 0.5 * (5.0_f64.sqrt() - 1.0);
-            for _ in 0..LAG_STEPS {
-                let (a, b) = (high - golden * (high - low), low + golden * (high - low));
-                if gain(Memory::Lag(a.exp())) > gain(Memory::Lag(b.exp())) { high = b } else { low = a }
-            }
-            memory = Memory::Lag((0.5 * (low + high)).exp());
-            most = gain(memory);
+        let memory = all.max_by(|a, b| a.1.total_cmp(&b.1)).map_or(best, |(memory, _)| memory);
+        let Memory::Lag(lag_s) = memory else { return (driver, memory) };
+        let (mut low, mut high) = ((lag_s / RATIO).ln(), (lag_s * RATIO).ln());
+        let golden = 0.5 * (5.0_f64.sqrt() - 1.0);
+        for _ in 0..LAG_STEPS {
+            let (a, b) = (high - golden * (high - low), low + golden * (high - low));
+            if gain(Memory::Lag(a.exp())) > gain(Memory::Lag(b.exp())) { high = b } else { low = a }
         }
-        Driven { channel: self.channel, driver, memory, gain: most }
+        (driver, Memory::Lag((0.5 * (low + high)).exp()))
+    }
+}
+
+/// Twice the rise of the logarithm of the likelihood by a function.
+#[derive(Clone, Copy, Debug, Default)]
+struct Gain {
+    /// With the level of the noise fitted in each part: whether it is there.
+    fitted: f64,
+    /// With the declared level of slow noise, the same for all channels: along which channel, and which function.
+    declared: f64,
+}
+
+impl Gain {
+    /// From slow samples, whitened with the declared noise, and from faster bands.
+    fn of(slow: Part, fast: &[Part]) -> Self {
+        let weighed = |of: fn(&Part) -> f64| fast.iter().map(|p| 2.0 * p.observations / p.power * of(p)).sum::<f64>();
+        let (squared, along) = (slow.squared + weighed(|p| p.squared), slow.along + weighed(|p| p.along));
+        let declared = if squared > 0.0 { along.powi(2) / squared } else { 0.0 };
+        Self { fitted: gain(&[&[slow], fast].concat()), declared }
     }
 }
 
@@ -345,7 +388,7 @@ mod tests {
             let whitened = thin.whitened(0, &noise(), &means_s).expect("a covariance");
             let housekeeping = none(1);
             let search = Search { samples: &thin, housekeeping: &housekeeping, channel: 0, whitened };
-            search.gains(&[(Driver::Value(0), Memory::None)])[0]
+            search.gains(&[(Driver::Value(0), Memory::None)])[0].fitted
         };
         let mean = |size: f64| (0..300).map(|seed| gain(seed, size)).sum::<f64>() / 300.0;
         let quiet = mean(0.0);

@@ -37,11 +37,14 @@ pub(crate) fn proposals(replay: &Replay<'_>, record: &Record) -> Result<(Vec<Pro
     if replay.registry.find(Kind::Effect, FORMULA).is_err() {
         return Ok((all, 0));
     }
-    let mut before = None;
+    let mut with_factors = true;
     for driven in slow.driven(&own, &record.noise_model()?, housekeeping) {
         let channel = &channels[driven.channel];
-        let first = before.replace(driven.channel) != Some(driven.channel);
-        let factors = if first { driven.driver.factors() } else { Vec::new() };
+        let factors = if with_factors { driven.driver.factors() } else { Vec::new() };
+        with_factors &= factors.is_empty();
+        if std::env::var_os("DBG").is_some() {
+            println!("DBG {} {} {}", channel, slow.expression(driven.driver, driven.memory, housekeeping), driven.gain);
+        }
         for driver in [driven.driver].into_iter().chain(factors) {
             let expression = slow.expression(driver, driven.memory, housekeeping);
             let rms = slow.rms(driver, driven.memory, housekeeping);
