@@ -1,7 +1,7 @@
 //! `dragfree diagnose` on telemetry whose hidden cause no input of the program contains.
 
 use dragfree_tests::calibration::{diagnose, science_mode};
-use dragfree_tests::{dragfree, expect, simulate};
+use dragfree_tests::{dragfree, expect, fixture, simulate};
 use serde_json::Value;
 use std::path::Path;
 
@@ -233,6 +233,29 @@ fn increased_torque_noise_is_found_alone() {
     let first = &d["candidates"][0];
     let (value, sigma) = (first["value"].as_f64().expect("a value"), first["sigma"].as_f64().expect("a sigma"));
     assert!((value - 2.0).abs() < 4.0 * sigma && sigma < 0.05, "{value} ± {sigma}");
+}
+
+/// A force that no effect of the library states, the square of the battery's current behind a lag of 50 s: nothing is
+/// named, a formula is proposed on its test mass and axis, and the current is among the first three that drive it, as
+/// the magnetic field and the heater change with it. With the formula in the model the next diagnosis finds nothing.
+#[test]
+fn an_unknown_force_is_told_by_a_formula_that_explains_it() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let hidden = ["--hours", "6", "--seed", "7", "--effect", "current-force:tm1.y=1e-13,lag_s=50"];
+    let d = diagnose(folder.path(), &calibrated(folder.path(), &hidden));
+    assert_eq!((d["verdict"].as_str(), accepted(&d)), (Some("unexplained"), Vec::new()), "{:#}", d["candidates"]);
+    let [formula] = &d["formulas"].as_array().expect("a list")[..] else { panic!("{:#}", d["formulas"]) };
+    assert_eq!((&formula["effect"], &formula["shape"]["acts_on"]), (&"formula".into(), &"tm1.accel.y".into()));
+    let drivers = d["unexplained"]["coherent_with"].as_array().expect("a list");
+    let current = |name: &Value| name.as_str().is_some_and(|name| name.contains("hk/battery_current_a"));
+    assert!(drivers.iter().take(3).any(current), "{drivers:?}");
+    std::fs::write(folder.path().join("d.json"), d.to_string()).expect("writable");
+    std::fs::copy(fixture("models/com-offset.toml"), folder.path().join("m.toml")).expect("copied");
+    expect(dragfree(folder.path()).args(["model", "add", "m.toml", "--from", "d.json"]), 0);
+    let run = science_mode(folder.path()).arg("SC1_2035-01-01.mcap").args(["--model", "m.toml"]).output();
+    let product: Value = serde_json::from_slice(&run.expect("runs").stdout).expect("a product as JSON");
+    let d = diagnose(folder.path(), &product);
+    assert_eq!(d["verdict"], "sufficient", "{:#} {:#} {}", d["candidates"][0], d["formulas"], d["reasons"]);
 }
 
 /// Ten minutes are shorter than a segment: an error, not a result.

@@ -147,19 +147,18 @@ impl SlowSamples {
         (series.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n).sqrt()
     }
 
-    /// The function as the effect `formula` reads it, `lag(hk.battery_current_a^2, 120.0)`.
+    /// The function as the effect `formula` reads it, `lag(hk.battery_current_a - 1.900000e0, 120.0)`.
     pub fn expression(&self, driver: Driver, memory: Memory, housekeeping: &HousekeepingCoherence) -> String {
         let level = &housekeeping.level;
         let name = |i: usize| self.names[i].replacen("hk/", "hk.", 1);
-        let about = |i: usize| {
-            let sign = if level[i] < 0.0 { '+' } else { '-' };
-            format!("({} {sign} {:e})", name(i), level[i].abs())
-        };
+        let less = |level: f64| format!("{} {:.6e}", if level < 0.0 { '+' } else { '-' }, level.abs());
+        let about = |i: usize| format!("{} {}", name(i), less(level[i]));
+        // Without what is constant, which has no power to tell and costs digits.
         let plain = match driver {
-            Driver::Value(i) => name(i),
+            Driver::Value(i) => about(i),
             Driver::Derivative(i) => format!("derivative({})", name(i)),
-            Driver::Square(i) => format!("{}^2", name(i)),
-            Driver::Product(i, j) => format!("{} * {}", about(i), about(j)),
+            Driver::Square(i) => format!("{}^2 {}", name(i), less(level[i].powi(2))),
+            Driver::Product(i, j) => format!("({}) * ({})", about(i), about(j)),
         };
         match memory {
             Memory::None => plain,
@@ -372,7 +371,7 @@ mod tests {
         let found = all.driven(&[0], &noise(), &housekeeping);
         assert!(matches!(found[0].driver, Driver::Square(1)), "{found:?}");
         let expression = all.expression(found[0].driver, Memory::Lag(120.0), &housekeeping);
-        assert_eq!(expression, "lag(hk.1^2, 120.0)");
+        assert_eq!(expression, "lag(hk.1^2 - 0.000000e0, 120.0)");
         assert_eq!(all.unit_of_amplitude(found[0].driver, Memory::None), "m s-2 A-2");
         assert_eq!(all.unit_of_amplitude(Driver::Derivative(0), Memory::Integral), "m s-2 A-1");
     }

@@ -432,7 +432,10 @@ fn found(
         p_value,
         log10_p_value,
         delta_bic: dof * decided.numbers.ln() - fitted.gain,
-        in_range: fitted.values.iter().zip(&fitted.free).all(|(a, b)| a == b),
+        in_range: own.iter().zip(&fitted.values).all(|(i, value)| match &decided.parameters[*i].1 {
+            Meaning::Coefficient(c) => c.lower < *value && *value < c.upper,
+            Meaning::Level | Meaning::Power => true,
+        }),
         chi2_per_dof_before: if accepted { before + fitted.gain / decided.numbers } else { before },
         chi2_per_dof_after: if accepted { before } else { before - fitted.gain / decided.numbers },
         offset_shift_m,

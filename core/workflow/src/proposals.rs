@@ -42,9 +42,6 @@ pub(crate) fn proposals(replay: &Replay<'_>, record: &Record) -> Result<(Vec<Pro
         let channel = &channels[driven.channel];
         let factors = if with_factors { driven.driver.factors() } else { Vec::new() };
         with_factors &= factors.is_empty();
-        if std::env::var_os("DBG").is_some() {
-            println!("DBG {} {} {}", channel, slow.expression(driven.driver, driven.memory, housekeeping), driven.gain);
-        }
         for driver in [driven.driver].into_iter().chain(factors) {
             let expression = slow.expression(driver, driven.memory, housekeeping);
             let rms = slow.rms(driver, driven.memory, housekeeping);
