@@ -411,7 +411,7 @@ pub(crate) mod tests {
         let mut white = |asd: f64| {
             asd * (2.0 * IN_S).sqrt().recip() * <StandardNormal as Distribution<f64>>::sample(&StandardNormal, &mut rng)
         };
-        let mut columns = vec![Vec::with_capacity(count); 2];
+        let mut columns = vec![Vec::new(); 2];
         for k in 0..count {
             let both = white(BOTH);
             columns[0].push(both + white(EACH) + force(IN_S * k as f64));
