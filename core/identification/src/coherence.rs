@@ -551,6 +551,24 @@ mod tests {
         assert_eq!(together(&[]).1, []);
     }
 
+    /// Parts of a driver have its amplitude, as the channels' noise has unit power. With some 75 observations σ is
+    /// 1/√(2·75) = 0.08, of which 4.4 (false alarm 1e-5); behind a response the amplitude is that of what comes out.
+    #[test]
+    fn parts_have_the_amplitude_of_a_driver() {
+        let (coherence, _) = segments(3, |channels, housekeeping| {
+            channels[0].iter_mut().zip(&housekeeping[1]).for_each(|(z, x)| *z += 3.0 * x);
+        });
+        let amplitude = |response: f64, from_hz: f64| {
+            let parts = coherence.parts(0, Driver::Value(1), |_| Complex::new(response, 0.0), from_hz);
+            let sum = |of: fn(&Part) -> f64| parts.iter().map(of).sum::<f64>();
+            (sum(|p| p.along) / sum(|p| p.squared), sum(|p| p.observations))
+        };
+        let (found, observations) = amplitude(1.0, 0.0);
+        assert!((found - 3.0).abs() < 4.4 * (2.0 * observations).sqrt().recip(), "{found} of {observations}");
+        assert!((amplitude(-2.0, 0.0).0 + found / 2.0).abs() < 1e-12);
+        assert!(amplitude(1.0, 0.02).1 < observations);
+    }
+
     /// The twin: a driver with half of a channel's power, |γ|² = 1/2, is worth 2n log 2 = 97 over some 70 observations.
     #[test]
     fn a_driver_is_the_largest_coherence() {

@@ -1,5 +1,5 @@
-//! Forces that follow a function of housekeeping: which function explains the residual of a channel best, over the whole
-//! of each product.
+//! Forces that follow a function of housekeeping: which function explains the residual of a channel best, over the
+//! whole of each product.
 //!
 //! The amplitude a of a function is one. What is slow is told by [`crate::slow_samples`], what is faster by the
 //! cross-spectra of [`crate::coherence`]; the level of the noise is one in each band and one of the samples. With n
@@ -20,6 +20,9 @@ const LAG_STEPS: usize = 10;
 /// Rounds in which amplitude and levels of the noise follow each other: what is explained is a part of the power, and
 /// the error of the levels falls by that part in each round.
 const LEVEL_ROUNDS: usize = 10;
+
+/// Functions whose samples are made at a time.
+const AT_ONCE: usize = 256;
 
 /// Functions of one housekeeping channel that are given for the channel of which most is explained.
 const SINGLES: usize = 6;
@@ -80,37 +83,22 @@ impl SlowSamples {
         [Memory::Integral, Memory::None].into_iter().chain(lags).collect()
     }
 
-    /// Functions of housekeeping that explain the residual of that of some channels best of which most is explained, and
-    /// the first of them for the others, since a force along one shows in all: where they explain more than the best of
-    /// as many would by chance. The best first; `noise` is that of the channels.
+    /// Functions of housekeeping for the one of some channels of which they explain most, and the first of them for the
+    /// other channels, since a force along one shows in all: those that explain more than the best of as many would by
+    /// chance. The best first; `noise` is that of the channels.
     pub fn driven(&self, channels: &[usize], noise: &NoiseModel, housekeeping: &HousekeepingCoherence) -> Vec<Driven> {
         let (thin, means_s) = self.thinned();
         let forms = thin.forms(housekeeping);
         let chance = 2.0 * ((forms.len() * channels.len()) as f64).ln();
         let search = |channel: &usize| {
             let whitened = thin.whitened(*channel, noise, &means_s)?;
-            Some(Search { samples: &thin, housekeeping, channel: *channel, whitened })
+            Some(Search { samples: &thin, housekeeping, channel: *channel, whitened, chance })
         };
         let searches: Vec<Search<'_>> = channels.iter().filter_map(search).collect();
-        let all: Vec<Vec<Gain>> = searches.iter().map(|search| search.gains(&forms)).collect();
-        let most = |gains: &Vec<Gain>| {
-            gains.iter().filter(|g| g.fitted > chance).map(|g| g.declared).fold(f64::NEG_INFINITY, f64::max)
-        };
-        let Some(best) = (0..all.len()).max_by(|a, b| most(&all[*a]).total_cmp(&most(&all[*b]))) else {
-            return Vec::new();
-        };
-        let mut order: Vec<usize> = (0..forms.len()).filter(|i| all[best][*i].fitted > chance).collect();
-        order.sort_by(|a, b| all[best][*b].declared.total_cmp(&all[best][*a].declared));
-        // A product with what hardly changes is its other factor, slightly better by chance: each kind has its own.
-        let mut functions: Vec<(Driver, Memory)> = Vec::new();
-        for i in order {
-            let own = forms[i].0.of();
-            let alike = functions.iter().filter(|(other, _)| other.of().len() == own.len()).count();
-            let most = if own.len() == 1 { SINGLES } else { PRODUCTS };
-            if alike < most && functions.iter().all(|(other, _)| other.of() != own) {
-                functions.push(searches[best].refined(forms[i]));
-            }
-        }
+        let ranked: Vec<Vec<(f64, usize)>> = searches.iter().map(|search| search.ranked(&forms)).collect();
+        let most = |s: &usize| ranked[*s].first().map_or(0.0, |(gain, _)| *gain);
+        let Some(best) = (0..searches.len()).max_by(|a, b| most(a).total_cmp(&most(b))) else { return Vec::new() };
+        let functions = searches[best].functions(&forms, &ranked[best]);
         let first = |factors: usize| functions.iter().position(|(driver, _)| driver.of().len() == factors);
         let firsts = [first(1), first(2)];
         let of_channel = |(s, f): (usize, usize)| {
@@ -242,9 +230,35 @@ struct Search<'a> {
     housekeeping: &'a HousekeepingCoherence,
     channel: usize,
     whitened: Whitened,
+    /// What the best of all functions explains by chance.
+    chance: f64,
 }
 
 impl Search<'_> {
+    /// Functions that explain more than by chance, by index: what they explain with the declared noise, the most first.
+    fn ranked(&self, forms: &[(Driver, Memory)]) -> Vec<(f64, usize)> {
+        let gains = forms.chunks(AT_ONCE).flat_map(|some| self.gains(some)).enumerate();
+        let mut all: Vec<(f64, usize)> =
+            gains.filter(|(_, gain)| gain.fitted > self.chance).map(|(i, gain)| (gain.declared, i)).collect();
+        all.sort_by(|a, b| b.0.total_cmp(&a.0));
+        all
+    }
+
+    /// The best of them, no two of the same housekeeping, each with its best memory. A product with what hardly changes
+    /// is its other factor, slightly better by chance: each kind has its own.
+    fn functions(&self, forms: &[(Driver, Memory)], ranked: &[(f64, usize)]) -> Vec<(Driver, Memory)> {
+        let mut functions: Vec<(Driver, Memory)> = Vec::new();
+        for (_, i) in ranked {
+            let own = forms[*i].0.of();
+            let alike = functions.iter().filter(|(other, _)| other.of().len() == own.len()).count();
+            let most = if own.len() == 1 { SINGLES } else { PRODUCTS };
+            if alike < most && functions.iter().all(|(other, _)| other.of() != own) {
+                functions.push(self.refined(forms[*i]));
+            }
+        }
+        functions
+    }
+
     /// Gains of some functions.
     fn gains(&self, forms: &[(Driver, Memory)]) -> Vec<Gain> {
         let (w, samples) = (&self.whitened, self.samples);
@@ -386,7 +400,7 @@ mod tests {
             let (thin, means_s) = all.thinned();
             let whitened = thin.whitened(0, &noise(), &means_s).expect("a covariance");
             let housekeeping = none(1);
-            let search = Search { samples: &thin, housekeeping: &housekeeping, channel: 0, whitened };
+            let search = Search { samples: &thin, housekeeping: &housekeeping, channel: 0, whitened, chance: 0.0 };
             search.gains(&[(Driver::Value(0), Memory::None)])[0].fitted
         };
         let mean = |size: f64| (0..300).map(|seed| gain(seed, size)).sum::<f64>() / 300.0;

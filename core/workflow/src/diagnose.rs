@@ -198,11 +198,6 @@ impl Evidence<'_> {
         self.proposals.iter().find(|p| (p.entry.id.as_str(), p.entry.instance.as_str()) == (effect, instance))
     }
 
-    /// The same by its whole name, `formula:NAME`.
-    fn proposal_named(&self, name: &str) -> Option<&Proposal> {
-        name.split_once(':').and_then(|(effect, instance)| self.proposal(effect, instance))
-    }
-
     /// What acts once was searched for at every time.
     fn family<'b>(&self, effect: &'b str) -> &'b str {
         if has_parameter(self.replay.registry, effect, AT_NS) { TRANSIENT } else { effect }
@@ -322,9 +317,12 @@ fn followed(
             coherences: Vec::new(),
         }
     });
-    let names = |f: &Found| [vec![format!("{}:{}", f.effect, f.instance)], f.confounders.clone()].concat();
-    let of = |name: String| evidence.proposal_named(&name).map(|p| p.driver.clone());
-    let drivers: Vec<String> = formulas.iter().flat_map(names).filter_map(of).collect();
+    let is = |f: &Found, p: &Proposal| (&f.effect, &f.instance) == (&p.entry.id, &p.entry.instance);
+    let driver = |told: &dyn Fn(&Found, &Proposal) -> bool| -> Vec<String> {
+        let told = evidence.proposals.iter().filter(|p| formulas.iter().any(|f| told(f, p)));
+        told.map(|p| p.driver.clone()).collect()
+    };
+    let drivers = [driver(&is), driver(&|f, p| f.confounders.contains(&p.words))].concat();
     let before = std::mem::take(&mut u.coherent_with);
     for driver in drivers.into_iter().chain(before) {
         if !u.coherent_with.contains(&driver) {
@@ -402,7 +400,10 @@ fn found(
     let channels: BTreeSet<&String> =
         own.iter().filter_map(|i| decided.channels.get(&decided.parameters[*i].0)).flatten().collect();
     let rivals: Vec<usize> = fitted.alternatives.iter().filter(|(_, p)| *p > evidence.least).map(|(c, _)| *c).collect();
-    let name_of = |c: &usize| format!("{}:{}", decided.candidates[*c].0, decided.candidates[*c].1);
+    let name_of = |c: &usize| {
+        let (effect, instance, _) = &decided.candidates[*c];
+        evidence.proposal(effect, instance).map_or_else(|| format!("{effect}:{instance}"), |p| p.words.clone())
+    };
     let set = &named;
     let separation = |c: &usize| Separation::new(name_of(c), decided.quadratic.separation(fitted.candidate, *c, set));
     let separations: Vec<Separation> = rivals.iter().map(separation).collect();

@@ -22,6 +22,8 @@ pub(crate) struct Proposal {
     pub(crate) entry: EffectEntry,
     /// The driver as among those that are coherent with a residual, `hk/battery_current_a^2`.
     pub(crate) driver: String,
+    /// What acts where, `lag(hk.battery_current_a - 1.912320e0, 50.0) on tm1.accel.y`.
+    pub(crate) words: String,
 }
 
 /// Formulas for the residuals of the model, and how many were tried. A product comes with its two factors, since where
@@ -65,7 +67,7 @@ pub(crate) fn proposals(replay: &Replay<'_>, record: &Record) -> Result<(Vec<Pro
                 ("unit".to_owned(), text(&slow.unit_of_amplitude(driver, driven.memory))),
                 ("range".to_owned(), toml::Value::from(vec![-most, most])),
             ]);
-            all.push(Proposal { entry, driver: slow.label(driver) });
+            all.push(Proposal { entry, driver: slow.label(driver), words: format!("{expression} on {channel}") });
         }
     }
     Ok((all, slow.functions(housekeeping) * own.len()))

@@ -58,13 +58,14 @@ fn screen(diagnosed: &Diagnosed, command: &Diagnose, repeated: &str, paint: Pain
     if let Some(u) = &d.unexplained {
         let _ = writeln!(out, "\nWhat no installed effect explains");
         let _ = writeln!(out, "  channels {}", u.channels.join(", "));
-        let _ = writeln!(
-            out,
-            "  {} between {:.2e} and {:.2e} Hz, {:.2} times the power",
-            u.kind, u.band_hz[0], u.band_hz[1], u.ratio
-        );
+        let band = format!("between {:.2e} and {:.2e} Hz", u.band_hz[0], u.band_hz[1]);
+        let _ = match (u.kind.as_str(), u.power) {
+            ("driven", _) => writeln!(out, "  driven by something aboard, {band}"),
+            (kind, true) => writeln!(out, "  {kind} {band}, {:.2} times the power", u.ratio),
+            (kind, false) => writeln!(out, "  {kind} {band}, told by housekeeping: {:.2} times the power", u.ratio),
+        };
         if !u.coherent_with.is_empty() {
-            let _ = writeln!(out, "  coherent with {}", u.coherent_with.join(", "));
+            out.push_str(&crate::text::labelled("  coherent with", &u.coherent_with.join(", ")));
         }
     }
     if !d.formulas.is_empty() {
@@ -152,7 +153,7 @@ fn put(out: &mut String, f: &Found, ask: Ask) {
         out.push_str(&crate::text::labelled("    values", &text));
     }
     if !f.confounders.is_empty() {
-        let _ = writeln!(out, "    cannot be told from {}", f.confounders.join(", "));
+        out.push_str(&crate::text::labelled("    cannot be told from", &f.confounders.join(", ")));
     }
     for s in f.separations.iter().filter(|_| ask.next) {
         let length = if s.times_the_data < LONGEST {
