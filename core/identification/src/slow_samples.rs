@@ -80,8 +80,8 @@ pub(crate) struct Thinner {
 }
 
 impl Thinner {
-    /// For samples of so many `columns` every `step_ns`, of which the first make residuals (channels × base columns), and
-    /// for housekeeping of these names and units.
+    /// For samples of so many `columns` every `step_ns`, of which the first make residuals (channels × base columns),
+    /// and for housekeeping of these names and units.
     pub(crate) fn new(
         names: Vec<String>,
         units: Vec<String>,
