@@ -27,6 +27,10 @@ const POWERS: usize = 3;
 /// Part of the power of a series that is rounding.
 pub(crate) const OWN: f64 = 1e-9;
 
+/// Steps between two forms that differ in a number, in its logarithm: 5 % of a lag where forms are a factor of 1.5
+/// apart, so that passes come to rest.
+const BETWEEN: u32 = 8;
+
 /// Frequencies in the integral of a covariance, per 1/T.
 const FINENESS: f64 = 4.0;
 
@@ -153,6 +157,9 @@ pub(crate) struct Whitened {
 impl SlowSamples {
     /// Adds other products with the same housekeeping.
     pub fn add(&mut self, other: &Self) {
+        if self.names != other.names {
+            return;
+        }
         self.products.extend(other.products.iter().cloned());
     }
 
@@ -296,8 +303,14 @@ impl SlowSamples {
                 d.tr_mul(&d).pseudo_inverse(OWN).map_or(0.0, |inverse| along.dot(&(inverse * &along)))
             };
             for place in places {
-                let forms = 0..set.coefficients[place[0]].forms.len();
-                let all = forms.map(|form| set.candidate(place, form)).map(|c| (gain(&c), c));
+                let forms: Vec<Candidate> =
+                    (0..set.coefficients[place[0]].forms.len()).map(|form| set.candidate(place, form)).collect();
+                let all = forms.iter().map(|c| (gain(c), c));
+                let Some((_, best)) = all.max_by(|a, b| a.0.total_cmp(&b.0)) else { continue };
+                let between = neighbours(best, &forms).into_iter().flat_map(|other| {
+                    (1..BETWEEN).map(move |k| best.towards(other, f64::from(k) / f64::from(BETWEEN)))
+                });
+                let all = std::iter::once(best.clone()).chain(between).map(|c| (gain(&c), c));
                 chosen.extend(all.max_by(|a, b| a.0.total_cmp(&b.0)).map(|(_, c)| c));
             }
         }
@@ -323,6 +336,29 @@ impl SlowSamples {
         }
         sum.filter(|s| s.norm_squared() > 0.0)
     }
+}
+
+/// Forms that differ from one in their numbers alone, such as a lag: the nearest below and above.
+fn neighbours<'a>(of: &Candidate, forms: &'a [Candidate]) -> Vec<&'a Candidate> {
+    let shape = |c: &Candidate| c.parts[0].1.shape.clone();
+    let own = shape(of);
+    let distance = |c: &Candidate| {
+        let mut sum = 0.0;
+        for (key, value) in shape(c) {
+            match (own.get(&key).and_then(|v| v.as_f64()), value.as_f64()) {
+                (Some(a), Some(b)) if a > 0.0 && b > 0.0 => sum += (b / a).ln(),
+                _ if own.get(&key) == Some(&value) => {}
+                _ => return None,
+            }
+        }
+        Some(sum)
+    };
+    let all: Vec<(f64, &Candidate)> = forms.iter().filter_map(|c| Some((distance(c)?, c))).collect();
+    let nearest = |sign: f64| {
+        let side = all.iter().filter(|(d, _)| sign * d > 0.0);
+        side.min_by(|a, b| a.0.abs().total_cmp(&b.0.abs())).map(|(_, c)| *c)
+    };
+    [nearest(-1.0), nearest(1.0)].into_iter().flatten().collect()
 }
 
 fn sinc(x: f64) -> f64 {

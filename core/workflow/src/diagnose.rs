@@ -317,12 +317,11 @@ fn followed(
             coherences: Vec::new(),
         }
     });
-    let is = |f: &Found, p: &Proposal| (&f.effect, &f.instance) == (&p.entry.id, &p.entry.instance);
-    let driver = |told: &dyn Fn(&Found, &Proposal) -> bool| -> Vec<String> {
-        let told = evidence.proposals.iter().filter(|p| formulas.iter().any(|f| told(f, p)));
-        told.map(|p| p.driver.clone()).collect()
-    };
-    let drivers = [driver(&is), driver(&|f, p| f.confounders.contains(&p.words))].concat();
+    // The chosen ones first, then what the data cannot tell from them, as likely first.
+    let own = formulas.iter().filter_map(|f| evidence.proposal(&f.effect, &f.instance));
+    let words = formulas.iter().flat_map(|f| &f.confounders);
+    let others = words.filter_map(|words| evidence.proposals.iter().find(|p| p.words == *words));
+    let drivers: Vec<String> = own.chain(others).map(|p| p.driver.clone()).collect();
     let before = std::mem::take(&mut u.coherent_with);
     for driver in drivers.into_iter().chain(before) {
         if !u.coherent_with.contains(&driver) {
