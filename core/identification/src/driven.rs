@@ -391,7 +391,7 @@ mod tests {
     }
 
     /// Without a force the gain of one function is χ² of one degree of freedom, so that its mean over 300 sets is one:
-    /// false alarm 1e-5. The twin: half of the noise's amplitude as a force in the shape of the function.
+    /// false alarm 1e-5. The twin: a force of amplitude A in its shape, which adds A² T / S = 4.3.
     #[test]
     fn gains_are_chi_squared_without_a_force() {
         let gain = |seed: u64, size: f64| {

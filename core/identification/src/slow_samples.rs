@@ -467,8 +467,8 @@ pub(crate) mod tests {
         thinner.finish()
     }
 
-    /// Whitened noise has unit variance and no correlation, and the noise that both channels share is gone. With 200
-    /// hours there are some 1400 numbers after thinning of each of 20 sets: false alarm 1e-5 each.
+    /// Whitened noise has unit variance and no correlation, and the noise that both channels share is gone: 20 sets of
+    /// 12 hours, some 430 numbers each. False alarm 1e-5 each.
     #[test]
     fn whitened_noise_is_white() {
         let (mut squares, mut products, mut n) = (0.0, 0.0, 0.0);
