@@ -87,7 +87,7 @@ pub fn diagnose(
 
 /// Passes that fit constants beside what is named, at the start and after a form has changed: the first from 1e5 σ, so
 /// that rounding leaves some σ to the second.
-const OPENING: usize = 2;
+const OPENING: usize = 1;
 
 /// Decides by the likelihood of the innovations among the forms that the spectra choose, beside the effects that are
 /// named so far: passes until nothing moves.

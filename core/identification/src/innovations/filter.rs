@@ -22,19 +22,14 @@
 
 use std::sync::{Mutex, PoisonError};
 
-use nalgebra::{DMatrix, DMatrixView, DVector, Dyn};
+use nalgebra::{DMatrix, DVector};
 
-use super::predictor::{Beside, Change, Predictor};
+use super::lanes::{Batch, Kernel, LANES, Products, Tile};
+use super::predictor::{Change, Predictor};
 use super::state_space::NoiseStates;
 
-/// Parameters that are filtered side by side.
-const LANES: usize = 8;
-/// Tiles of a group, whose products are taken together.
-const TILES: usize = 5;
-/// Parameters of a group.
-const WIDE: usize = LANES * TILES;
 /// Rows that are filtered before products are taken.
-const ROWS: usize = 128;
+const ROWS: usize = 32;
 /// What is left of a start when squares of innovations are summed for levels of the noise, and the longest wait, s.
 const SETTLED: f64 = 1e-2;
 const LONGEST_WAIT_S: f64 = 600.0;
@@ -42,6 +37,7 @@ const LONGEST_WAIT_S: f64 = 600.0;
 pub(crate) const FREE: f64 = 1e6;
 /// Powers of time that each channel may follow beside everything else: a constant, a slope, a curvature.
 pub const POWERS: usize = 3;
+
 const DAY_NS: f64 = 86_400e9;
 
 /// Response of a channel to a parameter: channel, series, factor.
@@ -160,62 +156,6 @@ impl Sums {
     }
 }
 
-/// The matrices of the filter, laid out for it.
-struct Kernel {
-    channels: usize,
-    /// States as they are filtered, see [`NoiseStates::merged`], made even by one that stays zero.
-    states: usize,
-    /// Two states after two states: for both a state before and a factor, zero where the other has more of them.
-    transition: Vec<Vec<[(usize, f64); 2]>>,
-    /// Of each channel: states and factors.
-    output: Vec<Vec<(usize, f64)>>,
-    /// Two states after two states, their gains channel by channel.
-    gain: Vec<[f64; 2]>,
-    /// Two channels after two channels: channels up to the second of them.
-    whitening: Vec<Vec<[f64; 2]>>,
-}
-
-/// Eight parameters.
-struct Tile {
-    /// Channel, lane, series, factor in units of the channel.
-    responses: Vec<(usize, usize, usize, f64)>,
-    /// `∂K`, states × channels; empty where no parameter changes the noise.
-    changes: Vec<[f64; LANES]>,
-    /// Filters at zero, each in one lane.
-    filters: Vec<Filter>,
-    state: Vec<[f64; LANES]>,
-    next: Vec<[f64; LANES]>,
-    nu: Vec<[f64; LANES]>,
-    /// Channel and lane that are not weighed.
-    not_weighed: Vec<(usize, usize)>,
-}
-
-/// A filter at coefficient zero: states of one parameter.
-struct Filter {
-    lane: usize,
-    /// State, state before, factor.
-    transition: Vec<(usize, usize, f64)>,
-    /// Channel, state, factor.
-    output: Vec<(usize, usize, f64)>,
-    /// `∂K`, states × channels.
-    gain: Vec<f64>,
-    state: Vec<f64>,
-    next: Vec<f64>,
-}
-
-/// Tiles whose products are taken together.
-struct Group {
-    tiles: Vec<Tile>,
-    /// Whitened ν: lanes of all tiles × (rows × channels).
-    whitened: DMatrix<f64>,
-}
-
-/// Products of the lanes of two groups.
-struct Product {
-    groups: (usize, usize),
-    sum: DMatrix<f64>,
-}
-
 /// Rows that wait.
 struct Waiting {
     /// Series with the powers of time.
@@ -232,7 +172,9 @@ pub struct Innovations {
     /// What is known of the channels: taken off before anything else.
     known: Vec<Response>,
     /// Parameters and the data, and at last the start of the moving averages.
-    groups: Vec<Group>,
+    tiles: Vec<Tile>,
+    /// Tiles of parameters and the data.
+    asked: usize,
     /// `W ∂S Wᵀ` of the parameters that change the noise.
     changes: Vec<(usize, DMatrix<f64>)>,
     /// Lane of each parameter, and at last that of the data.
@@ -262,8 +204,8 @@ pub struct Innovations {
     /// Series of the last row, without the powers of time.
     before: Vec<f64>,
     waiting: Waiting,
-    /// Those of parameters and data first.
-    products: Vec<Product>,
+    /// By tile.
+    products: Vec<Products>,
     /// Samples of a block, and the number of the block that is summed.
     block: Option<u64>,
     number: i64,
@@ -314,24 +256,19 @@ impl Innovations {
         let none = Parameter::default();
         let own: Vec<&Parameter> = order.iter().map(|i| &parameters[*i]).chain([&none]).collect();
         let merged = system.merged();
-        let group = |own: &[&Parameter]| {
-            let tiles: Vec<Tile> = own.chunks(LANES).map(|own| Tile::new(own, &unit, &kernel, &merged)).collect();
-            Group { whitened: DMatrix::zeros(LANES * tiles.len(), ROWS * channels), tiles }
-        };
-        let mut groups: Vec<Group> = own.chunks(WIDE).map(group).collect();
-        let asked = groups.len();
-        groups.push(group(&vec![&none; moving]));
-        let pairs = (0..asked).flat_map(|i| (i..asked).map(move |j| (i, j)));
-        let size = |i: usize| groups[i].whitened.nrows();
-        let product = |(i, j): (usize, usize)| Product { groups: (i, j), sum: DMatrix::zeros(size(i), size(j)) };
-        let products = pairs.chain((0..=asked).map(|i| (i, asked))).map(product).collect();
+        let tile = |own: &[&Parameter]| Tile::new(own, &unit, &kernel, &merged, ROWS);
+        let mut tiles: Vec<Tile> = own.chunks(LANES).map(tile).collect();
+        let asked = tiles.len();
+        tiles.extend(vec![&none; moving].chunks(LANES).map(tile));
+        let products = (0..tiles.len()).map(|i| Products::new(i, tiles.len())).collect();
         let most = (LONGEST_WAIT_S * 1e9 / step_ns as f64) as usize;
         let start = predictor.known_of_the_start(system) * FREE;
         let innovation = |(i, p): (usize, &Parameter)| Some((i, p.change.as_ref()?.innovation.clone()));
         let mut pass = Self {
             known: known.into_iter().map(|(c, s, factor)| (c, s, factor / unit[c])).collect(),
             unit,
-            groups,
+            tiles,
+            asked,
             changes: parameters.iter().enumerate().filter_map(innovation).collect(),
             lanes,
             uncertain: start.clone(),
@@ -426,14 +363,11 @@ impl Innovations {
         if let Some(known) = self.known_starts.get(self.starts.len()) {
             self.state[..moving].copy_from_slice(known.as_slice());
         }
-        let tiles = self.groups.iter_mut().flat_map(|g| &mut g.tiles);
-        tiles.for_each(|tile| tile.state[..moving].fill([0.0; LANES]));
-        let lanes = self.groups.last_mut().into_iter().flat_map(|g| &mut g.tiles);
-        for (t, tile) in lanes.enumerate() {
-            tile.state.fill([0.0; LANES]);
-            for i in t * LANES..moving.min((t + 1) * LANES) {
-                tile.state[i][i - t * LANES] = -1.0;
-            }
+        let (asked, starts) = self.tiles.split_at_mut(self.asked);
+        asked.iter_mut().for_each(|tile| tile.state[..moving * LANES].fill(0.0));
+        starts.iter_mut().for_each(|tile| tile.state.fill(0.0));
+        for i in 0..moving {
+            starts[i / LANES].state[i * LANES + i % LANES] = -1.0;
         }
         let state = DVector::from_column_slice(&self.state[..moving]);
         self.starts.push(Start { state, slope: DMatrix::zeros(moving, self.lanes.len() - 1) });
@@ -449,35 +383,41 @@ impl Innovations {
     /// are is then the same whenever a start is fitted.
     fn take_start_out(&mut self) {
         let moving = 2 * self.kernel.channels;
-        let asked = self.groups.len() - 1;
-        let with_start = self.products.len() - self.groups.len();
-        let (own, with) = self.products.split_at_mut(with_start);
-        let Some(information) = with.last().map(|p| p.sum.view((0, 0), (moving, moving)).into_owned()) else { return };
+        let own = self.asked * LANES;
+        let product = |a: usize, start: usize| {
+            let (a, b) = (a, own + start);
+            self.products[a / LANES].at(a % LANES, b / LANES, b % LANES)
+        };
+        let information = DMatrix::from_fn(moving, moving, |i, j| product(own + i.min(j), i.max(j)));
         let gain = known_with(&self.uncertain, &information);
-        // Lanes of a group × states.
-        let products: Vec<DMatrix<f64>> = with[..asked].iter().map(|p| p.sum.columns(0, moving).into_owned()).collect();
-        let fitted: Vec<DMatrix<f64>> = products.iter().map(|b| b * &gain).collect();
-        for Product { groups: (i, j), sum } in own {
-            *sum -= &fitted[*i] * products[*j].transpose();
+        // Lanes × states.
+        let with_start = DMatrix::from_fn(own, moving, product);
+        let fitted = &with_start * &gain;
+        let lost = &fitted * with_start.transpose();
+        for (i, products) in self.products.iter_mut().enumerate() {
+            for j in i..self.asked {
+                for (k, sum) in products.with(j).iter_mut().enumerate() {
+                    *sum -= lost[(i * LANES + k / LANES, j * LANES + k % LANES)];
+                }
+            }
+            (self.asked.max(i)..self.tiles.len()).for_each(|j| products.with(j).fill(0.0));
         }
-        with.iter_mut().for_each(|p| p.sum.fill(0.0));
-        let of = |lane: usize| fitted[lane / WIDE].row(lane % WIDE);
         let Some((data, parameters)) = self.lanes.split_last() else { return };
         if let Some(start) = self.starts.last_mut() {
-            start.state += of(*data).transpose();
+            start.state += fitted.row(*data).transpose();
             for (i, lane) in parameters.iter().enumerate() {
                 let mut slope = start.slope.column_mut(i);
-                slope -= of(*lane).transpose();
+                slope -= fitted.row(*lane).transpose();
             }
         }
         self.uncertain = gain;
-        let Some((starts, rest)) = self.groups.split_last_mut() else { return };
-        for i in 0..moving {
-            let (tile, at) = (&starts.tiles[i / LANES].state, i % LANES);
-            for (g, group) in rest.iter_mut().enumerate() {
-                for (t, own) in group.tiles.iter_mut().enumerate() {
-                    let by: [f64; LANES] = std::array::from_fn(|l| fitted[g][(t * LANES + l, i)]);
-                    own.state.iter_mut().zip(tile).for_each(|(x, influence)| add(x, -influence[at], &by));
+        let (asked, starts) = self.tiles.split_at_mut(self.asked);
+        for (t, tile) in asked.iter_mut().enumerate() {
+            for i in 0..moving {
+                let influence = starts[i / LANES].state.chunks_exact(LANES).map(|lanes| lanes[i % LANES]);
+                for (state, influence) in tile.state.chunks_exact_mut(LANES).zip(influence) {
+                    let by = (0..LANES).map(|l| fitted[(t * LANES + l, i)]);
+                    state.iter_mut().zip(by).for_each(|(x, by)| *x -= influence * by);
                 }
             }
         }
@@ -497,28 +437,22 @@ impl Innovations {
             innovations: &self.waiting.innovations,
         };
         let (kernel, threads) = (&self.kernel, self.threads);
-        in_parallel(&mut self.groups, threads, |group| group.filter(kernel, &batch));
+        in_parallel(&mut self.tiles, threads, |tile| tile.filter(kernel, &batch));
         // The lane of the data has what the starts as they are found add to the innovations.
         let lane = self.lanes.last().copied().unwrap_or(0);
         let mut white = DVector::zeros(n);
-        for row in 0..rows {
-            kernel.whiten(&self.waiting.innovations[row * n..(row + 1) * n], white.as_mut_slice());
-            let own = &mut self.groups[lane / WIDE].whitened;
-            white.iter().enumerate().for_each(|(c, e)| own[(lane % WIDE, row * n + c)] += *e);
+        for (row, e) in batch.innovations.chunks_exact(n).enumerate() {
+            kernel.whiten(e, white.as_mut_slice());
+            let own = self.tiles[lane / LANES].whitened.chunks_exact_mut(LANES).skip(row * n);
+            own.zip(white.iter()).for_each(|(own, e)| own[lane % LANES] += e);
             if self.waiting.counts[row] {
                 self.squares.ger(1.0, &white, &white, 1.0);
                 self.settled += 1;
             }
         }
         self.samples += rows as u64;
-        let whitened: Vec<&[f64]> = self.groups.iter().map(|g| g.whitened.as_slice()).collect();
-        in_parallel(&mut self.products, threads, |Product { groups: (i, j), sum }| {
-            let (a, b) = (sum.nrows(), sum.ncols());
-            let a = DMatrixView::from_slice(whitened[*i], a, rows * n);
-            // Transposed by its strides.
-            let b = DMatrixView::<f64, Dyn, Dyn>::from_slice_with_strides(whitened[*j], rows * n, b, b, 1);
-            sum.gemm(1.0, &a, &b, 1.0);
-        });
+        let whitened: Vec<&[f64]> = self.tiles.iter().map(|tile| tile.whitened.as_slice()).collect();
+        in_parallel(&mut self.products, threads, |products| products.add(&whitened, rows * n));
         self.waiting.inputs.clear();
         self.waiting.innovations.clear();
         self.waiting.counts.clear();
@@ -532,12 +466,9 @@ impl Innovations {
             return;
         }
         let Some((data, parameters)) = self.lanes.split_last() else { return };
-        let groups = self.groups.len() - 1;
         let product = |a: usize, b: usize| {
             let (a, b) = (a.min(b), a.max(b));
-            let (i, j) = (a / WIDE, b / WIDE);
-            // Rows of a triangle before the i-th.
-            self.products[i * groups - i * i.saturating_sub(1) / 2 + j - i].sum[(a % WIDE, b % WIDE)]
+            self.products[a / LANES].at(a % LANES, b / LANES, b % LANES)
         };
         let mut information: Vec<f64> = Vec::with_capacity(parameters.len() * (parameters.len() + 1) / 2);
         for (j, b) in parameters.iter().enumerate() {
@@ -562,7 +493,7 @@ impl Innovations {
             samples: self.samples,
             settled: self.settled,
         });
-        self.products.iter_mut().for_each(|p| p.sum.fill(0.0));
+        self.products.iter_mut().for_each(Products::clear);
         self.squares.fill(0.0);
         self.samples = 0;
         self.settled = 0;
@@ -612,218 +543,4 @@ fn in_parallel<T: Send>(items: &mut [T], threads: usize, work: impl Fn(&mut T) +
         (1..threads).for_each(|_| drop(scope.spawn(all)));
         all();
     });
-}
-
-struct Batch<'a> {
-    rows: usize,
-    /// Series with the powers of time.
-    width: usize,
-    inputs: &'a [f64],
-    innovations: &'a [f64],
-}
-
-impl Kernel {
-    fn new(system: &NoiseStates, predictor: &Predictor) -> Self {
-        let n = system.channels();
-        let merged = system.merged();
-        let states = merged.iter().max().map_or(0, |last| last + 1).next_multiple_of(2);
-        let mut rows = vec![Vec::new(); states];
-        let mut output = vec![Vec::new(); n];
-        let mut seen = vec![false; states];
-        for (j, to) in merged.iter().enumerate() {
-            // One of those that are merged stands for all.
-            if std::mem::replace(&mut seen[*to], true) {
-                continue;
-            }
-            for (i, factor) in system.transition.column(j).iter().enumerate().filter(|(_, x)| **x != 0.0) {
-                rows[merged[i]].push((*to, *factor));
-            }
-            for (c, factor) in system.output.column(j).iter().enumerate().filter(|(_, x)| **x != 0.0) {
-                output[c].push((*to, *factor));
-            }
-        }
-        let both = |rows: &[Vec<(usize, f64)>]| {
-            let at = |half: usize, k: usize| rows[half].get(k).copied().unwrap_or_default();
-            (0..rows[0].len().max(rows[1].len())).map(|k| [at(0, k), at(1, k)]).collect()
-        };
-        let transition = rows.chunks_exact(2).map(both).collect();
-        let mut gain = vec![[0.0; 2]; states / 2 * n];
-        for (i, to) in merged.iter().enumerate() {
-            for c in 0..n {
-                gain[to / 2 * n + c][to % 2] += predictor.gain[(i, c)];
-            }
-        }
-        let w = |c: usize, d: usize| if c < n { predictor.whitening[(c, d)] } else { 0.0 };
-        let two = |c: usize| (0..n.min(c + 2)).map(|d| [w(c, d), w(c + 1, d)]).collect();
-        Self { channels: n, states, transition, output, gain, whitening: (0..n).step_by(2).map(two).collect() }
-    }
-
-    /// From what is seen to innovations, for the data.
-    fn step(&self, state: &mut Vec<f64>, next: &mut Vec<f64>, z: &mut [f64]) {
-        for (z, output) in z.iter_mut().zip(&self.output) {
-            output.iter().for_each(|(s, factor)| *z -= factor * state[*s]);
-        }
-        let pairs = self.transition.iter().zip(self.gain.chunks_exact(self.channels));
-        for (next, (before, k)) in next.chunks_exact_mut(2).zip(pairs) {
-            let mut two = [0.0; 2];
-            for [(i, p), (j, q)] in before {
-                two[0] += p * state[*i];
-                two[1] += q * state[*j];
-            }
-            for ([p, q], e) in k.iter().zip(&*z) {
-                two[0] += p * e;
-                two[1] += q * e;
-            }
-            next.copy_from_slice(&two);
-        }
-        std::mem::swap(state, next);
-    }
-
-    fn whiten(&self, e: &[f64], to: &mut [f64]) {
-        for (pair, w) in self.whitening.iter().enumerate() {
-            for (half, to) in to[2 * pair..].iter_mut().take(2).enumerate() {
-                *to = w.iter().zip(e).map(|(w, e)| w[half] * e).sum();
-            }
-        }
-    }
-}
-
-impl Group {
-    fn filter(&mut self, kernel: &Kernel, batch: &Batch<'_>) {
-        for (t, tile) in self.tiles.iter_mut().enumerate() {
-            tile.filter(kernel, batch, &mut self.whitened, t * LANES);
-        }
-    }
-}
-
-impl Filter {
-    fn new(lane: usize, of: &Beside) -> Self {
-        let sparse = |m: &DMatrix<f64>| {
-            let all = (0..m.nrows()).flat_map(|i| (0..m.ncols()).map(move |j| (i, j)));
-            all.filter(|at| m[*at] != 0.0).map(|(i, j)| (i, j, m[(i, j)])).collect()
-        };
-        let states = of.gain.nrows();
-        Self {
-            lane,
-            transition: sparse(&of.transition),
-            output: sparse(&of.output),
-            gain: of.gain.transpose().as_slice().to_vec(),
-            state: vec![0.0; states],
-            next: vec![0.0; states],
-        }
-    }
-
-    /// Takes off what is seen of it, and goes on by the innovations `e`.
-    fn step(&mut self, nu: &mut [[f64; LANES]], e: &[f64]) {
-        for (c, s, factor) in &self.output {
-            nu[*c][self.lane] -= factor * self.state[*s];
-        }
-        for (next, k) in self.next.iter_mut().zip(self.gain.chunks_exact(e.len())) {
-            *next = -k.iter().zip(e).map(|(k, e)| k * e).sum::<f64>();
-        }
-        for (i, j, factor) in &self.transition {
-            self.next[*i] += factor * self.state[*j];
-        }
-        std::mem::swap(&mut self.state, &mut self.next);
-    }
-}
-
-impl Tile {
-    fn new(parameters: &[&Parameter], unit: &[f64], kernel: &Kernel, merged: &[usize]) -> Self {
-        let n = unit.len();
-        let mut responses: Vec<(usize, usize, usize, f64)> = Vec::new();
-        for (lane, parameter) in parameters.iter().enumerate() {
-            responses.extend(parameter.responses.iter().map(|(c, s, factor)| (*c, lane, *s, factor / unit[*c])));
-        }
-        let (mut changes, mut filters) = (Vec::new(), Vec::new());
-        for (lane, change) in parameters.iter().enumerate().filter_map(|(lane, p)| Some((lane, p.change.as_ref()?))) {
-            changes.resize(kernel.states * n, [0.0; LANES]);
-            filters.extend(change.beside.as_ref().map(|beside| Filter::new(lane, beside)));
-            for (i, row) in change.gain.row_iter().enumerate() {
-                row.iter().enumerate().for_each(|(c, k)| changes[merged[i] * n + c][lane] += *k);
-            }
-        }
-        let zero = [0.0; LANES];
-        let each = parameters.iter().enumerate();
-        let not_weighed = each.flat_map(|(lane, p)| p.not_weighed.iter().map(move |c| (*c, lane))).collect();
-        Self {
-            responses,
-            changes,
-            filters,
-            state: vec![zero; kernel.states],
-            next: vec![zero; kernel.states],
-            nu: vec![zero; n],
-            not_weighed,
-        }
-    }
-
-    fn filter(&mut self, kernel: &Kernel, batch: &Batch<'_>, whitened: &mut DMatrix<f64>, lane: usize) {
-        let n = kernel.channels;
-        let wide = whitened.nrows();
-        let columns = whitened.as_mut_slice();
-        for row in 0..batch.rows {
-            self.nu.fill([0.0; LANES]);
-            let input = &batch.inputs[row * batch.width..(row + 1) * batch.width];
-            for (c, lane, s, factor) in &self.responses {
-                self.nu[*c][*lane] += factor * input[*s];
-            }
-            for (nu, output) in self.nu.iter_mut().zip(&kernel.output) {
-                let mut sum = *nu;
-                output.iter().for_each(|(s, factor)| add(&mut sum, -factor, &self.state[*s]));
-                *nu = sum;
-            }
-            let e = &batch.innovations[row * n..(row + 1) * n];
-            self.filters.iter_mut().for_each(|filter| filter.step(&mut self.nu, e));
-            let to = &mut columns[row * n * wide..(row + 1) * n * wide];
-            for (w, to) in kernel.whitening.iter().zip(to.chunks_mut(2 * wide)) {
-                let two = multiply([[0.0; LANES]; 2], w, &self.nu);
-                for (white, to) in two.iter().zip(to.chunks_exact_mut(wide)) {
-                    to[lane..lane + LANES].copy_from_slice(white);
-                }
-            }
-            self.not_weighed.iter().for_each(|(c, own)| to[c * wide + lane + own] = 0.0);
-            let pairs = kernel.transition.iter().zip(kernel.gain.chunks_exact(n));
-            for (pair, (next, (before, k))) in self.next.chunks_exact_mut(2).zip(pairs).enumerate() {
-                let (mut first, mut second) = ([0.0; LANES], [0.0; LANES]);
-                for [(i, p), (j, q)] in before {
-                    add(&mut first, *p, &self.state[*i]);
-                    add(&mut second, *q, &self.state[*j]);
-                }
-                let mut two = multiply([first, second], k, &self.nu);
-                if let Some(changes) = self.changes.get(2 * pair * n..(2 * pair + 2) * n) {
-                    two = two_changes(two, changes, e);
-                }
-                next.copy_from_slice(&two);
-            }
-            std::mem::swap(&mut self.state, &mut self.next);
-        }
-    }
-}
-
-/// Takes two rows of `∂K` times what drives them off: each lane has a matrix of its own.
-#[inline(always)]
-fn two_changes(from: [[f64; LANES]; 2], changes: &[[f64; LANES]], e: &[f64]) -> [[f64; LANES]; 2] {
-    let [mut first, mut second] = from;
-    let (p, q) = changes.split_at(e.len());
-    for ((e, p), q) in e.iter().zip(p).zip(q) {
-        add(&mut first, -e, p);
-        add(&mut second, -e, q);
-    }
-    [first, second]
-}
-
-/// Adds a matrix of two rows times lanes: two at once read each lane once.
-#[inline(always)]
-fn multiply(to: [[f64; LANES]; 2], two: &[[f64; 2]], by: &[[f64; LANES]]) -> [[f64; LANES]; 2] {
-    let [mut first, mut second] = to;
-    for ([p, q], x) in two.iter().zip(by) {
-        add(&mut first, *p, x);
-        add(&mut second, *q, x);
-    }
-    [first, second]
-}
-
-#[inline(always)]
-fn add(to: &mut [f64; LANES], factor: f64, what: &[f64; LANES]) {
-    to.iter_mut().zip(what).for_each(|(to, x)| *to += factor * x);
 }

@@ -8,6 +8,7 @@
 
 pub mod decision;
 pub mod filter;
+mod lanes;
 pub mod predictor;
 pub mod state_space;
 
