@@ -3,8 +3,8 @@
 
 use dragfree_tests::calibration::diagnose;
 use dragfree_tests::foreign::{
-    Blow, Container, Draw, Flight, HEAT_LAG_S, Heat, Hidden, Loops, PERIOD_NS, Record, Recorder, Spacecraft, Start,
-    fly, write,
+    Blow, Container, Draw, Flight, HEAT_LAG_S, Heat, Hidden, Line, Loops, PERIOD_NS, Record, Recorder, Spacecraft,
+    Start, fly, write,
 };
 use dragfree_tests::{coefficient, dragfree, fixture};
 use serde_json::Value;
@@ -334,6 +334,23 @@ fn another_producers_impulse_is_found_with_its_time_and_momentum() {
     let at_ns = candidate["shape"]["at_ns"].as_i64().expect("a time");
     let late_s = (at_ns - START_NS as i64) as f64 * 1e-9 - at_s;
     assert!(late_s.abs() < 1.0, "{late_s} s");
+}
+
+/// A line in the thrust: on its axis, at its frequency to a tenth of 1/T, with its amplitude.
+#[test]
+fn another_producers_line_in_the_thrust_is_found_with_its_frequency_and_amplitude() {
+    let (hz, force_n) = (0.012_345, 8e-9);
+    let answer = diagnosed(Hidden { line: Some(Line { axis: 1, force_n, hz }), ..Hidden::NONE });
+    let (accepted, candidate, _) = found(&answer, force_n);
+    assert_eq!(accepted, "line:sc.y", "{candidate:#}");
+    let frequency_hz = candidate["shape"]["frequency_hz"].as_f64().expect("a frequency");
+    assert!((frequency_hz - hz).abs() < 0.1 / FLIGHT.seconds, "{frequency_hz}");
+    let parts: Vec<(f64, f64)> = (candidate["coefficients"].as_array().expect("two amplitudes").iter())
+        .map(|c| (c["value"].as_f64().expect("a number"), c["sigma"].as_f64().expect("a number")))
+        .collect();
+    let amplitude_n = parts.iter().map(|(value, _)| value * value).sum::<f64>().sqrt();
+    let sigma_n = parts.iter().map(|(_, sigma)| sigma * sigma).sum::<f64>().sqrt() / 2.0_f64.sqrt();
+    assert!((amplitude_n - force_n).abs() < 4.0 * sigma_n, "{amplitude_n} ± {sigma_n}");
 }
 
 /// Largest displacement along an axis that is read, m, and attitude error, rad, of samples.

@@ -56,7 +56,7 @@ impl Length {
     }
 
     /// Length of all data, h.
-    fn hours(self) -> f64 {
+    pub(crate) fn hours(self) -> f64 {
         match self {
             Self::H2 => 2.0,
             Self::H6 => 6.0,

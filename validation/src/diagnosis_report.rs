@@ -409,7 +409,7 @@ mod tests {
             name: name.to_owned(),
             size: 0.1,
             unit: "1".to_owned(),
-            known: !name.starts_with("thrust-line"),
+            known: !name.starts_with("current-squared"),
             drawn_significance: drawn,
             significance_at_hand: at_hand,
             named,
@@ -479,9 +479,9 @@ mod tests {
         let lines = [
             set("9h", "foreign", "missing", &["a:x", "b:x"], pair(true)),
             set("9h", "foreign", "missing", &["a:x"], pair(false)),
-            set("9h", "foreign", "unexplained", &[], vec![acted("thrust-line:sc.x", 9.0, None, false)]),
-            set("9h", "foreign", "sufficient", &[], vec![acted("thrust-line:sc.x", 7.0, None, false)]),
-            set("9h", "foreign", "missing", &["c:x"], vec![acted("thrust-line:sc.x", 9.0, None, false)]),
+            set("9h", "foreign", "unexplained", &[], vec![acted("current-squared:sc.x", 9.0, None, false)]),
+            set("9h", "foreign", "sufficient", &[], vec![acted("current-squared:sc.x", 7.0, None, false)]),
+            set("9h", "foreign", "missing", &["c:x"], vec![acted("current-squared:sc.x", 9.0, None, false)]),
         ];
         assert_eq!(measured(&lines, "pairs"), Measured::Share(1, 2));
         assert_eq!(measured(&lines, "a kind"), Measured::Share(1, 2));

@@ -131,6 +131,13 @@ fn truth_in_form(acted: &foreign::Acted, form: &Value) -> Option<f64> {
     }
 }
 
+/// Amplitude of a line and its σ: its phase is free, and its two coefficients are as well known.
+fn amplitude(candidate: &Value) -> Option<(f64, f64)> {
+    let parts = list(&candidate["coefficients"]);
+    let sum = |key: &str| parts.iter().map(|part| Some(part[key].as_f64()?.powi(2))).sum::<Option<f64>>();
+    Some((sum("value")?.sqrt(), (sum("sigma")? / parts.len() as f64).sqrt()))
+}
+
 fn scored(acted: &foreign::Acted, start_ns: u64, diagnosis: &Value) -> Acted {
     let name = acted.name();
     let part = if acted.effect == "impulse" && acted.instance.starts_with("sc") { ".momentum" } else { "" };
@@ -142,6 +149,9 @@ fn scored(acted: &foreign::Acted, start_ns: u64, diagnosis: &Value) -> Acted {
     let named = candidate.is_some_and(|c| c["accepted"] == true);
     let estimate = candidate.and_then(|c| {
         let truth = truth_in_form(acted, &c["shape"])?;
+        if acted.effect == "line" {
+            return amplitude(c).map(|(value, sigma)| (truth.abs(), value, sigma));
+        }
         let found = list(&c["coefficients"]).iter().find(|one| one["name"] == coefficient.as_str())?;
         Some((truth, found["value"].as_f64()?, found["sigma"].as_f64()?))
     });
@@ -181,7 +191,7 @@ mod tests {
 
     fn hidden(effect: &'static str, instance: &str, size: f64) -> foreign::Acted {
         let at_s = (effect == "impulse").then_some(1000.0);
-        let known = effect != "thrust-line";
+        let known = effect != "current-squared";
         foreign::Acted { effect, instance: instance.to_owned(), size, unit: "1", sigma: 0.01, at_s, known }
     }
 
@@ -270,7 +280,7 @@ mod tests {
         let mut d = diagnosis("sufficient", &[]);
         d["upper_limits"] = json!([{ "effect": "mps-noise", "instance": "sc.x", "coefficient": "mps-noise.sc.x",
             "sigma": 0.1, "shape": {} }]);
-        let (_, effects) = by(&[hidden("mps-noise", "sc.x", 1.5), hidden("thrust-line", "sc.x", 0.1)], &[], &d);
+        let (_, effects) = by(&[hidden("mps-noise", "sc.x", 1.5), hidden("current-squared", "sc.x", 0.1)], &[], &d);
         assert!((effects[0].significance_at_hand.unwrap() - 5.0).abs() < 1e-9 && effects[0].set_size.is_none());
         assert!(effects[1].significance_at_hand.is_none() && (effects[1].drawn_significance - 10.0).abs() < 1e-9);
     }

@@ -9,6 +9,7 @@ mod diagnosis;
 mod diagnosis_report;
 mod diagnosis_score;
 mod error;
+mod limits;
 mod program;
 mod records;
 mod report;
@@ -46,6 +47,8 @@ enum Command {
     Blind(Blind),
     /// Diagnose sets of 2 h to 3 × 24 h by two producers and score them; goes on where it was stopped
     Diagnosis(Diagnosis),
+    /// Compute what data of each length can say of each effect; goes on where it was stopped
+    Limits,
     /// Measure ratios of speed, on a machine that does nothing else
     Speed,
     /// Write the generated parts of VALIDATION.md and the picture from the results
@@ -161,6 +164,7 @@ fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
             };
             diagnosis::diagnosis(&Program::build()?, &plan, d.seeds.clone(), d.at_once, &file, &scratch)
         }
+        Command::Limits => limits::limits(&Program::build()?, &results.join("limits.jsonl"), &scratch),
         Command::Speed => speed::measure(&Program::build()?, &speed_file, &scratch),
         Command::Report => report::write(&results),
         Command::All => {

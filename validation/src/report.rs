@@ -12,6 +12,7 @@ use crate::bound::free_space;
 use crate::campaign::{NOMINAL, TWINS, Twin, note, taiji};
 use crate::diagnosis_report;
 use crate::error::{CampaignError, file};
+use crate::limits::{self, Limits};
 use crate::program::root;
 use crate::records::{Blind, Diagnosed, Line, Solution, read};
 use crate::speed::Speed;
@@ -42,6 +43,8 @@ pub(crate) struct Measured {
     pub(crate) blind: Vec<Blind>,
     /// Diagnosis campaign.
     pub(crate) diagnosis: Vec<Diagnosed>,
+    /// What data of each length can say.
+    pub(crate) limits: Vec<Limits>,
 }
 
 impl Measured {
@@ -53,6 +56,7 @@ impl Measured {
             speed: Speed::read(&folder.join("speed.json"))?,
             blind: read(&folder.join("blind.jsonl"))?,
             diagnosis: read(&folder.join("diagnosis.jsonl"))?,
+            limits: read(&folder.join("limits.jsonl"))?,
         })
     }
 }
@@ -557,6 +561,7 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
         ("speed", speed),
         ("blind", blind),
         ("diagnosis", diagnosis),
+        ("limits", limits::table(&measured.limits)),
     ]);
     Ok(Report { parts, pictures, failed })
 }

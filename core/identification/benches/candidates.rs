@@ -7,6 +7,7 @@ use dragfree_hinf_dfacs::noise::declared;
 use dragfree_identification::candidates::{CandidateSet, Coefficient, Form, Term};
 use dragfree_identification::coherence::HousekeepingCoherence;
 use dragfree_identification::gram::{Columns, GramAccumulator, GramSums};
+use dragfree_identification::lines::LineSearch;
 use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::transient::Search;
 use dragfree_physics::mission::Mission;
@@ -115,7 +116,7 @@ fn gathered(columns: &[Vec<f64>], threads: usize) -> GramSums {
     let averaged = (0..columns.len()).map(|j| j >= CHANNELS.len()).collect();
     let mut segmenter = Segmenter::new(LENGTH, (1e9 / RATE_HZ) as i64, averaged).of_first(of.fast);
     let coherence = |plan: &_| HousekeepingCoherence::new(Vec::new(), plan, residual, Vec::new());
-    let mut gatherer = GramAccumulator::new(of, LENGTH, RATE_HZ, threads, coherence, search);
+    let mut gatherer = GramAccumulator::new(of, LENGTH, RATE_HZ, threads, coherence, search, LineSearch::nowhere());
     for first in (0..ROWS).step_by(BATCH) {
         let rows = first..(first + BATCH).min(ROWS);
         let times: Vec<i64> = rows.clone().map(|k| (1e9 / RATE_HZ) as i64 * k as i64).collect();

@@ -198,7 +198,8 @@ pub struct Diagnosis {
     pub verdict: String,
     /// False-alarm rate.
     pub false_alarm_rate: f64,
-    /// Forms and levels of effects that were tried; transient templates were tried at every time besides.
+    /// Forms and levels of effects that were tried; besides, transients were tried at every time and lines at every
+    /// frequency.
     pub tried: usize,
     /// Candidates, the accepted ones first, then the best of the rest.
     pub candidates: Vec<Found>,
@@ -232,6 +233,9 @@ pub struct Trials {
 /// The family of all transients.
 pub const TRANSIENT: &str = "transient search";
 
+/// The family of all lines.
+pub const LINE: &str = "line search";
+
 /// Family whose part of the false-alarm rate a candidate uses.
 pub(crate) fn family(c: &Candidate) -> &str {
     if c.transient { TRANSIENT } else { &c.effect }
@@ -248,12 +252,20 @@ impl Trials {
         if search > 0.0 {
             forms.insert(TRANSIENT.to_owned(), search);
         }
+        let lines = scorer.gathered.lines.tried;
+        if lines > 0.0 {
+            forms.insert(LINE.to_owned(), lines);
+        }
         Self { forms }
     }
 
     /// Forms and levels of all effects.
     pub fn total(&self) -> usize {
-        self.forms.iter().filter(|(family, _)| *family != TRANSIENT).map(|(_, n)| n).sum::<f64>() as usize
+        self.forms
+            .iter()
+            .filter(|(family, _)| ![TRANSIENT, LINE].contains(&family.as_str()))
+            .map(|(_, n)| n)
+            .sum::<f64>() as usize
     }
 
     /// Trials of a family, one at least.

@@ -15,6 +15,7 @@ use nalgebra::{DMatrix, DMatrixView};
 
 use crate::coherence::HousekeepingCoherence;
 use crate::decimate::{Decimator, Response, SLOW_HZ};
+use crate::lines::{LineSearch, Lines};
 use crate::slow_samples::{SlowSamples, Thinner};
 use crate::transient::{Part, Search, Transients};
 
@@ -127,6 +128,8 @@ pub struct GramSums {
     pub slow: SlowSamples,
     /// The loudest transients.
     pub transients: Transients,
+    /// The loudest lines.
+    pub lines: Lines,
 }
 
 impl GramSums {
@@ -151,6 +154,7 @@ pub struct GramAccumulator {
     bench: SegmentTransform,
     search: Search,
     long_search: Search,
+    line_search: LineSearch,
     decimator: Decimator,
     segmenter: Segmenter,
     long: Plan,
@@ -254,6 +258,7 @@ impl GramAccumulator {
         threads: usize,
         coherence: impl FnOnce(&Plan) -> HousekeepingCoherence,
         search: Search,
+        line_search: LineSearch,
     ) -> Self {
         let threads = threads.max(1);
         let (whole, short) = (whole_plan(length, rate_hz), Plan::new(length, rate_hz));
@@ -272,6 +277,7 @@ impl GramAccumulator {
             bench: SegmentTransform::new(&short, columns.fast, threads),
             long_search: search.thinned(factor, SLOW_HZ),
             search,
+            line_search,
             segmenter: Segmenter::new(long.length, decimator.step_ns(), vec![false; all]),
             decimator,
             thinner,
@@ -284,6 +290,7 @@ impl GramAccumulator {
                 housekeeping,
                 slow,
                 transients: Transients::default(),
+                lines: Lines::default(),
                 columns,
             },
             whole,
@@ -296,6 +303,7 @@ impl GramAccumulator {
     pub fn finish(mut self) -> GramSums {
         self.gathered.total.bands.iter_mut().for_each(DMatrix::fill_upper_triangle_with_lower_triangle);
         self.gathered.slow = self.thinner.finish();
+        self.gathered.lines = self.line_search.finish();
         self.gathered
     }
 
@@ -378,6 +386,7 @@ impl Cuts for GramAccumulator {
     }
 
     fn rows(&mut self, first_ns: i64, columns: &[&[f64]]) {
+        self.line_search.push(first_ns, &columns[..self.gathered.columns.base]);
         let (times, thinned) = self.decimator.push(first_ns, columns);
         let thinned: Vec<&[f64]> = thinned.iter().map(Vec::as_slice).collect();
         self.thinner.push(&times, &thinned);

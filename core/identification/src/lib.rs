@@ -18,6 +18,7 @@ pub mod distributions;
 pub mod driven;
 pub mod gram;
 pub mod innovations;
+pub mod lines;
 pub mod record;
 pub mod scores;
 pub mod screen;

@@ -57,6 +57,7 @@ impl Record {
         g.housekeeping.add(&other.gathered.housekeeping);
         g.slow.add(&other.gathered.slow);
         g.transients.add(&other.gathered.transients);
+        g.lines.add(&other.gathered.lines);
         Ok(())
     }
 }

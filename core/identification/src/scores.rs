@@ -573,6 +573,7 @@ mod tests {
     use crate::candidates::{Coefficient, Form, Term};
     use crate::coherence::HousekeepingCoherence;
     use crate::gram::{Columns, GramAccumulator, LONG};
+    use crate::lines::LineSearch;
     use crate::transient::Search;
     use crate::waveform::Waveform;
     use dragfree_estimation::segments::Segmenter;
@@ -658,7 +659,7 @@ mod tests {
             HousekeepingCoherence::new(Vec::new(), plan, residual.clone(), whitening)
         };
         let search = Search::new(Vec::new(), residual.clone(), Vec::new());
-        let mut gatherer = GramAccumulator::new(columns, LENGTH, 1.0, 1, coherence, search);
+        let mut gatherer = GramAccumulator::new(columns, LENGTH, 1.0, 1, coherence, search, LineSearch::nowhere());
         let mut segmenter = Segmenter::new(LENGTH, 1_000_000_000, vec![false; 5]);
         let slices = [&first, &second, &model, &lasting, &event].map(Vec::as_slice);
         segmenter.cut(&time_ns, &slices, &mut gatherer);

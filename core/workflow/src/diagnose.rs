@@ -12,10 +12,11 @@ use dragfree_engine::run::Progress;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::decimate::SLOW_HZ;
 use dragfree_identification::diagnosis::{
-    self, Constancy, Diagnosis, Found, LIMIT_QUANTILE, Limit, OfProduct, Separation, TRANSIENT, Trials, UNOBSERVABLE,
-    Unexplained,
+    self, Constancy, Diagnosis, Found, LIMIT_QUANTILE, LINE, Limit, OfProduct, Separation, TRANSIENT, Trials,
+    UNOBSERVABLE, Unexplained,
 };
 use dragfree_identification::innovations::decision::{Fitted, Quadratic};
+use dragfree_identification::lines::Line;
 use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::screen::{RefinementRequest, Screened, screen};
@@ -27,7 +28,7 @@ use serde_json::{Map, json};
 use crate::WorkflowError;
 use crate::likelihood::{Decided, Judge, Meaning, PASSES, Point, moved, one_pass, step};
 use crate::proposals::{FORMULA, Proposal, proposals};
-use crate::replay::{AT_NS, FINE, Pass, Replay, What, sum};
+use crate::replay::{AT_NS, FINE, FREQUENCY_HZ, Pass, Replay, What, sum};
 
 /// A diagnosis and the sums that chose the forms of the candidates.
 pub struct Diagnosed {
@@ -49,13 +50,17 @@ pub fn diagnose(
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Diagnosed, WorkflowError> {
     let settings = replay.settings()?;
-    let found = sum(replay, settings, What::Transients, progress)?.gathered.transients;
+    let searched = sum(replay, settings, What::Transients, progress)?.gathered;
+    let (found, lines) = (searched.transients, searched.lines);
+    let of_lines: Vec<EffectEntry> = lines.found.iter().map(entry_of).collect();
     let detected: Vec<Detection> =
         found.certain(settings.transient_p_value).take(settings.max_transients).cloned().collect();
     let mut gather = |requests: &[RefinementRequest], proposals: &[Proposal]| {
-        let entries: Vec<EffectEntry> = proposals.iter().map(|p| p.entry.clone()).collect();
+        let proposed = proposals.iter().map(|p| p.entry.clone());
+        let entries: Vec<EffectEntry> = of_lines.iter().cloned().chain(proposed).collect();
         let mut record = sum(replay, settings, What::Candidates(&detected, requests, &entries), progress)?;
         record.gathered.transients = found.clone();
+        record.gathered.lines = lines.clone();
         let noise = record.noise_model()?;
         let screened = {
             let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
@@ -78,6 +83,7 @@ pub fn diagnose(
         }
     }
     tried.insert(FORMULA.to_owned(), formulas);
+    tried.retain(|effect, _| !has_parameter(replay.registry, effect, FREQUENCY_HZ));
     let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
     let evidence = Evidence { trials: Trials::new(&scorer, &tried), least: settings.false_alarm, replay, proposals };
     let mut diagnosis = decide(settings, &record, &scorer, screened, &evidence, progress)?;
@@ -88,6 +94,13 @@ pub fn diagnose(
 /// Passes that fit constants beside what is named, at the start and after a form has changed: the first from 1e5 σ, so
 /// that rounding leaves some σ to the second.
 const OPENING: usize = 1;
+
+/// A model's entry of a line.
+fn entry_of(line: &Line) -> EffectEntry {
+    let mut entry = EffectEntry::new(&line.effect, &line.instance);
+    entry.parameters.insert(FREQUENCY_HZ.to_owned(), toml::Value::from(line.frequency_hz));
+    entry
+}
 
 /// Decides by the likelihood of the innovations among the forms that the spectra choose, beside the effects that are
 /// named so far: passes until nothing moves.
@@ -198,9 +211,14 @@ impl Evidence<'_> {
         self.proposals.iter().find(|p| (p.entry.id.as_str(), p.entry.instance.as_str()) == (effect, instance))
     }
 
-    /// What acts once was searched for at every time.
+    /// What acts once was searched for at every time, and what acts at one frequency at every frequency.
     fn family<'b>(&self, effect: &'b str) -> &'b str {
-        if has_parameter(self.replay.registry, effect, AT_NS) { TRANSIENT } else { effect }
+        let has = |name| has_parameter(self.replay.registry, effect, name);
+        match (has(AT_NS), has(FREQUENCY_HZ)) {
+            (true, _) => TRANSIENT,
+            (_, true) => LINE,
+            _ => effect,
+        }
     }
 }
 

@@ -23,6 +23,9 @@ pub(crate) const FINE: &str = "fine";
 /// Parameter of an effect that acts once, at a time that the host finds.
 pub(crate) const AT_NS: &str = "at_ns";
 
+/// Parameter of an effect that acts at one frequency, which the host finds.
+pub(crate) const FREQUENCY_HZ: &str = "frequency_hz";
+
 /// Which data are replayed, and how.
 pub struct Replay<'a> {
     /// Plugins.
@@ -60,7 +63,7 @@ pub enum Pass {
 pub(crate) enum What<'a> {
     /// The model alone.
     Model,
-    /// Nothing but transients.
+    /// Nothing but transients and lines.
     Transients,
     /// Every candidate: transients at these times, in fine steps about these shapes what can be tried so, and these
     /// effects in the form that they state.
@@ -111,8 +114,11 @@ pub(crate) fn sum(
         let mut all = candidates(registry, &sources)?;
         match what {
             What::Model => all.clear(),
-            What::Transients => all.retain(|e| has_parameter(registry, &e.id, AT_NS)),
+            What::Transients => {
+                all.retain(|e| [AT_NS, FREQUENCY_HZ].iter().any(|name| has_parameter(registry, &e.id, name)));
+            }
             What::Candidates(_, requests, _) => {
+                all.retain(|e| !has_parameter(registry, &e.id, FREQUENCY_HZ));
                 for request in requests {
                     let of = |e: &&mut EffectEntry| (&e.id, &e.instance) == (&request.effect, &request.instance);
                     for entry in all.iter_mut().filter(of) {

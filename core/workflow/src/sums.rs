@@ -4,6 +4,7 @@
 use std::borrow::Cow;
 use std::collections::{BTreeMap, HashSet};
 use std::path::Path;
+use std::sync::Arc;
 
 use dragfree_engine::chain::{Chain, Sink};
 use dragfree_engine::examine::Wanted;
@@ -16,6 +17,7 @@ use dragfree_identification::candidates::{CandidateSet, Coefficient as Unknown, 
 use dragfree_identification::coherence::HousekeepingCoherence;
 use dragfree_identification::decimate::SLOW_HZ;
 use dragfree_identification::gram::{Columns, GramAccumulator, LONG};
+use dragfree_identification::lines::{LineSearch, Place};
 use dragfree_identification::record::Record;
 use dragfree_identification::transient::{Detection, Search, Template};
 use dragfree_identification::waveform::Waveform;
@@ -23,6 +25,7 @@ use dragfree_schema::{Available, Coefficient, Column, Constraint, NoiseProcess, 
 use nalgebra::DMatrix;
 
 use crate::WorkflowError;
+use crate::replay::FREQUENCY_HZ;
 
 /// How often Σ is measured from the residuals of the reference.
 const REFINEMENTS: usize = 3;
@@ -141,8 +144,9 @@ impl ColumnSums {
         // As they are called in telemetry: `hk/battery_current_a`.
         let topics: Vec<String> = housekeeping.iter().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
         let noise = NoiseModel::new(&available.noise, &candidate_set.channels, 1.0 / rate_hz)?;
-        let inverse = |hz: f64| {
-            let sigma = noise.psd(hz);
+        let declared = Arc::new(noise);
+        let inverse = move |hz: f64| {
+            let sigma = declared.psd(hz);
             let nothing = DMatrix::zeros(sigma.nrows(), sigma.ncols());
             sigma.cholesky().map_or(nothing, |c| c.inverse())
         };
@@ -152,6 +156,9 @@ impl ColumnSums {
             plan.bands.iter().map(|b| (plan.bin_hz(b.end as f64 - 0.5), inverse(plan.frequency_hz(*b)))).collect();
         let templates = if request.detected.is_some() { Vec::new() } else { templates };
         let search = Search::new(templates, residual.clone(), inverses).on(request.threads);
+        let places = if request.only_transients { places(&available, &channels) } else { Vec::new() };
+        let step_ns = (1e9 / rate_hz).round() as i64;
+        let line_search = LineSearch::new(places, residual.clone(), Arc::new(inverse.clone()), step_ns);
         let coherence = |plan: &Plan| {
             let whitening = plan.bands.iter().map(|b| inverse(plan.frequency_hz(*b))).collect();
             HousekeepingCoherence::new(topics, plan, residual, whitening)
@@ -170,7 +177,7 @@ impl ColumnSums {
             base: all.base,
             waveforms_at: all.fast - waveforms.len(),
             waveforms,
-            accumulator: GramAccumulator::new(all, length, rate_hz, request.threads, coherence, search),
+            accumulator: GramAccumulator::new(all, length, rate_hz, request.threads, coherence, search, line_search),
             names,
             candidate_set,
             noise: available.noise.clone(),
@@ -482,6 +489,20 @@ fn candidate_set(available: &Available, channels: &[&Column], series: &Series, w
             .collect(),
         rules: available.constraints.iter().map(rule).collect(),
     }
+}
+
+/// Where a line may act: candidates of one frequency, which respond to both phases alike.
+fn places(available: &Available, channels: &[&Column]) -> Vec<Place> {
+    let mut all: Vec<Place> = Vec::new();
+    for c in available.coefficients.iter().filter(|c| c.candidate && c.shape.contains_key(FREQUENCY_HZ)) {
+        let at = |r: &Response| Some((channels.iter().position(|c| name_of(c) == r.channel)?, r.factor));
+        let known = all.iter().any(|p| (&p.effect, &p.instance) == (&c.effect, &c.instance));
+        if !known {
+            let channels = c.responses.iter().filter_map(at).collect();
+            all.push(Place { effect: c.effect.clone(), instance: c.instance.clone(), channels });
+        }
+    }
+    all
 }
 
 fn templates(available: &Available, channels: &[&Column], differenced: &[bool]) -> Vec<Template> {

@@ -14,6 +14,7 @@ mod correlation;
 mod electromagnetic;
 mod geometry;
 mod impulse;
+mod line;
 mod linear;
 mod noise;
 mod prediction;
@@ -35,6 +36,7 @@ use electromagnetic::{Charge, Magnetic};
 use formula::Formula;
 use geometry::{OffsetDrift, OpeningAngle};
 use impulse::Impulse;
+use line::Line;
 use linear::Linear;
 use noise::{IsNoise, MpsNoise, TorqueNoise};
 use readout::{IsCrosstalk, IsScale, TiltToLength, TimeOffset};
@@ -54,6 +56,7 @@ dragfree_sdk::export_plugin!(effects: [
     Linear<IsCrosstalk>,
     IsNoise,
     Linear<IsScale>,
+    Line,
     Magnetic,
     MpsCorrelation,
     Linear<MpsGain>,

@@ -208,9 +208,9 @@ const ROWS: [Row; 45] = [
     row(Cause::CurrentByPanel, "current-by-panel", "m s-2 A-1 K-1", Place::Tm(X), 2e-15, 1e-9),
     row(Cause::CurrentByPanel, "current-by-panel", "m s-2 A-1 K-1", Place::Tm(Y), 2e-15, 1e-9),
     row(Cause::CurrentByPanel, "current-by-panel", "m s-2 A-1 K-1", Place::Tm(Z), 2e-15, 1e-9),
-    row(Cause::ThrustLine, "thrust-line", "N", Place::Sc(X), 5e-10, 1e-4),
-    row(Cause::ThrustLine, "thrust-line", "N", Place::Sc(Y), 5e-10, 1e-4),
-    row(Cause::ThrustLine, "thrust-line", "N", Place::Sc(Z), 1e-9, 1e-4),
+    row(Cause::ThrustLine, "line", "N", Place::Sc(X), 5e-10, 1e-4),
+    row(Cause::ThrustLine, "line", "N", Place::Sc(Y), 5e-10, 1e-4),
+    row(Cause::ThrustLine, "line", "N", Place::Sc(Z), 1e-9, 1e-4),
 ];
 
 /// Kinds that bundled effects cover, and kinds that none covers.
@@ -228,8 +228,9 @@ pub const KINDS: [&[&str]; 2] = [
         "mps-noise",
         "torque-noise",
         "is-noise",
+        "line",
     ],
-    &["current-squared", "current-by-panel", "thrust-line"],
+    &["current-squared", "current-by-panel"],
 ];
 
 impl Row {
