@@ -96,17 +96,23 @@ impl Complex {
 /// What a filter remembers of one column.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Memory {
-    /// Last two outputs of the whitening, then input and output of each washout.
-    pub values: [f64; 6],
+    /// Last two outputs of the whitening, then input and output of each washout, and what is taken off the column.
+    pub values: [f64; 7],
 }
 
 impl Memory {
+    /// At the start of a stretch, of a column that has a constant: the filter would ring from it at the start, and again
+    /// whenever it is designed anew, and a slow regressor may have one that is large against all that it varies.
+    fn beside(constant: f64) -> Self {
+        Self { values: [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, constant] }
+    }
+
     fn next(&mut self, w: &Whitener, x: f64) -> f64 {
-        let [e1, e2, u, v, p, q] = self.values;
-        let e = x - w.c[0] * e1 - w.c[1] * e2;
+        let [e1, e2, u, v, p, q, constant] = self.values;
+        let e = x - constant - w.c[0] * e1 - w.c[1] * e2;
         let first = w.pole * v + (e - u);
         let second = w.pole * q + (first - p);
-        self.values = [e, e1, e, first, first, second];
+        self.values = [e, e1, e, first, first, second, constant];
         second
     }
 }
@@ -225,11 +231,13 @@ impl Prediction {
         let channels = self.layout.channels.len();
         let n = self.layout.coefficients.len();
         let mut added = vec![0.0; self.block_size()];
+        let begins = self.state.since_gap == 0 && columns.iter().any(|column| !column.is_empty());
         for c in (0..channels).filter(|c| !self.regressors[*c].is_empty()) {
             let w = self.whiteners[c];
             let memory = &mut self.state.memory;
             let mut run = |m: usize, column: &[f64]| -> Vec<f64> {
-                let mut state = memory[m];
+                let mean = || column.iter().sum::<f64>() / column.len() as f64;
+                let mut state = if begins { Memory::beside(mean()) } else { memory[m] };
                 let out = column.iter().map(|x| state.next(&w, *x)).collect();
                 memory[m] = state;
                 out
@@ -378,6 +386,23 @@ mod tests {
                 assert!((got - want).abs() < 1e-9 * want + grain, "{held} {readout} {f}: {got} against {want}");
             }
         }
+    }
+
+    /// A constant leaves nothing, at the start and when the levels are measured anew, however large it is.
+    #[test]
+    fn a_constant_of_a_regressor_never_shows() {
+        let before = Whitener::new(Levels { held: 4.4e-21, readout: 3.2e-18 }, true, 0.1);
+        let after = Whitener::new(Levels { held: 2e-21, readout: 4e-18 }, true, 0.1);
+        let mut memory = Memory::beside(300.0);
+        let shown =
+            |memory: &mut Memory, w: &Whitener| (0..1000).map(|_| memory.next(w, 300.0).abs()).fold(0.0, f64::max);
+        assert_eq!(shown(&mut memory, &before), 0.0);
+        assert_eq!(shown(&mut memory, &after), 0.0);
+        // Its twin, which begins at zero as if the constant were a step.
+        let mut memory = Memory::default();
+        shown(&mut memory, &before);
+        (0..20_000).for_each(|_| drop(memory.next(&before, 300.0)));
+        assert!(shown(&mut memory, &after) > 1.0);
     }
 
     #[test]
