@@ -1,7 +1,7 @@
 //! Telemetry of another producer runs with a mission file alone: other controllers, other noise, offsets a few
 //! millimetres off the nominal, housekeeping never seen before, with and without `/command`.
 
-use dragfree_tests::calibration::diagnose;
+use dragfree_tests::calibration::{diagnose, science_mode};
 use dragfree_tests::foreign::{
     Blow, Container, Draw, Flight, HEAT_LAG_S, Heat, Hidden, Line, Loops, PERIOD_NS, Record, Recorder, Spacecraft,
     Start, fly, write,
@@ -336,11 +336,15 @@ fn another_producers_impulse_is_found_with_its_time_and_momentum() {
     assert!(late_s.abs() < 1.0, "{late_s} s");
 }
 
-/// A line in the thrust: on its axis, at its frequency to a tenth of 1/T, with its amplitude.
+/// A line in the thrust: on its axis, at its frequency to a tenth of 1/T, with its amplitude. With it in the model nothing
+/// is missing, while a second one there is searched.
 #[test]
 fn another_producers_line_in_the_thrust_is_found_with_its_frequency_and_amplitude() {
     let (hz, force_n) = (0.012_345, 8e-9);
-    let answer = diagnosed(Hidden { line: Some(Line { axis: 1, force_n, hz }), ..Hidden::NONE });
+    let line = Some(Line { axis: 1, force_n, hz });
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let flight = Flight { hidden: Hidden { line, ..Hidden::NONE }, seed: 2, ..FLIGHT };
+    let answer = diagnose(dir.path(), &calibrated(dir.path(), &flight, START_NS, 0..0));
     let (accepted, candidate, _) = found(&answer, force_n);
     assert_eq!(accepted, "line:sc.y", "{candidate:#}");
     let frequency_hz = candidate["shape"]["frequency_hz"].as_f64().expect("a frequency");
@@ -351,6 +355,17 @@ fn another_producers_line_in_the_thrust_is_found_with_its_frequency_and_amplitud
     let amplitude_n = parts.iter().map(|(value, _)| value * value).sum::<f64>().sqrt();
     let sigma_n = parts.iter().map(|(_, sigma)| sigma * sigma).sum::<f64>().sqrt() / 2.0_f64.sqrt();
     assert!((amplitude_n - force_n).abs() < 4.0 * sigma_n, "{amplitude_n} ± {sigma_n}");
+
+    std::fs::write(dir.path().join("d.json"), answer.to_string()).expect("writable");
+    std::fs::copy(fixture("models/com-offset.toml"), dir.path().join("m.toml")).expect("copied");
+    let add = dragfree(dir.path()).args(["model", "add", "m.toml", "--from", "d.json"]).output().expect("runs");
+    assert!(add.status.success(), "{}", String::from_utf8_lossy(&add.stderr));
+    let mut run = science_mode(dir.path());
+    run.arg(format!("foreign-{START_NS}.mcap")).arg("--mission").arg(mission(dir.path(), false));
+    let run = run.args(["--model", "m.toml"]).output().expect("runs");
+    let product = serde_json::from_slice(&run.stdout).unwrap_or_else(|_| panic!("{run:?}"));
+    let after = diagnose(dir.path(), &product);
+    assert_eq!(after["verdict"], "sufficient", "{:#} {}", after["candidates"][0], after["reasons"]);
 }
 
 /// Largest displacement along an axis that is read, m, and attitude error, rad, of samples.

@@ -36,8 +36,11 @@ pub struct Examination<'a> {
 /// A consumer of columns, with the indices of those that it wants in [`Chain::columns`].
 pub type Wanted<C> = (C, Vec<usize>);
 
-/// Every instance of every installed effect that is not in the model of a product, on its mission. An effect without a
-/// list of instances is left out.
+/// Parameter of an effect that acts at one frequency, which the host finds. `NAME-2` is another one at the place `NAME`.
+pub const FREQUENCY_HZ: &str = "frequency_hz";
+
+/// Every instance of every installed effect that is not in the model of a product, on its mission; beside one at a
+/// frequency another one. An effect without a list of instances is left out.
 ///
 /// # Errors
 /// The mission or the model file cannot be read.
@@ -46,10 +49,12 @@ pub fn candidates(registry: &Registry, sources: &Sources) -> Result<Vec<EffectEn
     let mut all = Vec::new();
     for found in registry.plugins().filter(|p| p.info.kind == Kind::Effect) {
         let manifest = &found.info.manifest;
+        let taken = |instance: &String| model.effects.iter().any(|e| e.id == manifest.id && e.instance == *instance);
+        let several = manifest.parameters.iter().any(|p| p.name == FREQUENCY_HZ);
         for instance in manifest.instances_on(&mission.value) {
-            if !model.effects.iter().any(|e| e.id == manifest.id && e.instance == instance) {
-                all.push(EffectEntry::new(&manifest.id, &instance));
-            }
+            let others = (2..).take_while(|_| several).map(|k| format!("{instance}-{k}"));
+            let free = std::iter::once(instance.clone()).chain(others).find(|name| !taken(name));
+            all.extend(free.map(|name| EffectEntry::new(&manifest.id, &name)));
         }
     }
     Ok(all)

@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use dragfree_engine::config::EffectEntry;
-use dragfree_engine::examine::has_parameter;
+use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
 use dragfree_engine::product::Written;
 use dragfree_engine::run::Progress;
 use dragfree_identification::candidates::Candidate;
@@ -28,7 +28,7 @@ use serde_json::{Map, json};
 use crate::WorkflowError;
 use crate::likelihood::{Decided, Judge, Meaning, PASSES, Point, moved, one_pass, step};
 use crate::proposals::{FORMULA, Proposal, proposals};
-use crate::replay::{AT_NS, FINE, FREQUENCY_HZ, Pass, Replay, What, sum};
+use crate::replay::{AT_NS, FINE, Pass, Replay, What, sum};
 
 /// A diagnosis and the sums that chose the forms of the candidates.
 pub struct Diagnosed {

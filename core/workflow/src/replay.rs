@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use dragfree_engine::chain::Chain;
 use dragfree_engine::config::EffectEntry;
-use dragfree_engine::examine::{Examination, candidates, examine, has_parameter};
+use dragfree_engine::examine::{Examination, FREQUENCY_HZ, candidates, examine, has_parameter};
 use dragfree_engine::product::Written;
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::Progress;
@@ -22,9 +22,6 @@ pub(crate) const FINE: &str = "fine";
 
 /// Parameter of an effect that acts once, at a time that the host finds.
 pub(crate) const AT_NS: &str = "at_ns";
-
-/// Parameter of an effect that acts at one frequency, which the host finds.
-pub(crate) const FREQUENCY_HZ: &str = "frequency_hz";
 
 /// Which data are replayed, and how.
 pub struct Replay<'a> {

@@ -7,7 +7,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use dragfree_engine::chain::{Chain, Sink};
-use dragfree_engine::examine::Wanted;
+use dragfree_engine::examine::{FREQUENCY_HZ, Wanted};
 use dragfree_estimation::estimate::{Method, Observed, Refinement, estimate_with};
 use dragfree_estimation::segments::{Segmenter, all_finite, longest_length};
 use dragfree_estimation::sigma::{BandNoise, NoiseModel};
@@ -25,7 +25,6 @@ use dragfree_schema::{Available, Coefficient, Column, Constraint, NoiseProcess, 
 use nalgebra::DMatrix;
 
 use crate::WorkflowError;
-use crate::replay::FREQUENCY_HZ;
 
 /// How often Σ is measured from the residuals of the reference.
 const REFINEMENTS: usize = 3;
