@@ -100,6 +100,23 @@ fn commanded_torque_as_angular_acceleration_gives_a_disagreement() {
     }
 }
 
+/// Torque noise about z that doubles halfway through a day. The weights of the angular acceleration are those of the first
+/// hour, so the offset is wrong by 4σ, and the residuals of the attitude and of the test masses are coherent.
+#[test]
+fn torque_noise_that_doubles_halfway_gives_a_disagreement() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let mission = fixture("missions/taiji.toml");
+    for seed in SEEDS {
+        let folder = dir.path().join(seed);
+        let mut command = dragfree(dir.path());
+        command.arg("simulate").arg(&mission).arg("--out").arg(&folder).args(["--hours", "24", "--seed", seed]);
+        dragfree_tests::expect(command.args(["--effect", "torque-noise:sc.z=2,from_s=43200"]), 0);
+        let run = run(&folder.join("SC1_2035-01-01.mcap"), &mission, "", &[], &[]);
+        run.assert_ended(4, "disagree");
+        assert!(run.notes().contains("the torque noise changes after the first hour"), "{}", run.notes());
+    }
+}
+
 /// The disagreement is detected without the filter, without the survey, and without both.
 #[test]
 fn the_disagreement_needs_neither_filter_nor_survey() {

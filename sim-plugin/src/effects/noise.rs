@@ -1,4 +1,4 @@
-//! Noise that exceeds the mission file's, or has a spectral line.
+//! Noise that exceeds the mission file's from some time on, or has a spectral line.
 //!
 //! The excess is an independent process with `sqrt(k² − 1)` times the mission's shape, so that powers add to `k²`.
 
@@ -23,6 +23,7 @@ const LINE: &[Shape] = &[
         0.1,
         "amplitude of the line, in units of the mission's ASD above the corner",
     ),
+    Shape::new("from_s", Number::new("s", 0.0, 1e8), 0.0, "when it begins"),
 ];
 
 pub(super) const KINDS: &[Kind] = &[
@@ -76,6 +77,8 @@ struct Excess {
     line_hz: f64,
     line_amplitude: f64,
     line_phase_rad: f64,
+    /// When it begins.
+    from_s: f64,
 }
 
 impl Excess {
@@ -91,12 +94,15 @@ impl Excess {
             line_hz: request.shape("line_hz"),
             line_amplitude,
             line_phase_rad: 0.0,
+            from_s: request.shape("from_s"),
         }))
     }
 
     fn next(&mut self, at_s: f64, rng: &mut Xoshiro256PlusPlus) -> f64 {
         let noise = self.process.next(rng);
-        if self.line_hz > 0.0 {
+        if at_s < self.from_s {
+            0.0
+        } else if self.line_hz > 0.0 {
             noise + self.line_amplitude * (TAU * (self.line_hz * at_s).fract() + self.line_phase_rad).sin()
         } else {
             noise
