@@ -1,14 +1,15 @@
-//! Levels of torque noise and attitude readout noise, measured in the first interval of a run.
+//! Levels of torque noise and attitude readout noise, measured in the first interval of a run and in every one after it.
 //!
 //! `α̂` combines attitude readouts and commanded torques, and is biased by wrong weights. The levels are therefore
 //! fitted to the spectrum of the attitude channels, `a cos² + b (4 sin²/dt²)²`, before the reconstruction. A level that
-//! differs significantly from the mission file's replaces it.
+//! differs significantly from the mission file's replaces it. What an interval says acts from its end on, so that after
+//! a change the weights are wrong for less than two of them.
 
 use dragfree_physics::levels::{self, Bin};
 use dragfree_physics::spectrum::welch;
 use nalgebra::Vector3;
 
-/// Length of the first interval, s.
+/// Length of an interval, s.
 const LENGTH_S: f64 = 3276.8;
 
 /// Length of a segment of its spectrum, s.
@@ -37,7 +38,13 @@ impl NoiseScale {
     }
 }
 
-/// Number of epochs in the first interval.
+impl Default for NoiseScale {
+    fn default() -> Self {
+        Self::nominal()
+    }
+}
+
+/// Number of epochs in an interval.
 pub fn length(rate_hz: f64) -> usize {
     (LENGTH_S * rate_hz).round() as usize
 }

@@ -33,6 +33,13 @@ struct Linked {
     all_readouts: bool,
     /// Epochs held back until the noise levels are measured; `None` after that.
     held_back: Option<Vec<Epoch>>,
+    /// Levels by which the smoother weighs now, and whether they follow the data.
+    now: NoiseScale,
+    follows: bool,
+    /// Attitude channels of the interval that is not complete.
+    recent: Vec<[f64; 3]>,
+    /// When the levels changed, Unix ns, and to what.
+    changes: Vec<(i64, NoiseScale)>,
     rate_hz: f64,
     input: Columns<In>,
     table: Table,
@@ -134,7 +141,7 @@ impl HinfDfacs {
         let reconstruction = self.reconstruction(&settings, all_readouts)?;
         self.notes = notes;
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
-        (linked.settings, linked.reconstruction) = (settings, reconstruction);
+        (linked.settings, linked.reconstruction, linked.now) = (settings, reconstruction, scale);
         Ok(())
     }
 
@@ -153,10 +160,7 @@ impl HinfDfacs {
         let scale = levels.map_or_else(NoiseScale::nominal, measured);
         self.rebuild(scale)?;
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
-        for epoch in &epochs {
-            linked.reconstruction.push(epoch, &mut linked.rows)?;
-        }
-        Ok(())
+        epochs.iter().try_for_each(|epoch| linked.push(&self.mission, epoch))
     }
 
     /// Builds the reconstruction, with a replay of the control law if possible.
@@ -240,6 +244,35 @@ fn write_columns(
 }
 
 impl Linked {
+    /// Reconstructs an epoch, and measures the levels of noise at the end of every interval.
+    fn push(&mut self, mission: &Mission, epoch: &Epoch) -> Result<(), PluginError> {
+        let before = self.rows.len();
+        self.reconstruction.push(epoch, &mut self.rows)?;
+        if !self.follows {
+            return Ok(());
+        }
+        self.recent.extend(self.rows[before..].iter().map(Row::attitude_channels));
+        let length = noise_calibration::length(self.rate_hz);
+        while self.recent.len() >= length {
+            let interval: Vec<_> = self.recent.drain(..length).collect();
+            self.follow(mission, &interval, epoch.time_ns)?;
+        }
+        Ok(())
+    }
+
+    fn follow(&mut self, mission: &Mission, interval: &[[f64; 3]], time_ns: i64) -> Result<(), PluginError> {
+        let Some((held, sensing)) = levels_of(mission) else { return Ok(()) };
+        let (held, sensing) = (held.component_mul(&self.now.torque), sensing * self.now.sensing);
+        let change = noise_calibration::measure(interval, self.rate_hz, &held, sensing);
+        if change == NoiseScale::nominal() {
+            return Ok(());
+        }
+        let torque = self.now.torque.component_mul(&change.torque);
+        self.now = NoiseScale { torque, sensing: self.now.sensing * change.sensing };
+        self.changes.push((time_ns, self.now));
+        Ok(self.reconstruction.set_levels(mission, &Settings { scale: self.now, ..self.settings })?)
+    }
+
     fn write_rows(&mut self, output: &mut Outputs) {
         output.time(self.table).extend(self.rows.iter().map(|row| row.time_ns));
         let (fixed, on_demand) = self.out.split_at(self.fixed);
@@ -424,6 +457,10 @@ impl Stage for HinfDfacs {
             settings,
             all_readouts,
             held_back: (smoother && self.measure_noise).then(Vec::new),
+            now: NoiseScale::nominal(),
+            follows: smoother && self.measure_noise,
+            recent: Vec::new(),
+            changes: Vec::new(),
             rate_hz,
             input: Columns { readout, command, sun, ephemeris_age, omega_crf, alpha_crf },
             table,
@@ -450,8 +487,7 @@ impl Stage for HinfDfacs {
         }
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
         for (k, time_ns) in times.iter().enumerate().skip(k) {
-            let epoch = columns.epoch(*time_ns, k);
-            linked.reconstruction.push(&epoch, &mut linked.rows)?;
+            linked.push(&self.mission, &columns.epoch(*time_ns, k))?;
         }
         linked.write_rows(output);
         Ok(())
@@ -520,6 +556,18 @@ impl Stage for HinfDfacs {
                 scale.sensing
             ));
         }
+        let changes: Vec<_> = linked.changes.iter().map(|(time_ns, scale)| change_json(*time_ns, scale)).collect();
+        q.insert("noise_power_changes".to_owned(), json!(changes));
+        if let Some((time_ns, scale)) = linked.changes.last() {
+            report.notes.push(format!(
+                "the noise of the attitude changed {} times; from Unix time {time_ns} ns on the torque noise about x, y, z has {:.2?} \
+                 times the power of the mission file's and the long-arm wavefront sensing {:.2} times. The angular acceleration \
+                 follows an hour later; the levels by which the offset is weighed are those of the whole run",
+                linked.changes.len(),
+                scale.torque.as_slice(),
+                scale.sensing
+            ));
+        }
         q.insert("smoother_lag_s".to_owned(), json!(linked.reconstruction.lag() as f64 / linked.rate_hz));
         if self.angular_acceleration != AngularAcceleration::Smoother && !self.needs.prediction {
             report
@@ -577,8 +625,30 @@ impl Stage for HinfDfacs {
         if state.is_loading() {
             self.rebuild(scale)?;
         }
+        let linked = self.linked.as_mut().ok_or_else(not_linked)?;
+        let levels = |state: &mut State<'_>, scale: &mut NoiseScale| {
+            state.f64s(scale.torque.iter_mut().chain([&mut scale.sensing]))?;
+            let sound = scale.torque.iter().chain([&scale.sensing]).all(|x| x.is_finite() && *x > 0.0);
+            if sound { Ok(()) } else { Err(StateError::Content("a noise level")) }
+        };
+        levels(state, &mut linked.now)?;
+        state.list(&mut linked.recent, |state, row| state.f64s(row))?;
+        if linked.recent.len() >= most {
+            return Err(StateError::Content("a number of epochs").into());
+        }
+        state.list(&mut linked.changes, |state, (time_ns, scale)| {
+            state.i64(time_ns)?;
+            levels(state, scale)
+        })?;
+        if state.is_loading() && !linked.changes.is_empty() {
+            linked.reconstruction.set_levels(&self.mission, &Settings { scale: linked.now, ..linked.settings })?;
+        }
         Ok(self.linked.as_mut().ok_or_else(not_linked)?.reconstruction.visit(state)?)
     }
+}
+
+fn change_json(time_ns: i64, scale: &NoiseScale) -> serde_json::Value {
+    json!({ "time_ns": time_ns, "thruster_torque": scale.torque.as_slice(), "dws_long_arm": scale.sensing })
 }
 
 /// `{"samples", "rms_distance": {vector: value}, "mean_distance": {…}, "rms_flown": {…}, "rms_change_of_flown": {…}}`,

@@ -542,6 +542,17 @@ impl Reconstruction {
         Row { time_ns: now.time_ns, values: vectors.iter().flatten().copied().collect(), on_demand: Vec::new() }
     }
 
+    /// From now on the smoother weighs by the levels of noise of `settings`.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn set_levels(&mut self, mission: &Mission, settings: &Settings) -> Result<(), MissionError> {
+        let missing = || MissionError::Missing { section: "noise.thruster_torque".to_owned(), needed_by: NEEDED_BY };
+        let noise = ThrustNoise::of(mission).ok_or_else(missing)?;
+        self.smoother.set_levels(&model(mission, &noise, settings)?);
+        Ok(())
+    }
+
     /// Name, unit and frame of the requested columns.
     pub fn on_demand_columns(&self) -> Vec<(String, &'static str, String)> {
         self.on_demand.as_ref().map(OnDemand::columns).unwrap_or_default()

@@ -138,6 +138,8 @@ struct Step {
     gain: [Axes; 3],
     /// Innovation over its variance; zero, as the gain, without a readout.
     weighted_innovation: Axes,
+    /// Variance of the mean disturbance over the sample that follows, rad² s⁻⁴.
+    disturbance_variance: Axes,
     /// Whether attitude and rate are reset after this epoch because the command is unknown.
     reset: bool,
 }
@@ -235,6 +237,20 @@ impl Smoother {
         }
     }
 
+    /// From now on the levels of noise are those of another model. Principal axes and lag stay: those of the other model
+    /// turn by the part of the torque noise that is common to two axes.
+    pub fn set_levels(&mut self, other: &Model) {
+        let turn = self.model.srf_from_principal.tr_mul(&other.srf_from_principal);
+        let along = |variance: &Axes| {
+            let turned = turn * Matrix3::from_diagonal(&Vector3::from(*variance)) * turn.transpose();
+            std::array::from_fn(|i| turned[(i, i)])
+        };
+        self.model.disturbance_variance = along(&other.disturbance_variance);
+        self.model.drift_variance = along(&other.drift_variance);
+        self.model.readout_variance = other.readout_variance;
+        self.model.coloured_noise = other.coloured_noise;
+    }
+
     /// The model.
     pub fn model(&self) -> &Model {
         &self.model
@@ -301,6 +317,9 @@ impl Smoother {
             self.mean[0][i] += dt * self.mean[1][i] + half * accel;
             self.mean[1][i] += dt * accel;
             let q = self.model.disturbance_variance[i];
+            if let Some(step) = self.steps.last_mut() {
+                step.disturbance_variance[i] = q;
+            }
             let theta_theta = p00[i] + dt * p01[i] + half * p02[i];
             let theta_omega = p01[i] + dt * p11[i] + half * p12[i];
             let theta_beta = p02[i] + dt * p12[i] + half * p22[i];
@@ -403,7 +422,7 @@ impl Smoother {
             for i in 0..3 {
                 let [r0, r1, r2] = [adjoint[0][i], adjoint[1][i], adjoint[2][i]];
                 let by_accel = half * r0 + dt * r1;
-                noise[i] = self.model.disturbance_variance[i] * by_accel;
+                noise[i] = step.disturbance_variance[i] * by_accel;
                 // s = Aᵀ r, then r ← s − Hᵀ K·s + Hᵀ v/F.
                 let [s0, s1, s2] = if step.reset { [0.0, 0.0, r2] } else { [r0, dt * r0 + r1, by_accel + r2] };
                 let corrected = step.gain[0][i] * s0 + step.gain[1][i] * s1 + step.gain[2][i] * s2;
@@ -453,6 +472,7 @@ impl Smoother {
             state.f64s(step.covariance.as_flattened_mut())?;
             state.f64s(step.gain.as_flattened_mut())?;
             state.f64s(&mut step.weighted_innovation)?;
+            state.f64s(&mut step.disturbance_variance)?;
             state.flag(&mut step.reset)
         })?;
         if self.steps.len() > 2 * self.model.lag { Err(StateError::Content("a number of epochs")) } else { Ok(()) }

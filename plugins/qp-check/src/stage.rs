@@ -546,7 +546,7 @@ fn contradictions(settings: &Settings, solution: &Solution) -> Vec<String> {
         out.push(format!(
             "residuals of the attitude and of the test masses are coherent (χ²/dof {ratio:.3} on {dof}): noise that pushes and \
              turns at once, such as thrusters one by one, or an angular acceleration that is not E[α | data], as where the torque \
-             noise changes after the first hour; the offset takes such noise for its own. State the layout in \
+             noise changes; the offset takes such noise for its own. State the layout in \
              [[thrusters.unit]], calibrate the hours apart (--from, --until), or look at the reconstruction"
         ));
     }
