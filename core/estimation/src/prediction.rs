@@ -401,7 +401,9 @@ mod tests {
         // Its twin, which begins at zero as if the constant were a step.
         let mut memory = Memory::default();
         shown(&mut memory, &before);
-        (0..20_000).for_each(|_| drop(memory.next(&before, 300.0)));
+        for _ in 0..20_000 {
+            memory.next(&before, 300.0);
+        }
         assert!(shown(&mut memory, &after) > 1.0);
     }
 
