@@ -336,8 +336,8 @@ fn another_producers_impulse_is_found_with_its_time_and_momentum() {
     assert!(late_s.abs() < 1.0, "{late_s} s");
 }
 
-/// A line in the thrust: on its axis, at its frequency to a tenth of 1/T, with its amplitude. With it in the model nothing
-/// is missing, while a second one there is searched.
+/// A line in the thrust: on its axis, at its frequency to a tenth of 1/T, with its amplitude. With it in the model
+/// nothing is missing, while a second one there is searched.
 #[test]
 fn another_producers_line_in_the_thrust_is_found_with_its_frequency_and_amplitude() {
     let (hz, force_n) = (0.012_345, 8e-9);

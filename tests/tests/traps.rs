@@ -101,8 +101,8 @@ fn commanded_torque_as_angular_acceleration_gives_a_disagreement() {
 }
 
 /// Torque noise about z that doubles halfway through a day. The weights of the angular acceleration follow it: every
-/// offset of the batch solution within 4σ (36 numbers, 0.2 %). With the weights of the mission file for the whole day it is
-/// wrong by 4σ and more, and the residuals of the attitude and of the test masses are coherent.
+/// offset of the batch solution within 4σ (18 numbers, 0.1 %). With the weights of the mission file for the whole day
+/// it is wrong by 4σ and more, and the residuals of the attitude and of the test masses are coherent.
 #[test]
 fn the_angular_acceleration_follows_torque_noise_that_doubles_halfway() {
     let dir = tempfile::tempdir().expect("a temporary folder");

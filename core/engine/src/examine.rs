@@ -36,7 +36,8 @@ pub struct Examination<'a> {
 /// A consumer of columns, with the indices of those that it wants in [`Chain::columns`].
 pub type Wanted<C> = (C, Vec<usize>);
 
-/// Parameter of an effect that acts at one frequency, which the host finds. `NAME-2` is another one at the place `NAME`.
+/// Parameter of an effect that acts at one frequency, which the host finds. `NAME-2` is another one at the place
+/// `NAME`.
 pub const FREQUENCY_HZ: &str = "frequency_hz";
 
 /// Every instance of every installed effect that is not in the model of a product, on its mission; beside one at a

@@ -101,8 +101,8 @@ pub struct Memory {
 }
 
 impl Memory {
-    /// At the start of a stretch, of a column that has a constant: the filter would ring from it at the start, and again
-    /// whenever it is designed anew, and a slow regressor may have one that is large against all that it varies.
+    /// At the start of a stretch, of a column that has a constant: the filter would ring from it at the start, and
+    /// again whenever it is designed anew, and a slow regressor may have one that is large against all that it varies.
     fn beside(constant: f64) -> Self {
         Self { values: [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, constant] }
     }

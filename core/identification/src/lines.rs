@@ -1,8 +1,8 @@
 //! Search for lines: forces and torques at one frequency, at every frequency of the whole run.
 //!
-//! With residuals r(f) of a tapered stretch, their declared Σ(f) and the channels' response d to a place, the power that
-//! a line at f may have is `s = |dᵀΣ⁻¹r|²/(dᵀΣ⁻¹d)`: exponential with a mean of one where there is none. Levels of noise
-//! are not as declared, so it is taken over its local mean, from the median of the frequencies around.
+//! With residuals r(f) of a tapered stretch, their declared Σ(f) and the channels' response d to a place, the power
+//! that a line at f may have is `s = |dᵀΣ⁻¹r|²/(dᵀΣ⁻¹d)`: exponential with a mean of one where there is none. Levels of
+//! noise are not as declared, so it is taken over its local mean, from the median of the frequencies around.
 
 use std::sync::Arc;
 

@@ -9,7 +9,8 @@
 //!
 //! Two coefficients, the amplitudes of `cos 2πft` and `sin 2πft` with t in Unix time: N in SRF on the spacecraft
 //! (`−T_S^{O_i} e/m_S` on the test masses), N m in SRF (`J_S⁻¹ e` on the attitude), N in ORF on a test mass (`1/m_m`).
-//! A series has the mean over each sample. **Confounder**: a line A in the readout, which shows as `−(2πf)² A`. **Range**: ±1e-4 N, ±1e-4 N m, ±1e-9 N. The host searches the frequency.
+//! A series has the mean over each sample. The host searches the frequency. **Range**: ±1e-4 N, ±1e-4 N m, ±1e-9 N.
+//! **Confounder**: a line A in the readout, which shows as `−(2πf)² A`.
 
 use std::f64::consts::{PI, TAU};
 

@@ -1,4 +1,4 @@
-//! Levels of torque noise and attitude readout noise, measured in the first interval of a run and in every one after it.
+//! Levels of torque noise and attitude readout noise, measured in every interval of a run.
 //!
 //! `α̂` combines attitude readouts and commanded torques, and is biased by wrong weights. The levels are therefore
 //! fitted to the spectrum of the attitude channels, `a cos² + b (4 sin²/dt²)²`, before the reconstruction. A level that

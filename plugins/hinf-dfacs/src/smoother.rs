@@ -237,8 +237,8 @@ impl Smoother {
         }
     }
 
-    /// From now on the levels of noise are those of another model. Principal axes and lag stay: those of the other model
-    /// turn by the part of the torque noise that is common to two axes.
+    /// From now on the levels of noise are those of another model. Principal axes and lag stay: those of the other
+    /// model turn by the part of the torque noise that is common to two axes.
     pub fn set_levels(&mut self, other: &Model) {
         let turn = self.model.srf_from_principal.tr_mul(&other.srf_from_principal);
         let along = |variance: &Axes| {

@@ -25,6 +25,7 @@ use std::sync::{Mutex, PoisonError};
 use nalgebra::{DMatrix, DVector};
 
 use super::lanes::{Batch, Kernel, LANES, Products, Tile};
+pub use super::lanes::{Parameter, Response};
 use super::predictor::{Change, Predictor};
 use super::state_space::NoiseStates;
 
@@ -39,21 +40,6 @@ pub(crate) const FREE: f64 = 1e6;
 pub const POWERS: usize = 3;
 
 const DAY_NS: f64 = 86_400e9;
-
-/// Response of a channel to a parameter: channel, series, factor.
-pub type Response = (usize, usize, f64);
-
-/// A parameter of the likelihood.
-#[derive(Clone, Debug, Default)]
-pub struct Parameter {
-    /// What it adds to the channels.
-    pub responses: Vec<Response>,
-    /// How it changes the noise.
-    pub change: Option<Change>,
-    /// Channels whose innovations, whitened with those before them, are not weighed for it: they are not independent of
-    /// what it adds. What is left is the likelihood of the other channels alone.
-    pub not_weighed: Vec<usize>,
-}
 
 /// Sums of a pass. Sums of several stretches of data add.
 #[derive(Clone, Debug)]

@@ -7,8 +7,7 @@ use aligned_vec::{AVec, avec};
 use nalgebra::DMatrix;
 use pulp::{Arch, Simd, WithSimd};
 
-use super::filter::Parameter;
-use super::predictor::{Beside, Predictor};
+use super::predictor::{Beside, Change, Predictor};
 use super::state_space::NoiseStates;
 
 /// Parameters of a tile.
@@ -17,6 +16,21 @@ pub(super) const LANES: usize = 8;
 const BLOCK: usize = 8;
 /// Channels whose sums are.
 const CHANNELS: usize = 3;
+
+/// Response of a channel to a parameter: channel, series, factor.
+pub type Response = (usize, usize, f64);
+
+/// A parameter of the likelihood.
+#[derive(Clone, Debug, Default)]
+pub struct Parameter {
+    /// What it adds to the channels.
+    pub responses: Vec<Response>,
+    /// How it changes the noise.
+    pub change: Option<Change>,
+    /// Channels whose innovations, whitened with those before them, are not weighed for it: they are not independent of
+    /// what it adds. What is left is the likelihood of the other channels alone.
+    pub not_weighed: Vec<usize>,
+}
 
 /// The matrices of the filter, laid out for it.
 pub(super) struct Kernel {
