@@ -26,7 +26,7 @@ use nalgebra::{DMatrix, DVector};
 
 use super::lanes::{Batch, Kernel, LANES, Products, Tile};
 pub use super::lanes::{Parameter, Response};
-use super::predictor::{Change, Predictor};
+use super::predictor::Predictor;
 use super::state_space::NoiseStates;
 
 /// Rows that are filtered before products are taken.
