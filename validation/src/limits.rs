@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::campaign::{note, science_mode, taiji};
+use crate::campaign::{ScratchFolder, note, science_mode, taiji};
 use crate::diagnosis::Length;
 use crate::error::{CampaignError, file};
 use crate::program::{Chain, Program, root};
@@ -58,16 +58,12 @@ pub(crate) fn limits(program: &Program, results: &Path, scratch: &Path) -> Resul
     let (results, _) = Results::<Limits>::open(results, &build)?;
     for length in Length::ALL.into_iter().filter(|length| !results.has(length.name(), SEED)) {
         let folder = scratch.join(format!("limits-{}", length.name()));
-        let io = |e: std::io::Error| file(&folder, &e);
-        if folder.exists() {
-            std::fs::remove_dir_all(&folder).map_err(io)?;
-        }
-        std::fs::create_dir_all(&folder).map_err(io)?;
+        ScratchFolder::new(&folder)?;
         let diagnosis = diagnosed(program, length, &folder)?;
         let limits = known(&diagnosis).ok_or_else(|| file(&folder, &"the diagnosis has no upper_limits"))?;
         note(&format!("{}: {}, σ of {} coefficients", length.name(), diagnosis["verdict"], limits.len()));
         results.append(Limits { length: length.name().to_owned(), build: build.clone(), limits })?;
-        std::fs::remove_dir_all(&folder).map_err(io)?;
+        std::fs::remove_dir_all(&folder).map_err(|e| file(&folder, &e))?;
     }
     results.sort(&Length::ALL.map(Length::name)).map(|_| ())
 }

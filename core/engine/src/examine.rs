@@ -62,7 +62,7 @@ pub fn candidates(registry: &Registry, sources: &Sources) -> Result<Vec<EffectEn
 }
 
 /// Whether an effect has a parameter: with `at_ns` what it does happens once, at a time that the host finds; with
-/// `fine` its candidate can be tried about one shape in fine steps.
+/// [`FREQUENCY_HZ`] it acts at one frequency; with `fine` its candidate can be tried about one shape in fine steps.
 pub fn has_parameter(registry: &Registry, effect: &str, name: &str) -> bool {
     let found = registry.find(Kind::Effect, effect);
     found.is_ok_and(|f| f.info.manifest.parameters.iter().any(|p| p.name == name))

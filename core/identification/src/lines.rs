@@ -4,6 +4,8 @@
 //! that a line at f may have is `s = |dᵀΣ⁻¹r|²/(dᵀΣ⁻¹d)`: exponential with a mean of one where there is none. Levels of
 //! noise are not as declared, so it is taken over its local mean, from the median of the frequencies around.
 
+use std::f64::consts::{LN_2, TAU};
+use std::ops::Range;
 use std::sync::Arc;
 
 use nalgebra::{DMatrix, DVector};
@@ -117,12 +119,11 @@ impl LineSearch {
         if self.measured.is_empty() {
             self.first_ns = first_ns;
         }
-        let at = ((first_ns - self.first_ns) / self.step_ns).max(0) as usize;
+        let mut at = ((first_ns - self.first_ns + self.step_ns / 2) / self.step_ns).max(0) as usize;
         if at + rows > LONGEST {
             self.search();
-            self.first_ns = first_ns;
+            (self.first_ns, at) = (first_ns, 0);
         }
-        let at = ((first_ns - self.first_ns + self.step_ns / 2) / self.step_ns).max(0) as usize;
         self.measured.resize(at, false);
         self.measured.resize(at + rows, true);
         for (samples, factors) in self.samples.iter_mut().zip(self.residual.row_iter()) {
@@ -164,7 +165,7 @@ impl LineSearch {
             let slope = if determinant > 0.0 { (s0 * x1 - s1 * x0) / determinant } else { 0.0 };
             let mean = (x0 - slope * s1) / s0.max(1.0);
             for (k, (x, measured)) in samples.iter_mut().zip(&self.measured).enumerate() {
-                let window = 0.5 * (1.0 + (std::f64::consts::TAU * time(k)).cos());
+                let window = 0.5 * (1.0 + (TAU * time(k)).cos());
                 *x = if *measured { window * (*x - mean - slope * time(k)) } else { 0.0 };
             }
         }
@@ -192,27 +193,32 @@ impl LineSearch {
         }
         powers.sort_by(|a, b| b.2.total_cmp(&a.2));
         let mut peaks: Vec<(usize, f64)> = Vec::new();
-        let mut found: Vec<(usize, Line)> = Vec::new();
+        let mut found: Vec<Line> = Vec::new();
         for (p, bin, power) in powers {
             let place = &self.places[p];
             let same = |(other, _): &&(usize, f64)| bin.abs_diff(*other) <= NEAR;
             let peak = peaks.iter().find(same).copied();
-            let new_place =
-                !found.iter().any(|(_, line)| line.instance == place.instance && line.effect == place.effect);
             let wanted = match peak {
                 Some((_, highest)) => power > RIVAL * highest,
                 None => peaks.len() < MOST,
             };
-            if peak.is_none() && wanted {
+            if !wanted {
+                continue;
+            }
+            if peak.is_none() {
                 peaks.push((bin, power));
             }
-            if wanted && new_place {
+            if found.iter().all(|line| (&line.effect, &line.instance) != (&place.effect, &place.instance)) {
                 let frequency_hz = self.refined(place, bin);
-                let line = Line { effect: place.effect.clone(), instance: place.instance.clone(), frequency_hz, power };
-                found.push((bin, line));
+                found.push(Line {
+                    effect: place.effect.clone(),
+                    instance: place.instance.clone(),
+                    frequency_hz,
+                    power,
+                });
             }
         }
-        Lines { found: found.into_iter().map(|(_, line)| line).collect(), tried }
+        Lines { found, tried }
     }
 
     fn hz(&self, bin: f64) -> f64 {
@@ -230,7 +236,7 @@ impl LineSearch {
     }
 
     /// Powers over the local mean.
-    fn normalised(&self, place: &Place, spectra: &[Vec<Complex64>], bins: std::ops::Range<usize>) -> Vec<f64> {
+    fn normalised(&self, place: &Place, spectra: &[Vec<Complex64>], bins: Range<usize>) -> Vec<f64> {
         let mut all = Vec::with_capacity(bins.len());
         let mut first = bins.start;
         while first < bins.end {
@@ -261,7 +267,7 @@ impl LineSearch {
         let combined: Vec<f64> =
             (0..n).map(|k| weights.iter().zip(&self.samples).map(|(w, r)| w * r[k]).sum()).collect();
         let power = |at: f64| {
-            let turn = Complex64::from_polar(1.0, -std::f64::consts::TAU * at / n as f64);
+            let turn = Complex64::from_polar(1.0, -TAU * at / n as f64);
             let mut phase = Complex64::new(1.0, 0.0);
             let mut sum = Complex64::default();
             for x in &combined {
@@ -288,7 +294,7 @@ fn mean_around(all: &[f64], first: usize) -> f64 {
     let mut around = all[range].to_vec();
     let half = around.len() / 2;
     let (_, median, _) = around.select_nth_unstable_by(half, f64::total_cmp);
-    (*median / std::f64::consts::LN_2).max(f64::MIN_POSITIVE)
+    (*median / LN_2).max(f64::MIN_POSITIVE)
 }
 
 #[cfg(test)]
@@ -324,8 +330,6 @@ mod tests {
         }
         search.finish()
     }
-
-    use std::f64::consts::TAU;
 
     /// A line of 8σ is the loudest that is found, in its channel, at its frequency to a fifth of a bin.
     #[test]

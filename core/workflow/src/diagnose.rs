@@ -91,10 +91,6 @@ pub fn diagnose(
     Ok(Diagnosed { diagnosis, settings: settings.clone(), record })
 }
 
-/// Passes that fit constants beside what is named, at the start and after a form has changed: the first from 1e5 σ, so
-/// that rounding leaves some σ to the second.
-const OPENING: usize = 1;
-
 /// A model's entry of a line.
 fn entry_of(line: &Line) -> EffectEntry {
     let mut entry = EffectEntry::new(&line.effect, &line.instance);
@@ -125,14 +121,15 @@ fn decide(
     let events: Vec<Candidate> = screened.forms.iter().filter(events).cloned().collect();
     let mut slow = slow_forces(scorer, &scorer.fit(&events)?, &record.noise);
     let mut named: Vec<Candidate> = Vec::new();
-    let (mut openings, mut passes) = (OPENING, 0);
+    // A pass that fits constants beside what is named comes first, at the start and after a form has changed: they are
+    // 1e5 σ away, and a filter would take them for noise.
+    let (mut opening, mut passes) = (true, 0);
     let (decided, screened, moving) = loop {
         let chosen: Vec<EffectEntry> = screened.forms.iter().map(|form| evidence.entry(form)).collect();
-        let opening = openings > 0;
         let decided = one_pass(evidence.replay, &chosen, &slow, opening, &point, evidence, progress)?;
         let next = step(&point, &decided);
         if opening {
-            openings -= 1;
+            opening = false;
             point = next;
             continue;
         }
@@ -155,7 +152,7 @@ fn decide(
             let parts = named.iter().flat_map(|c| c.parts.iter().map(move |(index, _)| (c, *index)));
             for ((_, index), value) in parts.zip(values).filter(|((c, _), _)| !now.contains(c)) {
                 // Its mean is another, and constants are far away again.
-                openings = OPENING;
+                opening = true;
                 point.values.insert(record.candidate_set.coefficients[index].name.clone(), *value);
             }
             slow = slow_forces(scorer, &fit, &record.noise);

@@ -7,6 +7,7 @@
 
 use dragfree_physics::levels::{self, Bin};
 use dragfree_physics::spectrum::welch;
+use dragfree_sdk::state::{State, StateError};
 use nalgebra::Vector3;
 
 /// Length of an interval, s.
@@ -35,6 +36,12 @@ impl NoiseScale {
     /// The levels of the mission file.
     pub fn nominal() -> Self {
         Self { torque: Vector3::repeat(1.0), sensing: 1.0 }
+    }
+
+    pub(crate) fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        state.f64s(self.torque.iter_mut().chain([&mut self.sensing]))?;
+        let sound = self.torque.iter().chain([&self.sensing]).all(|x| x.is_finite() && *x > 0.0);
+        if sound { Ok(()) } else { Err(StateError::Content("a noise level")) }
     }
 }
 

@@ -33,8 +33,7 @@ struct Linked {
     all_readouts: bool,
     /// Epochs held back until the noise levels are measured; `None` after that.
     held_back: Option<Vec<Epoch>>,
-    /// Levels by which the smoother weighs now, and whether they follow the data.
-    now: NoiseScale,
+    /// Whether the levels by which the smoother weighs follow the data.
     follows: bool,
     /// Attitude channels of the interval that is not complete.
     recent: Vec<[f64; 3]>,
@@ -141,7 +140,7 @@ impl HinfDfacs {
         let reconstruction = self.reconstruction(&settings, all_readouts)?;
         self.notes = notes;
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
-        (linked.settings, linked.reconstruction, linked.now) = (settings, reconstruction, scale);
+        (linked.settings, linked.reconstruction) = (settings, reconstruction);
         Ok(())
     }
 
@@ -260,17 +259,23 @@ impl Linked {
         Ok(())
     }
 
+    /// Levels by which the smoother weighs now.
+    fn levels(&self) -> NoiseScale {
+        self.changes.last().map_or(self.settings.scale, |(_, scale)| *scale)
+    }
+
     fn follow(&mut self, mission: &Mission, interval: &[[f64; 3]], time_ns: i64) -> Result<(), PluginError> {
         let Some((held, sensing)) = levels_of(mission) else { return Ok(()) };
-        let (held, sensing) = (held.component_mul(&self.now.torque), sensing * self.now.sensing);
+        let now = self.levels();
+        let (held, sensing) = (held.component_mul(&now.torque), sensing * now.sensing);
         let change = noise_calibration::measure(interval, self.rate_hz, &held, sensing);
         if change == NoiseScale::nominal() {
             return Ok(());
         }
-        let torque = self.now.torque.component_mul(&change.torque);
-        self.now = NoiseScale { torque, sensing: self.now.sensing * change.sensing };
-        self.changes.push((time_ns, self.now));
-        Ok(self.reconstruction.set_levels(mission, &Settings { scale: self.now, ..self.settings })?)
+        let torque = now.torque.component_mul(&change.torque);
+        let scale = NoiseScale { torque, sensing: now.sensing * change.sensing };
+        self.changes.push((time_ns, scale));
+        Ok(self.reconstruction.set_levels(mission, &Settings { scale, ..self.settings })?)
     }
 
     fn write_rows(&mut self, output: &mut Outputs) {
@@ -457,7 +462,6 @@ impl Stage for HinfDfacs {
             settings,
             all_readouts,
             held_back: (smoother && self.measure_noise).then(Vec::new),
-            now: NoiseScale::nominal(),
             follows: smoother && self.measure_noise,
             recent: Vec::new(),
             changes: Vec::new(),
@@ -544,10 +548,7 @@ impl Stage for HinfDfacs {
         };
         q.insert("angular_acceleration".to_owned(), json!(method));
         let scale = linked.settings.scale;
-        q.insert(
-            "measured_over_stated_noise_power".to_owned(),
-            json!({ "thruster_torque": scale.torque.as_slice(), "dws_long_arm": scale.sensing }),
-        );
+        q.insert("measured_over_stated_noise_power".to_owned(), scale_json(&scale));
         if scale != NoiseScale::nominal() {
             report.notes.push(format!(
                 "the first 55 minutes have {:.2?} times the power of the mission file's torque noise about x, y, z and {:.2} times that \
@@ -556,7 +557,8 @@ impl Stage for HinfDfacs {
                 scale.sensing
             ));
         }
-        let changes: Vec<_> = linked.changes.iter().map(|(time_ns, scale)| change_json(*time_ns, scale)).collect();
+        let change = |(time_ns, scale): &(i64, NoiseScale)| json!({ "time_ns": time_ns, "power": scale_json(scale) });
+        let changes: Vec<_> = linked.changes.iter().map(change).collect();
         q.insert("noise_power_changes".to_owned(), json!(changes));
         if let Some((time_ns, scale)) = linked.changes.last() {
             report.notes.push(format!(
@@ -610,10 +612,7 @@ impl Stage for HinfDfacs {
         let test_masses = self.mission.test_mass.len();
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
         let mut scale = linked.settings.scale;
-        state.f64s(scale.torque.iter_mut().chain([&mut scale.sensing]))?;
-        if !scale.torque.iter().chain([&scale.sensing]).all(|x| x.is_finite() && *x > 0.0) {
-            return Err(StateError::Content("a noise level").into());
-        }
+        scale.visit(state)?;
         let most = noise_calibration::length(linked.rate_hz);
         state.option(&mut linked.held_back, |state, held_back| {
             state.list(held_back, |state, epoch| epoch.visit(test_masses, state))?;
@@ -626,29 +625,25 @@ impl Stage for HinfDfacs {
             self.rebuild(scale)?;
         }
         let linked = self.linked.as_mut().ok_or_else(not_linked)?;
-        let levels = |state: &mut State<'_>, scale: &mut NoiseScale| {
-            state.f64s(scale.torque.iter_mut().chain([&mut scale.sensing]))?;
-            let sound = scale.torque.iter().chain([&scale.sensing]).all(|x| x.is_finite() && *x > 0.0);
-            if sound { Ok(()) } else { Err(StateError::Content("a noise level")) }
-        };
-        levels(state, &mut linked.now)?;
         state.list(&mut linked.recent, |state, row| state.f64s(row))?;
         if linked.recent.len() >= most {
             return Err(StateError::Content("a number of epochs").into());
         }
         state.list(&mut linked.changes, |state, (time_ns, scale)| {
             state.i64(time_ns)?;
-            levels(state, scale)
+            scale.visit(state)
         })?;
         if state.is_loading() && !linked.changes.is_empty() {
-            linked.reconstruction.set_levels(&self.mission, &Settings { scale: linked.now, ..linked.settings })?;
+            let scale = linked.levels();
+            linked.reconstruction.set_levels(&self.mission, &Settings { scale, ..linked.settings })?;
         }
         Ok(self.linked.as_mut().ok_or_else(not_linked)?.reconstruction.visit(state)?)
     }
 }
 
-fn change_json(time_ns: i64, scale: &NoiseScale) -> serde_json::Value {
-    json!({ "time_ns": time_ns, "thruster_torque": scale.torque.as_slice(), "dws_long_arm": scale.sensing })
+/// Power over that of the mission file.
+fn scale_json(scale: &NoiseScale) -> serde_json::Value {
+    json!({ "thruster_torque": scale.torque.as_slice(), "dws_long_arm": scale.sensing })
 }
 
 /// `{"samples", "rms_distance": {vector: value}, "mean_distance": {…}, "rms_flown": {…}, "rms_change_of_flown": {…}}`,

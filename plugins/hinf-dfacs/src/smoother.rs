@@ -299,10 +299,11 @@ impl Smoother {
         let (dt, half) = (self.model.dt_s, 0.5 * self.model.dt_s * self.model.dt_s);
         let [zz, zw, ww] = self.model.coloured_noise;
         let [p00, p01, p02, p11, p12, p22] = self.covariance;
+        if let Some(step) = self.steps.last_mut() {
+            step.disturbance_variance = self.model.disturbance_variance;
+            step.reset = known_rad_s2.is_none();
+        }
         let Some(known) = known_rad_s2 else {
-            if let Some(step) = self.steps.last_mut() {
-                step.reset = true;
-            }
             self.command_consistency.response = Default::default();
             let zero = [0.0; 3];
             let drifted = std::array::from_fn(|i| p22[i] + self.model.drift_variance[i]);
@@ -317,9 +318,6 @@ impl Smoother {
             self.mean[0][i] += dt * self.mean[1][i] + half * accel;
             self.mean[1][i] += dt * accel;
             let q = self.model.disturbance_variance[i];
-            if let Some(step) = self.steps.last_mut() {
-                step.disturbance_variance[i] = q;
-            }
             let theta_theta = p00[i] + dt * p01[i] + half * p02[i];
             let theta_omega = p01[i] + dt * p11[i] + half * p12[i];
             let theta_beta = p02[i] + dt * p12[i] + half * p22[i];
@@ -476,5 +474,28 @@ impl Smoother {
             state.flag(&mut step.reset)
         })?;
         if self.steps.len() > 2 * self.model.lag { Err(StateError::Content("a number of epochs")) } else { Ok(()) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Levels of a model whose principal axes are others: the variance along each axis that stays.
+    #[test]
+    fn other_levels_are_taken_along_the_axes_that_stay() {
+        let sensing = NoiseShape::white(1e-9);
+        let psd = |x: f64, xy: f64, yz: f64| Matrix3::new(x, xy, 0.0, xy, 2.0, yz, 0.0, yz, 3.0) * 1e-20;
+        let (own, other) = (psd(1.0, 0.3, 0.2), psd(4.0, -0.5, 0.7));
+        let mut smoother = Smoother::new(Model::new(&own, &sensing, 0.1));
+        let axes = smoother.model.srf_from_principal;
+        for (levels, matrix) in [(Model::new(&other, &sensing, 0.1), other), (Model::new(&own, &sensing, 0.1), own)] {
+            smoother.set_levels(&levels);
+            let along = axes.transpose() * matrix * axes * (0.5 / 0.1);
+            for i in 0..3 {
+                let found = smoother.model.disturbance_variance[i];
+                assert!((found - along[(i, i)]).abs() < 1e-12 * found, "axis {i}: {found} {along}");
+            }
+        }
     }
 }

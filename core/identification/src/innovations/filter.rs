@@ -38,7 +38,6 @@ const LONGEST_WAIT_S: f64 = 600.0;
 pub(crate) const FREE: f64 = 1e6;
 /// Powers of time that each channel may follow beside everything else: a constant, a slope, a curvature.
 pub const POWERS: usize = 3;
-
 const DAY_NS: f64 = 86_400e9;
 
 /// Sums of a pass. Sums of several stretches of data add.

@@ -447,3 +447,81 @@ fn outer<S: Simd, const A: usize, const N: usize>(
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_xoshiro::Xoshiro256PlusPlus;
+
+    const N: usize = 4;
+    const STATES: usize = 16;
+    const ROWS: usize = 50;
+
+    /// Processors with these lengths of vectors, as far as this one has them.
+    fn all() -> Vec<Arch> {
+        let mut all = vec![Arch::Scalar, Arch::new()];
+        #[cfg(target_arch = "x86_64")]
+        all.extend(pulp::x86::V3::try_new().map(Arch::V3));
+        all
+    }
+
+    /// A filter of random numbers, and eight parameters of which one changes the noise.
+    fn filter(dice: &mut Xoshiro256PlusPlus) -> (Kernel, Tile) {
+        let mut small = || dice.random_range(-0.1..0.1);
+        let kernel = Kernel {
+            channels: N,
+            states: STATES,
+            transition: (0..STATES).map(|i| vec![(i, 0.5 + small()), ((i + 1) % STATES, small())]).collect(),
+            output: (0..N).map(|c| vec![(c, 1.0), (c + N, small())]).collect(),
+            gain: (0..STATES / BLOCK * N).map(|_| std::array::from_fn(|_| small())).collect(),
+            whitening: vec![(0..3).map(|_| [1.0 + small(); 3]).collect(), (0..4).map(|_| [1.0 + small(); 3]).collect()],
+        };
+        let parameter = |lane: usize| Parameter {
+            responses: vec![(lane % N, lane % 2, 1.0)],
+            change: (lane == 3).then(|| Change {
+                gain: DMatrix::from_fn(STATES, N, |i, j| 0.01 * (i + j) as f64),
+                innovation: DMatrix::zeros(N, N),
+                beside: None,
+            }),
+            not_weighed: if lane == 5 { vec![1] } else { Vec::new() },
+        };
+        let parameters: Vec<Parameter> = (0..LANES).map(parameter).collect();
+        let merged: Vec<usize> = (0..STATES).collect();
+        let tile = Tile::new(&parameters.iter().collect::<Vec<_>>(), &[1.0; N], &kernel, &merged, ROWS);
+        (kernel, tile)
+    }
+
+    /// Vectors of every length give the same, up to whether `a b + c` is rounded once or twice; products of lanes also
+    /// equal sums made one by one.
+    #[test]
+    fn the_length_of_a_vector_changes_nothing() {
+        let made = |arch: Arch| {
+            let mut dice = Xoshiro256PlusPlus::seed_from_u64(1);
+            let (kernel, mut tile) = filter(&mut dice);
+            let inputs: Vec<f64> = (0..2 * ROWS).map(|_| dice.random_range(-1.0..1.0)).collect();
+            let innovations: Vec<f64> = (0..N * ROWS).map(|_| dice.random_range(-1.0..1.0)).collect();
+            let batch = Batch { rows: ROWS, width: 2, inputs: &inputs, innovations: &innovations };
+            arch.dispatch(Filtering { tile: &mut tile, kernel: &kernel, batch: &batch });
+            // Five tiles, so that vectors are left over after whole groups of them.
+            let tiles: Vec<Vec<f64>> =
+                (1..6).map(|k| tile.whitened.iter().map(|x| x * f64::from(k)).collect()).collect();
+            let panels: Vec<&[f64]> = tiles.iter().map(Vec::as_slice).collect();
+            let mut products = Products::new(1, 5);
+            arch.dispatch(Adding { panels: panels[1..].to_vec(), sums: &mut products.sums });
+            (tile.whitened.to_vec(), products)
+        };
+        let (filtered, _) = made(Arch::Scalar);
+        assert!(filtered.iter().any(|x| x.abs() > 0.1));
+        let near = |a: f64, b: f64| (a - b).abs() < 1e-12 * (1.0 + b.abs());
+        for arch in all() {
+            let (own, products) = made(arch);
+            assert!(own.iter().zip(&filtered).all(|(a, b)| near(*a, *b)), "{arch:?}");
+            for (tile, a, b) in (1..5).flat_map(|t| (0..64).map(move |k| (t, k / LANES, k % LANES))) {
+                let lane = |l: usize| filtered.iter().skip(l).step_by(LANES);
+                let sum: f64 = 2.0 * (tile + 1) as f64 * lane(a).zip(lane(b)).map(|(x, y)| x * y).sum::<f64>();
+                assert!(near(products.at(a, tile, b), sum), "{arch:?} {tile} {a} {b}");
+            }
+        }
+    }
+}
