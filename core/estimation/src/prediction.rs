@@ -344,7 +344,7 @@ fn fit(frequencies: &[f64], psd: &[f64], weights: &[f64], differenced: bool, dt_
         .collect();
     let unknown = Levels { held: 1.0, readout: 0.0 };
     if differenced {
-        return levels::fit(&bins, dt_s).unwrap_or(unknown);
+        return levels::fit(&bins, dt_s).map_or(unknown, |fitted| fitted.levels);
     }
     let used = bins.iter().filter(|b| b.psd.is_finite() && b.weight > 0.0);
     let (sum, weight) = used.fold((0.0, 0.0), |(s, w), b| (s + b.weight * b.psd, w + b.weight));

@@ -632,25 +632,31 @@ mod tests {
         }
     }
 
-    /// `size` of the waveform, and `push` of the lasting series, whose correlation with the model's is 0.9.
-    fn gathered(seed: u64, samples: usize, at: usize, size: f64, push: f64) -> GramSums {
+    /// Waveforms of some sizes at some samples, and `push` of the lasting series, whose correlation with the model's is
+    /// 0.9.
+    fn gathered(seed: u64, samples: usize, events: &[(usize, f64)], push: f64) -> GramSums {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         let mut white = || -> Vec<f64> { (0..samples).map(|_| StandardNormal.sample(&mut rng)).collect() };
         let (mut first, mut second, model, mut lasting) = (white(), white(), white(), white());
         lasting.iter_mut().zip(&model).for_each(|(x, m)| *x = 0.9 * m + 0.19f64.sqrt() * *x);
         let time_ns: Vec<i64> = (0..samples as i64).map(|k| 1_000_000_000 * k).collect();
-        let waveform = Waveform { at_ns: time_ns[at], step_ns: 1_000_000_000, kernel: WAVEFORM.to_vec() };
-        let event = waveform.over(&time_ns);
-        first.iter_mut().zip(&event).for_each(|(x, e)| *x = *x * VARIANCE.sqrt() + size * e);
+        let waveform = |at: usize| Waveform { at_ns: time_ns[at], step_ns: 1_000_000_000, kernel: WAVEFORM.to_vec() };
+        let waveforms: Vec<Waveform> = events.iter().map(|(at, _)| waveform(*at)).collect();
+        let series: Vec<Vec<f64>> = waveforms.iter().map(|w| w.over(&time_ns)).collect();
+        first.iter_mut().for_each(|x| *x *= VARIANCE.sqrt());
+        for (event, (_, size)) in series.iter().zip(events) {
+            first.iter_mut().zip(event).for_each(|(x, e)| *x += size * e);
+        }
         first.iter_mut().zip(&lasting).for_each(|(x, l)| *x += push * l);
         second.iter_mut().for_each(|x| *x *= VARIANCE.sqrt());
         let plan = Plan::slow(LONG * LENGTH, LENGTH, 1.0);
         let columns = Columns {
-            names: ["first", "second", "model", "lasting", "event"].map(str::to_owned).to_vec(),
+            names: ["first", "second", "model", "lasting", "event", "event"].map(str::to_owned)[..4 + events.len()]
+                .to_vec(),
             channels: 2,
             base: 3,
-            fast: 5,
-            energy: vec![waveform.energy(&plan, false)],
+            fast: 4 + events.len(),
+            energy: waveforms.iter().map(|w| w.energy(&plan, false)).collect(),
             housekeeping_units: Vec::new(),
         };
         let residual = DMatrix::from_fn(2, 3, |i, j| f64::from(u8::from(i == j)));
@@ -660,8 +666,9 @@ mod tests {
         };
         let search = Search::new(Vec::new(), residual.clone(), Vec::new());
         let mut gatherer = GramAccumulator::new(columns, LENGTH, 1.0, 1, coherence, search, LineSearch::nowhere());
-        let mut segmenter = Segmenter::new(LENGTH, 1_000_000_000, vec![false; 5]);
-        let slices = [&first, &second, &model, &lasting, &event].map(Vec::as_slice);
+        let mut segmenter = Segmenter::new(LENGTH, 1_000_000_000, vec![false; 4 + events.len()]);
+        let slices: Vec<&[f64]> =
+            [&first, &second, &model, &lasting].into_iter().chain(&series).map(Vec::as_slice).collect();
         segmenter.cut(&time_ns, &slices, &mut gatherer);
         segmenter.cut_end(&mut gatherer);
         gatherer.finish()
@@ -685,7 +692,7 @@ mod tests {
         let (candidate_set, noise, settings) = (candidate_set(), noise(), Settings::default());
         let mut natural: Vec<f64> = Vec::new();
         for (k, at) in (0..8).map(|k| (k, 9000 + 64 * k)) {
-            let gathered = gathered(7 + k as u64, SAMPLES, at, 6.0, 0.0);
+            let gathered = gathered(7 + k as u64, SAMPLES, &[(at, 6.0)], 0.0);
             let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise, &settings);
             let scored = transient(&scorer.rank(&scorer.fit(&[]).unwrap()), "one");
             let sigma = scored.information[(0, 0)].sqrt().recip();
@@ -703,7 +710,7 @@ mod tests {
     #[test]
     fn what_a_range_holds_back_comes_back_beside_a_candidate() {
         let (mut candidate_set, noise, settings) = (candidate_set(), noise(), Settings::default());
-        let gathered = gathered(5, SAMPLES, 9000, 0.0, 1.0);
+        let gathered = gathered(5, SAMPLES, &[(9000, 0.0)], 1.0);
         for limit in [None, Some(0.1)] {
             let form = &mut candidate_set.coefficients[0].forms[0];
             (form.lower, form.upper) = (limit.map(|x: f64| -x), limit);
@@ -726,7 +733,7 @@ mod tests {
     fn an_event_is_ranked_apart_from_what_lasts() {
         let (candidate_set, noise, settings) = (candidate_set(), noise(), Settings::default());
         assert_eq!(candidate_set.places().len(), 4);
-        let gathered = gathered(3, SAMPLES, 9000, 6.0, 0.0);
+        let gathered = gathered(3, SAMPLES, &[(9000, 6.0)], 0.0);
         let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise, &settings);
         let fit = scorer.fit(&[]).unwrap();
         let ranked = scorer.rank(&fit);
@@ -739,5 +746,36 @@ mod tests {
         let left = scorer.rank(&fit);
         assert!(left.all.iter().all(|s| s.candidate.instance != "one"));
         assert!(transient(&left, "other").delta_chi2 < 20.0);
+    }
+
+    /// An event at the first of two times is named at "one"; "both" could have made it too. It stays at that time, to be
+    /// compared, and not at the second time, where six times there is nothing (it would have more of the noise there than
+    /// beside the named one in all six once in 64). Where something happened at the second time as well, it is there.
+    #[test]
+    fn what_could_have_made_a_named_event_stays_at_its_time() {
+        let (mut candidate_set, noise, settings) = (candidate_set(), noise(), Settings::default());
+        let times = [("at_ns", 9_000_000_000_000), ("at_ns", 12_000_000_000_000)];
+        for instance in [2, 3] {
+            let before = candidate_set.coefficients[instance].forms[0].clone();
+            let at = |k: usize| {
+                let terms: Vec<_> = before.terms.iter().map(|t| (t.channel, 4 + k, t.factor)).collect();
+                form(&times[k..=k], &terms)
+            };
+            candidate_set.coefficients[instance].forms = vec![at(0), at(1)];
+        }
+        let rival = |seed: u64, later: f64| {
+            let mut gathered = gathered(seed, SAMPLES, &[(9000, 6.0), (12_000, later)], 0.0);
+            gathered.transients.tried = 1e4;
+            let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise, &settings);
+            let named = candidate_set.candidate(&[2], 0);
+            let forms = crate::screen::screen(&scorer, &[named.clone()]).unwrap().forms;
+            let of = |instance: &str| forms.iter().find(|f| f.transient && f.instance == instance).unwrap();
+            assert_eq!(of("one").parts, named.parts);
+            of("both").parts[0].1.shape["at_ns"].clone()
+        };
+        for seed in 1..=6 {
+            assert_eq!(rival(seed, 0.0), times[0].1);
+        }
+        assert_eq!(rival(7, 6.0), times[1].1);
     }
 }

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use dragfree_estimation::spectra::FIRST_BIN;
 use serde_json::{Map, Value};
 
-use crate::candidates::Candidate;
+use crate::candidates::{Candidate, Coefficient};
 use crate::diagnosis::{Trials, family};
 use crate::gram::LONG;
 use crate::scores::{CandidateScorer, Fit, IdentificationError, Scored, WithoutExcess};
@@ -37,7 +37,9 @@ pub struct RefinementRequest {
     pub shape: Map<String, Value>,
 }
 
-/// Chooses the form of each candidate beside `named` effects; that of a named one beside the others.
+/// Chooses the form of each candidate beside `named` effects; that of a named one beside the others. A transient that is
+/// not significant beside them has the form that it would have in place of the one that it can best replace: the
+/// likelihood compares the two at the same time.
 ///
 /// # Errors
 /// [`IdentificationError`]: too little data, or a model that cannot be fitted.
@@ -53,14 +55,29 @@ pub fn screen(scorer: &CandidateScorer<'_>, named: &[Candidate]) -> Result<Scree
         shape: s.candidate.parts[0].1.shape.clone(),
     };
     let requests = ranked.all.iter().filter(stands_out).map(request).collect();
+    let certain = ranked.all.iter().filter(|s| trials.p_value_of(s).0 < scorer.settings.false_alarm);
+    let significant: Vec<Candidate> = certain.map(|s| s.candidate.clone()).collect();
+    let mut rivals: Vec<Scored> = Vec::new();
     let mut forms = refined(scorer, &fit, ranked.all, &trials)?;
     for (i, candidate) in named.iter().enumerate() {
         let mut others = named.to_vec();
         others.remove(i);
         let without = scorer.fit(&others)?;
-        let own = scorer.rank_where(&without, |c| (&c.effect, &c.instance) == (&candidate.effect, &candidate.instance));
-        let form = refined(scorer, &without, own.all, &trials)?.into_iter().next();
+        let own = |c: &Coefficient| (&c.effect, &c.instance) == (&candidate.effect, &candidate.instance);
+        let ranked = scorer.rank_where(&without, own);
+        let form = refined(scorer, &without, ranked.all, &trials)?.into_iter().next();
         forms.insert(i, form.unwrap_or_else(|| candidate.clone()));
+        if candidate.transient {
+            rivals.extend(scorer.rank_where(&without, |c| c.transient && !own(c)).all);
+        }
+    }
+    rivals.sort_by(|a, b| a.delta_chi2.total_cmp(&b.delta_chi2));
+    // The best one comes last and stays.
+    for rival in rivals {
+        let place = |f: &&mut Candidate| f.transient && f.name() == rival.candidate.name();
+        if let Some(form) = forms.iter_mut().filter(|f| !named.contains(f) && !significant.contains(*f)).find(place) {
+            *form = rival.candidate;
+        }
     }
     Ok(Screened { forms, tried: ranked.tried, unobservable: ranked.unobservable, requests })
 }
@@ -98,9 +115,7 @@ fn refined(
     by_p_value(&mut ranked);
     let mut forms: Vec<Candidate> = ranked.into_iter().map(|s| s.candidate).collect();
     if let Some(WithoutExcess { plain, bands, .. }) = scorer.without_excess(fit) {
-        let of_ranked = |c: &crate::candidates::Coefficient| {
-            forms.iter().any(|f| (&f.effect, &f.instance) == (&c.effect, &c.instance))
-        };
+        let of_ranked = |c: &Coefficient| forms.iter().any(|f| (&f.effect, &f.instance) == (&c.effect, &c.instance));
         let mut of_excess = scorer.rank_where(&plain, of_ranked).all;
         by_p_value(&mut of_excess);
         for scored in of_excess.into_iter().take(scorer.settings.max_excess_candidates) {

@@ -47,6 +47,11 @@ impl Spectrum {
         2.0 * k / (1.0 + 2.0 * SEGMENT_CORRELATION * (k - 1.0) / k)
     }
 
+    /// Inverse of the relative variance of a bin, for sums over many neighbouring bins, which are correlated.
+    pub fn bin_weight(&self) -> f64 {
+        self.dof() / (2.0 * BIN_CORRELATION)
+    }
+
     /// Mean of `psd/model` over the bins in `band_hz`, and its expected scatter; `None` when the band holds no bin.
     pub fn ratio(&self, band_hz: std::ops::Range<f64>, model: impl Fn(f64) -> f64) -> Option<Ratio> {
         let inside = self.frequency_hz.iter().zip(&self.psd).filter(|(f, _)| band_hz.contains(f));

@@ -19,9 +19,9 @@ const SEGMENT_S: f64 = 204.8;
 /// Lowest frequency of the fit, Hz; below, coloured sensing noise and slow torques are not negligible.
 const LOWEST_HZ: f64 = 0.01;
 
-/// Natural logarithm of measured over stated power above which the measured level is used: five standard deviations of
-/// the torque level.
-const SIGNIFICANT_LOG_RATIO: f64 = 0.25;
+/// A measured level is used where its logarithm differs from that of the stated one by this many σ: by chance once in 150
+/// days, with a hundred levels measured in a day.
+const SIGNIFICANT_SIGMAS: f64 = 4.0;
 
 /// Noise power relative to the mission file.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -67,27 +67,50 @@ pub fn measure(channels: &[[f64; 3]], rate_hz: f64, held: &Vector3<f64>, readout
     if longest.len() < 8 * segment {
         return NoiseScale::nominal();
     }
-    let measured: Vec<(f64, f64)> = (0..3)
+    let measured: Vec<[Level; 2]> = (0..3)
         .filter_map(|axis| {
             let channel: Vec<f64> = longest.iter().map(|row| row[axis]).collect();
             let spectrum = welch(&channel, rate_hz, segment).ok()?;
+            let weight = spectrum.bin_weight();
             let bins: Vec<Bin> = spectrum
                 .frequency_hz
                 .iter()
                 .zip(&spectrum.psd)
                 .filter(|(f, _)| (LOWEST_HZ..0.49 * rate_hz).contains(*f))
-                .map(|(f, s)| Bin { frequency_hz: *f, psd: *s, weight: 1.0 })
+                .map(|(f, s)| Bin { frequency_hz: *f, psd: *s, weight })
                 .collect();
-            let level = levels::fit(&bins, 1.0 / rate_hz)?;
-            Some((level.held / held[axis], level.readout / readout))
+            let fitted = levels::fit(&bins, 1.0 / rate_hz)?;
+            let ratios = [fitted.levels.held / held[axis], fitted.levels.readout / readout];
+            Some([0, 1].map(|i| Level { log: ratios[i].ln(), sigma: fitted.sigma[i] }))
         })
         .collect();
-    let significant = |ratio: f64| if ratio.ln().abs() > SIGNIFICANT_LOG_RATIO { ratio } else { 1.0 };
     match measured.as_slice() {
         [x, y, z] => NoiseScale {
-            torque: Vector3::new(x.0, y.0, z.0).map(significant),
-            sensing: significant((x.1 * y.1 * z.1).cbrt()),
+            torque: Vector3::new(x[0], y[0], z[0]).map(Level::if_significant),
+            sensing: Level::mean(&[x[1], y[1], z[1]]).if_significant(),
         },
         _ => NoiseScale::nominal(),
+    }
+}
+
+/// A measured level over the stated one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Level {
+    /// Natural logarithm.
+    log: f64,
+    sigma: f64,
+}
+
+impl Level {
+    /// The mean of independent measurements of one level.
+    fn mean(of: &[Self; 3]) -> Self {
+        let weight = |level: &Self| level.sigma.powi(-2);
+        let sum: f64 = of.iter().map(weight).sum();
+        Self { log: of.iter().map(|level| weight(level) * level.log).sum::<f64>() / sum, sigma: sum.powf(-0.5) }
+    }
+
+    /// The ratio of powers, one where it may be chance.
+    fn if_significant(self) -> f64 {
+        if self.log.abs() > SIGNIFICANT_SIGMAS * self.sigma { self.log.exp() } else { 1.0 }
     }
 }
