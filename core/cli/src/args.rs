@@ -276,6 +276,12 @@ pub(crate) struct Diagnose {
     /// Say what length of data would tell a named effect from what it cannot be told from
     #[arg(long)]
     pub(crate) next: bool,
+    /// Keep what a later diagnosis of several products needs of this one, in a file beside it
+    #[arg(long, conflicts_with = "extracts")]
+    pub(crate) keep_extract: bool,
+    /// Diagnose from the extracts of the products, without telemetry
+    #[arg(long)]
+    pub(crate) extracts: bool,
 }
 
 #[derive(Debug, Subcommand)]

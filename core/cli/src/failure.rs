@@ -24,6 +24,9 @@ pub(crate) enum Refusal {
     /// A diagnosis that names no effect to add.
     #[error("{}: {what}", path.display())]
     Diagnosis { path: PathBuf, what: String },
+    /// An extract of several products.
+    #[error("--keep-extract keeps the extract of one product, and {0} were named; diagnose each by itself")]
+    Extracts(usize),
     /// A skeleton would have to share a folder.
     #[error("{} is not empty; name another folder with --out", .0.display())]
     NoPluginFolder(PathBuf),

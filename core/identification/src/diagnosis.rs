@@ -3,7 +3,8 @@
 
 use dragfree_estimation::levels::Levels;
 use dragfree_estimation::verdict::chi2_per_dof_at;
-use serde::Serialize;
+use dragfree_schema::Settings;
+use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 use std::collections::BTreeMap;
 
@@ -105,7 +106,7 @@ pub struct OfProduct {
     pub sigma: f64,
 }
 
-/// Whether a coefficient is the same in all products: the weighted sum of squares about the weighted mean.
+/// Whether coefficients are the same in all products: the weighted sum of squares about the weighted mean.
 #[derive(Clone, Debug, Serialize)]
 pub struct Constancy {
     /// Sum of squares.
@@ -126,12 +127,21 @@ impl Constancy {
         }
         let mean = known.iter().map(|(x, w)| x * w).sum::<f64>() / known.iter().map(|(_, w)| w).sum::<f64>();
         let chi2 = known.iter().map(|(x, w)| w * (x - mean).powi(2)).sum::<f64>();
-        let dof = known.len() - 1;
-        Some(Self { chi2, dof, p_value: ln_chi2_above(chi2, dof as f64).exp() })
+        Some(Self::new(chi2, known.len() - 1))
+    }
+
+    /// Of a sum of squares.
+    pub fn new(chi2: f64, dof: usize) -> Self {
+        Self { chi2, dof, p_value: ln_chi2_above(chi2, dof as f64).exp() }
     }
 }
 
 impl Found {
+    /// Of a level of noise: whether it differs from the stated one for certain, and by more than a mission file's may.
+    pub fn standing(&self, settings: &Settings) -> (bool, bool) {
+        (self.p_value < settings.false_alarm, self.value.ln().abs() > settings.level_tolerance.ln_1p())
+    }
+
     /// As a level that is told and is no cause.
     pub fn level(&self) -> OtherLevel {
         let (effect, instance) = (self.effect.clone(), self.instance.clone());
@@ -209,6 +219,8 @@ pub struct Diagnosis {
     pub unexplained: Option<Unexplained>,
     /// Formulas that would explain it, as a model states them.
     pub formulas: Vec<Found>,
+    /// Whether several products agree beside what is named, in all coefficients at once; none of one product.
+    pub agreement: Option<Constancy>,
     /// Why the model is not called sufficient although neither a candidate was accepted nor an excess was found.
     pub reasons: Vec<String>,
     /// Levels of noise other than declared, certain, and within the tolerance of a mission file.
@@ -225,6 +237,7 @@ pub struct Diagnosis {
 ///
 /// With equal weights of all forms, an effect of one form would pay for the ten thousand pairs of thermometers and lags
 /// of another.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Trials {
     /// Trials per family: forms and levels of an effect, and those of the transient search.
     forms: BTreeMap<String, f64>,
@@ -257,6 +270,14 @@ impl Trials {
             forms.insert(LINE.to_owned(), lines);
         }
         Self { forms }
+    }
+
+    /// Adds those of other data: what acts once or at one frequency was searched for there as well.
+    pub fn add(&mut self, other: &Self) {
+        for (family, trials) in &other.forms {
+            let own = self.forms.entry(family.clone()).or_default();
+            *own = if [TRANSIENT, LINE].contains(&family.as_str()) { *own + trials } else { own.max(*trials) };
+        }
     }
 
     /// Forms and levels of all effects.

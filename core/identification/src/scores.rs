@@ -768,7 +768,7 @@ mod tests {
             gathered.transients.tried = 1e4;
             let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise, &settings);
             let named = candidate_set.candidate(&[2], 0);
-            let forms = crate::screen::screen(&scorer, &[named.clone()]).unwrap().forms;
+            let forms = crate::screen::screen(&scorer, std::slice::from_ref(&named)).unwrap().forms;
             let of = |instance: &str| forms.iter().find(|f| f.transient && f.instance == instance).unwrap();
             assert_eq!(of("one").parts, named.parts);
             of("both").parts[0].1.shape["at_ns"].clone()

@@ -3,32 +3,29 @@
 //! The data are read for transients, for the spectra of all candidates, which choose the form of each, a third time if
 //! a shape can be refined, and then until the likelihood of the innovations, which decides, has settled.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 
 use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
-use dragfree_engine::product::Written;
 use dragfree_engine::run::Progress;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::decimate::SLOW_HZ;
-use dragfree_identification::diagnosis::{
-    self, Constancy, Diagnosis, Found, LIMIT_QUANTILE, LINE, Limit, OfProduct, Separation, TRANSIENT, Trials,
-    UNOBSERVABLE, Unexplained,
-};
-use dragfree_identification::innovations::decision::{Fitted, Quadratic};
+use dragfree_identification::diagnosis::{self, Diagnosis, Found, Trials, UNOBSERVABLE, Unexplained};
 use dragfree_identification::lines::Line;
 use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::screen::{RefinementRequest, Screened, screen};
 use dragfree_identification::slow_forces::slow_forces;
 use dragfree_identification::transient::Detection;
-use dragfree_schema::Settings;
-use serde_json::{Map, json};
+use dragfree_schema::{NoiseProcess, Settings};
+use serde_json::json;
 
 use crate::WorkflowError;
-use crate::likelihood::{Decided, Judge, Meaning, PASSES, Point, moved, one_pass, step};
+use crate::answer::{Evidence, apart, contradict, found, limits, louder, noise_levels, verdict};
+use crate::extract::Extract;
+use crate::likelihood::{Decided, PASSES, Point, moved, one_pass, step, step_of_model};
 use crate::proposals::{FORMULA, Proposal, proposals};
-use crate::replay::{AT_NS, FINE, Pass, Replay, What, sum};
+use crate::replay::{FINE, Pass, Replay, What, sum};
 
 /// A diagnosis and the sums that chose the forms of the candidates.
 pub struct Diagnosed {
@@ -38,15 +35,19 @@ pub struct Diagnosed {
     pub diagnosis: Diagnosis,
     /// Thresholds.
     pub settings: Settings,
+    /// What it leaves for a diagnosis of several products; none where there are several.
+    pub extract: Option<Extract>,
 }
 
-/// Diagnoses the data of products of one model. `progress` is told the pass and the number of the product.
+/// Diagnoses the data of products of one model; `keeps` an extract of one product. `progress` is told the pass and the
+/// number of the product.
 ///
 /// # Errors
 /// [`WorkflowError`]: an input has changed, the products do not belong together, there is too little data, or a stage
 /// declares noise that cannot be filtered.
 pub fn diagnose(
     replay: &Replay<'_>,
+    keeps: bool,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Diagnosed, WorkflowError> {
     let settings = replay.settings()?;
@@ -85,10 +86,22 @@ pub fn diagnose(
     tried.insert(FORMULA.to_owned(), formulas);
     tried.retain(|effect, _| !has_parameter(replay.registry, effect, FREQUENCY_HZ));
     let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
-    let evidence = Evidence { trials: Trials::new(&scorer, &tried), least: settings.false_alarm, replay, proposals };
-    let mut diagnosis = decide(settings, &record, &scorer, screened, &evidence, progress)?;
-    contradict(&mut diagnosis, replay);
-    Ok(Diagnosed { diagnosis, settings: settings.clone(), record })
+    let (registry, products) = (replay.registry, replay.products);
+    let trials = Trials::new(&scorer, &tried);
+    let evidence = Evidence { trials, least: settings.false_alarm, registry, products, proposals };
+    let last = decide(replay, settings, &record, &scorer, screened, &evidence, progress)?;
+    let Last { decided, screened, moving, .. } = &last;
+    let mut diagnosis = answer(settings, &record, &scorer, decided, screened, &evidence, moving)?;
+    contradict(&mut diagnosis, products);
+    let extract = match products {
+        [product] if keeps => {
+            let about_model = about_model(replay, &record, &last, &evidence, progress)?;
+            let levels = noise_levels(decided, &record);
+            Extract::new(product, &about_model, &diagnosis, levels, &evidence.trials)
+        }
+        _ => None,
+    };
+    Ok(Diagnosed { diagnosis, settings: settings.clone(), extract, record })
 }
 
 /// A model's entry of a line.
@@ -101,13 +114,14 @@ fn entry_of(line: &Line) -> EffectEntry {
 /// Decides by the likelihood of the innovations among the forms that the spectra choose, beside the effects that are
 /// named so far: passes until nothing moves.
 fn decide(
+    replay: &Replay<'_>,
     settings: &Settings,
     record: &Record,
     scorer: &CandidateScorer<'_>,
     mut screened: Screened,
     evidence: &Evidence<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
-) -> Result<Diagnosis, WorkflowError> {
+) -> Result<Last, WorkflowError> {
     let fit = scorer.fit(&[])?;
     let model = &record.candidate_set.coefficients[..record.candidate_set.model()];
     let start = model.iter().zip(fit.estimate.theta.iter()).map(|(c, value)| (c.name.clone(), *value)).collect();
@@ -124,9 +138,9 @@ fn decide(
     // A pass that fits constants beside what is named comes first, at the start and after a form has changed: they are
     // 1e5 σ away, and a filter would take them for noise.
     let (mut opening, mut passes) = (true, 0);
-    let (decided, screened, moving) = loop {
+    loop {
         let chosen: Vec<EffectEntry> = screened.forms.iter().map(|form| evidence.entry(form)).collect();
-        let decided = one_pass(evidence.replay, &chosen, &slow, opening, &point, evidence, progress)?;
+        let decided = one_pass(replay, &chosen, &slow, opening, &point, evidence, progress)?;
         let next = step(&point, &decided);
         if opening {
             opening = false;
@@ -141,7 +155,7 @@ fn decide(
         }
         point = next;
         if passes > 1 && moving.is_empty() || passes == PASSES {
-            break (decided, screened, moving);
+            return Ok(Last { decided, screened, moving, slow, point });
         }
         if now != named {
             let beside = screen(scorer, &now)?;
@@ -158,8 +172,45 @@ fn decide(
             slow = slow_forces(scorer, &fit, &record.noise);
             screened = Screened { forms: beside.forms, ..screened };
         }
+    }
+}
+
+/// The last pass of a decision, and where the next one would be made.
+struct Last {
+    decided: Decided,
+    screened: Screened,
+    /// What had not settled.
+    moving: BTreeSet<String>,
+    slow: Vec<NoiseProcess>,
+    point: Point,
+}
+
+/// A pass about the model alone, for the extract of a product. Likelihoods of days add where they are taken about the
+/// same point: what one day names, another has not. What is named has its form of this day, everything else the first of
+/// its forms, which is the same on every day.
+fn about_model(
+    replay: &Replay<'_>,
+    record: &Record,
+    last: &Last,
+    evidence: &Evidence<'_>,
+    progress: &mut dyn FnMut(Pass, usize, Progress),
+) -> Result<Decided, WorkflowError> {
+    let named = named_forms(&last.decided, &last.screened.forms);
+    let set = &record.candidate_set;
+    let places = set.places();
+    let form = |screened: &Candidate| {
+        let of = |place: &&Vec<usize>| set.candidate(place, 0).name() == screened.name();
+        let first = places.iter().find(of).map(|place| set.candidate(place, 0));
+        if named.contains(screened) { screened.clone() } else { first.unwrap_or_else(|| screened.clone()) }
     };
-    answer(settings, record, scorer, &decided, &screened, evidence, &moving)
+    let entries: Vec<EffectEntry> = last.screened.forms.iter().map(|f| evidence.entry(&form(f))).collect();
+    let mut point = step_of_model(&last.point, &last.decided);
+    // The first of the two finds the means of series that are new. Levels are those beside what is named.
+    point.levels.clone_from(&last.point.levels);
+    let opening = one_pass(replay, &entries, &last.slow, true, &point, evidence, progress)?;
+    point = step(&point, &opening);
+    point.levels.clone_from(&last.point.levels);
+    one_pass(replay, &entries, &last.slow, false, &point, evidence, progress)
 }
 
 /// Names of the effects that are in one of two lists in a form in which they are not in the other.
@@ -174,59 +225,11 @@ fn differences(a: &[Candidate], b: &[Candidate]) -> BTreeSet<String> {
 fn named_forms(decided: &Decided, forms: &[Candidate]) -> Vec<Candidate> {
     let named = |c: &&Candidate| {
         let mut all = decided.selection.chosen.iter().map(|f| &decided.candidates[f.candidate]);
-        all.any(|(effect, instance, _)| (effect, instance) == (&c.effect, &c.instance))
+        all.any(|place| (&place.effect, &place.instance) == (&c.effect, &c.instance))
     };
     let mut all: Vec<Candidate> = forms.iter().filter(named).cloned().collect();
     all.sort_by_key(Candidate::name);
     all
-}
-
-/// Corrected p-values of the effects of a replay.
-struct Evidence<'a> {
-    trials: Trials,
-    /// Probability from which another explanation is named beside the chosen one.
-    least: f64,
-    replay: &'a Replay<'a>,
-    /// Formulas among the candidates.
-    proposals: Vec<Proposal>,
-}
-
-impl Evidence<'_> {
-    /// A model's entry that makes a candidate in its form.
-    fn entry(&self, candidate: &Candidate) -> EffectEntry {
-        if let Some(proposal) = self.proposal(&candidate.effect, &candidate.instance) {
-            return proposal.entry.clone();
-        }
-        let mut entry = EffectEntry::new(&candidate.effect, &candidate.instance);
-        let shape = candidate.parts.iter().flat_map(|(_, form)| &form.shape);
-        entry.parameters = shape.filter_map(|(k, v)| Some((k.clone(), toml::Value::try_from(v).ok()?))).collect();
-        entry
-    }
-
-    /// The formula of a candidate that is one.
-    fn proposal(&self, effect: &str, instance: &str) -> Option<&Proposal> {
-        self.proposals.iter().find(|p| (p.entry.id.as_str(), p.entry.instance.as_str()) == (effect, instance))
-    }
-
-    /// What acts once was searched for at every time, and what acts at one frequency at every frequency.
-    fn family<'b>(&self, effect: &'b str) -> &'b str {
-        let has = |name| has_parameter(self.replay.registry, effect, name);
-        match (has(AT_NS), has(FREQUENCY_HZ)) {
-            (true, _) => TRANSIENT,
-            (_, true) => LINE,
-            _ => effect,
-        }
-    }
-}
-
-impl Judge for Evidence<'_> {
-    fn log10_p(&self, effect: &str, gain: f64, dof: usize) -> f64 {
-        self.trials.p_value(self.family(effect), gain, dof as f64).1
-    }
-
-    fn ln_prior(&self, effect: &str) -> f64 {
-        -self.trials.of(self.family(effect)).ln()
-    }
 }
 
 /// The answer that the last pass gives.
@@ -242,9 +245,9 @@ fn answer(
     let forms = &screened.forms;
     let unexplained = diagnosis::remaining(scorer, &named_forms(decided, forms))?;
     let mut named: Vec<Found> =
-        decided.selection.chosen.iter().map(|f| found(settings, decided, f, forms, evidence, true)).collect();
+        decided.selection.chosen.iter().map(|f| found(settings, decided, f, evidence, true)).collect();
     let mut others: Vec<Found> =
-        decided.selection.rest.iter().map(|f| found(settings, decided, f, forms, evidence, false)).collect();
+        decided.selection.rest.iter().map(|f| found(settings, decided, f, evidence, false)).collect();
     let is_formula = |f: &Found| evidence.proposal(&f.effect, &f.instance).is_some();
     let formulas: Vec<Found> = named.extract_if(.., |f| is_formula(f)).collect();
     others.retain(|f| !is_formula(f));
@@ -259,10 +262,9 @@ fn answer(
     }
     let unexplained = followed(unexplained, &formulas, evidence, scorer);
     let mut levels = Vec::new();
-    for f in louder(decided, record, evidence) {
-        let certain = f.p_value < settings.false_alarm;
-        let beyond = f.value.ln().abs() > settings.level_tolerance.ln_1p();
-        match (certain, beyond) {
+    let measured = noise_levels(decided, record);
+    for f in louder(&measured, decided.chi2, decided.numbers, evidence) {
+        match f.standing(settings) {
             (true, true) => named.push(Found { accepted: true, ..f }),
             (true, false) => levels.push(f.level()),
             (false, _) => {}
@@ -280,15 +282,12 @@ fn answer(
         let names: Vec<&str> = moving.iter().map(String::as_str).collect();
         reasons.push(format!("the likelihood is not settled after {PASSES} passes: {} still move", names.join(", ")));
     }
-    let verdict = match (named.is_empty(), unexplained.is_some() || !reasons.is_empty()) {
-        (false, _) => "missing",
-        (true, true) => "unexplained",
-        (true, false) => "sufficient",
-    };
+    let agreement = decided.agreement();
+    reasons.extend(apart(agreement.as_ref(), settings));
+    let verdict = verdict(&named, unexplained.is_some() || !reasons.is_empty());
     others.truncate(settings.max_evaluated);
     named.extend(others);
-    let beside_constants = decided.selection.unobservable.iter().map(|c| &decided.candidates[*c]);
-    let beside_constants = beside_constants.map(|(effect, instance, _)| format!("{effect}:{instance}"));
+    let beside_constants = decided.selection.unobservable.iter().map(|c| decided.candidates[*c].name());
     let unobservable = screened.unobservable.iter().cloned().chain(beside_constants);
     let unobservable = unobservable.map(|name| (name, UNOBSERVABLE.to_owned()));
     Ok(Diagnosis {
@@ -296,9 +295,10 @@ fn answer(
         false_alarm_rate: settings.false_alarm,
         tried: evidence.trials.total(),
         candidates: named,
-        upper_limits: decided.selection.rest.iter().flat_map(|f| limits(decided, f, forms, evidence)).collect(),
+        upper_limits: decided.selection.rest.iter().flat_map(|f| limits(decided, f, evidence)).collect(),
         unexplained,
         formulas,
+        agreement,
         reasons,
         levels,
         transients: scorer.gathered.transients.certain(settings.false_alarm).map(|h| json!(h)).collect(),
@@ -369,204 +369,13 @@ fn follows_an_excess(
     Ok(all.map(|c| (c.effect.clone(), c.instance.clone())).collect())
 }
 
-/// Values and σ of a candidate's coefficients; index of the largest over its σ.
-fn leading(fitted: &Fitted) -> (Vec<(f64, f64)>, usize) {
-    let sigma = |k: usize| fitted.covariance[(k, k)].max(0.0).sqrt();
-    let values: Vec<(f64, f64)> = fitted.values.iter().enumerate().map(|(k, value)| (*value, sigma(k))).collect();
-    let size = |k: &usize| (values[*k].0 / values[*k].1).abs();
-    let lead = (0..values.len()).max_by(|a, b| size(a).total_cmp(&size(b))).unwrap_or(0);
-    (values, lead)
-}
-
-fn coefficient(decided: &Decided, parameter: usize) -> (&str, &str) {
-    match &decided.parameters[parameter] {
-        (name, Meaning::Coefficient(c)) => (name, &c.unit),
-        (name, _) => (name, "1"),
-    }
-}
-
-fn found(
-    settings: &Settings,
-    decided: &Decided,
-    fitted: &Fitted,
-    forms: &[Candidate],
-    evidence: &Evidence<'_>,
-    accepted: bool,
-) -> Found {
-    let (effect, instance, own) = &decided.candidates[fitted.candidate];
-    let (values, lead) = leading(fitted);
-    let form = forms.iter().find(|c| (&c.effect, &c.instance) == (effect, instance));
-    let dof = own.len() as f64;
-    let (p_value, log10_p_value) = evidence.trials.p_value(evidence.family(effect), fitted.gain, dof);
-    let (mut offset_shift_m, mut offset_shift_sigma) = (BTreeMap::new(), BTreeMap::new());
-    let named: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
-    let without: Vec<usize> = named.iter().copied().filter(|c| *c != fitted.candidate).collect();
-    let with: Vec<usize> = without.iter().copied().chain([fitted.candidate]).collect();
-    let by_product =
-        if accepted { by_product(decided, &with, own[lead], evidence.replay.products) } else { Vec::new() };
-    let [(with, _), (without, sigma)] = [with, without].map(|set| decided.quadratic.solution(&set));
-    for (i, (name, meaning)) in decided.parameters.iter().enumerate() {
-        if matches!(meaning, Meaning::Coefficient(c) if !c.candidate && c.unit == "m") {
-            offset_shift_m.insert(name.clone(), without[i] - with[i]);
-            offset_shift_sigma.insert(name.clone(), (without[i] - with[i]) / sigma[i]);
-        }
-    }
-    let channels: BTreeSet<&String> =
-        own.iter().filter_map(|i| decided.channels.get(&decided.parameters[*i].0)).flatten().collect();
-    let rivals: Vec<usize> = fitted.alternatives.iter().filter(|(_, p)| *p > evidence.least).map(|(c, _)| *c).collect();
-    let name_of = |c: &usize| {
-        let (effect, instance, _) = &decided.candidates[*c];
-        evidence.proposal(effect, instance).map_or_else(|| format!("{effect}:{instance}"), |p| p.words.clone())
-    };
-    let set = &named;
-    let separation = |c: &usize| Separation::new(name_of(c), decided.quadratic.separation(fitted.candidate, *c, set));
-    let separations: Vec<Separation> = rivals.iter().map(separation).collect();
-    let before = decided.chi2 / decided.numbers;
-    let (name, unit) = coefficient(decided, own[lead]);
-    Found {
-        effect: effect.clone(),
-        instance: instance.clone(),
-        coefficient: name.to_owned(),
-        value: values[lead].0,
-        sigma: values[lead].1,
-        unit: unit.to_owned(),
-        shape: match (evidence.proposal(effect, instance), form) {
-            (Some(p), _) => p.entry.parameters.iter().map(|(k, value)| (k.clone(), json!(value))).collect(),
-            (None, Some(form)) => form.parts[0].1.shape.clone(),
-            (None, None) => Map::new(),
-        },
-        coefficients: own
-            .iter()
-            .zip(&values)
-            .map(|(i, (value, sigma))| {
-                let (name, unit) = coefficient(decided, *i);
-                json!({ "name": name, "value": value, "sigma": sigma, "unit": unit })
-            })
-            .collect(),
-        delta_chi2: fitted.gain,
-        p_value,
-        log10_p_value,
-        delta_bic: dof * decided.numbers.ln() - fitted.gain,
-        in_range: own.iter().zip(&fitted.values).all(|(i, value)| match &decided.parameters[*i].1 {
-            Meaning::Coefficient(c) => c.lower < *value && *value < c.upper,
-            Meaning::Level | Meaning::Power => true,
-        }),
-        chi2_per_dof_before: if accepted { before + fitted.gain / decided.numbers } else { before },
-        chi2_per_dof_after: if accepted { before } else { before - fitted.gain / decided.numbers },
-        offset_shift_m,
-        offset_shift_sigma,
-        channels: channels.into_iter().cloned().collect(),
-        confounders: rivals.iter().map(name_of).collect(),
-        separations,
-        accepted,
-        refused: (!accepted && p_value < evidence.least).then(|| {
-            if fitted.beyond > settings.range_sigmas.powi(2) {
-                "its best value lies outside its physical range".to_owned()
-            } else {
-                "it may be what the form of a named effect leaves, or as many effects as the settings allow are named"
-                    .to_owned()
-            }
-        }),
-        constancy: Constancy::of(&by_product),
-        by_product,
-    }
-}
-
-/// What each product alone says of a parameter, with a set of candidates.
-fn by_product(decided: &Decided, set: &[usize], parameter: usize, products: &[Written]) -> Vec<OfProduct> {
-    let of = |(quadratic, written): (&Quadratic, &Written)| {
-        let (values, sigma) = quadratic.solution(set);
-        OfProduct { product: written.product.id().to_owned(), value: values[parameter], sigma: sigma[parameter] }
-    };
-    decided.by_product.iter().zip(products).map(of).collect()
-}
-
-/// Levels of noise that effects could state, as the likelihood has them.
-fn louder(decided: &Decided, record: &Record, evidence: &Evidence<'_>) -> Vec<Found> {
-    let all = record.candidate_set.coefficients.iter().filter(|c| !c.noise.is_empty());
-    all.filter_map(|c| {
-        let i = decided.parameters.iter().position(|(name, m)| *name == c.noise && matches!(m, Meaning::Level))?;
-        let (ln, relative) = (decided.selection.values[i], decided.selection.sigma[i]);
-        // A level that the model states is in the noise already; what is measured is relative to it.
-        let value = ln.exp() * if c.candidate { 1.0 } else { c.initial };
-        let gain = (ln / relative).powi(2);
-        let (p_value, log10_p_value) = evidence.trials.p_value(&c.effect, gain, 1.0);
-        let sigma = relative * value;
-        let before = decided.chi2 / decided.numbers;
-        Some(Found {
-            effect: c.effect.clone(),
-            instance: c.instance.clone(),
-            coefficient: c.name.clone(),
-            value,
-            sigma,
-            unit: "1".to_owned(),
-            shape: Map::new(),
-            coefficients: vec![json!({ "name": c.name, "value": value, "sigma": sigma, "unit": "1" })],
-            delta_chi2: gain,
-            p_value,
-            log10_p_value,
-            delta_bic: decided.numbers.ln() - gain,
-            in_range: true,
-            chi2_per_dof_before: before + gain / decided.numbers,
-            chi2_per_dof_after: before,
-            offset_shift_m: BTreeMap::new(),
-            offset_shift_sigma: BTreeMap::new(),
-            channels: channels_of(record, &c.noise),
-            confounders: Vec::new(),
-            separations: Vec::new(),
-            accepted: false,
-            refused: None,
-            by_product: Vec::new(),
-            constancy: None,
-        })
-    })
-    .collect()
-}
-
-/// Channels that a component of noise enters.
-fn channels_of(record: &Record, component: &str) -> Vec<String> {
-    let all = record.noise.iter().filter(|p| p.components.iter().any(|name| name == component));
-    all.flat_map(|p| {
-        let k = p.components.iter().position(|name| name == component).unwrap_or(0);
-        p.enters.iter().filter(move |(_, gains)| gains[k] != 0.0).map(|(channel, _)| channel.clone())
-    })
-    .collect()
-}
-
-/// Limits of a candidate's coefficients; none of a formula, which the data themselves have written.
-fn limits(decided: &Decided, fitted: &Fitted, forms: &[Candidate], evidence: &Evidence<'_>) -> Vec<Limit> {
-    let (effect, instance, own) = &decided.candidates[fitted.candidate];
-    if evidence.proposal(effect, instance).is_some() {
-        return Vec::new();
-    }
-    let form = forms.iter().find(|c| (&c.effect, &c.instance) == (effect, instance));
-    let limit = |(k, i): (usize, &usize)| {
-        let sigma = fitted.covariance[(k, k)].max(0.0).sqrt();
-        let (name, unit) = coefficient(decided, *i);
-        Limit {
-            effect: effect.clone(),
-            instance: instance.clone(),
-            coefficient: name.to_owned(),
-            limit_95: fitted.free[k].abs() + LIMIT_QUANTILE * sigma,
-            sigma,
-            unit: unit.to_owned(),
-            shape: form.map(|c| c.parts[0].1.shape.clone()).unwrap_or_default(),
-        }
-    };
-    own.iter().enumerate().map(limit).collect()
-}
-
-/// A model whose two solutions disagree is not sufficient, whatever the candidates say.
-fn contradict(diagnosis: &mut Diagnosis, replay: &Replay<'_>) {
-    let disagree = replay.products.iter().filter(|p| p.product.result.verdict.as_deref() == Some("disagree"));
-    let names: Vec<String> = disagree.map(|p| p.product.id().to_string()).collect();
-    if diagnosis.verdict == "sufficient" && !names.is_empty() {
-        diagnosis.verdict = "unexplained".to_owned();
-        diagnosis.reasons.push(format!("the recursive and the batch solution of {} disagree", names.join(", ")));
-    }
-}
-
 impl Diagnosed {
+    /// Number of effects that were tried, without transients.
+    pub fn effects(&self) -> usize {
+        let set = &self.record.candidate_set;
+        set.places().iter().filter(|p| !set.coefficients[p[0]].transient).count()
+    }
+
     /// Detected transients that no accepted candidate explains, by decreasing significance; of close ones the first.
     pub fn unexplained_transients(&self) -> Vec<&Detection> {
         let seen = self.record.gathered.transients.certain(self.diagnosis.false_alarm_rate);
@@ -597,7 +406,7 @@ mod tests {
             instance: "tm1.x".to_owned(),
             coefficient: "impulse.tm1.x".to_owned(),
             unit: "N s".to_owned(),
-            shape: Map::new(),
+            shape: serde_json::Map::new(),
             at_ns: 1_000_000_000 * at_s,
             significance: 10.0,
         };

@@ -2,9 +2,11 @@
 //! ladder of models. Each takes options, the registry of plugins and a callback for progress, and gives values; none
 //! prints, knows a terminal or asks a clock.
 
+mod answer;
 pub mod calibrate;
 pub mod compare;
 pub mod diagnose;
+pub mod extract;
 pub mod ladder;
 mod likelihood;
 mod proposals;
@@ -58,6 +60,12 @@ pub enum WorkflowError {
     /// Normal equations that cannot be used.
     #[error("{}: {what}", path.display())]
     Reference { path: PathBuf, what: String },
+    /// An extract that cannot be used or written.
+    #[error("extract {}: {what}", path.display())]
+    Extract { path: PathBuf, what: String },
+    /// Products of different models.
+    #[error("{product} has other coefficients in its model than {first}: name products of one model")]
+    OfOtherModel { product: String, first: String },
     /// The likelihood of innovations needs more than the stages declare.
     #[error("the likelihood of the innovations is not to be had: {0}")]
     NoLikelihood(String),

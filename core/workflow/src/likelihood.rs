@@ -12,9 +12,10 @@ use dragfree_engine::examine::{Examination, examine};
 use dragfree_engine::product::Written;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
-use dragfree_identification::innovations::decision::{Candidate, Evidence, Prior, Quadratic, Selection};
+use dragfree_identification::diagnosis::Constancy;
+use dragfree_identification::innovations::decision::{Candidate, Evidence, Prior, Quadratic, Selection, disagreement};
 use dragfree_identification::innovations::filter::{Start, Sums};
-use dragfree_schema::{Coefficient, NoiseProcess, PREDICTION_NEED, Settings};
+use dragfree_schema::{Coefficient, NoiseProcess, PREDICTION_NEED, Settings, Shape};
 use nalgebra::{DMatrix, DVector};
 
 mod pass;
@@ -66,13 +67,45 @@ pub(crate) enum Meaning {
     Power,
 }
 
+impl Meaning {
+    /// Values of the shape parameters of a candidate.
+    fn form(&self) -> Option<&Shape> {
+        match self {
+            Self::Coefficient(c) if c.candidate => Some(&c.shape),
+            _ => None,
+        }
+    }
+}
+
+/// An effect's instance that may be in the model or not, in one form.
+#[derive(Clone, Debug)]
+pub(crate) struct Place {
+    pub(crate) effect: String,
+    pub(crate) instance: String,
+    /// Values of the shape parameters.
+    pub(crate) shape: Shape,
+    /// Its parameters of the likelihood.
+    pub(crate) parameters: Vec<usize>,
+}
+
+impl Place {
+    /// `EFFECT:INSTANCE`.
+    pub(crate) fn name(&self) -> String {
+        format!("{}:{}", self.effect, self.instance)
+    }
+}
+
 /// The result: a selection with what its parameters stand for.
 pub(crate) struct Decided {
     pub(crate) selection: Selection,
     /// Name and meaning of each parameter.
     pub(crate) parameters: Vec<(String, Meaning)>,
-    /// Effect and instance of each candidate, with its parameters.
-    pub(crate) candidates: Vec<(String, String, Vec<usize>)>,
+    /// Candidates.
+    pub(crate) candidates: Vec<Place>,
+    /// What is known of sums of coefficients before any data.
+    surveys: Vec<(Vec<(String, f64)>, Prior)>,
+    /// Sums of each product.
+    parts: Vec<Part>,
     /// The likelihood, for what the model would be without one of the chosen.
     pub(crate) quadratic: Quadratic,
     /// That of each product by itself; none where there is only one.
@@ -90,6 +123,117 @@ pub(crate) struct Decided {
     pub(crate) not_tried: Vec<(String, String)>,
 }
 
+impl Decided {
+    /// The likelihood of the coefficients of one product, with the noise levels and the powers of time fitted: what adds
+    /// to that of other products. `None` of several products.
+    pub(crate) fn of_coefficients(&self) -> Option<CoefficientSums> {
+        let [part] = &self.parts[..] else { return None };
+        let kept = self.coefficients(|_| true);
+        let (information, score) = self.reduced(part, &kept);
+        let coefficient = |i: &usize| match &self.parameters[*i].1 {
+            Meaning::Coefficient(c) => Some((**c).clone()),
+            _ => None,
+        };
+        Some(CoefficientSums {
+            coefficients: kept.iter().filter_map(coefficient).collect(),
+            information,
+            score,
+            chi2: part.sums.chi2,
+            numbers: part.sums.numbers,
+            samples: part.sums.samples,
+            surveys: self.surveys.clone(),
+            channels: self.channels.clone(),
+        })
+    }
+
+    /// Whether several products agree in the coefficients of the model and of what is named; `None` of one product.
+    pub(crate) fn agreement(&self) -> Option<Constancy> {
+        let named: BTreeSet<usize> = self.selection.chosen.iter().map(|f| f.candidate).collect();
+        let chosen = |i: usize| named.iter().any(|c| self.candidates[*c].parameters.contains(&i));
+        let in_model = |i: usize| matches!(&self.parameters[i].1, Meaning::Coefficient(c) if !c.candidate);
+        let kept = self.coefficients(|i| chosen(i) || in_model(i));
+        let data: Vec<_> = self.parts.iter().map(|part| self.reduced(part, &kept)).collect();
+        let (chi2, dof) = disagreement(&data, self.numbers);
+        (dof > 0).then(|| Constancy::new(chi2, dof))
+    }
+
+    /// Parameters that are coefficients, of those that are asked for.
+    fn coefficients(&self, asked: impl Fn(usize) -> bool) -> Vec<usize> {
+        let coefficient = |i: &usize| matches!(self.parameters[*i].1, Meaning::Coefficient(_));
+        (0..self.parameters.len()).filter(coefficient).filter(|i| asked(*i)).collect()
+    }
+
+    /// Information of some coefficients in one product, and their score about zero, with the noise levels and the powers
+    /// of time fitted; others are zero.
+    fn reduced(&self, part: &Part, kept: &[usize]) -> (DMatrix<f64>, DVector<f64>) {
+        let mut sums = no_sums(self.parameters.len());
+        part.add_to(&mut sums);
+        let mut start = self.start.clone();
+        let others: BTreeSet<usize> = self.coefficients(|i| !kept.contains(&i)).into_iter().collect();
+        // About zero, and at zero.
+        let at = DVector::from_column_slice(&sums.score) + &sums.information * DVector::from_column_slice(&start);
+        for i in &others {
+            sums.information.row_mut(*i).fill(0.0);
+            sums.information.column_mut(*i).fill(0.0);
+        }
+        start.iter_mut().for_each(|x| *x = 0.0);
+        sums.score = at.as_slice().to_vec();
+        let single = |i: &usize| Candidate {
+            parameters: vec![*i],
+            lower: vec![f64::NEG_INFINITY],
+            upper: vec![f64::INFINITY],
+            prior_sigma: vec![f64::INFINITY],
+            ln_prior: 0.0,
+            shaped: false,
+        };
+        let levels = (0..start.len()).filter(|i| matches!(self.parameters[*i].1, Meaning::Level));
+        let priors: Vec<_> = levels.map(|i| (vec![(i, 1.0)], Prior { mean: 0.0, sigma: LEVEL_PRIOR })).collect();
+        Quadratic::new(&sums, &start, &priors, kept.iter().map(single).collect()).of_candidates()
+    }
+}
+
+/// The likelihood of the coefficients of one product about zero, everything else fitted.
+pub(crate) struct CoefficientSums {
+    /// Coefficients of the model and of candidates.
+    pub(crate) coefficients: Vec<Coefficient>,
+    /// Their information.
+    pub(crate) information: DMatrix<f64>,
+    /// Derivative of the log-likelihood where all are zero, as a quadratic form has it.
+    pub(crate) score: DVector<f64>,
+    /// Sum of squares of the whitened innovations.
+    pub(crate) chi2: f64,
+    /// Numbers of them.
+    pub(crate) numbers: f64,
+    /// Samples.
+    pub(crate) samples: u64,
+    /// What is known of sums of coefficients before any data.
+    pub(crate) surveys: Vec<(Vec<(String, f64)>, Prior)>,
+    /// Channels on which each coefficient acts.
+    pub(crate) channels: BTreeMap<String, BTreeSet<String>>,
+}
+
+/// The decision that sums of several products give.
+pub(crate) fn joined(
+    products: Vec<CoefficientSums>,
+    settings: &Settings,
+    judge: &dyn Judge,
+    not_tried: Vec<(String, String)>,
+) -> Decided {
+    let mut all = Joined::default();
+    for product in products {
+        let places = product.coefficients.into_iter().enumerate();
+        let mut place = |c: Coefficient| all.place((c.name.clone(), Meaning::Coefficient(Box::new(c))));
+        let places = places.map(|(i, c)| (i, place(c))).collect();
+        let mut sums = no_sums(0);
+        (sums.information, sums.score) = (product.information, product.score.as_slice().to_vec());
+        (sums.chi2, sums.numbers, sums.samples) = (product.chi2, product.numbers, product.samples);
+        all.parts.push(Part { sums, places });
+        all.surveys = product.surveys;
+        all.channels.extend(product.channels);
+    }
+    all.decided(&Point::default(), false, settings, judge, not_tried)
+}
+
 /// What the decision needs to know of candidates.
 pub(crate) trait Judge {
     /// Decimal logarithm of the corrected p-value of a gain `2 Δ ln L` of an effect.
@@ -100,12 +244,21 @@ pub(crate) trait Judge {
 
 /// The point that the sums of a pass lead to.
 pub(crate) fn step(from: &Point, decided: &Decided) -> Point {
-    let mut to = Point::default();
     let chosen: BTreeSet<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
+    to_values(from, decided, &decided.selection.values, &chosen)
+}
+
+/// The same with the model alone, and nothing named.
+pub(crate) fn step_of_model(from: &Point, decided: &Decided) -> Point {
+    to_values(from, decided, &decided.quadratic.solution(&[]).0, &BTreeSet::new())
+}
+
+fn to_values(from: &Point, decided: &Decided, values: &DVector<f64>, chosen: &BTreeSet<usize>) -> Point {
+    let mut to = Point::default();
     let others = decided.candidates.iter().enumerate().filter(|(c, _)| !chosen.contains(c));
-    let not_named: BTreeSet<usize> = others.flat_map(|(_, (.., own))| own.iter().copied()).collect();
+    let not_named: BTreeSet<usize> = others.flat_map(|(_, place)| place.parameters.iter().copied()).collect();
     for (i, (name, meaning)) in decided.parameters.iter().enumerate() {
-        let value = decided.selection.values[i];
+        let value = values[i];
         match meaning {
             Meaning::Coefficient(_) if not_named.contains(&i) => {}
             Meaning::Coefficient(_) => drop(to.values.insert(name.clone(), value)),
@@ -122,7 +275,7 @@ pub(crate) fn step(from: &Point, decided: &Decided) -> Point {
         to.powers.entry(constant.power.clone()).and_modify(|value| *value -= own);
     }
     to.means.clone_from(&decided.means);
-    let moved = &decided.selection.values - DVector::from_column_slice(&decided.start);
+    let moved = values - DVector::from_column_slice(&decided.start);
     let state = |start: &Start| &start.state + &start.slope * &moved;
     to.starts = decided.starts.iter().map(|product| product.iter().map(state).collect()).collect();
     to
@@ -252,15 +405,20 @@ impl Joined {
                 not_tried.push((parameter.0, reason.clone()));
                 continue;
             }
-            let at = self.parameters.iter().position(|(name, _)| *name == parameter.0);
-            places.push((i, at.unwrap_or(self.parameters.len())));
-            if at.is_none() {
-                self.parameters.push(parameter);
-            }
+            places.push((i, self.place(parameter)));
         }
         self.parts.push(Part { sums: innovations.finish().total(), places });
         self.surveys = surveys;
         self.channels.extend(channels);
+    }
+
+    /// Index of a parameter among all. One in another form is another one.
+    fn place(&mut self, parameter: (String, Meaning)) -> usize {
+        let same = |(name, meaning): &(String, Meaning)| *name == parameter.0 && meaning.form() == parameter.1.form();
+        self.parameters.iter().position(same).unwrap_or_else(|| {
+            self.parameters.push(parameter);
+            self.parameters.len() - 1
+        })
     }
 
     fn decided(
@@ -272,7 +430,7 @@ impl Joined {
         not_tried: Vec<(String, String)>,
     ) -> Decided {
         let parameters = self.parameters;
-        let mut groups: Vec<(String, String, Vec<usize>)> = Vec::new();
+        let mut groups: Vec<Place> = Vec::new();
         let mut start = Vec::new();
         let mut priors = Vec::new();
         for (i, (name, meaning)) in parameters.iter().enumerate() {
@@ -288,9 +446,17 @@ impl Joined {
                 // What is named stays so while constants are found.
                 Meaning::Coefficient(c) if c.candidate && opening => {}
                 Meaning::Coefficient(c) if c.candidate => {
-                    match groups.iter_mut().find(|(e, at, _)| *e == c.effect && *at == c.instance) {
-                        Some((.., own)) => own.push(i),
-                        None => groups.push((c.effect.clone(), c.instance.clone(), vec![i])),
+                    // A coefficient that comes again does so in another form.
+                    let lacks = |p: &Place| p.parameters.iter().all(|own| parameters[*own].0 != *name);
+                    let of = |p: &&mut Place| (&p.effect, &p.instance) == (&c.effect, &c.instance) && lacks(p);
+                    match groups.iter_mut().find(of) {
+                        Some(place) => place.parameters.push(i),
+                        None => groups.push(Place {
+                            effect: c.effect.clone(),
+                            instance: c.instance.clone(),
+                            shape: c.shape.clone(),
+                            parameters: vec![i],
+                        }),
                     }
                 }
                 Meaning::Coefficient(c) if c.prior_sigma.is_finite() && c.prior_sigma > 0.0 => {
@@ -307,7 +473,7 @@ impl Joined {
         }
         let candidates: Vec<Candidate> = groups
             .iter()
-            .map(|(effect, _, own)| {
+            .map(|Place { effect, parameters: own, .. }| {
                 let coefficients = || {
                     own.iter().filter_map(|i| match &parameters[*i].1 {
                         Meaning::Coefficient(c) => Some(c),
@@ -335,7 +501,7 @@ impl Joined {
         };
         let by_product = if self.parts.len() > 1 { self.parts.iter().map(of_product).collect() } else { Vec::new() };
         let quadratic = Quadratic::new(&sums, &start, &priors, candidates);
-        let log10_p = |c: usize, gain: f64| judge.log10_p(&groups[c].0, gain, groups[c].2.len());
+        let log10_p = |c: usize, gain: f64| judge.log10_p(&groups[c].effect, gain, groups[c].parameters.len());
         let selection = quadratic.select(&Evidence {
             log10_p: &log10_p,
             bound: settings.false_alarm.log10(),
@@ -347,6 +513,8 @@ impl Joined {
             selection,
             parameters,
             candidates: groups,
+            surveys: self.surveys,
+            parts: self.parts,
             quadratic,
             by_product,
             chi2: sums.chi2,

@@ -1,26 +1,58 @@
 //! `dragfree diagnose`: the data of products once more, with every effect that is not in the model.
 
-use super::{Done, INCONSISTENT, replay};
+use super::{Done, INCONSISTENT, products, replay};
 use crate::args::{Diagnose, Global};
-use crate::failure::Failure;
+use crate::failure::{Failure, Refusal};
 use crate::text::Paint;
 use chrono::DateTime;
-use dragfree_identification::diagnosis::Found;
-use dragfree_workflow::diagnose::{Diagnosed, diagnose};
+use dragfree_identification::diagnosis::{Diagnosis, Found};
+use dragfree_identification::transient::Detection;
+use dragfree_workflow::diagnose::diagnose;
+use dragfree_workflow::extract::diagnose_extracts;
 use std::fmt::Write as _;
 
 pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Result<Done, Failure> {
-    let diagnosed = replay::with_meter(&command.products, &command.archive.folder, global, diagnose)?;
-    let code = if diagnosed.diagnosis.verdict == "sufficient" { 0 } else { INCONSISTENT };
+    let products = products::open_all(&command.products, &command.archive.folder)?;
+    if command.keep_extract && products.len() != 1 {
+        return Err(Refusal::Extracts(products.len()).into());
+    }
+    let (answer, extract) = if command.extracts {
+        let diagnosis = diagnose_extracts(&super::registry(global)?, &products)?;
+        (Answer { diagnosis, effects: None, unnamed: Vec::new() }, None)
+    } else {
+        let diagnosed =
+            replay::with_meter(&products, global, |replay, progress| diagnose(replay, command.keep_extract, progress))?;
+        let unnamed = diagnosed.unexplained_transients().into_iter().cloned().collect();
+        let effects = Some(diagnosed.effects());
+        (Answer { diagnosis: diagnosed.diagnosis, effects, unnamed }, diagnosed.extract)
+    };
+    let kept = match (extract, &products[..]) {
+        (Some(extract), [product]) if command.keep_extract => Some(extract.write(&product.path)?),
+        _ => None,
+    };
+    let code = if answer.diagnosis.verdict == "sufficient" { 0 } else { INCONSISTENT };
     if global.json {
-        let value = serde_json::to_value(&diagnosed.diagnosis)?;
+        let value = serde_json::to_value(&answer.diagnosis)?;
         return Ok(Done { code, ..Done::json(&value) });
     }
-    Ok(Done { code, ..Done::new(screen(&diagnosed, command, &super::repeated(None, global), paint)) })
+    let mut text = screen(&answer, command, &super::repeated(None, global), paint);
+    if let Some((path, bytes)) = kept {
+        let _ = writeln!(text, "extract   {}, {} bytes", path.display(), crate::text::grouped(bytes));
+    }
+    Ok(Done { code, ..Done::new(text) })
 }
 
-fn screen(diagnosed: &Diagnosed, command: &Diagnose, repeated: &str, paint: Paint) -> String {
-    let Diagnosed { record, diagnosis: d, .. } = diagnosed;
+/// What is shown.
+struct Answer {
+    diagnosis: Diagnosis,
+    /// Effects that were tried; not known of extracts.
+    effects: Option<usize>,
+    /// Detected transients that are no part of the answer.
+    unnamed: Vec<Detection>,
+}
+
+fn screen(answer: &Answer, command: &Diagnose, repeated: &str, paint: Paint) -> String {
+    let Answer { diagnosis: d, effects, unnamed } = answer;
     let top = command.top;
     let ask = Ask { next: command.next, different: d.false_alarm_rate };
     let mut out = String::new();
@@ -32,9 +64,9 @@ fn screen(diagnosed: &Diagnosed, command: &Diagnose, repeated: &str, paint: Pain
     let _ = writeln!(out, "verdict   {} ({verdict})", paint.bold(&d.verdict));
     let _ = writeln!(
         out,
-        "tried     {} forms of {} effects, false alarms at most {} in 100",
+        "tried     {} forms{}, false alarms at most {} in 100",
         d.tried,
-        record.candidate_set.places().iter().filter(|p| !record.candidate_set.coefficients[p[0]].transient).count(),
+        effects.map_or_else(String::new, |n| format!(" of {n} effects")),
         100.0 * d.false_alarm_rate
     );
     let accepted: Vec<&Found> = d.candidates.iter().filter(|f| f.accepted).collect();
@@ -72,7 +104,6 @@ fn screen(diagnosed: &Diagnosed, command: &Diagnose, repeated: &str, paint: Pain
         let _ = writeln!(out, "\nFormulas that would explain it");
         d.formulas.iter().for_each(|f| put(&mut out, f, ask));
     }
-    let unnamed = diagnosed.unexplained_transients();
     if !unnamed.is_empty() {
         let _ = writeln!(out, "\nTransients that were detected and are no part of the answer");
         for h in unnamed.iter().take(top) {

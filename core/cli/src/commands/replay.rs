@@ -1,24 +1,21 @@
 //! The data of archived products once more, with progress on stderr.
 
-use super::products;
 use crate::args::{BATCH_ROWS, Global};
 use crate::failure::Failure;
 use crate::progress::Meter;
+use dragfree_engine::product::Written;
 use dragfree_workflow::calibrate::Progress;
 use dragfree_workflow::{Pass, Replay, WorkflowError};
-use std::path::Path;
 
-/// Does a job on products by their names in an archive.
+/// Does a job on products.
 pub(super) fn with_meter<T>(
-    names: &[String],
-    archive: &Path,
+    products: &[Written],
     global: &Global,
     job: impl FnOnce(&Replay<'_>, &mut dyn FnMut(Pass, usize, Progress)) -> Result<T, WorkflowError>,
 ) -> Result<T, Failure> {
-    let products = products::open_all(names, archive)?;
     let registry = super::registry(global)?;
     let threads = super::threads(global);
-    let replay = Replay { registry: &registry, products: &products, threads, batch_rows: BATCH_ROWS as usize };
+    let replay = Replay { registry: &registry, products, threads, batch_rows: BATCH_ROWS as usize };
     let mut shown: Option<(Pass, usize, Meter)> = None;
     let mut progress = |pass: Pass, product: usize, progress: Progress| {
         if shown.as_ref().is_none_or(|(of, number, _)| (*of, *number) != (pass, product)) {

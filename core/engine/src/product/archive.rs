@@ -7,7 +7,7 @@
 use super::ProductError;
 use super::draft::{self, Draft};
 use super::file::{self, Attachment, Product, Supersedes};
-use crate::files::{IoContext as _, Problem, sha256_of, sync_folder};
+use crate::files::{IoContext as _, Problem, folder_of, sha256_of, sync_folder};
 use chrono::NaiveDate;
 use dragfree_schema::Report;
 use std::collections::BTreeMap;
@@ -21,6 +21,12 @@ const PATIENCE: Duration = Duration::from_secs(5);
 
 /// Suffix of the file that says where the inputs lay. No product lists it: places change, content does not.
 pub(crate) const SOURCES: &str = "sources.json";
+
+/// Suffixes of files that no product lists, since they come later or change.
+const UNLISTED: [&str; 2] = [SOURCES, EXTRACT];
+
+/// Suffix of what a diagnosis of a product keeps for later ones.
+pub const EXTRACT: &str = "extract.json";
 
 /// Revisions have four digits.
 const LAST_REVISION: u32 = 9999;
@@ -42,6 +48,25 @@ pub struct ProductWriter {
     staging: tempfile::TempDir,
     staged: BTreeMap<String, PathBuf>,
     beside: BTreeMap<String, PathBuf>,
+}
+
+/// Writes what a diagnosis keeps of a product beside it, in one step: another reader sees the whole file or what was
+/// there before.
+///
+/// # Errors
+/// [`ProductError::Io`]: the archive cannot be written.
+pub fn write_extract(product: &Path, content: &[u8]) -> Result<PathBuf, ProductError> {
+    let path = product.with_extension(EXTRACT);
+    let archive = folder_of(&path);
+    // The folder is that of a writer, so that what a killed one leaves is known as such.
+    let staging =
+        tempfile::Builder::new().prefix(".staging-").tempdir_in(archive).at("write in the archive", archive)?;
+    let staged = staging.path().join(EXTRACT);
+    let mut file = File::create(&staged).at("write", &staged)?;
+    file.write_all(content).and_then(|()| file.sync_all()).at("write", &staged)?;
+    fs::rename(&staged, &path).at("write", &path)?;
+    sync_folder(archive).at("write in the archive", archive)?;
+    Ok(path)
 }
 
 impl ProductWriter {
@@ -336,7 +361,7 @@ pub fn list(archive: &Path) -> Result<Listing, ProductError> {
         let owned = |entry: &Entry| {
             let suffix = name.strip_prefix(entry.product.id()).and_then(|rest| rest.strip_prefix('.'));
             suffix.is_some_and(|suffix| {
-                suffix == SOURCES || entry.product.attachments.iter().any(|file| file.suffix == suffix)
+                UNLISTED.contains(&suffix) || entry.product.attachments.iter().any(|file| file.suffix == suffix)
             })
         };
         if !listing.entries.iter().any(owned) {

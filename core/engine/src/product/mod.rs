@@ -13,7 +13,7 @@ mod file;
 mod json;
 
 pub(crate) use archive::SOURCES;
-pub use archive::{Entry, Listing, ProductWriter, Written, find, find_days, list};
+pub use archive::{EXTRACT, Entry, Listing, ProductWriter, Written, find, find_days, list, write_extract};
 pub use draft::Draft;
 pub use file::{
     Attachment, Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Loss, Model,

@@ -2,6 +2,7 @@
 //! asked for fitted beside it.
 
 use nalgebra::{DMatrix, DVector};
+use serde::{Deserialize, Serialize};
 
 use super::filter::Sums;
 
@@ -44,7 +45,7 @@ pub struct Evidence<'a> {
 }
 
 /// What is known of a sum of parameters beside the data: a Gaussian about `mean`.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Prior {
     /// Mean.
     pub mean: f64,
@@ -131,6 +132,19 @@ impl Quadratic {
         };
         quadratic.profile();
         quadratic
+    }
+
+    /// Information and score of the candidates' parameters, in their order, everything else fitted; zero where rounding
+    /// alone is left of the information.
+    pub fn of_candidates(&self) -> (DMatrix<f64>, DVector<f64>) {
+        let all: Vec<usize> = (0..self.candidates.len()).collect();
+        let at = self.parameters(&all);
+        let known = |i: usize| self.profiled[(at[i], at[i])] > self.rounding[at[i]];
+        let information = DMatrix::from_fn(at.len(), at.len(), |i, j| {
+            if known(i) && known(j) { self.profiled[(at[i], at[j])] } else { 0.0 }
+        });
+        let score = |i: usize, _| if known(i) { self.profiled_score[at[i]] } else { 0.0 };
+        (information, DVector::from_fn(at.len(), score))
     }
 
     fn profile(&mut self) {
@@ -368,6 +382,31 @@ impl Quadratic {
         all.iter().enumerate().for_each(|(k, i)| sigma[*i] = covariance[(k, k)].max(0.0).sqrt());
         (values, sigma)
     }
+}
+
+/// By how much the likelihoods of several data about the same point, as twice their logarithms, are higher where each has
+/// coefficients of its own than where all have the same, and by how many values: χ² and its degrees of freedom where the
+/// data agree. Information and score of each; `numbers` are those in the data.
+pub fn disagreement(data: &[(DMatrix<f64>, DVector<f64>)], numbers: f64) -> (f64, usize) {
+    let least = ROUNDING * numbers.max(1.0).sqrt() * f64::EPSILON;
+    let highest = |information: &DMatrix<f64>, score: &DVector<f64>| {
+        let unit = information.diagonal().map(|d| if d > 0.0 { d.sqrt().recip() } else { 0.0 });
+        let scaled = DMatrix::from_fn(unit.len(), unit.len(), |i, j| information[(i, j)] * unit[i] * unit[j]);
+        let eigen = scaled.symmetric_eigen();
+        let along = eigen.eigenvectors.transpose() * score.component_mul(&unit);
+        let known = eigen.eigenvalues.iter().zip(along.iter()).filter(|(value, _)| **value > least);
+        known.fold((0.0, 0), |(sum, n), (value, x)| (sum + x * x / value, n + 1))
+    };
+    let Some((information, score)) = data.first() else { return (0.0, 0) };
+    let mut all = (information * 0.0, score * 0.0);
+    let (mut apart, mut values) = (0.0, 0);
+    for (information, score) in data {
+        all = (all.0 + information, all.1 + score);
+        let (gain, n) = highest(information, score);
+        (apart, values) = (apart + gain, values + n);
+    }
+    let (together, n) = highest(&all.0, &all.1);
+    ((apart - together).max(0.0), values - n)
 }
 
 /// Inverse of a symmetric matrix with rows of different units; rows of zeros stay zero.

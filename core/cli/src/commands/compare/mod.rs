@@ -2,7 +2,7 @@
 
 mod page;
 
-use super::{Done, INCONSISTENT, replay};
+use super::{Done, INCONSISTENT, products, replay};
 use crate::args::{Compare, Global};
 use crate::failure::Failure;
 use crate::text::{self, Paint, columns, labelled};
@@ -17,7 +17,8 @@ const NAMED: usize = 5;
 
 pub(super) fn execute(command: &Compare, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let names = &command.products;
-    let comparison = replay::with_meter(names, &command.archive.folder, global, compare)?;
+    let products = products::open_all(names, &command.archive.folder)?;
+    let comparison = replay::with_meter(&products, global, compare)?;
     if let Some(path) = &command.page {
         let meaning = (!comparison.passes).then(|| meaning(&comparison));
         let page = page::page(&comparison, names, meaning)?;

@@ -1,0 +1,315 @@
+//! What a decision means to its reader: effects with values, limits, levels of noise, each with what it cannot be told
+//! from.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use dragfree_engine::config::EffectEntry;
+use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
+use dragfree_engine::product::Written;
+use dragfree_engine::registry::Registry;
+use dragfree_identification::candidates::Candidate;
+use dragfree_identification::diagnosis::{
+    Constancy, Diagnosis, Found, LIMIT_QUANTILE, LINE, Limit, OfProduct, Separation, TRANSIENT, Trials,
+};
+use dragfree_identification::innovations::decision::{Fitted, Quadratic};
+use dragfree_identification::record::Record;
+use dragfree_schema::Settings;
+use serde::{Deserialize, Serialize};
+use serde_json::json;
+
+use crate::likelihood::{Decided, Judge, Meaning};
+use crate::proposals::Proposal;
+use crate::replay::AT_NS;
+
+/// Corrected p-values of the effects of some products.
+pub(crate) struct Evidence<'a> {
+    pub(crate) trials: Trials,
+    /// Probability from which another explanation is named beside the chosen one.
+    pub(crate) least: f64,
+    pub(crate) registry: &'a Registry,
+    pub(crate) products: &'a [Written],
+    /// Formulas among the candidates.
+    pub(crate) proposals: Vec<Proposal>,
+}
+
+impl Evidence<'_> {
+    /// A model's entry that makes a candidate in its form.
+    pub(crate) fn entry(&self, candidate: &Candidate) -> EffectEntry {
+        if let Some(proposal) = self.proposal(&candidate.effect, &candidate.instance) {
+            return proposal.entry.clone();
+        }
+        let mut entry = EffectEntry::new(&candidate.effect, &candidate.instance);
+        let shape = candidate.parts.iter().flat_map(|(_, form)| &form.shape);
+        entry.parameters = shape.filter_map(|(k, v)| Some((k.clone(), toml::Value::try_from(v).ok()?))).collect();
+        entry
+    }
+
+    /// The formula of a candidate that is one.
+    pub(crate) fn proposal(&self, effect: &str, instance: &str) -> Option<&Proposal> {
+        self.proposals.iter().find(|p| (p.entry.id.as_str(), p.entry.instance.as_str()) == (effect, instance))
+    }
+
+    /// What acts once was searched for at every time, and what acts at one frequency at every frequency.
+    fn family<'b>(&self, effect: &'b str) -> &'b str {
+        let has = |name| has_parameter(self.registry, effect, name);
+        match (has(AT_NS), has(FREQUENCY_HZ)) {
+            (true, _) => TRANSIENT,
+            (_, true) => LINE,
+            _ => effect,
+        }
+    }
+}
+
+impl Judge for Evidence<'_> {
+    fn log10_p(&self, effect: &str, gain: f64, dof: usize) -> f64 {
+        self.trials.p_value(self.family(effect), gain, dof as f64).1
+    }
+
+    fn ln_prior(&self, effect: &str) -> f64 {
+        -self.trials.of(self.family(effect)).ln()
+    }
+}
+
+/// Values and σ of a candidate's coefficients; index of the largest over its σ.
+fn leading(fitted: &Fitted) -> (Vec<(f64, f64)>, usize) {
+    let sigma = |k: usize| fitted.covariance[(k, k)].max(0.0).sqrt();
+    let values: Vec<(f64, f64)> = fitted.values.iter().enumerate().map(|(k, value)| (*value, sigma(k))).collect();
+    let size = |k: &usize| (values[*k].0 / values[*k].1).abs();
+    let lead = (0..values.len()).max_by(|a, b| size(a).total_cmp(&size(b))).unwrap_or(0);
+    (values, lead)
+}
+
+fn coefficient(decided: &Decided, parameter: usize) -> (&str, &str) {
+    match &decided.parameters[parameter] {
+        (name, Meaning::Coefficient(c)) => (name, &c.unit),
+        (name, _) => (name, "1"),
+    }
+}
+
+/// An effect with its evidence; `accepted` where it is part of the answer.
+pub(crate) fn found(
+    settings: &Settings,
+    decided: &Decided,
+    fitted: &Fitted,
+    evidence: &Evidence<'_>,
+    accepted: bool,
+) -> Found {
+    let place = &decided.candidates[fitted.candidate];
+    let (effect, instance, own) = (&place.effect, &place.instance, &place.parameters);
+    let (values, lead) = leading(fitted);
+    let dof = own.len() as f64;
+    let (p_value, log10_p_value) = evidence.trials.p_value(evidence.family(effect), fitted.gain, dof);
+    let (mut offset_shift_m, mut offset_shift_sigma) = (BTreeMap::new(), BTreeMap::new());
+    let named: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
+    let without: Vec<usize> = named.iter().copied().filter(|c| *c != fitted.candidate).collect();
+    let with: Vec<usize> = without.iter().copied().chain([fitted.candidate]).collect();
+    let by_product = if accepted { by_product(decided, &with, own[lead], evidence.products) } else { Vec::new() };
+    let [(with, _), (without, sigma)] = [with, without].map(|set| decided.quadratic.solution(&set));
+    for (i, (name, meaning)) in decided.parameters.iter().enumerate() {
+        if matches!(meaning, Meaning::Coefficient(c) if !c.candidate && c.unit == "m") {
+            offset_shift_m.insert(name.clone(), without[i] - with[i]);
+            offset_shift_sigma.insert(name.clone(), (without[i] - with[i]) / sigma[i]);
+        }
+    }
+    let channels: BTreeSet<&String> =
+        own.iter().filter_map(|i| decided.channels.get(&decided.parameters[*i].0)).flatten().collect();
+    let rivals: Vec<usize> = fitted.alternatives.iter().filter(|(_, p)| *p > evidence.least).map(|(c, _)| *c).collect();
+    let name_of = |c: &usize| {
+        let other = &decided.candidates[*c];
+        evidence.proposal(&other.effect, &other.instance).map_or_else(|| other.name(), |p| p.words.clone())
+    };
+    let set = &named;
+    let separation = |c: &usize| Separation::new(name_of(c), decided.quadratic.separation(fitted.candidate, *c, set));
+    let separations: Vec<Separation> = rivals.iter().map(separation).collect();
+    let before = decided.chi2 / decided.numbers;
+    let (name, unit) = coefficient(decided, own[lead]);
+    Found {
+        effect: effect.clone(),
+        instance: instance.clone(),
+        coefficient: name.to_owned(),
+        value: values[lead].0,
+        sigma: values[lead].1,
+        unit: unit.to_owned(),
+        shape: match evidence.proposal(effect, instance) {
+            Some(p) => p.entry.parameters.iter().map(|(k, value)| (k.clone(), json!(value))).collect(),
+            None => place.shape.clone().into_iter().collect(),
+        },
+        coefficients: own
+            .iter()
+            .zip(&values)
+            .map(|(i, (value, sigma))| {
+                let (name, unit) = coefficient(decided, *i);
+                json!({ "name": name, "value": value, "sigma": sigma, "unit": unit })
+            })
+            .collect(),
+        delta_chi2: fitted.gain,
+        p_value,
+        log10_p_value,
+        delta_bic: dof * decided.numbers.ln() - fitted.gain,
+        in_range: own.iter().zip(&fitted.values).all(|(i, value)| match &decided.parameters[*i].1 {
+            Meaning::Coefficient(c) => c.lower < *value && *value < c.upper,
+            Meaning::Level | Meaning::Power => true,
+        }),
+        chi2_per_dof_before: if accepted { before + fitted.gain / decided.numbers } else { before },
+        chi2_per_dof_after: if accepted { before } else { before - fitted.gain / decided.numbers },
+        offset_shift_m,
+        offset_shift_sigma,
+        channels: channels.into_iter().cloned().collect(),
+        confounders: rivals.iter().map(name_of).collect(),
+        separations,
+        accepted,
+        refused: (!accepted && p_value < evidence.least).then(|| {
+            if fitted.beyond > settings.range_sigmas.powi(2) {
+                "its best value lies outside its physical range".to_owned()
+            } else {
+                "it may be what the form of a named effect leaves, or as many effects as the settings allow are named"
+                    .to_owned()
+            }
+        }),
+        constancy: Constancy::of(&by_product),
+        by_product,
+    }
+}
+
+/// What each product alone says of a parameter, with a set of candidates.
+fn by_product(decided: &Decided, set: &[usize], parameter: usize, products: &[Written]) -> Vec<OfProduct> {
+    let of = |(quadratic, written): (&Quadratic, &Written)| {
+        let (values, sigma) = quadratic.solution(set);
+        OfProduct { product: written.product.id().to_owned(), value: values[parameter], sigma: sigma[parameter] }
+    };
+    decided.by_product.iter().zip(products).map(of).collect()
+}
+
+/// Limits of a candidate's coefficients; none of a formula, which the data themselves have written.
+pub(crate) fn limits(decided: &Decided, fitted: &Fitted, evidence: &Evidence<'_>) -> Vec<Limit> {
+    let place = &decided.candidates[fitted.candidate];
+    if evidence.proposal(&place.effect, &place.instance).is_some() {
+        return Vec::new();
+    }
+    let limit = |(k, i): (usize, &usize)| {
+        let sigma = fitted.covariance[(k, k)].max(0.0).sqrt();
+        let (name, unit) = coefficient(decided, *i);
+        Limit {
+            effect: place.effect.clone(),
+            instance: place.instance.clone(),
+            coefficient: name.to_owned(),
+            limit_95: fitted.free[k].abs() + LIMIT_QUANTILE * sigma,
+            sigma,
+            unit: unit.to_owned(),
+            shape: place.shape.clone().into_iter().collect(),
+        }
+    };
+    place.parameters.iter().enumerate().map(limit).collect()
+}
+
+/// The level of a component of the noise that an effect could state, as some data have it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct NoiseLevel {
+    pub(crate) effect: String,
+    pub(crate) instance: String,
+    pub(crate) coefficient: String,
+    /// Amplitude in the model, over the declared one.
+    pub(crate) stated: f64,
+    /// Natural logarithm of the amplitude over that of the model.
+    pub(crate) ln: f64,
+    /// σ of it.
+    pub(crate) sigma: f64,
+    /// Channels that it enters.
+    pub(crate) channels: Vec<String>,
+}
+
+/// Levels of noise that effects could state, as the likelihood has them.
+pub(crate) fn noise_levels(decided: &Decided, record: &Record) -> Vec<NoiseLevel> {
+    let all = record.candidate_set.coefficients.iter().filter(|c| !c.noise.is_empty());
+    all.filter_map(|c| {
+        let i = decided.parameters.iter().position(|(name, m)| *name == c.noise && matches!(m, Meaning::Level))?;
+        Some(NoiseLevel {
+            effect: c.effect.clone(),
+            instance: c.instance.clone(),
+            coefficient: c.name.clone(),
+            // A level that the model states is in the noise already; what is measured is relative to it.
+            stated: if c.candidate { 1.0 } else { c.initial },
+            ln: decided.selection.values[i],
+            sigma: decided.selection.sigma[i],
+            channels: channels_of(record, &c.noise),
+        })
+    })
+    .collect()
+}
+
+/// Levels as what may be missing. `chi2` is that of the whitened innovations, of so many numbers.
+pub(crate) fn louder(levels: &[NoiseLevel], chi2: f64, numbers: f64, evidence: &Evidence<'_>) -> Vec<Found> {
+    let found = |level: &NoiseLevel| {
+        let value = level.ln.exp() * level.stated;
+        let gain = (level.ln / level.sigma).powi(2);
+        let (p_value, log10_p_value) = evidence.trials.p_value(&level.effect, gain, 1.0);
+        let sigma = level.sigma * value;
+        let before = chi2 / numbers;
+        let name = level.coefficient.clone();
+        Found {
+            effect: level.effect.clone(),
+            instance: level.instance.clone(),
+            coefficients: vec![json!({ "name": name, "value": value, "sigma": sigma, "unit": "1" })],
+            coefficient: name,
+            value,
+            sigma,
+            unit: "1".to_owned(),
+            shape: serde_json::Map::new(),
+            delta_chi2: gain,
+            p_value,
+            log10_p_value,
+            delta_bic: numbers.ln() - gain,
+            in_range: true,
+            chi2_per_dof_before: before + gain / numbers,
+            chi2_per_dof_after: before,
+            offset_shift_m: BTreeMap::new(),
+            offset_shift_sigma: BTreeMap::new(),
+            channels: level.channels.clone(),
+            confounders: Vec::new(),
+            separations: Vec::new(),
+            accepted: false,
+            refused: None,
+            by_product: Vec::new(),
+            constancy: None,
+        }
+    };
+    levels.iter().map(found).collect()
+}
+
+/// Channels that a component of noise enters.
+fn channels_of(record: &Record, component: &str) -> Vec<String> {
+    let all = record.noise.iter().filter(|p| p.components.iter().any(|name| name == component));
+    all.flat_map(|p| {
+        let k = p.components.iter().position(|name| name == component).unwrap_or(0);
+        p.enters.iter().filter(move |(_, gains)| gains[k] != 0.0).map(|(channel, _)| channel.clone())
+    })
+    .collect()
+}
+
+/// What is missing, by what is named and whether something is left.
+pub(crate) fn verdict(named: &[Found], left: bool) -> &'static str {
+    match (named.is_empty(), left) {
+        (false, _) => "missing",
+        (true, true) => "unexplained",
+        (true, false) => "sufficient",
+    }
+}
+
+/// Why several products do not agree, if they do not.
+pub(crate) fn apart(agreement: Option<&Constancy>, settings: &Settings) -> Option<String> {
+    let Constancy { chi2, dof, p_value } = agreement.filter(|a| a.p_value < settings.false_alarm)?;
+    Some(format!(
+        "the products do not agree beside what is named (χ² {chi2:.0} of {dof}, p = {p_value:.1e}): something is not the same \
+         in all of them; diagnose them one by one"
+    ))
+}
+
+/// A model whose two solutions disagree is not sufficient, whatever the candidates say.
+pub(crate) fn contradict(diagnosis: &mut Diagnosis, products: &[Written]) {
+    let disagree = products.iter().filter(|p| p.product.result.verdict.as_deref() == Some("disagree"));
+    let names: Vec<String> = disagree.map(|p| p.product.id().to_string()).collect();
+    if diagnosis.verdict == "sufficient" && !names.is_empty() {
+        diagnosis.verdict = "unexplained".to_owned();
+        diagnosis.reasons.push(format!("the recursive and the batch solution of {} disagree", names.join(", ")));
+    }
+}

@@ -1,0 +1,268 @@
+//! The extract of a product: what a diagnosis of its telemetry leaves for later ones, which add it to those of other
+//! days without reading telemetry.
+//!
+//! It holds the likelihood of the coefficients of the model and of every effect, as the last pass has it, with what is
+//! a day's own (constants, noise levels, slow forces) fitted. Likelihoods of days add; what is linear in a day about its
+//! own values is so about the values of all days, which differ from them by some of the day's σ. An effect with a shape
+//! is there in the first of its forms, and in that of a day that has named it.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use dragfree_engine::EngineError;
+use dragfree_engine::product::{EXTRACT, Written, write_extract};
+use dragfree_engine::registry::Registry;
+use dragfree_identification::diagnosis::{Diagnosis, Found, Trials, UNOBSERVABLE};
+use dragfree_identification::innovations::decision::Prior;
+use dragfree_schema::{Coefficient, Settings};
+use nalgebra::{DMatrix, DVector};
+use serde::{Deserialize, Serialize};
+
+use crate::WorkflowError;
+use crate::answer::{Evidence, NoiseLevel, apart, contradict, found, limits, louder, verdict};
+use crate::likelihood::{CoefficientSums, Decided, joined};
+use crate::proposals::FORMULA;
+
+/// Format of the file.
+const FORMAT: &str = "dragfree-extract/1";
+
+/// What a diagnosis of one product leaves for those of several.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Extract {
+    format: String,
+    /// Product.
+    product: String,
+    /// Release of the program.
+    program: String,
+    coefficients: Vec<Coefficient>,
+    /// Lower triangle of their information, row after row.
+    information: Vec<f64>,
+    score: Vec<f64>,
+    chi2: f64,
+    numbers: f64,
+    samples: u64,
+    surveys: Vec<Survey>,
+    /// Channels on which each coefficient acts.
+    channels: BTreeMap<String, BTreeSet<String>>,
+    /// Effect and instance of what this product alone says is missing.
+    named: Vec<(String, String)>,
+    levels: Vec<NoiseLevel>,
+    trials: Trials,
+    /// Why this product alone is not explained; none where it is.
+    unexplained: Option<String>,
+    not_tried: Vec<(String, String)>,
+}
+
+/// What is known of a weighted sum of coefficients before any data.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+struct Survey {
+    terms: Vec<(String, f64)>,
+    prior: Prior,
+}
+
+impl Extract {
+    /// Of the diagnosis of one product.
+    pub(crate) fn new(
+        product: &Written,
+        decided: &Decided,
+        diagnosis: &Diagnosis,
+        levels: Vec<NoiseLevel>,
+        trials: &Trials,
+    ) -> Option<Self> {
+        let sums = decided.of_coefficients()?;
+        let n = sums.coefficients.len();
+        // A proposed formula is an effect of one diagnosis.
+        let kept: Vec<usize> = (0..n).filter(|i| !is_proposal(&sums.coefficients[*i])).collect();
+        let accepted = diagnosis.candidates.iter().filter(|f| f.accepted);
+        Some(Self {
+            format: FORMAT.to_owned(),
+            product: product.product.id().to_owned(),
+            program: env!("CARGO_PKG_VERSION").to_owned(),
+            coefficients: kept.iter().map(|i| sums.coefficients[*i].clone()).collect(),
+            information: kept
+                .iter()
+                .enumerate()
+                .flat_map(|(row, i)| kept[..=row].iter().map(|j| sums.information[(*i, *j)]))
+                .collect(),
+            score: kept.iter().map(|i| sums.score[*i]).collect(),
+            chi2: sums.chi2,
+            numbers: sums.numbers,
+            samples: sums.samples,
+            surveys: sums.surveys.into_iter().map(|(terms, prior)| Survey { terms, prior }).collect(),
+            channels: sums.channels,
+            named: accepted.map(|f| (f.effect.clone(), f.instance.clone())).collect(),
+            levels,
+            trials: trials.clone(),
+            unexplained: why_unexplained(diagnosis),
+            not_tried: diagnosis.not_tried.clone(),
+        })
+    }
+
+    /// Writes it beside its product, in one step. Returns the path and the bytes.
+    ///
+    /// # Errors
+    /// The archive cannot be written.
+    pub fn write(&self, product: &Path) -> Result<(PathBuf, u64), WorkflowError> {
+        let refuse = |e: serde_json::Error| WorkflowError::Extract { path: product.to_owned(), what: e.to_string() };
+        let text = serde_json::to_vec(self).map_err(refuse)?;
+        let path = write_extract(product, &text).map_err(EngineError::from)?;
+        Ok((path, text.len() as u64))
+    }
+
+    /// Reads that of a product.
+    ///
+    /// # Errors
+    /// [`WorkflowError::Extract`]: there is none, or it is of another product, format or release.
+    pub fn read(product: &Written) -> Result<Self, WorkflowError> {
+        let path = product.path.with_extension(EXTRACT);
+        let id = product.product.id();
+        let make = format!("make it from the telemetry: dragfree diagnose {id} --keep-extract");
+        let refuse = |what: String| WorkflowError::Extract { path: path.clone(), what };
+        let text = std::fs::read(&path).map_err(|e| refuse(format!("{e}; {make}")))?;
+        let extract: Self = serde_json::from_slice(&text).map_err(|e| refuse(format!("{e}; {make}")))?;
+        let n = extract.coefficients.len();
+        let whole = extract.information.len() == n * (n + 1) / 2 && extract.score.len() == n;
+        let sound = [
+            (extract.format == FORMAT, format!("its format is {}, not {FORMAT}", extract.format)),
+            (extract.product == id, format!("it is of product {}", extract.product)),
+            (
+                extract.program == env!("CARGO_PKG_VERSION"),
+                format!("release {} made it, with other candidates perhaps", extract.program),
+            ),
+            (whole, "its sums are not of its coefficients".to_owned()),
+        ];
+        match sound.into_iter().find(|(holds, _)| !holds) {
+            Some((_, what)) => Err(refuse(format!("{what}; {make}"))),
+            None => Ok(extract),
+        }
+    }
+
+    fn names(&self, c: &Coefficient) -> bool {
+        self.named.iter().any(|(effect, instance)| (effect, instance) == (&c.effect, &c.instance))
+    }
+
+    /// The sums of some of its coefficients.
+    fn sums(&self, keep: impl Fn(&Coefficient) -> bool) -> CoefficientSums {
+        let kept: Vec<usize> = (0..self.coefficients.len()).filter(|i| keep(&self.coefficients[*i])).collect();
+        let packed = |i: usize, j: usize| self.information[i.max(j) * (i.max(j) + 1) / 2 + i.min(j)];
+        CoefficientSums {
+            coefficients: kept.iter().map(|i| self.coefficients[*i].clone()).collect(),
+            information: DMatrix::from_fn(kept.len(), kept.len(), |i, j| packed(kept[i], kept[j])),
+            score: DVector::from_fn(kept.len(), |i, _| self.score[kept[i]]),
+            chi2: self.chi2,
+            numbers: self.numbers,
+            samples: self.samples,
+            surveys: self.surveys.iter().map(|s| (s.terms.clone(), s.prior)).collect(),
+            channels: self.channels.clone(),
+        }
+    }
+}
+
+fn is_proposal(c: &Coefficient) -> bool {
+    c.candidate && c.effect == FORMULA
+}
+
+fn why_unexplained(diagnosis: &Diagnosis) -> Option<String> {
+    let left = diagnosis.unexplained.as_ref().map(|u| format!("{} is left in {}", u.kind, u.channels.join(", ")));
+    let formulas = (!diagnosis.formulas.is_empty()).then(|| "a formula is proposed".to_owned());
+    let all: Vec<String> = left.into_iter().chain(formulas).chain(diagnosis.reasons.iter().cloned()).collect();
+    (!all.is_empty()).then(|| all.join("; "))
+}
+
+/// Two coefficients that are the same, in the same form.
+fn same(a: &Coefficient, b: &Coefficient) -> bool {
+    (&a.name, &a.shape, a.candidate) == (&b.name, &b.shape, b.candidate)
+}
+
+/// Diagnoses products of one model from their extracts.
+///
+/// # Errors
+/// [`WorkflowError`]: an extract is missing, or the products have different models.
+pub fn diagnose_extracts(registry: &Registry, products: &[Written]) -> Result<Diagnosis, WorkflowError> {
+    let settings = &products.first().ok_or(WorkflowError::NoProduct)?.product.settings;
+    let extracts: Vec<Extract> = products.iter().map(Extract::read).collect::<Result<_, _>>()?;
+    of_one_model(&extracts)?;
+    let mut trials = Trials::default();
+    extracts.iter().for_each(|e| trials.add(&e.trials));
+    let evidence = Evidence { trials, least: settings.false_alarm, registry, products, proposals: Vec::new() };
+    let days = |c: &Coefficient| extracts.iter().filter(|e| e.coefficients.iter().any(|own| same(own, c))).count();
+    let several = |c: &Coefficient| days(c) > 1 || extracts.len() == 1;
+    let of_day = |e: &Extract| e.sums(|c| e.names(c) || several(c));
+    let mut not_tried: BTreeMap<String, String> = BTreeMap::new();
+    for e in &extracts {
+        not_tried.extend(e.not_tried.iter().cloned());
+        for c in e.coefficients.iter().filter(|c| !e.names(c) && !several(c)) {
+            let why = "its form is another on every day: a diagnosis with the telemetry chooses one for all days";
+            not_tried.insert(format!("{}:{}", c.effect, c.instance), why.to_owned());
+        }
+    }
+    let decided = joined(extracts.iter().map(of_day).collect(), settings, &evidence, Vec::new());
+    let unobservable = decided.selection.unobservable.iter().map(|c| decided.candidates[*c].name());
+    not_tried.extend(unobservable.map(|name| (name, UNOBSERVABLE.to_owned())));
+    let mut diagnosis = answer(settings, &decided, &extracts, &evidence);
+    diagnosis.not_tried = not_tried.into_iter().collect();
+    contradict(&mut diagnosis, products);
+    Ok(diagnosis)
+}
+
+fn of_one_model(extracts: &[Extract]) -> Result<(), WorkflowError> {
+    let model = |e: &Extract| -> Vec<String> {
+        e.coefficients.iter().filter(|c| !c.candidate).map(|c| c.name.clone()).collect()
+    };
+    let Some(first) = extracts.first() else { return Err(WorkflowError::NoProduct) };
+    match extracts.iter().find(|e| model(e) != model(first)) {
+        Some(other) => {
+            Err(WorkflowError::OfOtherModel { product: other.product.clone(), first: first.product.clone() })
+        }
+        None => Ok(()),
+    }
+}
+
+/// Levels of several days: weighted means, with the level of each day.
+fn levels_of_all(extracts: &[Extract]) -> Vec<NoiseLevel> {
+    let Some(first) = extracts.first() else { return Vec::new() };
+    let of = |level: &NoiseLevel| {
+        let own = extracts.iter().flat_map(|e| &e.levels).filter(|l| l.coefficient == level.coefficient);
+        let known = own.filter(|l| l.sigma > 0.0).map(|l| (l.sigma.powi(-2), l.ln));
+        let (weight, sum) = known.fold((0.0, 0.0), |(w, s), (weight, ln)| (w + weight, s + weight * ln));
+        NoiseLevel { ln: sum / weight, sigma: weight.powf(-0.5), ..level.clone() }
+    };
+    first.levels.iter().map(of).collect()
+}
+
+fn answer(settings: &Settings, decided: &Decided, extracts: &[Extract], evidence: &Evidence<'_>) -> Diagnosis {
+    let of = |accepted: bool| move |f| found(settings, decided, f, evidence, accepted);
+    let mut named: Vec<Found> = decided.selection.chosen.iter().map(of(true)).collect();
+    let mut others: Vec<Found> = decided.selection.rest.iter().map(of(false)).collect();
+    let mut levels = Vec::new();
+    for f in louder(&levels_of_all(extracts), decided.chi2, decided.numbers, evidence) {
+        match f.standing(settings) {
+            (true, true) => named.push(Found { accepted: true, ..f }),
+            (true, false) => levels.push(f.level()),
+            (false, _) => {}
+        }
+    }
+    named.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
+    others.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
+    let left = |e: &Extract| Some(format!("{} alone: {}", e.product, e.unexplained.as_ref()?));
+    let agreement = decided.agreement();
+    let reasons: Vec<String> =
+        apart(agreement.as_ref(), settings).into_iter().chain(extracts.iter().filter_map(left)).collect();
+    let verdict = verdict(&named, !reasons.is_empty());
+    others.truncate(settings.max_evaluated);
+    named.extend(others);
+    Diagnosis {
+        verdict: verdict.to_owned(),
+        false_alarm_rate: settings.false_alarm,
+        tried: evidence.trials.total(),
+        candidates: named,
+        upper_limits: decided.selection.rest.iter().flat_map(|f| limits(decided, f, evidence)).collect(),
+        unexplained: None,
+        formulas: Vec::new(),
+        agreement,
+        reasons,
+        levels,
+        transients: Vec::new(),
+        not_tried: Vec::new(),
+    }
+}
