@@ -43,8 +43,8 @@ fn gain(diagnosis: &Value) -> Option<&Value> {
 
 /// What three days of two hours say together, from their extracts alone, is what their telemetry says in one diagnosis:
 /// the gain is named, alone, within 0.2σ and with the same σ to 3 %. The two differ in where each day is linear and in
-/// its levels of noise. The size is within 4σ of the truth (false alarm 6e-5), and the days agree; with the fourth, where
-/// it is 10σ away, they do not.
+/// its levels of noise. The size is within 4σ of the truth (false alarm 6e-5), and the days agree; with the fourth,
+/// where it is 10σ away, they do not.
 #[test]
 fn days_together_from_their_extracts_say_what_their_telemetry_says() {
     let folder = tempfile::tempdir().expect("a temporary folder");

@@ -748,9 +748,10 @@ mod tests {
         assert!(transient(&left, "other").delta_chi2 < 20.0);
     }
 
-    /// An event at the first of two times is named at "one"; "both" could have made it too. It stays at that time, to be
-    /// compared, and not at the second time, where six times there is nothing (it would have more of the noise there than
-    /// beside the named one in all six once in 64). Where something happened at the second time as well, it is there.
+    /// An event at the first of two times is named at "one"; "both" could have made it too. It stays at that time, to
+    /// be compared, and not at the second time, where six times there is nothing (it would have more of the noise there
+    /// than beside the named one in all six once in 64). Where something happened at the second time as well, it is
+    /// there.
     #[test]
     fn what_could_have_made_a_named_event_stays_at_its_time() {
         let (mut candidate_set, noise, settings) = (candidate_set(), noise(), Settings::default());

@@ -37,8 +37,8 @@ pub struct RefinementRequest {
     pub shape: Map<String, Value>,
 }
 
-/// Chooses the form of each candidate beside `named` effects; that of a named one beside the others. A transient that is
-/// not significant beside them has the form that it would have in place of the one that it can best replace: the
+/// Chooses the form of each candidate beside `named` effects; that of a named one beside the others. A transient that
+/// is not significant beside them has the form that it would have in place of the one that it can best replace: the
 /// likelihood compares the two at the same time.
 ///
 /// # Errors

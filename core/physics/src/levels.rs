@@ -14,8 +14,8 @@ pub struct Levels {
 pub struct Fitted {
     /// The levels.
     pub levels: Levels,
-    /// σ of the logarithm of the held level, and of that of the readout, where the weights of the bins are the inverses of
-    /// the relative variances of their PSDs.
+    /// σ of the logarithm of the held level, and of that of the readout, where the weights of the bins are the inverses
+    /// of the relative variances of their PSDs.
     pub sigma: [f64; 2],
 }
 
@@ -97,8 +97,8 @@ mod tests {
         assert_eq!(fit(&[Bin { frequency_hz: 1.0, psd: f64::NAN, weight: 1.0 }], 0.1), None);
     }
 
-    /// The mean square of 200 pulls of each level: 1 ± 0.1, so 0.6 to 1.4 fails by chance once in 15000. Neighbouring bins
-    /// taken for independent would give 1.9.
+    /// The mean square of 200 pulls of each level: 1 ± 0.1, so 0.6 to 1.4 fails by chance once in 15000. Neighbouring
+    /// bins taken for independent would give 1.9.
     #[test]
     fn levels_scatter_by_their_sigma() {
         let (held, readout, dt_s) = (3e-21, 8e-20, 0.1_f64);

@@ -186,8 +186,8 @@ struct Last {
 }
 
 /// A pass about the model alone, for the extract of a product. Likelihoods of days add where they are taken about the
-/// same point: what one day names, another has not. What is named has its form of this day, everything else the first of
-/// its forms, which is the same on every day.
+/// same point: what one day names, another has not. What is named has its form of this day, everything else the first
+/// of its forms, which is the same on every day.
 fn about_model(
     replay: &Replay<'_>,
     record: &Record,

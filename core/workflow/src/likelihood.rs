@@ -124,8 +124,8 @@ pub(crate) struct Decided {
 }
 
 impl Decided {
-    /// The likelihood of the coefficients of one product, with the noise levels and the powers of time fitted: what adds
-    /// to that of other products. `None` of several products.
+    /// The likelihood of the coefficients of one product, with the noise levels and the powers of time fitted: what
+    /// adds to that of other products. `None` of several products.
     pub(crate) fn of_coefficients(&self) -> Option<CoefficientSums> {
         let [part] = &self.parts[..] else { return None };
         let kept = self.coefficients(|_| true);
@@ -163,8 +163,8 @@ impl Decided {
         (0..self.parameters.len()).filter(coefficient).filter(|i| asked(*i)).collect()
     }
 
-    /// Information of some coefficients in one product, and their score about zero, with the noise levels and the powers
-    /// of time fitted; others are zero.
+    /// Information of some coefficients in one product, and their score about zero, with the noise levels and the
+    /// powers of time fitted; others are zero.
     fn reduced(&self, part: &Part, kept: &[usize]) -> (DMatrix<f64>, DVector<f64>) {
         let mut sums = no_sums(self.parameters.len());
         part.add_to(&mut sums);

@@ -19,8 +19,8 @@ const SEGMENT_S: f64 = 204.8;
 /// Lowest frequency of the fit, Hz; below, coloured sensing noise and slow torques are not negligible.
 const LOWEST_HZ: f64 = 0.01;
 
-/// A measured level is used where its logarithm differs from that of the stated one by this many σ: by chance once in 150
-/// days, with a hundred levels measured in a day.
+/// A measured level is used where its logarithm differs from that of the stated one by this many σ: by chance once in
+/// 150 days, with a hundred levels measured in a day.
 const SIGNIFICANT_SIGMAS: f64 = 4.0;
 
 /// Noise power relative to the mission file.

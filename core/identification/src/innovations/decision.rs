@@ -384,9 +384,9 @@ impl Quadratic {
     }
 }
 
-/// By how much the likelihoods of several data about the same point, as twice their logarithms, are higher where each has
-/// coefficients of its own than where all have the same, and by how many values: χ² and its degrees of freedom where the
-/// data agree. Information and score of each; `numbers` are those in the data.
+/// By how much the likelihoods of several data about the same point, as twice their logarithms, are higher where each
+/// has coefficients of its own than where all have the same, and by how many values: χ² and its degrees of freedom
+/// where the data agree. Information and score of each; `numbers` are those in the data.
 pub fn disagreement(data: &[(DMatrix<f64>, DVector<f64>)], numbers: f64) -> (f64, usize) {
     let least = ROUNDING * numbers.max(1.0).sqrt() * f64::EPSILON;
     let highest = |information: &DMatrix<f64>, score: &DVector<f64>| {

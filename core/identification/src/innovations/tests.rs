@@ -768,9 +768,9 @@ fn noise_that_cannot_be_filtered_is_refused_with_its_name() {
     assert!(refused(&estimated).contains("estimate"));
 }
 
-/// Three data with three coefficients, of which each lacks one. Where all have the same values the disagreement is χ² of
-/// 2 + 2 + 2 − 3 = 3: its mean over 1000 draws is 3 ± 0.08, four of which either way are false once in 16000. Where one
-/// has another value, by d with information n against N of the others, it is higher by `d² n N/(n + N)`.
+/// Three data with three coefficients, of which each lacks one. Where all have the same values the disagreement is χ²
+/// of 2 + 2 + 2 − 3 = 3: its mean over 1000 draws is 3 ± 0.08, four of which either way are false once in 16000. Where
+/// one has another value, by d with information n against N of the others, it is higher by `d² n N/(n + N)`.
 #[test]
 fn data_disagree_by_chi_squared() {
     let mut random = StdRng::seed_from_u64(5);

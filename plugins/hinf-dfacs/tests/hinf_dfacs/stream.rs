@@ -431,9 +431,9 @@ fn one_silent_test_mass_does_not_silence_the_other() {
 }
 
 /// Levels measured in 55 minutes: with the mission's own noise nothing replaces it, and torque three times as loud
-/// about one axis, or sensing twice, are found. The torque's level rests on 14 bins of 31 segments; both overlap, and its σ
-/// is √(0.034 · 1.94 / 14) = 0.07; 4σ either way for three axes, two false alarms in ten thousand. The sensing's is known
-/// to half a per cent.
+/// about one axis, or sensing twice, are found. The torque's level rests on 14 bins of 31 segments; both overlap, and
+/// its σ is √(0.034 · 1.94 / 14) = 0.07; 4σ either way for three axes, two false alarms in ten thousand. The sensing's
+/// is known to half a per cent.
 #[test]
 fn the_first_stretch_tells_the_levels_of_the_noise() {
     let m = mission();
