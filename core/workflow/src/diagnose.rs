@@ -26,7 +26,7 @@ use dragfree_schema::Settings;
 use serde_json::{Map, json};
 
 use crate::WorkflowError;
-use crate::likelihood::{Decided, Judge, Meaning, PASSES, Point, moved, one_pass, step};
+use crate::likelihood::{Decided, Judge, Meaning, PASSES, Point, Settled, moved, one_pass, step};
 use crate::proposals::{FORMULA, Proposal, proposals};
 use crate::replay::{AT_NS, FINE, Pass, Replay, What, sum};
 
@@ -38,6 +38,8 @@ pub struct Diagnosed {
     pub diagnosis: Diagnosis,
     /// Thresholds.
     pub settings: Settings,
+    /// Where the passes have ended.
+    pub(crate) end: Settled,
 }
 
 /// Diagnoses the data of products of one model. `progress` is told the pass and the number of the product.
@@ -86,9 +88,9 @@ pub fn diagnose(
     tried.retain(|effect, _| !has_parameter(replay.registry, effect, FREQUENCY_HZ));
     let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
     let evidence = Evidence { trials: Trials::new(&scorer, &tried), least: settings.false_alarm, replay, proposals };
-    let mut diagnosis = decide(settings, &record, &scorer, screened, &evidence, progress)?;
+    let (mut diagnosis, end) = decide(settings, &record, &scorer, screened, &evidence, progress)?;
     contradict(&mut diagnosis, replay);
-    Ok(Diagnosed { diagnosis, settings: settings.clone(), record })
+    Ok(Diagnosed { diagnosis, settings: settings.clone(), record, end })
 }
 
 /// A model's entry of a line.
@@ -107,7 +109,7 @@ fn decide(
     mut screened: Screened,
     evidence: &Evidence<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
-) -> Result<Diagnosis, WorkflowError> {
+) -> Result<(Diagnosis, Settled), WorkflowError> {
     let fit = scorer.fit(&[])?;
     let model = &record.candidate_set.coefficients[..record.candidate_set.model()];
     let start = model.iter().zip(fit.estimate.theta.iter()).map(|(c, value)| (c.name.clone(), *value)).collect();
@@ -124,7 +126,7 @@ fn decide(
     // A pass that fits constants beside what is named comes first, at the start and after a form has changed: they are
     // 1e5 σ away, and a filter would take them for noise.
     let (mut opening, mut passes) = (true, 0);
-    let (decided, screened, moving) = loop {
+    let (decided, screened, moving, chosen) = loop {
         let chosen: Vec<EffectEntry> = screened.forms.iter().map(|form| evidence.entry(form)).collect();
         let decided = one_pass(evidence.replay, &chosen, &slow, opening, &point, evidence, progress)?;
         let next = step(&point, &decided);
@@ -141,7 +143,7 @@ fn decide(
         }
         point = next;
         if passes > 1 && moving.is_empty() || passes == PASSES {
-            break (decided, screened, moving);
+            break (decided, screened, moving, chosen);
         }
         if now != named {
             let beside = screen(scorer, &now)?;
@@ -159,7 +161,8 @@ fn decide(
             screened = Screened { forms: beside.forms, ..screened };
         }
     };
-    answer(settings, record, scorer, &decided, &screened, evidence, &moving)
+    let diagnosis = answer(settings, record, scorer, &decided, &screened, evidence, &moving)?;
+    Ok((diagnosis, Settled { decided, chosen, slow, point }))
 }
 
 /// Names of the effects that are in one of two lists in a form in which they are not in the other.

@@ -7,6 +7,7 @@ pub mod compare;
 pub mod diagnose;
 pub mod ladder;
 mod likelihood;
+pub mod next;
 mod proposals;
 mod replay;
 mod sums;
@@ -61,6 +62,9 @@ pub enum WorkflowError {
     /// The likelihood of innovations needs more than the stages declare.
     #[error("the likelihood of the innovations is not to be had: {0}")]
     NoLikelihood(String),
+    /// A mission file that a manoeuvre cannot be planned with.
+    #[error("no manoeuvre can be planned: {0}")]
+    Mission(#[from] dragfree_physics::mission::MissionError),
     /// A detection without its template.
     #[error(
         "{effect} has no waveform any more for the transient at {at_ns} ns: its plugin declares others in every pass"

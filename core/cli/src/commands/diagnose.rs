@@ -1,28 +1,53 @@
 //! `dragfree diagnose`: the data of products once more, with every effect that is not in the model.
 
 use super::{Done, INCONSISTENT, replay};
+use crate::advice;
 use crate::args::{Diagnose, Global};
 use crate::failure::Failure;
 use crate::text::Paint;
 use chrono::DateTime;
+use dragfree_engine::product::{self, Written};
 use dragfree_identification::diagnosis::Found;
 use dragfree_workflow::diagnose::{Diagnosed, diagnose};
+use dragfree_workflow::next::next;
 use std::fmt::Write as _;
+use std::path::Path;
 
 pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Result<Done, Failure> {
-    let diagnosed = replay::with_meter(&command.products, &command.archive.folder, global, diagnose)?;
+    let archive = &command.archive.folder;
+    let others = if command.next { latest(archive)? } else { Vec::new() };
+    let (diagnosed, next) = replay::with_meter(&command.products, archive, global, |replay, progress| {
+        let diagnosed = diagnose(replay, progress)?;
+        let next = command.next.then(|| next(replay, &diagnosed, &others, progress)).transpose()?;
+        Ok((diagnosed, next))
+    })?;
     let code = if diagnosed.diagnosis.verdict == "sufficient" { 0 } else { INCONSISTENT };
     if global.json {
-        let value = serde_json::to_value(&diagnosed.diagnosis)?;
+        let mut value = serde_json::to_value(&diagnosed.diagnosis)?;
+        if let Some(next) = &next {
+            value["next"] = serde_json::to_value(next)?;
+        }
         return Ok(Done { code, ..Done::json(&value) });
     }
-    Ok(Done { code, ..Done::new(screen(&diagnosed, command, &super::repeated(None, global), paint)) })
+    let mut text = screen(&diagnosed, command, &super::repeated(None, global), paint);
+    if let Some(next) = &next {
+        text += &advice::screen(next);
+    }
+    Ok(Done { code, ..Done::new(text) })
+}
+
+/// The latest products of an archive; none where there is no archive, as products may be named by their files.
+fn latest(archive: &Path) -> Result<Vec<Written>, Failure> {
+    if !archive.is_dir() {
+        return Ok(Vec::new());
+    }
+    let entries = product::list(archive)?.entries.into_iter().filter(|entry| entry.latest);
+    Ok(entries.map(|entry| Written { product: entry.product, path: entry.path }).collect())
 }
 
 fn screen(diagnosed: &Diagnosed, command: &Diagnose, repeated: &str, paint: Paint) -> String {
     let Diagnosed { record, diagnosis: d, .. } = diagnosed;
     let top = command.top;
-    let ask = Ask { next: command.next, different: d.false_alarm_rate };
     let mut out = String::new();
     let verdict = match d.verdict.as_str() {
         "missing" => "an effect is missing from the model",
@@ -40,13 +65,13 @@ fn screen(diagnosed: &Diagnosed, command: &Diagnose, repeated: &str, paint: Pain
     let accepted: Vec<&Found> = d.candidates.iter().filter(|f| f.accepted).collect();
     if !accepted.is_empty() {
         let _ = writeln!(out, "\nWhat is missing");
-        accepted.iter().for_each(|f| put(&mut out, f, ask));
+        accepted.iter().for_each(|f| put(&mut out, f, d.false_alarm_rate));
     }
     let others: Vec<&Found> =
         d.candidates.iter().filter(|f| !f.accepted).take(top.saturating_sub(accepted.len())).collect();
     if !others.is_empty() {
         let _ = writeln!(out, "\nTried next, and not accepted");
-        others.iter().for_each(|f| put(&mut out, f, ask));
+        others.iter().for_each(|f| put(&mut out, f, d.false_alarm_rate));
     }
     for reason in &d.reasons {
         out += &crate::text::labelled("reason", reason);
@@ -70,7 +95,7 @@ fn screen(diagnosed: &Diagnosed, command: &Diagnose, repeated: &str, paint: Pain
     }
     if !d.formulas.is_empty() {
         let _ = writeln!(out, "\nFormulas that would explain it");
-        d.formulas.iter().for_each(|f| put(&mut out, f, ask));
+        d.formulas.iter().for_each(|f| put(&mut out, f, d.false_alarm_rate));
     }
     let unnamed = diagnosed.unexplained_transients();
     if !unnamed.is_empty() {
@@ -105,19 +130,8 @@ fn added(f: &Found, repeated: &str) -> String {
     format!("dragfree model add MODEL.toml {}:{}{parameters}{repeated}", f.effect, f.instance)
 }
 
-/// What is asked of each effect.
-#[derive(Clone, Copy)]
-struct Ask {
-    /// What would tell it from others.
-    next: bool,
-    /// p-value below which products differ.
-    different: f64,
-}
-
-/// Length over that of the data from which on it is no advice.
-const LONGEST: f64 = 1000.0;
-
-fn put(out: &mut String, f: &Found, ask: Ask) {
+/// `different` is the p-value below which products differ.
+fn put(out: &mut String, f: &Found, different: f64) {
     let _ = writeln!(out, "  {}:{}", f.effect, f.instance);
     let _ = writeln!(
         out,
@@ -147,21 +161,11 @@ fn put(out: &mut String, f: &Found, ask: Ask) {
     }
     if let Some(c) = &f.constancy {
         let days: Vec<String> = f.by_product.iter().map(|d| format!("{:.3e} ± {:.0e}", d.value, d.sigma)).collect();
-        let verdict =
-            if c.p_value < ask.different { "not the same in all products" } else { "the same in all products" };
+        let verdict = if c.p_value < different { "not the same in all products" } else { "the same in all products" };
         let text = format!("{verdict}: {} (χ² {:.1} of {}, p = {:.1e})", days.join(", "), c.chi2, c.dof, c.p_value);
         out.push_str(&crate::text::labelled("    values", &text));
     }
     if !f.confounders.is_empty() {
         out.push_str(&crate::text::labelled("    cannot be told from", &f.confounders.join(", ")));
-    }
-    for s in f.separations.iter().filter(|_| ask.next) {
-        let length = if s.times_the_data < LONGEST {
-            format!("{:.1} times these data", s.times_the_data.max(1.0))
-        } else {
-            "no length of such data: a test on the ground, or a manoeuvre".to_owned()
-        };
-        let text = format!("{} at 5σ: {length} (now {:.1}σ)", s.from, s.chi2.sqrt());
-        out.push_str(&crate::text::labelled("    told from", &text));
     }
 }
