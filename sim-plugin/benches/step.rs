@@ -30,6 +30,7 @@ fn simulator() -> Simulator {
         settle_s: 60.0,
         com_offset_srf_m: Vector3::new(0.001, 0.0, 0.0),
         stiffness_error: 0.2,
+        manoeuvres: Vec::new(),
         effects: Vec::new(),
     };
     Simulator::new(&mission(), settings).expect("the fixture flies")

@@ -81,6 +81,7 @@ fn residuals(mission: &Mission, samples: usize, effect: Option<&str>) -> (Vec<Ve
         settle_s: 600.0,
         com_offset_srf_m: Vector3::new(0.001, 0.0, 0.0),
         stiffness_error: 0.2,
+        manoeuvres: Vec::new(),
         effects: effect.iter().map(|text| EffectRequest::parse(text, &names(mission)).expect("an effect")).collect(),
     };
     let known = Known::new(mission);

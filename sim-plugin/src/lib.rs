@@ -15,6 +15,7 @@ pub mod simulator;
 mod testing;
 pub mod thrusters;
 
+use dragfree_physics::manoeuvre::Manoeuvre;
 use dragfree_physics::mission::{ANGLES, AXES, Mission, TestMass};
 use dragfree_sdk::prelude::*;
 use nalgebra::Vector3;
@@ -303,6 +304,11 @@ impl Source for Sim {
                 &[],
                 "ID:INSTANCE=SIZE[,NAME=VALUE]..., as mps-gain:sc.y=0.02; what is not there is answered with the list",
             ),
+            Parameter::text_list(
+                "manoeuvres",
+                &[],
+                "INPUT=AMPLITUDE,frequency_hz=F,from_s=A,until_s=B: a sine commanded beside the control law, N or N m",
+            ),
         ],
         instances: &[],
         needs: &[],
@@ -322,6 +328,9 @@ impl Source for Sim {
         let given = setup.text_list("effects")?;
         let names: Vec<String> = mission.test_mass.keys().cloned().collect();
         let mut effects = given.iter().map(|text| EffectRequest::parse(text, &names)).collect::<Result<Vec<_>, _>>()?;
+        let flown = setup.text_list("manoeuvres")?;
+        let manoeuvres = flown.iter().map(|text| Manoeuvre::parse(text, &mission)).collect::<Result<_, _>>();
+        let manoeuvres = manoeuvres.map_err(|e| refuse(e.into()))?;
         let days = (end_ns - start_ns) as f64 / 86_400e9;
         let hidden = u64::try_from(setup.i64("hidden")?).ok().map(|seed| Hidden::draw(seed, days, &names));
         effects.extend(hidden.iter().flat_map(|h| &h.drawn).map(|d| d.request.clone()));
@@ -333,6 +342,7 @@ impl Source for Sim {
             com_offset_srf_m: Vector3::from(offset),
             stiffness_error: setup.f64("stiffness_error")?,
             effects,
+            manoeuvres,
         };
         let simulator = Simulator::new(&mission, settings).map_err(refuse)?;
         let sealed = hidden.map(|hidden| {

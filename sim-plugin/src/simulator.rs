@@ -3,6 +3,7 @@
 use dragfree_physics::attitude::{rotation_vector, turn};
 use dragfree_physics::control::{Command, ControlLaw, PerTestMass};
 use dragfree_physics::control_design::growth_per_sample;
+use dragfree_physics::manoeuvre::{Manoeuvre, ManoeuvreError};
 use dragfree_physics::mission::{ANGLES, AXES, Actuators, Limits, Mission, MissionError, SPACECRAFT};
 use dragfree_physics::process::normal;
 use nalgebra::{Matrix3, Vector3};
@@ -40,6 +41,9 @@ pub enum SimulationError {
     /// An effect was refused.
     #[error(transparent)]
     Effect(#[from] EffectError),
+    /// A manoeuvre was refused.
+    #[error(transparent)]
+    Manoeuvre(#[from] ManoeuvreError),
     /// A parameter is invalid.
     #[error("{0}")]
     Parameter(String),
@@ -76,6 +80,8 @@ pub struct Settings {
     pub stiffness_error: f64,
     /// Effects unknown to the controller.
     pub effects: Vec<EffectRequest>,
+    /// What is commanded beside the control law.
+    pub manoeuvres: Vec<Manoeuvre>,
 }
 
 /// One epoch of the loop.
@@ -345,7 +351,8 @@ impl Simulator {
         if let Some(limits) = &self.limits {
             measured.saturate(limits);
         }
-        let command = self.law.step(&measured.readout(Some(ephemeris.sun_srf)));
+        let response = self.law.step(&measured.readout(Some(ephemeris.sun_srf)));
+        let command = self.with_manoeuvres(response);
         let (loads, outside) = (self.loads(&command), self.outside());
         let before = self.state;
         let means = self.plant.step(&mut self.state, &loads, &outside, self.dt_s);
@@ -375,6 +382,16 @@ impl Simulator {
             },
             ephemeris: packet.then_some(ephemeris),
         })
+    }
+
+    /// The command with the manoeuvres, within the actuators' limits.
+    fn with_manoeuvres(&self, mut command: Command) -> Command {
+        let elapsed_s = self.index as f64 * self.dt_s;
+        self.settings.manoeuvres.iter().for_each(|m| m.add(elapsed_s, &mut command));
+        match &self.actuators {
+            Some(limits) if !self.settings.manoeuvres.is_empty() => command.limited(limits),
+            _ => command,
+        }
     }
 
     /// Updates the surroundings at an epoch.

@@ -431,6 +431,7 @@ fn dropped_terms_are_small_in_science_mode() {
         settle_s: 1800.0,
         com_offset_srf_m: Vector3::new(0.001, 0.0, 0.0),
         stiffness_error: 0.2,
+        manoeuvres: Vec::new(),
         effects: Vec::new(),
     };
     let mut simulator = Simulator::new(&taiji(), settings).unwrap();

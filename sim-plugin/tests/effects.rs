@@ -36,6 +36,7 @@ fn settings(effects: &[&str], settle_s: f64) -> Settings {
         settle_s,
         com_offset_srf_m: Vector3::new(0.001, 0.0, 0.0),
         stiffness_error: 0.2,
+        manoeuvres: Vec::new(),
         effects: effects.iter().map(|text| parse(text).unwrap()).collect(),
     }
 }

@@ -271,6 +271,7 @@ fn times_without_planets_are_refused_by_name() {
         settle_s: 600.0,
         com_offset_srf_m: Vector3::zeros(),
         stiffness_error: 0.2,
+        manoeuvres: Vec::new(),
         effects: Vec::new(),
     };
     let early = Simulator::new(&mission(|_| ()), settings(1_700_000_000_000_000_000)).err().unwrap().to_string();

@@ -24,7 +24,7 @@ fn config(seconds: i64, change: impl Fn(&mut Value, &mut Value)) -> Config {
     let mut mission: Value = toml::from_str(&text).unwrap();
     let mut parameters = json!({
         "seed": 5, "com_offset_srf_m": [0.001, 0.0, 0.0], "command": true, "stiffness_error": 0.2, "settle_s": 60.0,
-        "effects": [], "hidden": -1
+        "effects": [], "manoeuvres": [], "hidden": -1
     });
     change(&mut mission, &mut parameters);
     let value = json!({

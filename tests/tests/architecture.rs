@@ -47,9 +47,13 @@ fn allowed(crate_name: &str) -> &'static [&'static str] {
         "dragfree-validation" => &["dragfree-engine", "dragfree-physics", "dragfree-chart", "dragfree-tests"],
         "dragfree-estimation" => &["dragfree-physics", "dragfree-schema"],
         "dragfree-identification" => &["dragfree-schema", "dragfree-estimation"],
-        "dragfree-workflow" => {
-            &["dragfree-schema", "dragfree-engine", "dragfree-estimation", "dragfree-identification"]
-        }
+        "dragfree-workflow" => &[
+            "dragfree-schema",
+            "dragfree-physics",
+            "dragfree-engine",
+            "dragfree-estimation",
+            "dragfree-identification",
+        ],
         "dragfree-tests" => &["dragfree-schema"],
         "dragfree-qp-check" => &["dragfree-sdk", "dragfree-estimation"],
         _ => &["dragfree-sdk", "dragfree-physics"],

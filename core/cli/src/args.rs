@@ -162,6 +162,14 @@ pub(crate) struct Simulate {
     /// Add an effect to the truth, `es-gain:tm1.y=0.02`, SI units; repeatable. The list is below
     #[arg(long = "effect", value_name = "ID:INSTANCE=SIZE[,NAME=VALUE]...", value_parser = effect)]
     pub(crate) effects: Vec<String>,
+    /// Command a sine beside the control law, `sc.x=1e-5,frequency_hz=0.01,from_s=3600,until_s=5400`: N or N m, s
+    /// after the first epoch; `sc.x` is thrust, `sc.phi` torque, `tm1.y` force of the electrodes; repeatable
+    #[arg(
+        long = "manoeuvre",
+        value_name = "INPUT=AMPLITUDE,frequency_hz=F,from_s=A,until_s=B",
+        conflicts_with = "no_command"
+    )]
+    pub(crate) manoeuvres: Vec<String>,
     /// Hide what this seed draws: mostly one effect; sealed in DIR/truth/, opened by `reveal`
     #[arg(long, value_name = "SEED")]
     pub(crate) hidden: Option<u32>,
@@ -273,14 +281,15 @@ pub(crate) struct Diagnose {
     /// Candidates and limits to print; --json has all
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub(crate) top: usize,
-    /// Say what length of data would tell a named effect from what it cannot be told from
+    /// Say what would tell a named effect from what it cannot be told from: more data like these, products of the
+    /// archive, or a small manoeuvre, with the σ that is expected
     #[arg(long)]
     pub(crate) next: bool,
     /// Keep what a later diagnosis of several products needs of this one, in a file beside it
     #[arg(long, conflicts_with = "extracts")]
     pub(crate) keep_extract: bool,
     /// Diagnose from the extracts of the products, without telemetry
-    #[arg(long)]
+    #[arg(long, conflicts_with = "next")]
     pub(crate) extracts: bool,
 }
 

@@ -1,5 +1,6 @@
 //! The dragfree command: arguments, progress, tables, exit codes. What it does is done by the engine.
 
+mod advice;
 mod args;
 mod bundled;
 mod commands;

@@ -2,16 +2,22 @@
 //! the columns that the caller chooses come back to it.
 
 use std::collections::BTreeMap;
+use std::ops::Range;
 
 use crate::EngineError;
 use crate::border::Kind;
 use crate::chain::{Chain, Sink};
 use crate::config::{EffectEntry, Mission, Model, Node};
+use crate::feed::{Feed, SourceFeed, Summary};
 use crate::files::{IoContext as _, sha256_of};
 use crate::product::Product;
 use crate::registry::Registry;
 use crate::run::{Progress, RunOptions, Setup};
 use crate::sources::Sources;
+use crate::table::{Chunk, TableSpec};
+
+/// Puts other values into the rows of a feed, as they would be in another experiment. Times stay.
+pub type Altering<'a> = &'a dyn Fn(&[TableSpec], &mut Chunk);
 
 /// Which data are examined, and how.
 pub struct Examination<'a> {
@@ -27,6 +33,8 @@ pub struct Examination<'a> {
     pub needs: &'a [&'static str],
     /// Coefficients of the model that start at another value than the model file's, by name.
     pub values: &'a BTreeMap<String, f64>,
+    /// Rows as they would be in another experiment; as they are where there is none.
+    pub altered: Option<Altering<'a>>,
     /// Threads; results do not depend on them.
     pub threads: usize,
     /// Most rows in one call; results do not depend on it.
@@ -105,13 +113,48 @@ pub fn examine<C: Sink, E: From<EngineError>>(
     }
     let nodes = &mut setup.pipeline.nodes;
     nodes.truncate(nodes.iter().position(|n| *n == Node::Effects).map_or(nodes.len(), |i| i + 1));
-    let mut feed = setup.feed(registry, None)?;
+    let mut feed: Box<dyn Feed + '_> = setup.feed(registry, None)?;
+    if let Some(alter) = what.altered {
+        feed = Box::new(Altered { feed, alter });
+    }
     let mut chain = setup.link(registry, feed.tables())?;
     let (mut consumer, columns) = link(&chain)?;
     chain.tap(&columns).map_err(EngineError::from)?;
     setup.carry(feed.as_mut(), &mut chain, &mut consumer, progress)?;
     chain.finish(&mut consumer).map_err(EngineError::from)?;
     Ok((consumer, chain.not_tried))
+}
+
+/// A feed with other values.
+struct Altered<'a> {
+    feed: Box<dyn Feed + 'a>,
+    alter: Altering<'a>,
+}
+
+impl Feed for Altered<'_> {
+    fn tables(&self) -> &[TableSpec] {
+        self.feed.tables()
+    }
+
+    fn next(&mut self) -> Result<Option<Chunk>, EngineError> {
+        let mut chunk = self.feed.next()?;
+        if let Some(chunk) = &mut chunk {
+            (self.alter)(self.feed.tables(), chunk);
+        }
+        Ok(chunk)
+    }
+
+    fn span_ns(&self) -> Option<Range<i64>> {
+        self.feed.span_ns()
+    }
+
+    fn summary(&mut self) -> Result<Summary, EngineError> {
+        self.feed.summary()
+    }
+
+    fn source(&self) -> Option<&SourceFeed> {
+        self.feed.source()
+    }
 }
 
 /// The inputs are those that the product names.

@@ -93,7 +93,7 @@ impl Separation {
 }
 
 /// χ² at which two effects count as told apart: five σ.
-const SEPARATED_CHI2: f64 = 25.0;
+pub const SEPARATED_CHI2: f64 = 25.0;
 
 /// What one product says of a coefficient.
 #[derive(Clone, Debug, Serialize)]

@@ -170,7 +170,7 @@ impl LinearPlant {
     ///
     /// `α = J_S⁻¹(M_T − Σ T M_Ej − Σ b_j×(T F_Ej))`, `r̈_i = −T((F_T − Σ T F_Ej)/m_S + α×b_i) + F_Ei/m_i`, and a test
     /// mass turns against its housing by `J_m⁻¹ M_Ei − T α`.
-    fn accelerations(&self, u: &Command) -> Vec<f64> {
+    pub(crate) fn accelerations(&self, u: &Command) -> Vec<f64> {
         let (mut force, mut torque) = (u.mps_force_srf_n, u.mps_torque_srf_nm);
         for (tm, e) in self.tm.iter().zip(&u.tm) {
             let f = tm.dcm_orf_from_srf.tr_mul(&e.force_orf_n);

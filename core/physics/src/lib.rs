@@ -13,6 +13,7 @@ pub mod hinf;
 pub mod lag;
 pub mod levels;
 pub mod lti;
+pub mod manoeuvre;
 pub mod mission;
 pub mod noise;
 pub mod process;

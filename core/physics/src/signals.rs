@@ -76,7 +76,8 @@ impl Command {
             | reaches(&self.mps_torque_srf_nm, limits.torque_limit_nm)
     }
 
-    pub(crate) fn limited(mut self, limits: &Actuators) -> Self {
+    /// The same with every component within its limit.
+    pub fn limited(mut self, limits: &Actuators) -> Self {
         let clamp = |v: &mut Vector3<f64>, limit: f64| v.apply(|x| *x = x.clamp(-limit, limit));
         clamp(&mut self.mps_force_srf_n, limits.thrust_limit_n);
         clamp(&mut self.mps_torque_srf_nm, limits.torque_limit_nm);

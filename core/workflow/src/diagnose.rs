@@ -17,13 +17,13 @@ use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::screen::{RefinementRequest, Screened, screen};
 use dragfree_identification::slow_forces::slow_forces;
 use dragfree_identification::transient::Detection;
-use dragfree_schema::{NoiseProcess, Settings};
+use dragfree_schema::Settings;
 use serde_json::json;
 
 use crate::WorkflowError;
 use crate::answer::{Evidence, apart, contradict, found, limits, louder, noise_levels, verdict};
 use crate::extract::Extract;
-use crate::likelihood::{Decided, PASSES, Point, moved, one_pass, step, step_of_model};
+use crate::likelihood::{Decided, PASSES, Point, Settled, moved, one_pass, step, step_of_model};
 use crate::proposals::{FORMULA, Proposal, proposals};
 use crate::replay::{FINE, Pass, Replay, What, sum};
 
@@ -37,6 +37,8 @@ pub struct Diagnosed {
     pub settings: Settings,
     /// What it leaves for a diagnosis of several products; none where there are several.
     pub extract: Option<Extract>,
+    /// Where the passes have ended.
+    pub(crate) end: Settled,
 }
 
 /// Diagnoses the data of products of one model; `keeps` an extract of one product. `progress` is told the pass and the
@@ -90,8 +92,8 @@ pub fn diagnose(
     let trials = Trials::new(&scorer, &tried);
     let evidence = Evidence { trials, least: settings.false_alarm, registry, products, proposals };
     let last = decide(replay, settings, &record, &scorer, screened, &evidence, progress)?;
-    let Last { decided, screened, moving, .. } = &last;
-    let mut diagnosis = answer(settings, &record, &scorer, decided, screened, &evidence, moving)?;
+    let decided = &last.end.decided;
+    let mut diagnosis = answer(settings, &record, &scorer, decided, &last.screened, &evidence, &last.moving)?;
     contradict(&mut diagnosis, products);
     let extract = match products {
         [product] if keeps => {
@@ -101,7 +103,7 @@ pub fn diagnose(
         }
         _ => None,
     };
-    Ok(Diagnosed { diagnosis, settings: settings.clone(), extract, record })
+    Ok(Diagnosed { diagnosis, settings: settings.clone(), extract, end: last.end, record })
 }
 
 /// A model's entry of a line.
@@ -155,7 +157,7 @@ fn decide(
         }
         point = next;
         if passes > 1 && moving.is_empty() || passes == PASSES {
-            return Ok(Last { decided, screened, moving, slow, point });
+            return Ok(Last { end: Settled { decided, chosen, slow, point }, screened, moving });
         }
         if now != named {
             let beside = screen(scorer, &now)?;
@@ -175,14 +177,12 @@ fn decide(
     }
 }
 
-/// The last pass of a decision, and where the next one would be made.
+/// The end of the passes of a decision.
 struct Last {
-    decided: Decided,
+    end: Settled,
     screened: Screened,
     /// What had not settled.
     moving: BTreeSet<String>,
-    slow: Vec<NoiseProcess>,
-    point: Point,
 }
 
 /// A pass about the model alone, for the extract of a product. Likelihoods of days add where they are taken about the
@@ -195,7 +195,7 @@ fn about_model(
     evidence: &Evidence<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Decided, WorkflowError> {
-    let named = named_forms(&last.decided, &last.screened.forms);
+    let named = named_forms(&last.end.decided, &last.screened.forms);
     let set = &record.candidate_set;
     let places = set.places();
     let form = |screened: &Candidate| {
@@ -204,13 +204,13 @@ fn about_model(
         if named.contains(screened) { screened.clone() } else { first.unwrap_or_else(|| screened.clone()) }
     };
     let entries: Vec<EffectEntry> = last.screened.forms.iter().map(|f| evidence.entry(&form(f))).collect();
-    let mut point = step_of_model(&last.point, &last.decided);
+    let mut point = step_of_model(&last.end.point, &last.end.decided);
     // The first of the two finds the means of series that are new. Levels are those beside what is named.
-    point.levels.clone_from(&last.point.levels);
-    let opening = one_pass(replay, &entries, &last.slow, true, &point, evidence, progress)?;
+    point.levels.clone_from(&last.end.point.levels);
+    let opening = one_pass(replay, &entries, &last.end.slow, true, &point, evidence, progress)?;
     point = step(&point, &opening);
-    point.levels.clone_from(&last.point.levels);
-    one_pass(replay, &entries, &last.slow, false, &point, evidence, progress)
+    point.levels.clone_from(&last.end.point.levels);
+    one_pass(replay, &entries, &last.end.slow, false, &point, evidence, progress)
 }
 
 /// Names of the effects that are in one of two lists in a form in which they are not in the other.

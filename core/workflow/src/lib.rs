@@ -9,6 +9,7 @@ pub mod diagnose;
 pub mod extract;
 pub mod ladder;
 mod likelihood;
+pub mod next;
 mod proposals;
 mod replay;
 mod sums;
@@ -69,6 +70,9 @@ pub enum WorkflowError {
     /// The likelihood of innovations needs more than the stages declare.
     #[error("the likelihood of the innovations is not to be had: {0}")]
     NoLikelihood(String),
+    /// A mission file that a manoeuvre cannot be planned with.
+    #[error("no manoeuvre can be planned: {0}")]
+    Mission(#[from] dragfree_physics::mission::MissionError),
     /// A detection without its template.
     #[error(
         "{effect} has no waveform any more for the transient at {at_ns} ns: its plugin declares others in every pass"

@@ -18,9 +18,11 @@ use dragfree_identification::innovations::filter::{Start, Sums};
 use dragfree_schema::{Coefficient, NoiseProcess, PREDICTION_NEED, Settings, Shape};
 use nalgebra::{DMatrix, DVector};
 
+mod experiment;
 mod pass;
 
-use pass::{Constant, Filtered};
+pub(crate) use experiment::{Experiment, InBlock, Settled, information};
+use pass::{At, Constant, Filtered};
 
 use crate::WorkflowError;
 use crate::replay::{Pass, Replay, noise_levels};
@@ -34,6 +36,9 @@ const LEVEL_PRIOR: f64 = 1.0;
 /// Largest change of the logarithm of a level in one pass: beyond it the quadratic form is no likelihood.
 const LEVEL_STEP: f64 = 0.7;
 
+/// Means of series by table and name.
+pub(crate) type Means = BTreeMap<(String, String), f64>;
+
 /// Where a pass is made.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Point {
@@ -44,7 +49,7 @@ pub(crate) struct Point {
     /// Powers of time of each channel, by product, beside series with their means; none before the first pass.
     powers: BTreeMap<String, f64>,
     /// Means of series by table and name, by product.
-    means: Vec<BTreeMap<(String, String), f64>>,
+    means: Vec<Means>,
     /// States at the start of each stretch, by product.
     starts: Vec<Vec<DVector<f64>>>,
 }
@@ -116,7 +121,7 @@ pub(crate) struct Decided {
     /// Values of the parameters at which the pass was made.
     start: Vec<f64>,
     constants: Vec<Constant>,
-    means: Vec<BTreeMap<(String, String), f64>>,
+    means: Vec<Means>,
     /// Starts of the stretches, by product.
     starts: Vec<Vec<Start>>,
     /// Candidates that could not be tried, and why.
@@ -325,10 +330,12 @@ pub(crate) fn one_pass(
             chosen: chosen.to_vec(),
             needs: &[PREDICTION_NEED],
             values: &levels,
+            altered: None,
             threads: replay.threads,
             batch_rows: replay.batch_rows,
         };
-        let link = |chain: &Chain| Filtered::link(chain, point, slow, opening, number, settings, replay.threads);
+        let at = At { point, slow, opening, number, block_s: None, data: true };
+        let link = |chain: &Chain| Filtered::link(chain, at, settings, replay.threads);
         let (filtered, refused) =
             examine(replay.registry, &examination, link, &mut |p| progress(Pass::Likelihood, number, p))?;
         not_tried.extend(refused);
@@ -345,7 +352,7 @@ struct Joined {
     channels: BTreeMap<String, BTreeSet<String>>,
     parts: Vec<Part>,
     constants: Vec<Constant>,
-    means: Vec<BTreeMap<(String, String), f64>>,
+    means: Vec<Means>,
 }
 
 /// Sums of one product.

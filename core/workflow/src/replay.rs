@@ -53,6 +53,8 @@ pub enum Pass {
     Candidates,
     /// Innovations of the channels.
     Likelihood,
+    /// What other data would tell.
+    Experiment,
 }
 
 /// What is summed.
@@ -141,6 +143,7 @@ pub(crate) fn sum(
             chosen: if let What::Candidates(.., chosen) = what { chosen.to_vec() } else { Vec::new() },
             needs: &[],
             values: &levels,
+            altered: None,
             threads,
             batch_rows,
         };

@@ -22,6 +22,7 @@ pub(crate) fn settings(seed: u64) -> Settings {
         settle_s: 600.0,
         com_offset_srf_m: Vector3::new(0.001, 0.0, 0.0),
         stiffness_error: 0.2,
+        manoeuvres: Vec::new(),
         effects: Vec::new(),
     }
 }

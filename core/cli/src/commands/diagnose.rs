@@ -1,45 +1,69 @@
 //! `dragfree diagnose`: the data of products once more, with every effect that is not in the model.
 
 use super::{Done, INCONSISTENT, products, replay};
+use crate::advice;
 use crate::args::{Diagnose, Global};
 use crate::failure::{Failure, Refusal};
 use crate::text::Paint;
 use chrono::DateTime;
+use dragfree_engine::product::{self, Written};
 use dragfree_identification::diagnosis::{Diagnosis, Found};
 use dragfree_identification::transient::Detection;
 use dragfree_workflow::diagnose::diagnose;
 use dragfree_workflow::extract::diagnose_extracts;
+use dragfree_workflow::next::{Next, next};
 use std::fmt::Write as _;
+use std::path::Path;
 
 pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Result<Done, Failure> {
-    let products = products::open_all(&command.products, &command.archive.folder)?;
+    let archive = &command.archive.folder;
+    let products = products::open_all(&command.products, archive)?;
     if command.keep_extract && products.len() != 1 {
         return Err(Refusal::Extracts(products.len()).into());
     }
-    let (answer, extract) = if command.extracts {
+    let (answer, kept) = if command.extracts {
         let diagnosis = diagnose_extracts(&super::registry(global)?, &products)?;
-        (Answer { diagnosis, effects: None, unnamed: Vec::new() }, None)
+        (Answer { diagnosis, effects: None, unnamed: Vec::new(), next: None }, None)
     } else {
-        let diagnosed =
-            replay::with_meter(&products, global, |replay, progress| diagnose(replay, command.keep_extract, progress))?;
+        let others = if command.next { latest(archive)? } else { Vec::new() };
+        let (diagnosed, next) = replay::with_meter(&products, global, |replay, progress| {
+            let diagnosed = diagnose(replay, command.keep_extract, progress)?;
+            let next = command.next.then(|| next(replay, &diagnosed, &others, progress)).transpose()?;
+            Ok((diagnosed, next))
+        })?;
+        let kept = match (&diagnosed.extract, &products[..]) {
+            (Some(extract), [product]) => Some(extract.write(&product.path)?),
+            _ => None,
+        };
         let unnamed = diagnosed.unexplained_transients().into_iter().cloned().collect();
         let effects = Some(diagnosed.effects());
-        (Answer { diagnosis: diagnosed.diagnosis, effects, unnamed }, diagnosed.extract)
-    };
-    let kept = match (extract, &products[..]) {
-        (Some(extract), [product]) if command.keep_extract => Some(extract.write(&product.path)?),
-        _ => None,
+        (Answer { diagnosis: diagnosed.diagnosis, effects, unnamed, next }, kept)
     };
     let code = if answer.diagnosis.verdict == "sufficient" { 0 } else { INCONSISTENT };
     if global.json {
-        let value = serde_json::to_value(&answer.diagnosis)?;
+        let mut value = serde_json::to_value(&answer.diagnosis)?;
+        if let Some(next) = &answer.next {
+            value["next"] = serde_json::to_value(next)?;
+        }
         return Ok(Done { code, ..Done::json(&value) });
     }
     let mut text = screen(&answer, command, &super::repeated(None, global), paint);
+    if let Some(next) = &answer.next {
+        text += &advice::screen(next);
+    }
     if let Some((path, bytes)) = kept {
         let _ = writeln!(text, "extract   {}, {} bytes", path.display(), crate::text::grouped(bytes));
     }
     Ok(Done { code, ..Done::new(text) })
+}
+
+/// The latest products of an archive; none where there is no archive, as products may be named by their files.
+fn latest(archive: &Path) -> Result<Vec<Written>, Failure> {
+    if !archive.is_dir() {
+        return Ok(Vec::new());
+    }
+    let entries = product::list(archive)?.entries.into_iter().filter(|entry| entry.latest);
+    Ok(entries.map(|entry| Written { product: entry.product, path: entry.path }).collect())
 }
 
 /// What is shown.
@@ -49,12 +73,13 @@ struct Answer {
     effects: Option<usize>,
     /// Detected transients that are no part of the answer.
     unnamed: Vec<Detection>,
+    /// What would tell more, where it was asked for.
+    next: Option<Next>,
 }
 
 fn screen(answer: &Answer, command: &Diagnose, repeated: &str, paint: Paint) -> String {
-    let Answer { diagnosis: d, effects, unnamed } = answer;
+    let Answer { diagnosis: d, effects, unnamed, .. } = answer;
     let top = command.top;
-    let ask = Ask { next: command.next, different: d.false_alarm_rate };
     let mut out = String::new();
     let verdict = match d.verdict.as_str() {
         "missing" => "an effect is missing from the model",
@@ -72,13 +97,13 @@ fn screen(answer: &Answer, command: &Diagnose, repeated: &str, paint: Paint) -> 
     let accepted: Vec<&Found> = d.candidates.iter().filter(|f| f.accepted).collect();
     if !accepted.is_empty() {
         let _ = writeln!(out, "\nWhat is missing");
-        accepted.iter().for_each(|f| put(&mut out, f, ask));
+        accepted.iter().for_each(|f| put(&mut out, f, d.false_alarm_rate));
     }
     let others: Vec<&Found> =
         d.candidates.iter().filter(|f| !f.accepted).take(top.saturating_sub(accepted.len())).collect();
     if !others.is_empty() {
         let _ = writeln!(out, "\nTried next, and not accepted");
-        others.iter().for_each(|f| put(&mut out, f, ask));
+        others.iter().for_each(|f| put(&mut out, f, d.false_alarm_rate));
     }
     for reason in &d.reasons {
         out += &crate::text::labelled("reason", reason);
@@ -102,7 +127,7 @@ fn screen(answer: &Answer, command: &Diagnose, repeated: &str, paint: Paint) -> 
     }
     if !d.formulas.is_empty() {
         let _ = writeln!(out, "\nFormulas that would explain it");
-        d.formulas.iter().for_each(|f| put(&mut out, f, ask));
+        d.formulas.iter().for_each(|f| put(&mut out, f, d.false_alarm_rate));
     }
     if !unnamed.is_empty() {
         let _ = writeln!(out, "\nTransients that were detected and are no part of the answer");
@@ -136,19 +161,8 @@ fn added(f: &Found, repeated: &str) -> String {
     format!("dragfree model add MODEL.toml {}:{}{parameters}{repeated}", f.effect, f.instance)
 }
 
-/// What is asked of each effect.
-#[derive(Clone, Copy)]
-struct Ask {
-    /// What would tell it from others.
-    next: bool,
-    /// p-value below which products differ.
-    different: f64,
-}
-
-/// Length over that of the data from which on it is no advice.
-const LONGEST: f64 = 1000.0;
-
-fn put(out: &mut String, f: &Found, ask: Ask) {
+/// `different` is the p-value below which products differ.
+fn put(out: &mut String, f: &Found, different: f64) {
     let _ = writeln!(out, "  {}:{}", f.effect, f.instance);
     let _ = writeln!(
         out,
@@ -178,21 +192,11 @@ fn put(out: &mut String, f: &Found, ask: Ask) {
     }
     if let Some(c) = &f.constancy {
         let days: Vec<String> = f.by_product.iter().map(|d| format!("{:.3e} ± {:.0e}", d.value, d.sigma)).collect();
-        let verdict =
-            if c.p_value < ask.different { "not the same in all products" } else { "the same in all products" };
+        let verdict = if c.p_value < different { "not the same in all products" } else { "the same in all products" };
         let text = format!("{verdict}: {} (χ² {:.1} of {}, p = {:.1e})", days.join(", "), c.chi2, c.dof, c.p_value);
         out.push_str(&crate::text::labelled("    values", &text));
     }
     if !f.confounders.is_empty() {
         out.push_str(&crate::text::labelled("    cannot be told from", &f.confounders.join(", ")));
-    }
-    for s in f.separations.iter().filter(|_| ask.next) {
-        let length = if s.times_the_data < LONGEST {
-            format!("{:.1} times these data", s.times_the_data.max(1.0))
-        } else {
-            "no length of such data: a test on the ground, or a manoeuvre".to_owned()
-        };
-        let text = format!("{} at 5σ: {length} (now {:.1}σ)", s.from, s.chi2.sqrt());
-        out.push_str(&crate::text::labelled("    told from", &text));
     }
 }

@@ -34,5 +34,6 @@ fn name(pass: Pass) -> &'static str {
         Pass::Transients => "look",
         Pass::Candidates => "diagnose",
         Pass::Likelihood => "decide",
+        Pass::Experiment => "next",
     }
 }

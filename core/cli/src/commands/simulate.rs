@@ -42,6 +42,7 @@ pub(super) fn run(command: &Simulate, global: &Global) -> Result<SimulateOutcome
     }
     parameters.insert("command".into(), (!command.no_command).into());
     parameters.insert("effects".into(), command.effects.clone().into());
+    parameters.insert("manoeuvres".into(), command.manoeuvres.clone().into());
     let options = SimulateOptions {
         mission: command.mission.clone(),
         out: command.out.clone(),

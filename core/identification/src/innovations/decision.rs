@@ -349,6 +349,48 @@ impl Quadratic {
         values.dot(&(left * &values)).max(0.0)
     }
 
+    /// Weights of all parameters whose quadratic form with the information of a stretch of data is the part of that
+    /// stretch in [`Self::separation`], but for what is known beside the data.
+    pub fn contrast(&self, candidate: usize, from: usize, set: &[usize]) -> DVector<f64> {
+        let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).chain([from]).collect();
+        let own = self.parameters(&[candidate]);
+        let at: Vec<usize> = self.base.iter().copied().chain(self.parameters(&others)).collect();
+        let values = self.beside(candidate, set).values;
+        let mut weights = DVector::zeros(self.score.len());
+        own.iter().zip(&values).for_each(|(i, value)| weights[*i] = *value);
+        let along = &self.information * &weights;
+        let taken = self.inverse(&at) * DVector::from_fn(at.len(), |i, _| along[at[i]]);
+        at.iter().zip(taken.iter()).for_each(|(i, x)| weights[*i] = -x);
+        weights
+    }
+
+    /// σ of the parameters of a candidate, beside a set or in it, everything else fitted.
+    pub fn sigma(&self, candidate: usize, set: &[usize]) -> Vec<f64> {
+        self.beside(candidate, set).covariance.diagonal().iter().map(|variance| variance.max(0.0).sqrt()).collect()
+    }
+
+    /// The likelihood that is expected of data with `more` information than these, if all parameters have these `values`.
+    pub fn expected(&self, more: &DMatrix<f64>, values: &DVector<f64>) -> Self {
+        let information = &self.information + more;
+        let mut quadratic = Self {
+            score: &information * values,
+            profiled: information.clone(),
+            profiled_score: DVector::zeros(values.len()),
+            information,
+            base: self.base.clone(),
+            candidates: self.candidates.clone(),
+            numbers: self.numbers,
+            rounding: Vec::new(),
+        };
+        quadratic.profile();
+        quadratic
+    }
+
+    /// The likelihood that is expected of data like these of another length, as a multiple of theirs.
+    pub fn of_length(&self, times: f64, values: &DVector<f64>) -> Self {
+        self.expected(&(&self.information * (times - 1.0)), values)
+    }
+
     fn with_alternatives(&self, candidate: usize, set: &[usize], usable: &[usize]) -> Fitted {
         let mut fitted = self.beside(candidate, set);
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
@@ -410,7 +452,7 @@ pub fn disagreement(data: &[(DMatrix<f64>, DVector<f64>)], numbers: f64) -> (f64
 }
 
 /// Inverse of a symmetric matrix with rows of different units; rows of zeros stay zero.
-fn inverse(m: &DMatrix<f64>) -> DMatrix<f64> {
+pub fn inverse(m: &DMatrix<f64>) -> DMatrix<f64> {
     let unit: Vec<f64> = m.diagonal().iter().map(|d| if *d > 0.0 { d.sqrt().recip() } else { 0.0 }).collect();
     let mut scaled = DMatrix::from_fn(m.nrows(), m.nrows(), |i, j| m[(i, j)] * unit[i] * unit[j]);
     (0..m.nrows()).filter(|i| unit[*i] == 0.0).for_each(|i| scaled[(i, i)] = 1.0);

@@ -199,6 +199,8 @@ pub struct Innovations {
     samples: u64,
     /// Samples of which squares are summed.
     settled: u64,
+    /// Whether all innovations are taken as zero.
+    without_data: bool,
 }
 
 /// What a pass is made of.
@@ -281,10 +283,17 @@ impl Innovations {
             squares: DMatrix::zeros(channels, channels),
             samples: 0,
             settled: 0,
+            without_data: false,
             kernel,
         };
         pass.restart();
         pass
+    }
+
+    /// The same with all innovations zero: the information of the series alone, as before there are data.
+    pub fn without_data(mut self) -> Self {
+        self.without_data = true;
+        self
     }
 
     /// Adds a row: the channels and the series at `time_ns`. A row with a number that is not finite is a gap.
@@ -308,6 +317,9 @@ impl Innovations {
             }
             for (c, s, factor) in &self.known {
                 self.z[*c] -= factor * self.waiting.inputs[from + s];
+            }
+            if self.without_data {
+                self.z.fill(0.0);
             }
             self.kernel.step(&mut self.state, &mut self.next, &mut self.z);
             self.waiting.innovations.extend(&self.z);

@@ -68,6 +68,23 @@ impl Gaps {
     }
 }
 
+/// Where and how a pass is made.
+#[derive(Clone, Copy)]
+pub(super) struct At<'a> {
+    pub(super) point: &'a Point,
+    /// Slow forces beside the declared noise.
+    pub(super) slow: &'a [NoiseProcess],
+    /// Whether it fits constants of the channels, powers of time and the model alone: constants are many σ of the noise
+    /// between test masses, and a filter without them would take them for noise.
+    pub(super) opening: bool,
+    /// Number of the product.
+    pub(super) number: usize,
+    /// Length of a block of sums, s; all in one where there is none.
+    pub(super) block_s: Option<f64>,
+    /// Whether the innovations are those of the rows; else they are zero.
+    pub(super) data: bool,
+}
+
 /// A pass over one product.
 pub(super) struct Filtered {
     pub(super) parameters: Vec<(String, Meaning)>,
@@ -343,23 +360,17 @@ fn noise_point(responses: &Responses<'_>, filters: &[usize], values: &[f64], lev
 }
 
 impl Filtered {
-    /// The filter of one product's chain at a point, with `slow` forces beside the declared noise; `number` is that of
-    /// the product.
-    ///
-    /// An opening pass fits constants of the channels, powers of time and the model alone: constants are many σ of the
-    /// noise between test masses, and a filter without them would take them for noise.
+    /// The filter of one product's chain.
     ///
     /// # Errors
     /// [`WorkflowError::NoLikelihood`] where the declared noise cannot be filtered.
     pub(super) fn link(
         chain: &Chain,
-        point: &Point,
-        slow: &[NoiseProcess],
-        opening: bool,
-        number: usize,
+        at: At<'_>,
         settings: &Settings,
         threads: usize,
     ) -> Result<Wanted<Self>, WorkflowError> {
+        let At { point, slow, opening, number, block_s, data } = at;
         let available = Available {
             columns: chain.columns.clone(),
             coefficients: chain.coefficients.clone(),
@@ -425,9 +436,10 @@ impl Filtered {
             series: count,
             averaged: responses.channels.iter().any(|c| c.attribute("average") == "2"),
             step_ns: (1e9 / rate_hz).round() as i64,
-            block: None,
+            block: block_s.map(|length_s| (length_s * rate_hz).round() as u64),
             threads,
         });
+        let innovations = if data { innovations } else { innovations.without_data() };
         let acting = |i: usize| {
             let own = responses.terms.iter().filter(move |t| t.coefficient == i);
             own.map(|t| responses.names[t.channel].clone()).collect()
