@@ -148,7 +148,7 @@ fn a_manoeuvre_is_answered_as_the_linear_loop_answers() {
         effects: Vec::new(),
     };
     let times = "from_s=20,until_s=120";
-    for (what, amplitude) in [("sc.y", 1e-5), ("sc.theta", 1e-6), ("tm2.z", 5e-11)] {
+    for (what, amplitude) in [("sc.y", 5e-8), ("sc.theta", 1e-7), ("tm2.z", 5e-11)] {
         let read = |amplitude: f64| {
             Manoeuvre::parse(&format!("{what}={amplitude:e},frequency_hz=0.02,{times}"), &mission).unwrap()
         };
