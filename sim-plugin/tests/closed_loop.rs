@@ -130,8 +130,8 @@ fn answer(command: &Command, displacements: [Vector3<f64>; 2]) -> [Vector3<f64>;
     [command.mps_force_srf_n, command.mps_torque_srf_nm, tm1, tm2, displacements[0], displacements[1]]
 }
 
-/// The answer of the loop to a manoeuvre is that of the linear loop, from which `diagnose --next` expects what a manoeuvre
-/// tells. The same noise flies with and without it, so the difference is the answer alone. The nominal plant lacks what
+/// The answer of the loop to a manoeuvre is that of the linear loop, from which `diagnose --next` expects what a
+/// manoeuvre tells. The same noise flies with and without it, so the difference is the answer alone. The nominal plant lacks what
 /// is drawn of the stiffness: 2 % of the largest number of each vector. The twin of half the amplitude is off by half.
 #[test]
 fn a_manoeuvre_is_answered_as_the_linear_loop_answers() {
@@ -148,7 +148,7 @@ fn a_manoeuvre_is_answered_as_the_linear_loop_answers() {
         effects: Vec::new(),
     };
     let times = "from_s=20,until_s=120";
-    for (what, amplitude) in [("sc.y", 1e-5), ("sc.theta", 1e-6), ("tm2.z", 5e-11)] {
+    for (what, amplitude) in [("sc.y", 5e-8), ("sc.theta", 1e-7), ("tm2.z", 5e-11)] {
         let read = |amplitude: f64| {
             Manoeuvre::parse(&format!("{what}={amplitude:e},frequency_hz=0.02,{times}"), &mission).unwrap()
         };

@@ -25,20 +25,25 @@ pub(crate) fn screen(next: &Next) -> String {
     out
 }
 
+/// A line below a heading.
+fn line(label: &str, words: &str) -> String {
+    labelled(&format!("  {label:<9}"), words)
+}
+
 fn separation(out: &mut String, a: &Advice, next: &Next) {
     let _ = writeln!(out, "\nWhat would tell {} from {}", a.effect, a.from);
-    let _ = writeln!(out, "  now       {:.1}σ", a.now_sigma);
+    *out += &line("now", &format!("{:.1}σ", a.now_sigma));
     match &a.data {
         Some(data) => {
             let length = format!("{:.1} times these data, {:.1} h, tell them apart at 5σ", data.times, data.hours);
-            *out += &labelled("  data", &length);
+            *out += &line("data", &length);
             data.coefficients.iter().for_each(|c| coefficient(out, c, "then"));
         }
-        None => *out += &labelled("  data", "no length of such data: a test on the ground, or a manoeuvre"),
+        None => *out += &line("data", "no length of such data: a test on the ground, or a manoeuvre"),
     }
-    *out += &labelled("  archive", &archive(&a.archive));
+    *out += &line("archive", &archive(&a.archive));
     if let Some(text) = hours(&a.hours) {
-        *out += &labelled("  hours", &text);
+        *out += &line("hours", &text);
     }
     manoeuvre(out, a.manoeuvre.as_ref(), next);
 }
@@ -46,14 +51,14 @@ fn separation(out: &mut String, a: &Advice, next: &Next) {
 fn limit(out: &mut String, a: &LimitAdvice, next: &Next) {
     let _ = writeln!(out, "\nWhat would limit {}", a.effect);
     let text = format!("σ {:.1e} of {}, which may be {:.1e}", a.sigma_now, a.coefficient, a.largest);
-    *out += &labelled("  now", &text);
+    *out += &line("now", &text);
     manoeuvre(out, a.manoeuvre.as_ref(), next);
 }
 
 fn coefficient(out: &mut String, c: &Expected, then: &str) {
     let unit = if c.unit == "1" { String::new() } else { format!(" {}", c.unit) };
     let text = format!("{} ± {:.1e}{unit} now, ± {:.1e}{unit} {then}", c.name, c.sigma_now, c.sigma_expected);
-    *out += &labelled("           ", &text);
+    *out += &line("", &text);
 }
 
 fn archive(a: &OfArchive) -> String {
@@ -89,7 +94,7 @@ fn manoeuvre(out: &mut String, planned: Option<&Planned>, next: &Next) {
     let authority = 100.0 * next.authority;
     let Some(p) = planned else {
         let text = format!("none with {authority:.0} % of the authority within half a run of {:.1} h", next.run_hours);
-        *out += &labelled("  manoeuvre", &text);
+        *out += &line("manoeuvre", &text);
         return;
     };
     let text = format!(
@@ -97,7 +102,7 @@ fn manoeuvre(out: &mut String, planned: Option<&Planned>, next: &Next) {
          actuators and readouts allow",
         p.input, p.amplitude, p.unit, p.frequency_hz, p.duration_s, p.expected_sigma, next.run_hours
     );
-    *out += &labelled("  manoeuvre", &text);
+    *out += &line("manoeuvre", &text);
     p.coefficients.iter().for_each(|c| coefficient(out, c, "with it"));
-    *out += &labelled("           ", &format!("dragfree simulate … {}", p.simulate));
+    *out += &line("", &format!("dragfree simulate … {}", p.simulate));
 }

@@ -162,7 +162,7 @@ pub(crate) struct Simulate {
     /// Add an effect to the truth, `es-gain:tm1.y=0.02`, SI units; repeatable. The list is below
     #[arg(long = "effect", value_name = "ID:INSTANCE=SIZE[,NAME=VALUE]...", value_parser = effect)]
     pub(crate) effects: Vec<String>,
-    /// Command a sine beside the control law, `sc.x=1e-5,frequency_hz=0.01,from_s=3600,until_s=5400`: N or N m, s
+    /// Command a sine beside the control law, `sc.x=1e-7,frequency_hz=0.01,from_s=3600,until_s=5400`: N or N m, s
     /// after the first epoch; `sc.x` is thrust, `sc.phi` torque, `tm1.y` force of the electrodes; repeatable
     #[arg(
         long = "manoeuvre",

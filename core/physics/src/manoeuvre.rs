@@ -88,7 +88,7 @@ pub enum ManoeuvreError {
     /// The text does not have the form of a manoeuvre.
     #[error(
         "manoeuvre {0}: not of the form INPUT=AMPLITUDE,frequency_hz=F,from_s=A,until_s=B, as \
-         sc.x=1e-5,frequency_hz=0.01,from_s=3600,until_s=5400"
+         sc.x=1e-7,frequency_hz=0.01,from_s=3600,until_s=5400"
     )]
     Form(String),
     /// There is no such actuator.
@@ -115,7 +115,7 @@ pub struct Manoeuvre {
 }
 
 impl Manoeuvre {
-    /// Reads `sc.x=1e-5,frequency_hz=0.01,from_s=3600,until_s=5400`.
+    /// Reads `sc.x=1e-7,frequency_hz=0.01,from_s=3600,until_s=5400`.
     ///
     /// # Errors
     /// [`ManoeuvreError`]: a name is unknown, the amplitude is beyond the actuator, a time or frequency is impossible.

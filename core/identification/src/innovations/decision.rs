@@ -369,7 +369,8 @@ impl Quadratic {
         self.beside(candidate, set).covariance.diagonal().iter().map(|variance| variance.max(0.0).sqrt()).collect()
     }
 
-    /// The likelihood that is expected of data with `more` information than these, if all parameters have these `values`.
+    /// The likelihood that is expected of data with `more` information than these, if all parameters have these
+    /// `values`.
     pub fn expected(&self, more: &DMatrix<f64>, values: &DVector<f64>) -> Self {
         let information = &self.information + more;
         let mut quadratic = Self {

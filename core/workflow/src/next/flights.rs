@@ -2,8 +2,9 @@
 //!
 //! Information is quadratic in the regressors, and the response of the loop to a manoeuvre is independent of the noise:
 //! what a manoeuvre adds is the information of the regressors of a spacecraft on which nothing happens but the
-//! manoeuvre. The telemetry at hand is therefore replayed with every value held at its first one and the response of the
-//! linear loop added to commands and readouts; manoeuvres follow each other, and the sums of each are a block of time.
+//! manoeuvre. The telemetry at hand is therefore replayed with every value held at its first one and the response of
+//! the linear loop added to commands and readouts; manoeuvres follow each other, and the sums of each are a block of
+//! time.
 
 use std::cell::RefCell;
 
