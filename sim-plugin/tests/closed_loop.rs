@@ -131,8 +131,9 @@ fn answer(command: &Command, displacements: [Vector3<f64>; 2]) -> [Vector3<f64>;
 }
 
 /// The answer of the loop to a manoeuvre is that of the linear loop, from which `diagnose --next` expects what a
-/// manoeuvre tells. The same noise flies with and without it, so the difference is the answer alone. The nominal plant lacks what
-/// is drawn of the stiffness: 2 % of the largest number of each vector. The twin of half the amplitude is off by half.
+/// manoeuvre tells. The same noise flies with and without it, so the difference is the answer alone. The nominal plant
+/// lacks what is drawn of the stiffness: 2 % of the largest number of each vector. The twin of half the amplitude is
+/// off by half.
 #[test]
 fn a_manoeuvre_is_answered_as_the_linear_loop_answers() {
     let mut mission = taiji();
