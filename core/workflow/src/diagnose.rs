@@ -9,8 +9,8 @@ use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
 use dragfree_engine::product::Written;
 use dragfree_engine::run::Progress;
+use dragfree_estimation::decimate::SLOW_HZ;
 use dragfree_identification::candidates::Candidate;
-use dragfree_identification::decimate::SLOW_HZ;
 use dragfree_identification::diagnosis::{
     self, Constancy, Diagnosis, Found, LIMIT_QUANTILE, LINE, Limit, OfProduct, Separation, TRANSIENT, Trials,
     UNOBSERVABLE, Unexplained,
