@@ -1,7 +1,8 @@
 //! Effects of the environment, end to end: a calibration whose model contains the simulated effect recovers size and
 //! offset.
 
-use dragfree_tests::{coefficient, dragfree, fixture, json, simulate};
+use dragfree_tests::calibration::{diagnose, science_mode};
+use dragfree_tests::{coefficient, fixture, json, simulate};
 use serde_json::Value;
 use std::fmt::Write;
 use std::path::Path;
@@ -35,15 +36,7 @@ fn calibrated(truth: &[&str], effects: &[Entry<'_>]) -> Value {
     let mut arguments = vec!["--hours", "6", "--seed", "5"];
     truth.iter().for_each(|effect| arguments.extend(["--effect", effect]));
     let file = simulate(dir.path(), &arguments).remove(0);
-    // Segments of 1.75 hours: slow causes lie below the lowest bins of the default segments.
-    let text = std::fs::read_to_string(fixture("pipelines/science-mode.toml")).expect("readable");
-    let text = text.replace("../", &format!("{}/", fixture("").display()));
-    let long = "plugin = \"qp-check\"\nparameters = { segment_s = 6553.6 }";
-    let pipeline = dir.path().join("pipeline.toml");
-    std::fs::write(&pipeline, text.replace("plugin = \"qp-check\"", long)).expect("writable");
-    let mut run = dragfree(dir.path());
-    run.arg("run").arg(pipeline).arg(file).args(["--archive", "archive", "--json"]);
-    json(run.arg("--model").arg(model(dir.path(), effects)), 0)
+    json(science_mode(dir.path()).arg(file).arg("--model").arg(model(dir.path(), effects)), 0)
 }
 
 /// Within 4σ of the truth (false alarm 6e-5 each); the size is such that a wrong sign is 16σ and a missing effect 8σ
@@ -55,6 +48,7 @@ fn found(product: &Value, name: &str, truth: f64) {
     assert!(truth.abs() > 8.0 * sigma, "{name}: {truth:e} is not seen with ±{sigma:e}");
 }
 
+/// The offsets of both solutions within 4σ.
 fn offsets_found(product: &Value) {
     for (name, truth_m) in OFFSETS_M {
         for solution in ["es-akf", "qp"] {
@@ -99,4 +93,32 @@ fn slosh_and_formula_coefficients_are_recovered() {
     found(&product, "slosh.sc.y", 0.03 / 0.97);
     found(&product, "formula.battery", 5e-13);
     offsets_found(&product);
+}
+
+/// A thermal force that changes over hours, below the first bin of a segment: `diagnose` names it, and with it in the
+/// model `run` gives its size within 4σ and with a σ that is at most twice that of the diagnosis, which sees the
+/// longest times too. The offsets stay what and as sure as they were, and the verdict is `agree`.
+#[test]
+fn a_slow_force_is_calibrated_as_well_as_it_is_diagnosed() {
+    const TRUTH: f64 = 1e-10;
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let effect = format!("thermal:tm1.x={TRUTH:e},lag_s=480");
+    let file = simulate(dir.path(), &["--hours", "12", "--seed", "5", "--effect", &effect]).remove(0);
+    let run = |model: &Path| json(science_mode(dir.path()).arg(&file).arg("--model").arg(model), 0);
+    let offsets_alone = run(&fixture("models/com-offset.toml"));
+    let diagnosis = diagnose(dir.path(), &offsets_alone);
+    let named = &diagnosis["candidates"][0];
+    let entry = "plus = \"hk.eh1_xp_temperature_k\"\nminus = \"hk.eh1_xm_temperature_k\"\nlag_s = 480.0";
+    let with_heat = run(&model(dir.path(), &[("thermal", "tm1.x", entry)]));
+    assert_eq!((&named["effect"], &named["instance"]), (&"thermal".into(), &"tm1.x".into()));
+    found(&with_heat, "thermal.tm1.x", TRUTH);
+    let ((_, sigma), diagnosed) =
+        (coefficient(&with_heat, "thermal.tm1.x", "qp"), named["sigma"].as_f64().expect("a σ"));
+    assert!(sigma < 2.0 * diagnosed, "{sigma:e} in the run, {diagnosed:e} in the diagnosis");
+    assert_eq!(with_heat["verdict"], "agree", "{}", with_heat["notes"]);
+    offsets_found(&with_heat);
+    for (name, _) in OFFSETS_M {
+        let [(before, sigma), (after, sigma_after)] = [&offsets_alone, &with_heat].map(|p| coefficient(p, name, "qp"));
+        assert!((after - before).abs() < 0.2 * sigma && (sigma_after / sigma - 1.0).abs() < 0.02, "{name}");
+    }
 }

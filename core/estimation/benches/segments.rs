@@ -1,9 +1,10 @@
 //! Cost of an epoch: nine channels, two offsets (eighteen regressors), segments of 16384 samples; and of one solution.
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use dragfree_estimation::collected::Collected;
 use dragfree_estimation::estimate::{Observed, Unknown, estimate};
 use dragfree_estimation::prediction::Prediction;
-use dragfree_estimation::segments::{Collected, Segmenter};
+use dragfree_estimation::segments::Segmenter;
 use dragfree_estimation::sigma::NoiseModel;
 use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor};
 use dragfree_hinf_dfacs::noise::declared;
@@ -35,7 +36,14 @@ fn bench(criterion: &mut Criterion) {
     let regressors = (0..18)
         .map(|series| {
             let coefficient = series / 3;
-            Regressor { coefficient, channel: 3 * (coefficient / 3) + series % 3, series, factor: 1.0, times: None }
+            Regressor {
+                coefficient,
+                channel: 3 * (coefficient / 3) + series % 3,
+                series,
+                factor: 1.0,
+                times: None,
+                in_loop: false,
+            }
         })
         .collect();
     let names = |n: usize| (0..n).map(|i| i.to_string()).collect();

@@ -27,7 +27,7 @@ impl ColourPower for Colour {
             |c: &[f64], s: Complex64| c.iter().rev().fold(Complex64::default(), |sum, c| sum * s + Complex64::from(*c));
         let at = |i: usize| {
             let bin = band.first as f64 - 0.5 + band.bins() as f64 * (i as f64 + 0.5) / POINTS as f64;
-            let s = Complex64::new(0.0, TAU * plan.bin_hz(bin));
+            let s = Complex64::new(0.0, TAU * plan.hz(band, bin));
             (1.0 + coefficient * polynomial(&self.numerator, s) / polynomial(&self.denominator, s)).norm_sqr()
         };
         (0..POINTS).map(at).sum::<f64>() / POINTS as f64
@@ -51,12 +51,12 @@ mod tests {
         let plan = Plan::new(20_000, 10.0);
         let bin = |hz: f64| (hz / plan.bin_hz(1.0)).round() as usize;
         for (hz, power) in [(0.002, 1.0), (0.1, 2.0), (4.0, 1.21)] {
-            let band = Band { first: bin(hz), end: bin(hz) + 1 };
+            let band = Band { first: bin(hz), end: bin(hz) + 1, of: plan.length };
             assert!((colour.power(0.1, &plan, band) / power - 1.0).abs() < 2e-3, "{hz}");
         }
         // A wide band has the mean of what its bins have.
-        let wide = Band { first: bin(0.05), end: bin(0.05) + 16 };
-        let bins = (wide.first..wide.end).map(|k| colour.power(0.1, &plan, Band { first: k, end: k + 1 }));
+        let wide = Band { first: bin(0.05), end: bin(0.05) + 16, of: plan.length };
+        let bins = (wide.first..wide.end).map(|k| colour.power(0.1, &plan, Band { first: k, end: k + 1, ..wide }));
         assert!((colour.power(0.1, &plan, wide) / (bins.sum::<f64>() / 16.0) - 1.0).abs() < 1e-4);
     }
 }

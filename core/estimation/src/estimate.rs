@@ -14,9 +14,10 @@ use serde::Serialize;
 
 use crate::colour::Colour;
 use crate::levels::Levels;
-use crate::normal::{Equations, NormalEquations, accumulate, residuals};
+use crate::normal::{Equations, NormalEquations, Split, accumulate};
 use crate::prediction::Prediction;
 use crate::qp::{Active, Kkt, Problem, QpError, Row, Side};
+use crate::random_walk::{BandSpectra, significant_powers};
 use crate::refine::{Chi2, SigmaError, Whitening};
 use crate::sigma::{BandNoise, NoiseError, NoiseModel};
 use crate::spectra::{Band, FIRST_BIN, Layout, Plan, Spectra, Sums};
@@ -251,13 +252,16 @@ pub fn estimate_with(
     let mut inverses = whitening.model_inverses();
     let initial: Vec<f64> = unknowns.iter().map(|u| u.initial).collect();
     let mut linear = layout.linear_at(&initial);
-    let mut equations = accumulate(spectra, &linear, &inverses, &kept);
+    let mut apart = layout.in_loop();
+    apart.retain(|i| unknowns[*i].estimate);
+    let split = Split { spectra, slow_bands: plan.slow_bands, apart: &apart };
+    let mut equations = split.accumulate(&linear, &inverses, &kept);
     let seen = |i: usize| equations.normal[(i, i)] > 0.0;
     let free: Vec<usize> = (0..unknowns.len()).filter(|i| unknowns[*i].estimate && seen(*i)).collect();
     let unseen: Vec<usize> = (0..unknowns.len()).filter(|i| unknowns[*i].estimate && !seen(*i)).collect();
 
     let mut solved = Reduced::new(&equations, unknowns, bounds, &free).solve()?;
-    let mut residual = residuals(spectra, &linear, plan.bands.len(), &solved.theta);
+    let mut residual = split.residuals(&linear, &inverses, &kept, &solved.theta);
     let modelled = whitening.chi2(&residual, &inverses, false);
     let mut last_step = DVector::zeros(unknowns.len());
     // Products of coefficients want as many steps as Σ does.
@@ -265,19 +269,15 @@ pub fn estimate_with(
     let steps = if products { refinements.max(PRODUCT_STEPS) } else { refinements };
     for step in 0..steps {
         if step < refinements {
-            inverses = match refinement {
-                Refinement::Bands => whitening.refined_inverses(&residual),
-                Refinement::Levels => {
-                    by_levels(noise.model, plan, spectra, &residual, &colours(unknowns, &solved.theta), settings)
-                }
-            };
+            let from = FromResiduals { plan, spectra, residual: &residual, settings };
+            inverses = from.refined(noise, refinement, &whitening, &colours(unknowns, &solved.theta))?;
         }
         linear = layout.linear_at(solved.theta.as_slice());
-        equations = accumulate(spectra, &linear, &inverses, &kept);
+        equations = split.accumulate(&linear, &inverses, &kept);
         let next = Reduced::new(&equations, unknowns, bounds, &free).solve()?;
         last_step = &next.theta - &solved.theta;
         solved = next;
-        residual = residuals(spectra, &linear, plan.bands.len(), &solved.theta);
+        residual = split.residuals(&linear, &inverses, &kept, &solved.theta);
     }
     let layout = &linear;
     let fitted = refinements > 0 && refinement == Refinement::Bands;
@@ -288,9 +288,10 @@ pub fn estimate_with(
     let dof = (chi2.expected - free.len() as f64).max(1.0);
     let chi2_per_dof = chi2.sum / dof;
     let covariance = reduced.covariance(&solved.active);
-    let scatter = covariance
-        .as_ref()
-        .and_then(|c| scatter(sums, layout, &inverses, &solved.theta, c, &free, settings.scatter_sigmas));
+    let scatter = covariance.as_ref().and_then(|c| {
+        let linear = Observed { layout, ..*observed };
+        scatter(&linear, &inverses, &solved.theta, c, &free, settings.scatter_sigmas)
+    });
     let covariance = covariance.map(|c| {
         let by_blocks =
             |k: usize| scatter.as_ref().map_or(1.0, |s| if s.ratio[k] > s.upper { s.ratio[k] } else { 1.0 });
@@ -346,7 +347,8 @@ pub fn estimate_with(
 }
 
 /// Weights with which the score of a gain inside the loop vanishes where the gain is right: each band as much as it is
-/// wide, and the octave above the lowest bin for what lies below it too.
+/// wide, and the octave above the lowest bin for what lies below it too. Slow bands have their own weights, as such a
+/// gain is not estimated there.
 ///
 /// A command follows the noise through a strictly causal filter U, and `∫ Re U df = 0` from zero on (see
 /// [`crate::levels`]). Below the lowest bin of an ordinary segment, 1.8 mHz, the loop is stiff, and U is much as it is
@@ -357,7 +359,9 @@ fn zero_area_weights(spectra: &Spectra, plan: &Plan) -> Vec<f64> {
     // Of frequencies from zero, half a bin belongs to the constant.
     let both = 1.0 + (FIRST_BIN as f64 - 0.5) / FIRST_BIN as f64;
     let weight = |(band, even): (&Band, f64)| if octave.contains(&band.first) { both * even } else { even };
-    plan.bands.iter().zip(spectra.equal_time_weights()).map(weight).collect()
+    let mut weights: Vec<f64> = plan.bands.iter().zip(spectra.equal_time_weights()).map(weight).collect();
+    weights[..plan.slow_bands].copy_from_slice(&spectra.kept()[..plan.slow_bands]);
+    weights
 }
 
 /// By how much σ of each free coefficient is larger than the equations with other weights than the true ones say: bands
@@ -379,19 +383,85 @@ fn unevenness(
     (0..free.len()).map(|k| (1.0 + spread[(k, k)] / covariance[(k, k)]).max(1.0).sqrt()).collect()
 }
 
-fn by_levels(
-    model: &NoiseModel,
-    plan: &Plan,
-    spectra: &Spectra,
-    residual: &[DMatrix<f64>],
-    colours: &[(&Colour, f64)],
-    settings: &Settings,
-) -> Vec<DMatrix<f64>> {
-    let expected = spectra.expected.iter().map(|e| e.max(f64::MIN_POSITIVE));
-    let measured: Vec<DMatrix<f64>> = residual.iter().zip(expected).map(|(r, e)| r / e).collect();
-    let mut levels = Levels::new(model, plan, spectra, &measured, settings).coloured(plan, colours);
-    levels.fit();
-    levels.inverses()
+/// What Σ is measured from, and from what size on something is judged.
+struct FromResiduals<'a> {
+    plan: &'a Plan,
+    spectra: &'a Spectra,
+    residual: &'a [DMatrix<f64>],
+    settings: &'a Settings,
+}
+
+impl FromResiduals<'_> {
+    /// `Σ⁻¹` per band. Slow bands are refined by bands in any case: no gain in the loop is estimated there, which a Σ
+    /// that is free in every band would fit.
+    fn refined(
+        &self,
+        noise: &BandNoise<'_>,
+        refinement: Refinement,
+        declared: &Whitening,
+        colours: &[(&Colour, f64)],
+    ) -> Result<Vec<DMatrix<f64>>, SigmaError> {
+        let slow = self.plan.slow_bands;
+        let is_slow = self.spectra.weight[..slow].iter().any(|w| *w > 0.0);
+        if !is_slow && refinement == Refinement::Bands {
+            return Ok(declared.refined_inverses(self.residual));
+        }
+        let measured = self.measured();
+        let levels = self.fitted(noise.model, &measured, colours);
+        if !is_slow {
+            return Ok(levels.inverses());
+        }
+        let mut mean = noise.mean.clone();
+        mean[..slow].clone_from_slice(&self.slow_sigma(&noise.model.directions, &levels, &measured));
+        let beside_walks = Whitening::new(&BandNoise { model: noise.model, mean }, self.plan, self.spectra)?;
+        let mut inverses = beside_walks.refined_inverses(self.residual);
+        if refinement == Refinement::Levels {
+            inverses[slow..].clone_from_slice(&levels.inverses()[slow..]);
+        }
+        Ok(inverses)
+    }
+
+    /// One-sided cross-spectra of the residuals.
+    fn measured(&self) -> Vec<DMatrix<f64>> {
+        let expected = self.spectra.expected.iter().map(|e| e.max(f64::MIN_POSITIVE));
+        self.residual.iter().zip(expected).map(|(r, e)| r / e).collect()
+    }
+
+    /// Levels that fit the ordinary bands. A slow force that nobody models is no level of the noise.
+    fn fitted<'b>(
+        &'b self,
+        model: &'b NoiseModel,
+        measured: &'b [DMatrix<f64>],
+        colours: &[(&Colour, f64)],
+    ) -> Levels<'b> {
+        let weights = self.spectra.weights_of(self.plan.ordinary_bands());
+        let mut levels = Levels::new(model, self.plan, &weights, measured, self.settings).coloured(self.plan, colours);
+        levels.fit();
+        levels
+    }
+
+    /// Σ in the slow bands: the declared noise at the levels of the bands above, and random walks of the forces where
+    /// the residuals have some.
+    fn slow_sigma(
+        &self,
+        directions: &[DVector<f64>],
+        levels: &Levels<'_>,
+        measured: &[DMatrix<f64>],
+    ) -> Vec<DMatrix<f64>> {
+        let observations = self.spectra.observations(self.plan);
+        let all: Vec<BandSpectra<'_>> = (0..self.plan.slow_bands)
+            .map(|b| BandSpectra {
+                hz: self.plan.frequency_hz(self.plan.bands[b]),
+                observations: observations[b],
+                modelled: &levels.modelled()[b],
+                measured: &measured[b],
+            })
+            .collect();
+        let seen: Vec<BandSpectra<'_>> = all.iter().filter(|b| b.observations > 0.0).copied().collect();
+        let directions: Vec<&DVector<f64>> = directions.iter().collect();
+        let powers = significant_powers(&seen, &directions, self.settings.level_delta_chi2);
+        all.iter().map(|band| band.with(&powers, &directions)).collect()
+    }
 }
 
 /// The problem in the free coefficients alone.
@@ -676,8 +746,7 @@ fn check(
 /// Pulls of the blocks on the free coefficients, `C (c_b − N_b θ)`, squared and summed, over their expectation when Σ
 /// is right and the same at all times; B blocks share one θ, which takes a part 1/B.
 fn scatter(
-    sums: &Sums,
-    layout: &Layout,
+    &Observed { sums, layout, plan, .. }: &Observed<'_>,
     inverses: &[DMatrix<f64>],
     theta: &DVector<f64>,
     covariance: &DMatrix<f64>,
@@ -688,7 +757,8 @@ fn scatter(
     if blocks < LEAST_BLOCKS || free.is_empty() {
         return None;
     }
-    let kept = sums.total.kept();
+    // Long segments have no blocks.
+    let kept = sums.total.weights_of(plan.ordinary_bands()).kept();
     let (mut measured, mut expected) = (DVector::zeros(free.len()), DVector::zeros(free.len()));
     for block in &sums.blocks {
         let equations = accumulate(&block.spectra, layout, inverses, &kept);
@@ -725,6 +795,9 @@ fn channel_quality(
     let overall = whitening.power_ratio(residual, 0..plan.bands.len());
     let mut decades: Vec<(i32, std::ops::Range<usize>)> = Vec::new();
     for (b, band) in plan.bands.iter().enumerate() {
+        if whitening.observations(b..b + 1) == 0.0 {
+            continue;
+        }
         let decade = plan.frequency_hz(*band).log10().floor() as i32;
         match decades.last_mut() {
             Some((last, range)) if *last == decade => range.end = b + 1,
@@ -734,8 +807,8 @@ fn channel_quality(
     let by_decade: Vec<(f64, f64, Vec<f64>, f64)> = decades
         .into_iter()
         .map(|(_, range)| {
-            let from = plan.bin_hz(plan.bands[range.start].first as f64);
-            let to = plan.bin_hz(plan.bands[range.end - 1].end as f64);
+            let [first, last] = [plan.bands[range.start], plan.bands[range.end - 1]];
+            let (from, to) = (plan.hz(first, first.first as f64), plan.hz(last, last.end as f64));
             // Half the relative standard deviation of a power that n complex observations give.
             let sigma = 0.5 / whitening.observations(range.clone()).sqrt();
             (from, to, whitening.power_ratio(residual, range), sigma)
@@ -770,11 +843,12 @@ fn worst_band(
     whitening: &Whitening,
 ) -> ((f64, f64), f64) {
     let mut worst = ((0.0, 0.0), 1.0);
-    for (b, band) in plan.bands.iter().enumerate() {
+    // A slow band has few observations, whose scatter would hide a line above.
+    for b in plan.ordinary_bands() {
         let (expected, dof) = whitening.expected_chi2(b);
         let ratio = residual[b].dot(&inverses[b]) / expected;
         if ratio > worst.0.1 {
-            worst = ((plan.frequency_hz(*band), ratio), dof);
+            worst = ((plan.frequency_hz(plan.bands[b]), ratio), dof);
         }
     }
     worst

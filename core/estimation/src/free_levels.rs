@@ -57,7 +57,9 @@ pub fn estimate_with_levels(
         let expected = spectra.expected.iter().map(|e| e.max(f64::MIN_POSITIVE));
         let measured: Vec<DMatrix<f64>> = residual.iter().zip(expected).map(|(r, e)| r / e).collect();
         let names: Vec<&str> = free.iter().map(|c| c.noise.as_str()).collect();
-        let mut steps = Levels::new(&model, plan, spectra, &measured, method.settings)
+        // A slow force that nobody models is no level of the noise.
+        let weights = spectra.weights_of(plan.ordinary_bands());
+        let mut steps = Levels::new(&model, plan, &weights, &measured, method.settings)
             .coloured(plan, &colours(unknowns, &solved.theta));
         let steps = steps.fit_jointly(&names);
         let moves = |s: &Level| (s.value - 1.0).abs() > NEGLIGIBLE_STEP * s.sigma;

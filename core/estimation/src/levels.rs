@@ -96,6 +96,8 @@ pub struct Levels<'a> {
     /// Middle of each band, Hz.
     hz: Vec<f64>,
     observations: Vec<f64>,
+    /// Bands below those of ordinary segments, which are in no group.
+    slow_bands: usize,
     measured: &'a [DMatrix<f64>],
     modelled: Vec<DMatrix<f64>>,
     settings: &'a Settings,
@@ -117,6 +119,7 @@ impl<'a> Levels<'a> {
             processes: noise.process_names().filter_map(process).collect(),
             modelled: hz.iter().map(|f| noise.psd(*f)).collect(),
             observations: weights.observations(plan),
+            slow_bands: plan.slow_bands,
             measured,
             hz,
             settings,
@@ -253,10 +256,10 @@ impl<'a> Levels<'a> {
         sum
     }
 
-    /// Bands in groups of a third of a decade.
+    /// Ordinary bands in groups of a third of a decade.
     fn groups(&self) -> Vec<Range<usize>> {
         let mut groups = Vec::new();
-        let mut first = 0;
+        let mut first = self.slow_bands;
         while first < self.hz.len() {
             let end = first + self.hz[first..].iter().take_while(|f| **f < self.hz[first] * GROUP).count();
             groups.push(first..end);
@@ -358,7 +361,8 @@ impl<'a> Levels<'a> {
     pub fn deviance(&self, measured: &[DMatrix<f64>], bands: &[bool]) -> f64 {
         let (processes, hz) = (BTreeMap::new(), self.hz.clone());
         let (observations, modelled) = (self.observations.clone(), self.modelled.clone());
-        let own = Levels { processes, hz, observations, measured, modelled, settings: self.settings };
+        let Self { slow_bands, settings, .. } = *self;
+        let own = Levels { processes, hz, observations, slow_bands, measured, modelled, settings };
         let of = |((inverse, w), n): ((DMatrix<f64>, &DMatrix<f64>), &f64)| {
             let power = inverse.dot(w);
             let log_det = Cholesky::new(inverse).map_or(0.0, |c| 2.0 * c.l().diagonal().map(f64::ln).sum());

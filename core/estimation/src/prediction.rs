@@ -305,7 +305,9 @@ impl Prediction {
     /// Measures the levels anew from the residuals of all segments so far.
     pub fn train(&mut self, spectra: &Spectra, plan: &Plan) {
         self.state.trained_at = spectra.segments;
-        let equations = accumulate(spectra, &self.layout, &self.inverses, &spectra.kept());
+        // What is slow is washed out, and may be more than the noise.
+        let weights = spectra.weights_of(plan.ordinary_bands()).kept();
+        let equations = accumulate(spectra, &self.layout, &self.inverses, &weights);
         // A coefficient that nothing sees yet is left at zero.
         let mut normal = equations.normal;
         let largest = normal.diagonal().amax();

@@ -42,8 +42,10 @@ pub(crate) struct Whitening {
     residual: Vec<bool>,
     /// Channels in the group of each channel.
     group_size: Vec<f64>,
-    /// Ranges of bands of the sums.
+    /// Ranges of bands of the sums, none with slow and other bands together.
     coarse: Vec<Range<usize>>,
+    /// Bands below those of ordinary segments.
+    slow_bands: usize,
     /// Expected diagonal of the residuals' sums over Σ, per band.
     expected: Vec<f64>,
     /// What makes information of the sums, per band.
@@ -80,19 +82,9 @@ impl Whitening {
         let per_band = spectra.observations(plan);
         let needed = OBSERVATIONS_PER_CHANNEL * group_size.iter().fold(0.0, |a: f64, b| a.max(*b));
         let observed = |range: &Range<usize>| per_band[range.clone()].iter().sum::<f64>();
-        let mut coarse = Vec::new();
-        let mut start = 0;
-        for end in 1..=plan.bands.len() {
-            let wide = plan.bands[end - 1].end as f64 >= RATIO * plan.bands[start].first as f64;
-            if wide && observed(&(start..end)) >= needed {
-                coarse.push(start..end);
-                start = end;
-            }
-        }
-        if start < plan.bands.len() {
-            let first = coarse.pop().map_or(0, |last| last.start);
-            coarse.push(first..plan.bands.len());
-        }
+        let slow = wide_bands(plan, 0..plan.slow_bands, needed, observed);
+        let coarse: Vec<Range<usize>> =
+            slow.into_iter().chain(wide_bands(plan, plan.ordinary_bands(), needed, observed)).collect();
         Ok(Self {
             factors,
             variances,
@@ -101,6 +93,7 @@ impl Whitening {
             group_size,
             observations: coarse.iter().map(observed).collect(),
             coarse,
+            slow_bands: plan.slow_bands,
             observations_per_band: per_band,
             expected: spectra.expected.clone(),
             kept: spectra.kept(),
@@ -202,12 +195,13 @@ impl Whitening {
         (expected, expected * self.kept[band])
     }
 
-    /// Whether residuals that the model does not connect are as unrelated as it says: for each pair of groups the sum
+    /// Whether residuals that the model does not connect are as unrelated as it says, above the slow bands, where what
+    /// pushes and turns need be no noise: for each pair of groups the sum
     /// of `2n ρ²` over pairs of channels and refined bands, ρ the real coherence of the residuals, χ² of as many
     /// degrees of freedom when it is so.
     pub(crate) fn between_groups(&self, residuals: &[DMatrix<f64>]) -> (f64, f64) {
         let (mut sum, mut dof) = (0.0, 0.0);
-        for (range, n) in self.coarse.iter().zip(&self.observations) {
+        for (range, n) in self.coarse.iter().zip(&self.observations).filter(|(r, _)| r.start >= self.slow_bands) {
             let w = self.whitened(residuals, range);
             for i in 0..self.group.len() {
                 let apart = |j: &usize| self.group[i] != self.group[*j] && self.residual[i] && self.residual[*j];
@@ -234,6 +228,29 @@ impl Whitening {
             .map(|c| range.clone().map(|b| residuals[b][(c, c)] / self.variances[b][c]).sum::<f64>() / expected)
             .collect()
     }
+}
+
+/// Bands in which Σ may move: neighbouring ones of a range together, until they are wide and hold what is needed.
+fn wide_bands(
+    plan: &Plan,
+    bands: Range<usize>,
+    needed: f64,
+    observed: impl Fn(&Range<usize>) -> f64,
+) -> Vec<Range<usize>> {
+    let mut coarse = Vec::new();
+    let mut start = bands.start;
+    for end in bands.start + 1..=bands.end {
+        let wide = plan.bands[end - 1].end as f64 >= RATIO * plan.bands[start].first as f64;
+        if wide && observed(&(start..end)) >= needed {
+            coarse.push(start..end);
+            start = end;
+        }
+    }
+    if start < bands.end {
+        let first = coarse.pop().map_or(bands.start, |last: Range<usize>| last.start);
+        coarse.push(first..bands.end);
+    }
+    coarse
 }
 
 /// `χ²` as summed, with its expectation.

@@ -13,6 +13,7 @@ use dragfree_physics::levels::responses;
 use dragfree_schema::{NoiseProcess, NoiseResponse, NoiseShape};
 use nalgebra::{DMatrix, DVector};
 
+use crate::random_walk::held_directions;
 use crate::spectra::{Band, Plan};
 
 /// A declaration that makes no noise model.
@@ -68,6 +69,8 @@ pub struct NoiseModel {
     processes: Vec<Process>,
     components: Vec<Component>,
     errors: Vec<EstimationError>,
+    /// Unit vectors along which declared forces enter the channels.
+    pub(crate) directions: Vec<DVector<f64>>,
     /// Channels without declared noise: they start as white with unit PSD and are measured.
     pub unknown: Vec<usize>,
 }
@@ -87,6 +90,7 @@ impl NoiseModel {
             processes: Vec::new(),
             components: Vec::new(),
             errors: Vec::new(),
+            directions: held_directions(declared, channels).into_iter().map(|(_, direction)| direction).collect(),
             unknown: Vec::new(),
         };
         for (index, process) in declared.iter().enumerate() {
@@ -287,7 +291,7 @@ impl<'a> BandNoise<'a> {
     pub fn new(model: &'a NoiseModel, plan: &Plan) -> Self {
         let zero = || DMatrix::zeros(model.channels, model.channels);
         let mean = |band: &Band| {
-            let bins = (band.first..band.end).map(|k| model.psd(plan.bin_hz(k as f64)));
+            let bins = (band.first..band.end).map(|k| model.psd(plan.hz(*band, k as f64)));
             bins.fold(zero(), |sum, psd| sum + psd) / band.bins() as f64
         };
         Self { model, mean: plan.bands.iter().map(mean).collect() }

@@ -42,6 +42,9 @@ pub struct Regressor {
     /// Index of another coefficient whose value multiplies the response too.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub times: Option<usize>,
+    /// Whether the series is made of commands, which answer the noise of the channels.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub in_loop: bool,
 }
 
 impl Layout {
@@ -52,6 +55,12 @@ impl Layout {
             r.factor *= r.times.take().map_or(1.0, |other| theta[other]);
         }
         linear
+    }
+
+    /// Coefficients that act through series made of commands.
+    pub fn in_loop(&self) -> Vec<usize> {
+        let acts = |i: &usize| self.regressors.iter().any(|r| r.in_loop && r.coefficient == *i);
+        (0..self.coefficients.len()).filter(acts).collect()
     }
 
     /// Channels and series together.
@@ -67,6 +76,8 @@ pub struct Band {
     pub first: usize,
     /// One past the last bin.
     pub end: usize,
+    /// Samples of the segments whose bins these are.
+    pub of: usize,
 }
 
 impl Band {
@@ -84,6 +95,9 @@ pub const FIRST_BIN: usize = 3;
 /// alone, so the second is free of what a constant leaves; the removed slope takes 0.155 of the power of white noise
 /// there, most of its odd part, and less than 0.016 in any bin above.
 pub const FIRST_SLOW_BIN: usize = 2;
+
+/// Long segments, for what is slow, are so many times as long as the others.
+pub const LONG: usize = 16;
 
 /// What the removed straight line leaves of white noise in [`FIRST_SLOW_BIN`].
 const LEFT_IN_SLOW_BIN: f64 = 0.845;
@@ -103,6 +117,7 @@ pub const SHORTEST: usize = 16;
 
 /// Bands, and the segments whose bins fall into them: of the full length, and of its halves down to [`SHORTEST`] for
 /// what gaps leave over. A short segment has no bins in the lowest bands and counts in the others.
+#[derive(Clone)]
 pub struct Plan {
     /// Samples of the longest segment, divisible by four.
     pub length: usize,
@@ -112,13 +127,17 @@ pub struct Plan {
     pub bands: Vec<Band>,
     /// The first bin that counts of any segment, with which spectra begin.
     pub first_bin: usize,
-    /// Samples of the segments whose bins the bands are told in.
+    /// Bands below the first bin of these segments, which stand before the others and have bins of [`LONG`] times as
+    /// long ones.
+    pub slow_bands: usize,
+    /// Samples of the segments whose bins the other bands are told in.
     bins_of: usize,
     /// The longest segment first.
     tapers: Vec<Taper>,
 }
 
 /// A length of segment.
+#[derive(Clone)]
 struct Taper {
     length: usize,
     /// The first of its bins that counts.
@@ -137,15 +156,15 @@ struct Taper {
 
 impl Taper {
     /// Periodic Hann window of a segment, its bins from the first in the bands of a plan of segments of another length.
-    fn new(length: usize, longest: usize, first_bin: usize, bands: &[Band]) -> Self {
+    fn new(length: usize, first_bin: usize, bands: &[Band]) -> Self {
         let window: Vec<f64> =
             (0..length).map(|t| 0.5 - 0.5 * (std::f64::consts::TAU * t as f64 / length as f64).cos()).collect();
         let squared: Vec<f64> = window.iter().map(|w| w * w).collect();
         let bins: Vec<Range<usize>> =
-            bands.iter().map(|b| bins_between(b.first..b.end, longest, length, first_bin)).collect();
-        let ratio = longest as f64 / length as f64;
+            bands.iter().map(|b| bins_between(b.first..b.end, b.of, length, first_bin)).collect();
+        let part = |(b, own): (&Band, &Range<usize>)| (own.len() * b.of) as f64 / (length * b.bins()) as f64;
         Self {
-            part: bands.iter().zip(&bins).map(|(b, own)| own.len() as f64 * ratio / b.bins() as f64).collect(),
+            part: bands.iter().zip(&bins).map(part).collect(),
             bins,
             window_sums: [
                 squared.iter().sum(),
@@ -169,6 +188,20 @@ fn bins_between(bins: Range<usize>, of: usize, length: usize, first_bin: usize) 
     first..own(bins.end).max(first)
 }
 
+/// Bands of neighbouring bins from the first to the last below Nyquist, of segments of `length` samples.
+fn bands_from(first_bin: usize, length: usize) -> Vec<Band> {
+    let nyquist = length / 2;
+    let mut bands = Vec::new();
+    let mut first = first_bin;
+    while first < nyquist {
+        let width = ((first as f64 * RELATIVE_WIDTH) as usize).max(1);
+        let end = (first + width).min(nyquist);
+        bands.push(Band { first, end, of: length });
+        first = end;
+    }
+    bands
+}
+
 impl Plan {
     /// Segments of `length` samples, divisible by four, and of its halves.
     pub fn new(length: usize, rate_hz: f64) -> Self {
@@ -181,21 +214,26 @@ impl Plan {
         Self::from_bin(FIRST_SLOW_BIN, length, ordinary, rate_hz)
     }
 
+    /// As [`Self::new`], with bands for what is slower, from [`FIRST_SLOW_BIN`] of segments [`LONG`] times as long to
+    /// half an ordinary bin below [`FIRST_BIN`], where that bin begins.
+    pub fn with_slow_bands(length: usize, rate_hz: f64) -> Self {
+        let mut bands = bands_from(FIRST_SLOW_BIN, LONG * length);
+        bands.retain(|b| b.end <= LONG * FIRST_BIN - LONG / 2);
+        let slow_bands = bands.len();
+        bands.extend(bands_from(FIRST_BIN, length));
+        Self { slow_bands, ..Self::of_bands(bands, FIRST_BIN, length, length, rate_hz) }
+    }
+
     fn from_bin(first_bin: usize, length: usize, ordinary: usize, rate_hz: f64) -> Self {
-        let nyquist = length / 2;
-        let mut bands = Vec::new();
-        let mut first = first_bin;
-        while first < nyquist {
-            let width = ((first as f64 * RELATIVE_WIDTH) as usize).max(1);
-            let end = (first + width).min(nyquist);
-            bands.push(Band { first, end });
-            first = end;
-        }
+        Self::of_bands(bands_from(first_bin, length), first_bin, length, ordinary, rate_hz)
+    }
+
+    fn of_bands(bands: Vec<Band>, first_bin: usize, length: usize, ordinary: usize, rate_hz: f64) -> Self {
         let halves = std::iter::successors(Some(length), |l| l.is_multiple_of(8).then_some(l / 2));
         let lengths = halves.take_while(|l| *l == length || *l >= SHORTEST);
         let first = |l: usize| if l > ordinary { first_bin } else { FIRST_BIN };
-        let tapers = lengths.map(|l| Taper::new(l, length, first(l), &bands)).collect();
-        Self { tapers, length, rate_hz, bands, first_bin, bins_of: length }
+        let tapers = lengths.map(|l| Taper::new(l, first(l), &bands)).collect();
+        Self { tapers, length, rate_hz, bands, first_bin, slow_bands: 0, bins_of: length }
     }
 
     /// For one segment of another length, between half the longest and the longest: the bands of this plan that half
@@ -203,8 +241,9 @@ impl Plan {
     pub fn between_halves(&self, length: usize) -> Self {
         let out_of_reach = |b: &&Band| b.first < 2 * self.first_bin;
         let bands: Vec<Band> = self.bands.iter().take_while(out_of_reach).copied().collect();
-        let tapers = vec![Taper::new(length, self.bins_of, self.first_bin, &bands)];
-        Self { tapers, length, rate_hz: self.rate_hz, bands, first_bin: self.first_bin, bins_of: self.bins_of }
+        let tapers = vec![Taper::new(length, self.first_bin, &bands)];
+        let Self { rate_hz, first_bin, bins_of, .. } = *self;
+        Self { tapers, length, rate_hz, bands, first_bin, slow_bands: 0, bins_of }
     }
 
     /// Bins of segments of the `taper`-th length that lie between bins of the longest, in the bands of this plan alone.
@@ -226,12 +265,22 @@ impl Plan {
 
     /// Frequency of the middle of a band, Hz.
     pub fn frequency_hz(&self, band: Band) -> f64 {
-        self.bin_hz(0.5 * (band.first + band.end - 1) as f64)
+        self.hz(band, 0.5 * (band.first + band.end - 1) as f64)
+    }
+
+    /// Frequency of a bin of the segments whose bins a band has, Hz.
+    pub fn hz(&self, band: Band, bin: f64) -> f64 {
+        bin * self.rate_hz / band.of as f64
     }
 
     /// Frequency of a bin of the longest segment, Hz.
     pub fn bin_hz(&self, bin: f64) -> f64 {
         bin * self.rate_hz / self.bins_of as f64
+    }
+
+    /// Bands that segments of the longest length and shorter ones have bins in: all but the slow ones.
+    pub fn ordinary_bands(&self) -> Range<usize> {
+        self.slow_bands..self.bands.len()
     }
 
     fn first_block_ns(&self) -> i64 {
@@ -263,6 +312,31 @@ impl Spectra {
             weight: vec![0.0; bands],
             weight_squared: vec![0.0; bands],
             segments: 0,
+        }
+    }
+
+    /// The weights alone, of some bands, as if the others had not been seen.
+    pub fn weights_of(&self, bands: Range<usize>) -> Self {
+        let of = |x: &[f64]| (0..x.len()).map(|b| if bands.contains(&b) { x[b] } else { 0.0 }).collect();
+        Self {
+            packed: Vec::new(),
+            expected: of(&self.expected),
+            weight: of(&self.weight),
+            weight_squared: of(&self.weight_squared),
+            segments: self.segments,
+        }
+    }
+
+    /// Takes the sums of the first bands from elsewhere.
+    pub fn replace_first(&mut self, bands: usize, other: &Self) {
+        let entries = bands * (self.packed.len() / self.expected.len().max(1));
+        self.packed[..entries].copy_from_slice(&other.packed[..entries]);
+        for (own, other) in [
+            (&mut self.expected, &other.expected),
+            (&mut self.weight, &other.weight),
+            (&mut self.weight_squared, &other.weight_squared),
+        ] {
+            own[..bands].copy_from_slice(&other[..bands]);
         }
     }
 
@@ -337,7 +411,7 @@ impl Spectra {
         plan.bands
             .iter()
             .enumerate()
-            .map(|(b, band)| self.weight[b] * kept[b] * band.bins() as f64 / plan.bins_of as f64)
+            .map(|(b, band)| self.weight[b] * kept[b] * band.bins() as f64 / band.of as f64)
             .collect()
     }
 
@@ -438,6 +512,7 @@ pub fn triangle(n: usize) -> usize {
 }
 
 /// Turns samples into spectra; owns the scratch space.
+#[derive(Clone)]
 pub struct Transformer {
     time: Vec<f64>,
     spectrum: Vec<Complex64>,
@@ -542,7 +617,7 @@ impl Analyser {
 }
 
 /// Scalar product in eight fixed lanes, so that it vectorises and never depends on how it was compiled in.
-fn dot(a: &[f64], b: &[f64]) -> f64 {
+pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
     let mut lanes = [0.0; 8];
     let (a8, b8) = (a.chunks_exact(8), b.chunks_exact(8));
     let rest: f64 = a8.remainder().iter().zip(b8.remainder()).map(|(x, y)| x * y).sum();
@@ -569,6 +644,24 @@ mod tests {
                 next = band.end;
             }
             assert_eq!(next, length / 2);
+        }
+    }
+
+    /// Bins of long segments go on where those of the others end: at 2.5 bins of these.
+    #[test]
+    fn slow_bands_end_where_the_others_begin() {
+        for length in [16, 48, 100, 1024, 16384] {
+            let (plan, ordinary) = (Plan::with_slow_bands(length, 10.0), Plan::new(length, 10.0));
+            assert_eq!(plan.bands[plan.ordinary_bands()], ordinary.bands);
+            let mut next = FIRST_SLOW_BIN;
+            for band in &plan.bands[..plan.slow_bands] {
+                assert_eq!((band.first, band.of), (next, 16 * length));
+                next = band.end;
+            }
+            assert_eq!(next, 40);
+            for taper in &plan.tapers {
+                assert!(taper.bins[..plan.slow_bands].iter().all(Range::is_empty));
+            }
         }
     }
 
@@ -615,7 +708,7 @@ mod tests {
                 *power += 0.5 * rate_hz * spectrum[rows].iter().map(|x| x * x).sum::<f64>();
             }
         }
-        assert_eq!(plan.bands[0], Band { first: 2, end: 3 });
+        assert_eq!(plan.bands[0], Band { first: 2, end: 3, of: length });
         for (b, (power, expected)) in power.iter().zip(&weights.expected).enumerate() {
             // A straight line leaves 1.016 in bin 3.
             let tolerance = if plan.bands[b].first == 3 { 0.017 } else { 1e-3 };

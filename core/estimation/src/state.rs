@@ -2,8 +2,10 @@
 
 use dragfree_schema::state::{State, StateError};
 
+use crate::collected::Collected;
 use crate::prediction::{self, Stretch};
-use crate::segments::{self, Collected};
+use crate::segments;
+use crate::slow_band::SlowBand;
 use crate::spectra::{Block, MAX_BLOCKS, Plan, Spectra, Sums};
 
 /// Visits the whole state; `layout` says what it is for. Sums of this run and of those before are one in it. What is
@@ -36,6 +38,9 @@ pub fn visit(
     if state.is_loading() {
         collected.earlier = sums;
     }
+    if let Some(slow) = &mut collected.slow {
+        visit_slow(state, slow)?;
+    }
     if let Some(prediction) = &mut collected.prediction {
         let empty = Stretch { number: 0, sums: vec![0.0; prediction.block_size()] };
         visit_prediction(state, &mut prediction.state, &empty)?;
@@ -62,6 +67,18 @@ fn segments_of(state: &mut State<'_>, segments: &mut segments::State) -> Result<
         state.u64(count)?;
     }
     segments.missing.iter_mut().try_for_each(|count| state.u64(count))
+}
+
+fn visit_slow(state: &mut State<'_>, slow: &mut SlowBand) -> Result<(), StateError> {
+    let length = slow.decimator.length();
+    let pending = &mut slow.decimator.state;
+    state.i64(&mut pending.first_ns)?;
+    pending.pending.iter_mut().try_for_each(|column| state.f64_list(column))?;
+    let samples = pending.pending.first().map_or(0, Vec::len);
+    if samples >= length || pending.pending.iter().any(|column| column.len() != samples) {
+        return Err(StateError::Content("decimated columns"));
+    }
+    segments_of(state, &mut slow.segmenter.state)
 }
 
 fn visit_spectra(state: &mut State<'_>, spectra: &mut Spectra) -> Result<(), StateError> {
@@ -127,14 +144,21 @@ mod tests {
         Layout {
             channels: vec!["c".into()],
             series: vec!["s".into()],
-            regressors: vec![Regressor { coefficient: 0, channel: 0, series: 0, factor: 2.0, times: None }],
+            regressors: vec![Regressor {
+                coefficient: 0,
+                channel: 0,
+                series: 0,
+                factor: 2.0,
+                times: None,
+                in_loop: false,
+            }],
             coefficients: vec!["b".into()],
         }
     }
 
     fn begin() -> (Segmenter, Collected, Analyser) {
         let model = NoiseModel::new(&[], &["c"], 0.1).expect("a model");
-        let plan = Plan::new(64, 10.0);
+        let plan = Plan::with_slow_bands(64, 10.0);
         let prediction = Prediction::new(&model, &[false], &layout(), &plan);
         assert!(prediction.is_some());
         let collected = Collected::new(&plan, &layout(), prediction);
@@ -178,6 +202,9 @@ mod tests {
         let mut whole = begin();
         feed(0, 20_000, &mut whole);
         assert_eq!(second.0.state, whole.0.state);
+        let slow = [&second, &whole].map(|r| r.1.slow.as_ref().expect("slow bands"));
+        assert_eq!(slow[0].decimator.state, slow[1].decimator.state);
+        assert_eq!(slow[0].segmenter.state, slow[1].segmenter.state);
         let states = [&second, &whole].map(|r| r.1.prediction.as_ref().expect("a fit").state.clone());
         let apart = states[0].blocks.iter().zip(&states[1].blocks).flat_map(|(a, b)| {
             assert_eq!(a.number, b.number);

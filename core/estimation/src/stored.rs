@@ -5,8 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use crate::spectra::{Block, Layout, Plan, Spectra, Sums, triangle};
 
-/// Version of the layout of stored sums.
-pub const FORMAT: u32 = 2;
+/// Version of the layout of stored sums. Those of version 2 have no slow bands.
+pub const FORMAT: u32 = 3;
 
 /// Sums in a form for JSON, in which every float is exact.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -19,6 +19,9 @@ pub struct Stored {
     pub length: usize,
     /// Samples per second.
     pub rate_hz: f64,
+    /// Bands below the others, of segments [`LONG`](crate::spectra::LONG) times as long, which stand first.
+    #[serde(default)]
+    pub slow_bands: usize,
     /// Declared noise of the channels, from which Σ is made.
     #[serde(default)]
     pub noise: Vec<NoiseProcess>,
@@ -53,8 +56,9 @@ impl Stored {
             layout: layout.clone(),
             length: plan.length,
             rate_hz: plan.rate_hz,
+            slow_bands: plan.slow_bands,
             noise: noise.to_vec(),
-            bands_hz: plan.bands.iter().map(|b| [b.first, b.end - 1].map(|k| plan.bin_hz(k as f64))).collect(),
+            bands_hz: plan.bands.iter().map(|b| [b.first, b.end - 1].map(|k| plan.hz(*b, k as f64))).collect(),
             spectra: spectra.clone(),
         }
     }
@@ -71,13 +75,14 @@ impl Stored {
                 (day.layout == first.layout, "channels or effects"),
                 (day.length == first.length, "the length of segments"),
                 (day.rate_hz == first.rate_hz, "the sample rate"),
+                (day.slow_bands == first.slow_bands, "the lowest band"),
                 (day.noise == first.noise, "the declared noise"),
             ];
             if let Some((_, what)) = same.into_iter().find(|(same, _)| !same) {
                 return Err(StoredError::Unlike(what));
             }
         }
-        let plan = Plan::new(first.length, first.rate_hz);
+        let plan = first.plan();
         let mut sums = Sums::new(&plan, &first.layout);
         for (number, day) in (0..).zip(days) {
             let block = Block { number, spectra: day.spectra.clone(), overlaps_before: None };
@@ -87,8 +92,16 @@ impl Stored {
         Ok((first.layout.clone(), plan, sums))
     }
 
+    /// The bands of the sums.
+    fn plan(&self) -> Plan {
+        match self.slow_bands {
+            0 => Plan::new(self.length, self.rate_hz),
+            _ => Plan::with_slow_bands(self.length, self.rate_hz),
+        }
+    }
+
     fn check(&self) -> Result<(), StoredError> {
-        if self.format != FORMAT {
+        if !(2..=FORMAT).contains(&self.format) {
             return Err(StoredError::Format { found: self.format });
         }
         let Layout { channels, series, regressors, coefficients } = &self.layout;
@@ -111,7 +124,11 @@ impl Stored {
         if self.noise.iter().any(|p| p.check().is_err()) {
             return damaged("declared noise");
         }
-        let bands = Plan::new(self.length, self.rate_hz).bands.len();
+        let plan = self.plan();
+        let bands = plan.bands.len();
+        if self.slow_bands != plan.slow_bands {
+            return damaged("number of slow bands");
+        }
         let Spectra { packed, expected, weight, weight_squared, .. } = &self.spectra;
         let sizes = [self.bands_hz.len(), expected.len(), weight.len(), weight_squared.len()];
         if sizes != [bands; 4] || packed.len() != bands * triangle(self.layout.columns()) {
@@ -144,7 +161,14 @@ mod tests {
         let layout = Layout {
             channels: vec!["c".into()],
             series: vec!["s".into()],
-            regressors: vec![Regressor { coefficient: 0, channel: 0, series: 0, factor: -0.5, times: None }],
+            regressors: vec![Regressor {
+                coefficient: 0,
+                channel: 0,
+                series: 0,
+                factor: -0.5,
+                times: None,
+                in_loop: false,
+            }],
             coefficients: vec!["b".into()],
         };
         let mut analyser = Analyser::new(Plan::new(64, 10.0), &layout);

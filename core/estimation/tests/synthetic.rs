@@ -5,9 +5,10 @@
 //! and thrust noise, readouts differenced twice, and α̂ as the Wiener estimate from the attitude channel, in the
 //! frequency domain.
 
+use dragfree_estimation::collected::Collected;
 use dragfree_estimation::estimate::{Bound, Estimate, Observed, Unknown, estimate};
 use dragfree_estimation::prediction::Prediction;
-use dragfree_estimation::segments::{Collected, Segmenter};
+use dragfree_estimation::segments::Segmenter;
 use dragfree_estimation::sigma::NoiseModel;
 use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, Sums};
 use dragfree_estimation::state;
@@ -194,7 +195,14 @@ fn layout() -> Layout {
     let regressors = (0..18)
         .map(|series| {
             let coefficient = series / 3;
-            Regressor { coefficient, channel: 3 * (coefficient / 3) + series % 3, series, factor: 1.0, times: None }
+            Regressor {
+                coefficient,
+                channel: 3 * (coefficient / 3) + series % 3,
+                series,
+                factor: 1.0,
+                times: None,
+                in_loop: false,
+            }
         })
         .collect();
     let names = |n: usize| (0..n).map(|i| i.to_string()).collect();

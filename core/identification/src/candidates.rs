@@ -186,6 +186,7 @@ impl CandidateSet {
                     series,
                     factor: t.factor,
                     times: t.times,
+                    in_loop: false,
                 });
             }
         }

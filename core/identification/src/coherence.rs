@@ -1,7 +1,7 @@
 //! Coherence of housekeeping with the residuals.
 //!
 //! Drivers are each housekeeping value, its derivative, its square and the products of two. Their cross-spectra with
-//! `Σ⁻¹ r` of the residuals r are summed over long segments, in wide bands below [`crate::decimate::SLOW_HZ`]. `Σ⁻¹ r`,
+//! `Σ⁻¹ r` of the residuals r are summed over long segments, in wide bands below [`SLOW_HZ`]. `Σ⁻¹ r`,
 //! at unit power, is what is left of a channel given all others: a force on one test mass shows there far below the
 //! thrusters' noise, which moves all channels. A lag between cause and force turns the phase and leaves the coherence.
 //! For n complex observations without relation `−2(n−1) log(1 − |γ|²)` is χ² with two degrees of freedom, whatever the
@@ -17,8 +17,8 @@ use dragfree_estimation::spectra::{Band, Plan, Transformer};
 use nalgebra::{Complex, DMatrix, DMatrixView};
 use serde::{Deserialize, Serialize};
 
-use crate::decimate::SLOW_HZ;
 use crate::distributions::{corrected, ln_chi2_above};
+use dragfree_estimation::decimate::SLOW_HZ;
 
 /// Ratio of the ends of a band.
 const RATIO: f64 = 1.6;

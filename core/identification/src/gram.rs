@@ -3,24 +3,21 @@
 //! Any model made of these columns is solved from the sums without reading the data again.
 //!
 //! Two lengths of segments cover the bands. Short ones serve those from [`SLOW_HZ`] on. Segments [`LONG`] times as
-//! long, of samples that [`crate::decimate`] has decimated, serve those below, where heat, charge and drifts act and
+//! long, of samples that [`Decimator`] has decimated, serve those below, where heat, charge and drifts act and
 //! which lie under the main lobe of a short window. A run shorter than a long segment is one segment for the bins that
 //! its halves do not have. Slow series stand last and are in the long segments alone.
 
 use std::ops::Range;
 
 use dragfree_estimation::segments::{Cuts, Segmenter};
-use dragfree_estimation::spectra::{Plan, Spectra, Transformer, triangle};
+use dragfree_estimation::spectra::{LONG, Plan, Spectra, Transformer, triangle};
 use nalgebra::{DMatrix, DMatrixView};
 
 use crate::coherence::HousekeepingCoherence;
-use crate::decimate::{Decimator, Response, SLOW_HZ};
 use crate::lines::{LineSearch, Lines};
 use crate::slow_samples::{SlowSamples, Thinner};
 use crate::transient::{Part, Search, Transients};
-
-/// Long segments are so many times as long as the short ones.
-pub const LONG: usize = 16;
+use dragfree_estimation::decimate::{Decimator, Response, SLOW_HZ};
 
 /// Halvings of a long segment that make a short one.
 const HALVINGS: usize = LONG.ilog2() as usize;

@@ -12,7 +12,6 @@
 pub mod candidates;
 pub mod coherence;
 pub mod compare;
-pub mod decimate;
 pub mod diagnosis;
 pub mod distributions;
 pub mod driven;

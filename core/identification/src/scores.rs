@@ -572,11 +572,12 @@ mod tests {
     use super::*;
     use crate::candidates::{Coefficient, Form, Term};
     use crate::coherence::HousekeepingCoherence;
-    use crate::gram::{Columns, GramAccumulator, LONG};
+    use crate::gram::{Columns, GramAccumulator};
     use crate::lines::LineSearch;
     use crate::transient::Search;
     use crate::waveform::Waveform;
     use dragfree_estimation::segments::Segmenter;
+    use dragfree_estimation::spectra::LONG;
     use rand::SeedableRng;
     use rand_distr::{Distribution, StandardNormal};
     use rand_xoshiro::Xoshiro256PlusPlus;

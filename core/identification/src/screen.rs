@@ -5,12 +5,11 @@
 
 use std::collections::BTreeMap;
 
-use dragfree_estimation::spectra::FIRST_BIN;
+use dragfree_estimation::spectra::{FIRST_BIN, LONG};
 use serde_json::{Map, Value};
 
 use crate::candidates::{Candidate, Coefficient};
 use crate::diagnosis::{Trials, family};
-use crate::gram::LONG;
 use crate::scores::{CandidateScorer, Fit, IdentificationError, Scored, WithoutExcess};
 
 /// Every candidate in the form that the spectra choose.

@@ -1,27 +1,12 @@
 //! Slow forces that no effect explains: random walks of acceleration, one for each way in which a force enters the
-//! channels.
-//!
-//! What an unknown slow force does to a channel looks like whatever slow series is nearest to it. Beside a random walk
-//! of the right power such a series explains no more than chance. The power is that of the highest likelihood of the
-//! residuals' spectra (Whittle): with `Σ_b + Σ_k q_k f_b⁻² g_k g_kᵀ` the modelled spectra in band b and Ŵ_b the
-//! measured ones, the iteration
-//!
-//! ```text
-//! q_k ← q_k √( Σ_b n_b f_b⁻² g_kᵀ Σ⁻¹ Ŵ Σ⁻¹ g_k / Σ_b n_b f_b⁻² g_kᵀ Σ⁻¹ g_k )
-//! ```
-//!
-//! raises the likelihood in every step (majorisation of the Itakura–Saito divergence: Févotte and Idier, Neural
-//! Computation 23, 2421, 2011) and keeps every power positive. A random walk is there when the likelihood says so:
-//! beside one that is not, slow regressors would have less information than they have.
+//! channels ([`dragfree_estimation::random_walk`]).
 
+use dragfree_estimation::random_walk::{BandSpectra, held_directions, significant_powers};
 use dragfree_schema::{NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm};
-use nalgebra::{Cholesky, DMatrix, DVector};
+use nalgebra::DVector;
 
-use crate::decimate::SLOW_HZ;
 use crate::scores::{CandidateScorer, Fit};
-
-/// Steps of the iteration: a power that is there has converged to a small part of its own uncertainty.
-const STEPS: usize = 100;
+use dragfree_estimation::decimate::SLOW_HZ;
 
 /// Frequency at which the spectral density of a random walk is stated, Hz.
 const STATED_HZ: f64 = 1e-3;
@@ -29,27 +14,15 @@ const STATED_HZ: f64 = 1e-3;
 /// Random walks of acceleration beside the declared noise, with the powers that the residuals of a fit have.
 pub fn slow_forces(scorer: &CandidateScorer<'_>, fit: &Fit, declared: &[NoiseProcess]) -> Vec<NoiseProcess> {
     let channels = &scorer.candidate_set.channels;
-    let mut directions: Vec<(String, DVector<f64>)> = Vec::new();
-    for process in declared.iter().filter(|p| p.response == NoiseResponse::Held) {
-        for k in 0..process.size() {
-            let gain = |c: &String| process.enters.get(c).map_or(0.0, |gains| gains[k]);
-            let direction = DVector::from_iterator(channels.len(), channels.iter().map(gain));
-            let Some(direction) = direction.try_normalize(f64::MIN_POSITIVE) else { continue };
-            let parallel = |(_, other): &(String, DVector<f64>)| direction.dot(other).abs() > 1.0 - 1e-9;
-            if !directions.iter().any(parallel) {
-                let name = process.components.get(k).unwrap_or(&process.name);
-                directions.push((format!("slow force beside {name}"), direction));
-            }
-        }
-    }
+    let directions = held_directions(declared, channels);
     let plan = scorer.plan();
     let measured = scorer.residual_psd(fit);
     let mut levels = scorer.levels(fit, scorer.total, &measured);
     levels.fit();
     let observations = scorer.total.weights.observations(plan);
-    let bands: Vec<Band<'_>> = (0..plan.bands.len())
+    let bands: Vec<BandSpectra<'_>> = (0..plan.bands.len())
         .filter(|b| observations[*b] > 0.0 && plan.frequency_hz(plan.bands[*b]) < SLOW_HZ)
-        .map(|b| Band {
+        .map(|b| BandSpectra {
             hz: plan.frequency_hz(plan.bands[b]),
             observations: observations[b],
             modelled: &levels.modelled()[b],
@@ -63,7 +36,7 @@ pub fn slow_forces(scorer: &CandidateScorer<'_>, fit: &Fit, declared: &[NoisePro
         .zip(powers)
         .filter(|(_, power)| *power > 0.0)
         .map(|((name, direction), power)| NoiseProcess {
-            name: name.clone(),
+            name: format!("slow force beside {name}"),
             unit: "m s-2".to_owned(),
             spectrum: Some(NoiseShape {
                 terms: vec![NoiseTerm { asd: power.sqrt() / STATED_HZ, corner_hz: STATED_HZ, exponent: 2 }],
@@ -73,115 +46,4 @@ pub fn slow_forces(scorer: &CandidateScorer<'_>, fit: &Fit, declared: &[NoisePro
             ..NoiseProcess::default()
         })
         .collect()
-}
-
-/// Spectra of a band.
-struct Band<'a> {
-    hz: f64,
-    /// Complex observations.
-    observations: f64,
-    modelled: &'a DMatrix<f64>,
-    measured: &'a DMatrix<f64>,
-}
-
-/// Powers at 1 Hz of random walks along `directions`, zero for those without which `−2 log` of the likelihood rises by
-/// less than `least`: the one that explains most is added until none explains enough.
-fn significant_powers(bands: &[Band<'_>], directions: &[&DVector<f64>], least: f64) -> Vec<f64> {
-    let mut chosen: Vec<usize> = Vec::new();
-    let mut found = (Vec::new(), deviance(bands, &[], &[]));
-    while chosen.len() < directions.len() {
-        let with = |k: usize| {
-            let all: Vec<&DVector<f64>> = chosen.iter().chain([&k]).map(|k| directions[*k]).collect();
-            let powers = powers(bands, &all);
-            let deviance = deviance(bands, &powers, &all);
-            (k, powers, deviance)
-        };
-        let left = (0..directions.len()).filter(|k| !chosen.contains(k));
-        let best = left.map(with).min_by(|a, b| a.2.total_cmp(&b.2));
-        let Some((k, powers, deviance)) = best.filter(|best| found.1 - best.2 > least) else { break };
-        chosen.push(k);
-        found = (powers, deviance);
-    }
-    let mut powers = vec![0.0; directions.len()];
-    chosen.iter().zip(found.0).for_each(|(k, q)| powers[*k] = q);
-    powers
-}
-
-/// Modelled spectra of a band with random walks.
-fn total(band: &Band<'_>, powers: &[f64], directions: &[&DVector<f64>]) -> DMatrix<f64> {
-    let mut total = band.modelled.clone();
-    for (q, g) in powers.iter().zip(directions) {
-        total.ger(q / band.hz.powi(2), g, g, 1.0);
-    }
-    total
-}
-
-/// `−2 log` of Whittle's likelihood up to a constant; infinite where the modelled spectra are singular.
-fn deviance(bands: &[Band<'_>], powers: &[f64], directions: &[&DVector<f64>]) -> f64 {
-    let of = |band: &Band<'_>| {
-        Cholesky::new(total(band, powers, directions)).map_or(f64::INFINITY, |factor| {
-            let ln_det: f64 = factor.l().diagonal().iter().map(|x| 2.0 * x.ln()).sum();
-            2.0 * band.observations * (ln_det + factor.solve(band.measured).trace())
-        })
-    };
-    bands.iter().map(of).sum()
-}
-
-/// Powers at 1 Hz of random walks along `directions`, of the highest likelihood.
-fn powers(bands: &[Band<'_>], directions: &[&DVector<f64>]) -> Vec<f64> {
-    let Some(lowest) = bands.iter().min_by(|a, b| a.hz.total_cmp(&b.hz)) else { return vec![0.0; directions.len()] };
-    let inverse = |m: DMatrix<f64>| Cholesky::new(m).map(|c| c.inverse());
-    let Some(known) = inverse(lowest.modelled.clone()) else { return vec![0.0; directions.len()] };
-    // As much as the modelled noise in the lowest band.
-    let mut powers: Vec<f64> = directions.iter().map(|g| lowest.hz.powi(2) / g.dot(&(&known * *g))).collect();
-    for _ in 0..STEPS {
-        let (mut above, mut below) = (vec![0.0; powers.len()], vec![0.0; powers.len()]);
-        for band in bands {
-            let Some(inverse) = inverse(total(band, &powers, directions)) else { continue };
-            for (k, g) in directions.iter().enumerate() {
-                let along = &inverse * *g;
-                let weight = band.observations / band.hz.powi(2);
-                above[k] += weight * along.dot(&(band.measured * &along));
-                below[k] += weight * g.dot(&along);
-            }
-        }
-        for (q, (a, b)) in powers.iter_mut().zip(above.iter().zip(&below)) {
-            *q *= if *b > 0.0 { (a / b).max(0.0).sqrt() } else { 0.0 };
-        }
-    }
-    powers
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// Where the measured spectra are the modelled ones with random walks of known powers, these come back; a direction
-    /// without one has none.
-    #[test]
-    fn powers_of_exact_spectra_come_back() {
-        let directions =
-            [[1.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]].map(|g| DVector::from_row_slice(&g).normalize());
-        let truth = [4e-4, 0.0, 9e-6];
-        let modelled = DMatrix::from_row_slice(3, 3, &[2.0, 1.0, 0.0, 1.0, 2.0, 0.3, 0.0, 0.3, 1.0]);
-        let hz: Vec<f64> = (1..30).map(|k| 1e-3 * f64::from(k)).collect();
-        let measured: Vec<DMatrix<f64>> = hz
-            .iter()
-            .map(|f| {
-                let walks = directions.iter().zip(truth).map(|(g, q)| g * g.transpose() * (q / (f * f)));
-                walks.fold(modelled.clone(), |sum, walk| sum + walk)
-            })
-            .collect();
-        let band = |(f, w): (&f64, _)| Band { hz: *f, observations: 5.0, modelled: &modelled, measured: w };
-        let bands: Vec<Band<'_>> = hz.iter().zip(&measured).map(band).collect();
-        let found = powers(&bands, &directions.each_ref());
-        for (q, truth) in found.iter().zip(truth) {
-            // Convergence at a bound is slow: what is not there is below a hundredth of the smallest that is.
-            assert!((q - truth).abs() < 1e-2 * truth.max(9e-6), "{found:?}");
-        }
-        let significant = significant_powers(&bands, &directions.each_ref(), 25.0);
-        assert!(significant[0] > 0.0 && significant[1] == 0.0 && significant[2] > 0.0, "{significant:?}");
-        let fewer = significant_powers(&bands, &directions.each_ref(), f64::INFINITY);
-        assert_eq!(fewer, [0.0; 3]);
-    }
 }

@@ -13,7 +13,7 @@ use dragfree_estimation::sigma::NoiseModel;
 use nalgebra::{Cholesky, DMatrix, DVector};
 
 use crate::candidates::{Candidate, CandidateSet, Form};
-use crate::decimate::Decimator;
+use dragfree_estimation::decimate::Decimator;
 
 /// Distance of samples, s; a multiple of it where there would be more than [`MOST`] in a product.
 const STEP_S: f64 = 100.0;

@@ -83,17 +83,19 @@ impl Available {
         Ok(all)
     }
 
-    /// Whether a coefficient acts through a series that was made from commands (attribute `in_loop` = `true`). Commands
-    /// depend on the past readouts of all channels: a fit of such a coefficient must condition on all of them.
+    /// Whether a response is by a series that was made from commands (attribute `in_loop` = `true`).
+    pub fn is_in_loop(&self, response: &Response) -> bool {
+        let made = |c: &&Column| c.name == response.series && (response.table.is_empty() || c.table == response.table);
+        self.columns.iter().filter(made).any(|c| c.attribute("in_loop") == "true")
+    }
+
+    /// Whether a coefficient acts through a series that was made from commands. Commands depend on the past readouts of
+    /// all channels: a fit of such a coefficient must condition on all of them.
     ///
     /// # Errors
     /// As [`Self::responses`].
     pub fn has_regressors_in_loop(&self) -> Result<bool, NoSuchCoefficient> {
-        let in_loop = |r: &Response| {
-            let made = |c: &&Column| c.name == r.series && (r.table.is_empty() || c.table == r.table);
-            self.columns.iter().filter(made).any(|c| c.attribute("in_loop") == "true")
-        };
-        Ok(self.responses()?.iter().any(|(_, r)| in_loop(r)))
+        Ok(self.responses()?.iter().any(|(_, r)| self.is_in_loop(r)))
     }
 
     /// A coefficient by name.

@@ -8,15 +8,15 @@ use std::sync::Arc;
 
 use dragfree_engine::chain::{Chain, Sink};
 use dragfree_engine::examine::{FREQUENCY_HZ, Wanted};
+use dragfree_estimation::decimate::SLOW_HZ;
 use dragfree_estimation::estimate::{Method, Observed, Refinement, estimate_with};
 use dragfree_estimation::segments::{Segmenter, all_finite, longest_length};
 use dragfree_estimation::sigma::{BandNoise, NoiseModel};
-use dragfree_estimation::spectra::Plan;
+use dragfree_estimation::spectra::{LONG, Plan};
 use dragfree_estimation::stored::Stored;
 use dragfree_identification::candidates::{CandidateSet, Coefficient as Unknown, Form, Rule, Term};
 use dragfree_identification::coherence::HousekeepingCoherence;
-use dragfree_identification::decimate::SLOW_HZ;
-use dragfree_identification::gram::{Columns, GramAccumulator, LONG};
+use dragfree_identification::gram::{Columns, GramAccumulator};
 use dragfree_identification::lines::{LineSearch, Place};
 use dragfree_identification::record::Record;
 use dragfree_identification::transient::{Detection, Search, Template};

@@ -6,15 +6,16 @@ use dragfree_sdk::prelude::*;
 use nalgebra::DMatrix;
 use serde_json::json;
 
+use dragfree_estimation::collected::Collected;
 use dragfree_estimation::estimate::{
     Bound, Estimate as Solution, Method, Observed, Refinement, Unknown, estimate_with,
 };
 use dragfree_estimation::free_levels::{WithLevels, estimate_with_levels, log_determinant};
 use dragfree_estimation::levels::Level as NoiseLevel;
 use dragfree_estimation::prediction::Prediction;
-use dragfree_estimation::segments::{Collected, Segmenter, longest_length};
+use dragfree_estimation::segments::{Segmenter, longest_length};
 use dragfree_estimation::sigma::{BandNoise, NoiseModel};
-use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, SHORTEST, Spectra};
+use dragfree_estimation::spectra::{Analyser, LONG, Layout, Plan, Regressor, SHORTEST, Spectra};
 use dragfree_estimation::state;
 use dragfree_estimation::stored::Stored;
 use dragfree_estimation::verdict::{Difference, Pull, Value, chi2_bounds, chi2_quantile, differences};
@@ -175,14 +176,18 @@ impl Linked {
         // Commands follow the very noise whose spectrum would be measured.
         let refinement = if available.has_regressors_in_loop()? { Refinement::Levels } else { Refinement::Bands };
         let length = longest_length((stage.segment_s * rate_hz).round() as usize);
-        let analyser = Analyser::new(Plan::new(length, rate_hz), &layout);
+        let analyser = Analyser::new(Plan::with_slow_bands(length, rate_hz), &layout);
         let seen_as_mean = |s: usize| layout.regressors.iter().any(|r| r.series == s && differenced[r.channel]);
         let averaged = std::iter::repeat_n(false, layout.channels.len())
             .chain((0..layout.series.len()).map(seen_as_mean))
             .collect();
         let names: Vec<String> = channels.iter().map(|c| c.name.clone()).chain(layout.series.iter().cloned()).collect();
         Ok(Self {
-            signature: format!("{} in segments of {length} samples at {rate_hz} Hz", names.join(", ")),
+            signature: format!(
+                "{} in segments of {length} and {} samples at {rate_hz} Hz",
+                names.join(", "),
+                LONG * length
+            ),
             columns,
             names,
             left_out,
@@ -227,9 +232,9 @@ impl Linked {
         let (mut segmenter, mut collected) = (self.segmenter.clone(), self.collected.clone());
         segmenter.end_run(&mut self.analyser, &mut collected);
         let sums = collected.all(self.analyser.plan());
-        // The open end is stored only where there is nothing else: a later run stores the segment that it becomes.
-        let own = if self.collected.sums.total.segments == 0 { &collected.sums } else { &self.collected.sums };
-        let stored = Stored::new(&self.layout, self.analyser.plan(), &self.declared, &own.total);
+        // The open end is stored only where there is nothing else of segments as long: a later run stores the segment
+        // that it becomes.
+        let stored = Stored::new(&self.layout, self.analyser.plan(), &self.declared, &self.own(&collected));
         report.counts.insert("epochs_in_segments".to_owned(), segmenter.state.covered);
         if sums.total.segments == 0 {
             self.no_solution(&mut report);
@@ -261,6 +266,20 @@ impl Linked {
         self.describe(&solution, &levels, earlier, &mut report);
         self.attach(&solution, &stored, &mut report);
         Ok(report)
+    }
+
+    /// What this run adds to the sums. `with_open_end` has its open end too.
+    fn own(&self, with_open_end: &Collected) -> Spectra {
+        let (whole, with_open_end) = (&self.collected.sums.total, &with_open_end.sums.total);
+        if whole.segments == 0 {
+            return with_open_end.clone();
+        }
+        let mut own = whole.clone();
+        let slow_bands = self.analyser.plan().slow_bands;
+        if whole.weight[..slow_bands].iter().all(|w| *w == 0.0) {
+            own.replace_first(slow_bands, with_open_end);
+        }
+        own
     }
 
     fn nothing_collected(&self) -> Collected {
@@ -606,6 +625,7 @@ fn layout(
             Some(other) => Some(coefficient(other).ok_or_else(|| nobody(c, "coefficient", other))?),
             None => None,
         };
+        let in_loop = available.is_in_loop(r);
         let key = (r.table.clone(), r.series.clone());
         regressors.push(Regressor {
             coefficient: coefficient(&c.name).ok_or_else(|| nobody(c, "coefficient", &c.name))?,
@@ -616,6 +636,7 @@ fn layout(
             }),
             factor: r.factor,
             times,
+            in_loop,
         });
     }
     let layout = Layout {

@@ -19,6 +19,11 @@ pub struct Response {
 }
 
 impl Response {
+    /// Of a decimator that keeps every `factor`-th sample.
+    pub fn of(factor: usize) -> Self {
+        Self { factor: factor as f64 }
+    }
+
     /// At a frequency in cycles per sample that comes in.
     pub fn at(self, cycles: f64) -> f64 {
         let angle = std::f64::consts::PI * cycles;
@@ -31,11 +36,19 @@ impl Response {
 pub struct Decimator {
     factor: usize,
     kernel: DVector<f64>,
-    /// Samples that outputs to come still need, per column, and the time of the first, ns.
-    pending: Vec<Vec<f64>>,
-    first_ns: i64,
     step_ns: i64,
     threads: usize,
+    /// What must survive a checkpoint.
+    pub state: State,
+}
+
+/// Samples that outputs to come still need.
+#[derive(Clone, Debug, PartialEq)]
+pub struct State {
+    /// Per column, fewer than the filter is long.
+    pub pending: Vec<Vec<f64>>,
+    /// Time of the first, ns.
+    pub first_ns: i64,
 }
 
 /// Samples of all columns that are worth a thread.
@@ -51,7 +64,8 @@ impl Decimator {
             out
         };
         let kernel = (0..ORDER).fold(vec![1.0], |kernel, _| convolved(kernel));
-        Self { factor, kernel: kernel.into(), pending: vec![Vec::new(); columns], first_ns: 0, step_ns, threads }
+        let state = State { pending: vec![Vec::new(); columns], first_ns: 0 };
+        Self { factor, kernel: kernel.into(), step_ns, threads, state }
     }
 
     /// Nanoseconds between samples that are kept.
@@ -61,19 +75,24 @@ impl Decimator {
 
     /// Its response.
     pub fn response(&self) -> Response {
-        Response { factor: self.factor as f64 }
+        Response::of(self.factor)
+    }
+
+    /// Samples that one output is made of.
+    pub fn length(&self) -> usize {
+        self.kernel.len()
     }
 
     /// More samples of the run; what is kept, at the times of the middle of what it was made of.
     pub fn push(&mut self, first_ns: i64, columns: &[&[f64]]) -> (Vec<i64>, Vec<Vec<f64>>) {
-        if self.pending.first().is_none_or(Vec::is_empty) {
-            self.first_ns = first_ns;
+        if self.state.pending.first().is_none_or(Vec::is_empty) {
+            self.state.first_ns = first_ns;
         }
         let length = self.kernel.len();
         let new = columns.first().map_or(0, |c| c.len());
-        let samples = self.pending.first().map_or(0, Vec::len) + new;
+        let samples = self.state.pending.first().map_or(0, Vec::len) + new;
         let kept = if samples < length { 0 } else { (samples - length) / self.factor + 1 };
-        let middle_ns = self.first_ns + (length as i64 - 1) * self.step_ns / 2;
+        let middle_ns = self.state.first_ns + (length as i64 - 1) * self.step_ns / 2;
         let times = (0..kept as i64).map(|m| middle_ns + m * self.step_ns()).collect();
         let (kernel, factor) = (&self.kernel, self.factor);
         let filter = |pending: &mut Vec<f64>, samples: &[f64]| {
@@ -86,7 +105,7 @@ impl Decimator {
         let mut thinned = vec![Vec::new(); columns.len()];
         let threads = if new * columns.len() < WORTH_A_THREAD { 1 } else { self.threads };
         let each = columns.len().div_ceil(threads).max(1);
-        let shares = thinned.chunks_mut(each).zip(self.pending.chunks_mut(each)).zip(columns.chunks(each));
+        let shares = thinned.chunks_mut(each).zip(self.state.pending.chunks_mut(each)).zip(columns.chunks(each));
         std::thread::scope(|scope| {
             for (k, ((out, pending), columns)) in shares.enumerate() {
                 let work = move || {
@@ -100,13 +119,13 @@ impl Decimator {
                 }
             }
         });
-        self.first_ns += kept as i64 * self.step_ns();
+        self.state.first_ns += kept as i64 * self.step_ns();
         (times, thinned)
     }
 
     /// The run has ended.
     pub fn gap(&mut self) {
-        self.pending.iter_mut().for_each(Vec::clear);
+        self.state.pending.iter_mut().for_each(Vec::clear);
     }
 }
 
