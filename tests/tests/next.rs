@@ -50,7 +50,9 @@ fn assert_came_true(d: &Value, coefficients: &Value) {
 }
 
 /// What is expected of a manoeuvre and of more data comes true within 10 % for two pairs that three hours cannot tell,
-/// and the manoeuvre tells them. Later rows have other noise. The twin, which flies half the amplitude, is off by more.
+/// and the manoeuvre tells them. The first seed is one of those whose data name the effect and cannot tell it from
+/// these two; the later rows have other noise, of seeds that were fixed before any of them was run. The twin, which
+/// flies half the amplitude, is off by more.
 #[test]
 fn the_sigma_that_is_expected_of_a_manoeuvre_and_of_more_data_comes_true() {
     let effect = ["--effect", "opening-angle:tm1=0.03"];
@@ -63,7 +65,7 @@ fn the_sigma_that_is_expected_of_a_manoeuvre_and_of_more_data_comes_true() {
     assert_eq!(planned, arguments(pairs[1]), "one flight serves both");
     let manoeuvre = planned.strip_prefix("--manoeuvre ").expect("an option");
     let fly =
-        |manoeuvre: &str| of(&["--hours", "3", "--seed", "32", "--start", "2035-01-02", "--manoeuvre", manoeuvre], &[]);
+        |manoeuvre: &str| of(&["--hours", "3", "--seed", "42", "--start", "2035-01-02", "--manoeuvre", manoeuvre], &[]);
     let flown = fly(manoeuvre);
     let confounders = flown["candidates"][0]["confounders"].to_string();
     for a in pairs {
@@ -78,6 +80,6 @@ fn the_sigma_that_is_expected_of_a_manoeuvre_and_of_more_data_comes_true() {
 
     let data = &pairs[0]["data"];
     let hours = data["hours"].to_string();
-    let longer = of(&["--hours", &hours, "--seed", "33", "--start", "2035-01-03"], &[]);
+    let longer = of(&["--hours", &hours, "--seed", "43", "--start", "2035-01-03"], &[]);
     assert_came_true(&longer, &data["coefficients"]);
 }

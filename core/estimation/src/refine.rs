@@ -196,9 +196,8 @@ impl Whitening {
     }
 
     /// Whether residuals that the model does not connect are as unrelated as it says, above the slow bands, where what
-    /// pushes and turns need be no noise: for each pair of groups the sum
-    /// of `2n ρ²` over pairs of channels and refined bands, ρ the real coherence of the residuals, χ² of as many
-    /// degrees of freedom when it is so.
+    /// pushes and turns need be no noise: for each pair of groups the sum of `2n ρ²` over pairs of channels and refined
+    /// bands, ρ the real coherence of the residuals, χ² of as many degrees of freedom when it is so.
     pub(crate) fn between_groups(&self, residuals: &[DMatrix<f64>]) -> (f64, f64) {
         let (mut sum, mut dof) = (0.0, 0.0);
         for (range, n) in self.coarse.iter().zip(&self.observations).filter(|(r, _)| r.start >= self.slow_bands) {

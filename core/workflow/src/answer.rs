@@ -9,7 +9,7 @@ use dragfree_engine::product::Written;
 use dragfree_engine::registry::Registry;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{
-    Constancy, Diagnosis, Found, LIMIT_QUANTILE, LINE, Limit, OfProduct, Separation, TRANSIENT, Trials,
+    Constancy, Diagnosis, Found, LIMIT_QUANTILE, LINE, Limit, OfProduct, OtherLevel, Separation, TRANSIENT, Trials,
 };
 use dragfree_identification::innovations::decision::{Fitted, Quadratic};
 use dragfree_identification::record::Record;
@@ -238,7 +238,7 @@ pub(crate) fn noise_levels(decided: &Decided, record: &Record) -> Vec<NoiseLevel
 }
 
 /// Levels as what may be missing. `chi2` is that of the whitened innovations, of so many numbers.
-pub(crate) fn louder(levels: &[NoiseLevel], chi2: f64, numbers: f64, evidence: &Evidence<'_>) -> Vec<Found> {
+fn louder(levels: &[NoiseLevel], chi2: f64, numbers: f64, evidence: &Evidence<'_>) -> Vec<Found> {
     let found = |level: &NoiseLevel| {
         let value = level.ln.exp() * level.stated;
         let gain = (level.ln / level.sigma).powi(2);
@@ -274,6 +274,27 @@ pub(crate) fn louder(levels: &[NoiseLevel], chi2: f64, numbers: f64, evidence: &
         }
     };
     levels.iter().map(found).collect()
+}
+
+/// Puts levels of noise beyond the tolerance of a mission file among what is named, and sorts by significance; returns
+/// the levels that are certain and within it.
+pub(crate) fn with_levels(
+    named: &mut Vec<Found>,
+    levels: &[NoiseLevel],
+    decided: &Decided,
+    evidence: &Evidence<'_>,
+    settings: &Settings,
+) -> Vec<OtherLevel> {
+    let mut within = Vec::new();
+    for f in louder(levels, decided.chi2, decided.numbers, evidence) {
+        match f.standing(settings) {
+            (true, true) => named.push(Found { accepted: true, ..f }),
+            (true, false) => within.push(f.level()),
+            (false, _) => {}
+        }
+    }
+    named.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
+    within
 }
 
 /// Channels that a component of noise enters.

@@ -21,7 +21,7 @@ use dragfree_schema::Settings;
 use serde_json::json;
 
 use crate::WorkflowError;
-use crate::answer::{Evidence, apart, contradict, found, limits, louder, noise_levels, verdict};
+use crate::answer::{Evidence, apart, contradict, found, limits, noise_levels, verdict, with_levels};
 use crate::extract::Extract;
 use crate::likelihood::{Decided, PASSES, Point, Settled, moved, one_pass, step, step_of_model};
 use crate::proposals::{FORMULA, Proposal, proposals};
@@ -99,7 +99,7 @@ pub fn diagnose(
         [product] if keeps => {
             let about_model = about_model(replay, &record, &last, &evidence, progress)?;
             let levels = noise_levels(decided, &record);
-            Extract::new(product, &about_model, &diagnosis, levels, &evidence.trials)
+            Extract::new(product, &about_model, &diagnosis, levels, &evidence)
         }
         _ => None,
     };
@@ -261,16 +261,7 @@ fn answer(
         others.push(Found { accepted: false, refused, ..f });
     }
     let unexplained = followed(unexplained, &formulas, evidence, scorer);
-    let mut levels = Vec::new();
-    let measured = noise_levels(decided, record);
-    for f in louder(&measured, decided.chi2, decided.numbers, evidence) {
-        match f.standing(settings) {
-            (true, true) => named.push(Found { accepted: true, ..f }),
-            (true, false) => levels.push(f.level()),
-            (false, _) => {}
-        }
-    }
-    named.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
+    let levels = with_levels(&mut named, &noise_levels(decided, record), decided, evidence, settings);
     others.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
     let refused = |f: &Found| {
         let reason = f.refused.as_ref()?;

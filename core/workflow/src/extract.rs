@@ -19,9 +19,8 @@ use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use crate::WorkflowError;
-use crate::answer::{Evidence, NoiseLevel, apart, contradict, found, limits, louder, verdict};
+use crate::answer::{Evidence, NoiseLevel, apart, contradict, found, limits, verdict, with_levels};
 use crate::likelihood::{CoefficientSums, Decided, joined};
-use crate::proposals::FORMULA;
 
 /// Format of the file.
 const FORMAT: &str = "dragfree-extract/1";
@@ -40,7 +39,6 @@ pub struct Extract {
     score: Vec<f64>,
     chi2: f64,
     numbers: f64,
-    samples: u64,
     surveys: Vec<Survey>,
     /// Channels on which each coefficient acts.
     channels: BTreeMap<String, BTreeSet<String>>,
@@ -67,11 +65,12 @@ impl Extract {
         decided: &Decided,
         diagnosis: &Diagnosis,
         levels: Vec<NoiseLevel>,
-        trials: &Trials,
+        evidence: &Evidence<'_>,
     ) -> Option<Self> {
         let sums = decided.of_coefficients()?;
         let n = sums.coefficients.len();
         // A proposed formula is an effect of one diagnosis.
+        let is_proposal = |c: &Coefficient| evidence.proposal(&c.effect, &c.instance).is_some();
         let kept: Vec<usize> = (0..n).filter(|i| !is_proposal(&sums.coefficients[*i])).collect();
         let accepted = diagnosis.candidates.iter().filter(|f| f.accepted);
         Some(Self {
@@ -87,12 +86,11 @@ impl Extract {
             score: kept.iter().map(|i| sums.score[*i]).collect(),
             chi2: sums.chi2,
             numbers: sums.numbers,
-            samples: sums.samples,
             surveys: sums.surveys.into_iter().map(|(terms, prior)| Survey { terms, prior }).collect(),
             channels: sums.channels,
             named: accepted.map(|f| (f.effect.clone(), f.instance.clone())).collect(),
             levels,
-            trials: trials.clone(),
+            trials: evidence.trials.clone(),
             unexplained: why_unexplained(diagnosis),
             not_tried: diagnosis.not_tried.clone(),
         })
@@ -151,15 +149,10 @@ impl Extract {
             score: DVector::from_fn(kept.len(), |i, _| self.score[kept[i]]),
             chi2: self.chi2,
             numbers: self.numbers,
-            samples: self.samples,
             surveys: self.surveys.iter().map(|s| (s.terms.clone(), s.prior)).collect(),
             channels: self.channels.clone(),
         }
     }
-}
-
-fn is_proposal(c: &Coefficient) -> bool {
-    c.candidate && c.effect == FORMULA
 }
 
 fn why_unexplained(diagnosis: &Diagnosis) -> Option<String> {
@@ -218,31 +211,23 @@ fn of_one_model(extracts: &[Extract]) -> Result<(), WorkflowError> {
     }
 }
 
-/// Levels of several days: weighted means, with the level of each day.
+/// Levels of several days: means weighted by 1/σ².
 fn levels_of_all(extracts: &[Extract]) -> Vec<NoiseLevel> {
     let Some(first) = extracts.first() else { return Vec::new() };
     let of = |level: &NoiseLevel| {
         let own = extracts.iter().flat_map(|e| &e.levels).filter(|l| l.coefficient == level.coefficient);
         let known = own.filter(|l| l.sigma > 0.0).map(|l| (l.sigma.powi(-2), l.ln));
         let (weight, sum) = known.fold((0.0, 0.0), |(w, s), (weight, ln)| (w + weight, s + weight * ln));
-        NoiseLevel { ln: sum / weight, sigma: weight.powf(-0.5), ..level.clone() }
+        (weight > 0.0).then(|| NoiseLevel { ln: sum / weight, sigma: weight.powf(-0.5), ..level.clone() })
     };
-    first.levels.iter().map(of).collect()
+    first.levels.iter().filter_map(of).collect()
 }
 
 fn answer(settings: &Settings, decided: &Decided, extracts: &[Extract], evidence: &Evidence<'_>) -> Diagnosis {
     let of = |accepted: bool| move |f| found(settings, decided, f, evidence, accepted);
     let mut named: Vec<Found> = decided.selection.chosen.iter().map(of(true)).collect();
     let mut others: Vec<Found> = decided.selection.rest.iter().map(of(false)).collect();
-    let mut levels = Vec::new();
-    for f in louder(&levels_of_all(extracts), decided.chi2, decided.numbers, evidence) {
-        match f.standing(settings) {
-            (true, true) => named.push(Found { accepted: true, ..f }),
-            (true, false) => levels.push(f.level()),
-            (false, _) => {}
-        }
-    }
-    named.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
+    let levels = with_levels(&mut named, &levels_of_all(extracts), decided, evidence, settings);
     others.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
     let left = |e: &Extract| Some(format!("{} alone: {}", e.product, e.unexplained.as_ref()?));
     let agreement = decided.agreement();

@@ -145,7 +145,6 @@ impl Decided {
             score,
             chi2: part.sums.chi2,
             numbers: part.sums.numbers,
-            samples: part.sums.samples,
             surveys: self.surveys.clone(),
             channels: self.channels.clone(),
         })
@@ -173,16 +172,13 @@ impl Decided {
     fn reduced(&self, part: &Part, kept: &[usize]) -> (DMatrix<f64>, DVector<f64>) {
         let mut sums = no_sums(self.parameters.len());
         part.add_to(&mut sums);
-        let mut start = self.start.clone();
-        let others: BTreeSet<usize> = self.coefficients(|i| !kept.contains(&i)).into_iter().collect();
-        // About zero, and at zero.
-        let at = DVector::from_column_slice(&sums.score) + &sums.information * DVector::from_column_slice(&start);
-        for i in &others {
-            sums.information.row_mut(*i).fill(0.0);
-            sums.information.column_mut(*i).fill(0.0);
+        let about_zero = &sums.information * DVector::from_column_slice(&self.start);
+        sums.score.iter_mut().zip(about_zero.iter()).for_each(|(score, moved)| *score += moved);
+        for i in self.coefficients(|i| !kept.contains(&i)) {
+            sums.information.row_mut(i).fill(0.0);
+            sums.information.column_mut(i).fill(0.0);
         }
-        start.iter_mut().for_each(|x| *x = 0.0);
-        sums.score = at.as_slice().to_vec();
+        let zero = vec![0.0; self.start.len()];
         let single = |i: &usize| Candidate {
             parameters: vec![*i],
             lower: vec![f64::NEG_INFINITY],
@@ -191,9 +187,9 @@ impl Decided {
             ln_prior: 0.0,
             shaped: false,
         };
-        let levels = (0..start.len()).filter(|i| matches!(self.parameters[*i].1, Meaning::Level));
+        let levels = (0..zero.len()).filter(|i| matches!(self.parameters[*i].1, Meaning::Level));
         let priors: Vec<_> = levels.map(|i| (vec![(i, 1.0)], Prior { mean: 0.0, sigma: LEVEL_PRIOR })).collect();
-        Quadratic::new(&sums, &start, &priors, kept.iter().map(single).collect()).of_candidates()
+        Quadratic::new(&sums, &zero, &priors, kept.iter().map(single).collect()).of_candidates()
     }
 }
 
@@ -209,8 +205,6 @@ pub(crate) struct CoefficientSums {
     pub(crate) chi2: f64,
     /// Numbers of them.
     pub(crate) numbers: f64,
-    /// Samples.
-    pub(crate) samples: u64,
     /// What is known of sums of coefficients before any data.
     pub(crate) surveys: Vec<(Vec<(String, f64)>, Prior)>,
     /// Channels on which each coefficient acts.
@@ -231,7 +225,7 @@ pub(crate) fn joined(
         let places = places.map(|(i, c)| (i, place(c))).collect();
         let mut sums = no_sums(0);
         (sums.information, sums.score) = (product.information, product.score.as_slice().to_vec());
-        (sums.chi2, sums.numbers, sums.samples) = (product.chi2, product.numbers, product.samples);
+        (sums.chi2, sums.numbers) = (product.chi2, product.numbers);
         all.parts.push(Part { sums, places });
         all.surveys = product.surveys;
         all.channels.extend(product.channels);

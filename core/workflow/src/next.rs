@@ -186,7 +186,7 @@ pub fn next(
     for (pair, hours) in pairs.iter().zip(hours) {
         next.separations.push(ask.separation(*pair, hours, &archive, catalogue));
     }
-    next.limits = limited.into_iter().map(|candidate| ask.limit(candidate, catalogue)).collect();
+    next.limits = limited.into_iter().map(|one| ask.limit(one, catalogue)).collect();
     Ok(next)
 }
 
@@ -269,25 +269,25 @@ impl<'a> Ask<'a> {
         self.decided.selection.chosen.iter().flat_map(of).collect()
     }
 
-    /// Effects that are not named and whose largest physical size is below five σ, the least limited first.
-    fn limited(&self) -> Vec<usize> {
-        let excess = |candidate: usize| {
-            let sigma = self.decided.quadratic.sigma(candidate, &self.set);
-            self.largest(candidate).map(|(at, largest)| largest / sigma[at])
-        };
+    /// Effects that are not named and whose largest physical size, which comes with them, is below five σ, the least
+    /// limited first.
+    fn limited(&self) -> Vec<(usize, f64)> {
+        let excess =
+            |(candidate, largest): (usize, f64)| largest / self.decided.quadratic.sigma(candidate, &self.set)[0];
         let rest = self.decided.selection.rest.iter().map(|f| f.candidate);
-        let mut all: Vec<(usize, f64)> = rest.filter_map(|c| Some((c, excess(c)?))).collect();
-        all.retain(|(_, sigmas)| sigmas.powi(2) < SEPARATED_CHI2);
-        all.sort_by(|a, b| a.1.total_cmp(&b.1));
-        all.into_iter().take(MOST_LIMITS).map(|(candidate, _)| candidate).collect()
+        let mut all: Vec<(usize, f64)> = rest.filter_map(|c| Some((c, self.largest(c)?))).collect();
+        all.retain(|one| excess(*one).powi(2) < SEPARATED_CHI2);
+        all.sort_by(|a, b| excess(*a).total_cmp(&excess(*b)));
+        all.truncate(MOST_LIMITS);
+        all
     }
 
-    /// The only coefficient of a candidate with its largest size; nothing of an effect of several coefficients or none.
-    fn largest(&self, candidate: usize) -> Option<(usize, f64)> {
+    /// The largest size of the only coefficient of a candidate; nothing of an effect of several coefficients or none.
+    fn largest(&self, candidate: usize) -> Option<f64> {
         let [own] = self.decided.candidates[candidate].parameters[..] else { return None };
         let Meaning::Coefficient(c) = &self.decided.parameters[own].1 else { return None };
         let largest = c.upper.abs().max(c.lower.abs());
-        (largest.is_finite() && largest > 0.0).then_some((0, largest))
+        (largest.is_finite() && largest > 0.0).then_some(largest)
     }
 
     /// σ of the coefficients of some candidates now and as expected, each beside what is named.
@@ -340,13 +340,12 @@ impl<'a> Ask<'a> {
         })
     }
 
-    fn limit(&self, candidate: usize, catalogue: Option<&Catalogue>) -> LimitAdvice {
-        let (at, largest) = self.largest(candidate).unwrap_or_default();
-        let sigma = |quadratic: &Quadratic| quadratic.sigma(candidate, &self.set)[at];
+    fn limit(&self, (candidate, largest): (usize, f64), catalogue: Option<&Catalogue>) -> LimitAdvice {
+        let sigma = |quadratic: &Quadratic| quadratic.sigma(candidate, &self.set)[0];
         let goal = |then: &Quadratic| (largest / sigma(then)).powi(2);
         LimitAdvice {
             effect: self.name(candidate),
-            coefficient: self.decided.parameters[self.decided.candidates[candidate].parameters[at]].0.clone(),
+            coefficient: self.decided.parameters[self.decided.candidates[candidate].parameters[0]].0.clone(),
             largest,
             sigma_now: sigma(&self.decided.quadratic),
             manoeuvre: catalogue.and_then(|c| self.shortest(c, &[candidate], &goal)),

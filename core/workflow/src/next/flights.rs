@@ -21,6 +21,7 @@ use dragfree_physics::manoeuvre::{Input, LinearLoop, Manoeuvre};
 use dragfree_physics::mission::{ANGLES, AXES, Mission};
 use nalgebra::DMatrix;
 
+use super::length_s;
 use crate::WorkflowError;
 use crate::likelihood::{Experiment, InBlock, Meaning, Means, Settled, information};
 use crate::replay::{AT_NS, Pass, Replay};
@@ -75,7 +76,7 @@ impl Catalogue {
         let stage = Stage { replay, end, number, sources, mission: &mission, chosen: steady(replay, end) };
         let quiet = stage.quiet(written, progress)?;
         // Regressors that wait for a filter to settle begin in the first slot, so nothing is flown in it.
-        let at_once = ((stage.length_s(written) / SLOT_S) as usize).saturating_sub(1).max(1);
+        let at_once = ((length_s(written) / SLOT_S) as usize).saturating_sub(1).max(1);
         for flights in flights.chunks_mut(at_once) {
             stage.fly(flights, &quiet, progress)?;
         }
@@ -229,11 +230,6 @@ struct Stage<'a> {
 }
 
 impl Stage<'_> {
-    fn length_s(&self, written: &Written) -> f64 {
-        let times = &written.product.header.non_standard_attributes;
-        1e-9 * (times.stop_time_epoch_ns - times.start_time_epoch_ns) as f64
-    }
-
     /// The spacecraft at rest, for two slots: in the first one filters settle.
     fn quiet(
         &self,
