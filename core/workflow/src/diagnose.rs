@@ -156,7 +156,7 @@ fn decide(
             moving.extend(differences(&now, &named));
         }
         point = next;
-        if passes > 1 && moving.is_empty() || passes == PASSES {
+        if moving.is_empty() || passes == PASSES {
             return Ok(Last { end: Settled { decided, chosen, slow, point }, screened, moving });
         }
         if now != named {

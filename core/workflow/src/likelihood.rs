@@ -280,22 +280,24 @@ fn to_values(from: &Point, decided: &Decided, values: &DVector<f64>, chosen: &BT
     to
 }
 
-/// What differs between two points: effects that are in one alone, and what moved by more than a part of its σ.
+/// What differs between two points: effects that are in one alone, and what the step has left by more than a part of
+/// its σ. A step of Newton's method in the logarithm of a level leaves its square.
 pub(crate) fn moved(from: &Point, to: &Point, decided: &Decided) -> BTreeSet<String> {
-    let all = decided.parameters.iter().enumerate();
-    let moving = all.filter(|(i, (name, meaning))| {
-        let (a, b) = match meaning {
-            Meaning::Coefficient(_) => (from.values.get(name).copied(), to.values.get(name).copied()),
-            Meaning::Level => (from.levels.get(name).map(|x| x.ln()), to.levels.get(name).map(|x| x.ln())),
-            Meaning::Power => (None, None),
+    let level = |point: &Point, name: &String| point.levels.get(name).copied().unwrap_or(1.0).ln();
+    let all = decided.parameters.iter().zip(decided.selection.sigma.iter());
+    let moving = all.filter(|((name, meaning), sigma)| {
+        let left = match meaning {
+            Meaning::Coefficient(_) => match (from.values.get(name), to.values.get(name)) {
+                (Some(a), Some(b)) => (a - b).abs(),
+                (None, None) => return false,
+                _ => return true,
+            },
+            Meaning::Level => (level(from, name) - level(to, name)).powi(2),
+            Meaning::Power => return false,
         };
-        match (a, b) {
-            (Some(a), Some(b)) => (a - b).abs() > REACHED_SIGMAS * decided.selection.sigma[*i],
-            (None, None) => false,
-            _ => true,
-        }
+        left > REACHED_SIGMAS * **sigma
     });
-    moving.map(|(_, (name, _))| name.clone()).collect()
+    moving.map(|((name, _), _)| name.clone()).collect()
 }
 
 /// One pass over all products, with effects in these forms and slow forces beside the declared noise.

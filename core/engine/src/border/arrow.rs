@@ -1,6 +1,5 @@
 //! Rows as Arrow C Data: borrowed on the way in, owned and checked on the way out.
 
-use arrow_array::{StructArray, cast::AsArray, types::Float64Type, types::Int64Type};
 use arrow_data::ffi::FFI_ArrowArray;
 use arrow_schema::{DataType, Field, Fields, ffi::FFI_ArrowSchema};
 use dragfree_abi as abi;
@@ -52,12 +51,13 @@ pub(super) fn borrow(time_ns: &[i64], columns: &[&[f64]]) -> (impl Sized + use<>
     ((children, child_pointers, buffers, own_buffers), array)
 }
 
-/// Takes a plugin's array: checks its shape, copies the rows, releases it.
+/// Takes a plugin's array of `time_ns` and so many columns: checks its shape, copies the rows, releases it.
+///
+/// The types are those that the plugin declared when it was linked, so no schema comes with each call.
 ///
 /// # Safety
 /// `array` was written by a plugin as a struct array of the C Data Interface, or is untouched.
-pub(super) unsafe fn take(array: abi::ArrowArray, fields: &Fields) -> Result<Batch, String> {
-    let columns = fields.len() - 1;
+pub(super) unsafe fn take(array: abi::ArrowArray, columns: usize) -> Result<Batch, String> {
     if array.release.is_none() {
         return if array.length == 0 && array.children.is_null() {
             Ok(Batch::empty(columns))
@@ -66,23 +66,44 @@ pub(super) unsafe fn take(array: abi::ArrowArray, fields: &Fields) -> Result<Bat
         };
     }
     // SAFETY: by the caller; the array has not been released.
-    let shape = unsafe { check_shape(&array, fields.len()) };
-    // SAFETY: the two structs have one layout; from here on `owned` releases the array when it is dropped.
-    let owned: FFI_ArrowArray = unsafe { std::mem::transmute(array) };
-    shape?;
-    let schema = FFI_ArrowSchema::try_from(DataType::Struct(fields.clone())).map_err(|e| e.to_string())?;
-    // SAFETY: the shape was checked against the declared fields; buffer lengths cannot be checked across a C border.
-    let data = unsafe { arrow_array::ffi::from_ffi(owned, &schema) }.map_err(|e| e.to_string())?;
-    let rows = StructArray::from(data);
-    Ok(Batch {
-        time_ns: rows.column(0).as_primitive::<Int64Type>().values().to_vec(),
-        columns: (1..=columns).map(|i| rows.column(i).as_primitive::<Float64Type>().values().to_vec()).collect(),
-    })
+    let shape = unsafe { check_shape(&array, columns + 1) };
+    // SAFETY: the shape was checked; lengths of buffers cannot be checked across a C border.
+    let batch = shape.map(|rows| unsafe {
+        let child = |i: usize| &**array.children.add(i);
+        let skipped = array.offset.cast_unsigned() as usize;
+        Batch {
+            time_ns: values(child(0), skipped, rows),
+            columns: (1..=columns).map(|i| values(child(i), skipped, rows)).collect(),
+        }
+    });
+    // SAFETY: the two structs have one layout; this one releases the array when it is dropped.
+    drop(unsafe { std::mem::transmute::<abi::ArrowArray, FFI_ArrowArray>(array) });
+    batch
 }
 
+/// `rows` values of a primitive array after `skipped` ones. A plugin may have put them at any address.
+///
 /// # Safety
-/// `array` is a released-able Arrow array.
-unsafe fn check_shape(array: &abi::ArrowArray, children: usize) -> Result<(), String> {
+/// The array has values of type `T`, and as many.
+unsafe fn values<T: Copy>(array: &abi::ArrowArray, skipped: usize, rows: usize) -> Vec<T> {
+    let mut out: Vec<T> = Vec::with_capacity(rows);
+    if rows > 0 {
+        let first = (skipped + array.offset.cast_unsigned() as usize) * size_of::<T>();
+        // SAFETY: by the caller; bytes have no alignment, and all `rows` values are written before they count.
+        unsafe {
+            let from = (*array.buffers.add(1)).cast::<u8>().add(first);
+            ptr::copy_nonoverlapping(from, out.as_mut_ptr().cast::<u8>(), rows * size_of::<T>());
+            out.set_len(rows);
+        }
+    }
+    out
+}
+
+/// The number of rows of a struct array of so many primitive children without nulls.
+///
+/// # Safety
+/// `array` has not been released.
+unsafe fn check_shape(array: &abi::ArrowArray, children: usize) -> Result<usize, String> {
     if array.n_children != children.cast_signed() as i64 || array.children.is_null() {
         return Err(format!("an output table of {} children where {children} were declared", array.n_children));
     }
@@ -103,5 +124,5 @@ unsafe fn check_shape(array: &abi::ArrowArray, children: usize) -> Result<(), St
             return Err(format!("output column {i} has no values"));
         }
     }
-    Ok(())
+    Ok(array.length.cast_unsigned() as usize)
 }

@@ -1,6 +1,6 @@
 //! A plugin instance: created, linked, fed, asked for report and state, destroyed.
 
-use arrow_schema::{DataType, Fields, ffi::FFI_ArrowSchema};
+use arrow_schema::{DataType, ffi::FFI_ArrowSchema};
 use dragfree_abi as abi;
 use dragfree_schema::{Coefficient, Constraint, NOISE_ATTRIBUTE, NoiseProcess, Report};
 use serde::de::DeserializeOwned;
@@ -84,7 +84,8 @@ pub struct Instance {
     _host: Box<abi::HostV1>,
     _host_name: Box<CString>,
     input_schemas: Vec<FFI_ArrowSchema>,
-    output_fields: Vec<Fields>,
+    /// Columns of each written table, beside the times.
+    output_columns: Vec<usize>,
     /// An earlier call failed; nothing but `destroy` may follow.
     dead: bool,
 }
@@ -518,7 +519,7 @@ impl Instance {
             _host: host,
             _host_name: host_name,
             input_schemas: Vec::new(),
-            output_fields: Vec::new(),
+            output_columns: Vec::new(),
             dead: false,
         })
     }
@@ -566,7 +567,7 @@ impl Instance {
                 .map_err(|e| BorderError::Link { plugin: self.name.clone(), sentence: e.to_string() })?;
             self.input_schemas.push(schema);
         }
-        self.output_fields = linked.writes.iter().map(|t| arrow::fields_of(&t.columns)).collect();
+        self.output_columns = linked.writes.iter().map(|t| t.columns.len()).collect();
         Ok(linked)
     }
 
@@ -621,7 +622,7 @@ impl Instance {
     /// The plugin failed or broke a rule of the border.
     pub fn flush(&mut self) -> Result<Vec<Batch>, BorderError> {
         let Some(flush) = self.node.flush else {
-            return Ok(self.output_fields.iter().map(|f| Batch::empty(f.len() - 1)).collect());
+            return Ok(self.output_columns.iter().map(|columns| Batch::empty(*columns)).collect());
         };
         // SAFETY: as in `process`.
         let batches = self.outputs("flush", |node, outputs, error| unsafe { flush(node, outputs, error) })?;
@@ -707,15 +708,15 @@ impl Instance {
         call: &'static str,
         work: impl FnOnce(*mut c_void, *mut abi::ArrowArray, *mut abi::ErrorV1) -> abi::Status,
     ) -> Result<Option<Vec<Batch>>, BorderError> {
-        let mut arrays: Vec<abi::ArrowArray> = self.output_fields.iter().map(|_| abi::ArrowArray::empty()).collect();
+        let mut arrays: Vec<abi::ArrowArray> = self.output_columns.iter().map(|_| abi::ArrowArray::empty()).collect();
         let pointer = arrays.as_mut_ptr();
         let called = self.call_or_discard(call, |node, error| work(node, pointer, error));
         // Arrays are taken, and so released, even after a failed call.
         let batches: Result<Vec<Batch>, String> = arrays
             .into_iter()
-            .zip(&self.output_fields)
+            .zip(&self.output_columns)
             // SAFETY: the plugin filled the arrays as the header asks, or left them empty.
-            .map(|(array, fields)| unsafe { arrow::take(array, fields) })
+            .map(|(array, columns)| unsafe { arrow::take(array, *columns) })
             .collect();
         if !called? {
             return Ok(None);
