@@ -150,6 +150,31 @@ fn a_pair_is_not_replaced_by_what_looks_like_both() {
     assert_eq!(found, ["mps-gain:sc.y", "mps-tilt:sc.z"], "{:#}", d["candidates"]);
 }
 
+/// What is named makes no other effect more certain. An opening angle turns the whole acceleration, with what a gain of
+/// the thrusters adds to it: without the product of the two in the model, σ of the opening angle is a tenth beside a
+/// named gain, and its value is zero where it acts. σ of two hours of the same noise agree within a few per cent.
+#[test]
+fn a_named_effect_makes_no_other_more_certain() {
+    let of = |more: &[&str]| diagnosis(&[&["--hours", "2", "--seed", "31"], more].concat());
+    let (clean, named) = (of(&[]), of(&["--effect", "mps-gain:sc.y=0.2"]));
+    assert_eq!(accepted(&named), ["mps-gain:sc.y"]);
+    let sigma = |d: &Value, name: &Value| {
+        let mut all = d["upper_limits"].as_array().expect("limits").iter();
+        all.find(|l| l["coefficient"] == *name).and_then(|l| l["sigma"].as_f64())
+    };
+    let mut compared = 0;
+    // Forms are chosen beside what is named, and another form has another σ.
+    let limits = clean["upper_limits"].as_array().expect("limits").iter();
+    for limit in limits.filter(|l| l["shape"].as_object().is_none_or(serde_json::Map::is_empty)) {
+        let name = &limit["coefficient"];
+        let Some(beside) = sigma(&named, name) else { continue };
+        let alone = limit["sigma"].as_f64().expect("a number");
+        assert!(beside > 0.8 * alone, "{name}: {alone} alone, {beside} beside the gain");
+        compared += 1;
+    }
+    assert!(compared > 40, "{compared} effects are in both");
+}
+
 /// A gain of the torques of 5 %, of which a level of torque noise fitted before it absorbs most: the level is fitted
 /// beside it.
 #[test]

@@ -39,7 +39,9 @@ impl Gaps {
     fn of(responses: &Responses<'_>) -> Self {
         let series = responses.series.len();
         let acts = |i: usize| {
-            let own = responses.terms.iter().filter(move |t| t.coefficient == i && t.series >= responses.base);
+            // What follows from two coefficients at once lacks nothing that one of them does not.
+            let declared = responses.terms[..responses.declared].iter();
+            let own = declared.filter(move |t| t.coefficients[0] == i && t.series >= responses.base);
             own.map(|t| t.series).collect()
         };
         let candidates = responses.coefficients.iter().enumerate().filter(|(_, c)| c.candidate);
@@ -116,8 +118,7 @@ fn name_of(channel: &Column) -> &str {
 pub(super) struct Constant {
     /// Name of the constant.
     pub(super) power: String,
-    coefficient: Factor,
-    times: Option<Factor>,
+    coefficients: Vec<Factor>,
     amount: f64,
 }
 
@@ -143,15 +144,14 @@ impl Factor {
 impl Constant {
     /// What it is at some values of coefficients.
     pub(super) fn at(&self, values: &BTreeMap<String, f64>) -> f64 {
-        self.amount * self.coefficient.at(values) * self.times.as_ref().map_or(1.0, |t| t.at(values))
+        self.amount * self.coefficients.iter().map(|c| c.at(values)).product::<f64>()
     }
 }
 
 /// A response of a coefficient as the likelihood takes it.
 struct Term {
-    /// Its coefficient, and another that multiplies it.
-    coefficient: usize,
-    times: Option<usize>,
+    /// Its coefficient, and others that multiply it.
+    coefficients: Vec<usize>,
     channel: usize,
     series: usize,
     factor: f64,
@@ -172,6 +172,8 @@ struct Responses<'a> {
     /// Series of the model.
     base: usize,
     terms: Vec<Term>,
+    /// Terms that effects have declared; the others follow from them.
+    declared: usize,
 }
 
 impl<'a> Responses<'a> {
@@ -179,13 +181,16 @@ impl<'a> Responses<'a> {
         let channels: Vec<&Column> = available.of_kind("channel").collect();
         let names: Vec<String> = channels.iter().map(|c| name_of(c).to_owned()).collect();
         let coefficients: Vec<&Coefficient> = available.coefficients.iter().filter(|c| c.noise.is_empty()).collect();
-        let mut all = Self { channels, names, coefficients, series: Vec::new(), base: 0, terms: Vec::new() };
+        let mut all =
+            Self { channels, names, coefficients, series: Vec::new(), base: 0, terms: Vec::new(), declared: 0 };
         let mut responses = available.responses()?;
         // Stable: the model's series come first.
         responses.sort_by_key(|(c, _)| c.candidate);
         for (c, response) in responses {
             all.add(available, c, response);
         }
+        all.declared = all.terms.len();
+        all.couple();
         Ok(all)
     }
 
@@ -216,8 +221,7 @@ impl<'a> Responses<'a> {
             self.base = self.series.len();
         }
         self.terms.push(Term {
-            coefficient,
-            times: times.flatten(),
+            coefficients: std::iter::once(coefficient).chain(times.flatten()).collect(),
             channel,
             series,
             factor: response.factor,
@@ -225,6 +229,34 @@ impl<'a> Responses<'a> {
             unpredicted_slope,
             ahead,
         });
+    }
+
+    /// Adds what follows from two coefficients at once. A series that lacks a part of the acceleration in a channel
+    /// lacks that part of what other coefficients add to the channel too: an opening angle turns the whole acceleration,
+    /// with what an error of the thrusters' gain makes of it. Terms that an effect has declared itself are its own.
+    fn couple(&mut self) {
+        let lacking = self.terms.iter().filter(|t| t.coefficients.len() == 1);
+        let gains = lacking.flat_map(|t| t.unpredicted.iter().flatten().enumerate().map(move |gain| (t, gain)));
+        let declared: BTreeSet<_> = self.terms.iter().map(Term::place).collect();
+        let mut products: Vec<Term> = Vec::new();
+        for (t, (channel, gain)) in gains.filter(|(_, (_, gain))| **gain != 0.0) {
+            let acting = |u: &&Term| u.channel == channel && !u.coefficients.contains(&t.coefficients[0]);
+            for u in self.terms.iter().filter(acting) {
+                let product = Term {
+                    coefficients: t.coefficients.iter().chain(&u.coefficients).copied().collect(),
+                    channel: t.channel,
+                    series: u.series,
+                    factor: t.factor * gain * u.factor,
+                    unpredicted: u.unpredicted.clone(),
+                    unpredicted_slope: u.unpredicted_slope.clone(),
+                    ahead: t.ahead.iter().chain(&u.ahead).copied().collect(),
+                };
+                if !declared.contains(&product.place()) {
+                    products.push(product);
+                }
+            }
+        }
+        self.terms.extend(products);
     }
 
     /// Values of the coefficients at a point.
@@ -240,19 +272,15 @@ impl<'a> Responses<'a> {
     /// What a little of a coefficient adds to the channels.
     fn to(&self, i: usize, values: &[f64]) -> Vec<Response> {
         let response = |t: &Term| {
-            let scale = match t.times {
-                _ if t.coefficient == i => t.times.map_or(1.0, |other| values[other]),
-                Some(other) if other == i => values[t.coefficient],
-                _ => 0.0,
-            };
+            let scale = t.slope(i, values);
             (scale != 0.0).then_some((t.channel, t.series, t.factor * scale))
         };
         self.terms.iter().filter_map(response).collect()
     }
 
     /// Channels of whose innovations what a coefficient adds is not independent.
-    fn not_weighed(&self, i: usize) -> Vec<usize> {
-        let own = self.terms.iter().filter(|t| t.coefficient == i || t.times == Some(i));
+    fn not_weighed(&self, i: usize, values: &[f64]) -> Vec<usize> {
+        let own = self.terms.iter().filter(|t| t.slope(i, values) != 0.0);
         let channels: BTreeSet<usize> = own.flat_map(|t| t.ahead.iter().copied()).collect();
         channels.into_iter().collect()
     }
@@ -275,8 +303,20 @@ impl<'a> Responses<'a> {
 }
 
 impl Term {
+    /// Product of the values of its coefficients.
     fn scale(&self, values: &[f64]) -> f64 {
-        values[self.coefficient] * self.times.map_or(1.0, |other| values[other])
+        self.coefficients.iter().map(|i| values[*i]).product()
+    }
+
+    /// Derivative of that product by one of them; zero by any other.
+    fn slope(&self, by: usize, values: &[f64]) -> f64 {
+        let others = self.coefficients.iter().filter(|i| **i != by).map(|i| values[*i]);
+        if self.coefficients.contains(&by) { others.product() } else { 0.0 }
+    }
+
+    /// Its channel, and the coefficients in proportion to which it acts.
+    fn place(&self) -> (usize, BTreeSet<usize>) {
+        (self.channel, self.coefficients.iter().copied().collect())
     }
 }
 
@@ -316,7 +356,7 @@ impl<'a> NoiseAt<'a> {
     fn by_coefficient(&self, i: usize) -> Option<Change> {
         let lacks = |t: &&Term| t.unpredicted.is_some() || t.unpredicted_slope.is_some();
         let mut acting = self.responses.terms.iter().filter(lacks);
-        if !self.filters.contains(&i) && !acting.any(|t| t.coefficient == i || t.times == Some(i)) {
+        if !self.filters.contains(&i) && !acting.any(|t| t.coefficients.contains(&i)) {
             return None;
         }
         let half = DIFFERENCE * reach(self.responses.coefficients[i]);
@@ -387,7 +427,7 @@ impl Filtered {
             let own = responses.to(i, &noise.values);
             if !own.is_empty() || change.is_some() {
                 let meaning = Meaning::Coefficient(Box::new((*c).clone()));
-                let not_weighed = responses.not_weighed(i);
+                let not_weighed = responses.not_weighed(i, &noise.values);
                 unknowns.push((c.name.clone(), meaning, Parameter { responses: own, change, not_weighed }));
             }
         }
@@ -403,8 +443,7 @@ impl Filtered {
         let constant_of = |channel: usize| format!("{} day^0 of product {number}", responses.names[channel]);
         let constant = |t: &Term| Constant {
             power: constant_of(t.channel),
-            coefficient: Factor::of(responses.coefficients[t.coefficient]),
-            times: t.times.map(|other| Factor::of(responses.coefficients[other])),
+            coefficients: t.coefficients.iter().map(|i| Factor::of(responses.coefficients[*i])).collect(),
             amount: t.factor * centres[t.series] / noise.system.unit[t.channel],
         };
         let constants: Vec<Constant> = responses.terms.iter().map(constant).collect();
@@ -441,7 +480,7 @@ impl Filtered {
         });
         let innovations = if data { innovations } else { innovations.without_data() };
         let acting = |i: usize| {
-            let own = responses.terms.iter().filter(move |t| t.coefficient == i);
+            let own = responses.terms.iter().filter(move |t| t.coefficients[0] == i);
             own.map(|t| responses.names[t.channel].clone()).collect()
         };
         let named = responses.coefficients.iter().enumerate();
