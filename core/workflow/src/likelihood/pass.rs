@@ -232,8 +232,9 @@ impl<'a> Responses<'a> {
     }
 
     /// Adds what follows from two coefficients at once. A series that lacks a part of the acceleration in a channel
-    /// lacks that part of what other coefficients add to the channel too: an opening angle turns the whole acceleration,
-    /// with what an error of the thrusters' gain makes of it. Terms that an effect has declared itself are its own.
+    /// lacks that part of what other coefficients add to the channel too: an opening angle turns the whole
+    /// acceleration, with what an error of the thrusters' gain makes of it. Terms that an effect has declared itself
+    /// are its own.
     fn couple(&mut self) {
         let lacking = self.terms.iter().filter(|t| t.coefficients.len() == 1);
         let gains = lacking.flat_map(|t| t.unpredicted.iter().flatten().enumerate().map(move |gain| (t, gain)));
