@@ -445,8 +445,8 @@ fn a_driven_force_on_the_spacecraft_is_told_as_one() {
     assert!(told && pull.abs() < 4.0, "{pull} {found:#}");
 }
 
-/// Fall of χ² on the six later hours by an effect whose size is fitted to the six earlier ones; `model` is a copy of the
-/// model without it.
+/// Fall of χ² on the six later hours by an effect whose size is fitted to the six earlier ones; `model` is a copy of
+/// the model without it.
 fn held_out_fall(folder: &Path, model: &str, add: &[&str]) -> f64 {
     let split = "2035-03-07T09:20:00Z";
     let command = |arguments: &[&str]| {
@@ -478,8 +478,8 @@ fn held_out_fall(folder: &Path, model: &str, add: &[&str]) -> f64 {
 }
 
 /// A gain of the thrusters along z that follows the temperature of the panel: the formula is the product of the two,
-/// not a force that follows the temperature, with its size within 4σ (false alarm 6e-5). On six later hours it lowers χ² to within 10 % of
-/// the model that knew. The twin, the temperature alone, does not.
+/// not a force that follows the temperature, with its size within 4σ (false alarm 6e-5). On six later hours it lowers
+/// χ² to within 10 % of the model that knew. The twin, the temperature alone, does not.
 #[test]
 fn a_gain_that_follows_housekeeping_is_told_as_a_product_with_the_command() {
     let gain = Gain { test_mass: None, axis: 2, per_k: 0.2 };

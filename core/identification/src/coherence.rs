@@ -764,8 +764,8 @@ mod tests {
         (sum(|p| p.along) / sum(|p| p.squared), sum(|p| p.along).powi(2) / sum(|p| p.squared))
     }
 
-    /// A force on the spacecraft enters two channels. At the place of the spacecraft it has its amplitude within 4.4σ of
-    /// 0.08 (false alarm 1e-5), and more of it is told there than at either channel.
+    /// A force on the spacecraft enters two channels. At the place of the spacecraft it has its amplitude within 4.4σ
+    /// of 0.08 (false alarm 1e-5), and more of it is told there than at either channel.
     #[test]
     fn a_force_on_the_spacecraft_is_told_at_its_place() {
         let (coherence, _) = segments_with(11, Vec::new(), |channels, housekeeping| {
@@ -778,8 +778,8 @@ mod tests {
         assert!(at(CHANNELS).1 > at(0).1 && at(0).1 > at(1).1, "{:?}", [at(CHANNELS), at(0), at(1)]);
     }
 
-    /// A gain that follows a slow wave of the last of housekeeping, a command: the product has its amplitude, within 4.4σ
-    /// of 0.08 over the wave's rms of 0.7, doubled for what its factors take. A constant gain of the same command is no
+    /// A gain that follows a slow wave of the last of housekeeping, a command: the product has its amplitude, within
+    /// 4.4σ of 0.08 over the wave's rms of 0.7, doubled for what its factors take. A constant gain of the same command is no
     /// such product, nor is a force by the wave itself: 19.5 of a χ² of one degree of freedom (false alarm 1e-5). A
     /// command acts where its frame is.
     #[test]

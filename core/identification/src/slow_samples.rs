@@ -3,8 +3,8 @@
 //! A slow cause shows most below the lowest frequency of the segments of [`crate::gram`], where heat, currents and what
 //! they heat change from hour to hour. Here all of it is kept as samples a hundred seconds apart. A channel is taken
 //! given the others, `y = gᵀ r` with `g = Σ⁻¹ e_c / (Σ⁻¹)_cc`: the thrusters' noise, which moves all test masses, is
-//! gone from it, and a force along the channel is not. Of a force that enters the channels along another direction d it is
-//! `g = Σ⁻¹ d / (dᵀΣ⁻¹d)`. With the covariance of its declared noise the amplitude of a
+//! gone from it, and a force along the channel is not. Of a force that enters the channels along another direction d
+//! it is `g = Σ⁻¹ d / (dᵀΣ⁻¹d)`. With the covariance of its declared noise the amplitude of a
 //! series is that of generalised least squares beside powers of time. Gaps separate stretches, which are taken as
 //! independent.
 
@@ -190,8 +190,8 @@ impl SlowSamples {
         (thin, vec![self.step_s, step_s])
     }
 
-    /// A force that enters the channels along a direction, given what else is in them, whitened; none where the noise is
-    /// unknown or there are too few samples.
+    /// A force that enters the channels along a direction, given what else is in them, whitened; none where the noise
+    /// is unknown or there are too few samples.
     pub(crate) fn whitened(&self, along: &DVector<f64>, noise: &NoiseModel, means_s: &[f64]) -> Option<Whitened> {
         let longest = self.products.iter().flatten().map(Stretch::len).max()?;
         // The combination that is quietest in the middle of the frequencies, in their logarithm.

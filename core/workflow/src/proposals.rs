@@ -10,19 +10,17 @@ use dragfree_identification::record::Record;
 
 use crate::WorkflowError;
 use crate::replay::Replay;
+use crate::sums::ACTS_ON;
 
 /// The effect that states them.
 pub(crate) const FORMULA: &str = "formula";
-
-/// Its parameter that says where it acts.
-pub(crate) const ACTS_ON: &str = "acts_on";
 
 /// Root mean square of the largest acceleration of a test mass for which a formula may stand, m s⁻²: that of `thermal`
 /// at the end of its range where a temperature difference varies by 10 mK.
 const MOST_M_S2: f64 = 1e-11;
 
-/// The same of a force on the spacecraft, N, and of a torque, N m: micronewtons, as of gas that leaks or a thruster whose
-/// valve follows the temperature, at arms of a metre.
+/// The same of a force on the spacecraft, N, and of a torque, N m: micronewtons, as of gas that leaks or a valve that
+/// follows the temperature, at arms of a metre.
 const MOST_N: f64 = 3e-6;
 
 /// The same of the change of an actuator's gain: that of the gains in the library.
@@ -113,7 +111,7 @@ fn proposal(record: &Record, driven: &Driven, place: &str, instance: &str) -> Op
     let (rms, rms_of_factor) = (slow.rms(driver, memory, housekeeping), slow.rms_of_factor(driver, housekeeping));
     let (acts_on, of, most, rms) = match (slow.unit_of_known(driver), on_test_mass) {
         // A gain, of which the factor alone changes.
-        (Some("N"), true) => (place.replace(".accel.", ".force."), "N", MOST_GAIN, rms_of_factor),
+        (Some("N"), true) => (place.replace("accel", "force"), "N", MOST_GAIN, rms_of_factor),
         (Some("N" | "N m"), false) => (place.to_owned(), unit_at(place), MOST_GAIN, rms_of_factor),
         (_, true) => (place.to_owned(), "m s-2", MOST_M_S2, rms),
         (_, false) => (place.to_owned(), unit_at(place), MOST_N, rms),

@@ -26,10 +26,12 @@ use dragfree_schema::{Available, Coefficient, Column, Constraint, NoiseProcess, 
 use nalgebra::{DMatrix, DVector};
 
 use crate::WorkflowError;
-use crate::proposals::ACTS_ON;
 
 /// How often Σ is measured from the residuals of the reference.
 const REFINEMENTS: usize = 3;
+
+/// Shape parameter of a probe: where it acts.
+pub(crate) const ACTS_ON: &str = "acts_on";
 
 /// Frame of forces and torques on the spacecraft.
 const SPACECRAFT_FRAME: &str = "SRF";
