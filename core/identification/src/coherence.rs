@@ -779,9 +779,9 @@ mod tests {
     }
 
     /// A gain that follows a slow wave of the last of housekeeping, a command: the product has its amplitude, within
-    /// 4.4σ of 0.08 over the wave's rms of 0.7, doubled for what its factors take. A constant gain of the same command is no
-    /// such product, nor is a force by the wave itself: 19.5 of a χ² of one degree of freedom (false alarm 1e-5). A
-    /// command acts where its frame is.
+    /// 4.4σ of 0.08 over the wave's rms of 0.7, doubled for what its factors take. A constant gain of the same command
+    /// is no such product, nor is a force by the wave itself: 19.5 of a χ² of one degree of freedom (false alarm 1e-5).
+    /// A command acts where its frame is.
     #[test]
     fn a_gain_that_follows_housekeeping_is_told_from_its_factors() {
         let known = NAMES - 1;
