@@ -24,8 +24,8 @@ use crate::WorkflowError;
 use crate::answer::{Evidence, apart, contradict, found, limits, noise_levels, verdict, with_levels};
 use crate::extract::Extract;
 use crate::likelihood::{Decided, PASSES, Point, Settled, moved, one_pass, step, step_of_model};
-use crate::proposals::{FORMULA, Proposal, proposals};
-use crate::replay::{FINE, Pass, Replay, What, sum};
+use crate::proposals::{FORMULA, Proposal, probes, proposals};
+use crate::replay::{FINE, Forms, Pass, Replay, What, sum};
 
 /// A diagnosis and the sums that chose the forms of the candidates.
 pub struct Diagnosed {
@@ -58,10 +58,11 @@ pub fn diagnose(
     let of_lines: Vec<EffectEntry> = lines.found.iter().map(entry_of).collect();
     let detected: Vec<Detection> =
         found.certain(settings.transient_p_value).take(settings.max_transients).cloned().collect();
-    let mut gather = |requests: &[RefinementRequest], proposals: &[Proposal]| {
+    let mut gather = |requests: &[RefinementRequest], proposals: &[Proposal], probes: &[EffectEntry]| {
         let proposed = proposals.iter().map(|p| p.entry.clone());
-        let entries: Vec<EffectEntry> = of_lines.iter().cloned().chain(proposed).collect();
-        let mut record = sum(replay, settings, What::Candidates(&detected, requests, &entries), progress)?;
+        let chosen: Vec<EffectEntry> = of_lines.iter().cloned().chain(proposed).collect();
+        let forms = Forms { detected: &detected, requests, chosen: &chosen, probes };
+        let mut record = sum(replay, settings, What::Candidates(&forms), progress)?;
         record.gathered.transients = found.clone();
         record.gathered.lines = lines.clone();
         let noise = record.noise_model()?;
@@ -71,7 +72,7 @@ pub fn diagnose(
         };
         Ok::<_, WorkflowError>((record, noise, screened))
     };
-    let (mut record, mut noise, mut screened) = gather(&[], &[])?;
+    let (mut record, mut noise, mut screened) = gather(&[], &[], &probes(replay.registry))?;
     let mut tried = screened.tried.clone();
     let mut requests = screened.requests.clone();
     requests.retain(|request| has_parameter(replay.registry, &request.effect, FINE));
@@ -80,7 +81,7 @@ pub fn diagnose(
         tried.retain(|effect, _| requests.iter().any(|request| request.effect == *effect));
         // Sums are large, and these are made again.
         drop(record);
-        (record, noise, screened) = gather(&requests, &proposals)?;
+        (record, noise, screened) = gather(&requests, &proposals, &[])?;
         for (effect, forms) in &screened.tried {
             *tried.entry(effect.clone()).or_default() += forms;
         }
