@@ -3,12 +3,21 @@
 //! The rate of a parameter needs no series of its own: what it adds in a block of time is what the parameter adds, times
 //! the time ([`Moments`]). A coefficient that is neither in the model nor named is tried with its value beside its rate.
 
+use dragfree_engine::examine::FREQUENCY_HZ;
 use dragfree_identification::diagnosis::{DRIFT, Drift};
 use dragfree_identification::innovations::decision::{Candidate, Fitted, Quadratic};
 use dragfree_identification::innovations::filter::DAY_NS;
-use dragfree_schema::Settings;
+use dragfree_schema::{Coefficient, Settings};
 
 use super::{Decided, Judge, Meaning, no_sums};
+use crate::proposals::FORMULA;
+use crate::replay::AT_NS;
+
+/// Whether a candidate's time, frequency or formula was chosen by these data: its rate has as many trials as that search,
+/// and one that acts once has no rate.
+fn searched(c: &Coefficient) -> bool {
+    c.effect == FORMULA || [AT_NS, FREQUENCY_HZ].iter().any(|name| c.shape.contains_key(*name))
+}
 
 /// A parameter with a rate.
 struct Changing {
@@ -69,8 +78,7 @@ impl Decided {
     fn changing(&self, chosen: &[usize]) -> Vec<Changing> {
         let place = |i: usize| self.candidates.iter().position(|place| place.parameters.contains(&i));
         let of = |i: usize| match &self.parameters[i].1 {
-            // What acts once has no rate.
-            Meaning::Coefficient(c) if c.shape.contains_key(crate::replay::AT_NS) => None,
+            Meaning::Coefficient(c) if c.candidate && searched(c) => None,
             Meaning::Coefficient(_) => {
                 let with_value = place(i).is_some_and(|place| !chosen.contains(&place));
                 Some(Changing { parameter: i, with_value })
