@@ -208,8 +208,8 @@ fn a_glitch_in_the_last_hour_is_detected() {
     assert!(seen["significance"].as_f64().is_some_and(|sigmas| sigmas > 8.0), "{seen:#}");
 }
 
-/// Near the ends of two hours: each named alone, with its momentum within 4σ (false alarm 6e-5). A hit has its time to a
-/// sample; a push of a test mass, a difference of exponentials of 10 and 2 s, has its mean time to 15 s.
+/// Near the ends of two hours: each named alone, with its momentum within 4σ (false alarm 6e-5). A hit has its time to
+/// a sample; a push of a test mass, a difference of exponentials of 10 and 2 s, has its mean time to 15 s.
 #[test]
 fn transients_near_the_ends_are_named_with_time_and_size() {
     for (name, seed, momentum, at_s, more, mean_s, within_s) in [

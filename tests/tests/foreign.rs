@@ -298,8 +298,8 @@ fn a_cause_that_is_not_the_same_every_day_is_told() {
     }
 }
 
-/// A thruster gain from −0.2 to 0.2 in the six hours, none on average: told with its rate within 4σ (6e-5), and the model
-/// is not called sufficient.
+/// A thruster gain from −0.2 to 0.2 in the six hours, none on average: told with its rate within 4σ (6e-5), and the
+/// model is not called sufficient.
 #[test]
 fn another_producers_drifting_gain_is_told_with_its_rate() {
     let hidden = Hidden { thrust_gain: [0.0, -0.2, 0.0], thrust_gain_per_day: [0.0, 1.6, 0.0], ..Hidden::NONE };

@@ -415,8 +415,8 @@ impl Quadratic {
         &self.candidates
     }
 
-    /// Values and σ of all parameters if `others` may act beside a set, each with what is known of it before any data: that
-    /// and the data limit what they can be. Ranges of the set are left aside. Zero for parameters of neither.
+    /// Values and σ of all parameters if `others` may act beside a set, each with what is known of it before any data:
+    /// that and the data limit what they can be. Ranges of the set are left aside. Zero for parameters of neither.
     pub fn solution_with(&self, set: &[usize], others: &[usize]) -> (DVector<f64>, DVector<f64>) {
         let mut information = self.information.clone();
         for c in others {

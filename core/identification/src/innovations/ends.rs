@@ -1,10 +1,10 @@
 //! Detection of transients near the ends of the data and of gaps: matched filters on the innovations.
 //!
-//! The spectra of [`crate::transient`] taper the ends of the data, so that a transient there is lost or has a wrong time.
-//! The innovations need no taper: they are white, and what a transient that begins at `t` adds to them is one response
-//! `h`, shifted. With innovations e up to the last one, `n(t) = Σ_s h(s)·e(t + s)` has the variance `D(t) = Σ_s h²(s)`,
-//! both over the samples that there are, and `n/√D` is the significance. Constants and starts have been fitted before,
-//! and their score is zero: they only lower D, so the significance is never too high on their account.
+//! The spectra of [`crate::transient`] taper the ends of the data, so that a transient there is lost or has a wrong
+//! time. The innovations need no taper: they are white, and what a transient that begins at `t` adds to them is one
+//! response `h`, shifted. With innovations e up to the last one, `n(t) = Σ_s h(s)·e(t + s)` has the variance `D(t) =
+//! Σ_s h²(s)`, both over the samples that there are, and `n/√D` is the significance. Constants and starts have been
+//! fitted before, and their score is zero: they only lower D, so the significance is never too high on their account.
 
 use std::f64::consts::TAU;
 use std::ops::Range;

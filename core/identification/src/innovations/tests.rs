@@ -890,9 +890,9 @@ fn transients_near_both_ends_are_found_at_their_times() {
     assert!(found(samples / 2, size).is_empty());
 }
 
-/// Errors of an offset, where another effect acts beside it with a size from what is known of it. Of 4000 draws the mean
-/// square over what is expected, of the value where the effect may act and of the value where it is taken to be absent,
-/// is one within 4σ (6e-5); over the variance where it is taken to be absent it is far above one.
+/// Errors of an offset, where another effect acts beside it with a size from what is known of it. Of 4000 draws the
+/// mean square over what is expected, of the value where the effect may act and of the value where it is taken to be
+/// absent, is one within 4σ (6e-5); over the variance where it is taken to be absent it is far above one.
 #[test]
 fn an_offset_has_the_errors_that_an_undetected_effect_makes() {
     let information = DMatrix::from_row_slice(2, 2, &[4.0, 5.0, 5.0, 9.0]);

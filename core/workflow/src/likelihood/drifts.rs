@@ -1,7 +1,8 @@
 //! Coefficients and levels of noise that change through the data at a constant rate.
 //!
-//! The rate of a parameter needs no series of its own: what it adds in a block of time is what the parameter adds, times
-//! the time ([`Moments`]). A coefficient that is neither in the model nor named is tried with its value beside its rate.
+//! The rate of a parameter needs no series of its own: what it adds in a block of time is what the parameter adds,
+//! times the time ([`Moments`]). A coefficient that is neither in the model nor named is tried with its value beside
+//! its rate.
 
 use dragfree_engine::examine::FREQUENCY_HZ;
 use dragfree_identification::diagnosis::{DRIFT, Drift};
@@ -13,8 +14,8 @@ use super::{Decided, Judge, Meaning, no_sums};
 use crate::proposals::FORMULA;
 use crate::replay::AT_NS;
 
-/// Whether a candidate's time, frequency or formula was chosen by these data: its rate has as many trials as that search,
-/// and one that acts once has no rate.
+/// Whether a candidate's time, frequency or formula was chosen by these data: its rate has as many trials as that
+/// search, and one that acts once has no rate.
 fn searched(c: &Coefficient) -> bool {
     c.effect == FORMULA || [AT_NS, FREQUENCY_HZ].iter().any(|name| c.shape.contains_key(*name))
 }
