@@ -466,7 +466,8 @@ impl Simulator {
 
     /// True loads over the next sample.
     fn loads(&mut self, command: &Command) -> Loads {
-        let mut acting = self.effects.act(command);
+        let elapsed_s = self.index as f64 * self.dt_s;
+        let mut acting = self.effects.act(elapsed_s, command);
         if let Some(thrusters) = &mut self.thrusters {
             (acting.mps_force_srf_n, acting.mps_torque_srf_nm) =
                 thrusters.act(&acting.mps_force_srf_n, &acting.mps_torque_srf_nm);
@@ -476,7 +477,6 @@ impl Simulator {
             torque_srf_nm: acting.mps_torque_srf_nm,
             ..Loads::zero(self.plant.tm.len())
         };
-        let elapsed_s = self.index as f64 * self.dt_s;
         for ((load, acting), own) in loads.tm.iter_mut().zip(&acting.tm).zip(&self.self_gravity) {
             load.force_orf_n = acting.force_orf_n;
             load.torque_orf_nm = acting.torque_orf_nm;

@@ -233,6 +233,41 @@ fn a_glitch_in_the_last_hour_is_detected() {
     assert!(seen["significance"].as_f64().is_some_and(|sigmas| sigmas > 8.0), "{seen:#}");
 }
 
+/// Near the ends of two hours: each named alone, with its momentum within 4σ (false alarm 6e-5). A hit has its time to
+/// a sample; a push of a test mass, a difference of exponentials of 10 and 2 s, has its mean time to 15 s.
+#[test]
+fn transients_near_the_ends_are_named_with_time_and_size() {
+    for (name, seed, momentum, at_s, more, mean_s, within_s) in [
+        ("impulse:tm2.x", "500", 2e-10, 300.0, ",decay_s=10,rise_s=2", 312.0, 15.0),
+        ("impulse:sc.y", "10980", 8e-6, 7180.0, "", 7180.0, 0.11),
+    ] {
+        let effect = format!("{name}={momentum},at_s={at_s}{more}");
+        let d = diagnosis(&["--hours", "2", "--seed", seed, "--effect", &effect]);
+        assert_eq!(accepted(&d), [name], "{:#} {}", d["candidates"][0], d["reasons"]);
+        let first = &d["candidates"][0];
+        let (value, sigma) = (first["value"].as_f64().expect("a value"), first["sigma"].as_f64().expect("a sigma"));
+        assert!((value - momentum).abs() < 4.0 * sigma && sigma < 0.1 * momentum, "{value} ± {sigma}");
+        let shape = |key: &str| first["shape"][key].as_f64().unwrap_or(0.0);
+        let found_s = first["shape"]["at_ns"].as_i64().expect("a time") as f64 * 1e-9 % 86_400.0;
+        let found_s = found_s + shape("decay_s") + shape("rise_s");
+        assert!((found_s - mean_s).abs() < within_s, "{found_s} and not {mean_s}");
+    }
+}
+
+/// A thruster gain from −0.2 to 0.2 in four hours, none on average: told with its rate within 4σ (false alarm 6e-5),
+/// and the model is not called sufficient. One that is the same throughout is not told to change (1 %).
+#[test]
+fn a_gain_that_drifts_is_told_with_its_rate() {
+    let d = diagnosis(&["--hours", "4", "--seed", "506", "--effect", "mps-gain:sc.y=-0.2,per_day=2.4"]);
+    assert_ne!(d["verdict"], "sufficient");
+    let drift = &d["drifts"][0];
+    assert!(d["reasons"].to_string().contains("is not the same through the data"), "{:#}", d["reasons"]);
+    let [rate, sigma] = ["per_day", "sigma_per_day"].map(|key| drift[key].as_f64().expect("a number"));
+    assert!(drift["coefficient"] == "mps-gain.sc.y" && (rate - 2.4).abs() < 4.0 * sigma && sigma < 0.5, "{drift:#}");
+    let d = diagnosis(&["--hours", "4", "--seed", "507", "--effect", "mps-gain:sc.y=0.2"]);
+    assert_eq!((accepted(&d), &d["drifts"]), (vec!["mps-gain:sc.y".to_owned()], &serde_json::json!([])));
+}
+
 /// Propellant slosh: instance, shape and size, and nothing else. Without its colouring in Σ the estimate is biased and
 /// a thruster gain appears.
 #[test]

@@ -298,6 +298,19 @@ fn a_cause_that_is_not_the_same_every_day_is_told() {
     }
 }
 
+/// A thruster gain from −0.2 to 0.2 in the six hours, none on average: told with its rate within 4σ (6e-5), and the
+/// model is not called sufficient.
+#[test]
+fn another_producers_drifting_gain_is_told_with_its_rate() {
+    let hidden = Hidden { thrust_gain: [0.0, -0.2, 0.0], thrust_gain_per_day: [0.0, 1.6, 0.0], ..Hidden::NONE };
+    let d = diagnosed(hidden);
+    assert_ne!(d["verdict"], "sufficient", "{:#}", d["drifts"]);
+    let drift = &d["drifts"][0];
+    let [rate, sigma] = ["per_day", "sigma_per_day"].map(|key| drift[key].as_f64().expect("a number"));
+    assert!(drift["coefficient"] == "mps-gain.sc.y" && (rate - 1.6).abs() < 4.0 * sigma, "{drift:#}");
+    assert!(sigma < 0.4, "{drift:#}");
+}
+
 /// A readout scale of 1.1: accepted, or listed as a confounder of the electrode gain along the same axis.
 #[test]
 fn another_producers_readout_scale_is_found_or_listed_as_a_confounder() {

@@ -188,6 +188,45 @@ pub struct Unexplained {
     pub coherences: Vec<Coherence>,
 }
 
+/// A coefficient, or a level of noise, that changes through the data.
+#[derive(Clone, Debug, Serialize)]
+pub struct Drift {
+    /// Coefficient, or component of the noise.
+    pub coefficient: String,
+    /// Unit of it; 1 for a level, as a factor.
+    pub unit: String,
+    /// Value at the first sample, if it changes at a constant rate.
+    pub at_start: f64,
+    /// The same at the last sample.
+    pub at_end: f64,
+    /// Change per day; of a level that of its logarithm.
+    pub per_day: f64,
+    /// σ of it.
+    pub sigma_per_day: f64,
+    /// Fall of χ².
+    pub delta_chi2: f64,
+    /// p-value, corrected for all coefficients and levels that were tried.
+    pub p_value: f64,
+    /// Others whose change explains as much.
+    pub confounders: Vec<String>,
+}
+
+/// An offset of the model beside what is named.
+#[derive(Clone, Debug, Serialize)]
+pub struct Offset {
+    /// Coefficient.
+    pub coefficient: String,
+    /// Value, m.
+    pub value_m: f64,
+    /// σ if nothing acts but the model and what is named, m.
+    pub sigma_m: f64,
+    /// σ if every lasting effect that is installed may act with what is known of it before any data, as far as these
+    /// data allow, m.
+    pub sigma_with_undetected_m: f64,
+    /// The effect that by itself raises σ most; none where no other is installed.
+    pub most_from: Option<String>,
+}
+
 /// A level of noise other than declared.
 #[derive(Clone, Debug, Serialize)]
 pub struct OtherLevel {
@@ -208,8 +247,8 @@ pub struct Diagnosis {
     pub verdict: String,
     /// False-alarm rate.
     pub false_alarm_rate: f64,
-    /// Forms and levels of effects that were tried; besides, transients were tried at every time and lines at every
-    /// frequency.
+    /// Forms and levels of effects that were tried; besides, transients were tried at every time, lines at every
+    /// frequency, and a drift of every coefficient.
     pub tried: usize,
     /// Candidates, the accepted ones first, then the best of the rest.
     pub candidates: Vec<Found>,
@@ -219,6 +258,10 @@ pub struct Diagnosis {
     pub unexplained: Option<Unexplained>,
     /// Formulas that would explain it, as a model states them.
     pub formulas: Vec<Found>,
+    /// Coefficients and levels that are not the same through the data.
+    pub drifts: Vec<Drift>,
+    /// Offsets of the model.
+    pub offsets: Vec<Offset>,
     /// Whether several products agree beside what is named, in all coefficients at once; none of one product.
     pub agreement: Option<Constancy>,
     /// Why the model is not called sufficient although neither a candidate was accepted nor an excess was found.
@@ -249,6 +292,12 @@ pub const TRANSIENT: &str = "transient search";
 /// The family of all lines.
 pub const LINE: &str = "line search";
 
+/// The family of all coefficients and levels that may change at a constant rate.
+pub const DRIFT: &str = "drift";
+
+/// Families that search without forms.
+const SEARCHES: [&str; 3] = [TRANSIENT, LINE, DRIFT];
+
 /// Family whose part of the false-alarm rate a candidate uses.
 pub(crate) fn family(c: &Candidate) -> &str {
     if c.transient { TRANSIENT } else { &c.effect }
@@ -269,6 +318,8 @@ impl Trials {
         if lines > 0.0 {
             forms.insert(LINE.to_owned(), lines);
         }
+        // A coefficient that states a level stands for the component of the noise.
+        forms.insert(DRIFT.to_owned(), scorer.candidate_set.coefficients.len() as f64);
         Self { forms }
     }
 
@@ -282,11 +333,8 @@ impl Trials {
 
     /// Forms and levels of all effects.
     pub fn total(&self) -> usize {
-        self.forms
-            .iter()
-            .filter(|(family, _)| ![TRANSIENT, LINE].contains(&family.as_str()))
-            .map(|(_, n)| n)
-            .sum::<f64>() as usize
+        self.forms.iter().filter(|(family, _)| !SEARCHES.contains(&family.as_str())).map(|(_, n)| n).sum::<f64>()
+            as usize
     }
 
     /// Trials of a family, one at least.

@@ -25,19 +25,19 @@ use serde_json::{Map, Value};
 use crate::distributions::normal_tails;
 
 /// Peaks of a lower significance are not kept.
-const LEAST: f64 = 5.0;
+pub(crate) const LEAST: f64 = 5.0;
 
 /// Level u, σ, at which trials are counted: about that of the weakest certain peak. Noise behind a filter whose power
 /// has the mean squared frequency ν² crosses u upwards `ν T e^{−u²/2}` times in T (Rice, Bell Syst. Tech. J. 24, 46):
 /// as often as `√(2π) u ν T` independent normal numbers exceed it.
-const LOUD: f64 = 6.0;
+pub(crate) const LOUD: f64 = 6.0;
 
 /// Times where the taper leaves less than this part of the noise's power are skipped: other causes could not be told
 /// apart there.
 const LEAST_VARIANCE: f64 = 0.1;
 
 /// Median of the size of a standard normal number.
-const MEDIAN: f64 = 0.674_49;
+pub(crate) const MEDIAN: f64 = 0.674_49;
 
 /// Peaks nearer than this to a higher one are part of it, s: in short segments, and in long ones, where a filter of the
 /// information below 2 mHz rings for half an hour on either side. A second, smaller event within it is not detected.
@@ -65,6 +65,23 @@ pub struct Template {
     pub channels: Vec<(usize, f64, bool)>,
 }
 
+impl Template {
+    /// Its detection at a time.
+    pub(crate) fn at(&self, at_ns: i64, significance: f64) -> Detection {
+        let mut shape = self.shape.clone();
+        shape.insert("at_ns".to_owned(), at_ns.into());
+        Detection {
+            effect: self.effect.clone(),
+            instance: self.instance.clone(),
+            coefficient: self.coefficient.clone(),
+            unit: self.unit.clone(),
+            shape,
+            at_ns,
+            significance,
+        }
+    }
+}
+
 /// A template that was detected.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Detection {
@@ -84,6 +101,23 @@ pub struct Detection {
     pub significance: f64,
 }
 
+impl Detection {
+    /// The same at a later time.
+    pub fn moved(&self, by_ns: i64) -> Self {
+        let at_ns = self.at_ns + by_ns;
+        let mut moved = Self { at_ns, ..self.clone() };
+        moved.shape.insert("at_ns".to_owned(), at_ns.into());
+        moved
+    }
+
+    /// The same with other shape parameters.
+    pub fn of_course(&self, shape: &Map<String, Value>) -> Self {
+        let mut other = self.clone();
+        other.shape.extend(shape.clone());
+        other
+    }
+}
+
 /// All detections.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Transients {
@@ -96,7 +130,12 @@ pub struct Transients {
 impl Transients {
     /// Peaks whose p-value over the whole search is below `chance`.
     pub fn certain(&self, chance: f64) -> impl Iterator<Item = &Detection> {
-        self.detections.iter().filter(move |h| normal_tails(h.significance) * self.tried < chance)
+        self.detections.iter().filter(move |h| self.p_value(h) < chance)
+    }
+
+    /// p-value of a peak over the whole search, without an upper end.
+    pub fn p_value(&self, detection: &Detection) -> f64 {
+        normal_tails(detection.significance) * self.tried
     }
 
     /// Adds the peaks of other data.
@@ -192,8 +231,7 @@ impl Search {
     }
 
     fn prepare(&self, plan: &Plan, n: usize) -> Prepared {
-        let mut planner = RealFftPlanner::<f64>::new();
-        let fft = Transforms { forward: planner.plan_fft_forward(n), inverse: planner.plan_fft_inverse(n) };
+        let fft = Transforms::new(n);
         let mean: Vec<Complex64> =
             (0..=n / 2).map(|k| 0.5 * (1.0 + Complex64::from_polar(1.0, TAU * k as f64 / n as f64))).collect();
         // `Σ⁻¹ = L Lᵀ`: `Lᵀ T` is the template in white noise.
@@ -364,13 +402,18 @@ struct MatchedFilterOutput {
 }
 
 /// Transforms of one length.
-struct Transforms {
+pub(crate) struct Transforms {
     forward: Arc<dyn RealToComplex<f64>>,
     inverse: Arc<dyn ComplexToReal<f64>>,
 }
 
 impl Transforms {
-    fn spectrum(&self, mut samples: Vec<f64>) -> Vec<Complex64> {
+    pub(crate) fn new(n: usize) -> Self {
+        let mut planner = RealFftPlanner::<f64>::new();
+        Self { forward: planner.plan_fft_forward(n), inverse: planner.plan_fft_inverse(n) }
+    }
+
+    pub(crate) fn spectrum(&self, mut samples: Vec<f64>) -> Vec<Complex64> {
         let mut spectrum = self.forward.make_output_vec();
         // The length is that of the plan of the transform, the only thing that it refuses.
         let done = self.forward.process(&mut samples, &mut spectrum);
@@ -379,7 +422,7 @@ impl Transforms {
     }
 
     /// Without the factor of one over the length.
-    fn samples(&self, mut spectrum: Vec<Complex64>) -> Vec<f64> {
+    pub(crate) fn samples(&self, mut spectrum: Vec<Complex64>) -> Vec<f64> {
         // What belongs to no pair of frequencies is real.
         for end in [0, spectrum.len() - 1] {
             spectrum[end].im = 0.0;
@@ -400,19 +443,8 @@ fn keep(detections: &mut Vec<Detection>, template: &Template, near_s: f64, at_ns
         return;
     }
     detections.retain(|h| !near(h));
-    let mut shape = template.shape.clone();
-    shape.insert("at_ns".to_owned(), at_ns.into());
-    let detection = Detection {
-        effect: template.effect.clone(),
-        instance: template.instance.clone(),
-        coefficient: template.coefficient.clone(),
-        unit: template.unit.clone(),
-        shape,
-        at_ns,
-        significance,
-    };
     let place = detections.partition_point(|h| h.significance >= significance);
-    detections.insert(place, detection);
+    detections.insert(place, template.at(at_ns, significance));
     detections.truncate(MOST);
 }
 

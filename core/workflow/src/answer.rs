@@ -9,7 +9,8 @@ use dragfree_engine::product::Written;
 use dragfree_engine::registry::Registry;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{
-    Constancy, Diagnosis, Found, LIMIT_QUANTILE, LINE, Limit, OfProduct, OtherLevel, Separation, TRANSIENT, Trials,
+    Constancy, Diagnosis, Drift, Found, LIMIT_QUANTILE, LINE, Limit, OfProduct, Offset, OtherLevel, Separation,
+    TRANSIENT, Trials,
 };
 use dragfree_identification::innovations::decision::{Fitted, Quadratic};
 use dragfree_identification::record::Record;
@@ -314,6 +315,57 @@ pub(crate) fn verdict(named: &[Found], left: bool) -> &'static str {
         (true, true) => "unexplained",
         (true, false) => "sufficient",
     }
+}
+
+/// Offsets of the model, with σ if nothing undetected acts, and if every lasting effect that is installed may.
+pub(crate) fn offsets(decided: &Decided, evidence: &Evidence<'_>) -> Vec<Offset> {
+    let named: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
+    let lasts = |c: &usize| {
+        let place = &decided.candidates[*c];
+        let proposed = evidence.proposal(&place.effect, &place.instance).is_some();
+        !named.contains(c) && !proposed && evidence.family(&place.effect) == place.effect
+    };
+    let others: Vec<usize> = (0..decided.candidates.len()).filter(lasts).collect();
+    let values = &decided.selection.values;
+    // About the value that is given: what the others would move it by in these data counts too.
+    let with = |others: &[usize]| {
+        let (moved, sigma) = decided.quadratic.solution_with(&named, others);
+        (moved - values).zip_map(&sigma, f64::hypot)
+    };
+    let sigma = with(&others);
+    let alone: Vec<_> = others.iter().map(|c| (c, with(&[*c]))).collect();
+    let offset = |(i, (name, meaning)): (usize, &(String, Meaning))| {
+        let is_offset = matches!(meaning, Meaning::Coefficient(c) if !c.candidate && c.unit == "m");
+        let most = || alone.iter().max_by(|a, b| a.1[i].total_cmp(&b.1[i]));
+        is_offset.then(|| Offset {
+            most_from: most().map(|(c, _)| decided.candidates[**c].name()),
+            coefficient: name.clone(),
+            value_m: values[i],
+            sigma_m: decided.selection.sigma[i],
+            sigma_with_undetected_m: sigma[i],
+        })
+    };
+    decided.parameters.iter().enumerate().filter_map(offset).collect()
+}
+
+/// Why a drift leaves a model insufficient: none for a level of noise within the tolerance of a mission file.
+pub(crate) fn drifting(drift: &Drift, settings: &Settings, decided: &Decided) -> Option<String> {
+    let Drift { coefficient, unit, at_start, at_end, delta_chi2, p_value, confounders, .. } = drift;
+    let is_level = decided.parameters.iter().any(|(name, m)| name == coefficient && matches!(m, Meaning::Level));
+    if is_level && (at_end / at_start).ln().abs() < settings.level_tolerance.ln_1p() {
+        return None;
+    }
+    let unit = if unit == "1" { String::new() } else { format!(" {unit}") };
+    let what = if is_level { format!("the level of {coefficient}") } else { coefficient.clone() };
+    let others = match &confounders[..] {
+        [] => String::new(),
+        all => format!("; as well it may be {} that changes", all.join(" or ")),
+    };
+    Some(format!(
+        "{what} is not the same through the data: from {at_start:.3e} at their start to {at_end:.3e}{unit} \
+         at their end lowers χ² by {delta_chi2:.0} (p = {p_value:.1e}){others}; a model has one value for a run: \
+         run shorter parts"
+    ))
 }
 
 /// Why several products do not agree, if they do not.

@@ -9,21 +9,23 @@ use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
 use dragfree_engine::run::Progress;
 use dragfree_estimation::decimate::SLOW_HZ;
-use dragfree_identification::candidates::Candidate;
+use dragfree_identification::candidates::{Candidate, Coefficient as Unknown};
 use dragfree_identification::diagnosis::{self, Diagnosis, Found, Trials, UNOBSERVABLE, Unexplained};
 use dragfree_identification::lines::Line;
 use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::screen::{RefinementRequest, Screened, screen};
 use dragfree_identification::slow_forces::slow_forces;
-use dragfree_identification::transient::Detection;
+use dragfree_identification::transient::{Detection, Transients};
 use dragfree_schema::Settings;
 use serde_json::json;
 
 use crate::WorkflowError;
-use crate::answer::{Evidence, apart, contradict, found, limits, noise_levels, verdict, with_levels};
+use crate::answer::{
+    Evidence, apart, contradict, drifting, found, limits, noise_levels, offsets, verdict, with_levels,
+};
 use crate::extract::Extract;
-use crate::likelihood::{Decided, PASSES, Point, Settled, moved, one_pass, step, step_of_model};
+use crate::likelihood::{Decided, PASSES, Point, Settled, moved, one_pass, step, step_of_model, transients_near_ends};
 use crate::proposals::{FORMULA, Proposal, probes, proposals};
 use crate::replay::{FINE, Forms, Pass, Replay, What, sum};
 
@@ -54,21 +56,21 @@ pub fn diagnose(
 ) -> Result<Diagnosed, WorkflowError> {
     let settings = replay.settings()?;
     let searched = sum(replay, settings, What::Transients, progress)?.gathered;
-    let (found, lines) = (searched.transients, searched.lines);
+    let (mut found, lines) = (searched.transients, searched.lines);
+    let near_ends = transients_near_ends(replay, &mut found, progress)?;
     let of_lines: Vec<EffectEntry> = lines.found.iter().map(entry_of).collect();
-    let detected: Vec<Detection> =
-        found.certain(settings.transient_p_value).take(settings.max_transients).cloned().collect();
+    let detected = Detected::new(&found, &near_ends, settings);
     let mut gather = |requests: &[RefinementRequest], proposals: &[Proposal], probes: &[EffectEntry]| {
         let proposed = proposals.iter().map(|p| p.entry.clone());
         let chosen: Vec<EffectEntry> = of_lines.iter().cloned().chain(proposed).collect();
-        let forms = Forms { detected: &detected, requests, chosen: &chosen, probes };
+        let forms = Forms { detected: &detected.all, requests, chosen: &chosen, probes };
         let mut record = sum(replay, settings, What::Candidates(&forms), progress)?;
         record.gathered.transients = found.clone();
         record.gathered.lines = lines.clone();
         let noise = record.noise_model()?;
         let screened = {
             let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
-            screen(&scorer, &[])?
+            detected.screen(&scorer, &[])?
         };
         Ok::<_, WorkflowError>((record, noise, screened))
     };
@@ -92,7 +94,7 @@ pub fn diagnose(
     let (registry, products) = (replay.registry, replay.products);
     let trials = Trials::new(&scorer, &tried);
     let evidence = Evidence { trials, least: settings.false_alarm, registry, products, proposals };
-    let last = decide(replay, settings, &record, &scorer, screened, &evidence, progress)?;
+    let last = decide(replay, &detected, &record, &scorer, screened, &evidence, progress)?;
     let decided = &last.end.decided;
     let mut diagnosis = answer(settings, &record, &scorer, decided, &last.screened, &evidence, &last.moving)?;
     contradict(&mut diagnosis, products);
@@ -107,6 +109,54 @@ pub fn diagnose(
     Ok(Diagnosed { diagnosis, settings: settings.clone(), extract, end: last.end, record })
 }
 
+/// Transients that become candidates.
+struct Detected {
+    /// All of them.
+    all: Vec<Detection>,
+    /// Those near an end of the data, the most significant of each place.
+    near_ends: Vec<Detection>,
+}
+
+impl Detected {
+    /// Those of the spectra, as many as the settings allow, and those near the ends.
+    fn new(found: &Transients, near_ends: &Transients, settings: &Settings) -> Self {
+        let place = |d: &Detection| (d.effect.clone(), d.instance.clone());
+        let (mut all, mut near, mut places) = (Vec::new(), Vec::new(), BTreeSet::new());
+        for detection in found.certain(settings.transient_p_value) {
+            let at_an_end = near_ends.detections.contains(detection);
+            if places.insert(place(detection)) && at_an_end {
+                near.push(detection.clone());
+            }
+            if !at_an_end && all.len() < settings.max_transients {
+                all.push(detection.clone());
+            }
+        }
+        all.extend(near.iter().cloned());
+        Self { all, near_ends: near }
+    }
+
+    /// The screen, with the transients near the ends in the form that the innovations have found: the spectra are
+    /// tapered there.
+    fn screen(&self, scorer: &CandidateScorer<'_>, named: &[Candidate]) -> Result<Screened, WorkflowError> {
+        let mut screened = screen(scorer, named)?;
+        let (set, forms) = (scorer.candidate_set, &mut screened.forms);
+        let places = set.places();
+        for detection in &self.near_ends {
+            let of = |c: &Unknown| c.transient && (&c.effect, &c.instance) == (&detection.effect, &detection.instance);
+            let Some(place) = places.iter().find(|p| of(&set.coefficients[p[0]])) else { continue };
+            let own = set.coefficients[place[0]].forms.iter().position(|form| form.shape == detection.shape);
+            let Some(form) = own.map(|k| set.candidate(place, k)) else { continue };
+            match forms.iter_mut().find(|f| f.name() == form.name()) {
+                Some(other) if other.transient => *other = form,
+                // What acts at the steps of a flag may be there as well as once.
+                Some(_) => {}
+                None => forms.push(form),
+            }
+        }
+        Ok(screened)
+    }
+}
+
 /// A model's entry of a line.
 fn entry_of(line: &Line) -> EffectEntry {
     let mut entry = EffectEntry::new(&line.effect, &line.instance);
@@ -118,14 +168,14 @@ fn entry_of(line: &Line) -> EffectEntry {
 /// named so far: passes until nothing moves.
 fn decide(
     replay: &Replay<'_>,
-    settings: &Settings,
+    detected: &Detected,
     record: &Record,
     scorer: &CandidateScorer<'_>,
     mut screened: Screened,
     evidence: &Evidence<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Last, WorkflowError> {
-    let fit = scorer.fit(&[])?;
+    let (settings, fit) = (scorer.settings, scorer.fit(&[])?);
     let model = &record.candidate_set.coefficients[..record.candidate_set.model()];
     let start = model.iter().zip(fit.estimate.theta.iter()).map(|(c, value)| (c.name.clone(), *value)).collect();
     let mut point = Point::at(start);
@@ -161,7 +211,7 @@ fn decide(
             return Ok(Last { end: Settled { decided, chosen, slow, point }, screened, moving });
         }
         if now != named {
-            let beside = screen(scorer, &now)?;
+            let beside = detected.screen(scorer, &now)?;
             // A form that has changed is named in its new form, of which the spectra alone know a value.
             named = named_forms(&decided, &beside.forms);
             let fit = scorer.fit(&named)?;
@@ -276,6 +326,8 @@ fn answer(
     }
     let agreement = decided.agreement();
     reasons.extend(apart(agreement.as_ref(), settings));
+    let drifts = decided.drifts(settings, evidence);
+    reasons.extend(drifts.iter().filter_map(|drift| drifting(drift, settings, decided)));
     let verdict = verdict(&named, unexplained.is_some() || !reasons.is_empty());
     others.truncate(settings.max_evaluated);
     named.extend(others);
@@ -290,6 +342,8 @@ fn answer(
         upper_limits: decided.selection.rest.iter().flat_map(|f| limits(decided, f, evidence)).collect(),
         unexplained,
         formulas,
+        drifts,
+        offsets: offsets(decided, evidence),
         agreement,
         reasons,
         levels,

@@ -19,7 +19,7 @@ use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use crate::WorkflowError;
-use crate::answer::{Evidence, NoiseLevel, apart, contradict, found, limits, verdict, with_levels};
+use crate::answer::{Evidence, NoiseLevel, apart, contradict, found, limits, offsets, verdict, with_levels};
 use crate::likelihood::{CoefficientSums, Decided, joined};
 
 /// Format of the file.
@@ -244,6 +244,8 @@ fn answer(settings: &Settings, decided: &Decided, extracts: &[Extract], evidence
         upper_limits: decided.selection.rest.iter().flat_map(|f| limits(decided, f, evidence)).collect(),
         unexplained: None,
         formulas: Vec::new(),
+        drifts: Vec::new(),
+        offsets: offsets(decided, evidence),
         agreement,
         reasons,
         levels,

@@ -14,13 +14,16 @@ use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_identification::diagnosis::Constancy;
 use dragfree_identification::innovations::decision::{Candidate, Evidence, Prior, Quadratic, Selection, disagreement};
-use dragfree_identification::innovations::filter::{Start, Sums};
+use dragfree_identification::innovations::filter::{Moments, Start, Sums};
 use dragfree_schema::{Coefficient, NoiseProcess, PREDICTION_NEED, Settings, Shape};
 use nalgebra::{DMatrix, DVector};
 
+mod drifts;
+mod ends;
 mod experiment;
 mod pass;
 
+pub(crate) use ends::transients_near_ends;
 pub(crate) use experiment::{Experiment, InBlock, Settled, information};
 use pass::{At, Constant, Filtered};
 
@@ -35,6 +38,9 @@ const REACHED_SIGMAS: f64 = 0.5;
 const LEVEL_PRIOR: f64 = 1.0;
 /// Largest change of the logarithm of a level in one pass: beyond it the quadratic form is no likelihood.
 const LEVEL_STEP: f64 = 0.7;
+
+/// Length of a block of sums, s: how finely changes through the data are resolved.
+const BLOCK_S: f64 = 600.0;
 
 /// Means of series by table and name.
 pub(crate) type Means = BTreeMap<(String, String), f64>;
@@ -109,6 +115,8 @@ pub(crate) struct Decided {
     pub(crate) candidates: Vec<Place>,
     /// What is known of sums of coefficients before any data.
     surveys: Vec<(Vec<(String, f64)>, Prior)>,
+    /// What is known of all sums of parameters before any data.
+    priors: Vec<(Vec<(usize, f64)>, Prior)>,
     /// Sums of each product.
     parts: Vec<Part>,
     /// The likelihood, for what the model would be without one of the chosen.
@@ -226,7 +234,7 @@ pub(crate) fn joined(
         let mut sums = no_sums(0);
         (sums.information, sums.score) = (product.information, product.score.as_slice().to_vec());
         (sums.chi2, sums.numbers) = (product.chi2, product.numbers);
-        all.parts.push(Part { sums, places });
+        all.parts.push(Part { sums, moments: None, places });
         all.surveys = product.surveys;
         all.channels.extend(product.channels);
     }
@@ -330,7 +338,8 @@ pub(crate) fn one_pass(
             threads: replay.threads,
             batch_rows: replay.batch_rows,
         };
-        let at = At { point, slow, opening, number, block_s: None, data: true };
+        let block_s = (!opening).then_some(BLOCK_S);
+        let at = At { point, slow, opening, number, block_s, data: true, search: false, waveforms: &[] };
         let link = |chain: &Chain| Filtered::link(chain, at, settings, replay.threads);
         let (filtered, refused) =
             examine(replay.registry, &examination, link, &mut |p| progress(Pass::Likelihood, number, p))?;
@@ -354,6 +363,8 @@ struct Joined {
 /// Sums of one product.
 struct Part {
     sums: Sums,
+    /// The same with time as weight; an extract has none.
+    moments: Option<Moments>,
     /// Parameters of the product among all.
     places: Vec<(usize, usize)>,
 }
@@ -410,7 +421,8 @@ impl Joined {
             }
             places.push((i, self.place(parameter)));
         }
-        self.parts.push(Part { sums: innovations.finish().total(), places });
+        let passed = innovations.finish();
+        self.parts.push(Part { sums: passed.total(), moments: Some(passed.moments()), places });
         self.surveys = surveys;
         self.channels.extend(channels);
     }
@@ -517,6 +529,7 @@ impl Joined {
             parameters,
             candidates: groups,
             surveys: self.surveys,
+            priors,
             parts: self.parts,
             quadratic,
             by_product,

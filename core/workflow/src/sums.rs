@@ -549,7 +549,7 @@ fn places(available: &Available, channels: &[&Column]) -> Vec<Place> {
     all
 }
 
-fn templates(available: &Available, channels: &[&Column], differenced: &[bool]) -> Vec<Template> {
+pub(crate) fn templates(available: &Available, channels: &[&Column], differenced: &[bool]) -> Vec<Template> {
     let mut out = Vec::new();
     for c in available.coefficients.iter().filter(|c| c.candidate) {
         for t in &c.transients {

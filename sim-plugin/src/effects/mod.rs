@@ -84,8 +84,9 @@ pub trait Cause: Send {
     /// Changes the readouts at `t_k`.
     fn read(&mut self, _now: &Moment<'_>, _rng: &mut Xoshiro256PlusPlus, _measured: &mut Measured) {}
 
-    /// Changes the forces and torques that result from the command over `[t_k, t_{k+1})`.
-    fn act(&mut self, _command: &Command, _acting: &mut Command) {}
+    /// Changes the forces and torques that result from the command over `[t_k, t_{k+1})`, `elapsed_s` after the first
+    /// sample of the telemetry.
+    fn act(&mut self, _elapsed_s: f64, _command: &Command, _acting: &mut Command) {}
 
     /// Adds loads over `[t_k, t_{k+1})`.
     fn push(&mut self, _now: &Moment<'_>, _rng: &mut Xoshiro256PlusPlus, _loads: &mut Loads) {}
@@ -172,11 +173,11 @@ impl Effects {
         }
     }
 
-    /// Forces and torques that result from a command.
-    pub fn act(&mut self, command: &Command) -> Command {
+    /// Forces and torques that result from a command `elapsed_s` after the first sample of the telemetry.
+    pub fn act(&mut self, elapsed_s: f64, command: &Command) -> Command {
         let mut acting = *command;
         for active in &mut self.0 {
-            active.cause.act(command, &mut acting);
+            active.cause.act(elapsed_s, command, &mut acting);
         }
         acting
     }

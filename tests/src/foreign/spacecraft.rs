@@ -72,6 +72,8 @@ impl Start {
 pub struct Hidden {
     /// Gain error of the thrusters' force along each axis.
     pub thrust_gain: [f64; 3],
+    /// Its change per day from the first recorded sample on.
+    pub thrust_gain_per_day: [f64; 3],
     /// Angle by which the thrusters are turned about each axis, rad, small.
     pub thrust_tilt_rad: [f64; 3],
     /// Gain error of the thrusters' torque about each axis.
@@ -113,6 +115,7 @@ impl Hidden {
     /// The spacecraft of the mission file.
     pub const NONE: Self = Self {
         thrust_gain: [0.0; 3],
+        thrust_gain_per_day: [0.0; 3],
         thrust_tilt_rad: [0.0; 3],
         torque_gain: [0.0; 3],
         electrodes: [[[0.0; 3]; 3]; 2],
@@ -527,9 +530,10 @@ impl Spacecraft {
         let sunlight = [flight.sunlight_n, 0.0, 0.0];
         let sunlight_torque = cross([0.1, 0.0, 0.6], sunlight);
         let turned = cross(hidden.thrust_tilt_rad, record.force_n);
+        let days = self.time_s() / 86_400.0;
         let mut force: [f64; 3] = std::array::from_fn(|a| {
             let noise = hidden.thrust_noise[a] * self.dice.white(flight.thrust_n);
-            let gain = hidden.thrust_gain[a] + self.gain_now(None, a);
+            let gain = hidden.thrust_gain[a] + hidden.thrust_gain_per_day[a] * days + self.gain_now(None, a);
             record.force_n[a] + sunlight[a] + noise + gain * record.force_n[a] + turned[a]
         });
         if let Some((axis, per_a)) = hidden.current_on_spacecraft {

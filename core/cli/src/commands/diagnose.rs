@@ -7,7 +7,7 @@ use crate::failure::{Failure, Refusal};
 use crate::text::Paint;
 use chrono::DateTime;
 use dragfree_engine::product::{self, Written};
-use dragfree_identification::diagnosis::{Diagnosis, Found};
+use dragfree_identification::diagnosis::{Diagnosis, Found, Offset};
 use dragfree_identification::transient::Detection;
 use dragfree_workflow::diagnose::diagnose;
 use dragfree_workflow::extract::diagnose_extracts;
@@ -108,6 +108,15 @@ fn screen(answer: &Answer, command: &Diagnose, repeated: &str, paint: Paint) -> 
     for reason in &d.reasons {
         out += &crate::text::labelled("reason", reason);
     }
+    if !d.offsets.is_empty() {
+        let offset = |o: &Offset| {
+            let [value, sigma, with] = [o.value_m, o.sigma_m, o.sigma_with_undetected_m].map(|x| 1e3 * x);
+            format!("{} = {value:.2} ± {sigma:.2} ({with:.2}) mm", o.coefficient)
+        };
+        let all: Vec<String> = d.offsets.iter().map(offset).collect();
+        let text = format!("{}; in brackets σ if effects act that were not detected", all.join(", "));
+        out += &crate::text::labelled("offsets", &text);
+    }
     for level in &d.levels {
         let level = format!("{}:{} = {:.3} ± {:.3}", level.effect, level.instance, level.value, level.sigma);
         out += &crate::text::labelled("noise", &format!("{level}, within the tolerance of a mission file"));
@@ -135,7 +144,10 @@ fn screen(answer: &Answer, command: &Diagnose, repeated: &str, paint: Paint) -> 
             let at = DateTime::from_timestamp_nanos(h.at_ns).format("%Y-%m-%dT%H:%M:%SZ");
             let _ = writeln!(out, "  {at}, as {}:{} would, {:.0}σ", h.effect, h.instance, h.significance);
         }
-        let _ = writeln!(out, "  Near a gap or the end there is too little to weigh it: run two days' files as one.");
+        let _ = writeln!(
+            out,
+            "  Within seconds of a gap or an end there is too little to weigh it: run two days' files as one."
+        );
     }
     if let Some(f) = accepted.first() {
         let _ = writeln!(out, "\nnext      dragfree model add MODEL.toml {}:{}{repeated}", f.effect, f.instance);

@@ -218,7 +218,7 @@ impl Quadratic {
     }
 
     /// A candidate beside a set, or in it.
-    fn beside(&self, candidate: usize, set: &[usize]) -> Fitted {
+    pub fn beside(&self, candidate: usize, set: &[usize]) -> Fitted {
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
         let all: Vec<usize> = others.iter().copied().chain([candidate]).collect();
         let (values, with) = self.fit(&all);
@@ -242,7 +242,7 @@ impl Quadratic {
     }
 
     /// Whether the base and a set leave more of the information of each parameter of a candidate than rounding may.
-    fn observable(&self, candidate: usize, set: &[usize]) -> bool {
+    pub fn observable(&self, candidate: usize, set: &[usize]) -> bool {
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
         let at = self.parameters(&others);
         let inner = inverse(&DMatrix::from_fn(at.len(), at.len(), |i, j| self.profiled[(at[i], at[j])]));
@@ -408,6 +408,35 @@ impl Quadratic {
         fitted.alternatives = weights.into_iter().map(|(c, w)| (c, w / sum)).collect();
         fitted.alternatives.sort_by(|a, b| b.1.total_cmp(&a.1));
         fitted
+    }
+
+    /// The candidates.
+    pub fn candidates(&self) -> &[Candidate] {
+        &self.candidates
+    }
+
+    /// Values and σ of all parameters if `others` may act beside a set, each with what is known of it before any data:
+    /// that and the data limit what they can be. Ranges of the set are left aside. Zero for parameters of neither.
+    pub fn solution_with(&self, set: &[usize], others: &[usize]) -> (DVector<f64>, DVector<f64>) {
+        let mut information = self.information.clone();
+        for c in others {
+            let Candidate { parameters, lower, upper, prior_sigma, .. } = &self.candidates[*c];
+            for (k, i) in parameters.iter().enumerate() {
+                // Where only a range is known, σ of an even distribution over it.
+                let even = (upper[k] - lower[k]) / 12.0_f64.sqrt();
+                let known = if prior_sigma[k].is_finite() { prior_sigma[k] } else { even };
+                information[(*i, *i)] += known.powi(-2);
+            }
+        }
+        let optional = self.parameters(set).into_iter().chain(self.parameters(others));
+        let at: Vec<usize> = self.base.iter().copied().chain(optional).collect();
+        let covariance = inverse(&DMatrix::from_fn(at.len(), at.len(), |i, j| information[(at[i], at[j])]));
+        let solved = &covariance * DVector::from_fn(at.len(), |i, _| self.score[at[i]]);
+        let (mut values, mut sigma) = (DVector::zeros(self.score.len()), DVector::zeros(self.score.len()));
+        for (k, i) in at.iter().enumerate() {
+            (values[*i], sigma[*i]) = (solved[k], covariance[(k, k)].max(0.0).sqrt());
+        }
+        (values, sigma)
     }
 
     /// Values and σ of the base and of a set.

@@ -20,14 +20,17 @@
 //! test masses, where forces are weak, readouts are averaged over many minutes: what a start was is told for many
 //! hours.
 
+use std::ops::Range;
 use std::sync::{Mutex, PoisonError};
 
 use nalgebra::{DMatrix, DVector};
 
+use super::ends::Ends;
 use super::lanes::{Batch, Kernel, LANES, Products, Tile};
 pub use super::lanes::{Parameter, Response};
 use super::predictor::Predictor;
 use super::state_space::NoiseStates;
+use crate::transient::{Template, Transients};
 
 /// Rows that are filtered before products are taken.
 const ROWS: usize = 32;
@@ -38,7 +41,8 @@ const LONGEST_WAIT_S: f64 = 600.0;
 pub(crate) const FREE: f64 = 1e6;
 /// Powers of time that each channel may follow beside everything else: a constant, a slope, a curvature.
 pub const POWERS: usize = 3;
-const DAY_NS: f64 = 86_400e9;
+/// Nanoseconds in a day.
+pub const DAY_NS: f64 = 86_400e9;
 
 /// Sums of a pass. Sums of several stretches of data add.
 #[derive(Clone, Debug)]
@@ -73,6 +77,8 @@ pub struct Start {
 pub struct Block {
     /// Where the block begins: a multiple of its length after the first row of all, ns.
     pub first_ns: i64,
+    /// Mean time of its samples, Unix ns.
+    pub mean_ns: i64,
     /// Upper triangle of the information, column after column: element (i, j) with i ≤ j is at `j (j + 1) / 2 + i`.
     pub information: Vec<f64>,
     /// Score.
@@ -107,6 +113,59 @@ impl Passed {
         self.blocks.iter().for_each(|block| sums.add(block));
         sums.starts.clone_from(&self.starts);
         sums
+    }
+
+    /// The sums of all blocks with the time of each as weight.
+    pub fn moments(&self) -> Moments {
+        let from_ns = self.blocks.first().map_or(0, |block| block.mean_ns);
+        let until_ns = self.blocks.last().map_or(0, |block| block.mean_ns);
+        let p = self.parameters;
+        let mut moments = Moments {
+            from_ns,
+            until_ns,
+            once: DMatrix::zeros(p, p),
+            twice: DMatrix::zeros(p, p),
+            score: DVector::zeros(p),
+        };
+        for block in &self.blocks {
+            let days = (block.mean_ns - from_ns) as f64 / DAY_NS;
+            let mut sums = Sums::zeros(p, self.channels);
+            sums.add(block);
+            moments.once += &sums.information * days;
+            moments.twice += &sums.information * (days * days);
+            moments.score += DVector::from_vec(sums.score) * days;
+        }
+        moments
+    }
+}
+
+/// Sums with time as weight: the information and the score of parameters that change at a constant rate. What a
+/// parameter θ adds in a block, a rate of it per day adds times the days since some instant.
+#[derive(Clone, Debug)]
+pub struct Moments {
+    /// From when time counts: mean time of the first block, Unix ns.
+    pub from_ns: i64,
+    /// Mean time of the last block, Unix ns.
+    pub until_ns: i64,
+    /// Information times days: of a parameter and the rate of another.
+    pub once: DMatrix<f64>,
+    /// Information times days squared: of two rates.
+    pub twice: DMatrix<f64>,
+    /// Score times days.
+    pub score: DVector<f64>,
+}
+
+impl Moments {
+    /// The same with time from another instant, of the sums that they belong to.
+    pub fn about(&self, sums: &Sums, from_ns: i64) -> Self {
+        let days = (from_ns - self.from_ns) as f64 / DAY_NS;
+        Self {
+            from_ns,
+            until_ns: self.until_ns,
+            once: &self.once - &sums.information * days,
+            twice: &self.twice - &self.once * (2.0 * days) + &sums.information * (days * days),
+            score: &self.score - DVector::from_column_slice(&sums.score) * days,
+        }
     }
 }
 
@@ -197,10 +256,14 @@ pub struct Innovations {
     blocks: Vec<Block>,
     squares: DMatrix<f64>,
     samples: u64,
+    /// Sum of their times since the first row of all, ns.
+    times_ns: i128,
     /// Samples of which squares are summed.
     settled: u64,
     /// Whether all innovations are taken as zero.
     without_data: bool,
+    /// Innovations near the ends of the data, where transients are searched for.
+    ends: Option<Ends>,
 }
 
 /// What a pass is made of.
@@ -282,8 +345,10 @@ impl Innovations {
             blocks: Vec::new(),
             squares: DMatrix::zeros(channels, channels),
             samples: 0,
+            times_ns: 0,
             settled: 0,
             without_data: false,
+            ends: None,
             kernel,
         };
         pass.restart();
@@ -294,6 +359,21 @@ impl Innovations {
     pub fn without_data(mut self) -> Self {
         self.without_data = true;
         self
+    }
+
+    /// The same with a search for transients near the ends of the data and of gaps.
+    pub fn with_search(mut self, templates: Vec<Template>) -> Self {
+        self.ends = Some(Ends::new(&self.kernel, &self.unit, self.step_ns, templates));
+        self
+    }
+
+    /// The transients that were searched for, and the times between which each window of the search lies, Unix ns.
+    pub fn transients(&mut self) -> (Transients, Vec<Range<i64>>) {
+        let threads = self.threads;
+        self.ends.as_mut().map_or_else(Default::default, |ends| {
+            ends.gap();
+            ends.search(threads)
+        })
     }
 
     /// Adds a row: the channels and the series at `time_ns`. A row with a number that is not finite is a gap.
@@ -310,6 +390,7 @@ impl Innovations {
             let from = self.waiting.inputs.len();
             let mean = |(now, before): (&f64, &f64)| if self.averaged { 0.5 * (now + before) } else { *now };
             self.waiting.inputs.extend(series.iter().zip(&self.before).map(mean));
+            self.times_ns += i128::from(time_ns - first);
             let days = (time_ns - first) as f64 / DAY_NS;
             self.waiting.inputs.extend((0..POWERS).map(|k| days.powi(k as i32)));
             for ((to, z), unit) in self.z.iter_mut().zip(channels).zip(&self.unit) {
@@ -323,6 +404,11 @@ impl Innovations {
             }
             self.kernel.step(&mut self.state, &mut self.next, &mut self.z);
             self.waiting.innovations.extend(&self.z);
+            if let Some(ends) = &mut self.ends {
+                let mut white = vec![0.0; self.z.len()];
+                self.kernel.whiten(&self.z, &mut white);
+                ends.push(time_ns, &white);
+            }
             self.fresh = false;
             self.waiting.counts.push(self.unsettled == 0);
             self.unsettled = self.unsettled.saturating_sub(1);
@@ -340,6 +426,7 @@ impl Innovations {
             self.sum();
             self.take_start_out();
             self.restart();
+            self.ends.iter_mut().for_each(Ends::gap);
         }
     }
 
@@ -482,6 +569,7 @@ impl Innovations {
         let length = self.block.map_or(0, u64::cast_signed);
         self.blocks.push(Block {
             first_ns: self.first_ns.unwrap_or(0) + self.number * length * self.step_ns,
+            mean_ns: self.first_ns.unwrap_or(0) + (self.times_ns / i128::from(self.samples)) as i64,
             information,
             score,
             chi2: product(*data, *data),
@@ -493,6 +581,7 @@ impl Innovations {
         self.products.iter_mut().for_each(Products::clear);
         self.squares.fill(0.0);
         self.samples = 0;
+        self.times_ns = 0;
         self.settled = 0;
     }
 

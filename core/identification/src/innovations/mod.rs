@@ -7,6 +7,7 @@
 //! the sums of one pass over the data, and [`decision`] what follows from them.
 
 pub mod decision;
+mod ends;
 pub mod filter;
 mod lanes;
 pub mod predictor;

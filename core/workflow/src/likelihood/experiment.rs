@@ -85,7 +85,8 @@ pub(crate) fn information(
     };
     let block_s = Some(experiment.block_s);
     let data = experiment.altered.is_none();
-    let at = At { point: &point, slow: &end.slow, opening: false, number, block_s, data };
+    let at =
+        At { point: &point, slow: &end.slow, opening: false, number, block_s, data, search: false, waveforms: &[] };
     let link = |chain: &Chain| Filtered::link(chain, at, settings, replay.threads);
     let (filtered, _) = examine(replay.registry, &examination, link, &mut |p| progress(Pass::Experiment, number, p))?;
     let means = filtered.means();

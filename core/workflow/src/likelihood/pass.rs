@@ -8,6 +8,8 @@ use dragfree_identification::innovations::decision::Prior;
 use dragfree_identification::innovations::filter::{Innovations, POWERS, Parameter, Response, Setup};
 use dragfree_identification::innovations::predictor::{Change, Predictor};
 use dragfree_identification::innovations::state_space::{NoNoise, NoisePoint, NoiseStates, gains};
+use dragfree_identification::transient::Template;
+use dragfree_identification::waveform::Waveform;
 use dragfree_schema::{
     AHEAD_ATTRIBUTE, Available, Coefficient, Column, NoiseProcess, Response as Declared, Settings,
     UNPREDICTED_ATTRIBUTE, UNPREDICTED_SLOPE_ATTRIBUTE,
@@ -16,6 +18,7 @@ use nalgebra::DMatrix;
 
 use super::{Meaning, Point};
 use crate::WorkflowError;
+use crate::sums::templates;
 
 /// Part of a coefficient's scale, and of a level, over which the noise is differenced. The covariance of the driving
 /// noise is a quadratic form in them, so central differences are exact.
@@ -85,6 +88,18 @@ pub(super) struct At<'a> {
     pub(super) block_s: Option<f64>,
     /// Whether the innovations are those of the rows; else they are zero.
     pub(super) data: bool,
+    /// Whether transients are searched for near the ends of the data.
+    pub(super) search: bool,
+    /// Waveforms that are further parameters, the last ones.
+    pub(super) waveforms: &'a [Placed],
+}
+
+/// A waveform at a time, and the channels on which it acts.
+#[derive(Clone, Debug)]
+pub(super) struct Placed {
+    pub(super) waveform: Waveform,
+    /// Channel, factor.
+    pub(super) channels: Vec<(usize, f64)>,
 }
 
 /// A pass over one product.
@@ -104,6 +119,12 @@ pub(super) struct Filtered {
     pub(super) constants: Vec<Constant>,
     pub(super) gaps: Gaps,
     patience: u64,
+    /// Samples per second.
+    pub(super) rate_hz: f64,
+    /// Series that no plugin makes, the last ones.
+    waveforms: Vec<Waveform>,
+    /// Transients that are searched for.
+    pub(super) templates: Vec<Template>,
     pub(super) innovations: Innovations,
 }
 
@@ -411,7 +432,7 @@ impl Filtered {
         settings: &Settings,
         threads: usize,
     ) -> Result<Wanted<Self>, WorkflowError> {
-        let At { point, slow, opening, number, block_s, data } = at;
+        let At { point, slow, opening, number, block_s, data, search, waveforms } = at;
         let available = Available {
             columns: chain.columns.clone(),
             coefficients: chain.coefficients.clone(),
@@ -421,6 +442,8 @@ impl Filtered {
         let responses = Responses::of(&available)?;
         let noise = NoiseAt::new(&available, &responses, point)?;
         let mut unknowns: Vec<(String, Meaning, Parameter)> = Vec::new();
+        let own = responses.series.len();
+        let count = own + waveforms.len();
         let named = |c: &Coefficient| point.values.contains_key(&c.name);
         let asked = |c: &Coefficient| if c.candidate { !opening || named(c) } else { c.estimate };
         for (i, c) in responses.coefficients.iter().enumerate().filter(|(_, c)| asked(c)) {
@@ -452,12 +475,20 @@ impl Filtered {
         for (channel, name) in responses.names.iter().enumerate() {
             for k in 0..POWERS {
                 let power = format!("{name} day^{k} of product {number}");
-                let (series, unit) = (responses.series.len() + k, noise.system.unit[channel]);
+                let (series, unit) = (count + k, noise.system.unit[channel]);
                 let mean = constants.iter().filter(|c| c.power == power).map(|c| c.at(&point.values)).sum::<f64>();
                 known.extend(point.powers.get(&power).map(|value| (channel, series, (value + mean) * unit)));
                 let own = Parameter { responses: vec![(channel, series, unit)], ..Parameter::default() };
                 unknowns.push((power, Meaning::Power, own));
             }
+        }
+        for (k, placed) in waveforms.iter().enumerate() {
+            let to = placed.channels.iter().map(|(channel, factor)| (*channel, own + k, *factor)).collect();
+            unknowns.push((
+                format!("waveform {k}"),
+                Meaning::Power,
+                Parameter { responses: to, ..Parameter::default() },
+            ));
         }
         let mut parameters = Vec::new();
         let mut filtered = Vec::new();
@@ -466,7 +497,6 @@ impl Filtered {
             filtered.push(parameter);
         }
         let rate_hz = responses.channels.first().map_or(0.0, |c| c.rate_hz);
-        let count = responses.series.len();
         let innovations = Innovations::new(Setup {
             system: &noise.system,
             predictor: &noise.predictor,
@@ -480,6 +510,9 @@ impl Filtered {
             threads,
         });
         let innovations = if data { innovations } else { innovations.without_data() };
+        let differenced: Vec<bool> = responses.channels.iter().map(|c| c.attribute("average") == "2").collect();
+        let templates = if search { templates(&available, &responses.channels, &differenced) } else { Vec::new() };
+        let innovations = if search { innovations.with_search(templates.clone()) } else { innovations };
         let acting = |i: usize| {
             let own = responses.terms.iter().filter(move |t| t.coefficients[0] == i);
             own.map(|t| responses.names[t.channel].clone()).collect()
@@ -491,12 +524,15 @@ impl Filtered {
             parameters,
             count: responses.names.len(),
             base: responses.base,
-            held: vec![f64::NAN; count],
-            sums: vec![0.0; count],
+            held: vec![f64::NAN; own],
+            sums: vec![0.0; own],
+            waveforms: waveforms.iter().map(|placed| placed.waveform.clone()).collect(),
+            templates,
             keys: responses.series.clone(),
             centres,
             constants,
             gaps: Gaps::of(&responses),
+            rate_hz,
             patience: (settings.patience_s * rate_hz) as u64,
             innovations,
         };
@@ -515,9 +551,12 @@ impl Filtered {
 impl Sink for Filtered {
     fn tapped(&mut self, time_ns: &[i64], columns: &[&[f64]]) {
         let mut channels = vec![0.0; self.count];
-        let mut series = vec![0.0; columns.len() - self.count];
+        let own = columns.len() - self.count;
+        let mut series = vec![0.0; own];
+        let waveforms: Vec<Vec<f64>> = self.waveforms.iter().map(|w| w.over(time_ns)).collect();
         for (k, time_ns) in time_ns.iter().enumerate() {
             channels.iter_mut().zip(columns).for_each(|(x, column)| *x = column[k]);
+            series.truncate(own);
             let waits = self.gaps.rows < self.patience;
             let mut begun = true;
             let measured = columns[..self.count + self.base].iter().all(|column| column[k].is_finite());
@@ -550,6 +589,7 @@ impl Sink for Filtered {
                 }
                 *x -= self.centres[s];
             }
+            series.extend(waveforms.iter().map(|w| w[k]));
             self.innovations.push(*time_ns, &channels, &series);
         }
     }
