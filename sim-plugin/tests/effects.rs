@@ -694,7 +694,7 @@ fn what_is_not_there_is_answered_with_what_is() {
         ("slosh:sc.x=-0.1", "SIZE = -0.1"),
         ("slosh:sc.x=0.1,zeta=-1", "zeta = -1 must be a number from 0e0 to 2e0 1"),
         ("thermal:tm1.x=1e-12,tau=3", "thermal has no parameter tau; it has lag_s (lag, s; 480 unless given)"),
-        ("es-gain:tm1.y=0.1,lag_s=3", "es-gain has no parameter lag_s; it has none"),
+        ("is-scale:tm1.y=0.1,lag_s=3", "is-scale has no parameter lag_s; it has none"),
         ("time-offset:is=-0.1", "SIZE = -0.1"),
         ("mps-correlation:sc=1e-7", "mps-correlation has no instance sc; it has layout"),
     ] {
