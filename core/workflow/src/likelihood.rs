@@ -34,6 +34,8 @@ use crate::replay::{Pass, Replay, noise_levels};
 pub(crate) const PASSES: usize = 6;
 /// A point is reached when nothing moves by more than this part of its σ.
 const REACHED_SIGMAS: f64 = 0.5;
+/// Largest last step of the logarithm of a level: σ, which has two digits, is made with the level before it.
+const TWO_DIGITS: f64 = 0.01;
 /// σ of the logarithm of a level before any data: the data decide.
 const LEVEL_PRIOR: f64 = 1.0;
 /// Largest change of the logarithm of a level in one pass: beyond it the quadratic form is no likelihood.
@@ -300,7 +302,10 @@ pub(crate) fn moved(from: &Point, to: &Point, decided: &Decided) -> BTreeSet<Str
                 (None, None) => return false,
                 _ => return true,
             },
-            Meaning::Level => (level(from, name) - level(to, name)).powi(2),
+            Meaning::Level => match (level(from, name) - level(to, name)).abs() {
+                step if step > TWO_DIGITS => return true,
+                step => step.powi(2),
+            },
             Meaning::Power => return false,
         };
         left > REACHED_SIGMAS * **sigma
