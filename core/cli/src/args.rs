@@ -133,8 +133,8 @@ Effects, and where (TM: tm1, tm2; AXIS: x, y, z; size in SI units):
   is-noise:TM.AXIS             is-scale:TM.AXIS        is-crosstalk:TM.FROM-TO
   tilt-to-length:TM            time-offset:is|ifo|dws  thermal:TM.AXIS
   magnetic:TM                  charge:TM               current-force:TM.AXIS
-  product-force:TM.AXIS        slosh:sc.x|y            solar-pressure:sc
-  impulse:sc.AXIS|TM.AXIS|sc.phi|theta|psi             mps-correlation:layout
+  product-force:TM.AXIS        field-force:TM.AXIS     slosh:sc.x|y
+  solar-pressure:sc            mps-correlation:layout  impulse:sc.AXIS|TM.AXIS|sc.phi|theta|psi
 Some have named shapes, as thermal:tm1.x=2e-12,lag_s=480. A question, as
 --effect thermal:?=0, is answered with unit, shapes and what it does.";
 

@@ -115,7 +115,8 @@ fn gathered(columns: &[Vec<f64>], threads: usize) -> GramSums {
     let search = Search::new(Vec::new(), residual.clone(), Vec::new());
     let averaged = (0..columns.len()).map(|j| j >= CHANNELS.len()).collect();
     let mut segmenter = Segmenter::new(LENGTH, (1e9 / RATE_HZ) as i64, averaged).of_first(of.fast);
-    let coherence = |plan: &_| HousekeepingCoherence::new(Vec::new(), plan, residual, Vec::new());
+    let coherence =
+        |plan: &_| HousekeepingCoherence::new(Vec::new(), Vec::new(), plan, residual, Vec::new(), Vec::new());
     let mut gatherer = GramAccumulator::new(of, LENGTH, RATE_HZ, threads, coherence, search, LineSearch::nowhere());
     for first in (0..ROWS).step_by(BATCH) {
         let rows = first..(first + BATCH).min(ROWS);

@@ -6,7 +6,7 @@
 //! numbers of power P before and P(a) after, the logarithm of the likelihood rises by `½ Σ n log(P/P(a))`.
 
 use dragfree_estimation::sigma::NoiseModel;
-use nalgebra::{Complex, DMatrix};
+use nalgebra::{Complex, DMatrix, DVector};
 
 use crate::coherence::{Driver, HousekeepingCoherence, Part};
 use crate::slow_samples::{OWN, SlowSamples, Stretch, Whitened};
@@ -27,8 +27,11 @@ const AT_ONCE: usize = 256;
 /// Functions of one housekeeping channel that are given for the channel of which most is explained.
 const SINGLES: usize = 6;
 
-/// Products that are given for it.
+/// Products of two that are given for it, and products with known series.
 const PRODUCTS: usize = 3;
+
+/// Housekeeping channels of which every product with a known series at the place is given.
+const AS_GAINS: usize = 2;
 
 /// What lies between a cause and its force.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -41,11 +44,11 @@ pub enum Memory {
     Integral,
 }
 
-/// A channel's residual as a multiple of a function of housekeeping.
+/// A force as a multiple of a function of housekeeping.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Driven {
-    /// Index of the channel.
-    pub channel: usize,
+    /// Where it acts ([`crate::coherence::HousekeepingCoherence::places`]).
+    pub place: usize,
     /// The function.
     pub driver: Driver,
     /// What lies between it and the force.
@@ -55,16 +58,20 @@ pub struct Driven {
 }
 
 impl SlowSamples {
-    /// Functions that are tried for each channel by [`Self::driven`].
-    pub fn functions(&self, housekeeping: &HousekeepingCoherence) -> usize {
-        self.forms(housekeeping).len()
+    /// Functions that are tried at some places by [`Self::driven`].
+    pub fn functions(&self, places: &[usize], housekeeping: &HousekeepingCoherence) -> usize {
+        places.iter().map(|place| self.forms_at(*place, housekeeping).len()).sum()
+    }
+
+    fn forms_at(&self, place: usize, housekeeping: &HousekeepingCoherence) -> Vec<(Driver, Memory)> {
+        self.forms(housekeeping).into_iter().filter(|(driver, _)| housekeeping.acts(*driver, place)).collect()
     }
 
     fn forms(&self, housekeeping: &HousekeepingCoherence) -> Vec<(Driver, Memory)> {
         let memories = self.memories();
         let with = |driver: &Driver| {
             let all = match driver {
-                Driver::Product(..) => &[Memory::None],
+                Driver::Product(..) | Driver::Modulated(..) => &[Memory::None],
                 // The integral of a derivative is the value.
                 Driver::Derivative(_) => &memories[1..],
                 _ => &memories[..],
@@ -83,33 +90,48 @@ impl SlowSamples {
         [Memory::Integral, Memory::None].into_iter().chain(lags).collect()
     }
 
-    /// Functions of housekeeping for the one of some channels of which they explain most, and the first of them for the
-    /// other channels, since a force along one shows in all: those that explain more than the best of as many would by
-    /// chance. The best first; `noise` is that of the channels.
-    pub fn driven(&self, channels: &[usize], noise: &NoiseModel, housekeeping: &HousekeepingCoherence) -> Vec<Driven> {
+    /// Functions of housekeeping for the one of some places at which they explain most, and the first of them for the
+    /// other places, since a force at one shows at all: those that explain more than the best of as many would by
+    /// chance, and of the first of them the products with every known series there. The best first; `noise` is that of
+    /// the channels.
+    pub fn driven(&self, places: &[usize], noise: &NoiseModel, housekeeping: &HousekeepingCoherence) -> Vec<Driven> {
         let (thin, means_s) = self.thinned();
-        let forms = thin.forms(housekeeping);
-        let chance = 2.0 * ((forms.len() * channels.len()) as f64).ln();
-        let search = |channel: &usize| {
-            let whitened = thin.whitened(*channel, noise, &means_s)?;
-            Some(Search { samples: &thin, housekeeping, channel: *channel, whitened, chance })
+        let chance = 2.0 * (thin.functions(places, housekeeping).max(1) as f64).ln();
+        let search = |place: &usize| {
+            let whitened = thin.whitened(&housekeeping.places[*place].response, noise, &means_s)?;
+            Some(Search::new(&thin, housekeeping, *place, whitened, chance))
         };
-        let searches: Vec<Search<'_>> = channels.iter().filter_map(search).collect();
-        let ranked: Vec<Vec<(f64, usize)>> = searches.iter().map(|search| search.ranked(&forms)).collect();
+        let searches: Vec<Search<'_>> = places.iter().filter_map(search).collect();
+        let ranked: Vec<Vec<(f64, (Driver, Memory))>> = searches.iter().map(Search::ranked).collect();
         let most = |s: &usize| ranked[*s].first().map_or(0.0, |(gain, _)| *gain);
         let Some(best) = (0..searches.len()).max_by(|a, b| most(a).total_cmp(&most(b))) else { return Vec::new() };
-        let functions = searches[best].functions(&forms, &ranked[best]);
-        let first = |factors: usize| functions.iter().position(|(driver, _)| driver.of().len() == factors);
-        let firsts = [first(1), first(2)];
-        let of_channel = |(s, f): (usize, usize)| {
+        let functions = searches[best].functions(&ranked[best]);
+        let first = |kind: Kind| functions.iter().position(|(driver, _)| Kind::of(*driver) == kind);
+        let firsts = [Kind::Single, Kind::Product, Kind::WithKnown].map(first);
+        let at_place = |(s, f): (usize, usize)| {
             let (driver, memory) = functions[f];
+            if !housekeeping.acts(driver, searches[s].place) {
+                return None;
+            }
             let gain = searches[s].gains(&[functions[f]])[0];
             let asked = s == best || firsts.contains(&Some(f));
-            let channel = searches[s].channel;
-            (asked && gain.fitted > chance).then_some(Driven { channel, driver, memory, gain: gain.declared })
+            let place = searches[s].place;
+            (asked && gain.fitted > chance).then_some(Driven { place, driver, memory, gain: gain.declared })
         };
-        let places = (0..functions.len()).flat_map(|f| (0..searches.len()).map(move |s| (s, f)));
-        let mut found: Vec<Driven> = places.filter_map(of_channel).collect();
+        let all = (0..functions.len()).flat_map(|f| (0..searches.len()).map(move |s| (s, f)));
+        let mut found: Vec<Driven> = all.filter_map(at_place).collect();
+        // Commands have a constant part, so a gain that follows housekeeping shows as a force that does; what tells the
+        // two apart may be faster than what is seen here.
+        let singles = functions.iter().filter(|(driver, _)| Kind::of(*driver) == Kind::Single);
+        let leading: Vec<usize> = singles.map(|(driver, _)| driver.of()[0]).take(AS_GAINS).collect();
+        let gains = leading.iter().flat_map(|i| housekeeping.known().map(move |k| Driver::Modulated(*i, k)));
+        for driver in gains.filter(|driver| housekeeping.acts(*driver, searches[best].place)) {
+            let (place, memory) = (searches[best].place, Memory::None);
+            let gain = searches[best].gains(&[(driver, memory)])[0].declared;
+            if found.iter().all(|other| (other.place, other.driver) != (place, driver)) {
+                found.push(Driven { place, driver, memory, gain });
+            }
+        }
         found.sort_by(|a, b| b.gain.total_cmp(&a.gain));
         found
     }
@@ -135,6 +157,11 @@ impl SlowSamples {
         (series.iter().map(|x| (x - mean).powi(2)).sum::<f64>() / n).sqrt()
     }
 
+    /// Root mean square of what changes in a product with a known series: of housekeeping about where it began.
+    pub fn rms_of_factor(&self, driver: Driver, housekeeping: &HousekeepingCoherence) -> f64 {
+        driver.factors().first().map_or(0.0, |factor| self.rms(*factor, Memory::None, housekeeping))
+    }
+
     /// The function as the effect `formula` reads it, `lag(hk.battery_current_a - 1.900000e0, 120.0)`.
     pub fn expression(&self, driver: Driver, memory: Memory, housekeeping: &HousekeepingCoherence) -> String {
         let level = &housekeeping.level;
@@ -147,6 +174,7 @@ impl SlowSamples {
             Driver::Derivative(i) => format!("derivative({})", name(i)),
             Driver::Square(i) => format!("{}^2 {}", name(i), less(level[i].powi(2))),
             Driver::Product(i, j) => format!("({}) * ({})", about(i), about(j)),
+            Driver::Modulated(i, k) => format!("({}) * {}", about(i), name(k)),
         };
         match memory {
             Memory::None => plain,
@@ -155,27 +183,36 @@ impl SlowSamples {
         }
     }
 
+    /// Unit of the known series in a function; none without one.
+    pub fn unit_of_known(&self, driver: Driver) -> Option<&str> {
+        let Driver::Modulated(_, k) = driver else { return None };
+        self.units.get(k).map(String::as_str)
+    }
+
     /// The function in words, as among coherences.
     pub fn label(&self, driver: Driver) -> String {
         driver.label(&self.names)
     }
 
-    /// Unit of the amplitude of a function that is an acceleration, `m s-2 A-2`.
-    pub fn unit_of_amplitude(&self, driver: Driver, memory: Memory) -> String {
+    /// Unit of the amplitude of a function that has the unit `of`, `m s-2 A-2`.
+    pub fn unit_of_amplitude(&self, of: &str, driver: Driver, memory: Memory) -> String {
         let times = if matches!(driver, Driver::Square(_)) { 2 } else { 1 };
-        let rate = i32::from(matches!(driver, Driver::Derivative(_)));
-        let seconds = -2 + rate - i32::from(matches!(memory, Memory::Integral));
-        let mut powers = vec![("m".to_owned(), 1), ("s".to_owned(), seconds)];
-        let symbols = driver.of().into_iter().flat_map(|i| self.units[i].split_whitespace());
-        for (symbol, power) in symbols.filter_map(symbol_and_power) {
+        let seconds =
+            i32::from(matches!(driver, Driver::Derivative(_))) - i32::from(matches!(memory, Memory::Integral));
+        let mut powers: Vec<(String, i32)> = of.split_whitespace().filter_map(symbol_and_power).collect();
+        let divided =
+            driver.of().into_iter().flat_map(|i| self.units[i].split_whitespace()).filter_map(symbol_and_power);
+        let divided = divided.map(|(symbol, power)| (symbol, -times * power));
+        for (symbol, power) in std::iter::once(("s".to_owned(), seconds)).chain(divided) {
             match powers.iter_mut().find(|(own, _)| *own == symbol) {
-                Some((_, own)) => *own -= times * power,
-                None => powers.push((symbol, -times * power)),
+                Some((_, own)) => *own += power,
+                None => powers.push((symbol, power)),
             }
         }
         let told = powers.into_iter().filter(|(_, power)| *power != 0);
         let told = told.map(|(symbol, power)| if power == 1 { symbol } else { format!("{symbol}{power}") });
-        told.collect::<Vec<_>>().join(" ")
+        let unit = told.collect::<Vec<_>>().join(" ");
+        if unit.is_empty() { "1".to_owned() } else { unit }
     }
 }
 
@@ -224,36 +261,76 @@ impl Memory {
     }
 }
 
-/// What explains one channel.
+/// Kinds of functions, of which each has its own best.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Kind {
+    Single,
+    Product,
+    WithKnown,
+}
+
+impl Kind {
+    fn of(driver: Driver) -> Self {
+        match driver {
+            Driver::Product(..) => Self::Product,
+            Driver::Modulated(..) => Self::WithKnown,
+            _ => Self::Single,
+        }
+    }
+}
+
+/// What explains a force at one place.
 struct Search<'a> {
     samples: &'a SlowSamples,
     housekeeping: &'a HousekeepingCoherence,
-    channel: usize,
+    place: usize,
     whitened: Whitened,
+    /// What is left of each housekeeping value and known series that is a factor; zero where nothing is.
+    factors: Vec<DVector<f64>>,
     /// What the best of all functions explains by chance.
     chance: f64,
 }
 
-impl Search<'_> {
-    /// Functions that explain more than by chance, by index: what they explain with the declared noise, the most first.
-    fn ranked(&self, forms: &[(Driver, Memory)]) -> Vec<(f64, usize)> {
-        let gains = forms.chunks(AT_ONCE).flat_map(|some| self.gains(some)).enumerate();
-        let mut all: Vec<(f64, usize)> =
-            gains.filter(|(_, gain)| gain.fitted > self.chance).map(|(i, gain)| (gain.declared, i)).collect();
+impl<'a> Search<'a> {
+    fn new(
+        samples: &'a SlowSamples,
+        housekeeping: &'a HousekeepingCoherence,
+        place: usize,
+        whitened: Whitened,
+        chance: f64,
+    ) -> Self {
+        let of = |i: usize| {
+            let series = samples.series(Driver::Value(i), Memory::None, &housekeeping.level);
+            let whole = DMatrix::from_column_slice(series.len(), 1, &series);
+            let whole = whitened.whiten(&whole).unwrap_or_else(|| DMatrix::zeros(series.len(), 1));
+            let own = whitened.left(&whole).column(0).into_owned();
+            if own.norm_squared() > OWN * whole.norm_squared() { own.normalize() } else { own * 0.0 }
+        };
+        let are = !housekeeping.known().is_empty();
+        let factors = (0..samples.names.len()).filter(|_| are).map(of).collect();
+        Self { samples, housekeeping, place, whitened, factors, chance }
+    }
+
+    /// Functions that explain more than by chance, and what they explain with the declared noise, the most first.
+    fn ranked(&self) -> Vec<(f64, (Driver, Memory))> {
+        let forms = self.samples.forms_at(self.place, self.housekeeping);
+        let gains = forms.chunks(AT_ONCE).flat_map(|some| self.gains(some)).zip(&forms);
+        let mut all: Vec<(f64, (Driver, Memory))> =
+            gains.filter(|(gain, _)| gain.fitted > self.chance).map(|(gain, form)| (gain.declared, *form)).collect();
         all.sort_by(|a, b| b.0.total_cmp(&a.0));
         all
     }
 
     /// The best of them, no two of the same housekeeping, each with its best memory. A product with what hardly changes
     /// is its other factor, slightly better by chance: each kind has its own.
-    fn functions(&self, forms: &[(Driver, Memory)], ranked: &[(f64, usize)]) -> Vec<(Driver, Memory)> {
+    fn functions(&self, ranked: &[(f64, (Driver, Memory))]) -> Vec<(Driver, Memory)> {
         let mut functions: Vec<(Driver, Memory)> = Vec::new();
-        for (_, i) in ranked {
-            let own = forms[*i].0.of();
-            let alike = functions.iter().filter(|(other, _)| other.of().len() == own.len()).count();
-            let most = if own.len() == 1 { SINGLES } else { PRODUCTS };
+        for (_, form) in ranked {
+            let (own, kind) = (form.0.of(), Kind::of(form.0));
+            let alike = functions.iter().filter(|(other, _)| Kind::of(*other) == kind).count();
+            let most = if kind == Kind::Single { SINGLES } else { PRODUCTS };
             if alike < most && functions.iter().all(|(other, _)| other.of() != own) {
-                functions.push(self.refined(forms[*i]));
+                functions.push(self.refined(*form));
             }
         }
         functions
@@ -268,18 +345,30 @@ impl Search<'_> {
         }
         let Some(whole) = w.whiten(&all) else { return vec![Gain::default(); forms.len()] };
         let own = w.left(&whole);
-        let observations = 0.5 * (w.y.len() - w.beside.ncols()) as f64;
         let nyquist_hz = 0.5 / samples.step_s;
-        let part = |k: usize| {
-            let (d, whole) = (own.column(k), whole.column(k));
-            // What powers of time explain of a function but for rounding has nothing of its own.
-            let told = d.norm_squared() > OWN * whole.norm_squared();
-            let (squared, along) = if told { (d.norm_squared(), d.dot(&w.y)) } else { (0.0, 0.0) };
-            Part { observations, power: w.y.norm_squared(), squared, along }
+        let slow = |k: usize, driver: Driver| {
+            let (mut d, mut y) = (own.column(k).into_owned(), w.y.clone());
+            let mut parameters = w.beside.ncols();
+            // See `HousekeepingCoherence::parts`.
+            if let Driver::Modulated(i, k) = driver {
+                let (known, value) = (&self.factors[k], &self.factors[i]);
+                let apart = value - known * known.dot(value);
+                let apart = apart.try_normalize(OWN).unwrap_or_else(|| value * 0.0);
+                for factor in [known, &apart] {
+                    d.axpy(-factor.dot(&d), factor, 1.0);
+                    y.axpy(-factor.dot(&y), factor, 1.0);
+                    parameters += 1;
+                }
+            }
+            // What is explained of a function but for rounding by what is beside it has nothing of its own.
+            let told = d.norm_squared() > OWN * whole.column(k).norm_squared();
+            let (squared, along) = if told { (d.norm_squared(), d.dot(&y)) } else { (0.0, 0.0) };
+            let observations = 0.5 * y.len().saturating_sub(parameters) as f64;
+            Part { observations, power: y.norm_squared(), squared, along }
         };
         let gain = |(k, (driver, memory)): (usize, &(Driver, Memory))| {
-            let fast = self.housekeeping.parts(self.channel, *driver, |hz| memory.at(hz), nyquist_hz);
-            Gain::of(part(k), &fast)
+            let fast = self.housekeeping.parts(self.place, *driver, |hz| memory.at(hz), nyquist_hz);
+            Gain::of(slow(k, *driver), &fast)
         };
         forms.iter().enumerate().map(gain).collect()
     }
@@ -336,14 +425,16 @@ fn gain(parts: &[Part]) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::slow_samples::tests::{noise, samples};
+    use crate::coherence::Direction;
+    use crate::slow_samples::tests::{first, noise, samples};
     use dragfree_estimation::spectra::Plan;
 
     /// Housekeeping without sums of segments: what is fast is told by nothing.
     fn none(names: usize) -> HousekeepingCoherence {
         let named = (0..names).map(|i| format!("hk/{i}")).collect();
-        let mut coherence =
-            HousekeepingCoherence::new(named, &Plan::new(1024, 1.0), DMatrix::identity(2, 2), Vec::new());
+        let places = Direction::of_channels(&[("a", ""), ("b", "")]);
+        let (plan, same) = (Plan::new(1024, 1.0), DMatrix::identity(2, 2));
+        let mut coherence = HousekeepingCoherence::new(named, Vec::new(), &plan, same, Vec::new(), places);
         coherence.level = vec![0.0; names];
         coherence
     }
@@ -386,8 +477,10 @@ mod tests {
         assert!(matches!(found[0].driver, Driver::Square(1)), "{found:?}");
         let expression = all.expression(found[0].driver, Memory::Lag(120.0), &housekeeping);
         assert_eq!(expression, "lag(hk.1^2 - 0.000000e0, 120.0)");
-        assert_eq!(all.unit_of_amplitude(found[0].driver, Memory::None), "m s-2 A-2");
-        assert_eq!(all.unit_of_amplitude(Driver::Derivative(0), Memory::Integral), "m s-2 A-1");
+        assert_eq!(all.unit_of_amplitude("m s-2", found[0].driver, Memory::None), "m s-2 A-2");
+        assert_eq!(all.unit_of_amplitude("m s-2", Driver::Derivative(0), Memory::Integral), "m s-2 A-1");
+        assert_eq!(all.unit_of_amplitude("N", Driver::Derivative(0), Memory::None), "N s A-1");
+        assert_eq!(all.unit_of_amplitude("A", Driver::Value(0), Memory::None), "1");
     }
 
     /// Without a force the gain of one function is χ² of one degree of freedom, so that its mean over 300 sets is one:
@@ -398,9 +491,9 @@ mod tests {
             let cause = wave(1.7, 0.1 * seed as f64);
             let all = samples(seed, 6.0, |t| size * cause(t), &[], &[&cause]);
             let (thin, means_s) = all.thinned();
-            let whitened = thin.whitened(0, &noise(), &means_s).expect("a covariance");
+            let whitened = thin.whitened(&first(), &noise(), &means_s).expect("a covariance");
             let housekeeping = none(1);
-            let search = Search { samples: &thin, housekeeping: &housekeeping, channel: 0, whitened, chance: 0.0 };
+            let search = Search::new(&thin, &housekeeping, 0, whitened, 0.0);
             search.gains(&[(Driver::Value(0), Memory::None)])[0].fitted
         };
         let mean = |size: f64| (0..300).map(|seed| gain(seed, size)).sum::<f64>() / 300.0;

@@ -663,7 +663,7 @@ mod tests {
         let residual = DMatrix::from_fn(2, 3, |i, j| f64::from(u8::from(i == j)));
         let coherence = |plan: &Plan| {
             let whitening = vec![DMatrix::identity(2, 2); plan.bands.len()];
-            HousekeepingCoherence::new(Vec::new(), plan, residual.clone(), whitening)
+            HousekeepingCoherence::new(Vec::new(), Vec::new(), plan, residual.clone(), whitening, Vec::new())
         };
         let search = Search::new(Vec::new(), residual.clone(), Vec::new());
         let mut gatherer = GramAccumulator::new(columns, LENGTH, 1.0, 1, coherence, search, LineSearch::nowhere());

@@ -3,7 +3,8 @@
 //! A slow cause shows most below the lowest frequency of the segments of [`crate::gram`], where heat, currents and what
 //! they heat change from hour to hour. Here all of it is kept as samples a hundred seconds apart. A channel is taken
 //! given the others, `y = gᵀ r` with `g = Σ⁻¹ e_c / (Σ⁻¹)_cc`: the thrusters' noise, which moves all test masses, is
-//! gone from it, and a force along the channel is not. With the covariance of its declared noise the amplitude of a
+//! gone from it, and a force along the channel is not. Of a force that enters the channels along another direction d
+//! it is `g = Σ⁻¹ d / (dᵀΣ⁻¹d)`. With the covariance of its declared noise the amplitude of a
 //! series is that of generalised least squares beside powers of time. Gaps separate stretches, which are taken as
 //! independent.
 
@@ -189,14 +190,16 @@ impl SlowSamples {
         (thin, vec![self.step_s, step_s])
     }
 
-    /// A channel given the others, whitened; none where its noise is unknown or there are too few samples.
-    pub(crate) fn whitened(&self, channel: usize, noise: &NoiseModel, means_s: &[f64]) -> Option<Whitened> {
+    /// A force that enters the channels along a direction, given what else is in them, whitened; none where the noise
+    /// is unknown or there are too few samples.
+    pub(crate) fn whitened(&self, along: &DVector<f64>, noise: &NoiseModel, means_s: &[f64]) -> Option<Whitened> {
         let longest = self.products.iter().flatten().map(Stretch::len).max()?;
         // The combination that is quietest in the middle of the frequencies, in their logarithm.
         let length_s = longest as f64 * self.step_s;
         let middle_hz = (2.0 * length_s * self.step_s).sqrt().recip();
         let inverse = noise.psd(middle_hz).cholesky()?.inverse();
-        let gains = inverse.column(channel) / inverse[(channel, channel)];
+        let gains = &inverse * along;
+        let gains = &gains / along.dot(&gains);
         let covariance = self.covariance(&gains, noise, longest, means_s);
         let factor_of = |n: usize| {
             let toeplitz = DMatrix::from_fn(n, n, |i, j| covariance[i.abs_diff(j)]);
@@ -268,7 +271,8 @@ impl SlowSamples {
         }
         let mut chosen = Vec::new();
         for (channel, places) in by_channel {
-            let Some(mut whitened) = thin.whitened(channel, noise, &means_s) else { continue };
+            let along = DVector::from_fn(set.channels.len(), |c, _| f64::from(u8::from(c == channel)));
+            let Some(mut whitened) = thin.whitened(&along, noise, &means_s) else { continue };
             let parts = added.iter().flat_map(|c| &c.parts).map(|(_, form)| form);
             let acting: Vec<DVector<f64>> = parts.filter_map(|form| thin.acting(form, &whitened.gains)).collect();
             if !acting.is_empty() {
@@ -433,6 +437,11 @@ pub(crate) mod tests {
         NoiseModel::new(&[both, each], &["a".to_owned(), "b".to_owned()], IN_S).expect("a noise model")
     }
 
+    /// The first of the two channels.
+    pub(crate) fn first() -> DVector<f64> {
+        DVector::from_vec(vec![1.0, 0.0])
+    }
+
     /// Two channels of that noise, to which `force` is added in the first, and series as columns after them.
     pub(crate) fn samples(
         seed: u64,
@@ -474,7 +483,7 @@ pub(crate) mod tests {
         let (mut squares, mut products, mut n) = (0.0, 0.0, 0.0);
         for seed in 0..20 {
             let (thin, means_s) = samples(seed, 12.0, |_| 0.0, &[], &[]).thinned();
-            let whitened = thin.whitened(0, &noise(), &means_s).expect("a covariance");
+            let whitened = thin.whitened(&first(), &noise(), &means_s).expect("a covariance");
             squares += whitened.y.norm_squared();
             n += (whitened.y.len() - POWERS) as f64;
             products += whitened.y.as_slice().windows(2).map(|w| w[0] * w[1]).sum::<f64>();

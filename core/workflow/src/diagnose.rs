@@ -26,8 +26,8 @@ use crate::answer::{
 };
 use crate::extract::Extract;
 use crate::likelihood::{Decided, PASSES, Point, Settled, moved, one_pass, step, step_of_model, transients_near_ends};
-use crate::proposals::{FORMULA, Proposal, proposals};
-use crate::replay::{FINE, Pass, Replay, What, sum};
+use crate::proposals::{FORMULA, Proposal, probes, proposals};
+use crate::replay::{FINE, Forms, Pass, Replay, What, sum};
 
 /// A diagnosis and the sums that chose the forms of the candidates.
 pub struct Diagnosed {
@@ -60,10 +60,11 @@ pub fn diagnose(
     let near_ends = transients_near_ends(replay, &mut found, progress)?;
     let of_lines: Vec<EffectEntry> = lines.found.iter().map(entry_of).collect();
     let detected = Detected::new(&found, &near_ends, settings);
-    let mut gather = |requests: &[RefinementRequest], proposals: &[Proposal]| {
+    let mut gather = |requests: &[RefinementRequest], proposals: &[Proposal], probes: &[EffectEntry]| {
         let proposed = proposals.iter().map(|p| p.entry.clone());
-        let entries: Vec<EffectEntry> = of_lines.iter().cloned().chain(proposed).collect();
-        let mut record = sum(replay, settings, What::Candidates(&detected.all, requests, &entries), progress)?;
+        let chosen: Vec<EffectEntry> = of_lines.iter().cloned().chain(proposed).collect();
+        let forms = Forms { detected: &detected.all, requests, chosen: &chosen, probes };
+        let mut record = sum(replay, settings, What::Candidates(&forms), progress)?;
         record.gathered.transients = found.clone();
         record.gathered.lines = lines.clone();
         let noise = record.noise_model()?;
@@ -73,7 +74,7 @@ pub fn diagnose(
         };
         Ok::<_, WorkflowError>((record, noise, screened))
     };
-    let (mut record, mut noise, mut screened) = gather(&[], &[])?;
+    let (mut record, mut noise, mut screened) = gather(&[], &[], &probes(replay.registry))?;
     let mut tried = screened.tried.clone();
     let mut requests = screened.requests.clone();
     requests.retain(|request| has_parameter(replay.registry, &request.effect, FINE));
@@ -82,7 +83,7 @@ pub fn diagnose(
         tried.retain(|effect, _| requests.iter().any(|request| request.effect == *effect));
         // Sums are large, and these are made again.
         drop(record);
-        (record, noise, screened) = gather(&requests, &proposals)?;
+        (record, noise, screened) = gather(&requests, &proposals, &[])?;
         for (effect, forms) in &screened.tried {
             *tried.entry(effect.clone()).or_default() += forms;
         }

@@ -1,19 +1,30 @@
-//! Formulas that are proposed for a force that no effect of the library knows: accelerations of a test mass that follow
-//! a function of housekeeping. They compete with the library in the likelihood as candidates do.
+//! Formulas that are proposed for a force that no effect of the library knows: of a test mass, or a force or torque on
+//! the spacecraft, that follows a function of housekeeping, or the product of housekeeping with a command or a
+//! displacement. They compete with the library in the likelihood as candidates do.
 
 use dragfree_engine::border::Kind;
 use dragfree_engine::config::EffectEntry;
+use dragfree_engine::registry::Registry;
+use dragfree_identification::driven::Driven;
 use dragfree_identification::record::Record;
 
 use crate::WorkflowError;
 use crate::replay::Replay;
+use crate::sums::ACTS_ON;
 
 /// The effect that states them.
 pub(crate) const FORMULA: &str = "formula";
 
-/// Root mean square of the largest acceleration for which a formula may stand, m s⁻²: that of `thermal` at the end of
-/// its range where a temperature difference varies by 10 mK.
+/// Root mean square of the largest acceleration of a test mass for which a formula may stand, m s⁻²: that of `thermal`
+/// at the end of its range where a temperature difference varies by 10 mK.
 const MOST_M_S2: f64 = 1e-11;
+
+/// The same of a force on the spacecraft, N, and of a torque, N m: micronewtons, as of gas that leaks or a valve that
+/// follows the temperature, at arms of a metre.
+const MOST_N: f64 = 3e-6;
+
+/// The same of the change of an actuator's gain: that of the gains in the library.
+const MOST_GAIN: f64 = 0.3;
 
 /// A formula, and its driver in words.
 #[derive(Clone, Debug)]
@@ -26,55 +37,99 @@ pub(crate) struct Proposal {
     pub(crate) words: String,
 }
 
-/// Formulas for the residuals of the model, and how many were tried. A product comes with its two factors, since where
-/// each is zero is not known.
+/// Formulas on the spacecraft that say how a force or torque there enters the channels.
+pub(crate) fn probes(registry: &Registry) -> Vec<EffectEntry> {
+    if registry.find(Kind::Effect, FORMULA).is_err() {
+        return Vec::new();
+    }
+    let axes = ["force", "torque"].into_iter().flat_map(|what| ["x", "y", "z"].map(|axis| format!("sc.{what}.{axis}")));
+    axes.map(|acts_on| {
+        let instance = format!("probe_{}", acts_on.replace('.', "_"));
+        entry(&instance, &acts_on, "1", "1", 1.0)
+    })
+    .collect()
+}
+
+/// The model's entry of a formula.
+fn entry(instance: &str, acts_on: &str, expression: &str, unit: &str, most: f64) -> EffectEntry {
+    let mut entry = EffectEntry::new(FORMULA, instance);
+    let text = |text: &str| toml::Value::from(text);
+    entry.parameters.extend([
+        (ACTS_ON.to_owned(), text(acts_on)),
+        ("expression".to_owned(), text(expression)),
+        ("unit".to_owned(), text(unit)),
+        ("range".to_owned(), toml::Value::from(vec![-most, most])),
+    ]);
+    entry
+}
+
+/// Formulas for the residuals of the model, and how many were tried. A product comes with its factor or factors, since
+/// where each is zero is not known.
 ///
 /// # Errors
 /// A declaration of noise contradicts itself.
 pub(crate) fn proposals(replay: &Replay<'_>, record: &Record) -> Result<(Vec<Proposal>, usize), WorkflowError> {
     let (slow, housekeeping) = (&record.gathered.slow, &record.gathered.housekeeping);
     let channels = &record.candidate_set.channels;
-    let own: Vec<usize> = (0..channels.len()).filter(|c| acts_on(&channels[*c])).collect();
-    let mut all = Vec::new();
+    let name = |place: usize| &housekeeping.places[place].name;
+    let on_spacecraft = channels.len()..housekeeping.places.len();
+    let own = (0..channels.len()).filter(|channel| is_of_test_mass(name(*channel)));
+    let places: Vec<usize> = own.chain(on_spacecraft).collect();
+    let mut all: Vec<Proposal> = Vec::new();
     if replay.registry.find(Kind::Effect, FORMULA).is_err() {
         return Ok((all, 0));
     }
-    let mut with_factors = true;
-    for driven in slow.driven(&own, &record.noise_model()?, housekeeping) {
-        let channel = &channels[driven.channel];
-        let factors = if with_factors { driven.driver.factors() } else { Vec::new() };
-        with_factors &= factors.is_empty();
-        for driver in [driven.driver].into_iter().chain(factors) {
-            let expression = slow.expression(driver, driven.memory, housekeeping);
-            let rms = slow.rms(driver, driven.memory, housekeeping);
-            if !readable(&expression) || rms <= 0.0 {
-                continue;
-            }
+    let mut factors_of = Vec::new();
+    for driven in slow.driven(&places, &record.noise_model()?, housekeeping) {
+        let factors = driven.driver.factors();
+        let kind = std::mem::discriminant(&driven.driver);
+        // Those of the best product of each kind.
+        let with_factors = !factors.is_empty() && !factors_of.contains(&kind);
+        factors_of.extend(with_factors.then_some(kind));
+        for driver in [driven.driver].into_iter().chain(factors.into_iter().filter(|_| with_factors)) {
+            let driven = Driven { driver, ..driven };
             let taken = |name: &String| {
                 let of_model = record.candidate_set.coefficients.iter();
                 let mut taken = of_model.filter(|c| c.effect == FORMULA).map(|c| &c.instance);
-                taken.any(|own| own == name) || all.iter().any(|p: &Proposal| p.entry.instance == *name)
+                taken.any(|own| own == name) || all.iter().any(|p| p.entry.instance == *name)
             };
-            let plain = channel.replace('.', "_");
+            let plain = name(driven.place).replace('.', "_");
             let mut numbered = (1..).map(|k| if k == 1 { plain.clone() } else { format!("{plain}_{k}") });
             let Some(instance) = numbered.find(|name| !taken(name)) else { continue };
-            let mut entry = EffectEntry::new(FORMULA, &instance);
-            let most = MOST_M_S2 / rms;
-            let text = |text: &str| toml::Value::from(text);
-            entry.parameters.extend([
-                ("acts_on".to_owned(), text(channel)),
-                ("expression".to_owned(), text(&expression)),
-                ("unit".to_owned(), text(&slow.unit_of_amplitude(driver, driven.memory))),
-                ("range".to_owned(), toml::Value::from(vec![-most, most])),
-            ]);
-            all.push(Proposal { entry, driver: slow.label(driver), words: format!("{expression} on {channel}") });
+            all.extend(proposal(record, &driven, name(driven.place), &instance));
         }
     }
-    Ok((all, slow.functions(housekeeping) * own.len()))
+    Ok((all, slow.functions(&places, housekeeping)))
+}
+
+/// The proposal of a function at a place; none where it does not change or cannot be written.
+fn proposal(record: &Record, driven: &Driven, place: &str, instance: &str) -> Option<Proposal> {
+    let (slow, housekeeping) = (&record.gathered.slow, &record.gathered.housekeeping);
+    let &Driven { driver, memory, .. } = driven;
+    let expression = slow.expression(driver, memory, housekeeping);
+    let on_test_mass = is_of_test_mass(place);
+    let (rms, rms_of_factor) = (slow.rms(driver, memory, housekeeping), slow.rms_of_factor(driver, housekeeping));
+    let (acts_on, of, most, rms) = match (slow.unit_of_known(driver), on_test_mass) {
+        // A gain, of which the factor alone changes.
+        (Some("N"), true) => (place.replace("accel", "force"), "N", MOST_GAIN, rms_of_factor),
+        (Some("N" | "N m"), false) => (place.to_owned(), unit_at(place), MOST_GAIN, rms_of_factor),
+        (_, true) => (place.to_owned(), "m s-2", MOST_M_S2, rms),
+        (_, false) => (place.to_owned(), unit_at(place), MOST_N, rms),
+    };
+    (readable(&expression) && rms > 0.0).then(|| Proposal {
+        entry: entry(instance, &acts_on, &expression, &slow.unit_of_amplitude(of, driver, memory), most / rms),
+        driver: slow.label(driver),
+        words: format!("{expression} on {acts_on}"),
+    })
+}
+
+/// Unit of what acts on the spacecraft.
+fn unit_at(place: &str) -> &'static str {
+    if place.contains(".torque.") { "N m" } else { "N" }
 }
 
 /// Whether a channel is the acceleration of a test mass along an axis, which a formula names as the channel is named.
-fn acts_on(channel: &str) -> bool {
+fn is_of_test_mass(channel: &str) -> bool {
     matches!(channel.split('.').collect::<Vec<_>>()[..], [_, "accel", _])
 }
 

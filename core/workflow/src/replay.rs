@@ -64,9 +64,21 @@ pub(crate) enum What<'a> {
     Model,
     /// Nothing but transients and lines.
     Transients,
-    /// Every candidate: transients at these times, in fine steps about these shapes what can be tried so, and these
-    /// effects in the form that they state.
-    Candidates(&'a [Detection], &'a [RefinementRequest], &'a [EffectEntry]),
+    /// Every candidate.
+    Candidates(&'a Forms<'a>),
+}
+
+/// Forms in which candidates are tried.
+#[derive(Clone, Copy)]
+pub(crate) struct Forms<'a> {
+    /// Transients at these times.
+    pub(crate) detected: &'a [Detection],
+    /// In fine steps about these shapes what can be tried so.
+    pub(crate) requests: &'a [RefinementRequest],
+    /// These effects in the form that they state.
+    pub(crate) chosen: &'a [EffectEntry],
+    /// Effects that say how a driven force enters the channels ([`Request::probes`]).
+    pub(crate) probes: &'a [EffectEntry],
 }
 
 impl What<'_> {
@@ -74,7 +86,7 @@ impl What<'_> {
         match self {
             Self::Model => Pass::Residuals,
             Self::Transients => Pass::Transients,
-            Self::Candidates(..) => Pass::Candidates,
+            Self::Candidates(_) => Pass::Candidates,
         }
     }
 }
@@ -116,9 +128,9 @@ pub(crate) fn sum(
             What::Transients => {
                 all.retain(|e| [AT_NS, FREQUENCY_HZ].iter().any(|name| has_parameter(registry, &e.id, name)));
             }
-            What::Candidates(_, requests, _) => {
+            What::Candidates(forms) => {
                 all.retain(|e| !has_parameter(registry, &e.id, FREQUENCY_HZ));
-                for request in requests {
+                for request in forms.requests {
                     let of = |e: &&mut EffectEntry| (&e.id, &e.instance) == (&request.effect, &request.instance);
                     for entry in all.iter_mut().filter(of) {
                         let value = |v| toml::Value::try_from(v).ok();
@@ -129,18 +141,20 @@ pub(crate) fn sum(
                 }
             }
         }
+        let forms = if let What::Candidates(forms) = what { Some(forms) } else { None };
+        let probes = forms.map_or(&[][..], |forms| forms.probes);
         let request = Request {
             only_transients: matches!(what, What::Transients),
-            detected: if let What::Candidates(detected, ..) = what { Some(detected) } else { None },
+            detected: forms.map(|forms| forms.detected),
             reference: equations.is_file().then_some(equations.as_path()),
+            probes,
             threads,
         };
-        let candidates = all;
         let examination = Examination {
             product,
             sources: &sources,
-            candidates,
-            chosen: if let What::Candidates(.., chosen) = what { chosen.to_vec() } else { Vec::new() },
+            candidates: all,
+            chosen: forms.map_or_else(Vec::new, |forms| [forms.chosen, probes].concat()),
             needs: &[],
             values: &levels,
             altered: None,
@@ -150,7 +164,8 @@ pub(crate) fn sum(
         let link = |chain: &Chain| ColumnSums::link(&request, chain, settings);
         let (sums, not_tried) = examine(registry, &examination, link, &mut |p| progress(what.pass(), number, p))?;
         let mut record = sums.record();
-        record.not_tried.extend(not_tried);
+        let is_probe = |name: &String| probes.iter().any(|p| *name == format!("{}:{}", p.id, p.instance));
+        record.not_tried.extend(not_tried.into_iter().filter(|(name, _)| !is_probe(name)));
         match &mut whole {
             Some(sum) => sum.add(&record)?,
             None => whole = Some(record),

@@ -7,6 +7,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use dragfree_engine::chain::{Chain, Sink};
+use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{FREQUENCY_HZ, Wanted};
 use dragfree_estimation::decimate::SLOW_HZ;
 use dragfree_estimation::estimate::{Method, Observed, Refinement, estimate_with};
@@ -15,19 +16,25 @@ use dragfree_estimation::sigma::{BandNoise, NoiseModel};
 use dragfree_estimation::spectra::{LONG, Plan};
 use dragfree_estimation::stored::Stored;
 use dragfree_identification::candidates::{CandidateSet, Coefficient as Unknown, Form, Rule, Term};
-use dragfree_identification::coherence::HousekeepingCoherence;
+use dragfree_identification::coherence::{Direction, HousekeepingCoherence};
 use dragfree_identification::gram::{Columns, GramAccumulator};
 use dragfree_identification::lines::{LineSearch, Place};
 use dragfree_identification::record::Record;
 use dragfree_identification::transient::{Detection, Search, Template};
 use dragfree_identification::waveform::Waveform;
 use dragfree_schema::{Available, Coefficient, Column, Constraint, NoiseProcess, Response, Settings, Shape, Variant};
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DVector};
 
 use crate::WorkflowError;
 
 /// How often Σ is measured from the residuals of the reference.
 const REFINEMENTS: usize = 3;
+
+/// Shape parameter of a probe: where it acts.
+pub(crate) const ACTS_ON: &str = "acts_on";
+
+/// Frame of forces and torques on the spacecraft.
+const SPACECRAFT_FRAME: &str = "SRF";
 
 /// The table of columns that no plugin makes: waveforms that begin at a detection.
 const WAVEFORMS: &str = "waveforms";
@@ -40,6 +47,10 @@ pub(crate) struct Request<'a> {
     pub(crate) detected: Option<&'a [Detection]>,
     /// Normal equations of the product: residuals for the matched filters and for the coherences.
     pub(crate) reference: Option<&'a Path>,
+    /// Effect and instance of candidates that are no candidates: how they respond says how a force enters the
+    /// channels that a function of housekeeping may drive. Where there are any, products of housekeeping with commands
+    /// and displacements are drivers too.
+    pub(crate) probes: &'a [EffectEntry],
     /// Threads; results do not depend on them.
     pub(crate) threads: usize,
 }
@@ -87,11 +98,16 @@ fn finite(x: f64) -> Option<f64> {
     x.is_finite().then_some(x)
 }
 
-/// What the chain has, as a plugin behind the effects would see it.
-fn available(chain: &Chain) -> Available {
+fn is_of(coefficient: &Coefficient, entries: &[EffectEntry]) -> bool {
+    let own = (&coefficient.effect, &coefficient.instance);
+    coefficient.candidate && entries.iter().any(|e| (&e.id, &e.instance) == own)
+}
+
+/// What the chain has, as a plugin behind the effects would see it, `without` some candidates.
+fn available(chain: &Chain, without: &[EffectEntry]) -> Available {
     Available {
         columns: chain.columns.clone(),
-        coefficients: chain.coefficients.clone(),
+        coefficients: chain.coefficients.iter().filter(|c| !is_of(c, without)).cloned().collect(),
         constraints: chain.constraints.clone(),
         noise: chain.noise.clone(),
     }
@@ -107,7 +123,7 @@ impl ColumnSums {
         chain: &Chain,
         settings: &Settings,
     ) -> Result<Wanted<Self>, WorkflowError> {
-        let available = available(chain);
+        let available = available(chain, request.probes);
         let channels: Vec<&Column> = available.of_kind("channel").collect();
         let Some(rate_hz) = channels.first().map(|c| c.rate_hz) else {
             return Err(WorkflowError::NoChannel);
@@ -118,9 +134,12 @@ impl ColumnSums {
         let sorted = Series::sort(&available, &channels, request.only_transients, &waveforms)?;
         let housekeeping: Vec<&Column> =
             available.columns.iter().filter(|c| c.table == "grid" && c.name.starts_with("hk.")).collect();
+        let known: Vec<&Column> =
+            available.columns.iter().filter(|c| !request.probes.is_empty() && is_known(c)).collect();
+        let drivers = || housekeeping.iter().chain(&known);
         let of = |c: &&Column| (c.table.clone(), c.name.clone());
         let series = sorted.keys.iter().filter(|(table, _)| table != WAVEFORMS).cloned();
-        let keys = channels.iter().map(of).chain(series).chain(housekeeping.iter().map(of));
+        let keys = channels.iter().map(of).chain(series).chain(drivers().map(of));
         let place = |(table, name): (String, String)| {
             let at = available.columns.iter().position(|c| c.table == table && c.name == name);
             at.ok_or(WorkflowError::NoColumn { table, name })
@@ -136,12 +155,16 @@ impl ColumnSums {
             base: channels.len() + sorted.base,
             fast: channels.len() + sorted.fast,
             energy: waveforms.iter().map(|c| c.energy(&plan, differenced.contains(&true))).collect(),
-            housekeeping_units: housekeeping.iter().map(|c| c.unit.clone()).collect(),
+            housekeeping_units: drivers().map(|c| c.unit.clone()).collect(),
         };
         let candidate_set = candidate_set(&available, &channels, &sorted, &waveforms);
         let residual = residual(request.reference, &candidate_set, &channels, &all, length, settings)?;
         // As they are called in telemetry: `hk/battery_current_a`.
-        let topics: Vec<String> = housekeeping.iter().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
+        let topics: Vec<String> = drivers().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
+        let own: Vec<(&str, &str)> = channels.iter().map(|c| (name_of(c), c.frame.as_str())).collect();
+        let mut forces = Direction::of_channels(&own);
+        forces.extend(directions(chain, request.probes, &channels));
+        let known = known.iter().map(|c| c.frame.clone()).collect();
         let noise = NoiseModel::new(&available.noise, &candidate_set.channels, 1.0 / rate_hz)?;
         let declared = Arc::new(noise);
         let inverse = move |hz: f64| {
@@ -160,7 +183,7 @@ impl ColumnSums {
         let line_search = LineSearch::new(places, residual.clone(), Arc::new(inverse.clone()), step_ns);
         let coherence = |plan: &Plan| {
             let whitening = plan.bands.iter().map(|b| inverse(plan.frequency_hz(*b))).collect();
-            HousekeepingCoherence::new(topics, plan, residual, whitening)
+            HousekeepingCoherence::new(topics, known, plan, residual, whitening, forces)
         };
         let width = wanted.len() + waveforms.len();
         let averaged: Vec<bool> =
@@ -488,6 +511,28 @@ fn candidate_set(available: &Available, channels: &[&Column], series: &Series, w
             .collect(),
         rules: available.constraints.iter().map(rule).collect(),
     }
+}
+
+/// Whether a column is a command or a displacement: what may act in proportion to housekeeping.
+fn is_known(column: &Column) -> bool {
+    column.table == "reconstruction" && ["N", "N m", "m"].contains(&column.unit.as_str())
+}
+
+/// How forces enter the channels, as probes respond: each by the place that it states. What acts through a coefficient
+/// of the model is a small part of it, and left out.
+fn directions(chain: &Chain, probes: &[EffectEntry], channels: &[&Column]) -> Vec<Direction> {
+    let direction = |c: &Coefficient| {
+        let mut response = DVector::zeros(channels.len());
+        for r in c.responses.iter().filter(|r| r.times.is_none()) {
+            if let Some(channel) = channels.iter().position(|c| name_of(c) == r.channel) {
+                response[channel] += r.factor;
+            }
+        }
+        let name = c.shape.get(ACTS_ON)?.as_str()?.to_owned();
+        let frame = SPACECRAFT_FRAME.to_owned();
+        (response.norm_squared() > 0.0).then_some(Direction { name, frame, response })
+    };
+    chain.coefficients.iter().filter(|c| is_of(c, probes)).filter_map(direction).collect()
 }
 
 /// Where a line may act: candidates of one frequency, which respond to both phases alike.

@@ -71,7 +71,20 @@ pub(super) const KINDS: &[Kind] = &[
             }))
         },
     },
+    Kind {
+        id: "field-force",
+        places: tm_axes,
+        size: Number::new("m s-2 T-2", -1e3, 1e3),
+        help: "SIZE times the square of the magnetic field along the axis",
+        shape: &[],
+        build: |request, _| Ok(Lagged::boxed(request, |inside, tm, axis| field_t(inside, tm, axis).powi(2))),
+    },
 ];
+
+/// Field at a test mass along an axis, T.
+fn field_t(inside: &Interior, tm: usize, axis: usize) -> f64 {
+    inside.interplanetary_t[axis] + inside.units_field[tm] * of_housing(&FIELD_T, tm)[axis]
+}
 
 /// A force proportional to a quantity of the interior behind a first-order lag.
 struct Lagged {

@@ -55,7 +55,7 @@ struct Topic {
     metadata: &'static [(&'static str, &'static str)],
 }
 
-const TOPICS: [Topic; 13] = [
+const TOPICS: [Topic; 16] = [
     Topic { name: "/is", message: "InertialSensors", encoding: "protobuf", metadata: &[] },
     Topic { name: "/ifo", message: "Interferometers", encoding: "protobuf", metadata: &[] },
     Topic { name: "/dws", message: "Dws", encoding: "protobuf", metadata: &[] },
@@ -89,9 +89,14 @@ const TOPICS: [Topic; 13] = [
         encoding: "protobuf",
         metadata: &[("unit", "K"), ("place", "panel"), ("rate_hz", "0.1")],
     },
+    Topic { name: "/hk/boom_bx_t", message: "Scalar", encoding: "protobuf", metadata: MAGNETOMETER },
+    Topic { name: "/hk/boom_by_t", message: "Scalar", encoding: "protobuf", metadata: MAGNETOMETER },
+    Topic { name: "/hk/boom_bz_t", message: "Scalar", encoding: "protobuf", metadata: MAGNETOMETER },
 ];
-/// Topics of a file without the power system's.
+/// Topics of a file without those of the power system and the magnetometer.
 const WITHOUT_POWER: usize = 11;
+
+const MAGNETOMETER: &[(&str, &str)] = &[("unit", "T"), ("place", "boom"), ("rate_hz", "0.1")];
 
 const THERMOMETER: &[(&str, &str)] = &[("unit", "K"), ("place", "somewhere"), ("rate_hz", "0.1")];
 
@@ -136,7 +141,7 @@ pub struct Recorder {
     written: u64,
     out: Vec<u8>,
     container: Container,
-    /// Whether current and panel temperature of the power system are telemetered.
+    /// Whether current and panel temperature of the power system, and the magnetic field, are telemetered.
     power: bool,
     /// Messages of the open chunk, with times and positions per channel.
     open: Vec<u8>,
@@ -149,8 +154,8 @@ pub struct Recorder {
 }
 
 impl Recorder {
-    /// A new file with its definitions; `power` tells whether current and panel temperature of the power system are
-    /// telemetered.
+    /// A new file with its definitions; `power` tells whether current and panel temperature of the power system, and
+    /// the magnetic field, are telemetered.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -214,6 +219,9 @@ impl Recorder {
             }
             if self.power {
                 self.message(12, time_ns, &wire::scalar(r.panel_k))?;
+                for (i, b) in r.field_t.into_iter().enumerate() {
+                    self.message(13 + i, time_ns, &wire::scalar(b))?;
+                }
             }
         }
         Ok(())

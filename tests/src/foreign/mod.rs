@@ -11,5 +11,5 @@ mod wire;
 pub use draw::{Acted, Draw, KINDS, Levels};
 pub use file::{Container, PERIOD_NS, Recorder, write};
 pub use spacecraft::{
-    Blow, Flight, HEAT_LAG_S, Heat, Hidden, Line, Loops, Matrix, Record, Spacecraft, Start, Variation, fly,
+    Blow, Flight, Gain, HEAT_LAG_S, Heat, Hidden, Line, Loops, Matrix, Record, Spacecraft, Start, Variation, fly,
 };

@@ -98,6 +98,12 @@ pub struct Hidden {
     /// Acceleration by the product of bus current and panel temperature, each about its mean: test mass, axis,
     /// m s⁻² A⁻¹ K⁻¹.
     pub current_by_panel: Option<(usize, usize, f64)>,
+    /// Acceleration by the squares of the magnetic field's components: test mass, axis, m s⁻² T⁻² of each.
+    pub field_squared: Option<(usize, usize, [f64; 3])>,
+    /// Part of the commanded force that acts too little or too much, per kelvin of the panel above its mean, K⁻¹.
+    pub gain_by_panel: Option<Gain>,
+    /// Force on the spacecraft by the bus current: axis of SRF, N A⁻¹.
+    pub current_on_spacecraft: Option<(usize, f64)>,
     /// Sinusoidal force on the spacecraft.
     pub line: Option<Line>,
 }
@@ -121,6 +127,9 @@ impl Hidden {
         is_noise: [[1.0; 3]; 2],
         current_squared: None,
         current_by_panel: None,
+        field_squared: None,
+        gain_by_panel: None,
+        current_on_spacecraft: None,
         line: None,
     };
 }
@@ -170,6 +179,17 @@ pub struct Line {
     pub hz: f64,
 }
 
+/// A gain that follows the temperature of the solar panel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Gain {
+    /// The electrodes of this test mass, along an axis of ORF; otherwise the thrusters, along an axis of SRF.
+    pub test_mass: Option<usize>,
+    /// Axis.
+    pub axis: usize,
+    /// Gain error per kelvin above the mean, K⁻¹.
+    pub per_k: f64,
+}
+
 /// Usual lag between thermometer and force, s.
 pub const HEAT_LAG_S: f64 = 700.0;
 /// Mean of the bus current, A; relaxation time of its slow part, s, and its standard deviation, A; height, A, and mean
@@ -183,6 +203,10 @@ const LOAD_S: f64 = 1200.0;
 const PANEL_K: f64 = 310.0;
 const PANEL_S: f64 = 4000.0;
 const PANEL_SLOW_K: f64 = 1.0;
+/// Mean of the magnetic field, SRF, T; relaxation time, s, and standard deviation of each component, T.
+const FIELD_T: [f64; 3] = [1e-7, -2e-7, 1.5e-7];
+const FIELD_S: f64 = 1500.0;
+const FIELD_SLOW_T: f64 = 2e-7;
 /// Relaxation time of the temperatures, s, and their standard deviation, K.
 const HEAT_S: f64 = 1500.0;
 const HEAT_K: f64 = 0.03;
@@ -245,6 +269,8 @@ pub struct Record {
     pub bus_a: f64,
     /// Temperature of the solar panel, K.
     pub panel_k: f64,
+    /// Magnetic field, SRF, T.
+    pub field_t: [f64; 3],
 }
 
 /// xorshift64* and Box–Muller.
@@ -376,11 +402,13 @@ pub struct Spacecraft {
     weather: Dice,
     power: Dice,
     strays: Dice,
+    magnet: Dice,
     temperature_k: [f64; 3],
     felt_k: f64,
     bus_slow_a: f64,
     load_on: bool,
     panel_slow_k: f64,
+    field_slow_t: [f64; 3],
     /// Momentum that is still to be transferred to a test mass, N s.
     left_n_s: f64,
     /// Samples, those before the first recorded one included.
@@ -409,11 +437,13 @@ impl Spacecraft {
             weather: stream(1),
             power: stream(2),
             strays: stream(3),
+            magnet: stream(4),
             temperature_k: [0.0; 3],
             felt_k: 0.0,
             bus_slow_a: 0.0,
             load_on: false,
             panel_slow_k: 0.0,
+            field_slow_t: [0.0; 3],
             left_n_s: 0.0,
             k: 0,
             settle,
@@ -464,6 +494,20 @@ impl Spacecraft {
         self.load_on ^= self.power.uniform() < DT_S / LOAD_S;
         record.bus_a = self.bus_a() + 1e-3 * self.power.normal();
         record.panel_k = PANEL_K + self.panel_slow_k + 1e-3 * self.power.normal();
+        for b in &mut self.field_slow_t {
+            *b = self.magnet.relax(*b, FIELD_S, FIELD_SLOW_T);
+        }
+        record.field_t = self.field_t().map(|b| b + 2e-9 * self.magnet.normal());
+    }
+
+    fn field_t(&self) -> [f64; 3] {
+        std::array::from_fn(|a| FIELD_T[a] + self.field_slow_t[a])
+    }
+
+    /// Gain error of the electrodes of a test mass, or of the thrusters, along an axis now.
+    fn gain_now(&self, test_mass: Option<usize>, axis: usize) -> f64 {
+        let own = self.flight.hidden.gain_by_panel.filter(|g| (g.test_mass, g.axis) == (test_mass, axis));
+        own.map_or(0.0, |gain| gain.per_k * self.panel_slow_k)
     }
 
     fn bus_a(&self) -> f64 {
@@ -489,9 +533,12 @@ impl Spacecraft {
         let days = self.time_s() / 86_400.0;
         let mut force: [f64; 3] = std::array::from_fn(|a| {
             let noise = hidden.thrust_noise[a] * self.dice.white(flight.thrust_n);
-            let gain = hidden.thrust_gain[a] + hidden.thrust_gain_per_day[a] * days;
+            let gain = hidden.thrust_gain[a] + hidden.thrust_gain_per_day[a] * days + self.gain_now(None, a);
             record.force_n[a] + sunlight[a] + noise + gain * record.force_n[a] + turned[a]
         });
+        if let Some((axis, per_a)) = hidden.current_on_spacecraft {
+            force[axis] += per_a * (self.bus_a() - BUS_A);
+        }
         if let Some(blow) = hidden.blow.filter(|blow| blow.test_mass.is_none() && self.is_hit(blow)) {
             force[blow.axis] += blow.momentum_n_s / DT_S;
         }
@@ -517,6 +564,9 @@ impl Spacecraft {
         }
         if let Some((i, axis, size)) = hidden.current_by_panel {
             all[i][axis] += size * (self.bus_a() - BUS_A) * self.panel_slow_k;
+        }
+        if let Some((i, axis, sizes)) = hidden.field_squared {
+            all[i][axis] += sizes.iter().zip(self.field_t()).map(|(size, b)| size * b * b).sum::<f64>();
         }
         if let Some((blow, i)) = hidden.blow.and_then(|blow| Some((blow, blow.test_mass?))) {
             if self.is_hit(&blow) {
@@ -546,7 +596,7 @@ impl Spacecraft {
         let electrostatic: [[f64; 3]; 2] = std::array::from_fn(|i| {
             let (commanded, beside) =
                 (record.electrostatic_n[i], times(self.flight.hidden.electrodes[i], record.electrostatic_n[i]));
-            std::array::from_fn(|a| commanded[a] + beside[a])
+            std::array::from_fn(|a| commanded[a] * (1.0 + self.gain_now(Some(i), a)) + beside[a])
         });
         let (mut on_spacecraft, mut torque_on_spacecraft) = (force, torque);
         for (i, acting) in electrostatic.iter().enumerate() {

@@ -57,21 +57,20 @@ pub fn fuzz_formula(bytes: &[u8]) {
     }
 }
 
-/// Names that a formula may use, with their columns.
+/// Names that a formula may use, with their columns: housekeeping, and of the reconstruction every column by its own
+/// name, some by a short one too.
 fn names(available: &Available, mission: &Mission) -> Vec<(String, Column)> {
     let mut names = Vec::new();
     for column in &available.columns {
-        let name = column.name.as_str();
-        let short = if column.table == "grid" && name.starts_with("hk.") {
-            Some(name.to_owned())
-        } else if column.table == "reconstruction" {
-            short_name(name, mission)
-        } else {
-            None
+        let name = &column.name;
+        let all = match column.table.as_str() {
+            "grid" if name.starts_with("hk.") => [None, Some(name.clone())],
+            "reconstruction" => [short_name(name, mission), Some(name.clone())],
+            _ => [None, None],
         };
         // The parser cannot tell other names from expressions.
         let plain = |n: &String| n.bytes().all(|b| b.is_ascii_alphanumeric() || b == b'_' || b == b'.');
-        names.extend(short.filter(plain).map(|short| (short, column.clone())));
+        names.extend(all.into_iter().flatten().filter(plain).map(|name| (name, column.clone())));
     }
     names
 }
