@@ -157,7 +157,8 @@ impl Stage for Preprocess {
                 self.age = Some((specs.len(), link.write(grid, "ephemeris.age_s", "s", "")?));
             }
             let mut spec = table_spec(name, columns, mandatory, &test_masses, self.mission.limits.as_ref());
-            // Some housekeeping follows commands, as the current of a valve does: interpolated, it knows later readouts.
+            // Some housekeeping follows commands, as the current of a valve does: interpolated, it would know readouts
+            // to come.
             let held = self.prediction && name.starts_with("hk");
             spec.columns.iter_mut().for_each(|column| column.flag |= held);
             specs.push(spec);
