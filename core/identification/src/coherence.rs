@@ -379,6 +379,11 @@ impl HousekeepingCoherence {
         }
     }
 
+    /// Number of known series that act at a place.
+    pub fn known_at(&self, place: usize) -> usize {
+        self.known.iter().filter(|frame| **frame == self.places[place].frame).count()
+    }
+
     /// Known series, as indices of names.
     pub(crate) fn known(&self) -> Range<usize> {
         self.names.len() - self.known.len()..self.names.len()
@@ -571,13 +576,19 @@ impl HousekeepingCoherence {
 }
 
 impl Driver {
-    /// The factors of a product, each by itself.
+    /// The factors of a product of two housekeeping channels, each by itself.
     pub fn factors(self) -> Vec<Self> {
         match self {
             Self::Product(i, j) => vec![Self::Value(i), Self::Value(j)],
-            // Where a command hardly changes, its product is its other factor.
-            Self::Modulated(i, _) => vec![Self::Value(i)],
             _ => Vec::new(),
+        }
+    }
+
+    /// What is made of housekeeping alone in it.
+    pub fn housekeeping(self) -> Self {
+        match self {
+            Self::Modulated(i, _) => Self::Value(i),
+            other => other,
         }
     }
 

@@ -30,7 +30,7 @@ const SINGLES: usize = 6;
 /// Products of two that are given for it, and products with known series.
 const PRODUCTS: usize = 3;
 
-/// Housekeeping channels of which every product with a known series at the place is given.
+/// Housekeeping channels of which every product with a command at the place is given.
 const AS_GAINS: usize = 2;
 
 /// What lies between a cause and its force.
@@ -92,7 +92,7 @@ impl SlowSamples {
 
     /// Functions of housekeeping for the one of some places at which they explain most, and the first of them for the
     /// other places, since a force at one shows at all: those that explain more than the best of as many would by
-    /// chance, and of the first of them the products with every known series there. The best first; `noise` is that of
+    /// chance, and of the first of them the products with every command there. The best first; `noise` is that of
     /// the channels.
     pub fn driven(&self, places: &[usize], noise: &NoiseModel, housekeeping: &HousekeepingCoherence) -> Vec<Driven> {
         let (thin, means_s) = self.thinned();
@@ -124,7 +124,8 @@ impl SlowSamples {
         // two apart may be faster than what is seen here.
         let singles = functions.iter().filter(|(driver, _)| Kind::of(*driver) == Kind::Single);
         let leading: Vec<usize> = singles.map(|(driver, _)| driver.of()[0]).take(AS_GAINS).collect();
-        let gains = leading.iter().flat_map(|i| housekeeping.known().map(move |k| Driver::Modulated(*i, k)));
+        let commands = || housekeeping.known().filter(|k| self.units[*k] != "m");
+        let gains = leading.iter().flat_map(|i| commands().map(move |k| Driver::Modulated(*i, k)));
         for driver in gains.filter(|driver| housekeeping.acts(*driver, searches[best].place)) {
             let (place, memory) = (searches[best].place, Memory::None);
             let gain = searches[best].gains(&[(driver, memory)])[0].declared;
@@ -159,7 +160,7 @@ impl SlowSamples {
 
     /// Root mean square of what changes in a product with a known series: of housekeeping about where it began.
     pub fn rms_of_factor(&self, driver: Driver, housekeeping: &HousekeepingCoherence) -> f64 {
-        driver.factors().first().map_or(0.0, |factor| self.rms(*factor, Memory::None, housekeeping))
+        self.rms(driver.housekeeping(), Memory::None, housekeeping)
     }
 
     /// The function as the effect `formula` reads it, `lag(hk.battery_current_a - 1.900000e0, 120.0)`.

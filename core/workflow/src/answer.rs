@@ -66,8 +66,9 @@ impl Judge for Evidence<'_> {
         self.trials.p_value(self.family(effect), gain, dof as f64).1
     }
 
-    fn ln_prior(&self, effect: &str) -> f64 {
-        -self.trials.of(self.family(effect)).ln()
+    fn ln_prior(&self, effect: &str, instance: &str) -> f64 {
+        let of_proposal = self.proposal(effect, instance).map_or(0.0, |p| p.ln_weight);
+        of_proposal - self.trials.of(self.family(effect)).ln()
     }
 }
 

@@ -248,7 +248,7 @@ pub(crate) trait Judge {
     /// Decimal logarithm of the corrected p-value of a gain `2 Δ ln L` of an effect.
     fn log10_p(&self, effect: &str, gain: f64, dof: usize) -> f64;
     /// Logarithm of the weight of an effect's instance before any data.
-    fn ln_prior(&self, effect: &str) -> f64;
+    fn ln_prior(&self, effect: &str, instance: &str) -> f64;
 }
 
 /// The point that the sums of a pass lead to.
@@ -493,7 +493,7 @@ impl Joined {
         }
         let candidates: Vec<Candidate> = groups
             .iter()
-            .map(|Place { effect, parameters: own, .. }| {
+            .map(|Place { effect, instance, parameters: own, .. }| {
                 let coefficients = || {
                     own.iter().filter_map(|i| match &parameters[*i].1 {
                         Meaning::Coefficient(c) => Some(c),
@@ -505,7 +505,7 @@ impl Joined {
                     lower: coefficients().map(|c| c.lower).collect(),
                     upper: coefficients().map(|c| c.upper).collect(),
                     prior_sigma: coefficients().map(|c| c.prior_sigma).collect(),
-                    ln_prior: judge.ln_prior(effect),
+                    ln_prior: judge.ln_prior(effect, instance),
                     shaped: coefficients().any(|c| !c.shape.is_empty()),
                 }
             })

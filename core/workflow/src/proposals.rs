@@ -31,8 +31,12 @@ const MOST_GAIN: f64 = 0.3;
 pub(crate) struct Proposal {
     /// The model's entry.
     pub(crate) entry: EffectEntry,
-    /// The driver as among those that are coherent with a residual, `hk/battery_current_a^2`.
+    /// The housekeeping in it as among drivers that are coherent with a residual, `hk/battery_current_a^2`.
     pub(crate) driver: String,
+    /// Logarithm of its weight before any data, in that of formulas. Products with commands, whose constant part makes
+    /// them resemble their housekeeping, have the false-alarm rate together: one is told only if it explains
+    /// significantly more than housekeeping alone.
+    pub(crate) ln_weight: f64,
     /// What acts where, `lag(hk.battery_current_a - 1.912320e0, 50.0) on tm1.accel.y`.
     pub(crate) words: String,
 }
@@ -63,8 +67,8 @@ fn entry(instance: &str, acts_on: &str, expression: &str, unit: &str, most: f64)
     entry
 }
 
-/// Formulas for the residuals of the model, and how many were tried. A product comes with its factor or factors, since
-/// where each is zero is not known.
+/// Formulas for the residuals of the model, and how many were tried. A product comes with its two factors, since where
+/// each is zero is not known.
 ///
 /// # Errors
 /// A declaration of noise contradicts itself.
@@ -73,20 +77,20 @@ pub(crate) fn proposals(replay: &Replay<'_>, record: &Record) -> Result<(Vec<Pro
     let channels = &record.candidate_set.channels;
     let name = |place: usize| &housekeeping.places[place].name;
     let on_spacecraft = channels.len()..housekeeping.places.len();
-    let own = (0..channels.len()).filter(|channel| is_of_test_mass(name(*channel)));
-    let places: Vec<usize> = own.chain(on_spacecraft).collect();
+    let on_test_masses = (0..channels.len()).filter(|channel| is_of_test_mass(name(*channel)));
+    let places: [Vec<usize>; 2] = [on_test_masses.collect(), on_spacecraft.collect()];
     let mut all: Vec<Proposal> = Vec::new();
     if replay.registry.find(Kind::Effect, FORMULA).is_err() {
         return Ok((all, 0));
     }
-    let mut factors_of = Vec::new();
-    for driven in slow.driven(&places, &record.noise_model()?, housekeeping) {
-        let factors = driven.driver.factors();
-        let kind = std::mem::discriminant(&driven.driver);
-        // Those of the best product of each kind.
-        let with_factors = !factors.is_empty() && !factors_of.contains(&kind);
-        factors_of.extend(with_factors.then_some(kind));
-        for driver in [driven.driver].into_iter().chain(factors.into_iter().filter(|_| with_factors)) {
+    let mut with_factors = true;
+    let noise = record.noise_model()?;
+    // Apart: what follows the thrusters, as the current of a valve does, explains most on the spacecraft whatever acts
+    // on a test mass.
+    for driven in places.iter().flat_map(|places| slow.driven(places, &noise, housekeeping)) {
+        let factors = if with_factors { driven.driver.factors() } else { Vec::new() };
+        with_factors &= factors.is_empty();
+        for driver in [driven.driver].into_iter().chain(factors) {
             let driven = Driven { driver, ..driven };
             let taken = |name: &String| {
                 let of_model = record.candidate_set.coefficients.iter();
@@ -96,18 +100,23 @@ pub(crate) fn proposals(replay: &Replay<'_>, record: &Record) -> Result<(Vec<Pro
             let plain = name(driven.place).replace('.', "_");
             let mut numbered = (1..).map(|k| if k == 1 { plain.clone() } else { format!("{plain}_{k}") });
             let Some(instance) = numbered.find(|name| !taken(name)) else { continue };
-            all.extend(proposal(record, &driven, name(driven.place), &instance));
+            let weight = replay.settings()?.false_alarm;
+            all.extend(proposal(record, &driven, name(driven.place), &instance, weight));
         }
     }
-    Ok((all, slow.functions(&places, housekeeping)))
+    let tried = places.iter().map(|places| slow.functions(places, housekeeping)).sum();
+    Ok((all, tried))
 }
 
 /// The proposal of a function at a place; none where it does not change or cannot be written.
-fn proposal(record: &Record, driven: &Driven, place: &str, instance: &str) -> Option<Proposal> {
+/// Products with known series have the weight `of_products` together.
+fn proposal(record: &Record, driven: &Driven, place: &str, instance: &str, of_products: f64) -> Option<Proposal> {
     let (slow, housekeeping) = (&record.gathered.slow, &record.gathered.housekeeping);
     let &Driven { driver, memory, .. } = driven;
     let expression = slow.expression(driver, memory, housekeeping);
     let on_test_mass = is_of_test_mass(place);
+    let products = housekeeping.known_at(driven.place).max(1) as f64;
+    let ln_weight = slow.unit_of_known(driver).map_or(0.0, |_| (of_products / products).ln());
     let (rms, rms_of_factor) = (slow.rms(driver, memory, housekeeping), slow.rms_of_factor(driver, housekeeping));
     let (acts_on, of, most, rms) = match (slow.unit_of_known(driver), on_test_mass) {
         // A gain, of which the factor alone changes.
@@ -118,7 +127,8 @@ fn proposal(record: &Record, driven: &Driven, place: &str, instance: &str) -> Op
     };
     (readable(&expression) && rms > 0.0).then(|| Proposal {
         entry: entry(instance, &acts_on, &expression, &slow.unit_of_amplitude(of, driver, memory), most / rms),
-        driver: slow.label(driver),
+        ln_weight,
+        driver: slow.label(driver.housekeeping()),
         words: format!("{expression} on {acts_on}"),
     })
 }

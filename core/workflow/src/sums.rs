@@ -513,9 +513,15 @@ fn candidate_set(available: &Available, channels: &[&Column], series: &Series, w
     }
 }
 
-/// Whether a column is a command or a displacement: what may act in proportion to housekeeping.
+/// Whether a column is a command or a displacement: what may act in proportion to housekeeping. Torques on test masses
+/// move no channel.
 fn is_known(column: &Column) -> bool {
-    column.table == "reconstruction" && ["N", "N m", "m"].contains(&column.unit.as_str())
+    let acts = match column.unit.as_str() {
+        "N" | "m" => true,
+        "N m" => column.frame == SPACECRAFT_FRAME,
+        _ => false,
+    };
+    acts && column.table == "reconstruction"
 }
 
 /// How forces enter the channels, as probes respond: each by the place that it states. What acts through a coefficient

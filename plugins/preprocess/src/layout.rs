@@ -10,7 +10,7 @@ pub(crate) struct ColumnSpec {
     pub(crate) name: String,
     /// Largest valid magnitude, in the column's SI unit.
     pub(crate) limit: f64,
-    /// Whether it is a flag, which is held rather than interpolated.
+    /// Whether it is held rather than interpolated: a flag, or housekeeping where columns must know no later sample.
     pub(crate) flag: bool,
     /// Whether it is an instrument's measurement; exact repetition means that it is stuck.
     pub(crate) instrument: bool,

@@ -16,6 +16,8 @@ pub struct Preprocess {
     mission: Mission,
     mandatory: Vec<String>,
     config: Config,
+    /// No column may depend on later samples ([`PREDICTION_NEED`]).
+    prediction: bool,
     /// Columns read and written, per table.
     tables: Vec<(Vec<In>, Vec<Out>)>,
     /// The table `ephemeris` and the column of its age: on board the last packet is held.
@@ -110,7 +112,8 @@ impl Stage for Preprocess {
             hold_intervals: setup.f64("hold_intervals")?,
             max_gap_s: setup.f64("max_gap_s")?,
         };
-        Ok(Self { mission, mandatory, config, tables: Vec::new(), age: None, grid: None, gridder: None })
+        let prediction = setup.needs(PREDICTION_NEED);
+        Ok(Self { mission, mandatory, config, prediction, tables: Vec::new(), age: None, grid: None, gridder: None })
     }
 
     fn link(&mut self, available: &Available, link: &mut Link<'_>) -> Result<(), PluginError> {
@@ -153,7 +156,12 @@ impl Stage for Preprocess {
             if *name == "ephemeris" {
                 self.age = Some((specs.len(), link.write(grid, "ephemeris.age_s", "s", "")?));
             }
-            specs.push(table_spec(name, columns, mandatory, &test_masses, self.mission.limits.as_ref()));
+            let mut spec = table_spec(name, columns, mandatory, &test_masses, self.mission.limits.as_ref());
+            // Some housekeeping follows commands, as the current of a valve does: interpolated, it would know readouts
+            // to come.
+            let held = self.prediction && name.starts_with("hk");
+            spec.columns.iter_mut().for_each(|column| column.flag |= held);
+            specs.push(spec);
             self.tables.push((ins, outs));
         }
         self.grid = Some(grid);
