@@ -1,6 +1,7 @@
 //! Arguments. The names are a contract: scripts use them.
 
 use crate::utc;
+use chrono::NaiveDate;
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
 use std::path::PathBuf;
 
@@ -384,7 +385,7 @@ pub(crate) enum Language {
 #[derive(Debug, Subcommand)]
 pub(crate) enum Products {
     /// List the products of an archive
-    List(Archive),
+    List(List),
     /// Show a product
     Show {
         /// Its id, its id without the revision, its day or its file
@@ -393,6 +394,33 @@ pub(crate) enum Products {
         #[command(flatten)]
         archive: Archive,
     },
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct List {
+    #[command(flatten)]
+    pub(crate) archive: Archive,
+    /// First day
+    #[arg(long, value_name = "DAY")]
+    pub(crate) from: Option<NaiveDate>,
+    /// Last day
+    #[arg(long, value_name = "DAY")]
+    pub(crate) until: Option<NaiveDate>,
+    /// Spacecraft, `SC1`
+    #[arg(long, value_name = "NAME")]
+    pub(crate) spacecraft: Option<String>,
+    /// agree, disagree or weak
+    #[arg(long, value_name = "VERDICT")]
+    pub(crate) verdict: Option<String>,
+    /// Revision of the model, or its beginning
+    #[arg(long, value_name = "REVISION")]
+    pub(crate) model: Option<String>,
+    /// Those that a set names
+    #[arg(long, value_name = "SET")]
+    pub(crate) set: Option<String>,
+    /// Only the newest of each day that holds: not withdrawn, not in disagreement, no test on data kept out of a fit
+    #[arg(long)]
+    pub(crate) latest: bool,
 }
 
 /// What can be done with a model file.

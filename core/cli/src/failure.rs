@@ -58,7 +58,7 @@ pub(crate) fn chain(error: &dyn Error) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dragfree_engine::files::IoError;
+    use dragfree_archive::files::IoError;
 
     #[derive(Debug, thiserror::Error)]
     #[error("the pipeline stopped")]

@@ -3,7 +3,7 @@
 use crate::args::Global;
 use crate::failure::Failure;
 use crate::progress;
-use dragfree_engine::files::IoContext as _;
+use dragfree_archive::files::IoContext as _;
 use std::fs::File;
 use std::io::{IsTerminal as _, Write};
 use std::sync::Mutex;

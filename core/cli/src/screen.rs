@@ -3,8 +3,9 @@
 use crate::text::{self, Paint};
 use crate::utc;
 use dragfree_engine::border::{Manifest, Parameter, ParameterType};
-use dragfree_engine::files::Problem;
-use dragfree_engine::product::{Coefficient, Listing, Product};
+use dragfree_archive::files::Problem;
+use dragfree_archive::product::{Coefficient, Product};
+use dragfree_archive::{Entry, Listing};
 use dragfree_engine::registry::Registry;
 use dragfree_workflow::calibrate::{CheckReport, CheckedNode};
 use serde_json::Value;
@@ -124,15 +125,20 @@ pub(crate) fn listing(listing: &Listing, folder: &Path, paint: Paint) -> String 
         let _ = writeln!(screen, "no product in {}", folder.display());
     } else {
         let heading = ["product", "epochs", "verdict", "χ²/dof", "model", ""];
-        let row = |entry: &dragfree_engine::product::Entry| {
-            let product = &entry.product;
+        let row = |Entry { row, .. }: &Entry| {
+            let state = match (&row.withdrawn, &row.fixed_from, row.latest) {
+                (Some(_), ..) => "withdrawn",
+                (_, Some(_), _) => "held out",
+                (.., true) => "latest",
+                _ => "",
+            };
             vec![
-                product.id().to_owned(),
-                text::grouped(product.quality.epochs_used),
-                product.result.verdict.clone().unwrap_or_else(|| "-".to_owned()),
-                text::plain(product.quality.chi2_per_dof),
-                product.model.revision.clone(),
-                if entry.latest { "latest" } else { "" }.to_owned(),
+                row.id.clone(),
+                text::grouped(row.epochs_used.unwrap_or(0)),
+                row.verdict.clone().unwrap_or_else(|| "-".to_owned()),
+                text::plain(row.chi2_per_dof.unwrap_or(f64::NAN)),
+                row.model.clone().unwrap_or_default(),
+                state.to_owned(),
             ]
         };
         screen += &text::columns(&text::table(&heading, listing.entries.iter().map(row)));
@@ -237,24 +243,12 @@ pub(crate) fn problems_json(problems: &[Problem]) -> Vec<Value> {
 
 /// An archive as JSON.
 pub(crate) fn listing_json(listing: &Listing) -> Value {
-    let entries = listing.entries.iter().map(|entry| {
-        let product = &entry.product;
-        let attributes = &product.header.non_standard_attributes;
-        serde_json::json!({
-            "id": product.id(),
-            "path": entry.path.to_string_lossy(),
-            "day": attributes.day,
-            "spacecraft": product.header.global_attributes.platform,
-            "release": attributes.release,
-            "revision": attributes.revision,
-            "latest": entry.latest,
-            "epochs_used": product.quality.epochs_used,
-            "verdict": product.result.verdict,
-            "chi2_per_dof": product.quality.chi2_per_dof,
-            "model": product.model,
-            "date_created": product.header.global_attributes.date_created,
-            "sha256": attributes.sha256,
-        })
+    let entries = listing.entries.iter().map(|Entry { row, path }| {
+        let mut value = serde_json::json!(row);
+        value["path"] = serde_json::json!(path.to_string_lossy());
+        value["model"] = serde_json::json!({"revision": row.model, "fixed_from": row.fixed_from});
+        value["sha256"] = serde_json::json!(row.digest);
+        value
     });
     serde_json::json!({"products": entries.collect::<Vec<_>>(), "problems": problems_json(&listing.problems)})
 }
@@ -277,7 +271,7 @@ pub(crate) fn plugins_json(registry: &Registry, clash: Option<&str>) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dragfree_engine::product::{Draft, Model, ProductWriter, Written};
+    use dragfree_archive::product::{Draft, Model, ProductWriter, Written};
     use dragfree_engine::schema::Report;
 
     const PLAIN: Paint = Paint(false);
@@ -392,7 +386,7 @@ mod tests {
         written(folder.path(), serde_json::json!({"verdict": "agree", "epochs_used": 215_874, "chi2_per_dof": 1.0}));
         written(folder.path(), serde_json::json!({}));
         std::fs::write(folder.path().join("notes.txt"), "mine").expect("write");
-        let found = dragfree_engine::product::list(folder.path()).expect("list");
+        let found = dragfree_archive::product::list(folder.path()).expect("list");
         let screen = listing(&found, folder.path(), PLAIN);
         let lines: Vec<_> = screen.lines().collect();
         assert_eq!(lines[1], "COM1B_2035-01-01_SC1_01_0001  215 874  agree    1.0000  1");

@@ -11,7 +11,7 @@ use crate::EngineError;
 use crate::border::{Config, Instance};
 use crate::chain;
 use crate::config::{Mission, resolve_parameters};
-use crate::product::Loss;
+use dragfree_archive::product::Loss;
 use crate::registry::{Found, Registry};
 use crate::replay::Replay;
 use crate::sealed::Sealed;

@@ -1,15 +1,14 @@
-//! Replay, links between plugins, checkpoints, model files and products; no terminal, no clock.
+//! Replay, links between plugins, checkpoints and model files; no terminal, no clock.
 //!
 //! [`run::run`] is the main job: a [`feed`] of rows from telemetry files ([`mod@replay`]) or a source plugin, carried
-//! through a linked [`chain`] of plugins found in a [`registry`], into a [`product`].
+//! through a linked [`chain`] of plugins found in a [`registry`], into a product of the archive.
 
 pub mod border;
 pub mod chain;
 pub mod config;
+pub mod draft;
 pub mod examine;
 pub mod feed;
-pub mod files;
-pub mod product;
 pub mod registry;
 pub mod replay;
 pub mod revisions;
@@ -47,12 +46,12 @@ pub enum EngineError {
     /// What a simulation hides.
     #[error(transparent)]
     Sealed(#[from] sealed::SealedError),
-    /// Writing the product.
+    /// The archive.
     #[error(transparent)]
-    Product(#[from] product::ProductError),
+    Archive(#[from] dragfree_archive::ArchiveError),
     /// The operating system refused something.
     #[error(transparent)]
-    Io(#[from] files::IoError),
+    Io(#[from] dragfree_archive::files::IoError),
     /// Neither the command line nor the pipeline names a file.
     #[error("{}: names no {what}, and the command line gives none; add `{what} = \"…\"` or pass --{what}", pipeline.display())]
     NotNamed { what: &'static str, pipeline: PathBuf },

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use crate::border::{BorderError, Config, Instance, Kind, Library, PluginInfo};
-use crate::files::Problem;
+use dragfree_archive::files::Problem;
 
 /// The plugins that were found.
 #[derive(Debug, Default)]

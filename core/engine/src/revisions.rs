@@ -16,7 +16,7 @@ use serde::Serialize;
 use toml_edit::{ArrayOfTables, DocumentMut, InlineTable, Item, Table, TableLike, Value, value};
 
 use crate::config::{ConfigError, EffectEntry, Model};
-use crate::files::{IoContext as _, IoError, Problem, folder_of, sync_folder};
+use dragfree_archive::files::{IoContext as _, IoError, Problem, folder_of, sync_folder};
 
 /// Why a model file could not be changed or its history not be read.
 #[derive(Debug, thiserror::Error)]
@@ -255,7 +255,7 @@ impl Edit {
     }
 
     /// Becomes a child of the revision `base` of the model file `source` in which every estimated effect but those of
-    /// `keep` (by id, or `ID:INSTANCE`) is fixed at `values`, coefficients by name in SI units.
+    /// `keep` (by id, or `ID:INSTANCE`) is fixed at `values`, coefficients by name in SI units, of the product `from`.
     ///
     /// # Errors
     /// No such revision; an effect has no value, or two of its coefficients end alike.
@@ -263,7 +263,7 @@ impl Edit {
         &mut self,
         source: &Path,
         base: &str,
-        values: &[(String, f64)],
+        (from, values): (&str, &[(String, f64)]),
         keep: &[String],
     ) -> Result<(), RevisionError> {
         let (model, text) = find(source, base)?;
@@ -277,6 +277,9 @@ impl Edit {
             )));
         }
         self.document = document(source, &text)?;
+        if let Some(header) = self.document.get_mut("model").and_then(Item::as_table_like_mut) {
+            set(header, "fixed_from", from.into());
+        }
         self.parent = Some((model.identity().0, model.effects.clone()));
         let fixed: Vec<bool> =
             model.effects.iter().map(|e| e.estimate && !keep.iter().any(|name| named(e, name))).collect();

@@ -10,12 +10,13 @@ use std::path::{Path, PathBuf};
 use crate::EngineError;
 use crate::border::PluginInfo;
 use crate::chain::{self, Carry, Chain, ChainNode, Sink};
-use crate::config::{Mission, Model, Pipeline};
+use crate::config::{Mission, Model, Pipeline, read};
+use crate::draft::Draft;
 use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions};
-use crate::files::{IoContext as _, IoError, folder_of, sha256, sha256_of, sync_folder};
-use crate::product::{self, Draft, Loss, NoiseLevel, ProductWriter, Stage, Written};
+use dragfree_archive::files::{IoContext as _, IoError, folder_of, sha256, sha256_of, sync_folder};
+use dragfree_archive::product::{self, Loss, NoiseLevel, Stage, Status, Stream};
+use dragfree_archive::{InputPlace, MadeOf, ProductWriter, Window, Written};
 use crate::registry::Registry;
-use crate::sources::Sources;
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{FileHeader, TelemetryWriter, interface_tables};
 
@@ -44,6 +45,10 @@ pub struct RunOptions {
     pub state_in: Option<PathBuf>,
     /// Where to keep the state for the next run.
     pub state_out: Option<PathBuf>,
+    /// Why the product is made.
+    pub stream: Stream,
+    /// How final it is.
+    pub status: Status,
     /// When the product is made; the engine has no clock.
     pub created: DateTime<Utc>,
     /// Version of the program.
@@ -97,20 +102,29 @@ pub(crate) struct Setup<'a> {
     pub(crate) pipeline: Pipeline,
     pub(crate) mission: Mission,
     pub(crate) model: Model,
+    /// Role, file and text of what was read once, so that what is archived is what was used.
+    texts: [(&'static str, PathBuf, String); 3],
 }
 
 impl<'a> Setup<'a> {
     pub(crate) fn load(options: &'a RunOptions) -> Result<Self, EngineError> {
-        let pipeline = Pipeline::load(&options.pipeline)?;
+        let text = read(&options.pipeline)?;
+        let pipeline = Pipeline::parse(&options.pipeline, &text)?;
         let choose = |given: &Option<PathBuf>, own: &Option<PathBuf>, what: &'static str| {
-            given
-                .clone()
-                .or_else(|| own.clone())
-                .ok_or(EngineError::NotNamed { what, pipeline: options.pipeline.clone() })
+            let path = given.clone().or_else(|| own.clone());
+            let path = path.ok_or(EngineError::NotNamed { what, pipeline: options.pipeline.clone() })?;
+            let text = read(&path)?;
+            Ok::<_, EngineError>((what, path, text))
         };
-        let mission = Mission::load(&choose(&options.mission, &pipeline.mission, "mission")?)?;
-        let model = Model::load(&choose(&options.model, &pipeline.model, "model")?)?;
-        Ok(Self { options, pipeline, mission, model })
+        let mission = choose(&options.mission, &pipeline.mission, "mission")?;
+        let model = choose(&options.model, &pipeline.model, "model")?;
+        Ok(Self {
+            mission: Mission::parse(&mission.1, &mission.2)?,
+            model: Model::parse(&model.1, &model.2)?,
+            texts: [("pipeline", options.pipeline.clone(), text), mission, model],
+            options,
+            pipeline,
+        })
     }
 
     /// Opens the feed for the window of the options, from `resume_ns` on.
@@ -212,16 +226,24 @@ pub fn run(
     let mut series = Series::create(&chain, &mut writer, &setup)?;
     let covered = setup.carry(feed.as_mut(), &mut chain, &mut series, progress)?;
     // Saved before the flush, because the next day continues within the lags.
-    let next_state = next_state.map(|next| next.write(&chain.save()?)).transpose()?;
+    let left = chain.save()?;
+    let next_state = next_state.map(|next| next.write(&left)).transpose()?;
     chain.finish(&mut series)?;
     let reports = chain.reports()?;
     series.finish()?;
-    let draft = draft(&setup, &chain, feed.as_mut(), reports, &covered)?;
-    sources(&setup).write(&writer.staged_unlisted(product::SOURCES))?;
+    let draft = draft(&setup, &chain, feed.as_mut(), (state.as_deref(), reports), &covered)?;
     tracing::debug!(epochs_from_ns = covered.first_ns, epochs_to_ns = covered.last_ns, "every stage has reported");
-    // The state last: after a kill in between, the day can be run again.
-    let written = writer.commit_with(&draft, || next_state.map_or(Ok(()), NextState::place))?;
+    for (role, path, text) in &setup.texts {
+        writer.keep(role, &name_of(path), text.as_bytes())?;
+    }
+    if let (Some(path), Some(state)) = (&options.state_in, &state) {
+        writer.keep("state_in", &name_of(path), state)?;
+    }
+    writer.keep("state_out", "state", &left)?;
+    let written = draft.commit(writer, made_of(&setup, &draft))?;
     tracing::info!(id = written.product.id(), path = %written.path.display(), "archived");
+    // The state last: after a kill in between, the day can be run again, and the archive has the state too.
+    next_state.map_or(Ok(()), NextState::place)?;
     Ok(written)
 }
 
@@ -375,7 +397,7 @@ fn draft(
     setup: &Setup<'_>,
     chain: &Chain,
     feed: &mut dyn Feed,
-    reports: Vec<Report>,
+    (state, reports): (Option<&[u8]>, Vec<Report>),
     covered: &Covered,
 ) -> Result<Draft, EngineError> {
     let mut replay = feed.summary()?;
@@ -407,44 +429,58 @@ fn draft(
         spacecraft: setup.mission.spacecraft.clone(),
         first_ns: covered.first_ns,
         last_ns: covered.last_ns,
-        inputs: inputs(setup)?,
+        inputs: inputs(setup, state)?,
         history,
-        model: product::Model { revision, parent, effects, noise_levels: noise_levels(chain) },
+        model: product::Model {
+            revision,
+            parent,
+            fixed_from: setup.model.fixed_from.clone(),
+            effects,
+            noise_levels: noise_levels(chain),
+        },
         software: setup.options.software.clone(),
         reports: replay.report.take().into_iter().chain(reports).collect(),
         replay,
         settings: setup.pipeline.settings.clone(),
+        stream: setup.options.stream,
+        status: setup.options.status,
         created: setup.options.created,
     })
 }
 
-/// Where the inputs of a run lie.
-fn sources(setup: &Setup<'_>) -> Sources {
-    let absolute = |path: &Path| std::path::absolute(path).unwrap_or_else(|_| path.to_owned());
-    Sources {
-        pipeline: absolute(&setup.pipeline.path),
-        mission: absolute(&setup.mission.path),
-        model: absolute(&setup.model.path),
-        telemetry: setup.options.files.iter().map(|f| absolute(f)).collect(),
-        from_ns: setup.options.from_ns,
-        until_ns: setup.options.until_ns,
-    }
+/// Name of a file without its folder, so that a product does not depend on where it was made.
+fn name_of(path: &Path) -> String {
+    path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default()
 }
 
-fn inputs(setup: &Setup<'_>) -> Result<Vec<product::Input>, EngineError> {
-    let telemetry = setup.options.files.iter().map(|f| ("telemetry", f.as_path()));
-    let own = [("pipeline", &setup.pipeline.path), ("mission", &setup.mission.path), ("model", &setup.model.path)];
-    let state = setup.options.state_in.iter().map(|f| ("state", f.as_path()));
-    telemetry
-        .chain(own.iter().map(|(role, path)| (*role, path.as_path())))
-        .chain(state)
-        .map(|(role, path)| {
-            Ok(product::Input {
-                role: role.to_owned(),
-                name: path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default(),
-                size: std::fs::metadata(path).at("read", path)?.len(),
-                sha256: sha256_of(path).at("read", path)?,
-            })
-        })
-        .collect()
+/// Where the inputs of a run lay, and what was asked for.
+fn made_of(setup: &Setup<'_>, draft: &Draft) -> MadeOf {
+    let options = setup.options;
+    let telemetry = draft.inputs.iter().filter(|input| input.role == "telemetry").zip(&options.files);
+    let place = |(input, path): (&product::Input, &PathBuf)| InputPlace {
+        sha256: input.sha256.clone(),
+        path: std::path::absolute(path).unwrap_or_else(|_| path.clone()),
+    };
+    let window = Window { from_ns: options.from_ns, until_ns: options.until_ns };
+    MadeOf { places: telemetry.map(place).collect(), window }
+}
+
+/// Every file that a run read. Of the files of a source plugin only those that the command line names are known.
+fn inputs(setup: &Setup<'_>, state: Option<&[u8]>) -> Result<Vec<product::Input>, EngineError> {
+    let input = |role: &str, path: &Path, size: usize, sha256: String| product::Input {
+        role: role.to_owned(),
+        name: name_of(path),
+        size: size as u64,
+        sha256,
+    };
+    let mut inputs = Vec::new();
+    for path in &setup.options.files {
+        let size = std::fs::metadata(path).at("read", path)?.len();
+        let sha256 = sha256_of(path).at("read", path)?;
+        inputs.push(product::Input { role: "telemetry".to_owned(), name: name_of(path), size, sha256 });
+    }
+    inputs.extend(setup.texts.iter().map(|(role, path, text)| input(role, path, text.len(), sha256(text))));
+    let state = setup.options.state_in.iter().zip(state);
+    inputs.extend(state.map(|(path, bytes)| input("state", path, bytes.len(), sha256(bytes))));
+    Ok(inputs)
 }

@@ -6,7 +6,7 @@ use std::fs::File;
 use std::io::{Read as _, Write as _};
 use std::path::{Path, PathBuf};
 
-use crate::files::{IoContext as _, IoError, hex, sha256};
+use dragfree_archive::files::{IoContext as _, IoError, hex, sha256};
 
 /// Key of the digest in the Metadata record of every telemetry file of the simulation.
 pub const DIGEST_KEY: &str = "sealed_sha256";

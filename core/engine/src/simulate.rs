@@ -9,7 +9,7 @@ use std::thread::{Scope, ScopedJoinHandle};
 use crate::EngineError;
 use crate::config::Mission;
 use crate::feed::{Feed, SourceFeed, SourceOptions};
-use crate::files::IoContext as _;
+use dragfree_archive::files::IoContext as _;
 use crate::registry::Registry;
 use crate::run::Progress;
 use crate::sealed::{DIGEST_KEY, Sealed};

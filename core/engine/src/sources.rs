@@ -1,15 +1,12 @@
-//! Where the inputs of a product lay when it was made.
+//! Where the inputs of a product lie now.
 
-use serde::{Deserialize, Serialize};
-use std::io;
 use std::path::{Path, PathBuf};
 
 use crate::EngineError;
-use crate::files::IoContext as _;
-use crate::product::SOURCES;
+use dragfree_archive::{Archive, ArchiveError, Place};
 
-/// Where the inputs of a product lay, in a file beside it that is no part of it: places change, content does not.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+/// Where the inputs of a product lie: pipeline, mission and model in the archive, telemetry where it was seen last.
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct Sources {
     /// Pipeline file.
     pub pipeline: PathBuf,
@@ -26,18 +23,48 @@ pub struct Sources {
 }
 
 impl Sources {
-    pub(crate) fn write(&self, path: &Path) -> Result<(), EngineError> {
-        let text = serde_json::to_string_pretty(self).unwrap_or_default() + "\n";
-        Ok(std::fs::write(path, text).at("write", path)?)
-    }
-
-    /// Reads them.
+    /// Those of the product whose `.toml` lies in an archive.
     ///
     /// # Errors
-    /// [`EngineError::Io`] where there is no such file beside the product.
-    pub fn read(product: &Path) -> Result<Self, EngineError> {
-        let path = product.with_extension(SOURCES);
-        let text = std::fs::read_to_string(&path).at("read where the inputs lay, from", &path)?;
-        Ok(serde_json::from_str(&text).map_err(io::Error::from).at("read", path)?)
+    /// The file is in no archive; an input is gone.
+    pub fn of(product: &Path) -> Result<Self, EngineError> {
+        let id = product.file_stem().unwrap_or_default().to_string_lossy();
+        Self::in_archive(&Archive::of(product)?, &id)
+    }
+
+    /// Those of a product of an archive.
+    ///
+    /// # Errors
+    /// There is no such product; an input is gone.
+    pub fn in_archive(archive: &Archive, id: &str) -> Result<Self, EngineError> {
+        let row = archive.row(id)?;
+        let inputs = archive.inputs(id)?;
+        let gone = |place: &Place| ArchiveError::Moved {
+            role: place.role.clone(),
+            name: place.name.clone(),
+            id: id.to_owned(),
+            place: place.path.clone().unwrap_or_else(|| PathBuf::from(&place.name)),
+        };
+        let there = |place: &Place| match &place.path {
+            Some(path) if path.is_file() => Ok(path.clone()),
+            _ => Err(gone(place)),
+        };
+        let kept = |role: &str| -> Result<PathBuf, EngineError> {
+            if let Some(Place { path: Some(path), .. }) = archive.made_of(id, role)? {
+                return Ok(path);
+            }
+            let input = inputs.iter().find(|place| place.role == role);
+            let missing = || ArchiveError::NotFound { id: format!("{id}: {role}"), folder: archive.folder().to_owned() };
+            Ok(there(input.ok_or_else(missing)?)?)
+        };
+        let telemetry = inputs.iter().filter(|place| place.role == "telemetry").map(there);
+        Ok(Self {
+            pipeline: kept("pipeline")?,
+            mission: kept("mission")?,
+            model: kept("model")?,
+            telemetry: telemetry.collect::<Result<_, _>>()?,
+            from_ns: row.asked_from_ns,
+            until_ns: row.asked_until_ns,
+        })
     }
 }

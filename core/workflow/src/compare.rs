@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use dragfree_engine::product::Product;
+use dragfree_archive::product::Product;
 use dragfree_engine::run::Progress;
 use dragfree_identification::compare::{self, Comparison, Innovations, Nis};
 use dragfree_identification::scores::CandidateScorer;

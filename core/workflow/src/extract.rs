@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use dragfree_engine::EngineError;
-use dragfree_engine::product::{EXTRACT, Written, write_extract};
+use dragfree_archive::{Archive, EXTRACT, Stamp, Written};
 use dragfree_engine::registry::Registry;
 use dragfree_identification::diagnosis::{Diagnosis, Found, Trials, UNOBSERVABLE};
 use dragfree_identification::innovations::decision::Prior;
@@ -96,14 +96,15 @@ impl Extract {
         })
     }
 
-    /// Writes it beside its product, in one step. Returns the path and the bytes.
+    /// Keeps it beside its product. Returns the path and the bytes.
     ///
     /// # Errors
     /// The archive cannot be written.
-    pub fn write(&self, product: &Path) -> Result<(PathBuf, u64), WorkflowError> {
+    pub fn write(&self, product: &Path, stamp: &Stamp<'_>) -> Result<(PathBuf, u64), WorkflowError> {
         let refuse = |e: serde_json::Error| WorkflowError::Extract { path: product.to_owned(), what: e.to_string() };
         let text = serde_json::to_vec(self).map_err(refuse)?;
-        let path = write_extract(product, &text).map_err(EngineError::from)?;
+        let keep = || Archive::of(product)?.keep_extract(&self.product, &text, stamp);
+        let path = keep().map_err(EngineError::from)?;
         Ok((path, text.len() as u64))
     }
 

@@ -11,7 +11,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use serde::Serialize;
 
 use dragfree_engine::config::Model;
-use dragfree_engine::product::{Coefficient, Product};
+use dragfree_archive::product::{Coefficient, Product};
 
 mod missions;
 mod nees;
@@ -365,7 +365,7 @@ fn any<'a>(days: &Days<'a>) -> &'a Product {
 /// Effects that ran, `ID:INSTANCE`.
 fn effects(product: &Product) -> Vec<String> {
     let ran = product.history.iter().filter(|s| s.kind == "effect");
-    let name = |s: &dragfree_engine::product::Stage| {
+    let name = |s: &dragfree_archive::product::Stage| {
         if s.instance.is_empty() { s.plugin.clone() } else { format!("{}:{}", s.plugin, s.instance) }
     };
     ran.map(name).collect()

@@ -9,7 +9,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use dragfree_engine::chain::Chain;
 use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{Examination, examine};
-use dragfree_engine::product::Written;
+use dragfree_archive::Written;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_identification::diagnosis::Constancy;
@@ -331,7 +331,7 @@ pub(crate) fn one_pass(
     let mut joined = Joined::default();
     let mut not_tried = Vec::new();
     for (number, Written { product, path }) in replay.products.iter().enumerate() {
-        let sources = Sources::read(path)?;
+        let sources = Sources::of(path)?;
         let examination = Examination {
             product,
             sources: &sources,

@@ -4,7 +4,7 @@
 //! All of it follows from the information matrix of the last pass of a diagnosis, with the noise and the values that it
 //! found: no data of the future are needed.
 
-use dragfree_engine::product::Written;
+use dragfree_archive::Written;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_identification::diagnosis::SEPARATED_CHI2;
@@ -200,7 +200,7 @@ fn usable(replay: &Replay<'_>, others: &[Written]) -> Vec<(String, f64)> {
         let known = replay.products.iter().any(|own| own.product.id() == other.id());
         let alike =
             other.model.revision == product.model.revision && other.header.global_attributes.platform == *platform;
-        let at_hand = Sources::read(&w.path).is_ok_and(|s| s.telemetry.iter().all(|file| file.is_file()));
+        let at_hand = Sources::of(&w.path).is_ok_and(|s| s.telemetry.iter().all(|file| file.is_file()));
         !known && alike && at_hand
     };
     others.iter().filter(fits).map(|w| (w.product.id().to_owned(), used_s(w) / 3600.0)).collect()
@@ -431,7 +431,7 @@ impl<'a> Ask<'a> {
         let contrasts: Vec<DVector<f64>> = pairs.iter().map(contrast).collect();
         let mut hours: Vec<Vec<Hour>> = vec![Vec::new(); pairs.len()];
         for (number, written) in self.replay.products.iter().enumerate() {
-            let sources = Sources::read(&written.path)?;
+            let sources = Sources::of(&written.path)?;
             let experiment = Experiment { number, sources: &sources, altered: None, means: None, block_s: STRETCH_S };
             let (blocks, _) = information(self.replay, self.end, &self.end.chosen, &experiment, progress)?;
             for (hours, w) in hours.iter_mut().zip(&contrasts) {

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use dragfree_engine::chain::Chain;
 use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{Examination, FREQUENCY_HZ, candidates, examine, has_parameter};
-use dragfree_engine::product::Written;
+use dragfree_archive::Written;
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
@@ -120,7 +120,7 @@ pub(crate) fn sum(
     let levels = noise_levels(products);
     let mut whole: Option<Record> = None;
     for (number, Written { product, path }) in products.iter().enumerate() {
-        let sources = Sources::read(path)?;
+        let sources = Sources::of(path)?;
         let equations = path.with_extension("neq.json");
         let mut all = candidates(registry, &sources)?;
         match what {

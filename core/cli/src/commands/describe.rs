@@ -4,7 +4,7 @@ use super::Done;
 use crate::args::{Arguments, Shell};
 use crate::failure::Failure;
 use clap::CommandFactory as _;
-use dragfree_engine::files::IoContext as _;
+use dragfree_archive::files::IoContext as _;
 use std::path::Path;
 
 pub(super) fn completions(shell: Shell) -> Result<Done, Failure> {

@@ -6,7 +6,7 @@ use crate::failure::Failure;
 use crate::text::{Paint, columns, labelled, table};
 use dragfree_chart::{Line, Panel, Stroke, svg};
 use dragfree_engine::config::Mission as MissionFile;
-use dragfree_engine::files::IoContext as _;
+use dragfree_archive::files::IoContext as _;
 use dragfree_physics::control_design::{ChannelDesign, Design, design};
 use dragfree_physics::decoupling::Allocation;
 use dragfree_physics::mission::{Control, Mission};

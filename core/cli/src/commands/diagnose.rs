@@ -6,7 +6,7 @@ use crate::args::{Diagnose, Global};
 use crate::failure::{Failure, Refusal};
 use crate::text::Paint;
 use chrono::DateTime;
-use dragfree_engine::product::{self, Written};
+use dragfree_archive::{Find, Written};
 use dragfree_identification::diagnosis::{Diagnosis, Found, Offset};
 use dragfree_identification::transient::Detection;
 use dragfree_workflow::diagnose::diagnose;
@@ -32,7 +32,7 @@ pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Resu
             Ok((diagnosed, next))
         })?;
         let kept = match (&diagnosed.extract, &products[..]) {
-            (Some(extract), [product]) => Some(extract.write(&product.path)?),
+            (Some(extract), [product]) => Some(extract.write(&product.path, &super::stamp())?),
             _ => None,
         };
         let unnamed = diagnosed.unexplained_transients().into_iter().cloned().collect();
@@ -62,8 +62,9 @@ fn latest(archive: &Path) -> Result<Vec<Written>, Failure> {
     if !archive.is_dir() {
         return Ok(Vec::new());
     }
-    let entries = product::list(archive)?.entries.into_iter().filter(|entry| entry.latest);
-    Ok(entries.map(|entry| Written { product: entry.product, path: entry.path }).collect())
+    let archive = products::archive(archive)?;
+    let latest = archive.list(&Find { latest: true, ..Find::default() })?.entries.into_iter();
+    latest.map(|entry| Ok(Written { product: archive.product(&entry.row.id)?, path: entry.path })).collect()
 }
 
 /// What is shown.

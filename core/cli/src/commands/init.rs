@@ -5,7 +5,7 @@ use crate::args::Init;
 use crate::failure::{Failure, Refusal};
 use crate::installed;
 use crate::text::quoted;
-use dragfree_engine::files::IoContext as _;
+use dragfree_archive::files::IoContext as _;
 use std::fs::File;
 use std::io::Write as _;
 use std::path::Path;

@@ -110,6 +110,9 @@ fn threads(global: &Global) -> usize {
 }
 
 /// Version of the program, as products tell it.
-fn software() -> String {
-    concat!("dragfree ", env!("CARGO_PKG_VERSION")).to_owned()
+const SOFTWARE: &str = concat!("dragfree ", env!("CARGO_PKG_VERSION"));
+
+/// Now, and by this program.
+fn stamp() -> dragfree_archive::Stamp<'static> {
+    dragfree_archive::Stamp { time: std::time::SystemTime::now().into(), software: SOFTWARE }
 }

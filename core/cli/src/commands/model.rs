@@ -7,8 +7,8 @@ use crate::screen::problems_json;
 use crate::text::{self, Paint, columns, labelled, table};
 use dragfree_engine::border::{Kind, Manifest, ParameterType};
 use dragfree_engine::config::{EffectEntry, Model, Prior};
-use dragfree_engine::files::IoContext as _;
-use dragfree_engine::files::Problem;
+use dragfree_archive::files::IoContext as _;
+use dragfree_archive::files::Problem;
 use dragfree_engine::registry::Found;
 use dragfree_engine::revisions::{self, Change, Committed, Edit, Log, Logged, Place, What};
 use dragfree_engine::validate::{Coefficient, Subject};
@@ -284,7 +284,7 @@ fn fix(command: &ModelFix, global: &Global, paint: Paint) -> Result<Done, Failur
     let solution = adopted.first().map(|c| c.solution.as_str()).unwrap_or_default();
     let values: Vec<(String, f64)> = adopted.iter().map(|c| (c.name.clone(), c.value)).collect();
     let mut edit = Edit::begin_or_new(&out)?;
-    edit.fix(&command.model, &product.model.revision, &values, &command.keep)?;
+    edit.fix(&command.model, &product.model.revision, (product.id(), &values), &command.keep)?;
     let committed = edit.commit()?;
     let mut made = done(&out, "", committed.as_ref(), Some(&command.archive.folder), global, paint);
     if !global.json {

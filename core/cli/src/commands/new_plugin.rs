@@ -4,7 +4,7 @@ use crate::args::{Language, NewPlugin, PluginKind};
 use crate::commands::Done;
 use crate::failure::{Failure, Refusal};
 use crate::installed;
-use dragfree_engine::files::IoContext as _;
+use dragfree_archive::files::IoContext as _;
 use std::path::PathBuf;
 
 macro_rules! skeleton {

@@ -3,7 +3,7 @@
 use crate::args::{BATCH_ROWS, Global};
 use crate::failure::Failure;
 use crate::progress::Meter;
-use dragfree_engine::product::Written;
+use dragfree_archive::Written;
 use dragfree_workflow::calibrate::Progress;
 use dragfree_workflow::{Pass, Replay, WorkflowError};
 

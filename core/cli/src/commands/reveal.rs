@@ -5,7 +5,7 @@ use crate::args::{Global, Reveal};
 use crate::failure::{Failure, Refusal};
 use crate::text::{self, Paint, columns, labelled, table};
 use dragfree_engine::border::Kind;
-use dragfree_engine::files::IoContext as _;
+use dragfree_archive::files::IoContext as _;
 use dragfree_engine::sealed::Sealed;
 use dragfree_score::{Compared, Outcome, Score, Scored, Verdict, score};
 use serde_json::Value;

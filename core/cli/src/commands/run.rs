@@ -6,7 +6,8 @@ use crate::failure::Failure;
 use crate::progress::Meter;
 use crate::screen;
 use crate::text::Paint;
-use dragfree_engine::product::{self, Product, Written};
+use dragfree_archive::Written;
+use dragfree_archive::product::{self, Product};
 use dragfree_workflow::calibrate::{Options, calibrate, check};
 use std::fmt::Write as _;
 use std::path::Path;
@@ -60,7 +61,7 @@ fn options(chain: &Chain, global: &Global) -> Options {
         threads: super::threads(global),
         batch_rows: BATCH_ROWS as usize,
         created: SystemTime::now().into(),
-        software: super::software(),
+        software: super::SOFTWARE.to_owned(),
         ..Options::default()
     }
 }

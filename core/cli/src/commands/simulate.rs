@@ -50,7 +50,7 @@ pub(super) fn run(command: &Simulate, global: &Global) -> Result<SimulateOutcome
         end_ns: command.end_ns(),
         source: SOURCE.to_owned(),
         parameters,
-        software: super::software(),
+        software: super::SOFTWARE.to_owned(),
         threads: super::threads(global),
     };
     let mut meter = Meter::new("simulate", global);

@@ -74,7 +74,7 @@ impl Library {
     pub fn open(path: &Path) -> Result<Self, BorderError> {
         let refuse = |reason: String| BorderError::Refused { path: path.to_owned(), reason };
         let bytes = std::fs::read(path).map_err(|e| refuse(format!("cannot be read: {e}")))?;
-        let sha256 = crate::files::sha256(&bytes);
+        let sha256 = dragfree_archive::files::sha256(&bytes);
         check_permissions(path).map_err(&refuse)?;
         check_lock(path, &sha256).map_err(&refuse)?;
         crash::install();

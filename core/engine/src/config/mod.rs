@@ -30,7 +30,7 @@ pub enum ConfigError {
     Parameter { file: String, plugin: String, what: String },
 }
 
-fn read(path: &Path) -> Result<String, ConfigError> {
+pub(crate) fn read(path: &Path) -> Result<String, ConfigError> {
     std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })
 }
 

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use super::{ConfigError, Mission, parse, read};
 use crate::border::Manifest;
-use crate::files::sha256;
+use dragfree_archive::files::sha256;
 
 /// A model: a revision and its effects.
 #[derive(Clone, Debug)]
@@ -17,6 +17,8 @@ pub struct Model {
     pub revision: String,
     /// Revision that this one came from.
     pub parent: Option<String>,
+    /// The product at whose values `model fix` fixed its coefficients.
+    pub fixed_from: Option<String>,
     /// Effects in order.
     pub effects: Vec<EffectEntry>,
     /// Effects that are not in the file but are to be tried beside it.
@@ -78,6 +80,7 @@ struct File {
 struct Header {
     revision: String,
     parent: Option<String>,
+    fixed_from: Option<String>,
 }
 
 /// Hexadecimal digits of a digest in a revision's name.
@@ -114,6 +117,7 @@ impl Model {
             path: path.to_owned(),
             revision: file.model.revision,
             parent: file.model.parent,
+            fixed_from: file.model.fixed_from,
             effects: file.effect,
             candidates: Vec::new(),
             chosen: Vec::new(),

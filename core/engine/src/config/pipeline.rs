@@ -98,7 +98,15 @@ impl Pipeline {
     /// # Errors
     /// [`ConfigError`] says what, where and why.
     pub fn load(path: &Path) -> Result<Self, ConfigError> {
-        let file: File = parse(path, &read(path)?)?;
+        Self::parse(path, &read(path)?)
+    }
+
+    /// Reads the text of a pipeline file; paths in it are relative to the folder of `path`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] says what, where and why.
+    pub fn parse(path: &Path, text: &str) -> Result<Self, ConfigError> {
+        let file: File = parse(path, text)?;
         let folder = path.parent().unwrap_or(Path::new("."));
         let sense = |what: String| ConfigError::Sense { path: path.to_owned(), what };
         let mut nodes = Vec::new();

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
-use crate::product::Loss;
+use dragfree_archive::product::Loss;
 
 /// Sentences kept of each kind; the counts go on.
 const MESSAGES_PER_KIND: usize = 8;

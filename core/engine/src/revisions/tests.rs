@@ -210,7 +210,7 @@ fn coefficients_are_fixed_in_a_file_of_their_own() {
     let fix = |base: &str, values: &[(String, f64)], keep: &[&str]| {
         let mut edit = Edit::begin_or_new(&held)?;
         let keep: Vec<String> = keep.iter().map(|&k| k.to_owned()).collect();
-        edit.fix(&path, base, values, &keep)?;
+        edit.fix(&path, base, ("COM1B_2035-01-01_SC1_01_0001", values), &keep)?;
         edit.commit()
     };
     let fixed = fix(&added.revision, &values, &["com-offset"]).expect("fixed").expect("a change");

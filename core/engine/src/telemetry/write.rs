@@ -8,7 +8,7 @@ use tempfile::NamedTempFile;
 
 use super::encode::{EncodeError, Encoder, MessageType};
 use super::mcap_file::McapFile;
-use crate::files::{folder_of, sync_folder};
+use dragfree_archive::files::{folder_of, sync_folder};
 use crate::table::{Batch, Chunk, TableSpec};
 
 /// Why a file cannot be written.

@@ -3,7 +3,8 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use dragfree_engine::product::{Input, Product, Written};
+use dragfree_archive::Written;
+use dragfree_archive::product::{Input, Product};
 use dragfree_estimation::free_levels::log_determinant;
 use dragfree_estimation::sigma::{BandNoise, NoiseModel};
 use dragfree_estimation::stored::Stored;

@@ -1,6 +1,6 @@
 //! Normalised estimation error squared of the solutions of products of a simulation.
 
-use dragfree_engine::product::{Coefficient, Product};
+use dragfree_archive::product::{Coefficient, Product};
 use nalgebra::{Cholesky, DMatrix, DVector};
 use serde::Serialize;
 

@@ -1,5 +1,5 @@
 use super::*;
-use dragfree_engine::product::{self, Draft, ProductWriter, Stage};
+use dragfree_archive::product::{self, Draft, ProductWriter, Stage};
 use serde_json::json;
 
 /// 2035-01-01.

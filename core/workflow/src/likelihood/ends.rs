@@ -2,7 +2,7 @@
 
 use dragfree_engine::chain::Chain;
 use dragfree_engine::examine::{Examination, candidates, examine, has_parameter};
-use dragfree_engine::product::Written;
+use dragfree_archive::Written;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_identification::innovations::decision::{Candidate, Quadratic};
@@ -74,7 +74,7 @@ fn pass(
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Filtered, WorkflowError> {
     let Written { product, path } = replay.products.get(number).ok_or(WorkflowError::NoProduct)?;
-    let sources = Sources::read(path)?;
+    let sources = Sources::of(path)?;
     let mut events = candidates(replay.registry, &sources)?;
     events.retain(|e| search && has_parameter(replay.registry, &e.id, AT_NS));
     let examination = Examination {

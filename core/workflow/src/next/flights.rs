@@ -11,7 +11,7 @@ use std::cell::RefCell;
 use dragfree_engine::EngineError;
 use dragfree_engine::config::{EffectEntry, Mission as MissionFile};
 use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
-use dragfree_engine::product::Written;
+use dragfree_archive::Written;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_engine::table::{Chunk, TableSpec};
@@ -69,7 +69,7 @@ impl Catalogue {
         progress: &mut dyn FnMut(Pass, usize, Progress),
     ) -> Result<Self, WorkflowError> {
         let written = replay.products.get(number).ok_or(WorkflowError::NoProduct)?;
-        let sources = Sources::read(&written.path)?;
+        let sources = Sources::of(&written.path)?;
         let file = MissionFile::load(&sources.mission).map_err(EngineError::from)?;
         let mission = Mission::from_json(&file.value.to_string())?;
         let mut flights = within_limits(&mission, end.decided.parameters.len())?;

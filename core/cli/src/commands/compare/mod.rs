@@ -6,7 +6,7 @@ use super::{Done, INCONSISTENT, products, replay};
 use crate::args::{Compare, Global};
 use crate::failure::Failure;
 use crate::text::{self, Paint, columns, labelled};
-use dragfree_engine::files::IoContext as _;
+use dragfree_archive::files::IoContext as _;
 use dragfree_identification::coherence::{Coherence, StepwiseCoherence};
 use dragfree_identification::compare::{Channel, Comparison, Innovations, Kind, Test};
 use dragfree_workflow::compare::compare;

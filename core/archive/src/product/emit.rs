@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 use toml::{Table, Value};
 
 /// The text of a document; floats survive bit for bit.
-pub(super) fn emit(document: &Table) -> String {
+pub(crate) fn emit(document: &Table) -> String {
     let mut text = String::new();
     tables(&mut text, "", document);
     text

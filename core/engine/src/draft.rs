@@ -1,13 +1,13 @@
 //! What a run knows at its end, and how it becomes a product.
 
-use super::ProductError;
-use super::file::{
-    Attachment, Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Model,
-    NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Supersedes, Variable,
-};
 use crate::border::without_name;
 use crate::feed::Summary;
 use chrono::{DateTime, SecondsFormat, Utc};
+use dragfree_archive::product::{
+    Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Model, NonStandardAttributes,
+    Outcome, Product, Quality, Stage, Status, Stream, Variable,
+};
+use dragfree_archive::{ArchiveError, MadeOf, ProductWriter, Stamp, Written};
 use dragfree_schema::{Report, Settings};
 use std::collections::BTreeSet;
 
@@ -42,8 +42,28 @@ pub struct Draft {
     pub reports: Vec<Report>,
     /// Thresholds.
     pub settings: Settings,
+    /// Why the product is made.
+    pub stream: Stream,
+    /// How final it is.
+    pub status: Status,
     /// When the product is made; the engine has no clock.
     pub created: DateTime<Utc>,
+}
+
+impl Draft {
+    /// Archives the product with what its stages attach.
+    ///
+    /// # Errors
+    /// [`ArchiveError`]; nothing is left in the archive then.
+    pub fn commit(&self, mut writer: ProductWriter, made_of: MadeOf) -> Result<Written, ArchiveError> {
+        let product = product(self)?;
+        for report in &self.reports {
+            for attachment in &report.attachments {
+                writer.attach(&report.plugin, &attachment.suffix, &attachment.text)?;
+            }
+        }
+        writer.commit(&product, made_of, &Stamp { time: self.created, software: &self.software })
+    }
 }
 
 /// UTC day of the first epoch.
@@ -52,24 +72,19 @@ fn day(draft: &Draft) -> String {
 }
 
 /// A product's name without its revision, `COM1B_2035-01-01_SC1_01`.
-pub(super) fn stem(draft: &Draft) -> Result<String, ProductError> {
+fn stem(draft: &Draft) -> Result<String, ArchiveError> {
     let named = |what, value: &str, place, extra: &[char]| {
         let fits = !value.is_empty() && value.chars().all(|c| c.is_ascii_alphanumeric() || extra.contains(&c));
-        if fits { Ok(()) } else { Err(ProductError::Name { what, value: value.to_owned(), place }) }
+        if fits { Ok(()) } else { Err(ArchiveError::Name { what, value: value.to_owned(), place }) }
     };
     named("the product name", &draft.product, "pipeline", &[])?;
     named("the spacecraft", &draft.spacecraft, "mission", &['-'])?;
     Ok(format!("{}_{}_{}_{:02}", draft.product, day(draft), draft.spacecraft, draft.release))
 }
 
-/// Builds the product with `revision`; its digest is filled in.
-pub(super) fn product(
-    draft: &Draft,
-    revision: u32,
-    attachments: Vec<Attachment>,
-    supersedes: Option<Supersedes>,
-) -> Result<Product, ProductError> {
-    let id = format!("{}_{revision:04}", stem(draft)?);
+/// Builds the product. The archive gives it its revision, and fills in its files and its digest.
+fn product(draft: &Draft) -> Result<Product, ArchiveError> {
+    let id = stem(draft)?;
     let result = outcome(draft);
     let quality = quality(draft);
     let header = Header {
@@ -100,10 +115,10 @@ pub(super) fn product(
         non_standard_attributes: NonStandardAttributes {
             product: draft.product.clone(),
             release: draft.release,
-            revision,
+            revision: 0,
             day: day(draft),
-            stream: Stream::Test,
-            status: Status::Quicklook,
+            stream: draft.stream,
+            status: draft.status,
             time_scale: if draft.replay.time_scale.is_empty() { "unknown" } else { &draft.replay.time_scale }
                 .to_owned(),
             start_time_epoch_ns: draft.first_ns,
@@ -114,21 +129,19 @@ pub(super) fn product(
         },
         variables: variables(&result.coefficients),
     };
-    let mut product = Product {
+    Ok(Product {
         format_version: FORMAT_VERSION.to_owned(),
         header,
         model: draft.model.clone(),
         settings: draft.settings.clone(),
         result,
         quality,
-        supersedes,
+        supersedes: None,
         inputs: draft.inputs.clone(),
         history: draft.history.clone(),
         losses: draft.replay.losses.clone(),
-        attachments,
-    };
-    product.header.non_standard_attributes.sha256 = product.digest();
-    Ok(product)
+        attachments: Vec::new(),
+    })
 }
 
 /// The value of the last stage that reports one: it has seen the earlier reports.
@@ -251,3 +264,6 @@ fn variables(coefficients: &[Coefficient]) -> Vec<Variable> {
 fn calendar(time_ns: i64) -> String {
     DateTime::from_timestamp_nanos(time_ns).format("%Y-%m-%dT%H:%M:%S%.9f").to_string()
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,7 +1,7 @@
 //! The product file: its layout, its digest, reading and emitting. The JSON Schema refuses unknown keys.
 
-use super::ProductError;
 use super::emit::emit;
+use crate::ArchiveError;
 use crate::files::{IoContext as _, sha256};
 use dragfree_schema::{Role, Settings};
 use serde::{Deserialize, Serialize};
@@ -10,7 +10,7 @@ use std::path::Path;
 use std::sync::LazyLock;
 
 /// Version of the layout.
-pub const FORMAT_VERSION: &str = "1.0.0";
+pub const FORMAT_VERSION: &str = "1.1.0";
 
 static SCHEMA: LazyLock<jsonschema::Validator> = LazyLock::new(|| {
     let schema = serde_json::from_str(include_str!("../../../../fixtures/schema/product.schema.json"))
@@ -132,7 +132,7 @@ pub struct NonStandardAttributes {
 }
 
 /// Why a product was made.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "UPPERCASE")]
 pub enum Stream {
     /// Daily operations.
@@ -140,18 +140,20 @@ pub enum Stream {
     /// Reprocessing.
     Rpro,
     /// A test or a simulation.
+    #[default]
     Test,
 }
 
 /// How final a product is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Status {
     /// First look, data may still come.
+    #[default]
     Quicklook,
     /// All data are in.
     Final,
-    /// Not to be used.
+    /// Not to be used; of earlier versions, since the archive says it now.
     Withdrawn,
 }
 
@@ -178,6 +180,9 @@ pub struct Model {
     /// The revision that it came from.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub parent: Option<String>,
+    /// The product whose values it was fixed at: the run is a test on data that were kept out of that fit.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fixed_from: Option<String>,
     /// Its effects, each once, `com-offset`.
     pub effects: Vec<String>,
     /// Levels of noise that its effects state.
@@ -351,6 +356,20 @@ impl Product {
         &self.header.global_attributes.id
     }
 
+    /// The product as `revision` of its series, with its files and its digest; its id has no revision before.
+    pub(crate) fn numbered(
+        &self,
+        revision: u32,
+        attachments: Vec<Attachment>,
+        supersedes: Option<Supersedes>,
+    ) -> Self {
+        let mut product = Self { attachments, supersedes, ..self.clone() };
+        product.header.non_standard_attributes.revision = revision;
+        product.header.global_attributes.id = format!("{}_{revision:04}", self.id());
+        product.header.non_standard_attributes.sha256 = product.digest();
+        product
+    }
+
     /// SHA-256 of what the run found and from what, lower-case hexadecimal.
     ///
     /// Its bytes are the document as JSON without white space, keys sorted, missing numbers `null`; left out are the
@@ -380,15 +399,15 @@ impl Product {
     }
 
     /// The whole document.
-    pub(super) fn document(&self) -> serde_json::Value {
+    pub(crate) fn document(&self) -> serde_json::Value {
         serde_json::to_value(self).expect("every key of a product is a string")
     }
 
     /// The text of the file, checked against the schema.
-    pub(super) fn emit(&self) -> Result<String, ProductError> {
+    pub(crate) fn emit(&self) -> Result<String, ArchiveError> {
         check(self.id(), &self.document())?;
         let table = toml::Table::try_from(self);
-        Ok(emit(&table.map_err(|source| ProductError::Emit { id: self.id().to_owned(), source })?))
+        Ok(emit(&table.map_err(|source| ArchiveError::Emit { id: self.id().to_owned(), source })?))
     }
 }
 
@@ -401,12 +420,12 @@ fn canonical(mut document: serde_json::Value) -> Vec<u8> {
 /// Reads a product and checks its format version, schema, name and digest.
 ///
 /// # Errors
-/// [`ProductError`]: the file cannot be read, is no product, is from a later version or was changed.
-pub fn read(path: &Path) -> Result<Product, ProductError> {
+/// [`ArchiveError`]: the file cannot be read, is no product, is from a later version or was changed.
+pub fn read(path: &Path) -> Result<Product, ArchiveError> {
     let text = std::fs::read_to_string(path).at("read", path)?;
     let product = parse(&text, path)?;
     if path.file_stem().is_none_or(|stem| stem != product.id()) {
-        return Err(ProductError::Damaged {
+        return Err(ArchiveError::Damaged {
             path: path.to_owned(),
             reason: format!("the file says that it is {}", product.id()),
         });
@@ -415,14 +434,14 @@ pub fn read(path: &Path) -> Result<Product, ProductError> {
 }
 
 /// Reads a product's text; `path` is for messages.
-pub(super) fn parse(text: &str, path: &Path) -> Result<Product, ProductError> {
-    let table = |source| ProductError::Parse { path: path.to_owned(), source: Box::new(source) };
+pub(crate) fn parse(text: &str, path: &Path) -> Result<Product, ArchiveError> {
+    let table = |source| ArchiveError::Parse { path: path.to_owned(), source: Box::new(source) };
     let document: toml::Table = toml::from_str(text).map_err(table)?;
     let major = |version: &str| version.split('.').next().map(str::to_owned);
     if let Some(found) = document.get("format_version").and_then(toml::Value::as_str)
         && major(found) != major(FORMAT_VERSION)
     {
-        return Err(ProductError::Format { path: path.to_owned(), found: found.to_owned() });
+        return Err(ArchiveError::Format { path: path.to_owned(), found: found.to_owned() });
     }
     let name = path.file_stem().unwrap_or_default().to_string_lossy();
     let mut stored = serde_json::to_value(&document).expect("every key of TOML is a string");
@@ -432,13 +451,13 @@ pub(super) fn parse(text: &str, path: &Path) -> Result<Product, ProductError> {
     let found = product.digest_beside(stored.get_mut("settings").map(serde_json::Value::take));
     if found != *written {
         let reason = format!("its digest is {found}, the file says {written}");
-        return Err(ProductError::Damaged { path: path.to_owned(), reason });
+        return Err(ArchiveError::Damaged { path: path.to_owned(), reason });
     }
     Ok(product)
 }
 
-fn check(id: &str, document: &serde_json::Value) -> Result<(), ProductError> {
-    SCHEMA.validate(document).map_err(|error| ProductError::Schema {
+fn check(id: &str, document: &serde_json::Value) -> Result<(), ArchiveError> {
+    SCHEMA.validate(document).map_err(|error| ArchiveError::Schema {
         id: id.to_owned(),
         at: error.instance_path().to_string(),
         reason: error.to_string(),

@@ -1,0 +1,95 @@
+//! What writers have not committed: a folder for each, held by a lock that its owner's death releases.
+
+use crate::ArchiveError;
+use crate::files::IoContext as _;
+use crate::objects::entries;
+use std::fs::{self, File, TryLockError};
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
+
+/// Name of the list of digests that a writer is about to place; a killed one's are looked through.
+pub(crate) const PLACING: &str = "placing.json";
+
+const LOCK: &str = ".lock";
+
+/// A writer's folder; gone when it is dropped.
+#[derive(Debug)]
+pub(crate) struct Staging {
+    lock: File,
+    folder: PathBuf,
+}
+
+impl Staging {
+    /// Makes one inside of `staging/` of an archive.
+    pub(crate) fn begin(archive: &Path) -> Result<Self, ArchiveError> {
+        let all = root(archive);
+        fs::create_dir_all(&all).at("make the folder", &all)?;
+        loop {
+            let made = tempfile::Builder::new().prefix("w").suffix(LOCK).tempfile_in(&all);
+            let (lock, path) = made.at("write in the archive", &all)?.keep().map_err(|e| e.error).at("write", &all)?;
+            lock.lock().at("lock", &path)?;
+            // Between its making and its locking, another program may have taken it for a dead writer's.
+            if !path.exists() {
+                continue;
+            }
+            let folder = path.with_extension("");
+            let staging = Self { lock, folder };
+            fs::create_dir(&staging.folder).at("make the folder", &staging.folder)?;
+            return Ok(staging);
+        }
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.folder
+    }
+}
+
+impl Drop for Staging {
+    fn drop(&mut self) {
+        // What stays, the next command clears. The folder first: as long as the lock is held, it is not a dead writer's.
+        let _ = fs::remove_dir_all(&self.folder);
+        let _ = fs::remove_file(self.folder.with_extension(&LOCK[1..]));
+        let _ = self.lock.unlock();
+    }
+}
+
+fn root(archive: &Path) -> PathBuf {
+    archive.join("staging")
+}
+
+/// Whether any writer, alive or dead, has a folder.
+pub(crate) fn any(archive: &Path) -> Result<bool, ArchiveError> {
+    Ok(!entries(&root(archive))?.is_empty())
+}
+
+/// Clears the folders of dead writers. `forget` is told what each was about to place, before its folder is gone: who
+/// is killed in between leaves the list to the next.
+pub(crate) fn clear_dead(
+    archive: &Path,
+    mut forget: impl FnMut(Vec<String>) -> Result<(), ArchiveError>,
+) -> Result<(), ArchiveError> {
+    let root = root(archive);
+    let all = entries(&root)?;
+    for name in all.iter().filter(|name| name.ends_with(LOCK)) {
+        let path = root.join(name);
+        let lock = match File::open(&path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => continue,
+            lock => lock.at("read", &path)?,
+        };
+        match lock.try_lock() {
+            Ok(()) => {}
+            Err(TryLockError::WouldBlock) => continue,
+            Err(TryLockError::Error(error)) => return Err(error).at("lock", &path).map_err(Into::into),
+        }
+        let folder = path.with_extension("");
+        if let Ok(list) = fs::read(folder.join(PLACING)) {
+            // A list that was not written to its end was not acted on.
+            forget(serde_json::from_slice(&list).unwrap_or_default())?;
+        }
+        if folder.exists() {
+            fs::remove_dir_all(&folder).at("clear", &folder)?;
+        }
+        fs::remove_file(&path).at("clear", &path)?;
+    }
+    Ok(())
+}

@@ -1,0 +1,236 @@
+//! Archiving a product: everything is written apart, placed by digest, and committed by one entry of the journal.
+
+use crate::archive::Archive;
+use crate::files::{IoContext as _, sha256_of};
+use crate::journal::{Event, InputPlace, Stamp, Stored};
+use crate::product::{self, Attachment, Product, Supersedes};
+use crate::staging::{PLACING, Staging};
+use crate::{ArchiveError, EXTRACT, STATE, Window};
+use std::collections::BTreeMap;
+use std::fs::{self, File};
+use std::io::Write as _;
+use std::path::{Path, PathBuf};
+
+/// Revisions have four digits.
+const LAST_REVISION: u32 = 9999;
+
+/// A product and where it lies.
+#[derive(Clone, Debug)]
+pub struct Written {
+    /// The product.
+    pub product: Product,
+    /// Its `.toml`.
+    pub path: PathBuf,
+}
+
+/// What a product was made of, beside what its document says.
+#[derive(Clone, Debug, Default)]
+pub struct MadeOf {
+    /// Where its inputs lay.
+    pub places: Vec<InputPlace>,
+    /// The time that was asked for.
+    pub window: Window,
+}
+
+/// Writes one product: ask for [`ProductWriter::staged`] paths, write the files, [`ProductWriter::commit`].
+/// Dropped without a commit it leaves nothing behind.
+#[derive(Debug)]
+pub struct ProductWriter {
+    archive: Archive,
+    staging: Staging,
+    attachments: BTreeMap<String, PathBuf>,
+    /// Contents that are kept by role, with the names that their files had.
+    kept: BTreeMap<String, (String, PathBuf)>,
+}
+
+/// A file that is about to be placed.
+struct Sealed {
+    from: PathBuf,
+    sha256: String,
+    size: u64,
+}
+
+impl ProductWriter {
+    /// Opens a transaction in the archive `folder`, which is made where it does not exist.
+    ///
+    /// # Errors
+    /// [`ArchiveError`]: the archive cannot be made, read or written.
+    pub fn begin(folder: &Path) -> Result<Self, ArchiveError> {
+        let archive = Archive::create(folder)?;
+        let staging = Staging::begin(folder)?;
+        Ok(Self { archive, staging, attachments: BTreeMap::new(), kept: BTreeMap::new() })
+    }
+
+    /// Path at which the caller writes the file that will lie beside the product as `ID.suffix`.
+    pub fn staged(&mut self, suffix: &str) -> PathBuf {
+        let path = self.staging.path().join(suffix);
+        self.attachments.insert(suffix.to_owned(), path.clone());
+        path
+    }
+
+    /// Writes what `stage` attaches.
+    ///
+    /// # Errors
+    /// The suffix cannot end a file name or is taken.
+    pub fn attach(&mut self, stage: &str, suffix: &str, text: &str) -> Result<(), ArchiveError> {
+        let refuse =
+            |reason| ArchiveError::Attachment { stage: stage.to_owned(), suffix: suffix.to_owned(), reason };
+        let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || matches!(c, '.' | '-' | '_');
+        if !suffix.starts_with(|c: char| c.is_ascii_lowercase()) || !suffix.chars().all(plain) {
+            return Err(refuse("a suffix is lower-case letters, digits, '.', '-' and '_', a letter first"));
+        }
+        if ["toml", STATE, EXTRACT].contains(&suffix) || self.attachments.contains_key(suffix) {
+            return Err(refuse("that file exists already"));
+        }
+        let path = self.staged(suffix);
+        Ok(fs::write(&path, text).at("write", path)?)
+    }
+
+    /// Keeps a content that the product was made of, or left, by its role; `name` is that of its file.
+    ///
+    /// # Errors
+    /// It cannot be written.
+    pub fn keep(&mut self, role: &str, name: &str, content: &[u8]) -> Result<(), ArchiveError> {
+        let path = self.staging.path().join(format!("{role}.kept"));
+        fs::write(&path, content).at("write", &path)?;
+        self.kept.insert(role.to_owned(), (name.to_owned(), path));
+        Ok(())
+    }
+
+    /// Archives a product that has no revision yet as the next one of its day.
+    ///
+    /// # Errors
+    /// [`ArchiveError`]; nothing is left in the archive then.
+    pub fn commit(mut self, product: &Product, made_of: MadeOf, stamp: &Stamp<'_>) -> Result<Written, ArchiveError> {
+        let mut sealed = Vec::new();
+        let mut attachments = Vec::new();
+        for (suffix, path) in &self.attachments {
+            let file = seal(path)?;
+            attachments.push(Attachment { suffix: suffix.clone(), size: file.size, sha256: file.sha256.clone() });
+            sealed.push(file);
+        }
+        let mut kept = BTreeMap::new();
+        for (role, (name, path)) in &self.kept {
+            let file = seal(path)?;
+            kept.insert(role.clone(), Stored { name: name.clone(), sha256: file.sha256.clone(), size: file.size });
+            sealed.push(file);
+        }
+        let _held = self.archive.hold()?;
+        self.archive.finish()?;
+        let (revision, supersedes) = self.follows(product, &attachments)?;
+        let product = product.numbered(revision, attachments, supersedes);
+        let document = self.staging.path().join("product.toml");
+        let text = product.emit()?;
+        let write = || {
+            let mut file = File::create_new(&document)?;
+            file.write_all(text.as_bytes())?;
+            file.sync_all()
+        };
+        write().at("write", &document)?;
+        let back = fs::read_to_string(&document).at("read", &document)?;
+        if product::parse(&back, &document)?.document() != product.document() {
+            let reason = "it does not read as it was written".to_owned();
+            return Err(ArchiveError::Damaged { path: document, reason });
+        }
+        let document = seal(&document)?;
+        let event = Event::Product {
+            id: product.id().to_owned(),
+            sha256: document.sha256.clone(),
+            made_of: kept,
+            places: made_of.places,
+            from_ns: made_of.window.from_ns,
+            until_ns: made_of.window.until_ns,
+        };
+        sealed.push(document);
+        self.place(&sealed, event, stamp)?;
+        self.archive.committed();
+        Ok(Written { path: self.archive.path_of(product.id()), product })
+    }
+
+    /// Places contents and commits the event that names them; takes them away again where that fails.
+    fn place(&self, sealed: &[Sealed], event: Event, stamp: &Stamp<'_>) -> Result<(), ArchiveError> {
+        let (number, previous) = self.archive.catalogue.applied()?;
+        let digests: Vec<String> = sealed.iter().map(|file| file.sha256.clone()).collect();
+        announce(self.staging.path(), &digests)?;
+        let mut new = Vec::new();
+        let mut place = || -> Result<(), ArchiveError> {
+            for file in sealed {
+                if self.archive.objects.place(&file.from, &file.sha256)? {
+                    new.push(&file.sha256);
+                }
+            }
+            Ok(())
+        };
+        let placed = place();
+        let append = || self.archive.journal.append(self.staging.path(), (number, &previous), event, stamp);
+        let committed = placed.and_then(|()| append());
+        if committed.is_err() {
+            for sha256 in new {
+                let _ = self.archive.objects.remove(sha256); // already failing; `verify` tells what stays
+            }
+        }
+        committed
+    }
+
+    /// The revision that comes next, and what it takes the place of.
+    fn follows(
+        &self,
+        product: &Product,
+        attachments: &[Attachment],
+    ) -> Result<(u32, Option<Supersedes>), ArchiveError> {
+        let stem = product.id();
+        let same = "substr(p.id, 1, length(p.id) - 5) = ?1";
+        let mut earlier = self.archive.catalogue.products(same, [stem])?;
+        let revision = earlier.last().map_or(1, |row| row.revision + 1);
+        if revision > LAST_REVISION {
+            return Err(ArchiveError::Full(stem.to_owned()));
+        }
+        earlier.retain(|row| row.problem.is_none());
+        let old = earlier.pop().and_then(|row| product::read(&self.archive.path_of(&row.id)).ok());
+        let supersedes = old.map(|old| {
+            let new = Product { attachments: attachments.to_vec(), ..product.clone() };
+            Supersedes {
+                id: old.id().to_owned(),
+                sha256: old.header.non_standard_attributes.sha256.clone(),
+                reason: what_changed(&old, &new),
+            }
+        });
+        Ok((revision, supersedes))
+    }
+}
+
+/// Writes the list of contents that are about to be placed, so that those of a killed writer are found.
+pub(crate) fn announce(staging: &Path, digests: &[String]) -> Result<(), ArchiveError> {
+    let path = staging.join(PLACING);
+    let text = serde_json::to_vec(digests).map_err(std::io::Error::from).at("write", &path)?;
+    Ok(fs::write(&path, text).at("write", path)?)
+}
+
+/// Makes a staged file durable and takes its digest.
+fn seal(path: &Path) -> Result<Sealed, ArchiveError> {
+    let file = File::open(path).at("read", path)?;
+    file.sync_all().at("write", path)?;
+    let size = file.metadata().at("read", path)?.len();
+    Ok(Sealed { from: path.to_owned(), sha256: sha256_of(path).at("read", path)?, size })
+}
+
+/// What differs between a product and the one that takes its place, in words.
+fn what_changed(old: &Product, new: &Product) -> String {
+    let software = |product: &Product| product.header.non_standard_attributes.software_version.clone();
+    let window = |product: &Product| {
+        let attributes = &product.header.non_standard_attributes;
+        (attributes.start_time_epoch_ns, attributes.stop_time_epoch_ns)
+    };
+    let changed = [
+        ("inputs", old.inputs != new.inputs),
+        ("plugins or their parameters", old.history != new.history),
+        ("program", software(old) != software(new)),
+        ("window", window(old) != window(new)),
+    ];
+    let changed: Vec<&str> = changed.into_iter().filter_map(|(what, differs)| differs.then_some(what)).collect();
+    match changed.as_slice() {
+        [] if old.header.non_standard_attributes.sha256 == new.digest() => "run again, same result".to_owned(),
+        [] => "run again with the same inputs, plugins and parameters".to_owned(),
+        changed => format!("changed: {}", changed.join(", ")),
+    }
+}
