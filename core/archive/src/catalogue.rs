@@ -331,6 +331,12 @@ impl Catalogue {
         self.all(question, [sha256], |row| row.get(0))
     }
 
+    /// Products for which a content is kept by a role.
+    pub(crate) fn products_with(&self, role: &str, sha256: &str) -> Result<Vec<String>, ArchiveError> {
+        let question = "SELECT id FROM made_of WHERE role = ?1 AND sha256 = ?2 ORDER BY id";
+        self.all(question, [role, sha256], |row| row.get(0))
+    }
+
     /// Whether any event names a content.
     pub(crate) fn names(&self, sha256: &str) -> Result<bool, ArchiveError> {
         let question = "SELECT EXISTS (SELECT 1 FROM files WHERE sha256 = ?1) \

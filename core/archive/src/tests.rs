@@ -364,7 +364,9 @@ fn times_of_a_set_never_overlap() {
         until_ns: until.map(|day| START_NS + day * DAY_NS),
     };
     let mut certify = |spacecraft: &str, set: &str, from: i64, until: Option<i64>| {
-        archive.certify(&FIRST.replace("SC1", spacecraft), set, window(from, until), &stamp()).map_err(|e| e.to_string())
+        archive
+            .certify(&FIRST.replace("SC1", spacecraft), set, window(from, until), &stamp())
+            .map_err(|e| e.to_string())
     };
     certify("SC1", "ops", 10, Some(20)).expect("the first");
     for (from, until) in [(5, Some(11)), (19, Some(25)), (12, Some(15)), (5, Some(25)), (10, Some(20)), (15, None)] {

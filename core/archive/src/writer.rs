@@ -73,8 +73,7 @@ impl ProductWriter {
     /// # Errors
     /// The suffix cannot end a file name or is taken.
     pub fn attach(&mut self, stage: &str, suffix: &str, text: &str) -> Result<(), ArchiveError> {
-        let refuse =
-            |reason| ArchiveError::Attachment { stage: stage.to_owned(), suffix: suffix.to_owned(), reason };
+        let refuse = |reason| ArchiveError::Attachment { stage: stage.to_owned(), suffix: suffix.to_owned(), reason };
         let plain = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit() || matches!(c, '.' | '-' | '_');
         if !suffix.starts_with(|c: char| c.is_ascii_lowercase()) || !suffix.chars().all(plain) {
             return Err(refuse("a suffix is lower-case letters, digits, '.', '-' and '_', a letter first"));
@@ -187,15 +186,17 @@ impl ProductWriter {
         }
         earlier.retain(|row| row.problem.is_none());
         let old = earlier.pop().and_then(|row| product::read(&self.archive.path_of(&row.id)).ok());
-        let supersedes = old.map(|old| {
-            let new = Product { attachments: attachments.to_vec(), ..product.clone() };
-            Supersedes {
-                id: old.id().to_owned(),
-                sha256: old.header.non_standard_attributes.sha256.clone(),
-                reason: what_changed(&old, &new),
-            }
-        });
-        Ok((revision, supersedes))
+        let new = Product { attachments: attachments.to_vec(), ..product.clone() };
+        Ok((revision, old.map(|old| supersedes(&old, &new))))
+    }
+}
+
+/// What a product says of the one that it takes the place of.
+pub(crate) fn supersedes(old: &Product, new: &Product) -> Supersedes {
+    Supersedes {
+        id: old.id().to_owned(),
+        sha256: old.header.non_standard_attributes.sha256.clone(),
+        reason: what_changed(old, new),
     }
 }
 

@@ -1,5 +1,7 @@
-//! Charts as SVG: lines on linear or logarithmic axes, heat maps ([`heat`]) and tables of counts ([`matrix`]).
+//! Charts as SVG: lines on linear or logarithmic axes, heat maps ([`heat`]), tables of counts ([`matrix`]) and boxes with
+//! arrows ([`graph`]).
 
+pub mod graph;
 pub mod heat;
 pub mod matrix;
 

@@ -84,9 +84,14 @@ pub(crate) enum Command {
     /// The plugins that can be found
     #[command(subcommand)]
     Plugins(Plugins),
-    /// The archive
+    /// The products of an archive
     #[command(subcommand)]
     Products(Products),
+    /// The calibration that holds at a time, by a set of certified products; exit code 1 where there is none
+    At(At),
+    /// The archive itself
+    #[command(subcommand)]
+    Archive(ArchiveCommand),
     /// Model files: what is in them, what changed, every revision kept
     #[command(subcommand)]
     Model(Model),
@@ -229,9 +234,25 @@ pub(crate) struct Run {
     /// Save the state once the product is archived, so that the next day can resume; may be the file resumed from
     #[arg(long, value_name = "FILE")]
     pub(crate) save_state: Option<PathBuf>,
+    /// Why the product is made: operations, reprocessing or a test
+    #[arg(long, value_enum, value_name = "STREAM", default_value_t = RunStream::Test)]
+    pub(crate) stream: RunStream,
+    /// All data of the window are in: the product is final, not a first look
+    #[arg(long = "final")]
+    pub(crate) is_final: bool,
     /// Epochs that plugins are handed at a time; results do not depend on it
     #[arg(long, value_name = "N", default_value_t = BATCH_ROWS, value_parser = clap::value_parser!(u32).range(1..))]
     pub(crate) batch_rows: u32,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum RunStream {
+    /// Daily operations
+    Oper,
+    /// Reprocessing
+    Rpro,
+    /// A test or a simulation
+    Test,
 }
 
 /// What a run is linked from.
@@ -267,6 +288,8 @@ pub(crate) struct Compare {
     pub(crate) products: Vec<String>,
     #[command(flatten)]
     pub(crate) archive: Archive,
+    #[command(flatten)]
+    pub(crate) inputs: Inputs,
     /// Write spectra, maps and tests as one page of HTML that needs nothing else
     #[arg(long, value_name = "FILE.html")]
     pub(crate) page: Option<PathBuf>,
@@ -279,6 +302,8 @@ pub(crate) struct Diagnose {
     pub(crate) products: Vec<String>,
     #[command(flatten)]
     pub(crate) archive: Archive,
+    #[command(flatten)]
+    pub(crate) inputs: Inputs,
     /// Candidates and limits to print; --json has all
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub(crate) top: usize,
@@ -394,6 +419,180 @@ pub(crate) enum Products {
         #[command(flatten)]
         archive: Archive,
     },
+    /// What differs between two products: values in σ, then inputs, plugins, parameters and model
+    Diff {
+        /// The earlier one: its id, its id without the revision, its day or its file
+        #[arg(value_name = "A")]
+        first: String,
+        /// The later one
+        #[arg(value_name = "B")]
+        second: String,
+        #[command(flatten)]
+        archive: Archive,
+    },
+    /// What a product was made of, and what was made of it
+    Lineage {
+        /// Its id, its id without the revision or its day
+        #[arg(value_name = "PRODUCT")]
+        product: String,
+        /// Draw it as SVG
+        #[arg(long, value_name = "FILE.svg")]
+        picture: Option<PathBuf>,
+        #[command(flatten)]
+        archive: Archive,
+    },
+    /// Compare everything that belongs to products with its digests
+    Verify {
+        /// Products: ids, ids without the revision or days [default: all]
+        #[arg(value_name = "PRODUCT")]
+        products: Vec<String>,
+        /// All products, the journal and every content of the archive
+        #[arg(long, conflicts_with = "products")]
+        all: bool,
+        #[command(flatten)]
+        archive: Archive,
+    },
+    /// Make a product again from what it was made of, and compare; a damaged one is mended by it
+    Rebuild {
+        /// Its id, its id without the revision or its day
+        #[arg(value_name = "PRODUCT")]
+        product: String,
+        #[command(flatten)]
+        archive: Archive,
+        #[command(flatten)]
+        inputs: Inputs,
+    },
+    /// Say that a product is not to be used any more; it stays in the archive
+    Withdraw {
+        /// Its id
+        #[arg(value_name = "PRODUCT")]
+        product: String,
+        /// Why
+        #[arg(long, value_name = "TEXT")]
+        reason: String,
+        #[command(flatten)]
+        archive: Archive,
+    },
+    /// Say that a product holds for a time, in a set; times of a set never overlap
+    Certify {
+        /// Its id, its id without the revision or its day
+        #[arg(value_name = "PRODUCT")]
+        product: String,
+        /// First time
+        #[arg(long, value_name = "UTC", value_parser = utc::parse)]
+        from: i64,
+        /// End, exclusive
+        #[arg(long, value_name = "UTC", value_parser = utc::parse, required_unless_present = "open_ended")]
+        until: Option<i64>,
+        /// Until further notice: a time without calibration is then not noticed as such
+        #[arg(long, conflicts_with = "until")]
+        open_ended: bool,
+        /// Name of the set, which is made where there is none
+        #[arg(long = "into", value_name = "SET")]
+        set: String,
+        #[command(flatten)]
+        archive: Archive,
+    },
+    /// Take a time out of a set
+    Decertify {
+        /// Name of the set
+        #[arg(long = "from-set", value_name = "SET")]
+        set: String,
+        /// Spacecraft, `SC1`
+        #[arg(long, value_name = "NAME")]
+        spacecraft: String,
+        /// First time [default: from the beginning]
+        #[arg(long, value_name = "UTC", value_parser = utc::parse)]
+        from: Option<i64>,
+        /// End, exclusive [default: without end]
+        #[arg(long, value_name = "UTC", value_parser = utc::parse)]
+        until: Option<i64>,
+        #[command(flatten)]
+        archive: Archive,
+    },
+    /// Sets of certified products
+    #[command(subcommand)]
+    Sets(Sets),
+    /// Write the result of a product in another format
+    Export {
+        /// Its id, its id without the revision, its day or its file
+        #[arg(value_name = "PRODUCT")]
+        product: String,
+        /// Format
+        #[arg(long, value_enum)]
+        format: Format,
+        /// File [default: the terminal]
+        #[arg(long, value_name = "FILE")]
+        out: Option<PathBuf>,
+        #[command(flatten)]
+        archive: Archive,
+    },
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub(crate) enum Format {
+    /// A row per coefficient of every solution
+    Csv,
+    /// The offset of each test mass in the text format of GRACE-FO's VCM1B
+    Vcm1b,
+    /// The whole product
+    Json,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Sets {
+    /// List the sets, and what each says
+    List(Archive),
+    /// Fix a set: what it says it says always
+    Publish {
+        /// Name of the set
+        #[arg(value_name = "SET")]
+        set: String,
+        #[command(flatten)]
+        archive: Archive,
+    },
+    /// Say that a set is not to be used any more
+    Invalidate {
+        /// Name of the set
+        #[arg(value_name = "SET")]
+        set: String,
+        /// Why
+        #[arg(long, value_name = "TEXT")]
+        reason: String,
+        #[command(flatten)]
+        archive: Archive,
+    },
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum ArchiveCommand {
+    /// Make the catalogue again from the journal and the products
+    Reindex(Archive),
+    /// Take over the products of a folder that an earlier version wrote
+    Migrate(Archive),
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct At {
+    /// Time
+    #[arg(value_name = "UTC", value_parser = utc::parse)]
+    pub(crate) time_ns: i64,
+    /// Set of certified products [default: the only one that is not invalidated]
+    #[arg(long, value_name = "SET")]
+    pub(crate) set: Option<String>,
+    /// Spacecraft [default: all]
+    #[arg(long, value_name = "NAME")]
+    pub(crate) spacecraft: Option<String>,
+    #[command(flatten)]
+    pub(crate) archive: Archive,
+}
+
+/// Where inputs may be that are not where they were.
+#[derive(Debug, Args)]
+pub(crate) struct Inputs {
+    /// Look here, and in the folders inside, for telemetry that has moved; it is found by its digest; repeatable
+    #[arg(long = "inputs", value_name = "DIR")]
+    pub(crate) folders: Vec<PathBuf>,
 }
 
 #[derive(Debug, Args)]
@@ -622,6 +821,24 @@ mod tests {
             "dragfree plugins new my-effect --kind stage --sdk ../core/sdk",
             "dragfree products list --json",
             "dragfree products show COM1B_2035-01-01_SC1_01_0001 --archive d --color never",
+            "dragfree products list --from 2035-01-01 --until 2035-01-31 --verdict agree --model 2 --set ops --latest",
+            "dragfree products diff a b --json",
+            "dragfree products lineage a --picture l.svg",
+            "dragfree products verify --all",
+            "dragfree products verify a b",
+            "dragfree products rebuild a --inputs d --inputs e",
+            "dragfree products withdraw a --reason wrong",
+            "dragfree products certify a --from 2035-01-01 --until 2035-02-01 --into ops",
+            "dragfree products certify a --from 2035-01-01 --open-ended --into ops",
+            "dragfree products decertify --from-set ops --spacecraft SC1 --from 2035-01-05 --until 2035-01-06",
+            "dragfree products sets list",
+            "dragfree products sets publish ops",
+            "dragfree products sets invalidate ops --reason wrong",
+            "dragfree products export a --format vcm1b --out f.txt",
+            "dragfree at 2035-01-05T12:00Z --set ops --json",
+            "dragfree archive reindex --archive d",
+            "dragfree archive migrate --archive d",
+            "dragfree run p.toml --stream oper --final",
             "dragfree --threads 2 -q run p.toml",
             "dragfree -vv run p.toml",
             "dragfree run p.toml --log-json l.jsonl",

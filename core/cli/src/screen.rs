@@ -2,10 +2,10 @@
 
 use crate::text::{self, Paint};
 use crate::utc;
-use dragfree_engine::border::{Manifest, Parameter, ParameterType};
 use dragfree_archive::files::Problem;
 use dragfree_archive::product::{Coefficient, Product};
 use dragfree_archive::{Entry, Listing};
+use dragfree_engine::border::{Manifest, Parameter, ParameterType};
 use dragfree_engine::registry::Registry;
 use dragfree_workflow::calibrate::{CheckReport, CheckedNode};
 use serde_json::Value;
@@ -271,7 +271,9 @@ pub(crate) fn plugins_json(registry: &Registry, clash: Option<&str>) -> Value {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use dragfree_archive::product::{Draft, Model, ProductWriter, Written};
+    use dragfree_archive::product::{Model, Status, Stream};
+    use dragfree_archive::{Archive, Find, MadeOf, ProductWriter, Written};
+    use dragfree_engine::draft::Draft;
     use dragfree_engine::schema::Report;
 
     const PLAIN: Paint = Paint(false);
@@ -295,6 +297,7 @@ mod tests {
             model: Model {
                 revision: "1".into(),
                 parent: None,
+                fixed_from: None,
                 effects: vec!["com-offset".into()],
                 noise_levels: Vec::new(),
             },
@@ -302,9 +305,11 @@ mod tests {
             replay: dragfree_engine::feed::Summary { time_scale: "UTC".into(), ..Default::default() },
             reports: vec![Report { plugin: "qp-check".into(), ..report }],
             settings: Default::default(),
+            stream: Stream::Test,
+            status: Status::Quicklook,
             created: chrono::DateTime::UNIX_EPOCH,
         };
-        ProductWriter::begin(folder).expect("begin").commit(&draft).expect("commit")
+        draft.commit(ProductWriter::begin(folder).expect("begin"), MadeOf::default()).expect("commit")
     }
 
     fn fits(screen: &str) {
@@ -386,7 +391,7 @@ mod tests {
         written(folder.path(), serde_json::json!({"verdict": "agree", "epochs_used": 215_874, "chi2_per_dof": 1.0}));
         written(folder.path(), serde_json::json!({}));
         std::fs::write(folder.path().join("notes.txt"), "mine").expect("write");
-        let found = dragfree_archive::product::list(folder.path()).expect("list");
+        let found = Archive::open(folder.path()).expect("archive").list(&Find::default()).expect("list");
         let screen = listing(&found, folder.path(), PLAIN);
         let lines: Vec<_> = screen.lines().collect();
         assert_eq!(lines[1], "COM1B_2035-01-01_SC1_01_0001  215 874  agree    1.0000  1");

@@ -5,7 +5,9 @@ use chrono::{DateTime, NaiveDate, NaiveDateTime};
 /// Unix ns of an RFC 3339 instant, of a date alone (its first instant) or of a date and time without a zone (UTC).
 pub(crate) fn parse(text: &str) -> Result<i64, String> {
     let zoned = DateTime::parse_from_rfc3339(text).ok().map(|instant| instant.to_utc());
-    let plain = || text.parse::<NaiveDateTime>().ok().map(|instant| instant.and_utc());
+    let without_zone = text.strip_suffix('Z').unwrap_or(text);
+    let to_the_minute = || NaiveDateTime::parse_from_str(without_zone, "%Y-%m-%dT%H:%M").ok();
+    let plain = || text.parse::<NaiveDateTime>().ok().or_else(to_the_minute).map(|instant| instant.and_utc());
     let date = || text.parse::<NaiveDate>().ok().map(|day| day.and_time(chrono::NaiveTime::MIN).and_utc());
     let instant = zoned
         .or_else(plain)
@@ -31,6 +33,7 @@ mod tests {
         assert_eq!(parse("2035-01-01"), Ok(START_NS));
         assert_eq!(parse("2035-01-01T06:00:00Z"), Ok(START_NS + DAY_NS / 4));
         assert_eq!(parse("2035-01-01T06:00:00+02:00"), Ok(START_NS + DAY_NS / 6));
+        assert_eq!(parse("2035-01-01T06:00Z"), Ok(START_NS + DAY_NS / 4));
         assert_eq!(parse("2035-01-01T06:00:00.5"), Ok(START_NS + DAY_NS / 4 + 500_000_000));
         for wrong in ["", "2035", "2035-13-01", "2035-02-29", "9999-01-01", "06:00"] {
             assert!(parse(wrong).is_err(), "{wrong}");

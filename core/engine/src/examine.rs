@@ -9,12 +9,12 @@ use crate::border::Kind;
 use crate::chain::{Chain, Sink};
 use crate::config::{EffectEntry, Mission, Model, Node};
 use crate::feed::{Feed, SourceFeed, Summary};
-use dragfree_archive::files::{IoContext as _, sha256_of};
-use dragfree_archive::product::Product;
 use crate::registry::Registry;
 use crate::run::{Progress, RunOptions, Setup};
 use crate::sources::Sources;
 use crate::table::{Chunk, TableSpec};
+use dragfree_archive::files::{IoContext as _, sha256_of};
+use dragfree_archive::product::Product;
 
 /// Puts other values into the rows of a feed, as they would be in another experiment. Times stay.
 pub type Altering<'a> = &'a dyn Fn(&[TableSpec], &mut Chunk);

@@ -11,11 +11,11 @@ use crate::EngineError;
 use crate::border::{Config, Instance};
 use crate::chain;
 use crate::config::{Mission, resolve_parameters};
-use dragfree_archive::product::Loss;
 use crate::registry::{Found, Registry};
 use crate::replay::Replay;
 use crate::sealed::Sealed;
 use crate::table::{Chunk, TableSpec};
+use dragfree_archive::product::Loss;
 
 /// Rows in stretches of time.
 pub trait Feed {

@@ -13,12 +13,12 @@ use crate::chain::{self, Carry, Chain, ChainNode, Sink};
 use crate::config::{Mission, Model, Pipeline, read};
 use crate::draft::Draft;
 use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions};
-use dragfree_archive::files::{IoContext as _, IoError, folder_of, sha256, sha256_of, sync_folder};
-use dragfree_archive::product::{self, Loss, NoiseLevel, Stage, Status, Stream};
-use dragfree_archive::{InputPlace, MadeOf, ProductWriter, Window, Written};
 use crate::registry::Registry;
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{FileHeader, TelemetryWriter, interface_tables};
+use dragfree_archive::files::{IoContext as _, IoError, folder_of, sha256, sha256_of, sync_folder};
+use dragfree_archive::product::{self, Loss, NoiseLevel, Stage, Status, Stream};
+use dragfree_archive::{InputPlace, MadeOf, ProductWriter, Window, Written};
 
 /// What to run.
 #[derive(Clone, Debug, Default)]

@@ -9,12 +9,12 @@ use std::thread::{Scope, ScopedJoinHandle};
 use crate::EngineError;
 use crate::config::Mission;
 use crate::feed::{Feed, SourceFeed, SourceOptions};
-use dragfree_archive::files::IoContext as _;
 use crate::registry::Registry;
 use crate::run::Progress;
 use crate::sealed::{DIGEST_KEY, Sealed};
 use crate::table::{Chunk, TableSpec};
 use crate::telemetry::{FileHeader, TelemetryWriter, WriteError};
+use dragfree_archive::files::IoContext as _;
 
 /// What to simulate.
 #[derive(Clone, Debug)]

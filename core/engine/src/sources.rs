@@ -54,7 +54,8 @@ impl Sources {
                 return Ok(path);
             }
             let input = inputs.iter().find(|place| place.role == role);
-            let missing = || ArchiveError::NotFound { id: format!("{id}: {role}"), folder: archive.folder().to_owned() };
+            let missing =
+                || ArchiveError::NotFound { id: format!("{id}: {role}"), folder: archive.folder().to_owned() };
             Ok(there(input.ok_or_else(missing)?)?)
         };
         let telemetry = inputs.iter().filter(|place| place.role == "telemetry").map(there);

@@ -3,9 +3,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use dragfree_archive::Written;
 use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
-use dragfree_archive::Written;
 use dragfree_engine::registry::Registry;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{

@@ -9,8 +9,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use dragfree_engine::EngineError;
 use dragfree_archive::{Archive, EXTRACT, Stamp, Written};
+use dragfree_engine::EngineError;
 use dragfree_engine::registry::Registry;
 use dragfree_identification::diagnosis::{Diagnosis, Found, Trials, UNOBSERVABLE};
 use dragfree_identification::innovations::decision::Prior;

@@ -10,8 +10,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::Serialize;
 
-use dragfree_engine::config::Model;
 use dragfree_archive::product::{Coefficient, Product};
+use dragfree_engine::config::Model;
 
 mod missions;
 mod nees;

@@ -11,6 +11,7 @@ pub mod ladder;
 mod likelihood;
 pub mod next;
 mod proposals;
+pub mod provenance;
 mod replay;
 mod sums;
 

@@ -6,10 +6,10 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
+use dragfree_archive::Written;
 use dragfree_engine::chain::Chain;
 use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{Examination, examine};
-use dragfree_archive::Written;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_identification::diagnosis::Constancy;

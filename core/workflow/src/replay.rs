@@ -2,10 +2,10 @@
 
 use std::collections::BTreeMap;
 
+use dragfree_archive::Written;
 use dragfree_engine::chain::Chain;
 use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{Examination, FREQUENCY_HZ, candidates, examine, has_parameter};
-use dragfree_archive::Written;
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;

@@ -357,16 +357,18 @@ impl Product {
     }
 
     /// The product as `revision` of its series, with its files and its digest; its id has no revision before.
-    pub(crate) fn numbered(
-        &self,
-        revision: u32,
-        attachments: Vec<Attachment>,
-        supersedes: Option<Supersedes>,
-    ) -> Self {
+    pub(crate) fn numbered(&self, revision: u32, attachments: Vec<Attachment>, supersedes: Option<Supersedes>) -> Self {
         let mut product = Self { attachments, supersedes, ..self.clone() };
         product.header.non_standard_attributes.revision = revision;
         product.header.global_attributes.id = format!("{}_{revision:04}", self.id());
         product.header.non_standard_attributes.sha256 = product.digest();
+        product
+    }
+
+    /// The product under another id without a revision.
+    pub(crate) fn unnumbered(&self, stem: &str) -> Self {
+        let mut product = Self { supersedes: None, ..self.clone() };
+        stem.clone_into(&mut product.header.global_attributes.id);
         product
     }
 

@@ -5,10 +5,10 @@ use crate::args::Ladder as Arguments;
 use crate::failure::Failure;
 use crate::text::{self, Paint, columns, distinct, labelled, table};
 use crate::truth;
-use dragfree_chart::{Line, Panel, Scale, Stroke, svg};
-use dragfree_archive::files::IoContext as _;
 use dragfree_archive::Written;
+use dragfree_archive::files::IoContext as _;
 use dragfree_archive::product::Product;
+use dragfree_chart::{Line, Panel, Scale, Stroke, svg};
 use dragfree_workflow::ladder::{Fall, Fit, Ladder, Rung, Value, Verdict, Window, declared_log_determinant, ladder};
 use std::path::Path;
 

@@ -59,7 +59,9 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
         Command::Diagnose(command) => diagnose::execute(command, global, paint),
         Command::Config(Config::Check(chain)) => run::config_check(chain, global),
         Command::Plugins(command) => plugins::execute(command, global, paint),
-        Command::Products(command) => products::execute(command, global.json, paint),
+        Command::Products(command) => products::execute(command, global, paint),
+        Command::At(command) => products::at(command, global.json, paint),
+        Command::Archive(command) => products::of_archive(command, global.json),
         Command::Model(command) => model::execute(command, global, paint),
         Command::Ladder(command) => ladder::execute(command, global.json, paint),
     }

@@ -1,13 +1,13 @@
 //! `dragfree run` and `dragfree config check`.
 
 use super::{Done, INCONSISTENT};
-use crate::args::{BATCH_ROWS, Chain, Global, Run};
+use crate::args::{BATCH_ROWS, Chain, Global, Run, RunStream};
 use crate::failure::Failure;
 use crate::progress::Meter;
 use crate::screen;
 use crate::text::Paint;
 use dragfree_archive::Written;
-use dragfree_archive::product::{self, Product};
+use dragfree_archive::product::{self, Product, Status, Stream};
 use dragfree_workflow::calibrate::{Options, calibrate, check};
 use std::fmt::Write as _;
 use std::path::Path;
@@ -36,6 +36,12 @@ pub(super) fn archive(command: &Run, global: &Global) -> Result<Written, Failure
         batch_rows: command.batch_rows as usize,
         state_in: command.load_state.clone(),
         state_out: command.save_state.clone(),
+        stream: match command.stream {
+            RunStream::Oper => Stream::Oper,
+            RunStream::Rpro => Stream::Rpro,
+            RunStream::Test => Stream::Test,
+        },
+        status: if command.is_final { Status::Final } else { Status::Quicklook },
         ..options(&command.chain, global)
     };
     let mut meter = Meter::new("run", global);

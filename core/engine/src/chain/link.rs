@@ -6,9 +6,9 @@ use serde_json::{Map, Value, json};
 use super::{Carry, Chain, ChainError, ChainNode, Queue, Route};
 use crate::border::{BorderError, Config, Instance, Kind, LinkRequest, Linked};
 use crate::config::{EffectEntry, Mission, Model, Node, Pipeline, resolve_parameters};
-use dragfree_archive::files::sha256;
 use crate::registry::{Found, Registry};
 use crate::table::{Column, TableSpec};
+use dragfree_archive::files::sha256;
 
 /// Links a pipeline over the tables of a feed.
 ///

@@ -8,8 +8,8 @@ use tempfile::NamedTempFile;
 
 use super::encode::{EncodeError, Encoder, MessageType};
 use super::mcap_file::McapFile;
-use dragfree_archive::files::{folder_of, sync_folder};
 use crate::table::{Batch, Chunk, TableSpec};
+use dragfree_archive::files::{folder_of, sync_folder};
 
 /// Why a file cannot be written.
 #[derive(Debug, thiserror::Error)]

@@ -1,5 +1,7 @@
 use super::*;
-use dragfree_archive::product::{self, Draft, ProductWriter, Stage};
+use dragfree_archive::product::{self, Stage, Status, Stream};
+use dragfree_archive::{MadeOf, ProductWriter};
+use dragfree_engine::draft::Draft;
 use serde_json::json;
 
 /// 2035-01-01.
@@ -102,6 +104,7 @@ impl Made<'_> {
             model: product::Model {
                 revision: self.revision.into(),
                 parent: self.parent.map(str::to_owned),
+                fixed_from: None,
                 effects: Vec::new(),
                 noise_levels: Vec::new(),
             },
@@ -109,10 +112,13 @@ impl Made<'_> {
             replay: dragfree_engine::feed::Summary { time_scale: "UTC".into(), ..Default::default() },
             reports: vec![serde_json::from_value(report).expect("a report")],
             settings: Default::default(),
+            stream: Stream::Test,
+            status: Status::Quicklook,
             created: chrono::DateTime::UNIX_EPOCH,
         };
         let folder = tempfile::tempdir().expect("folder");
-        ProductWriter::begin(folder.path()).expect("begin").commit(&draft).expect("commit").product
+        let writer = ProductWriter::begin(folder.path()).expect("begin");
+        draft.commit(writer, MadeOf::default()).expect("commit").product
     }
 }
 

@@ -1,8 +1,8 @@
 //! Transients near the ends of the data and of gaps, before any effect is weighed.
 
+use dragfree_archive::Written;
 use dragfree_engine::chain::Chain;
 use dragfree_engine::examine::{Examination, candidates, examine, has_parameter};
-use dragfree_archive::Written;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_identification::innovations::decision::{Candidate, Quadratic};

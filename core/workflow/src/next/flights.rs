@@ -8,10 +8,10 @@
 
 use std::cell::RefCell;
 
+use dragfree_archive::Written;
 use dragfree_engine::EngineError;
 use dragfree_engine::config::{EffectEntry, Mission as MissionFile};
 use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
-use dragfree_archive::Written;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_engine::table::{Chunk, TableSpec};

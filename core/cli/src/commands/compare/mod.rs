@@ -18,6 +18,7 @@ const NAMED: usize = 5;
 pub(super) fn execute(command: &Compare, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let names = &command.products;
     let products = products::open_all(names, &command.archive.folder)?;
+    products::look_for(&products, &command.inputs.folders)?;
     let comparison = replay::with_meter(&products, global, compare)?;
     if let Some(path) = &command.page {
         let meaning = (!comparison.passes).then(|| meaning(&comparison));

@@ -1,0 +1,161 @@
+//! `dragfree products diff` and `lineage`.
+
+use crate::commands::Done;
+use crate::failure::Failure;
+use crate::text::{self, Paint};
+use dragfree_archive::files::IoContext as _;
+use dragfree_chart::graph::{self, Node};
+use dragfree_workflow::provenance::{self, Change, Diff, Lineage};
+use std::fmt::Write as _;
+use std::path::Path;
+
+pub(super) fn diff(names: [&str; 2], folder: &Path, json: bool, paint: Paint) -> Result<Done, Failure> {
+    let [first, second] = [super::open(names[0], folder)?, super::open(names[1], folder)?];
+    let diff = provenance::diff(&first.product, &second.product);
+    if json {
+        return Ok(Done::json(&serde_json::to_value(&diff)?));
+    }
+    let mut text = format!("first     {}\nsecond    {}\n", diff.first, diff.second);
+    if diff.same {
+        let _ = writeln!(text, "digest    {}: the same result from the same inputs", paint.good("same"));
+    }
+    Ok(Done::new(text + &differences(&diff, paint)))
+}
+
+/// Values, then everything else that is not the same.
+pub(super) fn differences(diff: &Diff, paint: Paint) -> String {
+    let mut screen = String::new();
+    if !diff.values.is_empty() {
+        let row = |c: &provenance::ValueChange| {
+            let (unit, factor) = text::readable_unit(&c.unit);
+            let value = |x: Option<f64>, s: Option<f64>| {
+                x.map_or_else(|| "-".to_owned(), |x| text::measured(x * factor, s.unwrap_or(f64::NAN) * factor))
+            };
+            vec![
+                c.name.clone(),
+                value(c.first, c.first_sigma),
+                value(c.second, c.second_sigma),
+                unit.to_owned(),
+                c.sigmas.map_or_else(|| "-".to_owned(), |q| format!("{q:+.2} σ")),
+            ]
+        };
+        let heading = ["coefficient", "first", "second", "unit", "difference"];
+        screen += "\n";
+        screen += &text::columns(&text::table(&heading, diff.values.iter().map(row)));
+    }
+    let parts = [
+        ("inputs", &diff.inputs),
+        ("plugins", &diff.plugins),
+        ("parameters", &diff.parameters),
+        ("model", &diff.model),
+        ("other", &diff.other),
+    ];
+    for (name, changes) in parts.into_iter().filter(|(_, changes)| !changes.is_empty()) {
+        let _ = writeln!(screen, "\n{}", paint.bold(name));
+        for Change { what, first, second } in changes {
+            let side = |side: &Option<String>| side.clone().unwrap_or_else(|| "not there".to_owned());
+            screen += &text::labelled("", what);
+            let _ = writeln!(screen, "            first   {}\n            second  {}", side(first), side(second));
+        }
+    }
+    if parts.iter().all(|(_, changes)| changes.is_empty()) {
+        screen += "\ninputs, plugins, parameters and model are the same\n";
+    }
+    screen
+}
+
+pub(super) fn lineage(
+    name: &str,
+    folder: &Path,
+    picture: Option<&Path>,
+    json: bool,
+    paint: Paint,
+) -> Result<Done, Failure> {
+    let archive = super::archive(folder)?;
+    let id = archive.find(name)?.row.id;
+    let lineage = provenance::lineage(&archive, &id)?;
+    if let Some(path) = picture {
+        std::fs::write(path, drawn(&lineage)?).at("write", path)?;
+    }
+    if json {
+        return Ok(Done::json(&serde_json::to_value(&lineage)?));
+    }
+    let mut text = told(&lineage, paint);
+    if let Some(path) = picture {
+        let _ = writeln!(text, "picture   {}", path.display());
+    }
+    Ok(Done::new(text))
+}
+
+/// The start of a digest, enough to tell contents apart.
+fn short(sha256: &str) -> &str {
+    sha256.get(..12).unwrap_or(sha256)
+}
+
+fn told(l: &Lineage, paint: Paint) -> String {
+    let mut text = format!("{}\n", paint.bold(&l.product.id));
+    if let Some(reason) = &l.product.withdrawn {
+        text += &text::labelled("withdrawn", reason);
+    }
+    text += "\nmade of\n";
+    for place in l.inputs.iter().filter(|place| place.role == "telemetry") {
+        let there = place.path.as_ref().filter(|path| path.is_file());
+        let gone = if there.is_some() { String::new() } else { format!(", {}", paint.doubtful("not there any more")) };
+        let _ = writeln!(text, "  telemetry  {}  {}{gone}", short(&place.sha256), place.name);
+        if let Some(path) = &place.path {
+            let _ = writeln!(text, "             {}", path.display());
+        }
+    }
+    for place in l.kept.iter().filter(|place| place.role != "state_out") {
+        let role = if place.role == "state_in" { "state" } else { &place.role };
+        let _ = writeln!(text, "  {role:<9}  {}  {}", short(&place.sha256), place.name);
+    }
+    for stage in &l.plugins {
+        let colon = if stage.instance.is_empty() { "" } else { ":" };
+        let name = format!("{}{colon}{}", stage.plugin, stage.instance);
+        let _ = writeln!(text, "  plugin     {}  {name} {}", short(&stage.library_sha256), stage.version);
+    }
+    for id in &l.resumed {
+        let _ = writeln!(text, "  after      {id}");
+    }
+    if let Some(id) = &l.supersedes {
+        let _ = writeln!(text, "  in place of {id}");
+    }
+    let of_it =
+        [("superseded by", &l.superseded_by), ("resumed by", &l.resumed_by), ("tested on other data by", &l.tested_by)];
+    if of_it.iter().any(|(_, ids)| !ids.is_empty()) || !l.certified.is_empty() {
+        text += "\nmade of it\n";
+    }
+    for (what, id) in of_it.into_iter().flat_map(|(what, ids)| ids.iter().map(move |id| (what, id))) {
+        let _ = writeln!(text, "  {what} {id}");
+    }
+    for v in &l.certified {
+        let _ = writeln!(text, "  set {} from {}", v.set, crate::utc::format(v.from_ns));
+    }
+    text
+}
+
+/// Inputs on the left, the product, what came of it on the right.
+fn drawn(l: &Lineage) -> Result<String, Failure> {
+    let node = |kind: &str, name: &str, note: &str| Node { lines: vec![kind.into(), name.into(), note.into()] };
+    let mut left: Vec<Node> = Vec::new();
+    left.extend(l.resumed.first().map(|id| node("state of", id, "")));
+    left.extend(l.supersedes.iter().map(|id| node("in place of", id, "")));
+    left.extend(
+        l.inputs.iter().filter(|p| p.role == "telemetry").map(|p| node("telemetry", &p.name, short(&p.sha256))),
+    );
+    let kept = l.kept.iter().filter(|p| !p.role.starts_with("state"));
+    left.extend(kept.map(|p| node(&p.role, &p.name, short(&p.sha256))));
+    let plugins = text::distinct(l.plugins.iter().map(|s| (s.plugin.as_str(), s.library_sha256.as_str())));
+    left.extend(plugins.into_iter().map(|(name, sha256)| node("plugin", name, short(sha256))));
+    let verdict = l.product.verdict.as_deref().unwrap_or("no verdict");
+    let middle = vec![node("product", &l.product.id, verdict)];
+    let mut right: Vec<Node> = Vec::new();
+    right.extend(l.superseded_by.iter().map(|id| node("superseded by", id, "")));
+    right.extend(l.resumed_by.iter().map(|id| node("resumed by", id, "")));
+    right.extend(l.tested_by.iter().map(|id| node("tested by", id, "")));
+    right.extend(l.certified.iter().map(|v| node("set", &v.set, &crate::utc::format(v.from_ns))));
+    let edges = (0..left.len()).map(|i| ((0, i), (1, 0))).chain((0..right.len()).map(|i| ((1, 0), (2, i))));
+    let edges: Vec<_> = edges.collect();
+    Ok(graph::svg(&[left, middle, right], &edges)?)
+}
