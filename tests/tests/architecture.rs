@@ -33,9 +33,11 @@ fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
 fn allowed(crate_name: &str) -> &'static [&'static str] {
     match crate_name {
         "dragfree-abi" | "dragfree-schema" | "dragfree-chart" | "dragfree-score" | "xtask" => &[],
-        "dragfree-physics" => &["dragfree-schema"],
-        "dragfree-sdk" | "dragfree-engine" => &["dragfree-abi", "dragfree-schema"],
+        "dragfree-physics" | "dragfree-archive" => &["dragfree-schema"],
+        "dragfree-sdk" => &["dragfree-abi", "dragfree-schema"],
+        "dragfree-engine" => &["dragfree-abi", "dragfree-archive", "dragfree-schema"],
         "dragfree" => &[
+            "dragfree-archive",
             "dragfree-engine",
             "dragfree-physics",
             "dragfree-chart",
@@ -48,6 +50,7 @@ fn allowed(crate_name: &str) -> &'static [&'static str] {
         "dragfree-estimation" => &["dragfree-physics", "dragfree-schema"],
         "dragfree-identification" => &["dragfree-schema", "dragfree-estimation"],
         "dragfree-workflow" => &[
+            "dragfree-archive",
             "dragfree-schema",
             "dragfree-physics",
             "dragfree-engine",
@@ -198,9 +201,10 @@ fn words_of_others(text: &str) -> Vec<(usize, &'static str)> {
 
 #[test]
 fn the_core_names_no_plugin_channel_or_test_mass() {
-    let mut folders = ["abi", "schema", "sdk", "engine", "estimation", "identification", "workflow", "chart", "cli"]
-        .map(|c| dragfree_tests::root().join("core").join(c).join("src"))
-        .to_vec();
+    let mut folders =
+        ["abi", "schema", "sdk", "archive", "engine", "estimation", "identification", "workflow", "chart", "cli"]
+            .map(|c| dragfree_tests::root().join("core").join(c).join("src"))
+            .to_vec();
     let (mut seen, mut found, mut still) = (0, Vec::new(), BTreeSet::new());
     while let Some(folder) = folders.pop() {
         for entry in std::fs::read_dir(&folder).expect("a folder").flatten() {

@@ -1,8 +1,8 @@
 //! The catalogue: what journal and products say, as tables. It holds nothing that is not in them.
 
 use crate::ArchiveError;
-use crate::journal::{Event, InputPlace, JournalEntry};
-use crate::product::Product;
+use crate::journal::{Event, InputPlace, JournalEntry, SetState};
+use crate::product::{EXTRACT, Product};
 use rusqlite::{Connection, OptionalExtension as _, Params, Row as SqlRow, params};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -225,8 +225,8 @@ impl Catalogue {
         self.connection.query_row("SELECT number, sha256 FROM applied", [], read).map_err(|e| self.error(e))
     }
 
-    /// Enters events that follow on what the tables know, all or none. `read` gives the document of an archived product by
-    /// id and digest, or why it cannot be read.
+    /// Enters events that follow on what the tables know, all or none. `read` gives the document of an archived product
+    /// by id and digest, or why it cannot be read.
     pub(crate) fn apply(
         &mut self,
         entries: &[(JournalEntry, String)],
@@ -491,7 +491,7 @@ fn enter_event(
                 }
             }
         }
-        Event::Extract { id, sha256, size } => enter_file(connection, id, crate::EXTRACT, sha256, *size)?,
+        Event::Extract { id, sha256, size } => enter_file(connection, id, EXTRACT, sha256, *size)?,
         Event::Places { places } => enter_places(connection, number, places)?,
         Event::Withdrawn { id, reason } => {
             let values = params![id, number, reason];
@@ -571,7 +571,7 @@ fn enter_places(connection: &Connection, number: i64, places: &[InputPlace]) -> 
 }
 
 fn open_set(connection: &Connection, set: &str, number: i64) -> rusqlite::Result<()> {
-    let state = crate::SetState::Open.name();
+    let state = SetState::Open.name();
     connection.execute("INSERT OR IGNORE INTO sets VALUES (?1, ?2, '', ?3)", params![set, state, number]).map(drop)
 }
 

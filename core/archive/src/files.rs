@@ -1,7 +1,7 @@
 //! Files: errors that name them, digests, and durable renames.
 
 use sha2::{Digest as _, Sha256};
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 
@@ -78,4 +78,29 @@ pub fn sha256_of(path: &Path) -> io::Result<String> {
             count => hasher.update(&buffer[..count]),
         }
     }
+}
+
+/// Number of a file on its file system.
+#[cfg(unix)]
+pub(crate) fn inode(stat: &fs::Metadata) -> u64 {
+    use std::os::unix::fs::MetadataExt as _;
+    stat.ino()
+}
+
+/// When a file was written last, Unix ns.
+#[cfg(unix)]
+pub(crate) fn mtime_ns(stat: &fs::Metadata) -> i64 {
+    use std::os::unix::fs::MetadataExt as _;
+    stat.mtime().saturating_mul(1_000_000_000).saturating_add(stat.mtime_nsec())
+}
+
+#[cfg(not(unix))]
+pub(crate) fn inode(_stat: &fs::Metadata) -> u64 {
+    0
+}
+
+#[cfg(not(unix))]
+pub(crate) fn mtime_ns(stat: &fs::Metadata) -> i64 {
+    let since = stat.modified().ok().and_then(|t| t.duration_since(std::time::UNIX_EPOCH).ok());
+    since.and_then(|d| i64::try_from(d.as_nanos()).ok()).unwrap_or(0)
 }

@@ -13,18 +13,24 @@
 
 mod archive;
 mod catalogue;
+mod contents;
+mod events;
 pub mod files;
 mod journal;
+mod mend;
 mod migrate;
 mod objects;
 pub mod product;
 mod staging;
 mod writer;
 
-pub use archive::{Archive, EXTRACT, Entry, Find, Listing, STATE, Window};
+pub use archive::Archive;
 pub use catalogue::{Place, Row, Validity};
+pub use contents::{Entry, Find, Listing};
+pub use events::Window;
 pub use journal::{Event, InputPlace, JournalEntry, SetState, Stamp, Stored};
 pub use migrate::{Migrated, migrate};
+pub use product::{EXTRACT, STATE};
 pub use writer::{MadeOf, ProductWriter, Written};
 
 use files::IoError;

@@ -1,13 +1,13 @@
 //! Archives of earlier versions: a folder of products without a journal.
 
+use crate::ArchiveError;
 use crate::archive::Archive;
 use crate::catalogue::parts;
 use crate::files::{IoContext as _, Problem, sha256_of};
 use crate::journal::{Event, InputPlace, Journal, Stamp, Stored};
 use crate::objects::entries;
-use crate::product::{self, Product};
+use crate::product::{self, EXTRACT, Product};
 use crate::staging::Staging;
-use crate::{ArchiveError, EXTRACT};
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::fs;
@@ -108,7 +108,7 @@ fn take_over(archive: &mut Archive, folder: &Path, path: &Path, stamp: &Stamp<'_
     let digests: Vec<String> = contents.iter().map(|(_, sha256)| sha256.clone()).collect();
     let _held = archive.hold()?;
     archive.finish()?;
-    crate::writer::announce(staging.path(), &digests)?;
+    crate::staging::announce(staging.path(), &digests)?;
     for (from, sha256) in &contents {
         archive.objects.place(from, sha256)?;
     }

@@ -8,7 +8,7 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// Name of the list of digests that a writer is about to place; a killed one's are looked through.
-pub(crate) const PLACING: &str = "placing.json";
+const PLACING: &str = "placing.json";
 
 const LOCK: &str = ".lock";
 
@@ -46,7 +46,8 @@ impl Staging {
 
 impl Drop for Staging {
     fn drop(&mut self) {
-        // What stays, the next command clears. The folder first: as long as the lock is held, it is not a dead writer's.
+        // What stays, the next command clears. The folder first: as long as the lock is held, it is not a dead
+        // writer's.
         let _ = fs::remove_dir_all(&self.folder);
         let _ = fs::remove_file(self.folder.with_extension(&LOCK[1..]));
         let _ = self.lock.unlock();
@@ -92,4 +93,11 @@ pub(crate) fn clear_dead(
         fs::remove_file(&path).at("clear", &path)?;
     }
     Ok(())
+}
+
+/// Writes the list of contents that are about to be placed, so that those of a killed writer are found.
+pub(crate) fn announce(staging: &Path, digests: &[String]) -> Result<(), ArchiveError> {
+    let path = staging.join(PLACING);
+    let text = serde_json::to_vec(digests).map_err(std::io::Error::from).at("write", &path)?;
+    Ok(fs::write(&path, text).at("write", path)?)
 }

@@ -1,11 +1,12 @@
 //! Archiving a product: everything is written apart, placed by digest, and committed by one entry of the journal.
 
+use crate::ArchiveError;
 use crate::archive::Archive;
+use crate::events::Window;
 use crate::files::{IoContext as _, sha256_of};
 use crate::journal::{Event, InputPlace, Stamp, Stored};
-use crate::product::{self, Attachment, Product, Supersedes};
-use crate::staging::{PLACING, Staging};
-use crate::{ArchiveError, EXTRACT, STATE, Window};
+use crate::product::{self, Attachment, EXTRACT, Product, STATE, Supersedes};
+use crate::staging::{Staging, announce};
 use std::collections::BTreeMap;
 use std::fs::{self, File};
 use std::io::Write as _;
@@ -187,24 +188,8 @@ impl ProductWriter {
         earlier.retain(|row| row.problem.is_none());
         let old = earlier.pop().and_then(|row| product::read(&self.archive.path_of(&row.id)).ok());
         let new = Product { attachments: attachments.to_vec(), ..product.clone() };
-        Ok((revision, old.map(|old| supersedes(&old, &new))))
+        Ok((revision, old.map(|old| Supersedes::new(&old, &new))))
     }
-}
-
-/// What a product says of the one that it takes the place of.
-pub(crate) fn supersedes(old: &Product, new: &Product) -> Supersedes {
-    Supersedes {
-        id: old.id().to_owned(),
-        sha256: old.header.non_standard_attributes.sha256.clone(),
-        reason: what_changed(old, new),
-    }
-}
-
-/// Writes the list of contents that are about to be placed, so that those of a killed writer are found.
-pub(crate) fn announce(staging: &Path, digests: &[String]) -> Result<(), ArchiveError> {
-    let path = staging.join(PLACING);
-    let text = serde_json::to_vec(digests).map_err(std::io::Error::from).at("write", &path)?;
-    Ok(fs::write(&path, text).at("write", path)?)
 }
 
 /// Makes a staged file durable and takes its digest.
@@ -213,25 +198,4 @@ fn seal(path: &Path) -> Result<Sealed, ArchiveError> {
     file.sync_all().at("write", path)?;
     let size = file.metadata().at("read", path)?.len();
     Ok(Sealed { from: path.to_owned(), sha256: sha256_of(path).at("read", path)?, size })
-}
-
-/// What differs between a product and the one that takes its place, in words.
-fn what_changed(old: &Product, new: &Product) -> String {
-    let software = |product: &Product| product.header.non_standard_attributes.software_version.clone();
-    let window = |product: &Product| {
-        let attributes = &product.header.non_standard_attributes;
-        (attributes.start_time_epoch_ns, attributes.stop_time_epoch_ns)
-    };
-    let changed = [
-        ("inputs", old.inputs != new.inputs),
-        ("plugins or their parameters", old.history != new.history),
-        ("program", software(old) != software(new)),
-        ("window", window(old) != window(new)),
-    ];
-    let changed: Vec<&str> = changed.into_iter().filter_map(|(what, differs)| differs.then_some(what)).collect();
-    match changed.as_slice() {
-        [] if old.header.non_standard_attributes.sha256 == new.digest() => "run again, same result".to_owned(),
-        [] => "run again with the same inputs, plugins and parameters".to_owned(),
-        changed => format!("changed: {}", changed.join(", ")),
-    }
 }

@@ -1,5 +1,5 @@
-//! Charts as SVG: lines on linear or logarithmic axes, heat maps ([`heat`]), tables of counts ([`matrix`]) and boxes with
-//! arrows ([`graph`]).
+//! Charts as SVG: lines on linear or logarithmic axes, heat maps ([`heat`]), tables of counts ([`matrix`]) and boxes
+//! with arrows ([`graph`]).
 
 pub mod graph;
 pub mod heat;

@@ -296,6 +296,38 @@ pub struct Supersedes {
     pub reason: String,
 }
 
+impl Supersedes {
+    /// What a product says of the one that it takes the place of.
+    pub(crate) fn new(old: &Product, new: &Product) -> Self {
+        Self {
+            id: old.id().to_owned(),
+            sha256: old.header.non_standard_attributes.sha256.clone(),
+            reason: what_changed(old, new),
+        }
+    }
+}
+
+/// What differs between a product and the one that takes its place, in words.
+fn what_changed(old: &Product, new: &Product) -> String {
+    let software = |product: &Product| product.header.non_standard_attributes.software_version.clone();
+    let window = |product: &Product| {
+        let attributes = &product.header.non_standard_attributes;
+        (attributes.start_time_epoch_ns, attributes.stop_time_epoch_ns)
+    };
+    let changed = [
+        ("inputs", old.inputs != new.inputs),
+        ("plugins or their parameters", old.history != new.history),
+        ("program", software(old) != software(new)),
+        ("window", window(old) != window(new)),
+    ];
+    let changed: Vec<&str> = changed.into_iter().filter_map(|(what, differs)| differs.then_some(what)).collect();
+    match changed.as_slice() {
+        [] if old.header.non_standard_attributes.sha256 == new.digest() => "run again, same result".to_owned(),
+        [] => "run again with the same inputs, plugins and parameters".to_owned(),
+        changed => format!("changed: {}", changed.join(", ")),
+    }
+}
+
 /// A file that was read.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Input {

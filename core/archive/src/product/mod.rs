@@ -15,3 +15,12 @@ pub use file::{
     NoiseLevel, NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Supersedes, Variable, read,
 };
 pub use json::to_json;
+
+/// Suffix of what a diagnosis of a product keeps for later ones.
+pub const EXTRACT: &str = "extract.json";
+
+/// Suffix of the state that a run left for the next day.
+pub const STATE: &str = "state";
+
+/// Suffix of the product itself.
+pub(crate) const PRODUCT: &str = "toml";
