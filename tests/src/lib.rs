@@ -93,6 +93,23 @@ pub fn compile_plugin(folder: &Path, source: &str, name: &str, defines: &[&str])
     library
 }
 
+/// What an archive holds: names of products and of what lies beside them, contents, leftovers of writers. The files that
+/// an empty archive has are left out.
+pub fn archived(archive: &Path) -> Vec<String> {
+    let names = |folder: &Path| -> Vec<String> {
+        let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+        entries.map(|e| e.file_name().to_string_lossy().into_owned()).collect()
+    };
+    let own = ["objects", "journal", "staging", "catalogue.sqlite"];
+    let mut all: Vec<String> = names(archive).into_iter().filter(|name| !own.contains(&name.as_str())).collect();
+    for folder in ["objects", "staging"] {
+        all.extend(names(&archive.join(folder)).into_iter().map(|name| format!("{folder}/{name}")));
+    }
+    all.extend(names(&archive.join("journal")).into_iter().filter(|name| name != "lock"));
+    all.sort();
+    all
+}
+
 /// Simulated telemetry of the bundled mission: the files in `folder`, oldest first.
 ///
 /// # Panics

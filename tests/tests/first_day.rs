@@ -89,7 +89,8 @@ fn attachments(folder: &Path) -> Vec<(String, Vec<u8>)> {
         .expect("an archive")
         .flatten()
         .map(|e| e.path())
-        .filter(|p| p.is_file() && p.extension().is_some_and(|x| x != "toml"))
+        .filter(|p| p.file_name().is_some_and(|n| n.to_string_lossy().starts_with("COM1B")))
+        .filter(|p| p.extension().is_some_and(|x| x != "toml"))
         .map(|p| (p.file_name().expect("a name").to_string_lossy().into_owned(), std::fs::read(&p).expect("readable")))
         .collect();
     all.sort();
