@@ -112,6 +112,21 @@ pub(crate) enum Command {
     },
 }
 
+impl Command {
+    /// Whether it carries rows of telemetry through plugins, and so can end between two batches of them.
+    pub(crate) fn carries_rows(&self) -> bool {
+        matches!(
+            self,
+            Self::Demo { .. }
+                | Self::Simulate(_)
+                | Self::Run(_)
+                | Self::Compare(_)
+                | Self::Diagnose(_)
+                | Self::Products(Products::Rebuild { .. })
+        )
+    }
+}
+
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub(crate) enum Shell {
     Bash,

@@ -6,6 +6,7 @@ mod bundled;
 mod commands;
 mod failure;
 mod installed;
+mod interrupt;
 mod logs;
 mod output;
 mod progress;
@@ -36,6 +37,9 @@ fn main() -> ExitCode {
     }
     let mut run = || -> Result<u8, failure::Failure> {
         installed::resolve(&mut arguments)?;
+        if arguments.command.carries_rows() {
+            interrupt::listen()?;
+        }
         let done = commands::execute(&arguments, paint)?;
         output::print(&done.text)?;
         Ok(done.code)

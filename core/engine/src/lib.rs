@@ -16,6 +16,7 @@ pub mod run;
 pub mod sealed;
 pub mod simulate;
 pub mod sources;
+pub mod stop;
 pub mod table;
 pub mod telemetry;
 pub mod validate;
@@ -67,6 +68,9 @@ pub enum EngineError {
     /// The telemetry is not of the mission's spacecraft.
     #[error("the telemetry is of spacecraft {telemetry}, the mission file {} is for {mission}; use that spacecraft's mission file", path.display())]
     WrongSpacecraft { telemetry: String, mission: String, path: PathBuf },
+    /// Somebody asked the program to end.
+    #[error("stopped as asked, between two batches; nothing half done is left")]
+    Stopped,
     /// A simulation of no time.
     #[error("there is nothing to simulate: the end is not after the start")]
     EmptyWindow,

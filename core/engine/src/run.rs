@@ -14,6 +14,7 @@ use crate::config::{Mission, Model, Pipeline, read};
 use crate::draft::Draft;
 use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions};
 use crate::registry::Registry;
+use crate::stop;
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{FileHeader, TelemetryWriter, interface_tables};
 use dragfree_archive::files::{IoContext as _, IoError, folder_of, sha256, sha256_of, sync_folder};
@@ -171,6 +172,7 @@ impl<'a> Setup<'a> {
                 progress(Progress { until_ns: last_ns, first_ns: covered.first_ns, end_ns });
             }
             chain.feed(chunk, sink)?;
+            stop::check()?;
         }
         covered.ok_or_else(|| EngineError::NoRows { files: self.options.files.clone() })
     }

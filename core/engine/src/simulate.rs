@@ -12,6 +12,7 @@ use crate::feed::{Feed, SourceFeed, SourceOptions};
 use crate::registry::Registry;
 use crate::run::Progress;
 use crate::sealed::{DIGEST_KEY, Sealed};
+use crate::stop;
 use crate::table::{Chunk, TableSpec};
 use crate::telemetry::{FileHeader, TelemetryWriter, WriteError};
 use dragfree_archive::files::IoContext as _;
@@ -108,6 +109,9 @@ pub fn simulate(
             };
             progress(Progress { until_ns: chunk.complete_until_ns, first_ns: window.start, end_ns: Some(window.end) });
             days.write(chunk)?;
+            if let Err(stopped) = stop::check() {
+                return Err(days.abandon().err().unwrap_or(stopped));
+            }
         }
         days.close()?;
         Ok(days.done)

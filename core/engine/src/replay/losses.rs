@@ -60,7 +60,7 @@ pub enum Finding {
 impl Finding {
     /// True where data were there and are not in the tables.
     pub fn is_loss(self) -> bool {
-        self <= Self::LateMessages
+        self <= Self::ConflictingMessages
     }
 }
 

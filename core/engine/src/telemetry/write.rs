@@ -229,16 +229,39 @@ fn channel_metadata(table: &TableSpec, message: &MessageType) -> BTreeMap<String
     metadata
 }
 
-/// A file beside `path`, removed unless it is renamed.
+/// What the name of a file begins with until it is complete.
+const WRITING: &str = ".writing-";
+
+/// A file beside `path`, removed unless it is renamed, and locked, so that it is known whose writer is still alive. Files
+/// of dead writers in the same folder are removed.
 fn temporary(path: &Path) -> io::Result<NamedTempFile> {
+    let folder = folder_of(path);
+    clear_dead(folder);
     let mut builder = tempfile::Builder::new();
-    builder.prefix(".writing-").suffix(".mcap");
+    builder.prefix(WRITING).suffix(".mcap");
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt as _;
         builder.permissions(std::fs::Permissions::from_mode(0o666)); // less the umask, as of any new file
     }
-    builder.tempfile_in(folder_of(path))
+    loop {
+        let file = builder.tempfile_in(folder)?;
+        file.as_file().lock()?;
+        // Before it was locked, another program may have taken it for a dead writer's.
+        if file.path().exists() {
+            return Ok(file);
+        }
+    }
+}
+
+/// Removes files that writers in a folder did not complete and will not.
+fn clear_dead(folder: &Path) {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    for entry in entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(WRITING)) {
+        if std::fs::File::open(entry.path()).is_ok_and(|file| file.try_lock().is_ok()) {
+            let _ = std::fs::remove_file(entry.path()); // of no use, and in nobody's way
+        }
+    }
 }
 
 #[cfg(test)]
@@ -248,6 +271,18 @@ mod tests {
     use crate::telemetry::interface_tables;
 
     const START: i64 = 2_051_222_400_000_000_000;
+
+    /// A killed writer's file goes with the next file, a living writer's stays.
+    #[test]
+    fn what_a_killed_writer_leaves_is_removed_by_the_next() {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        let dead = dir.path().join(".writing-dead.mcap");
+        std::fs::write(&dead, "half").expect("writable");
+        let living = temporary(&dir.path().join("a.mcap")).expect("a file");
+        assert!(!dead.exists());
+        let other = temporary(&dir.path().join("b.mcap")).expect("a file");
+        assert!(living.path().exists() && other.path().exists());
+    }
 
     /// `ifo` and `dws` alone.
     fn tables() -> Vec<TableSpec> {
