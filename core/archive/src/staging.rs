@@ -46,10 +46,10 @@ impl Staging {
 
 impl Drop for Staging {
     fn drop(&mut self) {
-        // What stays, the next command clears. The folder first: as long as the lock is held, it is not a dead
-        // writer's.
-        let _ = fs::remove_dir_all(&self.folder);
-        let _ = fs::remove_file(self.folder.with_extension(&LOCK[1..]));
+        // What stays, the next command clears. The folder first: as long as there is a lock, it is held.
+        if fs::remove_dir_all(&self.folder).is_ok() || !self.folder.exists() {
+            let _ = fs::remove_file(self.folder.with_extension(&LOCK[1..]));
+        }
         let _ = self.lock.unlock();
     }
 }
@@ -91,6 +91,12 @@ pub(crate) fn clear_dead(
             fs::remove_dir_all(&folder).at("clear", &folder)?;
         }
         fs::remove_file(&path).at("clear", &path)?;
+    }
+    // A lock is there before its folder and after it, so one without a lock is nobody's.
+    for name in all.iter().filter(|name| !name.ends_with(LOCK) && !all.contains(&format!("{name}{LOCK}"))) {
+        let path = root.join(name);
+        let cleared = if path.is_dir() { fs::remove_dir_all(&path) } else { fs::remove_file(&path) };
+        cleared.at("clear", &path)?;
     }
     Ok(())
 }
