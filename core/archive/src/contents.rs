@@ -84,6 +84,9 @@ impl Archive {
     }
 
     /// Suffix, digest and size of the files of a product, itself among them.
+    ///
+    /// # Errors
+    /// The catalogue cannot be read.
     pub fn files_of(&self, id: &str) -> Result<Vec<(String, String, u64)>, ArchiveError> {
         let mut files = self.catalogue.files(id)?;
         let made_of = self.catalogue.made_of(id)?;
@@ -210,27 +213,37 @@ impl Archive {
         found.pop().ok_or_else(|| self.missing(id))
     }
 
-    /// The newest product of every day from `first` to `last` that has one and is not withdrawn, in order.
+    /// The newest product of every day from `first` to `last` that has one, in order; withdrawn ones and tests on data kept
+    /// out of a fit are left out.
     ///
     /// # Errors
     /// No day has one, or a day has products of several spacecraft.
     pub fn find_days(&self, first: NaiveDate, last: NaiveDate) -> Result<Vec<Entry>, ArchiveError> {
-        let condition = "p.day BETWEEN ?1 AND ?2 AND w.reason IS NULL AND p.problem IS NULL AND p.fixed_from IS NULL";
-        let rows = self.catalogue.products(condition, [first.to_string(), last.to_string()])?;
-        let mut newest: Vec<Entry> = Vec::new();
-        for row in rows {
-            let of = |row: &Row| (row.day.clone(), row.spacecraft.clone(), row.name.clone());
-            if newest.last().is_some_and(|last| of(&last.row) == of(&row)) {
-                newest.pop();
-            }
-            newest.push(Entry { path: self.path_of(&row.id), row });
-        }
+        let mut newest = self.newest()?;
+        newest.retain(|entry| entry.row.day.parse().is_ok_and(|day: NaiveDate| first <= day && day <= last));
         newest.sort_by(|a, b| a.row.day.cmp(&b.row.day));
         if let Some(two) = newest.windows(2).find(|two| two[0].row.day == two[1].row.day) {
             return Err(self.several(&two[0].row.day, two));
         }
         if newest.is_empty() {
             return Err(self.missing(&format!("{first}..{last}")));
+        }
+        Ok(newest)
+    }
+
+    /// The newest product of every day, spacecraft and name, whatever its verdict; withdrawn ones and tests on data kept out
+    /// of a fit are left out.
+    ///
+    /// # Errors
+    /// The catalogue cannot be read.
+    pub fn newest(&self) -> Result<Vec<Entry>, ArchiveError> {
+        let mut newest: Vec<Entry> = Vec::new();
+        for row in self.catalogue.products("w.reason IS NULL AND p.problem IS NULL AND p.fixed_from IS NULL", [])? {
+            let of = |row: &Row| (row.day.clone(), row.spacecraft.clone(), row.name.clone());
+            if newest.last().is_some_and(|last| of(&last.row) == of(&row)) {
+                newest.pop();
+            }
+            newest.push(Entry { path: self.path_of(&row.id), row });
         }
         Ok(newest)
     }

@@ -74,7 +74,7 @@ impl Archive {
         write().at("write", &staged)?;
         let _held = self.hold()?;
         self.finish()?;
-        announce(staging.path(), &[sha256.clone()])?;
+        announce(staging.path(), std::slice::from_ref(&sha256))?;
         let (number, previous) = self.catalogue.applied()?;
         let new = self.objects.place(&staged, &sha256)?;
         let event = Event::Extract { id: id.to_owned(), sha256: sha256.clone(), size: content.len() as u64 };
@@ -99,7 +99,7 @@ impl Archive {
     /// Marks a product as not to be used any more.
     ///
     /// # Errors
-    /// There is no such product, it is withdrawn already, or a published set names it.
+    /// There is no such product, or it is withdrawn already.
     pub fn withdraw(&mut self, id: &str, reason: &str, stamp: &Stamp<'_>) -> Result<(), ArchiveError> {
         self.commit(stamp, |archive| {
             let row = archive.row(id)?;
@@ -112,8 +112,9 @@ impl Archive {
 
     /// Says that a product holds for a time, in a set that is open.
     ///
-    /// # Errors There is no such product, it is damaged or withdrawn; the set is not open; the time is empty or
-    /// overlaps another.
+    /// # Errors
+    /// There is no such product, it is damaged or withdrawn; the set is not open; the time is empty, or it overlaps
+    /// another.
     pub fn certify(&mut self, id: &str, set: &str, window: Window, stamp: &Stamp<'_>) -> Result<(), ArchiveError> {
         let from_ns = window.from_ns.ok_or_else(|| ArchiveError::Refused("a certificate needs a first time".into()))?;
         let until = window.until_ns.unwrap_or(i64::MAX);

@@ -6,7 +6,7 @@ use crate::args::{Diagnose, Global};
 use crate::failure::{Failure, Refusal};
 use crate::text::Paint;
 use chrono::DateTime;
-use dragfree_archive::{Find, Written};
+use dragfree_archive::Written;
 use dragfree_identification::diagnosis::{Diagnosis, Found, Offset};
 use dragfree_identification::transient::Detection;
 use dragfree_workflow::diagnose::diagnose;
@@ -42,7 +42,7 @@ pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Resu
     };
     let code = if answer.diagnosis.verdict == "sufficient" { 0 } else { INCONSISTENT };
     if global.json {
-        let mut value = serde_json::to_value(&answer.diagnosis)?;
+        let mut value = products::said_of(&products, &answer.diagnosis)?;
         if let Some(next) = &answer.next {
             value["next"] = serde_json::to_value(next)?;
         }
@@ -58,14 +58,14 @@ pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Resu
     Ok(Done { code, ..Done::new(text) })
 }
 
-/// The latest products of an archive; none where there is no archive, as products may be named by their files.
+/// The newest products of an archive; none where there is no archive, as products may be named by their files.
 fn latest(archive: &Path) -> Result<Vec<Written>, Failure> {
     if !archive.is_dir() {
         return Ok(Vec::new());
     }
     let archive = products::archive(archive)?;
-    let latest = archive.list(&Find { latest: true, ..Find::default() })?.entries.into_iter();
-    latest.map(|entry| Ok(Written { product: archive.product(&entry.row.id)?, path: entry.path })).collect()
+    let newest = archive.newest()?.into_iter();
+    newest.map(|entry| Ok(Written { product: archive.product(&entry.row.id)?, path: entry.path })).collect()
 }
 
 /// What is shown.

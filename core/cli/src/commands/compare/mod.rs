@@ -26,7 +26,7 @@ pub(super) fn execute(command: &Compare, global: &Global, paint: Paint) -> Resul
         std::fs::write(path, page).at("write", path)?;
     }
     let done = if global.json {
-        Done::json(&serde_json::to_value(&comparison)?)
+        Done::json(&products::said_of(&products, &comparison)?)
     } else {
         let names = names.join(" ") + &super::repeated(Some(&command.archive.folder), global);
         Done::new(screen(&comparison, &names, command.page.as_deref(), paint))

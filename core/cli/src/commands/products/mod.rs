@@ -87,6 +87,22 @@ pub(super) fn of_archive(command: &ArchiveCommand, json: bool) -> Result<Done, F
     }
 }
 
+/// A result as JSON, with the products that it is of and the program that says it.
+pub(super) fn said_of(products: &[Written], result: &impl serde::Serialize) -> Result<serde_json::Value, Failure> {
+    let of = |w: &Written| {
+        serde_json::json!({
+            "id": w.product.id(),
+            "sha256": w.product.header.non_standard_attributes.sha256,
+            "model": w.product.model.revision,
+            "software_version": w.product.header.non_standard_attributes.software_version,
+        })
+    };
+    let mut value = serde_json::to_value(result)?;
+    value["products"] = products.iter().map(of).collect();
+    value["software_version"] = super::SOFTWARE.into();
+    Ok(value)
+}
+
 /// Looks for inputs of products that are not where they were.
 pub(super) fn look_for(products: &[Written], folders: &[PathBuf]) -> Result<(), Failure> {
     for written in products.iter().filter(|_| !folders.is_empty()) {
