@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// Changes with the tables: a catalogue of another version is made again.
-const VERSION: i64 = 1;
+const VERSION: i64 = 2;
 
 /// How long a question waits for another program's transaction, which takes milliseconds.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -20,7 +20,7 @@ INSERT INTO applied VALUES (0, '');
 CREATE TABLE products (
     id TEXT PRIMARY KEY, number INTEGER NOT NULL, name TEXT NOT NULL, day TEXT NOT NULL, spacecraft TEXT NOT NULL,
     release INTEGER NOT NULL, revision INTEGER NOT NULL, sha256 TEXT NOT NULL, asked_from_ns INTEGER,
-    asked_until_ns INTEGER, problem TEXT, digest TEXT, stream TEXT, status TEXT, verdict TEXT, model TEXT,
+    asked_until_ns INTEGER, run_in_ns INTEGER NOT NULL, problem TEXT, digest TEXT, stream TEXT, status TEXT, verdict TEXT, model TEXT,
     fixed_from TEXT, supersedes TEXT, start_ns INTEGER, stop_ns INTEGER, epochs_used INTEGER, chi2_per_dof REAL,
     nis REAL, inconsistent INTEGER, data_loss INTEGER
 ) STRICT, WITHOUT ROWID;
@@ -40,6 +40,10 @@ CREATE TABLE made_of (
 CREATE INDEX made_of_by_digest ON made_of (sha256);
 CREATE TABLE places (sha256 TEXT NOT NULL, path TEXT NOT NULL, number INTEGER NOT NULL, PRIMARY KEY (sha256, path))
     STRICT, WITHOUT ROWID;
+CREATE TABLE failed (
+    day TEXT NOT NULL, spacecraft TEXT NOT NULL, reason TEXT NOT NULL, tried_with TEXT NOT NULL, number INTEGER NOT NULL,
+    PRIMARY KEY (day, spacecraft)
+) STRICT, WITHOUT ROWID;
 CREATE TABLE withdrawn (id TEXT PRIMARY KEY, number INTEGER NOT NULL, reason TEXT NOT NULL) STRICT, WITHOUT ROWID;
 CREATE TABLE sets (name TEXT PRIMARY KEY, state TEXT NOT NULL, reason TEXT NOT NULL, number INTEGER NOT NULL)
     STRICT, WITHOUT ROWID;
@@ -102,6 +106,8 @@ pub struct Row {
     pub asked_from_ns: Option<i64>,
     /// End of the time that was asked for, Unix ns.
     pub asked_until_ns: Option<i64>,
+    /// Data before the time asked for that only settled the stages before the estimators, ns.
+    pub run_in_ns: i64,
     /// Why it is not to be used any more.
     pub withdrawn: Option<String>,
     /// Whether it is the newest of its day, spacecraft and name that holds: not withdrawn, not in disagreement, no
@@ -291,6 +297,7 @@ impl Catalogue {
                 data_loss: row.get("data_loss")?,
                 asked_from_ns: row.get("asked_from_ns")?,
                 asked_until_ns: row.get("asked_until_ns")?,
+                run_in_ns: row.get("run_in_ns")?,
                 withdrawn: row.get("withdrawn")?,
                 latest: row.get("latest")?,
             })
@@ -350,6 +357,14 @@ impl Catalogue {
         self.all("SELECT name, state FROM sets ORDER BY name", [], |row| Ok((row.get(0)?, row.get(1)?)))
     }
 
+    /// Reason and digest of what it was tried with, of the last failure of a day that no product followed.
+    pub(crate) fn failed(&self, day: &str, spacecraft: &str) -> Result<Option<(String, String)>, ArchiveError> {
+        let question = "SELECT reason, tried_with FROM failed WHERE day = ?1 AND spacecraft = ?2 AND number > \
+             (SELECT coalesce(max(number), 0) FROM products WHERE day = ?1 AND spacecraft = ?2)";
+        let read = |row: &SqlRow<'_>| Ok((row.get(0)?, row.get(1)?));
+        self.connection.query_row(question, [day, spacecraft], read).optional().map_err(|e| self.error(e))
+    }
+
     /// Times of a set, in order; of all sets where none is named.
     pub(crate) fn validity(&self, set: Option<&str>) -> Result<Vec<Validity>, ArchiveError> {
         let question = "SELECT set_name, spacecraft, from_ns, until_ns, id FROM validity \
@@ -391,7 +406,8 @@ impl Catalogue {
     /// Every table but `seen` as text, for comparison.
     #[cfg(test)]
     pub(crate) fn dump(&self) -> Vec<String> {
-        let tables = ["applied", "products", "files", "inputs", "made_of", "places", "withdrawn", "sets", "validity"];
+        let tables =
+            ["applied", "products", "files", "inputs", "made_of", "places", "failed", "withdrawn", "sets", "validity"];
         let text = |table: &str| {
             let mut question = self.connection.prepare(&format!("SELECT * FROM {table} ORDER BY 1, 2")).expect("SQL");
             let columns = question.column_count();
@@ -458,11 +474,11 @@ fn enter_event(
 ) -> rusqlite::Result<()> {
     let number = as_i64(entry.number);
     match &entry.event {
-        Event::Product { id, sha256, made_of, places, from_ns, until_ns } => {
+        Event::Product { id, sha256, made_of, places, from_ns, until_ns, run_in_ns } => {
             let [name, day, spacecraft, release, revision] = parts(id).unwrap_or([""; 5]);
             connection.execute(
                 "INSERT INTO products (id, number, name, day, spacecraft, release, revision, sha256, asked_from_ns, \
-                 asked_until_ns) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10)",
+                 asked_until_ns, run_in_ns) VALUES (?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8, ?9, ?10, ?11)",
                 params![
                     id,
                     number,
@@ -473,7 +489,8 @@ fn enter_event(
                     revision.parse::<i64>().unwrap_or(0),
                     sha256,
                     from_ns,
-                    until_ns
+                    until_ns,
+                    run_in_ns
                 ],
             )?;
             for (role, stored) in made_of {
@@ -492,6 +509,10 @@ fn enter_event(
             }
         }
         Event::Extract { id, sha256, size } => enter_file(connection, id, EXTRACT, sha256, *size)?,
+        Event::Failed { day, spacecraft, reason, tried_with } => {
+            let values = params![day, spacecraft, reason, tried_with, number];
+            connection.execute("INSERT OR REPLACE INTO failed VALUES (?1, ?2, ?3, ?4, ?5)", values)?;
+        }
         Event::Places { places } => enter_places(connection, number, places)?,
         Event::Withdrawn { id, reason } => {
             let values = params![id, number, reason];

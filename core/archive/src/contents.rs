@@ -303,6 +303,23 @@ impl Archive {
         self.catalogue.products_of(sha256)
     }
 
+    /// Why a day gave no product, and a digest of what it was tried with; none where a product followed.
+    ///
+    /// # Errors
+    /// The catalogue cannot be read.
+    pub fn failed(&self, day: &str, spacecraft: &str) -> Result<Option<(String, String)>, ArchiveError> {
+        self.catalogue.failed(day, spacecraft)
+    }
+
+    /// The newest product of a day that was no test, withdrawn or not.
+    ///
+    /// # Errors
+    /// The catalogue cannot be read.
+    pub fn of_day(&self, day: &str, spacecraft: &str, name: &str) -> Result<Option<Row>, ArchiveError> {
+        let condition = "p.day = ?1 AND p.spacecraft = ?2 AND p.name = ?3 AND p.problem IS NULL AND p.stream <> 'TEST'";
+        Ok(self.catalogue.products(condition, [day, spacecraft, name])?.pop())
+    }
+
     /// Sets with their states.
     ///
     /// # Errors

@@ -96,6 +96,26 @@ impl Archive {
         if places.is_empty() { Ok(()) } else { self.commit(stamp, |_| Ok(Event::Places { places })) }
     }
 
+    /// Takes note that a day gave no product.
+    ///
+    /// # Errors
+    /// The archive cannot be written.
+    pub fn keep_failure(
+        &mut self,
+        (day, spacecraft): (&str, &str),
+        reason: &str,
+        tried_with: &str,
+        stamp: &Stamp<'_>,
+    ) -> Result<(), ArchiveError> {
+        let event = Event::Failed {
+            day: day.to_owned(),
+            spacecraft: spacecraft.to_owned(),
+            reason: reason.to_owned(),
+            tried_with: tried_with.to_owned(),
+        };
+        self.commit(stamp, |_| Ok(event))
+    }
+
     /// Marks a product as not to be used any more.
     ///
     /// # Errors

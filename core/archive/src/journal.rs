@@ -48,6 +48,20 @@ pub enum Event {
         from_ns: Option<i64>,
         /// End of the time that was asked for, Unix ns.
         until_ns: Option<i64>,
+        /// Data before `from_ns` that only settled the stages before the estimators, ns.
+        #[serde(default)]
+        run_in_ns: i64,
+    },
+    /// A day gave no product.
+    Failed {
+        /// UTC day.
+        day: String,
+        /// Spacecraft.
+        spacecraft: String,
+        /// Why, as the operator was told.
+        reason: String,
+        /// Digest of everything that it was tried with: with the same again it would fail again.
+        tried_with: String,
     },
     /// A diagnosis kept its sums.
     Extract {

@@ -88,6 +88,7 @@ fn take_over(archive: &mut Archive, folder: &Path, path: &Path, stamp: &Stamp<'_
         places: Vec::new(),
         from_ns: None,
         until_ns: None,
+        run_in_ns: 0,
     };
     if let (Some(sources), Event::Product { made_of, places, from_ns, until_ns, .. }) = (sources, &mut event) {
         (*from_ns, *until_ns) = (sources.from_ns, sources.until_ns);

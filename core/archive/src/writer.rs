@@ -31,6 +31,8 @@ pub struct MadeOf {
     pub places: Vec<InputPlace>,
     /// The time that was asked for.
     pub window: Window,
+    /// Data before it that only settled the stages before the estimators, ns.
+    pub run_in_ns: i64,
 }
 
 /// Writes one product: ask for [`ProductWriter::staged`] paths, write the files, [`ProductWriter::commit`].
@@ -140,6 +142,7 @@ impl ProductWriter {
             places: made_of.places,
             from_ns: made_of.window.from_ns,
             until_ns: made_of.window.until_ns,
+            run_in_ns: made_of.run_in_ns,
         };
         sealed.push(document);
         self.place(&sealed, event, stamp)?;

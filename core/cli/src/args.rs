@@ -1,5 +1,6 @@
 //! Arguments. The names are a contract: scripts use them.
 
+use crate::operations;
 use crate::utc;
 use chrono::NaiveDate;
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
@@ -84,6 +85,12 @@ pub(crate) enum Command {
     /// The plugins that can be found
     #[command(subcommand)]
     Plugins(Plugins),
+    /// Calibrate one day by the mission's file of operations
+    Day(DayCommand),
+    /// Calibrate, in order, every day that has no product or would come out otherwise now
+    CatchUp(CatchUp),
+    /// Stay, and calibrate days as their telemetry comes in
+    Watch(Watch),
     /// The products of an archive
     #[command(subcommand)]
     Products(Products),
@@ -122,6 +129,9 @@ impl Command {
                 | Self::Run(_)
                 | Self::Compare(_)
                 | Self::Diagnose(_)
+                | Self::Day(_)
+                | Self::CatchUp(_)
+                | Self::Watch(_)
                 | Self::Products(Products::Rebuild { .. })
         )
     }
@@ -291,9 +301,47 @@ pub(crate) struct Chain {
 
 #[derive(Debug, Args)]
 pub(crate) struct Archive {
-    /// Folder with the products
-    #[arg(long = "archive", value_name = "DIR", default_value = "archive")]
+    /// Folder with the products [default: that of the nearest mission-ops.toml, or `archive`]
+    #[arg(long = "archive", value_name = "DIR", default_value_os_t = operations::archive(), hide_default_value = true)]
     pub(crate) folder: PathBuf,
+}
+
+/// Where a mission's parts lie.
+#[derive(Debug, Args)]
+pub(crate) struct Ops {
+    /// File of operations [default: mission-ops.toml in this folder or the nearest one above]
+    #[arg(long = "ops", value_name = "FILE")]
+    pub(crate) file: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct DayCommand {
+    /// Day
+    #[arg(value_name = "DATE")]
+    pub(crate) day: NaiveDate,
+    #[command(flatten)]
+    pub(crate) ops: Ops,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct CatchUp {
+    /// Last day
+    #[arg(long, value_name = "DATE")]
+    pub(crate) until: Option<NaiveDate>,
+    /// Say what is to be done, and do nothing
+    #[arg(long)]
+    pub(crate) dry_run: bool,
+    #[command(flatten)]
+    pub(crate) ops: Ops,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Watch {
+    /// Wait until nothing has been written into the inbox for this long, s
+    #[arg(long, value_name = "S", value_parser = positive, default_value_t = 5.0)]
+    pub(crate) settle_s: f64,
+    #[command(flatten)]
+    pub(crate) ops: Ops,
 }
 
 #[derive(Debug, Args)]
@@ -477,6 +525,8 @@ pub(crate) enum Products {
         #[command(flatten)]
         inputs: Inputs,
     },
+    /// Products that would come out otherwise now, with the reasons: telemetry, files or plugins are others
+    Stale(Ops),
     /// Say that a product is not to be used any more; it stays in the archive
     Withdraw {
         /// Its id
@@ -850,6 +900,10 @@ mod tests {
             "dragfree products sets publish ops",
             "dragfree products sets invalidate ops --reason wrong",
             "dragfree products export a --format vcm1b --out f.txt",
+            "dragfree day 2035-01-05 --ops m/mission-ops.toml",
+            "dragfree catch-up --until 2035-01-05 --dry-run --json",
+            "dragfree watch --settle-s 2",
+            "dragfree products stale",
             "dragfree at 2035-01-05T12:00Z --set ops --json",
             "dragfree archive reindex --archive d",
             "dragfree archive migrate --archive d",

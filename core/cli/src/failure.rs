@@ -18,6 +18,14 @@ pub(crate) enum Refusal {
     /// No archive there.
     #[error("there is no archive {}; --archive names one, `dragfree run` makes one", .0.display())]
     NoArchive(PathBuf),
+    /// No file of operations.
+    #[error(
+        "there is no mission-ops.toml here or in a folder above; name one with --ops, `dragfree init DIR` writes one"
+    )]
+    NoOperations,
+    /// Another program runs days.
+    #[error("another dragfree runs days of {}; wait for it, or end it", .0.display())]
+    DaysRunning(PathBuf),
     /// The demo would have to share a folder.
     #[error("{} is neither empty nor made by an earlier demo; name a folder of its own with --dir", .0.display())]
     NoDemoFolder(PathBuf),

@@ -8,6 +8,7 @@ mod failure;
 mod installed;
 mod interrupt;
 mod logs;
+mod operations;
 mod output;
 mod progress;
 mod screen;

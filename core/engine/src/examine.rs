@@ -97,6 +97,7 @@ pub fn examine<C: Sink, E: From<EngineError>>(
         model: Some(sources.model.clone()),
         from_ns: sources.from_ns,
         until_ns: sources.until_ns,
+        run_in_ns: sources.run_in_ns,
         threads: what.threads,
         batch_rows: what.batch_rows,
         ..RunOptions::default()

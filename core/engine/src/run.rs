@@ -38,6 +38,8 @@ pub struct RunOptions {
     pub from_ns: Option<i64>,
     /// End of the time wanted, exclusive, Unix ns.
     pub until_ns: Option<i64>,
+    /// Data before `from_ns` that only settle the stages before the estimators, ns.
+    pub run_in_ns: i64,
     /// Threads; results do not depend on them.
     pub threads: usize,
     /// Most rows in one call of a plugin; results do not depend on it.
@@ -54,6 +56,13 @@ pub struct RunOptions {
     pub created: DateTime<Utc>,
     /// Version of the program.
     pub software: String,
+}
+
+impl RunOptions {
+    /// Where the data that settle the stages end and those of the product begin.
+    fn run_in_until_ns(&self) -> Option<i64> {
+        self.from_ns.filter(|_| self.run_in_ns > 0)
+    }
 }
 
 /// How far a run has come.
@@ -131,7 +140,8 @@ impl<'a> Setup<'a> {
     /// Opens the feed for the window of the options, from `resume_ns` on.
     pub(crate) fn feed(&self, registry: &Registry, resume_ns: Option<i64>) -> Result<Box<dyn Feed>, EngineError> {
         let options = self.options;
-        let (start, end) = (options.from_ns.max(resume_ns), options.until_ns);
+        let from_ns = options.from_ns.map(|from| from.saturating_sub(options.run_in_ns));
+        let (start, end) = (from_ns.max(resume_ns), options.until_ns);
         let window: Option<Range<i64>> =
             (start.is_some() || end.is_some()).then(|| start.unwrap_or(i64::MIN)..end.unwrap_or(i64::MAX));
         match &self.pipeline.source {
@@ -151,7 +161,9 @@ impl<'a> Setup<'a> {
     }
 
     pub(crate) fn link(&self, registry: &Registry, tables: &[TableSpec]) -> Result<Chain, EngineError> {
-        let carry = Carry { batch_rows: self.options.batch_rows, threads: self.options.threads };
+        let run_in_until_ns = self.options.run_in_until_ns();
+        let Self { options: RunOptions { batch_rows, threads, .. }, .. } = *self;
+        let carry = Carry { batch_rows: *batch_rows, threads: *threads, run_in_until_ns };
         Ok(chain::build(registry, &self.pipeline, &self.mission, &self.model, tables, carry)?)
     }
 
@@ -166,7 +178,9 @@ impl<'a> Setup<'a> {
         let end_ns = feed.span_ns().map(|span| span.end).filter(|end| *end != i64::MAX);
         let mut covered: Option<Covered> = None;
         while let Some(chunk) = feed.next()? {
-            if let Some((first_ns, last_ns)) = extent(&chunk) {
+            let run_in_until_ns = self.options.run_in_until_ns().unwrap_or(i64::MIN);
+            if let Some((first_ns, last_ns)) = extent(&chunk).filter(|(_, last_ns)| *last_ns >= run_in_until_ns) {
+                let first_ns = first_ns.max(run_in_until_ns);
                 let covered = covered.get_or_insert(Covered { first_ns, last_ns });
                 covered.last_ns = covered.last_ns.max(last_ns);
                 progress(Progress { until_ns: last_ns, first_ns: covered.first_ns, end_ns });
@@ -333,6 +347,8 @@ struct Series {
     tables: Vec<TableSpec>,
     last_ns: Vec<Option<i64>>,
     writer: Option<TelemetryWriter>,
+    /// Rows before this time are of data that only settle the stages.
+    from_ns: i64,
 }
 
 impl Series {
@@ -348,7 +364,8 @@ impl Series {
         };
         let create = || TelemetryWriter::create(&product.staged("mcap"), &tables, &header);
         let writer = (!tables.is_empty()).then(create).transpose()?;
-        Ok(Self { last_ns: vec![None; tables.len()], tables, writer })
+        let from_ns = setup.options.run_in_until_ns().unwrap_or(i64::MIN);
+        Ok(Self { last_ns: vec![None; tables.len()], tables, writer, from_ns })
     }
 
     fn finish(self) -> Result<(), EngineError> {
@@ -360,6 +377,14 @@ impl Series {
 impl Sink for Series {
     fn rows(&mut self, table: &TableSpec, batch: &Batch) -> Result<(), String> {
         let Some(writer) = &mut self.writer else { return Ok(()) };
+        let mut settled = batch.clone();
+        let early = settled.time_ns.partition_point(|t| *t < self.from_ns);
+        settled.time_ns.drain(..early);
+        settled.columns.iter_mut().for_each(|column| drop(column.drain(..early)));
+        let batch = &settled;
+        if batch.rows() == 0 {
+            return Ok(());
+        }
         let mut chunk = Chunk::default();
         for (i, t) in self.tables.iter().enumerate() {
             let mine = t.name == table.name;
@@ -464,7 +489,7 @@ fn made_of(setup: &Setup<'_>, draft: &Draft) -> MadeOf {
         path: std::path::absolute(path).unwrap_or_else(|_| path.clone()),
     };
     let window = Window { from_ns: options.from_ns, until_ns: options.until_ns };
-    MadeOf { places: telemetry.map(place).collect(), window }
+    MadeOf { places: telemetry.map(place).collect(), window, run_in_ns: options.run_in_ns }
 }
 
 /// Every file that a run read. Of the files of a source plugin only those that the command line names are known.

@@ -20,6 +20,8 @@ pub struct Sources {
     pub from_ns: Option<i64>,
     /// End of the time that was asked for, Unix ns.
     pub until_ns: Option<i64>,
+    /// Data before `from_ns` that only settled the stages before the estimators, ns.
+    pub run_in_ns: i64,
 }
 
 impl Sources {
@@ -66,6 +68,7 @@ impl Sources {
             telemetry: telemetry.collect::<Result<_, _>>()?,
             from_ns: row.asked_from_ns,
             until_ns: row.asked_until_ns,
+            run_in_ns: row.run_in_ns,
         })
     }
 }

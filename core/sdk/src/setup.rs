@@ -197,7 +197,8 @@ impl Setup {
         &self.config.files
     }
 
-    /// Sources: first time wanted, Unix ns.
+    /// Sources: first time wanted, Unix ns. Stages and effects: first time of the product, where rows before it come in
+    /// that only settle what goes on with them; `None` where every row belongs to the product.
     #[must_use]
     pub fn start_ns(&self) -> Option<i64> {
         self.config.start_ns

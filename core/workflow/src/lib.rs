@@ -10,6 +10,7 @@ pub mod extract;
 pub mod ladder;
 mod likelihood;
 pub mod next;
+pub mod operations;
 mod proposals;
 pub mod provenance;
 mod replay;
@@ -48,6 +49,9 @@ pub enum WorkflowError {
     /// No comparison or diagnosis.
     #[error(transparent)]
     Identification(#[from] IdentificationError),
+    /// What a mission's file of operations says cannot be followed.
+    #[error("{}: {what}", path.display())]
+    Operations { path: PathBuf, what: String },
     /// No product was named.
     #[error("no product was named")]
     NoProduct,

@@ -42,6 +42,8 @@ pub(crate) struct Config {
     pub(crate) hold_intervals: f64,
     /// Longest gap that is filled with blank rows, s.
     pub(crate) max_gap_s: f64,
+    /// Epochs before this time belong to no product and are not counted, Unix ns.
+    pub(crate) counted_from_ns: i64,
 }
 
 /// Destination of the rows.
@@ -99,6 +101,8 @@ pub(crate) struct EpochRun {
 pub(crate) struct Summary {
     pub(crate) used: u64,
     pub(crate) rejected: u64,
+    /// Epochs before those of the product.
+    early: u64,
     pub(crate) longest: EpochRun,
     current: EpochRun,
     /// Gaps too long to fill: number, and the longest with its start, ns.
@@ -775,6 +779,10 @@ impl Gridder {
         };
         let summary = &mut self.summary;
         for (mask, time) in self.mask.iter().zip(times) {
+            if *time < self.config.counted_from_ns {
+                summary.early += 1;
+                continue;
+            }
             if whole(*mask) {
                 summary.used += 1;
                 summary.current.rows = 0;
@@ -795,7 +803,7 @@ impl Gridder {
 
     /// Properties of each table, for the report.
     pub(crate) fn table_summaries(&self) -> Vec<TableSummary> {
-        let emitted = self.summary.used + self.summary.rejected;
+        let emitted = self.summary.early + self.summary.used + self.summary.rejected;
         let describe = |(t, series): (usize, &Series)| {
             let fast = if let Some(Class::Fast(fast)) = self.classes.get(t) { Some(fast) } else { None };
             let absent = fast.map_or_else(Vec::new, |fast| {
@@ -942,7 +950,7 @@ impl Fast {
 
 impl Summary {
     fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
-        for count in [&mut self.used, &mut self.rejected, &mut self.cut_gaps, &mut self.rephased] {
+        for count in [&mut self.used, &mut self.rejected, &mut self.early, &mut self.cut_gaps, &mut self.rephased] {
             state.u64(count)?;
         }
         for run in [&mut self.longest, &mut self.current] {

@@ -111,6 +111,7 @@ impl Stage for Preprocess {
             stuck_samples: u32::try_from(setup.i64("stuck_samples")?)?,
             hold_intervals: setup.f64("hold_intervals")?,
             max_gap_s: setup.f64("max_gap_s")?,
+            counted_from_ns: setup.start_ns().unwrap_or(i64::MIN),
         };
         let prediction = setup.needs(PREDICTION_NEED);
         Ok(Self { mission, mandatory, config, prediction, tables: Vec::new(), age: None, grid: None, gridder: None })

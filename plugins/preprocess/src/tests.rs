@@ -51,7 +51,14 @@ fn is_and_dws(rows: i64) -> Vec<Telemetry> {
 }
 
 fn config() -> Config {
-    Config { rate_hz: 10.0, outlier_sigma: 20.0, stuck_samples: 10, hold_intervals: 2.0, max_gap_s: 21_600.0 }
+    Config {
+        rate_hz: 10.0,
+        outlier_sigma: 20.0,
+        stuck_samples: 10,
+        hold_intervals: 2.0,
+        max_gap_s: 21_600.0,
+        counted_from_ns: i64::MIN,
+    }
 }
 
 fn spec(t: &Telemetry) -> TableSpec {

@@ -4,6 +4,7 @@ use super::Done;
 use crate::args::Init;
 use crate::failure::{Failure, Refusal};
 use crate::installed;
+use crate::operations;
 use crate::text::quoted;
 use dragfree_archive::files::IoContext as _;
 use std::fs::File;
@@ -12,6 +13,28 @@ use std::path::Path;
 
 /// The chain of a mission that no pipeline is made for.
 const PIPELINE: &str = "science-mode";
+
+/// The file of operations of a new mission.
+const OPERATIONS: &str = "\
+# Where the parts of the mission lie; paths are relative to this file. In this folder and the ones below, `dragfree day`,
+# `catch-up`, `watch`, `products` and `at` find it by themselves; from elsewhere name it with --ops.
+
+[operations]
+pipeline = \"pipeline.toml\"
+mission = \"mission.toml\"
+model = \"model.toml\"
+archive = \"archive\"
+
+# Telemetry: any number of patterns. Files may come late, twice, in pieces and in any order.
+inbox = [\"telemetry/*.mcap\"]
+
+# Data before a day that settle the stages before the estimators; they are no part of the day's product.
+run_in_hours = 1.0
+
+# Commands of yours, run by `sh` in this folder, with DRAGFREE_PRODUCT, DRAGFREE_PRODUCT_PATH and DRAGFREE_DAY set:
+# on_data_loss = \"...\"        # a product with loss of data (exit code 3)
+# on_inconsistent = \"...\"     # a product whose model contradicts the data (exit code 4)
+";
 
 pub(super) fn execute(init: &Init, json: bool) -> Result<Done, Failure> {
     let read = |path: &Path| std::fs::read_to_string(path).at("read", path);
@@ -53,6 +76,7 @@ pub(super) fn execute(init: &Init, json: bool) -> Result<Done, Failure> {
                 read(&model_path)?
             ),
         ),
+        (operations::NAME, OPERATIONS.to_owned()),
     ];
     std::fs::create_dir_all(&init.folder).at("make the folder", &init.folder)?;
     let places = texts.each_ref().map(|(file, _)| init.folder.join(file));

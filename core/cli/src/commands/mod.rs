@@ -1,6 +1,7 @@
 //! One function per command; each gives back what belongs on stdout.
 
 mod compare;
+mod days;
 mod demo;
 mod describe;
 mod design;
@@ -59,6 +60,9 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
         Command::Diagnose(command) => diagnose::execute(command, global, paint),
         Command::Config(Config::Check(chain)) => run::config_check(chain, global),
         Command::Plugins(command) => plugins::execute(command, global, paint),
+        Command::Day(command) => days::day(command, global, paint),
+        Command::CatchUp(command) => days::catch_up(command, global, paint),
+        Command::Watch(command) => days::watch(command, global, paint),
         Command::Products(command) => products::execute(command, global, paint),
         Command::At(command) => products::at(command, global.json, paint),
         Command::Archive(command) => products::of_archive(command, global.json),

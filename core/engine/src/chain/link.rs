@@ -39,10 +39,21 @@ pub fn build(
             ..Chain::default()
         },
     };
+    let mut behind_effects = false;
     for node in &pipeline.nodes {
         match node {
-            Node::Stage { plugin, parameters } => builder.stage(plugin, parameters, pipeline)?,
-            Node::Effects => builder.effects()?,
+            Node::Stage { plugin, parameters } => {
+                builder.stage(plugin, parameters, pipeline)?;
+                if let (true, Some(from_ns), Some(stage)) =
+                    (behind_effects, carry.run_in_until_ns, builder.chain.nodes.last_mut())
+                {
+                    stage.inputs.iter_mut().for_each(|queue| queue.begin_at(from_ns));
+                }
+            }
+            Node::Effects => {
+                builder.effects()?;
+                behind_effects = true;
+            }
         }
     }
     if !model.effects.is_empty() && !pipeline.nodes.contains(&Node::Effects) {
@@ -218,7 +229,7 @@ impl Builder<'_> {
         instance: &str,
         standing: Standing,
     ) -> Result<Linked, ChainError> {
-        let config = Config {
+        let mut config = Config {
             value: json!({
                 "parameters": parameters,
                 "mission": self.mission.value,
@@ -229,6 +240,9 @@ impl Builder<'_> {
                 "threads": self.chain.carry.threads,
             }),
         };
+        if let Some(start_ns) = self.chain.carry.run_in_until_ns {
+            config.value["start_ns"] = start_ns.into();
+        }
         let mut node = found.create(&config)?;
         let model_json = self.model_json(standing != Standing::Member);
         let mut linked = node.link(LinkRequest { available: &self.available, model_json: &model_json })?;

@@ -128,11 +128,14 @@ pub struct Carry {
     pub batch_rows: usize,
     /// Threads for nodes that do not read each other.
     pub threads: usize,
+    /// Rows before this time run in what stands before and in the effects, and go no further: neither to the stages
+    /// behind the effects nor to the host.
+    pub run_in_until_ns: Option<i64>,
 }
 
 impl Default for Carry {
     fn default() -> Self {
-        Self { batch_rows: 4096, threads: 1 }
+        Self { batch_rows: 4096, threads: 1, run_in_until_ns: None }
     }
 }
 
@@ -192,7 +195,9 @@ impl Chain {
         }
         self.tap.order = order;
         for (input, (table, names)) in tables.into_iter().enumerate() {
-            self.tap.inputs.push(Queue::new(table.to_owned(), true, names.len()));
+            let mut queue = Queue::new(table.to_owned(), true, names.len());
+            queue.begin_at(self.carry.run_in_until_ns.unwrap_or(i64::MIN));
+            self.tap.inputs.push(queue);
             self.subscribe(table, &names, None, input);
         }
         Ok(())

@@ -11,11 +11,19 @@ pub(super) struct Queue {
     start: usize,
     time_ns: Vec<i64>,
     columns: Vec<Vec<f64>>,
+    /// Rows before this time are not for the reader, Unix ns.
+    from_ns: i64,
 }
 
 impl Queue {
     pub(super) fn new(table: String, uniform: bool, columns: usize) -> Self {
-        Self { table, uniform, start: 0, time_ns: Vec::new(), columns: vec![Vec::new(); columns] }
+        let columns = vec![Vec::new(); columns];
+        Self { table, uniform, start: 0, time_ns: Vec::new(), columns, from_ns: i64::MIN }
+    }
+
+    /// Leaves out rows before a time.
+    pub(super) fn begin_at(&mut self, from_ns: i64) {
+        self.from_ns = from_ns;
     }
 
     pub(super) fn rows(&self) -> usize {
@@ -23,9 +31,10 @@ impl Queue {
     }
 
     pub(super) fn push(&mut self, batch: &Batch, columns: &[usize]) {
-        self.time_ns.extend_from_slice(&batch.time_ns);
+        let early = batch.time_ns.partition_point(|t| *t < self.from_ns);
+        self.time_ns.extend_from_slice(&batch.time_ns[early..]);
         for (mine, theirs) in self.columns.iter_mut().zip(columns) {
-            mine.extend_from_slice(&batch.columns[*theirs]);
+            mine.extend_from_slice(&batch.columns[*theirs][early..]);
         }
     }
 

@@ -67,6 +67,7 @@ pub fn rebuild(
             archive: apart.path().join("archive"),
             from_ns: sources.from_ns,
             until_ns: sources.until_ns,
+            run_in_ns: sources.run_in_ns,
             stream: known(row.stream.as_deref()).unwrap_or(options.stream),
             status: known(row.status.as_deref()).unwrap_or(options.status),
             created: archive.event(row.number).map_err(again)?.time,

@@ -44,6 +44,7 @@ pub(super) fn execute(command: &Products, global: &Global, paint: Paint) -> Resu
         Products::Rebuild { product, archive, inputs } => {
             verify::rebuild(product, &archive.folder, &inputs.folders, global, paint)
         }
+        Products::Stale(ops) => super::days::stale(ops, global, paint),
         Products::Withdraw { product, reason, archive } => certify::withdraw(product, reason, &archive.folder, json),
         Products::Certify { product, from, until, set, archive, .. } => {
             certify::certify(product, set, (*from, *until), &archive.folder, json)

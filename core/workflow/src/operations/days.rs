@@ -1,0 +1,287 @@
+//! Which days are to be run, and running them.
+
+use super::{Inbox, InboxFile, Operations};
+use crate::WorkflowError;
+use chrono::{DateTime, NaiveDate, NaiveTime, Utc};
+use dragfree_archive::files::sha256;
+use dragfree_archive::product::{Product, Status, Stream};
+use dragfree_archive::{Archive, Row, Stamp, Written};
+use dragfree_engine::EngineError;
+use dragfree_engine::border::Kind;
+use dragfree_engine::config::{Mission, Model, Pipeline};
+use dragfree_engine::registry::Registry;
+use dragfree_engine::run::{Progress, RunOptions, run};
+use serde::Serialize;
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+
+const DAY_NS: i64 = 86_400_000_000_000;
+/// A day is whole when no more than this is missing at either end of it, ns.
+const EDGE_NS: i64 = 1_000_000_000;
+
+/// A day with telemetry.
+#[derive(Clone, Debug, Serialize)]
+pub struct Day {
+    /// UTC day.
+    pub day: NaiveDate,
+    /// Its newest product; none where it has none.
+    pub product: Option<String>,
+    /// Why it is to be run; empty where it is not.
+    pub reasons: Vec<String>,
+    /// Why the last run gave no product; it is not run again with the same inputs.
+    pub failed: Option<String>,
+}
+
+/// A day that is to be run.
+#[derive(Clone, Debug)]
+pub struct Planned {
+    /// What is said of it.
+    pub day: Day,
+    files: Vec<PathBuf>,
+    whole: bool,
+    stream: Stream,
+    tried_with: String,
+}
+
+/// What came of a day.
+#[derive(Clone, Debug)]
+pub enum Outcome {
+    /// A product.
+    Product(Box<Written>),
+    /// None, with the reason.
+    Failed(String),
+}
+
+/// A day that was run.
+#[derive(Clone, Debug)]
+pub struct Ran {
+    /// UTC day.
+    pub day: NaiveDate,
+    /// What came of it.
+    pub outcome: Outcome,
+}
+
+/// What a day is compared with and run with.
+pub struct Planner<'a> {
+    operations: &'a Operations,
+    registry: &'a Registry,
+    /// Threads, rows of a batch, time and program.
+    options: RunOptions,
+    product: String,
+    spacecraft: String,
+    /// Role and digest of pipeline, mission and model.
+    configuration: Vec<(&'static str, String)>,
+    model: Model,
+}
+
+impl<'a> Planner<'a> {
+    /// Reads pipeline, mission and model.
+    ///
+    /// # Errors
+    /// One of them cannot be read.
+    pub fn new(operations: &'a Operations, registry: &'a Registry, options: RunOptions) -> Result<Self, WorkflowError> {
+        let read = |path: &PathBuf| std::fs::read_to_string(path).unwrap_or_default();
+        let pipeline = Pipeline::load(&operations.pipeline).map_err(EngineError::from)?;
+        let missing = |what| EngineError::NotNamed { what, pipeline: operations.pipeline.clone() };
+        let mission = operations.mission.clone().or(pipeline.mission.clone()).ok_or_else(|| missing("mission"))?;
+        let model = operations.model.clone().or(pipeline.model.clone()).ok_or_else(|| missing("model"))?;
+        let spacecraft = Mission::load(&mission).map_err(EngineError::from)?.spacecraft;
+        Ok(Self {
+            configuration: vec![
+                ("pipeline", sha256(read(&operations.pipeline))),
+                ("mission", sha256(read(&mission))),
+                ("model", sha256(read(&model))),
+            ],
+            model: Model::load(&model).map_err(EngineError::from)?,
+            product: pipeline.product,
+            spacecraft,
+            options: RunOptions {
+                pipeline: operations.pipeline.clone(),
+                mission: Some(mission),
+                model: Some(model),
+                archive: operations.archive.clone(),
+                run_in_ns: operations.run_in_ns,
+                ..options
+            },
+            operations,
+            registry,
+        })
+    }
+
+    /// Spacecraft of the mission.
+    pub fn spacecraft(&self) -> &str {
+        &self.spacecraft
+    }
+
+    /// Telemetry that a day is made of: files that cover a part of it, and of the run-in before it.
+    fn files<'f>(&self, inbox: &'f Inbox, day: NaiveDate) -> Vec<&'f InboxFile> {
+        let start = start_ns(day);
+        let covers = |from: i64, until: i64| move |file: &&InboxFile| file.first_ns < until && from <= file.last_ns;
+        if !inbox.files.iter().any(|file| covers(start, start + DAY_NS)(&file)) {
+            return Vec::new();
+        }
+        inbox.files.iter().filter(covers(start - self.operations.run_in_ns, start + DAY_NS)).collect()
+    }
+
+    /// A day beside its newest product; none where there is no telemetry of it.
+    fn look_at(&self, archive: &Archive, inbox: &Inbox, day: NaiveDate) -> Result<Option<Planned>, WorkflowError> {
+        let again = |e| WorkflowError::from(EngineError::from(e));
+        let files = self.files(inbox, day);
+        if files.is_empty() {
+            return Ok(None);
+        }
+        let name = day.to_string();
+        let row = archive.of_day(&name, &self.spacecraft, &self.product).map_err(again)?;
+        let product = row.as_ref().and_then(|row| archive.product(&row.id).ok());
+        let reasons = match (&row, &product) {
+            (None, _) => vec!["it has no product".to_owned()],
+            (Some(row), None) => vec![format!("{} is damaged", row.id)],
+            (Some(row), Some(product)) => self.reasons(row, product, &files),
+        };
+        let mut tried: Vec<String> = files.iter().map(|file| file.sha256.clone()).collect();
+        tried.extend(self.configuration.iter().map(|(_, sha256)| sha256.clone()));
+        tried.extend(self.libraries().into_iter().map(|(_, sha256)| sha256));
+        let tried_with = sha256(tried.join("\n"));
+        let failed = archive.failed(&name, &self.spacecraft).map_err(again)?;
+        let failed = failed.filter(|(_, with)| *with == tried_with).map(|(reason, _)| reason);
+        let (start, end) = (start_ns(day), start_ns(day) + DAY_NS);
+        let first = files.iter().map(|file| file.first_ns).min().unwrap_or(i64::MAX);
+        let last = files.iter().map(|file| file.last_ns).max().unwrap_or(i64::MIN);
+        let same_configuration = product.as_ref().is_none_or(|product| self.changed_configuration(product).is_empty());
+        Ok(Some(Planned {
+            day: Day { day, product: row.map(|row| row.id), reasons, failed },
+            files: files.into_iter().map(|file| file.path.clone()).collect(),
+            whole: first <= start + EDGE_NS && end - EDGE_NS <= last,
+            stream: if same_configuration { Stream::Oper } else { Stream::Rpro },
+            tried_with,
+        }))
+    }
+
+    /// Why a product is not what a run would give now.
+    fn reasons(&self, row: &Row, product: &Product, files: &[&InboxFile]) -> Vec<String> {
+        let mut reasons = Vec::new();
+        let telemetry = || product.inputs.iter().filter(|input| input.role == "telemetry");
+        let used: BTreeSet<&str> = telemetry().map(|input| input.sha256.as_str()).collect();
+        let there: BTreeSet<&str> = files.iter().map(|file| file.sha256.as_str()).collect();
+        let file_name = |path: &PathBuf| path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        let new = files.iter().filter(|file| !used.contains(file.sha256.as_str())).map(|file| file_name(&file.path));
+        reasons.extend(new.map(|name| format!("telemetry {name} was not there, or was another")));
+        let gone = telemetry().filter(|input| !there.contains(input.sha256.as_str()));
+        reasons.extend(gone.map(|input| format!("telemetry {} is gone, or is another now", input.name)));
+        reasons
+            .extend(self.changed_configuration(product).into_iter().map(|what| format!("the {what} file has changed")));
+        for (name, sha256) in self.libraries() {
+            let stages = product.history.iter().filter(|stage| stage.plugin == name);
+            if stages.clone().any(|stage| stage.library_sha256 != sha256) {
+                reasons.push(format!("plugin {name} is another build"));
+            }
+        }
+        let start = product.header.non_standard_attributes.day.parse().map_or(0, start_ns);
+        let asked = (row.asked_from_ns, row.asked_until_ns, row.run_in_ns);
+        if asked != (Some(start), Some(start + DAY_NS), self.operations.run_in_ns) {
+            reasons.push("another window or another run-in was asked for".to_owned());
+        }
+        reasons
+    }
+
+    /// Which of pipeline, mission and model a product was not made with.
+    fn changed_configuration(&self, product: &Product) -> Vec<&'static str> {
+        let same = |role: &str, sha256: &String| {
+            product.inputs.iter().any(|input| input.role == role && input.sha256 == *sha256)
+        };
+        let changed = self.configuration.iter().filter(|(role, sha256)| !same(role, sha256));
+        changed.map(|(role, _)| *role).collect()
+    }
+
+    /// Plugins that are installed, with the digests of their libraries.
+    fn libraries(&self) -> Vec<(String, String)> {
+        let in_model = |id: &str| self.model.effects.iter().any(|effect| effect.id == id);
+        let all = self.registry.plugins();
+        let mut all: Vec<_> = all
+            .filter(|found| found.info.kind != Kind::Effect || in_model(&found.info.manifest.id))
+            .map(|found| (found.info.manifest.id.clone(), found.opened.sha256.clone()))
+            .collect();
+        all.sort();
+        all
+    }
+
+    /// Runs a day. A day that gives no product is noted in the archive, so that the next one goes on.
+    ///
+    /// # Errors
+    /// The archive cannot be written, or somebody asked to stop.
+    pub fn run(&self, planned: &Planned, progress: &mut dyn FnMut(Progress)) -> Result<Ran, WorkflowError> {
+        let day = planned.day.day;
+        let start = start_ns(day);
+        let options = RunOptions {
+            files: planned.files.clone(),
+            from_ns: Some(start),
+            until_ns: Some(start + DAY_NS),
+            stream: planned.stream,
+            status: if planned.whole { Status::Final } else { Status::Quicklook },
+            ..self.options.clone()
+        };
+        match run(self.registry, &options, progress) {
+            Ok(written) => Ok(Ran { day, outcome: Outcome::Product(Box::new(written)) }),
+            Err(stopped @ (EngineError::Stopped | EngineError::Archive(_))) => Err(stopped.into()),
+            Err(error) => {
+                let reason = error.to_string();
+                let stamp = Stamp { time: self.options.created, software: &self.options.software };
+                let keep = || {
+                    let mut archive = Archive::create(&self.operations.archive)?;
+                    archive.keep_failure((&day.to_string(), &self.spacecraft), &reason, &planned.tried_with, &stamp)
+                };
+                keep().map_err(EngineError::from)?;
+                Ok(Ran { day, outcome: Outcome::Failed(reason) })
+            }
+        }
+    }
+}
+
+/// Every day that there is telemetry of, in order.
+///
+/// # Errors
+/// The archive cannot be read.
+pub fn plan(planner: &Planner<'_>, archive: &Archive, inbox: &Inbox) -> Result<Vec<Planned>, WorkflowError> {
+    let mut days = BTreeSet::new();
+    for file in &inbox.files {
+        let (first, last) = (file.first_ns.div_euclid(DAY_NS), file.last_ns.div_euclid(DAY_NS));
+        days.extend((first..=last).map(|day| DateTime::from_timestamp_nanos(day * DAY_NS).date_naive()));
+    }
+    let mut planned = Vec::new();
+    for day in days {
+        planned.extend(planner.look_at(archive, inbox, day)?);
+    }
+    Ok(planned)
+}
+
+/// Runs in order every day up to `until` that has no product or one that would come out otherwise now; a day that failed
+/// with the same inputs is left out. `each` is told a day before it is run, and what came of it.
+///
+/// # Errors
+/// The archive cannot be read or written, or somebody asked to stop.
+pub fn catch_up(
+    planner: &Planner<'_>,
+    inbox: &Inbox,
+    until: Option<NaiveDate>,
+    each: &mut dyn FnMut(&Planned) -> Box<dyn FnMut(Progress)>,
+) -> Result<Vec<Ran>, WorkflowError> {
+    let archive = Archive::create(&planner.operations.archive).map_err(EngineError::from)?;
+    let days = plan(planner, &archive, inbox)?;
+    drop(archive);
+    let due = |planned: &&Planned| {
+        let day = &planned.day;
+        !day.reasons.is_empty() && day.failed.is_none() && until.is_none_or(|until| day.day <= until)
+    };
+    let mut ran = Vec::new();
+    for planned in days.iter().filter(due) {
+        let mut progress = each(planned);
+        ran.push(planner.run(planned, &mut *progress)?);
+    }
+    Ok(ran)
+}
+
+/// First instant of a day, Unix ns.
+fn start_ns(day: NaiveDate) -> i64 {
+    let start: DateTime<Utc> = day.and_time(NaiveTime::MIN).and_utc();
+    start.timestamp_nanos_opt().unwrap_or(i64::MIN)
+}
