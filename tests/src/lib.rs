@@ -93,8 +93,8 @@ pub fn compile_plugin(folder: &Path, source: &str, name: &str, defines: &[&str])
     library
 }
 
-/// What an archive holds: names of products and of what lies beside them, contents, leftovers of writers. The files that
-/// an empty archive has are left out.
+/// What an archive holds: names of products and of what lies beside them, contents, leftovers of writers. The files
+/// that an empty archive has are left out.
 pub fn archived(archive: &Path) -> Vec<String> {
     let names = |folder: &Path| -> Vec<String> {
         let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
@@ -105,7 +105,8 @@ pub fn archived(archive: &Path) -> Vec<String> {
     for folder in ["objects", "staging"] {
         all.extend(names(&archive.join(folder)).into_iter().map(|name| format!("{folder}/{name}")));
     }
-    all.extend(names(&archive.join("journal")).into_iter().filter(|name| name != "lock"));
+    let is_event = |name: &String| name.starts_with(|c: char| c.is_ascii_digit());
+    all.extend(names(&archive.join("journal")).into_iter().filter(is_event));
     all.sort();
     all
 }

@@ -213,8 +213,8 @@ impl Archive {
         found.pop().ok_or_else(|| self.missing(id))
     }
 
-    /// The newest product of every day from `first` to `last` that has one, in order; withdrawn ones and tests on data kept
-    /// out of a fit are left out.
+    /// The newest product of every day from `first` to `last` that has one, in order; withdrawn ones and tests on data
+    /// kept out of a fit are left out.
     ///
     /// # Errors
     /// No day has one, or a day has products of several spacecraft.
@@ -231,8 +231,8 @@ impl Archive {
         Ok(newest)
     }
 
-    /// The newest product of every day, spacecraft and name, whatever its verdict; withdrawn ones and tests on data kept out
-    /// of a fit are left out.
+    /// The newest product of every day, spacecraft and name, whatever its verdict; withdrawn ones and tests on data
+    /// kept out of a fit are left out.
     ///
     /// # Errors
     /// The catalogue cannot be read.

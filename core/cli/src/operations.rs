@@ -1,6 +1,5 @@
 //! The mission's file of operations: which one is meant, and the archive that it names.
 
-use crate::args::Ops;
 use crate::failure::{Failure, Refusal};
 use dragfree_workflow::operations::{FILE, Operations};
 use std::path::{Path, PathBuf};
@@ -9,8 +8,8 @@ use std::path::{Path, PathBuf};
 ///
 /// # Errors
 /// There is none, or it cannot be read.
-pub(crate) fn load(ops: &Ops) -> Result<Operations, Failure> {
-    let path = ops.file.clone().or_else(|| Operations::find(Path::new(".")));
+pub(crate) fn load(named: Option<&Path>) -> Result<Operations, Failure> {
+    let path = named.map(PathBuf::from).or_else(|| Operations::find(Path::new(".")));
     Ok(Operations::load(&path.ok_or(Refusal::NoOperations)?)?)
 }
 

@@ -110,10 +110,10 @@ typedef struct dragfree_host_v1 {
  * true where the effect is not in the model and a diagnosis tries it), `needs` (stages: what effects of the model ask
  * for in their manifests; a stage that knows how to make one of these makes it), `settings` (thresholds of the
  * pipeline, or their defaults; schema/settings lists them), `threads` (how many an instance may
- * use, itself included; results must not depend on it), `files`, `start_ns`, `end_ns` (sources), `start_ns` (stages and
- * effects: first time of the product, where rows before it come in that only settle what goes on with them). The getters
- * walk it by dotted path, "parameters.gain", "mission.spacecraft.mass_kg", so that plain C needs no JSON parser;
- * DRAGFREE_ERROR where there is no such number or string. A string from `get_text` is valid during `create`. */
+ * use, itself included; results must not depend on it), `files`, `start_ns`, `end_ns` (sources), `start_ns` (stages
+ * and effects: first time of the product, where rows before it come in that only settle what goes on with them).
+ * The getters walk it by dotted path, "parameters.gain", "mission.spacecraft.mass_kg", so that plain C needs no JSON
+ * parser; DRAGFREE_ERROR where there is no such number or string. A string from `get_text` is valid during `create`. */
 typedef struct dragfree_config_v1 {
   void *context;
   const char *json;

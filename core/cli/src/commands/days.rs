@@ -31,7 +31,7 @@ struct Desk {
 
 impl Desk {
     fn open(ops: &Ops, global: &Global) -> Result<Self, Failure> {
-        let operations = operations::load(ops)?;
+        let operations = operations::load(ops.file.as_deref())?;
         let inbox = Inbox::remembered(&memory(&operations));
         Ok(Self { operations, registry: super::registry(global)?, inbox })
     }

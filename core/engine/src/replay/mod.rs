@@ -18,7 +18,7 @@ mod tests;
 use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::ops::Range;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::{self, JoinHandle};
 
@@ -206,12 +206,17 @@ fn times(scan: &Scan) -> Option<(i64, i64)> {
     stated.map(|t| (t, t)).reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))
 }
 
+/// Name of a file in findings: without its folder, so that a product does not depend on where its telemetry lay.
+fn name_of(path: &Path) -> String {
+    path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
+}
+
 fn info(files: &[(PathBuf, Scan)], losses: &mut Losses) -> Result<ReplayInfo, ReplayError> {
     let mut info = ReplayInfo::default();
     let mut said: BTreeMap<&'static str, String> = BTreeMap::new();
     for (path, scan) in files {
         let path = path.clone();
-        let name = path.display().to_string();
+        let name = name_of(&path);
         let times = times(scan);
         info.first_ns = info.first_ns.into_iter().chain(times.map(|t| t.0)).min();
         info.last_ns = info.last_ns.into_iter().chain(times.map(|t| t.1)).max();

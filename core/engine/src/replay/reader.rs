@@ -140,7 +140,7 @@ impl Reader {
     fn read(&mut self, file: usize, pending: Pending, until_ns: i64) -> Result<(), ReplayError> {
         let horizon_ns = until_ns.saturating_add(HORIZON);
         let (path, routes) = &mut self.files[file];
-        let name = path.display().to_string();
+        let name = super::name_of(path);
         let piece = &pending.piece;
         let io = |source| ReplayError::Io { path: path.clone(), source };
         let mut opened = File::open(&*path).map_err(io)?;

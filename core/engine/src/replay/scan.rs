@@ -76,7 +76,7 @@ impl From<io::Error> for ScanError {
 
 /// Scans one file; what is wrong with it goes to `losses`.
 pub(super) fn scan(path: &Path, losses: &mut Losses) -> Result<Scan, ScanError> {
-    let name = path.display().to_string();
+    let name = super::name_of(path);
     let mut file = File::open(path)?;
     let bytes = file.seek(SeekFrom::End(0))?;
     let mut scan = Scan { bytes, ..Scan::default() };

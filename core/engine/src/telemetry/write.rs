@@ -232,8 +232,8 @@ fn channel_metadata(table: &TableSpec, message: &MessageType) -> BTreeMap<String
 /// What the name of a file begins with until it is complete.
 const WRITING: &str = ".writing-";
 
-/// A file beside `path`, removed unless it is renamed, and locked, so that it is known whose writer is still alive. Files
-/// of dead writers in the same folder are removed.
+/// A file beside `path`, removed unless it is renamed, and locked, so that it is known whose writer is still alive.
+/// Files of dead writers in the same folder are removed.
 fn temporary(path: &Path) -> io::Result<NamedTempFile> {
     let folder = folder_of(path);
     clear_dead(folder);

@@ -237,6 +237,9 @@ impl<'a> Planner<'a> {
     }
 }
 
+/// Told how far a day has come.
+pub type Report = Box<dyn FnMut(Progress)>;
+
 /// Every day that there is telemetry of, in order.
 ///
 /// # Errors
@@ -254,8 +257,8 @@ pub fn plan(planner: &Planner<'_>, archive: &Archive, inbox: &Inbox) -> Result<V
     Ok(planned)
 }
 
-/// Runs in order every day up to `until` that has no product or one that would come out otherwise now; a day that failed
-/// with the same inputs is left out. `each` is told a day before it is run, and what came of it.
+/// Runs in order every day up to `until` that has no product or one that would come out otherwise now; a day that
+/// failed with the same inputs is left out. `each` is told a day before it is run, and what came of it.
 ///
 /// # Errors
 /// The archive cannot be read or written, or somebody asked to stop.
@@ -263,7 +266,7 @@ pub fn catch_up(
     planner: &Planner<'_>,
     inbox: &Inbox,
     until: Option<NaiveDate>,
-    each: &mut dyn FnMut(&Planned) -> Box<dyn FnMut(Progress)>,
+    each: &mut dyn FnMut(&Planned) -> Report,
 ) -> Result<Vec<Ran>, WorkflowError> {
     let archive = Archive::create(&planner.operations.archive).map_err(EngineError::from)?;
     let days = plan(planner, &archive, inbox)?;

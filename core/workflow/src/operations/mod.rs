@@ -10,5 +10,5 @@ mod days;
 mod inbox;
 
 pub use config::{FILE, Operations};
-pub use days::{Day, Outcome, Planned, Planner, Ran, catch_up, plan};
+pub use days::{Day, Outcome, Planned, Planner, Ran, Report, catch_up, plan};
 pub use inbox::{Inbox, InboxFile};

@@ -162,5 +162,6 @@ fn other(product: &Product) -> BTreeMap<String, String> {
         ("NIS".to_owned(), quality.nis.to_string()),
     ]);
     all.extend(product.losses.iter().map(loss));
+    all.insert("notes".to_owned(), quality.notes.join("; "));
     all
 }

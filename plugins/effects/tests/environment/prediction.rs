@@ -178,7 +178,8 @@ fn chain(folder: &str, change: impl FnOnce(&mut Model)) -> Chain {
     let mission = Mission { path, name: name(), spacecraft: name(), value: mission_json() };
     let mut model = Model::parse(Path::new("m.toml"), "[model]\nrevision = \"1\"\n").expect("a model");
     change(&mut model);
-    build(&registry, &pipeline, &mission, &model, &tables, Carry { batch_rows: 100, threads: 1 }).expect("a chain")
+    build(&registry, &pipeline, &mission, &model, &tables, Carry { batch_rows: 100, threads: 1, run_in_until_ns: None })
+        .expect("a chain")
 }
 
 fn drift(column: &str) -> EffectEntry {

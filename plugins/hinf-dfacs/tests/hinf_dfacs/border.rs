@@ -361,7 +361,7 @@ fn what_the_host_asks_for_reaches_the_stage() {
     let mut model = Model::parse(Path::new("m.toml"), "[model]\nrevision = \"1\"\n").expect("a model");
     for asked in [false, true] {
         model.needs = if asked { vec![PREDICTION_NEED.to_owned()] } else { Vec::new() };
-        let carry = Carry { batch_rows: 4096, threads: 1 };
+        let carry = Carry { batch_rows: 4096, threads: 1, run_in_until_ns: None };
         let chain = build(&registry, &pipeline, &mission, &model, std::slice::from_ref(&grid), carry).expect("a chain");
         let stated = chain.columns.iter().filter(|c| c.attributes.contains_key(UNPREDICTED_ATTRIBUTE)).count();
         let torque = chain.noise.iter().find(|p| p.name == "thruster_torque").expect("torque noise");
