@@ -127,7 +127,8 @@ impl Archive {
         let path = self.folder.join(&name);
         let stat = fs::metadata(&path).at("read", &path)?;
         let now = Seen { sha256: sha256.to_owned(), size: stat.len(), mtime_ns: mtime_ns(&stat), inode: inode(&stat) };
-        if !fully && self.catalogue.seen(&name)?.is_some_and(|before| before == now) {
+        let looks_the_same = self.catalogue.seen(&name)?.is_some_and(|before| before == now);
+        if !fully && looks_the_same {
             return Ok(());
         }
         let found = sha256_of(&path).at("read", &path)?;
@@ -135,7 +136,7 @@ impl Archive {
             let reason = format!("its digest is {found}, the archive says {sha256}");
             return Err(ArchiveError::Damaged { path, reason });
         }
-        if self.writable {
+        if self.writable && !looks_the_same {
             self.catalogue.keep_seen(&name, &now);
         }
         Ok(())

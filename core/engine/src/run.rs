@@ -242,8 +242,16 @@ pub fn run(
     let mut series = Series::create(&chain, &mut writer, &setup)?;
     let covered = setup.carry(feed.as_mut(), &mut chain, &mut series, progress)?;
     // Saved before the flush, because the next day continues within the lags.
-    let left = chain.save()?;
-    let next_state = next_state.map(|next| next.write(&left)).transpose()?;
+    let left = match chain.save() {
+        Ok(left) => Some(left),
+        // Nobody asked for it: a plugin that cannot be saved is no reason to lose the day.
+        Err(error) if next_state.is_none() => {
+            tracing::warn!("the archive gets no state for the next day: {error}");
+            None
+        }
+        Err(error) => return Err(error.into()),
+    };
+    let next_state = next_state.zip(left.as_ref()).map(|(next, left)| next.write(left)).transpose()?;
     chain.finish(&mut series)?;
     let reports = chain.reports()?;
     series.finish()?;
@@ -255,7 +263,9 @@ pub fn run(
     if let (Some(path), Some(state)) = (&options.state_in, &state) {
         writer.keep("state_in", &name_of(path), state)?;
     }
-    writer.keep("state_out", "state", &left)?;
+    if let Some(left) = &left {
+        writer.keep("state_out", "state", left)?;
+    }
     let written = draft.commit(writer, made_of(&setup, &draft))?;
     tracing::info!(id = written.product.id(), path = %written.path.display(), "archived");
     // The state last: after a kill in between, the day can be run again, and the archive has the state too.
