@@ -91,12 +91,22 @@ fn refused(folder: &Path) {
         let next = format!("dragfree diagnose {} --keep-extract", name(2));
         assert!(text.contains(what) && text.contains(&next), "{text}");
     };
+    let sound = std::fs::read(path(2)).expect("readable");
     std::fs::copy(path(1), path(2)).expect("copied");
-    says("it is of product");
-    let text = std::fs::read_to_string(path(1)).expect("readable");
-    std::fs::write(path(2), &text[..text.len() / 2]).expect("written");
-    says("EOF");
-    std::fs::remove_file(path(2)).expect("removable");
+    says("is damaged");
+    std::fs::write(path(2), &sound[..sound.len() / 2]).expect("written");
+    says("is damaged");
+    // The product itself is whole, so that its extract can be made again.
+    expect(dragfree(folder).args(["products", "show", &name(2)]), 0);
+    let list = json(dragfree(folder).args(["products", "list", "--json"]), 0);
+    assert!(list["problems"][0]["path"].as_str().is_some_and(|path| path.ends_with(".extract.json")), "{list:#}");
+    assert_eq!(list["products"].as_array().map(Vec::len), Some(4));
+    std::fs::write(path(2), &sound).expect("written");
+    assert_eq!(json(dragfree(folder).args(["products", "list", "--json"]), 0)["problems"], serde_json::json!([]));
+    let folders = std::fs::read_dir(archive.join("objects")).expect("objects").flatten();
+    let objects = folders.flat_map(|f| std::fs::read_dir(f.path()).expect("a folder").flatten().map(|e| e.path()));
+    let object = objects.into_iter().find(|object| std::fs::read(object).is_ok_and(|content| content == sound));
+    std::fs::remove_file(object.expect("a content of the archive")).expect("removable");
     says("No such file");
     let out = diagnose(folder).args(["2035-01-01..2035-01-02", "--keep-extract"]).output().expect("runs");
     assert_eq!(out.status.code(), Some(1));

@@ -5,7 +5,7 @@ use crate::archive::Archive;
 use crate::catalogue::{Place, Row, Seen, Validity};
 use crate::files::{IoContext as _, Problem, inode, mtime_ns, sha256_of};
 use crate::objects::entries;
-use crate::product::{self, PRODUCT, Product, STATE};
+use crate::product::{self, EXTRACT, PRODUCT, Product, STATE};
 use chrono::NaiveDate;
 use std::collections::BTreeSet;
 use std::fs;
@@ -77,7 +77,8 @@ impl Archive {
         if let Some(reason) = row.problem {
             return Err(ArchiveError::Damaged { path, reason });
         }
-        for (suffix, sha256, _) in self.files_of(id)? {
+        // An extract is made from the product and no part of it; whoever reads one compares it.
+        for (suffix, sha256, _) in self.files_of(id)?.into_iter().filter(|(suffix, ..)| suffix != EXTRACT) {
             self.check(id, &suffix, &sha256, true)?;
         }
         product::read(&path)
@@ -161,8 +162,15 @@ impl Archive {
         for row in self.catalogue.products("1", [])? {
             let mut sound = row.problem.clone().map_or(Ok(()), Err);
             for (suffix, sha256, _) in self.files_of(&row.id)? {
-                known.insert(format!("{}.{suffix}", row.id));
-                sound = sound.and_then(|()| self.check(&row.id, &suffix, &sha256, false).map_err(|e| e.to_string()));
+                let name = format!("{}.{suffix}", row.id);
+                let checked = self.check(&row.id, &suffix, &sha256, false).map_err(|e| e.to_string());
+                match checked {
+                    Err(reason) if suffix == EXTRACT => {
+                        listing.problems.push(Problem { path: self.folder.join(&name), reason });
+                    }
+                    checked => sound = sound.and(checked),
+                }
+                known.insert(name);
             }
             let path = self.path_of(&row.id);
             match sound {

@@ -117,7 +117,8 @@ impl Extract {
         let id = product.product.id();
         let make = format!("make it from the telemetry: dragfree diagnose {id} --keep-extract");
         let refuse = |what: String| WorkflowError::Extract { path: path.clone(), what };
-        let text = std::fs::read(&path).map_err(|e| refuse(format!("{e}; {make}")))?;
+        let read = || Archive::of(&path)?.read_file(id, EXTRACT);
+        let text = read().map_err(|e| refuse(format!("{e}; {make}")))?;
         let extract: Self = serde_json::from_slice(&text).map_err(|e| refuse(format!("{e}; {make}")))?;
         let n = extract.coefficients.len();
         let whole = extract.information.len() == n * (n + 1) / 2 && extract.score.len() == n;
