@@ -22,7 +22,7 @@ const KILL: i32 = 0;
 struct Bench {
     dir: TempDir,
     telemetry: PathBuf,
-    library: PathBuf,
+    preloaded: PathBuf,
     /// Digest of the product that every undisturbed run gives.
     digest: String,
 }
@@ -41,7 +41,7 @@ fn bench() -> &'static Bench {
         expect(&mut compile, 0);
         let product = json(run(dir.path(), &telemetry).arg("--json"), 0);
         let digest = product["sha256"].as_str().expect("a digest").to_owned();
-        Bench { dir, telemetry, library, digest }
+        Bench { dir, telemetry, preloaded: library, digest }
     })
 }
 
@@ -68,7 +68,7 @@ struct Failure {
 }
 
 fn disturbed(mut command: Command, folder: &Path, failure: Failure) -> Output {
-    command.env("LD_PRELOAD", &bench().library).env("FAIL_UNDER", folder.join("archive"));
+    command.env("LD_PRELOAD", &bench().preloaded).env("FAIL_UNDER", folder.join("archive"));
     command.env("FAIL_AT", failure.at.to_string()).env("FAIL_ERRNO", failure.errno.to_string());
     command.env("FAIL_ON", u8::from(failure.stays).to_string()).env("FAIL_COUNT", folder.join("count"));
     command.output().expect("the program runs")

@@ -4,7 +4,7 @@ use super::{Inbox, InboxFile, Operations};
 use crate::WorkflowError;
 use chrono::{DateTime, NaiveDate, NaiveTime, Utc};
 use dragfree_archive::files::sha256;
-use dragfree_archive::product::{Product, Status, Stream};
+use dragfree_archive::product::{Product, Stage, Status, Stream};
 use dragfree_archive::{Archive, Row, Stamp, Written};
 use dragfree_engine::EngineError;
 use dragfree_engine::border::Kind;
@@ -172,7 +172,7 @@ impl<'a> Planner<'a> {
             .extend(self.changed_configuration(product).into_iter().map(|what| format!("the {what} file has changed")));
         for (name, sha256) in self.libraries() {
             let stages = product.history.iter().filter(|stage| stage.plugin == name);
-            if stages.clone().any(|stage| stage.library_sha256 != sha256) {
+            if stages.clone().any(|Stage { library_sha256, .. }| *library_sha256 != sha256) {
                 reasons.push(format!("plugin {name} is another build"));
             }
         }

@@ -127,7 +127,8 @@ fn plugins(product: &Product, what: impl Fn(&Stage) -> String) -> BTreeMap<Strin
 }
 
 fn library(stage: &Stage) -> String {
-    format!("{}, library {}", stage.version, stage.library_sha256)
+    let Stage { version, library_sha256, .. } = stage;
+    format!("{version}, library {library_sha256}")
 }
 
 fn parameters(product: &Product) -> BTreeMap<String, String> {

@@ -4,6 +4,7 @@ use crate::commands::Done;
 use crate::failure::Failure;
 use crate::text::{self, Paint};
 use dragfree_archive::files::IoContext as _;
+use dragfree_archive::product::Stage;
 use dragfree_chart::graph::{self, Node};
 use dragfree_workflow::provenance::{self, Change, Diff, Lineage};
 use std::fmt::Write as _;
@@ -111,9 +112,10 @@ fn told(l: &Lineage, paint: Paint) -> String {
         let _ = writeln!(text, "  {role:<9}  {}  {}", short(&place.sha256), place.name);
     }
     for stage in &l.plugins {
+        let Stage { version, library_sha256, .. } = stage;
         let colon = if stage.instance.is_empty() { "" } else { ":" };
         let name = format!("{}{colon}{}", stage.plugin, stage.instance);
-        let _ = writeln!(text, "  plugin     {}  {name} {}", short(&stage.library_sha256), stage.version);
+        let _ = writeln!(text, "  plugin     {}  {name} {}", short(library_sha256), version);
     }
     for id in &l.resumed {
         let _ = writeln!(text, "  after      {id}");
@@ -146,7 +148,9 @@ fn drawn(l: &Lineage) -> Result<String, Failure> {
     );
     let kept = l.kept.iter().filter(|p| !p.role.starts_with("state"));
     left.extend(kept.map(|p| node(&p.role, &p.name, short(&p.sha256))));
-    let plugins = text::distinct(l.plugins.iter().map(|s| (s.plugin.as_str(), s.library_sha256.as_str())));
+    let plugins = text::distinct(
+        l.plugins.iter().map(|Stage { plugin, library_sha256, .. }| (plugin.as_str(), library_sha256.as_str())),
+    );
     left.extend(plugins.into_iter().map(|(name, sha256)| node("plugin", name, short(sha256))));
     let verdict = l.product.verdict.as_deref().unwrap_or("no verdict");
     let middle = vec![node("product", &l.product.id, verdict)];
