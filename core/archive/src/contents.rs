@@ -5,17 +5,18 @@ use crate::archive::Archive;
 use crate::catalogue::{Place, Row, Seen, Validity};
 use crate::files::{IoContext as _, Problem, inode, mtime_ns, sha256_of};
 use crate::objects::entries;
-use crate::product::{self, EXTRACT, PRODUCT, Product, STATE};
+use crate::product::{self, EXTRACT, JOINT, PRODUCT, Product, STATE};
 use chrono::NaiveDate;
 use std::collections::BTreeSet;
 use std::fs;
 use std::path::PathBuf;
 
 /// Names in an archive that are its own.
-const OWN: [&str; 7] = [
+const OWN: [&str; 8] = [
     "objects",
     "journal",
     "staging",
+    "sums",
     "catalogue.sqlite",
     "catalogue.sqlite-journal",
     "catalogue.sqlite-wal",
@@ -101,8 +102,21 @@ impl Archive {
         Ok(files)
     }
 
+    /// Reads a product and compares it, but not the files beside it, with what was archived.
+    ///
+    /// # Errors
+    /// There is no such product, or it is damaged.
+    pub fn document(&self, id: &str) -> Result<Product, ArchiveError> {
+        let (sha256, _) = self.document_of(id)?;
+        self.check(id, PRODUCT, &sha256, false)?;
+        product::read(&self.path_of(id))
+    }
+
     /// Digest and size of a product's document.
-    fn document_of(&self, id: &str) -> Result<(String, u64), ArchiveError> {
+    ///
+    /// # Errors
+    /// There is no such product.
+    pub fn document_of(&self, id: &str) -> Result<(String, u64), ArchiveError> {
         let sha256 = self.catalogue.document(id)?.ok_or_else(|| self.missing(id))?;
         let size = fs::metadata(self.objects.path(&sha256)).map_or(0, |m| m.len());
         Ok((sha256, size))
@@ -200,8 +214,8 @@ impl Archive {
         Ok(listing)
     }
 
-    /// Finds a product by its id, by its id without the revision (the newest one then) or by its day. A withdrawn one
-    /// is found by its id alone.
+    /// Finds a product by its id, by its id without the revision (the newest one then) or by its day, which does not
+    /// find those of many days. A withdrawn one is found by its id alone.
     ///
     /// # Errors
     /// There is none, or the day has products of several series.
@@ -211,8 +225,8 @@ impl Archive {
         if let Some(row) = self.catalogue.products("p.id = ?1", [id])?.pop() {
             return Ok(entry(row));
         }
-        let condition = "(p.day = ?1 OR substr(p.id, 1, length(p.id) - 5) = ?1) AND w.reason IS NULL";
-        let mut found: Vec<Entry> = self.catalogue.products(condition, [id])?.into_iter().map(entry).collect();
+        let condition = "((p.day = ?1 AND p.name <> ?2) OR substr(p.id, 1, length(p.id) - 5) = ?1) AND w.reason IS NULL";
+        let mut found: Vec<Entry> = self.catalogue.products(condition, [id, JOINT])?.into_iter().map(entry).collect();
         let series = |e: &Entry| (e.row.spacecraft.clone(), e.row.name.clone());
         if let Some(last) = found.last()
             && found.iter().any(|e| series(e) != series(last))
@@ -240,14 +254,15 @@ impl Archive {
         Ok(newest)
     }
 
-    /// The newest product of every day, spacecraft and name, whatever its verdict; withdrawn ones and tests on data
-    /// kept out of a fit are left out.
+    /// The newest product of every day, spacecraft and name, whatever its verdict; withdrawn ones, tests on data kept
+    /// out of a fit and products of many days are left out.
     ///
     /// # Errors
     /// The catalogue cannot be read.
     pub fn newest(&self) -> Result<Vec<Entry>, ArchiveError> {
         let mut newest: Vec<Entry> = Vec::new();
-        for row in self.catalogue.products("w.reason IS NULL AND p.problem IS NULL AND p.fixed_from IS NULL", [])? {
+        let condition = "w.reason IS NULL AND p.problem IS NULL AND p.fixed_from IS NULL AND p.name <> ?1";
+        for row in self.catalogue.products(condition, [JOINT])? {
             let of = |row: &Row| (row.day.clone(), row.spacecraft.clone(), row.name.clone());
             if newest.last().is_some_and(|last| of(&last.row) == of(&row)) {
                 newest.pop();

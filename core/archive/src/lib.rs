@@ -6,6 +6,7 @@
 //!         journal/00000001.json               what happened, in order, one file an event
 //!         catalogue.sqlite                    the same as tables; made again from the two above whenever it is gone
 //!         staging/                            what writers have not committed
+//!         sums/                               sums of days, which may be deleted
 //! ```
 //!
 //! An event has happened when its file has its number in the journal, and nothing before that is visible. Everything
@@ -22,6 +23,7 @@ mod migrate;
 mod objects;
 pub mod product;
 mod staging;
+mod sums;
 mod writer;
 
 pub use archive::Archive;
@@ -30,7 +32,7 @@ pub use contents::{Entry, Find, Listing};
 pub use events::Window;
 pub use journal::{Event, InputPlace, JournalEntry, SetState, Stamp, Stored};
 pub use migrate::{Migrated, migrate};
-pub use product::{EXTRACT, STATE};
+pub use product::{EXTRACT, JOINT, STATE};
 pub use writer::{MadeOf, ProductWriter, Written};
 
 use files::IoError;

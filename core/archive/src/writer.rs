@@ -103,7 +103,30 @@ impl ProductWriter {
     ///
     /// # Errors
     /// [`ArchiveError`]; nothing is left in the archive then.
-    pub fn commit(mut self, product: &Product, made_of: MadeOf, stamp: &Stamp<'_>) -> Result<Written, ArchiveError> {
+    pub fn commit(self, product: &Product, made_of: MadeOf, stamp: &Stamp<'_>) -> Result<Written, ArchiveError> {
+        self.archived(product, made_of, stamp, false).map(|(written, _)| written)
+    }
+
+    /// As [`Self::commit`]; where the newest revision is the same, that is given, and false.
+    ///
+    /// # Errors
+    /// As [`Self::commit`].
+    pub fn commit_if_new(
+        self,
+        product: &Product,
+        made_of: MadeOf,
+        stamp: &Stamp<'_>,
+    ) -> Result<(Written, bool), ArchiveError> {
+        self.archived(product, made_of, stamp, true)
+    }
+
+    fn archived(
+        mut self,
+        product: &Product,
+        made_of: MadeOf,
+        stamp: &Stamp<'_>,
+        only_new: bool,
+    ) -> Result<(Written, bool), ArchiveError> {
         let mut sealed = Vec::new();
         let mut attachments = Vec::new();
         for (suffix, path) in &self.attachments {
@@ -121,6 +144,11 @@ impl ProductWriter {
         self.archive.finish()?;
         let (revision, supersedes) = self.follows(product, &attachments)?;
         let product = product.numbered(revision, attachments, supersedes);
+        let before = product.supersedes.as_ref().filter(|old| only_new && old.sha256 == product.digest());
+        if let Some(Supersedes { id, .. }) = before {
+            let path = self.archive.path_of(id);
+            return Ok((Written { product: product::read(&path)?, path }, false));
+        }
         let document = self.staging.path().join("product.toml");
         let text = product.emit()?;
         let write = || {
@@ -147,7 +175,7 @@ impl ProductWriter {
         sealed.push(document);
         self.place(&sealed, event, stamp)?;
         self.archive.committed();
-        Ok(Written { path: self.archive.path_of(product.id()), product })
+        Ok((Written { path: self.archive.path_of(product.id()), product }, true))
     }
 
     /// Places contents and commits the event that names them; takes them away again where that fails.

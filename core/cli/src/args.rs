@@ -1,9 +1,11 @@
 //! Arguments. The names are a contract: scripts use them.
 
+use crate::failure::Failure;
 use crate::operations;
 use crate::utc;
 use chrono::NaiveDate;
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
+use dragfree_workflow::operations::Operations;
 use std::path::PathBuf;
 
 /// Epochs that plugins are handed at a time unless the command line says otherwise.
@@ -94,6 +96,10 @@ pub(crate) enum Command {
     /// The products of an archive
     #[command(subcommand)]
     Products(Products),
+    /// One calibration of many days from the sums that their products hold, with rates, and steps at events
+    Joint(Joint),
+    /// Values of days with their errors, and the days that leave what those before them predict
+    Trend(Trend),
     /// The calibration that holds at a time, by a set of certified products; exit code 1 where there is none
     At(At),
     /// The archive itself
@@ -302,8 +308,83 @@ pub(crate) struct Chain {
 #[derive(Debug, Args)]
 pub(crate) struct Archive {
     /// Folder with the products [default: that of the nearest mission-ops.toml, or `archive`]
-    #[arg(long = "archive", value_name = "DIR", default_value_os_t = operations::archive(), hide_default_value = true)]
-    pub(crate) folder: PathBuf,
+    #[arg(long = "archive", value_name = "DIR")]
+    named: Option<PathBuf>,
+    /// File of operations that names the folder
+    #[arg(long, value_name = "FILE", conflicts_with = "named")]
+    ops: Option<PathBuf>,
+}
+
+impl Archive {
+    /// The folder.
+    ///
+    /// # Errors
+    /// The file of operations that is named cannot be read.
+    pub(crate) fn folder(&self) -> Result<PathBuf, Failure> {
+        self.named.clone().map_or_else(|| operations::archive(self.ops.as_deref()), Ok)
+    }
+
+    /// The file of operations that belongs to it, where there is one.
+    ///
+    /// # Errors
+    /// It cannot be read.
+    pub(crate) fn operations(&self) -> Result<Option<Operations>, Failure> {
+        if self.named.is_some() { Ok(None) } else { operations::nearest(self.ops.as_deref()) }
+    }
+}
+
+/// Days of an archive.
+#[derive(Debug, Args)]
+pub(crate) struct Days {
+    /// First and last day, `2035-01-01..2035-03-31`
+    #[arg(value_name = "DAY..DAY", value_parser = days)]
+    pub(crate) days: (NaiveDate, NaiveDate),
+    /// Spacecraft; needed where the archive has products of several
+    #[arg(long, value_name = "NAME")]
+    pub(crate) spacecraft: Option<String>,
+    /// Events, a list in YAML as JPL's of GRACE-FO [default: that of mission-ops.toml]
+    #[arg(long, value_name = "FILE")]
+    pub(crate) events: Option<PathBuf>,
+    /// A kind of event, and the effect whose coefficients it changes: `MTEA=com-offset`; repeatable
+    #[arg(long = "step", value_name = "EVENT=EFFECT", value_parser = step)]
+    pub(crate) steps: Vec<(String, String)>,
+    #[command(flatten)]
+    pub(crate) archive: Archive,
+}
+
+fn days(text: &str) -> Result<(NaiveDate, NaiveDate), String> {
+    let parsed = text.split_once("..").and_then(|(a, b)| Some((a.parse().ok()?, b.parse().ok()?)));
+    match parsed {
+        Some((first, last)) if first <= last => Ok((first, last)),
+        Some(_) => Err("the last day is before the first one".to_owned()),
+        None => Err("two days and two dots between them are wanted, 2035-01-01..2035-03-31".to_owned()),
+    }
+}
+
+fn step(text: &str) -> Result<(String, String), String> {
+    let (event, effect) = text.split_once('=').ok_or("EVENT=EFFECT is wanted, MTEA=com-offset")?;
+    Ok((event.to_owned(), effect.to_owned()))
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Joint {
+    #[command(flatten)]
+    pub(crate) days: Days,
+    /// Archive no product
+    #[arg(long)]
+    pub(crate) dry_run: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Trend {
+    #[command(flatten)]
+    pub(crate) days: Days,
+    /// Draw the values of every coefficient over days
+    #[arg(long, value_name = "FILE.svg")]
+    pub(crate) picture: Option<PathBuf>,
+    /// Write the values as a table
+    #[arg(long, value_name = "FILE.csv")]
+    pub(crate) csv: Option<PathBuf>,
 }
 
 /// Where a mission's parts lie.

@@ -4,19 +4,34 @@ use crate::failure::{Failure, Refusal};
 use dragfree_workflow::operations::{FILE, Operations};
 use std::path::{Path, PathBuf};
 
-/// The file that is named, or the nearest one from this folder upwards.
+/// The file that is named, or the nearest one from this folder upwards; none where there is no such file.
+///
+/// # Errors
+/// It cannot be read.
+pub(crate) fn nearest(named: Option<&Path>) -> Result<Option<Operations>, Failure> {
+    let path = named.map(PathBuf::from).or_else(|| Operations::find(Path::new(".")));
+    Ok(path.map(|path| Operations::load(&path)).transpose()?)
+}
+
+/// As [`nearest`].
 ///
 /// # Errors
 /// There is none, or it cannot be read.
 pub(crate) fn load(named: Option<&Path>) -> Result<Operations, Failure> {
-    let path = named.map(PathBuf::from).or_else(|| Operations::find(Path::new(".")));
-    Ok(Operations::load(&path.ok_or(Refusal::NoOperations)?)?)
+    nearest(named)?.ok_or_else(|| Refusal::NoOperations.into())
 }
 
-/// The archive that a command works on where `--archive` does not say: that of the nearest file of operations.
-pub(crate) fn archive() -> PathBuf {
-    let found = Operations::find(Path::new(".")).and_then(|path| Operations::load(&path).ok());
-    found.map_or_else(|| PathBuf::from("archive"), |operations| operations.archive)
+/// The archive that a command works on where `--archive` does not say: that of the file of operations that is named, or
+/// of the nearest one.
+///
+/// # Errors
+/// The file that is named cannot be read.
+pub(crate) fn archive(named: Option<&Path>) -> Result<PathBuf, Failure> {
+    let found = match named {
+        Some(_) => nearest(named)?,
+        None => nearest(None).ok().flatten(),
+    };
+    Ok(found.map_or_else(|| PathBuf::from("archive"), |operations| operations.archive))
 }
 
 /// Name of the file of operations.

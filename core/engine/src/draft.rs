@@ -7,7 +7,7 @@ use dragfree_archive::product::{
     Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Model, NonStandardAttributes,
     Outcome, Product, Quality, Stage, Status, Stream, Variable,
 };
-use dragfree_archive::{ArchiveError, MadeOf, ProductWriter, Stamp, Written};
+use dragfree_archive::{ArchiveError, JOINT, MadeOf, ProductWriter, Stamp, Written};
 use dragfree_schema::{Report, Settings};
 use std::collections::BTreeSet;
 
@@ -55,14 +55,29 @@ impl Draft {
     ///
     /// # Errors
     /// [`ArchiveError`]; nothing is left in the archive then.
-    pub fn commit(&self, mut writer: ProductWriter, made_of: MadeOf) -> Result<Written, ArchiveError> {
+    pub fn commit(&self, writer: ProductWriter, made_of: MadeOf) -> Result<Written, ArchiveError> {
         let product = product(self)?;
+        let writer = self.attached(writer)?;
+        writer.commit(&product, made_of, &Stamp { time: self.created, software: &self.software })
+    }
+
+    /// As [`Self::commit`]; where the newest revision is the same, that is given, and false.
+    ///
+    /// # Errors
+    /// As [`Self::commit`].
+    pub fn commit_if_new(&self, writer: ProductWriter, made_of: MadeOf) -> Result<(Written, bool), ArchiveError> {
+        let product = product(self)?;
+        let writer = self.attached(writer)?;
+        writer.commit_if_new(&product, made_of, &Stamp { time: self.created, software: &self.software })
+    }
+
+    fn attached(&self, mut writer: ProductWriter) -> Result<ProductWriter, ArchiveError> {
         for report in &self.reports {
             for attachment in &report.attachments {
                 writer.attach(&report.plugin, &attachment.suffix, &attachment.text)?;
             }
         }
-        writer.commit(&product, made_of, &Stamp { time: self.created, software: &self.software })
+        Ok(writer)
     }
 }
 
@@ -105,7 +120,7 @@ fn product(draft: &Draft) -> Result<Product, ArchiveError> {
             conventions: "CF-1.6, ACDD-1.3, ISO 8601".to_owned(),
             project: draft.mission.clone(),
             platform: draft.spacecraft.clone(),
-            processing_level: "1B".to_owned(),
+            processing_level: if draft.product == JOINT { "2" } else { "1B" }.to_owned(),
             product_version: format!("{:02}", draft.release),
             source: draft.pipeline.clone(),
             date_created: draft.created.to_rfc3339_opts(SecondsFormat::Secs, true),

@@ -8,7 +8,7 @@
 //! Projecting active rows out would claim that a quantity is known exactly because the data wanted it outside its
 //! range.
 
-use dragfree_schema::Settings;
+use dragfree_schema::{Coefficient, Constraint, Settings};
 use nalgebra::{Cholesky, DMatrix, DVector};
 use serde::Serialize;
 
@@ -44,6 +44,22 @@ pub struct Unknown {
     pub colours: Option<Colour>,
 }
 
+impl Unknown {
+    /// Of a declared coefficient.
+    pub fn of(c: &Coefficient) -> Self {
+        Self {
+            name: c.name.clone(),
+            unit: c.unit.clone(),
+            lower: c.lower,
+            upper: c.upper,
+            initial: c.initial,
+            prior_sigma: c.prior_sigma,
+            estimate: c.estimate,
+            colours: c.colours.clone(),
+        }
+    }
+}
+
 /// The noises that unknowns colour, with their values.
 pub fn colours<'a>(unknowns: &'a [Unknown], theta: &'a DVector<f64>) -> Vec<(&'a Colour, f64)> {
     unknowns.iter().zip(theta.iter()).filter_map(|(u, value)| Some((u.colours.as_ref()?, *value))).collect()
@@ -62,6 +78,18 @@ pub struct Bound {
     pub lower: f64,
     /// Upper bound.
     pub upper: f64,
+}
+
+impl Bound {
+    /// Of declared constraints; one on a coefficient that is not in the model constrains nothing here.
+    pub fn all(coefficients: &[Coefficient], constraints: &[Constraint]) -> Vec<Self> {
+        let index = |name: &str| coefficients.iter().position(|c| c.name == name);
+        let of = |c: &Constraint| {
+            let terms = c.terms.iter().map(|(name, weight)| Some((index(name)?, *weight))).collect::<Option<_>>()?;
+            Some(Self { name: c.name.clone(), survey: c.kind == "survey", terms, lower: c.lower, upper: c.upper })
+        };
+        constraints.iter().filter_map(of).collect()
+    }
 }
 
 /// What was made of the data.
@@ -354,7 +382,7 @@ pub fn estimate_with(
 /// [`crate::levels`]). Below the lowest bin of an ordinary segment, 1.8 mHz, the loop is stiff, and U is much as it is
 /// in the octave above. Left out, that moved gains of the thrusters by 0.02, more than their σ, whatever the length of
 /// the data. Segments that are there for what is slow leave next to nothing out.
-fn zero_area_weights(spectra: &Spectra, plan: &Plan) -> Vec<f64> {
+pub(crate) fn zero_area_weights(spectra: &Spectra, plan: &Plan) -> Vec<f64> {
     let octave = if plan.first_bin == FIRST_BIN { FIRST_BIN..2 * FIRST_BIN } else { 0..0 };
     // Of frequencies from zero, half a bin belongs to the constant.
     let both = 1.0 + (FIRST_BIN as f64 - 0.5) / FIRST_BIN as f64;

@@ -30,6 +30,31 @@ pub struct WithLevels {
     pub noise: Vec<NoiseProcess>,
 }
 
+/// Solves for all coefficients that are estimated, the levels of noise among them that the channels show; `declared`
+/// has these at their initial values.
+///
+/// # Errors
+/// [`EstimateError`] as [`estimate_with`].
+pub fn solve(
+    observed: &Observed<'_>,
+    declared: &[NoiseProcess],
+    coefficients: &[Coefficient],
+    bounds: &[Bound],
+    method: &Method<'_>,
+) -> Result<WithLevels, EstimateError> {
+    let model = NoiseModel::new(declared, &observed.layout.channels, 1.0 / observed.plan.rate_hz)?;
+    let is_level = |c: &Coefficient| c.estimate && model.process_names().any(|name| name == c.noise);
+    let free: Vec<Coefficient> = coefficients.iter().filter(|c| is_level(c)).cloned().collect();
+    let others = |c: &Coefficient| Unknown { estimate: c.estimate && !is_level(c), ..Unknown::of(c) };
+    let unknowns: Vec<Unknown> = coefficients.iter().map(others).collect();
+    if free.is_empty() {
+        let noise = BandNoise::new(&model, observed.plan);
+        let estimate = estimate_with(observed, &noise, &unknowns, bounds, method)?;
+        return Ok(WithLevels { estimate, levels: Vec::new(), noise: declared.to_vec() });
+    }
+    estimate_with_levels(observed, declared, &free, &unknowns, bounds, method)
+}
+
 /// Solves for the coefficients and for `free` levels of noise. `declared` has them at their initial values; a level
 /// that its channels do not show is left out.
 ///

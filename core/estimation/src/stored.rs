@@ -1,12 +1,29 @@
 //! Sums as they lie beside a product: what a day leaves behind, to be added to other days and solved again for any Σ.
 
-use dragfree_schema::NoiseProcess;
+use dragfree_schema::{Coefficient, Constraint, NoiseProcess};
 use serde::{Deserialize, Serialize};
 
 use crate::spectra::{Block, Layout, Plan, Spectra, Sums, triangle};
 
-/// Version of the layout of stored sums. Those of version 2 have no slow bands.
-pub const FORMAT: u32 = 3;
+/// Version of the layout of stored sums. Those of version 2 have no slow bands, those of version 3 no coefficients.
+pub const FORMAT: u32 = 4;
+
+/// What a solution needs beside the sums, as the plugins declared it.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Declared {
+    /// Noise in the channels, from which Σ is made.
+    #[serde(default)]
+    pub noise: Vec<NoiseProcess>,
+    /// Coefficients of the model, in the order of the layout, without their responses, which are in the layout.
+    #[serde(default)]
+    pub coefficients: Vec<Coefficient>,
+    /// Surveys and ranges.
+    #[serde(default)]
+    pub constraints: Vec<Constraint>,
+    /// How often Σ is measured from the residuals.
+    #[serde(default)]
+    pub refinements: usize,
+}
 
 /// Sums in a form for JSON, in which every float is exact.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -22,9 +39,9 @@ pub struct Stored {
     /// Bands below the others, of segments [`LONG`](crate::spectra::LONG) times as long, which stand first.
     #[serde(default)]
     pub slow_bands: usize,
-    /// Declared noise of the channels, from which Σ is made.
-    #[serde(default)]
-    pub noise: Vec<NoiseProcess>,
+    /// Noise, coefficients and constraints.
+    #[serde(flatten)]
+    pub declared: Declared,
     /// First and last frequency of each band, Hz.
     pub bands_hz: Vec<[f64; 2]>,
     /// Per band, the lower triangle of the columns' summed cross-spectra, channels, then series; and their weights.
@@ -35,6 +52,9 @@ pub struct Stored {
 #[derive(Debug, thiserror::Error)]
 #[expect(missing_docs, reason = "the messages name the fields")]
 pub enum StoredError {
+    /// No JSON of sums.
+    #[error("these are no sums of a day: {0}")]
+    Json(#[from] serde_json::Error),
     /// Another version.
     #[error("stored sums have format {found}, this program reads {FORMAT}: run the day again")]
     Format { found: u32 },
@@ -50,17 +70,32 @@ pub enum StoredError {
 
 impl Stored {
     /// What is to be stored.
-    pub fn new(layout: &Layout, plan: &Plan, noise: &[NoiseProcess], spectra: &Spectra) -> Self {
+    pub fn new(layout: &Layout, plan: &Plan, mut declared: Declared, spectra: &Spectra) -> Self {
+        declared.coefficients.iter_mut().for_each(|c| c.responses.clear());
         Self {
             format: FORMAT,
             layout: layout.clone(),
             length: plan.length,
             rate_hz: plan.rate_hz,
             slow_bands: plan.slow_bands,
-            noise: noise.to_vec(),
+            declared,
             bands_hz: plan.bands.iter().map(|b| [b.first, b.end - 1].map(|k| plan.hz(*b, k as f64))).collect(),
             spectra: spectra.clone(),
         }
+    }
+
+    /// Of the normal equations beside a product, `neq.json`, which hold them as `sums`.
+    ///
+    /// # Errors
+    /// [`StoredError`] when it holds none, or damaged ones.
+    pub fn of_equations(text: &[u8]) -> Result<Self, StoredError> {
+        #[derive(Deserialize)]
+        struct Equations {
+            sums: Stored,
+        }
+        let Equations { sums } = serde_json::from_slice(text)?;
+        sums.check()?;
+        Ok(sums)
     }
 
     /// The days' sums as one, each day a block.
@@ -71,14 +106,7 @@ impl Stored {
         let first = days.first().ok_or(StoredError::Damaged("no day at all"))?;
         for day in days {
             day.check()?;
-            let same = [
-                (day.layout == first.layout, "channels or effects"),
-                (day.length == first.length, "the length of segments"),
-                (day.rate_hz == first.rate_hz, "the sample rate"),
-                (day.slow_bands == first.slow_bands, "the lowest band"),
-                (day.noise == first.noise, "the declared noise"),
-            ];
-            if let Some((_, what)) = same.into_iter().find(|(same, _)| !same) {
+            if let Some(what) = first.unlike(day) {
                 return Err(StoredError::Unlike(what));
             }
         }
@@ -92,15 +120,32 @@ impl Stored {
         Ok((first.layout.clone(), plan, sums))
     }
 
+    /// In what the sums of another day differ so that they cannot be added.
+    pub fn unlike(&self, other: &Self) -> Option<&'static str> {
+        let same = [
+            (self.layout == other.layout, "channels or effects"),
+            (self.length == other.length, "the length of segments"),
+            (self.rate_hz == other.rate_hz, "the sample rate"),
+            (self.slow_bands == other.slow_bands, "the lowest band"),
+            (self.declared.noise == other.declared.noise, "the declared noise"),
+            (self.declared == other.declared, "ranges, surveys or starting values"),
+        ];
+        same.into_iter().find(|(same, _)| !same).map(|(_, what)| what)
+    }
+
     /// The bands of the sums.
-    fn plan(&self) -> Plan {
+    pub fn plan(&self) -> Plan {
         match self.slow_bands {
             0 => Plan::new(self.length, self.rate_hz),
             _ => Plan::with_slow_bands(self.length, self.rate_hz),
         }
     }
 
-    fn check(&self) -> Result<(), StoredError> {
+    /// Whether sizes and numbers fit each other.
+    ///
+    /// # Errors
+    /// [`StoredError::Format`] or [`StoredError::Damaged`].
+    pub fn check(&self) -> Result<(), StoredError> {
         if !(2..=FORMAT).contains(&self.format) {
             return Err(StoredError::Format { found: self.format });
         }
@@ -121,8 +166,12 @@ impl Stored {
         if !regressors.iter().all(|r| inside(r) && r.factor.is_finite()) {
             return damaged("regressors");
         }
-        if self.noise.iter().any(|p| p.check().is_err()) {
+        if self.declared.noise.iter().any(|p| p.check().is_err()) {
             return damaged("declared noise");
+        }
+        let names = self.declared.coefficients.iter().map(|c| &c.name);
+        if self.format == FORMAT && !names.eq(coefficients) {
+            return damaged("coefficients");
         }
         let plan = self.plan();
         let bands = plan.bands.len();
@@ -176,7 +225,9 @@ mod tests {
         let column =
             |k: u64| -> Vec<f64> { (0..64).map(|t| (1e-9 * (t * t + 7 * k) as f64 * seed as f64).sin()).collect() };
         analyser.add(0, 0, &[&column(1), &column(2)], false, &mut sums);
-        Stored::new(&layout, analyser.plan(), &[declared(1e-12)], &sums.total)
+        let coefficients = vec![Coefficient { name: "b".to_owned(), ..Coefficient::default() }];
+        let declared = Declared { noise: vec![declared(1e-12)], coefficients, ..Declared::default() };
+        Stored::new(&layout, analyser.plan(), declared, &sums.total)
     }
 
     #[test]
@@ -202,10 +253,16 @@ mod tests {
         assert!(change(|d| d.spectra.packed[0] = f64::NAN).contains("damaged"));
         assert!(change(|d| d.length = 10).contains("length"));
         assert!(change(|d| d.rate_hz = 5.0).contains("sample rate"));
-        assert!(change(|d| d.noise = vec![declared(2e-12)]).contains("declared noise"));
-        assert!(change(|d| d.noise = vec![declared(f64::NAN)]).contains("damaged"));
+        assert!(change(|d| d.declared.noise = vec![declared(2e-12)]).contains("declared noise"));
+        assert!(change(|d| d.declared.noise = vec![declared(f64::NAN)]).contains("damaged"));
         assert!(change(|d| d.layout.regressors[0].series = 9).contains("regressors"));
-        assert!(change(|d| d.layout.coefficients[0] = "g".into()).contains("effects"));
+        assert!(change(|d| d.layout.coefficients[0] = "g".into()).contains("coefficients"));
+        assert!(change(|d| d.declared.coefficients[0].upper = 3.0).contains("ranges"));
+        let rename = |d: &mut Stored| {
+            d.layout.coefficients[0] = "g".into();
+            d.declared.coefficients[0].name = "g".into();
+        };
+        assert!(change(rename).contains("effects"));
         assert!(Stored::stack(&[]).is_err());
     }
 }

@@ -5,8 +5,10 @@
 mod answer;
 pub mod calibrate;
 pub mod compare;
+mod days;
 pub mod diagnose;
 pub mod extract;
+pub mod joint;
 pub mod ladder;
 mod likelihood;
 pub mod next;
@@ -15,6 +17,7 @@ mod proposals;
 pub mod provenance;
 mod replay;
 mod sums;
+pub mod trend;
 
 pub use replay::{Pass, Replay};
 
@@ -52,6 +55,15 @@ pub enum WorkflowError {
     /// What a mission's file of operations says cannot be followed.
     #[error("{}: {what}", path.display())]
     Operations { path: PathBuf, what: String },
+    /// A file of events that cannot be used.
+    #[error("{}: {what}", path.display())]
+    Events { path: PathBuf, what: String },
+    /// No day can enter a calibration of many.
+    #[error("no day is left to calibrate together: {what}")]
+    NoDays { what: String },
+    /// Days of several spacecraft or pipelines.
+    #[error("the archive has products of several series in that time ({what}); name the spacecraft")]
+    SeveralSeries { what: String },
     /// No product was named.
     #[error("no product was named")]
     NoProduct,

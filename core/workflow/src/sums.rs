@@ -317,10 +317,8 @@ fn residual(
     let mut theta: Vec<f64> = candidate_set.coefficients.iter().map(|c| c.initial).collect();
     if let Some(path) = reference {
         let refuse = |what: String| WorkflowError::Reference { path: path.to_owned(), what };
-        let text = std::fs::read_to_string(path).map_err(|e| refuse(e.to_string()))?;
-        let mut value: serde_json::Value = serde_json::from_str(&text).map_err(|e| refuse(e.to_string()))?;
-        let stored: Stored = serde_json::from_value(value["sums"].take()).map_err(|e| refuse(e.to_string()))?;
-        let days = [stored];
+        let text = std::fs::read(path).map_err(|e| refuse(e.to_string()))?;
+        let days = [Stored::of_equations(&text).map_err(|e| refuse(e.to_string()))?];
         let (layout, plan, sums) = Stored::stack(&days).map_err(|e| refuse(e.to_string()))?;
         let model = candidate_set.model();
         let same = layout.coefficients.iter().eq(candidate_set.coefficients[..model].iter().map(|c| &c.name));
@@ -328,7 +326,7 @@ fn residual(
             return Err(refuse("belongs to another model, or to segments of another length".to_owned()));
         }
         if sums.total.segments > 0 {
-            let noise = NoiseModel::new(&days[0].noise, &layout.channels, 1.0 / plan.rate_hz)?;
+            let noise = NoiseModel::new(&days[0].declared.noise, &layout.channels, 1.0 / plan.rate_hz)?;
             let observed = Observed { layout: &layout, plan: &plan, sums: &sums, prediction: None };
             let (unknowns, bounds) = (candidate_set.unknowns(&[]), candidate_set.bounds());
             let noise = BandNoise::new(&noise, &plan);

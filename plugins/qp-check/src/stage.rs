@@ -8,16 +8,16 @@ use serde_json::json;
 
 use dragfree_estimation::collected::Collected;
 use dragfree_estimation::estimate::{
-    Bound, Estimate as Solution, Method, Observed, Refinement, Unknown, estimate_with,
+    Bound, Estimate as Solution, Method, Observed, Refinement,
 };
-use dragfree_estimation::free_levels::{WithLevels, estimate_with_levels, log_determinant};
+use dragfree_estimation::free_levels::{WithLevels, log_determinant, solve};
 use dragfree_estimation::levels::Level as NoiseLevel;
 use dragfree_estimation::prediction::Prediction;
 use dragfree_estimation::segments::{Segmenter, longest_length};
 use dragfree_estimation::sigma::{BandNoise, NoiseModel};
 use dragfree_estimation::spectra::{Analyser, LONG, Layout, Plan, Regressor, SHORTEST, Spectra};
 use dragfree_estimation::state;
-use dragfree_estimation::stored::Stored;
+use dragfree_estimation::stored::{Declared, Stored};
 use dragfree_estimation::verdict::{Difference, Pull, Value, chi2_bounds, chi2_quantile, differences};
 
 /// Normal equations over segments, a constrained solution, and a verdict.
@@ -43,6 +43,7 @@ struct Linked {
     differenced: Vec<bool>,
     coefficients: Vec<Coefficient>,
     bounds: Vec<Bound>,
+    constraints: Vec<Constraint>,
     refinements: usize,
     refinement: Refinement,
     settings: Settings,
@@ -191,7 +192,8 @@ impl Linked {
             columns,
             names,
             left_out,
-            bounds: bounds(available),
+            bounds: Bound::all(&available.coefficients, &available.constraints),
+            constraints: available.constraints.clone(),
             coefficients: available.coefficients.clone(),
             refinements: stage.refinements,
             refinement,
@@ -218,9 +220,6 @@ impl Linked {
         for c in &self.model.unknown {
             report.notes.push(format!("{}: {UNKNOWN_NOISE}", self.layout.channels[*c]));
         }
-        let is_solved_for = |c: &Coefficient| c.estimate && !self.is_free_level(c);
-        let unknowns: Vec<Unknown> =
-            self.coefficients.iter().map(|c| Unknown { estimate: is_solved_for(c), ..unknown(c) }).collect();
         if !self.left_out.is_empty() {
             report.notes.push(format!(
                 "{}: nothing in the model acts on them, so they are left out; as witnesses of the thrusters' noise they would lend \
@@ -234,7 +233,13 @@ impl Linked {
         let sums = collected.all(self.analyser.plan());
         // The open end is stored only where there is nothing else of segments as long: a later run stores the segment
         // that it becomes.
-        let stored = Stored::new(&self.layout, self.analyser.plan(), &self.declared, &self.own(&collected));
+        let declared = Declared {
+            noise: self.declared.clone(),
+            coefficients: self.coefficients.clone(),
+            constraints: self.constraints.clone(),
+            refinements: self.refinements,
+        };
+        let stored = Stored::new(&self.layout, self.analyser.plan(), declared, &self.own(&collected));
         report.counts.insert("epochs_in_segments".to_owned(), segmenter.state.covered);
         if sums.total.segments == 0 {
             self.no_solution(&mut report);
@@ -247,17 +252,10 @@ impl Linked {
             prediction: collected.prediction.as_ref(),
         };
         let method = Method { refinements: self.refinements, refinement: self.refinement, settings: &self.settings };
-        let noise = BandNoise::new(&self.model, observed.plan);
-        let free: Vec<Coefficient> = self.coefficients.iter().filter(|c| self.is_free_level(c)).cloned().collect();
-        let WithLevels { estimate: solution, levels, noise: fitted } = if free.is_empty() {
-            let estimate = estimate_with(&observed, &noise, &unknowns, &self.bounds, &method)?;
-            WithLevels { estimate, levels: Vec::new(), noise: Vec::new() }
-        } else {
-            estimate_with_levels(&observed, &self.declared, &free, &unknowns, &self.bounds, &method)?
-        };
+        let WithLevels { estimate: solution, levels, noise: now } =
+            solve(&observed, &self.declared, &self.coefficients, &self.bounds, &method)?;
         if self.coefficients.iter().any(|c| !c.noise.is_empty()) {
-            let now = if free.is_empty() { &self.declared } else { &fitted };
-            let ratio = self.log_determinant_ratio(now, &sums.total)?;
+            let ratio = self.log_determinant_ratio(&now, &sums.total)?;
             report.quality.extend(ratio.map(|ratio| (LOG_DETERMINANT.to_owned(), json!(ratio))));
         }
         // What χ² with the declared Σ is a sum over: the same for every model of the same data, which `dof` is not.
@@ -310,11 +308,6 @@ impl Linked {
                 report.coefficients.push(estimate_of(c, solution, None, None));
             }
         }
-    }
-
-    /// Whether this is a level of noise that is estimated, and the channels show it.
-    fn is_free_level(&self, c: &Coefficient) -> bool {
-        c.estimate && self.model.process_names().any(|name| name == c.noise)
     }
 
     /// `Σ 2n log (det Σ/det Σ_declared)`: what the levels of the model change of `−2 log` of the likelihood beside χ².
@@ -670,32 +663,6 @@ fn is_differenced(channel: &Column) -> Result<bool, PluginError> {
             channel.name
         ))),
     }
-}
-
-fn unknown(c: &Coefficient) -> Unknown {
-    Unknown {
-        name: c.name.clone(),
-        unit: c.unit.clone(),
-        lower: c.lower,
-        upper: c.upper,
-        initial: c.initial,
-        prior_sigma: c.prior_sigma,
-        estimate: c.estimate,
-        colours: c.colours.clone(),
-    }
-}
-
-fn bounds(available: &Available) -> Vec<Bound> {
-    let index = |name: &str| available.coefficients.iter().position(|c| c.name == name);
-    available
-        .constraints
-        .iter()
-        .filter_map(|c| {
-            // A constraint on a coefficient that is not in the model constrains nothing here.
-            let terms = c.terms.iter().map(|(name, weight)| Some((index(name)?, *weight))).collect::<Option<_>>()?;
-            Some(Bound { name: c.name.clone(), survey: c.kind == "survey", terms, lower: c.lower, upper: c.upper })
-        })
-        .collect()
 }
 
 /// By how much each σ was widened: for residuals beyond the refined Σ, or for blocks of time that scatter more than

@@ -10,7 +10,7 @@ use std::path::Path;
 use std::sync::LazyLock;
 
 /// Version of the layout.
-pub const FORMAT_VERSION: &str = "1.1.0";
+pub const FORMAT_VERSION: &str = "1.2.0";
 
 static SCHEMA: LazyLock<jsonschema::Validator> = LazyLock::new(|| {
     let schema = serde_json::from_str(include_str!("../../../../fixtures/schema/product.schema.json"))
@@ -88,7 +88,7 @@ pub struct GlobalAttributes {
     pub project: String,
     /// Spacecraft.
     pub platform: String,
-    /// `1B`.
+    /// `1B`, `2` of many days.
     pub processing_level: String,
     /// Release, two digits.
     pub product_version: String,
@@ -331,7 +331,7 @@ fn what_changed(old: &Product, new: &Product) -> String {
 /// A file that was read.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Input {
-    /// What it is: `telemetry`, `mission`, `model`, `pipeline` or `state`.
+    /// What it is: `telemetry`, `mission`, `model`, `pipeline`, `state` or, of a product of many days, `product`.
     pub role: String,
     /// File name without folders, so that a product does not depend on where it was made.
     pub name: String,

@@ -16,6 +16,9 @@ pub use file::{
 };
 pub use json::to_json;
 
+/// Name of products of many days.
+pub const JOINT: &str = "COM2";
+
 /// Suffix of what a diagnosis of a product keeps for later ones.
 pub const EXTRACT: &str = "extract.json";
 

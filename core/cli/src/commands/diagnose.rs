@@ -16,7 +16,7 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Result<Done, Failure> {
-    let archive = &command.archive.folder;
+    let archive = &command.archive.folder()?;
     let products = products::open_all(&command.products, archive)?;
     products::look_for(&products, &command.inputs.folders)?;
     if command.keep_extract && products.len() != 1 {

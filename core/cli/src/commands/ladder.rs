@@ -14,7 +14,7 @@ use std::path::Path;
 
 pub(super) fn execute(command: &Arguments, json: bool, paint: Paint) -> Result<Done, Failure> {
     let open = |names: &[String]| -> Result<Vec<Written>, Failure> {
-        names.iter().map(|name| products::open(name, &command.archive.folder)).collect()
+        names.iter().map(|name| products::open(name, &command.archive.folder()?)).collect()
     };
     let (fitted, held_out) = (open(&command.products)?, open(&command.held_out)?);
     let declared = |product: &Product| {

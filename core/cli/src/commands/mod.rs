@@ -8,6 +8,7 @@ mod design;
 mod diagnose;
 mod init;
 mod ladder;
+mod many_days;
 mod model;
 mod new_plugin;
 mod plugins;
@@ -64,6 +65,8 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
         Command::CatchUp(command) => days::catch_up(command, global, paint),
         Command::Watch(command) => days::watch(command, global, paint),
         Command::Products(command) => products::execute(command, global, paint),
+        Command::Joint(command) => many_days::joint(command, global.json, paint),
+        Command::Trend(command) => many_days::trend(command, global.json, paint),
         Command::At(command) => products::at(command, global.json, paint),
         Command::Archive(command) => products::of_archive(command, global.json),
         Command::Model(command) => model::execute(command, global, paint),

@@ -272,7 +272,7 @@ fn evidence(candidate: &Value) -> String {
 }
 
 fn fix(command: &ModelFix, global: &Global, paint: Paint) -> Result<Done, Failure> {
-    let product = products::open(&command.product, &command.archive.folder)?.product;
+    let product = products::open(&command.product, &command.archive.folder()?)?.product;
     let out = command.out.clone().unwrap_or_else(|| command.model.with_extension("fixed.toml"));
     if out.canonicalize().ok().is_some_and(|out| command.model.canonicalize().ok() == Some(out)) {
         return Err(
@@ -286,7 +286,7 @@ fn fix(command: &ModelFix, global: &Global, paint: Paint) -> Result<Done, Failur
     let mut edit = Edit::begin_or_new(&out)?;
     edit.fix(&command.model, &product.model.revision, (product.id(), &values), &command.keep)?;
     let committed = edit.commit()?;
-    let mut made = done(&out, "", committed.as_ref(), Some(&command.archive.folder), global, paint);
+    let mut made = done(&out, "", committed.as_ref(), Some(&command.archive.folder()?), global, paint);
     if !global.json {
         made.text = format!("fixed     at the values of {} ({solution})\n", product.id()) + &made.text;
     }

@@ -23,7 +23,7 @@ pub(super) fn execute(command: &Run, global: &Global, paint: Paint) -> Result<Do
         return Ok(Done { code, ..Done::json(&product::to_json(&outcome.product, &outcome.path)) });
     }
     let mut text = screen::product(&outcome.product, &outcome.path, paint);
-    let _ = writeln!(text, "next      {}", next(&outcome.product, &command.chain.archive.folder, global));
+    let _ = writeln!(text, "next      {}", next(&outcome.product, &command.chain.archive.folder()?, global));
     Ok(Done { text, code })
 }
 
@@ -42,7 +42,7 @@ pub(super) fn archive(command: &Run, global: &Global) -> Result<Written, Failure
             RunStream::Test => Stream::Test,
         },
         status: if command.is_final { Status::Final } else { Status::Quicklook },
-        ..options(&command.chain, global)
+        ..options(&command.chain, global)?
     };
     let mut meter = Meter::new("run", global);
     Ok(calibrate(&registry, &options, &mut |progress| meter.show(&progress))?)
@@ -50,26 +50,26 @@ pub(super) fn archive(command: &Run, global: &Global) -> Result<Written, Failure
 
 /// `dragfree config check`: links as a run would.
 pub(super) fn config_check(chain: &Chain, global: &Global) -> Result<Done, Failure> {
-    let report = check(&super::registry(global)?, &options(chain, global))?;
+    let report = check(&super::registry(global)?, &options(chain, global)?)?;
     if global.json {
         return Ok(Done::json(&serde_json::to_value(&report)?));
     }
     Ok(Done::new(screen::check(&report)))
 }
 
-fn options(chain: &Chain, global: &Global) -> Options {
-    Options {
+fn options(chain: &Chain, global: &Global) -> Result<Options, Failure> {
+    Ok(Options {
         pipeline: chain.pipeline.clone(),
         files: chain.files.clone(),
         mission: chain.mission.clone(),
         model: chain.model.clone(),
-        archive: chain.archive.folder.clone(),
+        archive: chain.archive.folder()?,
         threads: super::threads(global),
         batch_rows: BATCH_ROWS as usize,
         created: SystemTime::now().into(),
         software: super::SOFTWARE.to_owned(),
         ..Options::default()
-    }
+    })
 }
 
 /// An inconsistent model weighs more than lost data: the values themselves are in doubt.

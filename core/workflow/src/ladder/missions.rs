@@ -79,10 +79,9 @@ impl Labels {
 /// `Σ 2n log det Σ` of a product with the noise of its mission file, from the sums beside it; `None` where there are
 /// none, or where they are of a part of the product's observations.
 pub fn declared_log_determinant(written: &Written) -> Option<f64> {
-    let text = std::fs::read_to_string(written.path.with_extension("neq.json")).ok()?;
-    let mut value: serde_json::Value = serde_json::from_str(&text).ok()?;
-    let stored: Stored = serde_json::from_value(value["sums"].take()).ok()?;
-    let mut noise = stored.noise.clone();
+    let text = std::fs::read(written.path.with_extension("neq.json")).ok()?;
+    let stored = Stored::of_equations(&text).ok()?;
+    let mut noise = stored.declared.noise.clone();
     let (layout, plan, sums) = Stored::stack(&[stored]).ok()?;
     let stated = written.product.model.noise_levels.iter().map(|level| Coefficient {
         name: level.coefficient.clone(),

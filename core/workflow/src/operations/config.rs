@@ -2,6 +2,7 @@
 
 use crate::WorkflowError;
 use serde::Deserialize;
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// Name of the file, which is looked for from the working folder upwards.
@@ -24,6 +25,10 @@ pub struct Operations {
     pub inbox: Vec<String>,
     /// Data before a day that settle the stages before the estimators, ns.
     pub run_in_ns: i64,
+    /// File of events of the spacecraft.
+    pub events: Option<PathBuf>,
+    /// Kinds of events with the effects whose coefficients they change.
+    pub steps: BTreeMap<String, String>,
     /// Command of the operator's for a product with loss of data.
     pub on_data_loss: Option<String>,
     /// Command of the operator's for a product whose model contradicts the data.
@@ -46,6 +51,9 @@ struct Table {
     inbox: Vec<String>,
     #[serde(default = "one_hour")]
     run_in_hours: f64,
+    events: Option<PathBuf>,
+    #[serde(default)]
+    steps: BTreeMap<String, String>,
     on_data_loss: Option<String>,
     on_inconsistent: Option<String>,
 }
@@ -87,6 +95,8 @@ impl Operations {
             archive: folder.join(table.archive),
             inbox: table.inbox.iter().map(pattern).collect(),
             run_in_ns: run_in_ns as i64,
+            events: table.events.map(|p| folder.join(p)),
+            steps: table.steps,
             on_data_loss: table.on_data_loss,
             on_inconsistent: table.on_inconsistent,
         })

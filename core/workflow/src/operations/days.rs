@@ -2,7 +2,8 @@
 
 use super::{Inbox, InboxFile, Operations};
 use crate::WorkflowError;
-use chrono::{DateTime, NaiveDate, NaiveTime, Utc};
+use crate::days::{DAY_NS, day_number, day_of_number, start_of_day_ns};
+use chrono::NaiveDate;
 use dragfree_archive::files::sha256;
 use dragfree_archive::product::{Product, Stage, Status, Stream};
 use dragfree_archive::{Archive, Row, Stamp, Written};
@@ -15,7 +16,6 @@ use serde::Serialize;
 use std::collections::BTreeSet;
 use std::path::PathBuf;
 
-const DAY_NS: i64 = 86_400_000_000_000;
 /// A day is whole when no more than this is missing at either end of it, ns.
 const EDGE_NS: i64 = 1_000_000_000;
 
@@ -248,7 +248,7 @@ pub fn plan(planner: &Planner<'_>, archive: &Archive, inbox: &Inbox) -> Result<V
     let mut days = BTreeSet::new();
     for file in &inbox.files {
         let (first, last) = (file.first_ns.div_euclid(DAY_NS), file.last_ns.div_euclid(DAY_NS));
-        days.extend((first..=last).map(|day| DateTime::from_timestamp_nanos(day * DAY_NS).date_naive()));
+        days.extend((first..=last).map(day_of_number));
     }
     let mut planned = Vec::new();
     for day in days {
@@ -285,6 +285,5 @@ pub fn catch_up(
 
 /// First instant of a day, Unix ns.
 fn start_ns(day: NaiveDate) -> i64 {
-    let start: DateTime<Utc> = day.and_time(NaiveTime::MIN).and_utc();
-    start.timestamp_nanos_opt().unwrap_or(i64::MIN)
+    start_of_day_ns(day_number(day))
 }

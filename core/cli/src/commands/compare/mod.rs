@@ -17,7 +17,7 @@ const NAMED: usize = 5;
 
 pub(super) fn execute(command: &Compare, global: &Global, paint: Paint) -> Result<Done, Failure> {
     let names = &command.products;
-    let products = products::open_all(names, &command.archive.folder)?;
+    let products = products::open_all(names, &command.archive.folder()?)?;
     products::look_for(&products, &command.inputs.folders)?;
     let comparison = replay::with_meter(&products, global, compare)?;
     if let Some(path) = &command.page {
@@ -28,7 +28,7 @@ pub(super) fn execute(command: &Compare, global: &Global, paint: Paint) -> Resul
     let done = if global.json {
         Done::json(&products::said_of(&products, &comparison)?)
     } else {
-        let names = names.join(" ") + &super::repeated(Some(&command.archive.folder), global);
+        let names = names.join(" ") + &super::repeated(Some(&command.archive.folder()?), global);
         Done::new(screen(&comparison, &names, command.page.as_deref(), paint))
     };
     Ok(Done { code: if comparison.passes { 0 } else { INCONSISTENT }, ..done })

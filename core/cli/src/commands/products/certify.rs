@@ -6,6 +6,7 @@ use crate::failure::Failure;
 use crate::text::{self, Paint};
 use crate::utc;
 use dragfree_archive::{Archive, SetState, Validity, Window};
+use dragfree_workflow::joint;
 use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::path::Path;
@@ -63,14 +64,14 @@ pub(super) fn decertify(
 
 pub(super) fn sets(command: &Sets, json: bool) -> Result<Done, Failure> {
     match command {
-        Sets::List(archive) => told(&super::archive(&archive.folder)?, None, json),
+        Sets::List(archive) => told(&super::archive(&archive.folder()?)?, None, json),
         Sets::Publish { set, archive } => {
-            let mut archive = super::archive(&archive.folder)?;
+            let mut archive = super::archive(&archive.folder()?)?;
             archive.set_state(set, SetState::Published, "", &stamp())?;
             told(&archive, Some(set), json)
         }
         Sets::Invalidate { set, reason, archive } => {
-            let mut archive = super::archive(&archive.folder)?;
+            let mut archive = super::archive(&archive.folder()?)?;
             archive.set_state(set, SetState::Invalidated, reason, &stamp())?;
             told(&archive, Some(set), json)
         }
@@ -109,7 +110,7 @@ fn window(v: &Validity) -> String {
 
 /// `dragfree at`.
 pub(in crate::commands) fn at(command: &At, json: bool, paint: Paint) -> Result<Done, Failure> {
-    let archive = super::archive(&command.archive.folder)?;
+    let archive = super::archive(&command.archive.folder()?)?;
     let set = set(&archive, command.set.as_deref())?;
     let holds = |v: &Validity| {
         v.from_ns <= command.time_ns
@@ -139,17 +140,16 @@ pub(in crate::commands) fn at(command: &At, json: bool, paint: Paint) -> Result<
             .into());
         }
         let product = archive.product(&v.id)?;
-        let adopted = product.result.adopted();
-        let solution = adopted.first().map_or("", |c| c.solution.as_str());
-        let covariance = product.result.covariance.get(solution);
+        let then = joint::at(&product, command.time_ns);
+        let solution = then.coefficients.first().map_or("", |c| c.solution.as_str());
         let _ = writeln!(text, "{}", paint.bold(&v.id));
         text += &text::labelled("set", &format!("{set}, {}", window(v)));
-        for c in &adopted {
+        for c in &then.coefficients {
             let (unit, factor) = text::readable_unit(&c.unit);
             let value = text::measured(c.value * factor, c.sigma * factor);
             let _ = writeln!(text, "          {:<28} {value} {unit}", c.name);
         }
-        let coefficient = |c: &&dragfree_archive::product::Coefficient| -> Value {
+        let coefficient = |c: &dragfree_archive::product::Coefficient| -> Value {
             json!({"name": c.name, "value": c.value, "sigma": c.sigma, "unit": c.unit, "frame": c.frame})
         };
         values.push(json!({
@@ -159,9 +159,9 @@ pub(in crate::commands) fn at(command: &At, json: bool, paint: Paint) -> Result<
             "from_ns": v.from_ns,
             "until_ns": if v.until_ns == i64::MAX { Value::Null } else { json!(v.until_ns) },
             "solution": solution,
-            "coefficients": adopted.iter().map(coefficient).collect::<Vec<_>>(),
-            "covariance": covariance.map(|c| &c.matrix),
-            "covariance_names": covariance.map(|c| &c.names),
+            "coefficients": then.coefficients.iter().map(coefficient).collect::<Vec<_>>(),
+            "covariance": then.covariance.as_ref().map(|c| &c.matrix),
+            "covariance_names": then.covariance.as_ref().map(|c| &c.names),
             "verdict": product.result.verdict,
             "model": product.model.revision,
             "sha256": product.header.non_standard_attributes.sha256,

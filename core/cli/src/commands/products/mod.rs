@@ -28,33 +28,33 @@ pub(super) fn execute(command: &Products, global: &Global, paint: Paint) -> Resu
                 set: list.set.clone(),
                 latest: list.latest,
             };
-            let folder = &list.archive.folder;
+            let folder = &list.archive.folder()?;
             let listing = archive(folder)?.list(&find)?;
             if json {
                 return Ok(Done::json(&screen::listing_json(&listing)));
             }
             Ok(Done::new(screen::listing(&listing, folder, paint)))
         }
-        Products::Show { product, archive } => show(product, &archive.folder, json, paint),
-        Products::Diff { first, second, archive } => history::diff([first, second], &archive.folder, json, paint),
+        Products::Show { product, archive } => show(product, &archive.folder()?, json, paint),
+        Products::Diff { first, second, archive } => history::diff([first, second], &archive.folder()?, json, paint),
         Products::Lineage { product, picture, archive } => {
-            history::lineage(product, &archive.folder, picture.as_deref(), json, paint)
+            history::lineage(product, &archive.folder()?, picture.as_deref(), json, paint)
         }
-        Products::Verify { products, archive, .. } => verify::verify(products, &archive.folder, json, paint),
+        Products::Verify { products, archive, .. } => verify::verify(products, &archive.folder()?, json, paint),
         Products::Rebuild { product, archive, inputs } => {
-            verify::rebuild(product, &archive.folder, &inputs.folders, global, paint)
+            verify::rebuild(product, &archive.folder()?, &inputs.folders, global, paint)
         }
         Products::Stale(ops) => super::days::stale(ops, global, paint),
-        Products::Withdraw { product, reason, archive } => certify::withdraw(product, reason, &archive.folder, json),
+        Products::Withdraw { product, reason, archive } => certify::withdraw(product, reason, &archive.folder()?, json),
         Products::Certify { product, from, until, set, archive, .. } => {
-            certify::certify(product, set, (*from, *until), &archive.folder, json)
+            certify::certify(product, set, (*from, *until), &archive.folder()?, json)
         }
         Products::Decertify { set, spacecraft, from, until, archive } => {
-            certify::decertify(set, spacecraft, (*from, *until), &archive.folder, json)
+            certify::decertify(set, spacecraft, (*from, *until), &archive.folder()?, json)
         }
         Products::Sets(command) => certify::sets(command, json),
         Products::Export { product, format, out, archive } => {
-            export::execute(product, *format, out.as_deref(), &archive.folder)
+            export::execute(product, *format, out.as_deref(), &archive.folder()?)
         }
     }
 }
@@ -63,16 +63,16 @@ pub(super) fn execute(command: &Products, global: &Global, paint: Paint) -> Resu
 pub(super) fn of_archive(command: &ArchiveCommand, json: bool) -> Result<Done, Failure> {
     match command {
         ArchiveCommand::Reindex(archive) => {
-            exists(&archive.folder)?;
-            let events = Archive::reindex(&archive.folder)?;
+            exists(&archive.folder()?)?;
+            let events = Archive::reindex(&archive.folder()?)?;
             if json {
                 return Ok(Done::json(&serde_json::json!({"events": events})));
             }
             Ok(Done::new(format!("catalogue made again from {events} events\n")))
         }
         ArchiveCommand::Migrate(archive) => {
-            exists(&archive.folder)?;
-            let migrated = dragfree_archive::migrate(&archive.folder, &super::stamp())?;
+            exists(&archive.folder()?)?;
+            let migrated = dragfree_archive::migrate(&archive.folder()?, &super::stamp())?;
             let code = u8::from(!migrated.problems.is_empty());
             if json {
                 let problems = screen::problems_json(&migrated.problems);
