@@ -115,6 +115,18 @@ pub struct Row {
     pub latest: bool,
 }
 
+impl Row {
+    /// The id without the revision.
+    pub fn stem(&self) -> &str {
+        stem(&self.id)
+    }
+}
+
+/// An id without its revision.
+pub fn stem(id: &str) -> &str {
+    id.rsplit_once('_').map_or("", |(stem, _)| stem)
+}
+
 /// A time in a set.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize)]
 pub struct Validity {

@@ -44,7 +44,7 @@ pub struct Entry {
 impl Entry {
     /// The id without the revision.
     pub fn stem(&self) -> &str {
-        self.row.id.rsplit_once('_').map_or("", |(stem, _)| stem)
+        self.row.stem()
     }
 }
 
@@ -113,10 +113,7 @@ impl Archive {
     }
 
     /// Digest and size of a product's document.
-    ///
-    /// # Errors
-    /// There is no such product.
-    pub fn document_of(&self, id: &str) -> Result<(String, u64), ArchiveError> {
+    fn document_of(&self, id: &str) -> Result<(String, u64), ArchiveError> {
         let sha256 = self.catalogue.document(id)?.ok_or_else(|| self.missing(id))?;
         let size = fs::metadata(self.objects.path(&sha256)).map_or(0, |m| m.len());
         Ok((sha256, size))
@@ -358,6 +355,24 @@ impl Archive {
     /// The catalogue cannot be read.
     pub fn validity(&self, set: Option<&str>) -> Result<Vec<Validity>, ArchiveError> {
         self.catalogue.validity(set)
+    }
+
+    /// The newest revision of a product with a digest.
+    ///
+    /// # Errors
+    /// There is none.
+    pub fn with_digest(&self, stem: &str, sha256: &str) -> Result<Row, ArchiveError> {
+        let condition = "substr(p.id, 1, length(p.id) - 5) = ?1 AND p.digest = ?2";
+        let gone = || ArchiveError::NotFound { id: format!("{stem} with the digest {sha256}"), folder: self.folder.clone() };
+        self.catalogue.products(condition, [stem, sha256])?.pop().ok_or_else(gone)
+    }
+
+    /// Products of a name, sound or not, in the order of days and revisions.
+    ///
+    /// # Errors
+    /// The catalogue cannot be read.
+    pub fn named(&self, name: &str) -> Result<Vec<Row>, ArchiveError> {
+        self.catalogue.products("p.name = ?1", [name])
     }
 
     /// Ids of all products, sound or not.

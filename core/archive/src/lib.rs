@@ -27,7 +27,7 @@ mod sums;
 mod writer;
 
 pub use archive::Archive;
-pub use catalogue::{Place, Row, Validity};
+pub use catalogue::{Place, Row, Validity, stem};
 pub use contents::{Entry, Find, Listing};
 pub use events::Window;
 pub use journal::{Event, InputPlace, JournalEntry, SetState, Stamp, Stored};

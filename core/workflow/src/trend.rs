@@ -14,7 +14,7 @@ use serde::Serialize;
 
 use crate::WorkflowError;
 use crate::days::{day_number, day_of_number};
-use crate::joint::{Event, Measured, Options, chosen, events_of};
+use crate::joint::{Declared, Event, Measured, Options, chosen};
 
 /// Most days that a prediction rests on: what changes slower than in a month is followed.
 const MOST_DAYS: usize = 30;
@@ -103,7 +103,7 @@ pub fn trend(archive: &Archive, options: &Options, expected: bool) -> Result<Tre
     let Some((first, row, newest)) = products.first().map(|(day, row, product)| (*day, row.clone(), product.clone())) else {
         return Err(WorkflowError::NoProduct);
     };
-    let events = events_of(options, &row.spacecraft)?;
+    let events = Declared::read(options)?.events(&row.spacecraft)?;
     let false_alarm = newest.settings.false_alarm;
     let mut alerts = Vec::new();
     for (day, row, product) in &products {

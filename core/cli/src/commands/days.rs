@@ -12,6 +12,7 @@ use dragfree_archive::product::Product;
 use dragfree_archive::{Archive, Written};
 use dragfree_engine::registry::Registry;
 use dragfree_workflow::calibrate::{Options, Progress};
+use dragfree_workflow::joint;
 use dragfree_workflow::operations::{self as workflow, Inbox, Operations, Outcome, Planned, Planner, Ran};
 use notify::Watcher as _;
 use serde_json::{Value, json};
@@ -185,7 +186,20 @@ pub(super) fn stale(ops: &Ops, global: &Global, paint: Paint) -> Result<Done, Fa
     let mut desk = Desk::open(ops, global)?;
     let days = desk.look(global)?;
     let is_stale = |p: &&Planned| p.day.product.is_some() && !p.day.reasons.is_empty();
-    Ok(planned(days.iter().filter(is_stale), &desk.inbox, global, paint))
+    let mut done = planned(days.iter().filter(is_stale), &desk.inbox, global, paint);
+    let many = joint::stale(&Archive::open(&desk.operations.archive)?)?;
+    if global.json {
+        let mut value: Value = serde_json::from_str(&done.text)?;
+        value["many_days"] = json!(many);
+        return Ok(Done { code: done.code, ..Done::json(&value) });
+    }
+    for stale in many {
+        let _ = writeln!(done.text, "{}", paint.bold(&stale.product));
+        for reason in &stale.reasons {
+            done.text += &text::labelled("", reason);
+        }
+    }
+    Ok(done)
 }
 
 /// Days with what is to be done, and why.

@@ -17,7 +17,7 @@ const PIPELINE: &str = "science-mode";
 /// The file of operations of a new mission.
 const OPERATIONS: &str = "\
 # Where the parts of the mission lie; paths are relative to this file. In this folder and the ones below, `dragfree day`,
-# `catch-up`, `watch`, `products` and `at` find it by themselves; from elsewhere name it with --ops.
+# `catch-up`, `watch`, `products`, `joint`, `trend` and `at` find it by themselves; from elsewhere name it with --ops.
 
 [operations]
 pipeline = \"pipeline.toml\"
@@ -31,9 +31,16 @@ inbox = [\"telemetry/*.mcap\"]
 # Data before a day that settle the stages before the estimators; they are no part of the day's product.
 run_in_hours = 1.0
 
+# Events of the spacecraft, a list in YAML as JPL's of GRACE-FO; `joint` estimates the steps of coefficients there:
+# events = \"events.yaml\"
+
 # Commands of yours, run by `sh` in this folder, with DRAGFREE_PRODUCT, DRAGFREE_PRODUCT_PATH and DRAGFREE_DAY set:
 # on_data_loss = \"...\"        # a product with loss of data (exit code 3)
 # on_inconsistent = \"...\"     # a product whose model contradicts the data (exit code 4)
+
+# Kinds of events, and the effect whose coefficients each changes:
+# [operations.steps]
+# MTEA = \"com-offset\"
 ";
 
 pub(super) fn execute(init: &Init, json: bool) -> Result<Done, Failure> {

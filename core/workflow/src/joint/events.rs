@@ -67,14 +67,19 @@ struct Entry {
     changes: Vec<String>,
 }
 
-/// Events of a spacecraft that change coefficients. `steps` are kinds with the effects that they change.
+/// Events of a spacecraft that change coefficients, from the text of a file. `steps` are kinds with the effects that
+/// they change.
 ///
 /// # Errors
-/// [`WorkflowError::Events`]: the file cannot be read, or a time in it.
-pub(super) fn read(path: &Path, spacecraft: &str, steps: &[(String, String)]) -> Result<Vec<Event>, WorkflowError> {
+/// [`WorkflowError::Events`]: the text is no list of events, or a time in it is none.
+pub(super) fn parse(
+    text: &str,
+    path: &Path,
+    spacecraft: &str,
+    steps: &[(String, String)],
+) -> Result<Vec<Event>, WorkflowError> {
     let refuse = |what: String| WorkflowError::Events { path: path.to_owned(), what };
-    let text = std::fs::read_to_string(path).map_err(|e| refuse(e.to_string()))?;
-    let entries: Vec<Entry> = serde_yaml_ng::from_str(&text).map_err(|e| refuse(e.to_string()))?;
+    let entries: Vec<Entry> = serde_yaml_ng::from_str(text).map_err(|e| refuse(e.to_string()))?;
     let mut events = Vec::new();
     for entry in entries {
         let mut effects = entry.changes;
@@ -147,10 +152,7 @@ mod tests {
 ";
 
     fn read_text(text: &str) -> Result<Vec<Event>, WorkflowError> {
-        let folder = tempfile::tempdir().expect("a folder");
-        let path = folder.path().join("events.yaml");
-        std::fs::write(&path, text).expect("written");
-        read(&path, "C", &[("MTEA".to_owned(), "com-offset".to_owned())])
+        parse(text, Path::new("events.yaml"), "C", &[("MTEA".to_owned(), "com-offset".to_owned())])
     }
 
     #[test]

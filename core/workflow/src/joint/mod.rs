@@ -7,26 +7,28 @@
 mod calendar;
 mod events;
 mod product;
+mod stale;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 
 use chrono::NaiveDate;
 use dragfree_archive::product::{Input, Product};
-use dragfree_archive::{Archive, ArchiveError, Row};
+use dragfree_archive::{Archive, Row};
 use dragfree_engine::EngineError;
 use dragfree_estimation::estimate::{Estimate, Scatter};
 use dragfree_estimation::joint::{self as many, Change, Course, DayScore, ManyDays, Stretch};
 use dragfree_estimation::stored::Stored;
 use dragfree_identification::distributions::chi2_tails;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use crate::WorkflowError;
 use crate::days::{DAY_NS, day_number, day_of_number, start_of_day_ns};
 use calendar::{Calendar, Leaf};
 
 pub use events::Event;
-pub use product::{At, archived, at};
+pub use product::{At, again, archived, at};
+pub use stale::{Stale, stale};
 
 /// Blocks of time that the days are summed in, about; fewer do not show whether the noise is the same at all times.
 const BLOCKS: usize = 16;
@@ -51,6 +53,40 @@ pub struct Options {
     pub events: Option<PathBuf>,
     /// Kinds of events with the effects, or coefficients, that they change.
     pub steps: Vec<(String, String)>,
+}
+
+/// Events that change coefficients, as they were given.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct Declared {
+    /// Kinds of events with the effects that they change.
+    pub steps: Vec<(String, String)>,
+    /// Name and text of the file of events.
+    #[serde(skip)]
+    pub file: Option<(String, String)>,
+}
+
+impl Declared {
+    /// Reads the file of events that is asked for.
+    ///
+    /// # Errors
+    /// It cannot be read.
+    pub fn read(options: &Options) -> Result<Self, WorkflowError> {
+        let file = options.events.as_ref().map(|path| {
+            let refuse = |e: std::io::Error| WorkflowError::Events { path: path.clone(), what: e.to_string() };
+            let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            std::fs::read_to_string(path).map(|text| (name, text)).map_err(refuse)
+        });
+        Ok(Self { steps: options.steps.clone(), file: file.transpose()? })
+    }
+
+    /// Events of a spacecraft, in order.
+    ///
+    /// # Errors
+    /// The file is no list of events.
+    pub fn events(&self, spacecraft: &str) -> Result<Vec<Event>, WorkflowError> {
+        let parse = |(name, text): &(String, String)| events::parse(text, name.as_ref(), spacecraft, &self.steps);
+        self.file.as_ref().map_or_else(|| Ok(Vec::new()), parse)
+    }
 }
 
 /// One calibration of many days.
@@ -81,6 +117,8 @@ pub struct Joint {
     pub missing: Vec<NaiveDate>,
     /// Events that lie between days.
     pub events: Vec<Event>,
+    /// What was declared of events.
+    pub declared: Declared,
     /// Sentences.
     pub notes: Vec<String>,
     /// Covariance of all that was estimated, in the units of the product.
@@ -142,6 +180,8 @@ pub struct Day {
     pub day: NaiveDate,
     /// Its product.
     pub product: String,
+    /// Digest of that.
+    pub sha256: String,
     /// The values of the product.
     pub values: Vec<Value>,
     /// Whether the day agrees with all days.
@@ -184,8 +224,16 @@ pub struct LeftOut {
     pub day: NaiveDate,
     /// Its product.
     pub product: String,
+    /// Digest of that.
+    pub sha256: String,
     /// Why.
     pub reason: String,
+}
+
+impl LeftOut {
+    fn new(day: NaiveDate, row: &Row, reason: String) -> Self {
+        Self { day, product: row.id.clone(), sha256: row.digest.clone().unwrap_or_default(), reason }
+    }
 }
 
 impl Joint {
@@ -204,9 +252,14 @@ type Products = BTreeMap<i64, (Row, Product)>;
 /// [`WorkflowError`]: no day has a product, or several spacecraft have; the days are of different make; the sums of one
 /// are damaged or of an earlier version.
 pub fn joint(archive: &Archive, options: &Options) -> Result<Joint, WorkflowError> {
-    let (mut days, mut left_out) = products(archive, options)?;
+    of_products(archive, chosen(archive, options)?, Declared::read(options)?)
+}
+
+/// Makes one calibration of products of one spacecraft and pipeline, one a day.
+fn of_products(archive: &Archive, rows: Vec<Row>, declared: Declared) -> Result<Joint, WorkflowError> {
+    let (mut days, mut left_out) = products(archive, rows)?;
     let spacecraft = days.values().next().map(|(row, _)| row.spacecraft.clone()).unwrap_or_default();
-    let events = events_of(options, &spacecraft)?;
+    let events = declared.events(&spacecraft)?;
     let scale = days.values().next().map(|(_, p)| p.header.non_standard_attributes.time_scale.clone());
     let margin = |event: &Event| if scale.as_deref() == Some(&event.time_scale) { 0 } else { SCALES_NS };
     days.retain(|number, (row, product)| {
@@ -215,7 +268,7 @@ pub fn joint(archive: &Archive, options: &Options) -> Result<Joint, WorkflowErro
         let cut = events.iter().find(|e| from < e.time_ns + margin(e) && e.time_ns - margin(e) < until);
         if let Some(event) = cut {
             let reason = format!("{} at {}: its coefficients step within the day", event.kind, event.time);
-            left_out.push(LeftOut { day: day_of_number(*number), product: row.id.clone(), reason });
+            left_out.push(LeftOut::new(day_of_number(*number), row, reason));
         }
         cut.is_none()
     });
@@ -225,7 +278,7 @@ pub fn joint(archive: &Archive, options: &Options) -> Result<Joint, WorkflowErro
         return Err(WorkflowError::NoDays { what: reasons() });
     };
 
-    let inputs = inputs(archive, &days)?;
+    let inputs = inputs(&days);
     let calendar = Calendar { archive, days: leaves(archive, &days)? };
     let like = calendar.stored(first)?;
     same_make(&calendar, first, &like)?;
@@ -255,15 +308,16 @@ pub fn joint(archive: &Archive, options: &Options) -> Result<Joint, WorkflowErro
     let day_lines = days.iter().zip(&scores).map(|((number, (row, product)), score)| Day {
         day: day_of_number(*number),
         product: row.id.clone(),
+        sha256: row.digest.clone().unwrap_or_default(),
         values: values(product),
         agreement: Agreement::new(score.chi2, score.dof),
     });
     let day_lines: Vec<Day> = day_lines.collect();
     let Estimate { weak, quality, scatter, .. } = &solution.solution.estimate;
     let mut notes = Vec::new();
-    let lone = events.iter().filter(|e| !borders.iter().any(|b| b.events.contains(e)));
-    let cut_off = |e: &&Event| e.time_ns < start_of_day_ns(first) || e.time_ns > start_of_day_ns(last + 1);
-    notes.extend(lone.filter(cut_off).filter(|e| inside(e, options)).map(|e| {
+    let within = |e: &&Event| (start_of_day_ns(first)..start_of_day_ns(last + 1)).contains(&e.time_ns);
+    let lone = events.iter().filter(within).filter(|e| !borders.iter().any(|b| b.events.contains(e)));
+    notes.extend(lone.map(|e| {
         format!("{} at {}: there are no days on both sides of it, so no step is estimated", e.kind, e.time)
     }));
     let reported = Reported { days: &days, borders: &borders, time, last, false_alarm: settings.false_alarm };
@@ -285,19 +339,11 @@ pub fn joint(archive: &Archive, options: &Options) -> Result<Joint, WorkflowErro
         days: day_lines,
         left_out,
         events: borders.iter().flat_map(|b| b.events.clone()).collect(),
+        declared,
         notes,
         inputs,
         like: days.remove(&last).map(|(_, product)| product).ok_or(WorkflowError::NoProduct)?,
     })
-}
-
-fn inside(event: &Event, options: &Options) -> bool {
-    (day_number(options.first)..=day_number(options.last)).contains(&event.time_ns.div_euclid(DAY_NS))
-}
-
-/// Events of a spacecraft that change coefficients; none without a file.
-pub(crate) fn events_of(options: &Options, spacecraft: &str) -> Result<Vec<Event>, WorkflowError> {
-    options.events.as_ref().map_or_else(|| Ok(Vec::new()), |path| events::read(path, spacecraft, &options.steps))
 }
 
 /// The newest product of each day that is asked for, of one spacecraft and one pipeline.
@@ -320,14 +366,14 @@ pub(crate) fn chosen(archive: &Archive, options: &Options) -> Result<Vec<Row>, W
 }
 
 /// Products that agree with their data, by day, and those that do not.
-fn products(archive: &Archive, options: &Options) -> Result<(Products, Vec<LeftOut>), WorkflowError> {
+fn products(archive: &Archive, rows: Vec<Row>) -> Result<(Products, Vec<LeftOut>), WorkflowError> {
     let (mut days, mut left_out) = (Products::new(), Vec::new());
-    for row in chosen(archive, options)? {
-        let day = row.day.parse::<NaiveDate>().unwrap_or(options.first);
+    for row in rows {
+        let day = row.day.parse::<NaiveDate>().unwrap_or_default();
         let product = archive.document(&row.id).map_err(EngineError::from)?;
         if product.quality.inconsistent {
             let reason = "its model contradicts the data; `dragfree diagnose` asks why".to_owned();
-            left_out.push(LeftOut { day, product: row.id, reason });
+            left_out.push(LeftOut::new(day, &row, reason));
         } else {
             days.insert(day_number(day), (row, product));
         }
@@ -335,13 +381,16 @@ fn products(archive: &Archive, options: &Options) -> Result<(Products, Vec<LeftO
     Ok((days, left_out))
 }
 
-/// The days' products, as what the calibration is made of.
-fn inputs(archive: &Archive, days: &Products) -> Result<Vec<Input>, WorkflowError> {
-    let of = |(row, _): &(Row, Product)| -> Result<Input, ArchiveError> {
-        let (sha256, size) = archive.document_of(&row.id)?;
-        Ok(Input { role: "product".to_owned(), name: format!("{}.toml", row.id), size, sha256 })
+/// The days' products, as what the calibration is made of: by name without revision and by digest, so that a day with
+/// the same result once more changes nothing.
+fn inputs(days: &Products) -> Vec<Input> {
+    let of = |(row, product): &(Row, Product)| Input {
+        role: "product".to_owned(),
+        name: row.stem().to_owned(),
+        size: product.attachments.iter().map(|file| file.size).sum(),
+        sha256: product.header.non_standard_attributes.sha256.clone(),
     };
-    Ok(days.values().map(of).collect::<Result<_, _>>().map_err(EngineError::from)?)
+    days.values().map(of).collect()
 }
 
 fn leaves(archive: &Archive, days: &Products) -> Result<BTreeMap<i64, Leaf>, WorkflowError> {

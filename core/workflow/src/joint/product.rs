@@ -2,15 +2,18 @@
 
 use chrono::{DateTime, Utc};
 use dragfree_archive::product::{self, Coefficient, Product};
-use dragfree_archive::{Archive, JOINT, MadeOf, ProductWriter, Window, Written};
+use dragfree_archive::files::IoContext as _;
+use dragfree_archive::{Archive, ArchiveError, JOINT, MadeOf, Place, ProductWriter, Window, Written, stem};
 use dragfree_engine::EngineError;
 use dragfree_engine::draft::Draft;
 use dragfree_engine::feed::Summary;
 use dragfree_schema::{Attachment, Covariance, Estimate, Report, Role};
 use nalgebra::{DMatrix, DVector};
-use serde_json::json;
+use serde::Deserialize;
+use serde_json::{Value, json};
+use std::path::Path;
 
-use super::Joint;
+use super::{Declared, Joint};
 use crate::WorkflowError;
 use crate::days::{day_number, start_of_day_ns};
 
@@ -27,6 +30,12 @@ pub(super) fn step(of: &str, time_ns: i64) -> String {
     format!("{of}{STEP}{}", DateTime::from_timestamp_nanos(time_ns).format("%Y-%m-%dT%H:%M:%S"))
 }
 
+/// Suffix of the table of days beside a product.
+pub(super) const DAYS: &str = "days.json";
+
+/// Role of the file of events among what is kept.
+const EVENTS: &str = "events";
+
 const RATE: &str = ".rate";
 const STEP: &str = ".step.";
 
@@ -40,10 +49,74 @@ pub fn archived(
     created: DateTime<Utc>,
     software: &str,
 ) -> Result<(Written, bool), WorkflowError> {
+    Ok(commit(archive.folder(), joint, created, software).map_err(EngineError::from)?)
+}
+
+fn commit(
+    folder: &Path,
+    joint: &Joint,
+    created: DateTime<Utc>,
+    software: &str,
+) -> Result<(Written, bool), ArchiveError> {
     let (draft, window) = draft(joint, created, software);
-    let writer = ProductWriter::begin(archive.folder()).map_err(EngineError::from)?;
-    let made_of = MadeOf { window, ..MadeOf::default() };
-    Ok(draft.commit_if_new(writer, made_of).map_err(EngineError::from)?)
+    let mut writer = ProductWriter::begin(folder)?;
+    if let Some((name, text)) = &joint.declared.file {
+        writer.keep(EVENTS, name, text.as_bytes())?;
+    }
+    draft.commit_if_new(writer, MadeOf { window, ..MadeOf::default() })
+}
+
+/// Makes a calibration of many days again, from the products that it was made of, in another archive.
+///
+/// # Errors
+/// One of these products is gone or damaged, or the archive cannot be written.
+pub fn again(
+    archive: &Archive,
+    id: &str,
+    apart: &Path,
+    created: DateTime<Utc>,
+    software: &str,
+) -> Result<Written, WorkflowError> {
+    let made = || -> Result<_, ArchiveError> {
+        let table = archive.read_file(id, DAYS)?;
+        let table: Table = serde_json::from_slice(&table).unwrap_or_default();
+        let inputs = archive.inputs(id)?.into_iter().map(|input| (input.name, input.sha256));
+        let all = inputs.chain(table.left_out.into_iter().map(|left| (left.product, left.sha256)));
+        let rows = all.map(|(stem, sha256)| archive.with_digest(&stem, &sha256)).collect::<Result<Vec<_>, _>>()?;
+        let mut declared = table.declared;
+        if let Some(Place { name, path: Some(path), .. }) = archive.made_of(id, EVENTS)? {
+            let text = std::fs::read_to_string(&path).at("read", &path)?;
+            declared.file = Some((name, text));
+        }
+        Ok((rows, declared))
+    };
+    let (rows, declared) = made().map_err(EngineError::from)?;
+    let joint = super::of_products(archive, rows, declared)?;
+    Ok(commit(apart, &joint, created, software).map_err(EngineError::from)?.0)
+}
+
+/// The table of days, with products by their names without revision, as among the inputs.
+fn table(joint: &Joint) -> Value {
+    let mut table = json!(joint);
+    for list in ["days", "left_out"] {
+        for day in table[list].as_array_mut().into_iter().flatten() {
+            day["product"] = stem(day["product"].as_str().unwrap_or_default()).into();
+        }
+    }
+    table
+}
+
+/// What is read of the table of days.
+#[derive(Default, Deserialize)]
+pub(super) struct Table {
+    pub(super) left_out: Vec<TableLeftOut>,
+    declared: Declared,
+}
+
+#[derive(Deserialize)]
+pub(super) struct TableLeftOut {
+    product: String,
+    pub(super) sha256: String,
 }
 
 /// The product, and the time that it is of.
@@ -103,7 +176,7 @@ fn report(joint: &Joint) -> Report {
         }
     }
     let mut notes = joint.notes.clone();
-    notes.extend(joint.left_out.iter().map(|l| format!("{} is left out: {}", l.product, l.reason)));
+    notes.extend(joint.left_out.iter().map(|l| format!("{} is left out: {}", stem(&l.product), l.reason)));
     if disagree {
         notes.push(format!(
             "the days are not all the same: χ² {:.1} on {}, probability {:.1e}",
@@ -129,7 +202,7 @@ fn report(joint: &Joint) -> Report {
         inconsistent: disagree,
         notes,
         quality: quality.into_iter().map(|(k, v)| (k.to_owned(), v)).collect(),
-        attachments: vec![Attachment { suffix: "days.json".to_owned(), text: json!(joint).to_string() }],
+        attachments: vec![Attachment { suffix: DAYS.to_owned(), text: table(joint).to_string() }],
         ..Report::default()
     }
 }

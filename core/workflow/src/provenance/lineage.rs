@@ -25,6 +25,8 @@ pub struct Lineage {
     pub superseded_by: Vec<String>,
     /// Products that resumed from the state that it left.
     pub resumed_by: Vec<String>,
+    /// Calibrations of many days that it entered.
+    pub entered: Vec<String>,
     /// Tests on other data with the model fixed at its values.
     pub tested_by: Vec<String>,
     /// Times for which it is certified.
@@ -66,6 +68,7 @@ pub fn lineage(archive: &Archive, id: &str) -> Result<Lineage, WorkflowError> {
             supersedes: product.supersedes.clone(),
             superseded_by: with(&|row| row.supersedes.as_deref() == Some(id)),
             resumed_by,
+            entered: archive.products_of(product.digest.as_deref().unwrap_or_default())?,
             tested_by: with(&|row| row.fixed_from.as_deref() == Some(id)),
             certified,
             product,

@@ -6,4 +6,4 @@ mod rebuild;
 
 pub use diff::{Change, Diff, ValueChange, diff};
 pub use lineage::{Lineage, lineage};
-pub use rebuild::{Rebuilt, rebuild};
+pub use rebuild::{Rebuilt, can_be_rebuilt, rebuild};

@@ -1,10 +1,10 @@
 //! Making a product again from what it was made of.
 
 use super::{Diff, diff};
-use crate::WorkflowError;
+use crate::{WorkflowError, joint};
 use dragfree_archive::files::IoContext as _;
 use dragfree_archive::product::Product;
-use dragfree_archive::{Archive, ArchiveError, Place};
+use dragfree_archive::{Archive, ArchiveError, JOINT, Place, Row, Written};
 use dragfree_engine::EngineError;
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::{Progress, RunOptions, run};
@@ -48,34 +48,15 @@ pub fn rebuild(
     let archived = archive.product(id);
     let apart =
         tempfile::tempdir().at("make a folder for", "the product that is made again").map_err(EngineError::from)?;
-    let sources = Sources::in_archive(archive, id)?;
-    let inputs = archive.inputs(id).map_err(again)?;
-    let mut named = Named { folder: apart.path(), inputs: &inputs, count: 0 };
-    let mut files = Vec::new();
-    for path in &sources.telemetry {
-        files.push(named.name("telemetry", path)?);
-    }
-    let state = archive.made_of(id, "state_in").map_err(again)?;
-    let made = run(
-        registry,
-        &RunOptions {
-            pipeline: named.name("pipeline", &sources.pipeline)?,
-            mission: Some(named.name("mission", &sources.mission)?),
-            model: Some(named.name("model", &sources.model)?),
-            state_in: state.and_then(|s| s.path).map(|path| named.name("state", &path)).transpose()?,
-            files,
-            archive: apart.path().join("archive"),
-            from_ns: sources.from_ns,
-            until_ns: sources.until_ns,
-            run_in_ns: sources.run_in_ns,
-            stream: known(row.stream.as_deref()).unwrap_or(options.stream),
-            status: known(row.status.as_deref()).unwrap_or(options.status),
-            created: archive.event(row.number).map_err(again)?.time,
-            ..options.clone()
-        },
-        progress,
-    )?;
-    let rebuilt = Archive::open(&apart.path().join("archive")).map_err(again)?;
+    let folder = apart.path().join("archive");
+    let created = archive.event(row.number).map_err(again)?.time;
+    let made = if row.name == JOINT {
+        joint::again(archive, id, &folder, created, &options.software)?
+    } else {
+        let options = RunOptions { created, archive: folder.clone(), ..options.clone() };
+        run_again(registry, archive, &row, apart.path(), &options, progress)?
+    };
+    let rebuilt = Archive::open(&folder).map_err(again)?;
     let digest = |product: &Product| product.header.non_standard_attributes.sha256.clone();
     let archived_sha256 = row.digest.clone().unwrap_or_default();
     let state = |archive: &Archive, id: &str| archive.made_of(id, "state_out").map(|p| p.map(|p| p.sha256));
@@ -91,6 +72,52 @@ pub fn rebuild(
         diff: archived.ok().map(|archived| diff(&archived, &made.product)),
         mended,
     })
+}
+
+/// Runs what a product of one run was made of once more.
+fn run_again(
+    registry: &Registry,
+    archive: &Archive,
+    row: &Row,
+    apart: &Path,
+    options: &RunOptions,
+    progress: &mut dyn FnMut(Progress),
+) -> Result<Written, WorkflowError> {
+    let id = row.id.as_str();
+    let sources = Sources::in_archive(archive, id)?;
+    let inputs = archive.inputs(id).map_err(EngineError::from)?;
+    let mut named = Named { folder: apart, inputs: &inputs, count: 0 };
+    let mut files = Vec::new();
+    for path in &sources.telemetry {
+        files.push(named.name("telemetry", path)?);
+    }
+    let state = archive.made_of(id, "state_in").map_err(EngineError::from)?;
+    let options = RunOptions {
+        pipeline: named.name("pipeline", &sources.pipeline)?,
+        mission: Some(named.name("mission", &sources.mission)?),
+        model: Some(named.name("model", &sources.model)?),
+        state_in: state.and_then(|s| s.path).map(|path| named.name("state", &path)).transpose()?,
+        files,
+        from_ns: sources.from_ns,
+        until_ns: sources.until_ns,
+        run_in_ns: sources.run_in_ns,
+        stream: known(row.stream.as_deref()).unwrap_or(options.stream),
+        status: known(row.status.as_deref()).unwrap_or(options.status),
+        ..options.clone()
+    };
+    Ok(run(registry, &options, progress)?)
+}
+
+/// Whether everything is there that a product was made of.
+pub fn can_be_rebuilt(archive: &Archive, id: &str) -> bool {
+    match archive.row(id) {
+        Ok(row) if row.name == JOINT => {
+            let inputs = archive.inputs(id).unwrap_or_default();
+            let whole = |row: Row| archive.document(&row.id).is_ok();
+            inputs.iter().all(|input| archive.with_digest(&input.name, &input.sha256).is_ok_and(whole))
+        }
+        _ => Sources::in_archive(archive, id).is_ok(),
+    }
 }
 
 /// A word of the catalogue.

@@ -124,7 +124,12 @@ fn told(l: &Lineage, paint: Paint) -> String {
         let _ = writeln!(text, "  in place of {id}");
     }
     let of_it =
-        [("superseded by", &l.superseded_by), ("resumed by", &l.resumed_by), ("tested on other data by", &l.tested_by)];
+        [
+            ("superseded by", &l.superseded_by),
+            ("resumed by", &l.resumed_by),
+            ("entered", &l.entered),
+            ("tested on other data by", &l.tested_by),
+        ];
     if of_it.iter().any(|(_, ids)| !ids.is_empty()) || !l.certified.is_empty() {
         text += "\nmade of it\n";
     }
@@ -157,6 +162,7 @@ fn drawn(l: &Lineage) -> Result<String, Failure> {
     let mut right: Vec<Node> = Vec::new();
     right.extend(l.superseded_by.iter().map(|id| node("superseded by", id, "")));
     right.extend(l.resumed_by.iter().map(|id| node("resumed by", id, "")));
+    right.extend(l.entered.iter().map(|id| node("entered", id, "")));
     right.extend(l.tested_by.iter().map(|id| node("tested by", id, "")));
     right.extend(l.certified.iter().map(|v| node("set", &v.set, &crate::utc::format(v.from_ns))));
     let edges = (0..left.len()).map(|i| ((0, i), (1, 0))).chain((0..right.len()).map(|i| ((1, 0), (2, i))));

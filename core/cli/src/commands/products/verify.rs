@@ -6,7 +6,6 @@ use crate::failure::Failure;
 use crate::progress::Meter;
 use crate::text::{self, Paint};
 use dragfree_archive::Find;
-use dragfree_engine::sources::Sources;
 use dragfree_workflow::calibrate::Options;
 use dragfree_workflow::provenance;
 use serde_json::json;
@@ -49,7 +48,7 @@ pub(super) fn verify(names: &[String], folder: &Path, json: bool, paint: Paint) 
     for id in &ids {
         let whole = archive.product(id).map(drop).and_then(|()| archive.verify_kept(id));
         if let Err(error) = whole {
-            let rebuild = Some(Sources::in_archive(&archive, id).is_ok());
+            let rebuild = Some(provenance::can_be_rebuilt(&archive, id));
             broken.push(Broken { what: id.clone(), reason: error.to_string(), rebuild });
         }
     }
