@@ -370,6 +370,9 @@ fn step(text: &str) -> Result<(String, String), String> {
 pub(crate) struct Joint {
     #[command(flatten)]
     pub(crate) days: Days,
+    /// Coefficients are known to be constant between events: estimate no rates
+    #[arg(long)]
+    pub(crate) constant: bool,
     /// Archive no product
     #[arg(long)]
     pub(crate) dry_run: bool,

@@ -10,18 +10,21 @@
 use dragfree_schema::{Coefficient, Constraint, Settings};
 use nalgebra::{DMatrix, DVector, SymmetricEigen};
 
-use crate::estimate::{Bound, Estimate, EstimateError, Method, Observed, Refinement, zero_area_weights};
+use crate::estimate::{
+    Bound, Estimate, EstimateError, LEAST_BLOCKS, Method, Observed, Refinement, Scatter, zero_area_weights,
+};
 use crate::free_levels::{WithLevels, solve};
 use crate::moments::Moments;
 use crate::normal::{Split, accumulate};
-use crate::spectra::{Block, Layout, Plan, Regressor, Spectra, Sums, triangle};
+use crate::spectra::{Layout, Plan, Regressor, Spectra, Sums, triangle};
 use crate::stored::Declared;
+use crate::verdict::chi2_per_dof_at;
 
 /// Days between two steps.
 #[derive(Clone, Debug)]
 pub struct Stretch {
-    /// Their sums, in blocks of time, about one origin that all stretches share.
-    pub blocks: Vec<Moments>,
+    /// Their sums, about one origin that all stretches share.
+    pub sums: Moments,
     /// Middle of the stretch, days after the origin.
     pub middle_days: f64,
 }
@@ -67,6 +70,8 @@ pub struct ManyDays<'a> {
     pub settings: &'a Settings,
     /// At least one.
     pub stretches: &'a [Stretch],
+    /// From the first day to the last one.
+    pub length_days: f64,
 }
 
 /// A solution of many days.
@@ -102,6 +107,9 @@ pub struct Same {
     /// Its degrees of freedom.
     pub dof: usize,
 }
+
+/// Kind of a constraint that is a measurement.
+const SURVEY: &str = "survey";
 
 /// Directions whose information is below this part of the largest one, each coefficient in its own σ, are not seen.
 const UNSEEN: f64 = 1e-8;
@@ -143,38 +151,54 @@ impl ManyDays<'_> {
         Coefficient { noise: String::new(), colours: None, prior_sigma: f64::INFINITY, ..declared }
     }
 
-    /// The constraints of a day, in the middle of each stretch.
+    /// Constraints of a day on its coefficients and their changes.
+    ///
+    /// A range holds in the middle of every stretch. A survey knows a sum of coefficients once, at the origin: what is
+    /// wrong with it is wrong at all times, and more rows would count it more often. As it holds at all times, a change
+    /// of the sum is at most the difference of two values of its interval, whose half width h makes it σ = √2 h/√3.
     fn constraints(&self, courses: &[Course]) -> Vec<Constraint> {
-        let name = |i: usize| &self.declared.coefficients[i].name;
+        let mut changes: Vec<Change> = courses.iter().map(|course| course.change).collect();
+        changes.sort_unstable();
+        changes.dedup();
         let mut all = Vec::new();
-        for (number, stretch) in self.stretches.iter().enumerate() {
-            for constraint in &self.declared.constraints {
-                let mut terms = constraint.terms.clone();
-                for course in courses {
-                    let own = constraint.terms.iter().find(|(of, _)| of == name(course.coefficient));
-                    let by = course.change.at(stretch.middle_days, number);
-                    if let (Some((of, weight)), true) = (own, by != 0.0) {
-                        terms.push((change_name(of, course.change), weight * by));
+        for constraint in &self.declared.constraints {
+            if constraint.kind != SURVEY {
+                for (number, stretch) in self.stretches.iter().enumerate() {
+                    let mut terms = constraint.terms.clone();
+                    for change in &changes {
+                        terms.extend(self.terms_of(constraint, courses, *change, change.at(stretch.middle_days, number)));
                     }
-                }
-                // Without a change of its terms it is the same in every stretch.
-                if number == 0 || terms.len() > constraint.terms.len() {
                     all.push(Constraint { terms, ..constraint.clone() });
+                }
+                continue;
+            }
+            all.push(constraint.clone());
+            let width = 0.5 * (constraint.upper - constraint.lower) * std::f64::consts::SQRT_2;
+            for change in &changes {
+                let by = if *change == Change::Rate { self.length_days } else { 1.0 };
+                let terms = self.terms_of(constraint, courses, *change, by);
+                if !terms.is_empty() && width.is_finite() {
+                    let name = format!("change of {}", constraint.name);
+                    all.push(Constraint { name, terms, lower: -width, upper: width, ..constraint.clone() });
                 }
             }
         }
         all
     }
 
+    /// Terms of a constraint, of one change of its coefficients.
+    fn terms_of(&self, constraint: &Constraint, courses: &[Course], change: Change, by: f64) -> Vec<(String, f64)> {
+        let changing = courses.iter().filter(|course| course.change == change && by != 0.0);
+        let names: Vec<&str> =
+            changing.map(|c| self.declared.coefficients[c.coefficient].name.as_str()).collect();
+        let own = constraint.terms.iter().filter(|(of, _)| names.contains(&of.as_str()));
+        own.map(|(of, weight)| (change_name(of, change), weight * by)).collect()
+    }
+
     fn sums(&self, extended: &Extended) -> Sums {
         let mut sums = Sums::new(self.plan, &extended.layout);
-        for (stretch, own) in self.stretches.iter().enumerate() {
-            for block in &own.blocks {
-                let spectra = extended.spectra(block, stretch);
-                sums.total.add(&spectra);
-                let number = sums.blocks.len() as i64;
-                sums.blocks.push(Block { number, spectra, overlaps_before: None });
-            }
+        for (number, stretch) in self.stretches.iter().enumerate() {
+            sums.total.add(&extended.spectra(&stretch.sums, number));
         }
         sums
     }
@@ -279,28 +303,43 @@ impl Joint {
         Same { chi2: all - score.dot(&(&inverse * &score)), dof: dof.saturating_sub(rank) }
     }
 
-    /// Free coefficients of a day without a rate, each with what χ² would fall by with one.
-    pub fn rates_wanted(&self, days: &[DayScore]) -> Vec<(usize, f64)> {
-        let has_rate = |i: &usize| self.courses.iter().any(|c| c.coefficient == *i && c.change == Change::Rate);
-        let free = self.free_of_day();
-        let (information, score) = self.together(days);
-        let (inverse, _) = pseudo_inverse(&information);
-        let mut wanted = Vec::new();
-        for (k, i) in free.iter().enumerate().filter(|(_, i)| !has_rate(i)) {
-            let mut cross = DVector::zeros(score.len());
-            let (mut own, mut slope) = (0.0, 0.0);
-            for day in days {
-                cross += self.design(day).tr_mul(&day.information.column(k)) * day.days;
-                own += day.days * day.days * day.information[(k, k)];
-                slope += day.days * day.score[k];
-            }
-            let solved = &inverse * &cross;
-            let left = own - cross.dot(&solved);
-            if left > UNSEEN * own {
-                wanted.push((*i, (slope - solved.dot(&score)).powi(2) / left));
-            }
+    /// Scatter of the days' pulls on what is estimated over what the information of each promises, and its largest
+    /// value by chance; `None` with too few days.
+    ///
+    /// A day pulls by `C Dᵀs`, s its score at the solution, with the variance `C Dᵀ(W − W D C Dᵀ W)D C`: it has a part
+    /// in the solution that it is compared with.
+    pub fn scatter(&self, days: &[DayScore], sigmas: f64) -> Option<Scatter> {
+        let estimate = &self.solution.estimate;
+        let covariance = estimate.covariance.as_ref().filter(|_| days.len() >= LEAST_BLOCKS)?;
+        let n = estimate.free.len();
+        let (mut measured, mut expected) = (DVector::zeros(n), DVector::zeros(n));
+        for day in days {
+            let reach = covariance * self.design(day).transpose();
+            let pull = &reach * &day.score;
+            let own = &day.information * self.design(day);
+            let variance = &day.information - &own * covariance * own.transpose();
+            measured += pull.component_mul(&pull);
+            expected += (&reach * variance * reach.transpose()).diagonal();
         }
-        wanted
+        // As many values as there are days determine a coefficient with its changes.
+        let most = estimate.free.iter().map(|i| 1 + self.courses.iter().filter(|c| c.coefficient == *i).count()).max();
+        let dof = days.len().saturating_sub(most.unwrap_or(1)).max(1) as f64;
+        let ratio = measured.component_div(&expected).map(f64::sqrt);
+        Some(Scatter {
+            blocks: days.len(),
+            ratio: ratio.iter().copied().collect(),
+            upper: chi2_per_dof_at(dof, sigmas).sqrt(),
+        })
+    }
+
+    /// Widens the covariance where days scatter more than chance allows.
+    pub fn widened(mut self, scatter: Option<&Scatter>) -> Self {
+        if let (Some(covariance), Some(scatter)) = (&mut self.solution.estimate.covariance, scatter) {
+            let widen = |k: usize| if scatter.ratio[k] > scatter.upper { scatter.ratio[k] } else { 1.0 };
+            let n = covariance.nrows();
+            *covariance = DMatrix::from_fn(n, n, |i, j| covariance[(i, j)] * widen(i) * widen(j));
+        }
+        self
     }
 }
 
@@ -463,9 +502,10 @@ mod tests {
         }
         let stretch = |number: usize| {
             let own = days.iter().filter(|(.., stretch)| *stretch == number);
-            let blocks: Vec<Moments> = own.clone().map(|(s, time, _)| Moments::of_day(s.clone(), *time)).collect();
-            let middle_days = own.map(|(_, time, _)| time).sum::<f64>() / blocks.len() as f64;
-            Stretch { blocks, middle_days }
+            let mut sums = Moments::default();
+            own.clone().for_each(|(s, time, _)| sums.add(&Moments::of_day(s.clone(), *time)));
+            let middle_days = own.clone().map(|(_, time, _)| time).sum::<f64>() / own.count() as f64;
+            Stretch { sums, middle_days }
         };
         let stretches = vec![stretch(0), stretch(1)];
         Flight { days, stretches }
@@ -473,7 +513,7 @@ mod tests {
 
     fn solve(plan: &Plan, flight: &Flight, courses: &[Course]) -> (Joint, Vec<DayScore>) {
         let (layout, declared, settings) = (layout(), declared(), Settings::default());
-        let all = ManyDays { layout: &layout, plan, declared: &declared, settings: &settings, stretches: &flight.stretches };
+        let all = ManyDays { layout: &layout, plan, declared: &declared, settings: &settings, stretches: &flight.stretches, length_days: 12.0 };
         let joint = all.solve(courses).expect("a solution");
         let scores = flight.days.iter().map(|(s, time, stretch)| all.score(&joint, s, *time, *stretch)).collect();
         (joint, scores)
@@ -516,36 +556,55 @@ mod tests {
         within(same.chi2, same.dof as f64);
     }
 
-    /// Of 60 flights in which nothing drifts, χ² that a rate would gain is that of one degree of freedom: its mean over
-    /// both coefficients within 4σ. Where one drifts by 6σ, it is the one that wants a rate.
+    /// Scatter of the days over what is promised: its mean square over 40 flights is one, within 4σ of χ². Where the
+    /// noise of every third day is three times as loud, σ of the shared coefficient is widened, and of its own too.
     #[test]
-    fn a_rate_is_wanted_where_there_is_one() {
+    fn days_of_louder_noise_widen_sigma() {
         let plan = Plan::new(SEGMENT, RATE_HZ);
-        let mut gains = Vec::new();
-        for seed in 100..160 {
-            let flight = flight(&plan, seed, |_, stretch| truth(0.0, stretch));
-            let (joint, scores) = solve(&plan, &flight, &[STEP]);
-            gains.extend(joint.rates_wanted(&scores).into_iter().map(|(_, gain)| gain));
+        let mut squares = Vec::new();
+        for seed in 200..240 {
+            let flight = flight(&plan, seed, truth);
+            let (joint, scores) = solve(&plan, &flight, &[STEP, RATE]);
+            let scatter = joint.scatter(&scores, 4.0).expect("twelve days");
+            squares.extend(scatter.ratio.iter().map(|r| r * r));
         }
-        let dof = gains.len() as f64;
-        let mean = gains.iter().sum::<f64>() / dof;
-        assert_eq!(dof, 120.0);
+        let mean = squares.iter().sum::<f64>() / squares.len() as f64;
+        // Twelve days a flight, two coefficients that are independent.
+        let dof = 40.0 * 12.0 * 2.0;
         assert!((chi2_per_dof_at(dof, -4.0)..chi2_per_dof_at(dof, 4.0)).contains(&mean), "{mean}");
 
-        let flight = flight(&plan, 160, truth);
-        let (joint, scores) = solve(&plan, &flight, &[STEP]);
-        let wanted = joint.rates_wanted(&scores);
-        let (joint, _) = solve(&plan, &flight, &[STEP, RATE]);
-        let estimate = &joint.solution.estimate;
-        let sigmas = estimate.theta[3] / estimate.covariance.as_ref().expect("seen")[(3, 3)].sqrt();
-        // The score at the solution without it is what it is worth, but for the step of one iteration.
-        assert!((wanted[1].1 / sigmas.powi(2) - 1.0).abs() < 0.05, "{wanted:?} {sigmas}");
-        assert!(wanted[0].1 < 16.0 && wanted[1].1 > 36.0, "{wanted:?}");
+        let loud = |k: usize| if k.is_multiple_of(3) { 3.0 } else { 1.0 };
+        let mut pulls = 0.0;
+        for seed in 300..330 {
+            let mut flight = flight(&plan, seed, |_, _| [0.0, 0.0]);
+            for (k, (spectra, ..)) in flight.days.iter_mut().enumerate() {
+                // Channels are columns 0 and 1: with nothing in them but noise they may be made louder.
+                for band in spectra.packed.chunks_mut(triangle(4)) {
+                    let of = |column: usize| if column < 2 { loud(k) } else { 1.0 };
+                    for i in 0..4 {
+                        (0..=i).for_each(|j| band[triangle(i) + j] *= of(i) * of(j));
+                    }
+                }
+            }
+            let moments = flight.days.iter().map(|(s, time, _)| Moments::of_day(s.clone(), *time));
+            let mut sums = Moments::default();
+            moments.for_each(|m| sums.add(&m));
+            flight.stretches = vec![Stretch { sums, middle_days: 0.0 }];
+            flight.days.iter_mut().for_each(|(.., stretch)| *stretch = 0);
+            let (joint, scores) = solve(&plan, &flight, &[RATE]);
+            let scatter = joint.scatter(&scores, 0.0);
+            let joint = joint.widened(scatter.as_ref());
+            let estimate = &joint.solution.estimate;
+            let sigma = estimate.covariance.as_ref().expect("seen")[(0, 0)].sqrt();
+            pulls += (estimate.theta[0] / sigma).powi(2) / 30.0;
+        }
+        assert!(pulls < chi2_per_dof_at(30.0, 3.0), "{pulls}");
     }
 
-    /// A survey of the sum of both coefficients holds before and after a step, whose size it tells too.
+    /// A survey of the sum of both coefficients is known once, and tells that the sum neither steps nor drifts: what it
+    /// knows of the sum, its σ says, and of its step √2 times that.
     #[test]
-    fn a_survey_holds_in_every_stretch() {
+    fn a_survey_is_counted_once_and_holds_always() {
         let plan = Plan::new(SEGMENT, RATE_HZ);
         let flight = flight(&plan, 7, |_, stretch| truth(0.0, stretch));
         let mut declared = declared();
@@ -553,17 +612,29 @@ mod tests {
             name: "sum".to_owned(),
             kind: "survey".to_owned(),
             terms: vec![("gain.a".to_owned(), 1.0), ("gain.b".to_owned(), 1.0)],
-            lower: 0.2 - 1e-6,
-            upper: 0.2 + 1e-6,
+            lower: 0.2 - 1e-4,
+            upper: 0.2 + 1e-4,
             unit: "1".to_owned(),
             parts: 1,
         });
         let (layout, settings) = (layout(), Settings::default());
         let all =
-            ManyDays { layout: &layout, plan: &plan, declared: &declared, settings: &settings, stretches: &flight.stretches };
-        let both = [STEP, Course { coefficient: 1, ..STEP }];
+            ManyDays { layout: &layout, plan: &plan, declared: &declared, settings: &settings, stretches: &flight.stretches, length_days: 12.0 };
+        let both = [STEP, Course { coefficient: 1, ..STEP }, RATE, Course { coefficient: 0, ..RATE }];
         let joint = all.solve(&both).expect("a solution");
-        let theta = &joint.solution.estimate.theta;
-        assert!((theta[0] + theta[1] - 0.2).abs() < 2e-6 && (theta[2] + theta[3]).abs() < 4e-6, "{theta}");
+        let Estimate { theta, covariance, .. } = &joint.solution.estimate;
+        let covariance = covariance.as_ref().expect("seen");
+        // σ of a row's sum over that of its interval; twice where the solution stands at an end of it.
+        let h = 1e-4;
+        let check = |(i, j): (usize, usize), middle: f64, half: f64| {
+            let distance = (theta[i] + theta[j] - middle).abs();
+            assert!(distance < 1.01 * half, "{distance} {half}");
+            let expected = half / 3f64.sqrt() * if distance > 0.99 * half { 2.0 } else { 1.0 };
+            let sigma = (covariance[(i, i)] + covariance[(j, j)] + 2.0 * covariance[(i, j)]).sqrt();
+            assert!((sigma / expected - 1.0).abs() < 0.01, "{sigma} {expected}");
+        };
+        check((0, 1), 0.2, h);
+        check((2, 3), 0.0, h * 2f64.sqrt());
+        check((4, 5), 0.0, h * 2f64.sqrt() / 12.0);
     }
 }

@@ -6,7 +6,7 @@ use crate::failure::Failure;
 use crate::text::{self, Paint};
 use dragfree_archive::files::IoContext as _;
 use dragfree_chart::{Line, Panel, Scale, Stroke};
-use dragfree_workflow::joint::{self as workflow, Coefficient, Joint, Measured, Options};
+use dragfree_workflow::joint::{self as workflow, Changed, Coefficient, Joint, Measured, Options};
 use dragfree_workflow::trend::{self, Series, Trend};
 use serde_json::json;
 use std::fmt::Write as _;
@@ -25,6 +25,7 @@ fn options(days: &Days) -> Result<Options, Failure> {
         spacecraft: days.spacecraft.clone(),
         events: days.events.clone(),
         steps: days.steps.clone(),
+        constant: false,
     };
     if let Some(operations) = operations {
         options.events = options.events.or(operations.events);
@@ -35,7 +36,8 @@ fn options(days: &Days) -> Result<Options, Failure> {
 
 pub(super) fn joint(command: &JointCommand, json: bool, paint: Paint) -> Result<Done, Failure> {
     let archive = products::archive(&command.days.archive.folder()?)?;
-    let joint = workflow::joint(&archive, &options(&command.days)?)?;
+    let asked = Options { constant: command.constant, ..options(&command.days)? };
+    let joint = workflow::joint(&archive, &asked)?;
     let (mut id, mut new) = (None, false);
     if !command.dry_run {
         let (written, is_new) = workflow::archived(&archive, &joint, SystemTime::now().into(), SOFTWARE)?;
@@ -106,14 +108,15 @@ fn rows(c: &Coefficient) -> Vec<Vec<String>> {
     let measured = |m: Measured, factor: f64| text::measured(m.value * factor, m.sigma * factor);
     let own = Measured { value: c.value, sigma: c.sigma };
     let mut rows = vec![vec![c.name.clone(), measured(own, factor), unit.to_owned(), String::new()]];
+    let mut add = |name: String, changed: Changed, unit: String, factor: f64| {
+        let seen = if changed.seen { "seen" } else { "not seen" };
+        rows.push(vec![name, measured(changed.size, factor), unit, seen.to_owned()]);
+    };
     if let Some(rate) = c.rate {
-        let per_day = measured(rate, factor * DAY_S);
-        rows.push(vec!["  rate".to_owned(), per_day, format!("{unit}/d"), String::new()]);
+        add("  rate".to_owned(), rate, format!("{unit}/d"), factor * DAY_S);
     }
     for step in &c.steps {
-        let seen = if step.seen { "" } else { "not seen" };
-        let name = format!("  step {}", step.events.join(", "));
-        rows.push(vec![name, measured(step.size, factor), unit.to_owned(), seen.to_owned()]);
+        add(format!("  step {}", step.events.join(", ")), step.changed, unit.to_owned(), factor);
     }
     rows
 }

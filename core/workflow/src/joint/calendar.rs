@@ -20,6 +20,9 @@ use crate::WorkflowError;
 /// Nodes of every so many levels are kept; those between them are added again from at most 2³ kept ones.
 const KEPT_LEVELS: u32 = 3;
 
+/// Nodes have less than 2 to this days.
+const MOST_LEVELS: u32 = 20;
+
 /// Changes with the layout of what is kept.
 const FORMAT: &str = "dragfree-sums/1";
 
@@ -98,21 +101,21 @@ impl Calendar<'_> {
         Ok((kept.spectra, kept.make))
     }
 
-    /// Sums of the days from `first` to `end`, exclusive, in blocks of 2^`level` days and, at the ends, of fewer. Their
-    /// time is counted from `origin`, days since 1970.
-    pub(crate) fn blocks(&self, first: i64, end: i64, level: u32, origin: f64) -> Result<Vec<Moments>, WorkflowError> {
-        let mut blocks = Vec::new();
+    /// Sums of the days from `first` to `end`, exclusive. Their time is counted from `origin`, days since 1970.
+    pub(crate) fn sum(&self, first: i64, end: i64, origin: f64) -> Result<Moments, WorkflowError> {
+        let mut sum = Moments::default();
         let mut at = first;
         while at < end {
-            let fits = |l: &u32| at.rem_euclid(1 << l) == 0 && at + (1 << l) <= end;
-            let level = (0..=level).rev().find(fits).unwrap_or(0);
+            // The longest node that begins here and ends in time.
+            let fits = |level: &u32| at.rem_euclid(1 << level) == 0 && at + (1 << level) <= end;
+            let level = (0..MOST_LEVELS).rev().find(fits).unwrap_or(0);
             let node = Node { level, index: at >> level };
-            if let Some(sums) = self.node(node)? {
-                blocks.push(sums.shifted(node.middle() - origin));
+            if let Some(own) = self.node(node)? {
+                sum.add(&own.shifted(node.middle() - origin));
             }
             at = node.end();
         }
-        Ok(blocks)
+        Ok(sum)
     }
 
     /// The sums of a node about its middle; none where it has no day.

@@ -1,8 +1,11 @@
 //! One calibration of many days from the sums that their products hold, without telemetry.
 //!
 //! Each day has its own product. Here the days' sums are added ([`calendar`]) and solved once more, with constraints
-//! counted once; coefficients that the data want to drift get a constant rate, and those that a declared event changes
-//! a step there. What the days say alone is compared with that.
+//! counted once. Every coefficient has a constant rate, and those that a declared event changes have a step there. What
+//! the days say alone is compared with that.
+//!
+//! Rates are estimated whether they stand out or not. One that is left out because it does not may be as large as twice
+//! its σ or more, and would be an error of several σ at either end of the time, and of every step.
 
 mod calendar;
 mod events;
@@ -30,8 +33,8 @@ pub use events::Event;
 pub use product::{At, again, archived, at};
 pub use stale::{Stale, stale};
 
-/// Blocks of time that the days are summed in, about; fewer do not show whether the noise is the same at all times.
-const BLOCKS: usize = 16;
+/// Days below which no rate is estimated: two would be fitted exactly.
+const LEAST_DAYS: usize = 3;
 
 /// A day whose data end or begin within this of an event, ns, is not cut by it.
 const EDGE_NS: i64 = 1_000_000_000;
@@ -53,13 +56,17 @@ pub struct Options {
     pub events: Option<PathBuf>,
     /// Kinds of events with the effects, or coefficients, that they change.
     pub steps: Vec<(String, String)>,
+    /// Whether coefficients are known to be constant between events.
+    pub constant: bool,
 }
 
-/// Events that change coefficients, as they were given.
+/// What is declared of the days.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Declared {
     /// Kinds of events with the effects that they change.
     pub steps: Vec<(String, String)>,
+    /// Whether coefficients are known to be constant between events.
+    pub constant: bool,
     /// Name and text of the file of events.
     #[serde(skip)]
     pub file: Option<(String, String)>,
@@ -76,7 +83,7 @@ impl Declared {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             std::fs::read_to_string(path).map(|text| (name, text)).map_err(refuse)
         });
-        Ok(Self { steps: options.steps.clone(), file: file.transpose()? })
+        Ok(Self { steps: options.steps.clone(), constant: options.constant, file: file.transpose()? })
     }
 
     /// Events of a spacecraft, in order.
@@ -143,8 +150,8 @@ pub struct Coefficient {
     pub value: f64,
     /// Its standard deviation.
     pub sigma: f64,
-    /// Constant rate, per s, where the data want one.
-    pub rate: Option<Measured>,
+    /// Constant rate, per s; none where it is known to be zero, or with too few days.
+    pub rate: Option<Changed>,
     /// Steps at events that change it.
     pub steps: Vec<Step>,
 }
@@ -158,16 +165,24 @@ pub struct Measured {
     pub sigma: f64,
 }
 
+/// A rate, or the size of a step.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Changed {
+    /// Value and σ.
+    #[serde(flatten)]
+    pub size: Measured,
+    /// Whether it stands out from the noise, at the false-alarm rate of the settings for all rates, or steps, together.
+    pub seen: bool,
+}
+
 /// A step of a coefficient.
 #[derive(Clone, Debug, Serialize)]
 pub struct Step {
     /// Times of the events, as they are written.
     pub events: Vec<String>,
-    /// Size.
+    /// Its size.
     #[serde(flatten)]
-    pub size: Measured,
-    /// Whether it stands out from the noise, at the false-alarm rate of the settings for all steps together.
-    pub seen: bool,
+    pub changed: Changed,
     /// Time of the last of its events, Unix ns.
     #[serde(skip)]
     time_ns: i64,
@@ -282,27 +297,21 @@ fn of_products(archive: &Archive, rows: Vec<Row>, declared: Declared) -> Result<
     let calendar = Calendar { archive, days: leaves(archive, &days)? };
     let like = calendar.stored(first)?;
     same_make(&calendar, first, &like)?;
-    let time = Time { origin: 0.5 * (first + last + 1) as f64, level: level(days.len()) };
+    let origin = 0.5 * (first + last + 1) as f64;
     let borders = borders(&days, &events);
-    let stretches = stretches(&calendar, &days, &borders, time)?;
+    let stretches = stretches(&calendar, &days, &borders, origin)?;
     let settings = days[&last].1.settings.clone();
     let (layout, plan) = (&like.layout, &like.plan());
     let all =
-        ManyDays { layout, plan, declared: &like.declared, settings: &settings, stretches: &stretches };
-    let steps = all_steps(&like, &borders);
-    let mut courses = steps.clone();
-    let (solution, scores) = loop {
-        let solution = all.solve(&courses)?;
-        let scores = scores(&calendar, &all, &solution, &borders, time)?;
-        // One more rate at a time: coefficients that the data hardly tell apart want one together.
-        let wanted = solution.rates_wanted(&scores);
-        let most = wanted.iter().max_by(|a, b| a.1.total_cmp(&b.1));
-        let tried = solution.free_of_day().len() as f64;
-        match most.filter(|(_, chi2)| chi2_tails(*chi2, 1.0).1 * tried < settings.false_alarm) {
-            Some((coefficient, _)) => courses.push(Course { coefficient: *coefficient, change: Change::Rate }),
-            None => break (solution, scores),
-        }
-    };
+        ManyDays { layout, plan, declared: &like.declared, settings: &settings, stretches: &stretches, length_days: (last + 1 - first) as f64 };
+    let mut courses = steps(&like, &borders);
+    if days.len() >= LEAST_DAYS && !declared.constant {
+        courses.extend(rates(&like));
+    }
+    let solution = all.solve(&courses)?;
+    let scores = scores(&calendar, &all, &solution, &borders, origin)?;
+    let scatter = solution.scatter(&scores, settings.scatter_sigmas);
+    let solution = solution.widened(scatter.as_ref());
 
     let same = solution.same(&scores);
     let day_lines = days.iter().zip(&scores).map(|((number, (row, product)), score)| Day {
@@ -313,14 +322,14 @@ fn of_products(archive: &Archive, rows: Vec<Row>, declared: Declared) -> Result<
         agreement: Agreement::new(score.chi2, score.dof),
     });
     let day_lines: Vec<Day> = day_lines.collect();
-    let Estimate { weak, quality, scatter, .. } = &solution.solution.estimate;
+    let Estimate { weak, quality, .. } = &solution.solution.estimate;
     let mut notes = Vec::new();
     let within = |e: &&Event| (start_of_day_ns(first)..start_of_day_ns(last + 1)).contains(&e.time_ns);
     let lone = events.iter().filter(within).filter(|e| !borders.iter().any(|b| b.events.contains(e)));
     notes.extend(lone.map(|e| {
         format!("{} at {}: there are no days on both sides of it, so no step is estimated", e.kind, e.time)
     }));
-    let reported = Reported { days: &days, borders: &borders, time, last, false_alarm: settings.false_alarm };
+    let reported = Reported { days: &days, borders: &borders, origin, last, false_alarm: settings.false_alarm };
     Ok(Joint {
         spacecraft,
         first: day_of_number(first),
@@ -329,7 +338,7 @@ fn of_products(archive: &Archive, rows: Vec<Row>, declared: Declared) -> Result<
         covariance: reported.covariance(&like, &solution),
         same: Agreement::new(same.chi2, same.dof),
         chi2_per_dof: quality.chi2_per_dof_modelled_sigma,
-        scatter: scatter.clone(),
+        scatter,
         weak: weak.iter().map(|w| w.sentence.clone()).collect(),
         missing: (first..=last)
             .filter(|n| !days.contains_key(n))
@@ -434,17 +443,6 @@ fn same_make(calendar: &Calendar<'_>, first: i64, like: &Stored) -> Result<(), W
     Ok(())
 }
 
-/// Where time begins, days since 1970, and the length of blocks, 2^level days.
-#[derive(Clone, Copy)]
-struct Time {
-    origin: f64,
-    level: u32,
-}
-
-fn level(days: usize) -> u32 {
-    days.div_ceil(BLOCKS).next_power_of_two().trailing_zeros()
-}
-
 /// Between two days that both entered, events that change coefficients.
 struct Border {
     /// The first day after it.
@@ -479,22 +477,22 @@ fn stretches(
     calendar: &Calendar<'_>,
     days: &Products,
     borders: &[Border],
-    time: Time,
+    origin: f64,
 ) -> Result<Vec<Stretch>, WorkflowError> {
     let mut stretches = Vec::new();
     for number in 0..=borders.len() {
         let own: Vec<i64> = days.keys().copied().filter(|day| stretch_of(borders, *day) == number).collect();
         let (Some(first), Some(last)) = (own.first(), own.last()) else { continue };
         stretches.push(Stretch {
-            blocks: calendar.blocks(*first, last + 1, time.level, time.origin)?,
-            middle_days: 0.5 * (first + last + 1) as f64 - time.origin,
+            sums: calendar.sum(*first, last + 1, origin)?,
+            middle_days: 0.5 * (first + last + 1) as f64 - origin,
         });
     }
     Ok(stretches)
 }
 
 /// Steps of the coefficients that events change.
-fn all_steps(like: &Stored, borders: &[Border]) -> Vec<Course> {
+fn steps(like: &Stored, borders: &[Border]) -> Vec<Course> {
     let mut steps = Vec::new();
     for (after, border) in borders.iter().enumerate() {
         for (coefficient, c) in like.declared.coefficients.iter().enumerate() {
@@ -506,15 +504,23 @@ fn all_steps(like: &Stored, borders: &[Border]) -> Vec<Course> {
     steps
 }
 
+/// Rates of the coefficients that act on a channel.
+fn rates(like: &Stored) -> Vec<Course> {
+    let acts = |coefficient: &usize| like.layout.regressors.iter().any(|r| r.coefficient == *coefficient);
+    let estimated = |i: &usize| like.declared.coefficients[*i].estimate;
+    let all = (0..like.declared.coefficients.len()).filter(acts).filter(estimated);
+    all.map(|coefficient| Course { coefficient, change: Change::Rate }).collect()
+}
+
 fn scores(
     calendar: &Calendar<'_>,
     all: &ManyDays<'_>,
     solution: &many::Joint,
     borders: &[Border],
-    time: Time,
+    origin: f64,
 ) -> Result<Vec<DayScore>, WorkflowError> {
     let of = |(day, leaf): (&i64, &Leaf)| {
-        let days = *day as f64 + 0.5 + leaf.after_noon_days - time.origin;
+        let days = *day as f64 + 0.5 + leaf.after_noon_days - origin;
         let (spectra, _) = calendar.day(*day)?;
         Ok(all.score(solution, &spectra, days, stretch_of(borders, *day)))
     };
@@ -534,7 +540,7 @@ fn values(product: &Product) -> Vec<Value> {
 struct Reported<'a> {
     days: &'a Products,
     borders: &'a [Border],
-    time: Time,
+    origin: f64,
     last: i64,
     false_alarm: f64,
 }
@@ -549,7 +555,7 @@ impl Reported<'_> {
     /// End of the last day's data, in days after the origin.
     fn end_days(&self) -> f64 {
         let end_ns = self.days[&self.last].1.header.non_standard_attributes.stop_time_epoch_ns;
-        (end_ns - start_of_day_ns(self.last)) as f64 / DAY_NS as f64 + self.last as f64 - self.time.origin
+        (end_ns - start_of_day_ns(self.last)) as f64 / DAY_NS as f64 + self.last as f64 - self.origin
     }
 
     fn coefficients(&self, like: &Stored, solution: &many::Joint) -> Vec<Coefficient> {
@@ -564,7 +570,11 @@ impl Reported<'_> {
             let own = covariance.as_ref().map_or(f64::NAN, |c| c[(at, at)].sqrt());
             Some(Measured { value: estimated[at], sigma: own })
         };
-        let steps = solution.courses.iter().filter(|c| c.change != Change::Rate).count().max(1) as f64;
+        let rates = solution.courses.iter().filter(|c| c.change == Change::Rate).count();
+        let changed = |size: Measured, tried: usize| {
+            let p = chi2_tails((size.value / size.sigma).powi(2), 1.0).1;
+            Changed { size, seen: p * tried as f64 <= self.false_alarm }
+        };
         let mut all = Vec::new();
         for (i, c) in like.declared.coefficients.iter().enumerate().filter(|(i, _)| free.contains(i)) {
             let weights = solution.weights(i, self.end_days(), self.borders.len());
@@ -582,17 +592,14 @@ impl Reported<'_> {
                 match course.change {
                     Change::Rate => {
                         let per_s = 1e9 / DAY_NS as f64;
-                        told.rate = Some(Measured { value: size.value * per_s, sigma: size.sigma * per_s });
+                        let size = Measured { value: size.value * per_s, sigma: size.sigma * per_s };
+                        told.rate = Some(changed(size, rates));
                     }
-                    Change::Step(after) => {
-                        let p = chi2_tails((size.value / size.sigma).powi(2), 1.0).1;
-                        told.steps.push(Step {
-                            events: self.borders[after].events.iter().map(|e| e.time.clone()).collect(),
-                            size,
-                            seen: p * steps < self.false_alarm,
-                            time_ns: self.step_ns(after),
-                        });
-                    }
+                    Change::Step(after) => told.steps.push(Step {
+                        events: self.borders[after].events.iter().map(|e| e.time.clone()).collect(),
+                        changed: changed(size, solution.courses.len() - rates),
+                        time_ns: self.step_ns(after),
+                    }),
                 }
             }
             all.push(told);

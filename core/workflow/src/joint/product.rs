@@ -168,11 +168,11 @@ fn report(joint: &Joint) -> Report {
         };
         add(c.name.clone(), c.unit.clone(), c.value, c.sigma);
         for step in &c.steps {
-            add(self::step(&c.name, step.time_ns), c.unit.clone(), step.size.value, step.size.sigma);
+            add(self::step(&c.name, step.time_ns), c.unit.clone(), step.changed.size.value, step.changed.size.sigma);
         }
         if let Some(per_s) = c.rate {
             let unit = if c.unit == "1" { "1/s".to_owned() } else { format!("{}/s", c.unit) };
-            add(rate(&c.name), unit, per_s.value, per_s.sigma);
+            add(rate(&c.name), unit, per_s.size.value, per_s.size.sigma);
         }
     }
     let mut notes = joint.notes.clone();
