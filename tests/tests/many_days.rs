@@ -38,7 +38,8 @@ static FLOWN: LazyLock<TempDir> = LazyLock::new(|| {
     for day in DAYS {
         let offset = if day < TRIMMED { "com-offset:sc.x=0" } else { "com-offset:sc.x=0.018" };
         // The loop settles in the hour before midnight, of which the file is left out.
-        let start = format!("{}T23:00:00Z", if day == 1 { "2034-12-31".into() } else { format!("2035-01-{:02}", day - 1) });
+        let start =
+            format!("{}T23:00:00Z", if day == 1 { "2034-12-31".into() } else { format!("2035-01-{:02}", day - 1) });
         let (out, seed) = (format!("vault{day}"), (40 + day).to_string());
         let arguments = ["--out", &out, "--start", &start, "--hours", "3", "--seed", &seed, "--effect", offset];
         expect(dragfree(dir.path()).args(["simulate", "mission.toml"]).args(arguments), 0);
@@ -297,9 +298,17 @@ fn a_new_product_of_a_day_makes_the_calibration_stale() {
     assert_eq!(mission.json("products stale", 0)["many_days"], serde_json::json!([]));
     assert_eq!(mission.joint()["new"], false);
     let other = mission.path().join("telemetry/SC1_2035-01-08.mcap");
-    expect(dragfree(mission.path()).args(["run", "pipeline.toml", "--mission", "mission.toml", "--model", "model.toml"])
-        .args(["--from", "2035-01-08T00:30:00Z", "--stream", "oper"]).arg(other), 0);
-    expect(dragfree(mission.path()).args(["products", "withdraw", "COM1B_2035-01-02_SC1_01_0001", "--reason", "a test"]), 0);
+    expect(
+        dragfree(mission.path())
+            .args(["run", "pipeline.toml", "--mission", "mission.toml", "--model", "model.toml"])
+            .args(["--from", "2035-01-08T00:30:00Z", "--stream", "oper"])
+            .arg(other),
+        0,
+    );
+    expect(
+        dragfree(mission.path()).args(["products", "withdraw", "COM1B_2035-01-02_SC1_01_0001", "--reason", "a test"]),
+        0,
+    );
     let stale = mission.json("products stale", 0);
     assert_eq!(stale["many_days"][0]["product"], "COM2_2035-01-01_SC1_01_0001");
     let reasons = stale["many_days"][0]["reasons"].to_string();

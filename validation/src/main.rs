@@ -10,6 +10,7 @@ mod diagnosis_report;
 mod diagnosis_score;
 mod error;
 mod limits;
+mod months;
 mod program;
 mod records;
 mod report;
@@ -47,6 +48,8 @@ enum Command {
     Blind(Blind),
     /// Diagnose sets of 2 h to 3 × 24 h by two producers and score them; goes on where it was stopped
     Diagnosis(Diagnosis),
+    /// Calibrate 90 days with a drift and steps, alone and together; goes on where it was stopped
+    Months(MonthsCommand),
     /// Compute what data of each length can say of each effect; goes on where it was stopped
     Limits,
     /// Measure ratios of speed, on a machine that does nothing else
@@ -124,6 +127,22 @@ struct Diagnosis {
     results: Option<PathBuf>,
 }
 
+#[derive(Debug, Args)]
+struct MonthsCommand {
+    /// Seeds, FIRST-LAST
+    #[arg(long, value_parser = seeds, default_value = "1-20")]
+    seeds: RangeInclusive<u32>,
+    /// Hours of telemetry of each day
+    #[arg(long, default_value_t = 8.0)]
+    hours: f64,
+    /// Sets at a time
+    #[arg(long, default_value_t = AT_ONCE)]
+    at_once: usize,
+    /// File of results
+    #[arg(long, value_name = "FILE")]
+    results: Option<PathBuf>,
+}
+
 const AT_ONCE: usize = 2;
 const SEEDS: RangeInclusive<u32> = 1..=100;
 
@@ -163,6 +182,10 @@ fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
                 arguments: d.arguments.split_whitespace().map(str::to_owned).collect(),
             };
             diagnosis::diagnosis(&Program::build()?, &plan, d.seeds.clone(), d.at_once, &file, &scratch)
+        }
+        Command::Months(m) => {
+            let file = m.results.clone().unwrap_or_else(|| results.join("months.jsonl"));
+            months::months(&Program::build()?, m.seeds.clone(), (m.hours, m.at_once), &file, &scratch)
         }
         Command::Limits => limits::limits(&Program::build()?, &results.join("limits.jsonl"), &scratch),
         Command::Speed => speed::measure(&Program::build()?, &speed_file, &scratch),

@@ -196,6 +196,19 @@ impl Program {
         Ok(json(command.arg("--json"), &[0])?["score"].take())
     }
 
+    /// Runs `dragfree joint` or `trend` over days of an archive. Days that disagree and alerts are accepted.
+    pub(crate) fn of_days(
+        &self,
+        command: &str,
+        days: &str,
+        events: &Path,
+        archive: &Path,
+    ) -> Result<Value, CampaignError> {
+        let mut called = self.command();
+        called.arg(command).arg(days).arg("--events").arg(events).arg("--archive").arg(archive).arg("--json");
+        json(&mut called, &[0, 4])
+    }
+
     /// Runs a chain over telemetry and returns the product as JSON. Exit codes for lost data and an inconsistent model
     /// are accepted.
     pub(crate) fn run(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Result<Value, CampaignError> {

@@ -13,6 +13,7 @@ use crate::campaign::{NOMINAL, TWINS, Twin, note, taiji};
 use crate::diagnosis_report;
 use crate::error::{CampaignError, file};
 use crate::limits::{self, Limits};
+use crate::months::{self, Months};
 use crate::program::root;
 use crate::records::{Blind, Diagnosed, Line, Solution, read};
 use crate::speed::Speed;
@@ -45,6 +46,8 @@ pub(crate) struct Measured {
     pub(crate) diagnosis: Vec<Diagnosed>,
     /// What data of each length can say.
     pub(crate) limits: Vec<Limits>,
+    /// Days together.
+    pub(crate) months: Vec<Months>,
 }
 
 impl Measured {
@@ -57,6 +60,7 @@ impl Measured {
             blind: read(&folder.join("blind.jsonl"))?,
             diagnosis: read(&folder.join("diagnosis.jsonl"))?,
             limits: read(&folder.join("limits.jsonl"))?,
+            months: read(&folder.join("months.jsonl"))?,
         })
     }
 }
@@ -547,6 +551,8 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
     failed.extend(more);
     let (diagnosis, more) = diagnosis_report::numbers(&measured.diagnosis, &free);
     failed.extend(more);
+    let (months, more) = months::table(&measured.months);
+    failed.extend(more);
     let drawn =
         [("coverage", picture(&measured.coverage, &free)), ("confusion", blind_report::picture(&measured.blind))];
     let mut pictures = Vec::new();
@@ -562,6 +568,7 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
         ("blind", blind),
         ("diagnosis", diagnosis),
         ("limits", limits::table(&measured.limits)),
+        ("months", months),
     ]);
     Ok(Report { parts, pictures, failed })
 }

@@ -222,7 +222,8 @@ impl Archive {
         if let Some(row) = self.catalogue.products("p.id = ?1", [id])?.pop() {
             return Ok(entry(row));
         }
-        let condition = "((p.day = ?1 AND p.name <> ?2) OR substr(p.id, 1, length(p.id) - 5) = ?1) AND w.reason IS NULL";
+        let condition =
+            "((p.day = ?1 AND p.name <> ?2) OR substr(p.id, 1, length(p.id) - 5) = ?1) AND w.reason IS NULL";
         let mut found: Vec<Entry> = self.catalogue.products(condition, [id, JOINT])?.into_iter().map(entry).collect();
         let series = |e: &Entry| (e.row.spacecraft.clone(), e.row.name.clone());
         if let Some(last) = found.last()
@@ -363,7 +364,8 @@ impl Archive {
     /// There is none.
     pub fn with_digest(&self, stem: &str, sha256: &str) -> Result<Row, ArchiveError> {
         let condition = "substr(p.id, 1, length(p.id) - 5) = ?1 AND p.digest = ?2";
-        let gone = || ArchiveError::NotFound { id: format!("{stem} with the digest {sha256}"), folder: self.folder.clone() };
+        let gone =
+            || ArchiveError::NotFound { id: format!("{stem} with the digest {sha256}"), folder: self.folder.clone() };
         self.catalogue.products(condition, [stem, sha256])?.pop().ok_or_else(gone)
     }
 

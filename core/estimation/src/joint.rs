@@ -128,11 +128,8 @@ impl ManyDays<'_> {
         coefficients.extend(courses.iter().map(|course| self.coefficient(course)));
         let bounds = Bound::all(&coefficients, &self.constraints(courses));
         let observed = Observed { layout: &extended.layout, plan: self.plan, sums: &sums, prediction: None };
-        let method = Method {
-            refinements: self.declared.refinements,
-            refinement: self.refinement(),
-            settings: self.settings,
-        };
+        let method =
+            Method { refinements: self.declared.refinements, refinement: self.refinement(), settings: self.settings };
         let solution = solve(&observed, &self.declared.noise, &coefficients, &bounds, &method)?;
         Ok(Joint { of_day: self.layout.coefficients.len(), courses: courses.to_vec(), solution })
     }
@@ -166,7 +163,12 @@ impl ManyDays<'_> {
                 for (number, stretch) in self.stretches.iter().enumerate() {
                     let mut terms = constraint.terms.clone();
                     for change in &changes {
-                        terms.extend(self.terms_of(constraint, courses, *change, change.at(stretch.middle_days, number)));
+                        terms.extend(self.terms_of(
+                            constraint,
+                            courses,
+                            *change,
+                            change.at(stretch.middle_days, number),
+                        ));
                     }
                     all.push(Constraint { terms, ..constraint.clone() });
                 }
@@ -189,8 +191,7 @@ impl ManyDays<'_> {
     /// Terms of a constraint, of one change of its coefficients.
     fn terms_of(&self, constraint: &Constraint, courses: &[Course], change: Change, by: f64) -> Vec<(String, f64)> {
         let changing = courses.iter().filter(|course| course.change == change && by != 0.0);
-        let names: Vec<&str> =
-            changing.map(|c| self.declared.coefficients[c.coefficient].name.as_str()).collect();
+        let names: Vec<&str> = changing.map(|c| self.declared.coefficients[c.coefficient].name.as_str()).collect();
         let own = constraint.terms.iter().filter(|(of, _)| names.contains(&of.as_str()));
         own.map(|(of, weight)| (change_name(of, change), weight * by)).collect()
     }
@@ -376,8 +377,7 @@ impl Extended {
             extended.layout.coefficients.push(change_name(&layout.coefficients[course.coefficient], course.change));
             for r in &layout.regressors {
                 let acts = [
-                    (r.coefficient == course.coefficient)
-                        .then(|| Regressor { coefficient: of_day + number, ..*r }),
+                    (r.coefficient == course.coefficient).then(|| Regressor { coefficient: of_day + number, ..*r }),
                     (r.times == Some(course.coefficient)).then(|| Regressor { times: Some(of_day + number), ..*r }),
                 ];
                 for regressor in acts.into_iter().flatten() {
@@ -461,7 +461,8 @@ mod tests {
             enters: [(channel.to_owned(), vec![1.0])].into(),
             ..NoiseProcess::default()
         };
-        let coefficient = |name: &str| Coefficient { name: name.to_owned(), effect: "gain".into(), ..Coefficient::default() };
+        let coefficient =
+            |name: &str| Coefficient { name: name.to_owned(), effect: "gain".into(), ..Coefficient::default() };
         Declared {
             noise: vec![noise("a"), noise("b")],
             coefficients: vec![coefficient("gain.a"), coefficient("gain.b")],
@@ -513,7 +514,14 @@ mod tests {
 
     fn solve(plan: &Plan, flight: &Flight, courses: &[Course]) -> (Joint, Vec<DayScore>) {
         let (layout, declared, settings) = (layout(), declared(), Settings::default());
-        let all = ManyDays { layout: &layout, plan, declared: &declared, settings: &settings, stretches: &flight.stretches, length_days: 12.0 };
+        let all = ManyDays {
+            layout: &layout,
+            plan,
+            declared: &declared,
+            settings: &settings,
+            stretches: &flight.stretches,
+            length_days: 12.0,
+        };
         let joint = all.solve(courses).expect("a solution");
         let scores = flight.days.iter().map(|(s, time, stretch)| all.score(&joint, s, *time, *stretch)).collect();
         (joint, scores)
@@ -618,8 +626,14 @@ mod tests {
             parts: 1,
         });
         let (layout, settings) = (layout(), Settings::default());
-        let all =
-            ManyDays { layout: &layout, plan: &plan, declared: &declared, settings: &settings, stretches: &flight.stretches, length_days: 12.0 };
+        let all = ManyDays {
+            layout: &layout,
+            plan: &plan,
+            declared: &declared,
+            settings: &settings,
+            stretches: &flight.stretches,
+            length_days: 12.0,
+        };
         let both = [STEP, Course { coefficient: 1, ..STEP }, RATE, Course { coefficient: 0, ..RATE }];
         let joint = all.solve(&both).expect("a solution");
         let Estimate { theta, covariance, .. } = &joint.solution.estimate;

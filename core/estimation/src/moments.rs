@@ -77,7 +77,10 @@ mod tests {
         for power in 0..3 {
             let direct: f64 = all.iter().map(|(value, days)| value * (days + 4.0_f64).powi(power)).sum();
             let found = shifted.power(power as usize);
-            assert!((found[0] - direct).abs() < 1e-12 * direct.abs() && (found[1] - 0.3 * direct).abs() < 1e-11, "{power}");
+            assert!(
+                (found[0] - direct).abs() < 1e-12 * direct.abs() && (found[1] - 0.3 * direct).abs() < 1e-11,
+                "{power}"
+            );
         }
         assert_eq!(shifted.spectra.expected, [3.0]);
     }

@@ -12,10 +12,11 @@ use dragfree_estimation::segments::Segmenter;
 use dragfree_estimation::sigma::NoiseModel;
 use dragfree_estimation::spectra::{Analyser, Layout, Plan, Regressor, Sums};
 use dragfree_estimation::state;
-use dragfree_estimation::stored::Stored;
+use dragfree_estimation::stored::{Declared, Stored};
 use dragfree_hinf_dfacs::noise::declared;
 use dragfree_physics::frames::dcm_turned_about_z;
 use dragfree_physics::mission::Mission;
+use dragfree_schema::Coefficient;
 use dragfree_schema::state::{State, load, save};
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use rand::SeedableRng;
@@ -732,7 +733,10 @@ fn daily_sums_stacked_are_one_long_run() {
     feed(midnight..ROWS, &mut second);
 
     let want = solve(&long.1.all(&plan()));
-    let stored = [&first.1, &second.1].map(|c| Stored::new(&layout(), &plan(), &[], &c.sums.total));
+    let named = |name: &String| Coefficient { name: name.clone(), ..Coefficient::default() };
+    let coefficients: Vec<Coefficient> = layout().coefficients.iter().map(named).collect();
+    let declared = Declared { coefficients, ..Declared::default() };
+    let stored = [&first.1, &second.1].map(|c| Stored::new(&layout(), &plan(), declared.clone(), &c.sums.total));
     let text = stored.map(|s| serde_json::to_string(&s).expect("JSON"));
     let days: Vec<Stored> = text.iter().map(|t| serde_json::from_str(t).expect("our own")).collect();
     let (_, _, stacked) = Stored::stack(&days).expect("two days");

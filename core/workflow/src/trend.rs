@@ -100,7 +100,8 @@ pub fn trend(archive: &Archive, options: &Options, expected: bool) -> Result<Tre
         products.push((row.day.parse::<NaiveDate>().unwrap_or(options.first), row, product));
     }
     products.sort_by_key(|(day, ..)| *day);
-    let Some((first, row, newest)) = products.first().map(|(day, row, product)| (*day, row.clone(), product.clone())) else {
+    let Some((first, row, newest)) = products.first().map(|(day, row, product)| (*day, row.clone(), product.clone()))
+    else {
         return Err(WorkflowError::NoProduct);
     };
     let events = Declared::read(options)?.events(&row.spacecraft)?;
@@ -246,9 +247,8 @@ mod tests {
     fn the_line_is_that_of_least_squares() {
         let points = [(0.0, 1.0, 0.5), (1.0, 2.5, 1.0), (3.0, 2.0, 0.25), (4.0, 4.0, 2.0)]
             .map(|(t, value, sigma)| (t, Measured { value, sigma }));
-        let sum = |f: &dyn Fn(f64, f64) -> f64| -> f64 {
-            points.iter().map(|(t, m)| f(*t, m.value) / m.sigma.powi(2)).sum()
-        };
+        let sum =
+            |f: &dyn Fn(f64, f64) -> f64| -> f64 { points.iter().map(|(t, m)| f(*t, m.value) / m.sigma.powi(2)).sum() };
         let (s, st, stt) = (sum(&|_, _| 1.0), sum(&|t, _| t), sum(&|t, _| t * t));
         let (sy, sty) = (sum(&|_, y| y), sum(&|t, y| t * y));
         let det = s * stt - st * st;
@@ -265,12 +265,8 @@ mod tests {
     }
 
     fn series(values: impl Iterator<Item = f64>) -> Series {
-        let point = |(k, value)| Point {
-            day: day(k),
-            measured: Measured { value, sigma: 1.0 },
-            predicted: None,
-            sigmas: None,
-        };
+        let point =
+            |(k, value)| Point { day: day(k), measured: Measured { value, sigma: 1.0 }, predicted: None, sigmas: None };
         let points = (0..).zip(values).map(point).collect();
         Series { name: "com-offset.tm1.x".into(), unit: "m".into(), frame: String::new(), points }
     }

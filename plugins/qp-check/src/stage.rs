@@ -7,9 +7,7 @@ use nalgebra::DMatrix;
 use serde_json::json;
 
 use dragfree_estimation::collected::Collected;
-use dragfree_estimation::estimate::{
-    Bound, Estimate as Solution, Method, Observed, Refinement,
-};
+use dragfree_estimation::estimate::{Bound, Estimate as Solution, Method, Observed, Refinement};
 use dragfree_estimation::free_levels::{WithLevels, log_determinant, solve};
 use dragfree_estimation::levels::Level as NoiseLevel;
 use dragfree_estimation::prediction::Prediction;

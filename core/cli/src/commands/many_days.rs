@@ -134,7 +134,9 @@ pub(super) fn trend(command: &TrendCommand, json: bool, paint: Paint) -> Result<
     if json {
         return Ok(Done { code, ..Done::json(&serde_json::to_value(&trend)?) });
     }
-    let (Some(first), Some(last)) = (trend.days.first(), trend.days.last()) else { return Ok(Done::new(String::new())) };
+    let (Some(first), Some(last)) = (trend.days.first(), trend.days.last()) else {
+        return Ok(Done::new(String::new()));
+    };
     let days = format!("{} days of {} from {} to {}", trend.days.len(), trend.spacecraft, first.day, last.day);
     let mut text = text::labelled("days", &days);
     let row = |series: &Series| {
@@ -167,7 +169,8 @@ pub(super) fn trend(command: &TrendCommand, json: bool, paint: Paint) -> Result<
 
 /// One row for each coefficient of each day.
 fn csv(trend: &Trend) -> String {
-    let mut text = "day,product,verdict,coefficient,unit,frame,value,sigma,predicted,predicted_sigma,sigmas\n".to_owned();
+    let mut text =
+        "day,product,verdict,coefficient,unit,frame,value,sigma,predicted,predicted_sigma,sigmas\n".to_owned();
     for series in &trend.coefficients {
         for point in &series.points {
             let of_day = trend.days.iter().find(|day| day.day == point.day);

@@ -302,8 +302,14 @@ fn of_products(archive: &Archive, rows: Vec<Row>, declared: Declared) -> Result<
     let stretches = stretches(&calendar, &days, &borders, origin)?;
     let settings = days[&last].1.settings.clone();
     let (layout, plan) = (&like.layout, &like.plan());
-    let all =
-        ManyDays { layout, plan, declared: &like.declared, settings: &settings, stretches: &stretches, length_days: (last + 1 - first) as f64 };
+    let all = ManyDays {
+        layout,
+        plan,
+        declared: &like.declared,
+        settings: &settings,
+        stretches: &stretches,
+        length_days: (last + 1 - first) as f64,
+    };
     let mut courses = steps(&like, &borders);
     if days.len() >= LEAST_DAYS && !declared.constant {
         courses.extend(rates(&like));
@@ -326,9 +332,11 @@ fn of_products(archive: &Archive, rows: Vec<Row>, declared: Declared) -> Result<
     let mut notes = Vec::new();
     let within = |e: &&Event| (start_of_day_ns(first)..start_of_day_ns(last + 1)).contains(&e.time_ns);
     let lone = events.iter().filter(within).filter(|e| !borders.iter().any(|b| b.events.contains(e)));
-    notes.extend(lone.map(|e| {
-        format!("{} at {}: there are no days on both sides of it, so no step is estimated", e.kind, e.time)
-    }));
+    notes.extend(
+        lone.map(|e| {
+            format!("{} at {}: there are no days on both sides of it, so no step is estimated", e.kind, e.time)
+        }),
+    );
     let reported = Reported { days: &days, borders: &borders, origin, last, false_alarm: settings.false_alarm };
     Ok(Joint {
         spacecraft,
@@ -549,7 +557,7 @@ impl Reported<'_> {
     /// Times between the last day before a step and the first one after it.
     fn step_ns(&self, after: usize) -> i64 {
         let middles = self.borders[after].events.iter().map(|e| e.time_ns);
-        middles.last().unwrap_or_else(|| start_of_day_ns(self.borders[after].after))
+        middles.max().unwrap_or_else(|| start_of_day_ns(self.borders[after].after))
     }
 
     /// End of the last day's data, in days after the origin.

@@ -1,8 +1,8 @@
 //! A calibration of many days as a product of the archive, `COM2`, and what it says of a time.
 
 use chrono::{DateTime, Utc};
-use dragfree_archive::product::{self, Coefficient, Product};
 use dragfree_archive::files::IoContext as _;
+use dragfree_archive::product::{self, Coefficient, Product};
 use dragfree_archive::{Archive, ArchiveError, JOINT, MadeOf, Place, ProductWriter, Window, Written, stem};
 use dragfree_engine::EngineError;
 use dragfree_engine::draft::Draft;
@@ -226,9 +226,8 @@ pub fn at(product: &Product, time_ns: i64) -> At {
         Some(covariance) => covariance.names.iter().map(String::as_str).collect(),
         None => adopted.iter().map(|c| c.name.as_str()).collect(),
     };
-    let values = DVector::from_fn(names.len(), |k, _| {
-        adopted.iter().find(|c| c.name == names[k]).map_or(f64::NAN, |c| c.value)
-    });
+    let values =
+        DVector::from_fn(names.len(), |k, _| adopted.iter().find(|c| c.name == names[k]).map_or(f64::NAN, |c| c.value));
     let is_many = product.header.non_standard_attributes.product == JOINT;
     // Values are those at the epoch: what came between is taken off.
     let before_s = (product.result.epoch_ns - time_ns) as f64 * 1e-9;

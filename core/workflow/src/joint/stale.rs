@@ -54,8 +54,7 @@ fn reasons(archive: &Archive, row: &Row, days: &[Row]) -> Result<Vec<String>, Wo
         day.zip(edge(row.asked_from_ns)).zip(edge(row.asked_until_ns)).is_some_and(|((d, a), b)| (a..b).contains(&d))
     };
     let mut reasons = Vec::new();
-    let own: Vec<&Row> =
-        days.iter().filter(|day| day.spacecraft == row.spacecraft && covered(&day.day)).collect();
+    let own: Vec<&Row> = days.iter().filter(|day| day.spacecraft == row.spacecraft && covered(&day.day)).collect();
     let digest = |day: &Row| day.digest.clone().unwrap_or_default();
     for day in own.iter().filter(|day| !known.contains(digest(day).as_str())) {
         reasons.push(format!("{} is new, or has another result", day.id));

@@ -123,13 +123,12 @@ fn told(l: &Lineage, paint: Paint) -> String {
     if let Some(id) = &l.supersedes {
         let _ = writeln!(text, "  in place of {id}");
     }
-    let of_it =
-        [
-            ("superseded by", &l.superseded_by),
-            ("resumed by", &l.resumed_by),
-            ("entered", &l.entered),
-            ("tested on other data by", &l.tested_by),
-        ];
+    let of_it = [
+        ("superseded by", &l.superseded_by),
+        ("resumed by", &l.resumed_by),
+        ("entered", &l.entered),
+        ("tested on other data by", &l.tested_by),
+    ];
     if of_it.iter().any(|(_, ids)| !ids.is_empty()) || !l.certified.is_empty() {
         text += "\nmade of it\n";
     }
