@@ -208,6 +208,9 @@ impl Set<'_> {
     }
 }
 
+/// Error and σ of something of a coefficient, and whether it was seen where that is told.
+type Told = ([f64; 2], Option<bool>);
+
 /// What is said of the sets in VALIDATION.md, and what is outside of its bounds.
 pub(crate) fn table(all: &[Months]) -> (String, Vec<String>) {
     let Some(first) = all.first() else { return ("Not run yet.\n".to_owned(), Vec::new()) };
@@ -224,7 +227,7 @@ pub(crate) fn table(all: &[Months]) -> (String, Vec<String>) {
         first.hours,
         first.build
     );
-    let mut row = |what: &str, truth: &str, factor: f64, of: &dyn Fn(&Course) -> ([f64; 2], Option<bool>)| {
+    let mut row = |what: &str, truth: &str, factor: f64, of: &dyn Fn(&Course) -> Told| {
         let each = || all.iter().flat_map(|m| &m.coefficients).map(of);
         let count = each().count() as f64;
         let rms = (each().map(|([error, sigma], _)| (error / sigma).powi(2)).sum::<f64>() / count).sqrt();

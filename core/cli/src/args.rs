@@ -682,6 +682,8 @@ pub(crate) enum Products {
 pub(crate) enum Format {
     /// A row per coefficient of every solution
     Csv,
+    /// The same as Parquet
+    Parquet,
     /// The offset of each test mass in the text format of GRACE-FO's VCM1B
     Vcm1b,
     /// The whole product

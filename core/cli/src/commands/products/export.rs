@@ -1,5 +1,6 @@
 //! `dragfree products export`.
 
+use super::parquet;
 use crate::args::Format;
 use crate::commands::Done;
 use crate::failure::Failure;
@@ -12,13 +13,17 @@ use std::path::Path;
 
 pub(super) fn execute(name: &str, format: Format, out: Option<&Path>, folder: &Path) -> Result<Done, Failure> {
     let written = super::open(name, folder)?;
-    let text = match format {
-        Format::Csv => csv(&written.product),
-        Format::Vcm1b => vcm1b(&written.product)?,
-        Format::Json => format!("{:#}\n", product::to_json(&written.product, &written.path)),
+    let content = match format {
+        Format::Csv => csv(&written.product).into_bytes(),
+        Format::Vcm1b => vcm1b(&written.product)?.into_bytes(),
+        Format::Json => format!("{:#}\n", product::to_json(&written.product, &written.path)).into_bytes(),
+        Format::Parquet => parquet::coefficients(&written.product)?,
     };
-    let Some(path) = out else { return Ok(Done::new(text)) };
-    std::fs::write(path, text).at("write", path)?;
+    let Some(path) = out else {
+        let text = String::from_utf8(content).ok().filter(|_| format != Format::Parquet);
+        return text.map(Done::new).ok_or_else(|| "a Parquet file is no text; name one with --out FILE".into());
+    };
+    std::fs::write(path, content).at("write", path)?;
     Ok(Done::new(format!("{}\n", path.display())))
 }
 

@@ -3,6 +3,7 @@
 mod certify;
 mod export;
 mod history;
+mod parquet;
 mod verify;
 
 use super::Done;
