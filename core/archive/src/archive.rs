@@ -147,8 +147,8 @@ impl Archive {
             return Ok(());
         }
         if self.writable {
-            for (entry, _) in &new {
-                self.give_names(&entry.event)?;
+            for event in new.iter().flat_map(|(entry, _)| entry.event.each()) {
+                self.give_names(event)?;
             }
             sync_folder(&self.folder).at("flush", &self.folder)?;
         }

@@ -256,11 +256,13 @@ impl Catalogue {
             for (entry, sha256) in entries {
                 // Another program may have entered it in between.
                 if as_i64(entry.number) == applied + 1 {
-                    let product = match &entry.event {
-                        Event::Product { id, sha256, .. } => Some(read(id, sha256)),
-                        _ => None,
-                    };
-                    enter_event(&transaction, entry, product)?;
+                    for event in entry.event.each() {
+                        let product = match event {
+                            Event::Product { id, sha256, .. } => Some(read(id, sha256)),
+                            _ => None,
+                        };
+                        enter_event(&transaction, as_i64(entry.number), event, product)?;
+                    }
                     applied += 1;
                     transaction.execute("UPDATE applied SET number = ?1, sha256 = ?2", params![applied, sha256])?;
                 }
@@ -481,11 +483,12 @@ pub(crate) fn parts(id: &str) -> Option<[&str; 5]> {
 
 fn enter_event(
     connection: &Connection,
-    entry: &JournalEntry,
+    number: i64,
+    event: &Event,
     product: Option<Result<Product, String>>,
 ) -> rusqlite::Result<()> {
-    let number = as_i64(entry.number);
-    match &entry.event {
+    match event {
+        Event::Several { .. } => {} // each is entered by itself
         Event::Product { id, sha256, made_of, places, from_ns, until_ns, run_in_ns } => {
             let [name, day, spacecraft, release, revision] = parts(id).unwrap_or([""; 5]);
             connection.execute(

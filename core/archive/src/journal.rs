@@ -52,6 +52,11 @@ pub enum Event {
         #[serde(default)]
         run_in_ns: i64,
     },
+    /// Several of these at once, none of them `several`.
+    Several {
+        /// In order.
+        events: Vec<Event>,
+    },
     /// A day gave no product.
     Failed {
         /// UTC day.
@@ -127,6 +132,16 @@ pub enum SetState {
     Published,
     /// Not to be used any more.
     Invalidated,
+}
+
+impl Event {
+    /// Itself, or what happened at once.
+    pub(crate) fn each(&self) -> &[Self] {
+        match self {
+            Self::Several { events } => events,
+            one => std::slice::from_ref(one),
+        }
+    }
 }
 
 impl SetState {

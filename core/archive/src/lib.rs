@@ -24,6 +24,7 @@ mod objects;
 pub mod product;
 mod staging;
 mod sums;
+mod take_over;
 mod writer;
 
 pub use archive::Archive;
@@ -33,6 +34,7 @@ pub use events::Window;
 pub use journal::{Event, InputPlace, JournalEntry, SetState, Stamp, Stored};
 pub use migrate::{Migrated, migrate};
 pub use product::{EXTRACT, JOINT, STATE};
+pub use sums::Sums;
 pub use writer::{MadeOf, ProductWriter, Written};
 
 use files::IoError;

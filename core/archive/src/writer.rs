@@ -13,7 +13,7 @@ use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 /// Revisions have four digits.
-const LAST_REVISION: u32 = 9999;
+pub(crate) const LAST_REVISION: u32 = 9999;
 
 /// A product and where it lies.
 #[derive(Clone, Debug)]

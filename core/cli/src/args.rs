@@ -6,6 +6,7 @@ use crate::utc;
 use chrono::NaiveDate;
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
 use dragfree_workflow::operations::Operations;
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
 /// Epochs that plugins are handed at a time unless the command line says otherwise.
@@ -96,6 +97,9 @@ pub(crate) enum Command {
     /// The products of an archive
     #[command(subcommand)]
     Products(Products),
+    /// Many days by many workers: on this machine, by Dask, or as a Slurm array
+    #[command(subcommand)]
+    Campaign(Campaign),
     /// One calibration of many days from the sums that their products hold, with rates, and steps at events
     Joint(Joint),
     /// Values of days with their errors, and the days that leave what those before them predict
@@ -771,6 +775,52 @@ pub(crate) struct List {
     /// Only the newest of each day that holds: not withdrawn, not in disagreement, no test on data kept out of a fit
     #[arg(long)]
     pub(crate) latest: bool,
+}
+
+#[derive(Debug, Subcommand)]
+pub(crate) enum Campaign {
+    /// List the tasks of a campaign: one JSON document a line, in DIR/plan.jsonl
+    Plan {
+        /// What the campaign is to do
+        #[arg(value_name = "SPEC.toml")]
+        spec: PathBuf,
+        /// Folder of the campaign, which all workers see
+        #[arg(long, value_name = "DIR")]
+        out: PathBuf,
+    },
+    /// Do one task, or give the result that is there
+    Task {
+        /// Folder of the campaign
+        #[arg(value_name = "DIR")]
+        folder: PathBuf,
+        /// Its id
+        #[arg(value_name = "ID", required_unless_present = "number")]
+        id: Option<String>,
+        /// Its line in the plan, from 1, in place of the id: for job arrays
+        #[arg(long, value_name = "N", conflicts_with = "id")]
+        number: Option<usize>,
+    },
+    /// Do all tasks that have no result on this machine
+    Run {
+        /// Folder of the campaign
+        #[arg(value_name = "DIR")]
+        folder: PathBuf,
+        /// Tasks at a time [default: as many as the machine has processors]
+        #[arg(long, value_name = "N")]
+        local: Option<NonZeroUsize>,
+    },
+    /// Take the results over into the archive, all of them in one step
+    Commit {
+        /// Folder of the campaign
+        #[arg(value_name = "DIR")]
+        folder: PathBuf,
+    },
+    /// How far the campaign has come
+    Status {
+        /// Folder of the campaign
+        #[arg(value_name = "DIR")]
+        folder: PathBuf,
+    },
 }
 
 /// What can be done with a model file.

@@ -84,4 +84,19 @@ mod tests {
         }
         assert_eq!(shifted.spectra.expected, [3.0]);
     }
+
+    /// Days added in another order have other bits: why sums of many days are added in a tree whose shape is fixed.
+    #[test]
+    fn the_order_of_addition_shows() {
+        let days: Vec<Moments> = (1..=8).map(|k| day(0.1 * f64::from(k), 0.3 * f64::from(k))).collect();
+        let add = |order: &[usize]| {
+            let mut sum = Moments::default();
+            order.iter().for_each(|k| sum.add(&days[*k]));
+            sum
+        };
+        let forward = add(&[0, 1, 2, 3, 4, 5, 6, 7]);
+        assert_eq!(forward, add(&[0, 1, 2, 3, 4, 5, 6, 7]));
+        let orders = [[7, 6, 5, 4, 3, 2, 1, 0], [3, 0, 6, 1, 7, 2, 5, 4], [4, 5, 6, 7, 0, 1, 2, 3]];
+        assert!(orders.iter().any(|order| add(order) != forward));
+    }
 }

@@ -4,6 +4,7 @@
 
 mod answer;
 pub mod calibrate;
+pub mod campaign;
 pub mod compare;
 mod days;
 pub mod diagnose;
@@ -55,6 +56,9 @@ pub enum WorkflowError {
     /// What a mission's file of operations says cannot be followed.
     #[error("{}: {what}", path.display())]
     Operations { path: PathBuf, what: String },
+    /// A campaign that cannot be planned, or a task of it that cannot be done here.
+    #[error("{0}")]
+    Campaign(String),
     /// A file of events that cannot be used.
     #[error("{}: {what}", path.display())]
     Events { path: PathBuf, what: String },

@@ -1,5 +1,6 @@
 //! One function per command; each gives back what belongs on stdout.
 
+mod campaign;
 mod compare;
 mod days;
 mod demo;
@@ -65,6 +66,7 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
         Command::CatchUp(command) => days::catch_up(command, global, paint),
         Command::Watch(command) => days::watch(command, global, paint),
         Command::Products(command) => products::execute(command, global, paint),
+        Command::Campaign(command) => campaign::execute(command, global, paint),
         Command::Joint(command) => many_days::joint(command, global.json, paint),
         Command::Trend(command) => many_days::trend(command, global.json, paint),
         Command::At(command) => products::at(command, global.json, paint),

@@ -6,9 +6,11 @@
 //! changes the nodes above it, one of each length. Nodes of 8, 64, 512 … days are kept in the archive.
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 
-use dragfree_archive::Archive;
 use dragfree_archive::files::sha256;
+use dragfree_archive::product::Product;
+use dragfree_archive::{Archive, Sums};
 use dragfree_engine::EngineError;
 use dragfree_estimation::moments::Moments;
 use dragfree_estimation::spectra::Spectra;
@@ -16,6 +18,7 @@ use dragfree_estimation::stored::Stored;
 use serde::{Deserialize, Serialize};
 
 use crate::WorkflowError;
+use crate::days::{DAY_NS, start_of_day_ns};
 
 /// Nodes of every so many levels are kept; those between them are added again from at most 2³ kept ones.
 const KEPT_LEVELS: u32 = 3;
@@ -27,11 +30,13 @@ const MOST_LEVELS: u32 = 20;
 const FORMAT: &str = "dragfree-sums/1";
 
 /// Suffix of a product's sums.
-pub(crate) const SUMS: &str = "neq.json";
+const SUMS: &str = "neq.json";
 
 /// The sums of a day.
 #[derive(Clone, Debug)]
 pub(crate) struct Leaf {
+    /// Archive of the day's product.
+    archive: PathBuf,
     /// The day's product.
     pub(crate) product: String,
     /// Digest of its sums.
@@ -49,24 +54,42 @@ struct KeptDay {
 }
 
 /// Days by their number, with their sums.
-pub(crate) struct Calendar<'a> {
-    pub(crate) archive: &'a Archive,
+pub(crate) struct Calendar {
+    pub(crate) kept: Sums,
     pub(crate) days: BTreeMap<i64, Leaf>,
 }
 
 /// 2^level days from `index · 2^level` on.
-#[derive(Clone, Copy)]
-struct Node {
-    level: u32,
-    index: i64,
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Node {
+    pub(crate) level: u32,
+    pub(crate) index: i64,
 }
 
 impl Node {
-    fn first(self) -> i64 {
+    /// Nodes that are kept, shorter ones first, of days from `first` to `last`.
+    pub(crate) fn kept(first: i64, last: i64) -> Vec<Self> {
+        let mut nodes = Vec::new();
+        for level in (KEPT_LEVELS..MOST_LEVELS).step_by(KEPT_LEVELS as usize) {
+            let (from, to) = (first >> level, last >> level);
+            nodes.extend((from..=to).map(|index| Self { level, index }));
+            if from == to {
+                break;
+            }
+        }
+        nodes
+    }
+
+    /// Whether a kept node is one of those that it is made of.
+    pub(crate) fn made_of(self, other: Self) -> bool {
+        other.level + KEPT_LEVELS == self.level && other.index >> KEPT_LEVELS == self.index
+    }
+
+    pub(crate) fn first(self) -> i64 {
         self.index << self.level
     }
 
-    fn end(self) -> i64 {
+    pub(crate) fn end(self) -> i64 {
         (self.index + 1) << self.level
     }
 
@@ -79,12 +102,36 @@ impl Node {
     }
 }
 
-impl Calendar<'_> {
+impl Leaf {
+    /// Of the product of a day.
+    pub(crate) fn new(archive: &Archive, day: i64, product: &Product) -> Result<Self, WorkflowError> {
+        let Some(sums) = product.attachments.iter().find(|a| a.suffix == SUMS) else {
+            let what = "no stage of its pipeline leaves sums (`qp-check` does)".to_owned();
+            return Err(WorkflowError::Reference { path: archive.path_of(product.id()), what });
+        };
+        let attributes = &product.header.non_standard_attributes;
+        let middle_ns = i64::midpoint(attributes.start_time_epoch_ns, attributes.stop_time_epoch_ns);
+        Ok(Self {
+            archive: archive.folder().to_owned(),
+            product: product.id().to_owned(),
+            sha256: sums.sha256.clone(),
+            after_noon_days: (middle_ns - start_of_day_ns(day) - DAY_NS / 2) as f64 / DAY_NS as f64,
+        })
+    }
+
+    /// The product's file.
+    pub(crate) fn path(&self) -> PathBuf {
+        self.archive.join(format!("{}.toml", self.product))
+    }
+}
+
+impl Calendar {
     /// The sums of a day as its product has them.
     pub(crate) fn stored(&self, day: i64) -> Result<Stored, WorkflowError> {
         let leaf = &self.days[&day];
-        let text = self.archive.read_file(&leaf.product, SUMS).map_err(EngineError::from)?;
-        let path = self.archive.path_of(&leaf.product).with_extension(SUMS);
+        let read = || Archive::open(&leaf.archive)?.read_file(&leaf.product, SUMS);
+        let text = read().map_err(EngineError::from)?;
+        let path = leaf.path().with_extension(SUMS);
         Stored::of_equations(&text).map_err(|e| WorkflowError::Reference { path, what: e.to_string() })
     }
 
@@ -119,7 +166,7 @@ impl Calendar<'_> {
     }
 
     /// The sums of a node about its middle; none where it has no day.
-    fn node(&self, node: Node) -> Result<Option<Moments>, WorkflowError> {
+    pub(crate) fn node(&self, node: Node) -> Result<Option<Moments>, WorkflowError> {
         let days: Vec<(&i64, &Leaf)> = self.days.range(node.first()..node.end()).collect();
         if days.is_empty() {
             return Ok(None);
@@ -153,12 +200,12 @@ impl Calendar<'_> {
     }
 
     fn kept<T: for<'de> Deserialize<'de>>(&self, key: &str) -> Option<T> {
-        postcard::from_bytes(&self.archive.sums(key)?).ok()
+        postcard::from_bytes(&self.kept.get(key)?).ok()
     }
 
     fn keep(&self, key: &str, what: &impl Serialize) {
         if let Ok(content) = postcard::to_stdvec(what) {
-            self.archive.keep_sums(key, &content);
+            self.kept.keep(key, &content);
         }
     }
 }

@@ -7,7 +7,7 @@
 //! Rates are estimated whether they stand out or not. One that is left out because it does not may be as large as twice
 //! its σ or more, and would be an error of several σ at either end of the time, and of every step.
 
-mod calendar;
+pub(crate) mod calendar;
 mod events;
 mod product;
 mod stale;
@@ -294,7 +294,7 @@ fn of_products(archive: &Archive, rows: Vec<Row>, declared: Declared) -> Result<
     };
 
     let inputs = inputs(&days);
-    let calendar = Calendar { archive, days: leaves(archive, &days)? };
+    let calendar = Calendar { kept: archive.sums(), days: leaves(archive, &days)? };
     let like = calendar.stored(first)?;
     same_make(&calendar, first, &like)?;
     let origin = 0.5 * (first + last + 1) as f64;
@@ -411,26 +411,12 @@ fn inputs(days: &Products) -> Vec<Input> {
 }
 
 fn leaves(archive: &Archive, days: &Products) -> Result<BTreeMap<i64, Leaf>, WorkflowError> {
-    let mut leaves = BTreeMap::new();
-    for (number, (row, product)) in days {
-        let sums = product.attachments.iter().find(|a| a.suffix == calendar::SUMS);
-        let Some(sums) = sums else {
-            let path = archive.path_of(&row.id);
-            let what = "no stage of its pipeline leaves sums (`qp-check` does)".to_owned();
-            return Err(WorkflowError::Reference { path, what });
-        };
-        let attributes = &product.header.non_standard_attributes;
-        let (from, until) = (attributes.start_time_epoch_ns, attributes.stop_time_epoch_ns);
-        let middle_ns = from + (until - from) / 2;
-        let after_noon_days = (middle_ns - start_of_day_ns(*number) - DAY_NS / 2) as f64 / DAY_NS as f64;
-        leaves.insert(*number, Leaf { product: row.id.clone(), sha256: sums.sha256.clone(), after_noon_days });
-    }
-    Ok(leaves)
+    days.iter().map(|(day, (_, product))| Ok((*day, Leaf::new(archive, *day, product)?))).collect()
 }
 
 /// Whether the sums of all days can be added.
-fn same_make(calendar: &Calendar<'_>, first: i64, like: &Stored) -> Result<(), WorkflowError> {
-    let path = |day: i64| calendar.archive.path_of(&calendar.days[&day].product);
+fn same_make(calendar: &Calendar, first: i64, like: &Stored) -> Result<(), WorkflowError> {
+    let path = |day: i64| calendar.days[&day].path();
     if like.declared.coefficients.is_empty() {
         let what = "its sums are of an earlier version, without ranges and surveys: run the day again".to_owned();
         return Err(WorkflowError::Reference { path: path(first), what });
@@ -482,7 +468,7 @@ fn stretch_of(borders: &[Border], day: i64) -> usize {
 }
 
 fn stretches(
-    calendar: &Calendar<'_>,
+    calendar: &Calendar,
     days: &Products,
     borders: &[Border],
     origin: f64,
@@ -521,7 +507,7 @@ fn rates(like: &Stored) -> Vec<Course> {
 }
 
 fn scores(
-    calendar: &Calendar<'_>,
+    calendar: &Calendar,
     all: &ManyDays<'_>,
     solution: &many::Joint,
     borders: &[Border],

@@ -12,15 +12,15 @@ use dragfree_engine::border::Kind;
 use dragfree_engine::config::{Mission, Model, Pipeline};
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::{Progress, RunOptions, run};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeSet;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 /// A day is whole when no more than this is missing at either end of it, ns.
 const EDGE_NS: i64 = 1_000_000_000;
 
 /// A day with telemetry.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Day {
     /// UTC day.
     pub day: NaiveDate,
@@ -33,7 +33,7 @@ pub struct Day {
 }
 
 /// A day that is to be run.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Planned {
     /// What is said of it.
     pub day: Day,
@@ -205,22 +205,61 @@ impl<'a> Planner<'a> {
         all
     }
 
-    /// Runs a day. A day that gives no product is noted in the archive, so that the next one goes on.
+    /// A digest of pipeline, mission, model and of the plugins that are installed.
+    pub fn configuration_digest(&self) -> String {
+        let mut all: Vec<String> = self.configuration.iter().map(|(_, sha256)| sha256.clone()).collect();
+        all.extend(self.libraries().into_iter().map(|(_, sha256)| sha256));
+        sha256(all.join("\n"))
+    }
+
+    /// A day with telemetry of its own, in place of that of the inbox.
+    pub fn with_files(&self, day: NaiveDate, files: Vec<PathBuf>, whole: bool) -> Planned {
+        let day = Day { day, product: None, reasons: Vec::new(), failed: None };
+        Planned { day, files, whole, stream: Stream::Test, tried_with: self.configuration_digest() }
+    }
+
+    /// The mission file.
+    pub fn mission(&self) -> Option<&PathBuf> {
+        self.options.mission.as_ref()
+    }
+
+    /// Data before a day that settle the stages before the estimators, ns.
+    pub fn run_in_ns(&self) -> i64 {
+        self.operations.run_in_ns
+    }
+
+    /// Runs a day into an archive of its own.
     ///
     /// # Errors
-    /// The archive cannot be written, or somebody asked to stop.
-    pub fn run(&self, planned: &Planned, progress: &mut dyn FnMut(Progress)) -> Result<Ran, WorkflowError> {
-        let day = planned.day.day;
-        let start = start_ns(day);
-        let options = RunOptions {
+    /// The run fails.
+    pub fn run_apart(
+        &self,
+        planned: &Planned,
+        archive: &Path,
+        progress: &mut dyn FnMut(Progress),
+    ) -> Result<Written, EngineError> {
+        run(self.registry, &RunOptions { archive: archive.to_owned(), ..self.of(planned) }, progress)
+    }
+
+    fn of(&self, planned: &Planned) -> RunOptions {
+        let start = start_ns(planned.day.day);
+        RunOptions {
             files: planned.files.clone(),
             from_ns: Some(start),
             until_ns: Some(start + DAY_NS),
             stream: planned.stream,
             status: if planned.whole { Status::Final } else { Status::Quicklook },
             ..self.options.clone()
-        };
-        match run(self.registry, &options, progress) {
+        }
+    }
+
+    /// Runs a day. A day that gives no product is noted in the archive, so that the next one goes on.
+    ///
+    /// # Errors
+    /// The archive cannot be written, or somebody asked to stop.
+    pub fn run(&self, planned: &Planned, progress: &mut dyn FnMut(Progress)) -> Result<Ran, WorkflowError> {
+        let day = planned.day.day;
+        match run(self.registry, &self.of(planned), progress) {
             Ok(written) => Ok(Ran { day, outcome: Outcome::Product(Box::new(written)) }),
             Err(stopped @ (EngineError::Stopped | EngineError::Archive(_))) => Err(stopped.into()),
             Err(error) => {

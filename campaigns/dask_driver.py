@@ -1,0 +1,45 @@
+"""Does the tasks of a campaign on a Dask cluster: dask_driver.py DIR [--scheduler ADDRESS] [--commit]
+
+DIR is a folder with a plan, made by `dragfree campaign plan`, that all workers see under the same name; every worker
+needs the `dragfree` that planned it on its PATH. Without an address, two workers are started on this machine. The
+scheduler keeps nothing that matters: whatever is killed, the next run does what has no result yet.
+"""
+
+import argparse
+import json
+import pathlib
+import subprocess
+
+from dask.distributed import Client, LocalCluster, as_completed
+
+
+def do(argv, *_results_before):
+    """One task: its command, with the error text where it fails."""
+    done = subprocess.run([*argv, "--quiet", "--json"], capture_output=True, text=True)
+    if done.returncode != 0:
+        raise RuntimeError(done.stderr.strip())
+    return json.loads(done.stdout)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=pathlib.Path)
+    parser.add_argument("--scheduler", help="address of a scheduler, tcp://host:8786")
+    parser.add_argument("--commit", action="store_true", help="take the results over at the end")
+    arguments = parser.parse_args()
+    cluster = arguments.scheduler or LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+    with Client(cluster) as client:
+        futures = {}
+        for line in (arguments.folder / "plan.jsonl").read_text().splitlines():
+            task = json.loads(line)
+            # The key is the task's id: two clients that submit one plan do each task once.
+            before = [futures[id] for id in task["after"]]
+            futures[task["id"]] = client.submit(do, task["argv"], *before, key=task["id"], retries=3, pure=True)
+        for count, (_, result) in enumerate(as_completed(futures.values(), with_results=True), 1):
+            print(f"{count} of {len(futures)}  {result['id']}  {result['digest']}", flush=True)
+    if arguments.commit:
+        subprocess.run(["dragfree", "campaign", "commit", arguments.folder], check=True)
+
+
+if __name__ == "__main__":
+    main()
