@@ -47,7 +47,7 @@ static FLOWN: LazyLock<TempDir> = LazyLock::new(|| {
         std::fs::rename(dir.path().join(&out).join(&name), dir.path().join("telemetry").join(&name)).expect("moved");
     }
     expect(dragfree(dir.path()).args(["catch-up", "-q"]), 0);
-    std::fs::write(dir.path().join("events.yaml"), EVENTS).expect("written");
+    std::fs::write(dir.path().join("log.yaml"), EVENTS).expect("written");
     dir
 });
 
@@ -71,7 +71,7 @@ impl Mission {
 
     /// The calibration of all days with the trim.
     fn joint(&self) -> Value {
-        self.json("joint 2035-01-01..2035-01-08 --events events.yaml --step MTEA=com-offset --constant", 0)
+        self.json("joint 2035-01-01..2035-01-08 --events log.yaml --step MTEA=com-offset --constant", 0)
     }
 
     /// Digest of the newest calibration of many days.
@@ -209,9 +209,9 @@ fn a_day_with_an_event_in_it_is_left_out() {
     let mission = Mission::flown();
     let write = |time: &str| {
         let text = EVENTS.replace("2035-01-05 00:00:00 UTC", time);
-        std::fs::write(mission.path().join("events.yaml"), text).expect("written");
+        std::fs::write(mission.path().join("log.yaml"), text).expect("written");
     };
-    let ask = "joint 2035-01-01..2035-01-08 --events events.yaml --step MTEA=com-offset --dry-run";
+    let ask = "joint 2035-01-01..2035-01-08 --events log.yaml --step MTEA=com-offset --dry-run";
     write("2035-01-05 01:00:00 UTC");
     let joint = mission.json(ask, 0);
     assert_eq!(joint["left_out"][0]["day"], "2035-01-05");
@@ -229,7 +229,7 @@ fn a_day_with_an_event_in_it_is_left_out() {
     let joint: Value = serde_json::from_slice(&ran.stdout).expect("JSON");
     assert!(joint["notes"][0].as_str().is_some_and(|note| note.contains("both sides")), "{}", joint["notes"]);
     write("a Friday");
-    assert!(mission.refusal(ask).contains("events.yaml: the time \"a Friday\""));
+    assert!(mission.refusal(ask).contains("log.yaml: the time \"a Friday\""));
 }
 
 /// Sums of different make are refused by the day that differs, and in what.
@@ -277,7 +277,7 @@ fn the_trend_alarms_at_a_step_until_it_is_declared() {
     let missing = trend["alerts"].as_array().expect("alerts").iter().find(|a| a["day"] == "2035-01-03");
     assert!(missing.is_some_and(|a| a["what"].as_str().is_some_and(|w| w.starts_with("no product"))));
 
-    let declared = "trend 2035-01-01..2035-01-08 --events events.yaml --step MTEA=com-offset";
+    let declared = "trend 2035-01-01..2035-01-08 --events log.yaml --step MTEA=com-offset";
     let trend = mission.json(&format!("{declared} --csv t.csv --picture t.svg"), 4);
     assert!(alerts(&trend, "com-offset.tm1.x").is_empty(), "{}", trend["alerts"]);
     let csv = std::fs::read_to_string(mission.path().join("t.csv")).expect("a table");

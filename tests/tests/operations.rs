@@ -225,4 +225,14 @@ fn a_command_of_the_operators_is_run_for_a_loss_of_data() {
     assert_eq!(output.status.code(), Some(3), "{}", String::from_utf8_lossy(&output.stderr));
     let told = std::fs::read_to_string(mission.path().join("told")).expect("the command was run");
     assert_eq!(told.trim(), "COM1B_2035-01-02_SC1_01_0001 2035-01-02");
+    // From elsewhere, the file of operations names the archive; beside --archive it would be a second answer.
+    let elsewhere = tempfile::tempdir().expect("a temporary folder");
+    let list = || {
+        let mut command = dragfree(elsewhere.path());
+        command.args(["products", "list", "--json", "--ops"]).arg(&ops);
+        command
+    };
+    assert_eq!(json(&mut list(), 0)["products"][0]["id"], "COM1B_2035-01-02_SC1_01_0001");
+    expect(list().args(["--archive", "archive"]), 2);
+    expect(dragfree(elsewhere.path()).args(["products", "list"]), 1);
 }

@@ -62,6 +62,7 @@ fn layout(root: &Path, workspace: &Workspace) -> Result<Tree, Failure> {
     for page in ["README.md", "CHANGELOG.md", "VALIDATION.md"] {
         tree.copy(&root.join(page), &format!("share/doc/dragfree/{page}"))?;
     }
+    tree.copy(&root.join("campaigns"), "share/dragfree/campaigns")?;
     tree.copy(&root.join("ops-guide/src"), "share/doc/dragfree/guide")?;
     tree.copy(
         &root.join("fixtures/ephemeris/LICENSE-naif-packages.txt"),

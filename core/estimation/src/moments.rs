@@ -1,8 +1,8 @@
 //! Sums of several days with the powers of time that a rate needs.
 //!
-//! A coefficient that changes at a constant rate acts through its series and through the series times the time. Cross-
-//! spectra of these are the cross-spectra of the series summed over days with weights 1, t and t², t in days. So what is
-//! kept of some days is three sums, whatever their number, and any of their coefficients may have a rate.
+//! A coefficient that changes at a constant rate acts through its series and through the series times the time. The
+//! cross-spectra of both are those of the series, summed over days with weights 1, t and t², t in days. So what is kept
+//! of some days is three sums, whatever their number, and any of their coefficients may have a rate.
 
 use crate::spectra::Spectra;
 

@@ -15,33 +15,13 @@ use std::path::Path;
 const PIPELINE: &str = "science-mode";
 
 /// The file of operations of a new mission.
-const OPERATIONS: &str = "\
-# Where the parts of the mission lie; paths are relative to this file. In this folder and the ones below, `dragfree day`,
-# `catch-up`, `watch`, `products`, `joint`, `trend` and `at` find it by themselves; from elsewhere name it with --ops.
+const OPERATIONS: &str = include_str!("../../../../fixtures/operations/mission-ops.toml");
 
-[operations]
-pipeline = \"pipeline.toml\"
-mission = \"mission.toml\"
-model = \"model.toml\"
-archive = \"archive\"
+/// A campaign of a new mission.
+const CAMPAIGN: &str = include_str!("../../../../fixtures/operations/campaign.toml");
 
-# Telemetry: any number of patterns. Files may come late, twice, in pieces and in any order.
-inbox = [\"telemetry/*.mcap\"]
-
-# Data before a day that settle the stages before the estimators; they are no part of the day's product.
-run_in_hours = 1.0
-
-# Events of the spacecraft, a list in YAML as JPL's of GRACE-FO; `joint` estimates the steps of coefficients there:
-# events = \"events.yaml\"
-
-# Commands of yours, run by `sh` in this folder, with DRAGFREE_PRODUCT, DRAGFREE_PRODUCT_PATH and DRAGFREE_DAY set:
-# on_data_loss = \"...\"        # a product with loss of data (exit code 3)
-# on_inconsistent = \"...\"     # a product whose model contradicts the data (exit code 4)
-
-# Kinds of events, and the effect whose coefficients each changes:
-# [operations.steps]
-# MTEA = \"com-offset\"
-";
+/// The file of events of a new mission.
+const EVENTS: &str = include_str!("../../../../fixtures/operations/events.yaml");
 
 pub(super) fn execute(init: &Init, json: bool) -> Result<Done, Failure> {
     let read = |path: &Path| std::fs::read_to_string(path).at("read", path);
@@ -84,6 +64,8 @@ pub(super) fn execute(init: &Init, json: bool) -> Result<Done, Failure> {
             ),
         ),
         (operations::NAME, OPERATIONS.to_owned()),
+        ("events.yaml", EVENTS.to_owned()),
+        ("campaign.toml", CAMPAIGN.to_owned()),
     ];
     std::fs::create_dir_all(&init.folder).at("make the folder", &init.folder)?;
     let places = texts.each_ref().map(|(file, _)| init.folder.join(file));

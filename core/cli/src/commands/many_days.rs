@@ -29,7 +29,8 @@ fn options(days: &Days) -> Result<Options, Failure> {
     };
     if let Some(operations) = operations {
         options.events = options.events.or(operations.events);
-        options.steps.extend(operations.steps);
+        let more = operations.steps.into_iter().filter(|step| !options.steps.contains(step)).collect::<Vec<_>>();
+        options.steps.extend(more);
     }
     Ok(options)
 }
@@ -206,14 +207,19 @@ fn picture(trend: &Trend) -> Result<String, Failure> {
             series.points.iter().map(move |p| (days(p.day), (p.measured.value + k * p.measured.sigma) * factor))
         };
         let band: Vec<(f64, f64)> = with(1.0).chain(with(-1.0).collect::<Vec<_>>().into_iter().rev()).collect();
-        let predicted = series.points.iter().filter_map(|p| Some((days(p.day), p.predicted?.value * factor)));
+        // A line ends where a day has no prediction, as after an event.
+        let stretches = series.points.split(|p| p.predicted.is_none()).filter(|stretch| !stretch.is_empty());
+        let predicted = stretches.map(|stretch| {
+            stretch.iter().filter_map(|p| Some((days(p.day), p.predicted?.value * factor))).collect::<Vec<_>>()
+        });
         let all: Vec<f64> = band.iter().map(|(_, y)| *y).collect();
         let (low, high) = all.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), y| (a.min(*y), b.max(*y)));
-        let mut lines = vec![
-            Line::new("value ± σ", 0, Stroke::Area, band),
-            Line::new("", 0, Stroke::Solid, with(0.0).collect()),
-            Line::new("predicted", 1, Stroke::Dashed, predicted.collect()),
-        ];
+        let mut lines =
+            vec![Line::new("value ± σ", 0, Stroke::Area, band), Line::new("", 0, Stroke::Solid, with(0.0).collect())];
+        for (number, stretch) in predicted.enumerate() {
+            let label = if number == 0 { "predicted" } else { "" };
+            lines.push(Line::new(label, 1, Stroke::Dashed, stretch));
+        }
         let margin = 0.05 * (high - low).max(f64::MIN_POSITIVE);
         let events = trend.events.iter().filter(|e| e.changes(&series.name));
         for (number, event) in events.enumerate() {

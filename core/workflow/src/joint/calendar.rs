@@ -106,7 +106,7 @@ impl Leaf {
     /// Of the product of a day.
     pub(crate) fn new(archive: &Archive, day: i64, product: &Product) -> Result<Self, WorkflowError> {
         let Some(sums) = product.attachments.iter().find(|a| a.suffix == SUMS) else {
-            let what = "no stage of its pipeline leaves sums (`qp-check` does)".to_owned();
+            let what = "no stage of its pipeline leaves sums".to_owned();
             return Err(WorkflowError::Reference { path: archive.path_of(product.id()), what });
         };
         let attributes = &product.header.non_standard_attributes;

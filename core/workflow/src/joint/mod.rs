@@ -1,6 +1,6 @@
 //! One calibration of many days from the sums that their products hold, without telemetry.
 //!
-//! Each day has its own product. Here the days' sums are added ([`calendar`]) and solved once more, with constraints
+//! Each day has its own product. Here the days' sums are added (`calendar`) and solved once more, with constraints
 //! counted once. Every coefficient has a constant rate, and those that a declared event changes have a step there. What
 //! the days say alone is compared with that.
 //!
@@ -111,8 +111,8 @@ pub struct Joint {
     pub same: Agreement,
     /// χ² per degree of freedom of the residuals, with the declared noise.
     pub chi2_per_dof: f64,
-    /// Whether the noise was the same at all times: scatter of the blocks of days over what is expected, and the largest
-    /// that chance allows; none with too few blocks.
+    /// Whether the noise was the same at all times: scatter of the days over what is expected, and the largest that
+    /// chance allows; none with too few days.
     pub scatter: Option<Scatter>,
     /// Directions that the data do not determine.
     pub weak: Vec<String>,
