@@ -9,6 +9,7 @@ mod diagnosis;
 mod diagnosis_report;
 mod diagnosis_score;
 mod error;
+mod kills;
 mod limits;
 mod months;
 mod program;
@@ -50,6 +51,8 @@ enum Command {
     Diagnosis(Diagnosis),
     /// Calibrate 90 days with a drift and steps, alone and together; goes on where it was stopped
     Months(MonthsCommand),
+    /// Kill commands that write at random instants, and look at what the next one finds; goes on where it was stopped
+    Kills(KillsCommand),
     /// Compute what data of each length can say of each effect; goes on where it was stopped
     Limits,
     /// Measure ratios of speed, on a machine that does nothing else
@@ -128,6 +131,19 @@ struct Diagnosis {
 }
 
 #[derive(Debug, Args)]
+struct KillsCommand {
+    /// Seeds, FIRST-LAST; each determines command, signal and instant
+    #[arg(long, value_parser = seeds, default_value = "1-1000")]
+    seeds: RangeInclusive<u32>,
+    /// Kills at a time
+    #[arg(long, default_value_t = AT_ONCE)]
+    at_once: usize,
+    /// File of results
+    #[arg(long, value_name = "FILE")]
+    results: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
 struct MonthsCommand {
     /// Seeds, FIRST-LAST
     #[arg(long, value_parser = seeds, default_value = "1-20")]
@@ -186,6 +202,10 @@ fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
         Command::Months(m) => {
             let file = m.results.clone().unwrap_or_else(|| results.join("months.jsonl"));
             months::months(&Program::build()?, m.seeds.clone(), (m.hours, m.at_once), &file, &scratch)
+        }
+        Command::Kills(k) => {
+            let file = k.results.clone().unwrap_or_else(|| results.join("kills.jsonl"));
+            kills::kills(&Program::build()?, k.seeds.clone(), k.at_once, &file, &scratch)
         }
         Command::Limits => limits::limits(&Program::build()?, &results.join("limits.jsonl"), &scratch),
         Command::Speed => speed::measure(&Program::build()?, &speed_file, &scratch),

@@ -6,7 +6,7 @@ use sha2::{Digest as _, Sha256};
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
-use std::process::Command;
+use std::process::{Child, Command, Stdio};
 
 use dragfree_engine::telemetry::first_message;
 
@@ -194,6 +194,18 @@ impl Program {
         command.arg("reveal").arg(&hidden.sealed).arg("--diagnosis").arg(diagnosis);
         command.args(hidden.files.iter().flat_map(|file| [OsStr::new("--telemetry"), file.as_os_str()]));
         Ok(json(command.arg("--json"), &[0])?["score"].take())
+    }
+
+    /// Runs a command in a folder, and gives its answer as JSON. Data loss and inconsistent models are accepted.
+    pub(crate) fn ask(&self, folder: &Path, arguments: &[&str]) -> Result<Value, CampaignError> {
+        json(self.command().current_dir(folder).args(arguments).arg("--json"), &[0, 3, 4])
+    }
+
+    /// Starts a command in a folder.
+    pub(crate) fn start(&self, folder: &Path, arguments: &[&str]) -> Result<Child, CampaignError> {
+        let mut command = self.command();
+        command.current_dir(folder).args(arguments).stdout(Stdio::null()).stderr(Stdio::null());
+        command.spawn().map_err(|source| CampaignError::Start { command: format!("{command:?}"), source })
     }
 
     /// Runs `dragfree joint` or `trend` over days of an archive. Days that disagree and alerts are accepted.

@@ -12,6 +12,7 @@ use crate::bound::free_space;
 use crate::campaign::{NOMINAL, TWINS, Twin, note, taiji};
 use crate::diagnosis_report;
 use crate::error::{CampaignError, file};
+use crate::kills::{self, Kill};
 use crate::limits::{self, Limits};
 use crate::months::{self, Months};
 use crate::program::root;
@@ -48,6 +49,8 @@ pub(crate) struct Measured {
     pub(crate) limits: Vec<Limits>,
     /// Days together.
     pub(crate) months: Vec<Months>,
+    /// Programs that were killed.
+    pub(crate) kills: Vec<Kill>,
 }
 
 impl Measured {
@@ -61,6 +64,7 @@ impl Measured {
             diagnosis: read(&folder.join("diagnosis.jsonl"))?,
             limits: read(&folder.join("limits.jsonl"))?,
             months: read(&folder.join("months.jsonl"))?,
+            kills: read(&folder.join("kills.jsonl"))?,
         })
     }
 }
@@ -553,6 +557,8 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
     failed.extend(more);
     let (months, more) = months::table(&measured.months);
     failed.extend(more);
+    let (kills, more) = kills::table(&measured.kills);
+    failed.extend(more);
     let drawn =
         [("coverage", picture(&measured.coverage, &free)), ("confusion", blind_report::picture(&measured.blind))];
     let mut pictures = Vec::new();
@@ -569,6 +575,7 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
         ("diagnosis", diagnosis),
         ("limits", limits::table(&measured.limits)),
         ("months", months),
+        ("kills", kills),
     ]);
     Ok(Report { parts, pictures, failed })
 }
