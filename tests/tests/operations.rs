@@ -2,7 +2,7 @@
 //! end a certified set and every product made again.
 
 use dragfree_tests::recording::{Message, Recording};
-use dragfree_tests::{dragfree, expect, json};
+use dragfree_tests::{dragfree, expect, json, root};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -235,4 +235,51 @@ fn a_command_of_the_operators_is_run_for_a_loss_of_data() {
     assert_eq!(json(&mut list(), 0)["products"][0]["id"], "COM1B_2035-01-02_SC1_01_0001");
     expect(list().args(["--archive", "archive"]), 2);
     expect(dragfree(elsewhere.path()).args(["products", "list"]), 1);
+}
+
+/// The unit of systemd in the guide, followed to the letter in a folder that stands for the root of a machine: the
+/// command that it starts calibrates what comes in, and the signal that it stops with ends it well, in time.
+#[test]
+fn the_service_of_the_guide_runs_from_the_page_alone() {
+    let page = std::fs::read_to_string(root().join("ops-guide/src/operations.md")).expect("the page");
+    let unit = page.split("```ini\n").nth(1).and_then(|rest| rest.split("```").next()).expect("a unit");
+    let setting = |key: &str| -> &str {
+        let line = unit.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix('='));
+        line.unwrap_or_else(|| panic!("the unit has no {key}"))
+    };
+    let machine = tempfile::tempdir().expect("a temporary folder");
+    let within = |path: &str| machine.path().join(path.trim_start_matches('/'));
+    let mut words = setting("ExecStart").split(' ');
+    let program = within(words.next().expect("a program"));
+    std::fs::create_dir_all(program.parent().expect("a folder")).expect("a folder");
+    std::os::unix::fs::symlink(dragfree_tests::built().join("dragfree"), &program).expect("linked");
+    let folder = within(setting("WorkingDirectory"));
+    expect(dragfree(machine.path()).arg("init").arg(&folder), 0);
+    let arguments: Vec<PathBuf> =
+        words.map(|word| if word.starts_with('/') { within(word) } else { word.into() }).collect();
+    assert!(arguments.iter().filter(|a| a.is_absolute()).all(|path| path.exists()), "{arguments:?}");
+    std::fs::create_dir(folder.join("telemetry")).expect("a folder");
+    let mut child = Command::new(&program)
+        .args(&arguments)
+        .current_dir(&folder)
+        .env_clear()
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .expect("the service starts");
+    let simulate = ["--out", "telemetry", "--hours", "0.2", "-q"];
+    expect(dragfree(&folder).args(["simulate", "mission.toml"]).args(simulate), 0);
+    let product = folder.join("archive/COM1B_2035-01-01_SC1_01_0001.toml");
+    let since = Instant::now();
+    while !product.exists() {
+        assert!(since.elapsed() < Duration::from_secs(120), "no {}", product.display());
+        assert!(child.try_wait().expect("a process").is_none(), "the service has ended");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let signal = setting("KillSignal").trim_start_matches("SIG");
+    expect(Command::new("kill").arg(format!("-{signal}")).arg(child.id().to_string()), 0);
+    let since = Instant::now();
+    assert!(child.wait().expect("it ends").success());
+    let patience: u64 = setting("TimeoutStopSec").parse().expect("seconds");
+    assert!(since.elapsed() < Duration::from_secs(patience));
 }

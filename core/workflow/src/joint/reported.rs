@@ -21,10 +21,10 @@ pub(super) struct Reported<'a> {
 }
 
 impl Reported<'_> {
-    /// Times between the last day before a step and the first one after it.
+    /// Time of a step: of the last of its events.
     fn step_ns(&self, after: usize) -> i64 {
-        let middles = self.borders[after].events.iter().map(|e| e.time_ns);
-        middles.max().unwrap_or_else(|| start_of_day_ns(self.borders[after].after))
+        let times = self.borders[after].events.iter().map(|e| e.time_ns);
+        times.max().unwrap_or_else(|| start_of_day_ns(self.borders[after].after))
     }
 
     /// End of the last day's data, in days after the origin.
