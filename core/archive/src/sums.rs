@@ -51,18 +51,20 @@ impl Sums {
         }
     }
 
-    /// Takes over what another folder keeps.
+    /// Takes over what another folder keeps and this one does not. Returns how many files that were.
     ///
     /// # Errors
     /// It cannot be read, or not be written.
-    pub fn take_over(&self, folder: &Path) -> Result<(), ArchiveError> {
+    pub fn take_over(&self, folder: &Path) -> Result<usize, ArchiveError> {
+        let mut count = 0;
         for name in entries(folder)? {
             let path = folder.join(&name);
             if sealed(&path).is_some() && sealed(&self.folder.join(&name)).is_none() {
                 self.place(&name, &fs::read(&path).at("read", &path)?)?;
+                count += 1;
             }
         }
-        Ok(())
+        Ok(count)
     }
 
     fn place(&self, name: &str, content: &[u8]) -> Result<(), ArchiveError> {

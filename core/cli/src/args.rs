@@ -366,7 +366,8 @@ fn days(text: &str) -> Result<(NaiveDate, NaiveDate), String> {
 }
 
 fn step(text: &str) -> Result<(String, String), String> {
-    let (event, effect) = text.split_once('=').ok_or("EVENT=EFFECT is wanted, MTEA=com-offset")?;
+    let parts = text.split_once('=').filter(|(event, effect)| !event.is_empty() && !effect.is_empty());
+    let (event, effect) = parts.ok_or("EVENT=EFFECT is wanted, MTEA=com-offset")?;
     Ok((event.to_owned(), effect.to_owned()))
 }
 

@@ -2,6 +2,7 @@
 
 use crate::text::{self, Paint};
 use crate::utc;
+use dragfree_archive::JOINT;
 use dragfree_archive::files::Problem;
 use dragfree_archive::product::{Coefficient, Product};
 use dragfree_archive::{Entry, Listing};
@@ -29,7 +30,12 @@ pub(crate) fn product(product: &Product, path: &Path, paint: Paint) -> String {
     let (used, rejected) = (text::grouped(quality.epochs_used), text::grouped(quality.epochs_rejected));
     let model = format!("revision {}: {}", product.model.revision, product.model.effects.join(", "));
     screen += &text::labelled("window", &window);
-    screen += &text::labelled("epochs", &format!("{used} used, {rejected} rejected{commands}"));
+    let days = product.inputs.iter().filter(|input| input.role == "product").count();
+    if days > 0 {
+        screen += &text::labelled("days", &days.to_string());
+    } else {
+        screen += &text::labelled("epochs", &format!("{used} used, {rejected} rejected{commands}"));
+    }
     screen += &text::labelled("model", &model);
     screen.push('\n');
     screen += &coefficients(&product.result.coefficients);
@@ -87,7 +93,10 @@ fn verdict(product: &Product, paint: Paint) -> String {
     let mut screen = match product.result.verdict.as_deref() {
         None => text::labelled("verdict", "none: no stage compared two solutions"),
         Some(word) => {
+            let many = product.header.non_standard_attributes.product == JOINT;
             let (meaning, painted) = match word {
+                "agree" if many => ("what fits all days fits each", paint.good(word)),
+                "disagree" if many => ("the days are not all the same", paint.bad(word)),
                 "agree" => ("the recursive and the batch solution agree within their errors", paint.good(word)),
                 "weak" => ("the data leave directions open; do not use those alone", paint.doubtful(word)),
                 _ => ("the solutions differ by more than their errors allow; do not use", paint.bad(word)),

@@ -13,7 +13,7 @@ use dragfree_identification::distributions::normal_tails;
 use serde::Serialize;
 
 use crate::WorkflowError;
-use crate::days::{day_number, day_of_number};
+use crate::days::{DAY_NS, day_number, day_of_number};
 use crate::joint::{Declared, Event, Measured, Options, chosen};
 
 /// Most days that a prediction rests on: what changes slower than in a month is followed.
@@ -89,11 +89,12 @@ pub struct Alert {
     pub what: String,
 }
 
-/// The trend of the days of an archive. With `expected`, a day without a product is an alert.
+/// The trend of the days of an archive. A day without a product is an alert where a later one has one, or where it is
+/// before `today`.
 ///
 /// # Errors
 /// [`WorkflowError`]: no day has a product, or several spacecraft have; the events cannot be read.
-pub fn trend(archive: &Archive, options: &Options, expected: bool) -> Result<Trend, WorkflowError> {
+pub fn trend(archive: &Archive, options: &Options, today: NaiveDate) -> Result<Trend, WorkflowError> {
     let mut products = Vec::new();
     for row in chosen(archive, options)? {
         let product = archive.document(&row.id).map_err(EngineError::from)?;
@@ -111,7 +112,8 @@ pub fn trend(archive: &Archive, options: &Options, expected: bool) -> Result<Tre
         alerts.extend(of_day(*day, &row.id, product));
     }
     let last = products.last().map_or(first, |(day, ..)| *day);
-    for number in (day_number(first)..=day_number(last)).filter(|_| expected) {
+    let expected = last.max(today.pred_opt().unwrap_or(today)).min(options.last);
+    for number in day_number(options.first)..=day_number(expected) {
         let day = day_of_number(number);
         if products.iter().all(|(other, ..)| *other != day) {
             alerts.push(Alert { day, coefficient: None, what: "no product: is its telemetry late?".to_owned() });
@@ -183,9 +185,13 @@ impl Series {
         let mut previous: Option<NaiveDate> = None;
         for point in &mut self.points {
             let stepped = |e: &&Event| {
-                let number = e.time_ns.div_euclid(crate::days::DAY_NS);
-                let since = previous.is_some_and(|day| day_number(day) <= number);
-                since && number <= day_number(point.day) && e.changes(&self.name)
+                let number = e.time_ns.div_euclid(DAY_NS);
+                let since = |previous: i64| {
+                    let between = previous < number && number <= day_number(point.day);
+                    // A day with an event in it is no ground for the next one.
+                    between || (previous == number && e.time_ns.rem_euclid(DAY_NS) != 0)
+                };
+                previous.is_some_and(|day| since(day_number(day))) && e.changes(&self.name)
             };
             if events.iter().any(|e| stepped(&e)) {
                 ground.clear();
@@ -299,13 +305,23 @@ mod tests {
         let event = |changes: &str| Event {
             kind: "MTEA".into(),
             time: String::new(),
-            time_ns: (23_741 + 15) * crate::days::DAY_NS,
+            time_ns: (23_741 + 15) * DAY_NS,
             time_scale: "UTC".into(),
             comments: String::new(),
             data: serde_json::Map::new(),
             effects: vec![changes.to_owned()],
         };
-        assert!(series(values()).predict(&[event("com-offset")], 1e-3).is_empty());
+        let mut declared = series(values());
+        assert!(declared.predict(&[event("com-offset")], 1e-3).is_empty());
+        // The day of the step is ground for the next ones: two of them predict the third.
+        let predicted: Vec<bool> = declared.points.iter().map(|p| p.predicted.is_some()).collect();
+        assert_eq!(predicted[13..19], [true, true, false, false, true, true]);
+        // A day with the event in it is no ground.
+        let within = Event { time_ns: event("com-offset").time_ns + 1, ..event("com-offset") };
+        let mut declared = series(values());
+        declared.predict(&[within], 1e-3);
+        let predicted: Vec<bool> = declared.points.iter().map(|p| p.predicted.is_some()).collect();
+        assert_eq!(predicted[13..20], [true, true, false, false, false, true, true]);
         assert_eq!(series(values()).predict(&[event("com-off")], 1e-3).len(), 15);
     }
 }

@@ -136,6 +136,9 @@ fn run(folder: &Path, at_once: usize, global: &Global, paint: Paint) -> Result<D
         std::thread::sleep(LOOK);
     }
     let mut done = status(folder, global)?;
+    if !workflow::status(folder, &tasks)?.failed.is_empty() {
+        done.code = 1;
+    }
     if !errors.is_empty() {
         done.code = 1;
         if !global.json {
@@ -152,8 +155,9 @@ fn commit(folder: &Path, global: &Global) -> Result<Done, Failure> {
     let registry = super::registry(global)?;
     let spacecraft = planner(&operations, &registry, global)?.spacecraft().to_owned();
     let committed = workflow::commit(&folder, &tasks, (&operations.archive, &spacecraft), &stamp())?;
+    let code = u8::from(!committed.failed.is_empty());
     if global.json {
-        return Ok(Done::json(&serde_json::to_value(&committed)?));
+        return Ok(Done { code, ..Done::json(&serde_json::to_value(&committed)?) });
     }
     let mut text = String::new();
     for id in &committed.products {
@@ -169,7 +173,7 @@ fn commit(folder: &Path, global: &Global) -> Result<Done, Failure> {
         committed.sums,
         committed.cleared
     );
-    Ok(Done::new(text))
+    Ok(Done { text, code })
 }
 
 fn status(folder: &Path, global: &Global) -> Result<Done, Failure> {

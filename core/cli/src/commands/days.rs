@@ -187,7 +187,11 @@ pub(super) fn stale(ops: &Ops, global: &Global, paint: Paint) -> Result<Done, Fa
     let days = desk.look(global)?;
     let is_stale = |p: &&Planned| p.day.product.is_some() && !p.day.reasons.is_empty();
     let mut done = planned(days.iter().filter(is_stale), &desk.inbox, global, paint);
-    let many = joint::stale(&Archive::open(&desk.operations.archive)?)?;
+    let options = joint::Options {
+        events: desk.operations.events.clone().filter(|path| path.is_file()),
+        ..joint::Options::default()
+    };
+    let many = joint::stale(&Archive::open(&desk.operations.archive)?, &joint::Declared::read(&options)?)?;
     if global.json {
         let mut value: Value = serde_json::from_str(&done.text)?;
         value["many_days"] = json!(many);

@@ -79,13 +79,16 @@ fn screen(joint: &Joint, paint: Paint) -> String {
         let words: Vec<String> = words.into_iter().filter(|w| !w.is_empty()).collect();
         text += &text::labelled("event", &words.join("; "));
     }
-    let _ = writeln!(text, "\nat the end of {}:", joint.last);
+    let _ = writeln!(text, "\nat {}, the end of the data:", crate::utc::format(joint.epoch_ns));
     let rows = joint.coefficients.iter().flat_map(rows);
     text += &text::columns(&text::table(&["coefficient", "value", "unit", ""], rows));
     let same = joint.same;
     let word = if joint.agrees() { paint.good("yes") } else { paint.bad("no") };
-    let words = format!("χ² {:.1} on {} degrees of freedom, p = {:.2e}", same.chi2, same.dof, same.p);
-    let _ = writeln!(text, "\nthe same every day  {word}: {words}");
+    let words = match same.dof {
+        0 => "nothing to compare".to_owned(),
+        dof => format!("{word}: χ² {:.1} on {dof} degrees of freedom, p = {:.2e}", same.chi2, same.p),
+    };
+    let _ = writeln!(text, "\nthe same every day  {words}");
     if !joint.agrees() {
         let mut worst: Vec<_> = joint.days.iter().collect();
         worst.sort_by(|a, b| a.agreement.p.total_cmp(&b.agreement.p));
@@ -117,14 +120,18 @@ fn rows(c: &Coefficient) -> Vec<Vec<String>> {
         add("  rate".to_owned(), rate, format!("{unit}/d"), factor * DAY_S);
     }
     for step in &c.steps {
-        add(format!("  step {}", step.events.join(", ")), step.changed, unit.to_owned(), factor);
+        let name = match &step.events[..] {
+            [one] => format!("  step {one}"),
+            several => format!("  step {} +{}", several.first().map_or("", String::as_str), several.len() - 1),
+        };
+        add(name, step.changed, unit.to_owned(), factor);
     }
     rows
 }
 
 pub(super) fn trend(command: &TrendCommand, json: bool, paint: Paint) -> Result<Done, Failure> {
     let archive = products::archive(&command.days.archive.folder()?)?;
-    let trend = trend::trend(&archive, &options(&command.days)?, true)?;
+    let trend = trend::trend(&archive, &options(&command.days)?, super::stamp().time.date_naive())?;
     if let Some(path) = &command.csv {
         std::fs::write(path, csv(&trend)).at("write", path)?;
     }

@@ -20,7 +20,7 @@ pub struct Committed {
     pub products: Vec<String>,
     /// Days that gave no product, with the reason.
     pub failed: Vec<(String, String)>,
-    /// Sums that the archive keeps now.
+    /// Sums that the archive did not keep before.
     pub sums: usize,
     /// Folders of killed workers and results of other plans that were cleared.
     pub cleared: usize,
@@ -60,18 +60,24 @@ fn day(job: &Job) -> String {
 /// The folder cannot be read.
 pub fn status(folder: &Path, tasks: &[Task]) -> Result<Status, WorkflowError> {
     let mut status = Status { kinds: BTreeMap::new(), at_work: 0, failed: Vec::new(), ready: Vec::new() };
-    let mut done = BTreeSet::new();
+    let (mut there, mut done) = (BTreeSet::new(), BTreeSet::new());
     for task in tasks {
         let outcome = Outcome::read(&folder.join(&task.output));
         let count = status.kinds.entry(kind(&task.job)).or_default();
         count.1 += 1;
         if let Some(outcome) = outcome {
-            count.0 += 1;
-            done.insert(&task.id);
-            status.failed.extend(outcome.failed.map(|reason| (day(&task.job), reason)));
+            there.insert(&task.id);
+            match outcome.failed {
+                Some(reason) => status.failed.push((day(&task.job), reason)),
+                None => {
+                    count.0 += 1;
+                    done.insert(&task.id);
+                }
+            }
         }
     }
-    let ready = |task: &&Task| !done.contains(&task.id) && task.after.iter().all(|id| done.contains(id));
+    // Sums go without a day that failed.
+    let ready = |task: &&Task| !done.contains(&task.id) && task.after.iter().all(|id| there.contains(id));
     status.ready = tasks.iter().filter(ready).map(|task| task.id.clone()).collect();
     status.at_work = locks(folder)?.iter().filter(|path| is_held(path)).count();
     Ok(status)
@@ -134,8 +140,7 @@ pub fn commit(
     let mut sums = 0;
     for (task, result, _) in &outcomes {
         if matches!(task.job, Job::Sums { .. }) {
-            kept.take_over(&result.join("sums")).map_err(again)?;
-            sums += 1;
+            sums += kept.take_over(&result.join("sums")).map_err(again)?;
         }
     }
     Ok(Committed { products, failed, sums, cleared: clear(folder, tasks)? })

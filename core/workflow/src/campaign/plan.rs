@@ -154,6 +154,10 @@ pub fn plan(
     let mut days: Vec<(i64, String)> = Vec::new();
     match &spec.simulate {
         Some(simulate) => {
+            if !(simulate.hours > 0.0 && simulate.hours <= 24.0) {
+                let what = format!("hours = {} must be more than 0 and at most 24", simulate.hours);
+                return Err(WorkflowError::Campaign(what));
+            }
             for (place, number) in (0..).zip(first..=last) {
                 let (seed, effects) = (simulate.seed.wrapping_mul(1000).wrapping_add(place), simulate.effects.clone());
                 let job = Job::Flight { day: day_of_number(number), seed, hours: simulate.hours, effects };
@@ -231,6 +235,9 @@ pub fn read(folder: &Path) -> Result<Vec<Task>, WorkflowError> {
     let mut tasks = Vec::new();
     for (number, line) in text.lines().enumerate() {
         tasks.push(serde_json::from_str(line).map_err(|e| refuse(format!("line {}: {e}", number + 1)))?);
+    }
+    if tasks.is_empty() {
+        return Err(refuse("it has no task".to_owned()));
     }
     Ok(tasks)
 }

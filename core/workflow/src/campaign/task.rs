@@ -81,7 +81,8 @@ impl Worker<'_> {
     /// task differ; the folder cannot be written.
     pub fn task(&self, task: &Task, all: &[Task], progress: &mut dyn FnMut(Progress)) -> Result<Done, WorkflowError> {
         let result = self.folder.join(&task.output);
-        if let Some(outcome) = Outcome::read(&result) {
+        // A day that failed is tried again: what it lacked may be there now.
+        if let Some(outcome) = Outcome::read(&result).filter(|outcome| outcome.failed.is_none()) {
             return Ok(done(outcome, false));
         }
         let build = sha256(format!("{}\n{}", self.program, self.planner.configuration_digest()));
@@ -208,6 +209,10 @@ impl Scratch {
             let text = serde_json::to_vec_pretty(outcome).map_err(std::io::Error::from).at("write", &path)?;
             fs::write(&path, text).and_then(|()| File::open(&path)?.sync_all()).at("write", &path)?;
             sync_folder(&self.folder).at("flush", &self.folder)?;
+            // A result that failed, or cannot be read, gives way.
+            if result.exists() && Outcome::read(result).is_none_or(|there| there.failed.is_some()) {
+                fs::remove_dir_all(result).at("clear", result)?;
+            }
             match fs::rename(&self.folder, result) {
                 Ok(()) => {
                     let results = dragfree_archive::files::folder_of(result);

@@ -9,7 +9,7 @@ use super::events::{self, Event};
 use crate::WorkflowError;
 
 /// What is asked for.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct Options {
     /// First day.
     pub first: NaiveDate,
@@ -28,6 +28,8 @@ pub struct Options {
 /// What is declared of the days.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Declared {
+    /// First and last day.
+    pub days: (NaiveDate, NaiveDate),
     /// Kinds of events with the effects that they change.
     pub steps: Vec<(String, String)>,
     /// Whether coefficients are known to be constant between events.
@@ -48,7 +50,12 @@ impl Declared {
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
             std::fs::read_to_string(path).map(|text| (name, text)).map_err(refuse)
         });
-        Ok(Self { steps: options.steps.clone(), constant: options.constant, file: file.transpose()? })
+        Ok(Self {
+            days: (options.first, options.last),
+            steps: options.steps.clone(),
+            constant: options.constant,
+            file: file.transpose()?,
+        })
     }
 
     /// Events of a spacecraft, in order.

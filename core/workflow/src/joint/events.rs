@@ -8,8 +8,8 @@
 //!   changes: [com-offset]            # effects whose coefficients step; ours
 //! ```
 //!
-//! Which coefficients an event changes, its entry says with `changes`, or the caller by its kind: JPL's log has no such
-//! key.
+//! Which coefficients an event changes, its entry says with `changes`, or else the caller by its kind: JPL's log has no
+//! such key.
 
 use std::path::Path;
 
@@ -41,6 +41,15 @@ pub struct Event {
 }
 
 impl Event {
+    /// What of it is neither an effect nor a coefficient of a model.
+    pub(super) fn names_nothing<'a>(&'a self, coefficients: &[&str]) -> Vec<&'a str> {
+        let known = |what: &&String| {
+            let one = Self { effects: vec![(*what).clone()], ..self.clone() };
+            coefficients.iter().any(|name| one.changes(name))
+        };
+        self.effects.iter().filter(|what| !known(what)).map(String::as_str).collect()
+    }
+
     /// Whether it changes a coefficient: by its name, or by a beginning of it that ends before a dot.
     pub fn changes(&self, coefficient: &str) -> bool {
         let names = |what: &String| match coefficient.strip_prefix(what.as_str()) {
@@ -82,8 +91,8 @@ pub(super) fn parse(
     let entries: Vec<Entry> = serde_yaml_ng::from_str(text).map_err(|e| refuse(e.to_string()))?;
     let mut events = Vec::new();
     for entry in entries {
-        let mut effects = entry.changes;
-        effects.extend(steps.iter().filter(|(kind, _)| *kind == entry.soe_event).map(|(_, effect)| effect.clone()));
+        let by_kind = steps.iter().filter(|(kind, _)| *kind == entry.soe_event).map(|(_, effect)| effect.clone());
+        let effects = if entry.changes.is_empty() { by_kind.collect() } else { entry.changes };
         let elsewhere = !entry.spacecraft.is_empty() && entry.spacecraft != spacecraft;
         if effects.is_empty() || elsewhere || is_no_change(&entry.data) {
             continue;

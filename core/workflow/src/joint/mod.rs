@@ -23,7 +23,7 @@ use dragfree_estimation::joint::{self as many, Change, Course, DayScore, ManyDay
 use dragfree_estimation::stored::Stored;
 
 use crate::WorkflowError;
-use crate::days::{day_of_number, start_of_day_ns};
+use crate::days::{day_number, day_of_number, start_of_day_ns};
 use calendar::{Calendar, Leaf};
 use days::{Products, inputs, leaves, products, same_make, values};
 use reported::Reported;
@@ -67,7 +67,9 @@ fn of_products(archive: &Archive, rows: Vec<Row>, declared: Declared) -> Result<
         let (from, until) = (attributes.start_time_epoch_ns + EDGE_NS, attributes.stop_time_epoch_ns - EDGE_NS);
         let cut = events.iter().find(|e| from < e.time_ns + margin(e) && e.time_ns - margin(e) < until);
         if let Some(event) = cut {
-            let reason = format!("{} at {}: its coefficients step within the day", event.kind, event.time);
+            let near =
+                if margin(event) > 0 { ", which has another time scale: within a minute of the day" } else { "" };
+            let reason = format!("{} at {} lies in the day{near}", event.kind, event.time);
             left_out.push(LeftOut::new(day_of_number(*number), row, reason));
         }
         cut.is_none()
@@ -101,10 +103,8 @@ fn of_products(archive: &Archive, rows: Vec<Row>, declared: Declared) -> Result<
     }
     let solution = all.solve(&courses)?;
     let scores = scores(&calendar, &all, &solution, &borders, origin)?;
-    let scatter = solution.scatter(&scores, settings.scatter_sigmas);
-    let solution = solution.widened(scatter.as_ref());
-
     let same = solution.same(&scores);
+    let (solution, widened) = solution.widened(same, settings.scatter_sigmas);
     let day_lines = days.iter().zip(&scores).map(|((number, (row, product)), score)| Day {
         day: day_of_number(*number),
         product: row.id.clone(),
@@ -114,7 +114,12 @@ fn of_products(archive: &Archive, rows: Vec<Row>, declared: Declared) -> Result<
     });
     let day_lines: Vec<Day> = day_lines.collect();
     let Estimate { weak, quality, .. } = &solution.solution.estimate;
-    let mut notes = Vec::new();
+    let mut notes = notes(&like, &events, &declared, days.len());
+    if widened > 1.0 {
+        notes.push(format!(
+            "the days differ by {widened:.2} times what their noise says; σ of everything is widened by that"
+        ));
+    }
     let within = |e: &&Event| (start_of_day_ns(first)..start_of_day_ns(last + 1)).contains(&e.time_ns);
     let lone = events.iter().filter(within).filter(|e| !borders.iter().any(|b| b.events.contains(e)));
     notes.extend(
@@ -125,15 +130,16 @@ fn of_products(archive: &Archive, rows: Vec<Row>, declared: Declared) -> Result<
     let reported = Reported { days: &days, borders: &borders, origin, last, false_alarm: settings.false_alarm };
     Ok(Joint {
         spacecraft,
-        first: day_of_number(first),
-        last: day_of_number(last),
+        first: declared.days.0,
+        last: declared.days.1,
+        epoch_ns: days[&last].1.header.non_standard_attributes.stop_time_epoch_ns,
         coefficients: reported.coefficients(&like, &solution),
         covariance: reported.covariance(&like, &solution),
         same: Agreement::new(same.chi2, same.dof),
         chi2_per_dof: quality.chi2_per_dof_modelled_sigma,
-        scatter,
+        widened,
         weak: weak.iter().map(|w| w.sentence.clone()).collect(),
-        missing: (first..=last)
+        missing: (day_number(declared.days.0)..=day_number(declared.days.1))
             .filter(|n| !days.contains_key(n))
             .map(day_of_number)
             .filter(|day| left_out.iter().all(|l| l.day != *day))
@@ -146,6 +152,27 @@ fn of_products(archive: &Archive, rows: Vec<Row>, declared: Declared) -> Result<
         inputs,
         like: days.remove(&last).map(|(_, product)| product).ok_or(WorkflowError::NoProduct)?,
     })
+}
+
+/// What was asked for and cannot be done.
+fn notes(like: &Stored, events: &[Event], declared: &Declared, days: usize) -> Vec<String> {
+    let mut notes = Vec::new();
+    let names: Vec<&str> = like.declared.coefficients.iter().filter(|c| c.estimate).map(|c| c.name.as_str()).collect();
+    for event in events {
+        let nothing = event.names_nothing(&names);
+        if !nothing.is_empty() {
+            notes.push(format!(
+                "{} at {} changes {}, which no coefficient of the model is: there is no step of it",
+                event.kind,
+                event.time,
+                nothing.join(", ")
+            ));
+        }
+    }
+    if days < LEAST_DAYS && !declared.constant {
+        notes.push(format!("with fewer than {LEAST_DAYS} days no rate is estimated"));
+    }
+    notes
 }
 
 /// Between two days that both entered, events that change coefficients.

@@ -9,7 +9,7 @@ use dragfree_engine::draft::Draft;
 use dragfree_engine::feed::Summary;
 use dragfree_schema::{Attachment, Covariance, Estimate, Report, Role};
 use nalgebra::{DMatrix, DVector};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -31,10 +31,13 @@ pub(super) fn step(of: &str, time_ns: i64) -> String {
 }
 
 /// Suffix of the table of days beside a product.
-pub(super) const DAYS: &str = "days.json";
+const DAYS: &str = "days.json";
 
 /// Role of the file of events among what is kept.
-const EVENTS: &str = "events";
+pub(super) const EVENTS: &str = "events";
+
+/// Role of what was asked for among what is kept.
+const ASKED: &str = "asked";
 
 const RATE: &str = ".rate";
 const STEP: &str = ".step.";
@@ -63,6 +66,9 @@ fn commit(
     if let Some((name, text)) = &joint.declared.file {
         writer.keep(EVENTS, name, text.as_bytes())?;
     }
+    let left_out = joint.left_out.iter().map(|l| (stem(&l.product).to_owned(), l.sha256.clone())).collect();
+    let asked = json!(Asked { declared: joint.declared.clone(), left_out });
+    writer.keep(ASKED, "asked.json", asked.to_string().as_bytes())?;
     draft.commit_if_new(writer, MadeOf { window, ..MadeOf::default() })
 }
 
@@ -78,12 +84,10 @@ pub fn again(
     software: &str,
 ) -> Result<Written, WorkflowError> {
     let made = || -> Result<_, ArchiveError> {
-        let table = archive.read_file(id, DAYS)?;
-        let table: Table = serde_json::from_slice(&table).unwrap_or_default();
+        let Asked { mut declared, left_out } = asked(archive, id)?;
         let inputs = archive.inputs(id)?.into_iter().map(|input| (input.name, input.sha256));
-        let all = inputs.chain(table.left_out.into_iter().map(|left| (left.product, left.sha256)));
+        let all = inputs.chain(left_out);
         let rows = all.map(|(stem, sha256)| archive.with_digest(&stem, &sha256)).collect::<Result<Vec<_>, _>>()?;
-        let mut declared = table.declared;
         if let Some(Place { name, path: Some(path), .. }) = archive.made_of(id, EVENTS)? {
             let text = std::fs::read_to_string(&path).at("read", &path)?;
             declared.file = Some((name, text));
@@ -106,17 +110,21 @@ fn table(joint: &Joint) -> Value {
     table
 }
 
-/// What is read of the table of days.
-#[derive(Default, Deserialize)]
-pub(super) struct Table {
-    pub(super) left_out: Vec<TableLeftOut>,
-    declared: Declared,
+/// What a calibration was asked for, as the archive keeps it.
+#[derive(Serialize, Deserialize)]
+pub(super) struct Asked {
+    pub(super) declared: Declared,
+    /// Days that were left out: names of their products without revision, and digests.
+    pub(super) left_out: Vec<(String, String)>,
 }
 
-#[derive(Deserialize)]
-pub(super) struct TableLeftOut {
-    product: String,
-    pub(super) sha256: String,
+/// What a calibration of the archive was asked for.
+pub(super) fn asked(archive: &Archive, id: &str) -> Result<Asked, ArchiveError> {
+    let gone =
+        || ArchiveError::NotFound { id: format!("what {id} was asked for"), folder: archive.folder().to_owned() };
+    let path = archive.made_of(id, ASKED)?.and_then(|place| place.path).ok_or_else(gone)?;
+    let text = std::fs::read(&path).at("read", &path)?;
+    serde_json::from_slice(&text).map_err(|e| ArchiveError::Damaged { path, reason: e.to_string() })
 }
 
 /// The product, and the time that it is of.
@@ -183,11 +191,8 @@ fn report(joint: &Joint) -> Report {
             joint.same.chi2, joint.same.dof, joint.same.p
         ));
     }
-    let quality = [
-        ("same_every_day", json!(joint.same)),
-        ("days", joint.days.len().into()),
-        ("scatter_of_blocks", json!(joint.scatter)),
-    ];
+    let quality =
+        [("same_every_day", json!(joint.same)), ("days", joint.days.len().into()), ("widened", json!(joint.widened))];
     Report {
         plugin: MAKER.to_owned(),
         coefficients,

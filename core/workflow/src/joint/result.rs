@@ -3,7 +3,6 @@
 use chrono::NaiveDate;
 use dragfree_archive::Row;
 use dragfree_archive::product::{Input, Product};
-use dragfree_estimation::estimate::Scatter;
 use dragfree_identification::distributions::chi2_tails;
 use serde::Serialize;
 
@@ -15,26 +14,27 @@ use super::events::Event;
 pub struct Joint {
     /// Spacecraft.
     pub spacecraft: String,
-    /// First day with a product.
+    /// First day that was asked for.
     pub first: NaiveDate,
-    /// Last day with a product.
+    /// Last day that was asked for.
     pub last: NaiveDate,
-    /// Coefficients at the end of the last day, with their changes.
+    /// Time of the values, the end of the data, Unix ns of the days' time scale.
+    pub epoch_ns: i64,
+    /// Coefficients at that time, with their changes.
     pub coefficients: Vec<Coefficient>,
     /// Whether the days agree with it.
     pub same: Agreement,
     /// χ² per degree of freedom of the residuals, with the declared noise.
     pub chi2_per_dof: f64,
-    /// Whether the noise was the same at all times: scatter of the days over what is expected, and the largest that
-    /// chance allows; none with too few days.
-    pub scatter: Option<Scatter>,
+    /// Factor by which σ is widened because the days differ more than their noise says; 1 where they do not.
+    pub widened: f64,
     /// Directions that the data do not determine.
     pub weak: Vec<String>,
     /// Days that entered, in order.
     pub days: Vec<Day>,
     /// Days with a product that did not, and why.
     pub left_out: Vec<LeftOut>,
-    /// Days without a product.
+    /// Days that were asked for and have no product.
     pub missing: Vec<NaiveDate>,
     /// Events that lie between days.
     pub events: Vec<Event>,
@@ -60,7 +60,7 @@ pub struct Coefficient {
     pub unit: String,
     /// Frame, empty where there is none.
     pub frame: String,
-    /// Value at the end of the last day.
+    /// Value at the end of the data.
     pub value: f64,
     /// Its standard deviation.
     pub sigma: f64,

@@ -3,11 +3,13 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use chrono::NaiveDate;
+use dragfree_archive::files::sha256;
 use dragfree_archive::{Archive, JOINT, Row};
 use dragfree_engine::EngineError;
 use serde::Serialize;
 
-use super::product::{DAYS, Table};
+use super::asked::Declared;
+use super::product::{EVENTS, asked};
 use crate::WorkflowError;
 use crate::days::{DAY_NS, day_number};
 
@@ -20,34 +22,40 @@ pub struct Stale {
     pub reasons: Vec<String>,
 }
 
-/// Calibrations of many days, the newest of each first day, of which a day has another product now.
+/// Calibrations of many days, the newest of each time and all that are certified, that would come out otherwise now.
+/// `now` is what is declared of events now.
 ///
 /// # Errors
 /// The archive cannot be read.
-pub fn stale(archive: &Archive) -> Result<Vec<Stale>, WorkflowError> {
+pub fn stale(archive: &Archive, now: &Declared) -> Result<Vec<Stale>, WorkflowError> {
     let days: Vec<Row> = archive.newest().map_err(EngineError::from)?.into_iter().map(|entry| entry.row).collect();
-    let mut newest: BTreeMap<String, Row> = BTreeMap::new();
+    let certified: BTreeSet<String> =
+        archive.validity(None).map_err(EngineError::from)?.into_iter().map(|validity| validity.id).collect();
+    let mut watched: BTreeMap<(String, Option<i64>, Option<i64>), Row> = BTreeMap::new();
+    let mut others = Vec::new();
     for row in archive.named(JOINT).map_err(EngineError::from)? {
-        if row.withdrawn.is_none() && row.problem.is_none() {
-            newest.insert(format!("{} {}", row.spacecraft, row.day), row);
+        if row.withdrawn.is_some() || row.problem.is_some() {
+            continue;
         }
+        let before = watched.insert((row.spacecraft.clone(), row.asked_from_ns, row.asked_until_ns), row);
+        others.extend(before.filter(|before| certified.contains(&before.id)));
     }
     let mut stale = Vec::new();
-    for row in newest.into_values() {
-        let reasons = reasons(archive, &row, &days)?;
+    for row in others.into_iter().chain(watched.into_values()) {
+        let reasons = reasons(archive, &row, &days, now)?;
         if !reasons.is_empty() {
             stale.push(Stale { product: row.id, reasons });
         }
     }
+    stale.sort_by(|a: &Stale, b| a.product.cmp(&b.product));
     Ok(stale)
 }
 
-fn reasons(archive: &Archive, row: &Row, days: &[Row]) -> Result<Vec<String>, WorkflowError> {
+fn reasons(archive: &Archive, row: &Row, days: &[Row], now: &Declared) -> Result<Vec<String>, WorkflowError> {
     let product = archive.document(&row.id).map_err(EngineError::from)?;
-    let table = archive.read_file(&row.id, DAYS).map_err(EngineError::from)?;
-    let left_out = serde_json::from_slice::<Table>(&table).unwrap_or_default().left_out;
+    let left_out = asked(archive, &row.id).map_err(EngineError::from)?.left_out;
     let of_inputs = product.inputs.iter().map(|input| input.sha256.as_str());
-    let known: BTreeSet<&str> = of_inputs.chain(left_out.iter().map(|left| left.sha256.as_str())).collect();
+    let known: BTreeSet<&str> = of_inputs.chain(left_out.iter().map(|(_, sha256)| sha256.as_str())).collect();
     let covered = |day: &str| {
         let day = day.parse::<NaiveDate>().ok().map(day_number);
         let edge = |ns: Option<i64>| ns.map(|ns| ns.div_euclid(DAY_NS));
@@ -61,5 +69,12 @@ fn reasons(archive: &Archive, row: &Row, days: &[Row]) -> Result<Vec<String>, Wo
     }
     let gone = product.inputs.iter().filter(|input| own.iter().all(|day| day.stem() != input.name));
     reasons.extend(gone.map(|input| format!("{} has no product any more", input.name)));
+    let events = archive.made_of(&row.id, EVENTS).map_err(EngineError::from)?;
+    if let (Some(kept), Some((name, text))) = (events, &now.file)
+        && kept.name == *name
+        && kept.sha256 != sha256(text)
+    {
+        reasons.push(format!("the events of {name} are others now"));
+    }
     Ok(reasons)
 }

@@ -3,6 +3,7 @@
 use crate::commands::Done;
 use crate::failure::Failure;
 use crate::text::{self, Paint};
+use dragfree_archive::Place;
 use dragfree_archive::files::IoContext as _;
 use dragfree_archive::product::Stage;
 use dragfree_chart::graph::{self, Node};
@@ -93,16 +94,24 @@ fn short(sha256: &str) -> &str {
     sha256.get(..12).unwrap_or(sha256)
 }
 
+/// Role of the products that one of many days was made of.
+const PRODUCT: &str = "product";
+
+fn is_data(place: &&Place) -> bool {
+    ["telemetry", PRODUCT].contains(&place.role.as_str())
+}
+
 fn told(l: &Lineage, paint: Paint) -> String {
     let mut text = format!("{}\n", paint.bold(&l.product.id));
     if let Some(reason) = &l.product.withdrawn {
         text += &text::labelled("withdrawn", reason);
     }
     text += "\nmade of\n";
-    for place in l.inputs.iter().filter(|place| place.role == "telemetry") {
-        let there = place.path.as_ref().filter(|path| path.is_file());
-        let gone = if there.is_some() { String::new() } else { format!(", {}", paint.doubtful("not there any more")) };
-        let _ = writeln!(text, "  telemetry  {}  {}{gone}", short(&place.sha256), place.name);
+    for place in l.inputs.iter().filter(is_data) {
+        // Products lie in the archive, under another digest: theirs leaves out when they were made.
+        let there = place.role == PRODUCT || place.path.as_ref().is_some_and(|path| path.is_file());
+        let gone = if there { String::new() } else { format!(", {}", paint.doubtful("not there any more")) };
+        let _ = writeln!(text, "  {:<9}  {}  {}{gone}", place.role, short(&place.sha256), place.name);
         if let Some(path) = &place.path {
             let _ = writeln!(text, "             {}", path.display());
         }
@@ -147,9 +156,7 @@ fn drawn(l: &Lineage) -> Result<String, Failure> {
     let mut left: Vec<Node> = Vec::new();
     left.extend(l.resumed.first().map(|id| node("state of", id, "")));
     left.extend(l.supersedes.iter().map(|id| node("in place of", id, "")));
-    left.extend(
-        l.inputs.iter().filter(|p| p.role == "telemetry").map(|p| node("telemetry", &p.name, short(&p.sha256))),
-    );
+    left.extend(l.inputs.iter().filter(is_data).map(|p| node(&p.role, &p.name, short(&p.sha256))));
     let kept = l.kept.iter().filter(|p| !p.role.starts_with("state"));
     left.extend(kept.map(|p| node(&p.role, &p.name, short(&p.sha256))));
     let plugins = text::distinct(
