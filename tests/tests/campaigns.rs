@@ -144,6 +144,14 @@ fn days_of_the_inbox_are_those_of_catch_up() {
     let text = std::fs::read_to_string(&spec).expect("read");
     std::fs::write(&spec, text.split("[simulate]").next().expect("a part")).expect("written");
     assert_eq!(many.plan().iter().filter(|task| kind(task) == "day").count(), 3);
+    // A day whose telemetry is away fails and is told; it is tried again. A result that cannot be read gives way.
+    let (there, away) = (many.path().join("telemetry/SC1_2035-01-02.mcap"), many.path().join("away.mcap"));
+    std::fs::rename(&there, &away).expect("moved");
+    let status = json(&mut many.command(&["run", "camp", "--json"]), 1);
+    assert_eq!((&status["kinds"]["days"], &status["failed"][0][0]), (&serde_json::json!([2, 3]), &"2035-01-02".into()));
+    std::fs::rename(&away, &there).expect("moved");
+    let first = many.path().join("camp").join(many.plan()[0]["output"].as_str().expect("a folder"));
+    std::fs::write(first.join("result.json"), "bad").expect("written");
     json(&mut many.command(&["run", "camp", "--json"]), 0);
     many.commit();
     assert_eq!(many.digests(), single.digests());

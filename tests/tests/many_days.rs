@@ -136,6 +136,14 @@ fn a_step_comes_back_and_holds_from_its_time_on() {
     let rebuilt = mission.json(&format!("products rebuild {id}"), 0);
     assert_eq!(rebuilt["same"], true, "{rebuilt}");
     assert_eq!(mission.json("products verify", 0)["broken"], serde_json::json!([]));
+    // Its table of days, damaged, comes out again.
+    let shown = mission.json(&format!("products show {id}"), 0);
+    let attached = shown["attachments"].as_array().expect("files").iter().find(|a| a["suffix"] == "days.json");
+    let sha256 = attached.expect("a table")["sha256"].as_str().expect("a digest").to_owned();
+    let object = mission.path().join("archive/objects").join(&sha256[..2]).join(&sha256[2..]);
+    std::fs::write(&object, "{}").expect("written");
+    assert_eq!(mission.json(&format!("products rebuild {id}"), 0)["mended"], serde_json::json!(["days.json"]));
+    assert_eq!(mission.json("products verify", 0)["broken"], serde_json::json!([]));
     // A day is still found by its day.
     assert_eq!(mission.json("products show 2035-01-01", 0)["id"], "COM1B_2035-01-01_SC1_01_0001");
 
@@ -227,7 +235,22 @@ fn a_day_with_an_event_in_it_is_left_out() {
     write("2035-01-01 00:00:00 UTC");
     let ran = dragfree(mission.path()).args(ask.split(' ')).arg("--json").output().expect("runs");
     let joint: Value = serde_json::from_slice(&ran.stdout).expect("JSON");
-    assert!(joint["notes"][0].as_str().is_some_and(|note| note.contains("both sides")), "{}", joint["notes"]);
+    assert!(joint["notes"].to_string().contains("both sides"), "{}", joint["notes"]);
+    // What an event names itself stands in place of what its kind changes; a name that is none is told.
+    let named = |what: &str| {
+        let text = EVENTS.replace("  data:", &format!("  changes: [{what}]\n  data:"));
+        std::fs::write(mission.path().join("log.yaml"), text).expect("written");
+        let ran = dragfree(mission.path()).args(ask.split(' ')).arg("--json").output().expect("runs");
+        serde_json::from_slice::<Value>(&ran.stdout).expect("JSON")
+    };
+    let steps = |joint: &Value| -> Vec<bool> {
+        let all = joint["coefficients"].as_array().expect("coefficients");
+        all.iter().map(|c| c["steps"].as_array().is_some_and(|steps| !steps.is_empty())).collect()
+    };
+    assert_eq!(steps(&named("com-offset.tm1")), [true, true, true, false, false, false]);
+    let nothing = named("com-offset.tm3");
+    assert_eq!(steps(&nothing), [false; 6]);
+    assert!(nothing["notes"].to_string().contains("com-offset.tm3, which no coefficient"), "{}", nothing["notes"]);
     write("a Friday");
     assert!(mission.refusal(ask).contains("log.yaml: the time \"a Friday\""));
 }
@@ -315,6 +338,13 @@ fn a_new_product_of_a_day_makes_the_calibration_stale() {
     assert!(reasons.contains("COM1B_2035-01-08_SC1_01_0002 is new"), "{reasons}");
     assert!(reasons.contains("COM1B_2035-01-02_SC1_01 has no product"), "{reasons}");
     assert_eq!(stale["many_days"][0]["reasons"].as_array().map(Vec::len), Some(2), "{reasons}");
+    // Another time has its own; the file of events of the mission changes.
+    mission.json("joint 2035-01-05..2035-01-07", 0);
+    assert_eq!(mission.json("products stale", 0)["many_days"].as_array().map(Vec::len), Some(1));
+    std::fs::write(mission.path().join("events.yaml"), "# nothing happened\n[]\n").expect("written");
+    let stale = mission.json("products stale", 0);
+    assert_eq!(stale["many_days"][1]["product"], "COM2_2035-01-05_SC1_01_0001");
+    assert_eq!(stale["many_days"][1]["reasons"], serde_json::json!(["the events of events.yaml are others now"]));
     let again = mission.joint();
     assert_eq!(again["product"], "COM2_2035-01-01_SC1_01_0002");
     assert_eq!(again["days"].as_array().map(Vec::len), Some(DAYS.len() - 1));

@@ -2,10 +2,9 @@
 
 use crate::text::{self, Paint};
 use crate::utc;
-use dragfree_archive::JOINT;
 use dragfree_archive::files::Problem;
 use dragfree_archive::product::{Coefficient, Product};
-use dragfree_archive::{Entry, Listing};
+use dragfree_archive::{Entry, JOINT, Listing};
 use dragfree_engine::border::{Manifest, Parameter, ParameterType};
 use dragfree_engine::registry::Registry;
 use dragfree_workflow::calibrate::{CheckReport, CheckedNode};
