@@ -257,19 +257,15 @@ pub(crate) fn table(all: &[Months]) -> (String, Vec<String>) {
     }
     let false_steps = all.iter().flat_map(|m| &m.coefficients).filter(|c| c.seen[0]).count();
     let [alerts, predicted] = [all.iter().map(|m| m.alerts).sum::<usize>(), all.iter().map(|m| m.predicted).sum()];
-    let slowest = |k: usize| all.iter().map(|m| m.joint_s[k]).fold(0.0, f64::max);
     text += &format!(
         "\nDays against what fits them all: χ²/dof {:.3} on {dof:.0} degrees of freedom, accepted {:.3}–{:.3} (once in 100). Steps \
          reported where there is none: {false_steps} of {}, at a false-alarm rate of 1 in 100 for all steps and coefficients of a \
-         set. `trend`: {alerts} of {predicted} predictions alarm, at most {:.0} are to be expected. `joint` takes at most {:.2} s \
-         at first and {:.2} s once more, beside another process.\n",
+         set. `trend`: {alerts} of {predicted} predictions alarm, at most {:.0} are to be expected.\n",
         chi2 / dof,
         accepted.low,
         accepted.high,
         6 * all.len(),
         predicted as f64 * 0.01 / 6.0,
-        slowest(0),
-        slowest(1),
     );
     (text, failed)
 }
