@@ -536,8 +536,8 @@ mod tests {
     }
 
     /// Where the noise of every third day is three times as loud, Σ of all days has it, σ is right, and nothing is
-    /// widened: the pull of the first coefficient over 30 flights is within 4σ of χ². Where a coefficient is another one
-    /// every day, by five σ of a day, the days differ, and σ is widened.
+    /// widened: the pull of the first coefficient over 30 flights is within 4σ of χ². Where a coefficient is another
+    /// one every day, by five σ of a day, the days differ, and σ is widened.
     #[test]
     fn days_that_differ_widen_sigma_and_louder_ones_do_not() {
         let plan = Plan::new(SEGMENT, RATE_HZ);
