@@ -3,7 +3,6 @@
 //! Days are given as sums ([`crate::moments`]) over *stretches*, between which coefficients may step. A rate and a step
 //! are further coefficients: of the series times the time, and of the series from the step on. So a solution of many
 //! days is one of the same kind as that of a day, with more columns: Σ from its residuals, constraints, covariance.
-//! Surveys and ranges hold in the middle of every stretch.
 //!
 //! Whether days agree is seen in the scores of single days at the solution ([`DayScore`]), which are independent.
 
