@@ -137,16 +137,14 @@ impl Prepared {
         Ok(())
     }
 
-    /// Brings a content into the staging folder, by a link where both are on one file system.
+    /// Copies a content into the staging folder: a link would let who writes over a result write over the archive.
     fn stage(&mut self, staging: &Path, from: &Archive, digest: &str) -> Result<(), ArchiveError> {
         if self.contents.contains_key(digest) {
             return Ok(());
         }
         let (source, staged) = (from.objects.path(digest), staging.join(digest));
-        if fs::hard_link(&source, &staged).is_err() {
-            fs::copy(&source, &staged).at("copy", &source)?;
-            File::open(&staged).and_then(|file| file.sync_all()).at("write", &staged)?;
-        }
+        fs::copy(&source, &staged).at("copy", &source)?;
+        File::open(&staged).and_then(|file| file.sync_all()).at("write", &staged)?;
         let found = crate::files::sha256_of(&staged).at("read", &staged)?;
         if found != digest {
             let reason = format!("its digest is {found}, its name says {digest}");
