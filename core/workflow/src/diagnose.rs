@@ -1,7 +1,7 @@
 //! Which effect is missing from the model of some products.
 //!
-//! The data are read for transients, for the spectra of all candidates, which choose the form of each, a third time if
-//! a shape can be refined, and then until the likelihood of the innovations, which decides, has settled.
+//! The data are read for transients, for the spectra of all candidates, which choose the form of each, once more if a
+//! shape can be refined, and then until the likelihood of the innovations, which decides, has settled.
 
 use std::collections::BTreeSet;
 
@@ -9,15 +9,16 @@ use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
 use dragfree_engine::run::Progress;
 use dragfree_estimation::decimate::SLOW_HZ;
+use dragfree_estimation::sigma::NoiseModel;
 use dragfree_identification::candidates::{Candidate, Coefficient as Unknown};
 use dragfree_identification::diagnosis::{self, Diagnosis, Found, Trials, UNOBSERVABLE, Unexplained};
-use dragfree_identification::lines::Line;
+use dragfree_identification::lines::{Line, Lines};
 use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::screen::{RefinementRequest, Screened, screen};
 use dragfree_identification::slow_forces::slow_forces;
 use dragfree_identification::transient::{Detection, Transients};
-use dragfree_schema::Settings;
+use dragfree_schema::{NoiseProcess, Settings};
 use serde_json::json;
 
 use crate::WorkflowError;
@@ -55,58 +56,112 @@ pub fn diagnose(
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Diagnosed, WorkflowError> {
     let settings = replay.settings()?;
-    let searched = sum(replay, settings, What::Transients, progress)?.gathered;
-    let (mut found, lines) = (searched.transients, searched.lines);
-    let near_ends = transients_near_ends(replay, &mut found, progress)?;
-    let of_lines: Vec<EffectEntry> = lines.found.iter().map(entry_of).collect();
-    let detected = Detected::new(&found, &near_ends, settings);
-    let mut gather = |requests: &[RefinementRequest], proposals: &[Proposal], probes: &[EffectEntry]| {
-        let proposed = proposals.iter().map(|p| p.entry.clone());
-        let chosen: Vec<EffectEntry> = of_lines.iter().cloned().chain(proposed).collect();
-        let forms = Forms { detected: &detected.all, requests, chosen: &chosen, probes };
-        let mut record = sum(replay, settings, What::Candidates(&forms), progress)?;
-        record.gathered.transients = found.clone();
-        record.gathered.lines = lines.clone();
-        let noise = record.noise_model()?;
-        let screened = {
-            let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
-            detected.screen(&scorer, &[])?
-        };
-        Ok::<_, WorkflowError>((record, noise, screened))
-    };
-    let (mut record, mut noise, mut screened) = gather(&[], &[], &probes(replay.registry))?;
-    let mut tried = screened.tried.clone();
-    let mut requests = screened.requests.clone();
+    let searched = Searched::new(replay, progress)?;
+    let first = Spectra::gather(replay, &searched, &[], &[], &probes(replay.registry), progress)?;
+    let mut tried = first.screened.tried.clone();
+    let (proposals, formulas) = proposals(replay, &first.record)?;
+    let mut requests = first.screened.requests.clone();
     requests.retain(|request| has_parameter(replay.registry, &request.effect, FINE));
-    let (proposals, formulas) = proposals(replay, &record)?;
-    if !requests.is_empty() || !proposals.is_empty() {
+    let spectra = if requests.is_empty() {
+        first
+    } else {
         tried.retain(|effect, _| requests.iter().any(|request| request.effect == *effect));
         // Sums are large, and these are made again.
-        drop(record);
-        (record, noise, screened) = gather(&requests, &proposals, &[])?;
-        for (effect, forms) in &screened.tried {
+        drop(first);
+        let finer = Spectra::gather(replay, &searched, &requests, &proposals, &[], progress)?;
+        for (effect, forms) in &finer.screened.tried {
             *tried.entry(effect.clone()).or_default() += forms;
         }
-    }
+        finer
+    };
     tried.insert(FORMULA.to_owned(), formulas);
     tried.retain(|effect, _| !has_parameter(replay.registry, effect, FREQUENCY_HZ));
-    let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
+    let trials = Trials::new(&spectra.scorer(settings), &tried);
     let (registry, products) = (replay.registry, replay.products);
-    let trials = Trials::new(&scorer, &tried);
     let evidence = Evidence { trials, least: settings.false_alarm, registry, products, proposals };
-    let last = decide(replay, &detected, &record, &scorer, screened, &evidence, progress)?;
+    let (last, spectra) = decide(replay, &searched, spectra, &requests, &evidence, progress)?;
     let decided = &last.end.decided;
-    let mut diagnosis = answer(settings, &record, &scorer, decided, &last.screened, &evidence, &last.moving)?;
+    let scorer = spectra.scorer(settings);
+    let mut diagnosis = answer(settings, &spectra.record, &scorer, decided, &last.screened, &evidence, &last.moving)?;
     contradict(&mut diagnosis, products);
     let extract = match products {
         [product] if keeps => {
-            let about_model = about_model(replay, &record, &last, &evidence, progress)?;
-            let levels = noise_levels(decided, &record);
+            let about_model = about_model(replay, &spectra.record, &last, &evidence, progress)?;
+            let levels = noise_levels(decided, &spectra.record);
             Extract::new(product, &about_model, &diagnosis, levels, &evidence)
         }
         _ => None,
     };
-    Ok(Diagnosed { diagnosis, settings: settings.clone(), extract, end: last.end, record })
+    Ok(Diagnosed { diagnosis, settings: settings.clone(), extract, end: last.end, record: spectra.record })
+}
+
+/// What the searches without forms have found.
+struct Searched {
+    found: Transients,
+    lines: Lines,
+    /// Transients that become candidates.
+    detected: Detected,
+}
+
+impl Searched {
+    fn new(replay: &Replay<'_>, progress: &mut dyn FnMut(Pass, usize, Progress)) -> Result<Self, WorkflowError> {
+        let settings = replay.settings()?;
+        let by_spectra = sum(replay, settings, What::Transients, progress)?.gathered;
+        let (mut found, lines) = (by_spectra.transients, by_spectra.lines);
+        let near_ends = transients_near_ends(replay, &mut found, progress)?;
+        let detected = Detected::new(&found, &near_ends, settings);
+        Ok(Self { found, lines, detected })
+    }
+}
+
+/// Sums of the spectra of all candidates, and the forms that they choose.
+struct Spectra {
+    record: Record,
+    noise: NoiseModel,
+    screened: Screened,
+    /// Whether the proposed formulas are among the candidates.
+    has_formulas: bool,
+}
+
+impl Spectra {
+    /// Sums of all candidates, in fine steps what is requested, and of the proposed formulas.
+    fn gather(
+        replay: &Replay<'_>,
+        searched: &Searched,
+        requests: &[RefinementRequest],
+        proposals: &[Proposal],
+        probes: &[EffectEntry],
+        progress: &mut dyn FnMut(Pass, usize, Progress),
+    ) -> Result<Self, WorkflowError> {
+        let settings = replay.settings()?;
+        let of_lines = searched.lines.found.iter().map(entry_of);
+        let chosen: Vec<EffectEntry> = of_lines.chain(proposals.iter().map(|p| p.entry.clone())).collect();
+        let forms = Forms { detected: &searched.detected.all, requests, chosen: &chosen, probes };
+        let mut record = sum(replay, settings, What::Candidates(&forms), progress)?;
+        record.gathered.transients = searched.found.clone();
+        record.gathered.lines = searched.lines.clone();
+        let noise = record.noise_model()?;
+        let scorer = CandidateScorer::new(&record.candidate_set, &record.gathered, &noise, settings);
+        let screened = searched.detected.screen(&scorer, &[])?;
+        Ok(Self { record, noise, screened, has_formulas: !proposals.is_empty() })
+    }
+
+    fn scorer<'a>(&'a self, settings: &'a Settings) -> CandidateScorer<'a> {
+        CandidateScorer::new(&self.record.candidate_set, &self.record.gathered, &self.noise, settings)
+    }
+
+    /// Every candidate in the form of a screen, and every proposed formula. One that has not been summed has no
+    /// responses: it has one form, and only beside others does a screen need its sums.
+    fn forms(&self, screened: &Screened, proposals: &[Proposal]) -> Vec<Candidate> {
+        let formula = |p: &Proposal| Candidate {
+            effect: p.entry.id.clone(),
+            instance: p.entry.instance.clone(),
+            transient: false,
+            parts: Vec::new(),
+        };
+        let formulas = if self.has_formulas { &[] } else { proposals };
+        screened.forms.iter().cloned().chain(formulas.iter().map(formula)).collect()
+    }
 }
 
 /// Transients that become candidates.
@@ -165,34 +220,25 @@ fn entry_of(line: &Line) -> EffectEntry {
 }
 
 /// Decides by the likelihood of the innovations among the forms that the spectra choose, beside the effects that are
-/// named so far: passes until nothing moves.
+/// named so far: passes until nothing moves. Gives the spectra back, with the sums of the formulas where one was named.
 fn decide(
     replay: &Replay<'_>,
-    detected: &Detected,
-    record: &Record,
-    scorer: &CandidateScorer<'_>,
-    mut screened: Screened,
+    searched: &Searched,
+    mut spectra: Spectra,
+    requests: &[RefinementRequest],
     evidence: &Evidence<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
-) -> Result<Last, WorkflowError> {
-    let (settings, fit) = (scorer.settings, scorer.fit(&[])?);
-    let model = &record.candidate_set.coefficients[..record.candidate_set.model()];
-    let start = model.iter().zip(fit.estimate.theta.iter()).map(|(c, value)| (c.name.clone(), *value)).collect();
-    let mut point = Point::at(start);
-    // A glitch is no slow force, although it has its power.
-    let seen = unexplained(scorer.gathered.transients.certain(settings.false_alarm), &[], settings.same_transient_s);
-    let events = |c: &&Candidate| {
-        let of = |d: &&Detection| (&d.effect, &d.instance) == (&c.effect, &c.instance);
-        c.transient && seen.iter().any(of)
-    };
-    let events: Vec<Candidate> = screened.forms.iter().filter(events).cloned().collect();
-    let mut slow = slow_forces(scorer, &scorer.fit(&events)?, &record.noise);
+) -> Result<(Last, Spectra), WorkflowError> {
+    let settings = replay.settings()?;
+    let (mut point, mut slow) = start_of_passes(&spectra, settings)?;
+    let mut screened = spectra.screened.clone();
     let mut named: Vec<Candidate> = Vec::new();
     // A pass that fits constants beside what is named comes first, at the start and after a form has changed: they are
     // 1e5 σ away, and a filter would take them for noise.
     let (mut opening, mut passes) = (true, 0);
     loop {
-        let chosen: Vec<EffectEntry> = screened.forms.iter().map(|form| evidence.entry(form)).collect();
+        let forms = spectra.forms(&screened, &evidence.proposals);
+        let chosen: Vec<EffectEntry> = forms.iter().map(|form| evidence.entry(form)).collect();
         let decided = one_pass(replay, &chosen, &slow, opening, &point, evidence, progress)?;
         let next = step(&point, &decided);
         if opening {
@@ -201,31 +247,58 @@ fn decide(
             continue;
         }
         passes += 1;
-        let now = named_forms(&decided, &screened.forms);
+        let mut now = named_forms(&decided, &forms);
+        if now.iter().any(|form| form.parts.is_empty()) {
+            // Sums are large, and these are made again.
+            drop(spectra);
+            spectra = Spectra::gather(replay, searched, requests, &evidence.proposals, &[], progress)?;
+            let is_formula = |form: &&Candidate| evidence.proposal(&form.effect, &form.instance).is_some();
+            screened.forms.extend(spectra.screened.forms.iter().filter(is_formula).cloned());
+            now = named_forms(&decided, &screened.forms);
+        }
         let mut moving = moved(&point, &next, &decided);
         if now != named {
             moving.extend(differences(&now, &named));
         }
         point = next;
         if moving.is_empty() || passes == PASSES {
-            return Ok(Last { end: Settled { decided, chosen, slow, point }, screened, moving });
+            let screened = Screened { forms: spectra.forms(&screened, &evidence.proposals), ..screened };
+            return Ok((Last { end: Settled { decided, chosen, slow, point }, screened, moving }, spectra));
         }
         if now != named {
-            let beside = detected.screen(scorer, &now)?;
+            let scorer = spectra.scorer(settings);
+            let beside = searched.detected.screen(&scorer, &now)?;
             // A form that has changed is named in its new form, of which the spectra alone know a value.
             named = named_forms(&decided, &beside.forms);
             let fit = scorer.fit(&named)?;
-            let values = &fit.estimate.theta.as_slice()[record.candidate_set.model()..];
+            let values = &fit.estimate.theta.as_slice()[spectra.record.candidate_set.model()..];
             let parts = named.iter().flat_map(|c| c.parts.iter().map(move |(index, _)| (c, *index)));
             for ((_, index), value) in parts.zip(values).filter(|((c, _), _)| !now.contains(c)) {
                 // Its mean is another, and constants are far away again.
                 opening = true;
-                point.values.insert(record.candidate_set.coefficients[index].name.clone(), *value);
+                point.values.insert(spectra.record.candidate_set.coefficients[index].name.clone(), *value);
             }
-            slow = slow_forces(scorer, &fit, &record.noise);
+            slow = slow_forces(&scorer, &fit, &spectra.record.noise);
             screened = Screened { forms: beside.forms, ..screened };
         }
     }
+}
+
+/// Where the passes begin: the model as the spectra have it, and slow forces beside the declared noise that its
+/// residuals show. A glitch is no slow force, although it has the power of one.
+fn start_of_passes(spectra: &Spectra, settings: &Settings) -> Result<(Point, Vec<NoiseProcess>), WorkflowError> {
+    let (scorer, set) = (spectra.scorer(settings), &spectra.record.candidate_set);
+    let fit = scorer.fit(&[])?;
+    let model = &set.coefficients[..set.model()];
+    let values = model.iter().zip(fit.estimate.theta.iter()).map(|(c, value)| (c.name.clone(), *value)).collect();
+    let seen = unexplained(scorer.gathered.transients.certain(settings.false_alarm), &[], settings.same_transient_s);
+    let events = |c: &&Candidate| {
+        let of = |d: &&Detection| (&d.effect, &d.instance) == (&c.effect, &c.instance);
+        c.transient && seen.iter().any(of)
+    };
+    let events: Vec<Candidate> = spectra.screened.forms.iter().filter(events).cloned().collect();
+    let slow = slow_forces(&scorer, &scorer.fit(&events)?, &spectra.record.noise);
+    Ok((Point::at(values), slow))
 }
 
 /// The end of the passes of a decision.
