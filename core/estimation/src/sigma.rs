@@ -175,13 +175,23 @@ impl NoiseModel {
 
     /// One-sided cross-spectral matrix at `frequency_hz`, channels × channels, units of the channels squared per Hz.
     pub fn psd(&self, frequency_hz: f64) -> DMatrix<f64> {
+        self.mean_psd(&[frequency_hz])
+    }
+
+    /// Mean of [`Self::psd`] over some frequencies. What is linear in the spectra is averaged before it is spread over
+    /// the channels: a band has up to ten thousand bins.
+    fn mean_psd(&self, frequencies_hz: &[f64]) -> DMatrix<f64> {
+        let count = frequencies_hz.len() as f64;
         let mut sigma = DMatrix::zeros(self.channels, self.channels);
         for p in &self.processes {
-            let power = p.shape.psd(frequency_hz) * self.power(p.response, frequency_hz);
-            sigma.iter_mut().zip(&p.enters).for_each(|(s, e)| *s += e * power);
+            let power = |hz: &f64| p.shape.psd(*hz) * self.power(p.response, *hz);
+            sigma += &p.enters * (frequencies_hz.iter().map(power).sum::<f64>() / count);
         }
         for error in &self.errors {
-            sigma += &error.gain * self.remaining(error, frequency_hz) * error.gain.transpose();
+            let size = error.gain.ncols();
+            let remaining = frequencies_hz.iter().map(|hz| self.remaining(error, *hz));
+            let mean = remaining.fold(DMatrix::zeros(size, size), |sum, r| sum + r) / count;
+            sigma += &error.gain * mean * error.gain.transpose();
         }
         sigma
     }
@@ -277,8 +287,7 @@ fn matrix(rows: &[Vec<f64>], columns: usize) -> DMatrix<f64> {
     DMatrix::from_fn(rows.len(), columns, |i, j| rows[i][j])
 }
 
-/// The modelled noise in the bands of a plan: made once for as many estimates as there are, as a band has up to ten
-/// thousand bins.
+/// The modelled noise in the bands of a plan: made once for as many estimates as there are.
 pub struct BandNoise<'a> {
     /// At any frequency.
     pub model: &'a NoiseModel,
@@ -289,10 +298,9 @@ pub struct BandNoise<'a> {
 impl<'a> BandNoise<'a> {
     /// Of the bands of `plan`.
     pub fn new(model: &'a NoiseModel, plan: &Plan) -> Self {
-        let zero = || DMatrix::zeros(model.channels, model.channels);
         let mean = |band: &Band| {
-            let bins = (band.first..band.end).map(|k| model.psd(plan.hz(*band, k as f64)));
-            bins.fold(zero(), |sum, psd| sum + psd) / band.bins() as f64
+            let bins: Vec<f64> = (band.first..band.end).map(|k| plan.hz(*band, k as f64)).collect();
+            model.mean_psd(&bins)
         };
         Self { model, mean: plan.bands.iter().map(mean).collect() }
     }
