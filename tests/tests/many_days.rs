@@ -252,7 +252,7 @@ fn a_day_with_an_event_in_it_is_left_out() {
     assert_eq!(steps(&nothing), [false; 6]);
     assert!(nothing["notes"].to_string().contains("com-offset.tm3, which no coefficient"), "{}", nothing["notes"]);
     write("a Friday");
-    assert!(mission.refusal(ask).contains("log.yaml: the time \"a Friday\""));
+    assert!(mission.refusal(ask).contains("log.yaml: at line 1, the time \"a Friday\""));
 }
 
 /// Sums of different make are refused by the day that differs, and in what.
