@@ -18,9 +18,9 @@ use dragfree_schema::{Coefficient, Settings};
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
-use crate::{ManyDays, WorkflowError};
 use crate::answer::{Evidence, NoiseLevel, apart, contradict, found, limits, offsets, verdict, with_levels};
 use crate::likelihood::{CoefficientSums, Decided, joined};
+use crate::{ManyDays, WorkflowError};
 
 /// Format of the file.
 const FORMAT: &str = "dragfree-extract/1";

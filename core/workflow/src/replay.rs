@@ -14,8 +14,8 @@ use dragfree_identification::screen::RefinementRequest;
 use dragfree_identification::transient::Detection;
 use dragfree_schema::Settings;
 
-use crate::{ManyDays, WorkflowError};
 use crate::sums::{ColumnSums, Request};
+use crate::{ManyDays, WorkflowError};
 
 /// Parameter of an effect whose candidate can be tried about one shape in fine steps.
 pub(crate) const FINE: &str = "fine";
