@@ -165,7 +165,11 @@ fn nothing_that_is_not_run_looks_like_a_test() {
         let Some(library) = package["targets"].as_array().expect("targets").iter().find(library) else { continue };
         let source = Path::new(library["src_path"].as_str().expect("a path")).parent().expect("a folder");
         let text: String = files_below(source).iter().map(|p| std::fs::read_to_string(p).expect("text")).collect();
-        assert_eq!(library["doctest"] == true, has_example(&text), "{name}: `doctest` of its [lib] against its comments");
+        assert_eq!(
+            library["doctest"] == true,
+            has_example(&text),
+            "{name}: `doctest` of its [lib] against its comments"
+        );
         let has_tests = text.contains("#[test]") || text.contains("proptest!");
         assert_eq!(library["test"] == true, has_tests, "{name}: `test` of its [lib] against its modules");
         without_examples += usize::from(library["doctest"] == false);
