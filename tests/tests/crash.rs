@@ -144,8 +144,8 @@ fn certify(folder: &Path) -> Command {
     command
 }
 
-/// Counts of writes, so that a library that is not preloaded is noticed. To the archive a full disk (below) and one that
-/// cannot be written are one case, so that each command meets one of them.
+/// Counts of writes, so that a library that is not preloaded is noticed. To the archive a full disk (below) and one
+/// that cannot be written are one case, so that each command meets one of them.
 #[test]
 fn every_write_of_certify_fails_in_turn() {
     for (errno, stays) in [(EROFS, true), (EIO, false), (EDQUOT, false), (KILL, false)] {

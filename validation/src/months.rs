@@ -79,7 +79,7 @@ impl Keyed for Months {
     }
 
     /// Builds of one commit in several places differ in their digests.
-    fn build(&self) -> &str {
+    fn made_with(&self) -> &str {
         &self.commit
     }
 }
