@@ -158,7 +158,8 @@ fn vcm1b(product: &Product) -> Result<String, Failure> {
 }
 
 /// What a VCM1B file of many days must say, as its format has one vector for all of them.
-const OF_MANY_DAYS: &str = "the vectors hold at epoch_of_values; before it they differ by the rates, where there are any, and by the steps at events, which `dragfree at TIME` and --format csv tell";
+const OF_MANY_DAYS: &str = "the vectors hold at epoch_of_values; before it they differ by the rates, where there are any, \
+                            and by the steps at events, which `dragfree at TIME` and --format csv tell";
 
 struct Offset<'a> {
     value_m: [f64; 3],
