@@ -5,7 +5,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
+/// The packages of the workspace, as cargo knows them.
+fn packages() -> Vec<Value> {
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     let output = dragfree_tests::expect(
         Command::new(cargo).current_dir(dragfree_tests::root()).args([
@@ -18,8 +19,11 @@ fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
         0,
     );
     let metadata: Value = serde_json::from_slice(&output.stdout).expect("cargo prints JSON");
-    let packages = metadata["packages"].as_array().expect("packages");
-    packages
+    metadata["packages"].as_array().expect("packages").clone()
+}
+
+fn dependencies() -> BTreeMap<String, BTreeSet<String>> {
+    packages()
         .iter()
         .map(|p| {
             let normal = p["dependencies"].as_array().expect("dependencies").iter().filter(|d| d["kind"].is_null());
@@ -148,6 +152,68 @@ fn tests_do_not_change_the_features_of_the_program() {
     let (program, tests) = (features("normal,build"), features("normal,build,dev"));
     assert!(program.len() > 100 && tests.len() > program.len(), "{} {}", program.len(), tests.len());
     assert_eq!(program.difference(&tests).collect::<Vec<_>>(), Vec::<&String>::new());
+}
+
+/// What cargo is told not to test has no test: a crate without documentation tests has no example in its comments, one
+/// without tests of its own has none.
+#[test]
+fn nothing_that_is_not_run_looks_like_a_test() {
+    let (mut without_examples, mut without_tests) = (0, 0);
+    for package in packages() {
+        let name = package["name"].as_str().expect("a name");
+        let library = |target: &&Value| target["kind"].to_string().contains("lib");
+        let Some(library) = package["targets"].as_array().expect("targets").iter().find(library) else { continue };
+        let source = Path::new(library["src_path"].as_str().expect("a path")).parent().expect("a folder");
+        let text: String = files_below(source).iter().map(|p| std::fs::read_to_string(p).expect("text")).collect();
+        assert_eq!(
+            library["doctest"] == true,
+            has_example(&text),
+            "{name}: `doctest` of its [lib] against its comments"
+        );
+        let has_tests = text.contains("#[test]") || text.contains("proptest!");
+        assert_eq!(library["test"] == true, has_tests, "{name}: `test` of its [lib] against its modules");
+        without_examples += usize::from(library["doctest"] == false);
+        without_tests += usize::from(library["test"] == false);
+    }
+    assert!(without_examples > 10 && without_tests > 3, "{without_examples} {without_tests}");
+    assert!(has_example("/// ```\n/// a();\n/// ```\n") && has_example("//! ```no_run\n//! a();\n//! ```\n"));
+    assert!(!has_example("/// ```text\n/// a\n/// ```\nlet fence = \"```\";\n"));
+}
+
+/// Whether a comment of documentation has a block that rustdoc takes for Rust.
+fn has_example(text: &str) -> bool {
+    let comment = |line: &str| {
+        let line = line.trim_start();
+        let rest = line.strip_prefix("///").or_else(|| line.strip_prefix("//!"))?;
+        rest.trim().strip_prefix("```").map(str::to_owned)
+    };
+    let opening = text.lines().filter_map(comment).step_by(2);
+    let other = ["text", "toml", "yaml", "json", "sh", "c", "math"];
+    opening.into_iter().any(|language| !other.contains(&language.as_str()))
+}
+
+/// Rust files of a folder and those inside of it.
+fn files_below(folder: &Path) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).expect("a folder").flatten().map(|entry| entry.path());
+    let of = |path: PathBuf| if path.is_dir() { files_below(&path) } else { vec![path] };
+    entries.flat_map(of).filter(|path| path.extension().is_some_and(|e| e == "rs")).collect()
+}
+
+/// A file of tests that is no module of `programs.rs` and no binary of its own would never run.
+#[test]
+fn every_file_of_whole_program_tests_is_run() {
+    let folder = dragfree_tests::root().join("tests");
+    let programs = std::fs::read_to_string(folder.join("tests/programs.rs")).expect("the list");
+    let manifest = std::fs::read_to_string(folder.join("Cargo.toml")).expect("a manifest");
+    let mut seen = 0;
+    for path in std::fs::read_dir(folder.join("tests")).expect("a folder").flatten().map(|entry| entry.path()) {
+        let name = path.file_stem().expect("a name").to_string_lossy().into_owned();
+        let is_module = programs.lines().any(|line| line == format!("mod {name};"));
+        let is_binary = manifest.contains(&format!("[[test]]\nname = \"{name}\"\n"));
+        assert!(is_module != is_binary, "{name}: once in tests/tests/programs.rs, or in tests/Cargo.toml");
+        seen += 1;
+    }
+    assert!(seen > 30, "{seen}");
 }
 
 /// Simulator and effects share no code, so that one would reveal an error of the other.

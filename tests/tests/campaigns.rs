@@ -193,6 +193,63 @@ fn what_does_not_fit_is_refused_and_nothing_taken_over() {
     let empty = json(dragfree(campaign.path()).args(["products", "list", "--json"]), 0);
     assert_eq!(empty["products"], serde_json::json!([]));
     assert!(campaign.refusal(&["task", "camp", "0000"]).contains("no task 0000"));
+    let spec = campaign.path().join("spec.toml");
+    let text = std::fs::read_to_string(&spec).expect("read");
+    std::fs::write(&spec, text.replace("hours = 0.5", "hours = 25")).expect("written");
+    assert!(campaign.refusal(&["plan", "spec.toml", "--out", "other"]).contains("at most 24"));
+    assert!(!campaign.path().join("other").exists(), "a plan that failed leaves nothing");
+}
+
+/// Stands for Slurm's `sbatch`: does the tasks of an array, the last one first, once the job that it waits for has
+/// ended well, and tells the number of its own.
+const SBATCH: &str = r#"#!/bin/sh
+set -eu
+for argument; do
+    case $argument in
+    --array=*) array=${argument#--array=} ;;
+    --wrap=*) wrap=${argument#--wrap=} ;;
+    --dependency=afterok:*) [ -e "jobs/${argument##*:}" ] ;;
+    esac
+done
+task=${array#*-}
+while [ "$task" -ge "${array%-*}" ]; do
+    SLURM_ARRAY_TASK_ID=$task sh -c "$wrap" > /dev/null
+    task=$((task - 1))
+done
+number=$(($(ls jobs | wc -l) + 1))
+touch "jobs/$number"
+echo "$number"
+"#;
+
+/// The script for Slurm with a stand-in for `sbatch`: what one machine makes.
+#[test]
+fn arrays_of_slurm_make_what_one_machine_makes() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let campaign = Campaign::new();
+    let tasks = campaign.plan();
+    let bin = campaign.path().join("bin");
+    std::fs::create_dir(&bin).expect("a folder");
+    std::fs::create_dir(campaign.path().join("jobs")).expect("a folder");
+    std::fs::write(bin.join("sbatch"), SBATCH).expect("written");
+    std::fs::set_permissions(bin.join("sbatch"), std::fs::Permissions::from_mode(0o755)).expect("a program");
+    let mut script = Command::new("sh");
+    script.current_dir(campaign.path()).arg(root().join("campaigns/slurm_array.sh")).arg("camp");
+    let told = expect(script.env("PATH", path_with(&[&bin, built()])), 0);
+    let told = String::from_utf8_lossy(&told.stdout).into_owned();
+    // Nine days, their nodes of eight days, and that of sixty-four days each wait for what comes before them.
+    let days = tasks.iter().filter(|task| kind(task) == "flight").count();
+    assert!(told.starts_with(&format!("lines 1 to {days}: job 1\n")), "{told}");
+    assert!(told.lines().count() >= 2 && told.contains(&format!("to {}: job", tasks.len())), "{told}");
+    assert_eq!(campaign.results(), tasks.len());
+    campaign.commit();
+    assert_eq!(&campaign.digests(), serial());
+}
+
+/// `PATH` with folders before it.
+fn path_with(folders: &[&Path]) -> std::ffi::OsString {
+    let own = std::env::var_os("PATH").unwrap_or_default();
+    let folders = folders.iter().map(|folder| folder.to_path_buf());
+    std::env::join_paths(folders.chain(std::env::split_paths(&own))).expect("a path")
 }
 
 /// The library that ends a program at a write.
@@ -325,10 +382,7 @@ fn dask_makes_what_one_machine_makes_whatever_is_killed() {
     let Some(python) = python() else { return };
     let campaign = Campaign::new();
     let tasks = campaign.plan();
-    let path = std::env::join_paths(
-        std::iter::once(built().to_owned()).chain(std::env::split_paths(&std::env::var_os("PATH").unwrap_or_default())),
-    )
-    .expect("a path");
+    let path = path_with(&[built()]);
     let start = |arguments: &[&str]| {
         Group::start(Command::new(&python).current_dir(campaign.path()).env("PATH", &path).args(arguments))
     };

@@ -13,7 +13,7 @@ fn committed<T: JsonSchema>(name: &str) {
         std::fs::write(&path, &made).expect("written");
     }
     let there = std::fs::read_to_string(&path).unwrap_or_default();
-    let again = "DRAGFREE_WRITE_SCHEMA=1 cargo test --release -p dragfree-tests --test json_schema";
+    let again = "DRAGFREE_WRITE_SCHEMA=1 cargo test --release -p dragfree-tests --test programs json_schema";
     assert!(there == made, "{} is not the schema of {name}; run `{again}`", path.display());
 }
 

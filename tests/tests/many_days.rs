@@ -167,6 +167,41 @@ fn a_step_comes_back_and_holds_from_its_time_on() {
     }
 }
 
+/// A calibration of many days has no data of its own, which commands that need some say. As VCM1B it has its rates. Two
+/// of them are compared on a screen of 80 columns.
+#[test]
+fn a_calibration_of_many_days_is_not_taken_for_one_of_a_day() {
+    let mission = Mission::flown();
+    let constant = mission.joint()["product"].as_str().expect("a product").to_owned();
+    for command in ["ladder", "compare", "diagnose"] {
+        let refused = mission.refusal(&format!("{command} {constant}"));
+        assert!(refused.contains("one calibration of many days, with no data of its own"), "{command}: {refused}");
+        assert!(refused.contains(&format!("`dragfree products lineage {constant}`")), "{command}: {refused}");
+    }
+    let ask = "joint 2035-01-01..2035-01-08 --events log.yaml --step MTEA=com-offset";
+    let drifting = mission.json(ask, 0)["product"].as_str().expect("a product").to_owned();
+    let vcm1b = |id: &str| {
+        let told = expect(dragfree(mission.path()).args(["products", "export", id, "--format", "vcm1b"]), 0);
+        String::from_utf8(told.stdout).expect("text")
+    };
+    let text = vcm1b(&drifting);
+    let header: serde_yaml_ng::Value =
+        serde_yaml_ng::from_str(text.split("# End").next().expect("a header")).expect("YAML");
+    let attributes = &header["header"]["non-standard_attributes"];
+    let product = mission.json(&format!("products show {drifting}"), 0);
+    for (at, axis) in ["x", "y", "z"].iter().enumerate() {
+        let (value, sigma) = dragfree_tests::coefficient(&product, &format!("com-offset.tm2.{axis}.rate"), "joint");
+        assert_eq!(attributes["rate_tm2_m_s"][at].as_f64(), Some(value), "{text}");
+        assert_eq!(attributes["sigma_rate_tm2_m_s"][at].as_f64(), Some(sigma), "{text}");
+    }
+    assert!(attributes["comment"].as_str().is_some_and(|c| c.contains("hold at epoch_of_values")), "{text}");
+    assert!(!vcm1b(&constant).contains("rate_") && !vcm1b("COM1B_2035-01-01_SC1_01_0001").contains("comment: \"the"));
+    let told = expect(dragfree(mission.path()).args(["products", "diff", &constant, &drifting]), 0);
+    let told = String::from_utf8(told.stdout).expect("text");
+    assert!(told.contains("com-offset.tm1.x.step.2035-01-05T00:00:00\n"), "{told}");
+    assert!(told.lines().all(|line| line.chars().count() <= 80), "{told}");
+}
+
 /// Without the event the days are not the same.
 #[test]
 fn a_step_that_nobody_declares_makes_days_disagree() {
@@ -252,7 +287,7 @@ fn a_day_with_an_event_in_it_is_left_out() {
     assert_eq!(steps(&nothing), [false; 6]);
     assert!(nothing["notes"].to_string().contains("com-offset.tm3, which no coefficient"), "{}", nothing["notes"]);
     write("a Friday");
-    assert!(mission.refusal(ask).contains("log.yaml: the time \"a Friday\""));
+    assert!(mission.refusal(ask).contains("log.yaml: at line 1, the time \"a Friday\""));
 }
 
 /// Sums of different make are refused by the day that differs, and in what.

@@ -9,20 +9,28 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 
-/// A mission as `init` writes it, with an hour of telemetry on either side of two midnights, in `vault`.
+/// A mission as `init` writes it, with an hour of telemetry on either side of two midnights, in `vault`; of the third
+/// day there are five hours in `vault/whole.mcap`.
 struct Mission {
     dir: TempDir,
 }
+
+const HOUR_NS: u64 = 3_600_000_000_000;
 
 impl Mission {
     fn new() -> Self {
         let dir = tempfile::tempdir().expect("a temporary folder");
         let mission = Self { dir };
         expect(dragfree(mission.path()).args(["init", "."]), 0);
-        for (start, seed) in [("2035-01-01T23:00:00Z", "1"), ("2035-01-03T23:00:00Z", "2")] {
-            let arguments = ["--out", "vault", "--start", start, "--hours", "2", "--seed", seed];
+        for (start, hours, seed) in [("2035-01-01T23:00:00Z", "2", "1"), ("2035-01-03T19:00:00Z", "6", "2")] {
+            let arguments = ["--out", "vault", "--start", start, "--hours", hours, "--seed", seed];
             expect(dragfree(mission.path()).args(["simulate", "mission.toml"]).args(arguments), 0);
         }
+        let whole = mission.path().join("vault/whole.mcap");
+        std::fs::rename(mission.vault(3), &whole).expect("moved");
+        let recording = Recording::read(&whole);
+        let last_hour = recording.start_ns() + 4 * HOUR_NS;
+        recording.write(&mission.vault(3), |m| (last_hour <= m.log_time).then_some(m));
         std::fs::create_dir(mission.path().join("telemetry")).expect("a folder");
         mission
     }
@@ -114,14 +122,14 @@ fn a_week_of_trials_ends_in_a_certified_set() {
     assert_eq!(pieced["coefficients"], whole["coefficients"]);
     assert_eq!(pieced["epochs_used"], whole["epochs_used"]);
 
-    // A corrected file with a gap: its day, and the day whose run-in it is.
-    let recording = Recording::read(&mission.vault(3));
-    let (gap, end) = (recording.start_ns() + 600_000_000_000, recording.start_ns() + 1_200_000_000_000);
+    // A corrected file that begins earlier and has a gap of three hours: its day, and the day whose run-in it is.
+    let recording = Recording::read(&mission.path().join("vault/whole.mcap"));
+    let (gap, end) = (recording.start_ns() + HOUR_NS, recording.start_ns() + 4 * HOUR_NS);
     recording.write(&mission.inbox("day3.mcap"), |m| (m.log_time < gap || end <= m.log_time).then_some(m));
     std::fs::remove_file(mission.inbox("again.mcap")).expect("removed");
     assert_eq!(mission.ran(), days(&[(3, "0002"), (4, "0003")]));
     let gapped = mission.product("2035-01-03");
-    assert_eq!(gapped["epochs_used"], 30_000);
+    assert_eq!((&gapped["epochs_used"], &gapped["verdict"]), (&json!(72_000), &json!("agree")));
 
     // A file that is none stops no day.
     std::fs::write(mission.inbox("broken.mcap"), "not telemetry").expect("written");
@@ -235,6 +243,42 @@ fn a_command_of_the_operators_is_run_for_a_loss_of_data() {
     assert_eq!(json(&mut list(), 0)["products"][0]["id"], "COM1B_2035-01-02_SC1_01_0001");
     expect(list().args(["--archive", "archive"]), 2);
     expect(dragfree(elsewhere.path()).args(["products", "list"]), 1);
+}
+
+/// The same inputs give the product that was withdrawn, so that no day is due; asked for by name it is run. A test is
+/// no product of the day.
+#[test]
+fn a_withdrawn_product_is_made_again_only_when_asked_for_and_a_test_is_no_day() {
+    let mission = Mission::new();
+    mission.arrives(4, "day4.mcap");
+    let mut test = dragfree(mission.path());
+    let run = ["run", "pipeline.toml", "telemetry/day4.mcap", "--stream", "test", "--archive", "archive", "-q"];
+    let ran = test.args(run).output().expect("runs");
+    assert!(matches!(ran.status.code(), Some(0 | 4)), "{}", String::from_utf8_lossy(&ran.stderr));
+    assert_eq!(mission.ran(), days(&[(4, "0002")]));
+    let withdraw = ["products", "withdraw", "COM1B_2035-01-04_SC1_01_0002", "--reason", "wrong survey"];
+    expect(dragfree(mission.path()).args(withdraw), 0);
+    assert_eq!(mission.ran(), []);
+    let day = dragfree(mission.path()).args(["day", "2035-01-04", "-q"]).output().expect("runs");
+    assert!(matches!(day.status.code(), Some(0 | 4)), "{}", String::from_utf8_lossy(&day.stderr));
+    assert_eq!(mission.product("2035-01-04")["id"], "COM1B_2035-01-04_SC1_01_0003");
+}
+
+/// Files of a source plugin do not say which days they cover.
+#[test]
+fn days_of_a_source_plugin_are_refused_with_what_to_do() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    expect(dragfree(dir.path()).args(["init", "."]), 0);
+    let pipeline = dir.path().join("pipeline.toml");
+    let text = std::fs::read_to_string(&pipeline).expect("readable");
+    std::fs::write(&pipeline, format!("{text}\n[source]\nplugin = \"gracefo\"\n")).expect("writable");
+    for command in [&["catch-up"][..], &["day", "2035-01-01"], &["products", "stale"]] {
+        let refused = expect(dragfree(dir.path()).args(command), 1);
+        let said = String::from_utf8_lossy(&refused.stderr).into_owned();
+        for words in ["mission-ops.toml", "the source gracefo", "dragfree run"] {
+            assert!(said.contains(words), "{command:?}: {said}");
+        }
+    }
 }
 
 /// The unit of systemd in the guide, followed to the letter in a folder that stands for the root of a machine: the

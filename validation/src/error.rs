@@ -26,6 +26,9 @@ pub(crate) enum CampaignError {
     /// A product lacks a part.
     #[error("configuration {configuration}, seed {seed}: the product lacks {what}")]
     Product { configuration: String, seed: u32, what: String },
+    /// The program of a campaign cannot be made again.
+    #[error("{0}")]
+    Frozen(String),
     /// A file of the campaign.
     #[error("{path}: {reason}", path = path.display())]
     File { path: PathBuf, reason: String },

@@ -56,7 +56,7 @@ impl Keyed for Kill {
         (String::new(), self.seed)
     }
 
-    fn build(&self) -> &str {
+    fn made_with(&self) -> &str {
         &self.build
     }
 }

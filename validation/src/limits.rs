@@ -47,7 +47,7 @@ impl Keyed for Limits {
         (self.length.clone(), SEED)
     }
 
-    fn build(&self) -> &str {
+    fn made_with(&self) -> &str {
         &self.build
     }
 }

@@ -9,6 +9,7 @@ mod diagnosis;
 mod diagnosis_report;
 mod diagnosis_score;
 mod error;
+mod frozen;
 mod kills;
 mod limits;
 mod months;
@@ -49,7 +50,8 @@ enum Command {
     Blind(Blind),
     /// Diagnose sets of 2 h to 3 × 24 h by two producers and score them; goes on where it was stopped
     Diagnosis(Diagnosis),
-    /// Calibrate 90 days with a drift and steps, alone and together; goes on where it was stopped
+    /// Calibrate 90 days with a drift and steps, alone and together; goes on where it was stopped, with the program of
+    /// the commit that the results name
     Months(MonthsCommand),
     /// Kill commands that write at random instants, and look at what the next one finds; goes on where it was stopped
     Kills(KillsCommand),
@@ -201,7 +203,8 @@ fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
         }
         Command::Months(m) => {
             let file = m.results.clone().unwrap_or_else(|| results.join("months.jsonl"));
-            months::months(&Program::build()?, m.seeds.clone(), (m.hours, m.at_once), &file, &scratch)
+            let sets = months::Sets { seeds: m.seeds.clone(), hours: m.hours, at_once: m.at_once };
+            months::months(&sets, &file, &scratch)
         }
         Command::Kills(k) => {
             let file = k.results.clone().unwrap_or_else(|| results.join("kills.jsonl"));

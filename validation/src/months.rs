@@ -1,15 +1,18 @@
 //! Months: days with an offset that drifts and steps, each calibrated alone, then together by `joint` and `trend`.
 
+use std::ffi::OsString;
+use std::ops::RangeInclusive;
 use std::path::Path;
 use std::time::Instant;
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::campaign::{Meter, ScratchFolder, science_mode, taiji, work};
+use crate::campaign::{Meter, ScratchFolder, note, science_mode, taiji, work};
 use crate::error::{CampaignError, file};
-use crate::program::{Chain, Program};
-use crate::records::{COEFFICIENTS, Keyed, Results, rounded};
+use crate::frozen;
+use crate::program::{Chain, Program, root};
+use crate::records::{COEFFICIENTS, Keyed, Results, read, rounded};
 use crate::stats;
 
 /// Days of a set.
@@ -39,6 +42,9 @@ pub(crate) struct Months {
     pub(crate) hours: f64,
     /// Digest of program and plugins.
     pub(crate) build: String,
+    /// Commit of program and plugins; empty in results of before.
+    #[serde(default)]
+    pub(crate) commit: String,
     /// Time that `joint` took at first and once more, s.
     pub(crate) joint_s: [f64; 2],
     /// χ² of the days against the fit, and its degrees of freedom.
@@ -72,8 +78,32 @@ impl Keyed for Months {
         (format!("{}h", self.hours), self.seed)
     }
 
-    fn build(&self) -> &str {
-        &self.build
+    /// Builds of one commit in several places differ in their digests.
+    fn made_with(&self) -> &str {
+        &self.commit
+    }
+}
+
+/// Which sets are wanted.
+pub(crate) struct Sets {
+    /// Seeds.
+    pub(crate) seeds: RangeInclusive<u32>,
+    /// Hours of telemetry of each day.
+    pub(crate) hours: f64,
+    /// Sets at a time.
+    pub(crate) at_once: usize,
+}
+
+impl Sets {
+    /// The arguments that ask for them, of which `[results, scratch]` are files and folders.
+    fn arguments(&self, [results, scratch]: [&Path; 2]) -> Result<Vec<OsString>, CampaignError> {
+        let absolute = |path: &Path| std::path::absolute(path).map_err(|e| file(path, &e));
+        let (results, scratch) = (absolute(results)?, absolute(scratch)?);
+        let seeds = format!("{}-{}", self.seeds.start(), self.seeds.end());
+        let words = [seeds, self.hours.to_string(), self.at_once.to_string()];
+        let values = words.map(OsString::from).into_iter().chain([results.into(), scratch.into()]);
+        let names = ["--seeds", "--hours", "--at-once", "--results", "--scratch"].map(OsString::from);
+        Ok(std::iter::once("months".into()).chain(names.into_iter().zip(values).flat_map(|(n, v)| [n, v])).collect())
     }
 }
 
@@ -88,25 +118,29 @@ fn name(day: u32) -> String {
     chrono::DateTime::from_timestamp(seconds, 0).map(|t| t.format("%Y-%m-%d").to_string()).unwrap_or_default()
 }
 
-/// Runs the seeds that `results` lacks.
-pub(crate) fn months(
-    program: &Program,
-    seeds: std::ops::RangeInclusive<u32>,
-    (hours, at_once): (f64, usize),
-    results: &Path,
-    scratch: &Path,
-) -> Result<(), CampaignError> {
+/// Runs the seeds that `results` lacks, with the program of the commit that it names.
+pub(crate) fn months(sets: &Sets, results: &Path, scratch: &Path) -> Result<(), CampaignError> {
+    let commit = frozen::commit(root())?;
+    let lines: Vec<Months> = read(results)?;
+    if let Some(begun) = frozen::begun_with(lines.iter().map(|line| line.commit.as_str()))?
+        && begun != commit
+    {
+        note(&format!("going on with commit {begun}; another file of --results begins anew"));
+        let arguments = sets.arguments([results, scratch])?;
+        return frozen::go_on(root(), &begun, &arguments.iter().map(OsString::as_os_str).collect::<Vec<_>>());
+    }
+    let program = &Program::build()?;
     let build = program.whole_digest()?;
-    let (results, _) = Results::<Months>::open(results, &build)?;
-    let configuration = format!("{hours}h");
-    let tasks: Vec<u32> = seeds.filter(|seed| !results.has(&configuration, *seed)).collect();
+    let (results, _) = Results::<Months>::open(results, &commit)?;
+    let (hours, configuration) = (sets.hours, format!("{}h", sets.hours));
+    let tasks: Vec<u32> = sets.seeds.clone().filter(|seed| !results.has(&configuration, *seed)).collect();
     let meter = Meter::new(f64::from(DAYS) * tasks.len() as f64);
-    work(tasks, at_once, |seed| {
+    work(tasks, sets.at_once, |seed| {
         let folder = scratch.join(format!("months-{seed}"));
         ScratchFolder::new(&folder)?;
         let set = Set { program, seed, hours, folder: &folder };
         let truth_m = set.fly(&meter)?;
-        results.append(set.judge(&truth_m, &build)?)?;
+        results.append(set.judge(&truth_m, [&build, &commit])?)?;
         std::fs::remove_dir_all(&folder).map_err(|e| file(&folder, &e))
     })?;
     results.sort(&[configuration]).map(|_| ())
@@ -146,7 +180,7 @@ impl Set<'_> {
         Ok(truth_m)
     }
 
-    fn judge(&self, truth_m: &[[f64; 6]], build: &str) -> Result<Months, CampaignError> {
+    fn judge(&self, truth_m: &[[f64; 6]], [build, commit]: [&str; 2]) -> Result<Months, CampaignError> {
         let events: String = EVENTS
             .iter()
             .map(|(day, _)| {
@@ -199,6 +233,7 @@ impl Set<'_> {
             seed: self.seed,
             hours: self.hours,
             build: build.to_owned(),
+            commit: commit.to_owned(),
             joint_s: [rounded(first_s), rounded(again_s)],
             same: (rounded(same("chi2")?), same("dof")?),
             coefficients,
@@ -225,7 +260,7 @@ pub(crate) fn table(all: &[Months]) -> (String, Vec<String>) {
          | what | true along x of SRF | median σ of tm1.x | rms pull | accepted | seen in tm1.x |\n|---|---|---|---|---|---|\n",
         all.len(),
         first.hours,
-        first.build
+        if first.commit.is_empty() { &first.build } else { first.commit.get(..12).unwrap_or(&first.commit) }
     );
     let mut row = |what: &str, truth: &str, factor: f64, of: &dyn Fn(&Course) -> Told| {
         let each = || all.iter().flat_map(|m| &m.coefficients).map(of);
@@ -274,6 +309,18 @@ pub(crate) fn table(all: &[Months]) -> (String, Vec<String>) {
 mod tests {
     use super::*;
 
+    /// The program of a commit is asked for the same sets, wherever it lies.
+    #[test]
+    fn another_program_is_asked_for_the_same_sets() {
+        let sets = Sets { seeds: 3..=20, hours: 8.0, at_once: 2 };
+        let arguments = sets.arguments(["/r.jsonl".as_ref(), "/scratch".as_ref()]).unwrap();
+        let expected = "months --seeds 3-20 --hours 8 --at-once 2 --results /r.jsonl --scratch /scratch";
+        assert_eq!(arguments, expected.split(' ').map(OsString::from).collect::<Vec<_>>());
+        assert!(
+            sets.arguments(["r.jsonl".as_ref(), "scratch".as_ref()]).unwrap()[8].to_string_lossy().starts_with('/')
+        );
+    }
+
     #[test]
     fn days_have_names_and_offsets() {
         assert_eq!((name(0).as_str(), name(31).as_str()), ("2035-01-01", "2035-02-01"));
@@ -298,6 +345,7 @@ mod tests {
                     seed,
                     hours: 8.0,
                     build: "b".into(),
+                    commit: String::new(),
                     joint_s: [1.0, 0.5],
                     same: (510.0, 510.0),
                     coefficients: (0..6).map(course).collect(),

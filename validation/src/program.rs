@@ -246,7 +246,8 @@ fn offsets_m(truth: &Path) -> Result<[f64; 6], CampaignError> {
     Ok(truth_m)
 }
 
-fn output(command: &mut Command, codes: &[i32]) -> Result<Vec<u8>, CampaignError> {
+/// What a command prints, where it ends with one of these codes.
+pub(crate) fn output(command: &mut Command, codes: &[i32]) -> Result<Vec<u8>, CampaignError> {
     let name = format!("{command:?}");
     let output = command.output().map_err(|source| CampaignError::Start { command: name.clone(), source })?;
     match output.status.code() {

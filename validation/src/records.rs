@@ -115,8 +115,8 @@ impl Line {
 pub(crate) trait Keyed {
     /// Configuration and seed.
     fn key(&self) -> (String, u32);
-    /// Digest of the build.
-    fn build(&self) -> &str;
+    /// What program and plugins it was made with: the digest of a build, or a commit.
+    fn made_with(&self) -> &str;
 }
 
 impl Keyed for Line {
@@ -124,7 +124,7 @@ impl Keyed for Line {
         (self.configuration.clone(), self.seed)
     }
 
-    fn build(&self) -> &str {
+    fn made_with(&self) -> &str {
         &self.build
     }
 }
@@ -167,7 +167,7 @@ impl Keyed for Blind {
         (self.configuration.clone(), self.seed)
     }
 
-    fn build(&self) -> &str {
+    fn made_with(&self) -> &str {
         &self.build
     }
 }
@@ -267,7 +267,7 @@ impl Keyed for Diagnosed {
         (self.configuration.clone(), self.seed)
     }
 
-    fn build(&self) -> &str {
+    fn made_with(&self) -> &str {
         &self.build
     }
 }
@@ -299,7 +299,7 @@ impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
     pub(crate) fn open(path: &Path, build: &str) -> Result<(Self, usize), CampaignError> {
         let mut lines: Vec<T> = read(path)?;
         let before = lines.len();
-        lines.retain(|line| line.build() == build);
+        lines.retain(|line| line.made_with() == build);
         let dropped = before - lines.len();
         std::fs::create_dir_all(path.parent().unwrap_or(Path::new("."))).map_err(|e| file(path, &e))?;
         replace(path, &lines)?;

@@ -61,8 +61,8 @@ impl Keyed for Row {
         self.run.key()
     }
 
-    fn build(&self) -> &str {
-        self.run.build()
+    fn made_with(&self) -> &str {
+        self.run.made_with()
     }
 }
 

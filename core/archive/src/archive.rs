@@ -6,7 +6,7 @@ use crate::files::{IoContext as _, inode, sync_folder};
 use crate::journal::{Event, Journal, JournalEntry, Stamp};
 use crate::objects::{Objects, PLACE, entries};
 use crate::product::{self, EXTRACT, PRODUCT, STATE};
-use crate::staging::{self, Staging};
+use crate::staging::{self, Staging, announce};
 use std::fs::{self, File, TryLockError};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
@@ -229,17 +229,41 @@ impl Archive {
         let _held = self.hold()?;
         self.finish()?;
         let event = check(self)?;
-        let (number, previous) = self.catalogue.applied()?;
-        self.journal.append(staging.path(), (number, &previous), event, stamp)?;
-        self.committed();
-        Ok(())
+        self.place_and_commit(&staging, &[], event, stamp)
     }
 
-    /// Brings names and catalogue up to date after a commit; what fails is left to the next command.
-    pub(crate) fn committed(&mut self) {
+    /// Places durable files as the contents with their digests and commits the event that names them. Where that fails
+    /// the contents that are new are taken away again. The caller holds the archive and has brought it up to date.
+    pub(crate) fn place_and_commit(
+        &mut self,
+        staging: &Staging,
+        contents: &[(PathBuf, String)],
+        event: Event,
+        stamp: &Stamp<'_>,
+    ) -> Result<(), ArchiveError> {
+        let (number, previous) = self.catalogue.applied()?;
+        if !contents.is_empty() {
+            announce(staging.path(), contents.iter().map(|(_, sha256)| sha256.as_str()))?;
+        }
+        let mut new = Vec::new();
+        let commit = || {
+            for (from, sha256) in contents {
+                if self.objects.place(from, sha256)? {
+                    new.push(sha256);
+                }
+            }
+            self.journal.append(staging.path(), (number, &previous), event, stamp)
+        };
+        if let Err(error) = commit() {
+            for sha256 in new {
+                let _ = self.objects.remove(sha256); // already failing; `verify` tells what stays
+            }
+            return Err(error);
+        }
         if let Err(error) = self.catch_up() {
             tracing::warn!("committed; names and catalogue are left to the next command: {error}");
         }
+        Ok(())
     }
 
     /// The `.toml` of a product.

@@ -3,12 +3,12 @@
 use crate::ArchiveError;
 use crate::archive::Archive;
 use crate::catalogue::{Place, Validity};
-use crate::files::{IoContext as _, sha256, sha256_of};
+use crate::files::{IoContext as _, sha256, sha256_of, write_durable};
 use crate::journal::{Event, InputPlace, SetState, Stamp};
 use crate::objects::entries;
 use crate::product::EXTRACT;
-use crate::staging::{Staging, announce};
-use std::fs::{self, File};
+use crate::staging::Staging;
+use std::fs;
 use std::path::PathBuf;
 
 /// A time, `until_ns` exclusive.
@@ -65,26 +65,11 @@ impl Archive {
         let staging = Staging::begin(&self.folder)?;
         let staged = staging.path().join(EXTRACT);
         let sha256 = sha256(content);
-        let write = || {
-            use std::io::Write as _;
-            let mut file = File::create(&staged)?;
-            file.write_all(content)?;
-            file.sync_all()
-        };
-        write().at("write", &staged)?;
+        write_durable(&staged, content)?;
         let _held = self.hold()?;
         self.finish()?;
-        announce(staging.path(), std::slice::from_ref(&sha256))?;
-        let (number, previous) = self.catalogue.applied()?;
-        let new = self.objects.place(&staged, &sha256)?;
         let event = Event::Extract { id: id.to_owned(), sha256: sha256.clone(), size: content.len() as u64 };
-        if let Err(error) = self.journal.append(staging.path(), (number, &previous), event, stamp) {
-            if new {
-                self.objects.remove(&sha256)?;
-            }
-            return Err(error);
-        }
-        self.committed();
+        self.place_and_commit(&staging, &[(staged, sha256)], event, stamp)?;
         Ok(self.folder.join(format!("{id}.{EXTRACT}")))
     }
 

@@ -2,7 +2,7 @@
 
 use sha2::{Digest as _, Sha256};
 use std::fs::{self, File};
-use std::io::{self, Read as _};
+use std::io::{self, Read as _, Write as _};
 use std::path::{Path, PathBuf};
 
 /// The operating system refused something.
@@ -52,6 +52,16 @@ pub fn folder_of(path: &Path) -> &Path {
 /// The operating system refuses.
 pub fn sync_folder(folder: &Path) -> io::Result<()> {
     if cfg!(unix) { File::open(folder).and_then(|folder| folder.sync_all()) } else { Ok(()) }
+}
+
+/// Writes a new file and makes its content durable.
+pub(crate) fn write_durable(path: &Path, content: &[u8]) -> Result<(), IoError> {
+    let write = || {
+        let mut file = File::create_new(path)?;
+        file.write_all(content)?;
+        file.sync_all()
+    };
+    write().at("write", path)
 }
 
 /// Lower-case hexadecimal.

@@ -1,13 +1,13 @@
 //! The journal: one file for each event, numbered without gaps, each with the digest of the one before.
 
 use crate::ArchiveError;
-use crate::files::{IoContext as _, sha256, sync_folder};
+use crate::files::{IoContext as _, sha256, sync_folder, write_durable};
 use crate::objects::{PLACE, entries};
 use chrono::{DateTime, Utc};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::fs::{self, File};
-use std::io::{ErrorKind, Write as _};
+use std::fs;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// Version of the layout.
@@ -243,12 +243,7 @@ impl Journal {
         };
         let staged = staging.join("entry.json");
         let text = serde_json::to_vec_pretty(&entry).map_err(std::io::Error::from).at("write", &staged)?;
-        let write = || {
-            let mut file = File::create(&staged)?;
-            file.write_all(&text)?;
-            file.sync_all()
-        };
-        write().at("write", &staged)?;
+        write_durable(&staged, &text)?;
         let path = self.path(number);
         fs::hard_link(&staged, &path).at(PLACE, &path)?;
         if let Err(error) = sync_folder(&self.folder) {

@@ -4,7 +4,7 @@ use crate::ArchiveError;
 use crate::archive::Archive;
 use crate::catalogue::parts;
 use crate::files::{IoContext as _, Problem, sha256_of};
-use crate::journal::{Event, InputPlace, Journal, Stamp, Stored};
+use crate::journal::{Event, InputPlace, Stamp, Stored};
 use crate::objects::entries;
 use crate::product::{self, EXTRACT, Product};
 use crate::staging::Staging;
@@ -106,17 +106,10 @@ fn take_over(archive: &mut Archive, folder: &Path, path: &Path, stamp: &Stamp<'_
         };
         places.extend(telemetry.zip(&sources.telemetry).map(place));
     }
-    let digests: Vec<String> = contents.iter().map(|(_, sha256)| sha256.clone()).collect();
-    let _held = archive.hold()?;
+    let held = archive.hold()?;
     archive.finish()?;
-    crate::staging::announce(staging.path(), &digests)?;
-    for (from, sha256) in &contents {
-        archive.objects.place(from, sha256)?;
-    }
-    let (number, previous) = archive.catalogue.applied()?;
-    Journal::new(folder).append(staging.path(), (number, &previous), event, stamp)?;
-    archive.committed();
-    drop(_held);
+    archive.place_and_commit(&staging, &contents, event, stamp)?;
+    drop(held);
     let extract = path.with_extension(EXTRACT);
     if let Ok(content) = fs::read(&extract) {
         archive.keep_extract(product.id(), &content, stamp)?;

@@ -102,8 +102,8 @@ pub(crate) fn clear_dead(
 }
 
 /// Writes the list of contents that are about to be placed, so that those of a killed writer are found.
-pub(crate) fn announce(staging: &Path, digests: &[String]) -> Result<(), ArchiveError> {
+pub(crate) fn announce<'a>(staging: &Path, digests: impl Iterator<Item = &'a str>) -> Result<(), ArchiveError> {
     let path = staging.join(PLACING);
-    let text = serde_json::to_vec(digests).map_err(std::io::Error::from).at("write", &path)?;
+    let text = serde_json::to_vec(&digests.collect::<Vec<_>>()).map_err(std::io::Error::from).at("write", &path)?;
     Ok(fs::write(&path, text).at("write", path)?)
 }

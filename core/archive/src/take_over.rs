@@ -3,14 +3,13 @@
 
 use crate::ArchiveError;
 use crate::archive::Archive;
-use crate::files::{IoContext as _, sha256};
+use crate::files::{IoContext as _, sha256, write_durable};
 use crate::journal::{Event, InputPlace, Stamp, Stored};
 use crate::product::{self, EXTRACT, PRODUCT, Product, Supersedes};
-use crate::staging::{Staging, announce};
+use crate::staging::Staging;
 use crate::writer::LAST_REVISION;
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 /// What is about to be placed.
@@ -64,26 +63,8 @@ impl Archive {
         if ids.is_empty() {
             return Ok(ids);
         }
-        let digests: Vec<String> = prepared.contents.keys().cloned().collect();
-        announce(staging.path(), &digests)?;
-        let mut new = Vec::new();
-        let mut place = || -> Result<(), ArchiveError> {
-            for (sha256, path) in &prepared.contents {
-                if self.objects.place(path, sha256)? {
-                    new.push(sha256);
-                }
-            }
-            let (number, previous) = self.catalogue.applied()?;
-            let event = Event::Several { events: std::mem::take(&mut prepared.events) };
-            self.journal.append(staging.path(), (number, &previous), event, stamp)
-        };
-        if let Err(error) = place() {
-            for sha256 in new {
-                let _ = self.objects.remove(sha256); // already failing; `verify` tells what stays
-            }
-            return Err(error);
-        }
-        self.committed();
+        let contents: Vec<_> = prepared.contents.into_iter().map(|(sha256, path)| (path, sha256)).collect();
+        self.place_and_commit(&staging, &contents, Event::Several { events: prepared.events }, stamp)?;
         Ok(ids)
     }
 
@@ -114,12 +95,7 @@ impl Prepared {
         let text = product.emit()?;
         let document = sha256(&text);
         let staged = staging.join(&document);
-        let write = || {
-            let mut file = File::create_new(&staged)?;
-            file.write_all(text.as_bytes())?;
-            file.sync_all()
-        };
-        write().at("write", &staged)?;
+        write_durable(&staged, text.as_bytes())?;
         self.contents.insert(document.clone(), staged);
         let places = from.inputs(id)?.into_iter().filter_map(|place| {
             let (path, sha256) = (place.path?, place.sha256);

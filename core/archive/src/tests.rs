@@ -246,6 +246,36 @@ fn a_file_of_nobody_is_told_and_left_alone() {
     assert!(list(folder.path()).problems[0].reason.contains("neq.json"), "a missing file is told too");
 }
 
+/// Products of other archives come all or none, and what becomes of those archives afterwards changes nothing here.
+#[test]
+fn products_are_taken_over_whole_and_copied() {
+    let (here, one, two) = (tempfile::tempdir(), tempfile::tempdir(), tempfile::tempdir());
+    let [here, one, two] = [here, one, two].map(|folder| folder.expect("folder"));
+    write(one.path(), &product(0, "SC1", 1.0));
+    let second = write(two.path(), &product(1, "SC1", 2.0)).product.id().to_owned();
+    let products = [(one.path().to_owned(), FIRST.to_owned()), (two.path().to_owned(), second.clone())];
+    let series = two.path().join(format!("{second}.mcap"));
+    let sound = fs::read(&series).expect("read");
+    fs::write(&series, "damaged").expect("write"); // in place: the object is the same file
+    let mut archive = Archive::create(here.path()).expect("an archive");
+    let error = archive.take_over(&products, &stamp()).expect_err("a damaged series").to_string();
+    assert!(error.contains("is damaged"), "{error}");
+    for part in ["staging", "objects"] {
+        assert_eq!(names(&here.path().join(part)), Vec::<String>::new(), "{part}");
+    }
+
+    fs::write(&series, &sound).expect("write");
+    assert_eq!(archive.take_over(&products, &stamp()).expect("taken over"), [FIRST, &second]);
+    assert_eq!(archive.events().expect("events").len(), 1, "in one step");
+    for (folder, id) in &products {
+        for suffix in ["toml", "mcap", "neq.json", "state"] {
+            fs::write(folder.join(format!("{id}.{suffix}")), "written over").expect("write");
+        }
+        archive.product(id).expect("untouched here");
+    }
+    assert!(list(here.path()).problems.is_empty());
+}
+
 /// Everything that the catalogue says is in journal and objects.
 #[test]
 fn a_catalogue_made_again_is_the_same() {

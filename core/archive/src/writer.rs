@@ -3,13 +3,12 @@
 use crate::ArchiveError;
 use crate::archive::Archive;
 use crate::events::Window;
-use crate::files::{IoContext as _, sha256_of};
+use crate::files::{IoContext as _, sha256_of, write_durable};
 use crate::journal::{Event, InputPlace, Stamp, Stored};
 use crate::product::{self, Attachment, EXTRACT, Product, STATE, Supersedes};
-use crate::staging::{Staging, announce};
+use crate::staging::Staging;
 use std::collections::BTreeMap;
 use std::fs::{self, File};
-use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 /// Revisions have four digits.
@@ -151,12 +150,7 @@ impl ProductWriter {
         }
         let document = self.staging.path().join("product.toml");
         let text = product.emit()?;
-        let write = || {
-            let mut file = File::create_new(&document)?;
-            file.write_all(text.as_bytes())?;
-            file.sync_all()
-        };
-        write().at("write", &document)?;
+        write_durable(&document, text.as_bytes())?;
         let back = fs::read_to_string(&document).at("read", &document)?;
         if product::parse(&back, &document)?.document() != product.document() {
             let reason = "it does not read as it was written".to_owned();
@@ -173,34 +167,9 @@ impl ProductWriter {
             run_in_ns: made_of.run_in_ns,
         };
         sealed.push(document);
-        self.place(&sealed, event, stamp)?;
-        self.archive.committed();
+        let contents: Vec<_> = sealed.into_iter().map(|file| (file.from, file.sha256)).collect();
+        self.archive.place_and_commit(&self.staging, &contents, event, stamp)?;
         Ok((Written { path: self.archive.path_of(product.id()), product }, true))
-    }
-
-    /// Places contents and commits the event that names them; takes them away again where that fails.
-    fn place(&self, sealed: &[Sealed], event: Event, stamp: &Stamp<'_>) -> Result<(), ArchiveError> {
-        let (number, previous) = self.archive.catalogue.applied()?;
-        let digests: Vec<String> = sealed.iter().map(|file| file.sha256.clone()).collect();
-        announce(self.staging.path(), &digests)?;
-        let mut new = Vec::new();
-        let mut place = || -> Result<(), ArchiveError> {
-            for file in sealed {
-                if self.archive.objects.place(&file.from, &file.sha256)? {
-                    new.push(&file.sha256);
-                }
-            }
-            Ok(())
-        };
-        let placed = place();
-        let append = || self.archive.journal.append(self.staging.path(), (number, &previous), event, stamp);
-        let committed = placed.and_then(|()| append());
-        if committed.is_err() {
-            for sha256 in new {
-                let _ = self.archive.objects.remove(sha256); // already failing; `verify` tells what stays
-            }
-        }
-        committed
     }
 
     /// The revision that comes next, and what it takes the place of.

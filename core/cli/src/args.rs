@@ -459,6 +459,9 @@ pub(crate) struct Diagnose {
     /// Candidates and limits to print; --json has all
     #[arg(long, value_name = "N", default_value_t = 8)]
     pub(crate) top: usize,
+    /// Write what --json prints to a file, too: `model add --from` and `reveal --diagnosis` read it
+    #[arg(long, value_name = "FILE")]
+    pub(crate) out: Option<PathBuf>,
     /// Say what would tell a named effect from what it cannot be told from: more data like these, products of the
     /// archive, or a small manoeuvre, with the σ that is expected
     #[arg(long)]

@@ -86,7 +86,7 @@ impl Bound {
         let index = |name: &str| coefficients.iter().position(|c| c.name == name);
         let of = |c: &Constraint| {
             let terms = c.terms.iter().map(|(name, weight)| Some((index(name)?, *weight))).collect::<Option<_>>()?;
-            Some(Self { name: c.name.clone(), survey: c.kind == "survey", terms, lower: c.lower, upper: c.upper })
+            Some(Self { name: c.name.clone(), survey: c.is_survey(), terms, lower: c.lower, upper: c.upper })
         };
         constraints.iter().filter_map(of).collect()
     }

@@ -105,9 +105,6 @@ pub struct Same {
     pub dof: usize,
 }
 
-/// Kind of a constraint that is a measurement.
-const SURVEY: &str = "survey";
-
 /// Directions whose information is below this part of the largest one, each coefficient in its own σ, are not seen.
 const UNSEEN: f64 = 1e-8;
 
@@ -156,7 +153,7 @@ impl ManyDays<'_> {
         changes.dedup();
         let mut all = Vec::new();
         for constraint in &self.declared.constraints {
-            if constraint.kind != SURVEY {
+            if !constraint.is_survey() {
                 for (number, stretch) in self.stretches.iter().enumerate() {
                     let mut terms = constraint.terms.clone();
                     for change in &changes {
@@ -590,7 +587,7 @@ mod tests {
         let mut declared = declared();
         declared.constraints.push(Constraint {
             name: "sum".to_owned(),
-            kind: "survey".to_owned(),
+            kind: Constraint::SURVEY.to_owned(),
             terms: vec![("gain.a".to_owned(), 1.0), ("gain.b".to_owned(), 1.0)],
             lower: 0.2 - 1e-4,
             upper: 0.2 + 1e-4,

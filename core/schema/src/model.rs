@@ -202,6 +202,17 @@ pub struct Constraint {
     pub parts: u32,
 }
 
+impl Constraint {
+    /// Kind of a measurement with a tolerance.
+    pub const SURVEY: &str = "survey";
+
+    /// Whether it is a measurement, and not a physical bound.
+    #[must_use]
+    pub fn is_survey(&self) -> bool {
+        self.kind == Self::SURVEY
+    }
+}
+
 fn one() -> u32 {
     1
 }

@@ -18,9 +18,9 @@ use dragfree_schema::{Coefficient, Settings};
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
-use crate::WorkflowError;
 use crate::answer::{Evidence, NoiseLevel, apart, contradict, found, limits, offsets, verdict, with_levels};
 use crate::likelihood::{CoefficientSums, Decided, joined};
+use crate::{ManyDays, WorkflowError};
 
 /// Format of the file.
 const FORMAT: &str = "dragfree-extract/1";
@@ -175,6 +175,7 @@ fn same(a: &Coefficient, b: &Coefficient) -> bool {
 /// [`WorkflowError`]: an extract is missing, or the products have different models.
 pub fn diagnose_extracts(registry: &Registry, products: &[Written]) -> Result<Diagnosis, WorkflowError> {
     let settings = &products.first().ok_or(WorkflowError::NoProduct)?.product.settings;
+    ManyDays::refuse(products.iter().map(|w| &w.product))?;
     let extracts: Vec<Extract> = products.iter().map(Extract::read).collect::<Result<_, _>>()?;
     of_one_model(&extracts)?;
     let mut trials = Trials::default();

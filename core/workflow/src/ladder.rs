@@ -13,6 +13,8 @@ use serde::Serialize;
 use dragfree_archive::product::{Coefficient, Product};
 use dragfree_engine::config::Model;
 
+use crate::ManyDays;
+
 mod missions;
 mod nees;
 
@@ -27,6 +29,9 @@ pub enum LadderError {
     /// Products of two spacecraft, or of none.
     #[error("{0}")]
     Products(String),
+    /// A product without data of its own.
+    #[error(transparent)]
+    ManyDays(#[from] ManyDays),
     /// A product that is no held-out one.
     #[error("{id} cannot be held out: {why}")]
     HeldOut { id: String, why: String },
@@ -214,6 +219,7 @@ pub fn ladder(
     let Some(first) = products.first() else {
         return Err(LadderError::Products("a ladder needs a product; `dragfree run` makes one".to_owned()));
     };
+    ManyDays::refuse(products.iter().chain(held_out))?;
     for other in products.iter().chain(held_out) {
         if craft(other) != craft(first) && !same_telemetry(other, first) {
             return Err(LadderError::Products(format!(

@@ -24,12 +24,33 @@ pub use replay::{Pass, Replay};
 
 use std::path::PathBuf;
 
+use dragfree_archive::JOINT;
+use dragfree_archive::product::Product;
 use dragfree_engine::EngineError;
 use dragfree_estimation::estimate::EstimateError;
 use dragfree_estimation::sigma::NoiseError;
 use dragfree_identification::record::Unlike;
 use dragfree_identification::scores::IdentificationError;
 use dragfree_schema::NoSuchCoefficient;
+
+/// A calibration of many days where the product of a day is needed.
+#[derive(Debug, thiserror::Error)]
+#[error(
+    "{0} is one calibration of many days, with no data of its own; name the products of its days, which `dragfree products lineage {0}` \
+     lists"
+)]
+pub struct ManyDays(String);
+
+impl ManyDays {
+    /// That every product is of one day.
+    ///
+    /// # Errors
+    /// One is of many days.
+    fn refuse<'a>(products: impl IntoIterator<Item = &'a Product>) -> Result<(), Self> {
+        let of_many = |product: &&Product| product.header.non_standard_attributes.product == JOINT;
+        products.into_iter().find(of_many).map_or(Ok(()), |product| Err(Self(product.id().to_owned())))
+    }
+}
 
 /// Why a comparison or a diagnosis failed.
 #[derive(Debug, thiserror::Error)]
@@ -71,6 +92,9 @@ pub enum WorkflowError {
     /// No product was named.
     #[error("no product was named")]
     NoProduct,
+    /// A product without data of its own.
+    #[error(transparent)]
+    ManyDays(#[from] ManyDays),
     /// There is nothing to explain.
     #[error("the chain makes no channel to explain: put a stage before the effects that makes some")]
     NoChannel,

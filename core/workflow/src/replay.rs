@@ -14,8 +14,8 @@ use dragfree_identification::screen::RefinementRequest;
 use dragfree_identification::transient::Detection;
 use dragfree_schema::Settings;
 
-use crate::WorkflowError;
 use crate::sums::{ColumnSums, Request};
+use crate::{ManyDays, WorkflowError};
 
 /// Parameter of an effect whose candidate can be tried about one shape in fine steps.
 pub(crate) const FINE: &str = "fine";
@@ -117,6 +117,7 @@ pub(crate) fn sum(
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Record, WorkflowError> {
     let Replay { registry, products, threads, batch_rows } = *replay;
+    ManyDays::refuse(products.iter().map(|w| &w.product))?;
     let levels = noise_levels(products);
     let mut whole: Option<Record> = None;
     for (number, Written { product, path }) in products.iter().enumerate() {

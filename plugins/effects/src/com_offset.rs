@@ -63,7 +63,7 @@ fn baseline_constraints(instance: &str, sign: f64, test_mass: &TestMass, housing
     let srf_from_orf = test_mass.dcm_orf_from_srf().transpose();
     [0, 1, 2].map(|i| Constraint {
         name: format!("baseline.{}", AXES[i]),
-        kind: "survey".to_owned(),
+        kind: Constraint::SURVEY.to_owned(),
         terms: terms(instance, &srf_from_orf, i, sign),
         lower: housing.baseline_srf_m[i] - housing.baseline_tolerance_m,
         upper: housing.baseline_srf_m[i] + housing.baseline_tolerance_m,

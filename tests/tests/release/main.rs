@@ -8,6 +8,7 @@ use dragfree_tests::{built, expect, json, root};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
 
 /// An unpacked release and a user's empty folder.
 struct Release {
@@ -17,28 +18,36 @@ struct Release {
     package: PathBuf,
 }
 
+/// Release archive and package, made once.
+fn made() -> &'static [PathBuf; 2] {
+    static MADE: OnceLock<(tempfile::TempDir, [PathBuf; 2])> = OnceLock::new();
+    let (_, files) = MADE.get_or_init(|| {
+        let dir = tempfile::tempdir().expect("a temporary folder");
+        let made = expect(Command::new(built().join("xtask")).args(["dist", "--out"]).arg(dir.path().join("out")), 0);
+        let made = String::from_utf8(made.stdout).expect("paths");
+        let files: Vec<PathBuf> = made.lines().map(PathBuf::from).collect();
+        (dir, files.try_into().expect("an archive and a package"))
+    });
+    files
+}
+
 impl Release {
     fn new() -> Self {
         let dir = tempfile::tempdir().expect("a temporary folder");
-        let out = dir.path().join("out");
-        built();
-        let made = expect(Command::new(built().join("xtask")).args(["dist", "--out"]).arg(&out), 0);
-        let made = String::from_utf8(made.stdout).expect("paths");
-        let mut files = made.lines().map(PathBuf::from);
-        let (archive, package) = (files.next().expect("an archive"), files.next().expect("a package"));
+        let [archive, package] = made();
         let name = archive.file_name().and_then(|name| name.to_str()).expect("a name");
         let name = name.strip_suffix(".tar.zst").expect("an archive");
         let expected = format!("dragfree-{}-{}-linux", env!("CARGO_PKG_VERSION"), std::env::consts::ARCH);
         assert_eq!(name, expected);
         let place = dir.path().join("some where");
         std::fs::create_dir(&place).expect("writable");
-        let file = std::fs::File::open(&archive).expect("readable");
+        let file = std::fs::File::open(archive).expect("readable");
         tar::Archive::new(zstd::Decoder::new(file).expect("zstd")).unpack(&place).expect("a sound archive");
         let tops: Vec<_> = std::fs::read_dir(&place).expect("a folder").flatten().map(|e| e.file_name()).collect();
         assert_eq!(tops, [name], "one top folder");
         let home = dir.path().join("home");
         std::fs::create_dir(&home).expect("writable");
-        Self { top: place.join(name), home, package, _dir: dir }
+        Self { top: place.join(name), home, package: package.clone(), _dir: dir }
     }
 
     /// A command in the user's folder, with the archive's `bin` on the path and nothing of ours in the environment.

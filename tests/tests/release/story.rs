@@ -1,7 +1,7 @@
 //! The story of `dragfree demo`, from an unpacked release, and of the guide: a hidden effect is found, added to the
 //! model, and revealed.
 
-use crate::Release;
+use super::Release;
 use dragfree_tests::calibration::TRUTH_M;
 use dragfree_tests::{coefficient, dragfree, fixture, json};
 use serde_json::Value;

@@ -52,8 +52,7 @@ fn plan(spec: &Path, out: &Path, global: &Global) -> Result<Done, Failure> {
     let spec = Spec::load(spec)?;
     let operations = Operations::load(spec.ops())?;
     let registry = super::registry(global)?;
-    std::fs::create_dir_all(out).at("make the folder", out)?;
-    let folder = out.canonicalize().at("find", out)?;
+    let folder = std::path::absolute(out).at("find", out)?;
     let tasks = workflow::plan(&spec, &folder, &planner(&operations, &registry, global)?, &operations, &program()?)?;
     let path = workflow::write(&folder, &tasks)?;
     if global.json {

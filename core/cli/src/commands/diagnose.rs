@@ -7,6 +7,7 @@ use crate::failure::{Failure, Refusal};
 use crate::text::Paint;
 use chrono::DateTime;
 use dragfree_archive::Written;
+use dragfree_archive::files::IoContext as _;
 use dragfree_identification::diagnosis::{Diagnosis, Found, Offset};
 use dragfree_identification::transient::Detection;
 use dragfree_workflow::diagnose::diagnose;
@@ -41,12 +42,18 @@ pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Resu
         (Answer { diagnosis: diagnosed.diagnosis, effects, unnamed, next }, kept)
     };
     let code = if answer.diagnosis.verdict == "sufficient" { 0 } else { INCONSISTENT };
-    if global.json {
+    if global.json || command.out.is_some() {
         let mut value = products::said_of(&products, &answer.diagnosis)?;
         if let Some(next) = &answer.next {
             value["next"] = serde_json::to_value(next)?;
         }
-        return Ok(Done { code, ..Done::json(&value) });
+        let document = Done::json(&value);
+        if let Some(path) = &command.out {
+            std::fs::write(path, &document.text).at("write", path)?;
+        }
+        if global.json {
+            return Ok(Done { code, ..document });
+        }
     }
     let mut text = screen(&answer, command, &super::repeated(None, global), paint);
     if let Some(next) = &answer.next {

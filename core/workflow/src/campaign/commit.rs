@@ -41,7 +41,7 @@ pub struct Status {
 
 fn kind(job: &Job) -> &'static str {
     match job {
-        Job::Day { .. } | Job::Flight { .. } => "days",
+        Job::Day { .. } | Job::Flight(_) => "days",
         Job::Sums { .. } => "sums",
     }
 }
@@ -49,7 +49,7 @@ fn kind(job: &Job) -> &'static str {
 fn day(job: &Job) -> String {
     match job {
         Job::Day { planned } => planned.day.day.to_string(),
-        Job::Flight { day, .. } => day.to_string(),
+        Job::Flight(flight) => flight.day.to_string(),
         Job::Sums { level, index } => format!("sums {level} {index}"),
     }
 }

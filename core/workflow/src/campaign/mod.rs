@@ -10,5 +10,5 @@ mod plan;
 mod task;
 
 pub use commit::{Committed, Status, commit, status};
-pub use plan::{Job, PLAN, Spec, Task, plan, read, write};
+pub use plan::{Flight, Job, PLAN, Spec, Task, plan, read, write};
 pub use task::{Done, Worker};

@@ -61,16 +61,7 @@ pub enum Job {
         planned: Planned,
     },
     /// Simulates a day and calibrates it; its telemetry is not kept.
-    Flight {
-        /// The day.
-        day: NaiveDate,
-        /// Seed of the day.
-        seed: u32,
-        /// Hours.
-        hours: f64,
-        /// Effects.
-        effects: Vec<String>,
-    },
+    Flight(Flight),
     /// Adds the sums of a node of the calendar.
     Sums {
         /// 2^level days …
@@ -78,6 +69,19 @@ pub enum Job {
         /// … from `index · 2^level` on, since 1970.
         index: i64,
     },
+}
+
+/// A day to be simulated.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Flight {
+    /// The day.
+    pub day: NaiveDate,
+    /// Seed of the day.
+    pub seed: u32,
+    /// Hours.
+    pub hours: f64,
+    /// Effects, as of `simulate --effect`.
+    pub effects: Vec<String>,
 }
 
 /// A task.
@@ -160,7 +164,7 @@ pub fn plan(
             }
             for (place, number) in (0..).zip(first..=last) {
                 let (seed, effects) = (simulate.seed.wrapping_mul(1000).wrapping_add(place), simulate.effects.clone());
-                let job = Job::Flight { day: day_of_number(number), seed, hours: simulate.hours, effects };
+                let job = Job::Flight(Flight { day: day_of_number(number), seed, hours: simulate.hours, effects });
                 tasks.push(make(job, Vec::new())?);
                 days.push((number, tasks[tasks.len() - 1].id.clone()));
             }
@@ -200,13 +204,14 @@ pub fn plan(
     Ok(tasks)
 }
 
-/// Writes the tasks of a campaign, one JSON document a line, into its folder.
+/// Writes the tasks of a campaign, one JSON document a line, into its folder, which is made where there is none.
 ///
 /// # Errors
 /// The folder cannot be written.
 pub fn write(folder: &Path, tasks: &[Task]) -> Result<PathBuf, WorkflowError> {
     let path = folder.join(PLAN);
     let keep = || -> Result<(), EngineError> {
+        std::fs::create_dir_all(folder).at("make the folder", folder)?;
         for name in ["results", "scratch"] {
             let own = folder.join(name);
             std::fs::create_dir_all(&own).at("make the folder", &own)?;

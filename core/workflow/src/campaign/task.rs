@@ -5,18 +5,18 @@ use std::fs::{self, File};
 use std::path::{Path, PathBuf};
 
 use dragfree_archive::files::{IoContext as _, sha256, sync_folder};
-use dragfree_archive::{Archive, Sums};
+use dragfree_archive::{Archive, Sums, Written};
 use dragfree_engine::EngineError;
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::Progress;
 use dragfree_engine::simulate::{SimulateOptions, simulate};
 use serde::{Deserialize, Serialize};
 
-use super::plan::{Job, Task};
+use super::plan::{Flight, Job, Task};
 use crate::WorkflowError;
 use crate::days::{DAY_NS, day_number, start_of_day_ns};
 use crate::joint::calendar::{Calendar, Leaf, Node};
-use crate::operations::Planner;
+use crate::operations::{Planned, Planner};
 
 /// The bundled simulator.
 const SIMULATOR: &str = "sim";
@@ -98,50 +98,49 @@ impl Worker<'_> {
             Job::Sums { level, index } => {
                 self.sums(task, all, Node { level: *level, index: *index }, &scratch.folder)?
             }
-            _ => self.day(task, &scratch.folder, progress)?,
+            Job::Day { planned } => calibrated(task, self.day(planned, &scratch.folder, progress))?,
+            Job::Flight(flight) => calibrated(task, self.flight(flight, &scratch.folder, progress))?,
         };
         scratch.commit(&outcome, &result).map(|new| done(outcome, new))
     }
 
-    fn day(&self, task: &Task, scratch: &Path, progress: &mut dyn FnMut(Progress)) -> Result<Outcome, WorkflowError> {
+    /// Calibrates a day with its telemetry.
+    fn day(
+        &self,
+        planned: &Planned,
+        scratch: &Path,
+        progress: &mut dyn FnMut(Progress),
+    ) -> Result<Written, EngineError> {
+        self.planner.run_apart(planned, &scratch.join("archive"), progress)
+    }
+
+    /// Simulates a day and calibrates it; its telemetry is not kept.
+    fn flight(
+        &self,
+        flight: &Flight,
+        scratch: &Path,
+        progress: &mut dyn FnMut(Progress),
+    ) -> Result<Written, EngineError> {
         let telemetry = scratch.join("telemetry");
-        let archive = scratch.join("archive");
-        let mut run = || match &task.job {
-            Job::Flight { day, seed, hours, effects } => {
-                let start_ns = start_of_day_ns(day_number(*day));
-                let mut parameters = toml::Table::new();
-                parameters.insert("seed".into(), i64::from(*seed).into());
-                parameters.insert("effects".into(), effects.clone().into());
-                let options = SimulateOptions {
-                    mission: self.planner.mission().cloned().unwrap_or_default(),
-                    out: telemetry.clone(),
-                    start_ns: start_ns - self.planner.run_in_ns(),
-                    end_ns: start_ns + (hours * 3.6e12) as i64,
-                    source: SIMULATOR.to_owned(),
-                    parameters,
-                    software: self.software.to_owned(),
-                    threads: self.threads,
-                };
-                let made = simulate(self.registry, &options, progress)?;
-                let whole = options.end_ns - start_ns >= DAY_NS;
-                self.planner.run_apart(&self.planner.with_files(*day, made.files, whole), &archive, progress)
-            }
-            Job::Day { planned } => self.planner.run_apart(planned, &archive, progress),
-            Job::Sums { .. } => Err(EngineError::EmptyWindow),
+        let start_ns = start_of_day_ns(day_number(flight.day));
+        let mut parameters = toml::Table::new();
+        parameters.insert("seed".into(), i64::from(flight.seed).into());
+        parameters.insert("effects".into(), flight.effects.clone().into());
+        let options = SimulateOptions {
+            mission: self.planner.mission().cloned().unwrap_or_default(),
+            out: telemetry.clone(),
+            start_ns: start_ns - self.planner.run_in_ns(),
+            end_ns: start_ns + (flight.hours * 3.6e12) as i64,
+            source: SIMULATOR.to_owned(),
+            parameters,
+            software: self.software.to_owned(),
+            threads: self.threads,
         };
-        let outcome = |digest: String, product, failed| Outcome { id: task.id.clone(), digest, product, failed };
-        match run() {
-            Ok(written) => {
-                if telemetry.exists() {
-                    fs::remove_dir_all(&telemetry).at("clear", &telemetry).map_err(EngineError::from)?;
-                }
-                let product = written.product;
-                let digest = product.header.non_standard_attributes.sha256.clone();
-                Ok(outcome(digest, Some(product.id().to_owned()), None))
-            }
-            Err(stopped @ (EngineError::Stopped | EngineError::Archive(_))) => Err(stopped.into()),
-            Err(error) => Ok(outcome(String::new(), None, Some(error.to_string()))),
-        }
+        let made = simulate(self.registry, &options, progress)?;
+        let whole = options.end_ns - start_ns >= DAY_NS;
+        let written = self.day(&self.planner.with_files(flight.day, made.files, whole), scratch, progress)?;
+        fs::remove_dir_all(&telemetry).at("clear", &telemetry)?;
+        Ok(written)
     }
 
     /// Adds the sums of a node, of days whose results are there.
@@ -173,6 +172,19 @@ impl Worker<'_> {
         let digest =
             sums.map(|sums| sha256([bits(&sums.spectra.packed), bits(&sums.first), bits(&sums.second)].concat()));
         Ok(Outcome { id: task.id.clone(), digest: digest.unwrap_or_default(), product: None, failed: None })
+    }
+}
+
+/// Result of a task that calibrates a day: a day that gives no product is a result, too.
+fn calibrated(task: &Task, run: Result<Written, EngineError>) -> Result<Outcome, WorkflowError> {
+    let outcome = |digest: String, product, failed| Outcome { id: task.id.clone(), digest, product, failed };
+    match run {
+        Ok(Written { product, .. }) => {
+            let digest = product.header.non_standard_attributes.sha256.clone();
+            Ok(outcome(digest, Some(product.id().to_owned()), None))
+        }
+        Err(stopped @ (EngineError::Stopped | EngineError::Archive(_))) => Err(stopped.into()),
+        Err(error) => Ok(outcome(String::new(), None, Some(error.to_string()))),
     }
 }
 

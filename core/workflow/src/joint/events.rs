@@ -90,7 +90,7 @@ pub(super) fn parse(
     let refuse = |what: String| WorkflowError::Events { path: path.to_owned(), what };
     let entries: Vec<Entry> = serde_yaml_ng::from_str(text).map_err(|e| refuse(e.to_string()))?;
     let mut events = Vec::new();
-    for entry in entries {
+    for (number, entry) in entries.into_iter().enumerate() {
         let by_kind = steps.iter().filter(|(kind, _)| *kind == entry.soe_event).map(|(_, effect)| effect.clone());
         let effects = if entry.changes.is_empty() { by_kind.collect() } else { entry.changes };
         let elsewhere = !entry.spacecraft.is_empty() && entry.spacecraft != spacecraft;
@@ -98,7 +98,8 @@ pub(super) fn parse(
             continue;
         }
         let (time_ns, time_scale) = time(&entry.time).ok_or_else(|| {
-            refuse(format!("the time {:?} of an event is not of the form 2035-01-31 12:00:00 UTC", entry.time))
+            let line = line_of(text, number).map_or_else(String::new, |line| format!("at line {line}, "));
+            refuse(format!("{line}the time {:?} of an event is not of the form 2035-01-31 12:00:00 UTC", entry.time))
         })?;
         let data = entry.data.as_object().cloned().unwrap_or_default();
         let Entry { soe_event: kind, time, comments, .. } = entry;
@@ -106,6 +107,14 @@ pub(super) fn parse(
     }
     events.sort_by_key(|event| event.time_ns);
     Ok(events)
+}
+
+/// Line at which an entry of a list begins, from 1 on; none where the list is written in brackets.
+fn line_of(text: &str, number: usize) -> Option<usize> {
+    let dash = |line: &str| line.trim_start().starts_with('-').then(|| line.len() - line.trim_start().len());
+    let indent = text.lines().filter(|line| !line.starts_with("---")).find_map(dash)?;
+    let begins = |(_, line): &(usize, &str)| !line.starts_with("---") && dash(line) == Some(indent);
+    text.lines().enumerate().filter(begins).nth(number).map(|(at, _)| at + 1)
 }
 
 /// JPL's log begins with entries of zeros, which say where things stood at first.
@@ -180,7 +189,12 @@ mod tests {
     #[test]
     fn a_time_that_is_none_is_refused_with_its_text() {
         let said = read_text(&LOG.replace("2018-07-18 06:00:00 GPS", "18 July")).expect_err("refused").to_string();
-        assert!(said.contains("18 July") && said.contains("events.yaml"), "{said}");
+        assert!(said.contains("events.yaml: at line 16, the time \"18 July\""), "{said}");
+        let said = read_text(&LOG.replace("changes: [com-offset, es-gain.tm1.y]", "changes: com-offset"));
+        let said = said.expect_err("no list").to_string();
+        assert!(said.contains("changes") && said.contains("line 28"), "{said}");
         assert!(read_text("- [").is_err());
+        let said = read_text("[{soe_event: MTEA, time: never}]").expect_err("refused").to_string();
+        assert!(said.contains("events.yaml: the time \"never\""), "{said}");
     }
 }

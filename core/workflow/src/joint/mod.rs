@@ -32,7 +32,7 @@ pub(crate) use days::chosen;
 
 pub use asked::{Declared, Options};
 pub use events::Event;
-pub use product::{At, again, archived, at};
+pub use product::{At, again, archived, at, rate_of};
 pub use result::{Agreement, Changed, Coefficient, Day, Joint, LeftOut, Measured, Step, Value};
 pub use stale::{Stale, stale};
 

@@ -212,6 +212,12 @@ fn report(joint: &Joint) -> Report {
     }
 }
 
+/// Rate of a coefficient among the recommended ones of a product, per s; none where it has none.
+pub fn rate_of<'a>(product: &'a Product, name: &str) -> Option<&'a Coefficient> {
+    let name = rate(name);
+    product.result.adopted().into_iter().find(|c| c.name == name)
+}
+
 /// What a product says of a time.
 #[derive(Clone, Debug)]
 pub struct At {

@@ -78,10 +78,20 @@ impl<'a> Planner<'a> {
     /// Reads pipeline, mission and model.
     ///
     /// # Errors
-    /// One of them cannot be read.
+    /// One of them cannot be read, or the pipeline reads its telemetry with a source plugin.
     pub fn new(operations: &'a Operations, registry: &'a Registry, options: RunOptions) -> Result<Self, WorkflowError> {
         let read = |path: &PathBuf| std::fs::read_to_string(path).unwrap_or_default();
         let pipeline = Pipeline::load(&operations.pipeline).map_err(EngineError::from)?;
+        if let Some((source, _)) = &pipeline.source {
+            // Only MCAP files say which times they cover; a source's files are known to the source alone.
+            let what = format!(
+                "the pipeline {} reads its telemetry with the source {source}, whose files do not say which days they cover; \
+                 calibrate each day by `dragfree run {} FILES --from DAY --until DAY --stream oper`",
+                operations.pipeline.display(),
+                operations.pipeline.display()
+            );
+            return Err(WorkflowError::Operations { path: operations.path.clone(), what });
+        }
         let missing = |what| EngineError::NotNamed { what, pipeline: operations.pipeline.clone() };
         let mission = operations.mission.clone().or(pipeline.mission.clone()).ok_or_else(|| missing("mission"))?;
         let model = operations.model.clone().or(pipeline.model.clone()).ok_or_else(|| missing("model"))?;

@@ -5,8 +5,10 @@ use crate::args::Format;
 use crate::commands::Done;
 use crate::failure::Failure;
 use chrono::{DateTime, SecondsFormat};
+use dragfree_archive::JOINT;
 use dragfree_archive::files::IoContext as _;
 use dragfree_archive::product::{self, Coefficient, Product};
+use dragfree_workflow::joint::rate_of;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
@@ -111,6 +113,14 @@ fn vcm1b(product: &Product) -> Result<String, Failure> {
         let sigma: Vec<String> = offset.sigma_m.iter().map(|s| format!("{s:e}")).collect();
         let _ = writeln!(text, "    sigma_{test_mass}_m: [{}]", sigma.join(", "));
         let _ = writeln!(text, "    frame_{test_mass}: {}", quoted(&offset.frame));
+        if let Some(rate) = &offset.rate {
+            let list = |of: fn(&Coefficient) -> f64| rate.map(|c| format!("{:e}", of(c))).join(", ");
+            let _ = writeln!(text, "    rate_{test_mass}_m_s: [{}]", list(|c| c.value));
+            let _ = writeln!(text, "    sigma_rate_{test_mass}_m_s: [{}]", list(|c| c.sigma));
+        }
+    }
+    if attributes.product == JOINT {
+        let _ = writeln!(text, "    comment: {}", quoted(OF_MANY_DAYS));
     }
     text += "  variables:\n";
     let columns = [
@@ -147,14 +157,20 @@ fn vcm1b(product: &Product) -> Result<String, Failure> {
     Ok(text)
 }
 
-struct Offset {
+/// What a VCM1B file of many days must say, as its format has one vector for all of them.
+const OF_MANY_DAYS: &str = "the vectors hold at epoch_of_values; before it they differ by the rates, where there are any, \
+                            and by the steps at events, which `dragfree at TIME` and --format csv tell";
+
+struct Offset<'a> {
     value_m: [f64; 3],
     sigma_m: [f64; 3],
     frame: String,
+    /// Rates of the three components, of a calibration of many days.
+    rate: Option<[&'a Coefficient; 3]>,
 }
 
 /// Vectors whose three components, `EFFECT.TESTMASS.x|y|z` in metres, are in the adopted solution, by test mass.
-fn offsets(product: &Product) -> BTreeMap<String, Offset> {
+fn offsets(product: &Product) -> BTreeMap<String, Offset<'_>> {
     let mut parts: BTreeMap<(String, String), [Option<&Coefficient>; 3]> = BTreeMap::new();
     for c in product.result.adopted().into_iter().filter(|c| c.unit == "m" && c.value.is_finite()) {
         let names: Vec<&str> = c.name.split('.').collect();
@@ -165,7 +181,9 @@ fn offsets(product: &Product) -> BTreeMap<String, Offset> {
     }
     let whole = |((_, test_mass), [x, y, z]): ((String, String), [Option<&Coefficient>; 3])| {
         let (x, y, z) = (x?, y?, z?);
+        let [rate_x, rate_y, rate_z] = [x, y, z].map(|c| rate_of(product, &c.name));
         let offset = Offset {
+            rate: rate_x.zip(rate_y).zip(rate_z).map(|((x, y), z)| [x, y, z]),
             value_m: [x.value, y.value, z.value],
             sigma_m: [x.sigma, y.sigma, z.sigma],
             frame: x.frame.clone(),

@@ -43,7 +43,8 @@ pub(super) fn differences(diff: &Diff, paint: Paint) -> String {
         };
         let heading = ["coefficient", "first", "second", "unit", "difference"];
         screen += "\n";
-        screen += &text::columns(&text::table(&heading, diff.values.iter().map(row)));
+        let table = text::columns(&text::table(&heading, diff.values.iter().map(row)));
+        screen += &if text::fits(&table) { table } else { stacked(&heading, diff.values.iter().map(row)) };
     }
     let parts = [
         ("inputs", &diff.inputs),
@@ -55,9 +56,10 @@ pub(super) fn differences(diff: &Diff, paint: Paint) -> String {
     for (name, changes) in parts.into_iter().filter(|(_, changes)| !changes.is_empty()) {
         let _ = writeln!(screen, "\n{}", paint.bold(name));
         for Change { what, first, second } in changes {
-            let side = |side: &Option<String>| side.clone().unwrap_or_else(|| "not there".to_owned());
+            let side = |side: &Option<String>| side.as_deref().map_or_else(|| "not there".to_owned(), short_digests);
             screen += &text::labelled("", what);
-            let _ = writeln!(screen, "            first   {}\n            second  {}", side(first), side(second));
+            screen += &text::labelled("            first  ", &side(first));
+            screen += &text::labelled("            second ", &side(second));
         }
     }
     if parts.iter().all(|(_, changes)| changes.is_empty()) {
@@ -87,6 +89,21 @@ pub(super) fn lineage(
         let _ = writeln!(text, "picture   {}", path.display());
     }
     Ok(Done::new(text))
+}
+
+/// Rows whose first cell, a name, stands on a line of its own.
+fn stacked(heading: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String {
+    let (names, mut rest): (Vec<String>, Vec<Vec<String>>) =
+        text::table(heading, rows).into_iter().map(|mut row| (row.remove(0), row)).unzip();
+    rest.iter_mut().for_each(|row| row.insert(0, String::new()));
+    let below = text::columns(&rest);
+    names.iter().zip(below.lines()).map(|(name, values)| format!("{name}\n{values}\n")).collect()
+}
+
+/// A text with the start of each digest in it alone.
+fn short_digests(words: &str) -> String {
+    let is_digest = |word: &str| word.len() == 64 && word.bytes().all(|b| b.is_ascii_hexdigit());
+    words.split(' ').map(|word| if is_digest(word) { short(word) } else { word }).collect::<Vec<_>>().join(" ")
 }
 
 /// The start of a digest, enough to tell contents apart.
