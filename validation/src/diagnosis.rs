@@ -5,6 +5,7 @@
 //! foreign producer are scored by names. If everything that was named is true, it is added to the model and the same
 //! telemetry is calibrated again.
 
+use std::ffi::OsString;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -17,8 +18,9 @@ use crate::campaign::{Meter, note, science_mode, taiji, work};
 use crate::diagnosis_report::summary;
 use crate::diagnosis_score::{Truth, by_names, by_reveal, name_of, undiagnosed};
 use crate::error::{CampaignError, file};
+use crate::frozen;
 use crate::program::{Chain, Hidden, Program, root, solution};
-use crate::records::{Acted, Answer, Diagnosed, Extended, Results, Solution, rounded};
+use crate::records::{Acted, Answer, Diagnosed, Extended, Results, Solution, read, rounded};
 
 /// Length of a set.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -119,6 +121,22 @@ struct Set {
 }
 
 impl Plan {
+    /// The arguments that ask for some seeds, with files and folders `[results, scratch]`.
+    fn arguments_of(
+        &self,
+        seeds: &RangeInclusive<u32>,
+        at_once: usize,
+        [results, scratch]: [&Path; 2],
+    ) -> Result<Vec<OsString>, CampaignError> {
+        let mut words = vec!["diagnosis".to_owned(), format!("--seeds={}-{}", seeds.start(), seeds.end())];
+        words.extend(self.length.map(|length| format!("--length={}", named(&length))));
+        words.extend(self.producer.map(|producer| format!("--producer={}", named(&producer))));
+        words.extend(self.clean.then(|| "--clean".to_owned()));
+        words.push(format!("--arguments={}", self.arguments.join(" ")));
+        words.push(format!("--at-once={at_once}"));
+        Ok(words.into_iter().map(OsString::from).chain(frozen::places(results, scratch)?).collect())
+    }
+
     fn set(&self, seed: u32) -> Set {
         let (block, place) = ((seed - 1) / BLOCK, (seed - 1) % BLOCK);
         let lengths = Length::ALL.len() as u32;
@@ -139,6 +157,11 @@ impl Plan {
         let comma = if arguments.is_empty() { "" } else { ", " };
         format!("{} {}{clean}{comma}{arguments}", set.length.name(), set.producer.name())
     }
+}
+
+/// A value as it is written in an argument.
+fn named(value: &impl ValueEnum) -> String {
+    value.to_possible_value().map(|v| v.get_name().to_owned()).unwrap_or_default()
 }
 
 impl Set {
@@ -166,21 +189,21 @@ enum Secret {
     Nothing,
 }
 
-/// Runs the seeds that `results` lacks, `at_once` in parallel.
+/// Runs the seeds that `results` lacks, `at_once` in parallel, with the program of the commit that they name.
 /// After an error the results so far are on disk, and the next call continues.
 pub(crate) fn diagnosis(
-    program: &Program,
     plan: &Plan,
     seeds: RangeInclusive<u32>,
     at_once: usize,
     results: &Path,
     scratch: &Path,
 ) -> Result<(), CampaignError> {
-    let build = program.whole_digest()?;
-    let (results, dropped) = Results::<Diagnosed>::open(results, &build)?;
-    if dropped > 0 {
-        note(&format!("{dropped} results of another build are dropped and measured again"));
-    }
+    let lines: Vec<Diagnosed> = read(results)?;
+    let commits = lines.iter().map(|line| line.commit.as_str());
+    let asked = || plan.arguments_of(&seeds, at_once, [results, scratch]);
+    let Some(commit) = frozen::present_or_go_on(commits, asked)? else { return Ok(()) };
+    let program = &Program::build()?;
+    let (results, _) = Results::<Diagnosed>::open(results, &commit)?;
     let sets = seeds.map(|seed| plan.set(seed)).filter(|set| !results.has(&plan.configuration(set), set.seed));
     let sets: Vec<Set> = sets.collect();
     // A start of the program takes about as long as an hour of data.
@@ -195,7 +218,7 @@ pub(crate) fn diagnosis(
         }
         std::fs::create_dir_all(&folder).map_err(io)?;
         let measurement = Measurement { program, plan, set: &set, folder: &folder, configuration: &configuration };
-        let line = measurement.measure(&build)?;
+        let line = measurement.measure(&commit)?;
         let said = told(&line);
         results.append(line)?;
         std::fs::remove_dir_all(&folder).map_err(io)?;
@@ -242,7 +265,7 @@ impl Measurement<'_> {
         CampaignError::Product { configuration: self.configuration.to_owned(), seed: self.set.seed, what }
     }
 
-    fn measure(&self, build: &str) -> Result<Diagnosed, CampaignError> {
+    fn measure(&self, commit: &str) -> Result<Diagnosed, CampaignError> {
         let made = match self.set.producer {
             Producer::Own => self.simulated()?,
             Producer::Foreign => self.flown()?,
@@ -259,7 +282,7 @@ impl Measurement<'_> {
         let mut line = Diagnosed {
             configuration: self.configuration.to_owned(),
             seed: self.set.seed,
-            build: build.to_owned(),
+            commit: commit.to_owned(),
             length: self.set.length.name().to_owned(),
             producer: self.set.producer.name().to_owned(),
             arguments: self.plan.arguments.join(" "),

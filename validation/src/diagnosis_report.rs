@@ -334,7 +334,7 @@ pub(crate) fn numbers(lines: &[Diagnosed], free: &DMatrix<f64>) -> (String, Vec<
 
 /// What was run, and with which build.
 fn provenance(method: &str, lines: &[&Diagnosed]) -> String {
-    let builds: BTreeSet<&str> = lines.iter().map(|l| l.build.as_str()).collect();
+    let builds: BTreeSet<&str> = lines.iter().map(|l| l.commit.as_str()).collect();
     let builds = builds.into_iter().collect::<Vec<_>>().join(", ");
     let (first, last) = lines.iter().fold((u32::MAX, 0), |(a, b), l| (a.min(l.seed), b.max(l.seed)));
     let median = stats::median(lines.iter().map(|l| l.diagnosis_s).collect());
@@ -388,7 +388,7 @@ mod tests {
         Diagnosed {
             configuration: format!("{length} {producer}"),
             seed: 1,
-            build: "b".to_owned(),
+            commit: "b".to_owned(),
             length: length.to_owned(),
             producer: producer.to_owned(),
             arguments: String::new(),

@@ -2,12 +2,13 @@
 //! results name a commit, and that commit is checked out and built again where it is not the present one.
 
 use std::collections::BTreeSet;
-use std::ffi::OsStr;
+use std::ffi::{OsStr, OsString};
 use std::path::Path;
 use std::process::Command;
 
-use crate::error::CampaignError;
-use crate::program::output;
+use crate::campaign::note;
+use crate::error::{CampaignError, file};
+use crate::program::{output, root};
 
 /// What program, plugins and campaigns are made of.
 const MADE_OF: [&str; 9] =
@@ -20,7 +21,7 @@ const PACKAGE: &str = "dragfree-validation";
 ///
 /// # Errors
 /// Some of it is in no commit, so that no later session could make the program again; there is no git.
-pub(crate) fn commit(repository: &Path) -> Result<String, CampaignError> {
+fn commit(repository: &Path) -> Result<String, CampaignError> {
     let changed = git(repository, &["status", "--porcelain", "--"], &MADE_OF)?;
     if !changed.is_empty() {
         return Err(CampaignError::Frozen(format!(
@@ -35,7 +36,7 @@ pub(crate) fn commit(repository: &Path) -> Result<String, CampaignError> {
 ///
 /// # Errors
 /// They name several.
-pub(crate) fn begun_with<'a>(commits: impl IntoIterator<Item = &'a str>) -> Result<Option<String>, CampaignError> {
+fn begun_with<'a>(commits: impl IntoIterator<Item = &'a str>) -> Result<Option<String>, CampaignError> {
     let all: BTreeSet<&str> = commits.into_iter().filter(|commit| !commit.is_empty()).collect();
     if all.len() > 1 {
         let all = all.into_iter().collect::<Vec<_>>().join(", ");
@@ -44,11 +45,41 @@ pub(crate) fn begun_with<'a>(commits: impl IntoIterator<Item = &'a str>) -> Resu
     Ok(all.first().map(|commit| (*commit).to_owned()))
 }
 
+/// The present commit, where a campaign with results of these commits begins or goes on with it. Where it was begun with
+/// another one, the program of that commit goes on with `arguments`, and there is none.
+///
+/// # Errors
+/// As [`commit`], [`begun_with`] and [`go_on`].
+pub(crate) fn present_or_go_on<'a>(
+    commits: impl IntoIterator<Item = &'a str>,
+    arguments: impl FnOnce() -> Result<Vec<OsString>, CampaignError>,
+) -> Result<Option<String>, CampaignError> {
+    let present = commit(root())?;
+    match begun_with(commits)? {
+        Some(begun) if begun != present => {
+            note(&format!("going on with commit {begun}; another file of --results begins anew"));
+            let arguments = arguments()?;
+            go_on(root(), &begun, &arguments.iter().map(OsString::as_os_str).collect::<Vec<_>>())?;
+            Ok(None)
+        }
+        _ => Ok(Some(present)),
+    }
+}
+
+/// `--results FILE --scratch DIR` as they are from any folder.
+///
+/// # Errors
+/// There is no present folder.
+pub(crate) fn places(results: &Path, scratch: &Path) -> Result<[OsString; 4], CampaignError> {
+    let absolute = |path: &Path| std::path::absolute(path).map_err(|e| file(path, &e));
+    Ok(["--results".into(), absolute(results)?.into(), "--scratch".into(), absolute(scratch)?.into()])
+}
+
 /// Runs `dragfree-validation` of a commit, built in a working tree of its own below `target/frozen`.
 ///
 /// # Errors
 /// The commit is not there, does not build, or its campaign stops.
-pub(crate) fn go_on(repository: &Path, commit: &str, arguments: &[&OsStr]) -> Result<(), CampaignError> {
+fn go_on(repository: &Path, commit: &str, arguments: &[&OsStr]) -> Result<(), CampaignError> {
     let tree = repository.join("target/frozen").join(commit);
     if !tree.exists() {
         // --force: a working tree that somebody has deleted is still known to git.

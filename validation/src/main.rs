@@ -48,7 +48,8 @@ enum Command {
     Table(Table),
     /// Hide effects, diagnose, and score when the seals are opened; goes on where it was stopped
     Blind(Blind),
-    /// Diagnose sets of 2 h to 3 × 24 h by two producers and score them; goes on where it was stopped
+    /// Diagnose sets of 2 h to 3 × 24 h by two producers and score them; goes on where it was stopped, with the program
+    /// of the commit that the results name
     Diagnosis(Diagnosis),
     /// Calibrate 90 days with a drift and steps, alone and together; goes on where it was stopped, with the program of
     /// the commit that the results name
@@ -199,7 +200,7 @@ fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
                 clean: d.clean,
                 arguments: d.arguments.split_whitespace().map(str::to_owned).collect(),
             };
-            diagnosis::diagnosis(&Program::build()?, &plan, d.seeds.clone(), d.at_once, &file, &scratch)
+            diagnosis::diagnosis(&plan, d.seeds.clone(), d.at_once, &file, &scratch)
         }
         Command::Months(m) => {
             let file = m.results.clone().unwrap_or_else(|| results.join("months.jsonl"));

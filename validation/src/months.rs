@@ -8,10 +8,10 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-use crate::campaign::{Meter, ScratchFolder, note, science_mode, taiji, work};
+use crate::campaign::{Meter, ScratchFolder, science_mode, taiji, work};
 use crate::error::{CampaignError, file};
 use crate::frozen;
-use crate::program::{Chain, Program, root};
+use crate::program::{Chain, Program};
 use crate::records::{COEFFICIENTS, Keyed, Results, read, rounded};
 use crate::stats;
 
@@ -97,13 +97,11 @@ pub(crate) struct Sets {
 impl Sets {
     /// The arguments that ask for them, of which `[results, scratch]` are files and folders.
     fn arguments(&self, [results, scratch]: [&Path; 2]) -> Result<Vec<OsString>, CampaignError> {
-        let absolute = |path: &Path| std::path::absolute(path).map_err(|e| file(path, &e));
-        let (results, scratch) = (absolute(results)?, absolute(scratch)?);
         let seeds = format!("{}-{}", self.seeds.start(), self.seeds.end());
-        let words = [seeds, self.hours.to_string(), self.at_once.to_string()];
-        let values = words.map(OsString::from).into_iter().chain([results.into(), scratch.into()]);
-        let names = ["--seeds", "--hours", "--at-once", "--results", "--scratch"].map(OsString::from);
-        Ok(std::iter::once("months".into()).chain(names.into_iter().zip(values).flat_map(|(n, v)| [n, v])).collect())
+        let words = [seeds, self.hours.to_string(), self.at_once.to_string()].map(OsString::from);
+        let names = ["--seeds", "--hours", "--at-once"].map(OsString::from);
+        let own = names.into_iter().zip(words).flat_map(|(name, value)| [name, value]);
+        Ok(std::iter::once("months".into()).chain(own).chain(frozen::places(results, scratch)?).collect())
     }
 }
 
@@ -120,15 +118,9 @@ fn name(day: u32) -> String {
 
 /// Runs the seeds that `results` lacks, with the program of the commit that it names.
 pub(crate) fn months(sets: &Sets, results: &Path, scratch: &Path) -> Result<(), CampaignError> {
-    let commit = frozen::commit(root())?;
     let lines: Vec<Months> = read(results)?;
-    if let Some(begun) = frozen::begun_with(lines.iter().map(|line| line.commit.as_str()))?
-        && begun != commit
-    {
-        note(&format!("going on with commit {begun}; another file of --results begins anew"));
-        let arguments = sets.arguments([results, scratch])?;
-        return frozen::go_on(root(), &begun, &arguments.iter().map(OsString::as_os_str).collect::<Vec<_>>());
-    }
+    let commits = lines.iter().map(|line| line.commit.as_str());
+    let Some(commit) = frozen::present_or_go_on(commits, || sets.arguments([results, scratch]))? else { return Ok(()) };
     let program = &Program::build()?;
     let build = program.whole_digest()?;
     let (results, _) = Results::<Months>::open(results, &commit)?;

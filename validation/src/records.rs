@@ -180,8 +180,8 @@ pub(crate) struct Diagnosed {
     pub(crate) configuration: String,
     /// Seed of everything drawn.
     pub(crate) seed: u32,
-    /// Digest of program and plugins, twelve hexadecimal digits.
-    pub(crate) build: String,
+    /// Commit of program, plugins and campaign.
+    pub(crate) commit: String,
     /// Length, as `6h`.
     pub(crate) length: String,
     /// `own` or `foreign`.
@@ -268,7 +268,7 @@ impl Keyed for Diagnosed {
     }
 
     fn made_with(&self) -> &str {
-        &self.build
+        &self.commit
     }
 }
 
