@@ -17,7 +17,7 @@ use crate::registry::Registry;
 use crate::stop;
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{FileHeader, TelemetryWriter, interface_tables};
-use dragfree_archive::files::{IoContext as _, IoError, folder_of, sha256, sha256_of, sync_folder};
+use dragfree_archive::files::{IoContext as _, IoError, folder_of, sha256, sync_folder};
 use dragfree_archive::product::{self, Loss, NoiseLevel, Stage, Status, Stream};
 use dragfree_archive::{InputPlace, MadeOf, ProductWriter, Window, Written};
 
@@ -158,6 +158,13 @@ impl<'a> Setup<'a> {
             None if options.files.is_empty() => Err(EngineError::NoFiles { pipeline: options.pipeline.clone() }),
             None => Ok(Box::new(FileFeed::open(&options.files, window, options.threads, &self.mission)?)),
         }
+    }
+
+    /// The files that were read once, with their paths.
+    pub(crate) fn inputs(&self) -> Vec<(product::Input, PathBuf)> {
+        let input =
+            |(role, path, text): &(&'static str, PathBuf, String)| (named(role, path, text.as_bytes()), path.clone());
+        self.texts.iter().map(input).collect()
     }
 
     pub(crate) fn link(&self, registry: &Registry, tables: &[TableSpec]) -> Result<Chain, EngineError> {
@@ -437,6 +444,7 @@ fn draft(
     (state, reports): (Option<&[u8]>, Vec<Report>),
     covered: &Covered,
 ) -> Result<Draft, EngineError> {
+    let inputs = inputs(setup, feed, state)?;
     let mut replay = feed.summary()?;
     let source = feed.source().map(|s| stage(&s.found.info, "", &s.found.opened.sha256, &s.parameters));
     let nodes = chain.nodes.iter().map(|n| {
@@ -466,7 +474,7 @@ fn draft(
         spacecraft: setup.mission.spacecraft.clone(),
         first_ns: covered.first_ns,
         last_ns: covered.last_ns,
-        inputs: inputs(setup, state)?,
+        inputs,
         history,
         model: product::Model {
             revision,
@@ -502,22 +510,17 @@ fn made_of(setup: &Setup<'_>, draft: &Draft) -> MadeOf {
     MadeOf { places: telemetry.map(place).collect(), window, run_in_ns: options.run_in_ns }
 }
 
+/// A file that was read once.
+fn named(role: &str, path: &Path, content: &[u8]) -> product::Input {
+    let (role, name) = (role.to_owned(), name_of(path));
+    product::Input { role, name, size: content.len() as u64, sha256: sha256(content) }
+}
+
 /// Every file that a run read. Of the files of a source plugin only those that the command line names are known.
-fn inputs(setup: &Setup<'_>, state: Option<&[u8]>) -> Result<Vec<product::Input>, EngineError> {
-    let input = |role: &str, path: &Path, size: usize, sha256: String| product::Input {
-        role: role.to_owned(),
-        name: name_of(path),
-        size: size as u64,
-        sha256,
-    };
-    let mut inputs = Vec::new();
-    for path in &setup.options.files {
-        let size = std::fs::metadata(path).at("read", path)?.len();
-        let sha256 = sha256_of(path).at("read", path)?;
-        inputs.push(product::Input { role: "telemetry".to_owned(), name: name_of(path), size, sha256 });
-    }
-    inputs.extend(setup.texts.iter().map(|(role, path, text)| input(role, path, text.len(), sha256(text))));
+fn inputs(setup: &Setup<'_>, feed: &mut dyn Feed, state: Option<&[u8]>) -> Result<Vec<product::Input>, EngineError> {
+    let mut inputs = feed.inputs()?;
+    inputs.extend(setup.inputs().into_iter().map(|(input, _)| input));
     let state = setup.options.state_in.iter().zip(state);
-    inputs.extend(state.map(|(path, bytes)| input("state", path, bytes.len(), sha256(bytes))));
+    inputs.extend(state.map(|(path, bytes)| named("state", path, bytes)));
     Ok(inputs)
 }

@@ -1,9 +1,9 @@
 //! From pieces of files to stretches of time.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::ops::Range;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use mcap::records::op;
 
@@ -13,6 +13,8 @@ use super::inflate::{InflateError, Inflater, Piece, Stored};
 use super::losses::{Finding, Losses};
 use super::records::{Cursor, Message};
 use super::tables::{Route, Routes};
+use crate::input::InputFile;
+use crate::limits::ROWS_IN_FLIGHT_BYTES;
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{Cells, Decoder, WireError};
 
@@ -48,9 +50,20 @@ type Key = (i64, usize, u64);
 /// A file ready to be read.
 #[derive(Debug)]
 pub(super) struct OpenFile {
-    pub(super) path: PathBuf,
+    pub(super) input: Arc<InputFile>,
     pub(super) pieces: Vec<Piece>,
     pub(super) routes: Routes,
+    /// Messages that it should hold, where it says so.
+    pub(super) messages: Option<u64>,
+}
+
+/// A file under way.
+#[derive(Debug)]
+struct ReadFile {
+    input: Arc<InputFile>,
+    routes: Routes,
+    /// Messages that should be in it and have not come yet; none where it does not say, or is not read whole.
+    due: Option<u64>,
 }
 
 /// Where a message of a piece lies.
@@ -64,7 +77,7 @@ struct Entry {
 /// Reads the pieces of all files in order of time.
 #[derive(Debug)]
 pub(super) struct Reader {
-    files: Vec<(PathBuf, Routes)>,
+    files: Vec<ReadFile>,
     tables: Vec<TableSpec>,
     queue: BTreeMap<Key, Pending>,
     /// Rows read and not yet delivered, by table.
@@ -91,6 +104,7 @@ impl Reader {
         let mut opened = Vec::with_capacity(files.len());
         let mut end_ns = i64::MIN;
         for (at, file) in files.into_iter().enumerate() {
+            let mut due = file.messages;
             for piece in file.pieces {
                 let (start, end) = (clamp_ns(piece.start), clamp_ns(piece.end));
                 // Pieces with times out of range are read for the count of them.
@@ -100,9 +114,11 @@ impl Reader {
                         end_ns = end_ns.max(end + 1);
                     }
                     queue.insert((start, at, piece.offset), Pending { piece, from_ns: i64::MIN });
+                } else {
+                    due = None;
                 }
             }
-            opened.push((file.path, file.routes));
+            opened.push(ReadFile { input: file.input, routes: file.routes, due });
         }
         let blocks = tables.iter().map(|_| vec![]).collect();
         let done_ns = i64::MIN;
@@ -118,7 +134,10 @@ impl Reader {
         loop {
             let queued = self.queue.first_key_value().map(|(key, _)| key.0);
             let held = self.blocks.iter().flatten().filter_map(Block::head).min();
-            let Some(first) = queued.into_iter().chain(held).min() else { return Ok(None) };
+            let Some(first) = queued.into_iter().chain(held).min() else {
+                self.count_missing();
+                return Ok(None);
+            };
             let until_ns = ((first.max(self.done_ns).div_euclid(STRETCH_NS)) + 1) * STRETCH_NS;
             while let Some(entry) = self.queue.first_entry().filter(|e| e.key().0 < until_ns) {
                 let ((_, file, _), pending) = entry.remove_entry();
@@ -136,15 +155,31 @@ impl Reader {
         }
     }
 
+    /// Counts the messages that files should hold and do not; once, at the end.
+    fn count_missing(&mut self) {
+        for file in &mut self.files {
+            let Some(missing) = file.due.take().filter(|missing| *missing > 0) else { continue };
+            let name = super::name_of(file.input.path());
+            self.losses.add(Finding::MissingMessages, missing, &name, || {
+                format!("{name}: {missing} messages that its statistics count are not in it; fetch the file again")
+            });
+        }
+    }
+
+    /// Bytes of the rows that wait to be delivered.
+    fn held_bytes(&self) -> usize {
+        self.blocks.iter().flatten().map(Block::bytes).sum()
+    }
+
     /// Reads the rows of a piece that lie between what was delivered and the horizon.
     fn read(&mut self, file: usize, pending: Pending, until_ns: i64) -> Result<(), ReplayError> {
         let horizon_ns = until_ns.saturating_add(HORIZON);
-        let (path, routes) = &mut self.files[file];
-        let name = super::name_of(path);
+        let mut held = self.held_bytes();
+        let ReadFile { input, routes, due } = &mut self.files[file];
+        let name = super::name_of(input.path());
         let piece = &pending.piece;
-        let io = |source| ReplayError::Io { path: path.clone(), source };
-        let mut opened = File::open(&*path).map_err(io)?;
-        let records = match self.inflater.read(&mut opened, piece) {
+        let io = |source| ReplayError::Io { path: input.path().to_owned(), source };
+        let records = match self.inflater.read(input, piece) {
             Ok(records) => records,
             Err(InflateError::Io(error)) => return Err(io(error)),
             Err(InflateError::Corrupt(why)) => {
@@ -170,7 +205,10 @@ impl Reader {
             window_ns: self.window_ns.clone(),
             first_time,
         };
-        let later = index(records, &wanted, &mut self.entries, &name, &mut self.losses);
+        let (later, messages) = index(records, &wanted, &mut self.entries, &name, &mut self.losses);
+        if let Some(due) = due.as_mut().filter(|_| first_time) {
+            *due = due.saturating_sub(messages);
+        }
         self.entries.sort_by_key(|e| e.channel); // stable: within a channel the order of the file stays
         for entries in self.entries.chunk_by(|a, b| a.channel == b.channel) {
             let (channel, count) = (entries[0].channel, entries.len());
@@ -187,6 +225,10 @@ impl Reader {
                 }
                 Some(Route::Table { table, decoder }) => {
                     let spec = &self.tables[*table];
+                    held += Block::bytes_of(count, spec.columns.len());
+                    if held > ROWS_IN_FLIGHT_BYTES {
+                        return Err(ReplayError::TooMuchAtOnce { path: input.path().to_owned(), offset: piece.offset });
+                    }
                     let rows = decode(entries, records, decoder, spec.columns.len());
                     let topic = &spec.name;
                     self.losses.add(Finding::NonFiniteValues, rows.non_finite, topic, || {
@@ -252,12 +294,19 @@ struct Wanted {
     first_time: bool,
 }
 
-/// Lists the messages of a piece that are wanted; returns the earliest time of those that are for later.
-fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, losses: &mut Losses) -> Option<i64> {
+/// Lists the messages of a piece that are wanted; returns the earliest time of those that are for later, and how many
+/// messages there are in all.
+fn index(
+    records: &[u8],
+    wanted: &Wanted,
+    entries: &mut Vec<Entry>,
+    name: &str,
+    losses: &mut Losses,
+) -> (Option<i64>, u64) {
     entries.clear();
     let mut cursor = Cursor(records);
     let mut later: Option<i64> = None;
-    let (mut insane, mut backwards, mut late) = (0, 0, 0);
+    let (mut messages, mut insane, mut backwards, mut late) = (0, 0, 0, 0);
     let mut before: BTreeMap<u16, u64> = BTreeMap::new();
     loop {
         let (code, body) = match cursor.record() {
@@ -278,6 +327,7 @@ fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, 
             losses.add(Finding::DamagedRecords, 1, name, || format!("{name}: a message is shorter than its header"));
             continue;
         };
+        messages += 1;
         let time_ns = i64::try_from(message.log_time).unwrap_or(i64::MAX);
         if wanted.first_time {
             let last = before.entry(message.channel).or_insert(0);
@@ -305,5 +355,5 @@ fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, 
     losses.add(Finding::LateMessages, late, name, || {
         format!("{name}: messages lie outside the times that their chunk states and came too late to be put in order; they are lost")
     });
-    later
+    (later, messages)
 }

@@ -1,0 +1,54 @@
+//! Who could put other code into a plugin folder: a library runs with all rights of the program.
+
+use std::path::Path;
+
+use crate::input::InputFile;
+
+/// Refuses a library that somebody could change who is neither this user, nor root, nor the owner of the program.
+///
+/// # Errors
+/// The reason, with what to do.
+#[cfg(unix)]
+pub(super) fn check(path: &Path, file: &InputFile) -> Result<(), String> {
+    use std::os::unix::fs::MetadataExt as _;
+    let stat = file.metadata().map_err(|e| e.to_string())?;
+    if stat.mode() & 0o002 != 0 {
+        let mode = stat.mode() & 0o777;
+        return Err(format!("may be changed by everybody (mode {mode:o}); `chmod o-w` it if you trust it"));
+    }
+    let trusted = trusted();
+    let foreign = |owner: u32, what: &str| {
+        let who = "who is neither you nor root nor the owner of the program";
+        format!("{what} belongs to user {owner}, {who}; `chown` it if you trust it")
+    };
+    if !trusted.contains(&stat.uid()) {
+        return Err(foreign(stat.uid(), "the file"));
+    }
+    let place = path.canonicalize().map_err(|e| e.to_string())?;
+    for (level, folder) in place.ancestors().skip(1).enumerate() {
+        let stat = std::fs::metadata(folder).map_err(|e| e.to_string())?;
+        let shown = folder.display();
+        // In a folder with the sticky bit, such as /tmp, nobody can take away what belongs to another.
+        if stat.mode() & 0o1002 == 0o002 {
+            return Err(format!("its folder {shown} may be changed by everybody; `chmod o-w {shown}` if you trust it"));
+        }
+        if level == 0 && !trusted.contains(&stat.uid()) {
+            return Err(foreign(stat.uid(), &format!("its folder {shown}")));
+        }
+    }
+    Ok(())
+}
+
+/// This user, root, and whoever owns the program and could change it as well.
+#[cfg(unix)]
+fn trusted() -> [u32; 3] {
+    use std::os::unix::fs::MetadataExt as _;
+    let me = rustix::process::geteuid().as_raw();
+    let program = std::env::current_exe().and_then(std::fs::metadata).map_or(me, |stat| stat.uid());
+    [0, me, program]
+}
+
+#[cfg(not(unix))]
+pub(super) fn check(_path: &Path, _file: &InputFile) -> Result<(), String> {
+    Ok(())
+}
