@@ -208,6 +208,9 @@ static void release_badly(struct ArrowArray *array) {
   release_table(array);
 }
 
+/* Of a spoilt table, which nobody can walk any more. */
+static void keep(struct ArrowArray *array) { array->release = NULL; }
+
 /* A sound table, made unsound. What it owned stays where it is. */
 static void spoil(struct ArrowArray *table) {
   static struct ArrowArray *children[2];
@@ -260,6 +263,7 @@ static dragfree_status hostile_process(void *self, const dragfree_inputs_v1 *inp
   if (!make_table(&outputs[0], input(table, -1), table->length, 1)) return say(error, DRAGFREE_FATAL, "no memory");
   memcpy(column(&outputs[0], 0), input(table, s->x.column), (size_t)table->length * 8);
   if (is("process_writes_inputs")) ((double *)(intptr_t)input(table, s->x.column))[0] = 1e30;
+  if (way_of("process")) outputs[0].release = keep;
   spoil(&outputs[0]);
   if (way_of("release")) outputs[0].release = release_badly;
   return failing("process", error);

@@ -330,6 +330,24 @@ fn a_plugin_that_breaks_a_rule_of_a_call_is_named() {
     check_all(of_single_calls());
 }
 
+/// A run that its terminal stops for longer than the limit goes on afterwards.
+#[test]
+fn a_program_that_was_stopped_is_not_taken_for_one_that_hangs() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut command = run("nothing", folder.path());
+    command.args(["--plugin-time-limit", LIMIT_S]).stdout(std::process::Stdio::null());
+    let mut child = command.spawn().expect("the program runs");
+    let staging = folder.path().join("archive/staging");
+    while !std::fs::read_dir(&staging).is_ok_and(|mut entries| entries.next().is_some()) {
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    let signal = |name: &str| expect(Command::new("kill").arg(name).arg(child.id().to_string()), 0);
+    signal("-STOP");
+    std::thread::sleep(Duration::from_millis(2500));
+    signal("-CONT");
+    assert!(child.wait().expect("it ends").success());
+}
+
 /// A library that nobody uses may not end or delay other commands.
 #[test]
 fn other_plugins_are_found_beside_a_hostile_library() {

@@ -46,7 +46,7 @@ pub(crate) fn harmless(text: &str, paint: Paint) -> String {
         match c {
             '\n' | '\t' => safe.push(c),
             '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => {
-                safe.extend(c.escape_unicode())
+                safe.extend(c.escape_unicode());
             }
             c if c.is_control() => safe.extend(c.escape_default()),
             c => safe.push(c),

@@ -181,7 +181,7 @@ mod tests {
     fn sums_are_of_the_bytes_that_are_read() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("file");
-        let bytes: Vec<u8> = (0..700_000_u32).map(|k| (k * 31 >> 3) as u8).collect();
+        let bytes: Vec<u8> = (0..700_000_u32).map(|k| ((k * 31) >> 3) as u8).collect();
         std::fs::write(&path, &bytes).unwrap();
         let input = InputFile::open(&path).unwrap();
         for end in [0, 1, 262_144, 300_000, 700_000, u64::MAX] {

@@ -1,5 +1,5 @@
-//! Budgets: how much a file, a plugin or a configuration may ask of this program. What is beyond ends in a sentence, not
-//! in an abort. `SECURITY.md` lists them with those of the mission file (`core/physics/src/mission/limits.rs`).
+//! Budgets: how much a file, a plugin or a configuration may ask of this program. What is beyond ends in a sentence,
+//! not in an abort. `SECURITY.md` lists them with those of the mission file (`core/physics/src/ranges.rs`).
 
 /// Largest chunk of a telemetry file, bytes, compressed or not; also of a run of loose messages and of a summary.
 pub const PIECE_BYTES: u64 = 1 << 27;

@@ -263,6 +263,9 @@ pub fn run(
     let reports = chain.reports()?;
     series.finish()?;
     let draft = draft(&setup, &chain, feed.as_mut(), (state.as_deref(), reports), &covered)?;
+    // Before the commit: a plugin that fails in its end is a failed run, and a failed run archives nothing.
+    drop(chain);
+    drop(feed);
     tracing::debug!(epochs_from_ns = covered.first_ns, epochs_to_ns = covered.last_ns, "every stage has reported");
     for (role, path, text) in &setup.texts {
         writer.keep(role, &name_of(path), text.as_bytes())?;

@@ -33,8 +33,10 @@ struct Slot {
 }
 
 impl Slot {
-    const FREE: Self =
-        Self { since_ms: AtomicU64::new(0), call: AtomicUsize::new(0), name: AtomicPtr::new(std::ptr::null_mut()) };
+    const fn free() -> Self {
+        let name = AtomicPtr::new(std::ptr::null_mut());
+        Self { since_ms: AtomicU64::new(0), call: AtomicUsize::new(0), name }
+    }
 
     fn name(&self) -> Option<&'static str> {
         // SAFETY: the slots hold null or what `Name::of` has leaked.
@@ -48,7 +50,7 @@ thread_local! {
 }
 
 /// The plugins that some thread is in: a plugin's own threads carry no name.
-static RUNNING: [Slot; NOTED] = [const { Slot::FREE }; NOTED];
+static RUNNING: [Slot; NOTED] = [const { Slot::free() }; NOTED];
 
 fn now_ms() -> u64 {
     static FIRST: LazyLock<Instant> = LazyLock::new(Instant::now);
@@ -169,7 +171,8 @@ mod handler {
         }
     }
 
-    /// Says which plugin did `what`: that of this thread, or else those that any thread is in. False where there is none.
+    /// Says which plugin did `what`: that of this thread, or else those that any thread is in. False where there is
+    /// none.
     pub(in super::super) fn blame(what: &str) -> bool {
         let mut line = Line { bytes: [0; 1024], length: 0 };
         if let Some((Name(name), call)) = CURRENT.get() {

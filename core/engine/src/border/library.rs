@@ -207,8 +207,8 @@ impl Library {
     }
 }
 
-/// Opens a checked library by its descriptor, so that what runs is what was checked. The descriptor stays open for ever:
-/// the loader knows libraries by name, and a number that came again would be taken for the library that had it before.
+/// Opens a checked library by its descriptor, so that what runs is what was checked. The descriptor stays open for
+/// ever: the loader knows libraries by name, and a number that came again would be taken for the library before.
 #[cfg(target_os = "linux")]
 fn open(checked: &Checked) -> Result<libloading::Library, String> {
     let descriptor = checked.file.keep_open().map_err(|e| format!("cannot be kept open: {e}"))?;

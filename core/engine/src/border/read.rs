@@ -32,8 +32,8 @@ pub(super) fn declaration<T: DeserializeOwned>(document: Value) -> Result<T, Str
     }
 }
 
-/// Reads a report. Unknown keys and numbers that are none become notes in it: a day of data stands behind a report. What
-/// breaks the schema is given beside it.
+/// Reads a report. Unknown keys and numbers that are none become notes in it: a day of data stands behind a report.
+/// What breaks the schema is given beside it.
 ///
 /// # Errors
 /// A sentence that names the place or the key that cannot be understood.

@@ -32,6 +32,8 @@ pub enum Finding {
     MessagesOfUnknownChannels,
     /// A message before 1980 or after 2200; dropped.
     TimesOutOfRange,
+    /// A message more than a day from all others, or one of two or three together: its clock had failed; dropped.
+    StrayMessages,
     /// A message earlier than its file's index says, found too late to be put in order; lost.
     LateMessages,
     /// A message of a time at which its topic already has other values; the first in the order of the files counts.

@@ -223,8 +223,8 @@ impl Replay {
         Ok(())
     }
 
-    /// Size and SHA-256 of every file, in the order in which they were given, through the descriptors that the rows come
-    /// through. What the CRCs of the data sections say goes to the losses.
+    /// Size and SHA-256 of every file, in the order in which they were given, through the descriptors that the rows
+    /// come through. What the CRCs of the data sections say goes to the losses.
     ///
     /// # Errors
     /// [`ReplayError::Changed`] when a file is not what it was when it was opened; it cannot be read.
@@ -268,19 +268,25 @@ impl Replay {
 /// The sums of files, several at once where there are threads.
 fn all_sums(files: &[CheckedFile], threads: usize) -> Vec<io::Result<Sums>> {
     let sums = |file: &CheckedFile| file.input.sums(file.checked_until.map_or(0, |(end, _)| end));
+    let each = |some: &[CheckedFile]| some.iter().map(sums).collect::<Vec<_>>();
     let share = files.len().div_ceil(threads.clamp(1, files.len().max(1))).max(1);
     thread::scope(|scope| {
-        let running: Vec<_> = files.chunks(share).map(|some| scope.spawn(|| some.iter().map(sums).collect())).collect();
+        // Where the system allows no more threads, the work is done here.
+        let start = |some| thread::Builder::new().spawn_scoped(scope, move || each(some)).map_err(|_| each(some));
+        let running: Vec<_> = files.chunks(share).map(start).collect();
         let join = |thread: thread::ScopedJoinHandle<'_, Vec<_>>| {
             thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
         };
-        running.into_iter().flat_map(join).collect()
+        running.into_iter().flat_map(|one| one.map_or_else(|done| done, join)).collect()
     })
 }
 
-fn ahead(mut reader: Reader) -> Engine {
+fn ahead(reader: Reader) -> Engine {
     let (send, stretches) = sync_channel(AHEAD);
-    let thread = thread::spawn(move || {
+    // The reader is handed over once there is a thread: where the system allows no more, it stays here.
+    let (hand, taken) = sync_channel::<Reader>(1);
+    let thread = thread::Builder::new().spawn(move || {
+        let Ok(mut reader) = taken.recv() else { return };
         loop {
             let stretch = reader.next().map(|chunk| (chunk, reader.losses().clone()));
             let more = matches!(&stretch, Ok((Some(_), _)));
@@ -290,7 +296,13 @@ fn ahead(mut reader: Reader) -> Engine {
             }
         }
     });
-    Engine::Ahead { stretches, thread: Some(thread) }
+    match thread {
+        Ok(thread) => match hand.send(reader) {
+            Ok(()) => Engine::Ahead { stretches, thread: Some(thread) },
+            Err(error) => Engine::Here(Box::new(error.0)),
+        },
+        Err(_) => Engine::Here(Box::new(reader)),
+    }
 }
 
 /// First and last time that the pieces of a file state, as far as they are sane, Unix ns.

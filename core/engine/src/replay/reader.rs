@@ -23,6 +23,11 @@ const STRETCH_NS: i64 = 409_600_000_000;
 /// Rows later than this many stretches ahead are not kept but read again, so that a file in no order at all costs
 /// time and not memory.
 const HORIZON: i64 = 16 * STRETCH_NS;
+/// Most rows of a table in a stretch by itself that count as stray. A single time of 1980 would make the product one of
+/// that day.
+const STRAY_ROWS: usize = 3;
+/// Distance from all other rows from which they do, ns.
+const STRAY_NS: i64 = 86_400_000_000_000;
 /// 1980-01-01 and 2200-01-01: a clock outside has failed.
 pub(super) const SANE_NS: Range<i64> = 315_532_800_000_000_000..7_258_118_400_000_000_000;
 
@@ -87,6 +92,8 @@ pub(super) struct Reader {
     end_ns: i64,
     /// Every row before this time has been delivered.
     done_ns: i64,
+    /// Time of the last row delivered.
+    last_ns: Option<i64>,
     inflater: Inflater,
     entries: Vec<Entry>,
     losses: Losses,
@@ -121,8 +128,20 @@ impl Reader {
             opened.push(ReadFile { input: file.input, routes: file.routes, due });
         }
         let blocks = tables.iter().map(|_| vec![]).collect();
-        let done_ns = i64::MIN;
-        Ok(Self { files: opened, tables, queue, blocks, window_ns, end_ns, done_ns, inflater, entries: vec![], losses })
+        let (done_ns, last_ns, entries) = (i64::MIN, None, vec![]);
+        Ok(Self {
+            files: opened,
+            tables,
+            queue,
+            blocks,
+            window_ns,
+            end_ns,
+            done_ns,
+            last_ns,
+            inflater,
+            entries,
+            losses,
+        })
     }
 
     pub(super) fn losses(&self) -> &Losses {
@@ -132,9 +151,7 @@ impl Reader {
     /// The next stretch that has a row; `None` at the end.
     pub(super) fn next(&mut self) -> Result<Option<Chunk>, ReplayError> {
         loop {
-            let queued = self.queue.first_key_value().map(|(key, _)| key.0);
-            let held = self.blocks.iter().flatten().filter_map(Block::head).min();
-            let Some(first) = queued.into_iter().chain(held).min() else {
+            let Some(first) = self.next_ns() else {
                 self.count_missing();
                 return Ok(None);
             };
@@ -147,12 +164,39 @@ impl Reader {
                 .map(|(blocks, table)| drain(blocks, until_ns, table.columns.len(), &table.name, &mut self.losses))
                 .collect();
             self.done_ns = until_ns;
+            if self.is_stray(&batches) {
+                let rows = batches.iter().map(|b| b.rows() as u64).sum();
+                self.losses.add(Finding::StrayMessages, rows, "", || {
+                    "messages lie more than a day from all others: a clock had failed; they were dropped".to_owned()
+                });
+                continue;
+            }
             if let Some(last) = batches.iter().filter_map(|b| b.time_ns.last()).max() {
+                self.last_ns = Some(*last);
                 self.end_ns = self.end_ns.max(last + 1);
                 let complete_until_ns = until_ns.min(self.window_ns.end).min(self.end_ns);
                 return Ok(Some(Chunk { batches, complete_until_ns }));
             }
         }
+    }
+
+    /// Time of the first row that is left, as far as pieces tell theirs rightly.
+    fn next_ns(&self) -> Option<i64> {
+        let queued = self.queue.first_key_value().map(|(key, _)| key.0);
+        let held = self.blocks.iter().flatten().filter_map(Block::head).min();
+        queued.into_iter().chain(held).min()
+    }
+
+    /// Whether a stretch holds a few rows far from all others, and there are others.
+    fn is_stray(&self, batches: &[Batch]) -> bool {
+        let times = || batches.iter().flat_map(|b| &b.time_ns).copied();
+        let (Some(first), Some(last)) = (times().min(), times().max()) else { return false };
+        let next = self.next_ns();
+        let alone = self.last_ns.is_none() && next.is_none();
+        !alone
+            && batches.iter().all(|b| b.rows() <= STRAY_ROWS)
+            && self.last_ns.is_none_or(|before| first - before > STRAY_NS)
+            && next.is_none_or(|after| after - last > STRAY_NS)
     }
 
     /// Counts the messages that files should hold and do not; once, at the end.

@@ -603,6 +603,38 @@ fn a_whole_file_out_of_range_is_counted() {
     }
 }
 
+/// One time of 1980 in a day of 2035 made the product one of 1980.
+#[test]
+fn a_stray_time_is_no_part_of_the_data() {
+    for stray in [316_000_000_000_000_000, DAY + 40_000 * EPOCH + 2 * 86_400_000_000_000, 7_000_000_000_000_000_000] {
+        let mut messages = epochs(0, 40_000);
+        messages.insert(20_000, ("/dws", stray, dws(1.0, 0)));
+        let outcome = replay(&[Foreign::new(messages).bytes()]);
+        assert_eq!(outcome.numbers(), (0..40_000).collect::<Vec<_>>(), "{stray}");
+        assert_eq!(outcome.count(Finding::StrayMessages), 1, "{:?}", outcome.losses);
+        assert!(outcome.losses.data_loss());
+    }
+    let near = DAY + 40_000 * EPOCH + 80_000_000_000_000;
+    let mut messages = epochs(0, 40_000);
+    messages.push(("/dws", near, dws(1.0, 0)));
+    let outcome = replay(&[Foreign::new(messages).bytes()]);
+    assert_eq!((outcome.count(Finding::StrayMessages), outcome.rows["dws"].rows()), (0, 40_001), "within a day");
+    let single = replay(&[Foreign::new(epochs(7, 1)).bytes()]);
+    assert_eq!(single.numbers(), [7], "alone it is what there is");
+}
+
+/// A second that is told twice, as clocks that follow UTC do at a leap second, lost ten epochs at exit code 0.
+#[test]
+fn a_repeated_leap_second_is_a_loss() {
+    let mut messages = epochs(0, 100);
+    let again: Messages = (50..60).map(|k| ("/dws", DAY + k * EPOCH, dws(-1.0, 0))).collect();
+    messages.splice(60..60, again);
+    let outcome = replay(&[Foreign::new(messages).bytes()]);
+    assert_eq!(outcome.numbers(), (0..100).collect::<Vec<_>>(), "the first second counts");
+    assert_eq!(outcome.count(Finding::ConflictingMessages), 10);
+    assert!(outcome.losses.data_loss());
+}
+
 #[test]
 fn a_topic_without_messages_is_missing() {
     let tables = interface_tables();
