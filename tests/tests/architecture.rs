@@ -62,6 +62,7 @@ fn allowed(crate_name: &str) -> &'static [&'static str] {
             "dragfree-identification",
         ],
         "dragfree-tests" => &["dragfree-schema"],
+        "dragfree-fuzz" => &["dragfree-archive", "dragfree-engine", "dragfree-physics"],
         "dragfree-qp-check" => &["dragfree-sdk", "dragfree-estimation"],
         _ => &["dragfree-sdk", "dragfree-physics"],
     }

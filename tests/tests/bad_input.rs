@@ -152,6 +152,21 @@ fn a_missing_topic_is_named() {
     }
 }
 
+/// Telemetry at 1 Hz under a mission of 10 Hz: "36,000 epochs used", every adopted value null, and exit code 0.
+#[test]
+fn a_run_that_adopts_nothing_is_a_loss() {
+    let run = run_changed(|messages| {
+        let start = messages[0].log_time;
+        messages.into_iter().filter(|m| (m.log_time - start).is_multiple_of(SECOND_NS)).collect()
+    });
+    assert_eq!(run.code(), Some(3), "{}", run.stderr());
+    let product = run.product();
+    let adopted = product["coefficients"].as_array().expect("coefficients").iter().filter(|c| c["role"] == "adopted");
+    assert!(adopted.clone().count() == 6 && adopted.clone().all(|c| c["value"].is_null()), "{product}");
+    let losses = product["losses"].as_array().expect("losses");
+    assert!(losses.iter().any(|l| l["kind"] == "values_not_adopted" && l["count"] == 6), "{losses:?}");
+}
+
 /// Replaces the doubles of a message by NaN: all fields of `InertialSensors` but status.
 fn poison(message: &mut Message) {
     // Wire: tm1 { r_orf_m { x y z } … }: tags and lengths, then 9 = field 1, fixed64.

@@ -165,7 +165,7 @@ fn a_crash_names_the_plugin() {
     for (way, said) in [
         (22, "plugin bad: process: crashed: SIGSEGV"),
         (23, "plugin bad: process: crashed: SIGABRT"),
-        (24, "while these plugins ran: bad: SIGABRT"),
+        (24, "while these plugins ran: bad: crashed: SIGABRT"),
     ] {
         let (code, stderr) = misbehaving(way);
         assert_eq!(code, None, "way {way}: {stderr}");

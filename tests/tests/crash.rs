@@ -163,10 +163,10 @@ fn every_write_of_run_fails_in_turn() {
     }
 }
 
-/// SIGKILL, SIGTERM and SIGINT at instants all over a run.
+/// SIGKILL, SIGTERM, SIGINT and SIGHUP at instants all over a run.
 #[test]
 fn a_signal_at_any_instant_loses_nothing() {
-    const SIGNALS: [&str; 3] = ["KILL", "TERM", "INT"];
+    const SIGNALS: [&str; 4] = ["KILL", "TERM", "INT", "HUP"];
     const KILLS: u32 = 36;
     let folder = copy();
     let started = Instant::now();
@@ -186,6 +186,21 @@ fn a_signal_at_any_instant_loses_nothing() {
     let ids = sound(folder.path(), &"all kills");
     assert!(ids.len() as u32 >= 2 + ended, "whoever said that it was done has archived its product");
     assert!(ended < KILLS, "some were killed");
+}
+
+/// `nohup` starts a program with SIGHUP ignored; a handler would take that back.
+#[test]
+fn a_program_that_is_to_outlive_its_terminal_does() {
+    let folder = copy();
+    let command = run(folder.path(), &bench().telemetry);
+    let mut shell = Command::new("sh");
+    shell.args(["-c", "trap '' HUP; exec \"$@\"", "sh"]).arg(command.get_program()).args(command.get_args());
+    let mut child = shell.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("runs");
+    while child.try_wait().expect("a child").is_none() {
+        let _ = Command::new("kill").arg("-HUP").arg(child.id().to_string()).output(); // it may just have ended
+        std::thread::sleep(std::time::Duration::from_millis(20));
+    }
+    assert!(child.wait().expect("it ended").success());
 }
 
 #[test]

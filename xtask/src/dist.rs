@@ -59,7 +59,7 @@ fn layout(root: &Path, workspace: &Workspace) -> Result<Tree, Failure> {
         tree.copy(&root.join("fixtures").join(folder), &format!("share/dragfree/{folder}"))?;
     }
     sdk(root, workspace, &mut tree)?;
-    for page in ["README.md", "CHANGELOG.md", "VALIDATION.md"] {
+    for page in ["README.md", "CHANGELOG.md", "SECURITY.md", "VALIDATION.md"] {
         tree.copy(&root.join(page), &format!("share/doc/dragfree/{page}"))?;
     }
     tree.copy(&root.join("campaigns"), "share/dragfree/campaigns")?;

@@ -50,6 +50,9 @@ pub(crate) struct Global {
     /// Threads that a run may use
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     pub(crate) threads: Option<u16>,
+    /// Seconds after which a call of a plugin that has not come back ends the program
+    #[arg(long, global = true, value_name = "S", default_value_t = 600.0, value_parser = positive)]
+    pub(crate) plugin_time_limit: f64,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -494,6 +497,13 @@ pub(crate) enum Plugins {
     Validate(Validate),
     /// Write the skeleton of a plugin that builds and works as it is
     New(NewPlugin),
+    /// Open libraries in this very process: what this command asks of its children
+    #[command(hide = true)]
+    Probe {
+        /// Libraries
+        #[arg(value_name = "FILE")]
+        files: Vec<PathBuf>,
+    },
 }
 
 #[derive(Debug, Args)]

@@ -3,6 +3,7 @@
 mod advice;
 mod args;
 mod bundled;
+mod child;
 mod commands;
 mod failure;
 mod installed;
@@ -15,14 +16,24 @@ mod screen;
 mod text;
 mod truth;
 mod utc;
+mod watchdog;
 
 use args::{Arguments, Colour};
 use clap::Parser as _;
+use dragfree_engine::border;
 use std::io::{IsTerminal as _, Write as _};
 use std::process::ExitCode;
+use std::time::Duration;
 
 fn main() -> ExitCode {
-    let mut arguments = Arguments::parse();
+    let arguments = Arguments::parse();
+    border::watch_exit();
+    let code = perform(arguments);
+    border::exit_is_due();
+    code
+}
+
+fn perform(mut arguments: Arguments) -> ExitCode {
     let allowed = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
     let colour = |terminal: bool| match arguments.global.color {
         Colour::Always => true,
@@ -36,13 +47,15 @@ fn main() -> ExitCode {
     if let Err(error) = output::reserve() {
         return complain(&error);
     }
+    watchdog::start(Duration::from_secs_f64(arguments.global.plugin_time_limit));
     let mut run = || -> Result<u8, failure::Failure> {
         installed::resolve(&mut arguments)?;
         if arguments.command.carries_rows() {
             interrupt::listen()?;
         }
         let done = commands::execute(&arguments, paint)?;
-        output::print(&done.text)?;
+        let text = if arguments.global.json { done.text } else { text::harmless(&done.text, paint) };
+        output::print(&text)?;
         Ok(done.code)
     };
     run().map_or_else(|error| complain(&*error), ExitCode::from)
@@ -50,6 +63,7 @@ fn main() -> ExitCode {
 
 fn complain(error: &dyn std::error::Error) -> ExitCode {
     progress::clear_line();
-    let _ = writeln!(std::io::stderr(), "dragfree: {}", failure::chain(error)); // nobody is left to tell
+    let what = text::harmless(&failure::chain(error), text::Paint(false));
+    let _ = writeln!(std::io::stderr(), "dragfree: {what}"); // nobody is left to tell
     ExitCode::FAILURE
 }

@@ -31,6 +31,31 @@ impl Paint {
     }
 }
 
+/// A text that tells a terminal nothing: control characters from telemetry, files and plugins become visible, and so do
+/// those that turn the direction of writing. The paint's own sequences stay where it is used.
+pub(crate) fn harmless(text: &str, paint: Paint) -> String {
+    const OWN: [&str; 5] = ["\x1b[0m", "\x1b[1m", "\x1b[31m", "\x1b[32m", "\x1b[33m"];
+    let mut safe = String::with_capacity(text.len());
+    let mut rest = text;
+    while let Some(c) = rest.chars().next() {
+        if let Some(own) = OWN.iter().find(|own| paint.0 && rest.starts_with(**own)) {
+            safe += own;
+            rest = &rest[own.len()..];
+            continue;
+        }
+        match c {
+            '\n' | '\t' => safe.push(c),
+            '\u{200e}' | '\u{200f}' | '\u{202a}'..='\u{202e}' | '\u{2066}'..='\u{2069}' => {
+                safe.extend(c.escape_unicode());
+            }
+            c if c.is_control() => safe.extend(c.escape_default()),
+            c => safe.push(c),
+        }
+        rest = &rest[c.len_utf8()..];
+    }
+    safe
+}
+
 /// Characters on the screen; everything printed here is one column wide.
 pub(crate) fn width(text: &str) -> usize {
     text.chars().count()
@@ -199,6 +224,19 @@ mod tests {
         ] {
             assert_eq!(measured(value, sigma), expected);
         }
+    }
+
+    /// A topic or a plugin's note could clear the screen, change the window's title or write over what stood there.
+    #[test]
+    fn a_terminal_is_told_nothing_by_data() {
+        let paint = Paint(true);
+        let text = format!("{}\n\tfine ± χ²\x1b]0;title\x07\x1b[2J\r\u{9b}31m\u{202e}", paint.bold("bold"));
+        let safe = harmless(&text, paint);
+        assert!(safe.starts_with("\x1b[1mbold\x1b[0m\n\tfine ± χ²\\u{1b}]0;title"), "{safe:?}");
+        let left = safe.replace("\x1b[1m", "").replace("\x1b[0m", "");
+        assert!(left.chars().all(|c| c == '\n' || c == '\t' || !c.is_control()), "{left:?}");
+        assert!(!left.contains('\u{202e}') && left.contains("\\u{202e}") && left.contains("\\r"), "{left:?}");
+        assert!(!harmless(&text, Paint(false)).contains('\x1b'));
     }
 
     #[test]

@@ -4,11 +4,11 @@ use crate::border::without_name;
 use crate::feed::Summary;
 use chrono::{DateTime, SecondsFormat, Utc};
 use dragfree_archive::product::{
-    Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Model, NonStandardAttributes,
-    Outcome, Product, Quality, Stage, Status, Stream, Variable,
+    Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Loss, Model,
+    NonStandardAttributes, Outcome, Product, Quality, Stage, Status, Stream, Variable,
 };
 use dragfree_archive::{ArchiveError, JOINT, MadeOf, ProductWriter, Stamp, Written};
-use dragfree_schema::{Report, Settings};
+use dragfree_schema::{Report, Role, Settings};
 use std::collections::BTreeSet;
 
 /// All that a product is made from.
@@ -101,7 +101,8 @@ fn stem(draft: &Draft) -> Result<String, ArchiveError> {
 fn product(draft: &Draft) -> Result<Product, ArchiveError> {
     let id = stem(draft)?;
     let result = outcome(draft);
-    let quality = quality(draft);
+    let losses: Vec<Loss> = draft.replay.losses.iter().cloned().chain(nothing_adopted(&result.coefficients)).collect();
+    let quality = quality(draft, !losses.is_empty());
     let header = Header {
         dimensions: Dimensions {
             epoch: quality.epochs_used.saturating_add(quality.epochs_rejected),
@@ -154,7 +155,7 @@ fn product(draft: &Draft) -> Result<Product, ArchiveError> {
         supersedes: None,
         inputs: draft.inputs.clone(),
         history: draft.history.clone(),
-        losses: draft.replay.losses.clone(),
+        losses,
         attachments: Vec::new(),
     })
 }
@@ -185,7 +186,7 @@ fn outcome(draft: &Draft) -> Outcome {
     }
 }
 
-fn quality(draft: &Draft) -> Quality {
+fn quality(draft: &Draft, lost: bool) -> Quality {
     let mut weak_directions: Vec<String> = Vec::new();
     for direction in draft.reports.iter().flat_map(|report| &report.weak_directions) {
         if !weak_directions.contains(direction) {
@@ -206,7 +207,7 @@ fn quality(draft: &Draft) -> Quality {
         commands: last(draft, |report| report.commands.clone()),
         chi2_per_dof: last(draft, |report| report.chi2_per_dof).unwrap_or(f64::NAN),
         nis: last(draft, |report| report.nis).unwrap_or(f64::NAN),
-        data_loss: !draft.replay.losses.is_empty() || draft.reports.iter().any(|report| report.data_loss),
+        data_loss: lost || draft.reports.iter().any(|report| report.data_loss),
         inconsistent: draft.reports.iter().any(|report| report.inconsistent),
         weak_directions,
         notes: draft
@@ -219,6 +220,16 @@ fn quality(draft: &Draft) -> Quality {
         counts: replayed.into_iter().chain(draft.reports.iter().filter_map(reported)).collect(),
         stages: draft.reports.iter().filter_map(figures).collect(),
     }
+}
+
+/// A product that says nothing: a run that used epochs and adopted no value is no success.
+fn nothing_adopted(coefficients: &[Coefficient]) -> Option<Loss> {
+    let adopted: Vec<&Coefficient> = coefficients.iter().filter(|c| c.role == Some(Role::Adopted)).collect();
+    if adopted.is_empty() || adopted.iter().any(|c| c.value.is_finite()) {
+        return None;
+    }
+    let detail = "no coefficient has an adopted value: the notes say which data were missing or not used".to_owned();
+    Some(Loss { kind: "values_not_adopted".to_owned(), count: adopted.len() as u64, detail })
 }
 
 /// JSON as TOML: TOML has no null, so a missing value becomes `nan`.

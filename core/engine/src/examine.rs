@@ -3,6 +3,7 @@
 
 use std::collections::BTreeMap;
 use std::ops::Range;
+use std::path::Path;
 
 use crate::EngineError;
 use crate::border::Kind;
@@ -13,8 +14,7 @@ use crate::registry::Registry;
 use crate::run::{Progress, RunOptions, Setup};
 use crate::sources::Sources;
 use crate::table::{Chunk, TableSpec};
-use dragfree_archive::files::{IoContext as _, sha256_of};
-use dragfree_archive::product::Product;
+use dragfree_archive::product::{Input, Product};
 
 /// Puts other values into the rows of a feed, as they would be in another experiment. Times stay.
 pub type Altering<'a> = &'a dyn Fn(&[TableSpec], &mut Chunk);
@@ -89,7 +89,6 @@ pub fn examine<C: Sink, E: From<EngineError>>(
     progress: &mut dyn FnMut(Progress),
 ) -> Result<(C, Vec<(String, String)>), E> {
     let sources = what.sources;
-    unchanged(what.product, sources)?;
     let options = RunOptions {
         pipeline: sources.pipeline.clone(),
         files: sources.telemetry.clone(),
@@ -103,6 +102,8 @@ pub fn examine<C: Sink, E: From<EngineError>>(
         ..RunOptions::default()
     };
     let mut setup = Setup::load(&options)?;
+    let same = |input: &Input, path: &Path| named(what.product, input, path);
+    setup.inputs().iter().try_for_each(|(input, path)| same(input, path))?;
     setup.model.candidates.clone_from(&what.candidates);
     setup.model.chosen.clone_from(&what.chosen);
     setup.model.needs = what.needs.iter().map(|need| (*need).to_owned()).collect();
@@ -115,6 +116,7 @@ pub fn examine<C: Sink, E: From<EngineError>>(
     let nodes = &mut setup.pipeline.nodes;
     nodes.truncate(nodes.iter().position(|n| *n == Node::Effects).map_or(nodes.len(), |i| i + 1));
     let mut feed: Box<dyn Feed + '_> = setup.feed(registry, None)?;
+    feed.inputs()?.iter().zip(&sources.telemetry).try_for_each(|(input, path)| same(input, path))?;
     if let Some(alter) = what.altered {
         feed = Box::new(Altered { feed, alter });
     }
@@ -123,6 +125,7 @@ pub fn examine<C: Sink, E: From<EngineError>>(
     chain.tap(&columns).map_err(EngineError::from)?;
     setup.carry(feed.as_mut(), &mut chain, &mut consumer, progress)?;
     chain.finish(&mut consumer).map_err(EngineError::from)?;
+    feed.unchanged()?;
     Ok((consumer, chain.not_tried))
 }
 
@@ -149,6 +152,14 @@ impl Feed for Altered<'_> {
         self.feed.span_ns()
     }
 
+    fn inputs(&mut self) -> Result<Vec<Input>, EngineError> {
+        self.feed.inputs()
+    }
+
+    fn unchanged(&self) -> Result<(), EngineError> {
+        self.feed.unchanged()
+    }
+
     fn summary(&mut self) -> Result<Summary, EngineError> {
         self.feed.summary()
     }
@@ -158,14 +169,10 @@ impl Feed for Altered<'_> {
     }
 }
 
-/// The inputs are those that the product names.
-fn unchanged(product: &Product, sources: &Sources) -> Result<(), EngineError> {
-    let all = [&sources.pipeline, &sources.mission, &sources.model].into_iter().chain(&sources.telemetry);
-    for path in all {
-        let digest = sha256_of(path).at("read", path)?;
-        if !product.inputs.iter().any(|input| input.sha256 == digest) {
-            return Err(EngineError::Changed { path: path.clone(), product: product.id().to_owned() });
-        }
+/// An input is one that the product names.
+fn named(product: &Product, input: &Input, path: &Path) -> Result<(), EngineError> {
+    if product.inputs.iter().any(|of_product| of_product.sha256 == input.sha256) {
+        return Ok(());
     }
-    Ok(())
+    Err(EngineError::Changed { path: path.to_owned(), product: product.id().to_owned() })
 }

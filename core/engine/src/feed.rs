@@ -3,19 +3,21 @@
 use serde_json::json;
 use std::collections::BTreeMap;
 use std::ops::Range;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use dragfree_schema::Report;
 
 use crate::EngineError;
-use crate::border::{Config, Instance};
+use crate::border::{BorderError, Config, Instance};
 use crate::chain;
 use crate::config::{Mission, resolve_parameters};
+use crate::input::InputFile;
 use crate::registry::{Found, Registry};
 use crate::replay::Replay;
 use crate::sealed::Sealed;
 use crate::table::{Chunk, TableSpec};
-use dragfree_archive::product::Loss;
+use dragfree_archive::files::IoContext as _;
+use dragfree_archive::product::{Input, Loss};
 
 /// Rows in stretches of time.
 pub trait Feed {
@@ -30,6 +32,19 @@ pub trait Feed {
 
     /// Times that the feed expects to cover, Unix ns; `None` where it cannot know.
     fn span_ns(&self) -> Option<Range<i64>>;
+
+    /// The files that it reads, with their digests, in the order in which they were given; what the files' own sums say
+    /// goes to the summary.
+    ///
+    /// # Errors
+    /// A file is not what it was when it was opened, or cannot be read.
+    fn inputs(&mut self) -> Result<Vec<Input>, EngineError>;
+
+    /// That no file has changed since it was opened.
+    ///
+    /// # Errors
+    /// One has.
+    fn unchanged(&self) -> Result<(), EngineError>;
 
     /// What there is to say at the end.
     ///
@@ -61,6 +76,7 @@ pub struct Summary {
 /// Telemetry files.
 pub struct FileFeed {
     replay: Replay,
+    files: Vec<PathBuf>,
     window_ns: Option<Range<i64>>,
 }
 
@@ -90,7 +106,7 @@ impl FileFeed {
                 path: mission.path.clone(),
             });
         }
-        Ok(Self { replay, window_ns })
+        Ok(Self { replay, files: files.to_vec(), window_ns })
     }
 }
 
@@ -113,6 +129,15 @@ impl Feed for FileFeed {
         Some(first..end)
     }
 
+    fn inputs(&mut self) -> Result<Vec<Input>, EngineError> {
+        let digests = self.replay.digests()?;
+        Ok(self.files.iter().zip(digests).map(|(path, (size, sha256))| telemetry(path, size, sha256)).collect())
+    }
+
+    fn unchanged(&self) -> Result<(), EngineError> {
+        Ok(self.replay.unchanged()?)
+    }
+
     fn summary(&mut self) -> Result<Summary, EngineError> {
         let losses = self.replay.losses();
         Ok(Summary {
@@ -125,6 +150,12 @@ impl Feed for FileFeed {
     }
 }
 
+/// A file of telemetry as a product names it.
+fn telemetry(path: &Path, size: u64, sha256: String) -> Input {
+    let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    Input { role: "telemetry".to_owned(), name, size, sha256 }
+}
+
 /// A source plugin.
 #[derive(Debug)]
 pub struct SourceFeed {
@@ -135,9 +166,17 @@ pub struct SourceFeed {
     instance: Instance,
     tables: Vec<TableSpec>,
     span_ns: Option<Range<i64>>,
+    /// The files that it was given, as they were before it opened them.
+    files: Vec<(InputFile, Input)>,
     rows: u32,
     done: bool,
+    /// Steps in a row that gave no row and went nowhere.
+    idle: u32,
+    complete_until_ns: i64,
 }
+
+/// Most steps in a row in which a source may give nothing and go nowhere: it would never end.
+const MOST_IDLE: u32 = 10_000;
 
 /// What a source is opened with.
 #[derive(Clone, Debug)]
@@ -176,6 +215,7 @@ impl SourceFeed {
                 "end_ns": options.window_ns.as_ref().map(|w| w.end),
             }),
         };
+        let files = options.files.iter().map(|path| before(path)).collect::<Result<_, _>>()?;
         let (instance, tables) = chain::open_source(&found, &config)?;
         Ok(Self {
             found,
@@ -183,10 +223,21 @@ impl SourceFeed {
             instance,
             tables,
             span_ns: options.window_ns.clone(),
+            files,
             rows: u32::try_from(options.rows.max(1)).unwrap_or(u32::MAX),
             done: false,
+            idle: 0,
+            complete_until_ns: i64::MIN,
         })
     }
+}
+
+/// A file before a plugin opens it by its path.
+fn before(path: &Path) -> Result<(InputFile, Input), EngineError> {
+    let input = InputFile::open(path).at("read", path)?;
+    let sha256 = input.sums(0).at("read", path)?.sha256;
+    let named = telemetry(path, input.size(), sha256);
+    Ok((input, named))
 }
 
 /// End of the name of an attachment that is sealed: the source's secret until it is revealed.
@@ -215,11 +266,33 @@ impl Feed for SourceFeed {
         }
         let step = self.instance.next(self.rows).map_err(chain::ChainError::from)?;
         self.done = step.done;
+        let went_on = step.batches.iter().any(|b| b.rows() > 0) || step.complete_until_ns > self.complete_until_ns;
+        self.idle = if went_on { 0 } else { self.idle + 1 };
+        self.complete_until_ns = step.complete_until_ns;
+        if self.idle > MOST_IDLE && !self.done {
+            let what = format!("{MOST_IDLE} steps in a row without a row, and time stands still; say `done`");
+            let plugin = self.found.info.manifest.id.clone();
+            return Err(chain::ChainError::from(BorderError::Rule { plugin, call: "next", what }).into());
+        }
         Ok(Some(Chunk { batches: step.batches, complete_until_ns: step.complete_until_ns }))
     }
 
     fn span_ns(&self) -> Option<Range<i64>> {
         self.span_ns.clone()
+    }
+
+    fn inputs(&mut self) -> Result<Vec<Input>, EngineError> {
+        self.unchanged()?;
+        Ok(self.files.iter().map(|(_, named)| named.clone()).collect())
+    }
+
+    fn unchanged(&self) -> Result<(), EngineError> {
+        for (input, _) in &self.files {
+            if !input.is_unchanged().and_then(|same| Ok(same && input.is_in_place()?)).at("read", input.path())? {
+                return Err(crate::replay::ReplayError::Changed { path: input.path().to_owned() }.into());
+            }
+        }
+        Ok(())
     }
 
     fn summary(&mut self) -> Result<Summary, EngineError> {

@@ -9,6 +9,8 @@ pub mod config;
 pub mod draft;
 pub mod examine;
 pub mod feed;
+mod input;
+pub mod limits;
 pub mod registry;
 pub mod replay;
 pub mod revisions;

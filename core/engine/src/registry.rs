@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::border::{BorderError, Config, Instance, Kind, Library, PluginInfo};
+use crate::border::{BorderError, Checked, Config, Instance, Kind, Library, PluginInfo};
 use dragfree_archive::files::Problem;
 
 /// The plugins that were found.
@@ -23,6 +23,10 @@ pub struct Found {
     pub info: PluginInfo,
 }
 
+/// Tries files as plugin libraries where that can do no harm. For each the digest of what was tried, or why it is to be
+/// refused.
+pub type Probe<'a> = &'a mut dyn FnMut(&[&Path]) -> Vec<Result<String, String>>;
+
 /// Why there is no plugin.
 #[derive(Debug, thiserror::Error)]
 #[allow(missing_docs, reason = "every field is named in its sentence")]
@@ -40,28 +44,67 @@ pub enum RegistryError {
 impl Registry {
     /// Opens every shared library in the folders. A file that is refused is kept with its reason, and is no error.
     pub fn discover(folders: &[PathBuf]) -> Self {
+        Self::open_all(folders, None)
+    }
+
+    /// The same; but what no `plugins.lock` vouches for goes through `probe` first, since a library may crash, end the
+    /// program or hang where it is opened.
+    pub fn discover_probed(folders: &[PathBuf], probe: Probe<'_>) -> Self {
+        Self::open_all(folders, Some(probe))
+    }
+
+    fn open_all(folders: &[PathBuf], probe: Option<Probe<'_>>) -> Self {
         let mut this = Self { folders: folders.to_vec(), ..Self::default() };
-        let mut seen = std::collections::BTreeSet::new();
-        for folder in folders {
-            for path in shared_libraries(folder) {
-                let canonical = path.canonicalize().unwrap_or_else(|_| path.clone());
-                if !seen.insert(canonical) {
-                    continue;
+        let mut checked = this.check_all();
+        if let Some(probe) = probe {
+            let unknown: Vec<&Path> = checked.iter().filter(|c| !c.is_locked()).map(Checked::path).collect();
+            let answers = if unknown.is_empty() { Vec::new() } else { probe(&unknown) };
+            let mut answers = answers.into_iter();
+            checked.retain(|library| {
+                let refused = if library.is_locked() { None } else { refusal(library, answers.next()) };
+                this.refused.extend(refused.clone());
+                refused.is_none()
+            });
+        }
+        for library in checked {
+            let path = library.path().to_owned();
+            match Library::load(library) {
+                Ok(library) => {
+                    let plugins = library.plugins.len();
+                    tracing::debug!(path = %path.display(), sha256 = library.sha256, plugins, "opened");
+                    this.libraries.push(Arc::new(library));
                 }
-                match Library::open(&path) {
-                    // The same bytes under another name are the same plugin, not a second one.
-                    Ok(library) if this.libraries.iter().any(|l| l.sha256 == library.sha256) => {}
-                    Ok(library) => {
-                        let plugins = library.plugins.len();
-                        tracing::debug!(path = %path.display(), sha256 = library.sha256, plugins, "opened");
-                        this.libraries.push(Arc::new(library));
-                    }
-                    Err(BorderError::Refused { path, reason }) => this.refused.push(Problem { path, reason }),
-                    Err(other) => this.refused.push(Problem { path, reason: other.to_string() }),
-                }
+                Err(error) => this.refuse(path, error),
             }
         }
+        this.refused.sort_by(|a, b| a.path.cmp(&b.path));
         this
+    }
+
+    /// Every shared library in the folders that passes the checks that run no code of it, each content once.
+    fn check_all(&mut self) -> Vec<Checked> {
+        let mut seen = std::collections::BTreeSet::new();
+        let mut all: Vec<Checked> = Vec::new();
+        for path in self.folders.clone().iter().flat_map(|folder| shared_libraries(folder)) {
+            if !seen.insert(path.canonicalize().unwrap_or_else(|_| path.clone())) {
+                continue;
+            }
+            match Checked::new(&path) {
+                // The same bytes under another name are the same plugin, not a second one.
+                Ok(library) if all.iter().any(|other| other.sha256() == library.sha256()) => {}
+                Ok(library) => all.push(library),
+                Err(error) => self.refuse(path, error),
+            }
+        }
+        all
+    }
+
+    fn refuse(&mut self, path: PathBuf, error: BorderError) {
+        let reason = match error {
+            BorderError::Refused { reason, .. } => reason,
+            other => other.to_string(),
+        };
+        self.refused.push(Problem { path, reason });
     }
 
     /// Every plugin, by file and then kind.
@@ -118,6 +161,17 @@ impl Found {
     pub fn create(&self, config: &Config) -> Result<Instance, BorderError> {
         Instance::create(&self.opened, &self.info, config)
     }
+}
+
+/// Why a library that was tried is not opened.
+fn refusal(library: &Checked, answer: Option<Result<String, String>>) -> Option<Problem> {
+    let reason = match answer {
+        Some(Ok(sha256)) if sha256 == library.sha256() => return None,
+        Some(Ok(_)) => "was changed while it was tried; try again when it is complete".to_owned(),
+        Some(Err(reason)) => reason,
+        None => "could not be tried".to_owned(),
+    };
+    Some(Problem { path: library.path().to_owned(), reason })
 }
 
 /// The shared libraries of a folder in the order of their names; none where the folder cannot be read.

@@ -17,7 +17,7 @@ use crate::registry::Registry;
 use crate::stop;
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{FileHeader, TelemetryWriter, interface_tables};
-use dragfree_archive::files::{IoContext as _, IoError, folder_of, sha256, sha256_of, sync_folder};
+use dragfree_archive::files::{IoContext as _, IoError, folder_of, sha256, sync_folder};
 use dragfree_archive::product::{self, Loss, NoiseLevel, Stage, Status, Stream};
 use dragfree_archive::{InputPlace, MadeOf, ProductWriter, Window, Written};
 
@@ -160,6 +160,13 @@ impl<'a> Setup<'a> {
         }
     }
 
+    /// The files that were read once, with their paths.
+    pub(crate) fn inputs(&self) -> Vec<(product::Input, PathBuf)> {
+        let input =
+            |(role, path, text): &(&'static str, PathBuf, String)| (named(role, path, text.as_bytes()), path.clone());
+        self.texts.iter().map(input).collect()
+    }
+
     pub(crate) fn link(&self, registry: &Registry, tables: &[TableSpec]) -> Result<Chain, EngineError> {
         let run_in_until_ns = self.options.run_in_until_ns();
         let Self { options: RunOptions { batch_rows, threads, .. }, .. } = *self;
@@ -256,6 +263,9 @@ pub fn run(
     let reports = chain.reports()?;
     series.finish()?;
     let draft = draft(&setup, &chain, feed.as_mut(), (state.as_deref(), reports), &covered)?;
+    // Before the commit: a plugin that fails in its end is a failed run, and a failed run archives nothing.
+    drop(chain);
+    drop(feed);
     tracing::debug!(epochs_from_ns = covered.first_ns, epochs_to_ns = covered.last_ns, "every stage has reported");
     for (role, path, text) in &setup.texts {
         writer.keep(role, &name_of(path), text.as_bytes())?;
@@ -437,6 +447,7 @@ fn draft(
     (state, reports): (Option<&[u8]>, Vec<Report>),
     covered: &Covered,
 ) -> Result<Draft, EngineError> {
+    let inputs = inputs(setup, feed, state)?;
     let mut replay = feed.summary()?;
     let source = feed.source().map(|s| stage(&s.found.info, "", &s.found.opened.sha256, &s.parameters));
     let nodes = chain.nodes.iter().map(|n| {
@@ -466,7 +477,7 @@ fn draft(
         spacecraft: setup.mission.spacecraft.clone(),
         first_ns: covered.first_ns,
         last_ns: covered.last_ns,
-        inputs: inputs(setup, state)?,
+        inputs,
         history,
         model: product::Model {
             revision,
@@ -502,22 +513,17 @@ fn made_of(setup: &Setup<'_>, draft: &Draft) -> MadeOf {
     MadeOf { places: telemetry.map(place).collect(), window, run_in_ns: options.run_in_ns }
 }
 
+/// A file that was read once.
+fn named(role: &str, path: &Path, content: &[u8]) -> product::Input {
+    let (role, name) = (role.to_owned(), name_of(path));
+    product::Input { role, name, size: content.len() as u64, sha256: sha256(content) }
+}
+
 /// Every file that a run read. Of the files of a source plugin only those that the command line names are known.
-fn inputs(setup: &Setup<'_>, state: Option<&[u8]>) -> Result<Vec<product::Input>, EngineError> {
-    let input = |role: &str, path: &Path, size: usize, sha256: String| product::Input {
-        role: role.to_owned(),
-        name: name_of(path),
-        size: size as u64,
-        sha256,
-    };
-    let mut inputs = Vec::new();
-    for path in &setup.options.files {
-        let size = std::fs::metadata(path).at("read", path)?.len();
-        let sha256 = sha256_of(path).at("read", path)?;
-        inputs.push(product::Input { role: "telemetry".to_owned(), name: name_of(path), size, sha256 });
-    }
-    inputs.extend(setup.texts.iter().map(|(role, path, text)| input(role, path, text.len(), sha256(text))));
+fn inputs(setup: &Setup<'_>, feed: &mut dyn Feed, state: Option<&[u8]>) -> Result<Vec<product::Input>, EngineError> {
+    let mut inputs = feed.inputs()?;
+    inputs.extend(setup.inputs().into_iter().map(|(input, _)| input));
     let state = setup.options.state_in.iter().zip(state);
-    inputs.extend(state.map(|(path, bytes)| input("state", path, bytes.len(), sha256(bytes))));
+    inputs.extend(state.map(|(path, bytes)| named("state", path, bytes)));
     Ok(inputs)
 }

@@ -12,10 +12,15 @@ pub fn flag() -> Arc<AtomicBool> {
     Arc::clone(&REQUESTED)
 }
 
+/// Whether somebody asked.
+pub(crate) fn requested() -> bool {
+    REQUESTED.load(Ordering::Relaxed)
+}
+
 /// Ends a job where that was asked for.
 ///
 /// # Errors
 /// [`EngineError::Stopped`].
 pub(crate) fn check() -> Result<(), EngineError> {
-    if REQUESTED.load(Ordering::Relaxed) { Err(EngineError::Stopped) } else { Ok(()) }
+    if requested() { Err(EngineError::Stopped) } else { Ok(()) }
 }

@@ -17,6 +17,7 @@ pub mod manoeuvre;
 pub mod mission;
 pub mod noise;
 pub mod process;
+mod ranges;
 pub mod riccati;
 pub mod schur;
 pub mod signals;

@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 
 use crate::frames::dcm_turned_about_z;
 use crate::noise::{NoiseLine, NoiseShape, NoiseTerm};
+use crate::ranges;
 
 /// Why a mission file was refused: what, where, and what to do next.
 #[expect(missing_docs, reason = "the messages name the fields")]
@@ -22,6 +23,9 @@ pub enum MissionError {
     /// A value is not physical.
     #[error("mission file: {key} = {value} {reason}")]
     Value { key: String, value: String, reason: &'static str },
+    /// A value is beyond what any spacecraft has.
+    #[error("mission file: {key} = {value} {must}")]
+    Range { key: String, value: String, must: String },
     /// The actuators cannot accelerate every channel independently.
     #[error("mission file: no allocation of the channels to the actuators: {reason}")]
     Decoupling { reason: String },
@@ -622,7 +626,11 @@ impl Mission {
     /// [`MissionError`] names the key, its value and what it must be.
     pub fn from_json(text: &str) -> Result<Self, MissionError> {
         let shape = |source: serde_json::Error| MissionError::Shape { key: key_at(text, &source), source };
+        let value: serde_json::Value = serde_json::from_str(text).map_err(shape)?;
         let mission: Self = serde_json::from_str(text).map_err(shape)?;
+        if let Some((key, value, must)) = ranges::beyond(&value) {
+            return Err(MissionError::Range { key, value, must });
+        }
         mission.check()?;
         Ok(mission)
     }

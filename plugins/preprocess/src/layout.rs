@@ -119,6 +119,7 @@ pub(crate) fn table_spec(
             let limit = match (limits, name, c.unit.as_str()) {
                 (Some(l), "is" | "ifo", "m") => l.displacement_m,
                 (Some(l), "is" | "dws", "rad") => l.angle_rad,
+                (_, "ephemeris", unit) => ephemeris_limit(unit),
                 _ => f64::MAX,
             };
             let flag = is_status(&c.name) || (c.unit.is_empty() && !name.starts_with("hk/"));
@@ -133,6 +134,18 @@ pub(crate) fn table_spec(
         stated_rate_hz: stated_rate_hz(columns),
         never_interpolated: mandatory || matches!(name, "is" | "ifo" | "dws" | "command"),
         mandatory,
+    }
+}
+
+/// Largest size of a value of the ephemeris by its unit: within the heliosphere, slower than anything bound to the Sun,
+/// turning less than once in six seconds. Unlike instruments, nothing else tells a wrong one.
+fn ephemeris_limit(unit: &str) -> f64 {
+    match unit {
+        "m" => 1e13,
+        "m s-1" => 1e6,
+        "rad s-1" | "rad s-2" => 1.0,
+        "1" => 1.1,
+        _ => f64::MAX,
     }
 }
 
@@ -210,6 +223,16 @@ mod tests {
         assert_eq!(covered(8.0), [0, 1, 2, 3]);
         assert_eq!(covered(f64::NAN), [0, 1, 2, 3]);
         assert_eq!(covered(0.5), [0, 1, 2, 3]);
+    }
+
+    /// One 1e30 in an ephemeris nearly doubled σ, and nothing said so.
+    #[test]
+    fn an_impossible_ephemeris_is_beyond_its_limit() {
+        let owned = columns("ephemeris", &["r_sc_irf_m.x", "omega_crf_rad_s.z", "sun_srf.y", "alpha_crf_rad_s2.x"]);
+        let spec = table_spec("ephemeris", &owned.iter().collect::<Vec<_>>(), false, &["tm1"], None);
+        for (column, sound) in spec.columns.iter().zip([1.5e11, 1.1e-3, 1.0, 1e-6]) {
+            assert!(sound < column.limit && column.limit < 1e30, "{}: {}", column.name, column.limit);
+        }
     }
 
     #[test]

@@ -281,7 +281,7 @@ const VALUE_REASONS: [(Reason, &str); 6] = [
     (Reason::Status, "under a status flag"),
     (Reason::NotANumber, "NaN"),
     (Reason::Infinite, "infinite"),
-    (Reason::Limit, "beyond [limits] of the mission file"),
+    (Reason::Limit, "beyond [limits] of the mission file, or beyond what an ephemeris can hold"),
     (Reason::Stuck, "repeated exactly"),
     (Reason::Outlier, "outliers"),
 ];

@@ -13,6 +13,7 @@ mod many_days;
 mod model;
 mod new_plugin;
 mod plugins;
+mod probe;
 mod products;
 mod replay;
 mod reveal;
@@ -25,6 +26,7 @@ use crate::failure::{Failure, Refusal};
 use crate::text::{self, Paint};
 use dragfree_engine::registry::Registry;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Exit code where the model contradicts the data, or is not sufficient.
 const INCONSISTENT: u8 = 4;
@@ -92,7 +94,8 @@ fn discovered(global: &Global) -> Result<Registry, Failure> {
         return Err(Refusal::PluginFolder(missing.clone()).into());
     }
     folders.extend(own_folders());
-    Ok(Registry::discover(&folders))
+    let limit = Duration::from_secs_f64(global.plugin_time_limit).min(probe::LIMIT);
+    Ok(Registry::discover_probed(&folders, &mut |files| probe::probe(files, limit)))
 }
 
 /// Beside the program, which is also where a build puts the plugins, and where an installation does.

@@ -3,6 +3,7 @@
 use super::Done;
 use crate::args::{Global, Validate};
 use crate::bundled;
+use crate::child;
 use crate::failure::{Failure, Refusal};
 use crate::text::{self, Paint};
 use dragfree_engine::border::{Library, PluginInfo};
@@ -23,7 +24,7 @@ const LIST: &str = "list";
 
 pub(super) fn execute(validate: &Validate, global: &Global, paint: Paint) -> Result<Done, Failure> {
     if let Some(check) = &validate.check {
-        return child(validate, check);
+        return answered(validate, check);
     }
     let target = Path::new(&validate.target);
     let subjects = if target.is_file() { listed(validate, target) } else { found(validate, global)? };
@@ -103,7 +104,7 @@ fn ask(validate: &Validate, path: &Path, check: &str, plugin: Option<(&str, &str
         Ok((Some(status), stdout, stderr)) => {
             let line = stdout.lines().rev().find_map(|line| line.strip_prefix(ANSWER));
             let told = line.and_then(|line| serde_json::from_str(line).ok());
-            told.unwrap_or_else(|| failed(format!("{}{}", ended(status), last_line(&stderr))))
+            told.unwrap_or_else(|| failed(format!("{}{}", child::ended(status), last_line(&stderr))))
         }
         Ok((None, ..)) => {
             let detail =
@@ -146,22 +147,6 @@ fn answer(command: &mut Command, limit: Duration) -> std::io::Result<(Option<Exi
     Ok((status, text(stdout), text(stderr)))
 }
 
-/// How a process ended that gave no answer.
-fn ended(status: ExitStatus) -> String {
-    #[cfg(unix)]
-    if let Some(signal) = std::os::unix::process::ExitStatusExt::signal(&status) {
-        let name = match signal {
-            4 => ", an illegal instruction",
-            6 => ", it aborted",
-            7 | 11 => ", memory that is not its own",
-            8 => ", a division of whole numbers by zero",
-            _ => "",
-        };
-        return format!("crashed: signal {signal}{name}");
-    }
-    format!("ended the process: {status}")
-}
-
 fn last_line(stderr: &str) -> String {
     stderr
         .lines()
@@ -171,7 +156,7 @@ fn last_line(stderr: &str) -> String {
 }
 
 /// The child's part: one check in this very process.
-fn child(validate: &Validate, check: &str) -> Result<Done, Failure> {
+fn answered(validate: &Validate, check: &str) -> Result<Done, Failure> {
     let library = match Library::open(Path::new(&validate.target)) {
         Ok(library) => library,
         Err(error) => return Ok(told(&json!({ "passed": false, "detail": error.to_string() }))),

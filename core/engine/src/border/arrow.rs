@@ -7,6 +7,8 @@ use std::collections::HashMap;
 use std::ffi::c_void;
 use std::ptr;
 
+use super::text::aligned;
+use crate::limits::ROWS;
 use crate::table::{Batch, Column};
 
 const _: () = assert!(size_of::<FFI_ArrowArray>() == size_of::<abi::ArrowArray>());
@@ -84,7 +86,7 @@ pub(super) unsafe fn take(array: abi::ArrowArray, columns: usize) -> Result<Batc
 /// `rows` values of a primitive array after `skipped` ones. A plugin may have put them at any address.
 ///
 /// # Safety
-/// The array has values of type `T`, and as many.
+/// [`check_shape`] has seen the array, and its buffer is as long as it says.
 unsafe fn values<T: Copy>(array: &abi::ArrowArray, skipped: usize, rows: usize) -> Vec<T> {
     let mut out: Vec<T> = Vec::with_capacity(rows);
     if rows > 0 {
@@ -99,30 +101,95 @@ unsafe fn values<T: Copy>(array: &abi::ArrowArray, skipped: usize, rows: usize) 
     out
 }
 
-/// The number of rows of a struct array of so many primitive children without nulls.
+/// The number of rows of a struct array of so many primitive children without nulls. Lengths and offsets are small
+/// enough afterwards that no sum of them, and no product with the size of a value, overflows.
 ///
 /// # Safety
-/// `array` has not been released.
+/// `array` has not been released, and its pointers lead where the C Data Interface says.
 unsafe fn check_shape(array: &abi::ArrowArray, children: usize) -> Result<usize, String> {
-    if array.n_children != children.cast_signed() as i64 || array.children.is_null() {
+    if array.n_children != children.cast_signed() as i64 || !aligned(array.children) {
         return Err(format!("an output table of {} children where {children} were declared", array.n_children));
     }
-    if array.length < 0 || array.offset < 0 || array.n_buffers != 1 || array.null_count > 0 {
+    if array.n_buffers != 1 || array.null_count > 0 || !array.dictionary.is_null() {
         return Err("an output table that is no struct array without nulls".to_owned());
     }
+    let within = |what: &str, number: i64| match usize::try_from(number) {
+        Ok(number) if number <= ROWS => Ok(number),
+        _ => Err(format!("{what} {number}, where 0 to {ROWS} are possible")),
+    };
+    let rows = within("an output table of length", array.length)?;
+    let skipped = within("an output table at offset", array.offset)?;
     for i in 0..children {
         // SAFETY: there are `n_children` pointers.
-        let child = unsafe { (*array.children.add(i)).as_ref() }.ok_or("an output column without an array")?;
-        if child.n_buffers != 2 || child.buffers.is_null() || child.offset < 0 || child.null_count > 0 {
+        let child = unsafe { *array.children.add(i) };
+        if !aligned(child.cast_const()) {
+            return Err(format!("output column {i} has no array"));
+        }
+        // SAFETY: it is neither null nor misaligned, and by the caller it is an array.
+        let child = unsafe { &*child };
+        if child.n_buffers != 2 || !aligned(child.buffers) || child.null_count > 0 || !child.dictionary.is_null() {
             return Err(format!("output column {i} is no primitive array without nulls"));
         }
-        if child.length < array.length.saturating_add(array.offset) {
-            return Err(format!("output column {i} has {} rows where the table has {}", child.length, array.length));
+        within(&format!("output column {i} at offset"), child.offset)?;
+        if child.length < (rows + skipped) as i64 {
+            return Err(format!("output column {i} has {} rows where the table has {rows}", child.length));
         }
         // SAFETY: there are two buffers.
         if child.length > 0 && unsafe { (*child.buffers.add(1)).is_null() } {
             return Err(format!("output column {i} has no values"));
         }
     }
-    Ok(array.length.cast_unsigned() as usize)
+    Ok(rows)
+}
+
+#[cfg(test)]
+#[allow(clippy::undocumented_unsafe_blocks, reason = "the tests stand for a plugin that keeps the header's promises")]
+mod tests {
+    use super::*;
+
+    /// What `check_shape` says of a table of two columns of three rows that `change` has changed.
+    fn shape_of(change: impl FnOnce(&mut abi::ArrowArray, &mut [abi::ArrowArray])) -> Result<usize, String> {
+        let (times, values) = ([1_i64, 2, 3], [1.0_f64, 2.0, 3.0]);
+        let mut buffers = [[ptr::null(), times.as_ptr().cast()], [ptr::null(), values.as_ptr().cast::<c_void>()]];
+        let mut children: Vec<abi::ArrowArray> = buffers
+            .iter_mut()
+            .map(|b| abi::ArrowArray { length: 3, n_buffers: 2, buffers: b.as_mut_ptr(), ..abi::ArrowArray::empty() })
+            .collect();
+        let mut pointers: Vec<*mut abi::ArrowArray> = children.iter_mut().map(|c| &raw mut *c).collect();
+        let mut table = abi::ArrowArray {
+            length: 3,
+            n_buffers: 1,
+            n_children: 2,
+            children: pointers.as_mut_ptr(),
+            ..abi::ArrowArray::empty()
+        };
+        change(&mut table, &mut children);
+        unsafe { check_shape(&table, 2) }
+    }
+
+    /// A length of 2^60, or a large offset, ended the program: their products with the size of a value overflow.
+    #[test]
+    fn lengths_and_offsets_that_overflow_are_refused() {
+        assert_eq!(shape_of(|_, _| ()), Ok(3));
+        for huge in [1 << 25, 1 << 60, i64::MAX, -1, i64::MIN] {
+            assert!(shape_of(|t, c| (t.length, c[0].length, c[1].length) = (huge, huge, huge)).is_err(), "{huge}");
+            assert!(shape_of(|t, c| (t.offset, c[0].length, c[1].length) = (huge, i64::MAX, i64::MAX)).is_err());
+            assert!(shape_of(|_, c| c[1].offset = huge).is_err(), "{huge}");
+        }
+        assert!(shape_of(|t, _| t.offset = 1).is_err(), "one row more than the columns have");
+        assert_eq!(shape_of(|t, _| (t.offset, t.length) = (1, 2)), Ok(2));
+    }
+
+    #[test]
+    fn pointers_that_lead_nowhere_are_refused() {
+        assert!(shape_of(|t, _| t.children = ptr::null_mut()).is_err());
+        assert!(shape_of(|t, _| t.children = t.children.wrapping_byte_add(1)).is_err());
+        assert!(shape_of(|t, _| unsafe { *t.children = ptr::null_mut() }).is_err());
+        assert!(shape_of(|t, _| unsafe { *t.children = (*t.children).wrapping_byte_add(4) }).is_err());
+        assert!(shape_of(|_, c| c[0].buffers = ptr::null_mut()).is_err());
+        assert!(shape_of(|_, c| unsafe { *c[1].buffers.add(1) = ptr::null() }).is_err());
+        assert!(shape_of(|t, _| t.n_children = 3).is_err());
+        assert!(shape_of(|_, c| c[1].null_count = 1).is_err());
+        assert!(shape_of(|_, c| c[1].n_buffers = 3).is_err(), "a text column has three");
+    }
 }

@@ -2,15 +2,16 @@
 
 use arrow_schema::{DataType, ffi::FFI_ArrowSchema};
 use dragfree_abi as abi;
-use dragfree_schema::{Coefficient, Constraint, NOISE_ATTRIBUTE, NoiseProcess, Report};
-use serde::de::DeserializeOwned;
-use std::collections::BTreeMap;
-use std::ffi::{CStr, CString, c_char, c_void};
+use dragfree_schema::Report;
+use std::ffi::{CString, c_void};
 
 use super::crash::Name;
+use super::host::{self, Collected, ConfigContext, Log};
 use super::library::{Kind, Library, PluginInfo};
-use super::{BorderError, arrow, floats, read, without_name};
-use crate::table::{Batch, Column, TableSpec};
+use super::link::{self, CColumn, LinkContext, Linked};
+use super::{BorderError, FLOATS_CHANGED, arrow, read, without_name};
+use crate::limits::{REPORT_BYTES, STATE_BYTES};
+use crate::table::{Batch, Column};
 
 /// What an instance is made from: the JSON object that `dragfree_config_v1` describes.
 #[derive(Clone, Debug, Default)]
@@ -26,28 +27,6 @@ pub struct LinkRequest<'a> {
     pub available: &'a [Column],
     /// What the plugins before it declared: a [`dragfree_schema::Model`].
     pub model_json: &'a str,
-}
-
-/// A column that an instance reads: its index among the available ones.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ReadColumn {
-    /// Index into [`LinkRequest::available`].
-    pub available: usize,
-}
-
-/// What an instance declared when it was linked.
-#[derive(Clone, Debug, Default)]
-pub struct Linked {
-    /// Per input table, in slot order: the columns read.
-    pub reads: Vec<Vec<ReadColumn>>,
-    /// Tables written, in order.
-    pub writes: Vec<TableSpec>,
-    /// Coefficients that it announced.
-    pub coefficients: Vec<Coefficient>,
-    /// Constraints that it announced.
-    pub constraints: Vec<Constraint>,
-    /// Noise processes that it declared.
-    pub noise: Vec<NoiseProcess>,
 }
 
 /// Rows of one input table.
@@ -82,404 +61,29 @@ pub struct Instance {
     node: abi::NodeV1,
     // Lives as long as the node, which holds a pointer to it.
     _host: Box<abi::HostV1>,
-    _host_name: Box<CString>,
+    // Lives as long as the host, which holds a pointer to it.
+    _log: Box<Log>,
     input_schemas: Vec<FFI_ArrowSchema>,
     /// Columns of each written table, beside the times.
     output_columns: Vec<usize>,
+    /// Where the last report broke its schema.
+    broken_in_report: Vec<String>,
     /// An earlier call failed; nothing but `destroy` may follow.
     dead: bool,
 }
 
-// SAFETY: the header lets an instance be called from any thread, one at a time; the host's callbacks take no state but
-// an immutable name.
+// SAFETY: the header lets an instance be called from any thread, one at a time; what the host's callbacks share between
+// threads is the log, whose count is atomic.
 unsafe impl Send for Instance {}
 
 impl Drop for Instance {
     fn drop(&mut self) {
         if let Some(destroy) = self.node.destroy {
             // SAFETY: called once, in whatever state.
-            self.crash_name.during("destroy", || unsafe { destroy(self.node.self_) });
-        }
-    }
-}
-
-unsafe extern "C" fn log(context: *mut c_void, level: i32, message: *const c_char) {
-    if context.is_null() || message.is_null() {
-        return;
-    }
-    // SAFETY: the context is the instance's name, the message a NUL-terminated string.
-    let (plugin, message) =
-        unsafe { (CStr::from_ptr(context.cast()).to_string_lossy(), CStr::from_ptr(message).to_string_lossy()) };
-    match level {
-        abi::LOG_ERROR => tracing::error!(%plugin, "{message}"),
-        abi::LOG_WARN => tracing::warn!(%plugin, "{message}"),
-        abi::LOG_INFO => tracing::info!(%plugin, "{message}"),
-        _ => tracing::debug!(%plugin, "{message}"),
-    }
-}
-
-/// The configuration while `create` runs.
-struct ConfigContext<'a> {
-    value: &'a serde_json::Value,
-    texts: Vec<CString>,
-}
-
-impl ConfigContext<'_> {
-    fn find(&self, path: &str) -> Option<&serde_json::Value> {
-        path.split('.').try_fold(self.value, |value, key| match value {
-            serde_json::Value::Array(items) => items.get(key.parse::<usize>().ok()?),
-            other => other.get(key),
-        })
-    }
-}
-
-/// # Safety
-/// `context` is a `ConfigContext`, `path` NUL-terminated.
-unsafe fn config_value<'a>(context: *mut c_void, path: *const c_char) -> Option<(&'a mut ConfigContext<'a>, String)> {
-    if path.is_null() {
-        return None;
-    }
-    // SAFETY: by the caller.
-    unsafe {
-        let context = context.cast::<ConfigContext<'a>>().as_mut()?;
-        Some((context, CStr::from_ptr(path).to_string_lossy().into_owned()))
-    }
-}
-
-unsafe extern "C" fn get_f64(context: *mut c_void, path: *const c_char, out: *mut f64) -> abi::Status {
-    // SAFETY: as the header promises.
-    unsafe {
-        let Some((context, path)) = config_value(context, path) else { return abi::ERROR };
-        match (context.find(&path).and_then(serde_json::Value::as_f64), out.as_mut()) {
-            (Some(value), Some(out)) => {
-                *out = value;
-                abi::OK
+            let ((), changed) = self.crash_name.guarded("destroy", || unsafe { destroy(self.node.self_) });
+            if changed {
+                tracing::warn!(plugin = self.name, "destroy: {FLOATS_CHANGED}; it was put back");
             }
-            _ => abi::ERROR,
-        }
-    }
-}
-
-unsafe extern "C" fn get_text(context: *mut c_void, path: *const c_char, out: *mut *const c_char) -> abi::Status {
-    // SAFETY: as the header promises.
-    unsafe {
-        let Some((context, path)) = config_value(context, path) else { return abi::ERROR };
-        let text = context.find(&path).and_then(serde_json::Value::as_str).map(str::to_owned);
-        match (text.and_then(|t| CString::new(t).ok()), out.as_mut()) {
-            (Some(text), Some(out)) => {
-                // The heap buffer of a CString does not move when the vector grows.
-                *out = text.as_ptr();
-                context.texts.push(text);
-                abi::OK
-            }
-            _ => abi::ERROR,
-        }
-    }
-}
-
-/// The declarations while `link` runs.
-struct LinkContext<'a> {
-    available: &'a [Column],
-    linked: Linked,
-    tables: Vec<String>,
-    kind: Kind,
-    refused: Option<String>,
-}
-
-impl LinkContext<'_> {
-    fn refuse(&mut self, sentence: String) -> abi::Status {
-        self.refused.get_or_insert(sentence);
-        abi::ERROR
-    }
-
-    fn read(&mut self, want: &WantedColumn) -> Result<abi::SlotV1, String> {
-        let column = self.find(want)?;
-        let have = &self.available[column];
-        let mismatch = |what: &str, wanted: &str, is: &str| {
-            Err(format!(
-                "wants column {}:{} with {what} `{wanted}`, but it is made with {what} `{is}`; correct the one that is wrong",
-                have.table, have.name
-            ))
-        };
-        if let Some(unit) = want.unit.as_deref().filter(|u| *u != have.unit) {
-            return mismatch("unit", unit, &have.unit);
-        }
-        if let Some(frame) = want.frame.as_deref().filter(|f| *f != have.frame) {
-            return mismatch("frame", frame, &have.frame);
-        }
-        if want.rate_hz != 0.0 && want.rate_hz != have.rate_hz {
-            return mismatch("rate in Hz", &want.rate_hz.to_string(), &have.rate_hz.to_string());
-        }
-        let table = self.tables.iter().position(|t| *t == have.table).unwrap_or_else(|| {
-            self.tables.push(have.table.clone());
-            self.linked.reads.push(Vec::new());
-            self.tables.len() - 1
-        });
-        let columns = &mut self.linked.reads[table];
-        let read = ReadColumn { available: column };
-        let position = columns.iter().position(|c| *c == read).unwrap_or_else(|| {
-            columns.push(read);
-            columns.len() - 1
-        });
-        let index = |i: usize| u32::try_from(i).map_err(|e| e.to_string());
-        Ok(abi::SlotV1 { table: index(table)?, column: index(position)? })
-    }
-
-    fn find(&self, want: &WantedColumn) -> Result<usize, String> {
-        let fits = |c: &Column| c.name == want.name && want.table.as_ref().is_none_or(|t| *t == c.table);
-        // Raw telemetry has the names that preprocessed columns keep: without a table, the grid is meant.
-        let uniform = self.available.iter().any(|c| fits(c) && c.rate_hz > 0.0);
-        let mut found = self
-            .available
-            .iter()
-            .enumerate()
-            .filter(|(_, c)| fits(c) && (!uniform || c.rate_hz > 0.0 || want.table.is_some()));
-        let shown = want.table.as_ref().map_or_else(|| want.name.clone(), |t| format!("{t}:{}", want.name));
-        match (found.next(), found.next()) {
-            (Some((index, _)), None) => Ok(index),
-            (Some((_, a)), Some((_, b))) => Err(format!(
-                "wants column {shown}, which tables {} and {} both have; it must name the table",
-                a.table, b.table
-            )),
-            (None, _) => {
-                let mut near: Vec<_> = self
-                    .available
-                    .iter()
-                    .map(|c| (distance(&c.name, &want.name), format!("{}:{}", c.table, c.name)))
-                    .collect();
-                near.sort();
-                let near: Vec<_> = near.into_iter().take(3).map(|(_, name)| name).collect();
-                let near = if near.is_empty() {
-                    "there are no columns yet".to_owned()
-                } else {
-                    format!("nearest: {}", near.join(", "))
-                };
-                Err(format!(
-                    "wants column {shown}, which no file and no stage before it makes ({near}); add the topic or the stage that makes it"
-                ))
-            }
-        }
-    }
-
-    fn write(&mut self, column: Column) -> Result<(), String> {
-        if column.table.is_empty() || column.name.is_empty() {
-            return Err("writes a column without a table or a name".to_owned());
-        }
-        let taken = |c: &Column| c.table == column.table && c.name == column.name;
-        if self.available.iter().any(taken) || self.linked.writes.iter().flat_map(|t| &t.columns).any(taken) {
-            return Err(format!("writes column {}:{}, which exists already", column.table, column.name));
-        }
-        if !(column.rate_hz.is_finite() && column.rate_hz >= 0.0) {
-            return Err(format!("writes column {}:{} at a rate of {} Hz", column.table, column.name, column.rate_hz));
-        }
-        if let Some(table) = self.linked.writes.iter_mut().find(|t| t.name == column.table) {
-            if table.rate_hz != column.rate_hz {
-                return Err(format!(
-                    "writes table {} at {} Hz and at {} Hz",
-                    table.name, table.rate_hz, column.rate_hz
-                ));
-            }
-            table.columns.push(column);
-        } else {
-            if self.available.iter().any(|c| c.table == column.table) {
-                return Err(format!("writes table {}, which exists already", column.table));
-            }
-            let truth = self.kind == Kind::Source && column.table == "truth";
-            let (name, rate_hz) = (column.table.clone(), column.rate_hz);
-            self.linked.writes.push(TableSpec { name, rate_hz, columns: vec![column], truth });
-        }
-        Ok(())
-    }
-}
-
-/// The declared noise makes sense, and enters channels that exist.
-fn check_noise(linked: &Linked, available: &[Column]) -> Result<(), String> {
-    for process in &linked.noise {
-        process.check().map_err(|what| format!("declares the noise process `{}`: {what}", process.name))?;
-        let known = |channel: &str| {
-            let written = linked.writes.iter().flat_map(|t| &t.columns);
-            let name = |c: &Column| c.attributes.get("channel").map_or(c.name.clone(), String::clone);
-            available.iter().chain(written).any(|c| c.attribute("kind") == "channel" && name(c) == channel)
-        };
-        if let Some(channel) = process.channels().find(|channel| !known(channel)) {
-            return Err(format!(
-                "declares that the noise process `{}` enters `{channel}`, which is no channel; write it with the attribute kind = channel",
-                process.name
-            ));
-        }
-    }
-    Ok(())
-}
-
-/// A coarse measure of how far two names are apart: what is left outside the common start and end.
-fn distance(a: &str, b: &str) -> usize {
-    let start = a.bytes().zip(b.bytes()).take_while(|(x, y)| x == y).count();
-    let end = a.bytes().rev().zip(b.bytes().rev()).take_while(|(x, y)| x == y).count();
-    (a.len().max(b.len())).saturating_sub(start + end)
-}
-
-struct WantedColumn {
-    table: Option<String>,
-    name: String,
-    unit: Option<String>,
-    frame: Option<String>,
-    rate_hz: f64,
-}
-
-/// # Safety
-/// `text` is null or NUL-terminated.
-unsafe fn optional(text: *const c_char) -> Option<String> {
-    // SAFETY: by the caller.
-    (!text.is_null()).then(|| unsafe { CStr::from_ptr(text) }.to_string_lossy().into_owned())
-}
-
-unsafe extern "C" fn link_read(
-    context: *mut c_void,
-    wanted: *const abi::ColumnV1,
-    slot: *mut abi::SlotV1,
-) -> abi::Status {
-    // SAFETY: as the header promises.
-    unsafe {
-        let (Some(context), Some(c)) = (context.cast::<LinkContext<'_>>().as_mut(), wanted.as_ref()) else {
-            return abi::ERROR;
-        };
-        let Some(name) = optional(c.name) else { return context.refuse("wants a column without a name".to_owned()) };
-        let want = WantedColumn {
-            table: optional(c.table),
-            name,
-            unit: optional(c.unit),
-            frame: optional(c.frame),
-            rate_hz: c.rate_hz,
-        };
-        match (context.read(&want), slot.as_mut()) {
-            (Ok(found), Some(slot)) => {
-                *slot = found;
-                abi::OK
-            }
-            (Ok(_), None) => context.refuse("gave no slot".to_owned()),
-            (Err(sentence), _) => context.refuse(sentence),
-        }
-    }
-}
-
-unsafe extern "C" fn link_write(context: *mut c_void, column: *const abi::ColumnV1) -> abi::Status {
-    // SAFETY: as the header promises.
-    unsafe {
-        let (Some(context), Some(c)) = (context.cast::<LinkContext<'_>>().as_mut(), column.as_ref()) else {
-            return abi::ERROR;
-        };
-        let text = |t| optional(t).unwrap_or_default();
-        let result = attributes(&text(c.attributes))
-            .map_err(|what| format!("attributes of column {}: {what}", text(c.name)))
-            .and_then(|(attributes, noise)| {
-                context.linked.noise.extend(noise);
-                context.write(Column {
-                    table: text(c.table),
-                    name: text(c.name),
-                    unit: text(c.unit),
-                    frame: text(c.frame),
-                    rate_hz: c.rate_hz,
-                    attributes,
-                })
-            });
-        result.map_or_else(|sentence| context.refuse(sentence), |()| abi::OK)
-    }
-}
-
-/// The attributes of a written column, and the noise processes among them.
-fn attributes(json: &str) -> Result<(BTreeMap<String, String>, Vec<NoiseProcess>), String> {
-    if json.is_empty() {
-        return Ok((BTreeMap::new(), Vec::new()));
-    }
-    let mut all: serde_json::Map<String, serde_json::Value> = serde_json::from_str(json).map_err(|e| e.to_string())?;
-    let noise = all.remove(NOISE_ATTRIBUTE).map_or(Ok(Vec::new()), read::declaration);
-    let noise = noise.map_err(|what| format!("{NOISE_ATTRIBUTE}: {what}"))?;
-    Ok((read::declaration(all.into())?, noise))
-}
-
-/// # Safety
-/// As the header promises for `coefficient` and `constraint`.
-unsafe fn link_json<T: DeserializeOwned>(
-    context: *mut c_void,
-    json: *const c_char,
-    what: &str,
-    list: impl FnOnce(&mut Linked) -> &mut Vec<T>,
-) -> abi::Status {
-    // SAFETY: by the caller.
-    unsafe {
-        let Some(context) = context.cast::<LinkContext<'_>>().as_mut() else { return abi::ERROR };
-        if context.kind != Kind::Effect {
-            return context.refuse(format!("announces a {what}, but is no effect"));
-        }
-        let document = serde_json::from_str(&optional(json).unwrap_or_default()).map_err(|e| e.to_string());
-        match document.and_then(read::declaration) {
-            Ok(declared) => {
-                list(&mut context.linked).push(declared);
-                abi::OK
-            }
-            Err(why) => context.refuse(format!("announces a {what} that cannot be read: {why}")),
-        }
-    }
-}
-
-unsafe extern "C" fn link_coefficient(context: *mut c_void, json: *const c_char) -> abi::Status {
-    // SAFETY: as the header promises.
-    unsafe { link_json(context, json, "coefficient", |linked| &mut linked.coefficients) }
-}
-
-unsafe extern "C" fn link_constraint(context: *mut c_void, json: *const c_char) -> abi::Status {
-    // SAFETY: as the header promises.
-    unsafe { link_json(context, json, "constraint", |linked| &mut linked.constraints) }
-}
-
-unsafe extern "C" fn collect(context: *mut c_void, bytes: *const u8, length: usize) -> abi::Status {
-    // SAFETY: the context is the vector of `bytes_from`; the plugin gives `length` bytes.
-    unsafe {
-        match context.cast::<Vec<u8>>().as_mut() {
-            Some(buffer) if length == 0 || !bytes.is_null() => {
-                if length > 0 {
-                    buffer.extend_from_slice(std::slice::from_raw_parts(bytes, length));
-                }
-                abi::OK
-            }
-            _ => abi::ERROR,
-        }
-    }
-}
-
-/// A column as C strings.
-struct CColumn {
-    table: CString,
-    name: CString,
-    unit: CString,
-    frame: CString,
-    attributes: CString,
-    rate_hz: f64,
-}
-
-impl CColumn {
-    fn new(column: &Column) -> Self {
-        // Names come from files and plugins: a NUL cannot be in a C string, and no column has one that matters.
-        let c = |s: &str| CString::new(s.replace('\0', "?")).unwrap_or_default();
-        let attributes = serde_json::to_string(&column.attributes).unwrap_or_default();
-        Self {
-            table: c(&column.table),
-            name: c(&column.name),
-            unit: c(&column.unit),
-            frame: c(&column.frame),
-            attributes: c(&attributes),
-            rate_hz: column.rate_hz,
-        }
-    }
-
-    fn raw(&self) -> abi::ColumnV1 {
-        abi::ColumnV1 {
-            table: self.table.as_ptr(),
-            name: self.name.as_ptr(),
-            unit: self.unit.as_ptr(),
-            frame: self.frame.as_ptr(),
-            rate_hz: self.rate_hz,
-            attributes: self.attributes.as_ptr(),
         }
     }
 }
@@ -497,11 +101,13 @@ impl Instance {
         let factory =
             library.factory(plugin.kind).map_err(rule)?.ok_or_else(|| rule("the factory vanished".to_owned()))?;
         let create = factory.create.ok_or_else(|| rule("a factory without `create`".to_owned()))?;
-        let host_name = Box::new(CString::new(name.replace('\0', "?")).unwrap_or_default());
-        let host = Box::new(abi::HostV1 { context: host_name.as_ptr().cast_mut().cast(), log });
+        let log = Box::new(Log::new(&name));
+        let host = Box::new(abi::HostV1 { context: (&raw const *log).cast_mut().cast(), log: host::log });
         let json = CString::new(config.value.to_string().replace("\\u0000", "?")).unwrap_or_default();
-        let mut context = ConfigContext { value: &config.value, texts: Vec::new() };
-        let raw = abi::ConfigV1 { context: (&raw mut context).cast(), json: json.as_ptr(), get_f64, get_text };
+        let mut context = ConfigContext::new(&config.value);
+        let context = (&raw mut context).cast();
+        let (get_f64, get_text) = (host::get_f64, host::get_text);
+        let raw = abi::ConfigV1 { context, json: json.as_ptr(), get_f64, get_text };
         let mut node = abi::NodeV1::empty();
         let crash_name = Name::of(&name);
         guarded_call(crash_name, &name, "create", |error| {
@@ -517,9 +123,10 @@ impl Instance {
             kind: plugin.kind,
             node,
             _host: host,
-            _host_name: host_name,
+            _log: log,
             input_schemas: Vec::new(),
             output_columns: Vec::new(),
+            broken_in_report: Vec::new(),
             dead: false,
         })
     }
@@ -532,22 +139,16 @@ impl Instance {
         let columns: Vec<CColumn> = request.available.iter().map(CColumn::new).collect();
         let raw_columns: Vec<abi::ColumnV1> = columns.iter().map(CColumn::raw).collect();
         let model = CString::new(request.model_json.replace('\0', "?")).unwrap_or_default();
-        let mut context = LinkContext {
-            available: request.available,
-            linked: Linked::default(),
-            tables: Vec::new(),
-            kind: self.kind,
-            refused: None,
-        };
+        let mut context = LinkContext::new(request.available, self.kind);
         let raw = abi::LinkV1 {
             context: (&raw mut context).cast(),
             available_count: u32::try_from(raw_columns.len()).unwrap_or(u32::MAX),
             available: raw_columns.as_ptr(),
             model_json: model.as_ptr(),
-            read: link_read,
-            write: link_write,
-            coefficient: link_coefficient,
-            constraint: link_constraint,
+            read: link::link_read,
+            write: link::link_write,
+            coefficient: link::link_coefficient,
+            constraint: link::link_constraint,
         };
         let link = self.function(self.node.link, "link")?;
         // SAFETY: every pointer lives during the call.
@@ -559,7 +160,7 @@ impl Instance {
         }
         result?;
         let linked = context.linked;
-        check_noise(&linked, request.available)
+        link::check_noise(&linked, request.available)
             .map_err(|sentence| BorderError::Link { plugin: self.name.clone(), sentence })?;
         for columns in &linked.reads {
             let columns: Vec<Column> = columns.iter().map(|c| request.available[c.available].clone()).collect();
@@ -637,10 +238,18 @@ impl Instance {
         let Some(report) = self.node.report else { return Ok(Report::default()) };
         let earlier = CString::new(earlier_json.replace('\0', "?")).unwrap_or_default();
         // SAFETY: the string and the writer live during the call.
-        let bytes =
-            self.bytes_from("report", |node, writer, error| unsafe { report(node, earlier.as_ptr(), writer, error) })?;
-        let report = read::report(&String::from_utf8_lossy(&bytes)).map_err(|what| self.rule("report", what))?;
+        let bytes = self.bytes_from("report", REPORT_BYTES, |node, writer, error| unsafe {
+            report(node, earlier.as_ptr(), writer, error)
+        })?;
+        let (report, broken) =
+            read::report(&String::from_utf8_lossy(&bytes)).map_err(|what| self.rule("report", what))?;
+        self.broken_in_report = broken;
         Ok(Report { plugin: self.name.clone(), ..report })
+    }
+
+    /// Where the last report broke its schema, and was read all the same.
+    pub(crate) fn broken_in_report(&self) -> &[String] {
+        &self.broken_in_report
     }
 
     /// The whole state.
@@ -650,7 +259,7 @@ impl Instance {
     pub fn save(&mut self) -> Result<Vec<u8>, BorderError> {
         let Some(save) = self.node.save else { return Ok(Vec::new()) };
         // SAFETY: the writer lives during the call.
-        self.bytes_from("save", |node, writer, error| unsafe { save(node, writer, error) })
+        self.bytes_from("save", STATE_BYTES, |node, writer, error| unsafe { save(node, writer, error) })
     }
 
     /// Takes a state back.
@@ -712,15 +321,18 @@ impl Instance {
         let pointer = arrays.as_mut_ptr();
         let called = self.call_or_discard(call, |node, error| work(node, pointer, error));
         // Arrays are taken, and so released, even after a failed call.
-        let batches: Result<Vec<Batch>, String> = arrays
-            .into_iter()
-            .zip(&self.output_columns)
+        let columns = &self.output_columns;
+        let (batches, changed): (Result<Vec<Batch>, String>, bool) = self.crash_name.guarded("release", || {
+            let arrays = arrays.into_iter().zip(columns);
+            // All of them, so that each is released.
             // SAFETY: the plugin filled the arrays as the header asks, or left them empty.
-            .map(|(array, columns)| unsafe { arrow::take(array, *columns) })
-            .collect();
+            let taken: Vec<_> = arrays.map(|(array, columns)| unsafe { arrow::take(array, *columns) }).collect();
+            taken.into_iter().collect()
+        });
         if !called? {
             return Ok(None);
         }
+        let batches = if changed { Err(format!("release: {FLOATS_CHANGED}")) } else { batches };
         batches.map(Some).map_err(|what| {
             self.dead = true;
             self.rule(call, what)
@@ -730,12 +342,18 @@ impl Instance {
     fn bytes_from(
         &mut self,
         call: &'static str,
+        limit: usize,
         work: impl FnOnce(*mut c_void, *const abi::WriterV1, *mut abi::ErrorV1) -> abi::Status,
     ) -> Result<Vec<u8>, BorderError> {
-        let mut bytes: Vec<u8> = Vec::new();
-        let writer = abi::WriterV1 { context: (&raw mut bytes).cast(), write: collect };
-        self.call(call, |node, error| work(node, &raw const writer, error))?;
-        Ok(bytes)
+        let mut collected = Collected::new(limit);
+        let writer = abi::WriterV1 { context: (&raw mut collected).cast(), write: host::collect };
+        let called = self.call(call, |node, error| work(node, &raw const writer, error));
+        // The host's own message is more precise than the plugin's.
+        if let Some(what) = collected.refused {
+            self.dead = true;
+            return Err(self.rule(call, what));
+        }
+        called.map(|()| collected.bytes)
     }
 }
 
@@ -749,12 +367,9 @@ fn guarded_call(
 ) -> Result<bool, BorderError> {
     let mut text = [0u8; 4096];
     let mut error = abi::ErrorV1 { text: text.as_mut_ptr().cast(), capacity: text.len() };
-    let before = floats::control_word();
-    let status = name.during(call, || work(&raw mut error));
-    if floats::control_word() != before {
-        floats::restore(before);
-        let what = "it changed the floating-point control word, which would change every later result".to_owned();
-        return Err(BorderError::Rule { plugin: plugin.to_owned(), call, what });
+    let (status, changed) = name.guarded(call, || work(&raw mut error));
+    if changed {
+        return Err(BorderError::Rule { plugin: plugin.to_owned(), call, what: FLOATS_CHANGED.to_owned() });
     }
     let end = text.iter().position(|b| *b == 0).unwrap_or(text.len());
     let message = String::from_utf8_lossy(&text[..end]);

@@ -1,14 +1,17 @@
-//! Plugin libraries: checked, opened, their manifests read.
+//! Plugin libraries: checked, opened through the descriptor that was checked, their manifests read.
 
 use dragfree_abi as abi;
 use dragfree_schema::Manifest;
 use serde::{Deserialize, Serialize};
-use std::ffi::{CStr, CString};
+use std::ffi::CString;
 use std::mem::ManuallyDrop;
 use std::path::{Path, PathBuf};
 
 use super::BorderError;
 use super::crash::{self, Name};
+use super::text::{aligned, text_of};
+use crate::input::{InputFile, read_text};
+use crate::limits::{CONFIG_BYTES, LIBRARY_BYTES, PLUGINS, TEXT_BYTES};
 
 /// What a plugin is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -53,6 +56,14 @@ pub struct PluginInfo {
     pub manifest: Manifest,
 }
 
+/// A library file that was checked and that no code was run of yet.
+#[derive(Debug)]
+pub struct Checked {
+    file: InputFile,
+    sha256: String,
+    locked: bool,
+}
+
 /// An open plugin library; never closed.
 #[derive(Debug)]
 pub struct Library {
@@ -65,55 +76,99 @@ pub struct Library {
     entry: &'static abi::EntryV1,
 }
 
+impl Checked {
+    /// Opens a file and checks it: who may change it, and whether `plugins.lock` has its digest.
+    ///
+    /// # Errors
+    /// [`BorderError::Refused`] with the reason.
+    pub fn new(path: &Path) -> Result<Self, BorderError> {
+        let refuse = |reason: String| BorderError::Refused { path: path.to_owned(), reason };
+        let unreadable = |e: std::io::Error| refuse(format!("cannot be read: {e}"));
+        let file = InputFile::open(path).map_err(unreadable)?;
+        if file.size() > LIBRARY_BYTES {
+            return Err(refuse(format!("has {} bytes, where a library may have {LIBRARY_BYTES}", file.size())));
+        }
+        super::owner::check(path, &file).map_err(refuse)?;
+        let sha256 = file.sums(0).map_err(unreadable)?.sha256;
+        let locked = check_lock(path, &sha256).map_err(refuse)?;
+        Ok(Self { file, sha256, locked })
+    }
+
+    /// The file.
+    pub fn path(&self) -> &Path {
+        self.file.path()
+    }
+
+    /// Its digest, lower-case hexadecimal.
+    pub fn sha256(&self) -> &str {
+        &self.sha256
+    }
+
+    /// Whether the operator vouches for it by name and digest.
+    pub fn is_locked(&self) -> bool {
+        self.locked
+    }
+}
+
 impl Library {
     /// Checks a file, opens it and reads its manifests.
     ///
     /// # Errors
-    /// [`BorderError::Refused`] with the reason: writable by everybody, not in `plugins.lock`, no shared library, no
+    /// [`BorderError::Refused`] with the reason: others may change it, not in `plugins.lock`, no shared library, no
     /// plugin, another ABI version, a manifest that cannot be read.
     pub fn open(path: &Path) -> Result<Self, BorderError> {
-        let refuse = |reason: String| BorderError::Refused { path: path.to_owned(), reason };
-        let bytes = std::fs::read(path).map_err(|e| refuse(format!("cannot be read: {e}")))?;
-        let sha256 = dragfree_archive::files::sha256(&bytes);
-        check_permissions(path).map_err(&refuse)?;
-        check_lock(path, &sha256).map_err(&refuse)?;
-        crash::install();
-        Name::of(&path.to_string_lossy()).during("open", || Self::load(path, sha256))
+        Self::load(Checked::new(path)?)
     }
 
-    /// Opens a file that was checked: what runs code of the library.
-    fn load(path: &Path, sha256: String) -> Result<Self, BorderError> {
-        let refuse = |reason: String| BorderError::Refused { path: path.to_owned(), reason };
-        // SAFETY: opening a library runs its initialisers; the operator vouches for the plugin folder, and the checks
-        // above refuse a file that somebody else could have changed.
-        let library = unsafe { libloading::Library::new(path) }
-            .map_err(|e| refuse(format!("is no shared library that this machine can load: {e}")))?;
-        let library = ManuallyDrop::new(library);
+    /// Opens a file that was checked and reads its manifests.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn load(checked: Checked) -> Result<Self, BorderError> {
+        let path = checked.path().to_owned();
+        let refuse = |reason: String| BorderError::Refused { path: path.clone(), reason };
+        let same = checked.file.is_unchanged().map_err(|e| refuse(format!("cannot be read: {e}")))?;
+        if !same {
+            return Err(refuse("was changed while it was checked; try again when it is complete".to_owned()));
+        }
+        crash::install();
+        let (opened, changed) =
+            Name::of(&path.to_string_lossy()).guarded("open", || Self::read(checked).map_err(refuse));
+        if changed {
+            return Err(refuse(super::FLOATS_CHANGED.to_owned()));
+        }
+        opened
+    }
+
+    /// Opens a library and reads its manifests: what runs code of it.
+    fn read(checked: Checked) -> Result<Self, String> {
+        let library = ManuallyDrop::new(open(&checked)?);
         // SAFETY: the header defines the symbol as data of this type; its first field is read before anything else.
         let symbol = unsafe { library.get::<*const abi::EntryV1>(abi::ENTRY_SYMBOL) }
-            .map_err(|_| refuse("exports no `dragfree_entry`: it is no dragfree plugin".to_owned()))?;
+            .map_err(|_| "exports no `dragfree_entry`: it is no dragfree plugin".to_owned())?;
         // SAFETY: the symbol's address outlives the handle, which is never closed.
         let entry =
             unsafe { symbol.try_as_raw_ptr() }.map_or(std::ptr::null(), |p| p.cast::<abi::EntryV1>().cast_const());
-        if entry.is_null() {
-            return Err(refuse("exports a null `dragfree_entry`".to_owned()));
+        if !aligned(entry) {
+            return Err("exports a null or misaligned `dragfree_entry`".to_owned());
         }
         // SAFETY: `abi_version` is the first field in every version of the struct; reading it alone is always sound.
         let version = unsafe { *entry.cast::<u32>() };
         if version != abi::ABI_VERSION {
-            return Err(refuse(format!(
+            return Err(format!(
                 "was built for ABI version {version}, this host speaks version {}; rebuild it with this host's plugin.h",
                 abi::ABI_VERSION
-            )));
+            ));
         }
-        // SAFETY: the version matches, so the whole struct is there; the library is never closed.
+        // SAFETY: the version matches, so the plugin says that the whole struct is there; it is never unloaded.
         let entry: &'static abi::EntryV1 = unsafe { &*entry };
-        let mut this = Self { path: path.to_owned(), sha256, plugins: Vec::new(), entry };
+        let path = checked.path().to_owned();
+        let mut this = Self { path, sha256: checked.sha256, plugins: Vec::new(), entry };
         for kind in Kind::ALL {
-            this.read_manifests(kind).map_err(&refuse)?;
+            this.read_manifests(kind)?;
         }
         if this.plugins.is_empty() {
-            return Err(refuse("holds no source, stage or effect of a revision that this host knows".to_owned()));
+            return Err("holds no source, stage or effect of a revision that this host knows".to_owned());
         }
         Ok(this)
     }
@@ -121,16 +176,16 @@ impl Library {
     fn read_manifests(&mut self, kind: Kind) -> Result<(), String> {
         let Some(factory) = self.factory(kind)? else { return Ok(()) };
         let manifest = factory.manifest.ok_or("a factory without `manifest`")?;
+        if factory.count > PLUGINS {
+            return Err(format!("says that it has {} {kind}s, where {PLUGINS} are the most", factory.count));
+        }
         for index in 0..factory.count {
-            // SAFETY: `index` is below `count`.
-            let text = unsafe { manifest(index) };
-            if text.is_null() {
-                return Err(format!("manifest {index} of its {kind}s is null"));
-            }
-            // SAFETY: the header promises a static string.
-            let text = unsafe { CStr::from_ptr(text) }.to_string_lossy();
-            let manifest: Manifest =
-                serde_json::from_str(&text).map_err(|e| format!("manifest {index} of its {kind}s: {e}"))?;
+            let broken = |what: String| format!("manifest {index} of its {kind}s: {what}");
+            // SAFETY: `index` is below `count`; the header promises a static string.
+            let text = unsafe { text_of(manifest(index), TEXT_BYTES) }
+                .map_err(broken)?
+                .ok_or_else(|| format!("manifest {index} of its {kind}s is null"))?;
+            let manifest: Manifest = serde_json::from_str(&text).map_err(|e| broken(e.to_string()))?;
             if manifest.id.is_empty() {
                 return Err(format!("manifest {index} of its {kind}s has an empty id"));
             }
@@ -142,44 +197,64 @@ impl Library {
     pub(super) fn factory(&self, kind: Kind) -> Result<Option<&'static abi::FactoryV1>, String> {
         let get = self.entry.get_factory.ok_or("its entry has no `get_factory`")?;
         let id = CString::new(kind.factory_id()).map_err(|e| e.to_string())?;
-        // SAFETY: the id is NUL-terminated; the header promises null or a static factory.
-        Ok(unsafe { get(id.as_ptr()).as_ref() })
+        // SAFETY: the id is NUL-terminated.
+        let factory = unsafe { get(id.as_ptr()) };
+        if !factory.is_null() && !factory.is_aligned() {
+            return Err(format!("its factory of {kind}s is misaligned"));
+        }
+        // SAFETY: the header promises null or a static factory.
+        Ok(unsafe { factory.as_ref() })
     }
 }
 
-#[cfg(unix)]
-fn check_permissions(path: &Path) -> Result<(), String> {
-    use std::os::unix::fs::PermissionsExt;
-    let mode = std::fs::metadata(path).map_err(|e| e.to_string())?.permissions().mode();
-    if mode & 0o002 != 0 {
-        return Err(format!("may be changed by everybody (mode {:o}); `chmod o-w` it if you trust it", mode & 0o777));
+/// Opens a checked library by its descriptor, so that what runs is what was checked. The descriptor stays open for
+/// ever: the loader knows libraries by name, and a number that came again would be taken for the library before.
+#[cfg(target_os = "linux")]
+fn open(checked: &Checked) -> Result<libloading::Library, String> {
+    let descriptor = checked.file.keep_open().map_err(|e| format!("cannot be kept open: {e}"))?;
+    // SAFETY: opening a library runs its initialisers; the operator vouches for the plugin folder, and the checks
+    // before refuse a file that somebody else could have changed.
+    let opened = unsafe { libloading::Library::new(format!("/proc/self/fd/{descriptor}")) };
+    match opened {
+        // Libraries beside it that it finds by `$ORIGIN` are found by its path alone; nobody promised them by digest.
+        Err(_) if !checked.locked && checked.file.is_in_place().is_ok_and(|same| same) => by_path(checked),
+        opened => opened.map_err(unloadable),
     }
-    Ok(())
 }
 
-#[cfg(not(unix))]
-fn check_permissions(_path: &Path) -> Result<(), String> {
-    Ok(())
+#[cfg(not(target_os = "linux"))]
+fn open(checked: &Checked) -> Result<libloading::Library, String> {
+    by_path(checked)
+}
+
+fn by_path(checked: &Checked) -> Result<libloading::Library, String> {
+    // SAFETY: as above.
+    unsafe { libloading::Library::new(checked.path()) }.map_err(unloadable)
+}
+
+#[allow(clippy::needless_pass_by_value, reason = "for `map_err`")]
+fn unloadable(error: libloading::Error) -> String {
+    format!("is no shared library that this machine can load: {error}")
 }
 
 /// `plugins.lock` beside the libraries: a table `[sha256]` from file name to digest. Where it exists, nothing else
-/// loads.
-fn check_lock(path: &Path, sha256: &str) -> Result<(), String> {
+/// loads; true where it has the file.
+fn check_lock(path: &Path, sha256: &str) -> Result<bool, String> {
     #[derive(Deserialize)]
     #[serde(deny_unknown_fields)]
     struct Lock {
         sha256: std::collections::BTreeMap<String, String>,
     }
     let lock_path = path.with_file_name("plugins.lock");
-    let text = match std::fs::read_to_string(&lock_path) {
+    let text = match read_text(&lock_path, CONFIG_BYTES) {
         Ok(text) => text,
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(false),
         Err(e) => return Err(format!("{} cannot be read: {e}", lock_path.display())),
     };
     let lock: Lock = toml::from_str(&text).map_err(|e| format!("{}: {e}", lock_path.display()))?;
     let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
     match lock.sha256.get(&name) {
-        Some(locked) if locked.eq_ignore_ascii_case(sha256) => Ok(()),
+        Some(locked) if locked.eq_ignore_ascii_case(sha256) => Ok(true),
         Some(_) => Err(format!("its digest {sha256} is not the one in {}", lock_path.display())),
         None => Err(format!("it is not listed in {}; add its digest {sha256} if you trust it", lock_path.display())),
     }

@@ -5,16 +5,27 @@
 
 mod arrow;
 mod crash;
+mod exit;
 mod floats;
+mod host;
 mod instance;
 mod library;
+mod link;
+mod owner;
 mod read;
+mod text;
 
+pub use crash::overdue;
 pub use dragfree_schema::{Manifest, Parameter, ParameterType};
-pub use instance::{Config, Instance, LinkRequest, Linked, ReadColumn, Rows, SourceStep};
-pub use library::{Kind, Library, PluginInfo};
+pub use exit::{exit_is_due, exit_now, watch_exit};
+pub use instance::{Config, Instance, LinkRequest, Rows, SourceStep};
+pub use library::{Checked, Kind, Library, PluginInfo};
+pub use link::{Linked, ReadColumn};
 
 use std::path::PathBuf;
+
+/// What is said of a plugin that leaves another control word.
+const FLOATS_CHANGED: &str = "it changed the floating-point control word, which would change every later result";
 
 /// A plugin's message without its own name in front, which every message is told with.
 pub(crate) fn without_name<'a>(plugin: &str, message: &'a str) -> &'a str {

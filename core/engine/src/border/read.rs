@@ -33,10 +33,11 @@ pub(super) fn declaration<T: DeserializeOwned>(document: Value) -> Result<T, Str
 }
 
 /// Reads a report. Unknown keys and numbers that are none become notes in it: a day of data stands behind a report.
+/// What breaks the schema is given beside it.
 ///
 /// # Errors
 /// A sentence that names the place or the key that cannot be understood.
-pub(super) fn report(text: &str) -> Result<Report, String> {
+pub(super) fn report(text: &str) -> Result<(Report, Vec<String>), String> {
     let mut notes = Vec::new();
     let document = serde_json::from_str(text).or_else(|original| {
         let mended = null_for_nan(text);
@@ -49,6 +50,7 @@ pub(super) fn report(text: &str) -> Result<Report, String> {
     }
     let (mut report, unknown): (Report, _) = lenient(document)?;
     notes.extend(unknown.into_iter().map(|key| format!("unknown key {key:?} left out")));
+    let broken = notes.clone();
     for (solution, covariance) in &report.covariance {
         let missing = covariance.matrix.iter().flatten().filter(|x| !x.is_finite()).count();
         if missing > 0 {
@@ -56,7 +58,7 @@ pub(super) fn report(text: &str) -> Result<Report, String> {
         }
     }
     report.notes.extend(notes);
-    Ok(report)
+    Ok((report, broken))
 }
 
 /// The text with `null` in place of `nan`, `inf` and `infinity`, as C's `printf` writes them, outside of strings.
@@ -90,7 +92,8 @@ mod tests {
     #[test]
     fn an_unknown_key_of_a_report_is_noted() {
         let text = r#"{"nis": 1.5, "shade": "blue", "coefficients": [{"name": "a", "solution": "qp", "value": 1.0, "sigma": null, "snr": 3}]}"#;
-        let read = report(text).expect("a report");
+        let (read, broken) = report(text).expect("a report");
+        assert_eq!(broken, read.notes);
         assert_eq!((read.nis, read.coefficients[0].value, read.coefficients[0].sigma), (Some(1.5), Some(1.0), None));
         assert_eq!(read.notes, ["unknown key \"shade\" left out", "unknown key \"coefficients.0.snr\" left out"]);
     }
@@ -98,7 +101,7 @@ mod tests {
     /// `printf("%g", sigma)` of a C author writes `nan`, which is no JSON.
     #[test]
     fn nan_as_c_writes_it_is_read_as_null_and_noted() {
-        let read = report(
+        let (read, _) = report(
             r#"{"nis": -nan, "chi2_per_dof": inf, "notes": ["-inf \"nan\" stays"],
                 "covariance": {"c": {"names": ["a"], "matrix": [[NaN]]}}}"#,
         )

@@ -320,11 +320,14 @@ impl Chain {
                 let next = || waiting.lock().unwrap_or_else(PoisonError::into_inner).next();
                 let work = || std::iter::from_fn(next).map(call).collect::<Vec<_>>();
                 std::thread::scope(|scope| {
-                    let running: Vec<_> = (0..threads).map(|_| scope.spawn(work)).collect();
+                    // Where the system allows no more threads, this one does the work.
+                    let start = |_| std::thread::Builder::new().spawn_scoped(scope, work);
+                    let running: Vec<_> = (1..threads).filter_map(|n| start(n).ok()).collect();
+                    let mine = work();
                     let join = |thread: std::thread::ScopedJoinHandle<'_, Vec<(usize, Made)>>| {
                         thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
                     };
-                    running.into_iter().flat_map(join).collect()
+                    mine.into_iter().chain(running.into_iter().flat_map(join)).collect()
                 })
             } else {
                 due.into_iter().map(call).collect()

@@ -31,7 +31,8 @@ pub enum ConfigError {
 }
 
 pub(crate) fn read(path: &Path) -> Result<String, ConfigError> {
-    std::fs::read_to_string(path).map_err(|source| ConfigError::Read { path: path.to_owned(), source })
+    crate::input::read_text(path, crate::limits::CONFIG_BYTES)
+        .map_err(|source| ConfigError::Read { path: path.to_owned(), source })
 }
 
 fn parse<T: serde::de::DeserializeOwned>(path: &Path, text: &str) -> Result<T, ConfigError> {

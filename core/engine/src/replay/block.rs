@@ -36,6 +36,16 @@ impl Block {
         }
     }
 
+    /// Bytes that rows of so many columns take.
+    pub(super) fn bytes_of(rows: usize, columns: usize) -> usize {
+        rows.saturating_mul(columns + 1).saturating_mul(size_of::<f64>())
+    }
+
+    /// Bytes that its rows take.
+    pub(super) fn bytes(&self) -> usize {
+        Self::bytes_of(self.times.len(), self.columns.len())
+    }
+
     /// Time of the first row not yet delivered, Unix ns.
     pub(super) fn head(&self) -> Option<i64> {
         self.times.get(self.next).copied()

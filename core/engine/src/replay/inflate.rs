@@ -1,10 +1,10 @@
 //! The records of a piece of a file, uncompressed and vouched for by their CRC.
 
 use std::fmt;
-use std::io::{self, Read, Seek, SeekFrom};
+use std::io::{self, Read};
 
-/// Largest piece that is read, bytes, compressed or not. A length beyond it is damage or an attack.
-pub(super) const MAX_PIECE: u64 = 1 << 29;
+use crate::input::InputFile;
+use crate::limits::{INFLATION, INFLATION_FREE_BYTES, PIECE_BYTES};
 
 /// How the records of a piece are stored.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -51,22 +51,25 @@ impl Inflater {
     }
 
     /// The records of `piece`.
-    pub(super) fn read(&mut self, file: &mut (impl Read + Seek), piece: &Piece) -> Result<&[u8], InflateError> {
+    pub(super) fn read(&mut self, file: &InputFile, piece: &Piece) -> Result<&[u8], InflateError> {
         let corrupt = |what: String| Err(InflateError::Corrupt(what));
-        if piece.length > MAX_PIECE {
-            return corrupt(format!("{} bytes are more than a chunk can sensibly have", piece.length));
+        let too_large = |bytes: u64| corrupt(format!("{bytes} bytes, where a chunk may have {PIECE_BYTES}"));
+        if piece.length > PIECE_BYTES {
+            return too_large(piece.length);
         }
-        file.seek(SeekFrom::Start(piece.offset)).map_err(InflateError::Io)?;
-        self.stored.clear();
-        let got = file.take(piece.length).read_to_end(&mut self.stored).map_err(InflateError::Io)?;
-        if got as u64 != piece.length {
-            return corrupt(format!("the file ends {} bytes early", piece.length - got as u64));
+        file.read_range(piece.offset, piece.length, &mut self.stored).map_err(InflateError::Io)?;
+        let got = self.stored.len() as u64;
+        if got != piece.length {
+            return corrupt(format!("the file ends {} bytes early", piece.length - got));
         }
         let Stored::Chunk { compression, uncompressed_size, crc } = &piece.stored else {
             return Ok(&self.stored);
         };
-        if *uncompressed_size > MAX_PIECE {
-            return corrupt(format!("{uncompressed_size} bytes are more than a chunk can sensibly have"));
+        if *uncompressed_size > PIECE_BYTES {
+            return too_large(*uncompressed_size);
+        }
+        if *uncompressed_size > piece.length.saturating_mul(INFLATION).max(INFLATION_FREE_BYTES) {
+            return corrupt(format!("{} bytes that are to become {uncompressed_size}", piece.length));
         }
         let size = usize::try_from(*uncompressed_size)
             .map_err(|_| InflateError::Corrupt(format!("{uncompressed_size} bytes do not fit the memory")))?;

@@ -19,6 +19,11 @@ pub enum Finding {
     EmptyFiles,
     /// A chunk whose CRC, compression or size is wrong; all its messages are lost.
     CorruptChunks,
+    /// A file whose data section is not what its CRC says, with messages that no other CRC covers: they were read, and
+    /// may be wrong.
+    DamagedDataSections,
+    /// A message that the statistics of its file count and the file does not hold.
+    MissingMessages,
     /// A record that makes no sense where it stands; what it held is lost.
     DamagedRecords,
     /// A message that is not what its schema says; lost.
@@ -27,6 +32,8 @@ pub enum Finding {
     MessagesOfUnknownChannels,
     /// A message before 1980 or after 2200; dropped.
     TimesOutOfRange,
+    /// A message more than a day from all others, or one of two or three together: its clock had failed; dropped.
+    StrayMessages,
     /// A message earlier than its file's index says, found too late to be put in order; lost.
     LateMessages,
     /// A message of a time at which its topic already has other values; the first in the order of the files counts.
@@ -49,6 +56,10 @@ pub enum Finding {
     FilesWithoutMetadata,
     /// A chunk written without a CRC.
     ChunksWithoutCrc,
+    /// A file with messages that no CRC covers.
+    UncheckedFiles,
+    /// A file whose data section is not what its CRC says, where CRCs of their own show that every message is right.
+    DamageBesideMessages,
     /// A file without a usable summary; its channels were found by reading all of it.
     FilesWithoutSummary,
     /// A file without a message.

@@ -19,15 +19,17 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::io;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::{self, JoinHandle};
 
 pub use losses::{Finding, Losses};
 
+use crate::input::{InputFile, Sums};
 use crate::table::{Chunk, TableSpec};
 use crate::telemetry::{Drift, LayoutError};
 use reader::{OpenFile, Reader, SANE_NS, clamp_ns, is_sane};
-use scan::{Scan, ScanError, scan};
+use scan::{Cover, Scan, ScanError, scan};
 
 /// Stretches decoded ahead on the second thread.
 const AHEAD: usize = 2;
@@ -68,6 +70,15 @@ pub enum ReplayError {
     /// One housekeeping topic in two units.
     #[error("{path}: topic {topic} is in {found:?} where the files before it have {before:?}; convert one of them", path = path.display())]
     MixedUnits { path: PathBuf, topic: String, found: String, before: String },
+    /// A file is not what it was.
+    #[error("{path} was changed while it was read, so that its rows are of no one file; run again when it is complete", path = path.display())]
+    Changed { path: PathBuf },
+    /// Rows that must wait for earlier ones take too much memory.
+    #[error("{path}: the chunk at byte {offset} and what waits for its turn make more than {} MiB of rows; write the file in order of time, in chunks of a few MiB (`mcap sort`, `mcap compress`)", crate::limits::ROWS_IN_FLIGHT_BYTES >> 20, path = path.display())]
+    TooMuchAtOnce { path: PathBuf, offset: u64 },
+    /// More topics or columns than telemetry can have.
+    #[error("{path}: {what}; this is no telemetry of a spacecraft", path = path.display())]
+    TooManyColumns { path: PathBuf, what: String },
     /// The thread that reads ahead ended without a word.
     #[error("the reading thread died; this is a defect of dragfree, please report it with the files")]
     Worker,
@@ -93,6 +104,19 @@ pub struct Replay {
     info: ReplayInfo,
     losses: Losses,
     engine: Engine,
+    /// The files in the order in which they were given.
+    checked: Vec<CheckedFile>,
+    threads: usize,
+}
+
+/// A file, and what its own sums say of it.
+#[derive(Debug)]
+struct CheckedFile {
+    input: Arc<InputFile>,
+    /// Where its data section ends, and the CRC, where it has one.
+    checked_until: Option<(u64, u32)>,
+    /// Which other CRCs cover its messages.
+    cover: Cover,
 }
 
 /// Who reads.
@@ -117,15 +141,24 @@ impl Replay {
         }
         let mut losses = Losses::default();
         let mut scans = Vec::with_capacity(files.len());
+        let mut checked = Vec::with_capacity(files.len());
         for path in files.iter().cloned() {
-            match scan(&path, &mut losses) {
-                Ok(scan) => scans.push((path, scan)),
+            let input = match InputFile::open(&path) {
+                Ok(input) => Arc::new(input),
+                Err(source) => return Err(ReplayError::Io { path, source }),
+            };
+            match scan(&input, &mut losses) {
+                Ok(scan) => {
+                    let Scan { checked_until, cover, .. } = scan;
+                    checked.push(CheckedFile { input: Arc::clone(&input), checked_until, cover });
+                    scans.push((input, scan));
+                }
                 Err(ScanError::Io(source)) => return Err(ReplayError::Io { path, source }),
                 Err(ScanError::NotMcap) => return Err(ReplayError::NotMcap { path }),
             }
         }
         let mut files = scans;
-        files.sort_by_cached_key(|(path, scan)| (times(scan).map(|t| t.0), path.clone()));
+        files.sort_by_cached_key(|(input, scan)| (times(scan).map(|t| t.0), input.path().to_owned()));
         let info = info(&files, &mut losses)?;
         let (tables, routes) = tables::link(&files, &mut losses)?;
         // Files that ended before their first channel are a loss, not the wrong files.
@@ -135,11 +168,11 @@ impl Replay {
             return Err(ReplayError::NoTelemetry { found: Vec::from_iter(topics).join(", ") });
         }
         let files = (files.into_iter().zip(routes))
-            .map(|((path, scan), routes)| OpenFile { path, pieces: scan.pieces, routes })
+            .map(|((input, scan), routes)| OpenFile { input, pieces: scan.pieces, routes, messages: scan.messages })
             .collect();
         let reader = Reader::new(files, tables.clone(), window_ns.unwrap_or(SANE_NS), losses.clone())?;
         let engine = if threads < 2 { Engine::Here(Box::new(reader)) } else { ahead(reader) };
-        Ok(Self { tables, info, losses, engine })
+        Ok(Self { tables, info, losses, engine, checked, threads })
     }
 
     /// The tables, in the order of the interface, housekeeping last by name. A table that is not here is a topic that
@@ -176,6 +209,53 @@ impl Replay {
         &self.losses
     }
 
+    /// That no file has changed since it was opened.
+    ///
+    /// # Errors
+    /// [`ReplayError::Changed`].
+    pub fn unchanged(&self) -> Result<(), ReplayError> {
+        for CheckedFile { input, .. } in &self.checked {
+            let path = || input.path().to_owned();
+            if !input.is_unchanged().map_err(|source| ReplayError::Io { path: path(), source })? {
+                return Err(ReplayError::Changed { path: path() });
+            }
+        }
+        Ok(())
+    }
+
+    /// Size and SHA-256 of every file, in the order in which they were given, through the descriptors that the rows
+    /// come through. What the CRCs of the data sections say goes to the losses.
+    ///
+    /// # Errors
+    /// [`ReplayError::Changed`] when a file is not what it was when it was opened; it cannot be read.
+    pub fn digests(&mut self) -> Result<Vec<(u64, String)>, ReplayError> {
+        let mut digests = Vec::with_capacity(self.checked.len());
+        let sums = all_sums(&self.checked, self.threads);
+        for (file, sums) in self.checked.iter().zip(sums) {
+            let path = || file.input.path().to_owned();
+            let sums = sums.map_err(|source| ReplayError::Io { path: path(), source })?;
+            digests.push((file.input.size(), sums.sha256));
+            if file.checked_until.is_none_or(|(_, crc)| crc == sums.crc) {
+                continue;
+            }
+            let name = name_of(file.input.path());
+            let (finding, what) = match file.cover {
+                Cover::All => (Finding::DamageBesideMessages, "only beside its messages, by the CRCs of their chunks"),
+                Cover::Uncertain => (
+                    Finding::UncheckedFiles,
+                    "or was written by a program that leaves chunks without a CRC out of it; damage to them goes unseen",
+                ),
+                Cover::DataSectionAlone => {
+                    (Finding::DamagedDataSections, "so that values in it may be wrong; fetch it again")
+                }
+            };
+            self.losses
+                .add(finding, 1, &name, || format!("{name} is not what the CRC of its data section says, {what}"));
+        }
+        self.unchanged()?;
+        Ok(digests)
+    }
+
     /// True when the reading thread came to its end in order.
     fn ended(&mut self) -> bool {
         match &mut self.engine {
@@ -185,9 +265,28 @@ impl Replay {
     }
 }
 
-fn ahead(mut reader: Reader) -> Engine {
+/// The sums of files, several at once where there are threads.
+fn all_sums(files: &[CheckedFile], threads: usize) -> Vec<io::Result<Sums>> {
+    let sums = |file: &CheckedFile| file.input.sums(file.checked_until.map_or(0, |(end, _)| end));
+    let each = |some: &[CheckedFile]| some.iter().map(sums).collect::<Vec<_>>();
+    let share = files.len().div_ceil(threads.clamp(1, files.len().max(1))).max(1);
+    thread::scope(|scope| {
+        // Where the system allows no more threads, the work is done here.
+        let start = |some| thread::Builder::new().spawn_scoped(scope, move || each(some)).map_err(|_| each(some));
+        let running: Vec<_> = files.chunks(share).map(start).collect();
+        let join = |thread: thread::ScopedJoinHandle<'_, Vec<_>>| {
+            thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+        };
+        running.into_iter().flat_map(|one| one.map_or_else(|done| done, join)).collect()
+    })
+}
+
+fn ahead(reader: Reader) -> Engine {
     let (send, stretches) = sync_channel(AHEAD);
-    let thread = thread::spawn(move || {
+    // The reader is handed over once there is a thread: where the system allows no more, it stays here.
+    let (hand, taken) = sync_channel::<Reader>(1);
+    let thread = thread::Builder::new().spawn(move || {
+        let Ok(mut reader) = taken.recv() else { return };
         loop {
             let stretch = reader.next().map(|chunk| (chunk, reader.losses().clone()));
             let more = matches!(&stretch, Ok((Some(_), _)));
@@ -197,7 +296,13 @@ fn ahead(mut reader: Reader) -> Engine {
             }
         }
     });
-    Engine::Ahead { stretches, thread: Some(thread) }
+    match thread {
+        Ok(thread) => match hand.send(reader) {
+            Ok(()) => Engine::Ahead { stretches, thread: Some(thread) },
+            Err(error) => Engine::Here(Box::new(error.0)),
+        },
+        Err(_) => Engine::Here(Box::new(reader)),
+    }
 }
 
 /// First and last time that the pieces of a file state, as far as they are sane, Unix ns.
@@ -211,11 +316,11 @@ fn name_of(path: &Path) -> String {
     path.file_name().unwrap_or(path.as_os_str()).to_string_lossy().into_owned()
 }
 
-fn info(files: &[(PathBuf, Scan)], losses: &mut Losses) -> Result<ReplayInfo, ReplayError> {
+fn info(files: &[(Arc<InputFile>, Scan)], losses: &mut Losses) -> Result<ReplayInfo, ReplayError> {
     let mut info = ReplayInfo::default();
     let mut said: BTreeMap<&'static str, String> = BTreeMap::new();
-    for (path, scan) in files {
-        let path = path.clone();
+    for (input, scan) in files {
+        let path = input.path().to_owned();
         let name = name_of(&path);
         let times = times(scan);
         info.first_ns = info.first_ns.into_iter().chain(times.map(|t| t.0)).min();

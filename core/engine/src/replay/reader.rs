@@ -1,9 +1,9 @@
 //! From pieces of files to stretches of time.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::ops::Range;
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use mcap::records::op;
 
@@ -13,6 +13,8 @@ use super::inflate::{InflateError, Inflater, Piece, Stored};
 use super::losses::{Finding, Losses};
 use super::records::{Cursor, Message};
 use super::tables::{Route, Routes};
+use crate::input::InputFile;
+use crate::limits::ROWS_IN_FLIGHT_BYTES;
 use crate::table::{Batch, Chunk, TableSpec};
 use crate::telemetry::{Cells, Decoder, WireError};
 
@@ -21,6 +23,11 @@ const STRETCH_NS: i64 = 409_600_000_000;
 /// Rows later than this many stretches ahead are not kept but read again, so that a file in no order at all costs
 /// time and not memory.
 const HORIZON: i64 = 16 * STRETCH_NS;
+/// Most rows of a table in a stretch by itself that count as stray. A single time of 1980 would make the product one of
+/// that day.
+const STRAY_ROWS: usize = 3;
+/// Distance from all other rows from which they do, ns.
+const STRAY_NS: i64 = 86_400_000_000_000;
 /// 1980-01-01 and 2200-01-01: a clock outside has failed.
 pub(super) const SANE_NS: Range<i64> = 315_532_800_000_000_000..7_258_118_400_000_000_000;
 
@@ -48,9 +55,20 @@ type Key = (i64, usize, u64);
 /// A file ready to be read.
 #[derive(Debug)]
 pub(super) struct OpenFile {
-    pub(super) path: PathBuf,
+    pub(super) input: Arc<InputFile>,
     pub(super) pieces: Vec<Piece>,
     pub(super) routes: Routes,
+    /// Messages that it should hold, where it says so.
+    pub(super) messages: Option<u64>,
+}
+
+/// A file under way.
+#[derive(Debug)]
+struct ReadFile {
+    input: Arc<InputFile>,
+    routes: Routes,
+    /// Messages that should be in it and have not come yet; none where it does not say, or is not read whole.
+    due: Option<u64>,
 }
 
 /// Where a message of a piece lies.
@@ -64,7 +82,7 @@ struct Entry {
 /// Reads the pieces of all files in order of time.
 #[derive(Debug)]
 pub(super) struct Reader {
-    files: Vec<(PathBuf, Routes)>,
+    files: Vec<ReadFile>,
     tables: Vec<TableSpec>,
     queue: BTreeMap<Key, Pending>,
     /// Rows read and not yet delivered, by table.
@@ -74,6 +92,8 @@ pub(super) struct Reader {
     end_ns: i64,
     /// Every row before this time has been delivered.
     done_ns: i64,
+    /// Time of the last row delivered.
+    last_ns: Option<i64>,
     inflater: Inflater,
     entries: Vec<Entry>,
     losses: Losses,
@@ -91,6 +111,7 @@ impl Reader {
         let mut opened = Vec::with_capacity(files.len());
         let mut end_ns = i64::MIN;
         for (at, file) in files.into_iter().enumerate() {
+            let mut due = file.messages;
             for piece in file.pieces {
                 let (start, end) = (clamp_ns(piece.start), clamp_ns(piece.end));
                 // Pieces with times out of range are read for the count of them.
@@ -100,13 +121,27 @@ impl Reader {
                         end_ns = end_ns.max(end + 1);
                     }
                     queue.insert((start, at, piece.offset), Pending { piece, from_ns: i64::MIN });
+                } else {
+                    due = None;
                 }
             }
-            opened.push((file.path, file.routes));
+            opened.push(ReadFile { input: file.input, routes: file.routes, due });
         }
         let blocks = tables.iter().map(|_| vec![]).collect();
-        let done_ns = i64::MIN;
-        Ok(Self { files: opened, tables, queue, blocks, window_ns, end_ns, done_ns, inflater, entries: vec![], losses })
+        let (done_ns, last_ns, entries) = (i64::MIN, None, vec![]);
+        Ok(Self {
+            files: opened,
+            tables,
+            queue,
+            blocks,
+            window_ns,
+            end_ns,
+            done_ns,
+            last_ns,
+            inflater,
+            entries,
+            losses,
+        })
     }
 
     pub(super) fn losses(&self) -> &Losses {
@@ -116,9 +151,10 @@ impl Reader {
     /// The next stretch that has a row; `None` at the end.
     pub(super) fn next(&mut self) -> Result<Option<Chunk>, ReplayError> {
         loop {
-            let queued = self.queue.first_key_value().map(|(key, _)| key.0);
-            let held = self.blocks.iter().flatten().filter_map(Block::head).min();
-            let Some(first) = queued.into_iter().chain(held).min() else { return Ok(None) };
+            let Some(first) = self.next_ns() else {
+                self.count_missing();
+                return Ok(None);
+            };
             let until_ns = ((first.max(self.done_ns).div_euclid(STRETCH_NS)) + 1) * STRETCH_NS;
             while let Some(entry) = self.queue.first_entry().filter(|e| e.key().0 < until_ns) {
                 let ((_, file, _), pending) = entry.remove_entry();
@@ -128,7 +164,15 @@ impl Reader {
                 .map(|(blocks, table)| drain(blocks, until_ns, table.columns.len(), &table.name, &mut self.losses))
                 .collect();
             self.done_ns = until_ns;
+            if self.is_stray(&batches) {
+                let rows = batches.iter().map(|b| b.rows() as u64).sum();
+                self.losses.add(Finding::StrayMessages, rows, "", || {
+                    "messages lie more than a day from all others: a clock had failed; they were dropped".to_owned()
+                });
+                continue;
+            }
             if let Some(last) = batches.iter().filter_map(|b| b.time_ns.last()).max() {
+                self.last_ns = Some(*last);
                 self.end_ns = self.end_ns.max(last + 1);
                 let complete_until_ns = until_ns.min(self.window_ns.end).min(self.end_ns);
                 return Ok(Some(Chunk { batches, complete_until_ns }));
@@ -136,15 +180,50 @@ impl Reader {
         }
     }
 
+    /// Time of the first row that is left, as far as pieces tell theirs rightly.
+    fn next_ns(&self) -> Option<i64> {
+        let queued = self.queue.first_key_value().map(|(key, _)| key.0);
+        let held = self.blocks.iter().flatten().filter_map(Block::head).min();
+        queued.into_iter().chain(held).min()
+    }
+
+    /// Whether a stretch holds a few rows far from all others, and there are others.
+    fn is_stray(&self, batches: &[Batch]) -> bool {
+        let times = || batches.iter().flat_map(|b| &b.time_ns).copied();
+        let (Some(first), Some(last)) = (times().min(), times().max()) else { return false };
+        let next = self.next_ns();
+        let alone = self.last_ns.is_none() && next.is_none();
+        !alone
+            && batches.iter().all(|b| b.rows() <= STRAY_ROWS)
+            && self.last_ns.is_none_or(|before| first - before > STRAY_NS)
+            && next.is_none_or(|after| after - last > STRAY_NS)
+    }
+
+    /// Counts the messages that files should hold and do not; once, at the end.
+    fn count_missing(&mut self) {
+        for file in &mut self.files {
+            let Some(missing) = file.due.take().filter(|missing| *missing > 0) else { continue };
+            let name = super::name_of(file.input.path());
+            self.losses.add(Finding::MissingMessages, missing, &name, || {
+                format!("{name}: {missing} messages that its statistics count are not in it; fetch the file again")
+            });
+        }
+    }
+
+    /// Bytes of the rows that wait to be delivered.
+    fn held_bytes(&self) -> usize {
+        self.blocks.iter().flatten().map(Block::bytes).sum()
+    }
+
     /// Reads the rows of a piece that lie between what was delivered and the horizon.
     fn read(&mut self, file: usize, pending: Pending, until_ns: i64) -> Result<(), ReplayError> {
         let horizon_ns = until_ns.saturating_add(HORIZON);
-        let (path, routes) = &mut self.files[file];
-        let name = super::name_of(path);
+        let mut held = self.held_bytes();
+        let ReadFile { input, routes, due } = &mut self.files[file];
+        let name = super::name_of(input.path());
         let piece = &pending.piece;
-        let io = |source| ReplayError::Io { path: path.clone(), source };
-        let mut opened = File::open(&*path).map_err(io)?;
-        let records = match self.inflater.read(&mut opened, piece) {
+        let io = |source| ReplayError::Io { path: input.path().to_owned(), source };
+        let records = match self.inflater.read(input, piece) {
             Ok(records) => records,
             Err(InflateError::Io(error)) => return Err(io(error)),
             Err(InflateError::Corrupt(why)) => {
@@ -170,7 +249,10 @@ impl Reader {
             window_ns: self.window_ns.clone(),
             first_time,
         };
-        let later = index(records, &wanted, &mut self.entries, &name, &mut self.losses);
+        let (later, messages) = index(records, &wanted, &mut self.entries, &name, &mut self.losses);
+        if let Some(due) = due.as_mut().filter(|_| first_time) {
+            *due = due.saturating_sub(messages);
+        }
         self.entries.sort_by_key(|e| e.channel); // stable: within a channel the order of the file stays
         for entries in self.entries.chunk_by(|a, b| a.channel == b.channel) {
             let (channel, count) = (entries[0].channel, entries.len());
@@ -187,6 +269,10 @@ impl Reader {
                 }
                 Some(Route::Table { table, decoder }) => {
                     let spec = &self.tables[*table];
+                    held += Block::bytes_of(count, spec.columns.len());
+                    if held > ROWS_IN_FLIGHT_BYTES {
+                        return Err(ReplayError::TooMuchAtOnce { path: input.path().to_owned(), offset: piece.offset });
+                    }
                     let rows = decode(entries, records, decoder, spec.columns.len());
                     let topic = &spec.name;
                     self.losses.add(Finding::NonFiniteValues, rows.non_finite, topic, || {
@@ -252,12 +338,19 @@ struct Wanted {
     first_time: bool,
 }
 
-/// Lists the messages of a piece that are wanted; returns the earliest time of those that are for later.
-fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, losses: &mut Losses) -> Option<i64> {
+/// Lists the messages of a piece that are wanted; returns the earliest time of those that are for later, and how many
+/// messages there are in all.
+fn index(
+    records: &[u8],
+    wanted: &Wanted,
+    entries: &mut Vec<Entry>,
+    name: &str,
+    losses: &mut Losses,
+) -> (Option<i64>, u64) {
     entries.clear();
     let mut cursor = Cursor(records);
     let mut later: Option<i64> = None;
-    let (mut insane, mut backwards, mut late) = (0, 0, 0);
+    let (mut messages, mut insane, mut backwards, mut late) = (0, 0, 0, 0);
     let mut before: BTreeMap<u16, u64> = BTreeMap::new();
     loop {
         let (code, body) = match cursor.record() {
@@ -278,6 +371,7 @@ fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, 
             losses.add(Finding::DamagedRecords, 1, name, || format!("{name}: a message is shorter than its header"));
             continue;
         };
+        messages += 1;
         let time_ns = i64::try_from(message.log_time).unwrap_or(i64::MAX);
         if wanted.first_time {
             let last = before.entry(message.channel).or_insert(0);
@@ -305,5 +399,5 @@ fn index(records: &[u8], wanted: &Wanted, entries: &mut Vec<Entry>, name: &str, 
     losses.add(Finding::LateMessages, late, name, || {
         format!("{name}: messages lie outside the times that their chunk states and came too late to be put in order; they are lost")
     });
-    later
+    (later, messages)
 }

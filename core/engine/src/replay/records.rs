@@ -175,12 +175,13 @@ impl ChunkIndex {
     }
 }
 
-/// What the statistics count, as far as it tells whether a summary is complete.
+/// What the statistics count, as far as it tells whether a summary, or a file, is complete.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Statistics {
     pub(super) schemas: u16,
     pub(super) channels: u32,
     pub(super) chunks: u32,
+    pub(super) messages: u64,
     /// Channels with at least one message; `None` where the writer did not count by channel.
     pub(super) used: Option<BTreeSet<u16>>,
 }
@@ -204,7 +205,7 @@ impl Statistics {
             }
         }
         let used = Some(used).filter(|used| messages == 0 || !used.is_empty());
-        Ok(Self { schemas, channels, chunks, used })
+        Ok(Self { schemas, channels, chunks, messages, used })
     }
 }
 

@@ -6,24 +6,22 @@
 //! walk falls back on when a record's length is damaged.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
-use std::path::Path;
 
 use mcap::MAGIC;
 use mcap::records::op;
 
-use super::inflate::{InflateError, Inflater, MAX_PIECE, Piece, Stored};
+use super::inflate::{InflateError, Inflater, Piece, Stored};
 use super::losses::{Finding, Losses};
 use super::records::{
     Channel, ChunkHeader, ChunkIndex, Cursor, FOOTER, MESSAGE_HEADER, Message, RECORD_HEADER, Schema, Statistics,
     footer, metadata,
 };
+use crate::input::{InputFile, InputReader};
+use crate::limits::{DEFINITION_BYTES, PIECE_BYTES};
 
 /// Size at which a run of loose messages is closed.
 const LOOSE_BYTES: u64 = 1 << 20;
-/// Most bytes of a schema, channel or metadata record that are read; a longer one is damaged.
-const MAX_DEFINITION: u64 = 1 << 26;
 /// Buffer of the walk: a chunk's header and the message indexes before the next one.
 const WALK_BUFFER: usize = 1 << 13;
 
@@ -59,6 +57,25 @@ pub(super) struct Scan {
     pub(super) used: BTreeSet<u16>,
     /// Entries of the Metadata record `dragfree`.
     pub(super) metadata: Option<BTreeMap<String, String>>,
+    /// Messages that the file should hold, where it says so.
+    pub(super) messages: Option<u64>,
+    /// Where the data section ends, and its CRC, where the file has one.
+    pub(super) checked_until: Option<(u64, u32)>,
+    /// Which CRCs cover its messages beside that of the data section.
+    pub(super) cover: Cover,
+}
+
+/// Which CRCs cover the messages of a file beside that of its data section.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) enum Cover {
+    /// Each lies in a chunk with a CRC, and every chunk of the index was found.
+    All,
+    /// Some lie in chunks without a CRC. The data section's cannot be relied on then: the crate `mcap` 0.26 leaves such
+    /// chunks out of it.
+    #[default]
+    Uncertain,
+    /// Some lie outside of chunks, or chunks may be missing.
+    DataSectionAlone,
 }
 
 /// Why a file cannot be scanned at all.
@@ -75,24 +92,35 @@ impl From<io::Error> for ScanError {
 }
 
 /// Scans one file; what is wrong with it goes to `losses`.
-pub(super) fn scan(path: &Path, losses: &mut Losses) -> Result<Scan, ScanError> {
-    let name = super::name_of(path);
-    let mut file = File::open(path)?;
-    let bytes = file.seek(SeekFrom::End(0))?;
+pub(super) fn scan(file: &InputFile, losses: &mut Losses) -> Result<Scan, ScanError> {
+    let name = super::name_of(file.path());
+    let bytes = file.size();
     let mut scan = Scan { bytes, ..Scan::default() };
     if bytes == 0 {
         losses.add(Finding::EmptyFiles, 1, &name, || format!("{name} is empty; nothing was read from it"));
         return Ok(scan);
     }
     let mut magic = Vec::new();
-    file.seek(SeekFrom::Start(0))?;
-    (&mut file).take(MAGIC.len() as u64).read_to_end(&mut magic)?;
+    file.read_range(0, MAGIC.len() as u64, &mut magic)?;
     if !MAGIC.starts_with(&magic) {
         return Err(ScanError::NotMcap);
     }
-    let summary = summary(&mut file, bytes)?;
-    Walk { name: &name, bytes, index: &summary.chunks, scan: &mut scan, losses }.run(&mut file)?;
+    let summary = summary(file, bytes)?;
+    Walk { name: &name, bytes, index: &summary.chunks, scan: &mut scan, losses }.run(file.reader(0))?;
     let complete = summary.complete;
+    scan.messages = summary.messages;
+    scan.cover = if scan.pieces.iter().any(|p| matches!(p.stored, Stored::Chunk { crc: 0, .. })) {
+        Cover::Uncertain
+    } else if complete && scan.pieces.iter().all(|p| p.stored != Stored::Loose) {
+        Cover::All
+    } else {
+        Cover::DataSectionAlone
+    };
+    if scan.checked_until.is_none() && scan.pieces.iter().any(|p| p.stored == Stored::Loose) {
+        losses.add(Finding::UncheckedFiles, 1, &name, || {
+            format!("{name} has messages outside of chunks and no CRC of its data section; damage to them goes unseen")
+        });
+    }
     scan.used.extend(summary.used);
     let doubtful = doubtful(&scan.pieces, &summary.chunks, complete);
     for (id, schema) in summary.definitions.schemas {
@@ -106,7 +134,7 @@ pub(super) fn scan(path: &Path, losses: &mut Losses) -> Result<Scan, ScanError> 
             format!("{name} has no complete summary; it was read twice. `mcap recover` writes one")
         });
     }
-    inspect(&mut file, &mut scan, &doubtful, &name, losses)?;
+    inspect(file, &mut scan, &doubtful, &name, losses)?;
     if scan.pieces.is_empty() {
         losses.add(Finding::FilesWithoutMessages, 1, &name, || format!("{name} holds no messages"));
     }
@@ -136,7 +164,7 @@ fn doubtful(pieces: &[Piece], index: &[ChunkIndex], complete: bool) -> Vec<usize
 /// Reads the chunks at `which` for their definitions and their true range of times. A corrupt one is left for the
 /// reader to report.
 fn inspect(
-    file: &mut File,
+    file: &InputFile,
     scan: &mut Scan,
     which: &[usize],
     name: &str,
@@ -181,25 +209,25 @@ struct Summary {
     used: BTreeSet<u16>,
     /// It lists as many schemas, channels and chunks as it counts.
     complete: bool,
+    /// Messages that the file should hold.
+    messages: Option<u64>,
 }
 
 /// Reads the summary; an unreadable one is as good as none.
-fn summary(file: &mut File, bytes: u64) -> io::Result<Summary> {
+fn summary(file: &InputFile, bytes: u64) -> io::Result<Summary> {
     const TAIL: usize = RECORD_HEADER + FOOTER + MAGIC.len();
     let none = Ok(Summary::default());
     let Some(footer_at) = bytes.checked_sub(TAIL as u64) else { return none };
     let mut tail = Vec::with_capacity(TAIL);
-    file.seek(SeekFrom::Start(footer_at))?;
-    (&mut *file).take(TAIL as u64).read_to_end(&mut tail)?;
+    file.read_range(footer_at, TAIL as u64, &mut tail)?;
     let mut cursor = Cursor(&tail);
     let Ok(Some((op::FOOTER, body))) = cursor.record() else { return none };
     let Ok((start, _, crc)) = footer(body) else { return none };
-    if cursor.0 != MAGIC || start < MAGIC.len() as u64 || start > footer_at || footer_at - start > MAX_PIECE {
+    if cursor.0 != MAGIC || start < MAGIC.len() as u64 || start > footer_at || footer_at - start > PIECE_BYTES {
         return none;
     }
     let mut section = Vec::new();
-    file.seek(SeekFrom::Start(start))?;
-    (&mut *file).take(footer_at - start).read_to_end(&mut section)?;
+    file.read_range(start, footer_at - start, &mut section)?;
     let mut hasher = crc32fast::Hasher::new();
     hasher.update(&section);
     hasher.update(&tail[..RECORD_HEADER + FOOTER - 4]); // the CRC covers the footer up to itself
@@ -222,6 +250,7 @@ fn parse_summary(section: &[u8]) -> Option<Summary> {
         }
     }
     if let Some(statistics) = statistics {
+        summary.messages = Some(statistics.messages);
         summary.complete = usize::from(statistics.schemas) == summary.definitions.schemas.len()
             && statistics.channels as usize == summary.definitions.channels.len()
             && statistics.chunks as usize == summary.chunks.len();
@@ -241,7 +270,7 @@ struct Walk<'a> {
 }
 
 impl Walk<'_> {
-    fn run(&mut self, file: &mut File) -> io::Result<()> {
+    fn run(&mut self, file: InputReader<'_>) -> io::Result<()> {
         let mut known: Vec<u64> = self.index.iter().map(|i| i.offset).collect();
         known.sort_unstable();
         let mut reader = BufReader::with_capacity(WALK_BUFFER, file);
@@ -288,12 +317,15 @@ impl Walk<'_> {
                 }
             };
             if last {
+                if code == op::DATA_END {
+                    self.checked(at, length, &mut reader)?;
+                }
                 return Ok(());
             }
             let wanted = match code {
                 op::CHUNK => length.min(ChunkHeader::MAX as u64),
                 op::MESSAGE => length.min(MESSAGE_HEADER as u64),
-                op::SCHEMA | op::CHANNEL | op::METADATA => length.min(MAX_DEFINITION),
+                op::SCHEMA | op::CHANNEL | op::METADATA => length.min(DEFINITION_BYTES),
                 _ => 0,
             };
             body.clear();
@@ -311,13 +343,23 @@ impl Walk<'_> {
         }
     }
 
+    /// Takes the CRC of the data section, which ends at `at`; 0 stands for none.
+    fn checked(&mut self, at: u64, length: u64, reader: &mut impl Read) -> io::Result<()> {
+        let mut crc = [0; 4];
+        if length >= crc.len() as u64 && fill(reader, &mut crc)? {
+            self.scan.checked_until = Some((at, u32::from_le_bytes(crc))).filter(|(_, crc)| *crc != 0);
+        }
+        Ok(())
+    }
+
     fn chunk(&mut self, body_at: u64, length: u64, body: &[u8]) -> bool {
         let Ok(header) = ChunkHeader::parse(body) else { return false };
         let offset = header.length as u64;
         if header.compressed_size != length - offset {
             return false;
         }
-        if header.uncompressed_size > 0 {
+        // Either size may be damaged: the header stands outside every CRC.
+        if header.uncompressed_size > 0 || header.compressed_size > 0 {
             self.scan.pieces.push(Piece {
                 offset: body_at + offset,
                 length: header.compressed_size,

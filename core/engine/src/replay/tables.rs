@@ -1,11 +1,14 @@
 //! Tables of a replay: the union of what its files hold, and the way of each channel into them.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+use std::path::Path;
+use std::sync::Arc;
 
 use super::ReplayError;
 use super::losses::{Finding, Losses};
 use super::scan::Scan;
+use crate::input::InputFile;
+use crate::limits::{COLUMNS, TABLES};
 use crate::table::TableSpec;
 use crate::telemetry::{self, Decoder, Layout};
 
@@ -33,12 +36,13 @@ struct Feed {
 
 /// The tables of `files`, in the order of the interface, and the routes of each file.
 pub(super) fn link(
-    files: &[(PathBuf, Scan)],
+    files: &[(Arc<InputFile>, Scan)],
     losses: &mut Losses,
 ) -> Result<(Vec<TableSpec>, Vec<Routes>), ReplayError> {
     let mut routes = vec![Routes::new(); files.len()];
     let mut feeds: BTreeMap<(usize, String), (Vec<Feed>, TableSpec)> = BTreeMap::new();
-    for (at, (path, scan)) in files.iter().enumerate() {
+    for (at, (input, scan)) in files.iter().enumerate() {
+        let path = input.path();
         for (&id, channel) in &scan.definitions.channels {
             let finding = match channel.topic.as_str() {
                 telemetry::TRUTH => Some(Finding::TruthMessages),
@@ -49,24 +53,34 @@ pub(super) fn link(
                 routes[at].insert(id, Route::Nowhere { finding, topic: channel.topic.clone() });
                 continue;
             }
+            let name = channel.topic.trim_start_matches('/').to_owned();
+            let rank = ORDER.iter().position(|n| *n == name).unwrap_or(ORDER.len());
+            let place = (rank, name.clone());
+            if feeds.len() >= TABLES && !feeds.contains_key(&place) {
+                let what = format!("more than {TABLES} topics of telemetry");
+                return Err(ReplayError::TooManyColumns { path: path.to_owned(), what });
+            }
             let layout = layout(path, scan, id)?;
             for field in layout.ignored() {
                 losses.add(Finding::IgnoredFields, 1, &format!("{}.{field}", channel.topic), || {
                     format!(
                         "{}: field {field} of {} is no scalar of 32 bits or a double; it is not read",
-                        path.display(),
+                        super::name_of(path),
                         channel.topic
                     )
                 });
             }
-            let name = channel.topic.trim_start_matches('/').to_owned();
-            let rank = ORDER.iter().position(|n| *n == name).unwrap_or(ORDER.len());
-            let (feeds, table) = feeds.entry((rank, name.clone())).or_insert_with(|| {
+            let (feeds, table) = feeds.entry(place).or_insert_with(|| {
                 (vec![], TableSpec { name: name.clone(), rate_hz: 0.0, columns: vec![], truth: false })
             });
             let housekeeping = name.starts_with("hk/").then_some(&channel.metadata);
             extend(table, &channel.topic, &layout, housekeeping, path, losses)?;
+            let columns = table.columns.len();
             feeds.push(Feed { file: at, channel: id, layout });
+            if columns > COLUMNS {
+                let what = format!("topic {} has {columns} columns, where {COLUMNS} are the most", channel.topic);
+                return Err(ReplayError::TooManyColumns { path: path.to_owned(), what });
+            }
         }
     }
     let mut tables = Vec::with_capacity(feeds.len());
@@ -133,7 +147,7 @@ fn extend(
     let (Some(metadata), Some(value)) = (housekeeping, table.columns.first_mut()) else { return Ok(()) };
     let unit = metadata.get("unit").filter(|u| !u.is_empty()).cloned().unwrap_or_else(|| {
         losses.add(Finding::MissingUnits, 1, topic, || {
-            format!("{}: channel {topic} does not state its unit; it is read as a number (1)", path.display())
+            format!("{}: channel {topic} does not state its unit; it is read as a number (1)", super::name_of(path))
         });
         "1".to_owned()
     });

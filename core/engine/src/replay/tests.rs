@@ -172,6 +172,7 @@ fn drive_files(
         chunks.push(chunk);
     }
     assert!(replay.next()?.is_none(), "the end is the end");
+    assert_eq!(replay.digests()?.len(), files.len());
     Ok((Outcome { tables, rows, losses: replay.losses().clone() }, chunks))
 }
 
@@ -249,8 +250,10 @@ fn every_way_of_storing_gives_the_same() {
     for (edit, finding) in cases {
         let other = stored(edit);
         assert_eq!(other.numbers(), plain.numbers());
-        assert!(!other.losses.data_loss());
-        assert_eq!(other.losses.counts().len(), usize::from(finding.is_some()), "{:?}", other.losses);
+        assert!(!other.losses.data_loss(), "{:?}", other.losses);
+        // The crate leaves chunks without a CRC out of that of the data section.
+        let counts = usize::from(finding.is_some()) + usize::from(finding == Some(Finding::ChunksWithoutCrc));
+        assert_eq!(other.losses.counts().len(), counts, "{:?}", other.losses);
         assert!(finding.is_none_or(|f| other.count(f) > 0), "{:?}", other.losses);
     }
 }
@@ -348,6 +351,156 @@ fn a_flipped_bit_loses_its_chunk_and_says_so() {
         survived.insert(came.len());
     }
     assert!(survived.len() > 1 && survived.iter().min() > Some(&150), "one chunk of several is lost: {survived:?}");
+}
+
+/// A file without chunks has one CRC for all its messages; it was never compared, and 143 of 300 flips went unseen.
+#[test]
+fn a_flipped_bit_outside_of_chunks_is_told() {
+    let mut file = Foreign::new(epochs(0, 300));
+    file.options = file.options.use_chunks(false);
+    let whole = file.bytes();
+    let sound = replay(std::slice::from_ref(&whole));
+    let mut told = BTreeSet::new();
+    for byte in (8..whole.len()).step_by(11) {
+        let mut damaged = whole.clone();
+        damaged[byte] ^= 1 << (byte / 11 % 8);
+        let Ok(outcome) = replay_window(&[damaged], None) else { continue };
+        let same = bits_of(&outcome) == bits_of(&sound);
+        assert!(same || outcome.losses.data_loss(), "byte {byte}: {:?}", outcome.losses);
+        told.extend(outcome.losses.counts().into_keys());
+    }
+    assert!(told.contains("damaged_data_sections"), "{told:?}");
+    let mut unchecked = Foreign::new(epochs(0, 5));
+    unchecked.options = unchecked.options.use_chunks(false).calculate_data_section_crc(false);
+    assert_eq!(replay(&[unchecked.bytes()]).count(Finding::UncheckedFiles), 1);
+}
+
+fn bits_of(outcome: &Outcome) -> Vec<u64> {
+    let cells = outcome.rows.values().flat_map(|batch| batch.columns.iter().flatten().map(|v| v.to_bits()));
+    cells.chain(outcome.rows.values().flat_map(|batch| batch.time_ns.iter().map(|t| *t as u64))).collect()
+}
+
+/// Where the header of every chunk begins, after its operation code and length.
+fn chunk_headers(file: &[u8]) -> Vec<usize> {
+    let summary = mcap::Summary::read(file).unwrap().unwrap();
+    summary.chunk_indexes.iter().map(|index| index.chunk_start_offset as usize + 9).collect()
+}
+
+/// The size of a chunk's records stands in its header, outside of every CRC but the file's: with 0 in it the chunk was
+/// left out, and nothing said so.
+#[test]
+fn a_chunk_that_says_it_is_empty_is_no_silent_loss() {
+    for compression in [None, Some(Compression::Zstd), Some(Compression::Lz4)] {
+        let mut file = Foreign::new(epochs(0, 300));
+        file.options = file.options.compression(compression);
+        let mut bytes = file.bytes();
+        let header = chunk_headers(&bytes)[1];
+        bytes[header + 16..header + 24].copy_from_slice(&0_u64.to_le_bytes());
+        let outcome = replay(&[bytes]);
+        assert_eq!(outcome.count(Finding::CorruptChunks), 1, "{compression:?}: {:?}", outcome.losses);
+        let missing = 300 - outcome.numbers().len() as u64;
+        assert!(missing > 0);
+        assert_eq!(outcome.count(Finding::MissingMessages), missing, "{:?}", outcome.losses);
+    }
+}
+
+/// Chunks that vanish with their entries of the index leave the statistics, which say what should be there.
+#[test]
+fn messages_that_the_statistics_count_are_missed() {
+    let whole = Foreign::new(epochs(0, 300)).bytes();
+    let summary = mcap::Summary::read(&whole).unwrap().unwrap();
+    let chunk = &summary.chunk_indexes[1];
+    let mut damaged = whole;
+    // Another operation code: a record that readers pass over. Neither it nor its index entry is a chunk any more.
+    damaged[chunk.chunk_start_offset as usize] = 0x80;
+    let start = footer_of(&damaged);
+    let index_at = find_chunk_index(&damaged, start, chunk.chunk_start_offset);
+    damaged[index_at] = 0x80;
+    let end = damaged.len();
+    damaged[end - 12..end - 8].fill(0); // the sum of the summary: 0 stands for none
+    let outcome = replay(&[damaged]);
+    let missing = 300 - outcome.numbers().len() as u64;
+    assert!(missing > 0 && outcome.count(Finding::MissingMessages) == missing, "{:?}", outcome.losses);
+    let window = Some(DAY..DAY + EPOCH);
+    let part = replay_window(&[Foreign::new(epochs(0, 300)).bytes()], window).unwrap();
+    assert_eq!(part.count(Finding::MissingMessages), 0, "what nobody asked for is not missing");
+}
+
+/// Where the summary of a file begins, by its footer.
+fn footer_of(file: &[u8]) -> usize {
+    let body = file.len() - 8 - 20;
+    u64::from_le_bytes(file[body..body + 8].try_into().unwrap()) as usize
+}
+
+fn find_chunk_index(file: &[u8], mut at: usize, chunk: u64) -> usize {
+    loop {
+        let length = u64::from_le_bytes(file[at + 1..at + 9].try_into().unwrap()) as usize;
+        let of_chunk = file[at] == 0x08 && file[at + 25..at + 33] == chunk.to_le_bytes();
+        if of_chunk {
+            return at;
+        }
+        at += 9 + length;
+    }
+}
+
+/// Damage to an index record costs no message, and says so.
+#[test]
+fn damage_beside_messages_is_a_note() {
+    let mut bytes = Foreign::new(epochs(0, 300)).bytes();
+    let summary = mcap::Summary::read(&bytes).unwrap().unwrap();
+    let chunk = &summary.chunk_indexes[1];
+    let index = (chunk.chunk_start_offset + chunk.chunk_length) as usize;
+    bytes[index + 9 + 6] ^= 4;
+    let outcome = replay(&[bytes]);
+    assert_eq!(outcome.count(Finding::DamageBesideMessages), 1, "{:?}", outcome.losses);
+    assert!(!outcome.losses.data_loss());
+    assert_eq!(outcome.numbers().len(), 300);
+}
+
+/// 514 kB became 7.6 GB, and the program aborted.
+#[test]
+fn what_grows_beyond_measure_is_refused() {
+    let zeros = zstd::bulk::compress(&vec![0; 100 << 20], 3).unwrap();
+    let mut bytes = Foreign::new(epochs(0, 300)).bytes();
+    let header = chunk_headers(&bytes)[1];
+    bytes[header + 16..header + 24].copy_from_slice(&(100_u64 << 20).to_le_bytes());
+    bytes[header + 24..header + 28].fill(0);
+    let size_at = header + 28 + 4 + 4; // after "zstd"
+    let stored = u64::from_le_bytes(bytes[size_at..size_at + 8].try_into().unwrap()) as usize;
+    assert_eq!(&bytes[header + 32..header + 36], b"zstd");
+    bytes.splice(size_at + 8..size_at + 8 + stored, zeros.iter().copied());
+    bytes[size_at..size_at + 8].copy_from_slice(&(zeros.len() as u64).to_le_bytes());
+    bytes[header - 8..header].copy_from_slice(&(44 + zeros.len() as u64).to_le_bytes());
+    let outcome = replay(&[bytes]);
+    assert!(outcome.count(Finding::CorruptChunks) == 1, "{:?}", outcome.losses);
+    let said = outcome.losses.entries();
+    assert!(said.iter().any(|loss| loss.detail.contains("are to become 104857600")), "{said:?}");
+
+    // Two million rows in one chunk: a sentence, and no gigabytes.
+    let many: Messages = (0..2_200_000).map(|k| ("/ephemeris", DAY + k, vec![])).collect();
+    let mut file = Foreign::new(many);
+    file.options = file.options.chunk_size(None).compression(None);
+    let outcome = replay_window(&[file.bytes()], None);
+    assert!(matches!(outcome, Err(ReplayError::TooMuchAtOnce { .. })));
+}
+
+/// Each chunk was read from whatever lay at the path at that time: rows of two files, and the digest of the second.
+#[test]
+fn a_file_replaced_in_mid_replay_gives_no_product_of_two_files() {
+    let folder = tempfile::tempdir().unwrap();
+    let files = stored(folder.path(), &[Foreign::new(epochs(0, 40_000)).bytes()]);
+    let mut replay = Replay::open(&files, None, 1).unwrap();
+    let first = replay.next().unwrap().unwrap();
+    let other = epochs(0, 40_000).into_iter().map(|(topic, time, _)| (topic, time, dws(-1.0, 0))).collect();
+    let beside = folder.path().join("beside");
+    std::fs::write(&beside, Foreign::new(other).bytes()).unwrap();
+    std::fs::rename(&beside, &files[0]).unwrap();
+    let mut negative = 0;
+    while let Some(chunk) = replay.next().unwrap() {
+        negative += chunk.batches[0].columns[0].iter().filter(|v| **v < 0.0).count();
+    }
+    assert!(first.batches[0].rows() > 0 && negative == 0, "{negative} rows of the other file");
+    assert!(matches!(replay.digests(), Err(ReplayError::Changed { .. })));
 }
 
 #[test]
@@ -448,6 +601,38 @@ fn a_whole_file_out_of_range_is_counted() {
         assert_eq!(outcome.numbers(), (0..5).collect::<Vec<_>>());
         assert_eq!(outcome.count(Finding::TimesOutOfRange), 1, "{time}");
     }
+}
+
+/// One time of 1980 in a day of 2035 made the product one of 1980.
+#[test]
+fn a_stray_time_is_no_part_of_the_data() {
+    for stray in [316_000_000_000_000_000, DAY + 40_000 * EPOCH + 2 * 86_400_000_000_000, 7_000_000_000_000_000_000] {
+        let mut messages = epochs(0, 40_000);
+        messages.insert(20_000, ("/dws", stray, dws(1.0, 0)));
+        let outcome = replay(&[Foreign::new(messages).bytes()]);
+        assert_eq!(outcome.numbers(), (0..40_000).collect::<Vec<_>>(), "{stray}");
+        assert_eq!(outcome.count(Finding::StrayMessages), 1, "{:?}", outcome.losses);
+        assert!(outcome.losses.data_loss());
+    }
+    let near = DAY + 40_000 * EPOCH + 80_000_000_000_000;
+    let mut messages = epochs(0, 40_000);
+    messages.push(("/dws", near, dws(1.0, 0)));
+    let outcome = replay(&[Foreign::new(messages).bytes()]);
+    assert_eq!((outcome.count(Finding::StrayMessages), outcome.rows["dws"].rows()), (0, 40_001), "within a day");
+    let single = replay(&[Foreign::new(epochs(7, 1)).bytes()]);
+    assert_eq!(single.numbers(), [7], "alone it is what there is");
+}
+
+/// A second that is told twice, as clocks that follow UTC do at a leap second, lost ten epochs at exit code 0.
+#[test]
+fn a_repeated_leap_second_is_a_loss() {
+    let mut messages = epochs(0, 100);
+    let again: Messages = (50..60).map(|k| ("/dws", DAY + k * EPOCH, dws(-1.0, 0))).collect();
+    messages.splice(60..60, again);
+    let outcome = replay(&[Foreign::new(messages).bytes()]);
+    assert_eq!(outcome.numbers(), (0..100).collect::<Vec<_>>(), "the first second counts");
+    assert_eq!(outcome.count(Finding::ConflictingMessages), 10);
+    assert!(outcome.losses.data_loss());
 }
 
 #[test]
@@ -617,12 +802,13 @@ mod conformance {
         let mut losses = Losses::default();
         let folder = tempfile::tempdir().unwrap();
         let path = &stored(folder.path(), &[file.to_vec()])[0];
-        let scan = scan(path, &mut losses).unwrap_or_else(|e| panic!("{name}: {e:?}"));
+        let input = InputFile::open(path).unwrap();
+        let scan = scan(&input, &mut losses).unwrap_or_else(|e| panic!("{name}: {e:?}"));
         assert!(!losses.data_loss(), "{name}: {losses:?}");
         let mut messages = vec![];
-        let (mut inflater, mut reader) = (Inflater::new().unwrap(), std::fs::File::open(path).unwrap());
+        let mut inflater = Inflater::new().unwrap();
         for piece in &scan.pieces {
-            let mut cursor = Cursor(inflater.read(&mut reader, piece).unwrap_or_else(|e| panic!("{name}: {e:?}")));
+            let mut cursor = Cursor(inflater.read(&input, piece).unwrap_or_else(|e| panic!("{name}: {e:?}")));
             while let Some((code, body)) = cursor.record().unwrap() {
                 if code == op::MESSAGE {
                     let m = Message::parse(body).unwrap();

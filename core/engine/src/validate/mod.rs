@@ -15,7 +15,7 @@ use std::path::PathBuf;
 
 use crate::border::{BorderError, Config, Kind, Library, LinkRequest, Linked, Manifest, PluginInfo};
 use crate::config::{ConfigError, Mission, resolve_parameters};
-use crate::table::Column;
+use crate::table::{Batch, Column};
 use session::{Given, Session, difference};
 
 /// Epochs that a check feeds: ten minutes at 10 Hz.
@@ -95,6 +95,15 @@ pub struct Subject<'a> {
     pub parameters: &'a toml::Table,
     /// Files, for a source that reads some.
     pub files: &'a [PathBuf],
+}
+
+/// The rate of most rows, where it is not the one declared, within a hundredth.
+fn other_rate(batch: &Batch, declared_hz: f64) -> Option<f64> {
+    let mut steps: Vec<i64> = batch.time_ns.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    steps.sort_unstable();
+    let step = steps.get(steps.len() / 2).filter(|step| **step > 0)?;
+    let found_hz = 1e9 / *step as f64;
+    ((found_hz / declared_hz - 1.0).abs() > 0.01).then_some(found_hz)
 }
 
 impl Subject<'_> {
@@ -263,7 +272,18 @@ impl Subject<'_> {
         let whole = gap.is_none();
         let mut session = self.session(instance, gap)?;
         session.advance(EPOCHS, 512)?;
-        let Given { batches, times_ns, .. } = session.finish()?;
+        let Given { batches, times_ns, broken, .. } = session.finish()?;
+        if let Some(first) = broken.first() {
+            return Err(self.broken(instance, format!("its report breaks the schema: {first}")));
+        }
+        let (_, _, linked) = self.linked(instance, false)?;
+        for (table, batch) in linked.writes.iter().zip(&batches).filter(|(table, _)| whole && table.rate_hz > 0.0) {
+            if let Some(found_hz) = other_rate(batch, table.rate_hz) {
+                let what =
+                    format!("table {} comes at {found_hz} Hz, and was declared at {} Hz", table.name, table.rate_hz);
+                return Err(self.broken(instance, what));
+            }
+        }
         for (table, batch) in batches.iter().enumerate() {
             if batch.time_ns.windows(2).any(|pair| pair[0] >= pair[1]) {
                 return Err(self.broken(instance, format!("the times of table {table} do not ascend")));

@@ -71,7 +71,7 @@ impl Session {
             let batches = if self.kind == Kind::Source {
                 let step = self.node.next(u32::try_from(size).unwrap_or(u32::MAX))?;
                 // A source may be done with nothing, or be complete from the start: its clock counts.
-                self.at = usize::try_from((step.complete_until_ns - START_NS) / self.step_ns).unwrap_or(0);
+                self.at = usize::try_from(step.complete_until_ns.saturating_sub(START_NS) / self.step_ns).unwrap_or(0);
                 self.done = step.done;
                 Some(step.batches)
             } else {
@@ -87,7 +87,7 @@ impl Session {
 
     fn process(&mut self, epochs: Range<usize>) -> Result<Option<Vec<Batch>>, Finding> {
         let times: Vec<i64> = epochs.clone().map(|epoch| self.time_ns(epoch)).collect();
-        let tables: Vec<(Vec<i64>, Vec<Vec<f64>>)> = self
+        let tables: Vec<Table> = self
             .inputs
             .iter()
             .map(|input| {
@@ -104,8 +104,15 @@ impl Session {
             .iter()
             .map(|(time_ns, columns)| Rows { time_ns, columns: columns.iter().map(Vec::as_slice).collect() })
             .collect();
+        let before = tables.clone();
+        let made = self.node.process(&rows, self.time_ns(epochs.end))?;
+        drop(rows);
+        if !same_rows(&tables, &before) {
+            let what = "writes into the rows that it is given, which other plugins read too".to_owned();
+            return Err(Finding::Broken { instance: self.node.name.clone(), what });
+        }
         self.times_ns.extend(times);
-        Ok(self.node.process(&rows, self.time_ns(epochs.end))?)
+        Ok(made)
     }
 
     fn take(&mut self, batches: Vec<Batch>) {
@@ -124,7 +131,8 @@ impl Session {
             self.take(rest);
         }
         let report = serde_json::to_string(&self.node.report("[]")?).unwrap_or_default();
-        Ok(Given { batches: self.batches, times_ns: self.times_ns, report })
+        let broken = self.node.broken_in_report().to_vec();
+        Ok(Given { batches: self.batches, times_ns: self.times_ns, report, broken })
     }
 
     pub(super) fn save(&mut self) -> Result<Vec<u8>, Finding> {
@@ -145,6 +153,17 @@ pub(super) struct Given {
     pub(super) times_ns: Vec<i64>,
     /// Its report, as text: NaN is not equal to itself.
     pub(super) report: String,
+    /// Where it broke its schema.
+    pub(super) broken: Vec<String>,
+}
+
+/// Times and columns of one input table.
+type Table = (Vec<i64>, Vec<Vec<f64>>);
+
+/// Whether rows are the same bit by bit.
+fn same_rows(a: &[Table], b: &[Table]) -> bool {
+    let bits = |(_, columns): &Table| columns.iter().flatten().map(|v| v.to_bits()).collect::<Vec<_>>();
+    a.iter().zip(b).all(|(a, b)| a.0 == b.0 && bits(a) == bits(b))
 }
 
 /// Where two results differ; every NaN is no value, and so alike.

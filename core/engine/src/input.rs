@@ -1,0 +1,221 @@
+//! A file that a job reads: opened once, hashed and read through one descriptor, and at the end compared with what it
+//! was, so that a product names the bytes that it was made of.
+
+use sha2::{Digest as _, Sha256};
+use std::fs::{File, Metadata};
+use std::io::{self, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+/// Size of the buffer that a whole file goes through.
+const BUFFER: usize = 1 << 18;
+
+/// An open file.
+#[derive(Debug)]
+pub(crate) struct InputFile {
+    path: PathBuf,
+    file: File,
+    /// What it looked like when it was opened.
+    opened_as: Look,
+}
+
+/// What tells whether a file has changed: any write or rename over it changes one of these.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct Look {
+    size: u64,
+    #[cfg(unix)]
+    modified_ns: (i64, i64),
+    #[cfg(unix)]
+    changed_ns: (i64, i64),
+    #[cfg(unix)]
+    place: (u64, u64),
+    #[cfg(not(unix))]
+    modified: Option<std::time::SystemTime>,
+}
+
+impl Look {
+    #[cfg(unix)]
+    fn of(stat: &Metadata) -> Self {
+        use std::os::unix::fs::MetadataExt as _;
+        Self {
+            size: stat.len(),
+            modified_ns: (stat.mtime(), stat.mtime_nsec()),
+            changed_ns: (stat.ctime(), stat.ctime_nsec()),
+            place: (stat.dev(), stat.ino()),
+        }
+    }
+
+    #[cfg(not(unix))]
+    fn of(stat: &Metadata) -> Self {
+        Self { size: stat.len(), modified: stat.modified().ok() }
+    }
+}
+
+/// Digests of a whole file.
+#[derive(Clone, Debug)]
+pub(crate) struct Sums {
+    /// SHA-256, lower-case hexadecimal.
+    pub(crate) sha256: String,
+    /// CRC-32 of the bytes before the place that was asked for.
+    pub(crate) crc: u32,
+}
+
+impl InputFile {
+    pub(crate) fn open(path: &Path) -> io::Result<Self> {
+        let file = File::open(path)?;
+        let opened_as = Look::of(&file.metadata()?);
+        Ok(Self { path: path.to_owned(), file, opened_as })
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Size when it was opened, bytes.
+    pub(crate) fn size(&self) -> u64 {
+        self.opened_as.size
+    }
+
+    /// What the operating system says of it now.
+    pub(crate) fn metadata(&self) -> io::Result<Metadata> {
+        self.file.metadata()
+    }
+
+    /// Keeps it open as long as the program runs; its descriptor.
+    #[cfg(unix)]
+    pub(crate) fn keep_open(&self) -> io::Result<std::os::fd::RawFd> {
+        use std::os::fd::IntoRawFd as _;
+        Ok(self.file.try_clone()?.into_raw_fd())
+    }
+
+    /// Whether it is the file that was opened, unwritten since.
+    pub(crate) fn is_unchanged(&self) -> io::Result<bool> {
+        Ok(Look::of(&self.file.metadata()?) == self.opened_as)
+    }
+
+    /// Whether its path leads to it still: a plugin opens files by path.
+    pub(crate) fn is_in_place(&self) -> io::Result<bool> {
+        Ok(Look::of(&std::fs::metadata(&self.path)?) == self.opened_as)
+    }
+
+    /// Reads `length` bytes at `offset` into `buffer`, fewer at the end of the file; what the buffer held is gone.
+    pub(crate) fn read_range(&self, offset: u64, length: u64, buffer: &mut Vec<u8>) -> io::Result<()> {
+        buffer.clear();
+        self.reader(offset).take(length).read_to_end(buffer)?;
+        Ok(())
+    }
+
+    /// Its bytes from `position` on.
+    pub(crate) fn reader(&self, position: u64) -> InputReader<'_> {
+        InputReader { input: self, position }
+    }
+
+    /// Digests of all of it; the CRC covers the bytes before `crc_end`.
+    pub(crate) fn sums(&self, crc_end: u64) -> io::Result<Sums> {
+        let (mut sha256, mut crc) = (Sha256::new(), crc32fast::Hasher::new());
+        let mut reader = self.reader(0);
+        let mut buffer = vec![0; BUFFER];
+        loop {
+            let left = usize::try_from(crc_end.saturating_sub(reader.position)).unwrap_or(usize::MAX);
+            let count = match reader.read(&mut buffer) {
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => continue,
+                count => count?,
+            };
+            if count == 0 {
+                break;
+            }
+            sha256.update(&buffer[..count]);
+            crc.update(&buffer[..count.min(left)]);
+        }
+        Ok(Sums { sha256: dragfree_archive::files::hex(&sha256.finalize()), crc: crc.finalize() })
+    }
+}
+
+/// The text of a file of at most `limit` bytes.
+///
+/// # Errors
+/// It cannot be read, is longer, or is no UTF-8.
+pub(crate) fn read_text(path: &Path, limit: u64) -> io::Result<String> {
+    let mut text = String::new();
+    File::open(path)?.take(limit + 1).read_to_string(&mut text)?;
+    if text.len() as u64 > limit {
+        return Err(io::Error::other(format!("it is longer than {limit} bytes")));
+    }
+    Ok(text)
+}
+
+/// A place in an open file. Several read one file, since each has its own position.
+#[derive(Debug)]
+pub(crate) struct InputReader<'a> {
+    input: &'a InputFile,
+    position: u64,
+}
+
+impl Read for InputReader<'_> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        #[cfg(unix)]
+        let count = std::os::unix::fs::FileExt::read_at(&self.input.file, buffer, self.position)?;
+        #[cfg(windows)]
+        let count = std::os::windows::fs::FileExt::seek_read(&self.input.file, buffer, self.position)?;
+        self.position += count as u64;
+        Ok(count)
+    }
+}
+
+impl Seek for InputReader<'_> {
+    fn seek(&mut self, to: SeekFrom) -> io::Result<u64> {
+        let position = match to {
+            SeekFrom::Start(position) => Some(position),
+            SeekFrom::Current(by) => self.position.checked_add_signed(by),
+            SeekFrom::End(by) => self.input.size().checked_add_signed(by),
+        };
+        self.position = position.ok_or(io::ErrorKind::InvalidInput)?;
+        Ok(self.position)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sums_are_of_the_bytes_that_are_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("file");
+        let bytes: Vec<u8> = (0..700_000_u32).map(|k| ((k * 31) >> 3) as u8).collect();
+        std::fs::write(&path, &bytes).unwrap();
+        let input = InputFile::open(&path).unwrap();
+        for end in [0, 1, 262_144, 300_000, 700_000, u64::MAX] {
+            let sums = input.sums(end).unwrap();
+            let covered = usize::try_from(end).unwrap_or(usize::MAX).min(bytes.len());
+            assert_eq!(sums.crc, crc32fast::hash(&bytes[..covered]), "{end}");
+            assert_eq!(sums.sha256, dragfree_archive::files::sha256(&bytes));
+        }
+        let mut part = vec![9; 3];
+        input.read_range(699_990, 100, &mut part).unwrap();
+        assert_eq!(part, bytes[699_990..]);
+    }
+
+    /// A file that was replaced while it was read gave rows of two files, and the digest of the second.
+    #[cfg(unix)]
+    #[test]
+    fn a_replaced_or_rewritten_file_is_noticed() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, other) = (folder.path().join("file"), folder.path().join("other"));
+        std::fs::write(&path, "one").unwrap();
+        let input = InputFile::open(&path).unwrap();
+        assert!(input.is_unchanged().unwrap() && input.is_in_place().unwrap());
+        std::fs::write(&other, "two").unwrap();
+        std::fs::rename(&other, &path).unwrap();
+        assert!(!input.is_unchanged().unwrap() && !input.is_in_place().unwrap());
+        let mut kept = vec![];
+        input.read_range(0, 10, &mut kept).unwrap();
+        assert_eq!(kept, b"one", "what is read is what was opened");
+
+        let input = InputFile::open(&path).unwrap();
+        let written = std::fs::metadata(&path).unwrap().modified().unwrap();
+        std::thread::sleep(std::time::Duration::from_millis(20)); // the clock of a file system has ticks
+        std::fs::write(&path, "TWO").unwrap();
+        File::options().write(true).open(&path).unwrap().set_modified(written).unwrap();
+        assert!(!input.is_unchanged().unwrap(), "same size, same time of writing");
+    }
+}
