@@ -153,7 +153,8 @@ impl Browser {
         flags.push(format!("--user-data-dir={}", profile.path().join("profile").display()));
         flags.push(format!("--window-size={width},{height}"));
         let options = json!({ "binary": program("chromium"), "args": flags });
-        let wanted = json!({ "browserName": "chrome", "goog:chromeOptions": options, "goog:loggingPrefs": { "browser": "ALL" } });
+        let wanted = json!({ "browserName": "chrome", "goog:chromeOptions": options, "goog:loggingPrefs": {
+            "browser": "ALL" } });
         let body = json!({ "capabilities": { "alwaysMatch": wanted } }).to_string();
         let begun = Instant::now();
         while TcpStream::connect(("127.0.0.1", port)).is_err() {
@@ -252,7 +253,8 @@ impl Browser {
     /// The file cannot be written.
     pub fn picture(&self, path: &Path) {
         let size = self.run("return [document.documentElement.scrollWidth, document.documentElement.scrollHeight]");
-        let clip = json!({ "x": 0, "y": 0, "width": size[0], "height": size[1].as_f64().unwrap_or(0.0).min(6000.0), "scale": 1 });
+        let clip = json!({ "x": 0, "y": 0, "width": size[0], "height": size[1].as_f64().unwrap_or(0.0).min(6000.0),
+            "scale": 1 });
         let shot = json!({ "format": "png", "captureBeyondViewport": true, "clip": clip });
         let data = self.devtools("Page.captureScreenshot", &shot);
         std::fs::write(path, unbase64(data["data"].as_str().unwrap_or_default())).expect("writable");

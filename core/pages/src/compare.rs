@@ -32,17 +32,20 @@ pub(crate) fn page(site: &Site, id: &str, links: &Links) -> Result<Markup, Pages
         p {
             @match links.of("day", &row.id) { Some(to) => a href=(to) { (row.id) }, None => (row.id) } ": "
             @if failing.is_empty() {
-                strong class="good-word" { "passes" } ": what the model leaves is the noise of the mission, in every band of every channel."
+                strong class="good-word" { "passes" } ": what the model leaves is the noise of the mission, in every \
+                    band of every channel."
             } @else {
                 strong class="bad-word" { "fails" } " in " (failing.join(", ")) "."
             }
             " A sound model fails in each channel with a probability of " (found.false_alarm) "."
         }
         h2 { "Power of the residual over that of the noise" }
-        p class="quiet" { "1 where the model is right. Groups of bands, a sixth of a decade wide, from low to high frequency; a group is framed with any of its bands." }
+        p class="quiet" { "1 where the model is right. Groups of bands, a sixth of a decade wide, from low to high \
+            frequency; a group is framed with any of its bands." }
         (map(&found))
         h2 { "Spectrum" }
-        p class="quiet" { "Solid: measured. Dashed: the declared noise; 95 of 100 measured values lie in the band about it." }
+        p class="quiet" { "Solid: measured. Dashed: the declared noise; 95 of 100 measured values lie in the band \
+            about it." }
         label class="pick" { "Channel " select id="channel" { @for c in &found.channels { option { (c.name) } } } }
         div class="plot tall" id="spectrum" {}
         (data("residuals", &for_script(&found)))

@@ -36,9 +36,11 @@ pub(crate) fn page(site: &Site, id: &str, links: &Links) -> Result<Markup, Pages
         (quality(&product))
         (next(site, &row, &product, has_extract, links))
         h2 { "Where it comes from" }
-        p { "Inputs on the left, the product, and what came of it on the right. Numbers are the starts of SHA-256 digests." }
+        p { "Inputs on the left, the product, and what came of it on the right. Numbers are the starts of SHA-256 \
+            digests." }
         (picture(&pictures::lineage(&lineage)?, "What the product was made of, and what was made of it"))
-        (command(&format!("dragfree products lineage {}{}\ndragfree products rebuild {}{}", row.id, site.setup.flags, row.id, site.setup.flags)))
+        (command(&format!("dragfree products lineage {}{}\ndragfree products rebuild {}{}", row.id, site.setup.flags,
+            row.id, site.setup.flags)))
     };
     let lead = "Read the coloured sentence first: it says whether to use the values below.";
     Ok(whole(links, "Day", &row.id, lead, &body))
@@ -78,7 +80,8 @@ fn advice(row: &Row, product: &Product, diagnosed: bool, named: &[String]) -> (&
             "bad",
             "Do not use it yet.",
             format!(
-                "The diagnosis names an effect that the model lacks: {what}. It moves the offset; the page on missing physics shows by how much."
+                "The diagnosis names an effect that the model lacks: {what}. It moves the offset; the page on missing \
+                    physics shows by how much."
             ),
         );
     }
@@ -173,10 +176,12 @@ fn next(site: &Site, row: &Row, product: &Product, has_extract: bool, links: &Li
             }
         }
         @if !has_extract && product.model.fixed_from.is_none() {
-            p { "This product was not diagnosed yet. The diagnosis reads the telemetry once; after it effects can be switched on here:" }
+            p { "This product was not diagnosed yet. The diagnosis reads the telemetry once; after it effects can be \
+                switched on here:" }
             (command(&format!("dragfree diagnose {id} --keep-extract{flags}")))
         }
         p { "It holds for a time once it is certified:" }
-        (command(&format!("dragfree products certify {id} --from {}{flags}", product.header.non_standard_attributes.day)))
+        (command(&format!("dragfree products certify {id} --from {}{flags}",
+            product.header.non_standard_attributes.day)))
     }
 }

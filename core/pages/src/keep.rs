@@ -43,7 +43,8 @@ impl Site {
         }
         lines.push(format!("dragfree ladder {first} NEW-PRODUCT{flags}"));
         html! {
-            p { "Kept: the model is revision " strong { (revision) } " now, before it " (added.before) ". These commands prove it on the data:" }
+            p { "Kept: the model is revision " strong { (revision) } " now, before it " (added.before)
+                ". These commands prove it on the data:" }
             (command(&lines.join("\n")))
         }
     }

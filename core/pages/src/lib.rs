@@ -2,6 +2,7 @@
 //!
 //! The pages say what [`dragfree_workflow`] answers, and compute nothing themselves.
 
+mod address;
 mod compare;
 mod day;
 mod guard;

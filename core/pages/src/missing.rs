@@ -41,7 +41,8 @@ fn diagnosed(site: &Site) -> Result<Vec<Row>, PagesError> {
 fn nothing(site: &Site) -> Result<Markup, PagesError> {
     let newest = site.archive()?.newest()?.pop().map_or_else(|| "PRODUCT".to_owned(), |entry| entry.row.id);
     Ok(html! {
-        p { "No product was diagnosed yet. A diagnosis reads the telemetry of a product once and keeps what the switches need:" }
+        p { "No product was diagnosed yet. A diagnosis reads the telemetry of a product once and keeps what the \
+            switches need:" }
         (command(&format!("dragfree diagnose {newest} --keep-extract{}", site.setup.flags)))
     })
 }
@@ -118,7 +119,8 @@ fn days(site: &Site, query: &Query, links: &Links) -> Result<Markup, PagesError>
     Ok(html! {
         details class="choose" open[same.len() <= 4] {
             summary { (summary) }
-            p class="quiet" { "Days of one model, " (model.unwrap_or_default()) ". A day that is kept out tests what the others say." }
+            p class="quiet" { "Days of one model, " (model.unwrap_or_default())
+                ". A day that is kept out tests what the others say." }
             table {
                 thead { tr { th { "product" } th { "in the fit" } th { "kept out" } th { "not used" } } }
                 tbody { @for row in &same { tr {
@@ -139,7 +141,8 @@ fn days(site: &Site, query: &Query, links: &Links) -> Result<Markup, PagesError>
             }
             @if !others.is_empty() {
                 p { "Diagnosed with another model: "
-                    @for row in &others { a href={ "/missing?products=" (row.id) } { (row.day) " " (row.model.as_deref().unwrap_or_default()) } " " } }
+                    @for row in &others { a href={ "/missing?products=" (row.id) } { (row.day) " "
+                        (row.model.as_deref().unwrap_or_default()) } " " } }
             }
         }
     })
@@ -175,7 +178,8 @@ fn said(refit: &Refit) -> Markup {
             ". "
             @if let Some((before, after, by)) = most {
                 (before.name) " moves from " (value(before.value_m, before.sigma_m, "m")) " to "
-                strong { (value(after.value_m, after.sigma_m, "m")) } ", by " (format!("{:.1} σ", (by / before.sigma_m).abs())) "."
+                strong { (value(after.value_m, after.sigma_m, "m")) } ", by " (format!("{:.1} σ", (by /
+                    before.sigma_m).abs())) "."
             }
         }
     }
@@ -198,7 +202,8 @@ fn offsets(refit: &Refit, truth: &dyn Fn(&str) -> Option<f64>) -> Markup {
                 td class="figure" { (value(before.value_m, before.sigma_m, "m")) }
                 td class="figure main" { (value(after.value_m, after.sigma_m, "m")) }
                 td class="figure" {
-                    @if by.abs() > TOLD_SIGMAS * before.sigma_m { (if by > 0.0 { "↑ " } else { "↓ " }) (millimetres(by)) }
+                    @if by.abs() > TOLD_SIGMAS * before.sigma_m { (if by > 0.0 { "↑ " } else { "↓ " })
+                        (millimetres(by)) }
                     @else { "–" }
                 }
                 @if known {
@@ -240,7 +245,8 @@ fn switches(basis: &Basis, refit: &Refit, query: &Query, links: &Links) -> Marku
         }
         div class="scroll" tabindex="0" { table id="effects" {
             thead { tr {
-                th { "on" } th { "effect" } th { "size" } th { "χ² falls by" } th { "chance" } th { "without it the offset is wrong by" }
+                th { "on" } th { "effect" } th { "size" } th { "χ² falls by" } th { "chance" } th {
+                    "without it the offset is wrong by" }
             } }
             tbody { @for effect in &refit.effects {
                 @let certain = effect.p_value < basis.false_alarm() && !effect.out_of_range;
@@ -256,7 +262,8 @@ fn switches(basis: &Basis, refit: &Refit, query: &Query, links: &Links) -> Marku
                     }
                     td {
                         strong { (effect.name) }
-                        @if effect.named { " " span class="mark" title="a diagnosis of one of these days names it" { "named" } }
+                        @if effect.named { " " span class="mark" title="a diagnosis of one of these days names it" {
+                            "named" } }
                         @if effect.is_noise { " " span class="mark" { "noise" } }
                         @for (key, shape) in &effect.shape { br; span class="quiet" { (key) " = " (shape) } }
                         @if !effect.channels.is_empty() {
@@ -266,20 +273,24 @@ fn switches(basis: &Basis, refit: &Refit, query: &Query, links: &Links) -> Marku
                             details { summary { "these data cannot tell it from " (effect.confounders.len()) " others" }
                                 ul { @for other in &effect.confounders { li {
                                     (other.name) ": χ² would be " (format!("{:.1}", other.chi2)) " higher; five σ need "
-                                    (times(25.0 / other.chi2.max(1e-3))) " the data, or a manoeuvre (dragfree diagnose --next)"
+                                    (times(25.0 / other.chi2.max(1e-3)))
+                                        " the data, or a manoeuvre (dragfree diagnose --next)"
                                 } } }
                             }
                         }
                     }
-                    td class="figure" { @for size in &effect.coefficients { (value(size.value, size.sigma, &size.unit)) br; } }
+                    td class="figure" { @for size in &effect.coefficients { (value(size.value, size.sigma,
+                        &size.unit)) br; } }
                     td class="figure" { (format!("{:.1}", effect.delta_chi2)) }
                     td class="figure" {
                         (chance(effect.log10_p_value))
-                        @if effect.out_of_range { br; span class="quiet" { "its best size lies outside its physical range" } }
+                        @if effect.out_of_range { br; span class="quiet" {
+                            "its best size lies outside its physical range" } }
                     }
                     td class="figure" {
                         @if effect.is_noise { span class="quiet" { "nothing: the levels are fitted in these sums" } }
-                        @for (name, shift) in effect.offset_shift_m.iter().filter(|(n, s)| s.abs() > TOLD_SIGMAS * sigma(n)) {
+                        @for (name, shift) in effect.offset_shift_m.iter().filter(|(n, s)| s.abs() > TOLD_SIGMAS *
+                            sigma(n)) {
                             (crate::pictures::tail(name)) " " (millimetres(*shift)) br;
                         }
                     }
@@ -311,16 +322,19 @@ fn keep(site: &Site, refit: &Refit, links: &Links) -> Markup {
         @if on.is_empty() {
             p { "Switch on an effect first: then it can be added to the model as a new revision." }
         } @else {
-            p { "Adds " (on.iter().map(|e| e.name.as_str()).collect::<Vec<_>>().join(", ")) " to the model as a new revision. The same as:" }
+            p { "Adds " (on.iter().map(|e| e.name.as_str()).collect::<Vec<_>>().join(", "))
+                " to the model as a new revision. The same as:" }
             (command(&commands(site, &on).join("\n")))
             @if links.allows_changes() && site.setup.model.is_some() {
                 form id="keep" {
-                    label { "Token, printed where the server was started " input id="token" type="password" autocomplete="off" size="34"; }
+                    label { "Token, printed where the server was started " input id="token" type="password"
+                        autocomplete="off" size="34"; }
                     button type="submit" { "Keep" }
                 }
                 div id="kept" role="status" {}
             } @else if !links.is_file() {
-                p class="quiet" { "This server only reads. With --model FILE --allow-changes it keeps effects at the press of a button." }
+                p class="quiet" { "This server only reads. With --model FILE --allow-changes it keeps effects at the \
+                    press of a button." }
             }
         }
     }
@@ -330,12 +344,15 @@ fn limits(basis: &Basis, refit: &Refit) -> Markup {
     html! {
         h2 { "What these numbers are" }
         p {
-            "Every number above was solved for just now from what the diagnoses of " (refit.products.len() + refit.held_out.len())
-            " products have kept: " (grouped(refit.numbers as u64)) " whitened innovations in the fit. The likelihood is a quadratic form about "
+            "Every number above was solved for just now from what the diagnoses of " (refit.products.len() +
+                refit.held_out.len())
+            " products have kept: " (grouped(refit.numbers as u64))
+                " whitened innovations in the fit. The likelihood is a quadratic form about "
             "the model alone; levels of noise are fitted day by day. A run with the kept model has the last word."
         }
         p {
-            "Spectra by band, χ² of single channels, other forms of an effect (lags, resonances) and new formulas are not in these sums: they need the "
+            "Spectra by band, χ² of single channels, other forms of an effect (lags, resonances) and new formulas are \
+                not in these sums: they need the "
             "telemetry (" code { "dragfree compare" } ", " code { "dragfree diagnose" } ")."
         }
         @if !basis.not_tried().is_empty() {

@@ -100,9 +100,10 @@ pub(crate) fn page(site: &Site, _query: &Query, links: &Links) -> Result<Markup,
         @for ((spacecraft, name), days) in &series { (of_series(site, spacecraft, name, days)) }
         h2 { "What runs, and what is due" }
         p { "These commands say which days would come out otherwise now, and calibrate them:" }
-        (command(&format!("dragfree products stale\ndragfree catch-up\ndragfree watch")))
+        (command("dragfree products stale\ndragfree catch-up\ndragfree watch"))
     };
-    let lead = "Look for days with ✗ or ! and open them; on a day with ✓ the two solutions agree, and its page says whether to use it.";
+    let lead = "Look for days with ✗ or ! and open them; on a day with ✓ the two solutions agree, and its page says \
+        whether to use it.";
     Ok(whole(links, "Mission", "Mission", lead, &body))
 }
 

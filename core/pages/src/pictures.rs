@@ -99,7 +99,8 @@ pub(crate) fn ladder(refit: &Refit, truth: &dyn Fn(&str) -> Option<f64>) -> Mark
             text class="quiet" x=(names + plot + 10.0) y="38" { "χ² falls by" }
             @for n in (-5..=5).map(f64::from) {
                 @if n.abs() * tick <= 1.04 * reach {
-                    line class=(if n == 0.0 { "axis" } else { "grid" }) x1=(x(n * tick)) x2=(x(n * tick)) y1=(EDGES[0] - 4.0) y2=(bottom) {}
+                    line class=(if n == 0.0 { "axis" } else { "grid" }) x1=(x(n * tick)) x2=(x(n * tick))
+                        y1=(EDGES[0] - 4.0) y2=(bottom) {}
                     text class="quiet middle" x=(x(n * tick)) y=(bottom + 14.0) { (plain(n * tick)) }
                 }
             }
@@ -115,7 +116,8 @@ pub(crate) fn ladder(refit: &Refit, truth: &dyn Fn(&str) -> Option<f64>) -> Mark
                     circle class=(format!("c{} dot", k % 6)) cx=(x(*value)) cy=(y) r="4" {}
                 }
                 @if rung.added.is_some() {
-                    text x=(names + plot + 10.0) y=(top + 0.5 * high(step.len()) - 4.0) { (format!("{:.1}", rung.fall)) " in the fit" }
+                    text x=(names + plot + 10.0) y=(top + 0.5 * high(step.len()) - 4.0) { (format!("{:.1}",
+                        rung.fall)) " in the fit" }
                     @if held_out {
                         text x=(names + plot + 10.0) y=(top + 0.5 * high(step.len()) + 13.0) {
                             (format!("{:.1}", rung.held_out_fall.unwrap_or(0.0))) " kept out"

@@ -19,7 +19,8 @@ pub(crate) fn page(site: &Site, links: &Links) -> Result<Markup, PagesError> {
             }
         }
         h2 { "Loaded" }
-        p { (all.len()) " plugins. A product names each by the digest of its library, so that a day can be made again with the very same ones." }
+        p { (all.len()) " plugins. A product names each by the digest of its library, so that a day can be made again \
+            with the very same ones." }
         @for found in &all {
             @let manifest = &found.info.manifest;
             details class="plugin" {
@@ -34,7 +35,8 @@ pub(crate) fn page(site: &Site, links: &Links) -> Result<Markup, PagesError> {
                 }
                 @if !manifest.parameters.is_empty() {
                     div class="scroll" tabindex="0" { table {
-                        thead { tr { th { "parameter" } th { "default" } th { "unit" } th { "range" } th { "meaning" } } }
+                        thead { tr { th { "parameter" } th { "default" } th { "unit" } th { "range" } th { "meaning"
+                            } } }
                         tbody { @for p in &manifest.parameters { tr {
                             td { code { (p.name) } }
                             td { (p.default) }

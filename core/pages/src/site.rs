@@ -1,4 +1,4 @@
-//! The pages by their addresses, for the server and for a report alike.
+//! An archive as the pages see it: what they are asked, and what they read once.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
@@ -7,9 +7,8 @@ use dragfree_archive::{Archive, Written};
 use dragfree_workflow::refit::{Asked, Basis, Refit};
 use serde::Deserialize;
 
-use crate::layout::Links;
+use crate::PagesError;
 use crate::setup::Setup;
-use crate::{PagesError, compare, day, missing, mission, plugins, trends};
 
 /// Bases that are kept in memory: a colleague may look at other days. One of 30 days takes some ten megabytes.
 const BASES: usize = 4;
@@ -50,33 +49,6 @@ impl Site {
     /// Pages of an archive.
     pub fn new(setup: Setup) -> Self {
         Self { setup, bases: Mutex::default() }
-    }
-
-    /// A page by its path, `/day/ID`, as HTML.
-    ///
-    /// # Errors
-    /// [`PagesError`]: there is no such page, or what it shows cannot be computed.
-    pub fn page(&self, path: &str, query: &Query, links: &Links) -> Result<String, PagesError> {
-        let parts: Vec<&str> = path.trim_matches('/').split('/').collect();
-        let page = match parts[..] {
-            [""] => mission::page(self, query, links),
-            ["trends"] => trends::page(self, query, links),
-            ["day", id] => day::page(self, id, links),
-            ["compare"] => compare::newest(self, links),
-            ["compare", id] => compare::page(self, id, links),
-            ["missing"] => missing::page(self, query, links),
-            ["plugins"] => plugins::page(self, links),
-            _ => Err(PagesError::NoPage(path.to_owned())),
-        };
-        Ok(page?.into_string())
-    }
-
-    /// The part of the page on missing physics that the switches change.
-    ///
-    /// # Errors
-    /// [`PagesError`]: the switches cannot be set so.
-    pub fn refit_part(&self, query: &Query, links: &Links) -> Result<String, PagesError> {
-        Ok(missing::part(self, query, links)?.into_string())
     }
 
     /// What the switches of an address give.

@@ -76,8 +76,10 @@ fn panel(before: &Rung, after: &Rung, plane: &Plane, truth: &dyn Fn(&str) -> Opt
     let moved = (from[0] - to[0]).hypot(from[1] - to[1]) > 0.04 * reach;
     let label = format!("{}: offset with its 95 % ellipse before and after, in millimetres", plane.body);
     html! {
-        svg class="drawn ellipse" role="img" aria-label=(label) viewBox=(format!("0 0 {} {}", SIDE + EDGE + 12.0, SIDE + 66.0)) {
-            defs { marker id="arrow" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8" orient="auto" {
+        svg class="drawn ellipse" role="img" aria-label=(label) viewBox=(format!("0 0 {} {}", SIDE + EDGE + 12.0,
+            SIDE + 66.0)) {
+            defs { marker id="arrow" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8"
+                orient="auto" {
                 path class="head" d="M0 0 8 4 0 8z" {}
             } }
             text class="name" x=(EDGE) y="15" { (tail(&plane.body)) }
@@ -94,12 +96,15 @@ fn panel(before: &Rung, after: &Rung, plane: &Plane, truth: &dyn Fn(&str) -> Opt
             polygon class="before" points=(path(&outlines[0])) {}
             polygon class="after" points=(path(&outlines[1])) {}
             @if moved {
-                line class="arrow" x1=(x(from[0])) y1=(y(from[1])) x2=(x(to[0])) y2=(y(to[1])) marker-end="url(#arrow)" {}
+                line class="arrow" x1=(x(from[0])) y1=(y(from[1])) x2=(x(to[0])) y2=(y(to[1]))
+                    marker-end="url(#arrow)" {}
             }
             @if let Some(t) = true_mm {
-                path class="truth" d=(format!("M{0:.1} {2:.1}L{1:.1} {3:.1}M{0:.1} {3:.1}L{1:.1} {2:.1}", x(t[0]) - 5.0, x(t[0]) + 5.0, y(t[1]) - 5.0, y(t[1]) + 5.0)) {}
+                path class="truth" d=(format!("M{0:.1} {2:.1}L{1:.1} {3:.1}M{0:.1} {3:.1}L{1:.1} {2:.1}", x(t[0]) -
+                    5.0, x(t[0]) + 5.0, y(t[1]) - 5.0, y(t[1]) + 5.0)) {}
             }
-            text class="quiet middle" x=(EDGE + 0.5 * SIDE) y=(SIDE + 58.0) { (tail(name_a)) " and, upwards, " (tail(name_b)) ", mm" }
+            text class="quiet middle" x=(EDGE + 0.5 * SIDE) y=(SIDE + 58.0) { (tail(name_a)) " and, upwards, "
+                (tail(name_b)) ", mm" }
         }
     }
 }

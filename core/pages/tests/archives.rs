@@ -103,8 +103,8 @@ fn names_with_html_are_shown_as_text() {
     assert!(shown > 8, "the texts are there: {shown}");
 }
 
-/// The first page is made within 300 ms, with a cell for every day. `DRAGFREE_DAYS=3000` asks it of more days, which take
-/// minutes to archive.
+/// The first page is made within 300 ms, with a cell for every day. `DRAGFREE_DAYS=3000` asks it of more days, which
+/// take minutes to archive.
 #[test]
 #[allow(clippy::print_stdout, reason = "VALIDATION.md has this line")]
 fn many_days_are_shown_at_once() {

@@ -356,8 +356,8 @@ impl Day {
         sum
     }
 
-    /// By how much −2 log of the likelihood falls with a level of noise as some days have it: this day's own estimate is
-    /// a Gaussian about its value.
+    /// By how much −2 log of the likelihood falls with a level of noise as some days have it: this day's own estimate
+    /// is a Gaussian about its value.
     fn fall_with(&self, level: &NoiseLevel) -> f64 {
         let own = self.levels.iter().find(|l| l.coefficient == level.coefficient && l.sigma > 0.0);
         own.map_or(0.0, |l| (l.ln.powi(2) - (l.ln - level.ln).powi(2)) / l.sigma.powi(2))

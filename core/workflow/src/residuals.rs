@@ -1,6 +1,6 @@
-//! Where a product's model fails, from the normal equations by band that lie beside it: what each channel leaves in each
-//! band, over the noise that the mission declares. No telemetry is read, so there are no hours: [`crate::compare`] has
-//! them.
+//! Where a product's model fails, from the normal equations by band that lie beside it: what each channel leaves in
+//! each band, over the noise that the mission declares. No telemetry is read, so there are no hours, which
+//! [`crate::compare`] has.
 
 use std::ops::Range;
 
