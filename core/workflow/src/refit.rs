@@ -10,7 +10,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use dragfree_archive::Written;
 use dragfree_engine::registry::Registry;
 use dragfree_identification::diagnosis::Trials;
-use dragfree_identification::innovations::decision::{Candidate, Prior, Quadratic};
+use dragfree_identification::innovations::decision::{Candidate, Prior, Quadratic, inverse};
 use dragfree_identification::innovations::filter::Sums;
 use dragfree_schema::{Coefficient, Settings, Shape};
 use nalgebra::{DMatrix, DVector};
@@ -24,6 +24,9 @@ use crate::likelihood::{CoefficientSums, Decided, Meaning, joined};
 
 /// Effects that are not switched on are told as far as this rank: what comes after explains nothing.
 const TOLD: usize = 40;
+
+/// Of these the first are told with what their absence does and what they are confounded with.
+const EXPLAINED: usize = 12;
 
 /// Below this fall of χ² two effects cannot be told apart: three σ.
 const ALIKE_CHI2: f64 = 9.0;
@@ -427,21 +430,62 @@ impl Solving<'_> {
     /// Effects that are on, then the others by significance; and how many more there are.
     fn effects(&self, on: &[On]) -> (Vec<Effect>, usize) {
         let set = effects_of(on);
-        let usable = |c: &usize| !set.contains(c) && self.quadratic.observable(*c, &set);
-        let off = (0..self.basis.switches.len()).filter(usable).map(On::Effect);
         let levels = (0..self.levels.len()).map(On::Level).filter(|level| !on.contains(level));
+        let (likely, unlikely) = self.likely(&set);
+        let off = likely.into_iter().filter(|c| self.quadratic.observable(*c, &set)).map(On::Effect);
         let mut off: Vec<(On, Effect)> = off.chain(levels).map(|o| (o, self.effect(o, &set))).collect();
-        off.sort_by(|(_, a), (_, b)| {
+        let by_evidence = |a: &Effect, b: &Effect| {
             a.log10_p_value.total_cmp(&b.log10_p_value).then(b.delta_chi2.total_cmp(&a.delta_chi2))
-        });
-        let not_told = off.len().saturating_sub(TOLD);
+        };
+        off.sort_by(|(_, a), (_, b)| by_evidence(a, b));
+        let not_told = unlikely + off.len().saturating_sub(TOLD);
         off.truncate(TOLD);
         let mut all: Vec<(On, Effect)> =
             on.iter().map(|o| (*o, Effect { on: true, ..self.effect(*o, &set) })).collect();
         all.extend(off);
         let told: Vec<usize> = all.iter().filter_map(|(o, _)| o.switch()).collect();
-        let told = all.into_iter().map(|(o, effect)| self.with_consequences(o, effect, &set, &told));
-        (told.collect(), not_told)
+        let (now, _) = self.quadratic.solution(&set);
+        let explained = on.len() + EXPLAINED;
+        let consequences = |(k, (o, effect)): (usize, (On, Effect))| {
+            if k < explained { self.with_consequences(o, effect, (&set, &now), &told) } else { effect }
+        };
+        (all.into_iter().enumerate().map(consequences).collect(), not_told)
+    }
+
+    /// The candidates beside a set that explain most for their number of coefficients, ranges aside, and how many there
+    /// are besides. The exact numbers of all would take most of the time.
+    fn likely(&self, set: &[usize]) -> (Vec<usize>, usize) {
+        let (information, score) = self.quadratic.of_candidates();
+        let mut first = 0;
+        let places: Vec<Vec<usize>> = self
+            .basis
+            .candidates
+            .iter()
+            .map(|c| {
+                let own = (first..first + c.parameters.len()).collect();
+                first += c.parameters.len();
+                own
+            })
+            .collect();
+        let at: Vec<usize> = set.iter().flat_map(|c| places[*c].iter().copied()).collect();
+        let of = |rows: &[usize], columns: &[usize]| {
+            DMatrix::from_fn(rows.len(), columns.len(), |i, j| information[(rows[i], columns[j])])
+        };
+        let score = |rows: &[usize]| DVector::from_fn(rows.len(), |i, _| score[rows[i]]);
+        let inner = inverse(&of(&at, &at));
+        let gain = |c: usize| {
+            let own = &places[c];
+            let along = of(own, &at) * &inner;
+            let left = score(own) - &along * score(&at);
+            let known = of(own, own) - &along * of(&at, own);
+            left.dot(&(inverse(&known) * &left)) - own.len() as f64
+        };
+        let off = (0..places.len()).filter(|c| !set.contains(c));
+        let mut all: Vec<(usize, f64)> = off.map(|c| (c, gain(c))).collect();
+        all.sort_by(|a, b| b.1.total_cmp(&a.1));
+        let unlikely = all.len().saturating_sub(TOLD);
+        all.truncate(TOLD);
+        (all.into_iter().map(|(c, _)| c).collect(), unlikely)
     }
 
     fn effect(&self, which: On, set: &[usize]) -> Effect {
@@ -510,11 +554,14 @@ impl Solving<'_> {
     }
 
     /// With what its absence does to the offsets, and what these data cannot tell from it.
-    fn with_consequences(&self, which: On, effect: Effect, set: &[usize], told: &[usize]) -> Effect {
+    /// `now` are the set that is on and its solution.
+    fn with_consequences(&self, which: On, effect: Effect, now: (&[usize], &DVector<f64>), told: &[usize]) -> Effect {
         let Some(c) = which.switch() else { return effect };
-        let without: Vec<usize> = set.iter().copied().filter(|other| *other != c).collect();
-        let with: Vec<usize> = without.iter().copied().chain([c]).collect();
-        let [with, without] = [with, without].map(|set| self.quadratic.solution(&set).0);
+        let (set, now) = now;
+        let others: Vec<usize> = set.iter().copied().filter(|other| *other != c).collect();
+        let toggled = if effect.on { others } else { [&others[..], &[c]].concat() };
+        let (toggled, _) = self.quadratic.solution(&toggled);
+        let (with, without) = if effect.on { (now, &toggled) } else { (&toggled, now) };
         let shift = |i: usize| (self.basis.coefficients[i].name.clone(), without[i] - with[i]);
         // What is not there has nothing that it could be confounded with.
         let is_there = effect.on || effect.p_value < self.basis.settings.false_alarm;
