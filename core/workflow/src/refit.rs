@@ -23,7 +23,7 @@ use crate::extract::{Extract, levels_of_all, of_products, shared, trials};
 use crate::likelihood::{CoefficientSums, Decided, Meaning, joined};
 
 /// Effects that are not switched on are told as far as this rank: what comes after explains nothing.
-const TOLD: usize = 40;
+const TOLD: usize = 24;
 
 /// Of these the first are told with what their absence does and what they are confounded with.
 const EXPLAINED: usize = 12;
