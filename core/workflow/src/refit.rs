@@ -23,10 +23,10 @@ use crate::extract::{Extract, levels_of_all, of_products, shared, trials};
 use crate::likelihood::{CoefficientSums, Decided, Meaning, joined};
 
 /// Effects that are not switched on are told as far as this rank: what comes after explains nothing.
-const TOLD: usize = 24;
+const TOLD: usize = 16;
 
 /// Of these the first are told with what their absence does and what they are confounded with.
-const EXPLAINED: usize = 12;
+const EXPLAINED: usize = 8;
 
 /// Below this fall of χ² two effects cannot be told apart: three σ.
 const ALIKE_CHI2: f64 = 9.0;
