@@ -1,5 +1,6 @@
 //! Shared by the whole-program tests: the built program, its plugins, the repository's fixtures.
 
+pub mod browser;
 pub mod calibration;
 pub mod foreign;
 pub mod recording;

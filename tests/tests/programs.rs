@@ -44,3 +44,4 @@ mod replayed_law;
 mod settings;
 mod threads;
 mod traps;
+mod workbench;

@@ -162,6 +162,22 @@ impl Archive {
         self.catalogue.products("p.id = ?1", [id])?.pop().ok_or_else(|| self.missing(id))
     }
 
+    /// What the catalogue says of all products, by spacecraft, day, name, release and revision. No file is looked at.
+    ///
+    /// # Errors
+    /// The catalogue cannot be read.
+    pub fn rows(&self) -> Result<Vec<Row>, ArchiveError> {
+        self.catalogue.products("1", [])
+    }
+
+    /// The same of products that have a file with this suffix beside them and are not withdrawn.
+    ///
+    /// # Errors
+    /// The catalogue cannot be read.
+    pub fn rows_with(&self, suffix: &str) -> Result<Vec<Row>, ArchiveError> {
+        self.catalogue.products("w.reason IS NULL AND p.id IN (SELECT id FROM files WHERE suffix = ?1)", [suffix])
+    }
+
     /// Products that fit, and what is wrong in the folder. A file that does not look as it was archived is compared
     /// with its digest.
     ///

@@ -6,6 +6,7 @@ use crate::utc;
 use chrono::NaiveDate;
 use clap::{ArgAction, Args, Parser, Subcommand, ValueEnum};
 use dragfree_workflow::operations::Operations;
+use std::net::SocketAddr;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 
@@ -117,6 +118,10 @@ pub(crate) enum Command {
     Model(Model),
     /// The error from model revision to revision, on days of the fit and on days kept out of it
     Ladder(Ladder),
+    /// The workbench: pages in a browser, served on this machine
+    Serve(Serve),
+    /// The workbench's pages of one product as files, for a mail or a folder on the web
+    Report(Report),
     /// Print what completes this command line in a shell
     Completions {
         /// Shell
@@ -338,6 +343,46 @@ impl Archive {
     pub(crate) fn operations(&self) -> Result<Option<Operations>, Failure> {
         if self.named.is_some() { Ok(None) } else { operations::nearest(self.ops.as_deref()) }
     }
+}
+
+/// What the pages of the workbench are made from.
+#[derive(Debug, Args)]
+pub(crate) struct Bench {
+    #[command(flatten)]
+    pub(crate) archive: Archive,
+    /// Model file that "Keep" adds effects to [default: that of mission-ops.toml]
+    #[arg(long, value_name = "FILE")]
+    pub(crate) model: Option<PathBuf>,
+    /// Mission file that effects are tried with before they are kept [default: that of mission-ops.toml]
+    #[arg(long, value_name = "FILE")]
+    pub(crate) mission: Option<PathBuf>,
+    /// Truth of a simulation whose seal is open, `DIR/truth/NAME.mcap`, to be laid over
+    #[arg(long, value_name = "FILE")]
+    pub(crate) truth: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Serve {
+    #[command(flatten)]
+    pub(crate) bench: Bench,
+    /// Address; one of another machine's reach needs the token for reading too. Port 0 takes a free one
+    #[arg(long, value_name = "ADDRESS:PORT", default_value = "127.0.0.1:7035")]
+    pub(crate) listen: SocketAddr,
+    /// Let pages change the model, with the token that is printed at the start. Without it they only read
+    #[arg(long)]
+    pub(crate) allow_changes: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct Report {
+    /// Product, by its id or its day
+    #[arg(value_name = "PRODUCT")]
+    pub(crate) product: String,
+    /// Folder for the pages
+    #[arg(long, value_name = "DIR")]
+    pub(crate) out: PathBuf,
+    #[command(flatten)]
+    pub(crate) bench: Bench,
 }
 
 /// Days of an archive.

@@ -304,6 +304,11 @@ impl<'a> BandNoise<'a> {
         };
         Self { model, mean: plan.bands.iter().map(mean).collect() }
     }
+
+    /// Mean over the bins of a band, channels × channels.
+    pub fn mean(&self, band: usize) -> &DMatrix<f64> {
+        &self.mean[band]
+    }
 }
 
 #[cfg(test)]

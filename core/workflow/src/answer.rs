@@ -51,7 +51,7 @@ impl Evidence<'_> {
     }
 
     /// What acts once was searched for at every time, and what acts at one frequency at every frequency.
-    fn family<'b>(&self, effect: &'b str) -> &'b str {
+    pub(crate) fn family<'b>(&self, effect: &'b str) -> &'b str {
         let has = |name| has_parameter(self.registry, effect, name);
         match (has(AT_NS), has(FREQUENCY_HZ)) {
             (true, _) => TRANSIENT,

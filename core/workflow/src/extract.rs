@@ -137,6 +137,16 @@ impl Extract {
         }
     }
 
+    /// Effect and instance of what this product alone says is missing.
+    pub(crate) fn named(&self) -> &[(String, String)] {
+        &self.named
+    }
+
+    /// Levels of noise that effects could state.
+    pub(crate) fn levels(&self) -> &[NoiseLevel] {
+        &self.levels
+    }
+
     fn names(&self, c: &Coefficient) -> bool {
         self.named.iter().any(|(effect, instance)| (effect, instance) == (&c.effect, &c.instance))
     }
@@ -175,30 +185,50 @@ fn same(a: &Coefficient, b: &Coefficient) -> bool {
 /// [`WorkflowError`]: an extract is missing, or the products have different models.
 pub fn diagnose_extracts(registry: &Registry, products: &[Written]) -> Result<Diagnosis, WorkflowError> {
     let settings = &products.first().ok_or(WorkflowError::NoProduct)?.product.settings;
-    ManyDays::refuse(products.iter().map(|w| &w.product))?;
-    let extracts: Vec<Extract> = products.iter().map(Extract::read).collect::<Result<_, _>>()?;
-    of_one_model(&extracts)?;
-    let mut trials = Trials::default();
-    extracts.iter().for_each(|e| trials.add(&e.trials));
-    let evidence = Evidence { trials, least: settings.false_alarm, registry, products, proposals: Vec::new() };
-    let days = |c: &Coefficient| extracts.iter().filter(|e| e.coefficients.iter().any(|own| same(own, c))).count();
-    let several = |c: &Coefficient| days(c) > 1 || extracts.len() == 1;
-    let of_day = |e: &Extract| e.sums(|c| e.names(c) || several(c));
-    let mut not_tried: BTreeMap<String, String> = BTreeMap::new();
-    for e in &extracts {
-        not_tried.extend(e.not_tried.iter().cloned());
-        for c in e.coefficients.iter().filter(|c| !e.names(c) && !several(c)) {
-            let why = "its form is another on every day: a diagnosis with the telemetry chooses one for all days";
-            not_tried.insert(format!("{}:{}", c.effect, c.instance), why.to_owned());
-        }
-    }
-    let decided = joined(extracts.iter().map(of_day).collect(), settings, &evidence, Vec::new());
+    let extracts = of_products(products)?;
+    let evidence =
+        Evidence { trials: trials(&extracts), least: settings.false_alarm, registry, products, proposals: Vec::new() };
+    let (sums, mut not_tried) = shared(&extracts);
+    let decided = joined(sums, settings, &evidence, Vec::new());
     let unobservable = decided.selection.unobservable.iter().map(|c| decided.candidates[*c].name());
     not_tried.extend(unobservable.map(|name| (name, UNOBSERVABLE.to_owned())));
     let mut diagnosis = answer(settings, &decided, &extracts, &evidence);
     diagnosis.not_tried = not_tried.into_iter().collect();
     contradict(&mut diagnosis, products);
     Ok(diagnosis)
+}
+
+/// The extracts of products of one model.
+///
+/// # Errors
+/// [`WorkflowError`]: an extract is missing, or the products have different models.
+pub(crate) fn of_products(products: &[Written]) -> Result<Vec<Extract>, WorkflowError> {
+    ManyDays::refuse(products.iter().map(|w| &w.product))?;
+    let extracts: Vec<Extract> = products.iter().map(Extract::read).collect::<Result<_, _>>()?;
+    of_one_model(&extracts)?;
+    Ok(extracts)
+}
+
+/// What was tried in all of them.
+pub(crate) fn trials(extracts: &[Extract]) -> Trials {
+    let mut trials = Trials::default();
+    extracts.iter().for_each(|e| trials.add(&e.trials));
+    trials
+}
+
+/// The sums of each that can be added to those of the others, and what could not be tried, with the reason.
+pub(crate) fn shared(extracts: &[Extract]) -> (Vec<CoefficientSums>, BTreeMap<String, String>) {
+    let days = |c: &Coefficient| extracts.iter().filter(|e| e.coefficients.iter().any(|own| same(own, c))).count();
+    let several = |c: &Coefficient| days(c) > 1 || extracts.len() == 1;
+    let mut not_tried: BTreeMap<String, String> = BTreeMap::new();
+    for e in extracts {
+        not_tried.extend(e.not_tried.iter().cloned());
+        for c in e.coefficients.iter().filter(|c| !e.names(c) && !several(c)) {
+            let why = "its form is another on every day: a diagnosis with the telemetry chooses one for all days";
+            not_tried.insert(format!("{}:{}", c.effect, c.instance), why.to_owned());
+        }
+    }
+    (extracts.iter().map(|e| e.sums(|c| e.names(c) || several(c))).collect(), not_tried)
 }
 
 fn of_one_model(extracts: &[Extract]) -> Result<(), WorkflowError> {
@@ -215,22 +245,23 @@ fn of_one_model(extracts: &[Extract]) -> Result<(), WorkflowError> {
 }
 
 /// Levels of several days: means weighted by 1/σ².
-fn levels_of_all(extracts: &[Extract]) -> Vec<NoiseLevel> {
-    let Some(first) = extracts.first() else { return Vec::new() };
+pub(crate) fn levels_of_all(days: &[&[NoiseLevel]]) -> Vec<NoiseLevel> {
+    let Some(first) = days.first() else { return Vec::new() };
     let of = |level: &NoiseLevel| {
-        let own = extracts.iter().flat_map(|e| &e.levels).filter(|l| l.coefficient == level.coefficient);
+        let own = days.iter().copied().flatten().filter(|l| l.coefficient == level.coefficient);
         let known = own.filter(|l| l.sigma > 0.0).map(|l| (l.sigma.powi(-2), l.ln));
         let (weight, sum) = known.fold((0.0, 0.0), |(w, s), (weight, ln)| (w + weight, s + weight * ln));
         (weight > 0.0).then(|| NoiseLevel { ln: sum / weight, sigma: weight.powf(-0.5), ..level.clone() })
     };
-    first.levels.iter().filter_map(of).collect()
+    first.iter().filter_map(of).collect()
 }
 
 fn answer(settings: &Settings, decided: &Decided, extracts: &[Extract], evidence: &Evidence<'_>) -> Diagnosis {
     let of = |accepted: bool| move |f| found(settings, decided, f, evidence, accepted);
     let mut named: Vec<Found> = decided.selection.chosen.iter().map(of(true)).collect();
     let mut others: Vec<Found> = decided.selection.rest.iter().map(of(false)).collect();
-    let levels = with_levels(&mut named, &levels_of_all(extracts), decided, evidence, settings);
+    let levels: Vec<&[NoiseLevel]> = extracts.iter().map(Extract::levels).collect();
+    let levels = with_levels(&mut named, &levels_of_all(&levels), decided, evidence, settings);
     others.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
     let left = |e: &Extract| Some(format!("{} alone: {}", e.product, e.unexplained.as_ref()?));
     let agreement = decided.agreement();

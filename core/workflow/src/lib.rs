@@ -2,6 +2,7 @@
 //! ladder of models. Each takes options, the registry of plugins and a callback for progress, and gives values; none
 //! prints, knows a terminal or asks a clock.
 
+pub mod adding;
 mod answer;
 pub mod calibrate;
 pub mod campaign;
@@ -16,9 +17,12 @@ pub mod next;
 pub mod operations;
 mod proposals;
 pub mod provenance;
+pub mod refit;
 mod replay;
+pub mod residuals;
 mod sums;
 pub mod trend;
+pub mod words;
 
 pub use replay::{Pass, Replay};
 

@@ -118,7 +118,7 @@ pub(crate) struct Decided {
     /// What is known of sums of coefficients before any data.
     surveys: Vec<(Vec<(String, f64)>, Prior)>,
     /// What is known of all sums of parameters before any data.
-    priors: Vec<(Vec<(usize, f64)>, Prior)>,
+    pub(crate) priors: Vec<(Vec<(usize, f64)>, Prior)>,
     /// Sums of each product.
     parts: Vec<Part>,
     /// The likelihood, for what the model would be without one of the chosen.

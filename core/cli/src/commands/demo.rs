@@ -62,7 +62,7 @@ pub(super) fn execute(folder: &Path, global: &Global, paint: Paint) -> Result<Do
     let first = story.newest(DAYS[0])?;
 
     story.say("Is there an effect missing? Every installed one is tried.")?;
-    let found = story.keep(&["diagnose", &first, "--archive", &archive, "--json"], &diagnosis)?;
+    let found = story.keep(&["diagnose", &first, "--archive", &archive, "--keep-extract", "--json"], &diagnosis)?;
     story.show(&summary(&found))?;
 
     story.say(
@@ -107,6 +107,8 @@ pub(super) fn execute(folder: &Path, global: &Global, paint: Paint) -> Result<Do
     let mut text = format!("\nproduct   {}, before it {first}\n", path.display());
     text += &format!("telemetry {}\n          {}\n", telemetry[0], telemetry[1]);
     text += &format!("next      dragfree products show {second} --archive {archive}\n");
+    text += &format!("          dragfree serve --archive {archive} --model {model} --truth {truth}\n");
+    text += "          and open the address that it prints: look at it, and switch the effect on by hand\n";
     text += "          hide another: the same commands with another number behind --hidden\n";
     text += "          open the .mcap files in Foxglove, PlotJuggler or Rerun\n";
     Ok(Done { text, code })

@@ -1,5 +1,6 @@
 //! One function per command; each gives back what belongs on stdout.
 
+mod bench;
 mod campaign;
 mod compare;
 mod days;
@@ -75,6 +76,8 @@ pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failu
         Command::Archive(command) => products::of_archive(command, global.json),
         Command::Model(command) => model::execute(command, global, paint),
         Command::Ladder(command) => ladder::execute(command, global.json, paint),
+        Command::Serve(command) => bench::serve(command, global),
+        Command::Report(command) => bench::report(command, global),
     }
 }
 

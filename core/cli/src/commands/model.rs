@@ -9,9 +9,8 @@ use dragfree_archive::files::IoContext as _;
 use dragfree_archive::files::Problem;
 use dragfree_engine::border::{Kind, Manifest, ParameterType};
 use dragfree_engine::config::{EffectEntry, Model, Prior};
-use dragfree_engine::registry::Found;
 use dragfree_engine::revisions::{self, Change, Committed, Edit, Log, Logged, Place, What};
-use dragfree_engine::validate::{Coefficient, Subject};
+use dragfree_workflow::adding::{self, Addition};
 use serde_json::{Value, json};
 use std::path::Path;
 
@@ -129,51 +128,16 @@ fn add(command: &ModelAdd, global: &Global, paint: Paint) -> Result<Done, Failur
         entry.parameters.insert(name.clone(), parameter(manifest, name, value)?);
     }
     priors(&mut entry, command)?;
-    let coefficients = accepted(&found, &entry, command.mission.as_deref())?;
-    if let Some(candidate) = &diagnosed {
-        start_levels(&mut entry, &coefficients, candidate);
-    }
-    change(&command.model, global, paint, |edit| edit.add(&entry, &comment))
+    let mission = super::validate::mission(command.mission.as_deref())?;
+    let addition = Addition { entry, comment, diagnosed: diagnosed.as_ref().map(values).unwrap_or_default() };
+    let added = adding::add(&command.model, &super::registry(global)?, &mission, &[addition])?;
+    Ok(done(&command.model, &added.before, added.committed.as_ref(), None, global, paint))
 }
 
-/// Asks the effect itself whether it takes the parameters, and whether it has the coefficients that are given a prior;
-/// gives its coefficients, as far as they can be known without telemetry.
-fn accepted(found: &Found, entry: &EffectEntry, mission: Option<&Path>) -> Result<Vec<Coefficient>, Failure> {
-    let mission = super::validate::mission(mission)?;
-    let subject = Subject {
-        opened: &found.opened,
-        plugin: &found.info,
-        mission: &mission,
-        parameters: &entry.parameters,
-        files: &[],
-    };
-    let refused =
-        |error| Failure::from(format!("{error}; tried with the mission {}, --mission names another", mission.name));
-    entry.check_instance(&found.info.manifest, &mission).map_err(refused)?;
-    let announced = subject.coefficients(&entry.instance).map_err(|finding| refused(finding.to_string()))?;
-    let Some(coefficients) = announced else { return Ok(Vec::new()) };
-    let names: Vec<&str> = coefficients.iter().map(short).collect();
-    match entry.prior.keys().find(|name| !names.contains(&name.as_str())) {
-        Some(name) => Err(format!("{entry} has no coefficient `{name}`; it has {}", names.join(", ")).into()),
-        None => Ok(coefficients),
-    }
-}
-
-/// `x` of `com-offset.tm1.x`.
-fn short(coefficient: &Coefficient) -> &str {
-    coefficient.name.rsplit('.').next().unwrap_or_default()
-}
-
-/// Levels of noise start at their diagnosed values, where the command line gives none: a recursive filter estimates no
-/// level and uses this one.
-fn start_levels(entry: &mut EffectEntry, coefficients: &[Coefficient], candidate: &Value) {
-    let all = candidate["coefficients"].as_array();
-    for c in coefficients.iter().filter(|c| !c.noise.is_empty()) {
-        let found = all.and_then(|all| all.iter().find(|found| found["name"] == c.name.as_str()));
-        let value = found.and_then(|found| found["value"].as_f64()).filter(|value| *value > 0.0);
-        let prior = entry.prior.entry(short(c).to_owned()).or_default();
-        prior.value = prior.value.or(value);
-    }
+/// Values of a candidate's coefficients by name.
+fn values(candidate: &Value) -> Vec<(String, f64)> {
+    let all = candidate["coefficients"].as_array().into_iter().flatten();
+    all.filter_map(|c| Some((c["name"].as_str()?.to_owned(), c["value"].as_f64()?))).collect()
 }
 
 /// A parameter's value as the plugin declares it: texts need no quotes, lists no brackets.

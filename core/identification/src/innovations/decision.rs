@@ -454,6 +454,17 @@ impl Quadratic {
         all.iter().enumerate().for_each(|(k, i)| sigma[*i] = covariance[(k, k)].max(0.0).sqrt());
         (values, sigma)
     }
+
+    /// Covariance of all parameters with a set; zero for candidates that are not in it.
+    pub fn covariance(&self, set: &[usize]) -> DMatrix<f64> {
+        let all: Vec<usize> = self.base.iter().copied().chain(self.parameters(set)).collect();
+        let own = self.inverse(&all);
+        let mut covariance = DMatrix::zeros(self.score.len(), self.score.len());
+        for (k, i) in all.iter().enumerate() {
+            all.iter().enumerate().for_each(|(l, j)| covariance[(*i, *j)] = own[(k, l)]);
+        }
+        covariance
+    }
 }
 
 /// By how much the likelihoods of several data about the same point, as twice their logarithms, are higher where each

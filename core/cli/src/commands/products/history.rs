@@ -3,10 +3,9 @@
 use crate::commands::Done;
 use crate::failure::Failure;
 use crate::text::{self, Paint};
-use dragfree_archive::Place;
 use dragfree_archive::files::IoContext as _;
 use dragfree_archive::product::Stage;
-use dragfree_chart::graph::{self, Node};
+use dragfree_pages::pictures::{self, is_data, short};
 use dragfree_workflow::provenance::{self, Change, Diff, Lineage};
 use std::fmt::Write as _;
 use std::path::Path;
@@ -79,7 +78,7 @@ pub(super) fn lineage(
     let id = archive.find(name)?.row.id;
     let lineage = provenance::lineage(&archive, &id)?;
     if let Some(path) = picture {
-        std::fs::write(path, drawn(&lineage)?).at("write", path)?;
+        std::fs::write(path, pictures::lineage(&lineage)?).at("write", path)?;
     }
     if json {
         return Ok(Done::json(&serde_json::to_value(&lineage)?));
@@ -106,17 +105,8 @@ fn short_digests(words: &str) -> String {
     words.split(' ').map(|word| if is_digest(word) { short(word) } else { word }).collect::<Vec<_>>().join(" ")
 }
 
-/// The start of a digest, enough to tell contents apart.
-fn short(sha256: &str) -> &str {
-    sha256.get(..12).unwrap_or(sha256)
-}
-
 /// Role of the products that one of many days was made of.
 const PRODUCT: &str = "product";
-
-fn is_data(place: &&Place) -> bool {
-    ["telemetry", PRODUCT].contains(&place.role.as_str())
-}
 
 fn told(l: &Lineage, paint: Paint) -> String {
     let mut text = format!("{}\n", paint.bold(&l.product.id));
@@ -165,30 +155,4 @@ fn told(l: &Lineage, paint: Paint) -> String {
         let _ = writeln!(text, "  set {} from {}", v.set, crate::utc::format(v.from_ns));
     }
     text
-}
-
-/// Inputs on the left, the product, what came of it on the right.
-fn drawn(l: &Lineage) -> Result<String, Failure> {
-    let node = |kind: &str, name: &str, note: &str| Node { lines: vec![kind.into(), name.into(), note.into()] };
-    let mut left: Vec<Node> = Vec::new();
-    left.extend(l.resumed.first().map(|id| node("state of", id, "")));
-    left.extend(l.supersedes.iter().map(|id| node("in place of", id, "")));
-    left.extend(l.inputs.iter().filter(is_data).map(|p| node(&p.role, &p.name, short(&p.sha256))));
-    let kept = l.kept.iter().filter(|p| !p.role.starts_with("state"));
-    left.extend(kept.map(|p| node(&p.role, &p.name, short(&p.sha256))));
-    let plugins = text::distinct(
-        l.plugins.iter().map(|Stage { plugin, library_sha256, .. }| (plugin.as_str(), library_sha256.as_str())),
-    );
-    left.extend(plugins.into_iter().map(|(name, sha256)| node("plugin", name, short(sha256))));
-    let verdict = l.product.verdict.as_deref().unwrap_or("no verdict");
-    let middle = vec![node("product", &l.product.id, verdict)];
-    let mut right: Vec<Node> = Vec::new();
-    right.extend(l.superseded_by.iter().map(|id| node("superseded by", id, "")));
-    right.extend(l.resumed_by.iter().map(|id| node("resumed by", id, "")));
-    right.extend(l.entered.iter().map(|id| node("entered", id, "")));
-    right.extend(l.tested_by.iter().map(|id| node("tested by", id, "")));
-    right.extend(l.certified.iter().map(|v| node("set", &v.set, &crate::utc::format(v.from_ns))));
-    let edges = (0..left.len()).map(|i| ((0, i), (1, 0))).chain((0..right.len()).map(|i| ((1, 0), (2, i))));
-    let edges: Vec<_> = edges.collect();
-    Ok(graph::svg(&[left, middle, right], &edges)?)
 }

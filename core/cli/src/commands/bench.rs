@@ -1,0 +1,72 @@
+//! `dragfree serve` and `dragfree report`: the workbench.
+
+use super::{Done, SOFTWARE, products};
+use crate::args::{Bench, Global, Report, Serve};
+use crate::failure::Failure;
+use crate::{output, truth};
+use dragfree_pages::server::{Ready, serve as pages};
+use dragfree_pages::{Setup, Site, Truth};
+use serde_json::json;
+use std::time::SystemTime;
+
+pub(super) fn serve(command: &Serve, global: &Global) -> Result<Done, Failure> {
+    let site = Site::new(setup(&command.bench, global)?);
+    let mut failed = Ok(());
+    pages(site, command.listen, command.allow_changes, |ready| {
+        failed = output::print(&told(ready, command, global));
+    })?;
+    failed?;
+    Ok(Done::new(String::new()))
+}
+
+fn told(ready: &Ready, command: &Serve, global: &Global) -> String {
+    let Ready { address, token } = ready;
+    let needed = command.allow_changes || !command.listen.ip().is_loopback();
+    if global.json {
+        return format!("{}\n", json!({ "address": address, "token": needed.then_some(token) }));
+    }
+    let mut text = format!("pages     {address}\n");
+    if command.allow_changes {
+        text += &format!("changes   {address}#token={token}\n");
+    }
+    if needed {
+        text += &format!("token     {token}\n");
+    }
+    text + "end       Ctrl-C\n"
+}
+
+pub(super) fn report(command: &Report, global: &Global) -> Result<Done, Failure> {
+    let site = Site::new(setup(&command.bench, global)?);
+    let files = dragfree_pages::report(&site, &command.product, &command.out)?;
+    if global.json {
+        let files: Vec<String> = files.iter().map(|file| file.to_string_lossy().into_owned()).collect();
+        return Ok(Done::json(&json!({ "files": files })));
+    }
+    let open = command.out.join("index.html");
+    Ok(Done::new(format!("report    {} files\nopen      {}\n", files.len(), open.display())))
+}
+
+fn setup(bench: &Bench, global: &Global) -> Result<Setup, Failure> {
+    let archive = bench.archive.folder()?;
+    // Refuses a folder that is none, before a browser does.
+    products::archive(&archive)?;
+    let operations = bench.archive.operations()?;
+    let of = |file: fn(&dragfree_workflow::operations::Operations) -> Option<std::path::PathBuf>| {
+        operations.as_ref().and_then(file)
+    };
+    let mission = bench.mission.clone().or_else(|| of(|o| o.mission.clone()));
+    let truth = bench.truth.as_deref().map(truth::first).transpose()?;
+    let truth = truth.map(|values| -> Truth { Box::new(move |name| dragfree_score::offset(&values, name)) });
+    Ok(Setup {
+        registry: super::registry(global)?,
+        mission: super::validate::mission(mission.as_deref())?,
+        model: bench.model.clone().or_else(|| of(|o| o.model.clone())),
+        truth,
+        events: of(|o| o.events.clone()),
+        steps: operations.as_ref().map(|o| o.steps.clone().into_iter().collect()).unwrap_or_default(),
+        flags: super::repeated(Some(&archive), global),
+        software: SOFTWARE,
+        today: chrono::DateTime::<chrono::Utc>::from(SystemTime::now()).date_naive(),
+        archive,
+    })
+}

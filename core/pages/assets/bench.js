@@ -1,0 +1,257 @@
+// The workbench in the browser: switches without a new page, plots, and the button that keeps an effect.
+// The server makes all HTML; without this script every switch is a link.
+"use strict";
+
+// ---- Switches -------------------------------------------------------------------------------------------------------
+
+const part = document.getElementById("part");
+let underway = null;
+
+// Asks for a state and shows it; a request that is overtaken is broken off.
+async function show(address, key, remember) {
+  if (underway) underway.abort();
+  underway = new AbortController();
+  const signal = underway.signal;
+  part.setAttribute("aria-busy", "true");
+  try {
+    const answer = await fetch("/refit" + address.search, { signal });
+    const text = await answer.text();
+    if (signal.aborted) return;
+    if (answer.ok) {
+      const open = opened();
+      part.innerHTML = text;
+      reopen(open);
+      if (remember) history.pushState(null, "", address.href);
+      fillToken();
+    } else {
+      complain(text);
+    }
+    const again = key && [...part.querySelectorAll("[data-key]")].find((e) => e.dataset.key === key);
+    if (again) again.focus({ preventScroll: true });
+  } catch (error) {
+    if (error.name !== "AbortError") complain("The server does not answer: is it still running?");
+  } finally {
+    if (underway && underway.signal === signal) part.removeAttribute("aria-busy");
+  }
+}
+
+function complain(text) {
+  const said = part.querySelector(".said");
+  if (said) said.textContent = text;
+}
+
+// What a reader has unfolded stays so.
+function opened() {
+  return [...part.querySelectorAll("details")].map((d) => [d.querySelector("summary").textContent, d.open]);
+}
+
+function reopen(before) {
+  for (const details of part.querySelectorAll("details")) {
+    const own = before.find(([text]) => text === details.querySelector("summary").textContent);
+    if (own) details.open = own[1];
+  }
+}
+
+if (part) {
+  part.addEventListener("click", (event) => {
+    const link = event.target.closest("a[data-refit]");
+    if (!link || event.ctrlKey || event.metaKey || event.shiftKey || event.button !== 0) return;
+    event.preventDefault();
+    show(new URL(link.href), link.dataset.key, true);
+  });
+  // A switch answers to the space bar too.
+  part.addEventListener("keydown", (event) => {
+    const link = event.target.closest("a[role=switch]");
+    if (link && event.key === " ") {
+      event.preventDefault();
+      link.click();
+    }
+  });
+  addEventListener("popstate", () => show(new URL(location.href), null, false));
+}
+
+// ---- Keep -----------------------------------------------------------------------------------------------------------
+
+// The address printed at the start ends in #token=…, which a browser does not send; it is kept until the tab is closed.
+const given = /[#&]token=([0-9a-f]+)/.exec(location.hash);
+if (given) {
+  sessionStorage.setItem("token", given[1]);
+  history.replaceState(null, "", location.pathname + location.search);
+}
+
+function fillToken() {
+  const field = document.getElementById("token");
+  if (field && !field.value) field.value = sessionStorage.getItem("token") || "";
+}
+
+fillToken();
+
+document.addEventListener("submit", async (event) => {
+  if (event.target.id !== "keep") return;
+  event.preventDefault();
+  const token = document.getElementById("token").value.trim();
+  const state = Object.fromEntries(new URLSearchParams(location.search));
+  const kept = document.getElementById("kept");
+  try {
+    const headers = { "content-type": "application/json", "x-dragfree-token": token };
+    const answer = await fetch("/keep", { method: "POST", headers, body: JSON.stringify(state) });
+    const text = await answer.text();
+    if (answer.ok) {
+      sessionStorage.setItem("token", token);
+      kept.innerHTML = text;
+    } else {
+      kept.textContent = text;
+    }
+    kept.className = answer.ok ? "kept" : "refused";
+  } catch {
+    kept.textContent = "The server does not answer: is it still running?";
+  }
+});
+
+// ---- Plots ----------------------------------------------------------------------------------------------------------
+
+function read(id) {
+  const element = document.getElementById(id);
+  return element ? JSON.parse(element.textContent) : null;
+}
+
+function colour(name) {
+  return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+}
+
+function axis(more) {
+  const line = { stroke: colour("--grid"), width: 1 };
+  return { stroke: colour("--text"), grid: line, ticks: line, font: "12px system-ui, sans-serif", ...more };
+}
+
+const plots = [];
+
+// Plots follow the width of their place, and the colours of the system.
+function drawn(make) {
+  const entry = { make, plot: null };
+  const draw = () => {
+    if (entry.plot) entry.plot.destroy();
+    entry.plot = entry.make();
+  };
+  draw();
+  plots.push(draw);
+}
+
+let waiting = 0;
+const redraw = () => {
+  clearTimeout(waiting);
+  waiting = setTimeout(() => plots.forEach((draw) => draw()), 100);
+};
+addEventListener("resize", redraw);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
+
+function width(place) {
+  return Math.max(240, Math.min(1100, place.clientWidth));
+}
+
+const iso = (time) => new Date(1000 * time).toISOString().slice(0, 10);
+const days = (u, times) => times.map(iso);
+
+function trends(data) {
+  const shared = uPlot.sync("days");
+  for (const place of document.querySelectorAll(".plot[data-series]")) {
+    const s = data.series.find((own) => own.name === place.dataset.series);
+    const faint = { stroke: "transparent", width: 0, points: { show: false }, class: "faint" };
+    const options = () => ({
+      width: width(place),
+      height: 220,
+      padding: [8, 44, 0, 0],
+      cursor: { sync: { key: shared.key } },
+      legend: { show: true, live: true },
+      axes: [axis({ values: days, incrs: [1, 2, 7, 14, 28, 91, 182, 364].map((n) => 86400 * n), space: 90 }), axis({ label: s.unit || "1", size: 74, labelFont: "12px system-ui, sans-serif" })],
+      scales: { x: { time: true } },
+      series: [
+        { label: "day", value: (u, time) => (time == null ? "" : iso(time)) },
+        { label: "expected to", ...faint },
+        { label: "expected from", ...faint },
+        { label: "value + σ", ...faint },
+        { label: "value − σ", ...faint },
+        {
+          label: "value",
+          stroke: colour("--c0"),
+          width: 1,
+          points: { show: true, size: 6, fill: colour("--c0") },
+        },
+      ],
+      bands: [
+        { series: [1, 2], fill: colour("--band") },
+        { series: [3, 4], fill: colour("--sigma") },
+      ],
+      hooks: { draw: [(u) => marks(u, data.events)] },
+    });
+    const rows = [s.time, s.expected_high, s.expected_low, s.high, s.low, s.value];
+    drawn(() => {
+      const plot = new uPlot(options(), rows, place);
+      plot.over.addEventListener("click", () => {
+        const day = data.products.find((p) => p[0] === s.time[plot.cursor.idx]);
+        if (day) location.href = "/day/" + encodeURIComponent(day[1]);
+      });
+      return plot;
+    });
+  }
+}
+
+// Events as lines on the time axis.
+function marks(u, events) {
+  const { ctx } = u;
+  ctx.save();
+  ctx.strokeStyle = colour("--event");
+  ctx.setLineDash([4, 4]);
+  for (const [time] of events) {
+    const x = Math.round(u.valToPos(time, "x", true));
+    if (x < u.bbox.left || x > u.bbox.left + u.bbox.width) continue;
+    ctx.beginPath();
+    ctx.moveTo(x, u.bbox.top);
+    ctx.lineTo(x, u.bbox.top + u.bbox.height);
+    ctx.stroke();
+  }
+  ctx.restore();
+}
+
+function spectrum(data) {
+  const place = document.getElementById("spectrum");
+  const pick = document.getElementById("channel");
+  const short = (x) => (x == null ? "" : x.toExponential(1).replace("e+", "e"));
+  const make = () => {
+    const c = data.channels.find((own) => own.name === pick.value) || data.channels[0];
+    const faint = { stroke: "transparent", width: 0, points: { show: false }, class: "faint" };
+    const tick = (u, values) => values.map((v) => (v && Math.log10(v) % 1 === 0 ? short(v) : ""));
+    return new uPlot(
+      {
+        width: width(place),
+        height: 320,
+        axes: [axis({ values: tick, label: "Hz", labelFont: "12px system-ui, sans-serif" }), axis({ values: tick, size: 64 })],
+        scales: { x: { time: false, distr: 3 }, y: { distr: 3 } },
+        series: [
+          { label: "Hz", value: (u, v) => short(v) },
+          { label: "95 % to", ...faint, value: (u, v) => short(v) },
+          { label: "95 % from", ...faint, value: (u, v) => short(v) },
+          { label: "noise /√Hz", stroke: colour("--c1"), width: 2, dash: [6, 4], points: { show: false }, value: (u, v) => short(v) },
+          { label: "measured /√Hz", stroke: colour("--c0"), width: 2, points: { show: true, size: 5 }, value: (u, v) => short(v) },
+        ],
+        bands: [{ series: [1, 2], fill: colour("--band") }],
+      },
+      [c.hz, c.high, c.low, c.modelled, c.measured],
+      place,
+    );
+  };
+  drawn(make);
+  pick.addEventListener("change", redraw);
+  for (const button of document.querySelectorAll("[data-channel]")) {
+    button.addEventListener("click", () => {
+      pick.value = button.dataset.channel;
+      redraw();
+      place.scrollIntoView({ behavior: "auto", block: "center" });
+    });
+  }
+}
+
+const trend = read("trend");
+if (trend) trends(trend);
+const residuals = read("residuals");
+if (residuals && residuals.channels.length) spectrum(residuals);

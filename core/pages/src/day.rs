@@ -1,0 +1,187 @@
+//! A product as an operator reads it.
+
+use dragfree_archive::product::{Coefficient, Product};
+use dragfree_archive::{EXTRACT, Row};
+use dragfree_workflow::provenance::lineage;
+use maud::{Markup, html};
+
+use crate::PagesError;
+use crate::layout::{Links, command, page as whole, picture, shell, value};
+use crate::pictures;
+use crate::site::Site;
+
+pub(crate) fn page(site: &Site, id: &str, links: &Links) -> Result<Markup, PagesError> {
+    let archive = site.archive()?;
+    let row = archive.find(id)?.row;
+    let product = archive.document(&row.id)?;
+    let has_extract = archive.files_of(&row.id)?.iter().any(|(suffix, ..)| suffix == EXTRACT);
+    let lineage = lineage(&archive, &row.id)?;
+    // A diagnosis may name what both solutions are wrong by together.
+    let named = if has_extract { site.basis(&row.id)?.named().to_vec() } else { Vec::new() };
+    let (class, word, sentence) = advice(&row, &product, has_extract, &named);
+    let attributes = &product.header.non_standard_attributes;
+    let hours = (attributes.stop_time_epoch_ns - attributes.start_time_epoch_ns) as f64 / 3.6e12;
+    let body = html! {
+        p class={ "verdict " (class) } { strong { (word) } " " (sentence) }
+        @for id in &lineage.superseded_by {
+            p { "A newer revision took its place: "
+                @match links.of("day", id) { Some(to) => a href=(to) { (id) }, None => (id) } }
+        }
+        p class="quiet" {
+            (attributes.day) ", " (format!("{hours:.1}")) " h · model " (product.model.revision) ": "
+            (product.model.effects.join(", ")) " · " (product.quality.epochs_used) " epochs used, "
+            (product.quality.epochs_rejected) " not"
+        }
+        (coefficients(&product))
+        (quality(&product))
+        (next(site, &row, &product, has_extract, links))
+        h2 { "Where it comes from" }
+        p { "Inputs on the left, the product, and what came of it on the right. Numbers are the starts of SHA-256 \
+            digests." }
+        (picture(&pictures::lineage(&lineage)?, "What the product was made of, and what was made of it"))
+        (command(&format!("dragfree products lineage {}{}\ndragfree products rebuild {}{}", row.id, site.setup.flags,
+            row.id, site.setup.flags)))
+    };
+    let lead = "Read the coloured sentence first: it says whether to use the values below.";
+    Ok(whole(links, "Day", &row.id, lead, &body))
+}
+
+const NOT_DIAGNOSED: &str =
+    "An effect that the model lacks may still move both alike: a diagnosis has not looked for one.";
+
+/// Whether to use the values: class, word, sentence.
+fn advice(row: &Row, product: &Product, diagnosed: bool, named: &[String]) -> (&'static str, &'static str, String) {
+    let verdict = row.verdict.as_deref();
+    if let Some(reason) = &row.withdrawn {
+        return ("bad", "Do not use it.", format!("It was withdrawn: {reason}"));
+    }
+    if let Some(problem) = &row.problem {
+        return ("bad", "Do not use it.", problem.clone());
+    }
+    if let Some(from) = &product.model.fixed_from {
+        return (
+            "weak",
+            "A test.",
+            format!("Its model was fixed at the values of {from}: it says how well these predict this day."),
+        );
+    }
+    if verdict == Some("disagree") {
+        let why =
+            "The two independent solutions differ by more than their errors: something is missing from the model.";
+        return ("bad", "Do not use it.", why.to_owned());
+    }
+    if product.quality.inconsistent {
+        let why = "The model contradicts the data: something is missing from it, or the noise is another one.";
+        return ("bad", "Do not use it.", why.to_owned());
+    }
+    if !named.is_empty() {
+        let what = named.join(", ");
+        return (
+            "bad",
+            "Do not use it yet.",
+            format!(
+                "The diagnosis names an effect that the model lacks: {what}. It moves the offset; the page on missing \
+                    physics shows by how much."
+            ),
+        );
+    }
+    if product.quality.data_loss {
+        return (
+            "lost",
+            "Use it with care.",
+            "The solutions agree, but data were lost; the losses are below.".to_owned(),
+        );
+    }
+    if verdict == Some("weak") {
+        let what = product.quality.weak_directions.join("; ");
+        return ("weak", "Use it with care.", format!("The data do not determine everything: {what}"));
+    }
+    let why = "The recursive and the batch solution agree within their errors, and what the model leaves is noise.";
+    (
+        "good",
+        "Use it.",
+        format!("{why} {}", if diagnosed { "A diagnosis found no effect missing." } else { NOT_DIAGNOSED }),
+    )
+}
+
+fn coefficients(product: &Product) -> Markup {
+    let adopted = product.result.adopted();
+    let mut solutions: Vec<&str> = product.result.coefficients.iter().map(|c| c.solution.as_str()).collect();
+    solutions.dedup();
+    let mut seen: Vec<&str> = Vec::new();
+    solutions.retain(|s| {
+        !seen.contains(s) && {
+            seen.push(s);
+            true
+        }
+    });
+    let of = |name: &str, solution: &str| -> Option<&Coefficient> {
+        product.result.coefficients.iter().find(|c| c.name == name && c.solution == solution)
+    };
+    let main = adopted.first().map(|c| c.solution.as_str()).unwrap_or_default();
+    html! {
+        h2 { "Values" }
+        p { "Value ± one standard deviation. The column " strong { (main) } " is the one to use." }
+        div class="scroll" tabindex="0" { table {
+            thead { tr { th { "coefficient" } @for s in &solutions { th { (s) } } th { "frame" } } }
+            tbody { @for c in &adopted { tr {
+                th scope="row" { (c.name) }
+                @for s in &solutions {
+                    td class=(if *s == main { "figure main" } else { "figure" }) {
+                        @if let Some(c) = of(&c.name, s) { (value(c.value, c.sigma, &c.unit)) }
+                    }
+                }
+                td { (c.frame) }
+            } } }
+        } }
+    }
+}
+
+fn quality(product: &Product) -> Markup {
+    let q = &product.quality;
+    html! {
+        h2 { "Quality" }
+        p { "χ² per degree of freedom and NIS are 1 where model and noise are right." }
+        dl {
+            dt { "χ²/dof" } dd { (format!("{:.4}", q.chi2_per_dof)) }
+            dt { "NIS" } dd { (format!("{:.4}", q.nis)) }
+            @if let Some(commands) = &q.commands { dt { "Commands" } dd { (commands) } }
+            dt { "Time scale" } dd { (product.header.non_standard_attributes.time_scale) }
+        }
+        @if !q.weak_directions.is_empty() {
+            h3 { "Not determined by the data" }
+            ul { @for direction in &q.weak_directions { li { (direction) } } }
+        }
+        @if !product.losses.is_empty() {
+            h3 { "Losses" }
+            ul { @for loss in &product.losses { li { strong { (loss.count) } " " (loss.kind) ": " (loss.detail) } } }
+        }
+        @if !q.notes.is_empty() {
+            h3 { "Notes" }
+            ul { @for note in &q.notes { li { (note) } } }
+        }
+    }
+}
+
+fn next(site: &Site, row: &Row, product: &Product, has_extract: bool, links: &Links) -> Markup {
+    let (id, flags) = (shell(&row.id), &site.setup.flags);
+    html! {
+        h2 { "What next" }
+        ul {
+            @if let Some(to) = links.of("compare", &row.id) {
+                li { a href=(to) { "See where the model fails" } ", channel by channel and band by band." }
+            }
+            @if has_extract && let Some(to) = links.missing(&row.id) {
+                li { a href=(to) { "See which effect is missing" } ": switch effects on and watch the offset move." }
+            }
+        }
+        @if !has_extract && product.model.fixed_from.is_none() {
+            p { "This product was not diagnosed yet. The diagnosis reads the telemetry once; after it effects can be \
+                switched on here:" }
+            (command(&format!("dragfree diagnose {id} --keep-extract{flags}")))
+        }
+        p { "It holds for a time once it is certified:" }
+        (command(&format!("dragfree products certify {id} --from {}{flags}",
+            product.header.non_standard_attributes.day)))
+    }
+}

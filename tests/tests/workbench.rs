@@ -1,0 +1,399 @@
+//! The workbench: what its switches say, what a reader does with it in a browser, and what it refuses.
+
+use std::io::{BufRead as _, BufReader, Read as _, Write as _};
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+use std::process::Stdio;
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
+
+use dragfree_tests::browser::{Browser, Ended, get, request, send};
+use dragfree_tests::calibration::TRUTH_M;
+use dragfree_tests::{dragfree, expect, fixture, json, root, simulate};
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+/// Hidden on both days, eight σ of two hours.
+const EFFECT: &str = "mps-tilt:sc.z";
+const SIZE_RAD: f64 = 0.08;
+
+const DAYS: [&str; 2] = ["COM1B_2035-01-01_SC1_01_0001", "COM1B_2035-01-02_SC1_01_0001"];
+
+/// Two days of two hours with a hidden effect, calibrated with the offset alone and diagnosed.
+struct Flight {
+    folder: TempDir,
+    diagnosis: Value,
+    truth: PathBuf,
+}
+
+fn flight() -> &'static Flight {
+    static FLIGHT: OnceLock<Flight> = OnceLock::new();
+    FLIGHT.get_or_init(|| {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let at = folder.path();
+        std::fs::copy(fixture("models/com-offset.toml"), at.join("model.toml")).expect("copied");
+        let mut diagnosis = Value::Null;
+        for (day, seed) in [("2035-01-02", "72"), ("2035-01-01", "71")] {
+            let effect = format!("{EFFECT}={SIZE_RAD}");
+            let out = at.join(day);
+            std::fs::create_dir(&out).expect("a new folder");
+            let file = simulate(&out, &["--hours", "2", "--start", day, "--seed", seed, "--effect", &effect]).remove(0);
+            let run = calibrate(at, &file, "archive");
+            assert!(matches!(run, 0 | 4), "{run}");
+            diagnosis = json(dragfree(at).args(["diagnose", day, "--keep-extract", "--json"]), 4);
+        }
+        let truth = at.join("2035-01-01/truth/SC1_2035-01-01.mcap");
+        Flight { folder, diagnosis, truth }
+    })
+}
+
+/// One test at a time: they measure times.
+fn alone() -> MutexGuard<'static, ()> {
+    static ALONE: Mutex<()> = Mutex::new(());
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Calibrates a file with the flight's model into an archive; gives the exit code.
+fn calibrate(folder: &Path, file: &Path, archive: &str) -> i32 {
+    let mut run = dragfree(folder);
+    run.arg("run").arg(fixture("pipelines/science-mode.toml")).arg(file);
+    run.args(["--model", "model.toml", "--json", "--archive", archive]);
+    run.output().expect("runs").status.code().unwrap_or(-1)
+}
+
+/// A server of the flight's archive, ended with this.
+struct Server {
+    process: Ended,
+    port: u16,
+    token: String,
+}
+
+fn serve(folder: &Path, more: &[&str]) -> Server {
+    let mut command = dragfree(folder);
+    command.args(["serve", "--listen", "127.0.0.1:0", "--json"]).args(more);
+    let mut child = command.stdout(Stdio::piped()).spawn().expect("starts");
+    let mut line = String::new();
+    BufReader::new(child.stdout.take().expect("piped")).read_line(&mut line).expect("a line");
+    let ready: Value = serde_json::from_str(&line).unwrap_or_else(|e| panic!("{e}: {line:?}"));
+    let address = ready["address"].as_str().expect("an address");
+    let port = address.trim_end_matches('/').rsplit(':').next().and_then(|port| port.parse().ok()).expect("a port");
+    let token = ready["token"].as_str().unwrap_or_default().to_owned();
+    Server { process: Ended(child), port, token }
+}
+
+fn number(value: &Value) -> f64 {
+    value.as_f64().unwrap_or_else(|| panic!("no number: {value}"))
+}
+
+fn refit(port: u16, query: &str) -> Value {
+    let answer = get(port, &format!("/refit.json?{query}"));
+    assert_eq!(answer.status, 200, "{answer:?}");
+    serde_json::from_str(&answer.body).unwrap_or_else(|e| panic!("{e}: {}", answer.body))
+}
+
+fn offset<'a>(rung: &'a Value, name: &str) -> &'a Value {
+    let all = rung["offsets"].as_array().expect("offsets");
+    all.iter().find(|o| o["name"] == name).unwrap_or_else(|| panic!("no {name} in {rung}"))
+}
+
+/// A switch gives what a diagnosis of the same product gives: from its extract to rounding, from its telemetry nearly.
+/// Size, σ, fall of χ², offsets and what the absence does to them. The other day, kept out, is predicted better with
+/// the effect. A run with the kept effect, by another estimator, gives the same offsets, and both are near the truth.
+#[test]
+fn a_switch_says_what_the_diagnosis_says_and_the_run_confirms() {
+    let (_alone, flight) = (alone(), flight());
+    let server = serve(flight.folder.path(), &[]);
+    let on = refit(server.port, &format!("products={}&on={EFFECT}", DAYS[0]));
+    let effect = &on["effects"][0];
+    let summed = json(dragfree(flight.folder.path()).args(["diagnose", DAYS[0], "--extracts", "--json"]), 4);
+    let near = |a: &Value, b: &Value, scale: f64, what: &str| {
+        assert!((number(a) - number(b)).abs() < scale, "{what}: {a} {b}");
+    };
+    // From the same extract by other code, and from the telemetry. The two differ in where the model is linear.
+    for (diagnosis, part) in [(&summed, 1e-6), (&flight.diagnosis, 0.2)] {
+        let found = &diagnosis["candidates"][0];
+        assert_eq!((effect["name"].as_str(), &found["accepted"]), (Some(EFFECT), &Value::Bool(true)), "{found:#}");
+        let sigma = number(&found["sigma"]);
+        near(&effect["coefficients"][0]["value"], &found["value"], part * sigma, "size");
+        near(&effect["coefficients"][0]["sigma"], &found["sigma"], part * sigma, "σ");
+        // χ² of a value of λ σ that is moved by a part of σ changes by 2λ times that.
+        let fall = number(&found["delta_chi2"]);
+        near(&effect["delta_chi2"], &found["delta_chi2"], part * 2.0 * fall.sqrt(), "fall");
+        near(&on["rungs"][1]["fall"], &found["delta_chi2"], part * 2.0 * fall.sqrt(), "fall of the rung");
+        for (name, truth) in TRUTH_M {
+            let [before, after] = [0, 1].map(|k| offset(&on["rungs"][k], name));
+            let diagnosed = diagnosis["offsets"].as_array().expect("offsets");
+            let diagnosed = diagnosed.iter().find(|o| o["coefficient"] == name).expect("an offset");
+            let sigma = number(&diagnosed["sigma_m"]);
+            near(&after["value_m"], &diagnosed["value_m"], part * sigma, name);
+            near(&after["sigma_m"], &diagnosed["sigma_m"], part * sigma, name);
+            near(&effect["offset_shift_m"][name], &found["offset_shift_m"][name], part * sigma, name);
+            let moved = number(&before["value_m"]) - number(&after["value_m"]);
+            assert!((moved - number(&effect["offset_shift_m"][name])).abs() < 1e-6 * sigma, "{name}");
+            // Six offsets within 4.5σ: a false alarm in 2e4.
+            assert!((number(&after["value_m"]) - truth).abs() < 4.5 * sigma, "{name}: {after}");
+        }
+    }
+    let held = refit(server.port, &format!("products={}&held={}&on={EFFECT}", DAYS.join(","), DAYS[1]));
+    // Of λ² = 59 on a day, with a standard deviation of 2λ, some is lost by the error of the other day.
+    let (fall, held_out) = (number(&held["rungs"][1]["fall"]), number(&held["rungs"][1]["held_out_fall"]));
+    assert!(held_out > 5.0 && (held_out - fall).abs() < 4.5 * 2.0 * 2.0_f64.sqrt() * fall.sqrt(), "{held:#}");
+    assert_eq!(held["held_out"], json!([DAYS[1]]));
+
+    let folder = flight.folder.path();
+    std::fs::copy(folder.join("model.toml"), folder.join("proof.toml")).expect("copied");
+    expect(dragfree(folder).args(["model", "add", "proof.toml", EFFECT]), 0);
+    let mut run = dragfree(folder);
+    run.arg("run").arg(fixture("pipelines/science-mode.toml")).arg("2035-01-01/SC1_2035-01-01.mcap");
+    let product = json(run.args(["--model", "proof.toml", "--archive", "proof", "--json"]), 0);
+    for (name, _) in TRUTH_M {
+        let (value, sigma) = dragfree_tests::coefficient(&product, name, "adopted");
+        let refitted = number(&offset(&on["rungs"][1], name)["value_m"]);
+        // The likelihood is efficient: the difference from another estimate of the same data has the difference of the
+        // variances (Hausman, 1978), and a tenth of σ is left to the linearisation.
+        let efficient = number(&offset(&on["rungs"][1], name)["sigma_m"]);
+        let bound = 4.5 * (sigma.powi(2) - efficient.powi(2)).max(0.0).sqrt() + 0.1 * sigma;
+        assert!((value - refitted).abs() < bound, "{name}: run {value} ± {sigma}, refit {refitted} ± {efficient}");
+    }
+}
+
+/// The story by clicks alone: from the calendar to the day, to the effect, on, kept. Then by the keyboard alone. No
+/// error in the console, and axe-core finds nothing serious, wide and narrow, light and dark.
+#[test]
+fn a_reader_finds_the_effect_and_keeps_it_by_clicks() {
+    let (_alone, flight) = (alone(), flight());
+    let folder = flight.folder.path();
+    std::fs::copy(folder.join("model.toml"), folder.join("kept.toml")).expect("copied");
+    let truth = flight.truth.display().to_string();
+    let server = serve(folder, &["--model", "kept.toml", "--allow-changes", "--truth", &truth]);
+    let browser = Browser::start(1280, 900, false);
+    browser.open(&format!("http://127.0.0.1:{}/#token={}", server.port, server.token));
+    browser.click(&format!("a.day[href$=\"{}\"]", DAYS[0]));
+    browser.wait_for("document.querySelector('.verdict')");
+    browser.click("main a[href^='/missing']");
+    let switch = format!("[data-key='{EFFECT}']");
+    browser.wait_for(&format!("document.querySelector(\"{switch}\")"));
+    let value = "document.querySelector('#offsets tbody tr:nth-child(2) td:nth-child(3)').textContent";
+    let before = browser.run(&format!("return {value}"));
+    browser.run("window.same_page = true");
+    browser.click(&switch);
+    browser.wait_for(&format!("{value} !== {before}"));
+    assert_eq!(browser.run("return window.same_page && location.search.includes('on=')"), true);
+    assert_eq!(browser.run(&format!("return document.querySelector(\"{switch}\").ariaChecked")), "true");
+    let said = browser.run("return document.querySelector('.said').textContent");
+    assert!(said.as_str().is_some_and(|s| s.contains("1 effect is on") && s.contains("com-offset.tm")), "{said}");
+    // A link shows a colleague the same.
+    let after = browser.run(&format!("return {value}"));
+    browser.run("location.reload()");
+    browser.wait_for("!window.same_page && document.querySelector('.said')");
+    assert_eq!(browser.run(&format!("return {value}")), after);
+    browser.click("#keep button");
+    browser.wait_for("document.querySelector('#kept.kept')");
+    let shown = json(dragfree(folder).args(["model", "show", "kept.toml", "--json"]), 0);
+    let kept =
+        shown["effects"].as_array().expect("effects").iter().any(|e| e["id"] == "mps-tilt" && e["instance"] == "sc.z");
+    assert!(kept, "{shown:#}");
+    // The mouse aside: back off, by the focus and the space bar.
+    browser.run(&format!("document.querySelector(\"{switch}\").focus()"));
+    browser.press(" ");
+    browser.wait_for(&format!("document.querySelector(\"{switch}\").ariaChecked === 'false'"));
+    assert_eq!(browser.run("return document.activeElement.dataset.key"), EFFECT);
+    browser.run("history.back()");
+    browser.wait_for(&format!("document.querySelector(\"{switch}\").ariaChecked === 'true'"));
+    assert_eq!(browser.console(), Vec::<String>::new());
+    drop(browser);
+    for (width, dark) in [(1280, false), (1280, true), (400, false), (400, true)] {
+        every_page_is_readable(&server, width, dark);
+    }
+}
+
+/// axe-core finds nothing serious, nothing is wider than the window, no label is smaller than 11 px, and the console is
+/// empty. `DRAGFREE_PICTURES=DIR` keeps pictures of the pages.
+fn every_page_is_readable(server: &Server, width: u32, dark: bool) {
+    let axe = std::fs::read_to_string(root().join("tests/data/axe/axe.min.js")).expect("vendored");
+    let browser = Browser::start(width, 900, dark);
+    let missing = format!("missing?products={}&held={}&on={EFFECT}", DAYS.join(","), DAYS[1]);
+    let pages = ["", "trends", &format!("day/{}", DAYS[0]), &format!("compare/{}", DAYS[0]), &missing, "plugins"];
+    for page in pages {
+        browser.open(&format!("http://127.0.0.1:{}/{page}", server.port));
+        browser.wait_for("document.readyState === 'complete'");
+        if let Some(folder) = std::env::var_os("DRAGFREE_PICTURES").map(PathBuf::from) {
+            let name = page.split(['/', '?']).next().filter(|name| !name.is_empty()).unwrap_or("mission");
+            browser.picture(&folder.join(format!("{name}-{width}-{}.png", if dark { "dark" } else { "light" })));
+        }
+        browser.run(&axe);
+        let found = browser.run_async(
+            "const done = arguments[arguments.length - 1]; \
+             axe.run().then(r => done(r.violations.filter(v => ['serious', 'critical'].includes(v.impact)) \
+             .map(v => [v.id, v.nodes.slice(0, 3).map(n => n.html + n.failureSummary)])))",
+        );
+        assert_eq!(found, json!([]), "{page} at {width}, dark {dark}");
+        let wide = browser.run("return document.documentElement.scrollWidth - document.documentElement.clientWidth");
+        assert!(number(&wide) <= 0.0, "{page} at {width}: {wide} px too wide");
+        let small = browser.run(
+            "return [...document.querySelectorAll('body *')].filter(e => !e.closest('svg, script, .hidden') && \
+             [...e.childNodes].some(n => n.nodeType === 3 && n.data.trim()) && \
+             parseFloat(getComputedStyle(e).fontSize) < 11).map(e => e.outerHTML.slice(0, 80))",
+        );
+        assert_eq!(small, json!([]), "{page} at {width}");
+        let lead = browser.run("return document.querySelector('h1 + .lead').textContent.trim().length");
+        assert!(number(&lead) > 20.0, "{page} begins with a sentence that says what to do");
+        assert_eq!(browser.console(), Vec::<String>::new(), "{page} at {width}");
+    }
+}
+
+/// Without the right host, origin, token or size nothing is answered or changed, and names are text wherever they are
+/// shown.
+#[test]
+fn what_is_hostile_is_refused() {
+    let (_alone, flight) = (alone(), flight());
+    let folder = flight.folder.path();
+    std::fs::copy(folder.join("model.toml"), folder.join("hostile.toml")).expect("copied");
+    let before = std::fs::read(folder.join("hostile.toml")).expect("a model");
+    let server = serve(folder, &["--model", "hostile.toml", "--allow-changes"]);
+    let port = server.port;
+    let own = format!("http://127.0.0.1:{port}");
+    let body = json!({ "products": DAYS[0], "on": EFFECT }).to_string();
+    let headers = |origin: &str, token: &str| {
+        format!("Content-Type: application/json\r\nOrigin: {origin}\r\nX-Dragfree-Token: {token}\r\n")
+    };
+    for (headers, status) in [
+        (String::new(), 403),
+        (headers(&own, "0123456789abcdef0123456789abcdef"), 403),
+        (headers("http://evil.example", &server.token), 403),
+        (headers("null", &server.token), 403),
+        (headers(&own, &server.token).replace("application/json", "text/plain"), 403),
+        (headers(&own, &server.token) + "Host: evil.example\r\n", 403),
+    ] {
+        assert_eq!(request(port, "POST", "/keep", &headers, &body).status, status, "{headers}");
+    }
+    let right = headers(&own, &server.token);
+    let large = format!(
+        "POST /keep HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nConnection: close\r\nContent-Length: 100000\r\n{right}\r\n{}",
+        "x".repeat(100_000)
+    );
+    // The server need not read to the end what it refuses.
+    assert!(send(port, large.as_bytes()).map_or(true, |answer| answer.status == 413));
+    assert_eq!(request(port, "POST", "/keep", &right, "{\"on\": 1}").status, 400);
+    assert_eq!(request(port, "POST", "/", &right, "").status, 405);
+    assert_eq!(request(port, "GET", "/", "Host: evil.example\r\n", "").status, 403);
+    assert_eq!(std::fs::read(folder.join("hostile.toml")).expect("a model"), before);
+    for path in [
+        "/../../etc/passwd",
+        "/assets/../Cargo.toml",
+        "/assets/..%2f..%2fetc%2fpasswd",
+        "/day/..%2F..%2Fetc%2Fpasswd",
+        "/compare/%3Cscript%3Ealert(1)%3C%2Fscript%3E",
+        "/day/%00",
+    ] {
+        let answer = get(port, path);
+        assert_eq!(answer.status, 404, "{path}: {}", answer.body);
+        assert!(answer.head.to_lowercase().contains("content-type: text/plain"), "{}", answer.head);
+    }
+    for query in ["on=%3Cb%3E", "held=%3Cb%3E", "products=%3Cb%3E"] {
+        let query =
+            if query.starts_with("products") { query.to_owned() } else { format!("products={}&{query}", DAYS[0]) };
+        let answer = get(port, &format!("/missing?{query}"));
+        assert!(matches!(answer.status, 400 | 404) && answer.head.contains("text/plain"), "{answer:?}");
+    }
+    assert!(get(port, "/").head.contains("default-src 'none'"));
+    // A header that never ends, and a body that comes a byte at a time, are given up.
+    let large = format!("GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nX: {}\r\n\r\n", "x".repeat(2_000_000));
+    assert!(send(port, large.as_bytes()).map_or(true, |answer| answer.status >= 400));
+    let begun = Instant::now();
+    let mut slow = TcpStream::connect(("127.0.0.1", port)).expect("connects");
+    slow.write_all(b"GET / HTTP/1.1\r\nHost: 127").expect("written");
+    slow.set_read_timeout(Some(Duration::from_secs(20))).expect("set");
+    let mut answer = Vec::new();
+    let _ = slow.read_to_end(&mut answer);
+    assert!(begun.elapsed() < Duration::from_secs(10), "{:?}", begun.elapsed());
+    let reads = serve(folder, &["--model", "hostile.toml"]);
+    let headers = format!("Content-Type: application/json\r\nOrigin: http://127.0.0.1:{}\r\n", reads.port);
+    let answer = request(reads.port, "POST", "/keep", &headers, &body);
+    assert!(answer.status == 403 && answer.body.contains("--allow-changes"), "{answer:?}");
+}
+
+/// Processor time of a program, all of its threads: others on the machine do not count.
+fn processor_time(id: u32) -> Duration {
+    let tasks = std::fs::read_dir(format!("/proc/{id}/task")).into_iter().flatten().flatten();
+    let of = |task: std::fs::DirEntry| {
+        let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
+        text.split(' ').next()?.parse::<u64>().ok()
+    };
+    Duration::from_nanos(tasks.filter_map(of).sum())
+}
+
+/// Of 200 requests at once every one is answered, and a run beside them makes its product. A switch over HTTP takes, in
+/// 95 of 100 cases, at most 100 ms of the processor, and the memory stays below 100 MB.
+#[test]
+#[allow(clippy::print_stdout, reason = "VALIDATION.md has these lines")]
+fn many_requests_at_once_and_one_after_the_other() {
+    let (_alone, flight) = (alone(), flight());
+    let folder = flight.folder.path();
+    let server = serve(folder, &[]);
+    let port = server.port;
+    let query = format!("products={}&held={}", DAYS.join(","), DAYS[1]);
+    let names: Vec<String> = {
+        let all = refit(port, &query);
+        let all = all["effects"].as_array().expect("effects").iter();
+        all.filter_map(|e| e["name"].as_str()).map(|name| name.replace('#', "%23")).collect()
+    };
+    assert!(names.len() > 12, "{names:?}");
+    let (id, mut waits) = (server.process.0.id(), Vec::new());
+    let mut times: Vec<Duration> = (0..40)
+        .map(|k| {
+            let on: Vec<&str> = (0..10).map(|i| names[(k + i) % names.len()].as_str()).collect();
+            let (begun, before) = (Instant::now(), processor_time(id));
+            let answer = get(port, &format!("/refit?{query}&on={}", on.join(",")));
+            assert_eq!(answer.status, 200, "{answer:?}");
+            waits.push(begun.elapsed());
+            processor_time(id).saturating_sub(before)
+        })
+        .collect();
+    times.sort();
+    waits.sort();
+    println!("a switch with 10 effects over HTTP: processor {:.1?}, 95 of 100 at most {:.1?}", times[20], times[37]);
+    println!("the same by the clock: {:.1?}, 95 of 100 within {:.1?}", waits[20], waits[37]);
+    assert!(times[37] < Duration::from_millis(100), "{times:?}");
+    let run = std::thread::spawn(move || calibrate(folder, &folder.join("2035-01-01/SC1_2035-01-01.mcap"), "other"));
+    let asking: Vec<_> = (0..200)
+        .map(|k| {
+            let path =
+                if k % 2 == 0 { "/".to_owned() } else { format!("/refit?{query}&on={}", names[k % names.len()]) };
+            std::thread::spawn(move || get(port, &path).status)
+        })
+        .collect();
+    for asked in asking {
+        assert_eq!(asked.join().expect("answered"), 200);
+    }
+    assert!(matches!(run.join().expect("runs"), 0 | 4));
+    let status = std::fs::read_to_string(format!("/proc/{}/status", server.process.0.id())).unwrap_or_default();
+    let peak =
+        status.lines().find_map(|line| line.strip_prefix("VmHWM:")?.trim().strip_suffix(" kB")?.parse::<f64>().ok());
+    if let Some(peak) = peak {
+        println!("memory of the server: {:.0} MB at most", peak / 1e3);
+        assert!(peak < 100e3, "{peak} kB");
+    }
+}
+
+/// The pages of a report are whole by themselves: every file that they load is beside them, and nothing else is.
+#[test]
+fn a_report_needs_no_server() {
+    let (_alone, flight) = (alone(), flight());
+    let folder = flight.folder.path();
+    let out = folder.join("report");
+    let made = json(dragfree(folder).args(["report", "2035-01-01", "--json", "--out"]).arg(&out), 0);
+    assert_eq!(made["files"].as_array().map(Vec::len), Some(7), "{made:#}");
+    for page in ["index.html", "compare.html", "missing.html"] {
+        let text = std::fs::read_to_string(out.join(page)).expect("a page");
+        assert!(text.contains(DAYS[0]), "{page}");
+        for link in
+            text.split(['"', '\'']).skip(1).step_by(2).filter(|w| w.ends_with(".html") || w.starts_with("assets/"))
+        {
+            assert!(out.join(link).is_file(), "{page} loads {link}");
+        }
+        assert!(!text.contains("src=\"http") && !text.contains("href=\"http") && !text.contains("href=\"/"), "{page}");
+    }
+    let missing = std::fs::read_to_string(out.join("missing.html")).expect("a page");
+    assert!(missing.contains("1 effect is on") && missing.contains(EFFECT), "what the diagnosis names is on");
+}
