@@ -7,7 +7,8 @@ if command -v chromium > /dev/null && command -v chromedriver > /dev/null; then
 fi
 as_root=()
 if [ "$(id -u)" != 0 ]; then
-    as_root=(sudo)
+    # Without a password: nobody is there to type one while tests run.
+    as_root=(sudo -n)
 fi
 "${as_root[@]}" apt-get update --quiet
 "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get install --quiet --yes --no-install-recommends \

@@ -4,6 +4,7 @@ use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
@@ -115,12 +116,23 @@ pub struct Browser {
     _profile: tempfile::TempDir,
 }
 
+/// The browser that this test drives, or its driver; installed where there is none.
 fn program(name: &str) -> PathBuf {
-    let path = std::env::var_os("PATH").unwrap_or_default();
-    let found = std::env::split_paths(&path).map(|folder| folder.join(name)).find(|program| program.is_file());
-    found.unwrap_or_else(|| {
-        panic!("there is no {name}: tests/browser/install.sh installs the browser that this test drives")
+    static INSTALL: Mutex<()> = Mutex::new(());
+    let _one_at_a_time = INSTALL.lock().unwrap_or_else(PoisonError::into_inner);
+    installed(name).unwrap_or_else(|| {
+        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("browser/install.sh");
+        let said = Command::new(&script).output().expect("the script that installs the browser");
+        installed(name).unwrap_or_else(|| {
+            let error = String::from_utf8_lossy(&said.stderr);
+            panic!("there is no {name}, and {} did not install it: {error}", script.display())
+        })
     })
+}
+
+fn installed(name: &str) -> Option<PathBuf> {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    std::env::split_paths(&path).map(|folder| folder.join(name)).find(|program| program.is_file())
 }
 
 impl Browser {

@@ -45,8 +45,8 @@ fn begun_with<'a>(commits: impl IntoIterator<Item = &'a str>) -> Result<Option<S
     Ok(all.first().map(|commit| (*commit).to_owned()))
 }
 
-/// The present commit, where a campaign with results of these commits begins or goes on with it. Where it was begun with
-/// another one, the program of that commit goes on with `arguments`, and there is none.
+/// The present commit, where a campaign with results of these commits begins or goes on with it. Where it was begun
+/// with another one, the program of that commit goes on with `arguments`, and there is none.
 ///
 /// # Errors
 /// As [`commit`], [`begun_with`] and [`go_on`].

@@ -539,11 +539,7 @@ impl Transformer {
         // The straight line that fits the *windowed* samples best. A fit to the bare samples would take its slope from
         // the ends, where a second difference of readout noise is a hundred times louder than the lowest bins.
         let middle = (samples.len() / 2) as f64;
-        let (mut sum, mut moment) = (0.0, 0.0);
-        for (t, (x, w)) in samples.iter().zip(&segment.window).enumerate() {
-            sum += w * w * x;
-            moment += w * w * (t as f64 - middle) * x;
-        }
+        let (sum, moment) = sum_and_moment(samples, &segment.window, middle);
         let (mean, slope) = (sum / segment.window_sums[0], moment / segment.window_moment);
         for (t, ((out, x), w)) in time.iter_mut().zip(samples).zip(&segment.window).enumerate() {
             *out = (x - mean - slope * (t as f64 - middle)) * w;
@@ -561,6 +557,28 @@ impl Transformer {
             pair[1] = x.im * scale;
         }
     }
+}
+
+/// Sums side by side: a single one would wait for each of its additions.
+const SIDE_BY_SIDE: usize = 8;
+
+/// `Σ w² x` and `Σ w² (t − middle) x` of as many samples as the window has.
+fn sum_and_moment(samples: &[f64], window: &[f64], middle: f64) -> (f64, f64) {
+    let (mut sums, mut moments) = ([0.0; SIDE_BY_SIDE], [0.0; SIDE_BY_SIDE]);
+    let (whole, rest) = samples.as_chunks::<SIDE_BY_SIDE>();
+    let (windows, rest_of_window) = window.as_chunks::<SIDE_BY_SIDE>();
+    let mut add = |k: usize, t: f64, x: f64, w: f64| {
+        let weighted = w * w * x;
+        sums[k] += weighted;
+        moments[k] += (t - middle) * weighted;
+    };
+    for (chunk, (x, w)) in whole.iter().zip(windows).enumerate() {
+        let first = (chunk * SIDE_BY_SIDE) as f64;
+        (0..SIDE_BY_SIDE).for_each(|k| add(k, first + k as f64, x[k], w[k]));
+    }
+    let first = (whole.len() * SIDE_BY_SIDE) as f64;
+    rest.iter().zip(rest_of_window).enumerate().for_each(|(k, (x, w))| add(k, first + k as f64, *x, *w));
+    (sums.iter().sum(), moments.iter().sum())
 }
 
 /// Turns segments into cross-spectra.

@@ -157,11 +157,14 @@ impl Ends {
         };
         let windows: Vec<_> = self.windows.iter().map(|w| spectra(&w.rows)).collect();
         let responses: Vec<_> = self.responses.iter().map(|rows| spectra(rows)).collect();
+        // Spectrum of the mean of two samples.
+        let previous = |k: usize| Complex64::from_polar(1.0, -TAU * k as f64 / n as f64);
+        let averaging: Vec<Complex64> = (0..=self.length).map(|k| 0.5 * (1.0 + previous(k))).collect();
         let all: Vec<usize> = (0..self.templates.len()).collect();
         let look = |templates: &[usize]| {
             let (mut peaks, mut tried) = (Vec::new(), 0.0);
             for template in templates {
-                let response = self.response(*template, &responses, &fft);
+                let response = self.response(*template, &responses, &averaging, &fft);
                 let outputs: Vec<Vec<f64>> =
                     windows.iter().enumerate().map(|(w, spectra)| self.sizes(w, &response, spectra, &fft)).collect();
                 // Noise may exceed the declared one. A transient in one window leaves the others as they are.
@@ -225,23 +228,28 @@ impl Ends {
     }
 
     /// What a template adds to the innovations.
-    fn response(&self, template: usize, responses: &[Vec<Vec<Complex64>>], fft: &Transforms) -> Response {
+    fn response(
+        &self,
+        template: usize,
+        responses: &[Vec<Vec<Complex64>>],
+        averaging: &[Complex64],
+        fft: &Transforms,
+    ) -> Response {
         let template = &self.templates[template];
         let n = 2 * self.length;
         let mut kernel = template.kernel.clone();
         kernel.resize(n, 0.0);
         let kernel = fft.spectrum(kernel);
+        let averaged: Vec<Complex64> = kernel.iter().zip(averaging).map(|(x, mean)| x * mean).collect();
         let mut energy = vec![0.0; self.length + 1];
         let mut power = vec![0.0; n / 2 + 1];
         let conjugate = (0..self.channels)
             .map(|to| {
                 let mut spectrum = vec![Complex64::default(); n / 2 + 1];
-                for (from, factor, averaged) in &template.channels {
-                    for (k, (x, r)) in spectrum.iter_mut().zip(&responses[*from][to]).enumerate() {
-                        let previous = Complex64::from_polar(1.0, -TAU * k as f64 / n as f64);
-                        let mean = if *averaged { 0.5 * (1.0 + previous) } else { Complex64::new(1.0, 0.0) };
-                        *x += r * kernel[k] * mean * *factor;
-                    }
+                for (from, factor, is_averaged) in &template.channels {
+                    let own = if *is_averaged { &averaged } else { &kernel };
+                    let driven = responses[*from][to].iter().zip(own);
+                    spectrum.iter_mut().zip(driven).for_each(|(x, (r, own))| *x += r * own * *factor);
                 }
                 let mut samples = fft.samples(spectrum);
                 samples.iter_mut().for_each(|x| *x /= n as f64);
