@@ -15,7 +15,7 @@ use crate::table::{Column, TableSpec};
 /// A column that an instance reads: its index among the available ones.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ReadColumn {
-    /// Index into [`LinkRequest::available`].
+    /// Index into [`available`](super::LinkRequest::available).
     pub available: usize,
 }
 
