@@ -3,6 +3,7 @@
 
 use dragfree_tests::{archived, dragfree, expect, fixture, json, root, simulate};
 use serde_json::Value;
+use std::io::{BufRead as _, BufReader};
 use std::os::unix::process::ExitStatusExt as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -192,9 +193,14 @@ fn a_signal_at_any_instant_loses_nothing() {
 fn a_program_that_is_to_outlive_its_terminal_does() {
     let folder = copy();
     let command = run(folder.path(), &bench().telemetry);
+    // The line tells that the shell ignores the signal: one that came earlier would end the shell itself.
+    let script = "trap '' HUP; echo ignored; exec \"$@\" > /dev/null";
     let mut shell = Command::new("sh");
-    shell.args(["-c", "trap '' HUP; exec \"$@\"", "sh"]).arg(command.get_program()).args(command.get_args());
-    let mut child = shell.stdout(Stdio::null()).stderr(Stdio::null()).spawn().expect("runs");
+    shell.args(["-c", script, "sh"]).arg(command.get_program()).args(command.get_args());
+    let mut child = shell.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().expect("runs");
+    let mut line = String::new();
+    BufReader::new(child.stdout.take().expect("a pipe")).read_line(&mut line).expect("a line");
+    assert_eq!(line, "ignored\n");
     while child.try_wait().expect("a child").is_none() {
         let _ = Command::new("kill").arg("-HUP").arg(child.id().to_string()).output(); // it may just have ended
         std::thread::sleep(std::time::Duration::from_millis(20));
