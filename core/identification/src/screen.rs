@@ -81,6 +81,30 @@ pub fn screen(scorer: &CandidateScorer<'_>, named: &[Candidate]) -> Result<Scree
     Ok(Screened { forms, tried: ranked.tried, unobservable: ranked.unobservable, requests })
 }
 
+/// Leaves out of the requests of a screen beside nothing what its most significant candidate explains: of a cause that
+/// is no resonance, resonances stand out too, and no finer form of theirs is asked for.
+///
+/// # Errors
+/// A model that cannot be fitted.
+pub fn retain_unexplained(
+    scorer: &CandidateScorer<'_>,
+    screened: &Screened,
+    requests: &mut Vec<RefinementRequest>,
+) -> Result<(), IdentificationError> {
+    let Some(best) = screened.forms.first().filter(|_| !requests.is_empty()) else { return Ok(()) };
+    let of = |request: &RefinementRequest, c: (&String, &String)| (&request.effect, &request.instance) == c;
+    let fit = scorer.fit(std::slice::from_ref(best))?;
+    let trials = Trials::new(scorer, &screened.tried);
+    let asked = |c: &Coefficient| !c.transient && requests.iter().any(|r| of(r, (&c.effect, &c.instance)));
+    let mut left = scorer.rank_where(&fit, asked).all;
+    left.retain(|s| trials.p_value_of(s).0 < scorer.settings.false_alarm);
+    requests.retain(|request| {
+        let is = |c: &Candidate| !c.transient && of(request, (&c.effect, &c.instance));
+        is(best) || left.iter().any(|s| is(&s.candidate))
+    });
+    Ok(())
+}
+
 /// Effective number of independent short segments, from the observations in their lowest octave. A single band is too
 /// narrow: a bin of a short segment spans many bands of the long ones, and counts in one of them.
 fn segments(scorer: &CandidateScorer<'_>) -> f64 {

@@ -15,7 +15,7 @@ use dragfree_identification::diagnosis::{self, Diagnosis, Found, Trials, UNOBSER
 use dragfree_identification::lines::{Line, Lines};
 use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
-use dragfree_identification::screen::{RefinementRequest, Screened, screen};
+use dragfree_identification::screen::{RefinementRequest, Screened, retain_unexplained, screen};
 use dragfree_identification::slow_forces::slow_forces;
 use dragfree_identification::transient::{Detection, Transients};
 use dragfree_schema::{NoiseProcess, Settings};
@@ -62,6 +62,7 @@ pub fn diagnose(
     let (proposals, formulas) = proposals(replay, &first.record)?;
     let mut requests = first.screened.requests.clone();
     requests.retain(|request| has_parameter(replay.registry, &request.effect, FINE));
+    retain_unexplained(&first.scorer(settings), &first.screened, &mut requests)?;
     let spectra = if requests.is_empty() {
         first
     } else {
