@@ -81,17 +81,18 @@ pub struct FileFeed {
 }
 
 impl FileFeed {
-    /// Opens the files.
+    /// Opens the files. What comes before `run_in_until_ns`, Unix ns, only settles the stages.
     ///
     /// # Errors
     /// [`EngineError::Replay`]; or the telemetry is of another spacecraft than the mission.
     pub fn open(
         files: &[PathBuf],
         window_ns: Option<Range<i64>>,
+        run_in_until_ns: Option<i64>,
         threads: usize,
         mission: &Mission,
     ) -> Result<Self, EngineError> {
-        let replay = Replay::open(files, window_ns.clone(), threads)?;
+        let replay = Replay::open_with_run_in(files, window_ns.clone(), run_in_until_ns, threads)?;
         if replay.tables().is_empty() {
             let losses = replay.losses();
             let said =
@@ -139,12 +140,15 @@ impl Feed for FileFeed {
     }
 
     fn summary(&mut self) -> Result<Summary, EngineError> {
-        let losses = self.replay.losses();
+        let (losses, run_in) = (self.replay.losses(), self.replay.losses_of_run_in());
+        let before = run_in.entries().into_iter().map(|loss| {
+            format!("before the data, where they only settle the stages: {} {}: {}", loss.count, loss.kind, loss.detail)
+        });
         Ok(Summary {
             time_scale: self.replay.info().time_scale.clone(),
             counts: losses.counts(),
             losses: losses.entries(),
-            notes: losses.notes(),
+            notes: losses.notes().into_iter().chain(before).collect(),
             report: None,
         })
     }

@@ -156,7 +156,10 @@ impl<'a> Setup<'a> {
                 Ok(Box::new(SourceFeed::open(registry, id, &self.mission, &source)?))
             }
             None if options.files.is_empty() => Err(EngineError::NoFiles { pipeline: options.pipeline.clone() }),
-            None => Ok(Box::new(FileFeed::open(&options.files, window, options.threads, &self.mission)?)),
+            None => {
+                let run_in = options.run_in_until_ns();
+                Ok(Box::new(FileFeed::open(&options.files, window, run_in, options.threads, &self.mission)?))
+            }
         }
     }
 

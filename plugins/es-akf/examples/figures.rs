@@ -74,7 +74,7 @@ fn run(files: &[PathBuf], parameters: &str, watch: &mut dyn Watch) -> Result<(),
     let registry = Registry::discover(&[plugins]);
     let mission = Mission::load(&fixture("missions/taiji.toml"))?;
     let model = Model::load(&fixture("models/com-offset.toml"))?;
-    let mut feed = FileFeed::open(files, None, 2, &mission)?;
+    let mut feed = FileFeed::open(files, None, None, 2, &mission)?;
     let tables = feed.tables().to_vec();
     let carry = Carry { batch_rows: 65_536, threads: 2, run_in_until_ns: None };
     let mut chain = build(&registry, &Pipeline::load(&path)?, &mission, &model, &tables, carry)?;

@@ -90,6 +90,22 @@ pub struct Losses {
     told: BTreeSet<(Finding, String)>,
 }
 
+/// What was met in the data that were asked for, and in those before them that only settle the stages.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Findings {
+    /// In the data, and in whatever may have held some of them.
+    pub of_data: Losses,
+    /// In what ends before the data begin.
+    pub of_run_in: Losses,
+}
+
+impl Findings {
+    /// Where a finding belongs in something that ends before `end_ns`, where the data begin at `run_in_until_ns`.
+    pub(super) fn before(&mut self, end_ns: i64, run_in_until_ns: i64) -> &mut Losses {
+        if end_ns <= run_in_until_ns { &mut self.of_run_in } else { &mut self.of_data }
+    }
+}
+
 impl Losses {
     /// How often `finding` was met.
     pub fn count(&self, finding: Finding) -> u64 {

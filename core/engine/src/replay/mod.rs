@@ -23,7 +23,7 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, sync_channel};
 use std::thread::{self, JoinHandle};
 
-pub use losses::{Finding, Losses};
+pub use losses::{Finding, Findings, Losses};
 
 use crate::input::{InputFile, Sums};
 use crate::table::{Chunk, TableSpec};
@@ -102,7 +102,7 @@ pub struct ReplayInfo {
 pub struct Replay {
     tables: Vec<TableSpec>,
     info: ReplayInfo,
-    losses: Losses,
+    findings: Findings,
     engine: Engine,
     /// The files in the order in which they were given.
     checked: Vec<CheckedFile>,
@@ -127,7 +127,7 @@ enum Engine {
 }
 
 /// A stretch, or the end, and what was met until then.
-type Stretch = Result<(Option<Chunk>, Losses), ReplayError>;
+type Stretch = Result<(Option<Chunk>, Findings), ReplayError>;
 
 impl Replay {
     /// Opens `files` for the log times within `window_ns` (Unix ns, all when `None`); with two or more `threads` the
@@ -136,6 +136,20 @@ impl Replay {
     /// # Errors
     /// [`ReplayError`] when a file cannot be read at all or does not fit the others or the interface.
     pub fn open(files: &[PathBuf], window_ns: Option<Range<i64>>, threads: usize) -> Result<Self, ReplayError> {
+        Self::open_with_run_in(files, window_ns, None, threads)
+    }
+
+    /// The same, where what comes before `run_in_until_ns`, Unix ns, only settles what reads it: what is wrong in pieces
+    /// of files that end before is told apart ([`Findings::of_run_in`]).
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn open_with_run_in(
+        files: &[PathBuf],
+        window_ns: Option<Range<i64>>,
+        run_in_until_ns: Option<i64>,
+        threads: usize,
+    ) -> Result<Self, ReplayError> {
         if files.is_empty() {
             return Err(ReplayError::NoFiles);
         }
@@ -170,9 +184,11 @@ impl Replay {
         let files = (files.into_iter().zip(routes))
             .map(|((input, scan), routes)| OpenFile { input, pieces: scan.pieces, routes, messages: scan.messages })
             .collect();
-        let reader = Reader::new(files, tables.clone(), window_ns.unwrap_or(SANE_NS), losses.clone())?;
+        let (window_ns, run_in_until_ns) = (window_ns.unwrap_or(SANE_NS), run_in_until_ns.unwrap_or(i64::MIN));
+        let reader = Reader::new(files, tables.clone(), window_ns, run_in_until_ns, losses)?;
+        let findings = reader.findings().clone();
         let engine = if threads < 2 { Engine::Here(Box::new(reader)) } else { ahead(reader) };
-        Ok(Self { tables, info, losses, engine, checked, threads })
+        Ok(Self { tables, info, findings, engine, checked, threads })
     }
 
     /// The tables, in the order of the interface, housekeeping last by name. A table that is not here is a topic that
@@ -192,21 +208,26 @@ impl Replay {
     /// [`ReplayError::Io`] when a file can no longer be read.
     #[allow(clippy::should_implement_trait, reason = "an iterator cannot be asked for its losses between two items")]
     pub fn next(&mut self) -> Result<Option<Chunk>, ReplayError> {
-        let (chunk, losses) = match &mut self.engine {
-            Engine::Here(reader) => (reader.next()?, reader.losses().clone()),
+        let (chunk, findings) = match &mut self.engine {
+            Engine::Here(reader) => (reader.next()?, reader.findings().clone()),
             Engine::Ahead { stretches, .. } => match stretches.recv() {
                 Ok(stretch) => stretch?,
-                Err(_) if self.ended() => (None, self.losses.clone()),
+                Err(_) if self.ended() => (None, self.findings.clone()),
                 Err(_) => return Err(ReplayError::Worker),
             },
         };
-        self.losses = losses;
+        self.findings = findings;
         Ok(chunk)
     }
 
-    /// What was met until the last stretch delivered; complete when [`Replay::next`] has said `None`.
+    /// What was met in the data until the last stretch delivered; complete when [`Replay::next`] has said `None`.
     pub fn losses(&self) -> &Losses {
-        &self.losses
+        &self.findings.of_data
+    }
+
+    /// The same of what comes before the data and only settles what reads it.
+    pub fn losses_of_run_in(&self) -> &Losses {
+        &self.findings.of_run_in
     }
 
     /// That no file has changed since it was opened.
@@ -249,7 +270,8 @@ impl Replay {
                     (Finding::DamagedDataSections, "so that values in it may be wrong; fetch it again")
                 }
             };
-            self.losses
+            self.findings
+                .of_data
                 .add(finding, 1, &name, || format!("{name} is not what the CRC of its data section says, {what}"));
         }
         self.unchanged()?;
@@ -288,7 +310,7 @@ fn ahead(reader: Reader) -> Engine {
     let thread = thread::Builder::new().spawn(move || {
         let Ok(mut reader) = taken.recv() else { return };
         loop {
-            let stretch = reader.next().map(|chunk| (chunk, reader.losses().clone()));
+            let stretch = reader.next().map(|chunk| (chunk, reader.findings().clone()));
             let more = matches!(&stretch, Ok((Some(_), _)));
             // The other side is gone when the replay was dropped: nobody wants the rest.
             if send.send(stretch).is_err() || !more {

@@ -10,7 +10,7 @@ use mcap::records::op;
 use super::ReplayError;
 use super::block::{Block, drain};
 use super::inflate::{InflateError, Inflater, Piece, Stored};
-use super::losses::{Finding, Losses};
+use super::losses::{Finding, Findings, Losses};
 use super::records::{Cursor, Message};
 use super::tables::{Route, Routes};
 use crate::input::InputFile;
@@ -41,6 +41,11 @@ pub(super) fn is_sane(log_time: u64) -> bool {
     i64::try_from(log_time).is_ok_and(|t| SANE_NS.contains(&t))
 }
 
+/// After the last row that a piece states, Unix ns; `i64::MAX` where that is no time.
+fn end_of(piece: &Piece) -> i64 {
+    if is_sane(piece.start) && is_sane(piece.end) { clamp_ns(piece.end).saturating_add(1) } else { i64::MAX }
+}
+
 /// A piece that has yet to be read.
 #[derive(Debug)]
 struct Pending {
@@ -69,6 +74,8 @@ struct ReadFile {
     routes: Routes,
     /// Messages that should be in it and have not come yet; none where it does not say, or is not read whole.
     due: Option<u64>,
+    /// After the last row that its pieces state, Unix ns.
+    end_ns: i64,
 }
 
 /// Where a message of a piece lies.
@@ -96,7 +103,9 @@ pub(super) struct Reader {
     last_ns: Option<i64>,
     inflater: Inflater,
     entries: Vec<Entry>,
-    losses: Losses,
+    /// Rows before this time only settle the stages, Unix ns; `i64::MIN` where there are none.
+    run_in_until_ns: i64,
+    findings: Findings,
 }
 
 impl Reader {
@@ -104,6 +113,7 @@ impl Reader {
         files: Vec<OpenFile>,
         tables: Vec<TableSpec>,
         window_ns: Range<i64>,
+        run_in_until_ns: i64,
         losses: Losses,
     ) -> Result<Self, ReplayError> {
         let inflater = Inflater::new().map_err(|source| ReplayError::Io { path: PathBuf::from("zstd"), source })?;
@@ -112,6 +122,9 @@ impl Reader {
         let mut end_ns = i64::MIN;
         for (at, file) in files.into_iter().enumerate() {
             let mut due = file.messages;
+            // A chunk without messages states zero for both times.
+            let with_messages = file.pieces.iter().filter(|piece| (piece.start, piece.end) != (0, 0));
+            let file_end_ns = with_messages.map(end_of).max().unwrap_or(i64::MAX);
             for piece in file.pieces {
                 let (start, end) = (clamp_ns(piece.start), clamp_ns(piece.end));
                 // Pieces with times out of range are read for the count of them.
@@ -125,7 +138,7 @@ impl Reader {
                     due = None;
                 }
             }
-            opened.push(ReadFile { input: file.input, routes: file.routes, due });
+            opened.push(ReadFile { input: file.input, routes: file.routes, due, end_ns: file_end_ns });
         }
         let blocks = tables.iter().map(|_| vec![]).collect();
         let (done_ns, last_ns, entries) = (i64::MIN, None, vec![]);
@@ -140,12 +153,13 @@ impl Reader {
             last_ns,
             inflater,
             entries,
-            losses,
+            run_in_until_ns,
+            findings: Findings { of_data: losses, of_run_in: Losses::default() },
         })
     }
 
-    pub(super) fn losses(&self) -> &Losses {
-        &self.losses
+    pub(super) fn findings(&self) -> &Findings {
+        &self.findings
     }
 
     /// The next stretch that has a row; `None` at the end.
@@ -160,13 +174,14 @@ impl Reader {
                 let ((_, file, _), pending) = entry.remove_entry();
                 self.read(file, pending, until_ns)?;
             }
+            let losses = self.findings.before(until_ns, self.run_in_until_ns);
             let batches: Vec<Batch> = (self.blocks.iter_mut().zip(&self.tables))
-                .map(|(blocks, table)| drain(blocks, until_ns, table.columns.len(), &table.name, &mut self.losses))
+                .map(|(blocks, table)| drain(blocks, until_ns, table.columns.len(), &table.name, losses))
                 .collect();
             self.done_ns = until_ns;
             if self.is_stray(&batches) {
                 let rows = batches.iter().map(|b| b.rows() as u64).sum();
-                self.losses.add(Finding::StrayMessages, rows, "", || {
+                self.findings.before(until_ns, self.run_in_until_ns).add(Finding::StrayMessages, rows, "", || {
                     "messages lie more than a day from all others: a clock had failed; they were dropped".to_owned()
                 });
                 continue;
@@ -204,7 +219,8 @@ impl Reader {
         for file in &mut self.files {
             let Some(missing) = file.due.take().filter(|missing| *missing > 0) else { continue };
             let name = super::name_of(file.input.path());
-            self.losses.add(Finding::MissingMessages, missing, &name, || {
+            let losses = self.findings.before(file.end_ns, self.run_in_until_ns);
+            losses.add(Finding::MissingMessages, missing, &name, || {
                 format!("{name}: {missing} messages that its statistics count are not in it; fetch the file again")
             });
         }
@@ -219,15 +235,16 @@ impl Reader {
     fn read(&mut self, file: usize, pending: Pending, until_ns: i64) -> Result<(), ReplayError> {
         let horizon_ns = until_ns.saturating_add(HORIZON);
         let mut held = self.held_bytes();
-        let ReadFile { input, routes, due } = &mut self.files[file];
+        let ReadFile { input, routes, due, .. } = &mut self.files[file];
         let name = super::name_of(input.path());
         let piece = &pending.piece;
+        let losses = self.findings.before(end_of(piece), self.run_in_until_ns);
         let io = |source| ReplayError::Io { path: input.path().to_owned(), source };
         let records = match self.inflater.read(input, piece) {
             Ok(records) => records,
             Err(InflateError::Io(error)) => return Err(io(error)),
             Err(InflateError::Corrupt(why)) => {
-                self.losses.add(Finding::CorruptChunks, 1, &format!("{name}@{}", piece.offset), || {
+                losses.add(Finding::CorruptChunks, 1, &format!("{name}@{}", piece.offset), || {
                     format!(
                         "{name}: the chunk at byte {} is corrupt ({why}); its messages from {} to {} ns are lost; fetch the file again",
                         piece.offset, piece.start, piece.end
@@ -238,7 +255,7 @@ impl Reader {
         };
         let first_time = pending.from_ns == i64::MIN;
         if first_time && matches!(&piece.stored, Stored::Chunk { crc: 0, .. }) {
-            self.losses.add(Finding::ChunksWithoutCrc, 1, &name, || {
+            losses.add(Finding::ChunksWithoutCrc, 1, &name, || {
                 format!("{name} has chunks without a CRC; damage goes unseen")
             });
         }
@@ -249,7 +266,7 @@ impl Reader {
             window_ns: self.window_ns.clone(),
             first_time,
         };
-        let (later, messages) = index(records, &wanted, &mut self.entries, &name, &mut self.losses);
+        let (later, messages) = index(records, &wanted, &mut self.entries, &name, losses);
         if let Some(due) = due.as_mut().filter(|_| first_time) {
             *due = due.saturating_sub(messages);
         }
@@ -257,7 +274,7 @@ impl Reader {
         for entries in self.entries.chunk_by(|a, b| a.channel == b.channel) {
             let (channel, count) = (entries[0].channel, entries.len());
             match routes.get_mut(&channel) {
-                None => self.losses.add(Finding::MessagesOfUnknownChannels, count as u64, &format!("{name}#{channel}"), || {
+                None => losses.add(Finding::MessagesOfUnknownChannels, count as u64, &format!("{name}#{channel}"), || {
                     format!("{name}: {count} messages are of channel {channel}, which the file does not define; they are lost")
                 }),
                 Some(Route::Nowhere { finding, topic }) => {
@@ -265,7 +282,7 @@ impl Reader {
                         Finding::TruthMessages => "it is the truth of a simulation and no calibration may read it",
                         _ => "it is not in telemetry.proto; housekeeping belongs under /hk/",
                     };
-                    self.losses.add(*finding, count as u64, topic, || format!("{name}: topic {topic} is not read: {why}"));
+                    losses.add(*finding, count as u64, topic, || format!("{name}: topic {topic} is not read: {why}"));
                 }
                 Some(Route::Table { table, decoder }) => {
                     let spec = &self.tables[*table];
@@ -275,11 +292,11 @@ impl Reader {
                     }
                     let rows = decode(entries, records, decoder, spec.columns.len());
                     let topic = &spec.name;
-                    self.losses.add(Finding::NonFiniteValues, rows.non_finite, topic, || {
+                    losses.add(Finding::NonFiniteValues, rows.non_finite, topic, || {
                         format!("{name}: topic /{topic} has values that are NaN or infinite; they are passed on")
                     });
                     if let Some(error) = rows.error {
-                        self.losses.add(Finding::MalformedMessages, (count - rows.times.len()) as u64, topic, || {
+                        losses.add(Finding::MalformedMessages, (count - rows.times.len()) as u64, topic, || {
                             format!("{name}: messages of topic /{topic} contradict their schema ({error}) and are lost")
                         });
                     }

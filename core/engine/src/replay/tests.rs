@@ -404,6 +404,29 @@ fn a_chunk_that_says_it_is_empty_is_no_silent_loss() {
     }
 }
 
+/// Damage in a file that ends before the data begin costs these nothing; the same damage in their own file does.
+#[test]
+fn what_is_lost_before_the_data_is_no_loss_of_theirs() {
+    let halves = || [Foreign::new(epochs(0, 300)).bytes(), Foreign::new(epochs(300, 300)).bytes()];
+    for damaged in [0, 1] {
+        let mut files = halves();
+        let header = chunk_headers(&files[damaged])[1];
+        files[damaged][header + 16..header + 24].copy_from_slice(&0_u64.to_le_bytes());
+        let folder = tempfile::tempdir().unwrap();
+        let files = stored(folder.path(), &files);
+        for threads in [1, 2] {
+            let begin_ns = Some(DAY + 300 * EPOCH);
+            let mut replay = Replay::open_with_run_in(&files, None, begin_ns, threads).unwrap();
+            while replay.next().unwrap().is_some() {}
+            let (data, run_in) = (replay.losses(), replay.losses_of_run_in());
+            let (with, without) = if damaged == 0 { (run_in, data) } else { (data, run_in) };
+            assert_eq!(with.count(Finding::CorruptChunks), 1, "file {damaged}");
+            assert!(with.count(Finding::MissingMessages) > 0, "file {damaged}");
+            assert_eq!(*without, Losses::default(), "file {damaged}");
+        }
+    }
+}
+
 /// Chunks that vanish with their entries of the index leave the statistics, which say what should be there.
 #[test]
 fn messages_that_the_statistics_count_are_missed() {
