@@ -84,8 +84,10 @@ impl Recording {
         for (sequence, message) in messages.into_iter().enumerate() {
             let channel = &self.channels[&message.topic];
             let id = *ids.entry(message.topic.clone()).or_insert_with(|| {
-                let schema = channel.schema.as_ref().expect("a schema");
-                let schema = writer.add_schema(&schema.name, &schema.encoding, &schema.data).expect("a schema");
+                // A channel without a schema has the number 0.
+                let schema = channel.schema.as_ref().map_or(0, |schema| {
+                    writer.add_schema(&schema.name, &schema.encoding, &schema.data).expect("a schema")
+                });
                 let encoding = &channel.message_encoding;
                 writer.add_channel(schema, &message.topic, encoding, &channel.metadata).expect("a channel")
             });

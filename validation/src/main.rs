@@ -9,6 +9,7 @@ mod diagnosis;
 mod diagnosis_report;
 mod diagnosis_score;
 mod error;
+mod faults;
 mod frozen;
 mod kills;
 mod limits;
@@ -56,6 +57,9 @@ enum Command {
     Months(MonthsCommand),
     /// Kill commands that write at random instants, and look at what the next one finds; goes on where it was stopped
     Kills(KillsCommand),
+    /// Put mixtures of faults into telemetry of two producers, and look whether a product is wrong and says that it is
+    /// right; goes on where it was stopped
+    Faults(FaultsCommand),
     /// Compute what data of each length can say of each effect; goes on where it was stopped
     Limits,
     /// Measure ratios of speed, on a machine that does nothing else
@@ -147,6 +151,19 @@ struct KillsCommand {
 }
 
 #[derive(Debug, Args)]
+struct FaultsCommand {
+    /// Seeds, FIRST-LAST; each determines producer and faults
+    #[arg(long, value_parser = seeds, default_value = "1-500")]
+    seeds: RangeInclusive<u32>,
+    /// Sets at a time
+    #[arg(long, default_value_t = AT_ONCE)]
+    at_once: usize,
+    /// File of results
+    #[arg(long, value_name = "FILE")]
+    results: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
 struct MonthsCommand {
     /// Seeds, FIRST-LAST
     #[arg(long, value_parser = seeds, default_value = "1-20")]
@@ -210,6 +227,10 @@ fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
         Command::Kills(k) => {
             let file = k.results.clone().unwrap_or_else(|| results.join("kills.jsonl"));
             kills::kills(&Program::build()?, k.seeds.clone(), k.at_once, &file, &scratch)
+        }
+        Command::Faults(f) => {
+            let file = f.results.clone().unwrap_or_else(|| results.join("faults.jsonl"));
+            faults::faults(&Program::build()?, f.seeds.clone(), f.at_once, &file, &scratch)
         }
         Command::Limits => limits::limits(&Program::build()?, &results.join("limits.jsonl"), &scratch),
         Command::Speed => speed::measure(&Program::build()?, &speed_file, &scratch),

@@ -224,6 +224,29 @@ impl Program {
     /// Runs a chain over telemetry and returns the product as JSON. Exit codes for lost data and an inconsistent model
     /// are accepted.
     pub(crate) fn run(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Result<Value, CampaignError> {
+        json(&mut self.run_command(chain, files, archive), &[0, 3, 4])
+    }
+
+    /// The same of telemetry that may be refused.
+    pub(crate) fn try_run(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Result<Ran, CampaignError> {
+        let mut command = self.run_command(chain, files, archive);
+        command.arg("--quiet");
+        let name = || format!("{command:?}");
+        let (name, output) = (name(), command.output());
+        let output = output.map_err(|source| CampaignError::Start { command: name.clone(), source })?;
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        match output.status.code() {
+            Some(exit @ (0 | 3 | 4)) => {
+                let product = serde_json::from_slice(&output.stdout);
+                let product = product.map_err(|_| missing(&command, "a JSON document"))?;
+                Ok(Ran { exit, product: Some(product), said })
+            }
+            Some(exit @ 1) => Ok(Ran { exit, product: None, said }),
+            _ => Err(CampaignError::Failed { command: name, status: output.status, message: said }),
+        }
+    }
+
+    fn run_command(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Command {
         let mut command = self.command();
         command.arg("run").arg(&chain.pipeline).args(files).arg("--archive").arg(archive).arg("--json");
         for (option, path) in [("--mission", &chain.mission), ("--model", &chain.model)] {
@@ -231,8 +254,19 @@ impl Program {
                 command.arg(option).arg(path);
             }
         }
-        json(&mut command, &[0, 3, 4])
+        command
     }
+}
+
+/// What became of a run.
+#[derive(Clone, Debug)]
+pub(crate) struct Ran {
+    /// Exit code.
+    pub(crate) exit: i32,
+    /// The product; none where the run was refused.
+    pub(crate) product: Option<Value>,
+    /// What stood on stderr.
+    pub(crate) said: String,
 }
 
 /// True offsets, m, in a simulation's truth.

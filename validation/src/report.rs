@@ -12,6 +12,7 @@ use crate::bound::free_space;
 use crate::campaign::{NOMINAL, TWINS, Twin, note, taiji};
 use crate::diagnosis_report;
 use crate::error::{CampaignError, file};
+use crate::faults::{self, Mixture};
 use crate::kills::{self, Kill};
 use crate::limits::{self, Limits};
 use crate::months::{self, Months};
@@ -51,6 +52,8 @@ pub(crate) struct Measured {
     pub(crate) months: Vec<Months>,
     /// Programs that were killed.
     pub(crate) kills: Vec<Kill>,
+    /// Telemetry with faults.
+    pub(crate) faults: Vec<Mixture>,
 }
 
 impl Measured {
@@ -65,6 +68,7 @@ impl Measured {
             limits: read(&folder.join("limits.jsonl"))?,
             months: read(&folder.join("months.jsonl"))?,
             kills: read(&folder.join("kills.jsonl"))?,
+            faults: read(&folder.join("faults.jsonl"))?,
         })
     }
 }
@@ -559,6 +563,8 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
     failed.extend(more);
     let (kills, more) = kills::table(&measured.kills);
     failed.extend(more);
+    let (faults, more) = faults::table(&measured.faults);
+    failed.extend(more);
     let drawn =
         [("coverage", picture(&measured.coverage, &free)), ("confusion", blind_report::picture(&measured.blind))];
     let mut pictures = Vec::new();
@@ -576,6 +582,7 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
         ("limits", limits::table(&measured.limits)),
         ("months", months),
         ("kills", kills),
+        ("faults", faults),
     ]);
     Ok(Report { parts, pictures, failed })
 }

@@ -95,6 +95,8 @@ pub struct Quadratic {
     /// Such that `score − information · values` is the derivative at `values`.
     score: DVector<f64>,
     base: Vec<usize>,
+    /// Inverse of the information of the base.
+    base_inverse: DMatrix<f64>,
     candidates: Vec<Candidate>,
     /// Numbers in the data.
     numbers: f64,
@@ -126,6 +128,7 @@ impl Quadratic {
             information,
             score,
             base,
+            base_inverse: DMatrix::zeros(0, 0),
             candidates,
             numbers: sums.numbers.max(1.0),
             rounding: Vec::new(),
@@ -148,8 +151,8 @@ impl Quadratic {
     }
 
     fn profile(&mut self) {
-        let inner = self.inverse(&self.base);
-        let b = &self.base;
+        self.base_inverse = self.inverse(&self.base);
+        let (b, inner) = (&self.base, &self.base_inverse);
         let p = self.score.len();
         let across = DMatrix::from_fn(p, b.len(), |i, j| self.information[(i, b[j])]);
         let along = &across * inner;
@@ -338,6 +341,11 @@ impl Quadratic {
     /// By how much χ² is expected to be higher with another candidate in the place of one of a set, if that one acts
     /// with its fitted values: what the other and the rest of the set leave of it. Grows with the length of the data.
     pub fn separation(&self, candidate: usize, from: usize, set: &[usize]) -> f64 {
+        self.separation_of(candidate, &self.beside(candidate, set).values, from, set)
+    }
+
+    /// The same where the candidate acts with these values.
+    pub fn separation_of(&self, candidate: usize, values: &[f64], from: usize, set: &[usize]) -> f64 {
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).chain([from]).collect();
         let (own, at) = (self.parameters(&[candidate]), self.parameters(&others));
         let n = |rows: &[usize], columns: &[usize]| {
@@ -345,7 +353,7 @@ impl Quadratic {
         };
         let across = n(&own, &at);
         let left = n(&own, &own) - &across * inverse(&n(&at, &at)) * across.transpose();
-        let values = DVector::from_vec(self.beside(candidate, set).values);
+        let values = DVector::from_column_slice(values);
         values.dot(&(left * &values)).max(0.0)
     }
 
@@ -379,6 +387,7 @@ impl Quadratic {
             profiled_score: DVector::zeros(values.len()),
             information,
             base: self.base.clone(),
+            base_inverse: DMatrix::zeros(0, 0),
             candidates: self.candidates.clone(),
             numbers: self.numbers,
             rounding: Vec::new(),
@@ -439,20 +448,24 @@ impl Quadratic {
         (values, sigma)
     }
 
+    /// Values of the base and of a set; zero for candidates that are not in it.
+    pub fn values(&self, set: &[usize]) -> DVector<f64> {
+        let mut values = DVector::zeros(self.score.len());
+        let (inside, _) = self.fit(set);
+        self.parameters(set).iter().zip(inside).for_each(|(i, x)| values[*i] = x);
+        let rest = &self.score - &self.information * &values;
+        let solved = &self.base_inverse * DVector::from_fn(self.base.len(), |i, _| rest[self.base[i]]);
+        self.base.iter().zip(solved.iter()).for_each(|(i, x)| values[*i] = *x);
+        values
+    }
+
     /// Values and σ of the base and of a set.
     pub fn solution(&self, set: &[usize]) -> (DVector<f64>, DVector<f64>) {
-        let p = self.score.len();
-        let (mut values, mut sigma) = (DVector::zeros(p), DVector::zeros(p));
-        let at = self.parameters(set);
-        let (inside, _) = self.fit(set);
-        at.iter().zip(inside).for_each(|(i, x)| values[*i] = x);
-        let rest = &self.score - &self.information * &values;
-        let solved = self.inverse(&self.base) * DVector::from_fn(self.base.len(), |i, _| rest[self.base[i]]);
-        self.base.iter().zip(solved.iter()).for_each(|(i, x)| values[*i] = *x);
-        let all: Vec<usize> = self.base.iter().copied().chain(at).collect();
+        let mut sigma = DVector::zeros(self.score.len());
+        let all: Vec<usize> = self.base.iter().copied().chain(self.parameters(set)).collect();
         let covariance = self.inverse(&all);
         all.iter().enumerate().for_each(|(k, i)| sigma[*i] = covariance[(k, k)].max(0.0).sqrt());
-        (values, sigma)
+        (self.values(set), sigma)
     }
 
     /// Covariance of all parameters with a set; zero for candidates that are not in it.
