@@ -10,7 +10,16 @@ import json
 import pathlib
 import subprocess
 
+import dask
 from dask.distributed import Client, LocalCluster, as_completed
+
+# Workers that are started here look at their own stack a hundred times a second, which tells nothing of a program that
+# they wait for, and takes its time.
+QUIET = {
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.system-monitor.interval": "10s",
+    "distributed.worker.memory.monitor-interval": "10s",
+}
 
 
 def do(argv, *_results_before):
@@ -27,6 +36,7 @@ def main():
     parser.add_argument("--scheduler", help="address of a scheduler, tcp://host:8786")
     parser.add_argument("--commit", action="store_true", help="take the results over at the end")
     arguments = parser.parse_args()
+    dask.config.set(QUIET)
     cluster = arguments.scheduler or LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
     with Client(cluster) as client:
         futures = {}

@@ -14,6 +14,7 @@ use tempfile::TempDir;
 const FIRST: &str = "COM1B_2035-01-01_SC1_01_0001";
 
 const ENOSPC: i32 = 28;
+const EINTR: i32 = 4;
 const EIO: i32 = 5;
 const EROFS: i32 = 30;
 const EDQUOT: i32 = 122;
@@ -148,9 +149,27 @@ fn certify(folder: &Path) -> Command {
 /// Counts of writes, so that a library that is not preloaded is noticed.
 #[test]
 fn every_write_of_certify_fails_in_turn() {
-    for (errno, stays) in [(ENOSPC, true), (EIO, false), (EROFS, true), (EDQUOT, false), (KILL, false)] {
+    let errors = [(ENOSPC, true), (EIO, false), (EINTR, false), (EROFS, true), (EDQUOT, false), (KILL, false)];
+    for (errno, stays) in errors {
         let writes = every_write(certify, sets, errno, stays);
         assert!(writes > 15, "{writes} writes with error {errno}");
+    }
+}
+
+#[test]
+fn every_write_of_withdraw_fails_in_turn() {
+    let withdraw = |folder: &Path| {
+        let mut command = dragfree(folder);
+        command.args(["products", "withdraw", FIRST, "--reason", "a test", "--archive"]).arg(folder.join("archive"));
+        command
+    };
+    let withdrawn = |folder: &Path, _: &[String]| {
+        let list = json(dragfree(folder).args(["products", "list", "--json"]), 0);
+        list["products"].as_array().expect("products").iter().filter(|p| !p["withdrawn"].is_null()).count()
+    };
+    for (errno, stays) in [(ENOSPC, true), (EINTR, false), (KILL, false)] {
+        let writes = every_write(withdraw, withdrawn, errno, stays);
+        assert!(writes > 10, "{writes} writes with error {errno}");
     }
 }
 

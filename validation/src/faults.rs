@@ -333,8 +333,7 @@ fn of_messages(kind: Kind, messages: &mut Vec<Message>, start_ns: u64, dice: &mu
         }
         Kind::Spikes => {
             let (count, size) = (dice.random_range(1..=50), noise * 10_f64.powf(dice.random_range(1.0..6.0)));
-            let times: Vec<u64> =
-                (0..count).map(|_| start_ns + STEP_NS * dice.random_range(0..SAMPLES)).collect();
+            let times: Vec<u64> = (0..count).map(|_| start_ns + STEP_NS * dice.random_range(0..SAMPLES)).collect();
             change(messages, &|m| times.contains(&m.log_time), &mut |x| x + size);
             format!("{field}, {count} of {size:.1e}")
         }

@@ -2,6 +2,7 @@
 
 use crate::Failure;
 use crate::deb;
+use crate::sbom;
 use crate::tree::Tree;
 use serde_json::Value;
 use std::collections::BTreeSet;
@@ -68,6 +69,8 @@ fn layout(root: &Path, workspace: &Workspace) -> Result<Tree, Failure> {
         &root.join("fixtures/ephemeris/LICENSE-naif-packages.txt"),
         "share/doc/dragfree/LICENSE-naif-packages.txt",
     )?;
+    let linked = workspace.plugin_packages().chain(["dragfree".to_owned()]).collect();
+    tree.put("share/doc/dragfree/sbom.cdx.json", sbom::make(root, &workspace.version("dragfree")?, &linked)?);
     tree.put("share/doc/dragfree/copyright", "License: MIT OR Apache-2.0\n");
     let pages = tempfile::tempdir()?;
     output(Command::new(&program).args(["man", "--out"]).arg(pages.path()))?;
@@ -150,12 +153,14 @@ impl Workspace {
     /// Libraries of plugins: what is built as a `cdylib` beside the program.
     fn plugins(&self) -> Vec<String> {
         let targets = self.packages.iter().filter_map(|p| p["targets"].as_array()).flatten();
-        let is_plugin = |target: &&Value| {
-            let has = |key: &str, what: &str| target[key].as_array().is_some_and(|all| all.iter().any(|x| x == what));
-            has("crate_types", "cdylib") && !has("kind", "example")
-        };
         let name = |target: &Value| target["name"].as_str().map(|name| name.replace('-', "_"));
-        targets.filter(is_plugin).filter_map(name).collect()
+        targets.filter(|target| is_plugin(target)).filter_map(name).collect()
+    }
+
+    /// The crates that these are built from.
+    fn plugin_packages(&self) -> impl Iterator<Item = String> {
+        let makes_one = |p: &&Value| p["targets"].as_array().is_some_and(|all| all.iter().any(is_plugin));
+        self.packages.iter().filter(makes_one).filter_map(|p| Some(p["name"].as_str()?.to_owned()))
     }
 
     /// A crate and those of ours that it needs, in order of their names.
@@ -174,13 +179,19 @@ impl Workspace {
     }
 }
 
-fn cargo(folder: &Path, arguments: &[&str]) -> Result<Vec<u8>, Failure> {
+/// Whether a target of a crate is a library of plugins.
+fn is_plugin(target: &Value) -> bool {
+    let has = |key: &str, what: &str| target[key].as_array().is_some_and(|all| all.iter().any(|x| x == what));
+    has("crate_types", "cdylib") && !has("kind", "example")
+}
+
+pub(crate) fn cargo(folder: &Path, arguments: &[&str]) -> Result<Vec<u8>, Failure> {
     let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
     output(Command::new(cargo).current_dir(folder).args(arguments))
 }
 
 /// Stdout of a command that must succeed.
-fn output(command: &mut Command) -> Result<Vec<u8>, Failure> {
+pub(crate) fn output(command: &mut Command) -> Result<Vec<u8>, Failure> {
     let output = command.output().map_err(|error| format!("{command:?}: {error}"))?;
     if output.status.success() {
         return Ok(output.stdout);

@@ -2,6 +2,7 @@
 
 mod deb;
 mod dist;
+mod sbom;
 mod tree;
 
 use clap::{Parser, Subcommand};

@@ -146,6 +146,40 @@ fn a_release_works_wherever_it_is_unpacked() {
     assert!(!String::from_utf8_lossy(&binary).contains(root().to_str().expect("text")), "no path of this machine");
 }
 
+/// What cargo itself says is linked into program and plugins stands in the bill of materials, with its licence, and
+/// what comes from elsewhere with its checksum; what only tests need does not.
+#[test]
+fn the_bill_of_materials_names_every_crate() {
+    let release = Release::new();
+    let path = release.top.join("share/doc/dragfree/sbom.cdx.json");
+    let bill: serde_json::Value =
+        serde_json::from_slice(&std::fs::read(path).expect("a bill")).expect("a JSON document");
+    assert_eq!((&bill["bomFormat"], &bill["specVersion"]), (&"CycloneDX".into(), &"1.5".into()));
+    let components = bill["components"].as_array().expect("components");
+    let text = |c: &serde_json::Value, key: &str| c[key].as_str().unwrap_or_else(|| panic!("{key} of {c}")).to_owned();
+    let named: BTreeSet<String> =
+        components.iter().map(|c| format!("{} v{}", text(c, "name"), text(c, "version"))).collect();
+    for c in components {
+        assert!(c["licenses"][0]["expression"].is_string(), "{c}");
+        let sha256 = c["hashes"][0]["content"].as_str().map_or(0, str::len);
+        let ours = text(c, "name").starts_with("dragfree");
+        assert_eq!(sha256, if ours { 0 } else { 64 }, "{c}");
+        assert_eq!(text(c, "purl"), text(c, "bom-ref"));
+    }
+    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
+    let mut tree = Command::new(cargo);
+    tree.current_dir(root()).args(["tree", "--offline", "--locked", "--edges", "normal", "--prefix", "none"]);
+    let packages = ["dragfree", "dragfree-effects", "dragfree-sim", "dragfree-hinf-dfacs"];
+    tree.args(packages.iter().flat_map(|name| ["--package", name]));
+    let linked = String::from_utf8(expect(&mut tree, 0).stdout).expect("names");
+    let linked: BTreeSet<String> =
+        linked.lines().filter(|l| !l.is_empty()).map(|l| l.split(' ').take(2).collect::<Vec<_>>().join(" ")).collect();
+    assert!(linked.len() > 100, "{linked:?}");
+    let missing: Vec<&String> = linked.iter().filter(|name| !named.contains(*name)).collect();
+    assert!(missing.is_empty(), "{missing:?}");
+    assert!(!named.iter().any(|name| name.starts_with("proptest ") || name.starts_with("criterion ")), "{named:?}");
+}
+
 /// The package is an `ar` archive of three members in order, and installs the same files below /usr.
 fn package_holds(release: &Release) {
     let bytes = std::fs::read(&release.package).expect("readable");

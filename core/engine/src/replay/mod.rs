@@ -139,8 +139,8 @@ impl Replay {
         Self::open_with_run_in(files, window_ns, None, threads)
     }
 
-    /// The same, where what comes before `run_in_until_ns`, Unix ns, only settles what reads it: what is wrong in pieces
-    /// of files that end before is told apart ([`Findings::of_run_in`]).
+    /// The same, where what comes before `run_in_until_ns`, Unix ns, only settles what reads it: what is wrong in
+    /// pieces of files that end before is told apart ([`Findings::of_run_in`]).
     ///
     /// # Errors
     /// As [`Self::open`].

@@ -10,10 +10,10 @@ use super::{Basis, Confounder, Day, Effect, Offset, On, Rung, Size, Switch, leve
 use crate::answer::NoiseLevel;
 
 /// Effects that are not switched on are told as far as this rank: what comes after explains nothing.
-const TOLD: usize = 16;
+const TOLD: usize = 24;
 
 /// Of these the first are told with what their absence does and what they are confounded with.
-const EXPLAINED: usize = 8;
+const EXPLAINED: usize = 12;
 
 /// Below this fall of χ² two effects cannot be told apart: three σ.
 const ALIKE_CHI2: f64 = 9.0;
@@ -44,7 +44,7 @@ impl Solving<'_> {
 
     fn rung(&self, on: &[On]) -> Rung {
         let set = effects_of(on);
-        let (values, sigma) = self.quadratic.solution(&set);
+        let values = self.quadratic.values(&set);
         let covariance = self.quadratic.covariance(&set);
         let offsets: Vec<usize> = self.offsets().collect();
         let levels: Vec<&NoiseLevel> = on.iter().filter_map(|o| self.level(*o)).collect();
@@ -56,7 +56,7 @@ impl Solving<'_> {
         let offset = |i: &usize| Offset {
             name: self.basis.coefficients[*i].name.clone(),
             value_m: values[*i],
-            sigma_m: sigma[*i],
+            sigma_m: covariance[(*i, *i)].max(0.0).sqrt(),
             frame: self.basis.coefficients[*i].frame.clone(),
         };
         Rung {
