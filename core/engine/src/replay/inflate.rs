@@ -36,6 +36,13 @@ pub(super) enum InflateError {
     Io(io::Error),
     /// What stands there is not what was written.
     Corrupt(String),
+    /// What was written is nothing that can be read.
+    Unreadable {
+        /// Why.
+        why: String,
+        /// What helps.
+        remedy: &'static str,
+    },
 }
 
 /// Reads and decompresses, in buffers that stay.
@@ -53,7 +60,10 @@ impl Inflater {
     /// The records of `piece`.
     pub(super) fn read(&mut self, file: &InputFile, piece: &Piece) -> Result<&[u8], InflateError> {
         let corrupt = |what: String| Err(InflateError::Corrupt(what));
-        let too_large = |bytes: u64| corrupt(format!("{bytes} bytes, where a chunk may have {PIECE_BYTES}"));
+        let too_large = |bytes: u64| {
+            let why = format!("{bytes} bytes, where a chunk may have {PIECE_BYTES}");
+            Err(InflateError::Unreadable { why, remedy: "write it again in chunks of a few MiB (`mcap compress`)" })
+        };
         if piece.length > PIECE_BYTES {
             return too_large(piece.length);
         }
@@ -91,7 +101,10 @@ impl Inflater {
                     .map_err(|e| InflateError::Corrupt(format!("lz4: {e}")))?;
                 &self.records
             }
-            other => return corrupt(format!("compression {other:?} is neither zstd nor lz4")),
+            other => {
+                let why = format!("compression {other:?} is neither zstd nor lz4");
+                return Err(InflateError::Unreadable { why, remedy: "write it again with zstd (`mcap compress`)" });
+            }
         };
         if records.len() != size {
             return corrupt(format!("{} bytes where {size} were written", records.len()));

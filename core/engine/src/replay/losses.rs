@@ -19,6 +19,8 @@ pub enum Finding {
     EmptyFiles,
     /// A chunk whose CRC, compression or size is wrong; all its messages are lost.
     CorruptChunks,
+    /// A chunk that is too large, or compressed in another way; all its messages are lost.
+    UnreadableChunks,
     /// A file whose data section is not what its CRC says, with messages that no other CRC covers: they were read, and
     /// may be wrong.
     DamagedDataSections,

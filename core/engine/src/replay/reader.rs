@@ -244,12 +244,11 @@ impl Reader {
             Ok(records) => records,
             Err(InflateError::Io(error)) => return Err(io(error)),
             Err(InflateError::Corrupt(why)) => {
-                losses.add(Finding::CorruptChunks, 1, &format!("{name}@{}", piece.offset), || {
-                    format!(
-                        "{name}: the chunk at byte {} is corrupt ({why}); its messages from {} to {} ns are lost; fetch the file again",
-                        piece.offset, piece.start, piece.end
-                    )
-                });
+                lost(losses, Finding::CorruptChunks, &name, piece, &format!("corrupt ({why})"), "fetch the file again");
+                return Ok(());
+            }
+            Err(InflateError::Unreadable { why, remedy }) => {
+                lost(losses, Finding::UnreadableChunks, &name, piece, &format!("unreadable ({why})"), remedy);
                 return Ok(());
             }
         };
@@ -313,6 +312,16 @@ impl Reader {
         }
         Ok(())
     }
+}
+
+/// Counts a chunk whose messages are lost.
+fn lost(losses: &mut Losses, finding: Finding, name: &str, piece: &Piece, what: &str, remedy: &str) {
+    let Piece { offset, start, end, .. } = piece;
+    losses.add(finding, 1, &format!("{name}@{offset}"), || {
+        format!(
+            "{name}: the chunk at byte {offset} is {what}; its messages from {start} to {end} ns are lost; {remedy}"
+        )
+    });
 }
 
 /// The messages of one channel, decoded.

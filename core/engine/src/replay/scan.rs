@@ -178,7 +178,7 @@ fn inspect(
         let records = match inflater.read(file, &scan.pieces[at]) {
             Ok(records) => records,
             Err(InflateError::Io(error)) => return Err(error.into()),
-            Err(InflateError::Corrupt(_)) => continue,
+            Err(InflateError::Corrupt(_) | InflateError::Unreadable { .. }) => continue,
         };
         let mut cursor = Cursor(records);
         let (mut start, mut end) = (u64::MAX, 0);

@@ -404,6 +404,23 @@ fn a_chunk_that_says_it_is_empty_is_no_silent_loss() {
     }
 }
 
+/// Neither is mended by fetching the file again, so that something else is said of them.
+#[test]
+fn a_chunk_that_nobody_could_read_says_what_helps() {
+    let mut large = Foreign::new(epochs(0, 300)).bytes();
+    let header = chunk_headers(&large)[1];
+    large[header + 16..header + 24].copy_from_slice(&(200_u64 << 20).to_le_bytes());
+    let mut other = Foreign::new(epochs(0, 300)).bytes();
+    assert_eq!(&other[header + 32..header + 36], b"zstd");
+    other[header + 32..header + 36].copy_from_slice(b"brot");
+    for (bytes, remedy) in [(large, "in chunks of a few MiB"), (other, "write it again with zstd")] {
+        let outcome = replay(&[bytes]);
+        assert_eq!(outcome.count(Finding::UnreadableChunks), 1, "{:?}", outcome.losses);
+        let said = outcome.losses.entries();
+        assert!(said[0].detail.contains(remedy) && !said[0].detail.contains("fetch"), "{said:?}");
+    }
+}
+
 /// Damage in a file that ends before the data begin costs these nothing; the same damage in their own file does.
 #[test]
 fn what_is_lost_before_the_data_is_no_loss_of_theirs() {
