@@ -2,6 +2,7 @@
 
 use std::io::{BufRead as _, BufReader, Read as _, Write as _};
 use std::net::TcpStream;
+use std::os::unix::fs::PermissionsExt as _;
 use std::path::{Path, PathBuf};
 use std::process::Stdio;
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
@@ -321,6 +322,32 @@ fn processor_time(id: u32) -> Duration {
         text.split(' ').next()?.parse::<u64>().ok()
     };
     Duration::from_nanos(tasks.filter_map(of).sum())
+}
+
+/// `serve --open` gives its page to the desktop's own opener.
+#[test]
+fn the_page_is_opened_in_a_browser() {
+    let flight = flight();
+    let bin = tempfile::tempdir().expect("a temporary folder");
+    let (opener, opened) = (bin.path().join("xdg-open"), bin.path().join("opened"));
+    std::fs::write(&opener, format!("#!/bin/sh\nprintf %s \"$1\" > '{}'\n", opened.display())).expect("written");
+    std::fs::set_permissions(&opener, std::fs::Permissions::from_mode(0o755)).expect("a mode");
+    let mut command = dragfree(flight.folder.path());
+    command.args(["serve", "--listen", "127.0.0.1:0", "--json", "--open", "missing?products=2035-01-01"]);
+    let path = std::env::var("PATH").unwrap_or_default();
+    let mut child = command.env("PATH", format!("{}:{path}", bin.path().display())).stdout(Stdio::piped()).spawn();
+    let mut line = String::new();
+    let stdout = child.as_mut().expect("starts").stdout.take().expect("piped");
+    let _ended = Ended(child.expect("starts"));
+    BufReader::new(stdout).read_line(&mut line).expect("a line");
+    let ready: Value = serde_json::from_str(&line).expect("a JSON document");
+    let begun = Instant::now();
+    while std::fs::read_to_string(&opened).is_ok_and(|text| text.is_empty()) || !opened.exists() {
+        assert!(begun.elapsed() < Duration::from_secs(20), "nothing was opened");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let expected = format!("{}missing?products=2035-01-01", ready["address"].as_str().expect("an address"));
+    assert_eq!(std::fs::read_to_string(&opened).expect("an address"), expected);
 }
 
 /// Of 200 requests at once every one is answered, and a run beside them makes its product. A switch over HTTP takes, in

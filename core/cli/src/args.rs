@@ -71,6 +71,9 @@ pub(crate) enum Command {
         /// Folder for everything that the demo writes
         #[arg(long, value_name = "DIR", default_value = "dragfree-demo")]
         dir: PathBuf,
+        /// Show the story in a browser at the end, until Ctrl-C
+        #[arg(long)]
+        open: bool,
     },
     /// Write the files of a new mission: mission, pipeline and model, with comments
     Init(Init),
@@ -371,6 +374,9 @@ pub(crate) struct Serve {
     /// Let pages change the model, with the token that is printed at the start. Without it they only read
     #[arg(long)]
     pub(crate) allow_changes: bool,
+    /// Open a browser, at this page where one is given: `missing?products=ID`
+    #[arg(long, value_name = "PAGE", num_args = 0..=1, default_missing_value = "")]
+    pub(crate) open: Option<String>,
 }
 
 #[derive(Debug, Args)]

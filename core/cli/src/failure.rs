@@ -29,6 +29,9 @@ pub(crate) enum Refusal {
     /// The demo would have to share a folder.
     #[error("{} is neither empty nor made by an earlier demo; name a folder of its own with --dir", .0.display())]
     NoDemoFolder(PathBuf),
+    /// The demo would have to print one document while it shows pages.
+    #[error("--open shows pages until it is ended, and --json prints one document at the end; leave one of them out")]
+    OpenAsJson,
     /// A diagnosis that names no effect to add.
     #[error("{}: {what}", path.display())]
     Diagnosis { path: PathBuf, what: String },

@@ -5,6 +5,7 @@
 
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::Duration;
 
 use axum::Router;
@@ -33,6 +34,9 @@ const BODY: usize = 1 << 16;
 /// A request must have come by then.
 const PATIENCE: Duration = Duration::from_secs(5);
 
+/// How often it is looked whether the process is to end.
+const LOOKS_UP: Duration = Duration::from_millis(200);
+
 /// What the pages load. No page asks another server for anything.
 pub(crate) const ASSETS: [(&str, &str, &str); 4] = [
     ("uPlot.min.css", "text/css", include_str!("../assets/uPlot.min.css")),
@@ -57,7 +61,7 @@ pub struct Ready {
     pub token: String,
 }
 
-/// Serves the pages until the program is ended. Port 0 takes a free one; `ready` is told which.
+/// Serves the pages until the program is ended, or its jobs are asked to end ([`dragfree_engine::stop`]). Port 0 takes a free one; `ready` is told which.
 ///
 /// # Errors
 /// [`PagesError`]: nothing can listen at the address.
@@ -76,11 +80,14 @@ pub fn serve(site: Site, at: SocketAddr, changes: bool, ready: impl FnOnce(&Read
     })
 }
 
+/// Takes connections until the process is asked to end.
 async fn accept(listener: TcpListener, router: &Router) {
     let connections = Arc::new(Semaphore::new(CONNECTIONS));
-    loop {
+    let asked_to_end = dragfree_engine::stop::flag();
+    while !asked_to_end.load(Ordering::Relaxed) {
         let Ok(permit) = Arc::clone(&connections).acquire_owned().await else { return };
-        let Ok((stream, _)) = listener.accept().await else {
+        let Ok(accepted) = tokio::time::timeout(LOOKS_UP, listener.accept()).await else { continue };
+        let Ok((stream, _)) = accepted else {
             // No descriptor is left: one will be when a connection has ended.
             tokio::time::sleep(Duration::from_millis(50)).await;
             continue;

@@ -7,6 +7,7 @@ use crate::{output, truth};
 use dragfree_pages::server::{Ready, serve as pages};
 use dragfree_pages::{Setup, Site, Truth};
 use serde_json::json;
+use std::io::Write as _;
 use std::time::SystemTime;
 
 pub(super) fn serve(command: &Serve, global: &Global) -> Result<Done, Failure> {
@@ -14,9 +15,20 @@ pub(super) fn serve(command: &Serve, global: &Global) -> Result<Done, Failure> {
     let mut failed = Ok(());
     pages(site, command.listen, command.allow_changes, |ready| {
         failed = output::print(&told(ready, command, global));
+        if let Some(page) = &command.open {
+            open(&format!("{}{page}", ready.address));
+        }
     })?;
     failed?;
     Ok(Done::new(String::new()))
+}
+
+/// Without a browser the pages are there all the same.
+fn open(address: &str) {
+    if let Err(error) = ::open::that_detached(address) {
+        // Nobody may be reading.
+        let _ = writeln!(std::io::stderr(), "no browser could be opened ({error}); open {address} in yours");
+    }
 }
 
 fn told(ready: &Ready, command: &Serve, global: &Global) -> String {

@@ -24,7 +24,10 @@ const MADE: [&str; 7] =
 /// The day of the paper's simulation, and the one after it.
 const DAYS: [&str; 2] = ["2035-01-01", "2035-01-02"];
 
-pub(super) fn execute(folder: &Path, global: &Global, paint: Paint) -> Result<Done, Failure> {
+pub(super) fn execute(folder: &Path, open: bool, global: &Global, paint: Paint) -> Result<Done, Failure> {
+    if open && global.json {
+        return Err(Refusal::OpenAsJson.into());
+    }
     own(folder)?;
     for (path, text) in bundled::FILES {
         place(&folder.join(path), text)?;
@@ -111,6 +114,14 @@ pub(super) fn execute(folder: &Path, global: &Global, paint: Paint) -> Result<Do
     text += "          and open the address that it prints: look at it, and switch the effect on by hand\n";
     text += "          hide another: the same commands with another number behind --hidden\n";
     text += "          open the .mcap files in Foxglove, PlotJuggler or Rerun\n";
+    if open {
+        story.show(&text)?;
+        story.say("The switch of the effect is on this page. Ctrl-C ends it.")?;
+        let page = format!("missing?products={first}");
+        let free = ["serve", "--listen", "127.0.0.1:0", "--archive", &archive];
+        story.tell(&[&free[..], &["--model", &model, "--truth", &truth, "--open", &page]].concat())?;
+        text.clear();
+    }
     Ok(Done { text, code })
 }
 

@@ -53,7 +53,7 @@ impl Done {
 pub(crate) fn execute(arguments: &Arguments, paint: Paint) -> Result<Done, Failure> {
     let global = &arguments.global;
     match &arguments.command {
-        Command::Demo { dir } => demo::execute(dir, global, paint),
+        Command::Demo { dir, open } => demo::execute(dir, *open, global, paint),
         Command::Init(command) => init::execute(command, global.json),
         Command::Completions { shell } => describe::completions(*shell),
         Command::Man { out } => describe::man(out),
