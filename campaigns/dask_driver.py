@@ -23,8 +23,8 @@ QUIET = {
 
 
 def do(argv, *_results_before):
-    """One task: its command, with the error text where it fails."""
-    done = subprocess.run([*argv, "--quiet", "--json"], capture_output=True, text=True)
+    """One task: its command, with the error text where it fails. A worker has one core for it."""
+    done = subprocess.run([*argv, "--quiet", "--json", "--threads", "1"], capture_output=True, text=True)
     if done.returncode != 0:
         raise RuntimeError(done.stderr.strip())
     return json.loads(done.stdout)

@@ -61,7 +61,8 @@ pub struct Ready {
     pub token: String,
 }
 
-/// Serves the pages until the program is ended, or its jobs are asked to end ([`dragfree_engine::stop`]). Port 0 takes a free one; `ready` is told which.
+/// Serves the pages until the program is ended, or its jobs are asked to end ([`dragfree_engine::stop`]). Port 0 takes
+/// a free one; `ready` is told which.
 ///
 /// # Errors
 /// [`PagesError`]: nothing can listen at the address.
