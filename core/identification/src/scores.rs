@@ -749,6 +749,32 @@ mod tests {
         assert!(transient(&left, "other").delta_chi2 < 20.0);
     }
 
+    /// Two lasting causes push; a third candidate has the series of the first in another unit. All three stand out, and
+    /// beside the first only the second does: of the third no finer form is asked for.
+    #[test]
+    fn what_the_most_significant_candidate_explains_is_not_asked_for_again() {
+        let (mut candidate_set, noise, settings) = (candidate_set(), noise(), Settings::default());
+        candidate_set.coefficients.truncate(2);
+        candidate_set.coefficients.push(coefficient("other", true, false, vec![form(&[], &[(0, 4, 1.0)])]));
+        candidate_set.coefficients.push(coefficient("same", true, false, vec![form(&[], &[(0, 3, 2.0)])]));
+        let gathered = gathered(5, SAMPLES, &[(9000, 8.0)], 1.0);
+        let scorer = CandidateScorer::new(&candidate_set, &gathered, &noise, &settings);
+        let screened = crate::screen::screen(&scorer, &[]).unwrap();
+        let instances = |requests: &[crate::screen::RefinementRequest]| {
+            let mut all: Vec<String> = requests.iter().map(|r| r.instance.clone()).collect();
+            all.sort();
+            all
+        };
+        assert_eq!(instances(&screened.requests), ["one", "other", "same"]);
+        let mut requests = screened.requests.clone();
+        crate::screen::retain_unexplained(&scorer, &screened, &mut requests).unwrap();
+        let first = screened.forms[0].instance.clone();
+        assert!(first == "one" || first == "same", "{first}");
+        let mut expected = [first, "other".to_owned()];
+        expected.sort();
+        assert_eq!(instances(&requests), expected);
+    }
+
     /// An event at the first of two times is named at "one"; "both" could have made it too. It stays at that time, to
     /// be compared, and not at the second time, where six times there is nothing (it would have more of the noise there
     /// than beside the named one in all six once in 64). Where something happened at the second time as well, it is
