@@ -231,9 +231,8 @@ impl Program {
     pub(crate) fn try_run(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Result<Ran, CampaignError> {
         let mut command = self.run_command(chain, files, archive);
         command.arg("--quiet");
-        let name = || format!("{command:?}");
-        let (name, output) = (name(), command.output());
-        let output = output.map_err(|source| CampaignError::Start { command: name.clone(), source })?;
+        let name = format!("{command:?}");
+        let output = command.output().map_err(|source| CampaignError::Start { command: name.clone(), source })?;
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         match output.status.code() {
             Some(exit @ (0 | 3 | 4)) => {

@@ -141,9 +141,9 @@ impl Feed for FileFeed {
 
     fn summary(&mut self) -> Result<Summary, EngineError> {
         let (losses, run_in) = (self.replay.losses(), self.replay.losses_of_run_in());
-        let before = run_in.entries().into_iter().map(|loss| {
-            format!("before the data, where they only settle the stages: {} {}: {}", loss.count, loss.kind, loss.detail)
-        });
+        let lost = run_in.entries().into_iter().map(|loss| format!("{} {}: {}", loss.count, loss.kind, loss.detail));
+        let before = lost.chain(run_in.notes());
+        let before = before.map(|what| format!("in the time before the data, which only settles the stages: {what}"));
         Ok(Summary {
             time_scale: self.replay.info().time_scale.clone(),
             counts: losses.counts(),
