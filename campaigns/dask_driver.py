@@ -7,6 +7,7 @@ scheduler keeps nothing that matters: whatever is killed, the next run does what
 
 import argparse
 import json
+import os
 import pathlib
 import subprocess
 
@@ -23,8 +24,13 @@ QUIET = {
 
 
 def do(argv, *_results_before):
-    """One task: its command, with the error text where it fails. A worker has one core for it."""
-    done = subprocess.run([*argv, "--quiet", "--json", "--threads", "1"], capture_output=True, text=True)
+    """One task: its command, with the error text where it fails. A worker has one core for it.
+
+    Dask has its workers give memory back at once (MALLOC_TRIM_THRESHOLD_), which costs a program a tenth of its time.
+    """
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
+    words = [*argv, "--quiet", "--json", "--threads", "1"]
+    done = subprocess.run(words, capture_output=True, text=True, env=environment)
     if done.returncode != 0:
         raise RuntimeError(done.stderr.strip())
     return json.loads(done.stdout)

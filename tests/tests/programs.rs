@@ -35,6 +35,7 @@ mod model;
 mod next;
 mod noise_effects;
 mod operations;
+mod over_time;
 mod plugin_author;
 mod python_reader;
 mod recursive_solutions;

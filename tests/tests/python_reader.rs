@@ -99,6 +99,20 @@ fn python_reads_what_we_write() {
     // NIS is counted after the filter's warm-up of ten minutes.
     let warming = |(name, n): (&String, &Value)| name.ends_with(".nis") && n.as_u64().is_some_and(|n| n <= 10);
     assert!(missing.iter().all(warming), "{filter}");
+
+    // Half an hour in intervals of 1.875 s, nine channels with four numbers each; the layout names fields of this file.
+    let residuals = &series["topics"]["/residuals"];
+    assert!((900..=961).contains(&residuals["count"].as_u64().expect("a count")), "{residuals}");
+    assert_eq!(residuals["sums"].as_object().map(serde_json::Map::len), Some(36), "{residuals}");
+    let mut export = dragfree(dir.path());
+    export.args(["products", "export", id, "--format", "foxglove", "--archive", "archive"]);
+    let layout: Value = serde_json::from_slice(&export.output().expect("runs").stdout).expect("JSON");
+    let panels = layout["configById"].as_object().expect("panels");
+    for path in panels.values().filter_map(|panel| panel["paths"].as_array()).flatten() {
+        let path = path["value"].as_str().expect("a path");
+        let (topic, field) = path.split_once('.').expect("a topic and a field");
+        assert!(series["topics"][topic]["sums"].get(field).is_some(), "{path} is not in the file");
+    }
 }
 
 /// The first double of `Interferometers`: tm1 { x_orf_m }, wire bytes `0a LEN 09 …`.

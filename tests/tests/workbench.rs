@@ -403,6 +403,34 @@ fn many_requests_at_once_and_one_after_the_other() {
     }
 }
 
+/// A calibration is seen on the page while it runs, with how far it is, and not when it has ended.
+#[test]
+fn what_runs_is_seen_while_it_runs() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let files = simulate(folder.path(), &["--hours", "16", "--seed", "4"]);
+    let mut run = dragfree(folder.path());
+    run.args(["--threads", "1", "-q", "run"]).arg(fixture("pipelines/science-mode.toml")).args(&files);
+    let mut run = Ended(run.args(["--archive", "archive"]).stdout(Stdio::null()).spawn().expect("starts"));
+    let since = Instant::now();
+    while !folder.path().join("archive/staging").exists() {
+        assert!(since.elapsed() < Duration::from_secs(60), "no archive");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    let server = serve(folder.path(), &["--archive", "archive"]);
+    let running = || get(server.port, "/running").body;
+    let mut seen = String::new();
+    while run.0.try_wait().expect("a process").is_none() {
+        let now = running();
+        if now.contains("COM1B SC1") {
+            seen = now;
+        }
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    assert!(seen.contains("has come to 2035-01-01") && seen.contains(" s left"), "{seen:?}");
+    assert!(running().contains("Nothing runs now"), "{}", running());
+}
+
 /// The pages of a report are whole by themselves: every file that they load is beside them, and nothing else is.
 #[test]
 fn a_report_needs_no_server() {

@@ -450,6 +450,28 @@ mod tests {
         Mixture { seed: 7, build: "b".to_owned(), own: true, faults, exit: 0, refused: None, verdict, largest_pull }
     }
 
+    /// A kind that did nothing would make its row of the table weaker without a word. Of eight draws five change
+    /// something at least: a gap of a few seconds may lie between two messages of the ephemeris.
+    #[test]
+    fn every_fault_changes_the_telemetry() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let files = Draw::new(1, HOURS, true).record(folder.path()).expect("a recording");
+        let recording = Recording::read(&files[0]);
+        let plain = |m: &Message| (m.log_time, m.topic.clone(), m.data.clone());
+        let before: Vec<_> = recording.messages().iter().map(plain).collect();
+        let of_file = [Kind::Cut, Kind::FlippedBytes, Kind::Pieces];
+        for (kind, _) in KINDS.into_iter().filter(|(kind, _)| !of_file.contains(kind)) {
+            let changed = |seed: u64| {
+                let mut messages = recording.messages().to_vec();
+                let mut dice = Xoshiro256PlusPlus::seed_from_u64(seed);
+                let _ = of_messages(kind, &mut messages, recording.start_ns(), &mut dice);
+                messages.len() != before.len() || messages.iter().zip(&before).any(|(m, was)| plain(m) != *was)
+            };
+            let count = (1..=8).filter(|seed| changed(*seed)).count();
+            assert!(count >= 5, "{kind:?} has changed {count} of 8");
+        }
+    }
+
     #[test]
     fn only_what_is_wrong_and_agrees_fails() {
         let (text, failed) = table(&[set("agree", 3.9), set("disagree", 50.0)]);

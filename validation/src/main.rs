@@ -17,6 +17,7 @@ mod months;
 mod program;
 mod records;
 mod report;
+mod soak;
 mod speed;
 mod stats;
 mod table;
@@ -60,6 +61,8 @@ enum Command {
     /// Put mixtures of faults into telemetry of two producers, and look whether a product is wrong and says that it is
     /// right; goes on where it was stopped
     Faults(FaultsCommand),
+    /// Watch an inbox for more than a year of days, a third of them late, cut, doubled or corrected, with kills
+    Soak(SoakCommand),
     /// Compute what data of each length can say of each effect; goes on where it was stopped
     Limits,
     /// Measure ratios of speed, on a machine that does nothing else
@@ -164,6 +167,19 @@ struct FaultsCommand {
 }
 
 #[derive(Debug, Args)]
+struct SoakCommand {
+    /// Seeds, FIRST-LAST
+    #[arg(long, value_parser = seeds, default_value = "1-1")]
+    seeds: RangeInclusive<u32>,
+    /// Days of each
+    #[arg(long, default_value_t = 400, value_parser = clap::value_parser!(u32).range(4..))]
+    days: u32,
+    /// File of results
+    #[arg(long, value_name = "FILE")]
+    results: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
 struct MonthsCommand {
     /// Seeds, FIRST-LAST
     #[arg(long, value_parser = seeds, default_value = "1-20")]
@@ -231,6 +247,10 @@ fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
         Command::Faults(f) => {
             let file = f.results.clone().unwrap_or_else(|| results.join("faults.jsonl"));
             faults::faults(&Program::build()?, f.seeds.clone(), f.at_once, &file, &scratch)
+        }
+        Command::Soak(s) => {
+            let file = s.results.clone().unwrap_or_else(|| results.join("soak.jsonl"));
+            soak::soak(&Program::build()?, s.seeds.clone(), s.days, &file, &scratch)
         }
         Command::Limits => limits::limits(&Program::build()?, &results.join("limits.jsonl"), &scratch),
         Command::Speed => speed::measure(&Program::build()?, &speed_file, &scratch),

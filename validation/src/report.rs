@@ -18,6 +18,7 @@ use crate::limits::{self, Limits};
 use crate::months::{self, Months};
 use crate::program::root;
 use crate::records::{Blind, Diagnosed, Line, Solution, read};
+use crate::soak::{self, Soak};
 use crate::speed::Speed;
 use crate::stats::{self, Bounds};
 use crate::table::{REGIMES, Row, configuration, mission};
@@ -54,6 +55,8 @@ pub(crate) struct Measured {
     pub(crate) kills: Vec<Kill>,
     /// Telemetry with faults.
     pub(crate) faults: Vec<Mixture>,
+    /// Days that were watched.
+    pub(crate) soak: Vec<Soak>,
 }
 
 impl Measured {
@@ -69,6 +72,7 @@ impl Measured {
             months: read(&folder.join("months.jsonl"))?,
             kills: read(&folder.join("kills.jsonl"))?,
             faults: read(&folder.join("faults.jsonl"))?,
+            soak: read(&folder.join("soak.jsonl"))?,
         })
     }
 }
@@ -565,6 +569,8 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
     failed.extend(more);
     let (faults, more) = faults::table(&measured.faults);
     failed.extend(more);
+    let (soak, more) = soak::table(&measured.soak);
+    failed.extend(more);
     let drawn =
         [("coverage", picture(&measured.coverage, &free)), ("confusion", blind_report::picture(&measured.blind))];
     let mut pictures = Vec::new();
@@ -583,6 +589,7 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
         ("months", months),
         ("kills", kills),
         ("faults", faults),
+        ("soak", soak),
     ]);
     Ok(Report { parts, pictures, failed })
 }

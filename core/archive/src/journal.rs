@@ -241,7 +241,7 @@ impl Journal {
             software: stamp.software.to_owned(),
             event,
         };
-        let staged = staging.join("entry.json");
+        let staged = staging.join(".entry.json");
         let text = serde_json::to_vec_pretty(&entry).map_err(std::io::Error::from).at("write", &staged)?;
         write_durable(&staged, &text)?;
         let path = self.path(number);

@@ -22,6 +22,7 @@ mod mend;
 mod migrate;
 mod objects;
 pub mod product;
+mod running;
 mod staging;
 mod sums;
 mod take_over;
@@ -34,6 +35,7 @@ pub use events::Window;
 pub use journal::{Event, InputPlace, JournalEntry, SetState, Stamp, Stored};
 pub use migrate::{Migrated, migrate};
 pub use product::{EXTRACT, JOINT, STATE};
+pub use running::{Running, Teller};
 pub use sums::Sums;
 pub use writer::{MadeOf, ProductWriter, Written};
 

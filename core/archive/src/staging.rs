@@ -7,8 +7,9 @@ use std::fs::{self, File, TryLockError};
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
-/// Name of the list of digests that a writer is about to place; a killed one's are looked through.
-const PLACING: &str = "placing.json";
+/// Name of the list of digests that a writer is about to place; a killed one's are looked through. What a plugin
+/// attaches begins with a letter.
+const PLACING: &str = ".placing.json";
 
 const LOCK: &str = ".lock";
 
@@ -61,6 +62,18 @@ fn root(archive: &Path) -> PathBuf {
 /// Whether any writer, alive or dead, has a folder.
 pub(crate) fn any(archive: &Path) -> Result<bool, ArchiveError> {
     Ok(!entries(&root(archive))?.is_empty())
+}
+
+/// Folders of writers that live.
+pub(crate) fn held(archive: &Path) -> Vec<PathBuf> {
+    let root = root(archive);
+    let lives = |lock: &PathBuf| {
+        // Shared, so that nobody who looks on keeps another from looking.
+        let lock = File::open(lock).map(|file| file.try_lock_shared());
+        matches!(lock, Ok(Err(TryLockError::WouldBlock)))
+    };
+    let locks = entries(&root).unwrap_or_default().into_iter().filter(|name| name.ends_with(LOCK));
+    locks.map(|name| root.join(name)).filter(lives).map(|lock| lock.with_extension("")).collect()
 }
 
 /// Clears the folders of dead writers. `forget` is told what each was about to place, before its folder is gone: who

@@ -106,6 +106,23 @@ fn a_second_run_is_the_next_revision_and_says_what_changed() {
     assert_eq!((third.id.as_str(), third.reason.as_str()), ("COM1B_2035-01-01_SC1_01_0002", "changed: inputs"));
 }
 
+/// They had the names of the writer's own files, which then took their place under their digest.
+#[test]
+fn attachments_may_have_any_name() {
+    let folder = tempfile::tempdir().expect("folder");
+    let mut writer = ProductWriter::begin(folder.path()).expect("begin");
+    let names = ["product.toml", "placing.json", "entry.json", "running.json", "mission.kept"];
+    for name in names {
+        writer.attach("odd", name, name).expect("attach");
+    }
+    writer.keep("mission", "taiji.toml", b"[mission]").expect("keep");
+    let written = writer.commit(&product(0, "SC1", 1.0), MadeOf::default(), &stamp()).expect("commit");
+    for name in names {
+        assert_eq!(open(folder.path()).read_file(written.product.id(), name).expect(name), name.as_bytes());
+    }
+    assert!(list(folder.path()).problems.is_empty());
+}
+
 #[test]
 fn a_day_of_two_spacecraft_is_asked_about() {
     let folder = tempfile::tempdir().expect("folder");
@@ -338,7 +355,7 @@ fn what_a_killed_writer_leaves_is_cleared_or_finished_by_the_next_command() {
         fs::write(staging.join(format!("{name}.lock")), "").expect("write");
         fs::create_dir(staging.join(name)).expect("folder");
         fs::write(staging.join(name).join("product.toml"), "half").expect("write");
-        fs::write(staging.join(name).join("placing.json"), json!(placing).to_string()).expect("write");
+        fs::write(staging.join(name).join(".placing.json"), json!(placing).to_string()).expect("write");
     }
     assert_eq!(list(folder.path()).entries.len(), 1);
     assert!(names(&staging).is_empty(), "{:?}", names(&staging));

@@ -6,6 +6,7 @@ use crate::events::Window;
 use crate::files::{IoContext as _, sha256_of, write_durable};
 use crate::journal::{Event, InputPlace, Stamp, Stored};
 use crate::product::{self, Attachment, EXTRACT, Product, STATE, Supersedes};
+use crate::running::{RUNNING, Teller};
 use crate::staging::Staging;
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -34,8 +35,9 @@ pub struct MadeOf {
     pub run_in_ns: i64,
 }
 
-/// Writes one product: ask for [`ProductWriter::staged`] paths, write the files, [`ProductWriter::commit`].
-/// Dropped without a commit it leaves nothing behind.
+/// Writes one product: ask for [`ProductWriter::staged`] paths, write the files, [`ProductWriter::commit`]. What it
+/// writes for itself begins with a dot, what plugins attach with a letter. Dropped without a commit it leaves nothing
+/// behind.
 #[derive(Debug)]
 pub struct ProductWriter {
     archive: Archive,
@@ -61,6 +63,11 @@ impl ProductWriter {
         let archive = Archive::create(folder)?;
         let staging = Staging::begin(folder)?;
         Ok(Self { archive, staging, attachments: BTreeMap::new(), kept: BTreeMap::new() })
+    }
+
+    /// Tells others how far the calibration of `what` has come.
+    pub fn teller(&self, what: &str) -> Teller {
+        Teller::new(self.staging.path().join(RUNNING), what.to_owned())
     }
 
     /// Path at which the caller writes the file that will lie beside the product as `ID.suffix`.
@@ -92,7 +99,7 @@ impl ProductWriter {
     /// # Errors
     /// It cannot be written.
     pub fn keep(&mut self, role: &str, name: &str, content: &[u8]) -> Result<(), ArchiveError> {
-        let path = self.staging.path().join(format!("{role}.kept"));
+        let path = self.staging.path().join(format!(".{role}.kept"));
         fs::write(&path, content).at("write", &path)?;
         self.kept.insert(role.to_owned(), (name.to_owned(), path));
         Ok(())
@@ -148,7 +155,7 @@ impl ProductWriter {
             let path = self.archive.path_of(id);
             return Ok((Written { product: product::read(&path)?, path }, false));
         }
-        let document = self.staging.path().join("product.toml");
+        let document = self.staging.path().join(".product.toml");
         let text = product.emit()?;
         write_durable(&document, text.as_bytes())?;
         let back = fs::read_to_string(&document).at("read", &document)?;

@@ -757,6 +757,8 @@ pub(crate) enum Format {
     Vcm1b,
     /// The whole product
     Json,
+    /// A layout of Foxglove for the time series in the .mcap beside the product
+    Foxglove,
 }
 
 #[derive(Debug, Subcommand)]

@@ -92,7 +92,7 @@ impl FileFeed {
         threads: usize,
         mission: &Mission,
     ) -> Result<Self, EngineError> {
-        let replay = Replay::open_with_run_in(files, window_ns.clone(), run_in_until_ns, threads)?;
+        let mut replay = Replay::open_with_run_in(files, window_ns.clone(), run_in_until_ns, threads)?;
         if replay.tables().is_empty() {
             let losses = replay.losses();
             let said =
@@ -107,6 +107,7 @@ impl FileFeed {
                 path: mission.path.clone(),
             });
         }
+        replay.hash_ahead();
         Ok(Self { replay, files: files.to_vec(), window_ns })
     }
 }

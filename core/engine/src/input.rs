@@ -2,9 +2,12 @@
 //! was, so that a product names the bytes that it was made of.
 
 use sha2::{Digest as _, Sha256};
+use std::collections::BTreeMap;
 use std::fs::{File, Metadata};
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, SystemTime};
 
 /// Size of the buffer that a whole file goes through.
 const BUFFER: usize = 1 << 18;
@@ -16,10 +19,21 @@ pub(crate) struct InputFile {
     file: File,
     /// What it looked like when it was opened.
     opened_as: Look,
+    /// Whether it was written so long ago that whatever is written to it now would make it look otherwise.
+    settled: bool,
 }
 
+/// Clocks of file systems go in steps of some milliseconds: within one, a file may change and look the same.
+const SETTLES: Duration = Duration::from_secs(1);
+
+/// Digests of settled files, by what these look like and the end of the CRC: a diagnosis opens the same ones for each
+/// of its passes.
+static KNOWN: Mutex<BTreeMap<(Look, u64), Sums>> = Mutex::new(BTreeMap::new());
+/// Most of them.
+const MOST_KNOWN: usize = 10_000;
+
 /// What tells whether a file has changed: any write or rename over it changes one of these.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 struct Look {
     size: u64,
     #[cfg(unix)]
@@ -29,7 +43,7 @@ struct Look {
     #[cfg(unix)]
     place: (u64, u64),
     #[cfg(not(unix))]
-    modified: Option<std::time::SystemTime>,
+    modified: Option<SystemTime>,
 }
 
 impl Look {
@@ -48,6 +62,18 @@ impl Look {
     fn of(stat: &Metadata) -> Self {
         Self { size: stat.len(), modified: stat.modified().ok() }
     }
+
+    /// When it last changed; none where the system does not tell.
+    #[cfg(unix)]
+    fn changed(&self) -> Option<SystemTime> {
+        let (seconds, nanoseconds) = (u64::try_from(self.changed_ns.0).ok()?, u32::try_from(self.changed_ns.1).ok()?);
+        SystemTime::UNIX_EPOCH.checked_add(Duration::new(seconds, nanoseconds))
+    }
+
+    #[cfg(not(unix))]
+    fn changed(&self) -> Option<SystemTime> {
+        None
+    }
 }
 
 /// Digests of a whole file.
@@ -63,7 +89,8 @@ impl InputFile {
     pub(crate) fn open(path: &Path) -> io::Result<Self> {
         let file = File::open(path)?;
         let opened_as = Look::of(&file.metadata()?);
-        Ok(Self { path: path.to_owned(), file, opened_as })
+        let settled = opened_as.changed().is_some_and(|at| at.elapsed().is_ok_and(|age| age > SETTLES));
+        Ok(Self { path: path.to_owned(), file, opened_as, settled })
     }
 
     pub(crate) fn path(&self) -> &Path {
@@ -111,6 +138,23 @@ impl InputFile {
 
     /// Digests of all of it; the CRC covers the bytes before `crc_end`.
     pub(crate) fn sums(&self, crc_end: u64) -> io::Result<Sums> {
+        let known = || KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
+        let key = (self.opened_as.clone(), crc_end);
+        if let Some(sums) = known().get(&key).filter(|_| self.settled) {
+            return Ok(sums.clone());
+        }
+        let sums = self.read_sums(crc_end)?;
+        if self.settled && self.is_unchanged()? {
+            let mut known = known();
+            if known.len() >= MOST_KNOWN {
+                known.clear();
+            }
+            known.insert(key, sums.clone());
+        }
+        Ok(sums)
+    }
+
+    fn read_sums(&self, crc_end: u64) -> io::Result<Sums> {
         let (mut sha256, mut crc) = (Sha256::new(), crc32fast::Hasher::new());
         let mut reader = self.reader(0);
         let mut buffer = vec![0; BUFFER];
@@ -177,6 +221,25 @@ impl Seek for InputReader<'_> {
 mod tests {
     use super::*;
 
+    /// A diagnosis opens its telemetry for each pass: it is hashed once, and again after it has changed.
+    #[test]
+    fn sums_of_a_settled_file_are_remembered_until_it_changes() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a");
+        let sha256 = |path: &Path| InputFile::open(path).unwrap().sums(0).unwrap().sha256;
+        std::fs::write(&path, "one").unwrap();
+        assert!(!InputFile::open(&path).unwrap().settled, "it may still change within a tick of the clock");
+        std::thread::sleep(SETTLES + Duration::from_millis(100));
+        let input = InputFile::open(&path).unwrap();
+        let key = (input.opened_as.clone(), 0);
+        assert!(input.settled && !KNOWN.lock().unwrap().contains_key(&key));
+        let one = sha256(&path);
+        assert_eq!(KNOWN.lock().unwrap()[&key].sha256, one);
+        assert_eq!(sha256(&path), one);
+        std::fs::write(&path, "two").unwrap();
+        assert_ne!(sha256(&path), one);
+    }
+
     #[test]
     fn sums_are_of_the_bytes_that_are_read() {
         let folder = tempfile::tempdir().unwrap();
@@ -213,7 +276,7 @@ mod tests {
 
         let input = InputFile::open(&path).unwrap();
         let written = std::fs::metadata(&path).unwrap().modified().unwrap();
-        std::thread::sleep(std::time::Duration::from_millis(20)); // the clock of a file system has ticks
+        std::thread::sleep(Duration::from_millis(20)); // the clock of a file system has ticks
         std::fs::write(&path, "TWO").unwrap();
         File::options().write(true).open(&path).unwrap().set_modified(written).unwrap();
         assert!(!input.is_unchanged().unwrap(), "same size, same time of writing");

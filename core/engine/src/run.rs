@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use crate::EngineError;
 use crate::border::PluginInfo;
-use crate::chain::{self, Carry, Chain, ChainNode, Sink};
+use crate::chain::{self, Carry, Chain, ChainNode, Sink, comes_at_the_end};
 use crate::config::{Mission, Model, Pipeline, read};
 use crate::draft::Draft;
 use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions};
@@ -198,6 +198,8 @@ impl<'a> Setup<'a> {
             chain.feed(chunk, sink)?;
             stop::check()?;
         }
+        // What waits now waits for rows to come, however the feed was cut: so it can be saved.
+        chain.settle(sink)?;
         covered.ok_or_else(|| EngineError::NoRows { files: self.options.files.clone() })
     }
 }
@@ -250,7 +252,12 @@ pub fn run(
     }
     let mut writer = ProductWriter::begin(&options.archive)?;
     let mut series = Series::create(&chain, &mut writer, &setup)?;
-    let covered = setup.carry(feed.as_mut(), &mut chain, &mut series, progress)?;
+    let mut teller = writer.teller(&format!("{} {}", setup.pipeline.product, setup.mission.spacecraft));
+    let mut told = |done: Progress| {
+        teller.tell(done.first_ns, done.until_ns, done.end_ns);
+        progress(done);
+    };
+    let covered = setup.carry(feed.as_mut(), &mut chain, &mut series, &mut told)?;
     // Saved before the flush, because the next day continues within the lags.
     let left = match chain.save() {
         Ok(left) => Some(left),
@@ -369,6 +376,8 @@ fn free_bytes(_archive: &Path) -> Option<u64> {
 struct Series {
     tables: Vec<TableSpec>,
     last_ns: Vec<Option<i64>>,
+    /// Rows of tables that come at the end, after those of all others: these need not wait for them.
+    at_the_end: Vec<(usize, Batch)>,
     writer: Option<TelemetryWriter>,
     /// Rows before this time are of data that only settle the stages.
     from_ns: i64,
@@ -388,37 +397,52 @@ impl Series {
         let create = || TelemetryWriter::create(&product.staged("mcap"), &tables, &header);
         let writer = (!tables.is_empty()).then(create).transpose()?;
         let from_ns = setup.options.run_in_until_ns().unwrap_or(i64::MIN);
-        Ok(Self { last_ns: vec![None; tables.len()], tables, writer, from_ns })
+        Ok(Self { last_ns: vec![None; tables.len()], at_the_end: Vec::new(), tables, writer, from_ns })
     }
 
     fn finish(self) -> Result<(), EngineError> {
-        self.writer.map(TelemetryWriter::finish).transpose()?;
+        let chunk = Chunk { batches: self.nothing(), complete_until_ns: i64::MAX };
+        let Some(mut writer) = self.writer else { return Ok(()) };
+        writer.write(chunk)?;
+        for (table, batch) in self.at_the_end {
+            writer.write_table(table, batch)?;
+        }
+        writer.finish()?;
         Ok(())
+    }
+
+    /// A batch without rows for every table.
+    fn nothing(&self) -> Vec<Batch> {
+        self.tables.iter().map(|t| Batch::empty(t.columns.len())).collect()
     }
 }
 
 impl Sink for Series {
     fn rows(&mut self, table: &TableSpec, batch: &Batch) -> Result<(), String> {
-        let Some(writer) = &mut self.writer else { return Ok(()) };
+        if self.writer.is_none() {
+            return Ok(());
+        }
         let mut settled = batch.clone();
         let early = settled.time_ns.partition_point(|t| *t < self.from_ns);
         settled.time_ns.drain(..early);
         settled.columns.iter_mut().for_each(|column| drop(column.drain(..early)));
-        let batch = &settled;
-        if batch.rows() == 0 {
+        if settled.rows() == 0 {
             return Ok(());
         }
-        let mut chunk = Chunk::default();
-        for (i, t) in self.tables.iter().enumerate() {
-            let mine = t.name == table.name;
-            if mine {
-                self.last_ns[i] = batch.time_ns.last().copied();
-            }
-            chunk.batches.push(if mine { batch.clone() } else { Batch::empty(t.columns.len()) });
+        let of_this = self.tables.iter().position(|t| t.name == table.name);
+        let index = of_this.ok_or_else(|| format!("table {} is none of those that are archived", table.name))?;
+        if comes_at_the_end(table) {
+            self.at_the_end.push((index, settled));
+            return Ok(());
         }
+        self.last_ns[index] = settled.time_ns.last().copied();
         // A table without any row so far may still deliver earlier ones.
-        chunk.complete_until_ns = self.last_ns.iter().map(|t| t.unwrap_or(i64::MIN)).min().unwrap_or(i64::MIN);
-        writer.write(chunk).map_err(|e| e.to_string())
+        let due = self.tables.iter().zip(&self.last_ns).filter(|(table, _)| !comes_at_the_end(table));
+        let complete_until_ns = due.map(|(_, last)| last.unwrap_or(i64::MIN)).min().unwrap_or(i64::MIN);
+        let mut batches = self.nothing();
+        batches[index] = settled;
+        let chunk = Chunk { batches, complete_until_ns };
+        self.writer.as_mut().map_or(Ok(()), |writer| writer.write(chunk).map_err(|e| e.to_string()))
     }
 }
 

@@ -1,6 +1,7 @@
 //! What an estimation gathers of its rows: sums of segments and of long segments, and the fit in the time domain.
 
 use crate::prediction::Prediction;
+use crate::residual_means::ResidualMeans;
 use crate::segments::{Cuts, Segmenter};
 use crate::slow_band::SlowBand;
 use crate::spectra::{Analyser, Layout, Plan, Sums};
@@ -16,6 +17,9 @@ impl Cuts for IntoSums<'_> {
         self.0.add(taper, first_ns, columns, overlaps, &mut self.1.sums);
     }
     fn rows(&mut self, first_ns: i64, columns: &[&[f64]]) {
+        if let Some(residuals) = &mut self.1.residuals {
+            residuals.push(first_ns, columns);
+        }
         if let Some(slow) = &mut self.1.slow {
             slow.push(first_ns, columns, &mut self.1.sums.total);
         }
@@ -45,13 +49,22 @@ pub struct Collected {
     pub prediction: Option<Prediction>,
     /// The open long segments, where the plan has bands for them.
     pub slow: Option<SlowBand>,
+    /// Means of this run's rows, for residuals over time, where they are asked for.
+    pub residuals: Option<ResidualMeans>,
 }
 
 impl Collected {
     /// Nothing yet.
     pub fn new(plan: &Plan, layout: &Layout, prediction: Option<Prediction>) -> Self {
         let sums = Sums::new(plan, layout);
-        Self { earlier: sums.clone(), sums, prediction, slow: SlowBand::new(plan, layout.columns()) }
+        let slow = SlowBand::new(plan, layout.columns());
+        Self { earlier: sums.clone(), sums, prediction, slow, residuals: None }
+    }
+
+    /// The same with means of the rows to come.
+    pub fn with_residuals(mut self, plan: &Plan, layout: &Layout) -> Self {
+        self.residuals = Some(ResidualMeans::new(layout, plan.rate_hz));
+        self
     }
 
     /// Sums of this run and of those before.

@@ -4,7 +4,7 @@
 //! decimated samples for what is slow (`slow_band`). Σ(f) starts as the declared noise ([`sigma`]) and is re-measured
 //! from the residuals (`refine`), beside random walks of unknown slow forces ([`random_walk`]). The normal equations
 //! ([`normal`]) are solved under the survey and the physical ranges ([`qp`]); [`verdict`] says what the solution is
-//! worth. No module knows an effect by name.
+//! worth. Residuals over time ([`residual_means`]) are for eyes. No module knows an effect by name.
 
 pub mod collected;
 pub mod colour;
@@ -19,6 +19,7 @@ pub mod prediction;
 pub mod qp;
 pub mod random_walk;
 mod refine;
+pub mod residual_means;
 pub mod segments;
 pub mod sigma;
 mod slow_band;

@@ -108,6 +108,23 @@ document.addEventListener("submit", async (event) => {
   }
 });
 
+// ---- What runs ------------------------------------------------------------------------------------------------------
+
+// Asked for again while somebody looks; a page in the background asks nothing.
+const jobs = document.getElementById("running");
+if (jobs && location.protocol.startsWith("http")) {
+  setInterval(async () => {
+    if (document.hidden) return;
+    try {
+      const answer = await fetch("/running");
+      const text = answer.ok ? await answer.text() : "";
+      if (answer.ok && jobs.innerHTML !== text) jobs.innerHTML = text;
+    } catch {
+      jobs.textContent = "The server does not answer: is it still running?";
+    }
+  }, 2000);
+}
+
 // ---- Plots ----------------------------------------------------------------------------------------------------------
 
 function read(id) {
@@ -251,7 +268,55 @@ function spectrum(data) {
   }
 }
 
+// Least and greatest residual of each stretch of time, with the lines between which 95 of 100 lie.
+function overTime(data) {
+  const shared = uPlot.sync("over-time");
+  for (const place of document.querySelectorAll("[data-over-time]")) {
+    const c = data.channels.find((own) => own.name === place.dataset.overTime);
+    if (!c) continue;
+    const line = { stroke: colour("--c0"), width: 1, points: { show: false } };
+    const options = () => ({
+      width: width(place),
+      height: 130,
+      cursor: { sync: { key: shared.key } },
+      legend: { show: false },
+      axes: [
+        axis({ space: 90, values: (u, all) => all.map((t) => new Date(1000 * t).toISOString().slice(11, 16)) }),
+        axis({ size: 50, space: 20, values: (u, all) => all.map((v) => v + " σ") }),
+      ],
+      scales: { x: { time: true }, y: { range: (u, low, high) => [Math.min(-4, low - 0.5), Math.max(4, high + 0.5)] } },
+      series: [
+        { label: "time" },
+        { label: "greatest", ...line },
+        { label: "least", ...line },
+      ],
+      bands: [{ series: [1, 2], fill: colour("--sigma") }],
+      tzDate: (t) => uPlot.tzDate(new Date(1000 * t), "Etc/UTC"),
+      hooks: { draw: [bounds] },
+    });
+    drawn(() => new uPlot(options(), [data.time, c.high, c.low], place));
+  }
+}
+
+// ±1.96 σ.
+function bounds(u) {
+  const { ctx } = u;
+  ctx.save();
+  ctx.strokeStyle = colour("--event");
+  ctx.setLineDash([4, 4]);
+  for (const sigmas of [-1.96, 1.96]) {
+    const y = Math.round(u.valToPos(sigmas, "y", true));
+    ctx.beginPath();
+    ctx.moveTo(u.bbox.left, y);
+    ctx.lineTo(u.bbox.left + u.bbox.width, y);
+    ctx.stroke();
+  }
+  ctx.restore();
+}
+
 const trend = read("trend");
 if (trend) trends(trend);
 const residuals = read("residuals");
 if (residuals && residuals.channels.length) spectrum(residuals);
+const series = read("over-time");
+if (series) overTime(series);

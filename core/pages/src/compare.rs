@@ -1,6 +1,8 @@
 //! Where the model fails: channels by bands.
 
+use chrono::DateTime;
 use dragfree_archive::product::JOINT;
+use dragfree_workflow::over_time::{OverTime, extremes, over_time};
 use dragfree_workflow::residuals::{Band, Residuals, residuals};
 use maud::{Markup, html};
 use serde_json::{Value, json};
@@ -49,11 +51,65 @@ pub(crate) fn page(site: &Site, id: &str, links: &Links) -> Result<Markup, Pages
         label class="pick" { "Channel " select id="channel" { @for c in &found.channels { option { (c.name) } } } }
         div class="plot tall" id="spectrum" {}
         (data("residuals", &for_script(&found)))
+        @if let Some(residuals) = over_time(&archive, &row.id)? { (series(&residuals, found.false_alarm)) }
         h2 { "Hour by hour" }
-        p { "The product keeps sums over its whole time. Hours, time series and housekeeping need the telemetry:" }
+        p { "Spectra of single hours, and housekeeping that goes with the residuals, need the telemetry:" }
         (command(&telemetry))
     };
     Ok(whole(links, "Compare", "Where the model fails", LEAD, &body))
+}
+
+/// Stretches of the time of a product that a picture tells apart.
+const STRETCHES: usize = 720;
+
+/// Residuals over time: a sentence and a picture for each channel.
+fn series(residuals: &OverTime, false_alarm: f64) -> Markup {
+    let seconds = residuals.time_ns.windows(2).map(|t| (t[1] - t[0]) as f64 * 1e-9).fold(f64::INFINITY, f64::min);
+    let told: Vec<_> = residuals.channels.iter().map(|c| (c, residuals.told(c, false_alarm))).collect();
+    let clock = |ns: i64| DateTime::from_timestamp_nanos(ns).format("%H:%M:%S").to_string();
+    html! {
+        h2 { "Over time" }
+        p class="quiet" {
+            "Means of what the model leaves of each channel over " (short_number(seconds)) " s, in σ of the declared noise: \
+            of a sound model 95 of 100 lie between the dashed lines. A glitch is a spike, a slow force a wander, a gap a \
+            hole. The numbers are in the topic " code { "/residuals" } " of the " code { ".mcap" } " beside the product."
+        }
+        @for (channel, told) in &told {
+            @if let Some(told) = told {
+                section class="chart" {
+                    h3 { (channel.name)
+                        @if told.stands_out { " " span class="bad-word" { "▲ stands out" } } }
+                    p class="quiet" {
+                        "Size " (format!("{:.2}", told.size)) ", 1 where the model is right; farthest "
+                        (format!("{:+.1}", told.farthest).replace('-', "−")) " σ at " (clock(told.farthest_ns)) "."
+                    }
+                    div class="plot low-plot" data-over-time=(channel.name) role="img"
+                        aria-label={ "Residual of " (channel.name) " over time" } {}
+                }
+            } @else {
+                p { (channel.name) ": no noise is declared for it, so its residual has no σ." }
+            }
+        }
+        (data("over-time", &over_time_for_script(residuals)))
+    }
+}
+
+fn short_number(x: f64) -> String {
+    format!("{x:.3}").trim_end_matches('0').trim_end_matches('.').to_owned()
+}
+
+fn over_time_for_script(residuals: &OverTime) -> Value {
+    let rounded = |values: &[f64]| -> Vec<Option<f64>> {
+        values.iter().map(|x| x.is_finite().then(|| (x * 100.0).round() / 100.0)).collect()
+    };
+    let all: Vec<_> = residuals.channels.iter().map(|c| extremes(&residuals.time_ns, &c.whitened, STRETCHES)).collect();
+    let times = all.first().map_or(&[][..], |e| &e.time_ns);
+    let channels = residuals.channels.iter().zip(&all);
+    let of = channels.map(|(c, e)| json!({ "name": c.name, "low": rounded(&e.low), "high": rounded(&e.high) }));
+    json!({
+        "channels": of.collect::<Vec<_>>(),
+        "time": times.iter().map(|t| t / 1_000_000_000).collect::<Vec<_>>(),
+    })
 }
 
 /// A class for the colour and a sign for those who see none.

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use chrono::{Datelike as _, NaiveDate};
+use chrono::{DateTime, Datelike as _, NaiveDate};
 use dragfree_archive::Row;
 use maud::{Markup, html};
 
@@ -99,12 +99,32 @@ pub(crate) fn page(site: &Site, _query: &Query, links: &Links) -> Result<Markup,
         }
         @for ((spacecraft, name), days) in &series { (of_series(site, spacecraft, name, days)) }
         h2 { "What runs, and what is due" }
+        div id="running" aria-live="polite" { (running(site)?) }
         p { "These commands say which days would come out otherwise now, and calibrate them:" }
         (command("dragfree products stale\ndragfree catch-up\ndragfree watch"))
     };
     let lead = "Look for days with ✗ or ! and open them; on a day with ✓ the two solutions agree, and its page says \
         whether to use it.";
     Ok(whole(links, "Mission", "Mission", lead, &body))
+}
+
+/// The calibrations that are under way: the part of the page that is asked for again.
+pub(crate) fn running(site: &Site) -> Result<Markup, PagesError> {
+    let all = site.archive()?.running();
+    Ok(html! {
+        @if all.is_empty() { p { "Nothing runs now." } }
+        @for job in &all {
+            @let until = DateTime::from_timestamp_nanos(job.until_ns).format("%Y-%m-%d %H:%M:%S");
+            p {
+                strong { (job.what) } " has come to " (until) ", " (format!("{:.0}", job.rate())) " times as fast as the data"
+                @if let Some((part, left_s)) = job.left() {
+                    ": " (format!("{:.0}", 100.0 * part)) " %, " (format!("{left_s:.0}")) " s left. "
+                    progress max="100" value=(format!("{:.0}", 100.0 * part)) aria-label={ "Part of " (job.what) } {}
+                } @else { "." }
+                span class="quiet" { " Process " (job.process) }
+            }
+        }
+    })
 }
 
 fn of_series(site: &Site, spacecraft: &str, name: &str, days: &Days<'_>) -> Markup {

@@ -109,6 +109,7 @@ fn router(app: App) -> Router {
     Router::new()
         .route("/refit", get(part))
         .route("/refit.json", get(numbers))
+        .route("/running", get(running))
         .route("/assets/{name}", get(asset))
         .route("/keep", post(keep))
         .fallback(page)
@@ -165,6 +166,13 @@ async fn numbers(State(app): Shared, Asked(query): Asked<Query>, headers: Header
         Ok(text) => answer(StatusCode::OK, "application/json", text),
         Err(error) => failed(&error),
     }
+}
+
+async fn running(State(app): Shared, headers: HeaderMap) -> Response {
+    if let Err(refusal) = app.guard.may_read(&headers) {
+        return refused(refusal);
+    }
+    html(app.compute(|site| Ok(crate::mission::running(site)?.into_string())).await)
 }
 
 async fn asset(State(app): Shared, Path(name): Path<String>, headers: HeaderMap) -> Response {

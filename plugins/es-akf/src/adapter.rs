@@ -351,7 +351,7 @@ impl EsAkf {
         };
         let archive = [("archive", "true")];
         for c in &coefficients {
-            value.push(link.write_with(table, &label(c), &c.unit, &c.frame, &archive)?);
+            value.push(link.write_with(table, &format!("{}.value", label(c)), &c.unit, &c.frame, &archive)?);
             sigma.push(link.write_with(table, &format!("{}.sigma", label(c)), &c.unit, &c.frame, &archive)?);
         }
         let (mut displacement_m, mut nis) = (Vec::new(), Vec::new());

@@ -50,6 +50,29 @@ struct Linked {
     collected: Collected,
     /// What a saved state must have been made for.
     signature: String,
+    /// Columns of each channel's residuals over time.
+    over_time: Vec<OverTime>,
+    table: Table,
+    /// The solution, once there is no more input.
+    solved: Option<Solved>,
+}
+
+/// A channel's residuals over time: their mean over an interval, its σ where the model and the noise are right, the
+/// mean in σ, and the root of their mean square.
+struct OverTime {
+    mean: Out,
+    sigma: Out,
+    whitened: Out,
+    rms: Out,
+}
+
+/// A solution and what it was made of.
+struct Solved {
+    /// Everything collected, the open end too.
+    collected: Collected,
+    epochs_in_segments: u64,
+    /// None where there is too little data for any.
+    solution: Option<WithLevels>,
 }
 
 impl Stage for QpCheck {
@@ -105,6 +128,16 @@ impl Stage for QpCheck {
         Ok(())
     }
 
+    fn flush(&mut self, output: &mut Outputs) -> Result<(), PluginError> {
+        let linked = self.linked.as_mut().ok_or_else(before_link)?;
+        let solved = linked.solve()?;
+        if let Some(WithLevels { estimate, noise, .. }) = &solved.solution {
+            linked.put_residuals(estimate, noise, output)?;
+        }
+        linked.solved = Some(solved);
+        Ok(())
+    }
+
     fn report(&mut self, earlier: &[Report]) -> Result<Report, PluginError> {
         self.linked.as_mut().ok_or_else(before_link)?.report(earlier)
     }
@@ -124,6 +157,9 @@ const LOG_DETERMINANT: &str = "log_determinant_over_declared";
 
 const UNKNOWN_NOISE: &str = "no stage declares its noise, so it is weighed by its residuals alone; the stage that makes it should \
      declare one, from the [noise] tables of the mission file";
+
+/// Table of the residuals over time.
+const RESIDUALS: &str = "residuals";
 
 /// What this stage brings.
 const SOLUTIONS: [(&str, Role); 2] = [("qp", Role::Batch), ("adopted", Role::Adopted)];
@@ -145,6 +181,21 @@ fn recursive_solutions(earlier: &[Report]) -> BTreeMap<&str, Vec<Value>> {
         }
     }
     all
+}
+
+impl OverTime {
+    fn new(link: &mut Link<'_>, table: Table, channel: &Column) -> Result<Self, PluginError> {
+        let name = name_of(channel);
+        let mut write = |what: &str, unit: &str| {
+            link.write_with(table, &format!("{name}.{what}"), unit, &channel.frame, &[("archive", "end")])
+        };
+        Ok(Self {
+            mean: write("value", &channel.unit)?,
+            sigma: write("sigma", &channel.unit)?,
+            whitened: write("whitened", "1")?,
+            rms: write("rms", &channel.unit)?,
+        })
+    }
 }
 
 fn before_link() -> PluginError {
@@ -176,6 +227,8 @@ impl Linked {
         let refinement = if available.has_regressors_in_loop()? { Refinement::Levels } else { Refinement::Bands };
         let length = longest_length((stage.segment_s * rate_hz).round() as usize);
         let analyser = Analyser::new(Plan::with_slow_bands(length, rate_hz), &layout);
+        let table = link.table(RESIDUALS, 0.0);
+        let over_time = channels.iter().map(|c| OverTime::new(link, table, c)).collect::<Result<_, _>>()?;
         let seen_as_mean = |s: usize| layout.regressors.iter().any(|r| r.series == s && differenced[r.channel]);
         let averaged = std::iter::repeat_n(false, layout.channels.len())
             .chain((0..layout.series.len()).map(seen_as_mean))
@@ -210,7 +263,58 @@ impl Linked {
             analyser,
             model,
             layout,
+            over_time,
+            table,
+            solved: None,
         })
+    }
+
+    /// The solution of everything so far.
+    fn solve(&mut self) -> Result<Solved, PluginError> {
+        // The open run ends here for this answer alone: a later run goes on with it.
+        let (mut segmenter, mut collected) = (self.segmenter.clone(), self.collected.clone());
+        segmenter.end_run(&mut self.analyser, &mut collected);
+        let sums = collected.all(self.analyser.plan());
+        let epochs_in_segments = segmenter.state.covered;
+        if sums.total.segments == 0 {
+            return Ok(Solved { collected, epochs_in_segments, solution: None });
+        }
+        let observed = Observed {
+            layout: &self.layout,
+            plan: self.analyser.plan(),
+            sums: &sums,
+            prediction: collected.prediction.as_ref(),
+        };
+        let method = Method { refinements: self.refinements, refinement: self.refinement, settings: &self.settings };
+        let solution = solve(&observed, &self.declared, &self.coefficients, &self.bounds, &method)?;
+        Ok(Solved { collected, epochs_in_segments, solution: Some(solution) })
+    }
+
+    /// Writes what the solution leaves of the channels, over time.
+    fn put_residuals(
+        &self,
+        solution: &Solution,
+        noise: &[NoiseProcess],
+        output: &mut Outputs,
+    ) -> Result<(), PluginError> {
+        let Some(means) = &self.collected.residuals else { return Ok(()) };
+        let rate_hz = self.analyser.plan().rate_hz;
+        let model = NoiseModel::new(noise, &self.layout.channels, 1.0 / rate_hz)?;
+        let noise = means.noise(&model);
+        let mut sigmas: BTreeMap<u64, Vec<f64>> = BTreeMap::new();
+        for row in means.at(&self.layout, solution.theta.as_slice()) {
+            let sigma = sigmas.entry(row.count).or_insert_with(|| noise.sigma(row.count));
+            output.time(self.table).push(row.time_ns);
+            for (c, to) in self.over_time.iter().enumerate() {
+                // Where nobody declares a noise there is none to compare with.
+                let sigma = if model.unknown.contains(&c) { f64::NAN } else { sigma[c] };
+                output.f64(to.mean).push(row.mean[c]);
+                output.f64(to.sigma).push(sigma);
+                output.f64(to.whitened).push(row.mean[c] / sigma);
+                output.f64(to.rms).push(row.rms[c]);
+            }
+        }
+        Ok(())
     }
 
     fn report(&mut self, earlier: &[Report]) -> Result<Report, PluginError> {
@@ -225,9 +329,10 @@ impl Linked {
                 self.left_out.join(", ")
             ));
         }
-        // The open run ends here for this answer alone: a later run goes on with it.
-        let (mut segmenter, mut collected) = (self.segmenter.clone(), self.collected.clone());
-        segmenter.end_run(&mut self.analyser, &mut collected);
+        let Solved { collected, epochs_in_segments, solution } = match self.solved.take() {
+            Some(solved) => solved,
+            None => self.solve()?,
+        };
         let sums = collected.all(self.analyser.plan());
         // The open end is stored only where there is nothing else of segments as long: a later run stores the segment
         // that it becomes.
@@ -238,20 +343,11 @@ impl Linked {
             refinements: self.refinements,
         };
         let stored = Stored::new(&self.layout, self.analyser.plan(), declared, &self.own(&collected));
-        report.counts.insert("epochs_in_segments".to_owned(), segmenter.state.covered);
-        if sums.total.segments == 0 {
+        report.counts.insert("epochs_in_segments".to_owned(), epochs_in_segments);
+        let Some(WithLevels { estimate: solution, levels, noise: now }) = solution else {
             self.no_solution(&mut report);
             return Ok(report);
-        }
-        let observed = Observed {
-            layout: &self.layout,
-            plan: self.analyser.plan(),
-            sums: &sums,
-            prediction: collected.prediction.as_ref(),
         };
-        let method = Method { refinements: self.refinements, refinement: self.refinement, settings: &self.settings };
-        let WithLevels { estimate: solution, levels, noise: now } =
-            solve(&observed, &self.declared, &self.coefficients, &self.bounds, &method)?;
         if self.coefficients.iter().any(|c| !c.noise.is_empty()) {
             let ratio = self.log_determinant_ratio(&now, &sums.total)?;
             report.quality.extend(ratio.map(|ratio| (LOG_DETERMINANT.to_owned(), json!(ratio))));
@@ -517,7 +613,7 @@ fn nothing_collected(
         Refinement::Bands => Prediction::new(model, differenced, &layout.linear_at(&initial), plan),
         Refinement::Levels => None,
     };
-    Collected::new(plan, layout, prediction)
+    Collected::new(plan, layout, prediction).with_residuals(plan, layout)
 }
 
 /// The fit in the time domain beside the QP, coefficient by coefficient.

@@ -250,7 +250,7 @@ impl Builder<'_> {
         self.inherit_loop(&mut linked);
         node.activate(u32::try_from(self.chain.carry.batch_rows).unwrap_or(u32::MAX))?;
         let index = self.chain.nodes.len();
-        let (inputs, wave) = self.route(index, &linked);
+        let (inputs, makers) = self.route(index, &linked);
         let reads = linked
             .reads
             .iter()
@@ -266,7 +266,9 @@ impl Builder<'_> {
             inputs,
             routes: linked.writes.iter().map(|t| Route { readers: Vec::new(), archive: is_archived(t) }).collect(),
             writes: linked.writes.clone(),
-            wave,
+            makers,
+            done_until_ns: i64::MIN,
+            seconds: 0.0,
             is_effect: node.kind == Kind::Effect,
             discarded_rows: 0,
             instance: node,
@@ -298,22 +300,30 @@ impl Builder<'_> {
     }
 
     /// The queues of a new node, its routes entered where its tables are made.
-    fn route(&mut self, index: usize, linked: &Linked) -> (Vec<Queue>, usize) {
-        let mut wave = 0;
+    fn route(&mut self, index: usize, linked: &Linked) -> (Vec<Queue>, Vec<usize>) {
+        let mut makers = Vec::new();
         let mut inputs = Vec::new();
         for (input, columns) in linked.reads.iter().enumerate() {
             let Some(first) = columns.first().map(|c| &self.available[c.available]) else { continue };
             let (table, uniform) = (first.table.clone(), first.rate_hz > 0.0);
             let names: Vec<&str> = columns.iter().map(|c| self.available[c.available].name.as_str()).collect();
             inputs.push(Queue::new(table.clone(), uniform, columns.len()));
-            wave = wave.max(self.chain.subscribe(&table, &names, Some(index), input));
+            makers.extend(self.chain.subscribe(&table, &names, Some(index), input));
         }
-        (inputs, wave)
+        (inputs, makers)
     }
 }
 
 fn is_archived(table: &TableSpec) -> bool {
-    table.columns.iter().any(|c| c.attributes.get("archive").is_some_and(|a| a == "true"))
+    table.columns.iter().any(|c| c.attributes.get("archive").is_some_and(|a| a == "true" || a == AT_THE_END))
+}
+
+/// Value of the attribute `archive` of a table that has no rows before the flush.
+const AT_THE_END: &str = "end";
+
+/// Whether all rows of a table come at the flush.
+pub(crate) fn comes_at_the_end(table: &TableSpec) -> bool {
+    table.columns.iter().any(|c| c.attributes.get("archive").is_some_and(|a| a == AT_THE_END))
 }
 
 /// Makes and links a source: it reads nothing, and says which tables it makes.

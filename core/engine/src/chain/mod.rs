@@ -1,18 +1,19 @@
 //! The chain: plugins linked by their columns, rows flowing from the feed through stages and effects.
 //!
-//! Uniform tables are joined row by row, so a lag of a stage delays the stages after it and needs no bookkeeping.
-//! Results depend neither on the ends of batches nor on the number of threads: each instance sees its rows in one
-//! order.
+//! Uniform tables are joined row by row, so a lag of a stage delays the stages after it and needs no bookkeeping. All
+//! nodes work at the same time, each at the rows that the one before it has made last. Results depend neither on the
+//! ends of batches nor on the number of threads: each instance sees its rows in one order.
 
 mod link;
 mod queue;
 mod state;
 
 pub use link::build;
-pub(crate) use link::open_source;
+pub(crate) use link::{comes_at_the_end, open_source};
 pub use state::resumes_at_ns;
 
 use std::sync::{Mutex, PoisonError};
+use std::time::Instant;
 
 use dragfree_schema::{Coefficient, Constraint, NoiseProcess, Report};
 
@@ -81,8 +82,12 @@ pub struct ChainNode {
     /// Tables that it writes.
     pub writes: Vec<TableSpec>,
     routes: Vec<Route>,
-    /// Nodes of one wave do not read each other's tables.
-    wave: usize,
+    /// Nodes that make its irregular tables.
+    makers: Vec<usize>,
+    /// Everything before this time that the feed gave has gone through the node, Unix ns.
+    done_until_ns: i64,
+    /// Duration of its last call, s: what takes longest begins first.
+    seconds: f64,
     is_effect: bool,
     /// Rows of batches that the plugin discarded.
     pub discarded_rows: u64,
@@ -99,10 +104,26 @@ impl ChainNode {
         self.inputs.iter().filter(|q| q.uniform).map(Queue::rows).min().unwrap_or(0)
     }
 
+    /// Rows that wait, of the table with most of them.
+    fn waiting(&self) -> usize {
+        self.inputs.iter().map(Queue::rows).max().unwrap_or(0)
+    }
+
     /// Whether it goes row by row through some table; others take whatever there is.
     fn has_uniform(&self) -> bool {
         self.inputs.iter().any(|q| q.uniform)
     }
+}
+
+/// Whom a round calls.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Call {
+    /// Who has a whole batch, and those that read no uniform table, as there are new rows.
+    NewRows,
+    /// Who has a whole batch: calls of equal size keep all threads busy.
+    FullBatch,
+    /// Who has any row of its uniform tables.
+    AnyRows,
 }
 
 /// Where the rows of a table go.
@@ -126,7 +147,7 @@ struct Reader {
 pub struct Carry {
     /// Most rows of a uniform table in one call.
     pub batch_rows: usize,
-    /// Threads for nodes that do not read each other.
+    /// Threads for nodes, each at rows of its own.
     pub threads: usize,
     /// Rows before this time run in what stands before and in the effects, and go no further: neither to the stages
     /// behind the effects nor to the host.
@@ -203,8 +224,8 @@ impl Chain {
         Ok(())
     }
 
-    /// Routes columns of a table to a node, or to the tap; gives the first wave after those that make them.
-    fn subscribe(&mut self, table: &str, names: &[&str], node: Option<usize>, input: usize) -> usize {
+    /// Routes columns of a table to a node, or to the tap; where the table is irregular, gives the nodes that make it.
+    fn subscribe(&mut self, table: &str, names: &[&str], node: Option<usize>, input: usize) -> Vec<usize> {
         let reader = |made: &TableSpec| Reader {
             node,
             input,
@@ -213,14 +234,16 @@ impl Chain {
         for (made, route) in self.feed_tables.iter().zip(&mut self.feed_routes).filter(|(t, _)| t.name == table) {
             route.readers.push(reader(made));
         }
-        let mut wave = 0;
-        for maker in &mut self.nodes {
+        let mut makers = Vec::new();
+        for (index, maker) in self.nodes.iter_mut().enumerate() {
             for (made, route) in maker.writes.iter().zip(&mut maker.routes).filter(|(t, _)| t.name == table) {
                 route.readers.push(reader(made));
-                wave = wave.max(maker.wave + 1);
+                if made.rate_hz <= 0.0 {
+                    makers.push(index);
+                }
             }
         }
-        wave
+        makers
     }
 
     /// Every row before this time has gone into the chain, Unix ns.
@@ -234,7 +257,8 @@ impl Chain {
         all.filter(|(_, route)| route.archive).map(|(table, _)| table.clone()).collect()
     }
 
-    /// Pushes a chunk of the feed through the chain.
+    /// Pushes a chunk of the feed into the chain. What went in before goes on at the same time, node by node at rows of
+    /// its own, as on an assembly line; up to a batch stays before each node ([`Self::settle`]).
     ///
     /// # Errors
     /// A plugin failed, or broke a rule.
@@ -245,7 +269,29 @@ impl Chain {
                 publish(&mut self.nodes, &mut self.tap, table, route, batch, sink)?;
             }
             self.complete_until_ns = piece.complete_until_ns;
-            self.advance(sink)?;
+            self.round(Call::NewRows, sink)?;
+            // A plugin may hold rows back for an hour and give them at once.
+            while self.has_backlog() && self.round(Call::FullBatch, sink)? {}
+        }
+        Ok(())
+    }
+
+    /// Whether more than a batch waits anywhere, beside the one that the next round takes.
+    fn has_backlog(&self) -> bool {
+        let rows = 2 * self.carry.batch_rows;
+        self.nodes.iter().any(|n| n.ready() >= rows) || self.tap.ready() >= rows
+    }
+
+    /// Lets everything that can go on go on: what waits then waits for rows to come, however the feed was cut.
+    ///
+    /// # Errors
+    /// A plugin failed, or broke a rule.
+    pub fn settle(&mut self, sink: &mut dyn Sink) -> Result<(), ChainError> {
+        while self.round(Call::AnyRows, sink)? {}
+        // Rows of irregular tables that a node makes go one node at a time.
+        for _ in 0..self.nodes.iter().filter(|n| !n.makers.is_empty()).count() {
+            self.round(Call::NewRows, sink)?;
+            while self.round(Call::AnyRows, sink)? {}
         }
         Ok(())
     }
@@ -255,14 +301,15 @@ impl Chain {
     /// # Errors
     /// A plugin failed, or broke a rule.
     pub fn finish(&mut self, sink: &mut dyn Sink) -> Result<(), ChainError> {
+        self.settle(sink)?;
         for i in 0..self.nodes.len() {
             if let Some(made) = step(&mut self.nodes[i], i64::MAX, self.carry.batch_rows, true)? {
                 self.distribute(i, &made, sink)?;
             }
-            while self.round(false, sink)? {}
+            while self.round(Call::AnyRows, sink)? {}
             let made = self.nodes[i].instance.flush()?;
             self.distribute(i, &made, sink)?;
-            while self.round(false, sink)? {}
+            while self.round(Call::AnyRows, sink)? {}
         }
         let readers = self.nodes.iter().map(|n| (n.name(), &n.inputs)).chain([(TAP, &self.tap.inputs)]);
         for (reader, inputs) in readers {
@@ -289,73 +336,64 @@ impl Chain {
         Ok(reports)
     }
 
-    /// Calls nodes in rounds until none has input. A plugin may hold rows back for an hour and give them at once; one
-    /// call of each node per round bounds the queues after it.
-    fn advance(&mut self, sink: &mut dyn Sink) -> Result<(), ChainError> {
-        let mut new_rows = true;
-        while self.round(new_rows, sink)? {
-            new_rows = false;
-        }
-        Ok(())
-    }
-
-    /// Calls each node that has rows once, and with `new_rows` those that read no uniform table; false if none was due.
-    /// An effect waits while a reader has a whole batch of its rows: to queue inputs takes less memory than outputs.
-    fn round(&mut self, new_rows: bool, sink: &mut dyn Sink) -> Result<bool, ChainError> {
-        let waves = self.nodes.iter().map(|n| n.wave + 1).max().unwrap_or(0);
-        let (until, rows) = (self.complete_until_ns, self.carry.batch_rows);
-        let mut busy = false;
-        for wave in 0..waves {
-            let ahead: Vec<bool> = self.nodes.iter().map(|n| n.is_effect && self.unread(n) >= rows).collect();
-            let in_wave = self.nodes.iter_mut().zip(&ahead).enumerate().filter(|(_, (n, _))| n.wave == wave);
-            let due: Vec<(usize, &mut ChainNode)> = in_wave
-                .filter(|(_, (n, ahead))| n.ready() > 0 && !**ahead || new_rows && !n.has_uniform())
-                .map(|(i, (n, _))| (i, n))
-                .collect();
-            let worth = due.iter().filter(|(_, n)| n.ready() > SPAWN_WORTH_ROWS).count();
-            let call = |(i, node): (usize, &mut ChainNode)| (i, step(node, until, rows, new_rows));
-            let threads = self.carry.threads.min(worth);
-            let mut made: Vec<(usize, Made)> = if threads > 1 {
-                let waiting = Mutex::new(due.into_iter());
-                let next = || waiting.lock().unwrap_or_else(PoisonError::into_inner).next();
-                let work = || std::iter::from_fn(next).map(call).collect::<Vec<_>>();
-                std::thread::scope(|scope| {
-                    // Where the system allows no more threads, this one does the work.
-                    let start = |_| std::thread::Builder::new().spawn_scoped(scope, work);
-                    let running: Vec<_> = (1..threads).filter_map(|n| start(n).ok()).collect();
-                    let mine = work();
-                    let join = |thread: std::thread::ScopedJoinHandle<'_, Vec<(usize, Made)>>| {
-                        thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
-                    };
-                    mine.into_iter().chain(running.into_iter().flat_map(join)).collect()
-                })
-            } else {
-                due.into_iter().map(call).collect()
-            };
-            made.sort_by_key(|(i, _)| *i);
-            for (i, made) in made {
-                if let Some(batches) = made? {
-                    busy = true;
-                    self.distribute(i, &batches, sink)?;
-                }
+    /// Calls nodes that are due once, all at the same time; the host takes its rows meanwhile. False if nobody was due.
+    /// What a node makes, its readers have in the next round. An effect waits while a reader has two batches of its
+    /// rows: to queue inputs takes less memory than outputs.
+    fn round(&mut self, whom: Call, sink: &mut dyn Sink) -> Result<bool, ChainError> {
+        let rows = self.carry.batch_rows;
+        let (least, new_rows) = (if whom == Call::AnyRows { 1 } else { rows }, whom == Call::NewRows);
+        let ahead: Vec<bool> = self.nodes.iter().map(|n| n.is_effect && self.unread(n) >= 2 * rows).collect();
+        let made_until = |n: &ChainNode| n.makers.iter().map(|m| self.nodes[*m].done_until_ns).min();
+        let until = |n: &ChainNode| made_until(n).map_or(self.complete_until_ns, |t| t.min(self.complete_until_ns));
+        let until: Vec<i64> = self.nodes.iter().map(until).collect();
+        let mut due: Vec<(usize, &mut ChainNode)> = Vec::new();
+        for (i, node) in self.nodes.iter_mut().enumerate() {
+            let is_due = node.ready() >= least && !ahead[i] || new_rows && !node.has_uniform();
+            if node.has_uniform() && node.ready() == 0 || is_due && node.ready() <= rows {
+                node.done_until_ns = until[i];
+            }
+            if is_due {
+                due.push((i, node));
             }
         }
-        Ok(self.pour(sink)? || busy)
-    }
-
-    /// Hands the tap's rows to the host, at most a batch of them; false where there are none.
-    fn pour(&mut self, sink: &mut dyn Sink) -> Result<bool, ChainError> {
-        let Tap { inputs, order } = &mut self.tap;
-        let rows = inputs.iter().map(Queue::rows).min().unwrap_or(0).min(self.carry.batch_rows);
-        if rows == 0 {
-            return Ok(false);
+        due.sort_by(|(_, a), (_, b)| b.seconds.total_cmp(&a.seconds));
+        let worth = due.iter().filter(|(_, n)| n.waiting() > SPAWN_WORTH_ROWS).count();
+        let call = |(i, node): (usize, &mut ChainNode)| {
+            let start = Instant::now();
+            let made = step(node, until[i], rows, new_rows);
+            node.seconds = start.elapsed().as_secs_f64();
+            (i, made)
+        };
+        let (tap, more) = (&mut self.tap, self.carry.threads.min(worth).saturating_sub(1));
+        let (mut made, poured): (Vec<(usize, Made)>, _) = if more > 0 {
+            let waiting = Mutex::new(due.into_iter());
+            let next = || waiting.lock().unwrap_or_else(PoisonError::into_inner).next();
+            let work = || std::iter::from_fn(next).map(call).collect::<Vec<_>>();
+            std::thread::scope(|scope| {
+                // Where the system allows no more threads, this one does the work.
+                let start = |_| std::thread::Builder::new().spawn_scoped(scope, work);
+                let running: Vec<_> = (0..more).filter_map(|n| start(n).ok()).collect();
+                let poured = tap.pour(rows, sink);
+                let mine = work();
+                let join = |thread: std::thread::ScopedJoinHandle<'_, Vec<(usize, Made)>>| {
+                    thread.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))
+                };
+                (mine.into_iter().chain(running.into_iter().flat_map(join)).collect(), poured)
+            })
+        } else {
+            let poured = tap.pour(rows, sink);
+            (due.into_iter().map(call).collect(), poured)
+        };
+        let poured = poured?;
+        made.sort_by_key(|(i, _)| *i);
+        let mut busy = poured;
+        for (i, made) in made {
+            if let Some(batches) = made? {
+                busy = true;
+                self.distribute(i, &batches, sink)?;
+            }
         }
-        check_join(TAP, inputs, rows)?;
-        let tables: Vec<Rows<'_>> = inputs.iter().map(|q| q.front(rows)).collect();
-        let columns: Vec<&[f64]> = order.iter().map(|(input, column)| tables[*input].columns[*column]).collect();
-        sink.tapped(tables[0].time_ns, &columns);
-        inputs.iter_mut().for_each(|q| q.consume(rows));
-        Ok(true)
+        Ok(busy)
     }
 
     /// Most rows that a reader of a node has not used yet.
@@ -375,6 +413,28 @@ impl Chain {
         self.nodes[node].routes = routes;
         self.nodes[node].writes = writes;
         result
+    }
+}
+
+impl Tap {
+    /// Rows that it could hand over now.
+    fn ready(&self) -> usize {
+        self.inputs.iter().map(Queue::rows).min().unwrap_or(0)
+    }
+
+    /// Hands its rows to the host, at most a batch of them; false where there are none.
+    fn pour(&mut self, most: usize, sink: &mut dyn Sink) -> Result<bool, ChainError> {
+        let rows = self.ready().min(most);
+        let Self { inputs, order } = self;
+        if rows == 0 {
+            return Ok(false);
+        }
+        check_join(TAP, inputs, rows)?;
+        let tables: Vec<Rows<'_>> = inputs.iter().map(|q| q.front(rows)).collect();
+        let columns: Vec<&[f64]> = order.iter().map(|(input, column)| tables[*input].columns[*column]).collect();
+        sink.tapped(tables[0].time_ns, &columns);
+        inputs.iter_mut().for_each(|q| q.consume(rows));
+        Ok(true)
     }
 }
 

@@ -107,10 +107,12 @@ pub struct Replay {
     /// The files in the order in which they were given.
     checked: Vec<CheckedFile>,
     threads: usize,
+    /// Their digests, where they are taken ahead.
+    sums: Option<JoinHandle<Vec<io::Result<Sums>>>>,
 }
 
 /// A file, and what its own sums say of it.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 struct CheckedFile {
     input: Arc<InputFile>,
     /// Where its data section ends, and the CRC, where it has one.
@@ -188,7 +190,17 @@ impl Replay {
         let reader = Reader::new(files, tables.clone(), window_ns, run_in_until_ns, losses)?;
         let findings = reader.findings().clone();
         let engine = if threads < 2 { Engine::Here(Box::new(reader)) } else { ahead(reader) };
-        Ok(Self { tables, info, findings, engine, checked, threads })
+        Ok(Self { tables, info, findings, engine, checked, threads, sums: None })
+    }
+
+    /// Takes the digests of the files while they are read, where there are several threads.
+    pub fn hash_ahead(&mut self) {
+        if self.threads < 2 {
+            return;
+        }
+        let (checked, threads) = (self.checked.clone(), self.threads - 1);
+        // Where the system allows no more threads, they are taken when they are asked for.
+        self.sums = thread::Builder::new().spawn(move || all_sums(&checked, threads)).ok();
     }
 
     /// The tables, in the order of the interface, housekeeping last by name. A table that is not here is a topic that
@@ -251,7 +263,11 @@ impl Replay {
     /// [`ReplayError::Changed`] when a file is not what it was when it was opened; it cannot be read.
     pub fn digests(&mut self) -> Result<Vec<(u64, String)>, ReplayError> {
         let mut digests = Vec::with_capacity(self.checked.len());
-        let sums = all_sums(&self.checked, self.threads);
+        let sums = match self.sums.take().map(JoinHandle::join) {
+            Some(Ok(sums)) => sums,
+            Some(Err(panic)) => std::panic::resume_unwind(panic),
+            None => all_sums(&self.checked, self.threads),
+        };
         for (file, sums) in self.checked.iter().zip(sums) {
             let path = || file.input.path().to_owned();
             let sums = sums.map_err(|source| ReplayError::Io { path: path(), source })?;

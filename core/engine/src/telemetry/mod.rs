@@ -6,18 +6,18 @@
 
 mod decode;
 mod encode;
-mod first;
 mod interface;
 mod layout;
 mod mcap_file;
 mod names;
+mod topic;
 mod write;
 
 pub use decode::{Cells, Decoder, WireError};
 pub use encode::{EncodeError, Encoder, MessageType};
-pub use first::{FirstError, first_message};
 pub use interface::{Drift, check, descriptor, expected, interface_tables};
 pub(crate) use interface::{TRUTH, column};
 pub use layout::{Kind, Layout, LayoutError, Leaf};
 pub use names::unit_and_frame;
+pub use topic::{Topic, TopicError, first_message, read_topic, topics};
 pub use write::{FileHeader, TelemetryWriter, WriteError};

@@ -58,6 +58,8 @@ struct Topic {
     pending: Batch,
     /// Rows of `pending` already written.
     done: usize,
+    /// Time of the last row that was written, Unix ns.
+    last_ns: i64,
 }
 
 /// Writes tables into one MCAP file: protobuf, chunks of about 1 MiB, zstd, CRCs, indexes, statistics; messages in
@@ -103,6 +105,7 @@ impl TelemetryWriter {
                 encoder: Encoder::new(message),
                 pending: Batch::empty(table.columns.len()),
                 done: 0,
+                last_ns: i64::MIN,
             });
         }
         Ok(Self { path: path.to_owned(), file, topics, message: Vec::new(), written_until_ns: i64::MIN })
@@ -137,19 +140,30 @@ impl TelemetryWriter {
         Ok(path)
     }
 
+    /// Takes rows of one table, by its number in [`TelemetryWriter::create`], and writes them at once: in order of time
+    /// within the table alone, so that no table waits for another.
+    ///
+    /// # Errors
+    /// [`WriteError`]; nothing can be written after one.
+    ///
+    /// # Panics
+    /// When there is no such table.
+    pub fn write_table(&mut self, table: usize, batch: Batch) -> Result<(), WriteError> {
+        let topic = &mut self.topics[table];
+        topic.accept(batch, topic.last_ns)?;
+        while topic.head().is_some() {
+            topic.write_row(&mut self.file, &mut self.message, &self.path)?;
+        }
+        topic.forget();
+        Ok(())
+    }
+
     fn write_before(&mut self, until_ns: i64) -> Result<(), WriteError> {
         // Equal times go in the order of the tables.
         while let Some(time_ns) = self.topics.iter().filter_map(Topic::head).min().filter(|t| *t < until_ns) {
             for topic in &mut self.topics {
                 while topic.head() == Some(time_ns) {
-                    self.message.clear();
-                    topic.encoder.encode(&topic.pending, topic.done, &mut self.message)?;
-                    let log_time = u64::try_from(time_ns)
-                        .map_err(|_| WriteError::NegativeTime { table: topic.name.clone(), time_ns })?;
-                    self.file
-                        .message(topic.channel, log_time, &self.message)
-                        .map_err(|source| WriteError::Io { path: self.path.clone(), source })?;
-                    topic.done += 1;
+                    topic.write_row(&mut self.file, &mut self.message, &self.path)?;
                 }
             }
         }
@@ -163,6 +177,25 @@ impl Topic {
     /// Time of the first row that is not yet written.
     fn head(&self) -> Option<i64> {
         self.pending.time_ns.get(self.done).copied()
+    }
+
+    /// Writes the first row that is not yet written.
+    fn write_row(
+        &mut self,
+        file: &mut McapFile<BufWriter<NamedTempFile>>,
+        message: &mut Vec<u8>,
+        path: &Path,
+    ) -> Result<(), WriteError> {
+        let time_ns = self.pending.time_ns[self.done];
+        message.clear();
+        self.encoder.encode(&self.pending, self.done, message)?;
+        let log_time = u64::try_from(time_ns);
+        let log_time = log_time.map_err(|_| WriteError::NegativeTime { table: self.name.clone(), time_ns })?;
+        let io = |source| WriteError::Io { path: path.to_owned(), source };
+        file.message(self.channel, log_time, message).map_err(io)?;
+        self.last_ns = time_ns;
+        self.done += 1;
+        Ok(())
     }
 
     /// Takes rows in order of time, none before `written_until_ns`.

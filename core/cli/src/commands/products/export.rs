@@ -5,10 +5,10 @@ use crate::args::Format;
 use crate::commands::Done;
 use crate::failure::Failure;
 use chrono::{DateTime, SecondsFormat};
-use dragfree_archive::JOINT;
 use dragfree_archive::files::IoContext as _;
 use dragfree_archive::product::{self, Coefficient, Product};
-use dragfree_workflow::joint::rate_of;
+use dragfree_archive::{Archive, JOINT};
+use dragfree_workflow::{foxglove, joint::rate_of};
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
@@ -20,6 +20,9 @@ pub(super) fn execute(name: &str, format: Format, out: Option<&Path>, folder: &P
         Format::Vcm1b => vcm1b(&written.product)?.into_bytes(),
         Format::Json => format!("{:#}\n", product::to_json(&written.product, &written.path)).into_bytes(),
         Format::Parquet => parquet::coefficients(&written.product)?,
+        Format::Foxglove => {
+            format!("{:#}\n", foxglove::layout(&Archive::open(folder)?, written.product.id())?).into_bytes()
+        }
     };
     let Some(path) = out else {
         let text = String::from_utf8(content).ok().filter(|_| format != Format::Parquet);
