@@ -49,7 +49,7 @@ pub struct Collected {
     pub prediction: Option<Prediction>,
     /// The open long segments, where the plan has bands for them.
     pub slow: Option<SlowBand>,
-    /// Means of this run's rows, for residuals over time, where they are asked for.
+    /// Means of rows, for residuals over time, where they are asked for.
     pub residuals: Option<ResidualMeans>,
 }
 

@@ -2,10 +2,11 @@
 //!
 //! A residual `z − Φθ` is known when θ is, at the end. Means of z and Φ over short intervals are kept until then, and
 //! the products of those that meet in one channel, of which the mean square of every residual follows. There are never
-//! more than a few thousand intervals: when there would be, each two neighbours become one.
+//! more than two thousand intervals: when there would be, each two neighbours become one.
 
 use std::f64::consts::PI;
 
+use dragfree_schema::state::{State, StateError};
 use nalgebra::DMatrix;
 
 use crate::sigma::NoiseModel;
@@ -14,7 +15,9 @@ use crate::spectra::Layout;
 /// Length of the first intervals, ns: five doublings make a minute.
 const FIRST_INTERVAL_NS: i64 = 1_875_000_000;
 /// Intervals that are kept.
-const MOST: usize = 4096;
+const MOST: usize = 2048;
+/// The longest interval over the first one, far beyond any mission.
+const MOST_DOUBLED: i64 = 1 << 20;
 /// Frequencies between which the noise is interpolated.
 const FREQUENCIES: usize = 256;
 
@@ -136,6 +139,41 @@ impl ResidualMeans {
         }
     }
 
+    /// Visits all of it, as part of the state of a stage with these columns.
+    ///
+    /// # Errors
+    /// What is loaded are no intervals in the order of time.
+    pub fn visit(&mut self, state: &mut State<'_>) -> Result<(), StateError> {
+        state.i64(&mut self.interval_ns)?;
+        let doublings = self.interval_ns / FIRST_INTERVAL_NS;
+        if self.interval_ns % FIRST_INTERVAL_NS != 0 || !(1..=MOST_DOUBLED).contains(&doublings) {
+            return Err(StateError::Content("the length of an interval of residuals"));
+        }
+        let count = state.count(self.intervals.len())?;
+        if count > MOST {
+            return Err(StateError::Content("intervals of residuals"));
+        }
+        if state.is_loading() {
+            self.intervals.clear();
+        }
+        for k in 0..count {
+            if state.is_loading() {
+                self.begin(0);
+            }
+            let interval = &mut self.intervals[k];
+            state.i64(&mut interval.number)?;
+            state.u64(&mut interval.count)?;
+            state.f64s(&mut interval.sums)?;
+            state.f64s(&mut interval.products)?;
+        }
+        let in_order = self.intervals.windows(2).all(|pair| pair[0].number < pair[1].number);
+        let is_time = |i: &Interval| i.number.checked_add(1).and_then(|n| n.checked_mul(self.interval_ns)).is_some();
+        if !in_order || !self.intervals.iter().all(is_time) {
+            return Err(StateError::Content("the order of intervals of residuals"));
+        }
+        Ok(())
+    }
+
     /// The residuals at `theta`, in the order of time, less their mean: no fit sees a constant, such as the gravity of
     /// the spacecraft. Intervals of which less than half has data are left out.
     pub fn at(&self, layout: &Layout, theta: &[f64]) -> Vec<Means> {
@@ -243,7 +281,7 @@ impl MeanNoise {
 mod tests {
     use super::*;
     use crate::spectra::Regressor;
-    use dragfree_schema::{NoiseProcess, NoiseResponse, NoiseShape};
+    use dragfree_schema::{NoiseProcess, NoiseResponse, NoiseShape, state};
 
     const STEP_NS: i64 = 100_000_000;
 
@@ -302,10 +340,10 @@ mod tests {
         };
         let whole = gathered(&columns, 1000);
         let means = whole.at(&layout(), &[p, q]);
-        assert_eq!(whole.interval_ns, 4 * FIRST_INTERVAL_NS);
-        assert!((2000..=MOST).contains(&means.len()), "{}", means.len());
+        assert_eq!(whole.interval_ns, 8 * FIRST_INTERVAL_NS);
+        assert!((1000..=MOST).contains(&means.len()), "{}", means.len());
         let left_out = rows as u64 - means.iter().map(|m| m.count).sum::<u64>();
-        assert!(left_out < 38, "{left_out}: less than half of the last interval");
+        assert!(left_out < 75, "{left_out}: less than half of the last interval");
         let kept = rows - left_out as usize;
         let constant = [0, 1].map(|c| (0..kept).map(|row| residual(row)[c]).sum::<f64>() / kept as f64);
         let mut row = 0;
@@ -327,6 +365,29 @@ mod tests {
         for batch in [1, 77, rows] {
             assert_eq!(gathered(&columns, batch).at(&layout(), &[p, q]), means, "{batch}");
         }
+    }
+
+    /// Saved and loaded into a new run they go on as if nothing had been; what is no state of them is refused.
+    #[test]
+    fn a_state_goes_on_where_it_was() {
+        let columns: Vec<Vec<f64>> = (1..5).map(|seed| noise(60_000, seed)).collect();
+        let part = |from: usize, to: usize| -> Vec<&[f64]> { columns.iter().map(|c| &c[from..to]).collect() };
+        let mut first = ResidualMeans::new(&layout(), 10.0);
+        first.push(0, &part(0, 45_000));
+        let visit = |means: &mut ResidualMeans, state: &mut State<'_>| means.visit(state);
+        let bytes = state::save("test", 1, |state| visit(&mut first, state)).expect("saved");
+        let mut second = ResidualMeans::new(&layout(), 10.0);
+        state::load("test", 1, &bytes, |state| visit(&mut second, state)).expect("loaded");
+        for means in [&mut first, &mut second] {
+            means.push(45_000 * STEP_NS, &part(45_000, 60_000));
+        }
+        assert_eq!(first.at(&layout(), &[0.3, 0.1]), second.at(&layout(), &[0.3, 0.1]));
+        first.intervals.swap(3, 4);
+        let bytes = state::save("test", 1, |state| visit(&mut first, state));
+        assert!(bytes.is_err(), "out of order");
+        first.intervals.swap(3, 4);
+        first.interval_ns = 7;
+        assert!(state::save("test", 1, |state| visit(&mut first, state)).is_err(), "no such interval");
     }
 
     #[test]

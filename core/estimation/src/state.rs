@@ -41,6 +41,9 @@ pub fn visit(
     if let Some(slow) = &mut collected.slow {
         visit_slow(state, slow)?;
     }
+    if let Some(residuals) = &mut collected.residuals {
+        residuals.visit(state)?;
+    }
     if let Some(prediction) = &mut collected.prediction {
         let empty = Stretch { number: 0, sums: vec![0.0; prediction.block_size()] };
         visit_prediction(state, &mut prediction.state, &empty)?;

@@ -142,6 +142,8 @@ impl Stage for QpCheck {
         self.linked.as_mut().ok_or_else(before_link)?.report(earlier)
     }
 
+    const STATE_VERSION: u32 = 2;
+
     fn state(&mut self, state: &mut State<'_>) -> Result<(), PluginError> {
         let linked = self.linked.as_mut().ok_or_else(before_link)?;
         if state.is_loading() {
