@@ -29,6 +29,9 @@ const WARM: u32 = 20;
 /// Growth of the memory that is allowed, over that at the first look.
 const GROWTH: f64 = 0.05;
 
+/// What a product says that must be the same.
+const SAID: [&str; 7] = ["coefficients", "covariance", "verdict", "quality", "losses", "model", "history"];
+
 /// Longest wait until a day is run, s.
 const PATIENCE_S: u64 = 120;
 
@@ -236,7 +239,8 @@ impl<'a> Bench<'a> {
         }
     }
 
-    /// The newest product of every day with its digest, and the number of all.
+    /// The newest product of every day, what it says and of which bytes it was made, and the number of all. A file that
+    /// comes twice has two names, and which of them a product states is no matter here.
     fn held(&self, mission: &Path) -> Result<(BTreeMap<String, String>, u32), CampaignError> {
         let list = self.program.ask(mission, &["products", "list"])?;
         let products = list["products"].as_array().cloned().unwrap_or_default();
@@ -247,7 +251,11 @@ impl<'a> Bench<'a> {
         }
         for id in newest.values_mut() {
             let shown = self.program.ask(mission, &["products", "show", id])?;
-            *id = shown["sha256"].as_str().unwrap_or_default().to_owned();
+            let inputs = shown["inputs"].as_array().into_iter().flatten();
+            let mut bytes: Vec<&str> = inputs.filter_map(|input| input["sha256"].as_str()).collect();
+            bytes.sort_unstable();
+            let said = SAID.map(|key| format!("{key} {}", shown[key]));
+            *id = format!("{}\n{}", said.join("\n"), bytes.join(" "));
         }
         Ok((newest, products.len() as u32))
     }
