@@ -2,7 +2,7 @@
 
 use dragfree_tests::calibration::{diagnose, science_mode};
 use dragfree_tests::recording::Recording;
-use dragfree_tests::simulate;
+use dragfree_tests::{dragfree, expect, simulate};
 use serde_json::Value;
 use std::path::Path;
 
@@ -97,4 +97,33 @@ fn a_candidate_collinear_with_the_model() {
     };
     let (same, other) = (sigma("tm2.y"), sigma("tm1.y").expect("the other gain has a limit"));
     assert!(same.is_none_or(|sigma| sigma > 10.0 * other), "{same:?} and {other}");
+}
+
+/// What the stages make is kept in a file from pass to pass. The answer is the same, to the last digit, where there is no
+/// room for it, with gaps in the telemetry and whatever the sizes of batches.
+#[test]
+fn a_diagnosis_without_room_for_its_rows_says_the_same() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let at = folder.path();
+    let file = simulate(at, &["--hours", "2", "--seed", "23", "--effect", "mps-gain:sc.y=0.2"]).remove(0);
+    let recording = Recording::read(&file);
+    let start_ns = recording.start_ns();
+    recording.write(&file, |message| {
+        let second = message.log_time.saturating_sub(start_ns) / 1_000_000_000;
+        (!(3000..3100).contains(&second)).then_some(message)
+    });
+    let product = science_mode(at).arg(&file).output().expect("runs").stdout;
+    let product: Value = serde_json::from_slice(&product).expect("a product as JSON");
+    let id = product["id"].as_str().expect("an id");
+    let told = |temporary: &Path, log: &str, threads: &str| {
+        let mut command = dragfree(at);
+        command.args(["diagnose", id, "--archive", "archive", "--json", "-q", "--log-json", log, "--threads", threads]);
+        let answer = expect(command.env("TMPDIR", temporary), 4).stdout;
+        let log = std::fs::read_to_string(at.join(log)).expect("a log");
+        (answer, log.matches("an earlier pass has kept").count())
+    };
+    let (kept, reads) = told(&std::env::temp_dir(), "kept.jsonl", "2");
+    let (again, no_reads) = told(&at.join("nowhere"), "again.jsonl", "1");
+    assert!(reads >= 4 && no_reads == 0, "{reads} passes read what was kept, and {no_reads} where there is no room");
+    assert!(kept == again, "{}", String::from_utf8_lossy(&kept));
 }

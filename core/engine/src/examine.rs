@@ -7,12 +7,13 @@ use std::path::Path;
 
 use crate::EngineError;
 use crate::border::Kind;
-use crate::chain::{Chain, Sink};
+use crate::chain::{Chain, Recording, Recordings, Sink};
 use crate::config::{EffectEntry, Mission, Model, Node};
 use crate::feed::{Feed, SourceFeed, Summary};
 use crate::registry::Registry;
 use crate::run::{Progress, RunOptions, Setup};
 use crate::sources::Sources;
+use crate::stop;
 use crate::table::{Chunk, TableSpec};
 use dragfree_archive::product::{Input, Product};
 
@@ -35,6 +36,8 @@ pub struct Examination<'a> {
     pub values: &'a BTreeMap<String, f64>,
     /// Rows as they would be in another experiment; as they are where there is none.
     pub altered: Option<Altering<'a>>,
+    /// Where what the stages make is kept for later passes over the same data, and read once it is.
+    pub recordings: Option<&'a Recordings>,
     /// Threads; results do not depend on them.
     pub threads: usize,
     /// Most rows in one call; results do not depend on it.
@@ -107,6 +110,11 @@ pub fn examine<C: Sink, E: From<EngineError>>(
     setup.model.candidates.clone_from(&what.candidates);
     setup.model.chosen.clone_from(&what.chosen);
     setup.model.needs = what.needs.iter().map(|need| (*need).to_owned()).collect();
+    if what.recordings.is_some() {
+        // What any effect may ask for, so that later passes with other effects find it.
+        let effects = registry.plugins().filter(|p| p.info.kind == Kind::Effect);
+        setup.model.needs.extend(effects.flat_map(|p| p.info.manifest.needs.clone()));
+    }
     for (name, value) in what.values {
         let short = name.rsplit('.').next().unwrap_or_default();
         for entry in setup.model.effects.iter_mut().filter(|e| e.owns(name)) {
@@ -123,10 +131,47 @@ pub fn examine<C: Sink, E: From<EngineError>>(
     let mut chain = setup.link(registry, feed.tables())?;
     let (mut consumer, columns) = link(&chain)?;
     chain.tap(&columns).map_err(EngineError::from)?;
-    setup.carry(feed.as_mut(), &mut chain, &mut consumer, progress)?;
-    chain.finish(&mut consumer).map_err(EngineError::from)?;
+    let recordings = what.recordings.filter(|_| what.altered.is_none());
+    let made_by = chain.made_by(&data_of(what));
+    let recording = recordings.and_then(|all| all.find(&made_by, &chain));
+    if let Some(recording) = recording {
+        tracing::debug!("rows are read from what an earlier pass has kept");
+        play(&mut chain, &recording, &mut consumer, progress)?;
+        chain.finish(&mut consumer).map_err(EngineError::from)?;
+    } else {
+        recordings.iter().for_each(|all| chain.record(made_by.clone(), all));
+        setup.carry(feed.as_mut(), &mut chain, &mut consumer, progress)?;
+        chain.finish(&mut consumer).map_err(EngineError::from)?;
+        recordings.iter().for_each(|all| chain.recorded(all));
+    }
     feed.unchanged()?;
     Ok((consumer, chain.not_tried))
+}
+
+/// Which data go into a chain.
+fn data_of(what: &Examination<'_>) -> String {
+    let Sources { telemetry, from_ns, until_ns, run_in_ns, .. } = what.sources;
+    format!("{} {telemetry:?} {from_ns:?} {until_ns:?} {run_in_ns}", what.product.id())
+}
+
+/// Carries the rows of a recording into the effects and to the host.
+fn play(
+    chain: &mut Chain,
+    recording: &Recording,
+    consumer: &mut dyn Sink,
+    progress: &mut dyn FnMut(Progress),
+) -> Result<(), EngineError> {
+    let ends = |block: &[i64]| block.first().copied().zip(block.last().copied());
+    let blocks: Vec<(i64, i64)> = recording.blocks().filter_map(ends).collect();
+    let (Some((first_ns, _)), end_ns) = (blocks.first().copied(), blocks.last().map(|(_, last)| *last)) else {
+        return Ok(());
+    };
+    for (block, (_, until_ns)) in blocks.into_iter().enumerate() {
+        chain.play(recording, block, consumer)?;
+        progress(Progress { until_ns, first_ns, end_ns });
+        stop::check()?;
+    }
+    Ok(())
 }
 
 /// A feed with other values.

@@ -17,6 +17,9 @@ pub const TABLES: usize = 1024;
 /// Most columns of a table from telemetry, and of the tables that one plugin writes.
 pub const COLUMNS: usize = 4096;
 
+/// Most bytes of rows that a program keeps in files without a name, so that stages need not make them again.
+pub const RECORDING_BYTES: u64 = 8 << 30;
+
 /// Largest configuration file: pipeline, mission, model, lock, bytes.
 pub const CONFIG_BYTES: u64 = 16 << 20;
 

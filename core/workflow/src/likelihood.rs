@@ -340,6 +340,7 @@ pub(crate) fn one_pass(
             needs: &[PREDICTION_NEED],
             values: &levels,
             altered: None,
+            recordings: Some(&replay.recordings),
             threads: replay.threads,
             batch_rows: replay.batch_rows,
         };

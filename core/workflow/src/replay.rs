@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use dragfree_archive::Written;
-use dragfree_engine::chain::Chain;
+use dragfree_engine::chain::{Chain, Recordings};
 use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{Examination, FREQUENCY_HZ, candidates, examine, has_parameter};
 use dragfree_engine::registry::Registry;
@@ -33,6 +33,8 @@ pub struct Replay<'a> {
     pub threads: usize,
     /// Most rows in one call of a plugin; results do not depend on it.
     pub batch_rows: usize,
+    /// What the stages before the effects have made in earlier passes.
+    pub recordings: Recordings,
 }
 
 impl Replay<'_> {
@@ -116,7 +118,7 @@ pub(crate) fn sum(
     what: What<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Record, WorkflowError> {
-    let Replay { registry, products, threads, batch_rows } = *replay;
+    let Replay { registry, products, threads, batch_rows, .. } = *replay;
     ManyDays::refuse(products.iter().map(|w| &w.product))?;
     let levels = noise_levels(products);
     let mut whole: Option<Record> = None;
@@ -159,6 +161,7 @@ pub(crate) fn sum(
             needs: &[],
             values: &levels,
             altered: None,
+            recordings: (!matches!(what, What::Model)).then_some(&replay.recordings),
             threads,
             batch_rows,
         };

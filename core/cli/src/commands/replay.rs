@@ -4,6 +4,7 @@ use crate::args::{BATCH_ROWS, Global};
 use crate::failure::Failure;
 use crate::progress::Meter;
 use dragfree_archive::Written;
+use dragfree_engine::chain::Recordings;
 use dragfree_workflow::calibrate::Progress;
 use dragfree_workflow::{Pass, Replay, WorkflowError};
 
@@ -15,7 +16,8 @@ pub(super) fn with_meter<T>(
 ) -> Result<T, Failure> {
     let registry = super::registry(global)?;
     let threads = super::threads(global);
-    let replay = Replay { registry: &registry, products, threads, batch_rows: BATCH_ROWS as usize };
+    let (registry, batch_rows) = (&registry, BATCH_ROWS as usize);
+    let replay = Replay { registry, products, threads, batch_rows, recordings: Recordings::default() };
     let mut shown: Option<(Pass, usize, Meter)> = None;
     let mut progress = |pass: Pass, product: usize, progress: Progress| {
         if shown.as_ref().is_none_or(|(of, number, _)| (*of, *number) != (pass, product)) {

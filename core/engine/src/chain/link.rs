@@ -3,7 +3,7 @@
 use dragfree_schema::{Coefficient, Constraint, NoiseLevels, NoiseProcess, Settings};
 use serde_json::{Map, Value, json};
 
-use super::{Carry, Chain, ChainError, ChainNode, Queue, Route};
+use super::{Carry, Chain, ChainError, ChainNode, Queue, Route, To};
 use crate::border::{BorderError, Config, Instance, Kind, LinkRequest, Linked};
 use crate::config::{EffectEntry, Mission, Model, Node, Pipeline, resolve_parameters};
 use crate::registry::{Found, Registry};
@@ -63,6 +63,7 @@ pub fn build(
         )));
     }
     builder.chain.columns = std::mem::take(&mut builder.available);
+    builder.chain.needs = std::mem::take(&mut builder.needs);
     builder.chain.model_sha256 = sha256(builder.model_json(false));
     Ok(builder.chain)
 }
@@ -308,7 +309,7 @@ impl Builder<'_> {
             let (table, uniform) = (first.table.clone(), first.rate_hz > 0.0);
             let names: Vec<&str> = columns.iter().map(|c| self.available[c.available].name.as_str()).collect();
             inputs.push(Queue::new(table.clone(), uniform, columns.len()));
-            makers.extend(self.chain.subscribe(&table, &names, Some(index), input));
+            makers.extend(self.chain.subscribe(&table, &names, To::Node(index), input));
         }
         (inputs, makers)
     }

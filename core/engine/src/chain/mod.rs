@@ -6,13 +6,16 @@
 
 mod link;
 mod queue;
+mod recording;
 mod state;
 
 pub use link::build;
 pub(crate) use link::{comes_at_the_end, open_source};
+pub(crate) use recording::Recording;
+pub use recording::Recordings;
 pub use state::resumes_at_ns;
 
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
 use dragfree_schema::{Coefficient, Constraint, NoiseProcess, Report};
@@ -20,6 +23,7 @@ use dragfree_schema::{Coefficient, Constraint, NoiseProcess, Report};
 use crate::border::{BorderError, Instance, PluginInfo, Rows};
 use crate::table::{Batch, Chunk, Column, TableSpec};
 use queue::Queue;
+use recording::Recorder;
 
 /// What can go wrong between plugins.
 #[derive(Debug, thiserror::Error)]
@@ -49,6 +53,9 @@ pub enum ChainError {
     /// Rows could not be archived.
     #[error("time series: {0}")]
     Sink(String),
+    /// What was kept of an earlier pass cannot be read.
+    #[error("the file in which an earlier pass has kept its rows: {what}; give TMPDIR another folder")]
+    Recording { what: String },
 }
 
 /// A consumer of rows that leave the chain.
@@ -135,11 +142,18 @@ struct Route {
 
 #[derive(Clone, Debug)]
 struct Reader {
-    /// None for the tap.
-    node: Option<usize>,
+    to: To,
     input: usize,
     /// Columns of the table, in the reader's order.
-    columns: Vec<usize>,
+    columns: Arc<[usize]>,
+}
+
+/// Who reads.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum To {
+    Node(usize),
+    Tap,
+    Recording,
 }
 
 /// How rows are carried.
@@ -178,6 +192,11 @@ pub struct Chain {
     feed_tables: Vec<TableSpec>,
     feed_routes: Vec<Route>,
     tap: Tap,
+    recorder: Option<Recorder>,
+    /// Whether rows come from a recording of what the stages before the effects have made.
+    from_recording: bool,
+    /// What effects and the host have asked of the stages by name.
+    needs: Vec<String>,
     carry: Carry,
     complete_until_ns: i64,
     /// Digests of what a state must have been saved with.
@@ -219,15 +238,15 @@ impl Chain {
             let mut queue = Queue::new(table.to_owned(), true, names.len());
             queue.begin_at(self.carry.run_in_until_ns.unwrap_or(i64::MIN));
             self.tap.inputs.push(queue);
-            self.subscribe(table, &names, None, input);
+            self.subscribe(table, &names, To::Tap, input);
         }
         Ok(())
     }
 
     /// Routes columns of a table to a node, or to the tap; where the table is irregular, gives the nodes that make it.
-    fn subscribe(&mut self, table: &str, names: &[&str], node: Option<usize>, input: usize) -> Vec<usize> {
+    fn subscribe(&mut self, table: &str, names: &[&str], to: To, input: usize) -> Vec<usize> {
         let reader = |made: &TableSpec| Reader {
-            node,
+            to,
             input,
             columns: names.iter().filter_map(|n| made.columns.iter().position(|c| c.name == *n)).collect(),
         };
@@ -264,9 +283,9 @@ impl Chain {
     /// A plugin failed, or broke a rule.
     pub fn feed(&mut self, chunk: Chunk, sink: &mut dyn Sink) -> Result<(), ChainError> {
         for piece in pieces(chunk, self.carry.batch_rows) {
-            for (i, batch) in piece.batches.iter().enumerate() {
+            for (i, batch) in piece.batches.into_iter().enumerate() {
                 let (table, route) = (&self.feed_tables[i], &self.feed_routes[i]);
-                publish(&mut self.nodes, &mut self.tap, table, route, batch, sink)?;
+                publish(&mut self.nodes, &mut self.tap, &mut self.recorder, table, route, batch, sink)?;
             }
             self.complete_until_ns = piece.complete_until_ns;
             self.round(Call::NewRows, sink)?;
@@ -303,12 +322,15 @@ impl Chain {
     pub fn finish(&mut self, sink: &mut dyn Sink) -> Result<(), ChainError> {
         self.settle(sink)?;
         for i in 0..self.nodes.len() {
+            if self.from_recording && !self.nodes[i].is_effect {
+                continue;
+            }
             if let Some(made) = step(&mut self.nodes[i], i64::MAX, self.carry.batch_rows, true)? {
-                self.distribute(i, &made, sink)?;
+                self.distribute(i, made, sink)?;
             }
             while self.round(Call::AnyRows, sink)? {}
             let made = self.nodes[i].instance.flush()?;
-            self.distribute(i, &made, sink)?;
+            self.distribute(i, made, sink)?;
             while self.round(Call::AnyRows, sink)? {}
         }
         let readers = self.nodes.iter().map(|n| (n.name(), &n.inputs)).chain([(TAP, &self.tap.inputs)]);
@@ -347,7 +369,8 @@ impl Chain {
         let until = |n: &ChainNode| made_until(n).map_or(self.complete_until_ns, |t| t.min(self.complete_until_ns));
         let until: Vec<i64> = self.nodes.iter().map(until).collect();
         let mut due: Vec<(usize, &mut ChainNode)> = Vec::new();
-        for (i, node) in self.nodes.iter_mut().enumerate() {
+        let silent = |node: &ChainNode| self.from_recording && !node.is_effect;
+        for (i, node) in self.nodes.iter_mut().enumerate().filter(|(_, node)| !silent(node)) {
             let is_due = node.ready() >= least && !ahead[i] || new_rows && !node.has_uniform();
             if node.has_uniform() && node.ready() == 0 || is_due && node.ready() <= rows {
                 node.done_until_ns = until[i];
@@ -390,7 +413,7 @@ impl Chain {
         for (i, made) in made {
             if let Some(batches) = made? {
                 busy = true;
-                self.distribute(i, &batches, sink)?;
+                self.distribute(i, batches, sink)?;
             }
         }
         Ok(busy)
@@ -399,16 +422,25 @@ impl Chain {
     /// Most rows that a reader of a node has not used yet.
     fn unread(&self, node: &ChainNode) -> usize {
         let readers = node.routes.iter().flat_map(|route| &route.readers);
-        let inputs = |r: &Reader| r.node.map_or(&self.tap.inputs, |node| &self.nodes[node].inputs);
-        readers.map(|r| inputs(r)[r.input].rows()).max().unwrap_or(0)
+        let rows = |r: &Reader| match r.to {
+            To::Node(node) => self.nodes[node].inputs[r.input].rows(),
+            To::Tap => self.tap.inputs[r.input].rows(),
+            To::Recording => 0,
+        };
+        readers.map(rows).max().unwrap_or(0)
     }
 
-    fn distribute(&mut self, node: usize, made: &[Batch], sink: &mut dyn Sink) -> Result<(), ChainError> {
+    fn distribute(&mut self, node: usize, made: Vec<Batch>, sink: &mut dyn Sink) -> Result<(), ChainError> {
         let routes = std::mem::take(&mut self.nodes[node].routes);
         let writes = std::mem::take(&mut self.nodes[node].writes);
         let mut result = Ok(());
         for ((table, route), batch) in writes.iter().zip(&routes).zip(made) {
-            result = result.and_then(|()| publish(&mut self.nodes, &mut self.tap, table, route, batch, sink));
+            let (nodes, tap, recorder) = (&mut self.nodes, &mut self.tap, &mut self.recorder);
+            result = result.and_then(|()| publish(nodes, tap, recorder, table, route, batch, sink));
+        }
+        if let Some(Err(why)) = self.recorder.as_mut().map(|recorder| recorder.pour(false)) {
+            recording::not_kept(&why);
+            self.recorder = None;
         }
         self.nodes[node].routes = routes;
         self.nodes[node].writes = writes;
@@ -429,6 +461,7 @@ impl Tap {
         if rows == 0 {
             return Ok(false);
         }
+        inputs.iter_mut().for_each(|queue| queue.gather(rows));
         check_join(TAP, inputs, rows)?;
         let tables: Vec<Rows<'_>> = inputs.iter().map(|q| q.front(rows)).collect();
         let columns: Vec<&[f64]> = order.iter().map(|(input, column)| tables[*input].columns[*column]).collect();
@@ -450,20 +483,29 @@ const SPAWN_WORTH_ROWS: usize = 512;
 fn publish(
     nodes: &mut [ChainNode],
     tap: &mut Tap,
+    recorder: &mut Option<Recorder>,
     table: &TableSpec,
     route: &Route,
-    batch: &Batch,
+    batch: Batch,
     sink: &mut dyn Sink,
 ) -> Result<(), ChainError> {
     if batch.rows() == 0 {
         return Ok(());
     }
-    for reader in &route.readers {
-        let inputs = reader.node.map_or(&mut tap.inputs, |node| &mut nodes[node].inputs);
-        inputs[reader.input].push(batch, &reader.columns);
-    }
     if route.archive {
-        sink.rows(table, batch).map_err(ChainError::Sink)?;
+        sink.rows(table, &batch).map_err(ChainError::Sink)?;
+    }
+    let batch = Arc::new(batch);
+    for reader in &route.readers {
+        let queue = match reader.to {
+            To::Node(node) => &mut nodes[node].inputs[reader.input],
+            To::Tap => &mut tap.inputs[reader.input],
+            To::Recording => match recorder {
+                Some(recorder) => &mut recorder.inputs[reader.input],
+                None => continue,
+            },
+        };
+        queue.push(&batch, &reader.columns);
     }
     Ok(())
 }
@@ -474,8 +516,9 @@ fn step(node: &mut ChainNode, complete_until_ns: i64, batch_rows: usize, new_row
     if rows == 0 && (node.has_uniform() || !new_rows) {
         return Ok(None);
     }
-    check_join(node.name(), &node.inputs, rows)?;
     let given: Vec<usize> = node.inputs.iter().map(|q| if q.uniform { rows } else { q.rows() }).collect();
+    node.inputs.iter_mut().zip(&given).for_each(|(queue, n)| queue.gather(*n));
+    check_join(node.name(), &node.inputs, rows)?;
     let tables: Vec<Rows<'_>> = node.inputs.iter().zip(&given).map(|(q, n)| q.front(*n)).collect();
     let batches = match node.instance.process(&tables, complete_until_ns)? {
         Some(batches) => {
@@ -493,7 +536,7 @@ fn step(node: &mut ChainNode, complete_until_ns: i64, batch_rows: usize, new_row
 /// A discarded batch leaves rows without values in the node's uniform tables, so that the chain stays in step.
 fn discarded(node: &mut ChainNode, rows: usize) -> Vec<Batch> {
     node.discarded_rows += rows as u64;
-    let times = node.inputs.iter().find(|q| q.uniform).map(|q| q.front(rows).time_ns.to_vec()).unwrap_or_default();
+    let times = node.inputs.iter().find(|q| q.uniform).map(|q| q.times(rows).to_vec()).unwrap_or_default();
     node.writes
         .iter()
         .map(|t| {
@@ -509,9 +552,12 @@ fn discarded(node: &mut ChainNode, rows: usize) -> Vec<Batch> {
 fn check_join(reader: &str, inputs: &[Queue], rows: usize) -> Result<(), ChainError> {
     let mut uniform = inputs.iter().filter(|q| q.uniform);
     let Some(first) = uniform.next() else { return Ok(()) };
-    let times = first.front(rows).time_ns;
+    let times = first.times(rows);
     for queue in uniform {
-        let other = queue.front(rows).time_ns;
+        let other = queue.times(rows);
+        if std::ptr::eq(times, other) {
+            continue;
+        }
         if let Some(i) = (0..rows).find(|i| times[*i] != other[*i]) {
             return Err(ChainError::Join {
                 reader: reader.to_owned(),

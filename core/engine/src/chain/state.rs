@@ -58,7 +58,7 @@ impl Chain {
         put(&mut bytes, &header);
         for node in &mut self.nodes {
             put(&mut bytes, &node.instance.save()?);
-            for queue in &node.inputs {
+            for queue in &mut node.inputs {
                 queue.put(&mut bytes);
             }
         }
@@ -154,7 +154,8 @@ fn take<'a>(rest: &mut &'a [u8]) -> Result<&'a [u8], ChainError> {
 }
 
 impl Queue {
-    fn put(&self, bytes: &mut Vec<u8>) {
+    fn put(&mut self, bytes: &mut Vec<u8>) {
+        self.gather(self.rows());
         let rows = self.front(self.rows());
         put(bytes, &rows.time_ns.iter().flat_map(|t| t.to_le_bytes()).collect::<Vec<u8>>());
         for column in &rows.columns {

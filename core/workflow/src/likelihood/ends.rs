@@ -85,6 +85,7 @@ fn pass(
         needs: &[PREDICTION_NEED],
         values: &noise_levels(replay.products),
         altered: None,
+        recordings: Some(&replay.recordings),
         threads: replay.threads,
         batch_rows: replay.batch_rows,
     };

@@ -70,6 +70,7 @@ pub(crate) fn information(
         needs: &[PREDICTION_NEED],
         values: &levels,
         altered: experiment.altered,
+        recordings: Some(&replay.recordings),
         threads: replay.threads,
         batch_rows: replay.batch_rows,
     };
