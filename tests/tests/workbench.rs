@@ -158,6 +158,89 @@ fn a_switch_says_what_the_diagnosis_says_and_the_run_confirms() {
     }
 }
 
+/// Frequencies above which groups of bands are made of the same segments by whoever sums them, Hz.
+const SAME_SEGMENTS_HZ: f64 = 0.05;
+
+/// Mean of measured over predicted power between two frequencies as a comparison from telemetry has it: its bands
+/// weighed by their observations, which follow from the width of their intervals.
+fn compared(comparison: &Value, channel: &str, [first, last]: [f64; 2]) -> Option<f64> {
+    let channel = comparison["channels"].as_array()?.iter().find(|c| c["name"] == channel)?;
+    let numbers = |key: &str| channel[key].as_array().cloned().unwrap_or_default();
+    let (hz, measured, predicted) = (numbers("frequency_hz"), numbers("measured_psd"), numbers("predicted_psd"));
+    let (mut weight, mut sum) = (0.0, 0.0);
+    for (k, interval) in numbers("interval_95").iter().enumerate() {
+        if (0.999 * first..1.001 * last).contains(&number(&hz[k])) {
+            // The width of the logarithm of χ² over its degrees of freedom goes with the root of their inverse.
+            let observations = (number(&interval[1]) / number(&interval[0])).ln().powi(-2);
+            weight += observations;
+            sum += observations * number(&measured[k]) / number(&predicted[k]);
+        }
+    }
+    (weight > 0.0).then(|| sum / weight)
+}
+
+/// The spectra of a switch are those that a comparison reads from the telemetry: with the model alone, and with the
+/// effect those of runs that have it, to a hundredth (the ends of the data are weighed in another way), and what the
+/// effect changes to three thousandths, where it changes more than four times that somewhere. Hours that are kept out of
+/// the fit are predicted better with the effect, and together with those of the fit they fall as the whole does.
+#[test]
+fn spectra_and_hours_of_a_switch_are_those_of_the_telemetry() {
+    let (_alone, flight) = (alone(), flight());
+    let folder = flight.folder.path();
+    let server = serve(folder, &[]);
+    std::fs::copy(folder.join("model.toml"), folder.join("spectra.toml")).expect("copied");
+    expect(dragfree(folder).args(["model", "add", "spectra.toml", EFFECT]), 0);
+    for day in ["2035-01-01", "2035-01-02"] {
+        let mut run = dragfree(folder);
+        run.arg("run").arg(fixture("pipelines/science-mode.toml")).arg(format!("{day}/SC1_{day}.mcap"));
+        expect(run.args(["--model", "spectra.toml", "--archive", "spectra"]), 0);
+    }
+    let read = |archive: &str| {
+        let mut compare = dragfree(folder);
+        let output = compare.args(["compare", "2035-01-01..2035-01-02", "--json", "--archive", archive]).output();
+        serde_json::from_slice::<Value>(&output.expect("runs").stdout).expect("a JSON document")
+    };
+    let telemetry = [read("archive"), read("spectra")];
+    let both = refit(server.port, &format!("products={}&on={EFFECT}", DAYS.join(",")));
+    let (before, now) = (&both["spectra"]["before"], &both["spectra"]["now"]);
+    let (mut cells, mut most) = (0, 0.0_f64);
+    for (c, channel) in now["channels"].as_array().expect("channels").iter().enumerate() {
+        let name = channel["name"].as_str().expect("a name");
+        for (g, ends) in now["groups_hz"].as_array().expect("groups").iter().enumerate() {
+            let ends = [number(&ends[0]), number(&ends[1])];
+            if ends[0] < SAME_SEGMENTS_HZ {
+                continue;
+            }
+            let [own_before, own_now] = [before, now].map(|s| number(&s["channels"][c]["groups"][g]["ratio"]));
+            let [read_before, read_now] =
+                [0, 1].map(|k| compared(&telemetry[k], name, ends).unwrap_or_else(|| panic!("no {name} at {ends:?}")));
+            let what = format!("{name} at {ends:?}: {own_before} {read_before}, {own_now} {read_now}");
+            assert!((own_before - read_before).abs() < 0.01 && (own_now - read_now).abs() < 0.01, "{what}");
+            let (own, of_telemetry) = (own_now - own_before, read_now - read_before);
+            assert!((own - of_telemetry).abs() < 3e-3, "{what}");
+            (cells, most) = (cells + 1, most.max(of_telemetry.abs()));
+        }
+    }
+    assert!(cells > 60 && most > 0.012, "{cells} cells, {most}");
+    let falls = both["spectra"]["fall"].as_array().expect("falls");
+    assert!(falls.iter().map(number).sum::<f64>() > 25.0, "{falls:?}");
+
+    let hours: Vec<String> = (1..=3).map(|k| format!("{}@{k}", DAYS[0])).collect();
+    let whole = refit(server.port, &format!("products={}&on={EFFECT}", DAYS[0]));
+    let half = refit(server.port, &format!("products={}&on={EFFECT}&held={}", DAYS[0], hours.join(",")));
+    assert_eq!(half["held_out"], json!(hours));
+    let [all, fit] = [&whole, &half].map(|r| number(&r["rungs"][1]["fall"]));
+    let out = number(&half["rungs"][1]["held_out_fall"]);
+    // Of the λ² of a part, what is kept out loses as much as it would gain in a fit of its own: (θ − θ̂)² of both
+    // parts, a number of the size of one, with a standard deviation of 2λ of the part.
+    assert!(out > 0.0 && (fit + out - all).abs() < 4.5 * 2.0 * fit.sqrt(), "{all} of the whole, {fit} and {out}");
+    assert!(number(&half["numbers"]) < 0.55 * number(&whole["numbers"]));
+    for wrong in ["@0", "@99", "@-1", "@", "@1@2"] {
+        let path = format!("/refit.json?products={0}&held={0}{wrong}", DAYS[0]);
+        assert_eq!(get(server.port, &path).status, 400, "{path}");
+    }
+}
+
 /// The story by clicks alone: from the calendar to the day, to the effect, on, kept. Then by the keyboard alone. No
 /// error in the console, and axe-core finds nothing serious, wide and narrow, light and dark.
 #[test]
@@ -183,6 +266,19 @@ fn a_reader_finds_the_effect_and_keeps_it_by_clicks() {
     assert_eq!(browser.run(&format!("return document.querySelector(\"{switch}\").ariaChecked")), "true");
     let said = browser.run("return document.querySelector('.said').textContent");
     assert!(said.as_str().is_some_and(|s| s.contains("1 effect is on") && s.contains("com-offset.tm")), "{said}");
+    // The map says what has changed, and the spectrum shows both.
+    let map = browser.run("return document.querySelectorAll('.map td u').length");
+    assert!(number(&map) > 3.0, "{map} cells have changed");
+    browser.wait_for("document.querySelector('#spectrum .u-legend').textContent.includes('model alone')");
+    browser.click("[data-channel='tm1.accel.x']");
+    browser.wait_for("document.getElementById('channel').value === 'tm1.accel.x'");
+    // Hours kept out by a click: the channel that was picked stays.
+    let hours = format!("[data-key='{}@2']", DAYS[0]);
+    browser.click(&hours);
+    browser.wait_for("document.querySelector('.said').textContent.includes('on what is kept out')");
+    assert_eq!(browser.run("return document.getElementById('channel').value"), "tm1.accel.x");
+    browser.click(&hours);
+    browser.wait_for("!document.querySelector('.said').textContent.includes('kept out')");
     // A link shows a colleague the same.
     let after = browser.run(&format!("return {value}"));
     browser.run("location.reload()");

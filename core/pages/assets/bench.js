@@ -19,8 +19,11 @@ async function show(address, key, remember) {
     if (signal.aborted) return;
     if (answer.ok) {
       const open = opened();
+      const channel = document.getElementById("channel");
+      const chosen = channel && channel.dataset.chosen;
       part.innerHTML = text;
       reopen(open);
+      spectrum(read("residuals"), chosen);
       if (remember) history.pushState(null, "", address.href);
       fillToken();
     } else {
@@ -151,13 +154,17 @@ function drawn(make) {
     entry.plot = entry.make();
   };
   draw();
-  plots.push(draw);
+  plots.push({ draw, there: () => entry.plot.root.isConnected });
 }
 
 let waiting = 0;
 const redraw = () => {
   clearTimeout(waiting);
-  waiting = setTimeout(() => plots.forEach((draw) => draw()), 100);
+  waiting = setTimeout(() => {
+    // Those of a part that was replaced are gone.
+    plots.splice(0, plots.length, ...plots.filter((p) => p.there()));
+    plots.forEach((p) => p.draw());
+  }, 100);
 };
 addEventListener("resize", redraw);
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
@@ -230,26 +237,58 @@ function marks(u, events) {
   ctx.restore();
 }
 
-function spectrum(data) {
+function spectrum(data, chosen) {
   const place = document.getElementById("spectrum");
   const pick = document.getElementById("channel");
+  if (!data || !data.channels.length || !place) return;
+  // A channel that a reader has picked stays; otherwise the server says which is shown first.
+  if (chosen && data.channels.some((c) => c.name === chosen)) {
+    pick.value = chosen;
+    pick.dataset.chosen = chosen;
+  }
   const short = (x) => (x == null ? "" : x.toExponential(1).replace("e+", "e"));
   const make = () => {
     const c = data.channels.find((own) => own.name === pick.value) || data.channels[0];
     const faint = { stroke: "transparent", width: 0, points: { show: false }, class: "faint" };
     const tick = (u, values) => values.map((v) => (v && Math.log10(v) % 1 === 0 ? short(v) : ""));
+    const ticks = axis({ values: tick, label: "Hz", labelFont: "12px system-ui, sans-serif" });
+    const solid = { stroke: colour("--c0"), width: 2, points: { show: true, size: 5 } };
+    if (c.before) {
+      // What effects change is small beside the decades of a spectrum: over the noise it is seen.
+      const over = (row) => row.map((x, i) => (x / c.modelled[i]) ** 2);
+      const two = (u, v) => (v == null ? "" : v.toFixed(2));
+      return new uPlot(
+        {
+          width: width(place),
+          height: 320,
+          axes: [ticks, axis({ size: 56 })],
+          scales: { x: { time: false, distr: 3 } },
+          series: [
+            { label: "Hz", value: (u, v) => short(v) },
+            { label: "95 % to", ...faint, value: two },
+            { label: "95 % from", ...faint, value: two },
+            { label: "noise", stroke: colour("--c1"), width: 2, dash: [6, 4], points: { show: false }, value: two },
+            { label: "model alone", stroke: colour("--c3"), width: 2, dash: [2, 3], points: { show: false }, value: two },
+            { label: "with the effects", ...solid, value: two },
+          ],
+          bands: [{ series: [1, 2], fill: colour("--band") }],
+        },
+        [c.hz, over(c.high), over(c.low), c.hz.map(() => 1), over(c.before), over(c.measured)],
+        place,
+      );
+    }
     return new uPlot(
       {
         width: width(place),
         height: 320,
-        axes: [axis({ values: tick, label: "Hz", labelFont: "12px system-ui, sans-serif" }), axis({ values: tick, size: 64 })],
+        axes: [ticks, axis({ values: tick, size: 64 })],
         scales: { x: { time: false, distr: 3 }, y: { distr: 3 } },
         series: [
           { label: "Hz", value: (u, v) => short(v) },
           { label: "95 % to", ...faint, value: (u, v) => short(v) },
           { label: "95 % from", ...faint, value: (u, v) => short(v) },
           { label: "noise /√Hz", stroke: colour("--c1"), width: 2, dash: [6, 4], points: { show: false }, value: (u, v) => short(v) },
-          { label: "measured /√Hz", stroke: colour("--c0"), width: 2, points: { show: true, size: 5 }, value: (u, v) => short(v) },
+          { label: "measured /√Hz", ...solid, value: (u, v) => short(v) },
         ],
         bands: [{ series: [1, 2], fill: colour("--band") }],
       },
@@ -258,10 +297,14 @@ function spectrum(data) {
     );
   };
   drawn(make);
-  pick.addEventListener("change", redraw);
+  pick.addEventListener("change", () => {
+    pick.dataset.chosen = pick.value;
+    redraw();
+  });
   for (const button of document.querySelectorAll("[data-channel]")) {
     button.addEventListener("click", () => {
       pick.value = button.dataset.channel;
+      pick.dataset.chosen = pick.value;
       redraw();
       place.scrollIntoView({ behavior: "auto", block: "center" });
     });
@@ -316,7 +359,6 @@ function bounds(u) {
 
 const trend = read("trend");
 if (trend) trends(trend);
-const residuals = read("residuals");
-if (residuals && residuals.channels.length) spectrum(residuals);
+spectrum(read("residuals"), null);
 const series = read("over-time");
 if (series) overTime(series);

@@ -44,13 +44,11 @@ pub(crate) fn page(site: &Site, id: &str, links: &Links) -> Result<Markup, Pages
         h2 { "Power of the residual over that of the noise" }
         p class="quiet" { "1 where the model is right. Groups of bands, a sixth of a decade wide, from low to high \
             frequency; a group is framed with any of its bands." }
-        (map(&found))
+        (map(&found, None, None))
         h2 { "Spectrum" }
         p class="quiet" { "Solid: measured. Dashed: the declared noise; 95 of 100 measured values lie in the band \
             about it." }
-        label class="pick" { "Channel " select id="channel" { @for c in &found.channels { option { (c.name) } } } }
-        div class="plot tall" id="spectrum" {}
-        (data("residuals", &for_script(&found)))
+        (spectrum(&found, None, ""))
         @if let Some(residuals) = over_time(&archive, &row.id)? { (series(&residuals, found.false_alarm)) }
         h2 { "Hour by hour" }
         p { "Spectra of single hours, and housekeeping that goes with the residuals, need the telemetry:" }
@@ -124,20 +122,50 @@ fn look(band: &Band) -> (&'static str, &'static str) {
     }
 }
 
-fn map(found: &Residuals) -> Markup {
+/// A plot of the spectrum of the channel that a reader picks, `first` at the start; `before` is drawn beside it.
+pub(crate) fn spectrum(found: &Residuals, before: Option<&Residuals>, first: &str) -> Markup {
+    html! {
+        label class="pick" { "Channel " select id="channel" autocomplete="off" {
+            @for c in &found.channels { option selected[c.name == first] { (c.name) } }
+        } }
+        div class="plot tall" id="spectrum" {}
+        (data("residuals", &for_script(found, before)))
+    }
+}
+
+/// A cell has changed if it has by this part of the width in which 95 of 100 lie.
+const CHANGED: f64 = 0.1;
+
+/// Whether a cell is another than before, to a reader who looks for what the effects change.
+fn changed(band: &Band, before: Option<&Band>) -> bool {
+    let by = before.and_then(|before| Some((band.ratio? - before.ratio?).abs()));
+    by.is_some_and(|by| by > CHANGED * (band.bounds[1] - band.bounds[0]))
+}
+
+/// Channels by groups of bands; cells that are others than `before` are underlined, and `fall` is by how much χ² of each
+/// channel falls.
+pub(crate) fn map(found: &Residuals, before: Option<&Residuals>, fall: Option<&[f64]>) -> Markup {
     html! {
         div class="scroll" tabindex="0" { table class="map" {
             thead { tr {
                 th { "Hz from" }
                 @for [first, _] in &found.groups_hz { th class="turned" { span { (frequency(*first)) } } }
+                @if fall.is_some() { th class="turned" { span { "χ² falls by" } } }
             } }
-            tbody { @for channel in &found.channels { tr {
+            tbody { @for (k, channel) in found.channels.iter().enumerate() { tr {
                 th scope="row" { button type="button" class="link" data-channel=(channel.name) { (channel.name) } }
-                @for (band, [first, last]) in channel.groups.iter().zip(&found.groups_hz) {
+                @for (g, (band, [first, last])) in channel.groups.iter().zip(&found.groups_hz).enumerate() {
+                    @let was = before.and_then(|all| all.channels.get(k)?.groups.get(g));
                     @let (class, sign) = look(band);
-                    td class=(class) title=(format!("{} to {}: {}", frequency(*first), frequency(*last), words(band))) {
-                        @if let Some(ratio) = band.ratio { (short(ratio)) (sign) }
+                    td class=(class) title=(format!("{} to {}: {}{}", frequency(*first), frequency(*last), words(band),
+                        was.and_then(|b| b.ratio).map_or_else(String::new, |r| format!(", {} with the model alone", short(r))))) {
+                        @if let Some(ratio) = band.ratio {
+                            @if changed(band, was) { u { (short(ratio)) (sign) } } @else { (short(ratio)) (sign) }
+                        }
                     }
+                }
+                @if let Some(fall) = fall.and_then(|all| all.get(k)) {
+                    td class="fall" { (format!("{fall:.1}").replace('-', "−")) }
                 }
             } } }
         } }
@@ -164,15 +192,16 @@ fn words(band: &Band) -> String {
     }
 }
 
-fn for_script(found: &Residuals) -> Value {
+fn for_script(found: &Residuals, before: Option<&Residuals>) -> Value {
     let with_data = |bands: &[Band]| -> Vec<usize> { (0..bands.len()).filter(|i| bands[*i].ratio.is_some()).collect() };
-    let channels = found.channels.iter().map(|c| {
+    let channels = found.channels.iter().enumerate().map(|(k, c)| {
         let at = with_data(&c.bands);
         let of = |f: &dyn Fn(&Band) -> f64| -> Vec<f64> { at.iter().map(|i| f(&c.bands[*i])).collect() };
         json!({
             "name": c.name,
             "hz": at.iter().map(|i| (found.bands_hz[*i][0] * found.bands_hz[*i][1]).sqrt()).collect::<Vec<_>>(),
             "measured": of(&|b| b.measured_asd),
+            "before": before.map(|all| at.iter().map(|i| all.channels[k].bands[*i].measured_asd).collect::<Vec<_>>()),
             "modelled": of(&|b| b.modelled_asd),
             "low": of(&|b| b.modelled_asd * b.bounds[0].sqrt()),
             "high": of(&|b| b.modelled_asd * b.bounds[1].sqrt()),

@@ -1,11 +1,13 @@
 //! Missing physics: switches beside effects, and what the model says with them.
 
+use chrono::DateTime;
 use dragfree_archive::{EXTRACT, Row};
-use dragfree_workflow::refit::{Basis, Effect, Refit};
+use dragfree_workflow::refit::{Basis, Effect, Refit, STRETCH, Spectra, Stretch};
 use dragfree_workflow::words::grouped;
 use maud::{Markup, html};
 
 use crate::PagesError;
+use crate::compare::{map, spectrum};
 use crate::keep::commands;
 use crate::layout::{Links, command, millimetres, page as whole, value};
 use crate::pictures::ladder;
@@ -53,7 +55,7 @@ pub(crate) fn part(site: &Site, query: &Query, links: &Links) -> Result<Markup, 
     let refit = basis.refit(&query.asked())?;
     let truth = |name: &str| site.setup.truth.as_ref().and_then(|truth| truth(name));
     Ok(html! {
-        (days(site, query, links)?)
+        (days(site, &basis, query, links)?)
         p class="said" { (said(&refit)) }
         div class="pictures" {
             section { h2 { "Ladder" } div class="scroll" tabindex="0" { (ladder(&refit, &truth)) } }
@@ -67,14 +69,15 @@ pub(crate) fn part(site: &Site, query: &Query, links: &Links) -> Result<Markup, 
             }
         }
         (offsets(&refit, &truth))
+        (spectra(&refit))
         (switches(&basis, &refit, query, links))
         (keep(site, &refit, links))
         (limits(&basis, &refit))
     })
 }
 
-/// The days: in the fit, kept out of it, or not used.
-fn days(site: &Site, query: &Query, links: &Links) -> Result<Markup, PagesError> {
+/// The days: in the fit, kept out of it, or not used; and the hours of each, any of which can be kept out.
+fn days(site: &Site, basis: &Basis, query: &Query, links: &Links) -> Result<Markup, PagesError> {
     let (products, held) = (list(&query.products), list(&query.held));
     if links.is_file() {
         return Ok(
@@ -86,7 +89,8 @@ fn days(site: &Site, query: &Query, links: &Links) -> Result<Markup, PagesError>
     let same = rows.iter().filter(|r| r.model == model && r.fixed_from.is_none());
     let same: Vec<&Row> = same.collect();
     let others: Vec<&Row> = rows.iter().filter(|r| r.model != model && r.fixed_from.is_none()).collect();
-    let without = |from: &[String], id: &str| from.iter().filter(|own| *own != id).cloned().collect::<Vec<_>>();
+    let of = |own: &str, id: &str| own.split_once(STRETCH).map_or(own, |(product, _)| product) == id;
+    let without = |from: &[String], id: &str| from.iter().filter(|own| !of(own, id)).cloned().collect::<Vec<_>>();
     let with = |to: &[String], id: &str| [without(to, id), vec![id.to_owned()]].concat();
     let fitted = |id: &str| products.iter().any(|own| own == id) && held.iter().all(|own| own != id);
     let states = |id: &str| {
@@ -115,14 +119,20 @@ fn days(site: &Site, query: &Query, links: &Links) -> Result<Markup, PagesError>
         _ => "not used",
     };
     let in_fit = products.iter().filter(|id| fitted(id)).count();
-    let summary = format!("Days: {in_fit} in the fit, {} kept out", held.len());
+    let whole = held.iter().filter(|own| !own.contains(STRETCH)).count();
+    let mut summary = format!("Days: {in_fit} in the fit, {whole} kept out");
+    if held.len() > whole {
+        summary += &format!("; of days in the fit {} stretches of hours kept out", held.len() - whole);
+    }
     Ok(html! {
         details class="choose" open[same.len() <= 4] {
             summary { (summary) }
             p class="quiet" { "Days of one model, " (model.unwrap_or_default())
-                ". A day that is kept out tests what the others say." }
+                ". A day or hours that are kept out test what the others say: with an effect that is there, χ² falls in \
+                    them too." }
             table {
-                thead { tr { th { "product" } th { "in the fit" } th { "kept out" } th { "not used" } } }
+                thead { tr { th { "product" } th { "in the fit" } th { "kept out" } th { "not used" }
+                    th { "hours kept out" } } }
                 tbody { @for row in &same { tr {
                     th scope="row" { a href={ "/day/" (row.id) } { (row.day) } " " span class="quiet" { (row.id) } }
                     @for (state, to) in states(&row.id) {
@@ -137,6 +147,7 @@ fn days(site: &Site, query: &Query, links: &Links) -> Result<Markup, PagesError>
                             }
                         }
                     }
+                    td class="hours" { @if fitted(&row.id) { (hours(&basis.stretches(&row.id), query)) } }
                 } } }
             }
             @if !others.is_empty() {
@@ -148,10 +159,72 @@ fn days(site: &Site, query: &Query, links: &Links) -> Result<Markup, PagesError>
     })
 }
 
+/// Stretches of the time of a product in the fit, each of which can be kept out as long as another is in the fit.
+fn hours(stretches: &[Stretch], query: &Query) -> Markup {
+    let held = list(&query.held);
+    let is_out = |s: &Stretch| held.contains(&s.name);
+    let clock = |ns: i64| DateTime::from_timestamp_nanos(ns).format("%H:%M").to_string();
+    let left = stretches.iter().filter(|s| !is_out(s)).count();
+    let toggled = |s: &Stretch| {
+        let mut all: Vec<String> = held.iter().filter(|own| **own != s.name).cloned().collect();
+        if !is_out(s) {
+            all.push(s.name.clone());
+        }
+        Query { held: all.join(","), ..query.clone() }
+    };
+    html! {
+        @for s in stretches {
+            @let (out, time) = (is_out(s), format!("{}–{}", clock(s.from_ns), clock(s.until_ns)));
+            @if !out && left == 1 { span class="quiet" title="some hours must stay in the fit" { (time) } }
+            @else {
+                a class="hour" role="switch" aria-checked=(out) aria-label={ (time) " kept out" } data-refit=""
+                    data-key=(s.name) href={ "/missing?" (address(&toggled(s))) } { (if out { "● " } else { "○ " }) (time) }
+            }
+            " "
+        }
+    }
+}
+
+/// Where the model fails with the effects that are on.
+fn spectra(refit: &Refit) -> Markup {
+    let Some(Spectra { before, now, fall }) = &refit.spectra else {
+        return html! {
+            h2 { "Where the model fails" }
+            p { "The extracts of these products do not tell: they are of an older program. A diagnosis with "
+                code { "--keep-extract" } " makes them again." }
+        };
+    };
+    let failing = |of: &dragfree_workflow::residuals::Residuals| {
+        of.channels.iter().flat_map(|c| &c.groups).filter(|b| b.fails).count()
+    };
+    let (was, is) = (failing(before), failing(now));
+    let on = refit.rungs.len() > 1;
+    let first = fall.iter().enumerate().max_by(|a, b| a.1.total_cmp(b.1)).filter(|_| on);
+    let first = first.map_or("", |(k, _)| now.channels[k].name.as_str());
+    let cells = |n: usize| if n == 1 { "1 cell fails".to_owned() } else { format!("{n} cells fail") };
+    html! {
+        h2 { "Where the model fails" }
+        p id="fails" {
+            @if on { (cells(was)) " with the model alone, " strong { (is) } " with the effects that are on. " }
+            @else { (cells(is)) " with the model alone. " }
+            "A cell is the power of the residual over that of the noise, 1 where the model is right; ▲ or ▼ where \
+                chance is no explanation. " @if on { "Underlined: changed by the effects that are on. " }
+            "All hours of the days in the fit."
+        }
+        (map(now, on.then_some(before), on.then_some(fall)))
+        p class="quiet" {
+            @if on { "Power over that of the noise. Solid: with the effects that are on; dotted: with the model alone. 95 of \
+                100 values lie in the band about 1." }
+            @else { "Solid: measured. Dashed: the noise; 95 of 100 measured values lie in the band about it." }
+        }
+        (spectrum(now, on.then_some(before), first))
+    }
+}
+
 /// What stands behind `?` in an address.
 fn address(query: &Query) -> String {
     let escaped = |text: &str| {
-        let plain = |b: u8| b.is_ascii_alphanumeric() || b"-_.:,".contains(&b);
+        let plain = |b: u8| b.is_ascii_alphanumeric() || b"-_.:,@".contains(&b);
         text.bytes().map(|b| if plain(b) { char::from(b).to_string() } else { format!("%{b:02X}") }).collect::<String>()
     };
     let parts = [("products", &query.products), ("on", &query.on), ("held", &query.held)];
@@ -172,7 +245,7 @@ fn said(refit: &Refit) -> Markup {
             (on) (if on == 1 { " effect is" } else { " effects are" }) " on: χ² falls by "
             strong { (format!("{:.1}", last.fall)) } " in the fit"
             @if let Some(fall) = last.held_out_fall {
-                " and by " strong { (format!("{fall:.1}")) } " on the days kept out"
+                " and by " strong { (format!("{fall:.1}")) } " on what is kept out"
                 @if fall <= 0.0 { ", so that it does not help there" }
             }
             ". "
@@ -351,9 +424,9 @@ fn limits(basis: &Basis, refit: &Refit) -> Markup {
             "the model alone; levels of noise are fitted day by day. A run with the kept model has the last word."
         }
         p {
-            "Spectra by band, χ² of single channels, other forms of an effect (lags, resonances) and new formulas are \
-                not in these sums: they need the "
-            "telemetry (" code { "dragfree compare" } ", " code { "dragfree diagnose" } ")."
+            "Spectra are those of the same residuals at these values, in groups of bands. An effect that filters a noise \
+                does not change the noise here. Other forms of an effect (lags, resonances) and new formulas are not in \
+                these sums: they need the telemetry (" code { "dragfree diagnose" } ")."
         }
         @if !basis.not_tried().is_empty() {
             details { summary { (basis.not_tried().len()) " effects could not be tried" }

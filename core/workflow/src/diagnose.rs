@@ -89,7 +89,7 @@ pub fn diagnose(
         [product] if keeps => {
             let about_model = about_model(replay, &spectra.record, &last, &evidence, progress)?;
             let levels = noise_levels(decided, &spectra.record);
-            Extract::new(product, &about_model, &diagnosis, levels, &evidence)
+            Extract::new(product, &about_model, &diagnosis, levels, &spectra.record, &evidence)?
         }
         _ => None,
     };

@@ -14,13 +14,20 @@ use dragfree_engine::EngineError;
 use dragfree_engine::registry::Registry;
 use dragfree_identification::diagnosis::{Diagnosis, Found, Trials, UNOBSERVABLE};
 use dragfree_identification::innovations::decision::Prior;
+use dragfree_identification::record::Record;
 use dragfree_schema::{Coefficient, Settings};
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use crate::answer::{Evidence, NoiseLevel, apart, contradict, found, limits, offsets, verdict, with_levels};
-use crate::likelihood::{CoefficientSums, Decided, joined};
+use crate::likelihood::{CoefficientSums, Decided, Stretches, joined};
 use crate::{ManyDays, WorkflowError};
+
+mod by_band;
+mod packed;
+
+pub(crate) use by_band::ByBand;
+pub(crate) use packed::doubles;
 
 /// Format of the file.
 const FORMAT: &str = "dragfree-extract/1";
@@ -49,6 +56,12 @@ pub struct Extract {
     /// Why this product alone is not explained; none where it is.
     unexplained: Option<String>,
     not_tried: Vec<(String, String)>,
+    /// What the channels leave in each band; none in extracts of older programs.
+    #[serde(default)]
+    by_band: Option<ByBand>,
+    /// The likelihood of stretches of time; none in extracts of older programs.
+    #[serde(default)]
+    stretches: Option<Stretches>,
 }
 
 /// What is known of a weighted sum of coefficients before any data.
@@ -65,19 +78,33 @@ impl Extract {
         decided: &Decided,
         diagnosis: &Diagnosis,
         levels: Vec<NoiseLevel>,
+        record: &Record,
         evidence: &Evidence<'_>,
-    ) -> Option<Self> {
-        let sums = decided.of_coefficients()?;
+    ) -> Result<Option<Self>, WorkflowError> {
+        let Some(sums) = decided.of_coefficients() else { return Ok(None) };
         let n = sums.coefficients.len();
         // A proposed formula is an effect of one diagnosis.
         let is_proposal = |c: &Coefficient| evidence.proposal(&c.effect, &c.instance).is_some();
         let kept: Vec<usize> = (0..n).filter(|i| !is_proposal(&sums.coefficients[*i])).collect();
         let accepted = diagnosis.candidates.iter().filter(|f| f.accepted);
-        Some(Self {
+        let coefficients: Vec<Coefficient> = kept.iter().map(|i| sums.coefficients[*i].clone()).collect();
+        let adopted = product.product.result.adopted();
+        let adopted = |name: &str| adopted.iter().find(|c| c.name == name).map(|c| c.value);
+        let mut stretches = decided.stretches(|c| !is_proposal(c));
+        // Levels are told by what could state them.
+        for name in stretches.iter_mut().flat_map(|s| &mut s.levels).filter(|name| !name.is_empty()) {
+            let states = record.candidate_set.coefficients.iter().find(|c| c.noise == *name);
+            if let Some(c) = states {
+                name.clone_from(&c.name);
+            }
+        }
+        Ok(Some(Self {
             format: FORMAT.to_owned(),
             product: product.product.id().to_owned(),
             program: env!("CARGO_PKG_VERSION").to_owned(),
-            coefficients: kept.iter().map(|i| sums.coefficients[*i].clone()).collect(),
+            by_band: Some(ByBand::new(&coefficients, record, adopted)?),
+            stretches,
+            coefficients,
             information: kept
                 .iter()
                 .enumerate()
@@ -93,7 +120,7 @@ impl Extract {
             trials: evidence.trials.clone(),
             unexplained: why_unexplained(diagnosis),
             not_tried: diagnosis.not_tried.clone(),
-        })
+        }))
     }
 
     /// Keeps it beside its product. Returns the path and the bytes.
@@ -130,6 +157,8 @@ impl Extract {
                 format!("release {} made it, with other candidates perhaps", extract.program),
             ),
             (whole, "its sums are not of its coefficients".to_owned()),
+            (extract.by_band.as_ref().is_none_or(|b| b.is_whole(n)), "its spectra are damaged".to_owned()),
+            (extract.stretches.as_ref().is_none_or(|s| s.is_whole(n)), "its stretches are damaged".to_owned()),
         ];
         match sound.into_iter().find(|(holds, _)| !holds) {
             Some((_, what)) => Err(refuse(format!("{what}; {make}"))),
@@ -145,6 +174,16 @@ impl Extract {
     /// Levels of noise that effects could state.
     pub(crate) fn levels(&self) -> &[NoiseLevel] {
         &self.levels
+    }
+
+    /// Which of its coefficients is this one.
+    pub(crate) fn place(&self, c: &Coefficient) -> Option<usize> {
+        self.coefficients.iter().position(|own| same(own, c))
+    }
+
+    /// What the channels leave in each band, and the likelihood of stretches of time.
+    pub(crate) fn into_parts(self) -> (Option<ByBand>, Option<Stretches>) {
+        (self.by_band, self.stretches)
     }
 
     fn names(&self, c: &Coefficient) -> bool {

@@ -22,10 +22,13 @@ mod drifts;
 mod ends;
 mod experiment;
 mod pass;
+mod stretches;
 
 pub(crate) use ends::transients_near_ends;
 pub(crate) use experiment::{Experiment, InBlock, Settled, information};
 use pass::{At, Constant, Filtered};
+pub(crate) use stretches::{Alone, OneStretch, Stretches};
+use stretches::{Stretch, stretches};
 
 use crate::WorkflowError;
 use crate::replay::{Pass, Replay, noise_levels};
@@ -236,7 +239,7 @@ pub(crate) fn joined(
         let mut sums = no_sums(0);
         (sums.information, sums.score) = (product.information, product.score.as_slice().to_vec());
         (sums.chi2, sums.numbers) = (product.chi2, product.numbers);
-        all.parts.push(Part { sums, moments: None, places });
+        all.parts.push(Part { sums, moments: None, stretches: Vec::new(), places });
         all.surveys = product.surveys;
         all.channels.extend(product.channels);
     }
@@ -371,6 +374,8 @@ struct Part {
     sums: Sums,
     /// The same with time as weight; an extract has none.
     moments: Option<Moments>,
+    /// Sums of its stretches of time; an extract has them elsewhere.
+    stretches: Vec<Stretch>,
     /// Parameters of the product among all.
     places: Vec<(usize, usize)>,
 }
@@ -428,7 +433,8 @@ impl Joined {
             places.push((i, self.place(parameter)));
         }
         let passed = innovations.finish();
-        self.parts.push(Part { sums: passed.total(), moments: Some(passed.moments()), places });
+        let (moments, stretches) = (Some(passed.moments()), stretches(&passed));
+        self.parts.push(Part { sums: passed.total(), moments, stretches, places });
         self.surveys = surveys;
         self.channels.extend(channels);
     }

@@ -5,7 +5,8 @@
 //! zero ([`crate::extract`]). Forms of days add, so that any set of effects is a small linear system, and days that are
 //! kept out of the sum test it.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::{Arc, Mutex, PoisonError};
 
 use dragfree_archive::Written;
 use dragfree_engine::registry::Registry;
@@ -17,14 +18,15 @@ use nalgebra::{DMatrix, DVector};
 
 use crate::WorkflowError;
 use crate::answer::{Evidence, NoiseLevel};
-use crate::extract::{Extract, levels_of_all, of_products, shared, trials};
-use crate::likelihood::{CoefficientSums, Decided, Meaning, joined};
+use crate::extract::{ByBand, Extract, levels_of_all, of_products, shared, trials};
+use crate::likelihood::{Alone, CoefficientSums, Decided, Meaning, OneStretch, Stretches, joined};
 
 mod solving;
+mod spectra;
 mod told;
 
 use solving::Solving;
-pub use told::{Confounder, Effect, Offset, Refit, Rung, Size};
+pub use told::{Confounder, Effect, Offset, Refit, Rung, Size, Spectra, Stretch};
 
 /// What diagnoses have kept of products of one model, ready to be solved with other effects.
 pub struct Basis {
@@ -40,6 +42,16 @@ pub struct Basis {
     families: BTreeMap<String, String>,
     named: Vec<String>,
     not_tried: BTreeMap<String, String>,
+    /// Days that are divided into a part in the fit and one that is kept out, newest first.
+    divided: Mutex<VecDeque<Arc<Divided>>>,
+}
+
+/// A product of which some stretches of time are kept out of the fit.
+struct Divided {
+    product: String,
+    kept_out: Vec<usize>,
+    fit: Day,
+    out: Day,
 }
 
 /// One product.
@@ -53,6 +65,10 @@ struct Day {
     chi2_at_zero: f64,
     numbers: f64,
     levels: Vec<NoiseLevel>,
+    /// Index of each of its coefficients in its extract.
+    kept: Vec<usize>,
+    by_band: Option<Arc<ByBand>>,
+    stretches: Option<Arc<Stretches>>,
 }
 
 /// What can be switched: an effect's instance in one form.
@@ -63,12 +79,18 @@ struct Switch {
     shape: Shape,
 }
 
+/// Between a product and the number of a stretch of its time.
+pub const STRETCH: char = '@';
+
+/// Divided days that are kept besides one of each product.
+const DIVIDED: usize = 4;
+
 /// What is asked of a basis.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Asked {
     /// Effects in the order in which they were switched on, by [`Effect::name`].
     pub on: Vec<String>,
-    /// Products that are kept out of the fit.
+    /// Products that are kept out of the fit, and stretches of time of products: `PRODUCT@2` is the second one.
     pub held_out: Vec<String>,
 }
 
@@ -82,6 +104,12 @@ pub enum RefitError {
     /// No such product.
     #[error("{0:?} is none of these products")]
     NoProduct(String),
+    /// No such stretch of time.
+    #[error("{0:?} is no stretch of time of these products; `dragfree diagnose PRODUCT --keep-extract` keeps them")]
+    NoStretch(String),
+    /// All stretches of a product.
+    #[error("every stretch of {0} is kept out: keep the whole product out")]
+    WholeProduct(String),
     /// Nothing is left to fit.
     #[error("all products are kept out of the fit: leave one in")]
     NothingToFit,
@@ -123,12 +151,19 @@ impl Basis {
                 chi2_at_zero: 0.0,
                 numbers: totals[k].1,
                 levels: extracts[k].levels().to_vec(),
+                kept: own.iter().filter_map(|c| extracts[k].place(c)).collect(),
+                by_band: None,
+                stretches: None,
             };
             // An extract is made about the model alone, and gives χ² there.
             day.chi2_at_zero = totals[k].0 - day.rise(&values);
             days.push(day);
         }
         let named = named_by(&extracts, &switches);
+        for (day, extract) in days.iter_mut().zip(extracts) {
+            let (by_band, stretches) = extract.into_parts();
+            (day.by_band, day.stretches) = (by_band.map(Arc::new), stretches.map(Arc::new));
+        }
         let families = switches.iter().map(|s| (s.effect.clone(), evidence.family(&s.effect).to_owned())).collect();
         Ok(Self {
             days,
@@ -142,6 +177,7 @@ impl Basis {
             named,
             not_tried,
             settings,
+            divided: Mutex::default(),
         })
     }
 
@@ -170,11 +206,12 @@ impl Basis {
     /// # Errors
     /// [`RefitError`]: an effect or a product is not there, or no product is left.
     pub fn refit(&self, asked: &Asked) -> Result<Refit, RefitError> {
-        if let Some(other) = asked.held_out.iter().find(|id| self.products().all(|own| own != id.as_str())) {
-            return Err(RefitError::NoProduct(other.clone()));
-        }
-        let (held_out, fitted): (Vec<&Day>, Vec<&Day>) =
-            self.days.iter().partition(|day| asked.held_out.contains(&day.product));
+        let divided = self.divided(&asked.held_out)?;
+        let whole = |day: &&Day| divided.iter().all(|d| d.product != day.product);
+        let (mut held_out, mut fitted): (Vec<&Day>, Vec<&Day>) =
+            self.days.iter().filter(whole).partition(|day| asked.held_out.contains(&day.product));
+        fitted.extend(divided.iter().map(|d| &d.fit));
+        held_out.extend(divided.iter().map(|d| &d.out));
         if fitted.is_empty() {
             return Err(RefitError::NothingToFit);
         }
@@ -182,16 +219,75 @@ impl Basis {
         let on = asked.on.iter().map(|name| self.find(name, &levels)).collect::<Result<Vec<_>, _>>()?;
         let solving = Solving { basis: self, quadratic: self.quadratic(&fitted), fitted, held_out, levels };
         let rungs = solving.rungs(&asked.on, &on);
+        let spectra = solving.spectra(&on);
         let (effects, not_told) = solving.effects(&on);
         let ids = |days: &[&Day]| days.iter().map(|day| day.product.clone()).collect();
+        let of_divided = |held: &&String| {
+            divided.iter().any(|d| held.split_once(STRETCH).is_some_and(|(product, _)| product == d.product))
+        };
+        let stretches = asked.held_out.iter().filter(of_divided);
+        let whole: Vec<&Day> = solving.held_out.iter().copied().filter(whole).collect();
         Ok(Refit {
             products: ids(&solving.fitted),
-            held_out: ids(&solving.held_out),
+            held_out: [ids(&whole), stretches.cloned().collect()].concat(),
+            spectra,
             numbers: solving.fitted.iter().map(|day| day.numbers).sum(),
             rungs,
             effects,
             not_told,
         })
+    }
+
+    /// Stretches of time of each product, any of which can be kept out of the fit; none of a product whose extract has
+    /// none.
+    pub fn stretches(&self, product: &str) -> Vec<Stretch> {
+        let day = self.days.iter().find(|day| day.product == product);
+        let all = day.and_then(|day| day.stretches.as_ref()).map_or(&[][..], |s| &s.all);
+        let stretch = |(k, one): (usize, &OneStretch)| Stretch {
+            name: format!("{product}{STRETCH}{}", k + 1),
+            from_ns: one.from_ns,
+            until_ns: one.until_ns,
+        };
+        all.iter().enumerate().map(stretch).collect()
+    }
+
+    /// The products of which a part is kept out. A product of which every stretch is kept out is kept out itself.
+    fn divided(&self, held_out: &[String]) -> Result<Vec<Arc<Divided>>, RefitError> {
+        let mut parts: BTreeMap<&str, BTreeSet<usize>> = BTreeMap::new();
+        for held in held_out {
+            let (product, stretch) = held.split_once(STRETCH).map_or((held.as_str(), None), |(p, k)| (p, Some(k)));
+            let day = self.days.iter().find(|day| day.product == product);
+            let day = day.ok_or_else(|| RefitError::NoProduct(held.clone()))?;
+            let Some(stretch) = stretch else { continue };
+            let count = day.stretches.as_ref().map_or(0, |s| s.all.len());
+            let number = stretch.parse::<usize>().ok().filter(|k| (1..=count).contains(k));
+            let number = number.ok_or_else(|| RefitError::NoStretch(held.clone()))?;
+            if count > 1 && held_out.iter().all(|other| other != product) {
+                parts.entry(product).or_default().insert(number - 1);
+            }
+        }
+        parts.into_iter().map(|(product, kept_out)| self.divide(product, kept_out.into_iter().collect())).collect()
+    }
+
+    fn divide(&self, product: &str, kept_out: Vec<usize>) -> Result<Arc<Divided>, RefitError> {
+        let same = |d: &&Arc<Divided>| d.product == product && d.kept_out == kept_out;
+        let known = self.divided.lock().unwrap_or_else(PoisonError::into_inner).iter().find(same).cloned();
+        if let Some(known) = known {
+            return Ok(known);
+        }
+        let no_product = || RefitError::NoProduct(product.to_owned());
+        let day = self.days.iter().find(|day| day.product == product).ok_or_else(no_product)?;
+        let stretches = day.stretches.as_ref().ok_or_else(no_product)?;
+        if kept_out.len() == stretches.all.len() {
+            return Err(RefitError::WholeProduct(product.to_owned()));
+        }
+        let (fit, out) = stretches.divided(|k| kept_out.contains(&k));
+        let (fit, out) = (day.with(&fit), day.with(&out));
+        let divided = Arc::new(Divided { product: product.to_owned(), kept_out, fit, out });
+        let mut all = self.divided.lock().unwrap_or_else(PoisonError::into_inner);
+        all.push_front(Arc::clone(&divided));
+        all.truncate(self.days.len() + DIVIDED);
+        Ok(divided)
     }
 
     fn find(&self, name: &str, levels: &[NoiseLevel]) -> Result<On, RefitError> {
@@ -234,6 +330,27 @@ impl Basis {
 }
 
 impl Day {
+    /// The same product with another likelihood of its coefficients.
+    fn with(&self, alone: &Alone) -> Self {
+        let n = self.kept.len();
+        let level = |own: &NoiseLevel| {
+            let (_, ln, sigma) = alone.levels.iter().find(|(name, ..)| *name == own.coefficient)?;
+            Some(NoiseLevel { ln: *ln, sigma: *sigma, ..own.clone() })
+        };
+        Self {
+            product: self.product.clone(),
+            places: self.places.clone(),
+            information: DMatrix::from_fn(n, n, |i, j| alone.information[(self.kept[i], self.kept[j])]),
+            score: DVector::from_fn(n, |i, _| alone.score[self.kept[i]]),
+            chi2_at_zero: alone.chi2_at_zero,
+            numbers: alone.numbers,
+            levels: self.levels.iter().filter_map(level).collect(),
+            kept: self.kept.clone(),
+            by_band: self.by_band.clone(),
+            stretches: None,
+        }
+    }
+
     /// χ² at these values of all coefficients, above that at zero.
     fn rise(&self, values: &DVector<f64>) -> f64 {
         // Most values are zero: effects that are off.

@@ -16,7 +16,7 @@ use serde::Serialize;
 use crate::WorkflowError;
 
 /// Probability outside of the bounds that are drawn.
-const OUTSIDE: f64 = 0.05;
+pub(crate) const OUTSIDE: f64 = 0.05;
 
 /// Width of a group of bands, decades: a map of four decades is looked at in one piece.
 const GROUP_DECADES: f64 = 1.0 / 6.0;
@@ -93,7 +93,7 @@ pub fn residuals(archive: &Archive, id: &str) -> Result<Residuals, WorkflowError
         let power = |b: usize| if observations[b] > 0.0 { observations[b] * psd(b) / model(b) } else { 0.0 };
         let dof = 2.0 * known;
         let ratio = (expected > 0.0 && dof > 0.0).then(|| of(&power) / known);
-        let fails = ratio.is_some_and(|r| corrected(two_sided(r, dof), tried) < false_alarm);
+        let fails = fails(ratio, dof, tried, false_alarm);
         let quantile = |p| if dof > 0.0 { chi2_per_dof_quantile(p, dof) } else { 1.0 };
         let root = |f: &dyn Fn(usize) -> f64| (of(f) / expected).max(0.0).sqrt();
         Band {
@@ -123,8 +123,13 @@ pub fn residuals(archive: &Archive, id: &str) -> Result<Residuals, WorkflowError
     })
 }
 
+/// Whether chance is no explanation of a ratio of powers, of so many that are looked at.
+pub(crate) fn fails(ratio: Option<f64>, dof: f64, tried: f64, false_alarm: f64) -> bool {
+    ratio.is_some_and(|r| corrected(two_sided(r, dof), tried) < false_alarm)
+}
+
 /// Neighbouring bands, together [`GROUP_DECADES`] wide at least.
-fn groups(bands_hz: &[[f64; 2]]) -> Vec<Range<usize>> {
+pub(crate) fn groups(bands_hz: &[[f64; 2]]) -> Vec<Range<usize>> {
     let mut all: Vec<Range<usize>> = Vec::new();
     for (b, [low, _]) in bands_hz.iter().enumerate() {
         match all.last_mut() {

@@ -225,7 +225,7 @@ impl Solving<'_> {
         all.filter(|(_, c)| !c.candidate && c.unit == "m").map(|(i, _)| i)
     }
 
-    fn level(&self, on: On) -> Option<&NoiseLevel> {
+    pub(super) fn level(&self, on: On) -> Option<&NoiseLevel> {
         match on {
             On::Level(k) => self.levels.get(k),
             On::Effect(_) => None,
@@ -233,6 +233,6 @@ impl Solving<'_> {
     }
 }
 
-fn effects_of(on: &[On]) -> Vec<usize> {
+pub(super) fn effects_of(on: &[On]) -> Vec<usize> {
     on.iter().filter_map(|o| o.switch()).collect()
 }

@@ -77,6 +77,9 @@ fn basis(days: &[Data]) -> Basis {
         chi2_at_zero: d.measured.norm_squared(),
         numbers: SAMPLES as f64,
         levels: vec![level.clone()],
+        kept: (0..n).collect(),
+        by_band: None,
+        stretches: None,
     };
     Basis {
         settings: Settings::default(),
@@ -90,6 +93,7 @@ fn basis(days: &[Data]) -> Basis {
         families: BTreeMap::new(),
         named: Vec::new(),
         not_tried: BTreeMap::new(),
+        divided: Mutex::default(),
     }
 }
 

@@ -5,13 +5,17 @@ use std::collections::BTreeMap;
 use serde::Serialize;
 use serde_json::{Map, Value};
 
+use crate::residuals::Residuals;
+
 /// The model with some effects switched on.
 #[derive(Clone, Debug, Serialize)]
 pub struct Refit {
     /// Products of the fit.
     pub products: Vec<String>,
-    /// Products that are kept out.
+    /// Products that are kept out, and stretches of time of products.
     pub held_out: Vec<String>,
+    /// What the channels of the products of the fit leave in each band; none where an extract does not tell.
+    pub spectra: Option<Spectra>,
     /// Whitened innovations in the fit.
     pub numbers: f64,
     /// The model, then one more effect each.
@@ -110,4 +114,26 @@ pub struct Size {
     pub sigma: f64,
     /// SI unit.
     pub unit: String,
+}
+
+/// What the channels leave in each group of bands, over the power of the noise.
+#[derive(Clone, Debug, Serialize)]
+pub struct Spectra {
+    /// With the model alone.
+    pub before: Residuals,
+    /// With the effects that are on.
+    pub now: Residuals,
+    /// By how much χ² of each channel's spectrum falls: what the channels have in common is left aside.
+    pub fall: Vec<f64>,
+}
+
+/// A stretch of the time of a product.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Stretch {
+    /// As it is kept out: `PRODUCT@2`.
+    pub name: String,
+    /// Begin, Unix ns.
+    pub from_ns: i64,
+    /// End, Unix ns.
+    pub until_ns: i64,
 }
