@@ -11,7 +11,7 @@ use std::ops::Range;
 
 use dragfree_estimation::segments::{Cuts, Segmenter};
 use dragfree_estimation::spectra::{LONG, Plan, Spectra, Transformer, triangle};
-use nalgebra::{DMatrix, DMatrixView};
+use nalgebra::{DMatrix, DMatrixView, DVector};
 
 use crate::coherence::HousekeepingCoherence;
 use crate::lines::{LineSearch, Lines};
@@ -67,20 +67,80 @@ impl Columns {
 pub struct Gram {
     /// Weights as those of the channels' spectra; their cross-spectra stay empty.
     pub weights: Spectra,
-    /// Per band, the square of its active columns, symmetric.
-    pub bands: Vec<DMatrix<f64>>,
+    /// Per band, the square of its active columns.
+    pub bands: Vec<Symmetric>,
+}
+
+/// A symmetric matrix. Most of the memory of a diagnosis is in these, so that little more than one triangle is kept:
+/// blocks of columns, each from its part of the diagonal down.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Symmetric {
+    order: usize,
+    blocks: Vec<DMatrix<f64>>,
+}
+
+/// Columns of a block of a [`Symmetric`] matrix.
+const BLOCK: usize = 64;
+
+impl Symmetric {
+    /// A matrix of zeros, `order` × `order`.
+    pub fn zeros(order: usize) -> Self {
+        let block = |first: usize| DMatrix::zeros(order - first, BLOCK.min(order - first));
+        Self { order, blocks: (0..order).step_by(BLOCK).map(block).collect() }
+    }
+
+    /// Number of rows and of columns.
+    pub fn order(&self) -> usize {
+        self.order
+    }
+
+    /// An element.
+    ///
+    /// # Panics
+    /// There is no such row or column.
+    pub fn at(&self, i: usize, j: usize) -> f64 {
+        let (row, column) = (i.max(j), i.min(j));
+        let first = column / BLOCK * BLOCK;
+        self.blocks[column / BLOCK][(row - first, column - first)]
+    }
+
+    /// A column.
+    ///
+    /// # Panics
+    /// As [`Self::at`].
+    pub fn column(&self, j: usize) -> DVector<f64> {
+        DVector::from_fn(self.order, |i, _| self.at(i, j))
+    }
+
+    /// Adds another one of the same order.
+    pub fn add(&mut self, other: &Self) {
+        self.blocks.iter_mut().zip(&other.blocks).for_each(|(a, b)| *a += b);
+    }
+
+    /// Adds `AᵀA` of the first columns of A: blocks of columns meet themselves and what follows.
+    ///
+    /// # Panics
+    /// A has fewer columns than this matrix.
+    pub fn add_square(&mut self, a: &DMatrixView<'_, f64>) {
+        let a = a.columns(0, self.order);
+        let transposed = a.transpose();
+        for (k, block) in self.blocks.iter_mut().enumerate() {
+            let first = k * BLOCK;
+            block.gemm(1.0, &transposed.rows(first, block.nrows()), &a.columns(first, block.ncols()), 1.0);
+        }
+    }
 }
 
 impl Gram {
     pub(crate) fn zero(columns: &Columns, plan: &Plan) -> Self {
-        let square = |b: usize| DMatrix::zeros(columns.active(plan, b), columns.active(plan, b));
+        let square = |b: usize| Symmetric::zeros(columns.active(plan, b));
         Self { weights: Spectra::zero(plan.bands.len(), 0), bands: (0..plan.bands.len()).map(square).collect() }
     }
 
     /// Adds the sums of other segments of the same columns.
     pub fn add(&mut self, other: &Self) {
         self.weights.add(&other.weights);
-        self.bands.iter_mut().zip(&other.bands).for_each(|(a, b)| *a += b);
+        self.bands.iter_mut().zip(&other.bands).for_each(|(a, b)| a.add(b));
     }
 
     /// The spectra of some of the columns, in the order asked for; zero where a slow one has nothing.
@@ -89,8 +149,8 @@ impl Gram {
         out.packed = Vec::with_capacity(self.bands.len() * triangle(columns.len()));
         for g in &self.bands {
             for (i, a) in columns.iter().enumerate() {
-                let inside = |b: &usize| *a < g.nrows() && *b < g.nrows();
-                out.packed.extend(columns[..=i].iter().map(|b| if inside(b) { g[(*a, *b)] } else { 0.0 }));
+                let inside = |b: &usize| *a < g.order() && *b < g.order();
+                out.packed.extend(columns[..=i].iter().map(|b| if inside(b) { g.at(*a, *b) } else { 0.0 }));
             }
         }
         out
@@ -157,7 +217,6 @@ pub struct GramAccumulator {
     long: Plan,
     long_bench: SegmentTransform,
     thinner: Thinner,
-    /// Gram matrices from the diagonal down.
     gathered: GramSums,
 }
 
@@ -196,12 +255,12 @@ impl SegmentTransform {
         });
     }
 
-    /// `G_b += A_bᵀ A_b` in every band from the diagonal down, the bands shared among the threads by the work in them.
-    fn multiply(&self, bins: &[Range<usize>], grams: &mut [DMatrix<f64>]) {
+    /// `G_b += A_bᵀ A_b` in every band, the bands shared among the threads by the work in them.
+    fn multiply(&self, bins: &[Range<usize>], grams: &mut [Symmetric]) {
         let spectra = &self.spectra;
         let earliest = bins.iter().filter(|b| !b.is_empty()).map(|b| b.start).min();
         assert!(earliest.is_none_or(|first| first >= self.first_bin), "the spectra have no bin {earliest:?}");
-        let work = |g: &DMatrix<f64>, bins: &Range<usize>| g.len() * bins.len();
+        let work = |g: &Symmetric, bins: &Range<usize>| g.order().pow(2) * bins.len();
         let total: usize = grams.iter().zip(bins).map(|(g, b)| work(g, b)).sum();
         std::thread::scope(|scope| {
             let mut rest = grams;
@@ -218,7 +277,7 @@ impl SegmentTransform {
                 (rest, first) = (others, first + count);
                 scope.spawn(move || {
                     for (g, bins) in mine.iter_mut().zip(bins).filter(|(_, b)| !b.is_empty()) {
-                        add_square(g, &spectra.rows(2 * (bins.start - self.first_bin), 2 * bins.len()));
+                        g.add_square(&spectra.rows(2 * (bins.start - self.first_bin), 2 * bins.len()));
                     }
                 });
             }
@@ -227,21 +286,6 @@ impl SegmentTransform {
 
     fn base(&self, columns: usize) -> DMatrixView<'_, f64> {
         self.spectra.columns(0, columns)
-    }
-}
-
-/// Columns of a block of [`add_square`].
-const BLOCK: usize = 64;
-
-/// `G += AᵀA` from the diagonal down, with the first columns of A: blocks of columns meet themselves and what follows.
-fn add_square(g: &mut DMatrix<f64>, a: &DMatrixView<'_, f64>) {
-    let n = g.ncols();
-    let a = a.columns(0, n);
-    let transposed = a.transpose();
-    for first in (0..n).step_by(BLOCK) {
-        let (block, rest) = (BLOCK.min(n - first), n - first);
-        let mut out = g.view_mut((first, first), (rest, block));
-        out.gemm(1.0, &transposed.rows(first, rest), &a.columns(first, block), 1.0);
     }
 }
 
@@ -298,7 +342,6 @@ impl GramAccumulator {
 
     /// The sums.
     pub fn finish(mut self) -> GramSums {
-        self.gathered.total.bands.iter_mut().for_each(DMatrix::fill_upper_triangle_with_lower_triangle);
         self.gathered.slow = self.thinner.finish();
         self.gathered.lines = self.line_search.finish();
         self.gathered
@@ -494,5 +537,31 @@ impl Low<'_> {
         set.weights.count_bands(counted, taper, overlaps, bands);
         let base = self.bench.base(self.gathered.columns.base);
         self.gathered.housekeeping.segment(plan, taper, housekeeping, &base, overlaps);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Several blocks, of which the last one is narrower; the product by nalgebra as a whole.
+    #[test]
+    fn a_sum_of_squares_has_both_triangles() {
+        for order in [1, BLOCK, 2 * BLOCK + 7] {
+            let a = DMatrix::from_fn(9, order + 2, |i, j| ((7 * i + 3 * j) % 11) as f64 - 4.0);
+            let mut sum = Symmetric::zeros(order);
+            sum.add_square(&a.as_view());
+            let mut twice = sum.clone();
+            twice.add(&sum);
+            let whole = a.columns(0, order).transpose() * a.columns(0, order);
+            assert_eq!(DMatrix::from_fn(order, order, |i, j| sum.at(i, j)), whole);
+            assert_eq!(twice.column(order / 2), 2.0 * whole.column(order / 2));
+        }
+    }
+
+    #[test]
+    fn little_more_than_a_triangle_is_kept() {
+        let kept: usize = Symmetric::zeros(800).blocks.iter().map(DMatrix::len).sum();
+        assert!(kept < 800 * (800 + 2 * BLOCK) / 2, "{kept}");
     }
 }

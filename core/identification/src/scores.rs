@@ -206,8 +206,8 @@ impl<'a> CandidateScorer<'a> {
         let free = &estimate.free;
         let mut model = vec![DMatrix::zeros(n, channels); free.len()];
         for (g, w) in gram.bands.iter().zip(&weights) {
-            let m = g.nrows();
-            let mut left = g.columns(0, channels).into_owned();
+            let m = g.order();
+            let mut left = DMatrix::from_fn(m, channels, |i, j| g.at(i, j));
             for r in &linear.regressors {
                 let column = columns[channels + r.series];
                 if column < m {
@@ -373,10 +373,10 @@ impl<'a> CandidateScorer<'a> {
         DMatrix::from_fn(a.len(), b.len(), |i, j| {
             let mut sum = 0.0;
             for (g, w) in gram.bands.iter().zip(weights) {
-                let m = g.nrows();
+                let m = g.order();
                 for (s, c, f) in a[i].iter().filter(|t| t.0 < m) {
                     for (t, d, h) in b[j].iter().filter(|t| t.0 < m) {
-                        sum += f * h * w[(*c, *d)] * g[(*s, *t)];
+                        sum += f * h * w[(*c, *d)] * g.at(*s, *t);
                     }
                 }
             }
@@ -439,7 +439,7 @@ impl<'a> CandidateScorer<'a> {
         let ratio = |(u, v): (f64, f64)| if v > 0.0 { u / v } else { 0.0 };
         let energy = candidate.parts.iter().flat_map(|(_, form)| &form.terms).find_map(|t| {
             let energy = self.gathered.columns.energy_of(t.column)?;
-            let windowed = self.total.bands.iter().zip(&equal_time).map(|(g, k)| g[(t.column, t.column)] * k);
+            let windowed = self.total.bands.iter().zip(&equal_time).map(|(g, k)| g.at(t.column, t.column) * k);
             Some(energy.iter().copied().zip(windowed).map(ratio).map(|r| r.min(self.settings.max_taper_loss)).collect())
         });
         let lasts = || equal_time.iter().copied().zip(weights.kept()).map(|(e, k)| ratio((k, e)).min(1.0)).collect();

@@ -9,9 +9,9 @@ use std::ops::Range;
 
 use dragfree_estimation::sigma::BandNoise;
 use dragfree_identification::candidates::{CandidateSet, Coefficient as Unknown, Form};
+use dragfree_identification::gram::Symmetric;
 use dragfree_identification::record::Record;
 use dragfree_schema::Coefficient;
-use nalgebra::DMatrix;
 use serde::{Deserialize, Serialize};
 
 use super::packed::singles;
@@ -194,8 +194,8 @@ fn form_of<'a>(set: &'a CandidateSet, c: &Coefficient) -> Option<&'a Form> {
 }
 
 /// Adds the products of combinations of columns in a band, from the diagonal down, times a weight.
-fn add(sum: &mut [f64], gram: &DMatrix<f64>, combinations: &[Vec<(usize, f64)>], weight: f64) {
-    let n = gram.nrows();
+fn add(sum: &mut [f64], gram: &Symmetric, combinations: &[Vec<(usize, f64)>], weight: f64) {
+    let n = gram.order();
     let inside = |terms: &[(usize, f64)]| -> Vec<(usize, f64)> {
         terms.iter().copied().filter(|(column, _)| *column < n).collect()
     };
@@ -203,7 +203,7 @@ fn add(sum: &mut [f64], gram: &DMatrix<f64>, combinations: &[Vec<(usize, f64)>],
     let mut to = sum.iter_mut();
     for (k, a) in combinations.iter().enumerate() {
         for b in &combinations[..=k] {
-            let product = |(i, x): &(usize, f64)| x * b.iter().map(|(j, y)| y * gram[(*i, *j)]).sum::<f64>();
+            let product = |(i, x): &(usize, f64)| x * b.iter().map(|(j, y)| y * gram.at(*i, *j)).sum::<f64>();
             if let Some(to) = to.next() {
                 *to += weight * a.iter().map(product).sum::<f64>();
             }
@@ -213,6 +213,8 @@ fn add(sum: &mut [f64], gram: &DMatrix<f64>, combinations: &[Vec<(usize, f64)>],
 
 #[cfg(test)]
 mod tests {
+    use nalgebra::DMatrix;
+
     use super::*;
 
     /// The form at any values is the power of the residual made of the columns themselves, to the digits of 32 bits.
@@ -225,7 +227,8 @@ mod tests {
             state as f64 / 2_147_483_647.0 - 0.5
         };
         let columns = DMatrix::from_fn(40, 5, |_, _| next());
-        let gram = columns.tr_mul(&columns);
+        let mut gram = Symmetric::zeros(5);
+        gram.add_square(&columns.as_view());
         // Channel 0 with a coefficient of the model in column 1, and candidates in 2 and in 3 and 4; a sixth column is
         // not in this band.
         let about = [0.7, 0.0, 0.0];
