@@ -220,9 +220,17 @@ impl Browser {
     /// # Panics
     /// It does not within half a minute.
     pub fn wait_for(&self, script: &str) {
+        self.wait_for_within(script, PATIENCE);
+    }
+
+    /// The same with another patience: what is waited for is computed.
+    ///
+    /// # Panics
+    /// It does not come within that time.
+    pub fn wait_for_within(&self, script: &str, patience: Duration) {
         let begun = Instant::now();
         while self.run(&format!("return Boolean({script})")) != true {
-            assert!(begun.elapsed() < PATIENCE, "never true: {script}\n{}", self.run("return document.body.innerText"));
+            assert!(begun.elapsed() < patience, "never true: {script}\n{}", self.run("return document.body.innerText"));
             std::thread::sleep(Duration::from_millis(20));
         }
     }

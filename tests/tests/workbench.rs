@@ -180,9 +180,10 @@ fn compared(comparison: &Value, channel: &str, [first, last]: [f64; 2]) -> Optio
 }
 
 /// The spectra of a switch are those that a comparison reads from the telemetry: with the model alone, and with the
-/// effect those of runs that have it, to a hundredth (the ends of the data are weighed in another way), and what the
-/// effect changes to three thousandths, where it changes more than four times that somewhere. Hours that are kept out of
-/// the fit are predicted better with the effect, and together with those of the fit they fall as the whole does.
+/// effect those of runs that have it, within a standard deviation, as the test weighs bands by what it is told of them;
+/// and what the effect changes to three thousandths, where it changes more than four times that somewhere. Hours that
+/// are kept out of the fit are predicted better with the effect, and together with those of the fit they fall as the
+/// whole does.
 #[test]
 fn spectra_and_hours_of_a_switch_are_those_of_the_telemetry() {
     let (_alone, flight) = (alone(), flight());
@@ -215,7 +216,9 @@ fn spectra_and_hours_of_a_switch_are_those_of_the_telemetry() {
             let [read_before, read_now] =
                 [0, 1].map(|k| compared(&telemetry[k], name, ends).unwrap_or_else(|| panic!("no {name} at {ends:?}")));
             let what = format!("{name} at {ends:?}: {own_before} {read_before}, {own_now} {read_now}");
-            assert!((own_before - read_before).abs() < 0.01 && (own_now - read_now).abs() < 0.01, "{what}");
+            let bounds = &now["channels"][c]["groups"][g]["bounds"];
+            let sigma = (number(&bounds[1]) - number(&bounds[0])) / (2.0 * 1.96);
+            assert!((own_before - read_before).abs() < sigma && (own_now - read_now).abs() < sigma, "{what}");
             let (own, of_telemetry) = (own_now - own_before, read_now - read_before);
             assert!((own - of_telemetry).abs() < 3e-3, "{what}");
             (cells, most) = (cells + 1, most.max(of_telemetry.abs()));
@@ -268,7 +271,7 @@ fn a_reader_finds_the_effect_and_keeps_it_by_clicks() {
     assert!(said.as_str().is_some_and(|s| s.contains("1 effect is on") && s.contains("com-offset.tm")), "{said}");
     // The map says what has changed, and the spectrum shows both.
     let map = browser.run("return document.querySelectorAll('.map td u').length");
-    assert!(number(&map) > 3.0, "{map} cells have changed");
+    assert!(number(&map) >= 1.0, "{map} cells have changed");
     browser.wait_for("document.querySelector('#spectrum .u-legend').textContent.includes('model alone')");
     browser.click("[data-channel='tm1.accel.x']");
     browser.wait_for("document.getElementById('channel').value === 'tm1.accel.x'");
@@ -304,13 +307,103 @@ fn a_reader_finds_the_effect_and_keeps_it_by_clicks() {
     }
 }
 
+/// A calibration or a diagnosis of two hours, beside other tests.
+const COMPUTES: Duration = Duration::from_secs(400);
+
+/// The whole story by clicks alone, from an empty archive: a run of what is due, the day, its diagnosis, the comparison,
+/// the effect switched on and kept, the day calibrated once more, and the error that has fallen.
+#[test]
+fn from_an_empty_archive_to_a_smaller_error_by_clicks_alone() {
+    let _alone = alone();
+    let mission = tempfile::tempdir().expect("a temporary folder");
+    let folder = mission.path();
+    expect(dragfree(folder).args(["init", "."]), 0);
+    let vault = folder.join("vault");
+    std::fs::create_dir(&vault).expect("a folder");
+    let effect = format!("{EFFECT}={SIZE_RAD}");
+    let file = simulate(&vault, &["--hours", "2", "--seed", "71", "--effect", &effect]).remove(0);
+    std::fs::create_dir(folder.join("telemetry")).expect("a folder");
+    std::fs::copy(&file, folder.join("telemetry/SC1.mcap")).expect("copied");
+    let truth = vault.join("truth/SC1_2035-01-01.mcap").display().to_string();
+    assert!(!folder.join("archive").exists());
+    let server = serve(folder, &["--ops", "mission-ops.toml", "--allow-changes", "--truth", &truth]);
+    let browser = Browser::start(1280, 900, false);
+    browser.open(&format!("http://127.0.0.1:{}/#token={}", server.port, server.token));
+    browser.wait_for("document.querySelector('main').textContent.includes('no product yet')");
+    browser.click("form.start button");
+    browser.wait_for_within("document.querySelector('a.day')", COMPUTES);
+    assert!(browser.run("return document.getElementById('running').textContent").to_string().contains("Done"));
+    browser.click("a.day");
+    browser.wait_for("document.querySelector('.verdict')");
+    assert_eq!(browser.run("return document.querySelector('#before')"), Value::Null);
+    // By the keyboard: the token is there, and the return key in its field is the button.
+    browser.run("document.querySelector('form.start .token').focus()");
+    browser.press("\u{E007}");
+    browser.wait_for("document.getElementById('running').textContent.includes('dragfree diagnose')");
+    let diagnosed = "document.querySelector(\"main ul a[href^='/missing']\")";
+    browser.wait_for_within(diagnosed, COMPUTES);
+    browser.click("main a[href^='/compare/']");
+    browser.wait_for("document.querySelector('table.map')");
+    browser.click("nav a[href='/missing']");
+    let switch = format!("[data-key='{EFFECT}']");
+    browser.wait_for(&format!("document.querySelector(\"{switch}\")"));
+    browser.click(&switch);
+    browser.wait_for("document.querySelector('.said').textContent.includes('1 effect is on')");
+    browser.click("#keep button");
+    browser.wait_for("document.querySelector('#kept.kept')");
+    browser.click("#kept form.start button");
+    browser.wait_for("document.getElementById('running').textContent.includes('dragfree catch-up')");
+    browser.wait_for_within("document.querySelector(\"#running a[href^='/day/']\")", COMPUTES);
+    browser.click("#running a[href^='/day/']");
+    browser.wait_for("document.querySelector('#before')");
+    assert_eq!(browser.console(), Vec::<String>::new());
+    // True errors in σ before and now, as the page shows them.
+    let rows = browser.run("return [...document.querySelectorAll('#before tbody tr')].map(r => r.textContent)");
+    let sigmas = |row: &Value| -> Vec<f64> {
+        let row = row.as_str().expect("text");
+        row.split(" σ").filter_map(|part| part.rsplit(", ").next()?.parse().ok()).collect()
+    };
+    let errors: Vec<Vec<f64>> = rows.as_array().expect("rows").iter().map(sigmas).collect();
+    assert!(errors.len() == TRUTH_M.len() && errors.iter().all(|row| row.len() == 2), "{rows:#}");
+    let worst = |k: usize| errors.iter().map(|row| row[k]).fold(0.0, f64::max);
+    // The effect moves an offset by ten σ of its own; six offsets within 4.5σ are a false alarm in 2e4.
+    assert!(worst(0) > 8.0 && worst(1) < 4.5, "{rows:#}");
+    let now = browser.run("return location.pathname").as_str().expect("a path").to_owned();
+    drop(browser);
+    for (width, dark) in [(1280, false), (400, true)] {
+        readable(&server, width, dark, &["", now.trim_start_matches('/'), "missing"]);
+    }
+    // What pages may start, they may with the token alone, and nothing that is no product.
+    let own = format!("http://127.0.0.1:{}", server.port);
+    let headers =
+        |token: &str| format!("Content-Type: application/json\r\nOrigin: {own}\r\nX-Dragfree-Token: {token}\r\n");
+    let start = |headers: &str, body: &str| request(server.port, "POST", "/start", headers, body).status;
+    assert_eq!(start("", "{\"job\":\"catch-up\"}"), 403);
+    assert_eq!(start(&headers("0123456789abcdef0123456789abcdef"), "{\"job\":\"catch-up\"}"), 403);
+    let right = headers(&server.token);
+    assert_eq!(start(&right, "{\"job\":\"rm\"}"), 400);
+    for product in ["--help", "../../etc/passwd", "nothing", "<b>"] {
+        let status = start(&right, &json!({ "job": "diagnose", "product": product }).to_string());
+        assert!(matches!(status, 400 | 404), "{product}: {status}");
+    }
+    let reads = serve(folder, &["--ops", "mission-ops.toml"]);
+    let page = get(reads.port, "/");
+    assert!(page.status == 200 && !page.body.contains("<form"), "{}", page.body);
+    let token = headers("").replace(&own, &format!("http://127.0.0.1:{}", reads.port));
+    assert_eq!(request(reads.port, "POST", "/start", &token, "{\"job\":\"catch-up\"}").status, 403);
+}
+
 /// axe-core finds nothing serious, nothing is wider than the window, no label is smaller than 11 px, and the console is
 /// empty. `DRAGFREE_PICTURES=DIR` keeps pictures of the pages.
 fn every_page_is_readable(server: &Server, width: u32, dark: bool) {
-    let axe = std::fs::read_to_string(root().join("tests/data/axe/axe.min.js")).expect("vendored");
-    let browser = Browser::start(width, 900, dark);
     let missing = format!("missing?products={}&held={}&on={EFFECT}", DAYS.join(","), DAYS[1]);
     let pages = ["", "trends", &format!("day/{}", DAYS[0]), &format!("compare/{}", DAYS[0]), &missing, "plugins"];
+    readable(server, width, dark, &pages);
+}
+
+fn readable(server: &Server, width: u32, dark: bool, pages: &[&str]) {
+    let axe = std::fs::read_to_string(root().join("tests/data/axe/axe.min.js")).expect("vendored");
+    let browser = Browser::start(width, 900, dark);
     for page in pages {
         browser.open(&format!("http://127.0.0.1:{}/{page}", server.port));
         browser.wait_for("document.readyState === 'complete'");

@@ -83,50 +83,74 @@ if (given) {
 }
 
 function fillToken() {
-  const field = document.getElementById("token");
-  if (field && !field.value) field.value = sessionStorage.getItem("token") || "";
+  for (const field of document.querySelectorAll("input.token")) {
+    if (!field.value) field.value = sessionStorage.getItem("token") || "";
+  }
 }
 
 fillToken();
 
-document.addEventListener("submit", async (event) => {
-  if (event.target.id !== "keep") return;
-  event.preventDefault();
-  const token = document.getElementById("token").value.trim();
-  const state = Object.fromEntries(new URLSearchParams(location.search));
-  const kept = document.getElementById("kept");
+// Asks for a change with the token of a form, and shows what the server says. Gives whether it was done.
+async function change(address, form, state, place) {
+  const token = form.querySelector(".token").value.trim();
   try {
     const headers = { "content-type": "application/json", "x-dragfree-token": token };
-    const answer = await fetch("/keep", { method: "POST", headers, body: JSON.stringify(state) });
+    const answer = await fetch(address, { method: "POST", headers, body: JSON.stringify(state) });
     const text = await answer.text();
     if (answer.ok) {
       sessionStorage.setItem("token", token);
-      kept.innerHTML = text;
+      place.innerHTML = text;
+      fillToken();
     } else {
-      kept.textContent = text;
+      place.textContent = text;
     }
-    kept.className = answer.ok ? "kept" : "refused";
+    return answer.ok;
   } catch {
-    kept.textContent = "The server does not answer: is it still running?";
+    place.textContent = "The server does not answer: is it still running?";
+    return false;
+  }
+}
+
+document.addEventListener("submit", async (event) => {
+  const form = event.target;
+  if (form.id === "keep") {
+    event.preventDefault();
+    const kept = document.getElementById("kept");
+    const state = Object.fromEntries(new URLSearchParams(location.search));
+    kept.className = (await change("/keep", form, state, kept)) ? "kept" : "refused";
+  } else if (form.classList.contains("start")) {
+    event.preventDefault();
+    const said = form.querySelector(".started");
+    const done = await change("/start", form, { ...form.dataset }, said);
+    said.className = done ? "started" : "started refused";
+    lookAtJobs();
   }
 });
 
 // ---- What runs ------------------------------------------------------------------------------------------------------
 
 // Asked for again while somebody looks; a page in the background asks nothing.
-const jobs = document.getElementById("running");
-if (jobs && location.protocol.startsWith("http")) {
-  setInterval(async () => {
-    if (document.hidden) return;
-    try {
-      const answer = await fetch("/running");
-      const text = answer.ok ? await answer.text() : "";
-      if (answer.ok && jobs.innerHTML !== text) jobs.innerHTML = text;
-    } catch {
-      jobs.textContent = "The server does not answer: is it still running?";
-    }
-  }, 2000);
+const ended = () => document.querySelector("#running [data-ended]")?.dataset.ended;
+const before = ended();
+
+async function lookAtJobs() {
+  const jobs = document.getElementById("running");
+  if (!jobs || document.hidden) return;
+  try {
+    const answer = await fetch("/running");
+    const text = answer.ok ? await answer.text() : "";
+    // What a reader has unfolded, or has the focus in, is left alone.
+    if (!answer.ok || jobs.dataset.text === text || jobs.contains(document.activeElement)) return;
+    jobs.dataset.text = text;
+    jobs.innerHTML = text;
+    // What a command has made is on the page once it is loaded again.
+    if ("reload" in jobs.dataset && ended() !== before) location.reload();
+  } catch {
+    jobs.textContent = "The server does not answer: is it still running?";
+  }
 }
+
+if (location.protocol.startsWith("http")) setInterval(lookAtJobs, 2000);
 
 // ---- Plots ----------------------------------------------------------------------------------------------------------
 

@@ -134,7 +134,7 @@ pub(crate) fn spectrum(found: &Residuals, before: Option<&Residuals>, first: &st
 }
 
 /// A cell has changed if it has by this part of the width in which 95 of 100 lie.
-const CHANGED: f64 = 0.1;
+const CHANGED: f64 = 0.05;
 
 /// Whether a cell is another than before, to a reader who looks for what the effects change.
 fn changed(band: &Band, before: Option<&Band>) -> bool {

@@ -1,12 +1,14 @@
 //! A product as an operator reads it.
 
 use dragfree_archive::product::{Coefficient, Product};
-use dragfree_archive::{EXTRACT, Row};
+use dragfree_archive::{Archive, EXTRACT, Row};
 use dragfree_workflow::provenance::lineage;
 use maud::{Markup, html};
 
 use crate::PagesError;
-use crate::layout::{Links, command, page as whole, picture, shell, value};
+use crate::jobs::{Job, button};
+use crate::layout::{Links, command, error, millimetres, page as whole, picture, shell, value};
+use crate::mission::running;
 use crate::pictures;
 use crate::site::Site;
 
@@ -33,8 +35,9 @@ pub(crate) fn page(site: &Site, id: &str, links: &Links) -> Result<Markup, Pages
             (product.quality.epochs_rejected) " not"
         }
         (coefficients(&product))
+        (before(site, &archive, &row, &product, links)?)
         (quality(&product))
-        (next(site, &row, &product, has_extract, links))
+        (next(site, &row, &product, has_extract, links)?)
         h2 { "Where it comes from" }
         p { "Inputs on the left, the product, and what came of it on the right. Numbers are the starts of SHA-256 \
             digests." }
@@ -137,6 +140,51 @@ fn coefficients(product: &Product) -> Markup {
     }
 }
 
+/// The values beside those of the product of the same day before it: what another model has made of the same hours.
+fn before(site: &Site, archive: &Archive, row: &Row, product: &Product, links: &Links) -> Result<Markup, PagesError> {
+    let same = |other: &&Row| {
+        (&other.day, &other.spacecraft, &other.name) == (&row.day, &row.spacecraft, &row.name)
+            && other.number < row.number
+            && other.fixed_from.is_none()
+    };
+    let rows = archive.rows()?;
+    let Some(other) = rows.iter().filter(same).max_by_key(|other| other.number) else { return Ok(html! {}) };
+    let earlier = archive.document(&other.id)?;
+    let truth = |name: &str| site.setup.truth.as_ref().and_then(|truth| truth(name));
+    let was = earlier.result.adopted();
+    let now = product.result.adopted();
+    let pairs: Vec<(&Coefficient, &Coefficient)> = now
+        .iter()
+        .filter(|c| c.unit == "m")
+        .filter_map(|c| Some((*was.iter().find(|w| w.name == c.name)?, *c)))
+        .collect();
+    let known = pairs.iter().any(|(_, c)| truth(&c.name).is_some());
+    let (q, e) = (&product.quality, &earlier.quality);
+    Ok(html! {
+        h2 { "Against the product before it" }
+        p {
+            @match links.of("day", &other.id) { Some(to) => a href=(to) { (other.id) }, None => (other.id) }
+            ", model " (earlier.model.revision) ": χ²/dof " (format!("{:.4}", e.chi2_per_dof)) ", now "
+            strong { (format!("{:.4}", q.chi2_per_dof)) } "; NIS " (format!("{:.4}", e.nis)) ", now "
+            strong { (format!("{:.4}", q.nis)) } "."
+        }
+        div class="scroll" tabindex="0" { table id="before" {
+            thead { tr { th { "coefficient" } th { "before" } th { "now" } th { "change" }
+                @if known { th { "true error before" } th { "now" } } } }
+            tbody { @for (was, c) in &pairs { tr {
+                th scope="row" { (c.name) }
+                td class="figure" { (value(was.value, was.sigma, &was.unit)) }
+                td class="figure main" { (value(c.value, c.sigma, &c.unit)) }
+                td class="figure" { (millimetres(c.value - was.value)) }
+                @if let Some(true_m) = truth(&c.name) {
+                    td class="figure" { (error(was.value - true_m, was.sigma)) }
+                    td class="figure" { (error(c.value - true_m, c.sigma)) }
+                }
+            } } }
+        } }
+    })
+}
+
 fn quality(product: &Product) -> Markup {
     let q = &product.quality;
     html! {
@@ -163,9 +211,9 @@ fn quality(product: &Product) -> Markup {
     }
 }
 
-fn next(site: &Site, row: &Row, product: &Product, has_extract: bool, links: &Links) -> Markup {
+fn next(site: &Site, row: &Row, product: &Product, has_extract: bool, links: &Links) -> Result<Markup, PagesError> {
     let (id, flags) = (shell(&row.id), &site.setup.flags);
-    html! {
+    Ok(html! {
         h2 { "What next" }
         ul {
             @if let Some(to) = links.of("compare", &row.id) {
@@ -178,10 +226,11 @@ fn next(site: &Site, row: &Row, product: &Product, has_extract: bool, links: &Li
         @if !has_extract && product.model.fixed_from.is_none() {
             p { "This product was not diagnosed yet. The diagnosis reads the telemetry once; after it effects can be \
                 switched on here:" }
-            (command(&format!("dragfree diagnose {id} --keep-extract{flags}")))
+            (button(site, links, &Job::Diagnose { product: row.id.clone() }, "Diagnose"))
+            @if !links.is_file() { div id="running" aria-live="polite" data-reload="" { (running(site)?) } }
         }
         p { "It holds for a time once it is certified:" }
         (command(&format!("dragfree products certify {id} --from {}{flags}",
             product.header.non_standard_attributes.day)))
-    }
+    })
 }

@@ -7,7 +7,8 @@ use maud::{Markup, html};
 use serde_json::Value;
 
 use crate::PagesError;
-use crate::layout::{command, shell, value};
+use crate::jobs::{Job, button};
+use crate::layout::{Links, command, shell, value};
 use crate::site::{Query, Site};
 
 impl Site {
@@ -46,6 +47,8 @@ impl Site {
             p { "Kept: the model is revision " strong { (revision) } " now, before it " (added.before)
                 ". These commands prove it on the data:" }
             (command(&lines.join("\n")))
+            p { "Or every day is calibrated with the new model: the old products stay beside the new ones." }
+            (button(self, &Links::Server { changes: true }, &Job::CatchUp, "Run what is due"))
         }
     }
 }

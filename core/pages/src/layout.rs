@@ -131,6 +131,11 @@ pub(crate) fn millimetres(value_m: f64) -> String {
     format!("{:+.2} mm", 1e3 * value_m).replace('-', "−")
 }
 
+/// A true error with its size in σ.
+pub(crate) fn error(error_m: f64, sigma_m: f64) -> String {
+    format!("{}, {:.1} σ", millimetres(error_m), (error_m / sigma_m).abs())
+}
+
 /// Data for the script of a page. `<` is written so that no text of the data can end the element.
 pub(crate) fn data(id: &str, value: &impl Serialize) -> Markup {
     let text = serde_json::to_string(value).unwrap_or_default().replace('<', "\\u003c");

@@ -6,6 +6,7 @@ mod address;
 mod compare;
 mod day;
 mod guard;
+pub mod jobs;
 mod keep;
 mod layout;
 mod missing;

@@ -9,7 +9,7 @@ use maud::{Markup, html};
 use crate::PagesError;
 use crate::compare::{map, spectrum};
 use crate::keep::commands;
-use crate::layout::{Links, command, millimetres, page as whole, value};
+use crate::layout::{Links, command, error, millimetres, page as whole, value};
 use crate::pictures::ladder;
 use crate::site::{Query, Site, list};
 use crate::spacecraft::ellipses;
@@ -71,7 +71,7 @@ pub(crate) fn part(site: &Site, query: &Query, links: &Links) -> Result<Markup, 
         (offsets(&refit, &truth))
         (spectra(&refit))
         (switches(&basis, &refit, query, links))
-        (keep(site, &refit, links))
+        (keep(site, &refit, links)?)
         (limits(&basis, &refit))
     })
 }
@@ -130,7 +130,7 @@ fn days(site: &Site, basis: &Basis, query: &Query, links: &Links) -> Result<Mark
             p class="quiet" { "Days of one model, " (model.unwrap_or_default())
                 ". A day or hours that are kept out test what the others say: with an effect that is there, χ² falls in \
                     them too." }
-            table {
+            div class="scroll" tabindex="0" {             table {
                 thead { tr { th { "product" } th { "in the fit" } th { "kept out" } th { "not used" }
                     th { "hours kept out" } } }
                 tbody { @for row in &same { tr {
@@ -149,7 +149,7 @@ fn days(site: &Site, basis: &Basis, query: &Query, links: &Links) -> Result<Mark
                     }
                     td class="hours" { @if fitted(&row.id) { (hours(&basis.stretches(&row.id), query)) } }
                 } } }
-            }
+            } }
             @if !others.is_empty() {
                 p { "Diagnosed with another model: "
                     @for row in &others { a href={ "/missing?products=" (row.id) } { (row.day) " "
@@ -295,10 +295,6 @@ fn offsets(refit: &Refit, truth: &dyn Fn(&str) -> Option<f64>) -> Markup {
     }
 }
 
-fn error(error_m: f64, sigma_m: f64) -> String {
-    format!("{}, {:.1} σ", millimetres(error_m), (error_m / sigma_m).abs())
-}
-
 fn switches(basis: &Basis, refit: &Refit, query: &Query, links: &Links) -> Markup {
     let on = list(&query.on);
     let toggled = |effect: &Effect| {
@@ -388,9 +384,9 @@ fn chance(log10: f64) -> String {
     }
 }
 
-fn keep(site: &Site, refit: &Refit, links: &Links) -> Markup {
+fn keep(site: &Site, refit: &Refit, links: &Links) -> Result<Markup, PagesError> {
     let on: Vec<&Effect> = refit.effects.iter().filter(|e| e.on).collect();
-    html! {
+    Ok(html! {
         h2 { "Keep" }
         @if on.is_empty() {
             p { "Switch on an effect first: then it can be added to the model as a new revision." }
@@ -400,17 +396,18 @@ fn keep(site: &Site, refit: &Refit, links: &Links) -> Markup {
             (command(&commands(site, &on).join("\n")))
             @if links.allows_changes() && site.setup.model.is_some() {
                 form id="keep" {
-                    label { "Token, printed where the server was started " input id="token" type="password"
+                    label { "Token, printed where the server was started " input class="token" type="password"
                         autocomplete="off" size="34"; }
                     button type="submit" { "Keep" }
                 }
                 div id="kept" role="status" {}
+                div id="running" aria-live="polite" { (site.job()?) }
             } @else if !links.is_file() {
                 p class="quiet" { "This server only reads. With --model FILE --allow-changes it keeps effects at the \
                     press of a button." }
             }
         }
-    }
+    })
 }
 
 fn limits(basis: &Basis, refit: &Refit) -> Markup {

@@ -7,6 +7,7 @@ use dragfree_archive::Row;
 use maud::{Markup, html};
 
 use crate::PagesError;
+use crate::jobs::{Job, button};
 use crate::layout::{Links, command, page as whole};
 use crate::site::{Query, Site};
 
@@ -96,12 +97,15 @@ pub(crate) fn page(site: &Site, _query: &Query, links: &Links) -> Result<Markup,
         @if series.is_empty() {
             p { "The archive " code { (site.setup.archive.display()) } " has no product yet. This makes one:" }
             (command(&format!("dragfree run PIPELINE.toml FILE.mcap{}", site.setup.flags)))
+            p { "Or put telemetry into the inbox that mission-ops.toml names, and run what is due:" }
         }
         @for ((spacecraft, name), days) in &series { (of_series(site, spacecraft, name, days)) }
         h2 { "What runs, and what is due" }
-        div id="running" aria-live="polite" { (running(site)?) }
-        p { "These commands say which days would come out otherwise now, and calibrate them:" }
-        (command("dragfree products stale\ndragfree catch-up\ndragfree watch"))
+        div id="running" aria-live="polite" data-reload="" { (running(site)?) }
+        p { "Every day that has no product, or one that would come out otherwise now, is calibrated by:" }
+        (button(site, links, &Job::CatchUp, "Run what is due"))
+        p { "These commands say which days these are, and wait for new telemetry:" }
+        (command("dragfree products stale\ndragfree watch"))
     };
     let lead = "Look for days with ✗ or ! and open them; on a day with ✓ the two solutions agree, and its page says \
         whether to use it.";
@@ -112,7 +116,8 @@ pub(crate) fn page(site: &Site, _query: &Query, links: &Links) -> Result<Markup,
 pub(crate) fn running(site: &Site) -> Result<Markup, PagesError> {
     let all = site.archive()?.running();
     Ok(html! {
-        @if all.is_empty() { p { "Nothing runs now." } }
+        @if all.is_empty() { p { "Nothing is calibrated now." } }
+        (site.job()?)
         @for job in &all {
             @let until = DateTime::from_timestamp_nanos(job.until_ns).format("%Y-%m-%d %H:%M:%S");
             p {

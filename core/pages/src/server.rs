@@ -17,11 +17,13 @@ use axum::routing::{get, post};
 use hyper::server::conn::http1;
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use serde::de::DeserializeOwned;
 use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 
 use crate::PagesError;
 use crate::guard::{Guard, Refusal};
+use crate::jobs::Job;
 use crate::layout::Links;
 use crate::site::{Query, Site};
 
@@ -112,6 +114,7 @@ fn router(app: App) -> Router {
         .route("/running", get(running))
         .route("/assets/{name}", get(asset))
         .route("/keep", post(keep))
+        .route("/start", post(start))
         .fallback(page)
         .with_state(Arc::new(app))
 }
@@ -186,20 +189,28 @@ async fn asset(State(app): Shared, Path(name): Path<String>, headers: HeaderMap)
 }
 
 async fn keep(State(app): Shared, headers: HeaderMap, request: Request) -> Response {
-    if let Err(refusal) = app.guard.may_change(&headers) {
-        return refused(refusal);
-    }
-    let body = tokio::time::timeout(PATIENCE, to_bytes(request.into_body(), BODY)).await;
-    let query = match body {
-        Ok(Ok(bytes)) => serde_json::from_slice::<Query>(&bytes),
-        Ok(Err(_)) => {
-            return answer(StatusCode::PAYLOAD_TOO_LARGE, "text/plain", "the request is too large".to_owned());
-        }
-        Err(_) => return answer(StatusCode::REQUEST_TIMEOUT, "text/plain", "the request came too slowly".to_owned()),
-    };
-    match query {
+    match asked::<Query>(&app, &headers, request).await {
         Ok(query) => html(app.compute(move |site| site.keep(&query)).await),
-        Err(error) => failed(&PagesError::Request(format!("the request is not understood: {error}"))),
+        Err(refusal) => refusal,
+    }
+}
+
+async fn start(State(app): Shared, headers: HeaderMap, request: Request) -> Response {
+    match asked::<Job>(&app, &headers, request).await {
+        Ok(job) => html(app.compute(move |site| site.start(&job)).await),
+        Err(refusal) => refusal,
+    }
+}
+
+/// What a request that changes something asks for, or why it is refused.
+async fn asked<T: DeserializeOwned>(app: &App, headers: &HeaderMap, request: Request) -> Result<T, Response> {
+    app.guard.may_change(headers).map_err(refused)?;
+    let body = tokio::time::timeout(PATIENCE, to_bytes(request.into_body(), BODY)).await;
+    match body {
+        Ok(Ok(bytes)) => serde_json::from_slice::<T>(&bytes)
+            .map_err(|error| failed(&PagesError::Request(format!("the request is not understood: {error}")))),
+        Ok(Err(_)) => Err(answer(StatusCode::PAYLOAD_TOO_LARGE, "text/plain", "the request is too large".to_owned())),
+        Err(_) => Err(answer(StatusCode::REQUEST_TIMEOUT, "text/plain", "the request came too slowly".to_owned())),
     }
 }
 

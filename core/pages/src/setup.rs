@@ -6,6 +6,8 @@ use chrono::NaiveDate;
 use dragfree_engine::config::Mission;
 use dragfree_engine::registry::Registry;
 
+use crate::jobs::Starter;
+
 /// True value of a coefficient of a simulation, in its SI unit.
 pub type Truth = Box<dyn Fn(&str) -> Option<f64> + Send + Sync>;
 
@@ -19,6 +21,8 @@ pub struct Setup {
     pub mission: Mission,
     /// Model file that "Keep" adds effects to; none where there is nothing to keep them in.
     pub model: Option<PathBuf>,
+    /// Programs that pages may start; none where they may not.
+    pub starter: Option<Starter>,
     /// Truth of a simulation whose seal is open.
     pub truth: Option<Truth>,
     /// Events on the time line.

@@ -8,6 +8,7 @@ use dragfree_workflow::refit::{Asked, Basis, Refit};
 use serde::Deserialize;
 
 use crate::PagesError;
+use crate::jobs::Jobs;
 use crate::setup::Setup;
 
 /// Bases that are kept in memory: a colleague may look at other days. One of 30 days takes some ten megabytes.
@@ -19,6 +20,7 @@ const MOST_PRODUCTS: usize = 120;
 /// The pages of an archive.
 pub struct Site {
     pub(crate) setup: Setup,
+    pub(crate) jobs: Jobs,
     bases: Mutex<VecDeque<(String, Arc<Basis>)>>,
 }
 
@@ -48,7 +50,7 @@ pub struct Query {
 impl Site {
     /// Pages of an archive.
     pub fn new(setup: Setup) -> Self {
-        Self { setup, bases: Mutex::default() }
+        Self { setup, jobs: Jobs::default(), bases: Mutex::default() }
     }
 
     /// What the switches of an address give.

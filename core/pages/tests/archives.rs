@@ -72,6 +72,7 @@ fn site(archive: &Path) -> Site {
         mission: Mission::parse(Path::new("taiji.toml"), text).expect("a mission"),
         model: None,
         truth: None,
+        starter: None,
         events: None,
         steps: Vec::new(),
         flags: String::new(),
