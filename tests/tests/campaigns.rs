@@ -200,46 +200,131 @@ fn what_does_not_fit_is_refused_and_nothing_taken_over() {
     assert!(!campaign.path().join("other").exists(), "a plan that failed leaves nothing");
 }
 
-/// Stands for Slurm's `sbatch`: does the tasks of an array, the last one first, once the job that it waits for has
-/// ended well, and tells the number of its own.
-const SBATCH: &str = r#"#!/bin/sh
-set -eu
-for argument; do
-    case $argument in
-    --array=*) array=${argument#--array=} ;;
-    --wrap=*) wrap=${argument#--wrap=} ;;
-    --dependency=afterok:*) [ -e "jobs/${argument##*:}" ] ;;
-    esac
-done
-task=${array#*-}
-while [ "$task" -ge "${array%-*}" ]; do
-    SLURM_ARRAY_TASK_ID=$task sh -c "$wrap" > /dev/null
-    task=$((task - 1))
-done
-number=$(($(ls jobs | wc -l) + 1))
-touch "jobs/$number"
-echo "$number"
+/// Slurm on this machine: a controller and a node, in a folder of their own.
+struct Slurm {
+    folder: TempDir,
+    daemons: Vec<Group>,
+}
+
+impl Slurm {
+    fn start() -> Self {
+        let script = root().join("tests/slurm/install.sh");
+        let said = Command::new(&script).output().expect("the script that installs Slurm");
+        assert!(said.status.success(), "{} failed: {}", script.display(), String::from_utf8_lossy(&said.stderr));
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let ask = |program: &str, argument: &str| {
+            let output = expect(Command::new(program).arg(argument), 0);
+            String::from_utf8(output.stdout).expect("text").trim().to_owned()
+        };
+        let port = || std::net::TcpListener::bind("127.0.0.1:0").expect("a port");
+        let ports = [port(), port()].map(|listener| listener.local_addr().expect("a port").port().to_string());
+        let text = std::fs::read_to_string(root().join("tests/slurm/slurm.conf")).expect("a configuration");
+        let text = text.replace("FOLDER", folder.path().to_str().expect("text")).replace("USER", &ask("id", "-un"));
+        let text = text.replace("HOST", ask("uname", "-n").split('.').next().expect("a name"));
+        let text = text.replace("PORT_OF_CONTROLLER", &ports[0]).replace("PORT_OF_NODE", &ports[1]);
+        std::fs::write(folder.path().join("slurm.conf"), text).expect("written");
+        let mut slurm = Self { folder, daemons: Vec::new() };
+        for (program, arguments) in [("slurmctld", vec!["-D", "-i"]), ("slurmd", vec!["-D"])] {
+            let mut daemon = slurm.command(program);
+            // Users other than root do not have it on their path.
+            daemon.env("PATH", path_with(&[Path::new("/usr/sbin")])).args(arguments);
+            let log = slurm.folder.path().join(program).with_extension("log");
+            slurm.daemons.push(Group::start(daemon.arg("-L").arg(log)));
+        }
+        wait("a node that takes jobs", || {
+            let idle = slurm.command("sinfo").args(["--noheader", "--format=%T"]).output();
+            idle.is_ok_and(|output| output.stdout == b"idle\n") || slurm.ended()
+        });
+        slurm
+    }
+
+    /// Never, but with what the daemons say.
+    fn ended(&self) -> bool {
+        let log = |name: &str| std::fs::read_to_string(self.folder.path().join(name)).unwrap_or_default();
+        let told = [log("slurmctld.log"), log("slurmd.log")].concat();
+        assert!(!told.contains("fatal: "), "{told}");
+        false
+    }
+
+    fn command(&self, program: &str) -> Command {
+        let mut command = Command::new(program);
+        command.env("SLURM_CONF", self.folder.path().join("slurm.conf"));
+        command
+    }
+
+    fn wait_until_idle(&self) {
+        for _ in 0..3 {
+            let since = Instant::now();
+            while since.elapsed() < Duration::from_secs(50) {
+                if expect(self.command("squeue").arg("--noheader"), 0).stdout.is_empty() {
+                    return;
+                }
+                std::thread::sleep(Duration::from_millis(100));
+            }
+        }
+        let queue = expect(&mut self.command("squeue"), 0);
+        panic!("still there: {}", String::from_utf8_lossy(&queue.stdout));
+    }
+}
+
+impl Drop for Slurm {
+    fn drop(&mut self) {
+        // Tasks are no children of the daemons.
+        let _ = self.command("scancel").args(["--partition", "all"]).status();
+        self.daemons.iter_mut().rev().for_each(Group::kill);
+    }
+}
+
+/// Stands before the program: the first one that does the third line of the plan is killed at work.
+const KILLED_ONCE: &str = r#"#!/bin/sh
+case "$*" in
+*"--number 3")
+    if mkdir killed; then
+        PROGRAM "$@" &
+        until [ -n "$(ls camp/scratch)" ]; do :; done
+        kill -KILL $!
+        exit 1
+    fi
+    ;;
+esac
+exec PROGRAM "$@"
 "#;
 
-/// The script for Slurm with a stand-in for `sbatch`: what one machine makes.
+/// Slurm itself, with arrays of at most four tasks. A task is killed at work and another one cancelled: the sums that
+/// need them fail and nothing hangs. The script does what is left when it is started again, and no more: the archive is
+/// that of one machine.
 #[test]
 fn arrays_of_slurm_make_what_one_machine_makes() {
     use std::os::unix::fs::PermissionsExt as _;
+    let slurm = Slurm::start();
     let campaign = Campaign::new();
     let tasks = campaign.plan();
-    let bin = campaign.path().join("bin");
+    assert_eq!(tasks.len(), 14, "nine days, and sums of three levels");
+    let bin = campaign.path().join("it's a folder");
     std::fs::create_dir(&bin).expect("a folder");
-    std::fs::create_dir(campaign.path().join("jobs")).expect("a folder");
-    std::fs::write(bin.join("sbatch"), SBATCH).expect("written");
-    std::fs::set_permissions(bin.join("sbatch"), std::fs::Permissions::from_mode(0o755)).expect("a program");
-    let mut script = Command::new("sh");
-    script.current_dir(campaign.path()).arg(root().join("campaigns/slurm_array.sh")).arg("camp");
-    let told = expect(script.env("PATH", path_with(&[&bin, built()])), 0);
-    let told = String::from_utf8_lossy(&told.stdout).into_owned();
-    // Nine days, their nodes of eight days, and that of sixty-four days each wait for what comes before them.
-    let days = tasks.iter().filter(|task| kind(task) == "flight").count();
-    assert!(told.starts_with(&format!("lines 1 to {days}: job 1\n")), "{told}");
-    assert!(told.lines().count() >= 2 && told.contains(&format!("to {}: job", tasks.len())), "{told}");
+    let script = KILLED_ONCE.replace("PROGRAM", built().join("dragfree").to_str().expect("text"));
+    std::fs::write(bin.join("dragfree"), script).expect("written");
+    std::fs::set_permissions(bin.join("dragfree"), std::fs::Permissions::from_mode(0o755)).expect("a program");
+    let submit = || {
+        let mut script = slurm.command(root().join("campaigns/slurm_array.sh").to_str().expect("text"));
+        script.current_dir(campaign.path()).env("PATH", path_with(&[&bin])).args(["camp", "--comment", "a test"]);
+        String::from_utf8(expect(&mut script, 0).stdout).expect("text")
+    };
+    let told = submit();
+    expect(slurm.command("scancel").arg("1_4"), 0);
+    let lines: Vec<&str> = told.lines().collect();
+    assert_eq!(lines[0], "job 1: tasks 1-4 from line 0 of the plan");
+    let rest = ["1-4 from line 4", "1 from line 8", "1-2 from line 9", "1-2 from line 11", "1 from line 13"];
+    assert!(lines[1..].iter().zip(rest).all(|(line, part)| line.contains(part)) && lines.len() == 6, "{told}");
+    slurm.wait_until_idle();
+    let status = json(campaign.command(&["status", "camp"]).arg("--json"), 0);
+    assert_eq!(status["kinds"]["days"], serde_json::json!([7, 9]), "{status}");
+    assert!(campaign.refusal(&["commit", "camp"]).contains("have a result"));
+
+    let told = submit();
+    assert!(told.lines().next().is_some_and(|line| line.ends_with(": tasks 1-2 from line 2 of the plan")), "{told}");
+    slurm.wait_until_idle();
+    assert_eq!(submit(), "every task has a result\n");
     assert_eq!(campaign.results(), tasks.len());
     campaign.commit();
     assert_eq!(&campaign.digests(), serial());
