@@ -42,6 +42,7 @@ mod recursive_solutions;
 #[path = "release/main.rs"]
 mod release;
 mod replayed_law;
+mod second_checkout;
 mod settings;
 mod threads;
 mod traps;
