@@ -1,6 +1,6 @@
 //! An archive as its users have it: damage is noticed, products are made again elsewhere, sets say what holds when.
 
-use dragfree_tests::{dragfree, expect, fixture, json, simulate};
+use dragfree_tests::{built, dragfree, expect, fixture, json, simulate};
 use serde_json::{Value, json};
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -94,6 +94,37 @@ fn a_product_is_made_again_from_a_copy_of_the_archive_and_telemetry_found_by_dig
     assert!(text.contains("resumed by COM1B_2035-01-01_SC1_01_0003"), "{text}");
     let picture = std::fs::read_to_string(other.path().join("l.svg")).expect("a picture");
     assert!(picture.contains("another-name.mcap") || picture.contains("SC1_2035-01-01.mcap"));
+}
+
+/// Plugins' libraries of another build are another origin, and the digest says so; that all the rest is the same is told.
+#[test]
+fn a_product_made_again_with_other_libraries_has_another_digest_and_the_same_result() {
+    let (dir, _) = mission();
+    let other = dir.path().join("other build");
+    std::fs::create_dir(&other).expect("a folder");
+    for entry in std::fs::read_dir(built()).expect("a folder").flatten() {
+        let (name, path) = (entry.file_name(), entry.path());
+        if name == "dragfree" || path.extension().is_some_and(|e| e == std::env::consts::DLL_EXTENSION) {
+            let mut content = std::fs::read(&path).expect("readable");
+            content.extend(if name == "dragfree" { &b""[..] } else { b"another build" });
+            std::fs::write(other.join(&name), content).expect("writable");
+        }
+    }
+    let program = other.join("dragfree");
+    std::fs::set_permissions(&program, std::fs::metadata(built().join("dragfree")).expect("there").permissions())
+        .expect("a program");
+    let rebuild = |more: &[&str], code: i32| {
+        let mut command = Command::new(&program);
+        command.current_dir(dir.path()).env_remove("DRAGFREE_PLUGIN_PATH").args(["products", "rebuild", FIRST]);
+        expect(command.args(more), code)
+    };
+    let rebuilt: Value = serde_json::from_slice(&rebuild(&["--json"], 1).stdout).expect("JSON");
+    assert_eq!((&rebuilt["same"], &rebuilt["same_but_libraries"]), (&json!(false), &json!(true)), "{rebuilt:#}");
+    let told = String::from_utf8(rebuild(&[], 1).stdout).expect("text");
+    let words = told.split_whitespace().collect::<Vec<_>>().join(" ");
+    assert!(words.contains("all that was found is the same, to the last bit"), "{told}");
+    let sound = json(&mut products(dir.path(), &["rebuild", FIRST, "--json"]), 0);
+    assert_eq!((&sound["same"], &sound["same_but_libraries"]), (&json!(true), &json!(true)), "{sound:#}");
 }
 
 /// Another model, or an edited mission file, is named as what differs.

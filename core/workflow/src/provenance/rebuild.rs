@@ -19,6 +19,9 @@ pub struct Rebuilt {
     pub id: String,
     /// Whether the new one has its digest.
     pub same: bool,
+    /// Whether it would have it if the plugins' libraries had the digests that the archived one states: all that was
+    /// found is the same, to the last bit, by code that may be other code.
+    pub same_but_libraries: bool,
     /// Digest of the archived one.
     pub archived_sha256: String,
     /// Digest of the new one.
@@ -66,12 +69,24 @@ pub fn rebuild(
     Ok(Rebuilt {
         id: id.to_owned(),
         same: archived_sha256 == digest(&made.product),
+        same_but_libraries: archived
+            .as_ref()
+            .is_ok_and(|archived| with_libraries_of(archived, &made.product).digest() == archived_sha256),
         archived_sha256,
         rebuilt_sha256: digest(&made.product),
         same_state,
         diff: archived.ok().map(|archived| diff(&archived, &made.product)),
         mended,
     })
+}
+
+/// A product as if it had been made with the libraries of another one.
+fn with_libraries_of(other: &Product, product: &Product) -> Product {
+    let mut product = product.clone();
+    for (stage, theirs) in product.history.iter_mut().zip(&other.history) {
+        stage.library_sha256.clone_from(&theirs.library_sha256);
+    }
+    product
 }
 
 /// Runs what a product of one run was made of once more.

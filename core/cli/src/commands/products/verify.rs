@@ -114,7 +114,12 @@ pub(super) fn rebuild(
     if let (false, Some(diff)) = (rebuilt.same, &rebuilt.diff) {
         text += &super::history::differences(diff, paint);
     }
-    if rebuilt.same_state == Some(false) {
+    if !rebuilt.same && rebuilt.same_but_libraries {
+        text += "\n";
+        let words = "all that was found is the same, to the last bit; the plugins' libraries alone are others, from \
+                     other sources or built by another compiler";
+        text += &text::labelled("result", words);
+    } else if rebuilt.same_state == Some(false) {
         text += &text::labelled("note", "the state that it leaves to the next day is another one");
     }
     Ok(Done { text, code })
