@@ -11,7 +11,7 @@ use std::process::Command;
 use std::time::SystemTime;
 
 /// The workspace.
-const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
+pub(crate) const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/..");
 
 /// The crate that plugins in Rust depend on.
 const SDK: &str = "dragfree-sdk";
@@ -19,8 +19,8 @@ const SDK: &str = "dragfree-sdk";
 /// Compression level: a few seconds for the whole tree.
 const ZSTD_LEVEL: i32 = 12;
 
-/// Makes archive and package in `out`, and gives their paths.
-pub(crate) fn make(out: &Path) -> Result<Vec<PathBuf>, Failure> {
+/// Makes archive and package in `out`, and gives their paths, one a line.
+pub(crate) fn make(out: &Path) -> Result<String, Failure> {
     let root = Path::new(ROOT).canonicalize()?;
     let workspace = Workspace::read(&root)?;
     let target = workspace.target.to_str().ok_or("the target folder's path is no text")?;
@@ -35,7 +35,7 @@ pub(crate) fn make(out: &Path) -> Result<Vec<PathBuf>, Failure> {
     std::io::Write::flush(&mut tree.tar(&name, time_s, zstd)?.finish()?)?;
     let package = out.join(format!("{name}.deb"));
     std::fs::write(&package, deb::package(&tree, &version, time_s)?)?;
-    Ok(vec![archive, package])
+    Ok(format!("{}\n{}\n", archive.display(), package.display()))
 }
 
 /// `SOURCE_DATE_EPOCH` makes two releases of one source the same, byte for byte.
@@ -115,14 +115,14 @@ fn sdk(root: &Path, workspace: &Workspace, tree: &mut Tree) -> Result<(), Failur
 }
 
 /// What `cargo metadata` says of our crates, and where they are built.
-struct Workspace {
+pub(crate) struct Workspace {
     packages: Vec<Value>,
     root: PathBuf,
-    target: PathBuf,
+    pub(crate) target: PathBuf,
 }
 
 impl Workspace {
-    fn read(root: &Path) -> Result<Self, Failure> {
+    pub(crate) fn read(root: &Path) -> Result<Self, Failure> {
         let text = cargo(root, &["metadata", "--no-deps", "--offline", "--format-version", "1"])?;
         let metadata: Value = serde_json::from_slice(&text)?;
         let packages = metadata["packages"].as_array().cloned().ok_or("cargo metadata names no packages")?;
@@ -151,7 +151,7 @@ impl Workspace {
     }
 
     /// Libraries of plugins: what is built as a `cdylib` beside the program.
-    fn plugins(&self) -> Vec<String> {
+    pub(crate) fn plugins(&self) -> Vec<String> {
         let targets = self.packages.iter().filter_map(|p| p["targets"].as_array()).flatten();
         let name = |target: &Value| target["name"].as_str().map(|name| name.replace('-', "_"));
         targets.filter(|target| is_plugin(target)).filter_map(name).collect()

@@ -1,8 +1,10 @@
-//! Tasks of the project's developers. `cargo xtask dist --out DIR` makes a release.
+//! Tasks of the project's developers. `cargo xtask dist --out DIR` makes a release, `cargo xtask second-checkout --at DIR`
+//! looks whether another checkout makes every product again.
 
 mod deb;
 mod dist;
 mod sbom;
+mod second_checkout;
 mod tree;
 
 use clap::{Parser, Subcommand};
@@ -28,15 +30,25 @@ enum Task {
         #[arg(long, value_name = "DIR")]
         out: PathBuf,
     },
+    /// Build a clone elsewhere, and make every product of an archive again with it; takes as long as a build
+    SecondCheckout {
+        /// A new folder for the clone and the archive
+        #[arg(long, value_name = "DIR")]
+        at: PathBuf,
+        /// Hours of telemetry of each of four days
+        #[arg(long, default_value = "2")]
+        hours: String,
+    },
 }
 
 fn main() -> ExitCode {
-    let Task::Dist { out } = Arguments::parse().task;
-    match dist::make(&out) {
-        Ok(files) => {
-            for file in files {
-                let _ = writeln!(std::io::stdout(), "{}", file.display()); // nobody may be reading
-            }
+    let done = match Arguments::parse().task {
+        Task::Dist { out } => dist::make(&out),
+        Task::SecondCheckout { at, hours } => second_checkout::try_it(&at, &hours),
+    };
+    match done {
+        Ok(told) => {
+            let _ = write!(std::io::stdout(), "{told}"); // nobody may be reading
             ExitCode::SUCCESS
         }
         Err(error) => {
