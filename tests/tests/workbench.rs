@@ -307,6 +307,68 @@ fn a_reader_finds_the_effect_and_keeps_it_by_clicks() {
     }
 }
 
+/// A formula is typed: what is wrong is marked where it is, a name is taken from the list by the keyboard, and what can be
+/// read is added to the model with the token. What is typed is text, whatever it is.
+#[test]
+fn a_formula_is_checked_while_it_is_typed() {
+    let (_alone, flight) = (alone(), flight());
+    let folder = flight.folder.path();
+    std::fs::copy(folder.join("model.toml"), folder.join("formula.toml")).expect("copied");
+    let server = serve(folder, &["--model", "formula.toml", "--allow-changes"]);
+    let browser = Browser::start(1280, 900, false);
+    browser.open(&format!("http://127.0.0.1:{}/missing?products={}#token={}", server.port, DAYS[0], server.token));
+    browser.wait_for("document.getElementById('formula')");
+    for (field, text) in [("unit", "m s-2 A-2"), ("lower", "-1e-11"), ("upper", "1e-11")] {
+        browser.write(&format!("#formula [name={field}]"), text);
+    }
+    let said = "document.getElementById('formula-said').textContent";
+    browser.write("#expression", "2 * <b>");
+    browser.wait_for("document.querySelector('#formula-said mark')");
+    let marked = browser
+        .run("const m = document.querySelector('#formula-said mark'); return [m.previousSibling.data, m.textContent]");
+    assert_eq!(marked, json!(["2 * ", "<"]));
+    let clear = "const f = document.getElementById('expression'); f.value = ''; f.focus()";
+    browser.run(clear);
+    browser.write("#expression", "hk.batery_current_a");
+    browser.wait_for(&format!("{said}.includes('no channel')"));
+    browser.run(clear);
+    browser.write("#expression", "lag(battery_cur");
+    browser.wait_for("!document.getElementById('formula-names').hidden");
+    browser.press("\u{E015}");
+    browser.press("\u{E007}");
+    assert_eq!(browser.run("return document.getElementById('expression').value"), "lag(hk.battery_current_a");
+    browser.write("#expression", " ^ 2, 50)");
+    browser.wait_for(&format!("{said}.includes('It can be read')"));
+    browser.press("\u{E007}");
+    browser.wait_for("document.querySelector('#formula-added.kept')");
+    assert_eq!(browser.console(), Vec::<String>::new());
+    let shown = json(dragfree(folder).args(["model", "show", "formula.toml", "--json"]), 0);
+    let added = shown["effects"].as_array().expect("effects").iter().find(|e| e["id"] == "formula").cloned();
+    let added = added.unwrap_or_else(|| panic!("{shown:#}"));
+    assert_eq!(added["instance"], "mine", "{added:#}");
+    assert!(added.to_string().contains("lag(hk.battery_current_a ^ 2, 50)"), "{added:#}");
+    let before = std::fs::read(folder.join("formula.toml")).expect("a model");
+    let typed = |name: &str, expression: &str| {
+        json!({ "products": DAYS[0], "name": name, "acts_on": "tm1.accel.y", "expression": expression, "unit": "m s-2",
+            "lower": "-1", "upper": "1" })
+        .to_string()
+    };
+    let own = format!("http://127.0.0.1:{}", server.port);
+    let headers =
+        |token: &str| format!("Content-Type: application/json\r\nOrigin: {own}\r\nX-Dragfree-Token: {token}\r\n");
+    let add = |token: &str, body: &str| request(server.port, "POST", "/formula", &headers(token), body);
+    assert_eq!(add("", &typed("two", "1")).status, 403);
+    let deep = "(".repeat(5000);
+    for (name, expression) in [("a.b", "1"), ("", "1"), ("two", ""), ("two", "1 +"), ("two", &deep), ("two", "hk.none")]
+    {
+        let answer = add(&server.token, &typed(name, expression));
+        assert!(answer.status == 400 && answer.body.len() < 1000, "{name} {expression}: {answer:?}");
+    }
+    assert_eq!(std::fs::read(folder.join("formula.toml")).expect("a model"), before);
+    let answer = get(server.port, "/formula?name=%3Cb%3E&expression=%3Cscript%3E&lower=%3Ci%3E&upper=1");
+    assert!(answer.status == 200 && !answer.body.contains("<i>") && !answer.body.contains("<script"), "{answer:?}");
+}
+
 /// A calibration or a diagnosis of two hours, beside other tests.
 const COMPUTES: Duration = Duration::from_secs(400);
 

@@ -156,6 +156,11 @@ pub(crate) struct Whitened {
 }
 
 impl SlowSamples {
+    /// Names and units of what was sampled.
+    pub fn housekeeping(&self) -> impl Iterator<Item = (&str, &str)> {
+        self.names.iter().zip(&self.units).map(|(name, unit)| (name.as_str(), unit.as_str()))
+    }
+
     /// Adds other products with the same housekeeping.
     pub fn add(&mut self, other: &Self) {
         if self.names != other.names {

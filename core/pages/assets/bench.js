@@ -127,6 +127,101 @@ document.addEventListener("submit", async (event) => {
   }
 });
 
+// ---- A formula ------------------------------------------------------------------------------------------------------
+
+const formula = document.getElementById("formula");
+if (formula) completed(formula);
+
+// Checks a formula while it is typed, and offers names for the word before the caret.
+function completed(form) {
+  const field = form.elements.expression;
+  const list = document.getElementById("formula-names");
+  const said = document.getElementById("formula-said");
+  const names = read("names");
+  let active = -1;
+  let timer = 0;
+  let asked = 0;
+  const word = () => /[A-Za-z_][A-Za-z0-9_.]*$/.exec(field.value.slice(0, field.selectionStart))?.[0] || "";
+  const close = () => {
+    list.hidden = true;
+    active = -1;
+    field.setAttribute("aria-expanded", "false");
+    field.removeAttribute("aria-activedescendant");
+  };
+  const take = (name) => {
+    const end = field.selectionStart;
+    field.setRangeText(name, end - word().length, end, "end");
+    close();
+    field.focus();
+    check();
+  };
+  const offer = () => {
+    const begun = word().toLowerCase();
+    const found = begun ? names.filter((n) => n.name.toLowerCase().includes(begun) && n.name !== begun).slice(0, 8) : [];
+    list.replaceChildren(
+      ...found.map((n, i) => {
+        const option = document.createElement("li");
+        option.role = "option";
+        option.id = "formula-name-" + i;
+        option.dataset.name = n.name;
+        option.textContent = n.unit ? n.name + ", " + n.unit : n.name;
+        option.addEventListener("mousedown", (event) => {
+          event.preventDefault();
+          take(n.name);
+        });
+        return option;
+      }),
+    );
+    close();
+    list.hidden = !found.length;
+    field.setAttribute("aria-expanded", String(found.length > 0));
+  };
+  const mark = (to) => {
+    const all = [...list.children];
+    active = (to + all.length) % all.length;
+    all.forEach((option, i) => option.setAttribute("aria-selected", String(i === active)));
+    field.setAttribute("aria-activedescendant", all[active].id);
+  };
+  const check = () => {
+    clearTimeout(timer);
+    const own = ++asked;
+    timer = setTimeout(async () => {
+      if (!field.value.trim()) return said.replaceChildren();
+      try {
+        const answer = await fetch("/formula?" + new URLSearchParams(new FormData(form)));
+        const text = await answer.text();
+        // One that was overtaken says nothing.
+        if (own !== asked) return;
+        if (answer.ok) said.innerHTML = text;
+        else said.textContent = text;
+        fillToken();
+      } catch {
+        said.textContent = "The server does not answer: is it still running?";
+      }
+    }, 150);
+  };
+  field.addEventListener("keydown", (event) => {
+    if (list.hidden) return;
+    if (event.key === "ArrowDown" || event.key === "ArrowUp") mark(active + (event.key === "ArrowDown" ? 1 : -1));
+    else if (event.key === "Enter" && active >= 0) take(list.children[active].dataset.name);
+    else if (event.key === "Escape") close();
+    else return;
+    event.preventDefault();
+  });
+  field.addEventListener("input", offer);
+  field.addEventListener("blur", close);
+  form.addEventListener("input", (event) => {
+    if (!event.target.classList.contains("token")) check();
+  });
+  form.addEventListener("submit", async (event) => {
+    event.preventDefault();
+    if (!said.querySelector(".token")) return;
+    const typed = Object.fromEntries(new FormData(form));
+    const place = document.getElementById("formula-added");
+    place.className = (await change("/formula", said, typed, place)) ? "kept" : "refused";
+  });
+}
+
 // ---- What runs ------------------------------------------------------------------------------------------------------
 
 // Asked for again while somebody looks; a page in the background asks nothing.

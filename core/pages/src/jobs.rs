@@ -165,6 +165,11 @@ impl Site {
         Ok(html! { "Started." }.into_string())
     }
 
+    /// Whether a command that a page has started is under way.
+    pub(crate) fn runs(&self) -> bool {
+        locked(&self.jobs.0).now.is_some()
+    }
+
     /// The command that a page has started: how far it is, and what came of the last one.
     pub(crate) fn job(&self) -> Result<Markup, PagesError> {
         let state = locked(&self.jobs.0);

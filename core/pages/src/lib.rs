@@ -5,6 +5,7 @@
 mod address;
 mod compare;
 mod day;
+mod formula;
 mod guard;
 pub mod jobs;
 mod keep;
@@ -20,6 +21,7 @@ mod site;
 mod spacecraft;
 mod trends;
 
+pub use formula::Typed;
 pub use layout::Links;
 pub use report::report;
 pub use setup::{Setup, Truth};

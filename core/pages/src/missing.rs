@@ -8,6 +8,7 @@ use maud::{Markup, html};
 
 use crate::PagesError;
 use crate::compare::{map, spectrum};
+use crate::formula::form;
 use crate::keep::commands;
 use crate::layout::{Links, command, error, millimetres, page as whole, value};
 use crate::pictures::ladder;
@@ -29,7 +30,10 @@ pub(crate) fn page(site: &Site, query: &Query, links: &Links) -> Result<Markup, 
         };
         query.products = row.id;
     }
-    let body = html! { div id="part" aria-live="polite" { (part(site, &query, links)?) } };
+    let body = html! {
+        div id="part" aria-live="polite" { (part(site, &query, links)?) }
+        (form(site, &query.products, links))
+    };
     Ok(whole(links, "Missing physics", "Missing physics", LEAD, &body))
 }
 

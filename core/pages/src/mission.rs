@@ -116,7 +116,7 @@ pub(crate) fn page(site: &Site, _query: &Query, links: &Links) -> Result<Markup,
 pub(crate) fn running(site: &Site) -> Result<Markup, PagesError> {
     let all = site.archive()?.running();
     Ok(html! {
-        @if all.is_empty() { p { "Nothing is calibrated now." } }
+        @if all.is_empty() && !site.runs() { p { "Nothing runs now." } }
         (site.job()?)
         @for job in &all {
             @let until = DateTime::from_timestamp_nanos(job.until_ns).format("%Y-%m-%d %H:%M:%S");

@@ -22,6 +22,7 @@ use tokio::net::TcpListener;
 use tokio::sync::Semaphore;
 
 use crate::PagesError;
+use crate::formula::Typed;
 use crate::guard::{Guard, Refusal};
 use crate::jobs::Job;
 use crate::layout::Links;
@@ -115,6 +116,7 @@ fn router(app: App) -> Router {
         .route("/assets/{name}", get(asset))
         .route("/keep", post(keep))
         .route("/start", post(start))
+        .route("/formula", get(formula).post(add_formula))
         .fallback(page)
         .with_state(Arc::new(app))
 }
@@ -198,6 +200,21 @@ async fn keep(State(app): Shared, headers: HeaderMap, request: Request) -> Respo
 async fn start(State(app): Shared, headers: HeaderMap, request: Request) -> Response {
     match asked::<Job>(&app, &headers, request).await {
         Ok(job) => html(app.compute(move |site| site.start(&job)).await),
+        Err(refusal) => refusal,
+    }
+}
+
+async fn formula(State(app): Shared, Asked(typed): Asked<Typed>, headers: HeaderMap) -> Response {
+    if let Err(refusal) = app.guard.may_read(&headers) {
+        return refused(refusal);
+    }
+    let links = app.links();
+    html(app.compute(move |site| Ok(site.formula(&typed, &links))).await)
+}
+
+async fn add_formula(State(app): Shared, headers: HeaderMap, request: Request) -> Response {
+    match asked::<Typed>(&app, &headers, request).await {
+        Ok(typed) => html(app.compute(move |site| site.add_formula(&typed)).await),
         Err(refusal) => refusal,
     }
 }

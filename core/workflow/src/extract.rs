@@ -59,6 +59,9 @@ pub struct Extract {
     /// What the channels leave in each band; none in extracts of older programs.
     #[serde(default)]
     by_band: Option<ByBand>,
+    /// Housekeeping channels, as expressions name them, with their units.
+    #[serde(default)]
+    housekeeping: BTreeMap<String, String>,
     /// The likelihood of stretches of time; none in extracts of older programs.
     #[serde(default)]
     stretches: Option<Stretches>,
@@ -104,6 +107,7 @@ impl Extract {
             program: env!("CARGO_PKG_VERSION").to_owned(),
             by_band: Some(ByBand::new(&coefficients, record, adopted)?),
             stretches,
+            housekeeping: housekeeping(record),
             coefficients,
             information: kept
                 .iter()
@@ -171,6 +175,11 @@ impl Extract {
         &self.named
     }
 
+    /// Housekeeping channels with their units.
+    pub(crate) fn housekeeping(&self) -> &BTreeMap<String, String> {
+        &self.housekeeping
+    }
+
     /// Levels of noise that effects could state.
     pub(crate) fn levels(&self) -> &[NoiseLevel] {
         &self.levels
@@ -204,6 +213,12 @@ impl Extract {
             channels: self.channels.clone(),
         }
     }
+}
+
+/// Housekeeping of the telemetry by its name in expressions, `hk.battery_current_a`, with its unit.
+fn housekeeping(record: &Record) -> BTreeMap<String, String> {
+    let of = |(topic, unit): (&str, &str)| Some((format!("hk.{}", topic.strip_prefix("hk/")?), unit.to_owned()));
+    record.gathered.slow.housekeeping().filter_map(of).collect()
 }
 
 fn why_unexplained(diagnosis: &Diagnosis) -> Option<String> {

@@ -10,6 +10,7 @@ pub mod compare;
 mod days;
 pub mod diagnose;
 pub mod extract;
+pub mod formula;
 pub mod foxglove;
 pub mod joint;
 pub mod ladder;

@@ -42,6 +42,8 @@ pub struct Basis {
     families: BTreeMap<String, String>,
     named: Vec<String>,
     not_tried: BTreeMap<String, String>,
+    /// Housekeeping channels with their units.
+    housekeeping: BTreeMap<String, String>,
     /// Days that are divided into a part in the fit and one that is kept out, newest first.
     divided: Mutex<VecDeque<Arc<Divided>>>,
 }
@@ -160,6 +162,8 @@ impl Basis {
             days.push(day);
         }
         let named = named_by(&extracts, &switches);
+        let housekeeping = extracts.iter().flat_map(Extract::housekeeping);
+        let housekeeping = housekeeping.map(|(name, unit)| (name.clone(), unit.clone())).collect();
         for (day, extract) in days.iter_mut().zip(extracts) {
             let (by_band, stretches) = extract.into_parts();
             (day.by_band, day.stretches) = (by_band.map(Arc::new), stretches.map(Arc::new));
@@ -177,6 +181,7 @@ impl Basis {
             named,
             not_tried,
             settings,
+            housekeeping,
             divided: Mutex::default(),
         })
     }
@@ -189,6 +194,11 @@ impl Basis {
     /// Effects that the products' own diagnoses name, by [`Effect::name`].
     pub fn named(&self) -> &[String] {
         &self.named
+    }
+
+    /// Housekeeping channels of the products, as expressions name them, with their units.
+    pub fn housekeeping(&self) -> &BTreeMap<String, String> {
+        &self.housekeeping
     }
 
     /// What could not be tried, and why.

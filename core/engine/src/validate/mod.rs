@@ -137,6 +137,21 @@ impl Subject<'_> {
         Ok(Some(linked.coefficients))
     }
 
+    /// The same, or why it finds no column to its liking among the made-up ones.
+    ///
+    /// # Errors
+    /// [`Finding`]: as above, and what it refuses when it is linked.
+    pub fn announced_coefficients(&self, instance: &str) -> Result<Vec<Coefficient>, Finding> {
+        let (_, _, linked) = self.linked(instance, false)?;
+        Ok(linked.coefficients)
+    }
+
+    /// The columns that are made up for it, the most of them.
+    pub fn columns(&self) -> Vec<Column> {
+        let rate_hz = 1e9 / self.step_ns() as f64;
+        stand::stands(self.plugin.kind, rate_hz, &serde_json::Map::new()).into_iter().next().unwrap_or_default()
+    }
+
     /// Runs `check` for each instance; a stage or a source has one.
     fn each(&self, check: impl Fn(&Self, &str) -> Result<(), Finding>, what: &str) -> Result<String, Finding> {
         let instances = self.plugin.manifest.instances_on(&self.mission.value);

@@ -4,11 +4,11 @@
 //! With c the coefficients and n what is shared, about the point of the pass,
 //!
 //! ```text
-//! χ²_f(c, n) = χ²_f − 2 sᵀ(c, n) + (c, n)ᵀ N (c, n),   n̂(c) = N_nn⁻¹ (s_n − N_nc c)
+//! χ²(c, n) = χ² − 2 sᵀ(c, n) + (c, n)ᵀ N (c, n),   χ²(c) = min_n χ²(c, n),   χ²_o(c | f) = χ²_fo(c) − χ²_f(c)
 //! ```
 //!
-//! over the stretches of the fit. n̂ is put into the form of the stretches that are kept out, so that these have no part
-//! in it.
+//! of the stretches f of the fit and of those that are kept out, o. What is shared is a polynomial in time for one: it is
+//! not known in o as f alone has it, and χ² given f counts that.
 
 use dragfree_identification::innovations::decision::{Candidate, Prior, Quadratic, inverse};
 use dragfree_identification::innovations::filter::{Block, Passed, Sums};
@@ -135,28 +135,34 @@ impl Stretches {
         self.about.len() == n && self.about.iter().all(|x| x.is_finite()) && self.all.iter().all(whole)
     }
 
-    /// The likelihood of the coefficients in the stretches of the fit, what is shared fitted there, and in those that
-    /// are kept out, with what is shared as the fit has it.
+    /// The likelihood of the coefficients in the stretches of the fit, and that of those that are kept out, given these.
     pub(crate) fn divided(&self, kept_out: impl Fn(usize) -> bool) -> (Alone, Alone) {
-        let (out, fit): (Vec<usize>, Vec<usize>) = (0..self.all.len()).partition(|k| kept_out(*k));
-        let (fit, out) = (self.sum(&fit), self.sum(&out));
+        let all: Vec<usize> = (0..self.all.len()).collect();
+        let (out, fit): (Vec<usize>, Vec<usize>) = all.iter().partition(|k| kept_out(**k));
+        let (whole, fit, out) = (self.alone(&all), self.alone(&fit), self.alone(&out));
+        let given = Alone {
+            information: whole.information - &fit.information,
+            score: whole.score - &fit.score,
+            chi2_at_zero: whole.chi2_at_zero - fit.chi2_at_zero,
+            ..out
+        };
+        (fit, given)
+    }
+
+    /// The likelihood of the coefficients in some stretches, with what is shared fitted there.
+    fn alone(&self, which: &[usize]) -> Alone {
+        let sum = self.sum(which);
         let (total, shared) = (self.about.len(), self.levels.len());
         let coefficients = total - shared;
-        let block = |of: &DMatrix<f64>, rows: (usize, usize), columns: (usize, usize)| {
-            of.view((rows.0, columns.0), (rows.1, columns.1)).into_owned()
-        };
-        let (c, n) = ((0, coefficients), (coefficients, shared));
         let priors = self.priors();
-        let (mut normal, mut right) =
-            (block(&fit.information, n, n), fit.score.rows(coefficients, shared).into_owned());
+        let mut normal = sum.information.view((coefficients, coefficients), (shared, shared)).into_owned();
+        let mut right = sum.score.rows(coefficients, shared).into_owned();
         for (terms, prior) in &priors {
             let (i, known) = (terms[0].0 - coefficients, prior.sigma.powi(-2));
             normal[(i, i)] += known;
             right[i] += known * (prior.mean - self.about[i + coefficients]);
         }
         let known = inverse(&normal);
-        let along = block(&fit.information, n, c);
-        let response = &known * &along;
         let at = &known * &right;
         let single = |i: usize| Candidate {
             parameters: vec![i],
@@ -168,41 +174,19 @@ impl Stretches {
         };
         // As the extract of the whole product is made, with what rounding alone leaves set to zero.
         let mut sums = Sums::zeros(0, 0);
-        (sums.information, sums.score) = (fit.information.clone(), fit.score.as_slice().to_vec());
-        sums.numbers = fit.numbers;
+        (sums.information, sums.score, sums.numbers) = (sum.information, sum.score.as_slice().to_vec(), sum.numbers);
         let whole = Quadratic::new(&sums, &self.about, &priors, (0..coefficients).map(single).collect());
         let (information, score) = whole.of_candidates();
         let about = DVector::from_column_slice(&self.about[..coefficients]);
-        // The form is χ² less the fitted part at the point of the pass.
-        let chi2_there = fit.chi2 - right.dot(&at);
-        let alone = Alone {
+        // At the point of the pass, less what the shared parameters take.
+        let chi2_there = sum.chi2 - right.dot(&at);
+        Alone {
             chi2_at_zero: chi2_there + 2.0 * score.dot(&about) - about.dot(&(&information * &about)),
             information,
             score,
-            numbers: fit.numbers,
+            numbers: sum.numbers,
             levels: self.levels_of(&at, &known),
-        };
-        // (c, n̂(c)) = move · c + at.
-        let mut moves = DMatrix::zeros(total, coefficients);
-        moves.view_mut((0, 0), (coefficients, coefficients)).fill_with_identity();
-        moves.view_mut((coefficients, 0), (shared, coefficients)).copy_from(&-response);
-        let mut offset = DVector::zeros(total);
-        offset.rows_mut(coefficients, shared).copy_from(&at);
-        let pulled = &out.information * &offset;
-        let own = inverse(&block(&out.information, n, n));
-        let own_at = &own * out.score.rows(coefficients, shared);
-        let information = moves.tr_mul(&(&out.information * &moves));
-        let score = moves.tr_mul(&(&out.score - &pulled));
-        let moved = &information * &about;
-        let chi2_there = out.chi2 + offset.dot(&pulled) - 2.0 * out.score.dot(&offset);
-        let kept_out = Alone {
-            chi2_at_zero: chi2_there + about.dot(&moved) + 2.0 * score.dot(&about),
-            score: score + moved,
-            information,
-            numbers: out.numbers,
-            levels: self.levels_of(&own_at, &own),
-        };
-        (alone, kept_out)
+        }
     }
 
     fn sum(&self, which: &[usize]) -> Whole {
@@ -247,11 +231,11 @@ mod tests {
 
     const ROWS: usize = 200;
 
-    /// Least squares on the rows of the fit, by QR, with three coefficients and two parameters that all stretches share:
-    /// the form has its values, its sum of squares, and in the stretch that is kept out the sum of squares at the shared
-    /// parameters that these rows want for any coefficients. About a point that is not the solution.
+    /// Least squares by QR, with three coefficients and two parameters that all stretches share, for any coefficients: the
+    /// form of the fit has its sum of squares and its values, that of what is kept out the sum of squares of all rows less
+    /// it. About a point that is not the solution.
     #[test]
-    fn what_is_kept_out_is_judged_by_what_the_others_say() {
+    fn what_is_kept_out_is_judged_given_the_others() {
         let mut random = Xoshiro256PlusPlus::seed_from_u64(3);
         let mut white = || -> f64 { StandardNormal.sample(&mut random) };
         let about = DVector::from_vec(vec![0.3, -0.2, 0.0, 0.5, 0.1]);
@@ -282,27 +266,31 @@ mod tests {
         };
         assert!(stretches.is_whole(3) && !stretches.is_whole(2));
         let (fit, out) = stretches.divided(|k| k == 1);
-        let design = DMatrix::from_fn(2 * ROWS, 5, |t, k| rows[2 * (t / ROWS)].0[(t % ROWS, k)]);
-        let measured = DVector::from_fn(2 * ROWS, |t, _| rows[2 * (t / ROWS)].1[t % ROWS]);
-        let solved = |columns: &[usize], target: &DVector<f64>| -> DVector<f64> {
-            let qr = design.select_columns(columns).qr();
+        let together = |which: &[usize]| {
+            let n = ROWS * which.len();
+            let design = DMatrix::from_fn(n, 5, |t, k| rows[which[t / ROWS]].0[(t % ROWS, k)]);
+            (design, DVector::from_fn(n, |t, _| rows[which[t / ROWS]].1[t % ROWS]))
+        };
+        let solved = |design: DMatrix<f64>, target: &DVector<f64>| -> DVector<f64> {
+            let qr = design.qr();
             qr.r().solve_upper_triangular(&qr.q().tr_mul(target)).expect("regular")
         };
-        let best = solved(&[0, 1, 2, 3, 4], &measured);
-        let own = fit.information.clone().cholesky().expect("definite").solve(&fit.score);
-        assert!((&own - best.rows(0, 3)).norm() < 1e-9, "{own} {best}");
+        let (own, all) = (together(&[0, 2]), together(&[0, 1, 2]));
+        let best = solved(own.0.clone(), &own.1);
+        let found = fit.information.clone().cholesky().expect("definite").solve(&fit.score);
+        assert!((&found - best.rows(0, 3)).norm() < 1e-9, "{found} {best}");
         let at = |form: &Alone, c: &DVector<f64>| {
             form.chi2_at_zero + c.dot(&(&form.information * c)) - 2.0 * form.score.dot(c)
         };
-        for c in [own, DVector::from_vec(vec![0.0, 0.0, 0.0]), DVector::from_vec(vec![0.5, 0.1, -2.0])] {
-            let rest = &measured - design.columns(0, 3) * &c;
-            let shared = solved(&[3, 4], &rest);
-            let squares = |design: &DMatrix<f64>, measured: &DVector<f64>| {
-                (measured - design.columns(0, 3) * &c - design.columns(3, 2) * &shared).norm_squared()
+        for c in [found, DVector::from_vec(vec![0.0, 0.0, 0.0]), DVector::from_vec(vec![0.5, 0.1, -2.0])] {
+            let squares = |(design, measured): &(DMatrix<f64>, DVector<f64>)| {
+                let rest = measured - design.columns(0, 3) * &c;
+                let shared = design.columns(3, 2).into_owned();
+                (&rest - &shared * solved(shared.clone(), &rest)).norm_squared()
             };
             let near = |a: f64, b: f64| assert!((a / b - 1.0).abs() < 1e-9, "{a} {b}");
-            near(at(&fit, &c), squares(&design, &measured));
-            near(at(&out, &c), squares(&rows[1].0, &rows[1].1));
+            near(at(&fit, &c), squares(&own));
+            near(at(&out, &c), squares(&all) - squares(&own));
         }
         assert_eq!((fit.numbers, out.numbers), (2.0 * ROWS as f64, ROWS as f64));
     }

@@ -93,6 +93,7 @@ fn basis(days: &[Data]) -> Basis {
         families: BTreeMap::new(),
         named: Vec::new(),
         not_tried: BTreeMap::new(),
+        housekeeping: BTreeMap::new(),
         divided: Mutex::default(),
     }
 }
