@@ -96,7 +96,8 @@ fn a_product_is_made_again_from_a_copy_of_the_archive_and_telemetry_found_by_dig
     assert!(picture.contains("another-name.mcap") || picture.contains("SC1_2035-01-01.mcap"));
 }
 
-/// Plugins' libraries of another build are another origin, and the digest says so; that all the rest is the same is told.
+/// Plugins' libraries of another build are another origin, and the digest says so; that all the rest is the same is
+/// told.
 #[test]
 fn a_product_made_again_with_other_libraries_has_another_digest_and_the_same_result() {
     let (dir, _) = mission();

@@ -99,8 +99,8 @@ fn a_candidate_collinear_with_the_model() {
     assert!(same.is_none_or(|sigma| sigma > 10.0 * other), "{same:?} and {other}");
 }
 
-/// What the stages make is kept in a file from pass to pass. The answer is the same, to the last digit, where there is no
-/// room for it, with gaps in the telemetry and whatever the sizes of batches.
+/// What the stages make is kept in a file from pass to pass. The answer is the same, to the last digit, where there
+/// is no room for it, with gaps in the telemetry and whatever the sizes of batches.
 #[test]
 fn a_diagnosis_without_room_for_its_rows_says_the_same() {
     let folder = tempfile::tempdir().expect("a temporary folder");

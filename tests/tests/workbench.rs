@@ -307,8 +307,8 @@ fn a_reader_finds_the_effect_and_keeps_it_by_clicks() {
     }
 }
 
-/// A formula is typed: what is wrong is marked where it is, a name is taken from the list by the keyboard, and what can be
-/// read is added to the model with the token. What is typed is text, whatever it is.
+/// A formula is typed: what is wrong is marked where it is, a name is taken from the list by the keyboard, and what
+/// can be read is added to the model with the token. What is typed is text, whatever it is.
 #[test]
 fn a_formula_is_checked_while_it_is_typed() {
     let (_alone, flight) = (alone(), flight());
@@ -372,8 +372,8 @@ fn a_formula_is_checked_while_it_is_typed() {
 /// A calibration or a diagnosis of two hours, beside other tests.
 const COMPUTES: Duration = Duration::from_secs(400);
 
-/// The whole story by clicks alone, from an empty archive: a run of what is due, the day, its diagnosis, the comparison,
-/// the effect switched on and kept, the day calibrated once more, and the error that has fallen.
+/// The whole story by clicks alone, from an empty archive: a run of what is due, the day, its diagnosis, the
+/// comparison, the effect switched on and kept, the day calibrated once more, and the error that has fallen.
 #[test]
 fn from_an_empty_archive_to_a_smaller_error_by_clicks_alone() {
     let _alone = alone();

@@ -1,5 +1,5 @@
-//! Tasks of the project's developers. `cargo xtask dist --out DIR` makes a release, `cargo xtask second-checkout --at DIR`
-//! looks whether another checkout makes every product again.
+//! Tasks of the project's developers. `cargo xtask dist --out DIR` makes a release, `cargo xtask second-checkout --at
+//! DIR` looks whether another checkout makes every product again.
 
 mod deb;
 mod dist;

@@ -142,8 +142,8 @@ fn changed(band: &Band, before: Option<&Band>) -> bool {
     by.is_some_and(|by| by > CHANGED * (band.bounds[1] - band.bounds[0]))
 }
 
-/// Channels by groups of bands; cells that are others than `before` are underlined, and `fall` is by how much χ² of each
-/// channel falls.
+/// Channels by groups of bands; cells that are others than `before` are underlined, and `fall` is by how much χ² of
+/// each channel falls.
 pub(crate) fn map(found: &Residuals, before: Option<&Residuals>, fall: Option<&[f64]>) -> Markup {
     html! {
         div class="scroll" tabindex="0" { table class="map" {

@@ -6,11 +6,12 @@ use dragfree_workflow::provenance::lineage;
 use maud::{Markup, html};
 
 use crate::PagesError;
-use crate::jobs::{Job, button};
+use crate::jobs::Job;
 use crate::layout::{Links, command, error, millimetres, page as whole, picture, shell, value};
 use crate::mission::running;
 use crate::pictures;
 use crate::site::Site;
+use crate::starting::button;
 
 pub(crate) fn page(site: &Site, id: &str, links: &Links) -> Result<Markup, PagesError> {
     let archive = site.archive()?;

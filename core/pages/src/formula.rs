@@ -6,9 +6,10 @@ use maud::{Markup, html};
 use serde::Deserialize;
 
 use crate::PagesError;
-use crate::jobs::{Job, button};
+use crate::jobs::Job;
 use crate::layout::{Links, command, data, shell};
 use crate::site::Site;
+use crate::starting::button;
 
 /// What the form holds.
 #[derive(Clone, Debug, Default, Deserialize)]

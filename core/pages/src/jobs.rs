@@ -1,5 +1,5 @@
-//! Commands that a page starts, one at a time. Each is a program of its own: what fails there ends nothing here, and its
-//! memory is not that of the pages.
+//! Commands that a page starts, one at a time. Each is a program of its own: what fails there ends nothing here, and
+//! its memory is not that of the pages.
 
 use std::io::Read;
 use std::process::{Child, Command, Stdio};
@@ -8,18 +8,12 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use dragfree_workflow::words::quoted;
-use maud::{Markup, html};
 use serde::Deserialize;
 
 use crate::PagesError;
-use crate::layout::{Links, command};
-use crate::site::Site;
 
 /// Bytes of what a command says that are kept: its last lines.
 const KEPT: usize = 4000;
-
-/// Products that are offered when days have been run.
-const OFFERED: usize = 4;
 
 /// What a page may start.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
@@ -39,34 +33,34 @@ pub type Starter = Box<dyn Fn(&Job) -> Option<Command> + Send + Sync>;
 
 /// The command under way and the last one that has ended.
 #[derive(Default)]
-pub(crate) struct Jobs(Arc<Mutex<State>>);
+pub(crate) struct Jobs(pub(crate) Arc<Mutex<State>>);
 
 #[derive(Default)]
-struct State {
-    now: Option<UnderWay>,
-    last: Option<Ended>,
+pub(crate) struct State {
+    pub(crate) now: Option<UnderWay>,
+    pub(crate) last: Option<Ended>,
     /// How many have ended.
-    ended: u64,
+    pub(crate) ended: u64,
 }
 
-struct UnderWay {
+pub(crate) struct UnderWay {
     job: Job,
-    words: String,
-    began: Instant,
+    pub(crate) words: String,
+    pub(crate) began: Instant,
     child: Child,
-    said: Arc<Mutex<Vec<u8>>>,
+    pub(crate) said: Arc<Mutex<Vec<u8>>>,
 }
 
-struct Ended {
-    job: Job,
-    words: String,
-    took: Duration,
+pub(crate) struct Ended {
+    pub(crate) job: Job,
+    pub(crate) words: String,
+    pub(crate) took: Duration,
     /// Exit code; none where a signal ended it.
-    code: Option<i32>,
-    said: String,
+    pub(crate) code: Option<i32>,
+    pub(crate) said: String,
 }
 
-fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+pub(crate) fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
@@ -84,7 +78,7 @@ fn follow(mut stream: impl Read + Send + 'static, said: &Arc<Mutex<Vec<u8>>>) ->
     })
 }
 
-fn text(said: &Mutex<Vec<u8>>) -> String {
+pub(crate) fn text(said: &Mutex<Vec<u8>>) -> String {
     String::from_utf8_lossy(&locked(said)).trim().to_owned()
 }
 
@@ -93,7 +87,7 @@ impl Jobs {
     ///
     /// # Errors
     /// Another one is under way, or the program does not start.
-    fn start(&self, job: Job, mut command: Command) -> Result<(), PagesError> {
+    pub(crate) fn start(&self, job: Job, mut command: Command) -> Result<(), PagesError> {
         let args = command.get_args().map(|word| quoted(&word.to_string_lossy()));
         let words = std::iter::once("dragfree".to_owned()).chain(args).collect::<Vec<_>>().join(" ");
         let mut state = locked(&self.0);
@@ -136,101 +130,6 @@ impl Drop for Jobs {
     }
 }
 
-/// What an exit code says.
-fn outcome(code: Option<i32>) -> (&'static str, &'static str) {
-    match code {
-        Some(0) => ("good-word", "Done"),
-        Some(3) => ("good-word", "Done; data were lost"),
-        Some(4) => ("good-word", "Done; something is missing from the model"),
-        _ => ("bad-word", "Failed"),
-    }
-}
-
-impl Site {
-    /// Starts what a page asks for. Gives what the page says then.
-    ///
-    /// # Errors
-    /// [`PagesError`]: it cannot be done here, there is no such product, or another command is under way.
-    pub fn start(&self, job: &Job) -> Result<String, PagesError> {
-        let job = match job {
-            // The name in the archive, which is no option of a command.
-            Job::Diagnose { product } => Job::Diagnose { product: self.archive()?.find(product)?.row.id },
-            Job::CatchUp => Job::CatchUp,
-        };
-        let command = self.setup.starter.as_ref().and_then(|starter| starter(&job));
-        let command = command.ok_or_else(|| {
-            PagesError::Request("this server has no mission-ops.toml that says which days there are: --ops".to_owned())
-        })?;
-        self.jobs.start(job, command)?;
-        Ok(html! { "Started." }.into_string())
-    }
-
-    /// Whether a command that a page has started is under way.
-    pub(crate) fn runs(&self) -> bool {
-        locked(&self.jobs.0).now.is_some()
-    }
-
-    /// The command that a page has started: how far it is, and what came of the last one.
-    pub(crate) fn job(&self) -> Result<Markup, PagesError> {
-        let state = locked(&self.jobs.0);
-        let newest = match &state.last {
-            Some(Ended { job: Job::CatchUp, .. }) => self.archive()?.newest()?,
-            _ => Vec::new(),
-        };
-        Ok(html! {
-            span class="hidden" data-ended=(state.ended) {}
-            @if let Some(now) = &state.now {
-                @let said = text(&now.said);
-                p { strong { "Runs, " (now.began.elapsed().as_secs()) " s so far: " } code { (now.words) }
-                    @if let Some(line) = said.lines().last() { br; span class="quiet" { (line) } }
-                }
-            } @else if let Some(last) = &state.last {
-                @let (class, word) = outcome(last.code);
-                p { strong class=(class) { (word) } ", after " (last.took.as_secs()) " s: " code { (last.words) } }
-                @match &last.job {
-                    Job::Diagnose { product } if matches!(last.code, Some(0 | 4)) => {
-                        p { a href={ "/missing?products=" (product) } { "See which effect is missing" } }
-                    }
-                    Job::CatchUp if !newest.is_empty() => {
-                        p { "Open "
-                            @for entry in newest.iter().rev().take(OFFERED) {
-                                a href={ "/day/" (entry.row.id) } { (entry.row.day) } " " }
-                        }
-                    }
-                    _ => {}
-                }
-                @if last.code != Some(0) && !last.said.is_empty() {
-                    details { summary { "What it said" } pre class="command" tabindex="0" { (last.said) } }
-                }
-            }
-        })
-    }
-}
-
-/// A button that starts a job, where this server may, and the command that does the same.
-pub(crate) fn button(site: &Site, links: &Links, job: &Job, label: &str) -> Markup {
-    let starter = site.setup.starter.as_ref().and_then(|starter| starter(job));
-    let (name, product) = match job {
-        Job::CatchUp => ("catch-up", None),
-        Job::Diagnose { product } => ("diagnose", Some(product)),
-    };
-    html! {
-        @if links.allows_changes() && starter.is_some() {
-            form class="start" data-job=(name) data-product=[product] {
-                label { "Token, printed where the server was started " input class="token" type="password"
-                    autocomplete="off" size="34"; }
-                button type="submit" { (label) }
-                span class="started" role="status" {}
-            }
-        }
-        @match job {
-            Job::CatchUp => (command("dragfree catch-up")),
-            Job::Diagnose { product } => (command(&format!("dragfree diagnose {} --keep-extract{}",
-                crate::layout::shell(product), site.setup.flags))),
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -252,8 +151,7 @@ mod tests {
     #[test]
     fn one_command_runs_at_a_time_and_its_last_words_are_kept() {
         let jobs = Jobs::default();
-        let long =
-            "i=0; while [ $i -lt 900 ]; do echo line $i; i=$((i+1)); done; echo '<b>last</b>' >&2; sleep 0.2; exit 4";
+        let long = "i=0; while [ $i -lt 900 ]; do echo line $i >&2; i=$((i+1)); done; echo '<b>last</b>' >&2; sleep 0.2; exit 4";
         jobs.start(Job::CatchUp, shell(long)).expect("starts");
         let refused = jobs.start(Job::CatchUp, shell("true")).expect_err("one is under way").to_string();
         assert!(refused.contains("runs now"), "{refused}");

@@ -7,9 +7,10 @@ use maud::{Markup, html};
 use serde_json::Value;
 
 use crate::PagesError;
-use crate::jobs::{Job, button};
+use crate::jobs::Job;
 use crate::layout::{Links, command, shell, value};
 use crate::site::{Query, Site};
+use crate::starting::button;
 
 impl Site {
     /// Adds the effects that are on to the model, as one revision, and tells the commands that prove it.

@@ -19,6 +19,7 @@ pub mod server;
 mod setup;
 mod site;
 mod spacecraft;
+mod starting;
 mod trends;
 
 pub use formula::Typed;

@@ -7,9 +7,10 @@ use dragfree_archive::Row;
 use maud::{Markup, html};
 
 use crate::PagesError;
-use crate::jobs::{Job, button};
+use crate::jobs::Job;
 use crate::layout::{Links, command, page as whole};
 use crate::site::{Query, Site};
+use crate::starting::button;
 
 /// Days that ask for attention are listed as far as this.
 const LISTED: usize = 12;

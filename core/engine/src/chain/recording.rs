@@ -1,7 +1,7 @@
 //! What the stages before the effects have made of some data, kept in a file for as long as the program needs it.
 //!
-//! A diagnosis reads the same data many times, each time with other effects. The stages before the effects make the same
-//! rows each time, so they are kept when they are made first and read from then on.
+//! A diagnosis reads the same data many times, each time with other effects. The stages before the effects make the
+//! same rows each time, so they are kept when they are made first and read from then on.
 
 use std::fs::File;
 use std::io::{BufWriter, Read as _, Seek as _, SeekFrom, Write as _};

@@ -1,8 +1,8 @@
 //! What a product's channels leave in each band, as a function of the coefficients of the model and of every candidate.
 //!
-//! With `r` the residual at the values `θ₀` and `φ_i` the regressors, the residual at θ is `r − Σ (θ_i − θ₀_i) φ_i`. Its
-//! power in a band is a quadratic form, here over the power of the noise and summed over the bands of a group. Forms of
-//! days add, as their bands are the same.
+//! With `r` the residual at the values `θ₀` and `φ_i` the regressors, the residual at θ is `r − Σ (θ_i − θ₀_i) φ_i`.
+//! Its power in a band is a quadratic form, here over the power of the noise and summed over the bands of a group.
+//! Forms of days add, as their bands are the same.
 
 use std::collections::BTreeMap;
 use std::ops::Range;

@@ -7,8 +7,8 @@
 //! χ²(c, n) = χ² − 2 sᵀ(c, n) + (c, n)ᵀ N (c, n),   χ²(c) = min_n χ²(c, n),   χ²_o(c | f) = χ²_fo(c) − χ²_f(c)
 //! ```
 //!
-//! of the stretches f of the fit and of those that are kept out, o. What is shared is a polynomial in time for one: it is
-//! not known in o as f alone has it, and χ² given f counts that.
+//! of the stretches f of the fit and of those that are kept out, o. What is shared is a polynomial in time for one:
+//! it is not known in o as f alone has it, and χ² given f counts that.
 
 use dragfree_identification::innovations::decision::{Candidate, Prior, Quadratic, inverse};
 use dragfree_identification::innovations::filter::{Block, Passed, Sums};
@@ -135,7 +135,8 @@ impl Stretches {
         self.about.len() == n && self.about.iter().all(|x| x.is_finite()) && self.all.iter().all(whole)
     }
 
-    /// The likelihood of the coefficients in the stretches of the fit, and that of those that are kept out, given these.
+    /// The likelihood of the coefficients in the stretches of the fit, and that of those that are kept out, given
+    /// these.
     pub(crate) fn divided(&self, kept_out: impl Fn(usize) -> bool) -> (Alone, Alone) {
         let all: Vec<usize> = (0..self.all.len()).collect();
         let (out, fit): (Vec<usize>, Vec<usize>) = all.iter().partition(|k| kept_out(**k));
@@ -231,9 +232,9 @@ mod tests {
 
     const ROWS: usize = 200;
 
-    /// Least squares by QR, with three coefficients and two parameters that all stretches share, for any coefficients: the
-    /// form of the fit has its sum of squares and its values, that of what is kept out the sum of squares of all rows less
-    /// it. About a point that is not the solution.
+    /// Least squares by QR, with three coefficients and two parameters that all stretches share, for any
+    /// coefficients: the form of the fit has its sum of squares and its values, that of what is kept out the sum of
+    /// squares of all rows less it. About a point that is not the solution.
     #[test]
     fn what_is_kept_out_is_judged_given_the_others() {
         let mut random = Xoshiro256PlusPlus::seed_from_u64(3);
