@@ -4,10 +4,11 @@ use std::io::{Read as _, Write as _};
 use std::net::TcpStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
+
+use crate::install;
 
 /// How long a page or an answer may take before a test fails.
 const PATIENCE: Duration = Duration::from_secs(30);
@@ -118,14 +119,11 @@ pub struct Browser {
 
 /// The browser that this test drives, or its driver; installed where there is none.
 fn program(name: &str) -> PathBuf {
-    static INSTALL: Mutex<()> = Mutex::new(());
-    let _one_at_a_time = INSTALL.lock().unwrap_or_else(PoisonError::into_inner);
     installed(name).unwrap_or_else(|| {
-        let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("browser/install.sh");
-        let said = Command::new(&script).output().expect("the script that installs the browser");
+        let said = install(&["chromium", "chromedriver"], &["chromium", "chromium-driver", "fonts-dejavu-core"]);
         installed(name).unwrap_or_else(|| {
             let error = String::from_utf8_lossy(&said.stderr);
-            panic!("there is no {name}, and {} did not install it: {error}", script.display())
+            panic!("there is no {name}, and tests/install.sh did not install it: {error}")
         })
     })
 }

@@ -7,7 +7,7 @@ pub mod recording;
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
-use std::sync::OnceLock;
+use std::sync::{Mutex, OnceLock, PoisonError};
 
 /// The repository.
 #[must_use]
@@ -51,6 +51,20 @@ pub fn dragfree(folder: &Path) -> Command {
     let mut command = Command::new(built().join(format!("dragfree{}", std::env::consts::EXE_SUFFIX)));
     command.current_dir(folder).env_remove("DRAGFREE_PLUGIN_PATH").env("NO_COLOR", "1");
     command
+}
+
+/// Installs Debian `packages` where one of the `programs` is missing, one after the other: two at once are refused. Gives
+/// what the script said.
+///
+/// # Panics
+/// The script cannot be started.
+#[must_use]
+pub fn install(programs: &[&str], packages: &[&str]) -> Output {
+    static ONE_AT_A_TIME: Mutex<()> = Mutex::new(());
+    let _turn = ONE_AT_A_TIME.lock().unwrap_or_else(PoisonError::into_inner);
+    let script = root().join("tests/install.sh");
+    let output = Command::new(script).args(programs).arg("--").args(packages).output();
+    output.expect("the script that installs what tests need")
 }
 
 /// Runs a command, asserts its exit code, and returns its output.

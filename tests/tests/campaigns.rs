@@ -2,7 +2,7 @@
 
 #![allow(clippy::print_stdout, reason = "a skipped test says so")]
 
-use dragfree_tests::{archived, built, dragfree, expect, json, root};
+use dragfree_tests::{archived, built, dragfree, expect, install, json, root};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::os::unix::process::{CommandExt as _, ExitStatusExt as _};
@@ -208,9 +208,8 @@ struct Slurm {
 
 impl Slurm {
     fn start() -> Self {
-        let script = root().join("tests/slurm/install.sh");
-        let said = Command::new(&script).output().expect("the script that installs Slurm");
-        assert!(said.status.success(), "{} failed: {}", script.display(), String::from_utf8_lossy(&said.stderr));
+        let said = install(&["slurmctld", "slurmd", "sbatch"], &["slurmctld", "slurmd", "slurm-client"]);
+        assert!(said.status.success(), "tests/install.sh failed: {}", String::from_utf8_lossy(&said.stderr));
         let folder = tempfile::tempdir().expect("a temporary folder");
         let ask = |program: &str, argument: &str| {
             let output = expect(Command::new(program).arg(argument), 0);

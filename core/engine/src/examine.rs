@@ -166,8 +166,9 @@ fn play(
     let (Some((first_ns, _)), end_ns) = (blocks.first().copied(), blocks.last().map(|(_, last)| *last)) else {
         return Ok(());
     };
+    let wanted = chain.silence_stages(recording);
     for (block, (_, until_ns)) in blocks.into_iter().enumerate() {
-        chain.play(recording, block, consumer)?;
+        chain.play(recording, block, &wanted, consumer)?;
         progress(Progress { until_ns, first_ns, end_ns });
         stop::check()?;
     }

@@ -192,17 +192,9 @@ impl Decided {
             sums.information.column_mut(i).fill(0.0);
         }
         let zero = vec![0.0; self.start.len()];
-        let single = |i: &usize| Candidate {
-            parameters: vec![*i],
-            lower: vec![f64::NEG_INFINITY],
-            upper: vec![f64::INFINITY],
-            prior_sigma: vec![f64::INFINITY],
-            ln_prior: 0.0,
-            shaped: false,
-        };
         let levels = (0..zero.len()).filter(|i| matches!(self.parameters[*i].1, Meaning::Level));
         let priors: Vec<_> = levels.map(|i| (vec![(i, 1.0)], Prior { mean: 0.0, sigma: LEVEL_PRIOR })).collect();
-        Quadratic::new(&sums, &zero, &priors, kept.iter().map(single).collect()).of_candidates()
+        Quadratic::new(&sums, &zero, &priors, kept.iter().copied().map(Candidate::free).collect()).of_candidates()
     }
 }
 

@@ -3,14 +3,15 @@
 //! A diagnosis reads the same data many times, each time with other effects. The stages before the effects make the
 //! same rows each time, so they are kept when they are made first and read from then on.
 
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{BufWriter, Read as _, Seek as _, SeekFrom, Write as _};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use super::queue::Queue;
-use super::{Chain, ChainError, Reader, To, check_join};
+use super::{Call, Chain, ChainError, ChainNode, Reader, Sink, To, check_join};
 use crate::limits::RECORDING_BYTES;
-use crate::table::{Batch, Column, TableSpec};
+use crate::table::{Batch, TableSpec};
 
 /// Rows of one block of a file.
 const BLOCK_ROWS: usize = 4096;
@@ -93,7 +94,7 @@ impl Recording {
     }
 
     /// The columns of a block that `wanted` asks for, table by table; the others stay empty.
-    fn read(&self, block: usize, wanted: &[Vec<bool>]) -> std::io::Result<Vec<Arc<Batch>>> {
+    fn read(&self, block: usize, wanted: &[Vec<bool>]) -> std::io::Result<Vec<Batch>> {
         let block = &self.blocks[block];
         let rows = block.time_ns.len();
         let mut at = block.at;
@@ -108,7 +109,7 @@ impl Recording {
                 }
                 at += 8 * rows as u64;
             }
-            batches.push(Arc::new(batch));
+            batches.push(batch);
         }
         Ok(batches)
     }
@@ -176,9 +177,8 @@ impl Chain {
 
     /// Who made the rows that effects read: data, and stages with all that they were given.
     pub(crate) fn made_by(&self, data: &str) -> String {
-        let column = |c: &Column| format!("{c:?}");
-        let stage = |n: &super::ChainNode| {
-            let columns: Vec<String> = n.writes.iter().flat_map(|t| &t.columns).map(column).collect();
+        let stage = |n: &ChainNode| {
+            let columns: Vec<String> = n.writes.iter().flat_map(|t| &t.columns).map(|c| format!("{c:?}")).collect();
             let digest = dragfree_archive::files::sha256(columns.join("\n"));
             format!("{} {} {} {digest}", n.name(), n.sha256, serde_json::Value::Object(n.parameters.clone()))
         };
@@ -186,7 +186,27 @@ impl Chain {
         format!("{data}\n{}\n{}\n{}", self.mission_sha256, self.needs.join(" "), stages.join("\n"))
     }
 
-    /// Hands the rows of a block to the effects and to the host. Stages before the effects are not called.
+    /// From now on rows come from a recording: the stages before the effects are not called and take none. Gives the
+    /// columns of each table that are read.
+    pub(crate) fn silence_stages(&mut self, recording: &Recording) -> Vec<Vec<bool>> {
+        self.from_recording = true;
+        let is_effect: Vec<bool> = self.nodes.iter().map(|n| n.is_effect).collect();
+        for route in self.nodes.iter_mut().flat_map(|n| &mut n.routes) {
+            route.readers.retain(|reader| !matches!(reader.to, To::Node(n) if !is_effect[n]));
+            // The host has what it asked for by the tap; not every column is there to be archived.
+            route.archive = false;
+        }
+        let read = |table: &TableSpec| {
+            let routes = self.nodes.iter().flat_map(|n| n.writes.iter().zip(&n.routes));
+            let own = routes.filter(|(made, _)| made.name == table.name).flat_map(|(_, route)| &route.readers);
+            let read: BTreeSet<usize> = own.flat_map(|reader| reader.columns.iter().copied()).collect();
+            (0..table.columns.len()).map(|c| read.contains(&c)).collect()
+        };
+        recording.tables.iter().map(read).collect()
+    }
+
+    /// Hands the rows of a block of a recording, in the columns that [`Self::silence_stages`] gave, to the effects and
+    /// to the host.
     ///
     /// # Errors
     /// The file cannot be read, or as [`Chain::feed`].
@@ -194,50 +214,24 @@ impl Chain {
         &mut self,
         recording: &Recording,
         block: usize,
-        sink: &mut dyn super::Sink,
+        wanted: &[Vec<bool>],
+        sink: &mut dyn Sink,
     ) -> Result<(), ChainError> {
-        self.from_recording = true;
-        let wanted = self.wanted(recording);
-        let batches = recording.read(block, &wanted).map_err(|e| ChainError::Recording { what: e.to_string() })?;
-        for (table, batch) in recording.tables.iter().zip(&batches) {
-            for i in 0..self.nodes.len() {
-                let routes = self.nodes[i].writes.iter().zip(&self.nodes[i].routes);
-                let route = routes.filter(|(made, _)| made.name == table.name).map(|(_, route)| route.clone()).next();
-                for reader in route.iter().flat_map(|route| &route.readers) {
-                    match reader.to {
-                        To::Node(n) if self.nodes[n].is_effect => {
-                            self.nodes[n].inputs[reader.input].push(batch, &reader.columns);
-                        }
-                        To::Tap => self.tap.inputs[reader.input].push(batch, &reader.columns),
-                        To::Node(_) | To::Recording => {}
-                    }
-                }
+        let mut batches = recording.read(block, wanted).map_err(|e| ChainError::Recording { what: e.to_string() })?;
+        for i in 0..self.nodes.len() {
+            let made = |table: &TableSpec| {
+                let own = recording.tables.iter().position(|kept| kept.name == table.name);
+                own.map_or_else(|| Batch::empty(table.columns.len()), |k| std::mem::take(&mut batches[k]))
+            };
+            if !self.nodes[i].is_effect {
+                let made = self.nodes[i].writes.iter().map(made).collect();
+                self.distribute(i, made, sink)?;
             }
         }
         let last_ns = recording.blocks[block].time_ns.last().copied().unwrap_or(i64::MIN);
         self.complete_until_ns = last_ns.saturating_add(1);
-        while self.round(super::Call::AnyRows, sink)? {}
+        while self.round(Call::AnyRows, sink)? {}
         Ok(())
-    }
-
-    /// Columns of each table that an effect or the host reads.
-    fn wanted(&self, recording: &Recording) -> Vec<Vec<bool>> {
-        let of = |table: &TableSpec| {
-            let mut wanted = vec![false; table.columns.len()];
-            for (made, route) in self.nodes.iter().flat_map(|n| n.writes.iter().zip(&n.routes)) {
-                let acting = |r: &&Reader| match r.to {
-                    To::Node(n) => self.nodes[n].is_effect,
-                    To::Tap => true,
-                    To::Recording => false,
-                };
-                if made.name == table.name {
-                    let columns = route.readers.iter().filter(acting).flat_map(|r| r.columns.iter());
-                    columns.for_each(|c| wanted[*c] = true);
-                }
-            }
-            wanted
-        };
-        recording.tables.iter().map(of).collect()
     }
 }
 
@@ -259,6 +253,7 @@ fn free_bytes(_file: &File) -> u64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::table::Column;
 
     fn recorder(most_bytes: u64) -> Recorder {
         let column = |table: &str, name: &str| Column {
@@ -318,7 +313,7 @@ mod tests {
             from = times.end;
             assert!(batches[0].columns[0].is_empty());
             assert_eq!(batches[0].columns[1], rows(2, times.clone()).columns[1]);
-            assert_eq!(*batches[1], *rows(1, times));
+            assert_eq!(batches[1], *rows(1, times));
         }
         assert_eq!(from, 10_000);
     }

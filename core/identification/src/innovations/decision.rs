@@ -29,6 +29,20 @@ pub struct Candidate {
     pub shaped: bool,
 }
 
+impl Candidate {
+    /// One parameter of which nothing is known before any data.
+    pub fn free(parameter: usize) -> Self {
+        Self {
+            parameters: vec![parameter],
+            lower: vec![f64::NEG_INFINITY],
+            upper: vec![f64::INFINITY],
+            prior_sigma: vec![f64::INFINITY],
+            ln_prior: 0.0,
+            shaped: false,
+        }
+    }
+}
+
 /// What counts as evidence.
 pub struct Evidence<'a> {
     /// Decimal logarithm of the corrected p-value of a gain of a candidate.

@@ -211,14 +211,7 @@ const SAME_NS: i64 = 600_000_000_000;
 fn gains(filtered: Filtered, waveforms: usize) -> Vec<f64> {
     let all = filtered.parameters.len();
     let sums = filtered.innovations.finish().total();
-    let candidate = |i: usize| Candidate {
-        parameters: vec![i],
-        lower: vec![f64::NEG_INFINITY],
-        upper: vec![f64::INFINITY],
-        prior_sigma: vec![f64::INFINITY],
-        ln_prior: 0.0,
-        shaped: true,
-    };
+    let candidate = |i: usize| Candidate { shaped: true, ..Candidate::free(i) };
     let quadratic = Quadratic::new(&sums, &vec![0.0; all], &[], (all - waveforms..all).map(candidate).collect());
     (0..waveforms).map(|k| quadratic.beside(k, &[]).gain).collect()
 }

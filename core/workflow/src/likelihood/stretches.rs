@@ -165,18 +165,10 @@ impl Stretches {
         }
         let known = inverse(&normal);
         let at = &known * &right;
-        let single = |i: usize| Candidate {
-            parameters: vec![i],
-            lower: vec![f64::NEG_INFINITY],
-            upper: vec![f64::INFINITY],
-            prior_sigma: vec![f64::INFINITY],
-            ln_prior: 0.0,
-            shaped: false,
-        };
         // As the extract of the whole product is made, with what rounding alone leaves set to zero.
         let mut sums = Sums::zeros(0, 0);
         (sums.information, sums.score, sums.numbers) = (sum.information, sum.score.as_slice().to_vec(), sum.numbers);
-        let whole = Quadratic::new(&sums, &self.about, &priors, (0..coefficients).map(single).collect());
+        let whole = Quadratic::new(&sums, &self.about, &priors, (0..coefficients).map(Candidate::free).collect());
         let (information, score) = whole.of_candidates();
         let about = DVector::from_column_slice(&self.about[..coefficients]);
         // At the point of the pass, less what the shared parameters take.

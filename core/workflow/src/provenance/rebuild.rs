@@ -3,7 +3,7 @@
 use super::{Diff, diff};
 use crate::{WorkflowError, joint};
 use dragfree_archive::files::IoContext as _;
-use dragfree_archive::product::Product;
+use dragfree_archive::product::{Product, Stage};
 use dragfree_archive::{Archive, ArchiveError, JOINT, Place, Row, Written};
 use dragfree_engine::EngineError;
 use dragfree_engine::registry::Registry;
@@ -83,8 +83,10 @@ pub fn rebuild(
 /// A product as if it had been made with the libraries of another one.
 fn with_libraries_of(other: &Product, product: &Product) -> Product {
     let mut product = product.clone();
-    for (stage, theirs) in product.history.iter_mut().zip(&other.history) {
-        stage.library_sha256.clone_from(&theirs.library_sha256);
+    for (Stage { library_sha256: own, .. }, Stage { library_sha256: theirs, .. }) in
+        product.history.iter_mut().zip(&other.history)
+    {
+        own.clone_from(theirs);
     }
     product
 }

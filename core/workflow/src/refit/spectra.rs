@@ -11,6 +11,14 @@ use crate::residuals::{Band, Channel, OUTSIDE, Residuals, fails};
 /// Power by channel and group of bands.
 type Power = Vec<Vec<f64>>;
 
+/// What is the same of all channels in each group of bands.
+#[derive(Clone, Copy)]
+struct Groups<'a> {
+    observations: &'a [f64],
+    /// Between which 95 of 100 ratios lie.
+    bounds: &'a [[f64; 2]],
+}
+
 impl Solving<'_> {
     /// None where the extract of a product does not tell its spectra.
     pub(super) fn spectra(&self, on: &[On]) -> Option<Spectra> {
@@ -33,7 +41,12 @@ impl Solving<'_> {
             (0..observations.len()).map(of).sum()
         };
         let fall = |c| chi2(&before, &as_it_is, c) - chi2(&now, &louder, c);
-        let residuals = |power: &Power, louder: &Power| self.residuals(first, &observations, power, louder);
+        let quantile = |p: f64, dof: f64| if dof > 0.0 { chi2_per_dof_quantile(p, dof) } else { 1.0 };
+        // The same for all channels, and dear.
+        let bounds: Vec<[f64; 2]> =
+            observations.iter().map(|x| [0.5 * OUTSIDE, 1.0 - 0.5 * OUTSIDE].map(|p| quantile(p, 2.0 * x))).collect();
+        let groups = Groups { observations: &observations, bounds: &bounds };
+        let residuals = |power: &Power, louder: &Power| self.residuals(first, groups, power, louder);
         Some(Spectra {
             fall: (0..first.channels.len()).map(fall).collect(),
             before: residuals(&before, &as_it_is),
@@ -53,18 +66,18 @@ impl Solving<'_> {
         all.iter().map(|x| x.max(f64::MIN_POSITIVE)).collect()
     }
 
-    fn residuals(&self, first: &ByBand, observations: &[f64], power: &Power, louder: &Power) -> Residuals {
+    fn residuals(&self, first: &ByBand, groups: Groups<'_>, power: &Power, louder: &Power) -> Residuals {
+        let Groups { observations, bounds } = groups;
         let false_alarm = self.basis.settings.false_alarm;
         let band = |c: usize, g: usize| {
             let (known, dof) = (observations[g], 2.0 * observations[g]);
             let ratio = (known > 0.0).then(|| power[c][g] / known / louder[c][g]);
-            let quantile = |p| if dof > 0.0 { chi2_per_dof_quantile(p, dof) } else { 1.0 };
             let modelled_asd = first.modelled_asd[c][g] * louder[c][g].sqrt();
             Band {
                 measured_asd: modelled_asd * ratio.unwrap_or(0.0).max(0.0).sqrt(),
                 modelled_asd,
                 ratio,
-                bounds: [0.5 * OUTSIDE, 1.0 - 0.5 * OUTSIDE].map(quantile),
+                bounds: bounds[g],
                 fails: fails(ratio, dof, observations.len() as f64, false_alarm),
             }
         };

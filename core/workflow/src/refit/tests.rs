@@ -46,14 +46,6 @@ fn basis(days: &[Data]) -> Basis {
         estimate: true,
         ..Coefficient::default()
     };
-    let candidate = |k: usize| Candidate {
-        parameters: vec![k],
-        lower: vec![f64::NEG_INFINITY],
-        upper: vec![f64::INFINITY],
-        prior_sigma: vec![f64::INFINITY],
-        ln_prior: 0.0,
-        shaped: false,
-    };
     let switch = |k: usize| Switch {
         name: format!("effect:{k}"),
         effect: "effect".to_owned(),
@@ -87,7 +79,7 @@ fn basis(days: &[Data]) -> Basis {
         coefficients: (0..n).map(coefficient).collect(),
         channels: BTreeMap::new(),
         priors: Vec::new(),
-        candidates: (OFFSETS..n).map(candidate).collect(),
+        candidates: (OFFSETS..n).map(Candidate::free).collect(),
         switches: (OFFSETS..n).map(switch).collect(),
         trials: serde_json::from_value(json!({ "forms": { "effect": n - OFFSETS, "louder": 1.0 } })).expect("trials"),
         families: BTreeMap::new(),
