@@ -1,15 +1,23 @@
 /* A stage that breaks the rules in one of many ways, chosen when it runs by the environment variable HOSTILE, as
- * PHASE_WAY. The host must say which plugin did what, end with failure in time, and archive nothing. */
+ * PHASE_WAY. The host must say which plugin did what, end with failure in time, and archive nothing. A process of its own
+ * has no environment but LD_LIBRARY_PATH. */
 #define _GNU_SOURCE
 #include <dragfree/rows.h>
+#include <fcntl.h>
 #include <fenv.h>
 #include <math.h>
 #include <pthread.h>
+#include <signal.h>
 #include <stdio.h>
+#include <sys/resource.h>
+#include <sys/socket.h>
+#include <sys/syscall.h>
+#include <sys/wait.h>
 #include <unistd.h>
 
 static const char *kind(void) {
   const char *chosen = getenv("HOSTILE");
+  if (!chosen) chosen = getenv("LD_LIBRARY_PATH");
   return chosen ? chosen : "";
 }
 
@@ -73,6 +81,28 @@ static void misbehave(const char *phase) {
     fesetround(FE_UPWARD);
 #endif
   }
+}
+
+/* Whether it reaches what a plugin that is not trusted must not reach. */
+static int reaches(void) {
+  if (is("process_reads")) return open("/etc/passwd", O_RDONLY) >= 0;
+  if (is("process_lists")) return open("/", O_RDONLY | O_DIRECTORY) >= 0;
+  if (is("process_writes")) return open("escaped", O_WRONLY | O_CREAT, 0600) >= 0;
+  if (is("process_connects")) return socket(AF_INET, SOCK_STREAM, 0) >= 0;
+  if (is("process_speaks")) return socket(AF_UNIX, SOCK_STREAM, 0) >= 0;
+  if (is("process_starts")) return system("true") == 0;
+  if (is("process_signals")) return kill(getppid(), 0) == 0;
+  if (is("process_takes_memory")) return malloc((size_t)8 << 30) != NULL;
+  if (is("process_raises_limits")) {
+    struct rlimit limit = {16, 16};
+    return setrlimit(RLIMIT_NOFILE, &limit) == 0;
+  }
+  if (is("process_forks")) {
+    pid_t child = fork();
+    if (!child) syscall(SYS_exit_group, 0);
+    return child > 0 && waitpid(child, NULL, 0) == child;
+  }
+  return 0;
 }
 
 /* Statuses and messages that are none. */
@@ -259,6 +289,7 @@ static dragfree_status hostile_process(void *self, const dragfree_inputs_v1 *inp
                                        dragfree_error_v1 *error) {
   hostile *s = self;
   misbehave("process");
+  if (reaches()) return say(error, DRAGFREE_ERROR, "reaches what it must not");
   const struct ArrowArray *table = &inputs->tables[s->x.table];
   if (!make_table(&outputs[0], input(table, -1), table->length, 1)) return say(error, DRAGFREE_FATAL, "no memory");
   memcpy(column(&outputs[0], 0), input(table, s->x.column), (size_t)table->length * 8);

@@ -206,6 +206,54 @@ fn of_single_calls() -> Vec<Case> {
     .collect()
 }
 
+/// What a plugin that is not trusted must not reach.
+const REACHES: [&str; 10] = [
+    "process_reads",
+    "process_lists",
+    "process_writes",
+    "process_connects",
+    "process_speaks",
+    "process_starts",
+    "process_signals",
+    "process_takes_memory",
+    "process_raises_limits",
+    "process_forks",
+];
+
+/// Where the plugin runs.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Place {
+    /// In the program's own process.
+    Here,
+    /// In a process of its own, as the folder's `plugins.lock` asks.
+    Apart,
+}
+use Place::{Apart, Here};
+
+impl Place {
+    fn folder(self) -> PathBuf {
+        bench().dir.path().join(if self == Here { "plugins" } else { "apart" })
+    }
+
+    /// How a case must end there, from how it must end in the program's own process.
+    fn case(self, (way, said, end): Case) -> Case {
+        if self == Here {
+            return (way, said, end);
+        }
+        let said = match said {
+            "ended the program" => "ended the process",
+            "crashed: SIGSEGV" => "crashed: signal 11",
+            "crashed: SIGABRT" => "crashed: signal 6",
+            "crashed: SIG" => "crashed: signal",
+            "was not open after 1 s" => "did not come back within 1 s",
+            said => said,
+        };
+        // What it does at its end meets a product that is made.
+        let end = if way.starts_with("destroy_") || end == Success { Success } else { Failure };
+        (way, said, end)
+    }
+}
+
 /// Six minutes of telemetry and the plugin, once.
 struct Bench {
     dir: TempDir,
@@ -219,7 +267,11 @@ fn bench() -> &'static Bench {
         let telemetry = simulate(dir.path(), &["--hours", "0.1"]).remove(0);
         let plugins = dir.path().join("plugins");
         std::fs::create_dir(&plugins).expect("writable");
-        compile_plugin(&plugins, "hostile_plugin.c", "hostile", &[]);
+        let library = compile_plugin(&plugins, "hostile_plugin.c", "hostile", &[]);
+        let apart = dir.path().join("apart");
+        std::fs::create_dir(&apart).expect("writable");
+        std::fs::copy(library, apart.join("libhostile.so")).expect("copied");
+        std::fs::write(apart.join("plugins.lock"), "isolate = true\n").expect("writable");
         let mission = fixture("missions/taiji.toml").display().to_string();
         let text = format!(
             "[pipeline]\nname = \"test\"\nmission = '{mission}'\nmodel = 'model.toml'\n\
@@ -231,23 +283,23 @@ fn bench() -> &'static Bench {
     })
 }
 
-fn run(way: &str, folder: &Path) -> Command {
+fn run(way: &str, place: Place, folder: &Path) -> Command {
     let Bench { dir, telemetry } = bench();
     let mut command = dragfree(folder);
     command.arg("run").arg(dir.path().join("pipeline.toml")).arg(telemetry).args(["--archive", "archive", "--json"]);
-    command.args(["--save-state", "state", "--plugin-dir"]).arg(dir.path().join("plugins"));
+    command.args(["--save-state", "state", "--plugin-dir"]).arg(place.folder());
     if way.ends_with("_hang") || way.ends_with("_spin") {
         command.args(["--plugin-time-limit", LIMIT_S]);
     }
-    command.env("HOSTILE", way);
+    command.env("HOSTILE", way).env("LD_LIBRARY_PATH", way);
     command
 }
 
 /// What is wrong with how a way has ended; none where all is as it must be.
-fn fault(way: &str, said: &str, end: End) -> Option<String> {
+fn fault(way: &str, place: Place, said: &str, end: End) -> Option<String> {
     let folder = tempfile::tempdir().expect("a temporary folder");
     let begun = Instant::now();
-    let Output { status, stdout, stderr } = run(way, folder.path()).output().expect("the program runs");
+    let Output { status, stdout, stderr } = run(way, place, folder.path()).output().expect("the program runs");
     let (took, stderr) = (begun.elapsed(), String::from_utf8_lossy(&stderr).into_owned());
     let code = match end {
         Failure => Some(1),
@@ -285,7 +337,8 @@ fn fault(way: &str, said: &str, end: End) -> Option<String> {
     if left.is_empty() { None } else { wrong(format!("left {left:?}")) }
 }
 
-fn check_all(cases: Vec<Case>) {
+fn check_all(cases: Vec<Case>, place: Place) {
+    let cases: Vec<Case> = cases.into_iter().map(|case| place.case(case)).collect();
     let count = cases.len();
     bench();
     let names: BTreeMap<&String, ()> = cases.iter().map(|(way, ..)| (way, ())).collect();
@@ -296,7 +349,7 @@ fn check_all(cases: Vec<Case>) {
             scope.spawn(|| {
                 loop {
                     let Some((way, said, end)) = cases.lock().expect("no panic").pop() else { break };
-                    faults.lock().expect("no panic").extend(fault(&way, said, end));
+                    faults.lock().expect("no panic").extend(fault(&way, place, said, end));
                 }
             });
         }
@@ -309,7 +362,7 @@ fn check_all(cases: Vec<Case>) {
 #[test]
 fn the_plugin_that_keeps_the_rules_goes_through() {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let product = json(&mut run("nothing", folder.path()), 0);
+    let product = json(&mut run("nothing", Here, folder.path()), 0);
     assert_eq!(product["id"], "COM1B_2035-01-01_SC1_01_0001");
     assert!(folder.path().join("state").is_file());
 }
@@ -317,24 +370,45 @@ fn the_plugin_that_keeps_the_rules_goes_through() {
 /// Constructors that ended the program made it a success, and one that hung stopped every command.
 #[test]
 fn a_library_that_misbehaves_where_it_is_opened_is_refused() {
-    check_all(where_it_is_opened());
+    check_all(where_it_is_opened(), Here);
 }
 
 #[test]
 fn a_plugin_that_ends_crashes_or_hangs_in_a_call_is_named() {
-    check_all(in_every_call());
+    check_all(in_every_call(), Here);
 }
 
 #[test]
 fn a_plugin_that_breaks_a_rule_of_a_call_is_named() {
-    check_all(of_single_calls());
+    check_all(of_single_calls(), Here);
+}
+
+#[test]
+fn a_hostile_plugin_in_a_process_of_its_own_stops_nobody() {
+    check_all(where_it_is_opened().into_iter().chain(in_every_call()).chain(of_single_calls()).collect(), Apart);
+}
+
+/// In the program's own process it reaches all of it, in one of its own nothing, and the run goes on.
+#[test]
+fn a_process_of_its_own_reaches_no_file_connection_or_process() {
+    for way in REACHES {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        let output = run(way, Here, folder.path()).output().expect("the program runs");
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.code() == Some(1) && said.contains("reaches what it must not"), "{way}: {said}");
+        let escaped = folder.path().join("escaped");
+        assert_eq!(escaped.exists(), way == "process_writes");
+        let _ = std::fs::remove_file(&escaped); // there or not
+        json(&mut run(way, Apart, folder.path()), 0);
+        assert!(!escaped.exists());
+    }
 }
 
 /// A run that its terminal stops for longer than the limit goes on afterwards.
 #[test]
 fn a_program_that_was_stopped_is_not_taken_for_one_that_hangs() {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let mut command = run("nothing", folder.path());
+    let mut command = run("nothing", Here, folder.path());
     command.args(["--plugin-time-limit", LIMIT_S]).stdout(std::process::Stdio::null());
     let mut child = command.spawn().expect("the program runs");
     let staging = folder.path().join("archive/staging");

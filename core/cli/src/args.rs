@@ -555,6 +555,9 @@ pub(crate) enum Plugins {
         #[arg(value_name = "FILE")]
         files: Vec<PathBuf>,
     },
+    /// Run the plugin that another process asks for over stdin
+    #[command(hide = true)]
+    Serve,
 }
 
 #[derive(Debug, Args)]

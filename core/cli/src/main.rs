@@ -3,7 +3,6 @@
 mod advice;
 mod args;
 mod bundled;
-mod child;
 mod commands;
 mod failure;
 mod installed;

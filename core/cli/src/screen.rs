@@ -164,6 +164,7 @@ pub(crate) fn plugins(registry: &Registry, clash: Option<&str>, paint: Paint) ->
         .plugins()
         .map(|found| {
             let file = found.opened.path.file_name().unwrap_or_default().to_string_lossy().into_owned();
+            let file = if found.opened.is_isolated() { format!("{file} (a process of its own)") } else { file };
             vec![found.info.manifest.id.clone(), found.info.kind.to_string(), found.info.manifest.version.clone(), file]
         })
         .collect();
@@ -271,6 +272,7 @@ pub(crate) fn plugins_json(registry: &Registry, clash: Option<&str>) -> Value {
             "description": found.info.manifest.description,
             "path": found.opened.path.to_string_lossy(),
             "sha256": found.opened.sha256,
+            "isolated": found.opened.is_isolated(),
         })
     });
     serde_json::json!({"plugins": plugins.collect::<Vec<_>>(), "refused": problems_json(registry.refused()), "error": clash})

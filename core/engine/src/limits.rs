@@ -1,6 +1,8 @@
 //! Budgets: how much a file, a plugin or a configuration may ask of this program. What is beyond ends in a sentence,
 //! not in an abort. `SECURITY.md` lists them with those of the mission file (`core/physics/src/ranges.rs`).
 
+use std::time::Duration;
+
 /// Largest chunk of a telemetry file, bytes, compressed or not; also of a run of loose messages and of a summary.
 pub const PIECE_BYTES: u64 = 1 << 27;
 /// Most bytes that one stored byte may become. Telemetry that repeats itself shrinks to a thirtieth, since each message
@@ -25,6 +27,8 @@ pub const CONFIG_BYTES: u64 = 16 << 20;
 
 /// Largest plugin library, bytes.
 pub const LIBRARY_BYTES: u64 = 1 << 30;
+/// Time that a library has to be opened in, in a process of its own.
+pub const OPENING: Duration = Duration::from_secs(20);
 /// Most plugins of one kind in a library.
 pub const PLUGINS: u32 = 256;
 /// Longest text that a plugin gives at once: a manifest, a declaration, the attributes of a column, bytes.
@@ -43,3 +47,7 @@ pub const LOG_BYTES: usize = 4096;
 pub const LOG_LINES: u32 = 1000;
 /// Most rows in one array from a plugin. `preprocess` gives a long gap as rows at once.
 pub const ROWS: usize = 1 << 24;
+/// Address space of a plugin in a process of its own; also most bytes of rows that it is given, or gives, at once.
+pub const ISOLATED_BYTES: u64 = 4 << 30;
+/// Longest message between this program and such a process, bytes, beside rows, reports and states.
+pub const MESSAGE_BYTES: usize = 64 << 20;

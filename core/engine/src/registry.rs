@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::border::{BorderError, Checked, Config, Instance, Kind, Library, PluginInfo};
+use crate::border::{BorderError, Checked, Config, Instance, Isolation, Kind, Library, PluginInfo};
 use dragfree_archive::files::Problem;
 
 /// The plugins that were found.
@@ -12,6 +12,7 @@ pub struct Registry {
     libraries: Vec<Arc<Library>>,
     refused: Vec<Problem>,
     folders: Vec<PathBuf>,
+    isolation: Option<Arc<Isolation>>,
 }
 
 /// A plugin of the registry.
@@ -21,6 +22,9 @@ pub struct Found {
     pub opened: Arc<Library>,
     /// Its place and manifest.
     pub info: PluginInfo,
+    isolation: Option<Arc<Isolation>>,
+    /// Whether its instances run in processes of their own.
+    apart: bool,
 }
 
 /// Tries files as plugin libraries where that can do no harm. For each the digest of what was tried, or why it is to be
@@ -44,31 +48,33 @@ pub enum RegistryError {
 impl Registry {
     /// Opens every shared library in the folders. A file that is refused is kept with its reason, and is no error.
     pub fn discover(folders: &[PathBuf]) -> Self {
-        Self::open_all(folders, None)
+        Self::open_all(folders, None, None)
     }
 
     /// The same; but what no `plugins.lock` vouches for goes through `probe` first, since a library may crash, end the
-    /// program or hang where it is opened.
-    pub fn discover_probed(folders: &[PathBuf], probe: Probe<'_>) -> Self {
-        Self::open_all(folders, Some(probe))
+    /// program or hang where it is opened. Plugins can run in processes of their own, and those of a folder that asks for
+    /// it are opened nowhere else.
+    pub fn discover_probed(folders: &[PathBuf], isolation: Isolation, probe: Probe<'_>) -> Self {
+        Self::open_all(folders, Some(Arc::new(isolation)), Some(probe))
     }
 
-    fn open_all(folders: &[PathBuf], probe: Option<Probe<'_>>) -> Self {
-        let mut this = Self { folders: folders.to_vec(), ..Self::default() };
+    fn open_all(folders: &[PathBuf], isolation: Option<Arc<Isolation>>, probe: Option<Probe<'_>>) -> Self {
+        let mut this = Self { folders: folders.to_vec(), isolation, ..Self::default() };
         let mut checked = this.check_all();
         if let Some(probe) = probe {
-            let unknown: Vec<&Path> = checked.iter().filter(|c| !c.is_locked()).map(Checked::path).collect();
+            let is_tried = |library: &Checked| !library.is_locked() && !library.is_isolated();
+            let unknown: Vec<&Path> = checked.iter().filter(|c| is_tried(c)).map(Checked::path).collect();
             let answers = if unknown.is_empty() { Vec::new() } else { probe(&unknown) };
             let mut answers = answers.into_iter();
             checked.retain(|library| {
-                let refused = if library.is_locked() { None } else { refusal(library, answers.next()) };
+                let refused = if is_tried(library) { refusal(library, answers.next()) } else { None };
                 this.refused.extend(refused.clone());
                 refused.is_none()
             });
         }
         for library in checked {
             let path = library.path().to_owned();
-            match Library::load(library) {
+            match this.opened(library) {
                 Ok(library) => {
                     let plugins = library.plugins.len();
                     tracing::debug!(path = %path.display(), sha256 = library.sha256, plugins, "opened");
@@ -79,6 +85,15 @@ impl Registry {
         }
         this.refused.sort_by(|a, b| a.path.cmp(&b.path));
         this
+    }
+
+    /// Opens a library, here or, where its folder asks for it, in a process of its own.
+    fn opened(&self, checked: Checked) -> Result<Library, BorderError> {
+        match &self.isolation {
+            Some(isolation) if checked.is_isolated() => Library::described(checked, isolation),
+            None if checked.is_isolated() => Err(not_isolated(checked.path())),
+            _ => Library::load(checked),
+        }
     }
 
     /// Every shared library in the folders that passes the checks that run no code of it, each content once.
@@ -110,7 +125,12 @@ impl Registry {
     /// Every plugin, by file and then kind.
     pub fn plugins(&self) -> impl Iterator<Item = Found> {
         self.libraries.iter().flat_map(|library| {
-            library.plugins.iter().map(|info| Found { opened: Arc::clone(library), info: info.clone() })
+            library.plugins.iter().map(|info| Found {
+                opened: Arc::clone(library),
+                info: info.clone(),
+                isolation: self.isolation.clone(),
+                apart: library.is_isolated(),
+            })
         })
     }
 
@@ -154,13 +174,29 @@ impl Registry {
 }
 
 impl Found {
+    /// The same, with instances in processes of their own if `isolate` or its folder asks for it.
+    #[must_use]
+    pub fn apart(self, isolate: bool) -> Self {
+        Self { apart: self.apart || isolate, ..self }
+    }
+
     /// Makes an instance.
     ///
     /// # Errors
-    /// The plugin refused its configuration.
+    /// The plugin refused its configuration, or its process cannot be started.
     pub fn create(&self, config: &Config) -> Result<Instance, BorderError> {
-        Instance::create(&self.opened, &self.info, config)
+        if !self.apart {
+            return Instance::create(&self.opened, &self.info, config);
+        }
+        let isolation = self.isolation.as_ref().ok_or_else(|| not_isolated(&self.opened.path))?;
+        Instance::create_apart(isolation, &self.opened, &self.info, config)
     }
+}
+
+/// What is said where nobody said how a process is started.
+fn not_isolated(path: &Path) -> BorderError {
+    let reason = "is to run in a process of its own, which this program does not start".to_owned();
+    BorderError::Refused { path: path.to_owned(), reason }
 }
 
 /// Why a library that was tried is not opened.

@@ -71,7 +71,7 @@ pub enum What {
     Added,
     /// It is gone.
     Removed,
-    /// These keys differ: `estimate`, `prior`, `parameters`, `order`.
+    /// These keys differ: `estimate`, `isolate`, `prior`, `parameters`, `order`.
     Changed(Vec<&'static str>),
 }
 
@@ -103,6 +103,7 @@ pub fn changes(old: &[EffectEntry], new: &[EffectEntry]) -> Vec<Change> {
         place += 1;
         let keys = [
             ("estimate", before.estimate != entry.estimate),
+            ("isolate", before.isolate != entry.isolate),
             ("prior", before.prior != entry.prior),
             ("parameters", before.parameters != entry.parameters),
             ("order", moved),
@@ -192,6 +193,9 @@ impl Edit {
             table.insert("instance", value(&entry.instance));
         }
         table.insert("estimate", value(entry.estimate));
+        if entry.isolate {
+            table.insert("isolate", value(true));
+        }
         if !entry.parameters.is_empty() {
             let text = toml::Value::Table(entry.parameters.clone()).to_string();
             let parameters: Value = text.parse().map_err(|_| RevisionError::Shape { path: self.path.clone() })?;

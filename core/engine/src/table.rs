@@ -1,9 +1,10 @@
 //! Tables: what flows from a feed (files or a source plugin) through the stages. See ARCHITECTURE.md.
 
 pub use dragfree_schema::Column;
+use serde::{Deserialize, Serialize};
 
 /// A table as linked: its columns after the times.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TableSpec {
     /// Name, `is` or `grid`.
     pub name: String,
@@ -37,6 +38,12 @@ impl Batch {
             time_ns: self.time_ns.split_off(at),
             columns: self.columns.iter_mut().map(|c| c.split_off(at)).collect(),
         }
+    }
+
+    /// Its columns, the times first, each as the bytes of its values.
+    pub(crate) fn bytes(&self) -> Vec<&[u8]> {
+        let values = self.columns.iter().map(|column| bytemuck::cast_slice(column));
+        std::iter::once(bytemuck::cast_slice(&self.time_ns)).chain(values).collect()
     }
 
     /// Number of rows.

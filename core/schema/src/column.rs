@@ -1,9 +1,10 @@
 //! Columns of the tables that flow through the chain.
 
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 
 /// What a column is: its name, unit, frame, rate and free attributes.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct Column {
     /// Table that the column belongs to.
     pub table: String,

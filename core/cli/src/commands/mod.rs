@@ -25,7 +25,10 @@ mod validate;
 use crate::args::{Arguments, Command, Config, Global};
 use crate::failure::{Failure, Refusal};
 use crate::text::{self, Paint};
+use dragfree_engine::border::Isolation;
+use dragfree_engine::limits::OPENING;
 use dragfree_engine::registry::Registry;
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
@@ -97,8 +100,15 @@ fn discovered(global: &Global) -> Result<Registry, Failure> {
         return Err(Refusal::PluginFolder(missing.clone()).into());
     }
     folders.extend(own_folders());
-    let limit = Duration::from_secs_f64(global.plugin_time_limit).min(probe::LIMIT);
-    Ok(Registry::discover_probed(&folders, &mut |files| probe::probe(files, limit)))
+    let limit = Duration::from_secs_f64(global.plugin_time_limit).min(OPENING);
+    Ok(Registry::discover_probed(&folders, isolation(global)?, &mut |files| probe::probe(files, limit)))
+}
+
+/// This program again, for a plugin that is to run in a process of its own.
+fn isolation(global: &Global) -> Result<Isolation, Failure> {
+    let program = std::env::current_exe().map_err(|error| format!("this program cannot find itself: {error}"))?;
+    let arguments = ["plugins", "serve", "--quiet"].map(OsString::from).to_vec();
+    Ok(Isolation { program, arguments, limit: Duration::from_secs_f64(global.plugin_time_limit) })
 }
 
 /// Beside the program, which is also where a build puts the plugins, and where an installation does.

@@ -5,6 +5,7 @@ use crate::args::{Global, Plugins};
 use crate::failure::{Failure, Refusal};
 use crate::screen;
 use crate::text::Paint;
+use dragfree_engine::border;
 use dragfree_engine::registry::Registry;
 
 pub(super) fn execute(command: &Plugins, global: &Global, paint: Paint) -> Result<Done, Failure> {
@@ -21,6 +22,7 @@ pub(super) fn execute(command: &Plugins, global: &Global, paint: Paint) -> Resul
         Plugins::Inspect { id } => inspect(&super::registry(global)?, id, global.json, paint),
         Plugins::Validate(validate) => super::validate::execute(validate, global, paint),
         Plugins::Probe { files } => super::probe::child(files),
+        Plugins::Serve => border::serve(),
         Plugins::New(new) => super::new_plugin::execute(new, global.json),
     }
 }

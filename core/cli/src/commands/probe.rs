@@ -2,7 +2,6 @@
 //! crashes, ends the program or hangs where it is opened is refused, and stops nobody.
 
 use super::Done;
-use crate::child;
 use crate::failure::Failure;
 use crate::output;
 use dragfree_engine::border::{self, BorderError, Library};
@@ -12,9 +11,6 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
-
-/// Time that a library has to be opened in.
-pub(super) const LIMIT: Duration = Duration::from_secs(20);
 
 /// For each file the digest of what was opened, or why it is refused.
 pub(super) fn probe(files: &[&Path], limit: Duration) -> Vec<Result<String, String>> {
@@ -48,7 +44,7 @@ pub(super) fn probe(files: &[&Path], limit: Duration) -> Vec<Result<String, Stri
         if answers.len() < files.len() {
             let how = match status {
                 _ if late => format!("was not open after {} s", limit.as_secs_f64()),
-                Ok(status) => child::ended(status),
+                Ok(status) => border::ended(status),
                 Err(error) => error.to_string(),
             };
             answers.push(Err(format!("{how}, where it was opened; it was tried in a process of its own")));

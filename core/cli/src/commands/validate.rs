@@ -3,10 +3,9 @@
 use super::Done;
 use crate::args::{Global, Validate};
 use crate::bundled;
-use crate::child;
 use crate::failure::{Failure, Refusal};
 use crate::text::{self, Paint};
-use dragfree_engine::border::{Library, PluginInfo};
+use dragfree_engine::border::{self, Library, PluginInfo};
 use dragfree_engine::config::Mission;
 use dragfree_engine::validate::{Check, Subject, to_json};
 use serde_json::{Value, json};
@@ -104,7 +103,7 @@ fn ask(validate: &Validate, path: &Path, check: &str, plugin: Option<(&str, &str
         Ok((Some(status), stdout, stderr)) => {
             let line = stdout.lines().rev().find_map(|line| line.strip_prefix(ANSWER));
             let told = line.and_then(|line| serde_json::from_str(line).ok());
-            told.unwrap_or_else(|| failed(format!("{}{}", child::ended(status), last_line(&stderr))))
+            told.unwrap_or_else(|| failed(format!("{}{}", border::ended(status), last_line(&stderr))))
         }
         Ok((None, ..)) => {
             let detail =

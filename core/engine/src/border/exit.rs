@@ -29,6 +29,22 @@ pub fn exit_is_due() {
     DONE.store(true, Ordering::Relaxed);
 }
 
+/// How a process ended that should have gone on.
+pub fn ended(status: std::process::ExitStatus) -> String {
+    #[cfg(unix)]
+    if let Some(signal) = std::os::unix::process::ExitStatusExt::signal(&status) {
+        let name = match signal {
+            libc::SIGILL => ", an illegal instruction",
+            libc::SIGABRT => ", it aborted",
+            libc::SIGBUS | libc::SIGSEGV => ", memory that is not its own",
+            libc::SIGFPE => ", a division of whole numbers by zero",
+            _ => "",
+        };
+        return format!("crashed: signal {signal}{name}");
+    }
+    format!("ended the process: {status}")
+}
+
 /// Ends the program now, and runs no code of any library.
 pub fn exit_now(code: u8) -> ! {
     exit_is_due();

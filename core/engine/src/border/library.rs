@@ -9,12 +9,13 @@ use std::path::{Path, PathBuf};
 
 use super::BorderError;
 use super::crash::{self, Name};
+use super::isolated::{self, Isolation};
 use super::text::{aligned, text_of};
 use crate::input::{InputFile, read_text};
 use crate::limits::{CONFIG_BYTES, LIBRARY_BYTES, PLUGINS, TEXT_BYTES};
 
 /// What a plugin is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Kind {
     /// Makes telemetry.
@@ -61,7 +62,7 @@ pub struct PluginInfo {
 pub struct Checked {
     file: InputFile,
     sha256: String,
-    locked: bool,
+    lock: Lock,
 }
 
 /// An open plugin library; never closed.
@@ -73,7 +74,8 @@ pub struct Library {
     pub sha256: String,
     /// What it holds.
     pub plugins: Vec<PluginInfo>,
-    entry: &'static abi::EntryV1,
+    /// None where its instances run in processes of their own, and this one has not opened it.
+    entry: Option<&'static abi::EntryV1>,
 }
 
 impl Checked {
@@ -90,8 +92,8 @@ impl Checked {
         }
         super::owner::check(path, &file).map_err(refuse)?;
         let sha256 = file.sums(0).map_err(unreadable)?.sha256;
-        let locked = check_lock(path, &sha256).map_err(refuse)?;
-        Ok(Self { file, sha256, locked })
+        let lock = Lock::of(path, &sha256).map_err(refuse)?;
+        Ok(Self { file, sha256, lock })
     }
 
     /// The file.
@@ -106,7 +108,12 @@ impl Checked {
 
     /// Whether the operator vouches for it by name and digest.
     pub fn is_locked(&self) -> bool {
-        self.locked
+        self.lock.vouches
+    }
+
+    /// Whether its folder asks for a process of its own for each instance.
+    pub fn is_isolated(&self) -> bool {
+        self.lock.isolates
     }
 }
 
@@ -140,6 +147,20 @@ impl Library {
         opened
     }
 
+    /// A library that was checked, and that a process of its own has opened and described: no code of it runs here.
+    ///
+    /// # Errors
+    /// As [`Self::open`], and where that process cannot be started.
+    pub fn described(checked: Checked, isolation: &Isolation) -> Result<Self, BorderError> {
+        let plugins = isolated::described(isolation, &checked)?;
+        Ok(Self { path: checked.path().to_owned(), sha256: checked.sha256, plugins, entry: None })
+    }
+
+    /// Whether its instances run in processes of their own, whoever makes them.
+    pub fn is_isolated(&self) -> bool {
+        self.entry.is_none()
+    }
+
     /// Opens a library and reads its manifests: what runs code of it.
     fn read(checked: Checked) -> Result<Self, String> {
         let library = ManuallyDrop::new(open(&checked)?);
@@ -163,7 +184,7 @@ impl Library {
         // SAFETY: the version matches, so the plugin says that the whole struct is there; it is never unloaded.
         let entry: &'static abi::EntryV1 = unsafe { &*entry };
         let path = checked.path().to_owned();
-        let mut this = Self { path, sha256: checked.sha256, plugins: Vec::new(), entry };
+        let mut this = Self { path, sha256: checked.sha256, plugins: Vec::new(), entry: Some(entry) };
         for kind in Kind::ALL {
             this.read_manifests(kind)?;
         }
@@ -195,7 +216,8 @@ impl Library {
     }
 
     pub(super) fn factory(&self, kind: Kind) -> Result<Option<&'static abi::FactoryV1>, String> {
-        let get = self.entry.get_factory.ok_or("its entry has no `get_factory`")?;
+        let entry = self.entry.ok_or("it runs in a process of its own, and was not opened here")?;
+        let get = entry.get_factory.ok_or("its entry has no `get_factory`")?;
         let id = CString::new(kind.factory_id()).map_err(|e| e.to_string())?;
         // SAFETY: the id is NUL-terminated.
         let factory = unsafe { get(id.as_ptr()) };
@@ -217,7 +239,7 @@ fn open(checked: &Checked) -> Result<libloading::Library, String> {
     let opened = unsafe { libloading::Library::new(format!("/proc/self/fd/{descriptor}")) };
     match opened {
         // Libraries beside it that it finds by `$ORIGIN` are found by its path alone; nobody promised them by digest.
-        Err(_) if !checked.locked && checked.file.is_in_place().is_ok_and(|same| same) => by_path(checked),
+        Err(_) if !checked.is_locked() && checked.file.is_in_place().is_ok_and(|same| same) => by_path(checked),
         opened => opened.map_err(unloadable),
     }
 }
@@ -237,25 +259,42 @@ fn unloadable(error: libloading::Error) -> String {
     format!("is no shared library that this machine can load: {error}")
 }
 
-/// `plugins.lock` beside the libraries: a table `[sha256]` from file name to digest. Where it exists, nothing else
-/// loads; true where it has the file.
-fn check_lock(path: &Path, sha256: &str) -> Result<bool, String> {
-    #[derive(Deserialize)]
-    #[serde(deny_unknown_fields)]
-    struct Lock {
-        sha256: std::collections::BTreeMap<String, String>,
-    }
-    let lock_path = path.with_file_name("plugins.lock");
-    let text = match read_text(&lock_path, CONFIG_BYTES) {
-        Ok(text) => text,
-        Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(false),
-        Err(e) => return Err(format!("{} cannot be read: {e}", lock_path.display())),
-    };
-    let lock: Lock = toml::from_str(&text).map_err(|e| format!("{}: {e}", lock_path.display()))?;
-    let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
-    match lock.sha256.get(&name) {
-        Some(locked) if locked.eq_ignore_ascii_case(sha256) => Ok(true),
-        Some(_) => Err(format!("its digest {sha256} is not the one in {}", lock_path.display())),
-        None => Err(format!("it is not listed in {}; add its digest {sha256} if you trust it", lock_path.display())),
+/// What `plugins.lock` beside a library says of it: a table `[sha256]` from file name to digest, outside of which nothing
+/// loads, and `isolate = true` for a folder whose plugins run in processes of their own.
+#[derive(Clone, Copy, Debug, Default)]
+struct Lock {
+    vouches: bool,
+    isolates: bool,
+}
+
+impl Lock {
+    fn of(path: &Path, sha256: &str) -> Result<Self, String> {
+        #[derive(Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct File {
+            #[serde(default)]
+            isolate: bool,
+            sha256: Option<std::collections::BTreeMap<String, String>>,
+        }
+        let lock_path = path.with_file_name("plugins.lock");
+        let text = match read_text(&lock_path, CONFIG_BYTES) {
+            Ok(text) => text,
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Self::default()),
+            Err(e) => return Err(format!("{} cannot be read: {e}", lock_path.display())),
+        };
+        let file: File = toml::from_str(&text).map_err(|e| format!("{}: {e}", lock_path.display()))?;
+        let isolates = file.isolate;
+        let Some(locked) = file.sha256 else {
+            let empty = || format!("{} says neither `isolate` nor [sha256]", lock_path.display());
+            return isolates.then_some(Self { vouches: false, isolates }).ok_or_else(empty);
+        };
+        let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
+        match locked.get(&name) {
+            Some(locked) if locked.eq_ignore_ascii_case(sha256) => Ok(Self { vouches: true, isolates }),
+            Some(_) => Err(format!("its digest {sha256} is not the one in {}", lock_path.display())),
+            None => {
+                Err(format!("it is not listed in {}; add its digest {sha256} if you trust it", lock_path.display()))
+            }
+        }
     }
 }

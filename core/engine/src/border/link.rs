@@ -3,6 +3,7 @@
 use dragfree_abi as abi;
 use dragfree_schema::{Coefficient, Constraint, NOISE_ATTRIBUTE, NoiseProcess};
 use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::ffi::{CString, c_char, c_void};
 
@@ -13,14 +14,14 @@ use crate::limits::{COLUMNS, DECLARATIONS, NAME_BYTES, TEXT_BYTES};
 use crate::table::{Column, TableSpec};
 
 /// A column that an instance reads: its index among the available ones.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct ReadColumn {
     /// Index into [`available`](super::LinkRequest::available).
     pub available: usize,
 }
 
 /// What an instance declared when it was linked.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Linked {
     /// Per input table, in slot order: the columns read.
     pub reads: Vec<Vec<ReadColumn>>,
@@ -154,6 +155,30 @@ impl<'a> LinkContext<'a> {
         }
         Ok(())
     }
+}
+
+/// What another process says that an instance declared, checked again as if it had been declared here.
+///
+/// # Errors
+/// A sentence: it is not what a plugin can declare.
+pub(super) fn declared_again(claimed: Linked, available: &[Column], kind: Kind) -> Result<Linked, String> {
+    let mut context = LinkContext::new(available, kind);
+    for columns in &claimed.reads {
+        let table = |read: &ReadColumn| available.get(read.available).map(|column| column.table.as_str());
+        let first = columns.first().and_then(table).ok_or("reads a table without columns")?;
+        if columns.iter().any(|read| table(read) != Some(first)) {
+            return Err("reads columns of several tables as one".to_owned());
+        }
+        context.linked.reads.push(columns.clone());
+    }
+    claimed.writes.into_iter().flat_map(|table| table.columns).try_for_each(|column| context.write(column))?;
+    if kind != Kind::Effect && !(claimed.coefficients.is_empty() && claimed.constraints.is_empty()) {
+        return Err("announces a coefficient or a constraint, but is no effect".to_owned());
+    }
+    take(&mut context.linked.coefficients, claimed.coefficients, "coefficients")?;
+    take(&mut context.linked.constraints, claimed.constraints, "constraints")?;
+    take(&mut context.linked.noise, claimed.noise, "noise processes")?;
+    Ok(context.linked)
 }
 
 /// The declared noise makes sense, and enters channels that exist.

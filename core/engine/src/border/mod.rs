@@ -9,16 +9,23 @@ mod exit;
 mod floats;
 mod host;
 mod instance;
+#[cfg(target_os = "linux")]
+mod isolated;
+#[cfg(not(target_os = "linux"))]
+#[path = "isolated_elsewhere.rs"]
+mod isolated;
 mod library;
 mod link;
+mod local;
 mod owner;
 mod read;
 mod text;
 
 pub use crash::overdue;
 pub use dragfree_schema::{Manifest, Parameter, ParameterType};
-pub use exit::{exit_is_due, exit_now, watch_exit};
+pub use exit::{ended, exit_is_due, exit_now, watch_exit};
 pub use instance::{Config, Instance, LinkRequest, Rows, SourceStep};
+pub use isolated::{Isolation, serve};
 pub use library::{Checked, Kind, Library, PluginInfo};
 pub use link::{Linked, ReadColumn};
 

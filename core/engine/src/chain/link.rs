@@ -42,8 +42,8 @@ pub fn build(
     let mut behind_effects = false;
     for node in &pipeline.nodes {
         match node {
-            Node::Stage { plugin, parameters } => {
-                builder.stage(plugin, parameters, pipeline)?;
+            Node::Stage { plugin, isolate, parameters } => {
+                builder.stage(plugin, *isolate, parameters, pipeline)?;
                 if let (true, Some(from_ns), Some(stage)) =
                     (behind_effects, carry.run_in_until_ns, builder.chain.nodes.last_mut())
                 {
@@ -111,8 +111,14 @@ impl Builder<'_> {
         json!({ "coefficients": told, "constraints": self.chain.constraints, "noise": self.chain.noise }).to_string()
     }
 
-    fn stage(&mut self, id: &str, parameters: &toml::Table, pipeline: &Pipeline) -> Result<(), ChainError> {
-        let found = self.registry.find(Kind::Stage, id)?;
+    fn stage(
+        &mut self,
+        id: &str,
+        isolate: bool,
+        parameters: &toml::Table,
+        pipeline: &Pipeline,
+    ) -> Result<(), ChainError> {
+        let found = self.registry.find(Kind::Stage, id)?.apart(isolate);
         let file = pipeline.path.display().to_string();
         let parameters = resolve_parameters(&file, &found.info.manifest, parameters)?;
         self.add(&found, parameters, "", Standing::Member)?;
@@ -122,7 +128,7 @@ impl Builder<'_> {
     fn effects(&mut self) -> Result<(), ChainError> {
         let mut constraints: Vec<(Constraint, u32)> = Vec::new();
         for entry in &self.model.effects {
-            let found = self.registry.find(Kind::Effect, &entry.id)?;
+            let found = self.registry.find(Kind::Effect, &entry.id)?.apart(entry.isolate);
             entry.check_instance(&found.info.manifest, self.mission).map_err(|what| self.model_error(what))?;
             let file = self.model.path.display().to_string();
             let parameters = resolve_parameters(&file, &found.info.manifest, &entry.parameters)?;
@@ -156,7 +162,7 @@ impl Builder<'_> {
 
     /// An effect that is not in the model: what keeps it from being tried is no error of the run.
     fn candidate(&mut self, entry: &EffectEntry, standing: Standing) -> Result<(), ChainError> {
-        let found = self.registry.find(Kind::Effect, &entry.id)?;
+        let found = self.registry.find(Kind::Effect, &entry.id)?.apart(entry.isolate);
         let mut linked = self.chain.coefficients.iter();
         if let Some(c) = linked.find(|c| c.effect == entry.id && c.instance == entry.instance) {
             // Before it is linked, because its table has the name of the other's.

@@ -41,6 +41,9 @@ pub struct EffectEntry {
     /// False fixes every coefficient at its value.
     #[serde(default = "yes")]
     pub estimate: bool,
+    /// Whether it runs in a process of its own.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub isolate: bool,
     /// Priors by the last part of a coefficient's name, `x`.
     #[serde(default)]
     pub prior: BTreeMap<String, Prior>,
@@ -183,6 +186,7 @@ impl EffectEntry {
             id: id.to_owned(),
             instance: instance.to_owned(),
             estimate: true,
+            isolate: false,
             prior: BTreeMap::new(),
             parameters: toml::Table::new(),
         }

@@ -36,6 +36,8 @@ pub enum Node {
     Stage {
         /// Id of the plugin.
         plugin: String,
+        /// Whether it runs in a process of its own.
+        isolate: bool,
         /// Parameters as written.
         parameters: toml::Table,
     },
@@ -89,6 +91,8 @@ struct StageEntry {
     #[serde(default)]
     effects: bool,
     #[serde(default)]
+    isolate: bool,
+    #[serde(default)]
     parameters: toml::Table,
 }
 
@@ -112,11 +116,12 @@ impl Pipeline {
         let mut nodes = Vec::new();
         for (i, stage) in file.stage.into_iter().enumerate() {
             nodes.push(match (stage.plugin, stage.effects) {
-                (Some(plugin), false) => Node::Stage { plugin, parameters: stage.parameters },
-                (None, true) if stage.parameters.is_empty() => Node::Effects,
+                (Some(plugin), false) => Node::Stage { plugin, isolate: stage.isolate, parameters: stage.parameters },
+                (None, true) if stage.parameters.is_empty() && !stage.isolate => Node::Effects,
                 (None, true) => {
                     return Err(sense(
-                        "`effects = true` takes no parameters; they belong into the model file".to_owned(),
+                        "`effects = true` takes neither parameters nor `isolate`; they belong into the model file"
+                            .to_owned(),
                     ));
                 }
                 (Some(_), true) => {

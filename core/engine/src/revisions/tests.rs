@@ -292,14 +292,15 @@ fn effect() -> impl Strategy<Value = EffectEntry> {
     (
         any::<String>(),
         "(tm[12](\\.[xyz](-[xyz])?)?)?",
-        any::<bool>(),
+        any::<[bool; 2]>(),
         prop::collection::btree_map("[a-z\"ü -]{1,4}", prior, 0..3),
         prop::collection::btree_map(any::<String>(), parameter(), 0..3),
     )
-        .prop_map(|(id, instance, estimate, prior, parameters)| EffectEntry {
+        .prop_map(|(id, instance, [estimate, isolate], prior, parameters)| EffectEntry {
             id,
             instance,
             estimate,
+            isolate,
             prior,
             parameters: parameters.into_iter().collect(),
         })
