@@ -53,8 +53,8 @@ pub fn dragfree(folder: &Path) -> Command {
     command
 }
 
-/// Installs Debian `packages` where one of the `programs` is missing, one after the other: two at once are refused. Gives
-/// what the script said.
+/// Installs Debian `packages` where one of the `programs` is missing, one after the other: two at once are refused.
+/// Gives what the script said.
 ///
 /// # Panics
 /// The script cannot be started.

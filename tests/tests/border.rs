@@ -249,3 +249,41 @@ fn a_locked_folder_loads_only_what_is_locked() {
     let list = json(dragfree(dir.path()).args(["plugins", "list", "--json", "--plugin-dir"]).arg(dir.path()), 0);
     assert!(list.to_string().contains("not listed in"), "{list}");
 }
+
+/// What a run of a day's chain leaves: series, sums and the state for tomorrow. `isolate` stands in every stage and effect.
+#[cfg(target_os = "linux")]
+fn science_mode(isolate: bool, folder: &Path) -> Vec<Vec<u8>> {
+    let isolated = |text: String, key: &str| {
+        let lines = text.lines().map(|line| match line.starts_with(key) && isolate {
+            true => format!("{line}\nisolate = true\n"),
+            false => format!("{line}\n"),
+        });
+        lines.collect::<String>()
+    };
+    let read = |path: &str| std::fs::read_to_string(fixture(path)).expect("a fixture");
+    let (pipeline, model) = (folder.join("pipeline.toml"), folder.join("model.toml"));
+    let text = read("pipelines/science-mode.toml").replace("../models/com-offset.toml", "model.toml");
+    let text = text.replace("../missions/taiji.toml", &fixture("missions/taiji.toml").display().to_string());
+    std::fs::write(&pipeline, isolated(text, "plugin = ")).expect("writable");
+    std::fs::write(&model, isolated(read("models/com-offset.toml"), "id = ")).expect("writable");
+    let mut command = dragfree(folder);
+    command.arg("run").arg(&pipeline).arg(telemetry()).args(["--archive", "archive", "--save-state", "state", "-v"]);
+    let output = command.arg("--json").output().expect("the program runs");
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{said}");
+    let product: serde_json::Value = serde_json::from_slice(&output.stdout).expect("JSON");
+    let id = product["id"].as_str().expect("an id");
+    let files = [".mcap", ".neq.json"].map(|end| folder.join("archive").join(format!("{id}{end}")));
+    files.iter().chain([&folder.join("state")]).map(|path| std::fs::read(path).expect("written")).collect()
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn a_run_in_processes_of_their_own_is_the_same_to_the_last_bit() {
+    let [here, apart] = [false, true].map(|isolate| {
+        let folder = tempfile::tempdir().expect("a temporary folder");
+        science_mode(isolate, folder.path())
+    });
+    let same: Vec<bool> = here.iter().zip(&apart).map(|(a, b)| a == b).collect();
+    assert_eq!(same, [true; 3], "series, sums, state");
+}

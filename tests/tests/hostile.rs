@@ -404,6 +404,38 @@ fn a_process_of_its_own_reaches_no_file_connection_or_process() {
     }
 }
 
+/// Whoever waits for the plugin is gone: it must not stay for ever.
+#[test]
+fn a_process_of_its_own_ends_with_the_program() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let mut command = run("process_hang", Apart, folder.path());
+    command.args(["--plugin-time-limit", "600"]).stdout(std::process::Stdio::null());
+    let mut program = command.stderr(std::process::Stdio::null()).spawn().expect("the program runs");
+    let of_program = format!("/proc/{0}/task/{0}/children", program.id());
+    let begun = Instant::now();
+    // One that has ended and that nobody has asked about has the state Z.
+    let alive = |pid: &String| {
+        let stat = std::fs::read_to_string(Path::new("/proc").join(pid).join("stat"));
+        stat.is_ok_and(|stat| !stat.contains(") Z "))
+    };
+    let children = loop {
+        let children = std::fs::read_to_string(&of_program).expect("children");
+        let children: Vec<String> = children.split_whitespace().map(str::to_owned).collect();
+        // Two at most: one says what the library holds, before one has the instance, in whose call it hangs.
+        if !children.is_empty() && folder.path().join("archive/staging").is_dir() {
+            break children;
+        }
+        assert!(begun.elapsed() < LONGEST, "it starts no process");
+        std::thread::sleep(Duration::from_millis(20));
+    };
+    program.kill().expect("it runs");
+    program.wait().expect("it ends");
+    while children.iter().any(alive) {
+        assert!(begun.elapsed() < LONGEST, "{children:?} are still there");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
+
 /// A run that its terminal stops for longer than the limit goes on afterwards.
 #[test]
 fn a_program_that_was_stopped_is_not_taken_for_one_that_hangs() {

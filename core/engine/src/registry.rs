@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::border::{BorderError, Checked, Config, Instance, Isolation, Kind, Library, PluginInfo};
+use crate::border::{self, BorderError, Checked, Config, Instance, Isolation, Kind, Library, PluginInfo};
 use dragfree_archive::files::Problem;
 
 /// The plugins that were found.
@@ -90,7 +90,7 @@ impl Registry {
     /// Opens a library, here or, where its folder asks for it, in a process of its own.
     fn opened(&self, checked: Checked) -> Result<Library, BorderError> {
         match &self.isolation {
-            Some(isolation) if checked.is_isolated() => Library::described(checked, isolation),
+            Some(isolation) if checked.is_isolated() => border::described(isolation, &checked),
             None if checked.is_isolated() => Err(not_isolated(checked.path())),
             _ => Library::load(checked),
         }

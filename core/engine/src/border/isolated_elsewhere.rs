@@ -5,7 +5,7 @@ use std::ffi::OsString;
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::instance::{Config, LinkRequest, Rows, SourceStep};
+use super::call::{Config, LinkRequest, Rows, SourceStep};
 use super::library::{Checked, Library, PluginInfo};
 use super::link::Linked;
 use super::{BorderError, exit_now};
@@ -25,7 +25,11 @@ pub fn serve() -> ! {
     exit_now(1)
 }
 
-pub(super) fn described(_: &Isolation, checked: &Checked) -> Result<Vec<PluginInfo>, BorderError> {
+/// Refuses a library.
+///
+/// # Errors
+/// Always.
+pub fn described(_: &Isolation, checked: &Checked) -> Result<Library, BorderError> {
     Err(BorderError::Refused { path: checked.path().to_owned(), reason: NOT_HERE.to_owned() })
 }
 

@@ -9,7 +9,6 @@ use std::path::{Path, PathBuf};
 
 use super::BorderError;
 use super::crash::{self, Name};
-use super::isolated::{self, Isolation};
 use super::text::{aligned, text_of};
 use crate::input::{InputFile, read_text};
 use crate::limits::{CONFIG_BYTES, LIBRARY_BYTES, PLUGINS, TEXT_BYTES};
@@ -147,13 +146,10 @@ impl Library {
         opened
     }
 
-    /// A library that was checked, and that a process of its own has opened and described: no code of it runs here.
-    ///
-    /// # Errors
-    /// As [`Self::open`], and where that process cannot be started.
-    pub fn described(checked: Checked, isolation: &Isolation) -> Result<Self, BorderError> {
-        let plugins = isolated::described(isolation, &checked)?;
-        Ok(Self { path: checked.path().to_owned(), sha256: checked.sha256, plugins, entry: None })
+    /// A library that was checked, and of which a process of its own says that it has these plugins: no code of it runs
+    /// here.
+    pub(super) fn elsewhere(checked: &Checked, plugins: Vec<PluginInfo>) -> Self {
+        Self { path: checked.path().to_owned(), sha256: checked.sha256.clone(), plugins, entry: None }
     }
 
     /// Whether its instances run in processes of their own, whoever makes them.

@@ -4,9 +4,9 @@ use arrow_schema::{DataType, ffi::FFI_ArrowSchema};
 use dragfree_abi as abi;
 use std::ffi::{CString, c_void};
 
+use super::call::{Config, LinkRequest, Rows, SourceStep};
 use super::crash::Name;
 use super::host::{self, Collected, ConfigContext, Log};
-use super::instance::{Config, LinkRequest, Rows, SourceStep};
 use super::library::{Kind, Library, PluginInfo};
 use super::link::{self, CColumn, LinkContext, Linked};
 use super::{BorderError, FLOATS_CHANGED, arrow, without_name};

@@ -4,6 +4,7 @@
 #![allow(unsafe_code, reason = "this module calls through the C border")]
 
 mod arrow;
+mod call;
 mod crash;
 mod exit;
 mod floats;
@@ -21,11 +22,12 @@ mod owner;
 mod read;
 mod text;
 
+pub use call::{Config, LinkRequest, Rows, SourceStep};
 pub use crash::overdue;
 pub use dragfree_schema::{Manifest, Parameter, ParameterType};
 pub use exit::{ended, exit_is_due, exit_now, watch_exit};
-pub use instance::{Config, Instance, LinkRequest, Rows, SourceStep};
-pub use isolated::{Isolation, serve};
+pub use instance::Instance;
+pub use isolated::{Isolation, described, serve};
 pub use library::{Checked, Kind, Library, PluginInfo};
 pub use link::{Linked, ReadColumn};
 

@@ -15,7 +15,7 @@ use tracing::field::{Field, Visit};
 use tracing::span::{Attributes, Id, Record};
 use tracing::{Event, Level, Metadata, Subscriber};
 
-use super::super::instance::{Config, LinkRequest, Rows};
+use super::super::call::{Config, LinkRequest, Rows};
 use super::super::library::{Checked, Library, PluginInfo};
 use super::super::local::Local;
 use super::super::{BorderError, exit_now};

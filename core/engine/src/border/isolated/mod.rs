@@ -12,7 +12,8 @@ mod parent;
 mod sandbox;
 
 pub use child::serve;
-pub(super) use parent::{Isolated, described};
+pub(super) use parent::Isolated;
+pub use parent::described;
 
 use std::ffi::OsString;
 use std::path::PathBuf;

@@ -11,7 +11,7 @@ use std::process::{Child, Command, ExitStatus};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-use super::super::instance::{Config, LinkRequest, Rows, SourceStep};
+use super::super::call::{Config, LinkRequest, Rows, SourceStep};
 use super::super::library::{Checked, Kind, Library, PluginInfo};
 use super::super::link::{self, Linked};
 use super::super::{BorderError, ended, without_name};
@@ -205,15 +205,15 @@ impl Isolated {
     }
 }
 
-/// What a library holds, as a process says that opened it behind the sandbox.
+/// A library, as a process says that opened it behind the sandbox: no code of it runs in this one.
 ///
 /// # Errors
 /// The process cannot be started, or the library is refused there, crashes or hangs.
-pub(in super::super) fn described(isolation: &Isolation, checked: &Checked) -> Result<Vec<PluginInfo>, BorderError> {
-    let path = checked.path().to_owned();
+pub fn described(isolation: &Isolation, checked: &Checked) -> Result<Library, BorderError> {
+    let path = checked.path();
     let name = path.file_name().map_or_else(String::new, |name| name.to_string_lossy().into_owned());
-    let (plugins, _) = opened(isolation, &path, checked.sha256(), &name, Vec::new())?;
-    Ok(plugins)
+    let (plugins, _) = opened(isolation, path, checked.sha256(), &name, Vec::new())?;
+    Ok(Library::elsewhere(checked, plugins))
 }
 
 /// What a library holds, and its process with the memory that this one writes and the one that it writes.
@@ -259,8 +259,6 @@ struct Process {
     child: Child,
     socket: Option<UnixStream>,
     limit: Duration,
-    /// Lines that it has logged.
-    lines: u32,
     /// Closed when all that it has printed is told.
     told: Receiver<()>,
 }
@@ -273,6 +271,8 @@ impl Process {
         command.args(&isolation.arguments).stdin(OwnedFd::from(its)).stdout(writer.try_clone()?).stderr(writer);
         // It needs nothing of the environment, and its terminal's signals are for this program.
         command.env_clear().process_group(0);
+        // Batches come and go: the C library would give their memory back to the system each time, and ask again.
+        command.env("MALLOC_TRIM_THRESHOLD_", "268435456").env("MALLOC_MMAP_THRESHOLD_", "33554432");
         if let Some(path) = std::env::var_os("LD_LIBRARY_PATH") {
             command.env("LD_LIBRARY_PATH", path);
         }
@@ -285,7 +285,7 @@ impl Process {
             drop::<std::sync::mpsc::Sender<()>>(sender);
         };
         std::thread::Builder::new().spawn(tell)?;
-        let mut process = Self { child, socket: Some(socket), limit: isolation.limit, lines: 0, told };
+        let mut process = Self { child, socket: Some(socket), limit: isolation.limit, told };
         process.hand_over(memories)?;
         Ok(process)
     }
@@ -308,19 +308,14 @@ impl Process {
         let socket = self.socket.as_ref().ok_or(io::ErrorKind::NotConnected)?;
         let mut timed = Timed { socket, waited: Duration::ZERO, limit: self.limit };
         send(&mut timed, ask, bytes)?;
-        loop {
+        // Each line is told at once, and none of them counts as the answer: there is an end to it.
+        for _ in 0..=LOG_LINES + 1 {
             match receive(&mut timed, most)? {
-                (Answer::Log { level, text }, _) => {
-                    self.lines = self.lines.saturating_add(1);
-                    tell(name, level, &text, self.lines);
-                    // What is logged costs time, and no plugin needs so many lines.
-                    if self.lines > 10 * LOG_LINES {
-                        return Err(io::Error::other(format!("logged {} lines", self.lines)));
-                    }
-                }
+                (Answer::Log { level, text }, _) => tell(name, level, &text),
                 answer => return Ok(answer),
             }
         }
+        Err(io::Error::other(format!("it logs more than {LOG_LINES} lines in one call")))
     }
 
     /// Why a message did not come through: how the process ended. One that lives is ended.
@@ -418,12 +413,9 @@ impl Write for Timed<'_> {
 }
 
 /// Logs a line of a plugin.
-fn tell(plugin: &str, level: i32, text: &str, line: u32) {
-    let end = text.floor_char_boundary(LOG_BYTES);
-    let text = &text[..end];
-    if line > LOG_LINES + 1 {
-        return;
-    }
+fn tell(plugin: &str, level: i32, text: &str) {
+    // Bytes that are no UTF-8 have become three each.
+    let text = if text.len() > 4 * LOG_BYTES { "a line that is too long, left out" } else { text };
     match level {
         abi::LOG_ERROR => tracing::error!(%plugin, "{text}"),
         abi::LOG_WARN => tracing::warn!(%plugin, "{text}"),
@@ -435,11 +427,14 @@ fn tell(plugin: &str, level: i32, text: &str, line: u32) {
 /// Tells what a process prints, its last words among it.
 fn tell_printed(plugin: &str, pipe: io::PipeReader) {
     let mut lines = BufReader::new(pipe);
-    for line in 1.. {
+    for line in 0.. {
         let mut bytes = Vec::new();
         match lines.by_ref().take(LOG_BYTES as u64).read_until(b'\n', &mut bytes) {
             Ok(0) | Err(_) => return,
-            Ok(_) => tell(plugin, abi::LOG_WARN, String::from_utf8_lossy(&bytes).trim_end(), line),
+            // What is beyond is read all the same: a full pipe would stop it.
+            Ok(_) if line > LOG_LINES => {}
+            Ok(_) if line == LOG_LINES => tell(plugin, abi::LOG_WARN, &format!("printed more than {line} lines")),
+            Ok(_) => tell(plugin, abi::LOG_WARN, String::from_utf8_lossy(&bytes).trim_end()),
         }
     }
 }
