@@ -102,7 +102,7 @@ impl Isolated {
             columns.extend(table.columns.iter().map(|column| bytemuck::cast_slice::<f64, u8>(column)));
         }
         let written = self.input.write(&columns);
-        written.map_err(|error| self.failed("process", format!("cannot be given its rows: {error}")))?;
+        written.map_err(|error| self.failed("process", &format!("cannot be given its rows: {error}")))?;
         let rows = tables.iter().map(|table| table.time_ns.len()).collect();
         match self.ask("process", &Ask::Process { rows, complete_until_ns }, &[], 0)?.0 {
             Answer::Discarded => Ok(None),
@@ -167,7 +167,7 @@ impl Isolated {
             Ok(answer) => Ok(answer),
             Err(error) => {
                 let why = self.process.why(&error);
-                Err(self.failed(call, why))
+                Err(self.failed(call, &why))
             }
         };
         self.dead = answer.is_err();
@@ -181,7 +181,7 @@ impl Isolated {
         }
         let sizes: Vec<_> = rows.iter().copied().zip(self.output_columns.iter().copied()).collect();
         let copied = self.output.copied(&sizes);
-        copied.map_err(|error| self.failed(call, format!("its rows cannot be read: {error}; {APART}")))
+        copied.map_err(|error| self.failed(call, &format!("its rows cannot be read: {error}; {APART}")))
     }
 
     fn error(&self, call: &'static str, kind: Failed, message: String) -> BorderError {
@@ -193,8 +193,8 @@ impl Isolated {
         }
     }
 
-    fn failed(&self, call: &'static str, message: String) -> BorderError {
-        let message = without_name(&self.name, &message).to_owned();
+    fn failed(&self, call: &'static str, message: &str) -> BorderError {
+        let message = without_name(&self.name, message).to_owned();
         BorderError::Plugin { plugin: self.name.clone(), call, message }
     }
 
