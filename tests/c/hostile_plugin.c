@@ -1,6 +1,6 @@
 /* A stage that breaks the rules in one of many ways, chosen when it runs by the environment variable HOSTILE, as
- * PHASE_WAY. The host must say which plugin did what, end with failure in time, and archive nothing. A process of its own
- * has no environment but LD_LIBRARY_PATH. */
+ * PHASE_WAY. The host must say which plugin did what, end with failure in time, and archive nothing. A process of its
+ * own has no environment but LD_LIBRARY_PATH. */
 #define _GNU_SOURCE
 #include <dragfree/rows.h>
 #include <fcntl.h>
@@ -60,7 +60,8 @@ static void misbehave(const char *phase) {
   if (!strcmp(way, "exit_at_once")) _exit(0);
   if (!strcmp(way, "quick_exit")) quick_exit(0);
   if (!strcmp(way, "exit_in_a_thread")) in_a_thread(exit_in_a_thread);
-  if (!strcmp(way, "hang"))
+  /* Two names: tests give a plugin that hangs a second. */
+  if (!strcmp(way, "hang") || !strcmp(way, "wait"))
     for (;;) sleep(1);
   if (!strcmp(way, "spin"))
     for (volatile unsigned i = 0;; i++) {

@@ -250,7 +250,8 @@ fn a_locked_folder_loads_only_what_is_locked() {
     assert!(list.to_string().contains("not listed in"), "{list}");
 }
 
-/// What a run of a day's chain leaves: series, sums and the state for tomorrow. `isolate` stands in every stage and effect.
+/// What a run of a day's chain leaves: series, sums and the state for tomorrow. `isolate` stands in every stage and
+/// effect.
 #[cfg(target_os = "linux")]
 fn science_mode(isolate: bool, folder: &Path) -> Vec<Vec<u8>> {
     let isolated = |text: String, key: &str| {

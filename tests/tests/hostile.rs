@@ -408,10 +408,15 @@ fn a_process_of_its_own_reaches_no_file_connection_or_process() {
 #[test]
 fn a_process_of_its_own_ends_with_the_program() {
     let folder = tempfile::tempdir().expect("a temporary folder");
-    let mut command = run("process_hang", Apart, folder.path());
-    command.args(["--plugin-time-limit", "600"]).stdout(std::process::Stdio::null());
+    let mut command = run("process_wait", Apart, folder.path());
+    command.stdout(std::process::Stdio::null());
     let mut program = command.stderr(std::process::Stdio::null()).spawn().expect("the program runs");
-    let of_program = format!("/proc/{0}/task/{0}/children", program.id());
+    // Of all its threads.
+    let children_of = |pid: u32| -> Vec<String> {
+        let tasks = std::fs::read_dir(format!("/proc/{pid}/task")).expect("a running program").flatten();
+        let read = |task: std::fs::DirEntry| std::fs::read_to_string(task.path().join("children")).unwrap_or_default();
+        tasks.flat_map(|task| read(task).split_whitespace().map(str::to_owned).collect::<Vec<_>>()).collect()
+    };
     let begun = Instant::now();
     // One that has ended and that nobody has asked about has the state Z.
     let alive = |pid: &String| {
@@ -419,8 +424,7 @@ fn a_process_of_its_own_ends_with_the_program() {
         stat.is_ok_and(|stat| !stat.contains(") Z "))
     };
     let children = loop {
-        let children = std::fs::read_to_string(&of_program).expect("children");
-        let children: Vec<String> = children.split_whitespace().map(str::to_owned).collect();
+        let children = children_of(program.id());
         // Two at most: one says what the library holds, before one has the instance, in whose call it hangs.
         if !children.is_empty() && folder.path().join("archive/staging").is_dir() {
             break children;

@@ -52,8 +52,8 @@ impl Registry {
     }
 
     /// The same; but what no `plugins.lock` vouches for goes through `probe` first, since a library may crash, end the
-    /// program or hang where it is opened. Plugins can run in processes of their own, and those of a folder that asks for
-    /// it are opened nowhere else.
+    /// program or hang where it is opened. Plugins can run in processes of their own, and those of a folder that asks
+    /// for it are opened nowhere else.
     pub fn discover_probed(folders: &[PathBuf], isolation: Isolation, probe: Probe<'_>) -> Self {
         Self::open_all(folders, Some(Arc::new(isolation)), Some(probe))
     }

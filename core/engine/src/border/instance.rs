@@ -1,4 +1,5 @@
-//! A plugin instance: created, linked, fed, asked for report and state, destroyed; in this process or in one of its own.
+//! A plugin instance: created, linked, fed, asked for report and state, destroyed; in this process or in one of its
+//! own.
 
 use dragfree_schema::Report;
 

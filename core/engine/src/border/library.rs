@@ -255,8 +255,8 @@ fn unloadable(error: libloading::Error) -> String {
     format!("is no shared library that this machine can load: {error}")
 }
 
-/// What `plugins.lock` beside a library says of it: a table `[sha256]` from file name to digest, outside of which nothing
-/// loads, and `isolate = true` for a folder whose plugins run in processes of their own.
+/// What `plugins.lock` beside a library says of it: a table `[sha256]` from file name to digest, outside of which
+/// nothing loads, and `isolate = true` for a folder whose plugins run in processes of their own.
 #[derive(Clone, Copy, Debug, Default)]
 struct Lock {
     vouches: bool,

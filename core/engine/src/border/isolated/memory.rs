@@ -202,7 +202,7 @@ mod tests {
         }
     }
 
-    /// A child that names more rows than there are, or shrinks the memory behind us, ends in an error and not in SIGBUS.
+    /// A child that names more rows than there are, or shrinks the memory behind us, ends in an error, not in SIGBUS.
     #[test]
     fn memory_that_is_not_there_is_refused() {
         let mut memory = Memory::new().unwrap();

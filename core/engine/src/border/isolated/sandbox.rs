@@ -1,5 +1,5 @@
-//! What a process of a plugin may do: compute. It opens no other program, no connection and no file but its libraries and
-//! the files of its configuration, and has a limited address space.
+//! What a process of a plugin may do: compute. It opens no other program, no connection and no file but its libraries
+//! and the files of its configuration, and has a limited address space.
 
 use landlock::{
     ABI, Access, AccessFs, Ruleset, RulesetAttr, RulesetCreatedAttr, RulesetStatus, Scope, path_beneath_rules,
