@@ -10,6 +10,7 @@ use chrono::NaiveDate;
 use dragfree_archive::files::IoContext as _;
 use dragfree_archive::product::Product;
 use dragfree_archive::{Archive, Written};
+use dragfree_engine::border;
 use dragfree_engine::registry::Registry;
 use dragfree_workflow::calibrate::{Options, Progress};
 use dragfree_workflow::joint;
@@ -143,6 +144,9 @@ pub(super) fn watch(command: &Watch, global: &Global, paint: Paint) -> Result<Do
         let told = run_due(&mut desk, None, global);
         match told {
             Ok(told) => {
+                if !told.is_empty() {
+                    border::give_memory_back();
+                }
                 for day in told {
                     crate::output::print(&day.line(paint))?;
                 }

@@ -41,7 +41,8 @@ pub(super) fn borrow(time_ns: &[i64], columns: &[&[f64]]) -> (impl Sized + use<>
         .map(|b| abi::ArrowArray { length: rows, n_buffers: 2, buffers: b.as_mut_ptr(), ..abi::ArrowArray::empty() })
         .collect();
     let mut child_pointers: Vec<*mut abi::ArrowArray> = children.iter_mut().map(|c| &raw mut *c).collect();
-    let mut own_buffers = Box::new([ptr::null()]);
+    // All of these are vectors: what a box holds may only be reached through it, wherever it is moved.
+    let mut own_buffers = vec![ptr::null()];
     let array = abi::ArrowArray {
         length: rows,
         n_buffers: 1,
@@ -155,7 +156,8 @@ mod tests {
             .iter_mut()
             .map(|b| abi::ArrowArray { length: 3, n_buffers: 2, buffers: b.as_mut_ptr(), ..abi::ArrowArray::empty() })
             .collect();
-        let mut pointers: Vec<*mut abi::ArrowArray> = children.iter_mut().map(|c| &raw mut *c).collect();
+        let first = children.as_mut_ptr();
+        let mut pointers: Vec<*mut abi::ArrowArray> = (0..2).map(|i| unsafe { first.add(i) }).collect();
         let mut table = abi::ArrowArray {
             length: 3,
             n_buffers: 1,
@@ -163,8 +165,19 @@ mod tests {
             children: pointers.as_mut_ptr(),
             ..abi::ArrowArray::empty()
         };
-        change(&mut table, &mut children);
+        change(&mut table, unsafe { std::slice::from_raw_parts_mut(first, 2) });
         unsafe { check_shape(&table, 2) }
+    }
+
+    #[test]
+    fn what_is_borrowed_is_where_the_array_says() {
+        let (times, values) = ([1_i64, 2, 3], [4.0_f64, 5.0, 6.0]);
+        let (_owned, array) = borrow(&times, &[&values]);
+        assert_eq!(unsafe { check_shape(&array, 2) }, Ok(3));
+        assert!(unsafe { (*array.buffers).is_null() });
+        let column = |i: usize| unsafe { &**array.children.add(i) };
+        assert_eq!(unsafe { super::values::<i64>(column(0), 1, 2) }, times[1..]);
+        assert_eq!(unsafe { super::values::<f64>(column(1), 0, 3) }, values);
     }
 
     /// A length of 2^60, or a large offset, ended the program: their products with the size of a value overflow.

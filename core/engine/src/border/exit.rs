@@ -100,3 +100,13 @@ fn end(code: libc::c_int) -> ! {
     // SAFETY: the call takes a number and does not return.
     unsafe { libc::_exit(code) }
 }
+
+/// Gives memory that is not in use back to the system, where the C library can: it keeps what the largest day needed,
+/// and with threads that come and go ever more of it.
+pub fn give_memory_back() {
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: takes a number, and may be called at any time.
+    unsafe {
+        libc::malloc_trim(0);
+    }
+}

@@ -25,7 +25,7 @@ mod text;
 pub use call::{Config, LinkRequest, Rows, SourceStep};
 pub use crash::overdue;
 pub use dragfree_schema::{Manifest, Parameter, ParameterType};
-pub use exit::{ended, exit_is_due, exit_now, watch_exit};
+pub use exit::{ended, exit_is_due, exit_now, give_memory_back, watch_exit};
 pub use instance::Instance;
 pub use isolated::{Isolation, described, serve};
 pub use library::{Checked, Kind, Library, PluginInfo};
