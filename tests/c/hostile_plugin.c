@@ -92,7 +92,7 @@ static int reaches(void) {
   if (is("process_connects")) return socket(AF_INET, SOCK_STREAM, 0) >= 0;
   if (is("process_speaks")) return socket(AF_UNIX, SOCK_STREAM, 0) >= 0;
   if (is("process_starts")) return system("true") == 0;
-  if (is("process_signals")) return kill(getppid(), 0) == 0;
+  if (is("process_signals")) return kill(getppid(), 0) == 0 || syscall(SYS_tgkill, getppid(), getppid(), 0) == 0;
   if (is("process_takes_memory")) return malloc((size_t)8 << 30) != NULL;
   if (is("process_raises_limits")) {
     struct rlimit limit = {16, 16};

@@ -1,8 +1,10 @@
 //! Tasks of the project's developers. `cargo xtask dist --out DIR` makes a release, `cargo xtask second-checkout --at
-//! DIR` looks whether another checkout makes every product again.
+//! DIR` looks whether another checkout makes every product again, `cargo xtask miri` whether the border breaks a rule of
+//! memory.
 
 mod deb;
 mod dist;
+mod miri;
 mod sbom;
 mod second_checkout;
 mod tree;
@@ -39,12 +41,15 @@ enum Task {
         #[arg(long, default_value = "2")]
         hours: String,
     },
+    /// Run the tests of the border under Miri, which is installed where it is missing
+    Miri,
 }
 
 fn main() -> ExitCode {
     let done = match Arguments::parse().task {
         Task::Dist { out } => dist::make(&out),
         Task::SecondCheckout { at, hours } => second_checkout::try_it(&at, &hours),
+        Task::Miri => miri::look(),
     };
     match done {
         Ok(told) => {

@@ -375,15 +375,15 @@ impl Timed<'_> {
         loop {
             let look = self.limit.saturating_sub(self.waited).clamp(Duration::from_millis(1), LOOK);
             let begun = Instant::now();
-            match work(look, self.socket) {
-                Err(e) if matches!(e.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut) => {
-                    self.waited += begun.elapsed().min(2 * look);
-                    if self.waited >= self.limit {
-                        return Err(io::ErrorKind::TimedOut.into());
-                    }
+            let done = work(look, self.socket);
+            // What comes counts too: a byte now and then is no answer.
+            self.waited += begun.elapsed().min(2 * look);
+            match done.map_err(|e| (e.kind(), e)) {
+                Err((io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut, _)) if self.waited >= self.limit => {
+                    return Err(io::ErrorKind::TimedOut.into());
                 }
-                Err(e) if e.kind() == io::ErrorKind::Interrupted => {}
-                done => return done,
+                Err((io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut | io::ErrorKind::Interrupted, _)) => {}
+                done => return done.map_err(|(_, e)| e),
             }
         }
     }
