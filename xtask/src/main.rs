@@ -1,6 +1,6 @@
 //! Tasks of the project's developers. `cargo xtask dist --out DIR` makes a release, `cargo xtask second-checkout --at
-//! DIR` looks whether another checkout makes every product again, `cargo xtask miri` whether the border breaks a rule of
-//! memory.
+//! DIR` looks whether another checkout makes every product again, `cargo xtask miri` whether the border breaks a rule
+//! of memory.
 
 mod deb;
 mod dist;
