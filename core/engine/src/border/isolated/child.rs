@@ -79,7 +79,7 @@ fn watch(socket: &UnixStream) -> io::Result<()> {
 /// A library, its instance, and who asks.
 struct Served {
     socket: UnixStream,
-    library: Library,
+    opened: Library,
     instance: Option<Local>,
     /// Columns of each input table, beside the times.
     reads: Vec<usize>,
@@ -103,7 +103,7 @@ impl Served {
         };
         let plugins = library.plugins.iter().map(|p| (p.kind, p.index, p.manifest.clone())).collect();
         send(&mut socket, &Answer::Opened { plugins, lacking }, &[])?;
-        Ok(Self { socket, library, instance: None, reads: Vec::new(), input, output })
+        Ok(Self { socket, opened: library, instance: None, reads: Vec::new(), input, output })
     }
 
     fn serve(mut self) -> io::Result<()> {
@@ -139,9 +139,9 @@ impl Served {
                 });
             }
             Ask::Create { kind, index, config } => {
-                let plugin = self.library.plugins.iter().find(|p| p.kind == kind && p.index == index);
+                let plugin = self.opened.plugins.iter().find(|p| p.kind == kind && p.index == index);
                 let plugin: PluginInfo = plugin.cloned().ok_or_else(|| io::Error::other("there is no such plugin"))?;
-                let created = Local::create(&self.library, &plugin, &Config { value: config });
+                let created = Local::create(&self.opened, &plugin, &Config { value: config });
                 created.map_or_else(Answer::of, |instance| {
                     self.instance = Some(instance);
                     Answer::Done
