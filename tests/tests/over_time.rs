@@ -1,6 +1,11 @@
-//! Residuals over time: as large as the declared noise where the model is right, and a glitch where and when it is.
+//! Series over time: residuals as large as the declared noise where the model is right, and a glitch where and when it
+//! is; the estimated angular acceleration, and the filter's innovations.
 
+use dragfree_tests::recording::Recording;
 use dragfree_tests::{dragfree, expect, fixture, json, simulate};
+use std::path::Path;
+
+const AXES: std::ops::RangeInclusive<u64> = 1..=3;
 
 /// What the page of a product says of a channel's residual over time.
 #[derive(Debug)]
@@ -90,4 +95,64 @@ fn a_layout_of_foxglove_has_a_plot_for_every_residual() {
     let tabs = panels["Tab!product"]["tabs"].as_array().expect("tabs");
     let titles: Vec<&str> = tabs.iter().map(|tab| tab["title"].as_str().expect("a title")).collect();
     assert_eq!(titles, ["Residuals", "Values", "Filter"]);
+}
+
+/// Times and values of a field, by the number of the field on each level.
+fn series(file: &Path, topic: &str, path: &[u64]) -> Vec<(u64, f64)> {
+    let recording = Recording::read(file);
+    let rows = recording.messages().iter().filter(|message| &*message.topic == topic);
+    let all: Vec<_> = rows.map(|m| (m.log_time, m.double(path).unwrap_or(0.0))).collect();
+    assert!(!all.is_empty(), "{topic} in {}", file.display());
+    all
+}
+
+fn rms(all: impl Iterator<Item = f64>) -> f64 {
+    let all: Vec<f64> = all.collect();
+    (all.iter().map(|x| x * x).sum::<f64>() / all.len() as f64).sqrt()
+}
+
+/// Two hours beside their truth. Means over 3.75 s of α̂ are those of the true angular acceleration, to the third that
+/// noise leaves; one interval away they are not, so that a row stands at its time. The lowest and the highest value are
+/// on either side of the mean.
+///
+/// The mean innovations of a minute are white with a σ of one where the mission's noise is right: of 109 rows after the
+/// warm-up the mean square has a σ of √(2/109) = 0.135, and six of them within 4.5 of these are a false alarm in 2e4.
+#[test]
+fn angular_acceleration_and_innovations_are_kept_over_time() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let file = simulate(folder.path(), &["--hours", "2", "--seed", "23"]).remove(0);
+    let mut run = dragfree(folder.path());
+    run.arg("run").arg(fixture("pipelines/science-mode.toml")).arg(&file).args(["--archive", "archive", "--json"]);
+    let product = json(&mut run, 0);
+    let id = product["id"].as_str().expect("an id");
+    let kept = folder.path().join(format!("archive/{id}.mcap"));
+    let truth = folder.path().join("truth").join(file.file_name().expect("a name"));
+    for axis in AXES {
+        let field = |what: u64| series(&kept, "/reconstruction", &[1, 1, axis, what]);
+        let (means, low, high) = (field(1), field(2), field(3));
+        assert!(means.iter().zip(&low).zip(&high).all(|((m, l), h)| l.1 <= m.1 && m.1 <= h.1));
+        let interval_ns = means[1].0 - means[0].0;
+        let mut true_means = std::collections::BTreeMap::<u64, (f64, f64)>::new();
+        for (time_ns, alpha) in series(&truth, "/truth", &[5, axis]) {
+            let (sum, count) = true_means.entry(time_ns / interval_ns).or_default();
+            (*sum, *count) = (*sum + alpha, *count + 1.0);
+        }
+        let off_by = |intervals: u64| {
+            let difference = |(time_ns, mean): &(u64, f64)| {
+                let (sum, count) = true_means.get(&(time_ns / interval_ns + intervals))?;
+                Some(mean - sum / count)
+            };
+            rms(means.iter().filter_map(difference))
+        };
+        let size = rms(means.iter().map(|(_, mean)| *mean));
+        assert!(off_by(0) < 0.4 * size && off_by(1) > 0.8 * size, "{} {} {size}", off_by(0), off_by(1));
+    }
+    for (test_mass, axis) in [2, 3].into_iter().flat_map(|t| AXES.map(move |axis| (t, axis))) {
+        let innovations = series(&kept, "/es-akf", &[test_mass, 3, axis]);
+        let settled = innovations.iter().filter(|(time_ns, _)| time_ns - innovations[0].0 > 600_000_000_000);
+        let settled = settled.map(|(_, x)| *x);
+        assert_eq!(settled.clone().count(), 109);
+        let square = rms(settled).powi(2);
+        assert!((square - 1.0).abs() < 4.5 * 0.135, "{test_mass} {axis}: {square}");
+    }
 }

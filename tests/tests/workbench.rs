@@ -307,6 +307,67 @@ fn a_reader_finds_the_effect_and_keeps_it_by_clicks() {
     }
 }
 
+/// A thermal force with a lag of a minute, found with a lag that the page can move: χ² falls most within a factor of two
+/// of the true lag and less and less beyond it, and the size there is the diagnosis'. A slider moved by the keyboard
+/// switches the effect on in that form, and back by the browser.
+#[test]
+fn a_lag_is_moved_by_a_slider() {
+    const TRUTH: f64 = 8e-10;
+    const LAG_S: f64 = 60.0;
+    let _alone = alone();
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let at = folder.path();
+    std::fs::copy(fixture("models/com-offset.toml"), at.join("model.toml")).expect("copied");
+    let effect = format!("thermal:tm1.x={TRUTH:e},lag_s={LAG_S}");
+    let file = simulate(at, &["--hours", "2", "--seed", "71", "--effect", &effect]).remove(0);
+    assert!(matches!(calibrate(at, &file, "archive"), 0 | 4));
+    let diagnosis = json(dragfree(at).args(["diagnose", DAYS[0], "--keep-extract", "--json"]), 4);
+    let found = &diagnosis["candidates"][0];
+    assert_eq!((&found["effect"], &found["instance"]), (&json!("thermal"), &json!("tm1.x")), "{found:#}");
+    let server = serve(at, &[]);
+    let on = |name: &str| refit(server.port, &format!("products={}&on={}", DAYS[0], name.replace('#', "%23")));
+    let (named, fall) = ("thermal:tm1.x", |refit: &Value| number(&refit["rungs"][1]["fall"]));
+    let first = on(named);
+    let size = &first["effects"][0]["coefficients"][0];
+    assert!((number(&size["value"]).abs() - TRUTH).abs() < 4.0 * number(&size["sigma"]), "{size}");
+    assert!((fall(&first) / number(&found["delta_chi2"]) - 1.0).abs() < 0.05, "{} {found:#}", fall(&first));
+    let forms = first["effects"][0]["forms"].as_array().expect("forms");
+    let lag = |form: &Value| number(&form["shape"]["lag_s"]);
+    let mut falls: Vec<(f64, f64)> =
+        forms.iter().map(|form| (lag(form), fall(&on(form["name"].as_str().expect("a name"))))).collect();
+    falls.sort_by(|a, b| a.0.total_cmp(&b.0));
+    assert!(falls.len() > 10, "{falls:?}");
+    let best = falls.iter().max_by(|a, b| a.1.total_cmp(&b.1)).expect("one").0;
+    assert!((0.5 * LAG_S..=2.0 * LAG_S).contains(&best), "{falls:?}");
+    let beyond: Vec<f64> = falls.iter().filter(|(lag, _)| *lag > 2.0 * LAG_S).map(|(_, fall)| *fall).collect();
+    assert!(beyond.windows(2).all(|pair| pair[1] < pair[0]) && beyond.len() > 4, "{falls:?}");
+    // The spectra know the form between those of the search, and the others.
+    let channel = |refit: &Value| number(&refit["spectra"]["fall"][0]);
+    assert!(channel(&first).abs() > 1e-3 && channel(&on("thermal:tm1.x#2")).abs() > 1e-3, "{:#}", first["spectra"]);
+    let browser = Browser::start(1280, 900, false);
+    browser.open(&format!("http://127.0.0.1:{}/missing?products={}", server.port, DAYS[0]));
+    let slider = "document.querySelector(\"input[data-key='thermal:tm1.x lag_s']\")";
+    browser.wait_for(slider);
+    browser.run(&format!("window.same_page = true; {slider}.focus()"));
+    let before = browser.run(&format!("return {slider}.ariaValueText"));
+    browser.press("\u{E014}");
+    browser.wait_for("document.querySelector('.said').textContent.includes('1 effect is on')");
+    browser.wait_for("location.search.includes('on=')");
+    let after = browser.run(&format!("return [{slider}.ariaValueText, {slider}.nextElementSibling.textContent]"));
+    assert!(after[0] == after[1] && after[0] != before, "{before} {after}");
+    browser.wait_for(&format!("document.activeElement === {slider}"));
+    browser.wait_for("document.querySelector(\"a[role=switch][aria-label^='thermal:tm1.x']\").ariaChecked === 'true'");
+    browser.run("history.back()");
+    browser.wait_for("document.querySelector('.said').textContent.includes('The model alone')");
+    assert_eq!(browser.run(&format!("return [window.same_page, {slider}.ariaValueText]")), json!([true, before]));
+    assert_eq!(browser.console(), Vec::<String>::new());
+    drop(browser);
+    let page = format!("missing?products={}&on={named}", DAYS[0]);
+    for (width, dark) in [(1280, false), (400, true)] {
+        readable(&server, width, dark, &[&page]);
+    }
+}
+
 /// A formula is typed: what is wrong is marked where it is, a name is taken from the list by the keyboard, and what
 /// can be read is added to the model with the token. What is typed is text, whatever it is.
 #[test]

@@ -21,6 +21,7 @@ mod soak;
 mod speed;
 mod stats;
 mod table;
+mod workbench;
 
 use campaign::note;
 use clap::{Args, Parser, Subcommand};
@@ -63,6 +64,8 @@ enum Command {
     Faults(FaultsCommand),
     /// Watch an inbox for more than a year of days, a third of them late, cut, doubled or corrected, with kills
     Soak(SoakCommand),
+    /// Time the workbench over many days
+    Workbench(WorkbenchCommand),
     /// Compute what data of each length can say of each effect; goes on where it was stopped
     Limits,
     /// Measure ratios of speed, on a machine that does nothing else
@@ -180,6 +183,19 @@ struct SoakCommand {
 }
 
 #[derive(Debug, Args)]
+struct WorkbenchCommand {
+    /// Days
+    #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u32).range(1..))]
+    days: u32,
+    /// Hours of telemetry of each day
+    #[arg(long, default_value_t = 2.0)]
+    hours: f64,
+    /// File of the result
+    #[arg(long, value_name = "FILE")]
+    results: Option<PathBuf>,
+}
+
+#[derive(Debug, Args)]
 struct MonthsCommand {
     /// Seeds, FIRST-LAST
     #[arg(long, value_parser = seeds, default_value = "1-20")]
@@ -251,6 +267,10 @@ fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
         Command::Soak(s) => {
             let file = s.results.clone().unwrap_or_else(|| results.join("soak.jsonl"));
             soak::soak(&Program::build()?, s.seeds.clone(), s.days, &file, &scratch)
+        }
+        Command::Workbench(w) => {
+            let file = w.results.clone().unwrap_or_else(|| results.join("workbench.json"));
+            workbench::workbench(&Program::build()?, w.days, w.hours, &file, &scratch)
         }
         Command::Limits => limits::limits(&Program::build()?, &results.join("limits.jsonl"), &scratch),
         Command::Speed => speed::measure(&Program::build()?, &speed_file, &scratch),

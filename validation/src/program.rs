@@ -5,6 +5,7 @@ use serde_json::Value;
 use sha2::{Digest as _, Sha256};
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
+use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
@@ -32,6 +33,25 @@ pub(crate) struct Simulated {
     pub(crate) files: Vec<PathBuf>,
     /// True offsets, m.
     pub(crate) truth_m: [f64; 6],
+}
+
+/// A workbench that runs.
+pub(crate) struct Server {
+    process: Child,
+    pub(crate) port: u16,
+}
+
+impl Server {
+    /// Memory in use, MB; NaN where the system does not say.
+    pub(crate) fn memory_mb(&self) -> f64 {
+        let status = std::fs::read_to_string(format!("/proc/{}/status", self.process.id())).unwrap_or_default();
+        let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+        line.and_then(|l| l.trim().strip_suffix("kB")?.trim().parse().ok()).map_or(f64::NAN, |kb: f64| kb / 1e3)
+    }
+
+    pub(crate) fn end(&mut self) {
+        let _ = self.process.kill().and_then(|()| self.process.wait()); // it may have ended
+    }
 }
 
 /// What `dragfree simulate --json` prints.
@@ -206,6 +226,25 @@ impl Program {
         let mut command = self.command();
         command.current_dir(folder).args(arguments).stdout(Stdio::null()).stderr(Stdio::null());
         command.spawn().map_err(|source| CampaignError::Start { command: format!("{command:?}"), source })
+    }
+
+    /// Starts the workbench over an archive.
+    pub(crate) fn serve(&self, archive: &Path) -> Result<Server, CampaignError> {
+        let mut command = self.command();
+        command.args(["serve", "--listen", "127.0.0.1:0", "--json", "--archive"]).arg(archive).stdout(Stdio::piped());
+        let spawned = command.spawn();
+        let mut process = spawned.map_err(|source| CampaignError::Start { command: format!("{command:?}"), source })?;
+        let mut line = String::new();
+        let read = process.stdout.take().map(|out| BufReader::new(out).read_line(&mut line));
+        let ready: Value = serde_json::from_str(&line).unwrap_or_default();
+        let port = ready["address"].as_str().and_then(|a| a.trim_end_matches('/').rsplit(':').next()?.parse().ok());
+        match (read, port) {
+            (Some(Ok(_)), Some(port)) => Ok(Server { process, port }),
+            _ => {
+                let _ = process.kill(); // it may have ended
+                Err(missing(&command, "address"))
+            }
+        }
     }
 
     /// Runs `dragfree joint` or `trend` over days of an archive. Days that disagree and alerts are accepted.

@@ -9,14 +9,15 @@ use std::path::{Path, PathBuf};
 
 use crate::EngineError;
 use crate::border::PluginInfo;
-use crate::chain::{self, Carry, Chain, ChainNode, Sink, comes_at_the_end};
+use crate::chain::{self, Carry, Chain, ChainNode, Sink};
 use crate::config::{Mission, Model, Pipeline, read};
 use crate::draft::Draft;
 use crate::feed::{Feed, FileFeed, SourceFeed, SourceOptions};
 use crate::registry::Registry;
+use crate::series::Series;
 use crate::stop;
-use crate::table::{Batch, Chunk, TableSpec};
-use crate::telemetry::{FileHeader, TelemetryWriter, interface_tables};
+use crate::table::{Chunk, TableSpec};
+use crate::telemetry::{FileHeader, interface_tables};
 use dragfree_archive::files::{IoContext as _, IoError, folder_of, sha256, sync_folder};
 use dragfree_archive::product::{self, Loss, NoiseLevel, Stage, Status, Stream};
 use dragfree_archive::{InputPlace, MadeOf, ProductWriter, Window, Written};
@@ -251,7 +252,8 @@ pub fn run(
         chain.load(state)?;
     }
     let mut writer = ProductWriter::begin(&options.archive)?;
-    let mut series = Series::create(&chain, &mut writer, &setup)?;
+    let from_ns = options.run_in_until_ns().unwrap_or(i64::MIN);
+    let mut series = Series::create(&chain, &mut writer, &header_of(&setup), from_ns)?;
     let mut teller = writer.teller(&format!("{} {}", setup.pipeline.product, setup.mission.spacecraft));
     let mut told = |done: Progress| {
         teller.tell(done.first_ns, done.until_ns, done.end_ns);
@@ -291,6 +293,18 @@ pub fn run(
     // The state last: after a kill in between, the day can be run again, and the archive has the state too.
     next_state.map_or(Ok(()), NextState::place)?;
     Ok(written)
+}
+
+/// What the file of time series says of itself.
+fn header_of(setup: &Setup<'_>) -> FileHeader {
+    FileHeader {
+        time_scale: "UTC".to_owned(),
+        mission: setup.mission.name.clone(),
+        spacecraft: setup.mission.spacecraft.clone(),
+        producer: "dragfree".to_owned(),
+        version: setup.options.software.clone(),
+        ..FileHeader::default()
+    }
 }
 
 /// Logs the linked chain.
@@ -370,80 +384,6 @@ fn free_bytes(archive: &Path) -> Option<u64> {
 #[cfg(not(unix))]
 fn free_bytes(_archive: &Path) -> Option<u64> {
     None
-}
-
-/// The time series beside the product; written only when a stage has any.
-struct Series {
-    tables: Vec<TableSpec>,
-    last_ns: Vec<Option<i64>>,
-    /// Rows of tables that come at the end, after those of all others: these need not wait for them.
-    at_the_end: Vec<(usize, Batch)>,
-    writer: Option<TelemetryWriter>,
-    /// Rows before this time are of data that only settle the stages.
-    from_ns: i64,
-}
-
-impl Series {
-    fn create(chain: &Chain, product: &mut ProductWriter, setup: &Setup<'_>) -> Result<Self, EngineError> {
-        let tables = chain.archived_tables();
-        let header = FileHeader {
-            time_scale: "UTC".to_owned(),
-            mission: setup.mission.name.clone(),
-            spacecraft: setup.mission.spacecraft.clone(),
-            producer: "dragfree".to_owned(),
-            version: setup.options.software.clone(),
-            ..FileHeader::default()
-        };
-        let create = || TelemetryWriter::create(&product.staged("mcap"), &tables, &header);
-        let writer = (!tables.is_empty()).then(create).transpose()?;
-        let from_ns = setup.options.run_in_until_ns().unwrap_or(i64::MIN);
-        Ok(Self { last_ns: vec![None; tables.len()], at_the_end: Vec::new(), tables, writer, from_ns })
-    }
-
-    fn finish(self) -> Result<(), EngineError> {
-        let chunk = Chunk { batches: self.nothing(), complete_until_ns: i64::MAX };
-        let Some(mut writer) = self.writer else { return Ok(()) };
-        writer.write(chunk)?;
-        for (table, batch) in self.at_the_end {
-            writer.write_table(table, batch)?;
-        }
-        writer.finish()?;
-        Ok(())
-    }
-
-    /// A batch without rows for every table.
-    fn nothing(&self) -> Vec<Batch> {
-        self.tables.iter().map(|t| Batch::empty(t.columns.len())).collect()
-    }
-}
-
-impl Sink for Series {
-    fn rows(&mut self, table: &TableSpec, batch: &Batch) -> Result<(), String> {
-        if self.writer.is_none() {
-            return Ok(());
-        }
-        let mut settled = batch.clone();
-        let early = settled.time_ns.partition_point(|t| *t < self.from_ns);
-        settled.time_ns.drain(..early);
-        settled.columns.iter_mut().for_each(|column| drop(column.drain(..early)));
-        if settled.rows() == 0 {
-            return Ok(());
-        }
-        let of_this = self.tables.iter().position(|t| t.name == table.name);
-        let index = of_this.ok_or_else(|| format!("table {} is none of those that are archived", table.name))?;
-        if comes_at_the_end(table) {
-            self.at_the_end.push((index, settled));
-            return Ok(());
-        }
-        self.last_ns[index] = settled.time_ns.last().copied();
-        // A table without any row so far may still deliver earlier ones.
-        let due = self.tables.iter().zip(&self.last_ns).filter(|(table, _)| !comes_at_the_end(table));
-        let complete_until_ns = due.map(|(_, last)| last.unwrap_or(i64::MIN)).min().unwrap_or(i64::MIN);
-        let mut batches = self.nothing();
-        batches[index] = settled;
-        let chunk = Chunk { batches, complete_until_ns };
-        self.writer.as_mut().map_or(Ok(()), |writer| writer.write(chunk).map_err(|e| e.to_string()))
-    }
 }
 
 /// A plugin that ran, as a product names it.

@@ -2,20 +2,17 @@
 //!
 //! A residual `z − Φθ` is known when θ is, at the end. Means of z and Φ over short intervals are kept until then, and
 //! the products of those that meet in one channel, of which the mean square of every residual follows. There are never
-//! more than two thousand intervals: when there would be, each two neighbours become one.
+//! more than [`MOST_INTERVALS`]: when there would be, each two neighbours become one.
 
 use std::f64::consts::PI;
 
 use dragfree_schema::state::{State, StateError};
+use dragfree_schema::{FIRST_INTERVAL_NS, MOST_INTERVALS};
 use nalgebra::DMatrix;
 
 use crate::sigma::NoiseModel;
 use crate::spectra::Layout;
 
-/// Length of the first intervals, ns: five doublings make a minute.
-const FIRST_INTERVAL_NS: i64 = 1_875_000_000;
-/// Intervals that are kept.
-const MOST: usize = 2048;
 /// The longest interval over the first one, far beyond any mission.
 const MOST_DOUBLED: i64 = 1 << 20;
 /// Frequencies between which the noise is interpolated.
@@ -88,7 +85,7 @@ impl ResidualMeans {
             let left_ns = (number + 1) * self.interval_ns - time_ns(row);
             let end = rows.min(row + ((left_ns + step_ns - 1) / step_ns) as usize);
             if self.intervals.last().is_none_or(|last| last.number != number) {
-                if self.intervals.len() == MOST {
+                if self.intervals.len() == MOST_INTERVALS {
                     self.double();
                     continue;
                 }
@@ -150,7 +147,7 @@ impl ResidualMeans {
             return Err(StateError::Content("the length of an interval of residuals"));
         }
         let count = state.count(self.intervals.len())?;
-        if count > MOST {
+        if count > MOST_INTERVALS {
             return Err(StateError::Content("intervals of residuals"));
         }
         if state.is_loading() {
@@ -341,7 +338,7 @@ mod tests {
         let whole = gathered(&columns, 1000);
         let means = whole.at(&layout(), &[p, q]);
         assert_eq!(whole.interval_ns, 8 * FIRST_INTERVAL_NS);
-        assert!((1000..=MOST).contains(&means.len()), "{}", means.len());
+        assert!((1000..=MOST_INTERVALS).contains(&means.len()), "{}", means.len());
         let left_out = rows as u64 - means.iter().map(|m| m.count).sum::<u64>();
         assert!(left_out < 75, "{left_out}: less than half of the last interval");
         let kept = rows - left_out as usize;

@@ -7,8 +7,9 @@
 const part = document.getElementById("part");
 let underway = null;
 
-// Asks for a state and shows it; a request that is overtaken is broken off.
-async function show(address, key, remember) {
+// Asks for a state and shows it; a request that is overtaken is broken off. While a slider is moved, the table that it
+// stands in stays.
+async function show(address, key, remember, moving) {
   if (underway) underway.abort();
   underway = new AbortController();
   const signal = underway.signal;
@@ -21,7 +22,8 @@ async function show(address, key, remember) {
       const open = opened();
       const channel = document.getElementById("channel");
       const chosen = channel && channel.dataset.chosen;
-      part.innerHTML = text;
+      if (moving) replaceAround("#effects", text);
+      else part.innerHTML = text;
       reopen(open);
       spectrum(read("residuals"), chosen);
       if (remember) history.pushState(null, "", address.href);
@@ -29,6 +31,7 @@ async function show(address, key, remember) {
     } else {
       complain(text);
     }
+    if (moving) return;
     const again = key && [...part.querySelectorAll("[data-key]")].find((e) => e.dataset.key === key);
     if (again) again.focus({ preventScroll: true });
   } catch (error) {
@@ -36,6 +39,19 @@ async function show(address, key, remember) {
   } finally {
     if (underway && underway.signal === signal) part.removeAttribute("aria-busy");
   }
+}
+
+// Replaces everything in the part but the block that holds this element.
+function replaceAround(selector, text) {
+  const template = document.createElement("template");
+  template.innerHTML = text;
+  const block = (root) => [...root.children].find((child) => child.querySelector(selector));
+  const [old, made] = [block(part), block(template.content)];
+  for (const child of [...part.childNodes]) if (child !== old) child.remove();
+  const all = [...template.content.childNodes];
+  const at = all.indexOf(made);
+  old.before(...all.slice(0, at));
+  old.after(...all.slice(at + 1));
 }
 
 function complain(text) {
@@ -70,6 +86,18 @@ if (part) {
       link.click();
     }
   });
+  // A slider answers while it is moved, and is remembered where it is let go.
+  for (const type of ["input", "change"]) {
+    part.addEventListener(type, (event) => {
+      const slider = event.target.closest("input[data-stops]");
+      if (!slider) return;
+      const value = JSON.parse(slider.dataset.values)[slider.value];
+      slider.setAttribute("aria-valuetext", value);
+      slider.nextElementSibling.textContent = value;
+      const address = JSON.parse(slider.dataset.stops)[slider.value];
+      show(new URL(address, location.href), slider.dataset.key, type === "change", type === "input");
+    });
+  }
   addEventListener("popstate", () => show(new URL(location.href), null, false));
 }
 

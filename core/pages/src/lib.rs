@@ -18,6 +18,7 @@ mod report;
 pub mod server;
 mod setup;
 mod site;
+mod sliders;
 mod spacecraft;
 mod starting;
 mod trends;

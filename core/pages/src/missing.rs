@@ -13,6 +13,7 @@ use crate::keep::commands;
 use crate::layout::{Links, command, error, millimetres, page as whole, value};
 use crate::pictures::ladder;
 use crate::site::{Query, Site, list};
+use crate::sliders::sliders;
 use crate::spacecraft::ellipses;
 
 const LEAD: &str = "Switch on the effect at the top of the list and watch the offset move; what helps on days that are \
@@ -306,6 +307,14 @@ fn switches(basis: &Basis, refit: &Refit, query: &Query, links: &Links) -> Marku
         let all = if effect.on { without } else { [without, vec![effect.name.clone()]].concat() };
         Query { on: all.join(","), ..query.clone() }
     };
+    // A file has no server that could solve for another form.
+    let forms_of = |effect: &'_ Effect| if links.is_file() { Vec::new() } else { effect.forms.clone() };
+    // An effect that is off is switched on in the form that is chosen.
+    let in_form = |effect: &Effect, form: &str| {
+        let there = |name: &String| if *name == effect.name { form.to_owned() } else { name.clone() };
+        let all: Vec<String> = on.iter().map(there).chain((!effect.on).then(|| form.to_owned())).collect();
+        Query { on: all.join(","), ..query.clone() }
+    };
     let sigma = |name: &str| {
         let offset = refit.rungs.first().and_then(|r| r.offsets.iter().find(|o| o.name == name));
         offset.map_or(f64::INFINITY, |o| o.sigma_m)
@@ -338,7 +347,11 @@ fn switches(basis: &Basis, refit: &Refit, query: &Query, links: &Links) -> Marku
                         @if effect.named { " " span class="mark" title="a diagnosis of one of these days names it" {
                             "named" } }
                         @if effect.is_noise { " " span class="mark" { "noise" } }
-                        @for (key, shape) in &effect.shape { br; span class="quiet" { (key) " = " (shape) } }
+                        @for (key, shape) in effect.shape.iter().filter(|(_, v)| !v.is_number()) {
+                            br; span class="quiet" { (key) " = " (shape) }
+                        }
+                        (sliders(&format!("{}:{}", effect.effect, effect.instance), &effect.shape, &forms_of(effect),
+                            &|form| format!("/missing?{}", address(&in_form(effect, form)))))
                         @if !effect.channels.is_empty() {
                             details { summary { (effect.channels.len()) " channels" } (effect.channels.join(", ")) }
                         }
@@ -426,8 +439,8 @@ fn limits(basis: &Basis, refit: &Refit) -> Markup {
         }
         p {
             "Spectra are those of the same residuals at these values, in groups of bands. An effect that filters a noise \
-                does not change the noise here. Other forms of an effect (lags, resonances) and new formulas are not in \
-                these sums: they need the telemetry (" code { "dragfree diagnose" } ")."
+                does not change the noise here. A lag or a resonance can be moved where a diagnosis of these days names \
+                the effect; its other forms, and new formulas, are not in these sums: they need the telemetry (" code { "dragfree diagnose" } ")."
         }
         @if !basis.not_tried().is_empty() {
             details { summary { (basis.not_tried().len()) " effects could not be tried" }

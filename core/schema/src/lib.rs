@@ -9,6 +9,7 @@
 
 mod available;
 mod column;
+mod intervals;
 mod manifest;
 mod model;
 mod noise;
@@ -20,6 +21,7 @@ pub mod state;
 
 pub use available::{Available, NoSuchCoefficient};
 pub use column::Column;
+pub use intervals::{FIRST_INTERVAL_NS, MOST_INTERVALS};
 pub use manifest::{Manifest, PREDICTION_NEED, Parameter, ParameterType};
 pub use model::{Coefficient, Colour, Constraint, Model, Response, Shape, Transient, Variant};
 pub use noise::{

@@ -25,7 +25,7 @@ use crate::WorkflowError;
 use crate::answer::{
     Evidence, apart, contradict, drifting, found, limits, noise_levels, offsets, verdict, with_levels,
 };
-use crate::extract::Extract;
+use crate::extract::{Extract, MadeOf};
 use crate::likelihood::{Decided, PASSES, Point, Settled, moved, one_pass, step, step_of_model, transients_near_ends};
 use crate::proposals::{FORMULA, Proposal, probes, proposals};
 use crate::replay::{FINE, Forms, Pass, Replay, What, sum};
@@ -87,9 +87,17 @@ pub fn diagnose(
     contradict(&mut diagnosis, products);
     let extract = match products {
         [product] if keeps => {
-            let about_model = about_model(replay, &spectra.record, &last, &evidence, progress)?;
-            let levels = noise_levels(decided, &spectra.record);
-            Extract::new(product, &about_model, &diagnosis, levels, &spectra.record, &evidence)?
+            let named = named_forms(decided, &last.screened.forms);
+            let beside = forms_beside(&spectra.record, &named);
+            let about_model = about_model(replay, &spectra.record, &last, (&named, &beside), &evidence, progress)?;
+            let made_of = MadeOf {
+                decided: &about_model,
+                named: &named,
+                beside: &beside,
+                record: &spectra.record,
+                levels: noise_levels(decided, &spectra.record),
+            };
+            Extract::new(product, made_of, &diagnosis, &evidence)?
         }
         _ => None,
     };
@@ -311,16 +319,16 @@ struct Last {
 }
 
 /// A pass about the model alone, for the extract of a product. Likelihoods of days add where they are taken about the
-/// same point: what one day names, another has not. What is named has its form of this day, everything else the first
-/// of its forms, which is the same on every day.
+/// same point: what one day names, another has not. What is named has its form of this day, and those `beside` it,
+/// everything else the first of its forms, which is the same on every day.
 fn about_model(
     replay: &Replay<'_>,
     record: &Record,
     last: &Last,
+    (named, beside): (&[Candidate], &[Candidate]),
     evidence: &Evidence<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Decided, WorkflowError> {
-    let named = named_forms(&last.end.decided, &last.screened.forms);
     let set = &record.candidate_set;
     let places = set.places();
     let form = |screened: &Candidate| {
@@ -328,7 +336,8 @@ fn about_model(
         let first = places.iter().find(of).map(|place| set.candidate(place, 0));
         if named.contains(screened) { screened.clone() } else { first.unwrap_or_else(|| screened.clone()) }
     };
-    let entries: Vec<EffectEntry> = last.screened.forms.iter().map(|f| evidence.entry(&form(f))).collect();
+    let forms = last.screened.forms.iter().map(form).chain(beside.iter().cloned());
+    let entries: Vec<EffectEntry> = forms.map(|form| evidence.entry(&form)).collect();
     let mut point = step_of_model(&last.end.point, &last.end.decided);
     // The first of the two finds the means of series that are new. Levels are those beside what is named.
     point.levels.clone_from(&last.end.point.levels);
@@ -336,6 +345,29 @@ fn about_model(
     point = step(&point, &opening);
     point.levels.clone_from(&last.end.point.levels);
     one_pass(replay, &entries, &last.end.slow, false, &point, evidence, progress)
+}
+
+/// Of what is named with a lag, a resonance or another number in its shape the forms of its search that differ from it
+/// in one number.
+fn forms_beside(record: &Record, named: &[Candidate]) -> Vec<Candidate> {
+    let set = &record.candidate_set;
+    let places = set.places();
+    let differs_in_a_number = |a: &Candidate, b: &Candidate| {
+        let (Some((_, a)), Some((_, b))) = (a.parts.first(), b.parts.first()) else { return false };
+        let mut differing = a.shape.iter().filter(|(key, value)| b.shape.get(*key) != Some(*value));
+        let (first, more) = (differing.next(), differing.next());
+        let is_number = |key: &String| b.shape.get(key).is_some_and(serde_json::Value::is_number);
+        a.shape.len() == b.shape.len() && more.is_none() && first.is_some_and(|(k, v)| v.is_number() && is_number(k))
+    };
+    let forms = |named: &Candidate| -> Vec<Candidate> {
+        let own = named.parts.first().filter(|_| !named.transient);
+        let place = own.and_then(|(index, _)| places.iter().find(|place| place.contains(index)));
+        let all = place
+            .into_iter()
+            .flat_map(|place| (0..set.coefficients[place[0]].forms.len()).map(|form| set.candidate(place, form)));
+        all.filter(|form| differs_in_a_number(named, form)).collect()
+    };
+    named.iter().flat_map(forms).collect()
 }
 
 /// Names of the effects that are in one of two lists in a form in which they are not in the other.

@@ -4,7 +4,8 @@
 //! It holds the likelihood of the coefficients of the model and of every effect, as the last pass has it, with what is
 //! a day's own (constants, noise levels, slow forces) fitted. Likelihoods of days add; what is linear in a day about
 //! its own values is so about the values of all days, which differ from them by some of the day's σ. An effect with a
-//! shape is there in the first of its forms, and in that of a day that has named it.
+//! shape is there in the first of its forms, and in that of a day that has named it. The forms beside that one are there
+//! for who looks at them ([`crate::refit`]): they decide nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -12,6 +13,7 @@ use std::path::{Path, PathBuf};
 use dragfree_archive::{Archive, EXTRACT, Stamp, Written};
 use dragfree_engine::EngineError;
 use dragfree_engine::registry::Registry;
+use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{Diagnosis, Found, Trials, UNOBSERVABLE};
 use dragfree_identification::innovations::decision::Prior;
 use dragfree_identification::record::Record;
@@ -65,6 +67,23 @@ pub struct Extract {
     /// The likelihood of stretches of time; none in extracts of older programs.
     #[serde(default)]
     stretches: Option<Stretches>,
+    /// Coefficients that are what is named in other forms.
+    #[serde(default)]
+    other_forms: BTreeSet<usize>,
+}
+
+/// What an extract is made of.
+pub(crate) struct MadeOf<'a> {
+    /// A pass about the model alone.
+    pub(crate) decided: &'a Decided,
+    /// What is named, in its form.
+    pub(crate) named: &'a [Candidate],
+    /// The same in other forms.
+    pub(crate) beside: &'a [Candidate],
+    /// The spectra.
+    pub(crate) record: &'a Record,
+    /// Levels of noise.
+    pub(crate) levels: Vec<NoiseLevel>,
 }
 
 /// What is known of a weighted sum of coefficients before any data.
@@ -78,12 +97,11 @@ impl Extract {
     /// Of the diagnosis of one product.
     pub(crate) fn new(
         product: &Written,
-        decided: &Decided,
+        made_of: MadeOf<'_>,
         diagnosis: &Diagnosis,
-        levels: Vec<NoiseLevel>,
-        record: &Record,
         evidence: &Evidence<'_>,
     ) -> Result<Option<Self>, WorkflowError> {
+        let MadeOf { decided, named, beside, record, levels } = made_of;
         let Some(sums) = decided.of_coefficients() else { return Ok(None) };
         let n = sums.coefficients.len();
         // A proposed formula is an effect of one diagnosis.
@@ -105,8 +123,9 @@ impl Extract {
             format: FORMAT.to_owned(),
             product: product.product.id().to_owned(),
             program: env!("CARGO_PKG_VERSION").to_owned(),
-            by_band: Some(ByBand::new(&coefficients, record, adopted)?),
+            by_band: Some(ByBand::new(&coefficients, named, record, adopted)?),
             stretches,
+            other_forms: (0..coefficients.len()).filter(|i| is_in(beside, &coefficients[*i])).collect(),
             housekeeping: housekeeping(record),
             coefficients,
             information: kept
@@ -163,6 +182,7 @@ impl Extract {
             (whole, "its sums are not of its coefficients".to_owned()),
             (extract.by_band.as_ref().is_none_or(|b| b.is_whole(n)), "its spectra are damaged".to_owned()),
             (extract.stretches.as_ref().is_none_or(|s| s.is_whole(n)), "its stretches are damaged".to_owned()),
+            (extract.other_forms.iter().all(|i| *i < n), "its forms are damaged".to_owned()),
         ];
         match sound.into_iter().find(|(holds, _)| !holds) {
             Some((_, what)) => Err(refuse(format!("{what}; {make}"))),
@@ -195,6 +215,11 @@ impl Extract {
         (self.by_band, self.stretches)
     }
 
+    /// Whether it has this coefficient in a form beside the one that is named.
+    pub(crate) fn has_beside(&self, c: &Coefficient) -> bool {
+        self.other_forms.iter().any(|i| same(&self.coefficients[*i], c))
+    }
+
     fn names(&self, c: &Coefficient) -> bool {
         self.named.iter().any(|(effect, instance)| (effect, instance) == (&c.effect, &c.instance))
     }
@@ -213,6 +238,13 @@ impl Extract {
             channels: self.channels.clone(),
         }
     }
+}
+
+/// Whether a coefficient is that of a candidate in its form.
+fn is_in(candidates: &[Candidate], c: &Coefficient) -> bool {
+    let shape = |candidate: &Candidate| candidate.parts.first().map(|(_, form)| form.shape.clone());
+    let of = |candidate: &&Candidate| (&candidate.effect, &candidate.instance) == (&c.effect, &c.instance);
+    c.candidate && candidates.iter().filter(of).any(|own| shape(own).is_some_and(|s| s.into_iter().eq(c.shape.clone())))
 }
 
 /// Housekeeping of the telemetry by its name in expressions, `hk.battery_current_a`, with its unit.
@@ -242,7 +274,7 @@ pub fn diagnose_extracts(registry: &Registry, products: &[Written]) -> Result<Di
     let extracts = of_products(products)?;
     let evidence =
         Evidence { trials: trials(&extracts), least: settings.false_alarm, registry, products, proposals: Vec::new() };
-    let (sums, mut not_tried) = shared(&extracts);
+    let (sums, mut not_tried) = shared(&extracts, |_| false);
     let decided = joined(sums, settings, &evidence, Vec::new());
     let unobservable = decided.selection.unobservable.iter().map(|c| decided.candidates[*c].name());
     not_tried.extend(unobservable.map(|name| (name, UNOBSERVABLE.to_owned())));
@@ -270,19 +302,24 @@ pub(crate) fn trials(extracts: &[Extract]) -> Trials {
     trials
 }
 
-/// The sums of each that can be added to those of the others, and what could not be tried, with the reason.
-pub(crate) fn shared(extracts: &[Extract]) -> (Vec<CoefficientSums>, BTreeMap<String, String>) {
-    let days = |c: &Coefficient| extracts.iter().filter(|e| e.coefficients.iter().any(|own| same(own, c))).count();
+/// The sums of each that can be added to those of the others, and what could not be tried, with the reason. Of what an
+/// extract has beside the form that is named, what is wanted.
+pub(crate) fn shared(
+    extracts: &[Extract],
+    wanted: impl Fn(&Coefficient) -> bool,
+) -> (Vec<CoefficientSums>, BTreeMap<String, String>) {
+    let has = |e: &Extract, c: &Coefficient| e.place(c).is_some_and(|i| !e.other_forms.contains(&i) || wanted(c));
+    let days = |c: &Coefficient| extracts.iter().filter(|e| has(e, c)).count();
     let several = |c: &Coefficient| days(c) > 1 || extracts.len() == 1;
     let mut not_tried: BTreeMap<String, String> = BTreeMap::new();
     for e in extracts {
         not_tried.extend(e.not_tried.iter().cloned());
-        for c in e.coefficients.iter().filter(|c| !e.names(c) && !several(c)) {
+        for c in e.coefficients.iter().filter(|c| has(e, c) && !e.names(c) && !several(c)) {
             let why = "its form is another on every day: a diagnosis with the telemetry chooses one for all days";
             not_tried.insert(format!("{}:{}", c.effect, c.instance), why.to_owned());
         }
     }
-    (extracts.iter().map(|e| e.sums(|c| e.names(c) || several(c))).collect(), not_tried)
+    (extracts.iter().map(|e| e.sums(|c| has(e, c) && (e.names(c) || several(c)))).collect(), not_tried)
 }
 
 fn of_one_model(extracts: &[Extract]) -> Result<(), WorkflowError> {

@@ -36,7 +36,7 @@ fn of_topics(topics: &BTreeMap<String, Vec<String>>) -> Value {
                 "whitened" if topic == RESIDUALS => 0,
                 _ if topic == RESIDUALS => continue,
                 "value" => 1,
-                "sigma" => continue,
+                "sigma" | "low" | "high" => continue,
                 _ => 2,
             };
             let of = if tab == 2 { field } else { name };
@@ -100,7 +100,7 @@ mod tests {
     fn what_belongs_together_is_in_one_plot() {
         let fields = |all: &[&str]| all.iter().map(|f| (*f).to_owned()).collect();
         let residuals = fields(&["tm1.accel.x.value", "tm1.accel.x.whitened", "tm1.accel.y.whitened"]);
-        let filter = fields(&["com_offset.tm1.x.value", "com_offset.tm1.x.sigma", "tm1.nis"]);
+        let filter = fields(&["com_offset.tm1.x.value", "com_offset.tm1.x.sigma", "com_offset.tm1.x.low", "tm1.nis"]);
         let layout = of_topics(&[(RESIDUALS.to_owned(), residuals), ("/es-akf".to_owned(), filter)].into());
         let paths = |panel: &str| -> Vec<&str> {
             let all = layout["configById"][panel]["paths"].as_array().expect("paths");

@@ -15,6 +15,7 @@ use dragfree_identification::innovations::decision::{Candidate, Prior, Quadratic
 use dragfree_identification::innovations::filter::Sums;
 use dragfree_schema::{Coefficient, Settings, Shape};
 use nalgebra::{DMatrix, DVector};
+use serde_json::json;
 
 use crate::WorkflowError;
 use crate::answer::{Evidence, NoiseLevel};
@@ -26,7 +27,7 @@ mod spectra;
 mod told;
 
 use solving::Solving;
-pub use told::{Confounder, Effect, Offset, Refit, Rung, Size, Spectra, Stretch};
+pub use told::{Confounder, Effect, Form, Offset, Refit, Rung, Size, Spectra, Stretch};
 
 /// What diagnoses have kept of products of one model, ready to be solved with other effects.
 pub struct Basis {
@@ -126,7 +127,7 @@ impl Basis {
         let settings = products.first().ok_or(WorkflowError::NoProduct)?.product.settings.clone();
         let extracts = of_products(products)?;
         let trials = trials(&extracts);
-        let (sums, not_tried) = shared(&extracts);
+        let (sums, not_tried) = shared(&extracts, |c| in_all_days(&extracts, c));
         let evidence =
             Evidence { trials: trials.clone(), least: settings.false_alarm, registry, products, proposals: Vec::new() };
         // The sums with their ranges and priors; which effects are added is the caller's decision.
@@ -136,7 +137,11 @@ impl Basis {
         let totals: Vec<(f64, f64)> = sums.iter().map(|s: &CoefficientSums| (s.chi2, s.numbers)).collect();
         let decided = joined(sums, &nothing_added, &evidence, Vec::new());
         let coefficients: Vec<Coefficient> = decided.parameters.iter().filter_map(coefficient).collect();
-        let switches = switches(&decided);
+        let beside = |i: usize| match &decided.parameters[i].1 {
+            Meaning::Coefficient(c) => extracts.iter().all(|e| e.has_beside(c) || e.place(c).is_none()),
+            Meaning::Level | Meaning::Power => false,
+        };
+        let switches = switches(&decided, beside);
         let mut days = Vec::new();
         for (k, (own, information, score)) in parts.into_iter().enumerate() {
             let same = |c: &Coefficient| {
@@ -407,20 +412,47 @@ fn coefficient((_, meaning): &(String, Meaning)) -> Option<Coefficient> {
     }
 }
 
-/// Names of the candidates; of several forms of one, those after the first with a number.
-fn switches(decided: &Decided) -> Vec<Switch> {
-    let mut all: Vec<Switch> = Vec::new();
-    for place in &decided.candidates {
-        let before = all.iter().filter(|s| (&s.effect, &s.instance) == (&place.effect, &place.instance)).count();
-        let name = if before == 0 { place.name() } else { format!("{}#{}", place.name(), before + 1) };
-        let (effect, instance) = (place.effect.clone(), place.instance.clone());
-        all.push(Switch { name, effect, instance, shape: place.shape.clone() });
-    }
-    all
+/// Whether every day that names the effect of this coefficient has it in this form: falls of χ² of forms are compared,
+/// so that all are of the same days.
+fn in_all_days(extracts: &[Extract], c: &Coefficient) -> bool {
+    let names =
+        |e: &&Extract| e.named().iter().any(|(effect, instance)| (effect, instance) == (&c.effect, &c.instance));
+    extracts.iter().filter(names).all(|e| e.place(c).is_some())
 }
 
-fn position_of(switches: &[Switch], named: &(String, String)) -> Option<usize> {
-    switches.iter().position(|s| (&s.effect, &s.instance) == (&named.0, &named.1))
+/// Names of the candidates. Of several forms of one, those after the first have a number; those that are `beside` what a
+/// day names come last.
+fn switches(decided: &Decided, beside: impl Fn(usize) -> bool) -> Vec<Switch> {
+    let mut order: Vec<usize> = (0..decided.candidates.len()).collect();
+    order.sort_by_key(|c| decided.candidates[*c].parameters.iter().copied().any(&beside));
+    let mut forms: BTreeMap<String, usize> = BTreeMap::new();
+    let mut names = vec![String::new(); order.len()];
+    for c in order {
+        let name = decided.candidates[c].name();
+        let number = forms.entry(name.clone()).and_modify(|n| *n += 1).or_insert(1);
+        names[c] = if *number == 1 { name } else { format!("{name}#{number}") };
+    }
+    let all = names.into_iter().zip(&decided.candidates);
+    all.map(|(name, place)| Switch {
+        name,
+        effect: place.effect.clone(),
+        instance: place.instance.clone(),
+        shape: place.shape.clone(),
+    })
+    .collect()
+}
+
+impl Switch {
+    /// Whether another one is the same effect in another form.
+    fn is_alike(&self, other: &Self) -> bool {
+        let fixed = |shape: &Shape| -> Shape {
+            shape
+                .iter()
+                .map(|(key, value)| (key.clone(), if value.is_number() { json!(0) } else { value.clone() }))
+                .collect()
+        };
+        (&self.effect, &self.instance) == (&other.effect, &other.instance) && fixed(&self.shape) == fixed(&other.shape)
+    }
 }
 
 fn level_name(level: &NoiseLevel) -> String {
@@ -433,7 +465,8 @@ fn named_by(extracts: &[Extract], switches: &[Switch]) -> Vec<String> {
     for named in extracts.iter().flat_map(Extract::named) {
         let is_level = |l: &NoiseLevel| (&l.effect, &l.instance) == (&named.0, &named.1);
         let level = || extracts.iter().flat_map(Extract::levels).find(|l| is_level(l)).map(level_name);
-        let name = position_of(switches, named).map(|at| switches[at].name.clone()).or_else(level);
+        let plain = format!("{}:{}", named.0, named.1);
+        let name = switches.iter().any(|s| s.name == plain).then_some(plain).or_else(level);
         all.extend(name.filter(|name| !all.contains(name)));
     }
     all

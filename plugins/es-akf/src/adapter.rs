@@ -58,6 +58,8 @@ struct LinkedFilter {
     displacement_m: Vec<Out>,
     /// One for each test mass.
     nis: Vec<Out>,
+    /// One for each readout.
+    innovation: Vec<Out>,
 }
 
 /// What a filter reads.
@@ -134,7 +136,7 @@ impl Stage for EsAkf {
         needs: &[],
     };
 
-    const STATE_VERSION: u32 = 2;
+    const STATE_VERSION: u32 = 3;
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         let mission = Mission::from_json(setup.mission_json())?;
@@ -266,6 +268,9 @@ impl Stage for EsAkf {
                 for column in &filter.nis {
                     output.f64(*column).push(s.nis);
                 }
+                for (column, x) in filter.innovation.iter().zip(&s.innovation) {
+                    output.f64(*column).push(*x);
+                }
             }
         }
         Ok(())
@@ -354,13 +359,16 @@ impl EsAkf {
             value.push(link.write_with(table, &format!("{}.value", label(c)), &c.unit, &c.frame, &archive)?);
             sigma.push(link.write_with(table, &format!("{}.sigma", label(c)), &c.unit, &c.frame, &archive)?);
         }
-        let (mut displacement_m, mut nis) = (Vec::new(), Vec::new());
+        let (mut displacement_m, mut nis, mut innovation) = (Vec::new(), Vec::new(), Vec::new());
         for TestMass { name, frame } in test_masses {
             for axis in AXES {
                 let column = format!("{name}.displacement.{axis}");
                 displacement_m.push(link.write_with(table, &column, "m", frame, &archive)?);
             }
             nis.push(link.write_with(table, &format!("{name}.nis"), "1", "", &archive)?);
+            for axis in AXES {
+                innovation.push(link.write_with(table, &format!("{name}.innovation.{axis}"), "1", frame, &archive)?);
+            }
         }
         let test_masses = test_masses.to_vec();
         Ok(Ok(LinkedFilter {
@@ -374,6 +382,7 @@ impl EsAkf {
             sigma,
             displacement_m,
             nis,
+            innovation,
         }))
     }
 

@@ -91,6 +91,8 @@ pub struct Statistics<const D: usize = 3> {
     pub design_sum: [f64; D],
     /// Readouts in `nis_sum`, per axis.
     pub readouts: [u64; D],
+    /// Sum of `d_i / √S̃_ii` per readout.
+    pub whitened_sum: [f64; D],
     /// `d_i / √S̃_ii` per readout, octave by octave.
     pub octaves: [Octaves; D],
 }
@@ -108,6 +110,7 @@ impl<const D: usize> Default for Statistics<D> {
             resets: 0,
             nis_sum: 0.0,
             design_sum: [0.0; D],
+            whitened_sum: [0.0; D],
             readouts: [0; D],
             octaves: [Octaves::default(); D],
         }
@@ -548,9 +551,11 @@ impl<const N: usize, const D: usize> Filter<N, D> {
                 s.nis_sum += d[i] * self.weight[i][j] * d[j];
             }
             if used[i] {
+                let whitened = d[i] / self.s_design[i][i].sqrt();
                 s.design_sum[i] += d[i] * d[i] / self.s_design[i][i];
+                s.whitened_sum[i] += whitened;
                 s.readouts[i] += 1;
-                s.octaves[i].push(d[i] / self.s_design[i][i].sqrt());
+                s.octaves[i].push(whitened);
             } else {
                 s.octaves[i].interrupt();
             }
@@ -697,6 +702,7 @@ impl<const N: usize, const D: usize> Filter<N, D> {
         s.readouts.iter_mut().try_for_each(|n| state.u64(n))?;
         state.f64(&mut s.nis_sum)?;
         state.f64s(&mut s.design_sum)?;
+        state.f64s(&mut s.whitened_sum)?;
         s.octaves.iter_mut().try_for_each(|octaves| octaves.visit(state))
     }
 }

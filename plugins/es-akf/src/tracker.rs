@@ -72,6 +72,9 @@ pub struct Snapshot {
     pub sigma: Vec<f64>,
     /// Mean NIS per degree of freedom since the row before, NaN where nothing was measured.
     pub nis: f64,
+    /// Mean innovation of each readout since the row before, over its σ where innovations are white and the mission's
+    /// noise is right; NaN where nothing was measured.
+    pub innovation: Vec<f64>,
 }
 
 /// Estimates summed over `BIN_S`, and their covariance at its start.
@@ -183,8 +186,16 @@ pub struct Tracker<const N: usize, const D: usize = 3> {
     dt_s: f64,
     snapshot_epochs: u64,
     bins: VecDeque<Bin>,
-    /// Statistics at the last snapshot: sum and degrees of freedom.
-    reported: (f64, u64),
+    /// Statistics at the last snapshot.
+    reported: Reported<D>,
+}
+
+/// What the last snapshot has told of.
+#[derive(Clone, Copy, Debug)]
+struct Reported<const D: usize> {
+    nis_sum: f64,
+    whitened_sum: [f64; D],
+    readouts: [u64; D],
 }
 
 impl<const N: usize, const D: usize> Tracker<N, D> {
@@ -192,7 +203,8 @@ impl<const N: usize, const D: usize> Tracker<N, D> {
     pub fn new(filter: Filter<N, D>, snapshot_s: f64) -> Self {
         let dt_s = filter.model().dt_s;
         let snapshot_epochs = ((snapshot_s / dt_s).round() as u64).max(1);
-        Self { filter, dt_s, snapshot_epochs, bins: VecDeque::new(), reported: (0.0, 0) }
+        let reported = Reported { nis_sum: 0.0, whitened_sum: [0.0; D], readouts: [0; D] };
+        Self { filter, dt_s, snapshot_epochs, bins: VecDeque::new(), reported }
     }
 
     /// The filter.
@@ -229,13 +241,17 @@ impl<const N: usize, const D: usize> Tracker<N, D> {
 
     fn snapshot(&mut self, row: usize) -> Snapshot {
         let s = self.filter.statistics();
-        let (sum, dof) = (s.nis_sum, s.readouts.iter().sum::<u64>());
-        let nis =
-            if dof > self.reported.1 { (sum - self.reported.0) / (dof - self.reported.1) as f64 } else { f64::NAN };
-        self.reported = (sum, dof);
+        let (now, last) =
+            (Reported { nis_sum: s.nis_sum, whitened_sum: s.whitened_sum, readouts: s.readouts }, self.reported);
+        let used: [u64; D] = std::array::from_fn(|i| now.readouts[i].saturating_sub(last.readouts[i]));
+        // NaN where there was none: 0/0.
+        let nis = (now.nis_sum - last.nis_sum) / used.iter().sum::<u64>() as f64;
+        let innovation = |i: usize| (now.whitened_sum[i] - last.whitened_sum[i]) / (used[i] as f64).sqrt();
+        let innovation = (0..D).map(innovation).collect();
+        self.reported = now;
         let value = self.filter.coefficients().to_vec();
         let sigma = (0..value.len()).map(|i| self.filter.coefficient_covariance(i, i).sqrt()).collect();
-        Snapshot { row, displacement_m: self.filter.displacement_m().to_vec(), value, sigma, nis }
+        Snapshot { row, displacement_m: self.filter.displacement_m().to_vec(), value, sigma, nis, innovation }
     }
 }
 
@@ -336,7 +352,8 @@ impl<const N: usize, const D: usize> Follower for Tracker<N, D> {
         if self.bins.len() > self.whole_window() {
             return Err(StateError::Content("a count of averages"));
         }
-        state.f64(&mut self.reported.0)?;
-        state.u64(&mut self.reported.1)
+        state.f64(&mut self.reported.nis_sum)?;
+        state.f64s(&mut self.reported.whitened_sum)?;
+        self.reported.readouts.iter_mut().try_for_each(|n| state.u64(n))
     }
 }

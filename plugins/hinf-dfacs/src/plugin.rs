@@ -205,8 +205,8 @@ fn write_columns(
     let mut out = Vec::with_capacity(row_length(noises.len()));
     for axis in AXES {
         let unpredicted = unpredicted(format!("sc.alpha.{axis}"));
-        let attributes = [(UNPREDICTED_ATTRIBUTE, unpredicted.as_str())];
-        let attributes = if prediction { &attributes[..] } else { &[] };
+        let attributes = [("archive", "mean"), (UNPREDICTED_ATTRIBUTE, unpredicted.as_str())];
+        let attributes = if prediction { &attributes[..] } else { &attributes[..1] };
         out.push(link.write_with(table, &format!("sc.alpha_srf_rad_s2.{axis}"), "rad s-2", "SRF", attributes)?);
     }
     for axis in AXES {

@@ -137,6 +137,16 @@ impl<'a> LinkContext<'a> {
         if !(column.rate_hz.is_finite() && column.rate_hz >= 0.0) {
             return Err(format!("writes column {}:{} at a rate of {} Hz", column.table, column.name, column.rate_hz));
         }
+        match column.attributes.get("archive").map(String::as_str) {
+            None | Some("true" | "end") => {}
+            Some("mean") if column.rate_hz > 0.0 => {}
+            Some(other) => {
+                let (table, name, rate_hz) = (&column.table, &column.name, column.rate_hz);
+                return Err(format!(
+                    "writes column {table}:{name} at {rate_hz} Hz with archive = {other:?}; there is `true`, `end`, and for tables with a rate `mean`"
+                ));
+            }
+        }
         if let Some(table) = self.linked.writes.iter_mut().find(|t| t.name == column.table) {
             if table.rate_hz != column.rate_hz {
                 return Err(format!(

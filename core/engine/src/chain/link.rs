@@ -6,6 +6,7 @@ use serde_json::{Map, Value, json};
 use super::{Carry, Chain, ChainError, ChainNode, Queue, Route, To};
 use crate::border::{BorderError, Config, Instance, Kind, LinkRequest, Linked};
 use crate::config::{EffectEntry, Mission, Model, Node, Pipeline, resolve_parameters};
+use crate::means;
 use crate::registry::{Found, Registry};
 use crate::table::{Column, TableSpec};
 use dragfree_archive::files::sha256;
@@ -164,7 +165,10 @@ impl Builder<'_> {
     fn candidate(&mut self, entry: &EffectEntry, standing: Standing) -> Result<(), ChainError> {
         let found = self.registry.find(Kind::Effect, &entry.id)?.apart(entry.isolate);
         let mut linked = self.chain.coefficients.iter();
-        if let Some(c) = linked.find(|c| c.effect == entry.id && c.instance == entry.instance) {
+        let in_a_form = |c: &Coefficient| c.candidate && c.variants.is_empty() && c.transients.is_empty();
+        let may_come_again = |c: &Coefficient| standing == Standing::Chosen && in_a_form(c);
+        let of = |c: &&Coefficient| c.effect == entry.id && c.instance == entry.instance;
+        if let Some(c) = linked.find(|c| of(c) && !may_come_again(c)) {
             // Before it is linked, because its table has the name of the other's.
             return Err(self.model_error(format!("coefficient {} exists twice", c.name)));
         }
@@ -199,7 +203,10 @@ impl Builder<'_> {
     ) -> Result<(), ChainError> {
         let mut unused: Vec<&String> = entry.prior.keys().collect();
         for mut c in announced {
-            if self.chain.coefficients.iter().any(|other| other.name == c.name) {
+            // One that is tried may come again in another form.
+            let is_another_form = |other: &Coefficient| candidate && other.candidate && other.shape != c.shape;
+            let same = |other: &&Coefficient| other.name == c.name && !is_another_form(other);
+            if self.chain.coefficients.iter().any(|other| same(&other)) {
                 return Err(self.model_error(format!("coefficient {} exists twice", c.name)));
             }
             c.effect.clone_from(&entry.id);
@@ -252,7 +259,9 @@ impl Builder<'_> {
         }
         let mut node = found.create(&config)?;
         let model_json = self.model_json(standing != Standing::Member);
-        let mut linked = node.link(LinkRequest { available: &self.available, model_json: &model_json })?;
+        let mut linked =
+            node.link(LinkRequest { available: &self.without_tables_of(&node.name), model_json: &model_json })?;
+        self.rename_tables(&mut linked);
         self.take_noise(&node.name, std::mem::take(&mut linked.noise))?;
         self.inherit_loop(&mut linked);
         node.activate(u32::try_from(self.chain.carry.batch_rows).unwrap_or(u32::MAX))?;
@@ -271,7 +280,11 @@ impl Builder<'_> {
             parameters,
             reads,
             inputs,
-            routes: linked.writes.iter().map(|t| Route { readers: Vec::new(), archive: is_archived(t) }).collect(),
+            routes: linked
+                .writes
+                .iter()
+                .map(|t| Route { readers: Vec::new(), archive: Archived::of(t).is_some() })
+                .collect(),
             writes: linked.writes.clone(),
             makers,
             done_until_ns: i64::MIN,
@@ -281,6 +294,34 @@ impl Builder<'_> {
             instance: node,
         });
         Ok(linked)
+    }
+
+    /// What exists for a plugin with a name. An effect that is tried in several forms writes the same tables in each:
+    /// those that are there already are hidden behind another name.
+    fn without_tables_of(&self, name: &str) -> std::borrow::Cow<'_, [Column]> {
+        let own = self.chain.nodes.iter().filter(|n| n.is_effect && n.name() == name).flat_map(|n| &n.writes);
+        let own: Vec<&str> = own.map(|table| table.name.as_str()).collect();
+        if own.is_empty() {
+            return self.available.as_slice().into();
+        }
+        let hidden = |c: &Column| {
+            let table = if own.contains(&c.table.as_str()) { format!("{} before", c.table) } else { c.table.clone() };
+            Column { table, ..c.clone() }
+        };
+        self.available.iter().map(hidden).collect()
+    }
+
+    /// Gives tables that an earlier form of the same effect has written too a number.
+    fn rename_tables(&self, linked: &mut Linked) {
+        for written in &mut linked.writes {
+            let taken = |name: &str| self.available.iter().any(|c| c.table == name);
+            let free = |name: &String| (2..).map(|k| format!("{name} {k}")).find(|name| !taken(name));
+            let Some(other) = taken(&written.name).then(|| free(&written.name)).flatten() else { continue };
+            let before = std::mem::replace(&mut written.name, other.clone());
+            written.columns.iter_mut().for_each(|c| c.table.clone_from(&other));
+            let responses = linked.coefficients.iter_mut().flat_map(|c| &mut c.responses);
+            responses.filter(|r| r.table == before).for_each(|r| r.table.clone_from(&other));
+        }
     }
 
     fn take_noise(&mut self, plugin: &str, declared: Vec<NoiseProcess>) -> Result<(), ChainError> {
@@ -321,16 +362,57 @@ impl Builder<'_> {
     }
 }
 
-fn is_archived(table: &TableSpec) -> bool {
-    table.columns.iter().any(|c| c.attributes.get("archive").is_some_and(|a| a == "true" || a == AT_THE_END))
+/// How a table goes into the file beside a product.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) enum Archived {
+    /// Row by row.
+    Whole,
+    /// Row by row; all rows come at the flush.
+    AtTheEnd,
+    /// As means of some columns over intervals.
+    Means {
+        /// Their indices.
+        columns: Vec<usize>,
+        /// Rate of the table, Hz.
+        rate_hz: f64,
+    },
 }
 
-/// Value of the attribute `archive` of a table that has no rows before the flush.
-const AT_THE_END: &str = "end";
+impl Archived {
+    /// As the attributes `archive` of its columns say; none where no column has one.
+    fn of(table: &TableSpec) -> Option<Self> {
+        let says = |c: &Column, value: &str| c.attributes.get("archive").is_some_and(|a| a == value);
+        let any = |value: &str| table.columns.iter().any(|c| says(c, value));
+        if any("end") {
+            return Some(Self::AtTheEnd);
+        }
+        if any("true") {
+            return Some(Self::Whole);
+        }
+        let columns = table.columns.iter().enumerate().filter(|(_, c)| says(c, "mean"));
+        let columns: Vec<usize> = columns.map(|(i, _)| i).collect();
+        (!columns.is_empty() && table.rate_hz > 0.0).then_some(Self::Means { columns, rate_hz: table.rate_hz })
+    }
+}
 
-/// Whether all rows of a table come at the flush.
-pub(crate) fn comes_at_the_end(table: &TableSpec) -> bool {
-    table.columns.iter().any(|c| c.attributes.get("archive").is_some_and(|a| a == AT_THE_END))
+impl Chain {
+    /// Tables of the file beside the product, as they are there, and how they come to it.
+    pub(crate) fn archived_tables(&self) -> Vec<(TableSpec, Archived)> {
+        let all = self.nodes.iter().flat_map(|n| n.writes.iter().zip(&n.routes)).filter(|(_, route)| route.archive);
+        let table = |table: &TableSpec| {
+            let archived = Archived::of(table)?;
+            let spec = match &archived {
+                Archived::Means { columns, .. } => TableSpec {
+                    rate_hz: 0.0,
+                    columns: columns.iter().flat_map(|c| means::columns_of(&table.columns[*c])).collect(),
+                    ..table.clone()
+                },
+                Archived::Whole | Archived::AtTheEnd => table.clone(),
+            };
+            Some((spec, archived))
+        };
+        all.filter_map(|(own, _)| table(own)).collect()
+    }
 }
 
 /// Makes and links a source: it reads nothing, and says which tables it makes.

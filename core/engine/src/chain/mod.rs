@@ -10,7 +10,7 @@ mod recording;
 mod state;
 
 pub use link::build;
-pub(crate) use link::{comes_at_the_end, open_source};
+pub(crate) use link::{Archived, open_source};
 pub(crate) use recording::Recording;
 pub use recording::Recordings;
 pub use state::resumes_at_ns;
@@ -268,12 +268,6 @@ impl Chain {
     /// Every row before this time has gone into the chain, Unix ns.
     pub fn complete_until_ns(&self) -> i64 {
         self.complete_until_ns
-    }
-
-    /// Tables that belong beside the product.
-    pub(crate) fn archived_tables(&self) -> Vec<TableSpec> {
-        let all = self.nodes.iter().flat_map(|n| n.writes.iter().zip(&n.routes));
-        all.filter(|(_, route)| route.archive).map(|(table, _)| table.clone()).collect()
     }
 
     /// Pushes a chunk of the feed into the chain. What went in before goes on at the same time, node by node at rows of

@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::ops::Range;
 
 use dragfree_estimation::sigma::BandNoise;
-use dragfree_identification::candidates::{CandidateSet, Coefficient as Unknown, Form};
+use dragfree_identification::candidates::{Candidate, CandidateSet, Coefficient as Unknown, Form};
 use dragfree_identification::gram::Symmetric;
 use dragfree_identification::record::Record;
 use dragfree_schema::Coefficient;
@@ -45,12 +45,14 @@ pub(crate) fn triangle(rows: usize) -> usize {
 }
 
 impl ByBand {
-    /// From the sums of all candidates. `about` gives the values of the model's coefficients.
+    /// From the sums of all candidates, and what is named in its form. `about` gives the values of the model's
+    /// coefficients.
     ///
     /// # Errors
     /// The declared noise contradicts itself.
     pub(super) fn new(
         coefficients: &[Coefficient],
+        named: &[Candidate],
         record: &Record,
         about: impl Fn(&str) -> Option<f64>,
     ) -> Result<Self, WorkflowError> {
@@ -64,7 +66,7 @@ impl ByBand {
         let (expected, observations) = (&gathered.total.weights.expected, gathered.total.weights.observations(&plan));
         let initial = |i: usize| set.coefficients[i].initial;
         let value = |i: usize| about(&set.coefficients[i].name).unwrap_or_else(|| initial(i));
-        let forms: Vec<Option<&Form>> = coefficients.iter().map(|c| form_of(set, c)).collect();
+        let forms: Vec<Option<&Form>> = coefficients.iter().map(|c| form_of(set, named, c)).collect();
         let about: Vec<f64> =
             coefficients.iter().map(|c| if c.candidate { 0.0 } else { about(&c.name).unwrap_or(c.initial) }).collect();
         // What a coefficient adds to a channel, as columns with weights.
@@ -184,13 +186,15 @@ impl ByBand {
     }
 }
 
-/// The form in which a coefficient is in an extract.
-fn form_of<'a>(set: &'a CandidateSet, c: &Coefficient) -> Option<&'a Form> {
+/// The form in which a coefficient is in an extract: one of the search, or one between these that is named.
+fn form_of<'a>(set: &'a CandidateSet, named: &'a [Candidate], c: &Coefficient) -> Option<&'a Form> {
     let same = |own: &&Unknown| own.name == c.name && own.candidate == c.candidate;
     let of_shape = |form: &&Form| {
         !c.candidate || (form.shape.len() == c.shape.len() && form.shape.iter().all(|(k, v)| c.shape.get(k) == Some(v)))
     };
-    set.coefficients.iter().filter(same).flat_map(|own| &own.forms).find(of_shape)
+    let parts = named.iter().flat_map(|candidate| &candidate.parts);
+    let between = parts.filter(|(index, _)| same(&&set.coefficients[*index])).map(|(_, form)| form);
+    set.coefficients.iter().filter(same).flat_map(|own| &own.forms).chain(between).find(of_shape)
 }
 
 /// Adds the products of combinations of columns in a band, from the diagonal down, times a weight.

@@ -218,7 +218,8 @@ impl<'a> Responses<'a> {
     /// Adds a response; one to a channel that does not exist, or scaled by a coefficient that the model lacks, is none.
     fn add(&mut self, available: &Available, c: &Coefficient, response: Declared) {
         let index = |name: &str| self.coefficients.iter().position(|c| c.name == name);
-        let Some(coefficient) = index(&c.name) else { return };
+        // Forms of a coefficient have the same name.
+        let Some(coefficient) = self.coefficients.iter().position(|own| std::ptr::eq(*own, c)) else { return };
         let Some(channel) = self.names.iter().position(|n| *n == response.channel) else { return };
         let times = response.times.as_deref().map(index);
         if times == Some(None) {

@@ -6,7 +6,7 @@ use dragfree_identification::innovations::decision::{Quadratic, inverse};
 use nalgebra::{DMatrix, DVector};
 use serde_json::Map;
 
-use super::{Basis, Confounder, Day, Effect, Offset, On, Rung, Size, Switch, level_name};
+use super::{Basis, Confounder, Day, Effect, Form, Offset, On, Rung, Size, Switch, level_name};
 use crate::answer::NoiseLevel;
 
 /// Effects that are not switched on are told as far as this rank: what comes after explains nothing.
@@ -123,12 +123,27 @@ impl Solving<'_> {
             let known = of(own, own) - &along * of(&at, own);
             left.dot(&(inverse(&known) * &left)) - own.len() as f64
         };
-        let off = (0..places.len()).filter(|c| !set.contains(c));
+        let off = self.forms_told(set).into_iter().filter(|c| !set.contains(c));
         let mut all: Vec<(usize, f64)> = off.map(|c| (c, gain(c))).collect();
         all.sort_by(|a, b| b.1.total_cmp(&a.1));
         let unlikely = all.len().saturating_sub(TOLD);
         all.truncate(TOLD);
         (all.into_iter().map(|(c, _)| c).collect(), unlikely)
+    }
+
+    /// The candidates, each in one form: one that is on, otherwise the first by name, which is that of a day.
+    fn forms_told(&self, set: &[usize]) -> Vec<usize> {
+        let switches = &self.basis.switches;
+        let mut order: Vec<usize> = (0..switches.len()).collect();
+        order.sort_by_key(|c| (!set.contains(c), switches[*c].name.len(), *c));
+        let mut told: Vec<usize> = Vec::new();
+        for c in order {
+            if set.contains(&c) || told.iter().all(|other| !switches[c].is_alike(&switches[*other])) {
+                told.push(c);
+            }
+        }
+        told.sort_unstable();
+        told
     }
 
     fn effect(&self, which: On, set: &[usize]) -> Effect {
@@ -157,6 +172,7 @@ impl Solving<'_> {
             effect: effect.clone(),
             instance: instance.clone(),
             shape: shape.clone().into_iter().collect(),
+            forms: self.forms_of(c),
             on: false,
             named: self.basis.named.contains(name),
             is_noise: false,
@@ -171,6 +187,15 @@ impl Solving<'_> {
         }
     }
 
+    /// The forms of a candidate's effect; none where there is one alone.
+    fn forms_of(&self, c: usize) -> Vec<Form> {
+        let switches = &self.basis.switches;
+        let alike = switches.iter().filter(|other| switches[c].is_alike(other));
+        let form = |s: &Switch| Form { name: s.name.clone(), shape: s.shape.clone().into_iter().collect() };
+        let all: Vec<Form> = alike.map(form).collect();
+        if all.len() > 1 { all } else { Vec::new() }
+    }
+
     fn of_level(&self, level: &NoiseLevel) -> Effect {
         let value = level.ln.exp() * level.stated;
         let size = Size { name: level.coefficient.clone(), value, sigma: level.sigma * value, unit: "1".to_owned() };
@@ -183,6 +208,7 @@ impl Solving<'_> {
             effect: level.effect.clone(),
             instance: level.instance.clone(),
             shape: Map::new(),
+            forms: Vec::new(),
             on: false,
             is_noise: true,
             coefficients: vec![size],

@@ -70,6 +70,8 @@ pub struct Effect {
     pub instance: String,
     /// Values of the shape parameters.
     pub shape: Map<String, Value>,
+    /// The forms in which it can be, itself among them; empty where there is one.
+    pub forms: Vec<Form>,
     /// Whether it is on.
     pub on: bool,
     /// Whether the diagnosis of a product names it.
@@ -92,6 +94,15 @@ pub struct Effect {
     pub offset_shift_m: BTreeMap<String, f64>,
     /// What these data cannot tell from it, of the effects told.
     pub confounders: Vec<Confounder>,
+}
+
+/// A form of an effect.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Form {
+    /// As [`Effect::name`].
+    pub name: String,
+    /// Values of the shape parameters.
+    pub shape: Map<String, Value>,
 }
 
 /// An effect that explains nearly the same.

@@ -284,8 +284,9 @@ impl Process {
             tell_printed(&name, printed);
             drop::<std::sync::mpsc::Sender<()>>(sender);
         };
-        std::thread::Builder::new().spawn(tell)?;
+        // From here on the end of this value is the end of the process.
         let mut process = Self { child, socket: Some(socket), limit: isolation.limit, told };
+        std::thread::Builder::new().spawn(tell)?;
         process.hand_over(memories)?;
         Ok(process)
     }
