@@ -1,8 +1,12 @@
 //! The readers, and what each of them must never do: panic, hang, or take more than its budget.
 
+use dragfree_engine::border::{Kind, Linked, read_answer};
 use dragfree_engine::config::{Mission, Model, Pipeline};
 use dragfree_engine::replay::Replay;
+use dragfree_engine::schema::{Coefficient, Constraint, NoiseProcess, NoiseShape};
+use dragfree_engine::table::{Column, TableSpec};
 use dragfree_engine::telemetry::{Cells, Decoder, Layout, check, descriptor, expected};
+use serde_json::json;
 use std::io;
 use std::path::{Path, PathBuf};
 
@@ -26,13 +30,15 @@ pub enum Target {
     Pipeline,
     /// A product.
     Product,
+    /// An answer of the process of a plugin that is not trusted.
+    Answer,
 }
 
 impl Target {
     /// All of them.
-    pub const ALL: [Self; 7] = {
+    pub const ALL: [Self; 8] = {
         use Target::*;
-        [Telemetry, Message, Schema, Mission, Model, Pipeline, Product]
+        [Telemetry, Message, Schema, Mission, Model, Pipeline, Product, Answer]
     };
 
     /// Its name.
@@ -45,6 +51,7 @@ impl Target {
             Self::Model => "model",
             Self::Pipeline => "pipeline",
             Self::Product => "product",
+            Self::Answer => "answer",
         }
     }
 
@@ -61,6 +68,7 @@ impl Target {
         let root = Path::new(env!("CARGO_MANIFEST_DIR"));
         let folder = match self {
             Self::Message => return Ok(messages()),
+            Self::Answer => return Ok(answers()),
             Self::Schema => return Ok(TOPICS.iter().filter_map(|t| Some(descriptor(t)?.1.to_vec())).collect()),
             Self::Telemetry => root.join("corpus/telemetry"),
             Self::Product => root.join("corpus/product"),
@@ -104,6 +112,11 @@ impl Target {
             }
             Self::Model => drop(Model::parse(name, &text())),
             Self::Pipeline => drop(Pipeline::parse(name, &text())),
+            Self::Answer => {
+                for kind in Kind::ALL {
+                    let _ = read_answer(bytes, &[column("grid", "x")], kind); // either answer will do
+                }
+            }
             Self::Product => {
                 std::fs::write(scratch, bytes)?;
                 drop(dragfree_archive::product::read(scratch));
@@ -111,6 +124,49 @@ impl Target {
         }
         Ok(())
     }
+}
+
+fn column(table: &str, name: &str) -> Column {
+    let attributes = [("kind".to_owned(), "channel".to_owned())].into();
+    let (table, name) = (table.to_owned(), name.to_owned());
+    Column { table, name, unit: "m".to_owned(), frame: "ORF_1".to_owned(), rate_hz: 10.0, attributes }
+}
+
+/// Answers to every kind of question, as a process would send them.
+fn answers() -> Vec<Vec<u8>> {
+    let written = vec![column("own", "a"), column("own", "b")];
+    let linked = Linked {
+        writes: vec![TableSpec { name: "own".to_owned(), rate_hz: 10.0, columns: written, truth: false }],
+        coefficients: vec![Coefficient { name: "own.tm1.x".to_owned(), ..Coefficient::default() }],
+        constraints: vec![Constraint {
+            name: "survey".to_owned(),
+            kind: "survey".to_owned(),
+            terms: vec![("own.tm1.x".to_owned(), 1.0)],
+            lower: -1.0,
+            upper: 1.0,
+            unit: "m".to_owned(),
+            parts: 1,
+        }],
+        noise: vec![NoiseProcess {
+            name: "n".to_owned(),
+            spectrum: Some(NoiseShape::white(1e-12)),
+            enters: [("a".to_owned(), vec![1.0])].into(),
+            ..NoiseProcess::default()
+        }],
+        ..Linked::default()
+    };
+    let texts = [
+        json!("Done"),
+        json!("Discarded"),
+        json!({ "Bytes": true }),
+        json!({ "Log": { "level": 2, "text": "it works" } }),
+        json!({ "Rows": { "rows": [10, 0, 3], "complete_until_ns": 7, "done": false } }),
+        json!({ "Failed": { "kind": "Plugin", "message": "no column" } }),
+        json!({ "Linked": linked }),
+    ];
+    let framed =
+        |text: String| [&(text.len() as u64).to_le_bytes()[..], &0_u64.to_le_bytes(), text.as_bytes()].concat();
+    texts.iter().map(|text| framed(text.to_string())).collect()
 }
 
 /// Messages as a producer would write them: fields of doubles in messages in messages, and a status.
@@ -132,4 +188,18 @@ fn replay(file: &Path) {
     let Ok(mut replay) = Replay::open(&[file.to_owned()], None, 1) else { return };
     while let Ok(Some(_)) = replay.next() {}
     let _ = replay.digests(); // either answer will do
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Otherwise every damaged one would be refused for the same reason.
+    #[test]
+    fn answers_of_the_corpus_are_accepted() {
+        for answer in answers() {
+            let read = read_answer(&answer, &[column("grid", "x")], Kind::Effect);
+            assert_eq!(read, Ok(()), "{}", String::from_utf8_lossy(&answer));
+        }
+    }
 }

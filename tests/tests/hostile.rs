@@ -4,6 +4,7 @@
 
 use dragfree_tests::{archived, compile_plugin, dragfree, expect, fixture, json, simulate};
 use std::collections::BTreeMap;
+use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 use std::sync::{Mutex, OnceLock};

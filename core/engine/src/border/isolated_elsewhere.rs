@@ -6,10 +6,10 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use super::call::{Config, LinkRequest, Rows, SourceStep};
-use super::library::{Checked, Library, PluginInfo};
+use super::library::{Checked, Kind, Library, PluginInfo};
 use super::link::Linked;
 use super::{BorderError, exit_now};
-use crate::table::Batch;
+use crate::table::{Batch, Column};
 
 /// How a process for a plugin would be started.
 #[derive(Clone, Debug)]
@@ -31,6 +31,14 @@ pub fn serve() -> ! {
 /// Always.
 pub fn described(_: &Isolation, checked: &Checked) -> Result<Library, BorderError> {
     Err(BorderError::Refused { path: checked.path().to_owned(), reason: NOT_HERE.to_owned() })
+}
+
+/// Refuses an answer.
+///
+/// # Errors
+/// Always.
+pub fn read_answer(_: &[u8], _: &[Column], _: Kind) -> Result<(), String> {
+    Err(NOT_HERE.to_owned())
 }
 
 const NOT_HERE: &str = "is to run in a process of its own, which works on Linux alone";
