@@ -250,6 +250,59 @@ fn a_locked_folder_loads_only_what_is_locked() {
     assert!(list.to_string().contains("not listed in"), "{list}");
 }
 
+/// With a key a folder loads only what a lock names that was signed with it; unsigned, signed by another, changed since
+/// it was signed, without digests, and without a lock nothing of the folder is opened. The key may stand in a file, in
+/// its text, or in the environment.
+#[test]
+fn with_a_key_a_folder_loads_only_what_its_owner_has_signed() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let dir = dir.path();
+    let library = compile_plugin(dir, "c_plugins.c", "c_plugins", &[]);
+    let keys = minisign::KeyPair::generate_unencrypted_keypair().expect("keys");
+    let others = minisign::KeyPair::generate_unencrypted_keypair().expect("keys");
+    let key = dir.join("mission.pub");
+    std::fs::write(&key, keys.pk.to_box().expect("a box").into_string()).expect("written");
+    let (lock, signature) = (dir.join("plugins.lock"), dir.join("plugins.lock.minisig"));
+    let sign = |keys: &minisign::KeyPair, text: &str| {
+        std::fs::write(&lock, text).expect("written");
+        let signed = minisign::sign(Some(&keys.pk), &keys.sk, text.as_bytes(), None, None).expect("signed");
+        std::fs::write(&signature, signed.into_string()).expect("written");
+    };
+    let listed = |command: &mut std::process::Command| {
+        json(command.args(["plugins", "list", "--json", "--plugin-dir"]).arg(dir), 0)
+    };
+    let with = |key: &str| listed(dragfree(dir).args(["--plugin-key", key]));
+    let by_file = || with(&key.display().to_string());
+    let found = |list: &serde_json::Value| list["plugins"].to_string().contains("\"c-scale\"");
+    let refused = |why: &str| {
+        let list = by_file();
+        assert!(!found(&list) && list["refused"].to_string().contains(why), "{why}: {list:#}");
+    };
+    refused("plugins.lock cannot be read");
+    let all = listed(&mut dragfree(dir))["plugins"].take();
+    let own = all.as_array().expect("plugins").iter().find(|p| p["id"] == "c-scale").expect("it is listed");
+    let sha256 = own["sha256"].as_str().expect("a digest");
+    let name = library.file_name().expect("a name").to_string_lossy().into_owned();
+    let text = format!("[sha256]\n{name:?} = \"{sha256}\"\n");
+    std::fs::write(&lock, &text).expect("written");
+    refused("plugins.lock.minisig cannot be read");
+    sign(&others, &text);
+    refused("is not signed with the key of --plugin-key");
+    sign(&keys, "isolate = true\n");
+    refused("has no [sha256]");
+    sign(&keys, &text);
+    std::fs::write(&lock, format!("{text}\"libother.so\" = \"00\"\n")).expect("written");
+    refused("is not signed with the key of --plugin-key");
+    std::fs::write(&lock, &text).expect("written");
+    assert!(found(&by_file()) && found(&with(&keys.pk.to_base64())));
+    let of_environment = listed(dragfree(dir).env("DRAGFREE_PLUGIN_KEY", &key));
+    assert!(found(&of_environment));
+    // What the program brings along is in a folder without a signed lock.
+    assert!(!of_environment["plugins"].to_string().contains("\"es-akf\""), "{of_environment:#}");
+    let output = expect(dragfree(dir).args(["plugins", "list", "--plugin-key", "nothing"]), 1);
+    assert!(String::from_utf8_lossy(&output.stderr).contains("is no public key of minisign"), "{output:?}");
+}
+
 /// What a run of a day's chain leaves: series, sums and the state for tomorrow. `isolate` stands in every stage and
 /// effect.
 #[cfg(target_os = "linux")]

@@ -307,9 +307,9 @@ fn a_reader_finds_the_effect_and_keeps_it_by_clicks() {
     }
 }
 
-/// A thermal force with a lag of a minute, found with a lag that the page can move: χ² falls most within a factor of two
-/// of the true lag and less and less beyond it, and the size there is the diagnosis'. A slider moved by the keyboard
-/// switches the effect on in that form, and back by the browser.
+/// A thermal force with a lag of a minute, found with a lag that the page can move: χ² falls most within a factor of
+/// two of the true lag and less and less beyond it, and the size there is the diagnosis'. A slider moved by the
+/// keyboard switches the effect on in that form, and back by the browser.
 #[test]
 fn a_lag_is_moved_by_a_slider() {
     const TRUTH: f64 = 8e-10;

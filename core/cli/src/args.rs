@@ -33,6 +33,10 @@ pub(crate) struct Global {
     /// Folder with plugins, besides the one of the program; repeatable. Also DRAGFREE_PLUGIN_PATH
     #[arg(long, global = true, value_name = "DIR")]
     pub(crate) plugin_dir: Vec<PathBuf>,
+    /// Public key of minisign, or its file: open no plugin but those of a plugins.lock that is signed with it. Also
+    /// DRAGFREE_PLUGIN_KEY
+    #[arg(long, global = true, value_name = "KEY")]
+    pub(crate) plugin_key: Option<String>,
     /// Print the result as JSON
     #[arg(long, global = true)]
     pub(crate) json: bool,

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::border::{self, BorderError, Checked, Config, Instance, Isolation, Kind, Library, PluginInfo};
+use crate::border::{self, BorderError, Checked, Config, Instance, Isolation, Kind, Library, PluginInfo, PluginKey};
 use dragfree_archive::files::Problem;
 
 /// The plugins that were found.
@@ -48,19 +48,30 @@ pub enum RegistryError {
 impl Registry {
     /// Opens every shared library in the folders. A file that is refused is kept with its reason, and is no error.
     pub fn discover(folders: &[PathBuf]) -> Self {
-        Self::open_all(folders, None, None)
+        Self::open_all(folders, None, None, None)
     }
 
-    /// The same; but what no `plugins.lock` vouches for goes through `probe` first, since a library may crash, end the
+    /// The same; but with a `key` every folder needs a `plugins.lock` that is signed with it. What no `plugins.lock`
+    /// vouches for goes through `probe` first, since a library may crash, end the
     /// program or hang where it is opened. Plugins can run in processes of their own, and those of a folder that asks
     /// for it are opened nowhere else.
-    pub fn discover_probed(folders: &[PathBuf], isolation: Isolation, probe: Probe<'_>) -> Self {
-        Self::open_all(folders, Some(Arc::new(isolation)), Some(probe))
+    pub fn discover_probed(
+        folders: &[PathBuf],
+        isolation: Isolation,
+        key: Option<&PluginKey>,
+        probe: Probe<'_>,
+    ) -> Self {
+        Self::open_all(folders, Some(Arc::new(isolation)), key, Some(probe))
     }
 
-    fn open_all(folders: &[PathBuf], isolation: Option<Arc<Isolation>>, probe: Option<Probe<'_>>) -> Self {
+    fn open_all(
+        folders: &[PathBuf],
+        isolation: Option<Arc<Isolation>>,
+        key: Option<&PluginKey>,
+        probe: Option<Probe<'_>>,
+    ) -> Self {
         let mut this = Self { folders: folders.to_vec(), isolation, ..Self::default() };
-        let mut checked = this.check_all();
+        let mut checked = this.check_all(key);
         if let Some(probe) = probe {
             let is_tried = |library: &Checked| !library.is_locked() && !library.is_isolated();
             let unknown: Vec<&Path> = checked.iter().filter(|c| is_tried(c)).map(Checked::path).collect();
@@ -97,14 +108,14 @@ impl Registry {
     }
 
     /// Every shared library in the folders that passes the checks that run no code of it, each content once.
-    fn check_all(&mut self) -> Vec<Checked> {
+    fn check_all(&mut self, key: Option<&PluginKey>) -> Vec<Checked> {
         let mut seen = std::collections::BTreeSet::new();
         let mut all: Vec<Checked> = Vec::new();
         for path in self.folders.clone().iter().flat_map(|folder| shared_libraries(folder)) {
             if !seen.insert(path.canonicalize().unwrap_or_else(|_| path.clone())) {
                 continue;
             }
-            match Checked::new(&path) {
+            match Checked::new(&path, key) {
                 // The same bytes under another name are the same plugin, not a second one.
                 Ok(library) if all.iter().any(|other| other.sha256() == library.sha256()) => {}
                 Ok(library) => all.push(library),

@@ -12,6 +12,7 @@ use dragfree_estimation::decimate::SLOW_HZ;
 use dragfree_estimation::sigma::NoiseModel;
 use dragfree_identification::candidates::{Candidate, Coefficient as Unknown};
 use dragfree_identification::diagnosis::{self, Diagnosis, Found, Trials, UNOBSERVABLE, Unexplained};
+use dragfree_identification::innovations::decision::Fitted;
 use dragfree_identification::lines::{Line, Lines};
 use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
@@ -26,7 +27,9 @@ use crate::answer::{
     Evidence, apart, contradict, drifting, found, limits, noise_levels, offsets, verdict, with_levels,
 };
 use crate::extract::{Extract, MadeOf};
-use crate::likelihood::{Decided, PASSES, Point, Settled, moved, one_pass, step, step_of_model, transients_near_ends};
+use crate::likelihood::{
+    Decided, PASSES, Place, Point, Settled, moved, one_pass, step, step_of_model, transients_near_ends,
+};
 use crate::proposals::{FORMULA, Proposal, probes, proposals};
 use crate::replay::{FINE, Forms, Pass, Replay, What, sum};
 
@@ -406,8 +409,16 @@ fn answer(
     let mut others: Vec<Found> =
         decided.selection.rest.iter().map(|f| found(settings, decided, f, evidence, false)).collect();
     let is_formula = |f: &Found| evidence.proposal(&f.effect, &f.instance).is_some();
-    let formulas: Vec<Found> = named.extract_if(.., |f| is_formula(f)).collect();
+    let mut formulas: Vec<Found> = named.extract_if(.., |f| is_formula(f)).collect();
     others.retain(|f| !is_formula(f));
+    for (f, rivals) in not_told_from_formulas(settings, decided, evidence) {
+        let is_it = |own: &mut Found| (&own.effect, &own.instance) == (&f.effect, &f.instance);
+        for own in named.extract_if(.., is_it) {
+            let refused = Some(format!("these data do not tell it from {}", first_few(&own.confounders)));
+            others.push(Found { accepted: false, refused, ..own });
+        }
+        formulas.extend(rivals);
+    }
     // A small remainder of what was there without them is what the grid of forms cannot represent.
     let before = diagnosis::remaining(scorer, &[])?.map_or(0.0, |u| u.ratio);
     let loud = unexplained.as_ref().filter(|u| u.ratio > settings.excess_remainder * before);
@@ -459,6 +470,38 @@ fn answer(
             .chain(decided.not_tried.iter().cloned())
             .collect(),
     })
+}
+
+/// The first three names of a list, and how many there are besides.
+fn first_few(names: &[String]) -> String {
+    let few = names.iter().take(3).map(String::as_str).collect::<Vec<_>>().join(", ");
+    if names.len() > 3 { format!("{few} and {} more", names.len() - 3) } else { few }
+}
+
+/// What is named, and may as well be a force that no effect knows: the probability of that is above the false-alarm
+/// rate. With the formulas that state such forces, the most probable first.
+fn not_told_from_formulas<'a>(
+    settings: &Settings,
+    decided: &'a Decided,
+    evidence: &Evidence<'_>,
+) -> Vec<(&'a Place, Vec<Found>)> {
+    let place = |c: usize| &decided.candidates[c];
+    let is_formula = |c: usize| evidence.proposal(&place(c).effect, &place(c).instance).is_some();
+    let set: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
+    let doubtful = |f: &&Fitted| {
+        let of_formulas = f.alternatives.iter().filter(|(c, _)| is_formula(*c)).map(|(_, p)| p);
+        !is_formula(f.candidate) && of_formulas.sum::<f64>() > settings.false_alarm
+    };
+    let rivals = |f: &Fitted| {
+        let others: Vec<usize> = set.iter().copied().filter(|c| *c != f.candidate).collect();
+        let formulas = f.alternatives.iter().filter(|(c, p)| is_formula(*c) && *p > settings.false_alarm);
+        let fitted = |c: usize| decided.quadratic.beside(c, &others);
+        // Each is as good as the other: nothing speaks against it.
+        let formula =
+            |(c, _): &(usize, f64)| Found { refused: None, ..found(settings, decided, &fitted(*c), evidence, false) };
+        (place(f.candidate), formulas.map(formula).collect())
+    };
+    decided.selection.chosen.iter().filter(doubtful).map(rivals).collect()
 }
 
 /// What is unexplained, with the drivers of the proposed formulas first among what is coherent with it.

@@ -4,8 +4,8 @@
 //! It holds the likelihood of the coefficients of the model and of every effect, as the last pass has it, with what is
 //! a day's own (constants, noise levels, slow forces) fitted. Likelihoods of days add; what is linear in a day about
 //! its own values is so about the values of all days, which differ from them by some of the day's σ. An effect with a
-//! shape is there in the first of its forms, and in that of a day that has named it. The forms beside that one are there
-//! for who looks at them ([`crate::refit`]): they decide nothing.
+//! shape is there in the first of its forms, and in that of a day that has named it. The forms beside that one are
+//! there for who looks at them ([`crate::refit`]): they decide nothing.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};

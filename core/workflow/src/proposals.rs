@@ -101,7 +101,9 @@ pub(crate) fn proposals(replay: &Replay<'_>, record: &Record) -> Result<(Vec<Pro
             let mut numbered = (1..).map(|k| if k == 1 { plain.clone() } else { format!("{plain}_{k}") });
             let Some(instance) = numbered.find(|name| !taken(name)) else { continue };
             let weight = replay.settings()?.false_alarm;
-            all.extend(proposal(record, &driven, name(driven.place), &instance, weight));
+            let proposed = proposal(record, &driven, name(driven.place), &instance, weight);
+            // A factor of a product may have been proposed by itself.
+            all.extend(proposed.filter(|p| all.iter().all(|other| other.words != p.words)));
         }
     }
     let tried = places.iter().map(|places| slow.functions(places, housekeeping)).sum();

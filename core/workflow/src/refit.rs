@@ -412,16 +412,16 @@ fn coefficient((_, meaning): &(String, Meaning)) -> Option<Coefficient> {
     }
 }
 
-/// Whether every day that names the effect of this coefficient has it in this form: falls of χ² of forms are compared,
-/// so that all are of the same days.
+/// Whether every day that names the effect of this coefficient has it in this form: falls of χ² of forms are
+/// compared, so that all are of the same days.
 fn in_all_days(extracts: &[Extract], c: &Coefficient) -> bool {
     let names =
         |e: &&Extract| e.named().iter().any(|(effect, instance)| (effect, instance) == (&c.effect, &c.instance));
     extracts.iter().filter(names).all(|e| e.place(c).is_some())
 }
 
-/// Names of the candidates. Of several forms of one, those after the first have a number; those that are `beside` what a
-/// day names come last.
+/// Names of the candidates. Of several forms of one, those after the first have a number; those that are `beside` what
+/// a day names come last.
 fn switches(decided: &Decided, beside: impl Fn(usize) -> bool) -> Vec<Switch> {
     let mut order: Vec<usize> = (0..decided.candidates.len()).collect();
     order.sort_by_key(|c| decided.candidates[*c].parameters.iter().copied().any(&beside));

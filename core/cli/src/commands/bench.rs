@@ -96,7 +96,7 @@ fn setup(bench: &Bench, global: &Global, starts: bool) -> Result<Setup, Failure>
 fn starter(operations: Option<&Operations>, archive: &Path, global: &Global) -> Result<Starter, Failure> {
     let program = std::env::current_exe()?;
     let (operations, archive) = (operations.map(|o| o.path.clone()), archive.to_owned());
-    let (plugins, threads) = (global.plugin_dir.clone(), global.threads);
+    let (plugins, key, threads) = (global.plugin_dir.clone(), global.plugin_key.clone(), global.threads);
     Ok(Box::new(move |job| {
         let mut command = Command::new(&program);
         match job {
@@ -108,6 +108,7 @@ fn starter(operations: Option<&Operations>, archive: &Path, global: &Global) -> 
         for folder in &plugins {
             command.arg("--plugin-dir").arg(folder);
         }
+        command.envs(key.iter().map(|key| (super::PLUGIN_KEY, key)));
         if let Some(threads) = threads {
             command.args(["--threads", &threads.to_string()]);
         }

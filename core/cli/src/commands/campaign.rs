@@ -112,6 +112,7 @@ fn run(folder: &Path, at_once: usize, global: &Global, paint: Paint) -> Result<D
             let mut command = Command::new(&exe);
             command.args(["--quiet", "--threads", "1"]);
             command.args(global.plugin_dir.iter().flat_map(|dir| [Path::new("--plugin-dir"), dir.as_path()]));
+            command.envs(global.plugin_key.iter().map(|key| (super::PLUGIN_KEY, key)));
             command.args(["campaign", "task"]).arg(folder).arg(&id).stdout(Stdio::null()).stderr(Stdio::piped());
             let child = command.spawn().at("start", &exe)?;
             running.push((id.clone(), child));

@@ -25,7 +25,7 @@ mod validate;
 use crate::args::{Arguments, Command, Config, Global};
 use crate::failure::{Failure, Refusal};
 use crate::text::{self, Paint};
-use dragfree_engine::border::Isolation;
+use dragfree_engine::border::{Isolation, PluginKey};
 use dragfree_engine::limits::OPENING;
 use dragfree_engine::registry::Registry;
 use std::ffi::OsString;
@@ -101,7 +101,20 @@ fn discovered(global: &Global) -> Result<Registry, Failure> {
     }
     folders.extend(own_folders());
     let limit = Duration::from_secs_f64(global.plugin_time_limit).min(OPENING);
-    Ok(Registry::discover_probed(&folders, isolation(global)?, &mut |files| probe::probe(files, limit)))
+    let key = plugin_key(global)?;
+    Ok(Registry::discover_probed(&folders, isolation(global)?, key.as_ref(), &mut |files| probe::probe(files, limit)))
+}
+
+/// The environment variable with the key of who vouches for plugins.
+const PLUGIN_KEY: &str = "DRAGFREE_PLUGIN_KEY";
+
+/// The key of who vouches for plugins.
+fn plugin_key(global: &Global) -> Result<Option<PluginKey>, Failure> {
+    let of_environment = || std::env::var(PLUGIN_KEY).ok().filter(|key| !key.is_empty());
+    let Some(given) = global.plugin_key.clone().or_else(of_environment) else { return Ok(None) };
+    let text = std::fs::read_to_string(&given).unwrap_or_else(|_| given.clone());
+    let key = PluginKey::parse(&text);
+    key.map(Some).map_err(|what| format!("--plugin-key {given}: {what}, and no file with one").into())
 }
 
 /// This program again, for a plugin that is to run in a process of its own.
@@ -129,7 +142,8 @@ fn repeated(archive: Option<&Path>, global: &Global) -> String {
     let archive = archive.into_iter().map(|folder| ("--archive", folder));
     let plugins = global.plugin_dir.iter().map(|folder| ("--plugin-dir", folder.as_path()));
     let word = |(flag, folder): (&str, &Path)| format!(" {flag} {}", text::quoted(&folder.to_string_lossy()));
-    archive.chain(plugins).map(word).collect()
+    let key = global.plugin_key.iter().map(|key| ("--plugin-key", Path::new(key)));
+    archive.chain(plugins).chain(key).map(word).collect()
 }
 
 /// Threads that may work: as asked for, or as many as the machine has.

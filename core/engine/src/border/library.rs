@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 
 use super::BorderError;
 use super::crash::{self, Name};
+use super::signature::PluginKey;
 use super::text::{aligned, text_of};
 use crate::input::{InputFile, read_text};
 use crate::limits::{CONFIG_BYTES, LIBRARY_BYTES, PLUGINS, TEXT_BYTES};
@@ -78,11 +79,12 @@ pub struct Library {
 }
 
 impl Checked {
-    /// Opens a file and checks it: who may change it, and whether `plugins.lock` has its digest.
+    /// Opens a file and checks it: who may change it, and whether `plugins.lock` has its digest. With a `key` it must
+    /// have, and must be signed with the key.
     ///
     /// # Errors
     /// [`BorderError::Refused`] with the reason.
-    pub fn new(path: &Path) -> Result<Self, BorderError> {
+    pub fn new(path: &Path, key: Option<&PluginKey>) -> Result<Self, BorderError> {
         let refuse = |reason: String| BorderError::Refused { path: path.to_owned(), reason };
         let unreadable = |e: std::io::Error| refuse(format!("cannot be read: {e}"));
         let file = InputFile::open(path).map_err(unreadable)?;
@@ -91,7 +93,7 @@ impl Checked {
         }
         super::owner::check(path, &file).map_err(refuse)?;
         let sha256 = file.sums(0).map_err(unreadable)?.sha256;
-        let lock = Lock::of(path, &sha256).map_err(refuse)?;
+        let lock = Lock::of(path, &sha256, key).map_err(refuse)?;
         Ok(Self { file, sha256, lock })
     }
 
@@ -123,7 +125,7 @@ impl Library {
     /// [`BorderError::Refused`] with the reason: others may change it, not in `plugins.lock`, no shared library, no
     /// plugin, another ABI version, a manifest that cannot be read.
     pub fn open(path: &Path) -> Result<Self, BorderError> {
-        Self::load(Checked::new(path)?)
+        Self::load(Checked::new(path, None)?)
     }
 
     /// Opens a file that was checked and reads its manifests.
@@ -264,7 +266,7 @@ struct Lock {
 }
 
 impl Lock {
-    fn of(path: &Path, sha256: &str) -> Result<Self, String> {
+    fn of(path: &Path, sha256: &str, key: Option<&PluginKey>) -> Result<Self, String> {
         #[derive(Deserialize)]
         #[serde(deny_unknown_fields)]
         struct File {
@@ -275,11 +277,15 @@ impl Lock {
         let lock_path = path.with_file_name("plugins.lock");
         let text = match read_text(&lock_path, CONFIG_BYTES) {
             Ok(text) => text,
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => return Ok(Self::default()),
+            Err(e) if e.kind() == std::io::ErrorKind::NotFound && key.is_none() => return Ok(Self::default()),
             Err(e) => return Err(format!("{} cannot be read: {e}", lock_path.display())),
         };
+        key.map_or(Ok(()), |key| key.check(&lock_path, &text))?;
         let file: File = toml::from_str(&text).map_err(|e| format!("{}: {e}", lock_path.display()))?;
         let isolates = file.isolate;
+        if key.is_some() && file.sha256.is_none() {
+            return Err(format!("{} has no [sha256], which --plugin-key asks for", lock_path.display()));
+        }
         let Some(locked) = file.sha256 else {
             let empty = || format!("{} says neither `isolate` nor [sha256]", lock_path.display());
             return isolates.then_some(Self { vouches: false, isolates }).ok_or_else(empty);

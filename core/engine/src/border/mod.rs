@@ -20,6 +20,7 @@ mod link;
 mod local;
 mod owner;
 mod read;
+mod signature;
 mod text;
 
 pub use call::{Config, LinkRequest, Rows, SourceStep};
@@ -30,6 +31,7 @@ pub use instance::Instance;
 pub use isolated::{Isolation, described, read_answer, serve};
 pub use library::{Checked, Kind, Library, PluginInfo};
 pub use link::{Linked, ReadColumn};
+pub use signature::PluginKey;
 
 use std::path::PathBuf;
 

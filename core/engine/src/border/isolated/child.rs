@@ -195,7 +195,7 @@ impl Served {
 
 fn open(path: &Path, sha256: &str, files: &[PathBuf]) -> Result<(Library, Vec<String>), BorderError> {
     let refused = |reason: String| BorderError::Refused { path: path.to_owned(), reason };
-    let checked = Checked::new(path)?;
+    let checked = Checked::new(path, None)?;
     if checked.sha256() != sha256 {
         return Err(refused("was changed since it was checked; try again when it is complete".to_owned()));
     }
