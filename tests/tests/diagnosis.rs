@@ -318,6 +318,23 @@ fn an_unknown_force_is_told_by_a_formula_that_explains_it() {
     assert_eq!(d["verdict"], "sufficient", "{:#} {:#} {}", d["candidates"][0], d["formulas"], d["reasons"]);
 }
 
+/// The same force on another axis, weaker and longer, so that `magnetic` on the other test mass explains as much with
+/// six coefficients: it is refused with the reason, and the formulas act where the force does.
+#[test]
+fn an_effect_is_not_named_where_an_unknown_force_explains_as_much() {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let hidden = ["--hours", "9", "--seed", "71", "--effect", "current-force:tm1.x=-3e-14,lag_s=50"];
+    let d = diagnose(folder.path(), &calibrated(folder.path(), &hidden));
+    assert_eq!((d["verdict"].as_str(), accepted(&d)), (Some("unexplained"), Vec::new()), "{:#}", d["candidates"]);
+    let formulas = d["formulas"].as_array().expect("a list");
+    assert!(formulas.iter().all(|f| f["shape"]["acts_on"] == "tm1.accel.x") && !formulas.is_empty(), "{formulas:#?}");
+    let expression = |f: &Value| f["shape"]["expression"].as_str().is_some_and(|e| e.contains("hk.battery_current_a"));
+    assert!(formulas.iter().take(3).any(expression), "{formulas:#?}");
+    let refused = d["candidates"].as_array().expect("a list").iter().filter(|c| c["refused"].is_string());
+    let reason = |c: &Value| c["refused"].as_str().unwrap_or_default().contains("these data do not tell it from");
+    assert!(refused.clone().all(reason), "{:#?}", refused.collect::<Vec<_>>());
+}
+
 /// Ten minutes are shorter than a segment: an error, not a result.
 #[test]
 fn a_diagnosis_on_too_little_data_is_refused() {

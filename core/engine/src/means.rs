@@ -137,13 +137,13 @@ mod tests {
         let all = means(&batch, 4096, from_ns);
         assert!((MOST_INTERVALS / 2 - 1..=MOST_INTERVALS).contains(&all.rows()), "{}", all.rows());
         let interval_ns = all.time_ns[1] - all.time_ns[0];
-        assert_eq!(interval_ns, 16 * FIRST_INTERVAL_NS);
+        assert_eq!(interval_ns, 8 * FIRST_INTERVAL_NS);
         for (k, centre) in all.time_ns.iter().enumerate() {
             let within = |t: i64| t >= from_ns && (t - centre + interval_ns / 2).div_euclid(interval_ns) == 0;
             let rows = batch.time_ns.iter().zip(&batch.columns[1]).filter(|(t, x)| within(**t) && x.is_finite());
             let own: Vec<f64> = rows.map(|(_, x)| *x).collect();
             let [mean, low, high] = [0, 1, 2].map(|c| all.columns[c][k]);
-            if 2 * own.len() < 300 {
+            if 2 * own.len() < 150 {
                 assert!(mean.is_nan() && low.is_nan() && high.is_nan());
                 continue;
             }

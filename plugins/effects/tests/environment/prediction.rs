@@ -194,15 +194,24 @@ fn a_chosen_candidate_has_the_form_of_its_parameters_alone() {
         model.effects = vec![EffectEntry::new("com-offset", "tm1")];
         model.chosen = vec![drift("hk.c"), drift("hk.a"), EffectEntry::new("com-offset", "tm1"), drift("hk.nothing")];
     });
-    let [.., one] = &chosen.coefficients[..] else { panic!("{:?}", chosen.coefficients) };
-    assert_eq!(chosen.coefficients.len(), 3 + 1);
-    assert_eq!((one.name.as_str(), one.shape["with"].as_str()), ("offset-drift.sc.x", Some("hk.c")));
-    assert!(one.candidate && !one.estimate && one.variants.is_empty() && !one.responses.is_empty());
+    let [.., one, other] = &chosen.coefficients[..] else { panic!("{:?}", chosen.coefficients) };
+    assert_eq!(chosen.coefficients.len(), 3 + 2);
+    for (c, form) in [(one, "hk.c"), (other, "hk.a")] {
+        assert_eq!((c.name.as_str(), c.shape["with"].as_str()), ("offset-drift.sc.x", Some(form)));
+        assert!(c.candidate && !c.estimate && c.variants.is_empty() && !c.responses.is_empty());
+        // Each answers to columns of its own.
+        let exists = |r: &dragfree_engine::schema::Response| {
+            chosen.columns.iter().filter(|column| column.table == r.table && column.name == r.series).count()
+        };
+        assert!(c.responses.iter().all(|r| exists(r) == 1), "{c:?}");
+    }
+    assert_ne!(one.responses, other.responses);
     assert!(chosen.coefficients[..3].iter().all(|c| !c.candidate && c.estimate));
-    // Of one id and instance the first is tried.
+    // What is in the model is not tried beside it, and what has no form is not either.
     let reasons: Vec<&str> = chosen.not_tried.iter().map(|(_, reason)| reason.as_str()).collect();
-    assert!(reasons.len() == 3 && reasons.iter().all(|reason| reason.contains("exists twice")), "{reasons:?}");
-    assert_eq!(chosen.nodes.len(), 2);
+    let [twice, nothing] = reasons[..] else { panic!("{reasons:?}") };
+    assert!(twice.contains("exists twice") && nothing.contains("hk.nothing"), "{reasons:?}");
+    assert_eq!(chosen.nodes.len(), 3);
 
     let refused = chain("refused", |model| model.chosen = vec![drift("hk.nothing")]);
     assert!(refused.coefficients.is_empty() && refused.nodes.is_empty());
