@@ -11,10 +11,15 @@ const SECOND: &str = "COM1B_2035-01-01_SC1_01_0002";
 
 /// A folder with half an hour of telemetry in `data`, a model file of its own, and its product in `archive`.
 fn mission() -> (TempDir, PathBuf) {
+    mission_of("0.5")
+}
+
+/// The same with so many hours.
+fn mission_of(hours: &str) -> (TempDir, PathBuf) {
     let dir = tempfile::tempdir().expect("a temporary folder");
     let data = dir.path().join("data");
     std::fs::create_dir(&data).expect("a folder");
-    let telemetry = simulate(&data, &["--hours", "0.5"]).remove(0);
+    let telemetry = simulate(&data, &["--hours", hours]).remove(0);
     std::fs::copy(fixture("models/com-offset.toml"), dir.path().join("model.toml")).expect("copied");
     json(&mut run(dir.path(), &telemetry, &[]), 0);
     (dir, telemetry)
@@ -208,6 +213,53 @@ fn a_set_says_which_calibration_holds_at_a_time() {
     assert!(told(dragfree(dir.path()).args(["at", "2035-01-06"])).contains("nothing is certified"));
     expect(dragfree(dir.path()).args(["archive", "reindex"]), 0);
     assert!(told(dragfree(dir.path()).args(["at", "2035-01-06"])).contains("nothing is certified"));
+}
+
+/// Who publishes a set signs what it says. Another key, a change of the statement, of the set or of a product is told,
+/// also where whoever changed the archive has made its digests anew.
+#[test]
+fn a_set_that_was_signed_is_compared_with_what_it_was() {
+    let (dir, _) = mission();
+    let dir = dir.path();
+    let certify = ["certify", FIRST, "--from", "2035-01-01", "--until", "2035-02-01", "--into", "ops"];
+    expect(&mut products(dir, &certify), 0);
+    let check = |key: &str, code: i32| {
+        let output = expect(&mut products(dir, &["sets", "check", "ops.toml", "--key", key]), code);
+        String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned()
+    };
+    let keys = minisign::KeyPair::generate_unencrypted_keypair().expect("keys");
+    let others = minisign::KeyPair::generate_unencrypted_keypair().expect("keys");
+    let (own, other) = (keys.pk.to_base64(), others.pk.to_base64());
+    let statement = dir.join("ops.toml");
+    let sign = || {
+        let text = std::fs::read(&statement).expect("readable");
+        let signed = minisign::sign(Some(&keys.pk), &keys.sk, text.as_slice(), None, None).expect("signed");
+        std::fs::write(dir.join("ops.toml.minisig"), signed.into_string()).expect("written");
+    };
+    let state = ["sets", "statement", "ops", "--out", "ops.toml"];
+    expect(&mut products(dir, &state), 0);
+    assert!(check(&own, 1).contains("ops.toml.minisig cannot be read"));
+    sign();
+    assert!(check(&own, 0).contains("set ops, open: 1 times"));
+    assert!(check(&other, 1).contains("is not signed with the key that was given"));
+    expect(&mut products(dir, &["sets", "publish", "ops"]), 0);
+    assert!(check(&own, 1).contains("the set was open, and is published"));
+    expect(&mut products(dir, &state), 0);
+    assert!(check(&own, 1).contains("is not signed with the key that was given"));
+    sign();
+    let printed = expect(&mut products(dir, &["sets", "statement", "ops"]), 0).stdout;
+    assert_eq!(printed, std::fs::read(&statement).expect("readable"));
+    assert!(check(&own, 0).contains("published"));
+    // An archive with the same names and times, whose digests all agree with other contents.
+    let (forged, _) = mission_of("0.6");
+    expect(&mut products(forged.path(), &certify), 0);
+    expect(&mut products(forged.path(), &["sets", "publish", "ops"]), 0);
+    expect(&mut products(forged.path(), &["verify"]), 0);
+    for file in ["ops.toml", "ops.toml.minisig"] {
+        std::fs::copy(dir.join(file), forged.path().join(file)).expect("copied");
+    }
+    let found = told(&mut products(forged.path(), &["sets", "check", "ops.toml", "--key", &own]));
+    assert!(found.contains("no longer: ") && found.contains("not signed: "), "{found}");
 }
 
 #[test]

@@ -23,6 +23,7 @@ mod migrate;
 mod objects;
 pub mod product;
 mod running;
+mod signature;
 mod staging;
 mod sums;
 mod take_over;
@@ -36,6 +37,7 @@ pub use journal::{Event, InputPlace, JournalEntry, SetState, Stamp, Stored};
 pub use migrate::{Migrated, migrate};
 pub use product::{EXTRACT, JOINT, STATE};
 pub use running::{Running, Teller};
+pub use signature::PublicKey;
 pub use sums::Sums;
 pub use writer::{MadeOf, ProductWriter, Written};
 

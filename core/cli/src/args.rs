@@ -791,6 +791,28 @@ pub(crate) enum Sets {
         #[command(flatten)]
         archive: Archive,
     },
+    /// Print what a set says, with the digests of its products, to be signed
+    Statement {
+        /// Name of the set
+        #[arg(value_name = "SET")]
+        set: String,
+        /// Write it into this file
+        #[arg(long, value_name = "FILE")]
+        out: Option<PathBuf>,
+        #[command(flatten)]
+        archive: Archive,
+    },
+    /// Compare a set and its products with a statement of it that was signed
+    Check {
+        /// The statement; FILE.minisig is its signature
+        #[arg(value_name = "FILE")]
+        statement: PathBuf,
+        /// Public key of minisign of who has signed it, or its file
+        #[arg(long, value_name = "KEY")]
+        key: String,
+        #[command(flatten)]
+        archive: Archive,
+    },
 }
 
 #[derive(Debug, Subcommand)]
@@ -1109,6 +1131,8 @@ mod tests {
             "dragfree products sets list",
             "dragfree products sets publish ops",
             "dragfree products sets invalidate ops --reason wrong",
+            "dragfree products sets statement ops --out ops.toml",
+            "dragfree products sets check ops.toml --key mission.pub",
             "dragfree products export a --format vcm1b --out f.txt",
             "dragfree day 2035-01-05 --ops m/mission-ops.toml",
             "dragfree catch-up --until 2035-01-05 --dry-run --json",

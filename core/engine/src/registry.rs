@@ -3,7 +3,8 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::border::{self, BorderError, Checked, Config, Instance, Isolation, Kind, Library, PluginInfo, PluginKey};
+use crate::border::{self, BorderError, Checked, Config, Instance, Isolation, Kind, Library, PluginInfo};
+use dragfree_archive::PublicKey;
 use dragfree_archive::files::Problem;
 
 /// The plugins that were found.
@@ -58,7 +59,7 @@ impl Registry {
     pub fn discover_probed(
         folders: &[PathBuf],
         isolation: Isolation,
-        key: Option<&PluginKey>,
+        key: Option<&PublicKey>,
         probe: Probe<'_>,
     ) -> Self {
         Self::open_all(folders, Some(Arc::new(isolation)), key, Some(probe))
@@ -67,7 +68,7 @@ impl Registry {
     fn open_all(
         folders: &[PathBuf],
         isolation: Option<Arc<Isolation>>,
-        key: Option<&PluginKey>,
+        key: Option<&PublicKey>,
         probe: Option<Probe<'_>>,
     ) -> Self {
         let mut this = Self { folders: folders.to_vec(), isolation, ..Self::default() };
@@ -108,7 +109,7 @@ impl Registry {
     }
 
     /// Every shared library in the folders that passes the checks that run no code of it, each content once.
-    fn check_all(&mut self, key: Option<&PluginKey>) -> Vec<Checked> {
+    fn check_all(&mut self, key: Option<&PublicKey>) -> Vec<Checked> {
         let mut seen = std::collections::BTreeSet::new();
         let mut all: Vec<Checked> = Vec::new();
         for path in self.folders.clone().iter().flat_map(|folder| shared_libraries(folder)) {

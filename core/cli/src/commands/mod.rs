@@ -25,7 +25,8 @@ mod validate;
 use crate::args::{Arguments, Command, Config, Global};
 use crate::failure::{Failure, Refusal};
 use crate::text::{self, Paint};
-use dragfree_engine::border::{Isolation, PluginKey};
+use dragfree_archive::PublicKey;
+use dragfree_engine::border::Isolation;
 use dragfree_engine::limits::OPENING;
 use dragfree_engine::registry::Registry;
 use std::ffi::OsString;
@@ -109,12 +110,16 @@ fn discovered(global: &Global) -> Result<Registry, Failure> {
 const PLUGIN_KEY: &str = "DRAGFREE_PLUGIN_KEY";
 
 /// The key of who vouches for plugins.
-fn plugin_key(global: &Global) -> Result<Option<PluginKey>, Failure> {
+fn plugin_key(global: &Global) -> Result<Option<PublicKey>, Failure> {
     let of_environment = || std::env::var(PLUGIN_KEY).ok().filter(|key| !key.is_empty());
-    let Some(given) = global.plugin_key.clone().or_else(of_environment) else { return Ok(None) };
-    let text = std::fs::read_to_string(&given).unwrap_or_else(|_| given.clone());
-    let key = PluginKey::parse(&text);
-    key.map(Some).map_err(|what| format!("--plugin-key {given}: {what}, and no file with one").into())
+    let given = global.plugin_key.clone().or_else(of_environment);
+    given.map(|given| public_key("--plugin-key", &given)).transpose()
+}
+
+/// A key that an option gives as a file or as text.
+fn public_key(option: &str, given: &str) -> Result<PublicKey, Failure> {
+    let text = std::fs::read_to_string(given).unwrap_or_else(|_| given.to_owned());
+    PublicKey::parse(&text).map_err(|what| format!("{option} {given}: {what}, and no file with one").into())
 }
 
 /// This program again, for a plugin that is to run in a process of its own.

@@ -1,6 +1,7 @@
 //! Plugin libraries: checked, opened through the descriptor that was checked, their manifests read.
 
 use dragfree_abi as abi;
+use dragfree_archive::PublicKey;
 use dragfree_schema::Manifest;
 use serde::{Deserialize, Serialize};
 use std::ffi::CString;
@@ -9,7 +10,6 @@ use std::path::{Path, PathBuf};
 
 use super::BorderError;
 use super::crash::{self, Name};
-use super::signature::PluginKey;
 use super::text::{aligned, text_of};
 use crate::input::{InputFile, read_text};
 use crate::limits::{CONFIG_BYTES, LIBRARY_BYTES, PLUGINS, TEXT_BYTES};
@@ -84,7 +84,7 @@ impl Checked {
     ///
     /// # Errors
     /// [`BorderError::Refused`] with the reason.
-    pub fn new(path: &Path, key: Option<&PluginKey>) -> Result<Self, BorderError> {
+    pub fn new(path: &Path, key: Option<&PublicKey>) -> Result<Self, BorderError> {
         let refuse = |reason: String| BorderError::Refused { path: path.to_owned(), reason };
         let unreadable = |e: std::io::Error| refuse(format!("cannot be read: {e}"));
         let file = InputFile::open(path).map_err(unreadable)?;
@@ -266,7 +266,7 @@ struct Lock {
 }
 
 impl Lock {
-    fn of(path: &Path, sha256: &str, key: Option<&PluginKey>) -> Result<Self, String> {
+    fn of(path: &Path, sha256: &str, key: Option<&PublicKey>) -> Result<Self, String> {
         #[derive(Deserialize)]
         #[serde(deny_unknown_fields)]
         struct File {

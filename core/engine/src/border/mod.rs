@@ -20,7 +20,6 @@ mod link;
 mod local;
 mod owner;
 mod read;
-mod signature;
 mod text;
 
 pub use call::{Config, LinkRequest, Rows, SourceStep};
@@ -31,7 +30,6 @@ pub use instance::Instance;
 pub use isolated::{Isolation, described, read_answer, serve};
 pub use library::{Checked, Kind, Library, PluginInfo};
 pub use link::{Linked, ReadColumn};
-pub use signature::PluginKey;
 
 use std::path::PathBuf;
 

@@ -32,8 +32,10 @@ use super::predictor::Predictor;
 use super::state_space::NoiseStates;
 use crate::transient::{Template, Transients};
 
-/// Rows that are filtered before products are taken.
+/// Rows whose products are taken at once: as many as caches hold of all tiles.
 const ROWS: usize = 32;
+/// Rows that wait until threads filter them. To start a thread takes as long as some hundred rows of a few parameters.
+const WAITING_ROWS: usize = 16 * ROWS;
 /// What is left of a start when squares of innovations are summed for levels of the noise, and the longest wait, s.
 const SETTLED: f64 = 1e-2;
 const LONGEST_WAIT_S: f64 = 600.0;
@@ -306,7 +308,7 @@ impl Innovations {
         let none = Parameter::default();
         let own: Vec<&Parameter> = order.iter().map(|i| &parameters[*i]).chain([&none]).collect();
         let merged = system.merged();
-        let tile = |own: &[&Parameter]| Tile::new(own, &unit, &kernel, &merged, ROWS);
+        let tile = |own: &[&Parameter]| Tile::new(own, &unit, &kernel, &merged, WAITING_ROWS);
         let mut tiles: Vec<Tile> = own.chunks(LANES).map(tile).collect();
         let asked = tiles.len();
         tiles.extend(vec![&none; moving].chunks(LANES).map(tile));
@@ -415,7 +417,7 @@ impl Innovations {
         }
         self.last_ns = Some(time_ns);
         self.before.copy_from_slice(series);
-        if self.waiting.counts.len() == ROWS {
+        if self.waiting.counts.len() == WAITING_ROWS {
             self.sum();
         }
     }
@@ -513,19 +515,22 @@ impl Innovations {
         if rows == 0 {
             return;
         }
-        let n = self.kernel.channels;
-        let batch = Batch {
-            rows,
-            width: self.series + POWERS,
-            inputs: &self.waiting.inputs,
-            innovations: &self.waiting.innovations,
-        };
+        let (n, width) = (self.kernel.channels, self.series + POWERS);
+        let Waiting { inputs, innovations, .. } = &self.waiting;
+        let inputs = inputs.chunks(ROWS * width);
+        let batches: Vec<Batch<'_>> = inputs
+            .zip(innovations.chunks(ROWS * n))
+            .enumerate()
+            .map(|(k, (inputs, innovations))| Batch { first: k * ROWS, width, inputs, innovations })
+            .collect();
         let (kernel, threads) = (&self.kernel, self.threads);
-        in_parallel(&mut self.tiles, threads, |tile| tile.filter(kernel, &batch));
+        in_parallel(self.tiles.iter_mut().collect(), threads, |tile| {
+            batches.iter().for_each(|batch| tile.filter(kernel, batch));
+        });
         // The lane of the data has what the starts as they are found add to the innovations.
         let lane = self.lanes.last().copied().unwrap_or(0);
         let mut white = DVector::zeros(n);
-        for (row, e) in batch.innovations.chunks_exact(n).enumerate() {
+        for (row, e) in self.waiting.innovations.chunks_exact(n).enumerate() {
             kernel.whiten(e, white.as_mut_slice());
             let own = self.tiles[lane / LANES].whitened.chunks_exact_mut(LANES).skip(row * n);
             own.zip(white.iter()).for_each(|(own, e)| own[lane % LANES] += e);
@@ -536,7 +541,19 @@ impl Innovations {
         }
         self.samples += rows as u64;
         let whitened: Vec<&[f64]> = self.tiles.iter().map(|tile| tile.whitened.as_slice()).collect();
-        in_parallel(&mut self.products, threads, |products| products.add(&whitened, rows * n));
+        // The first tile has the most products, so each thread has tiles from the front and from the back; it takes all
+        // products of a batch while caches hold it.
+        let mut shares: Vec<Vec<&mut Products>> = (0..threads).map(|_| Vec::new()).collect();
+        for (i, products) in self.products.iter_mut().enumerate() {
+            let turn = i % (2 * threads);
+            shares[turn.min(2 * threads - 1 - turn)].push(products);
+        }
+        in_parallel(shares, threads, |mut share| {
+            for first in (0..rows).step_by(ROWS) {
+                let own = first * n..rows.min(first + ROWS) * n;
+                share.iter_mut().for_each(|products| products.add(&whitened, own.clone()));
+            }
+        });
         self.waiting.inputs.clear();
         self.waiting.innovations.clear();
         self.waiting.counts.clear();
@@ -614,11 +631,11 @@ fn known_with(before: &DMatrix<f64>, information: &DMatrix<f64>) -> DMatrix<f64>
 }
 
 /// Calls `work` with every item, on some threads.
-fn in_parallel<T: Send>(items: &mut [T], threads: usize, work: impl Fn(&mut T) + Sync) {
+fn in_parallel<T: Send>(items: Vec<T>, threads: usize, work: impl Fn(T) + Sync) {
     if threads.min(items.len()) < 2 {
-        return items.iter_mut().for_each(work);
+        return items.into_iter().for_each(work);
     }
-    let queue = Mutex::new(items.iter_mut());
+    let queue = Mutex::new(items.into_iter());
     let next = || queue.lock().unwrap_or_else(PoisonError::into_inner).next();
     let all = || {
         while let Some(item) = next() {

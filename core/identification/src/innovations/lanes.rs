@@ -3,6 +3,8 @@
 //! Every lane has the same operations in the same order, so results do not depend on how many of them a processor takes
 //! at once; only whether it rounds once or twice in `a b + c` does.
 
+use std::ops::Range;
+
 use aligned_vec::{AVec, avec};
 use nalgebra::DMatrix;
 use pulp::{Arch, Simd, WithSimd};
@@ -49,7 +51,8 @@ pub(super) struct Kernel {
 
 /// Rows that are filtered at once.
 pub(super) struct Batch<'a> {
-    pub(super) rows: usize,
+    /// Its first row among those that wait.
+    pub(super) first: usize,
     /// Series with the powers of time.
     pub(super) width: usize,
     pub(super) inputs: &'a [f64],
@@ -179,7 +182,7 @@ impl Filter {
 }
 
 impl Tile {
-    /// At most eight parameters, filtered in batches of at most `rows`.
+    /// At most eight parameters, of which at most `rows` wait to be multiplied.
     pub(super) fn new(parameters: &[&Parameter], unit: &[f64], kernel: &Kernel, merged: &[usize], rows: usize) -> Self {
         let n = unit.len();
         let mut responses = Vec::new();
@@ -213,7 +216,7 @@ impl Tile {
         }
     }
 
-    /// Filters some rows into `whitened`.
+    /// Filters some rows into their places in `whitened`.
     pub(super) fn filter(&mut self, kernel: &Kernel, batch: &Batch<'_>) {
         Arch::new().dispatch(Filtering { tile: self, kernel, batch });
     }
@@ -233,7 +236,8 @@ impl WithSimd for Filtering<'_> {
         let Self { tile, kernel, batch } = self;
         let n = kernel.channels;
         // What is added, lane by lane, before all lanes are taken at once: these would wait for those.
-        let rows = &mut tile.whitened[..batch.rows * n * LANES];
+        let first = batch.first * n * LANES;
+        let rows = &mut tile.whitened[first..first + batch.innovations.len() * LANES];
         rows.fill(0.0);
         for (input, row) in batch.inputs.chunks_exact(batch.width).zip(rows.chunks_exact_mut(n * LANES)) {
             tile.responses.iter().for_each(|(at, s, factor)| row[*at] += factor * input[*s]);
@@ -371,9 +375,9 @@ impl Products {
         self.sums.fill(0.0);
     }
 
-    /// Adds `count` products of each pair of lanes; `whitened` are the results of all tiles.
-    pub(super) fn add(&mut self, whitened: &[&[f64]], count: usize) {
-        let panels = whitened.iter().skip(self.tile).map(|w| &w[..count * LANES]).collect();
+    /// Adds some products of each pair of lanes, by row and channel; `whitened` are the results of all tiles.
+    pub(super) fn add(&mut self, whitened: &[&[f64]], own: Range<usize>) {
+        let panels = whitened.iter().skip(self.tile).map(|w| &w[own.start * LANES..own.end * LANES]).collect();
         Arch::new().dispatch(Adding { panels, sums: &mut self.sums });
     }
 }
@@ -501,7 +505,7 @@ mod tests {
             let (kernel, mut tile) = filter(&mut dice);
             let inputs: Vec<f64> = (0..2 * ROWS).map(|_| dice.random_range(-1.0..1.0)).collect();
             let innovations: Vec<f64> = (0..N * ROWS).map(|_| dice.random_range(-1.0..1.0)).collect();
-            let batch = Batch { rows: ROWS, width: 2, inputs: &inputs, innovations: &innovations };
+            let batch = Batch { first: 0, width: 2, inputs: &inputs, innovations: &innovations };
             arch.dispatch(Filtering { tile: &mut tile, kernel: &kernel, batch: &batch });
             // Five tiles, so that vectors are left over after whole groups of them.
             let tiles: Vec<Vec<f64>> =

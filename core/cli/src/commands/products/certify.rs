@@ -5,8 +5,10 @@ use crate::commands::{Done, stamp};
 use crate::failure::Failure;
 use crate::text::{self, Paint};
 use crate::utc;
-use dragfree_archive::{Archive, SetState, Validity, Window};
+use dragfree_archive::files::IoContext as _;
+use dragfree_archive::{Archive, PublicKey, SetState, Validity, Window};
 use dragfree_workflow::joint;
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::fmt::Write as _;
 use std::path::Path;
@@ -75,7 +77,98 @@ pub(super) fn sets(command: &Sets, json: bool) -> Result<Done, Failure> {
             archive.set_state(set, SetState::Invalidated, reason, &stamp())?;
             told(&archive, Some(set), json)
         }
+        Sets::Statement { set, out, archive } => {
+            let text = Statement::of(&super::archive(&archive.folder()?)?, set)?.text()?;
+            if let Some(path) = out {
+                std::fs::write(path, &text).at("write", path)?;
+            }
+            let path = out.as_ref().map(|path| path.display().to_string());
+            match &path {
+                _ if json => Ok(Done::json(&json!({"set": set, "statement": text, "path": path}))),
+                Some(path) => Ok(Done::new(format!("written   {path}\n"))),
+                None => Ok(Done::new(text)),
+            }
+        }
+        Sets::Check { statement, key, archive } => {
+            check(&super::archive(&archive.folder()?)?, statement, &crate::commands::public_key("--key", key)?, json)
+        }
     }
+}
+
+/// What a set says, for who signs it.
+#[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Statement {
+    set: String,
+    state: String,
+    #[serde(default, rename = "holds", skip_serializing_if = "Vec::is_empty")]
+    all: Vec<Holds>,
+}
+
+/// A product and the time for which it holds.
+#[derive(Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Holds {
+    spacecraft: String,
+    /// UTC, or `the beginning`.
+    from: String,
+    /// UTC, exclusive, or `further notice`.
+    until: String,
+    product: String,
+    /// Digest of the product.
+    sha256: String,
+}
+
+impl Statement {
+    /// What the archive says now. Each product is compared with its digests.
+    fn of(archive: &Archive, set: &str) -> Result<Self, Failure> {
+        let sets = archive.sets()?;
+        let Some((set, state)) = sets.into_iter().find(|(name, _)| name == set) else {
+            return Err(format!("there is no set {set}; `dragfree products sets list` shows all").into());
+        };
+        let holds = |v: &Validity| -> Result<Holds, Failure> {
+            let product = archive.product(&v.id)?;
+            archive.verify_kept(&v.id)?;
+            Ok(Holds {
+                spacecraft: v.spacecraft.clone(),
+                from: edge(v.from_ns),
+                until: edge(v.until_ns),
+                product: v.id.clone(),
+                sha256: product.header.non_standard_attributes.sha256,
+            })
+        };
+        let all = archive.validity(Some(&set))?.iter().map(holds).collect::<Result<_, _>>()?;
+        Ok(Self { set, state, all })
+    }
+
+    fn text(&self) -> Result<String, Failure> {
+        Ok(toml::to_string(self).map_err(|error| error.to_string())?)
+    }
+}
+
+/// `sets check`: the signature, then the archive.
+fn check(archive: &Archive, path: &Path, key: &PublicKey, json: bool) -> Result<Done, Failure> {
+    let text = std::fs::read_to_string(path).map_err(|error| format!("{} cannot be read: {error}", path.display()))?;
+    key.check(path, &text)?;
+    let signed: Statement =
+        toml::from_str(&text).map_err(|error| format!("{} is no statement of a set: {error}", path.display()))?;
+    let now = Statement::of(archive, &signed.set)?;
+    let words = |h: &Holds| format!("{} from {} to {} ({})", h.product, h.from, h.until, &h.sha256);
+    let mut differs = Vec::new();
+    if signed.state != now.state {
+        differs.push(format!("the set was {}, and is {}", signed.state, now.state));
+    }
+    let only = |a: &[Holds], b: &[Holds]| a.iter().filter(|h| !b.contains(h)).map(words).collect::<Vec<_>>();
+    differs.extend(only(&signed.all, &now.all).iter().map(|h| format!("no longer: {h}")));
+    differs.extend(only(&now.all, &signed.all).iter().map(|h| format!("not signed: {h}")));
+    if !differs.is_empty() {
+        return Err(format!("set {} is not what {} says: {}", now.set, path.display(), differs.join("; ")).into());
+    }
+    let (set, products) = (&now.set, now.all.len());
+    if json {
+        return Ok(Done::json(&json!({"set": set, "state": now.state, "times": products})));
+    }
+    Ok(Done::new(format!("signed    set {set}, {}: {products} times, as the archive has them\n", now.state)))
 }
 
 /// The sets of an archive, or one of them, with what they say.
@@ -99,12 +192,15 @@ fn told(archive: &Archive, only: Option<&str>, json: bool) -> Result<Done, Failu
     Ok(Done::new(if text.is_empty() { "no set; `dragfree products certify` makes one\n".to_owned() } else { text }))
 }
 
-fn window(v: &Validity) -> String {
-    let edge = |ns: i64| match ns {
+fn edge(ns: i64) -> String {
+    match ns {
         i64::MIN => "the beginning".to_owned(),
         i64::MAX => "further notice".to_owned(),
         ns => utc::format(ns),
-    };
+    }
+}
+
+fn window(v: &Validity) -> String {
     format!("{}  {} to {}", v.spacecraft, edge(v.from_ns), edge(v.until_ns))
 }
 

@@ -1,24 +1,26 @@
-//! Signatures of `plugins.lock`, made with minisign.
+//! Signatures made with minisign: of a lock of plugins, and of what a set of calibrations says.
 
-use minisign_verify::{PublicKey, Signature};
+use minisign_verify::Signature;
+use std::fs::File;
+use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 
-use crate::input::read_text;
-use crate::limits::NAME_BYTES;
+/// Longest signature, bytes. One has some 300.
+const SIGNATURE_BYTES: u64 = 1024;
 
-/// The public key of who vouches for plugins.
+/// The public key of who vouches for something.
 #[derive(Clone, Debug)]
-pub struct PluginKey(PublicKey);
+pub struct PublicKey(minisign_verify::PublicKey);
 
-impl PluginKey {
+impl PublicKey {
     /// From the text of a file that `minisign -G` has written, or from its second line alone.
     ///
     /// # Errors
     /// A sentence: it is no such key.
     pub fn parse(text: &str) -> Result<Self, String> {
         let key = match text.trim().lines().count() {
-            1 => PublicKey::from_base64(text.trim()),
-            _ => PublicKey::decode(text),
+            1 => minisign_verify::PublicKey::from_base64(text.trim()),
+            _ => minisign_verify::PublicKey::decode(text),
         };
         key.map(Self).map_err(|error| format!("is no public key of minisign: {error}"))
     }
@@ -27,13 +29,19 @@ impl PluginKey {
     ///
     /// # Errors
     /// A sentence: it was not, or there is no signature.
-    pub(super) fn check(&self, path: &Path, text: &str) -> Result<(), String> {
+    pub fn check(&self, path: &Path, text: &str) -> Result<(), String> {
         let beside = PathBuf::from(format!("{}.minisig", path.display()));
-        let signature = read_text(&beside, 4 * NAME_BYTES as u64).map_err(|error| {
+        let signature = read(&beside).map_err(|error| {
             format!("{} cannot be read: {error}; `minisign -S -m {}` signs", beside.display(), path.display())
         })?;
-        let refuse = |error| format!("{} is not signed with the key of --plugin-key: {error}", path.display());
+        let refuse = |error| format!("{} is not signed with the key that was given: {error}", path.display());
         let signature = Signature::decode(&signature).map_err(refuse)?;
         self.0.verify(text.as_bytes(), &signature, false).map_err(refuse)
     }
+}
+
+fn read(path: &Path) -> io::Result<String> {
+    let mut text = String::new();
+    File::open(path)?.take(SIGNATURE_BYTES).read_to_string(&mut text)?;
+    Ok(text)
 }
