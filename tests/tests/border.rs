@@ -295,6 +295,9 @@ fn with_a_key_a_folder_loads_only_what_its_owner_has_signed() {
     refused("is not signed with the key that was given");
     std::fs::write(&lock, &text).expect("written");
     assert!(found(&by_file()) && found(&with(&keys.pk.to_base64())));
+    let by = by_file()["plugins"][0]["vouched_by"].take();
+    assert_eq!(by, format!("plugins.lock, signed with {}", keys.pk.to_base64()));
+    assert!(own["vouched_by"].is_null(), "{own:#}");
     let of_environment = listed(dragfree(dir).env("DRAGFREE_PLUGIN_KEY", &key));
     assert!(found(&of_environment));
     // What the program brings along is in a folder without a signed lock.

@@ -10,7 +10,10 @@ const SIGNATURE_BYTES: u64 = 1024;
 
 /// The public key of who vouches for something.
 #[derive(Clone, Debug)]
-pub struct PublicKey(minisign_verify::PublicKey);
+pub struct PublicKey {
+    key: minisign_verify::PublicKey,
+    base64: String,
+}
 
 impl PublicKey {
     /// From the text of a file that `minisign -G` has written, or from its second line alone.
@@ -22,7 +25,9 @@ impl PublicKey {
             1 => minisign_verify::PublicKey::from_base64(text.trim()),
             _ => minisign_verify::PublicKey::decode(text),
         };
-        key.map(Self).map_err(|error| format!("is no public key of minisign: {error}"))
+        let key = key.map_err(|error| format!("is no public key of minisign: {error}"))?;
+        let base64 = text.trim().lines().last().unwrap_or_default().trim().to_owned();
+        Ok(Self { key, base64 })
     }
 
     /// That the `text` of a file was signed by the owner of the key, in the file `.minisig` beside it.
@@ -36,7 +41,14 @@ impl PublicKey {
         })?;
         let refuse = |error| format!("{} is not signed with the key that was given: {error}", path.display());
         let signature = Signature::decode(&signature).map_err(refuse)?;
-        self.0.verify(text.as_bytes(), &signature, false).map_err(refuse)
+        self.key.verify(text.as_bytes(), &signature, false).map_err(refuse)
+    }
+}
+
+impl std::fmt::Display for PublicKey {
+    /// As minisign writes it, without the comment.
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(&self.base64)
     }
 }
 

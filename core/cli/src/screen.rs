@@ -272,6 +272,7 @@ pub(crate) fn plugins_json(registry: &Registry, clash: Option<&str>) -> Value {
             "description": found.info.manifest.description,
             "path": found.opened.path.to_string_lossy(),
             "sha256": found.opened.sha256,
+            "vouched_by": found.opened.vouched_by,
             "isolated": found.opened.is_isolated(),
         })
     });

@@ -31,6 +31,14 @@ pub(crate) fn page(site: &Site, links: &Links) -> Result<Markup, PagesError> {
                 dl {
                     dt { "File" } dd { code { (found.opened.path.display()) } }
                     dt { "SHA-256" } dd { code class="digest" { (found.opened.sha256) } }
+                    dt { "Vouched for by" }
+                    dd {
+                        @match (&found.opened.vouched_by, found.opened.is_isolated()) {
+                            (Some(by), _) => code class="digest" { (by) },
+                            (None, true) => "nobody; it runs in a process of its own",
+                            (None, false) => "nobody; it was tried in a process of its own first",
+                        }
+                    }
                     dt { "Licence" } dd { (manifest.licence) }
                 }
                 @if !manifest.parameters.is_empty() {

@@ -72,6 +72,9 @@ pub struct Library {
     pub path: PathBuf,
     /// Its digest, lower-case hexadecimal.
     pub sha256: String,
+    /// Who vouches for it: `plugins.lock`, and with which key that is signed; none where it was tried in a process of
+    /// its own instead.
+    pub vouched_by: Option<String>,
     /// What it holds.
     pub plugins: Vec<PluginInfo>,
     /// None where its instances run in processes of their own, and this one has not opened it.
@@ -109,7 +112,7 @@ impl Checked {
 
     /// Whether the operator vouches for it by name and digest.
     pub fn is_locked(&self) -> bool {
-        self.lock.vouches
+        self.lock.vouched_by.is_some()
     }
 
     /// Whether its folder asks for a process of its own for each instance.
@@ -151,7 +154,13 @@ impl Library {
     /// A library that was checked, and of which a process of its own says that it has these plugins: no code of it runs
     /// here.
     pub(super) fn elsewhere(checked: &Checked, plugins: Vec<PluginInfo>) -> Self {
-        Self { path: checked.path().to_owned(), sha256: checked.sha256.clone(), plugins, entry: None }
+        Self {
+            path: checked.path().to_owned(),
+            sha256: checked.sha256.clone(),
+            vouched_by: checked.lock.vouched_by.clone(),
+            plugins,
+            entry: None,
+        }
     }
 
     /// Whether its instances run in processes of their own, whoever makes them.
@@ -182,7 +191,8 @@ impl Library {
         // SAFETY: the version matches, so the plugin says that the whole struct is there; it is never unloaded.
         let entry: &'static abi::EntryV1 = unsafe { &*entry };
         let path = checked.path().to_owned();
-        let mut this = Self { path, sha256: checked.sha256, plugins: Vec::new(), entry: Some(entry) };
+        let Checked { sha256, lock, .. } = checked;
+        let mut this = Self { path, sha256, vouched_by: lock.vouched_by, plugins: Vec::new(), entry: Some(entry) };
         for kind in Kind::ALL {
             this.read_manifests(kind)?;
         }
@@ -259,9 +269,10 @@ fn unloadable(error: libloading::Error) -> String {
 
 /// What `plugins.lock` beside a library says of it: a table `[sha256]` from file name to digest, outside of which
 /// nothing loads, and `isolate = true` for a folder whose plugins run in processes of their own.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Debug, Default)]
 struct Lock {
-    vouches: bool,
+    /// As [`Library::vouched_by`].
+    vouched_by: Option<String>,
     isolates: bool,
 }
 
@@ -288,11 +299,14 @@ impl Lock {
         }
         let Some(locked) = file.sha256 else {
             let empty = || format!("{} says neither `isolate` nor [sha256]", lock_path.display());
-            return isolates.then_some(Self { vouches: false, isolates }).ok_or_else(empty);
+            return isolates.then_some(Self { vouched_by: None, isolates }).ok_or_else(empty);
         };
         let name = path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         match locked.get(&name) {
-            Some(locked) if locked.eq_ignore_ascii_case(sha256) => Ok(Self { vouches: true, isolates }),
+            Some(locked) if locked.eq_ignore_ascii_case(sha256) => {
+                let signed = key.map_or_else(String::new, |key| format!(", signed with {key}"));
+                Ok(Self { vouched_by: Some(format!("plugins.lock{signed}")), isolates })
+            }
             Some(_) => Err(format!("its digest {sha256} is not the one in {}", lock_path.display())),
             None => {
                 Err(format!("it is not listed in {}; add its digest {sha256} if you trust it", lock_path.display()))
