@@ -233,7 +233,9 @@ fn a_set_that_was_signed_is_compared_with_what_it_was() {
     let statement = dir.join("ops.toml");
     let sign = || {
         let text = std::fs::read(&statement).expect("readable");
-        let signed = minisign::sign(Some(&keys.pk), &keys.sk, text.as_slice(), None, None).expect("signed");
+        // minisign takes comments of up to 8,192 bytes.
+        let comment = "as flown, ".repeat(800);
+        let signed = minisign::sign(Some(&keys.pk), &keys.sk, text.as_slice(), Some(&comment), None).expect("signed");
         std::fs::write(dir.join("ops.toml.minisig"), signed.into_string()).expect("written");
     };
     let state = ["sets", "statement", "ops", "--out", "ops.toml"];

@@ -124,11 +124,26 @@ impl Archive {
     /// # Errors
     /// There is none, or it is damaged.
     pub fn read_file(&self, id: &str, suffix: &str) -> Result<Vec<u8>, ArchiveError> {
-        let files = self.files_of(id)?;
-        let (_, sha256, _) = files.iter().find(|(found, ..)| found == suffix).ok_or_else(|| {
+        self.content(&self.digest_of(id, suffix)?)
+    }
+
+    /// Digest of a file beside a product, as it is now.
+    ///
+    /// # Errors
+    /// There is none.
+    pub fn digest_of(&self, id: &str, suffix: &str) -> Result<String, ArchiveError> {
+        let found = self.files_of(id)?.into_iter().find(|(found, ..)| found == suffix);
+        found.map(|(_, sha256, _)| sha256).ok_or_else(|| {
             let id = format!("{id}.{suffix}");
             ArchiveError::NotFound { id, folder: self.folder.clone() }
-        })?;
+        })
+    }
+
+    /// The content with a digest, compared with it: what a file was before it was replaced is still there.
+    ///
+    /// # Errors
+    /// There is none, or it is damaged.
+    pub fn content(&self, sha256: &str) -> Result<Vec<u8>, ArchiveError> {
         self.objects.read(sha256)
     }
 

@@ -54,6 +54,19 @@ pub fn sync_folder(folder: &Path) -> io::Result<()> {
     if cfg!(unix) { File::open(folder).and_then(|folder| folder.sync_all()) } else { Ok(()) }
 }
 
+/// The text of a file of at most `limit` bytes.
+///
+/// # Errors
+/// It cannot be read, is longer, or is no UTF-8.
+pub fn read_text(path: &Path, limit: u64) -> io::Result<String> {
+    let mut bytes = Vec::new();
+    File::open(path)?.take(limit.saturating_add(1)).read_to_end(&mut bytes)?;
+    if bytes.len() as u64 > limit {
+        return Err(io::Error::other(format!("it is longer than {limit} bytes")));
+    }
+    String::from_utf8(bytes).map_err(|error| io::Error::new(io::ErrorKind::InvalidData, error.utf8_error()))
+}
+
 /// Writes a new file and makes its content durable.
 pub(crate) fn write_durable(path: &Path, content: &[u8]) -> Result<(), IoError> {
     let write = || {
@@ -113,4 +126,23 @@ pub(crate) fn inode(_stat: &fs::Metadata) -> u64 {
 pub(crate) fn mtime_ns(stat: &fs::Metadata) -> i64 {
     let since = stat.modified().ok().and_then(|t| t.duration_since(std::time::UNIX_EPOCH).ok());
     since.and_then(|d| i64::try_from(d.as_nanos()).ok()).unwrap_or(0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_text_is_read_up_to_its_limit_and_refused_beyond() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("text");
+        fs::write(&path, "offset é").unwrap();
+        assert_eq!(read_text(&path, 9).unwrap(), "offset é");
+        // Cut in the middle of a character, it is too long before it is no UTF-8.
+        for limit in [8, 7, 0] {
+            assert_eq!(read_text(&path, limit).unwrap_err().to_string(), format!("it is longer than {limit} bytes"));
+        }
+        fs::write(&path, [b'o', 0xff]).unwrap();
+        assert_eq!(read_text(&path, 9).unwrap_err().kind(), io::ErrorKind::InvalidData);
+    }
 }

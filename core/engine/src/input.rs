@@ -174,19 +174,6 @@ impl InputFile {
     }
 }
 
-/// The text of a file of at most `limit` bytes.
-///
-/// # Errors
-/// It cannot be read, is longer, or is no UTF-8.
-pub(crate) fn read_text(path: &Path, limit: u64) -> io::Result<String> {
-    let mut text = String::new();
-    File::open(path)?.take(limit + 1).read_to_string(&mut text)?;
-    if text.len() as u64 > limit {
-        return Err(io::Error::other(format!("it is longer than {limit} bytes")));
-    }
-    Ok(text)
-}
-
 /// A place in an open file. Several read one file, since each has its own position.
 #[derive(Debug)]
 pub(crate) struct InputReader<'a> {

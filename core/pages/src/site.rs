@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use dragfree_archive::{Archive, Written};
+use dragfree_archive::{Archive, EXTRACT, Written};
 use dragfree_workflow::refit::{Asked, Basis, Refit};
 use serde::Deserialize;
 
@@ -11,7 +11,7 @@ use crate::PagesError;
 use crate::jobs::Jobs;
 use crate::setup::Setup;
 
-/// Bases that are kept in memory: a colleague may look at other days. One of 30 days takes some ten megabytes.
+/// Bases that are kept in memory: a colleague may look at other days.
 const BASES: usize = 4;
 
 /// Most products of a refit.
@@ -21,7 +21,8 @@ const MOST_PRODUCTS: usize = 120;
 pub struct Site {
     pub(crate) setup: Setup,
     pub(crate) jobs: Jobs,
-    bases: Mutex<VecDeque<(String, Arc<Basis>)>>,
+    /// With the digests of their extracts: a product that is diagnosed anew has another one.
+    bases: Mutex<VecDeque<(Vec<String>, Arc<Basis>)>>,
 }
 
 /// What stands behind `?` in an address.
@@ -67,18 +68,20 @@ impl Site {
 
     /// What the diagnoses of some products have kept, read once.
     pub(crate) fn basis(&self, products: &str) -> Result<Arc<Basis>, PagesError> {
-        let found = {
-            let bases = self.bases.lock().unwrap_or_else(PoisonError::into_inner);
-            bases.iter().find(|(key, _)| key == products).map(|(_, basis)| Arc::clone(basis))
-        };
-        if let Some(basis) = found {
-            return Ok(basis);
-        }
         let ids = list(products);
         if ids.len() > MOST_PRODUCTS {
             return Err(PagesError::Request(format!("at most {MOST_PRODUCTS} products are looked at together")));
         }
         let archive = self.archive()?;
+        // Of a product without one, `Basis::read` says how to make it.
+        let key: Vec<String> = ids.iter().map(|id| archive.digest_of(id, EXTRACT).unwrap_or_default()).collect();
+        let found = {
+            let bases = self.bases.lock().unwrap_or_else(PoisonError::into_inner);
+            bases.iter().find(|(digests, _)| *digests == key).map(|(_, basis)| Arc::clone(basis))
+        };
+        if let Some(basis) = found {
+            return Ok(basis);
+        }
         let written = ids.iter().map(|id| -> Result<Written, PagesError> {
             let row = archive.row(id)?;
             Ok(Written { product: archive.product(&row.id)?, path: archive.path_of(&row.id) })
@@ -86,7 +89,7 @@ impl Site {
         let written: Vec<Written> = written.collect::<Result<_, _>>()?;
         let basis = Arc::new(Basis::read(&self.setup.registry, &written)?);
         let mut bases = self.bases.lock().unwrap_or_else(PoisonError::into_inner);
-        bases.push_front((products.to_owned(), Arc::clone(&basis)));
+        bases.push_front((key, Arc::clone(&basis)));
         bases.truncate(BASES);
         Ok(basis)
     }

@@ -70,6 +70,9 @@ pub struct Extract {
     /// Coefficients that are what is named in other forms.
     #[serde(default)]
     other_forms: BTreeSet<usize>,
+    /// As what it was read.
+    #[serde(skip)]
+    kept_as: Option<Kept>,
 }
 
 /// What an extract is made of.
@@ -143,6 +146,7 @@ impl Extract {
             trials: evidence.trials.clone(),
             unexplained: why_unexplained(diagnosis),
             not_tried: diagnosis.not_tried.clone(),
+            kept_as: None,
         }))
     }
 
@@ -161,33 +165,9 @@ impl Extract {
     /// Reads that of a product.
     ///
     /// # Errors
-    /// [`WorkflowError::Extract`]: there is none, or it is of another product, format or release.
+    /// As [`Kept::newest`] and [`Kept::read`].
     pub fn read(product: &Written) -> Result<Self, WorkflowError> {
-        let path = product.path.with_extension(EXTRACT);
-        let id = product.product.id();
-        let make = format!("make it from the telemetry: dragfree diagnose {id} --keep-extract");
-        let refuse = |what: String| WorkflowError::Extract { path: path.clone(), what };
-        let read = || Archive::of(&path)?.read_file(id, EXTRACT);
-        let text = read().map_err(|e| refuse(format!("{e}; {make}")))?;
-        let extract: Self = serde_json::from_slice(&text).map_err(|e| refuse(format!("{e}; {make}")))?;
-        let n = extract.coefficients.len();
-        let whole = extract.information.len() == n * (n + 1) / 2 && extract.score.len() == n;
-        let sound = [
-            (extract.format == FORMAT, format!("its format is {}, not {FORMAT}", extract.format)),
-            (extract.product == id, format!("it is of product {}", extract.product)),
-            (
-                extract.program == env!("CARGO_PKG_VERSION"),
-                format!("release {} made it, with other candidates perhaps", extract.program),
-            ),
-            (whole, "its sums are not of its coefficients".to_owned()),
-            (extract.by_band.as_ref().is_none_or(|b| b.is_whole(n)), "its spectra are damaged".to_owned()),
-            (extract.stretches.as_ref().is_none_or(|s| s.is_whole(n)), "its stretches are damaged".to_owned()),
-            (extract.other_forms.iter().all(|i| *i < n), "its forms are damaged".to_owned()),
-        ];
-        match sound.into_iter().find(|(holds, _)| !holds) {
-            Some((_, what)) => Err(refuse(format!("{what}; {make}"))),
-            None => Ok(extract),
-        }
+        Kept::newest(product)?.read()
     }
 
     /// Effect and instance of what this product alone says is missing.
@@ -210,9 +190,19 @@ impl Extract {
         self.coefficients.iter().position(|own| same(own, c))
     }
 
-    /// What the channels leave in each band, and the likelihood of stretches of time.
-    pub(crate) fn into_parts(self) -> (Option<ByBand>, Option<Stretches>) {
-        (self.by_band, self.stretches)
+    /// As what an archive has it; none of one that was not read.
+    pub(crate) fn kept_as(&self) -> Option<&Kept> {
+        self.kept_as.as_ref()
+    }
+
+    /// Takes out what the channels leave in each band.
+    pub(crate) fn take_by_band(&mut self) -> Option<ByBand> {
+        self.by_band.take()
+    }
+
+    /// Takes out the likelihood of stretches of time.
+    pub(crate) fn take_stretches(&mut self) -> Option<Stretches> {
+        self.stretches.take()
     }
 
     /// Whether it has this coefficient in a form beside the one that is named.
@@ -238,6 +228,67 @@ impl Extract {
             channels: self.channels.clone(),
         }
     }
+}
+
+/// An extract as an archive has it. Where a product is diagnosed anew, its extract is another one.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Kept {
+    product: String,
+    path: PathBuf,
+    sha256: String,
+}
+
+impl Kept {
+    /// The newest one of a product.
+    ///
+    /// # Errors
+    /// [`WorkflowError::Extract`]: there is none.
+    pub(crate) fn newest(product: &Written) -> Result<Self, WorkflowError> {
+        let (product, path) = (product.product.id().to_owned(), product.path.with_extension(EXTRACT));
+        let digest = Archive::of(&path).and_then(|archive| archive.digest_of(&product, EXTRACT));
+        match digest {
+            Ok(sha256) => Ok(Self { product, path, sha256 }),
+            Err(error) => {
+                let what = format!("{error}; {}", make(&product));
+                Err(WorkflowError::Extract { path, what })
+            }
+        }
+    }
+
+    /// Reads it.
+    ///
+    /// # Errors
+    /// [`WorkflowError::Extract`]: it is damaged, or of another product, format or release.
+    pub(crate) fn read(&self) -> Result<Extract, WorkflowError> {
+        let Self { product: id, path, sha256 } = self;
+        let make = make(id);
+        let refuse = |what: String| WorkflowError::Extract { path: path.clone(), what };
+        let text = Archive::of(path).and_then(|archive| archive.content(sha256));
+        let text = text.map_err(|e| refuse(format!("{e}; {make}")))?;
+        let extract: Extract = serde_json::from_slice(&text).map_err(|e| refuse(format!("{e}; {make}")))?;
+        let n = extract.coefficients.len();
+        let whole = extract.information.len() == n * (n + 1) / 2 && extract.score.len() == n;
+        let sound = [
+            (extract.format == FORMAT, format!("its format is {}, not {FORMAT}", extract.format)),
+            (extract.product == *id, format!("it is of product {}", extract.product)),
+            (
+                extract.program == env!("CARGO_PKG_VERSION"),
+                format!("release {} made it, with other candidates perhaps", extract.program),
+            ),
+            (whole, "its sums are not of its coefficients".to_owned()),
+            (extract.by_band.as_ref().is_none_or(|b| b.is_whole(n)), "its spectra are damaged".to_owned()),
+            (extract.stretches.as_ref().is_none_or(|s| s.is_whole(n)), "its stretches are damaged".to_owned()),
+            (extract.other_forms.iter().all(|i| *i < n), "its forms are damaged".to_owned()),
+        ];
+        match sound.into_iter().find(|(holds, _)| !holds) {
+            Some((_, what)) => Err(refuse(format!("{what}; {make}"))),
+            None => Ok(Extract { kept_as: Some(self.clone()), ..extract }),
+        }
+    }
+}
+
+fn make(product: &str) -> String {
+    format!("make it from the telemetry: dragfree diagnose {product} --keep-extract")
 }
 
 /// Whether a coefficient is that of a candidate in its form.
@@ -271,7 +322,7 @@ fn same(a: &Coefficient, b: &Coefficient) -> bool {
 /// [`WorkflowError`]: an extract is missing, or the products have different models.
 pub fn diagnose_extracts(registry: &Registry, products: &[Written]) -> Result<Diagnosis, WorkflowError> {
     let settings = &products.first().ok_or(WorkflowError::NoProduct)?.product.settings;
-    let extracts = of_products(products)?;
+    let extracts = of_products(products, |extract| drop((extract.take_by_band(), extract.take_stretches())))?;
     let evidence =
         Evidence { trials: trials(&extracts), least: settings.false_alarm, registry, products, proposals: Vec::new() };
     let (sums, mut not_tried) = shared(&extracts, |_| false);
@@ -284,13 +335,21 @@ pub fn diagnose_extracts(registry: &Registry, products: &[Written]) -> Result<Di
     Ok(diagnosis)
 }
 
-/// The extracts of products of one model.
+/// The extracts of products of one model; `take` may take parts out of each, so that these are not all in memory.
 ///
 /// # Errors
 /// [`WorkflowError`]: an extract is missing, or the products have different models.
-pub(crate) fn of_products(products: &[Written]) -> Result<Vec<Extract>, WorkflowError> {
+pub(crate) fn of_products(
+    products: &[Written],
+    mut take: impl FnMut(&mut Extract),
+) -> Result<Vec<Extract>, WorkflowError> {
     ManyDays::refuse(products.iter().map(|w| &w.product))?;
-    let extracts: Vec<Extract> = products.iter().map(Extract::read).collect::<Result<_, _>>()?;
+    let read = |product| {
+        let mut extract = Extract::read(product)?;
+        take(&mut extract);
+        Ok(extract)
+    };
+    let extracts: Vec<Extract> = products.iter().map(read).collect::<Result<_, WorkflowError>>()?;
     of_one_model(&extracts)?;
     Ok(extracts)
 }

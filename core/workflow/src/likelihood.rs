@@ -27,7 +27,7 @@ mod stretches;
 pub(crate) use ends::transients_near_ends;
 pub(crate) use experiment::{Experiment, InBlock, Settled, information};
 use pass::{At, Constant, Filtered};
-pub(crate) use stretches::{Alone, OneStretch, Stretches};
+pub(crate) use stretches::{Alone, Stretches};
 use stretches::{Stretch, stretches};
 
 use crate::WorkflowError;

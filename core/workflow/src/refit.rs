@@ -19,8 +19,8 @@ use serde_json::json;
 
 use crate::WorkflowError;
 use crate::answer::{Evidence, NoiseLevel};
-use crate::extract::{ByBand, Extract, levels_of_all, of_products, shared, trials};
-use crate::likelihood::{Alone, CoefficientSums, Decided, Meaning, OneStretch, Stretches, joined};
+use crate::extract::{ByBand, Extract, Kept, levels_of_all, of_products, shared, trials};
+use crate::likelihood::{Alone, CoefficientSums, Decided, Meaning, Stretches, joined};
 
 mod solving;
 mod spectra;
@@ -71,7 +71,11 @@ struct Day {
     /// Index of each of its coefficients in its extract.
     kept: Vec<usize>,
     by_band: Option<Arc<ByBand>>,
-    stretches: Option<Arc<Stretches>>,
+    /// First and last time of each stretch, Unix ns. Their sums are read when one is kept out of the fit: those of many
+    /// days are most of their extracts.
+    stretches: Vec<(i64, i64)>,
+    /// Where they are.
+    extract: Option<Kept>,
 }
 
 /// What can be switched: an effect's instance in one form.
@@ -113,6 +117,9 @@ pub enum RefitError {
     /// All stretches of a product.
     #[error("every stretch of {0} is kept out: keep the whole product out")]
     WholeProduct(String),
+    /// What was read before is not there any more.
+    #[error("{0}")]
+    Unreadable(String),
     /// Nothing is left to fit.
     #[error("all products are kept out of the fit: leave one in")]
     NothingToFit,
@@ -125,7 +132,8 @@ impl Basis {
     /// [`WorkflowError`]: an extract is missing, or the products have different models.
     pub fn read(registry: &Registry, products: &[Written]) -> Result<Self, WorkflowError> {
         let settings = products.first().ok_or(WorkflowError::NoProduct)?.product.settings.clone();
-        let extracts = of_products(products)?;
+        let mut stretches = Vec::new();
+        let extracts = of_products(products, |extract| stretches.push(times(extract.take_stretches())))?;
         let trials = trials(&extracts);
         let (sums, not_tried) = shared(&extracts, |c| in_all_days(&extracts, c));
         let evidence =
@@ -160,7 +168,8 @@ impl Basis {
                 levels: extracts[k].levels().to_vec(),
                 kept: own.iter().filter_map(|c| extracts[k].place(c)).collect(),
                 by_band: None,
-                stretches: None,
+                stretches: std::mem::take(&mut stretches[k]),
+                extract: extracts[k].kept_as().cloned(),
             };
             // An extract is made about the model alone, and gives χ² there.
             day.chi2_at_zero = totals[k].0 - day.rise(&values);
@@ -169,9 +178,8 @@ impl Basis {
         let named = named_by(&extracts, &switches);
         let housekeeping = extracts.iter().flat_map(Extract::housekeeping);
         let housekeeping = housekeeping.map(|(name, unit)| (name.clone(), unit.clone())).collect();
-        for (day, extract) in days.iter_mut().zip(extracts) {
-            let (by_band, stretches) = extract.into_parts();
-            (day.by_band, day.stretches) = (by_band.map(Arc::new), stretches.map(Arc::new));
+        for (day, mut extract) in days.iter_mut().zip(extracts) {
+            day.by_band = extract.take_by_band().map(Arc::new);
         }
         let families = switches.iter().map(|s| (s.effect.clone(), evidence.family(&s.effect).to_owned())).collect();
         Ok(Self {
@@ -257,12 +265,9 @@ impl Basis {
     /// none.
     pub fn stretches(&self, product: &str) -> Vec<Stretch> {
         let day = self.days.iter().find(|day| day.product == product);
-        let all = day.and_then(|day| day.stretches.as_ref()).map_or(&[][..], |s| &s.all);
-        let stretch = |(k, one): (usize, &OneStretch)| Stretch {
-            name: format!("{product}{STRETCH}{}", k + 1),
-            from_ns: one.from_ns,
-            until_ns: one.until_ns,
-        };
+        let all = day.map_or(&[][..], |day| &day.stretches);
+        let stretch =
+            |(k, &(from_ns, until_ns))| Stretch { name: format!("{product}{STRETCH}{}", k + 1), from_ns, until_ns };
         all.iter().enumerate().map(stretch).collect()
     }
 
@@ -274,7 +279,7 @@ impl Basis {
             let day = self.days.iter().find(|day| day.product == product);
             let day = day.ok_or_else(|| RefitError::NoProduct(held.clone()))?;
             let Some(stretch) = stretch else { continue };
-            let count = day.stretches.as_ref().map_or(0, |s| s.all.len());
+            let count = day.stretches.len();
             let number = stretch.parse::<usize>().ok().filter(|k| (1..=count).contains(k));
             let number = number.ok_or_else(|| RefitError::NoStretch(held.clone()))?;
             if count > 1 && held_out.iter().all(|other| other != product) {
@@ -292,10 +297,12 @@ impl Basis {
         }
         let no_product = || RefitError::NoProduct(product.to_owned());
         let day = self.days.iter().find(|day| day.product == product).ok_or_else(no_product)?;
-        let stretches = day.stretches.as_ref().ok_or_else(no_product)?;
-        if kept_out.len() == stretches.all.len() {
+        if kept_out.len() == day.stretches.len() {
             return Err(RefitError::WholeProduct(product.to_owned()));
         }
+        let extract = day.extract.as_ref().ok_or_else(no_product)?.read();
+        let stretches = extract.map_err(|e| RefitError::Unreadable(e.to_string()))?.take_stretches();
+        let stretches = stretches.ok_or_else(no_product)?;
         let (fit, out) = stretches.divided(|k| kept_out.contains(&k));
         let (fit, out) = (day.with(&fit), day.with(&out));
         let divided = Arc::new(Divided { product: product.to_owned(), kept_out, fit, out });
@@ -344,6 +351,11 @@ impl Basis {
     }
 }
 
+/// First and last time of each stretch.
+fn times(stretches: Option<Stretches>) -> Vec<(i64, i64)> {
+    stretches.map_or(Vec::new(), |s| s.all.iter().map(|one| (one.from_ns, one.until_ns)).collect())
+}
+
 impl Day {
     /// The same product with another likelihood of its coefficients.
     fn with(&self, alone: &Alone) -> Self {
@@ -362,7 +374,8 @@ impl Day {
             levels: self.levels.iter().filter_map(level).collect(),
             kept: self.kept.clone(),
             by_band: self.by_band.clone(),
-            stretches: None,
+            stretches: Vec::new(),
+            extract: None,
         }
     }
 

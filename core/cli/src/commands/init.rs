@@ -6,7 +6,8 @@ use crate::failure::{Failure, Refusal};
 use crate::installed;
 use crate::operations;
 use crate::text::quoted;
-use dragfree_archive::files::IoContext as _;
+use dragfree_archive::files::{IoContext as _, read_text};
+use dragfree_engine::limits::CONFIG_BYTES;
 use std::fs::File;
 use std::io::Write as _;
 use std::path::Path;
@@ -24,7 +25,7 @@ const CAMPAIGN: &str = include_str!("../../../../fixtures/operations/campaign.to
 const EVENTS: &str = include_str!("../../../../fixtures/operations/events.yaml");
 
 pub(super) fn execute(init: &Init, json: bool) -> Result<Done, Failure> {
-    let read = |path: &Path| std::fs::read_to_string(path).at("read", path);
+    let read = |path: &Path| read_text(path, CONFIG_BYTES).at("read", path);
     let name = init.mission.file_stem().unwrap_or_default().to_string_lossy().into_owned();
     let pipeline =
         installed::pipeline_of(&name).map_or_else(|| installed::find(installed::PIPELINE, Path::new(PIPELINE)), Ok)?;

@@ -118,8 +118,7 @@ fn plugin_key(global: &Global) -> Result<Option<PublicKey>, Failure> {
 
 /// A key that an option gives as a file or as text.
 fn public_key(option: &str, given: &str) -> Result<PublicKey, Failure> {
-    let text = std::fs::read_to_string(given).unwrap_or_else(|_| given.to_owned());
-    PublicKey::parse(&text).map_err(|what| format!("{option} {given}: {what}, and no file with one").into())
+    PublicKey::of(given).map_err(|what| format!("{option} {given}: {what}").into())
 }
 
 /// This program again, for a plugin that is to run in a process of its own.

@@ -2,6 +2,7 @@
 
 use dragfree_abi as abi;
 use dragfree_archive::PublicKey;
+use dragfree_archive::files::read_text;
 use dragfree_schema::Manifest;
 use serde::{Deserialize, Serialize};
 use std::ffi::CString;
@@ -11,7 +12,7 @@ use std::path::{Path, PathBuf};
 use super::BorderError;
 use super::crash::{self, Name};
 use super::text::{aligned, text_of};
-use crate::input::{InputFile, read_text};
+use crate::input::InputFile;
 use crate::limits::{CONFIG_BYTES, LIBRARY_BYTES, PLUGINS, TEXT_BYTES};
 
 /// What a plugin is.

@@ -31,7 +31,7 @@ pub enum ConfigError {
 }
 
 pub(crate) fn read(path: &Path) -> Result<String, ConfigError> {
-    crate::input::read_text(path, crate::limits::CONFIG_BYTES)
+    dragfree_archive::files::read_text(path, crate::limits::CONFIG_BYTES)
         .map_err(|source| ConfigError::Read { path: path.to_owned(), source })
 }
 

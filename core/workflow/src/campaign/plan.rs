@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 
 use chrono::NaiveDate;
 use dragfree_archive::Archive;
-use dragfree_archive::files::{IoContext as _, sha256};
+use dragfree_archive::files::{IoContext as _, read_text, sha256};
 use dragfree_engine::EngineError;
+use dragfree_engine::limits::CONFIG_BYTES;
 use serde::{Deserialize, Serialize};
 
 use crate::WorkflowError;
@@ -111,7 +112,7 @@ impl Spec {
     /// It cannot be read.
     pub fn load(path: &Path) -> Result<Self, WorkflowError> {
         let refuse = |what: String| WorkflowError::Campaign(format!("{}: {what}", path.display()));
-        let text = std::fs::read_to_string(path).map_err(|e| refuse(e.to_string()))?;
+        let text = read_text(path, CONFIG_BYTES).map_err(|e| refuse(e.to_string()))?;
         let mut spec: Self = toml::from_str(&text).map_err(|e| refuse(e.to_string()))?;
         let place = std::path::absolute(path).map_err(|e| refuse(e.to_string()))?;
         spec.campaign.ops = place.parent().unwrap_or(Path::new("/")).join(&spec.campaign.ops);

@@ -3,6 +3,8 @@
 use std::path::PathBuf;
 
 use chrono::NaiveDate;
+use dragfree_archive::files::read_text;
+use dragfree_engine::limits::CONFIG_BYTES;
 use serde::{Deserialize, Serialize};
 
 use super::events::{self, Event};
@@ -48,7 +50,7 @@ impl Declared {
         let file = options.events.as_ref().map(|path| {
             let refuse = |e: std::io::Error| WorkflowError::Events { path: path.clone(), what: e.to_string() };
             let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-            std::fs::read_to_string(path).map(|text| (name, text)).map_err(refuse)
+            read_text(path, CONFIG_BYTES).map(|text| (name, text)).map_err(refuse)
         });
         Ok(Self {
             days: (options.first, options.last),

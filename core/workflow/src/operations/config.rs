@@ -1,6 +1,8 @@
 //! `mission-ops.toml`: where the parts of a mission lie.
 
 use crate::WorkflowError;
+use dragfree_archive::files::read_text;
+use dragfree_engine::limits::CONFIG_BYTES;
 use serde::Deserialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -75,7 +77,7 @@ impl Operations {
     /// [`WorkflowError::Operations`] says what is wrong with it.
     pub fn load(path: &Path) -> Result<Self, WorkflowError> {
         let refuse = |what: String| WorkflowError::Operations { path: path.to_owned(), what };
-        let text = std::fs::read_to_string(path).map_err(|e| refuse(e.to_string()))?;
+        let text = read_text(path, CONFIG_BYTES).map_err(|e| refuse(e.to_string()))?;
         let File { operations: table } = toml::from_str(&text).map_err(|e| refuse(e.to_string()))?;
         let place = std::path::absolute(path).map_err(|e| refuse(e.to_string()))?;
         let folder = place.parent().unwrap_or(Path::new("/"));

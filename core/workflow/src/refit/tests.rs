@@ -71,7 +71,8 @@ fn basis(days: &[Data]) -> Basis {
         levels: vec![level.clone()],
         kept: (0..n).collect(),
         by_band: None,
-        stretches: None,
+        stretches: Vec::new(),
+        extract: None,
     };
     Basis {
         settings: Settings::default(),

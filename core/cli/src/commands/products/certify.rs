@@ -5,8 +5,9 @@ use crate::commands::{Done, stamp};
 use crate::failure::Failure;
 use crate::text::{self, Paint};
 use crate::utc;
-use dragfree_archive::files::IoContext as _;
+use dragfree_archive::files::{IoContext as _, read_text};
 use dragfree_archive::{Archive, PublicKey, SetState, Validity, Window};
+use dragfree_engine::limits::CONFIG_BYTES;
 use dragfree_workflow::joint;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -148,7 +149,7 @@ impl Statement {
 
 /// `sets check`: the signature, then the archive.
 fn check(archive: &Archive, path: &Path, key: &PublicKey, json: bool) -> Result<Done, Failure> {
-    let text = std::fs::read_to_string(path).map_err(|error| format!("{} cannot be read: {error}", path.display()))?;
+    let text = read_text(path, CONFIG_BYTES).map_err(|error| format!("{} cannot be read: {error}", path.display()))?;
     key.check(path, &text)?;
     let signed: Statement =
         toml::from_str(&text).map_err(|error| format!("{} is no statement of a set: {error}", path.display()))?;
