@@ -555,6 +555,9 @@ pub(crate) enum Plugins {
     /// Open libraries in this very process: what this command asks of its children
     #[command(hide = true)]
     Probe {
+        /// Answer with digests
+        #[arg(long)]
+        digests: bool,
         /// Libraries
         #[arg(value_name = "FILE")]
         files: Vec<PathBuf>,

@@ -97,6 +97,16 @@ impl InputFile {
         &self.path
     }
 
+    /// Whether whatever is written to it after it was opened makes it look otherwise.
+    pub(crate) fn is_settled(&self) -> bool {
+        self.settled
+    }
+
+    /// What it looked like when it was opened: a settled file that looks the same later is the same.
+    pub(crate) fn look(&self) -> String {
+        format!("{:?}", self.opened_as)
+    }
+
     /// Size when it was opened, bytes.
     pub(crate) fn size(&self) -> u64 {
         self.opened_as.size

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use crate::border::{self, BorderError, Checked, Config, Instance, Isolation, Kind, Library, PluginInfo};
+use crate::border::{self, BorderError, Checked, Config, Identity, Instance, Isolation, Kind, Library, PluginInfo};
 use dragfree_archive::PublicKey;
 use dragfree_archive::files::Problem;
 
@@ -28,9 +28,9 @@ pub struct Found {
     apart: bool,
 }
 
-/// Tries files as plugin libraries where that can do no harm. For each the digest of what was tried, or why it is to be
-/// refused.
-pub type Probe<'a> = &'a mut dyn FnMut(&[&Path]) -> Vec<Result<String, String>>;
+/// Tries files as plugin libraries where that can do no harm. For each the identity of what was tried, or why it is to
+/// be refused.
+pub type Probe<'a> = &'a mut dyn FnMut(&[&Path], Identity) -> Vec<Result<String, String>>;
 
 /// Why there is no plugin.
 #[derive(Debug, thiserror::Error)]
@@ -76,10 +76,12 @@ impl Registry {
         if let Some(probe) = probe {
             let is_tried = |library: &Checked| !library.is_locked() && !library.is_isolated();
             let unknown: Vec<&Path> = checked.iter().filter(|c| is_tried(c)).map(Checked::path).collect();
-            let answers = if unknown.is_empty() { Vec::new() } else { probe(&unknown) };
+            let settled = checked.iter().all(Checked::is_settled);
+            let by = if settled { Identity::Look } else { Identity::Digest };
+            let answers = if unknown.is_empty() { Vec::new() } else { probe(&unknown, by) };
             let mut answers = answers.into_iter();
             checked.retain(|library| {
-                let refused = if is_tried(library) { refusal(library, answers.next()) } else { None };
+                let refused = if is_tried(library) { refusal(library, by, answers.next()) } else { None };
                 this.refused.extend(refused.clone());
                 refused.is_none()
             });
@@ -212,9 +214,9 @@ fn not_isolated(path: &Path) -> BorderError {
 }
 
 /// Why a library that was tried is not opened.
-fn refusal(library: &Checked, answer: Option<Result<String, String>>) -> Option<Problem> {
+fn refusal(library: &Checked, by: Identity, answer: Option<Result<String, String>>) -> Option<Problem> {
     let reason = match answer {
-        Some(Ok(sha256)) if sha256 == library.sha256() => return None,
+        Some(Ok(identity)) if identity == library.identity(by) => return None,
         Some(Ok(_)) => "was changed while it was tried; try again when it is complete".to_owned(),
         Some(Err(reason)) => reason,
         None => "could not be tried".to_owned(),
@@ -233,4 +235,41 @@ fn shared_libraries(folder: &Path) -> Vec<PathBuf> {
         .collect();
     paths.sort();
     paths
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::time::Duration;
+
+    /// What was tried is what is opened: by the look of a file that was written long ago, by the digest of a new one.
+    #[test]
+    fn a_library_that_changes_while_it_is_tried_is_not_opened() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join(format!("a{}", std::env::consts::DLL_SUFFIX));
+        // As one that is written anew before it is opened for its trial.
+        let refused = |written_anew: bool| {
+            let mut tried_by = None;
+            let mut probe = |files: &[&Path], by: Identity| {
+                tried_by = Some(by);
+                if written_anew {
+                    std::fs::write(&path, "two").unwrap();
+                }
+                vec![Ok(Checked::new(files[0], None).unwrap().identity(by))]
+            };
+            let registry = Registry::open_all(&[folder.path().to_owned()], None, None, Some(&mut probe));
+            (tried_by, registry.refused[0].reason.clone())
+        };
+        for by in [Identity::Digest, Identity::Look] {
+            for (written_anew, why) in [(false, "no shared library"), (true, "was changed while it was tried")] {
+                std::fs::write(&path, "one").unwrap();
+                if by == Identity::Look && cfg!(unix) {
+                    std::thread::sleep(Duration::from_millis(1100));
+                }
+                let (tried_by, reason) = refused(written_anew);
+                assert!(!cfg!(unix) || tried_by == Some(by));
+                assert!(reason.contains(why), "{by:?}, {written_anew}: {reason}");
+            }
+        }
+    }
 }

@@ -103,7 +103,9 @@ fn discovered(global: &Global) -> Result<Registry, Failure> {
     folders.extend(own_folders());
     let limit = Duration::from_secs_f64(global.plugin_time_limit).min(OPENING);
     let key = plugin_key(global)?;
-    Ok(Registry::discover_probed(&folders, isolation(global)?, key.as_ref(), &mut |files| probe::probe(files, limit)))
+    Ok(Registry::discover_probed(&folders, isolation(global)?, key.as_ref(), &mut |files, by| {
+        probe::probe(files, by, limit)
+    }))
 }
 
 /// The environment variable with the key of who vouches for plugins.

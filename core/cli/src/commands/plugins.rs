@@ -21,7 +21,7 @@ pub(super) fn execute(command: &Plugins, global: &Global, paint: Paint) -> Resul
         }
         Plugins::Inspect { id } => inspect(&super::registry(global)?, id, global.json, paint),
         Plugins::Validate(validate) => super::validate::execute(validate, global, paint),
-        Plugins::Probe { files } => super::probe::child(files),
+        Plugins::Probe { digests, files } => super::probe::child(files, *digests),
         Plugins::Serve => border::serve(),
         Plugins::New(new) => super::new_plugin::execute(new, global.json),
     }

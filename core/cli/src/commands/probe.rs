@@ -4,7 +4,7 @@
 use super::Done;
 use crate::failure::Failure;
 use crate::output;
-use dragfree_engine::border::{self, BorderError, Library};
+use dragfree_engine::border::{self, BorderError, Identity, Library};
 use serde_json::{Value, json};
 use std::io::{BufRead as _, BufReader};
 use std::path::{Path, PathBuf};
@@ -12,11 +12,11 @@ use std::process::{Child, Command, Stdio};
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
-/// For each file the digest of what was opened, or why it is refused.
-pub(super) fn probe(files: &[&Path], limit: Duration) -> Vec<Result<String, String>> {
+/// For each file the identity of what was opened, or why it is refused.
+pub(super) fn probe(files: &[&Path], by: Identity, limit: Duration) -> Vec<Result<String, String>> {
     let mut answers: Vec<Result<String, String>> = Vec::with_capacity(files.len());
     while answers.len() < files.len() {
-        let (mut child, lines) = match start(&files[answers.len()..]) {
+        let (mut child, lines) = match start(&files[answers.len()..], by) {
             Ok(started) => started,
             Err(error) => {
                 let failed = format!("cannot be tried in a process of its own: {error}");
@@ -55,9 +55,13 @@ pub(super) fn probe(files: &[&Path], limit: Duration) -> Vec<Result<String, Stri
 }
 
 /// A child that opens the files in order, and its lines.
-fn start(files: &[&Path]) -> std::io::Result<(Child, Receiver<String>)> {
+fn start(files: &[&Path], by: Identity) -> std::io::Result<(Child, Receiver<String>)> {
     let mut command = Command::new(std::env::current_exe()?);
-    command.args(["plugins", "probe", "--quiet"]).args(files);
+    command.args(["plugins", "probe", "--quiet"]);
+    if by == Identity::Digest {
+        command.arg("--digests");
+    }
+    command.args(files);
     let mut child = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null()).spawn()?;
     let (sender, lines) = channel();
     let stdout = child.stdout.take();
@@ -79,10 +83,11 @@ fn answer(line: &str) -> Option<Result<String, String>> {
 }
 
 /// The child's part: opens each file and says so at once.
-pub(super) fn child(files: &[PathBuf]) -> Result<Done, Failure> {
+pub(super) fn child(files: &[PathBuf], digests: bool) -> Result<Done, Failure> {
+    let by = if digests { Identity::Digest } else { Identity::Look };
     for file in files {
-        let answer = match Library::open(file) {
-            Ok(library) => json!({ "opened": library.sha256 }),
+        let answer = match Library::try_open(file, by) {
+            Ok(identity) => json!({ "opened": identity }),
             Err(BorderError::Refused { reason, .. }) => json!({ "refused": reason }),
             Err(error) => json!({ "refused": error.to_string() }),
         };

@@ -82,6 +82,15 @@ pub struct Library {
     entry: Option<&'static abi::EntryV1>,
 }
 
+/// What tells a library from any other.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Identity {
+    /// Its place, size and times, which suffice for [settled](Checked::is_settled) ones.
+    Look,
+    /// The digest of its bytes, which takes longer than to open it.
+    Digest,
+}
+
 impl Checked {
     /// Opens a file and checks it: who may change it, and whether `plugins.lock` has its digest. With a `key` it must
     /// have, and must be signed with the key.
@@ -90,15 +99,34 @@ impl Checked {
     /// [`BorderError::Refused`] with the reason.
     pub fn new(path: &Path, key: Option<&PublicKey>) -> Result<Self, BorderError> {
         let refuse = |reason: String| BorderError::Refused { path: path.to_owned(), reason };
-        let unreadable = |e: std::io::Error| refuse(format!("cannot be read: {e}"));
-        let file = InputFile::open(path).map_err(unreadable)?;
+        let Self { file, .. } = Self::owned(path)?;
+        let sha256 = file.sums(0).map_err(|e| refuse(format!("cannot be read: {e}")))?.sha256;
+        let lock = Lock::of(path, &sha256, key).map_err(refuse)?;
+        Ok(Self { file, sha256, lock })
+    }
+
+    /// Opens a file and checks who may change it, without its digest and without `plugins.lock`.
+    fn owned(path: &Path) -> Result<Self, BorderError> {
+        let refuse = |reason: String| BorderError::Refused { path: path.to_owned(), reason };
+        let file = InputFile::open(path).map_err(|e| refuse(format!("cannot be read: {e}")))?;
         if file.size() > LIBRARY_BYTES {
             return Err(refuse(format!("has {} bytes, where a library may have {LIBRARY_BYTES}", file.size())));
         }
         super::owner::check(path, &file).map_err(refuse)?;
-        let sha256 = file.sums(0).map_err(unreadable)?.sha256;
-        let lock = Lock::of(path, &sha256, key).map_err(refuse)?;
-        Ok(Self { file, sha256, lock })
+        Ok(Self { file, sha256: String::new(), lock: Lock::default() })
+    }
+
+    /// What tells it from any other file, for who tries it in another process.
+    pub fn identity(&self, by: Identity) -> String {
+        match by {
+            Identity::Look => self.file.look(),
+            Identity::Digest => self.sha256.clone(),
+        }
+    }
+
+    /// Whether its look tells it from whatever may be written to it from now on.
+    pub fn is_settled(&self) -> bool {
+        self.file.is_settled()
     }
 
     /// The file.
@@ -130,6 +158,20 @@ impl Library {
     /// plugin, another ABI version, a manifest that cannot be read.
     pub fn open(path: &Path) -> Result<Self, BorderError> {
         Self::load(Checked::new(path, None)?)
+    }
+
+    /// Opens a file to see whether that can be done. Gives its identity.
+    ///
+    /// # Errors
+    /// As [`Self::open`].
+    pub fn try_open(path: &Path, by: Identity) -> Result<String, BorderError> {
+        let checked = match by {
+            Identity::Look => Checked::owned(path)?,
+            Identity::Digest => Checked::new(path, None)?,
+        };
+        let identity = checked.identity(by);
+        Self::load(checked)?;
+        Ok(identity)
     }
 
     /// Opens a file that was checked and reads its manifests.

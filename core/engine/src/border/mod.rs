@@ -28,7 +28,7 @@ pub use dragfree_schema::{Manifest, Parameter, ParameterType};
 pub use exit::{ended, exit_is_due, exit_now, give_memory_back, watch_exit};
 pub use instance::Instance;
 pub use isolated::{Isolation, described, read_answer, serve};
-pub use library::{Checked, Kind, Library, PluginInfo};
+pub use library::{Checked, Identity, Kind, Library, PluginInfo};
 pub use link::{Linked, ReadColumn};
 
 use std::path::PathBuf;
