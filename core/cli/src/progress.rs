@@ -24,6 +24,7 @@ pub(crate) struct Meter {
     job: &'static str,
     started: Instant,
     shown: Option<Instant>,
+    until_ns: i64,
 }
 
 impl Meter {
@@ -35,7 +36,7 @@ impl Meter {
             (false, false) if global.verbose > 0 => Style::Plain,
             (false, false) => Style::Silent,
         };
-        Self { style, job, started: Instant::now(), shown: None }
+        Self { style, job, started: Instant::now(), shown: None, until_ns: i64::MIN }
     }
 
     /// Shows how far the job is, now and then.
@@ -46,11 +47,12 @@ impl Meter {
             Style::Plain => Duration::from_secs(5),
         };
         let now = Instant::now();
+        let elapsed = self.elapsed(now, progress.until_ns);
         if now.duration_since(self.shown.unwrap_or(self.started)) < interval {
             return;
         }
         self.shown = Some(now);
-        let line = line(self.job, now.duration_since(self.started), progress);
+        let line = line(self.job, elapsed, progress);
         let mut stderr = std::io::stderr().lock();
         // Progress that cannot be shown is no reason to stop.
         let _ = match self.style {
@@ -60,6 +62,17 @@ impl Meter {
             }
             Style::Plain | Style::Silent => writeln!(stderr, "{line}"),
         };
+    }
+}
+
+impl Meter {
+    /// Time since the pass has begun: a job may go over its data several times, each at a rate of its own.
+    fn elapsed(&mut self, now: Instant, until_ns: i64) -> Duration {
+        if until_ns < self.until_ns {
+            (self.started, self.shown) = (now, Some(now));
+        }
+        self.until_ns = until_ns;
+        now.duration_since(self.started)
     }
 }
 
@@ -100,6 +113,16 @@ mod tests {
 
     const START_NS: i64 = 2_051_222_400_000_000_000;
     const HOUR_NS: i64 = 3_600_000_000_000;
+
+    #[test]
+    fn each_pass_over_the_data_has_a_rate_of_its_own() {
+        let (started, second) = (Instant::now(), Duration::from_secs(1));
+        let mut meter = Meter { style: Style::Silent, job: "decide", started, shown: None, until_ns: i64::MIN };
+        assert_eq!(meter.elapsed(started + second, START_NS), second);
+        assert_eq!(meter.elapsed(started + 10 * second, START_NS + HOUR_NS), 10 * second);
+        assert_eq!(meter.elapsed(started + 11 * second, START_NS), Duration::ZERO);
+        assert_eq!(meter.elapsed(started + 13 * second, START_NS + HOUR_NS), 2 * second);
+    }
 
     #[test]
     fn rate_and_time_left_follow_from_the_epochs() {

@@ -128,6 +128,34 @@ fn many_days_are_shown_at_once() {
     assert!(times[2] < Duration::from_millis(300), "{times:?}");
 }
 
+/// A day that is diagnosed anew has another extract, and the pages show that one.
+#[test]
+fn what_a_new_diagnosis_keeps_is_shown() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let id = write(folder.path(), &product(1, "1"));
+    let mut archive = Archive::open(folder.path()).expect("an archive");
+    let site = site(folder.path());
+    let query = Query { products: id.clone(), ..Query::default() };
+    let made = site.refit(&query).map(drop).expect_err("no extract").to_string();
+    assert!(made.contains("--keep-extract"), "{made}");
+    for (score, value_m) in [(4.0, 1.0), (8.0, 2.0)] {
+        let extract = json!({
+            "format": "dragfree-extract/1", "product": id, "program": env!("CARGO_PKG_VERSION"),
+            "coefficients": [{"name": "offset.b.x", "unit": "m"}], "information": [4.0], "score": [score],
+            "chi2": 10.0, "numbers": 10.0, "surveys": [], "channels": {}, "named": [], "levels": [],
+            "trials": {"forms": {}}, "unexplained": null, "not_tried": []
+        });
+        let text = serde_json::to_vec(&extract).expect("JSON");
+        drop(archive.keep_extract(&id, &text, &stamp()).expect("kept"));
+        // Once more, from what was read before.
+        for _ in 0..2 {
+            let refit = site.refit(&query).expect("a refit");
+            let offset = &refit.rungs[0].offsets[0];
+            assert!((offset.value_m - value_m).abs() < 1e-12 && (offset.sigma_m - 0.5).abs() < 1e-12, "{offset:?}");
+        }
+    }
+}
+
 #[test]
 fn an_empty_archive_says_how_to_fill_it() {
     let folder = tempfile::tempdir().expect("a folder");
