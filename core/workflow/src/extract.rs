@@ -165,7 +165,7 @@ impl Extract {
     /// Reads that of a product.
     ///
     /// # Errors
-    /// As [`Kept::newest`] and [`Kept::read`].
+    /// [`WorkflowError::Extract`]: there is none, or it is damaged, or of another product, format or release.
     pub fn read(product: &Written) -> Result<Self, WorkflowError> {
         Kept::newest(product)?.read()
     }
