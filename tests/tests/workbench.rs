@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use dragfree_tests::browser::{Browser, Ended, get, request, send};
 use dragfree_tests::calibration::TRUTH_M;
-use dragfree_tests::{dragfree, expect, fixture, json, root, simulate};
+use dragfree_tests::{compile_plugin, dragfree, expect, fixture, json, root, simulate};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -763,4 +763,40 @@ fn a_report_needs_no_server() {
     }
     let missing = std::fs::read_to_string(out.join("missing.html")).expect("a page");
     assert!(missing.contains("1 effect is on") && missing.contains(EFFECT), "what the diagnosis names is on");
+}
+
+/// The page Plugins says of every library who vouches for it: nobody, or the lock of its folder and who signed that.
+#[test]
+fn the_page_of_plugins_says_who_vouches_for_a_library() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let library = compile_plugin(folder.path(), "c_plugins.c", "c_plugins", &[]);
+    let own = folder.path().display().to_string();
+    let shown = |more: &[&str]| {
+        let server = serve(flight().folder.path(), &[&["--archive", "archive", "--plugin-dir", &own], more].concat());
+        let page = get(server.port, "/plugins").body;
+        let at = page.find("c-scale").unwrap_or_else(|| panic!("no c-scale: {page}"));
+        let from = at + page[at..].find("Vouched for by").expect("who vouches");
+        page[from..].split("Licence").next().unwrap_or_default().to_owned()
+    };
+    let nobody = shown(&[]);
+    assert!(nobody.contains("nobody; it was tried in a process of its own first"), "{nobody}");
+    let lock = folder.path().join("plugins.lock");
+    std::fs::write(&lock, "isolate = true\n").expect("written");
+    let isolated = shown(&[]);
+    assert!(isolated.contains("nobody; it runs in a process of its own"), "{isolated}");
+    let list = json(dragfree(folder.path()).args(["plugins", "list", "--json", "--plugin-dir", &own]), 0);
+    let found =
+        list["plugins"].as_array().expect("plugins").iter().find(|p| p["id"] == "c-scale").expect("it is there");
+    let digest = found["sha256"].as_str().expect("a digest");
+    let name = library.file_name().expect("a name").to_string_lossy().into_owned();
+    let text = format!("[sha256]\n{name:?} = \"{digest}\"\n");
+    std::fs::write(&lock, &text).expect("written");
+    assert!(shown(&[]).contains("plugins.lock<"), "{}", shown(&[]));
+    let keys = minisign::KeyPair::generate_unencrypted_keypair().expect("keys");
+    let signed = minisign::sign(Some(&keys.pk), &keys.sk, text.as_bytes(), None, None).expect("signed");
+    std::fs::write(folder.path().join("plugins.lock.minisig"), signed.into_string()).expect("written");
+    let key = keys.pk.to_base64();
+    let by_key = shown(&["--plugin-key", &key]);
+    assert!(by_key.contains(&format!("plugins.lock, signed with {key}")), "{by_key}");
 }
