@@ -70,9 +70,9 @@ pub struct Extract {
     /// Coefficients that are what is named in other forms.
     #[serde(default)]
     other_forms: BTreeSet<usize>,
-    /// As what it was read.
+    /// Where it was read from; none where it was made.
     #[serde(skip)]
-    kept_as: Option<Kept>,
+    read_from: Option<Kept>,
 }
 
 /// What an extract is made of.
@@ -146,7 +146,7 @@ impl Extract {
             trials: evidence.trials.clone(),
             unexplained: why_unexplained(diagnosis),
             not_tried: diagnosis.not_tried.clone(),
-            kept_as: None,
+            read_from: None,
         }))
     }
 
@@ -190,9 +190,9 @@ impl Extract {
         self.coefficients.iter().position(|own| same(own, c))
     }
 
-    /// As what an archive has it; none of one that was not read.
-    pub(crate) fn kept_as(&self) -> Option<&Kept> {
-        self.kept_as.as_ref()
+    /// Where it was read from; none where it was made.
+    pub(crate) fn read_from(&self) -> Option<&Kept> {
+        self.read_from.as_ref()
     }
 
     /// Takes out what the channels leave in each band.
@@ -230,7 +230,7 @@ impl Extract {
     }
 }
 
-/// An extract as an archive has it. Where a product is diagnosed anew, its extract is another one.
+/// An extract in an archive, by its digest: a product that is diagnosed anew has another one.
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Kept {
     product: String,
@@ -249,7 +249,7 @@ impl Kept {
         match digest {
             Ok(sha256) => Ok(Self { product, path, sha256 }),
             Err(error) => {
-                let what = format!("{error}; {}", make(&product));
+                let what = format!("{error}; {}", how_to_make(&product));
                 Err(WorkflowError::Extract { path, what })
             }
         }
@@ -261,7 +261,7 @@ impl Kept {
     /// [`WorkflowError::Extract`]: it is damaged, or of another product, format or release.
     pub(crate) fn read(&self) -> Result<Extract, WorkflowError> {
         let Self { product: id, path, sha256 } = self;
-        let make = make(id);
+        let make = how_to_make(id);
         let refuse = |what: String| WorkflowError::Extract { path: path.clone(), what };
         let text = Archive::of(path).and_then(|archive| archive.content(sha256));
         let text = text.map_err(|e| refuse(format!("{e}; {make}")))?;
@@ -282,12 +282,12 @@ impl Kept {
         ];
         match sound.into_iter().find(|(holds, _)| !holds) {
             Some((_, what)) => Err(refuse(format!("{what}; {make}"))),
-            None => Ok(Extract { kept_as: Some(self.clone()), ..extract }),
+            None => Ok(Extract { read_from: Some(self.clone()), ..extract }),
         }
     }
 }
 
-fn make(product: &str) -> String {
+fn how_to_make(product: &str) -> String {
     format!("make it from the telemetry: dragfree diagnose {product} --keep-extract")
 }
 

@@ -169,7 +169,7 @@ impl Basis {
                 kept: own.iter().filter_map(|c| extracts[k].place(c)).collect(),
                 by_band: None,
                 stretches: std::mem::take(&mut stretches[k]),
-                extract: extracts[k].kept_as().cloned(),
+                extract: extracts[k].read_from().cloned(),
             };
             // An extract is made about the model alone, and gives χ² there.
             day.chi2_at_zero = totals[k].0 - day.rise(&values);
