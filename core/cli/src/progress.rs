@@ -63,9 +63,7 @@ impl Meter {
             Style::Plain | Style::Silent => writeln!(stderr, "{line}"),
         };
     }
-}
 
-impl Meter {
     /// Time since the pass has begun: a job may go over its data several times, each at a rate of its own.
     fn elapsed(&mut self, now: Instant, until_ns: i64) -> Duration {
         if until_ns < self.until_ns {

@@ -71,8 +71,8 @@ struct Day {
     /// Index of each of its coefficients in its extract.
     kept: Vec<usize>,
     by_band: Option<Arc<ByBand>>,
-    /// First and last time of each stretch, Unix ns. Their sums are read when one is kept out of the fit: those of many
-    /// days are most of their extracts.
+    /// First and last time of each stretch, Unix ns. Their sums are read when one is kept out of the fit, so that those
+    /// of many days are not all in memory.
     stretches: Vec<(i64, i64)>,
     /// Where they are.
     extract: Option<Kept>,
