@@ -50,6 +50,7 @@ pub fn built() -> &'static Path {
 pub fn dragfree(folder: &Path) -> Command {
     let mut command = Command::new(built().join(format!("dragfree{}", std::env::consts::EXE_SUFFIX)));
     command.current_dir(folder).env_remove("DRAGFREE_PLUGIN_PATH").env("NO_COLOR", "1");
+    command.env("XDG_CACHE_HOME", folder);
     command
 }
 

@@ -52,8 +52,16 @@ fn allowed(crate_name: &str) -> &'static [&'static str] {
         ],
         // Pages show what the workflow answers: types of archive and engine are in its arguments and answers.
         "dragfree-pages" => &["dragfree-archive", "dragfree-chart", "dragfree-engine", "dragfree-workflow"],
-        // The tests hold the independent producer of telemetry.
-        "dragfree-validation" => &["dragfree-engine", "dragfree-physics", "dragfree-chart", "dragfree-tests"],
+        // The tests hold the independent producer of telemetry; the numerical crates are timed beside other packages.
+        "dragfree-validation" => &[
+            "dragfree-engine",
+            "dragfree-physics",
+            "dragfree-chart",
+            "dragfree-tests",
+            "dragfree-es-akf",
+            "dragfree-estimation",
+            "dragfree-identification",
+        ],
         "dragfree-estimation" => &["dragfree-physics", "dragfree-schema"],
         "dragfree-identification" => &["dragfree-schema", "dragfree-estimation"],
         "dragfree-workflow" => &[

@@ -250,6 +250,48 @@ fn a_locked_folder_loads_only_what_is_locked() {
     assert!(list.to_string().contains("not listed in"), "{list}");
 }
 
+/// A list takes the digest of a library from the list before while the library looks the same, unless somebody else may
+/// have written that; other commands hash what they open.
+#[cfg(unix)]
+#[test]
+fn a_list_hashes_a_library_once_and_another_command_each_time() {
+    use std::os::unix::fs::PermissionsExt;
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let dir = dir.path();
+    let library = compile_plugin(dir, "c_plugins.c", "c_plugins", &[]);
+    std::thread::sleep(std::time::Duration::from_millis(1200)); // what is written within a second may change unseen
+    let digest = || {
+        let list = json(dragfree(dir).args(["plugins", "list", "--json", "--plugin-dir"]).arg(dir), 0);
+        let plugins = list["plugins"].as_array().expect("plugins").clone();
+        let own = plugins.iter().find(|p| p["id"] == "c-scale").expect("c-scale").clone();
+        own["sha256"].as_str().expect("a digest").to_owned()
+    };
+    let sha256 = || {
+        let inspected = ["plugins", "inspect", "c-scale", "--json", "--plugin-dir"];
+        json(dragfree(dir).args(inspected).arg(dir), 0)["sha256"].as_str().expect("a digest").to_owned()
+    };
+    let file = dir.join("dragfree/libraries.json");
+    let first = sha256();
+    assert_eq!(digest(), first);
+    let wrong = "0".repeat(64);
+    let text = std::fs::read_to_string(&file).expect("digests are kept").replace(&first, &wrong);
+    let put = |mode: u32| {
+        std::fs::write(&file, &text).expect("written");
+        std::fs::set_permissions(&file, std::fs::Permissions::from_mode(mode)).expect("chmod");
+    };
+    put(0o600);
+    assert_eq!(digest(), wrong, "it was not read again");
+    assert_ne!(sha256(), wrong, "only a list believes it");
+    put(0o622);
+    assert_eq!(digest(), sha256(), "others may have written it");
+    put(0o600);
+    let mut bytes = std::fs::read(&library).expect("readable");
+    bytes.push(0);
+    std::fs::write(&library, bytes).expect("written");
+    assert_ne!(sha256(), first);
+    assert_eq!(digest(), sha256(), "the library has changed");
+}
+
 /// With a key a folder loads only what a lock names that was signed with it; unsigned, signed by another, changed since
 /// it was signed, without digests, and without a lock nothing of the folder is opened. The key may stand in a file, in
 /// its text, or in the environment.

@@ -195,6 +195,25 @@ fn a_week_of_trials_ends_in_a_certified_set() {
     }
 }
 
+/// Waits until a program does nothing for some looks at the inbox: that it looks must not be news to it. A look takes
+/// some hundredths of a second, and eight of them would follow each other here.
+fn rests(id: u32) {
+    let ticks = || {
+        let stat = std::fs::read_to_string(format!("/proc/{id}/stat")).expect("it runs");
+        let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
+        [11, 12].map(|k| fields[k].parse::<u64>().expect("a number")).iter().sum::<u64>()
+    };
+    let since = Instant::now();
+    loop {
+        let before = ticks();
+        std::thread::sleep(Duration::from_secs(4));
+        if ticks() - before <= 5 {
+            return;
+        }
+        assert!(since.elapsed() < Duration::from_secs(60), "it looks and looks");
+    }
+}
+
 #[test]
 fn two_programs_never_run_days_of_one_archive() {
     let mission = Mission::new();
@@ -215,6 +234,7 @@ fn two_programs_never_run_days_of_one_archive() {
     // What comes in while it watches is run too.
     mission.arrives(3, "b.mcap");
     wait(&mission.path().join("archive/COM1B_2035-01-03_SC1_01_0001.toml"));
+    rests(child.id());
     expect(Command::new("kill").arg("-TERM").arg(child.id().to_string()), 0);
     assert!(child.wait().expect("it ends").success());
     assert_eq!(mission.ran(), [], "everything was done");

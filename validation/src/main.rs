@@ -11,9 +11,11 @@ mod diagnosis_score;
 mod error;
 mod faults;
 mod frozen;
+mod growth;
 mod kills;
 mod limits;
 mod months;
+mod peers;
 mod program;
 mod records;
 mod report;
@@ -24,7 +26,7 @@ mod table;
 mod workbench;
 
 use campaign::note;
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, Parser, Subcommand, ValueEnum};
 use diagnosis::{Length, Plan, Producer};
 use error::CampaignError;
 use program::{Program, root};
@@ -68,8 +70,12 @@ enum Command {
     Workbench(WorkbenchCommand),
     /// Compute what data of each length can say of each effect; goes on where it was stopped
     Limits,
-    /// Measure ratios of speed, on a machine that does nothing else
-    Speed,
+    /// Time every bar of speed, on a machine that does nothing else
+    Speed(SpeedCommand),
+    /// Time the heaviest steps and those of other packages, with the same results, on a machine that does nothing else
+    Peers,
+    /// Time runs of more and more data, effects and columns, on a machine that does nothing else
+    Growth(GrowthCommand),
     /// Write the generated parts of VALIDATION.md and the picture from the results
     Report,
     /// Everything: coverage, table, speed, report
@@ -196,6 +202,22 @@ struct WorkbenchCommand {
 }
 
 #[derive(Debug, Args)]
+struct SpeedCommand {
+    /// Days of the longest run; 25 of them take 14 GB of the scratch folder
+    #[arg(long, default_value_t = report::TABLE_DAYS, value_parser = clap::value_parser!(u32).range(1..))]
+    days: u32,
+}
+
+#[derive(Debug, Args)]
+struct GrowthCommand {
+    /// What grows; all where none is given
+    #[arg(long, value_enum)]
+    only: Vec<growth::Grows>,
+    #[command(flatten)]
+    longest: SpeedCommand,
+}
+
+#[derive(Debug, Args)]
 struct MonthsCommand {
     /// Seeds, FIRST-LAST
     #[arg(long, value_parser = seeds, default_value = "1-20")]
@@ -273,13 +295,18 @@ fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
             workbench::workbench(&Program::build()?, w.days, w.hours, &file, &scratch)
         }
         Command::Limits => limits::limits(&Program::build()?, &results.join("limits.jsonl"), &scratch),
-        Command::Speed => speed::measure(&Program::build()?, &speed_file, &scratch),
+        Command::Speed(s) => speed::measure(&Program::build()?, s.days, &speed_file, &scratch),
+        Command::Peers => peers::peers(&Program::build()?, &results.join("peers.json"), &scratch),
+        Command::Growth(g) => {
+            let what = if g.only.is_empty() { growth::Grows::value_variants() } else { &g.only };
+            growth::growth(&Program::build()?, what, g.longest.days, &results.join("growth.json"), &scratch)
+        }
         Command::Report => report::write(&results),
         Command::All => {
             let program = Program::build()?;
             campaign::coverage(&program, SEEDS, &coverage_file, &scratch)?;
             table::table(&program, &[1], report::TABLE_DAYS, AT_ONCE, &table_file, &scratch)?;
-            speed::measure(&program, &speed_file, &scratch)?;
+            speed::measure(&program, report::TABLE_DAYS, &speed_file, &scratch)?;
             report::write(&results)
         }
     }

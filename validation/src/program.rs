@@ -5,11 +5,13 @@ use serde_json::Value;
 use sha2::{Digest as _, Sha256};
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
-use std::io::{BufRead as _, BufReader};
+use std::io::{BufRead as _, BufReader, Read as _};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
+use std::time::Instant;
 
 use dragfree_engine::telemetry::first_message;
+use wait4::Wait4 as _;
 
 use crate::error::{CampaignError, file};
 use crate::records::{COEFFICIENTS, Line, Solution, rounded};
@@ -284,6 +286,13 @@ impl Program {
         }
     }
 
+    /// What a command takes, run in a folder. Data loss and inconsistent models are accepted.
+    pub(crate) fn used(&self, folder: &Path, arguments: &[impl AsRef<OsStr>]) -> Result<(Value, Used), CampaignError> {
+        let mut command = self.command();
+        let (printed, used) = measured(command.current_dir(folder).args(arguments), &[0, 3, 4])?;
+        Ok((serde_json::from_slice(&printed).unwrap_or_default(), used))
+    }
+
     fn run_command(&self, chain: &Chain, files: &[PathBuf], archive: &Path) -> Command {
         let mut command = self.command();
         command.arg("run").arg(&chain.pipeline).args(files).arg("--archive").arg(archive).arg("--json");
@@ -316,6 +325,36 @@ fn offsets_m(truth: &Path) -> Result<[f64; 6], CampaignError> {
         *value = *first.get(&key).ok_or_else(|| file(truth, &format!("it has no {key}")))?;
     }
     Ok(truth_m)
+}
+
+/// What a process took.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Used {
+    /// By the clock, s.
+    pub(crate) wall_s: f64,
+    /// Of the processors, s.
+    pub(crate) processor_s: f64,
+    /// Most memory at a time, MB.
+    pub(crate) memory_mb: f64,
+}
+
+/// What a command prints and takes, where it ends with one of these codes.
+pub(crate) fn measured(command: &mut Command, codes: &[i32]) -> Result<(Vec<u8>, Used), CampaignError> {
+    let name = format!("{command:?}");
+    let fault = |source| CampaignError::Start { command: name.clone(), source };
+    let begun = Instant::now();
+    let mut process = command.stdout(Stdio::piped()).stderr(Stdio::null()).spawn().map_err(fault)?;
+    let mut printed = Vec::new();
+    process.stdout.take().map(|mut out| out.read_to_end(&mut printed)).transpose().map_err(fault)?;
+    let ended = process.wait4().map_err(fault)?;
+    let wall_s = begun.elapsed().as_secs_f64();
+    match ended.status.code() {
+        Some(code) if codes.contains(&code) => {
+            let processor_s = (ended.rusage.utime + ended.rusage.stime).as_secs_f64();
+            Ok((printed, Used { wall_s, processor_s, memory_mb: ended.rusage.maxrss as f64 / 1e6 }))
+        }
+        _ => Err(CampaignError::Failed { command: name, status: ended.status, message: String::new() }),
+    }
 }
 
 /// What a command prints, where it ends with one of these codes.

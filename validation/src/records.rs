@@ -293,6 +293,21 @@ pub(crate) fn read<T: DeserializeOwned>(path: &Path) -> Result<Vec<T>, CampaignE
     complete.lines().enumerate().map(parse).collect()
 }
 
+/// A document of results; `None` if it does not exist.
+pub(crate) fn read_document<T: DeserializeOwned>(path: &Path) -> Result<Option<T>, CampaignError> {
+    match std::fs::read_to_string(path) {
+        Err(error) if error.kind() == ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(file(path, &error)),
+        Ok(text) => serde_json::from_str(&text).map(Some).map_err(|e| file(path, &e)),
+    }
+}
+
+/// Writes a document of results.
+pub(crate) fn write_document(path: &Path, document: &impl Serialize) -> Result<(), CampaignError> {
+    let text = serde_json::to_string_pretty(document).map_err(|e| file(path, &e))?;
+    std::fs::write(path, text + "\n").map_err(|e| file(path, &e))
+}
+
 impl<T: Keyed + Serialize + DeserializeOwned> Results<T> {
     /// Opens a file to continue, or a new one. Removes results of another build, as a table must not mix builds;
     /// returns their number.

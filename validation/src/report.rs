@@ -13,11 +13,13 @@ use crate::campaign::{NOMINAL, TWINS, Twin, note, taiji};
 use crate::diagnosis_report;
 use crate::error::{CampaignError, file};
 use crate::faults::{self, Mixture};
+use crate::growth::Growth;
 use crate::kills::{self, Kill};
 use crate::limits::{self, Limits};
 use crate::months::{self, Months};
+use crate::peers::Peers;
 use crate::program::root;
-use crate::records::{Blind, Diagnosed, Line, Solution, read};
+use crate::records::{Blind, Diagnosed, Line, Solution, read, read_document};
 use crate::soak::{self, Soak};
 use crate::speed::Speed;
 use crate::stats::{self, Bounds};
@@ -41,8 +43,12 @@ pub(crate) struct Measured {
     pub(crate) coverage: Vec<Line>,
     /// The paper's table.
     pub(crate) table: Vec<Row>,
-    /// Ratios of speed.
+    /// Bars of speed.
     pub(crate) speed: Option<Speed>,
+    /// Other packages beside this one.
+    pub(crate) peers: Option<Peers>,
+    /// How time and memory grow.
+    pub(crate) growth: Option<Growth>,
     /// Blind campaign.
     pub(crate) blind: Vec<Blind>,
     /// Diagnosis campaign.
@@ -65,7 +71,9 @@ impl Measured {
         Ok(Self {
             coverage: read(&folder.join("coverage.jsonl"))?,
             table: read(&folder.join("table.jsonl"))?,
-            speed: Speed::read(&folder.join("speed.json"))?,
+            speed: read_document(&folder.join("speed.json"))?,
+            peers: read_document(&folder.join("peers.json"))?,
+            growth: read_document(&folder.join("growth.json"))?,
             blind: read(&folder.join("blind.jsonl"))?,
             diagnosis: read(&folder.join("diagnosis.jsonl"))?,
             limits: read(&folder.join("limits.jsonl"))?,
@@ -558,7 +566,10 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
     failed.extend(more);
     let (table, more) = table(&measured.table);
     failed.extend(more);
-    let speed = measured.speed.as_ref().map_or("Not measured yet.\n".to_owned(), Speed::table);
+    let missing = || "Not measured yet.\n".to_owned();
+    let speed = measured.speed.as_ref().map_or_else(missing, Speed::table);
+    let peers = measured.peers.as_ref().map_or_else(missing, Peers::table);
+    let growth = measured.growth.as_ref().map_or_else(missing, Growth::table);
     let (blind, more) = blind_report::numbers(&measured.blind);
     failed.extend(more);
     let (diagnosis, more) = diagnosis_report::numbers(&measured.diagnosis, &free);
@@ -571,8 +582,11 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
     failed.extend(more);
     let (soak, more) = soak::table(&measured.soak);
     failed.extend(more);
-    let drawn =
-        [("coverage", picture(&measured.coverage, &free)), ("confusion", blind_report::picture(&measured.blind))];
+    let drawn = [
+        ("coverage", picture(&measured.coverage, &free)),
+        ("confusion", blind_report::picture(&measured.blind)),
+        ("growth", measured.growth.as_ref().map(Growth::picture).transpose()),
+    ];
     let mut pictures = Vec::new();
     for (name, picture) in drawn {
         let path = picture_path(name);
@@ -583,6 +597,8 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
         ("twins", twins),
         ("table", table),
         ("speed", speed),
+        ("peers", peers),
+        ("growth", growth),
         ("blind", blind),
         ("diagnosis", diagnosis),
         ("limits", limits::table(&measured.limits)),

@@ -35,6 +35,9 @@ const SAID: [&str; 7] = ["coefficients", "covariance", "verdict", "quality", "lo
 /// Longest wait until a day is run, s.
 const PATIENCE_S: u64 = 120;
 
+/// The program rests when it has used no processor for so long, s: before, it may not have given memory back.
+const REST_S: f64 = 0.3;
+
 /// One soak.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -53,7 +56,7 @@ pub(crate) struct Soak {
     products: u32,
     /// What is wrong: days whose newest product is not that of the calm archive, and what `verify` finds.
     differences: Vec<String>,
-    /// Memory in use and open handles of the last life: at the first look, and the most after it.
+    /// Memory in use and open handles of the last life, at rest: at the first look, and the most after it.
     memory_kb: [u64; 2],
     handles: [u64; 2],
     /// Days of that life.
@@ -239,6 +242,23 @@ impl<'a> Bench<'a> {
         }
     }
 
+    /// Waits until the program rests.
+    fn rests(&self, id: u32) -> Result<(), CampaignError> {
+        let begun = Instant::now();
+        let (mut used, mut since) = (processor_ticks(id), Instant::now());
+        while since.elapsed().as_secs_f64() < REST_S {
+            if begun.elapsed() > Duration::from_secs(PATIENCE_S) {
+                return Err(file(&self.storm, &format!("watch has not come to rest in {PATIENCE_S} s")));
+            }
+            std::thread::sleep(Duration::from_millis(20));
+            let now = processor_ticks(id);
+            if now != used {
+                (used, since) = (now, Instant::now());
+            }
+        }
+        Ok(())
+    }
+
     /// The newest product of every day, what it says and of which bytes it was made, and the number of all. A file that
     /// comes twice has two names, and which of them a product states is no matter here.
     fn held(&self, mission: &Path) -> Result<(BTreeMap<String, String>, u32), CampaignError> {
@@ -287,6 +307,7 @@ impl<'a> Bench<'a> {
                 (kills, life) = (kills + 1, 0);
             }
             self.settles()?;
+            self.rests(child.id())?;
             if let Some(now) = in_use(child.id()).filter(|_| life >= WARM && day >= self.days / 2) {
                 for (seen, now) in [&mut memory_kb, &mut handles].into_iter().zip(now) {
                     *seen = if seen[0] == 0 { [now; 2] } else { [seen[0], seen[1].max(now)] };
@@ -341,13 +362,21 @@ fn in_use(id: u32) -> Option<[u64; 2]> {
     Some([memory, std::fs::read_dir(format!("/proc/{id}/fd")).ok()?.count() as u64])
 }
 
+/// Time of the processors that a process has used, in ticks of the system; none where it does not tell.
+fn processor_ticks(id: u32) -> Option<u64> {
+    let stat = std::fs::read_to_string(format!("/proc/{id}/stat")).ok()?;
+    // After the name, which may have spaces, come the state and ten more fields.
+    let fields: Vec<&str> = stat.rsplit(')').next()?.split_whitespace().collect();
+    Some(fields.get(11)?.parse::<u64>().ok()? + fields.get(12)?.parse::<u64>().ok()?)
+}
+
 /// What is said of the soaks in VALIDATION.md, and what is outside of its bounds.
 pub(crate) fn table(all: &[Soak]) -> (String, Vec<String>) {
     if all.is_empty() {
         return ("Not run yet.\n".to_owned(), Vec::new());
     }
     let mut text =
-        "| days | late | cut | doubled | corrected | kills | products | days that differ | memory | handles | time |\n\
+        "| days | late | cut | doubled | corrected | kills | products | days that differ | memory at rest | handles | time |\n\
                     |---|---|---|---|---|---|---|---|---|---|---|\n"
             .to_owned();
     let mut failed = Vec::new();
@@ -419,7 +448,8 @@ mod tests {
     }
 
     #[test]
-    fn a_process_has_memory_and_handles() {
+    fn a_process_has_memory_handles_and_processor_time() {
+        assert!(processor_ticks(std::process::id()).is_some());
         let [memory, handles] = in_use(std::process::id()).expect("told");
         assert!(memory > 100 && handles >= 3, "{memory} {handles}");
     }

@@ -2,14 +2,14 @@
 
 use crate::ArchiveError;
 use crate::journal::{Event, InputPlace, JournalEntry, SetState};
-use crate::product::{EXTRACT, Product};
+use crate::product::{EXTRACT, Product, Stage};
 use rusqlite::{Connection, OptionalExtension as _, Params, Row as SqlRow, params};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 /// Changes with the tables: a catalogue of another version is made again.
-const VERSION: i64 = 2;
+const VERSION: i64 = 3;
 
 /// How long a question waits for another program's transaction, which takes milliseconds.
 const PATIENCE: Duration = Duration::from_secs(20);
@@ -38,6 +38,8 @@ CREATE TABLE made_of (
     PRIMARY KEY (id, role)
 ) STRICT, WITHOUT ROWID;
 CREATE INDEX made_of_by_digest ON made_of (sha256);
+CREATE TABLE libraries (id TEXT NOT NULL, plugin TEXT NOT NULL, sha256 TEXT NOT NULL, PRIMARY KEY (id, plugin, sha256))
+    STRICT, WITHOUT ROWID;
 CREATE TABLE places (sha256 TEXT NOT NULL, path TEXT NOT NULL, number INTEGER NOT NULL, PRIMARY KEY (sha256, path))
     STRICT, WITHOUT ROWID;
 CREATE TABLE failed (
@@ -346,6 +348,12 @@ impl Catalogue {
         self.all("SELECT role, name, sha256, size, NULL FROM made_of WHERE id = ?1 ORDER BY role", [id], place)
     }
 
+    /// Plugins that made a product, with the digests of their libraries.
+    pub(crate) fn libraries(&self, id: &str) -> Result<Vec<(String, String)>, ArchiveError> {
+        let question = "SELECT plugin, sha256 FROM libraries WHERE id = ?1 ORDER BY plugin, sha256";
+        self.all(question, [id], |row| Ok((row.get(0)?, row.get(1)?)))
+    }
+
     /// Products that a content entered, by digest.
     pub(crate) fn products_of(&self, sha256: &str) -> Result<Vec<String>, ArchiveError> {
         let question = "SELECT DISTINCT id FROM inputs WHERE sha256 = ?1 ORDER BY id";
@@ -420,8 +428,19 @@ impl Catalogue {
     /// Every table but `seen` as text, for comparison.
     #[cfg(test)]
     pub(crate) fn dump(&self) -> Vec<String> {
-        let tables =
-            ["applied", "products", "files", "inputs", "made_of", "places", "failed", "withdrawn", "sets", "validity"];
+        let tables = [
+            "applied",
+            "products",
+            "files",
+            "inputs",
+            "made_of",
+            "libraries",
+            "places",
+            "failed",
+            "withdrawn",
+            "sets",
+            "validity",
+        ];
         let text = |table: &str| {
             let mut question = self.connection.prepare(&format!("SELECT * FROM {table} ORDER BY 1, 2")).expect("SQL");
             let columns = question.column_count();
@@ -589,6 +608,11 @@ fn enter_product(connection: &Connection, id: &str, product: &Product) -> rusqli
             "INSERT INTO inputs VALUES (?1, ?2, ?3, ?4, ?5, ?6)",
             params![id, as_i64(place as u64), input.role, input.name, input.sha256, as_i64(input.size)],
         )?;
+    }
+    for Stage { plugin, library_sha256, .. } in &product.history {
+        // An effect has a stage for each instance.
+        let entry = "INSERT OR IGNORE INTO libraries VALUES (?1, ?2, ?3)";
+        connection.execute(entry, params![id, plugin, library_sha256])?;
     }
     Ok(())
 }

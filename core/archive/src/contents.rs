@@ -73,16 +73,27 @@ impl Archive {
     /// # Errors
     /// There is no such product, or it is damaged.
     pub fn product(&self, id: &str) -> Result<Product, ArchiveError> {
-        let row = self.row(id)?;
-        let path = self.path_of(id);
-        if let Some(reason) = row.problem {
-            return Err(ArchiveError::Damaged { path, reason });
+        self.compare(id, true)?;
+        product::read(&self.path_of(id))
+    }
+
+    /// Compares a product, and every file beside it, with what was archived; a file that looks as when its digest was
+    /// last taken is taken for that one.
+    ///
+    /// # Errors
+    /// There is no such product, or it is damaged.
+    pub fn looks_sound(&self, id: &str) -> Result<(), ArchiveError> {
+        self.compare(id, false)
+    }
+
+    fn compare(&self, id: &str, fully: bool) -> Result<(), ArchiveError> {
+        if let Some(reason) = self.row(id)?.problem {
+            return Err(ArchiveError::Damaged { path: self.path_of(id), reason });
         }
         // An extract is made from the product and no part of it; whoever reads one compares it.
-        for (suffix, sha256, _) in self.files_of(id)?.into_iter().filter(|(suffix, ..)| suffix != EXTRACT) {
-            self.check(id, &suffix, &sha256, true)?;
-        }
-        product::read(&path)
+        let files = self.files_of(id)?;
+        let mut own = files.iter().filter(|(suffix, ..)| suffix != EXTRACT);
+        own.try_for_each(|(suffix, sha256, _)| self.check(id, suffix, sha256, fully))
     }
 
     /// Suffix, digest and size of the files of a product, itself among them.
@@ -318,6 +329,14 @@ impl Archive {
             input.path = places.iter().find(|path| path.is_file()).or(places.first()).cloned();
         }
         Ok(inputs)
+    }
+
+    /// Plugins that made a product, with the digests of their libraries.
+    ///
+    /// # Errors
+    /// The catalogue cannot be read.
+    pub fn libraries(&self, id: &str) -> Result<Vec<(String, String)>, ArchiveError> {
+        self.catalogue.libraries(id)
     }
 
     /// Where a content lies that the archive keeps for a product by `role`: `pipeline`, `mission`, `model`, `state_in`,

@@ -2,6 +2,7 @@
 
 use crate::border::without_name;
 use crate::feed::Summary;
+use crate::replay::Finding;
 use chrono::{DateTime, SecondsFormat, Utc};
 use dragfree_archive::product::{
     Coefficient, Covariance, Dimensions, FORMAT_VERSION, GlobalAttributes, Header, Input, Loss, Model,
@@ -178,12 +179,15 @@ fn outcome(draft: &Draft) -> Outcome {
     let covariance = draft.reports.iter().flat_map(|report| &report.covariance).map(|(solution, reported)| {
         (solution.clone(), Covariance { names: reported.names.clone(), matrix: reported.matrix.clone() })
     });
-    Outcome {
-        epoch_ns: draft.last_ns,
-        verdict: last(draft, |report| report.verdict.clone()),
-        coefficients: coefficients.collect(),
-        covariance: covariance.collect(),
-    }
+    let verdict = last(draft, |report| report.verdict.clone());
+    // Estimators cannot know: what is late follows the same laws, with another noise.
+    let verdict = if contradictory(draft) { verdict.map(|_| "disagree".to_owned()) } else { verdict };
+    Outcome { epoch_ns: draft.last_ns, verdict, coefficients: coefficients.collect(), covariance: covariance.collect() }
+}
+
+/// Whether times of the data contradict each other.
+fn contradictory(draft: &Draft) -> bool {
+    draft.replay.losses.iter().any(|loss| loss.kind == Finding::SteppedClocks.to_string())
 }
 
 fn quality(draft: &Draft, lost: bool) -> Quality {
@@ -208,7 +212,7 @@ fn quality(draft: &Draft, lost: bool) -> Quality {
         chi2_per_dof: last(draft, |report| report.chi2_per_dof).unwrap_or(f64::NAN),
         nis: last(draft, |report| report.nis).unwrap_or(f64::NAN),
         data_loss: lost || draft.reports.iter().any(|report| report.data_loss),
-        inconsistent: draft.reports.iter().any(|report| report.inconsistent),
+        inconsistent: contradictory(draft) || draft.reports.iter().any(|report| report.inconsistent),
         weak_directions,
         notes: draft
             .replay

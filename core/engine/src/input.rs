@@ -1,12 +1,13 @@
 //! A file that a job reads: opened once, hashed and read through one descriptor, and at the end compared with what it
 //! was, so that a product names the bytes that it was made of.
 
+use serde::{Deserialize, Serialize};
 use sha2::{Digest as _, Sha256};
 use std::collections::BTreeMap;
 use std::fs::{File, Metadata};
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, SystemTime};
 
 /// Size of the buffer that a whole file goes through.
@@ -31,10 +32,12 @@ const SETTLES: Duration = Duration::from_secs(1);
 static KNOWN: Mutex<BTreeMap<(Look, u64), Sums>> = Mutex::new(BTreeMap::new());
 /// Most of them.
 const MOST_KNOWN: usize = 10_000;
+/// Digests that an earlier call of the program has left, and no file of this one has had yet.
+static RECALLED: Mutex<BTreeMap<Look, String>> = Mutex::new(BTreeMap::new());
 
 /// What tells whether a file has changed: any write or rename over it changes one of these.
-#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Look {
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+pub(crate) struct Look {
     size: u64,
     #[cfg(unix)]
     modified_ns: (i64, i64),
@@ -74,6 +77,25 @@ impl Look {
     fn changed(&self) -> Option<SystemTime> {
         None
     }
+}
+
+/// Takes digests of an earlier call of the program for those of files that look the same.
+pub(crate) fn recall(digests: Vec<(Look, String)>) {
+    locked(&RECALLED).extend(digests);
+}
+
+/// Digests of the files that this process has had, with what these look like.
+pub(crate) fn used() -> Vec<(Look, String)> {
+    let known = locked(&KNOWN);
+    known
+        .iter()
+        .filter(|((_, end), _)| *end == 0)
+        .map(|((look, _), sums)| (look.clone(), sums.sha256.clone()))
+        .collect()
+}
+
+fn locked<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// Digests of a whole file.
@@ -148,12 +170,16 @@ impl InputFile {
 
     /// Digests of all of it; the CRC covers the bytes before `crc_end`.
     pub(crate) fn sums(&self, crc_end: u64) -> io::Result<Sums> {
-        let known = || KNOWN.lock().unwrap_or_else(PoisonError::into_inner);
+        let known = || locked(&KNOWN);
         let key = (self.opened_as.clone(), crc_end);
         if let Some(sums) = known().get(&key).filter(|_| self.settled) {
             return Ok(sums.clone());
         }
-        let sums = self.read_sums(crc_end)?;
+        let recalled = if crc_end == 0 && self.settled { locked(&RECALLED).remove(&self.opened_as) } else { None };
+        let sums = match recalled {
+            Some(sha256) => Sums { sha256, crc: 0 },
+            None => self.read_sums(crc_end)?,
+        };
         if self.settled && self.is_unchanged()? {
             let mut known = known();
             if known.len() >= MOST_KNOWN {

@@ -6,6 +6,7 @@
 pub mod border;
 pub mod chain;
 pub mod config;
+pub mod digests;
 pub mod draft;
 pub mod examine;
 pub mod feed;

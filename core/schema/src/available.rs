@@ -75,7 +75,7 @@ impl Available {
                 return Err(NoSuchCoefficient { table, column: series, coefficient: name.to_owned() });
             };
             let channel = column.attribute("channel").to_owned();
-            all.push((coefficient, Response { channel, table, series, factor: 1.0, times: None }));
+            all.push((coefficient, Response { channel, table, series, factor: 1.0, times: None, in_readout: false }));
         }
         for c in &self.coefficients {
             all.extend(c.responses.iter().map(|r| (c, r.clone())));

@@ -128,6 +128,14 @@ pub struct Response {
     /// The other coefficient of a product, `com-offset.tm1.x`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub times: Option<String>,
+    /// Whether the channel alone differs, not the motion that it reads: what follows the motion does not follow this.
+    #[serde(default, skip_serializing_if = "is_false")]
+    pub in_readout: bool,
+}
+
+#[allow(clippy::trivially_copy_pass_by_ref, reason = "for serde")]
+fn is_false(value: &bool) -> bool {
+    !value
 }
 
 /// One of several forms that a cause may have.

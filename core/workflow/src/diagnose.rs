@@ -346,7 +346,6 @@ fn about_model(
     point.levels.clone_from(&last.end.point.levels);
     let opening = one_pass(replay, &entries, &last.end.slow, true, &point, evidence, progress)?;
     point = step(&point, &opening);
-    point.levels.clone_from(&last.end.point.levels);
     one_pass(replay, &entries, &last.end.slow, false, &point, evidence, progress)
 }
 

@@ -258,7 +258,8 @@ pub(crate) fn step_of_model(from: &Point, decided: &Decided) -> Point {
 }
 
 fn to_values(from: &Point, decided: &Decided, values: &DVector<f64>, chosen: &BTreeSet<usize>) -> Point {
-    let mut to = Point::default();
+    // A pass that fits constants and the model has no levels among its parameters.
+    let mut to = Point { levels: from.levels.clone(), ..Point::default() };
     let others = decided.candidates.iter().enumerate().filter(|(c, _)| !chosen.contains(c));
     let not_named: BTreeSet<usize> = others.flat_map(|(_, place)| place.parameters.iter().copied()).collect();
     for (i, (name, meaning)) in decided.parameters.iter().enumerate() {

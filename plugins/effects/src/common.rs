@@ -56,7 +56,7 @@ pub(crate) type SeriesRef = (String, String);
 
 /// The response `factor · series` of a channel.
 pub(crate) fn response(channel: String, place: &SeriesRef, factor: f64) -> Response {
-    Response { channel, table: place.0.clone(), series: place.1.clone(), factor, times: None }
+    Response { channel, table: place.0.clone(), series: place.1.clone(), factor, times: None, in_readout: false }
 }
 
 /// Responses of the test masses to a force on the spacecraft along an axis of SRF; `force` is a series in N.

@@ -279,6 +279,8 @@ pub(crate) fn axis_pair(instance: &str) -> (usize, usize) {
 pub(crate) trait LinearEffect: Send + 'static {
     /// Identity, parameters and instances.
     const MANIFEST: Manifest;
+    /// Whether a readout differs, and not the motion that it reads.
+    const IN_READOUT: bool = false;
     /// The coefficients of the instance that `setup` configures, and their terms.
     ///
     /// # Errors
@@ -499,7 +501,14 @@ impl<E: LinearEffect> Effect for Linear<E> {
             terms
                 .map(|t| {
                     let (table, series) = series_refs.get(&t.series.name()).cloned().unwrap_or_default();
-                    Response { channel: t.channel.clone(), table, series, factor: t.factor, times: t.times.clone() }
+                    Response {
+                        channel: t.channel.clone(),
+                        table,
+                        series,
+                        factor: t.factor,
+                        times: t.times.clone(),
+                        in_readout: E::IN_READOUT,
+                    }
                 })
                 .collect()
         };

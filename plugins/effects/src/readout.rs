@@ -71,6 +71,7 @@ impl LinearEffect for IsScale {
         TM_YZ,
         &["commands"],
     );
+    const IN_READOUT: bool = true;
 
     fn coefficients(
         setup: &Setup,
@@ -98,6 +99,7 @@ impl LinearEffect for IsCrosstalk {
         &["{test_mass}.x-y", "{test_mass}.x-z", "{test_mass}.y-z", "{test_mass}.z-y"],
         &["commands"],
     );
+    const IN_READOUT: bool = true;
 
     fn coefficients(
         setup: &Setup,
@@ -128,6 +130,7 @@ impl LinearEffect for TiltToLength {
         TEST_MASSES,
         &["commands"],
     );
+    const IN_READOUT: bool = true;
 
     fn coefficients(
         setup: &Setup,
@@ -180,6 +183,7 @@ impl LinearEffect for TimeOffset {
         &["ifo", "dws", "is"],
         &["commands", "dws-delay-response"],
     );
+    const IN_READOUT: bool = true;
 
     fn coefficients(
         setup: &Setup,

@@ -124,7 +124,7 @@ pub trait Follower: std::fmt::Debug + Send + Sync {
 }
 
 /// Most states that a filter can have.
-pub const MAX_STATES: usize = 64;
+pub const MAX_STATES: usize = 96;
 
 /// The filter of a model at the capacity that its axes and states need, with a row for the archive every `snapshot_s`;
 /// `None` for more than [`MAX_STATES`] states or more than three test masses.
@@ -136,12 +136,15 @@ pub fn follow(model: Model, settings: Settings, snapshot_s: f64) -> Option<Box<d
         (3, 17..=24) => boxed::<24, 3>,
         (3, 25..=32) => boxed::<32, 3>,
         (3, 33..=48) => boxed::<48, 3>,
-        (3, 49..=MAX_STATES) => boxed::<64, 3>,
+        (3, 49..=64) => boxed::<64, 3>,
+        (3, 65..=MAX_STATES) => boxed::<96, 3>,
         (6, ..=32) => boxed::<32, 6>,
         (6, 33..=48) => boxed::<48, 6>,
-        (6, 49..=MAX_STATES) => boxed::<64, 6>,
+        (6, 49..=64) => boxed::<64, 6>,
+        (6, 65..=MAX_STATES) => boxed::<96, 6>,
         (9, ..=48) => boxed::<48, 9>,
-        (9, 49..=MAX_STATES) => boxed::<64, 9>,
+        (9, 49..=64) => boxed::<64, 9>,
+        (9, 65..=MAX_STATES) => boxed::<96, 9>,
         _ => return None,
     };
     Some(with(model, settings, snapshot_s))

@@ -220,19 +220,29 @@ fn a_filter_of_several_test_masses_adapts_where_it_is_asked_to() {
 
 /// 18 + 6 + 6 + 2·(10 + 9 + 5) states.
 #[test]
-fn test_masses_that_do_not_fit_into_one_filter_are_followed_apart_and_the_report_says_what_that_means() {
+fn test_masses_of_many_states_are_followed_in_one_filter_as_long_as_they_fit() {
     let (report, _) = run(&mission([&[8, 8], &[8, 8], &[8]]), &[1, 2], true, 6_000);
+    assert_eq!(report["quality"]["tm2"]["followed"], json!(["tm1", "tm2"]), "{report}");
+    assert_eq!(report["quality"]["tm2"]["states"], 78, "{report}");
+    let coefficients = report["coefficients"].as_array().expect("a list");
+    assert!(coefficients.iter().all(|c| c["value"].is_f64() && c["sigma"].as_f64() > Some(0.0)), "{report}");
+}
+
+/// 18 + 6 + 6 + 2·(14 + 13 + 13) states.
+#[test]
+fn test_masses_that_do_not_fit_into_one_filter_are_followed_apart_and_the_report_says_what_that_means() {
+    let (report, _) = run(&mission([&[8, 8, 8], &[8, 8, 8], &[8, 8, 8]]), &[1, 2], true, 6_000);
     assert_eq!(report["quality"]["tm2"]["followed"], json!(["tm2"]), "{report}");
     let notes = report["notes"].to_string();
-    assert!(notes.contains("would have 78 states, at most 64") && notes.contains("trust qp"), "{notes}");
+    assert!(notes.contains("would have 110 states, at most 96") && notes.contains("trust qp"), "{notes}");
 }
 
 #[test]
 fn more_states_than_there_is_room_for_are_refused_with_their_number() {
     let (columns, ..) = columns_and_rows(1, 0);
-    let many: &[u32] = &[8; 5];
+    let many: &[u32] = &[8; 7];
     let mut stage = create(&mission([many, many, many]), "auto");
     let request = LinkRequest { available: &columns, model_json: &model_json(&[1]) };
-    let refusal = stage.link(request).expect_err("76 states").to_string();
-    assert!(refusal.contains("76 states, at most 64") && refusal.contains("readout noise"), "{refusal}");
+    let refusal = stage.link(request).expect_err("100 states").to_string();
+    assert!(refusal.contains("100 states, at most 96") && refusal.contains("readout noise"), "{refusal}");
 }

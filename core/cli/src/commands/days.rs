@@ -61,11 +61,17 @@ impl Desk {
         }
     }
 
-    /// Reads what is new in the inbox, and gives every day with telemetry.
-    fn look(&mut self, global: &Global) -> Result<Vec<Planned>, Failure> {
+    /// Reads what is new in the inbox.
+    fn read_inbox(&mut self, global: &Global) -> Result<(), Failure> {
         let spacecraft = self.planner(global)?.spacecraft().to_owned();
-        self.inbox.look(&self.operations.inbox.clone(), &spacecraft)?;
+        self.inbox.look(&self.operations.inbox, &spacecraft)?;
         self.inbox.remember(&memory(&self.operations));
+        Ok(())
+    }
+
+    /// The same, and gives every day with telemetry.
+    fn look(&mut self, global: &Global) -> Result<Vec<Planned>, Failure> {
+        self.read_inbox(global)?;
         let archive = Archive::create(&self.operations.archive)?;
         Ok(workflow::plan(&self.planner(global)?, &archive, &self.inbox)?)
     }
@@ -110,7 +116,7 @@ pub(super) fn catch_up(command: &CatchUp, global: &Global, paint: Paint) -> Resu
 
 /// Runs the days that are due.
 fn run_due(desk: &mut Desk, until: Option<NaiveDate>, global: &Global) -> Result<Vec<Told>, Failure> {
-    desk.look(global)?;
+    desk.read_inbox(global)?;
     let mut reasons: Vec<Vec<String>> = Vec::new();
     let planner = desk.planner(global)?;
     let mut each = |planned: &Planned| -> Box<dyn FnMut(Progress)> {
@@ -132,7 +138,9 @@ pub(super) fn watch(command: &Watch, global: &Global, paint: Paint) -> Result<Do
     let _held = desk.hold()?;
     let (sender, events) = mpsc::channel();
     let mut watcher = notify::recommended_watcher(move |event| {
-        let _ = sender.send(event); // the receiver goes last, when the program ends
+        if is_change(&event) {
+            let _ = sender.send(()); // the receiver goes last, when the program ends
+        }
     })?;
     for folder in folders(&desk.operations.inbox) {
         std::fs::create_dir_all(&folder).at("make the folder", &folder)?;
@@ -144,9 +152,6 @@ pub(super) fn watch(command: &Watch, global: &Global, paint: Paint) -> Result<Do
         let told = run_due(&mut desk, None, global);
         match told {
             Ok(told) => {
-                if !told.is_empty() {
-                    border::give_memory_back();
-                }
                 for day in told {
                     crate::output::print(&day.line(paint))?;
                 }
@@ -154,6 +159,8 @@ pub(super) fn watch(command: &Watch, global: &Global, paint: Paint) -> Result<Do
             Err(_) if stop.load(Ordering::Relaxed) => break,
             Err(error) => return Err(error),
         }
+        // Also where nothing was due: to look at all days needs the more memory the more there are.
+        border::give_memory_back();
         // The first event ends the wait, and as long as others follow within the time to settle it goes on.
         let mut changed = false;
         while !stop.load(Ordering::Relaxed) {
@@ -166,6 +173,13 @@ pub(super) fn watch(command: &Watch, global: &Global, paint: Paint) -> Result<Do
         }
     }
     Ok(Done::new(String::new()))
+}
+
+/// Whether something may be new. That a folder or a file is opened says nothing: to look at the inbox opens it.
+fn is_change(event: &notify::Result<notify::Event>) -> bool {
+    use notify::event::{AccessKind, AccessMode, EventKind};
+    let Ok(event) = event else { return true };
+    !matches!(event.kind, EventKind::Access(kind) if kind != AccessKind::Close(AccessMode::Write))
 }
 
 /// Folders in which files of the patterns may come up: what stands before the first wildcard.

@@ -53,10 +53,17 @@ impl Block {
 }
 
 /// Takes every row before `until_ns` out of `blocks`, in order of time and, for equal times, of rank. Of rows with
-/// one time the first stays; the others are duplicates when they say the same and conflicts when they do not.
-pub(super) fn drain(blocks: &mut Vec<Block>, until_ns: i64, columns: usize, topic: &str, losses: &mut Losses) -> Batch {
+/// one time the first stays; the others are duplicates when they say the same and conflicts when they do not. Gives the
+/// rows, and the times of the conflicts.
+pub(super) fn drain(
+    blocks: &mut Vec<Block>,
+    until_ns: i64,
+    columns: usize,
+    topic: &str,
+    losses: &mut Losses,
+) -> (Batch, Vec<i64>) {
     let mut batch = Batch::empty(columns);
-    let (mut duplicates, mut conflicts) = (0, 0);
+    let (mut duplicates, mut conflicts) = (0, Vec::new());
     loop {
         let heads = || blocks.iter().enumerate().filter_map(|(i, b)| Some((b.head()?, b.rank, i)));
         let Some((head, _, first)) = heads().filter(|h| h.0 < until_ns).min() else { break };
@@ -71,7 +78,11 @@ pub(super) fn drain(blocks: &mut Vec<Block>, until_ns: i64, columns: usize, topi
                     .iter()
                     .zip(&batch.columns)
                     .all(|(c, kept)| kept.last().is_some_and(|k| k.to_bits() == c[row].to_bits()));
-                *(if same { &mut duplicates } else { &mut conflicts }) += 1;
+                if same {
+                    duplicates += 1;
+                } else {
+                    conflicts.push(block.times[row]);
+                }
                 row += 1;
                 continue;
             }
@@ -91,8 +102,8 @@ pub(super) fn drain(blocks: &mut Vec<Block>, until_ns: i64, columns: usize, topi
     losses.add(Finding::DuplicateMessages, duplicates, topic, || {
         format!("{topic}: messages that were there already were dropped")
     });
-    losses.add(Finding::ConflictingMessages, conflicts, topic, || {
+    losses.add(Finding::ConflictingMessages, conflicts.len() as u64, topic, || {
         format!("{topic}: messages of one time with different values; the first in the order of the files was kept")
     });
-    batch
+    (batch, conflicts)
 }

@@ -38,6 +38,9 @@ pub enum Finding {
     StrayMessages,
     /// A message earlier than its file's index says, found too late to be put in order; lost.
     LateMessages,
+    /// An epoch of a stretch in which the clock of its topic was wrong: as many messages are missing on one side of it
+    /// as have a second one on the other; its rows are there, with doubtful times.
+    SteppedClocks,
     /// A message of a time at which its topic already has other values; the first in the order of the files counts.
     ConflictingMessages,
     /// A message that repeats one of the same topic, time and values; dropped.

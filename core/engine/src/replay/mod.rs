@@ -6,6 +6,7 @@
 //! holds the pieces of files that overlap the present stretch, never a file.
 
 mod block;
+mod clock;
 mod inflate;
 mod losses;
 mod reader;

@@ -9,6 +9,7 @@ use mcap::records::op;
 
 use super::ReplayError;
 use super::block::{Block, drain};
+use super::clock::{Clock, Stepped};
 use super::inflate::{InflateError, Inflater, Piece, Stored};
 use super::losses::{Finding, Findings, Losses};
 use super::records::{Cursor, Message};
@@ -44,6 +45,21 @@ pub(super) fn is_sane(log_time: u64) -> bool {
 /// After the last row that a piece states, Unix ns; `i64::MAX` where that is no time.
 fn end_of(piece: &Piece) -> i64 {
     if is_sane(piece.start) && is_sane(piece.end) { clamp_ns(piece.end).saturating_add(1) } else { i64::MAX }
+}
+
+/// Counts a stretch in which the clock of a table was wrong.
+fn tell_stepped(stepped: &Stepped, table: &TableSpec, losses: &mut Losses) {
+    let Stepped { epochs, step_ns, from_ns, by } = *stepped;
+    // At least one, as the steps themselves were met.
+    losses.add(Finding::SteppedClocks, epochs.max(1), &format!("{}@{from_ns}", table.name), || {
+        let (topic, s) = (&table.name, (by.abs() * step_ns) as f64 / 1e9);
+        let at = chrono::DateTime::from_timestamp_nanos(from_ns).format("%H:%M:%S");
+        let when = if by > 0 { "late" } else { "early" };
+        format!(
+            "/{topic}: its clock was {s} s {when} from {at} on for {epochs} epochs: as many messages are missing on one side \
+             of them as have a second one with other values on the other; keep this time out, or send the topic again"
+        )
+    });
 }
 
 /// A piece that has yet to be read.
@@ -94,6 +110,8 @@ pub(super) struct Reader {
     queue: BTreeMap<Key, Pending>,
     /// Rows read and not yet delivered, by table.
     blocks: Vec<Vec<Block>>,
+    /// The clock of each table but those of housekeeping.
+    clocks: Vec<Option<Clock>>,
     window_ns: Range<i64>,
     /// After the last row that the pieces state: what comes later is another run's, and no promise can be made for it.
     end_ns: i64,
@@ -141,12 +159,14 @@ impl Reader {
             opened.push(ReadFile { input: file.input, routes: file.routes, due, end_ns: file_end_ns });
         }
         let blocks = tables.iter().map(|_| vec![]).collect();
+        let clocks = tables.iter().map(|t| (!t.name.starts_with("hk")).then(Clock::default)).collect();
         let (done_ns, last_ns, entries) = (i64::MIN, None, vec![]);
         Ok(Self {
             files: opened,
             tables,
             queue,
             blocks,
+            clocks,
             window_ns,
             end_ns,
             done_ns,
@@ -167,6 +187,7 @@ impl Reader {
         loop {
             let Some(first) = self.next_ns() else {
                 self.count_missing();
+                self.end_clocks();
                 return Ok(None);
             };
             let until_ns = ((first.max(self.done_ns).div_euclid(STRETCH_NS)) + 1) * STRETCH_NS;
@@ -175,9 +196,14 @@ impl Reader {
                 self.read(file, pending, until_ns)?;
             }
             let losses = self.findings.before(until_ns, self.run_in_until_ns);
-            let batches: Vec<Batch> = (self.blocks.iter_mut().zip(&self.tables))
-                .map(|(blocks, table)| drain(blocks, until_ns, table.columns.len(), &table.name, losses))
-                .collect();
+            let mut batches = Vec::with_capacity(self.tables.len());
+            for ((blocks, table), clock) in self.blocks.iter_mut().zip(&self.tables).zip(&mut self.clocks) {
+                let (batch, conflicts_ns) = drain(blocks, until_ns, table.columns.len(), &table.name, losses);
+                if let Some(clock) = clock {
+                    clock.see(&batch.time_ns, &conflicts_ns).iter().for_each(|s| tell_stepped(s, table, losses));
+                }
+                batches.push(batch);
+            }
             self.done_ns = until_ns;
             if self.is_stray(&batches) {
                 let rows = batches.iter().map(|b| b.rows() as u64).sum();
@@ -223,6 +249,15 @@ impl Reader {
             losses.add(Finding::MissingMessages, missing, &name, || {
                 format!("{name}: {missing} messages that its statistics count are not in it; fetch the file again")
             });
+        }
+    }
+
+    /// What the clocks still have to say; once, at the end.
+    fn end_clocks(&mut self) {
+        for (table, clock) in self.tables.iter().zip(&mut self.clocks) {
+            if let Some(stepped) = clock.as_mut().and_then(Clock::end) {
+                tell_stepped(&stepped, table, self.findings.before(self.end_ns, self.run_in_until_ns));
+            }
         }
     }
 

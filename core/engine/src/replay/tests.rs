@@ -281,6 +281,20 @@ fn of_conflicting_values_the_first_file_counts() {
     assert!(outcome.losses.data_loss(), "the other values were there and are not in the tables");
 }
 
+/// Late by 0.3 s for a minute: three epochs without a message, and three with two.
+#[test]
+fn a_clock_that_is_wrong_for_a_while_is_told_and_a_loss() {
+    let late: Messages = (0..2_000)
+        .map(|k| ("/dws", DAY + (if (700..1_300).contains(&k) { k + 3 } else { k }) * EPOCH, dws(k as f64, 0)))
+        .collect();
+    let outcome = replay(&[Foreign::new(late).bytes()]);
+    assert_eq!(outcome.count(Finding::ConflictingMessages), 3);
+    assert_eq!(outcome.count(Finding::SteppedClocks), 597);
+    let said = outcome.losses.entries();
+    let told = said.iter().find(|loss| loss.kind == "stepped_clocks").expect("told");
+    assert!(told.detail.contains("/dws: its clock was 0.3 s late from 00:01:10 on for 597 epochs"), "{}", told.detail);
+}
+
 #[test]
 fn unsorted_messages_are_put_in_order() {
     // 40,000 epochs are ten stretches; 200,000 lie beyond the horizon of sixteen, so pieces are read again.

@@ -181,6 +181,8 @@ struct Term {
     unpredicted_slope: Option<Vec<f64>>,
     /// Channels of whose next readout the series knows more than the past of all channels.
     ahead: Vec<usize>,
+    /// Whether the channel alone differs, and not the motion that it reads.
+    in_readout: bool,
 }
 
 /// The channels of a linked chain, and what coefficients add to them.
@@ -250,20 +252,22 @@ impl<'a> Responses<'a> {
             unpredicted,
             unpredicted_slope,
             ahead,
+            in_readout: response.in_readout,
         });
     }
 
     /// Adds what follows from two coefficients at once. A series that lacks a part of the acceleration in a channel
     /// lacks that part of what other coefficients add to the channel too: an opening angle turns the whole
-    /// acceleration, with what an error of the thrusters' gain makes of it. Terms that an effect has declared itself
-    /// are its own.
+    /// acceleration, with what an error of the thrusters' gain makes of it. An error of a readout is no acceleration: a
+    /// delay of the attitude's readout moves no test mass. Terms that an effect has declared itself are its own.
     fn couple(&mut self) {
         let lacking = self.terms.iter().filter(|t| t.coefficients.len() == 1);
         let gains = lacking.flat_map(|t| t.unpredicted.iter().flatten().enumerate().map(move |gain| (t, gain)));
         let declared: BTreeSet<_> = self.terms.iter().map(Term::place).collect();
         let mut products: Vec<Term> = Vec::new();
         for (t, (channel, gain)) in gains.filter(|(_, (_, gain))| **gain != 0.0) {
-            let acting = |u: &&Term| u.channel == channel && !u.coefficients.contains(&t.coefficients[0]);
+            let acting =
+                |u: &&Term| u.channel == channel && !u.in_readout && !u.coefficients.contains(&t.coefficients[0]);
             for u in self.terms.iter().filter(acting) {
                 let product = Term {
                     coefficients: t.coefficients.iter().chain(&u.coefficients).copied().collect(),
@@ -273,6 +277,7 @@ impl<'a> Responses<'a> {
                     unpredicted: u.unpredicted.clone(),
                     unpredicted_slope: u.unpredicted_slope.clone(),
                     ahead: t.ahead.iter().chain(&u.ahead).copied().collect(),
+                    in_readout: t.in_readout,
                 };
                 if !declared.contains(&product.place()) {
                     products.push(product);

@@ -5,8 +5,8 @@ use crate::WorkflowError;
 use crate::days::{DAY_NS, day_number, day_of_number, start_of_day_ns};
 use chrono::NaiveDate;
 use dragfree_archive::files::sha256;
-use dragfree_archive::product::{Product, Stage, Status, Stream};
-use dragfree_archive::{Archive, Row, Stamp, Written};
+use dragfree_archive::product::{Status, Stream};
+use dragfree_archive::{Archive, ArchiveError, Place, Row, Stamp, Written};
 use dragfree_engine::EngineError;
 use dragfree_engine::border::Kind;
 use dragfree_engine::config::{Mission, Model, Pipeline};
@@ -142,11 +142,17 @@ impl<'a> Planner<'a> {
         }
         let name = day.to_string();
         let row = archive.of_day(&name, &self.spacecraft, &self.product).map_err(again)?;
-        let product = row.as_ref().and_then(|row| archive.product(&row.id).ok());
-        let reasons = match (&row, &product) {
-            (None, _) => vec!["it has no product".to_owned()],
-            (Some(row), None) => vec![format!("{} is damaged", row.id)],
-            (Some(row), Some(product)) => self.reasons(row, product, &files),
+        let made_of = |row: &Row| Ok::<_, ArchiveError>((archive.inputs(&row.id)?, archive.libraries(&row.id)?));
+        let made_of = row.as_ref().map(made_of).transpose().map_err(again)?;
+        let (reasons, same_configuration) = match (&row, &made_of) {
+            (Some(row), Some((inputs, libraries))) => {
+                let reasons = match archive.looks_sound(&row.id) {
+                    Ok(()) => self.reasons(row, inputs, libraries, &files),
+                    Err(_) => vec![format!("{} is damaged", row.id)],
+                };
+                (reasons, self.changed_configuration(inputs).is_empty())
+            }
+            _ => (vec!["it has no product".to_owned()], true),
         };
         let mut tried: Vec<String> = files.iter().map(|file| file.sha256.clone()).collect();
         tried.extend(self.configuration.iter().map(|(_, sha256)| sha256.clone()));
@@ -157,7 +163,6 @@ impl<'a> Planner<'a> {
         let (start, end) = (start_ns(day), start_ns(day) + DAY_NS);
         let first = files.iter().map(|file| file.first_ns).min().unwrap_or(i64::MAX);
         let last = files.iter().map(|file| file.last_ns).max().unwrap_or(i64::MIN);
-        let same_configuration = product.as_ref().is_none_or(|product| self.changed_configuration(product).is_empty());
         Ok(Some(Planned {
             day: Day { day, product: row.map(|row| row.id), reasons, failed },
             files: files.into_iter().map(|file| file.path.clone()).collect(),
@@ -167,10 +172,16 @@ impl<'a> Planner<'a> {
         }))
     }
 
-    /// Why a product is not what a run would give now.
-    fn reasons(&self, row: &Row, product: &Product, files: &[&InboxFile]) -> Vec<String> {
+    /// Why a product is not what a run would give now, from what it was made of and the plugins' libraries.
+    fn reasons(
+        &self,
+        row: &Row,
+        inputs: &[Place],
+        libraries: &[(String, String)],
+        files: &[&InboxFile],
+    ) -> Vec<String> {
         let mut reasons = Vec::new();
-        let telemetry = || product.inputs.iter().filter(|input| input.role == "telemetry");
+        let telemetry = || inputs.iter().filter(|input| input.role == "telemetry");
         let used: BTreeSet<&str> = telemetry().map(|input| input.sha256.as_str()).collect();
         let there: BTreeSet<&str> = files.iter().map(|file| file.sha256.as_str()).collect();
         let file_name = |path: &PathBuf| path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
@@ -179,14 +190,13 @@ impl<'a> Planner<'a> {
         let gone = telemetry().filter(|input| !there.contains(input.sha256.as_str()));
         reasons.extend(gone.map(|input| format!("telemetry {} is gone, or is another now", input.name)));
         reasons
-            .extend(self.changed_configuration(product).into_iter().map(|what| format!("the {what} file has changed")));
+            .extend(self.changed_configuration(inputs).into_iter().map(|what| format!("the {what} file has changed")));
         for (name, sha256) in self.libraries() {
-            let stages = product.history.iter().filter(|stage| stage.plugin == name);
-            if stages.clone().any(|Stage { library_sha256, .. }| *library_sha256 != sha256) {
+            if libraries.iter().any(|(plugin, library)| *plugin == name && *library != sha256) {
                 reasons.push(format!("plugin {name} is another build"));
             }
         }
-        let start = product.header.non_standard_attributes.day.parse().map_or(0, start_ns);
+        let start = row.day.parse().map_or(0, start_ns);
         let asked = (row.asked_from_ns, row.asked_until_ns, row.run_in_ns);
         if asked != (Some(start), Some(start + DAY_NS), self.operations.run_in_ns) {
             reasons.push("another window or another run-in was asked for".to_owned());
@@ -195,10 +205,9 @@ impl<'a> Planner<'a> {
     }
 
     /// Which of pipeline, mission and model a product was not made with.
-    fn changed_configuration(&self, product: &Product) -> Vec<&'static str> {
-        let same = |role: &str, sha256: &String| {
-            product.inputs.iter().any(|input| input.role == role && input.sha256 == *sha256)
-        };
+    fn changed_configuration(&self, inputs: &[Place]) -> Vec<&'static str> {
+        let same =
+            |role: &str, sha256: &String| inputs.iter().any(|input| input.role == role && input.sha256 == *sha256);
         let changed = self.configuration.iter().filter(|(role, sha256)| !same(role, sha256));
         changed.map(|(role, _)| *role).collect()
     }

@@ -5,7 +5,7 @@ use dragfree_archive::files::sha256_of;
 use dragfree_engine::EngineError;
 use dragfree_engine::replay::Replay;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
@@ -64,18 +64,17 @@ impl Inbox {
     /// # Errors
     /// A pattern is wrong.
     pub fn look(&mut self, patterns: &[String], spacecraft: &str) -> Result<(), WorkflowError> {
-        let mut paths = Vec::new();
+        let mut paths = BTreeSet::new();
         for pattern in patterns {
             let refuse = |what: String| WorkflowError::Operations { path: pattern.into(), what };
             for found in glob::glob(pattern).map_err(|e| refuse(e.to_string()))? {
                 paths.extend(found.ok().filter(|path| path.is_file()));
             }
         }
-        paths.sort();
-        paths.dedup();
         self.known.retain(|path, _| paths.contains(path));
         self.files.clear();
         self.strangers.clear();
+        let mut contents = BTreeSet::new();
         for path in paths {
             let stat = std::fs::metadata(&path).ok();
             let size = stat.as_ref().map_or(0, std::fs::Metadata::len);
@@ -85,9 +84,7 @@ impl Inbox {
                 self.known.insert(path.clone(), Known { size, modified, file });
             }
             match self.known.get(&path).map(|known| &known.file) {
-                Some(Ok(file)) if self.files.iter().all(|other| other.sha256 != file.sha256) => {
-                    self.files.push(file.clone());
-                }
+                Some(Ok(file)) if contents.insert(file.sha256.clone()) => self.files.push(file.clone()),
                 Some(Err(reason)) => self.strangers.push((path, reason.clone())),
                 _ => {}
             }

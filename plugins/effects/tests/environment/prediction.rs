@@ -98,6 +98,37 @@ fn a_series_states_what_its_source_lacks_as_a_value_or_as_a_slope() {
     assert_eq!(attribute(&held, "held(tm1.r_orf_m.y)", "unpredicted").as_deref(), Some(r#"{"tm1.accel.y":2.0}"#));
 }
 
+/// What follows the motion must not follow an error of a readout: the host asks the responses.
+#[test]
+fn errors_of_readouts_say_that_they_move_nothing() {
+    let mut telemetry = telemetry(1, true);
+    for axis in AXES {
+        telemetry.add("reconstruction", &format!("used.tm1.torque_orf_nm.{axis}"), "N m", "ORF_1", [].into());
+    }
+    let in_readout = |id: &str, instance: &str| -> Vec<bool> {
+        let (_, linked) =
+            telemetry.link(id, instance, json!({}), false).unwrap_or_else(|e| panic!("{id}:{instance}: {e}"));
+        let responses: Vec<bool> =
+            linked.coefficients.iter().flat_map(|c| &c.responses).map(|r| r.in_readout).collect();
+        assert!(!responses.is_empty(), "{id}:{instance}");
+        responses
+    };
+    let errors = [
+        ("is-scale", "tm1.y"),
+        ("is-crosstalk", "tm1.y-z"),
+        ("tilt-to-length", "tm1"),
+        ("time-offset", "ifo"),
+        ("time-offset", "dws"),
+        ("time-offset", "is"),
+    ];
+    for (id, instance) in errors {
+        assert!(in_readout(id, instance).iter().all(|x| *x), "{id}:{instance}");
+    }
+    for (id, instance) in [("mps-gain", "sc.y"), ("mps-tilt", "sc.y"), ("es-gain", "tm1.y")] {
+        assert!(in_readout(id, instance).iter().all(|x| !x), "{id}:{instance}");
+    }
+}
+
 /// Rows before a change of all columns that effects read stay as they were, bit by bit, and some row after it does not.
 #[test]
 fn no_effect_uses_later_values() {
