@@ -243,6 +243,8 @@ impl Place {
         }
         let said = match said {
             "ended the program" => "ended the process",
+            // 6 where Rust's handler knows the page below the stack, and aborts; 11 where it does not.
+            "crashed: SIGSEGV" if way.ends_with("_stack") => "crashed: signal",
             "crashed: SIGSEGV" => "crashed: signal 11",
             "crashed: SIGABRT" => "crashed: signal 6",
             "crashed: SIG" => "crashed: signal",
