@@ -36,9 +36,9 @@ pub struct RefinementRequest {
     pub shape: Map<String, Value>,
 }
 
-/// Chooses the form of each candidate beside `named` effects; that of a named one beside the others. A transient that
-/// is not significant beside them has the form that it would have in place of the one that it can best replace: the
-/// likelihood compares the two at the same time.
+/// Chooses the form of each candidate beside `named` effects; that of a named one beside the others. A candidate that is
+/// not significant beside them, and could replace one of them, has the form that it would have in its place: beside the
+/// effect that has taken what it explains nothing is left to choose a form by, and the likelihood compares the two.
 ///
 /// # Errors
 /// [`IdentificationError`]: too little data, or a model that cannot be fitted.
@@ -54,8 +54,9 @@ pub fn screen(scorer: &CandidateScorer<'_>, named: &[Candidate]) -> Result<Scree
         shape: s.candidate.parts[0].1.shape.clone(),
     };
     let requests = ranked.all.iter().filter(stands_out).map(request).collect();
+    let place = |c: &Candidate| (c.transient, c.name());
     let certain = ranked.all.iter().filter(|s| trials.p_value_of(s).0 < scorer.settings.false_alarm);
-    let significant: Vec<Candidate> = certain.map(|s| s.candidate.clone()).collect();
+    let significant: Vec<(bool, String)> = certain.map(|s| place(&s.candidate)).collect();
     let mut rivals: Vec<Scored> = Vec::new();
     let mut forms = refined(scorer, &fit, ranked.all, &trials)?;
     for (i, candidate) in named.iter().enumerate() {
@@ -63,22 +64,51 @@ pub fn screen(scorer: &CandidateScorer<'_>, named: &[Candidate]) -> Result<Scree
         others.remove(i);
         let without = scorer.fit(&others)?;
         let own = |c: &Coefficient| (&c.effect, &c.instance) == (&candidate.effect, &candidate.instance);
-        let ranked = scorer.rank_where(&without, own);
-        let form = refined(scorer, &without, ranked.all, &trials)?.into_iter().next();
+        let own = scorer.rank_where(&without, own).all;
+        rivals.extend(rivals_of(scorer, &without, candidate, &own)?);
+        let form = refined(scorer, &without, own, &trials)?.into_iter().next();
         forms.insert(i, form.unwrap_or_else(|| candidate.clone()));
-        if candidate.transient {
-            rivals.extend(scorer.rank_where(&without, |c| c.transient && !own(c)).all);
-        }
     }
     rivals.sort_by(|a, b| a.delta_chi2.total_cmp(&b.delta_chi2));
     // The best one comes last and stays.
     for rival in rivals {
-        let place = |f: &&mut Candidate| f.transient && f.name() == rival.candidate.name();
-        if let Some(form) = forms.iter_mut().filter(|f| !named.contains(f) && !significant.contains(*f)).find(place) {
+        let own = place(&rival.candidate);
+        if significant.contains(&own) {
+            continue;
+        }
+        if let Some(form) = forms.iter_mut().filter(|f| !named.contains(f)).find(|f| place(f) == own) {
             *form = rival.candidate;
         }
     }
     Ok(Screened { forms, tried: ranked.tried, unobservable: ranked.unobservable, requests })
+}
+
+/// The candidates with a shape that could replace `named`, in the forms that they would have in its place, from the fit
+/// `without` it and its `own` scores there. Such a rival explains the greater part of what `named` explains, and leaves
+/// it the smaller part. Of transients, which last for minutes, all are.
+fn rivals_of(
+    scorer: &CandidateScorer<'_>,
+    without: &Fit,
+    named: &Candidate,
+    own: &[Scored],
+) -> Result<Vec<Scored>, IdentificationError> {
+    let is_own = |c: &Coefficient| (&c.effect, &c.instance) == (&named.effect, &named.instance);
+    let shaped = |c: &Coefficient| c.transient == named.transient && (c.transient || c.forms.len() > 1) && !is_own(c);
+    let mut rivals = scorer.rank_where(without, shaped).all;
+    if named.transient {
+        return Ok(rivals);
+    }
+    let explained = |own: &[Scored]| own.iter().find(|s| !s.candidate.transient).map_or(0.0, |s| s.delta_chi2);
+    let greater_part = 0.5 * explained(own);
+    rivals.retain(|r| r.delta_chi2 > greater_part);
+    let mut left = Vec::new();
+    for rival in rivals {
+        let beside = scorer.fit(&[&without.added[..], std::slice::from_ref(&rival.candidate)].concat())?;
+        if explained(&scorer.rank_where(&beside, is_own).all) < greater_part {
+            left.push(rival);
+        }
+    }
+    Ok(left)
 }
 
 /// Leaves out of the requests of a screen beside nothing what its most significant candidate explains: of a cause that
