@@ -303,6 +303,34 @@ fn increased_torque_noise_is_found_alone() {
     assert!((value - 2.0).abs() < 4.0 * sigma && sigma < 0.05, "{value} ± {sigma}");
 }
 
+/// A readout 1.657 times as loud as declared, of two hours, is found alone with its size. A likelihood that went back
+/// to the declared levels whenever the form of a named effect changed did not settle: 1.707 ± 0.005, and a thermal force
+/// that did not act.
+#[test]
+fn a_louder_readout_is_found_alone() {
+    let d = diagnosis(&["--hours", "2", "--seed", "100507", "--effect", "is-noise:tm2.z=1.657"]);
+    assert_eq!(named_alone(&d, 1.657), "is-noise:tm2.z");
+}
+
+/// A slosh of 4.3 % at 24 mHz beside a weak thermal force: in two hours a gain of the thrusters explains it as well.
+/// Whichever is named, the slosh is named or among what confounds it, and these are three at most. Its form beside the
+/// gain has another frequency, of no use in the gain's place.
+#[test]
+fn a_slosh_that_looks_like_a_gain_is_named_or_confounds_it() {
+    let slosh = "slosh:sc.y=0.0429,f0_hz=0.0243,zeta=0.02";
+    let thermal = "thermal:tm1.x=-2.787e-11,lag_s=593";
+    let d = diagnosis(&["--hours", "2", "--seed", "100494", "--effect", slosh, "--effect", thermal]);
+    let sets = d["candidates"].as_array().expect("a list").iter().filter(|c| c["accepted"] == true);
+    let mut sets = sets.map(|c| {
+        let others =
+            c["confounders"].as_array().expect("a list").iter().map(|o| o.as_str().expect("a name").to_owned());
+        let name = format!("{}:{}", c["effect"].as_str().expect("a name"), c["instance"].as_str().expect("a place"));
+        std::iter::once(name).chain(others).collect::<Vec<_>>()
+    });
+    let found = sets.find(|set| set.iter().any(|name| name == "slosh:sc.y"));
+    assert!(found.as_ref().is_some_and(|set| set.len() <= 3), "{found:?} {:#}", d["candidates"][0]);
+}
+
 /// A force that no effect of the library states, the square of the battery's current behind a lag of 50 s: nothing is
 /// named, a formula is proposed on its test mass and axis, and the current is among the first three that drive it, as
 /// the magnetic field and the heater change with it. With the formula in the model the next diagnosis finds nothing.
