@@ -7,18 +7,18 @@ use dragfree_archive::Written;
 use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
 use dragfree_engine::registry::Registry;
-use dragfree_identification::candidates::Candidate;
+use dragfree_identification::candidates;
 use dragfree_identification::diagnosis::{
     Constancy, Diagnosis, Drift, Found, LIMIT_QUANTILE, LINE, Limit, OfProduct, Offset, OtherLevel, Separation,
     TRANSIENT, Trials,
 };
-use dragfree_identification::innovations::decision::{Fitted, Quadratic};
+use dragfree_identification::innovations::decision::{Candidate, Fitted, Quadratic};
 use dragfree_identification::record::Record;
 use dragfree_schema::Settings;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-use crate::likelihood::{Decided, Judge, Meaning};
+use crate::likelihood::{Decided, Judge, Meaning, Place};
 use crate::proposals::Proposal;
 use crate::replay::AT_NS;
 
@@ -35,7 +35,7 @@ pub(crate) struct Evidence<'a> {
 
 impl Evidence<'_> {
     /// A model's entry that makes a candidate in its form.
-    pub(crate) fn entry(&self, candidate: &Candidate) -> EffectEntry {
+    pub(crate) fn entry(&self, candidate: &candidates::Candidate) -> EffectEntry {
         if let Some(proposal) = self.proposal(&candidate.effect, &candidate.instance) {
             return proposal.entry.clone();
         }
@@ -48,6 +48,11 @@ impl Evidence<'_> {
     /// The formula of a candidate that is one.
     pub(crate) fn proposal(&self, effect: &str, instance: &str) -> Option<&Proposal> {
         self.proposals.iter().find(|p| (p.entry.id.as_str(), p.entry.instance.as_str()) == (effect, instance))
+    }
+
+    /// What a candidate is called: a formula by its words.
+    fn name_of(&self, place: &Place) -> String {
+        self.proposal(&place.effect, &place.instance).map_or_else(|| place.name(), |p| p.words.clone())
     }
 
     /// What acts once was searched for at every time, and what acts at one frequency at every frequency.
@@ -116,10 +121,7 @@ pub(crate) fn found(
     let channels: BTreeSet<&String> =
         own.iter().filter_map(|i| decided.channels.get(&decided.parameters[*i].0)).flatten().collect();
     let rivals: Vec<usize> = fitted.alternatives.iter().filter(|(_, p)| *p > evidence.least).map(|(c, _)| *c).collect();
-    let name_of = |c: &usize| {
-        let other = &decided.candidates[*c];
-        evidence.proposal(&other.effect, &other.instance).map_or_else(|| other.name(), |p| p.words.clone())
-    };
+    let name_of = |c: &usize| evidence.name_of(&decided.candidates[*c]);
     let set = &named;
     let separation = |c: &usize| Separation::new(name_of(c), decided.quadratic.separation(fitted.candidate, *c, set));
     let separations: Vec<Separation> = rivals.iter().map(separation).collect();
@@ -218,14 +220,40 @@ pub(crate) struct NoiseLevel {
     pub(crate) sigma: f64,
     /// Channels that it enters.
     pub(crate) channels: Vec<String>,
+    /// What explains as much with the level as the model states it; none where the level is not certain.
+    #[serde(default)]
+    pub(crate) rivals: Option<Vec<Rival>>,
+}
+
+impl NoiseLevel {
+    /// Fall of χ² with the level free.
+    pub(crate) fn gain(&self) -> f64 {
+        (self.ln / self.sigma).powi(2)
+    }
+}
+
+/// An effect that explains as much as a level of noise in its place.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub(crate) struct Rival {
+    /// `EFFECT:INSTANCE`.
+    pub(crate) name: String,
+    /// Logarithm of its probability over that of the level.
+    pub(crate) ln_odds: f64,
+    /// By how much χ² is expected to be higher with it in the place of the level, in these data.
+    pub(crate) chi2: f64,
 }
 
 /// Levels of noise that effects could state, as the likelihood has them.
-pub(crate) fn noise_levels(decided: &Decided, record: &Record) -> Vec<NoiseLevel> {
+pub(crate) fn noise_levels(
+    decided: &Decided,
+    record: &Record,
+    evidence: &Evidence<'_>,
+    settings: &Settings,
+) -> Vec<NoiseLevel> {
     let all = record.candidate_set.coefficients.iter().filter(|c| !c.noise.is_empty());
     all.filter_map(|c| {
         let i = decided.parameters.iter().position(|(name, m)| *name == c.noise && matches!(m, Meaning::Level))?;
-        Some(NoiseLevel {
+        let level = NoiseLevel {
             effect: c.effect.clone(),
             instance: c.instance.clone(),
             coefficient: c.name.clone(),
@@ -234,20 +262,59 @@ pub(crate) fn noise_levels(decided: &Decided, record: &Record) -> Vec<NoiseLevel
             ln: decided.selection.values[i],
             sigma: decided.selection.sigma[i],
             channels: channels_of(record, &c.noise),
-        })
+            rivals: None,
+        };
+        let certain = evidence.trials.p_value(&level.effect, level.gain(), 1.0).0 < settings.false_alarm;
+        let rivals = certain.then(|| rivals(decided, &level, i, evidence));
+        Some(NoiseLevel { rivals, ..level })
     })
     .collect()
+}
+
+/// The rivals of a level on several days: those that it has on all of them; evidence adds.
+pub(crate) fn rivals_of_all(days: &[&[Rival]]) -> Vec<Rival> {
+    let [first, others @ ..] = days else { return Vec::new() };
+    let of = |rival: &Rival| {
+        let mut all = rival.clone();
+        for day in others {
+            let Rival { ln_odds, chi2, .. } = day.iter().find(|r| r.name == rival.name)?;
+            (all.ln_odds, all.chi2) = (all.ln_odds + ln_odds, all.chi2 + chi2);
+        }
+        Some(all)
+    };
+    first.iter().filter_map(of).collect()
+}
+
+/// What explains as much as a level in its place. The likelihood fits every level beside every candidate, so that a
+/// candidate which acts on the power of the noise, such as a gain in the loop, has lost its evidence to the level when
+/// both are asked for: it is compared with the level held as the model states it.
+fn rivals(decided: &Decided, level: &NoiseLevel, parameter: usize, evidence: &Evidence<'_>) -> Vec<Rival> {
+    let ln_prior = evidence.ln_prior(&level.effect, &level.instance);
+    let own = decided.candidates.len();
+    let quadratic = decided.quadratic.with_candidate(Candidate { ln_prior, ..Candidate::free(parameter) });
+    let set: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).chain([own]).collect();
+    let others: Vec<usize> = decided.selection.rest.iter().map(|f| f.candidate).collect();
+    let fitted = quadratic.with_alternatives(own, &set, &others);
+    let rival = |(c, probability): &(usize, f64)| Rival {
+        name: evidence.name_of(&decided.candidates[*c]),
+        ln_odds: (probability / fitted.probability).ln(),
+        chi2: quadratic.separation(own, *c, &set),
+    };
+    fitted.alternatives.iter().map(rival).collect()
 }
 
 /// Levels as what may be missing. `chi2` is that of the whitened innovations, of so many numbers.
 fn louder(levels: &[NoiseLevel], chi2: f64, numbers: f64, evidence: &Evidence<'_>) -> Vec<Found> {
     let found = |level: &NoiseLevel| {
         let value = level.ln.exp() * level.stated;
-        let gain = (level.ln / level.sigma).powi(2);
+        let gain = level.gain();
         let (p_value, log10_p_value) = evidence.trials.p_value(&level.effect, gain, 1.0);
         let sigma = level.sigma * value;
         let before = chi2 / numbers;
         let name = level.coefficient.clone();
+        let rivals = || level.rivals.iter().flatten();
+        let odds = 1.0 + rivals().map(|r| r.ln_odds.exp()).sum::<f64>();
+        let rivals = || rivals().filter(|r| r.ln_odds.exp() > evidence.least * odds);
         Found {
             effect: level.effect.clone(),
             instance: level.instance.clone(),
@@ -267,8 +334,8 @@ fn louder(levels: &[NoiseLevel], chi2: f64, numbers: f64, evidence: &Evidence<'_
             offset_shift_m: BTreeMap::new(),
             offset_shift_sigma: BTreeMap::new(),
             channels: level.channels.clone(),
-            confounders: Vec::new(),
-            separations: Vec::new(),
+            confounders: rivals().map(|r| r.name.clone()).collect(),
+            separations: rivals().map(|r| Separation::new(r.name.clone(), r.chi2)).collect(),
             accepted: false,
             refused: None,
             by_product: Vec::new(),

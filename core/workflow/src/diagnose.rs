@@ -98,7 +98,7 @@ pub fn diagnose(
                 named: &named,
                 beside: &beside,
                 record: &spectra.record,
-                levels: noise_levels(decided, &spectra.record),
+                levels: noise_levels(decided, &spectra.record, &evidence, settings),
             };
             Extract::new(product, made_of, &diagnosis, &evidence)?
         }
@@ -245,8 +245,9 @@ fn decide(
     let (mut point, mut slow) = start_of_passes(&spectra, settings)?;
     let mut screened = spectra.screened.clone();
     let mut named: Vec<Candidate> = Vec::new();
-    // A pass that fits constants beside what is named comes first, at the start and after a form has changed: they are
-    // 1e5 σ away, and a filter would take them for noise.
+    // A pass that fits constants beside what is named comes first, at the start and where a form is new: they are 1e5 σ
+    // away, a filter would take them for noise, and with the unknown mean of its series a form that explains nothing
+    // would seem to explain what rounding leaves of the constants.
     let (mut opening, mut passes) = (true, 0);
     loop {
         let forms = spectra.forms(&screened, &evidence.proposals);
@@ -286,10 +287,9 @@ fn decide(
             let values = &fit.estimate.theta.as_slice()[spectra.record.candidate_set.model()..];
             let parts = named.iter().flat_map(|c| c.parts.iter().map(move |(index, _)| (c, *index)));
             for ((_, index), value) in parts.zip(values).filter(|((c, _), _)| !now.contains(c)) {
-                // Its mean is another, and constants are far away again.
-                opening = true;
                 point.values.insert(spectra.record.candidate_set.coefficients[index].name.clone(), *value);
             }
+            opening = beside.forms.iter().any(|form| !screened.forms.contains(form));
             slow = slow_forces(&scorer, &fit, &spectra.record.noise);
             screened = Screened { forms: beside.forms, ..screened };
         }
@@ -428,7 +428,8 @@ fn answer(
         others.push(Found { accepted: false, refused, ..f });
     }
     let unexplained = followed(unexplained, &formulas, evidence, scorer);
-    let levels = with_levels(&mut named, &noise_levels(decided, record), decided, evidence, settings);
+    let levels = noise_levels(decided, record, evidence, settings);
+    let levels = with_levels(&mut named, &levels, decided, evidence, settings);
     others.sort_by(|a, b| a.log10_p_value.total_cmp(&b.log10_p_value));
     let refused = |f: &Found| {
         let reason = f.refused.as_ref()?;

@@ -21,7 +21,9 @@ use dragfree_schema::{Coefficient, Settings};
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
-use crate::answer::{Evidence, NoiseLevel, apart, contradict, found, limits, offsets, verdict, with_levels};
+use crate::answer::{
+    Evidence, NoiseLevel, Rival, apart, contradict, found, limits, offsets, rivals_of_all, verdict, with_levels,
+};
 use crate::likelihood::{CoefficientSums, Decided, Stretches, joined};
 use crate::{ManyDays, WorkflowError};
 
@@ -394,14 +396,16 @@ fn of_one_model(extracts: &[Extract]) -> Result<(), WorkflowError> {
     }
 }
 
-/// Levels of several days: means weighted by 1/σ².
+/// Levels of several days: means weighted by 1/σ², and the rivals of the days on which the level is certain.
 pub(crate) fn levels_of_all(days: &[&[NoiseLevel]]) -> Vec<NoiseLevel> {
     let Some(first) = days.first() else { return Vec::new() };
     let of = |level: &NoiseLevel| {
-        let own = days.iter().copied().flatten().filter(|l| l.coefficient == level.coefficient);
-        let known = own.filter(|l| l.sigma > 0.0).map(|l| (l.sigma.powi(-2), l.ln));
+        let own = || days.iter().copied().flatten().filter(|l| l.coefficient == level.coefficient);
+        let known = own().filter(|l| l.sigma > 0.0).map(|l| (l.sigma.powi(-2), l.ln));
         let (weight, sum) = known.fold((0.0, 0.0), |(w, s), (weight, ln)| (w + weight, s + weight * ln));
-        (weight > 0.0).then(|| NoiseLevel { ln: sum / weight, sigma: weight.powf(-0.5), ..level.clone() })
+        let certain: Vec<&[Rival]> = own().filter_map(|l| l.rivals.as_deref()).collect();
+        let rivals = (!certain.is_empty()).then(|| rivals_of_all(&certain));
+        (weight > 0.0).then(|| NoiseLevel { ln: sum / weight, sigma: weight.powf(-0.5), rivals, ..level.clone() })
     };
     first.iter().filter_map(of).collect()
 }

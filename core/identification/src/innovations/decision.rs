@@ -415,7 +415,27 @@ impl Quadratic {
         self.expected(&(&self.information * (times - 1.0)), values)
     }
 
-    fn with_alternatives(&self, candidate: usize, set: &[usize], usable: &[usize]) -> Fitted {
+    /// The same likelihood with parameters of the base as one more candidate, the last: without it they are zero.
+    pub fn with_candidate(&self, candidate: Candidate) -> Self {
+        let base = self.base.iter().copied().filter(|i| !candidate.parameters.contains(i)).collect();
+        let mut quadratic = Self {
+            information: self.information.clone(),
+            score: self.score.clone(),
+            base,
+            base_inverse: DMatrix::zeros(0, 0),
+            candidates: self.candidates.iter().cloned().chain([candidate]).collect(),
+            numbers: self.numbers,
+            profiled: DMatrix::zeros(0, 0),
+            profiled_score: DVector::zeros(0),
+            rounding: Vec::new(),
+        };
+        quadratic.profile();
+        quadratic
+    }
+
+    /// A candidate of a set, with those of the `usable` ones that explain as much in its place: the greater part of its
+    /// gain, whatever the weights say. Where little is to be explained, weights alone would name what explains nothing.
+    pub fn with_alternatives(&self, candidate: usize, set: &[usize], usable: &[usize]) -> Fitted {
         let mut fitted = self.beside(candidate, set);
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
         let evidence = |c: usize| self.ln_evidence(&others.iter().copied().chain([c]).collect::<Vec<_>>());
@@ -424,7 +444,7 @@ impl Quadratic {
             .iter()
             .filter(|c| !set.contains(c))
             .map(|c| (*c, (evidence(*c) - own).min(0.0).exp()))
-            .filter(|(_, weight)| *weight > 1e-3)
+            .filter(|(c, weight)| *weight > 1e-3 && self.beside(*c, &others).gain > 0.5 * fitted.gain)
             .collect();
         let sum = 1.0 + weights.iter().map(|(_, w)| w).sum::<f64>();
         fitted.probability = sum.recip();

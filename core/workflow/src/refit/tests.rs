@@ -60,6 +60,7 @@ fn basis(days: &[Data]) -> Basis {
         ln: 0.3,
         sigma: 0.1,
         channels: Vec::new(),
+        rivals: None,
     };
     let day = |(number, d): (usize, &Data)| Day {
         product: format!("day{number}"),
