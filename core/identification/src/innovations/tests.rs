@@ -752,6 +752,31 @@ fn ranges_bound_the_gain_and_equals_are_alternatives() {
     assert!((own.gain - (2.0 * 1e4 * 2.0 * 0.3 - 1e4 * 0.09)).abs() < 1e-6, "{}", own.gain);
 }
 
+/// What acts has a correlation of ρ with a level of the noise, which is fitted beside everything: of its χ² 1 − ρ² is
+/// left. Compared with the level in its place it explains all of it, as if the level had been a candidate from the
+/// start, and the level ρ². A third candidate that explains nothing is no alternative.
+#[test]
+fn a_level_of_the_base_is_compared_with_what_acts_in_its_place() {
+    let (n, rho) = (1e4, 0.99);
+    let rows = [n, rho * n, 0.0, rho * n, n, 0.0, 0.0, 0.0, n];
+    let mut information = DMatrix::identity(4, 4);
+    information.view_mut((1, 1), (3, 3)).copy_from(&DMatrix::from_row_slice(3, 3, &rows));
+    let truth = [0.0, 0.0, 0.1, 0.0];
+    let own = quadratic(information.clone(), &truth, vec![candidate(2), candidate(3)]);
+    let all = 0.01 * n;
+    let is = |x: f64, expected: f64| (x - expected).abs() < 1e-6 * all;
+    assert!(is(own.beside(0, &[]).gain, all * (1.0 - rho * rho)));
+    let compared = own.with_candidate(candidate(1));
+    let from_the_start = quadratic(information, &truth, vec![candidate(2), candidate(3), candidate(1)]);
+    for quadratic in [&compared, &from_the_start] {
+        assert!(is(quadratic.beside(0, &[]).gain, all) && is(quadratic.beside(2, &[]).gain, all * rho * rho));
+        let level = quadratic.with_alternatives(2, &[2], &[0, 1]);
+        let names: Vec<usize> = level.alternatives.iter().map(|(c, _)| *c).collect();
+        assert_eq!(names, [0]);
+        assert!(is(quadratic.separation(2, 0, &[2]), all * rho * rho * (1.0 - rho * rho)));
+    }
+}
+
 #[test]
 fn noise_that_cannot_be_filtered_is_refused_with_its_name() {
     let unknown = NoiseProcess { spectrum: None, ..declared().remove(1) };
