@@ -304,8 +304,8 @@ fn increased_torque_noise_is_found_alone() {
 }
 
 /// A readout 1.657 times as loud as declared, of two hours, is found alone with its size. A likelihood that went back
-/// to the declared levels whenever the form of a named effect changed did not settle: 1.707 ± 0.005, and a thermal force
-/// that did not act.
+/// to the declared levels whenever the form of a named effect changed did not settle: 1.707 ± 0.005, and a thermal
+/// force that did not act.
 #[test]
 fn a_louder_readout_is_found_alone() {
     let d = diagnosis(&["--hours", "2", "--seed", "100507", "--effect", "is-noise:tm2.z=1.657"]);
@@ -340,7 +340,11 @@ fn a_new_form_explains_no_constant() {
         "impulse:sc.x=4.5721e-7,at_s=2819.9,arm_x_m=0.5,arm_y_m=0.5,arm_z_m=0.3,rise_s=5,decay_s=60,pulse_s=10";
     let crosstalk = "is-crosstalk:tm1.y-z=0.0869";
     let (readout, torque) = ("is-noise:tm2.y=1.6889", "torque-noise:sc.y=1.3613");
-    for (seed, effects) in [("100570", [impulse, crosstalk]), ("100620", [readout, torque])] {
+    // Beside it a correlation of the thrusters was named at first, which acts on the noise: its value was lost where
+    // constants alone were fitted, and six passes did not settle.
+    let thruster = "mps-noise:sc.y=1.8803";
+    let sets = [("100570", &[impulse, crosstalk][..]), ("100620", &[readout, torque]), ("100595", &[thruster])];
+    for (seed, effects) in sets {
         let hidden = effects.iter().flat_map(|effect| ["--effect", effect]);
         let d = diagnosis(&["--hours", "2", "--seed", seed].into_iter().chain(hidden).collect::<Vec<_>>());
         let names: Vec<&str> = effects.iter().filter_map(|e| e.split('=').next()).collect();

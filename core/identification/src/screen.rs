@@ -36,9 +36,9 @@ pub struct RefinementRequest {
     pub shape: Map<String, Value>,
 }
 
-/// Chooses the form of each candidate beside `named` effects; that of a named one beside the others. A candidate that is
-/// not significant beside them, and could replace one of them, has the form that it would have in its place: beside the
-/// effect that has taken what it explains nothing is left to choose a form by, and the likelihood compares the two.
+/// Chooses the form of each candidate beside `named` effects; that of a named one beside the others. A candidate that
+/// is not significant beside them, and could replace one of them, has the form that it would have in its place: beside
+/// the effect that has taken what it explains nothing is left to choose a form by, and the likelihood compares the two.
 ///
 /// # Errors
 /// [`IdentificationError`]: too little data, or a model that cannot be fitted.

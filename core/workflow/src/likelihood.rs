@@ -235,7 +235,7 @@ pub(crate) fn joined(
         all.surveys = product.surveys;
         all.channels.extend(product.channels);
     }
-    all.decided(&Point::default(), false, settings, judge, not_tried)
+    all.decided(&Point::default(), settings, judge, not_tried)
 }
 
 /// What the decision needs to know of candidates.
@@ -258,10 +258,13 @@ pub(crate) fn step_of_model(from: &Point, decided: &Decided) -> Point {
 }
 
 fn to_values(from: &Point, decided: &Decided, values: &DVector<f64>, chosen: &BTreeSet<usize>) -> Point {
-    // A pass that fits constants and the model has no levels among its parameters.
-    let mut to = Point { levels: from.levels.clone(), ..Point::default() };
+    // A pass that fits constants and the model has neither levels nor candidates among its parameters.
+    let mut to = Point { values: from.values.clone(), levels: from.levels.clone(), ..Point::default() };
     let others = decided.candidates.iter().enumerate().filter(|(c, _)| !chosen.contains(c));
     let not_named: BTreeSet<usize> = others.flat_map(|(_, place)| place.parameters.iter().copied()).collect();
+    for i in &not_named {
+        to.values.remove(&decided.parameters[*i].0);
+    }
     for (i, (name, meaning)) in decided.parameters.iter().enumerate() {
         let value = values[i];
         match meaning {
@@ -348,7 +351,7 @@ pub(crate) fn one_pass(
         not_tried.extend(refused);
         joined.add(filtered, &mut not_tried, settings);
     }
-    Ok(joined.decided(point, opening, settings, judge, not_tried))
+    Ok(joined.decided(point, settings, judge, not_tried))
 }
 
 /// Sums of several products, by the names of the parameters.
@@ -444,7 +447,6 @@ impl Joined {
     fn decided(
         self,
         point: &Point,
-        opening: bool,
         settings: &Settings,
         judge: &dyn Judge,
         not_tried: Vec<(String, String)>,
@@ -463,8 +465,6 @@ impl Joined {
                 }),
             });
             match meaning {
-                // What is named stays so while constants are found.
-                Meaning::Coefficient(c) if c.candidate && opening => {}
                 Meaning::Coefficient(c) if c.candidate => {
                     // A coefficient that comes again does so in another form.
                     let lacks = |p: &Place| p.parameters.iter().all(|own| parameters[*own].0 != *name);

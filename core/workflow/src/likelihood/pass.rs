@@ -450,8 +450,8 @@ impl Filtered {
         let mut unknowns: Vec<(String, Meaning, Parameter)> = Vec::new();
         let own = responses.series.len();
         let count = own + waveforms.len();
-        let named = |c: &Coefficient| point.values.contains_key(&c.name);
-        let asked = |c: &Coefficient| if c.candidate { !opening || named(c) } else { c.estimate };
+        // What is named stays as it is while constants are found: what it does to the noise is not asked for there.
+        let asked = |c: &Coefficient| if c.candidate { !opening } else { c.estimate };
         for (i, c) in responses.coefficients.iter().enumerate().filter(|(_, c)| asked(c)) {
             let change = if opening { None } else { noise.by_coefficient(i) };
             let own = responses.to(i, &noise.values);
