@@ -18,7 +18,7 @@ use dragfree_schema::Settings;
 use serde::{Deserialize, Serialize};
 use serde_json::json;
 
-use crate::likelihood::{Decided, Judge, Meaning, Place};
+use crate::likelihood::{Decided, Judge, LEVEL_PRIOR, Meaning, Place};
 use crate::proposals::Proposal;
 use crate::replay::AT_NS;
 
@@ -291,7 +291,8 @@ pub(crate) fn rivals_of_all(days: &[&[Rival]]) -> Vec<Rival> {
 fn rivals(decided: &Decided, level: &NoiseLevel, parameter: usize, evidence: &Evidence<'_>) -> Vec<Rival> {
     let ln_prior = evidence.ln_prior(&level.effect, &level.instance);
     let own = decided.candidates.len();
-    let quadratic = decided.quadratic.with_candidate(Candidate { ln_prior, ..Candidate::free(parameter) });
+    let prior_sigma = vec![LEVEL_PRIOR];
+    let quadratic = decided.quadratic.with_candidate(Candidate { ln_prior, prior_sigma, ..Candidate::free(parameter) });
     let set: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).chain([own]).collect();
     let others: Vec<usize> = decided.selection.rest.iter().map(|f| f.candidate).collect();
     let fitted = quadratic.with_alternatives(own, &set, &others);

@@ -40,7 +40,7 @@ const REACHED_SIGMAS: f64 = 0.5;
 /// Largest last step of the logarithm of a level: σ, which has two digits, is made with the level before it.
 const TWO_DIGITS: f64 = 0.01;
 /// σ of the logarithm of a level before any data: the data decide.
-const LEVEL_PRIOR: f64 = 1.0;
+pub(crate) const LEVEL_PRIOR: f64 = 1.0;
 /// Largest change of the logarithm of a level in one pass: beyond it the quadratic form is no likelihood.
 const LEVEL_STEP: f64 = 0.7;
 

@@ -433,18 +433,17 @@ impl Quadratic {
         quadratic
     }
 
-    /// A candidate of a set, with those of the `usable` ones that explain as much in its place. What has less evidence
-    /// there than nothing has is none of them: where little is to be explained, what explains nothing would be one too.
+    /// A candidate of a set, with those of the `usable` ones that explain as much in its place.
     pub fn with_alternatives(&self, candidate: usize, set: &[usize], usable: &[usize]) -> Fitted {
         let mut fitted = self.beside(candidate, set);
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
         let evidence = |c: usize| self.ln_evidence(&others.iter().copied().chain([c]).collect::<Vec<_>>());
-        let (own, nothing) = (evidence(candidate), self.ln_evidence(&others));
+        let own = evidence(candidate);
         let weights: Vec<(usize, f64)> = usable
             .iter()
             .filter(|c| !set.contains(c))
             .map(|c| (*c, (evidence(*c) - own).min(0.0).exp()))
-            .filter(|(c, weight)| *weight > 1e-3 && evidence(*c) > nothing)
+            .filter(|(_, weight)| *weight > 1e-3)
             .collect();
         let sum = 1.0 + weights.iter().map(|(_, w)| w).sum::<f64>();
         fitted.probability = sum.recip();
