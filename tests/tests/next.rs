@@ -57,8 +57,8 @@ fn assert_came_true(d: &Value, coefficients: &Value) {
 fn the_sigma_that_is_expected_of_a_manoeuvre_and_of_more_data_comes_true() {
     let effect = ["--effect", "opening-angle:tm1=0.03"];
     let of = |arguments: &[&str], more: &[&str]| diagnosed(&[arguments, &effect].concat(), more);
-    let d = of(&["--hours", "3", "--seed", "31"], &["--next"]);
-    let pairs = ["opening-angle:tm2", "es-crosstalk:tm1.z-y"].map(|from| advice(&d, "opening-angle:tm1", from));
+    let d = of(&["--hours", "3", "--seed", "36"], &["--next"]);
+    let pairs = ["mps-gain:sc.y", "mps-tilt:sc.z"].map(|from| advice(&d, "opening-angle:tm1", from));
     assert!(pairs.iter().all(|a| a["now_sigma"].as_f64().is_some_and(|now| now < 5.0)), "{pairs:#?}");
     let arguments = |a: &Value| a["manoeuvre"]["simulate"].as_str().expect("a manoeuvre").to_owned();
     let planned = arguments(pairs[0]);

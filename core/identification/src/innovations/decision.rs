@@ -433,17 +433,19 @@ impl Quadratic {
         quadratic
     }
 
-    /// A candidate of a set, with those of the `usable` ones that explain as much in its place.
+    /// A candidate of a set, with those of the `usable` ones that explain as much in its place. Beside one that has less
+    /// evidence than nothing, as an event after a search of every time may have, they need more evidence than nothing:
+    /// whatever explains nothing would be as likely.
     pub fn with_alternatives(&self, candidate: usize, set: &[usize], usable: &[usize]) -> Fitted {
         let mut fitted = self.beside(candidate, set);
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
         let evidence = |c: usize| self.ln_evidence(&others.iter().copied().chain([c]).collect::<Vec<_>>());
-        let own = evidence(candidate);
+        let (own, nothing) = (evidence(candidate), self.ln_evidence(&others));
         let weights: Vec<(usize, f64)> = usable
             .iter()
             .filter(|c| !set.contains(c))
             .map(|c| (*c, (evidence(*c) - own).min(0.0).exp()))
-            .filter(|(_, weight)| *weight > 1e-3)
+            .filter(|(c, weight)| *weight > 1e-3 && (own > nothing || evidence(*c) > nothing))
             .collect();
         let sum = 1.0 + weights.iter().map(|(_, w)| w).sum::<f64>();
         fitted.probability = sum.recip();
