@@ -433,9 +433,9 @@ impl Quadratic {
         quadratic
     }
 
-    /// A candidate of a set, with those of the `usable` ones that explain as much in its place. Beside one that has less
-    /// evidence than nothing, as an event after a search of every time may have, they need more evidence than nothing:
-    /// whatever explains nothing would be as likely.
+    /// A candidate of a set, with those of the `usable` ones that explain as much in its place. Beside one that has
+    /// less evidence than nothing, as an event after a search of every time may have, they need more evidence than
+    /// nothing: whatever explains nothing would be as likely.
     pub fn with_alternatives(&self, candidate: usize, set: &[usize], usable: &[usize]) -> Fitted {
         let mut fitted = self.beside(candidate, set);
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != candidate).collect();
