@@ -455,3 +455,18 @@ pub(crate) fn contradict(diagnosis: &mut Diagnosis, products: &[Written]) {
         diagnosis.reasons.push(format!("the recursive and the batch solution of {} disagree", names.join(", ")));
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What explains a level on several days is what does on each of them; evidence adds.
+    #[test]
+    fn rivals_of_several_days_are_those_of_each() {
+        let rival = |name: &str, ln_odds: f64| Rival { name: name.to_owned(), ln_odds, chi2: 1.0 };
+        let days = [vec![rival("a", -1.0), rival("b", -2.0)], vec![rival("b", 0.5)]];
+        let all = rivals_of_all(&days.each_ref().map(Vec::as_slice));
+        assert_eq!(all, [Rival { chi2: 2.0, ..rival("b", -1.5) }]);
+        assert!(rivals_of_all(&[&days[0], &[]]).is_empty());
+    }
+}
