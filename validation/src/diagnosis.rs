@@ -103,8 +103,7 @@ pub(crate) struct Plan {
 
 /// Seeds of a block in which every length has the same number of sets, and a quarter of each is foreign.
 const BLOCK: u32 = 20;
-/// Distance of the seeds of one length from those of the next, so that lengths share no telemetry. It also keeps the
-/// bundled simulator's seeds apart from those of the blind campaign.
+/// Distance of the seeds of one length from those of the next, so that lengths share no telemetry.
 const SEEDS_PER_LENGTH: u32 = 100_000;
 /// Offset of the seeds of sets in which nothing is hidden.
 const CLEAN_SEEDS: u32 = 50_000;

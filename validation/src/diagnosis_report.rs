@@ -3,7 +3,10 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 
+use dragfree_chart::ChartError;
+use dragfree_chart::matrix::{Matrix, svg};
 use nalgebra::{DMatrix, DVector};
+use serde_json::Value;
 
 use crate::records::{Acted, Diagnosed, Solution};
 use crate::stats;
@@ -176,6 +179,19 @@ fn is_told_unexplained(line: &Diagnosed) -> bool {
         .is_some_and(|a| (a.verdict == "unexplained" || a.unexplained.is_object()) && a.false_causes.is_empty())
 }
 
+/// Whether one of the first three terms that are told of what is unexplained is made of what drives an effect.
+fn tells_driver(line: &Diagnosed, effect: &Acted) -> bool {
+    let drivers: &[&str] = match effect.name.split(':').next() {
+        Some("current-force") => &["battery_current_a"],
+        Some("product-force") => &["battery_current_a", "structure_temperature_k"],
+        Some("current-squared") => &["bus_current_a"],
+        Some("current-by-panel") => &["bus_current_a", "panel_k"],
+        _ => return false,
+    };
+    let terms = line.answer.iter().flat_map(|a| a.unexplained["coherent_with"].as_array().into_iter().flatten());
+    terms.take(3).filter_map(Value::as_str).any(|term| drivers.iter().all(|driver| term.contains(driver)))
+}
+
 fn names_false_cause(line: &Diagnosed) -> bool {
     line.answer.as_ref().is_some_and(|a| !a.false_causes.is_empty())
 }
@@ -253,6 +269,14 @@ fn rows(free: &DMatrix<f64>) -> Vec<Row<'_>> {
             Box::new(|lines| {
                 let loud = lines.iter().filter(|l| single(l, false).is_some_and(|e| e.drawn_significance > 8.0));
                 Measured::share(loud.map(|l| is_told_unexplained(l)))
+            }),
+        ),
+        (
+            "the same: what drives it among the first three that are told",
+            Bar::AtLeast(80),
+            Box::new(|lines| {
+                let loud = lines.iter().filter_map(|l| Some((l, single(l, false)?)));
+                Measured::share(loud.filter(|(_, e)| e.drawn_significance > 8.0).map(|(l, e)| tells_driver(l, e)))
             }),
         ),
         (
@@ -364,6 +388,59 @@ fn kinds(lines: &[&Diagnosed]) -> String {
         let _ = writeln!(text, "| `{kind}` | {producer} | {above} | {below} |");
     }
     text + "\n"
+}
+
+/// Significance of a hidden effect that should be found.
+const PLAIN: f64 = 6.0;
+/// Label of a set in which nothing is hidden.
+const NOTHING: &str = "nothing";
+
+/// Confusion matrices of the sets with at most one effect: hidden effect against first answer. `None` without results.
+pub(crate) fn picture(lines: &[Diagnosed]) -> Result<Option<String>, ChartError> {
+    let kind = |name: &str| name.split(':').next().unwrap_or(name).to_owned();
+    let mut tables = Vec::new();
+    for (title, wanted) in
+        [("Hidden above 6σ (rows), said first (columns)", true), ("Hidden below 6σ, or nothing", false)]
+    {
+        let mut counts: BTreeMap<(String, String), usize> = BTreeMap::new();
+        let mut known: BTreeMap<String, bool> = BTreeMap::new();
+        for line in lines {
+            let hidden = match line.effects.as_slice() {
+                [] if !wanted => NOTHING.to_owned(),
+                [one] if (significance(line, one) > PLAIN) == wanted => kind(&one.name),
+                _ => continue,
+            };
+            let Some(answer) = &line.answer else { continue };
+            let said = answer.named.first().map_or_else(|| answer.verdict.clone(), |name| kind(name));
+            known.insert(hidden.clone(), line.effects.iter().all(|e| e.known));
+            *counts.entry((hidden, said)).or_default() += 1;
+        }
+        if counts.is_empty() {
+            continue;
+        }
+        // Nothing, and kinds that no effect covers, come last, with the answers that belong to them.
+        let order = |name: &String| {
+            (matches!(name.as_str(), NOTHING | "sufficient" | "unexplained"), known.get(name) == Some(&false))
+        };
+        let sorted = |names: BTreeSet<&String>| {
+            let mut names: Vec<String> = names.into_iter().cloned().collect();
+            names.sort_by_key(order);
+            names
+        };
+        let rows = sorted(counts.keys().map(|(hidden, _)| hidden).collect());
+        let columns = sorted(counts.keys().map(|(_, said)| said).collect());
+        let belongs = |row: &String, column: &String| match (row.as_str(), known.get(row)) {
+            (NOTHING, _) => column == "sufficient",
+            (_, Some(false)) => column == "unexplained",
+            _ => column == row,
+        };
+        let cells = |i: usize| (0..columns.len()).map(move |j| (i, j));
+        let right = (0..rows.len()).flat_map(cells).filter(|(i, j)| belongs(&rows[*i], &columns[*j])).collect();
+        let count = |row: &String, column: &String| counts.get(&(row.clone(), column.clone())).copied().unwrap_or(0);
+        let counts = rows.iter().map(|row| columns.iter().map(|column| count(row, column)).collect()).collect();
+        tables.push(Matrix { title: title.to_owned(), rows, columns, counts, right });
+    }
+    if tables.is_empty() { Ok(None) } else { svg(&tables).map(Some) }
 }
 
 /// The counts of the bars in a few lines, for the end of a campaign.

@@ -1,8 +1,6 @@
 //! Measurements behind VALIDATION.md: seeded campaigns of the program, statistics with bounds, information bounds from
 //! the mission's noise, and the report generated from committed results.
 
-mod blind;
-mod blind_report;
 mod bound;
 mod campaign;
 mod diagnosis;
@@ -51,8 +49,6 @@ enum Command {
     Coverage(Coverage),
     /// The table to beat: 25 days in three regimes of noise; goes on where it was stopped
     Table(Table),
-    /// Hide effects, diagnose, and score when the seals are opened; goes on where it was stopped
-    Blind(Blind),
     /// Diagnose sets of 2 h to 3 × 24 h by two producers and score them; goes on where it was stopped, with the program
     /// of the commit that the results name
     Diagnosis(Diagnosis),
@@ -101,22 +97,6 @@ struct Table {
     #[arg(long, default_value_t = report::TABLE_DAYS, value_parser = clap::value_parser!(u32).range(1..))]
     days: u32,
     /// Regimes at a time; 25 days of one take 14 GB of the scratch folder
-    #[arg(long, default_value_t = AT_ONCE)]
-    at_once: usize,
-    /// File of results
-    #[arg(long, value_name = "FILE")]
-    results: Option<PathBuf>,
-}
-
-#[derive(Debug, Args)]
-struct Blind {
-    /// Seeds, FIRST-LAST; those up to 100 served to develop the method
-    #[arg(long, value_parser = seeds, default_value = "101-300")]
-    seeds: RangeInclusive<u32>,
-    /// Length of the data, h
-    #[arg(long, default_value_t = 6.0)]
-    hours: f64,
-    /// Diagnoses at a time; each takes some 2 GB of memory
     #[arg(long, default_value_t = AT_ONCE)]
     at_once: usize,
     /// File of results
@@ -258,10 +238,6 @@ fn execute(arguments: &Arguments) -> Result<(), CampaignError> {
         Command::Table(t) => {
             let file = t.results.as_ref().unwrap_or(&table_file);
             table::table(&Program::build()?, &t.seeds, t.days, t.at_once, file, &scratch)
-        }
-        Command::Blind(b) => {
-            let file = b.results.clone().unwrap_or_else(|| results.join("blind.jsonl"));
-            blind::blind(&Program::build()?, b.seeds.clone(), b.hours, b.at_once, &file, &scratch)
         }
         Command::Diagnosis(d) => {
             let file = d.results.clone().unwrap_or_else(|| results.join("diagnosis.jsonl"));

@@ -189,11 +189,6 @@ impl Program {
         output(self.command().arg("model").args(words), &[0]).map(|_| ())
     }
 
-    /// Runs `dragfree diagnose` on a product.
-    pub(crate) fn diagnose(&self, product: &Value, archive: &Path) -> Result<Value, CampaignError> {
-        self.diagnose_together(std::slice::from_ref(product), archive, &[])
-    }
-
     /// Runs `dragfree diagnose` on products of one model, with additional arguments.
     pub(crate) fn diagnose_together(
         &self,

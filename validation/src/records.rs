@@ -129,49 +129,6 @@ impl Keyed for Line {
     }
 }
 
-/// Result of one seed of the blind campaign.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(crate) struct Blind {
-    /// Length and kind of the data.
-    pub(crate) configuration: String,
-    /// Seed of hidden effects and noise.
-    pub(crate) seed: u32,
-    /// Digest of the plugins' libraries, twelve hexadecimal digits.
-    pub(crate) build: String,
-    /// Duration of the diagnosis, s.
-    pub(crate) diagnosis_s: f64,
-    /// Score by `reveal`.
-    pub(crate) score: Value,
-    /// Offset by the model without additions.
-    pub(crate) before: Solution,
-    /// Offset by the extended model; `None` if nothing could be added or a false cause was accepted.
-    pub(crate) after: Option<After>,
-}
-
-/// An extended model.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub(crate) struct After {
-    /// Added effects.
-    pub(crate) added: Vec<String>,
-    /// Offset from the same telemetry.
-    pub(crate) offset: Solution,
-    /// χ²/dof of telemetry that no fit has used: model before, model after, and with the true values; `None` if the
-    /// truth has no value that a model can take.
-    pub(crate) held_out_chi2_per_dof: [Option<f64>; 3],
-}
-
-impl Keyed for Blind {
-    fn key(&self) -> (String, u32) {
-        (self.configuration.clone(), self.seed)
-    }
-
-    fn made_with(&self) -> &str {
-        &self.build
-    }
-}
-
 /// Result of one set of the diagnosis campaign.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -7,7 +7,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-use crate::blind_report;
 use crate::bound::free_space;
 use crate::campaign::{NOMINAL, TWINS, Twin, note, taiji};
 use crate::diagnosis_report;
@@ -19,7 +18,7 @@ use crate::limits::{self, Limits};
 use crate::months::{self, Months};
 use crate::peers::Peers;
 use crate::program::root;
-use crate::records::{Blind, Diagnosed, Line, Solution, read, read_document};
+use crate::records::{Diagnosed, Line, Solution, read, read_document};
 use crate::soak::{self, Soak};
 use crate::speed::Speed;
 use crate::stats::{self, Bounds};
@@ -49,8 +48,6 @@ pub(crate) struct Measured {
     pub(crate) peers: Option<Peers>,
     /// How time and memory grow.
     pub(crate) growth: Option<Growth>,
-    /// Blind campaign.
-    pub(crate) blind: Vec<Blind>,
     /// Diagnosis campaign.
     pub(crate) diagnosis: Vec<Diagnosed>,
     /// What data of each length can say.
@@ -74,7 +71,6 @@ impl Measured {
             speed: read_document(&folder.join("speed.json"))?,
             peers: read_document(&folder.join("peers.json"))?,
             growth: read_document(&folder.join("growth.json"))?,
-            blind: read(&folder.join("blind.jsonl"))?,
             diagnosis: read(&folder.join("diagnosis.jsonl"))?,
             limits: read(&folder.join("limits.jsonl"))?,
             months: read(&folder.join("months.jsonl"))?,
@@ -570,8 +566,6 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
     let speed = measured.speed.as_ref().map_or_else(missing, Speed::table);
     let peers = measured.peers.as_ref().map_or_else(missing, Peers::table);
     let growth = measured.growth.as_ref().map_or_else(missing, Growth::table);
-    let (blind, more) = blind_report::numbers(&measured.blind);
-    failed.extend(more);
     let (diagnosis, more) = diagnosis_report::numbers(&measured.diagnosis, &free);
     failed.extend(more);
     let (months, more) = months::table(&measured.months);
@@ -584,7 +578,7 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
     failed.extend(more);
     let drawn = [
         ("coverage", picture(&measured.coverage, &free)),
-        ("confusion", blind_report::picture(&measured.blind)),
+        ("confusion", diagnosis_report::picture(&measured.diagnosis)),
         ("growth", measured.growth.as_ref().map(Growth::picture).transpose()),
     ];
     let mut pictures = Vec::new();
@@ -599,7 +593,6 @@ pub(crate) fn report(measured: &Measured) -> Result<Report, CampaignError> {
         ("speed", speed),
         ("peers", peers),
         ("growth", growth),
-        ("blind", blind),
         ("diagnosis", diagnosis),
         ("limits", limits::table(&measured.limits)),
         ("months", months),

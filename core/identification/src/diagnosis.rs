@@ -37,6 +37,8 @@ pub struct Found {
     pub unit: String,
     /// Values of the shape parameters.
     pub shape: Map<String, Value>,
+    /// σ of those of them that were fitted, in their units.
+    pub shape_sigma: BTreeMap<String, f64>,
     /// Every coefficient of the effect: name, value, σ, unit.
     pub coefficients: Vec<Value>,
     /// Fall of χ².

@@ -138,6 +138,7 @@ pub(crate) fn found(
             Some(p) => p.entry.parameters.iter().map(|(k, value)| (k.clone(), json!(value))).collect(),
             None => place.shape.clone().into_iter().collect(),
         },
+        shape_sigma: decided.shape_sigma(place),
         coefficients: own
             .iter()
             .zip(&values)
@@ -152,7 +153,7 @@ pub(crate) fn found(
         delta_bic: dof * decided.numbers.ln() - fitted.gain,
         in_range: own.iter().zip(&fitted.values).all(|(i, value)| match &decided.parameters[*i].1 {
             Meaning::Coefficient(c) => c.lower < *value && *value < c.upper,
-            Meaning::Level | Meaning::Power => true,
+            Meaning::Level | Meaning::Power | Meaning::Number(_) => true,
         }),
         chi2_per_dof_before: if accepted { before + fitted.gain / decided.numbers } else { before },
         chi2_per_dof_after: if accepted { before } else { before - fitted.gain / decided.numbers },
@@ -172,6 +173,22 @@ pub(crate) fn found(
         }),
         constancy: Constancy::of(&by_product),
         by_product,
+    }
+}
+
+/// Gives a named effect the form and the values that it has where the numbers in its form are fitted.
+pub(crate) fn fit_form(named: &mut Found, fitted: &Decided, evidence: &Evidence<'_>, settings: &Settings) {
+    let is_it = |f: &&Fitted| {
+        let place = &fitted.candidates[f.candidate];
+        (&place.effect, &place.instance) == (&named.effect, &named.instance)
+    };
+    if let Some(f) = fitted.selection.chosen.iter().find(is_it) {
+        let own = found(settings, fitted, f, evidence, true);
+        named.coefficient = own.coefficient;
+        (named.value, named.sigma, named.unit) = (own.value, own.sigma, own.unit);
+        (named.shape, named.shape_sigma) = (own.shape, own.shape_sigma);
+        (named.coefficients, named.in_range) = (own.coefficients, own.in_range);
+        (named.offset_shift_m, named.offset_shift_sigma) = (own.offset_shift_m, own.offset_shift_sigma);
     }
 }
 
@@ -325,6 +342,7 @@ fn louder(levels: &[NoiseLevel], chi2: f64, numbers: f64, evidence: &Evidence<'_
             sigma,
             unit: "1".to_owned(),
             shape: serde_json::Map::new(),
+            shape_sigma: BTreeMap::new(),
             delta_chi2: gain,
             p_value,
             log10_p_value,

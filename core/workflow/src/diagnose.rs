@@ -24,11 +24,12 @@ use serde_json::json;
 
 use crate::WorkflowError;
 use crate::answer::{
-    Evidence, apart, contradict, drifting, found, limits, noise_levels, offsets, verdict, with_levels,
+    Evidence, apart, contradict, drifting, fit_form, found, limits, noise_levels, offsets, verdict, with_levels,
 };
 use crate::extract::{Extract, MadeOf};
 use crate::likelihood::{
-    Decided, PASSES, Place, Point, Settled, moved, one_pass, step, step_of_model, transients_near_ends,
+    Decided, How, PASSES, Place, Point, Settled, moved, one_pass, step, step_of_model, transients_near_ends,
+    with_numbers,
 };
 use crate::proposals::{FORMULA, Proposal, probes, proposals};
 use crate::replay::{FINE, Forms, Pass, Replay, What, sum};
@@ -87,6 +88,9 @@ pub fn diagnose(
     let decided = &last.end.decided;
     let scorer = spectra.scorer(settings);
     let mut diagnosis = answer(settings, &spectra.record, &scorer, decided, &last.screened, &evidence, &last.moving)?;
+    if let Some(fitted) = with_numbers(replay, &last.end, &evidence, progress)? {
+        diagnosis.candidates.iter_mut().filter(|f| f.accepted).for_each(|f| fit_form(f, &fitted, &evidence, settings));
+    }
     contradict(&mut diagnosis, products);
     let extract = match products {
         [product] if keeps => {
@@ -252,13 +256,17 @@ fn decide(
     loop {
         let forms = spectra.forms(&screened, &evidence.proposals);
         let chosen: Vec<EffectEntry> = forms.iter().map(|form| evidence.entry(form)).collect();
-        let decided = one_pass(replay, &chosen, &slow, opening, &point, evidence, progress)?;
-        let next = step(&point, &decided);
         if opening {
+            let decided = one_pass(replay, &chosen, &slow, How::Opening, &point, evidence, progress)?;
+            point = step(&point, &decided);
             opening = false;
-            point = next;
-            continue;
         }
+        if passes > 0 {
+            let named: Vec<EffectEntry> = named.iter().map(|form| evidence.entry(form)).collect();
+            point = settle(replay, &named, &slow, point, evidence, progress)?;
+        }
+        let decided = one_pass(replay, &chosen, &slow, How::Select, &point, evidence, progress)?;
+        let next = step(&point, &decided);
         passes += 1;
         let mut now = named_forms(&decided, &forms);
         if now.iter().any(|form| form.parts.is_empty()) {
@@ -296,6 +304,28 @@ fn decide(
     }
 }
 
+/// Passes with what is named alone, until levels of noise and values stay: they take a small part of the time of one
+/// with all candidates.
+fn settle(
+    replay: &Replay<'_>,
+    named: &[EffectEntry],
+    slow: &[NoiseProcess],
+    mut point: Point,
+    evidence: &Evidence<'_>,
+    progress: &mut dyn FnMut(Pass, usize, Progress),
+) -> Result<Point, WorkflowError> {
+    for _ in 0..PASSES {
+        let fitted = one_pass(replay, named, slow, How::Fit, &point, evidence, progress)?;
+        let next = step(&point, &fitted);
+        let settled = moved(&point, &next, &fitted).is_empty();
+        point = next;
+        if settled {
+            break;
+        }
+    }
+    Ok(point)
+}
+
 /// Where the passes begin: the model as the spectra have it, and slow forces beside the declared noise that its
 /// residuals show. A glitch is no slow force, although it has the power of one.
 fn start_of_passes(spectra: &Spectra, settings: &Settings) -> Result<(Point, Vec<NoiseProcess>), WorkflowError> {
@@ -303,10 +333,10 @@ fn start_of_passes(spectra: &Spectra, settings: &Settings) -> Result<(Point, Vec
     let fit = scorer.fit(&[])?;
     let model = &set.coefficients[..set.model()];
     let values = model.iter().zip(fit.estimate.theta.iter()).map(|(c, value)| (c.name.clone(), *value)).collect();
-    let seen = unexplained(scorer.gathered.transients.certain(settings.false_alarm), &[], settings.same_transient_s);
+    // Of those at one place all, as the most significant may be another than what acts.
     let events = |c: &&Candidate| {
-        let of = |d: &&Detection| (&d.effect, &d.instance) == (&c.effect, &c.instance);
-        c.transient && seen.iter().any(of)
+        let of = |d: &Detection| (&d.effect, &d.instance) == (&c.effect, &c.instance);
+        c.transient && scorer.gathered.transients.certain(settings.false_alarm).any(of)
     };
     let events: Vec<Candidate> = spectra.screened.forms.iter().filter(events).cloned().collect();
     let slow = slow_forces(&scorer, &scorer.fit(&events)?, &spectra.record.noise);
@@ -344,9 +374,9 @@ fn about_model(
     let mut point = step_of_model(&last.end.point, &last.end.decided);
     // The first of the two finds the means of series that are new. Levels are those beside what is named.
     point.levels.clone_from(&last.end.point.levels);
-    let opening = one_pass(replay, &entries, &last.end.slow, true, &point, evidence, progress)?;
+    let opening = one_pass(replay, &entries, &last.end.slow, How::Opening, &point, evidence, progress)?;
     point = step(&point, &opening);
-    one_pass(replay, &entries, &last.end.slow, false, &point, evidence, progress)
+    one_pass(replay, &entries, &last.end.slow, How::Select, &point, evidence, progress)
 }
 
 /// Of what is named with a lag, a resonance or another number in its shape the forms of its search that differ from it

@@ -21,11 +21,13 @@ use nalgebra::{DMatrix, DVector};
 mod drifts;
 mod ends;
 mod experiment;
+mod numbers;
 mod pass;
 mod stretches;
 
 pub(crate) use ends::transients_near_ends;
 pub(crate) use experiment::{Experiment, InBlock, Settled, information};
+pub(crate) use numbers::with_numbers;
 use pass::{At, Constant, Filtered};
 pub(crate) use stretches::{Alone, Stretches};
 use stretches::{Stretch, stretches};
@@ -63,6 +65,8 @@ pub(crate) struct Point {
     means: Vec<Means>,
     /// States at the start of each stretch, by product.
     starts: Vec<Vec<DVector<f64>>>,
+    /// First rows, by product, Unix ns: to these the starts belong. A pass with fewer series has more rows.
+    first_ns: Vec<i64>,
 }
 
 impl Point {
@@ -81,6 +85,19 @@ pub(crate) enum Meaning {
     Level,
     /// A power of time in a channel of one product.
     Power,
+    /// How much a number in the form of an effect is larger, as its logarithm or a time in s; σ of that before any data.
+    Number(f64),
+}
+
+/// What a pass is for.
+#[derive(Clone, Copy, PartialEq)]
+pub(crate) enum How {
+    /// It fits constants and the model beside what is named.
+    Opening,
+    /// It fits all candidates.
+    Fit,
+    /// It chooses among the candidates.
+    Select,
 }
 
 impl Meaning {
@@ -137,6 +154,8 @@ pub(crate) struct Decided {
     means: Vec<Means>,
     /// Starts of the stretches, by product.
     starts: Vec<Vec<Start>>,
+    /// First rows, by product, Unix ns.
+    first_ns: Vec<i64>,
     /// Candidates that could not be tried, and why.
     pub(crate) not_tried: Vec<(String, String)>,
 }
@@ -235,7 +254,7 @@ pub(crate) fn joined(
         all.surveys = product.surveys;
         all.channels.extend(product.channels);
     }
-    all.decided(&Point::default(), settings, judge, not_tried)
+    all.decided(&Point::default(), How::Select, settings, judge, not_tried)
 }
 
 /// What the decision needs to know of candidates.
@@ -276,15 +295,20 @@ fn to_values(from: &Point, decided: &Decided, values: &DVector<f64>, chosen: &BT
                 to.levels.insert(name.clone(), (before + moved).exp());
             }
             Meaning::Power => drop(to.powers.insert(name.clone(), value)),
+            Meaning::Number(_) => {}
         }
     }
     for constant in &decided.constants {
         let own = constant.at(&to.values);
         to.powers.entry(constant.power.clone()).and_modify(|value| *value -= own);
     }
-    to.means.clone_from(&decided.means);
+    // Series that are not in this pass keep the means that they had.
+    to.means.clone_from(&from.means);
+    to.means.resize_with(decided.means.len(), Means::new);
+    to.means.iter_mut().zip(&decided.means).for_each(|(all, own)| all.extend(own.clone()));
     let moved = values - DVector::from_column_slice(&decided.start);
     let state = |start: &Start| &start.state + &start.slope * &moved;
+    to.first_ns.clone_from(&decided.first_ns);
     to.starts = decided.starts.iter().map(|product| product.iter().map(state).collect()).collect();
     to
 }
@@ -305,7 +329,7 @@ pub(crate) fn moved(from: &Point, to: &Point, decided: &Decided) -> BTreeSet<Str
                 step if step > TWO_DIGITS => return true,
                 step => step.powi(2),
             },
-            Meaning::Power => return false,
+            Meaning::Power | Meaning::Number(_) => return false,
         };
         left > REACHED_SIGMAS * **sigma
     });
@@ -320,11 +344,24 @@ pub(crate) fn one_pass(
     replay: &Replay<'_>,
     chosen: &[EffectEntry],
     slow: &[NoiseProcess],
-    opening: bool,
+    how: How,
     point: &Point,
     judge: &dyn Judge,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Decided, WorkflowError> {
+    let (joined, not_tried) = sums_of_pass(replay, chosen, slow, how, point, progress)?;
+    Ok(joined.decided(point, how, replay.settings()?, judge, not_tried))
+}
+
+/// The sums of one pass over all products, and what could not be tried.
+fn sums_of_pass(
+    replay: &Replay<'_>,
+    chosen: &[EffectEntry],
+    slow: &[NoiseProcess],
+    how: How,
+    point: &Point,
+    progress: &mut dyn FnMut(Pass, usize, Progress),
+) -> Result<(Joined, Vec<(String, String)>), WorkflowError> {
     let settings = replay.settings()?;
     let levels = noise_levels(replay.products);
     let mut joined = Joined::default();
@@ -343,6 +380,7 @@ pub(crate) fn one_pass(
             threads: replay.threads,
             batch_rows: replay.batch_rows,
         };
+        let opening = how == How::Opening;
         let block_s = (!opening).then_some(BLOCK_S);
         let at = At { point, slow, opening, number, block_s, data: true, search: false, waveforms: &[] };
         let link = |chain: &Chain| Filtered::link(chain, at, settings, replay.threads);
@@ -351,7 +389,7 @@ pub(crate) fn one_pass(
         not_tried.extend(refused);
         joined.add(filtered, &mut not_tried, settings);
     }
-    Ok(joined.decided(point, settings, judge, not_tried))
+    Ok((joined, not_tried))
 }
 
 /// Sums of several products, by the names of the parameters.
@@ -363,6 +401,7 @@ struct Joined {
     parts: Vec<Part>,
     constants: Vec<Constant>,
     means: Vec<Means>,
+    first_ns: Vec<i64>,
 }
 
 /// Sums of one product.
@@ -417,6 +456,7 @@ fn no_sums(parameters: usize) -> Sums {
 impl Joined {
     fn add(&mut self, filtered: Filtered, not_tried: &mut Vec<(String, String)>, settings: &Settings) {
         self.means.push(filtered.means());
+        self.first_ns.push(filtered.first_ns.unwrap_or(i64::MIN));
         let Filtered { parameters, surveys, channels, gaps, innovations, constants, .. } = filtered;
         self.constants.extend(constants);
         let gappy = gaps.refused(settings);
@@ -447,6 +487,7 @@ impl Joined {
     fn decided(
         self,
         point: &Point,
+        how: How,
         settings: &Settings,
         judge: &dyn Judge,
         not_tried: Vec<(String, String)>,
@@ -456,13 +497,16 @@ impl Joined {
         let mut start = Vec::new();
         let mut priors = Vec::new();
         for (i, (name, meaning)) in parameters.iter().enumerate() {
+            let is_another_form = parameters[..i].iter().any(|(other, _)| other == name);
             start.push(match meaning {
+                Meaning::Coefficient(_) if is_another_form => 0.0,
                 Meaning::Coefficient(_) => point.values.get(name).copied().unwrap_or(0.0),
                 Meaning::Level => point.levels.get(name).copied().unwrap_or(1.0).ln(),
                 Meaning::Power => point.powers.get(name).map_or(0.0, |value| {
                     let means = self.constants.iter().filter(|c| c.power == *name).map(|c| c.at(&point.values));
                     value + means.sum::<f64>()
                 }),
+                Meaning::Number(_) => 0.0,
             });
             match meaning {
                 Meaning::Coefficient(c) if c.candidate => {
@@ -483,6 +527,9 @@ impl Joined {
                     priors.push((vec![(i, 1.0)], Prior { mean: c.initial, sigma: c.prior_sigma }));
                 }
                 Meaning::Level => priors.push((vec![(i, 1.0)], Prior { mean: 0.0, sigma: LEVEL_PRIOR })),
+                Meaning::Number(sigma) if sigma.is_finite() => {
+                    priors.push((vec![(i, 1.0)], Prior { mean: 0.0, sigma: *sigma }));
+                }
                 _ => {}
             }
         }
@@ -522,13 +569,16 @@ impl Joined {
         let by_product = if self.parts.len() > 1 { self.parts.iter().map(of_product).collect() } else { Vec::new() };
         let quadratic = Quadratic::new(&sums, &start, &priors, candidates);
         let log10_p = |c: usize, gain: f64| judge.log10_p(&groups[c].effect, gain, groups[c].parameters.len());
-        let selection = quadratic.select(&Evidence {
-            log10_p: &log10_p,
-            bound: settings.false_alarm.log10(),
-            most: settings.max_added,
-            remainder: settings.excess_remainder,
-            range: settings.range_sigmas.powi(2),
-        });
+        let selection = match how {
+            How::Select => quadratic.select(&Evidence {
+                log10_p: &log10_p,
+                bound: settings.false_alarm.log10(),
+                most: settings.max_added,
+                remainder: settings.excess_remainder,
+                range: settings.range_sigmas.powi(2),
+            }),
+            How::Opening | How::Fit => quadratic.with_all(),
+        };
         Decided {
             selection,
             parameters,
@@ -543,6 +593,7 @@ impl Joined {
             channels: self.channels,
             constants: self.constants,
             means: self.means,
+            first_ns: self.first_ns,
             start,
             starts,
             not_tried,

@@ -147,7 +147,7 @@ impl Basis {
         let coefficients: Vec<Coefficient> = decided.parameters.iter().filter_map(coefficient).collect();
         let beside = |i: usize| match &decided.parameters[i].1 {
             Meaning::Coefficient(c) => extracts.iter().all(|e| e.has_beside(c) || e.place(c).is_none()),
-            Meaning::Level | Meaning::Power => false,
+            Meaning::Level | Meaning::Power | Meaning::Number(_) => false,
         };
         let switches = switches(&decided, beside);
         let mut days = Vec::new();
@@ -421,7 +421,7 @@ impl On {
 fn coefficient((_, meaning): &(String, Meaning)) -> Option<Coefficient> {
     match meaning {
         Meaning::Coefficient(c) => Some((**c).clone()),
-        Meaning::Level | Meaning::Power => None,
+        Meaning::Level | Meaning::Power | Meaning::Number(_) => None,
     }
 }
 

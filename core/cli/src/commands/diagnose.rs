@@ -200,7 +200,8 @@ fn put(out: &mut String, f: &Found, different: f64) {
         out.push_str(&crate::text::labelled("    refused", reason));
     }
     for (key, value) in &f.shape {
-        let _ = writeln!(out, "    {key} = {value}");
+        let sigma = f.shape_sigma.get(key).map_or_else(String::new, |sigma| format!(" ± {sigma:.1e}"));
+        let _ = writeln!(out, "    {key} = {value}{sigma}");
     }
     let moved: Vec<String> = f
         .offset_shift_sigma

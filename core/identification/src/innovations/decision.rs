@@ -310,6 +310,14 @@ impl Quadratic {
         Selection { chosen, rest, unobservable, values, sigma }
     }
 
+    /// The set of all candidates.
+    pub fn with_all(&self) -> Selection {
+        let set: Vec<usize> = (0..self.candidates.len()).collect();
+        let (values, sigma) = self.solution(&set);
+        let chosen = set.iter().map(|c| self.beside(*c, &set)).collect();
+        Selection { chosen, rest: Vec::new(), unobservable: Vec::new(), values, sigma }
+    }
+
     /// The least significant member of a set, if it is not significant beside the others.
     fn weakest(&self, set: &[usize], evidence: &Evidence<'_>) -> Option<usize> {
         let all = set.iter().map(|c| (*c, self.log10_p(*c, set, evidence)));

@@ -85,7 +85,7 @@ impl Decided {
                 Some(Changing { parameter: i, with_value })
             }
             Meaning::Level => Some(Changing { parameter: i, with_value: false }),
-            Meaning::Power => None,
+            Meaning::Power | Meaning::Number(_) => None,
         };
         (0..self.parameters.len()).filter_map(of).collect()
     }
@@ -122,7 +122,7 @@ impl Decided {
         let rate = |(k, c): (usize, &Changing)| {
             let [lower, upper] = match &self.parameters[c.parameter].1 {
                 Meaning::Coefficient(of) => [of.lower, of.upper],
-                Meaning::Level | Meaning::Power => [f64::NEG_INFINITY, f64::INFINITY],
+                Meaning::Level | Meaning::Power | Meaning::Number(_) => [f64::NEG_INFINITY, f64::INFINITY],
             };
             // A value that stays in its range cannot change by more than its width.
             let fastest = (upper - lower) / days;
@@ -150,7 +150,7 @@ impl Decided {
         let ends = [-0.5, 0.5].map(|part| middle + part * days * per_day);
         let (unit, [at_start, at_end]) = match meaning {
             Meaning::Coefficient(c) => (c.unit.clone(), ends),
-            Meaning::Level | Meaning::Power => ("1".to_owned(), ends.map(f64::exp)),
+            Meaning::Level | Meaning::Power | Meaning::Number(_) => ("1".to_owned(), ends.map(f64::exp)),
         };
         Drift {
             coefficient: name.clone(),

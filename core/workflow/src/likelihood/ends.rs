@@ -11,7 +11,7 @@ use dragfree_identification::waveform::Waveform;
 use dragfree_schema::PREDICTION_NEED;
 
 use super::pass::{At, Filtered, Placed};
-use super::{Judge, Point, one_pass, step};
+use super::{How, Judge, Point, one_pass, step};
 use crate::WorkflowError;
 use crate::replay::{AT_NS, Pass, Replay, noise_levels};
 
@@ -42,7 +42,7 @@ pub(crate) fn transients_near_ends(
     let adopted = replay.products.iter().flat_map(|p| p.product.result.adopted());
     let start = Point::at(adopted.map(|c| (c.name.clone(), c.value)).collect());
     // Constants are many σ of the noise, and a filter would take them for transients.
-    let opening = one_pass(replay, &[], &[], true, &start, &NoCandidates, progress)?;
+    let opening = one_pass(replay, &[], &[], How::Opening, &start, &NoCandidates, progress)?;
     let point = step(&start, &opening);
     let mut found = Transients::default();
     for number in 0..replay.products.len() {

@@ -119,6 +119,9 @@ pub(super) struct Filtered {
     pub(super) constants: Vec<Constant>,
     pub(super) gaps: Gaps,
     patience: u64,
+    /// First row at the earliest, and as it is, Unix ns.
+    not_before_ns: i64,
+    pub(super) first_ns: Option<i64>,
     /// Samples per second.
     pub(super) rate_hz: f64,
     /// Series that no plugin makes, the last ones.
@@ -150,13 +153,6 @@ struct Factor {
 }
 
 impl Factor {
-    fn of(c: &Coefficient) -> Self {
-        Self {
-            name: (c.estimate || c.candidate).then(|| c.name.clone()),
-            value: if c.candidate { 0.0 } else { c.initial },
-        }
-    }
-
     fn at(&self, values: &BTreeMap<String, f64>) -> f64 {
         self.name.as_ref().and_then(|name| values.get(name)).copied().unwrap_or(self.value)
     }
@@ -287,14 +283,19 @@ impl<'a> Responses<'a> {
         self.terms.extend(products);
     }
 
+    /// A coefficient as a point has it. Of one that is there in several forms the first has its value, others none.
+    fn factor(&self, i: usize) -> Factor {
+        let c = self.coefficients[i];
+        let is_another_form = self.coefficients[..i].iter().any(|other| other.name == c.name);
+        Factor {
+            name: ((c.estimate || c.candidate) && !is_another_form).then(|| c.name.clone()),
+            value: if c.candidate { 0.0 } else { c.initial },
+        }
+    }
+
     /// Values of the coefficients at a point.
     fn values(&self, point: &Point) -> Vec<f64> {
-        let value = |c: &&Coefficient| match point.values.get(&c.name) {
-            Some(value) if c.estimate || c.candidate => *value,
-            _ if c.candidate => 0.0,
-            _ => c.initial,
-        };
-        self.coefficients.iter().map(value).collect()
+        (0..self.coefficients.len()).map(|i| self.factor(i).at(&point.values)).collect()
     }
 
     /// What a little of a coefficient adds to the channels.
@@ -473,7 +474,7 @@ impl Filtered {
         let constant_of = |channel: usize| format!("{} day^0 of product {number}", responses.names[channel]);
         let constant = |t: &Term| Constant {
             power: constant_of(t.channel),
-            coefficients: t.coefficients.iter().map(|i| Factor::of(responses.coefficients[*i])).collect(),
+            coefficients: t.coefficients.iter().map(|i| responses.factor(*i)).collect(),
             amount: t.factor * centres[t.series] / noise.system.unit[t.channel],
         };
         let constants: Vec<Constant> = responses.terms.iter().map(constant).collect();
@@ -540,6 +541,8 @@ impl Filtered {
             gaps: Gaps::of(&responses),
             rate_hz,
             patience: (settings.patience_s * rate_hz) as u64,
+            not_before_ns: point.first_ns.get(number).copied().unwrap_or(i64::MIN),
+            first_ns: None,
             innovations,
         };
         Ok((all, responses.columns(&available)?))
@@ -586,9 +589,10 @@ impl Sink for Filtered {
             self.gaps.never[..self.base].fill(false);
             self.gaps.rows += 1;
             self.gaps.measured += u64::from(measured);
-            if !begun {
+            if !begun || *time_ns < self.not_before_ns {
                 continue;
             }
+            self.first_ns.get_or_insert(*time_ns);
             for (s, x) in series.iter_mut().enumerate() {
                 if measured {
                     self.sums[s] += *x;
