@@ -5,7 +5,7 @@
 //! foreign producer are scored by names. If everything that was named is true, it is added to the model and the same
 //! telemetry is calibrated again.
 
-use std::ffi::OsString;
+use std::ffi::{OsStr, OsString};
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
@@ -277,7 +277,12 @@ impl Measurement<'_> {
             Err(CampaignError::Failed { message, .. }) => (None, Some(shortened(&message))),
             Err(error) => return Err(error),
         };
-        let (answer, effects) = self.scored(&made, said.as_ref())?;
+        let (answer, mut effects) = self.scored(&made, said.as_ref())?;
+        if let [one] = &mut effects[..]
+            && !one.known
+        {
+            one.significance_at_hand = self.known_force(&chain, &made, one)?;
+        }
         let mut line = Diagnosed {
             configuration: self.configuration.to_owned(),
             seed: self.set.seed,
@@ -375,6 +380,37 @@ impl Measurement<'_> {
         Ok((said.map(|_| answer), effects))
     }
 
+    /// Significance of a force that no effect covers, with the σ that `run` has with its formula in the model; none
+    /// where that fails.
+    fn known_force(&self, chain: &Chain, made: &Made, acted: &Acted) -> Result<Option<f64>, CampaignError> {
+        let Some((effect, place)) = acted.name.split_once(':') else { return Ok(None) };
+        let Some((expression, unit)) = formula_of(effect) else { return Ok(None) };
+        let model = self.folder.join("known.toml");
+        std::fs::copy(chain.model.as_deref().unwrap_or(Path::new("")), &model).map_err(|e| self.io(&e))?;
+        let (test_mass, axis) = place.split_once('.').unwrap_or((place, "x"));
+        let parameters = [
+            format!("acts_on={test_mass}.accel.{axis}"),
+            format!("expression={expression}"),
+            format!("unit={unit}"),
+            "range=-1e-8,1e-8".to_owned(),
+        ];
+        let parameters = parameters.iter().flat_map(|p| ["--set".as_ref(), p.as_ref()]);
+        let words = ["add".as_ref(), model.as_os_str(), "formula:known".as_ref()];
+        let chain = Chain { model: Some(model.clone()), ..chain.clone() };
+        let added = self.program.model(&words.into_iter().chain(parameters).collect::<Vec<&OsStr>>());
+        let products = match added.and_then(|()| self.run(&chain, made)) {
+            Err(CampaignError::Failed { .. }) => return Ok(None),
+            products => products?,
+        };
+        let sigma = |product: &Value| {
+            let all = product["coefficients"].as_array()?;
+            let own = all.iter().find(|c| c["name"] == "formula.known" && c["solution"] == "adopted")?;
+            own["sigma"].as_f64()
+        };
+        let information: f64 = products.iter().filter_map(sigma).map(|sigma| sigma.powi(-2)).sum();
+        Ok(Some(acted.size.abs() * information.sqrt()))
+    }
+
     /// Names of everything that was named, if all of it is true.
     fn all_true(&self, made: &Made, line: &Diagnosed, diagnosis: &Value) -> Vec<String> {
         let levels = if let Secret::Drawn(draw) = &made.secret { draw.true_levels(TRUE_LEVEL) } else { Vec::new() };
@@ -416,6 +452,17 @@ impl Measurement<'_> {
             Err(error) => Err(error),
         }
     }
+}
+
+/// A force of a kind that no effect covers as a formula of telemetry, with the unit of its size.
+fn formula_of(effect: &str) -> Option<(&'static str, &'static str)> {
+    Some(match effect {
+        "current-force" => ("lag(hk.battery_current_a ^ 2, 50)", "m s-2 A-2"),
+        "product-force" => ("(hk.battery_current_a - 2.1) * (hk.structure_temperature_k - 296.5)", "m s-2 A-1 K-1"),
+        "current-squared" => ("hk.bus_current_a ^ 2", "m s-2 A-2"),
+        "current-by-panel" => ("(hk.bus_current_a - 2) * (hk.panel_k - 310)", "m s-2 A-1 K-1"),
+        _ => return None,
+    })
 }
 
 /// The beginning of a message, for a result line.

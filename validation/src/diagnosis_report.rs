@@ -138,9 +138,9 @@ impl Bar {
 
 /// Significance with the σ of the diagnosis; as drawn where it states none. The σ of an effect that is not named is
 /// that beside everything that is: something false in its place would widen it, and hide that it was missed. The larger
-/// significance counts then.
+/// significance counts then. Of a kind that no effect covers it is that of `run` with its formula in the model.
 fn significance(line: &Diagnosed, acted: &Acted) -> f64 {
-    let beside_others = !acted.named && line.answer.as_ref().is_some_and(|a| !a.named.is_empty());
+    let beside_others = acted.known && !acted.named && line.answer.as_ref().is_some_and(|a| !a.named.is_empty());
     match acted.significance_at_hand {
         Some(at_hand) if beside_others => at_hand.max(acted.drawn_significance),
         Some(at_hand) => at_hand,
@@ -264,10 +264,10 @@ fn rows(free: &DMatrix<f64>) -> Vec<Row<'_>> {
             Box::new(|lines| nees(lines.iter().filter_map(|l| l.after.as_ref()).flat_map(|a| &a.offset), free)),
         ),
         (
-            "a kind that no effect covers, drawn above 8σ: `unexplained`",
+            "a kind that no effect covers, above 8σ: `unexplained`",
             Bar::AtLeast(95),
             Box::new(|lines| {
-                let loud = lines.iter().filter(|l| single(l, false).is_some_and(|e| e.drawn_significance > 8.0));
+                let loud = lines.iter().filter(|l| single(l, false).is_some_and(|e| significance(l, e) > 8.0));
                 Measured::share(loud.map(|l| is_told_unexplained(l)))
             }),
         ),
@@ -276,7 +276,7 @@ fn rows(free: &DMatrix<f64>) -> Vec<Row<'_>> {
             Bar::AtLeast(80),
             Box::new(|lines| {
                 let loud = lines.iter().filter_map(|l| Some((l, single(l, false)?)));
-                Measured::share(loud.filter(|(_, e)| e.drawn_significance > 8.0).map(|(l, e)| tells_driver(l, e)))
+                Measured::share(loud.filter(|(l, e)| significance(l, e) > 8.0).map(|(l, e)| tells_driver(l, e)))
             }),
         ),
         (

@@ -85,7 +85,7 @@ pub(crate) enum Meaning {
     Level,
     /// A power of time in a channel of one product.
     Power,
-    /// How much a number in the form of an effect is larger, as its logarithm or a time in s; σ of that before any data.
+    /// By how much a number in the form of an effect is larger, as a logarithm or a time in s; its σ before any data.
     Number(f64),
 }
 

@@ -194,7 +194,7 @@ impl Joined {
         // Old parameters by new ones.
         let mut columns: Vec<Vec<(usize, f64)>> = kept.iter().map(|i| vec![(*i, 1.0)]).collect();
         for number in numbers {
-            let own = kept.iter().filter_map(|i| coefficient(i));
+            let own = kept.iter().filter_map(coefficient);
             let own = own.filter(|c| (&c.effect, &c.instance) == (&number.effect, &number.instance));
             let difference = own.map(|c| {
                 let side = |value: &Value| {
