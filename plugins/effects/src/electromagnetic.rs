@@ -17,18 +17,22 @@ use crate::common::{
 ///
 /// Noise of the measured charge attenuates `ΔV` (errors in variables) by its ratio to the charge's variation, parts in
 /// a thousand. **Confounders**: without a discharge, any slow drift.
+///
+/// As a candidate it has series of its own that are known to be slow: a charge drifts over hours, below the spectra, and
+/// which of the measured charges acts on this test mass is told by the slowest samples alone.
 #[derive(Debug)]
 pub(crate) struct Charge {
     setup: Setup,
     mission: Mission,
+    slow: Vec<(In, Out)>,
 }
 
 impl Charge {
-    fn responses(&self, available: &Available, column: &Column) -> Result<Vec<Response>, PluginError> {
+    fn responses(&self, available: &Available, series: &SeriesRef) -> Result<Vec<Response>, PluginError> {
         let instance = self.setup.instance();
         let mass_kg = self.mission.test_mass(instance, "the effect charge")?.mass_kg;
         let factor = self.setup.f64("gradient_f_m")? / (self.setup.f64("capacitance_f")? * mass_kg);
-        let x = response(format!("{instance}.accel.x"), &series_of(column), factor);
+        let x = response(format!("{instance}.accel.x"), series, factor);
         keep_available(available, &format!("charge:{instance}"), vec![x])
     }
 }
@@ -53,7 +57,7 @@ impl Effect for Charge {
     );
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
-        Ok(Self { setup: setup.clone(), mission: mission(setup)? })
+        Ok(Self { setup: setup.clone(), mission: mission(setup)?, slow: Vec::new() })
     }
 
     fn link(&mut self, available: &Available, link: &mut EffectLink<'_, '_>) -> Result<(), PluginError> {
@@ -69,7 +73,12 @@ impl Effect for Charge {
         let shape = |c: &Column| Shape::from([("charge".to_owned(), json!(c.name))]);
         if self.setup.candidate() {
             for column in housekeeping_in(available, "C") {
-                let responses = self.responses(available, column)?;
+                let name = format!("charge({})", column.name);
+                let (table, out) = link.slow_series(available, &name, "C", SLOW_HZ)?;
+                if let Some(out) = out {
+                    self.slow.push((link.read(&Want::of(column))?, out));
+                }
+                let responses = self.responses(available, &(table, name))?;
                 coefficient.variants.push(Variant { shape: shape(column), responses, ..Variant::default() });
             }
             if coefficient.variants.is_empty() {
@@ -80,12 +89,16 @@ impl Effect for Charge {
         } else {
             let (by, name) = (format!("charge:{instance}"), self.setup.text("charge")?);
             let column = find_housekeeping(available, &by, "charge", &name, "C")?;
-            (coefficient.shape, coefficient.responses) = (shape(column), self.responses(available, column)?);
+            (coefficient.shape, coefficient.responses) =
+                (shape(column), self.responses(available, &series_of(column))?);
         }
         link.coefficient(&coefficient)
     }
 
-    fn process(&mut self, _input: &Inputs<'_>, _output: &mut Outputs) -> Result<(), PluginError> {
+    fn process(&mut self, input: &Inputs<'_>, output: &mut Outputs) -> Result<(), PluginError> {
+        for (column, out) in &self.slow {
+            output.f64(*out).extend_from_slice(input.f64(*column));
+        }
         Ok(())
     }
 }
