@@ -395,12 +395,12 @@ const PLAIN: f64 = 6.0;
 /// Label of a set in which nothing is hidden.
 const NOTHING: &str = "nothing";
 
-/// Confusion matrices of the sets with at most one effect: hidden effect against first answer. `None` without results.
+/// Confusion matrices of the sets with at most one effect: it against what was said, itself where it is named, else the
+/// first that is false or takes its place. `None` without results.
 pub(crate) fn picture(lines: &[Diagnosed]) -> Result<Option<String>, ChartError> {
     let kind = |name: &str| name.split(':').next().unwrap_or(name).to_owned();
     let mut tables = Vec::new();
-    for (title, wanted) in
-        [("Hidden above 6σ (rows), said first (columns)", true), ("Hidden below 6σ, or nothing", false)]
+    for (title, wanted) in [("Hidden above 6σ (rows), said (columns)", true), ("Hidden below 6σ, or nothing", false)]
     {
         let mut counts: BTreeMap<(String, String), usize> = BTreeMap::new();
         let mut known: BTreeMap<String, bool> = BTreeMap::new();
@@ -411,7 +411,16 @@ pub(crate) fn picture(lines: &[Diagnosed]) -> Result<Option<String>, ChartError>
                 _ => continue,
             };
             let Some(answer) = &line.answer else { continue };
-            let said = answer.named.first().map_or_else(|| answer.verdict.clone(), |name| kind(name));
+            let said = match line.effects.as_slice() {
+                [one] if one.named => hidden.clone(),
+                all => {
+                    // A level of noise that really is off says nothing of what is hidden.
+                    let rival = || all.first().and_then(|one| one.confounder_of.first());
+                    let unexplained = answer.verdict == "unexplained" || answer.unexplained.is_object();
+                    let nothing = if unexplained { "unexplained" } else { "sufficient" };
+                    answer.false_causes.first().or_else(rival).map_or_else(|| nothing.to_owned(), |name| kind(name))
+                }
+            };
             known.insert(hidden.clone(), line.effects.iter().all(|e| e.known));
             *counts.entry((hidden, said)).or_default() += 1;
         }
