@@ -18,8 +18,8 @@ use crate::common::{
 /// Noise of the measured charge attenuates `ΔV` (errors in variables) by its ratio to the charge's variation, parts in
 /// a thousand. **Confounders**: without a discharge, any slow drift.
 ///
-/// As a candidate it has series of its own that are known to be slow: a charge drifts over hours, below the spectra, and
-/// which of the measured charges acts on this test mass is told by the slowest samples alone.
+/// As a candidate it has series of its own that are known to be slow: a charge drifts over hours, below the spectra,
+/// and which of the measured charges acts on this test mass is told by the slowest samples alone.
 #[derive(Debug)]
 pub(crate) struct Charge {
     setup: Setup,
