@@ -240,6 +240,15 @@ fn a_charge_acts_on_its_own_test_mass() {
     assert!(first["sigma"].as_f64().is_some_and(|sigma| sigma < 0.006), "{first:#}");
 }
 
+/// A charge that drifts evenly is no noise: a random walk whose power is made to fit took three quarters of its
+/// evidence, and it was `unexplained`. The size is within 4σ (false alarm 6e-5).
+#[test]
+fn an_even_drift_is_not_taken_for_noise() {
+    let d = diagnosis(&["--hours", "6", "--seed", "5201", "--effect", "charge:tm1=0.06"]);
+    assert_eq!(named_alone(&d, 0.06), "charge:tm1");
+    assert!(d["candidates"][0]["delta_chi2"].as_f64().is_some_and(|gain| gain > 100.0), "{}", d["candidates"][0]);
+}
+
 /// Of a loud glitch between the forms that are tried the course is fitted with the size, and momentum, decay and begin
 /// are within 4σ (false alarm 2e-4). A form of the grid has no σ of its course.
 #[test]

@@ -5,8 +5,10 @@ use dragfree_estimation::random_walk::{BandSpectra, held_directions, significant
 use dragfree_schema::{NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm};
 use nalgebra::DVector;
 
+use crate::candidates::Candidate;
 use crate::scores::{CandidateScorer, Fit};
 use dragfree_estimation::decimate::SLOW_HZ;
+use dragfree_estimation::sigma::{NoiseError, NoiseModel};
 
 /// Frequency at which the spectral density of a random walk is stated, Hz.
 const STATED_HZ: f64 = 1e-3;
@@ -46,4 +48,36 @@ pub fn slow_forces(scorer: &CandidateScorer<'_>, fit: &Fit, declared: &[NoisePro
             ..NoiseProcess::default()
         })
         .collect()
+}
+
+/// Slow forces without those that one of `candidates` explains better. A random walk whose power is made to fit takes
+/// what drifts evenly, and beside it the candidate that acts would explain next to nothing.
+///
+/// # Errors
+/// The declared noise and the slow forces contradict each other.
+pub fn not_explained(
+    scorer: &CandidateScorer<'_>,
+    fit: &Fit,
+    slow: &[NoiseProcess],
+    declared: &[NoiseProcess],
+    candidates: &[Candidate],
+) -> Result<Vec<NoiseProcess>, NoiseError> {
+    let (set, gathered) = (scorer.candidate_set, scorer.gathered);
+    let is_slow = |c: &&Candidate| {
+        let terms = c.parts.iter().flat_map(|(_, form)| &form.terms);
+        !c.transient && terms.clone().count() > 0 && terms.clone().all(|t| t.column >= gathered.columns.fast)
+    };
+    let candidates: Vec<&Candidate> = candidates.iter().filter(is_slow).collect();
+    let mut left = Vec::new();
+    for (k, force) in slow.iter().enumerate() {
+        let gain = |channel: &String| force.enters.get(channel).map_or(0.0, |gains| gains[0]);
+        let along = DVector::from_iterator(set.channels.len(), set.channels.iter().map(gain));
+        let others = slow.iter().enumerate().filter(|(i, _)| *i != k).map(|(_, other)| other);
+        let noise: Vec<NoiseProcess> = declared.iter().chain(others).cloned().collect();
+        let noise = NoiseModel::new(&noise, &set.channels, 1.0 / gathered.rate_hz)?;
+        if !gathered.slow.is_explained(&along, &candidates, &fit.added, &noise) {
+            left.push(force.clone());
+        }
+    }
+    Ok(left)
 }

@@ -17,7 +17,7 @@ use dragfree_identification::lines::{Line, Lines};
 use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::screen::{RefinementRequest, Screened, retain_unexplained, screen};
-use dragfree_identification::slow_forces::slow_forces;
+use dragfree_identification::slow_forces::{not_explained, slow_forces};
 use dragfree_identification::transient::{Detection, Transients};
 use dragfree_schema::{NoiseProcess, Settings};
 use serde_json::json;
@@ -246,7 +246,7 @@ fn decide(
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<(Last, Spectra), WorkflowError> {
     let settings = replay.settings()?;
-    let (mut point, mut slow) = start_of_passes(&spectra, settings)?;
+    let FirstPoint { mut point, walks, mut slow } = FirstPoint::new(&spectra, settings)?;
     let mut screened = spectra.screened.clone();
     let mut named: Vec<Candidate> = Vec::new();
     // A pass that fits constants beside what is named comes first, at the start and where a form is new: they are 1e5 σ
@@ -282,6 +282,11 @@ fn decide(
             moving.extend(differences(&now, &named));
         }
         point = next;
+        // What seemed to explain a slow force is not named.
+        if now.is_empty() && named.is_empty() && slow != walks && passes < PASSES {
+            slow.clone_from(&walks);
+            continue;
+        }
         if moving.is_empty() || passes == PASSES {
             let screened = Screened { forms: spectra.forms(&screened, &evidence.proposals), ..screened };
             return Ok((Last { end: Settled { decided, chosen, slow, point }, screened, moving }, spectra));
@@ -326,21 +331,35 @@ fn settle(
     Ok(point)
 }
 
-/// Where the passes begin: the model as the spectra have it, and slow forces beside the declared noise that its
-/// residuals show. A glitch is no slow force, although it has the power of one.
-fn start_of_passes(spectra: &Spectra, settings: &Settings) -> Result<(Point, Vec<NoiseProcess>), WorkflowError> {
-    let (scorer, set) = (spectra.scorer(settings), &spectra.record.candidate_set);
-    let fit = scorer.fit(&[])?;
-    let model = &set.coefficients[..set.model()];
-    let values = model.iter().zip(fit.estimate.theta.iter()).map(|(c, value)| (c.name.clone(), *value)).collect();
-    // Of those at one place all, as the most significant may be another than what acts.
-    let events = |c: &&Candidate| {
-        let of = |d: &Detection| (&d.effect, &d.instance) == (&c.effect, &c.instance);
-        c.transient && scorer.gathered.transients.certain(settings.false_alarm).any(of)
-    };
-    let events: Vec<Candidate> = spectra.screened.forms.iter().filter(events).cloned().collect();
-    let slow = slow_forces(&scorer, &scorer.fit(&events)?, &spectra.record.noise);
-    Ok((Point::at(values), slow))
+/// Where the passes begin.
+struct FirstPoint {
+    /// The model as the spectra have it.
+    point: Point,
+    /// Slow forces beside the declared noise that the residuals of the model show.
+    walks: Vec<NoiseProcess>,
+    /// Those of them that no candidate explains better.
+    slow: Vec<NoiseProcess>,
+}
+
+impl FirstPoint {
+    /// A glitch is no slow force, although it has the power of one.
+    fn new(spectra: &Spectra, settings: &Settings) -> Result<Self, WorkflowError> {
+        let (scorer, set) = (spectra.scorer(settings), &spectra.record.candidate_set);
+        let fit = scorer.fit(&[])?;
+        let model = &set.coefficients[..set.model()];
+        let values = model.iter().zip(fit.estimate.theta.iter()).map(|(c, value)| (c.name.clone(), *value)).collect();
+        // Of those at one place all, as the most significant may be another than what acts.
+        let events = |c: &&Candidate| {
+            let of = |d: &Detection| (&d.effect, &d.instance) == (&c.effect, &c.instance);
+            c.transient && scorer.gathered.transients.certain(settings.false_alarm).any(of)
+        };
+        let events: Vec<Candidate> = spectra.screened.forms.iter().filter(events).cloned().collect();
+        let beside = scorer.fit(&events)?;
+        let (declared, forms) = (&spectra.record.noise, &spectra.screened.forms);
+        let walks = slow_forces(&scorer, &beside, declared);
+        let slow = not_explained(&scorer, &beside, &walks, declared, forms)?;
+        Ok(Self { point: Point::at(values), walks, slow })
+    }
 }
 
 /// The end of the passes of a decision.
