@@ -279,9 +279,9 @@ impl Measurement<'_> {
         };
         let (answer, mut effects) = self.scored(&made, said.as_ref())?;
         if let [one] = &mut effects[..]
-            && !one.known
+            && (!one.known || one.significance_at_hand.is_none())
         {
-            one.significance_at_hand = self.known_force(&chain, &made, one)?;
+            one.significance_at_hand = self.in_the_model(&chain, &made, one)?;
         }
         let mut line = Diagnosed {
             configuration: self.configuration.to_owned(),
@@ -380,22 +380,33 @@ impl Measurement<'_> {
         Ok((said.map(|_| answer), effects))
     }
 
-    /// Significance of a force that no effect covers, with the σ that `run` has with its formula in the model; none
-    /// where that fails.
-    fn known_force(&self, chain: &Chain, made: &Made, acted: &Acted) -> Result<Option<f64>, CampaignError> {
+    /// Significance of a force that no effect covers, or of a line, with the σ that `run` has with it in the model; none
+    /// of other effects, and where that fails.
+    fn in_the_model(&self, chain: &Chain, made: &Made, acted: &Acted) -> Result<Option<f64>, CampaignError> {
         let Some((effect, place)) = acted.name.split_once(':') else { return Ok(None) };
-        let Some((expression, unit)) = formula_of(effect) else { return Ok(None) };
+        let line_hz = match &made.secret {
+            Secret::Drawn(draw) => draw.acted.iter().find_map(|own| own.frequency_hz),
+            _ => None,
+        };
+        let (entry, parameters, coefficient) = if let Some((expression, unit)) = formula_of(effect) {
+            let (test_mass, axis) = place.split_once('.').unwrap_or((place, "x"));
+            let parameters = vec![
+                format!("acts_on={test_mass}.accel.{axis}"),
+                format!("expression={expression}"),
+                format!("unit={unit}"),
+                "range=-1e-8,1e-8".to_owned(),
+            ];
+            ("formula:known", parameters, "formula.known".to_owned())
+        } else if let Some(hz) = line_hz {
+            // Of a line of any phase the two amplitudes have one σ.
+            (acted.name.as_str(), vec![format!("frequency_hz={hz}")], format!("line.{place}.sin"))
+        } else {
+            return Ok(None);
+        };
         let model = self.folder.join("known.toml");
         std::fs::copy(chain.model.as_deref().unwrap_or(Path::new("")), &model).map_err(|e| self.io(&e))?;
-        let (test_mass, axis) = place.split_once('.').unwrap_or((place, "x"));
-        let parameters = [
-            format!("acts_on={test_mass}.accel.{axis}"),
-            format!("expression={expression}"),
-            format!("unit={unit}"),
-            "range=-1e-8,1e-8".to_owned(),
-        ];
         let parameters = parameters.iter().flat_map(|p| ["--set".as_ref(), p.as_ref()]);
-        let words = ["add".as_ref(), model.as_os_str(), "formula:known".as_ref()];
+        let words = ["add".as_ref(), model.as_os_str(), entry.as_ref()];
         let chain = Chain { model: Some(model.clone()), ..chain.clone() };
         let added = self.program.model(&words.into_iter().chain(parameters).collect::<Vec<&OsStr>>());
         let products = match added.and_then(|()| self.run(&chain, made)) {
@@ -404,7 +415,7 @@ impl Measurement<'_> {
         };
         let sigma = |product: &Value| {
             let all = product["coefficients"].as_array()?;
-            let own = all.iter().find(|c| c["name"] == "formula.known" && c["solution"] == "adopted")?;
+            let own = all.iter().find(|c| c["name"] == coefficient.as_str() && c["solution"] == "adopted")?;
             own["sigma"].as_f64()
         };
         let information: f64 = products.iter().filter_map(sigma).map(|sigma| sigma.powi(-2)).sum();

@@ -192,7 +192,16 @@ mod tests {
     fn hidden(effect: &'static str, instance: &str, size: f64) -> foreign::Acted {
         let at_s = (effect == "impulse").then_some(1000.0);
         let known = effect != "current-squared";
-        foreign::Acted { effect, instance: instance.to_owned(), size, unit: "1", sigma: 0.01, at_s, known }
+        foreign::Acted {
+            effect,
+            instance: instance.to_owned(),
+            size,
+            unit: "1",
+            sigma: 0.01,
+            at_s,
+            frequency_hz: None,
+            known,
+        }
     }
 
     fn candidate(name: &str, accepted: bool, value: f64, confounders: &[&str]) -> Value {

@@ -51,6 +51,8 @@ pub struct Acted {
     pub sigma: f64,
     /// Time of an impulse after the first sample, s.
     pub at_s: Option<f64>,
+    /// Frequency of a line, Hz.
+    pub frequency_hz: Option<f64>,
     /// Whether a bundled effect covers it.
     pub known: bool,
 }
@@ -439,6 +441,7 @@ impl Draw {
             unit: row.unit,
             sigma: 0.0,
             at_s: None,
+            frequency_hz: None,
             known: true,
         };
         match row.cause {
@@ -476,7 +479,7 @@ impl Draw {
             Cause::ThrustLine => {
                 let hz = dice.log_uniform(7e-4, 0.1);
                 hidden.line = Some(Line { axis: from, force_n: size.abs(), hz });
-                told.size = size.abs();
+                (told.size, told.frequency_hz) = (size.abs(), Some(hz));
             }
         }
         told
