@@ -380,8 +380,8 @@ impl Measurement<'_> {
         Ok((said.map(|_| answer), effects))
     }
 
-    /// Significance of a force that no effect covers, or of a line, with the σ that `run` has with it in the model; none
-    /// of other effects, and where that fails.
+    /// Significance of a force that no effect covers, or of a line, with the σ that `run` has with it in the model;
+    /// none of other effects, and where that fails.
     fn in_the_model(&self, chain: &Chain, made: &Made, acted: &Acted) -> Result<Option<f64>, CampaignError> {
         let Some((effect, place)) = acted.name.split_once(':') else { return Ok(None) };
         let line_hz = match &made.secret {

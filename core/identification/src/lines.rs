@@ -2,9 +2,9 @@
 //!
 //! With residuals r(f) of a tapered stretch, their declared Σ(f) and the channels' response d to a place, the power
 //! that a line at f may have is `s = |dᵀΣ⁻¹r|²/(dᵀΣ⁻¹d)`: exponential with a mean of one where there is none. Levels of
-//! noise are not as declared, so it is taken over its local mean, from the median of the frequencies around. Between two
-//! bins of the transform it is that of their difference over √2, which a line half a bin from both raises together:
-//! of a line anywhere at least four fifths of the power are found.
+//! noise are not as declared, so it is taken over its local mean, from the median of the frequencies around. Between
+//! two bins of the transform it is that of their difference over √2, which a line half a bin from both raises: of a line
+//! anywhere at least four fifths of the power are found.
 
 use std::f64::consts::{LN_2, TAU};
 use std::ops::Range;
@@ -345,7 +345,7 @@ mod tests {
     /// above that of the threshold by 3.2σ at least (false alarm below 1e-2 in all).
     #[test]
     fn a_line_is_found_with_its_frequency_beside_gaps() {
-        // χ² of an amplitude A in n samples of unit noise is n A²/2; σ of its frequency is √3/(π 9) bins without a taper.
+        // χ² of an amplitude A in n samples of unit noise is n A²/2; σ of its frequency is √3/(9π) bins.
         let amplitude = (2.0 * 81.0 / N as f64).sqrt();
         let bin_hz = 10.0 / N as f64;
         for seed in 0..16 {

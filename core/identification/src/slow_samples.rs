@@ -325,8 +325,8 @@ impl SlowSamples {
 
     /// Whether one of some candidates explains a force `along` a direction better than a random walk of acceleration
     /// does, whose power is whatever explains most: each by itself beside what is `added` and the noise. Where a
-    /// candidate has more free numbers, each costs the logarithm of the number of samples (Schwarz, 1978), and being the
-    /// best of many costs twice the logarithm of their number.
+    /// candidate has more free numbers, each costs the logarithm of the number of samples (Schwarz, 1978), and being
+    /// the best of many costs twice the logarithm of their number.
     pub(crate) fn is_explained(
         &self,
         along: &DVector<f64>,
