@@ -105,6 +105,7 @@ fn gathered(columns: &[Vec<f64>], threads: usize) -> GramSums {
     let base = CHANNELS.len() + MODEL;
     let of = Columns {
         names: (0..columns.len()).map(|i| i.to_string()).collect(),
+        tables: vec![String::new(); columns.len()],
         channels: CHANNELS.len(),
         base,
         fast: base + CANDIDATES - SLOW,

@@ -6,6 +6,8 @@ use dragfree_estimation::spectra::{Layout, Regressor};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+use crate::gram::Columns;
+
 /// A channel's response to a coefficient.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Term {
@@ -204,6 +206,22 @@ impl Candidate {
     /// Its name, `es-gain:tm1.y`.
     pub fn name(&self) -> String {
         format!("{}:{}", self.effect, self.instance)
+    }
+
+    /// The same in another set, whose coefficients and columns stand in other places; none where it lacks one of them.
+    pub fn moved(&self, from: (&CandidateSet, &Columns), to: (&CandidateSet, &Columns)) -> Option<Self> {
+        let coefficient = |i: usize| {
+            let own = &from.0.coefficients[i];
+            to.0.coefficients.iter().position(|c| (&c.name, c.transient) == (&own.name, own.transient))
+        };
+        let mut moved = self.clone();
+        for (index, form) in &mut moved.parts {
+            *index = coefficient(*index)?;
+            for t in &mut form.terms {
+                t.column = to.1.place(&from.1.tables[t.column], &from.1.names[t.column])?;
+            }
+        }
+        Some(moved)
     }
 
     /// Between this form and another of the same place: `part` of the way, shapes in their logarithm.

@@ -36,6 +36,8 @@ pub const HOUR_NS: i64 = 3_600_000_000_000;
 pub struct Columns {
     /// Names: channels, series of the model, series of candidates, slow series of candidates.
     pub names: Vec<String>,
+    /// Tables in which they stand. Names may come again in another table.
+    pub tables: Vec<String>,
     /// How many of them are channels.
     pub channels: usize,
     /// Channels and series of the model.
@@ -54,6 +56,11 @@ impl Columns {
     pub fn energy_of(&self, column: usize) -> Option<&[f64]> {
         let first = self.fast.checked_sub(self.energy.len())?;
         self.energy.get(column.checked_sub(first)?).map(Vec::as_slice)
+    }
+
+    /// Index of a column.
+    pub fn place(&self, table: &str, name: &str) -> Option<usize> {
+        (0..self.names.len()).find(|i| self.tables[*i] == table && self.names[*i] == name)
     }
 
     /// Number of columns in a band.

@@ -654,6 +654,7 @@ mod tests {
         let columns = Columns {
             names: ["first", "second", "model", "lasting", "event", "event"].map(str::to_owned)[..4 + events.len()]
                 .to_vec(),
+            tables: vec![String::new(); 4 + events.len()],
             channels: 2,
             base: 3,
             fast: 4 + events.len(),

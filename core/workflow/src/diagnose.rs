@@ -270,9 +270,15 @@ fn decide(
         passes += 1;
         let mut now = named_forms(&decided, &forms);
         if now.iter().any(|form| form.parts.is_empty()) {
-            // Sums are large, and these are made again.
+            // Sums are large, and these are made again. With the formulas among them columns stand in other places.
+            let before = (spectra.record.candidate_set.clone(), spectra.record.gathered.columns.clone());
             drop(spectra);
             spectra = Spectra::gather(replay, searched, requests, &evidence.proposals, &[], progress)?;
+            let after = (&spectra.record.candidate_set, &spectra.record.gathered.columns);
+            let moved = |forms: &[Candidate]| -> Vec<Candidate> {
+                forms.iter().filter_map(|form| form.moved((&before.0, &before.1), after)).collect()
+            };
+            (screened.forms, named) = (moved(&screened.forms), moved(&named));
             let is_formula = |form: &&Candidate| evidence.proposal(&form.effect, &form.instance).is_some();
             screened.forms.extend(spectra.screened.forms.iter().filter(is_formula).cloned());
             now = named_forms(&decided, &screened.forms);

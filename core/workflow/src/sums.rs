@@ -151,6 +151,11 @@ impl ColumnSums {
         let plan = Plan::slow(LONG * length, length, rate_hz);
         let all = Columns {
             names: names.clone(),
+            tables: channels
+                .iter()
+                .map(|c| c.table.clone())
+                .chain(sorted.keys.iter().map(|(t, _)| t.clone()))
+                .collect(),
             channels: channels.len(),
             base: channels.len() + sorted.base,
             fast: channels.len() + sorted.fast,
