@@ -473,6 +473,13 @@ fn answer(
         }
         formulas.extend(rivals);
     }
+    for place in followed_by_formulas(decided, evidence) {
+        let is_it = |own: &mut Found| (&own.effect, &own.instance) == (&place.effect, &place.instance);
+        for own in named.extract_if(.., is_it) {
+            let refused = "formulas are needed beside it, which explain the greater part of what it explains, and more";
+            others.push(Found { accepted: false, refused: Some(refused.to_owned()), ..own });
+        }
+    }
     // A small remainder of what was there without them is what the grid of forms cannot represent.
     let before = diagnosis::remaining(scorer, &[])?.map_or(0.0, |u| u.ratio);
     let loud = unexplained.as_ref().filter(|u| u.ratio > settings.excess_remainder * before);
@@ -557,6 +564,26 @@ fn not_told_from_formulas<'a>(
         (place(f.candidate), formulas.map(formula).collect())
     };
     decided.selection.chosen.iter().filter(doubtful).map(rivals).collect()
+}
+
+/// What is chosen together with formulas, of which formulas explain the greater part, and more than it explains without
+/// them: of an unknown force it is one of the series that resemble it together, as they are.
+fn followed_by_formulas<'a>(decided: &'a Decided, evidence: &Evidence<'_>) -> Vec<&'a Place> {
+    let place = |c: usize| &decided.candidates[c];
+    let is_formula = |c: &usize| evidence.proposal(&place(*c).effect, &place(*c).instance).is_some();
+    let set: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
+    let (formulas, effects): (Vec<usize>, Vec<usize>) = set.iter().copied().partition(is_formula);
+    let follows = |c: &usize| {
+        let others: Vec<usize> = effects.iter().copied().filter(|other| other != c).collect();
+        let gain = |more: &[usize]| decided.quadratic.gain(&[&others[..], more].concat());
+        let (none, alone, by_formulas) = (gain(&[]), gain(&[*c]), gain(&formulas));
+        let own = decided.quadratic.gain(&set) - by_formulas;
+        own < 0.5 * (alone - none) && by_formulas > alone
+    };
+    if formulas.is_empty() {
+        return Vec::new();
+    }
+    effects.iter().filter(|c| follows(c)).map(|c| place(*c)).collect()
 }
 
 /// What is unexplained, with the drivers of the proposed formulas first among what is coherent with it.

@@ -502,6 +502,11 @@ impl Quadratic {
         values
     }
 
+    /// By how much χ² falls with a set in the model.
+    pub fn gain(&self, set: &[usize]) -> f64 {
+        self.fit(set).1
+    }
+
     /// Values and σ of the base and of a set.
     pub fn solution(&self, set: &[usize]) -> (DVector<f64>, DVector<f64>) {
         let mut sigma = DVector::zeros(self.score.len());
