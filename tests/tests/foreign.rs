@@ -447,6 +447,31 @@ fn a_force_by_the_square_of_the_field_along_one_axis_is_told() {
     }
 }
 
+/// Two hours with one bump of a force that no effect covers, by the product of two housekeeping values (seed 805 of the
+/// campaign): no force is named, and formulas are given. Named `magnetic` with formulas beside it was one of three series
+/// that made the bump together, and read the series of a formula where its own had stood.
+#[test]
+fn a_part_of_an_unknown_force_is_not_named() {
+    let dir = tempfile::tempdir().expect("a temporary folder");
+    let draw = Draw::new(100_805, 2.0, false);
+    assert_eq!(draw.acted[0].effect, "current-by-panel");
+    let files = draw.record(dir.path()).expect("the folder is writable");
+    let bundled = std::fs::read_to_string(fixture("missions/taiji.toml")).expect("the bundled mission");
+    let mission = dir.path().join("mission.toml");
+    std::fs::write(&mission, draw.mission(&bundled).expect("its tables")).expect("the folder is writable");
+    let mut command = dragfree(dir.path());
+    command.arg("run").arg(fixture("pipelines/science-mode.toml")).args(&files);
+    let run = command.arg("--mission").arg(mission).args(["--archive", "archive", "--json"]).output();
+    let run = run.expect("the program runs");
+    let product =
+        serde_json::from_slice(&run.stdout).unwrap_or_else(|_| panic!("{}", String::from_utf8_lossy(&run.stderr)));
+    let d = diagnose(dir.path(), &product);
+    let named = d["candidates"].as_array().into_iter().flatten().filter(|c| c["accepted"] == true);
+    let forces: Vec<&Value> = named.filter(|c| !c["effect"].as_str().is_some_and(|e| e.ends_with("-noise"))).collect();
+    assert!(forces.is_empty(), "{forces:#?}");
+    assert!(!d["formulas"].as_array().is_none_or(Vec::is_empty) && !d["unexplained"].is_null(), "{d:#}");
+}
+
 /// A force on the spacecraft by the bus current, which all channels of the test masses show: the formula acts on the
 /// spacecraft, with its size within 4σ.
 #[test]

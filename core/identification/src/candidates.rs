@@ -240,3 +240,59 @@ impl Candidate {
         mixed
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn set(names: &[&str]) -> CandidateSet {
+        let coefficient = |name: &&str| Coefficient {
+            name: (*name).to_owned(),
+            effect: (*name).to_owned(),
+            instance: "tm1".to_owned(),
+            initial: 0.0,
+            prior_sigma: None,
+            estimate: true,
+            candidate: true,
+            transient: false,
+            forms: Vec::new(),
+            noise: String::new(),
+        };
+        CandidateSet { channels: Vec::new(), coefficients: names.iter().map(coefficient).collect(), rules: Vec::new() }
+    }
+
+    fn columns(all: &[(&str, &str)]) -> Columns {
+        Columns {
+            names: all.iter().map(|(_, name)| (*name).to_owned()).collect(),
+            tables: all.iter().map(|(table, _)| (*table).to_owned()).collect(),
+            channels: 1,
+            base: 1,
+            fast: all.len(),
+            energy: Vec::new(),
+            housekeeping_units: Vec::new(),
+        }
+    }
+
+    /// Where another effect's series stand before its own, a candidate reads its own; in a set without them it is none.
+    #[test]
+    fn a_candidate_keeps_its_series_in_another_set() {
+        let from = (set(&["magnetic", "thermal"]), columns(&[("channels", "x"), ("slow", "a"), ("slow.1", "a")]));
+        let all = [("channels", "x"), ("formula", "formula"), ("slow", "a"), ("slow.1", "a")];
+        let to = (set(&["formula", "magnetic", "thermal"]), columns(&all));
+        let term = Term { channel: 0, column: 2, factor: 2.0, times: None };
+        let form = Form {
+            shape: Map::new(),
+            unit: "1".to_owned(),
+            lower: None,
+            upper: None,
+            terms: vec![term],
+            colours: None,
+        };
+        let (effect, instance) = ("thermal".to_owned(), "tm1".to_owned());
+        let candidate = Candidate { effect, instance, transient: false, parts: vec![(1, form)] };
+        let moved = candidate.moved((&from.0, &from.1), (&to.0, &to.1)).expect("all series are there");
+        assert_eq!((moved.parts[0].0, moved.parts[0].1.terms[0].column), (2, 3));
+        assert_eq!(moved.moved((&to.0, &to.1), (&from.0, &from.1)), Some(candidate.clone()));
+        assert_eq!(candidate.moved((&from.0, &from.1), (&to.0, &columns(&all[..3]))), None);
+    }
+}
