@@ -208,6 +208,12 @@ impl Candidate {
         format!("{}:{}", self.effect, self.instance)
     }
 
+    /// Whether it acts by slow series alone.
+    pub fn is_slow(&self, columns: &Columns) -> bool {
+        let mut terms = self.parts.iter().flat_map(|(_, form)| &form.terms).peekable();
+        terms.peek().is_some() && terms.all(|t| t.column >= columns.fast)
+    }
+
     /// The same in another set, whose coefficients and columns stand in other places; none where it lacks one of them.
     pub fn moved(&self, from: (&CandidateSet, &Columns), to: (&CandidateSet, &Columns)) -> Option<Self> {
         let coefficient = |i: usize| {

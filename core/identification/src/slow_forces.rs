@@ -63,11 +63,8 @@ pub fn not_explained(
     candidates: &[Candidate],
 ) -> Result<Vec<NoiseProcess>, NoiseError> {
     let (set, gathered) = (scorer.candidate_set, scorer.gathered);
-    let is_slow = |c: &&Candidate| {
-        let terms = c.parts.iter().flat_map(|(_, form)| &form.terms);
-        !c.transient && terms.clone().count() > 0 && terms.clone().all(|t| t.column >= gathered.columns.fast)
-    };
-    let candidates: Vec<&Candidate> = candidates.iter().filter(is_slow).collect();
+    let candidates: Vec<&Candidate> =
+        candidates.iter().filter(|c| !c.transient && c.is_slow(&gathered.columns)).collect();
     let mut left = Vec::new();
     for (k, force) in slow.iter().enumerate() {
         let gain = |channel: &String| force.enters.get(channel).map_or(0.0, |gains| gains[0]);

@@ -12,6 +12,7 @@ use dragfree_estimation::decimate::SLOW_HZ;
 use dragfree_estimation::sigma::NoiseModel;
 use dragfree_identification::candidates::{Candidate, Coefficient as Unknown};
 use dragfree_identification::diagnosis::{self, Diagnosis, Found, Trials, UNOBSERVABLE, Unexplained};
+use dragfree_identification::distributions::ln_chi2_above;
 use dragfree_identification::innovations::decision::Fitted;
 use dragfree_identification::lines::{Line, Lines};
 use dragfree_identification::record::Record;
@@ -28,7 +29,7 @@ use crate::answer::{
 };
 use crate::extract::{Extract, MadeOf};
 use crate::likelihood::{
-    Decided, How, PASSES, Place, Point, Settled, moved, one_pass, step, step_of_model, transients_near_ends,
+    Decided, How, Judge, PASSES, Place, Point, Settled, moved, one_pass, step, step_of_model, transients_near_ends,
     with_numbers,
 };
 use crate::proposals::{FORMULA, Proposal, probes, proposals};
@@ -468,7 +469,9 @@ fn answer(
     for (f, rivals) in not_told_from_formulas(settings, decided, evidence) {
         let is_it = |own: &mut Found| (&own.effect, &own.instance) == (&f.effect, &f.instance);
         for own in named.extract_if(.., is_it) {
-            let refused = Some(format!("these data do not tell it from {}", first_few(&own.confounders)));
+            let words = |f: &Found| evidence.proposal(&f.effect, &f.instance).map(|p| p.words.clone());
+            let names: Vec<String> = rivals.iter().filter_map(words).chain(own.confounders.iter().cloned()).collect();
+            let refused = Some(format!("these data do not tell it from {}", first_few(&names)));
             others.push(Found { accepted: false, refused, ..own });
         }
         formulas.extend(rivals);
@@ -479,6 +482,14 @@ fn answer(
             let refused = "formulas are needed beside it, which explain the greater part of what it explains, and more";
             others.push(Found { accepted: false, refused: Some(refused.to_owned()), ..own });
         }
+    }
+    let is_slow = |own: &Found| {
+        let form = forms.iter().find(|f| !f.transient && (&f.effect, &f.instance) == (&own.effect, &own.instance));
+        form.is_some_and(|form| form.is_slow(&record.gathered.columns))
+    };
+    for own in named.extract_if(.., |own| is_slow(own) && is_part_of_one(own, &formulas)) {
+        let refused = "a force that no effect states acts there and explains more: it may be a part of that";
+        others.push(Found { accepted: false, refused: Some(refused.to_owned()), ..own });
     }
     // A small remainder of what was there without them is what the grid of forms cannot represent.
     let before = diagnosis::remaining(scorer, &[])?.map_or(0.0, |u| u.ratio);
@@ -541,7 +552,8 @@ fn first_few(names: &[String]) -> String {
 }
 
 /// What is named, and may as well be a force that no effect knows: the probability of that is above the false-alarm
-/// rate. With the formulas that state such forces, the most probable first.
+/// rate, or a formula with fewer coefficients explains as much but for what the further ones explain by chance. With the
+/// formulas that state such forces, the most probable first.
 fn not_told_from_formulas<'a>(
     settings: &Settings,
     decided: &'a Decided,
@@ -550,20 +562,35 @@ fn not_told_from_formulas<'a>(
     let place = |c: usize| &decided.candidates[c];
     let is_formula = |c: usize| evidence.proposal(&place(c).effect, &place(c).instance).is_some();
     let set: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
-    let doubtful = |f: &&Fitted| {
-        let of_formulas = f.alternatives.iter().filter(|(c, _)| is_formula(*c)).map(|(_, p)| p);
-        !is_formula(f.candidate) && of_formulas.sum::<f64>() > settings.false_alarm
-    };
-    let rivals = |f: &Fitted| {
+    let rivals = |f: &'a Fitted| {
+        let probable = f.alternatives.iter().filter(|(c, _)| is_formula(*c));
+        let doubtful = probable.clone().map(|(_, p)| p).sum::<f64>() > settings.false_alarm;
+        let mut formulas: Vec<usize> =
+            probable.filter(|(_, p)| doubtful && *p > settings.false_alarm).map(|(c, _)| *c).collect();
         let others: Vec<usize> = set.iter().copied().filter(|c| *c != f.candidate).collect();
-        let formulas = f.alternatives.iter().filter(|(c, p)| is_formula(*c) && *p > settings.false_alarm);
         let fitted = |c: usize| decided.quadratic.beside(c, &others);
+        let more = place(f.candidate).parameters.len() - 1;
+        let is_simpler = |c: &usize| more > 0 && is_formula(*c) && !set.contains(c) && !formulas.contains(c);
+        let by_chance = |lost: f64| ln_chi2_above(lost.max(0.0), more as f64) > settings.false_alarm.ln();
+        let simpler = (0..decided.candidates.len()).filter(is_simpler).map(|c| (c, fitted(c).gain));
+        let as_good = simpler.filter(|(_, gain)| by_chance(f.gain - gain));
+        let ln_weight = |(c, gain): (usize, f64)| 0.5 * gain + evidence.ln_prior(&place(c).effect, &place(c).instance);
+        let mut as_good: Vec<(usize, f64)> = as_good.map(|own| (own.0, ln_weight(own))).collect();
+        as_good.sort_by(|a, b| b.1.total_cmp(&a.1));
+        let least = as_good.first().map_or(0.0, |best| best.1 + settings.false_alarm.ln());
+        formulas.extend(as_good.into_iter().filter(|(_, weight)| *weight > least).map(|(c, _)| c));
         // Each is as good as the other: nothing speaks against it.
-        let formula =
-            |(c, _): &(usize, f64)| Found { refused: None, ..found(settings, decided, &fitted(*c), evidence, false) };
-        (place(f.candidate), formulas.map(formula).collect())
+        let formula = |c: usize| Found { refused: None, ..found(settings, decided, &fitted(c), evidence, false) };
+        let all: Vec<Found> = formulas.into_iter().take(settings.max_evaluated).map(formula).collect();
+        (!all.is_empty()).then(|| (place(f.candidate), all))
     };
-    decided.selection.chosen.iter().filter(doubtful).map(rivals).collect()
+    decided.selection.chosen.iter().filter(|f| !is_formula(f.candidate)).filter_map(rivals).collect()
+}
+
+/// Whether an effect acts where a formula explains more.
+fn is_part_of_one(own: &Found, formulas: &[Found]) -> bool {
+    let shares = |f: &Found| f.channels.iter().any(|channel| own.channels.contains(channel));
+    formulas.iter().any(|f| shares(f) && f.delta_chi2 > own.delta_chi2)
 }
 
 /// What is chosen together with formulas, of which formulas explain the greater part, and more than it explains without
