@@ -600,6 +600,9 @@ fn followed_by_formulas<'a>(decided: &'a Decided, evidence: &Evidence<'_>) -> Ve
     let is_formula = |c: &usize| evidence.proposal(&place(*c).effect, &place(*c).instance).is_some();
     let set: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
     let (formulas, effects): (Vec<usize>, Vec<usize>) = set.iter().copied().partition(is_formula);
+    if formulas.is_empty() {
+        return Vec::new();
+    }
     let follows = |c: &usize| {
         let others: Vec<usize> = effects.iter().copied().filter(|other| other != c).collect();
         let gain = |more: &[usize]| decided.quadratic.gain(&[&others[..], more].concat());
@@ -607,9 +610,6 @@ fn followed_by_formulas<'a>(decided: &'a Decided, evidence: &Evidence<'_>) -> Ve
         let own = decided.quadratic.gain(&set) - by_formulas;
         own < 0.5 * (alone - none) && by_formulas > alone
     };
-    if formulas.is_empty() {
-        return Vec::new();
-    }
     effects.iter().filter(|c| follows(c)).map(|c| place(*c)).collect()
 }
 
