@@ -468,8 +468,8 @@ fn an_effect_is_not_named_where_an_unknown_force_explains_as_much() {
     assert!(refused.clone().all(reason), "{:#?}", refused.collect::<Vec<_>>());
 }
 
-/// A day of a force by a product that no effect covers, along one axis. `magnetic` with six coefficients explains no more
-/// than a formula with one but for what five explain by chance, and a charge a part of it: neither is named.
+/// A day of a force by a product that no effect covers, along one axis. `magnetic` with six coefficients explains no
+/// more than a formula with one but for what five explain by chance, and a charge a part of it: neither is named.
 #[test]
 fn six_coefficients_are_not_named_where_one_explains_as_much() {
     let d = diagnosis(&["--hours", "24", "--seed", "9204", "--effect", "product-force:tm2.x=2e-13"]);

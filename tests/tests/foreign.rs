@@ -448,8 +448,8 @@ fn a_force_by_the_square_of_the_field_along_one_axis_is_told() {
 }
 
 /// Two hours with one bump of a force that no effect covers, by the product of two housekeeping values (seed 805 of the
-/// campaign): no force is named, and formulas are given. Named `magnetic` with formulas beside it was one of three series
-/// that made the bump together, and read the series of a formula where its own had stood.
+/// campaign): no force is named, and formulas are given. `magnetic` was named with formulas beside it, one of three
+/// series that made the bump together, and read the series of a formula where its own had stood.
 #[test]
 fn a_part_of_an_unknown_force_is_not_named() {
     let dir = tempfile::tempdir().expect("a temporary folder");

@@ -3,8 +3,8 @@
 //! With residuals r(f) of a tapered stretch, their declared Σ(f) and the channels' response d to a place, the power
 //! that a line at f may have is `s = |dᵀΣ⁻¹r|²/(dᵀΣ⁻¹d)`: exponential with a mean of one where there is none. Levels of
 //! noise are not as declared, so it is taken over its local mean, from the median of the frequencies around. Between
-//! two bins of the transform it is that of their difference over √2, which a line half a bin from both raises: of a line
-//! anywhere at least four fifths of the power are found.
+//! two bins of the transform it is that of their difference over √2, which a line half a bin from both raises: of a
+//! line anywhere at least four fifths of the power are found.
 
 use std::f64::consts::{LN_2, TAU};
 use std::ops::Range;

@@ -552,8 +552,8 @@ fn first_few(names: &[String]) -> String {
 }
 
 /// What is named, and may as well be a force that no effect knows: the probability of that is above the false-alarm
-/// rate, or a formula with fewer coefficients explains as much but for what the further ones explain by chance. With the
-/// formulas that state such forces, the most probable first.
+/// rate, or a formula with fewer coefficients explains as much but for what the further ones explain by chance. With
+/// the formulas that state such forces, the most probable first.
 fn not_told_from_formulas<'a>(
     settings: &Settings,
     decided: &'a Decided,
