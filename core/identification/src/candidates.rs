@@ -6,7 +6,7 @@ use dragfree_estimation::spectra::{Layout, Regressor};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
-use crate::gram::Columns;
+use crate::columns::Columns;
 
 /// A channel's response to a coefficient.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

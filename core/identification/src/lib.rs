@@ -11,6 +11,7 @@
 
 pub mod candidates;
 pub mod coherence;
+pub mod columns;
 pub mod compare;
 pub mod diagnosis;
 pub mod distributions;

@@ -572,7 +572,8 @@ mod tests {
     use super::*;
     use crate::candidates::{Coefficient, Form, Term};
     use crate::coherence::HousekeepingCoherence;
-    use crate::gram::{Columns, GramAccumulator};
+    use crate::columns::Columns;
+    use crate::gram::GramAccumulator;
     use crate::lines::LineSearch;
     use crate::transient::Search;
     use crate::waveform::Waveform;
