@@ -38,8 +38,8 @@ const FINENESS: f64 = 4.0;
 /// Cosines of which a random walk is made: what is left of it lies above the frequencies at which slow causes show.
 const COSINES: usize = 64;
 
-/// Steps between two powers of a random walk that are tried, in its logarithm: a twentieth of what the power of one
-/// degree of freedom is uncertain by.
+/// Steps between two powers of a random walk that are tried, in its logarithm: less than a tenth of what the power of
+/// one degree of freedom is uncertain by.
 const POWER_STEP: f64 = 0.1;
 
 /// Samples without a gap.
@@ -351,7 +351,7 @@ impl SlowSamples {
                 Some(whitened.explained(own.into_iter()) - more * (whitened.y.len() as f64).ln())
             };
             let all: Vec<f64> = candidates.iter().filter_map(explained).collect();
-            let best = all.iter().copied().fold(0.0, f64::max);
+            let best = all.iter().copied().reduce(f64::max)?;
             let walk = whitened.explained_by_a_walk(&whitened.left(&whitened.whiten(&thin.walk())?));
             Some(best - 2.0 * (all.len() as f64).ln() > walk)
         };
@@ -488,7 +488,7 @@ impl Whitened {
             };
             modes.eigenvalues.iter().zip(along.iter()).map(of).sum::<f64>()
         };
-        // From a walk that is lost in the noise to one that explains everything and pays for it.
+        // As far below the noise as above a walk that explains everything.
         let most = (self.y.norm_squared() / OWN).ln();
         let count = (most / POWER_STEP) as usize;
         let powers = (0..count).map(|k| (POWER_STEP * k as f64).exp() * OWN.sqrt() / largest);
@@ -682,6 +682,8 @@ pub(crate) mod tests {
             };
             unknown += is_explained(&walks[0]);
             own += is_explained(&walks[1]);
+            let samples = samples(seed, hours, |t| size * walks[0](t), &series, &[]);
+            assert!(seed > 0 || !samples.is_explained(&first(), &[], &[], &noise()), "by no candidate");
         }
         assert_eq!(own, 100);
         assert!(unknown <= 5, "{unknown}");
