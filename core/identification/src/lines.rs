@@ -356,8 +356,8 @@ mod tests {
         }
     }
 
-    /// Of the power of a line of 30σ, 450, more is found on average of sixteen places between two bins than what is left
-    /// at the worst of them, 0.93 by the taper times 0.745. A Hann window and bins alone leave 0.60 on average.
+    /// Of the power of a line of 30σ, 450, more is found on average of sixteen places between two bins than what is
+    /// left at the worst of them, 0.93 by the taper times 0.745. A Hann window and bins alone leave 0.60 on average.
     #[test]
     fn more_than_two_thirds_of_the_power_of_a_line_are_found() {
         let amplitude = (2.0 * 900.0 / N as f64).sqrt();
