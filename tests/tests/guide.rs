@@ -82,3 +82,16 @@ fn every_command_of_the_guide_runs() {
     }
     assert!(run >= 8, "the pages were read: {run} commands");
 }
+
+/// The guide's table of effects has every effect that comes with the program.
+#[test]
+fn the_guide_names_every_effect() {
+    let listed = Command::new(built().join("dragfree")).args(["plugins", "list", "--json"]).output().expect("runs");
+    let listed: serde_json::Value = serde_json::from_slice(&listed.stdout).expect("JSON");
+    let ids = listed["plugins"].as_array().expect("plugins").iter().filter(|plugin| plugin["kind"] == "effect");
+    let ids: Vec<&str> = ids.filter_map(|plugin| plugin["id"].as_str()).collect();
+    assert!(ids.len() > 20, "{ids:?}");
+    let page = std::fs::read_to_string(root().join("ops-guide/src/model.md")).expect("the page");
+    let missing: Vec<&&str> = ids.iter().filter(|id| !page.contains(&format!("`{id}`"))).collect();
+    assert!(missing.is_empty(), "model.md does not name {missing:?}");
+}
