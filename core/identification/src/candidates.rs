@@ -91,6 +91,17 @@ pub struct CandidateSet {
     pub rules: Vec<Rule>,
 }
 
+/// Forms of a candidate that are left out.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct LeftOut {
+    /// Its name, `es-gain:tm1.y`.
+    pub name: String,
+    /// Whether no form is left.
+    pub all: bool,
+    /// For each form that is left out a column that it lacks.
+    pub columns: Vec<usize>,
+}
+
 /// An instance of an effect in one form, which can be added to a model.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Candidate {
@@ -126,6 +137,48 @@ impl CandidateSet {
             }
         }
         places
+    }
+
+    /// The same candidates in the forms that another set has too; none where the two differ in anything else.
+    pub fn common(&self, other: &Self) -> Option<Self> {
+        let without_forms = |set: &Self| {
+            let mut set = set.clone();
+            set.coefficients.iter_mut().filter(|c| c.candidate).for_each(|c| c.forms.clear());
+            set
+        };
+        if without_forms(self) != without_forms(other) {
+            return None;
+        }
+        let mut common = self.clone();
+        for (own, theirs) in common.coefficients.iter_mut().zip(&other.coefficients) {
+            own.forms.retain(|form| theirs.forms.contains(form));
+        }
+        Some(common)
+    }
+
+    /// Leaves out the forms of candidates that need a column which `lacks` a value: of all coefficients of a place, as
+    /// a form is one of all of them. Tells each place with the number of forms that it had, and the columns.
+    pub fn leave_out(&mut self, lacks: impl Fn(usize) -> bool) -> Vec<LeftOut> {
+        let mut all = Vec::new();
+        for place in self.places() {
+            let forms = self.coefficients[place[0]].forms.len();
+            let culprit = |form: usize| {
+                let mut terms = place.iter().flat_map(|i| &self.coefficients[*i].forms[form].terms);
+                terms.find(|t| lacks(t.column)).map(|t| t.column)
+            };
+            let culprits: Vec<Option<usize>> = (0..forms).map(culprit).collect();
+            for i in &place {
+                let mut keeps = culprits.iter().map(Option::is_none);
+                self.coefficients[*i].forms.retain(|_| keeps.next().unwrap_or(true));
+            }
+            let columns: Vec<usize> = culprits.into_iter().flatten().collect();
+            if !columns.is_empty() {
+                let first = &self.coefficients[place[0]];
+                let name = format!("{}:{}", first.effect, first.instance);
+                all.push(LeftOut { name, all: columns.len() == forms, columns });
+            }
+        }
+        all
     }
 
     /// The `form`-th form of the coefficients of a place.

@@ -6,7 +6,7 @@ use dragfree_estimation::verdict::chi2_per_dof_at;
 use dragfree_schema::Settings;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use crate::candidates::Candidate;
 use crate::coherence::Coherence;
@@ -365,13 +365,20 @@ pub fn remaining(
     let measured = scorer.residual_psd(&fit);
     let mut levels = scorer.levels(&fit, scorer.total, &measured);
     levels.fit();
-    Ok(unexplained(scorer, &levels))
+    // Housekeeping was compared with the residuals of the model: where a slow force was added, not with what is left.
+    let slow = added.iter().filter(|c| c.is_slow(&scorer.gathered.columns));
+    let explained = slow.flat_map(|c| &c.parts).flat_map(|(_, form)| &form.terms).map(|t| t.channel).collect();
+    Ok(unexplained(scorer, &levels, &explained))
 }
 
 /// Power beyond the modelled noise, channel by channel in thirds of a decade, and housekeeping that is coherent with
 /// the residuals. Either is evidence of an unknown cause; a slow force shows in the coherence long before it shows in
-/// the power.
-fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>) -> Option<Unexplained> {
+/// the power. Channels that are `explained` have no coherence.
+fn unexplained(
+    scorer: &CandidateScorer<'_>,
+    levels: &Levels<'_>,
+    explained: &BTreeSet<usize>,
+) -> Option<Unexplained> {
     let settings = scorer.settings;
     let plan = scorer.plan();
     let channels = &scorer.candidate_set.channels;
@@ -384,14 +391,15 @@ fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>) -> Option<Unex
         loud.extend(found.map(|(c, ratio)| (c, [hz(bands.start), hz(bands.end - 1)], ratio)));
     }
     let all = scorer.gathered.housekeeping.coherences(channels);
+    let of = |w: &Coherence| channels.iter().position(|c| *c == w.channel);
     let significant: Vec<Coherence> = all
         .into_iter()
+        .filter(|w| of(w).is_none_or(|channel| !explained.contains(&channel)))
         .filter(|w| corrected(ln_chi2_above(w.statistic, w.dof).exp(), w.trials) < settings.coherence_false_alarm)
         .collect();
     let power = !loud.is_empty();
     if !power {
         // A driver that explains a part x of the power raises it by 1/(1 − x).
-        let of = |w: &Coherence| channels.iter().position(|c| *c == w.channel);
         let best = significant.iter().find(|w| w.explained > settings.coherence_min_explained)?;
         loud.push((of(best)?, best.band_hz, (1.0 - best.explained.clamp(0.0, 0.999)).recip()));
     }

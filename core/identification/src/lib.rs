@@ -19,6 +19,7 @@ pub mod driven;
 pub mod gram;
 pub mod innovations;
 pub mod lines;
+pub mod quadratic;
 pub mod record;
 pub mod scores;
 pub mod screen;

@@ -35,14 +35,15 @@ impl Record {
         NoiseModel::new(&self.noise, &self.candidate_set.channels, 1.0 / self.gathered.rate_hz)
     }
 
-    /// Adds the sums of other telemetry.
+    /// Adds the sums of other telemetry. Forms of candidates whose series have gaps in one of the two are left out.
     ///
     /// # Errors
     /// [`Unlike`] where the two were not asked the same.
     pub fn add(&mut self, other: &Self) -> Result<(), Unlike> {
+        let common = self.candidate_set.common(&other.candidate_set);
         let (a, b) = (&self.gathered, &other.gathered);
         let same = [
-            (self.candidate_set == other.candidate_set, "models, candidates or housekeeping"),
+            (common.is_some(), "models, candidates or housekeeping"),
             (self.noise == other.noise, "declared noise"),
             (a.columns == b.columns, "columns"),
             (a.length == b.length && a.rate_hz == b.rate_hz, "segments"),
@@ -50,6 +51,10 @@ impl Record {
         if let Some((_, what)) = same.into_iter().find(|(same, _)| !same) {
             return Err(Unlike(what));
         }
+        self.candidate_set = common.unwrap_or_else(|| self.candidate_set.clone());
+        let new = other.not_tried.iter().filter(|told| !self.not_tried.contains(told));
+        let new: Vec<(String, String)> = new.cloned().collect();
+        self.not_tried.extend(new);
         let g = &mut self.gathered;
         g.total.add(&other.gathered.total);
         g.hours.extend(other.gathered.hours.iter().cloned());

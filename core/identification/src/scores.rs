@@ -19,6 +19,7 @@ use nalgebra::{Cholesky, DMatrix, DVector};
 
 use crate::candidates::{Candidate, CandidateSet, Coefficient};
 use crate::gram::{Gram, GramSums};
+use crate::quadratic::largest_in_box;
 
 /// Refinements of Σ from the residuals.
 const REFINEMENTS: usize = 3;
@@ -413,7 +414,7 @@ impl<'a> CandidateScorer<'a> {
             .collect();
         let free = Cholesky::new(information.clone())?.solve(&score);
         let in_range = free.iter().zip(&bounds).all(|(x, (lower, upper))| lower <= x && x <= upper);
-        let value = if in_range { free } else { inside(&information, &score, &bounds) };
+        let value = if in_range { free } else { largest_in_box(&information, &score, &bounds) };
         let delta_chi2 = 2.0 * score.dot(&value) - value.dot(&(&information * &value));
         Some(Scored { candidate, value, in_range, delta_chi2, information, understated: 1.0 })
     }
@@ -553,18 +554,6 @@ fn neighbours<'a>(of: &Candidate, all: impl Iterator<Item = &'a Candidate>) -> V
         }
     }
     nearest.into_values().collect()
-}
-
-/// The minimum of `½ xᵀSx − sᵀx` in a box, coordinate by coordinate: S is positive definite and small.
-fn inside(information: &DMatrix<f64>, score: &DVector<f64>, bounds: &[(f64, f64)]) -> DVector<f64> {
-    let mut x: DVector<f64> = DVector::from_iterator(bounds.len(), bounds.iter().map(|(l, u)| 0.0f64.clamp(*l, *u)));
-    for _ in 0..200 {
-        for i in 0..x.len() {
-            let rest = score[i] - information.row(i).dot(&x.transpose()) + information[(i, i)] * x[i];
-            x[i] = (rest / information[(i, i)]).clamp(bounds[i].0, bounds[i].1);
-        }
-    }
-    x
 }
 
 #[cfg(test)]

@@ -87,7 +87,7 @@ impl Site {
             Ok(Written { product: archive.product(&row.id)?, path: archive.path_of(&row.id) })
         });
         let written: Vec<Written> = written.collect::<Result<_, _>>()?;
-        let basis = Arc::new(Basis::read(&self.setup.registry, &written)?);
+        let basis = Arc::new(Basis::read(&written)?);
         let mut bases = self.bases.lock().unwrap_or_else(PoisonError::into_inner);
         bases.push_front((key, Arc::clone(&basis)));
         bases.truncate(BASES);

@@ -5,12 +5,9 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use dragfree_archive::Written;
 use dragfree_engine::config::EffectEntry;
-use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
-use dragfree_engine::registry::Registry;
 use dragfree_identification::candidates;
 use dragfree_identification::diagnosis::{
-    Constancy, Diagnosis, Drift, Found, LIMIT_QUANTILE, LINE, Limit, OfProduct, Offset, OtherLevel, Separation,
-    TRANSIENT, Trials,
+    Constancy, Diagnosis, Drift, Found, LIMIT_QUANTILE, Limit, OfProduct, Offset, OtherLevel, Separation, Trials,
 };
 use dragfree_identification::innovations::decision::{Candidate, Fitted, Quadratic};
 use dragfree_identification::record::Record;
@@ -20,14 +17,12 @@ use serde_json::json;
 
 use crate::likelihood::{Decided, Judge, LEVEL_PRIOR, Meaning, Place};
 use crate::proposals::Proposal;
-use crate::replay::AT_NS;
 
 /// Corrected p-values of the effects of some products.
 pub(crate) struct Evidence<'a> {
     pub(crate) trials: Trials,
     /// Probability from which another explanation is named beside the chosen one.
     pub(crate) least: f64,
-    pub(crate) registry: &'a Registry,
     pub(crate) products: &'a [Written],
     /// Formulas among the candidates.
     pub(crate) proposals: Vec<Proposal>,
@@ -55,25 +50,16 @@ impl Evidence<'_> {
         self.proposal(&place.effect, &place.instance).map_or_else(|| place.name(), |p| p.words.clone())
     }
 
-    /// What acts once was searched for at every time, and what acts at one frequency at every frequency.
-    pub(crate) fn family<'b>(&self, effect: &'b str) -> &'b str {
-        let has = |name| has_parameter(self.registry, effect, name);
-        match (has(AT_NS), has(FREQUENCY_HZ)) {
-            (true, _) => TRANSIENT,
-            (_, true) => LINE,
-            _ => effect,
-        }
-    }
 }
 
 impl Judge for Evidence<'_> {
-    fn log10_p(&self, effect: &str, gain: f64, dof: usize) -> f64 {
-        self.trials.p_value(self.family(effect), gain, dof as f64).1
+    fn log10_p(&self, family: &str, gain: f64, dof: usize) -> f64 {
+        self.trials.p_value(family, gain, dof as f64).1
     }
 
-    fn ln_prior(&self, effect: &str, instance: &str) -> f64 {
+    fn ln_prior(&self, effect: &str, instance: &str, family: &str) -> f64 {
         let of_proposal = self.proposal(effect, instance).map_or(0.0, |p| p.ln_weight);
-        of_proposal - self.trials.of(self.family(effect)).ln()
+        of_proposal - self.trials.of(family).ln()
     }
 }
 
@@ -105,7 +91,7 @@ pub(crate) fn found(
     let (effect, instance, own) = (&place.effect, &place.instance, &place.parameters);
     let (values, lead) = leading(fitted);
     let dof = own.len() as f64;
-    let (p_value, log10_p_value) = evidence.trials.p_value(evidence.family(effect), fitted.gain, dof);
+    let (p_value, log10_p_value) = evidence.trials.p_value(place.family(), fitted.gain, dof);
     let (mut offset_shift_m, mut offset_shift_sigma) = (BTreeMap::new(), BTreeMap::new());
     let named: Vec<usize> = decided.selection.chosen.iter().map(|f| f.candidate).collect();
     let without: Vec<usize> = named.iter().copied().filter(|c| *c != fitted.candidate).collect();
@@ -306,7 +292,7 @@ pub(crate) fn rivals_of_all(days: &[&[Rival]]) -> Vec<Rival> {
 /// candidate which acts on the power of the noise, such as a gain in the loop, has lost its evidence to the level when
 /// both are asked for: it is compared with the level held as the model states it.
 fn rivals(decided: &Decided, level: &NoiseLevel, parameter: usize, evidence: &Evidence<'_>) -> Vec<Rival> {
-    let ln_prior = evidence.ln_prior(&level.effect, &level.instance);
+    let ln_prior = evidence.ln_prior(&level.effect, &level.instance, &level.effect);
     let own = decided.candidates.len();
     let prior_sigma = vec![LEVEL_PRIOR];
     let quadratic = decided.quadratic.with_candidate(Candidate { ln_prior, prior_sigma, ..Candidate::free(parameter) });
@@ -410,7 +396,7 @@ pub(crate) fn offsets(decided: &Decided, evidence: &Evidence<'_>) -> Vec<Offset>
     let lasts = |c: &usize| {
         let place = &decided.candidates[*c];
         let proposed = evidence.proposal(&place.effect, &place.instance).is_some();
-        !named.contains(c) && !proposed && evidence.family(&place.effect) == place.effect
+        !named.contains(c) && !proposed && place.family() == place.effect
     };
     let others: Vec<usize> = (0..decided.candidates.len()).filter(lasts).collect();
     let values = &decided.selection.values;

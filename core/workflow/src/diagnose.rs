@@ -83,8 +83,8 @@ pub fn diagnose(
     tried.insert(FORMULA.to_owned(), formulas);
     tried.retain(|effect, _| !has_parameter(replay.registry, effect, FREQUENCY_HZ));
     let trials = Trials::new(&spectra.scorer(settings), &tried);
-    let (registry, products) = (replay.registry, replay.products);
-    let evidence = Evidence { trials, least: settings.false_alarm, registry, products, proposals };
+    let products = replay.products;
+    let evidence = Evidence { trials, least: settings.false_alarm, products, proposals };
     let (last, spectra) = decide(replay, &searched, spectra, &requests, &evidence, progress)?;
     let decided = &last.end.decided;
     let scorer = spectra.scorer(settings);
@@ -574,7 +574,8 @@ fn not_told_from_formulas<'a>(
         let by_chance = |lost: f64| ln_chi2_above(lost.max(0.0), more as f64) > settings.false_alarm.ln();
         let simpler = (0..decided.candidates.len()).filter(is_simpler).map(|c| (c, fitted(c).gain));
         let as_good = simpler.filter(|(_, gain)| by_chance(f.gain - gain));
-        let ln_weight = |(c, gain): (usize, f64)| 0.5 * gain + evidence.ln_prior(&place(c).effect, &place(c).instance);
+        let ln_prior = |p: &Place| evidence.ln_prior(&p.effect, &p.instance, p.family());
+        let ln_weight = |(c, gain): (usize, f64)| 0.5 * gain + ln_prior(place(c));
         let mut as_good: Vec<(usize, f64)> = as_good.map(|own| (own.0, ln_weight(own))).collect();
         as_good.sort_by(|a, b| b.1.total_cmp(&a.1));
         let least = as_good.first().map_or(0.0, |best| best.1 + settings.false_alarm.ln());

@@ -12,7 +12,6 @@ use std::path::{Path, PathBuf};
 
 use dragfree_archive::{Archive, EXTRACT, Stamp, Written};
 use dragfree_engine::EngineError;
-use dragfree_engine::registry::Registry;
 use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{Diagnosis, Found, Trials, UNOBSERVABLE};
 use dragfree_identification::innovations::decision::Prior;
@@ -322,11 +321,11 @@ fn same(a: &Coefficient, b: &Coefficient) -> bool {
 ///
 /// # Errors
 /// [`WorkflowError`]: an extract is missing, or the products have different models.
-pub fn diagnose_extracts(registry: &Registry, products: &[Written]) -> Result<Diagnosis, WorkflowError> {
+pub fn diagnose_extracts(products: &[Written]) -> Result<Diagnosis, WorkflowError> {
     let settings = &products.first().ok_or(WorkflowError::NoProduct)?.product.settings;
     let extracts = of_products(products, |extract| drop((extract.take_by_band(), extract.take_stretches())))?;
     let evidence =
-        Evidence { trials: trials(&extracts), least: settings.false_alarm, registry, products, proposals: Vec::new() };
+        Evidence { trials: trials(&extracts), least: settings.false_alarm, products, proposals: Vec::new() };
     let (sums, mut not_tried) = shared(&extracts, |_| false);
     let decided = joined(sums, settings, &evidence, Vec::new());
     let unobservable = decided.selection.unobservable.iter().map(|c| decided.candidates[*c].name());

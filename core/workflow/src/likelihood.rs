@@ -9,10 +9,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use dragfree_archive::Written;
 use dragfree_engine::chain::Chain;
 use dragfree_engine::config::EffectEntry;
-use dragfree_engine::examine::{Examination, examine};
+use dragfree_engine::examine::{Examination, FREQUENCY_HZ, examine};
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
-use dragfree_identification::diagnosis::Constancy;
+use dragfree_identification::diagnosis::{Constancy, LINE, TRANSIENT};
 use dragfree_identification::innovations::decision::{Candidate, Evidence, Prior, Quadratic, Selection, disagreement};
 use dragfree_identification::innovations::filter::{Moments, Start, Sums};
 use dragfree_schema::{Coefficient, NoiseProcess, PREDICTION_NEED, Settings, Shape};
@@ -33,7 +33,7 @@ pub(crate) use stretches::{Alone, Stretches};
 use stretches::{Stretch, stretches};
 
 use crate::WorkflowError;
-use crate::replay::{Pass, Replay, noise_levels};
+use crate::replay::{AT_NS, Pass, Replay, noise_levels};
 
 /// Passes that decide, after which the answer is given as it is, with what still moves.
 pub(crate) const PASSES: usize = 6;
@@ -125,6 +125,11 @@ impl Place {
     /// `EFFECT:INSTANCE`.
     pub(crate) fn name(&self) -> String {
         format!("{}:{}", self.effect, self.instance)
+    }
+
+    /// Family of trials of its form.
+    pub(crate) fn family(&self) -> &str {
+        family(&self.effect, &self.shape)
     }
 }
 
@@ -257,12 +262,24 @@ pub(crate) fn joined(
     all.decided(&Point::default(), How::Select, settings, judge, not_tried)
 }
 
+/// Family of trials of a form of an effect: what acts once was searched for at every time, and what acts at one
+/// frequency at every frequency. An impulse at every step of a flag is neither.
+pub(crate) fn family<'a>(effect: &'a str, shape: &Shape) -> &'a str {
+    if shape.contains_key(AT_NS) {
+        TRANSIENT
+    } else if shape.contains_key(FREQUENCY_HZ) {
+        LINE
+    } else {
+        effect
+    }
+}
+
 /// What the decision needs to know of candidates.
 pub(crate) trait Judge {
-    /// Decimal logarithm of the corrected p-value of a gain `2 Δ ln L` of an effect.
-    fn log10_p(&self, effect: &str, gain: f64, dof: usize) -> f64;
+    /// Decimal logarithm of the corrected p-value of a gain `2 Δ ln L` of a form in a family of trials.
+    fn log10_p(&self, family: &str, gain: f64, dof: usize) -> f64;
     /// Logarithm of the weight of an effect's instance before any data.
-    fn ln_prior(&self, effect: &str, instance: &str) -> f64;
+    fn ln_prior(&self, effect: &str, instance: &str, family: &str) -> f64;
 }
 
 /// The point that the sums of a pass lead to.
@@ -540,7 +557,8 @@ impl Joined {
         }
         let candidates: Vec<Candidate> = groups
             .iter()
-            .map(|Place { effect, instance, parameters: own, .. }| {
+            .map(|place| {
+                let Place { effect, instance, parameters: own, .. } = place;
                 let coefficients = || {
                     own.iter().filter_map(|i| match &parameters[*i].1 {
                         Meaning::Coefficient(c) => Some(c),
@@ -552,7 +570,7 @@ impl Joined {
                     lower: coefficients().map(|c| c.lower).collect(),
                     upper: coefficients().map(|c| c.upper).collect(),
                     prior_sigma: coefficients().map(|c| c.prior_sigma).collect(),
-                    ln_prior: judge.ln_prior(effect, instance),
+                    ln_prior: judge.ln_prior(effect, instance, place.family()),
                     shaped: coefficients().any(|c| !c.shape.is_empty()),
                 }
             })
@@ -568,7 +586,7 @@ impl Joined {
         };
         let by_product = if self.parts.len() > 1 { self.parts.iter().map(of_product).collect() } else { Vec::new() };
         let quadratic = Quadratic::new(&sums, &start, &priors, candidates);
-        let log10_p = |c: usize, gain: f64| judge.log10_p(&groups[c].effect, gain, groups[c].parameters.len());
+        let log10_p = |c: usize, gain: f64| judge.log10_p(groups[c].family(), gain, groups[c].parameters.len());
         let selection = match how {
             How::Select => quadratic.select(&Evidence {
                 log10_p: &log10_p,

@@ -9,7 +9,6 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use dragfree_archive::Written;
-use dragfree_engine::registry::Registry;
 use dragfree_identification::diagnosis::Trials;
 use dragfree_identification::innovations::decision::{Candidate, Prior, Quadratic};
 use dragfree_identification::innovations::filter::Sums;
@@ -39,8 +38,6 @@ pub struct Basis {
     candidates: Vec<Candidate>,
     switches: Vec<Switch>,
     trials: Trials,
-    /// Family of trials of each effect.
-    families: BTreeMap<String, String>,
     named: Vec<String>,
     not_tried: BTreeMap<String, String>,
     /// Housekeeping channels with their units.
@@ -130,14 +127,14 @@ impl Basis {
     ///
     /// # Errors
     /// [`WorkflowError`]: an extract is missing, or the products have different models.
-    pub fn read(registry: &Registry, products: &[Written]) -> Result<Self, WorkflowError> {
+    pub fn read(products: &[Written]) -> Result<Self, WorkflowError> {
         let settings = products.first().ok_or(WorkflowError::NoProduct)?.product.settings.clone();
         let mut stretches = Vec::new();
         let extracts = of_products(products, |extract| stretches.push(times(extract.take_stretches())))?;
         let trials = trials(&extracts);
         let (sums, not_tried) = shared(&extracts, |c| in_all_days(&extracts, c));
         let evidence =
-            Evidence { trials: trials.clone(), least: settings.false_alarm, registry, products, proposals: Vec::new() };
+            Evidence { trials: trials.clone(), least: settings.false_alarm, products, proposals: Vec::new() };
         // The sums with their ranges and priors; which effects are added is the caller's decision.
         let nothing_added = Settings { max_added: 0, ..settings.clone() };
         let parts: Vec<_> =
@@ -181,7 +178,6 @@ impl Basis {
         for (day, mut extract) in days.iter_mut().zip(extracts) {
             day.by_band = extract.take_by_band().map(Arc::new);
         }
-        let families = switches.iter().map(|s| (s.effect.clone(), evidence.family(&s.effect).to_owned())).collect();
         Ok(Self {
             days,
             candidates: decided.quadratic.candidates().to_vec(),
@@ -190,7 +186,6 @@ impl Basis {
             coefficients,
             switches,
             trials,
-            families,
             named,
             not_tried,
             settings,

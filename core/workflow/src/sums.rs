@@ -276,27 +276,17 @@ impl ColumnSums {
             self.missing[column] as f64 > self.settings.max_missing * self.measured.max(1) as f64
                 || self.held[column].is_nan()
         };
-        let model = candidate_set.model();
         let mut fewer: BTreeMap<usize, usize> = BTreeMap::new();
-        for c in &mut candidate_set.coefficients[model..] {
-            let before = c.forms.len();
-            let mut culprit = None;
-            c.forms.retain(|f| {
-                let bad = f.terms.iter().find(|t| t.column >= self.base && gappy(t.column));
-                culprit = bad.map(|t| t.column).or(culprit);
-                bad.is_none()
-            });
-            if let (false, Some(column)) = (c.forms.is_empty(), culprit) {
-                *fewer.entry(column).or_default() += before - c.forms.len();
-            }
-            if let (true, Some(column)) = (before > 0 && c.forms.is_empty(), culprit) {
-                not_tried.push((
-                    format!("{}:{}", c.effect, c.instance),
+        for left_out in candidate_set.leave_out(|column| column >= self.base && gappy(column)) {
+            match left_out.columns.last() {
+                Some(column) if left_out.all => not_tried.push((
+                    left_out.name,
                     format!(
                         "{} has no value in {} of {} epochs: what it is made of has gaps",
-                        self.names[column], self.missing[column], self.measured
+                        self.names[*column], self.missing[*column], self.measured
                     ),
-                ));
+                )),
+                _ => left_out.columns.into_iter().for_each(|column| *fewer.entry(column).or_default() += 1),
             }
         }
         not_tried.extend(fewer.into_iter().map(|(column, forms)| {

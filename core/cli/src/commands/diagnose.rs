@@ -24,7 +24,7 @@ pub(super) fn execute(command: &Diagnose, global: &Global, paint: Paint) -> Resu
         return Err(Refusal::Extracts(products.len()).into());
     }
     let (answer, kept) = if command.extracts {
-        let diagnosis = diagnose_extracts(&super::registry(global)?, &products)?;
+        let diagnosis = diagnose_extracts(&products)?;
         (Answer { diagnosis, effects: None, unnamed: Vec::new(), next: None }, None)
     } else {
         let others = if command.next { latest(archive)? } else { Vec::new() };

@@ -5,12 +5,11 @@ use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 
 use super::filter::Sums;
+use crate::quadratic::{inverse, largest_in_box};
 
 /// By how many times the error that rounding is expected to make a number must differ from zero to be no rounding: sums
 /// of n products have one of √n ε (Higham and Mary, 2019), and each product comes from several operations.
 const ROUNDING: f64 = 30.0;
-/// Rounds of fixing values at the ends of their ranges.
-const ROUNDS: usize = 20;
 
 /// An effect that may be in the model or not.
 #[derive(Clone, Debug)]
@@ -80,7 +79,7 @@ pub struct Fitted {
     pub covariance: DMatrix<f64>,
     /// Twice the logarithm of the ratio of likelihoods with and without it.
     pub gain: f64,
-    /// How much more it would be without ranges.
+    /// How much more it would be without the ranges of its own values.
     pub beyond: f64,
     /// Others that explain as much in its place, with their probabilities, and its own.
     pub alternatives: Vec<(usize, f64)>,
@@ -190,27 +189,21 @@ impl Quadratic {
 
     /// Values inside the ranges and the gain of a set of candidates.
     fn fit(&self, set: &[usize]) -> (Vec<f64>, f64) {
+        self.fit_without_ranges_of(None, set)
+    }
+
+    /// The same with one candidate of the set, if any, outside of its ranges too.
+    fn fit_without_ranges_of(&self, candidate: Option<usize>, set: &[usize]) -> (Vec<f64>, f64) {
         let at = self.parameters(set);
-        let bounds: Vec<(f64, f64)> = set
-            .iter()
-            .flat_map(|c| self.candidates[*c].lower.iter().copied().zip(self.candidates[*c].upper.iter().copied()))
-            .collect();
+        let ranges = |c: &usize| -> Vec<(f64, f64)> {
+            let Candidate { lower, upper, .. } = &self.candidates[*c];
+            let all = lower.iter().copied().zip(upper.iter().copied());
+            if Some(*c) == candidate { all.map(|_| (f64::NEG_INFINITY, f64::INFINITY)).collect() } else { all.collect() }
+        };
+        let bounds: Vec<(f64, f64)> = set.iter().flat_map(ranges).collect();
         let n = DMatrix::from_fn(at.len(), at.len(), |i, j| self.profiled[(at[i], at[j])]);
         let s = DVector::from_fn(at.len(), |i, _| self.profiled_score[at[i]]);
-        let mut fixed: Vec<Option<f64>> = vec![None; at.len()];
-        let mut values = DVector::zeros(at.len());
-        for _ in 0..ROUNDS {
-            let free: Vec<usize> = (0..at.len()).filter(|i| fixed[*i].is_none()).collect();
-            let held = DVector::from_fn(at.len(), |i, _| fixed[i].unwrap_or(0.0));
-            let rest = &s - &n * &held;
-            let own = inverse(&DMatrix::from_fn(free.len(), free.len(), |i, j| n[(free[i], free[j])]));
-            let solved = own * DVector::from_fn(free.len(), |i, _| rest[free[i]]);
-            values = held;
-            free.iter().zip(solved.iter()).for_each(|(i, x)| values[*i] = *x);
-            let outside = free.iter().find(|i| values[**i] < bounds[**i].0 || values[**i] > bounds[**i].1);
-            let Some(i) = outside else { break };
-            fixed[*i] = Some(values[*i].clamp(bounds[*i].0, bounds[*i].1));
-        }
+        let values = largest_in_box(&n, &s, &bounds);
         let gain = 2.0 * s.dot(&values) - values.dot(&(&n * &values));
         (values.iter().copied().collect(), gain)
     }
@@ -246,13 +239,20 @@ impl Quadratic {
         let covariance = inverse(&n);
         let free = &covariance * DVector::from_fn(at.len(), |i, _| self.profiled_score[at[i]]);
         let first = at.len() - own;
+        let Candidate { lower, upper, .. } = &self.candidates[candidate];
+        let is_inside = |(k, x): (usize, &f64)| lower[k] < *x && *x < upper[k];
+        let beyond = if values[first..].iter().enumerate().all(is_inside) {
+            0.0
+        } else {
+            self.fit_without_ranges_of(Some(candidate), &all).1 - with
+        };
         Fitted {
             candidate,
             values: values[first..].to_vec(),
             free: free.as_slice()[first..].to_vec(),
             covariance: covariance.view((first, first), (own, own)).into_owned(),
             gain: (with - without).max(0.0),
-            beyond: (free.dot(&(&n * &free)) - self.fit(&others).1 - (with - without)).max(0.0),
+            beyond: beyond.max(0.0),
             alternatives: Vec::new(),
             probability: 1.0,
         }
@@ -551,20 +551,4 @@ pub fn disagreement(data: &[(DMatrix<f64>, DVector<f64>)], numbers: f64) -> (f64
     }
     let (together, n) = highest(&all.0, &all.1);
     ((apart - together).max(0.0), values - n)
-}
-
-/// Inverse of a symmetric matrix with rows of different units; rows of zeros stay zero.
-pub fn inverse(m: &DMatrix<f64>) -> DMatrix<f64> {
-    let unit: Vec<f64> = m.diagonal().iter().map(|d| if *d > 0.0 { d.sqrt().recip() } else { 0.0 }).collect();
-    let mut scaled = DMatrix::from_fn(m.nrows(), m.nrows(), |i, j| m[(i, j)] * unit[i] * unit[j]);
-    (0..m.nrows()).filter(|i| unit[*i] == 0.0).for_each(|i| scaled[(i, i)] = 1.0);
-    if m.is_empty() {
-        return scaled;
-    }
-    let eigen = scaled.symmetric_eigen();
-    // What differs from a combination of the others by rounding alone has no information of its own.
-    let least = 1e-13 * eigen.eigenvalues.max().max(1.0);
-    let reciprocal = eigen.eigenvalues.map(|x| if x > least { x.recip() } else { 0.0 });
-    let inner = &eigen.eigenvectors * DMatrix::from_diagonal(&reciprocal) * eigen.eigenvectors.transpose();
-    DMatrix::from_fn(m.nrows(), m.nrows(), |i, j| inner[(i, j)] * unit[i] * unit[j])
 }

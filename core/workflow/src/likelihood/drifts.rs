@@ -63,8 +63,10 @@ impl Decided {
                 other != k && (-worse).exp() > settings.false_alarm
             };
             let confounders = tried.iter().filter(likely).map(|(other, _)| name(&changing[*other])).collect();
-            found.push(self.drift(&changing[*k], fitted, days, (10f64.powf(p(&best)), confounders)));
             set.push(first + k);
+            // Its value at half the time beside its rate: data that lie more on one side of it give another one alone.
+            let middle = quadratic.values(&set)[changing[*k].parameter];
+            found.push(self.drift(&changing[*k], fitted, (middle, days), (10f64.powf(p(&best)), confounders)));
         }
         found
     }
@@ -142,11 +144,16 @@ impl Decided {
         Quadratic::new(&sums, &start, &self.priors, candidates)
     }
 
-    fn drift(&self, changing: &Changing, fitted: &Fitted, days: f64, evidence: (f64, Vec<String>)) -> Drift {
+    fn drift(
+        &self,
+        changing: &Changing,
+        fitted: &Fitted,
+        (middle, days): (f64, f64),
+        evidence: (f64, Vec<String>),
+    ) -> Drift {
         let (name, meaning) = &self.parameters[changing.parameter];
         let last = fitted.values.len() - 1;
         let per_day = fitted.values[last];
-        let middle = if changing.with_value { fitted.values[0] } else { self.selection.values[changing.parameter] };
         let ends = [-0.5, 0.5].map(|part| middle + part * days * per_day);
         let (unit, [at_start, at_end]) = match meaning {
             Meaning::Coefficient(c) => (c.unit.clone(), ends),

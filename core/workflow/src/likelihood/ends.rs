@@ -23,7 +23,7 @@ impl Judge for NoCandidates {
         0.0
     }
 
-    fn ln_prior(&self, _: &str, _: &str) -> f64 {
+    fn ln_prior(&self, _: &str, _: &str, _: &str) -> f64 {
         0.0
     }
 }

@@ -4,7 +4,7 @@
 //! know. Two forms on either side of each number tell how the data change with it, so that it is a parameter like
 //! others: the size has the σ that is left with it, and passes go on until the numbers stay.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use dragfree_engine::config::EffectEntry;
 use dragfree_engine::examine::FREQUENCY_HZ;
@@ -109,7 +109,7 @@ fn six_digits(x: f64) -> f64 {
 }
 
 /// What is named in the forms that its numbers have as the data want them, with these as further parameters. None where
-/// no form has a number. Where the numbers do not settle, in the forms in which it was named.
+/// no form has a number that settles: an effect with one that does not stays in the form in which it was named.
 ///
 /// # Errors
 /// As a pass.
@@ -119,6 +119,32 @@ pub(crate) fn with_numbers(
     evidence: &Evidence<'_>,
     progress: &mut dyn FnMut(Pass, usize, Progress),
 ) -> Result<Option<Decided>, WorkflowError> {
+    let mut held = BTreeSet::new();
+    loop {
+        match fit_numbers(replay, end, &held, evidence, progress)? {
+            Outcome::NoNumbers => return Ok(None),
+            Outcome::Settled(decided) => return Ok(Some(*decided)),
+            Outcome::Moving(effects) => held.extend(effects),
+        }
+    }
+}
+
+/// What passes that fit numbers end with.
+enum Outcome {
+    NoNumbers,
+    Settled(Box<Decided>),
+    /// Effects and instances whose numbers still move.
+    Moving(Vec<(String, String)>),
+}
+
+/// Passes that fit the numbers of all named effects but those that are `held` in their forms.
+fn fit_numbers(
+    replay: &Replay<'_>,
+    end: &Settled,
+    held: &BTreeSet<(String, String)>,
+    evidence: &Evidence<'_>,
+    progress: &mut dyn FnMut(Pass, usize, Progress),
+) -> Result<Outcome, WorkflowError> {
     let named = end.decided.selection.chosen.iter().map(|f| &end.decided.candidates[f.candidate]);
     let named: Vec<&Place> = named.collect();
     let place = |e: &EffectEntry| named.iter().find(|p| (&p.effect, &p.instance) == (&e.id, &e.instance));
@@ -126,14 +152,15 @@ pub(crate) fn with_numbers(
     // Of what filters a noise the difference of two forms is no measure: for a slosh of 8σ it gave its damping to 6 to
     // 23 %, where the likelihood of damping from 0.01 to 0.05 differs by a χ² of 7.
     let colours = |e: &EffectEntry| place(e).is_some_and(|p| end.decided.colours(p));
-    let is_fitted = |e: &&EffectEntry| evidence.proposal(&e.id, &e.instance).is_none() && !colours(e);
+    let is_held = |e: &EffectEntry| held.contains(&(e.id.clone(), e.instance.clone()));
+    let is_fitted = |e: &&EffectEntry| evidence.proposal(&e.id, &e.instance).is_none() && !colours(e) && !is_held(e);
     let mut entries: Vec<EffectEntry> = end.chosen.iter().filter(is_named).cloned().collect();
     let mut point = end.point.clone();
-    let mut first = None;
+    let mut moving = Vec::new();
     for pass in 0..PASSES {
         let (numbers, beside): (Vec<Number>, Vec<_>) = entries.iter().filter(is_fitted).flat_map(Number::all).unzip();
         if numbers.is_empty() {
-            return Ok(None);
+            return Ok(Outcome::NoNumbers);
         }
         let all: Vec<EffectEntry> = entries.iter().cloned().chain(beside.into_iter().flatten()).collect();
         // Series that are new have no means yet.
@@ -148,17 +175,20 @@ pub(crate) fn with_numbers(
         let moves = numbers.iter().filter_map(|n| Some((n, at(n)?)));
         let moves = moves.map(|(n, i)| (n, decided.selection.values[i], decided.selection.sigma[i]));
         let moves: Vec<(&Number, f64, f64)> = moves.collect();
-        if moves.iter().all(|(_, by, sigma)| by.abs() <= REACHED_SIGMAS * sigma) {
-            return Ok(Some(decided));
+        // A time that has left the data has no information.
+        let settled = |by: f64, sigma: f64| sigma > 0.0 && by.abs() <= REACHED_SIGMAS * sigma;
+        let left = moves.iter().filter(|(_, by, sigma)| !settled(*by, *sigma));
+        moving = left.map(|(n, ..)| (n.effect.clone(), n.instance.clone())).collect();
+        if moving.is_empty() {
+            return Ok(Outcome::Settled(Box::new(decided)));
         }
         for (number, by, _) in moves {
             let own = |e: &&mut EffectEntry| (&e.id, &e.instance) == (&number.effect, &number.instance);
             entries.iter_mut().filter(own).for_each(|entry| number.move_in(entry, by));
         }
         point = step(&point, &decided);
-        first.get_or_insert(decided);
     }
-    Ok(first)
+    Ok(Outcome::Moving(moving))
 }
 
 impl Decided {

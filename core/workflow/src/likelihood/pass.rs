@@ -114,6 +114,8 @@ pub(super) struct Filtered {
     /// What is taken off each series: its mean of an earlier pass.
     centres: Vec<f64>,
     sums: Vec<f64>,
+    /// Rows in them.
+    summed: u64,
     /// Table and name of each series.
     keys: Vec<(String, String)>,
     pub(super) constants: Vec<Constant>,
@@ -533,6 +535,7 @@ impl Filtered {
             base: responses.base,
             held: vec![f64::NAN; own],
             sums: vec![0.0; own],
+            summed: 0,
             waveforms: waveforms.iter().map(|placed| placed.waveform.clone()).collect(),
             templates,
             keys: responses.series.clone(),
@@ -552,7 +555,7 @@ impl Filtered {
 impl Filtered {
     /// Means of the series.
     pub(super) fn means(&self) -> BTreeMap<(String, String), f64> {
-        let rows = self.gaps.measured.max(1) as f64;
+        let rows = self.summed.max(1) as f64;
         self.keys.iter().cloned().zip(self.sums.iter().map(|sum| sum / rows)).collect()
     }
 }
@@ -581,8 +584,10 @@ impl Sink for Filtered {
                     *x = self.held[s];
                     self.gaps.missing[s] += u64::from(measured);
                 } else {
-                    // Housekeeping may begin late; what never comes is zero, and its effects are not tried.
+                    // Housekeeping may begin late; until it comes it is zero, and its effects are not tried if that is
+                    // long.
                     begun &= !waits;
+                    self.gaps.missing[s] += u64::from(measured && !waits);
                     *x = 0.0;
                 }
             }
@@ -593,6 +598,7 @@ impl Sink for Filtered {
                 continue;
             }
             self.first_ns.get_or_insert(*time_ns);
+            self.summed += u64::from(measured);
             for (s, x) in series.iter_mut().enumerate() {
                 if measured {
                     self.sums[s] += *x;

@@ -10,7 +10,8 @@
 //! of the stretches f of the fit and of those that are kept out, o. What is shared is a polynomial in time for one:
 //! it is not known in o as f alone has it, and χ² given f counts that.
 
-use dragfree_identification::innovations::decision::{Candidate, Prior, Quadratic, inverse};
+use dragfree_identification::innovations::decision::{Candidate, Prior, Quadratic};
+use dragfree_identification::quadratic::inverse;
 use dragfree_identification::innovations::filter::{Block, Passed, Sums};
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};

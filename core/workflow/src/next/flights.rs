@@ -15,7 +15,7 @@ use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_engine::table::{Chunk, TableSpec};
-use dragfree_identification::innovations::decision::inverse;
+use dragfree_identification::quadratic::inverse;
 use dragfree_physics::control::Command;
 use dragfree_physics::manoeuvre::{Input, LinearLoop, Manoeuvre};
 use dragfree_physics::mission::{ANGLES, AXES, Mission};

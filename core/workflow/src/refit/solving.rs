@@ -2,12 +2,14 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use dragfree_identification::innovations::decision::{Quadratic, inverse};
+use dragfree_identification::innovations::decision::Quadratic;
+use dragfree_identification::quadratic::inverse;
 use nalgebra::{DMatrix, DVector};
 use serde_json::Map;
 
 use super::{Basis, Confounder, Day, Effect, Form, Offset, On, Rung, Size, Switch, level_name};
 use crate::answer::NoiseLevel;
+use crate::likelihood::family;
 
 /// Effects that are not switched on are told as far as this rank: what comes after explains nothing.
 const TOLD: usize = 24;
@@ -163,8 +165,8 @@ impl Solving<'_> {
             sigma: fitted.covariance[(k, k)].max(0.0).sqrt(),
             unit: self.basis.coefficients[*i].unit.clone(),
         };
-        let family = self.basis.families.get(effect).map_or(effect.as_str(), String::as_str);
-        let (p_value, log10_p_value) = self.basis.trials.p_value(family, fitted.gain, parameters.len() as f64);
+        let (p_value, log10_p_value) =
+            self.basis.trials.p_value(family(effect, shape), fitted.gain, parameters.len() as f64);
         let names = parameters.iter().map(|i| &self.basis.coefficients[*i].name);
         let channels: BTreeSet<&String> = names.filter_map(|name| self.basis.channels.get(name)).flatten().collect();
         Effect {

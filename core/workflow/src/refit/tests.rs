@@ -84,7 +84,6 @@ fn basis(days: &[Data]) -> Basis {
         candidates: (OFFSETS..n).map(Candidate::free).collect(),
         switches: (OFFSETS..n).map(switch).collect(),
         trials: serde_json::from_value(json!({ "forms": { "effect": n - OFFSETS, "louder": 1.0 } })).expect("trials"),
-        families: BTreeMap::new(),
         named: Vec::new(),
         not_tried: BTreeMap::new(),
         housekeeping: BTreeMap::new(),
