@@ -14,6 +14,10 @@
 //! variance before any data is a million times what it would be by chance, because commands know the readouts before
 //! the first sample, and a state that is independent of them would bias a gain.
 //!
+//! What is slower goes on through a gap as nothing is seen of it: it decays, and is less certain by what the samples of
+//! the gap would have told. This part of its state is unknown too, with the variance that it has by chance: a slow force
+//! has moved on, and the step that it shows after the gap is no effect that happens to change there.
+//!
 //! The state is fitted at the end of a stretch without a gap, and at the end of each block of time: everything goes on
 //! from the state as it is then found, with what is still unknown of it. A block's rows are so given the blocks before
 //! it, as a likelihood is a product of conditional ones, and the sums of all blocks are those of the whole. Between
@@ -222,12 +226,16 @@ pub struct Innovations {
     tiles: Vec<Tile>,
     /// Tiles of parameters and the data.
     asked: usize,
+    /// Those and the tiles of what is unknown in the stretch that goes on.
+    active: usize,
     /// `W ∂S Wᵀ` of the parameters that change the noise.
     changes: Vec<(usize, DMatrix<f64>)>,
     /// Lane of each parameter, and at last that of the data.
     lanes: Vec<usize>,
     /// Covariance of the moving averages at a start.
     start: DMatrix<f64>,
+    /// What a gap does to the slower states.
+    slower: Slower,
     /// Covariance of the start of the stretch that goes on, as the blocks before have it.
     uncertain: DMatrix<f64>,
     /// Whether no row has been filtered since the last start.
@@ -247,6 +255,8 @@ pub struct Innovations {
     /// Samples until squares are summed.
     unsettled: usize,
     last_ns: Option<i64>,
+    /// The last row that was filtered.
+    last_whole_ns: Option<i64>,
     first_ns: Option<i64>,
     /// Series of the last row, without the powers of time.
     before: Vec<f64>,
@@ -312,7 +322,8 @@ impl Innovations {
         let tile = |own: &[&Parameter]| Tile::new(own, &unit, &kernel, &merged, WAITING_ROWS);
         let mut tiles: Vec<Tile> = own.chunks(LANES).map(tile).collect();
         let asked = tiles.len();
-        tiles.extend(vec![&none; moving].chunks(LANES).map(tile));
+        let slower = Slower::new(&kernel, moving, &predictor.innovation);
+        tiles.extend(vec![&none; moving + slower.states()].chunks(LANES).map(tile));
         let products = (0..tiles.len()).map(|i| Products::new(i, tiles.len())).collect();
         let most = (LONGEST_WAIT_S * 1e9 / step_ns as f64) as usize;
         let start = predictor.known_of_the_start(system) * FREE;
@@ -322,6 +333,8 @@ impl Innovations {
             unit,
             tiles,
             asked,
+            active: asked,
+            slower,
             changes: parameters.iter().enumerate().filter_map(innovation).collect(),
             lanes,
             uncertain: start.clone(),
@@ -339,6 +352,7 @@ impl Innovations {
             z: vec![0.0; channels],
             unsettled: 0,
             last_ns: None,
+            last_whole_ns: None,
             first_ns: None,
             before: vec![f64::NAN; series],
             waiting: Waiting { inputs: Vec::new(), innovations: Vec::new(), counts: Vec::new() },
@@ -389,6 +403,11 @@ impl Innovations {
         }
         let first = *self.first_ns.get_or_insert(time_ns);
         if whole {
+            if let (true, Some(last)) = (self.fresh, self.last_whole_ns) {
+                let steps = (time_ns - last + self.step_ns / 2).div_euclid(self.step_ns);
+                self.after_gap(u64::try_from(steps - 1).unwrap_or(0));
+            }
+            self.last_whole_ns = Some(time_ns);
             self.enter_block(time_ns - first);
             let from = self.waiting.inputs.len();
             let mean = |(now, before): (&f64, &f64)| if self.averaged { 0.5 * (now + before) } else { *now };
@@ -423,7 +442,7 @@ impl Innovations {
         }
     }
 
-    /// A gap: what moving averages contribute is unknown again. What is slower goes on.
+    /// A gap: what moving averages contribute is unknown again. What is slower goes on, see [`Self::after_gap`].
     fn interrupt(&mut self) {
         if !self.fresh {
             self.sum();
@@ -458,9 +477,36 @@ impl Innovations {
         }
         let state = DVector::from_column_slice(&self.state[..moving]);
         self.starts.push(Start { state, slope: DMatrix::zeros(moving, self.lanes.len() - 1) });
-        self.uncertain.copy_from(&self.start);
+        self.uncertain = self.start.clone();
+        self.active = self.asked + moving.div_ceil(LANES);
         self.unsettled = self.settling;
         self.fresh = true;
+    }
+
+    /// The first row after so many missing samples: all lanes go on without innovations for so long, and what the slower
+    /// states have done meanwhile is unknown with the moving averages.
+    fn after_gap(&mut self, missing: u64) {
+        let (moving, slow) = (2 * self.kernel.channels, self.slower.states());
+        if slow == 0 || missing == 0 {
+            return;
+        }
+        let Over { transition, learned } = self.slower.over(missing);
+        let own = DVector::from_column_slice(&self.state[moving..]);
+        self.state[moving..].copy_from_slice((&transition * own).as_slice());
+        let (asked, starts) = self.tiles.split_at_mut(self.asked);
+        for tile in asked {
+            let lanes = &mut tile.state[moving * LANES..];
+            let before = DMatrix::from_row_slice(slow, LANES, lanes);
+            lanes.copy_from_slice((&transition * before).transpose().as_slice());
+        }
+        for i in moving..moving + slow {
+            starts[i / LANES].state[i * LANES + i % LANES] = -1.0;
+        }
+        let known = self.uncertain.clone();
+        self.uncertain = DMatrix::zeros(moving + slow, moving + slow);
+        self.uncertain.view_mut((0, 0), (moving, moving)).copy_from(&known);
+        self.uncertain.view_mut((moving, moving), (slow, slow)).copy_from(&learned);
+        self.active = self.tiles.len();
     }
 
     /// Fits the state at the start out of all sums since then: with D its information, M its covariance before the data
@@ -469,16 +515,16 @@ impl Innovations {
     /// from the innovations from the start as it is known, which stay what drives the lanes of the noise: what these
     /// are is then the same whenever a start is fitted.
     fn take_start_out(&mut self) {
-        let moving = 2 * self.kernel.channels;
+        let (moving, unknown) = (2 * self.kernel.channels, self.uncertain.nrows());
         let own = self.asked * LANES;
         let product = |a: usize, start: usize| {
             let (a, b) = (a, own + start);
             self.products[a / LANES].at(a % LANES, b / LANES, b % LANES)
         };
-        let information = DMatrix::from_fn(moving, moving, |i, j| product(own + i.min(j), i.max(j)));
+        let information = DMatrix::from_fn(unknown, unknown, |i, j| product(own + i.min(j), i.max(j)));
         let gain = known_with(&self.uncertain, &information);
         // Lanes × states.
-        let with_start = DMatrix::from_fn(own, moving, product);
+        let with_start = DMatrix::from_fn(own, unknown, product);
         let fitted = &with_start * &gain;
         let lost = &fitted * with_start.transpose();
         for (i, products) in self.products.iter_mut().enumerate() {
@@ -491,16 +537,16 @@ impl Innovations {
         }
         let Some((data, parameters)) = self.lanes.split_last() else { return };
         if let Some(start) = self.starts.last_mut() {
-            start.state += fitted.row(*data).transpose();
+            start.state += fitted.row(*data).columns(0, moving).transpose();
             for (i, lane) in parameters.iter().enumerate() {
                 let mut slope = start.slope.column_mut(i);
-                slope -= fitted.row(*lane).transpose();
+                slope -= fitted.row(*lane).columns(0, moving).transpose();
             }
         }
         self.uncertain = gain;
         let (asked, starts) = self.tiles.split_at_mut(self.asked);
         for (t, tile) in asked.iter_mut().enumerate() {
-            for i in 0..moving {
+            for i in 0..unknown {
                 let influence = starts[i / LANES].state.chunks_exact(LANES).map(|lanes| lanes[i % LANES]);
                 for (state, influence) in tile.state.chunks_exact_mut(LANES).zip(influence) {
                     let by = (0..LANES).map(|l| fitted[(t * LANES + l, i)]);
@@ -525,7 +571,7 @@ impl Innovations {
             .map(|(k, (inputs, innovations))| Batch { first: k * ROWS, width, inputs, innovations })
             .collect();
         let (kernel, threads) = (&self.kernel, self.threads);
-        in_parallel(self.tiles.iter_mut().collect(), threads, |tile| {
+        in_parallel(self.tiles[..self.active].iter_mut().collect(), threads, |tile| {
             batches.iter().for_each(|batch| tile.filter(kernel, batch));
         });
         // The lane of the data has what the starts as they are found add to the innovations.
@@ -541,7 +587,7 @@ impl Innovations {
             }
         }
         self.samples += rows as u64;
-        let whitened: Vec<&[f64]> = self.tiles.iter().map(|tile| tile.whitened.as_slice()).collect();
+        let whitened: Vec<&[f64]> = self.tiles[..self.active].iter().map(|tile| tile.whitened.as_slice()).collect();
         // The first tile has the most products, so each thread has tiles from the front and from the back; it takes all
         // products of a batch while caches hold it.
         let mut shares: Vec<Vec<&mut Products>> = (0..threads).map(|_| Vec::new()).collect();
@@ -612,6 +658,56 @@ impl Innovations {
         }
         let (parameters, channels) = (self.lanes.len() - 1, self.kernel.channels);
         Passed { blocks: self.blocks, starts: self.starts, parameters, channels }
+    }
+}
+
+/// States that are slower than the moving averages, over a gap.
+struct Slower {
+    /// Over one sample.
+    sample: Over,
+}
+
+/// Some samples of which nothing is seen.
+#[derive(Clone)]
+struct Over {
+    /// What they make of a state.
+    transition: DMatrix<f64>,
+    /// Covariance of what they would have told of it.
+    learned: DMatrix<f64>,
+}
+
+impl Slower {
+    /// The states from `first` on. With every sample the steady predictor learns of a state what has the covariance
+    /// `K S Kᵀ`: by this the Riccati equation differs from one without measurements.
+    fn new(kernel: &Kernel, first: usize, innovation: &DMatrix<f64>) -> Self {
+        let (transition, gain) = kernel.from_state(first);
+        Self { sample: Over { learned: &gain * innovation * gain.transpose(), transition } }
+    }
+
+    fn states(&self) -> usize {
+        self.sample.transition.nrows()
+    }
+
+    fn over(&self, mut samples: u64) -> Over {
+        let none = DMatrix::identity(self.states(), self.states());
+        let (mut all, mut power) = (Over { learned: &none * 0.0, transition: none }, self.sample.clone());
+        while samples > 0 {
+            if samples & 1 == 1 {
+                all = all.then(&power);
+            }
+            power = power.then(&power);
+            samples >>= 1;
+        }
+        all
+    }
+}
+
+impl Over {
+    fn then(&self, next: &Self) -> Self {
+        Self {
+            transition: &next.transition * &self.transition,
+            learned: &next.transition * &self.learned * next.transition.transpose() + &next.learned,
+        }
     }
 }
 

@@ -124,6 +124,17 @@ impl Kernel {
         Self { channels: n, states, transition, output, gain, whitening: (0..n).step_by(CHANNELS).map(block).collect() }
     }
 
+    /// Transition and gain of the states from `first` on, which follow no other state.
+    pub(super) fn from_state(&self, first: usize) -> (DMatrix<f64>, DMatrix<f64>) {
+        let count = self.states.saturating_sub(first);
+        let mut transition = DMatrix::zeros(count, count);
+        for (i, before) in self.transition.iter().skip(first).enumerate() {
+            before.iter().filter(|(s, _)| *s >= first).for_each(|(s, factor)| transition[(i, s - first)] += factor);
+        }
+        let gain = |i: usize, c: usize| self.gain[(first + i) / BLOCK * self.channels + c][(first + i) % BLOCK];
+        (transition, DMatrix::from_fn(count, self.channels, gain))
+    }
+
     /// From what is seen to innovations, for the data.
     pub(super) fn step(&self, state: &mut Vec<f64>, next: &mut Vec<f64>, z: &mut [f64]) {
         for (z, output) in z.iter_mut().zip(&self.output) {

@@ -510,6 +510,66 @@ fn a_command_that_follows_another_readout_is_not_weighed_where_it_foretells() {
     assert!(pulls[0].abs() > 5.0 && pulls[1].abs() < 2.58, "{pulls:?}");
 }
 
+/// Sum of squares of the innovations of a Kalman filter whose covariance follows the data, a gap included. What moving
+/// averages contribute is free at the start and after the gap, as in a pass.
+fn kalman_chi2(system: &NoiseStates, point: &NoisePoint, data: &[[f64; 2]]) -> f64 {
+    let driving = system.driving(point);
+    let predictor = Predictor::new(system, &driving).expect("a predictor");
+    let (f, c, n) = (&system.transition, &system.output, 2 * system.channels());
+    let (r, q) = (driving.view((0, 0), (2, 2)), driving.view_range(2.., 2..));
+    let cross = driving.view_range(2.., ..2);
+    let free = |mut p: DMatrix<f64>| {
+        let mut own = p.view_mut((0, 0), (n, n));
+        own += predictor.known_of_the_start(system) * FREE;
+        p
+    };
+    let mut p = free(predictor.covariance.clone());
+    let mut state = DVector::zeros(f.nrows());
+    let (mut chi2, mut fresh) = (0.0, true);
+    for z in data {
+        if !z[0].is_finite() {
+            (p, state, fresh) = (f * &p * f.transpose() + q, f * state, false);
+            continue;
+        }
+        if !std::mem::replace(&mut fresh, true) {
+            p = free(p);
+        }
+        let e = DVector::from_fn(2, |i, _| z[i] / system.unit[i]) - c * &state;
+        let inverse = (c * &p * c.transpose() + r).try_inverse().expect("positive");
+        chi2 += e.dot(&(&inverse * &e));
+        let gain = (f * &p * c.transpose() + cross) * &inverse;
+        state = f * state + &gain * e;
+        p = f * &p * f.transpose() + q - (f * &p * c.transpose() + cross) * gain.transpose();
+    }
+    chi2
+}
+
+/// After a gap the steady predictor, with what it does not know of the slow states fitted out, has the sums of a Kalman
+/// filter whose covariance follows the data: of noise, and of a step after the gap, of which a slow force that has moved
+/// on takes most. Where it is let go on as if there were no gap, the step has many times the information.
+#[test]
+fn a_gap_has_the_sums_of_a_filter_whose_covariance_follows_the_data() {
+    let walks = [
+        process("walk", NoiseResponse::Held, &[(0.5, 0.1, 2)], &[("a", &[1.0])]),
+        process("slope", NoiseResponse::Held, &[(0.5, 0.05, 2), (0.5, 0.05, 4)], &[("b", &[1.0])]),
+    ];
+    let declared: Vec<NoiseProcess> = declared().into_iter().chain(walks).collect();
+    let system = NoiseStates::new(&declared, &channels(), DT_S, &[], &[]).expect("a system");
+    let mut point = some_point(&system);
+    point.levels.resize(system.components.len(), 1.0);
+    let gap = 400..900;
+    let with_gap = |mut data: Vec<[f64; 2]>| {
+        data[gap.clone()].fill([f64::NAN; 2]);
+        data
+    };
+    let step = (0..1300).map(|t| if t < 900 { [0.0; 2] } else { [20.0, 30.0] }).collect();
+    for data in [with_gap(noise(1300, 7)), with_gap(step)] {
+        let want = kalman_chi2(&system, &point, &data);
+        let found = pass(&system, &point, Vec::new(), &data, &[], 1).chi2;
+        assert!((found / want - 1.0).abs() < 1e-4, "{found} against {want}");
+    }
+}
+
 /// Threads change no digit, and a gap makes two stretches of one pass.
 #[test]
 fn results_do_not_depend_on_threads_and_a_gap_separates_two_stretches() {
