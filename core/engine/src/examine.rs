@@ -47,12 +47,8 @@ pub struct Examination<'a> {
 /// A consumer of columns, with the indices of those that it wants in [`Chain::columns`].
 pub type Wanted<C> = (C, Vec<usize>);
 
-/// Parameter of an effect that acts at one frequency, which the host finds. `NAME-2` is another one at the place
-/// `NAME`.
-pub const FREQUENCY_HZ: &str = "frequency_hz";
-
 /// Every instance of every installed effect that is not in the model of a product, on its mission; beside one at a
-/// frequency another one. An effect without a list of instances is left out.
+/// time or a frequency another one. An effect without a list of instances is left out.
 ///
 /// # Errors
 /// The mission or the model file cannot be read.
@@ -62,9 +58,8 @@ pub fn candidates(registry: &Registry, sources: &Sources) -> Result<Vec<EffectEn
     for found in registry.plugins().filter(|p| p.info.kind == Kind::Effect) {
         let manifest = &found.info.manifest;
         let taken = |instance: &String| model.effects.iter().any(|e| e.id == manifest.id && e.instance == *instance);
-        let several = manifest.parameters.iter().any(|p| p.name == FREQUENCY_HZ);
         for instance in manifest.instances_on(&mission.value) {
-            let others = (2..).take_while(|_| several).map(|k| format!("{instance}-{k}"));
+            let others = (2..).take_while(|_| manifest.repeats()).map(|k| format!("{instance}-{k}"));
             let free = std::iter::once(instance.clone()).chain(others).find(|name| !taken(name));
             all.extend(free.map(|name| EffectEntry::new(&manifest.id, &name)));
         }
@@ -72,7 +67,7 @@ pub fn candidates(registry: &Registry, sources: &Sources) -> Result<Vec<EffectEn
     Ok(all)
 }
 
-/// Whether an effect has a parameter: with `at_ns` what it does happens once, at a time that the host finds; with
+/// Whether an effect has a parameter: with [`AT_NS`] what it does happens once, at a time that the host finds; with
 /// [`FREQUENCY_HZ`] it acts at one frequency; with `fine` its candidate can be tried about one shape in fine steps.
 pub fn has_parameter(registry: &Registry, effect: &str, name: &str) -> bool {
     let found = registry.find(Kind::Effect, effect);

@@ -3,6 +3,7 @@
 use dragfree_estimation::colour::Colour;
 use dragfree_estimation::estimate::{Bound, Unknown};
 use dragfree_estimation::spectra::{Layout, Regressor};
+use dragfree_schema::{AT_NS, place_and_number};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
@@ -119,6 +120,31 @@ impl CandidateSet {
     /// Coefficients of the model.
     pub fn model(&self) -> usize {
         self.coefficients.iter().take_while(|c| !c.candidate).count()
+    }
+
+    /// Forms that a transient may have beside some candidates: none before those with a smaller number at its place are
+    /// among these, and none within `same_s` of one at its place. All forms of what is no transient.
+    pub fn possible_forms(&self, place: &[usize], added: &[Candidate], same_s: f64) -> Vec<usize> {
+        let first = &self.coefficients[place[0]];
+        let all = 0..first.forms.len();
+        if !first.transient {
+            return all.collect();
+        }
+        let (at, number) = place_and_number(&first.instance);
+        let is_there = |effect: &str, instance: &str| effect == first.effect && place_and_number(instance).0 == at;
+        let smaller = self.coefficients.iter().filter(|c| c.transient && is_there(&c.effect, &c.instance));
+        let mut smaller = smaller.filter(|c| place_and_number(&c.instance).1 < number);
+        let is_added = |c: &Coefficient| added.iter().any(|a| (&a.effect, &a.instance) == (&c.effect, &c.instance));
+        if !smaller.all(is_added) {
+            return Vec::new();
+        }
+        let others = added.iter().filter(|a| is_there(&a.effect, &a.instance) && a.instance != first.instance);
+        let taken: Vec<i64> = others.filter_map(Candidate::at_ns).collect();
+        let is_free = |form: &usize| {
+            let own = at_ns_of(&first.forms[*form]);
+            own.is_none_or(|own| taken.iter().all(|other| (own - other).abs() > (1e9 * same_s) as i64))
+        };
+        all.filter(is_free).collect()
     }
 
     /// Every instance of every effect that is not in the model, as the indices of its coefficients: without noise
@@ -255,7 +281,17 @@ impl CandidateSet {
     }
 }
 
+/// When a form of a transient begins, Unix ns.
+fn at_ns_of(form: &Form) -> Option<i64> {
+    form.shape.get(AT_NS)?.as_i64()
+}
+
 impl Candidate {
+    /// When it begins, Unix ns, where it is a transient.
+    pub fn at_ns(&self) -> Option<i64> {
+        at_ns_of(&self.parts.first()?.1)
+    }
+
     /// Its name, `es-gain:tm1.y`.
     pub fn name(&self) -> String {
         format!("{}:{}", self.effect, self.instance)

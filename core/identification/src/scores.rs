@@ -476,9 +476,12 @@ impl<'a> CandidateScorer<'a> {
             if fit.added.iter().any(same) || !asked(first) {
                 continue;
             }
-            let forms = first.forms.len();
+            let forms = self.candidate_set.possible_forms(&place, &fit.added, self.settings.same_transient_s);
+            if forms.is_empty() {
+                continue;
+            }
             let scored: Vec<Option<Scored>> =
-                (0..forms).map(|f| self.score(scores, self.candidate_set.candidate(&place, f))).collect();
+                forms.into_iter().map(|f| self.score(scores, self.candidate_set.candidate(&place, f))).collect();
             // The matched filters count their own trials.
             if !first.transient {
                 *tried.entry(first.effect.clone()).or_default() += scored.iter().flatten().count();

@@ -22,7 +22,7 @@ pub mod state;
 pub use available::{Available, NoSuchCoefficient};
 pub use column::Column;
 pub use intervals::{FIRST_INTERVAL_NS, MOST_INTERVALS};
-pub use manifest::{Manifest, PREDICTION_NEED, Parameter, ParameterType};
+pub use manifest::{AT_NS, FREQUENCY_HZ, Manifest, PREDICTION_NEED, Parameter, ParameterType, place_and_number};
 pub use model::{Coefficient, Colour, Constraint, Model, Response, Shape, Transient, Variant};
 pub use noise::{
     AHEAD_ATTRIBUTE, NOISE_ATTRIBUTE, NoiseEstimate, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm,

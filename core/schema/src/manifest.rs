@@ -10,6 +10,21 @@ use serde::{Deserialize, Serialize};
 /// drives them.
 pub const PREDICTION_NEED: &str = "prediction";
 
+/// Parameter of an effect that acts once, at a time that the host finds, Unix ns. `NAME-2` is another time at the place
+/// `NAME`.
+pub const AT_NS: &str = "at_ns";
+
+/// Parameter of an effect that acts at one frequency, which the host finds. `NAME-2` is another one at the place
+/// `NAME`.
+pub const FREQUENCY_HZ: &str = "frequency_hz";
+
+/// Place and number of an instance of an effect that may be several times at one place: `tm1.z-2` is the second one at
+/// `tm1.z`, which is the first.
+pub fn place_and_number(instance: &str) -> (&str, usize) {
+    let numbered = instance.rsplit_once('-').and_then(|(place, number)| Some((place, number.parse().ok()?)));
+    numbered.filter(|(_, number)| *number > 1).unwrap_or((instance, 1))
+}
+
 /// What a plugin is and which parameters it takes.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[cfg_attr(feature = "json-schema", derive(schemars::JsonSchema))]
@@ -57,8 +72,19 @@ impl Manifest {
         all
     }
 
+    /// Whether it may be several times at one place, each with a time or a frequency of its own.
+    pub fn repeats(&self) -> bool {
+        self.parameters.iter().any(|p| [AT_NS, FREQUENCY_HZ].contains(&p.name.as_str()))
+    }
+
+    /// The place of an instance: the instance itself, without its number where the effect may be there several times.
+    pub fn place_of<'a>(&self, instance: &'a str) -> &'a str {
+        if self.repeats() { place_and_number(instance).0 } else { instance }
+    }
+
     /// Whether there may be a mission on which the effect can act at a place.
     pub fn may_act_at(&self, instance: &str) -> bool {
+        let instance = self.place_of(instance);
         self.instances.iter().any(|name| match template(name) {
             None => name == instance,
             Some((before, _, after)) => {
@@ -160,6 +186,10 @@ mod tests {
     fn a_place_is_told_from_others_without_a_mission() {
         let manifest = manifest(&["sc.x", "{test_mass}.y-x"]);
         assert!(manifest.may_act_at("sc.x") && manifest.may_act_at("tm7.y-x"));
+        assert!(!manifest.may_act_at("sc.x-2") && place_and_number("tm7.y-x") == ("tm7.y-x", 1));
+        let at_ns = Parameter { name: AT_NS.to_owned(), ..Parameter::default() };
+        let once = Manifest { parameters: vec![at_ns], ..manifest.clone() };
+        assert!(once.may_act_at("sc.x-2") && place_and_number("sc.x-2") == ("sc.x", 2));
         assert!(!manifest.may_act_at("sc.y") && !manifest.may_act_at(".y-x") && !manifest.may_act_at("tm7.x-y"));
     }
 }

@@ -6,11 +6,11 @@
 use std::collections::BTreeSet;
 
 use dragfree_engine::config::EffectEntry;
-use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
+use dragfree_engine::examine::has_parameter;
 use dragfree_engine::run::Progress;
 use dragfree_estimation::decimate::SLOW_HZ;
 use dragfree_estimation::sigma::NoiseModel;
-use dragfree_identification::candidates::{Candidate, Coefficient as Unknown};
+use dragfree_identification::candidates::Candidate;
 use dragfree_identification::diagnosis::{self, Diagnosis, Found, Trials, UNOBSERVABLE, Unexplained};
 use dragfree_identification::distributions::ln_chi2_above;
 use dragfree_identification::innovations::decision::Fitted;
@@ -20,7 +20,7 @@ use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::screen::{RefinementRequest, Screened, retain_unexplained, screen};
 use dragfree_identification::slow_forces::{not_explained, slow_forces};
 use dragfree_identification::transient::{Detection, Transients};
-use dragfree_schema::{NoiseProcess, Settings};
+use dragfree_schema::{FREQUENCY_HZ, NoiseProcess, Settings, place_and_number};
 use serde_json::json;
 
 use crate::WorkflowError;
@@ -185,26 +185,34 @@ impl Spectra {
 struct Detected {
     /// All of them.
     all: Vec<Detection>,
-    /// Those near an end of the data, the most significant of each place.
+    /// Those of them that are near an end of the data.
     near_ends: Vec<Detection>,
+    /// The most significant at each place, and those at another time there.
+    loudest: Vec<Detection>,
+    /// Two within this are one transient, s.
+    same_s: f64,
 }
 
 impl Detected {
     /// Those of the spectra, as many as the settings allow, and those near the ends.
     fn new(found: &Transients, near_ends: &Transients, settings: &Settings) -> Self {
-        let place = |d: &Detection| (d.effect.clone(), d.instance.clone());
-        let (mut all, mut near, mut places) = (Vec::new(), Vec::new(), BTreeSet::new());
+        let same_s = settings.same_transient_s;
+        let (mut all, mut near) = (Vec::new(), Vec::new());
+        let mut loudest: Vec<Detection> = Vec::new();
         for detection in found.certain(settings.transient_p_value) {
             let at_an_end = near_ends.detections.contains(detection);
-            if places.insert(place(detection)) && at_an_end {
-                near.push(detection.clone());
+            if loudest.iter().all(|other| !is_one(detection, other, same_s)) {
+                loudest.push(detection.clone());
+                if at_an_end && near.len() < settings.max_transients {
+                    near.push(detection.clone());
+                }
             }
             if !at_an_end && all.len() < settings.max_transients {
                 all.push(detection.clone());
             }
         }
         all.extend(near.iter().cloned());
-        Self { all, near_ends: near }
+        Self { all, near_ends: near, loudest, same_s }
     }
 
     /// The screen, with the transients near the ends in the form that the innovations have found: the spectra are
@@ -212,12 +220,19 @@ impl Detected {
     fn screen(&self, scorer: &CandidateScorer<'_>, named: &[Candidate]) -> Result<Screened, WorkflowError> {
         let mut screened = screen(scorer, named)?;
         let (set, forms) = (scorer.candidate_set, &mut screened.forms);
-        let places = set.places();
-        for detection in &self.near_ends {
-            let of = |c: &Unknown| c.transient && (&c.effect, &c.instance) == (&detection.effect, &detection.instance);
-            let Some(place) = places.iter().find(|p| of(&set.coefficients[p[0]])) else { continue };
-            let own = set.coefficients[place[0]].forms.iter().position(|form| form.shape == detection.shape);
-            let Some(form) = own.map(|k| set.candidate(place, k)) else { continue };
+        for place in set.places().iter().filter(|p| set.coefficients[p[0]].transient) {
+            let first = &set.coefficients[place[0]];
+            let is_there = |effect: &str, instance: &str| {
+                effect == first.effect && place_and_number(instance).0 == place_and_number(&first.instance).0
+            };
+            let others = named.iter().filter(|c| is_there(&c.effect, &c.instance) && c.instance != first.instance);
+            let others: Vec<i64> = others.filter_map(Candidate::at_ns).collect();
+            let is_new = |d: &&Detection| others.iter().all(|at_ns| !is_near(d.at_ns, *at_ns, self.same_s));
+            let loudest = self.loudest.iter().filter(|d| is_there(&d.effect, &d.instance)).find(is_new);
+            let Some(loudest) = loudest.filter(|d| self.near_ends.contains(d)) else { continue };
+            let possible = set.possible_forms(place, named, self.same_s);
+            let Some(own) = possible.into_iter().find(|k| first.forms[*k].shape == loudest.shape) else { continue };
+            let form = set.candidate(place, own);
             match forms.iter_mut().find(|f| f.name() == form.name()) {
                 Some(other) if other.transient => *other = form,
                 // What acts at the steps of a flag may be there as well as once.
@@ -227,6 +242,15 @@ impl Detected {
         }
         Ok(screened)
     }
+}
+
+/// Whether two detections at one place are of one transient.
+fn is_one(a: &Detection, b: &Detection, same_s: f64) -> bool {
+    (&a.effect, &a.instance) == (&b.effect, &b.instance) && is_near(a.at_ns, b.at_ns, same_s)
+}
+
+fn is_near(a_ns: i64, b_ns: i64, same_s: f64) -> bool {
+    (a_ns - b_ns).abs() <= (1e9 * same_s) as i64
 }
 
 /// A model's entry of a line.

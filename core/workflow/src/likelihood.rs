@@ -9,13 +9,13 @@ use std::collections::{BTreeMap, BTreeSet};
 use dragfree_archive::Written;
 use dragfree_engine::chain::Chain;
 use dragfree_engine::config::EffectEntry;
-use dragfree_engine::examine::{Examination, FREQUENCY_HZ, examine};
+use dragfree_engine::examine::{Examination, examine};
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_identification::diagnosis::{Constancy, LINE, TRANSIENT};
 use dragfree_identification::innovations::decision::{Candidate, Evidence, Prior, Quadratic, Selection, disagreement};
 use dragfree_identification::innovations::filter::{Moments, Start, Sums};
-use dragfree_schema::{Coefficient, NoiseProcess, PREDICTION_NEED, Settings, Shape};
+use dragfree_schema::{AT_NS, Coefficient, FREQUENCY_HZ, NoiseProcess, PREDICTION_NEED, Settings, Shape};
 use nalgebra::{DMatrix, DVector};
 
 mod drifts;
@@ -33,7 +33,7 @@ pub(crate) use stretches::{Alone, Stretches};
 use stretches::{Stretch, stretches};
 
 use crate::WorkflowError;
-use crate::replay::{AT_NS, Pass, Replay, noise_levels};
+use crate::replay::{Pass, Replay, noise_levels};
 
 /// Passes that decide, after which the answer is given as it is, with what still moves.
 pub(crate) const PASSES: usize = 6;

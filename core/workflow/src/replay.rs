@@ -5,23 +5,20 @@ use std::collections::BTreeMap;
 use dragfree_archive::Written;
 use dragfree_engine::chain::{Chain, Recordings};
 use dragfree_engine::config::EffectEntry;
-use dragfree_engine::examine::{Examination, FREQUENCY_HZ, candidates, examine, has_parameter};
+use dragfree_engine::examine::{Examination, candidates, examine, has_parameter};
 use dragfree_engine::registry::Registry;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_identification::record::Record;
 use dragfree_identification::screen::RefinementRequest;
 use dragfree_identification::transient::Detection;
-use dragfree_schema::Settings;
+use dragfree_schema::{AT_NS, FREQUENCY_HZ, Settings};
 
 use crate::sums::{ColumnSums, Request};
 use crate::{ManyDays, WorkflowError};
 
 /// Parameter of an effect whose candidate can be tried about one shape in fine steps.
 pub(crate) const FINE: &str = "fine";
-
-/// Parameter of an effect that acts once, at a time that the host finds.
-pub(crate) const AT_NS: &str = "at_ns";
 
 /// Which data are replayed, and how.
 pub struct Replay<'a> {

@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use dragfree_engine::chain::{Chain, Sink};
 use dragfree_engine::config::EffectEntry;
-use dragfree_engine::examine::{FREQUENCY_HZ, Wanted};
+use dragfree_engine::examine::Wanted;
 use dragfree_estimation::decimate::SLOW_HZ;
 use dragfree_estimation::estimate::{Method, Observed, Refinement, estimate_with};
 use dragfree_estimation::segments::{Segmenter, all_finite, longest_length};
@@ -23,7 +23,10 @@ use dragfree_identification::lines::{LineSearch, Place};
 use dragfree_identification::record::Record;
 use dragfree_identification::transient::{Detection, Search, Template};
 use dragfree_identification::waveform::Waveform;
-use dragfree_schema::{Available, Coefficient, Column, Constraint, NoiseProcess, Response, Settings, Shape, Variant};
+use dragfree_schema::{
+    AT_NS, Available, Coefficient, Column, Constraint, FREQUENCY_HZ, NoiseProcess, Response, Settings, Shape, Variant,
+    place_and_number,
+};
 use nalgebra::{DMatrix, DVector};
 
 use crate::WorkflowError;
@@ -163,7 +166,7 @@ impl ColumnSums {
             energy: waveforms.iter().map(|c| c.energy(&plan, differenced.contains(&true))).collect(),
             housekeeping_units: drivers().map(|c| c.unit.clone()).collect(),
         };
-        let candidate_set = candidate_set(&available, &channels, &sorted, &waveforms);
+        let candidate_set = candidate_set(&available, &channels, &sorted, &waveforms, settings);
         let residual = residual(request.reference, &candidate_set, &channels, &all, length, settings)?;
         // As they are called in telemetry: `hk/battery_current_a`.
         let topics: Vec<String> = drivers().map(|c| c.name.replacen("hk.", "hk/", 1)).collect();
@@ -412,7 +415,14 @@ impl Series {
     }
 }
 
-fn candidate_set(available: &Available, channels: &[&Column], series: &Series, waveforms: &[Waveform]) -> CandidateSet {
+fn candidate_set(
+    available: &Available,
+    channels: &[&Column],
+    series: &Series,
+    waveforms: &[Waveform],
+    settings: &Settings,
+) -> CandidateSet {
+    let times = apart(waveforms.iter().map(|waveform| waveform.at_ns), settings.same_transient_s);
     let column: BTreeMap<(&str, &str), usize> =
         series.keys.iter().enumerate().map(|(i, (t, n))| ((t.as_str(), n.as_str()), channels.len() + i)).collect();
     let coefficient = |name: &String| available.coefficients.iter().position(|c| !c.candidate && c.name == *name);
@@ -471,11 +481,11 @@ fn candidate_set(available: &Available, channels: &[&Column], series: &Series, w
         }
     };
     // Every coefficient with the waveform of a detection is a candidate for its cause.
-    let transient = |c: &Coefficient| {
+    let transients = |c: &Coefficient| -> Vec<Unknown> {
         let at = |(k, waveform): (usize, &Waveform)| {
             let transient = c.transients.iter().find(|t| t.kernel == waveform.kernel)?;
             let mut shape: serde_json::Map<_, _> = transient.shape.clone().into_iter().collect();
-            shape.insert("at_ns".to_owned(), waveform.at_ns.into());
+            shape.insert(AT_NS.to_owned(), waveform.at_ns.into());
             let column = *column.get(&(WAVEFORMS, format!("waveform {k}").as_str()))?;
             let term = |(name, factor): &(String, f64)| {
                 let channel = channels.iter().position(|c| name_of(c) == name)?;
@@ -486,7 +496,19 @@ fn candidate_set(available: &Available, channels: &[&Column], series: &Series, w
             Some(Form { shape, unit: c.unit.clone(), lower, upper, terms, colours: None })
         };
         let forms: Vec<Form> = waveforms.iter().enumerate().filter_map(at).collect();
-        (!forms.is_empty()).then(|| Unknown { transient: true, noise: String::new(), forms, ..unknown(c) })
+        // As many of them as there are times that are not one transient's, each an instance of its own.
+        let (place, first) = place_and_number(&c.instance);
+        let number = if forms.is_empty() { 0 } else { times };
+        let own = |k: usize| {
+            let mut own = Unknown { transient: true, noise: String::new(), forms: forms.clone(), ..unknown(c) };
+            if k > 0 {
+                let prefix = |instance: &str| format!("{}.{instance}", c.effect);
+                own.instance = format!("{place}-{}", first + k);
+                own.name = own.name.replacen(&prefix(&c.instance), &prefix(&own.instance), 1);
+            }
+            own
+        };
+        (0..number).map(own).collect()
     };
     let rule = |r: &Constraint| Rule {
         name: r.name.clone(),
@@ -501,10 +523,21 @@ fn candidate_set(available: &Available, channels: &[&Column], series: &Series, w
             .coefficients
             .iter()
             .map(unknown)
-            .chain(available.coefficients.iter().filter_map(transient))
+            .chain(available.coefficients.iter().flat_map(transients))
             .collect(),
         rules: available.constraints.iter().map(rule).collect(),
     }
+}
+
+/// How many of some times, in the order in which they come, are farther from all before them than one transient is long.
+fn apart(all_ns: impl Iterator<Item = i64>, same_s: f64) -> usize {
+    let mut kept: Vec<i64> = Vec::new();
+    for at_ns in all_ns {
+        if kept.iter().all(|other| (at_ns - other).abs() > (1e9 * same_s) as i64) {
+            kept.push(at_ns);
+        }
+    }
+    kept.len()
 }
 
 /// Whether a column is a command or a displacement: what may act in proportion to housekeeping. Torques on test masses

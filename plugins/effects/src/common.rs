@@ -35,6 +35,11 @@ pub(crate) fn axis_of(instance: &str) -> usize {
     AXES.iter().position(|axis| *axis == letter).unwrap_or(0)
 }
 
+/// Where an effect acts that may be there several times: the instance without its number, `tm1.x` for `tm1.x-2`.
+pub(crate) fn place_of(instance: &str) -> &str {
+    instance.split('-').next().unwrap_or_default()
+}
+
 /// Test mass of an instance name: `tm1` for `tm1.x`.
 pub(crate) fn tm_of(instance: &str) -> &str {
     instance.split('.').next().unwrap_or_default()

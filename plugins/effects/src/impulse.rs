@@ -7,7 +7,7 @@
 //! | `tmN.x\|y\|z` | glitch (arXiv:2205.11938) | momentum, N s | `(e^{−t/τ1} − e^{−t/τ2})/(τ1 − τ2)` |
 //! | `sc.phi\|theta\|psi` | antenna that starts or stops | angular momentum, N m s | rectangle of `pulse_s` |
 //!
-//! The parameters `decay_s` and `rise_s` are τ1 and τ2.
+//! The parameters `decay_s` and `rise_s` are τ1 and τ2. `tm1.z-2` is a second transient at `tm1.z`.
 //!
 //! With `flag`, a pulse proportional to the height of each step of that column occurs at the step: a moving part takes
 //! up angular momentum when it starts and returns it when it stops. All steps share one coefficient.
@@ -28,7 +28,7 @@ use serde_json::json;
 
 use crate::common::{
     AXES, SLOW_HZ, SeriesRef, accel_channel_of, axis_of, find_housekeeping, housekeeping_in, keep_available, manifest,
-    mission, response, responses_to_spacecraft_force, symmetric, tm_of,
+    mission, place_of, response, responses_to_spacecraft_force, symmetric, tm_of,
 };
 use crate::step_pulses::StepPulses;
 use crate::torque::responses_to_spacecraft_torque;
@@ -151,18 +151,19 @@ impl Impulse {
                 on(responses_to_spacecraft_torque(available, &self.mission, axis, pulse))?,
             ))
         };
+        let place = place_of(&self.instance);
         Ok(match self.cause {
             Cause::Glitch => {
-                let mass_kg = self.mission.test_mass(tm_of(&self.instance), "the effect impulse")?.mass_kg;
-                let pushed = on(vec![response(accel_channel_of(&self.instance), pulse, 1.0 / mass_kg)])?;
+                let mass_kg = self.mission.test_mass(tm_of(place), "the effect impulse")?.mass_kg;
+                let pushed = on(vec![response(accel_channel_of(place), pulse, 1.0 / mass_kg)])?;
                 vec![(coefficient("", "N s", MAX_TEST_MASS), pushed)]
             }
             Cause::Torque => {
-                let axis = ["sc.phi", "sc.theta", "sc.psi"].iter().position(|i| *i == self.instance);
+                let axis = ["sc.phi", "sc.theta", "sc.psi"].iter().position(|i| *i == place);
                 vec![turn("", axis.unwrap_or(0))?]
             }
             Cause::Hit => {
-                let behind = on(responses_to_spacecraft_force(&self.mission, axis_of(&self.instance), pulse))?;
+                let behind = on(responses_to_spacecraft_force(&self.mission, axis_of(place), pulse))?;
                 let mut coefficients = vec![(coefficient(".momentum", "N s", MAX_SPACECRAFT), behind)];
                 // Without attitude channels the angular momentum is unobservable.
                 if available.of_kind("channel").any(|c| c.name.starts_with("sc.alpha.")) {
@@ -297,7 +298,7 @@ impl Effect for Impulse {
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         let instance = setup.instance().to_owned();
-        let last = instance.rsplit('.').next().unwrap_or_default();
+        let last = place_of(&instance).rsplit('.').next().unwrap_or_default();
         let cause = match (tm_of(&instance), AXES.contains(&last)) {
             ("sc", true) => Cause::Hit,
             ("sc", false) => Cause::Torque,

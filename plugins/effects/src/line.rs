@@ -19,8 +19,8 @@ use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
-    SeriesRef, accel_channel_of, axis_of, keep_available, manifest, mission, response, responses_to_spacecraft_force,
-    symmetric, tm_of,
+    SeriesRef, accel_channel_of, axis_of, keep_available, manifest, mission, place_of, response,
+    responses_to_spacecraft_force, symmetric, tm_of,
 };
 use crate::torque::responses_to_spacecraft_torque;
 
@@ -45,18 +45,13 @@ impl Line {
         format!("line:{}", self.instance)
     }
 
-    /// Where it acts: the instance without a number.
-    fn place(&self) -> &str {
-        self.instance.split('-').next().unwrap_or_default()
-    }
-
     /// Unit and range of the coefficients, and the responses to a series of the force or torque.
     fn acts(
         &self,
         available: &Available,
         series: &SeriesRef,
     ) -> Result<(&'static str, f64, Vec<Response>), PluginError> {
-        let place = self.place();
+        let place = place_of(&self.instance);
         let axis = TORQUES.iter().position(|name| *name == place);
         let (unit, most, responses) = match axis {
             Some(axis) => {

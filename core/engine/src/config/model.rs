@@ -208,7 +208,8 @@ impl EffectEntry {
     /// A sentence that lists what there is.
     pub fn check_instance(&self, manifest: &Manifest, mission: &Mission) -> Result<(), String> {
         let instances = manifest.instances_on(&mission.value);
-        if manifest.instances.is_empty() || instances.contains(&self.instance) {
+        let place = manifest.place_of(&self.instance);
+        if manifest.instances.is_empty() || instances.iter().any(|name| name == place) {
             return Ok(());
         }
         let there = instances.join(", ");

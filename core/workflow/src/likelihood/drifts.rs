@@ -4,15 +4,13 @@
 //! times the time ([`Moments`]). A coefficient that is neither in the model nor named is tried with its value beside
 //! its rate.
 
-use dragfree_engine::examine::FREQUENCY_HZ;
 use dragfree_identification::diagnosis::{DRIFT, Drift};
 use dragfree_identification::innovations::decision::{Candidate, Fitted, Quadratic};
 use dragfree_identification::innovations::filter::DAY_NS;
-use dragfree_schema::{Coefficient, Settings};
+use dragfree_schema::{AT_NS, Coefficient, FREQUENCY_HZ, Settings};
 
 use super::{Decided, Judge, Meaning, no_sums};
 use crate::proposals::FORMULA;
-use crate::replay::AT_NS;
 
 /// Whether a candidate's time, frequency or formula was chosen by these data: its rate has as many trials as that
 /// search, and one that acts once has no rate.

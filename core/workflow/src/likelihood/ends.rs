@@ -8,12 +8,12 @@ use dragfree_engine::sources::Sources;
 use dragfree_identification::innovations::decision::{Candidate, Quadratic};
 use dragfree_identification::transient::{Detection, Template, Transients};
 use dragfree_identification::waveform::Waveform;
-use dragfree_schema::PREDICTION_NEED;
+use dragfree_schema::{AT_NS, PREDICTION_NEED};
 
 use super::pass::{At, Filtered, Placed};
 use super::{How, Judge, Point, one_pass, step};
 use crate::WorkflowError;
-use crate::replay::{AT_NS, Pass, Replay, noise_levels};
+use crate::replay::{Pass, Replay, noise_levels};
 
 /// A decision among no candidates.
 struct NoCandidates;

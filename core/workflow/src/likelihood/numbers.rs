@@ -7,10 +7,9 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use dragfree_engine::config::EffectEntry;
-use dragfree_engine::examine::FREQUENCY_HZ;
 use dragfree_engine::run::Progress;
 use dragfree_identification::innovations::filter::Start;
-use dragfree_schema::Coefficient;
+use dragfree_schema::{AT_NS, Coefficient, FREQUENCY_HZ};
 use nalgebra::{DMatrix, DVector};
 use serde_json::{Value, json};
 
@@ -20,7 +19,7 @@ use super::{
 };
 use crate::WorkflowError;
 use crate::answer::Evidence;
-use crate::replay::{AT_NS, Pass, Replay};
+use crate::replay::{Pass, Replay};
 
 /// Part of a number by which the forms on either side differ from it: little for any number that data tell, and much
 /// more than rounding.

@@ -11,7 +11,7 @@ use std::cell::RefCell;
 use dragfree_archive::Written;
 use dragfree_engine::EngineError;
 use dragfree_engine::config::{EffectEntry, Mission as MissionFile};
-use dragfree_engine::examine::{FREQUENCY_HZ, has_parameter};
+use dragfree_engine::examine::has_parameter;
 use dragfree_engine::run::Progress;
 use dragfree_engine::sources::Sources;
 use dragfree_engine::table::{Chunk, TableSpec};
@@ -19,12 +19,13 @@ use dragfree_identification::quadratic::inverse;
 use dragfree_physics::control::Command;
 use dragfree_physics::manoeuvre::{Input, LinearLoop, Manoeuvre};
 use dragfree_physics::mission::{ANGLES, AXES, Mission};
+use dragfree_schema::{AT_NS, FREQUENCY_HZ};
 use nalgebra::DMatrix;
 
 use super::length_s;
 use crate::WorkflowError;
 use crate::likelihood::{Experiment, InBlock, Meaning, Means, Settled, information};
-use crate::replay::{AT_NS, Pass, Replay};
+use crate::replay::{Pass, Replay};
 
 /// Largest command of a manoeuvre, and of the loop that answers it, over the limits of the actuators; largest readout
 /// over the limits of the telemetry. At this size what is quadratic in displacements and angles stays below the noise.
