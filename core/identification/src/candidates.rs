@@ -368,6 +368,64 @@ mod tests {
         }
     }
 
+    /// A coefficient with a form for each shape, made of a column of its own.
+    fn with_forms(name: &str, transient: bool, forms: &[(i64, usize)]) -> Coefficient {
+        let form = |(at_ns, column): &(i64, usize)| Form {
+            shape: [(AT_NS.to_owned(), Value::from(*at_ns))].into_iter().collect(),
+            unit: "1".to_owned(),
+            lower: None,
+            upper: None,
+            terms: vec![Term { channel: 0, column: *column, factor: 1.0, times: None }],
+            colours: None,
+        };
+        let (effect, instance) = name.split_once(':').expect("an effect and its place");
+        let forms = forms.iter().map(form).collect();
+        let own = set(&["x"]).coefficients.remove(0);
+        Coefficient {
+            name: name.replace(':', "."),
+            effect: effect.to_owned(),
+            instance: instance.to_owned(),
+            transient,
+            forms,
+            ..own
+        }
+    }
+
+    /// Two coefficients of one place lose a form together where one of them lacks a column; two days keep what both
+    /// have, and differ where more than forms does.
+    #[test]
+    fn forms_that_lack_a_column_are_left_out_of_both_coefficients_and_both_days() {
+        let forms = [(1, 1), (2, 2), (3, 3)];
+        let two = [with_forms("b:tm1", false, &forms), with_forms("b:tm1", false, &[(1, 4), (2, 5), (3, 6)])];
+        let whole = CandidateSet { coefficients: two.to_vec(), ..set(&[]) };
+        let mut first = whole.clone();
+        let left_out = first.leave_out(|column| column == 5);
+        assert_eq!(left_out, [LeftOut { name: "b:tm1".to_owned(), all: false, columns: vec![5] }]);
+        assert_eq!(first.coefficients.iter().map(|c| c.forms.len()).collect::<Vec<_>>(), [2, 2]);
+        let mut second = whole.clone();
+        second.leave_out(|column| column == 1);
+        let common = first.common(&second).expect("they differ in forms alone");
+        let columns = |c: &Coefficient| c.forms.iter().map(|form| form.terms[0].column).collect::<Vec<_>>();
+        assert_eq!(common.coefficients.iter().map(columns).collect::<Vec<_>>(), [vec![3], vec![6]]);
+        second.coefficients[0].initial = 1.0;
+        assert_eq!(first.common(&second), None);
+    }
+
+    /// A second transient at a place is tried once the first is there, and at none of its times; nor is the first tried
+    /// at those of the second.
+    #[test]
+    fn a_second_transient_at_a_place_has_other_times_than_the_first() {
+        let times = [(0, 1), (10, 2), (100, 3)].map(|(s, column)| (1_000_000_000 * s, column));
+        let names = ["impulse:tm1.z", "impulse:tm1.z-2", "impulse:tm2.z"];
+        let all = CandidateSet { coefficients: names.map(|name| with_forms(name, true, &times)).to_vec(), ..set(&[]) };
+        let possible = |place: usize, added: &[Candidate]| all.possible_forms(&[place], added, 20.0);
+        assert_eq!((possible(0, &[]), possible(1, &[])), (vec![0, 1, 2], Vec::new()));
+        let first = all.candidate(&[0], 1);
+        assert_eq!(possible(1, std::slice::from_ref(&first)), [2]);
+        assert_eq!(possible(2, std::slice::from_ref(&first)), [0, 1, 2]);
+        assert_eq!(possible(0, &[first, all.candidate(&[1], 2)]), [0, 1]);
+    }
+
     /// Where another effect's series stand before its own, a candidate reads its own; in a set without them it is none.
     #[test]
     fn a_candidate_keeps_its_series_in_another_set() {

@@ -618,3 +618,18 @@ impl Joined {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What was searched for at every time or frequency has the trials of that search; the same effect where it lasts,
+    /// such as pulses at every step of a flag, has those of its forms.
+    #[test]
+    fn a_form_has_the_trials_of_the_search_that_found_it() {
+        let shape = |key: &str| Shape::from([(key.to_owned(), serde_json::json!(1))]);
+        assert_eq!(family("impulse", &shape(AT_NS)), TRANSIENT);
+        assert_eq!(family("line", &shape(FREQUENCY_HZ)), LINE);
+        assert_eq!(family("impulse", &shape("flag")), "impulse");
+    }
+}

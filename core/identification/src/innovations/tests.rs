@@ -812,6 +812,20 @@ fn ranges_bound_the_gain_and_equals_are_alternatives() {
     assert!((own.gain - (2.0 * 1e4 * 2.0 * 0.3 - 1e4 * 0.09)).abs() < 1e-6, "{}", own.gain);
 }
 
+/// One of two wants a value outside of its range, by much: it alone is said to, not what acts inside of its own beside
+/// it, nor what is held by the first.
+#[test]
+fn a_value_outside_its_range_refuses_no_other() {
+    let mut information = DMatrix::from_diagonal(&DVector::from_vec(vec![1.0, 1e4, 1e4]));
+    (information[(1, 2)], information[(2, 1)]) = (3e3, 3e3);
+    let q = quadratic(information, &[0.0, 0.5, 0.1], vec![candidate(1), candidate(2)]);
+    let [outside, inside] = [0, 1].map(|c| q.beside(c, &[0, 1]));
+    assert_eq!(inside.beyond, 0.0);
+    // By 0.2 beyond the end, with what the other leaves of the information.
+    assert!((outside.beyond - 0.04 * (1e4 - 9e6 / 1e4)).abs() < 1e-6, "{}", outside.beyond);
+    assert_eq!(q.select(&evidence(2)).chosen.iter().map(|c| c.candidate).collect::<Vec<_>>(), [1]);
+}
+
 /// What acts has a correlation of ρ with a level of the noise, which is fitted beside everything: of its χ² 1 − ρ² is
 /// left. Compared with the level in its place it explains all of it, as if the level had been a candidate from the
 /// start, and the level ρ². A third candidate that explains nothing is no alternative.
