@@ -32,13 +32,14 @@ fn line(label: &str, words: &str) -> String {
 
 fn separation(out: &mut String, a: &Advice, next: &Next) {
     let _ = writeln!(out, "\nWhat would tell {} from {}", a.effect, a.from);
-    *out += &line("now", &format!("{:.1}σ", a.now_sigma));
+    *out += &line("now", &format!("{:.1}σ expected of data like these", a.now_sigma));
     match &a.data {
-        Some(data) => {
+        Some(data) if data.times > 1.0 => {
             let length = format!("{:.1} times these data, {:.1} h, tell them apart at 5σ", data.times, data.hours);
             *out += &line("data", &length);
             data.coefficients.iter().for_each(|c| coefficient(out, c, "then"));
         }
+        Some(_) => *out += &line("data", "as much again: these should have told them apart at 5σ, on average"),
         None => *out += &line("data", "no length of such data: a test on the ground, or a manoeuvre"),
     }
     *out += &line("archive", &archive(&a.archive));

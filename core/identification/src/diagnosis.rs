@@ -374,11 +374,7 @@ pub fn remaining(
 /// Power beyond the modelled noise, channel by channel in thirds of a decade, and housekeeping that is coherent with
 /// the residuals. Either is evidence of an unknown cause; a slow force shows in the coherence long before it shows in
 /// the power. Channels that are `explained` have no coherence.
-fn unexplained(
-    scorer: &CandidateScorer<'_>,
-    levels: &Levels<'_>,
-    explained: &BTreeSet<usize>,
-) -> Option<Unexplained> {
+fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>, explained: &BTreeSet<usize>) -> Option<Unexplained> {
     let settings = scorer.settings;
     let plan = scorer.plan();
     let channels = &scorer.candidate_set.channels;

@@ -33,7 +33,7 @@ pub enum IdentificationError {
     Estimate(#[from] EstimateError),
     /// Too little data.
     #[error(
-        "a {what} needs at least {needed} segments of {segment_s:.0} s without a gap, and there are {segments:.2}: \
+        "a {what} needs at least {needed} × {segment_s:.0} s without a gap, and there are {segments:.2} × {segment_s:.0} s: \
          give more telemetry, or several products"
     )]
     TooShort { what: &'static str, needed: f64, segments: f64, segment_s: f64 },

@@ -187,7 +187,7 @@ mod tests {
         let manifest = manifest(&["sc.x", "{test_mass}.y-x"]);
         assert!(manifest.may_act_at("sc.x") && manifest.may_act_at("tm7.y-x"));
         assert!(!manifest.may_act_at("sc.x-2") && place_and_number("tm7.y-x") == ("tm7.y-x", 1));
-        let at_ns = Parameter { name: AT_NS.to_owned(), ..Parameter::default() };
+        let at_ns = serde_json::from_value(json!({"name": AT_NS, "type": "i64", "default": 0})).expect("a parameter");
         let once = Manifest { parameters: vec![at_ns], ..manifest.clone() };
         assert!(once.may_act_at("sc.x-2") && place_and_number("sc.x-2") == ("sc.x", 2));
         assert!(!manifest.may_act_at("sc.y") && !manifest.may_act_at(".y-x") && !manifest.may_act_at("tm7.x-y"));

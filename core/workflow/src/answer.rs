@@ -49,7 +49,6 @@ impl Evidence<'_> {
     fn name_of(&self, place: &Place) -> String {
         self.proposal(&place.effect, &place.instance).map_or_else(|| place.name(), |p| p.words.clone())
     }
-
 }
 
 impl Judge for Evidence<'_> {

@@ -324,8 +324,7 @@ fn same(a: &Coefficient, b: &Coefficient) -> bool {
 pub fn diagnose_extracts(products: &[Written]) -> Result<Diagnosis, WorkflowError> {
     let settings = &products.first().ok_or(WorkflowError::NoProduct)?.product.settings;
     let extracts = of_products(products, |extract| drop((extract.take_by_band(), extract.take_stretches())))?;
-    let evidence =
-        Evidence { trials: trials(&extracts), least: settings.false_alarm, products, proposals: Vec::new() };
+    let evidence = Evidence { trials: trials(&extracts), least: settings.false_alarm, products, proposals: Vec::new() };
     let (sums, mut not_tried) = shared(&extracts, |_| false);
     let decided = joined(sums, settings, &evidence, Vec::new());
     let unobservable = decided.selection.unobservable.iter().map(|c| decided.candidates[*c].name());

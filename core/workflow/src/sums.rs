@@ -529,7 +529,8 @@ fn candidate_set(
     }
 }
 
-/// How many of some times, in the order in which they come, are farther from all before them than one transient is long.
+/// How many of some times, in the order in which they come, are farther from all before them than one transient
+/// lasts.
 fn apart(all_ns: impl Iterator<Item = i64>, same_s: f64) -> usize {
     let mut kept: Vec<i64> = Vec::new();
     for at_ns in all_ns {

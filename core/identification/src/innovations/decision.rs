@@ -198,7 +198,8 @@ impl Quadratic {
         let ranges = |c: &usize| -> Vec<(f64, f64)> {
             let Candidate { lower, upper, .. } = &self.candidates[*c];
             let all = lower.iter().copied().zip(upper.iter().copied());
-            if Some(*c) == candidate { all.map(|_| (f64::NEG_INFINITY, f64::INFINITY)).collect() } else { all.collect() }
+            let is_free = Some(*c) == candidate;
+            all.map(|range| if is_free { (f64::NEG_INFINITY, f64::INFINITY) } else { range }).collect()
         };
         let bounds: Vec<(f64, f64)> = set.iter().flat_map(ranges).collect();
         let n = DMatrix::from_fn(at.len(), at.len(), |i, j| self.profiled[(at[i], at[j])]);

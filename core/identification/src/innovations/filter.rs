@@ -15,8 +15,8 @@
 //! the first sample, and a state that is independent of them would bias a gain.
 //!
 //! What is slower goes on through a gap as nothing is seen of it: it decays, and is less certain by what the samples of
-//! the gap would have told. This part of its state is unknown too, with the variance that it has by chance: a slow force
-//! has moved on, and the step that it shows after the gap is no effect that happens to change there.
+//! the gap would have told. This part of its state is unknown too, with the variance that it has by chance: a slow
+//! force has moved on, and the step that it shows after the gap is no effect that happens to change there.
 //!
 //! The state is fitted at the end of a stretch without a gap, and at the end of each block of time: everything goes on
 //! from the state as it is then found, with what is still unknown of it. A block's rows are so given the blocks before
@@ -483,8 +483,8 @@ impl Innovations {
         self.fresh = true;
     }
 
-    /// The first row after so many missing samples: all lanes go on without innovations for so long, and what the slower
-    /// states have done meanwhile is unknown with the moving averages.
+    /// The first row after so many missing samples: all lanes go on without innovations for so long, and what the
+    /// slower states have done meanwhile is unknown with the moving averages.
     fn after_gap(&mut self, missing: u64) {
         let (moving, slow) = (2 * self.kernel.channels, self.slower.states());
         if slow == 0 || missing == 0 {

@@ -545,8 +545,8 @@ fn kalman_chi2(system: &NoiseStates, point: &NoisePoint, data: &[[f64; 2]]) -> f
 }
 
 /// After a gap the steady predictor, with what it does not know of the slow states fitted out, has the sums of a Kalman
-/// filter whose covariance follows the data: of noise, and of a step after the gap, of which a slow force that has moved
-/// on takes most. Where it is let go on as if there were no gap, the step has many times the information.
+/// filter whose covariance follows the data: of noise, and of a step after the gap, of which a slow force that has
+/// moved on takes most. Where it is let go on as if there were no gap, the step has many times the information.
 #[test]
 fn a_gap_has_the_sums_of_a_filter_whose_covariance_follows_the_data() {
     let walks = [

@@ -11,8 +11,8 @@
 //! it is not known in o as f alone has it, and χ² given f counts that.
 
 use dragfree_identification::innovations::decision::{Candidate, Prior, Quadratic};
-use dragfree_identification::quadratic::inverse;
 use dragfree_identification::innovations::filter::{Block, Passed, Sums};
+use dragfree_identification::quadratic::inverse;
 use nalgebra::{DMatrix, DVector};
 use serde::{Deserialize, Serialize};
 

@@ -24,8 +24,12 @@ pub(super) fn withdraw(name: &str, reason: &str, folder: &Path, json: bool) -> R
     }
     let mut text = format!("withdrawn {id}\n");
     for v in certified {
-        let words =
-            format!("set {} still names it, {}; `dragfree products decertify` takes that out", v.set, window(&v));
+        let words = format!(
+            "set {} still names it, {}: `dragfree products decertify` takes that out of an open set; a published one is \
+             invalidated (`sets invalidate`), and another takes its place",
+            v.set,
+            window(&v)
+        );
         text += &text::labelled("note", &words);
     }
     Ok(Done::new(text))
