@@ -176,14 +176,26 @@ impl CandidateSet {
             return None;
         }
         let mut common = self.clone();
+        if self == other {
+            return Some(common);
+        }
         for (own, theirs) in common.coefficients.iter_mut().zip(&other.coefficients) {
-            own.forms.retain(|form| theirs.forms.contains(form));
+            // Both have the order of the whole list.
+            let mut left = theirs.forms.iter();
+            own.forms.retain(|form| {
+                let mut ahead = left.clone();
+                let is_there = ahead.any(|other| other == form);
+                if is_there {
+                    left = ahead;
+                }
+                is_there
+            });
         }
         Some(common)
     }
 
     /// Leaves out the forms of candidates that need a column which `lacks` a value: of all coefficients of a place, as
-    /// a form is one of all of them. Tells each place with the number of forms that it had, and the columns.
+    /// a form is one of all of them. Tells each place, and the columns.
     pub fn leave_out(&mut self, lacks: impl Fn(usize) -> bool) -> Vec<LeftOut> {
         let mut all = Vec::new();
         for place in self.places() {

@@ -6,7 +6,7 @@ use dragfree_estimation::verdict::chi2_per_dof_at;
 use dragfree_schema::Settings;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use crate::candidates::Candidate;
 use crate::coherence::Coherence;
@@ -321,7 +321,8 @@ impl Trials {
             forms.insert(LINE.to_owned(), lines);
         }
         // A coefficient that states a level stands for the component of the noise.
-        forms.insert(DRIFT.to_owned(), scorer.candidate_set.coefficients.len() as f64);
+        let last = scorer.candidate_set.coefficients.iter().filter(|c| !c.transient);
+        forms.insert(DRIFT.to_owned(), last.count() as f64);
         Self { forms }
     }
 
@@ -365,16 +366,27 @@ pub fn remaining(
     let measured = scorer.residual_psd(&fit);
     let mut levels = scorer.levels(&fit, scorer.total, &measured);
     levels.fit();
-    // Housekeeping was compared with the residuals of the model: where a slow force was added, not with what is left.
-    let slow = added.iter().filter(|c| c.is_slow(&scorer.gathered.columns));
-    let explained = slow.flat_map(|c| &c.parts).flat_map(|(_, form)| &form.terms).map(|t| t.channel).collect();
+    let before = if added.is_empty() { measured.clone() } else { scorer.residual_psd(&scorer.fit(&[])?) };
+    let plan = scorer.plan();
+    // Housekeeping was compared with the residuals of the model: what was added since may have explained it.
+    let explained = |w: &Coherence| {
+        let Some(c) = scorer.candidate_set.channels.iter().position(|name| *name == w.channel) else { return false };
+        let inside = |b: &usize| (w.band_hz[0]..=w.band_hz[1]).contains(&plan.frequency_hz(plan.bands[*b]));
+        let left: Vec<f64> =
+            (0..plan.bands.len()).filter(inside).map(|b| measured[b][(c, c)] / before[b][(c, c)]).collect();
+        left.iter().sum::<f64>() < (1.0 - 0.5 * w.explained) * left.len() as f64
+    };
     Ok(unexplained(scorer, &levels, &explained))
 }
 
 /// Power beyond the modelled noise, channel by channel in thirds of a decade, and housekeeping that is coherent with
 /// the residuals. Either is evidence of an unknown cause; a slow force shows in the coherence long before it shows in
-/// the power. Channels that are `explained` have no coherence.
-fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>, explained: &BTreeSet<usize>) -> Option<Unexplained> {
+/// the power. What is `explained` since is no coherence any more.
+fn unexplained(
+    scorer: &CandidateScorer<'_>,
+    levels: &Levels<'_>,
+    explained: &dyn Fn(&Coherence) -> bool,
+) -> Option<Unexplained> {
     let settings = scorer.settings;
     let plan = scorer.plan();
     let channels = &scorer.candidate_set.channels;
@@ -387,15 +399,15 @@ fn unexplained(scorer: &CandidateScorer<'_>, levels: &Levels<'_>, explained: &BT
         loud.extend(found.map(|(c, ratio)| (c, [hz(bands.start), hz(bands.end - 1)], ratio)));
     }
     let all = scorer.gathered.housekeeping.coherences(channels);
-    let of = |w: &Coherence| channels.iter().position(|c| *c == w.channel);
     let significant: Vec<Coherence> = all
         .into_iter()
-        .filter(|w| of(w).is_none_or(|channel| !explained.contains(&channel)))
+        .filter(|w| !explained(w))
         .filter(|w| corrected(ln_chi2_above(w.statistic, w.dof).exp(), w.trials) < settings.coherence_false_alarm)
         .collect();
     let power = !loud.is_empty();
     if !power {
         // A driver that explains a part x of the power raises it by 1/(1 − x).
+        let of = |w: &Coherence| channels.iter().position(|c| *c == w.channel);
         let best = significant.iter().find(|w| w.explained > settings.coherence_min_explained)?;
         loud.push((of(best)?, best.band_hz, (1.0 - best.explained.clamp(0.0, 0.999)).recip()));
     }

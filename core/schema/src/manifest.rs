@@ -21,8 +21,11 @@ pub const FREQUENCY_HZ: &str = "frequency_hz";
 /// Place and number of an instance of an effect that may be several times at one place: `tm1.z-2` is the second one at
 /// `tm1.z`, which is the first.
 pub fn place_and_number(instance: &str) -> (&str, usize) {
-    let numbered = instance.rsplit_once('-').and_then(|(place, number)| Some((place, number.parse().ok()?)));
-    numbered.filter(|(_, number)| *number > 1).unwrap_or((instance, 1))
+    let numbered = instance.rsplit_once('-').and_then(|(place, text)| {
+        let number: usize = text.parse().ok()?;
+        (number > 1 && number.to_string() == text).then_some((place, number))
+    });
+    numbered.unwrap_or((instance, 1))
 }
 
 /// What a plugin is and which parameters it takes.

@@ -467,6 +467,18 @@ fn name_of(candidate: &Value) -> String {
     name(candidate["effect"].as_str().unwrap_or_default(), candidate["instance"].as_str().unwrap_or_default())
 }
 
+/// Whether an instance is at the place of a truth: `tm1.z-2` is a second transient at `tm1.z`.
+fn is_at(instance: &str, truth: &Truth) -> bool {
+    let is_number = |text: &str| text.parse::<usize>().is_ok_and(|number| number > 1);
+    let numbered = |rest: &str| rest.strip_prefix('-').is_some_and(is_number);
+    instance.strip_prefix(&truth.instance).is_some_and(|rest| rest.is_empty() || numbered(rest))
+}
+
+/// Whether a name, `EFFECT:INSTANCE`, is that of a truth.
+fn is_name_of(name: &str, truth: &Truth) -> bool {
+    name.split_once(':').is_some_and(|(effect, instance)| effect == truth.effect && is_at(instance, truth))
+}
+
 /// A diagnosis and the truth to compare it with.
 struct Scorer<'a> {
     sealed: &'a Value,
@@ -489,7 +501,8 @@ impl Scorer<'_> {
 
     /// Whether a candidate matches a truth: effect, instance and, for a transient, time.
     fn matches(&self, candidate: &Value, truth: &Truth) -> bool {
-        name_of(candidate) == truth.name()
+        candidate["effect"] == truth.effect.as_str()
+            && is_at(candidate["instance"].as_str().unwrap_or_default(), truth)
             && self.time_error_s(candidate, truth).is_none_or(|error| error.abs() < MAX_TIME_ERROR_S)
     }
 
@@ -509,7 +522,9 @@ impl Scorer<'_> {
         let accepted = candidate.is_some_and(|c| c["accepted"] == true);
         let lists = |c: &&Value| {
             let named = c["confounders"].as_array().into_iter().flatten();
-            c["accepted"] == true && !self.matches(c, &truth) && named.into_iter().any(|n| *n == truth.name().as_str())
+            c["accepted"] == true
+                && !self.matches(c, &truth)
+                && named.into_iter().filter_map(Value::as_str).any(|n| is_name_of(n, &truth))
         };
         let confounder_of: Vec<String> = self.candidates.iter().filter(lists).map(name_of).collect();
         let covered = self.covered(&truth);
@@ -575,7 +590,7 @@ impl Scorer<'_> {
         let empty = Map::new();
         let expected = expected(truth, candidate["shape"].as_object().unwrap_or(&empty), self.sealed)?;
         let coefficients = candidate["coefficients"].as_array().ok_or("the candidate lists no coefficients")?;
-        let stem = format!("{}.{}", truth.effect, truth.instance);
+        let stem = format!("{}.{}", truth.effect, candidate["instance"].as_str().unwrap_or_default());
         let both = coefficients.iter().filter_map(|c| {
             let part = c["name"].as_str()?.strip_prefix(&stem)?;
             let expected = expected.iter().find(|e| e.part == part && c["unit"] == e.unit)?;

@@ -96,6 +96,24 @@ fn both_of_two_causes_must_be_found() {
     assert!((s.effects[1].values[0].difference_sigma - 1.0).abs() < 1e-9);
 }
 
+/// Of two glitches at one place each is compared with the truth at its time, whatever its number; one at another time
+/// is a false cause.
+#[test]
+fn a_second_glitch_at_a_place_is_told_from_the_first_by_its_time() {
+    let glitch = |at_s: f64| hidden("impulse", "tm1.z", 1e-10, &json!({"at_s": at_s, "decay_s": 60.0}));
+    let found = |who: &str, at_s: i64| {
+        let mut found = candidate(who, true, 1e-10, 1e-11, &[]);
+        found["shape"] = json!({"at_ns": 1_000_000_000_000_i64 + 1_000_000_000 * at_s});
+        found
+    };
+    let truths = [glitch(500.0), glitch(9000.0)];
+    let both = [found("impulse:tm1.z", 9000), found("impulse:tm1.z-2", 500)];
+    let s = scored(&truths, &diagnosis("missing", &both));
+    assert_eq!((s.verdict, s.effects[0].rank, s.effects[1].rank), (Verdict::Right, Some(2), Some(1)));
+    let s = scored(&truths[..1], &diagnosis("missing", &both));
+    assert_eq!((s.verdict, s.false_causes.len()), (Verdict::FalseAlarm, 1));
+}
+
 /// No installed effect covers it: by id, by instance, or because it was not tried.
 #[test]
 fn an_uncovered_cause_is_unexplained_with_its_driver() {

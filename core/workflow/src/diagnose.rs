@@ -417,7 +417,9 @@ fn about_model(
     let form = |screened: &Candidate| {
         let of = |place: &&Vec<usize>| set.candidate(place, 0).name() == screened.name();
         let first = places.iter().find(of).map(|place| set.candidate(place, 0));
-        if named.contains(screened) { screened.clone() } else { first.unwrap_or_else(|| screened.clone()) }
+        // A transient has the time of this day.
+        let keeps = named.contains(screened) || screened.transient;
+        if keeps { screened.clone() } else { first.unwrap_or_else(|| screened.clone()) }
     };
     let forms = last.screened.forms.iter().map(form).chain(beside.iter().cloned());
     let entries: Vec<EffectEntry> = forms.map(|form| evidence.entry(&form)).collect();

@@ -498,17 +498,22 @@ fn candidate_set(
         let forms: Vec<Form> = waveforms.iter().enumerate().filter_map(at).collect();
         // As many of them as there are times that are not one transient's, each an instance of its own.
         let (place, first) = place_and_number(&c.instance);
+        let is_taken = |number: &usize| {
+            let name = format!("{place}-{number}");
+            available.coefficients.iter().any(|own| own.effect == c.effect && own.instance == name)
+        };
+        let mut free = (first + 1..).filter(|number| !is_taken(number));
         let number = if forms.is_empty() { 0 } else { times };
-        let own = |k: usize| {
+        let mut own = |k: usize| {
             let mut own = Unknown { transient: true, noise: String::new(), forms: forms.clone(), ..unknown(c) };
             if k > 0 {
                 let prefix = |instance: &str| format!("{}.{instance}", c.effect);
-                own.instance = format!("{place}-{}", first + k);
+                own.instance = format!("{place}-{}", free.next().unwrap_or(first + k));
                 own.name = own.name.replacen(&prefix(&c.instance), &prefix(&own.instance), 1);
             }
             own
         };
-        (0..number).map(own).collect()
+        (0..number).map(&mut own).collect()
     };
     let rule = |r: &Constraint| Rule {
         name: r.name.clone(),

@@ -222,7 +222,7 @@ pub struct Innovations {
     unit: Vec<f64>,
     /// What is known of the channels: taken off before anything else.
     known: Vec<Response>,
-    /// Parameters and the data, and at last the start of the moving averages.
+    /// Parameters and the data, and at last what is unknown at the start of a stretch.
     tiles: Vec<Tile>,
     /// Tiles of parameters and the data.
     asked: usize,
@@ -236,6 +236,8 @@ pub struct Innovations {
     start: DMatrix<f64>,
     /// What a gap does to the slower states.
     slower: Slower,
+    /// Covariance of what stretches before have left unknown of them.
+    carried: DMatrix<f64>,
     /// Covariance of the start of the stretch that goes on, as the blocks before have it.
     uncertain: DMatrix<f64>,
     /// Whether no row has been filtered since the last start.
@@ -334,6 +336,7 @@ impl Innovations {
             tiles,
             asked,
             active: asked,
+            carried: DMatrix::zeros(slower.states(), slower.states()),
             slower,
             changes: parameters.iter().enumerate().filter_map(innovation).collect(),
             lanes,
@@ -447,6 +450,7 @@ impl Innovations {
         if !self.fresh {
             self.sum();
             self.take_start_out();
+            self.carried = self.unknown_of_slower();
             self.restart();
             self.ends.iter_mut().for_each(Ends::gap);
         }
@@ -487,10 +491,12 @@ impl Innovations {
     /// slower states have done meanwhile is unknown with the moving averages.
     fn after_gap(&mut self, missing: u64) {
         let (moving, slow) = (2 * self.kernel.channels, self.slower.states());
-        if slow == 0 || missing == 0 {
+        self.tiles[..self.asked].iter_mut().for_each(|tile| tile.filters_over(missing));
+        if slow == 0 {
             return;
         }
         let Over { transition, learned } = self.slower.over(missing);
+        let learned = learned + &transition * &self.carried * transition.transpose();
         let own = DVector::from_column_slice(&self.state[moving..]);
         self.state[moving..].copy_from_slice((&transition * own).as_slice());
         let (asked, starts) = self.tiles.split_at_mut(self.asked);
@@ -507,6 +513,16 @@ impl Innovations {
         self.uncertain.view_mut((0, 0), (moving, moving)).copy_from(&known);
         self.uncertain.view_mut((moving, moving), (slow, slow)).copy_from(&learned);
         self.active = self.tiles.len();
+    }
+
+    /// Covariance of the slower states by what is still unknown of the stretch: what it makes of them by now.
+    fn unknown_of_slower(&self) -> DMatrix<f64> {
+        let (moving, unknown) = (2 * self.kernel.channels, self.uncertain.nrows());
+        let starts = &self.tiles[self.asked..];
+        let influence = DMatrix::from_fn(self.slower.states(), unknown, |i, j| {
+            starts[j / LANES].state[(moving + i) * LANES + j % LANES]
+        });
+        &influence * &self.uncertain * influence.transpose()
     }
 
     /// Fits the state at the start out of all sums since then: with D its information, M its covariance before the data
@@ -680,7 +696,7 @@ impl Slower {
     /// The states from `first` on. With every sample the steady predictor learns of a state what has the covariance
     /// `K S Kᵀ`: by this the Riccati equation differs from one without measurements.
     fn new(kernel: &Kernel, first: usize, innovation: &DMatrix<f64>) -> Self {
-        let (transition, gain) = kernel.from_state(first);
+        let (transition, gain) = kernel.states_from(first);
         Self { sample: Over { learned: &gain * innovation * gain.transpose(), transition } }
     }
 

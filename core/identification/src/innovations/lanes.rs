@@ -6,7 +6,7 @@
 use std::ops::Range;
 
 use aligned_vec::{AVec, avec};
-use nalgebra::DMatrix;
+use nalgebra::{DMatrix, DVector};
 use pulp::{Arch, Simd, WithSimd};
 
 use super::predictor::{Beside, Change, Predictor};
@@ -125,7 +125,7 @@ impl Kernel {
     }
 
     /// Transition and gain of the states from `first` on, which follow no other state.
-    pub(super) fn from_state(&self, first: usize) -> (DMatrix<f64>, DMatrix<f64>) {
+    pub(super) fn states_from(&self, first: usize) -> (DMatrix<f64>, DMatrix<f64>) {
         let count = self.states.saturating_sub(first);
         let mut transition = DMatrix::zeros(count, count);
         for (i, before) in self.transition.iter().skip(first).enumerate() {
@@ -224,6 +224,18 @@ impl Tile {
             nu: avec![0.0; n * LANES],
             whitened: avec![0.0; rows * n * LANES],
             not_weighed,
+        }
+    }
+
+    /// Filters at zero go on over samples of which nothing is seen.
+    pub(super) fn filters_over(&mut self, samples: u64) {
+        for filter in &mut self.filters {
+            let states = filter.state.len();
+            let mut transition = DMatrix::zeros(states, states);
+            filter.transition.iter().for_each(|(i, j, factor)| transition[(*i, *j)] += factor);
+            let over: DMatrix<f64> = transition.pow(u32::try_from(samples).unwrap_or(u32::MAX));
+            let state = over * DVector::from_column_slice(&filter.state);
+            filter.state.copy_from_slice(state.as_slice());
         }
     }
 

@@ -141,7 +141,7 @@ impl Predictor {
     /// Samples after which what the state was has less than `part` of its influence on the innovations, at most `most`.
     pub fn settling(&self, system: &NoiseStates, part: f64, most: usize) -> usize {
         let n = 2 * system.channels();
-        // The moving averages alone: what is slower is known by its constants.
+        // The moving averages alone: what is slower is known by its constants, or by what it was before a gap.
         let mut power = self.closed.view((0, 0), (n, n)).into_owned();
         let mut samples = 1;
         while power.amax() > part && samples < most {
