@@ -36,7 +36,7 @@ fn thresholds_of_a_pipeline_are_used_and_stored() {
     let default = calibrate(folder, &telemetry, "", 0);
     assert_eq!(stored(folder, &default)["agreement_sigmas"].as_float(), Some(3.0));
     let told = compare(&default);
-    assert!(told.status.code() == Some(1) && String::from_utf8_lossy(&told.stderr).contains("at least 4 segments"));
+    assert!(told.status.code() == Some(1) && String::from_utf8_lossy(&told.stderr).contains("at least 4 × 1638 s"));
 
     let other = calibrate(folder, &telemetry, "agreement_sigmas = 1e-3\nmin_segments = 0.25\n", 4);
     assert_eq!((&default["verdict"], &other["verdict"]), (&Value::from("agree"), &Value::from("disagree")));
