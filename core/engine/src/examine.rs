@@ -67,8 +67,9 @@ pub fn candidates(registry: &Registry, sources: &Sources) -> Result<Vec<EffectEn
     Ok(all)
 }
 
-/// Whether an effect has a parameter: with [`AT_NS`] what it does happens once, at a time that the host finds; with
-/// [`FREQUENCY_HZ`] it acts at one frequency; with `fine` its candidate can be tried about one shape in fine steps.
+/// Whether an effect has a parameter: with [`dragfree_schema::AT_NS`] what it does happens once, at a time that the
+/// host finds; with [`dragfree_schema::FREQUENCY_HZ`] it acts at one frequency; with `fine` its candidate can be tried
+/// about one shape in fine steps.
 pub fn has_parameter(registry: &Registry, effect: &str, name: &str) -> bool {
     let found = registry.find(Kind::Effect, effect);
     found.is_ok_and(|f| f.info.manifest.parameters.iter().any(|p| p.name == name))
