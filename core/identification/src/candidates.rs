@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
 use crate::columns::Columns;
+use crate::transient::is_one_transient;
 
 /// A channel's response to a coefficient.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -116,6 +117,19 @@ pub struct Candidate {
     pub parts: Vec<(usize, Form)>,
 }
 
+impl Coefficient {
+    /// Whether an instance of an effect is at its place, the instance itself or one with another number.
+    pub fn is_at_place_of(&self, effect: &str, instance: &str) -> bool {
+        effect == self.effect && place_and_number(instance).0 == place_and_number(&self.instance).0
+    }
+
+    /// Times of the others among some candidates that are transients at its place.
+    pub fn times_beside(&self, candidates: &[Candidate]) -> Vec<i64> {
+        let others = candidates.iter().filter(|c| self.is_at_place_of(&c.effect, &c.instance));
+        others.filter(|c| c.instance != self.instance).filter_map(Candidate::at_ns).collect()
+    }
+}
+
 impl CandidateSet {
     /// Coefficients of the model.
     pub fn model(&self) -> usize {
@@ -130,21 +144,16 @@ impl CandidateSet {
         if !first.transient {
             return all.collect();
         }
-        let (at, number) = place_and_number(&first.instance);
-        let is_there = |effect: &str, instance: &str| effect == first.effect && place_and_number(instance).0 == at;
-        let smaller = self.coefficients.iter().filter(|c| c.transient && is_there(&c.effect, &c.instance));
+        let (_, number) = place_and_number(&first.instance);
+        let smaller = self.coefficients.iter().filter(|c| c.transient && first.is_at_place_of(&c.effect, &c.instance));
         let mut smaller = smaller.filter(|c| place_and_number(&c.instance).1 < number);
         let is_added = |c: &Coefficient| added.iter().any(|a| (&a.effect, &a.instance) == (&c.effect, &c.instance));
         if !smaller.all(is_added) {
             return Vec::new();
         }
-        let others = added.iter().filter(|a| is_there(&a.effect, &a.instance) && a.instance != first.instance);
-        let taken: Vec<i64> = others.filter_map(Candidate::at_ns).collect();
-        let is_free = |form: &usize| {
-            let own = at_ns_of(&first.forms[*form]);
-            own.is_none_or(|own| taken.iter().all(|other| (own - other).abs() > (1e9 * same_s) as i64))
-        };
-        all.filter(is_free).collect()
+        let taken = first.times_beside(added);
+        let is_free = |own: i64| taken.iter().all(|other| !is_one_transient(own, *other, same_s));
+        all.filter(|form| at_ns_of(&first.forms[*form]).is_none_or(is_free)).collect()
     }
 
     /// Every instance of every effect that is not in the model, as the indices of its coefficients: without noise

@@ -205,7 +205,7 @@ pub struct Drift {
     pub per_day: f64,
     /// σ of it.
     pub sigma_per_day: f64,
-    /// Fall of χ².
+    /// By how much χ² falls with the rate, the value fitted with it and without it.
     pub delta_chi2: f64,
     /// p-value, corrected for all coefficients and levels that were tried.
     pub p_value: f64,
@@ -321,8 +321,8 @@ impl Trials {
             forms.insert(LINE.to_owned(), lines);
         }
         // A coefficient that states a level stands for the component of the noise.
-        let last = scorer.candidate_set.coefficients.iter().filter(|c| !c.transient);
-        forms.insert(DRIFT.to_owned(), last.count() as f64);
+        let lasting = scorer.candidate_set.coefficients.iter().filter(|c| !c.transient);
+        forms.insert(DRIFT.to_owned(), lasting.count() as f64);
         Self { forms }
     }
 

@@ -101,6 +101,11 @@ pub struct Detection {
     pub significance: f64,
 }
 
+/// Whether what begins at two times at one place is one transient: the information of a slow one rings for long.
+pub fn is_one_transient(a_ns: i64, b_ns: i64, same_s: f64) -> bool {
+    (a_ns - b_ns).abs() <= (1e9 * same_s) as i64
+}
+
 impl Detection {
     /// The same at a later time.
     pub fn moved(&self, by_ns: i64) -> Self {

@@ -63,7 +63,8 @@ pub use batch::{Inputs, Outputs, Progress};
 pub use dragfree_schema::{
     AHEAD_ATTRIBUTE, Attachment, Available, Coefficient, Colour, Column, Constraint, Covariance, Estimate,
     NoiseEstimate, NoiseLevels, NoiseProcess, NoiseResponse, NoiseShape, NoiseTerm, PREDICTION_NEED, Report, Response,
-    Role, Settings, Shape, Transient, UNPREDICTED_ATTRIBUTE, UNPREDICTED_SLOPE_ATTRIBUTE, Variant, state,
+    Role, Settings, Shape, Transient, UNPREDICTED_ATTRIBUTE, UNPREDICTED_SLOPE_ATTRIBUTE, Variant, place_and_number,
+    state,
 };
 pub use error::PluginError;
 pub use link::{EffectLink, In, Link, Out, Table};

@@ -435,8 +435,8 @@ pub(crate) fn drifting(drift: &Drift, settings: &Settings, decided: &Decided) ->
     };
     Some(format!(
         "{what} is not the same through the data: from {at_start:.3e} at their start to {at_end:.3e}{unit} \
-         at their end lowers χ² by {delta_chi2:.0} (p = {p_value:.1e}){others}; a model has one value for a run: \
-         run shorter parts"
+         at their end lowers χ² by {delta_chi2:.0} more than one value does (p = {p_value:.1e}){others}; a model has \
+         one value for a run: run shorter parts"
     ))
 }
 

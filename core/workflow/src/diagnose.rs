@@ -19,8 +19,8 @@ use dragfree_identification::record::Record;
 use dragfree_identification::scores::CandidateScorer;
 use dragfree_identification::screen::{RefinementRequest, Screened, retain_unexplained, screen};
 use dragfree_identification::slow_forces::{not_explained, slow_forces};
-use dragfree_identification::transient::{Detection, Transients};
-use dragfree_schema::{FREQUENCY_HZ, NoiseProcess, Settings, place_and_number};
+use dragfree_identification::transient::{Detection, Transients, is_one_transient};
+use dragfree_schema::{AT_NS, FREQUENCY_HZ, NoiseProcess, Settings};
 use serde_json::json;
 
 use crate::WorkflowError;
@@ -222,13 +222,9 @@ impl Detected {
         let (set, forms) = (scorer.candidate_set, &mut screened.forms);
         for place in set.places().iter().filter(|p| set.coefficients[p[0]].transient) {
             let first = &set.coefficients[place[0]];
-            let is_there = |effect: &str, instance: &str| {
-                effect == first.effect && place_and_number(instance).0 == place_and_number(&first.instance).0
-            };
-            let others = named.iter().filter(|c| is_there(&c.effect, &c.instance) && c.instance != first.instance);
-            let others: Vec<i64> = others.filter_map(Candidate::at_ns).collect();
-            let is_new = |d: &&Detection| others.iter().all(|at_ns| !is_near(d.at_ns, *at_ns, self.same_s));
-            let loudest = self.loudest.iter().filter(|d| is_there(&d.effect, &d.instance)).find(is_new);
+            let others = first.times_beside(named);
+            let is_new = |d: &&Detection| others.iter().all(|at_ns| !is_one_transient(d.at_ns, *at_ns, self.same_s));
+            let loudest = self.loudest.iter().filter(|d| first.is_at_place_of(&d.effect, &d.instance)).find(is_new);
             let Some(loudest) = loudest.filter(|d| self.near_ends.contains(d)) else { continue };
             let possible = set.possible_forms(place, named, self.same_s);
             let Some(own) = possible.into_iter().find(|k| first.forms[*k].shape == loudest.shape) else { continue };
@@ -246,11 +242,7 @@ impl Detected {
 
 /// Whether two detections at one place are of one transient.
 fn is_one(a: &Detection, b: &Detection, same_s: f64) -> bool {
-    (&a.effect, &a.instance) == (&b.effect, &b.instance) && is_near(a.at_ns, b.at_ns, same_s)
-}
-
-fn is_near(a_ns: i64, b_ns: i64, same_s: f64) -> bool {
-    (a_ns - b_ns).abs() <= (1e9 * same_s) as i64
+    (&a.effect, &a.instance) == (&b.effect, &b.instance) && is_one_transient(a.at_ns, b.at_ns, same_s)
 }
 
 /// A model's entry of a line.
@@ -715,11 +707,10 @@ impl Diagnosed {
 }
 
 fn unexplained<'a>(seen: impl Iterator<Item = &'a Detection>, candidates: &[Found], same_s: f64) -> Vec<&'a Detection> {
-    let same_ns = (1e9 * same_s) as i64;
     let accepted = candidates.iter().filter(|f| f.accepted);
-    let mut told: Vec<i64> = accepted.filter_map(|f| f.shape.get("at_ns")?.as_i64()).collect();
+    let mut told: Vec<i64> = accepted.filter_map(|f| f.shape.get(AT_NS)?.as_i64()).collect();
     let mut is_new = |detection: &&Detection| {
-        let new = told.iter().all(|at_ns| (at_ns - detection.at_ns).abs() > same_ns);
+        let new = told.iter().all(|at_ns| !is_one_transient(*at_ns, detection.at_ns, same_s));
         told.push(detection.at_ns);
         new
     };

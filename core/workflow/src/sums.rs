@@ -21,7 +21,7 @@ use dragfree_identification::columns::Columns;
 use dragfree_identification::gram::GramAccumulator;
 use dragfree_identification::lines::{LineSearch, Place};
 use dragfree_identification::record::Record;
-use dragfree_identification::transient::{Detection, Search, Template};
+use dragfree_identification::transient::{Detection, Search, Template, is_one_transient};
 use dragfree_identification::waveform::Waveform;
 use dragfree_schema::{
     AT_NS, Available, Coefficient, Column, Constraint, FREQUENCY_HZ, NoiseProcess, Response, Settings, Shape, Variant,
@@ -539,7 +539,7 @@ fn candidate_set(
 fn apart(all_ns: impl Iterator<Item = i64>, same_s: f64) -> usize {
     let mut kept: Vec<i64> = Vec::new();
     for at_ns in all_ns {
-        if kept.iter().all(|other| (at_ns - other).abs() > (1e9 * same_s) as i64) {
+        if kept.iter().all(|other| !is_one_transient(at_ns, *other, same_s)) {
             kept.push(at_ns);
         }
     }

@@ -35,12 +35,6 @@ pub(crate) fn axis_of(instance: &str) -> usize {
     AXES.iter().position(|axis| *axis == letter).unwrap_or(0)
 }
 
-/// Where an effect acts that may be there several times: the instance without its number, `tm1.x` for `tm1.x-2`.
-pub(crate) fn place_of(instance: &str) -> &str {
-    let is_number = |text: &str| text.parse::<usize>().is_ok_and(|number| number > 1);
-    instance.rsplit_once('-').filter(|(_, text)| is_number(text)).map_or(instance, |(place, _)| place)
-}
-
 /// Test mass of an instance name: `tm1` for `tm1.x`.
 pub(crate) fn tm_of(instance: &str) -> &str {
     instance.split('.').next().unwrap_or_default()

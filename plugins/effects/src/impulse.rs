@@ -23,12 +23,13 @@
 //! attitude; rise and time of a glitch.
 
 use dragfree_physics::mission::Mission;
+use dragfree_sdk::place_and_number;
 use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
     AXES, SLOW_HZ, SeriesRef, accel_channel_of, axis_of, find_housekeeping, housekeeping_in, keep_available, manifest,
-    mission, place_of, response, responses_to_spacecraft_force, symmetric, tm_of,
+    mission, response, responses_to_spacecraft_force, symmetric, tm_of,
 };
 use crate::step_pulses::StepPulses;
 use crate::torque::responses_to_spacecraft_torque;
@@ -151,7 +152,7 @@ impl Impulse {
                 on(responses_to_spacecraft_torque(available, &self.mission, axis, pulse))?,
             ))
         };
-        let place = place_of(&self.instance);
+        let (place, _) = place_and_number(&self.instance);
         Ok(match self.cause {
             Cause::Glitch => {
                 let mass_kg = self.mission.test_mass(tm_of(place), "the effect impulse")?.mass_kg;
@@ -298,7 +299,7 @@ impl Effect for Impulse {
 
     fn new(setup: &Setup) -> Result<Self, PluginError> {
         let instance = setup.instance().to_owned();
-        let last = place_of(&instance).rsplit('.').next().unwrap_or_default();
+        let last = place_and_number(&instance).0.rsplit('.').next().unwrap_or_default();
         let cause = match (tm_of(&instance), AXES.contains(&last)) {
             ("sc", true) => Cause::Hit,
             ("sc", false) => Cause::Torque,

@@ -15,12 +15,13 @@
 use std::f64::consts::{PI, TAU};
 
 use dragfree_physics::mission::Mission;
+use dragfree_sdk::place_and_number;
 use dragfree_sdk::prelude::*;
 use serde_json::json;
 
 use crate::common::{
-    SeriesRef, accel_channel_of, axis_of, keep_available, manifest, mission, place_of, response,
-    responses_to_spacecraft_force, symmetric, tm_of,
+    SeriesRef, accel_channel_of, axis_of, keep_available, manifest, mission, response, responses_to_spacecraft_force,
+    symmetric, tm_of,
 };
 use crate::torque::responses_to_spacecraft_torque;
 
@@ -51,7 +52,7 @@ impl Line {
         available: &Available,
         series: &SeriesRef,
     ) -> Result<(&'static str, f64, Vec<Response>), PluginError> {
-        let place = place_of(&self.instance);
+        let (place, _) = place_and_number(&self.instance);
         let axis = TORQUES.iter().position(|name| *name == place);
         let (unit, most, responses) = match axis {
             Some(axis) => {

@@ -66,7 +66,8 @@ pub(super) fn execute(folder: &Path, open: bool, global: &Global, paint: Paint) 
 
     story.say("Is there an effect missing? Every installed one is tried.")?;
     let found = story.keep(&["diagnose", &first, "--archive", &archive, "--keep-extract", "--json"], &diagnosis)?;
-    story.show(&summary(&found))?;
+    story.say("The answer is in that file. In short:")?;
+    story.show(&format!("\n{}", summary(&found)))?;
 
     story.say(
         "Eight other hours of the same spacecraft, kept out of every fit: how well does the old model predict them?",

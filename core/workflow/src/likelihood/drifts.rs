@@ -1,8 +1,9 @@
 //! Coefficients and levels of noise that change through the data at a constant rate.
 //!
 //! The rate of a parameter needs no series of its own: what it adds in a block of time is what the parameter adds,
-//! times the time ([`Moments`]). A coefficient that is neither in the model nor named is tried with its value beside
-//! its rate.
+//! times the time ([`Moments`]). Beside the rate of a coefficient that is neither in the model nor named the values of
+//! its effect are unknown too. What they explain is no evidence of a change: their form is the best of many, and was
+//! not good enough to be named.
 
 use dragfree_identification::diagnosis::{DRIFT, Drift};
 use dragfree_identification::innovations::decision::{Candidate, Fitted, Quadratic};
@@ -21,8 +22,21 @@ fn searched(c: &Coefficient) -> bool {
 /// A parameter with a rate.
 struct Changing {
     parameter: usize,
-    /// Whether its value is an unknown too that the set does not have.
-    with_value: bool,
+    /// The candidate whose values are unknown beside its rate; none where they are in the model or named.
+    beside: Option<usize>,
+}
+
+/// A rate that was tried.
+struct Tried {
+    /// Index among those that may change.
+    changing: usize,
+    /// The rate, its effect's values fitted beside it.
+    rate: Fitted,
+    /// By how much χ² falls with the rate and with these values.
+    gain: f64,
+    /// Number of these values.
+    values: usize,
+    log10_p: f64,
 }
 
 impl Decided {
@@ -37,34 +51,46 @@ impl Decided {
         }
         let quadratic = self.with_rates(&changing, days, i64::midpoint(from_ns, until_ns));
         let first = self.candidates.len();
-        let log10_p = |f: &Fitted, c: &Changing| judge.log10_p(DRIFT, f.gain, 1 + usize::from(c.with_value));
-        let name = |c: &Changing| self.parameters[c.parameter].0.clone();
+        let name = |k: usize| self.parameters[changing[k].parameter].0.clone();
+        let with_values = |k: usize, set: &[usize]| -> Vec<usize> {
+            let own = changing[k].beside.filter(|own| !set.contains(own));
+            set.iter().copied().chain(own).collect()
+        };
         let mut set = chosen;
         let mut found = Vec::new();
         while found.len() < settings.max_added {
+            let without = quadratic.gain(&set);
+            let try_rate = |k: usize| {
+                let beside = with_values(k, &set);
+                let is_observable = |candidate: &usize| quadratic.observable(*candidate, &beside);
+                if !beside[set.len()..].iter().chain([&(first + k)]).all(is_observable) {
+                    return None;
+                }
+                let rate = quadratic.beside(first + k, &beside);
+                let values = beside[set.len()..].iter().map(|own| self.candidates[*own].parameters.len()).sum();
+                let gain = quadratic.gain(&beside) + rate.gain - without;
+                let log10_p = judge.log10_p(DRIFT, rate.gain, 1);
+                let is_inside = rate.beyond <= settings.range_sigmas.powi(2);
+                is_inside.then_some(Tried { changing: k, rate, gain, values, log10_p })
+            };
             let left = (0..changing.len()).filter(|k| !set.contains(&(first + k)));
-            let tried: Vec<(usize, Fitted)> = left
-                .filter(|k| quadratic.observable(first + k, &set))
-                .map(|k| (k, quadratic.beside(first + k, &set)))
-                .filter(|(_, f)| f.beyond <= settings.range_sigmas.powi(2))
-                .collect();
-            let p = |(k, f): &&(usize, Fitted)| log10_p(f, &changing[*k]);
-            let Some(best) = tried.iter().min_by(|a, b| p(a).total_cmp(&p(b))) else { break };
-            if p(&best) >= settings.false_alarm.log10() {
+            let tried: Vec<Tried> = left.filter_map(try_rate).collect();
+            let Some(best) = tried.iter().min_by(|a, b| a.log10_p.total_cmp(&b.log10_p)) else { break };
+            if best.log10_p >= settings.false_alarm.log10() {
                 break;
             }
-            let (k, fitted) = best;
             // Twice the logarithm of the ratio of likelihoods, of as many values.
-            let likely = |(other, f): &&(usize, Fitted)| {
-                let [own, of] = [*k, *other].map(|i| f64::from(u8::from(changing[i].with_value)));
-                let worse = 0.5 * (fitted.gain - f.gain) + of - own;
-                other != k && (-worse).exp() > settings.false_alarm
+            let likely = |other: &&Tried| {
+                let worse = 0.5 * (best.gain - other.gain) + other.values as f64 - best.values as f64;
+                other.changing != best.changing && (-worse).exp() > settings.false_alarm
             };
-            let confounders = tried.iter().filter(likely).map(|(other, _)| name(&changing[*other])).collect();
-            set.push(first + k);
+            let confounders = tried.iter().filter(likely).map(|other| name(other.changing)).collect();
+            set = with_values(best.changing, &set);
+            set.push(first + best.changing);
             // Its value at half the time beside its rate: data that lie more on one side of it give another one alone.
-            let middle = quadratic.values(&set)[changing[*k].parameter];
-            found.push(self.drift(&changing[*k], fitted, (middle, days), (10f64.powf(p(&best)), confounders)));
+            let changing = &changing[best.changing];
+            let middle = quadratic.values(&set)[changing.parameter];
+            found.push(self.drift(changing, &best.rate, (middle, days), (10f64.powf(best.log10_p), confounders)));
         }
         found
     }
@@ -81,10 +107,9 @@ impl Decided {
         let of = |i: usize| match &self.parameters[i].1 {
             Meaning::Coefficient(c) if c.candidate && searched(c) => None,
             Meaning::Coefficient(_) => {
-                let with_value = place(i).is_some_and(|place| !chosen.contains(&place));
-                Some(Changing { parameter: i, with_value })
+                Some(Changing { parameter: i, beside: place(i).filter(|place| !chosen.contains(place)) })
             }
-            Meaning::Level => Some(Changing { parameter: i, with_value: false }),
+            Meaning::Level => Some(Changing { parameter: i, beside: None }),
             Meaning::Power | Meaning::Number(_) => None,
         };
         (0..self.parameters.len()).filter_map(of).collect()
@@ -126,16 +151,7 @@ impl Decided {
             };
             // A value that stays in its range cannot change by more than its width.
             let fastest = (upper - lower) / days;
-            let value = c.with_value.then_some((c.parameter, lower, upper));
-            let all = value.into_iter().chain([(p + k, -fastest, fastest)]);
-            let (mut parameters, mut ends) = (Vec::new(), (Vec::new(), Vec::new()));
-            for (i, lower, upper) in all {
-                parameters.push(i);
-                ends.0.push(lower);
-                ends.1.push(upper);
-            }
-            let prior_sigma = vec![f64::INFINITY; parameters.len()];
-            Candidate { parameters, lower: ends.0, upper: ends.1, prior_sigma, ln_prior: 0.0, shaped: false }
+            Candidate { lower: vec![-fastest], upper: vec![fastest], ..Candidate::free(p + k) }
         };
         let rates = changing.iter().enumerate().map(rate);
         let candidates = self.quadratic.candidates().iter().cloned().chain(rates).collect();
@@ -150,8 +166,7 @@ impl Decided {
         evidence: (f64, Vec<String>),
     ) -> Drift {
         let (name, meaning) = &self.parameters[changing.parameter];
-        let last = fitted.values.len() - 1;
-        let per_day = fitted.values[last];
+        let per_day = fitted.values[0];
         let ends = [-0.5, 0.5].map(|part| middle + part * days * per_day);
         let (unit, [at_start, at_end]) = match meaning {
             Meaning::Coefficient(c) => (c.unit.clone(), ends),
@@ -163,10 +178,77 @@ impl Decided {
             at_start,
             at_end,
             per_day,
-            sigma_per_day: fitted.covariance[(last, last)].max(0.0).sqrt(),
+            sigma_per_day: fitted.covariance[(0, 0)].max(0.0).sqrt(),
             delta_chi2: fitted.gain,
             p_value: evidence.0,
             confounders: evidence.1,
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use dragfree_identification::innovations::filter::Moments;
+    use nalgebra::{DMatrix, DVector};
+    use serde_json::json;
+
+    use super::super::{How, Joined, Part, Point};
+    use super::*;
+
+    /// Gaussian tails, whatever was tried.
+    struct OneTrial;
+
+    impl Judge for OneTrial {
+        fn log10_p(&self, _: &str, gain: f64, _: usize) -> f64 {
+            -0.2 * gain
+        }
+
+        fn ln_prior(&self, _: &str, _: &str, _: &str) -> f64 {
+            0.0
+        }
+    }
+
+    /// Drifts of one candidate with a lag, which is not named, with these scores of its value and of its rate per day
+    /// about the middle of one day; the information of both is one.
+    fn drifts(value: f64, rate: f64) -> Vec<Drift> {
+        let coefficient = Coefficient {
+            name: "thermal.tm1.x".to_owned(),
+            effect: "thermal".to_owned(),
+            instance: "tm1.x".to_owned(),
+            candidate: true,
+            shape: [("lag_s".to_owned(), json!(480.0))].into_iter().collect(),
+            ..Coefficient::default()
+        };
+        let mut all = Joined::default();
+        let place = all.place((coefficient.name.clone(), Meaning::Coefficient(Box::new(coefficient))));
+        let mut sums = no_sums(1);
+        (sums.information, sums.score, sums.numbers) = (DMatrix::identity(1, 1), vec![value], 1e4);
+        // About the middle; the sums begin with the day.
+        let (begin, half) = (0, (0.5 * DAY_NS) as i64);
+        let once = 0.5 * &sums.information;
+        let twice = (1.0 + 0.25) * &sums.information;
+        let score = DVector::from_vec(vec![rate + 0.5 * value]);
+        let moments = Moments { from_ns: begin, until_ns: 2 * half, once, twice, score };
+        all.parts.push(Part { sums, moments: Some(moments), stretches: Vec::new(), places: vec![(0, place)] });
+        let mut decided = all.decided(&Point::default(), How::Select, &Settings::default(), &OneTrial, Vec::new());
+        decided.selection.chosen.clear();
+        decided.channels = BTreeMap::new();
+        decided.drifts(&Settings::default(), &OneTrial)
+    }
+
+    /// A constant value is no change, however much it explains: it is the best of all lags and thermometers. What
+    /// changes is told with what the change alone explains.
+    #[test]
+    fn a_value_that_is_not_named_is_no_drift() {
+        assert!(drifts(5.5, 0.0).is_empty());
+        let [drift] = &drifts(2.0, 5.5)[..] else { panic!("one drift") };
+        assert!((drift.delta_chi2 - 5.5 * 5.5).abs() < 1e-9, "{drift:?}");
+        assert!((drift.at_start - (2.0 - 0.5 * 5.5)).abs() < 1e-9, "{drift:?}");
+        assert!(
+            (drift.at_end - (2.0 + 0.5 * 5.5)).abs() < 1e-9 && (drift.sigma_per_day - 1.0).abs() < 1e-9,
+            "{drift:?}"
+        );
     }
 }
