@@ -721,9 +721,8 @@ fn unexplained<'a>(seen: impl Iterator<Item = &'a Detection>, candidates: &[Foun
 mod tests {
     use super::*;
 
-    #[test]
-    fn what_rings_beside_something_louder_is_not_told_again() {
-        let detection = |at_s: i64| Detection {
+    fn detection(at_s: i64) -> Detection {
+        Detection {
             effect: "impulse".to_owned(),
             instance: "tm1.x".to_owned(),
             coefficient: "impulse.tm1.x".to_owned(),
@@ -731,7 +730,33 @@ mod tests {
             shape: serde_json::Map::new(),
             at_ns: 1_000_000_000 * at_s,
             significance: 10.0,
+        }
+    }
+
+    /// Of two detections near an end within what one transient rings, the louder one is a candidate; of two ends, and
+    /// beside one of the spectra within that time, each.
+    #[test]
+    fn a_transient_near_an_end_is_one_candidate() {
+        let certain = |times: &[i64]| {
+            let detections =
+                (0..).zip(times).map(|(k, at_s)| Detection { significance: 20.0 - f64::from(k), ..detection(*at_s) });
+            Transients { detections: detections.collect(), tried: 1.0 }
         };
+        let settings = Settings::default();
+        let (found, near_ends) = (certain(&[100, 600, 3000, 20_000]), certain(&[100, 600]));
+        let near = |d: &Detected| d.near_ends.iter().map(|d| d.at_ns / 1_000_000_000).collect::<Vec<_>>();
+        let near_ends = Transients { detections: found.detections[..2].to_vec(), ..near_ends };
+        let detected = Detected::new(&found, &near_ends, &settings);
+        assert_eq!(near(&detected), [100]);
+        let times: Vec<i64> = detected.all.iter().map(|d| d.at_ns / 1_000_000_000).collect();
+        assert_eq!(times, [3000, 20_000, 100]);
+        let two_ends =
+            Transients { detections: vec![found.detections[0].clone(), found.detections[3].clone()], ..found.clone() };
+        assert_eq!(near(&Detected::new(&found, &two_ends, &settings)), [100, 20_000]);
+    }
+
+    #[test]
+    fn what_rings_beside_something_louder_is_not_told_again() {
         let seen = [20_000, 21_800, 24_000, 5_000].map(detection);
         // The third rings beside the second, which rings beside the first.
         let times: Vec<i64> = unexplained(seen.iter(), &[], 3600.0).iter().map(|h| h.at_ns / 1_000_000_000).collect();

@@ -188,8 +188,6 @@ impl Decided {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
-
     use dragfree_identification::innovations::filter::Moments;
     use nalgebra::{DMatrix, DVector};
     use serde_json::json;
@@ -210,9 +208,9 @@ mod tests {
         }
     }
 
-    /// Drifts of one candidate with a lag, which is not named, with these scores of its value and of its rate per day
-    /// about the middle of one day; the information of both is one.
-    fn drifts(value: f64, rate: f64) -> Vec<Drift> {
+    /// Drifts of one candidate with a lag, which is not named, in a day of data without noise, whose information is one
+    /// and lies `mean` ± `spread` days from the middle of the day: its value there and its rate per day.
+    fn drifts(value: f64, rate: f64, (mean, spread): (f64, f64)) -> Vec<Drift> {
         let coefficient = Coefficient {
             name: "thermal.tm1.x".to_owned(),
             effect: "thermal".to_owned(),
@@ -223,32 +221,42 @@ mod tests {
         };
         let mut all = Joined::default();
         let place = all.place((coefficient.name.clone(), Meaning::Coefficient(Box::new(coefficient))));
+        // Moments of time since the begin of the day.
+        let (once, squared) = (0.5 + mean, (0.5 + mean).powi(2) + spread * spread);
+        let at_begin = value - 0.5 * rate;
         let mut sums = no_sums(1);
-        (sums.information, sums.score, sums.numbers) = (DMatrix::identity(1, 1), vec![value], 1e4);
-        // About the middle; the sums begin with the day.
-        let (begin, half) = (0, (0.5 * DAY_NS) as i64);
-        let once = 0.5 * &sums.information;
-        let twice = (1.0 + 0.25) * &sums.information;
-        let score = DVector::from_vec(vec![rate + 0.5 * value]);
-        let moments = Moments { from_ns: begin, until_ns: 2 * half, once, twice, score };
+        (sums.information, sums.score, sums.numbers) = (DMatrix::identity(1, 1), vec![at_begin + rate * once], 1e4);
+        let moments = Moments {
+            from_ns: 0,
+            until_ns: DAY_NS as i64,
+            once: &sums.information * once,
+            twice: &sums.information * squared,
+            score: DVector::from_vec(vec![at_begin * once + rate * squared]),
+        };
         all.parts.push(Part { sums, moments: Some(moments), stretches: Vec::new(), places: vec![(0, place)] });
         let mut decided = all.decided(&Point::default(), How::Select, &Settings::default(), &OneTrial, Vec::new());
         decided.selection.chosen.clear();
-        decided.channels = BTreeMap::new();
         decided.drifts(&Settings::default(), &OneTrial)
     }
 
-    /// A constant value is no change, however much it explains: it is the best of all lags and thermometers. What
-    /// changes is told with what the change alone explains.
+    /// A constant value is no change, however much it explains: it is the best of all lags and thermometers.
     #[test]
     fn a_value_that_is_not_named_is_no_drift() {
-        assert!(drifts(5.5, 0.0).is_empty());
-        let [drift] = &drifts(2.0, 5.5)[..] else { panic!("one drift") };
-        assert!((drift.delta_chi2 - 5.5 * 5.5).abs() < 1e-9, "{drift:?}");
-        assert!((drift.at_start - (2.0 - 0.5 * 5.5)).abs() < 1e-9, "{drift:?}");
-        assert!(
-            (drift.at_end - (2.0 + 0.5 * 5.5)).abs() < 1e-9 && (drift.sigma_per_day - 1.0).abs() < 1e-9,
-            "{drift:?}"
-        );
+        assert!(drifts(5.5, 0.0, (0.0, 0.3)).is_empty());
+        assert!(drifts(5.5, 0.0, (0.2, 0.2)).is_empty());
+    }
+
+    /// What changes is told with what the change alone explains, and with its values at both ends of the day wherever
+    /// in it the data lie.
+    #[test]
+    fn a_rate_is_told_with_the_values_at_both_ends() {
+        for (mean, spread) in [(0.0, 0.3), (0.2, 0.2)] {
+            let [drift] = &drifts(2.0, 20.0, (mean, spread))[..] else { panic!("one drift of data about {mean}") };
+            let expected = [-8.0, 12.0, 20.0, spread.recip(), (20.0 * spread).powi(2)];
+            let found = [drift.at_start, drift.at_end, drift.per_day, drift.sigma_per_day, drift.delta_chi2];
+            for (found, expected) in found.iter().zip(expected) {
+                assert!((found / expected - 1.0).abs() < 1e-6, "{found} for {expected}: {drift:?}");
+            }
+        }
     }
 }
