@@ -737,22 +737,15 @@ mod tests {
     /// beside one of the spectra within that time, each.
     #[test]
     fn a_transient_near_an_end_is_one_candidate() {
-        let certain = |times: &[i64]| {
-            let detections =
-                (0..).zip(times).map(|(k, at_s)| Detection { significance: 20.0 - f64::from(k), ..detection(*at_s) });
-            Transients { detections: detections.collect(), tried: 1.0 }
-        };
-        let settings = Settings::default();
-        let (found, near_ends) = (certain(&[100, 600, 3000, 20_000]), certain(&[100, 600]));
-        let near = |d: &Detected| d.near_ends.iter().map(|d| d.at_ns / 1_000_000_000).collect::<Vec<_>>();
-        let near_ends = Transients { detections: found.detections[..2].to_vec(), ..near_ends };
-        let detected = Detected::new(&found, &near_ends, &settings);
-        assert_eq!(near(&detected), [100]);
-        let times: Vec<i64> = detected.all.iter().map(|d| d.at_ns / 1_000_000_000).collect();
-        assert_eq!(times, [3000, 20_000, 100]);
-        let two_ends =
-            Transients { detections: vec![found.detections[0].clone(), found.detections[3].clone()], ..found.clone() };
-        assert_eq!(near(&Detected::new(&found, &two_ends, &settings)), [100, 20_000]);
+        let loud = |(at_s, significance)| Detection { significance, ..detection(at_s) };
+        let all = [(100, 20.0), (600, 19.0), (3000, 18.0), (20_000, 17.0)].map(loud);
+        let of =
+            |which: &[usize]| Transients { detections: which.iter().map(|k| all[*k].clone()).collect(), tried: 1.0 };
+        let detected = |near: &[usize]| Detected::new(&of(&[0, 1, 2, 3]), &of(near), &Settings::default());
+        let times = |all: &[Detection]| all.iter().map(|d| d.at_ns / 1_000_000_000).collect::<Vec<_>>();
+        assert_eq!(times(&detected(&[0, 1]).near_ends), [100]);
+        assert_eq!(times(&detected(&[0, 1]).all), [3000, 20_000, 100]);
+        assert_eq!(times(&detected(&[0, 3]).near_ends), [100, 20_000]);
     }
 
     #[test]
