@@ -20,7 +20,7 @@ use crate::diagnosis_score::{Truth, by_names, by_reveal, name_of, undiagnosed};
 use crate::error::{CampaignError, file};
 use crate::frozen;
 use crate::program::{Chain, Hidden, Program, root, solution};
-use crate::records::{Acted, Answer, Diagnosed, Extended, Results, Solution, read, rounded};
+use crate::records::{Acted, Answer, Diagnosed, Extended, KeptOut, Results, Solution, read, rounded};
 
 /// Length of a set.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -107,6 +107,11 @@ const BLOCK: u32 = 20;
 const SEEDS_PER_LENGTH: u32 = 100_000;
 /// Offset of the seeds of sets in which nothing is hidden.
 const CLEAN_SEEDS: u32 = 50_000;
+/// Distance of the seeds of kept-out data from those of the set, more than there are seeds of sets.
+const KEPT_OUT_SEEDS: u32 = 10_000_000;
+/// Where kept-out data of the bundled simulator and of the other producer begin: on another day than the set.
+const KEPT_OUT_FROM: &str = "2035-02-01";
+const KEPT_OUT_AFTER_NS: u64 = 10 * 86_400_000_000_000;
 /// Deviation of a noise level from the mission file from which naming it is not false.
 const TRUE_LEVEL: f64 = 0.05;
 
@@ -299,6 +304,7 @@ impl Measurement<'_> {
             effects,
             before: Vec::new(),
             after: None,
+            kept_out: None,
         };
         if let Some(said) = said {
             let products = &said.products;
@@ -310,6 +316,7 @@ impl Measurement<'_> {
             if !added.is_empty() {
                 line.after = Some(self.extended(&chain, &made, &said.diagnosis, added)?);
             }
+            line.kept_out = self.kept_out(&chain, &made, &said, &line.effects)?;
         }
         Ok(line)
     }
@@ -383,33 +390,20 @@ impl Measurement<'_> {
     /// Significance of a force that no effect covers, or of a line, with the σ that `run` has with it in the model;
     /// none of other effects, and where that fails.
     fn in_the_model(&self, chain: &Chain, made: &Made, acted: &Acted) -> Result<Option<f64>, CampaignError> {
-        let Some((effect, place)) = acted.name.split_once(':') else { return Ok(None) };
+        let Some((_, place)) = acted.name.split_once(':') else { return Ok(None) };
         let line_hz = match &made.secret {
             Secret::Drawn(draw) => draw.acted.iter().find_map(|own| own.frequency_hz),
             _ => None,
         };
-        let (entry, parameters, coefficient) = if let Some((expression, unit)) = formula_of(effect) {
-            let (test_mass, axis) = place.split_once('.').unwrap_or((place, "x"));
-            let parameters = vec![
-                format!("acts_on={test_mass}.accel.{axis}"),
-                format!("expression={expression}"),
-                format!("unit={unit}"),
-                "range=-1e-8,1e-8".to_owned(),
-            ];
-            ("formula:known", parameters, "formula.known".to_owned())
+        let (entry, coefficient) = if let Some(formula) = true_formula(&acted.name) {
+            (formula, "formula.known".to_owned())
         } else if let Some(hz) = line_hz {
             // Of a line of any phase the two amplitudes have one σ.
-            (acted.name.as_str(), vec![format!("frequency_hz={hz}")], format!("line.{place}.sin"))
+            (Entry { name: acted.name.clone(), set: vec![format!("frequency_hz={hz}")] }, format!("line.{place}.sin"))
         } else {
             return Ok(None);
         };
-        let model = self.folder.join("known.toml");
-        std::fs::copy(chain.model.as_deref().unwrap_or(Path::new("")), &model).map_err(|e| self.io(&e))?;
-        let parameters = parameters.iter().flat_map(|p| ["--set".as_ref(), p.as_ref()]);
-        let words = ["add".as_ref(), model.as_os_str(), entry.as_ref()];
-        let chain = Chain { model: Some(model.clone()), ..chain.clone() };
-        let added = self.program.model(&words.into_iter().chain(parameters).collect::<Vec<&OsStr>>());
-        let products = match added.and_then(|()| self.run(&chain, made)) {
+        let products = match self.with(chain, "known.toml", &entry.words()).and_then(|chain| self.run(&chain, made)) {
             Err(CampaignError::Failed { .. }) => return Ok(None),
             products => products?,
         };
@@ -420,6 +414,80 @@ impl Measurement<'_> {
         };
         let information: f64 = products.iter().filter_map(sigma).map(|sigma| sigma.powi(-2)).sum();
         Ok(Some(acted.size.abs() * information.sqrt()))
+    }
+
+    /// A chain whose model has one entry more, in a file of its own: the words of `dragfree model add` after the file.
+    fn with(&self, chain: &Chain, file: &str, words: &[&OsStr]) -> Result<Chain, CampaignError> {
+        let model = self.folder.join(file);
+        std::fs::copy(chain.model.as_deref().unwrap_or(Path::new("")), &model).map_err(|e| self.io(&e))?;
+        self.program.model(&[&["add".as_ref(), model.as_os_str()], words].concat())?;
+        Ok(Chain { model: Some(model), ..chain.clone() })
+    }
+
+    /// By how much χ² falls on other data of the same length, a day at most, with the first proposed formula and with
+    /// the true one, each fitted to the first day of the set.
+    fn kept_out(
+        &self,
+        chain: &Chain,
+        made: &Made,
+        said: &Said,
+        effects: &[Acted],
+    ) -> Result<Option<KeptOut>, CampaignError> {
+        let [acted] = effects else { return Ok(None) };
+        let Some(entry) = true_formula(&acted.name) else { return Ok(None) };
+        let others = self.other_data(made, acted)?;
+        let without = self.on_other_data(chain, made, &others)?;
+        let fall = |file: &str, words: &[&OsStr]| -> Result<Option<f64>, CampaignError> {
+            let with = match self.with(chain, file, words).and_then(|chain| self.on_other_data(&chain, made, &others)) {
+                Err(CampaignError::Failed { .. }) => return Ok(None),
+                with => with?,
+            };
+            let of_these = ["ladder", &without[0], &with[0], "--held-out", &without[1], &with[1]];
+            let answer = self.program.ask(self.folder, &[&of_these[..], &["--archive", "archive"]].concat())?;
+            Ok(answer["revisions"][1]["held_out"]["fall"]["delta_chi2"].as_f64())
+        };
+        let first = said.diagnosis["formulas"].as_array().and_then(|all| all.first()).map(name_of);
+        let proposed = match first {
+            Some(name) => {
+                let from = self.folder.join("proposed.json");
+                std::fs::write(&from, said.diagnosis.to_string()).map_err(|e| self.io(&e))?;
+                fall("proposed.toml", &[name.as_ref(), "--from".as_ref(), from.as_os_str()])?
+            }
+            None => None,
+        };
+        Ok(Some(KeptOut { proposed, true_formula: fall("true.toml", &entry.words())? }))
+    }
+
+    /// Data on which the same acts, of another seed and day.
+    fn other_data(&self, made: &Made, acted: &Acted) -> Result<Vec<PathBuf>, CampaignError> {
+        let folder = self.folder.join("other");
+        let hours = self.set.length.hours().min(Length::H24.hours());
+        if let Secret::Drawn(draw) = &made.secret {
+            std::fs::create_dir_all(&folder).map_err(|e| self.io(&e))?;
+            let mut other = (**draw).clone();
+            (other.flight.seconds, other.start_ns) = (3600.0 * hours, draw.start_ns + KEPT_OUT_AFTER_NS);
+            other.flight.seed = draw.flight.seed.wrapping_add(KEPT_OUT_SEEDS.into());
+            return other.record(&folder).map_err(|e| self.io(&e));
+        }
+        let seed = KEPT_OUT_SEEDS + self.set.drawn_by();
+        let arguments = ["--start", KEPT_OUT_FROM, "--seed", &seed.to_string(), "--hours", &hours.to_string()];
+        let effect = format!("--effect={}={}", acted.name, acted.size);
+        let arguments: Vec<&str> = arguments.into_iter().chain([effect.as_str()]).collect();
+        Ok(self.program.simulate(&taiji(), &folder, &arguments)?.files)
+    }
+
+    /// Products of the first day of a set, and of other data with all that this has told but the offset.
+    fn on_other_data(&self, chain: &Chain, made: &Made, others: &[PathBuf]) -> Result<[String; 2], CampaignError> {
+        let id = |product: &Value| product["id"].as_str().map(str::to_owned).ok_or_else(|| self.lacks("id".to_owned()));
+        let archive = self.archive();
+        let fitted = id(&self.program.run(chain, &made.files[..1], &archive)?)?;
+        let model = chain.model.clone().unwrap_or_default();
+        let fixed = model.with_extension("fixed.toml");
+        let words = ["fix".as_ref(), model.as_os_str(), "--from".as_ref(), fitted.as_ref(), "--keep".as_ref()];
+        let out = ["com-offset".as_ref(), "--archive".as_ref(), archive.as_os_str(), "--out".as_ref()];
+        self.program.model(&[&words[..], &out[..], &[fixed.as_os_str()]].concat())?;
+        let other = id(&self.program.run(&Chain { model: Some(fixed), ..chain.clone() }, others, &archive)?)?;
+        Ok([fitted, other])
     }
 
     /// Names of everything that was named, if all of it is true.
@@ -463,6 +531,34 @@ impl Measurement<'_> {
             Err(error) => Err(error),
         }
     }
+}
+
+/// An entry of a model: its name, and what is set in it.
+struct Entry {
+    name: String,
+    set: Vec<String>,
+}
+
+impl Entry {
+    /// As `dragfree model add` takes it.
+    fn words(&self) -> Vec<&OsStr> {
+        let set = self.set.iter().flat_map(|set| ["--set".as_ref(), set.as_ref()]);
+        std::iter::once(self.name.as_ref()).chain(set).collect()
+    }
+}
+
+/// The formula `formula:known` of an effect, `EFFECT:INSTANCE`, that is a force of a kind that no effect covers.
+fn true_formula(name: &str) -> Option<Entry> {
+    let (effect, place) = name.split_once(':')?;
+    let (expression, unit) = formula_of(effect)?;
+    let (test_mass, axis) = place.split_once('.').unwrap_or((place, "x"));
+    let set = vec![
+        format!("acts_on={test_mass}.accel.{axis}"),
+        format!("expression={expression}"),
+        format!("unit={unit}"),
+        "range=-1e-8,1e-8".to_owned(),
+    ];
+    Some(Entry { name: "formula:known".to_owned(), set })
 }
 
 /// A force of a kind that no effect covers as a formula of telemetry, with the unit of its size.

@@ -8,7 +8,7 @@ use dragfree_chart::matrix::{Matrix, svg};
 use nalgebra::{DMatrix, DVector};
 use serde_json::Value;
 
-use crate::records::{Acted, Diagnosed, Solution};
+use crate::records::{Acted, Diagnosed, KeptOut, Solution};
 use crate::stats;
 
 /// A part of the campaign: title, and whether a set belongs to it.
@@ -192,6 +192,12 @@ fn tells_driver(line: &Diagnosed, effect: &Acted) -> bool {
     terms.take(3).filter_map(Value::as_str).any(|term| drivers.iter().all(|driver| term.contains(driver)))
 }
 
+/// Whether the proposed formula is nearly as good on other data as the true one, where the latter can be run.
+fn predicts(kept_out: &KeptOut) -> Option<bool> {
+    let with_truth = kept_out.true_formula?;
+    Some(kept_out.proposed.is_some_and(|fall| fall >= 0.9 * with_truth))
+}
+
 fn names_false_cause(line: &Diagnosed) -> bool {
     line.answer.as_ref().is_some_and(|a| !a.false_causes.is_empty())
 }
@@ -277,6 +283,14 @@ fn rows(free: &DMatrix<f64>) -> Vec<Row<'_>> {
             Box::new(|lines| {
                 let loud = lines.iter().filter_map(|l| Some((l, single(l, false)?)));
                 Measured::share(loud.filter(|(l, e)| significance(l, e) > 8.0).map(|(l, e)| tells_driver(l, e)))
+            }),
+        ),
+        (
+            "the same: the proposed formula lowers χ² of other data by nine tenths of what the true one does",
+            Bar::AtLeast(70),
+            Box::new(|lines| {
+                let loud = lines.iter().filter(|l| single(l, false).is_some_and(|e| significance(l, e) > 8.0));
+                Measured::share(loud.filter_map(|l| predicts(l.kept_out.as_ref()?)))
             }),
         ),
         (
@@ -487,6 +501,7 @@ mod tests {
             effects,
             before: vec![solution([1e-3; 6], 1e-3)],
             after: None,
+            kept_out: None,
         }
     }
 
@@ -571,6 +586,12 @@ mod tests {
         ];
         assert_eq!(measured(&lines, "pairs"), Measured::Share(1, 2));
         assert_eq!(measured(&lines, "a kind"), Measured::Share(1, 2));
+        let mut loud = vec![lines[2].clone(); 4];
+        let falls = [(Some(91.0), Some(100.0)), (Some(89.0), Some(100.0)), (None, Some(100.0)), (Some(50.0), None)];
+        for (line, (proposed, true_formula)) in loud.iter_mut().zip(falls) {
+            line.kept_out = Some(KeptOut { proposed, true_formula });
+        }
+        assert_eq!(measured(&loud, "the same: the proposed formula"), Measured::Share(1, 3));
     }
 
     /// One σ in each of six directions is six degrees of freedom, told per three.

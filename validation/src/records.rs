@@ -163,6 +163,18 @@ pub(crate) struct Diagnosed {
     pub(crate) before: Vec<Solution>,
     /// Offset by the extended model; `None` if nothing was named, or not everything that was named is true.
     pub(crate) after: Option<Extended>,
+    /// What a formula says of other data; `None` unless the one hidden effect is a force that no effect covers.
+    pub(crate) kept_out: Option<KeptOut>,
+}
+
+/// By how much χ² falls on data that no fit has seen, with a formula that was fitted to the data of the set.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub(crate) struct KeptOut {
+    /// The first formula that the diagnosis proposes; `None` if it proposes none, or the program cannot run it.
+    pub(crate) proposed: Option<f64>,
+    /// The formula of the force that acts; `None` if the program cannot run it.
+    pub(crate) true_formula: Option<f64>,
 }
 
 /// What a diagnosis said as a whole.
